@@ -1,0 +1,1 @@
+//! The `vidar` program as a library, so that its parts can be tested.

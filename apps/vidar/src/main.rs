@@ -1,0 +1,3 @@
+//! The `vidar` program.
+
+fn main() {}

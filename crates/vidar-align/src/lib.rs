@@ -1,0 +1,1 @@
+//! Placement of predicted chunks in the metric world.

@@ -1,0 +1,162 @@
+//! Rotations SO(3), stored as unit quaternions.
+
+use super::{LieGroup, impl_group_ops};
+use nalgebra::{Matrix3, Quaternion, UnitQuaternion, Vector3};
+
+/// A rotation: maps vectors of one frame into another.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct So3(UnitQuaternion<f64>);
+
+/// Below this angle (rad) Taylor series replace quotients that lose digits.
+const SMALL_ANGLE: f64 = 1e-4;
+
+/// Cross-product matrix: `hat(a) b = a × b`.
+pub(crate) fn hat(v: &Vector3<f64>) -> Matrix3<f64> {
+    Matrix3::new(0.0, -v.z, v.y, v.z, 0.0, -v.x, -v.y, v.x, 0.0)
+}
+
+/// `Jl(ω) = I + (1−cos θ)/θ² ω^ + (θ−sin θ)/θ³ ω^²`.
+pub(crate) fn left_jacobian(omega: &Vector3<f64>) -> Matrix3<f64> {
+    let theta2 = omega.norm_squared();
+    let theta = theta2.sqrt();
+    let (a, b) = if theta < SMALL_ANGLE {
+        (0.5 - theta2 / 24.0, 1.0 / 6.0 - theta2 / 120.0)
+    } else {
+        // 1 − cos θ = 2 sin²(θ/2) keeps its digits for small θ.
+        let half_sin = (0.5 * theta).sin();
+        (2.0 * half_sin * half_sin / theta2, (theta - theta.sin()) / (theta2 * theta))
+    };
+    let w = hat(omega);
+    Matrix3::identity() + w * a + w * w * b
+}
+
+impl So3 {
+    /// No rotation.
+    pub const IDENTITY: Self = Self(UnitQuaternion::new_unchecked(Quaternion::from_vector(
+        nalgebra::Vector4::new(0.0, 0.0, 0.0, 1.0),
+    )));
+
+    /// From quaternion parts; the quaternion is normalised. `None` when it has no direction.
+    pub fn from_quaternion(x: f64, y: f64, z: f64, w: f64) -> Option<Self> {
+        let q = Quaternion::new(w, x, y, z);
+        let norm = q.norm();
+        (norm.is_finite() && norm > 1e-9).then(|| Self(UnitQuaternion::from_quaternion(q)))
+    }
+
+    /// From a matrix that is a rotation up to rounding; `None` when it is further than 1e-3 from one.
+    ///
+    /// The nearest rotation (polar factor) is taken, so text files with few digits are welcome.
+    pub fn from_matrix(matrix: &Matrix3<f64>) -> Option<Self> {
+        let deviation = (matrix.transpose() * matrix - Matrix3::identity()).amax();
+        if !(deviation < 1e-3 && matrix.determinant() > 0.0) {
+            return None;
+        }
+        let svd = matrix.svd(true, true);
+        let nearest = svd.u? * svd.v_t?;
+        let rotation = nalgebra::Rotation3::from_matrix_unchecked(nearest);
+        Some(Self(UnitQuaternion::from_rotation_matrix(&rotation)))
+    }
+
+    /// Rotation by `angle_rad` about `axis` (any length but zero; zero gives the identity).
+    pub fn from_axis_angle(axis: &Vector3<f64>, angle_rad: f64) -> Self {
+        match axis.try_normalize(1e-12) {
+            Some(unit) => Self::exp(&(unit * angle_rad)),
+            None => Self::IDENTITY,
+        }
+    }
+
+    /// The 3×3 matrix.
+    pub fn matrix(&self) -> Matrix3<f64> {
+        self.0.to_rotation_matrix().into_inner()
+    }
+
+    /// `[x, y, z, w]` with w ≥ 0.
+    pub fn quaternion_xyzw(&self) -> [f64; 4] {
+        let q = self.0.quaternion();
+        let sign = if q.w < 0.0 { -1.0 } else { 1.0 };
+        [q.i * sign, q.j * sign, q.k * sign, q.w * sign]
+    }
+
+    /// Angle of the rotation, rad, in [0, π].
+    pub fn angle_rad(&self) -> f64 {
+        self.log().norm()
+    }
+
+    /// Whether every part is finite.
+    pub fn is_finite(&self) -> bool {
+        self.0.coords.iter().all(|c| c.is_finite())
+    }
+}
+
+impl LieGroup<3> for So3 {
+    fn identity() -> Self {
+        Self::IDENTITY
+    }
+
+    fn exp(tangent: &Vector3<f64>) -> Self {
+        let theta2 = tangent.norm_squared();
+        let theta = theta2.sqrt();
+        // sin(θ/2)/θ
+        let k = if theta < SMALL_ANGLE { 0.5 - theta2 / 48.0 } else { (0.5 * theta).sin() / theta };
+        let v = tangent * k;
+        Self(UnitQuaternion::new_normalize(Quaternion::new((0.5 * theta).cos(), v.x, v.y, v.z)))
+    }
+
+    fn log(&self) -> Vector3<f64> {
+        let q = self.0.quaternion();
+        let sign = if q.w < 0.0 { -1.0 } else { 1.0 };
+        let v = Vector3::new(q.i, q.j, q.k) * sign;
+        let w = q.w * sign;
+        let n2 = v.norm_squared();
+        let n = n2.sqrt();
+        // θ/sin(θ/2) = 2 atan2(n, w)/n; atan2 stays exact at π, where acos and asin do not.
+        let k = if n < SMALL_ANGLE { 2.0 / w - 2.0 * n2 / (3.0 * w * w * w) } else { 2.0 * n.atan2(w) / n };
+        v * k
+    }
+
+    fn inverse(&self) -> Self {
+        Self(self.0.inverse())
+    }
+
+    fn compose(&self, other: &Self) -> Self {
+        // Renormalising keeps long chains on the group.
+        Self(UnitQuaternion::new_normalize(self.0.quaternion() * other.0.quaternion()))
+    }
+
+    fn act(&self, point: &Vector3<f64>) -> Vector3<f64> {
+        self.0 * point
+    }
+
+    fn adjoint(&self) -> Matrix3<f64> {
+        self.matrix()
+    }
+
+    fn left_jacobian(tangent: &Vector3<f64>) -> Matrix3<f64> {
+        left_jacobian(tangent)
+    }
+
+    fn right_jacobian_inverse(tangent: &Vector3<f64>) -> Option<Matrix3<f64>> {
+        // Jr⁻¹(ω) = I + ½ ω^ + (1/θ² − (1 + cos θ)/(2 θ sin θ)) ω^²
+        let theta2 = tangent.norm_squared();
+        let theta = theta2.sqrt();
+        let c = if theta < 1e-3 {
+            1.0 / 12.0 + theta2 / 720.0
+        } else {
+            let half = 0.5 * theta;
+            let sin_half = half.sin();
+            if sin_half.abs() < 1e-9 {
+                return None;
+            }
+            // (1 + cos θ)/(2 θ sin θ) = cot(θ/2)/(2 θ)
+            1.0 / theta2 - half.cos() / (sin_half * 2.0 * theta)
+        };
+        let w = hat(tangent);
+        Some(Matrix3::identity() + w * 0.5 + w * w * c)
+    }
+
+    fn d_act_d_perturbation(&self, point: &Vector3<f64>) -> Matrix3<f64> {
+        -self.matrix() * hat(point)
+    }
+}
+
+impl_group_ops!(So3);

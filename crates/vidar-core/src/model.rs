@@ -1,0 +1,130 @@
+//! What every source of dense geometry looks like: views in, a prediction in its own units out.
+
+use crate::camera::Pinhole;
+use crate::geometry::{Confidence, RelativeDepth};
+use crate::id::{ChunkId, FrameId};
+use crate::image::FrameImage;
+use crate::lie::Se3;
+use crate::time::Timestamp;
+use serde::{Deserialize, Serialize};
+use thiserror::Error;
+
+/// One undistorted view of a chunk.
+#[derive(Clone, Debug)]
+pub struct ChunkView {
+    /// Which frame it is.
+    pub frame_id: FrameId,
+    /// When it was taken.
+    pub time: Timestamp,
+    /// The undistorted image.
+    pub image: FrameImage,
+    /// Its intrinsics at the image's size.
+    pub intrinsics: Pinhole,
+    /// A prior pose in metres (from odometry, an external trajectory or ground truth), if there is one.
+    pub world_from_camera: Option<Se3>,
+}
+
+/// What a model sees at once.
+#[derive(Clone, Debug)]
+pub struct ChunkViews {
+    /// The chunk's number.
+    pub id: ChunkId,
+    /// Its views in the order of time.
+    pub views: Vec<ChunkView>,
+}
+
+/// Geometry of one view in the chunk's frame and units.
+#[derive(Clone, Debug)]
+pub struct ViewGeometry {
+    /// Which frame it is.
+    pub frame_id: FrameId,
+    /// Pose in the chunk's frame, translation in chunk units.
+    pub chunk_from_camera: Se3,
+    /// Intrinsics at the depth's size.
+    pub intrinsics: Pinhole,
+    /// z-depth in chunk units.
+    pub depth: RelativeDepth,
+    /// Confidence per pixel.
+    pub confidence: Confidence,
+}
+
+/// In which frame and units a prediction is.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum ChunkFrame {
+    /// The frame of the prior poses that were given, in metres.
+    PriorWorld,
+    /// A frame and scale of the model's own.
+    ModelNative,
+}
+
+/// Output of a model for one chunk.
+#[derive(Clone, Debug)]
+pub struct GeometryPrediction {
+    /// Which chunk.
+    pub chunk_id: ChunkId,
+    /// In which frame and units.
+    pub frame: ChunkFrame,
+    /// One entry per view that got geometry, in the order of the views given.
+    pub views: Vec<ViewGeometry>,
+}
+
+/// Which model it is and under which terms it may be used.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct ModelInfo {
+    /// Name as the user chooses it (`stereo`, `da3-small`).
+    pub name: String,
+    /// SPDX licence of the weights, or of the code when there are none.
+    pub licence: String,
+    /// SHA-256 of the weights, when there are any.
+    pub weights_sha256: Option<String>,
+    /// Whether prior poses are required.
+    pub needs_poses: bool,
+    /// Fewest views it can work with.
+    pub min_views: usize,
+}
+
+/// Why a model could not predict.
+#[derive(Debug, Error)]
+#[non_exhaustive]
+pub enum ModelError {
+    /// Fewer views than the model needs.
+    #[error("chunk {chunk}: {found} views, the model needs at least {needed}")]
+    TooFewViews {
+        /// Which chunk.
+        chunk: ChunkId,
+        /// Views given.
+        found: usize,
+        /// Views needed.
+        needed: usize,
+    },
+    /// A view lacks the prior pose that the model needs.
+    #[error("frame {frame} has no prior pose, and this model needs one")]
+    MissingPose {
+        /// Which frame.
+        frame: FrameId,
+    },
+    /// A view cannot be used as it is.
+    #[error("frame {frame}: {reason}")]
+    BadView {
+        /// Which frame.
+        frame: FrameId,
+        /// What is wrong with it.
+        reason: String,
+    },
+    /// The caller asked to stop.
+    #[error("cancelled")]
+    Cancelled,
+    /// Anything else, in the model's own words.
+    #[error("{0}")]
+    Other(String),
+}
+
+/// A source of dense geometry.
+pub trait GeometryModel: Send {
+    /// Which model this is.
+    fn info(&self) -> &ModelInfo;
+
+    /// Predicts depth, confidence and poses of a chunk. Same input, same bits, for any thread count.
+    fn predict(&mut self, views: &ChunkViews) -> Result<GeometryPrediction, ModelError>;
+}

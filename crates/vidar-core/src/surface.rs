@@ -1,0 +1,65 @@
+//! Surfaces: what fusion makes, export writes and evaluation judges. All in metres, in the world frame.
+
+/// Points with optional attributes; an attribute list is either empty or as long as `positions`.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct PointCloud {
+    /// Positions in the world, metres.
+    pub positions: Vec<[f32; 3]>,
+    /// Unit normals in the world, facing the observer.
+    pub normals: Vec<[f32; 3]>,
+    /// sRGB colours.
+    pub colors: Vec<[u8; 3]>,
+    /// Confidence in 0…1.
+    pub confidences: Vec<f32>,
+}
+
+impl PointCloud {
+    /// Points without attributes.
+    pub fn from_positions(positions: Vec<[f32; 3]>) -> Self {
+        Self { positions, ..Self::default() }
+    }
+
+    /// Number of points.
+    pub fn len(&self) -> usize {
+        self.positions.len()
+    }
+
+    /// Whether there is no point.
+    pub fn is_empty(&self) -> bool {
+        self.positions.is_empty()
+    }
+
+    /// Whether every attribute list is empty or as long as `positions`.
+    pub fn is_consistent(&self) -> bool {
+        let n = self.positions.len();
+        [self.normals.len(), self.colors.len(), self.confidences.len()]
+            .iter()
+            .all(|&len| len == 0 || len == n)
+    }
+}
+
+/// A triangle mesh with shared vertices; counter-clockwise seen from outside (the observed side).
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct TriangleMesh {
+    /// Vertex positions in the world, metres.
+    pub positions: Vec<[f32; 3]>,
+    /// Unit vertex normals, or empty.
+    pub normals: Vec<[f32; 3]>,
+    /// sRGB vertex colours, or empty.
+    pub colors: Vec<[u8; 3]>,
+    /// Confidence in 0…1 per vertex, or empty.
+    pub confidences: Vec<f32>,
+    /// Vertex indices of each triangle.
+    pub triangles: Vec<[u32; 3]>,
+}
+
+impl TriangleMesh {
+    /// Whether attributes fit the vertices and every index names a vertex.
+    pub fn is_consistent(&self) -> bool {
+        let n = self.positions.len();
+        [self.normals.len(), self.colors.len(), self.confidences.len()]
+            .iter()
+            .all(|&len| len == 0 || len == n)
+            && self.triangles.iter().flatten().all(|&i| (i as usize) < n)
+    }
+}

@@ -1,0 +1,1 @@
+//! Trajectory, depth and surface metrics with the paper's protocols.

@@ -1,0 +1,1 @@
+//! Trajectories, PLY, GLB, COLMAP, transforms.json and depth PNG, written and read back.

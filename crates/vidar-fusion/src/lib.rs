@@ -1,0 +1,1 @@
+//! Confidence-weighted TSDF and point fusion, mesh extraction, coverage.

@@ -1,0 +1,1 @@
+//! Multi-view stereo from known poses: a geometry model that needs no weights.

@@ -1,0 +1,1 @@
+//! Plots, pictures of depth and map, and the self-contained HTML report.

@@ -1,0 +1,1 @@
+//! The corridor: configuration, events, run folder, and the stages wired together.
