@@ -1,1 +1,11 @@
 //! Placement of predicted chunks in the metric world.
+//!
+//! A geometry model predicts in the frame and units of its chunk; the anchor (odometry, an external trajectory or
+//! ground truth) knows the same cameras in metres. [`place_chunk`] finds the similarity between the two, and
+//! [`aligned_views`] carries depth and poses over. This is the paper's *decoupled hybrid* for one chunk
+//! (section III-D): `S_vio = Umeyama({c_i^pred}, {c_i^VIO})`, `M ← S_vio(M)`, with its guard that a rank-deficient
+//! fit changes nothing (section III-F).
+
+mod place;
+
+pub use place::{AlignConfig, AlignError, Anchor, ChunkAlignment, Verdict, aligned_views, place_chunk};

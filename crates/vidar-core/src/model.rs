@@ -7,6 +7,7 @@ use crate::image::FrameImage;
 use crate::lie::Se3;
 use crate::time::Timestamp;
 use serde::{Deserialize, Serialize};
+use std::ops::Range;
 use thiserror::Error;
 
 /// One undistorted view of a chunk.
@@ -127,4 +128,24 @@ pub trait GeometryModel: Send {
 
     /// Predicts depth, confidence and poses of a chunk. Same input, same bits, for any thread count.
     fn predict(&mut self, views: &ChunkViews) -> Result<GeometryPrediction, ModelError>;
+
+    /// Predicts a chunk of which only the views `wanted` (indices into `views.views`) are needed.
+    ///
+    /// The others are context. `cancel` is asked now and then; `true` ends the work with
+    /// [`ModelError::Cancelled`]. The default predicts everything and keeps what is wanted.
+    fn predict_wanted(
+        &mut self,
+        views: &ChunkViews,
+        wanted: Range<usize>,
+        cancel: &(dyn Fn() -> bool + Sync),
+    ) -> Result<GeometryPrediction, ModelError> {
+        if cancel() {
+            return Err(ModelError::Cancelled);
+        }
+        let mut prediction = self.predict(views)?;
+        let ids: Vec<FrameId> =
+            views.views.iter().enumerate().filter(|(i, _)| wanted.contains(i)).map(|(_, v)| v.frame_id).collect();
+        prediction.views.retain(|v| ids.contains(&v.frame_id));
+        Ok(prediction)
+    }
 }

@@ -1,0 +1,191 @@
+//! One chunk onto its anchors.
+
+use nalgebra::Vector3;
+use serde::{Deserialize, Serialize};
+use thiserror::Error;
+use vidar_core::model::ChunkFrame;
+use vidar_core::{
+    AlignedView, ChunkId, ChunkView, FrameId, GeometryError, GeometryPrediction, LieGroup, Se3, Sim3,
+    umeyama_sim3,
+};
+
+/// What decides how a chunk is placed.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct AlignConfig {
+    /// Largest RMS distance (m) between placed and anchored camera centres at which a chunk is still trusted.
+    /// Raise it for fast vehicles with a coarse trajectory; lower it indoors.
+    pub max_center_rms_m: f64,
+}
+
+impl Default for AlignConfig {
+    fn default() -> Self {
+        Self { max_center_rms_m: 0.5 }
+    }
+}
+
+impl AlignConfig {
+    /// Checks the ranges.
+    pub fn validate(&self) -> Result<(), AlignError> {
+        if self.max_center_rms_m.is_finite() && self.max_center_rms_m > 0.0 {
+            return Ok(());
+        }
+        Err(AlignError::BadConfig { key: "max_center_rms_m", found: self.max_center_rms_m })
+    }
+}
+
+/// A metric pose of one of the chunk's cameras.
+#[derive(Clone, Copy, Debug)]
+pub struct Anchor {
+    /// Which frame.
+    pub frame_id: FrameId,
+    /// Its pose, metres.
+    pub world_from_camera: Se3,
+}
+
+/// What the evidence says of a placement.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Verdict {
+    /// The prediction was made in the anchors' own frame; nothing was fitted.
+    PriorWorld,
+    /// A similarity was fitted and agrees with the anchors.
+    Fitted,
+    /// The cameras do not fix a similarity (on a line, or too few): identity, as the paper's guard has it.
+    RankDeficient,
+    /// The fit exists but leaves the anchors further off than the configuration allows.
+    Inconsistent,
+}
+
+impl Verdict {
+    /// Whether the chunk may enter the map.
+    pub fn is_usable(self) -> bool {
+        matches!(self, Self::PriorWorld | Self::Fitted)
+    }
+}
+
+/// A placement together with its evidence.
+#[derive(Clone, Copy, Debug)]
+pub struct ChunkAlignment {
+    /// Which chunk.
+    pub chunk_id: ChunkId,
+    /// Maps chunk coordinates and units to metres in the world.
+    pub world_from_chunk: Sim3,
+    /// Camera centres used.
+    pub matched: usize,
+    /// RMS distance of placed and anchored camera centres, metres.
+    pub center_rms_m: f64,
+    /// The judgement.
+    pub verdict: Verdict,
+}
+
+/// Why a chunk cannot be placed.
+#[derive(Debug, Error)]
+#[non_exhaustive]
+pub enum AlignError {
+    /// A configuration value is out of range.
+    #[error("align.{key} must be finite and positive, found {found}")]
+    BadConfig {
+        /// Which key.
+        key: &'static str,
+        /// The value.
+        found: f64,
+    },
+    /// No camera of the chunk has an anchor.
+    #[error("chunk {chunk}: none of its {views} views has a metric pose")]
+    NoAnchor {
+        /// Which chunk.
+        chunk: ChunkId,
+        /// Views in the prediction.
+        views: usize,
+    },
+    /// The prediction holds something that cannot become a metric view.
+    #[error("chunk {chunk}: {source}")]
+    Geometry {
+        /// Which chunk.
+        chunk: ChunkId,
+        /// What is wrong.
+        source: GeometryError,
+    },
+}
+
+/// Finds the similarity that takes the chunk's camera centres onto their anchors.
+pub fn place_chunk(
+    prediction: &GeometryPrediction,
+    anchors: &[Anchor],
+    config: &AlignConfig,
+) -> Result<ChunkAlignment, AlignError> {
+    config.validate()?;
+    let (in_chunk, in_world) = matched_centers(prediction, anchors);
+    if in_chunk.is_empty() {
+        return Err(AlignError::NoAnchor { chunk: prediction.chunk_id, views: prediction.views.len() });
+    }
+    let (world_from_chunk, fitted) = match prediction.frame {
+        ChunkFrame::PriorWorld => (Sim3::IDENTITY, Verdict::PriorWorld),
+        ChunkFrame::ModelNative => match umeyama_sim3(&in_chunk, &in_world) {
+            Ok(similarity) => (similarity, Verdict::Fitted),
+            Err(_) => (Sim3::IDENTITY, Verdict::RankDeficient),
+        },
+    };
+    let center_rms_m = rms(&world_from_chunk, &in_chunk, &in_world);
+    let within = center_rms_m <= config.max_center_rms_m;
+    let verdict = if fitted.is_usable() && !within { Verdict::Inconsistent } else { fitted };
+    Ok(ChunkAlignment {
+        chunk_id: prediction.chunk_id,
+        world_from_chunk,
+        matched: in_chunk.len(),
+        center_rms_m,
+        verdict,
+    })
+}
+
+/// The prediction's views in metres and in the world, coloured from the images they were made of.
+pub fn aligned_views(
+    prediction: GeometryPrediction,
+    alignment: &ChunkAlignment,
+    views: &[ChunkView],
+) -> Result<Vec<AlignedView>, AlignError> {
+    let chunk = prediction.chunk_id;
+    let geometry = |source| AlignError::Geometry { chunk, source };
+    let mut aligned = Vec::with_capacity(prediction.views.len());
+    for view in prediction.views {
+        let image = views.iter().find(|v| v.frame_id == view.frame_id);
+        let depth = view.depth.to_metric(alignment.world_from_chunk.scale).map_err(geometry)?;
+        let world_from_camera = alignment.world_from_chunk.transform_pose(&view.chunk_from_camera);
+        let time = image.map_or_else(Default::default, |v| v.time);
+        let mut metric =
+            AlignedView::new(view.frame_id, time, world_from_camera, view.intrinsics, depth, view.confidence)
+                .map_err(geometry)?;
+        if let Some(image) = image {
+            let color = image.image.to_rgb8();
+            if color.width() == view.intrinsics.width && color.height() == view.intrinsics.height {
+                metric = metric.with_color(color).map_err(geometry)?;
+            }
+        }
+        aligned.push(metric);
+    }
+    Ok(aligned)
+}
+
+fn matched_centers(
+    prediction: &GeometryPrediction,
+    anchors: &[Anchor],
+) -> (Vec<Vector3<f64>>, Vec<Vector3<f64>>) {
+    prediction
+        .views
+        .iter()
+        .filter_map(|view| {
+            let anchor = anchors.iter().find(|a| a.frame_id == view.frame_id)?;
+            Some((view.chunk_from_camera.translation, anchor.world_from_camera.translation))
+        })
+        .unzip()
+}
+
+fn rms(world_from_chunk: &Sim3, in_chunk: &[Vector3<f64>], in_world: &[Vector3<f64>]) -> f64 {
+    let sum: f64 =
+        in_chunk.iter().zip(in_world).map(|(c, w)| (world_from_chunk.act(c) - w).norm_squared()).sum();
+    (sum / in_chunk.len().max(1) as f64).sqrt()
+}
+
+#[cfg(test)]
+mod tests;

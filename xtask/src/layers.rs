@@ -1,0 +1,66 @@
+//! Arrows go only down, and stage crates do not know each other (ARCHITECTURE.md).
+
+use anyhow::Result;
+use cargo_metadata::{DependencyKind, MetadataCommand};
+use std::path::Path;
+
+/// Crate, layer, and which crates of the workspace it may name.
+const LAYERS: &[(&str, &[&str])] = &[
+    ("vidar-core", &[]),
+    ("vidar-nn", &[]),
+    ("vidar-solve", &["vidar-core"]),
+    ("vidar-dataset", &["vidar-core"]),
+    ("vidar-odometry", &["vidar-core", "vidar-solve"]),
+    ("vidar-da3", &["vidar-core", "vidar-nn"]),
+    ("vidar-stereo", &["vidar-core"]),
+    ("vidar-align", &["vidar-core", "vidar-solve"]),
+    ("vidar-fusion", &["vidar-core"]),
+    ("vidar-eval", &["vidar-core", "vidar-solve"]),
+    ("vidar-export", &["vidar-core"]),
+    ("vidar-view", &["vidar-core"]),
+    ("vidar-synth", &["vidar-core"]),
+    ("vidar-cli", &["vidar"]),
+    ("xtask", &[]),
+];
+
+/// Third-party crates that only one place may name, with the reason.
+const RESERVED: &[(&str, &[&str], &str)] = &[
+    ("clap", &["vidar-cli"], "only the program parses flags; libraries take plain values"),
+    ("anyhow", &["vidar-cli", "xtask"], "libraries return typed errors"),
+    ("indicatif", &["vidar-cli"], "libraries emit events; the program draws them"),
+    ("tiny-skia", &["vidar-view"], "pictures are drawn in one place"),
+    ("kiddo", &["vidar-eval"], "nearest neighbours are searched in one place"),
+];
+
+/// Reads the workspace's own dependency graph and names every arrow that must not be.
+pub fn check(root: &Path) -> Result<Vec<String>> {
+    let metadata = MetadataCommand::new().manifest_path(root.join("Cargo.toml")).no_deps().exec()?;
+    let members: Vec<String> = metadata.packages.iter().map(|p| p.name.to_string()).collect();
+    let mut problems = Vec::new();
+    for package in &metadata.packages {
+        let name = package.name.to_string();
+        let may: Option<&[&str]> = LAYERS.iter().find(|(n, _)| *n == name).map(|(_, may)| *may);
+        if may.is_none() && name != "vidar" {
+            problems.push(format!("{name} has no layer; add it to xtask/src/layers.rs and ARCHITECTURE.md"));
+        }
+        for dependency in &package.dependencies {
+            // Tests may look sideways; what ships may not.
+            let ships = dependency.kind != DependencyKind::Development;
+            let ours = members.contains(&dependency.name);
+            let allowed = match may {
+                None => dependency.name != "vidar-cli",
+                Some(may) => may.contains(&dependency.name.as_str()),
+            };
+            if ours && ships && !allowed {
+                problems.push(format!("{name} -> {}: this arrow goes up or sideways", dependency.name));
+            }
+            if let Some((_, owners, reason)) = RESERVED.iter().find(|(n, _, _)| *n == dependency.name)
+                && ships
+                && !owners.contains(&name.as_str())
+            {
+                problems.push(format!("{name} -> {}: {reason}", dependency.name));
+            }
+        }
+    }
+    Ok(problems)
+}

@@ -1,0 +1,65 @@
+//! Checks on the text of the sources: banned names and file sizes.
+
+use anyhow::{Context, Result};
+use std::path::{Path, PathBuf};
+
+/// A file above this fails (CODE_STYLE.md); above [`WARN_LINES`] it is named.
+const MAX_LINES: usize = 800;
+const WARN_LINES: usize = 600;
+
+/// Words that hide a transform's direction, and the crates at the border that may say them.
+const BANNED: &[&str] = &["extrinsic", "c2w", "w2c", "t_cw", "t_wc", "cam_to_world", "world_to_cam"];
+const BORDER: &[&str] = &["vidar-dataset", "vidar-export", "xtask"];
+
+/// Rust sources of crates, program and tasks.
+fn sources(root: &Path) -> Result<Vec<PathBuf>> {
+    let mut found = Vec::new();
+    let mut folders = vec![root.join("crates"), root.join("apps"), root.join("xtask")];
+    while let Some(folder) = folders.pop() {
+        for entry in std::fs::read_dir(&folder).with_context(|| folder.display().to_string())? {
+            let path = entry?.path();
+            if path.is_dir() {
+                folders.push(path);
+            } else if path.extension().is_some_and(|e| e == "rs") {
+                found.push(path);
+            }
+        }
+    }
+    found.sort();
+    Ok(found)
+}
+
+/// Names every file that has outgrown its room.
+pub fn check_size(root: &Path) -> Result<Vec<String>> {
+    let mut problems = Vec::new();
+    for path in sources(root)? {
+        let lines = std::fs::read_to_string(&path)?.lines().count();
+        if lines > MAX_LINES {
+            problems.push(format!("{}: {lines} lines, the limit is {MAX_LINES}", path.display()));
+        } else if lines > WARN_LINES {
+            super::say(&format!("  note: {} has {lines} lines", path.display()));
+        }
+    }
+    Ok(problems)
+}
+
+/// Names every code line that uses a banned word outside the border crates.
+pub fn check_names(root: &Path) -> Result<Vec<String>> {
+    let mut problems = Vec::new();
+    for path in sources(root)? {
+        let shown = path.display().to_string();
+        if BORDER.iter().any(|crate_name| shown.contains(crate_name)) {
+            continue;
+        }
+        for (number, line) in std::fs::read_to_string(&path)?.lines().enumerate() {
+            // Prose may speak of the field's words; code may not.
+            let code = line.split("//").next().unwrap_or_default();
+            let code = code.split('"').step_by(2).collect::<String>().to_lowercase();
+            let words = code.split(|c: char| !(c.is_alphanumeric() || c == '_'));
+            for word in words.filter(|w| BANNED.contains(w)) {
+                problems.push(format!("{shown}:{}: {word:?}; name it a_from_b", number + 1));
+            }
+        }
+    }
+    Ok(problems)
+}
