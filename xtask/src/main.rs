@@ -10,7 +10,8 @@ use std::path::Path;
 fn main() -> Result<()> {
     let which = std::env::args().nth(1).unwrap_or_else(|| "check".into());
     let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("..");
-    let all: [(&str, fn(&Path) -> Result<Vec<String>>); 4] = [
+    type Check = fn(&Path) -> Result<Vec<String>>;
+    let all: [(&str, Check); 4] = [
         ("layers", layers::check),
         ("names", text::check_names),
         ("size", text::check_size),

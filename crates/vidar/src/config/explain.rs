@@ -1,0 +1,79 @@
+//! What a key means, taken from the doc comments of the configuration structs, so that it cannot drift.
+
+use super::{Config, Layered};
+use crate::error::Error;
+use schemars::schema_for;
+use serde_json::Value;
+
+/// Meaning, kind and default of one key.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Explanation {
+    /// The key.
+    pub key: String,
+    /// What it does, unit, range, when to touch it.
+    pub about: String,
+    /// The default as TOML.
+    pub default: String,
+}
+
+/// JSON schema of the whole configuration.
+pub fn schema() -> Value {
+    schema_for!(Config).to_value()
+}
+
+/// Explains one key, or every key of a section.
+pub fn explain(key: &str) -> Result<Vec<Explanation>, Error> {
+    let schema = schema();
+    let defaults = Layered::defaults()?;
+    let inside = format!("{key}.");
+    let found: Vec<Explanation> = defaults
+        .entries()
+        .into_iter()
+        .filter(|(k, _, _)| k == key || k.starts_with(&inside))
+        .map(|(k, default, _)| Explanation { about: about(&schema, &k), key: k, default })
+        .collect();
+    if found.is_empty() {
+        // `value` refuses an unknown key and names the nearest one.
+        let mut layered = defaults;
+        layered.value(key, toml::Value::Integer(0), super::Origin::Flag("vidar config explain"))?;
+    }
+    Ok(found)
+}
+
+fn about(schema: &Value, key: &str) -> String {
+    let mut node = schema;
+    for part in key.split('.') {
+        node = &resolve(schema, node)["properties"][part];
+    }
+    let own = node["description"].as_str().unwrap_or_default();
+    own.split_whitespace().collect::<Vec<_>>().join(" ")
+}
+
+/// Follows `$ref` and the one-element `allOf` that carries a reference beside a description.
+fn resolve<'a>(schema: &'a Value, node: &'a Value) -> &'a Value {
+    let reference = node["$ref"].as_str().or_else(|| node["allOf"][0]["$ref"].as_str());
+    match reference.and_then(|r| r.strip_prefix('#')).and_then(|pointer| schema.pointer(pointer)) {
+        Some(target) => resolve(schema, target),
+        None => node,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_key_has_an_explanation() {
+        for (key, _, _) in Layered::defaults().unwrap().entries() {
+            let found = explain(&key).unwrap();
+            assert_eq!(found.len(), 1, "{key}");
+            assert!(found[0].about.len() > 15, "{key} is not explained: {:?}", found[0].about);
+        }
+    }
+
+    #[test]
+    fn a_section_explains_all_its_keys_and_an_unknown_key_is_refused() {
+        assert!(explain("keyframes").unwrap().len() >= 3);
+        assert!(matches!(explain("keyframes.min_translation"), Err(Error::UnknownKey { .. })));
+    }
+}

@@ -1,0 +1,251 @@
+//! Layers of configuration, each value with its origin.
+
+use super::{Config, PRESETS};
+use crate::error::Error;
+use std::collections::BTreeMap;
+use std::fmt;
+use std::path::{Path, PathBuf};
+use toml::{Table, Value};
+
+/// Where a value came from.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Origin {
+    /// The program's default.
+    Default,
+    /// A preset.
+    Preset(String),
+    /// A file.
+    File(PathBuf),
+    /// An environment variable.
+    Environment(String),
+    /// `--set`.
+    Set,
+    /// A flag of its own.
+    Flag(&'static str),
+    /// Derived from the data.
+    Derived(&'static str),
+}
+
+impl fmt::Display for Origin {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Default => f.write_str("default"),
+            Self::Preset(name) => write!(f, "preset {name}"),
+            Self::File(path) => write!(f, "file {}", path.display()),
+            Self::Environment(name) => write!(f, "environment {name}"),
+            Self::Set => f.write_str("--set"),
+            Self::Flag(name) => f.write_str(name),
+            Self::Derived(why) => write!(f, "derived: {why}"),
+        }
+    }
+}
+
+/// Configuration under construction: the values so far and where each came from.
+#[derive(Clone, Debug)]
+pub struct Layered {
+    values: Table,
+    origins: BTreeMap<String, Origin>,
+}
+
+impl Layered {
+    /// The defaults.
+    pub fn defaults() -> Result<Self, Error> {
+        let values = Table::try_from(Config::default()).map_err(|e| Error::BadValue { reason: e.to_string() })?;
+        let mut origins = BTreeMap::new();
+        for_each_leaf(&values, "", &mut |key, _| {
+            origins.insert(key.to_owned(), Origin::Default);
+        });
+        Ok(Self { values, origins })
+    }
+
+    /// Applies a preset by name.
+    pub fn preset(&mut self, name: &str) -> Result<(), Error> {
+        let preset = PRESETS.iter().find(|p| p.name == name).ok_or_else(|| Error::UnknownPreset {
+            name: name.to_owned(),
+            known: PRESETS.iter().map(|p| p.name).collect::<Vec<_>>().join(", "),
+        })?;
+        self.table(preset.toml, &Origin::Preset(name.to_owned()))
+    }
+
+    /// Applies a TOML file.
+    pub fn file(&mut self, path: &Path) -> Result<(), Error> {
+        let fail = |reason: String| Error::ConfigFile { path: path.to_owned(), reason };
+        let text = std::fs::read_to_string(path).map_err(|e| fail(e.to_string()))?;
+        self.table(&text, &Origin::File(path.to_owned())).map_err(|error| match error {
+            Error::BadValue { reason } => fail(reason),
+            other => other,
+        })
+    }
+
+    /// Applies `VIDAR_SECTION__KEY=value` variables; those without a double underscore mean other things.
+    pub fn environment(&mut self, variables: impl Iterator<Item = (String, String)>) -> Result<(), Error> {
+        let mut sorted: Vec<_> = variables.collect();
+        sorted.sort();
+        for (name, value) in sorted {
+            if let Some(rest) = name.strip_prefix("VIDAR_")
+                && rest.contains("__")
+            {
+                let key = rest.to_lowercase().replace("__", ".");
+                self.value(&key, parse_value(&value), Origin::Environment(name))?;
+            }
+        }
+        Ok(())
+    }
+
+    /// Applies `section.key=value`.
+    pub fn set(&mut self, assignment: &str) -> Result<(), Error> {
+        let Some((key, value)) = assignment.split_once('=') else {
+            return Err(Error::Usage {
+                what: format!("--set {assignment:?} has no '='"),
+                hint: "write --set section.key=value, e.g. --set fusion.voxel_size_m=0.03".into(),
+            });
+        };
+        self.value(key.trim(), parse_value(value.trim()), Origin::Set)
+    }
+
+    /// Applies one value.
+    pub fn value(&mut self, key: &str, value: Value, origin: Origin) -> Result<(), Error> {
+        let Some(current) = lookup(&self.values, key) else {
+            return Err(Error::UnknownKey {
+                key: key.to_owned(),
+                nearest: self.nearest(key),
+                origin: origin.to_string(),
+            });
+        };
+        let value = coerce(current, value).map_err(|(expected, found)| Error::BadValue {
+            reason: format!("{key} must be {expected}, found {found} (from {origin})"),
+        })?;
+        store(&mut self.values, key, value);
+        self.origins.insert(key.to_owned(), origin);
+        Ok(())
+    }
+
+    fn table(&mut self, text: &str, origin: &Origin) -> Result<(), Error> {
+        let table: Table =
+            text.parse().map_err(|e: toml::de::Error| Error::BadValue { reason: e.to_string() })?;
+        let mut leaves = Vec::new();
+        for_each_leaf(&table, "", &mut |key, value| leaves.push((key.to_owned(), value.clone())));
+        leaves.into_iter().try_for_each(|(key, value)| self.value(&key, value, origin.clone()))
+    }
+
+    /// Builds and checks the configuration.
+    pub fn build(&self) -> Result<Config, Error> {
+        let config: Config =
+            self.values.clone().try_into().map_err(|e: toml::de::Error| Error::BadValue { reason: e.to_string() })?;
+        config.validate()?;
+        Ok(config)
+    }
+
+    /// Every key with its value as TOML and its origin, sorted.
+    pub fn entries(&self) -> Vec<(String, String, Origin)> {
+        let mut entries = Vec::new();
+        for_each_leaf(&self.values, "", &mut |key, value| {
+            let origin = self.origins.get(key).cloned().unwrap_or(Origin::Default);
+            entries.push((key.to_owned(), value.to_string(), origin));
+        });
+        entries
+    }
+
+    /// The configuration as TOML, each line with its origin in a comment when `with_origin`.
+    pub fn to_toml(&self, with_origin: bool) -> String {
+        let mut text = String::new();
+        let mut section = String::new();
+        for (key, value, origin) in self.entries() {
+            let (head, name) = key.rsplit_once('.').unwrap_or(("", &key));
+            if head != section {
+                let gap = if text.is_empty() { "" } else { "\n" };
+                text.push_str(&format!("{gap}[{head}]\n"));
+                head.clone_into(&mut section);
+            }
+            let line = format!("{name} = {value}");
+            match with_origin {
+                true => text.push_str(&format!("{line:<44} # {origin}\n")),
+                false => text.push_str(&format!("{line}\n")),
+            }
+        }
+        text
+    }
+
+    fn nearest(&self, key: &str) -> Option<String> {
+        // A key without its section counts as close to the full one.
+        let score = |candidate: &str| {
+            let tail = candidate.rsplit('.').next().unwrap_or(candidate);
+            strsim::jaro_winkler(key, candidate).max(strsim::jaro_winkler(key, tail))
+        };
+        self.origins
+            .keys()
+            .map(|k| (score(k), k))
+            .filter(|(s, _)| *s > 0.7)
+            .max_by(|a, b| a.0.total_cmp(&b.0))
+            .map(|(_, k)| k.clone())
+    }
+}
+
+/// A command-line value: TOML where it parses as such, else a plain string.
+fn parse_value(text: &str) -> Value {
+    format!("v = {text}")
+        .parse::<Table>()
+        .ok()
+        .filter(|t| t.len() == 1)
+        .and_then(|mut t| t.remove("v"))
+        .unwrap_or_else(|| Value::String(text.to_owned()))
+}
+
+fn for_each_leaf(table: &Table, prefix: &str, visit: &mut dyn FnMut(&str, &Value)) {
+    // Plain values first, so that a section's own keys are not printed under a subsection.
+    for tables in [false, true] {
+        for (name, value) in table.iter().filter(|(_, v)| v.is_table() == tables) {
+            let key = if prefix.is_empty() { name.clone() } else { format!("{prefix}.{name}") };
+            match value {
+                Value::Table(inner) => for_each_leaf(inner, &key, visit),
+                leaf => visit(&key, leaf),
+            }
+        }
+    }
+}
+
+fn lookup<'a>(table: &'a Table, key: &str) -> Option<&'a Value> {
+    let (head, rest) = key.split_once('.').map_or((key, None), |(h, r)| (h, Some(r)));
+    match (table.get(head)?, rest) {
+        (Value::Table(inner), Some(rest)) => lookup(inner, rest),
+        (Value::Table(_), None) | (_, Some(_)) => None,
+        (leaf, None) => Some(leaf),
+    }
+}
+
+fn store(table: &mut Table, key: &str, value: Value) {
+    match key.split_once('.') {
+        Some((head, rest)) => {
+            if let Some(Value::Table(inner)) = table.get_mut(head) {
+                store(inner, rest, value);
+            }
+        }
+        None => {
+            table.insert(key.to_owned(), value);
+        }
+    }
+}
+
+/// Fits `value` to the kind of `current`; the error is (expected, found).
+fn coerce(current: &Value, value: Value) -> Result<Value, (&'static str, String)> {
+    match (current, value) {
+        (Value::Float(_), Value::Integer(i)) => Ok(Value::Float(i as f64)),
+        (Value::Array(_), Value::Array(items)) => Ok(Value::Array(
+            items.into_iter().map(|v| if let Value::Integer(i) = v { Value::Float(i as f64) } else { v }).collect(),
+        )),
+        (current, value) if current.same_type(&value) => Ok(value),
+        (current, value) => Err((kind(current), value.to_string())),
+    }
+}
+
+fn kind(value: &Value) -> &'static str {
+    match value {
+        Value::String(_) => "a text",
+        Value::Integer(_) => "a whole number",
+        Value::Float(_) => "a number",
+        Value::Boolean(_) => "true or false",
+        Value::Datetime(_) => "a date",
+        Value::Array(_) => "a list",
+        Value::Table(_) => "a section",
+    }
+}

@@ -1,0 +1,206 @@
+//! Configuration: one plain struct per stage, composed here, in layers whose origins are kept.
+//!
+//! defaults < preset < file < `VIDAR_SECTION__KEY` < `--set section.key=value` < dedicated flags.
+
+mod explain;
+mod layers;
+mod presets;
+
+pub use explain::{Explanation, explain, schema};
+pub use layers::{Layered, Origin};
+pub use presets::{PRESETS, Preset};
+
+use crate::error::Error;
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+/// Which part of the input is used.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(default, deny_unknown_fields)]
+pub struct InputConfig {
+    /// Number of the camera to use (`cam0` is 0).
+    pub camera: u32,
+    /// Start, seconds after the first image.
+    pub start_secs: f64,
+    /// End, seconds after the first image; 0 means to the end.
+    pub end_secs: f64,
+    /// Use every n-th image, 1 or more. Raise it for high frame rates.
+    pub stride: usize,
+    /// Where metric poses come from: `auto` (external trajectory, else ground truth), `external`, `ground-truth`.
+    pub poses: PoseSource,
+    /// Longest gap (s) between two poses that is bridged by interpolation. Raise it for keyframe-only trajectories.
+    pub max_pose_gap_secs: f64,
+}
+
+/// Where metric poses come from.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "kebab-case")]
+pub enum PoseSource {
+    /// The external trajectory if given, else ground truth.
+    Auto,
+    /// The external trajectory only.
+    External,
+    /// Ground truth only.
+    GroundTruth,
+}
+
+impl Default for InputConfig {
+    fn default() -> Self {
+        Self {
+            camera: 0,
+            start_secs: 0.0,
+            end_secs: 0.0,
+            stride: 1,
+            poses: PoseSource::Auto,
+            max_pose_gap_secs: 0.5,
+        }
+    }
+}
+
+/// Which frames carry geometry.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(default, deny_unknown_fields)]
+pub struct KeyframeConfig {
+    /// A frame becomes a keyframe when the camera moved at least this far (m) since the last one.
+    pub min_translation_m: f64,
+    /// … or turned at least this much (degrees).
+    pub min_rotation_deg: f64,
+    /// Most keyframes; beyond it the distances are widened evenly. 0 means no limit.
+    pub max_count: usize,
+}
+
+impl Default for KeyframeConfig {
+    fn default() -> Self {
+        Self { min_translation_m: 0.05, min_rotation_deg: 8.0, max_count: 0 }
+    }
+}
+
+/// Which model sees the frames, and how many at once.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(default, deny_unknown_fields)]
+pub struct GeometryConfig {
+    /// The model: `stereo` (needs poses, no weights).
+    pub source: String,
+    /// Keyframes whose depth is computed together. Larger chunks need more memory.
+    pub chunk_keyframes: usize,
+    /// Keyframes on each side that are seen as context only.
+    pub context_keyframes: usize,
+    /// Widest undistorted image (px) that the model gets; larger images are reduced.
+    pub max_width_px: usize,
+}
+
+impl Default for GeometryConfig {
+    fn default() -> Self {
+        Self { source: "stereo".into(), chunk_keyframes: 16, context_keyframes: 8, max_width_px: 640 }
+    }
+}
+
+/// What is judged, and against what.
+#[derive(Clone, Debug, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
+#[serde(default, deny_unknown_fields)]
+pub struct EvalConfig {
+    /// Judge the result when there is something to judge it against.
+    pub mode: EvalMode,
+    /// Trajectory metrics.
+    pub trajectory: vidar_eval::TrajectoryEvalConfig,
+    /// Surface metrics.
+    pub surface: vidar_eval::SurfaceEvalConfig,
+}
+
+/// Whether the result is judged.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "kebab-case")]
+pub enum EvalMode {
+    /// When there is a reference.
+    #[default]
+    Auto,
+    /// Never.
+    Off,
+}
+
+/// What is written.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(default, deny_unknown_fields)]
+pub struct OutputConfig {
+    /// Write the depth of every keyframe as 16-bit PNG.
+    pub depth_png: bool,
+    /// Units of the depth PNG per metre: 1000 is millimetres, 5000 is TUM's.
+    pub depth_units_per_metre: f64,
+    /// Write the undistorted keyframe images; COLMAP and nerfstudio exports need them.
+    pub images: bool,
+    /// Write the mesh as GLB beside PLY.
+    pub mesh_glb: bool,
+    /// Draw pictures and the HTML report.
+    pub report: bool,
+}
+
+impl Default for OutputConfig {
+    fn default() -> Self {
+        Self { depth_png: true, depth_units_per_metre: 1000.0, images: true, mesh_glb: true, report: true }
+    }
+}
+
+/// All of it.
+#[derive(Clone, Debug, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
+#[serde(default, deny_unknown_fields)]
+pub struct Config {
+    /// Which part of the input is used.
+    pub input: InputConfig,
+    /// Which frames carry geometry.
+    pub keyframes: KeyframeConfig,
+    /// Which model sees them.
+    pub geometry: GeometryConfig,
+    /// Multi-view stereo.
+    pub stereo: vidar_stereo::StereoConfig,
+    /// Placement of chunks.
+    pub align: vidar_align::AlignConfig,
+    /// Fusion into one surface.
+    pub fusion: vidar_fusion::FusionConfig,
+    /// Judgement.
+    pub eval: EvalConfig,
+    /// What is written.
+    pub output: OutputConfig,
+}
+
+impl Config {
+    /// Checks every range; the message names the key.
+    pub fn validate(&self) -> Result<(), Error> {
+        let bad = |reason: String| Err(Error::BadValue { reason });
+        let positive = |key: &str, value: f64| match value.is_finite() && value > 0.0 {
+            true => Ok(()),
+            false => bad(format!("{key} must be finite and positive, found {value}")),
+        };
+        for (key, value) in [("input.start_secs", self.input.start_secs), ("input.end_secs", self.input.end_secs)] {
+            if !(value.is_finite() && value >= 0.0) {
+                return bad(format!("{key} must be finite and not negative, found {value}"));
+            }
+        }
+        for (key, value) in [
+            ("input.stride", self.input.stride),
+            ("geometry.chunk_keyframes", self.geometry.chunk_keyframes),
+        ] {
+            if value == 0 {
+                return bad(format!("{key} must be at least 1"));
+            }
+        }
+        positive("input.max_pose_gap_secs", self.input.max_pose_gap_secs)?;
+        positive("keyframes.min_translation_m", self.keyframes.min_translation_m)?;
+        positive("keyframes.min_rotation_deg", self.keyframes.min_rotation_deg)?;
+        positive("output.depth_units_per_metre", self.output.depth_units_per_metre)?;
+        if !(32..=8192).contains(&self.geometry.max_width_px) {
+            return bad(format!("geometry.max_width_px must be 32 to 8192, found {}", self.geometry.max_width_px));
+        }
+        if self.geometry.source != "stereo" {
+            return bad(format!("geometry.source must be \"stereo\", found {:?}", self.geometry.source));
+        }
+        let stage = |result: Result<(), String>| result.map_err(|reason| Error::BadValue { reason });
+        stage(self.stereo.validate().map_err(|e| e.to_string()))?;
+        stage(self.align.validate().map_err(|e| e.to_string()))?;
+        stage(self.fusion.validate().map_err(|e| e.to_string()))?;
+        stage(self.eval.trajectory.validate().map_err(|e| e.to_string()))?;
+        stage(self.eval.surface.validate().map_err(|e| e.to_string()))
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,36 @@
+//! Presets: small files over the defaults, embedded in the program.
+
+/// A named set of values.
+#[derive(Clone, Copy, Debug)]
+pub struct Preset {
+    /// Name on the command line.
+    pub name: &'static str,
+    /// When to use it.
+    pub about: &'static str,
+    /// The values.
+    pub toml: &'static str,
+}
+
+/// Every preset.
+pub const PRESETS: &[Preset] = &[
+    Preset {
+        name: "euroc",
+        about: "drone in a room or hall, wide-angle grey camera, 20 Hz (EuRoC MAV)",
+        toml: include_str!("../../../../presets/euroc.toml"),
+    },
+    Preset {
+        name: "tum-rgbd",
+        about: "hand-held camera at a desk or in an office, 30 Hz (TUM RGB-D, 7-Scenes)",
+        toml: include_str!("../../../../presets/tum_rgbd.toml"),
+    },
+    Preset {
+        name: "fast",
+        about: "a first look: half the resolution, coarser voxels",
+        toml: include_str!("../../../../presets/fast.toml"),
+    },
+    Preset {
+        name: "quality",
+        about: "patience for a better surface: more neighbours, finer voxels",
+        toml: include_str!("../../../../presets/quality.toml"),
+    },
+];

@@ -1,0 +1,283 @@
+//! Everything that can stop a run, with a stable code, the place, the next step and the exit status.
+
+use std::path::{Path, PathBuf};
+use thiserror::Error;
+
+/// How a run of the program ends; the numbers are part of its interface.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum ExitStatus {
+    /// Everything asked for was made.
+    Done = 0,
+    /// The input or the data cannot be used.
+    BadInput = 1,
+    /// The command line or the configuration is wrong.
+    Usage = 2,
+    /// Finished, but part of the result is missing or uncertain.
+    Degraded = 3,
+    /// Weights, memory, disk or a device are missing.
+    ResourceMissing = 4,
+    /// A threshold given with `--fail-above` or `--fail-below` was missed.
+    ThresholdFailed = 5,
+    /// A bug in VIDAR.
+    Bug = 70,
+    /// Interrupted; what was finished is on disk.
+    Interrupted = 130,
+}
+
+/// Why a run stopped.
+#[derive(Debug, Error)]
+#[non_exhaustive]
+pub enum Error {
+    /// A configuration key does not exist.
+    #[error("unknown configuration key {key:?} in {origin}")]
+    UnknownKey {
+        /// The key as given.
+        key: String,
+        /// The nearest existing key.
+        nearest: Option<String>,
+        /// Where it was given.
+        origin: String,
+    },
+    /// A configuration value is of the wrong kind or out of range.
+    #[error("configuration: {reason}")]
+    BadValue {
+        /// What was found and what is expected.
+        reason: String,
+    },
+    /// A configuration file cannot be read.
+    #[error("cannot read configuration {path}: {reason}", path = path.display())]
+    ConfigFile {
+        /// Which file.
+        path: PathBuf,
+        /// Why.
+        reason: String,
+    },
+    /// No such preset.
+    #[error("unknown preset {name:?}; presets are {known}")]
+    UnknownPreset {
+        /// The name as given.
+        name: String,
+        /// All names.
+        known: String,
+    },
+    /// A command was given something it cannot work with.
+    #[error("{what}")]
+    Usage {
+        /// What is wrong.
+        what: String,
+        /// What to do.
+        hint: String,
+    },
+    /// The output folder exists and is not empty.
+    #[error("output folder {path} exists", path = path.display())]
+    OutputExists {
+        /// Which folder.
+        path: PathBuf,
+    },
+    /// The input cannot be read.
+    #[error(transparent)]
+    Dataset(#[from] vidar_dataset::DatasetError),
+    /// No metric poses.
+    #[error("{name} has no metric trajectory: neither --trajectory nor ground truth")]
+    NoAnchor {
+        /// Dataset name.
+        name: String,
+    },
+    /// Images and trajectory do not meet in time.
+    #[error("no image has a pose: images span {images}, the trajectory spans {poses}")]
+    NoOverlap {
+        /// Time range of the images, s.
+        images: String,
+        /// Time range of the poses, s.
+        poses: String,
+    },
+    /// Too few keyframes to see depth.
+    #[error("{found} keyframes with poses, at least {needed} are needed")]
+    TooFewKeyframes {
+        /// Keyframes found.
+        found: usize,
+        /// Keyframes needed.
+        needed: usize,
+    },
+    /// The geometry model failed.
+    #[error("geometry: {0}")]
+    Geometry(#[from] vidar_core::ModelError),
+    /// The stereo model refused its configuration.
+    #[error("stereo: {0}")]
+    Stereo(#[from] vidar_stereo::StereoError),
+    /// A chunk could not be placed.
+    #[error("align: {0}")]
+    Align(#[from] vidar_align::AlignError),
+    /// Fusion failed.
+    #[error("fusion: {0}")]
+    Fusion(#[from] vidar_fusion::FusionError),
+    /// Evaluation failed.
+    #[error("evaluation: {0}")]
+    Eval(#[from] vidar_eval::EvalError),
+    /// A file format could not be written or read.
+    #[error("{0}")]
+    Export(#[from] vidar_export::ExportError),
+    /// A picture could not be made.
+    #[error("picture: {0}")]
+    View(#[from] vidar_view::ViewError),
+    /// A synthetic world could not be made.
+    #[error("synthetic world: {0}")]
+    Synth(#[from] vidar_synth::SynthError),
+    /// Nothing was reconstructed.
+    #[error("nothing was reconstructed from {keyframes} keyframes: {reason}")]
+    Empty {
+        /// Keyframes tried.
+        keyframes: usize,
+        /// The reason that occurred most.
+        reason: String,
+    },
+    /// A camera or view cannot be made.
+    #[error("camera: {0}")]
+    Camera(#[from] vidar_core::CameraError),
+    /// A trajectory cannot be carried into the frame needed.
+    #[error("trajectory: {0}")]
+    Trajectory(#[from] vidar_core::TrajectoryError),
+    /// The file system said no.
+    #[error("cannot {action} {path}: {source}", path = path.display())]
+    Io {
+        /// What was tried.
+        action: &'static str,
+        /// On which file.
+        path: PathBuf,
+        /// What the system said.
+        source: std::io::Error,
+    },
+    /// A folder is not a run folder of this program.
+    #[error("{path} is not a run folder: {reason}", path = path.display())]
+    NotARun {
+        /// Which folder.
+        path: PathBuf,
+        /// What is missing.
+        reason: String,
+    },
+    /// A threshold was missed.
+    #[error("{0}")]
+    Threshold(String),
+    /// The user asked to stop.
+    #[error("interrupted; what was finished is in {path}", path = path.display())]
+    Interrupted {
+        /// The run folder, or the current folder.
+        path: PathBuf,
+    },
+}
+
+impl Error {
+    /// An I/O error with its path and action.
+    pub fn io(action: &'static str, path: &Path, source: std::io::Error) -> Self {
+        Self::Io { action, path: path.to_owned(), source }
+    }
+
+    /// Stable code for scripts and for `vidar explain CODE`.
+    pub fn code(&self) -> &'static str {
+        match self {
+            Self::UnknownKey { .. } => "E0101",
+            Self::BadValue { .. } => "E0102",
+            Self::ConfigFile { .. } => "E0103",
+            Self::UnknownPreset { .. } => "E0104",
+            Self::Usage { .. } => "E0105",
+            Self::OutputExists { .. } => "E0106",
+            Self::Dataset(_) => "E0201",
+            Self::NoAnchor { .. } => "E0202",
+            Self::NoOverlap { .. } => "E0203",
+            Self::TooFewKeyframes { .. } => "E0204",
+            Self::Camera(_) => "E0205",
+            Self::Trajectory(_) => "E0206",
+            Self::NotARun { .. } => "E0207",
+            Self::Geometry(_) | Self::Stereo(_) => "E0301",
+            Self::Align(_) => "E0302",
+            Self::Fusion(_) => "E0303",
+            Self::Eval(_) => "E0304",
+            Self::Empty { .. } => "E0305",
+            Self::Export(_) => "E0306",
+            Self::View(_) => "E0307",
+            Self::Synth(_) => "E0308",
+            Self::Io { source, .. } if is_full(source) => "E0402",
+            Self::Io { .. } => "E0401",
+            Self::Threshold(_) => "E0501",
+            Self::Interrupted { .. } => "E1301",
+        }
+    }
+
+    /// How the program ends because of it.
+    pub fn exit_status(&self) -> ExitStatus {
+        match self.code().as_bytes() {
+            [b'E', b'0', b'1', ..] => ExitStatus::Usage,
+            [b'E', b'0', b'4', ..] => ExitStatus::ResourceMissing,
+            [b'E', b'0', b'5', ..] => ExitStatus::ThresholdFailed,
+            [b'E', b'1', ..] => ExitStatus::Interrupted,
+            _ => ExitStatus::BadInput,
+        }
+    }
+
+    /// The next step, where one is known.
+    pub fn hint(&self) -> Option<String> {
+        let text = match self {
+            Self::UnknownKey { nearest: Some(nearest), .. } => {
+                return Some(format!("did you mean {nearest:?}? `vidar config explain {nearest}` tells what it does"));
+            }
+            Self::Usage { hint, .. } => return Some(hint.clone()),
+            Self::UnknownKey { .. } => "`vidar config show` lists every key",
+            Self::BadValue { .. } => "`vidar config explain KEY` gives meaning, unit and range",
+            Self::ConfigFile { .. } => "the file is TOML; `vidar config show > my.toml` writes a valid one",
+            Self::UnknownPreset { .. } => "`vidar config presets` describes them",
+            Self::OutputExists { .. } => "choose another -o, or add --force to move the old folder aside",
+            Self::NoAnchor { .. } => {
+                "give the poses of your own odometry with --trajectory FILE (TUM, EuRoC csv or KITTI, metres)"
+            }
+            Self::NoOverlap { .. } => {
+                "check the trajectory's clock and unit; --time-unit s|ms|us|ns tells it when the guess is wrong"
+            }
+            Self::TooFewKeyframes { .. } => {
+                "lower keyframes.min_translation_m, or give a longer part of the sequence"
+            }
+            Self::Empty { .. } => "look at depth/ in the run folder; try --preset quality, or another depth range",
+            Self::Io { source, .. } if is_full(source) => {
+                "free space, or choose another disk with -o; finished files are kept"
+            }
+            Self::Io { .. } => "check that the path exists and may be written",
+            Self::NotARun { .. } => "a run folder holds manifest.json; `vidar run PATH` makes one",
+            Self::Dataset(_) => "`vidar inspect PATH` shows what was found and what is missing",
+            _ => return None,
+        };
+        Some(text.to_owned())
+    }
+}
+
+/// Whether the system said that no space is left.
+pub fn is_full(error: &std::io::Error) -> bool {
+    matches!(error.kind(), std::io::ErrorKind::StorageFull | std::io::ErrorKind::QuotaExceeded)
+}
+
+/// Every error code with what it means, for `vidar explain` and the reference page.
+pub const CODES: &[(&str, &str)] = &[
+    ("E0101", "A configuration key does not exist. Keys are refused rather than ignored, because an ignored key is a wrong result that looks right."),
+    ("E0102", "A configuration value has the wrong type or lies outside its range."),
+    ("E0103", "A configuration file is missing or is not valid TOML."),
+    ("E0104", "The preset is not one of those that `vidar config presets` lists."),
+    ("E0105", "The command line asks for something that this command cannot do."),
+    ("E0106", "The output folder exists. VIDAR never overwrites; --force moves the old folder aside."),
+    ("E0201", "The input path, a file in it, or its calibration cannot be used. The message names file, line, what was found and what was expected."),
+    ("E0202", "There is no source of metric poses. One camera alone has no scale: give a trajectory in metres, or ground truth."),
+    ("E0203", "Image times and pose times do not overlap: another clock, another unit, or another recording."),
+    ("E0204", "Too few frames have a pose and enough motion between them to see depth."),
+    ("E0205", "Camera parameters are not those of a camera, or no undistorted view fits into the image."),
+    ("E0206", "Poses belong to a body whose place on the rig is unknown."),
+    ("E0207", "The folder lacks what a run of VIDAR writes (manifest.json, views.json)."),
+    ("E0301", "The geometry model could not predict depth for any chunk."),
+    ("E0302", "Predicted geometry could not be placed in the metric world."),
+    ("E0303", "Fusion refused its configuration or a view, or met its memory bound."),
+    ("E0304", "There is nothing to compare, or what is compared does not match (body, time, empty cloud)."),
+    ("E0305", "Depth was computed but nothing passed confidence and consistency."),
+    ("E0306", "A file of an interchange format could not be written or read."),
+    ("E0307", "A picture could not be drawn or encoded."),
+    ("E0308", "The description of the synthetic world is not usable, or its files could not be written."),
+    ("E0401", "A file or folder could not be read or written."),
+    ("E0402", "The disk is full. Finished files are kept; unfinished ones are removed."),
+    ("E0501", "A threshold given with --fail-above or --fail-below was missed."),
+    ("E1301", "Interrupted by Ctrl-C or a signal. Files that were being written are finished or removed."),
+];

@@ -1,0 +1,312 @@
+//! The run folder: a thing one can mail to a colleague.
+//!
+//! Written atomically, appended as computed; nothing is deleted that this run did not write.
+
+use crate::error::Error;
+use crate::events::{EVENT_SCHEMA, Event};
+use serde::{Deserialize, Serialize};
+use std::fs::File;
+use std::io::Write;
+use std::path::{Path, PathBuf};
+use std::sync::Mutex;
+
+/// Schema of `manifest.json`.
+pub const MANIFEST_SCHEMA: &str = "vidar.run/1";
+/// Schema of `views.json`.
+pub const VIEWS_SCHEMA: &str = "vidar.views/1";
+
+/// Where a run writes.
+#[derive(Debug)]
+pub struct RunFolder {
+    root: PathBuf,
+    log: Mutex<Option<File>>,
+}
+
+/// Where a new run folder goes.
+#[derive(Clone, Debug)]
+pub enum Place {
+    /// Exactly here.
+    Exact {
+        /// The folder.
+        path: PathBuf,
+        /// Move an existing folder aside instead of refusing.
+        force: bool,
+    },
+    /// `runs/<dataset>/<time>/` under this folder, with a `latest` link beside it.
+    Dated {
+        /// Usually the current folder.
+        base: PathBuf,
+        /// Dataset name.
+        name: String,
+    },
+}
+
+/// What is written down about a run.
+#[derive(Clone, Debug, Default, Serialize, Deserialize)]
+pub struct Manifest {
+    /// [`MANIFEST_SCHEMA`].
+    pub schema: String,
+    /// Version of the program.
+    pub version: String,
+    /// The command as typed.
+    pub command: Vec<String>,
+    /// When it began, RFC 3339, UTC.
+    pub started: String,
+    /// What the input is.
+    pub dataset: serde_json::Value,
+    /// SHA-256 over the input's names, sizes and text files.
+    pub dataset_sha256: String,
+    /// SHA-256 of the resolved configuration.
+    pub config_sha256: String,
+    /// The geometry model.
+    pub model: serde_json::Value,
+    /// Where metric poses came from.
+    pub poses: serde_json::Value,
+    /// Machine and threads.
+    pub hardware: serde_json::Value,
+    /// Wall time per stage, s.
+    pub seconds: serde_json::Map<String, serde_json::Value>,
+    /// Largest resident memory, bytes, where the system tells.
+    pub peak_memory_bytes: Option<u64>,
+    /// Counts and scores.
+    pub result: serde_json::Value,
+    /// Warnings, each kind with its count.
+    pub warnings: serde_json::Value,
+    /// Files made, relative to the run folder.
+    pub artifacts: Vec<String>,
+    /// Exit status as a number.
+    pub exit: i32,
+}
+
+/// One keyframe as the run folder keeps it.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+pub struct StoredView {
+    /// Frame number in the sequence.
+    pub frame: u32,
+    /// Time, ns.
+    pub time_ns: i64,
+    /// Undistorted image, relative to the run folder, if written.
+    pub image: Option<String>,
+    /// Depth PNG, relative to the run folder, if written.
+    pub depth: Option<String>,
+    /// Undistorted intrinsics; pixel (0, 0) is the centre of the top-left pixel.
+    pub intrinsics: vidar_core::Pinhole,
+    /// Row-major 3×4 `world_from_camera`, metres.
+    pub world_from_camera: [[f64; 4]; 3],
+}
+
+impl RunFolder {
+    /// Makes the folder, refusing one that is in use.
+    pub fn create(place: &Place) -> Result<Self, Error> {
+        let root = match place {
+            Place::Exact { path, force } => {
+                make_way(path, *force)?;
+                path.clone()
+            }
+            Place::Dated { base, name } => {
+                let parent = base.join("runs").join(safe_name(name));
+                let root = free_name(&parent, &now_for_paths());
+                create_dir(&root)?;
+                link_latest(&parent, &root);
+                root
+            }
+        };
+        create_dir(&root)?;
+        let path = root.join("log.jsonl");
+        let log = File::create(&path).map_err(|e| Error::io("create", &path, e))?;
+        Ok(Self { root, log: Mutex::new(Some(log)) })
+    }
+
+    /// The folder.
+    pub fn path(&self) -> &Path {
+        &self.root
+    }
+
+    /// A path inside, its parent folder made.
+    pub fn file(&self, relative: &str) -> Result<PathBuf, Error> {
+        let path = self.root.join(relative);
+        if let Some(parent) = path.parent() {
+            create_dir(parent)?;
+        }
+        Ok(path)
+    }
+
+    /// Writes a whole file or nothing.
+    pub fn write(&self, relative: &str, bytes: &[u8]) -> Result<u64, Error> {
+        let path = self.file(relative)?;
+        write_whole(&path, bytes)?;
+        Ok(bytes.len() as u64)
+    }
+
+    /// Appends an event to `log.jsonl`. A log that cannot be written must not end a run.
+    pub fn log(&self, event: &Event) {
+        let Ok(mut guard) = self.log.lock() else { return };
+        if let Some(file) = guard.as_mut() {
+            let written = serde_json::to_string(&event_line(event)).map(|line| writeln!(file, "{line}"));
+            if !matches!(written, Ok(Ok(()))) {
+                *guard = None;
+            }
+        }
+    }
+
+    /// Writes the manifest.
+    pub fn write_manifest(&self, manifest: &Manifest) -> Result<(), Error> {
+        self.write("manifest.json", &pretty(manifest)).map(|_| ())
+    }
+}
+
+/// An event with its schema, as one JSON object.
+pub fn event_line(event: &Event) -> serde_json::Value {
+    let mut line = serde_json::json!({ "schema": EVENT_SCHEMA });
+    if let (Some(object), Ok(serde_json::Value::Object(fields))) =
+        (line.as_object_mut(), serde_json::to_value(event))
+    {
+        object.extend(fields);
+    }
+    line
+}
+
+/// Indented JSON with a final newline.
+pub fn pretty(value: &impl Serialize) -> Vec<u8> {
+    let mut bytes = serde_json::to_vec_pretty(value).unwrap_or_default();
+    bytes.push(b'\n');
+    bytes
+}
+
+/// Writes `bytes` beside `path` and renames, so that nobody ever sees half a file.
+pub fn write_whole(path: &Path, bytes: &[u8]) -> Result<(), Error> {
+    let mut temporary = path.as_os_str().to_owned();
+    temporary.push(".part");
+    let temporary = PathBuf::from(temporary);
+    let result = File::create(&temporary)
+        .and_then(|mut file| file.write_all(bytes).and_then(|()| file.flush()))
+        .and_then(|()| std::fs::rename(&temporary, path));
+    result.map_err(|e| {
+        // The unfinished file is ours; if it cannot be removed either, the first error is the one to tell.
+        let _ = std::fs::remove_file(&temporary);
+        Error::io("write", path, e)
+    })
+}
+
+fn create_dir(path: &Path) -> Result<(), Error> {
+    std::fs::create_dir_all(path).map_err(|e| Error::io("create", path, e))
+}
+
+fn make_way(path: &Path, force: bool) -> Result<(), Error> {
+    let occupied = match std::fs::read_dir(path) {
+        Ok(mut entries) => entries.next().is_some(),
+        Err(e) if e.kind() == std::io::ErrorKind::NotFound => false,
+        Err(e) => return Err(Error::io("open", path, e)),
+    };
+    if !occupied {
+        return Ok(());
+    }
+    if !force {
+        return Err(Error::OutputExists { path: path.to_owned() });
+    }
+    let parent = path.parent().map_or_else(PathBuf::new, Path::to_owned);
+    let name = path.file_name().map_or_else(|| "run".into(), |n| n.to_string_lossy().into_owned());
+    let aside = free_name(&parent, &format!("{name}.before-{}", now_for_paths()));
+    std::fs::rename(path, &aside).map_err(|e| Error::io("move aside", path, e))
+}
+
+/// `parent/name`, or `parent/name-2`, … whichever does not exist yet.
+fn free_name(parent: &Path, name: &str) -> PathBuf {
+    let first = parent.join(name);
+    if !first.exists() {
+        return first;
+    }
+    (2..10_000).map(|i| parent.join(format!("{name}-{i}"))).find(|p| !p.exists()).unwrap_or(first)
+}
+
+/// Keeps letters of any script, digits, `.`, `_` and `-`; everything else becomes `_`.
+fn safe_name(name: &str) -> String {
+    let safe: String =
+        name.chars().map(|c| if c.is_alphanumeric() || "._-".contains(c) { c } else { '_' }).collect();
+    let trimmed = safe.trim_matches('.').to_owned();
+    if trimmed.is_empty() { "run".to_owned() } else { trimmed }
+}
+
+#[allow(clippy::disallowed_methods)] // the run folder's name and manifest are the places where the clock is wanted
+fn now() -> std::time::SystemTime {
+    std::time::SystemTime::now()
+}
+
+/// Now, RFC 3339 in UTC.
+pub fn now_rfc3339() -> String {
+    humantime::format_rfc3339_seconds(now()).to_string()
+}
+
+fn now_for_paths() -> String {
+    now_rfc3339().replace(':', "-").trim_end_matches('Z').to_owned()
+}
+
+fn link_latest(parent: &Path, root: &Path) {
+    // The link is a convenience; systems without links go without it.
+    #[cfg(unix)]
+    if let Some(name) = root.file_name() {
+        let link = parent.join("latest");
+        if link.symlink_metadata().is_ok_and(|m| m.file_type().is_symlink()) {
+            let _ = std::fs::remove_file(&link);
+        }
+        let _ = std::os::unix::fs::symlink(name, link);
+    }
+    #[cfg(not(unix))]
+    let _ = (parent, root);
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_occupied_folder_is_refused_and_force_moves_it_aside() {
+        let base = tempfile::tempdir().unwrap();
+        let path = base.path().join("out ä");
+        let place = |force| Place::Exact { path: path.clone(), force };
+        RunFolder::create(&place(false)).unwrap().write("a/b.txt", b"one").unwrap();
+        assert!(matches!(RunFolder::create(&place(false)), Err(Error::OutputExists { .. })));
+        RunFolder::create(&place(true)).unwrap();
+        assert!(!path.join("a/b.txt").exists());
+        let aside = std::fs::read_dir(base.path()).unwrap().flatten().find(|e| e.path() != path).unwrap();
+        assert_eq!(std::fs::read(aside.path().join("a/b.txt")).unwrap(), b"one");
+    }
+
+    #[test]
+    fn dated_folders_never_collide_and_latest_names_the_newest() {
+        let base = tempfile::tempdir().unwrap();
+        let place = Place::Dated { base: base.path().to_owned(), name: "../my room".into() };
+        let first = RunFolder::create(&place).unwrap();
+        let second = RunFolder::create(&place).unwrap();
+        assert_ne!(first.path(), second.path());
+        assert!(first.path().starts_with(base.path().join("runs/_my_room")));
+        #[cfg(unix)]
+        assert_eq!(
+            base.path().join("runs/_my_room/latest").canonicalize().unwrap(),
+            second.path().canonicalize().unwrap()
+        );
+    }
+
+    #[test]
+    fn a_failed_write_leaves_nothing_behind() {
+        let base = tempfile::tempdir().unwrap();
+        let target = base.path().join("is-a-folder");
+        std::fs::create_dir_all(target.join("x")).unwrap();
+        assert!(write_whole(&target, b"bytes").is_err());
+        let left: Vec<_> = std::fs::read_dir(base.path()).unwrap().flatten().map(|e| e.file_name()).collect();
+        assert_eq!(left, ["is-a-folder"]);
+    }
+
+    #[test]
+    fn events_are_lines_with_a_schema() {
+        let base = tempfile::tempdir().unwrap();
+        let folder = RunFolder::create(&Place::Exact { path: base.path().join("r"), force: false }).unwrap();
+        folder.log(&Event::StageStarted { stage: "stereo", total: 3 });
+        let warning = vidar_core::Warning::new("time-gap", "0.5 s without images").at("cam0");
+        folder.log(&Event::Warning { warning });
+        let text = std::fs::read_to_string(folder.path().join("log.jsonl")).unwrap();
+        let lines: Vec<serde_json::Value> = text.lines().map(|l| serde_json::from_str(l).unwrap()).collect();
+        assert_eq!(lines[0], serde_json::json!({"schema": EVENT_SCHEMA, "event": "stage-started", "stage": "stereo", "total": 3}));
+        assert_eq!(lines[1]["kind"], "time-gap");
+    }
+}
