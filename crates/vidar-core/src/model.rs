@@ -143,8 +143,13 @@ pub trait GeometryModel: Send {
             return Err(ModelError::Cancelled);
         }
         let mut prediction = self.predict(views)?;
-        let ids: Vec<FrameId> =
-            views.views.iter().enumerate().filter(|(i, _)| wanted.contains(i)).map(|(_, v)| v.frame_id).collect();
+        let ids: Vec<FrameId> = views
+            .views
+            .iter()
+            .enumerate()
+            .filter(|(i, _)| wanted.contains(i))
+            .map(|(_, v)| v.frame_id)
+            .collect();
         prediction.views.retain(|v| ids.contains(&v.frame_id));
         Ok(prediction)
     }

@@ -12,7 +12,7 @@ mod so3;
 pub use se3::Se3;
 pub use sim3::Sim3;
 pub use so3::So3;
-pub(crate) use so3::{hat, left_jacobian as so3_left_jacobian};
+pub(crate) use so3::{hat, left_jacobian as so3_left_jacobian, trig_quotients};
 
 use nalgebra::{SMatrix, SVector, Vector3};
 
@@ -88,7 +88,8 @@ pub(crate) fn left_jacobian_by_doubling<const DOF: usize, G: LieGroup<DOF>>(
     let ad_small = ad(&small);
     let mut jacobian = SMatrix::identity();
     let mut term = SMatrix::identity();
-    for n in 1..16 {
+    // 0.25¹²/13! lies below the last digit.
+    for n in 1..13 {
         term = term * ad_small / f64::from(n + 1);
         jacobian += term;
     }

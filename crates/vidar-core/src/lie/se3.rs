@@ -1,6 +1,6 @@
 //! Rigid motions SE(3): `p_in_a = R · p_in_b + t`.
 
-use super::{LieGroup, So3, hat, impl_group_ops, left_jacobian_by_doubling, so3_left_jacobian};
+use super::{LieGroup, So3, hat, impl_group_ops, so3_left_jacobian, trig_quotients};
 use nalgebra::{Matrix3, Matrix4, Matrix6, SMatrix, Vector3, Vector6};
 
 /// A rigid motion `a_from_b`.
@@ -47,15 +47,16 @@ impl Se3 {
     }
 }
 
-/// `ad` with `[ω, ρ]`: the derivative of the adjoint at the identity.
-fn ad(tangent: &Vector6<f64>) -> Matrix6<f64> {
-    let w = hat(&tangent.fixed_rows::<3>(0).into_owned());
-    let r = hat(&tangent.fixed_rows::<3>(3).into_owned());
-    let mut m = Matrix6::zeros();
-    m.fixed_view_mut::<3, 3>(0, 0).copy_from(&w);
-    m.fixed_view_mut::<3, 3>(3, 0).copy_from(&r);
-    m.fixed_view_mut::<3, 3>(3, 3).copy_from(&w);
-    m
+/// Lower-left block `Q(ω, ρ)` of the left Jacobian (Barfoot, "State Estimation for Robotics", eq. 7.86).
+fn jacobian_coupling(omega: &Vector3<f64>, rho: &Vector3<f64>) -> Matrix3<f64> {
+    let [_, _, _, q3, q4, q5] = trig_quotients(omega.norm_squared());
+    let (w, p) = (hat(omega), hat(rho));
+    let (wp, pw) = (w * p, p * w);
+    let wpw = w * pw;
+    p * 0.5
+        + (wp + pw + wpw) * q3
+        + (w * wp + pw * w - wpw * 3.0) * q4
+        + (wpw * w + w * wpw) * (0.5 * (q4 - 3.0 * q5))
 }
 
 impl LieGroup<6> for Se3 {
@@ -106,15 +107,21 @@ impl LieGroup<6> for Se3 {
     }
 
     fn left_jacobian(tangent: &Vector6<f64>) -> Matrix6<f64> {
-        left_jacobian_by_doubling::<6, Self>(tangent, ad)
+        let omega = tangent.fixed_rows::<3>(0).into_owned();
+        let j = so3_left_jacobian(&omega);
+        let mut m = Matrix6::zeros();
+        m.fixed_view_mut::<3, 3>(0, 0).copy_from(&j);
+        m.fixed_view_mut::<3, 3>(3, 0)
+            .copy_from(&jacobian_coupling(&omega, &tangent.fixed_rows::<3>(3).into_owned()));
+        m.fixed_view_mut::<3, 3>(3, 3).copy_from(&j);
+        m
     }
 
     fn right_jacobian_inverse(tangent: &Vector6<f64>) -> Option<Matrix6<f64>> {
         // Block lower triangular [A 0; B A] has the inverse [A⁻¹ 0; −A⁻¹ B A⁻¹ A⁻¹].
         let omega = tangent.fixed_rows::<3>(0).into_owned();
         let a_inv = So3::right_jacobian_inverse(&omega)?;
-        let j = Self::right_jacobian(tangent);
-        let b: Matrix3<f64> = j.fixed_view::<3, 3>(3, 0).into_owned();
+        let b = jacobian_coupling(&-omega, &-tangent.fixed_rows::<3>(3).into_owned());
         let mut m = Matrix6::zeros();
         m.fixed_view_mut::<3, 3>(0, 0).copy_from(&a_inv);
         m.fixed_view_mut::<3, 3>(3, 3).copy_from(&a_inv);
@@ -132,3 +139,34 @@ impl LieGroup<6> for Se3 {
 }
 
 impl_group_ops!(Se3);
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::lie::left_jacobian_by_doubling;
+
+    /// `ad` with `[ω, ρ]`: the derivative of the adjoint at the identity.
+    fn ad(tangent: &Vector6<f64>) -> Matrix6<f64> {
+        let w = hat(&tangent.fixed_rows::<3>(0).into_owned());
+        let r = hat(&tangent.fixed_rows::<3>(3).into_owned());
+        let mut m = Matrix6::zeros();
+        m.fixed_view_mut::<3, 3>(0, 0).copy_from(&w);
+        m.fixed_view_mut::<3, 3>(3, 0).copy_from(&r);
+        m.fixed_view_mut::<3, 3>(3, 3).copy_from(&w);
+        m
+    }
+
+    #[test]
+    fn closed_form_jacobian_agrees_with_series_and_doubling() {
+        let axis = Vector3::new(0.6, -0.64, 0.48);
+        for angle in [0.0, 1e-12, 1e-8, 1e-4, 1e-2, 0.3, 0.999, 1.001, 2.0, std::f64::consts::PI, 6.0] {
+            for size in [0.0, 1e-3, 1.0, 1e3] {
+                let w = axis * angle;
+                let tangent = Vector6::new(w.x, w.y, w.z, 0.3 * size, -size, 0.7 * size);
+                let expected = left_jacobian_by_doubling::<6, Se3>(&tangent, ad);
+                let error = (Se3::left_jacobian(&tangent) - expected).amax() / expected.amax();
+                assert!(error < 5e-15, "angle {angle}, translation {size}: {error:.2e}");
+            }
+        }
+    }
+}

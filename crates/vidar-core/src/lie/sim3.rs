@@ -56,10 +56,10 @@ fn translation_factor(omega: &Vector3<f64>, sigma: f64) -> Matrix3<f64> {
     let w = hat(omega);
     // a = ∫ e^{τσ} dτ, which exp_m1 keeps exact for small σ.
     let a = if sigma.abs() < 1e-8 { 1.0 + 0.5 * sigma } else { sigma.exp_m1() / sigma };
-    let (b, c) = if theta < 1e-2 {
+    let (b, c) = if theta < 0.3 {
         small_angle_factors(theta2, sigma)
     } else {
-        // P = ∫ e^{τσ} sin(τθ) dτ, Q = ∫ e^{τσ} cos(τθ) dτ; rewritten so that σ → 0 needs no special case.
+        // p = ∫ e^{τσ} sin(τθ) dτ, q = ∫ e^{τσ} cos(τθ) dτ; θ > 0 keeps the denominator away from zero.
         let e = sigma.exp();
         let d = sigma * sigma + theta2;
         let (sin, cos) = theta.sin_cos();
@@ -70,39 +70,52 @@ fn translation_factor(omega: &Vector3<f64>, sigma: f64) -> Matrix3<f64> {
     Matrix3::identity() * a + w * b + w * w * c
 }
 
-/// Series in θ² of `b = ∫ e^{τσ} sin(τθ)/θ dτ` and `c = ∫ e^{τσ} (1 − cos τθ)/θ² dτ`.
+/// Series in θ² of `b = ∫ e^{τσ} sin(τθ)/θ dτ` and `c = ∫ e^{τσ} (1 − cos τθ)/θ² dτ`, for θ < 0.3.
 fn small_angle_factors(theta2: f64, sigma: f64) -> (f64, f64) {
-    // m[n] = ∫₀¹ τⁿ e^{τσ} dτ.
-    let m = exponential_moments(sigma);
-    let b = m[1] - theta2 / 6.0 * m[3] + theta2 * theta2 / 120.0 * m[5];
-    let c = m[2] / 2.0 - theta2 / 24.0 * m[4] + theta2 * theta2 / 720.0 * m[6];
+    let (mut b, mut c) = (0.0, 0.0);
+    // (−θ²)ʲ/(2j+1)!; the sixth term is below the last digit at θ = 0.3.
+    let mut coefficient = 1.0;
+    for j in 0..6 {
+        let odd = 2 * j + 1;
+        b += coefficient * exponential_moment(odd, sigma);
+        coefficient /= (odd + 1) as f64;
+        c += coefficient * exponential_moment(odd + 1, sigma);
+        coefficient *= -theta2 / (odd + 2) as f64;
+        if coefficient == 0.0 {
+            break;
+        }
+    }
     (b, c)
 }
 
-/// `∫₀¹ τⁿ e^{τσ} dτ` for n = 0…6.
-fn exponential_moments(sigma: f64) -> [f64; 7] {
-    let mut m = [0.0; 7];
-    for (n, moment) in m.iter_mut().enumerate() {
-        // Σ σᵏ / (k! (n+k+1)): for σ > 0 all terms are positive, for σ < 0 the factor e^σ makes them so.
-        let (base, step) = if sigma >= 0.0 { (1.0, sigma) } else { (sigma.exp(), -sigma) };
-        let mut sum = 0.0;
-        if sigma >= 0.0 {
-            let mut power = 1.0;
-            for k in 0..120 {
-                sum += power / ((n + k + 1) as f64);
-                power *= step / (k + 1) as f64;
+/// `∫₀¹ τⁿ e^{τσ} dτ`, by series whose terms are all positive, so that no digit is lost.
+fn exponential_moment(n: usize, sigma: f64) -> f64 {
+    let mut sum = 0.0;
+    // Terms fall once k exceeds |σ|; the cap only ends the loop for a σ that is not a number or absurd.
+    if sigma >= 0.0 {
+        // Σ σᵏ/(k! (n+k+1)).
+        let mut power = 1.0;
+        for k in 0..2000 {
+            let term = power / (n + k + 1) as f64;
+            sum += term;
+            if term < 1e-17 * sum {
+                break;
             }
-        } else {
-            // ∫ τⁿ e^{τσ} = e^σ Σ (−σ)ᵏ / ((n+1)(n+2)…(n+k+1)) by repeated integration by parts.
-            let mut term = 1.0 / (n + 1) as f64;
-            for k in 0..120 {
-                sum += term;
-                term *= step / (n + k + 2) as f64;
-            }
+            power *= sigma / (k + 1) as f64;
         }
-        *moment = base * sum;
+        sum
+    } else {
+        // e^σ Σ (−σ)ᵏ/((n+1)(n+2)…(n+k+1)), by repeated integration by parts.
+        let mut term = 1.0 / (n + 1) as f64;
+        for k in 0..2000 {
+            sum += term;
+            if term < 1e-17 * sum {
+                break;
+            }
+            term *= -sigma / (n + k + 2) as f64;
+        }
+        sum * sigma.exp()
     }
-    m
 }
 
 /// `ad` with `[ω, ρ, σ]`.
@@ -180,7 +193,19 @@ impl LieGroup<7> for Sim3 {
     }
 
     fn right_jacobian_inverse(tangent: &Tangent) -> Option<Matrix7> {
-        Self::right_jacobian(tangent).try_inverse()
+        // [A 0 0; B D c; 0 0 1] has the inverse [A⁻¹ 0 0; −D⁻¹ B A⁻¹  D⁻¹  −D⁻¹ c; 0 0 1].
+        let a_inv = So3::right_jacobian_inverse(&tangent.fixed_rows::<3>(0).into_owned())?;
+        let j = Self::right_jacobian(tangent);
+        let d_inv = j.fixed_view::<3, 3>(3, 3).into_owned().try_inverse()?;
+        let b = j.fixed_view::<3, 3>(3, 0).into_owned();
+        let c = j.fixed_view::<3, 1>(3, 6).into_owned();
+        let mut m = Matrix7::zeros();
+        m.fixed_view_mut::<3, 3>(0, 0).copy_from(&a_inv);
+        m.fixed_view_mut::<3, 3>(3, 0).copy_from(&-(d_inv * b * a_inv));
+        m.fixed_view_mut::<3, 3>(3, 3).copy_from(&d_inv);
+        m.fixed_view_mut::<3, 1>(3, 6).copy_from(&-(d_inv * c));
+        m[(6, 6)] = 1.0;
+        Some(m)
     }
 
     fn d_act_d_perturbation(&self, point: &Vector3<f64>) -> SMatrix<f64, 3, 7> {

@@ -15,19 +15,37 @@ pub(crate) fn hat(v: &Vector3<f64>) -> Matrix3<f64> {
     Matrix3::new(0.0, -v.z, v.y, v.z, 0.0, -v.x, -v.y, v.x, 0.0)
 }
 
-/// `Jl(ω) = I + (1−cos θ)/θ² ω^ + (θ−sin θ)/θ³ ω^²`.
-pub(crate) fn left_jacobian(omega: &Vector3<f64>) -> Matrix3<f64> {
-    let theta2 = omega.norm_squared();
-    let theta = theta2.sqrt();
-    let (a, b) = if theta < SMALL_ANGLE {
-        (0.5 - theta2 / 24.0, 1.0 / 6.0 - theta2 / 120.0)
+/// `φ_k(θ²) = Σₙ (−θ²)ⁿ/(2n+k)!` for k = 0…5: every quotient of sines and powers that the groups need.
+///
+/// φ₀ = cos θ, φ₁ = sin θ/θ, φ₂ = (1 − cos θ)/θ², φ₃ = (θ − sin θ)/θ³, and `φ_{k+2} = (1/k! − φ_k)/θ²`. Below one
+/// radian the recursion runs down from series, where it adds digits; above, it runs up, where it loses few.
+pub(crate) fn trig_quotients(theta2: f64) -> [f64; 6] {
+    if theta2 < 1.0 {
+        let series = |k: usize| {
+            let (mut sum, mut term) = (0.0, 1.0 / [1.0, 1.0, 2.0, 6.0, 24.0, 120.0][k]);
+            for n in 0..9 {
+                sum += term;
+                term *= -theta2 / ((2 * n + k + 1) * (2 * n + k + 2)) as f64;
+            }
+            sum
+        };
+        let (q5, q4) = (series(5), series(4));
+        let (q3, q2) = (1.0 / 6.0 - theta2 * q5, 0.5 - theta2 * q4);
+        [1.0 - theta2 * q2, 1.0 - theta2 * q3, q2, q3, q4, q5]
     } else {
-        // 1 − cos θ = 2 sin²(θ/2) keeps its digits for small θ.
-        let half_sin = (0.5 * theta).sin();
-        (2.0 * half_sin * half_sin / theta2, (theta - theta.sin()) / (theta2 * theta))
-    };
+        let theta = theta2.sqrt();
+        let (sin, cos) = theta.sin_cos();
+        let (q1, q2) = (sin / theta, (1.0 - cos) / theta2);
+        let (q3, q4) = ((1.0 - q1) / theta2, (0.5 - q2) / theta2);
+        [cos, q1, q2, q3, q4, (1.0 / 6.0 - q3) / theta2]
+    }
+}
+
+/// `Jl(ω) = I + φ₂ ω^ + φ₃ ω^²` (Solà 2018, eq. 145).
+pub(crate) fn left_jacobian(omega: &Vector3<f64>) -> Matrix3<f64> {
+    let [_, _, q2, q3, ..] = trig_quotients(omega.norm_squared());
     let w = hat(omega);
-    Matrix3::identity() + w * a + w * w * b
+    Matrix3::identity() + w * q2 + w * w * q3
 }
 
 impl So3 {
