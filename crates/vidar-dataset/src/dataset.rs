@@ -1,0 +1,215 @@
+//! What every reader returns.
+
+use crate::decode::{self, ImageLimits};
+use crate::error::{DatasetError, io_error};
+use crate::events::Events;
+use crate::options::DatasetKind;
+use crate::source::read_text_file;
+use std::path::{Path, PathBuf};
+use vidar_core::{
+    CameraId, Duration, FrameId, FrameImage, Image, ImuSample, MetricDepth, Pinhole, Rig, Se3, SpecificForce,
+    Timestamp, Trajectory, Warning,
+};
+
+/// One image of the chosen camera.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct ImageEntry {
+    /// Its number in the whole sequence, in the order of time; kept when the sequence is cut or thinned.
+    pub frame_id: FrameId,
+    /// When it was taken, in the dataset's clock.
+    pub time: Timestamp,
+    /// Which camera took it.
+    pub camera: CameraId,
+    /// Its file.
+    pub path: PathBuf,
+}
+
+/// One depth image.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct DepthEntry {
+    /// When it was taken, in the dataset's clock.
+    pub time: Timestamp,
+    /// Its file, a 16-bit grey PNG.
+    pub path: PathBuf,
+}
+
+/// The depth camera.
+#[derive(Clone, Debug, PartialEq)]
+pub struct DepthSensor {
+    /// How its (distortion-free) images project.
+    pub intrinsics: Pinhole,
+    /// Raw units per metre.
+    pub units_per_metre: f64,
+    /// Maps points in the depth camera to the chosen colour camera.
+    pub color_from_depth: Se3,
+    /// Raw values that mean "no depth"; 0 always does.
+    pub invalid: Vec<u16>,
+}
+
+/// One reading of an accelerometer that comes without a gyroscope (TUM RGB-D's `accelerometer.txt`).
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct AccelSample {
+    /// When.
+    pub time: Timestamp,
+    /// Specific force, m/s², in the accelerometer's frame.
+    pub accel: SpecificForce,
+}
+
+/// A metric trajectory that the user brought.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Anchor {
+    /// The poses.
+    pub trajectory: Trajectory,
+    /// Their file.
+    pub source: PathBuf,
+}
+
+/// Where the chosen camera's model comes from.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum CalibrationSource {
+    /// A calibration file.
+    File(PathBuf),
+    /// The user's flags.
+    Flags,
+    /// What is published for this kind of dataset; a warning says so.
+    DatasetDefault,
+    /// A guess from the size of the images; a warning says so. Nothing metric should rest on it.
+    Guessed,
+}
+
+/// A dataset, ready to be streamed. Images and depth stay on disk until asked for.
+#[derive(Clone, Debug)]
+pub struct Dataset {
+    /// Name for people and for run folders.
+    pub name: String,
+    /// Its layout.
+    pub kind: DatasetKind,
+    /// Why this layout was decided.
+    pub reason: String,
+    /// The folder that paths are told relative to.
+    pub root: PathBuf,
+    /// Cameras and IMU.
+    pub rig: Rig,
+    /// The camera whose images are listed, an index into the rig.
+    pub camera: CameraId,
+    /// Where that camera's model comes from.
+    pub calibration: CalibrationSource,
+    /// Images, strictly increasing in time.
+    pub images: Vec<ImageEntry>,
+    /// Inertial readings, strictly increasing in time.
+    pub imu: Vec<ImuSample>,
+    /// Accelerometer readings without a gyroscope, strictly increasing in time.
+    pub accelerometer: Vec<AccelSample>,
+    /// Depth images, strictly increasing in time.
+    pub depths: Vec<DepthEntry>,
+    /// The depth camera, where there are depth images.
+    pub depth_sensor: Option<DepthSensor>,
+    /// Reference poses.
+    pub ground_truth: Option<Trajectory>,
+    /// The metric trajectory the user brought.
+    pub anchor: Option<Anchor>,
+    /// A reference cloud of the scene (PLY).
+    pub reference_cloud: Option<PathBuf>,
+    /// What was found and is not quite right.
+    pub warnings: Vec<Warning>,
+    /// Every text file that was read (lists, calibration, poses).
+    pub text_files: Vec<PathBuf>,
+}
+
+/// An image and the depth image nearest in time count as one moment when no further apart than this: the
+/// association tolerance that the TUM RGB-D tools use.
+pub const DEPTH_TOLERANCE: Duration = Duration::from_millis(20);
+
+impl Dataset {
+    /// Reads the pixels of an image; its size must be its camera's.
+    pub fn load_image(&self, entry: &ImageEntry) -> Result<FrameImage, DatasetError> {
+        let image = decode::read_image(&entry.path, &ImageLimits::default())?;
+        if let Some(camera) = self.rig.camera(entry.camera) {
+            let expected = (camera.model.width(), camera.model.height());
+            check_size(&entry.path, (image.width(), image.height()), expected)?;
+        }
+        Ok(image)
+    }
+
+    /// Reads a depth image as z-depth in metres, NaN where there is none, in the depth camera's own pixels.
+    pub fn load_depth(&self, entry: &DepthEntry) -> Result<MetricDepth, DatasetError> {
+        let raw = decode::read_depth(&entry.path, &ImageLimits::default())?;
+        let Some(sensor) = &self.depth_sensor else {
+            return Err(DatasetError::BadImage {
+                path: entry.path.clone(),
+                reason: "the dataset has no depth camera to interpret it with".into(),
+            });
+        };
+        let expected = (sensor.intrinsics.width, sensor.intrinsics.height);
+        check_size(&entry.path, (raw.width(), raw.height()), expected)?;
+        Ok(MetricDepth::new(sensor.to_metres(&raw)))
+    }
+
+    /// The depth image of the moment `time`: the nearest within [`DEPTH_TOLERANCE`].
+    pub fn depth_for(&self, time: Timestamp) -> Option<&DepthEntry> {
+        let after = self.depths.partition_point(|d| d.time < time);
+        [after.checked_sub(1), Some(after)]
+            .into_iter()
+            .flatten()
+            .filter_map(|i| self.depths.get(i))
+            .min_by_key(|d| (d.time - time).abs())
+            .filter(|d| (d.time - time).abs() <= DEPTH_TOLERANCE)
+    }
+
+    /// All sensors in the order of time, images loaded when their turn comes.
+    ///
+    /// At equal times: IMU, ground truth, depth, image; so that an image finds everything of its moment known.
+    pub fn events(&self) -> impl Iterator<Item = Result<vidar_core::SensorEvent, DatasetError>> + '_ {
+        Events::new(self)
+    }
+
+    /// What a digest of the dataset must cover: name and size of every image and depth image, and every byte of
+    /// every text file that was read. Two datasets with equal fingerprints read the same.
+    pub fn fingerprint(&self) -> Result<Vec<u8>, DatasetError> {
+        let mut out = format!("vidar-dataset 1 {} camera {}\n", self.kind, self.camera).into_bytes();
+        let images = self.images.iter().map(|e| (e.time, &e.path));
+        let depths = self.depths.iter().map(|e| (e.time, &e.path));
+        for (time, path) in images.chain(depths) {
+            let size = std::fs::metadata(path).map_err(io_error(path))?.len();
+            out.extend_from_slice(format!("{} {size} {time}\n", self.relative(path)).as_bytes());
+        }
+        for path in &self.text_files {
+            let text = read_text_file(path)?;
+            out.extend_from_slice(format!("{} {}\n", self.relative(path), text.len()).as_bytes());
+            out.extend_from_slice(&text);
+        }
+        Ok(out)
+    }
+
+    /// The path as told to people: relative to the root where it lies inside.
+    pub fn relative(&self, path: &Path) -> String {
+        path.strip_prefix(&self.root).unwrap_or(path).display().to_string()
+    }
+}
+
+impl DepthSensor {
+    /// Raw values as metres, NaN where invalid.
+    pub fn to_metres(&self, raw: &Image<u16>) -> Image<f32> {
+        let metres_per_unit = 1.0 / self.units_per_metre;
+        raw.map(|&value| {
+            if value == 0 || self.invalid.contains(&value) {
+                f32::NAN
+            } else {
+                (f64::from(value) * metres_per_unit) as f32
+            }
+        })
+    }
+}
+
+fn check_size(path: &Path, found: (usize, usize), expected: (usize, usize)) -> Result<(), DatasetError> {
+    if found == expected {
+        return Ok(());
+    }
+    Err(DatasetError::WrongImageSize {
+        path: path.to_path_buf(),
+        found_width: found.0,
+        found_height: found.1,
+        expected_width: expected.0,
+        expected_height: expected.1,
+    })
+}

@@ -1,0 +1,256 @@
+//! What the user may say about a dataset.
+
+use crate::error::DatasetError;
+use std::fmt;
+use std::path::PathBuf;
+use std::str::FromStr;
+use vidar_core::{BodyFrame, CameraId, CameraModel, Duration, Se3, Timestamp};
+
+/// Layouts of datasets.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+pub enum DatasetKind {
+    /// EuRoC's ASL folders (`mav0/cam0/data.csv`, …).
+    EurocAsl,
+    /// TUM RGB-D (`rgb.txt`, `depth.txt`, `groundtruth.txt`, `accelerometer.txt`).
+    TumRgbd,
+    /// 7-Scenes (`frame-000000.color.png`, `.depth.png`, `.pose.txt`).
+    SevenScenes,
+    /// `images/`, `poses.txt`, `K.txt`, and perhaps `depth/`.
+    PosedFolder,
+    /// Images in one folder, with or without a file of times.
+    ImageFolder,
+}
+
+impl DatasetKind {
+    /// Every kind, in the order in which a path is tried.
+    pub const ALL: [Self; 5] =
+        [Self::EurocAsl, Self::TumRgbd, Self::SevenScenes, Self::PosedFolder, Self::ImageFolder];
+
+    /// The name used on the command line and in files.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::EurocAsl => "euroc",
+            Self::TumRgbd => "tum-rgbd",
+            Self::SevenScenes => "7scenes",
+            Self::PosedFolder => "posed-folder",
+            Self::ImageFolder => "images",
+        }
+    }
+}
+
+impl fmt::Display for DatasetKind {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(self.name())
+    }
+}
+
+impl FromStr for DatasetKind {
+    type Err = DatasetError;
+    fn from_str(text: &str) -> Result<Self, DatasetError> {
+        by_name("format", text, &Self::ALL, |k| k.name())
+    }
+}
+
+/// Formats of trajectory files.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+pub enum TrajectoryFormat {
+    /// `seconds tx ty tz qx qy qz qw`.
+    Tum,
+    /// `nanoseconds, px, py, pz, qw, qx, qy, qz, …`.
+    EurocCsv,
+    /// Twelve numbers of a row-major 3×4 matrix, without time.
+    Kitti,
+}
+
+impl TrajectoryFormat {
+    /// Every format.
+    pub const ALL: [Self; 3] = [Self::Tum, Self::EurocCsv, Self::Kitti];
+
+    /// The name used on the command line.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Tum => "tum",
+            Self::EurocCsv => "euroc",
+            Self::Kitti => "kitti",
+        }
+    }
+}
+
+impl fmt::Display for TrajectoryFormat {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(self.name())
+    }
+}
+
+impl FromStr for TrajectoryFormat {
+    type Err = DatasetError;
+    fn from_str(text: &str) -> Result<Self, DatasetError> {
+        by_name("trajectory format", text, &Self::ALL, |k| k.name())
+    }
+}
+
+/// Units in which a file writes its times.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+pub enum TimeUnit {
+    /// s
+    Seconds,
+    /// ms
+    Milliseconds,
+    /// µs
+    Microseconds,
+    /// ns
+    Nanoseconds,
+}
+
+impl TimeUnit {
+    /// Every unit, largest first.
+    pub const ALL: [Self; 4] = [Self::Seconds, Self::Milliseconds, Self::Microseconds, Self::Nanoseconds];
+
+    /// The name used on the command line.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Seconds => "s",
+            Self::Milliseconds => "ms",
+            Self::Microseconds => "us",
+            Self::Nanoseconds => "ns",
+        }
+    }
+
+    /// One second is 10 to this many units.
+    pub fn digits(self) -> u32 {
+        match self {
+            Self::Seconds => 0,
+            Self::Milliseconds => 3,
+            Self::Microseconds => 6,
+            Self::Nanoseconds => 9,
+        }
+    }
+}
+
+impl fmt::Display for TimeUnit {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(self.name())
+    }
+}
+
+impl FromStr for TimeUnit {
+    type Err = DatasetError;
+    fn from_str(text: &str) -> Result<Self, DatasetError> {
+        by_name("time unit", text, &Self::ALL, |k| k.name())
+    }
+}
+
+fn by_name<T: Copy>(
+    option: &'static str,
+    text: &str,
+    all: &[T],
+    name: impl Fn(T) -> &'static str,
+) -> Result<T, DatasetError> {
+    all.iter().copied().find(|&k| name(k).eq_ignore_ascii_case(text.trim())).ok_or_else(|| {
+        let names: Vec<_> = all.iter().map(|&k| name(k)).collect();
+        DatasetError::BadOption {
+            option,
+            found: format!("{text:?}"),
+            expected: format!("one of {}", names.join(", ")),
+        }
+    })
+}
+
+/// What the user says about a dataset; everything may be left to the dataset itself.
+#[derive(Clone, Debug, PartialEq)]
+pub struct OpenOptions {
+    /// The layout, where looking at the path would decide otherwise.
+    pub format: Option<DatasetKind>,
+    /// The camera whose images are read, as the dataset numbers it (`cam0`, `cam1`, …).
+    pub camera: CameraId,
+    /// Calibration files: EuRoC `sensor.yaml`, Kalibr camchain, Kalibr imu yaml. They override the dataset's own.
+    pub calibration: Vec<PathBuf>,
+    /// Model of the chosen (grey or colour) camera; overrides every file. Size 0×0 means "the size of its images".
+    /// Text such as `pinhole:525,525,319.5,239.5` becomes one through [`crate::CameraFlag`].
+    pub camera_model: Option<CameraModel>,
+    /// `[fx, fy, cx, cy]` of the depth camera, pixels of its own images.
+    pub depth_intrinsics: Option<[f64; 4]>,
+    /// Raw units of the depth images per metre (1000: millimetres, 5000: TUM).
+    pub depth_scale: Option<f64>,
+    /// Maps points in the depth camera to the chosen colour camera.
+    pub color_from_depth: Option<Se3>,
+    /// A metric trajectory of the same recording, to anchor the map.
+    pub trajectory: Option<PathBuf>,
+    /// Its format, where looking at the file would decide otherwise.
+    pub trajectory_format: Option<TrajectoryFormat>,
+    /// Whose poses it holds.
+    pub trajectory_body: Option<BodyFrame>,
+    /// A file of image times (image folders).
+    pub timestamps: Option<PathBuf>,
+    /// Unit of the times in image lists and file names, where their size would decide otherwise.
+    pub time_unit: Option<TimeUnit>,
+    /// Leaves out what is earlier than this after the first image.
+    pub start: Option<Duration>,
+    /// Leaves out what is later than this after the first image.
+    pub end: Option<Duration>,
+    /// Takes every n-th image, from 1.
+    pub stride: usize,
+}
+
+impl Default for OpenOptions {
+    fn default() -> Self {
+        Self {
+            format: None,
+            camera: CameraId(0),
+            calibration: Vec::new(),
+            camera_model: None,
+            depth_intrinsics: None,
+            depth_scale: None,
+            color_from_depth: None,
+            trajectory: None,
+            trajectory_format: None,
+            trajectory_body: None,
+            timestamps: None,
+            time_unit: None,
+            start: None,
+            end: None,
+            stride: 1,
+        }
+    }
+}
+
+impl OpenOptions {
+    /// Checks the values that can be checked without a dataset.
+    pub fn validate(&self) -> Result<(), DatasetError> {
+        let bad = |option, found: String, expected: &str| {
+            Err(DatasetError::BadOption { option, found, expected: expected.into() })
+        };
+        if self.stride == 0 {
+            return bad("stride", "0".into(), "1 or more");
+        }
+        if let Some(scale) = self.depth_scale
+            && !(scale.is_finite() && scale > 0.0)
+        {
+            return bad("depth scale", scale.to_string(), "finite and positive raw units per metre");
+        }
+        if let (Some(start), Some(end)) = (self.start, self.end)
+            && end <= start
+        {
+            return bad("end", end.to_string(), &format!("later than start ({start})"));
+        }
+        if let Some(motion) = &self.color_from_depth
+            && !motion.is_finite()
+        {
+            return bad("color from depth", "a value that is not finite".into(), "finite numbers");
+        }
+        Ok(())
+    }
+}
+
+/// How to read a trajectory file.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct TrajectoryReadOptions {
+    /// The format; `None`: by looking at the file.
+    pub format: Option<TrajectoryFormat>,
+    /// Whose poses; `None`: what the file's header says, else the IMU for EuRoC csv and TUM and camera 0 for KITTI.
+    pub body: Option<BodyFrame>,
+    /// Unit of time; `None`: what the format says, unless the size of the numbers speaks against it.
+    pub time_unit: Option<TimeUnit>,
+    /// One time per pose, for KITTI files.
+    pub times: Option<Vec<Timestamp>>,
+}
