@@ -164,7 +164,7 @@ fn difference_laws<const N: usize, G: LieGroup<N>>(
     delta: &SVector<f64, N>,
 ) -> Result<(), TestCaseError> {
     let between = a.inverse().compose(b);
-    let size = reach(a, reach(&a.inverse(), reach(b, 1.0))) + reach(a, reach(&between, 1.0));
+    let size = reach(a, reach(&a.inverse(), reach(b, 1.0))) + reach(a, reach(&between, 1.0)) + reach(a, 1.0);
     same(&a.plus(&b.minus(a)), b, size, "a + (b - a) = b")?;
     same(&a.interpolate(b, 0.0), a, size, "interpolation starts at a")?;
     same(&a.interpolate(b, 1.0), b, size, "interpolation ends at b")?;

@@ -5,16 +5,18 @@
 mod double_sphere;
 mod equidistant;
 mod fov;
+mod parametric;
 mod pinhole;
 mod radtan;
 
 pub use double_sphere::DoubleSphere;
 pub use equidistant::Equidistant;
 pub use fov::Fov;
+pub use parametric::{InvalidExample, ParametricCamera};
 pub use pinhole::Pinhole;
 pub use radtan::RadTan;
 
-use nalgebra::{Matrix2x3, Vector2, Vector3};
+use nalgebra::{Matrix2x3, Matrix2xX, Vector2, Vector3};
 use thiserror::Error;
 
 /// A pixel position, sub-pixel, `x` right and `y` down.
@@ -42,6 +44,33 @@ pub enum CameraError {
         /// Rows.
         height: usize,
     },
+    /// A list of parameters has the wrong length for its model.
+    #[error("a {model} camera has {expected} parameters, found {found}")]
+    WrongParameterCount {
+        /// Name of the model.
+        model: &'static str,
+        /// Parameters that the model has.
+        expected: usize,
+        /// Parameters given.
+        found: usize,
+    },
+    /// No distortion-free view of the camera fits what it sees.
+    #[error(
+        "no distortion-free view of {width}x{height} fits this camera (tried focal lengths up to {max_focal_px:.0} px)"
+    )]
+    NoUndistortedView {
+        /// Columns of the view wanted.
+        width: usize,
+        /// Rows of the view wanted.
+        height: usize,
+        /// Longest focal length tried.
+        max_focal_px: f64,
+    },
+}
+
+/// A pixel whose coordinates are numbers; what overflowed is nowhere.
+fn finite(pixel: Pixel) -> Option<Pixel> {
+    (pixel.x.is_finite() && pixel.y.is_finite()).then_some(pixel)
 }
 
 /// Any camera that VIDAR knows.
@@ -87,6 +116,65 @@ impl CameraModel {
     /// The unit direction in the camera frame that projects to `pixel`; `None` where there is none.
     pub fn unproject(&self, pixel: &Pixel) -> Option<Vector3<f64>> {
         each_model!(self, m => m.unproject(pixel))
+    }
+
+    /// The pixel and `d_pixel_d_parameters`, one column per entry of [`CameraModel::parameters`].
+    pub fn project_with_parameter_jacobian(
+        &self,
+        point_in_camera: &Vector3<f64>,
+    ) -> Option<(Pixel, Matrix2xX<f64>)> {
+        each_model!(self, m => {
+            let (pixel, jacobian) = m.project_with_parameter_jacobian(point_in_camera)?;
+            Some((pixel, Matrix2xX::from_column_slice(jacobian.as_slice())))
+        })
+    }
+
+    /// The intrinsic parameters in the order of [`CameraModel::parameter_names`].
+    pub fn parameters(&self) -> Vec<f64> {
+        each_model!(self, m => m.parameters().to_vec())
+    }
+
+    /// Names of the intrinsic parameters, fx, fy, cx, cy first.
+    pub fn parameter_names(&self) -> &'static [&'static str] {
+        match self {
+            Self::Pinhole(_) => &Pinhole::PARAMETER_NAMES,
+            Self::RadTan(_) => &RadTan::PARAMETER_NAMES,
+            Self::Equidistant(_) => &Equidistant::PARAMETER_NAMES,
+            Self::DoubleSphere(_) => &DoubleSphere::PARAMETER_NAMES,
+            Self::Fov(_) => &Fov::PARAMETER_NAMES,
+        }
+    }
+
+    /// A camera of the same model and size with other parameters.
+    pub fn with_parameters(&self, parameters: &[f64]) -> Result<Self, CameraError> {
+        fn build<const N: usize, M: ParametricCamera<N>>(
+            of: &CameraModel,
+            parameters: &[f64],
+        ) -> Result<M, CameraError> {
+            let parameters = parameters.try_into().map_err(|_| CameraError::WrongParameterCount {
+                model: of.name(),
+                expected: N,
+                found: parameters.len(),
+            })?;
+            M::from_parameters(parameters, of.width(), of.height())
+        }
+        match self {
+            Self::Pinhole(_) => build(self, parameters).map(Self::Pinhole),
+            Self::RadTan(_) => build(self, parameters).map(Self::RadTan),
+            Self::Equidistant(_) => build(self, parameters).map(Self::Equidistant),
+            Self::DoubleSphere(_) => build(self, parameters).map(Self::DoubleSphere),
+            Self::Fov(_) => build(self, parameters).map(Self::Fov),
+        }
+    }
+
+    /// The examples of every model, as real data sets use them.
+    pub fn examples() -> Vec<Self> {
+        let mut all: Vec<Self> = Pinhole::examples().into_iter().map(Self::Pinhole).collect();
+        all.extend(RadTan::examples().into_iter().map(Self::RadTan));
+        all.extend(Equidistant::examples().into_iter().map(Self::Equidistant));
+        all.extend(DoubleSphere::examples().into_iter().map(Self::DoubleSphere));
+        all.extend(Fov::examples().into_iter().map(Self::Fov));
+        all
     }
 
     /// Columns of the image.

@@ -1,7 +1,8 @@
 //! Pinhole: `u = fx·X/Z + cx`, `v = fy·Y/Z + cy`, for Z > 0. Parameters [fx, fy, cx, cy].
 
-use super::{CameraError, Pixel};
-use nalgebra::{Matrix2x3, Matrix3, Vector2, Vector3};
+use super::parametric::invalid_intrinsics;
+use super::{CameraError, InvalidExample, ParametricCamera, Pixel, finite};
+use nalgebra::{Matrix2x3, Matrix2x4, Matrix3, Vector2, Vector3};
 
 /// A distortion-free camera.
 #[derive(Clone, Copy, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
@@ -68,7 +69,10 @@ impl Pinhole {
 
     /// See [`super::CameraModel::project`].
     pub fn project(&self, p: &Vector3<f64>) -> Option<Pixel> {
-        (p.z > MIN_Z).then(|| Vector2::new(self.fx * p.x / p.z + self.cx, self.fy * p.y / p.z + self.cy))
+        if !(p.z > MIN_Z && p.z.is_finite()) {
+            return None;
+        }
+        finite(Vector2::new(self.fx * p.x / p.z + self.cx, self.fy * p.y / p.z + self.cy))
     }
 
     /// See [`super::CameraModel::project_with_jacobian`].
@@ -89,11 +93,46 @@ impl Pinhole {
     /// See [`super::CameraModel::unproject`].
     pub fn unproject(&self, pixel: &Pixel) -> Option<Vector3<f64>> {
         let ray = self.ray(pixel.x, pixel.y);
-        ray.iter().all(|v| v.is_finite()).then(|| ray.normalize())
+        let norm = ray.norm();
+        norm.is_finite().then(|| ray / norm)
     }
 
     /// The direction of pixel `(x, y)` with z = 1, so that a point is `ray · depth`.
     pub fn ray(&self, x: f64, y: f64) -> Vector3<f64> {
         Vector3::new((x - self.cx) / self.fx, (y - self.cy) / self.fy, 1.0)
+    }
+}
+
+impl ParametricCamera<4> for Pinhole {
+    const PARAMETER_NAMES: [&'static str; 4] = ["fx", "fy", "cx", "cy"];
+
+    fn parameters(&self) -> [f64; 4] {
+        [self.fx, self.fy, self.cx, self.cy]
+    }
+
+    fn from_parameters(parameters: &[f64; 4], width: usize, height: usize) -> Result<Self, CameraError> {
+        let [fx, fy, cx, cy] = *parameters;
+        Self::new(fx, fy, cx, cy, width, height)
+    }
+
+    fn project_with_parameter_jacobian(&self, p: &Vector3<f64>) -> Option<(Pixel, Matrix2x4<f64>)> {
+        let pixel = self.project(p)?;
+        let (x, y) = (p.x / p.z, p.y / p.z);
+        Some((pixel, Matrix2x4::new(x, 0.0, 1.0, 0.0, 0.0, y, 0.0, 1.0)))
+    }
+
+    fn examples() -> Vec<Self> {
+        vec![
+            // TUM RGB-D fr3, already rectified.
+            Self { fx: 535.4, fy: 539.2, cx: 320.1, cy: 247.6, width: 640, height: 480 },
+            // 7-Scenes depth camera.
+            Self { fx: 585.0, fy: 585.0, cx: 320.0, cy: 240.0, width: 640, height: 480 },
+            // A corner cut out of a wide view: the principal point lies outside.
+            Self { fx: 90.0, fy: 110.0, cx: -12.25, cy: 70.5, width: 33, height: 47 },
+        ]
+    }
+
+    fn invalid_examples() -> Vec<InvalidExample<4>> {
+        invalid_intrinsics([585.0, 585.0, 320.0, 240.0])
     }
 }
