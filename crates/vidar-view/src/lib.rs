@@ -1,1 +1,48 @@
-//! Plots, pictures of depth and map, and the self-contained HTML report.
+//! Pictures and the report: what a run looked like, for a person.
+//!
+//! Everything here turns values into pixels or into one HTML file and touches neither disk nor screen: the caller
+//! writes the bytes. A picture is an `Image<[u8; 3]>` in sRGB until [`encode_png`].
+//!
+//! - [`plot_trajectories_top_down`]: paths in metres, equal scale on both axes, ground truth where there is one.
+//! - [`plot_lines`], [`plot_histogram`], [`plot_bars`]: errors over time, distributions, timings.
+//! - [`depth_picture`], [`confidence_picture`], [`side_by_side`]: what the geometry stage saw.
+//! - [`render_map`]: a mesh or a cloud from a [`MapCamera`], by a software rasteriser.
+//! - [`render_html`]: a [`Report`] as one self-contained file.
+//!
+//! Plots and pictures never fail and never panic: values that are not finite are left out, an empty input gives
+//! empty axes that say so. The same input gives the same bytes for any number of threads.
+
+mod axes;
+mod canvas;
+mod chart;
+mod colormap;
+mod error;
+mod lines;
+mod map;
+mod picture;
+mod png_bytes;
+mod report;
+mod size;
+mod text;
+mod ticks;
+mod top_down;
+
+pub use chart::{BarGroup, BarPlot, Histogram, plot_bars, plot_histogram};
+pub use colormap::ColorMap;
+pub use error::ViewError;
+pub use lines::{AxisSpec, LinePlot, Mark, ReferenceLine, Series, plot_lines};
+pub use map::camera::{BackFaces, Cut, MapCamera, Projection, Viewpoint, up_of_world};
+pub use map::{MapSurface, Shading, render_map, render_map_with_path};
+pub use picture::{confidence_picture, depth_picture, side_by_side};
+pub use png_bytes::encode_png;
+pub use report::{
+    Figure, FigureWidth, Report, Section, SummaryItem, Table, Verdict, VerdictLevel, render_html,
+};
+pub use size::PictureSize;
+pub use ticks::{Ticks, nice_step};
+pub use top_down::{
+    PlotTrajectory, TrajectoryPlot, TrajectoryRole, plot_trajectories, plot_trajectories_top_down,
+};
+
+/// A picture: sRGB, row by row.
+pub type Picture = vidar_core::Image<[u8; 3]>;

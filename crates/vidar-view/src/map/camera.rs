@@ -1,0 +1,314 @@
+//! From where a map is looked at.
+
+use nalgebra::{Matrix3, Vector3};
+use vidar_core::Trajectory;
+
+/// Two horizontal directions and up, as a right-handed frame with names for axes.
+pub(crate) struct HorizontalPlane {
+    /// Rows: right, away, up.
+    rows: Matrix3<f64>,
+    /// Names of the three directions (`x`, `-z`).
+    pub names: [String; 3],
+}
+
+impl HorizontalPlane {
+    /// The plane across `up`. An `up` along an axis of the world keeps the world's axes.
+    pub(crate) fn of_up(up: &Vector3<f64>) -> Self {
+        let up =
+            up.try_normalize(1e-12).filter(|u| u.iter().all(|v| v.is_finite())).unwrap_or_else(Vector3::z);
+        let axis = up.iamax();
+        let rising = up[axis] > 0.0;
+        let (right, away) = match (axis, rising) {
+            (0, true) => (Vector3::y(), Vector3::z()),
+            (0, false) => (Vector3::z(), Vector3::y()),
+            (1, true) => (Vector3::x(), -Vector3::z()),
+            (1, false) => (Vector3::x(), Vector3::z()),
+            (_, true) => (Vector3::x(), Vector3::y()),
+            (_, false) => (Vector3::x(), -Vector3::y()),
+        };
+        if up[axis].abs() > 1.0 - 1e-9 {
+            let rows = Matrix3::from_rows(&[right.transpose(), away.transpose(), up.transpose()]);
+            return Self { rows, names: [axis_name(&right), axis_name(&away), axis_name(&up)] };
+        }
+        let right = (right - up * right.dot(&up)).normalize();
+        let away = up.cross(&right);
+        let rows = Matrix3::from_rows(&[right.transpose(), away.transpose(), up.transpose()]);
+        Self { rows, names: ["horizontal 1", "horizontal 2", "height"].map(str::to_owned) }
+    }
+
+    /// Coordinates of a point of the world along right, away, up.
+    pub(crate) fn coordinates(&self, p: &Vector3<f64>) -> [f64; 3] {
+        let q = self.rows * p;
+        [q.x, q.y, q.z]
+    }
+
+    fn direction(&self, right: f64, away: f64, up: f64) -> Vector3<f64> {
+        self.rows.transpose() * Vector3::new(right, away, up)
+    }
+}
+
+fn axis_name(direction: &Vector3<f64>) -> String {
+    let axis = direction.iamax();
+    let sign = if direction[axis] < 0.0 { "-" } else { "" };
+    format!("{sign}{}", ["x", "y", "z"][axis])
+}
+
+/// Which way is up in a world that may not have z up, judged by the cameras: people hold them level.
+///
+/// Takes the mean of the cameras' upward image axis. Within 35° of z it is z, the project's own convention;
+/// within 20° of another axis it is that axis; otherwise the mean itself. `camera_path` must be told of a camera
+/// (x right, y down, z forward). Without poses it is z.
+pub fn up_of_world(camera_path: &Trajectory) -> Vector3<f64> {
+    let sum: Vector3<f64> =
+        camera_path.poses().iter().map(|p| p.world_from_body.rotation * -Vector3::y()).sum();
+    let Some(mean) = sum.try_normalize(1e-6) else { return Vector3::z() };
+    if mean.z > 35f64.to_radians().cos() {
+        return Vector3::z();
+    }
+    let axis = mean.iamax();
+    if mean[axis].abs() > 20f64.to_radians().cos() {
+        return Vector3::ith(axis, mean[axis].signum());
+    }
+    mean
+}
+
+/// How points become pixels.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Projection {
+    /// Parallel: equal lengths stay equal.
+    Orthographic {
+        /// World length of the picture's height, metres.
+        height_m: f64,
+    },
+    /// Through a point.
+    Perspective {
+        /// Angle across the picture's height, degrees, within 1…170.
+        vertical_angle_deg: f64,
+    },
+}
+
+/// What happens to surfaces seen from behind.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum BackFaces {
+    /// They are left out: from outside one looks through walls and ceiling into the room.
+    Cull,
+    /// They are drawn darker and greyer.
+    Dim,
+}
+
+/// A fixed place to look at a map from.
+#[derive(Clone, Debug, PartialEq)]
+pub struct MapCamera {
+    /// Name for captions and files (`top`).
+    pub name: String,
+    /// Where it stands, metres, world.
+    pub position: Vector3<f64>,
+    /// Unit direction of the picture's columns towards the right, world.
+    pub right: Vector3<f64>,
+    /// Unit direction of the picture's rows downwards, world.
+    pub down: Vector3<f64>,
+    /// How points become pixels.
+    pub projection: Projection,
+    /// What happens to surfaces seen from behind.
+    pub back_faces: BackFaces,
+    /// Points beyond this distance above `up · p` are left out: opens a ceiling that has no normals.
+    pub cut: Option<Cut>,
+}
+
+/// A horizontal cut that takes away what lies above.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Cut {
+    /// Unit direction of up, world.
+    pub up: Vector3<f64>,
+    /// Largest `up · p` that is shown, metres.
+    pub height_m: f64,
+}
+
+/// The fixed viewpoints of a run's pictures.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Viewpoint {
+    /// From straight above, parallel.
+    Top,
+    /// From above and the front right.
+    ThreeQuarterFront,
+    /// From above and the back left.
+    ThreeQuarterBack,
+    /// From the middle of the camera's path, looking where the cameras looked.
+    Inside,
+}
+
+impl Viewpoint {
+    /// All of them.
+    pub const ALL: [Self; 4] = [Self::Top, Self::ThreeQuarterFront, Self::ThreeQuarterBack, Self::Inside];
+
+    /// Short name, fit for a file.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Top => "top",
+            Self::ThreeQuarterFront => "three-quarter-front",
+            Self::ThreeQuarterBack => "three-quarter-back",
+            Self::Inside => "inside",
+        }
+    }
+
+    /// Name in words, for captions.
+    pub fn caption(self) -> &'static str {
+        match self {
+            Self::Top => "From above",
+            Self::ThreeQuarterFront => "Three-quarter view from the front",
+            Self::ThreeQuarterBack => "Three-quarter view from the back",
+            Self::Inside => "From inside",
+        }
+    }
+}
+
+impl MapCamera {
+    /// The camera of a fixed viewpoint for a map with these vertices.
+    ///
+    /// Frames the middle 99 % of the vertices along each axis, so that a few stray points do not shrink the map.
+    /// `camera_path` (poses of a camera) places [`Viewpoint::Inside`]; without it that view stands in the middle
+    /// of the map. `aspect` is width / height of the picture. A map without vertices gives a camera that looks at
+    /// the origin.
+    pub fn fixed(
+        viewpoint: Viewpoint,
+        positions: &[[f32; 3]],
+        camera_path: Option<&Trajectory>,
+        up: &Vector3<f64>,
+        aspect: f64,
+    ) -> Self {
+        let plane = HorizontalPlane::of_up(up);
+        let bounds = Bounds::robust(positions, &plane);
+        let name = viewpoint.name();
+        match viewpoint {
+            Viewpoint::Top => Self::above(name, &plane, &bounds, aspect),
+            Viewpoint::ThreeQuarterFront => Self::around(name, &plane, &bounds, aspect, -55.0),
+            Viewpoint::ThreeQuarterBack => Self::around(name, &plane, &bounds, aspect, 125.0),
+            Viewpoint::Inside => Self::inside(name, &plane, &bounds, camera_path),
+        }
+    }
+
+    /// The same camera with everything above `height_m` along `up` taken away.
+    pub fn cut_above(self, up: &Vector3<f64>, height_m: f64) -> Self {
+        Self { cut: Some(Cut { up: *up, height_m }), ..self }
+    }
+
+    /// Where it looks, unit, world.
+    pub fn forward(&self) -> Vector3<f64> {
+        self.right.cross(&self.down)
+    }
+
+    fn above(name: &str, plane: &HorizontalPlane, bounds: &Bounds, aspect: f64) -> Self {
+        let size = bounds.size();
+        let height_m = 1.08 * size[1].max(size[0] / aspect);
+        Self {
+            name: name.to_owned(),
+            position: bounds.world(plane, [0.5, 0.5, 1.0]) + plane.direction(0.0, 0.0, size[2] + 1.0),
+            right: plane.direction(1.0, 0.0, 0.0),
+            down: plane.direction(0.0, -1.0, 0.0),
+            projection: Projection::Orthographic { height_m },
+            back_faces: BackFaces::Cull,
+            cut: None,
+        }
+    }
+
+    /// 38° above the horizon at an azimuth counted from the plane's first axis.
+    fn around(name: &str, plane: &HorizontalPlane, bounds: &Bounds, aspect: f64, azimuth_deg: f64) -> Self {
+        const ELEVATION_DEG: f64 = 38.0;
+        // A long lens: little distortion, yet near things look nearer.
+        const VERTICAL_ANGLE_DEG: f64 = 28.0;
+        let (sa, ca) = azimuth_deg.to_radians().sin_cos();
+        let (se, ce) = ELEVATION_DEG.to_radians().sin_cos();
+        let right = plane.direction(-sa, ca, 0.0);
+        let outwards = plane.direction(ce * ca, ce * sa, se);
+        let down = plane.direction(se * ca, se * sa, -ce);
+        let center = bounds.world(plane, [0.5; 3]);
+        let tangent = (0.5 * VERTICAL_ANGLE_DEG).to_radians().tan();
+        // The nearest distance from which all eight corners lie within the picture.
+        let mut distance = 0.0_f64;
+        for i in 0..8 {
+            let corner = bounds.world(plane, [0, 1, 2].map(|b| f64::from((i >> b) & 1))) - center;
+            let towards = corner.dot(&outwards);
+            let needed =
+                (corner.dot(&down).abs() / tangent).max(corner.dot(&right).abs() / (tangent * aspect));
+            distance = distance.max(towards + needed);
+        }
+        Self {
+            name: name.to_owned(),
+            position: center + outwards * (1.05 * distance),
+            right,
+            down,
+            projection: Projection::Perspective { vertical_angle_deg: VERTICAL_ANGLE_DEG },
+            back_faces: BackFaces::Cull,
+            cut: None,
+        }
+    }
+
+    /// At the pose nearest to the mean place of the cameras, upright, looking where it looked.
+    fn inside(name: &str, plane: &HorizontalPlane, bounds: &Bounds, path: Option<&Trajectory>) -> Self {
+        let poses = path.map_or(&[][..], Trajectory::poses);
+        let count = poses.len().max(1) as f64;
+        let mean: Vector3<f64> = poses.iter().map(|p| p.world_from_body.translation / count).sum();
+        let nearest = poses.iter().min_by(|a, b| {
+            let far = |p: &vidar_core::StampedPose| (p.world_from_body.translation - mean).norm_squared();
+            far(a).total_cmp(&far(b))
+        });
+        let (position, looked) = match nearest {
+            Some(p) => (p.world_from_body.translation, p.world_from_body.rotation * Vector3::z()),
+            None => (bounds.world(plane, [0.5; 3]), plane.direction(0.0, 1.0, 0.0)),
+        };
+        let up = plane.direction(0.0, 0.0, 1.0);
+        // Level the horizon unless the camera looks straight up or down.
+        let right = looked.cross(&up).try_normalize(0.1).unwrap_or_else(|| plane.direction(1.0, 0.0, 0.0));
+        let forward = looked.try_normalize(1e-9).unwrap_or_else(|| plane.direction(0.0, 1.0, 0.0));
+        let forward = (forward - right * forward.dot(&right)).normalize();
+        Self {
+            name: name.to_owned(),
+            position,
+            right,
+            down: forward.cross(&right),
+            projection: Projection::Perspective { vertical_angle_deg: 68.0 },
+            back_faces: BackFaces::Dim,
+            cut: None,
+        }
+    }
+}
+
+/// The box that holds nearly all vertices, in the axes of a plane.
+struct Bounds {
+    low: [f64; 3],
+    high: [f64; 3],
+}
+
+impl Bounds {
+    fn robust(positions: &[[f32; 3]], plane: &HorizontalPlane) -> Self {
+        // A hundred thousand samples place a percentile well enough.
+        let stride = (positions.len() / 100_000).max(1);
+        let finite = positions.iter().step_by(stride).filter(|p| p.iter().all(|v| v.is_finite()));
+        let points: Vec<[f64; 3]> =
+            finite.map(|p| plane.coordinates(&Vector3::from(p.map(f64::from)))).collect();
+        let mut bounds = Self { low: [-1.0; 3], high: [1.0; 3] };
+        for axis in 0..3 {
+            let mut values: Vec<f64> = points.iter().map(|p| p[axis]).collect();
+            values.sort_unstable_by(f64::total_cmp);
+            let Some(last) = values.len().checked_sub(1) else { continue };
+            let trim = values.len() / 200;
+            let (low, high) = (values[trim], values[last - trim]);
+            // What was trimmed usually continues a little.
+            let air = (0.02 * (high - low)).max(1e-3);
+            (bounds.low[axis], bounds.high[axis]) =
+                ((low - air).max(values[0] - 1e-3), (high + air).min(values[last] + 1e-3));
+        }
+        bounds
+    }
+
+    fn size(&self) -> [f64; 3] {
+        std::array::from_fn(|i| self.high[i] - self.low[i])
+    }
+
+    /// The point at shares 0…1 of each side.
+    fn world(&self, plane: &HorizontalPlane, share: [f64; 3]) -> Vector3<f64> {
+        let [right, away, up] =
+            std::array::from_fn(|i| self.low[i] + share[i] * (self.high[i] - self.low[i]));
+        plane.direction(right, away, up)
+    }
+}
