@@ -20,13 +20,14 @@ pub mod remap;
 pub mod rig;
 pub mod sensor;
 pub mod surface;
+mod svd3;
 pub mod testing;
 pub mod time;
 pub mod trajectory;
 pub mod umeyama;
 pub mod warning;
 
-pub use camera::{CameraError, CameraModel, Pinhole};
+pub use camera::{CameraError, CameraModel, ParametricCamera, Pinhole};
 pub use geometry::{AlignedView, Confidence, GeometryError, MetricDepth, RelativeDepth};
 pub use id::{CameraId, ChunkId, FrameId, KeyframeId, LandmarkId};
 pub use image::{FrameImage, Image, ImageError};
@@ -39,7 +40,7 @@ pub use sensor::{AngularRate, Frame, ImuSample, SensorEvent, SpecificForce};
 pub use surface::{PointCloud, TriangleMesh};
 pub use time::{Duration, TimeError, Timestamp};
 pub use trajectory::{BodyFrame, StampedPose, Trajectory, TrajectoryError};
-pub use umeyama::{UmeyamaError, umeyama_se3, umeyama_sim3};
+pub use umeyama::{UmeyamaError, umeyama_se3, umeyama_sim3, umeyama_sim3_weighted};
 pub use warning::Warning;
 
 /// Standard gravity magnitude used for synthetic data, m/s².

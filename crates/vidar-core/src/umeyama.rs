@@ -1,6 +1,12 @@
 //! Closed-form alignment of paired points (Umeyama, PAMI 1991; the paper's section III-E).
+//!
+//! Given source points x, target points y and weights w, the similarity that minimises `Σ w |y − (s R x + t)|²` comes
+//! from the means, the cross-covariance `Σ_xy = Σ w (y − ȳ)(x − x̄)ᵀ / Σ w = U D Vᵀ` and the source variance σ²:
+//! `R = U diag(1, 1, det U det V) Vᵀ`, `s = tr(D diag(1, 1, det U det V))/σ²`, `t = ȳ − s R x̄` (eq. 40–43).
+//! Points in a plane are enough; points on a line leave the rotation free and are refused.
 
 use crate::lie::{Se3, Sim3, So3};
+use crate::svd3::proper_svd;
 use nalgebra::{Matrix3, Vector3};
 use thiserror::Error;
 
@@ -16,8 +22,8 @@ pub enum UmeyamaError {
         /// Points to reach.
         target_len: usize,
     },
-    /// Fewer than three pairs.
-    #[error("{found} point pairs, at least 3 are needed")]
+    /// Fewer than three pairs with a weight (two for a scale alone).
+    #[error("{found} point pairs, at least 3 are needed (2 for a scale alone)")]
     TooFewPoints {
         /// Pairs given.
         found: usize,
@@ -35,42 +41,109 @@ pub enum UmeyamaError {
     Degenerate {
         /// Largest singular value of the cross-covariance.
         first: f64,
-        /// Second singular value.
+        /// What holds the rotation about the first direction: the second singular value plus the signed third.
         second: f64,
+    },
+    /// Points and weights differ in number.
+    #[error("{points} point pairs but {weights} weights")]
+    WeightCountMismatch {
+        /// Pairs given.
+        points: usize,
+        /// Weights given.
+        weights: usize,
+    },
+    /// A weight is negative or not finite.
+    #[error("weight {index} must be finite and not negative, found {found}")]
+    BadWeight {
+        /// Which weight.
+        index: usize,
+        /// The value found.
+        found: f64,
     },
 }
 
-/// Relative size of the second singular value below which the rotation counts as free.
+/// Share of the spread below which the rotation counts as free: a line of 1 m with 30 µm across still passes.
 const RANK_TOLERANCE: f64 = 1e-9;
+
+/// Spread over distance from the origin below which a cloud is one place seen through rounding.
+const PLACE_TOLERANCE: f64 = 1e-12;
 
 /// The similarity `target_from_source` that minimises `Σ |y − (s R x + t)|²` (Umeyama 1991, eq. 40–43).
 ///
 /// The least-squares scale `tr(D S)/σ_x²` is used; the paper's section III-E writes the ratio of RMS radii
 /// `σ_t/σ_s`, which agrees for noise-free pairs and is available as [`rms_radius_scale`].
 pub fn umeyama_sim3(source: &[Vector3<f64>], target: &[Vector3<f64>]) -> Result<Sim3, UmeyamaError> {
-    let fit = fit(source, target)?;
-    let scale = fit.signed_trace / fit.source_variance;
-    Sim3::new(fit.rotation, fit.target_mean - fit.rotation * fit.source_mean * scale, scale)
-        .ok_or(UmeyamaError::Degenerate { first: fit.signed_trace, second: 0.0 })
+    check(source, target, 3)?;
+    similarity(&fit(source, target, |_| 1.0)?)
+}
+
+/// The similarity that minimises `Σ w |y − (s R x + t)|²`; weights are finite, not negative, three of them positive.
+///
+/// Only the ratios of weights matter. A pair of weight 0 has no influence.
+pub fn umeyama_sim3_weighted(
+    source: &[Vector3<f64>],
+    target: &[Vector3<f64>],
+    weights: &[f64],
+) -> Result<Sim3, UmeyamaError> {
+    similarity(&weighted_fit(source, target, weights)?)
 }
 
 /// The rigid motion `target_from_source` that minimises `Σ |y − (R x + t)|²`.
 pub fn umeyama_se3(source: &[Vector3<f64>], target: &[Vector3<f64>]) -> Result<Se3, UmeyamaError> {
-    let fit = fit(source, target)?;
-    Ok(Se3::new(fit.rotation, fit.target_mean - fit.rotation * fit.source_mean))
+    check(source, target, 3)?;
+    Ok(rigid(&fit(source, target, |_| 1.0)?))
+}
+
+/// The rigid motion that minimises `Σ w |y − (R x + t)|²`; weights as in [`umeyama_sim3_weighted`].
+pub fn umeyama_se3_weighted(
+    source: &[Vector3<f64>],
+    target: &[Vector3<f64>],
+    weights: &[f64],
+) -> Result<Se3, UmeyamaError> {
+    Ok(rigid(&weighted_fit(source, target, weights)?))
 }
 
 /// The paper's closed form of the scale, `σ_t/σ_s` with RMS radii (section III-E).
+///
+/// It needs no rotation, but noise on either side biases it; [`scale_about_rotation`] is the least-squares one.
 pub fn rms_radius_scale(source: &[Vector3<f64>], target: &[Vector3<f64>]) -> Result<f64, UmeyamaError> {
-    check(source, target)?;
-    let (source_variance, target_variance) =
-        (variance(source, &mean(source)), variance(target, &mean(target)));
-    let scale = (target_variance / source_variance).sqrt();
+    check(source, target, 2)?;
+    let moments = moments(source, target, |_| 1.0)?;
+    positive_scale((moments.target_variance / moments.source_variance).sqrt(), &moments)
+}
+
+/// The scale that minimises `Σ |y − (s R x + t)|²` for a known rotation R: `Σ (y − ȳ)·R(x − x̄) / Σ |x − x̄|²`.
+///
+/// The paper's `UmeyamaScale` of predicted onto odometry camera centres when the chunk's orientation is already
+/// given; points on a line and two points are enough.
+pub fn scale_about_rotation(
+    source: &[Vector3<f64>],
+    target: &[Vector3<f64>],
+    target_from_source: &So3,
+) -> Result<f64, UmeyamaError> {
+    check(source, target, 2)?;
+    let moments = moments(source, target, |_| 1.0)?;
+    let along = target_from_source.matrix().component_mul(&moments.covariance).sum();
+    positive_scale(along / moments.source_variance, &moments)
+}
+
+fn similarity(fit: &Fit) -> Result<Sim3, UmeyamaError> {
+    let scale = fit.signed_trace / fit.source_variance;
+    let translation = fit.target_mean - fit.rotation * fit.source_mean * scale;
+    Sim3::new(fit.rotation, translation, scale)
+        .filter(Sim3::is_finite)
+        .ok_or(UmeyamaError::Degenerate { first: fit.signed_trace, second: 0.0 })
+}
+
+fn rigid(fit: &Fit) -> Se3 {
+    Se3::new(fit.rotation, fit.target_mean - fit.rotation * fit.source_mean)
+}
+
+fn positive_scale(scale: f64, moments: &Moments) -> Result<f64, UmeyamaError> {
     if scale.is_finite() && scale > 0.0 {
-        Ok(scale)
-    } else {
-        Err(UmeyamaError::Degenerate { first: source_variance, second: target_variance })
+        return Ok(scale);
     }
+    Err(UmeyamaError::Degenerate { first: moments.source_variance, second: moments.target_variance })
 }
 
 struct Fit {
@@ -81,11 +154,20 @@ struct Fit {
     signed_trace: f64,
 }
 
-fn check(source: &[Vector3<f64>], target: &[Vector3<f64>]) -> Result<(), UmeyamaError> {
+struct Moments {
+    source_mean: Vector3<f64>,
+    target_mean: Vector3<f64>,
+    source_variance: f64,
+    target_variance: f64,
+    /// `Σ_xy` of eq. 38.
+    covariance: Matrix3<f64>,
+}
+
+fn check(source: &[Vector3<f64>], target: &[Vector3<f64>], needed: usize) -> Result<(), UmeyamaError> {
     if source.len() != target.len() {
         return Err(UmeyamaError::LengthMismatch { source_len: source.len(), target_len: target.len() });
     }
-    if source.len() < 3 {
+    if source.len() < needed {
         return Err(UmeyamaError::TooFewPoints { found: source.len() });
     }
     let finite = |p: &Vector3<f64>| p.iter().all(|v| v.is_finite());
@@ -95,42 +177,81 @@ fn check(source: &[Vector3<f64>], target: &[Vector3<f64>]) -> Result<(), Umeyama
     }
 }
 
-fn mean(points: &[Vector3<f64>]) -> Vector3<f64> {
-    points.iter().sum::<Vector3<f64>>() / points.len() as f64
-}
-
-fn variance(points: &[Vector3<f64>], mean: &Vector3<f64>) -> f64 {
-    points.iter().map(|p| (p - mean).norm_squared()).sum::<f64>() / points.len() as f64
-}
-
-fn fit(source: &[Vector3<f64>], target: &[Vector3<f64>]) -> Result<Fit, UmeyamaError> {
-    check(source, target)?;
-    let (source_mean, target_mean) = (mean(source), mean(target));
-    let n = source.len() as f64;
-    // Σ_xy of Umeyama eq. 38.
-    let mut covariance = Matrix3::zeros();
-    for (x, y) in source.iter().zip(target) {
-        covariance += (y - target_mean) * (x - source_mean).transpose();
+fn weighted_fit(
+    source: &[Vector3<f64>],
+    target: &[Vector3<f64>],
+    weights: &[f64],
+) -> Result<Fit, UmeyamaError> {
+    check(source, target, 3)?;
+    if weights.len() != source.len() {
+        return Err(UmeyamaError::WeightCountMismatch { points: source.len(), weights: weights.len() });
     }
-    covariance /= n;
-    let source_variance = variance(source, &source_mean);
-    let target_variance = variance(target, &target_mean);
-    let svd = covariance.svd(true, true);
-    let degenerate = |first: f64, second: f64| UmeyamaError::Degenerate { first, second };
-    let (Some(u), Some(v_t)) = (svd.u, svd.v_t) else {
-        return Err(degenerate(f64::NAN, f64::NAN));
+    if let Some(index) = weights.iter().position(|w| !(w.is_finite() && *w >= 0.0)) {
+        return Err(UmeyamaError::BadWeight { index, found: weights[index] });
+    }
+    let found = weights.iter().filter(|w| **w > 0.0).count();
+    if found < 3 {
+        return Err(UmeyamaError::TooFewPoints { found });
+    }
+    // Only ratios matter; the largest weight becomes 1, so that no sum overflows.
+    let largest = weights.iter().fold(0.0, |a: f64, &w| a.max(w));
+    fit(source, target, |i| weights[i] / largest)
+}
+
+fn mean(points: &[Vector3<f64>], weight: impl Fn(usize) -> f64) -> Vector3<f64> {
+    let total: f64 = (0..points.len()).map(&weight).sum();
+    let about = |origin: Vector3<f64>| {
+        let sum: Vector3<f64> = points.iter().enumerate().map(|(i, p)| (p - origin) * weight(i)).sum();
+        origin + sum / total
     };
-    let d = svd.singular_values;
-    // Judge the rank against the spread of the points, so that a cloud of one place is degenerate too.
-    let reference = (source_variance * target_variance).sqrt();
-    let extent = source_mean.norm().max(target_mean.norm()).max(f64::MIN_POSITIVE);
-    let spread_is_rounding = source_variance.sqrt().min(target_variance.sqrt()) <= 1e-12 * extent;
-    if spread_is_rounding || !(reference > 0.0) || d[1] <= RANK_TOLERANCE * reference {
-        return Err(degenerate(d[0], d[1]));
+    // The second pass sums small numbers, so that a cloud far from the origin keeps its digits.
+    about(about(Vector3::zeros()))
+}
+
+/// Means, variances and cross-covariance; an error when a cloud is one place, seen through rounding.
+fn moments(
+    source: &[Vector3<f64>],
+    target: &[Vector3<f64>],
+    weight: impl Fn(usize) -> f64,
+) -> Result<Moments, UmeyamaError> {
+    let (source_mean, target_mean) = (mean(source, &weight), mean(target, &weight));
+    let (mut source_variance, mut target_variance, mut total) = (0.0, 0.0, 0.0);
+    let mut covariance = Matrix3::zeros();
+    for (i, (x, y)) in source.iter().zip(target).enumerate() {
+        let (w, x, y) = (weight(i), x - source_mean, y - target_mean);
+        source_variance += w * x.norm_squared();
+        target_variance += w * y.norm_squared();
+        covariance += y * x.transpose() * w;
+        total += w;
     }
-    let reflected = u.determinant() * v_t.determinant() < 0.0;
-    let s = if reflected { -1.0 } else { 1.0 };
-    let rotation = u * Matrix3::from_diagonal(&Vector3::new(1.0, 1.0, s)) * v_t;
-    let rotation = So3::from_matrix(&rotation).ok_or_else(|| degenerate(d[0], d[1]))?;
-    Ok(Fit { rotation, source_mean, target_mean, source_variance, signed_trace: d[0] + d[1] + s * d[2] })
+    let (source_variance, target_variance) = (source_variance / total, target_variance / total);
+    let one_place = |variance: f64, mean: &Vector3<f64>| {
+        !(variance.is_finite() && variance.sqrt() > PLACE_TOLERANCE * mean.norm() && variance > 0.0)
+    };
+    if one_place(source_variance, &source_mean) || one_place(target_variance, &target_mean) {
+        return Err(UmeyamaError::Degenerate { first: source_variance, second: target_variance });
+    }
+    let covariance = covariance / total;
+    Ok(Moments { source_mean, target_mean, source_variance, target_variance, covariance })
+}
+
+fn fit(
+    source: &[Vector3<f64>],
+    target: &[Vector3<f64>],
+    weight: impl Fn(usize) -> f64,
+) -> Result<Fit, UmeyamaError> {
+    let Moments { source_mean, target_mean, source_variance, target_variance, covariance } =
+        moments(source, target, weight)?;
+    let svd =
+        proper_svd(&covariance).ok_or(UmeyamaError::Degenerate { first: covariance.amax(), second: 0.0 })?;
+    let [first, second, third] = svd.values;
+    // Turning about the first direction changes the cost by second + third: zero on a line, and for the mirror image
+    // of a cloud with two equal spreads, where two rotations are equally good.
+    let hold = second + third;
+    let degenerate = UmeyamaError::Degenerate { first, second: hold };
+    if !(hold > RANK_TOLERANCE * (source_variance * target_variance).sqrt()) {
+        return Err(degenerate);
+    }
+    let rotation = So3::from_matrix(&svd.rotation).ok_or(degenerate)?;
+    Ok(Fit { rotation, source_mean, target_mean, source_variance, signed_trace: first + hold })
 }

@@ -16,9 +16,10 @@ fn across(direction: &Vector3<f64>) -> Matrix3x2<f64> {
 
 /// How far a rounding of the pixel can turn the direction: large near a fold, where the map flattens.
 fn radians_per_pixel(camera: &CameraModel, direction: &Vector3<f64>) -> f64 {
-    let (_, jacobian) = camera.project_with_jacobian(direction).unwrap();
-    let turn: Matrix2<f64> = jacobian * across(direction);
-    1.0 / turn.singular_values().min()
+    camera.project_with_jacobian(direction).map_or(f64::INFINITY, |(_, jacobian)| {
+        let turn: Matrix2<f64> = jacobian * across(direction);
+        1.0 / turn.singular_values().min()
+    })
 }
 
 /// Directions over the whole sphere, a quarter of them close to the axis or to the side.
@@ -26,7 +27,10 @@ fn direction() -> impl Strategy<Value = Vector3<f64>> {
     let component = -1.0..1.0_f64;
     let anywhere = (component.clone(), component.clone(), component)
         .prop_filter_map("too short", |(x, y, z)| Vector3::new(x, y, z).try_normalize(0.1));
-    let near_axis = (0.0..6.3_f64, prop::sample::select(vec![0.0_f64, 1e-12, 1e-9, 1e-7, 1e-3, std::f64::consts::PI - 3e-6]))
+    let near_axis = (
+        0.0..6.3_f64,
+        prop::sample::select(vec![0.0_f64, 1e-12, 1e-9, 1e-7, 1e-3, std::f64::consts::PI - 3e-6]),
+    )
         .prop_map(|(around, off)| {
             let (sin, cos) = off.sin_cos();
             Vector3::new(sin * around.cos(), sin * around.sin(), cos)
@@ -106,8 +110,8 @@ fn parameter_jacobian_is_numeric<const N: usize, M: ParametricCamera<N>>(
     if both_sides {
         check_jacobian("d_pixel_d_parameters", &jacobian, f, &at, 1e-6).map_err(TestCaseError::fail)?;
     }
-    let (_, dynamic) = model.project_with_parameter_jacobian(point).unwrap();
-    prop_assert_eq!(dynamic.as_slice(), jacobian.as_slice());
+    let dynamic = model.project_with_parameter_jacobian(point);
+    prop_assert_eq!(dynamic.as_ref().map(|d| d.1.as_slice()), Some(jacobian.as_slice()));
     Ok(())
 }
 

@@ -67,20 +67,20 @@ impl DoubleSphere {
         (n > super::pinhole::MIN_Z * d1).then_some(Lengths { d1, z1, d2, n })
     }
 
-    fn to_pixel(&self, p: &Vector3<f64>, n: f64) -> Option<Pixel> {
+    fn pixel_of(&self, p: &Vector3<f64>, n: f64) -> Option<Pixel> {
         let k = &self.pinhole;
         finite(Vector2::new(k.fx * p.x / n + k.cx, k.fy * p.y / n + k.cy))
     }
 
     /// See [`super::CameraModel::project`].
     pub fn project(&self, p: &Vector3<f64>) -> Option<Pixel> {
-        self.to_pixel(p, self.lengths(p)?.n)
+        self.pixel_of(p, self.lengths(p)?.n)
     }
 
     /// See [`super::CameraModel::project_with_jacobian`].
     pub fn project_with_jacobian(&self, p: &Vector3<f64>) -> Option<(Pixel, Matrix2x3<f64>)> {
         let Lengths { d1, z1, d2, n } = self.lengths(p)?;
-        let pixel = self.to_pixel(p, n)?;
+        let pixel = self.pixel_of(p, n)?;
         let d_d1 = RowVector3::new(p.x, p.y, p.z) / d1;
         let d_z1 = d_d1 * self.xi + RowVector3::new(0.0, 0.0, 1.0);
         let d_d2 = (RowVector3::new(p.x, p.y, 0.0) + d_z1 * z1) / d2;
@@ -128,7 +128,7 @@ impl ParametricCamera<6> for DoubleSphere {
 
     fn project_with_parameter_jacobian(&self, p: &Vector3<f64>) -> Option<(Pixel, SMatrix<f64, 2, 6>)> {
         let Lengths { d1, z1, d2, n } = self.lengths(p)?;
-        let pixel = self.to_pixel(p, n)?;
+        let pixel = self.pixel_of(p, n)?;
         let (x, y) = (p.x / n, p.y / n);
         let d_n_d_xi = d1 * (self.alpha * z1 / d2 + 1.0 - self.alpha);
         let d_n_d_alpha = d2 - z1;

@@ -81,20 +81,20 @@ impl Equidistant {
         Some(Direction { r, norm2, theta, slope, g, on_axis })
     }
 
-    fn to_pixel(&self, p: &Vector3<f64>, g: f64) -> Option<Pixel> {
+    fn pixel_of(&self, p: &Vector3<f64>, g: f64) -> Option<Pixel> {
         let k = &self.pinhole;
         finite(Vector2::new(k.fx * g * p.x + k.cx, k.fy * g * p.y + k.cy))
     }
 
     /// See [`super::CameraModel::project`].
     pub fn project(&self, p: &Vector3<f64>) -> Option<Pixel> {
-        self.to_pixel(p, self.direction(p)?.g)
+        self.pixel_of(p, self.direction(p)?.g)
     }
 
     /// See [`super::CameraModel::project_with_jacobian`].
     pub fn project_with_jacobian(&self, p: &Vector3<f64>) -> Option<(Pixel, Matrix2x3<f64>)> {
         let Direction { r, norm2, slope, g, on_axis, .. } = self.direction(p)?;
-        let pixel = self.to_pixel(p, g)?;
+        let pixel = self.pixel_of(p, g)?;
         let d_g = if on_axis {
             RowVector3::new(0.0, 0.0, -g / p.z)
         } else {
@@ -159,7 +159,7 @@ impl ParametricCamera<8> for Equidistant {
 
     fn project_with_parameter_jacobian(&self, p: &Vector3<f64>) -> Option<(Pixel, SMatrix<f64, 2, 8>)> {
         let Direction { r, theta, g, on_axis, .. } = self.direction(p)?;
-        let pixel = self.to_pixel(p, g)?;
+        let pixel = self.pixel_of(p, g)?;
         let (fx, fy) = (self.pinhole.fx, self.pinhole.fy);
         let mut jacobian = SMatrix::<f64, 2, 8>::zeros();
         (jacobian[(0, 0)], jacobian[(1, 1)]) = (g * p.x, g * p.y);

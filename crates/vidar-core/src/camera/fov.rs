@@ -48,20 +48,20 @@ impl Fov {
         Some(Radius { r, c, g, on_axis })
     }
 
-    fn to_pixel(&self, p: &Vector3<f64>, g: f64) -> Option<Pixel> {
+    fn pixel_of(&self, p: &Vector3<f64>, g: f64) -> Option<Pixel> {
         let k = &self.pinhole;
         finite(Vector2::new(k.fx * g * p.x + k.cx, k.fy * g * p.y + k.cy))
     }
 
     /// See [`super::CameraModel::project`].
     pub fn project(&self, p: &Vector3<f64>) -> Option<Pixel> {
-        self.to_pixel(p, self.radius(p)?.g)
+        self.pixel_of(p, self.radius(p)?.g)
     }
 
     /// See [`super::CameraModel::project_with_jacobian`].
     pub fn project_with_jacobian(&self, p: &Vector3<f64>) -> Option<(Pixel, Matrix2x3<f64>)> {
         let Radius { r, c, g, on_axis } = self.radius(p)?;
-        let pixel = self.to_pixel(p, g)?;
+        let pixel = self.pixel_of(p, g)?;
         let d_g = if on_axis {
             RowVector3::new(0.0, 0.0, -g / p.z)
         } else {
@@ -111,7 +111,7 @@ impl ParametricCamera<5> for Fov {
 
     fn project_with_parameter_jacobian(&self, p: &Vector3<f64>) -> Option<(Pixel, SMatrix<f64, 2, 5>)> {
         let Radius { r, c, g, .. } = self.radius(p)?;
-        let pixel = self.to_pixel(p, g)?;
+        let pixel = self.pixel_of(p, g)?;
         // dc/dω = 1/cos²(ω/2) = 1 + c²/4; the atan2's part by c is Z·r/(c²r² + Z²), here over r.
         let d_angle = (1.0 + 0.25 * c * c) * p.z / (c * c * r * r + p.z * p.z);
         let d_g_d_omega = (d_angle - g) / self.omega;

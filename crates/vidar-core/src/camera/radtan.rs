@@ -62,7 +62,7 @@ impl RadTan {
         Some((n, distorted, d_distorted_d_n))
     }
 
-    fn to_pixel(&self, distorted: &Vector2<f64>) -> Option<Pixel> {
+    fn pixel_of(&self, distorted: &Vector2<f64>) -> Option<Pixel> {
         let k = &self.pinhole;
         finite(Vector2::new(k.fx * distorted.x + k.cx, k.fy * distorted.y + k.cy))
     }
@@ -70,13 +70,13 @@ impl RadTan {
     /// See [`super::CameraModel::project`].
     pub fn project(&self, p: &Vector3<f64>) -> Option<Pixel> {
         let (_, distorted, _) = self.normalised(p)?;
-        self.to_pixel(&distorted)
+        self.pixel_of(&distorted)
     }
 
     /// See [`super::CameraModel::project_with_jacobian`].
     pub fn project_with_jacobian(&self, p: &Vector3<f64>) -> Option<(Pixel, Matrix2x3<f64>)> {
         let (n, distorted, d_distorted_d_n) = self.normalised(p)?;
-        let pixel = self.to_pixel(&distorted)?;
+        let pixel = self.pixel_of(&distorted)?;
         let iz = 1.0 / p.z;
         let d_n_d_point = Matrix2x3::new(iz, 0.0, -n.x * iz, 0.0, iz, -n.y * iz);
         let d_pixel_d_distorted = Matrix2::new(self.pinhole.fx, 0.0, 0.0, self.pinhole.fy);
@@ -151,7 +151,7 @@ impl ParametricCamera<8> for RadTan {
 
     fn project_with_parameter_jacobian(&self, p: &Vector3<f64>) -> Option<(Pixel, SMatrix<f64, 2, 8>)> {
         let (n, distorted, _) = self.normalised(p)?;
-        let pixel = self.to_pixel(&distorted)?;
+        let pixel = self.pixel_of(&distorted)?;
         let (x, y, r2) = (n.x, n.y, n.norm_squared());
         let (fx, fy) = (self.pinhole.fx, self.pinhole.fy);
         #[rustfmt::skip]
