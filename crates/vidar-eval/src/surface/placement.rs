@@ -1,0 +1,196 @@
+//! Laying the estimate onto the reference: the bounded native placement and the free ones.
+
+use super::PlacementStart;
+use super::cloud::{subset, transformed};
+use super::config::{IcpConfig, OnRefusal, SurfaceEvalConfig};
+use super::report::PlacementReport;
+use crate::error::EvalError;
+use crate::nearest::NearestIndex;
+use nalgebra::Vector3;
+use vidar_core::{Se3, Sim3, UmeyamaError, Warning, umeyama_se3, umeyama_sim3};
+
+/// A placement and the start that led to it.
+pub(super) struct Placement {
+    pub start: &'static str,
+    pub truth_from_estimate: Sim3,
+}
+
+/// The native placement with the evidence for it.
+pub(super) struct Refinement {
+    pub truth_from_estimate: Sim3,
+    accepted: bool,
+    reason: String,
+    /// Where the similarity ICP ended, taken or not.
+    refined: Option<IcpResult>,
+}
+
+/// Where an ICP ended.
+#[derive(Clone, Copy)]
+struct IcpResult {
+    truth_from_estimate: Sim3,
+    iterations: usize,
+    converged: bool,
+    rms_before_m: f64,
+    rms_after_m: f64,
+}
+
+/// Which transforms an ICP may use.
+#[derive(Clone, Copy)]
+enum Motion {
+    Rigid,
+    Similarity,
+}
+
+/// The SE(3) fit, refined by one similarity ICP when its scale is within bounds (the paper's eq. in section IV-B).
+pub(super) fn native_placement(
+    estimated: &[[f32; 3]],
+    reference: &NearestIndex,
+    start: &PlacementStart,
+    config: &SurfaceEvalConfig,
+) -> Result<Refinement, EvalError> {
+    let rigid = Sim3::from_se3(&start.truth_from_estimate);
+    let points = subset(estimated, config.icp.max_points);
+    let bounds = &config.scale_bounds;
+    let refined = icp(&points, reference, &rigid, Motion::Similarity, &config.icp);
+    let refusal = match &refined {
+        Err(error) => format!("refinement failed: {error}"),
+        Ok(r) if !bounds.contains(r.truth_from_estimate.scale) => format!(
+            "refined scale {:.4} is outside [{}, {}]",
+            r.truth_from_estimate.scale, bounds.min, bounds.max
+        ),
+        Ok(r) if r.rms_after_m > r.rms_before_m => {
+            format!("refinement made the fit worse: RMS {:.4} m from {:.4} m", r.rms_after_m, r.rms_before_m)
+        }
+        Ok(r) => {
+            let scale = r.truth_from_estimate.scale;
+            let reason = format!("refined scale {scale:.4} is within [{}, {}]", bounds.min, bounds.max);
+            let truth_from_estimate = r.truth_from_estimate;
+            return Ok(Refinement { truth_from_estimate, accepted: true, reason, refined: Some(*r) });
+        }
+    };
+    let kept = match config.on_refusal {
+        OnRefusal::KeepRigidFit => rigid,
+        OnRefusal::RefineRigid => icp(&points, reference, &rigid, Motion::Rigid, &config.icp)
+            .ok()
+            .filter(|r| r.rms_after_m <= r.rms_before_m)
+            .map_or(rigid, |r| r.truth_from_estimate),
+    };
+    Ok(Refinement { truth_from_estimate: kept, accepted: false, reason: refusal, refined: refined.ok() })
+}
+
+/// Placements of any scale: the refinement that was refused, and one from the trajectories' Sim(3) fit.
+pub(super) fn free_candidates(
+    estimated: &[[f32; 3]],
+    reference: &NearestIndex,
+    start: &PlacementStart,
+    config: &SurfaceEvalConfig,
+    native: &Refinement,
+) -> Result<Vec<Placement>, EvalError> {
+    let mut candidates = Vec::new();
+    if let (false, Some(refused)) = (native.accepted, &native.refined) {
+        candidates.push(Placement { start: "rigid-start", truth_from_estimate: refused.truth_from_estimate });
+    }
+    if let Some(similarity) = &start.truth_from_estimate_sim3 {
+        candidates.push(Placement { start: "similarity-start", truth_from_estimate: *similarity });
+        let points = subset(estimated, config.icp.max_points);
+        if let Ok(refined) = icp(&points, reference, similarity, Motion::Similarity, &config.icp) {
+            let truth_from_estimate = refined.truth_from_estimate;
+            candidates.push(Placement { start: "similarity-start-refined", truth_from_estimate });
+        }
+    }
+    Ok(candidates)
+}
+
+/// Trimmed point-to-point ICP from `start`: `min Σ |T x − y(x)|²` over the nearest pairs, one closed form per step.
+fn icp(
+    points: &[[f32; 3]],
+    reference: &NearestIndex,
+    start: &Sim3,
+    motion: Motion,
+    config: &IcpConfig,
+) -> Result<IcpResult, UmeyamaError> {
+    let mut current = *start;
+    let mut pairs = trimmed_pairs(points, reference, &current, config.keep_ratio);
+    let rms_before_m = pairs.rms_m;
+    let (mut iterations, mut converged) = (0, false);
+    while iterations < config.max_iterations && !converged {
+        let next = match motion {
+            Motion::Similarity => umeyama_sim3(&pairs.source, &pairs.target)?,
+            Motion::Rigid => rigid_step(&pairs, start.scale)?,
+        };
+        iterations += 1;
+        converged = step_rms(&pairs.source, &current, &next) <= config.tolerance_m;
+        current = next;
+        pairs = trimmed_pairs(points, reference, &current, config.keep_ratio);
+    }
+    Ok(IcpResult {
+        truth_from_estimate: current,
+        iterations,
+        converged,
+        rms_before_m,
+        rms_after_m: pairs.rms_m,
+    })
+}
+
+/// The best motion that keeps the scale.
+fn rigid_step(pairs: &Pairs, scale: f64) -> Result<Sim3, UmeyamaError> {
+    let scaled: Vec<_> = pairs.source.iter().map(|p| p * scale).collect();
+    let Se3 { rotation, translation } = umeyama_se3(&scaled, &pairs.target)?;
+    Ok(Sim3 { rotation, translation, scale })
+}
+
+/// Points of the estimate (in its own world) with their nearest points of the reference.
+struct Pairs {
+    source: Vec<Vector3<f64>>,
+    target: Vec<Vector3<f64>>,
+    rms_m: f64,
+}
+
+fn trimmed_pairs(points: &[[f32; 3]], reference: &NearestIndex, t: &Sim3, keep_ratio: f64) -> Pairs {
+    let placed = transformed(points, t);
+    let neighbours = reference.nearest_all(&placed, None);
+    let mut found: Vec<_> =
+        neighbours.iter().zip(points).filter_map(|(n, p)| n.map(|n| (n.distance_m, p, n.position))).collect();
+    let keep = ((found.len() as f64 * keep_ratio).ceil() as usize).min(found.len());
+    // A stable order of equal distances keeps the sums below the same on every run.
+    found.sort_by(|a, b| a.0.total_cmp(&b.0));
+    found.truncate(keep);
+    let sum: f64 = found.iter().map(|(d, _, _)| d * d).sum();
+    let to_f64 = |p: [f32; 3]| Vector3::from(p).cast::<f64>();
+    Pairs {
+        source: found.iter().map(|(_, p, _)| to_f64(**p)).collect(),
+        target: found.iter().map(|(_, _, q)| to_f64(*q)).collect(),
+        rms_m: (sum / keep.max(1) as f64).sqrt(),
+    }
+}
+
+fn step_rms(points: &[Vector3<f64>], from: &Sim3, to: &Sim3) -> f64 {
+    let sum: f64 = points.iter().map(|p| (*from * *p - *to * *p).norm_squared()).sum();
+    (sum / points.len().max(1) as f64).sqrt()
+}
+
+impl Refinement {
+    pub(super) fn report(&self) -> PlacementReport {
+        PlacementReport {
+            truth_from_estimate: self.truth_from_estimate.into(),
+            accepted: self.accepted,
+            reason: self.reason.clone(),
+            refined_scale: self.refined.map(|r| r.truth_from_estimate.scale),
+            iterations: self.refined.map_or(0, |r| r.iterations),
+            converged: self.refined.is_some_and(|r| r.converged),
+            rms_before_m: self.refined.map(|r| r.rms_before_m),
+            rms_after_m: self.refined.map(|r| r.rms_after_m),
+        }
+    }
+
+    pub(super) fn refusal_warning(&self, config: &SurfaceEvalConfig) -> Option<Warning> {
+        let kept = match config.on_refusal {
+            OnRefusal::KeepRigidFit => "the SE(3) fit was kept",
+            OnRefusal::RefineRigid => "the SE(3) fit was refined without scale",
+        };
+        (!self.accepted).then(|| {
+            Warning::new("placement-refused", format!("{}; {kept}", self.reason))
+                .hint("compare scale_free and delta_f: a large difference means that the scale is not metric")
+        })
+    }
+}
