@@ -1,1 +1,31 @@
 //! Synthetic worlds in EuRoC layout: exact flight, camera, IMU, depth and scan; deterministic by seed.
+//!
+//! One smooth curve ([`FlightPath`]) is the truth from which everything follows: images and depth by ray casting a
+//! furnished [`World`], inertial readings from the curve's derivatives, a reference cloud of the surface that the
+//! camera saw. [`write_sequence`] writes all of it as a EuRoC folder; [`render_views`] keeps it in memory.
+//!
+//! Every random number is drawn from a stream that belongs to its purpose and frame, so that the same [`SynthConfig`]
+//! gives the same bytes for any number of threads.
+
+mod config;
+mod error;
+mod flight;
+mod imu;
+mod layout;
+mod photometry;
+mod png_file;
+mod random;
+mod render;
+mod rig;
+mod scan;
+mod sequence;
+mod world;
+
+pub use config::{FlightKind, SceneKind, Start, SynthConfig};
+pub use error::SynthError;
+pub use flight::{FlightPath, FlightState};
+pub use imu::{ImuRecord, simulate_imu};
+pub use render::{RenderedView, SynthView, render_views};
+pub use rig::{euroc_body_from_camera, euroc_camera, euroc_rig};
+pub use sequence::{SynthSummary, write_sequence};
+pub use world::{Extent, Hit, World};

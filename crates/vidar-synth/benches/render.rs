@@ -1,0 +1,5 @@
+//! Rays per second of the renderer.
+
+fn main() {
+    divan::main();
+}

@@ -1,0 +1,177 @@
+//! The texts and clouds of a EuRoC folder (ASL format).
+
+use crate::config::SynthConfig;
+use crate::error::SynthError;
+use crate::flight::FlightPath;
+use crate::imu::ImuRecord;
+use crate::rig::EUROC_BODY_FROM_CAMERA;
+use crate::scan::ScanPoint;
+use std::fmt::Write as _;
+use std::fs::File;
+use std::io::{BufWriter, Write as _};
+use std::path::Path;
+use vidar_core::{CameraModel, Timestamp};
+
+/// Stamp of the sequence's beginning: a day in 2020, so that stamps have as many digits as real ones.
+const EPOCH_NANOS: i64 = 1_600_000_000_000_000_000;
+
+/// Stamp of sample `k` at `rate_hz`, and the instant (s after the beginning) that the rounded stamp names.
+pub(crate) fn stamp(k: usize, rate_hz: f64) -> (Timestamp, f64) {
+    let nanos = (k as f64 * 1e9 / rate_hz).round() as i64;
+    (Timestamp::from_nanos(EPOCH_NANOS + nanos), nanos as f64 * 1e-9)
+}
+
+/// `data.csv` of a camera or a depth camera.
+pub(crate) fn image_list(times: &[Timestamp]) -> String {
+    let mut text = String::from("#timestamp [ns],filename\n");
+    for t in times {
+        let _ = writeln!(text, "{0},{0}.png", t.nanos());
+    }
+    text
+}
+
+/// `data.csv` of the IMU.
+pub(crate) fn imu_list(record: &ImuRecord) -> String {
+    let mut text = String::from(
+        "#timestamp [ns],w_RS_S_x [rad s^-1],w_RS_S_y [rad s^-1],w_RS_S_z [rad s^-1],\
+         a_RS_S_x [m s^-2],a_RS_S_y [m s^-2],a_RS_S_z [m s^-2]\n",
+    );
+    for s in &record.samples {
+        let (w, a) = (s.gyro.0, s.accel.0);
+        let t = s.time.nanos();
+        let _ = writeln!(text, "{t},{:.12},{:.12},{:.12},{:.10},{:.10},{:.10}", w.x, w.y, w.z, a.x, a.y, a.z);
+    }
+    text
+}
+
+/// `data.csv` of the ground truth: EuRoC's 17 columns.
+pub(crate) fn truth_list(flight: &FlightPath, record: &ImuRecord, rate_hz: f64) -> String {
+    let mut text = String::from(
+        "#timestamp, p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w [], q_RS_x [], q_RS_y [], q_RS_z [], \
+         v_RS_R_x [m s^-1], v_RS_R_y [m s^-1], v_RS_R_z [m s^-1], b_w_RS_S_x [rad s^-1], b_w_RS_S_y [rad s^-1], \
+         b_w_RS_S_z [rad s^-1], b_a_RS_S_x [m s^-2], b_a_RS_S_y [m s^-2], b_a_RS_S_z [m s^-2]\n",
+    );
+    for (k, (bw, ba)) in record.gyro_bias.iter().zip(&record.accel_bias).enumerate() {
+        let (time, secs) = stamp(k, rate_hz);
+        let state = flight.state(secs);
+        let (p, v) = (state.world_from_body.translation, state.velocity_in_world);
+        let [x, y, z, w] = state.world_from_body.rotation.quaternion_xyzw();
+        let _ =
+            write!(text, "{},{:.9},{:.9},{:.9},{w:.12},{x:.12},{y:.12},{z:.12}", time.nanos(), p.x, p.y, p.z);
+        for part in [v, *bw, *ba] {
+            let _ = write!(text, ",{:.9},{:.9},{:.9}", part.x, part.y, part.z);
+        }
+        text.push('\n');
+    }
+    text
+}
+
+fn transform_yaml(matrix: &[f64; 16]) -> String {
+    let mut text = String::from("T_BS:\n  cols: 4\n  rows: 4\n  data: [");
+    for (i, value) in matrix.iter().enumerate() {
+        let gap = if i == 15 {
+            "]\n"
+        } else if i % 4 == 3 {
+            ",\n         "
+        } else {
+            ", "
+        };
+        let _ = write!(text, "{value:?}{gap}");
+    }
+    text
+}
+
+#[rustfmt::skip]
+const IDENTITY: [f64; 16] =
+    [1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0];
+
+/// `sensor.yaml` of cam0, or, with `depth_units_per_metre`, of the depth registered to cam0's pixels.
+pub(crate) fn camera_yaml(
+    camera: &CameraModel,
+    distortion: [f64; 4],
+    rate_hz: f64,
+    depth_units_per_metre: Option<u32>,
+) -> String {
+    let k = camera.intrinsics();
+    let kind = if depth_units_per_metre.is_some() { "depth" } else { "camera" };
+    let comment = if depth_units_per_metre.is_some() {
+        "exact z-depth along the optical axis of cam0, registered to cam0's (distorted) pixels"
+    } else {
+        "simulated VI-Sensor cam0"
+    };
+    let mut text =
+        format!("%YAML:1.0\n# General sensor definitions.\nsensor_type: {kind}\ncomment: {comment}\n\n");
+    text.push_str("# Sensor extrinsics wrt. the body-frame.\n");
+    text.push_str(&transform_yaml(&EUROC_BODY_FROM_CAMERA));
+    let _ = write!(
+        text,
+        "\n# Camera specific definitions.\nrate_hz: {rate_hz}\nresolution: [{}, {}]\ncamera_model: pinhole\n\
+         intrinsics: [{:?}, {:?}, {:?}, {:?}] #fu, fv, cu, cv\ndistortion_model: radial-tangential\n\
+         distortion_coefficients: {distortion:?}\n",
+        k.width, k.height, k.fx, k.fy, k.cx, k.cy
+    );
+    if let Some(units) = depth_units_per_metre {
+        let _ = write!(
+            text,
+            "\n# 16-bit value = depth in metres times this; 0 = no depth.\nunits_per_metre: {units}\n"
+        );
+    }
+    text
+}
+
+/// `sensor.yaml` of the IMU.
+pub(crate) fn imu_yaml(config: &SynthConfig) -> String {
+    let n = &config.imu_noise;
+    let s = config.imu_noise_scale;
+    format!(
+        "%YAML:1.0\n# General sensor definitions.\nsensor_type: imu\ncomment: simulated IMU\n\n\
+         # Sensor extrinsics wrt. the body-frame.\n{}rate_hz: {}\n\n\
+         # inertial sensor noise model parameters (static)\n\
+         gyroscope_noise_density: {:?}     # [ rad / s / sqrt(Hz) ]   ( gyro \"white noise\" )\n\
+         gyroscope_random_walk: {:?}       # [ rad / s^2 / sqrt(Hz) ] ( gyro bias diffusion )\n\
+         accelerometer_noise_density: {:?}  # [ m / s^2 / sqrt(Hz) ]   ( accel \"white noise\" )\n\
+         accelerometer_random_walk: {:?}    # [ m / s^3 / sqrt(Hz) ].  ( accel bias diffusion )\n",
+        transform_yaml(&IDENTITY),
+        config.imu_rate_hz,
+        // A noise-free IMU still states its data sheet, since estimators divide by it.
+        n.gyro_noise_density * if s > 0.0 { s } else { 1.0 },
+        n.gyro_random_walk * if s > 0.0 { s } else { 1.0 },
+        n.accel_noise_density * if s > 0.0 { s } else { 1.0 },
+        n.accel_random_walk * if s > 0.0 { s } else { 1.0 },
+    )
+}
+
+/// `sensor.yaml` of a sensor that is at the body or in the world itself.
+pub(crate) fn plain_yaml(sensor_type: &str, comment: &str) -> String {
+    let transform = transform_yaml(&IDENTITY);
+    format!(
+        "%YAML:1.0\n# General sensor definitions.\nsensor_type: {sensor_type}\ncomment: {comment}\n\n{transform}"
+    )
+}
+
+/// Writes a text file.
+pub(crate) fn write_text(path: &Path, text: &str) -> Result<(), SynthError> {
+    std::fs::write(path, text).map_err(SynthError::write(path))
+}
+
+/// Writes a binary PLY of positions in the world (float32) and grey as colour.
+pub(crate) fn write_ply(path: &Path, points: &[ScanPoint]) -> Result<(), SynthError> {
+    let write = || -> std::io::Result<()> {
+        let mut file = BufWriter::new(File::create(path)?);
+        write!(
+            file,
+            "ply\nformat binary_little_endian 1.0\ncomment world frame, metres\nelement vertex {}\n\
+             property float x\nproperty float y\nproperty float z\n\
+             property uchar red\nproperty uchar green\nproperty uchar blue\nend_header\n",
+            points.len()
+        )?;
+        for p in points {
+            for k in 0..3 {
+                file.write_all(&(p.position[k] as f32).to_le_bytes())?;
+            }
+            file.write_all(&[p.gray; 3])?;
+        }
+        file.flush()
+    };
+    write().map_err(SynthError::write(path))
+}

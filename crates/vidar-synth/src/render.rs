@@ -1,0 +1,145 @@
+//! Pictures and depth of a world by casting rays.
+//!
+//! Rays of one pixel are spread over the exposure (motion blur) and over the pixel's area (smooth silhouettes);
+//! textures are read with the ray's footprint. Depth is that of the pixel's centre at the middle of the exposure.
+
+use crate::error::SynthError;
+use crate::world::World;
+use nalgebra::Vector3;
+use rayon::prelude::*;
+use vidar_core::{CameraModel, FrameImage, Image, MetricDepth, Se3};
+
+/// The directions (z = 1) into which a camera's pixels look, for each of a set of places within the pixel.
+pub(crate) struct RayTable {
+    width: usize,
+    height: usize,
+    /// Per sample, per pixel: x and y at z = 1; NaN where the camera model does not hold.
+    samples: Vec<Vec<[f64; 2]>>,
+    /// Angle between neighbouring pixels near the axis, rad.
+    pixel_angle: f64,
+}
+
+impl RayTable {
+    /// A table of `samples` places per pixel; the middle one is the pixel's centre.
+    pub(crate) fn new(camera: &CameraModel, samples: usize) -> Self {
+        let (width, height) = (camera.width(), camera.height());
+        let samples = (0..samples)
+            .map(|s| {
+                let [dx, dy] = place_in_pixel(s, samples);
+                let ray = |i: usize| {
+                    let pixel = nalgebra::Vector2::new((i % width) as f64 + dx, (i / width) as f64 + dy);
+                    camera.unproject(&pixel).map_or([f64::NAN; 2], |r| [r.x / r.z, r.y / r.z])
+                };
+                (0..width * height).into_par_iter().map(ray).collect()
+            })
+            .collect();
+        Self { width, height, samples, pixel_angle: 1.0 / camera.intrinsics().fx }
+    }
+
+    /// The sample whose place is the pixel's centre.
+    pub(crate) fn centre(&self) -> usize {
+        self.samples.len() / 2
+    }
+}
+
+/// Sample `s` of `n` within the pixel, by the R2 sequence (Roberts 2018) shifted so that the middle one is the centre.
+fn place_in_pixel(s: usize, n: usize) -> [f64; 2] {
+    let k = s as f64 - (n / 2) as f64;
+    [0.754_877_666_246_69, 0.569_840_290_998_05].map(|a| {
+        let x = k * a;
+        x - x.round()
+    })
+}
+
+/// Radiance and z-depth of one frame.
+pub(crate) struct Exposed {
+    /// Mean radiance over the exposure, 0…1.
+    pub radiance: Vec<f32>,
+    /// z-depth of the pixel's centre at the middle of the exposure, m; NaN where there is none.
+    pub depth: Vec<f32>,
+}
+
+/// Renders the frame whose sample `s` is taken from pose `world_from_camera(s)`.
+pub(crate) fn expose(world: &World, rays: &RayTable, world_from_camera: &[Se3]) -> Exposed {
+    let n = rays.width * rays.height;
+    let mut radiance = vec![0.0_f32; n];
+    let mut depth = vec![f32::NAN; n];
+    let share = 1.0 / rays.samples.len() as f32;
+    for (s, directions) in rays.samples.iter().enumerate() {
+        let rotation = world_from_camera[s].rotation.matrix();
+        let origin = world_from_camera[s].translation;
+        let is_centre = s == rays.centre();
+        let pixels = radiance.par_chunks_mut(rays.width).zip(depth.par_chunks_mut(rays.width));
+        pixels.zip(directions.par_chunks(rays.width)).for_each(|((radiance, depth), directions)| {
+            for ((radiance, depth), &[x, y]) in radiance.iter_mut().zip(depth).zip(directions) {
+                if x.is_nan() {
+                    continue;
+                }
+                let direction = rotation * Vector3::new(x, y, 1.0);
+                let Some(hit) = world.cast(&origin, &direction) else {
+                    continue;
+                };
+                *radiance += share
+                    * world.radiance(&hit, footprint_m(&hit.normal, &direction, hit.t, rays.pixel_angle));
+                if is_centre {
+                    *depth = hit.t as f32;
+                }
+            }
+        });
+    }
+    Exposed { radiance, depth }
+}
+
+/// Width of the surface that a pixel sees: the geometric mean of the ellipse's axes, slightly toward the longer one.
+///
+/// The shorter axis would alias at grazing angles, the longer one would blur floors away.
+fn footprint_m(normal: &Vector3<f64>, direction: &Vector3<f64>, t: f64, pixel_angle: f64) -> f64 {
+    let length = direction.norm();
+    let cosine = (normal.dot(direction).abs() / length).max(0.05);
+    pixel_angle * t * length * cosine.powf(-0.65)
+}
+
+/// A place to look from.
+#[derive(Clone, Debug)]
+pub struct SynthView {
+    /// Pose of the camera.
+    pub world_from_camera: Se3,
+    /// How the camera projects, any model.
+    pub camera: CameraModel,
+}
+
+/// What is seen from a place.
+#[derive(Clone, Debug)]
+pub struct RenderedView {
+    /// The picture without noise, 8-bit grey, exposure 1.
+    pub image: FrameImage,
+    /// Exact z-depth at the pixel centres, m; NaN where a pixel sees nothing.
+    pub depth: MetricDepth,
+}
+
+/// Pictures and exact depth of `world` from arbitrary places, without noise or blur, `samples` rays per pixel.
+///
+/// Deterministic, and parallel over pixels.
+///
+/// # Errors
+/// `samples` outside 1…64.
+pub fn render_views(
+    world: &World,
+    views: &[SynthView],
+    samples: usize,
+) -> Result<Vec<RenderedView>, SynthError> {
+    if !(1..=64).contains(&samples) {
+        let found = samples.to_string();
+        return Err(SynthError::BadConfig { key: "samples", expected: "1 to 64", found });
+    }
+    Ok(views.iter().map(|view| render_view(world, view, samples)).collect())
+}
+
+fn render_view(world: &World, view: &SynthView, samples: usize) -> RenderedView {
+    let rays = RayTable::new(&view.camera, samples);
+    let exposed = expose(world, &rays, &vec![view.world_from_camera; samples]);
+    let (width, height) = (rays.width, rays.height);
+    let image = Image::from_fn(width, height, |x, y| (exposed.radiance[y * width + x] * 255.0).round() as u8);
+    let depth = Image::from_fn(width, height, |x, y| exposed.depth[y * width + x]);
+    RenderedView { image: FrameImage::Gray8(image), depth: MetricDepth::new(depth) }
+}
