@@ -246,6 +246,3 @@ fn applied_transform(rows: Option<Vec<[f64; 4]>>) -> Result<[[f64; 4]; 3], Expor
         )),
     }
 }
-
-#[cfg(test)]
-mod tests;

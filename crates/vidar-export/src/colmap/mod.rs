@@ -237,6 +237,3 @@ fn unsupported_model(place: String, model: &str) -> ExportError {
         hint: "undistort the model first (colmap image_undistorter), so that it is PINHOLE",
     }
 }
-
-#[cfg(test)]
-mod tests;

@@ -55,4 +55,16 @@ fn srgb_from_linear(linear: f64) -> u8 {
 }
 
 #[cfg(test)]
-mod tests;
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_srgb_byte_survives_linear_sixteen_bits() {
+        for byte in 0..=255 {
+            assert_eq!(srgb_from_linear(f64::from(linear_from_srgb(byte)) / 65_535.0), byte);
+        }
+        // IEC 61966-2-1: mid grey 188 is half of the light.
+        assert!((f64::from(linear_from_srgb(188)) / 65_535.0 - 0.5).abs() < 0.005);
+        assert_eq!([srgb_from_linear(f64::NAN), srgb_from_linear(-1.0), srgb_from_linear(9.0)], [0, 0, 255]);
+    }
+}

@@ -22,6 +22,3 @@ pub use read::{Ply, read_ply};
 pub use write::{write_ply_cloud, write_ply_mesh};
 
 pub(crate) const FORMAT: &str = "PLY";
-
-#[cfg(test)]
-mod tests;
