@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 ///
 /// There is no maximal weight on purpose: a running average that forgets depends on the order of the views,
 /// and this crate promises the same bits for every order.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct FusionConfig {
     /// Edge of a voxel, metres, 0.0005 to 10. Smaller shows more detail and costs memory with its inverse square.

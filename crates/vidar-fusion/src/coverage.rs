@@ -1,6 +1,11 @@
 //! What was seen, how often and how surely.
 
+use crate::field::Field;
+use crate::grid::{NODES, node_of};
+use crate::volume::TsdfVolume;
+use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
+use vidar_core::TriangleMesh;
 
 /// One voxel of a [`DensityMap`].
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
@@ -13,7 +18,7 @@ pub struct DensityCell {
     pub mean_confidence: f32,
 }
 
-/// Observation count and mean confidence of every voxel that the surface passes, sorted by index.
+/// Observation count and mean confidence of every voxel within one voxel of the surface, sorted by block and node.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct DensityMap {
     /// Edge of a voxel, metres.
@@ -27,11 +32,12 @@ pub struct DensityMap {
 pub struct CoverageReport {
     /// Area of the extracted mesh, m².
     pub surface_area_m2: f64,
-    /// Space that was seen, free or surface, m³.
+    /// Space that was seen, free or near surface, m³: voxels with an observation and blocks seen empty (those only
+    /// within the carving range).
     pub observed_volume_m3: f64,
     /// Smallest and largest corner of the mesh in the world, metres; `None` when it is empty.
     pub bounds_m: Option<[[f32; 3]; 2]>,
-    /// Surface voxels that were judged.
+    /// Voxels within one voxel of the surface.
     pub surface_voxels: u64,
     /// Mean number of views of a surface voxel.
     pub mean_observations: f64,
@@ -41,4 +47,70 @@ pub struct CoverageReport {
     pub share_seen_by_3_or_more: f64,
     /// Views that were fused.
     pub views: u32,
+}
+
+impl TsdfVolume {
+    /// How often and how surely each voxel of the surface was seen.
+    pub fn density_map(&self) -> DensityMap {
+        let field = Field::new(self);
+        let one_voxel = 1.0 / self.config().truncation_voxels as f32;
+        let cells: Vec<Vec<DensityCell>> = (0..field.len())
+            .into_par_iter()
+            .map(|at| {
+                let block = field.blocks[at];
+                (0..NODES)
+                    .filter(|&node| field.value(at, node).abs() <= one_voxel)
+                    .map(|node| DensityCell {
+                        index: node_of(field.keys[at], node),
+                        observations: u32::from(block.count[node]),
+                        mean_confidence: block.mean_confidence(node),
+                    })
+                    .collect()
+            })
+            .collect();
+        DensityMap { voxel_size_m: self.config().voxel_size_m, cells: cells.concat() }
+    }
+
+    /// The coverage of this volume, whose extracted mesh is `mesh`.
+    pub fn coverage(&self, mesh: &TriangleMesh) -> CoverageReport {
+        let cells = self.density_map().cells;
+        // Integer and sequential sums: nothing here depends on the number of threads.
+        let observations: u64 = cells.iter().map(|c| u64::from(c.observations)).sum();
+        let confidence: f64 = cells.iter().map(|c| f64::from(c.mean_confidence)).sum();
+        let often = cells.iter().filter(|c| c.observations >= 3).count();
+        let n = cells.len().max(1) as f64;
+        CoverageReport {
+            surface_area_m2: surface_area_m2(mesh),
+            observed_volume_m3: self.observed_nodes() as f64 * self.config().voxel_size_m.powi(3),
+            bounds_m: bounds(mesh),
+            surface_voxels: cells.len() as u64,
+            mean_observations: observations as f64 / n,
+            mean_confidence: confidence / n,
+            share_seen_by_3_or_more: often as f64 / n,
+            views: self.views(),
+        }
+    }
+
+    /// Nodes with an observation, with all nodes of blocks that were seen empty.
+    fn observed_nodes(&self) -> u64 {
+        let within_blocks: usize = (self.keys.par_iter().zip(&self.blocks))
+            .filter(|(key, _)| !self.free.contains_key(*key))
+            .map(|(_, block)| block.weight.iter().filter(|&&w| w > 0).count())
+            .sum();
+        (within_blocks + self.free.len() * NODES) as u64
+    }
+}
+
+/// Sum of the areas of all triangles, m².
+pub fn surface_area_m2(mesh: &TriangleMesh) -> f64 {
+    let point = |i: u32| nalgebra::Vector3::from(mesh.positions[i as usize].map(f64::from));
+    let area = |&[a, b, c]: &[u32; 3]| 0.5 * (point(b) - point(a)).cross(&(point(c) - point(a))).norm();
+    mesh.triangles.iter().map(area).sum()
+}
+
+fn bounds(mesh: &TriangleMesh) -> Option<[[f32; 3]; 2]> {
+    let first = *mesh.positions.first()?;
+    Some(mesh.positions.iter().fold([first, first], |[low, high], p| {
+        [[0, 1, 2].map(|a| low[a].min(p[a])), [0, 1, 2].map(|a| high[a].max(p[a]))]
+    }))
 }

@@ -1,8 +1,16 @@
-//! The TSDF volume.
+//! The TSDF volume: hashed blocks, one view at a time.
 
-use crate::{CoverageReport, DensityMap, FusionConfig, FusionError};
+use crate::allocate::touched_blocks;
+use crate::block::{Block, BlockUpdate};
+use crate::carve::{Vote, free_blocks};
+use crate::grid::{BlockKey, CameraFromWorld, EDGE, MAX_VIEWS, check_view, table_bytes};
+use crate::sample::SampledView;
+use crate::{FusionConfig, FusionError};
+use nalgebra::Vector3;
+use rayon::prelude::*;
+use rustc_hash::FxHashMap;
 use serde::{Deserialize, Serialize};
-use vidar_core::{AlignedView, PointCloud, TriangleMesh, Warning};
+use vidar_core::{AlignedView, Warning};
 
 /// What one call of `integrate` did.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -19,17 +27,41 @@ pub struct IntegrationStats {
     pub blocks_carved: u64,
 }
 
-/// A truncated signed distance field over hashed blocks of voxels.
+/// A truncated signed distance field over hashed blocks of 8³ voxels.
+///
+/// [`Self::integrate`] adds views to integer sums, so the volume is the same to the bit for any order of views and
+/// any number of threads. The one exception is a volume that ran into its memory budget: which blocks it had to
+/// refuse then depends on which view came first ([`Self::warnings`] says so).
 #[derive(Clone, Debug)]
 pub struct TsdfVolume {
     config: FusionConfig,
+    pub(crate) index: FxHashMap<BlockKey, u32>,
+    pub(crate) keys: Vec<BlockKey>,
+    // Boxed, so that a growing list moves pointers and not the blocks.
+    pub(crate) blocks: Vec<Box<Block>>,
+    /// Weight of the views that saw a whole block empty.
+    pub(crate) free: FxHashMap<BlockKey, u32>,
+    colored_blocks: u64,
+    views: u32,
+    dropped: u64,
+    peak_bytes: u64,
 }
 
 impl TsdfVolume {
     /// An empty volume; refuses a configuration that is out of range.
     pub fn new(config: &FusionConfig) -> Result<Self, FusionError> {
         config.validate()?;
-        Ok(Self { config: config.clone() })
+        Ok(Self {
+            config: config.clone(),
+            index: FxHashMap::default(),
+            keys: Vec::new(),
+            blocks: Vec::new(),
+            free: FxHashMap::default(),
+            colored_blocks: 0,
+            views: 0,
+            dropped: 0,
+            peak_bytes: 0,
+        })
     }
 
     /// The settings.
@@ -37,43 +69,164 @@ impl TsdfVolume {
         &self.config
     }
 
-    /// Fuses one view.
-    pub fn integrate(&mut self, _view: &AlignedView) -> Result<IntegrationStats, FusionError> {
-        Ok(IntegrationStats::default())
+    /// Views fused so far.
+    pub fn views(&self) -> u32 {
+        self.views
     }
 
-    /// The surface as a mesh.
-    pub fn extract_mesh(&self) -> TriangleMesh {
-        TriangleMesh::default()
+    /// Fuses one view. An error leaves the volume as it was; a view without usable depth changes nothing.
+    pub fn integrate(&mut self, view: &AlignedView) -> Result<IntegrationStats, FusionError> {
+        check_view(&self.config, view)?;
+        if self.views >= MAX_VIEWS {
+            return Err(FusionError::TooManyViews { frame: view.frame_id(), limit: MAX_VIEWS });
+        }
+        let sampled = SampledView::new(view, &self.config);
+        let wanted = touched_blocks(view, &sampled, &self.config);
+        let votes = free_blocks(view, &sampled, &self.config);
+        let (touched, dropped_blocks) = self.allocate(&wanted, view.color().is_some());
+        self.update(view, &sampled, &touched);
+        let dropped_votes = self.vote(&votes);
+        self.views += 1;
+        self.dropped += dropped_blocks + dropped_votes;
+        self.peak_bytes = self.peak_bytes.max(self.memory_bytes() + sampled.scratch_bytes());
+        Ok(IntegrationStats {
+            pixels_used: sampled.pixels_used,
+            blocks_touched: touched.len() as u64,
+            blocks_total: self.blocks.len() as u64,
+            dropped_by_budget: dropped_blocks + dropped_votes,
+            blocks_carved: votes.len() as u64 - dropped_votes,
+        })
     }
 
-    /// The vertices of the mesh.
-    pub fn extract_cloud(&self) -> PointCloud {
-        PointCloud::default()
+    /// Finds or makes the blocks at `wanted` (sorted); their indices, sorted, and how many the budget refused.
+    fn allocate(&mut self, wanted: &[BlockKey], colored: bool) -> (Vec<u32>, u64) {
+        let mut touched = Vec::with_capacity(wanted.len());
+        let mut dropped = 0;
+        for key in wanted {
+            if let Some(&at) = self.index.get(key) {
+                touched.push(at);
+                continue;
+            }
+            let more = Block::BYTES + if colored { Block::COLOR_BYTES } else { 0 };
+            if self.bytes_with(self.blocks.len() + 1, self.free.len(), more) > self.config.memory_budget_bytes
+            {
+                dropped += 1;
+                continue;
+            }
+            let at = self.blocks.len() as u32;
+            self.index.insert(*key, at);
+            self.keys.push(*key);
+            self.blocks.push(Box::new(Block::new()));
+            touched.push(at);
+        }
+        if colored {
+            for &at in &touched {
+                let fits = self.memory_bytes() + Block::COLOR_BYTES <= self.config.memory_budget_bytes;
+                let block = &mut self.blocks[at as usize];
+                if block.color.is_none() && fits {
+                    block.add_color();
+                    self.colored_blocks += 1;
+                } else if block.color.is_none() {
+                    dropped += 1;
+                }
+            }
+        }
+        touched.sort_unstable();
+        (touched, dropped)
     }
 
-    /// Per-voxel observation counts.
-    pub fn density_map(&self) -> DensityMap {
-        DensityMap::default()
+    /// Adds the view to the blocks of `touched`, in parallel.
+    fn update(&mut self, view: &AlignedView, sampled: &SampledView, touched: &[u32]) {
+        let camera_from_world = CameraFromWorld::new(view);
+        let voxel = self.config.voxel_size_m;
+        let k = view.intrinsics();
+        let update = BlockUpdate {
+            samples: &sampled.samples,
+            colors: view.color().map(|c| c.data()),
+            width: sampled.width,
+            height: sampled.height,
+            k: [k.fx as f32, k.fy as f32, k.cx as f32, k.cy as f32],
+            steps: [0, 1, 2].map(|a| (camera_from_world.rotation.column(a) * voxel).map(|v| v as f32).into()),
+            truncation_m: self.config.truncation_m() as f32,
+            voxel_m: voxel as f32,
+        };
+        let keys = &self.keys;
+        disjoint_mut(&mut self.blocks, touched).into_par_iter().with_min_len(16).for_each(|(at, block)| {
+            let first = keys[at as usize].map(|i| f64::from(i) * (EDGE as f64 * voxel));
+            let origin = camera_from_world.apply(&Vector3::from(first));
+            update.add_to(block, origin.map(|v| v as f32).into());
+        });
     }
 
-    /// Coverage, given the mesh that [`Self::extract_mesh`] made.
-    pub fn coverage(&self, _mesh: &TriangleMesh) -> CoverageReport {
-        CoverageReport::default()
+    /// Adds the votes for empty blocks; how many the budget refused.
+    fn vote(&mut self, votes: &[Vote]) -> u64 {
+        let mut dropped = 0;
+        for &(key, weight) in votes {
+            if let Some(sum) = self.free.get_mut(&key) {
+                *sum += weight;
+            } else if self.bytes_with(self.blocks.len(), self.free.len() + 1, 0)
+                <= self.config.memory_budget_bytes
+            {
+                self.free.insert(key, weight);
+            } else {
+                dropped += 1;
+            }
+        }
+        dropped
     }
 
-    /// Degradations so far.
+    /// Degradations so far: `fusion-memory-budget` when new space was refused.
     pub fn warnings(&self) -> Vec<Warning> {
-        Vec::new()
+        if self.dropped == 0 {
+            return Vec::new();
+        }
+        let budget_mib = self.config.memory_budget_bytes >> 20;
+        let message = format!(
+            "the volume reached its budget of {budget_mib} MiB: {} times a block was needed and refused, so parts \
+             are missing, and which ones depends on the order of the views",
+            self.dropped
+        );
+        let hint = "raise fusion.memory_budget_bytes, or fusion.voxel_size_m (memory falls with its square)";
+        vec![Warning::new("fusion-memory-budget", message).at("fusion.memory_budget_bytes").hint(hint)]
     }
 
-    /// Bytes held now.
+    /// Bytes held now by blocks and tables; never above the budget.
     pub fn memory_bytes(&self) -> u64 {
-        0
+        self.bytes_with(self.blocks.len(), self.free.len(), 0)
     }
 
-    /// Most bytes held at once so far, with the scratch of `integrate`.
+    /// Most bytes held at once so far: the volume and the scratch of one [`Self::integrate`].
+    ///
+    /// The scratch (8 bytes a pixel) and the extracted mesh come on top of the budget.
     pub fn peak_memory_bytes(&self) -> u64 {
-        0
+        self.peak_bytes
     }
+
+    /// Bytes with `blocks` block entries and `free` votes in the tables, and `more` bytes of block.
+    fn bytes_with(&self, blocks: usize, free: usize, more: u64) -> u64 {
+        let lists = blocks.next_power_of_two() * (size_of::<BlockKey>() + size_of::<usize>());
+        let entry = size_of::<(BlockKey, u32)>();
+        self.blocks.len() as u64 * Block::BYTES
+            + self.colored_blocks * Block::COLOR_BYTES
+            + more
+            + lists as u64
+            + table_bytes(blocks, entry)
+            + table_bytes(free, entry)
+    }
+}
+
+/// Exclusive references to the items at `indices` (sorted, each once).
+fn disjoint_mut<'a, T>(items: &'a mut [Box<T>], indices: &[u32]) -> Vec<(u32, &'a mut T)> {
+    let mut picked = Vec::with_capacity(indices.len());
+    let mut rest = items;
+    let mut passed = 0;
+    for &index in indices {
+        let (head, tail) = std::mem::take(&mut rest).split_at_mut(index as usize + 1 - passed);
+        passed = index as usize + 1;
+        if let Some(item) = head.last_mut() {
+            picked.push((index, &mut **item));
+        }
+        rest = tail;
+    }
+    picked
 }

@@ -1,0 +1,188 @@
+//! The surface of the volume: marching cubes with shared vertices.
+//!
+//! A vertex belongs to an edge of the lattice, and an edge to the block of its first node. First every block places
+//! its vertices, then every block connects them, looking up those of its neighbours; both in parallel, in the order
+//! of keys. A cube is used when all of its corners are observed, so the mesh ends where observation does.
+
+use crate::cubes::{Triangles, edge_start, triangle_table};
+use crate::field::{Field, Neighbourhood};
+use crate::grid::{EDGE, NODES, node_of};
+use crate::tidy::tidy;
+use crate::volume::TsdfVolume;
+use rayon::prelude::*;
+use vidar_core::{PointCloud, TriangleMesh};
+
+/// Vertices keep this share of an edge away from its ends, so that no two of them coincide.
+const END_MARGIN: f32 = 0.01;
+/// Marks an edge without vertex.
+const NO_VERTEX: u16 = u16::MAX;
+
+/// Vertices of one block, and which of its edges (node · 3 + axis) carries which.
+struct BlockVertices {
+    of_edge: Box<[u16; NODES * 3]>,
+    vertices: Vec<Vertex>,
+}
+
+struct Vertex {
+    position: [f32; 3],
+    normal: [f32; 3],
+    color: [u8; 3],
+    confidence: f32,
+}
+
+impl TsdfVolume {
+    /// The zero level of the distance as a mesh: vertices shared by all triangles around them, counter-clockwise
+    /// seen from the observers, with unit normals toward them, colours (when any view had one) and confidences.
+    ///
+    /// Closed wherever all eight corners of a cube were observed. The same bits for any order of the views and any
+    /// number of threads.
+    pub fn extract_mesh(&self) -> TriangleMesh {
+        let field = Field::new(self);
+        let colored = self.blocks.iter().any(|b| b.color.is_some());
+        let placed: Vec<Option<BlockVertices>> = (0..field.len())
+            .into_par_iter()
+            .with_min_len(8)
+            .map(|at| place_vertices(&field, at, self.config().voxel_size_m))
+            .collect();
+        let mut next = 0u32;
+        let first: Vec<u32> = placed
+            .iter()
+            .map(|p| {
+                let first = next;
+                next += p.as_ref().map_or(0, |p| p.vertices.len() as u32);
+                first
+            })
+            .collect();
+        let table = triangle_table();
+        let triangles: Vec<Vec<[u32; 3]>> = (0..field.len())
+            .into_par_iter()
+            .with_min_len(8)
+            .map(|at| connect_vertices(&field, at, &placed, &first, table))
+            .collect();
+        let mut mesh = TriangleMesh { triangles: triangles.concat(), ..TriangleMesh::default() };
+        for vertex in placed.iter().flatten().flat_map(|p| &p.vertices) {
+            mesh.positions.push(vertex.position);
+            mesh.normals.push(vertex.normal);
+            mesh.confidences.push(vertex.confidence);
+            if colored {
+                mesh.colors.push(vertex.color);
+            }
+        }
+        tidy(mesh, self.config().min_component_triangles as usize)
+    }
+
+    /// The vertices of the mesh as points, with normals, confidences and colours (when any view had one).
+    pub fn extract_cloud(&self) -> PointCloud {
+        let TriangleMesh { positions, normals, colors, confidences, .. } = self.extract_mesh();
+        PointCloud { positions, normals, colors, confidences }
+    }
+}
+
+/// Places a vertex on every edge of block `at` whose ends are observed on different sides of the surface.
+fn place_vertices(field: &Field<'_>, at: usize, voxel_m: f64) -> Option<BlockVertices> {
+    let around = field.neighbourhood(at)?;
+    let mut of_edge = Box::new([NO_VERTEX; NODES * 3]);
+    let mut vertices = Vec::new();
+    for node in 0..NODES {
+        let place = [node % EDGE, node / EDGE % EDGE, node / (EDGE * EDGE)];
+        let here = Neighbourhood::at(place[0], place[1], place[2]);
+        for axis in 0..3 {
+            let (a, b) = (around.value(here), around.value(here + Neighbourhood::STRIDE[axis]));
+            // A NaN is on no side.
+            if !((a < 0.0 && b > 0.0) || (a > 0.0 && b < 0.0)) {
+                continue;
+            }
+            of_edge[node * 3 + axis] = vertices.len() as u16;
+            let t = (a / (a - b)).clamp(END_MARGIN, 1.0 - END_MARGIN);
+            vertices.push(vertex(field, &around, [at, node, axis], t, voxel_m)?);
+        }
+    }
+    Some(BlockVertices { of_edge, vertices })
+}
+
+/// The vertex at share `t` of the edge [block, node, axis].
+fn vertex(
+    field: &Field<'_>,
+    around: &Neighbourhood,
+    [at, node, axis]: [usize; 3],
+    t: f32,
+    voxel_m: f64,
+) -> Option<Vertex> {
+    let mut place = [node % EDGE, node / EDGE % EDGE, node / (EDGE * EDGE)];
+    let here = Neighbourhood::at(place[0], place[1], place[2]);
+    place[axis] += 1;
+    let (other_block, other_node) = around.owner(place)?;
+    let ends = [(field.blocks[at], node), (field.blocks[other_block as usize], other_node)];
+    let mix = |a: f32, b: f32| a + t * (b - a);
+
+    let mut position = node_of(field.keys[at], node).map(f64::from);
+    position[axis] += f64::from(t);
+    let (g0, g1) = (around.gradient(here), around.gradient(here + Neighbourhood::STRIDE[axis]));
+    let gradient = [0, 1, 2].map(|i| mix(g0[i], g1[i]));
+    let norm = gradient.iter().map(|g| g * g).sum::<f32>().sqrt();
+    // The distance changes sign along this edge, so its slope there is not zero and a normal can be had.
+    let normal = if norm > 0.0 {
+        gradient.map(|g| g / norm)
+    } else {
+        let sign = (around.value(here + Neighbourhood::STRIDE[axis]) - around.value(here)).signum();
+        std::array::from_fn(|i| if i == axis { sign } else { 0.0 })
+    };
+    let confidences = ends.map(|(block, node)| block.mean_confidence(node));
+    let color = match ends.map(|(block, node)| block.mean_color(node)) {
+        [Some(a), Some(b)] => [0, 1, 2].map(|c| mix(a[c], b[c])),
+        [Some(c), None] | [None, Some(c)] => c,
+        [None, None] => [0.0; 3],
+    };
+    Some(Vertex {
+        position: position.map(|p| (p * voxel_m) as f32),
+        normal,
+        color: color.map(|c| c.round() as u8),
+        confidence: mix(confidences[0], confidences[1]),
+    })
+}
+
+/// The triangles of the cubes that start in block `at`.
+fn connect_vertices(
+    field: &Field<'_>,
+    at: usize,
+    placed: &[Option<BlockVertices>],
+    first: &[u32],
+    table: &[Triangles; 256],
+) -> Vec<[u32; 3]> {
+    let mut triangles = Vec::new();
+    let Some(around) = field.neighbourhood(at) else { return triangles };
+    for node in 0..NODES {
+        let place = [node % EDGE, node / EDGE % EDGE, node / (EDGE * EDGE)];
+        let Some(case) = cube_case(&around, place) else { continue };
+        for triangle in &table[case] {
+            let indices = triangle.map(|edge| {
+                let (corner, axis) = edge_start(edge);
+                let start = [0, 1, 2].map(|a| place[a] + (corner >> a & 1));
+                let (block, node) = around.owner(start)?;
+                let vertex = placed[block as usize].as_ref()?.of_edge[node * 3 + axis];
+                (vertex != NO_VERTEX).then(|| first[block as usize] + u32::from(vertex))
+            });
+            if let [Some(a), Some(b), Some(c)] = indices {
+                triangles.push([a, b, c]);
+            } else {
+                debug_assert!(false, "a cut edge of a fully observed cube has no vertex");
+            }
+        }
+    }
+    triangles
+}
+
+/// Which corners of the cube at `place` are behind the surface; `None` unless all are observed.
+fn cube_case(around: &Neighbourhood, place: [usize; 3]) -> Option<usize> {
+    let start = Neighbourhood::at(place[0], place[1], place[2]);
+    let mut case = 0;
+    for corner in 0..8 {
+        let [sx, sy, sz] = Neighbourhood::STRIDE;
+        let value = around.value(start + (corner & 1) * sx + (corner >> 1 & 1) * sy + (corner >> 2 & 1) * sz);
+        if value.is_nan() {
+            return None;
+        }
+        case |= usize::from(value < 0.0) << corner;
+    }
+    Some(case)
+}

@@ -1,0 +1,270 @@
+//! From a view to what the volume asks of each pixel: a depth, a weight, a confidence.
+//!
+//! The weight of a pixel with confidence c, incidence angle θ between its ray and its surface normal and depth z is
+//!
+//! `w = c · cos θ · min(1, (1 m / z)²)`,
+//!
+//! the angle as in Curless & Levoy (SIGGRAPH 1996, section 3.1: uncertainty grows as the surface turns away), the
+//! depth as in Nießner et al. (TOG 2013, section 4: weight falls with depth, since depth noise grows with it).
+//! It is stored as an integer, [`WEIGHT_ONE`] for w = 1, so that sums do not depend on their order.
+
+use crate::FusionConfig;
+use crate::simd::dispatch;
+use rayon::prelude::*;
+use vidar_core::{AlignedView, Pinhole};
+
+/// The integer that stands for a weight of 1 (12 bits).
+pub(crate) const WEIGHT_ONE: f32 = 4095.0;
+/// The integer that stands for a confidence of 1.
+pub(crate) const CONFIDENCE_ONE: f32 = 255.0;
+/// Pixels along the edge of a tile.
+pub(crate) const TILE: usize = 8;
+/// Depth steps between neighbouring pixels above this share of the depth are taken for the edge of an object.
+const JUMP_RATIO: f32 = 0.05;
+/// Adding this to a float below 2²² rounds it to the nearest integer, found in the low bits. Unlike `as`, which
+/// must saturate, this becomes one vector addition.
+const ROUND: f32 = 12_582_912.0;
+
+/// Nearest integer of `x`, for |x| < 2²².
+#[inline(always)]
+pub(crate) fn round_to_i32(x: f32) -> i32 {
+    ((x + ROUND).to_bits() as i32).wrapping_sub(ROUND.to_bits() as i32)
+}
+
+/// What fusion needs of a pixel.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Sample {
+    /// z-depth, metres.
+    pub depth: f32,
+    /// Weight in its low 16 bits, 0 = unusable; confidence (of [`CONFIDENCE_ONE`]) above.
+    pub weight_and_confidence: u32,
+}
+
+impl Sample {
+    pub const NONE: Self = Self { depth: 0.0, weight_and_confidence: 0 };
+
+    #[inline(always)]
+    pub fn weight(self) -> u32 {
+        self.weight_and_confidence & 0xffff
+    }
+
+    #[inline(always)]
+    pub fn confidence(self) -> u32 {
+        self.weight_and_confidence >> 16
+    }
+}
+
+/// Depths of a square of pixels, for deciding what is empty.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Tile {
+    /// Smallest depth of any pixel, usable or not; infinite when there is none.
+    pub nearest: f32,
+    /// Pixels of the square that lie in the image.
+    pub pixels: u32,
+    /// Usable pixels.
+    pub usable: u32,
+    /// Sum of the confidences of usable pixels.
+    pub confidence: u32,
+}
+
+impl Tile {
+    pub const EMPTY: Self = Self { nearest: f32::INFINITY, pixels: 0, usable: 0, confidence: 0 };
+
+    pub fn join(self, other: &Self) -> Self {
+        Self {
+            nearest: self.nearest.min(other.nearest),
+            pixels: self.pixels + other.pixels,
+            usable: self.usable + other.usable,
+            confidence: self.confidence + other.confidence,
+        }
+    }
+}
+
+/// All samples of a view, row by row, and their tiles.
+pub(crate) struct SampledView {
+    pub width: usize,
+    pub height: usize,
+    pub samples: Vec<Sample>,
+    pub tiles: Vec<Tile>,
+    pub tile_columns: usize,
+    pub pixels_used: u64,
+}
+
+impl SampledView {
+    /// Weighs every pixel of `view`.
+    pub fn new(view: &AlignedView, config: &FusionConfig) -> Self {
+        let (width, height) = (view.intrinsics().width, view.intrinsics().height);
+        let weigher = Weigher::new(view, config);
+        let (tile_columns, tile_rows) = (width.div_ceil(TILE), height.div_ceil(TILE));
+        let mut samples = vec![Sample::NONE; width * height];
+        let mut tiles = vec![Tile::EMPTY; tile_columns * tile_rows];
+        samples.par_chunks_mut(width * TILE).zip(tiles.par_chunks_mut(tile_columns)).enumerate().for_each(
+            |(tile_row, (samples, tiles))| {
+                for (row, samples) in samples.chunks_mut(width).enumerate() {
+                    let y = tile_row * TILE + row;
+                    weigher.row(y, samples);
+                    weigher.add_to_tiles(y, samples, tiles);
+                }
+            },
+        );
+        let pixels_used = tiles.iter().map(|t| u64::from(t.usable)).sum();
+        Self { width, height, samples, tiles, tile_columns, pixels_used }
+    }
+
+    /// Bytes held while the view is integrated.
+    pub fn scratch_bytes(&self) -> u64 {
+        (self.samples.len() * size_of::<Sample>() + self.tiles.len() * size_of::<Tile>()) as u64
+    }
+}
+
+/// Distance in pixels over which depth is differenced: about 3 at VGA, where neighbouring pixels hold mostly noise.
+pub(crate) fn gradient_step(width: usize) -> usize {
+    ((width + 100) / 200).clamp(1, 8)
+}
+
+/// Slope of depth per pixel, from the depths before, at and behind a pixel (NaN = none).
+///
+/// Central where the surface is smooth, the gentler side at an edge, 0 where nothing is known.
+#[inline(always)]
+pub(crate) fn slope(before: f32, here: f32, after: f32, per_step: f32) -> f32 {
+    let (left, right) = (here - before, after - here);
+    let left_known = !left.is_nan();
+    let right_known = !right.is_nan();
+    let gentler = if left.abs() < right.abs() { left } else { right };
+    let smooth = (left - right).abs() <= JUMP_RATIO * here;
+    let both = if smooth { 0.5 * (left + right) } else { gentler };
+    let one = if left_known { left } else { right };
+    let any = if left_known & right_known { both } else { one };
+    if left_known | right_known { any * per_step } else { 0.0 }
+}
+
+/// The surface normal in the camera (not unit, facing the camera) of a pixel of depth `z` and slopes `gx`, `gy`.
+///
+/// With P(u, v) = z(u, v)·r(u, v), r = ((u−cx)/fx, (v−cy)/fy, 1): ∂P/∂v × ∂P/∂u up to scale.
+#[inline(always)]
+pub(crate) fn camera_normal(k: &[f32; 4], du: f32, dv: f32, z: f32, gx: f32, gy: f32) -> [f32; 3] {
+    [k[0] * gx, k[1] * gy, -(z + du * gx + dv * gy)]
+}
+
+/// The unit normal in the camera, facing it, of pixel (x, y), which has a depth.
+pub(crate) fn normal_of_pixel(view: &AlignedView, x: usize, y: usize) -> [f32; 3] {
+    let (k, depth) = (view.intrinsics(), view.depth().image());
+    let step = gradient_step(k.width);
+    let at = |x: Option<usize>, y: Option<usize>| {
+        x.zip(y).and_then(|(x, y)| depth.get(x, y)).copied().unwrap_or(f32::NAN)
+    };
+    let (z, per_step) = (depth[(x, y)], 1.0 / step as f32);
+    let gx = slope(at(x.checked_sub(step), Some(y)), z, at(Some(x + step), Some(y)), per_step);
+    let gy = slope(at(Some(x), y.checked_sub(step)), z, at(Some(x), Some(y + step)), per_step);
+    let (du, dv) = (x as f32 - k.cx as f32, y as f32 - k.cy as f32);
+    let n = camera_normal(&[k.fx as f32, k.fy as f32, 0.0, 0.0], du, dv, z, gx, gy);
+    // n · r = −z, so n is never zero.
+    let norm = n.iter().map(|c| c * c).sum::<f32>().sqrt();
+    n.map(|c| c / norm)
+}
+
+struct Weigher<'a> {
+    width: usize,
+    height: usize,
+    depth: &'a [f32],
+    confidence: &'a [f32],
+    /// Stands for rows outside the image.
+    missing: Vec<f32>,
+    k: [f32; 4],
+    step: usize,
+    min_confidence: f32,
+    max_depth: f32,
+    min_cos: f32,
+}
+
+impl<'a> Weigher<'a> {
+    fn new(view: &'a AlignedView, config: &FusionConfig) -> Self {
+        let k: &Pinhole = view.intrinsics();
+        Self {
+            width: k.width,
+            height: k.height,
+            depth: view.depth().image().data(),
+            confidence: view.confidence().image().data(),
+            missing: vec![f32::NAN; k.width],
+            k: [k.fx as f32, k.fy as f32, k.cx as f32, k.cy as f32],
+            step: gradient_step(k.width),
+            // A confidence of 0 says "wrong", whatever the threshold.
+            min_confidence: (config.min_confidence as f32).max(f32::MIN_POSITIVE),
+            max_depth: config.max_depth_m as f32,
+            min_cos: (config.max_incidence_deg.to_radians().cos() as f32).max(0.0),
+        }
+    }
+
+    fn row(&self, y: usize, out: &mut [Sample]) {
+        let row = |y: usize| &self.depth[y * self.width..(y + 1) * self.width];
+        let above = if y >= self.step { row(y - self.step) } else { &self.missing[..] };
+        let below = if y + self.step < self.height { row(y + self.step) } else { &self.missing[..] };
+        let rows = [above, row(y), below];
+        let confidence = &self.confidence[y * self.width..(y + 1) * self.width];
+        let (w, step) = (self.width, self.step);
+        let inner = step.min(w)..w.saturating_sub(step).max(step.min(w));
+        for x in (0..inner.start).chain(inner.end..w) {
+            let at = |row: &[f32], x: Option<usize>| x.and_then(|x| row.get(x)).copied().unwrap_or(f32::NAN);
+            let line = [at(rows[1], x.checked_sub(step)), rows[1][x], at(rows[1], Some(x + step))];
+            let column = [above[x], below[x]];
+            out[x] = self.sample(x as f32, y as f32, line, column, confidence[x]);
+        }
+        dispatch!(self.inner(inner, y as f32, rows, confidence, out));
+    }
+
+    /// Pixels that have neighbours on both sides; cut to equal slices so that the loop has no bounds to check.
+    #[inline(always)]
+    fn inner(
+        &self,
+        range: std::ops::Range<usize>,
+        y: f32,
+        rows: [&[f32]; 3],
+        confidence: &[f32],
+        out: &mut [Sample],
+    ) {
+        let (first, n) = (range.start, range.len());
+        if n == 0 {
+            return;
+        }
+        let before = &rows[1][first - self.step..][..n];
+        let here = &rows[1][first..][..n];
+        let after = &rows[1][first + self.step..][..n];
+        let (above, below) = (&rows[0][first..][..n], &rows[2][first..][..n]);
+        let (confidence, out) = (&confidence[first..][..n], &mut out[first..][..n]);
+        for i in 0..n {
+            let line = [before[i], here[i], after[i]];
+            out[i] = self.sample((first + i) as f32, y, line, [above[i], below[i]], confidence[i]);
+        }
+    }
+
+    #[inline(always)]
+    fn sample(&self, x: f32, y: f32, line: [f32; 3], column: [f32; 2], confidence: f32) -> Sample {
+        let z = line[1];
+        let per_step = 1.0 / self.step as f32;
+        let gx = slope(line[0], z, line[2], per_step);
+        let gy = slope(column[0], z, column[1], per_step);
+        let (du, dv) = (x - self.k[2], y - self.k[3]);
+        let n = camera_normal(&self.k, du, dv, z, gx, gy);
+        let (rx, ry) = (du / self.k[0], dv / self.k[1]);
+        // n · r = −z for every slope, hence cos θ = z / (|n| |r|).
+        let cos = z / ((n[0] * n[0] + n[1] * n[1] + n[2] * n[2]) * (rx * rx + ry * ry + 1.0)).sqrt();
+        let usable = (z <= self.max_depth) & (confidence >= self.min_confidence) & (cos >= self.min_cos);
+        let near = (1.0 / (z * z)).min(1.0);
+        let weight = round_to_i32(confidence * cos * near * WEIGHT_ONE).max(1) as u32;
+        let confidence = round_to_i32(confidence * CONFIDENCE_ONE).max(1) as u32;
+        Sample { depth: z, weight_and_confidence: if usable { weight | (confidence << 16) } else { 0 } }
+    }
+
+    fn add_to_tiles(&self, y: usize, samples: &[Sample], tiles: &mut [Tile]) {
+        let depth = &self.depth[y * self.width..(y + 1) * self.width];
+        for ((samples, depth), tile) in samples.chunks(TILE).zip(depth.chunks(TILE)).zip(tiles) {
+            tile.pixels += samples.len() as u32;
+            for (sample, &z) in samples.iter().zip(depth) {
+                // `min` passes over NaN.
+                tile.nearest = tile.nearest.min(z);
+                tile.usable += u32::from(sample.weight() > 0);
+                tile.confidence += sample.confidence();
+            }
+        }
+    }
+}
