@@ -1,4 +1,34 @@
 //! Depth in chunk units and depth in metres are different types, so that one cannot be fused as the other.
+//!
+//! A function that wants metres cannot be given chunk units; the way across is [`RelativeDepth::to_metric`], which
+//! asks for the scale:
+//!
+//! ```
+//! use vidar_core::{Image, MetricDepth, RelativeDepth};
+//! fn fuse(depth: &MetricDepth) -> f64 { depth.valid_ratio() }
+//!
+//! let predicted = RelativeDepth::new(Image::filled(4, 3, 2.0));
+//! assert_eq!(fuse(&predicted.to_metric(0.5)?), 1.0);
+//! # Ok::<(), vidar_core::GeometryError>(())
+//! ```
+//!
+//! ```compile_fail,E0308
+//! use vidar_core::{Image, MetricDepth, RelativeDepth};
+//! fn fuse(depth: &MetricDepth) -> f64 { depth.valid_ratio() }
+//!
+//! let predicted = RelativeDepth::new(Image::filled(4, 3, 2.0));
+//! fuse(&predicted);
+//! ```
+//!
+//! Nor can an aligned view be made of chunk units:
+//!
+//! ```compile_fail,E0308
+//! use vidar_core::{AlignedView, Confidence, FrameId, Image, Pinhole, RelativeDepth, Se3, Timestamp};
+//! let intrinsics = Pinhole::new(4.0, 4.0, 1.5, 1.0, 4, 3).unwrap();
+//! let depth = RelativeDepth::new(Image::filled(4, 3, 2.0));
+//! let at = Timestamp::from_nanos(0);
+//! let _ = AlignedView::new(FrameId(0), at, Se3::IDENTITY, intrinsics, depth, Confidence::full(4, 3));
+//! ```
 
 use crate::camera::Pinhole;
 use crate::id::FrameId;
@@ -215,4 +245,87 @@ pub fn check_size<P>(
         width: image.width(),
         height: image.height(),
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::lie::So3;
+    use nalgebra::Vector3;
+
+    const BAD: [f32; 6] = [0.0, -1.0, f32::NAN, f32::INFINITY, f32::NEG_INFINITY, -0.0];
+
+    fn row(values: &[f32]) -> Image<f32> {
+        Image::from_vec(values.len(), 1, values.to_vec()).unwrap()
+    }
+
+    #[test]
+    fn what_cannot_be_a_depth_becomes_not_a_number() {
+        for bad in BAD {
+            let metric = MetricDepth::new(row(&[bad, 2.5]));
+            assert!(metric.image()[(0, 0)].is_nan() && metric.image()[(1, 0)] == 2.5, "{bad}");
+            assert_eq!(metric.valid_ratio(), 0.5);
+            assert!(RelativeDepth::new(row(&[bad])).image()[(0, 0)].is_nan());
+        }
+        assert_eq!(MetricDepth::new(Image::filled(0, 0, 1.0)).valid_ratio(), 0.0);
+    }
+
+    #[test]
+    fn scaling_keeps_holes_and_refuses_what_is_no_scale() {
+        let relative = RelativeDepth::new(row(&[1.5, f32::NAN, 1e38]));
+        let metric = relative.to_metric(4.0).unwrap();
+        assert_eq!(metric.image()[(0, 0)], 6.0);
+        // A depth beyond the range of f32 is no depth.
+        assert!(metric.image()[(1, 0)].is_nan() && metric.image()[(2, 0)].is_nan());
+        for bad in [0.0, -1.0, f64::INFINITY] {
+            assert_eq!(relative.to_metric(bad), Err(GeometryError::BadScale { scale: bad }));
+        }
+        assert!(matches!(relative.to_metric(f64::NAN), Err(GeometryError::BadScale { .. })));
+    }
+
+    #[test]
+    fn confidence_stays_between_zero_and_one() {
+        let confidence = Confidence::new(row(&[-0.5, 0.25, 1.5, f32::NAN, f32::INFINITY, f32::NEG_INFINITY]));
+        assert_eq!(confidence.image().data(), &[0.0, 0.25, 1.0, 0.0, 1.0, 0.0]);
+        assert!(Confidence::full(3, 2).image().data().iter().all(|&c| c == 1.0));
+    }
+
+    fn view(
+        depth: (usize, usize),
+        confidence: (usize, usize),
+        at: Se3,
+    ) -> Result<AlignedView, GeometryError> {
+        AlignedView::new(
+            FrameId(7),
+            Timestamp::from_nanos(5),
+            at,
+            Pinhole::new(10.0, 10.0, 2.0, 1.0, 5, 3).unwrap(),
+            MetricDepth::new(Image::filled(depth.0, depth.1, 1.0)),
+            Confidence::full(confidence.0, confidence.1),
+        )
+    }
+
+    #[test]
+    fn a_view_holds_images_of_one_size_at_a_finite_place() {
+        let good = view((5, 3), (5, 3), Se3::IDENTITY).unwrap();
+        assert_eq!(
+            (good.frame_id(), good.time(), good.color()),
+            (FrameId(7), Timestamp::from_nanos(5), None)
+        );
+        let mismatch = |what, width, height| GeometryError::SizeMismatch {
+            what,
+            expected_width: 5,
+            expected_height: 3,
+            width,
+            height,
+        };
+        assert_eq!(view((3, 5), (5, 3), Se3::IDENTITY).unwrap_err(), mismatch("depth", 3, 5));
+        assert_eq!(view((5, 3), (5, 4), Se3::IDENTITY).unwrap_err(), mismatch("confidence", 5, 4));
+        let color = good.clone().with_color(Image::filled(1, 3, [0; 3])).unwrap_err();
+        assert_eq!(color, mismatch("color", 1, 3));
+        assert_eq!(color.to_string(), "color: expected 5x3, found 1x3");
+        assert!(good.with_color(Image::filled(5, 3, [1; 3])).unwrap().color().is_some());
+        let nowhere = Se3::new(So3::IDENTITY, Vector3::new(0.0, f64::NAN, 0.0));
+        assert_eq!(view((5, 3), (5, 3), nowhere).unwrap_err(), GeometryError::BadPose { frame: FrameId(7) });
+    }
 }

@@ -181,3 +181,49 @@ impl FrameImage {
 fn luma(p: &[u8; 3]) -> f32 {
     0.299 * f32::from(p[0]) + 0.587 * f32::from(p[1]) + 0.114 * f32::from(p[2])
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn pixels_lie_row_by_row() {
+        let image = Image::from_fn(3, 2, |x, y| 10 * y + x);
+        assert_eq!(image.data(), &[0, 1, 2, 10, 11, 12]);
+        assert_eq!((image.width(), image.height(), image.row(1)), (3, 2, &[10, 11, 12][..]));
+        assert_eq!(
+            (image[(2, 1)], image.get(2, 1), image.get(3, 0), image.get(0, 2)),
+            (12, Some(&12), None, None)
+        );
+        assert_eq!(image.map(|v| v * 2).into_vec(), [0, 2, 4, 20, 22, 24]);
+        let mut changed = image.clone();
+        changed[(1, 1)] = 99;
+        changed.data_mut()[0] = 98;
+        assert_eq!(changed.into_vec(), [98, 1, 2, 10, 99, 12]);
+    }
+
+    #[test]
+    fn pixels_that_do_not_fit_the_size_are_refused() {
+        let wrong = ImageError::WrongLength { width: 3, height: 2, expected: 6, found: 5 };
+        assert_eq!(Image::from_vec(3, 2, vec![0; 5]), Err(wrong));
+        let (width, height) = (usize::MAX, 2);
+        assert_eq!(Image::<u8>::from_vec(width, height, vec![]), Err(ImageError::TooLarge { width, height }));
+        assert!(Image::from_vec(0, 7, Vec::<u8>::new()).is_ok());
+    }
+
+    #[test]
+    fn grey_levels_keep_black_white_and_luma() {
+        let deep = FrameImage::Gray16(Image::from_vec(4, 1, vec![0, 257, 32_896, 65_535]).unwrap());
+        assert_eq!(deep.to_gray8().data(), &[0, 1, 128, 255]);
+        assert_eq!(deep.to_gray_f32().data(), &[0.0, 1.0, 128.0, 255.0]);
+        let color = FrameImage::Rgb8(Image::from_vec(2, 1, vec![[255, 255, 255], [10, 200, 30]]).unwrap());
+        // 0.299·10 + 0.587·200 + 0.114·30 = 123.81.
+        assert_eq!(color.to_gray8().data(), &[255, 124]);
+        assert!((color.to_gray_f32().data()[1] - 123.81).abs() < 1e-4);
+        let grey = FrameImage::Gray8(Image::filled(2, 3, 7));
+        assert_eq!((grey.width(), grey.height()), (2, 3));
+        assert_eq!(grey.to_rgb8(), Image::filled(2, 3, [7; 3]));
+        assert_eq!((color.width(), deep.height()), (2, 1));
+        assert_eq!(color.to_rgb8().data()[1], [10, 200, 30]);
+    }
+}

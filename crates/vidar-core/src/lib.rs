@@ -9,6 +9,48 @@
 //! - **Depth.** z-depth in metres, `f32`; invalid = NaN.
 //! - **Units.** SI and radians; a scalar in another unit says so in its name. Time is integer nanoseconds.
 //! - **Perturbation.** Right: `T ⊞ δ = T · exp(δ)`, tangent order [rotation, translation, log-scale].
+//!
+//! `docs/concepts/frames-and-units.md` says the same with pictures in words and the conversions at the borders.
+//!
+//! # Example
+//!
+//! Where does a camera on a flying body see a point of the room?
+//!
+//! ```
+//! use nalgebra::{Matrix3, Vector3};
+//! use vidar_core::{
+//!     BodyFrame, CameraId, CameraModel, Duration, Pinhole, Rig, Se3, So3, StampedPose, Timestamp, Trajectory,
+//! };
+//!
+//! // A camera 10 cm ahead of the IMU that looks along the body's x axis (x ahead, y left, z up).
+//! let model = CameraModel::Pinhole(Pinhole::new(400.0, 400.0, 319.5, 239.5, 640, 480)?);
+//! let columns = [-Vector3::y(), -Vector3::z(), Vector3::x()]; // the camera's x, y, z in the body
+//! let looks_ahead = So3::from_matrix(&Matrix3::from_columns(&columns)).ok_or("not a rotation")?;
+//! let mut rig = Rig::single_camera(model);
+//! rig.cameras[0].body_from_camera = Se3::new(looks_ahead, Vector3::new(0.1, 0.0, 0.0));
+//!
+//! // The body flies 1 m ahead in 50 ms.
+//! let start = Timestamp::parse_secs("1403636580.838555648")?;
+//! let pose = |millis, x| StampedPose {
+//!     time: start + Duration::from_millis(millis),
+//!     world_from_body: Se3::from_translation(Vector3::new(x, 0.0, 1.0)),
+//! };
+//! let flight = Trajectory::new(BodyFrame::Imu, vec![pose(0, 0.0), pose(50, 1.0)])?;
+//!
+//! // Half way, told of the camera: p_in_camera = world_from_camera⁻¹ · p_in_world.
+//! let camera_flight = flight.in_camera_frame(CameraId(0), &rig)?;
+//! let half_way = start + Duration::from_millis(25);
+//! let world_from_camera =
+//!     camera_flight.interpolate(half_way, Duration::from_millis(50)).ok_or("outside the flight")?;
+//! let point_in_world = Vector3::new(4.6, -1.0, 1.5);
+//! let point_in_camera = vidar_core::LieGroup::inverse(&world_from_camera) * point_in_world;
+//!
+//! // 4 m ahead of the camera, 1 m to its right, 0.5 m above.
+//! assert!((point_in_camera - Vector3::new(1.0, -0.5, 4.0)).norm() < 1e-12);
+//! let pixel = rig.cameras[0].model.project(&point_in_camera).ok_or("not in front")?;
+//! assert!((pixel.x - 419.5).abs() < 1e-9 && (pixel.y - 189.5).abs() < 1e-9);
+//! # Ok::<(), Box<dyn std::error::Error>>(())
+//! ```
 
 pub mod camera;
 pub mod geometry;

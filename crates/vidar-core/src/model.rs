@@ -154,3 +154,72 @@ pub trait GeometryModel: Send {
         Ok(prediction)
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::image::Image;
+    use nalgebra::Vector3;
+
+    /// Says that everything is one unit away, where it was told to stand.
+    struct Wall(ModelInfo);
+
+    impl GeometryModel for Wall {
+        fn info(&self) -> &ModelInfo {
+            &self.0
+        }
+
+        fn predict(&mut self, chunk: &ChunkViews) -> Result<GeometryPrediction, ModelError> {
+            if chunk.views.len() < self.0.min_views {
+                let (found, needed) = (chunk.views.len(), self.0.min_views);
+                return Err(ModelError::TooFewViews { chunk: chunk.id, found, needed });
+            }
+            let view = |v: &ChunkView| {
+                let chunk_from_camera =
+                    v.world_from_camera.ok_or(ModelError::MissingPose { frame: v.frame_id })?;
+                Ok(ViewGeometry {
+                    frame_id: v.frame_id,
+                    chunk_from_camera,
+                    intrinsics: v.intrinsics,
+                    depth: RelativeDepth::new(Image::filled(v.image.width(), v.image.height(), 1.0)),
+                    confidence: Confidence::full(v.image.width(), v.image.height()),
+                })
+            };
+            let views = chunk.views.iter().map(view).collect::<Result<_, ModelError>>()?;
+            Ok(GeometryPrediction { chunk_id: chunk.id, frame: ChunkFrame::PriorWorld, views })
+        }
+    }
+
+    fn chunk(world_from_camera: Option<Se3>, n: u32) -> ChunkViews {
+        let intrinsics = Pinhole { fx: 4.0, fy: 4.0, cx: 1.5, cy: 1.0, width: 4, height: 3 };
+        let view = |i| ChunkView {
+            frame_id: FrameId(i),
+            time: Timestamp::from_nanos(i64::from(i)),
+            image: FrameImage::Gray8(Image::filled(4, 3, 128)),
+            intrinsics,
+            world_from_camera,
+        };
+        ChunkViews { id: ChunkId(3), views: (0..n).map(view).collect() }
+    }
+
+    #[test]
+    fn a_model_is_used_through_the_trait_and_names_what_it_lacks() {
+        let info = ModelInfo {
+            name: "wall".into(),
+            licence: "MIT".into(),
+            weights_sha256: None,
+            needs_poses: true,
+            min_views: 2,
+        };
+        let mut model: Box<dyn GeometryModel> = Box::new(Wall(info));
+        assert!(model.info().needs_poses);
+        let here = Se3::from_translation(Vector3::x());
+        let prediction = model.predict(&chunk(Some(here), 2)).unwrap();
+        assert_eq!((prediction.chunk_id, prediction.views.len()), (ChunkId(3), 2));
+        assert_eq!(prediction.views[1].chunk_from_camera, here);
+        let few = model.predict(&chunk(Some(here), 1)).unwrap_err();
+        assert_eq!(few.to_string(), "chunk 3: 1 views, the model needs at least 2");
+        let lost = model.predict(&chunk(None, 2)).unwrap_err();
+        assert_eq!(lost.to_string(), "frame 0 has no prior pose, and this model needs one");
+    }
+}

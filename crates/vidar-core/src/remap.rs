@@ -1,29 +1,69 @@
 //! Undistortion and resizing with intrinsics that stay right.
+//!
+//! A [`RemapTable`] holds, for each pixel of a distortion-free view, where the camera's own image shows the same
+//! direction. Where a pixel of the view covers several pixels of the image (a reduced view), the table holds a grid
+//! of positions spread over the pixel's area and [`RemapTable::apply`] averages them: an area average, so that fine
+//! texture becomes grey instead of a false pattern.
 
 use crate::camera::{CameraError, CameraModel, Pinhole};
 use crate::image::{FrameImage, Image};
-use nalgebra::Vector2;
+use nalgebra::{Matrix3x2, Vector2};
+use rayon::prelude::*;
+
+/// Most sample positions along one side of a pixel; a reduction beyond it is no longer a full average.
+const MAX_SAMPLES_PER_SIDE: usize = 16;
+
+/// A pixel may cover this many source pixels more than it has samples; bilinear reading spans a full pixel anyway.
+const SAMPLE_SLACK: f64 = 0.25;
 
 /// For each pixel of a pinhole view, where to look in the camera's own image.
 #[derive(Clone, Debug)]
 pub struct RemapTable {
     target: Pinhole,
-    /// Source position, x then y; NaN where the camera sees nothing.
+    source_width: usize,
+    source_height: usize,
+    samples_per_side: usize,
+    /// Source positions, x then y; the samples of one pixel lie together. NaN where the camera sees nothing.
     source: Vec<[f32; 2]>,
 }
 
 impl RemapTable {
     /// The map from `camera` to the distortion-free view `target`.
+    ///
+    /// A pixel of the view is seen when all of its samples lie on the image, whose area reaches half a pixel beyond
+    /// the centres of its border pixels.
     pub fn new(camera: &CameraModel, target: &Pinhole) -> Self {
-        let mut source = Vec::with_capacity(target.width * target.height);
-        for y in 0..target.height {
-            for x in 0..target.width {
-                let pixel = camera.project(&target.ray(x as f64, y as f64));
-                let inside = pixel.filter(|p| camera.contains(p, 0.5));
-                source.push(inside.map_or([f32::NAN; 2], |p| [p.x as f32, p.y as f32]));
+        let samples_per_side = samples_per_side(camera, target);
+        let per_pixel = samples_per_side * samples_per_side;
+        let offset = |i: usize| (i as f64 + 0.5) / samples_per_side as f64 - 0.5;
+        let mut source = vec![[f32::NAN; 2]; target.width * target.height * per_pixel];
+        source.par_chunks_mut((target.width * per_pixel).max(1)).enumerate().for_each(|(y, row)| {
+            for (x, samples) in row.chunks_mut(per_pixel).enumerate() {
+                for (i, sample) in samples.iter_mut().enumerate() {
+                    let dx = offset(i % samples_per_side);
+                    let dy = offset(i / samples_per_side);
+                    let pixel = camera.project(&target.ray(x as f64 + dx, y as f64 + dy));
+                    if let Some(p) = pixel.filter(|p| camera.contains(p, 0.0)) {
+                        *sample = [p.x as f32, p.y as f32];
+                    }
+                }
+                if samples.iter().any(|s| s[0].is_nan()) {
+                    samples.fill([f32::NAN; 2]);
+                }
             }
+        });
+        Self {
+            target: *target,
+            source_width: camera.width(),
+            source_height: camera.height(),
+            samples_per_side,
+            source,
         }
-        Self { target: *target, source }
+    }
+
+    /// The map that resizes a distortion-free image to `width` × `height`; [`RemapTable::target`] has its intrinsics.
+    pub fn resizing(source: &Pinhole, width: usize, height: usize) -> Result<Self, CameraError> {
+        Ok(Self::new(&CameraModel::Pinhole(*source), &source.resized(width, height)?))
     }
 
     /// The view that the map makes.
@@ -31,65 +71,148 @@ impl RemapTable {
         &self.target
     }
 
+    /// Columns and rows of the images that the map reads.
+    pub fn source_size(&self) -> (usize, usize) {
+        (self.source_width, self.source_height)
+    }
+
     /// Share of the target's pixels that the camera sees, 0…1.
     pub fn coverage(&self) -> f64 {
-        let seen = self.source.iter().filter(|s| !s[0].is_nan()).count();
-        seen as f64 / self.source.len().max(1) as f64
+        let per_pixel = self.samples_per_side * self.samples_per_side;
+        let seen = self.source.iter().step_by(per_pixel).filter(|s| !s[0].is_nan()).count();
+        (seen * per_pixel) as f64 / self.source.len().max(1) as f64
     }
 
     /// Whether target pixel `(x, y)` is seen by the camera.
     pub fn is_seen(&self, x: usize, y: usize) -> bool {
-        !self.source[y * self.target.width + x][0].is_nan()
+        !self.samples(x, y)[0][0].is_nan()
     }
 
-    /// The image as the target view sees it, bilinear; black where the camera sees nothing.
+    /// The image as the target view sees it: bilinear, averaged over the pixel's area where the view is reduced;
+    /// black where the camera sees nothing.
+    ///
+    /// Rows are done in parallel; the result is the same for any number of threads. The image must have the size of
+    /// the camera ([`RemapTable::source_size`]); of a smaller one the border pixels are repeated.
     pub fn apply(&self, image: &FrameImage) -> FrameImage {
         match image {
             FrameImage::Gray8(i) => {
-                FrameImage::Gray8(self.apply_with(i, |p| [f32::from(*p)], |v| v[0].round() as u8))
+                FrameImage::Gray8(self.averaged(i, |p| [f32::from(*p)], |[v]| (v + 0.5) as u8))
             }
             FrameImage::Gray16(i) => {
-                FrameImage::Gray16(self.apply_with(i, |p| [f32::from(*p)], |v| v[0].round() as u16))
+                FrameImage::Gray16(self.averaged(i, |p| [f32::from(*p)], |[v]| (v + 0.5) as u16))
             }
-            FrameImage::Rgb8(i) => FrameImage::Rgb8(self.apply_with(
+            FrameImage::Rgb8(i) => FrameImage::Rgb8(self.averaged(
                 i,
                 |p| p.map(f32::from),
-                |v: [f32; 3]| v.map(|c| c.round() as u8),
+                |v: [f32; 3]| v.map(|c| (c + 0.5) as u8),
             )),
         }
     }
 
-    fn apply_with<P: Copy, const C: usize>(
+    /// The value of the source pixel nearest to each target pixel, `outside` where the camera sees nothing.
+    ///
+    /// For values that must not be mixed: depths with holes, labels, masks.
+    pub fn apply_nearest<P: Copy + Send + Sync>(&self, image: &Image<P>, outside: P) -> Image<P> {
+        let (w, h) = (image.width(), image.height());
+        let last = |n: usize| n.saturating_sub(1) as f32;
+        self.by_rows(outside, |samples| {
+            if samples[0][0].is_nan() || w == 0 || h == 0 {
+                return outside;
+            }
+            let n = samples.len() as f32;
+            let x = samples.iter().map(|s| s[0]).sum::<f32>() / n;
+            let y = samples.iter().map(|s| s[1]).sum::<f32>() / n;
+            image[(x.round().clamp(0.0, last(w)) as usize, y.round().clamp(0.0, last(h)) as usize)]
+        })
+    }
+
+    fn samples(&self, x: usize, y: usize) -> &[[f32; 2]] {
+        let per_pixel = self.samples_per_side * self.samples_per_side;
+        let first = (y * self.target.width + x) * per_pixel;
+        &self.source[first..first + per_pixel]
+    }
+
+    fn by_rows<P: Copy + Send + Sync>(&self, fill: P, value: impl Fn(&[[f32; 2]]) -> P + Sync) -> Image<P> {
+        let mut out = Image::filled(self.target.width, self.target.height, fill);
+        out.data_mut().par_chunks_mut(self.target.width.max(1)).enumerate().for_each(|(y, row)| {
+            for (x, pixel) in row.iter_mut().enumerate() {
+                *pixel = value(self.samples(x, y));
+            }
+        });
+        out
+    }
+
+    fn averaged<P: Copy + Send + Sync, const C: usize>(
         &self,
         image: &Image<P>,
-        load: impl Fn(&P) -> [f32; C],
-        store: impl Fn([f32; C]) -> P,
+        load: impl Fn(&P) -> [f32; C] + Sync,
+        store: impl Fn([f32; C]) -> P + Sync,
     ) -> Image<P> {
-        let (w, h) = (image.width(), image.height());
-        Image::from_fn(self.target.width, self.target.height, |x, y| {
-            let [sx, sy] = self.source[y * self.target.width + x];
-            if sx.is_nan() || w == 0 || h == 0 {
-                return store([0.0; C]);
+        let black = store([0.0; C]);
+        if image.width() == 0 || image.height() == 0 {
+            return Image::filled(self.target.width, self.target.height, black);
+        }
+        let share = 1.0 / (self.samples_per_side * self.samples_per_side) as f32;
+        self.by_rows(black, |samples| {
+            if samples[0][0].is_nan() {
+                return black;
             }
-            let (sx, sy) = (sx.clamp(0.0, (w - 1) as f32), sy.clamp(0.0, (h - 1) as f32));
-            let (x0, y0) = (sx.floor() as usize, sy.floor() as usize);
-            let (x1, y1) = ((x0 + 1).min(w - 1), (y0 + 1).min(h - 1));
-            let (ax, ay) = (sx - x0 as f32, sy - y0 as f32);
-            let corners = [(x0, y0), (x1, y0), (x0, y1), (x1, y1)].map(|at| load(&image[at]));
-            let mut value = [0.0; C];
-            for c in 0..C {
-                let top = corners[0][c] + ax * (corners[1][c] - corners[0][c]);
-                let bottom = corners[2][c] + ax * (corners[3][c] - corners[2][c]);
-                value[c] = top + ay * (bottom - top);
+            let mut sum = [0.0; C];
+            for at in samples {
+                let value = bilinear(image, &load, at);
+                for c in 0..C {
+                    sum[c] += value[c];
+                }
             }
-            store(value)
+            store(sum.map(|v| v * share))
         })
     }
 }
 
+/// The value between the four pixels around `at`; positions beyond the border centres read the border.
+fn bilinear<P, const C: usize>(
+    image: &Image<P>,
+    load: impl Fn(&P) -> [f32; C],
+    &[x, y]: &[f32; 2],
+) -> [f32; C] {
+    let (w, h) = (image.width(), image.height());
+    let (x, y) = (x.clamp(0.0, (w - 1) as f32), y.clamp(0.0, (h - 1) as f32));
+    let (x0, y0) = (x as usize, y as usize);
+    let (ax, ay) = (x - x0 as f32, y - y0 as f32);
+    let x1 = (x0 + 1).min(w - 1);
+    let (upper, lower) = (image.row(y0), image.row((y0 + 1).min(h - 1)));
+    let [p00, p10, p01, p11] = [&upper[x0], &upper[x1], &lower[x0], &lower[x1]].map(load);
+    let mut value = [0.0; C];
+    for c in 0..C {
+        let top = p00[c] + ax * (p10[c] - p00[c]);
+        let bottom = p01[c] + ax * (p11[c] - p01[c]);
+        value[c] = top + ay * (bottom - top);
+    }
+    value
+}
+
+/// How many samples a side a pixel of `target` needs: as many as it spans pixels of `camera`, at the widest place.
+fn samples_per_side(camera: &CameraModel, target: &Pinhole) -> usize {
+    let d_ray_d_pixel = Matrix3x2::new(1.0 / target.fx, 0.0, 0.0, 1.0 / target.fy, 0.0, 0.0);
+    let mut widest: f64 = 1.0;
+    for j in 0..=16 {
+        for i in 0..=16 {
+            let x = (target.width as f64 - 1.0) * f64::from(i) / 16.0;
+            let y = (target.height as f64 - 1.0) * f64::from(j) / 16.0;
+            let Some((pixel, jacobian)) = camera.project_with_jacobian(&target.ray(x, y)) else { continue };
+            if camera.contains(&pixel, 0.0) {
+                let span = jacobian * d_ray_d_pixel;
+                widest = widest.max(span.column(0).norm()).max(span.column(1).norm());
+            }
+        }
+    }
+    ((widest - SAMPLE_SLACK).ceil() as usize).clamp(1, MAX_SAMPLES_PER_SIDE)
+}
+
 /// A distortion-free view of `width` × `height` inside what `camera` sees, keeping its aspect of pixels.
 ///
-/// The focal length is the smallest one for which every border pixel of the view is seen by the camera.
+/// The focal length is the smallest one, between 0.2 and 5 times the camera's own, for which the whole border of the
+/// view is seen; the principal point stays in place. A pinhole camera is only resized.
 pub fn undistorted_view(camera: &CameraModel, width: usize, height: usize) -> Result<Pinhole, CameraError> {
     let k = camera.intrinsics().resized(width, height)?;
     if matches!(camera, CameraModel::Pinhole(_)) {
@@ -98,6 +221,9 @@ pub fn undistorted_view(camera: &CameraModel, width: usize, height: usize) -> Re
     let view = |zoom: f64| Pinhole::new(k.fx * zoom, k.fy * zoom, k.cx, k.cy, width, height);
     // Zooming in shrinks the field of view; 0.2 to 5 spans every lens that a pinhole view can serve.
     let (mut low, mut high) = (0.2, 5.0);
+    if !border_is_seen(camera, &view(high)?) {
+        return Err(CameraError::NoUndistortedView { width, height, max_focal_px: k.fx.max(k.fy) * high });
+    }
     for _ in 0..40 {
         let middle = 0.5 * (low + high);
         if border_is_seen(camera, &view(middle)?) { high = middle } else { low = middle }
@@ -105,10 +231,12 @@ pub fn undistorted_view(camera: &CameraModel, width: usize, height: usize) -> Re
     view(high)
 }
 
+/// Whether the outline of the view's area, half a pixel outside its border centres, falls on the camera's image.
 fn border_is_seen(camera: &CameraModel, view: &Pinhole) -> bool {
-    let seen = |x: usize, y: usize| {
-        camera.project(&view.ray(x as f64, y as f64)).is_some_and(|p: Vector2<f64>| camera.contains(&p, 0.5))
+    let seen = |x: f64, y: f64| {
+        camera.project(&view.ray(x, y)).is_some_and(|p: Vector2<f64>| camera.contains(&p, 0.0))
     };
-    let (w, h) = (view.width, view.height);
-    (0..w).all(|x| seen(x, 0) && seen(x, h - 1)) && (0..h).all(|y| seen(0, y) && seen(w - 1, y))
+    let (right, bottom) = (view.width as f64 - 0.5, view.height as f64 - 0.5);
+    (0..=view.width).all(|i| seen(i as f64 - 0.5, -0.5) && seen(i as f64 - 0.5, bottom))
+        && (0..=view.height).all(|i| seen(-0.5, i as f64 - 0.5) && seen(right, i as f64 - 0.5))
 }

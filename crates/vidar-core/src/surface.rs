@@ -63,3 +63,28 @@ impl TriangleMesh {
             && self.triangles.iter().flatten().all(|&i| (i as usize) < n)
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn attributes_are_absent_or_one_per_point() {
+        let mut cloud = PointCloud::from_positions(vec![[0.0; 3]; 3]);
+        assert!(cloud.is_consistent() && cloud.len() == 3 && !cloud.is_empty());
+        cloud.confidences = vec![1.0; 3];
+        assert!(cloud.is_consistent());
+        cloud.normals = vec![[0.0, 0.0, 1.0]; 2];
+        assert!(!cloud.is_consistent());
+        assert!(PointCloud::default().is_consistent() && PointCloud::default().is_empty());
+    }
+
+    #[test]
+    fn triangles_name_vertices_that_exist() {
+        let positions = vec![[0.0; 3]; 3];
+        let mesh = TriangleMesh { positions, triangles: vec![[0, 1, 2]], ..TriangleMesh::default() };
+        assert!(mesh.is_consistent());
+        assert!(!TriangleMesh { triangles: vec![[0, 1, 3]], ..mesh.clone() }.is_consistent());
+        assert!(!TriangleMesh { colors: vec![[0; 3]], ..mesh }.is_consistent());
+    }
+}

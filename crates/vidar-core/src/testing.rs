@@ -24,6 +24,18 @@ pub fn numeric_jacobian<const M: usize, const N: usize>(
     jacobian
 }
 
+/// Largest absolute entry, NaN as soon as any entry is NaN.
+///
+/// nalgebra's `amax` compares and so passes over a NaN: a broken matrix would look small.
+pub fn largest_entry<const M: usize, const N: usize>(matrix: &SMatrix<f64, M, N>) -> f64 {
+    matrix.iter().fold(
+        0.0,
+        |largest: f64, v| {
+            if largest.is_nan() || v.is_nan() { f64::NAN } else { largest.max(v.abs()) }
+        },
+    )
+}
+
 /// Compares an analytic Jacobian with the numeric one.
 ///
 /// The error is the largest absolute difference over the largest entry (at least 1); `Err` names both matrices.
@@ -35,11 +47,46 @@ pub fn check_jacobian<const M: usize, const N: usize>(
     tolerance: f64,
 ) -> Result<(), String> {
     let numeric = numeric_jacobian(f, x);
-    let error = (analytic - numeric).amax() / numeric.amax().max(1.0);
+    let error = largest_entry(&(analytic - numeric)) / largest_entry(&numeric).max(1.0);
     // A NaN error must fail, so the comparison is written this way round.
     if error <= tolerance {
         Ok(())
     } else {
         Err(format!("{name}: error {error:.3e} > {tolerance:.1e}\nanalytic {analytic}numeric {numeric}"))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use nalgebra::{Matrix2, Vector2};
+
+    fn curve(x: &Vector2<f64>) -> Vector2<f64> {
+        Vector2::new(x[0].sin() * x[1], x[1].exp())
+    }
+
+    #[test]
+    fn a_right_jacobian_passes_and_a_wrong_one_is_shown() {
+        let x = Vector2::new(0.7_f64, 1.3);
+        let right = Matrix2::new(x[0].cos() * x[1], x[0].sin(), 0.0, x[1].exp());
+        assert_eq!(check_jacobian("curve", &right, curve, &x, 1e-10), Ok(()));
+        let mut wrong = right;
+        wrong[(0, 1)] += 1e-4;
+        let message = check_jacobian("curve", &wrong, curve, &x, 1e-6).unwrap_err();
+        assert!(message.starts_with("curve: error") && message.contains("numeric"), "{message}");
+    }
+
+    #[test]
+    fn not_a_number_never_passes() {
+        let x = Vector2::new(0.7_f64, 1.3);
+        let nan = Matrix2::repeat(f64::NAN);
+        assert!(check_jacobian("nan", &nan, curve, &x, 1e3).is_err());
+        let mut one_nan = numeric_jacobian(curve, &x);
+        one_nan[(1, 0)] = f64::NAN;
+        assert!(largest_entry(&one_nan).is_nan() && largest_entry(&one_nan.transpose()).is_nan());
+        assert_eq!(largest_entry(&Matrix2::new(1.0, -3.0, 2.0, 0.0)), 3.0);
+        assert!(check_jacobian("one nan", &one_nan, curve, &x, 1e3).is_err());
+        let broken = |_: &Vector2<f64>| Vector2::repeat(f64::NAN);
+        assert!(check_jacobian("broken f", &Matrix2::zeros(), broken, &x, 1e3).is_err());
     }
 }

@@ -6,7 +6,7 @@
 use nalgebra::{Matrix4, SMatrix, SVector, Vector3};
 use proptest::prelude::*;
 use std::f64::consts::PI;
-use vidar_core::testing::check_jacobian;
+use vidar_core::testing::{check_jacobian, largest_entry};
 use vidar_core::{LieGroup, Se3, Sim3, So3};
 
 const ROUNDINGS: f64 = 1e-13;
@@ -39,7 +39,7 @@ fn close<const R: usize, const C: usize>(
     size: f64,
     law: &str,
 ) -> Result<(), TestCaseError> {
-    let error = (a - b).amax();
+    let error = largest_entry(&(a - b));
     prop_assert!(error <= ROUNDINGS * size, "{law}: {error:.2e} at size {size:.2e}\n{a}{b}");
     Ok(())
 }

@@ -193,7 +193,7 @@ fn degenerate_points_are_an_error_value() {
 
 #[test]
 fn a_plane_is_enough() {
-    let square = vec![Vector3::zeros(), Vector3::x(), Vector3::y(), Vector3::x() + Vector3::y()];
+    let square = [Vector3::zeros(), Vector3::x(), Vector3::y(), Vector3::x() + Vector3::y()];
     let truth = Sim3::exp(&nalgebra::SVector::from([0.5, -1.0, 2.0, 3.0, 4.0, 5.0, -0.7]));
     for n in [3, 4] {
         let found = umeyama_sim3(&square[..n], &moved(&truth, &square[..n])).unwrap();

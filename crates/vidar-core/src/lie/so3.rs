@@ -178,3 +178,71 @@ impl LieGroup<3> for So3 {
 }
 
 impl_group_ops!(So3);
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::f64::consts::{FRAC_PI_2, PI};
+
+    #[test]
+    fn a_quarter_turn_about_z_takes_x_to_y() {
+        let turn = So3::from_axis_angle(&(Vector3::z() * 7.0), FRAC_PI_2);
+        assert!((turn * Vector3::x() - Vector3::y()).norm() < 1e-15);
+        let half = 0.5_f64.sqrt();
+        let q = turn.quaternion_xyzw();
+        assert!((q[2] - half).abs() < 1e-15 && (q[3] - half).abs() < 1e-15, "{q:?}");
+        assert!((turn.angle_rad() - FRAC_PI_2).abs() < 1e-15);
+        assert_eq!(So3::from_axis_angle(&Vector3::zeros(), 1.0), So3::IDENTITY);
+    }
+
+    #[test]
+    fn quaternions_are_normalised_and_their_sign_is_fixed() {
+        let turn = So3::from_quaternion(0.0, 0.0, -2.0, -2.0).unwrap();
+        assert!((turn * Vector3::x() - Vector3::y()).norm() < 1e-15);
+        assert!(turn.quaternion_xyzw()[3] > 0.0);
+        for bad in [[0.0; 4], [f64::NAN, 0.0, 0.0, 1.0], [f64::INFINITY, 0.0, 0.0, 1.0]] {
+            assert!(So3::from_quaternion(bad[0], bad[1], bad[2], bad[3]).is_none(), "{bad:?}");
+        }
+    }
+
+    #[test]
+    fn matrices_with_few_digits_are_welcome_and_others_are_not() {
+        let turn = So3::exp(&Vector3::new(0.4, -1.1, 2.0));
+        let rounded = turn.matrix().map(|v| (v * 1e4).round() / 1e4);
+        let found = So3::from_matrix(&rounded).unwrap();
+        assert!((found.inverse() * turn).angle_rad() < 1e-4);
+        assert!((found.matrix().determinant() - 1.0).abs() < 1e-14);
+        let half_turn = So3::exp(&Vector3::new(0.0, PI, 0.0));
+        assert!((So3::from_matrix(&half_turn.matrix()).unwrap().angle_rad() - PI).abs() < 1e-15);
+        for bad in [
+            Matrix3::from_diagonal(&Vector3::new(1.0, 1.0, -1.0)),
+            Matrix3::identity() * 1.01,
+            Matrix3::zeros(),
+            Matrix3::repeat(f64::NAN),
+        ] {
+            assert!(So3::from_matrix(&bad).is_none(), "{bad}");
+        }
+        for at in 0..9 {
+            let mut bad = Matrix3::identity();
+            bad[at] = f64::NAN;
+            assert!(So3::from_matrix(&bad).is_none(), "{bad}");
+        }
+    }
+
+    #[test]
+    fn quotients_of_sines_agree_where_the_two_ways_meet() {
+        let (below, above) = (trig_quotients(1.0 - 1e-15), trig_quotients(1.0));
+        for k in 0..6 {
+            assert!((below[k] - above[k]).abs() < 1e-14 * above[k].abs(), "k = {k}");
+        }
+        assert_eq!(trig_quotients(0.0), [1.0, 1.0, 0.5, 1.0 / 6.0, 1.0 / 24.0, 1.0 / 120.0]);
+    }
+
+    #[test]
+    fn a_long_chain_stays_a_rotation() {
+        let step = So3::exp(&Vector3::new(1e-3, 2e-3, -3e-3));
+        let end = (0..100_000).fold(So3::IDENTITY, |at, _| at * step);
+        assert!((end.matrix().determinant() - 1.0).abs() < 1e-14);
+        assert!((end.matrix().transpose() * end.matrix() - Matrix3::identity()).amax() < 1e-14);
+    }
+}

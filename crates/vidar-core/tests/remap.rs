@@ -1,0 +1,222 @@
+//! Undistortion and resizing, judged against scenes drawn directly through the ideal camera.
+
+use nalgebra::{Vector2, Vector3};
+use vidar_core::camera::{DoubleSphere, Equidistant, Fov, ParametricCamera, RadTan};
+use vidar_core::remap::{RemapTable, undistorted_view};
+use vidar_core::{CameraError, CameraModel, FrameImage, Image, Pinhole};
+
+/// Grey level of the world in a unit direction: waves of `wavelength` (rad, in the middle of the view) on the sky.
+fn grey(direction: &Vector3<f64>, wavelength: f64) -> f64 {
+    let k = std::f64::consts::TAU / wavelength;
+    let (x, y) = (direction.x, direction.y);
+    128.0 + 50.0 * (k * x).sin() + 50.0 * (k * (0.8 * y + 0.3 * x)).cos()
+}
+
+/// What `camera` sees, each pixel the mean of `n` × `n` rays over its area; 0 where a pixel has no ray in front.
+fn draw(camera: &CameraModel, wavelength: f64, n: usize) -> Image<f64> {
+    Image::from_fn(camera.width(), camera.height(), |x, y| {
+        let mut sum = 0.0;
+        for i in 0..n * n {
+            let at = |i: usize, base: usize| base as f64 + (i as f64 + 0.5) / n as f64 - 0.5;
+            let ray = camera.unproject(&Vector2::new(at(i % n, x), at(i / n, y)));
+            sum += ray.filter(|r| r.z > 0.05).map_or(0.0, |r| grey(&r, wavelength));
+        }
+        sum / (n * n) as f64
+    })
+}
+
+fn photograph(camera: &CameraModel, wavelength: f64, n: usize) -> FrameImage {
+    FrameImage::Gray8(draw(camera, wavelength, n).map(|v| v.round() as u8))
+}
+
+/// Largest and root-mean-square difference over the pixels seen.
+fn difference(table: &RemapTable, found: &FrameImage, expected: &Image<f64>) -> (f64, f64) {
+    let found = found.to_gray_f32();
+    let (mut largest, mut sum, mut n) = (0.0_f64, 0.0, 0.0);
+    for y in 0..expected.height() {
+        for x in 0..expected.width() {
+            if table.is_seen(x, y) {
+                let error = (f64::from(found[(x, y)]) - expected[(x, y)]).abs();
+                largest = largest.max(error);
+                sum += error * error;
+                n += 1.0;
+            }
+        }
+    }
+    (largest, f64::sqrt(sum / n))
+}
+
+fn distorted_cameras() -> Vec<CameraModel> {
+    vec![
+        CameraModel::RadTan(RadTan::examples()[0]),
+        CameraModel::Equidistant(Equidistant::examples()[0]),
+        CameraModel::DoubleSphere(DoubleSphere::examples()[0]),
+        CameraModel::Fov(Fov::examples()[1]),
+    ]
+}
+
+#[test]
+fn undistorted_images_agree_with_direct_drawing_within_two_grey_levels() {
+    for camera in distorted_cameras() {
+        // The best view at full size, whose pixels are at most as fine as the camera's in the middle.
+        let view = undistorted_view(&camera, camera.width(), camera.height()).unwrap();
+        let table = RemapTable::new(&camera, &view);
+        assert_eq!(table.coverage(), 1.0, "{}", camera.name());
+        let wavelength = 90.0 / camera.intrinsics().fx;
+        let found = table.apply(&photograph(&camera, wavelength, 1));
+        let expected = draw(&CameraModel::Pinhole(view), wavelength, 1);
+        let (largest, rms) = difference(&table, &found, &expected);
+        // Rounding twice gives 0.4 rms and 1 at most; bilinear reading adds the rest where the lens compresses.
+        assert!(largest < 2.0 && rms < 0.6, "{}: largest {largest:.2}, rms {rms:.2}", camera.name());
+    }
+}
+
+#[test]
+fn reduced_views_average_over_the_area() {
+    for camera in distorted_cameras() {
+        let (w, h) = (camera.width() / 4, camera.height() / 4);
+        let view = undistorted_view(&camera, w, h).unwrap();
+        let table = RemapTable::new(&camera, &view);
+        assert_eq!(table.coverage(), 1.0, "{}", camera.name());
+        // Waves of three target pixels lose a fifth of their height in an area average.
+        let wavelength = 3.0 / view.fx;
+        let found = table.apply(&photograph(&camera, wavelength, 2));
+        let expected = draw(&CameraModel::Pinhole(view), wavelength, 8);
+        let (largest, rms) = difference(&table, &found, &expected);
+        // One sample a pixel gives 13 and more; the average misses only what bilinear reading softens.
+        assert!(largest < 4.0 && rms < 1.0, "{}: largest {largest:.2}, rms {rms:.2}", camera.name());
+    }
+}
+
+#[test]
+fn texture_too_fine_for_the_reduced_view_becomes_grey() {
+    // A checkerboard of single pixels: point sampling at every fourth pixel would make it black or white.
+    let source = Pinhole::examples()[0];
+    let board = Image::from_fn(source.width, source.height, |x, y| if (x + y) % 2 == 0 { 255 } else { 0 });
+    let image = FrameImage::Gray8(board);
+    for (w, h) in [(160, 120), (161, 119), (213, 160), (320, 240), (40, 30)] {
+        let table = RemapTable::resizing(&source, w, h).unwrap();
+        let small = table.apply(&image).to_gray8();
+        let (least, most) = (small.data().iter().min().unwrap(), small.data().iter().max().unwrap());
+        assert!(*least >= 100 && *most <= 155, "{w}x{h}: {least} to {most}");
+    }
+    let table = RemapTable::resizing(&source, 320, 240).unwrap();
+    assert!(table.apply(&image).to_gray8().data().iter().all(|&v| v == 128));
+}
+
+#[test]
+fn halving_is_the_mean_of_four_and_no_change_is_no_change() {
+    let source = Pinhole::new(50.0, 50.0, 3.5, 2.5, 8, 6).unwrap();
+    let image = Image::from_fn(8, 6, |x, y| (x * 17 + y * 31) as u16 * 100);
+    let same = RemapTable::resizing(&source, 8, 6).unwrap();
+    assert_eq!(same.apply(&FrameImage::Gray16(image.clone())), FrameImage::Gray16(image.clone()));
+    let half = RemapTable::resizing(&source, 4, 3).unwrap();
+    let FrameImage::Gray16(small) = half.apply(&FrameImage::Gray16(image.clone())) else { unreachable!() };
+    for y in 0..3 {
+        for x in 0..4 {
+            let sum: u32 = [(0, 0), (1, 0), (0, 1), (1, 1)]
+                .iter()
+                .map(|&(i, j)| u32::from(image[(2 * x + i, 2 * y + j)]))
+                .sum();
+            assert_eq!(u32::from(small[(x, y)]), (sum + 2) / 4);
+        }
+    }
+}
+
+#[test]
+fn intrinsics_after_resize_and_crop_show_the_same_point() {
+    let full = Pinhole::new(420.0, 430.0, 315.2, 243.9, 640, 480).unwrap();
+    let point = Vector3::new(0.21, -0.13, 1.4);
+    let at = full.project(&point).unwrap();
+    // A bright spot of two pixels' width, drawn where the point projects.
+    let spot = |x: usize, y: usize| {
+        let d2 = (x as f64 - at.x).powi(2) + (y as f64 - at.y).powi(2);
+        (60_000.0 * (-d2 / 32.0).exp()) as u16
+    };
+    let image = FrameImage::Gray16(Image::from_fn(640, 480, spot));
+    let centroid = |image: &FrameImage| {
+        let FrameImage::Gray16(image) = image else { unreachable!() };
+        let (mut sum, mut mass) = (Vector2::zeros(), 0.0);
+        for y in 0..image.height() {
+            for x in 0..image.width() {
+                let v = f64::from(image[(x, y)]);
+                sum += Vector2::new(x as f64, y as f64) * v;
+                mass += v;
+            }
+        }
+        sum / mass
+    };
+    for (w, h) in [(320, 240), (427, 320), (160, 96), (960, 720)] {
+        let table = RemapTable::resizing(&full, w, h).unwrap();
+        assert_eq!(table.coverage(), 1.0, "{w}x{h}");
+        let expected = table.target().project(&point).unwrap();
+        let found = centroid(&table.apply(&image));
+        assert!((found - expected).norm() < 0.02, "{w}x{h}: {found:?} instead of {expected:?}");
+    }
+    let cut = full.cropped(300, 150, 200, 100).unwrap();
+    assert!((cut.project(&point).unwrap() - (at - Vector2::new(300.0, 150.0))).norm() < 1e-12);
+    let table = RemapTable::new(&CameraModel::Pinhole(full), &cut);
+    assert!((centroid(&table.apply(&image)) - cut.project(&point).unwrap()).norm() < 0.02);
+    // There and back again gives the same numbers.
+    let back = full.resized(320, 240).unwrap().resized(640, 480).unwrap();
+    assert!((back.matrix() - full.matrix()).amax() < 1e-12);
+}
+
+#[test]
+fn what_the_camera_does_not_see_is_black_and_told() {
+    let camera = CameraModel::Pinhole(Pinhole::new(100.0, 100.0, 49.5, 49.5, 100, 100).unwrap());
+    let wide = Pinhole::new(50.0, 50.0, 49.5, 49.5, 100, 100).unwrap();
+    let table = RemapTable::new(&camera, &wide);
+    assert_eq!(table.coverage(), 0.25);
+    let white = FrameImage::Rgb8(Image::filled(100, 100, [255, 254, 253]));
+    let FrameImage::Rgb8(found) = table.apply(&white) else { unreachable!() };
+    assert!(table.is_seen(50, 50) && !table.is_seen(10, 50));
+    assert_eq!((found[(50, 50)], found[(10, 50)]), ([255, 254, 253], [0; 3]));
+    assert_eq!(table.source_size(), (100, 100));
+    // An image of another size, even an empty one, is read without panic.
+    assert_eq!(table.apply(&FrameImage::Gray8(Image::filled(0, 0, 7))).width(), 100);
+    assert_eq!(table.apply(&FrameImage::Gray8(Image::filled(3, 2, 7))).to_gray8()[(50, 50)], 7);
+}
+
+#[test]
+fn nearest_reading_never_mixes_depths() {
+    let source = Pinhole::new(50.0, 50.0, 31.5, 23.5, 64, 48).unwrap();
+    let depth = Image::from_fn(64, 48, |x, _| if x < 32 { 1.0_f32 } else { 5.0 });
+    for (w, h) in [(32, 24), (21, 16), (100, 75)] {
+        let small = RemapTable::resizing(&source, w, h).unwrap().apply_nearest(&depth, f32::NAN);
+        assert!(small.data().iter().all(|&z| z == 1.0 || z == 5.0));
+        assert_eq!((small[(0, 0)], small[(w - 1, h - 1)]), (1.0, 5.0));
+    }
+}
+
+#[test]
+fn the_result_does_not_depend_on_the_number_of_threads() {
+    let camera = CameraModel::RadTan(RadTan::examples()[0]);
+    let image = photograph(&camera, 0.05, 1);
+    let run = |threads: usize| {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+        pool.install(|| {
+            let view = undistorted_view(&camera, 320, 200).unwrap();
+            RemapTable::new(&camera, &view).apply(&image)
+        })
+    };
+    assert_eq!(run(1), run(4));
+}
+
+#[test]
+fn views_of_every_example_are_covered_or_refused() {
+    for camera in CameraModel::examples() {
+        match undistorted_view(&camera, 320, 240) {
+            Ok(view) => {
+                let table = RemapTable::new(&camera, &view);
+                assert_eq!(table.coverage(), 1.0, "{camera:?} {view:?}");
+            }
+            Err(e) => panic!("{camera:?}: {e}"),
+        }
+    }
+    // A camera that looks past its own image: no view about its axis exists.
+    let aside = Pinhole::new(200.0, 200.0, -4000.0, 240.0, 640, 480).unwrap();
+    let aside = CameraModel::Equidistant(Equidistant::new(aside, [0.0; 4]).unwrap());
+    let error = undistorted_view(&aside, 640, 480).unwrap_err();
+    assert!(matches!(error, CameraError::NoUndistortedView { width: 640, .. }), "{error}");
+}
