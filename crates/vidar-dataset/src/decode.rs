@@ -99,6 +99,7 @@ fn open_decoder<'a>(bytes: &'a [u8], limits: &ImageLimits) -> Result<Box<dyn Ima
     let format = format_of(bytes)?;
     let mut decoder: Box<dyn ImageDecoder + 'a> = match format {
         Format::Png => {
+            check_png_palette(bytes)?;
             let decoder =
                 image::codecs::png::PngDecoder::with_limits(Cursor::new(bytes), image_limits.clone());
             Box::new(decoder.map_err(|e| e.to_string())?)
@@ -169,6 +170,38 @@ fn to_frame_image(color: ColorType, decoded: DynamicImage) -> Result<FrameImage,
             Image::from_vec(width, height, pixels.to_vec()).map(FrameImage::Rgb8).map_err(sized)
         }
     }
+}
+
+/// Refuses palettes whose length is no whole number of colours, and lists of transparencies longer than the
+/// palette: the decoder (png 0.18.1) indexes past the end of both and panics. Found by fuzzing.
+fn check_png_palette(bytes: &[u8]) -> Result<(), String> {
+    let mut at = 8usize;
+    let mut colours = None;
+    while let Some((length, kind)) = bytes
+        .get(at..)
+        .and_then(|b| b.split_first_chunk::<4>())
+        .and_then(|(length, rest)| Some((u32::from_be_bytes(*length) as usize, *rest.first_chunk::<4>()?)))
+    {
+        if kind == *b"PLTE" && (length % 3 != 0 || length > 768) {
+            return Err(format!("a palette of {length} bytes; it must hold 1 to 256 colours of 3 bytes"));
+        }
+        if kind == *b"PLTE" {
+            colours = Some(length / 3);
+        }
+        // Byte 25 is the header's colour type; 3 is "by palette".
+        if kind == *b"tRNS" && bytes.get(25) == Some(&3) && colours.is_some_and(|n| length > n) {
+            return Err(format!(
+                "{length} transparencies for {} colours of the palette",
+                colours.unwrap_or(0)
+            ));
+        }
+        if kind == *b"IEND" {
+            break;
+        }
+        // Length, kind and checksum take 12 bytes.
+        at = at.saturating_add(12).saturating_add(length);
+    }
+    Ok(())
 }
 
 /// Whether the segments of a JPEG lead to an end-of-image marker.

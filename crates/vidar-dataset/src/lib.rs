@@ -5,13 +5,24 @@
 //!
 //! The files may be anybody's: nothing here panics on them or allocates more than stated limits.
 
+mod calibration;
 pub mod camera_flag;
+mod checks;
 mod dataset;
 pub mod decode;
+mod draft;
 mod error;
+mod euroc;
 mod events;
+mod folder;
+mod image_folder;
 mod options;
+pub mod parse;
+mod posed_folder;
+mod seven_scenes;
 mod source;
+mod trajectory_file;
+mod tum_rgbd;
 
 pub use camera_flag::{CameraFlag, with_size};
 pub use dataset::{
@@ -20,23 +31,68 @@ pub use dataset::{
 pub use error::DatasetError;
 pub use options::{DatasetKind, OpenOptions, TimeUnit, TrajectoryFormat, TrajectoryReadOptions};
 
-use std::path::Path;
-use vidar_core::{Trajectory, Warning};
+pub use trajectory_file::{read_trajectory, trajectory_from};
 
-/// Opens the dataset at `path`.
+use std::path::Path;
+
+/// Opens the dataset at `path`: by the format the user names, else by looking at what lies there.
+///
+/// The layouts are tried from the most to the least particular; [`Dataset::reason`] tells what decided.
 pub fn open(path: &Path, options: &OpenOptions) -> Result<Dataset, DatasetError> {
     options.validate()?;
-    Err(DatasetError::UnknownLayout {
-        path: path.to_path_buf(),
-        found: "nothing yet".into(),
-        expected: "a reader".into(),
-    })
+    if !path.is_dir() {
+        let found = match std::fs::metadata(path) {
+            Ok(_) => "a file".to_string(),
+            Err(e) => return Err(error::io_error(path)(e)),
+        };
+        return Err(unknown(path, found));
+    }
+    let kinds = options.format.map_or(DatasetKind::ALL.to_vec(), |kind| vec![kind]);
+    for kind in kinds {
+        if let Some(draft) = try_kind(kind, path, options)? {
+            return draft.finish(options);
+        }
+    }
+    let names = folder::names_in(path)?;
+    let shown = names.iter().take(6).map(String::as_str).collect::<Vec<_>>().join(", ");
+    let found =
+        if names.is_empty() { "an empty folder".into() } else { format!("{} entries: {shown}", names.len()) };
+    Err(unknown(path, found))
 }
 
-/// Reads a trajectory file.
-pub fn read_trajectory(
+/// Reads `path` as one kind; `None` when it does not look like it.
+fn try_kind(
+    kind: DatasetKind,
     path: &Path,
-    _options: &TrajectoryReadOptions,
-) -> Result<(Trajectory, Vec<Warning>), DatasetError> {
-    Err(DatasetError::NoPoses { path: path.to_path_buf(), found: "nothing yet".into() })
+    options: &OpenOptions,
+) -> Result<Option<draft::Draft>, DatasetError> {
+    let single = |draft: Result<draft::Draft, DatasetError>| {
+        // Only EuRoC's layout has more than one camera to choose from.
+        let found = "camera 0 only".to_string();
+        if options.camera.0 == 0 {
+            draft.map(Some)
+        } else {
+            Err(DatasetError::MissingCamera { path: path.to_path_buf(), camera: options.camera, found })
+        }
+    };
+    match kind {
+        DatasetKind::EurocAsl => {
+            euroc::detect(path).map(|found| euroc::open(path, found, options)).transpose()
+        }
+        DatasetKind::TumRgbd => {
+            tum_rgbd::detect(path).map_or(Ok(None), |reason| single(tum_rgbd::open(path, reason, options)))
+        }
+        DatasetKind::SevenScenes => seven_scenes::detect(path)
+            .map_or(Ok(None), |(folder, reason)| single(seven_scenes::open(&folder, reason, options))),
+        DatasetKind::PosedFolder => posed_folder::detect(path)
+            .map_or(Ok(None), |reason| single(posed_folder::open(path, reason, options))),
+        DatasetKind::ImageFolder => image_folder::detect(path)
+            .map_or(Ok(None), |(folder, reason)| single(image_folder::open(path, &folder, reason, options))),
+    }
+}
+
+fn unknown(path: &Path, found: String) -> DatasetError {
+    let expected = "mav0/cam0/data.csv (EuRoC), rgb.txt (TUM RGB-D), frame-*.color.* (7-Scenes), \
+                    images/ with poses.txt, or a folder of PNG or JPEG images";
+    DatasetError::UnknownLayout { path: path.to_path_buf(), found, expected: expected.to_string() }
 }

@@ -1,20 +1,169 @@
-//! Text files of unknown origin: bounded in size, byte-order mark and CRLF found and named.
+//! Text files of unknown origin: bounded in size and line length, byte-order mark and CRLF found and named.
 
 use crate::error::{DatasetError, io_error};
 use std::io::Read;
 use std::path::Path;
+use vidar_core::Warning;
 
 /// Largest text file that is read.
 pub const MAX_TEXT_BYTES: u64 = 2 << 30;
+/// Longest line that is read; the longest line of a known format (17 columns) has under 500 bytes.
+pub const MAX_LINE_BYTES: usize = 16 << 10;
 
 /// Reads a text file of at most [`MAX_TEXT_BYTES`].
 pub(crate) fn read_text_file(path: &Path) -> Result<Vec<u8>, DatasetError> {
+    read_text_file_up_to(path, MAX_TEXT_BYTES)
+}
+
+pub(crate) fn read_text_file_up_to(path: &Path, limit: u64) -> Result<Vec<u8>, DatasetError> {
     let file = std::fs::File::open(path).map_err(io_error(path))?;
     let found = file.metadata().map_err(io_error(path))?.len();
-    if found > MAX_TEXT_BYTES {
-        return Err(DatasetError::TooLarge { path: path.to_path_buf(), found, limit: MAX_TEXT_BYTES });
+    if found > limit {
+        return Err(DatasetError::TooLarge { path: path.to_path_buf(), found, limit });
     }
     let mut bytes = Vec::with_capacity(found as usize);
-    file.take(MAX_TEXT_BYTES).read_to_end(&mut bytes).map_err(io_error(path))?;
+    file.take(limit).read_to_end(&mut bytes).map_err(io_error(path))?;
     Ok(bytes)
+}
+
+/// The bytes of a text file and its path for messages.
+#[derive(Clone, Copy, Debug)]
+pub struct Source<'a> {
+    /// Where the bytes come from.
+    pub path: &'a Path,
+    /// The whole file.
+    pub bytes: &'a [u8],
+}
+
+/// One line that is neither empty nor a comment.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Row<'a> {
+    /// Counted from 1.
+    pub line: usize,
+    pub text: &'a str,
+}
+
+/// The lines of a file, told apart.
+pub(crate) struct Lines<'a> {
+    pub rows: Vec<Row<'a>>,
+    /// The first comments, without their `#`.
+    pub comments: Vec<&'a str>,
+}
+
+/// Comments kept for their content; a header has a few lines, a file of comments may have millions.
+const MAX_COMMENTS: usize = 32;
+
+impl<'a> Source<'a> {
+    /// An error about a line of this file.
+    pub(crate) fn garbage(
+        &self,
+        line: usize,
+        found: impl Into<String>,
+        expected: impl Into<String>,
+    ) -> DatasetError {
+        DatasetError::Garbage {
+            path: self.path.to_path_buf(),
+            line,
+            found: found.into(),
+            expected: expected.into(),
+        }
+    }
+
+    /// The text without byte-order mark; UTF-16 is refused by name.
+    fn without_bom(&self, notes: &mut Vec<Warning>) -> Result<&'a [u8], DatasetError> {
+        match self.bytes {
+            [0xff, 0xfe, ..] | [0xfe, 0xff, ..] => {
+                Err(self.garbage(1, "UTF-16 text (its byte-order mark)", "UTF-8 text"))
+            }
+            [0xef, 0xbb, 0xbf, rest @ ..] => {
+                notes.push(
+                    Warning::new(
+                        "byte-order-mark",
+                        "the file begins with a UTF-8 byte-order mark; it is skipped",
+                    )
+                    .at(self.path.display()),
+                );
+                Ok(rest)
+            }
+            all => Ok(all),
+        }
+    }
+
+    /// The whole file as text.
+    pub(crate) fn text(&self, notes: &mut Vec<Warning>) -> Result<&'a str, DatasetError> {
+        let bytes = self.without_bom(notes)?;
+        std::str::from_utf8(bytes).map_err(|e| {
+            let line =
+                1 + bytes.get(..e.valid_up_to()).unwrap_or_default().iter().filter(|&&b| b == b'\n').count();
+            self.garbage(line, "bytes that are not UTF-8", "UTF-8 text")
+        })
+    }
+
+    /// Splits the file into lines; skips empty ones and a first line of column names.
+    pub(crate) fn lines(&self, notes: &mut Vec<Warning>) -> Result<Lines<'a>, DatasetError> {
+        let mut out = Lines { rows: Vec::new(), comments: Vec::new() };
+        let mut crlf = false;
+        for (index, raw) in self.without_bom(notes)?.split(|&b| b == b'\n').enumerate() {
+            let line = index + 1;
+            if raw.len() > MAX_LINE_BYTES {
+                let found = format!("a line of {} bytes", raw.len());
+                return Err(self.garbage(line, found, format!("at most {MAX_LINE_BYTES} bytes a line")));
+            }
+            crlf |= raw.last() == Some(&b'\r');
+            let text = std::str::from_utf8(raw)
+                .map_err(|_| self.garbage(line, "bytes that are not UTF-8", "UTF-8 text"))?
+                .trim();
+            if let Some(comment) = text.strip_prefix('#') {
+                if out.comments.len() < MAX_COMMENTS {
+                    out.comments.push(comment.trim());
+                }
+            } else if out.rows.is_empty() && is_column_names(text) {
+                out.comments.push(text);
+            } else if !text.is_empty() {
+                out.rows.push(Row { line, text });
+            }
+        }
+        if crlf {
+            notes.push(
+                Warning::new("crlf", "lines end with CRLF (Windows); read as usual").at(self.path.display()),
+            );
+        }
+        Ok(out)
+    }
+
+    /// A finite or non-finite number.
+    pub(crate) fn number(&self, row: &Row<'_>, field: &str, what: &str) -> Result<f64, DatasetError> {
+        field
+            .parse::<f64>()
+            .map_err(|_| self.garbage(row.line, quoted(field), format!("a number for {what}")))
+    }
+}
+
+/// The first line of a csv without `#` may hold names of columns.
+fn is_column_names(text: &str) -> bool {
+    let mut fields = text.split([',', ' ', '\t', ';']).filter(|f| !f.is_empty());
+    let first_is_word = fields.next().is_some_and(|f| f.starts_with(|c: char| c.is_ascii_alphabetic()));
+    let known = ["time", "stamp", "nsec", "sec", "p_x", "tx"];
+    let lower = text.to_ascii_lowercase();
+    first_is_word
+        && known.iter().any(|k| lower.contains(k))
+        && !lower.contains(".png")
+        && !lower.contains(".jp")
+}
+
+/// A field as shown in a message: cut and with control characters escaped.
+pub(crate) fn quoted(field: &str) -> String {
+    format!("{:?}", field.chars().take(60).collect::<String>())
+}
+
+impl<'a> Row<'a> {
+    /// Fields, separated by commas or semicolons where there are any, else by blanks.
+    pub(crate) fn fields(&self) -> impl Iterator<Item = &'a str> {
+        let separator = self.text.find([',', ';']);
+        let (by_comma, by_blank) = match separator {
+            Some(_) => (Some(self.text.trim_end_matches([',', ';']).split([',', ';'])), None),
+            None => (None, Some(self.text.split_ascii_whitespace())),
+        };
+        by_comma.into_iter().flatten().map(str::trim).chain(by_blank.into_iter().flatten())
+    }
 }

@@ -1,0 +1,181 @@
+//! Faults of time and of inertial readings, found and named.
+
+use std::path::Path;
+use vidar_core::{Duration, ImuSample, Timestamp, Trajectory, Warning};
+
+/// A gap is longer than this many median steps …
+const GAP_STEPS: i64 = 3;
+/// … and than this: a dropped image or two at 20 Hz, and ten lost readings at 200 Hz, are within what odometry
+/// and interpolation bridge.
+pub(crate) const IMAGE_GAP_FLOOR: Duration = Duration::from_millis(200);
+pub(crate) const IMU_GAP_FLOOR: Duration = Duration::from_millis(20);
+pub(crate) const POSE_GAP_FLOOR: Duration = Duration::from_millis(500);
+
+/// Brings `items` into strictly increasing time: sorts what is out of order, drops all but the first of each time.
+pub(crate) fn put_in_order<T>(
+    items: &mut Vec<T>,
+    time: impl Fn(&T) -> Timestamp,
+    what: &str,
+    place: &Path,
+    notes: &mut Vec<Warning>,
+) {
+    let backward = items.windows(2).filter(|w| time(&w[1]) < time(&w[0])).count();
+    if backward > 0 {
+        let message = format!("time of {what} goes backward {backward} times; sorted");
+        notes.push(Warning::new("time-not-increasing", message).at(place.display()));
+        items.sort_by_key(&time);
+    }
+    let before = items.len();
+    let mut first = None;
+    items.dedup_by(|later, earlier| {
+        let same = time(later) == time(earlier);
+        if same && first.is_none() {
+            first = Some(time(later));
+        }
+        same
+    });
+    if let Some(at) = first {
+        let message = format!(
+            "{} {what} have the time of the one before, first at {at} s; dropped",
+            before - items.len()
+        );
+        notes.push(Warning::new("time-duplicate", message).at(place.display()));
+    }
+}
+
+/// Names the gaps in strictly increasing times.
+pub(crate) fn find_gaps(
+    times: impl Iterator<Item = Timestamp>,
+    floor: Duration,
+    kind: &str,
+    what: &str,
+    place: &Path,
+    notes: &mut Vec<Warning>,
+) {
+    let times: Vec<Timestamp> = times.collect();
+    let steps: Vec<Duration> = times.windows(2).map(|w| w[1] - w[0]).collect();
+    let mut sorted: Vec<i64> = steps.iter().map(|s| s.nanos()).collect();
+    sorted.sort_unstable();
+    let Some(&median) = sorted.get(sorted.len() / 2) else { return };
+    let limit = Duration::from_nanos(median.saturating_mul(GAP_STEPS).max(floor.nanos()));
+    let gaps: Vec<usize> = (0..steps.len()).filter(|&i| steps[i] > limit).collect();
+    let Some(&longest) = gaps.iter().max_by_key(|&&i| (steps[i], std::cmp::Reverse(i))) else { return };
+    let message = format!(
+        "{} gaps in {what}; the longest is {} from {} s (the median step is {:.4} s)",
+        gaps.len(),
+        steps[longest],
+        times[longest],
+        median as f64 * 1e-9
+    );
+    notes.push(Warning::new(kind, message).at(place.display()));
+}
+
+/// Accelerometers measure about 9.8 m/s² at rest anywhere on Earth; 8.5 to 11 leaves room for motion and bias.
+const GRAVITY_RANGE_MPS2: std::ops::RangeInclusive<f64> = 8.5..=11.0;
+/// Largest standard deviation of |accel| in a second that counts as still (vibration of idle rotors stays below).
+const STILL_DEVIATION_MPS2: f64 = 0.3;
+/// 2000 °/s, the full scale of common gyroscopes, rad/s.
+const GYRO_FULL_SCALE_RADPS: f64 = 34.9;
+
+/// Mean of the norm over the first still second, else over everything.
+pub(crate) fn resting_norm(samples: &[(Timestamp, f64)]) -> Option<(f64, bool)> {
+    let mut from = 0;
+    while from < samples.len() {
+        let end = samples[from].0 + Duration::from_millis(1000);
+        let until = from + samples[from..].partition_point(|s| s.0 < end);
+        let window = &samples[from..until];
+        // A second that the recording cuts short, or of a few readings, proves nothing.
+        if until < samples.len() && window.len() >= 10 {
+            let mean = mean(window);
+            let variance = window.iter().map(|s| (s.1 - mean).powi(2)).sum::<f64>() / window.len() as f64;
+            if variance.sqrt() < STILL_DEVIATION_MPS2 {
+                return Some((mean, true));
+            }
+        }
+        from = until.max(from + 1);
+    }
+    (!samples.is_empty()).then(|| (mean(samples), false))
+}
+
+fn mean(samples: &[(Timestamp, f64)]) -> f64 {
+    samples.iter().map(|s| s.1).sum::<f64>() / samples.len() as f64
+}
+
+/// Checks that gravity has the right size.
+pub(crate) fn check_gravity(norms: &[(Timestamp, f64)], place: &Path, notes: &mut Vec<Warning>) {
+    let Some((norm, still)) = resting_norm(norms) else { return };
+    if GRAVITY_RANGE_MPS2.contains(&norm) {
+        return;
+    }
+    let when = if still { "over the first still second" } else { "on the whole" };
+    let guess = match norm {
+        n if (0.8..1.2).contains(&n) => "; it looks like units of g",
+        n if (800.0..1200.0).contains(&n) => "; it looks like units of mg",
+        n if n < 0.5 => "; gravity seems to have been taken out",
+        _ => "",
+    };
+    let message = format!("mean |accel| {when} is {norm:.3} m/s², not 8.5 to 11{guess}");
+    let hint = "the accelerometer must hold specific force in m/s², gravity included";
+    notes.push(Warning::new("gravity-norm", message).at(place.display()).hint(hint));
+}
+
+/// Checks the readings of an IMU that are in order.
+pub(crate) fn check_imu(imu: &[ImuSample], place: &Path, notes: &mut Vec<Warning>) {
+    find_gaps(imu.iter().map(|s| s.time), IMU_GAP_FLOOR, "imu-gap", "the inertial readings", place, notes);
+    let norms: Vec<_> = imu.iter().map(|s| (s.time, s.accel.0.norm())).collect();
+    check_gravity(&norms, place, notes);
+    let fastest = imu.iter().map(|s| s.gyro.0.amax()).fold(0.0, f64::max);
+    if fastest > GYRO_FULL_SCALE_RADPS {
+        let message =
+            format!("gyroscope reads up to {fastest:.1} rad/s, more than 2000 °/s; it looks like °/s");
+        notes.push(Warning::new("gyro-range", message).at(place.display()));
+    }
+}
+
+/// Checks that images and a trajectory are of one time.
+pub(crate) fn check_overlap(
+    images: Option<(Timestamp, Timestamp)>,
+    trajectory: &Trajectory,
+    what: &str,
+    place: &Path,
+    notes: &mut Vec<Warning>,
+) {
+    let (Some(images), Some(poses)) = (images, trajectory.time_range()) else { return };
+    if poses.0 <= images.1 && images.0 <= poses.1 {
+        return;
+    }
+    let message = format!(
+        "no overlap in time: images {} to {} s, {what} {} to {} s{}",
+        images.0,
+        images.1,
+        poses.0,
+        poses.1,
+        slip_between(images, poses)
+    );
+    notes.push(
+        Warning::new("no-overlap", message)
+            .at(place.display())
+            .hint("--time-unit, or bring both files into one clock"),
+    );
+}
+
+/// The factor of a thousand that would bring the ranges together, or the clock that starts at zero.
+fn slip_between(images: (Timestamp, Timestamp), poses: (Timestamp, Timestamp)) -> String {
+    let secs = |r: (Timestamp, Timestamp)| (r.0.as_secs_f64(), r.1.as_secs_f64());
+    let ((i0, i1), (p0, p1)) = (secs(images), secs(poses));
+    for factor in [1e3, 1e6, 1e9] {
+        if p0 * factor <= i1 && i0 <= p1 * factor {
+            return format!("; the poses' times times {factor:e} would fit: a unit slip");
+        }
+        if p0 / factor <= i1 && i0 <= p1 / factor {
+            return format!("; the poses' times over {factor:e} would fit: a unit slip");
+        }
+    }
+    if p0.abs() < 1e3 && i0 > 1e8 {
+        return "; the poses' clock starts near zero, the images' is Unix time".into();
+    }
+    if i0.abs() < 1e3 && p0 > 1e8 {
+        return "; the images' clock starts near zero, the poses' is Unix time".into();
+    }
+    String::new()
+}

@@ -1,0 +1,530 @@
+//! From what a reader found to a dataset that holds together: calibration, order, sizes, cuts, anchor.
+
+use crate::camera_flag::with_size;
+use crate::checks::{self, IMAGE_GAP_FLOOR};
+use crate::dataset::{Anchor, CalibrationSource, Dataset, DepthEntry, DepthSensor, ImageEntry};
+use crate::decode::{self, ImageLimits};
+use crate::error::{DatasetError, io_error};
+use crate::options::{DatasetKind, OpenOptions};
+use crate::parse::{self, Source};
+use crate::source::read_text_file_up_to;
+use crate::{trajectory_file, tum_rgbd};
+use std::path::{Path, PathBuf};
+use vidar_core::{
+    BodyFrame, CameraId, CameraModel, Duration, FrameId, ImuNoise, ImuSample, Pinhole, Rig, RigCamera, Se3,
+    StampedPose, Timestamp, Trajectory, Warning,
+};
+
+/// A camera of the dataset while its calibration is being put together.
+pub(crate) struct DraftCamera {
+    /// N of `camN`.
+    pub number: u32,
+    /// The model; size 0×0 = that of the images.
+    pub model: Option<CameraModel>,
+    pub source: CalibrationSource,
+    pub body_from_camera: Se3,
+    pub time_offset: Duration,
+    pub rate_hz: Option<f64>,
+}
+
+impl DraftCamera {
+    pub(crate) fn unknown(number: u32) -> Self {
+        Self {
+            number,
+            model: None,
+            source: CalibrationSource::Guessed,
+            body_from_camera: Se3::IDENTITY,
+            time_offset: Duration::ZERO,
+            rate_hz: None,
+        }
+    }
+}
+
+/// What a reader knows of the depth camera.
+pub(crate) struct DraftDepth {
+    pub intrinsics: Option<[f64; 4]>,
+    pub units_per_metre: Option<f64>,
+    /// Raw units that this kind of dataset uses when nothing says otherwise.
+    pub default_units: f64,
+    pub body_from_depth: Option<Se3>,
+    pub invalid: Vec<u16>,
+    /// Whether the dataset promises depth in the colour camera's pixels.
+    pub is_registered: bool,
+}
+
+/// What a reader found.
+pub(crate) struct Draft {
+    pub kind: DatasetKind,
+    pub reason: String,
+    pub root: PathBuf,
+    pub cameras: Vec<DraftCamera>,
+    /// Which of `cameras` the images are of.
+    pub chosen: usize,
+    /// The file or folder that lists the images.
+    pub image_list: PathBuf,
+    pub images: Vec<(Timestamp, PathBuf)>,
+    pub imu: Vec<ImuSample>,
+    pub imu_noise: Option<ImuNoise>,
+    pub accelerometer: Vec<crate::dataset::AccelSample>,
+    pub depths: Vec<(Timestamp, PathBuf)>,
+    pub depth: Option<DraftDepth>,
+    pub ground_truth: Option<(Trajectory, PathBuf)>,
+    pub reference_cloud: Option<PathBuf>,
+    pub warnings: Vec<Warning>,
+    pub text_files: Vec<PathBuf>,
+}
+
+impl Draft {
+    pub(crate) fn new(kind: DatasetKind, root: &Path, reason: String) -> Self {
+        Self {
+            kind,
+            reason,
+            root: root.to_path_buf(),
+            cameras: vec![DraftCamera::unknown(0)],
+            chosen: 0,
+            image_list: root.to_path_buf(),
+            images: Vec::new(),
+            imu: Vec::new(),
+            imu_noise: None,
+            accelerometer: Vec::new(),
+            depths: Vec::new(),
+            depth: None,
+            ground_truth: None,
+            reference_cloud: None,
+            warnings: Vec::new(),
+            text_files: Vec::new(),
+        }
+    }
+
+    /// Reads a text file and remembers that it belongs to the dataset.
+    pub(crate) fn read(&mut self, path: &Path) -> Result<Vec<u8>, DatasetError> {
+        let bytes = crate::source::read_text_file(path)?;
+        self.text_files.push(path.to_path_buf());
+        Ok(bytes)
+    }
+
+    /// Puts everything together, in the order in which one thing needs another.
+    pub(crate) fn finish(mut self, options: &OpenOptions) -> Result<Dataset, DatasetError> {
+        for path in &options.calibration {
+            self.apply_calibration(path)?;
+        }
+        let images = self.settle_images()?;
+        self.settle_model(options, &images)?;
+        let chosen = CameraId(self.chosen as u32);
+        let mut dataset = Dataset {
+            name: name_of(&self.root),
+            kind: self.kind,
+            reason: self.reason.clone(),
+            root: self.root.clone(),
+            calibration: self.cameras[self.chosen].source.clone(),
+            rig: self.rig(),
+            camera: chosen,
+            images,
+            imu: std::mem::take(&mut self.imu),
+            accelerometer: std::mem::take(&mut self.accelerometer),
+            depths: Vec::new(),
+            depth_sensor: None,
+            ground_truth: None,
+            anchor: None,
+            reference_cloud: self.reference_cloud.take(),
+            warnings: std::mem::take(&mut self.warnings),
+            text_files: std::mem::take(&mut self.text_files),
+        };
+        let root = self.root.clone();
+        let notes = &mut dataset.warnings;
+        checks::put_in_order(&mut dataset.imu, |s| s.time, "inertial readings", &root, notes);
+        if !dataset.imu.is_empty() {
+            checks::check_imu(&dataset.imu, &root, notes);
+        }
+        checks::put_in_order(&mut dataset.accelerometer, |s| s.time, "accelerometer readings", &root, notes);
+        let norms: Vec<_> = dataset.accelerometer.iter().map(|s| (s.time, s.accel.0.norm())).collect();
+        checks::check_gravity(&norms, &root, notes);
+        self.settle_depth(options, &mut dataset)?;
+        self.read_anchor(options, &mut dataset)?;
+        let range = image_range(&dataset.images);
+        if let Some((truth, place)) = self.ground_truth.take() {
+            checks::check_overlap(range, &truth, "ground truth", &place, &mut dataset.warnings);
+            dataset.ground_truth = Some(truth);
+        }
+        cut(&mut dataset, options)?;
+        Ok(dataset)
+    }
+
+    /// Existing images in the order of time, numbered.
+    fn settle_images(&mut self) -> Result<Vec<ImageEntry>, DatasetError> {
+        let listed = self.images.len();
+        let list = self.image_list.clone();
+        let mut images = std::mem::take(&mut self.images);
+        keep_existing(&mut images, "images", &list, &mut self.warnings)?;
+        if images.is_empty() {
+            let found = format!("{listed} files named, none of them there with content");
+            let expected = "to read (PNG or JPEG)".to_string();
+            return Err(DatasetError::NoImages { path: list, found, expected });
+        }
+        checks::put_in_order(&mut images, |i| i.0, "images", &list, &mut self.warnings);
+        let times = images.iter().map(|i| i.0);
+        checks::find_gaps(times, IMAGE_GAP_FLOOR, "image-gap", "the images", &list, &mut self.warnings);
+        let camera = CameraId(self.chosen as u32);
+        let numbered = images.into_iter().enumerate();
+        Ok(numbered
+            .map(|(i, (time, path))| ImageEntry { frame_id: FrameId(i as u32), time, camera, path })
+            .collect())
+    }
+
+    /// The chosen camera's model at the size of its images.
+    fn settle_model(&mut self, options: &OpenOptions, images: &[ImageEntry]) -> Result<(), DatasetError> {
+        let Some(first) = images.first() else { return Ok(()) };
+        let size = first_readable_size(images)?;
+        let camera = &mut self.cameras[self.chosen];
+        if let Some(model) = &options.camera_model {
+            (camera.model, camera.source) = (Some(model.clone()), CalibrationSource::Flags);
+        }
+        let model = match camera.model.take() {
+            Some(model) => model,
+            None => {
+                let (model, source, warning) = tum_rgbd::published_model(&self.root, self.kind, size)
+                    .map_or_else(|| guessed_model(size, &first.path), Ok)?;
+                self.warnings.push(warning);
+                camera.source = source;
+                model
+            }
+        };
+        let place = match &camera.source {
+            CalibrationSource::File(path) => path.clone(),
+            CalibrationSource::Flags => PathBuf::from("--camera-model"),
+            _ => self.root.clone(),
+        };
+        let model = if model.width() == 0 {
+            let key = "size of the first image".to_string();
+            with_size(&model, size.0, size.1).map_err(|source| DatasetError::BadCamera {
+                path: place.clone(),
+                key,
+                source,
+            })?
+        } else {
+            model
+        };
+        if (model.width(), model.height()) != size {
+            return Err(DatasetError::WrongImageSize {
+                path: first.path.clone(),
+                found_width: size.0,
+                found_height: size.1,
+                expected_width: model.width(),
+                expected_height: model.height(),
+            });
+        }
+        camera.model = Some(model);
+        Ok(())
+    }
+
+    /// The rig of all cameras whose model is known; the caller checked that the chosen one's is.
+    fn rig(&mut self) -> Rig {
+        let mut rig = Rig { cameras: Vec::new(), imu: self.imu_noise };
+        for camera in &self.cameras {
+            // A camera without model or size cannot project; only the chosen one is promised.
+            let fallback = || self.cameras[self.chosen].model.clone();
+            if let Some(model) = camera.model.clone().or_else(fallback) {
+                rig.cameras.push(RigCamera {
+                    model,
+                    body_from_camera: camera.body_from_camera,
+                    time_offset: camera.time_offset,
+                    rate_hz: camera.rate_hz,
+                });
+            }
+        }
+        rig
+    }
+
+    /// Takes what a calibration file says, EuRoC's or Kalibr's.
+    pub(crate) fn apply_calibration(&mut self, path: &Path) -> Result<(), DatasetError> {
+        let bytes = read_text_file_up_to(path, parse::yaml::MAX_YAML_BYTES as u64)?;
+        self.text_files.push(path.to_path_buf());
+        let source = Source { path, bytes: &bytes };
+        let (sensor, notes) = parse::euroc_sensor_yaml(&source)?;
+        let is_euroc = sensor.camera.is_some() || sensor.imu.is_some() || sensor.body_from_sensor.is_some();
+        if is_euroc {
+            self.warnings.extend(notes);
+            if sensor.imu.is_some() {
+                self.imu_noise = sensor.imu;
+            }
+            if let Some(calibration) = sensor.camera {
+                self.use_calibration(self.chosen, calibration, sensor.body_from_sensor, path);
+            }
+            return Ok(());
+        }
+        let (file, notes) = parse::kalibr_yaml(&source)?;
+        self.warnings.extend(notes);
+        if let Some(imu) = file.imu {
+            self.imu_noise = Some(imu.noise);
+        }
+        let single = file.cameras.len() == 1 && self.cameras.len() == 1;
+        for camera in file.cameras {
+            let index = self.cameras.iter().position(|c| c.number == camera.number || single);
+            let body_from_camera = camera.camera_from_imu.map(|m| vidar_core::LieGroup::inverse(&m));
+            if let Some(index) = index {
+                self.use_calibration(index, camera.calibration, body_from_camera, path);
+            }
+        }
+        Ok(())
+    }
+
+    fn use_calibration(
+        &mut self,
+        index: usize,
+        calibration: parse::CameraCalibration,
+        body_from_camera: Option<Se3>,
+        path: &Path,
+    ) {
+        let camera = &mut self.cameras[index];
+        if body_from_camera.is_none() && !self.imu.is_empty() {
+            self.warnings.push(
+                Warning::new(
+                    "extrinsics-missing",
+                    format!("no place of cam{} on the IMU; {}", camera.number, "the one known before stands"),
+                )
+                .at(path.display())
+                .hint("Kalibr writes T_cam_imu after its camera-imu calibration"),
+            );
+        }
+        camera.model = Some(calibration.model);
+        camera.time_offset = calibration.time_offset;
+        camera.rate_hz = calibration.rate_hz.or(camera.rate_hz);
+        camera.body_from_camera = body_from_camera.unwrap_or(camera.body_from_camera);
+        camera.source = CalibrationSource::File(path.to_path_buf());
+    }
+
+    fn settle_depth(&mut self, options: &OpenOptions, dataset: &mut Dataset) -> Result<(), DatasetError> {
+        let Some(depth) = self.depth.take() else { return Ok(()) };
+        let mut depths = std::mem::take(&mut self.depths);
+        let notes = &mut dataset.warnings;
+        keep_existing(&mut depths, "depth images", &self.root, notes)?;
+        checks::put_in_order(&mut depths, |d| d.0, "depth images", &self.root, notes);
+        let Some((_, first)) = depths.first() else { return Ok(()) };
+        let (width, height) = decode::read_size(first, &ImageLimits::default())?;
+        let Some(camera) = dataset.rig.camera(dataset.camera) else { return Ok(()) };
+        let bad = |key: &str| {
+            let (path, key) = (first.clone(), key.to_string());
+            move |source| DatasetError::BadCamera { path, key, source }
+        };
+        let intrinsics = match options.depth_intrinsics.or(depth.intrinsics) {
+            Some([fx, fy, cx, cy]) => {
+                Pinhole::new(fx, fy, cx, cy, width, height).map_err(bad("depth intrinsics"))?
+            }
+            None => {
+                if !depth.is_registered {
+                    notes.push(
+                        Warning::new(
+                            "depth-intrinsics",
+                            "no intrinsics of the depth camera; the colour camera's are used",
+                        )
+                        .at(self.root.display())
+                        .hint("--depth-intrinsics fx,fy,cx,cy"),
+                    );
+                }
+                camera.model.intrinsics().resized(width, height).map_err(bad("depth intrinsics"))?
+            }
+        };
+        let units_per_metre = match options.depth_scale.or(depth.units_per_metre) {
+            Some(units) => units,
+            None => {
+                let message = format!(
+                    "nothing tells the unit of depth; {} a metre, as usual for {}",
+                    depth.default_units, self.kind
+                );
+                notes.push(
+                    Warning::new("depth-scale", message).at(self.root.display()).hint("--depth-scale UNITS"),
+                );
+                depth.default_units
+            }
+        };
+        let by_rig =
+            depth.body_from_depth.map(|b| vidar_core::LieGroup::inverse(&camera.body_from_camera) * b);
+        let color_from_depth = match options.color_from_depth.or(by_rig) {
+            Some(motion) => motion,
+            None => {
+                if !depth.is_registered {
+                    notes.push(
+                        Warning::new(
+                            "depth-extrinsics",
+                            "the depth camera is taken to be where the colour camera is",
+                        )
+                        .at(self.root.display())
+                        .hint("--color-from-depth"),
+                    );
+                }
+                Se3::IDENTITY
+            }
+        };
+        dataset.depth_sensor =
+            Some(DepthSensor { intrinsics, units_per_metre, color_from_depth, invalid: depth.invalid });
+        dataset.depths = depths.into_iter().map(|(time, path)| DepthEntry { time, path }).collect();
+        Ok(())
+    }
+
+    fn read_anchor(&mut self, options: &OpenOptions, dataset: &mut Dataset) -> Result<(), DatasetError> {
+        let Some(path) = &options.trajectory else { return Ok(()) };
+        let bytes = crate::source::read_text_file(path)?;
+        let read = crate::TrajectoryReadOptions {
+            format: options.trajectory_format,
+            body: options.trajectory_body,
+            time_unit: None,
+            times: Some(dataset.images.iter().map(|i| i.time).collect()),
+        };
+        let (trajectory, notes) = trajectory_file::trajectory_from(&Source { path, bytes: &bytes }, &read)?;
+        dataset.warnings.extend(notes);
+        let trajectory = self.with_known_body(trajectory, options, path, dataset)?;
+        checks::check_overlap(
+            image_range(&dataset.images),
+            &trajectory,
+            "trajectory",
+            path,
+            &mut dataset.warnings,
+        );
+        dataset.anchor = Some(Anchor { trajectory, source: path.clone() });
+        dataset.text_files.push(path.clone());
+        Ok(())
+    }
+
+    /// Without an IMU there is no IMU frame: poses that a format calls the IMU's are then the chosen camera's.
+    fn with_known_body(
+        &self,
+        trajectory: Trajectory,
+        options: &OpenOptions,
+        path: &Path,
+        dataset: &mut Dataset,
+    ) -> Result<Trajectory, DatasetError> {
+        if options.trajectory_body.is_some() {
+            return Ok(trajectory);
+        }
+        let has_imu = !dataset.imu.is_empty() || dataset.rig.imu.is_some();
+        let body = match trajectory.body() {
+            BodyFrame::Imu if !has_imu => BodyFrame::Camera(dataset.camera),
+            known => known,
+        };
+        let whose = match body {
+            BodyFrame::Imu => "the IMU (body)".to_string(),
+            BodyFrame::Camera(id) => format!("camera {id}"),
+            BodyFrame::Other => "a tracked object that is neither IMU nor camera".to_string(),
+        };
+        dataset.warnings.push(
+            Warning::new("trajectory-body", format!("the trajectory is taken to be of {whose}"))
+                .at(path.display())
+                .hint("--trajectory-body body|cameraN says it for certain"),
+        );
+        let poses: Vec<StampedPose> = trajectory.poses().to_vec();
+        Trajectory::new(body, poses)
+            .map_err(|e| DatasetError::NoPoses { path: path.to_path_buf(), found: e.to_string() })
+    }
+}
+
+/// The last part of the root's path that says something (`mav0` does not).
+fn name_of(root: &Path) -> String {
+    let absolute = root.canonicalize().unwrap_or_else(|_| root.to_path_buf());
+    let parts = absolute.components().rev().filter_map(|c| match c {
+        std::path::Component::Normal(part) => Some(part.to_string_lossy().into_owned()),
+        _ => None,
+    });
+    let mut parts = parts.filter(|p| p != "mav0");
+    parts.next().unwrap_or_else(|| "dataset".into())
+}
+
+pub(crate) fn image_range(images: &[ImageEntry]) -> Option<(Timestamp, Timestamp)> {
+    Some((images.first()?.time, images.last()?.time))
+}
+
+/// Leaves out files that are not there or hold nothing, and names them.
+fn keep_existing(
+    files: &mut Vec<(Timestamp, PathBuf)>,
+    what: &str,
+    place: &Path,
+    notes: &mut Vec<Warning>,
+) -> Result<(), DatasetError> {
+    let (mut missing, mut empty) = (Vec::new(), Vec::new());
+    let mut kept = Vec::with_capacity(files.len());
+    for (time, path) in files.drain(..) {
+        match std::fs::metadata(&path) {
+            Ok(found) if !found.is_file() => missing.push(path),
+            Ok(found) if found.len() == 0 => empty.push(path),
+            Ok(_) => kept.push((time, path)),
+            Err(e) if e.kind() == std::io::ErrorKind::NotFound => missing.push(path),
+            Err(e) => return Err(io_error(&path)(e)),
+        }
+    }
+    for (kind, fault, paths) in
+        [("image-missing", "are named but not there", missing), ("image-empty", "are empty (0 bytes)", empty)]
+    {
+        if let Some(first) = paths.first() {
+            let name = first.display();
+            let message = format!("{} {what} {fault}; left out, the first is {name}", paths.len());
+            notes.push(Warning::new(kind, message).at(place.display()));
+        }
+    }
+    *files = kept;
+    Ok(())
+}
+
+/// The size of the first image whose header can be read; truncated ones are told when they are loaded.
+fn first_readable_size(images: &[ImageEntry]) -> Result<(usize, usize), DatasetError> {
+    let mut first_error = None;
+    // Ten unreadable images in a row are no accident.
+    for entry in images.iter().take(10) {
+        match decode::read_size(&entry.path, &ImageLimits::default()) {
+            Ok(size) => return Ok(size),
+            Err(e) => first_error = first_error.or(Some(e)),
+        }
+    }
+    Err(first_error.unwrap_or_else(|| DatasetError::NoImages {
+        path: PathBuf::new(),
+        found: "an empty list".into(),
+        expected: "to read".into(),
+    }))
+}
+
+/// Opening angle across the longer side assumed for a camera about which nothing is known, as of a phone: f = 0.8·w.
+const GUESSED_FOCAL_RATIO: f64 = 0.8;
+
+fn guessed_model(
+    (width, height): (usize, usize),
+    place: &Path,
+) -> Result<(CameraModel, CalibrationSource, Warning), DatasetError> {
+    let focal = GUESSED_FOCAL_RATIO * width.max(height) as f64;
+    let (cx, cy) = (0.5 * width as f64 - 0.5, 0.5 * height as f64 - 0.5);
+    let pinhole = Pinhole::new(focal, focal, cx, cy, width, height).map_err(|source| {
+        DatasetError::BadCamera { path: place.to_path_buf(), key: "image size".into(), source }
+    })?;
+    let warning = Warning::new(
+        "intrinsics-guessed",
+        format!("no calibration; a pinhole of focal length {focal:.0} px is guessed, so nothing metric can be trusted"),
+    )
+    .hint("--calibration FILE, or --camera-model pinhole:fx,fy,cx,cy");
+    Ok((CameraModel::Pinhole(pinhole), CalibrationSource::Guessed, warning))
+}
+
+/// Inertial readings and poses kept before and after the cut, so that an initialiser has its still seconds and
+/// interpolation its neighbours.
+const LEAD_IN: Duration = Duration::from_millis(3000);
+
+/// Applies start, end and stride.
+fn cut(dataset: &mut Dataset, options: &OpenOptions) -> Result<(), DatasetError> {
+    let Some((first, last)) = image_range(&dataset.images) else { return Ok(()) };
+    let from = options.start.map_or(first, |s| first + s);
+    let to = options.end.map_or(last, |e| first + e);
+    dataset.images.retain(|i| (from..=to).contains(&i.time));
+    let stride = options.stride.max(1);
+    dataset.images = std::mem::take(&mut dataset.images).into_iter().step_by(stride).collect();
+    if dataset.images.is_empty() {
+        return Err(DatasetError::NoImages {
+            path: dataset.root.clone(),
+            found: format!("images from 0 to {} after the first", last - first),
+            expected: format!("between {} and {}", from - first, to - first),
+        });
+    }
+    if options.start.is_some() || options.end.is_some() {
+        let wide = from - LEAD_IN..=to + LEAD_IN;
+        dataset.imu.retain(|s| wide.contains(&s.time));
+        dataset.accelerometer.retain(|s| wide.contains(&s.time));
+        let tolerance = crate::dataset::DEPTH_TOLERANCE;
+        dataset.depths.retain(|d| (from - tolerance..=to + tolerance).contains(&d.time));
+    }
+    Ok(())
+}

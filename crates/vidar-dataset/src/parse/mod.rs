@@ -1,0 +1,18 @@
+//! Parsers of whole files held in memory. Every one takes bytes of unknown origin and returns a value or an error
+//! that names the line; none panics, and none allocates more than a small multiple of the file.
+
+mod lists;
+mod matrices;
+mod poses;
+pub(crate) mod units;
+pub(crate) mod yaml;
+
+pub use crate::source::Source;
+pub(crate) use lists::is_image_name;
+pub use lists::{ListedFile, ListedTime, accelerometer_list, file_list, imu_csv, time_list};
+pub use matrices::{intrinsics_matrix, matrix_poses, single_pose};
+pub use poses::{PoseFile, RawPose, euroc_poses, guess_trajectory_format, kitti_poses, tum_poses};
+pub use units::UnitRule;
+pub use yaml::{
+    CameraCalibration, EurocSensor, ImuCalibration, KalibrCamera, KalibrFile, euroc_sensor_yaml, kalibr_yaml,
+};

@@ -1,0 +1,206 @@
+//! Trajectory files: TUM, EuRoC csv, KITTI.
+//!
+//! Policy for poses that are no pose: a row with NaN, infinity or a zero quaternion is what trackers write while
+//! lost, so it is left out, counted and named; a quaternion whose length is further than 5 % from one, or a matrix
+//! that is no rotation, is a wrong file and an error with its line.
+
+use super::units::{UnitRule, decide_unit, read_time};
+use crate::error::DatasetError;
+use crate::options::TrajectoryFormat;
+use crate::source::{Lines, Row, Source};
+use nalgebra::{Matrix4, Vector3};
+use vidar_core::{BodyFrame, CameraId, Se3, So3, Timestamp, Warning};
+
+/// A pose and its line.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct RawPose {
+    /// Line in the file, from 1.
+    pub line: usize,
+    /// Row among those that are neither empty nor comments, from 0.
+    pub row: usize,
+    /// When it holds; `None` in KITTI files.
+    pub time: Option<Timestamp>,
+    /// The pose as written.
+    pub world_from_body: Se3,
+}
+
+/// What a trajectory file holds.
+#[derive(Clone, Debug, PartialEq)]
+pub struct PoseFile {
+    /// Its poses in the order of the file.
+    pub poses: Vec<RawPose>,
+    /// Rows in the file, including those that were left out.
+    pub rows: usize,
+    /// Whose poses the header says they are (`# world_from_body, body = camera0`).
+    pub body: Option<BodyFrame>,
+    /// Whether it holds positions only (a prism); then rotations are the identity.
+    pub positions_only: bool,
+    /// What was found.
+    pub notes: Vec<Warning>,
+}
+
+/// A quaternion in a text file of six digits has a length within 1e-5 of one; 5 % is another thing.
+const QUATERNION_TOLERANCE: f64 = 0.05;
+
+/// Reads TUM rows: `seconds tx ty tz qx qy qz qw`.
+pub fn tum_poses(source: &Source<'_>, rule: UnitRule) -> Result<PoseFile, DatasetError> {
+    stamped_poses(source, rule, "timestamp tx ty tz qx qy qz qw", |q| [q[0], q[1], q[2], q[3]])
+}
+
+/// Reads EuRoC rows: `nanoseconds, px, py, pz, qw, qx, qy, qz, …` (8, 11 or 17 columns) or positions only (4).
+pub fn euroc_poses(source: &Source<'_>, rule: UnitRule) -> Result<PoseFile, DatasetError> {
+    stamped_poses(source, rule, "timestamp, p x y z, q w x y z", |q| [q[1], q[2], q[3], q[0]])
+}
+
+fn stamped_poses(
+    source: &Source<'_>,
+    rule: UnitRule,
+    columns: &str,
+    to_xyzw: impl Fn([f64; 4]) -> [f64; 4],
+) -> Result<PoseFile, DatasetError> {
+    let mut notes = Vec::new();
+    let lines = source.lines(&mut notes)?;
+    let place = source.path.display().to_string();
+    let firsts = lines.rows.iter().map(|r| r.fields().next().unwrap_or(""));
+    let unit = decide_unit(rule, firsts, &place, &mut notes);
+    // Positions without rotation: the first row decides for the file.
+    let positions_only = lines.rows.first().is_some_and(|r| r.fields().count() == 4);
+    let wanted = if positions_only { 3 } else { 7 };
+    let mut poses = Vec::with_capacity(lines.rows.len());
+    let mut lost = Lost::default();
+    for (index, row) in lines.rows.iter().enumerate() {
+        let mut fields = row.fields();
+        let time = read_time(source, row, fields.next().unwrap_or(""), unit)?;
+        let mut v = [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0];
+        for (i, number) in v.iter_mut().take(wanted).enumerate() {
+            let field = fields.next().ok_or_else(|| {
+                let expected = format!("{} columns: {columns}", wanted + 1);
+                source.garbage(row.line, format!("{} columns", i + 1), expected)
+            })?;
+            *number = source.number(row, field, columns)?;
+        }
+        let q = if positions_only { [0.0, 0.0, 0.0, 1.0] } else { to_xyzw([v[3], v[4], v[5], v[6]]) };
+        match pose_from(source, row, [v[0], v[1], v[2]], q)? {
+            Some(world_from_body) => {
+                poses.push(RawPose { line: row.line, row: index, time: Some(time), world_from_body })
+            }
+            None => lost.count(row.line),
+        }
+    }
+    lost.tell(&place, &mut notes);
+    let body = body_of(&lines);
+    Ok(PoseFile { poses, rows: lines.rows.len(), body, positions_only, notes })
+}
+
+/// Rows that hold no pose.
+#[derive(Default)]
+pub(super) struct Lost {
+    rows: usize,
+    first_line: usize,
+}
+
+impl Lost {
+    pub(super) fn count(&mut self, line: usize) {
+        if self.rows == 0 {
+            self.first_line = line;
+        }
+        self.rows += 1;
+    }
+
+    pub(super) fn tell(&self, place: &str, notes: &mut Vec<Warning>) {
+        if self.rows > 0 {
+            let message = format!(
+                "{} poses hold NaN, infinity or a zero quaternion (tracking lost); left out",
+                self.rows
+            );
+            notes.push(Warning::new("pose-not-finite", message).at(format!("{place}:{}", self.first_line)));
+        }
+    }
+}
+
+/// The pose of a row; `None` for the rows that lost trackers write.
+fn pose_from(
+    source: &Source<'_>,
+    row: &Row<'_>,
+    t: [f64; 3],
+    q: [f64; 4],
+) -> Result<Option<Se3>, DatasetError> {
+    let norm = q.iter().map(|c| c * c).sum::<f64>().sqrt();
+    if !t.iter().chain(&q).all(|c| c.is_finite()) || norm < 1e-6 {
+        return Ok(None);
+    }
+    if !((norm - 1.0).abs() <= QUATERNION_TOLERANCE) {
+        let found = format!("a quaternion of length {norm:.4}");
+        return Err(source.garbage(row.line, found, "a unit quaternion (are the columns in order?)"));
+    }
+    Ok(So3::from_quaternion(q[0], q[1], q[2], q[3]).map(|r| Se3::new(r, Vector3::from(t))))
+}
+
+/// Reads KITTI rows: the upper 3×4 (or whole 4×4) of `world_from_camera`, row by row.
+pub fn kitti_poses(source: &Source<'_>) -> Result<PoseFile, DatasetError> {
+    let mut notes = Vec::new();
+    let lines = source.lines(&mut notes)?;
+    let mut poses = Vec::with_capacity(lines.rows.len());
+    let mut lost = Lost::default();
+    for (index, row) in lines.rows.iter().enumerate() {
+        let m = super::matrices::row_matrix(source, row)?;
+        if m.iter().all(|v| v.is_finite()) {
+            let world_from_body = rigid(source, row.line, &m)?;
+            poses.push(RawPose { line: row.line, row: index, time: None, world_from_body });
+        } else {
+            lost.count(row.line);
+        }
+    }
+    lost.tell(&source.path.display().to_string(), &mut notes);
+    let body = body_of(&lines);
+    Ok(PoseFile { poses, rows: lines.rows.len(), body, positions_only: false, notes })
+}
+
+/// The rigid motion of a matrix in a file of poses.
+pub(super) fn rigid(source: &Source<'_>, line: usize, m: &Matrix4<f64>) -> Result<Se3, DatasetError> {
+    Se3::from_matrix(m).ok_or_else(|| {
+        source.garbage(line, crate::calibration::departure(m), "a rigid motion (orthonormal rotation)")
+    })
+}
+
+/// Whose poses a header says they are.
+fn body_of(lines: &Lines<'_>) -> Option<BodyFrame> {
+    lines.comments.iter().find_map(|comment| {
+        let (_, after) = comment.split_once("body =")?;
+        let name = after.trim().split([' ', ',', ';']).next()?;
+        match name {
+            "body" | "imu" => Some(BodyFrame::Imu),
+            "tracked-object" => Some(BodyFrame::Other),
+            camera => camera.strip_prefix("camera")?.parse().ok().map(|id| BodyFrame::Camera(CameraId(id))),
+        }
+    })
+}
+
+/// The format of a trajectory file, by its first row: 12 or 16 columns are KITTI; a comma or a nanosecond stamp is
+/// EuRoC csv, unless the header puts `qw` last; the rest is TUM.
+pub fn guess_trajectory_format(source: &Source<'_>) -> Option<TrajectoryFormat> {
+    // Only the head is looked at; a cut last line does not matter.
+    let head = Source { path: source.path, bytes: source.bytes.get(..64 << 10).unwrap_or(source.bytes) };
+    let head = match head.bytes.iter().rposition(|&b| b == b'\n') {
+        Some(end) => Source { path: head.path, bytes: head.bytes.get(..end)? },
+        None => head,
+    };
+    let lines = head.lines(&mut Vec::new()).ok()?;
+    let first = lines.rows.first()?;
+    let columns = first.fields().count();
+    if columns == 12 || columns == 16 {
+        return Some(TrajectoryFormat::Kitti);
+    }
+    let header = lines.comments.join(" ").to_ascii_lowercase();
+    let w_is_last = match (header.find("qw"), header.find("qx")) {
+        (Some(w), Some(x)) => Some(w > x),
+        _ => None,
+    };
+    let is_nanoseconds = first.fields().next()?.parse::<f64>().is_ok_and(|t| t >= 1e17);
+    let is_csv = first.text.contains(',');
+    match w_is_last {
+        Some(true) => Some(TrajectoryFormat::Tum),
+        _ if is_nanoseconds || is_csv => Some(TrajectoryFormat::EurocCsv),
+        _ => (columns >= 8).then_some(TrajectoryFormat::Tum),
+    }
+}

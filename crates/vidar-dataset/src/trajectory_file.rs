@@ -1,0 +1,94 @@
+//! Trajectory files as [`Trajectory`] with a body that has a name.
+
+use crate::checks::{POSE_GAP_FLOOR, find_gaps, put_in_order};
+use crate::error::DatasetError;
+use crate::options::{TimeUnit, TrajectoryFormat, TrajectoryReadOptions};
+use crate::parse::{self, PoseFile, Source, UnitRule};
+use crate::source::read_text_file;
+use std::path::Path;
+use vidar_core::{BodyFrame, CameraId, StampedPose, Timestamp, Trajectory, Warning};
+
+/// Reads a trajectory file (TUM, EuRoC csv, KITTI).
+///
+/// Poses come out strictly increasing in time; what had to be sorted, dropped or assumed is in the warnings.
+pub fn read_trajectory(
+    path: &Path,
+    options: &TrajectoryReadOptions,
+) -> Result<(Trajectory, Vec<Warning>), DatasetError> {
+    let bytes = read_text_file(path)?;
+    trajectory_from(&Source { path, bytes: &bytes }, options)
+}
+
+/// The same from bytes in memory.
+pub fn trajectory_from(
+    source: &Source<'_>,
+    options: &TrajectoryReadOptions,
+) -> Result<(Trajectory, Vec<Warning>), DatasetError> {
+    let format = match options.format.or_else(|| parse::guess_trajectory_format(source)) {
+        Some(format) => format,
+        None => return Err(not_a_trajectory(source)),
+    };
+    let file = match format {
+        TrajectoryFormat::Tum => {
+            parse::tum_poses(source, UnitRule::given_or(options.time_unit, TimeUnit::Seconds))?
+        }
+        TrajectoryFormat::EurocCsv => {
+            parse::euroc_poses(source, UnitRule::given_or(options.time_unit, TimeUnit::Nanoseconds))?
+        }
+        TrajectoryFormat::Kitti => parse::kitti_poses(source)?,
+    };
+    let body = body_of(&file, format, options.body);
+    let times = options.times.as_deref();
+    finish(source.path, file, body, times)
+}
+
+fn not_a_trajectory(source: &Source<'_>) -> DatasetError {
+    if source.bytes.is_empty() {
+        return DatasetError::NoPoses { path: source.path.to_path_buf(), found: "an empty file".into() };
+    }
+    let expected = "rows of TUM (8 columns), EuRoC csv (4, 8, 11 or 17) or KITTI (12)";
+    source.garbage(1, "no trajectory that VIDAR knows", expected)
+}
+
+/// The user's word, else the header's, else what the format's own tools write.
+fn body_of(file: &PoseFile, format: TrajectoryFormat, given: Option<BodyFrame>) -> BodyFrame {
+    let by_format = match (file.positions_only, format) {
+        (true, _) => BodyFrame::Other,
+        (_, TrajectoryFormat::Kitti) => BodyFrame::Camera(CameraId(0)),
+        _ => BodyFrame::Imu,
+    };
+    given.or(file.body).unwrap_or(by_format)
+}
+
+/// Gives every pose its time, and the poses their order.
+pub(crate) fn finish(
+    path: &Path,
+    file: PoseFile,
+    body: BodyFrame,
+    times: Option<&[Timestamp]>,
+) -> Result<(Trajectory, Vec<Warning>), DatasetError> {
+    let mut notes = file.notes;
+    let untimed = file.poses.iter().any(|p| p.time.is_none());
+    if untimed && times.is_none_or(|t| t.len() != file.rows) {
+        return Err(DatasetError::TimesMismatch {
+            path: path.to_path_buf(),
+            poses: file.rows,
+            times: times.map_or(0, <[_]>::len),
+        });
+    }
+    let mut poses = Vec::with_capacity(file.poses.len());
+    for raw in &file.poses {
+        if let Some(time) = raw.time.or_else(|| times?.get(raw.row).copied()) {
+            poses.push(StampedPose { time, world_from_body: raw.world_from_body });
+        }
+    }
+    put_in_order(&mut poses, |p| p.time, "poses", path, &mut notes);
+    find_gaps(poses.iter().map(|p| p.time), POSE_GAP_FLOOR, "pose-gap", "the trajectory", path, &mut notes);
+    if poses.is_empty() {
+        let found = format!("{} rows, none of them a finite pose", file.rows);
+        return Err(DatasetError::NoPoses { path: path.to_path_buf(), found });
+    }
+    let trajectory = Trajectory::new(body, poses)
+        .map_err(|e| DatasetError::NoPoses { path: path.to_path_buf(), found: e.to_string() })?;
+    Ok((trajectory, notes))
+}

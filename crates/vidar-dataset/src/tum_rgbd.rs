@@ -1,0 +1,183 @@
+//! TUM RGB-D: `rgb.txt`, `depth.txt`, `groundtruth.txt`, `accelerometer.txt`.
+//!
+//! Depth is registered to the colour camera, in units of 1/5000 m; poses are the colour camera's. The files hold no
+//! calibration: what the dataset's authors publish for each of the three cameras is used, and a warning says so.
+
+use crate::dataset::CalibrationSource;
+use crate::draft::{Draft, DraftDepth};
+use crate::error::DatasetError;
+use crate::options::{DatasetKind, OpenOptions, TimeUnit, TrajectoryFormat, TrajectoryReadOptions};
+use crate::parse::{self, Source, UnitRule};
+use crate::trajectory_file::trajectory_from;
+use nalgebra::{Matrix2, Vector2};
+use std::path::{Path, PathBuf};
+use vidar_core::camera::RadTan;
+use vidar_core::{BodyFrame, CameraId, CameraModel, Pinhole, Timestamp, Warning};
+
+/// Raw depth units per metre.
+const DEPTH_UNITS: f64 = 5000.0;
+
+/// Looks for the layout at `path`.
+pub(crate) fn detect(path: &Path) -> Option<String> {
+    let has = |n: &str| path.join(n).is_file();
+    let beside = ["depth.txt", "groundtruth.txt", "accelerometer.txt"].into_iter().find(|n| has(n));
+    match (has("rgb.txt"), beside) {
+        (true, Some(other)) => Some(format!("rgb.txt beside {other}")),
+        (true, None) if path.join("rgb").is_dir() => Some("rgb.txt beside a folder rgb".into()),
+        _ => None,
+    }
+}
+
+/// Reads the layout.
+pub(crate) fn open(path: &Path, reason: String, options: &OpenOptions) -> Result<Draft, DatasetError> {
+    let mut draft = Draft::new(DatasetKind::TumRgbd, path, reason);
+    let rule = UnitRule::given_or(options.time_unit, TimeUnit::Seconds);
+    draft.image_list = path.join("rgb.txt");
+    draft.images = read_list(&mut draft, &path.join("rgb.txt"), rule)?;
+    if path.join("depth.txt").is_file() {
+        draft.depths = read_list(&mut draft, &path.join("depth.txt"), rule)?;
+        draft.depth = Some(DraftDepth {
+            intrinsics: None,
+            units_per_metre: Some(DEPTH_UNITS),
+            default_units: DEPTH_UNITS,
+            body_from_depth: None,
+            invalid: vec![0],
+            is_registered: true,
+        });
+    }
+    let list = path.join("accelerometer.txt");
+    if list.is_file() {
+        let bytes = draft.read(&list)?;
+        let (samples, notes) = parse::accelerometer_list(&Source { path: &list, bytes: &bytes }, rule)?;
+        draft.warnings.extend(notes);
+        draft.accelerometer = samples;
+        let message = "the accelerometer comes without a gyroscope, so it is no IMU; it tells gravity only";
+        draft.warnings.push(Warning::new("imu-incomplete", message).at(list.display()));
+    }
+    let truth = path.join("groundtruth.txt");
+    if truth.is_file() {
+        let bytes = draft.read(&truth)?;
+        let read = TrajectoryReadOptions {
+            format: Some(TrajectoryFormat::Tum),
+            body: Some(BodyFrame::Camera(CameraId(0))),
+            time_unit: None,
+            times: None,
+        };
+        let (trajectory, notes) = trajectory_from(&Source { path: &truth, bytes: &bytes }, &read)?;
+        draft.warnings.extend(notes);
+        draft.ground_truth = Some((trajectory, truth));
+    }
+    Ok(draft)
+}
+
+fn read_list(
+    draft: &mut Draft,
+    list: &Path,
+    rule: UnitRule,
+) -> Result<Vec<(Timestamp, PathBuf)>, DatasetError> {
+    let bytes = draft.read(list)?;
+    let (files, notes) = parse::file_list(&Source { path: list, bytes: &bytes }, rule)?;
+    draft.warnings.extend(notes);
+    let folder = list.parent().unwrap_or(Path::new("."));
+    Ok(files.into_iter().map(|f| (f.time, folder.join(f.name))).collect())
+}
+
+/// A published colour camera: name, `[fx, fy, cx, cy]`, `[k1, k2, p1, p2, k3]`.
+type Published = (&'static str, [f64; 4], [f64; 5]);
+
+/// From the dataset's page "Intrinsic Camera Calibration of the Kinect".
+const CAMERAS: [Published; 4] = [
+    ("freiburg 1", [517.3, 516.5, 318.6, 255.3], [0.2624, -0.9531, -0.0054, 0.0026, 1.1633]),
+    ("freiburg 2", [520.9, 521.0, 325.1, 249.7], [0.2312, -0.7849, -0.0033, -0.0001, 0.9172]),
+    ("freiburg 3", [535.4, 539.2, 320.1, 247.6], [0.0; 5]),
+    ("ROS default", [525.0, 525.0, 319.5, 239.5], [0.0; 5]),
+];
+
+/// The published model for a dataset named like TUM's, for images of 640×480.
+pub(crate) fn published_model(
+    root: &Path,
+    kind: DatasetKind,
+    size: (usize, usize),
+) -> Option<(CameraModel, CalibrationSource, Warning)> {
+    let absolute = root.canonicalize().unwrap_or_else(|_| root.to_path_buf());
+    let name = absolute.file_name()?.to_string_lossy().to_ascii_lowercase();
+    let named = (1..=3).find(|i| {
+        name.contains(&format!("freiburg{i}")) || (name.contains("fr") && has_word(&name, &format!("fr{i}")))
+    });
+    let index = match (named, kind) {
+        (Some(i), _) => i - 1,
+        (None, DatasetKind::TumRgbd) => 3,
+        _ => return None,
+    };
+    if size != (640, 480) {
+        return None;
+    }
+    let (camera, [fx, fy, cx, cy], distortion) = CAMERAS[index];
+    let pinhole = Pinhole::new(fx, fy, cx, cy, size.0, size.1).ok()?;
+    let (model, residual_px) = without_k3(pinhole, distortion)?;
+    let fit = if residual_px > 0.0 {
+        format!("; its three radial terms are fitted by two, {residual_px:.1} px off at the worst corner")
+    } else {
+        String::new()
+    };
+    let warning = Warning::new(
+        "intrinsics-published",
+        format!(
+            "no calibration file; the published {camera} camera is used (f {fx}, {fy}, c {cx}, {cy}){fit}"
+        ),
+    )
+    .at(root.display())
+    .hint("--camera-model, or --calibration FILE");
+    Some((model, CalibrationSource::DatasetDefault, warning))
+}
+
+fn has_word(name: &str, word: &str) -> bool {
+    name.split(|c: char| !c.is_ascii_alphanumeric()).any(|part| part == word)
+}
+
+/// Fits `k1·r³ + k2·r⁵` to the published `k1·r³ + k2·r⁵ + k3·r⁷` over the image, weighted by area; returns the model
+/// and the largest radial departure, pixels.
+fn without_k3(pinhole: Pinhole, [k1, k2, p1, p2, k3]: [f64; 5]) -> Option<(CameraModel, f64)> {
+    if [k1, k2, p1, p2, k3] == [0.0; 5] {
+        return Some((CameraModel::Pinhole(pinhole), 0.0));
+    }
+    let corner = pinhole.unproject(&Vector2::new(0.0, 0.0))?;
+    let largest = (corner.x / corner.z).hypot(corner.y / corner.z);
+    let steps = 512;
+    let radii = (1..=steps).map(|i| largest * f64::from(i) / f64::from(steps));
+    let target = |r: f64| r.powi(3) * (k1 + r * r * (k2 + r * r * k3));
+    let (mut normal, mut right) = (Matrix2::zeros(), Vector2::zeros());
+    for r in radii.clone() {
+        let basis = Vector2::new(r.powi(3), r.powi(5));
+        normal += basis * basis.transpose() * r;
+        right += basis * target(r) * r;
+    }
+    let fitted = normal.lu().solve(&right)?;
+    let departure = |r: f64| (fitted.x * r.powi(3) + fitted.y * r.powi(5) - target(r)).abs() * pinhole.fx;
+    let residual_px = radii.map(departure).fold(0.0, f64::max);
+    let model = RadTan::new(pinhole, [fitted.x, fitted.y, p1, p2]).ok()?;
+    Some((CameraModel::RadTan(model), residual_px))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_two_term_fit_stays_near_the_three_term_polynomial() {
+        for (_, [fx, fy, cx, cy], d) in CAMERAS {
+            let (model, residual_px) =
+                without_k3(Pinhole::new(fx, fy, cx, cy, 640, 480).unwrap(), d).unwrap();
+            // The worst pixel is the farthest corner of freiburg 1; no distortion at all would be 34 px off there.
+            assert!(residual_px < 5.5, "{residual_px}");
+            // Every pixel of the image has a ray.
+            for pixel in [(0.0, 0.0), (639.0, 0.0), (0.0, 479.0), (639.0, 479.0), (320.0, 240.0)] {
+                assert!(
+                    model.unproject(&Vector2::new(pixel.0, pixel.1)).is_some(),
+                    "{pixel:?} of {}",
+                    model.name()
+                );
+            }
+        }
+    }
+}
