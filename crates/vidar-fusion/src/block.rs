@@ -140,8 +140,9 @@ impl BlockUpdate<'_> {
         let mut near: Lanes<u32> = [0; EDGE];
         for i in 0..EDGE {
             let distance = (depth[i] - depth_of_node[i]) * per_depth[i];
-            let fade = ((distance + self.truncation_m) * per_fade).clamp(0.0, 1.0);
-            let d = (distance * per_truncation).clamp(-1.0, 1.0);
+            // `max` and `min` turn the NaN of a node in the camera plane into a number; its weight is 0.
+            let fade = ((distance + self.truncation_m) * per_fade).max(0.0).min(1.0);
+            let d = (distance * per_truncation).max(-1.0).min(1.0);
             let w = round_to_i32((packed[i] & 0xffff) as f32 * fade);
             product[i] = w * round_to_i32(d * DISTANCE_ONE);
             weight[i] = w as u32;

@@ -13,7 +13,7 @@ use rayon::prelude::*;
 use vidar_core::{PointCloud, TriangleMesh};
 
 /// Vertices keep this share of an edge away from its ends, so that no two of them coincide.
-const END_MARGIN: f32 = 0.01;
+const END_MARGIN: f32 = 0.002;
 /// Marks an edge without vertex.
 const NO_VERTEX: u16 = u16::MAX;
 
