@@ -1,0 +1,40 @@
+//! Confidence: the probability that a depth is right to within [`TOLERANCE_RATIO`].
+//!
+//! A logistic function of what is known about a pixel, fitted once to frames with sensor depth and to synthetic
+//! ones (the tests check it on scenes that were not used for the fit).
+
+use crate::consistency::Support;
+use crate::estimate::Estimate;
+
+/// Relative depth error that counts as right.
+pub const TOLERANCE_RATIO: f32 = 0.03;
+
+/// Number of features.
+pub(crate) const FEATURES: usize = 7;
+
+/// Weights of the features, in their order.
+const WEIGHTS: [f32; FEATURES] = [-2.0, 3.0, 1.0, 0.3, -1.0, 0.5, 0.5];
+
+/// The features of pixel `i`: constant, share of agreeing views, agreeing views (saturating), log of the margin,
+/// matching cost, log of the texture, log of the depth resolution.
+pub(crate) fn features(estimate: &Estimate, i: usize, support: &Support, noise_gray: f32) -> [f32; FEATURES] {
+    let asked = f32::from(support.asked.max(1));
+    let agreeing = f32::from(support.agreeing);
+    [
+        1.0,
+        agreeing / asked,
+        agreeing / (agreeing + 1.0),
+        (estimate.margin[i].max(0.0) + 0.01).ln() + 3.0,
+        estimate.cost[i],
+        (estimate.texture[i] / noise_gray + 0.1).ln(),
+        // Pixels of shift per tolerance: how well the baseline resolves this depth.
+        (TOLERANCE_RATIO * support.rho / estimate.rho_per_px + 0.01).ln(),
+    ]
+}
+
+/// Confidence from features.
+pub(crate) fn confidence(features: &[f32; FEATURES]) -> f32 {
+    let z: f32 = features.iter().zip(&WEIGHTS).map(|(f, w)| f * w).sum();
+    let p = 1.0 / (1.0 + (-z).exp());
+    if p.is_finite() { p } else { 0.0 }
+}

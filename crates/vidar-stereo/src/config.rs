@@ -1,0 +1,83 @@
+//! What can be tuned from outside. Everything else is a named constant with its reason beside the code.
+
+use crate::error::StereoError;
+use serde::{Deserialize, Serialize};
+
+/// Settings of the stereo model. The defaults suit a hand-held camera or a drone in rooms and halls.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
+#[serde(default, deny_unknown_fields)]
+pub struct StereoConfig {
+    /// Largest width of the images that are matched, and so of the depth, pixels, 64…4096. Larger images are
+    /// area-averaged down; smaller ones are used as they are. Raise for finer depth; time grows with its square.
+    pub max_width_px: usize,
+    /// Views that each view is matched against, 1…8. More survive occlusion better and cost time in proportion.
+    pub neighbours: usize,
+    /// Smallest parallax that makes a neighbour useful, degrees at the typical depth of the scene, 0.05…20.
+    pub min_parallax_deg: f64,
+    /// Parallax at which a neighbour is as good as it gets, degrees, above `min_parallax_deg`, at most 30.
+    /// Lower it for cluttered scenes (less occlusion), raise it for open ones (finer depth).
+    pub best_parallax_deg: f64,
+    /// Nearest depth that is searched, metres, positive.
+    pub min_depth_m: f64,
+    /// Furthest depth that is searched, metres, above `min_depth_m`.
+    pub max_depth_m: f64,
+    /// Most depth planes of the sweep, 16…256. Fewer are used where the parallax is small.
+    pub max_planes: usize,
+    /// Penalty of a step by one plane between adjacent pixels, 1…200; a wrong match costs up to 254.
+    pub step_penalty: u16,
+    /// Penalty of a depth edge between adjacent pixels of equal brightness, `step_penalty`…1000.
+    pub jump_penalty: u16,
+    /// Rounds of slanted-plane refinement after the sweep, 0…8. Zero is quicker and leaves staircases.
+    pub refine_rounds: usize,
+    /// Noise of the images, grey levels of 255, 0.1…50. Texture weaker than this is not trusted.
+    pub noise_gray: f32,
+    /// Largest relative difference between the depths of two views that agree, 0.001…0.2.
+    pub agreement_ratio: f32,
+    /// Depths with less confidence are dropped, 0…1. Fusion weighs the rest, so this can stay low.
+    pub min_confidence: f32,
+}
+
+impl Default for StereoConfig {
+    fn default() -> Self {
+        Self {
+            max_width_px: 320,
+            neighbours: 5,
+            min_parallax_deg: 0.5,
+            best_parallax_deg: 6.0,
+            min_depth_m: 0.3,
+            max_depth_m: 20.0,
+            max_planes: 128,
+            step_penalty: 12,
+            jump_penalty: 80,
+            refine_rounds: 3,
+            noise_gray: 2.0,
+            agreement_ratio: 0.02,
+            min_confidence: 0.3,
+        }
+    }
+}
+
+impl StereoConfig {
+    /// Refuses values outside the ranges that the fields state, naming the key.
+    pub fn validate(&self) -> Result<(), StereoError> {
+        let check = |key: &'static str, found: f64, low: f64, high: f64| {
+            if found >= low && found <= high {
+                return Ok(());
+            }
+            Err(StereoError::BadConfig { key, found, low, high })
+        };
+        check("max_width_px", self.max_width_px as f64, 64.0, 4096.0)?;
+        check("neighbours", self.neighbours as f64, 1.0, 8.0)?;
+        check("min_parallax_deg", self.min_parallax_deg, 0.05, 20.0)?;
+        check("best_parallax_deg", self.best_parallax_deg, self.min_parallax_deg, 30.0)?;
+        check("min_depth_m", self.min_depth_m, 1e-6, 1e6)?;
+        check("max_depth_m", self.max_depth_m, self.min_depth_m * 1.1, 1e7)?;
+        check("max_planes", self.max_planes as f64, 16.0, 256.0)?;
+        check("step_penalty", f64::from(self.step_penalty), 1.0, 200.0)?;
+        check("jump_penalty", f64::from(self.jump_penalty), f64::from(self.step_penalty), 1000.0)?;
+        check("refine_rounds", self.refine_rounds as f64, 0.0, 8.0)?;
+        check("noise_gray", f64::from(self.noise_gray), 0.1, 50.0)?;
+        check("agreement_ratio", f64::from(self.agreement_ratio), 0.001, 0.2)?;
+        check("min_confidence", f64::from(self.min_confidence), 0.0, 1.0)
+    }
+}

@@ -1,0 +1,184 @@
+//! Depth of one reference view from its neighbours, before views are compared with each other.
+//!
+//! Probe at a quarter of the size for the scene's depth → choose neighbours for that depth → sweep → semi-global
+//! matching → winner with sub-plane fit → slanted-plane refinement.
+
+use crate::config::StereoConfig;
+use crate::prepare::{Level, Prepared};
+use crate::refine::refine;
+use crate::select::select;
+use crate::sgm::{Penalties, aggregate};
+use crate::sweep::{Planes, Source, UNSEEN, WORST, sweep};
+use crate::warp::{Warp, neighbour_from_reference};
+
+/// Pyramid level of the sweep; the refinement works on level 0.
+const SWEEP_LEVEL: usize = 1;
+/// Pyramid level of the probe for the scene's depth.
+const PROBE_LEVEL: usize = 2;
+/// Planes of the probe.
+const PROBE_PLANES: usize = 64;
+
+/// What one reference alone says.
+#[derive(Clone, Debug)]
+pub(crate) struct Estimate {
+    /// Inverse depth at the working size, 1/m; NaN where nothing was found.
+    pub rho: Vec<f32>,
+    /// Matching cost at the winner, 0 (perfect) to 1 (none).
+    pub cost: Vec<f32>,
+    /// How much worse the next best plane is after aggregation, in units of a full mismatch.
+    pub margin: Vec<f32>,
+    /// Standard deviation of the reference's window, grey levels.
+    pub texture: Vec<f32>,
+    /// Inverse-depth step that shifts the best neighbour by one working pixel, 1/m.
+    pub rho_per_px: f32,
+    /// Views it was matched against.
+    pub neighbours: Vec<usize>,
+}
+
+/// What became of a reference.
+pub(crate) enum Outcome {
+    Estimated(Box<Estimate>),
+    /// The largest parallax found, degrees.
+    NoParallax(f64),
+}
+
+/// Estimates the depth of `views[reference]`.
+pub(crate) fn estimate(views: &[Prepared], reference: usize, config: &StereoConfig) -> Outcome {
+    let depths_m = match probe(views, reference, config) {
+        Ok(depths_m) => depths_m,
+        Err(found_deg) => return Outcome::NoParallax(found_deg),
+    };
+    let selection = select(views, reference, &[depths_m.median], config);
+    if selection.neighbours.is_empty() {
+        return Outcome::NoParallax(selection.best_parallax_deg);
+    }
+    let neighbours = selection.neighbours;
+    let coarse = &views[reference].levels[SWEEP_LEVEL];
+    let sources = sources(views, reference, &neighbours, SWEEP_LEVEL);
+    let planes = spread_planes(coarse, &sources, depths_m.near.max(config.min_depth_m), config);
+    let costs = sweep(coarse, &sources, &planes, config.noise_gray);
+    let penalties = Penalties { step: config.step_penalty as i16, jump: config.jump_penalty as i16 };
+    let sums = aggregate(coarse, &costs, planes.count, penalties);
+    let winners = Winners::pick(coarse, &costs, &sums, &planes);
+    let fine_sources = self::sources(views, reference, &neighbours, 0);
+    let estimate = refine(&views[reference].levels[0], coarse, &winners, &fine_sources, &planes, config);
+    Outcome::Estimated(Box::new(Estimate { neighbours, ..estimate }))
+}
+
+/// The neighbours' images at one level, with the warps into them.
+pub(crate) fn sources<'a>(
+    views: &'a [Prepared],
+    reference: usize,
+    neighbours: &[usize],
+    level: usize,
+) -> Vec<Source<'a>> {
+    let own = &views[reference];
+    neighbours
+        .iter()
+        .map(|&i| {
+            let motion = neighbour_from_reference(&views[i].world_from_camera, &own.world_from_camera);
+            let other = &views[i].levels[level];
+            let warp = Warp::new(&own.levels[level].intrinsics, &other.intrinsics, &motion);
+            Source { level: other, warp }
+        })
+        .collect()
+}
+
+/// Shift of a neighbour's pixel per unit of inverse depth, px·m: the largest over `sources`, at the image's middle.
+pub(crate) fn shift_per_rho(level: &Level, sources: &[Source<'_>]) -> f32 {
+    let (x, y) = (level.width as f32 * 0.5, level.height as f32 * 0.5);
+    let shift = |source: &Source<'_>| {
+        let at = |rho| source.warp.project(x, y, rho);
+        // A small step from infinity: the derivative there, free of perspective.
+        match (at(0.0), at(0.01)) {
+            (Some(far), Some(near)) => ((near.0 - far.0).powi(2) + (near.1 - far.1).powi(2)).sqrt() * 100.0,
+            _ => 0.0,
+        }
+    };
+    sources.iter().map(shift).fold(0.0, f32::max)
+}
+
+/// Planes a pixel apart for the widest neighbour, from infinity's side to `near_m`.
+fn spread_planes(level: &Level, sources: &[Source<'_>], near_m: f64, config: &StereoConfig) -> Planes {
+    let (first, last) = (1.0 / config.max_depth_m, 1.0 / near_m.min(config.max_depth_m / 1.1));
+    let pixels = f64::from(shift_per_rho(level, sources)) * (last - first);
+    let count = (pixels.ceil() as usize + 1).clamp(16, config.max_planes);
+    Planes { first: first as f32, step: ((last - first) / (count - 1) as f64) as f32, count }
+}
+
+/// Typical and nearest depth of a scene, metres.
+struct SceneDepth {
+    median: f64,
+    near: f64,
+}
+
+/// A rough look at a quarter of the size. `Err` holds the largest parallax, if there is none worth matching.
+fn probe(views: &[Prepared], reference: usize, config: &StereoConfig) -> Result<SceneDepth, f64> {
+    // Depth is unknown here: average the worth of a neighbour over the searched range, evenly in log depth.
+    let ratio = config.max_depth_m / config.min_depth_m;
+    let depths_m: Vec<f64> = (0..5).map(|i| config.min_depth_m * ratio.powf((i as f64 + 0.5) / 5.0)).collect();
+    let selection = select(views, reference, &depths_m, config);
+    if selection.neighbours.is_empty() {
+        return Err(selection.best_parallax_deg);
+    }
+    let level = &views[reference].levels[PROBE_LEVEL];
+    let sources = sources(views, reference, &selection.neighbours, PROBE_LEVEL);
+    let (first, last) = (1.0 / config.max_depth_m as f32, 1.0 / config.min_depth_m as f32);
+    let planes = Planes { first, step: (last - first) / (PROBE_PLANES - 1) as f32, count: PROBE_PLANES };
+    let costs = sweep(level, &sources, &planes, config.noise_gray);
+    let penalties = Penalties { step: config.step_penalty as i16, jump: config.jump_penalty as i16 };
+    let sums = aggregate(level, &costs, planes.count, penalties);
+    let winners = Winners::pick(level, &costs, &sums, &planes);
+    let mut depths_m: Vec<f32> = (0..winners.rho.len())
+        .filter(|&i| winners.cost[i] < 0.4 && winners.margin[i] > 0.05 && winners.rho[i] > 0.0)
+        .map(|i| 1.0 / winners.rho[i])
+        .collect();
+    if depths_m.len() < winners.rho.len() / 50 {
+        let middle = (config.min_depth_m * config.max_depth_m).sqrt();
+        return Ok(SceneDepth { median: middle, near: config.min_depth_m });
+    }
+    depths_m.sort_unstable_by(f32::total_cmp);
+    let at = |share: f64| f64::from(depths_m[((depths_m.len() - 1) as f64 * share) as usize]);
+    // Small near things may have been missed at this size, so the near end keeps a margin.
+    Ok(SceneDepth { median: at(0.5), near: 0.6 * at(0.02) })
+}
+
+/// The best plane of every pixel.
+pub(crate) struct Winners {
+    pub rho: Vec<f32>,
+    pub cost: Vec<f32>,
+    pub margin: Vec<f32>,
+}
+
+impl Winners {
+    /// Picks the least sum, fits a parabola through its neighbours, and finds the least sum more than two planes off.
+    pub fn pick(level: &Level, costs: &[u8], sums: &[i16], planes: &Planes) -> Self {
+        let n = level.width * level.height;
+        let mut winners =
+            Self { rho: vec![f32::NAN; n], cost: vec![1.0; n], margin: vec![0.0; n] };
+        for pixel in 0..n {
+            let sums = &sums[pixel * planes.count..][..planes.count];
+            let costs = &costs[pixel * planes.count..][..planes.count];
+            let Some((best, &least)) = sums.iter().enumerate().min_by_key(|(_, s)| **s) else { continue };
+            if costs[best] == UNSEEN {
+                continue;
+            }
+            let outside = |k: usize| k.abs_diff(best) > 2;
+            let next = (0..planes.count).filter(|&k| outside(k)).map(|k| sums[k]).min().unwrap_or(least);
+            winners.rho[pixel] = planes.rho(best as f32 + parabola_offset(sums, best));
+            winners.cost[pixel] = f32::from(costs[best]) / WORST;
+            winners.margin[pixel] = f32::from(next - least) / (8.0 * WORST);
+        }
+        winners
+    }
+}
+
+/// Offset in −0.5…0.5 of the least of the parabola through the sums around `best`.
+fn parabola_offset(sums: &[i16], best: usize) -> f32 {
+    if best == 0 || best + 1 >= sums.len() {
+        return 0.0;
+    }
+    let (a, b, c) = (f32::from(sums[best - 1]), f32::from(sums[best]), f32::from(sums[best + 1]));
+    let curvature = a - 2.0 * b + c;
+    if curvature > 0.0 { (0.5 * (a - c) / curvature).clamp(-0.5, 0.5) } else { 0.0 }
+}
