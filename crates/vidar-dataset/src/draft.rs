@@ -4,9 +4,10 @@ use crate::camera_flag::with_size;
 use crate::checks::{self, IMAGE_GAP_FLOOR};
 use crate::dataset::{Anchor, CalibrationSource, Dataset, DepthEntry, DepthSensor, ImageEntry};
 use crate::decode::{self, ImageLimits};
-use crate::error::{DatasetError, io_error};
+use crate::error::DatasetError;
 use crate::options::{DatasetKind, OpenOptions};
 use crate::parse::{self, Source};
+use crate::settle::{cut, first_readable_size, guessed_model, keep_existing, name_of};
 use crate::source::read_text_file_up_to;
 use crate::{trajectory_file, tum_rgbd};
 use std::path::{Path, PathBuf};
@@ -417,114 +418,6 @@ impl Draft {
     }
 }
 
-/// The last part of the root's path that says something (`mav0` does not).
-fn name_of(root: &Path) -> String {
-    let absolute = root.canonicalize().unwrap_or_else(|_| root.to_path_buf());
-    let parts = absolute.components().rev().filter_map(|c| match c {
-        std::path::Component::Normal(part) => Some(part.to_string_lossy().into_owned()),
-        _ => None,
-    });
-    let mut parts = parts.filter(|p| p != "mav0");
-    parts.next().unwrap_or_else(|| "dataset".into())
-}
-
 pub(crate) fn image_range(images: &[ImageEntry]) -> Option<(Timestamp, Timestamp)> {
     Some((images.first()?.time, images.last()?.time))
-}
-
-/// Leaves out files that are not there or hold nothing, and names them.
-fn keep_existing(
-    files: &mut Vec<(Timestamp, PathBuf)>,
-    what: &str,
-    place: &Path,
-    notes: &mut Vec<Warning>,
-) -> Result<(), DatasetError> {
-    let (mut missing, mut empty) = (Vec::new(), Vec::new());
-    let mut kept = Vec::with_capacity(files.len());
-    for (time, path) in files.drain(..) {
-        match std::fs::metadata(&path) {
-            Ok(found) if !found.is_file() => missing.push(path),
-            Ok(found) if found.len() == 0 => empty.push(path),
-            Ok(_) => kept.push((time, path)),
-            Err(e) if e.kind() == std::io::ErrorKind::NotFound => missing.push(path),
-            Err(e) => return Err(io_error(&path)(e)),
-        }
-    }
-    for (kind, fault, paths) in
-        [("image-missing", "are named but not there", missing), ("image-empty", "are empty (0 bytes)", empty)]
-    {
-        if let Some(first) = paths.first() {
-            let name = first.display();
-            let message = format!("{} {what} {fault}; left out, the first is {name}", paths.len());
-            notes.push(Warning::new(kind, message).at(place.display()));
-        }
-    }
-    *files = kept;
-    Ok(())
-}
-
-/// The size of the first image whose header can be read; truncated ones are told when they are loaded.
-fn first_readable_size(images: &[ImageEntry]) -> Result<(usize, usize), DatasetError> {
-    let mut first_error = None;
-    // Ten unreadable images in a row are no accident.
-    for entry in images.iter().take(10) {
-        match decode::read_size(&entry.path, &ImageLimits::default()) {
-            Ok(size) => return Ok(size),
-            Err(e) => first_error = first_error.or(Some(e)),
-        }
-    }
-    Err(first_error.unwrap_or_else(|| DatasetError::NoImages {
-        path: PathBuf::new(),
-        found: "an empty list".into(),
-        expected: "to read".into(),
-    }))
-}
-
-/// Opening angle across the longer side assumed for a camera about which nothing is known, as of a phone: f = 0.8·w.
-const GUESSED_FOCAL_RATIO: f64 = 0.8;
-
-fn guessed_model(
-    (width, height): (usize, usize),
-    place: &Path,
-) -> Result<(CameraModel, CalibrationSource, Warning), DatasetError> {
-    let focal = GUESSED_FOCAL_RATIO * width.max(height) as f64;
-    let (cx, cy) = (0.5 * width as f64 - 0.5, 0.5 * height as f64 - 0.5);
-    let pinhole = Pinhole::new(focal, focal, cx, cy, width, height).map_err(|source| {
-        DatasetError::BadCamera { path: place.to_path_buf(), key: "image size".into(), source }
-    })?;
-    let warning = Warning::new(
-        "intrinsics-guessed",
-        format!("no calibration; a pinhole of focal length {focal:.0} px is guessed, so nothing metric can be trusted"),
-    )
-    .hint("--calibration FILE, or --camera-model pinhole:fx,fy,cx,cy");
-    Ok((CameraModel::Pinhole(pinhole), CalibrationSource::Guessed, warning))
-}
-
-/// Inertial readings and poses kept before and after the cut, so that an initialiser has its still seconds and
-/// interpolation its neighbours.
-const LEAD_IN: Duration = Duration::from_millis(3000);
-
-/// Applies start, end and stride.
-fn cut(dataset: &mut Dataset, options: &OpenOptions) -> Result<(), DatasetError> {
-    let Some((first, last)) = image_range(&dataset.images) else { return Ok(()) };
-    let from = options.start.map_or(first, |s| first + s);
-    let to = options.end.map_or(last, |e| first + e);
-    dataset.images.retain(|i| (from..=to).contains(&i.time));
-    let stride = options.stride.max(1);
-    dataset.images = std::mem::take(&mut dataset.images).into_iter().step_by(stride).collect();
-    if dataset.images.is_empty() {
-        return Err(DatasetError::NoImages {
-            path: dataset.root.clone(),
-            found: format!("images from 0 to {} after the first", last - first),
-            expected: format!("between {} and {}", from - first, to - first),
-        });
-    }
-    if options.start.is_some() || options.end.is_some() {
-        let wide = from - LEAD_IN..=to + LEAD_IN;
-        dataset.imu.retain(|s| wide.contains(&s.time));
-        dataset.accelerometer.retain(|s| wide.contains(&s.time));
-        let tolerance = crate::dataset::DEPTH_TOLERANCE;
-        dataset.depths.retain(|d| (from - tolerance..=to + tolerance).contains(&d.time));
-    }
-    Ok(())
 }

@@ -19,6 +19,7 @@ mod image_folder;
 mod options;
 pub mod parse;
 mod posed_folder;
+mod settle;
 mod seven_scenes;
 mod source;
 mod trajectory_file;
