@@ -70,13 +70,26 @@ fn quantised(z: f32, units_per_metre: f64, stats: &mut DepthPngStats) -> u16 {
 }
 
 fn write_gray16(mut w: impl Write, width: u32, height: u32, big_endian: &[u8]) -> io::Result<()> {
-    let mut encoder = png::Encoder::new(&mut w, width, height);
+    encode_gray16(&mut w, width, height, big_endian).map_err(|error| match error {
+        // The encoder's own conversion hides the system's reason (a full device) behind "other".
+        png::EncodingError::IoError(source) => source,
+        other => io::Error::other(other),
+    })?;
+    w.flush()
+}
+
+fn encode_gray16(
+    w: impl Write,
+    width: u32,
+    height: u32,
+    big_endian: &[u8],
+) -> Result<(), png::EncodingError> {
+    let mut encoder = png::Encoder::new(w, width, height);
     encoder.set_color(png::ColorType::Grayscale);
     encoder.set_depth(png::BitDepth::Sixteen);
     let mut writer = encoder.write_header()?;
     writer.write_image_data(big_endian)?;
-    writer.finish()?;
-    w.flush()
+    writer.finish()
 }
 
 /// Reads a 16-bit grey PNG as z-depth, given its scale.

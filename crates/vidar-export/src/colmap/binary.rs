@@ -100,7 +100,10 @@ pub(super) fn read_cameras(bytes: &[u8]) -> Result<Vec<RawCamera>, ExportError> 
                 (f, f)
             }
             other => {
-                let known = usize::try_from(other - 2).ok().and_then(|i| OTHER_MODELS.get(i));
+                let known = other
+                    .checked_sub(2)
+                    .and_then(|i| usize::try_from(i).ok())
+                    .and_then(|i| OTHER_MODELS.get(i));
                 let name = known.map_or_else(|| format!("number {other}"), |name| (*name).to_owned());
                 return Err(unsupported_model(what, &name));
             }

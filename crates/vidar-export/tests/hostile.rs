@@ -1,0 +1,437 @@
+//! Files that lie, end early or are garbage; and places that cannot be written.
+
+mod common;
+
+use common::*;
+use proptest::prelude::*;
+use std::alloc::{GlobalAlloc, Layout, System};
+use std::fs::{self, OpenOptions};
+use std::io::Write;
+use std::path::Path;
+use std::sync::atomic::{AtomicUsize, Ordering};
+use vidar_core::{Image, MetricDepth, PointCloud, Timestamp};
+use vidar_export::*;
+
+/// Remembers the largest single request, so that "does not allocate" is a number.
+struct LargestRequest;
+
+static LARGEST: AtomicUsize = AtomicUsize::new(0);
+
+// SAFETY: every call goes to the system's allocator unchanged.
+unsafe impl GlobalAlloc for LargestRequest {
+    unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
+        LARGEST.fetch_max(layout.size(), Ordering::Relaxed);
+        unsafe { System.alloc(layout) }
+    }
+    unsafe fn alloc_zeroed(&self, layout: Layout) -> *mut u8 {
+        LARGEST.fetch_max(layout.size(), Ordering::Relaxed);
+        unsafe { System.alloc_zeroed(layout) }
+    }
+    unsafe fn realloc(&self, pointer: *mut u8, layout: Layout, size: usize) -> *mut u8 {
+        LARGEST.fetch_max(size, Ordering::Relaxed);
+        unsafe { System.realloc(pointer, layout, size) }
+    }
+    unsafe fn dealloc(&self, pointer: *mut u8, layout: Layout) {
+        unsafe { System.dealloc(pointer, layout) }
+    }
+}
+
+#[global_allocator]
+static ALLOCATOR: LargestRequest = LargestRequest;
+
+/// All files of this test are small; the test harness and the PNG decoder's fixed buffers stay well below this.
+const MODEST_BYTES: usize = 4 << 20;
+
+fn assert_modest() {
+    let largest = LARGEST.load(Ordering::Relaxed);
+    assert!(largest < MODEST_BYTES, "a request of {largest} bytes for a file of a few hundred");
+}
+
+type Reader = fn(&[u8]) -> Result<(), ExportError>;
+
+/// A small valid file, its reader, and whether a file cut anywhere can be told from a whole one.
+struct Sample {
+    name: &'static str,
+    bytes: Vec<u8>,
+    read: Reader,
+    cut_is_seen: bool,
+}
+
+fn colmap_file(format: ColmapFormat, name: &str) -> Vec<u8> {
+    let dir = tempfile::tempdir().unwrap();
+    write_colmap(dir.path(), format, &small_views(), &cloud_of(&small_mesh())).unwrap();
+    fs::read(dir.path().join(name)).unwrap()
+}
+
+const NO_RECORDS: &[u8] = &[0; 8];
+
+fn samples() -> Vec<Sample> {
+    let (trajectory, mesh, views) = (small_trajectory(), small_mesh(), small_views());
+    let depth = MetricDepth::new(Image::from_fn(5, 4, |x, y| if x == y { f32::NAN } else { (x + y) as f32 }));
+    let frame = DepthFrame::new("0.png", views[1].frame_id, views[1].time, &views[1].world_from_camera);
+    let sidecar = DepthSidecar::new(1000.0, &views[0].intrinsics, vec![frame]);
+    let ascii_ply =
+        b"ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n\
+        element face 1\nproperty list uchar int vertex_indices\nend_header\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n";
+    let sample = |name, bytes, read: Reader, cut_is_seen| Sample { name, bytes, read, cut_is_seen };
+    use ColmapFormat::{Binary, Text};
+    vec![
+        sample("tum", written(|w| write_tum(w, &trajectory, "note")), |b| read_tum(b).map(drop), false),
+        sample(
+            "euroc",
+            written(|w| write_euroc_csv(w, &trajectory, "")),
+            |b| read_euroc_csv(b).map(drop),
+            false,
+        ),
+        sample(
+            "kitti",
+            written(|w| write_kitti(w, &trajectory)),
+            |b| {
+                let times = [0, 1].map(Timestamp::from_nanos).to_vec();
+                read_kitti(b, &KittiTimes { body: small_trajectory().body(), times }).map(drop)
+            },
+            // A cut through the last number leaves a number.
+            false,
+        ),
+        sample(
+            "times",
+            written(|w| write_kitti_times(w, &trajectory, "")),
+            |b| read_kitti_times(b).map(drop),
+            false,
+        ),
+        sample("ply", written(|w| write_ply_mesh(w, &mesh, &[])), |b| read_ply(b).map(drop), true),
+        sample("ascii ply", ascii_ply.to_vec(), |b| read_ply(b).map(drop), false),
+        sample("glb", written(|w| write_glb_mesh(w, &mesh, &["x".into()])), |b| read_glb(b).map(drop), true),
+        sample(
+            "transforms",
+            written(|w| write_transforms_json(w, &views, Some("p.ply"))),
+            |b| read_transforms_json(b).map(drop),
+            false,
+        ),
+        sample("sidecar", written(|w| sidecar.write(w)), |b| DepthSidecar::read(b).map(drop), false),
+        sample(
+            "depth",
+            written(|w| write_depth_png(w, &depth, 1000.0).map(drop)),
+            |b| read_depth_png(b, 1000.0).map(drop),
+            true,
+        ),
+        sample(
+            "cameras.txt",
+            colmap_file(Text, "cameras.txt"),
+            |b| read_colmap_bytes(Text, b, b"", b"").map(drop),
+            false,
+        ),
+        sample(
+            "images.txt",
+            colmap_file(Text, "images.txt"),
+            |b| read_colmap_bytes(Text, b"1 PINHOLE 64 48 100 110 32 24\n", b, b"").map(drop),
+            false,
+        ),
+        sample(
+            "points3D.txt",
+            colmap_file(Text, "points3D.txt"),
+            |b| read_colmap_bytes(Text, b"", b"", b).map(drop),
+            false,
+        ),
+        sample(
+            "cameras.bin",
+            colmap_file(Binary, "cameras.bin"),
+            |b| read_colmap_bytes(Binary, b, NO_RECORDS, NO_RECORDS).map(drop),
+            true,
+        ),
+        sample(
+            "images.bin",
+            colmap_file(Binary, "images.bin"),
+            |b| read_colmap_bytes(Binary, &colmap_file(Binary, "cameras.bin"), b, NO_RECORDS).map(drop),
+            true,
+        ),
+        sample(
+            "points3D.bin",
+            colmap_file(Binary, "points3D.bin"),
+            |b| read_colmap_bytes(Binary, NO_RECORDS, NO_RECORDS, b).map(drop),
+            true,
+        ),
+    ]
+}
+
+/// An error of a reader says where, in words.
+fn assert_placed(name: &str, error: &ExportError) {
+    match error {
+        ExportError::Malformed { place, expected, found, .. } => {
+            assert!(!place.is_empty() && !expected.is_empty() && !found.is_empty(), "{name}: {error}");
+        }
+        ExportError::Unsupported { place, feature, .. } => {
+            assert!(!place.is_empty() && !feature.is_empty(), "{name}: {error}");
+        }
+        other => panic!("{name}: {other}"),
+    }
+    assert!(error.to_string().len() < 2000, "{name}: {error}");
+}
+
+#[test]
+fn a_file_cut_at_any_byte_is_an_error_that_names_the_place() {
+    for sample in samples() {
+        (sample.read)(&sample.bytes).unwrap_or_else(|e| panic!("{}: {e}", sample.name));
+        let mut refused = 0;
+        for end in 0..sample.bytes.len() {
+            match (sample.read)(&sample.bytes[..end]) {
+                Ok(()) => {
+                    assert!(!sample.cut_is_seen, "{} cut at byte {end} was taken for whole", sample.name)
+                }
+                Err(error) => {
+                    assert_placed(sample.name, &error);
+                    refused += 1;
+                }
+            }
+        }
+        // Text may be cut between lines, within a comment or through the digits of its last number; not elsewhere.
+        assert!(refused > 10, "{}: {refused} of {}", sample.name, sample.bytes.len());
+    }
+    assert_modest();
+}
+
+#[test]
+fn no_changed_byte_makes_a_reader_panic_or_reserve_memory() {
+    for sample in samples() {
+        let mut bytes = sample.bytes.clone();
+        for at in 0..bytes.len() {
+            let original = bytes[at];
+            for value in [0, b'9', b'-', b'"', 0x7F, 0xFF, original ^ 1, original ^ 0x80] {
+                bytes[at] = value;
+                if let Err(error) = (sample.read)(&bytes) {
+                    assert_placed(sample.name, &error);
+                }
+            }
+            bytes[at] = original;
+        }
+    }
+    assert_modest();
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig { cases: 128, failure_persistence: None, ..ProptestConfig::default() })]
+
+    #[test]
+    fn garbage_behind_a_true_beginning_never_panics(
+        keep in 0.0..1.0,
+        garbage in proptest::collection::vec(any::<u8>(), 0..64),
+    ) {
+        for sample in samples() {
+            let mut bytes = sample.bytes;
+            bytes.truncate((bytes.len() as f64 * keep) as usize);
+            bytes.extend(&garbage);
+            if let Err(error) = (sample.read)(&bytes) {
+                assert_placed(sample.name, &error);
+            }
+        }
+        assert_modest();
+    }
+}
+
+fn refused<T: std::fmt::Debug>(result: Result<T, ExportError>, words: &[&str]) {
+    let error = result.unwrap_err();
+    assert_placed("refused", &error);
+    let text = error.to_string();
+    for word in words {
+        assert!(text.contains(word), "{word:?} is missing in: {text}");
+    }
+    assert_modest();
+}
+
+#[test]
+fn counts_that_no_file_can_hold_cost_no_memory() {
+    let vertex = "property float x\nproperty float y\nproperty float z\n";
+    for encoding in ["ascii", "binary_little_endian", "binary_big_endian"] {
+        for count in ["1000000000", "18446744073709551615"] {
+            let file =
+                format!("ply\nformat {encoding} 1.0\nelement vertex {count}\n{vertex}end_header\n1 2 3\n");
+            refused(read_ply(file.as_bytes()), &["element vertex", count]);
+            let file = format!(
+                "ply\nformat {encoding} 1.0\nelement nothing {count}\nelement vertex 0\n{vertex}end_header\n"
+            );
+            refused(read_ply(file.as_bytes()), &["element nothing", "properties"]);
+        }
+        let list = format!(
+            "ply\nformat {encoding} 1.0\nelement strange 1\nproperty list uint double l\nend_header\n"
+        );
+        let body: &[u8] = if encoding == "ascii" { b"4294967295 1 2 3 4 5" } else { &[0xFF; 30] };
+        refused(read_ply(&[list.as_bytes(), body].concat()), &["strange 0", "4294967295"]);
+    }
+    refused(read_ply(b"ply\nformat ascii 1.0\nelement vertex -1\n"), &["header line 3", "-1"]);
+
+    let huge = u64::MAX.to_le_bytes();
+    for files in
+        [[&huge, NO_RECORDS, NO_RECORDS], [NO_RECORDS, &huge, NO_RECORDS], [NO_RECORDS, NO_RECORDS, &huge]]
+    {
+        let read = read_colmap_bytes(ColmapFormat::Binary, files[0], files[1], files[2]);
+        refused(read, &["18446744073709551615", "byte 8"]);
+    }
+
+    // 16-bit grey of 16384 × 16384 with no pixels behind it, checksum right.
+    let mut png = vec![0x89, b'P', b'N', b'G', 13, 10, 26, 10, 0, 0, 0, 13];
+    let header = [b'I', b'H', b'D', b'R', 0, 0, 0x40, 0, 0, 0, 0x40, 0, 16, 0, 0, 0, 0];
+    png.extend(header);
+    png.extend(crc32(&header).to_be_bytes());
+    refused(read_depth_png(&png, 1000.0), &["depth PNG"]);
+}
+
+fn crc32(bytes: &[u8]) -> u32 {
+    !bytes.iter().fold(!0, |crc, byte| {
+        (0..8).fold(crc ^ u32::from(*byte), |c, _| if c & 1 == 1 { 0xEDB8_8320 ^ (c >> 1) } else { c >> 1 })
+    })
+}
+
+fn glb_of(document: &str, binary: &[u8]) -> Vec<u8> {
+    let mut json = document.as_bytes().to_vec();
+    json.resize(json.len().next_multiple_of(4), b' ');
+    let total = 20 + json.len() + 8 + binary.len();
+    let mut file = b"glTF\x02\0\0\0".to_vec();
+    file.extend((total as u32).to_le_bytes());
+    file.extend((json.len() as u32).to_le_bytes());
+    file.extend(b"JSON");
+    file.extend(json);
+    file.extend((binary.len() as u32).to_le_bytes());
+    file.extend(b"BIN\0");
+    file.extend(binary);
+    file
+}
+
+#[test]
+fn a_glb_that_lies_or_repeats_itself_is_refused() {
+    let glb = |nodes: &str, roots: &str, count: u64, length: u64| {
+        let document = format!(
+            r#"{{"asset":{{"version":"2.0"}},"scene":0,"scenes":[{{"nodes":{roots}}}],"nodes":{nodes},
+            "meshes":[{{"primitives":[{{"attributes":{{"POSITION":0}},"mode":0}}]}}],
+            "accessors":[{{"bufferView":0,"componentType":5126,"count":{count},"type":"VEC3"}}],
+            "bufferViews":[{{"buffer":0,"byteLength":{length}}}],"buffers":[{{"byteLength":{length}}}]}}"#
+        );
+        read_glb(&glb_of(&document, &[0; 1200]))
+    };
+    let one = r#"[{"mesh":0}]"#;
+    assert_eq!(glb(one, "[0]", 100, 1200).unwrap().mesh.positions.len(), 100);
+    refused(glb(one, "[0]", 101, 1200), &["accessors[0]", "101"]);
+    refused(glb(one, "[0]", u64::MAX, 1200), &["accessors[0]"]);
+    refused(glb(one, "[0]", 101, u64::MAX), &["bufferViews[0]"]);
+    refused(glb(one, "[0,0]", 1, 1200), &["nodes[0]", "twice"]);
+    refused(glb(r#"[{"children":[0]}]"#, "[0]", 1, 1200), &["nodes[0]", "twice"]);
+    refused(glb(r#"[{"mesh":7}]"#, "[0]", 1, 1200), &["nodes[0]", "mesh 7"]);
+    // A hundred nodes of one mesh: more vertices than the file has bytes.
+    let many = vec![r#"{"mesh":0}"#; 100].join(",");
+    let roots: Vec<String> = (0..100).map(|i| i.to_string()).collect();
+    refused(glb(&format!("[{many}]"), &format!("[{}]", roots.join(",")), 100, 1200), &["repeats"]);
+    // A chain of nodes deeper than any tool makes.
+    let chain: Vec<String> = (1..=100).map(|i| format!(r#"{{"children":[{i}]}}"#)).collect();
+    refused(glb(&format!("[{},{{}}]", chain.join(",")), "[0]", 1, 1200), &["levels"]);
+}
+
+#[test]
+fn nonsense_in_text_names_its_line() {
+    refused(read_tum(b"# c\n1 0 0 0 0 0 0 1\n2 0 0 nan 0 0 0 1\n"), &["line 3", "nan"]);
+    refused(read_tum(b"1 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 1\n"), &["line 2", "after 1.000000000"]);
+    refused(read_tum(b"1 0 0 0 0 0 0 2\n"), &["line 1", "length 2"]);
+    refused(read_tum(b"1 0 0 0 0 0 0 0\n"), &["line 1", "unit quaternion"]);
+    refused(read_tum(b"1 0 0 0 0 0 0\n"), &["line 1", "8 columns", "7"]);
+    refused(read_tum(b"1 0 0 0\n\xFF"), &["line 2", "UTF-8"]);
+    refused(read_tum(b"# world_from_body, body = cam\n"), &["line 1", "cam"]);
+    refused(read_euroc_csv(b"1.5,0,0,0,1,0,0,0\n"), &["line 1", "1.5", "integer nanoseconds"]);
+    let times = KittiTimes { body: small_trajectory().body(), times: vec![Timestamp::from_nanos(1)] };
+    refused(read_kitti(b"", &times), &["1 too few"]);
+    let line = "1 0 0 0 0 1 0 0 0 0 1 0\n";
+    refused(read_kitti(line.repeat(2).as_bytes(), &times), &["line 2", "one more"]);
+    refused(read_kitti(b"1 0 0 0 0 1 0 0 0 0 -1 0\n", &times), &["line 1", "rotation"]);
+    refused(
+        read_colmap_bytes(ColmapFormat::Text, b"", b"1 1 0 0 0 0 0 0 5 a.png\n\n", b""),
+        &["image 1", "camera 5"],
+    );
+    refused(
+        read_colmap_bytes(ColmapFormat::Text, b"# Number of cameras: 2\n", b"", b""),
+        &["2 records", "0"],
+    );
+    let scaled = r#"{"fl_x":1,"cx":1,"cy":1,"w":2,"h":2,"frames":[{"file_path":"a",
+        "transform_matrix":[[2,0,0,0],[0,2,0,0],[0,0,2,0],[0,0,0,1]]}]}"#;
+    refused(read_transforms_json(scaled.as_bytes()), &["frames[0]", "rigid"]);
+    let k1 = scaled.replace('2', "1").replace("\"frames\"", "\"k1\":0.1,\"frames\"");
+    refused(read_transforms_json(k1.as_bytes()), &["frames[0]", "k1 = 0.1", "undistort"]);
+    refused(
+        read_transforms_json(scaled.replace("\"cx\":1,", "").replace("2,0", "1,0").as_bytes()),
+        &["frames[0]"],
+    );
+}
+
+#[test]
+fn values_that_a_format_cannot_hold_are_refused_before_a_byte_is_written() {
+    let mut nan = small_mesh();
+    nan.positions[1][2] = f32::NAN;
+    let mut short = small_mesh();
+    short.colors.pop();
+    let mut loose = small_mesh();
+    loose.triangles[0][1] = 3;
+    for (mesh, words) in [(nan, "vertex 1"), (short, "2 of them for 3"), (loose, "only 3 vertices")] {
+        let mut bytes = Vec::new();
+        for error in [write_ply_mesh(&mut bytes, &mesh, &[]), write_glb_mesh(&mut bytes, &mesh, &[])] {
+            let text = error.unwrap_err().to_string();
+            assert!(text.contains(words), "{text}");
+        }
+        assert!(bytes.is_empty());
+    }
+    let dir = tempfile::tempdir().unwrap();
+    let refuse = |change: fn(&mut Vec<ExportView>), words: &str| {
+        let mut views = small_views();
+        change(&mut views);
+        let text_model = write_colmap(dir.path(), ColmapFormat::Text, &views, &PointCloud::default());
+        let error = text_model.unwrap_err().to_string();
+        assert!(error.contains(words), "{error}");
+        assert_eq!(fs::read_dir(dir.path()).unwrap().count(), 0);
+    };
+    refuse(|v| v[1].image_name = "two words.png".into(), "binary format");
+    refuse(|v| v[1].image_name = v[0].image_name.clone(), "twice");
+    refuse(|v| v[1].frame_id = v[0].frame_id, "twice");
+    refuse(|v| v[0].image_name = "a\0b".into(), "printable");
+    refuse(|v| v[0].intrinsics.fx = 0.0, "fx");
+    refuse(|v| v[0].world_from_camera.translation.x = f64::INFINITY, "not finite");
+    let depth = MetricDepth::new(Image::filled(2, 2, 1.0));
+    assert!(write_depth_png(Vec::new(), &depth, f64::NAN).is_err());
+}
+
+#[cfg(target_os = "linux")]
+#[test]
+fn every_writer_tells_of_a_full_device() {
+    let (trajectory, mesh, views) = (small_trajectory(), small_mesh(), small_views());
+    let depth = MetricDepth::new(Image::filled(3, 3, 1.0));
+    let sidecar = DepthSidecar::new(1000.0, &views[0].intrinsics, vec![]);
+    let full = || OpenOptions::new().write(true).open("/dev/full").unwrap();
+    let results = [
+        write_tum(full(), &trajectory, ""),
+        write_euroc_csv(full(), &trajectory, ""),
+        write_kitti(full(), &trajectory),
+        write_kitti_times(full(), &trajectory, ""),
+        write_ply_mesh(full(), &mesh, &[]),
+        write_ply_cloud(full(), &cloud_of(&mesh), &[]),
+        write_glb_mesh(full(), &mesh, &[]),
+        write_glb_cloud(full(), &cloud_of(&mesh), &[]),
+        write_transforms_json(full(), &views, None),
+        write_depth_png(full(), &depth, 1000.0).map(drop),
+        sidecar.write(full()),
+    ];
+    for (i, result) in results.into_iter().enumerate() {
+        match result {
+            Err(ExportError::Write { source, .. }) => {
+                assert_eq!(source.kind(), std::io::ErrorKind::StorageFull, "writer {i}");
+            }
+            other => panic!("writer {i}: {other:?}"),
+        }
+    }
+}
+
+#[test]
+fn a_model_in_a_place_that_cannot_be_made_or_read_names_the_path() {
+    let dir = tempfile::tempdir().unwrap();
+    let file = dir.path().join("eine Datei ä");
+    fs::File::create(&file).unwrap().write_all(b"x").unwrap();
+    let below: &Path = &file.join("sparse");
+    let write = write_colmap(below, ColmapFormat::Binary, &small_views(), &PointCloud::default());
+    for error in [write.unwrap_err(), read_colmap(below).unwrap_err()] {
+        assert!(matches!(error, ExportError::File { .. }), "{error}");
+        assert!(error.to_string().contains(&below.display().to_string()), "{error}");
+    }
+}
