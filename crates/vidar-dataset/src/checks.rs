@@ -132,6 +132,26 @@ pub(crate) fn check_imu(imu: &[ImuSample], place: &Path, notes: &mut Vec<Warning
     }
 }
 
+/// Checks that inertial readings surround every image.
+pub(crate) fn check_imu_coverage(
+    images: &[crate::dataset::ImageEntry],
+    imu: &[ImuSample],
+    place: &Path,
+    notes: &mut Vec<Warning>,
+) {
+    let (Some(first), Some(last)) = (imu.first(), imu.last()) else { return };
+    let outside = images.iter().filter(|i| i.time < first.time || i.time > last.time).count();
+    if outside > 0 {
+        let message = format!(
+            "{outside} of {} images lie outside the inertial readings ({} to {} s)",
+            images.len(),
+            first.time,
+            last.time
+        );
+        notes.push(Warning::new("imu-coverage", message).at(place.display()));
+    }
+}
+
 /// Checks that images and a trajectory are of one time.
 pub(crate) fn check_overlap(
     images: Option<(Timestamp, Timestamp)>,
@@ -155,7 +175,7 @@ pub(crate) fn check_overlap(
     notes.push(
         Warning::new("no-overlap", message)
             .at(place.display())
-            .hint("--time-unit, or bring both files into one clock"),
+            .hint("bring both files into one clock: the same unit and the same zero"),
     );
 }
 

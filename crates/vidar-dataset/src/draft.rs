@@ -9,7 +9,8 @@ use crate::options::{DatasetKind, OpenOptions};
 use crate::parse::{self, Source};
 use crate::settle::{cut, first_readable_size, guessed_model, keep_existing, name_of};
 use crate::source::read_text_file_up_to;
-use crate::{trajectory_file, tum_rgbd};
+use crate::trajectory_file::{self, ReadPoses};
+use crate::tum_rgbd;
 use std::path::{Path, PathBuf};
 use vidar_core::{
     BodyFrame, CameraId, CameraModel, Duration, FrameId, ImuNoise, ImuSample, Pinhole, Rig, RigCamera, Se3,
@@ -136,6 +137,7 @@ impl Draft {
         checks::put_in_order(&mut dataset.imu, |s| s.time, "inertial readings", &root, notes);
         if !dataset.imu.is_empty() {
             checks::check_imu(&dataset.imu, &root, notes);
+            checks::check_imu_coverage(&dataset.images, &dataset.imu, &root, notes);
         }
         checks::put_in_order(&mut dataset.accelerometer, |s| s.time, "accelerometer readings", &root, notes);
         let norms: Vec<_> = dataset.accelerometer.iter().map(|s| (s.time, s.accel.0.norm())).collect();
@@ -371,9 +373,9 @@ impl Draft {
             time_unit: None,
             times: Some(dataset.images.iter().map(|i| i.time).collect()),
         };
-        let (trajectory, notes) = trajectory_file::trajectory_from(&Source { path, bytes: &bytes }, &read)?;
-        dataset.warnings.extend(notes);
-        let trajectory = self.with_known_body(trajectory, options, path, dataset)?;
+        let mut found = trajectory_file::read_poses(&Source { path, bytes: &bytes }, &read)?;
+        dataset.warnings.append(&mut found.notes);
+        let trajectory = with_known_body(found, path, dataset)?;
         checks::check_overlap(
             image_range(&dataset.images),
             &trajectory,
@@ -385,37 +387,22 @@ impl Draft {
         dataset.text_files.push(path.clone());
         Ok(())
     }
+}
 
-    /// Without an IMU there is no IMU frame: poses that a format calls the IMU's are then the chosen camera's.
-    fn with_known_body(
-        &self,
-        trajectory: Trajectory,
-        options: &OpenOptions,
-        path: &Path,
-        dataset: &mut Dataset,
-    ) -> Result<Trajectory, DatasetError> {
-        if options.trajectory_body.is_some() {
-            return Ok(trajectory);
-        }
-        let has_imu = !dataset.imu.is_empty() || dataset.rig.imu.is_some();
-        let body = match trajectory.body() {
-            BodyFrame::Imu if !has_imu => BodyFrame::Camera(dataset.camera),
-            known => known,
-        };
-        let whose = match body {
-            BodyFrame::Imu => "the IMU (body)".to_string(),
-            BodyFrame::Camera(id) => format!("camera {id}"),
-            BodyFrame::Other => "a tracked object that is neither IMU nor camera".to_string(),
-        };
-        dataset.warnings.push(
-            Warning::new("trajectory-body", format!("the trajectory is taken to be of {whose}"))
-                .at(path.display())
-                .hint("--trajectory-body body|cameraN says it for certain"),
-        );
-        let poses: Vec<StampedPose> = trajectory.poses().to_vec();
-        Trajectory::new(body, poses)
-            .map_err(|e| DatasetError::NoPoses { path: path.to_path_buf(), found: e.to_string() })
+/// Without an IMU there is no IMU frame: poses that a format calls the IMU's are then the chosen camera's.
+fn with_known_body(found: ReadPoses, path: &Path, dataset: &mut Dataset) -> Result<Trajectory, DatasetError> {
+    if !found.body_is_assumed {
+        return Ok(found.trajectory);
     }
+    let has_imu = !dataset.imu.is_empty() || dataset.rig.imu.is_some();
+    let body = match found.trajectory.body() {
+        BodyFrame::Imu if !has_imu => BodyFrame::Camera(dataset.camera),
+        known => known,
+    };
+    dataset.warnings.push(trajectory_file::assumed_body(body, path));
+    let poses: Vec<StampedPose> = found.trajectory.poses().to_vec();
+    Trajectory::new(body, poses)
+        .map_err(|e| DatasetError::NoPoses { path: path.to_path_buf(), found: e.to_string() })
 }
 
 pub(crate) fn image_range(images: &[ImageEntry]) -> Option<(Timestamp, Timestamp)> {

@@ -9,7 +9,7 @@ use crate::error::{DatasetError, io_error};
 use crate::folder::{images_in, names_in};
 use crate::options::{DatasetKind, OpenOptions, TimeUnit, TrajectoryFormat, TrajectoryReadOptions};
 use crate::parse::{self, EurocSensor, Source, UnitRule};
-use crate::trajectory_file::trajectory_from;
+use crate::trajectory_file::{ReadPoses, read_poses};
 use std::path::{Path, PathBuf};
 use vidar_core::{BodyFrame, ImuNoise, LieGroup, Se3, StampedPose, Timestamp, Trajectory, Warning};
 
@@ -242,7 +242,7 @@ fn read_truth(draft: &mut Draft, body_from_imu: &Se3) -> Result<(), DatasetError
     let list = folder.join("data.csv");
     let bytes = draft.read(&list)?;
     let options = TrajectoryReadOptions { format: Some(TrajectoryFormat::EurocCsv), ..Default::default() };
-    let (trajectory, notes) = trajectory_from(&Source { path: &list, bytes: &bytes }, &options)?;
+    let ReadPoses { trajectory, notes, .. } = read_poses(&Source { path: &list, bytes: &bytes }, &options)?;
     draft.warnings.extend(notes);
     if trajectory.body() != BodyFrame::Imu {
         draft.ground_truth = Some((trajectory, list));

@@ -26,6 +26,9 @@ pub(crate) fn read_text_file_up_to(path: &Path, limit: u64) -> Result<Vec<u8>, D
     Ok(bytes)
 }
 
+/// Most rows of a file: ten hours at 1 kHz. It keeps a file of line feeds from growing into a list of rows.
+const MAX_ROWS: usize = 36_000_000;
+
 /// The bytes of a text file and its path for messages.
 #[derive(Clone, Copy, Debug)]
 pub struct Source<'a> {
@@ -120,6 +123,9 @@ impl<'a> Source<'a> {
             } else if out.rows.is_empty() && is_column_names(text) {
                 out.comments.push(text);
             } else if !text.is_empty() {
+                if out.rows.len() == MAX_ROWS {
+                    return Err(self.garbage(line, format!("more than {MAX_ROWS} rows"), "a shorter file"));
+                }
                 out.rows.push(Row { line, text });
             }
         }

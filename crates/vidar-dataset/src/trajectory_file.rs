@@ -24,6 +24,38 @@ pub fn trajectory_from(
     source: &Source<'_>,
     options: &TrajectoryReadOptions,
 ) -> Result<(Trajectory, Vec<Warning>), DatasetError> {
+    let mut read = read_poses(source, options)?;
+    if read.body_is_assumed {
+        read.notes.push(assumed_body(read.trajectory.body(), source.path));
+    }
+    Ok((read.trajectory, read.notes))
+}
+
+/// What is said when neither the user nor the file tells whose poses they are.
+pub(crate) fn assumed_body(body: BodyFrame, path: &Path) -> Warning {
+    let whose = match body {
+        BodyFrame::Imu => "the IMU (body)".to_string(),
+        BodyFrame::Camera(id) => format!("camera {id}"),
+        BodyFrame::Other => "a tracked object that is neither IMU nor camera".to_string(),
+    };
+    Warning::new("trajectory-body", format!("the trajectory is taken to be of {whose}"))
+        .at(path.display())
+        .hint("--trajectory-body body|cameraN says it for certain")
+}
+
+/// A trajectory and how sure its body is.
+pub(crate) struct ReadPoses {
+    pub trajectory: Trajectory,
+    pub notes: Vec<Warning>,
+    /// Neither the user nor the file said whose poses they are.
+    pub body_is_assumed: bool,
+}
+
+/// Reads a trajectory without judging what it was called for.
+pub(crate) fn read_poses(
+    source: &Source<'_>,
+    options: &TrajectoryReadOptions,
+) -> Result<ReadPoses, DatasetError> {
     let format = match options.format.or_else(|| parse::guess_trajectory_format(source)) {
         Some(format) => format,
         None => return Err(not_a_trajectory(source)),
@@ -38,8 +70,9 @@ pub fn trajectory_from(
         TrajectoryFormat::Kitti => parse::kitti_poses(source)?,
     };
     let body = body_of(&file, format, options.body);
-    let times = options.times.as_deref();
-    finish(source.path, file, body, times)
+    let body_is_assumed = options.body.is_none() && file.body.is_none();
+    let (trajectory, notes) = finish(source.path, file, body, options.times.as_deref())?;
+    Ok(ReadPoses { trajectory, notes, body_is_assumed })
 }
 
 fn not_a_trajectory(source: &Source<'_>) -> DatasetError {
@@ -61,7 +94,7 @@ fn body_of(file: &PoseFile, format: TrajectoryFormat, given: Option<BodyFrame>) 
 }
 
 /// Gives every pose its time, and the poses their order.
-pub(crate) fn finish(
+fn finish(
     path: &Path,
     file: PoseFile,
     body: BodyFrame,

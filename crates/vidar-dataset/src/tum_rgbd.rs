@@ -8,7 +8,7 @@ use crate::draft::{Draft, DraftDepth};
 use crate::error::DatasetError;
 use crate::options::{DatasetKind, OpenOptions, TimeUnit, TrajectoryFormat, TrajectoryReadOptions};
 use crate::parse::{self, Source, UnitRule};
-use crate::trajectory_file::trajectory_from;
+use crate::trajectory_file::{ReadPoses, read_poses};
 use nalgebra::{Matrix2, Vector2};
 use std::path::{Path, PathBuf};
 use vidar_core::camera::RadTan;
@@ -63,7 +63,7 @@ pub(crate) fn open(path: &Path, reason: String, options: &OpenOptions) -> Result
             time_unit: None,
             times: None,
         };
-        let (trajectory, notes) = trajectory_from(&Source { path: &truth, bytes: &bytes }, &read)?;
+        let ReadPoses { trajectory, notes, .. } = read_poses(&Source { path: &truth, bytes: &bytes }, &read)?;
         draft.warnings.extend(notes);
         draft.ground_truth = Some((trajectory, truth));
     }

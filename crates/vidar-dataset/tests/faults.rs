@@ -1,5 +1,12 @@
 //! Every fault is found and named: an error that says where and what, or a warning.
 
+#![allow(
+    clippy::unwrap_used,
+    clippy::panic,
+    clippy::print_stderr,
+    reason = "tests may stop at the first surprise"
+)]
+
 mod common;
 
 use common::*;
@@ -154,6 +161,9 @@ fn disorder_duplicates_and_gaps_are_named() {
         std::fs::remove_file(f.join(&format!("mav0/cam0/data/{}.png", frame_ns(i)))).unwrap();
     }
     assert!(warning(&f.open().unwrap(), "image-gap").message.contains("0.350 s"));
+    let f = euroc();
+    f.edit("mav0/imu0/data.csv", |s| s.lines().take(60).map(|l| format!("{l}\n")).collect());
+    assert!(warning(&f.open().unwrap(), "imu-coverage").message.starts_with("5 of 10 images"));
 }
 
 #[test]

@@ -1,5 +1,12 @@
 //! The real recordings in `shared/data`, where they are there.
 
+#![allow(
+    clippy::unwrap_used,
+    clippy::panic,
+    clippy::print_stderr,
+    reason = "tests may stop at the first surprise"
+)]
+
 use std::path::PathBuf;
 use vidar_core::{BodyFrame, CameraId, SensorEvent};
 use vidar_dataset::{

@@ -116,12 +116,14 @@ pub(crate) fn is_image_name(name: &str) -> bool {
         .is_some_and(|(_, ext)| ["png", "jpg", "jpeg"].iter().any(|known| ext.eq_ignore_ascii_case(known)))
 }
 
+type TimedRow<const N: usize> = (Timestamp, [f64; N]);
+
 /// Rows of a time and `N` numbers. Rows with a number that is not finite are left out and counted.
 fn timed_numbers<const N: usize>(
     source: &Source<'_>,
     rule: UnitRule,
     columns: &str,
-) -> Result<(Vec<(Timestamp, [f64; N])>, Vec<Warning>), DatasetError> {
+) -> Result<(Vec<TimedRow<N>>, Vec<Warning>), DatasetError> {
     let mut notes = Vec::new();
     let lines = source.lines(&mut notes)?;
     let place = source.path.display().to_string();
