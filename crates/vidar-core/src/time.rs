@@ -268,4 +268,33 @@ mod tests {
             assert!(matches!(Timestamp::parse_secs(text), Err(TimeError::OutOfRange { .. })), "{text:?}");
         }
     }
+
+    proptest::proptest! {
+        #![proptest_config(proptest::prelude::ProptestConfig { failure_persistence: None, ..Default::default() })]
+
+        #[test]
+        fn every_stamp_survives_its_own_text(nanos in -i64::MAX..=i64::MAX) {
+            let time = Timestamp::from_nanos(nanos);
+            proptest::prop_assert_eq!(Timestamp::parse_secs(&time.to_secs_string()), Ok(time));
+            proptest::prop_assert_eq!(Timestamp::parse_unit(&nanos.to_string(), 9), Ok(time));
+        }
+
+        #[test]
+        fn any_text_is_a_time_or_an_error(text in ".{0,40}", digits in 0..20_u32) {
+            let _ = Timestamp::parse_secs(&text);
+            let _ = Timestamp::parse_unit(&text, digits);
+        }
+    }
+
+    #[test]
+    fn sums_past_the_end_of_the_clock_saturate() {
+        let (last, tick) = (Timestamp::from_nanos(i64::MAX), Duration::from_nanos(1));
+        assert_eq!((last + tick, last.checked_add(tick)), (last, None));
+        assert_eq!(last.since(Timestamp::from_nanos(-1)).nanos(), i64::MAX);
+        assert_eq!(Duration::from_nanos(i64::MIN).abs().nanos(), i64::MAX);
+        assert_eq!(
+            (Duration::from_secs_f64(f64::NAN), Duration::from_secs_f64(1.5)),
+            (Duration::ZERO, Duration::from_millis(1500))
+        );
+    }
 }

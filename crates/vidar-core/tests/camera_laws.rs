@@ -298,3 +298,22 @@ fn a_fisheye_sees_beside_and_behind_itself_and_a_pinhole_does_not() {
     assert!(RadTan::examples()[0].project(&behind).is_none());
     assert!(Fov::examples()[0].project(&behind).is_none());
 }
+
+#[test]
+fn every_pixel_of_the_real_cameras_has_a_ray() {
+    // The one-to-one domain must not cost a real calibration any of its image.
+    let real = [
+        CameraModel::Pinhole(Pinhole::examples()[0]),
+        CameraModel::RadTan(RadTan::examples()[0]),
+        CameraModel::Equidistant(Equidistant::examples()[0]),
+        CameraModel::DoubleSphere(DoubleSphere::examples()[0]),
+        CameraModel::DoubleSphere(DoubleSphere::examples()[1]),
+        CameraModel::Fov(Fov::examples()[0]),
+    ];
+    for camera in real {
+        let (right, bottom) = (camera.width() as f64 - 0.5, camera.height() as f64 - 0.5);
+        for (x, y) in [(-0.5, -0.5), (right, -0.5), (-0.5, bottom), (right, bottom)] {
+            assert!(camera.unproject(&Vector2::new(x, y)).is_some(), "{camera:?} at {x}, {y}");
+        }
+    }
+}
