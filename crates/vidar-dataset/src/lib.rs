@@ -1,9 +1,4 @@
-//! Readers of EuRoC, TUM RGB-D, 7-Scenes and image folders into one time-ordered stream.
-//!
-//! [`open`] looks at a path, decides what it is, says why, and returns a [`Dataset`]: the rig, the lists of images
-//! and depth images, the inertial readings, reference poses, and warnings about what is not quite right.
-//!
-//! The files may be anybody's: nothing here panics on them or allocates more than stated limits.
+#![doc = include_str!("../README.md")]
 
 mod calibration;
 pub mod camera_flag;

@@ -8,7 +8,7 @@ use crate::options::OpenOptions;
 use std::path::{Path, PathBuf};
 use vidar_core::{CameraModel, Duration, Pinhole, Timestamp, Warning};
 
-/// The last part of the root's path that says something (`mav0` does not).
+/// The last part of the root's path that says something: `mav0` does not, and `seq-01` only with its room.
 pub(crate) fn name_of(root: &Path) -> String {
     let absolute = root.canonicalize().unwrap_or_else(|_| root.to_path_buf());
     let parts = absolute.components().rev().filter_map(|c| match c {
@@ -16,7 +16,11 @@ pub(crate) fn name_of(root: &Path) -> String {
         _ => None,
     });
     let mut parts = parts.filter(|p| p != "mav0");
-    parts.next().unwrap_or_else(|| "dataset".into())
+    let last = parts.next().unwrap_or_else(|| "dataset".into());
+    match parts.next() {
+        Some(room) if last.starts_with("seq") => format!("{room}-{last}"),
+        _ => last,
+    }
 }
 
 /// Leaves out files that are not there or hold nothing, and names them.

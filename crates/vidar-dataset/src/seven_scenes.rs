@@ -57,7 +57,8 @@ pub(crate) fn open(folder: &Path, reason: String, options: &OpenOptions) -> Resu
             poses.push((time, read_pose(&mut draft, &pose)?, pose));
         }
     }
-    draft.warnings.push(synthetic_warning(folder));
+    // The layout has no place for times, so there is nothing to hint at.
+    draft.warnings.push(Warning { hint: None, ..synthetic_warning(folder) });
     settle_poses(&mut draft, poses)?;
     settle_cameras(&mut draft, options)?;
     Ok(draft)

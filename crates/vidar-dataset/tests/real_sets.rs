@@ -90,6 +90,7 @@ fn seven_scenes_red_kitchen_opens_as_rgbd_with_metric_poses() {
     let Some(path) = shared("7scenes_redkitchen") else { return };
     let d = open(&path, &OpenOptions::default()).unwrap();
     assert_eq!((d.kind, d.images.len(), d.depths.len()), (DatasetKind::SevenScenes, 125, 125));
+    assert_eq!(d.name, "7scenes_redkitchen-seq-01");
     let truth = d.ground_truth.as_ref().unwrap();
     assert_eq!((truth.body(), truth.len()), (BodyFrame::Camera(CameraId(0)), 125));
     assert!(kinds(&d).contains(&"times-synthesised") && kinds(&d).contains(&"color-is-depth-camera"));
