@@ -29,3 +29,6 @@ pub use render::{RenderedView, SynthView, render_views};
 pub use rig::{euroc_body_from_camera, euroc_camera, euroc_rig};
 pub use sequence::{SynthSummary, write_sequence};
 pub use world::{Extent, Hit, World};
+
+#[cfg(test)]
+mod tests;

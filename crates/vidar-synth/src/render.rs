@@ -90,13 +90,14 @@ pub(crate) fn expose(world: &World, rays: &RayTable, world_from_camera: &[Se3]) 
     Exposed { radiance, depth }
 }
 
-/// Width of the surface that a pixel sees: the geometric mean of the ellipse's axes, slightly toward the longer one.
+/// Width of the surface that a pixel sees: between the axes of its ellipse, halfway from their mean to the longer one.
 ///
 /// The shorter axis would alias at grazing angles, the longer one would blur floors away.
 fn footprint_m(normal: &Vector3<f64>, direction: &Vector3<f64>, t: f64, pixel_angle: f64) -> f64 {
     let length = direction.norm();
     let cosine = (normal.dot(direction).abs() / length).max(0.05);
-    pixel_angle * t * length * cosine.powf(-0.65)
+    let root = cosine.sqrt();
+    pixel_angle * t * length / (root * root.sqrt())
 }
 
 /// A place to look from.
@@ -132,12 +133,22 @@ pub fn render_views(
         let found = samples.to_string();
         return Err(SynthError::BadConfig { key: "samples", expected: "1 to 64", found });
     }
-    Ok(views.iter().map(|view| render_view(world, view, samples)).collect())
+    let mut rendered = Vec::with_capacity(views.len());
+    // Views mostly share one camera, whose rays need to be found only once.
+    let mut known: Option<(&CameraModel, RayTable)> = None;
+    for view in views {
+        let rays = match known.take() {
+            Some((camera, rays)) if *camera == view.camera => rays,
+            _ => RayTable::new(&view.camera, samples),
+        };
+        rendered.push(render_view(world, view, &rays));
+        known = Some((&view.camera, rays));
+    }
+    Ok(rendered)
 }
 
-fn render_view(world: &World, view: &SynthView, samples: usize) -> RenderedView {
-    let rays = RayTable::new(&view.camera, samples);
-    let exposed = expose(world, &rays, &vec![view.world_from_camera; samples]);
+fn render_view(world: &World, view: &SynthView, rays: &RayTable) -> RenderedView {
+    let exposed = expose(world, rays, &vec![view.world_from_camera; rays.samples.len()]);
     let (width, height) = (rays.width, rays.height);
     let image = Image::from_fn(width, height, |x, y| (exposed.radiance[y * width + x] * 255.0).round() as u8);
     let depth = Image::from_fn(width, height, |x, y| exposed.depth[y * width + x]);

@@ -82,7 +82,9 @@ impl PoseSpline {
         debug_assert!(control.len() >= ORDER);
         let positions = control.iter().map(|c| c.translation).collect();
         let rotations: Vec<So3> = control.iter().map(|c| c.rotation).collect();
-        let steps = rotations.windows(2).map(|w| w[1].minus(&w[0])).collect();
+        // Equal rotations step by exactly nothing, where the logarithm of `R⁻¹ R` would leave rounding.
+        let step = |w: &[So3]| if w[0] == w[1] { Vector3::zeros() } else { w[1].minus(&w[0]) };
+        let steps = rotations.windows(2).map(step).collect();
         Self { first_secs, interval_secs, positions, rotations, steps }
     }
 

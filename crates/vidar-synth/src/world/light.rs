@@ -7,8 +7,11 @@ use super::shape::{Extent, Shape};
 use super::{Bvh, nearest_hit};
 use nalgebra::Vector3;
 
-/// Spacing of the grid on which light is computed, m.
+/// Spacing of the grid on which light is computed, m; coarser where textures are coarse.
 const GRID_M: f64 = 0.15;
+
+/// Texels between points of the grid at least.
+const TEXELS_PER_POINT: f64 = 6.0;
 
 /// Rays per grid point that look for occluders of the ambient light.
 const AMBIENT_RAYS: u32 = 10;
@@ -49,12 +52,12 @@ pub(super) struct LightMap {
 }
 
 impl LightMap {
-    pub(super) fn new(shapes: &[Shape], bvh: &Bvh, shape: usize, face: usize, lamps: &[Lamp]) -> Self {
-        let solid = &shapes[shape];
+    pub(super) fn new(scene: &Scene<'_>, shape: usize, face: usize, texel_m: f64) -> Self {
+        let solid = &scene.shapes[shape];
         let size = solid.face_size(face);
-        let [columns, rows] = size.map(|s| (s / GRID_M).ceil().max(1.0) as usize + 1);
+        let spacing = GRID_M.max(TEXELS_PER_POINT * texel_m);
+        let [columns, rows] = size.map(|s| (s / spacing).ceil().max(1.0) as usize + 1);
         let mut values = Vec::with_capacity(columns * rows);
-        let scene = Scene { shapes, bvh, lamps };
         for y in 0..rows {
             for x in 0..columns {
                 // Stay off the very edge, where neighbouring shapes touch.
@@ -94,10 +97,11 @@ impl LightMap {
     }
 }
 
-struct Scene<'a> {
-    shapes: &'a [Shape],
-    bvh: &'a Bvh,
-    lamps: &'a [Lamp],
+/// What light meets.
+pub(super) struct Scene<'a> {
+    pub shapes: &'a [Shape],
+    pub bvh: &'a Bvh,
+    pub lamps: &'a [Lamp],
 }
 
 impl Scene<'_> {

@@ -80,7 +80,8 @@ impl Material {
             Kind::Plaster => {
                 let dirt = rough(1.7, 0.62);
                 let specks = speckle(u, v, 0.035, texel, s ^ 11);
-                tone + 0.16 * dirt - 0.16 * specks - 0.10 * crack(u, v, 0.9, texel, s ^ 5)
+                let grain = octaves(u, v, 0.09, texel, 0.75, s ^ 29);
+                tone + 0.15 * dirt + 0.07 * grain - 0.20 * specks - 0.10 * crack(u, v, 0.9, texel, s ^ 5)
             }
             Kind::Plain => tone + 0.012 * rough(0.8, 0.5),
             Kind::Brick => brick(u, v, texel, s, tone),
@@ -176,7 +177,7 @@ fn planks(u: f32, v: f32, texel: f32, seed: u32, tone: f32) -> f32 {
     let own = hash(plank as i32, r, seed);
     let grain =
         octaves(along * 0.12, v + 0.01 * value_noise(along * 3.0, v * 9.0, own), 0.03, texel, 0.75, own);
-    let knots = speckle(u, v, 0.4, texel, seed ^ 31);
+    let knots = speckle(u, v, 0.13, texel, seed ^ 31);
     let gap = 1.0 - band(0.004, width - 0.001, y, texel) * band(0.004, length - 0.001, x, texel);
     let cloud = octaves(u, v, 1.3, texel, 0.6, seed ^ 77);
     let body =

@@ -82,8 +82,9 @@ impl World {
         let area: f64 = faces.iter().map(|&(i, f)| shapes[i].face_size(f)).map(|[u, v]| u * v).sum();
         let texel_m = wanted_texel_m.max((area / TEXEL_BUDGET).sqrt());
         let lamps = light::lamps(&room_of(&shapes), seed);
+        let scene = light::Scene { shapes: &shapes, bvh: &bvh, lamps: &lamps };
         let light: Vec<LightMap> =
-            faces.par_iter().map(|&(i, f)| LightMap::new(&shapes, &bvh, i, f, &lamps)).collect();
+            faces.par_iter().map(|&(i, f)| LightMap::new(&scene, i, f, texel_m)).collect();
         let textures = faces
             .par_iter()
             .zip(&light)
@@ -160,7 +161,7 @@ fn paint(surface: &Surface, light: &LightMap, size: [f64; 2], texel_m: f64) -> T
     Texture::bake(size, texel_m, |v, us, out| {
         for (&u, texel) in us.iter().zip(out) {
             let albedo = surface.albedo(u as f32, v as f32, size32, texel_m as f32);
-            let radiance = 1.0 - (-1.7 * albedo * light.at(u, v)).exp();
+            let radiance = 1.0 - (-3.2 * albedo * light.at(u, v)).exp();
             *texel = (radiance.clamp(0.0, 1.0) * 65_535.0) as u16;
         }
     })
@@ -199,3 +200,6 @@ fn room_around(scene: SceneKind, flight: &Extent) -> Result<Extent, SynthError> 
         max: Vector3::new(middle.x + half.x, middle.y + half.y, (floor + usual.z).max(flight.max.z + 1.0)),
     })
 }
+
+#[cfg(test)]
+mod tests;

@@ -17,11 +17,18 @@ pub(super) fn cell(x: i32, y: i32, seed: u32) -> f32 {
     hash(x, y, seed) as f32 * (1.0 / 4_294_967_296.0)
 }
 
+/// The integer below; without SSE4.1 the library's `floor` is a call.
+#[inline]
+fn floor(x: f32) -> i32 {
+    let towards_zero = x as i32;
+    towards_zero - i32::from((towards_zero as f32) > x)
+}
+
 /// Smooth value noise of unit wavelength, −1…1.
 #[inline]
 pub(super) fn value_noise(x: f32, y: f32, seed: u32) -> f32 {
-    let (fx, fy) = (x.floor(), y.floor());
-    let (ix, iy) = (fx as i32, fy as i32);
+    let (ix, iy) = (floor(x), floor(y));
+    let (fx, fy) = (ix as f32, iy as f32);
     let smooth = |a: f32| a * a * (3.0 - 2.0 * a);
     let (ax, ay) = (smooth(x - fx), smooth(y - fy));
     let top = mix(cell(ix, iy, seed), cell(ix + 1, iy, seed), ax);

@@ -47,7 +47,7 @@ impl Texture {
     pub(crate) fn read(&self, uv: [f64; 2], footprint_m: f32) -> f32 {
         let (u, v) = (uv[0] as f32 * self.texels_per_m[0], uv[1] as f32 * self.texels_per_m[1]);
         let last = (self.levels.len() - 1) as f32;
-        let level = (footprint_m * self.density).max(1.0).log2().min(last);
+        let level = log2((footprint_m * self.density).max(1.0)).min(last);
         let fine = level as usize;
         let share = level - fine as f32;
         let a = self.levels[fine].read(u, v, fine);
@@ -57,6 +57,14 @@ impl Texture {
         let b = self.levels[fine + 1].read(u, v, fine + 1);
         a + share * (b - a)
     }
+}
+
+/// Binary logarithm, straight between powers of two: within 0.09, and without a library call.
+#[inline]
+fn log2(x: f32) -> f32 {
+    let bits = x.to_bits();
+    let exponent = (bits >> 23) as i32 - 127;
+    exponent as f32 + (bits & 0x7F_FFFF) as f32 * (1.0 / 8_388_608.0)
 }
 
 impl Level {
