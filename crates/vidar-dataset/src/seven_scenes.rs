@@ -83,17 +83,22 @@ fn settle_poses(
     draft: &mut Draft,
     poses: Vec<(Timestamp, Option<Se3>, PathBuf)>,
 ) -> Result<(), DatasetError> {
-    let is_identity = |p: &Option<Se3>| p.is_some_and(|p| p == Se3::IDENTITY);
-    let is_real = |p: &Option<Se3>| p.is_some() && !is_identity(p);
+    let is_identity = |p: &Se3| *p == Se3::IDENTITY;
+    let real: Vec<Option<Se3>> = poses.iter().map(|p| p.1.filter(|p| !is_identity(p))).collect();
+    // The nearest real pose before and after each frame, in one sweep each way.
+    let nearest = |last: &mut Option<Se3>, p: &Option<Se3>| {
+        *last = p.or(*last);
+        Some(*last)
+    };
+    let before: Vec<Option<Se3>> = real.iter().scan(None, nearest).collect();
+    let mut after: Vec<Option<Se3>> = real.iter().rev().scan(None, nearest).collect();
+    after.reverse();
     let mut kept = Vec::with_capacity(poses.len());
     let mut skipped: Vec<&Path> = Vec::new();
     for (i, (time, pose, path)) in poses.iter().enumerate() {
-        let before = poses[..i].iter().rev().find(|p| is_real(&p.1));
-        let after = poses[i + 1..].iter().find(|p| is_real(&p.1));
-        let neighbours_near =
-            || [before, after].into_iter().flatten().any(|p| p.1.is_some_and(|p| is_near_identity(&p)));
+        let neighbour_near = [before[i], after[i]].iter().flatten().any(is_near_identity);
         match pose {
-            Some(pose) if !is_identity(&Some(*pose)) || neighbours_near() => {
+            Some(pose) if !is_identity(pose) || neighbour_near => {
                 kept.push(StampedPose { time: *time, world_from_body: *pose });
             }
             _ => skipped.push(path),
