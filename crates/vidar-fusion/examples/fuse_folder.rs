@@ -1,7 +1,7 @@
 //! Fuses a 7-Scenes sequence and prints what it took, as one JSON line: the counterpart of `bench/fusion_vs_open3d.py`.
 //!
 //! `fuse_folder SEQUENCE_DIR [--voxel M] [--trunc VOXELS] [--max-depth M] [--carve M] [--min-views N] [--frames N]
-//! [--color] [--cloud OUT.bin]`; the cloud is written as little-endian f32 x, y, z.
+//! [--color] [--points FRAMES] [--cloud OUT.bin]`; the cloud is written as little-endian f32 x, y, z.
 
 use std::collections::HashMap;
 use std::error::Error;
@@ -32,6 +32,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     let mut volume = TsdfVolume::new(&config)?;
     let mut frame_ms = Vec::new();
     let (mut touched, mut blocks) = (0, 0);
+    let cpu_before = cpu_ms();
     for view in &views {
         let start = Instant::now();
         let stats = volume.integrate(view)?;
@@ -39,23 +40,25 @@ fn main() -> Result<(), Box<dyn Error>> {
         touched += stats.blocks_touched;
         blocks = stats.blocks_total;
     }
+    let cpu_ms = cpu_ms() - cpu_before;
     let start = Instant::now();
     let mesh = volume.extract_mesh();
     let extract_ms = start.elapsed().as_secs_f64() * 1e3;
     let mut points = PointFusion::new(&config)?;
     let mut point_ms = Vec::new();
-    for view in views.iter().take(20) {
+    for view in views.iter().take(number("--points", 0.0)? as usize) {
         let start = Instant::now();
         points.integrate(view)?;
         point_ms.push(start.elapsed().as_secs_f64() * 1e3);
     }
     let coverage = volume.coverage(&mesh);
     println!(
-        "{{\"frames\": {}, \"ms_per_frame\": {:.4}, \"total_ms\": {:.3}, \"extract_ms\": {:.3}, \
+        "{{\"frames\": {}, \"ms_per_frame\": {:.4}, \"cpu_ms_per_frame\": {:.3}, \"total_ms\": {:.3}, \"extract_ms\": {:.3}, \
          \"blocks_per_frame\": {:.0}, \"blocks\": {}, \"vertices\": {}, \"triangles\": {}, \"area_m2\": {:.3}, \
          \"volume_mib\": {:.1}, \"peak_mib\": {:.1}, \"points_ms_per_frame\": {:.3}, \"share_seen_by_3\": {:.3}}}",
         views.len(),
         median(&mut frame_ms.clone()),
+        cpu_ms / views.len().max(1) as f64,
         frame_ms.iter().sum::<f64>(),
         extract_ms,
         touched as f64 / views.len().max(1) as f64,
@@ -73,6 +76,14 @@ fn main() -> Result<(), Box<dyn Error>> {
         std::fs::write(path, bytes)?;
     }
     Ok(())
+}
+
+/// Processor time of all threads so far, in steps of 10 ms; 0 where `/proc` does not tell.
+fn cpu_ms() -> f64 {
+    let stat = std::fs::read_to_string("/proc/self/stat").unwrap_or_default();
+    // Fields 14 and 15, in ticks of 1/100 s; the name in field 2 may hold spaces and ends with the last ')'.
+    let after_name = stat.rsplit(')').next().unwrap_or_default();
+    after_name.split_whitespace().skip(11).take(2).filter_map(|t| t.parse::<f64>().ok()).sum::<f64>() * 10.0
 }
 
 fn arguments() -> (PathBuf, HashMap<String, String>) {

@@ -5,7 +5,6 @@ use crate::grid::{BlockKey, EDGE, median_depth};
 use crate::sample::{SampledView, TILE};
 use nalgebra::Vector3;
 use rayon::prelude::*;
-use rustc_hash::FxHashSet;
 use vidar_core::AlignedView;
 
 /// Neighbouring rays that start a search lie at most this share of a block apart at the median depth…
@@ -25,14 +24,14 @@ pub(crate) fn touched_blocks(
     let stride_px = block_m * RAY_SPACING * k.fx.min(k.fy) / f64::from(median);
     let stride = (stride_px as usize).clamp(1, MAX_STRIDE_PX);
     let rows: Vec<usize> = (0..sampled.height).step_by(stride).collect();
-    let found: Vec<FxHashSet<BlockKey>> = rows
-        .par_chunks(4 * TILE / stride)
+    let found: Vec<Vec<BlockKey>> = rows
+        .par_chunks(8 * TILE / stride)
         .map(|rows| {
-            let mut found = FxHashSet::default();
+            let mut found = Found::default();
             for &y in rows {
                 touch_row(view, sampled, config, y, stride, &mut found);
             }
-            found
+            found.keys
         })
         .collect();
     let mut keys: Vec<BlockKey> = found.into_iter().flatten().collect();
@@ -47,41 +46,72 @@ fn touch_row(
     config: &FusionConfig,
     y: usize,
     stride: usize,
-    found: &mut FxHashSet<BlockKey>,
+    found: &mut Found,
 ) {
-    // In units of blocks.
+    // In units of blocks, from the block of the camera, where single precision is plenty.
     let per_block = 1.0 / (config.voxel_size_m * EDGE as f64);
-    let truncation = config.truncation_m();
+    let truncation = config.truncation_m() as f32;
+    let k = view.intrinsics();
     let rotation = view.world_from_camera().rotation.matrix() * per_block;
     let origin = view.world_from_camera().translation * per_block;
+    let camera_block = origin.map(f64::floor);
+    let start: Vector3<f32> = (origin - camera_block).map(|c| c as f32);
+    let camera_block = camera_block.map(|c| c as i32);
+    let row_ray: Vector3<f32> = (rotation * k.ray(0.0, y as f64)).map(|c| c as f32);
+    let column_ray: Vector3<f32> = (rotation.column(0) / k.fx).map(|c| c as f32);
     // Half a block per step and less than a block across: no block of a smooth surface is jumped over.
-    let steps = (4.0 * truncation * per_block).ceil().max(1.0) as usize;
-    let per_step = 2.0 * truncation / steps as f64;
-    let mut last = [[i32::MAX; 3]; 2];
+    let steps = (4.0 * truncation * per_block as f32).ceil().max(1.0) as usize;
+    let per_step = 2.0 * truncation / steps as f32;
+    let mut last = [i32::MAX; 3];
     for x in (0..sampled.width).step_by(stride) {
         let sample = sampled.samples[y * sampled.width + x];
         if sample.weight() == 0 {
             continue;
         }
-        let ray = rotation * view.intrinsics().ray(x as f64, y as f64);
-        let nearest = (f64::from(sample.depth) - truncation).max(0.0);
-        let mut at: Vector3<f64> = origin + ray * nearest;
+        let ray = row_ray + column_ray * x as f32;
+        let mut at = start + ray * (sample.depth - truncation).max(0.0);
         let step = ray * per_step;
         for _ in 0..=steps {
             let key = [floor(at.x), floor(at.y), floor(at.z)];
-            // Neighbouring rays cross the same two blocks most of the time.
-            if key != last[0] && key != last[1] {
-                found.insert(key);
-                last = [key, last[0]];
+            if key != last {
+                found.add([0, 1, 2].map(|a| camera_block[a] + key[a]));
+                last = key;
             }
             at += step;
         }
     }
 }
 
-/// Floor without the library call that `f64::floor` is on the baseline instruction set.
+/// Keys in the order of discovery, few of them twice: neighbouring rays cross the same blocks.
+struct Found {
+    keys: Vec<BlockKey>,
+    /// The last key seen of each residue, which drops nearly all repetitions without a hash table.
+    recent: [BlockKey; Self::RECENT],
+}
+
+impl Default for Found {
+    fn default() -> Self {
+        Self { keys: Vec::new(), recent: [[i32::MAX; 3]; Self::RECENT] }
+    }
+}
+
+impl Found {
+    /// 8 × 8 × 8 blocks.
+    const RECENT: usize = 512;
+
+    #[inline(always)]
+    fn add(&mut self, key: BlockKey) {
+        let slot = (key[0] & 7 | (key[1] & 7) << 3 | (key[2] & 7) << 6) as usize;
+        if self.recent[slot] != key {
+            self.recent[slot] = key;
+            self.keys.push(key);
+        }
+    }
+}
+
+/// Floor without the library call that `f32::floor` is on the baseline instruction set.
 #[inline(always)]
-fn floor(x: f64) -> i32 {
+fn floor(x: f32) -> i32 {
     let truncated = x as i32;
-    truncated - i32::from(f64::from(truncated) > x)
+    truncated - i32::from(truncated as f32 > x)
 }

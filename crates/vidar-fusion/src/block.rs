@@ -1,7 +1,8 @@
 //! The sums that a block keeps, and how one view is added to them.
 //!
 //! Every sum is an integer, so adding views commutes and associates: any order of views, any number of threads,
-//! the same bits. A node at signed distance s (metres along the ray, positive in front of the surface) adds
+//! the same bits. A node at projective distance s = depth of its pixel − its own z (metres, positive in front of the
+//! surface; Nießner et al. 2013, section 4) adds
 //!
 //! `d = clamp(s / truncation, −1, 1)`, `Σ w·d`, `Σ w`   (Curless & Levoy 1996, eq. 1–2),
 //!
@@ -120,7 +121,7 @@ impl BlockUpdate<'_> {
 
     #[inline(always)]
     fn add_row(&self, block: &mut Block, first: usize, start: [f32; 3]) {
-        let (pixel, depth_of_node, per_depth) = self.project_row(start);
+        let (pixel, depth_of_node) = self.project_row(start);
         let mut depth: Lanes<f32> = [0.0; EDGE];
         let mut packed: Lanes<u32> = [0; EDGE];
         let mut seen = 0;
@@ -139,10 +140,9 @@ impl BlockUpdate<'_> {
         let mut product: Lanes<i32> = [0; EDGE];
         let mut near: Lanes<u32> = [0; EDGE];
         for i in 0..EDGE {
-            let distance = (depth[i] - depth_of_node[i]) * per_depth[i];
-            // `max` and `min` turn the NaN of a node in the camera plane into a number; its weight is 0.
-            let fade = ((distance + self.truncation_m) * per_fade).max(0.0).min(1.0);
-            let d = (distance * per_truncation).max(-1.0).min(1.0);
+            let distance = depth[i] - depth_of_node[i];
+            let fade = ((distance + self.truncation_m) * per_fade).clamp(0.0, 1.0);
+            let d = (distance * per_truncation).clamp(-1.0, 1.0);
             let w = round_to_i32((packed[i] & 0xffff) as f32 * fade);
             product[i] = w * round_to_i32(d * DISTANCE_ONE);
             weight[i] = w as u32;
@@ -163,15 +163,14 @@ impl BlockUpdate<'_> {
         }
     }
 
-    /// For eight nodes from `start`: the pixel each falls on (`u32::MAX` = none), its z and its |ray|/z.
+    /// For eight nodes from `start`: the pixel each falls on (`u32::MAX` = none), and its z.
     #[inline(always)]
-    fn project_row(&self, start: [f32; 3]) -> (Lanes<u32>, Lanes<f32>, Lanes<f32>) {
+    fn project_row(&self, start: [f32; 3]) -> (Lanes<u32>, Lanes<f32>) {
         let [fx, fy, cx, cy] = self.k;
         let (right, bottom) = (self.width as f32 - 0.5, self.height as f32 - 0.5);
         let width = self.width as i32;
         let mut pixel: Lanes<u32> = [u32::MAX; EDGE];
         let mut depth: Lanes<f32> = [0.0; EDGE];
-        let mut per_depth: Lanes<f32> = [0.0; EDGE];
         for i in 0..EDGE {
             let t = i as f32;
             let x = start[0] + t * self.steps[0][0];
@@ -184,9 +183,8 @@ impl BlockUpdate<'_> {
             let index = round_to_i32(v).wrapping_mul(width).wrapping_add(round_to_i32(u));
             pixel[i] = if inside { index as u32 } else { u32::MAX };
             depth[i] = z;
-            per_depth[i] = (x * x + y * y + z * z).sqrt() * per_z;
         }
-        (pixel, depth, per_depth)
+        (pixel, depth)
     }
 }
 

@@ -66,8 +66,11 @@ fn frustum_blocks(
     config: &FusionConfig,
     block_m: f64,
 ) -> Option<(BlockKey, BlockKey, f64)> {
+    if config.carve_range_m == 0.0 {
+        return None;
+    }
     // Beyond the view's farthest depth nothing is seen through.
-    let farthest = sampled.samples.iter().filter(|s| s.weight() > 0).map(|s| s.depth).fold(0.0, f32::max);
+    let farthest = sampled.tiles.iter().map(|t| t.farthest).fold(0.0, f32::max);
     let mut range = config.carve_range_m.min(f64::from(farthest) - config.truncation_m());
     if !(range > 0.0) {
         return None;

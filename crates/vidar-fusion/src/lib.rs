@@ -1,4 +1,37 @@
 //! Confidence-weighted TSDF and point fusion, mesh extraction, coverage.
+//!
+//! [`TsdfVolume`] turns metric views into a truncated signed distance field (Curless & Levoy, SIGGRAPH 1996) over
+//! hashed blocks of voxels (Nießner et al., TOG 2013), and reads the surface from it by marching cubes.
+//! [`PointFusion`] averages the pixels of each voxel instead. Both weigh pixels by confidence, viewing angle and
+//! depth, hold to a memory budget, run on all threads of the caller's rayon pool, and give the same bits for any
+//! order of views and any number of threads, because they add integers only.
+//!
+//! ```
+//! use vidar_core::{AlignedView, Confidence, FrameId, Image, MetricDepth, Pinhole, Se3, Timestamp};
+//! use vidar_fusion::{FusionConfig, TsdfVolume};
+//! # fn main() -> Result<(), Box<dyn std::error::Error>> {
+//! // A wall one metre before the camera, seen twice.
+//! let camera = Pinhole::new(80.0, 80.0, 39.5, 29.5, 80, 60)?;
+//! let mut volume = TsdfVolume::new(&FusionConfig::default())?;
+//! for i in 0..2 {
+//!     let depth = MetricDepth::new(Image::filled(80, 60, 1.0));
+//!     let confidence = Confidence::full(80, 60);
+//!     let time = Timestamp::from_nanos(i);
+//!     let view = AlignedView::new(FrameId(i as u32), time, Se3::IDENTITY, camera, depth, confidence)?;
+//!     volume.integrate(&view)?;
+//! }
+//! let mesh = volume.extract_mesh();
+//! assert!(mesh.positions.iter().all(|p| (p[2] - 1.0).abs() < 1e-3));
+//! // Normals face the camera.
+//! assert!(mesh.normals.iter().all(|n| n[2] < -0.99));
+//! assert!(volume.coverage(&mesh).surface_area_m2 > 0.6);
+//! # Ok(())
+//! # }
+//! ```
+//!
+//! The path of a view: [`sample`] weighs its pixels, [`allocate`] finds the blocks it touches, [`block`] adds it to
+//! them, [`carve`] votes for what it sees empty. The way out: [`field`] reads distances, [`cubes`] has the
+//! triangles, [`extract`] makes the mesh, [`tidy`] drops crumbs, [`coverage`] counts.
 
 mod allocate;
 mod block;

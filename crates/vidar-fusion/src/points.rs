@@ -73,7 +73,8 @@ impl PointFusion {
             return Err(FusionError::TooManyViews { frame: view.frame_id(), limit: MAX_VIEWS });
         }
         self.views += 1;
-        let sampled = SampledView::new(view, &self.config);
+        let mut sampled = SampledView::default();
+        sampled.fill(view, &self.config);
         let parts = contributions(view, &sampled, self.config.voxel_size_m);
         let call = self.views;
         let budget = self.config.memory_budget_bytes / SHARDS as u64;

@@ -59,6 +59,8 @@ impl Sample {
 pub(crate) struct Tile {
     /// Smallest depth of any pixel, usable or not; infinite when there is none.
     pub nearest: f32,
+    /// Largest depth of a usable pixel; 0 when there is none.
+    pub farthest: f32,
     /// Pixels of the square that lie in the image.
     pub pixels: u32,
     /// Usable pixels.
@@ -68,11 +70,13 @@ pub(crate) struct Tile {
 }
 
 impl Tile {
-    pub const EMPTY: Self = Self { nearest: f32::INFINITY, pixels: 0, usable: 0, confidence: 0 };
+    pub const EMPTY: Self =
+        Self { nearest: f32::INFINITY, farthest: 0.0, pixels: 0, usable: 0, confidence: 0 };
 
     pub fn join(self, other: &Self) -> Self {
         Self {
             nearest: self.nearest.min(other.nearest),
+            farthest: self.farthest.max(other.farthest),
             pixels: self.pixels + other.pixels,
             usable: self.usable + other.usable,
             confidence: self.confidence + other.confidence,
@@ -80,7 +84,8 @@ impl Tile {
     }
 }
 
-/// All samples of a view, row by row, and their tiles.
+/// All samples of a view, row by row, and their tiles. Kept from view to view, so that its memory is asked for once.
+#[derive(Clone, Debug, Default)]
 pub(crate) struct SampledView {
     pub width: usize,
     pub height: usize,
@@ -91,24 +96,22 @@ pub(crate) struct SampledView {
 }
 
 impl SampledView {
-    /// Weighs every pixel of `view`.
-    pub fn new(view: &AlignedView, config: &FusionConfig) -> Self {
+    /// Weighs every pixel of `view`, in place of the view before.
+    pub fn fill(&mut self, view: &AlignedView, config: &FusionConfig) {
         let (width, height) = (view.intrinsics().width, view.intrinsics().height);
         let weigher = Weigher::new(view, config);
         let (tile_columns, tile_rows) = (width.div_ceil(TILE), height.div_ceil(TILE));
-        let mut samples = vec![Sample::NONE; width * height];
-        let mut tiles = vec![Tile::EMPTY; tile_columns * tile_rows];
-        samples.par_chunks_mut(width * TILE).zip(tiles.par_chunks_mut(tile_columns)).enumerate().for_each(
-            |(tile_row, (samples, tiles))| {
-                for (row, samples) in samples.chunks_mut(width).enumerate() {
-                    let y = tile_row * TILE + row;
-                    weigher.row(y, samples);
-                    weigher.add_to_tiles(y, samples, tiles);
-                }
-            },
-        );
-        let pixels_used = tiles.iter().map(|t| u64::from(t.usable)).sum();
-        Self { width, height, samples, tiles, tile_columns, pixels_used }
+        (self.width, self.height, self.tile_columns) = (width, height, tile_columns);
+        self.samples.resize(width * height, Sample::NONE);
+        self.tiles.resize(tile_columns * tile_rows, Tile::EMPTY);
+        let strips = self.samples.par_chunks_mut(width * TILE).zip(self.tiles.par_chunks_mut(tile_columns));
+        strips.enumerate().with_min_len(4).for_each(|(tile_row, (samples, tiles))| {
+            for (row, samples) in samples.chunks_mut(width).enumerate() {
+                weigher.row(tile_row * TILE + row, samples);
+            }
+            dispatch!(weigher.fill_tiles(tile_row, samples, tiles));
+        });
+        self.pixels_used = self.tiles.iter().map(|t| u64::from(t.usable)).sum();
     }
 
     /// Bytes held while the view is integrated.
@@ -252,19 +255,79 @@ impl<'a> Weigher<'a> {
         let near = (1.0 / (z * z)).min(1.0);
         let weight = round_to_i32(confidence * cos * near * WEIGHT_ONE).max(1) as u32;
         let confidence = round_to_i32(confidence * CONFIDENCE_ONE).max(1) as u32;
-        Sample { depth: z, weight_and_confidence: if usable { weight | (confidence << 16) } else { 0 } }
+        let packed = weight | (confidence << 16);
+        // Every field of an unusable sample is a number, so that kernels may compute with it and weigh it 0.
+        Sample { depth: if usable { z } else { 0.0 }, weight_and_confidence: if usable { packed } else { 0 } }
     }
 
-    fn add_to_tiles(&self, y: usize, samples: &[Sample], tiles: &mut [Tile]) {
-        let depth = &self.depth[y * self.width..(y + 1) * self.width];
-        for ((samples, depth), tile) in samples.chunks(TILE).zip(depth.chunks(TILE)).zip(tiles) {
-            tile.pixels += samples.len() as u32;
-            for (sample, &z) in samples.iter().zip(depth) {
-                // `min` passes over NaN.
-                tile.nearest = tile.nearest.min(z);
-                tile.usable += u32::from(sample.weight() > 0);
-                tile.confidence += sample.confidence();
+    /// Summarises the strip of rows that starts at `tile_row` · [`TILE`].
+    #[inline(always)]
+    fn fill_tiles(&self, tile_row: usize, samples: &[Sample], tiles: &mut [Tile]) {
+        let w = self.width;
+        let depth = &self.depth[tile_row * TILE * w..][..samples.len()];
+        for (column, tile) in tiles.iter_mut().enumerate() {
+            let columns = column * TILE..(column * TILE + TILE).min(w);
+            let mut lanes = TileLanes::default();
+            for (samples, depth) in samples.chunks_exact(w).zip(depth.chunks_exact(w)) {
+                match (
+                    <&[Sample; TILE]>::try_from(&samples[columns.clone()]),
+                    depth[columns.clone()].try_into(),
+                ) {
+                    (Ok(samples), Ok(depth)) => lanes.add(samples, depth),
+                    _ => {
+                        // The last column of an image whose width is no multiple of the tile.
+                        let mut padded = ([Sample::NONE; TILE], [f32::NAN; TILE]);
+                        padded.0[..columns.len()].copy_from_slice(&samples[columns.clone()]);
+                        padded.1[..columns.len()].copy_from_slice(&depth[columns.clone()]);
+                        lanes.add(&padded.0, &padded.1);
+                    }
+                }
             }
+            *tile = lanes.tile((columns.len() * samples.len() / w) as u32);
+        }
+    }
+}
+
+/// A tile in the making, one lane a column.
+struct TileLanes {
+    nearest: [f32; TILE],
+    farthest: [f32; TILE],
+    usable: [u32; TILE],
+    confidence: [u32; TILE],
+}
+
+impl Default for TileLanes {
+    fn default() -> Self {
+        Self {
+            nearest: [f32::INFINITY; TILE],
+            farthest: [0.0; TILE],
+            usable: [0; TILE],
+            confidence: [0; TILE],
+        }
+    }
+}
+
+impl TileLanes {
+    #[inline(always)]
+    fn add(&mut self, samples: &[Sample; TILE], depth: &[f32; TILE]) {
+        for i in 0..TILE {
+            let usable = samples[i].weight_and_confidence != 0;
+            // Comparisons with NaN are false.
+            self.nearest[i] = if depth[i] < self.nearest[i] { depth[i] } else { self.nearest[i] };
+            let farther = usable & (depth[i] > self.farthest[i]);
+            self.farthest[i] = if farther { depth[i] } else { self.farthest[i] };
+            self.usable[i] += u32::from(usable);
+            self.confidence[i] += samples[i].confidence();
+        }
+    }
+
+    fn tile(&self, pixels: u32) -> Tile {
+        Tile {
+            nearest: self.nearest.iter().copied().fold(f32::INFINITY, f32::min),
+            farthest: self.farthest.iter().copied().fold(0.0, f32::max),
+            pixels,
+            usable: self.usable.iter().sum(),
+            confidence: self.confidence.iter().sum(),
         }
     }
 }

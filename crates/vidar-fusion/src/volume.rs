@@ -42,6 +42,8 @@ pub struct TsdfVolume {
     /// Weight of the views that saw a whole block empty.
     pub(crate) free: FxHashMap<BlockKey, u32>,
     colored_blocks: u64,
+    /// Memory of the last view's samples, for the next one.
+    scratch: SampledView,
     views: u32,
     dropped: u64,
     peak_bytes: u64,
@@ -58,6 +60,7 @@ impl TsdfVolume {
             blocks: Vec::new(),
             free: FxHashMap::default(),
             colored_blocks: 0,
+            scratch: SampledView::default(),
             views: 0,
             dropped: 0,
             peak_bytes: 0,
@@ -80,7 +83,8 @@ impl TsdfVolume {
         if self.views >= MAX_VIEWS {
             return Err(FusionError::TooManyViews { frame: view.frame_id(), limit: MAX_VIEWS });
         }
-        let sampled = SampledView::new(view, &self.config);
+        let mut sampled = std::mem::take(&mut self.scratch);
+        sampled.fill(view, &self.config);
         let wanted = touched_blocks(view, &sampled, &self.config);
         let votes = free_blocks(view, &sampled, &self.config);
         let (touched, dropped_blocks) = self.allocate(&wanted, view.color().is_some());
@@ -89,8 +93,10 @@ impl TsdfVolume {
         self.views += 1;
         self.dropped += dropped_blocks + dropped_votes;
         self.peak_bytes = self.peak_bytes.max(self.memory_bytes() + sampled.scratch_bytes());
+        let pixels_used = sampled.pixels_used;
+        self.scratch = sampled;
         Ok(IntegrationStats {
-            pixels_used: sampled.pixels_used,
+            pixels_used,
             blocks_touched: touched.len() as u64,
             blocks_total: self.blocks.len() as u64,
             dropped_by_budget: dropped_blocks + dropped_votes,

@@ -1,5 +1,7 @@
 //! Order, threads, memory and bad input.
 
+#![allow(clippy::unwrap_used)] // helpers of tests are tests, though not marked as such
+
 mod common;
 use common::*;
 use proptest::prelude::*;

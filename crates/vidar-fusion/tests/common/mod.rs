@@ -1,5 +1,6 @@
 //! Analytic scenes and checks of meshes, shared by the tests.
 #![allow(dead_code)] // each test program uses its part
+#![allow(clippy::unwrap_used)] // these are tests, though not marked as such
 
 use nalgebra::Vector3;
 use std::collections::HashMap;
