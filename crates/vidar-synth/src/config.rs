@@ -89,7 +89,8 @@ pub struct SynthConfig {
     pub scan_spacing_m: f64,
     /// Standard deviation of the reference cloud along the surface normal, m, 0…0.1.
     pub scan_noise_m: f64,
-    /// How many pieces of furniture to try to place, 0…1000; what does not fit beside the flight is left out.
+    /// Pieces of furniture to try to place per 64 m² of floor (at most four times as many in large places), 0…1000;
+    /// what does not fit beside the flight is left out.
     pub clutter: usize,
     /// Width of the Gaussian that smooths a given trajectory's jitter, s, 0…1. 0 passes through every pose.
     pub trajectory_smoothing_secs: f64,

@@ -2,7 +2,6 @@
 
 use crate::photometry::Photometry;
 use crate::render::{RayTable, SynthView, expose, render_views};
-use crate::rig;
 use crate::scan::ScanPoint;
 use crate::*;
 use nalgebra::{Vector2, Vector3};
@@ -40,7 +39,7 @@ fn room() -> &'static (FlightPath, World) {
 }
 
 fn camera_at(path: &FlightPath, secs: f64) -> Se3 {
-    path.world_from_body(secs) * rig::euroc_body_from_camera()
+    path.world_from_body(secs) * euroc_body_from_camera()
 }
 
 /// Every file below `root` with its bytes.
@@ -114,7 +113,7 @@ fn a_sequence_has_every_file_of_the_layout_and_agrees_with_the_world() {
 
     // Depth images against rays cast here.
     let (path, world) = room();
-    let camera = rig::euroc_camera(64, 40).unwrap();
+    let camera = euroc_camera(64, 40).unwrap();
     for k in 0..5 {
         let name = format!("{}.png", 1_600_000_000_000_000_000_i64 + k * 200_000_000);
         let (w, h, depth_bits, bytes) = read_png(&out.join("mav0/depth0/data").join(&name));
@@ -214,11 +213,11 @@ fn a_full_disk_is_an_error_and_not_a_short_file() {
         eprintln!("skipped: no /dev/full here");
         return;
     }
-    assert!(crate::png_file::write_gray8(full, 64, 64, &[7; 4096]).is_err());
-    assert!(crate::png_file::write_gray16(full, 64, 64, &[7; 4096]).is_err());
-    assert!(crate::layout::write_text(full, "text").is_err());
+    assert!(png_file::write_gray8(full, 64, 64, &[7; 4096]).is_err());
+    assert!(png_file::write_gray16(full, 64, 64, &[7; 4096]).is_err());
+    assert!(layout::write_text(full, "text").is_err());
     let point = ScanPoint { position: Vector3::zeros(), gray: 1 };
-    assert!(crate::layout::write_ply(full, &[point; 3]).is_err());
+    assert!(layout::write_ply(full, &[point; 3]).is_err());
 }
 
 #[test]
@@ -237,7 +236,7 @@ fn every_scene_keeps_clear_of_every_flight_and_fills_every_pixel() {
             for p in path.positions(0.01) {
                 assert!(world.clearance_m(&p) >= 0.4, "{scene:?} {flight:?}: {} m", world.clearance_m(&p));
             }
-            let camera = rig::euroc_camera(32, 20).unwrap();
+            let camera = euroc_camera(32, 20).unwrap();
             let view = SynthView { world_from_camera: camera_at(&path, 2.5), camera };
             let seen = render_views(&world, &[view], 1).unwrap().remove(0);
             assert_eq!(seen.depth.valid_ratio(), 1.0);
@@ -304,7 +303,7 @@ fn two_views_agree_on_what_they_see() {
 #[test]
 fn long_exposures_blur_and_short_ones_do_not() {
     let (_, world) = room();
-    let rays = RayTable::new(&rig::euroc_camera(64, 40).unwrap(), 5);
+    let rays = RayTable::new(&euroc_camera(64, 40).unwrap(), 5);
     let still = camera_at(&room().0, 0.5);
     let shaken: Vec<Se3> = (0..5)
         .map(|s| still.plus(&nalgebra::Vector6::new(0.0, 0.06 * f64::from(s - 2), 0.0, 0.0, 0.0, 0.0)))
@@ -381,12 +380,12 @@ fn a_still_imu_shows_the_noise_of_its_data_sheet() {
 
 #[test]
 fn the_camera_is_eurocs_at_full_size_and_keeps_its_middle_when_cut() {
-    let full = rig::euroc_camera(752, 480).unwrap();
+    let full = euroc_camera(752, 480).unwrap();
     assert!((full.intrinsics().fx - 458.654).abs() < 1e-9 && (full.intrinsics().cy - 248.375).abs() < 1e-9);
-    let half = rig::euroc_camera(376, 240).unwrap();
+    let half = euroc_camera(376, 240).unwrap();
     let ray = full.unproject(&Vector2::new(300.5, 100.5)).unwrap();
     let pixel = half.project(&ray).unwrap();
     assert!((pixel - Vector2::new(150.0, 50.0)).norm() < 1e-6, "{pixel}");
-    let square = rig::euroc_camera(480, 480).unwrap();
+    let square = euroc_camera(480, 480).unwrap();
     assert!((square.intrinsics().cx - (367.215 - 136.0)).abs() < 1e-9);
 }

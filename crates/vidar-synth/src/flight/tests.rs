@@ -209,3 +209,56 @@ fn trajectories_that_cannot_be_flown_are_refused_with_a_reason() {
     let other = Trajectory::new(BodyFrame::Other, good).unwrap();
     assert!(matches!(FlightPath::from_trajectory(&other, &config), Err(SynthError::Frame(_))));
 }
+
+#[test]
+fn along_a_real_flight_the_simulated_imu_reads_what_the_real_one_read() {
+    let shared = std::env::var("VIDAR_SHARED")
+        .unwrap_or_else(|_| concat!(env!("CARGO_MANIFEST_DIR"), "/../../../shared").to_string());
+    let mav = std::path::Path::new(&shared).join("data/euroc_MH_01_real_11s/mav0");
+    let read = |name: &str| -> Option<Vec<(i64, Vec<f64>)>> {
+        let text = std::fs::read_to_string(mav.join(name)).ok()?;
+        let row = |line: &str| {
+            let (time, rest) = line.split_once(',').unwrap();
+            (time.parse().unwrap(), rest.split(',').map(|v| v.trim().parse().unwrap()).collect())
+        };
+        Some(text.lines().filter(|l| !l.starts_with('#') && !l.is_empty()).map(row).collect())
+    };
+    let (Some(truth), Some(imu)) = (read("state_groundtruth_estimate0/data.csv"), read("imu0/data.csv"))
+    else {
+        eprintln!("skipped: {} is not there", mav.display());
+        return;
+    };
+    let pose = |(time, v): &(i64, Vec<f64>)| {
+        let rotation = vidar_core::So3::from_quaternion(v[4], v[5], v[6], v[3]).unwrap();
+        let position = Vector3::new(v[0], v[1], v[2]);
+        StampedPose { time: Timestamp::from_nanos(*time), world_from_body: Se3::new(rotation, position) }
+    };
+    let trajectory = Trajectory::new(BodyFrame::Imu, truth.iter().map(pose).collect()).unwrap();
+    let config =
+        SynthConfig { duration_secs: 60.0, trajectory_smoothing_secs: 0.02, ..SynthConfig::default() };
+    let path = FlightPath::from_trajectory(&trajectory, &config).unwrap();
+    let begin = truth[0].0 + (MARGIN_SECS * 1e9) as i64;
+    let bias = |k: usize| Vector3::new(truth[0].1[k], truth[0].1[k + 1], truth[0].1[k + 2]);
+    let (mut gyro, mut accel, mut n) = (0.0, 0.0, 0);
+    for (time, v) in &imu {
+        let secs = (*time - begin) as f64 * 1e-9;
+        if secs < 0.0 || secs > path.duration_secs() {
+            continue;
+        }
+        let rate = Vector3::new(v[0], v[1], v[2]) - bias(10);
+        let force = Vector3::new(v[3], v[4], v[5]) - bias(13);
+        gyro += (path.state(secs).angular_rate - rate).norm_squared();
+        accel += (path.specific_force(secs) - force).norm_squared();
+        n += 1;
+    }
+    assert!(n > 1500, "{n} readings");
+    let (gyro, accel) = ((gyro / f64::from(n)).sqrt(), (accel / f64::from(n)).sqrt());
+    // What remains is vibration and the smoothing; a wrong frame or gravity sign would give 0.3 rad/s and 20 m/s².
+    assert!(gyro < 0.06 && accel < 0.6, "rms differences {gyro} rad/s, {accel} m/s²");
+    let fitted = trajectory.poses().iter().skip(200).step_by(10).filter(|p| p.time.nanos() > begin);
+    for p in fitted.take_while(|p| ((p.time.nanos() - begin) as f64 * 1e-9) < path.duration_secs()) {
+        let here = path.world_from_body((p.time.nanos() - begin) as f64 * 1e-9);
+        let off = (here.translation - p.world_from_body.translation).norm();
+        assert!(off < 0.01, "{off} m off the flown path at {} s", p.time);
+    }
+}

@@ -34,7 +34,7 @@ pub(super) fn furnish(config: &SynthConfig, room: &Extent, positions: &[Vector3<
     let shell = shell_surfaces(config.scene, room, &mut rng);
     let mut space = Space { room: *room, positions, taken: Vec::new() };
     let mut pieces = Vec::new();
-    for _ in 0..config.clutter {
+    for _ in 0..group_count(config, room) {
         let kind = Group::random(config.scene, &mut rng);
         for _ in 0..ATTEMPTS {
             let group = kind.build(room, &mut rng);
@@ -45,6 +45,12 @@ pub(super) fn furnish(config: &SynthConfig, room: &Extent, positions: &[Vector3<
         }
     }
     Furnished { shell, pieces }
+}
+
+/// `clutter` groups per 64 m² of floor, up to four times as many in large places.
+fn group_count(config: &SynthConfig, room: &Extent) -> usize {
+    let size = room.max - room.min;
+    (config.clutter as f64 * (size.x * size.y / 64.0).clamp(1.0, 4.0)).round() as usize
 }
 
 /// What is free.

@@ -97,6 +97,13 @@ impl LightMap {
     }
 }
 
+/// Mean light over some faces, each weighed by its number of grid points.
+pub(super) fn mean(maps: &[LightMap]) -> f32 {
+    let sum: f32 = maps.iter().map(|m| m.values.iter().sum::<f32>()).sum();
+    let count: usize = maps.iter().map(|m| m.values.len()).sum();
+    (sum / count.max(1) as f32).max(1e-6)
+}
+
 /// What light meets.
 pub(super) struct Scene<'a> {
     pub shapes: &'a [Shape],

@@ -135,8 +135,10 @@ fn speckle(u: f32, v: f32, pitch: f32, texel: f32, seed: u32) -> f32 {
         return 0.0;
     }
     let radius = pitch * (0.08 + 0.3 * cell(cx, cy, seed ^ 0x77));
-    let x = (cx as f32 + 0.4 + 0.2 * cell(cx, cy, seed ^ 0x11)) * pitch;
-    let y = (cy as f32 + 0.4 + 0.2 * cell(cx, cy, seed ^ 0x22)) * pitch;
+    // Anywhere in the cell where the whole spot fits.
+    let free = pitch - 2.0 * radius;
+    let x = cx as f32 * pitch + radius + free * cell(cx, cy, seed ^ 0x11);
+    let y = cy as f32 * pitch + radius + free * cell(cx, cy, seed ^ 0x22);
     // A spot smaller than a texel keeps its share of the texel.
     let share = (radius / texel).min(1.0);
     share * share * amount * (1.0 - step(radius, length(u - x, v - y), texel))
@@ -181,7 +183,7 @@ fn planks(u: f32, v: f32, texel: f32, seed: u32, tone: f32) -> f32 {
     let gap = 1.0 - band(0.004, width - 0.001, y, texel) * band(0.004, length - 0.001, x, texel);
     let cloud = octaves(u, v, 1.3, texel, 0.6, seed ^ 77);
     let body =
-        tone + 0.30 * ((own & 0xFFFF) as f32 / 65_535.0 - 0.5) + 0.13 * grain - 0.2 * knots + 0.08 * cloud;
+        tone + 0.30 * ((own & 0xFFFF) as f32 / 65_535.0 - 0.5) + 0.13 * grain - 0.12 * knots + 0.08 * cloud;
     mix(body, 0.08, 0.85 * gap * (0.005 / texel).min(1.0))
 }
 

@@ -49,6 +49,9 @@ pub struct World {
 /// Texels of all faces together at most: bounds memory (about 3 bytes each) and the time to bake.
 const TEXEL_BUDGET: f64 = 18e6;
 
+/// Albedo 0.5 under the mean light on the room's faces gives a radiance of 1 − exp(−0.5 · 1.15) = 0.44.
+const EXPOSURE: f32 = 1.15;
+
 /// Distance at which a texel is about as wide as a pixel, m.
 const SHARP_DISTANCE_M: f64 = 1.3;
 
@@ -85,11 +88,14 @@ impl World {
         let scene = light::Scene { shapes: &shapes, bvh: &bvh, lamps: &lamps };
         let light: Vec<LightMap> =
             faces.par_iter().map(|&(i, f)| LightMap::new(&scene, i, f, texel_m)).collect();
+        let exposure = EXPOSURE / light::mean(&light[..shapes[0].face_count()]);
         let textures = faces
             .par_iter()
             .zip(&light)
             .zip(surfaces)
-            .map(|((&(i, f), light), surface)| paint(surface, light, shapes[i].face_size(f), texel_m))
+            .map(|((&(i, f), light), surface)| {
+                paint(surface, light, exposure, shapes[i].face_size(f), texel_m)
+            })
             .collect();
         Self { shapes, bvh, first_face, textures }
     }
@@ -156,12 +162,12 @@ fn nearest_hit(
 }
 
 /// Bakes albedo and light of one face into a texture, through a soft shoulder so that highlights keep their structure.
-fn paint(surface: &Surface, light: &LightMap, size: [f64; 2], texel_m: f64) -> Texture {
+fn paint(surface: &Surface, light: &LightMap, exposure: f32, size: [f64; 2], texel_m: f64) -> Texture {
     let size32 = size.map(|s| s as f32);
     Texture::bake(size, texel_m, |v, us, out| {
         for (&u, texel) in us.iter().zip(out) {
             let albedo = surface.albedo(u as f32, v as f32, size32, texel_m as f32);
-            let radiance = 1.0 - (-3.2 * albedo * light.at(u, v)).exp();
+            let radiance = 1.0 - (-exposure * albedo * light.at(u, v)).exp();
             *texel = (radiance.clamp(0.0, 1.0) * 65_535.0) as u16;
         }
     })
