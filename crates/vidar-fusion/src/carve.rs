@@ -21,10 +21,20 @@ const TILES_ACROSS: usize = 4;
 /// A block seen empty, with its vote in units of [`WEIGHT_ONE`].
 pub(crate) type Vote = (BlockKey, u32);
 
-/// The blocks that `view` sees empty, sorted. A function of view and configuration alone.
-pub(crate) fn free_blocks(view: &AlignedView, sampled: &SampledView, config: &FusionConfig) -> Vec<Vote> {
+/// What a view sees empty. A function of view and configuration alone.
+#[derive(Default)]
+pub(crate) struct FreeSpace {
+    /// The blocks, sorted.
+    pub votes: Vec<Vote>,
+    /// Whether the range had to be shortened to keep the work bounded.
+    pub shortened: bool,
+}
+
+/// Finds the blocks that `view` sees empty.
+pub(crate) fn free_space(view: &AlignedView, sampled: &SampledView, config: &FusionConfig) -> FreeSpace {
     let block_m = config.voxel_size_m * EDGE as f64;
-    let Some((low, high, range)) = frustum_blocks(view, sampled, config, block_m) else { return Vec::new() };
+    let Some(frustum) = frustum_blocks(view, sampled, config, block_m) else { return FreeSpace::default() };
+    let Frustum { low, high, range, shortened } = frustum;
     let pyramid = Pyramid::new(sampled);
     let k = view.intrinsics();
     let judge = Judge {
@@ -56,16 +66,23 @@ pub(crate) fn free_blocks(view: &AlignedView, sampled: &SampledView, config: &Fu
         .collect();
     let mut votes: Vec<Vote> = layers.into_iter().flatten().collect();
     votes.par_sort_unstable();
-    votes
+    FreeSpace { votes, shortened }
 }
 
-/// Smallest and largest key of the box around the view's frustum, and the range it reaches.
+/// The box of blocks around a view's frustum, and the z that it reaches.
+struct Frustum {
+    low: BlockKey,
+    high: BlockKey,
+    range: f64,
+    shortened: bool,
+}
+
 fn frustum_blocks(
     view: &AlignedView,
     sampled: &SampledView,
     config: &FusionConfig,
     block_m: f64,
-) -> Option<(BlockKey, BlockKey, f64)> {
+) -> Option<Frustum> {
     if config.carve_range_m == 0.0 {
         return None;
     }
@@ -90,13 +107,14 @@ fn frustum_blocks(
     };
     let (low, high) = extent(range);
     let examined = (high - low).map(|e| e / block_m + 1.0).product();
-    if examined > MAX_EXAMINED {
+    let shortened = examined > MAX_EXAMINED;
+    if shortened {
         range *= (MAX_EXAMINED / examined).cbrt();
     }
     let (low, high) = extent(range);
     let origin = world_from_camera.translation;
     let key = |p: Vector3<f64>| [p.x, p.y, p.z].map(|c| (c / block_m).floor() as i32);
-    Some((key(origin + low), key(origin + high), range))
+    Some(Frustum { low: key(origin + low), high: key(origin + high), range, shortened })
 }
 
 struct Judge<'a> {

@@ -2,7 +2,7 @@
 
 use crate::allocate::touched_blocks;
 use crate::block::{Block, BlockUpdate};
-use crate::carve::{Vote, free_blocks};
+use crate::carve::{Vote, free_space};
 use crate::grid::{BlockKey, CameraFromWorld, EDGE, MAX_VIEWS, check_view, table_bytes};
 use crate::sample::SampledView;
 use crate::{FusionConfig, FusionError};
@@ -46,6 +46,7 @@ pub struct TsdfVolume {
     scratch: SampledView,
     views: u32,
     dropped: u64,
+    shortened_views: u32,
     peak_bytes: u64,
 }
 
@@ -63,6 +64,7 @@ impl TsdfVolume {
             scratch: SampledView::default(),
             views: 0,
             dropped: 0,
+            shortened_views: 0,
             peak_bytes: 0,
         })
     }
@@ -86,11 +88,12 @@ impl TsdfVolume {
         let mut sampled = std::mem::take(&mut self.scratch);
         sampled.fill(view, &self.config);
         let wanted = touched_blocks(view, &sampled, &self.config);
-        let votes = free_blocks(view, &sampled, &self.config);
+        let free = free_space(view, &sampled, &self.config);
         let (touched, dropped_blocks) = self.allocate(&wanted, view.color().is_some());
         self.update(view, &sampled, &touched);
-        let dropped_votes = self.vote(&votes);
+        let dropped_votes = self.vote(&free.votes);
         self.views += 1;
+        self.shortened_views += u32::from(free.shortened);
         self.dropped += dropped_blocks + dropped_votes;
         self.peak_bytes = self.peak_bytes.max(self.memory_bytes() + sampled.scratch_bytes());
         let pixels_used = sampled.pixels_used;
@@ -100,7 +103,7 @@ impl TsdfVolume {
             blocks_touched: touched.len() as u64,
             blocks_total: self.blocks.len() as u64,
             dropped_by_budget: dropped_blocks + dropped_votes,
-            blocks_carved: votes.len() as u64 - dropped_votes,
+            blocks_carved: free.votes.len() as u64 - dropped_votes,
         })
     }
 
@@ -181,19 +184,34 @@ impl TsdfVolume {
         dropped
     }
 
-    /// Degradations so far: `fusion-memory-budget` when new space was refused.
+    /// Degradations so far: `fusion-memory-budget` when new space was refused, `fusion-carve-range` when the
+    /// carving range was shortened because it holds too many blocks.
     pub fn warnings(&self) -> Vec<Warning> {
-        if self.dropped == 0 {
-            return Vec::new();
+        let mut warnings = Vec::new();
+        if self.dropped > 0 {
+            let message = format!(
+                "the volume reached its budget of {} MiB: {} times a block was needed and refused, so parts are \
+                 missing, and which ones depends on the order of the views",
+                self.config.memory_budget_bytes >> 20,
+                self.dropped
+            );
+            let hint =
+                "raise fusion.memory_budget_bytes, or fusion.voxel_size_m (memory falls with its square)";
+            let warning = Warning::new("fusion-memory-budget", message).at("fusion.memory_budget_bytes");
+            warnings.push(warning.hint(hint));
         }
-        let budget_mib = self.config.memory_budget_bytes >> 20;
-        let message = format!(
-            "the volume reached its budget of {budget_mib} MiB: {} times a block was needed and refused, so parts \
-             are missing, and which ones depends on the order of the views",
-            self.dropped
-        );
-        let hint = "raise fusion.memory_budget_bytes, or fusion.voxel_size_m (memory falls with its square)";
-        vec![Warning::new("fusion-memory-budget", message).at("fusion.memory_budget_bytes").hint(hint)]
+        if self.shortened_views > 0 {
+            let message = format!(
+                "{} of {} views hold too many blocks of {} m within {} m; they carved a shorter range",
+                self.shortened_views,
+                self.views,
+                self.config.voxel_size_m * EDGE as f64,
+                self.config.carve_range_m
+            );
+            let hint = "lower fusion.carve_range_m or raise fusion.voxel_size_m";
+            warnings.push(Warning::new("fusion-carve-range", message).at("fusion.carve_range_m").hint(hint));
+        }
+        warnings
     }
 
     /// Bytes held now by blocks and tables; never above the budget.

@@ -186,6 +186,8 @@ fn voxels_far_finer_than_the_pixels_are_refused_with_the_size_that_works() {
     let mut volume = TsdfVolume::new(&config).unwrap();
     let stats = volume.integrate(&seen).unwrap();
     assert!(stats.blocks_touched > 0 && volume.memory_bytes() <= 64 << 20);
+    let kinds: Vec<String> = volume.warnings().into_iter().map(|w| w.kind).collect();
+    assert!(kinds.contains(&"fusion-carve-range".to_string()), "{kinds:?}");
 }
 
 #[test]
