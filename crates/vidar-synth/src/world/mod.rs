@@ -49,8 +49,8 @@ pub struct World {
 /// Texels of all faces together at most: bounds memory (about 3 bytes each) and the time to bake.
 const TEXEL_BUDGET: f64 = 18e6;
 
-/// Albedo 0.5 under the mean light on the room's faces gives a radiance of 1 − exp(−0.5 · 1.15) = 0.44.
-const EXPOSURE: f32 = 1.15;
+/// Albedo 0.5 under the mean light on the room's faces gives a radiance of 1 − exp(−0.5 · 1.4) = 0.50.
+const EXPOSURE: f32 = 1.4;
 
 /// Distance at which a texel is about as wide as a pixel, m.
 const SHARP_DISTANCE_M: f64 = 1.3;
