@@ -8,9 +8,9 @@ use rayon::prelude::*;
 use vidar_core::AlignedView;
 
 /// Neighbouring rays that start a search lie at most this share of a block apart at the median depth…
-const RAY_SPACING: f64 = 1.0 / 8.0;
-/// …and at most this many pixels, so that thin objects are met.
-const MAX_STRIDE_PX: usize = 4;
+const RAY_SPACING: f64 = 1.0 / 5.0;
+/// …and at most this many pixels; rows are staggered, so that thin upright objects are met by the next row.
+const MAX_STRIDE_PX: usize = 6;
 
 /// The blocks that `view` touches, sorted, each once. At most a few per pixel, however small the voxels.
 pub(crate) fn touched_blocks(
@@ -63,7 +63,8 @@ fn touch_row(
     let steps = (4.0 * truncation * per_block as f32).ceil().max(1.0) as usize;
     let per_step = 2.0 * truncation / steps as f32;
     let mut last = [i32::MAX; 3];
-    for x in (0..sampled.width).step_by(stride) {
+    let stagger = (y / stride * 2 + y / stride / 3) % stride;
+    for x in (stagger..sampled.width).step_by(stride) {
         let sample = sampled.samples[y * sampled.width + x];
         if sample.weight() == 0 {
             continue;

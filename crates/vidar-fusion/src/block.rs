@@ -148,6 +148,10 @@ impl BlockUpdate<'_> {
             weight[i] = w as u32;
             near[i] = u32::from((distance <= self.truncation_m) & (w > 0));
         }
+        // Rows behind the surface are many and change nothing.
+        if weight == [0; EDGE] {
+            return;
+        }
         for i in 0..EDGE {
             block.weighted_distance[first + i] += i64::from(product[i]);
             block.weight[first + i] += weight[i];
