@@ -22,11 +22,11 @@ fn views(count: usize) -> Vec<AlignedView> {
                 (0..3).map(|a| half[a] / ray[a].abs()).fold(f64::INFINITY, f64::min) as f32
             });
             let color = Image::from_fn(640, 480, |x, y| [x as u8, y as u8, 128]);
-            let pose_of_view = Se3::new(turn, nalgebra::Vector3::zeros());
+            let world_from_camera = Se3::new(turn, nalgebra::Vector3::zeros());
             AlignedView::new(
                 FrameId(i as u32),
                 Timestamp::from_nanos(i as i64),
-                pose_of_view,
+                world_from_camera,
                 k,
                 MetricDepth::new(depth),
                 Confidence::full(640, 480),

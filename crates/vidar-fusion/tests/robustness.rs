@@ -1,6 +1,6 @@
 //! Order, threads, memory and bad input.
 
-#![allow(clippy::unwrap_used)] // helpers of tests are tests, though not marked as such
+#![allow(clippy::unwrap_used)] // what tests share is test code, though not marked as such
 
 mod common;
 use common::*;
