@@ -3,6 +3,8 @@
 //! `cargo run --release -p vidar-stereo --example stereo_on_frames -- <hololens|7scenes> FOLDER OUT [key=value…]`
 //! writes depth pictures to OUT, and `features.csv` with a sample of confidences against the sensor.
 
+#![allow(clippy::print_stdout, reason = "its output is what the example is for")]
+
 use nalgebra::{Matrix4, Vector3};
 use std::error::Error;
 use std::path::{Path, PathBuf};
@@ -46,7 +48,8 @@ fn rgb(path: &Path) -> Result<FrameImage, Box<dyn Error>> {
 }
 
 fn sorted(folder: &Path, end: &str) -> Result<Vec<PathBuf>, Box<dyn Error>> {
-    let mut files: Vec<PathBuf> = std::fs::read_dir(folder)?.filter_map(|e| e.ok().map(|e| e.path())).collect();
+    let mut files: Vec<PathBuf> =
+        std::fs::read_dir(folder)?.filter_map(|e| e.ok().map(|e| e.path())).collect();
     files.retain(|p| p.to_string_lossy().ends_with(end));
     files.sort();
     Ok(files)
@@ -83,7 +86,12 @@ fn load(kind: &str, folder: &Path) -> Result<Vec<(ChunkView, Truth)>, Box<dyn Er
             let depth_from_color = Se3::from_translation(Vector3::new(0.023, -0.012, 0.0));
             let depth_m = depth(Path::new(&format!("{name}.depth.png")))?;
             let intrinsics = Pinhole::new(585.0, 585.0, 320.0, 240.0, 640, 480)?;
-            push(image, k, world_from_depth * depth_from_color, Truth { depth_m, intrinsics, depth_from_color });
+            push(
+                image,
+                k,
+                world_from_depth * depth_from_color,
+                Truth { depth_m, intrinsics, depth_from_color },
+            );
         }
     }
     Ok(out)
@@ -96,7 +104,9 @@ fn main() -> Result<(), Box<dyn Error>> {
     };
     let stride: usize = if kind == "hololens" { 1 } else { 2 };
     let config: StereoConfig = toml::from_str(&settings.join("\n"))?;
-    let frames: Vec<_> = load(kind, Path::new(folder))?.into_iter().step_by(stride).collect();
+    // Fewer frames for a quick look.
+    let most: usize = std::env::var("STEREO_FRAMES").ok().and_then(|n| n.parse().ok()).unwrap_or(usize::MAX);
+    let frames: Vec<_> = load(kind, Path::new(folder))?.into_iter().step_by(stride).take(most).collect();
     std::fs::create_dir_all(out)?;
     let views = ChunkViews { id: ChunkId(0), views: frames.iter().map(|f| f.0.clone()).collect() };
     let references: Vec<usize> = (0..frames.len()).collect();
@@ -108,7 +118,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     let (mut truth_count, mut errors, mut bins) = (0usize, Vec::new(), [(0usize, 0usize, 0.0f64); 10]);
     let mut absolute = Vec::new();
     for (i, view) in output.prediction.views.iter().enumerate() {
-        let truth = &frames[view.frame_id.index()].1;
+        let Some((given, truth)) = frames.iter().find(|f| f.0.frame_id == view.frame_id) else { continue };
         let (k, kd) = (&view.intrinsics, &truth.intrinsics);
         let mut picture = image::GrayImage::new((3 * k.width) as u32, k.height as u32);
         // The sensor's depth, carried into the colour camera's pixels; the nearest wins.
@@ -131,7 +141,7 @@ fn main() -> Result<(), Box<dyn Error>> {
                 }
             }
         }
-        let gray = frames[view.frame_id.index()].0.image.to_gray8();
+        let gray = given.image.to_gray8();
         for y in 0..k.height {
             for x in 0..k.width {
                 let (z, t) = (view.depth.image()[(x, y)], sensor[(x, y)]);
@@ -164,7 +174,8 @@ fn main() -> Result<(), Box<dyn Error>> {
         }
     }
     std::fs::write(Path::new(out).join("features.csv"), csv)?;
-    let share = |v: &[f32], limit: f32| v.iter().filter(|e| **e < limit).count() as f64 / v.len().max(1) as f64;
+    let share =
+        |v: &[f32], limit: f32| v.iter().filter(|e| **e < limit).count() as f64 / v.len().max(1) as f64;
     let absrel = errors.iter().map(|e| f64::from(*e)).sum::<f64>() / errors.len().max(1) as f64;
     errors.sort_unstable_by(f32::total_cmp);
     println!(

@@ -49,10 +49,10 @@ impl Default for StereoConfig {
             max_planes: 128,
             step_penalty: 12,
             jump_penalty: 80,
-            refine_rounds: 3,
+            refine_rounds: 1,
             noise_gray: 2.0,
             agreement_ratio: 0.02,
-            min_confidence: 0.3,
+            min_confidence: 0.5,
         }
     }
 }

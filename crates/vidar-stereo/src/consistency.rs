@@ -65,7 +65,9 @@ pub(crate) fn support(
     own.rho
         .par_iter()
         .enumerate()
-        .map(|(i, &rho)| at_pixel((i % width) as f32, (i / width) as f32, rho, &others, config.agreement_ratio))
+        .map(|(i, &rho)| {
+            at_pixel((i % width) as f32, (i / width) as f32, rho, &others, config.agreement_ratio)
+        })
         .collect()
 }
 
@@ -98,7 +100,8 @@ fn at_pixel(x: f32, y: f32, rho: f32, others: &[Other<'_>], agreement: f32) -> S
         let own_again = theirs / back_ratio;
         let difference = (own_again - rho) / rho;
         let (ex, ey) = (bx - x - (ui - u), by - y - (vi - v));
-        if difference.abs() <= agreement && ex * ex + ey * ey <= REPROJECTION_LIMIT_PX * REPROJECTION_LIMIT_PX {
+        if difference.abs() <= agreement && ex * ex + ey * ey <= REPROJECTION_LIMIT_PX * REPROJECTION_LIMIT_PX
+        {
             found.agreeing += 1;
             sum += own_again;
             squares += difference * difference;

@@ -78,7 +78,9 @@ pub enum StereoError {
         expected_height: usize,
     },
     /// The image is too small to match anything in.
-    #[error("frame {frame}: image of {width}x{height} at the working size, at least {needed}x{needed} is needed")]
+    #[error(
+        "frame {frame}: image of {width}x{height} at the working size, at least {needed}x{needed} is needed"
+    )]
     TooSmall {
         /// Which frame.
         frame: FrameId,

@@ -116,7 +116,8 @@ struct SceneDepth {
 fn probe(views: &[Prepared], reference: usize, config: &StereoConfig) -> Result<SceneDepth, f64> {
     // Depth is unknown here: average the worth of a neighbour over the searched range, evenly in log depth.
     let ratio = config.max_depth_m / config.min_depth_m;
-    let depths_m: Vec<f64> = (0..5).map(|i| config.min_depth_m * ratio.powf((i as f64 + 0.5) / 5.0)).collect();
+    let depths_m: Vec<f64> =
+        (0..5).map(|i| config.min_depth_m * ratio.powf((i as f64 + 0.5) / 5.0)).collect();
     let selection = select(views, reference, &depths_m, config);
     if selection.neighbours.is_empty() {
         return Err(selection.best_parallax_deg);
@@ -154,8 +155,7 @@ impl Winners {
     /// Picks the least sum, fits a parabola through its neighbours, and finds the least sum more than two planes off.
     pub fn pick(level: &Level, costs: &[u8], sums: &[i16], planes: &Planes) -> Self {
         let n = level.width * level.height;
-        let mut winners =
-            Self { rho: vec![f32::NAN; n], cost: vec![1.0; n], margin: vec![0.0; n] };
+        let mut winners = Self { rho: vec![f32::NAN; n], cost: vec![1.0; n], margin: vec![0.0; n] };
         for pixel in 0..n {
             let sums = &sums[pixel * planes.count..][..planes.count];
             let costs = &costs[pixel * planes.count..][..planes.count];

@@ -1,10 +1,31 @@
 //! Multi-view stereo from known poses: a geometry model that needs no weights.
+//!
+//! ```text
+//! views ─▶ grey, working size ─▶ probe the scene's depth ─▶ choose neighbours ─▶ plane sweep ─▶ semi-global
+//!          matching ─▶ winner, sub-plane ─▶ slanted refinement ─▶ checks between views ─▶ confidence ─▶ depth
+//! ```
+//!
+//! - **Neighbours** (`select`): by overlap and parallax at the depth that a quick look at a quarter of the size finds;
+//!   each further neighbour should stand elsewhere than those before it.
+//! - **Plane sweep** (`sweep`; Collins 1996, Gallup 2007): zero-mean normalised correlation in small windows at half
+//!   the working size, planes even in inverse depth, the better half of the neighbours averaged. Gain and offset of
+//!   the exposure drop out.
+//! - **Semi-global matching** (`sgm`; Hirschmüller 2008): eight paths in integers.
+//! - **Refinement** (`refine`; after Bleyer 2011): planes in space at the working size, judged by weighted windows.
+//! - **Checks between views** (`consistency`; Schönberger 2016): there and back through the neighbours' own depths;
+//!   agreeing views are averaged.
+//! - **Confidence** (`confidence`): the probability of an error below [`TOLERANCE_RATIO`].
+//!
+//! Poses are taken as given: the prediction is in the frame of the prior poses and in metres. Results are the same
+//! bits for any number of threads. Memory for one reference of `w × h` working pixels and `d` planes is about
+//! `w/2 · h/2 · d · 5` bytes for costs and sums and 20 bytes a pixel for each view's finished estimate.
 
 mod confidence;
 mod config;
 mod consistency;
 mod error;
 mod estimate;
+mod filter;
 mod model;
 mod prepare;
 mod refine;

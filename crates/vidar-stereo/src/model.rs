@@ -5,6 +5,7 @@ use crate::config::StereoConfig;
 use crate::consistency::{Support, support};
 use crate::error::StereoError;
 use crate::estimate::{Estimate, Outcome, estimate};
+use crate::filter::remove_speckles;
 use crate::prepare::{Prepared, prepare};
 use vidar_core::model::ChunkFrame;
 use vidar_core::{
@@ -84,8 +85,7 @@ impl StereoModel {
         let mut references = references.to_vec();
         references.sort_unstable();
         references.dedup();
-        let prepared =
-            views.views.iter().map(|v| prepare(v, &self.config)).collect::<Result<Vec<_>, _>>()?;
+        let prepared = views.views.iter().map(|v| prepare(v, &self.config)).collect::<Result<Vec<_>, _>>()?;
         let mut estimates: Vec<Option<Outcome>> = (0..found).map(|_| None).collect();
         let need = |i: usize, estimates: &mut Vec<Option<Outcome>>| -> Result<(), StereoError> {
             if estimates[i].is_none() {
@@ -144,14 +144,19 @@ impl StereoModel {
         supports: &[Support],
     ) -> Result<ViewGeometry, StereoError> {
         let level = &view.levels[0];
-        let mut depth = Vec::with_capacity(supports.len());
-        let mut confident = Vec::with_capacity(supports.len());
+        let mut rho = vec![f32::NAN; supports.len()];
+        let mut confident = vec![0.0f32; supports.len()];
         for (i, support) in supports.iter().enumerate() {
             let p = confidence(&features(own, i, support, self.config.noise_gray));
-            let keep = support.rho > 0.0 && p >= self.config.min_confidence && support.agreeing > 0;
-            depth.push(if keep { 1.0 / support.rho } else { f32::NAN });
-            confident.push(if keep { p } else { 0.0 });
+            if support.rho > 0.0 && p >= self.config.min_confidence && support.agreeing > 0 {
+                (rho[i], confident[i]) = (support.rho, p);
+            }
         }
+        remove_speckles(&mut rho, level.width);
+        for (c, _) in confident.iter_mut().zip(&rho).filter(|(_, rho)| rho.is_nan()) {
+            *c = 0.0;
+        }
+        let depth: Vec<f32> = rho.iter().map(|rho| 1.0 / rho).collect();
         let image = |data| {
             Image::from_vec(level.width, level.height, data)
                 .map_err(|e| StereoError::Internal { what: e.to_string() })

@@ -32,6 +32,8 @@ const BILATERAL_GRAY: f32 = 25.0;
 /// Window of the refinement: every other pixel of 7 × 7.
 const REACH: i32 = 3;
 const SAMPLES: usize = 25;
+/// Neighbours that the refinement looks at: the best few say most, and each costs the same time.
+const MOST_SOURCES: usize = 3;
 /// From where planes are tried, in turns: near ones, then further ones.
 const FROM: [[(i32, i32); 4]; 2] = [[(-1, 0), (1, 0), (0, -1), (0, 1)], [(-4, 1), (4, -1), (1, 4), (-1, -4)]];
 
@@ -67,12 +69,6 @@ pub(crate) fn refine(
                     best = patches.scored(best, center, step, &patch);
                 }
                 if search {
-                    let mut attempt = |candidate: Plane| {
-                        let candidate = patches.scored(candidate, center, step, &patch);
-                        if candidate.score < best.score {
-                            best = candidate;
-                        }
-                    };
                     for (dx, dy) in FROM[round % 2] {
                         let (qx, qy) = (x as i32 + dx, y as i32 + dy);
                         if qx < 0 || qy < 0 || qx >= w as i32 || qy >= h as i32 {
@@ -81,14 +77,14 @@ pub(crate) fn refine(
                         let q = before[qy as usize * w + qx as usize];
                         let rho = q.rho - q.gx * dx as f32 - q.gy * dy as f32;
                         // Hardly another plane: not worth the time.
-                        if rho > 0.0 && (rho - own.rho).abs() > 0.1 * delta {
-                            attempt(Plane { rho, ..q });
+                        if rho > 0.0 && (rho - own.rho).abs() > 0.5 * delta {
+                            let candidate = patches.scored(Plane { rho, ..q }, center, step, &patch);
+                            if candidate.score < best.score {
+                                best = candidate;
+                            }
                         }
                     }
-                    for sign in [-1.0, 1.0] {
-                        let from = *own;
-                        attempt(Plane { rho: from.rho + sign * delta, ..from });
-                    }
+                    best = patches.settled(best, delta, center, step, &patch);
                 }
                 *own = best;
             }
@@ -216,10 +212,28 @@ impl Patches<'_> {
         Plane { score: cost + PRIOR_WEIGHT * pull, cost, ..plane }
     }
 
+    /// The best of a plane and the two `delta` nearer and further, with the vertex of the parabola through them.
+    fn settled(&self, plane: Plane, delta: f32, center: f32, step: f32, patch: &Patch) -> Plane {
+        let at = |by: f32| self.scored(Plane { rho: plane.rho + by, ..plane }, center, step, patch);
+        let (further, nearer) = (at(-delta), at(delta));
+        if further.score < plane.score && further.score <= nearer.score && further.rho > 0.0 {
+            return further;
+        }
+        if nearer.score < plane.score {
+            return nearer;
+        }
+        let curvature = further.score - 2.0 * plane.score + nearer.score;
+        if !(curvature > 1e-4) {
+            return plane;
+        }
+        let offset = (0.5 * (further.score - nearer.score) / curvature).clamp(-0.5, 0.5);
+        Plane { rho: plane.rho + offset * delta, ..plane }
+    }
+
     /// Mean of `1 − ncc` over the better half of the neighbours; 1 where none sees the window.
     fn cost(&self, plane: &Plane, patch: &Patch) -> f32 {
-        let mut costs = [f32::INFINITY; 8];
-        let n = self.sources.len().min(8);
+        let mut costs = [f32::INFINITY; MOST_SOURCES];
+        let n = self.sources.len().min(MOST_SOURCES);
         for (cost, source) in costs.iter_mut().zip(self.sources) {
             *cost = self.mismatch(plane, patch, source);
         }

@@ -29,7 +29,12 @@ pub(crate) struct Selection {
 }
 
 /// Chooses up to `config.neighbours` views for `reference`, for a scene at `depths_m` (averaged over them).
-pub(crate) fn select(views: &[Prepared], reference: usize, depths_m: &[f64], config: &StereoConfig) -> Selection {
+pub(crate) fn select(
+    views: &[Prepared],
+    reference: usize,
+    depths_m: &[f64],
+    config: &StereoConfig,
+) -> Selection {
     let mut best_parallax_deg = 0.0f64;
     let mut candidates = Vec::new();
     for index in (0..views.len()).filter(|&i| i != reference) {
@@ -45,8 +50,8 @@ pub(crate) fn select(views: &[Prepared], reference: usize, depths_m: &[f64], con
         }
         best_parallax_deg = best_parallax_deg.max(parallax);
         if score > 0.0 {
-            let offset = views[index].world_from_camera.translation
-                - views[reference].world_from_camera.translation;
+            let offset =
+                views[index].world_from_camera.translation - views[reference].world_from_camera.translation;
             candidates.push(Candidate { index, score, offset });
         }
     }
