@@ -1,8 +1,8 @@
 //! Confidence: the probability that a depth is right to within [`TOLERANCE_RATIO`].
 //!
-//! A logistic function of what is known about a pixel. The weights were set by the sign and rough size of each
-//! influence; one slope and one offset over their sum were then chosen between what real frames with sensor depth
-//! (a HoloLens room) and rendered ones ask for. A test compares it with rendered scenes. Poses that are a centimetre
+//! A logistic function of what is known about a pixel, fitted by maximum likelihood, half and half, to 20 frames of a
+//! HoloLens room with sensor depth and to three rendered scenes (board, slanted wall, straight wall; noise of 8, 12
+//! and 4 grey levels). A test checks it on rendered scenes that had no part in the fit. Poses that are a centimetre
 //! off, or images not taken when the poses say, make every pixel worse than this can know.
 
 use crate::consistency::Support;
@@ -15,7 +15,7 @@ pub const TOLERANCE_RATIO: f32 = 0.03;
 pub(crate) const FEATURES: usize = 7;
 
 /// Weights of the features, in their order.
-const WEIGHTS: [f32; FEATURES] = [-0.75, 2.1, 0.7, 0.21, -0.7, 0.35, 0.35];
+const WEIGHTS: [f32; FEATURES] = [-1.83, 2.4, 1.15, 0.85, 0.84, 0.2, -0.11];
 
 /// The features of pixel `i`: constant, share of agreeing views, agreeing views (saturating), log of the margin,
 /// matching cost, log of the texture, log of the depth resolution.
