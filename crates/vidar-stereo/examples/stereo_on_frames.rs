@@ -116,7 +116,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     let seconds = start.elapsed().as_secs_f64();
     let mut csv = String::new();
     let (mut truth_count, mut errors, mut bins) = (0usize, Vec::new(), [(0usize, 0usize, 0.0f64); 10]);
-    let mut absolute = Vec::new();
+    let (mut absolute, mut signed) = (Vec::new(), Vec::new());
     for (i, view) in output.prediction.views.iter().enumerate() {
         let Some((given, truth)) = frames.iter().find(|f| f.0.frame_id == view.frame_id) else { continue };
         let (k, kd) = (&view.intrinsics, &truth.intrinsics);
@@ -160,6 +160,7 @@ fn main() -> Result<(), Box<dyn Error>> {
                 let (e, c) = ((z - t).abs() / t, view.confidence.image()[(x, y)]);
                 errors.push(e);
                 absolute.push((z - t).abs());
+                signed.push((z - t) / t);
                 let bin = &mut bins[((c * 10.0) as usize).min(9)];
                 bin.0 += 1;
                 bin.1 += usize::from(e < vidar_stereo::TOLERANCE_RATIO);
@@ -178,6 +179,8 @@ fn main() -> Result<(), Box<dyn Error>> {
         |v: &[f32], limit: f32| v.iter().filter(|e| **e < limit).count() as f64 / v.len().max(1) as f64;
     let absrel = errors.iter().map(|e| f64::from(*e)).sum::<f64>() / errors.len().max(1) as f64;
     errors.sort_unstable_by(f32::total_cmp);
+    signed.sort_unstable_by(f32::total_cmp);
+    println!("median signed error {:.4}", signed.get(signed.len() / 2).unwrap_or(&f32::NAN));
     println!(
         "{kind}: {} views, {} omitted, {:.0} ms a view, completeness {:.3}, AbsRel {absrel:.4}, median {:.4}, \
          <3% {:.3} <5% {:.3} <10% {:.3}, <0.05 m {:.3} <0.10 m {:.3}; right within 0.05 m over all truth {:.3}",

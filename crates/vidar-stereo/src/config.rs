@@ -50,7 +50,7 @@ impl Default for StereoConfig {
             step_penalty: 12,
             jump_penalty: 80,
             refine_rounds: 1,
-            noise_gray: 2.0,
+            noise_gray: 1.0,
             agreement_ratio: 0.02,
             min_confidence: 0.5,
         }
