@@ -20,7 +20,7 @@ pub(crate) struct Support {
     pub rho: f32,
     /// Views that agree.
     pub agreeing: u8,
-    /// Views that see the point in free view of their own depth: agreeing or not, but not hidden.
+    /// Views that have a depth where the point falls: agreeing, disagreeing, or with something nearer in the way.
     pub asked: u8,
     /// Root mean square of the relative differences of those that agree.
     pub spread: f32,
@@ -91,7 +91,7 @@ fn at_pixel(x: f32, y: f32, rho: f32, others: &[Other<'_>], agreement: f32) -> S
         // Their inverse depth of our point would be rho / ratio.
         let expected = rho / ratio;
         if theirs > expected * (1.0 + 3.0 * agreement) {
-            // Something nearer stands in their way: hidden, which says nothing.
+            // Something nearer stands in their way: perhaps hidden, perhaps wrong, so it counts as asked.
             found.asked += 1;
             continue;
         }
