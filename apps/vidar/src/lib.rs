@@ -1,1 +1,109 @@
 //! The `vidar` program as a library, so that its parts can be tested.
+//!
+//! Standard output is data, the error stream is talk. Outcomes map to exit codes here and nowhere else.
+
+pub mod args;
+mod build;
+mod commands;
+mod print;
+mod progress;
+
+use args::{Cli, Command, ConfigCommand};
+use clap::Parser;
+use std::ffi::OsString;
+use std::process::ExitCode;
+use vidar::{CancelToken, Error, ExitStatus};
+
+/// What a command ends with.
+pub type Outcome = Result<ExitStatus, Error>;
+
+/// Parses, runs, prints, and returns the exit code.
+pub fn main_with(args: impl Iterator<Item = OsString>) -> ExitCode {
+    let typed: Vec<OsString> = args.collect();
+    let cli = match Cli::try_parse_from(&typed) {
+        Ok(cli) => cli,
+        Err(error) => {
+            // Help and version are data and go to the standard output; clap knows which is which.
+            let _ = error.print();
+            return ExitCode::from(if error.use_stderr() { ExitStatus::Usage as u8 } else { 0 });
+        }
+    };
+    let command = typed.iter().map(|a| quoted(&a.to_string_lossy())).collect();
+    let context = Context { cli: cli.common, command, cancel: CancelToken::new() };
+    install_cancel(&context.cancel);
+    let outcome = match context.thread_pool() {
+        Ok(pool) => pool.install(|| dispatch(cli.command, &context)),
+        Err(error) => Err(error),
+    };
+    match outcome {
+        Ok(status) => ExitCode::from(status as u8),
+        Err(error) => {
+            print::error(&error, context.cli.json);
+            ExitCode::from(error.exit_status() as u8)
+        }
+    }
+}
+
+/// What every command needs to know.
+pub(crate) struct Context {
+    pub cli: args::CommonArgs,
+    pub command: Vec<String>,
+    pub cancel: CancelToken,
+}
+
+impl Context {
+    fn thread_pool(&self) -> Result<rayon::ThreadPool, Error> {
+        let builder = rayon::ThreadPoolBuilder::new().num_threads(self.cli.threads);
+        builder.build().map_err(|e| Error::Usage {
+            what: format!("cannot start {} threads: {e}", self.cli.threads),
+            hint: "give a smaller --threads".into(),
+        })
+    }
+}
+
+fn dispatch(command: Command, context: &Context) -> Outcome {
+    match command {
+        Command::Run(args) => commands::run::run(&args, context),
+        Command::Demo(args) => commands::run::demo(&args, context),
+        Command::Inspect(args) => commands::inspect::inspect(&args, context),
+        Command::Eval(args) => commands::eval::eval(&args, context),
+        Command::Export(args) => commands::export::export(&args, context),
+        Command::Synth(args) => commands::synth::synth(&args, context),
+        Command::Doctor => commands::doctor::doctor(context),
+        Command::Config(ConfigCommand::Show { config, origin }) => {
+            commands::config::show(&config, origin, context)
+        }
+        Command::Config(ConfigCommand::Explain { key }) => commands::config::explain(&key, context),
+        Command::Config(ConfigCommand::Presets) => commands::config::presets(context),
+        Command::Config(ConfigCommand::Schema) => commands::config::schema(),
+        Command::Explain { code } => commands::explain::explain(&code),
+        Command::Completions { shell } => commands::completions(shell),
+    }
+}
+
+/// The first signal asks the run to finish its files; the second ends the process at once.
+fn install_cancel(cancel: &CancelToken) {
+    let cancel = cancel.clone();
+    // Without a handler the system's own applies, which ends the process: worse, but not wrong.
+    let _ = ctrlc::set_handler(move || {
+        if cancel.is_cancelled() {
+            end_now();
+        }
+        cancel.cancel();
+        print::talk("stopping: finishing files; press Ctrl-C again to end at once");
+    });
+}
+
+#[allow(clippy::disallowed_methods, clippy::exit)] // a signal handler has nobody to return to
+fn end_now() {
+    std::process::exit(ExitStatus::Interrupted as i32);
+}
+
+fn quoted(argument: &str) -> String {
+    let plain = |c: char| c.is_alphanumeric() || "-_./=:,@%+".contains(c);
+    if !argument.is_empty() && argument.chars().all(plain) {
+        argument.to_owned()
+    } else {
+        format!("'{}'", argument.replace('\'', r"'\''"))
+    }
+}

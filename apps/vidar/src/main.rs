@@ -1,3 +1,7 @@
-//! The `vidar` program.
+//! The `vidar` program: parse, validate, call the library, print.
 
-fn main() {}
+use std::process::ExitCode;
+
+fn main() -> ExitCode {
+    vidar_cli::main_with(std::env::args_os())
+}

@@ -5,12 +5,12 @@ use serde::{Deserialize, Serialize};
 use thiserror::Error;
 use vidar_core::model::ChunkFrame;
 use vidar_core::{
-    AlignedView, ChunkId, ChunkView, FrameId, GeometryError, GeometryPrediction, LieGroup, Se3, Sim3,
-    umeyama_sim3,
+    AlignedView, ChunkId, ChunkView, FrameId, FrameImage, GeometryError, GeometryPrediction, Image, LieGroup,
+    Se3, Sim3, umeyama_sim3,
 };
 
 /// What decides how a chunk is placed.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct AlignConfig {
     /// Largest RMS distance (m) between placed and anchored camera centres at which a chunk is still trusted.
@@ -157,14 +157,35 @@ pub fn aligned_views(
             AlignedView::new(view.frame_id, time, world_from_camera, view.intrinsics, depth, view.confidence)
                 .map_err(geometry)?;
         if let Some(image) = image {
-            let color = image.image.to_rgb8();
-            if color.width() == view.intrinsics.width && color.height() == view.intrinsics.height {
-                metric = metric.with_color(color).map_err(geometry)?;
-            }
+            let color = color_at_size(&image.image, view.intrinsics.width, view.intrinsics.height);
+            metric = metric.with_color(color).map_err(geometry)?;
         }
         aligned.push(metric);
     }
     Ok(aligned)
+}
+
+/// The image's colours at the depth's size: bilinear, pixel centres kept (`c' = (c + 0.5)·s − 0.5`).
+fn color_at_size(image: &FrameImage, width: usize, height: usize) -> Image<[u8; 3]> {
+    let color = image.to_rgb8();
+    let (w, h) = (color.width(), color.height());
+    if (w, h) == (width, height) || w == 0 || h == 0 {
+        return color;
+    }
+    let (sx, sy) = (w as f32 / width as f32, h as f32 / height as f32);
+    let source = |c: usize, s: f32, n: usize| ((c as f32 + 0.5) * s - 0.5).clamp(0.0, (n - 1) as f32);
+    Image::from_fn(width, height, |x, y| {
+        let (fx, fy) = (source(x, sx, w), source(y, sy, h));
+        let (x0, y0) = (fx as usize, fy as usize);
+        let (x1, y1) = ((x0 + 1).min(w - 1), (y0 + 1).min(h - 1));
+        let (ax, ay) = (fx - x0 as f32, fy - y0 as f32);
+        std::array::from_fn(|c| {
+            let at = |x: usize, y: usize| f32::from(color[(x, y)][c]);
+            let top = at(x0, y0) + ax * (at(x1, y0) - at(x0, y0));
+            let bottom = at(x0, y1) + ax * (at(x1, y1) - at(x0, y1));
+            (top + ay * (bottom - top)).round() as u8
+        })
+    })
 }
 
 fn matched_centers(

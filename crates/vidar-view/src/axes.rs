@@ -146,9 +146,11 @@ pub(crate) fn draw_header(
         top += 1.35 * height;
     }
     let style = TextStyle::new(scale.body, theme::INK);
-    let (key, gap) = (1.8 * line, 1.4 * line);
+    let gap = 1.4 * line;
     let mut left = side;
     for (i, (label, swatch)) in legend.iter().enumerate() {
+        // A mark needs less room than a piece of line.
+        let key = if matches!(swatch, Swatch::Line(_)) { 1.8 * line } else { 0.9 * line };
         let label = style.fitted(label, room - key - 0.4 * line);
         let width = key + 0.4 * line + style.width_of(&label);
         if i > 0 && left + width > side + room {

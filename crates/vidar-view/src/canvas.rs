@@ -178,7 +178,21 @@ impl Canvas {
     }
 
     /// An open line through `points`, round at joints and ends.
+    ///
+    /// Long lines are stroked piece by piece: the filler keeps the edges that cross a row in a sorted list, and a
+    /// path that winds over itself a hundred thousand times would take it minutes in one go.
     pub(crate) fn polyline(&mut self, points: &[(f64, f64)], pen: Pen) {
+        const PIECE: usize = 128;
+        // A dashed line starts its pattern anew at each piece, so it stays whole; those drawn here are short.
+        if pen.dash.is_some() || points.len() <= PIECE {
+            return self.stroke(points, pen);
+        }
+        for start in (0..points.len() - 1).step_by(PIECE - 1) {
+            self.stroke(&points[start..points.len().min(start + PIECE)], pen);
+        }
+    }
+
+    fn stroke(&mut self, points: &[(f64, f64)], pen: Pen) {
         let mut path = PathBuilder::new();
         for (i, &(x, y)) in points.iter().enumerate() {
             let (x, y) = (x as f32, y as f32);

@@ -282,3 +282,6 @@ fn draw_reference(canvas: &mut Canvas, frame: &Frame, reference: &ReferenceLine,
     canvas.veil(&halo, theme::PAPER, 200);
     canvas.text((right, middle), &text, Align::End, &style);
 }
+
+#[cfg(test)]
+mod tests;

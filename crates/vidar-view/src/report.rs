@@ -57,7 +57,7 @@ pub enum FigureWidth {
     /// The whole column.
     #[default]
     Full,
-    /// Two beside each other where the window is wide enough.
+    /// Two beside each other where the window is wide enough; plots of about 720 columns suit it.
     Half,
 }
 

@@ -102,7 +102,7 @@ pub(crate) fn padded((low, high): (f64, f64), share: f64) -> (f64, f64) {
     (low - share * span, high + share * span)
 }
 
-/// A short number for captions: three significant digits, without an exponent where that is readable.
+/// A short number for captions: at most three significant digits, without an exponent where that is readable.
 pub(crate) fn short_number(value: f64) -> String {
     let size = value.abs();
     if !value.is_finite() {
@@ -113,7 +113,8 @@ pub(crate) fn short_number(value: f64) -> String {
         s if !(1e-4..1e6).contains(&s) => format!("{value:.2e}"),
         s => {
             let decimals = (2.0 - s.log10().floor()).clamp(0.0, 6.0) as usize;
-            format!("{value:.decimals$}")
+            let text = format!("{value:.decimals$}");
+            if decimals == 0 { text } else { text.trim_end_matches('0').trim_end_matches('.').to_owned() }
         }
     }
 }
@@ -164,8 +165,8 @@ mod tests {
     }
 
     #[test]
-    fn short_numbers_keep_three_digits() {
-        let texts = [0.012_34, 1.234, 123.4, 98_765.0, 0.0, 1e-7, f64::NAN].map(short_number);
-        assert_eq!(texts, ["0.0123", "1.23", "123", "98765", "0", "1.00e-7", "n/a"]);
+    fn short_numbers_keep_three_digits_and_no_idle_zeros() {
+        let texts = [0.012_34, 0.4, 100.0, 98_765.0, 0.0, 1e-7, f64::NAN].map(short_number);
+        assert_eq!(texts, ["0.0123", "0.4", "100", "98765", "0", "1.00e-7", "n/a"]);
     }
 }

@@ -184,13 +184,15 @@ impl Panels {
 
         let width = outer.width - margins.left - margins.right;
         let room = outer.height - margins.top - margins.bottom;
-        let both = room - margins.top - margins.bottom;
+        // Marks at the ends of a flat path need room above and below.
+        let air = 20.0 * scale.unit;
+        let both = room - margins.top - margins.bottom - air;
         let with_side = side && both > 6.0 * scale.line();
         let (height, metres) = if with_side { (both, length(1) + length(2)) } else { (room, length(1)) };
         let per_metre = (width / length(0)).min(height / metres).max(1e-12);
         // What is left over vertically goes to the view from above; horizontally both are opened.
-        let side_height = if with_side { (length(2) * per_metre).max(3.0 * scale.line()) } else { 0.0 };
-        let top_height = (height - side_height).max(8.0);
+        let side_height = if with_side { (length(2) * per_metre).max(3.0 * scale.line()) + air } else { 0.0 };
+        let top_height = (if with_side { height + air } else { height } - side_height).max(8.0);
         let (left, width) = (outer.left + margins.left, width.max(8.0));
         let fit = |axis: usize, pixels: f64| centred(spans[axis], pixels / per_metre);
 

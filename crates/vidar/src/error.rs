@@ -218,7 +218,9 @@ impl Error {
     pub fn hint(&self) -> Option<String> {
         let text = match self {
             Self::UnknownKey { nearest: Some(nearest), .. } => {
-                return Some(format!("did you mean {nearest:?}? `vidar config explain {nearest}` tells what it does"));
+                return Some(format!(
+                    "did you mean {nearest:?}? `vidar config explain {nearest}` tells what it does"
+                ));
             }
             Self::Usage { hint, .. } => return Some(hint.clone()),
             Self::UnknownKey { .. } => "`vidar config show` lists every key",
@@ -235,7 +237,9 @@ impl Error {
             Self::TooFewKeyframes { .. } => {
                 "lower keyframes.min_translation_m, or give a longer part of the sequence"
             }
-            Self::Empty { .. } => "look at depth/ in the run folder; try --preset quality, or another depth range",
+            Self::Empty { .. } => {
+                "look at depth/ in the run folder; try --preset quality, or another depth range"
+            }
             Self::Io { source, .. } if is_full(source) => {
                 "free space, or choose another disk with -o; finished files are kept"
             }
@@ -255,15 +259,27 @@ pub fn is_full(error: &std::io::Error) -> bool {
 
 /// Every error code with what it means, for `vidar explain` and the reference page.
 pub const CODES: &[(&str, &str)] = &[
-    ("E0101", "A configuration key does not exist. Keys are refused rather than ignored, because an ignored key is a wrong result that looks right."),
+    (
+        "E0101",
+        "A configuration key does not exist. Keys are refused rather than ignored, because an ignored key is a wrong result that looks right.",
+    ),
     ("E0102", "A configuration value has the wrong type or lies outside its range."),
     ("E0103", "A configuration file is missing or is not valid TOML."),
     ("E0104", "The preset is not one of those that `vidar config presets` lists."),
     ("E0105", "The command line asks for something that this command cannot do."),
     ("E0106", "The output folder exists. VIDAR never overwrites; --force moves the old folder aside."),
-    ("E0201", "The input path, a file in it, or its calibration cannot be used. The message names file, line, what was found and what was expected."),
-    ("E0202", "There is no source of metric poses. One camera alone has no scale: give a trajectory in metres, or ground truth."),
-    ("E0203", "Image times and pose times do not overlap: another clock, another unit, or another recording."),
+    (
+        "E0201",
+        "The input path, a file in it, or its calibration cannot be used. The message names file, line, what was found and what was expected.",
+    ),
+    (
+        "E0202",
+        "There is no source of metric poses. One camera alone has no scale: give a trajectory in metres, or ground truth.",
+    ),
+    (
+        "E0203",
+        "Image times and pose times do not overlap: another clock, another unit, or another recording.",
+    ),
     ("E0204", "Too few frames have a pose and enough motion between them to see depth."),
     ("E0205", "Camera parameters are not those of a camera, or no undistorted view fits into the image."),
     ("E0206", "Poses belong to a body whose place on the rig is unknown."),

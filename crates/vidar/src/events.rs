@@ -70,7 +70,9 @@ pub enum Event {
 
 /// Where events go. Cheap to clone; readers are called in order, on the emitting thread.
 #[derive(Clone, Default)]
-pub struct Events(Vec<Arc<dyn Fn(&Event) + Send + Sync>>);
+pub struct Events(Vec<Reader>);
+
+type Reader = Arc<dyn Fn(&Event) + Send + Sync>;
 
 impl Events {
     /// Nobody listens.

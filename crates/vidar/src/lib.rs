@@ -1,1 +1,35 @@
-//! The corridor: configuration, events, run folder, and the stages wired together.
+//! The corridor: configuration, events, the run folder, and the stages wired together.
+//!
+//! Data flows through the rooms in one direction:
+//!
+//! ```text
+//! vidar-dataset ─▶ metric poses ─▶ vidar-stereo ─▶ vidar-align ─▶ vidar-fusion ─▶ vidar-eval · vidar-export · vidar-view
+//!  Dataset          Keyframe        GeometryPrediction  AlignedView    TsdfVolume       scores · files · pictures
+//! ```
+//!
+//! [`run::run`] is that figure as code; the program in `apps/vidar` only parses, calls it and prints.
+
+pub mod config;
+pub mod demo;
+pub mod doctor;
+pub mod error;
+pub mod evaluate;
+pub mod events;
+pub mod export;
+pub mod input;
+pub mod inspect;
+pub mod keyframes;
+pub mod run;
+pub mod run_folder;
+pub mod system;
+
+pub use config::{Config, Layered};
+pub use error::{Error, ExitStatus};
+pub use events::{CancelToken, Event, Events};
+pub use run::{RunOutcome, RunRequest, run};
+pub use vidar_core as core;
+pub use vidar_dataset as dataset;
+pub use vidar_synth as synth;
+
+/// Version of the program.
+pub const VERSION: &str = env!("CARGO_PKG_VERSION");

@@ -41,6 +41,26 @@ pub enum Place {
     },
 }
 
+impl Place {
+    /// Makes an empty folder there and returns its path.
+    pub fn reserve(&self) -> Result<PathBuf, Error> {
+        match self {
+            Self::Exact { path, force } => {
+                make_way(path, *force)?;
+                create_dir(path)?;
+                Ok(path.clone())
+            }
+            Self::Dated { base, name } => {
+                let parent = base.join("runs").join(safe_name(name));
+                let root = free_name(&parent, &now_for_paths());
+                create_dir(&root)?;
+                link_latest(&parent, &root);
+                Ok(root)
+            }
+        }
+    }
+}
+
 /// What is written down about a run.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
 pub struct Manifest {
@@ -98,20 +118,7 @@ pub struct StoredView {
 impl RunFolder {
     /// Makes the folder, refusing one that is in use.
     pub fn create(place: &Place) -> Result<Self, Error> {
-        let root = match place {
-            Place::Exact { path, force } => {
-                make_way(path, *force)?;
-                path.clone()
-            }
-            Place::Dated { base, name } => {
-                let parent = base.join("runs").join(safe_name(name));
-                let root = free_name(&parent, &now_for_paths());
-                create_dir(&root)?;
-                link_latest(&parent, &root);
-                root
-            }
-        };
-        create_dir(&root)?;
+        let root = place.reserve()?;
         let path = root.join("log.jsonl");
         let log = File::create(&path).map_err(|e| Error::io("create", &path, e))?;
         Ok(Self { root, log: Mutex::new(Some(log)) })
@@ -306,7 +313,10 @@ mod tests {
         folder.log(&Event::Warning { warning });
         let text = std::fs::read_to_string(folder.path().join("log.jsonl")).unwrap();
         let lines: Vec<serde_json::Value> = text.lines().map(|l| serde_json::from_str(l).unwrap()).collect();
-        assert_eq!(lines[0], serde_json::json!({"schema": EVENT_SCHEMA, "event": "stage-started", "stage": "stereo", "total": 3}));
+        assert_eq!(
+            lines[0],
+            serde_json::json!({"schema": EVENT_SCHEMA, "event": "stage-started", "stage": "stereo", "total": 3})
+        );
         assert_eq!(lines[1]["kind"], "time-gap");
     }
 }

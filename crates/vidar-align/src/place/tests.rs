@@ -118,3 +118,12 @@ fn missing_anchors_and_bad_configuration_are_error_values() {
     let config = AlignConfig { max_center_rms_m: f64::NAN };
     assert!(matches!(place_chunk(&chunk, &[], &config), Err(AlignError::BadConfig { .. })));
 }
+
+#[test]
+fn colours_follow_the_depth_to_another_size() {
+    let ramp = Image::from_fn(8, 6, |x, _| (x * 20) as u8);
+    let small = color_at_size(&FrameImage::Gray8(ramp), 4, 3);
+    // Pixel 1 of 4 has its centre at (1.5 · 2) − 0.5 = 2.5 of 8.
+    assert_eq!(small[(1, 1)], [50, 50, 50]);
+    assert_eq!((small.width(), small.height()), (4, 3));
+}

@@ -1,6 +1,6 @@
 //! Which pose of the estimate belongs to which of the truth.
 //!
-//! The rule is evo's: each stamp of the trajectory with fewer poses (the truth, when both have as many) takes the
+//! The rule is evo's: each stamp of the trajectory with fewer poses (the estimate, when both have as many) takes the
 //! nearest stamp of the other one, the earlier of two equally near, and is dropped when that one is more than the
 //! largest difference away. A pose of the longer trajectory may serve twice. Unlike evo, differences are integer
 //! nanoseconds, so a pair exactly at the limit counts whatever the epoch.
@@ -21,7 +21,7 @@ pub fn associate(
             return Err(EvalError::EmptyTrajectory { which });
         }
     }
-    let swapped = truth.len() <= estimate.len();
+    let swapped = truth.len() < estimate.len();
     let (few, many) = if swapped { (truth, estimate) } else { (estimate, truth) };
     let mut pairs = Vec::with_capacity(few.len());
     let mut smallest = Duration::from_nanos(i64::MAX);

@@ -1,7 +1,7 @@
 //! From where a map is looked at.
 
 use nalgebra::{Matrix3, Vector3};
-use vidar_core::Trajectory;
+use vidar_core::{StampedPose, Trajectory};
 
 /// Two horizontal directions and up, as a right-handed frame with names for axes.
 pub(crate) struct HorizontalPlane {
@@ -166,8 +166,8 @@ impl MapCamera {
     /// The camera of a fixed viewpoint for a map with these vertices.
     ///
     /// Frames the middle 99 % of the vertices along each axis, so that a few stray points do not shrink the map.
-    /// `camera_path` (poses of a camera) places [`Viewpoint::Inside`]; without it that view stands in the middle
-    /// of the map. `aspect` is width / height of the picture. A map without vertices gives a camera that looks at
+    /// `camera_path` (poses of a camera) is kept in the picture and places [`Viewpoint::Inside`]; without it that
+    /// view stands in the middle of the map. `aspect` is width / height of the picture. A map without vertices gives a camera that looks at
     /// the origin.
     pub fn fixed(
         viewpoint: Viewpoint,
@@ -177,7 +177,10 @@ impl MapCamera {
         aspect: f64,
     ) -> Self {
         let plane = HorizontalPlane::of_up(up);
-        let bounds = Bounds::robust(positions, &plane);
+        let mut bounds = Bounds::robust(positions, &plane);
+        if !positions.is_empty() {
+            bounds.include(&plane, camera_path.map_or(&[][..], Trajectory::poses));
+        }
         let name = viewpoint.name();
         match viewpoint {
             Viewpoint::Top => Self::above(name, &plane, &bounds, aspect),
@@ -221,20 +224,11 @@ impl MapCamera {
         let right = plane.direction(-sa, ca, 0.0);
         let outwards = plane.direction(ce * ca, ce * sa, se);
         let down = plane.direction(se * ca, se * sa, -ce);
-        let center = bounds.world(plane, [0.5; 3]);
         let tangent = (0.5 * VERTICAL_ANGLE_DEG).to_radians().tan();
-        // The nearest distance from which all eight corners lie within the picture.
-        let mut distance = 0.0_f64;
-        for i in 0..8 {
-            let corner = bounds.world(plane, [0, 1, 2].map(|b| f64::from((i >> b) & 1))) - center;
-            let towards = corner.dot(&outwards);
-            let needed =
-                (corner.dot(&down).abs() / tangent).max(corner.dot(&right).abs() / (tangent * aspect));
-            distance = distance.max(towards + needed);
-        }
+        let (center, distance) = bounds.framed(plane, [right, down, outwards], [tangent * aspect, tangent]);
         Self {
             name: name.to_owned(),
-            position: center + outwards * (1.05 * distance),
+            position: center + outwards * (1.06 * distance),
             right,
             down,
             projection: Projection::Perspective { vertical_angle_deg: VERTICAL_ANGLE_DEG },
@@ -249,7 +243,7 @@ impl MapCamera {
         let count = poses.len().max(1) as f64;
         let mean: Vector3<f64> = poses.iter().map(|p| p.world_from_body.translation / count).sum();
         let nearest = poses.iter().min_by(|a, b| {
-            let far = |p: &vidar_core::StampedPose| (p.world_from_body.translation - mean).norm_squared();
+            let far = |p: &StampedPose| (p.world_from_body.translation - mean).norm_squared();
             far(a).total_cmp(&far(b))
         });
         let (position, looked) = match nearest {
@@ -277,6 +271,8 @@ impl MapCamera {
 struct Bounds {
     low: [f64; 3],
     high: [f64; 3],
+    /// Vertices within, along right, away, up; thinned.
+    inside: Vec<[f64; 3]>,
 }
 
 impl Bounds {
@@ -286,7 +282,7 @@ impl Bounds {
         let finite = positions.iter().step_by(stride).filter(|p| p.iter().all(|v| v.is_finite()));
         let points: Vec<[f64; 3]> =
             finite.map(|p| plane.coordinates(&Vector3::from(p.map(f64::from)))).collect();
-        let mut bounds = Self { low: [-1.0; 3], high: [1.0; 3] };
+        let mut bounds = Self { low: [-1.0; 3], high: [1.0; 3], inside: Vec::new() };
         for axis in 0..3 {
             let mut values: Vec<f64> = points.iter().map(|p| p[axis]).collect();
             values.sort_unstable_by(f64::total_cmp);
@@ -298,7 +294,62 @@ impl Bounds {
             (bounds.low[axis], bounds.high[axis]) =
                 ((low - air).max(values[0] - 1e-3), (high + air).min(values[last] + 1e-3));
         }
+        let holds = |p: &[f64; 3]| (0..3).all(|i| (bounds.low[i]..=bounds.high[i]).contains(&p[i]));
+        bounds.inside = points.into_iter().filter(holds).collect();
         bounds
+    }
+
+    /// Widens the box so that a path within reach is seen whole.
+    fn include(&mut self, plane: &HorizontalPlane, poses: &[StampedPose]) {
+        // A path that left the map far behind would make the map small; then it is cut by the picture instead.
+        let reach = self.size().into_iter().fold(0.0, f64::max);
+        let near = |p: &[f64; 3]| (0..3).all(|i| p[i] >= self.low[i] - reach && p[i] <= self.high[i] + reach);
+        let stride = (poses.len() / 10_000).max(1);
+        let places = poses.iter().step_by(stride).map(|p| plane.coordinates(&p.world_from_body.translation));
+        let places: Vec<[f64; 3]> = places.filter(near).collect();
+        for p in &places {
+            for i in 0..3 {
+                self.low[i] = self.low[i].min(p[i]);
+                self.high[i] = self.high[i].max(p[i]);
+            }
+        }
+        self.inside.extend(places);
+    }
+
+    /// The point to look at and the distance from which all vertices within lie in the picture.
+    ///
+    /// `axes` are the picture's right and down and the direction towards the eye; `tangents` those of the half angles.
+    fn framed(
+        &self,
+        plane: &HorizontalPlane,
+        [right, down, outwards]: [Vector3<f64>; 3],
+        tangents: [f64; 2],
+    ) -> (Vector3<f64>, f64) {
+        let mut center = self.world(plane, [0.5; 3]);
+        let mut distance = 1.0;
+        // Each round centres what the last one saw; three are enough to a pixel.
+        for _ in 0..3 {
+            let relative: Vec<[f64; 3]> = self
+                .inside
+                .iter()
+                .map(|p| plane.direction(p[0], p[1], p[2]) - center)
+                .map(|d| [d.dot(&right), d.dot(&down), d.dot(&outwards)])
+                .collect();
+            let needed = |p: &[f64; 3]| p[2] + (p[0].abs() / tangents[0]).max(p[1].abs() / tangents[1]);
+            distance = relative.iter().map(needed).fold(1e-3, f64::max);
+            for (axis, direction) in [right, down].iter().enumerate() {
+                let slopes = relative.iter().map(|p| p[axis] / (distance - p[2]).max(1e-6));
+                if let Some((low, high)) = crate::ticks::range_of(slopes) {
+                    center += direction * (0.5 * (low + high) * distance);
+                }
+            }
+        }
+        // The last shift may have pushed something out by a little.
+        let needed = |p: &[f64; 3]| {
+            let d = plane.direction(p[0], p[1], p[2]) - center;
+            d.dot(&outwards) + (d.dot(&right).abs() / tangents[0]).max(d.dot(&down).abs() / tangents[1])
+        };
+        (center, self.inside.iter().map(needed).fold(distance.min(1.0), f64::max))
     }
 
     fn size(&self) -> [f64; 3] {

@@ -91,7 +91,7 @@ fn vertex_normals(mesh: &TriangleMesh) -> Vec<[f32; 3]> {
     sums.iter().map(|s| [s.x as f32, s.y as f32, s.z as f32]).collect()
 }
 
-/// Radius of a point's disc: a little more than half the usual distance between neighbours.
+/// Radius of a point's disc: somewhat more than half the usual distance between neighbours.
 ///
 /// The covered area is counted in cells of 1/128 of the map's extent, of which each holds about a cell's face of
 /// surface; the points share that area.
@@ -120,5 +120,5 @@ pub(super) fn disc_radius_m(cloud: &PointCloud) -> f64 {
     cells.sort_unstable();
     cells.dedup();
     let points_per_cell = (sampled * stride) as f64 / cells.len().max(1) as f64;
-    0.62 * cell / points_per_cell.max(1.0).sqrt()
+    0.7 * cell / points_per_cell.max(1.0).sqrt()
 }

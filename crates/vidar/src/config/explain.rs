@@ -40,6 +40,26 @@ pub fn explain(key: &str) -> Result<Vec<Explanation>, Error> {
     Ok(found)
 }
 
+/// Every key of the configuration, in sections, sorted.
+pub(super) fn keys() -> Vec<String> {
+    let schema = schema();
+    let mut found = Vec::new();
+    collect(&schema, &schema, "", &mut found);
+    found
+}
+
+fn collect(schema: &Value, node: &Value, prefix: &str, found: &mut Vec<String>) {
+    let node = resolve(schema, node);
+    let Some(properties) = node["properties"].as_object() else {
+        found.push(prefix.to_owned());
+        return;
+    };
+    for (name, inner) in properties {
+        let key = if prefix.is_empty() { name.clone() } else { format!("{prefix}.{name}") };
+        collect(schema, inner, &key, found);
+    }
+}
+
 fn about(schema: &Value, key: &str) -> String {
     let mut node = schema;
     for part in key.split('.') {

@@ -2,7 +2,7 @@
 
 use super::{Config, PRESETS};
 use crate::error::Error;
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::fmt;
 use std::path::{Path, PathBuf};
 use toml::{Table, Value};
@@ -45,17 +45,27 @@ impl fmt::Display for Origin {
 pub struct Layered {
     values: Table,
     origins: BTreeMap<String, Origin>,
+    /// Keys that may be absent; they hold [`ABSENT`] then.
+    optional: BTreeSet<String>,
 }
+
+/// How an optional value that is not set is written: TOML has no null.
+const ABSENT: &str = "none";
 
 impl Layered {
     /// The defaults.
     pub fn defaults() -> Result<Self, Error> {
-        let values = Table::try_from(Config::default()).map_err(|e| Error::BadValue { reason: e.to_string() })?;
+        let mut values =
+            Table::try_from(Config::default()).map_err(|e| Error::BadValue { reason: e.to_string() })?;
+        // The schema knows every key, the table only those that have a value by default.
+        let optional: BTreeSet<String> =
+            super::explain::keys().into_iter().filter(|key| lookup(&values, key).is_none()).collect();
+        optional.iter().for_each(|key| store(&mut values, key, Value::String(ABSENT.into())));
         let mut origins = BTreeMap::new();
         for_each_leaf(&values, "", &mut |key, _| {
             origins.insert(key.to_owned(), Origin::Default);
         });
-        Ok(Self { values, origins })
+        Ok(Self { values, origins, optional })
     }
 
     /// Applies a preset by name.
@@ -112,9 +122,12 @@ impl Layered {
                 origin: origin.to_string(),
             });
         };
-        let value = coerce(current, value).map_err(|(expected, found)| Error::BadValue {
-            reason: format!("{key} must be {expected}, found {found} (from {origin})"),
-        })?;
+        let free = self.optional.contains(key);
+        let value = if free { Ok(optional_value(value)) } else { coerce(current, value) }.map_err(
+            |(expected, found)| Error::BadValue {
+                reason: format!("{key} must be {expected}, found {found} (from {origin})"),
+            },
+        )?;
         store(&mut self.values, key, value);
         self.origins.insert(key.to_owned(), origin);
         Ok(())
@@ -130,8 +143,14 @@ impl Layered {
 
     /// Builds and checks the configuration.
     pub fn build(&self) -> Result<Config, Error> {
+        let mut values = self.values.clone();
+        for key in &self.optional {
+            if lookup(&values, key).is_some_and(|v| v.as_str() == Some(ABSENT)) {
+                remove(&mut values, key);
+            }
+        }
         let config: Config =
-            self.values.clone().try_into().map_err(|e: toml::de::Error| Error::BadValue { reason: e.to_string() })?;
+            values.try_into().map_err(|e: toml::de::Error| Error::BadValue { reason: e.to_string() })?;
         config.validate()?;
         Ok(config)
     }
@@ -226,12 +245,33 @@ fn store(table: &mut Table, key: &str, value: Value) {
     }
 }
 
+fn remove(table: &mut Table, key: &str) {
+    match key.split_once('.') {
+        Some((head, rest)) => {
+            if let Some(Value::Table(inner)) = table.get_mut(head) {
+                remove(inner, rest);
+            }
+        }
+        None => {
+            table.remove(key);
+        }
+    }
+}
+
+/// Optional values are numbers so far; whole ones are meant as such.
+fn optional_value(value: Value) -> Value {
+    if let Value::Integer(i) = value { Value::Float(i as f64) } else { value }
+}
+
 /// Fits `value` to the kind of `current`; the error is (expected, found).
 fn coerce(current: &Value, value: Value) -> Result<Value, (&'static str, String)> {
     match (current, value) {
         (Value::Float(_), Value::Integer(i)) => Ok(Value::Float(i as f64)),
         (Value::Array(_), Value::Array(items)) => Ok(Value::Array(
-            items.into_iter().map(|v| if let Value::Integer(i) = v { Value::Float(i as f64) } else { v }).collect(),
+            items
+                .into_iter()
+                .map(|v| if let Value::Integer(i) = v { Value::Float(i as f64) } else { v })
+                .collect(),
         )),
         (current, value) if current.same_type(&value) => Ok(value),
         (current, value) => Err((kind(current), value.to_string())),

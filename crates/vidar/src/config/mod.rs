@@ -170,15 +170,16 @@ impl Config {
             true => Ok(()),
             false => bad(format!("{key} must be finite and positive, found {value}")),
         };
-        for (key, value) in [("input.start_secs", self.input.start_secs), ("input.end_secs", self.input.end_secs)] {
+        for (key, value) in
+            [("input.start_secs", self.input.start_secs), ("input.end_secs", self.input.end_secs)]
+        {
             if !(value.is_finite() && value >= 0.0) {
                 return bad(format!("{key} must be finite and not negative, found {value}"));
             }
         }
-        for (key, value) in [
-            ("input.stride", self.input.stride),
-            ("geometry.chunk_keyframes", self.geometry.chunk_keyframes),
-        ] {
+        for (key, value) in
+            [("input.stride", self.input.stride), ("geometry.chunk_keyframes", self.geometry.chunk_keyframes)]
+        {
             if value == 0 {
                 return bad(format!("{key} must be at least 1"));
             }
@@ -188,7 +189,10 @@ impl Config {
         positive("keyframes.min_rotation_deg", self.keyframes.min_rotation_deg)?;
         positive("output.depth_units_per_metre", self.output.depth_units_per_metre)?;
         if !(32..=8192).contains(&self.geometry.max_width_px) {
-            return bad(format!("geometry.max_width_px must be 32 to 8192, found {}", self.geometry.max_width_px));
+            return bad(format!(
+                "geometry.max_width_px must be 32 to 8192, found {}",
+                self.geometry.max_width_px
+            ));
         }
         if self.geometry.source != "stereo" {
             return bad(format!("geometry.source must be \"stereo\", found {:?}", self.geometry.source));

@@ -33,4 +33,9 @@ pub const PRESETS: &[Preset] = &[
         about: "patience for a better surface: more neighbours, finer voxels",
         toml: include_str!("../../../../presets/quality.toml"),
     },
+    Preset {
+        name: "demo",
+        about: "the synthetic room of `vidar demo`: small images, a few metres",
+        toml: include_str!("../../../../presets/demo.toml"),
+    },
 ];

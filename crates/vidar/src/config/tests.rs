@@ -31,7 +31,10 @@ fn later_layers_win_and_every_value_knows_its_origin() {
     layered.environment(variables.iter().map(|(a, b)| (a.to_string(), b.to_string()))).unwrap();
     layered.set("keyframes.max_count = 12").unwrap();
     let config = layered.build().unwrap();
-    assert_eq!(config.keyframes, KeyframeConfig { min_translation_m: 0.5, min_rotation_deg: 4.0, max_count: 12 });
+    assert_eq!(
+        config.keyframes,
+        KeyframeConfig { min_translation_m: 0.5, min_rotation_deg: 4.0, max_count: 12 }
+    );
     let origin = |key: &str| layered.entries().into_iter().find(|(k, _, _)| k == key).unwrap().2;
     assert_eq!(origin("keyframes.min_translation_m"), Origin::File(file));
     assert!(matches!(origin("keyframes.min_rotation_deg"), Origin::Environment(_)));
@@ -71,7 +74,9 @@ fn wrong_kinds_and_ranges_name_the_key() {
         let mut layered = defaults();
         layered.set(assignment).and_then(|()| layered.build().map(|_| ())).unwrap_err().to_string()
     };
-    assert!(reason("keyframes.min_translation_m=far").contains("keyframes.min_translation_m must be a number"));
+    assert!(
+        reason("keyframes.min_translation_m=far").contains("keyframes.min_translation_m must be a number")
+    );
     assert!(reason("output.images=1").contains("true or false"));
     assert!(reason("input.stride=0").contains("input.stride"));
     assert!(reason("keyframes.min_rotation_deg=-2").contains("keyframes.min_rotation_deg"));

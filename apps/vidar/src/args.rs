@@ -1,0 +1,338 @@
+//! The command line, as plain values. Validation and building happen in the commands.
+
+use clap::{ArgAction, Args, Parser, Subcommand, ValueEnum, ValueHint};
+use std::path::PathBuf;
+
+/// One camera and metric poses into a metric dense 3-D map.
+#[derive(Debug, Parser)]
+#[command(name = "vidar", version = version(), max_term_width = 110, propagate_version = true)]
+#[command(
+    after_help = "Examples:\n  vidar demo\n  vidar inspect my_recording/\n  vidar run my_recording/ --trajectory vio.tum -o result"
+)]
+pub struct Cli {
+    /// What to do.
+    #[command(subcommand)]
+    pub command: Command,
+    /// Flags that every command has.
+    #[command(flatten)]
+    pub common: CommonArgs,
+}
+
+fn version() -> &'static str {
+    concat!(env!("CARGO_PKG_VERSION"), " (stereo, cpu)")
+}
+
+/// Flags that every command has.
+#[derive(Args, Clone, Debug)]
+pub struct CommonArgs {
+    /// How progress is told, on the error stream.
+    #[arg(long, value_enum, default_value_t = ProgressMode::Auto, global = true, help_heading = "Output")]
+    pub progress: ProgressMode,
+    /// Print the result as one JSON object on the standard output.
+    #[arg(long, global = true, help_heading = "Output")]
+    pub json: bool,
+    /// Say nothing but errors and the result.
+    #[arg(short, long, global = true, help_heading = "Output")]
+    pub quiet: bool,
+    /// Threads to use; 0 means all. The result does not depend on it.
+    #[arg(long, default_value_t = 0, global = true, help_heading = "Output")]
+    pub threads: usize,
+}
+
+/// How progress is told.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum ProgressMode {
+    /// A bar on a terminal, plain lines otherwise.
+    Auto,
+    /// A bar.
+    Bar,
+    /// A line per stage and now and then.
+    Plain,
+    /// One JSON object per event.
+    Json,
+    /// Nothing.
+    Off,
+}
+
+/// What to do.
+#[derive(Debug, Subcommand)]
+pub enum Command {
+    /// Everything: poses, depth, one surface, judgement, files.
+    #[command(after_help = RUN_EXAMPLES)]
+    Run(RunArgs),
+    /// A synthetic room, flown, mapped and judged; nothing is downloaded.
+    #[command(
+        after_help = "Examples:\n  vidar demo\n  vidar demo -o my_demo --seed 7\n  vidar demo --scene corridor --set fusion.voxel_size_m=0.03"
+    )]
+    Demo(DemoArgs),
+    /// What is in a recording, and is it healthy.
+    #[command(
+        after_help = "Examples:\n  vidar inspect my_recording/\n  vidar inspect my_recording/ --trajectory vio.tum\n  vidar inspect my_recording/ --json"
+    )]
+    Inspect(InspectArgs),
+    /// Judge a trajectory against a trajectory, a cloud against a cloud, or show a run's scores.
+    #[command(
+        after_help = "Examples:\n  vidar eval estimate.tum truth.tum\n  vidar eval map.ply scan.ply\n  vidar eval runs/demo/latest/run --fail-below f@0.05=0.5"
+    )]
+    Eval(EvalArgs),
+    /// Other programs' formats from a finished run.
+    #[command(
+        after_help = "Examples:\n  vidar export runs/demo/latest/run --to colmap -o colmap\n  vidar export runs/demo/latest/run --to nerfstudio -o ns\n  vidar export runs/demo/latest/run --to tum"
+    )]
+    Export(ExportArgs),
+    /// Render a synthetic sequence in EuRoC layout with exact ground truth.
+    #[command(
+        after_help = "Examples:\n  vidar synth room1\n  vidar synth hall1 --scene hall --seed 3 --duration 20\n  vidar synth flight1 --trajectory flight.tum --euroc"
+    )]
+    Synth(SynthArgs),
+    /// What is possible with what is there.
+    Doctor,
+    /// Settings: show, explain, presets, schema.
+    #[command(subcommand)]
+    Config(ConfigCommand),
+    /// What an error code means.
+    #[command(after_help = "Examples:\n  vidar explain E0202\n  vidar explain all")]
+    Explain {
+        /// The code, such as E0202, or `all`.
+        code: String,
+    },
+    /// A completion script for a shell, on the standard output.
+    Completions {
+        /// Which shell.
+        shell: clap_complete::Shell,
+    },
+}
+
+const RUN_EXAMPLES: &str = "Examples:
+  vidar run mav0/ --preset euroc -o result
+  vidar run frames/ --timestamps times.txt --camera-model pinhole:525,525,319.5,239.5 --trajectory vio.tum
+  vidar run my_recording/ --dry-run";
+
+/// How the input is read.
+#[derive(Args, Clone, Debug, Default)]
+pub struct InputArgs {
+    /// Layout, where looking at the path would decide otherwise: euroc, tum-rgbd, 7scenes, posed-folder, images.
+    #[arg(long, help_heading = "Input")]
+    pub format: Option<String>,
+    /// Number of the camera (`cam0` is 0).
+    #[arg(long, help_heading = "Input")]
+    pub camera: Option<u32>,
+    /// Calibration: EuRoC sensor.yaml, Kalibr camchain or imu yaml. Repeatable.
+    #[arg(long, value_hint = ValueHint::FilePath, help_heading = "Input")]
+    pub calibration: Vec<PathBuf>,
+    /// Camera from numbers: pinhole:fx,fy,cx,cy  radtan:…,k1,k2,p1,p2  kb4:…,k1,k2,k3,k4  ds:…,xi,alpha  fov:…,w.
+    #[arg(long, allow_hyphen_values = true, help_heading = "Input")]
+    pub camera_model: Option<String>,
+    /// Metric trajectory of the same recording: the anchor.
+    #[arg(long, value_hint = ValueHint::FilePath, help_heading = "Input")]
+    pub trajectory: Option<PathBuf>,
+    /// Its format: tum, euroc, kitti.
+    #[arg(long, help_heading = "Input")]
+    pub trajectory_format: Option<String>,
+    /// Whose poses it holds: imu, or camera0, camera1, ….
+    #[arg(long, help_heading = "Input")]
+    pub trajectory_body: Option<String>,
+    /// File of image times for image folders.
+    #[arg(long, value_hint = ValueHint::FilePath, help_heading = "Input")]
+    pub timestamps: Option<PathBuf>,
+    /// Unit of image times: s, ms, us, ns.
+    #[arg(long, help_heading = "Input")]
+    pub time_unit: Option<String>,
+    /// Depth camera: fx,fy,cx,cy.
+    #[arg(long, allow_hyphen_values = true, help_heading = "Input")]
+    pub depth_intrinsics: Option<String>,
+    /// Raw depth units per metre (1000: millimetres, 5000: TUM).
+    #[arg(long, help_heading = "Input")]
+    pub depth_scale: Option<f64>,
+    /// Place of the depth camera in the colour camera: tx,ty,tz metres, optionally ,qx,qy,qz,qw.
+    #[arg(long, allow_hyphen_values = true, help_heading = "Input")]
+    pub color_from_depth: Option<String>,
+    /// Start, seconds after the first image.
+    #[arg(long, help_heading = "Input")]
+    pub start: Option<f64>,
+    /// End, seconds after the first image.
+    #[arg(long, help_heading = "Input")]
+    pub end: Option<f64>,
+    /// Every n-th image only.
+    #[arg(long, help_heading = "Input")]
+    pub stride: Option<usize>,
+}
+
+/// How settings are given.
+#[derive(Args, Clone, Debug, Default)]
+pub struct ConfigArgs {
+    /// A preset: `vidar config presets` lists them.
+    #[arg(long, help_heading = "Settings")]
+    pub preset: Option<String>,
+    /// A TOML file over the preset.
+    #[arg(long, value_hint = ValueHint::FilePath, help_heading = "Settings")]
+    pub config: Option<PathBuf>,
+    /// One setting: section.key=value. Repeatable; beats files.
+    #[arg(long = "set", value_name = "KEY=VALUE", action = ArgAction::Append, help_heading = "Settings")]
+    pub set: Vec<String>,
+}
+
+/// Where results go.
+#[derive(Args, Clone, Debug, Default)]
+pub struct OutputArgs {
+    /// Output folder; default runs/<name>/<time>/ with a `latest` link.
+    #[arg(short, long, value_hint = ValueHint::DirPath, help_heading = "Output")]
+    pub output: Option<PathBuf>,
+    /// Move an existing output folder aside instead of refusing.
+    #[arg(long, help_heading = "Output")]
+    pub force: bool,
+}
+
+/// `vidar run`.
+#[derive(Args, Clone, Debug)]
+pub struct RunArgs {
+    /// The recording: EuRoC, TUM RGB-D, 7-Scenes, a posed folder, or a folder of images.
+    #[arg(value_hint = ValueHint::AnyPath)]
+    pub path: PathBuf,
+    /// How the input is read.
+    #[command(flatten)]
+    pub input: InputArgs,
+    /// How settings are given.
+    #[command(flatten)]
+    pub config: ConfigArgs,
+    /// Where results go.
+    #[command(flatten)]
+    pub output: OutputArgs,
+    /// A cloud (PLY, metres, world of ground truth) to judge the map against.
+    #[arg(long, value_hint = ValueHint::FilePath, help_heading = "Input")]
+    pub reference: Option<PathBuf>,
+    /// Say what would be done, and stop.
+    #[arg(long)]
+    pub dry_run: bool,
+    /// End with status 5 when a score is above its bound: ate, scale, chamfer (e.g. ate=0.1). Repeatable.
+    #[arg(long, value_name = "NAME=VALUE")]
+    pub fail_above: Vec<String>,
+    /// End with status 5 when a score is below its bound: f@0.05, f@0.10, … (e.g. f@0.05=0.5). Repeatable.
+    #[arg(long, value_name = "NAME=VALUE")]
+    pub fail_below: Vec<String>,
+}
+
+/// What to simulate.
+#[derive(Args, Clone, Debug, Default)]
+pub struct WorldArgs {
+    /// Everything random follows from it.
+    #[arg(long, help_heading = "World")]
+    pub seed: Option<u64>,
+    /// room, hall or corridor.
+    #[arg(long, help_heading = "World")]
+    pub scene: Option<String>,
+    /// sweep, orbit or aggressive.
+    #[arg(long, help_heading = "World")]
+    pub flight: Option<String>,
+    /// Length, seconds.
+    #[arg(long, help_heading = "World")]
+    pub duration: Option<f64>,
+    /// Sit still for this many seconds first; default: in flight from the first frame.
+    #[arg(long, help_heading = "World")]
+    pub static_start: Option<f64>,
+}
+
+/// `vidar demo`.
+#[derive(Args, Clone, Debug)]
+pub struct DemoArgs {
+    /// What to simulate.
+    #[command(flatten)]
+    pub world: WorldArgs,
+    /// How settings are given.
+    #[command(flatten)]
+    pub config: ConfigArgs,
+    /// Where results go.
+    #[command(flatten)]
+    pub output: OutputArgs,
+}
+
+/// `vidar inspect`.
+#[derive(Args, Clone, Debug)]
+pub struct InspectArgs {
+    /// The recording.
+    #[arg(value_hint = ValueHint::AnyPath)]
+    pub path: PathBuf,
+    /// How the input is read.
+    #[command(flatten)]
+    pub input: InputArgs,
+}
+
+/// `vidar eval`.
+#[derive(Args, Clone, Debug)]
+pub struct EvalArgs {
+    /// A trajectory, a cloud (.ply), or a run folder.
+    #[arg(value_hint = ValueHint::AnyPath)]
+    pub estimate: PathBuf,
+    /// What to judge it against; not for a run folder.
+    #[arg(value_hint = ValueHint::AnyPath)]
+    pub truth: Option<PathBuf>,
+    /// How settings are given.
+    #[command(flatten)]
+    pub config: ConfigArgs,
+    /// End with status 5 when a score is above its bound: ate, scale, chamfer. Repeatable.
+    #[arg(long, value_name = "NAME=VALUE")]
+    pub fail_above: Vec<String>,
+    /// End with status 5 when a score is below its bound: f@0.05, f@0.10, …. Repeatable.
+    #[arg(long, value_name = "NAME=VALUE")]
+    pub fail_below: Vec<String>,
+}
+
+/// `vidar export`.
+#[derive(Args, Clone, Debug)]
+pub struct ExportArgs {
+    /// The run folder.
+    #[arg(value_hint = ValueHint::DirPath)]
+    pub run: PathBuf,
+    /// colmap, colmap-text, nerfstudio, tum, kitti, euroc, ply or glb.
+    #[arg(long)]
+    pub to: String,
+    /// Output folder; default RUN/export/<format>.
+    #[arg(short, long, value_hint = ValueHint::DirPath)]
+    pub output: Option<PathBuf>,
+}
+
+/// `vidar synth`.
+#[derive(Args, Clone, Debug)]
+pub struct SynthArgs {
+    /// Folder of the sequence; must not exist.
+    #[arg(value_hint = ValueHint::DirPath)]
+    pub out: PathBuf,
+    /// What to simulate.
+    #[command(flatten)]
+    pub world: WorldArgs,
+    /// Fly along this trajectory (TUM or EuRoC csv) instead of a built-in flight.
+    #[arg(long, value_hint = ValueHint::FilePath)]
+    pub trajectory: Option<PathBuf>,
+    /// EuRoC's sizes and rates: 752x480 at 20 Hz, static start, 60 s.
+    #[arg(long)]
+    pub euroc: bool,
+    /// A TOML file with every setting of the world.
+    #[arg(long, value_hint = ValueHint::FilePath)]
+    pub world_config: Option<PathBuf>,
+}
+
+/// `vidar config`.
+#[derive(Debug, Subcommand)]
+pub enum ConfigCommand {
+    /// Every setting with its value.
+    Show {
+        /// How settings are given.
+        #[command(flatten)]
+        config: ConfigArgs,
+        /// Each value with where it came from.
+        #[arg(long)]
+        origin: bool,
+    },
+    /// What a setting, or all of a section, means.
+    #[command(
+        after_help = "Examples:\n  vidar config explain fusion.voxel_size_m\n  vidar config explain keyframes"
+    )]
+    Explain {
+        /// A key such as `fusion.voxel_size_m`, or a section such as `fusion`.
+        key: String,
+    },
+    /// Presets and when to use them.
+    Presets,
+    /// JSON schema of the configuration.
+    Schema,
+}

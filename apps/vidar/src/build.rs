@@ -1,0 +1,172 @@
+//! From flags to the library's values, each checked where it is used first.
+
+use crate::args::{ConfigArgs, InputArgs, OutputArgs, WorldArgs};
+use std::path::Path;
+use vidar::config::Origin;
+use vidar::core::{BodyFrame, CameraId, Se3, So3};
+use vidar::dataset::{CameraFlag, OpenOptions};
+use vidar::run_folder::Place;
+use vidar::synth::{FlightKind, SceneKind, Start, SynthConfig};
+use vidar::{Error, Layered};
+
+/// A wrong flag with what it should be.
+pub fn usage(what: impl Into<String>, hint: impl Into<String>) -> Error {
+    Error::Usage { what: what.into(), hint: hint.into() }
+}
+
+/// Configuration in its layers.
+pub fn layered(args: &ConfigArgs, default_preset: Option<&str>) -> Result<Layered, Error> {
+    let mut layered = Layered::defaults()?;
+    if let Some(name) = args.preset.as_deref().or(default_preset) {
+        layered.preset(name)?;
+    }
+    if let Some(path) = &args.config {
+        layered.file(path)?;
+    }
+    layered.environment(std::env::vars())?;
+    args.set.iter().try_for_each(|assignment| layered.set(assignment))?;
+    Ok(layered)
+}
+
+/// The flags that are settings too.
+pub fn apply_input_flags(layered: &mut Layered, input: &InputArgs) -> Result<(), Error> {
+    let flags: [(&str, &'static str, Option<f64>); 2] =
+        [("input.start_secs", "--start", input.start), ("input.end_secs", "--end", input.end)];
+    for (key, flag, value) in flags {
+        if let Some(value) = value {
+            layered.value(key, toml::Value::Float(value), Origin::Flag(flag))?;
+        }
+    }
+    let whole = [
+        ("input.camera", "--camera", input.camera.map(i64::from)),
+        ("input.stride", "--stride", input.stride.and_then(|s| i64::try_from(s).ok())),
+    ];
+    for (key, flag, value) in whole {
+        if let Some(value) = value {
+            layered.value(key, toml::Value::Integer(value), Origin::Flag(flag))?;
+        }
+    }
+    Ok(())
+}
+
+/// How the input is read.
+pub fn open_options(input: &InputArgs) -> Result<OpenOptions, Error> {
+    let mut options = OpenOptions {
+        calibration: input.calibration.clone(),
+        trajectory: input.trajectory.clone(),
+        timestamps: input.timestamps.clone(),
+        depth_scale: input.depth_scale,
+        camera: CameraId(input.camera.unwrap_or(0)),
+        ..OpenOptions::default()
+    };
+    options.format = input.format.as_deref().map(str::parse).transpose()?;
+    options.trajectory_format = input.trajectory_format.as_deref().map(str::parse).transpose()?;
+    options.time_unit = input.time_unit.as_deref().map(str::parse).transpose()?;
+    options.camera_model =
+        input.camera_model.as_deref().map(str::parse::<CameraFlag>).transpose()?.map(|flag| flag.0);
+    options.trajectory_body = input.trajectory_body.as_deref().map(body).transpose()?;
+    options.depth_intrinsics = input.depth_intrinsics.as_deref().map(four).transpose()?;
+    options.color_from_depth = input.color_from_depth.as_deref().map(motion).transpose()?;
+    Ok(options)
+}
+
+fn body(text: &str) -> Result<BodyFrame, Error> {
+    if matches!(text, "imu" | "body") {
+        return Ok(BodyFrame::Imu);
+    }
+    let number = text.strip_prefix("camera").or_else(|| text.strip_prefix("cam"));
+    number.and_then(|n| n.parse().ok()).map(|n| BodyFrame::Camera(CameraId(n))).ok_or_else(|| {
+        usage(format!("--trajectory-body {text:?} is not a body"), "write imu, camera0, camera1, …")
+    })
+}
+
+fn numbers(text: &str, flag: &str) -> Result<Vec<f64>, Error> {
+    let parsed: Result<Vec<f64>, _> = text.split(',').map(|t| t.trim().parse()).collect();
+    parsed.ok().filter(|v: &Vec<f64>| v.iter().all(|x| x.is_finite())).ok_or_else(|| {
+        usage(format!("{flag} {text:?} is not a list of numbers"), "separate numbers by commas, no spaces")
+    })
+}
+
+fn four(text: &str) -> Result<[f64; 4], Error> {
+    let values = numbers(text, "--depth-intrinsics")?;
+    <[f64; 4]>::try_from(values).map_err(|v| {
+        usage(
+            format!("--depth-intrinsics has {} numbers, expected 4", v.len()),
+            "write fx,fy,cx,cy in pixels",
+        )
+    })
+}
+
+fn motion(text: &str) -> Result<Se3, Error> {
+    let wrong =
+        |why: String| usage(format!("--color-from-depth {why}"), "write tx,ty,tz or tx,ty,tz,qx,qy,qz,qw");
+    let values = numbers(text, "--color-from-depth")?;
+    match values[..] {
+        [x, y, z] => Ok(Se3::from_translation([x, y, z].into())),
+        [x, y, z, qx, qy, qz, qw] => So3::from_quaternion(qx, qy, qz, qw)
+            .map(|rotation| Se3::new(rotation, [x, y, z].into()))
+            .ok_or_else(|| wrong("has a zero quaternion".into())),
+        _ => Err(wrong(format!("has {} numbers", values.len()))),
+    }
+}
+
+/// Where results go.
+pub fn place(output: &OutputArgs, name: &str) -> Place {
+    match &output.output {
+        Some(path) => Place::Exact { path: path.clone(), force: output.force },
+        None => Place::Dated { base: ".".into(), name: name.to_owned() },
+    }
+}
+
+/// The name of the recording at `path`, for the run folder.
+pub fn name_of(path: &Path) -> String {
+    let absolute = vidar::input::absolute(path);
+    let parts: Vec<String> = absolute
+        .components()
+        .filter_map(|c| match c {
+            std::path::Component::Normal(name) => Some(name.to_string_lossy().into_owned()),
+            _ => None,
+        })
+        .collect();
+    // `…/MH_01/mav0` is called MH_01.
+    let meaningful = parts.iter().rev().find(|p| !["mav0", "cam0", "data"].contains(&p.as_str()));
+    meaningful.cloned().unwrap_or_else(|| "run".into())
+}
+
+/// The world to simulate.
+pub fn world(args: &WorldArgs, mut world: SynthConfig) -> Result<SynthConfig, Error> {
+    if let Some(seed) = args.seed {
+        world.seed = seed;
+    }
+    if let Some(secs) = args.duration {
+        world.duration_secs = secs;
+    }
+    if let Some(secs) = args.static_start {
+        world.start = Start::Static { secs };
+    }
+    if let Some(scene) = &args.scene {
+        world.scene = match scene.as_str() {
+            "room" => SceneKind::Room,
+            "hall" => SceneKind::Hall,
+            "corridor" => SceneKind::Corridor,
+            other => {
+                return Err(usage(format!("--scene {other:?} is unknown"), "scenes: room, hall, corridor"));
+            }
+        };
+    }
+    if let Some(flight) = &args.flight {
+        world.flight = match flight.as_str() {
+            "sweep" => FlightKind::Sweep,
+            "orbit" => FlightKind::Orbit,
+            "aggressive" => FlightKind::Aggressive,
+            other => {
+                return Err(usage(
+                    format!("--flight {other:?} is unknown"),
+                    "flights: sweep, orbit, aggressive",
+                ));
+            }
+        };
+    }
+    world.validate()?;
+    Ok(world)
+}

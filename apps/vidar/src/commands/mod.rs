@@ -1,0 +1,23 @@
+//! One file per verb.
+
+pub mod config;
+pub mod doctor;
+pub mod eval;
+pub mod explain;
+pub mod export;
+pub mod inspect;
+pub mod run;
+pub mod synth;
+
+use crate::Outcome;
+use crate::args::Cli;
+use clap::CommandFactory;
+use vidar::ExitStatus;
+
+/// `vidar completions SHELL`.
+pub fn completions(shell: clap_complete::Shell) -> Outcome {
+    let mut script = Vec::new();
+    clap_complete::generate(shell, &mut Cli::command(), "vidar", &mut script);
+    crate::print::data(String::from_utf8_lossy(&script).trim_end());
+    Ok(ExitStatus::Done)
+}

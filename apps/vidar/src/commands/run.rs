@@ -1,0 +1,76 @@
+//! `vidar run` and `vidar demo`.
+
+use crate::args::{DemoArgs, RunArgs};
+use crate::{Context, Outcome, build, print, progress};
+use serde_json::json;
+use vidar::demo::DemoRequest;
+use vidar::evaluate::Thresholds;
+use vidar::synth::SynthConfig;
+use vidar::{Error, ExitStatus, RunOutcome, RunRequest};
+
+/// Everything, from recording to report.
+pub fn run(args: &RunArgs, context: &Context) -> Outcome {
+    let mut layered = build::layered(&args.config, None)?;
+    build::apply_input_flags(&mut layered, &args.input)?;
+    let thresholds = Thresholds::parse(&args.fail_above, &args.fail_below)?;
+    let request = RunRequest {
+        path: args.path.clone(),
+        open: build::open_options(&args.input)?,
+        layered,
+        reference: args.reference.clone(),
+        place: build::place(&args.output, &build::name_of(&args.path)),
+        command: context.command.clone(),
+    };
+    if args.dry_run {
+        return dry_run(&request, context);
+    }
+    let outcome = vidar::run(&request, &progress::events(&context.cli), &context.cancel)?;
+    conclude(&outcome, &thresholds, context)
+}
+
+fn dry_run(request: &RunRequest, context: &Context) -> Outcome {
+    let plan = vidar::run::plan(request)?;
+    if context.cli.json {
+        let lines: serde_json::Map<String, serde_json::Value> =
+            plan.lines().into_iter().map(|(k, v)| (k.replace(' ', "_"), v.into())).collect();
+        print::json(&json!({ "schema": "vidar.plan/1", "plan": lines }));
+    } else {
+        print::pairs(plan.lines());
+        print::warnings(&plan.warnings);
+    }
+    Ok(ExitStatus::Done)
+}
+
+/// A synthetic room, flown, mapped and judged.
+pub fn demo(args: &DemoArgs, context: &Context) -> Outcome {
+    let request = DemoRequest {
+        world: build::world(&args.world, SynthConfig::demo())?,
+        layered: build::layered(&args.config, Some("demo"))?,
+        place: build::place(&args.output, "demo"),
+        command: context.command.clone(),
+    };
+    let outcome = vidar::demo::demo(&request, &progress::events(&context.cli), &context.cancel)?;
+    conclude(&outcome, &Thresholds::default(), context)
+}
+
+/// Says what was made, how far to trust it, and what next; then applies thresholds.
+fn conclude(outcome: &RunOutcome, thresholds: &Thresholds, context: &Context) -> Outcome {
+    let scores = vidar::evaluate::scores(&outcome.judgement);
+    if context.cli.json {
+        print::json(&json!({
+            "schema": "vidar.run/1",
+            "folder": outcome.folder.display().to_string(),
+            "exit": outcome.status as i32,
+            "result": outcome.result_json(),
+            "scores": scores,
+        }));
+    } else {
+        print::warnings(&outcome.warnings);
+        print::pairs(outcome.summary_lines());
+    }
+    if outcome.status == ExitStatus::Interrupted {
+        return Err(Error::Interrupted { path: outcome.folder.clone() });
+    }
+    thresholds.check(&scores)?;
+    Ok(outcome.status)
+}

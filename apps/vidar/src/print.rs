@@ -1,0 +1,77 @@
+//! What people read. Writing to a closed terminal or pipe is not an error.
+
+use std::io::Write;
+use vidar::Error;
+use vidar::core::Warning;
+
+/// A line of data on the standard output.
+pub fn data(line: impl AsRef<str>) {
+    let _ = writeln!(std::io::stdout().lock(), "{}", line.as_ref());
+}
+
+/// A line of talk on the error stream.
+pub fn talk(line: impl AsRef<str>) {
+    let _ = writeln!(std::io::stderr().lock(), "{}", line.as_ref());
+}
+
+/// JSON on the standard output.
+pub fn json(value: &serde_json::Value) {
+    data(serde_json::to_string_pretty(value).unwrap_or_default());
+}
+
+/// An error: what, where, why, next step, code.
+pub fn error(error: &Error, as_json: bool) {
+    let hint = error.hint();
+    if as_json {
+        json(&serde_json::json!({
+            "schema": "vidar.error/1", "code": error.code(), "message": error.to_string(), "hint": hint,
+            "exit": error.exit_status() as i32,
+        }));
+    }
+    talk(format!("error[{}]: {error}", error.code()));
+    let mut source = std::error::Error::source(error);
+    while let Some(cause) = source {
+        // Transparent wrappers repeat their cause.
+        if !error.to_string().contains(&cause.to_string()) {
+            talk(format!("  because: {cause}"));
+        }
+        source = cause.source();
+    }
+    if let Some(hint) = hint {
+        talk(format!("  hint: {hint}"));
+    }
+}
+
+/// Warnings, each kind once with its count and its first example.
+pub fn warnings(warnings: &[Warning]) {
+    let mut kinds: Vec<(&Warning, usize)> = Vec::new();
+    for warning in warnings {
+        match kinds.iter_mut().find(|(first, _)| first.kind == warning.kind) {
+            Some((_, count)) => *count += 1,
+            None => kinds.push((warning, 1)),
+        }
+    }
+    for (first, count) in &kinds {
+        let more = if *count > 1 { format!(" (and {} more)", count - 1) } else { String::new() };
+        talk(format!("warning: {first}{more}"));
+        if let Some(hint) = &first.hint {
+            talk(format!("  hint: {hint}"));
+        }
+    }
+}
+
+/// Label and value in two columns.
+pub fn pairs<'a>(rows: impl IntoIterator<Item = (&'a str, String)>) {
+    for (label, value) in rows {
+        data(format!("{label:<20} {value}"));
+    }
+}
+
+/// Seconds as m:ss or s.
+pub fn seconds(secs: f64) -> String {
+    if secs < 60.0 {
+        format!("{secs:.1} s")
+    } else {
+        format!("{}:{:02} min", secs as u64 / 60, secs as u64 % 60)
+    }
+}

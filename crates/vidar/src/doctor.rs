@@ -1,0 +1,114 @@
+//! `vidar doctor`: what is possible with what is there. It never fails because something optional is absent.
+
+use crate::system::{Hardware, hardware};
+use serde::Serialize;
+use std::path::Path;
+
+/// One finding.
+#[derive(Clone, Debug, Serialize)]
+pub struct Finding {
+    /// What was looked at.
+    pub what: &'static str,
+    /// Whether it is as it should be, absent but optional, or in the way.
+    pub state: State,
+    /// What was found.
+    pub found: String,
+    /// What to do, if anything.
+    pub advice: Option<String>,
+}
+
+/// How a finding bears on a run.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum State {
+    /// As it should be.
+    Ok,
+    /// Absent, and nothing needs it.
+    Optional,
+    /// In the way of a run.
+    Problem,
+}
+
+/// Looks at machine, disk and environment.
+pub fn examine(folder: &Path) -> Vec<Finding> {
+    let machine = hardware();
+    vec![
+        finding("program", State::Ok, format!("vidar {}", crate::VERSION)),
+        cpu(&machine),
+        memory(&machine),
+        writable(folder),
+        finding(
+            "geometry",
+            State::Ok,
+            "stereo: built in, needs metric poses, no weights (MIT OR Apache-2.0)".into(),
+        ),
+        finding("weights", State::Optional, "none are read by this version (see WEIGHTS.md)".into()),
+        finding("gpu", State::Optional, "not used by this version; everything runs on the CPU".into()),
+        environment(),
+    ]
+}
+
+fn finding(what: &'static str, state: State, found: String) -> Finding {
+    Finding { what, state, found, advice: None }
+}
+
+fn cpu(machine: &Hardware) -> Finding {
+    let name = machine.cpu.clone().unwrap_or_else(|| "unknown CPU".into());
+    let features = machine.cpu_features.join(", ");
+    finding(
+        "cpu",
+        State::Ok,
+        format!("{name}, {} threads, {} [{features}]", machine.threads, machine.platform),
+    )
+}
+
+fn memory(machine: &Hardware) -> Finding {
+    const COMFORTABLE: u64 = 4 << 30;
+    match machine.memory_bytes {
+        None => finding("memory", State::Ok, "the system does not tell".into()),
+        Some(bytes) if bytes >= COMFORTABLE => finding("memory", State::Ok, crate::run::bytes(bytes)),
+        Some(bytes) => Finding {
+            what: "memory",
+            state: State::Ok,
+            found: crate::run::bytes(bytes),
+            advice: Some("bound the map with --set fusion.memory_budget_bytes=500000000".into()),
+        },
+    }
+}
+
+fn writable(folder: &Path) -> Finding {
+    let probe = folder.join(format!(".vidar-doctor-{}", std::process::id()));
+    let tried = std::fs::write(&probe, b"probe");
+    // Our own probe; if it cannot be removed there is nothing better to do.
+    let _ = std::fs::remove_file(&probe);
+    match tried {
+        Ok(()) => finding("output", State::Ok, format!("{} can be written", folder.display())),
+        Err(e) => Finding {
+            what: "output",
+            state: State::Problem,
+            found: format!("{} cannot be written: {e}", folder.display()),
+            advice: Some("change to another folder, or give -o".into()),
+        },
+    }
+}
+
+fn environment() -> Finding {
+    let set: Vec<String> =
+        std::env::vars().filter(|(k, _)| k.starts_with("VIDAR_")).map(|(k, _)| k).collect();
+    let found = if set.is_empty() { "no VIDAR_* variable is set".into() } else { set.join(", ") };
+    finding("environment", State::Ok, found)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_healthy_folder_has_no_problem_and_a_missing_one_has() {
+        let folder = tempfile::tempdir().unwrap();
+        assert!(examine(folder.path()).iter().all(|f| f.state != State::Problem));
+        let missing = examine(&folder.path().join("not/there"));
+        assert_eq!(missing.iter().filter(|f| f.state == State::Problem).count(), 1);
+        assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 0, "the probe is removed");
+    }
+}

@@ -1,0 +1,185 @@
+//! `vidar export`: other programs' formats, made after the fact from a run folder.
+
+use crate::error::Error;
+use crate::run::pose_of;
+use crate::run_folder::{StoredView, VIEWS_SCHEMA};
+use serde::Deserialize;
+use std::path::{Path, PathBuf};
+use std::str::FromStr;
+use vidar_core::{BodyFrame, CameraId, FrameId, PointCloud, StampedPose, Timestamp, Trajectory};
+use vidar_export::{ColmapFormat, ExportView};
+
+/// What to make.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum ExportTarget {
+    /// COLMAP model, binary, beside the images.
+    Colmap,
+    /// COLMAP model, text.
+    ColmapText,
+    /// nerfstudio `transforms.json`.
+    Nerfstudio,
+    /// Keyframe poses, TUM.
+    Tum,
+    /// Keyframe poses, KITTI with a file of times.
+    Kitti,
+    /// Keyframe poses, EuRoC csv.
+    Euroc,
+    /// Mesh and points as PLY.
+    Ply,
+    /// Mesh as GLB.
+    Glb,
+}
+
+/// Names on the command line.
+pub const TARGETS: &[(&str, ExportTarget)] = &[
+    ("colmap", ExportTarget::Colmap),
+    ("colmap-text", ExportTarget::ColmapText),
+    ("nerfstudio", ExportTarget::Nerfstudio),
+    ("tum", ExportTarget::Tum),
+    ("kitti", ExportTarget::Kitti),
+    ("euroc", ExportTarget::Euroc),
+    ("ply", ExportTarget::Ply),
+    ("glb", ExportTarget::Glb),
+];
+
+impl FromStr for ExportTarget {
+    type Err = String;
+    fn from_str(text: &str) -> Result<Self, String> {
+        let names = || TARGETS.iter().map(|(n, _)| *n).collect::<Vec<_>>().join(", ");
+        TARGETS
+            .iter()
+            .find(|(name, _)| *name == text)
+            .map(|(_, t)| *t)
+            .ok_or_else(|| format!("{text:?} is not one of {}", names()))
+    }
+}
+
+#[derive(Deserialize)]
+struct StoredViews {
+    schema: String,
+    views: Vec<StoredView>,
+}
+
+/// Reads the keyframes of a run folder.
+pub fn read_views(run: &Path) -> Result<Vec<StoredView>, Error> {
+    let path = run.join("views.json");
+    let not_a_run = |reason: String| Error::NotARun { path: run.to_owned(), reason };
+    let bytes = std::fs::read(&path).map_err(|e| not_a_run(format!("views.json: {e}")))?;
+    let stored: StoredViews =
+        serde_json::from_slice(&bytes).map_err(|e| not_a_run(format!("views.json: {e}")))?;
+    if stored.schema != VIEWS_SCHEMA {
+        return Err(not_a_run(format!(
+            "views.json has schema {:?}, expected {VIEWS_SCHEMA:?}",
+            stored.schema
+        )));
+    }
+    Ok(stored.views)
+}
+
+/// Makes `target` from the run folder `run` in the folder `out` and returns the files made.
+pub fn export_run(run: &Path, target: ExportTarget, out: &Path) -> Result<Vec<PathBuf>, Error> {
+    std::fs::create_dir_all(out).map_err(|e| Error::io("create", out, e))?;
+    match target {
+        ExportTarget::Colmap => colmap(run, out, ColmapFormat::Binary),
+        ExportTarget::ColmapText => colmap(run, out, ColmapFormat::Text),
+        ExportTarget::Nerfstudio => nerfstudio(run, out),
+        ExportTarget::Tum | ExportTarget::Kitti | ExportTarget::Euroc => trajectory(run, target, out),
+        ExportTarget::Ply => {
+            ["mesh.ply", "points.ply"].iter().map(|name| copy(run, "map", name, out)).collect()
+        }
+        ExportTarget::Glb => Ok(vec![copy(run, "map", "mesh.glb", out)?]),
+    }
+}
+
+fn colmap(run: &Path, out: &Path, format: ColmapFormat) -> Result<Vec<PathBuf>, Error> {
+    let views = export_views(run)?;
+    let sparse = out.join("sparse").join("0");
+    std::fs::create_dir_all(&sparse).map_err(|e| Error::io("create", &sparse, e))?;
+    vidar_export::write_colmap(&sparse, format, &views, &points(run)?)?;
+    let mut made = vec![sparse];
+    made.extend(copy_images(run, out)?);
+    Ok(made)
+}
+
+fn nerfstudio(run: &Path, out: &Path) -> Result<Vec<PathBuf>, Error> {
+    let mut views = export_views(run)?;
+    views.iter_mut().for_each(|v| v.image_name = format!("images/{}", v.image_name));
+    let json = out.join("transforms.json");
+    let points = copy(run, "map", "points.ply", out)?;
+    vidar_export::atomic::write_atomically(&json, |w| {
+        vidar_export::write_transforms_json(w, &views, Some("points.ply"))
+    })?;
+    let mut made = vec![json, points];
+    made.extend(copy_images(run, out)?);
+    Ok(made)
+}
+
+fn trajectory(run: &Path, target: ExportTarget, out: &Path) -> Result<Vec<PathBuf>, Error> {
+    let poses = read_views(run)?
+        .iter()
+        .filter_map(|v| {
+            Some(StampedPose { time: Timestamp::from_nanos(v.time_ns), world_from_body: pose_of(v)? })
+        })
+        .collect();
+    let trajectory = Trajectory::new(BodyFrame::Camera(CameraId(0)), poses)?;
+    let note = "keyframes of a VIDAR run";
+    let write = |name: &str, f: &dyn Fn(&mut dyn std::io::Write) -> Result<(), vidar_export::ExportError>| {
+        let path = out.join(name);
+        vidar_export::atomic::write_atomically(&path, f)?;
+        Ok::<PathBuf, Error>(path)
+    };
+    match target {
+        ExportTarget::Kitti => Ok(vec![
+            write("keyframes.kitti.txt", &|w| vidar_export::write_kitti(w, &trajectory))?,
+            write("keyframes.kitti.times.txt", &|w| vidar_export::write_kitti_times(w, &trajectory, note))?,
+        ]),
+        ExportTarget::Euroc => {
+            Ok(vec![write("keyframes.euroc.csv", &|w| vidar_export::write_euroc_csv(w, &trajectory, note))?])
+        }
+        _ => Ok(vec![write("keyframes.tum", &|w| vidar_export::write_tum(w, &trajectory, note))?]),
+    }
+}
+
+fn export_views(run: &Path) -> Result<Vec<ExportView>, Error> {
+    let views: Vec<ExportView> = read_views(run)?
+        .iter()
+        .filter_map(|v| {
+            Some(ExportView {
+                frame_id: FrameId(v.frame),
+                time: Timestamp::from_nanos(v.time_ns),
+                image_name: v.image.as_ref()?.rsplit('/').next()?.to_owned(),
+                world_from_camera: pose_of(v)?,
+                intrinsics: v.intrinsics,
+            })
+        })
+        .collect();
+    if views.is_empty() {
+        let reason = "it holds no images; run again with output.images = true".to_owned();
+        return Err(Error::NotARun { path: run.to_owned(), reason });
+    }
+    Ok(views)
+}
+
+fn points(run: &Path) -> Result<PointCloud, Error> {
+    let path = run.join("map/points.ply");
+    let bytes = std::fs::read(&path).map_err(|e| Error::io("read", &path, e))?;
+    Ok(vidar_export::read_ply(&bytes)?.cloud)
+}
+
+fn copy(run: &Path, folder: &str, name: &str, out: &Path) -> Result<PathBuf, Error> {
+    let (from, to) = (run.join(folder).join(name), out.join(name));
+    let bytes = std::fs::read(&from).map_err(|e| Error::io("read", &from, e))?;
+    crate::run_folder::write_whole(&to, &bytes)?;
+    Ok(to)
+}
+
+fn copy_images(run: &Path, out: &Path) -> Result<Vec<PathBuf>, Error> {
+    let images = out.join("images");
+    std::fs::create_dir_all(&images).map_err(|e| Error::io("create", &images, e))?;
+    for view in read_views(run)? {
+        if let Some(name) = view.image.as_deref().and_then(|p| p.rsplit('/').next()) {
+            copy(run, "images", name, &images)?;
+        }
+    }
+    Ok(vec![images])
+}

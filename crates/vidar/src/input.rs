@@ -1,0 +1,119 @@
+//! From a path to images with metric poses.
+
+use crate::config::{Config, PoseSource};
+use crate::error::Error;
+use crate::keyframes::PosedFrame;
+use serde::Serialize;
+use std::path::{Path, PathBuf};
+use vidar_core::{BodyFrame, CameraId, Duration, Trajectory, Warning};
+use vidar_dataset::{Dataset, OpenOptions};
+
+/// Where the metric poses of a run came from.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
+#[serde(tag = "source", rename_all = "kebab-case")]
+pub enum AnchorSource {
+    /// A trajectory that the user gave.
+    External {
+        /// Which file.
+        file: String,
+    },
+    /// The dataset's ground truth: scores made with it are an upper bound.
+    GroundTruth,
+}
+
+impl std::fmt::Display for AnchorSource {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match self {
+            Self::External { file } => write!(f, "external trajectory {file}"),
+            Self::GroundTruth => f.write_str("ground truth (upper bound)"),
+        }
+    }
+}
+
+/// The metric trajectory that everything is placed by, told of the camera in use.
+#[derive(Clone, Debug)]
+pub struct MetricAnchor {
+    /// Where it came from.
+    pub source: AnchorSource,
+    /// Poses of the camera in use.
+    pub camera_trajectory: Trajectory,
+}
+
+/// Applies the configuration's part of the options and opens the dataset.
+pub fn open_dataset(path: &Path, options: &OpenOptions, config: &Config) -> Result<Dataset, Error> {
+    let mut options = options.clone();
+    options.camera = CameraId(config.input.camera);
+    options.stride = config.input.stride;
+    options.start = Some(Duration::from_secs_f64(config.input.start_secs)).filter(|d| *d > Duration::ZERO);
+    options.end = Some(Duration::from_secs_f64(config.input.end_secs)).filter(|d| *d > Duration::ZERO);
+    Ok(vidar_dataset::open(path, &options)?)
+}
+
+/// The metric trajectory that the configuration asks for.
+pub fn metric_anchor(dataset: &Dataset, config: &Config) -> Result<MetricAnchor, Error> {
+    let external =
+        dataset.anchor.as_ref().map(|a| (&a.trajectory, AnchorSource::External { file: shown(&a.source) }));
+    let truth = dataset.ground_truth.as_ref().map(|t| (t, AnchorSource::GroundTruth));
+    let chosen = match config.input.poses {
+        PoseSource::Auto => external.or(truth),
+        PoseSource::External => external,
+        PoseSource::GroundTruth => truth,
+    };
+    let (trajectory, source) = chosen.ok_or_else(|| Error::NoAnchor { name: dataset.name.clone() })?;
+    Ok(MetricAnchor { source, camera_trajectory: in_camera(trajectory, dataset)? })
+}
+
+/// Ground truth told of the camera in use, if there is any that can be.
+pub fn truth_in_camera(dataset: &Dataset) -> Option<Trajectory> {
+    dataset.ground_truth.as_ref().and_then(|t| in_camera(t, dataset).ok())
+}
+
+fn in_camera(trajectory: &Trajectory, dataset: &Dataset) -> Result<Trajectory, Error> {
+    Ok(trajectory.in_frame(BodyFrame::Camera(dataset.camera), &dataset.rig)?)
+}
+
+/// Every image that has a pose. Images outside the trajectory are counted in a warning; none at all is an error.
+pub fn posed_frames(
+    dataset: &Dataset,
+    anchor: &MetricAnchor,
+    config: &Config,
+) -> Result<(Vec<PosedFrame>, Vec<Warning>), Error> {
+    let max_gap = Duration::from_secs_f64(config.input.max_pose_gap_secs);
+    let offset = dataset.rig.camera(dataset.camera).map_or(Duration::ZERO, |c| c.time_offset);
+    let frames: Vec<PosedFrame> = dataset
+        .images
+        .iter()
+        .filter_map(|image| {
+            // Poses are in the IMU's clock: t_imu = t_camera + offset.
+            let world_from_camera = anchor.camera_trajectory.interpolate(image.time + offset, max_gap)?;
+            Some(PosedFrame { image: image.clone(), world_from_camera })
+        })
+        .collect();
+    if frames.is_empty() {
+        let images = range(dataset.images.first().map(|i| i.time).zip(dataset.images.last().map(|i| i.time)));
+        return Err(Error::NoOverlap { images, poses: range(anchor.camera_trajectory.time_range()) });
+    }
+    let missing = dataset.images.len() - frames.len();
+    let mut warnings = Vec::new();
+    if missing > 0 {
+        let message = format!("{missing} of {} images have no pose and are left out", dataset.images.len());
+        warnings.push(
+            Warning::new("images-without-pose", message)
+                .hint("they lie outside the trajectory, or in a gap longer than input.max_pose_gap_secs"),
+        );
+    }
+    Ok((frames, warnings))
+}
+
+fn range(times: Option<(vidar_core::Timestamp, vidar_core::Timestamp)>) -> String {
+    times.map_or_else(|| "nothing".to_owned(), |(first, last)| format!("{first} to {last} s"))
+}
+
+fn shown(path: &Path) -> String {
+    path.display().to_string()
+}
+
+/// A path made absolute for the manifest, as far as the system can.
+pub fn absolute(path: &Path) -> PathBuf {
+    std::path::absolute(path).unwrap_or_else(|_| path.to_owned())
+}

@@ -1,0 +1,294 @@
+//! `vidar inspect`: what is in a recording, and is it healthy.
+
+use crate::error::Error;
+use nalgebra::Vector3;
+use serde::Serialize;
+use std::path::Path;
+use vidar_core::{CameraModel, FrameImage, RigCamera, Timestamp, Trajectory, Warning};
+use vidar_dataset::{Dataset, OpenOptions};
+
+/// A recording in numbers.
+#[derive(Clone, Debug, Serialize)]
+pub struct Inspection {
+    /// Its name.
+    pub name: String,
+    /// Its layout.
+    pub kind: String,
+    /// Why it was taken for that layout.
+    pub reason: String,
+    /// Streams with their rates.
+    pub streams: Vec<Stream>,
+    /// The camera in use, in words.
+    pub camera: Vec<String>,
+    /// The IMU, in words.
+    pub imu: Vec<String>,
+    /// Poses, in words.
+    pub poses: Vec<String>,
+    /// Brightness and sharpness of sampled images.
+    pub images: Option<ImageHealth>,
+    /// What can be done with it.
+    pub possible: Vec<String>,
+    /// What is not quite right.
+    pub warnings: Vec<Warning>,
+}
+
+/// One stream of readings.
+#[derive(Clone, Debug, Serialize)]
+pub struct Stream {
+    /// What it is.
+    pub what: String,
+    /// Number of readings.
+    pub count: usize,
+    /// First reading, s.
+    pub start_secs: f64,
+    /// Length, s.
+    pub length_secs: f64,
+    /// Median rate, Hz.
+    pub rate_hz: f64,
+    /// Longest time between two readings, s.
+    pub longest_gap_secs: f64,
+}
+
+/// Medians over sampled images.
+#[derive(Clone, Debug, Serialize)]
+pub struct ImageHealth {
+    /// Images looked at.
+    pub sampled: usize,
+    /// Those that could not be read.
+    pub unreadable: usize,
+    /// Median of mean brightness, 0…255.
+    pub brightness: f64,
+    /// Median share of pixels at 0 or 255, 0…1.
+    pub clipped: f64,
+    /// Median variance of the Laplacian; below about 20 an image is blurred or without texture.
+    pub sharpness: f64,
+}
+
+/// Images looked at; enough for a median, few enough for a first impression.
+const SAMPLED_IMAGES: usize = 9;
+
+/// Opens the recording and looks.
+pub fn inspect(path: &Path, options: &OpenOptions) -> Result<Inspection, Error> {
+    let dataset = vidar_dataset::open(path, options)?;
+    let images: Vec<Timestamp> = dataset.images.iter().map(|i| i.time).collect();
+    let imu: Vec<Timestamp> = dataset.imu.iter().map(|s| s.time).collect();
+    let depths: Vec<Timestamp> = dataset.depths.iter().map(|d| d.time).collect();
+    let truth: Vec<Timestamp> = times(dataset.ground_truth.as_ref());
+    let anchor: Vec<Timestamp> = times(dataset.anchor.as_ref().map(|a| &a.trajectory));
+    let camera = format!("images of camera {}", dataset.camera);
+    let streams = [
+        (camera.as_str(), images),
+        ("IMU", imu),
+        ("depth images", depths),
+        ("ground truth", truth),
+        ("trajectory", anchor),
+    ]
+    .into_iter()
+    .filter_map(|(what, times)| stream(what, &times))
+    .collect();
+    Ok(Inspection {
+        name: dataset.name.clone(),
+        kind: dataset.kind.to_string(),
+        reason: dataset.reason.clone(),
+        streams,
+        camera: camera_words(&dataset),
+        imu: imu_words(&dataset),
+        poses: pose_words(&dataset),
+        images: image_health(&dataset),
+        possible: possible(&dataset),
+        warnings: dataset.warnings.clone(),
+    })
+}
+
+fn times(trajectory: Option<&Trajectory>) -> Vec<Timestamp> {
+    trajectory.map(|t| t.poses().iter().map(|p| p.time).collect()).unwrap_or_default()
+}
+
+fn stream(what: &str, times: &[Timestamp]) -> Option<Stream> {
+    let (first, last) = (*times.first()?, *times.last()?);
+    let mut gaps: Vec<i64> = times.windows(2).map(|w| (w[1] - w[0]).nanos()).collect();
+    gaps.sort_unstable();
+    let median = gaps.get(gaps.len() / 2).copied().unwrap_or(0);
+    Some(Stream {
+        what: what.to_owned(),
+        count: times.len(),
+        start_secs: first.as_secs_f64(),
+        length_secs: (last - first).as_secs_f64(),
+        rate_hz: if median > 0 { 1e9 / median as f64 } else { 0.0 },
+        longest_gap_secs: gaps.last().copied().unwrap_or(0) as f64 * 1e-9,
+    })
+}
+
+fn camera_words(dataset: &Dataset) -> Vec<String> {
+    let Some(camera) = dataset.rig.camera(dataset.camera) else { return Vec::new() };
+    let model = &camera.model;
+    let k = model.intrinsics();
+    let mut words = vec![format!(
+        "{} {}x{}, f {:.1}/{:.1} px, centre {:.1}/{:.1} px, calibration: {:?}",
+        model.name(),
+        k.width,
+        k.height,
+        k.fx,
+        k.fy,
+        k.cx,
+        k.cy,
+        dataset.calibration
+    )];
+    if let Some((across, down)) = field_of_view_deg(model) {
+        words.push(format!("sees {across:.0} x {down:.0} degrees"));
+    }
+    words.push(place_words(camera));
+    words
+}
+
+/// Angles between the directions of opposite border pixels.
+fn field_of_view_deg(model: &CameraModel) -> Option<(f64, f64)> {
+    let (w, h) = (model.width() as f64 - 1.0, model.height() as f64 - 1.0);
+    let ray = |x: f64, y: f64| model.unproject(&nalgebra::Vector2::new(x, y));
+    let across = ray(0.0, h / 2.0)?.angle(&ray(w, h / 2.0)?);
+    let down = ray(w / 2.0, 0.0)?.angle(&ray(w / 2.0, h)?);
+    Some((across.to_degrees(), down.to_degrees()))
+}
+
+/// Where the camera sits on the body, as a person would say it.
+fn place_words(camera: &RigCamera) -> String {
+    let t = camera.body_from_camera.translation;
+    let forward = camera.body_from_camera.rotation * Vector3::z();
+    let centimetres: Vec<String> = ["x", "y", "z"]
+        .iter()
+        .zip(t.iter())
+        .map(|(axis, v)| format!("{axis} {:+.1} cm", v * 100.0))
+        .collect();
+    let axis = |v: Vector3<f64>| {
+        let (index, name) = [(0, "x"), (1, "y"), (2, "z")]
+            .into_iter()
+            .max_by(|a, b| v[a.0].abs().total_cmp(&v[b.0].abs()))
+            .unwrap_or((2, "z"));
+        format!("{}{name}", if v[index] < 0.0 { "-" } else { "+" })
+    };
+    format!(
+        "body_from_camera: sits at {} of the body, looks along body {}",
+        centimetres.join(", "),
+        axis(forward)
+    )
+}
+
+fn imu_words(dataset: &Dataset) -> Vec<String> {
+    if dataset.imu.is_empty() {
+        return vec!["none: scale can come from an external trajectory only".into()];
+    }
+    let mut words = Vec::new();
+    let n = dataset.imu.len() as f64;
+    let accel: f64 = dataset.imu.iter().map(|s| s.accel.0.norm()).sum::<f64>() / n;
+    let gyro: f64 = dataset.imu.iter().map(|s| s.gyro.0.norm()).sum::<f64>() / n;
+    words.push(format!(
+        "mean |specific force| {accel:.2} m/s2 (at rest: 9.8), mean |rate| {:.1} deg/s",
+        gyro.to_degrees()
+    ));
+    match &dataset.rig.imu {
+        Some(noise) => words.push(format!(
+            "noise: gyro {:.1e} rad/s/sqrt(Hz), accel {:.1e} m/s2/sqrt(Hz), {} Hz",
+            noise.gyro_noise_density, noise.accel_noise_density, noise.rate_hz
+        )),
+        None => words.push("noise: not in the calibration".into()),
+    }
+    words
+}
+
+fn pose_words(dataset: &Dataset) -> Vec<String> {
+    let describe = |what: &str, t: &Trajectory| {
+        format!("{what}: {} poses of the {}, path {:.1} m", t.len(), t.body(), t.path_length_m())
+    };
+    let mut words = Vec::new();
+    words.extend(dataset.ground_truth.as_ref().map(|t| describe("ground truth", t)));
+    words.extend(dataset.anchor.as_ref().map(|a| describe("external trajectory", &a.trajectory)));
+    if words.is_empty() {
+        words.push("none".into());
+    }
+    words
+}
+
+fn image_health(dataset: &Dataset) -> Option<ImageHealth> {
+    let n = dataset.images.len();
+    let chosen: Vec<usize> = (0..SAMPLED_IMAGES.min(n)).map(|i| i * n / SAMPLED_IMAGES.min(n)).collect();
+    let loaded: Vec<Option<FrameImage>> =
+        chosen.iter().map(|&i| dataset.load_image(&dataset.images[i]).ok()).collect();
+    let unreadable = loaded.iter().filter(|i| i.is_none()).count();
+    let measured: Vec<[f64; 3]> = loaded.iter().flatten().map(measure).collect();
+    if measured.is_empty() {
+        return None;
+    }
+    let median = |which: usize| {
+        let mut values: Vec<f64> = measured.iter().map(|m| m[which]).collect();
+        values.sort_by(f64::total_cmp);
+        values[values.len() / 2]
+    };
+    Some(ImageHealth {
+        sampled: chosen.len(),
+        unreadable,
+        brightness: median(0),
+        clipped: median(1),
+        sharpness: median(2),
+    })
+}
+
+/// Mean brightness, share of clipped pixels, variance of the Laplacian.
+fn measure(image: &FrameImage) -> [f64; 3] {
+    let gray = image.to_gray8();
+    let n = gray.data().len().max(1) as f64;
+    let mean = gray.data().iter().map(|&p| f64::from(p)).sum::<f64>() / n;
+    let clipped = gray.data().iter().filter(|&&p| p == 0 || p == 255).count() as f64 / n;
+    let (mut sum, mut squares, mut count) = (0.0, 0.0, 0.0);
+    for y in 1..gray.height().saturating_sub(1) {
+        for x in 1..gray.width().saturating_sub(1) {
+            let at = |dx: usize, dy: usize| f64::from(gray[(x + dx - 1, y + dy - 1)]);
+            let laplacian = at(0, 1) + at(2, 1) + at(1, 0) + at(1, 2) - 4.0 * at(1, 1);
+            sum += laplacian;
+            squares += laplacian * laplacian;
+            count += 1.0;
+        }
+    }
+    let count = f64::max(count, 1.0);
+    [mean, clipped, squares / count - (sum / count).powi(2)]
+}
+
+fn possible(dataset: &Dataset) -> Vec<String> {
+    let mut lines = Vec::new();
+    match (&dataset.anchor, &dataset.ground_truth) {
+        (Some(_), _) => lines.push("vidar run: metric map anchored by the external trajectory".into()),
+        (None, Some(_)) => {
+            lines.push("vidar run: metric map anchored by ground truth (an upper bound)".into())
+        }
+        (None, None) => lines.push("vidar run: not yet; give metric poses with --trajectory FILE".into()),
+    }
+    if dataset.reference_cloud.is_some() || dataset.depth_sensor.is_some() {
+        lines.push("the map will be judged against the scan or the depth sensor".into());
+    }
+    lines
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use vidar_core::Image;
+
+    #[test]
+    fn a_stream_knows_its_rate_and_longest_gap() {
+        let times: Vec<Timestamp> =
+            [0, 50, 100, 150, 400, 450].map(|ms| Timestamp::from_nanos(ms * 1_000_000)).into();
+        let stream = stream("x", &times).unwrap();
+        assert!((stream.rate_hz - 20.0).abs() < 1e-9);
+        assert!((stream.longest_gap_secs - 0.25).abs() < 1e-9);
+        assert!((stream.length_secs - 0.45).abs() < 1e-9);
+    }
+
+    #[test]
+    fn a_flat_image_is_unsharp_and_a_checkerboard_is_sharp() {
+        let flat = measure(&FrameImage::Gray8(Image::filled(20, 20, 100)));
+        assert_eq!(flat, [100.0, 0.0, 0.0]);
+        let board = FrameImage::Gray8(Image::from_fn(20, 20, |x, y| if (x + y) % 2 == 0 { 0 } else { 255 }));
+        let [_, clipped, sharpness] = measure(&board);
+        assert_eq!(clipped, 1.0);
+        assert!(sharpness > 1e5);
+    }
+}

@@ -1,0 +1,104 @@
+//! Frames that carry geometry: those with a metric pose, far enough from the last one.
+
+use crate::config::KeyframeConfig;
+use vidar_core::{LieGroup, Se3};
+use vidar_dataset::ImageEntry;
+
+/// A frame with its metric pose.
+#[derive(Clone, Debug)]
+pub struct PosedFrame {
+    /// The image.
+    pub image: ImageEntry,
+    /// Pose of its camera.
+    pub world_from_camera: Se3,
+}
+
+/// Chooses keyframes: the first frame, then each that moved or turned enough since the last one chosen.
+///
+/// With `max_count`, the distances are widened by the smallest factor (searched by bisection) that obeys it.
+pub fn select_keyframes(frames: &[PosedFrame], config: &KeyframeConfig) -> Vec<PosedFrame> {
+    let chosen = choose(frames, config, 1.0);
+    let count = |factor: f64| choose(frames, config, factor).len();
+    if config.max_count == 0 || chosen.len() <= config.max_count {
+        return pick(frames, &chosen);
+    }
+    let (mut low, mut high) = (1.0, 2.0);
+    while count(high) > config.max_count && high < 1e9 {
+        (low, high) = (high, high * 2.0);
+    }
+    for _ in 0..30 {
+        let middle = 0.5 * (low + high);
+        if count(middle) > config.max_count { low = middle } else { high = middle }
+    }
+    pick(frames, &choose(frames, config, high))
+}
+
+fn choose(frames: &[PosedFrame], config: &KeyframeConfig, factor: f64) -> Vec<usize> {
+    let mut chosen: Vec<usize> = Vec::new();
+    let far = config.min_translation_m * factor;
+    let turned = config.min_rotation_deg.to_radians() * factor;
+    for (index, frame) in frames.iter().enumerate() {
+        let Some(&last) = chosen.last() else {
+            chosen.push(index);
+            continue;
+        };
+        let last_from_this = frames[last].world_from_camera.inverse() * frame.world_from_camera;
+        if last_from_this.translation.norm() >= far || last_from_this.rotation.angle_rad() >= turned {
+            chosen.push(index);
+        }
+    }
+    chosen
+}
+
+fn pick(frames: &[PosedFrame], chosen: &[usize]) -> Vec<PosedFrame> {
+    chosen.iter().map(|&i| frames[i].clone()).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use nalgebra::Vector3;
+    use vidar_core::{CameraId, FrameId, So3, Timestamp};
+
+    fn frame(i: u32, x: f64, yaw: f64) -> PosedFrame {
+        PosedFrame {
+            image: ImageEntry {
+                frame_id: FrameId(i),
+                time: Timestamp::from_nanos(i64::from(i)),
+                camera: CameraId(0),
+                path: Default::default(),
+            },
+            world_from_camera: Se3::new(So3::exp(&Vector3::new(0.0, yaw, 0.0)), Vector3::new(x, 0.0, 0.0)),
+        }
+    }
+
+    fn ids(frames: &[PosedFrame]) -> Vec<u32> {
+        frames.iter().map(|f| f.image.frame_id.0).collect()
+    }
+
+    #[test]
+    fn moving_or_turning_enough_makes_a_keyframe() {
+        let config = KeyframeConfig { min_translation_m: 0.1, min_rotation_deg: 10.0, max_count: 0 };
+        let frames: Vec<_> = (0..11).map(|i| frame(i, f64::from(i) * 0.0401, 0.0)).collect();
+        assert_eq!(ids(&select_keyframes(&frames, &config)), [0, 3, 6, 9]);
+        let turning: Vec<_> = (0..7).map(|i| frame(i, 0.0, f64::from(i) * 0.0901)).collect();
+        assert_eq!(ids(&select_keyframes(&turning, &config)), [0, 2, 4, 6]);
+    }
+
+    #[test]
+    fn standing_still_gives_one_keyframe_and_nothing_gives_none() {
+        let config = KeyframeConfig::default();
+        let still: Vec<_> = (0..50).map(|i| frame(i, 0.0, 0.0)).collect();
+        assert_eq!(ids(&select_keyframes(&still, &config)), [0]);
+        assert!(select_keyframes(&[], &config).is_empty());
+    }
+
+    #[test]
+    fn a_limit_widens_the_distance_evenly() {
+        let config = KeyframeConfig { min_translation_m: 0.01, min_rotation_deg: 10.0, max_count: 10 };
+        let frames: Vec<_> = (0..1000).map(|i| frame(i, f64::from(i) * 0.02, 0.0)).collect();
+        let chosen = ids(&select_keyframes(&frames, &config));
+        assert_eq!(chosen.len(), 10);
+        assert!(*chosen.last().unwrap() > 880, "the end of the path is covered: {chosen:?}");
+    }
+}

@@ -1,0 +1,153 @@
+//! Files of the run folder: trajectories, map, depth sidecar, scores, README.
+
+use super::{Judgement, Plan, RunOutcome, RunRequest, anchored_by_truth, keyframe_trajectory};
+use crate::config::Config;
+use crate::error::Error;
+use crate::events::{Event, Events};
+use crate::run_folder::{MANIFEST_SCHEMA, RunFolder, StoredView, VIEWS_SCHEMA, pretty};
+use serde_json::{Value, json};
+use vidar_core::{FrameId, Se3, Timestamp, Trajectory};
+use vidar_export::{DepthFrame, DepthSidecar, ExportError};
+
+/// Writes everything but pictures and manifest.
+pub fn write(
+    outcome: &RunOutcome,
+    config: &Config,
+    request: &RunRequest,
+    folder: &RunFolder,
+    events: &Events,
+) -> Result<(), Error> {
+    let writer = Writer { folder, events };
+    let plan = &outcome.plan;
+    writer.trajectory("trajectory/anchor_camera", &plan.anchor.camera_trajectory, plan)?;
+    if let Some(keyframes) = keyframe_trajectory(plan) {
+        writer.trajectory("trajectory/keyframes_camera", &keyframes, plan)?;
+    }
+    writer.bytes("views.json", &pretty(&json!({ "schema": VIEWS_SCHEMA, "views": outcome.map.views })))?;
+    if config.output.depth_png && !outcome.map.views.is_empty() {
+        writer.export("depth/depth.json", |w| sidecar(outcome, config).write(w))?;
+    }
+    let comments = vec![
+        "VIDAR metric map".to_owned(),
+        "frame: world, right-handed; unit: metre".to_owned(),
+        format!("metric poses: {}", plan.anchor.source),
+        format!("geometry: {}", plan.model.name),
+    ];
+    let map = &outcome.map;
+    writer.export("map/mesh.ply", |w| vidar_export::write_ply_mesh(w, &map.mesh, &comments))?;
+    writer.export("map/points.ply", |w| vidar_export::write_ply_cloud(w, &map.cloud, &comments))?;
+    if config.output.mesh_glb && !map.mesh.triangles.is_empty() {
+        writer.export("map/mesh.glb", |w| vidar_export::write_glb_mesh(w, &map.mesh, &comments))?;
+    }
+    writer.bytes("map/coverage.json", &pretty(&map.coverage))?;
+    writer.bytes("eval/metrics.json", &pretty(&metrics(&outcome.judgement, plan)))?;
+    writer.bytes("README.txt", readme(outcome, request).as_bytes())
+}
+
+struct Writer<'a> {
+    folder: &'a RunFolder,
+    events: &'a Events,
+}
+
+impl Writer<'_> {
+    fn bytes(&self, path: &str, bytes: &[u8]) -> Result<(), Error> {
+        let bytes = self.folder.write(path, bytes)?;
+        self.events.emit(&Event::ArtifactWritten { path: path.to_owned(), bytes });
+        Ok(())
+    }
+
+    /// Streams through a buffer beside the target, so that large maps need no second copy in memory.
+    fn export(
+        &self,
+        path: &str,
+        write: impl FnOnce(&mut dyn std::io::Write) -> Result<(), ExportError>,
+    ) -> Result<(), Error> {
+        let target = self.folder.file(path)?;
+        vidar_export::atomic::write_atomically(&target, write)?;
+        let bytes = std::fs::metadata(&target).map(|m| m.len()).unwrap_or(0);
+        self.events.emit(&Event::ArtifactWritten { path: path.to_owned(), bytes });
+        Ok(())
+    }
+
+    fn trajectory(&self, stem: &str, trajectory: &Trajectory, plan: &Plan) -> Result<(), Error> {
+        let note = format!("metric poses: {}", plan.anchor.source);
+        self.export(&format!("{stem}.tum"), |w| vidar_export::write_tum(w, trajectory, &note))?;
+        self.export(&format!("{stem}.euroc.csv"), |w| vidar_export::write_euroc_csv(w, trajectory, &note))
+    }
+}
+
+fn sidecar(outcome: &RunOutcome, config: &Config) -> DepthSidecar {
+    let views = &outcome.map.views;
+    let frames = views
+        .iter()
+        .filter_map(|v| {
+            let file = v.depth.as_ref()?.rsplit('/').next()?.to_owned();
+            let pose = pose_of(v)?;
+            Some(DepthFrame::new(file, FrameId(v.frame), Timestamp::from_nanos(v.time_ns), &pose))
+        })
+        .collect();
+    let intrinsics = views.first().map_or(outcome.plan.view, |v| v.intrinsics);
+    DepthSidecar::new(config.output.depth_units_per_metre, &intrinsics, frames)
+}
+
+/// The stored 3×4 matrix as a motion.
+pub fn pose_of(view: &StoredView) -> Option<Se3> {
+    let mut matrix = nalgebra::Matrix4::identity();
+    for (r, row) in view.world_from_camera.iter().enumerate() {
+        for (c, value) in row.iter().enumerate() {
+            matrix[(r, c)] = *value;
+        }
+    }
+    Se3::from_matrix(&matrix)
+}
+
+fn metrics(judgement: &Judgement, plan: &Plan) -> Value {
+    json!({
+        "schema": "vidar.metrics/1",
+        "metric_poses": plan.anchor.source,
+        "poses_are_ground_truth": anchored_by_truth(plan),
+        "reference": plan.reference.to_string(),
+        "scores": crate::evaluate::scores(judgement),
+        "judgement": judgement,
+    })
+}
+
+/// Counts and scores for the manifest and `--json`.
+pub fn result_json(outcome: &RunOutcome) -> Value {
+    let judgement = &outcome.judgement;
+    json!({
+        "keyframes": outcome.plan.keyframes.len(),
+        "keyframes_with_depth": outcome.map.views.len(),
+        "mesh_triangles": outcome.map.mesh.triangles.len(),
+        "points": outcome.map.cloud.len(),
+        "coverage": outcome.map.coverage,
+        "volume_bytes": outcome.map.volume_bytes,
+        "metric_poses": outcome.plan.anchor.source,
+        "judgement": judgement,
+        "seconds": outcome.seconds,
+    })
+}
+
+fn readme(outcome: &RunOutcome, request: &RunRequest) -> String {
+    let plan: String = outcome.plan.lines().iter().map(|(k, v)| format!("  {k:<18} {v}\n")).collect();
+    format!(
+        "A run of VIDAR {version} ({MANIFEST_SCHEMA})\n\n{plan}\n\
+         Frames and units\n\
+         \x20 world: right-handed; metres. With an inertial or ground-truth trajectory z points up.\n\
+         \x20 camera: x right, y down, z forward; pixel (0, 0) is the centre of the top-left pixel.\n\
+         \x20 a_from_b maps coordinates in b to coordinates in a.\n\n\
+         Files\n\
+         \x20 report.html                    everything below in pictures and numbers\n\
+         \x20 map/mesh.ply, mesh.glb         surface (GLB is y-up by a root node; PLY is in the world frame)\n\
+         \x20 map/points.ply                 points with normals, colour, confidence\n\
+         \x20 trajectory/*.tum, *.csv        world_from_camera of the anchor and of the keyframes\n\
+         \x20 depth/*.png, depth.json        z-depth, 16 bit, 0 = none; scale and cameras in depth.json\n\
+         \x20 images/*.png, views.json       undistorted keyframes with intrinsics and world_from_camera\n\
+         \x20 eval/metrics.json              scores and what they were judged against\n\
+         \x20 config.resolved.toml           every setting with its origin\n\
+         \x20 manifest.json, log.jsonl       versions, hashes, timings, events\n\n\
+         To do it again\n  {command}\n",
+        version = crate::VERSION,
+        command = request.command.join(" "),
+    )
+}

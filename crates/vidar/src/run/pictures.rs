@@ -1,0 +1,423 @@
+//! Pictures of a run and its one-file report.
+
+use super::{RunOutcome, RunRequest, anchored_by_truth, keyframe_trajectory};
+use crate::error::{Error, ExitStatus};
+use crate::evaluate::{surface_lines, trajectory_lines};
+use crate::events::{Event, Events};
+use crate::input::truth_in_camera;
+use crate::run_folder::{RunFolder, StoredView};
+use vidar_core::Trajectory;
+use vidar_dataset::Dataset;
+use vidar_view::{
+    AxisSpec, Figure, FigureWidth, Histogram, MapCamera, MapSurface, Picture, PictureSize, PlotTrajectory,
+    Report, Section, Shading, SummaryItem, Table, TrajectoryPlot, Verdict, VerdictLevel, Viewpoint,
+};
+
+const MAP_SIZE: (usize, usize) = (960, 640);
+const PLOT_SIZE: (usize, usize) = (960, 640);
+/// Keyframes shown with image and depth, spread over the run.
+const SHOWN_VIEWS: usize = 6;
+
+/// Draws everything and writes `pictures/*.png` and `report.html`.
+pub fn draw(
+    outcome: &RunOutcome,
+    dataset: &Dataset,
+    request: &RunRequest,
+    folder: &RunFolder,
+    events: &Events,
+) -> Result<(), Error> {
+    let mut album = Album { folder, events };
+    let path = keyframe_trajectory(&outcome.plan);
+    let up = vidar_view::up_of_world(path.as_ref().unwrap_or(&outcome.plan.anchor.camera_trajectory));
+    let report = Report {
+        title: format!("VIDAR: {}", dataset.name),
+        subtitle: format!("{}; metric poses: {}", outcome.plan.input, outcome.plan.anchor.source),
+        verdict: Some(verdict(outcome)),
+        summary: summary(outcome),
+        sections: vec![
+            map_section(outcome, path.as_ref(), &up, &mut album)?,
+            judgement_section(outcome, path.as_ref(), &up, &mut album)?,
+            trajectory_section(outcome, dataset, &up, &mut album)?,
+            depth_section(outcome, folder, &mut album)?,
+            plan_section(outcome),
+        ],
+        warnings: outcome.warnings.clone(),
+        provenance: vec![
+            ("command".into(), request.command.join(" ")),
+            ("version".into(), crate::VERSION.into()),
+            ("started".into(), outcome.plan.started.clone()),
+            ("model".into(), format!("{} ({})", outcome.plan.model.name, outcome.plan.model.licence)),
+        ],
+    };
+    let html = vidar_view::render_html(&report);
+    let bytes = folder.write("report.html", html.as_bytes())?;
+    events.emit(&Event::ArtifactWritten { path: "report.html".into(), bytes });
+    Ok(())
+}
+
+struct Album<'a> {
+    folder: &'a RunFolder,
+    events: &'a Events,
+}
+
+impl Album<'_> {
+    fn figure(
+        &mut self,
+        name: &str,
+        picture: &Picture,
+        caption: &str,
+        width: FigureWidth,
+    ) -> Result<Figure, Error> {
+        let png = vidar_view::encode_png(picture)?;
+        let path = format!("pictures/{name}.png");
+        let bytes = self.folder.write(&path, &png)?;
+        self.events.emit(&Event::ArtifactWritten { path, bytes });
+        Ok(Figure { png, caption: caption.to_owned(), alt: caption.to_owned(), width })
+    }
+}
+
+fn verdict(outcome: &RunOutcome) -> Verdict {
+    let upper = if anchored_by_truth(&outcome.plan) {
+        "; poses are ground truth, so this is an upper bound"
+    } else {
+        ""
+    };
+    let (level, text) =
+        match (outcome.status, outcome.judgement.surface.as_ref().and_then(|s| s.native.last())) {
+            (ExitStatus::Interrupted, _) => {
+                (VerdictLevel::Bad, "interrupted: only a part was mapped".to_owned())
+            }
+            (ExitStatus::Degraded, _) => {
+                (VerdictLevel::Caution, "finished, but part of the input is missing (see warnings)".into())
+            }
+            (_, Some(s)) => (
+                if s.f >= 0.5 { VerdictLevel::Good } else { VerdictLevel::Caution },
+                format!("F {:.3} at {:.2} m against the reference{upper}", s.f, s.threshold_m),
+            ),
+            (_, None) => (VerdictLevel::Unjudged, "there is no reference to judge the surface by".to_owned()),
+        };
+    Verdict { level, text }
+}
+
+/// What was made, how far to trust it, how long it took, what next.
+pub fn summary_lines(outcome: &RunOutcome) -> Vec<(&'static str, String)> {
+    let map = &outcome.map;
+    let folder = outcome.folder.display();
+    let mut lines = vec![
+        (
+            "map",
+            format!(
+                "{folder}/map/mesh.ply ({} triangles), points.ply ({} points)",
+                map.mesh.triangles.len(),
+                map.cloud.len()
+            ),
+        ),
+        ("keyframes", format!("{} of {} with depth", map.views.len(), outcome.plan.keyframes.len())),
+        (
+            "surface",
+            format!(
+                "{:.1} m2, seen by {:.1} views on average",
+                map.coverage.surface_area_m2, map.coverage.mean_observations
+            ),
+        ),
+        ("metric poses", outcome.plan.anchor.source.to_string()),
+    ];
+    match &outcome.judgement.trajectory {
+        Some(t) => {
+            let number = |v: Option<f64>| v.map_or_else(|| "not determined".into(), |v| format!("{v:.4}"));
+            let ate = number(t.ate_se3_m.as_ref().map(|s| s.rmse));
+            lines.push((
+                "trajectory",
+                format!("ATE {ate} m, |ln s| {} ({} matched)", number(t.scale_error), t.matched),
+            ));
+        }
+        None if anchored_by_truth(&outcome.plan) => lines.push(("scale", "metric by ground truth".into())),
+        None => {
+            lines.push(("scale", "as metric as the trajectory given; no ground truth to check it".into()))
+        }
+    }
+    match &outcome.judgement.surface {
+        Some(surface) => {
+            let f: Vec<String> = surface
+                .native
+                .iter()
+                .map(|s| {
+                    format!("F@{:.2} {:.3} (P {:.3}, R {:.3})", s.threshold_m, s.f, s.precision, s.recall)
+                })
+                .collect();
+            lines.push(("how good", f.join("  ")));
+        }
+        None => lines.push(("how good", "not judged: no reference".into())),
+    }
+    if let Some(metric) = outcome.judgement.depth.as_ref().and_then(|d| d.summary.pixel_weighted.metric) {
+        let complete =
+            outcome.judgement.depth.as_ref().map_or(0.0, |d| d.summary.pixel_weighted.completeness);
+        lines.push((
+            "depth",
+            format!(
+                "AbsRel {:.4}, delta<1.25 {:.3}, on {:.0} % of the sensor's pixels",
+                metric.abs_rel,
+                metric.delta_1,
+                complete * 100.0
+            ),
+        ));
+    }
+    let memory = crate::system::peak_memory_bytes()
+        .map_or_else(String::new, |b| format!(", peak memory {}", super::bytes(b)));
+    lines.push(("took", format!("{:.1} s{memory}", outcome.seconds)));
+    lines.push(("look at it", format!("{folder}/report.html")));
+    lines
+}
+
+fn summary(outcome: &RunOutcome) -> Vec<SummaryItem> {
+    let item = |label: &str, value: String, why: &str| SummaryItem {
+        label: label.into(),
+        value,
+        explanation: why.into(),
+    };
+    let mut items = Vec::new();
+    if let Some(surface) = &outcome.judgement.surface {
+        for s in &surface.native {
+            items.push(item(
+                &format!("F@{:.2} m", s.threshold_m),
+                format!("{:.3}", s.f),
+                "harmonic mean of precision and recall at this distance",
+            ));
+        }
+    }
+    if let Some(t) = &outcome.judgement.trajectory {
+        if let Some(ate) = &t.ate_se3_m {
+            items.push(item(
+                "ATE SE(3)",
+                format!("{:.3} m", ate.rmse),
+                "RMSE of positions after a rigid fit",
+            ));
+        }
+        if let Some(scale) = t.scale_error {
+            items.push(item("|ln s|", format!("{scale:.4}"), "scale error: 0.01 is one percent"));
+        }
+    }
+    if let Some(m) = outcome.judgement.depth.as_ref().and_then(|d| d.summary.pixel_weighted.metric) {
+        items.push(item(
+            "depth AbsRel",
+            format!("{:.4}", m.abs_rel),
+            "mean relative depth error against the depth sensor",
+        ));
+    }
+    items.push(item(
+        "keyframes",
+        format!("{}/{}", outcome.map.views.len(), outcome.plan.keyframes.len()),
+        "with depth, of all chosen",
+    ));
+    items.push(item(
+        "surface",
+        format!("{:.1} m²", outcome.map.coverage.surface_area_m2),
+        "area of the mesh",
+    ));
+    items
+}
+
+fn size(of: (usize, usize)) -> PictureSize {
+    PictureSize::new(of.0, of.1)
+}
+
+fn map_section(
+    outcome: &RunOutcome,
+    path: Option<&Trajectory>,
+    up: &nalgebra::Vector3<f64>,
+    album: &mut Album<'_>,
+) -> Result<Section, Error> {
+    let mesh = &outcome.map.mesh;
+    let mut section = Section { heading: "Map".into(), ..Section::default() };
+    if mesh.triangles.is_empty() {
+        section.paragraphs.push("The map has no triangle.".into());
+        return Ok(section);
+    }
+    let aspect = MAP_SIZE.0 as f64 / MAP_SIZE.1 as f64;
+    for viewpoint in Viewpoint::ALL {
+        let camera = MapCamera::fixed(viewpoint, &mesh.positions, path, up, aspect);
+        let picture =
+            vidar_view::render_map(MapSurface::Mesh(mesh), &camera, size(MAP_SIZE), Shading::Color)?;
+        let name = format!("map-{}", viewpoint.name());
+        section.figures.push(album.figure(&name, &picture, viewpoint.caption(), FigureWidth::Half)?);
+    }
+    let c = &outcome.map.coverage;
+    section.tables.push(Table {
+        caption: "Coverage".into(),
+        columns: vec!["What".into(), "Value".into()],
+        rows: vec![
+            vec!["triangles".into(), mesh.triangles.len().to_string()],
+            vec!["points".into(), outcome.map.cloud.len().to_string()],
+            vec!["area".into(), format!("{:.2} m²", c.surface_area_m2)],
+            vec!["observed volume".into(), format!("{:.2} m³", c.observed_volume_m3)],
+            vec!["views per surface voxel".into(), format!("{:.1}", c.mean_observations)],
+            vec!["seen by three views or more".into(), format!("{:.1} %", c.share_seen_by_3_or_more * 100.0)],
+        ],
+    });
+    Ok(section)
+}
+
+fn judgement_section(
+    outcome: &RunOutcome,
+    path: Option<&Trajectory>,
+    up: &nalgebra::Vector3<f64>,
+    album: &mut Album<'_>,
+) -> Result<Section, Error> {
+    let mut section = Section { heading: "Judgement".into(), ..Section::default() };
+    section.paragraphs.push(format!("Judged against {}.", outcome.plan.reference));
+    if anchored_by_truth(&outcome.plan) {
+        section.paragraphs.push("Poses are ground truth: dense scores are an upper bound, and trajectory scores are left out because they would compare ground truth with itself.".into());
+    }
+    if let Some(surface) = &outcome.judgement.surface {
+        section.tables.push(table(
+            "Surface, native-scale bounded placement (paper, section IV-B)",
+            surface_lines(surface),
+        ));
+    }
+    if let Some(depth) = &outcome.judgement.depth {
+        let p = &depth.summary.pixel_weighted;
+        let mut rows = vec![vec!["completeness".into(), format!("{:.1} %", p.completeness * 100.0)]];
+        if let Some(m) = &p.metric {
+            rows.push(vec!["AbsRel".into(), format!("{:.4}", m.abs_rel)]);
+            rows.push(vec!["RMSE".into(), format!("{:.4} m", m.rmse_m)]);
+            rows.push(vec!["δ < 1.25".into(), format!("{:.4}", m.delta_1)]);
+        }
+        let columns = vec!["Score".into(), "Value".into()];
+        section.tables.push(Table {
+            caption: format!("Depth of {} keyframes against the sensor", depth.summary.frames),
+            columns,
+            rows,
+        });
+    }
+    if let Some((cloud, errors)) = &outcome.judgement.error_cloud {
+        let camera = MapCamera::fixed(
+            Viewpoint::Top,
+            &cloud.positions,
+            path,
+            up,
+            MAP_SIZE.0 as f64 / MAP_SIZE.1 as f64,
+        );
+        let shading =
+            Shading::Error { values: errors, range: (0.0, 0.1), label: "distance to reference [m]" };
+        let picture = vidar_view::render_map(MapSurface::Cloud(cloud), &camera, size(MAP_SIZE), shading)?;
+        section.figures.push(album.figure(
+            "error-top",
+            &picture,
+            "Distance of the map to the reference, from above",
+            FigureWidth::Half,
+        )?);
+        let values: Vec<f64> = errors.iter().map(|&e| f64::from(e)).collect();
+        let histogram = Histogram {
+            title: "Distance of the map's points to the reference".into(),
+            x: AxisSpec::new("distance", "m").between(0.0, 0.2),
+            values,
+            markers: Vec::new(),
+        };
+        let picture = vidar_view::plot_histogram(&histogram, size(PLOT_SIZE));
+        section.figures.push(album.figure(
+            "error-histogram",
+            &picture,
+            "How many points lie how far from the reference",
+            FigureWidth::Half,
+        )?);
+    }
+    Ok(section)
+}
+
+fn trajectory_section(
+    outcome: &RunOutcome,
+    dataset: &Dataset,
+    up: &nalgebra::Vector3<f64>,
+    album: &mut Album<'_>,
+) -> Result<Section, Error> {
+    let mut section = Section { heading: "Trajectory".into(), ..Section::default() };
+    let anchor = &outcome.plan.anchor.camera_trajectory;
+    let truth = truth_in_camera(dataset);
+    let aligned = outcome.judgement.trajectory.as_ref().and_then(|t| {
+        section.tables.push(table("Anchor against ground truth", trajectory_lines(t)));
+        aligned(anchor, t.truth_from_estimate_se3?.to_se3()?)
+    });
+    let mut shown = Vec::new();
+    if let (Some(truth), false) = (&truth, anchored_by_truth(&outcome.plan)) {
+        shown.push(PlotTrajectory::ground_truth("ground truth", truth));
+    }
+    shown.push(match anchored_by_truth(&outcome.plan) {
+        true => PlotTrajectory::ground_truth("ground truth (the anchor)", anchor),
+        false => PlotTrajectory::estimate("anchor, rigidly aligned", aligned.as_ref().unwrap_or(anchor)),
+    });
+    let plot = TrajectoryPlot { up: *up, ..TrajectoryPlot::default() };
+    let picture = vidar_view::plot_trajectories(&shown, &plot, size(PLOT_SIZE));
+    section.figures.push(album.figure(
+        "trajectory",
+        &picture,
+        "Path of the camera from above and from the side",
+        FigureWidth::Full,
+    )?);
+    Ok(section)
+}
+
+fn aligned(trajectory: &Trajectory, truth_from_estimate: vidar_core::Se3) -> Option<Trajectory> {
+    let poses = trajectory
+        .poses()
+        .iter()
+        .map(|p| vidar_core::StampedPose {
+            time: p.time,
+            world_from_body: truth_from_estimate * p.world_from_body,
+        })
+        .collect();
+    Trajectory::new(trajectory.body(), poses).ok()
+}
+
+fn depth_section(outcome: &RunOutcome, folder: &RunFolder, album: &mut Album<'_>) -> Result<Section, Error> {
+    let mut section = Section { heading: "Depth".into(), ..Section::default() };
+    let views = &outcome.map.views;
+    let n = views.len();
+    let shown: Vec<&StoredView> =
+        (0..SHOWN_VIEWS.min(n)).map(|i| &views[i * n / SHOWN_VIEWS.min(n)]).collect();
+    for view in shown {
+        if let Some(picture) = view_picture(view, outcome, folder) {
+            let caption = format!("Frame {}: image and depth", view.frame);
+            section.figures.push(album.figure(
+                &format!("depth-{:06}", view.frame),
+                &picture,
+                &caption,
+                FigureWidth::Half,
+            )?);
+        }
+    }
+    if section.figures.is_empty() {
+        section.paragraphs.push("No depth image was written.".into());
+    }
+    Ok(section)
+}
+
+/// Image and depth of a view, read back from what was written.
+fn view_picture(view: &StoredView, outcome: &RunOutcome, folder: &RunFolder) -> Option<Picture> {
+    let read = |path: &Option<String>| std::fs::read(folder.path().join(path.as_ref()?)).ok();
+    let depth = vidar_export::read_depth_png(&read(&view.depth)?, outcome.plan.depth_units_per_metre).ok()?;
+    let depth = vidar_view::depth_picture(depth.image(), None);
+    let image = view.image.as_ref().and_then(|path| {
+        vidar_dataset::decode::read_image(
+            &folder.path().join(path),
+            &vidar_dataset::decode::ImageLimits::default(),
+        )
+        .ok()
+    });
+    match image {
+        Some(image) => Some(vidar_view::side_by_side(&[("image", &image.to_rgb8()), ("depth", &depth)])),
+        None => Some(depth),
+    }
+}
+
+fn plan_section(outcome: &RunOutcome) -> Section {
+    let rows = outcome.plan.lines().into_iter().map(|(k, v)| (k.to_owned(), v)).collect();
+    Section { heading: "How it was made".into(), tables: vec![table("Plan", rows)], ..Section::default() }
+}
+
+fn table(caption: &str, lines: Vec<(String, String)>) -> Table {
+    Table {
+        caption: caption.into(),
+        columns: vec!["What".into(), "Value".into()],
+        rows: lines.into_iter().map(|(k, v)| vec![k, v]).collect(),
+    }
+}

@@ -1,0 +1,76 @@
+//! What machine this is, as far as the system tells without help.
+
+use serde::Serialize;
+use std::path::Path;
+
+/// Machine and limits.
+#[derive(Clone, Debug, Serialize)]
+pub struct Hardware {
+    /// Operating system and architecture.
+    pub platform: String,
+    /// CPU name, where the system tells.
+    pub cpu: Option<String>,
+    /// Instruction sets that matter to the kernels.
+    pub cpu_features: Vec<&'static str>,
+    /// Threads that this process may use.
+    pub threads: usize,
+    /// Memory, bytes, where the system tells.
+    pub memory_bytes: Option<u64>,
+}
+
+/// Looks at the machine.
+pub fn hardware() -> Hardware {
+    Hardware {
+        platform: format!("{}-{}", std::env::consts::OS, std::env::consts::ARCH),
+        cpu: field_of("/proc/cpuinfo", "model name"),
+        cpu_features: cpu_features(),
+        threads: rayon::current_num_threads(),
+        memory_bytes: kib_of("/proc/meminfo", "MemTotal"),
+    }
+}
+
+/// Largest resident memory of this process so far, bytes.
+pub fn peak_memory_bytes() -> Option<u64> {
+    kib_of("/proc/self/status", "VmHWM")
+}
+
+fn cpu_features() -> Vec<&'static str> {
+    #[cfg(target_arch = "x86_64")]
+    {
+        let all = [
+            ("sse4.2", std::arch::is_x86_feature_detected!("sse4.2")),
+            ("avx2", std::arch::is_x86_feature_detected!("avx2")),
+            ("fma", std::arch::is_x86_feature_detected!("fma")),
+            ("avx512f", std::arch::is_x86_feature_detected!("avx512f")),
+            ("avx512bf16", std::arch::is_x86_feature_detected!("avx512bf16")),
+        ];
+        all.into_iter().filter(|(_, there)| *there).map(|(name, _)| name).collect()
+    }
+    #[cfg(not(target_arch = "x86_64"))]
+    {
+        Vec::new()
+    }
+}
+
+fn field_of(file: impl AsRef<Path>, key: &str) -> Option<String> {
+    let text = std::fs::read_to_string(file).ok()?;
+    let line = text.lines().find(|l| l.split(':').next().is_some_and(|k| k.trim() == key))?;
+    line.split_once(':').map(|(_, value)| value.trim().to_owned())
+}
+
+fn kib_of(file: &str, key: &str) -> Option<u64> {
+    let value = field_of(file, key)?;
+    value.split_whitespace().next()?.parse::<u64>().ok()?.checked_mul(1024)
+}
+
+#[cfg(test)]
+mod tests {
+    #[test]
+    #[cfg(target_os = "linux")]
+    fn memory_and_peak_are_plausible() {
+        let hardware = super::hardware();
+        assert!(hardware.memory_bytes.unwrap() > 100 << 20);
+        assert!(super::peak_memory_bytes().unwrap() > 1 << 20);
+        assert!(hardware.threads >= 1);
+    }
+}
