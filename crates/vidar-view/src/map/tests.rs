@@ -87,10 +87,10 @@ fn what_is_nearer_hides_what_is_farther_in_any_order() {
     let high = [[-0.9, -0.9, 1.0], [0.9, -0.9, 1.0], [0.0, 0.9, 1.0]];
     for (first, second, colors) in [(low, high, [RED, BLUE]), (high, low, [BLUE, RED])] {
         let mesh = triangles(&[first, second].concat(), &colors);
-        assert_eq!(drawn(&mesh, &from_above(), 200)[100 * 200 + 100], BLUE);
+        assert!(is_like(drawn(&mesh, &from_above(), 200)[100 * 200 + 100], 2));
         let perspective =
             MapCamera { projection: Projection::Perspective { vertical_angle_deg: 30.0 }, ..from_above() };
-        assert_eq!(drawn(&mesh, &perspective, 200)[100 * 200 + 100], BLUE);
+        assert!(is_like(drawn(&mesh, &perspective, 200)[100 * 200 + 100], 2));
     }
 }
 
