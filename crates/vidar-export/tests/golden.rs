@@ -1,5 +1,6 @@
 //! The bytes of small files, so that no format drifts unnoticed. Binary ones are put together here field by field
 //! from each format's specification, not copied from a run.
+#![allow(clippy::unwrap_used, clippy::panic)] // Helpers of tests may stop at the first surprise, as tests may.
 
 mod common;
 

@@ -1,4 +1,5 @@
 //! Files that lie, end early or are garbage; and places that cannot be written.
+#![allow(clippy::unwrap_used, clippy::panic)] // Helpers of tests may stop at the first surprise, as tests may.
 
 mod common;
 

@@ -1,4 +1,5 @@
 //! What is written comes back: as properties over all formats, and with the conventions of other tools checked.
+#![allow(clippy::unwrap_used, clippy::panic)] // Helpers of tests may stop at the first surprise, as tests may.
 
 mod common;
 
