@@ -7,6 +7,7 @@ mod build;
 mod commands;
 mod print;
 mod progress;
+pub mod reference;
 
 use args::{Cli, Command, ConfigCommand};
 use clap::Parser;
@@ -35,7 +36,7 @@ pub fn main_with(args: impl Iterator<Item = OsString>) -> ExitCode {
         Ok(pool) => pool.install(|| dispatch(cli.command, &context)),
         Err(error) => Err(error),
     };
-    match outcome {
+    match outcome.and_then(|status| print::all_delivered().map(|()| status)) {
         Ok(status) => ExitCode::from(status as u8),
         Err(error) => {
             print::error(&error, context.cli.json);

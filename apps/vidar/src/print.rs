@@ -1,12 +1,33 @@
 //! What people read. Writing to a closed terminal or pipe is not an error.
 
-use std::io::Write;
+use std::io::{ErrorKind, Write};
+use std::sync::OnceLock;
+use std::sync::atomic::{AtomicBool, Ordering};
 use vidar::Error;
 use vidar::core::Warning;
 
+/// Why data did not reach the standard output, once that happened. A reader that went away is no reason.
+static LOST: OnceLock<std::io::Error> = OnceLock::new();
+/// Whether the one JSON object of this process was printed.
+static JSON_PRINTED: AtomicBool = AtomicBool::new(false);
+
 /// A line of data on the standard output.
 pub fn data(line: impl AsRef<str>) {
-    let _ = writeln!(std::io::stdout().lock(), "{}", line.as_ref());
+    match writeln!(std::io::stdout().lock(), "{}", line.as_ref()) {
+        Err(error) if error.kind() != ErrorKind::BrokenPipe => {
+            // Only the first reason is told.
+            let _ = LOST.set(error);
+        }
+        _ => {}
+    }
+}
+
+/// An error if data was lost on its way to the standard output, say to a full disk.
+pub fn all_delivered() -> Result<(), Error> {
+    match LOST.get() {
+        Some(error) => Err(Error::io("write", "standard output".as_ref(), error.kind().into())),
+        None => Ok(()),
+    }
 }
 
 /// A line of talk on the error stream.
@@ -16,13 +37,15 @@ pub fn talk(line: impl AsRef<str>) {
 
 /// JSON on the standard output.
 pub fn json(value: &serde_json::Value) {
+    JSON_PRINTED.store(true, Ordering::Relaxed);
     data(serde_json::to_string_pretty(value).unwrap_or_default());
 }
 
 /// An error: what, where, why, next step, code.
 pub fn error(error: &Error, as_json: bool) {
     let hint = error.hint();
-    if as_json {
+    // A script gets one object: after a result, the exit code says that a bound was missed.
+    if as_json && !JSON_PRINTED.load(Ordering::Relaxed) {
         json(&serde_json::json!({
             "schema": "vidar.error/1", "code": error.code(), "message": error.to_string(), "hint": hint,
             "exit": error.exit_status() as i32,

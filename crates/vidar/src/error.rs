@@ -83,6 +83,12 @@ pub enum Error {
         /// Dataset name.
         name: String,
     },
+    /// The camera is only guessed, and a guess makes no metric map.
+    #[error("{name} has no calibration: the camera is only guessed from the size of its images")]
+    NoCalibration {
+        /// Dataset name.
+        name: String,
+    },
     /// Images and trajectory do not meet in time.
     #[error("no image has a pose: images span {images}, the trajectory spans {poses}")]
     NoOverlap {
@@ -90,6 +96,8 @@ pub enum Error {
         images: String,
         /// Time range of the poses, s.
         poses: String,
+        /// What the ratio of both suggests, if it is that of two units of time.
+        slip: Option<&'static str>,
     },
     /// Too few keyframes to see depth.
     #[error("{found} keyframes with poses, at least {needed} are needed")]
@@ -188,18 +196,32 @@ impl Error {
             Self::Camera(_) => "E0205",
             Self::Trajectory(_) => "E0206",
             Self::NotARun { .. } => "E0207",
+            Self::NoCalibration { .. } => "E0208",
             Self::Geometry(_) | Self::Stereo(_) => "E0301",
             Self::Align(_) => "E0302",
             Self::Fusion(_) => "E0303",
             Self::Eval(_) => "E0304",
             Self::Empty { .. } => "E0305",
-            Self::Export(_) => "E0306",
-            Self::View(_) => "E0307",
-            Self::Synth(_) => "E0308",
-            Self::Io { source, .. } if is_full(source) => "E0402",
-            Self::Io { .. } => "E0401",
+            Self::Export(_) | Self::View(_) | Self::Synth(_) | Self::Io { .. } => match self.file_system() {
+                Some(source) if is_full(source) => "E0402",
+                Some(_) => "E0401",
+                None if matches!(self, Self::Export(_)) => "E0306",
+                None if matches!(self, Self::View(_)) => "E0307",
+                None => "E0308",
+            },
             Self::Threshold(_) => "E0501",
             Self::Interrupted { .. } => "E1301",
+        }
+    }
+
+    /// What the file system said, whichever stage asked it.
+    fn file_system(&self) -> Option<&std::io::Error> {
+        use vidar_export::ExportError as Export;
+        match self {
+            Self::Io { source, .. }
+            | Self::Export(Export::Write { source, .. } | Export::File { source, .. })
+            | Self::Synth(vidar_synth::SynthError::Write { source, .. }) => Some(source),
+            _ => None,
         }
     }
 
@@ -223,6 +245,9 @@ impl Error {
                 ));
             }
             Self::Usage { hint, .. } => return Some(hint.clone()),
+            Self::NoOverlap { slip: Some(slip), .. } => {
+                return Some(format!("{slip}; --time-unit s|ms|us|ns tells the unit of image times"));
+            }
             Self::UnknownKey { .. } => "`vidar config show` lists every key",
             Self::BadValue { .. } => "`vidar config explain KEY` gives meaning, unit and range",
             Self::ConfigFile { .. } => "the file is TOML; `vidar config show > my.toml` writes a valid one",
@@ -240,10 +265,25 @@ impl Error {
             Self::Empty { .. } => {
                 "look at depth/ in the run folder; try --preset quality, or another depth range"
             }
-            Self::Io { source, .. } if is_full(source) => {
+            other if other.file_system().is_some_and(is_full) => {
                 "free space, or choose another disk with -o; finished files are kept"
             }
-            Self::Io { .. } => "check that the path exists and may be written",
+            other if other.file_system().is_some() => "check that the path exists and may be written",
+            Self::NoCalibration { .. } => {
+                "give --calibration FILE (EuRoC sensor.yaml, Kalibr camchain) or --camera-model pinhole:fx,fy,cx,cy"
+            }
+            Self::Camera(_) => {
+                "check fx, fy, cx, cy and the distortion in the calibration, or give --camera-model"
+            }
+            Self::Trajectory(_) => {
+                "--trajectory-body imu|camera0 says whose poses they are; --calibration gives the rig"
+            }
+            Self::Export(_) => {
+                "the message names the place in the file; write it anew with the program it came from"
+            }
+            Self::Synth(_) => "`vidar synth --help` lists what can be set, --world-config takes all of it",
+            Self::Threshold(_) => "`vidar eval RUN` shows every score",
+            Self::Eval(_) => "check that both are of the same recording, body and clock",
             Self::NotARun { .. } => "a run folder holds manifest.json; `vidar run PATH` makes one",
             Self::Dataset(_) => "`vidar inspect PATH` shows what was found and what is missing",
             _ => return None,
@@ -252,9 +292,10 @@ impl Error {
     }
 }
 
-/// Whether the system said that no space is left.
+/// Whether the system said that no space is left: a full disk, a quota, or a limit on the size of files.
 pub fn is_full(error: &std::io::Error) -> bool {
-    matches!(error.kind(), std::io::ErrorKind::StorageFull | std::io::ErrorKind::QuotaExceeded)
+    use std::io::ErrorKind::{FileTooLarge, QuotaExceeded, StorageFull};
+    matches!(error.kind(), StorageFull | QuotaExceeded | FileTooLarge)
 }
 
 /// Every error code with what it means, for `vidar explain` and the reference page.
@@ -284,6 +325,10 @@ pub const CODES: &[(&str, &str)] = &[
     ("E0205", "Camera parameters are not those of a camera, or no undistorted view fits into the image."),
     ("E0206", "Poses belong to a body whose place on the rig is unknown."),
     ("E0207", "The folder lacks what a run of VIDAR writes (manifest.json, views.json)."),
+    (
+        "E0208",
+        "The images carry no calibration. A camera guessed from the size of the images bends every surface, so no metric map is made with it.",
+    ),
     ("E0301", "The geometry model could not predict depth for any chunk."),
     ("E0302", "Predicted geometry could not be placed in the metric world."),
     ("E0303", "Fusion refused its configuration or a view, or met its memory bound."),

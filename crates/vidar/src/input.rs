@@ -91,7 +91,10 @@ pub fn posed_frames(
         .collect();
     if frames.is_empty() {
         let images = range(dataset.images.first().map(|i| i.time).zip(dataset.images.last().map(|i| i.time)));
-        return Err(Error::NoOverlap { images, poses: range(anchor.camera_trajectory.time_range()) });
+        let poses = anchor.camera_trajectory.time_range();
+        let slip =
+            dataset.images.first().zip(poses).and_then(|(image, (pose, _))| unit_slip(image.time, pose));
+        return Err(Error::NoOverlap { images, poses: range(poses), slip });
     }
     let missing = dataset.images.len() - frames.len();
     let mut warnings = Vec::new();
@@ -103,6 +106,28 @@ pub fn posed_frames(
         );
     }
     Ok((frames, warnings))
+}
+
+/// Two clocks that differ by a factor of about 10³, 10⁶ or 10⁹ are one clock in two units.
+fn unit_slip(image: vidar_core::Timestamp, pose: vidar_core::Timestamp) -> Option<&'static str> {
+    let ratio =
+        (image.nanos().unsigned_abs().max(1) as f64 / pose.nanos().unsigned_abs().max(1) as f64).log10();
+    // Recordings last hours, clocks count years: a tenth of a decade is far more than a recording's length.
+    let near = |decades: f64| (ratio.abs() - decades).abs() < 0.1;
+    let known = [
+        (3.0, "one clock is about 1000 times the other, as seconds and milliseconds are"),
+        (6.0, "one clock is about 10^6 times the other, as seconds and microseconds are"),
+        (9.0, "one clock is about 10^9 times the other, as seconds and nanoseconds are"),
+    ];
+    known.into_iter().find(|(decades, _)| near(*decades)).map(|(_, words)| words)
+}
+
+/// Refuses a camera that is only guessed: it would bend every surface and still look metric.
+pub fn require_calibration(dataset: &Dataset) -> Result<(), Error> {
+    match dataset.calibration {
+        vidar_dataset::CalibrationSource::Guessed => Err(Error::NoCalibration { name: dataset.name.clone() }),
+        _ => Ok(()),
+    }
 }
 
 fn range(times: Option<(vidar_core::Timestamp, vidar_core::Timestamp)>) -> String {

@@ -254,6 +254,12 @@ fn measure(image: &FrameImage) -> [f64; 3] {
 
 fn possible(dataset: &Dataset) -> Vec<String> {
     let mut lines = Vec::new();
+    if dataset.calibration == vidar_dataset::CalibrationSource::Guessed {
+        lines.push(
+            "vidar run: not yet; give --calibration FILE or --camera-model (the camera is a guess)".into(),
+        );
+        return lines;
+    }
     match (&dataset.anchor, &dataset.ground_truth) {
         (Some(_), _) => lines.push("vidar run: metric map anchored by the external trajectory".into()),
         (None, Some(_)) => {

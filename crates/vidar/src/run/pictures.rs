@@ -165,7 +165,9 @@ pub fn summary_lines(outcome: &RunOutcome) -> Vec<(&'static str, String)> {
     let memory = crate::system::peak_memory_bytes()
         .map_or_else(String::new, |b| format!(", peak memory {}", super::bytes(b)));
     lines.push(("took", format!("{:.1} s{memory}", outcome.seconds)));
-    lines.push(("look at it", format!("{folder}/report.html")));
+    let report = outcome.folder.join("report.html");
+    let shown = if report.exists() { report } else { outcome.folder.join("map/mesh.ply") };
+    lines.push(("look at it", shown.display().to_string()));
     lines
 }
 

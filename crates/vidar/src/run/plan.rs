@@ -68,6 +68,7 @@ pub enum ReferenceSource {
 impl Plan {
     /// Looks at poses, camera and configuration.
     pub fn make(dataset: &Dataset, config: &Config, reference: Option<&Path>) -> Result<Self, Error> {
+        input::require_calibration(dataset)?;
         let anchor = input::metric_anchor(dataset, config)?;
         let (posed, mut warnings) = input::posed_frames(dataset, &anchor, config)?;
         let keyframes = select_keyframes(&posed, &config.keyframes);
