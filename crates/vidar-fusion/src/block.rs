@@ -1,70 +1,123 @@
-//! The sums that a block keeps, and how one view is added to them.
+//! The sums that a block keeps.
 //!
 //! Every sum is an integer, so adding views commutes and associates: any order of views, any number of threads,
-//! the same bits. A node at projective distance s = depth of its pixel − its own z (metres, positive in front of the
-//! surface; Nießner et al. 2013, section 4) adds
-//!
-//! `d = clamp(s / truncation, −1, 1)`, `Σ w·d`, `Σ w`   (Curless & Levoy 1996, eq. 1–2),
-//!
-//! with w of [`crate::sample`], falling linearly to 0 from one voxel behind the surface to the truncation, where
-//! nothing is known. Nodes within the truncation also count the view and sum its confidence and colour.
+//! the same bits. What a view changes lies together, row by row of eight nodes, in 32 bits a sum; their upper bits
+//! are moved away before they could overflow.
 
 use crate::grid::{EDGE, NODES};
-use crate::sample::{Sample, round_to_i32};
-use crate::simd::dispatch;
 
 /// The integer that stands for a distance of one truncation: 1/4096 of it is finer than any depth sensor.
 pub(crate) const DISTANCE_ONE: f32 = 4096.0;
-/// Nodes closer to the camera plane than this, metres, are not looked up.
-const NEAR_M: f32 = 1e-3;
+/// Rows of [`EDGE`] nodes in a block.
+pub(crate) const ROWS: usize = EDGE * EDGE;
+/// Views after which the 32-bit sums hand over to their upper parts: (2³¹ − 2²⁶) / (4095 · 4096).
+const VIEWS_BEFORE_CARRY: u8 = 120;
+/// Bits of Σ w·d that stay in a row when its upper part is handed over.
+const DISTANCE_BITS: u32 = 26;
+/// Bits of Σ confidence that stay in a row.
+const CONFIDENCE_BITS: u32 = 8;
+/// Where the confidence begins in [`Row::near`]; the count of views lies below.
+const CONFIDENCE_SHIFT: u32 = 16;
 
-/// Sums of red, green, blue times confidence, and of confidence, of one node.
-pub(crate) type ColorSum = [u32; 4];
+/// Eight neighbours along x.
+pub(crate) type Lanes<T> = [T; EDGE];
+
+/// Sums of eight nodes, as every view touches them: three vectors in one and a half cache lines.
+#[derive(Clone, Copy, Debug)]
+#[repr(C)]
+pub(crate) struct Row {
+    /// Lower part of Σ w·d, of weight · [`DISTANCE_ONE`].
+    pub distance: Lanes<i32>,
+    /// Σ w. 65535 views of 12 bits fit.
+    pub weight: Lanes<u32>,
+    /// Views within the truncation (lower 16 bits), and the lower part of the sum of their confidences (upper 16).
+    pub near: Lanes<u32>,
+}
+
+/// Sums of red, green, blue times confidence, and of confidence, of eight nodes.
+pub(crate) type ColorRow = [Lanes<u32>; 4];
 
 /// The sums of 8³ nodes, x fastest.
 #[derive(Clone, Debug)]
 pub(crate) struct Block {
-    /// Σ w·d, of weight · [`DISTANCE_ONE`]. 65535 views of 2²⁴ fit.
-    pub weighted_distance: [i64; NODES],
-    /// Σ w.
-    pub weight: [u32; NODES],
-    /// Σ confidence of the views within the truncation.
-    pub confidence: [u32; NODES],
-    /// Views within the truncation.
-    pub count: [u16; NODES],
+    pub rows: [Row; ROWS],
+    /// Upper part of Σ w·d, in 2^[`DISTANCE_BITS`]: together 42 bits, 65535 views of 2²⁴ fit.
+    distance_above: [i16; NODES],
+    /// Upper part of Σ confidence, in 2^[`CONFIDENCE_BITS`].
+    confidence_above: [u16; NODES],
+    /// Views since the last [`Self::carry`].
+    uncarried: u8,
     /// Colours, once a coloured view came.
-    pub color: Option<Box<[ColorSum; NODES]>>,
+    pub color: Option<Box<[ColorRow; ROWS]>>,
 }
 
 impl Block {
     /// Bytes of a block without colour, with its pointer.
     pub const BYTES: u64 = (size_of::<Self>() + size_of::<usize>()) as u64;
     /// Bytes that colour adds.
-    pub const COLOR_BYTES: u64 = size_of::<[ColorSum; NODES]>() as u64;
+    pub const COLOR_BYTES: u64 = size_of::<[ColorRow; ROWS]>() as u64;
 
     pub fn new() -> Self {
         Self {
-            weighted_distance: [0; NODES],
-            weight: [0; NODES],
-            confidence: [0; NODES],
-            count: [0; NODES],
+            rows: [Row { distance: [0; EDGE], weight: [0; EDGE], near: [0; EDGE] }; ROWS],
+            distance_above: [0; NODES],
+            confidence_above: [0; NODES],
+            uncarried: 0,
             color: None,
         }
     }
 
     pub fn add_color(&mut self) {
-        self.color.get_or_insert_with(|| Box::new([[0; 4]; NODES]));
+        self.color.get_or_insert_with(|| Box::new([[[0; EDGE]; 4]; ROWS]));
+    }
+
+    /// To be called before each view that is added, so that the 32-bit sums of the rows cannot overflow.
+    pub fn before_view(&mut self) {
+        if self.uncarried == VIEWS_BEFORE_CARRY {
+            self.carry();
+        }
+        self.uncarried += 1;
+    }
+
+    /// Moves the upper bits of all sums to where there is room. Changes no sum, hence may happen at any time.
+    #[cold]
+    fn carry(&mut self) {
+        for (at, row) in self.rows.iter_mut().enumerate() {
+            for i in 0..EDGE {
+                let node = at * EDGE + i;
+                // An arithmetic shift rounds down, so what stays is not negative.
+                self.distance_above[node] += (row.distance[i] >> DISTANCE_BITS) as i16;
+                row.distance[i] &= (1 << DISTANCE_BITS) - 1;
+                let above = row.near[i] >> (CONFIDENCE_SHIFT + CONFIDENCE_BITS);
+                self.confidence_above[node] += above as u16;
+                row.near[i] -= above << (CONFIDENCE_SHIFT + CONFIDENCE_BITS);
+            }
+        }
+        self.uncarried = 0;
+    }
+
+    /// Σ w·d of a node.
+    #[inline(always)]
+    fn weighted_distance(&self, node: usize) -> i64 {
+        let low = self.rows[node / EDGE].distance[node % EDGE];
+        i64::from(low) + (i64::from(self.distance_above[node]) << DISTANCE_BITS)
+    }
+
+    /// Views that saw a node within the truncation.
+    #[inline(always)]
+    pub fn observations(&self, node: usize) -> u32 {
+        self.rows[node / EDGE].near[node % EDGE] & 0xffff
     }
 
     /// Signed distance of a node in truncations, with `free` (weight seen through the whole block) as distance 1;
     /// `None` when fewer than `min_observations` views saw it near a surface.
     #[inline(always)]
     pub fn distance(&self, node: usize, free: u32, min_observations: u32) -> Option<f32> {
-        let weight = self.weight[node];
-        if weight == 0 || u32::from(self.count[node]) < min_observations {
+        let weight = self.rows[node / EDGE].weight[node % EDGE];
+        if weight == 0 || self.observations(node) < min_observations {
             return None;
         }
-        let sum = self.weighted_distance[node] + i64::from(free) * DISTANCE_ONE as i64;
+        let sum = self.weighted_distance(node) + i64::from(free) * DISTANCE_ONE as i64;
         let value = sum as f32 / ((u64::from(weight) + u64::from(free)) as f32 * DISTANCE_ONE);
         // A surface through a node would give up to six vertices in one place; a hair in front of it gives one
         // vertex per edge, all distinct.
@@ -73,13 +126,14 @@ impl Block {
 
     /// Mean confidence of a node, 0…1.
     pub fn mean_confidence(&self, node: usize) -> f32 {
-        let count = f32::from(self.count[node].max(1));
-        self.confidence[node] as f32 / (count * crate::sample::CONFIDENCE_ONE)
+        let low = self.rows[node / EDGE].near[node % EDGE] >> CONFIDENCE_SHIFT;
+        let sum = low + (u32::from(self.confidence_above[node]) << CONFIDENCE_BITS);
+        sum as f32 / (self.observations(node).max(1) as f32 * crate::sample::CONFIDENCE_ONE)
     }
 
     /// Mean colour of a node, if any coloured view saw it.
     pub fn mean_color(&self, node: usize) -> Option<[f32; 3]> {
-        let [r, g, b, weight] = self.color.as_ref()?[node];
+        let [r, g, b, weight] = self.color.as_ref()?[node / EDGE].map(|lanes| lanes[node % EDGE]);
         (weight > 0).then(|| [r, g, b].map(|c| c as f32 / weight as f32))
     }
 }
@@ -87,115 +141,31 @@ impl Block {
 /// What replaces a distance of exactly zero, in truncations.
 const ZERO_NUDGE: f32 = 1.0 / (4.0 * DISTANCE_ONE);
 
-/// One view, ready to be added to blocks.
-pub(crate) struct BlockUpdate<'a> {
-    pub samples: &'a [Sample],
-    pub colors: Option<&'a [[u8; 3]]>,
-    pub width: usize,
-    pub height: usize,
-    /// fx, fy, cx, cy.
-    pub k: [f32; 4],
-    /// Motion in the camera, metres, of one step along each axis of the lattice.
-    pub steps: [[f32; 3]; 3],
-    pub truncation_m: f32,
-    pub voxel_m: f32,
-}
+#[cfg(test)]
+mod tests {
+    use super::*;
 
-/// Eight neighbours along x.
-type Lanes<T> = [T; EDGE];
-
-impl BlockUpdate<'_> {
-    /// Adds the view to `block`, whose first node lies at `origin` in the camera, metres.
-    pub fn add_to(&self, block: &mut Block, origin: [f32; 3]) {
-        dispatch!(self.add_rows(block, origin));
-    }
-
-    #[inline(always)]
-    fn add_rows(&self, block: &mut Block, origin: [f32; 3]) {
-        for row in 0..EDGE * EDGE {
-            let (y, z) = ((row % EDGE) as f32, (row / EDGE) as f32);
-            let start = [0, 1, 2].map(|a| origin[a] + y * self.steps[1][a] + z * self.steps[2][a]);
-            self.add_row(block, row * EDGE, start);
-        }
-    }
-
-    #[inline(always)]
-    fn add_row(&self, block: &mut Block, first: usize, start: [f32; 3]) {
-        let (pixel, depth_of_node) = self.project_row(start);
-        let mut depth: Lanes<f32> = [0.0; EDGE];
-        let mut packed: Lanes<u32> = [0; EDGE];
-        let mut seen = 0;
-        for i in 0..EDGE {
-            let sample = self.samples.get(pixel[i] as usize).copied().unwrap_or(Sample::NONE);
-            depth[i] = sample.depth;
-            packed[i] = sample.weight_and_confidence;
-            seen |= packed[i];
-        }
-        if seen == 0 {
-            return;
-        }
-        let per_truncation = 1.0 / self.truncation_m;
-        let per_fade = 1.0 / (self.truncation_m - self.voxel_m);
-        let mut weight: Lanes<u32> = [0; EDGE];
-        let mut product: Lanes<i32> = [0; EDGE];
-        let mut near: Lanes<u32> = [0; EDGE];
-        for i in 0..EDGE {
-            let distance = depth[i] - depth_of_node[i];
-            let fade = ((distance + self.truncation_m) * per_fade).clamp(0.0, 1.0);
-            let d = (distance * per_truncation).clamp(-1.0, 1.0);
-            let w = round_to_i32((packed[i] & 0xffff) as f32 * fade);
-            product[i] = w * round_to_i32(d * DISTANCE_ONE);
-            weight[i] = w as u32;
-            near[i] = u32::from((distance <= self.truncation_m) & (w > 0));
-        }
-        // Rows behind the surface are many and change nothing.
-        if weight == [0; EDGE] {
-            return;
-        }
-        for i in 0..EDGE {
-            block.weighted_distance[first + i] += i64::from(product[i]);
-            block.weight[first + i] += weight[i];
-            block.count[first + i] += near[i] as u16;
-            block.confidence[first + i] += near[i] * (packed[i] >> 16);
-        }
-        if let (Some(sums), Some(colors)) = (&mut block.color, self.colors) {
-            for i in 0..EDGE {
-                if near[i] != 0 {
-                    add_color(&mut sums[first + i], colors[pixel[i] as usize], packed[i] >> 16);
+    #[test]
+    fn sums_of_the_most_views_with_the_largest_weights_are_exact() {
+        let views = crate::grid::MAX_VIEWS;
+        let mut block = Block::new();
+        for _ in 0..views {
+            block.before_view();
+            for row in &mut block.rows {
+                for i in 0..EDGE {
+                    // Even nodes in front of the surface, odd nodes behind it.
+                    row.distance[i] += if i % 2 == 0 { 4095 * 4096 } else { -4095 * 4096 };
+                    row.weight[i] += 4095;
+                    row.near[i] += 255 << CONFIDENCE_SHIFT | 1;
                 }
             }
         }
-    }
-
-    /// For eight nodes from `start`: the pixel each falls on (`u32::MAX` = none), and its z.
-    #[inline(always)]
-    fn project_row(&self, start: [f32; 3]) -> (Lanes<u32>, Lanes<f32>) {
-        let [fx, fy, cx, cy] = self.k;
-        let (right, bottom) = (self.width as f32 - 0.5, self.height as f32 - 0.5);
-        let width = self.width as i32;
-        let mut pixel: Lanes<u32> = [u32::MAX; EDGE];
-        let mut depth: Lanes<f32> = [0.0; EDGE];
-        for i in 0..EDGE {
-            let t = i as f32;
-            let x = start[0] + t * self.steps[0][0];
-            let y = start[1] + t * self.steps[0][1];
-            let z = start[2] + t * self.steps[0][2];
-            let per_z = 1.0 / z;
-            let (u, v) = (fx * x * per_z + cx, fy * y * per_z + cy);
-            let inside = (z > NEAR_M) & (u > -0.5) & (v > -0.5) & (u < right) & (v < bottom);
-            // Wrapping: what lies outside the image is garbage here and not taken.
-            let index = round_to_i32(v).wrapping_mul(width).wrapping_add(round_to_i32(u));
-            pixel[i] = if inside { index as u32 } else { u32::MAX };
-            depth[i] = z;
+        for node in [0, 7, 300, NODES - 1] {
+            let sign = if node % 2 == 0 { 1 } else { -1 };
+            assert_eq!(block.weighted_distance(node), sign * i64::from(views) * 4095 * 4096);
+            assert_eq!(block.observations(node), views);
+            assert_eq!(block.distance(node, 0, views), Some(sign as f32));
+            assert_eq!(block.mean_confidence(node), 1.0);
         }
-        (pixel, depth)
     }
-}
-
-#[inline(always)]
-fn add_color(sum: &mut ColorSum, rgb: [u8; 3], confidence: u32) {
-    for c in 0..3 {
-        sum[c] += u32::from(rgb[c]) * confidence;
-    }
-    sum[3] += confidence;
 }

@@ -62,7 +62,7 @@ impl TsdfVolume {
                     .filter(|&node| field.value(at, node).abs() <= one_voxel)
                     .map(|node| DensityCell {
                         index: node_of(field.keys[at], node),
-                        observations: u32::from(block.count[node]),
+                        observations: block.observations(node),
                         mean_confidence: block.mean_confidence(node),
                     })
                     .collect()
@@ -95,7 +95,7 @@ impl TsdfVolume {
     fn observed_nodes(&self) -> u64 {
         let within_blocks: usize = (self.keys.par_iter().zip(&self.blocks))
             .filter(|(key, _)| !self.free.contains_key(*key))
-            .map(|(_, block)| block.weight.iter().filter(|&&w| w > 0).count())
+            .map(|(_, block)| block.rows.iter().flat_map(|row| row.weight).filter(|&w| w > 0).count())
             .sum();
         (within_blocks + self.free.len() * NODES) as u64
     }

@@ -29,8 +29,8 @@
 //! # }
 //! ```
 //!
-//! The path of a view: [`sample`] weighs its pixels, [`allocate`] finds the blocks it touches, [`block`] adds it to
-//! them, [`carve`] votes for what it sees empty. The way out: [`field`] reads distances, [`cubes`] has the
+//! The path of a view: [`sample`] weighs its pixels, [`allocate`] finds the blocks it touches, [`update`] adds it to
+//! the sums of each [`block`], [`carve`] votes for what it sees empty. The way out: [`field`] reads distances, [`cubes`] has the
 //! triangles, [`extract`] makes the mesh, [`tidy`] drops crumbs, [`coverage`] counts.
 
 mod allocate;
@@ -43,10 +43,14 @@ mod error;
 mod extract;
 mod field;
 mod grid;
+mod pixels;
 mod points;
 mod sample;
 mod simd;
 mod tidy;
+mod update;
+#[cfg(target_arch = "x86_64")]
+mod update_avx2;
 mod volume;
 
 pub use config::FusionConfig;

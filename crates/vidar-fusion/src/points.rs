@@ -5,7 +5,8 @@
 //! and any number of threads, except where the memory budget refused voxels ([`PointFusion::warnings`] says so).
 
 use crate::grid::{BlockKey, MAX_VIEWS, check_view, table_bytes};
-use crate::sample::{CONFIDENCE_ONE, SampledView, TILE, normal_of_pixel};
+use crate::pixels::{FRACTION_ONE, Part, Strips};
+use crate::sample::{CONFIDENCE_ONE, SampledView};
 use crate::{FusionConfig, FusionError, IntegrationStats};
 use nalgebra::Vector3;
 use rayon::prelude::*;
@@ -14,9 +15,7 @@ use std::hash::BuildHasher;
 use vidar_core::{AlignedView, PointCloud, Warning};
 
 /// Voxels are dealt to this many tables, which are filled in parallel.
-const SHARDS: usize = 64;
-/// The integer that stands for one voxel edge in sums of positions, and for 1 in sums of normals.
-const FRACTION_ONE: f64 = 4096.0;
+pub(crate) const SHARDS: usize = 16;
 
 /// Sums over the pixels of one voxel. 65535 views of 2³² pixels' weights would be needed to overflow them.
 #[derive(Clone, Debug, Default)]
@@ -35,21 +34,13 @@ struct PointSum {
     last_call: u32,
 }
 
-/// One pixel on its way into a voxel.
-struct Contribution {
-    key: BlockKey,
-    offset: [i16; 3],
-    normal: [i16; 3],
-    color: Option<[u8; 3]>,
-    weight: u32,
-    confidence: u32,
-}
-
 /// A voxel-hashed point cloud that views are added to.
 #[derive(Clone, Debug)]
 pub struct PointFusion {
     config: FusionConfig,
     shards: Vec<FxHashMap<BlockKey, PointSum>>,
+    /// Memory of the last view's samples and parts, for the next one.
+    scratch: (SampledView, Strips),
     views: u32,
     dropped: u64,
 }
@@ -58,7 +49,13 @@ impl PointFusion {
     /// An empty cloud; refuses a configuration that is out of range.
     pub fn new(config: &FusionConfig) -> Result<Self, FusionError> {
         config.validate()?;
-        Ok(Self { config: config.clone(), shards: vec![FxHashMap::default(); SHARDS], views: 0, dropped: 0 })
+        Ok(Self {
+            config: config.clone(),
+            shards: vec![FxHashMap::default(); SHARDS],
+            scratch: <(SampledView, Strips)>::default(),
+            views: 0,
+            dropped: 0,
+        })
     }
 
     /// The settings.
@@ -73,20 +70,20 @@ impl PointFusion {
             return Err(FusionError::TooManyViews { frame: view.frame_id(), limit: MAX_VIEWS });
         }
         self.views += 1;
-        let mut sampled = SampledView::default();
+        let (sampled, strips) = &mut self.scratch;
         sampled.fill(view, &self.config);
-        let parts = contributions(view, &sampled, self.config.voxel_size_m);
+        strips.fill(view, sampled, self.config.voxel_size_m);
         let call = self.views;
         let budget = self.config.memory_budget_bytes / SHARDS as u64;
         let (touched, dropped) = self
             .shards
             .par_iter_mut()
             .enumerate()
-            .map(|(at, shard)| add_to_shard(shard, parts.iter().flat_map(|p| &p[at]), call, budget))
+            .map(|(at, shard)| add_to_shard(shard, strips.of_shard(at), call, budget))
             .reduce(|| (0, 0), |a, b| (a.0 + b.0, a.1 + b.1));
         self.dropped += dropped;
         Ok(IntegrationStats {
-            pixels_used: sampled.pixels_used,
+            pixels_used: self.scratch.0.pixels_used,
             blocks_touched: touched,
             blocks_total: self.shards.iter().map(|s| s.len() as u64).sum(),
             dropped_by_budget: dropped,
@@ -137,27 +134,23 @@ impl PointFusion {
 }
 
 impl PointSum {
-    fn add(&mut self, c: &Contribution, call: u32) {
-        let weight = i64::from(c.weight);
+    fn add(&mut self, part: &Part, call: u32) {
         for a in 0..3 {
-            self.offset[a] += weight * i64::from(c.offset[a]);
-            self.normal[a] += weight * i64::from(c.normal[a]);
+            self.offset[a] += i64::from(part.offset[a]);
+            self.normal[a] += i64::from(part.normal[a]);
         }
-        if let Some(rgb) = c.color {
-            for (sum, channel) in self.color.iter_mut().zip(rgb) {
-                *sum += u64::from(c.weight) * u64::from(channel);
-            }
-            self.color[3] += u64::from(c.weight);
+        for (sum, more) in self.color.iter_mut().zip(part.color) {
+            *sum += u64::from(more);
         }
-        self.weight += u64::from(c.weight);
-        self.confidence += u64::from(c.confidence);
-        self.pixels += 1;
+        self.weight += u64::from(part.weight);
+        self.confidence += u64::from(part.confidence);
+        self.pixels += u64::from(part.pixels);
         self.views += u32::from(self.last_call != call);
         self.last_call = call;
     }
 
     fn position(&self, key: BlockKey, voxel_m: f64) -> [f32; 3] {
-        let per_unit = 1.0 / (self.weight.max(1) as f64 * FRACTION_ONE);
+        let per_unit = 1.0 / (self.weight.max(1) as f64 * f64::from(FRACTION_ONE));
         [0, 1, 2].map(|a| ((f64::from(key[a]) + self.offset[a] as f64 * per_unit) * voxel_m) as f32)
     }
 
@@ -173,62 +166,30 @@ fn shard_bytes(entries: usize) -> u64 {
     table_bytes(entries, size_of::<(BlockKey, PointSum)>())
 }
 
-/// Adds pixels to the voxels of one shard; how many voxels changed, and how many pixels the budget refused.
+/// Adds parts to the voxels of one shard; how many voxels changed, and how many pixels the budget refused.
 fn add_to_shard<'a>(
     shard: &mut FxHashMap<BlockKey, PointSum>,
-    contributions: impl Iterator<Item = &'a Contribution>,
+    parts: impl Iterator<Item = &'a Part>,
     call: u32,
     budget: u64,
 ) -> (u64, u64) {
     let (mut touched, mut dropped) = (0, 0);
-    for c in contributions {
-        let fits = shard.contains_key(&c.key) || shard_bytes(shard.len() + 1) <= budget;
-        if !fits {
-            dropped += 1;
-            continue;
+    for part in parts {
+        if let Some(sum) = shard.get_mut(&part.key) {
+            touched += u64::from(sum.last_call != call);
+            sum.add(part, call);
+        } else if shard_bytes(shard.len() + 1) <= budget {
+            touched += 1;
+            shard.entry(part.key).or_default().add(part, call);
+        } else {
+            dropped += u64::from(part.pixels);
         }
-        let sum = shard.entry(c.key).or_default();
-        touched += u64::from(sum.last_call != call);
-        sum.add(c, call);
     }
     (touched, dropped)
 }
 
-/// Where each usable pixel goes: for every strip of rows, a list per shard.
-fn contributions(view: &AlignedView, sampled: &SampledView, voxel_m: f64) -> Vec<Vec<Vec<Contribution>>> {
-    let rotation = view.world_from_camera().rotation.matrix();
-    let origin = view.world_from_camera().translation / voxel_m;
-    let point_rotation = rotation / voxel_m;
-    let width = sampled.width;
-    sampled
-        .samples
-        .par_chunks(width * TILE)
-        .enumerate()
-        .map(|(strip, samples)| {
-            let mut shards: Vec<Vec<Contribution>> = (0..SHARDS).map(|_| Vec::new()).collect();
-            for (i, sample) in samples.iter().enumerate().filter(|(_, s)| s.weight() > 0) {
-                let (x, y) = (i % width, strip * TILE + i / width);
-                let ray = view.intrinsics().ray(x as f64, y as f64) * f64::from(sample.depth);
-                let at: Vector3<f64> = origin + point_rotation * ray;
-                let centre = at.map(f64::round);
-                let normal = Vector3::from(normal_of_pixel(view, x, y).map(f64::from));
-                let fraction = |v: Vector3<f64>| -> [i16; 3] { (v * FRACTION_ONE).map(|c| c as i16).into() };
-                let key: BlockKey = centre.map(|c| c as i32).into();
-                shards[shard_of(&key)].push(Contribution {
-                    key,
-                    offset: fraction(at - centre),
-                    normal: fraction(rotation * normal),
-                    color: view.color().map(|c| c[(x, y)]),
-                    weight: sample.weight(),
-                    confidence: sample.confidence(),
-                });
-            }
-            shards
-        })
-        .collect()
-}
-
-fn shard_of(key: &BlockKey) -> usize {
-    // The top bits, because the tables use the low ones.
+/// The shard that a voxel belongs to.
+pub(crate) fn shard_of(key: &BlockKey) -> usize {
+    // The upper half, because the tables use the lower bits.
     (FxBuildHasher.hash_one(key) >> 32) as usize % SHARDS
 }

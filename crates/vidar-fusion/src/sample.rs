@@ -23,7 +23,7 @@ pub(crate) const TILE: usize = 8;
 const JUMP_RATIO: f32 = 0.05;
 /// Adding this to a float below 2²² rounds it to the nearest integer, found in the low bits. Unlike `as`, which
 /// must saturate, this becomes one vector addition.
-const ROUND: f32 = 12_582_912.0;
+pub(crate) const ROUND: f32 = 12_582_912.0;
 
 /// Nearest integer of `x`, for |x| < 2²².
 #[inline(always)]
@@ -31,8 +31,9 @@ pub(crate) fn round_to_i32(x: f32) -> i32 {
     ((x + ROUND).to_bits() as i32).wrapping_sub(ROUND.to_bits() as i32)
 }
 
-/// What fusion needs of a pixel.
+/// What fusion needs of a pixel. Its layout is what the gathers of `update_avx2` read.
 #[derive(Clone, Copy, Debug)]
+#[repr(C)]
 pub(crate) struct Sample {
     /// z-depth, metres.
     pub depth: f32,
@@ -149,23 +150,6 @@ pub(crate) fn camera_normal(k: &[f32; 4], du: f32, dv: f32, z: f32, gx: f32, gy:
     [k[0] * gx, k[1] * gy, -(z + du * gx + dv * gy)]
 }
 
-/// The unit normal in the camera, facing it, of pixel (x, y), which has a depth.
-pub(crate) fn normal_of_pixel(view: &AlignedView, x: usize, y: usize) -> [f32; 3] {
-    let (k, depth) = (view.intrinsics(), view.depth().image());
-    let step = gradient_step(k.width);
-    let at = |x: Option<usize>, y: Option<usize>| {
-        x.zip(y).and_then(|(x, y)| depth.get(x, y)).copied().unwrap_or(f32::NAN)
-    };
-    let (z, per_step) = (depth[(x, y)], 1.0 / step as f32);
-    let gx = slope(at(x.checked_sub(step), Some(y)), z, at(Some(x + step), Some(y)), per_step);
-    let gy = slope(at(Some(x), y.checked_sub(step)), z, at(Some(x), Some(y + step)), per_step);
-    let (du, dv) = (x as f32 - k.cx as f32, y as f32 - k.cy as f32);
-    let n = camera_normal(&[k.fx as f32, k.fy as f32, 0.0, 0.0], du, dv, z, gx, gy);
-    // n · r = −z, so n is never zero.
-    let norm = n.iter().map(|c| c * c).sum::<f32>().sqrt();
-    n.map(|c| c / norm)
-}
-
 struct Weigher<'a> {
     width: usize,
     height: usize,
@@ -174,6 +158,7 @@ struct Weigher<'a> {
     /// Stands for rows outside the image.
     missing: Vec<f32>,
     k: [f32; 4],
+    per_focal: [f32; 2],
     step: usize,
     min_confidence: f32,
     max_depth: f32,
@@ -190,6 +175,7 @@ impl<'a> Weigher<'a> {
             confidence: view.confidence().image().data(),
             missing: vec![f32::NAN; k.width],
             k: [k.fx as f32, k.fy as f32, k.cx as f32, k.cy as f32],
+            per_focal: [1.0 / k.fx as f32, 1.0 / k.fy as f32],
             step: gradient_step(k.width),
             // A confidence of 0 says "wrong", whatever the threshold.
             min_confidence: (config.min_confidence as f32).max(f32::MIN_POSITIVE),
@@ -248,12 +234,14 @@ impl<'a> Weigher<'a> {
         let gy = slope(column[0], z, column[1], per_step);
         let (du, dv) = (x - self.k[2], y - self.k[3]);
         let n = camera_normal(&self.k, du, dv, z, gx, gy);
-        let (rx, ry) = (du / self.k[0], dv / self.k[1]);
+        let (rx, ry) = (du * self.per_focal[0], dv * self.per_focal[1]);
         // n · r = −z for every slope, hence cos θ = z / (|n| |r|).
-        let cos = z / ((n[0] * n[0] + n[1] * n[1] + n[2] * n[2]) * (rx * rx + ry * ry + 1.0)).sqrt();
-        let usable = (z <= self.max_depth) & (confidence >= self.min_confidence) & (cos >= self.min_cos);
-        let near = (1.0 / (z * z)).min(1.0);
-        let weight = round_to_i32(confidence * cos * near * WEIGHT_ONE).max(1) as u32;
+        let norms = ((n[0] * n[0] + n[1] * n[1] + n[2] * n[2]) * (rx * rx + ry * ry + 1.0)).sqrt();
+        let steep = z < self.min_cos * norms;
+        let usable = (z <= self.max_depth) & (confidence >= self.min_confidence) & !steep;
+        // cos θ · min(1, 1 / z²) with a single division: they and the root are what this kernel takes its time for.
+        let far = if z > 1.0 { z * z } else { 1.0 };
+        let weight = round_to_i32(confidence * z / (norms * far) * WEIGHT_ONE).max(1) as u32;
         let confidence = round_to_i32(confidence * CONFIDENCE_ONE).max(1) as u32;
         let packed = weight | (confidence << 16);
         // Every field of an unusable sample is a number, so that kernels may compute with it and weigh it 0.

@@ -1,10 +1,11 @@
 //! The TSDF volume: hashed blocks, one view at a time.
 
 use crate::allocate::touched_blocks;
-use crate::block::{Block, BlockUpdate};
+use crate::block::Block;
 use crate::carve::{Vote, free_space};
 use crate::grid::{BlockKey, CameraFromWorld, EDGE, MAX_VIEWS, check_view, table_bytes};
 use crate::sample::SampledView;
+use crate::update::BlockUpdate;
 use crate::{FusionConfig, FusionError};
 use nalgebra::Vector3;
 use rayon::prelude::*;

@@ -1,0 +1,220 @@
+//! The pixels of a view, summed by voxel, on their way into the point cloud.
+//!
+//! A voxel of usual size is seen by dozens of neighbouring pixels. So a strip of rows first sums them in a small
+//! table without chains, from which an older voxel is pushed out when another one takes its slot; what is pushed
+//! out, a part of a voxel, is then added to the cloud's hash tables. Sums are integers: how pixels are cut into
+//! parts does not matter.
+
+use crate::grid::BlockKey;
+use crate::points::{SHARDS, shard_of};
+use crate::sample::{Sample, SampledView, camera_normal, gradient_step, round_to_i32, slope};
+use crate::simd::dispatch;
+use nalgebra::{Matrix3, Vector3};
+use rayon::prelude::*;
+use vidar_core::AlignedView;
+
+/// The integer that stands for one voxel edge in sums of positions, and for 1 in sums of normals.
+pub(crate) const FRACTION_ONE: f32 = 4096.0;
+/// Rows of a strip.
+const STRIP: usize = 32;
+/// Pixels that a part takes: 127 weights (12 bits) of normals (12 bits and sign) fit 32 bits.
+const MAX_PIXELS: u32 = 127;
+/// Slots of a strip's table: 8 × 8 × 8 neighbouring voxels never meet in one.
+const SLOTS: usize = 512;
+
+/// Sums over some pixels of one voxel.
+#[derive(Clone, Copy, Debug, Default)]
+pub(crate) struct Part {
+    pub key: BlockKey,
+    /// Σ w · (position − centre of the voxel).
+    pub offset: [i32; 3],
+    /// Σ w · normal.
+    pub normal: [i32; 3],
+    /// Σ w · colour, and Σ w of the pixels that had one.
+    pub color: [u32; 4],
+    pub weight: u32,
+    pub confidence: u32,
+    pub pixels: u32,
+}
+
+/// The parts of a view, by strip and shard. Kept from view to view for its memory.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct Strips {
+    strips: Vec<Strip>,
+}
+
+#[derive(Clone, Debug, Default)]
+struct Strip {
+    parts: Vec<Vec<Part>>,
+    slots: Vec<Part>,
+    row: Row,
+}
+
+/// Where the pixels of a row lie and face; anything where there is no depth.
+#[derive(Clone, Debug, Default)]
+struct Row {
+    /// Depths with a margin of NaN on both sides.
+    depth: Vec<f32>,
+    pixels: Vec<Pixel>,
+}
+
+/// Place and direction of a pixel.
+#[derive(Clone, Copy, Debug, Default)]
+struct Pixel {
+    /// Voxels from that of the camera.
+    voxel: [i32; 3],
+    /// From the voxel's centre, of [`FRACTION_ONE`].
+    offset: [i32; 3],
+    /// Unit normal, of [`FRACTION_ONE`].
+    normal: [i32; 3],
+}
+
+impl Strips {
+    /// Sums the pixels of `view` by voxel, in place of the view before.
+    pub fn fill(&mut self, view: &AlignedView, sampled: &SampledView, voxel_m: f64) {
+        let placer = Placer::new(view, voxel_m);
+        self.strips.resize_with(sampled.height.div_ceil(STRIP), Strip::default);
+        let rows = sampled.samples.par_chunks(sampled.width * STRIP);
+        self.strips.par_iter_mut().zip(rows).enumerate().for_each(|(at, (strip, samples))| {
+            strip.clear();
+            for (row, samples) in samples.chunks_exact(sampled.width).enumerate() {
+                let y = at * STRIP + row;
+                dispatch!(placer.place(y, samples, &mut strip.row));
+                let colors = view.color().map(|c| &c.data()[y * sampled.width..][..sampled.width]);
+                strip.add(samples, colors, placer.camera_voxel);
+            }
+            strip.finish();
+        });
+    }
+
+    /// The parts of one shard, in the order of strips.
+    pub fn of_shard(&self, shard: usize) -> impl Iterator<Item = &Part> {
+        self.strips.iter().flat_map(move |strip| &strip.parts[shard])
+    }
+}
+
+impl Strip {
+    fn clear(&mut self) {
+        self.parts.resize_with(SHARDS, Vec::new);
+        self.parts.iter_mut().for_each(Vec::clear);
+        self.slots.clear();
+        self.slots.resize(SLOTS, Part::default());
+    }
+
+    /// Adds the row that was placed last.
+    fn add(&mut self, samples: &[Sample], colors: Option<&[[u8; 3]]>, camera_voxel: BlockKey) {
+        for (x, (sample, pixel)) in samples.iter().zip(&self.row.pixels).enumerate() {
+            let weight = sample.weight();
+            if weight == 0 {
+                continue;
+            }
+            let key = [0, 1, 2].map(|a| camera_voxel[a].wrapping_add(pixel.voxel[a]));
+            let slot = &mut self.slots[(key[0] & 7 | (key[1] & 7) << 3 | (key[2] & 7) << 6) as usize];
+            if slot.key != key || slot.pixels == MAX_PIXELS {
+                if slot.pixels > 0 {
+                    self.parts[shard_of(&slot.key)].push(*slot);
+                }
+                *slot = Part { key, ..Part::default() };
+            }
+            for a in 0..3 {
+                slot.offset[a] += weight as i32 * pixel.offset[a];
+                slot.normal[a] += weight as i32 * pixel.normal[a];
+            }
+            if let Some(colors) = colors {
+                for (sum, channel) in slot.color.iter_mut().zip(colors[x]) {
+                    *sum += weight * u32::from(channel);
+                }
+                slot.color[3] += weight;
+            }
+            slot.weight += weight;
+            slot.confidence += sample.confidence();
+            slot.pixels += 1;
+        }
+    }
+
+    /// Pushes out what is left in the slots.
+    fn finish(&mut self) {
+        for slot in self.slots.iter().filter(|slot| slot.pixels > 0) {
+            self.parts[shard_of(&slot.key)].push(*slot);
+        }
+    }
+}
+
+/// Finds the voxels of pixels.
+struct Placer<'a> {
+    depth: &'a [f32],
+    width: usize,
+    height: usize,
+    step: usize,
+    /// fx, fy, cx, cy.
+    k: [f32; 4],
+    /// Stands for rows outside the image.
+    missing: Vec<f32>,
+    camera_voxel: BlockKey,
+    /// Where the camera lies from the centre of its voxel, in voxels, where single precision is plenty.
+    start: [f32; 3],
+    rotation: [[f32; 3]; 3],
+    per_voxel: f32,
+}
+
+impl<'a> Placer<'a> {
+    fn new(view: &'a AlignedView, voxel_m: f64) -> Self {
+        let k = view.intrinsics();
+        let origin = view.world_from_camera().translation / voxel_m;
+        let camera_voxel = origin.map(f64::round);
+        let rotation: Matrix3<f64> = view.world_from_camera().rotation.matrix();
+        let rotation = [0, 1, 2].map(|r| [0, 1, 2].map(|c| rotation[(r, c)] as f32));
+        let start: Vector3<f32> = (origin - camera_voxel).map(|c| c as f32);
+        Self {
+            depth: view.depth().image().data(),
+            width: k.width,
+            height: k.height,
+            step: gradient_step(k.width),
+            k: [k.fx as f32, k.fy as f32, k.cx as f32, k.cy as f32],
+            missing: vec![f32::NAN; k.width],
+            camera_voxel: camera_voxel.map(|c| c as i32).into(),
+            start: start.into(),
+            rotation,
+            per_voxel: (1.0 / voxel_m) as f32,
+        }
+    }
+
+    /// Places the pixels of row `y`.
+    #[inline(always)]
+    fn place(&self, y: usize, samples: &[Sample], row: &mut Row) {
+        let (n, step) = (self.width, self.step);
+        let line = |y: usize| &self.depth[y * n..][..n];
+        row.depth.clear();
+        row.depth.resize(n + 2 * step, f32::NAN);
+        row.depth[step..step + n].copy_from_slice(line(y));
+        row.pixels.resize(n, Pixel::default());
+        let above = if y >= step { line(y - step) } else { &self.missing[..n] };
+        let below = if y + step < self.height { line(y + step) } else { &self.missing[..n] };
+        let (before, here, after) = (&row.depth[..n], &row.depth[step..][..n], &row.depth[2 * step..][..n]);
+        let (samples, pixels) = (&samples[..n], &mut row.pixels[..n]);
+        let per_step = 1.0 / step as f32;
+        let per_focal = [1.0 / self.k[0], 1.0 / self.k[1]];
+        let dv = y as f32 - self.k[3];
+        for x in 0..n {
+            let z = samples[x].depth;
+            let du = x as f32 - self.k[2];
+            let gx = slope(before[x], here[x], after[x], per_step);
+            let gy = slope(above[x], here[x], below[x], per_step);
+            let normal = camera_normal(&self.k, du, dv, z, gx, gy);
+            // n · r = −z, so n is not zero where there is a depth.
+            let squared = normal[0] * normal[0] + normal[1] * normal[1] + normal[2] * normal[2];
+            let scale = FRACTION_ONE / squared.sqrt();
+            let along = z * self.per_voxel;
+            let point = [du * per_focal[0] * along, dv * per_focal[1] * along, along];
+            for a in 0..3 {
+                let [r0, r1, r2] = self.rotation[a];
+                let at = self.start[a] + (r0 * point[0] + r1 * point[1] + r2 * point[2]);
+                let voxel = round_to_i32(at);
+                pixels[x].voxel[a] = voxel;
+                pixels[x].offset[a] = round_to_i32((at - voxel as f32) * FRACTION_ONE);
+                let turned = r0 * normal[0] + r1 * normal[1] + r2 * normal[2];
+                pixels[x].normal[a] = round_to_i32(turned * scale);
+            }
+        }
+    }
+}
