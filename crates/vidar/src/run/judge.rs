@@ -60,7 +60,12 @@ pub fn judge(
             Err(e) => warn("trajectory", e.to_string()),
         }
     }
-    if let Some(reference) = reference::cloud(&plan.reference, dataset, config, events)? {
+    // By now the map is made; a reference that cannot be read must not cost it.
+    let reference = reference::cloud(&plan.reference, dataset, config, events).unwrap_or_else(|e| {
+        warn("surface", format!("{}: {e}", plan.reference));
+        None
+    });
+    if let Some(reference) = reference {
         let surface = SurfaceEvalConfig { keep_point_errors: true, ..config.eval.surface.clone() };
         let judged = sampled(&map.mesh, config).map_err(Error::from).and_then(|estimate| {
             let report = vidar_eval::evaluate_surface_from(&estimate, &reference, &start, &surface)?;

@@ -156,6 +156,7 @@ const DEGRADING: &[&str] = &[
     "memory-budget",
     "no-parallax",
     "depth-unreadable",
+    "not-judged",
 ];
 
 impl Recorder {

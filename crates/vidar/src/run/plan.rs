@@ -68,6 +68,10 @@ pub enum ReferenceSource {
 impl Plan {
     /// Looks at poses, camera and configuration.
     pub fn make(dataset: &Dataset, config: &Config, reference: Option<&Path>) -> Result<Self, Error> {
+        if let Some(path) = reference {
+            // Better said now than after an hour of depth.
+            std::fs::File::open(path).map_err(|e| Error::io("read", path, e))?;
+        }
         input::require_calibration(dataset)?;
         let anchor = input::metric_anchor(dataset, config)?;
         let (posed, mut warnings) = input::posed_frames(dataset, &anchor, config)?;
