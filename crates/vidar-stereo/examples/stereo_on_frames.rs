@@ -81,7 +81,7 @@ fn load(kind: &str, folder: &Path) -> Result<Vec<(ChunkView, Truth)>, Box<dyn Er
         for color in colors {
             let name = color.to_string_lossy().replace(".color.jpg", "");
             let image = rgb(&color)?;
-            let k = Pinhole::new(523.5, 523.5, 319.8, 233.5, image.width(), image.height())?;
+            let k = Pinhole::new(525.1, 525.1, 322.3, 223.3, image.width(), image.height())?;
             let world_from_depth = motion(&numbers(&std::fs::read_to_string(format!("{name}.pose.txt"))?))?;
             let depth_from_color = Se3::from_translation(Vector3::new(0.023, -0.012, 0.0));
             let depth_m = depth(Path::new(&format!("{name}.depth.png")))?;

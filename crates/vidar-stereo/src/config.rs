@@ -29,12 +29,17 @@ pub struct StereoConfig {
     pub jump_penalty: u16,
     /// Rounds of slanted-plane refinement after the sweep, 0…8. Zero is quicker and leaves staircases.
     pub refine_rounds: usize,
+    /// Spread of the given poses, one standard deviation of each one's rotation, degrees, 0…5. Poses are corrected
+    /// within it by what the images say; 0 here or in `pose_spread_m` takes them as they are.
+    pub pose_spread_deg: f64,
+    /// Spread of the given camera centres, metres, 0…1.
+    pub pose_spread_m: f64,
     /// Noise of the images, grey levels of 255, 0.1…50. Texture weaker than this is not trusted.
-    pub noise_gray: f32,
+    pub noise_gray: f64,
     /// Largest relative difference between the depths of two views that agree, 0.001…0.2.
-    pub agreement_ratio: f32,
+    pub agreement_ratio: f64,
     /// Depths with less confidence are dropped, 0…1. Fusion weighs the rest, so this can stay low.
-    pub min_confidence: f32,
+    pub min_confidence: f64,
 }
 
 impl Default for StereoConfig {
@@ -50,6 +55,8 @@ impl Default for StereoConfig {
             step_penalty: 12,
             jump_penalty: 80,
             refine_rounds: 1,
+            pose_spread_deg: 0.1,
+            pose_spread_m: 0.01,
             noise_gray: 1.0,
             agreement_ratio: 0.02,
             min_confidence: 0.5,
@@ -76,8 +83,10 @@ impl StereoConfig {
         check("step_penalty", f64::from(self.step_penalty), 1.0, 200.0)?;
         check("jump_penalty", f64::from(self.jump_penalty), f64::from(self.step_penalty), 1000.0)?;
         check("refine_rounds", self.refine_rounds as f64, 0.0, 8.0)?;
-        check("noise_gray", f64::from(self.noise_gray), 0.1, 50.0)?;
-        check("agreement_ratio", f64::from(self.agreement_ratio), 0.001, 0.2)?;
-        check("min_confidence", f64::from(self.min_confidence), 0.0, 1.0)
+        check("pose_spread_deg", self.pose_spread_deg, 0.0, 5.0)?;
+        check("pose_spread_m", self.pose_spread_m, 0.0, 1.0)?;
+        check("noise_gray", self.noise_gray, 0.1, 50.0)?;
+        check("agreement_ratio", self.agreement_ratio, 0.001, 0.2)?;
+        check("min_confidence", self.min_confidence, 0.0, 1.0)
     }
 }

@@ -4,11 +4,11 @@
 //! the way there and back ends within a pixel or so of its start and the depths differ by little. Where views agree
 //! their inverse depths are averaged, which removes part of each one's noise.
 
+use crate::cache::ViewDepth;
 use crate::config::StereoConfig;
-use crate::estimate::Estimate;
-use crate::prepare::Prepared;
 use crate::warp::{Warp, neighbour_from_reference};
 use rayon::prelude::*;
+use std::sync::Arc;
 
 /// Largest distance between a pixel and where the way there and back ends, working pixels.
 const REPROJECTION_LIMIT_PX: f32 = 1.5;
@@ -35,38 +35,29 @@ struct Other<'a> {
     back: Warp,
 }
 
-/// Compares `reference` with the estimates of `others` (indices into `views`).
-pub(crate) fn support(
-    views: &[Prepared],
-    reference: usize,
-    own: &Estimate,
-    others: &[(usize, &Estimate)],
-    config: &StereoConfig,
-) -> Vec<Support> {
-    let level = &views[reference].levels[0];
+/// Compares a view's own depth with that of `others`.
+pub(crate) fn support(own: &ViewDepth, others: &[Arc<ViewDepth>], config: &StereoConfig) -> Vec<Support> {
     let others: Vec<Other<'_>> = others
         .iter()
-        .map(|&(i, estimate)| {
-            let other = &views[i].levels[0];
-            let motion =
-                neighbour_from_reference(&views[i].world_from_camera, &views[reference].world_from_camera);
-            let back =
-                neighbour_from_reference(&views[reference].world_from_camera, &views[i].world_from_camera);
+        .map(|other| {
+            let there = neighbour_from_reference(&other.world_from_camera, &own.world_from_camera);
+            let back = neighbour_from_reference(&own.world_from_camera, &other.world_from_camera);
             Other {
-                rho: &estimate.rho,
-                width: other.width,
-                height: other.height,
-                there: Warp::new(&level.intrinsics, &other.intrinsics, &motion),
-                back: Warp::new(&other.intrinsics, &level.intrinsics, &back),
+                rho: &other.estimate.rho,
+                width: other.intrinsics.width,
+                height: other.intrinsics.height,
+                there: Warp::new(&own.intrinsics, &other.intrinsics, &there),
+                back: Warp::new(&other.intrinsics, &own.intrinsics, &back),
             }
         })
         .collect();
-    let width = level.width;
-    own.rho
+    let width = own.intrinsics.width;
+    own.estimate
+        .rho
         .par_iter()
         .enumerate()
         .map(|(i, &rho)| {
-            at_pixel((i % width) as f32, (i / width) as f32, rho, &others, config.agreement_ratio)
+            at_pixel((i % width) as f32, (i / width) as f32, rho, &others, config.agreement_ratio as f32)
         })
         .collect()
 }

@@ -6,7 +6,7 @@
 use crate::config::StereoConfig;
 use crate::prepare::{Level, Prepared};
 use crate::refine::refine;
-use crate::select::select;
+use crate::select::{Selection, select};
 use crate::sgm::{Penalties, aggregate};
 use crate::sweep::{Planes, Source, UNSEEN, WORST, sweep};
 use crate::warp::{Warp, neighbour_from_reference};
@@ -14,7 +14,7 @@ use crate::warp::{Warp, neighbour_from_reference};
 /// Pyramid level of the sweep; the refinement works on level 0.
 const SWEEP_LEVEL: usize = 1;
 /// Pyramid level of the probe for the scene's depth.
-const PROBE_LEVEL: usize = 2;
+pub(crate) const PROBE_LEVEL: usize = 2;
 /// Planes of the probe.
 const PROBE_PLANES: usize = 64;
 
@@ -31,38 +31,41 @@ pub(crate) struct Estimate {
     pub texture: Vec<f32>,
     /// Inverse-depth step that shifts the best neighbour by one working pixel, 1/m.
     pub rho_per_px: f32,
-    /// Views it was matched against.
-    pub neighbours: Vec<usize>,
 }
 
-/// What became of a reference.
-pub(crate) enum Outcome {
-    Estimated(Box<Estimate>),
-    /// The largest parallax found, degrees.
-    NoParallax(f64),
-}
-
-/// Estimates the depth of `views[reference]`.
-pub(crate) fn estimate(views: &[Prepared], reference: usize, config: &StereoConfig) -> Outcome {
-    let depths_m = match probe(views, reference, config) {
-        Ok(depths_m) => depths_m,
-        Err(found_deg) => return Outcome::NoParallax(found_deg),
-    };
-    let selection = select(views, reference, &[depths_m.median], config);
+/// Depth of `views[reference]` and the views it was matched with; `Err` holds the largest parallax in degrees, if
+/// there is none worth matching.
+pub(crate) fn estimate(
+    views: &[Prepared],
+    reference: usize,
+    depth: &SceneDepth,
+    config: &StereoConfig,
+) -> Result<(Estimate, Vec<usize>), f64> {
+    let selection = select(views, reference, &[depth.median], config);
     if selection.neighbours.is_empty() {
-        return Outcome::NoParallax(selection.best_parallax_deg);
+        return Err(selection.best_parallax_deg);
     }
-    let neighbours = selection.neighbours;
+    let estimate = matched(views, reference, &selection.neighbours, depth.near, config);
+    Ok((estimate, selection.neighbours))
+}
+
+/// Sweep, semi-global matching and refinement against `neighbours`.
+fn matched(
+    views: &[Prepared],
+    reference: usize,
+    neighbours: &[usize],
+    near_m: f64,
+    config: &StereoConfig,
+) -> Estimate {
     let coarse = &views[reference].levels[SWEEP_LEVEL];
-    let sources = sources(views, reference, &neighbours, SWEEP_LEVEL);
-    let planes = spread_planes(coarse, &sources, depths_m.near.max(config.min_depth_m), config);
-    let costs = sweep(coarse, &sources, &planes, config.noise_gray);
+    let coarse_sources = sources(views, reference, neighbours, SWEEP_LEVEL);
+    let planes = spread_planes(coarse, &coarse_sources, near_m.max(config.min_depth_m), config);
+    let costs = sweep(coarse, &coarse_sources, &planes, config.noise_gray as f32);
     let penalties = Penalties { step: config.step_penalty as i16, jump: config.jump_penalty as i16 };
     let sums = aggregate(coarse, &costs, planes.count, penalties);
     let winners = Winners::pick(coarse, &costs, &sums, &planes);
-    let fine_sources = self::sources(views, reference, &neighbours, 0);
-    let estimate = refine(&views[reference].levels[0], coarse, &winners, &fine_sources, &planes, config);
-    Outcome::Estimated(Box::new(Estimate { neighbours, ..estimate }))
+    let fine_sources = sources(views, reference, neighbours, 0);
+    refine(&views[reference].levels[0], coarse, &winners, &fine_sources, &planes, config)
 }
 
 /// The neighbours' images at one level, with the warps into them.
@@ -107,41 +110,50 @@ fn spread_planes(level: &Level, sources: &[Source<'_>], near_m: f64, config: &St
 }
 
 /// Typical and nearest depth of a scene, metres.
-struct SceneDepth {
-    median: f64,
-    near: f64,
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct SceneDepth {
+    pub median: f64,
+    pub near: f64,
 }
 
-/// A rough look at a quarter of the size. `Err` holds the largest parallax, if there is none worth matching.
-fn probe(views: &[Prepared], reference: usize, config: &StereoConfig) -> Result<SceneDepth, f64> {
+/// What a rough look at a quarter of the size finds.
+#[derive(Clone, Debug)]
+pub(crate) struct Probe {
+    pub depth: SceneDepth,
+    /// Inverse depth at a quarter of the working size, 1/m; NaN where the look is not sure.
+    pub rho: Vec<f32>,
+}
+
+/// A rough look at a quarter of the size. `Err` holds the largest parallax in degrees, if none is worth matching.
+pub(crate) fn probe(views: &[Prepared], reference: usize, config: &StereoConfig) -> Result<Probe, f64> {
     // Depth is unknown here: average the worth of a neighbour over the searched range, evenly in log depth.
     let ratio = config.max_depth_m / config.min_depth_m;
     let depths_m: Vec<f64> =
         (0..5).map(|i| config.min_depth_m * ratio.powf((i as f64 + 0.5) / 5.0)).collect();
-    let selection = select(views, reference, &depths_m, config);
-    if selection.neighbours.is_empty() {
-        return Err(selection.best_parallax_deg);
+    let Selection { neighbours, best_parallax_deg } = select(views, reference, &depths_m, config);
+    if neighbours.is_empty() {
+        return Err(best_parallax_deg);
     }
     let level = &views[reference].levels[PROBE_LEVEL];
-    let sources = sources(views, reference, &selection.neighbours, PROBE_LEVEL);
+    let sources = sources(views, reference, &neighbours, PROBE_LEVEL);
     let (first, last) = (1.0 / config.max_depth_m as f32, 1.0 / config.min_depth_m as f32);
     let planes = Planes { first, step: (last - first) / (PROBE_PLANES - 1) as f32, count: PROBE_PLANES };
-    let costs = sweep(level, &sources, &planes, config.noise_gray);
+    let costs = sweep(level, &sources, &planes, config.noise_gray as f32);
     let penalties = Penalties { step: config.step_penalty as i16, jump: config.jump_penalty as i16 };
     let sums = aggregate(level, &costs, planes.count, penalties);
     let winners = Winners::pick(level, &costs, &sums, &planes);
-    let mut depths_m: Vec<f32> = (0..winners.rho.len())
-        .filter(|&i| winners.cost[i] < 0.4 && winners.margin[i] > 0.05 && winners.rho[i] > 0.0)
-        .map(|i| 1.0 / winners.rho[i])
-        .collect();
-    if depths_m.len() < winners.rho.len() / 50 {
+    let sure = |i: usize| winners.cost[i] < 0.4 && winners.margin[i] > 0.05 && winners.rho[i] > 0.0;
+    let rho: Vec<f32> =
+        (0..winners.rho.len()).map(|i| if sure(i) { winners.rho[i] } else { f32::NAN }).collect();
+    let mut depths_m: Vec<f32> = rho.iter().filter(|rho| !rho.is_nan()).map(|rho| 1.0 / rho).collect();
+    if depths_m.len() < rho.len() / 50 {
         let middle = (config.min_depth_m * config.max_depth_m).sqrt();
-        return Ok(SceneDepth { median: middle, near: config.min_depth_m });
+        return Ok(Probe { depth: SceneDepth { median: middle, near: config.min_depth_m }, rho });
     }
     depths_m.sort_unstable_by(f32::total_cmp);
     let at = |share: f64| f64::from(depths_m[((depths_m.len() - 1) as f64 * share) as usize]);
     // Small near things may have been missed at this size, so the near end keeps a margin.
-    Ok(SceneDepth { median: at(0.5), near: 0.6 * at(0.02) })
+    Ok(Probe { depth: SceneDepth { median: at(0.5), near: 0.6 * at(0.02) }, rho })
 }
 
 /// The best plane of every pixel.

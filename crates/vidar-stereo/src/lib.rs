@@ -20,6 +20,7 @@
 //! bits for any number of threads. Memory for one reference of `w × h` working pixels and `d` planes is about
 //! `w/2 · h/2 · d · 5` bytes for costs and sums and 20 bytes a pixel for each view's finished estimate.
 
+mod cache;
 mod confidence;
 mod config;
 mod consistency;
@@ -29,6 +30,7 @@ mod filter;
 mod model;
 mod prepare;
 mod refine;
+mod register;
 mod select;
 mod sgm;
 mod sweep;

@@ -48,7 +48,7 @@ pub(crate) fn refine(
 ) -> Estimate {
     let (w, h) = (fine.width, fine.height);
     let prior = upsample(fine, coarse, winners, planes);
-    let patches = Patches { fine, sources, noise_variance: config.noise_gray * config.noise_gray };
+    let patches = Patches { fine, sources, noise_variance: (config.noise_gray * config.noise_gray) as f32 };
     let step = planes.step;
     let mut state: Vec<Plane> = prior.clone();
     for round in 0..config.refine_rounds.max(1) {
@@ -99,7 +99,6 @@ pub(crate) fn refine(
         margin,
         texture,
         rho_per_px: 1.0 / shift_per_rho(fine, sources).max(f32::MIN_POSITIVE),
-        neighbours: Vec::new(),
     }
 }
 
