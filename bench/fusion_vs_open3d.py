@@ -8,8 +8,10 @@ Needs: pip install open3d-cpu==0.19.0 numpy scipy pillow
   python bench/fusion_vs_open3d.py SEQUENCE_DIR --binary target/release/examples/fuse_folder --out fusion.md
 
 Every tool gets the same frames in memory, two threads, the same voxel, truncation and range, and no minimal
-number of views; reading files is not timed. Rounds alternate between the tools; medians over rounds of the
-median frame are given. Quality: distances between the vertices of the meshes, both ways.
+number of views, and ours no limit of the viewing angle; reading files is not timed. Rounds alternate between the
+tools; medians over rounds of the median frame (of the mean frame for processor time) are given.
+Quality: distances between the vertices of the meshes, both ways, and how many vertices of each mesh any frame
+supports: a vertex is supported when some frame measured a depth within one voxel of the vertex's own z.
 """
 import argparse
 import glob
@@ -93,7 +95,7 @@ def voxel_block_grid(frames, color):
 def ours(binary, folder, count, color, extra):
     with tempfile.NamedTemporaryFile() as cloud:
         command = [binary, folder, "--voxel", str(VOXEL), "--trunc", str(TRUNC_VOXELS), "--max-depth", str(MAX_DEPTH),
-                   "--frames", str(count), "--cloud", cloud.name, "--points", "10", *extra] + (["--color"] if color else [])
+                   "--frames", str(count), "--cloud", cloud.name, "--points", str(count), *extra] + (["--color"] if color else [])
         out = subprocess.run(command, env={**os.environ, "RAYON_NUM_THREADS": THREADS}, check=True,
                              capture_output=True, text=True).stdout
         result = json.loads(out)
@@ -104,6 +106,40 @@ def closeness(a, b):
     """Median and mean distance (mm) from a to b, and the share of a within one voxel of b."""
     distance, _ = cKDTree(b).query(a, workers=2)
     return 1e3 * np.median(distance), 1e3 * np.mean(distance), np.mean(distance < VOXEL)
+
+
+def views_in_support(vertices, frames):
+    """For every vertex, in how many frames its pixel measured a depth within one voxel of the vertex's z."""
+    views = np.zeros(len(vertices), int)
+    for depth, _, camera_from_world in frames:
+        x, y, z = camera_from_world[:3, :3] @ vertices.T.astype(float) + camera_from_world[:3, 3:]
+        front = np.maximum(z, 1e-3)
+        u, v = np.rint(FOCAL * x / front + CX), np.rint(FOCAL * y / front + CY)
+        inside = (z > 1e-3) & (u >= 0) & (u < WIDTH) & (v >= 0) & (v < HEIGHT)
+        measured = depth[v[inside].astype(int), u[inside].astype(int)] * 1e-3
+        views[inside] += (measured > 0) & (measured < MAX_DEPTH) & (np.abs(measured - z[inside]) < VOXEL)
+    return views
+
+
+def support_lines(clouds, ours_by_setting, frames):
+    """What share of each mesh is supported, and what ours covers of the supported part of theirs."""
+    lines = ["| mesh | vertices | supported by a frame | by three frames | covers of VoxelBlockGrid | of its part "
+             "supported by one frame | by three |", "|---|---|---|---|---|---|---|"]
+    theirs = clouds["Open3D VoxelBlockGrid"]
+    support = views_in_support(theirs, frames)
+    for name, cloud in {**clouds, **ours_by_setting}.items():
+        if len(cloud) == 0:
+            continue
+        own = views_in_support(cloud, frames)
+        covered = cKDTree(cloud).query(theirs, workers=2)[0] < VOXEL
+        lines.append(f"| {name} | {len(cloud)} | {100 * np.mean(own > 0):.1f} % | {100 * np.mean(own > 2):.1f} % "
+                     f"| {100 * np.mean(covered):.1f} % | {100 * np.mean(covered[support > 0]):.1f} % "
+                     f"| {100 * np.mean(covered[support > 2]):.1f} % |")
+    missed = cKDTree(clouds["vidar-fusion"]).query(theirs, workers=2)[0] >= VOXEL
+    lines += ["", f"Of the vertices of VoxelBlockGrid that ours lacks at equal settings, "
+              f"{100 * np.mean(support[missed] == 0):.0f} % are supported by no frame at all "
+              f"({100 * np.mean(support[~missed] == 0):.0f} % of the others)."]
+    return lines
 
 
 def main():
@@ -118,7 +154,7 @@ def main():
         f"7-Scenes redkitchen, {args.frames} frames 640×480, voxel 20 mm, truncation 4 voxels, range 6 m, "
         f"{THREADS} threads, Open3D {o3d.__version__}, {args.rounds} rounds in turns, medians.", "",
         "| what | integrate, ms/frame | ratio | processor time, ms/frame | ratio | extract mesh, ms | ratio | vertices |", "|---|---|---|---|---|---|---|---|"]
-    quality = []
+    quality, support = [], []
     for color in (False, True):
         frames = read(args.folder, args.frames, color)
         tools = {
@@ -155,9 +191,17 @@ def main():
         d = details["vidar-fusion"]
         quality.append(f"- vidar-fusion {'with colour' if color else 'depth only'}: volume {d['volume_mib']} MiB, peak "
                        f"with scratch {d['peak_mib']} MiB, {d['blocks']} blocks, {d['blocks_per_frame']} touched a frame; "
-                       f"point fusion {d['points_ms_per_frame']} ms a frame")
+                       f"point fusion {d['points_ms_per_frame']:.2f} ms a frame, {d['points_cpu_ms_per_frame']:.2f} ms of "
+                       "processor time")
+        if not color:
+            settings = [("80", "1"), ("90", "2"), ("80", "2")]
+            support = support_lines(clouds, {
+                f"vidar-fusion, {angle}°, {views} view(s)": ours(
+                    args.binary, args.folder, args.frames, False, ["--max-incidence", angle, "--min-views", views])[3]
+                for angle, views in settings}, frames)
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    text = "\n".join(lines + ["", "Vertices of our mesh (depth only):", *quality]) + "\n"
+    text = "\n".join(lines + ["", "Vertices of our mesh (depth only):", *quality, "",
+                              "Support by the frames themselves (depth only):", "", *support]) + "\n"
     print(text)
     print(f"peak memory of this Python process {peak:.0f} MiB", file=sys.stderr)
     if args.out:

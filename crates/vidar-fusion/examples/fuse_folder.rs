@@ -46,16 +46,18 @@ fn main() -> Result<(), Box<dyn Error>> {
     let extract_ms = start.elapsed().as_secs_f64() * 1e3;
     let mut points = PointFusion::new(&config)?;
     let mut point_ms = Vec::new();
+    let point_cpu_before = self::cpu_ms();
     for view in views.iter().take(number("--points", 0.0)? as usize) {
         let start = Instant::now();
         points.integrate(view)?;
         point_ms.push(start.elapsed().as_secs_f64() * 1e3);
     }
+    let point_cpu_ms = self::cpu_ms() - point_cpu_before;
     let coverage = volume.coverage(&mesh);
     println!(
         "{{\"frames\": {}, \"ms_per_frame\": {:.4}, \"cpu_ms_per_frame\": {:.3}, \"total_ms\": {:.3}, \"extract_ms\": {:.3}, \
          \"blocks_per_frame\": {:.0}, \"blocks\": {}, \"vertices\": {}, \"triangles\": {}, \"area_m2\": {:.3}, \
-         \"volume_mib\": {:.1}, \"peak_mib\": {:.1}, \"points_ms_per_frame\": {:.3}, \"share_seen_by_3\": {:.3}}}",
+         \"volume_mib\": {:.1}, \"peak_mib\": {:.1}, \"points_ms_per_frame\": {:.3}, \"points_cpu_ms_per_frame\": {:.3}, \"share_seen_by_3\": {:.3}}}",
         views.len(),
         median(&mut frame_ms.clone()),
         cpu_ms / views.len().max(1) as f64,
@@ -69,6 +71,7 @@ fn main() -> Result<(), Box<dyn Error>> {
         volume.memory_bytes() as f64 / 1048576.0,
         volume.peak_memory_bytes() as f64 / 1048576.0,
         median(&mut point_ms),
+        point_cpu_ms / point_ms.len().max(1) as f64,
         coverage.share_seen_by_3_or_more,
     );
     if let Some(path) = options.get("--cloud") {

@@ -19,22 +19,33 @@ pub(crate) const FRACTION_ONE: f32 = 4096.0;
 const STRIP: usize = 32;
 /// Pixels that a part takes: 127 weights (12 bits) of normals (12 bits and sign) fit 32 bits.
 const MAX_PIXELS: u32 = 127;
-/// Slots of a strip's table: 8 × 8 × 8 neighbouring voxels never meet in one.
-const SLOTS: usize = 512;
+/// Slots of a strip's table: a few times the voxels that a row of pixels crosses, and still in the second cache.
+const SLOTS: usize = 1024;
 
 /// Sums over some pixels of one voxel.
 #[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct Part {
     pub key: BlockKey,
-    /// Σ w · (position − centre of the voxel).
-    pub offset: [i32; 3],
-    /// Σ w · normal.
-    pub normal: [i32; 3],
+    /// Σ w · (position − centre of the voxel), Σ w · normal, Σ w, 0: one vector.
+    pub sums: [i32; 8],
     /// Σ w · colour, and Σ w of the pixels that had one.
     pub color: [u32; 4],
-    pub weight: u32,
     pub confidence: u32,
     pub pixels: u32,
+}
+
+impl Part {
+    pub fn offset(&self) -> [i32; 3] {
+        [0, 1, 2].map(|a| self.sums[a])
+    }
+
+    pub fn normal(&self) -> [i32; 3] {
+        [3, 4, 5].map(|a| self.sums[a])
+    }
+
+    pub fn weight(&self) -> u32 {
+        self.sums[6] as u32
+    }
 }
 
 /// The parts of a view, by strip and shard. Kept from view to view for its memory.
@@ -63,10 +74,8 @@ struct Row {
 struct Pixel {
     /// Voxels from that of the camera.
     voxel: [i32; 3],
-    /// From the voxel's centre, of [`FRACTION_ONE`].
-    offset: [i32; 3],
-    /// Unit normal, of [`FRACTION_ONE`].
-    normal: [i32; 3],
+    /// Offset from the voxel's centre and unit normal, of [`FRACTION_ONE`], 1, 0: what [`Part::sums`] sums.
+    terms: [i32; 8],
 }
 
 impl Strips {
@@ -81,7 +90,7 @@ impl Strips {
                 let y = at * STRIP + row;
                 dispatch!(placer.place(y, samples, &mut strip.row));
                 let colors = view.color().map(|c| &c.data()[y * sampled.width..][..sampled.width]);
-                strip.add(samples, colors, placer.camera_voxel);
+                dispatch!(strip.add(samples, colors, placer.camera_voxel));
             }
             strip.finish();
         });
@@ -102,6 +111,7 @@ impl Strip {
     }
 
     /// Adds the row that was placed last.
+    #[inline(always)]
     fn add(&mut self, samples: &[Sample], colors: Option<&[[u8; 3]]>, camera_voxel: BlockKey) {
         for (x, (sample, pixel)) in samples.iter().zip(&self.row.pixels).enumerate() {
             let weight = sample.weight();
@@ -109,16 +119,15 @@ impl Strip {
                 continue;
             }
             let key = [0, 1, 2].map(|a| camera_voxel[a].wrapping_add(pixel.voxel[a]));
-            let slot = &mut self.slots[(key[0] & 7 | (key[1] & 7) << 3 | (key[2] & 7) << 6) as usize];
+            let slot = &mut self.slots[slot_of(&key)];
             if slot.key != key || slot.pixels == MAX_PIXELS {
                 if slot.pixels > 0 {
                     self.parts[shard_of(&slot.key)].push(*slot);
                 }
                 *slot = Part { key, ..Part::default() };
             }
-            for a in 0..3 {
-                slot.offset[a] += weight as i32 * pixel.offset[a];
-                slot.normal[a] += weight as i32 * pixel.normal[a];
+            for (sum, term) in slot.sums.iter_mut().zip(pixel.terms) {
+                *sum += weight as i32 * term;
             }
             if let Some(colors) = colors {
                 for (sum, channel) in slot.color.iter_mut().zip(colors[x]) {
@@ -126,7 +135,6 @@ impl Strip {
                 }
                 slot.color[3] += weight;
             }
-            slot.weight += weight;
             slot.confidence += sample.confidence();
             slot.pixels += 1;
         }
@@ -138,6 +146,15 @@ impl Strip {
             self.parts[shard_of(&slot.key)].push(*slot);
         }
     }
+}
+
+/// The slot of a voxel: Knuth's multiplicative hash, whose upper bits are the good ones.
+#[inline(always)]
+fn slot_of(key: &BlockKey) -> usize {
+    const FACTORS: [u32; 3] = [0x9e37_79b1, 0x85eb_ca77, 0xc2b2_ae3d];
+    let product = |a: usize| (key[a] as u32).wrapping_mul(FACTORS[a]);
+    let hash = product(0).wrapping_add(product(1)).wrapping_add(product(2));
+    (hash >> (u32::BITS - SLOTS.ilog2())) as usize % SLOTS
 }
 
 /// Finds the voxels of pixels.
@@ -211,10 +228,11 @@ impl<'a> Placer<'a> {
                 let at = self.start[a] + (r0 * point[0] + r1 * point[1] + r2 * point[2]);
                 let voxel = round_to_i32(at);
                 pixels[x].voxel[a] = voxel;
-                pixels[x].offset[a] = round_to_i32((at - voxel as f32) * FRACTION_ONE);
+                pixels[x].terms[a] = round_to_i32((at - voxel as f32) * FRACTION_ONE);
                 let turned = r0 * normal[0] + r1 * normal[1] + r2 * normal[2];
-                pixels[x].normal[a] = round_to_i32(turned * scale);
+                pixels[x].terms[3 + a] = round_to_i32(turned * scale);
             }
+            pixels[x].terms[6] = 1;
         }
     }
 }

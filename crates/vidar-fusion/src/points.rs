@@ -135,14 +135,15 @@ impl PointFusion {
 
 impl PointSum {
     fn add(&mut self, part: &Part, call: u32) {
+        let (offset, normal) = (part.offset(), part.normal());
         for a in 0..3 {
-            self.offset[a] += i64::from(part.offset[a]);
-            self.normal[a] += i64::from(part.normal[a]);
+            self.offset[a] += i64::from(offset[a]);
+            self.normal[a] += i64::from(normal[a]);
         }
         for (sum, more) in self.color.iter_mut().zip(part.color) {
             *sum += u64::from(more);
         }
-        self.weight += u64::from(part.weight);
+        self.weight += u64::from(part.weight());
         self.confidence += u64::from(part.confidence);
         self.pixels += u64::from(part.pixels);
         self.views += u32::from(self.last_call != call);
