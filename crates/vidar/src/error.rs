@@ -189,6 +189,7 @@ impl Error {
             Self::UnknownPreset { .. } => "E0104",
             Self::Usage { .. } => "E0105",
             Self::OutputExists { .. } => "E0106",
+            Self::Dataset(vidar_dataset::DatasetError::BadOption { .. }) => "E0105",
             Self::Dataset(_) => "E0201",
             Self::NoAnchor { .. } => "E0202",
             Self::NoOverlap { .. } => "E0203",
@@ -285,10 +286,36 @@ impl Error {
             Self::Threshold(_) => "`vidar eval RUN` shows every score",
             Self::Eval(_) => "check that both are of the same recording, body and clock",
             Self::NotARun { .. } => "a run folder holds manifest.json; `vidar run PATH` makes one",
-            Self::Dataset(_) => "`vidar inspect PATH` shows what was found and what is missing",
+            Self::Dataset(error) => return Some(dataset_hint(error).to_owned()),
             _ => return None,
         };
         Some(text.to_owned())
+    }
+}
+
+/// The next step after a recording was refused.
+fn dataset_hint(error: &vidar_dataset::DatasetError) -> &'static str {
+    use vidar_dataset::DatasetError as D;
+    match error {
+        D::Io { .. } => "check the path and that it may be read",
+        D::UnknownLayout { .. } => {
+            "--format names the layout; docs/getting-started.md shows what each one looks like"
+        }
+        D::Garbage { .. } => "repair or remove that line; the file may be cut off or of another format",
+        D::MissingCamera { .. } => "choose one of those with --camera N",
+        D::NoImages { .. } => {
+            "check --start, --end and --stride, and that the images lie where the list says"
+        }
+        D::NoPoses { .. } => "--trajectory-format tum|euroc|kitti says what the file is",
+        D::BadCamera { .. } | D::UnsupportedCamera { .. } => {
+            "correct the calibration, or replace it with --camera-model or --calibration FILE"
+        }
+        D::NotRigid { .. } => "the matrix maps sensor to body coordinates; its rotation must be orthonormal",
+        D::BadImage { .. } => "the image may be cut off; copy the recording again",
+        D::WrongImageSize { .. } => "the calibration is of another resolution; give the one of these images",
+        D::TimesMismatch { .. } => "give one time per pose with --timestamps, or the trajectory as TUM",
+        D::BadOption { .. } => "`vidar run --help` shows what each flag takes",
+        _ => "`vidar inspect PATH` shows what was found and what is missing",
     }
 }
 

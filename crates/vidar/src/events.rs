@@ -98,12 +98,19 @@ impl Events {
         self.emit(&Event::Warning { warning: warning.clone() });
     }
 
-    /// Runs `work` as a stage: started, finished, and how long.
-    pub fn stage<T>(&self, stage: &'static str, total: usize, work: impl FnOnce() -> T) -> T {
+    /// Runs `work` as a stage: started, finished, and how long. A stage that failed is not told as finished.
+    pub fn stage<T, E>(
+        &self,
+        stage: &'static str,
+        total: usize,
+        work: impl FnOnce() -> Result<T, E>,
+    ) -> Result<T, E> {
         let start = std::time::Instant::now();
         self.emit(&Event::StageStarted { stage, total });
         let result = work();
-        self.emit(&Event::StageFinished { stage, seconds: start.elapsed().as_secs_f64() });
+        if result.is_ok() {
+            self.emit(&Event::StageFinished { stage, seconds: start.elapsed().as_secs_f64() });
+        }
         result
     }
 }

@@ -78,6 +78,8 @@ pub fn read_views(run: &Path) -> Result<Vec<StoredView>, Error> {
 
 /// Makes `target` from the run folder `run` in the folder `out` and returns the files made.
 pub fn export_run(run: &Path, target: ExportTarget, out: &Path) -> Result<Vec<PathBuf>, Error> {
+    // What is no run folder is refused before anything is made in it.
+    read_views(run)?;
     std::fs::create_dir_all(out).map_err(|e| Error::io("create", out, e))?;
     match target {
         ExportTarget::Colmap => colmap(run, out, ColmapFormat::Binary),
@@ -87,8 +89,22 @@ pub fn export_run(run: &Path, target: ExportTarget, out: &Path) -> Result<Vec<Pa
         ExportTarget::Ply => {
             ["mesh.ply", "points.ply"].iter().map(|name| copy(run, "map", name, out)).collect()
         }
-        ExportTarget::Glb => Ok(vec![copy(run, "map", "mesh.glb", out)?]),
+        ExportTarget::Glb => Ok(vec![glb(run, out)?]),
     }
+}
+
+/// The run's own GLB, or one made from its mesh when the run was told not to write it.
+fn glb(run: &Path, out: &Path) -> Result<PathBuf, Error> {
+    if run.join("map/mesh.glb").is_file() {
+        return copy(run, "map", "mesh.glb", out);
+    }
+    let path = run.join("map/mesh.ply");
+    let bytes = std::fs::read(&path).map_err(|e| Error::io("read", &path, e))?;
+    let mesh = vidar_export::read_ply(&bytes)?.into_mesh();
+    let target = out.join("mesh.glb");
+    let comments = ["VIDAR metric map".to_owned()];
+    vidar_export::atomic::write_atomically(&target, |w| vidar_export::write_glb_mesh(w, &mesh, &comments))?;
+    Ok(target)
 }
 
 fn colmap(run: &Path, out: &Path, format: ColmapFormat) -> Result<Vec<PathBuf>, Error> {

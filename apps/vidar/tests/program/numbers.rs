@@ -17,7 +17,8 @@ fn truth() -> Trajectory {
 
 /// The same flight told in another world: turned, moved, scaled about the origin, and with small noise.
 fn told_otherwise(name: &str, scale: f64, noise_m: f64) -> PathBuf {
-    let other_from_world = Se3::new(So3::from_quaternion(0.1, -0.2, 0.4, 0.9).unwrap(), [3.0, -7.0, 1.5].into());
+    let other_from_world =
+        Se3::new(So3::from_quaternion(0.1, -0.2, 0.4, 0.9).unwrap(), [3.0, -7.0, 1.5].into());
     // A fixed sequence of numbers in [-1, 1]: Weyl's, so that the test needs no generator.
     let mut phase = 0.0_f64;
     let mut next = move || {
@@ -41,6 +42,8 @@ fn told_otherwise(name: &str, scale: f64, noise_m: f64) -> PathBuf {
 fn run_with(trajectory: &Path, out: &str) -> Value {
     let flags = [
         "--json",
+        "--set",
+        "eval.mode=auto",
         "--progress",
         "off",
         "--trajectory",
@@ -101,8 +104,11 @@ fn the_result_has_the_same_bits_with_one_thread_and_with_four() {
     let root = &shared().root;
     let folders = ["1", "4"].map(|threads| {
         let out = root.join(format!("threads {threads}"));
-        let mut command =
-            run_command(&shared().sequence, &out, &["-q", "--threads", threads, "--stride", "2"]);
+        let mut command = run_command(
+            &shared().sequence,
+            &out,
+            &["-q", "--threads", threads, "--stride", "2", "--set", "eval.mode=auto"],
+        );
         Ran::from(command.output().unwrap()).ends_with(0);
         out
     });

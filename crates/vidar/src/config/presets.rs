@@ -30,7 +30,7 @@ pub const PRESETS: &[Preset] = &[
     },
     Preset {
         name: "quality",
-        about: "patience for a better surface: more neighbours, finer voxels",
+        about: "patience for a better surface: closer keyframes, larger images",
         toml: include_str!("../../../../presets/quality.toml"),
     },
     Preset {

@@ -63,7 +63,10 @@ pub fn build(
         let reason = failures.pop().unwrap_or_else(|| "no keyframe image could be read".into());
         return Err(Error::Empty { keyframes: plan.keyframes.len(), reason });
     }
-    events.stage("surface", 0, || surface.extract(&mut map));
+    events.stage("surface", 0, || {
+        surface.extract(&mut map);
+        Ok::<(), Error>(())
+    })?;
     map.warnings.iter().for_each(|w| events.warn(w));
     Ok(map)
 }

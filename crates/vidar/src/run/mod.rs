@@ -151,6 +151,8 @@ struct Recorded {
 /// Kinds of warnings that mean that part of the result is missing.
 const DEGRADING: &[&str] = &[
     "image-unreadable",
+    "image-empty",
+    "image-missing",
     "chunk-failed",
     "chunk-not-placed",
     "memory-budget",
