@@ -1,0 +1,148 @@
+//! Chunks of a stream: only what is wanted, nothing twice, and poses that the images correct.
+
+#![allow(clippy::expect_used, reason = "helpers of tests may stop at the first surprise, as tests may")]
+
+mod scene;
+
+use nalgebra::Vector3;
+use scene::{Scene, WALL, depth, views};
+use std::ops::Range;
+use std::sync::atomic::{AtomicUsize, Ordering};
+use vidar_core::{
+    ChunkId, ChunkViews, FrameId, GeometryModel, LieGroup, ModelError, Se3, So3, Timestamp, ViewGeometry,
+};
+use vidar_stereo::{StereoConfig, StereoModel};
+
+fn model() -> StereoModel {
+    StereoModel::new(StereoConfig::default()).expect("defaults are valid")
+}
+
+fn boxed() -> Scene {
+    Scene { board: Some((0.45, 1.9)), ..WALL }
+}
+
+/// A flight to the side with a little weave.
+fn flight(count: usize) -> Vec<Se3> {
+    (0..count)
+        .map(|i| {
+            let x = 0.14 * (i as f64 - 0.5 * count as f64);
+            let y = 0.05 * (1.3 * i as f64).sin();
+            Se3::new(So3::exp(&Vector3::new(0.02 * y, -0.05 * x, 0.0)), Vector3::new(x, y, 0.0))
+        })
+        .collect()
+}
+
+fn part(all: &ChunkViews, range: Range<usize>) -> ChunkViews {
+    ChunkViews { id: ChunkId(range.start as u32), views: all.views[range].to_vec() }
+}
+
+fn bits(views: &[ViewGeometry]) -> Vec<u32> {
+    views.iter().flat_map(|v| v.depth.image().data().iter().map(|z| z.to_bits())).collect()
+}
+
+fn ids(views: &[ViewGeometry]) -> Vec<u32> {
+    views.iter().map(|v| v.frame_id.0).collect()
+}
+
+/// Predicts, and counts how often it was asked whether to stop: once before each piece of work.
+fn counted(model: &mut StereoModel, chunk: &ChunkViews, wanted: Range<usize>) -> (Vec<ViewGeometry>, usize) {
+    let asked = AtomicUsize::new(0);
+    let cancel = || {
+        asked.fetch_add(1, Ordering::Relaxed);
+        false
+    };
+    let prediction = model.predict_wanted(chunk, wanted, &cancel).expect("has parallax");
+    (prediction.views, asked.into_inner())
+}
+
+#[test]
+fn only_wanted_views_come_back_and_a_second_call_works_out_nothing_new() {
+    let all = views(&boxed(), &flight(8), |_| (1.0, 0.0), 2.0);
+    let mut model = model();
+    let (first, work) = counted(&mut model, &all, 3..5);
+    assert_eq!(ids(&first), [3, 4]);
+    // Eight probes and at most all estimates, and the probes are asked for again.
+    assert!(work > 8 + 2 && work <= 16, "{work}");
+    let (again, rest) = counted(&mut model, &all, 3..5);
+    assert!(bits(&first) == bits(&again) && rest == 8, "{rest}");
+}
+
+#[test]
+fn a_chunk_takes_over_what_the_chunk_before_it_estimated() {
+    let all = views(&boxed(), &flight(12), |_| (1.0, 0.0), 2.0);
+    let mut streaming = model();
+    counted(&mut streaming, &part(&all, 0..8), 0..5);
+    let (second, work) = counted(&mut streaming, &part(&all, 4..12), 1..6);
+    let (_, fresh) = counted(&mut model(), &part(&all, 4..12), 1..6);
+    assert_eq!(ids(&second), [5, 6, 7, 8, 9]);
+    assert!(work < fresh, "{work} of {fresh}");
+    // The same calls again, on one thread: the same bits.
+    let pool = rayon::ThreadPoolBuilder::new().num_threads(1).build().expect("pool");
+    let one_thread = pool.install(|| {
+        let mut other = model();
+        counted(&mut other, &part(&all, 0..8), 0..5);
+        counted(&mut other, &part(&all, 4..12), 1..6).0
+    });
+    assert!(bits(&second) == bits(&one_thread));
+}
+
+#[test]
+fn another_image_under_a_known_number_is_another_view() {
+    let flight = flight(5);
+    let one = views(&boxed(), &flight, |_| (1.0, 0.0), 2.0);
+    let other = views(&WALL, &flight, |_| (1.0, 0.0), 2.0);
+    let mut used = model();
+    used.predict_wanted(&one, 2..3, &|| false).expect("has parallax");
+    let after = used.predict_wanted(&other, 2..3, &|| false).expect("has parallax");
+    let fresh = model().predict_wanted(&other, 2..3, &|| false).expect("has parallax");
+    assert!(bits(&after.views) == bits(&fresh.views));
+}
+
+#[test]
+fn wanted_views_without_parallax_are_left_out_and_cancelling_is_heard() {
+    let turns: Vec<Se3> = (0..4)
+        .map(|i| Se3::new(So3::exp(&Vector3::new(0.0, 0.05 * i as f64, 0.0)), Vector3::zeros()))
+        .collect();
+    let chunk = views(&WALL, &turns, |_| (1.0, 0.0), 0.0);
+    let prediction = model().predict_wanted(&chunk, 1..3, &|| false).expect("nothing is no error here");
+    assert!(prediction.views.is_empty());
+    let chunk = views(&WALL, &flight(4), |_| (1.0, 0.0), 0.0);
+    assert!(matches!(model().predict_wanted(&chunk, 1..3, &|| true), Err(ModelError::Cancelled)));
+    // Heard as well in the middle of the work.
+    let asked = AtomicUsize::new(0);
+    let late = || asked.fetch_add(1, Ordering::Relaxed) > 5;
+    assert!(matches!(model().predict_wanted(&chunk, 0..4, &late), Err(ModelError::Cancelled)));
+}
+
+/// Share of pixels within 2 % of the truth.
+fn right(scene: &Scene, truth_pose: &Se3, view: &ViewGeometry) -> f64 {
+    let truth = depth(scene, truth_pose);
+    let near = |(z, t): &(&f32, &f32)| ((**z - **t) / **t).abs() < 0.02;
+    let right = view.depth.image().data().iter().zip(truth.data()).filter(near).count();
+    right as f64 / truth.data().len() as f64
+}
+
+#[test]
+fn poses_that_jitter_are_straightened_by_the_images() {
+    let true_poses = flight(9);
+    let mut chunk = views(&boxed(), &true_poses, |_| (1.0, 0.0), 2.0);
+    for (i, view) in chunk.views.iter_mut().enumerate() {
+        // Some 5 mm and a quarter of a degree, to and fro.
+        let (a, b) = ((2.1 * i as f64).sin(), (3.7 * i as f64 + 1.0).sin());
+        let jitter = Se3::new(
+            So3::exp(&Vector3::new(0.004 * a, 0.004 * b, -0.003 * a)),
+            Vector3::new(0.0, 0.005 * b, 0.0),
+        );
+        view.world_from_camera = Some(true_poses[i] * jitter);
+        view.time = Timestamp::from_nanos(i as i64 * 50_000_000);
+    }
+    let taken_as_given = StereoConfig { pose_spread_deg: 0.0, ..StereoConfig::default() };
+    let score = |config: StereoConfig| {
+        let mut model = StereoModel::new(config).expect("valid");
+        let found = model.predict_wanted(&chunk, 4..5, &|| false).expect("has parallax");
+        assert_eq!(found.views[0].frame_id, FrameId(4));
+        right(&boxed(), &true_poses[4], &found.views[0])
+    };
+    let (given, corrected) = (score(taken_as_given), score(StereoConfig::default()));
+    assert!(corrected > 0.6 && corrected > given + 0.1, "as given {given:.3}, corrected {corrected:.3}");
+}
