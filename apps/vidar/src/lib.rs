@@ -32,9 +32,12 @@ pub fn main_with(args: impl Iterator<Item = OsString>) -> ExitCode {
     let command = typed.iter().map(|a| quoted(&a.to_string_lossy())).collect();
     let context = Context { cli: cli.common, command, cancel: CancelToken::new() };
     install_cancel(&context.cancel);
-    let outcome = match context.thread_pool() {
+    let work = || match context.thread_pool() {
         Ok(pool) => pool.install(|| dispatch(cli.command, &context)),
         Err(error) => Err(error),
+    };
+    let Some(outcome) = without_bug(work) else {
+        return ExitCode::from(ExitStatus::Bug as u8);
     };
     match outcome.and_then(|status| print::all_delivered().map(|()| status)) {
         Ok(status) => ExitCode::from(status as u8),
@@ -43,6 +46,19 @@ pub fn main_with(args: impl Iterator<Item = OsString>) -> ExitCode {
             ExitCode::from(error.exit_status() as u8)
         }
     }
+}
+
+/// Runs `work`; a panic is a bug of ours, named as such, with what to do about it.
+fn without_bug<T>(work: impl FnOnce() -> T) -> Option<T> {
+    // Nothing that the panic may have left half changed is looked at afterwards: the process ends.
+    let result = std::panic::catch_unwind(std::panic::AssertUnwindSafe(work));
+    if result.is_err() {
+        print::talk("error[E7001]: this is a bug in VIDAR; what was finished is on disk");
+        print::talk(
+            "  hint: please report the lines above with the command and its manifest.json or log.jsonl",
+        );
+    }
+    result.ok()
 }
 
 /// What every command needs to know.
@@ -106,5 +122,24 @@ fn quoted(argument: &str) -> String {
         argument.to_owned()
     } else {
         format!("'{}'", argument.replace('\'', r"'\''"))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_panic_is_told_as_a_bug_and_everything_else_passes_through() {
+        assert_eq!(without_bug(|| 7), Some(7));
+        assert_eq!(without_bug(|| -> i32 { panic!("on purpose") }), None);
+    }
+
+    #[test]
+    fn a_command_is_quoted_so_that_a_shell_takes_it_back() {
+        assert_eq!(quoted("plain/path.tum"), "plain/path.tum");
+        assert_eq!(quoted("two words"), "'two words'");
+        assert_eq!(quoted("it's"), r"'it'\''s'");
+        assert_eq!(quoted(""), "''");
     }
 }

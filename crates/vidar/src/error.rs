@@ -367,5 +367,42 @@ pub const CODES: &[(&str, &str)] = &[
     ("E0401", "A file or folder could not be read or written."),
     ("E0402", "The disk is full. Finished files are kept; unfinished ones are removed."),
     ("E0501", "A threshold given with --fail-above or --fail-below was missed."),
+    (
+        "E7001",
+        "A bug in VIDAR: something that cannot happen happened. Please report it; finished files are on disk.",
+    ),
     ("E1301", "Interrupted by Ctrl-C or a signal. Files that were being written are finished or removed."),
 ];
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::io::ErrorKind::{FileTooLarge, NotFound, StorageFull};
+
+    #[test]
+    fn a_full_disk_is_the_same_error_whichever_stage_meets_it() {
+        let full = || std::io::Error::from(StorageFull);
+        let path = || PathBuf::from("map/mesh.ply");
+        let all = [
+            Error::io("write", &path(), full()),
+            Error::Export(vidar_export::ExportError::Write { format: "PLY", source: full() }),
+            Error::Export(vidar_export::ExportError::File { action: "write", path: path(), source: full() }),
+            Error::Synth(vidar_synth::SynthError::Write { path: path(), source: FileTooLarge.into() }),
+        ];
+        for error in all {
+            assert_eq!((error.code(), error.exit_status() as i32), ("E0402", 4), "{error}");
+            assert!(error.hint().is_some_and(|h| h.contains("finished files are kept")));
+        }
+        let other = Error::io("read", &path(), NotFound.into());
+        assert_eq!((other.code(), other.exit_status() as i32), ("E0401", 4));
+    }
+
+    #[test]
+    fn codes_are_listed_once() {
+        let mut codes: Vec<&str> = CODES.iter().map(|(code, _)| *code).collect();
+        codes.sort_unstable();
+        let count = codes.len();
+        codes.dedup();
+        assert_eq!(codes.len(), count);
+    }
+}

@@ -142,3 +142,21 @@ fn shown(path: &Path) -> String {
 pub fn absolute(path: &Path) -> PathBuf {
     std::path::absolute(path).unwrap_or_else(|_| path.to_owned())
 }
+
+#[cfg(test)]
+mod tests {
+    use super::unit_slip;
+    use vidar_core::Timestamp;
+
+    #[test]
+    fn clocks_of_two_units_are_recognised_and_other_clocks_are_not() {
+        let at = Timestamp::from_nanos;
+        let now = 1_600_000_000_000_000_000;
+        assert!(unit_slip(at(now), at(now / 1000)).is_some_and(|w| w.contains("milliseconds")));
+        assert!(unit_slip(at(now / 1_000_000), at(now)).is_some_and(|w| w.contains("microseconds")));
+        assert!(unit_slip(at(now), at(now / 1_000_000_000)).is_some_and(|w| w.contains("nanoseconds")));
+        assert!(unit_slip(at(now), at(now + 3_600_000_000_000)).is_none());
+        assert!(unit_slip(at(now), at(5_000_000_000)).is_none());
+        assert!(unit_slip(at(0), at(0)).is_none());
+    }
+}
