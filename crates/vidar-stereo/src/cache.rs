@@ -16,6 +16,8 @@ use vidar_core::{FrameId, Pinhole, Se3};
 pub(crate) struct ViewDepth {
     /// The pose it was estimated at.
     pub world_from_camera: Se3,
+    /// By how much the correction of the poses shifted what it shares with others, working pixels.
+    pub shift_px: f32,
     /// Intrinsics at the working size.
     pub intrinsics: Pinhole,
     pub estimate: Estimate,

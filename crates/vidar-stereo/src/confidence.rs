@@ -40,3 +40,20 @@ pub(crate) fn confidence(features: &[f32; FEATURES]) -> f32 {
     let p = 1.0 / (1.0 + (-z).exp());
     if p.is_finite() { p } else { 0.0 }
 }
+
+/// Share of the correction of the poses that is taken to remain in them.
+const REMAINING_SHARE: f32 = 1.0;
+
+/// Upper bound that the poses set: the probability of an error within [`TOLERANCE_RATIO`], if what is left of their
+/// errors shifts pixels by a normally distributed part of what was corrected. `ratio_per_px` is the relative change
+/// of depth that shifts a pixel by one.
+pub(crate) fn pose_cap(shift_px: f32, ratio_per_px: f32) -> f32 {
+    let sigma = REMAINING_SHARE * shift_px * ratio_per_px;
+    if !(sigma > 0.0) {
+        return 1.0;
+    }
+    let t = TOLERANCE_RATIO / sigma;
+    // P(|N(0,1)| < t), by the logistic approximation of the normal distribution (Bowling 2009), within 0.0002.
+    let tail = 1.0 / (1.0 + (0.07056 * t * t * t + 1.5976 * t).exp());
+    (1.0 - 2.0 * tail).clamp(0.0, 1.0)
+}

@@ -45,7 +45,7 @@ pub struct StereoConfig {
 impl Default for StereoConfig {
     fn default() -> Self {
         Self {
-            max_width_px: 320,
+            max_width_px: 480,
             neighbours: 5,
             min_parallax_deg: 0.5,
             best_parallax_deg: 6.0,

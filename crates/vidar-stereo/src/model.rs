@@ -1,11 +1,11 @@
 //! The model: views in, depth in the frame of the given poses out.
 
 use crate::cache::{Cache, ViewDepth, fingerprint};
-use crate::confidence::{confidence, features};
+use crate::confidence::{confidence, features, pose_cap};
 use crate::config::StereoConfig;
 use crate::consistency::{Support, support};
 use crate::error::StereoError;
-use crate::estimate::{Estimate, Probe, estimate, probe};
+use crate::estimate::{Probe, estimate, probe};
 use crate::filter::remove_speckles;
 use crate::prepare::{Prepared, prepare};
 use crate::register::registered;
@@ -179,8 +179,8 @@ impl StereoModel {
         }
         if self.config.pose_spread_deg > 0.0 && self.config.pose_spread_m > 0.0 {
             let poses = registered(views, &placed, probes, &self.config);
-            for (view, pose) in views.iter_mut().zip(poses) {
-                view.world_from_camera = pose;
+            for (view, corrected) in views.iter_mut().zip(poses) {
+                (view.world_from_camera, view.shift_px) = (corrected.world_from_camera, corrected.shift_px);
             }
         }
     }
@@ -214,6 +214,7 @@ impl StereoModel {
                 Ok((estimate, neighbours)) => {
                     let depth = ViewDepth {
                         world_from_camera: views[i].world_from_camera,
+                        shift_px: views[i].shift_px,
                         intrinsics: views[i].levels[0].intrinsics,
                         estimate,
                         neighbours: neighbours.iter().map(|&n| views[n].frame_id).collect(),
@@ -237,22 +238,23 @@ impl StereoModel {
         let others: Vec<_> =
             self.checked(view).into_iter().filter_map(|frame| self.cache.depth(frame)).collect();
         let supports = support(&own, &others, &self.config);
-        Some(self.geometry(view, &own.estimate, &supports))
+        Some(self.geometry(view, &own, &supports))
     }
 
     fn geometry(
         &self,
         view: &Prepared,
-        own: &Estimate,
+        own: &ViewDepth,
         supports: &[Support],
     ) -> Result<ViewGeometry, StereoError> {
         let level = &view.levels[0];
         let mut rho = vec![f32::NAN; supports.len()];
         let mut confident = vec![0.0f32; supports.len()];
         for (i, support) in supports.iter().enumerate() {
-            let p = confidence(&features(own, i, support, self.config.noise_gray as f32));
+            let p = confidence(&features(&own.estimate, i, support, self.config.noise_gray as f32));
             if support.rho > 0.0 && f64::from(p) >= self.config.min_confidence && support.agreeing > 0 {
-                (rho[i], confident[i]) = (support.rho, p);
+                let cap = pose_cap(own.shift_px, own.estimate.rho_per_px / support.rho);
+                (rho[i], confident[i]) = (support.rho, p * cap);
             }
         }
         remove_speckles(&mut rho, level.width);

@@ -22,6 +22,8 @@ pub(crate) struct Level {
 pub(crate) struct Prepared {
     pub frame_id: FrameId,
     pub world_from_camera: Se3,
+    /// By how much the correction of the poses shifted what this view shares with others, working pixels.
+    pub shift_px: f32,
     /// Working size, half of it, a quarter of it.
     pub levels: [Level; 3],
 }
@@ -60,7 +62,7 @@ pub(crate) fn prepare(view: &ChunkView, config: &StereoConfig) -> Result<Prepare
     }
     let half = halved(&working);
     let quarter = halved(&half);
-    Ok(Prepared { frame_id: frame, world_from_camera, levels: [working, half, quarter] })
+    Ok(Prepared { frame_id: frame, world_from_camera, shift_px: 0.0, levels: [working, half, quarter] })
 }
 
 /// Mean over blocks of 2 × 2; an odd last row or column is left out.

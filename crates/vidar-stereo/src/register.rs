@@ -45,6 +45,13 @@ pub(crate) struct Track {
     pub found: Vec<(usize, Vector2<f64>)>,
 }
 
+/// A corrected pose.
+pub(crate) struct Placed {
+    pub world_from_camera: Se3,
+    /// Median shift of what the view shares with others by the correction, working pixels.
+    pub shift_px: f32,
+}
+
 /// The views' poses, corrected; the given ones where there is nothing to correct them by.
 ///
 /// Views that are `placed` already keep their pose, and the others are fitted to them.
@@ -53,8 +60,8 @@ pub(crate) fn registered(
     placed: &[bool],
     probes: &[Option<Arc<Probe>>],
     config: &StereoConfig,
-) -> Vec<Se3> {
-    let tracks: Vec<Track> = (0..views.len())
+) -> Vec<Placed> {
+    let mut tracks: Vec<Track> = (0..views.len())
         .into_par_iter()
         .flat_map_iter(|i| tracks_of(views, i, probes[i].as_deref(), config))
         .collect();
@@ -64,7 +71,10 @@ pub(crate) fn registered(
         rotation_rad: config.pose_spread_deg.to_radians(),
         translation_m: config.pose_spread_m,
     };
-    solve::adjusted(&given, placed, &cameras, tracks, &spread)
+    let poses = solve::adjusted(&given, placed, &cameras, &mut tracks, &spread);
+    let shifts_px = solve::shifts_px(&given, &poses, &cameras, &tracks);
+    let pair = |(world_from_camera, shift_px)| Placed { world_from_camera, shift_px };
+    poses.into_iter().zip(shifts_px).map(pair).collect()
 }
 
 /// Corners of a view with known depth, each searched in the views that see it best.

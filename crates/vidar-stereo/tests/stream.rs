@@ -2,6 +2,7 @@
 
 #![allow(clippy::expect_used, reason = "helpers of tests may stop at the first surprise, as tests may")]
 
+#[allow(dead_code, reason = "the flight here is longer than the scene's own")]
 mod scene;
 
 use nalgebra::Vector3;

@@ -37,7 +37,7 @@ pub(crate) fn adjusted(
     given: &[Se3],
     placed: &[bool],
     cameras: &[Pinhole],
-    mut tracks: Vec<Track>,
+    tracks: &mut [Track],
     spread: &Spread,
 ) -> Vec<Se3> {
     let mut poses = given.to_vec();
@@ -45,7 +45,7 @@ pub(crate) fn adjusted(
         return poses;
     }
     for half_weight_px in HALF_WEIGHT_PX {
-        let Some(step) = step(&poses, given, placed, cameras, &mut tracks, spread, half_weight_px) else {
+        let Some(step) = step(&poses, given, placed, cameras, tracks, spread, half_weight_px) else {
             return given.to_vec();
         };
         for (i, pose) in poses.iter_mut().enumerate().filter(|(i, _)| !placed[*i]) {
@@ -58,6 +58,27 @@ pub(crate) fn adjusted(
         restore_scale(&mut poses, given, spread);
     }
     if poses.iter().all(Se3::is_finite) { poses } else { given.to_vec() }
+}
+
+/// By how much the correction moved the matches anchored in each view: their median shift, working pixels.
+pub(crate) fn shifts_px(given: &[Se3], poses: &[Se3], cameras: &[Pinhole], tracks: &[Track]) -> Vec<f32> {
+    let mut shifts: Vec<Vec<f64>> = vec![Vec::new(); poses.len()];
+    for track in tracks {
+        let at_anchor = track.ray / track.rho;
+        for (other, _) in &track.found {
+            let pixel = |poses: &[Se3]| {
+                cameras[*other].project(&(poses[*other].inverse() * poses[track.anchor] * at_anchor))
+            };
+            if let (Some(before), Some(after)) = (pixel(given), pixel(poses)) {
+                shifts[track.anchor].push((after - before).norm());
+            }
+        }
+    }
+    let median = |mut shifts: Vec<f64>| {
+        shifts.sort_unstable_by(f64::total_cmp);
+        shifts.get(shifts.len() / 2).map_or(0.0, |m| *m as f32)
+    };
+    shifts.into_iter().map(median).collect()
 }
 
 /// Scales the corrected camera centres about their middle to the size of the given ones.
