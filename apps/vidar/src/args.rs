@@ -175,7 +175,7 @@ pub struct ConfigArgs {
 /// Where results go.
 #[derive(Args, Clone, Debug, Default)]
 pub struct OutputArgs {
-    /// Output folder; default runs/<name>/<time>/ with a `latest` link.
+    /// Output folder; default `runs/<name>/<time>/` with a `latest` link.
     #[arg(short, long, value_hint = ValueHint::DirPath, help_heading = "Output")]
     pub output: Option<PathBuf>,
     /// Move an existing output folder aside instead of refusing.
@@ -286,7 +286,7 @@ pub struct ExportArgs {
     /// colmap, colmap-text, nerfstudio, tum, kitti, euroc, ply or glb.
     #[arg(long)]
     pub to: String,
-    /// Output folder; default RUN/export/<format>.
+    /// Output folder; default `RUN/export/<format>`.
     #[arg(short, long, value_hint = ValueHint::DirPath)]
     pub output: Option<PathBuf>,
 }
