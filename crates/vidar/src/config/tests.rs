@@ -64,7 +64,7 @@ fn an_unknown_key_is_refused_with_the_nearest_name() {
     };
     assert_eq!(nearest("fusion.voxel_size").as_deref(), Some("fusion.voxel_size_m"));
     assert_eq!(nearest("keyframe.min_translation_m").as_deref(), Some("keyframes.min_translation_m"));
-    assert_eq!(nearest("max_width_px").as_deref(), Some("geometry.max_width_px"));
+    assert_eq!(nearest("chunk_keyframes").as_deref(), Some("geometry.chunk_keyframes"));
     assert_eq!(nearest("zzzz"), None);
 }
 
