@@ -1,5 +1,7 @@
 //! Trajectory errors agree with evo's to 1e-9 (golden numbers made by `tools/make_evo_golden.py`).
 
+#![allow(clippy::unwrap_used, clippy::panic, clippy::print_stderr)] // helpers of tests are test code, though not marked so
+
 use serde_json::Value;
 use std::path::{Path, PathBuf};
 use vidar_core::{BodyFrame, Se3, So3, StampedPose, Timestamp, Trajectory};
@@ -44,7 +46,10 @@ fn assert_stats(what: &str, ours: Option<&ErrorStats>, golden: &Value) {
         ("max", ours.max),
     ] {
         let expected = golden[name].as_f64().unwrap();
-        assert!((value - expected).abs() <= TOLERANCE, "{what}: {name} is {value:.12}, evo says {expected:.12}");
+        assert!(
+            (value - expected).abs() <= TOLERANCE,
+            "{what}: {name} is {value:.12}, evo says {expected:.12}"
+        );
     }
 }
 

@@ -1,5 +1,7 @@
 //! Nearest-neighbour distances agree with Open3D's to 1e-6 (golden made by `tools/make_open3d_golden.py`).
 
+#![allow(clippy::unwrap_used, clippy::panic, clippy::print_stderr)] // helpers of tests are test code, though not marked so
+
 use serde_json::Value;
 use vidar_eval::{NearestIndex, nearest_distances};
 

@@ -1,1 +1,105 @@
 use super::*;
+use proptest::prelude::*;
+
+fn brute_force(query: &[f32; 3], points: &[[f32; 3]]) -> f64 {
+    let squared = |p: &[f32; 3]| -> f64 {
+        p.iter().zip(query).map(|(a, b)| (f64::from(*a) - f64::from(*b)).powi(2)).sum()
+    };
+    points.iter().map(squared).fold(f64::INFINITY, f64::min).sqrt()
+}
+
+#[track_caller]
+fn assert_exact(points: &[[f32; 3]], queries: &[[f32; 3]]) {
+    let index = NearestIndex::build(points).unwrap();
+    for (query, distance) in queries.iter().zip(nearest_distances(queries, &index, None)) {
+        let expected = brute_force(query, points);
+        assert!((f64::from(distance) - expected).abs() <= 1e-6 * expected.max(1.0), "{query:?}: {distance}");
+    }
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(48))]
+
+    #[test]
+    fn distances_are_those_of_brute_force(
+        points in prop::collection::vec(prop::array::uniform3(-5.0_f32..5.0), 1..300),
+        queries in prop::collection::vec(prop::array::uniform3(-8.0_f32..8.0), 1..60),
+    ) {
+        assert_exact(&points, &queries);
+    }
+
+    #[test]
+    fn coordinates_that_often_coincide_change_nothing(
+        points in prop::collection::vec(prop::array::uniform3(0_u8..4), 1..400),
+        queries in prop::collection::vec(prop::array::uniform3(-1.0_f32..5.0), 1..40),
+    ) {
+        let points: Vec<[f32; 3]> = points.iter().map(|p| p.map(f32::from)).collect();
+        assert_exact(&points, &queries);
+    }
+}
+
+#[test]
+fn planes_lines_and_one_place_a_thousandfold_are_ordinary_input() {
+    let grid: Vec<[f32; 3]> = (0..10_000).map(|i| [(i % 100) as f32, (i / 100) as f32, 2.0]).collect();
+    let queries: Vec<[f32; 3]> =
+        (0..300).map(|i| [i as f32 * 0.37, i as f32 * 0.21, i as f32 * 0.01]).collect();
+    assert_exact(&grid, &queries);
+    let line: Vec<[f32; 3]> = (0..5_000).map(|i| [1.0, i as f32 * 0.01, -3.0]).collect();
+    assert_exact(&line, &queries);
+    assert_exact(&vec![[0.5, 0.5, 0.5]; 5_000], &queries);
+}
+
+#[test]
+fn the_answer_names_the_point_that_was_given() {
+    let points: Vec<[f32; 3]> = (0..1000).map(|i| [(i * 7 % 1000) as f32, 0.0, 0.0]).collect();
+    let index = NearestIndex::build(&points).unwrap();
+    for (i, p) in points.iter().enumerate() {
+        let found = index.nearest(&[p[0] + 0.2, 0.0, 0.0], None).unwrap();
+        assert_eq!(found.index as usize, i);
+        assert_eq!(found.position, *p);
+    }
+    let all = index.nearest_all(&points, None);
+    assert!(
+        all.iter().enumerate().all(|(i, n)| n.is_some_and(|n| n.index as usize == i && n.distance_m == 0.0))
+    );
+}
+
+#[test]
+fn the_largest_distance_is_strict_and_beyond_it_is_infinity() {
+    let index = NearestIndex::build(&[[0.0; 3], [10.0, 0.0, 0.0]]).unwrap();
+    let queries = [[1.0, 0.0, 0.0], [0.5, 0.0, 0.0], [4.0, 0.0, 0.0], [10.0, 0.0, 0.25]];
+    let limited = nearest_distances(&queries, &index, Some(1.0));
+    assert_eq!(limited, [f32::INFINITY, 0.5, f32::INFINITY, 0.25]);
+    assert_eq!(nearest_distances(&queries, &index, None), [1.0, 0.5, 4.0, 0.25]);
+}
+
+#[test]
+fn unusable_points_are_left_out_and_unusable_queries_find_nothing() {
+    let index =
+        NearestIndex::build(&[[f32::NAN, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, f32::INFINITY, 0.0]]).unwrap();
+    assert_eq!((index.len(), index.dropped()), (1, 2));
+    assert_eq!(index.nearest(&[0.0; 3], None).unwrap().index, 1);
+    let distances = nearest_distances(&[[f32::NAN; 3], [0.0; 3]], &index, None);
+    assert!(distances[0].is_nan() && distances[1] == 1.0);
+    let empty = NearestIndex::build(&[]).unwrap();
+    assert!(empty.is_empty() && empty.bounds().is_none());
+    assert_eq!(nearest_distances(&[[0.0; 3]], &empty, None), [f32::INFINITY]);
+    assert!(nearest_distances(&[], &index, None).is_empty());
+}
+
+#[test]
+fn one_thread_and_four_give_the_same_bits() {
+    let mut state = 5_u64;
+    let mut next = || {
+        state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1);
+        (state >> 40) as f32 / (1 << 22) as f32
+    };
+    // Enough points for the parallel build, enough queries for several tasks.
+    let points: Vec<[f32; 3]> = (0..20_000).map(|_| [next(), next(), 0.125]).collect();
+    let queries: Vec<[f32; 3]> = (0..20_000).map(|_| [next(), next(), next()]).collect();
+    let with = |threads| {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+        pool.install(|| NearestIndex::build(&points).unwrap().nearest_all(&queries, None))
+    };
+    assert_eq!(with(1), with(4));
+}

@@ -88,7 +88,7 @@ pub(super) fn thinned(points: &[[f32; 3]], voxel_m: Option<f64>) -> Result<Vec<[
     Ok(keyed.chunk_by(|a, b| a.0 == b.0).map(mean).collect())
 }
 
-/// At most `count` points, evenly spaced along a space-filling order so that every part takes its share.
+/// At most `count` points, taken at even steps of the given order.
 pub(super) fn subset(points: &[[f32; 3]], count: usize) -> Vec<[f32; 3]> {
     let n = points.len();
     if n <= count {

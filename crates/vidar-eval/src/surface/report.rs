@@ -57,7 +57,8 @@ pub struct PlacementReport {
 /// The free placement that counted.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct FreePlacement {
-    /// Where it came from: `native`, `rigid-start`, `similarity-start`.
+    /// Where it came from: `native`; `rigid-start`, the refinement that was refused; `similarity-start`, the Sim(3) fit
+    /// of the trajectories; `similarity-start-refined`, an ICP from there.
     pub start: String,
     /// The placement.
     #[serde(with = "as_record")]
