@@ -16,8 +16,12 @@
 //!   agreeing views are averaged.
 //! - **Confidence** (`confidence`): the probability of an error below [`TOLERANCE_RATIO`].
 //!
-//! Poses are taken as given: the prediction is in the frame of the prior poses and in metres. Results are the same
-//! bits for any number of threads. Memory for one reference of `w × h` working pixels and `d` planes is about
+//! - **Poses** (`register`): corrected by a small bundle adjustment within the spread that the settings grant, before
+//!   anything else is matched; the prediction carries the corrected ones.
+//!
+//! The prediction is in the frame of the prior poses and in metres. A model follows one stream: a view that was placed
+//! and estimated in an earlier call is not worked out again (`cache`), so results depend on the calls before, and are
+//! the same bits for the same calls with any number of threads. Memory for one reference of `w × h` working pixels and `d` planes is about
 //! `w/2 · h/2 · d · 5` bytes for costs and sums and 20 bytes a pixel for each view's finished estimate.
 
 mod cache;

@@ -74,8 +74,8 @@ impl StereoModel {
 
     /// Depth of the views at the indices `references` only, from all of `views`.
     ///
-    /// Neighbours are chosen anywhere in `views`, so a streaming driver passes a window around the references; what
-    /// an earlier call worked out from the very same views is used again. `cancel` is asked before each view's
+    /// Neighbours are chosen anywhere in `views`, so a streaming driver passes a window around the references; a view
+    /// given before in just the same way keeps the pose and estimate that it got then. `cancel` is asked before each view's
     /// estimate. If no reference has parallax, that is an error.
     pub fn predict_with(
         &mut self,

@@ -12,6 +12,8 @@ pub(crate) struct Spread {
 
 /// Residual at which a match counts half, by round: first wide, so that all pull, then tight, so that few mislead.
 const HALF_WEIGHT_PX: [f64; 8] = [4.0, 3.0, 2.0, 1.5, 1.0, 0.8, 0.8, 0.8];
+/// Width up to which the pixels here and above are working pixels; beyond it they grow with the image.
+const SPREAD_WIDTH_PX: f64 = 320.0;
 /// Spread of a good match, working pixels.
 const MATCH_SPREAD_PX: f64 = 0.3;
 /// Weight that holds a placed view: a micrometre and a microradian.
@@ -203,8 +205,10 @@ fn row(
     by_other.fixed_view_mut::<2, 3>(0, 0).copy_from(&-by_point);
     by_other.fixed_view_mut::<2, 3>(0, 3).copy_from(&(by_point * skew(&p)));
     let by_rho = rotation * track.ray * (-1.0 / (track.rho * track.rho));
-    let weight = 1.0 / (1.0 + residual.norm_squared() / (half_weight_px * half_weight_px));
-    let weight = weight / (MATCH_SPREAD_PX * MATCH_SPREAD_PX);
+    // Errors of lens and shutter grow with the image, so larger images are not trusted to finer angles.
+    let size = (k.width as f64 / SPREAD_WIDTH_PX).max(1.0);
+    let weight = 1.0 / (1.0 + residual.norm_squared() / (half_weight_px * size).powi(2));
+    let weight = weight / (MATCH_SPREAD_PX * size).powi(2);
     Some(Row { other: *other, weight, residual, by_anchor, by_other, by_rho })
 }
 
