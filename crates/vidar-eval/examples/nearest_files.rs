@@ -1,0 +1,59 @@
+//! Distances from one file of points to another: the program that `bench/nn_vs_scipy.py` times.
+//!
+//! `nearest_files QUERY.f32 REFERENCE.f32 DISTANCES.f32 THREADS ROUNDS`; files hold little-endian `f32`, three a
+//! point. Prints one JSON object with seconds of each round and peak memory.
+
+#![allow(clippy::unwrap_used, clippy::panic, clippy::print_stdout)] // a measuring program: stops at the first surprise, prints
+
+use std::time::Instant;
+use vidar_eval::{NearestIndex, nearest_distances};
+
+fn points(path: &str) -> Vec<[f32; 3]> {
+    let bytes = std::fs::read(path).unwrap();
+    let number = |b: &[u8]| f32::from_le_bytes(b.try_into().unwrap());
+    bytes.chunks_exact(12).map(|p| [number(&p[..4]), number(&p[4..8]), number(&p[8..])]).collect()
+}
+
+/// Processor time of all threads, seconds, from Linux's own account.
+fn processor_secs() -> f64 {
+    let stat = std::fs::read_to_string("/proc/self/stat").unwrap_or_default();
+    let fields: Vec<&str> = stat.rsplit(')').next().unwrap_or_default().split_whitespace().collect();
+    let ticks = |i: usize| fields.get(i).and_then(|f| f.parse::<f64>().ok()).unwrap_or(0.0);
+    (ticks(11) + ticks(12)) / 100.0
+}
+
+/// Largest memory so far, MiB.
+fn peak_mib() -> f64 {
+    let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
+    let line = status.lines().find(|l| l.starts_with("VmHWM")).unwrap_or_default();
+    line.split_whitespace().nth(1).and_then(|kib| kib.parse::<f64>().ok()).unwrap_or(0.0) / 1024.0
+}
+
+fn main() {
+    let args: Vec<String> = std::env::args().skip(1).collect();
+    let [query, reference, out, threads, rounds] = args.as_slice() else {
+        panic!("usage: nearest_files QUERY.f32 REFERENCE.f32 DISTANCES.f32 THREADS ROUNDS");
+    };
+    let (query, reference) = (points(query), points(reference));
+    let given = peak_mib();
+    let pool = rayon::ThreadPoolBuilder::new().num_threads(threads.parse().unwrap()).build().unwrap();
+    let (mut build, mut search, mut processor) = (Vec::new(), Vec::new(), Vec::new());
+    let mut distances = Vec::new();
+    for _ in 0..rounds.parse::<usize>().unwrap() {
+        let before = processor_secs();
+        let start = Instant::now();
+        let index = pool.install(|| NearestIndex::build(&reference)).unwrap();
+        build.push(start.elapsed().as_secs_f64());
+        let start = Instant::now();
+        distances = pool.install(|| nearest_distances(&query, &index, None));
+        search.push(start.elapsed().as_secs_f64());
+        processor.push(processor_secs() - before);
+    }
+    let bytes: Vec<u8> = distances.iter().flat_map(|d| d.to_le_bytes()).collect();
+    let peak = peak_mib();
+    std::fs::write(out, bytes).unwrap();
+    println!(
+        "{{\"build\": {build:?}, \"query\": {search:?}, \"processor\": {processor:?}, \
+         \"points_mib\": {given:.1}, \"peak_mib\": {peak:.1}}}"
+    );
+}
