@@ -6,9 +6,10 @@ use crate::events::Events;
 use crate::options::DatasetKind;
 use crate::source::read_text_file;
 use std::path::{Path, PathBuf};
+use vidar_core::remap::RemapTable;
 use vidar_core::{
-    CameraId, Duration, FrameId, FrameImage, Image, ImuSample, MetricDepth, Pinhole, Rig, Se3, SpecificForce,
-    Timestamp, Trajectory, Warning,
+    CameraId, CameraModel, Duration, FrameId, FrameImage, Image, ImuSample, MetricDepth, Pinhole, Rig, Se3,
+    SpecificForce, Timestamp, Trajectory, Warning,
 };
 
 /// One image of the chosen camera.
@@ -36,8 +37,10 @@ pub struct DepthEntry {
 /// The depth camera.
 #[derive(Clone, Debug, PartialEq)]
 pub struct DepthSensor {
-    /// How its (distortion-free) images project.
+    /// How its depth projects as [`Dataset::load_depth`] returns it, without distortion.
     pub intrinsics: Pinhole,
+    /// The camera as its files are, where these are distorted.
+    pub distorted: Option<CameraModel>,
     /// Raw units per metre.
     pub units_per_metre: f64,
     /// Maps points in the depth camera to the chosen colour camera.
@@ -131,7 +134,8 @@ impl Dataset {
         Ok(image)
     }
 
-    /// Reads a depth image as z-depth in metres, NaN where there is none, in the depth camera's own pixels.
+    /// Reads a depth image as z-depth in metres, NaN where there is none, in the depth camera's pixels; distortion
+    /// is taken out.
     pub fn load_depth(&self, entry: &DepthEntry) -> Result<MetricDepth, DatasetError> {
         let raw = decode::read_depth(&entry.path, &ImageLimits::default())?;
         let Some(sensor) = &self.depth_sensor else {
@@ -142,7 +146,7 @@ impl Dataset {
         };
         let expected = (sensor.intrinsics.width, sensor.intrinsics.height);
         check_size(&entry.path, (raw.width(), raw.height()), expected)?;
-        Ok(MetricDepth::new(sensor.to_metres(&raw)))
+        Ok(MetricDepth::new(sensor.rectified(sensor.to_metres(&raw))))
     }
 
     /// The depth image of the moment `time`: the nearest within [`DEPTH_TOLERANCE`].
@@ -188,6 +192,15 @@ impl Dataset {
 }
 
 impl DepthSensor {
+    /// The same depth without distortion: nearest pixel, since depths must not be mixed across an edge. A ray keeps
+    /// its z-depth, so values stay as they are.
+    fn rectified(&self, metres: Image<f32>) -> Image<f32> {
+        match &self.distorted {
+            Some(model) => RemapTable::new(model, &self.intrinsics).apply_nearest(&metres, f32::NAN),
+            None => metres,
+        }
+    }
+
     /// Raw values as metres, NaN where invalid.
     pub fn to_metres(&self, raw: &Image<u16>) -> Image<f32> {
         let metres_per_unit = 1.0 / self.units_per_metre;
@@ -212,4 +225,40 @@ fn check_size(path: &Path, found: (usize, usize), expected: (usize, usize)) -> R
         expected_width: expected.0,
         expected_height: expected.1,
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use vidar_core::camera::RadTan;
+
+    #[test]
+    fn distortion_of_a_depth_camera_is_taken_out() {
+        let intrinsics = Pinhole::new(110.0, 110.0, 79.5, 51.5, 160, 104).unwrap();
+        let model = CameraModel::RadTan(RadTan::new(intrinsics, [-0.28, 0.07, 2e-4, 1.8e-5]).unwrap());
+        let depth_along = |ray: &nalgebra::Vector3<f64>| 2.0 + ray.x + 0.5 * ray.y;
+        let as_stored = Image::from_fn(160, 104, |x, y| {
+            let ray = model.unproject(&nalgebra::Vector2::new(x as f64, y as f64));
+            ray.map_or(f32::NAN, |ray| depth_along(&(ray / ray.z)) as f32)
+        });
+        let sensor = |distorted| DepthSensor {
+            intrinsics,
+            distorted,
+            units_per_metre: 1000.0,
+            color_from_depth: Se3::IDENTITY,
+            invalid: vec![0],
+        };
+        let worst = |image: &Image<f32>| {
+            let error = |x: usize, y: usize| {
+                f64::from(image[(x, y)]) - depth_along(&intrinsics.ray(x as f64, y as f64))
+            };
+            let pixels = (0..104).flat_map(|y| (0..160).map(move |x| (x, y)));
+            pixels.map(|(x, y)| error(x, y).abs()).filter(|e| !e.is_nan()).fold(0.0, f64::max)
+        };
+        // Half a stored pixel, which the lens stretches up to 1.8 times in the corners, along both slopes.
+        let bound = 0.5 * 1.8 * (1.0 + 0.5) / 110.0;
+        let found = worst(&sensor(Some(model)).rectified(as_stored.clone()));
+        assert!(found < bound, "{found} < {bound}");
+        assert!(worst(&sensor(None).rectified(as_stored)) > 0.05, "without the model the corners are wrong");
+    }
 }

@@ -45,6 +45,8 @@ impl DraftCamera {
 /// What a reader knows of the depth camera.
 pub(crate) struct DraftDepth {
     pub intrinsics: Option<[f64; 4]>,
+    /// The depth camera with its distortion, where the dataset knows one.
+    pub distorted: Option<vidar_core::CameraModel>,
     pub units_per_metre: Option<f64>,
     /// Raw units that this kind of dataset uses when nothing says otherwise.
     pub default_units: f64,
@@ -297,7 +299,7 @@ impl Draft {
     }
 
     fn settle_depth(&mut self, options: &OpenOptions, dataset: &mut Dataset) -> Result<(), DatasetError> {
-        let Some(depth) = self.depth.take() else { return Ok(()) };
+        let Some(mut depth) = self.depth.take() else { return Ok(()) };
         let mut depths = std::mem::take(&mut self.depths);
         let notes = &mut dataset.warnings;
         keep_existing(&mut depths, "depth images", &self.root, notes)?;
@@ -327,6 +329,10 @@ impl Draft {
                 camera.model.intrinsics().resized(width, height).map_err(bad("depth intrinsics"))?
             }
         };
+        // Numbers given by hand describe images without distortion, and so does a model of another size.
+        let distorted = depth.distorted.take().filter(|model| {
+            options.depth_intrinsics.is_none() && (model.width(), model.height()) == (width, height)
+        });
         let units_per_metre = match options.depth_scale.or(depth.units_per_metre) {
             Some(units) => units,
             None => {
@@ -358,8 +364,13 @@ impl Draft {
                 Se3::IDENTITY
             }
         };
-        dataset.depth_sensor =
-            Some(DepthSensor { intrinsics, units_per_metre, color_from_depth, invalid: depth.invalid });
+        dataset.depth_sensor = Some(DepthSensor {
+            intrinsics,
+            distorted,
+            units_per_metre,
+            color_from_depth,
+            invalid: depth.invalid,
+        });
         dataset.depths = depths.into_iter().map(|(time, path)| DepthEntry { time, path }).collect();
         Ok(())
     }

@@ -279,14 +279,9 @@ fn read_depth(draft: &mut Draft, body_from_imu: &Se3, options: &OpenOptions) -> 
     draft.depths = files.into_iter().map(|f| (f.time, data.join(f.name))).collect();
     let sensor = read_sensor(draft, &folder)?.map(|(s, _)| s);
     let model = sensor.as_ref().and_then(|s| s.camera.as_ref()).map(|c| c.model.clone());
-    if let Some(model) = &model
-        && !matches!(model, vidar_core::CameraModel::Pinhole(_))
-    {
-        let message = format!("the depth camera is {}; its distortion is not taken out", model.name());
-        draft.warnings.push(Warning::new("depth-distortion", message).at(folder.display()));
-    }
     let body_from_depth = sensor.as_ref().and_then(|s| s.body_from_sensor);
     draft.depth = Some(DraftDepth {
+        distorted: model.clone().filter(|m| !matches!(m, vidar_core::CameraModel::Pinhole(_))),
         intrinsics: model.map(|m| m.intrinsics().to_owned()).map(|p| [p.fx, p.fy, p.cx, p.cy]),
         units_per_metre: sensor.as_ref().and_then(|s| s.units_per_metre),
         default_units: 1000.0,

@@ -95,6 +95,7 @@ fn read_depth(draft: &mut Draft) -> Result<(), DatasetError> {
         }
     }
     draft.depth = Some(DraftDepth {
+        distorted: None,
         intrinsics: None,
         units_per_metre: None,
         default_units: 1000.0,

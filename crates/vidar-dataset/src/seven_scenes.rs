@@ -157,6 +157,7 @@ fn settle_cameras(draft: &mut Draft, options: &OpenOptions) -> Result<(), Datase
     }
     if !draft.depths.is_empty() {
         draft.depth = Some(DraftDepth {
+            distorted: None,
             intrinsics: Some(intrinsics),
             units_per_metre: Some(1000.0),
             default_units: 1000.0,

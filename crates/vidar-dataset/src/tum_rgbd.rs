@@ -37,6 +37,7 @@ pub(crate) fn open(path: &Path, reason: String, options: &OpenOptions) -> Result
     if path.join("depth.txt").is_file() {
         draft.depths = read_list(&mut draft, &path.join("depth.txt"), rule)?;
         draft.depth = Some(DraftDepth {
+            distorted: None,
             intrinsics: None,
             units_per_metre: Some(DEPTH_UNITS),
             default_units: DEPTH_UNITS,

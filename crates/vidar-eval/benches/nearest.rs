@@ -6,6 +6,7 @@
 
 use divan::{Bencher, black_box};
 use kiddo::{ImmutableKdTree, SquaredEuclidean};
+use rayon::prelude::*;
 use vidar_eval::{NearestIndex, nearest_distances};
 
 fn main() {
@@ -55,7 +56,7 @@ fn kiddo_query(bencher: Bencher<'_, '_>) {
     let queries = surface(2, COUNT);
     bencher.bench(|| -> f32 {
         black_box(&queries)
-            .iter()
+            .par_iter()
             .map(|q| tree.query(q).nearest_one::<SquaredEuclidean<f32>>().execute().distance.sqrt())
             .sum()
     });

@@ -117,6 +117,7 @@ mod tests {
         let intrinsics = Pinhole::new(100.0, 100.0, 15.5, 11.5, 32, 24).unwrap();
         let sensor = DepthSensor {
             intrinsics,
+            distorted: None,
             units_per_metre: 1000.0,
             color_from_depth: Se3::from_translation(Vector3::new(0.02, 0.0, 0.5)),
             invalid: vec![0],
