@@ -10,7 +10,7 @@
 //! with the same operations, whose rounding is monotone, so no nearer point is pruned; the winner's distance is
 //! then computed again in `f64`. What remains is the `f32` choice among near-ties, a relative error below 3e-7.
 //!
-//! Memory: 16.8 bytes per point for the tree, the same again while it is built, 16 bytes per query.
+//! Memory: 19 bytes per point for the tree, 16 more while it is built, 16 bytes per query.
 
 use crate::error::EvalError;
 use rayon::prelude::*;
