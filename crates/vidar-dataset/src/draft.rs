@@ -46,7 +46,7 @@ impl DraftCamera {
 pub(crate) struct DraftDepth {
     pub intrinsics: Option<[f64; 4]>,
     /// The depth camera with its distortion, where the dataset knows one.
-    pub distorted: Option<vidar_core::CameraModel>,
+    pub distorted: Option<CameraModel>,
     pub units_per_metre: Option<f64>,
     /// Raw units that this kind of dataset uses when nothing says otherwise.
     pub default_units: f64,

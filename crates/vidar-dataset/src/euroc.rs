@@ -11,7 +11,9 @@ use crate::options::{DatasetKind, OpenOptions, TimeUnit, TrajectoryFormat, Traje
 use crate::parse::{self, EurocSensor, Source, UnitRule};
 use crate::trajectory_file::{ReadPoses, read_poses};
 use std::path::{Path, PathBuf};
-use vidar_core::{BodyFrame, ImuNoise, LieGroup, Se3, StampedPose, Timestamp, Trajectory, Warning};
+use vidar_core::{
+    BodyFrame, CameraModel, ImuNoise, LieGroup, Se3, StampedPose, Timestamp, Trajectory, Warning,
+};
 
 /// Where the layout lies and which camera the path itself names.
 pub(crate) struct Found {
@@ -281,7 +283,7 @@ fn read_depth(draft: &mut Draft, body_from_imu: &Se3, options: &OpenOptions) -> 
     let model = sensor.as_ref().and_then(|s| s.camera.as_ref()).map(|c| c.model.clone());
     let body_from_depth = sensor.as_ref().and_then(|s| s.body_from_sensor);
     draft.depth = Some(DraftDepth {
-        distorted: model.clone().filter(|m| !matches!(m, vidar_core::CameraModel::Pinhole(_))),
+        distorted: model.clone().filter(|m| !matches!(m, CameraModel::Pinhole(_))),
         intrinsics: model.map(|m| m.intrinsics().to_owned()).map(|p| [p.fx, p.fy, p.cx, p.cy]),
         units_per_metre: sensor.as_ref().and_then(|s| s.units_per_metre),
         default_units: 1000.0,
