@@ -74,7 +74,8 @@ fn every_command_in_readme_and_documents_parses() {
         documents.extend(Some(root.join(name)).filter(|p| p.is_file()));
     }
     for document in documents {
-        let text = std::fs::read_to_string(&document).unwrap();
+        // A backslash at the end of a line carries the command on, as in a shell.
+        let text = std::fs::read_to_string(&document).unwrap().replace("\\\n", " ");
         for command in commands_in(&text) {
             if let Err(error) = parses(&command) {
                 panic!("{}: `vidar {}`: {error}", document.display(), command.join(" "));
