@@ -8,6 +8,7 @@ use std::path::Path;
 const LAYERS: &[(&str, &[&str])] = &[
     ("vidar-core", &[]),
     ("vidar-nn", &[]),
+    ("vidar-hub", &[]),
     ("vidar-solve", &["vidar-core"]),
     ("vidar-dataset", &["vidar-core"]),
     ("vidar-odometry", &["vidar-core", "vidar-solve"]),

@@ -1,0 +1,1 @@
+//! Depth Anything 3: views in, a prediction of depth, confidence and poses out.
