@@ -227,7 +227,7 @@ macro_rules! model_suite {
 }
 
 model_suite!(pinhole, Pinhole, 4);
-model_suite!(radtan, RadTan, 8);
+model_suite!(radtan, RadTan, 9);
 model_suite!(equidistant, Equidistant, 8);
 model_suite!(double_sphere, DoubleSphere, 6);
 model_suite!(fov, Fov, 5);
@@ -244,11 +244,12 @@ proptest! {
 
     #[test]
     fn every_radtan_maps_one_to_one_inside_its_domain(
-        k1 in -0.5..0.5_f64, k2 in -0.5..0.5_f64, p1 in -0.01..0.01_f64, p2 in -0.01..0.01_f64,
+        k1 in -0.5..0.5_f64, k2 in -0.5..0.5_f64, k3 in -0.5..0.5_f64,
+        p1 in -0.01..0.01_f64, p2 in -0.01..0.01_f64,
         x in -1.0..1.0_f64, y in -1.0..1.0_f64,
     ) {
         let pinhole = Pinhole::new(300.0, 300.0, 320.0, 240.0, 640, 480).unwrap();
-        let camera = CameraModel::RadTan(RadTan::new(pinhole, [k1, k2, p1, p2]).unwrap());
+        let camera = CameraModel::RadTan(RadTan::with_k3(pinhole, [k1, k2, p1, p2], k3).unwrap());
         round_trip_of_direction(&camera, &Vector3::new(x, y, 1.0).normalize())?;
     }
 
@@ -267,9 +268,9 @@ fn known_pixels_are_met() {
     // Computed by OpenCV's formulae with pencil and paper at x = 0.5, y = -0.25.
     let pinhole = Pinhole::new(400.0, 500.0, 320.0, 240.0, 640, 480).unwrap();
     let point = Vector3::new(1.0, -0.5, 2.0);
-    let radtan = RadTan::new(pinhole, [-0.2, 0.1, 0.01, -0.02]).unwrap();
+    let radtan = RadTan::with_k3(pinhole, [-0.2, 0.1, 0.01, -0.02], 0.05).unwrap();
     let (r2, x, y) = (0.3125, 0.5, -0.25);
-    let d = 1.0 - 0.2 * r2 + 0.1 * r2 * r2;
+    let d = 1.0 - 0.2 * r2 + 0.1 * r2 * r2 + 0.05 * r2 * r2 * r2;
     let expected = Vector2::new(
         400.0 * (x * d + 2.0 * 0.01 * x * y - 0.02 * (r2 + 2.0 * x * x)) + 320.0,
         500.0 * (y * d + 0.01 * (r2 + 2.0 * y * y) - 2.0 * 0.02 * x * y) + 240.0,

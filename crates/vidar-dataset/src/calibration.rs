@@ -33,7 +33,7 @@ pub(crate) fn model_from_parts(
     let four = || -> Result<[f64; 4], DatasetError> {
         coefficients
             .try_into()
-            .map_err(|_| count("distortion coefficients", coefficients.len(), "4 distortion coefficients"))
+            .map_err(|_| count("distortion coefficients", coefficients.len(), "4 distortion coefficients (radtan: 4 or 5)"))
     };
     let sphere = camera == "ds" || camera == "double-sphere";
     let focal = match (sphere, intrinsics) {
@@ -50,9 +50,13 @@ pub(crate) fn model_from_parts(
     let distorts = coefficients.iter().any(|c| *c != 0.0);
     match (camera, distortion) {
         ("pinhole", "none" | "") if !distorts => Ok(CameraModel::Pinhole(pinhole)),
-        ("pinhole", "radial-tangential" | "radtan" | "plumb_bob") => {
-            RadTan::new(pinhole, four()?).map(CameraModel::RadTan).map_err(bad)
+        ("pinhole", "radial-tangential" | "radtan" | "plumb_bob") => match coefficients {
+            // OpenCV's order: the third radial term comes last.
+            &[k1, k2, p1, p2, k3] => RadTan::with_k3(pinhole, [k1, k2, p1, p2], k3),
+            _ => RadTan::new(pinhole, four()?),
         }
+        .map(CameraModel::RadTan)
+        .map_err(bad),
         ("pinhole", "equidistant" | "kannala_brandt") => {
             Equidistant::new(pinhole, four()?).map(CameraModel::Equidistant).map_err(bad)
         }

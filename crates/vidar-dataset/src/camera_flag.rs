@@ -1,4 +1,4 @@
-//! A camera in one word: `pinhole:fx,fy,cx,cy`, `radtan:…,k1,k2,p1,p2`, `kb4:…,k1,k2,k3,k4`, `ds:…,xi,alpha`,
+//! A camera in one word: `pinhole:fx,fy,cx,cy`, `radtan:…,k1,k2,p1,p2[,k3]`, `kb4:…,k1,k2,k3,k4`, `ds:…,xi,alpha`,
 //! `fov:…,omega`.
 
 use crate::error::DatasetError;
@@ -10,7 +10,7 @@ use vidar_core::{CameraError, CameraModel, Pinhole};
 #[derive(Clone, Debug, PartialEq)]
 pub struct CameraFlag(pub CameraModel);
 
-const EXPECTED: &str = "pinhole:fx,fy,cx,cy | radtan:fx,fy,cx,cy,k1,k2,p1,p2 | kb4:fx,fy,cx,cy,k1,k2,k3,k4 | \
+const EXPECTED: &str = "pinhole:fx,fy,cx,cy | radtan:fx,fy,cx,cy,k1,k2,p1,p2[,k3] | kb4:fx,fy,cx,cy,k1,k2,k3,k4 | \
                         ds:fx,fy,cx,cy,xi,alpha | fov:fx,fy,cx,cy,omega";
 
 impl FromStr for CameraFlag {
@@ -45,6 +45,9 @@ fn from_parameters(name: &str, numbers: &[f64]) -> Option<Result<CameraModel, Ca
         ("pinhole", []) => Some(Ok(CameraModel::Pinhole(pinhole))),
         ("radtan", &[k1, k2, p1, p2]) => {
             Some(RadTan::new(pinhole, [k1, k2, p1, p2]).map(CameraModel::RadTan))
+        }
+        ("radtan", &[k1, k2, p1, p2, k3]) => {
+            Some(RadTan::with_k3(pinhole, [k1, k2, p1, p2], k3).map(CameraModel::RadTan))
         }
         ("kb4" | "equidistant", &[k1, k2, k3, k4]) => {
             Some(Equidistant::new(pinhole, [k1, k2, k3, k4]).map(CameraModel::Equidistant))

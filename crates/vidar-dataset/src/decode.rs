@@ -4,9 +4,10 @@
 //! bytes can at most inflate to. A JPEG that ends before its end-of-image marker is refused, because the decoder
 //! would fill the rest with grey and a stereo matcher would believe it.
 
-use crate::error::{DatasetError, io_error};
+use crate::error::DatasetError;
+use crate::source::read_file_up_to;
 use image::{ColorType, DynamicImage, ImageDecoder};
-use std::io::{Cursor, Read};
+use std::io::Cursor;
 use std::path::Path;
 use vidar_core::{FrameImage, Image};
 
@@ -33,7 +34,7 @@ const DEFLATE_MAX_EXPANSION: u64 = 1032;
 /// Reads an image file as grey or colour; alpha is dropped, palettes and 1/2/4-bit grey are expanded, 16-bit
 /// colour is rounded to 8 bits.
 pub fn read_image(path: &Path, limits: &ImageLimits) -> Result<FrameImage, DatasetError> {
-    let bytes = read_limited(path, limits.max_file_bytes)?;
+    let bytes = read_file_up_to(path, limits.max_file_bytes)?;
     decode_image(&bytes, limits).map_err(|reason| bad_image(path, reason))
 }
 
@@ -49,7 +50,7 @@ pub fn read_depth(path: &Path, limits: &ImageLimits) -> Result<Image<u16>, Datas
 /// The size that the header of an image file tells, columns and rows.
 pub fn read_size(path: &Path, limits: &ImageLimits) -> Result<(usize, usize), DatasetError> {
     // Headers may follow kilobytes of metadata, so the decoder decides how much it reads.
-    let bytes = read_limited(path, limits.max_file_bytes)?;
+    let bytes = read_file_up_to(path, limits.max_file_bytes)?;
     open_decoder(&bytes, limits)
         .map(|d| {
             let (width, height) = d.dimensions();
@@ -60,17 +61,6 @@ pub fn read_size(path: &Path, limits: &ImageLimits) -> Result<(usize, usize), Da
 
 fn bad_image(path: &Path, reason: String) -> DatasetError {
     DatasetError::BadImage { path: path.to_path_buf(), reason }
-}
-
-fn read_limited(path: &Path, limit: u64) -> Result<Vec<u8>, DatasetError> {
-    let file = std::fs::File::open(path).map_err(io_error(path))?;
-    let found = file.metadata().map_err(io_error(path))?.len();
-    if found > limit {
-        return Err(DatasetError::TooLarge { path: path.to_path_buf(), found, limit });
-    }
-    let mut bytes = Vec::with_capacity(found as usize);
-    file.take(limit).read_to_end(&mut bytes).map_err(io_error(path))?;
-    Ok(bytes)
 }
 
 enum Format {

@@ -8,7 +8,7 @@ use crate::error::DatasetError;
 use crate::options::{DatasetKind, OpenOptions};
 use crate::parse::{self, Source};
 use crate::settle::{cut, first_readable_size, guessed_model, keep_existing, name_of};
-use crate::source::read_text_file_up_to;
+use crate::source::read_file_up_to;
 use crate::trajectory_file::{self, ReadPoses};
 use crate::tum_rgbd;
 use std::path::{Path, PathBuf};
@@ -242,7 +242,7 @@ impl Draft {
 
     /// Takes what a calibration file says, EuRoC's or Kalibr's.
     pub(crate) fn apply_calibration(&mut self, path: &Path) -> Result<(), DatasetError> {
-        let bytes = read_text_file_up_to(path, parse::yaml::MAX_YAML_BYTES as u64)?;
+        let bytes = read_file_up_to(path, parse::yaml::MAX_YAML_BYTES as u64)?;
         self.text_files.push(path.to_path_buf());
         let source = Source { path, bytes: &bytes };
         let (sensor, notes) = parse::euroc_sensor_yaml(&source)?;

@@ -8,7 +8,7 @@ use crate::error::DatasetError;
 use crate::folder::{first_file, frame_number, names_in, synthetic_time, synthetic_warning};
 use crate::options::{DatasetKind, OpenOptions};
 use crate::parse::{self, Source};
-use crate::source::read_text_file_up_to;
+use crate::source::read_file_up_to;
 use std::path::{Path, PathBuf};
 use vidar_core::{
     BodyFrame, CameraId, CameraModel, LieGroup, Pinhole, Se3, StampedPose, Timestamp, Trajectory, Warning,
@@ -65,7 +65,7 @@ pub(crate) fn open(folder: &Path, reason: String, options: &OpenOptions) -> Resu
 }
 
 fn read_pose(draft: &mut Draft, path: &Path) -> Result<Option<Se3>, DatasetError> {
-    let bytes = read_text_file_up_to(path, MAX_POSE_BYTES)?;
+    let bytes = read_file_up_to(path, MAX_POSE_BYTES)?;
     draft.text_files.push(path.to_path_buf());
     parse::single_pose(&Source { path, bytes: &bytes })
 }

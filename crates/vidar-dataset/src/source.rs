@@ -12,10 +12,11 @@ pub const MAX_LINE_BYTES: usize = 16 << 10;
 
 /// Reads a text file of at most [`MAX_TEXT_BYTES`].
 pub(crate) fn read_text_file(path: &Path) -> Result<Vec<u8>, DatasetError> {
-    read_text_file_up_to(path, MAX_TEXT_BYTES)
+    read_file_up_to(path, MAX_TEXT_BYTES)
 }
 
-pub(crate) fn read_text_file_up_to(path: &Path, limit: u64) -> Result<Vec<u8>, DatasetError> {
+/// Reads a file of at most `limit` bytes, whatever it holds.
+pub(crate) fn read_file_up_to(path: &Path, limit: u64) -> Result<Vec<u8>, DatasetError> {
     let file = std::fs::File::open(path).map_err(io_error(path))?;
     let found = file.metadata().map_err(io_error(path))?.len();
     if found > limit {
