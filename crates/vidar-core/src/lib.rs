@@ -58,6 +58,7 @@ pub mod id;
 pub mod image;
 pub mod lie;
 pub mod model;
+pub mod odometry;
 pub mod remap;
 pub mod rig;
 pub mod sensor;
@@ -76,6 +77,9 @@ pub use image::{FrameImage, Image, ImageError};
 pub use lie::{LieGroup, Se3, Sim3, So3};
 pub use model::{
     ChunkView, ChunkViews, GeometryModel, GeometryPrediction, ModelError, ModelInfo, ViewGeometry,
+};
+pub use odometry::{
+    Health, NavCovariance, NavState, OdometryKeyframe, PoseCovariance, RevisedPose, SparseLandmark,
 };
 pub use rig::{ImuNoise, Rig, RigCamera};
 pub use sensor::{AngularRate, Frame, ImuSample, SensorEvent, SpecificForce};

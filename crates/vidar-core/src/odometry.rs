@@ -1,0 +1,180 @@
+//! What a metric odometry says of each frame and of each keyframe.
+//!
+//! The error state of a frame is `[δp, δθ, δv, δb_gyro, δb_accel]`, three numbers each: `p + δp` and `v + δv` in the
+//! world, `R · exp(δθ)` in the body, biases added. Covariances are ordered and scaled alike.
+
+use crate::camera::Pixel;
+use crate::id::{FrameId, KeyframeId, LandmarkId};
+use crate::lie::Se3;
+use crate::time::Timestamp;
+use nalgebra::{SMatrix, Vector3};
+use serde::{Deserialize, Serialize};
+use std::fmt;
+
+/// Covariance of a frame's error state: position, rotation, velocity, gyroscope bias, accelerometer bias.
+pub type NavCovariance = SMatrix<f64, 15, 15>;
+
+/// Covariance of a pose: position in the world (m), rotation in the body (rad).
+pub type PoseCovariance = SMatrix<f64, 6, 6>;
+
+/// Where the body is, how fast it moves, and how far its IMU is off.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct NavState {
+    /// When it holds, in the clock of the images.
+    pub time: Timestamp,
+    /// Pose of the body (IMU) in a world whose z axis points up.
+    pub world_from_body: Se3,
+    /// Velocity of the body in the world, m/s.
+    pub velocity_in_world: Vector3<f64>,
+    /// Bias of the gyroscope, rad/s: subtract it from readings.
+    pub gyro_bias: Vector3<f64>,
+    /// Bias of the accelerometer, m/s²: subtract it from readings.
+    pub accel_bias: Vector3<f64>,
+}
+
+impl NavState {
+    /// At rest at the origin with true sensors.
+    pub fn at_rest(time: Timestamp) -> Self {
+        let zero = Vector3::zeros();
+        Self {
+            time,
+            world_from_body: Se3::IDENTITY,
+            velocity_in_world: zero,
+            gyro_bias: zero,
+            accel_bias: zero,
+        }
+    }
+
+    /// Whether every number is finite.
+    pub fn is_finite(&self) -> bool {
+        let vectors = [&self.velocity_in_world, &self.gyro_bias, &self.accel_bias];
+        self.world_from_body.is_finite() && vectors.iter().all(|v| v.iter().all(|c| c.is_finite()))
+    }
+}
+
+/// How far a frame's state may be trusted, worst reason first.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Health {
+    /// All is well.
+    Ok,
+    /// Metric, but the scale is known to worse than two percent yet.
+    ScaleConverging,
+    /// Up to scale: there is no IMU, or it has not told the scale yet. Lengths are not metres.
+    ScaleUnknown,
+    /// Few landmarks are seen.
+    LowFeatures,
+    /// No image helps; the state follows from the IMU alone.
+    Degraded,
+    /// What sensors say contradicts the state.
+    Suspect,
+    /// No state is known.
+    Lost,
+}
+
+impl Health {
+    /// The word as it stands in files.
+    pub fn word(self) -> &'static str {
+        match self {
+            Self::Ok => "ok",
+            Self::ScaleConverging => "scale-converging",
+            Self::ScaleUnknown => "scale-unknown",
+            Self::LowFeatures => "low-features",
+            Self::Degraded => "degraded",
+            Self::Suspect => "suspect",
+            Self::Lost => "lost",
+        }
+    }
+
+    /// Whether lengths are metres and the state is backed by images: what may be fused into a metric map.
+    pub fn is_metric(self) -> bool {
+        matches!(self, Self::Ok | Self::ScaleConverging | Self::LowFeatures)
+    }
+}
+
+impl fmt::Display for Health {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(self.word())
+    }
+}
+
+/// A point of the world as a keyframe sees it.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct SparseLandmark {
+    /// Which point; the same in every keyframe that sees it.
+    pub id: LandmarkId,
+    /// Where the keyframe's image shows it.
+    pub pixel: Pixel,
+    /// One over its z-depth in the keyframe's camera, 1/m (1/unit while the scale is unknown).
+    pub inverse_depth: f64,
+    /// Standard deviation of `inverse_depth`.
+    pub inverse_depth_std: f64,
+}
+
+/// A keyframe as the dense part of a map needs it.
+#[derive(Clone, Debug, PartialEq)]
+pub struct OdometryKeyframe {
+    /// Its number, counted from the first of the sequence.
+    pub id: KeyframeId,
+    /// The frame it is.
+    pub frame_id: FrameId,
+    /// Its segment: poses of different segments share no world.
+    pub segment: u32,
+    /// Its state; `state.time` is the frame's.
+    pub state: NavState,
+    /// Pose of its camera.
+    pub world_from_camera: Se3,
+    /// Covariance of its pose, relative to the first pose of the segment.
+    pub pose_covariance: PoseCovariance,
+    /// The keyframe before it, and the covariance of the pose relative to that one (position in that keyframe's
+    /// body, rotation in this one's).
+    pub previous: Option<(KeyframeId, PoseCovariance)>,
+    /// Gravity in the world, m/s².
+    pub gravity_in_world: Vector3<f64>,
+    /// How well the scale is known: standard deviation of ln(scale); infinite when it is not.
+    pub scale_std: f64,
+    /// Its health when it was made.
+    pub health: Health,
+    /// The landmarks it sees.
+    pub landmarks: Vec<SparseLandmark>,
+}
+
+/// A keyframe's pose after later frames corrected it.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct RevisedPose {
+    /// Which keyframe.
+    pub id: KeyframeId,
+    /// Its pose now.
+    pub world_from_camera: Se3,
+    /// Whether this is the last word: the keyframe left the window.
+    pub is_final: bool,
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn only_metric_states_with_images_may_be_fused() {
+        let all = [
+            Health::Ok,
+            Health::ScaleConverging,
+            Health::ScaleUnknown,
+            Health::LowFeatures,
+            Health::Degraded,
+            Health::Suspect,
+            Health::Lost,
+        ];
+        let metric: Vec<&str> = all.iter().filter(|h| h.is_metric()).map(|h| h.word()).collect();
+        assert_eq!(metric, ["ok", "scale-converging", "low-features"]);
+        assert!(all.windows(2).all(|w| w[0] < w[1]), "the worst word is the greatest");
+    }
+
+    #[test]
+    fn a_state_with_one_number_missing_is_not_finite() {
+        let mut state = NavState::at_rest(Timestamp::from_nanos(5));
+        assert!(state.is_finite());
+        state.accel_bias.y = f64::NAN;
+        assert!(!state.is_finite());
+    }
+}
