@@ -31,6 +31,11 @@ pub fn write_atomically<T, E: From<ExportError>>(
     write_atomically_with(path, Durability::Process, f)
 }
 
+/// Writes `bytes` as the whole file `path`, or nothing.
+pub fn write_file_atomically(path: &Path, bytes: &[u8]) -> Result<(), ExportError> {
+    write_atomically(path, |w| w.write_all(bytes).map_err(|source| file_error("write", path, source)))
+}
+
 /// Writes `path` through `f`, all or nothing, as durably as asked.
 pub fn write_atomically_with<T, E: From<ExportError>>(
     path: &Path,
@@ -176,6 +181,16 @@ mod tests {
             assert_eq!(fs::read_to_string(&path).unwrap(), text);
         }
         assert_eq!(names(&folder), ["karte ä.txt"]);
+    }
+
+    #[test]
+    fn a_target_that_is_a_folder_is_left_alone() {
+        let dir = tempfile::tempdir().unwrap();
+        let target = dir.path().join("is-a-folder");
+        fs::create_dir_all(target.join("x")).unwrap();
+        let error = write_file_atomically(&target, b"bytes").unwrap_err();
+        assert!(error.to_string().contains("is-a-folder"), "{error}");
+        assert_eq!(names(dir.path()), ["is-a-folder"]);
     }
 
     #[test]

@@ -185,7 +185,7 @@ fn points(run: &Path) -> Result<PointCloud, Error> {
 fn copy(run: &Path, folder: &str, name: &str, out: &Path) -> Result<PathBuf, Error> {
     let (from, to) = (run.join(folder).join(name), out.join(name));
     let bytes = std::fs::read(&from).map_err(|e| Error::io("read", &from, e))?;
-    crate::run_folder::write_whole(&to, &bytes)?;
+    vidar_export::atomic::write_file_atomically(&to, &bytes)?;
     Ok(to)
 }
 

@@ -141,7 +141,7 @@ impl RunFolder {
     /// Writes a whole file or nothing.
     pub fn write(&self, relative: &str, bytes: &[u8]) -> Result<u64, Error> {
         let path = self.file(relative)?;
-        write_whole(&path, bytes)?;
+        vidar_export::atomic::write_file_atomically(&path, bytes)?;
         Ok(bytes.len() as u64)
     }
 
@@ -178,21 +178,6 @@ pub fn pretty(value: &impl Serialize) -> Vec<u8> {
     let mut bytes = serde_json::to_vec_pretty(value).unwrap_or_default();
     bytes.push(b'\n');
     bytes
-}
-
-/// Writes `bytes` beside `path` and renames, so that nobody ever sees half a file.
-pub fn write_whole(path: &Path, bytes: &[u8]) -> Result<(), Error> {
-    let mut temporary = path.as_os_str().to_owned();
-    temporary.push(".part");
-    let temporary = PathBuf::from(temporary);
-    let result = File::create(&temporary)
-        .and_then(|mut file| file.write_all(bytes).and_then(|()| file.flush()))
-        .and_then(|()| std::fs::rename(&temporary, path));
-    result.map_err(|e| {
-        // The unfinished file is ours; if it cannot be removed either, the first error is the one to tell.
-        let _ = std::fs::remove_file(&temporary);
-        Error::io("write", path, e)
-    })
 }
 
 fn create_dir(path: &Path) -> Result<(), Error> {
@@ -292,16 +277,6 @@ mod tests {
             base.path().join("runs/_my_room/latest").canonicalize().unwrap(),
             second.path().canonicalize().unwrap()
         );
-    }
-
-    #[test]
-    fn a_failed_write_leaves_nothing_behind() {
-        let base = tempfile::tempdir().unwrap();
-        let target = base.path().join("is-a-folder");
-        std::fs::create_dir_all(target.join("x")).unwrap();
-        assert!(write_whole(&target, b"bytes").is_err());
-        let left: Vec<_> = std::fs::read_dir(base.path()).unwrap().flatten().map(|e| e.file_name()).collect();
-        assert_eq!(left, ["is-a-folder"]);
     }
 
     #[test]

@@ -317,6 +317,12 @@ fn a_full_disk_ends_with_4_keeps_what_is_finished_and_leaves_no_half_file() {
         assert!(!file.ends_with(".part") && !file.contains("tmp"), "half a file: {file}");
     }
     assert!(!files.contains(&"map/mesh.ply".to_owned()), "{files:?}");
+    // What happened is written down where the finished files are.
+    let manifest: serde_json::Value =
+        serde_json::from_slice(&fs::read(out.join("manifest.json")).unwrap()).unwrap();
+    assert_eq!(manifest["exit"], 4);
+    assert_eq!(manifest["result"]["error"]["code"], "E0402");
+    assert!(manifest["seconds"]["read"].as_f64().unwrap() > 0.0);
 }
 
 #[test]

@@ -175,7 +175,17 @@ impl ParametricCamera<9> for RadTan {
         [
             // EuRoC cam0.
             make(
-                &[458.654, 457.296, 367.215, 248.375, -0.28340811, 0.07395907, 0.00019359, 1.76187114e-05, 0.0],
+                &[
+                    458.654,
+                    457.296,
+                    367.215,
+                    248.375,
+                    -0.28340811,
+                    0.07395907,
+                    0.00019359,
+                    1.76187114e-05,
+                    0.0,
+                ],
                 752,
                 480,
             ),
@@ -194,7 +204,9 @@ impl ParametricCamera<9> for RadTan {
     fn invalid_examples() -> Vec<InvalidExample<9>> {
         let good = [458.0, 457.0, 367.0, 248.0, -0.28, 0.07, 0.0, 0.0, 0.0];
         let mut examples = invalid_intrinsics(good);
-        for (index, found) in [(4, f64::NAN), (5, f64::INFINITY), (6, f64::NAN), (7, f64::NEG_INFINITY), (8, f64::NAN)] {
+        for (index, found) in
+            [(4, f64::NAN), (5, f64::INFINITY), (6, f64::NAN), (7, f64::NEG_INFINITY), (8, f64::NAN)]
+        {
             examples.push(InvalidExample::of_parameter(good, index, "distortion", "finite", found));
         }
         examples

@@ -5,6 +5,7 @@ mod judge;
 mod outputs;
 mod pictures;
 mod plan;
+mod record;
 mod reference;
 mod views;
 
@@ -12,15 +13,16 @@ pub use judge::{DepthScore, Judgement};
 pub use outputs::pose_of;
 pub use plan::{Plan, bytes};
 
-use crate::config::Layered;
+use crate::config::{Config, Layered};
 use crate::error::{Error, ExitStatus};
 use crate::events::{CancelToken, Event, Events};
 use crate::input::{self, AnchorSource};
-use crate::run_folder::{Manifest, Place, RunFolder, StoredView};
+use crate::run_folder::{Place, RunFolder, StoredView};
+use record::Recorder;
 use std::path::PathBuf;
-use std::sync::{Arc, Mutex};
+use std::sync::Arc;
 use vidar_core::{PointCloud, Trajectory, TriangleMesh, Warning};
-use vidar_dataset::OpenOptions;
+use vidar_dataset::{Dataset, OpenOptions};
 use vidar_fusion::CoverageReport;
 
 /// What to run on, how, and where to.
@@ -97,26 +99,58 @@ pub fn plan(request: &RunRequest) -> Result<Plan, Error> {
     Plan::make(&dataset, &config, request.reference.as_deref())
 }
 
-/// Runs all of it. On Ctrl-C what is finished is fused, written and judged, and the status says so.
+/// Runs all of it. On Ctrl-C what is finished is fused, written and judged, and the status says so. A run that fails
+/// after its folder was made leaves a manifest there that says why.
 pub fn run(request: &RunRequest, events: &Events, cancel: &CancelToken) -> Result<RunOutcome, Error> {
     let clock = std::time::Instant::now();
+    let recorder = Recorder::default();
+    let events = recorder.listen(events.clone());
     let config = request.layered.build()?;
     let dataset = events.stage("read", 0, || input::open_dataset(&request.path, &request.open, &config))?;
     let plan = Plan::make(&dataset, &config, request.reference.as_deref())?;
     let folder = Arc::new(RunFolder::create(&request.place)?);
-    let recorder = Recorder::default();
-    let events = recorder.attach(events.clone(), folder.clone());
+    recorder.keep_log_in(folder.clone());
     dataset.warnings.iter().chain(&plan.warnings).for_each(|w| events.warn(w));
-    folder.write("config.resolved.toml", request.layered.to_toml(true).as_bytes())?;
+    let about = record::About::new(request, &dataset, &plan)?;
 
-    let map = dense::build(&dataset, &plan, &config, &folder, &events, cancel)?;
-    let judgement = events.stage("judge", 0, || judge::judge(&dataset, &plan, &map, &config, &events))?;
+    let made = carry_out(request, &config, &dataset, plan, &folder, &events, cancel, &recorder);
+    let made = made.map(|outcome| RunOutcome {
+        seconds: clock.elapsed().as_secs_f64(),
+        warnings: recorder.warnings(),
+        ..outcome
+    });
+    let (exit, result) = match &made {
+        Ok(outcome) => (outcome.status, outputs::result_json(outcome)),
+        Err(error) => (error.exit_status(), record::failure_json(error)),
+    };
+    let noted = folder.write_manifest(&recorder.manifest(about, result, exit));
+    let outcome = made?;
+    noted?;
+    events.emit(&Event::Finished { exit: exit as i32, seconds: outcome.seconds });
+    Ok(outcome)
+}
+
+/// Dense map, judgement, files, report.
+#[allow(clippy::too_many_arguments)] // one call, in the order in which `run` made them
+fn carry_out(
+    request: &RunRequest,
+    config: &Config,
+    dataset: &Dataset,
+    plan: Plan,
+    folder: &RunFolder,
+    events: &Events,
+    cancel: &CancelToken,
+    recorder: &Recorder,
+) -> Result<RunOutcome, Error> {
+    folder.write("config.resolved.toml", request.layered.to_toml(true).as_bytes())?;
+    let map = dense::build(dataset, &plan, config, folder, events, cancel)?;
+    let judgement = events.stage("judge", 0, || judge::judge(dataset, &plan, &map, config, events))?;
     let status = match (cancel.is_cancelled(), recorder.is_degraded() || map.mesh.triangles.is_empty()) {
         (true, _) => ExitStatus::Interrupted,
         (false, true) => ExitStatus::Degraded,
         (false, false) => ExitStatus::Done,
     };
-    let mut outcome = RunOutcome {
+    let outcome = RunOutcome {
         folder: folder.path().to_owned(),
         status,
         plan,
@@ -125,107 +159,11 @@ pub fn run(request: &RunRequest, events: &Events, cancel: &CancelToken) -> Resul
         warnings: recorder.warnings(),
         seconds: 0.0,
     };
-    events.stage("write", 0, || outputs::write(&outcome, &config, request, &folder, &events))?;
+    events.stage("write", 0, || outputs::write(&outcome, config, request, folder, events))?;
     if config.output.report {
-        events.stage("report", 0, || pictures::draw(&outcome, &dataset, request, &folder, &events))?;
+        events.stage("report", 0, || pictures::draw(&outcome, dataset, request, folder, events))?;
     }
-    outcome.seconds = clock.elapsed().as_secs_f64();
-    outcome.warnings = recorder.warnings();
-    let manifest = manifest(&outcome, &dataset, request, &recorder)?;
-    folder.write_manifest(&manifest)?;
-    events.emit(&Event::Finished { exit: status as i32, seconds: outcome.seconds });
     Ok(outcome)
-}
-
-/// Remembers what the events said, for the manifest.
-#[derive(Clone, Default)]
-struct Recorder(Arc<Mutex<Recorded>>);
-
-#[derive(Default)]
-struct Recorded {
-    warnings: Vec<Warning>,
-    seconds: Vec<(&'static str, f64)>,
-    artifacts: Vec<String>,
-}
-
-/// Kinds of warnings that mean that part of the result is missing.
-const DEGRADING: &[&str] = &[
-    "image-unreadable",
-    "image-empty",
-    "image-missing",
-    "chunk-failed",
-    "chunk-not-placed",
-    "memory-budget",
-    "no-parallax",
-    "depth-unreadable",
-    "not-judged",
-];
-
-impl Recorder {
-    fn attach(&self, events: Events, folder: Arc<RunFolder>) -> Events {
-        let recorded = self.0.clone();
-        events.with(move |event| {
-            folder.log(event);
-            let Ok(mut recorded) = recorded.lock() else { return };
-            match event {
-                Event::Warning { warning } => recorded.warnings.push(warning.clone()),
-                Event::StageFinished { stage, seconds } => recorded.seconds.push((stage, *seconds)),
-                Event::ArtifactWritten { path, .. } => recorded.artifacts.push(path.clone()),
-                _ => {}
-            }
-        })
-    }
-
-    fn read<T>(&self, f: impl FnOnce(&Recorded) -> T) -> T {
-        match self.0.lock() {
-            Ok(recorded) => f(&recorded),
-            Err(poisoned) => f(&poisoned.into_inner()),
-        }
-    }
-
-    fn warnings(&self) -> Vec<Warning> {
-        self.read(|r| r.warnings.clone())
-    }
-
-    fn is_degraded(&self) -> bool {
-        self.read(|r| r.warnings.iter().any(|w| DEGRADING.contains(&w.kind.as_str())))
-    }
-}
-
-fn manifest(
-    outcome: &RunOutcome,
-    dataset: &vidar_dataset::Dataset,
-    request: &RunRequest,
-    recorder: &Recorder,
-) -> Result<Manifest, Error> {
-    let mut counts = std::collections::BTreeMap::<&str, u64>::new();
-    outcome.warnings.iter().for_each(|w| *counts.entry(&w.kind).or_default() += 1);
-    Ok(Manifest {
-        schema: crate::run_folder::MANIFEST_SCHEMA.into(),
-        version: crate::VERSION.into(),
-        command: request.command.clone(),
-        started: outcome.plan.started.clone(),
-        dataset: serde_json::json!({
-            "name": dataset.name, "kind": dataset.kind.to_string(), "path": request.path.display().to_string(),
-            "images": dataset.images.len(), "imu_samples": dataset.imu.len(), "depth_images": dataset.depths.len(),
-        }),
-        dataset_sha256: sha256_hex(&dataset.fingerprint()?),
-        config_sha256: sha256_hex(request.layered.to_toml(false).as_bytes()),
-        model: serde_json::json!(outcome.plan.model),
-        poses: serde_json::json!(outcome.plan.anchor.source),
-        hardware: serde_json::json!(crate::system::hardware()),
-        seconds: recorder.read(|r| r.seconds.iter().map(|(k, s)| ((*k).to_owned(), (*s).into())).collect()),
-        peak_memory_bytes: crate::system::peak_memory_bytes(),
-        result: outputs::result_json(outcome),
-        warnings: serde_json::json!(counts),
-        artifacts: recorder.read(|r| r.artifacts.clone()),
-        exit: outcome.status as i32,
-    })
-}
-
-fn sha256_hex(bytes: &[u8]) -> String {
-    use sha2::{Digest, Sha256};
-    Sha256::digest(bytes).iter().map(|b| format!("{b:02x}")).collect()
 }
 
 /// The trajectory that anchored the run and where it came from.
