@@ -31,9 +31,9 @@ pub(crate) fn model_from_parts(
     };
     let bad = |source| DatasetError::BadCamera { path: path.to_path_buf(), key: key.to_string(), source };
     let four = || -> Result<[f64; 4], DatasetError> {
-        coefficients
-            .try_into()
-            .map_err(|_| count("distortion coefficients", coefficients.len(), "4 distortion coefficients (radtan: 4 or 5)"))
+        coefficients.try_into().map_err(|_| {
+            count("distortion coefficients", coefficients.len(), "4 distortion coefficients (radtan: 4 or 5)")
+        })
     };
     let sphere = camera == "ds" || camera == "double-sphere";
     let focal = match (sphere, intrinsics) {

@@ -117,9 +117,7 @@ pub(crate) fn published_model(
     let model = published_camera(pinhole, distortion)?;
     let warning = Warning::new(
         "intrinsics-published",
-        format!(
-            "no calibration file; the published {camera} camera is used (f {fx}, {fy}, c {cx}, {cy})"
-        ),
+        format!("no calibration file; the published {camera} camera is used (f {fx}, {fy}, c {cx}, {cy})"),
     )
     .at(root.display())
     .hint("--camera-model, or --calibration FILE");
