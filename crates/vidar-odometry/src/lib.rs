@@ -1,1 +1,8 @@
 //! Visual-inertial odometry: images and IMU samples in, metric states, keyframes and covariance out.
+
+pub mod system;
+
+pub use system::{
+    DivergenceSign, ImuUse, InitCondition, InitProgress, LossReason, OdometryConfig, OdometryError, OdometryOutput, Status,
+    Tracking,
+};

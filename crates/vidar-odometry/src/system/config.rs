@@ -1,0 +1,118 @@
+//! What can be tuned from outside. Everything else is a named constant with its reason beside the code.
+
+use super::error::OdometryError;
+use serde::{Deserialize, Serialize};
+
+/// Whether inertial readings are used.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, schemars::JsonSchema)]
+#[serde(rename_all = "kebab-case")]
+pub enum ImuUse {
+    /// Where the rig has an IMU.
+    #[default]
+    Auto,
+    /// Always; without one the odometry refuses to start.
+    Required,
+    /// Never: the camera alone, up to scale.
+    Off,
+}
+
+/// Settings of the odometry. The defaults suit a drone or a hand-held camera with a consumer or industrial IMU.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
+#[serde(default, deny_unknown_fields)]
+pub struct OdometryConfig {
+    /// Whether inertial readings are used: `auto`, `required` or `off` (the camera alone, up to scale).
+    pub imu: ImuUse,
+    /// Landmarks followed at once, 20…400. More are more accurate and cost time in proportion.
+    pub max_landmarks: usize,
+    /// Keyframes kept in the window, 4…20. More hold longer and cost time with the cube.
+    pub max_keyframes: usize,
+    /// Iterations of the smoother per image, 1…10.
+    pub iterations: usize,
+    /// Image noise of a feature's position at its own pyramid level, pixels, 0.1…5. Raise it for blurred or
+    /// noisy cameras.
+    pub pixel_noise_px: f64,
+    /// Factor on the data sheet's gyroscope noise, 1…100: vibration and scale errors are in no data sheet.
+    pub gyro_noise_factor: f64,
+    /// Factor on the data sheet's accelerometer noise, 1…100.
+    pub accel_noise_factor: f64,
+    /// Strength of gravity, m/s², 9.5…10.
+    pub gravity_mps2: f64,
+    /// Whether the offset between the clocks of camera and IMU is estimated on the way.
+    pub estimate_time_offset: bool,
+    /// Whether the camera's place on the body is refined on the way.
+    pub estimate_extrinsics: bool,
+    /// Fastest speed that is believed, m/s, 0.1…100.
+    pub max_speed_mps: f64,
+    /// After this long without landmarks or readings the state is given up, s, 0.1…10.
+    pub max_blind_secs: f64,
+}
+
+impl Default for OdometryConfig {
+    fn default() -> Self {
+        Self {
+            imu: ImuUse::Auto,
+            max_landmarks: 150,
+            max_keyframes: 10,
+            iterations: 4,
+            pixel_noise_px: 0.5,
+            gyro_noise_factor: 2.0,
+            accel_noise_factor: 4.0,
+            gravity_mps2: vidar_core::GRAVITY_MPS2,
+            estimate_time_offset: true,
+            estimate_extrinsics: false,
+            max_speed_mps: 20.0,
+            max_blind_secs: 2.0,
+        }
+    }
+}
+
+impl OdometryConfig {
+    /// Refuses values outside the ranges that the fields state, naming the key.
+    pub fn validate(&self) -> Result<(), OdometryError> {
+        let check = |key, found: f64, low: f64, high: f64, expected| {
+            if found >= low && found <= high {
+                return Ok(());
+            }
+            Err(OdometryError::BadConfig { key, expected, found })
+        };
+        check("max_landmarks", self.max_landmarks as f64, 20.0, 400.0, "20 to 400")?;
+        check("max_keyframes", self.max_keyframes as f64, 4.0, 20.0, "4 to 20")?;
+        check("iterations", self.iterations as f64, 1.0, 10.0, "1 to 10")?;
+        check("pixel_noise_px", self.pixel_noise_px, 0.1, 5.0, "0.1 to 5 px")?;
+        check("gyro_noise_factor", self.gyro_noise_factor, 1.0, 100.0, "1 to 100")?;
+        check("accel_noise_factor", self.accel_noise_factor, 1.0, 100.0, "1 to 100")?;
+        check("gravity_mps2", self.gravity_mps2, 9.5, 10.0, "9.5 to 10 m/s²")?;
+        check("max_speed_mps", self.max_speed_mps, 0.1, 100.0, "0.1 to 100 m/s")?;
+        check("max_blind_secs", self.max_blind_secs, 0.1, 10.0, "0.1 to 10 s")
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn each_bad_key_is_named() {
+        type Spoil = fn(&mut OdometryConfig);
+        let cases: [(&str, Spoil); 9] = [
+            ("max_landmarks", |c| c.max_landmarks = 3),
+            ("max_keyframes", |c| c.max_keyframes = 100),
+            ("iterations", |c| c.iterations = 0),
+            ("pixel_noise_px", |c| c.pixel_noise_px = f64::NAN),
+            ("gyro_noise_factor", |c| c.gyro_noise_factor = 0.0),
+            ("accel_noise_factor", |c| c.accel_noise_factor = -1.0),
+            ("gravity_mps2", |c| c.gravity_mps2 = 1.62),
+            ("max_speed_mps", |c| c.max_speed_mps = 0.0),
+            ("max_blind_secs", |c| c.max_blind_secs = f64::INFINITY),
+        ];
+        OdometryConfig::default().validate().unwrap();
+        for (name, spoil) in cases {
+            let mut config = OdometryConfig::default();
+            spoil(&mut config);
+            match config.validate() {
+                Err(OdometryError::BadConfig { key, .. }) => assert_eq!(key, name),
+                other => panic!("{name}: {other:?}"),
+            }
+        }
+    }
+}

@@ -1,0 +1,239 @@
+//! What the odometry says of every image.
+
+use std::fmt;
+use vidar_core::{
+    FrameId, Health, NavCovariance, NavState, OdometryKeyframe, RevisedPose, SparseLandmark, Timestamp,
+};
+
+/// What is known after one image.
+#[derive(Clone, Debug, PartialEq)]
+pub struct OdometryOutput {
+    /// Which image.
+    pub frame_id: FrameId,
+    /// Its time, in the clock of the images.
+    pub time: Timestamp,
+    /// What is known.
+    pub status: Status,
+}
+
+/// Whether there is a state, and if not, why.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Status {
+    /// Not started yet; what is missing.
+    Waiting(InitProgress),
+    /// There is a state.
+    Tracking(Box<Tracking>),
+    /// There was one, and it cannot be kept.
+    Lost(LossReason),
+}
+
+impl OdometryOutput {
+    /// The state and all that belongs to it, if there is one.
+    pub fn tracking(&self) -> Option<&Tracking> {
+        match &self.status {
+            Status::Tracking(tracking) => Some(tracking),
+            Status::Waiting(_) | Status::Lost(_) => None,
+        }
+    }
+
+    /// One word for the frame.
+    pub fn health(&self) -> Health {
+        match &self.status {
+            Status::Waiting(_) => Health::ScaleUnknown,
+            Status::Tracking(tracking) => tracking.health,
+            Status::Lost(_) => Health::Lost,
+        }
+    }
+}
+
+/// The state at one image.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Tracking {
+    /// Counts worlds: poses of different segments cannot be compared.
+    pub segment: u32,
+    /// The state.
+    pub state: NavState,
+    /// Its covariance, relative to the first pose of the segment.
+    pub covariance: NavCovariance,
+    /// Standard deviation of ln(scale); infinite while lengths are not metres.
+    pub scale_std: f64,
+    /// How far it may be trusted.
+    pub health: Health,
+    /// Landmarks of the smoother that this image shows.
+    pub tracked: usize,
+    /// Those landmarks, with their depth from this image.
+    pub landmarks: Vec<SparseLandmark>,
+    /// The keyframe that this image became, if it did.
+    pub keyframe: Option<Box<OdometryKeyframe>>,
+    /// Keyframes whose poses changed since the last output.
+    pub revised: Vec<RevisedPose>,
+}
+
+/// What an initialisation still needs, and how far it is.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct InitProgress {
+    /// What is missing.
+    pub condition: InitCondition,
+    /// The value measured, in the condition's unit.
+    pub measured: f64,
+    /// The value needed.
+    pub needed: f64,
+}
+
+/// What an initialisation can wait for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+pub enum InitCondition {
+    /// Seconds of inertial readings before the image.
+    ImuData,
+    /// Corners found in the image.
+    Texture,
+    /// Features that were followed from an earlier image.
+    Tracks,
+    /// Parallax between views, degrees.
+    Parallax,
+    /// Frames with a visual reconstruction.
+    VisualFrames,
+    /// Change of the velocity over the window, m/s²: what makes a scale observable.
+    Excitation,
+    /// Standard deviation of ln(scale), which must fall below the value.
+    ScaleStd,
+    /// Factor between successive scale estimates, which must fall below the value.
+    ScaleAgreement,
+    /// Error of the inertial fit per degree of freedom, which must fall below the value.
+    InertialFit,
+}
+
+impl InitCondition {
+    /// The word as it stands in files.
+    pub fn word(self) -> &'static str {
+        match self {
+            Self::ImuData => "imu-data",
+            Self::Texture => "texture",
+            Self::Tracks => "tracks",
+            Self::Parallax => "parallax",
+            Self::VisualFrames => "visual-frames",
+            Self::Excitation => "excitation",
+            Self::ScaleStd => "scale-std",
+            Self::ScaleAgreement => "scale-agreement",
+            Self::InertialFit => "inertial-fit",
+        }
+    }
+}
+
+impl fmt::Display for InitProgress {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let (m, n) = (self.measured, self.needed);
+        match self.condition {
+            InitCondition::ImuData => write!(f, "{m:.2} s of IMU data < {n:.2} s: wait"),
+            InitCondition::Texture => write!(f, "{m:.0} corners < {n:.0}: turn to a textured surface"),
+            InitCondition::Tracks => write!(f, "{m:.0} tracks < {n:.0}: move more slowly or add light"),
+            InitCondition::Parallax => write!(f, "parallax {m:.1}° < {n:.1}°: move sideways"),
+            InitCondition::VisualFrames => write!(f, "{m:.0} frames reconstructed < {n:.0}: keep moving"),
+            InitCondition::Excitation => {
+                write!(f, "acceleration changes by {m:.2} m/s² < {n:.2} m/s²: speed up and slow down")
+            }
+            InitCondition::ScaleStd => {
+                write!(
+                    f,
+                    "scale known to {:.0} % > {:.0} %: move sideways and vary the speed",
+                    100.0 * m,
+                    100.0 * n
+                )
+            }
+            InitCondition::ScaleAgreement => {
+                write!(f, "two scale estimates differ by a factor {m:.2} > {n:.2}: keep moving")
+            }
+            InitCondition::InertialFit => {
+                write!(
+                    f,
+                    "inertial fit {m:.1} > {n:.1} per degree of freedom: check extrinsics and time offset"
+                )
+            }
+        }
+    }
+}
+
+/// Why a state was given up.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum LossReason {
+    /// Too few landmarks for too long.
+    NoFeatures {
+        /// How long nothing was seen, s.
+        secs: f64,
+    },
+    /// No inertial reading for too long.
+    ImuGap {
+        /// Length of the gap, s.
+        secs: f64,
+    },
+    /// No image for too long.
+    ImageGap {
+        /// Length of the gap, s.
+        secs: f64,
+    },
+    /// The state contradicts the sensors or physics.
+    Diverged {
+        /// What gave it away.
+        sign: DivergenceSign,
+        /// Its value, in the sign's unit.
+        found: f64,
+        /// Largest value that is believed.
+        limit: f64,
+    },
+}
+
+/// What gives a diverged state away.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+pub enum DivergenceSign {
+    /// Speed, m/s.
+    Speed,
+    /// Length of the gyroscope's bias, rad/s.
+    GyroBias,
+    /// Length of the accelerometer's bias, m/s².
+    AccelBias,
+    /// Share of measurements that contradict the prediction.
+    RejectedShare,
+    /// A number that is not finite.
+    NotFinite,
+}
+
+impl fmt::Display for LossReason {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::NoFeatures { secs } => write!(f, "no landmark was seen for {secs:.2} s"),
+            Self::ImuGap { secs } => write!(f, "no inertial reading for {secs:.2} s"),
+            Self::ImageGap { secs } => write!(f, "no image for {secs:.2} s"),
+            Self::Diverged { sign, found, limit } => match sign {
+                DivergenceSign::Speed => write!(f, "speed {found:.1} m/s > {limit:.1} m/s"),
+                DivergenceSign::GyroBias => write!(f, "gyroscope bias {found:.2} rad/s > {limit:.2} rad/s"),
+                DivergenceSign::AccelBias => {
+                    write!(f, "accelerometer bias {found:.2} m/s² > {limit:.2} m/s²")
+                }
+                DivergenceSign::RejectedShare => {
+                    write!(f, "{:.0} % of the measurements contradict the prediction", 100.0 * found)
+                }
+                DivergenceSign::NotFinite => write!(f, "the state is not finite"),
+            },
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn waiting_says_what_is_missing_how_much_and_what_to_do() {
+        let progress = InitProgress { condition: InitCondition::Parallax, measured: 0.41, needed: 1.0 };
+        assert_eq!(progress.to_string(), "parallax 0.4° < 1.0°: move sideways");
+        let progress = InitProgress { condition: InitCondition::ScaleStd, measured: 0.4, needed: 0.15 };
+        assert_eq!(progress.to_string(), "scale known to 40 % > 15 %: move sideways and vary the speed");
+    }
+
+    #[test]
+    fn a_loss_names_its_reason_with_values() {
+        let reason = LossReason::Diverged { sign: DivergenceSign::Speed, found: 31.0, limit: 20.0 };
+        assert_eq!(reason.to_string(), "speed 31.0 m/s > 20.0 m/s");
+        assert_eq!(LossReason::ImuGap { secs: 0.75 }.to_string(), "no inertial reading for 0.75 s");
+    }
+}
