@@ -1,7 +1,7 @@
 //! What a metric odometry says of each frame and of each keyframe.
 //!
-//! The error state of a frame is `[δp, δθ, δv, δb_gyro, δb_accel]`, three numbers each: `p + δp` and `v + δv` in the
-//! world, `R · exp(δθ)` in the body, biases added. Covariances are ordered and scaled alike.
+//! The error state of a frame is `[δθ, δp, δv, δb_gyro, δb_accel]`, three numbers each: `R · exp(δθ)` in the body,
+//! `p + δp` and `v + δv` in the world, biases added. Covariances are ordered and scaled alike.
 
 use crate::camera::Pixel;
 use crate::id::{FrameId, KeyframeId, LandmarkId};
@@ -11,10 +11,10 @@ use nalgebra::{SMatrix, Vector3};
 use serde::{Deserialize, Serialize};
 use std::fmt;
 
-/// Covariance of a frame's error state: position, rotation, velocity, gyroscope bias, accelerometer bias.
+/// Covariance of a frame's error state: rotation, position, velocity, gyroscope bias, accelerometer bias.
 pub type NavCovariance = SMatrix<f64, 15, 15>;
 
-/// Covariance of a pose: position in the world (m), rotation in the body (rad).
+/// Covariance of a pose: rotation in the body (rad), position in the world (m).
 pub type PoseCovariance = SMatrix<f64, 6, 6>;
 
 /// Where the body is, how fast it moves, and how far its IMU is off.
@@ -126,8 +126,8 @@ pub struct OdometryKeyframe {
     pub world_from_camera: Se3,
     /// Covariance of its pose, relative to the first pose of the segment.
     pub pose_covariance: PoseCovariance,
-    /// The keyframe before it, and the covariance of the pose relative to that one (position in that keyframe's
-    /// body, rotation in this one's).
+    /// The keyframe before it, and the covariance of the pose relative to that one (rotation in this
+    /// keyframe's body, position in that one's).
     pub previous: Option<(KeyframeId, PoseCovariance)>,
     /// Gravity in the world, m/s².
     pub gravity_in_world: Vector3<f64>,
