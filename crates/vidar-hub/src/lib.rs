@@ -1,1 +1,45 @@
-//! Checkpoints: the list of official ones, and finding, fetching, resuming and verifying them.
+//! Checkpoints of Depth Anything 3: the list of official ones, and finding, fetching, resuming and verifying them.
+//!
+//! - [`catalogue`]: which checkpoints there are, under which licence, how large, with which SHA-256.
+//! - [`HubSettings`]: where they are kept and fetched from, as the environment says.
+//! - [`Store`]: those on this machine: `find`, `require`, `list`, `verify`, `pull`, `import`.
+//!
+//! Nothing here is trusted that can be checked: a file takes its name only when its length and SHA-256 are the official
+//! ones. Nothing is fetched unless [`Store::pull`] is called, and then from one hub only
+//! (`{endpoint}/{repo}/resolve/{revision}/{file}`, and wherever it redirects to). Weights whose licence forbids commercial
+//! use are neither fetched nor handed out before an [`Acceptance`] lies beside them.
+//!
+//! ```
+//! use vidar_hub::{HubSettings, Store, catalogue};
+//! # fn main() -> Result<(), vidar_hub::HubError> {
+//! let store = Store::new(HubSettings::new("/no/such/folder".into()));
+//! let small = catalogue::find("da3-small")?;
+//! assert!(store.find(small)?.is_none());
+//! let missing = store.require(small).unwrap_err();
+//! assert!(missing.hint().unwrap().contains("vidar model pull da3-small"));
+//! # Ok(())
+//! # }
+//! ```
+
+mod address;
+pub mod catalogue;
+mod client;
+mod digest;
+mod disk;
+mod download;
+mod error;
+mod header;
+mod lock;
+mod pull;
+mod settings;
+mod store;
+
+pub use catalogue::{Ability, Checkpoint, Licence, OfficialFile};
+pub use digest::sha256_of;
+pub use download::{Progress, Watch};
+pub use error::HubError;
+pub use pull::PullOptions;
+pub use settings::{ENDPOINT, HubSettings};
+pub use store::{
+    Acceptance, IdentifiedBy, Installed, Place, Record, RecordedFile, Store, Verified, official_licence,
+};

@@ -1,0 +1,402 @@
+//! Checkpoints on this machine.
+//!
+//! ```text
+//! $VIDAR_MODELS/
+//!   da3-small/
+//!     config.json  model.safetensors    as on the hub
+//!     vidar-model.json                  where they came from, lengths, SHA-256
+//!     acceptance.json                   who accepted a non-commercial licence, when, and which text
+//! ```
+//!
+//! A checkpoint that is not there is looked for in the cache of the hub's own programs
+//! (`models--depth-anything--DA3-SMALL/snapshots/…`), which is read and never written.
+
+use crate::catalogue::{CHECKPOINTS, CONFIG, Checkpoint, Licence, OfficialFile, WEIGHTS};
+use crate::digest::sha256_of;
+use crate::download::Watch;
+use crate::error::HubError;
+use crate::settings::HubSettings;
+use serde::{Deserialize, Serialize, de::DeserializeOwned};
+use std::fs;
+use std::io::{ErrorKind, Read, Write};
+use std::path::{Path, PathBuf};
+
+/// Schema of [`Record`].
+pub const RECORD_SCHEMA: &str = "vidar.model/1";
+/// Schema of [`Acceptance`].
+pub const ACCEPTANCE_SCHEMA: &str = "vidar.acceptance/1";
+pub(crate) const RECORD: &str = "vidar-model.json";
+pub(crate) const ACCEPTANCE: &str = "acceptance.json";
+/// A file of JSON beside weights is never longer than this, bytes.
+const MOST_JSON: u64 = 1 << 20;
+
+/// Where a checkpoint came from and what it must be.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Record {
+    /// [`RECORD_SCHEMA`].
+    pub schema: String,
+    /// Name of the checkpoint.
+    pub name: String,
+    /// Address or path it was taken from.
+    pub source: String,
+    /// Commit on the hub, where known.
+    pub revision: Option<String>,
+    /// SPDX licence of the weights.
+    pub licence: String,
+    /// When, RFC 3339.
+    pub added: String,
+    /// Its files.
+    pub files: Vec<RecordedFile>,
+}
+
+/// One file of a record.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct RecordedFile {
+    /// Name beside the record.
+    pub name: String,
+    /// Length.
+    pub bytes: u64,
+    /// SHA-256, small hexadecimal letters.
+    pub sha256: String,
+    /// Who says that this is the right hash.
+    pub identified_by: IdentifiedBy,
+}
+
+/// Who says that a hash is the right one.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum IdentifiedBy {
+    /// The list of official checkpoints.
+    Catalogue,
+    /// The hub it was fetched from.
+    Hub,
+    /// Nobody: it is the hash of what came.
+    Nobody,
+}
+
+/// That somebody accepted a licence.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Acceptance {
+    /// [`ACCEPTANCE_SCHEMA`].
+    pub schema: String,
+    /// Name of the checkpoint.
+    pub model: String,
+    /// SPDX name of the licence.
+    pub licence: String,
+    /// Where its text is.
+    pub text: String,
+    /// Who accepted.
+    pub accepted_by: String,
+    /// When, RFC 3339.
+    pub accepted_at: String,
+}
+
+impl Acceptance {
+    /// The acceptance of `checkpoint`'s licence, which the user named as `given`.
+    pub fn new(checkpoint: &Checkpoint, given: &str, by: &str, at: &str) -> Result<Self, HubError> {
+        let licence = checkpoint.licence;
+        if !given.eq_ignore_ascii_case(licence.spdx()) {
+            let name = checkpoint.name.to_owned();
+            return Err(HubError::WrongLicence { name, licence, given: given.to_owned() });
+        }
+        Ok(Self {
+            schema: ACCEPTANCE_SCHEMA.to_owned(),
+            model: checkpoint.name.to_owned(),
+            licence: licence.spdx().to_owned(),
+            text: licence.text_url().to_owned(),
+            accepted_by: by.to_owned(),
+            accepted_at: at.to_owned(),
+        })
+    }
+
+    fn is_of(&self, checkpoint: &Checkpoint) -> bool {
+        self.schema == ACCEPTANCE_SCHEMA
+            && self.model == checkpoint.name
+            && self.licence == checkpoint.licence.spdx()
+    }
+}
+
+/// Where the files of a checkpoint lie.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Place {
+    /// In the store of this program.
+    Store,
+    /// In the cache of the hub's own programs.
+    HubCache,
+}
+
+/// A checkpoint that is on this machine.
+#[derive(Clone, Debug)]
+pub struct Installed {
+    /// Which one.
+    pub checkpoint: &'static Checkpoint,
+    /// The folder of its files.
+    pub folder: PathBuf,
+    /// Whose folder that is.
+    pub place: Place,
+    /// Where it came from; only in the store.
+    pub record: Option<Record>,
+    /// Who accepted its licence, where that is needed and was done.
+    pub acceptance: Option<Acceptance>,
+}
+
+impl Installed {
+    /// The file of weights.
+    pub fn weights(&self) -> PathBuf {
+        self.folder.join(WEIGHTS)
+    }
+
+    /// SHA-256 of the weights as recorded when they came.
+    pub fn recorded_sha256(&self) -> Option<&str> {
+        let files = &self.record.as_ref()?.files;
+        files.iter().find(|f| f.name == WEIGHTS).map(|f| f.sha256.as_str())
+    }
+}
+
+/// What became of a file when it was verified.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
+pub struct Verified {
+    /// Which file.
+    pub name: String,
+    /// Its length.
+    pub bytes: u64,
+    /// Its SHA-256.
+    pub sha256: String,
+    /// Who says that this is right.
+    pub identified_by: IdentifiedBy,
+}
+
+/// The checkpoints of this machine.
+#[derive(Clone, Debug)]
+pub struct Store {
+    settings: HubSettings,
+}
+
+impl Store {
+    /// The store that the settings describe.
+    pub fn new(settings: HubSettings) -> Self {
+        Self { settings }
+    }
+
+    /// Its settings.
+    pub fn settings(&self) -> &HubSettings {
+        &self.settings
+    }
+
+    /// The folder of a checkpoint, whether it exists or not.
+    pub fn folder(&self, checkpoint: &Checkpoint) -> PathBuf {
+        self.settings.root.join(checkpoint.name)
+    }
+
+    /// The checkpoint, if all of its files are here; `None` otherwise. Lengths are looked at, hashes are not.
+    pub fn find(&self, checkpoint: &'static Checkpoint) -> Result<Option<Installed>, HubError> {
+        let folder = self.folder(checkpoint);
+        let acceptance = self.acceptance(checkpoint)?;
+        if is_complete(&folder, checkpoint) {
+            let record = read_record(&folder, checkpoint)?;
+            return Ok(Some(Installed { checkpoint, folder, place: Place::Store, record, acceptance }));
+        }
+        let cached = self.settings.hub_cache.as_ref().and_then(|cache| in_hub_cache(cache, checkpoint));
+        Ok(cached.map(|folder| Installed {
+            checkpoint,
+            folder,
+            place: Place::HubCache,
+            record: None,
+            acceptance,
+        }))
+    }
+
+    /// The checkpoint, ready to be used: here, and its licence accepted where that is needed.
+    pub fn require(&self, checkpoint: &'static Checkpoint) -> Result<Installed, HubError> {
+        let Some(installed) = self.find(checkpoint)? else {
+            let (name, looked) = (checkpoint.name.to_owned(), self.folder(checkpoint));
+            return Err(HubError::NotInstalled { name, looked });
+        };
+        self.require_acceptance(checkpoint)?;
+        Ok(installed)
+    }
+
+    /// Who accepted the checkpoint's licence, if anybody did.
+    pub fn acceptance(&self, checkpoint: &Checkpoint) -> Result<Option<Acceptance>, HubError> {
+        let path = self.folder(checkpoint).join(ACCEPTANCE);
+        let read: Option<Acceptance> = read_json(&path)?;
+        match read {
+            Some(acceptance) if !acceptance.is_of(checkpoint) => {
+                let reason =
+                    format!("it is not an acceptance of {} for {}", checkpoint.licence, checkpoint.name);
+                Err(HubError::BadRecord { path, reason })
+            }
+            other => Ok(other),
+        }
+    }
+
+    /// An error unless the licence allows every use or somebody accepted it.
+    pub fn require_acceptance(&self, checkpoint: &Checkpoint) -> Result<Option<Acceptance>, HubError> {
+        let acceptance = self.acceptance(checkpoint)?;
+        if acceptance.is_none() && !checkpoint.licence.allows_commercial_use() {
+            let (name, licence) = (checkpoint.name.to_owned(), checkpoint.licence);
+            return Err(HubError::LicenceNotAccepted { name, licence });
+        }
+        Ok(acceptance)
+    }
+
+    /// Writes an acceptance down beside the weights.
+    pub fn accept(&self, checkpoint: &Checkpoint, acceptance: &Acceptance) -> Result<(), HubError> {
+        if !acceptance.is_of(checkpoint) {
+            let (name, licence) = (checkpoint.name.to_owned(), checkpoint.licence);
+            return Err(HubError::WrongLicence { name, licence, given: acceptance.licence.clone() });
+        }
+        let folder = self.folder(checkpoint);
+        make_folder(&folder)?;
+        write_json(&folder.join(ACCEPTANCE), acceptance)
+    }
+
+    /// Every official checkpoint with what is here of it.
+    pub fn list(&self) -> Result<Vec<(&'static Checkpoint, Option<Installed>)>, HubError> {
+        CHECKPOINTS.iter().map(|c| Ok((c, self.find(c)?))).collect()
+    }
+
+    /// Reads every byte of a checkpoint and holds lengths and hashes against catalogue and record.
+    pub fn verify(
+        &self,
+        checkpoint: &'static Checkpoint,
+        watch: &Watch<'_>,
+    ) -> Result<Vec<Verified>, HubError> {
+        let Some(installed) = self.find(checkpoint)? else {
+            let (name, looked) = (checkpoint.name.to_owned(), self.folder(checkpoint));
+            return Err(HubError::NotInstalled { name, looked });
+        };
+        let recorded = |name: &str| {
+            let files = installed.record.as_ref().map(|r| r.files.as_slice()).unwrap_or_default();
+            files.iter().find(|f| f.name == name)
+        };
+        let mut verified = Vec::new();
+        for official in &checkpoint.files {
+            let path = installed.folder.join(official.name);
+            let (bytes, sha256) = sha256_of(&path, watch)?;
+            let what = || path.display().to_string();
+            let record = recorded(official.name);
+            // Another commit, or a config.json that is our own: the record alone says what belongs there.
+            let own = record.is_some_and(|r| r.identified_by != IdentifiedBy::Catalogue);
+            let official =
+                if own { OfficialFile { bytes: None, sha256: None, ..*official } } else { *official };
+            for expected in [official.bytes, record.map(|r| r.bytes)].into_iter().flatten() {
+                if expected != bytes {
+                    return Err(HubError::WrongSize { what: what(), found: bytes, expected });
+                }
+            }
+            for expected in [official.sha256, record.map(|r| r.sha256.as_str())].into_iter().flatten() {
+                if expected != sha256 {
+                    let expected = expected.to_owned();
+                    return Err(HubError::WrongHash { what: what(), found: sha256, expected });
+                }
+            }
+            let identified_by = match (official.sha256, record) {
+                (Some(_), _) => IdentifiedBy::Catalogue,
+                (None, Some(record)) => record.identified_by,
+                (None, None) => IdentifiedBy::Nobody,
+            };
+            verified.push(Verified { name: official.name.to_owned(), bytes, sha256, identified_by });
+        }
+        Ok(verified)
+    }
+}
+
+/// Whether every file is there, the weights with the right length. The `config.json` of weights that came without
+/// one is our own, so its length says nothing.
+fn is_complete(folder: &Path, checkpoint: &Checkpoint) -> bool {
+    let length =
+        |name: &str| fs::metadata(folder.join(name)).ok().filter(fs::Metadata::is_file).map(|m| m.len());
+    let weights = length(WEIGHTS).is_some_and(|n| checkpoint.weights().bytes.is_none_or(|bytes| bytes == n));
+    weights && length(CONFIG).is_some_and(|n| n <= MOST_JSON)
+}
+
+/// The newest complete snapshot that the hub's own programs keep.
+fn in_hub_cache(cache: &Path, checkpoint: &Checkpoint) -> Option<PathBuf> {
+    let repository = cache.join(format!("models--{}", checkpoint.repo.replace('/', "--")));
+    let snapshots = repository.join("snapshots");
+    let main = fs::read_to_string(repository.join("refs").join("main")).unwrap_or_default();
+    let named = [checkpoint.revision, main.trim()].map(|revision| snapshots.join(revision));
+    let mut others: Vec<PathBuf> = fs::read_dir(&snapshots).ok()?.flatten().map(|e| e.path()).collect();
+    others.sort();
+    // `snapshots` itself is what an empty name gives; it holds no files of its own.
+    named.into_iter().chain(others).find(|folder| *folder != snapshots && is_complete(folder, checkpoint))
+}
+
+/// The record of a folder, if there is one and it is of that checkpoint.
+fn read_record(folder: &Path, checkpoint: &Checkpoint) -> Result<Option<Record>, HubError> {
+    let path = folder.join(RECORD);
+    let record: Option<Record> = read_json(&path)?;
+    match record {
+        Some(r) if r.schema != RECORD_SCHEMA || r.name != checkpoint.name => {
+            let reason =
+                format!("it describes {:?} ({:?}), expected {:?}", r.name, r.schema, checkpoint.name);
+            Err(HubError::BadRecord { path, reason })
+        }
+        other => Ok(other),
+    }
+}
+
+fn read_json<T: DeserializeOwned>(path: &Path) -> Result<Option<T>, HubError> {
+    let file = match fs::File::open(path) {
+        Ok(file) => file,
+        Err(e) if e.kind() == ErrorKind::NotFound => return Ok(None),
+        Err(e) => return Err(HubError::io("read", path)(e)),
+    };
+    let mut bytes = Vec::new();
+    file.take(MOST_JSON + 1).read_to_end(&mut bytes).map_err(HubError::io("read", path))?;
+    let bad = |reason: String| HubError::BadRecord { path: path.to_owned(), reason };
+    if bytes.len() as u64 > MOST_JSON {
+        return Err(bad(format!("longer than {MOST_JSON} bytes")));
+    }
+    serde_json::from_slice(&bytes).map(Some).map_err(|e| bad(e.to_string()))
+}
+
+/// Writes JSON beside `path` and renames, so that nobody ever sees half of it.
+pub(crate) fn write_json(path: &Path, value: &impl Serialize) -> Result<(), HubError> {
+    let bad = |e: serde_json::Error| HubError::BadRecord { path: path.to_owned(), reason: e.to_string() };
+    let mut bytes = serde_json::to_vec_pretty(value).map_err(bad)?;
+    bytes.push(b'\n');
+    let part = path.with_extension("json.part");
+    let written = fs::File::create(&part)
+        .and_then(|mut file| file.write_all(&bytes).and_then(|()| file.sync_all()))
+        .and_then(|()| fs::rename(&part, path));
+    written.map_err(HubError::io("write", path))
+}
+
+pub(crate) fn make_folder(folder: &Path) -> Result<(), HubError> {
+    fs::create_dir_all(folder).map_err(HubError::io("create", folder))
+}
+
+/// The record of a checkpoint whose files are `files`.
+pub(crate) fn record_of(
+    checkpoint: &Checkpoint,
+    source: String,
+    revision: Option<String>,
+    added: &str,
+    files: Vec<RecordedFile>,
+) -> Record {
+    Record {
+        schema: RECORD_SCHEMA.to_owned(),
+        name: checkpoint.name.to_owned(),
+        source,
+        revision,
+        licence: checkpoint.licence.spdx().to_owned(),
+        added: added.to_owned(),
+        files,
+    }
+}
+
+/// The `config.json` that names an architecture, for weights that came without one.
+pub(crate) fn minimal_config(checkpoint: &Checkpoint) -> String {
+    format!("{{\"model_name\": {:?}}}\n", checkpoint.architecture)
+}
+
+/// What a folder of weights seems to be: the official checkpoint with weights of that length, and its licence.
+///
+/// Weights trained further have the length, and mostly the licence, of what they were trained from.
+pub fn official_licence(folder: &Path) -> Option<Licence> {
+    let bytes = fs::metadata(folder.join(WEIGHTS)).ok()?.len();
+    crate::catalogue::of_size(bytes).map(|c| c.licence).next()
+}
