@@ -1,5 +1,6 @@
 //! Visual-inertial odometry: images and IMU samples in, metric states, keyframes and covariance out.
 
+pub mod frontend;
 pub mod system;
 
 pub use system::{

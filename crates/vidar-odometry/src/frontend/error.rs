@@ -1,0 +1,31 @@
+//! What the front end cannot do. A track that is lost is an outcome, not an error.
+
+use thiserror::Error;
+
+/// Why the front end refused its input.
+#[derive(Clone, Debug, PartialEq, Error)]
+#[non_exhaustive]
+pub enum FrontendError {
+    /// An image is not of the size that the buffers were made for.
+    #[error("image is {found_width}x{found_height}, the front end was made for {width}x{height}")]
+    SizeMismatch {
+        /// Columns expected.
+        width: usize,
+        /// Rows expected.
+        height: usize,
+        /// Columns found.
+        found_width: usize,
+        /// Rows found.
+        found_height: usize,
+    },
+    /// A key of the configuration is outside its domain.
+    #[error("frontend.{key}: expected {expected}, found {found}")]
+    BadConfig {
+        /// Which key.
+        key: &'static str,
+        /// Its domain.
+        expected: &'static str,
+        /// The value found.
+        found: f64,
+    },
+}

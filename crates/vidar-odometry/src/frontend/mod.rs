@@ -1,0 +1,35 @@
+//! The visual front end: from images to measured pixels with covariances.
+//!
+//! Semi-direct, after Forster et al., "SVO: Semidirect Visual Odometry for Monocular and Multicamera Systems", T-RO 2017:
+//!
+//! 1. [`Pyramid`]: the image at several resolutions.
+//! 2. [`ImageAligner`]: where the camera is, by sparse image alignment against the last keyframe and the last frame,
+//!    starting from what the gyroscope says. It predicts; nothing of it is kept as a measurement.
+//! 3. [`Warp`], [`Template`], [`align_feature`]: each landmark is measured against its **keyframe's** patch, so that errors do
+//!    not add up from frame to frame, with a covariance per measurement.
+//! 4. [`Detector`]: new features of a keyframe in the cells of an [`OccupancyGrid`] that no landmark holds.
+//!
+//! Every stage is a plain function or an object that owns nothing but buffers; the map, the states and the decisions are the
+//! caller's. Results do not depend on threads, and vector instructions give the bits that scalar code gives.
+
+mod config;
+mod detect;
+mod error;
+mod feature;
+mod feature_alignment;
+mod image_alignment;
+mod patch;
+mod pyramid;
+mod simd;
+mod template;
+
+pub use config::{DetectorConfig, FrontendConfig, ImageAlignmentConfig, MatchingConfig, PyramidConfig};
+pub use detect::{Detection, Detector, OccupancyGrid};
+pub use error::FrontendError;
+pub use feature::{Feature, FeatureKind, PixelMeasurement};
+pub use feature_alignment::{AlignedFeature, MatchFailure, align_feature};
+pub use image_alignment::{
+    AlignmentPoint, AlignmentReference, ImageAligner, ImageAlignment, MotionPrediction,
+};
+pub use pyramid::{Pyramid, from_level, level_scale, to_level};
+pub use template::{Template, Warp};
