@@ -1,0 +1,160 @@
+//! How to compute: the kernel set and the precision of matrix products.
+
+use std::fmt;
+use std::str::FromStr;
+
+use serde::{Deserialize, Serialize};
+
+use crate::error::NnError;
+
+/// How matrix products are computed. Inputs, outputs, accumulators and everything that is no matrix product are `f32`.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Precision {
+    /// Factors in `f32`.
+    #[default]
+    F32,
+    /// Factors split into two bf16 parts, three bf16 products: close to `f32`, and faster where bf16 tiles exist.
+    /// Kernel sets whose bf16 rate is below three times their `f32` rate compute it in `f32`.
+    F32Split,
+    /// Factors rounded to bf16 where the processor multiplies bf16; elsewhere `f32`, which is then as fast.
+    Bf16,
+    /// Weights rounded to f16, activations and arithmetic in `f32`.
+    F16,
+}
+
+impl Precision {
+    /// All precisions, most exact first.
+    pub const ALL: [Self; 4] = [Self::F32, Self::F32Split, Self::F16, Self::Bf16];
+
+    /// The word used in configuration and on the command line.
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::F32 => "f32",
+            Self::F32Split => "f32-split",
+            Self::Bf16 => "bf16",
+            Self::F16 => "f16",
+        }
+    }
+}
+
+impl fmt::Display for Precision {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(self.name())
+    }
+}
+
+impl FromStr for Precision {
+    type Err = NnError;
+    fn from_str(word: &str) -> Result<Self, NnError> {
+        Self::ALL.into_iter().find(|p| p.name() == word).ok_or_else(|| NnError::UnknownName {
+            what: "precision",
+            found: word.to_owned(),
+            expected: "f32, f32-split, f16, bf16",
+        })
+    }
+}
+
+/// A set of kernels. [`Isa::detect`] gives the best one here; the others can be forced for tests and comparisons.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Isa {
+    /// Plain Rust that the compiler vectorises for the baseline of the target.
+    Portable,
+    /// x86-64 with AVX2 and FMA.
+    Avx2,
+    /// x86-64 with AVX-512 (F, BW, DQ, VL); bf16 products where the processor also has AVX-512-BF16.
+    Avx512,
+    /// [`Isa::Avx512`] plus bf16 matrix tiles (AMX).
+    Amx,
+    /// 64-bit ARM.
+    Neon,
+}
+
+impl Isa {
+    /// All kernel sets, whether they run here or not.
+    pub const ALL: [Self; 5] = [Self::Portable, Self::Avx2, Self::Avx512, Self::Amx, Self::Neon];
+
+    /// The word used in configuration and on the command line.
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Portable => "portable",
+            Self::Avx2 => "avx2",
+            Self::Avx512 => "avx512",
+            Self::Amx => "amx",
+            Self::Neon => "neon",
+        }
+    }
+
+    /// The kernel sets that run on this machine, slowest first; never empty.
+    pub fn available() -> Vec<Self> {
+        Self::ALL.into_iter().filter(|isa| crate::kernels::is_available(*isa)).collect()
+    }
+
+    /// The fastest kernel set of this machine.
+    pub fn detect() -> Self {
+        Self::available().pop().unwrap_or(Self::Portable)
+    }
+}
+
+impl fmt::Display for Isa {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(self.name())
+    }
+}
+
+impl FromStr for Isa {
+    type Err = NnError;
+    fn from_str(word: &str) -> Result<Self, NnError> {
+        Self::ALL.into_iter().find(|isa| isa.name() == word).ok_or_else(|| NnError::UnknownName {
+            what: "kernel set",
+            found: word.to_owned(),
+            expected: "portable, avx2, avx512, amx, neon",
+        })
+    }
+}
+
+/// Where and how to compute; cheap to copy and given to every operation.
+///
+/// Operations use the rayon pool they are called in and give the same bits for any number of threads. The kernel set is
+/// known to run here: it can only be built through [`Compute::new`] and [`Compute::with_isa`].
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Compute {
+    isa: Isa,
+    precision: Precision,
+}
+
+impl Compute {
+    /// The best kernel set of this machine at the given precision.
+    pub fn new(precision: Precision) -> Self {
+        Self { isa: Isa::detect(), precision }
+    }
+
+    /// A chosen kernel set.
+    ///
+    /// # Errors
+    /// [`NnError::IsaUnavailable`] when it does not run on this machine.
+    pub fn with_isa(isa: Isa, precision: Precision) -> Result<Self, NnError> {
+        if crate::kernels::is_available(isa) {
+            return Ok(Self { isa, precision });
+        }
+        let names: Vec<&str> = Isa::available().into_iter().map(Isa::name).collect();
+        Err(NnError::IsaUnavailable { asked: isa, available: names.join(", ") })
+    }
+
+    /// The same kernel set at another precision (the heads of DA3 may be more exact than its backbone).
+    #[must_use]
+    pub const fn at(self, precision: Precision) -> Self {
+        Self { isa: self.isa, precision }
+    }
+
+    /// The kernel set.
+    pub const fn isa(&self) -> Isa {
+        self.isa
+    }
+
+    /// The precision of matrix products.
+    pub const fn precision(&self) -> Precision {
+        self.precision
+    }
+}
