@@ -1,0 +1,79 @@
+//! What can be set about the smoother.
+
+use serde::{Deserialize, Serialize};
+
+/// Settings of the fixed-lag smoother.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
+#[serde(default, deny_unknown_fields)]
+pub struct SmootherConfig {
+    /// Most frames held at once, keyframes and recent ones, 4…40. Time grows with its square to cube.
+    pub max_frames: usize,
+    /// Residual (in standard deviations) from which an observation pulls only linearly, 0.5…10.
+    pub huber_sigmas: f64,
+    /// Squared whitened residual (2 degrees of freedom) beyond which an observation is told as an outlier, 4…100.
+    /// 9.2 is 99 %.
+    pub outlier_chi2: f64,
+    /// Keyframes whose observations a landmark keeps when its host leaves and it lives on with a newer host, 1…20.
+    /// What is older goes into the prior.
+    pub rehost_keyframes: usize,
+    /// Whether states in the prior keep the linearisation point of their first use (FEJ). Off only for ablation.
+    pub first_estimates: bool,
+    /// Whether the rotation of the camera on the body is estimated, starting from the given one.
+    pub estimate_camera_rotation: bool,
+    /// Whether the position of the camera on the body is estimated. Needs rotation about two axes.
+    pub estimate_camera_position: bool,
+    /// Whether the offset between camera and IMU clocks is estimated. Needs pixel velocities with observations.
+    pub estimate_time_offset: bool,
+    /// Standard deviation of the given camera rotation, degrees, 0.01…10.
+    pub camera_rotation_sigma_deg: f64,
+    /// Standard deviation of the given camera position, metres, 0.0001…0.5.
+    pub camera_position_sigma_m: f64,
+    /// Standard deviation of the given clock offset, milliseconds, 0.01…100.
+    pub time_offset_sigma_ms: f64,
+}
+
+impl Default for SmootherConfig {
+    fn default() -> Self {
+        Self {
+            max_frames: 16,
+            huber_sigmas: 1.345,
+            outlier_chi2: 9.2,
+            rehost_keyframes: 3,
+            first_estimates: true,
+            estimate_camera_rotation: false,
+            estimate_camera_position: false,
+            estimate_time_offset: false,
+            camera_rotation_sigma_deg: 0.5,
+            camera_position_sigma_m: 0.01,
+            time_offset_sigma_ms: 5.0,
+        }
+    }
+}
+
+impl SmootherConfig {
+    /// Checks every key against its range; the first that is outside is told with its range.
+    ///
+    /// # Errors
+    /// The key, its range and what was found.
+    pub fn validate(&self) -> Result<(), super::SmootherError> {
+        let ranges = [
+            ("max_frames", self.max_frames as f64, 4.0, 40.0),
+            ("huber_sigmas", self.huber_sigmas, 0.5, 10.0),
+            ("outlier_chi2", self.outlier_chi2, 4.0, 100.0),
+            ("rehost_keyframes", self.rehost_keyframes as f64, 1.0, 20.0),
+            ("camera_rotation_sigma_deg", self.camera_rotation_sigma_deg, 0.01, 10.0),
+            ("camera_position_sigma_m", self.camera_position_sigma_m, 1e-4, 0.5),
+            ("time_offset_sigma_ms", self.time_offset_sigma_ms, 0.01, 100.0),
+        ];
+        for (key, found, low, high) in ranges {
+            if !(low..=high).contains(&found) {
+                return Err(super::SmootherError::BadSetting { key, low, high, found });
+            }
+        }
+        Ok(())
+    }
+
+    pub(crate) fn calibrates(&self) -> bool {
+        self.estimate_camera_rotation || self.estimate_camera_position || self.estimate_time_offset
+    }
+}

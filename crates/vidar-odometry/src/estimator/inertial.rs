@@ -1,0 +1,203 @@
+//! Inertial factors: preintegrated motion between neighbouring frames, standstill, and the anchor of the first frame.
+
+use crate::imu::{Matrix15, NavState, Preintegration, Vector15, gravity, hat};
+use nalgebra::{Matrix3, SMatrix, Vector3};
+use serde::{Deserialize, Serialize};
+use vidar_core::{LieGroup, So3};
+
+pub(crate) type Matrix9 = SMatrix<f64, 9, 9>;
+
+/// Whitening of the inertial factor: the inverse Cholesky factor of the 9×9 covariance and the weights of the walks.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Whitening {
+    pub(crate) motion: Matrix9,
+    pub(crate) gyro_walk: f64,
+    pub(crate) accel_walk: f64,
+}
+
+impl Whitening {
+    pub(crate) fn of(readings: &Preintegration) -> Self {
+        let model = readings.model();
+        let root_t = readings.secs().max(1e-9).sqrt();
+        // A floor keeps exact test data and empty stretches invertible.
+        let mut covariance = *readings.covariance();
+        for k in 0..9 {
+            covariance[(k, k)] += 1e-18;
+        }
+        let motion = covariance
+            .cholesky()
+            .and_then(|c| c.l().try_inverse())
+            .unwrap_or_else(|| Matrix9::identity() * 1e-3);
+        Self {
+            motion,
+            gyro_walk: 1.0 / (model.gyro_walk * root_t),
+            accel_walk: 1.0 / (model.accel_walk * root_t),
+        }
+    }
+
+    /// Whitens 15 rows of any width in place: rotation, position, velocity, gyroscope and accelerometer bias.
+    pub(crate) fn apply<const C: usize>(&self, rows: &SMatrix<f64, 15, C>) -> SMatrix<f64, 15, C> {
+        let mut out = SMatrix::<f64, 15, C>::zeros();
+        out.fixed_view_mut::<9, C>(0, 0).copy_from(&(self.motion * rows.fixed_view::<9, C>(0, 0)));
+        out.fixed_view_mut::<3, C>(9, 0).copy_from(&(rows.fixed_view::<3, C>(9, 0) * self.gyro_walk));
+        out.fixed_view_mut::<3, C>(12, 0).copy_from(&(rows.fixed_view::<3, C>(12, 0) * self.accel_walk));
+        out
+    }
+}
+
+/// Residual between two states, in the order of the error state:
+/// `r_θ = Log(ΔR(b)ᵀ R_iᵀ R_j)`, `r_p = R_iᵀ(p_j − p_i − v_i t − ½ g t²) − Δp(b)`,
+/// `r_v = R_iᵀ(v_j − v_i − g t) − Δv(b)`, `r_b = b_j − b_i` (Forster 2017, eq. 45).
+pub(crate) fn residual(readings: &Preintegration, i: &NavState, j: &NavState) -> Vector15 {
+    let t = readings.secs();
+    let (rotation, position, velocity) = readings.corrected(&i.bias);
+    let (from, to) = (&i.world_from_body, &j.world_from_body);
+    let back = from.rotation.inverse();
+    let turn = (rotation.inverse() * (back * to.rotation)).log();
+    let moved = back * (to.translation - from.translation - i.velocity * t - gravity() * (0.5 * t * t));
+    let sped = back * (j.velocity - i.velocity - gravity() * t);
+    let mut r = Vector15::zeros();
+    r.fixed_rows_mut::<3>(0).copy_from(&turn);
+    r.fixed_rows_mut::<3>(3).copy_from(&(moved - position));
+    r.fixed_rows_mut::<3>(6).copy_from(&(sped - velocity));
+    r.fixed_rows_mut::<3>(9).copy_from(&(j.bias.gyro - i.bias.gyro));
+    r.fixed_rows_mut::<3>(12).copy_from(&(j.bias.accel - i.bias.accel));
+    r
+}
+
+/// Derivatives of [`residual`] by the error states of both ends.
+pub(crate) fn jacobians(readings: &Preintegration, i: &NavState, j: &NavState) -> (Matrix15, Matrix15) {
+    let t = readings.secs();
+    let delta = &readings.delta;
+    let (rotation, ..) = readings.corrected(&i.bias);
+    let (from, to) = (&i.world_from_body, &j.world_from_body);
+    let back = from.rotation.inverse();
+    let back_m = back.matrix();
+    let turn = (rotation.inverse() * (back * to.rotation)).log();
+    let log_slope = So3::right_jacobian_inverse(&turn).unwrap_or_else(Matrix3::identity);
+    let d_gyro = i.bias.gyro - readings.bias().gyro;
+    let turn_by_gyro: Matrix3<f64> = delta.by_gyro_bias.fixed_view::<3, 3>(0, 0).into_owned();
+    let moved = back * (to.translation - from.translation - i.velocity * t - gravity() * (0.5 * t * t));
+    let sped = back * (j.velocity - i.velocity - gravity() * t);
+    let (mut by_i, mut by_j) = (Matrix15::zeros(), Matrix15::zeros());
+    let mut put = |m: &mut Matrix15, row: usize, col: usize, value: Matrix3<f64>| {
+        m.fixed_view_mut::<3, 3>(row, col).copy_from(&value);
+    };
+    put(&mut by_i, 0, 0, -log_slope * (to.rotation.inverse() * from.rotation).matrix());
+    put(
+        &mut by_i,
+        0,
+        9,
+        -log_slope
+            * So3::exp(&-turn).matrix()
+            * So3::right_jacobian(&(turn_by_gyro * d_gyro))
+            * turn_by_gyro,
+    );
+    put(&mut by_j, 0, 0, log_slope);
+    put(&mut by_i, 3, 0, hat(&moved));
+    put(&mut by_i, 3, 3, -back_m);
+    put(&mut by_i, 3, 6, back_m * -t);
+    put(&mut by_j, 3, 3, back_m);
+    put(&mut by_i, 6, 0, hat(&sped));
+    put(&mut by_i, 6, 6, -back_m);
+    put(&mut by_j, 6, 6, back_m);
+    for row in [3, 6] {
+        put(&mut by_i, row, 9, -delta.by_gyro_bias.fixed_view::<3, 3>(row, 0).into_owned());
+        put(&mut by_i, row, 12, -delta.by_accel_bias.fixed_view::<3, 3>(row, 0).into_owned());
+    }
+    for row in [9, 12] {
+        put(&mut by_i, row, row, -Matrix3::identity());
+        put(&mut by_j, row, row, Matrix3::identity());
+    }
+    (by_i, by_j)
+}
+
+/// Velocity in the body's axes, the residual of standstill, with its derivatives by rotation and velocity.
+/// The body's axes keep the factor blind to yaw.
+pub(crate) fn body_velocity(state: &NavState) -> (Vector3<f64>, Matrix3<f64>, Matrix3<f64>) {
+    let back = state.world_from_body.rotation.inverse();
+    let velocity = back * state.velocity;
+    (velocity, hat(&velocity), back.matrix())
+}
+
+/// What is known of the first state. `f64::INFINITY` says that nothing is.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct AnchorSigmas {
+    /// Position in the world, m per axis. Fixes the freedom of the world's origin.
+    pub position_m: f64,
+    /// Heading about the vertical, rad. Fixes the freedom of the world's heading.
+    pub yaw_rad: f64,
+    /// Inclination, rad per axis.
+    pub tilt_rad: f64,
+    /// Velocity, m/s per axis.
+    pub velocity_mps: f64,
+    /// Gyroscope bias, rad/s per axis.
+    pub gyro_bias: f64,
+    /// Accelerometer bias, m/s² per axis.
+    pub accel_bias: f64,
+}
+
+impl AnchorSigmas {
+    /// Origin and heading fixed, everything else as good as unknown; biases as MEMS parts have them.
+    pub const GAUGE: Self = Self {
+        position_m: 1e-3,
+        yaw_rad: 1e-3,
+        tilt_rad: f64::INFINITY,
+        velocity_mps: f64::INFINITY,
+        gyro_bias: 0.1,
+        accel_bias: 0.2,
+    };
+}
+
+/// The anchor's residual and derivative, whitened. Every row but position and yaw is blind to shifts and to yaw.
+pub(crate) fn anchor(reference: &NavState, sigmas: &AnchorSigmas, state: &NavState) -> (Vector15, SMatrix<f64, 15, 15>) {
+    anchor_at(reference, sigmas, state, state)
+}
+
+/// As [`anchor`], with the derivative at `at`.
+pub(crate) fn anchor_at(
+    reference: &NavState,
+    sigmas: &AnchorSigmas,
+    state: &NavState,
+    at: &NavState,
+) -> (Vector15, SMatrix<f64, 15, 15>) {
+    let weight = |sigma: f64| if sigma.is_finite() && sigma > 0.0 { 1.0 / sigma } else { 0.0 };
+    let up = Vector3::z();
+    let (mut r, mut j) = (Vector15::zeros(), Matrix15::zeros());
+    // Position, rows 0–2.
+    let w = weight(sigmas.position_m);
+    r.fixed_rows_mut::<3>(0)
+        .copy_from(&((state.world_from_body.translation - reference.world_from_body.translation) * w));
+    j.fixed_view_mut::<3, 3>(0, 3).copy_from(&(Matrix3::identity() * w));
+    // Yaw, row 3: vertical part of the rotation vector in the world.
+    let w = weight(sigmas.yaw_rad);
+    let turned = |s: &NavState| (s.world_from_body.rotation * reference.world_from_body.rotation.inverse()).log();
+    r[3] = up.dot(&turned(state)) * w;
+    let log_slope = So3::right_jacobian_inverse(&-turned(at)).unwrap_or_else(Matrix3::identity);
+    let yaw_row = up.transpose() * log_slope * at.world_from_body.rotation.matrix() * w;
+    j.fixed_view_mut::<1, 3>(3, 0).copy_from(&yaw_row);
+    // Inclination, rows 4–5: the vertical seen from the body.
+    let w = weight(sigmas.tilt_rad);
+    let vertical = |s: &NavState| s.world_from_body.rotation.inverse() * up;
+    let basis = super::visual::tangent_basis(&vertical(reference));
+    r.fixed_rows_mut::<2>(4).copy_from(&(basis.transpose() * vertical(state) * w));
+    j.fixed_view_mut::<2, 3>(4, 0).copy_from(&(basis.transpose() * hat(&vertical(at)) * w));
+    // Velocity in the body's axes, rows 6–8.
+    let w = weight(sigmas.velocity_mps);
+    let (velocity, ..) = body_velocity(state);
+    let (_, by_rotation, by_velocity) = body_velocity(at);
+    let (expected, ..) = body_velocity(reference);
+    r.fixed_rows_mut::<3>(6).copy_from(&((velocity - expected) * w));
+    j.fixed_view_mut::<3, 3>(6, 0).copy_from(&(by_rotation * w));
+    j.fixed_view_mut::<3, 3>(6, 6).copy_from(&(by_velocity * w));
+    // Biases, rows 9–14.
+    for (row, sigma, difference) in [
+        (9, sigmas.gyro_bias, state.bias.gyro - reference.bias.gyro),
+        (12, sigmas.accel_bias, state.bias.accel - reference.bias.accel),
+    ] {
+        let w = weight(sigma);
+        r.fixed_rows_mut::<3>(row).copy_from(&(difference * w));
+        j.fixed_view_mut::<3, 3>(row, row).copy_from(&(Matrix3::identity() * w));
+    }
+    (r, j)
+}

@@ -1,0 +1,515 @@
+//! Normal equations of the window: landmarks eliminated, motions first, then poses, then calibration.
+//!
+//! Velocities and biases couple only to their neighbours in time, so with them in front the Cholesky factor has long
+//! runs of leading zeros in their rows.
+
+use super::dense::Cholesky;
+use super::inertial::{anchor_at, body_velocity, jacobians, residual};
+use super::prior::Part;
+use super::visual::{self, CameraPlace};
+use super::window::{CALIBRATION_DIM, Landmark, Sighting};
+use super::{Smoother, SmootherConfig};
+use crate::imu::NavState;
+use nalgebra::{Matrix3, SMatrix, SVector, Vector2, Vector3};
+use vidar_core::{CameraModel, Se3};
+
+/// Whitened residual that a sighting which does not project counts as.
+const LOST_SIGMAS: f64 = 50.0;
+
+type ByCalibration = SMatrix<f64, 2, CALIBRATION_DIM>;
+
+/// A landmark's part in the last linearisation, for back substitution.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Eliminated {
+    pub(crate) slot: usize,
+    pub(crate) inverse: Matrix3<f64>,
+    pub(crate) gradient: Vector3<f64>,
+    pub(crate) cross_begin: usize,
+    pub(crate) cross_end: usize,
+    pub(crate) by_calibration: SMatrix<f64, CALIBRATION_DIM, 3>,
+}
+
+/// `J_poseᵀ J_landmark` of one frame.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Cross {
+    pub(crate) frame: usize,
+    pub(crate) value: SMatrix<f64, 6, 3>,
+}
+
+/// The system and everything that is needed to build and solve it without allocating.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct System {
+    pub(crate) frames: usize,
+    pub(crate) n: usize,
+    /// Lower triangle of `Jᵀ J`, row-major `n × n`.
+    pub(crate) h: Vec<f64>,
+    pub(crate) gradient: Vec<f64>,
+    pub(crate) first: Vec<usize>,
+    pub(crate) damping: Vec<f64>,
+    pub(crate) step: Vec<f64>,
+    pub(crate) cholesky: Cholesky,
+    /// Whether `cholesky` is of the undamped system at the present states.
+    pub(crate) factorised: bool,
+    pub(crate) places: Vec<CameraPlace>,
+    pub(crate) places_at: Vec<CameraPlace>,
+    pub(crate) states_at: Vec<NavState>,
+    pub(crate) eliminated: Vec<Eliminated>,
+    pub(crate) cross: Vec<Cross>,
+    pub(crate) saved: Vec<super::optimise::Saved>,
+    pub(crate) saved_landmarks: Vec<(usize, Vector3<f64>, f64)>,
+}
+
+impl System {
+    pub(crate) fn with_capacity(n: usize) -> Self {
+        Self {
+            h: Vec::with_capacity(n * n),
+            gradient: Vec::with_capacity(n),
+            first: Vec::with_capacity(n),
+            damping: Vec::with_capacity(n),
+            step: Vec::with_capacity(n),
+            cholesky: Cholesky::with_capacity(n),
+            eliminated: Vec::with_capacity(1024),
+            cross: Vec::with_capacity(16 * 1024),
+            saved: Vec::with_capacity(n / 15 + 1),
+            saved_landmarks: Vec::with_capacity(1024),
+            places: Vec::with_capacity(n / 15 + 1),
+            places_at: Vec::with_capacity(n / 15 + 1),
+            states_at: Vec::with_capacity(n / 15 + 1),
+            ..Self::default()
+        }
+    }
+
+    pub(crate) fn offset(&self, part: Part) -> usize {
+        match part {
+            Part::Motion(k) => 9 * k,
+            Part::Pose(k) => 9 * self.frames + 6 * k,
+            Part::Calibration => 15 * self.frames,
+        }
+    }
+
+    fn begin(&mut self, frames: usize, calibrates: bool) {
+        self.frames = frames;
+        self.n = 15 * frames + if calibrates { CALIBRATION_DIM } else { 0 };
+        let n = self.n;
+        self.h.clear();
+        self.h.resize(n * n, 0.0);
+        self.gradient.clear();
+        self.gradient.resize(n, 0.0);
+        self.first.clear();
+        self.first.extend((0..frames).flat_map(|k| [9 * k; 9]));
+        self.first.resize(15 * frames, 9 * frames);
+        self.first.resize(n, 0);
+        self.eliminated.clear();
+        self.cross.clear();
+        self.factorised = false;
+    }
+
+    /// Says that two parts share a factor.
+    fn couple(&mut self, a: Part, b: Part) {
+        let (a, b) = if self.offset(a) > self.offset(b) { (a, b) } else { (b, a) };
+        let (at, from) = (self.offset(a), self.offset(b));
+        for row in at..at + a.dim() {
+            self.first[row] = self.first[row].min(from);
+        }
+    }
+
+    /// Adds a block at (`row`, `col`), `row ≥ col`; of diagonal blocks the upper half is ignored later.
+    fn add<const R: usize, const C: usize>(&mut self, row: usize, col: usize, block: &SMatrix<f64, R, C>, sign: f64) {
+        for i in 0..R {
+            let target = &mut self.h[(row + i) * self.n + col..(row + i) * self.n + col + C];
+            for j in 0..C {
+                target[j] += sign * block[(i, j)];
+            }
+        }
+    }
+
+    /// As `add`, for a block that may lie above the diagonal.
+    fn add_either<const R: usize, const C: usize>(
+        &mut self,
+        row: usize,
+        col: usize,
+        block: &SMatrix<f64, R, C>,
+        sign: f64,
+    ) {
+        if row >= col {
+            self.add(row, col, block, sign);
+        } else {
+            self.add(col, row, &block.transpose(), sign);
+        }
+    }
+
+    fn add_gradient<const N: usize>(&mut self, at: usize, value: &SVector<f64, N>, sign: f64) {
+        for (g, v) in self.gradient[at..at + N].iter_mut().zip(value.iter()) {
+            *g += sign * v;
+        }
+    }
+}
+
+/// One sighting, whitened, weighted and differentiated.
+pub(crate) struct WeightedSighting {
+    pub(crate) residual: Vector2<f64>,
+    pub(crate) jacobians: visual::VisualJacobians,
+    pub(crate) by_calibration: Option<ByCalibration>,
+}
+
+/// What sightings need to know beside themselves.
+pub(crate) struct Scene<'a> {
+    pub(crate) camera: &'a CameraModel,
+    pub(crate) config: &'a SmootherConfig,
+    pub(crate) places: &'a [CameraPlace],
+    pub(crate) places_at: &'a [CameraPlace],
+    pub(crate) time_offset_secs: f64,
+}
+
+impl Scene<'_> {
+    fn huber(&self, chi2: f64) -> (f64, f64) {
+        let k = self.config.huber_sigmas;
+        if chi2 <= k * k {
+            (1.0, 0.5 * chi2)
+        } else {
+            let norm = chi2.sqrt();
+            (k / norm, k * (norm - 0.5 * k))
+        }
+    }
+
+    /// Whitened residual of a sighting, `None` if it does not project.
+    fn residual(&self, landmark: &Landmark, s: &Sighting) -> Option<Vector2<f64>> {
+        let (host, target) = (&self.places[landmark.host.frame], &self.places[s.frame]);
+        let q = visual::direction(host, target, &landmark.bearing, landmark.rho);
+        let pixel = self.camera.project(&q)?;
+        Some(s.whitening * (pixel - s.pixel - s.pixel_velocity * self.time_offset_secs))
+    }
+
+    /// Evaluates a sighting: stores its χ², returns its cost and, if it projects, what the system needs.
+    pub(crate) fn sighting(&self, landmark: &Landmark, s: &mut Sighting) -> (f64, Option<WeightedSighting>) {
+        let (host, target) = (&self.places_at[landmark.host.frame], &self.places_at[s.frame]);
+        let lost = self.huber(LOST_SIGMAS * LOST_SIGMAS).1;
+        let jacobians = visual::jacobians(self.camera, host, target, &landmark.bearing, landmark.rho);
+        let (Some(residual), Some(mut jacobians)) = (self.residual(landmark, s), jacobians) else {
+            s.chi2 = LOST_SIGMAS * LOST_SIGMAS;
+            return (lost, None);
+        };
+        s.chi2 = residual.norm_squared();
+        let (weight, cost) = self.huber(s.chi2);
+        let whiten = s.whitening * weight.sqrt();
+        jacobians.by_host = whiten * jacobians.by_host;
+        jacobians.by_target = whiten * jacobians.by_target;
+        jacobians.by_landmark = whiten * jacobians.by_landmark;
+        let by_calibration = self.config.calibrates().then(|| {
+            let by_place = visual::by_body_from_camera(self.camera, host, target, &landmark.bearing, landmark.rho)
+                .unwrap_or_else(SMatrix::zeros);
+            whiten * calibration_columns(self.config, &by_place, &s.pixel_velocity)
+        });
+        (cost, Some(WeightedSighting { residual: residual * weight.sqrt(), jacobians, by_calibration }))
+    }
+
+    /// The host's own sighting: it fixes the bearing (and the clock) only.
+    pub(crate) fn host(&self, landmark: &mut Landmark) -> Option<(f64, WeightedSighting)> {
+        let (pixel, by_direction) = self.camera.project_with_jacobian(&landmark.bearing)?;
+        let s = &mut landmark.host;
+        let residual = s.whitening * (pixel - s.pixel - s.pixel_velocity * self.time_offset_secs);
+        s.chi2 = residual.norm_squared();
+        let mut by_landmark = SMatrix::<f64, 2, 3>::zeros();
+        let by_bearing = s.whitening * by_direction * visual::tangent_basis(&landmark.bearing);
+        by_landmark.fixed_view_mut::<2, 2>(0, 0).copy_from(&by_bearing);
+        let zero = SMatrix::zeros();
+        let by_calibration = self
+            .config
+            .calibrates()
+            .then(|| s.whitening * calibration_columns(self.config, &SMatrix::zeros(), &s.pixel_velocity));
+        let jacobians = visual::VisualJacobians { by_host: zero, by_target: zero, by_landmark };
+        Some((0.5 * s.chi2, WeightedSighting { residual, jacobians, by_calibration }))
+    }
+}
+
+fn calibration_columns(
+    config: &SmootherConfig,
+    by_place: &SMatrix<f64, 2, 6>,
+    pixel_velocity: &Vector2<f64>,
+) -> ByCalibration {
+    let mut out = ByCalibration::zeros();
+    if config.estimate_camera_rotation {
+        out.fixed_view_mut::<2, 3>(0, 0).copy_from(&by_place.fixed_view::<2, 3>(0, 0));
+    }
+    if config.estimate_camera_position {
+        out.fixed_view_mut::<2, 3>(0, 3).copy_from(&by_place.fixed_view::<2, 3>(0, 3));
+    }
+    if config.estimate_time_offset {
+        out.fixed_view_mut::<2, 1>(0, 6).copy_from(&-pixel_velocity);
+    }
+    out
+}
+
+/// Inverse standard deviations of the calibration's own prior; 0 for what is not estimated.
+pub(crate) fn calibration_weights(config: &SmootherConfig) -> [f64; CALIBRATION_DIM] {
+    let rotation = 1.0 / config.camera_rotation_sigma_deg.to_radians();
+    let position = 1.0 / config.camera_position_sigma_m;
+    let clock = 1.0 / (config.time_offset_sigma_ms * 1e-3);
+    let on = |yes: bool, w: f64| if yes { w } else { 0.0 };
+    let r = on(config.estimate_camera_rotation, rotation);
+    let p = on(config.estimate_camera_position, position);
+    [r, r, r, p, p, p, on(config.estimate_time_offset, clock)]
+}
+
+impl Smoother {
+    /// Fills places and linearisation points of all frames.
+    pub(crate) fn place_cameras(&self, system: &mut System) {
+        let fej = self.config.first_estimates;
+        let (now, at) = (self.calibration.body_from_camera, self.calibration.at(fej));
+        system.places.clear();
+        system.places_at.clear();
+        system.states_at.clear();
+        for frame in &self.frames {
+            let state_at = frame.at(fej);
+            system.places.push(CameraPlace::new(&frame.state.world_from_body, &now));
+            system.places_at.push(CameraPlace::new(&state_at.world_from_body, &at));
+            system.states_at.push(state_at);
+        }
+    }
+
+    /// Builds the system at the present states and returns the robust cost.
+    pub(crate) fn linearise(&mut self, system: &mut System, lambda: f64) -> f64 {
+        system.begin(self.frames.len(), self.config.calibrates());
+        self.place_cameras(system);
+        let mut cost = self.add_prior(system);
+        cost += self.add_anchor(system);
+        for k in 0..self.frames.len() {
+            cost += self.add_link(system, k);
+            cost += self.add_standstill_factor(system, k);
+        }
+        if self.config.calibrates() {
+            cost += self.add_calibration(system);
+        }
+        cost += self.add_landmarks(system, lambda);
+        // Unknowns without any factor stay where they are.
+        for i in 0..system.n {
+            if system.h[i * system.n + i] <= 0.0 {
+                system.h[i * system.n + i] = 1.0;
+            }
+        }
+        cost
+    }
+
+    fn add_prior(&mut self, system: &mut System) -> f64 {
+        let cost = self.prior.evaluate(&self.frames, &self.calibration);
+        let prior = &self.prior;
+        for (a, &part_a) in prior.parts.iter().enumerate() {
+            let row = system.offset(part_a);
+            if row >= system.n {
+                continue;
+            }
+            for i in 0..part_a.dim() {
+                system.gradient[row + i] += prior.gradient[prior.starts[a] + i];
+            }
+            for (b, &part_b) in prior.parts.iter().enumerate() {
+                let col = system.offset(part_b);
+                if col > row || col >= system.n {
+                    continue;
+                }
+                system.couple(part_a, part_b);
+                for i in 0..part_a.dim() {
+                    let from = (prior.starts[a] + i) * prior.dim + prior.starts[b];
+                    let to = (row + i) * system.n + col;
+                    let source = &prior.information[from..from + part_b.dim()];
+                    for (target, value) in system.h[to..to + part_b.dim()].iter_mut().zip(source) {
+                        *target += value;
+                    }
+                }
+            }
+        }
+        cost
+    }
+
+    fn add_anchor(&self, system: &mut System) -> f64 {
+        let Some(anchor) = &self.anchor else { return 0.0 };
+        let k = anchor.frame;
+        let (r, j) =
+            anchor_at(&anchor.reference, &anchor.sigmas, &self.frames[k].state, &system.states_at[k]);
+        let (pose, motion) = (Part::Pose(k), Part::Motion(k));
+        let (jp, jm) = (j.fixed_columns::<6>(0).into_owned(), j.fixed_columns::<9>(6).into_owned());
+        let (at_pose, at_motion) = (system.offset(pose), system.offset(motion));
+        system.couple(pose, motion);
+        system.add(at_motion, at_motion, &(jm.transpose() * jm), 1.0);
+        system.add(at_pose, at_motion, &(jp.transpose() * jm), 1.0);
+        system.add(at_pose, at_pose, &(jp.transpose() * jp), 1.0);
+        system.add_gradient(at_motion, &(jm.transpose() * r), 1.0);
+        system.add_gradient(at_pose, &(jp.transpose() * r), 1.0);
+        0.5 * r.norm_squared()
+    }
+
+    fn add_link(&mut self, system: &mut System, k: usize) -> f64 {
+        if k == 0 {
+            return 0.0;
+        }
+        let (before, rest) = self.frames.split_at_mut(k);
+        let (from, to) = (&before[k - 1], &mut rest[0]);
+        let Some(link) = &mut to.link else { return 0.0 };
+        link.follow(&from.state);
+        let r = link.whitening.apply(&residual(&link.readings, &from.state, &to.state));
+        let (ji, jj) = jacobians(&link.readings, &system.states_at[k - 1], &system.states_at[k]);
+        let (ji, jj) = (link.whitening.apply(&ji), link.whitening.apply(&jj));
+        let parts = [Part::Motion(k - 1), Part::Motion(k), Part::Pose(k - 1), Part::Pose(k)];
+        for a in 0..4 {
+            for b in 0..a {
+                system.couple(parts[a], parts[b]);
+            }
+        }
+        let [mi, mj, pi, pj] = parts.map(|p| system.offset(p));
+        let (ii, ji_t) = (ji.transpose() * ji, jj.transpose() * ji);
+        let jj_t = jj.transpose() * jj;
+        for (square, m, p) in [(&ii, mi, pi), (&jj_t, mj, pj)] {
+            system.add(m, m, &square.fixed_view::<9, 9>(6, 6).into_owned(), 1.0);
+            system.add(p, m, &square.fixed_view::<6, 9>(0, 6).into_owned(), 1.0);
+            system.add(p, p, &square.fixed_view::<6, 6>(0, 0).into_owned(), 1.0);
+        }
+        system.add(mj, mi, &ji_t.fixed_view::<9, 9>(6, 6).into_owned(), 1.0);
+        system.add(pj, mi, &ji_t.fixed_view::<6, 9>(0, 6).into_owned(), 1.0);
+        system.add(pi, mj, &ji_t.fixed_view::<9, 6>(6, 0).transpose(), 1.0);
+        system.add(pj, pi, &ji_t.fixed_view::<6, 6>(0, 0).into_owned(), 1.0);
+        for (j, m, p) in [(&ji, mi, pi), (&jj, mj, pj)] {
+            let g = j.transpose() * r;
+            system.add_gradient(m, &g.fixed_rows::<9>(6).into_owned(), 1.0);
+            system.add_gradient(p, &g.fixed_rows::<6>(0).into_owned(), 1.0);
+        }
+        0.5 * r.norm_squared()
+    }
+
+    fn add_standstill_factor(&self, system: &mut System, k: usize) -> f64 {
+        let Some(sigma) = self.frames[k].standstill_sigma else { return 0.0 };
+        let weight = 1.0 / sigma;
+        let r = body_velocity(&self.frames[k].state).0 * weight;
+        let (_, by_rotation, by_velocity) = body_velocity(&system.states_at[k]);
+        let (jr, jv) = (by_rotation * weight, by_velocity * weight);
+        let (pose, motion) = (Part::Pose(k), Part::Motion(k));
+        let (p, m) = (system.offset(pose), system.offset(motion));
+        system.couple(pose, motion);
+        system.add(m, m, &(jv.transpose() * jv), 1.0);
+        system.add(p, m, &(jr.transpose() * jv), 1.0);
+        system.add(p, p, &(jr.transpose() * jr), 1.0);
+        system.add_gradient(m, &(jv.transpose() * r), 1.0);
+        system.add_gradient(p, &(jr.transpose() * r), 1.0);
+        0.5 * r.norm_squared()
+    }
+
+    /// The calibration's own prior, until it is part of the window's.
+    fn add_calibration(&self, system: &mut System) -> f64 {
+        if self.calibration.in_prior {
+            return 0.0;
+        }
+        let weights = calibration_weights(&self.config);
+        let difference = self.calibration.minus_given();
+        let at = system.offset(Part::Calibration);
+        let mut cost = 0.0;
+        for k in 0..CALIBRATION_DIM {
+            let r = weights[k] * difference[k];
+            cost += 0.5 * r * r;
+            system.h[(at + k) * system.n + at + k] += weights[k] * weights[k];
+            system.gradient[at + k] += weights[k] * r;
+        }
+        cost
+    }
+
+    fn add_landmarks(&mut self, system: &mut System, lambda: f64) -> f64 {
+        let places = std::mem::take(&mut system.places);
+        let places_at = std::mem::take(&mut system.places_at);
+        let scene = Scene {
+            camera: &self.camera,
+            config: &self.config,
+            places: &places,
+            places_at: &places_at,
+            time_offset_secs: self.calibration.time_offset_secs,
+        };
+        let mut cost = 0.0;
+        for (slot, landmark) in self.landmarks.iter_mut().enumerate() {
+            if landmark.alive && !landmark.sightings.is_empty() {
+                cost += add_landmark(system, &scene, landmark, slot, lambda);
+            }
+        }
+        system.places = places;
+        system.places_at = places_at;
+        cost
+    }
+}
+
+fn add_landmark(system: &mut System, scene: &Scene<'_>, landmark: &mut Landmark, slot: usize, lambda: f64) -> f64 {
+    let Some((mut cost, own)) = scene.host(landmark) else { return 0.0 };
+    let calibrates = scene.config.calibrates();
+    let at_calibration = system.offset(Part::Calibration);
+    let host = landmark.host.frame;
+    let at_host = system.offset(Part::Pose(host));
+    let mut square = own.jacobians.by_landmark.transpose() * own.jacobians.by_landmark;
+    let mut gradient = own.jacobians.by_landmark.transpose() * own.residual;
+    let mut host_square = SMatrix::<f64, 6, 6>::zeros();
+    let mut host_gradient = SVector::<f64, 6>::zeros();
+    let mut by_calibration = SMatrix::<f64, CALIBRATION_DIM, 3>::zeros();
+    if let Some(c) = &own.by_calibration {
+        by_calibration += c.transpose() * own.jacobians.by_landmark;
+        system.add(at_calibration, at_calibration, &(c.transpose() * c), 1.0);
+        system.add_gradient(at_calibration, &(c.transpose() * own.residual), 1.0);
+    }
+    let cross_begin = system.cross.len();
+    system.cross.push(Cross { frame: host, value: SMatrix::zeros() });
+    let mut sightings = std::mem::take(&mut landmark.sightings);
+    for s in &mut sightings {
+        let (part, weighted) = scene.sighting(landmark, s);
+        cost += part;
+        let Some(WeightedSighting { residual: r, jacobians: j, by_calibration: c }) = weighted else { continue };
+        let target = system.offset(Part::Pose(s.frame));
+        host_square += j.by_host.transpose() * j.by_host;
+        host_gradient += j.by_host.transpose() * r;
+        system.add(target, target, &(j.by_target.transpose() * j.by_target), 1.0);
+        system.add_either(target, at_host, &(j.by_target.transpose() * j.by_host), 1.0);
+        system.add_gradient(target, &(j.by_target.transpose() * r), 1.0);
+        square += j.by_landmark.transpose() * j.by_landmark;
+        gradient += j.by_landmark.transpose() * r;
+        system.cross[cross_begin].value += j.by_host.transpose() * j.by_landmark;
+        system.cross.push(Cross { frame: s.frame, value: j.by_target.transpose() * j.by_landmark });
+        if let Some(c) = c {
+            by_calibration += c.transpose() * j.by_landmark;
+            system.add(at_calibration, at_calibration, &(c.transpose() * c), 1.0);
+            system.add(at_calibration, at_host, &(c.transpose() * j.by_host), 1.0);
+            system.add(at_calibration, target, &(c.transpose() * j.by_target), 1.0);
+            system.add_gradient(at_calibration, &(c.transpose() * r), 1.0);
+        }
+    }
+    landmark.sightings = sightings;
+    system.add(at_host, at_host, &host_square, 1.0);
+    system.add_gradient(at_host, &host_gradient, 1.0);
+    let mut damped = square;
+    for k in 0..3 {
+        damped[(k, k)] += lambda * square[(k, k)] + 1e-12;
+    }
+    let Some(inverse) = damped.try_inverse() else {
+        system.cross.truncate(cross_begin);
+        return cost;
+    };
+    landmark.rho_sigma = inverse[(2, 2)].max(0.0).sqrt();
+    // Schur complement: H −= W V⁻¹ Wᵀ, g −= W V⁻¹ g_l.
+    let cross_end = system.cross.len();
+    for a in cross_begin..cross_end {
+        let Cross { frame, value } = system.cross[a];
+        let weighted = value * inverse;
+        let row = system.offset(Part::Pose(frame));
+        system.add_gradient(row, &(weighted * gradient), -1.0);
+        for b in cross_begin..=a {
+            let other = system.cross[b];
+            let col = system.offset(Part::Pose(other.frame));
+            system.add_either(row, col, &(weighted * other.value.transpose()), -1.0);
+        }
+        if calibrates {
+            system.add(at_calibration, row, &(by_calibration * weighted.transpose()), -1.0);
+        }
+    }
+    if calibrates {
+        let weighted = by_calibration * inverse;
+        system.add(at_calibration, at_calibration, &(weighted * by_calibration.transpose()), -1.0);
+        system.add_gradient(at_calibration, &(weighted * gradient), -1.0);
+    }
+    system.eliminated.push(Eliminated { slot, inverse, gradient, cross_begin, cross_end, by_calibration });
+    cost
+}
+
+/// The camera's place on the body at which derivatives are taken.
+pub(crate) fn camera_place_at(smoother: &Smoother) -> Se3 {
+    smoother.calibration.at(smoother.config.first_estimates)
+}

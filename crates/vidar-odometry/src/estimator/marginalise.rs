@@ -1,0 +1,476 @@
+//! Frames that leave the window.
+//!
+//! A frame that is marginalised hands over everything that is said of it: readings on both sides, the anchor, the prior,
+//! and the landmarks that it hosts. Every landmark's rows lose their landmark by three Householder steps, what is left is
+//! stacked with the rest, and a QR of the stack with the frame's columns in front leaves the new prior below them.
+//!
+//! A landmark that is still seen lives on with a newer keyframe as its host: its older sightings go into the prior,
+//! its newer ones stay, and none is used twice.
+
+use super::dense::Tall;
+use super::inertial::{anchor_at, body_velocity, jacobians, residual};
+use super::linearise::{Scene, System, calibration_weights};
+use super::prior::Part;
+use super::visual;
+use super::window::{CALIBRATION_DIM, Landmark, MAX_INVERSE_DISTANCE, MIN_INVERSE_DISTANCE, Sighting};
+use super::{Smoother, SmootherError};
+use crate::imu::Vector15;
+use nalgebra::{SMatrix, SVector};
+use vidar_core::{FrameId, LandmarkId};
+
+/// What happened to landmarks when a frame left. Refill one to stay free of allocations.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Departure {
+    /// Landmarks that have a new host now.
+    pub rehosted: Vec<LandmarkId>,
+    /// Landmarks that are gone.
+    pub ended: Vec<LandmarkId>,
+}
+
+/// What became of the readings after a frame that leaves.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum NextLink {
+    /// They are in the prior.
+    InPrior,
+    /// They were joined with those before the frame.
+    Joined,
+}
+
+/// Readings' memory that is kept for later.
+const MOST_SPARE: usize = 8;
+
+/// Memory for marginalising.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct Workbench {
+    parts: Vec<Part>,
+    starts: Vec<usize>,
+    stack: Tall,
+    one: Tall,
+    leaving: Vec<(usize, usize)>,
+    parting: Vec<Sighting>,
+}
+
+impl Workbench {
+    fn column(&self, part: Part) -> Option<usize> {
+        self.parts.iter().position(|&p| p == part).map(|at| self.starts[at])
+    }
+
+    fn rhs(&self) -> usize {
+        self.stack.cols() - 1
+    }
+
+    fn insert(&mut self, part: Part) {
+        if !self.parts.contains(&part) {
+            self.parts.push(part);
+        }
+    }
+
+    /// Writes a block of rows of one part and, for parts that already have a step, its share of the right-hand side.
+    fn put<const R: usize, const C: usize>(
+        &mut self,
+        row: usize,
+        part: Part,
+        block: &SMatrix<f64, R, C>,
+        step: Option<SVector<f64, C>>,
+    ) {
+        let Some(col) = self.column(part) else { return };
+        let rhs = self.rhs();
+        for c in 0..C {
+            for r in 0..R {
+                self.stack.add(row + r, col + c, block[(r, c)]);
+            }
+        }
+        if let Some(step) = step {
+            let shift = block * step;
+            for r in 0..R {
+                self.stack.add(row + r, rhs, -shift[r]);
+            }
+        }
+    }
+
+    fn put_rhs(&mut self, row: usize, values: &[f64]) {
+        let rhs = self.rhs();
+        for (r, v) in values.iter().enumerate() {
+            self.stack.add(row + r, rhs, *v);
+        }
+    }
+}
+
+impl Smoother {
+    /// Takes a frame that is no keyframe out of the window: what it saw is forgotten, its readings are joined to the next
+    /// frame's. Where that is not possible (the prior speaks of it, or it is the last) it is marginalised.
+    ///
+    /// # Errors
+    /// A frame that the window does not hold.
+    pub fn drop_frame(&mut self, id: FrameId, departure: &mut Departure) -> Result<(), SmootherError> {
+        let at = self.index(id)?;
+        let last = self.frames.len() - 1;
+        let anchored = self.anchor.is_some_and(|a| a.frame == at);
+        let hosts = self.landmarks.iter().any(|l| l.alive && l.host.frame == at);
+        let chained = at > 0 && at < last && self.frames[at].link.is_some() == self.frames[at + 1].link.is_some();
+        if self.prior.touches(at) || anchored || hosts || !chained {
+            return self.marginalise(id, departure);
+        }
+        departure.rehosted.clear();
+        departure.ended.clear();
+        self.system.factorised = false;
+        let (left, right) = self.frames.split_at_mut(at + 1);
+        if let (Some(link), Some(next)) = (left[at].link.take(), &mut right[0].link) {
+            let mut joined = link.readings;
+            joined.append(&next.readings);
+            let used = std::mem::replace(&mut next.readings, joined);
+            next.whitening = super::inertial::Whitening::of(&next.readings);
+            self.spare.push(used);
+        }
+        self.remove_frame(at, NextLink::Joined);
+        Ok(())
+    }
+
+    /// Takes a frame out of the window and puts what is known through it into the prior.
+    ///
+    /// # Errors
+    /// A frame that the window does not hold.
+    pub fn marginalise(&mut self, id: FrameId, departure: &mut Departure) -> Result<(), SmootherError> {
+        let gone = self.index(id)?;
+        departure.rehosted.clear();
+        departure.ended.clear();
+        let mut system = std::mem::take(&mut self.system);
+        let mut bench = std::mem::take(&mut self.workbench);
+        system.factorised = false;
+        system.frames = self.frames.len();
+        if self.frames.len() > 1 {
+            self.place_cameras(&mut system);
+            self.choose_leaving(gone, &mut bench);
+            self.lay_out(gone, &mut bench);
+            self.stack_prior(&mut bench);
+            self.stack_frame(gone, &system, &mut bench);
+            self.stack_landmarks(gone, &system, &mut bench);
+            self.new_prior(gone, &mut bench);
+            self.move_hosts(gone, &system, &bench, departure);
+        } else {
+            self.prior.clear();
+            departure.ended.extend(self.landmarks.iter().filter(|l| l.alive).map(|l| l.id));
+            for &landmark in &departure.ended {
+                self.remove_landmark(landmark);
+            }
+        }
+        self.system = system;
+        self.workbench = bench;
+        self.remove_frame(gone, NextLink::InPrior);
+        Ok(())
+    }
+
+    /// Landmarks hosted by the leaving frame, each with how many of its sightings leave with it.
+    fn choose_leaving(&self, gone: usize, bench: &mut Workbench) {
+        bench.leaving.clear();
+        for (slot, landmark) in self.landmarks.iter().enumerate() {
+            if !landmark.alive || landmark.host.frame != gone {
+                continue;
+            }
+            bench.leaving.push((slot, self.split(landmark)));
+        }
+    }
+
+    /// How many sightings of a landmark go into the prior: all when it is not seen any more, else the older ones.
+    fn split(&self, landmark: &Landmark) -> usize {
+        let recent = self.frames.len().saturating_sub(2);
+        let alive = landmark.sightings.last().is_some_and(|s| s.frame >= recent);
+        let keyframes = landmark.sightings.iter().filter(|s| self.frames[s.frame].keyframe).count();
+        if !alive || keyframes == 0 {
+            return landmark.sightings.len();
+        }
+        // The sighting that becomes the host's is the one that leaves `rehost_keyframes` keyframes, itself included.
+        let skip = keyframes.saturating_sub(self.config.rehost_keyframes);
+        let in_keyframes = landmark.sightings.iter().enumerate().filter(|(_, s)| self.frames[s.frame].keyframe);
+        in_keyframes.map(|(at, _)| at).nth(skip).unwrap_or(landmark.sightings.len())
+    }
+
+    /// Columns: the leaving frame first, then everything it is tied to, in the order of frames, calibration last.
+    fn lay_out(&self, gone: usize, bench: &mut Workbench) {
+        bench.parts.clear();
+        bench.insert(Part::Pose(gone));
+        bench.insert(Part::Motion(gone));
+        let mut tied = [0_u8; 64];
+        let mut calibration = false;
+        for part in &self.prior.parts {
+            match part {
+                Part::Pose(k) => tied[*k] |= 1,
+                Part::Motion(k) => tied[*k] |= 2,
+                Part::Calibration => calibration = true,
+            }
+        }
+        if self.frames[gone].link.is_some() && gone > 0 {
+            tied[gone - 1] = 3;
+        }
+        if self.frames.get(gone + 1).is_some_and(|f| f.link.is_some()) {
+            tied[gone + 1] = 3;
+        }
+        let mut rows = self.prior.rows + 2 * 15 + 15 + 3 + CALIBRATION_DIM;
+        for &(slot, leaving) in &bench.leaving {
+            let landmark = &self.landmarks[slot];
+            for s in landmark.sightings[..leaving].iter().filter(|s| self.frames[s.frame].keyframe) {
+                tied[s.frame] |= 1;
+                rows += 2;
+                calibration |= self.config.calibrates();
+            }
+            rows += 2;
+        }
+        for k in (0..self.frames.len()).filter(|&k| k != gone) {
+            if tied[k] & 1 != 0 {
+                bench.insert(Part::Pose(k));
+            }
+            if tied[k] & 2 != 0 {
+                bench.insert(Part::Motion(k));
+            }
+        }
+        if calibration {
+            bench.insert(Part::Calibration);
+        }
+        bench.starts.clear();
+        let mut at = 0;
+        for part in &bench.parts {
+            bench.starts.push(at);
+            at += part.dim();
+        }
+        bench.stack.reset(rows, at + 1);
+    }
+
+    fn stack_prior(&self, bench: &mut Workbench) {
+        let prior = &self.prior;
+        let row = bench.stack.add_rows(prior.rows);
+        let rhs = bench.rhs();
+        for (part, start) in prior.parts.iter().zip(&prior.starts) {
+            let Some(col) = bench.column(*part) else { continue };
+            for r in 0..prior.rows {
+                for c in 0..part.dim() {
+                    bench.stack.set(row + r, col + c, prior.root[r * prior.dim + start + c]);
+                }
+            }
+        }
+        for r in 0..prior.rows {
+            bench.stack.set(row + r, rhs, prior.residual[r]);
+        }
+    }
+
+    fn pose_step(&self, k: usize) -> Option<SVector<f64, 6>> {
+        let frame = &self.frames[k];
+        frame.pose_in_prior.then(|| frame.step.fixed_rows::<6>(0).into_owned())
+    }
+
+    fn motion_step(&self, k: usize) -> Option<SVector<f64, 9>> {
+        let frame = &self.frames[k];
+        frame.motion_in_prior.then(|| frame.step.fixed_rows::<9>(6).into_owned())
+    }
+
+    fn put_state(&self, bench: &mut Workbench, row: usize, k: usize, j: &SMatrix<f64, 15, 15>) {
+        bench.put(row, Part::Pose(k), &j.fixed_columns::<6>(0).into_owned(), self.pose_step(k));
+        bench.put(row, Part::Motion(k), &j.fixed_columns::<9>(6).into_owned(), self.motion_step(k));
+    }
+
+    /// Readings on both sides, anchor and standstill of the leaving frame, and the calibration's own prior.
+    fn stack_frame(&self, gone: usize, system: &System, bench: &mut Workbench) {
+        for k in [gone, gone + 1] {
+            let Some(link) = self.frames.get(k).and_then(|f| f.link.as_ref()).filter(|_| k > 0) else { continue };
+            let (from, to) = (&self.frames[k - 1], &self.frames[k]);
+            let r: Vector15 = link.whitening.apply(&residual(&link.readings, &from.state, &to.state));
+            let (ji, jj) = jacobians(&link.readings, &system.states_at[k - 1], &system.states_at[k]);
+            let row = bench.stack.add_rows(15);
+            bench.put_rhs(row, r.as_slice());
+            self.put_state(bench, row, k - 1, &link.whitening.apply(&ji));
+            self.put_state(bench, row, k, &link.whitening.apply(&jj));
+        }
+        if let Some(anchor) = self.anchor.as_ref().filter(|a| a.frame == gone) {
+            let state = &self.frames[gone].state;
+            let (r, j) = anchor_at(&anchor.reference, &anchor.sigmas, state, &system.states_at[gone]);
+            let row = bench.stack.add_rows(15);
+            bench.put_rhs(row, r.as_slice());
+            self.put_state(bench, row, gone, &j);
+        }
+        if let Some(sigma) = self.frames[gone].standstill_sigma {
+            let r = body_velocity(&self.frames[gone].state).0 / sigma;
+            let (_, by_rotation, by_velocity) = body_velocity(&system.states_at[gone]);
+            let mut by_pose = SMatrix::<f64, 3, 6>::zeros();
+            by_pose.fixed_view_mut::<3, 3>(0, 0).copy_from(&(by_rotation / sigma));
+            let mut by_motion = SMatrix::<f64, 3, 9>::zeros();
+            by_motion.fixed_view_mut::<3, 3>(0, 0).copy_from(&(by_velocity / sigma));
+            let row = bench.stack.add_rows(3);
+            bench.put_rhs(row, r.as_slice());
+            bench.put(row, Part::Pose(gone), &by_pose, self.pose_step(gone));
+            bench.put(row, Part::Motion(gone), &by_motion, self.motion_step(gone));
+        }
+        if bench.column(Part::Calibration).is_some() && !self.calibration.in_prior {
+            let weights = SVector::<f64, CALIBRATION_DIM>::from(calibration_weights(&self.config));
+            let row = bench.stack.add_rows(CALIBRATION_DIM);
+            bench.put_rhs(row, weights.component_mul(&self.calibration.minus_given()).as_slice());
+            bench.put(row, Part::Calibration, &SMatrix::from_diagonal(&weights), None);
+        }
+    }
+
+    /// Sightings that leave, each landmark eliminated.
+    fn stack_landmarks(&mut self, gone: usize, system: &System, bench: &mut Workbench) {
+        let mut leaving = std::mem::take(&mut bench.leaving);
+        for (slot, count) in &leaving {
+            let mut landmark = std::mem::replace(&mut self.landmarks[*slot], Landmark::placeholder());
+            self.stack_landmark(gone, &mut landmark, *count, system, bench);
+            self.landmarks[*slot] = landmark;
+        }
+        leaving.sort_unstable();
+        bench.leaving = leaving;
+    }
+
+    fn stack_landmark(
+        &self,
+        gone: usize,
+        landmark: &mut Landmark,
+        count: usize,
+        system: &System,
+        bench: &mut Workbench,
+    ) {
+        let scene = Scene {
+            camera: &self.camera,
+            config: &self.config,
+            places: &system.places,
+            places_at: &system.places_at,
+            time_offset_secs: self.calibration.time_offset_secs,
+        };
+        let Some((_, own)) = scene.host(landmark) else { return };
+        let mut sightings = std::mem::take(&mut bench.parting);
+        sightings.clear();
+        sightings.extend(
+            landmark.sightings[..count].iter().filter(|s| self.frames[s.frame].keyframe).copied(),
+        );
+        // The landmark's own three columns, then those of the stack.
+        let mut one = std::mem::take(&mut bench.one);
+        one.reset(2 * sightings.len() + 2, 3 + bench.stack.cols());
+        let rhs = 3 + bench.rhs();
+        let calibration = bench.column(Part::Calibration).map(|c| c + 3);
+        let calibration_step = self.calibration.in_prior.then_some(self.calibration.step);
+        let host = bench.column(Part::Pose(gone)).map_or(3, |c| c + 3);
+        let mut used = 0;
+        let mut write = |w: &super::linearise::WeightedSighting, target: Option<(usize, usize)>| {
+            let row = one.add_rows(2);
+            let mut r = w.residual;
+            let mut put = |col: usize, block: &SMatrix<f64, 2, 6>, step: Option<SVector<f64, 6>>| {
+                for c in 0..6 {
+                    one.add(row, col + c, block[(0, c)]);
+                    one.add(row + 1, col + c, block[(1, c)]);
+                }
+                if let Some(step) = step {
+                    r -= block * step;
+                }
+            };
+            put(host, &w.jacobians.by_host, self.pose_step(gone));
+            if let Some((frame, col)) = target {
+                put(col, &w.jacobians.by_target, self.pose_step(frame));
+            }
+            if let (Some(col), Some(c)) = (calibration, &w.by_calibration) {
+                for k in 0..CALIBRATION_DIM {
+                    one.add(row, col + k, c[(0, k)]);
+                    one.add(row + 1, col + k, c[(1, k)]);
+                }
+                if let Some(step) = calibration_step {
+                    r -= c * step;
+                }
+            }
+            for c in 0..3 {
+                one.add(row, c, w.jacobians.by_landmark[(0, c)]);
+                one.add(row + 1, c, w.jacobians.by_landmark[(1, c)]);
+            }
+            one.add(row, rhs, r.x);
+            one.add(row + 1, rhs, r.y);
+        };
+        write(&own, None);
+        for s in &mut sightings {
+            let (_, weighted) = scene.sighting(landmark, s);
+            let target = bench.column(Part::Pose(s.frame)).map(|c| (s.frame, c + 3));
+            if let (Some(weighted), Some(target)) = (weighted, target) {
+                if s.chi2 <= self.config.outlier_chi2 {
+                    write(&weighted, Some(target));
+                    used += 1;
+                }
+            }
+        }
+        if used > 0 {
+            let begin = one.triangularise(0, 0, 3);
+            let left = one.rows() - begin;
+            let row = bench.stack.add_rows(left);
+            for c in 0..bench.stack.cols() {
+                for r in 0..left {
+                    bench.stack.set(row + r, c, one.get(begin + r, 3 + c));
+                }
+            }
+        }
+        bench.one = one;
+        bench.parting = sightings;
+    }
+
+    /// Eliminates the leaving frame's columns; what is left is the prior.
+    fn new_prior(&mut self, gone: usize, bench: &mut Workbench) {
+        let leaving = Part::Pose(gone).dim() + Part::Motion(gone).dim();
+        let variables = bench.rhs();
+        let begin = bench.stack.triangularise(0, 0, leaving);
+        let end = bench.stack.triangularise(begin, leaving, variables);
+        let parts = &bench.parts[2..];
+        self.prior.reset(parts, end - begin);
+        let n = self.prior.dim;
+        for r in 0..self.prior.rows {
+            for c in 0..n {
+                self.prior.root[r * n + c] = bench.stack.get(begin + r, leaving + c);
+            }
+            self.prior.residual[r] = bench.stack.get(begin + r, variables);
+        }
+        self.prior.square();
+        for &part in parts {
+            match part {
+                Part::Pose(k) => self.frames[k].enter_prior(true, false),
+                Part::Motion(k) => self.frames[k].enter_prior(false, true),
+                Part::Calibration => self.calibration.enter_prior(),
+            }
+        }
+    }
+
+    /// Gives living landmarks their new host and ends the others.
+    fn move_hosts(&mut self, gone: usize, system: &System, bench: &Workbench, departure: &mut Departure) {
+        for &(slot, count) in &bench.leaving {
+            let landmark = &mut self.landmarks[slot];
+            if count >= landmark.sightings.len() {
+                let id = landmark.id;
+                departure.ended.push(id);
+                self.remove_landmark(id);
+                continue;
+            }
+            let host = landmark.sightings[count];
+            let (old, new) = (&system.places[gone], &system.places[host.frame]);
+            // Unit bearing over inverse distance in the old host; the length of the direction scales the inverse distance.
+            let q = visual::direction(old, new, &landmark.bearing, landmark.rho);
+            let length = q.norm();
+            landmark.sightings.drain(..=count);
+            landmark.host = host;
+            landmark.bearing = q / length;
+            landmark.rho = (landmark.rho / length).clamp(MIN_INVERSE_DISTANCE, MAX_INVERSE_DISTANCE);
+            departure.rehosted.push(landmark.id);
+        }
+    }
+
+    /// Removes a frame and every sighting in it; places in the window move up.
+    fn remove_frame(&mut self, gone: usize, next: NextLink) {
+        let frame = self.frames.remove(gone);
+        self.spare.extend(frame.link.map(|link| link.readings));
+        if let (NextLink::InPrior, Some(next)) = (next, self.frames.get_mut(gone)) {
+            self.spare.extend(next.link.take().map(|link| link.readings));
+        }
+        self.spare.truncate(MOST_SPARE);
+        self.anchor = self.anchor.filter(|a| a.frame != gone).map(|mut a| {
+            a.frame -= usize::from(a.frame > gone);
+            a
+        });
+        self.prior.frame_left(gone);
+        for landmark in self.landmarks.iter_mut().filter(|l| l.alive) {
+            landmark.sightings.retain(|s| s.frame != gone);
+            landmark.host.frame -= usize::from(landmark.host.frame > gone);
+            for s in &mut landmark.sightings {
+                s.frame -= usize::from(s.frame > gone);
+            }
+        }
+    }
+}

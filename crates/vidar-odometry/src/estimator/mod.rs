@@ -1,0 +1,434 @@
+//! The fixed-lag smoother: keyframes and recent frames with full inertial states, landmarks, and a square-root prior.
+//!
+//! Per image: [`Smoother::add_frame`] → observations → [`Smoother::optimise`] → [`Smoother::drop_frame`] of a recent
+//! frame that is no keyframe, or [`Smoother::marginalise`] of a keyframe that leaves. A dropped frame's readings are
+//! joined to its neighbour's, so nothing inertial is lost; a marginalised frame becomes part of the prior by QR
+//! (Demmel et al., "Square root marginalization for sliding-window bundle adjustment", ICCV 2021), and the states in the
+//! prior keep their linearisation point from then on (first-estimates Jacobians: Huang, Mourikis, Roumeliotis 2010), so
+//! that shift and heading stay unobservable.
+//!
+//! Landmarks are a bearing and an inverse distance in their host keyframe; they are eliminated one by one (Schur) while
+//! optimising, and by Householder reflections when they enter the prior.
+
+mod config;
+mod covariance;
+mod dense;
+mod inertial;
+mod linearise;
+mod marginalise;
+mod optimise;
+mod prior;
+mod visual;
+mod window;
+
+pub use config::SmootherConfig;
+pub use inertial::AnchorSigmas;
+pub use marginalise::Departure;
+pub use optimise::{OptimiseReport, Outlier};
+pub use window::{LandmarkEstimate, Observation};
+
+use crate::imu::{ImuModel, NavState, Preintegration};
+use linearise::System;
+use nalgebra::{Matrix2, Vector2};
+use prior::Prior;
+use rustc_hash::FxHashMap;
+use vidar_core::{CameraModel, Duration, FrameId, LandmarkId, Se3, Timestamp};
+use window::{Anchor, Calibration, Frame, Landmark, Link, Sighting};
+
+/// Why the smoother refuses.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+#[non_exhaustive]
+pub enum SmootherError {
+    /// A setting is outside its range.
+    #[error("{key} must be {low} to {high}, found {found}")]
+    BadSetting {
+        /// The key.
+        key: &'static str,
+        /// Least allowed.
+        low: f64,
+        /// Most allowed.
+        high: f64,
+        /// What was found.
+        found: f64,
+    },
+    /// The window is full; a frame has to be dropped or marginalised first.
+    #[error("the window holds {held} frames already (max_frames); drop or marginalise one first")]
+    Full {
+        /// Frames held.
+        held: usize,
+    },
+    /// Frames must come in the order of time, each once.
+    #[error("frame {id} at {time} s does not follow the newest frame at {newest} s")]
+    NotNext {
+        /// The frame.
+        id: FrameId,
+        /// Its time.
+        time: Timestamp,
+        /// Time of the newest frame held.
+        newest: Timestamp,
+    },
+    /// The window has no such frame.
+    #[error("frame {0} is not in the window")]
+    NoSuchFrame(FrameId),
+    /// There is no such landmark.
+    #[error("landmark {0} is not in the map")]
+    NoSuchLandmark(LandmarkId),
+    /// The landmark exists already, or the frame sees it already.
+    #[error("landmark {landmark} is already known to frame {frame}")]
+    Twice {
+        /// The landmark.
+        landmark: LandmarkId,
+        /// The frame.
+        frame: FrameId,
+    },
+    /// A value is not finite, a covariance not positive definite, or a pixel has no bearing.
+    #[error("{what} of landmark {landmark} in frame {frame} is of no use: {found}")]
+    BadMeasurement {
+        /// What is wrong.
+        what: &'static str,
+        /// The landmark.
+        landmark: LandmarkId,
+        /// The frame.
+        frame: FrameId,
+        /// The value.
+        found: String,
+    },
+    /// A state that is not finite.
+    #[error("the state given for frame {0} is not finite")]
+    BadState(FrameId),
+}
+
+/// The smoother; see the module's head.
+#[derive(Clone, Debug)]
+pub struct Smoother {
+    config: SmootherConfig,
+    camera: CameraModel,
+    calibration: Calibration,
+    frames: Vec<Frame>,
+    landmarks: Vec<Landmark>,
+    /// Slots of `landmarks` that are free.
+    free: Vec<usize>,
+    slots: FxHashMap<LandmarkId, usize>,
+    anchor: Option<Anchor>,
+    prior: Prior,
+    system: System,
+    spare: Vec<Preintegration>,
+    workbench: marginalise::Workbench,
+}
+
+impl Smoother {
+    /// An empty smoother for one camera on a body.
+    ///
+    /// # Errors
+    /// A setting outside its range.
+    pub fn new(config: SmootherConfig, camera: CameraModel, body_from_camera: Se3) -> Result<Self, SmootherError> {
+        config.validate()?;
+        let frames = config.max_frames + 1;
+        let mut slots = FxHashMap::default();
+        slots.reserve(1024);
+        Ok(Self {
+            camera,
+            calibration: Calibration::new(body_from_camera),
+            frames: Vec::with_capacity(frames),
+            landmarks: Vec::with_capacity(512),
+            free: Vec::with_capacity(512),
+            slots,
+            anchor: None,
+            prior: Prior::default(),
+            system: System::with_capacity(15 * frames + window::CALIBRATION_DIM),
+            spare: Vec::with_capacity(8),
+            workbench: marginalise::Workbench::default(),
+            config,
+        })
+    }
+
+    /// Settings in force.
+    pub fn config(&self) -> &SmootherConfig {
+        &self.config
+    }
+
+    /// Changes what is calibrated online from now on.
+    pub fn set_calibrating(&mut self, rotation: bool, position: bool, time_offset: bool) {
+        self.system.factorised = false;
+        self.config.estimate_camera_rotation = rotation;
+        self.config.estimate_camera_position = position;
+        self.config.estimate_time_offset = time_offset;
+    }
+
+    /// Begins with one frame, whose `state` is believed as well as `sigmas` say. Everything held before is forgotten.
+    ///
+    /// # Errors
+    /// A state that is not finite.
+    pub fn start(
+        &mut self,
+        id: FrameId,
+        time: Timestamp,
+        state: NavState,
+        sigmas: AnchorSigmas,
+    ) -> Result<(), SmootherError> {
+        if !state.is_finite() {
+            return Err(SmootherError::BadState(id));
+        }
+        self.clear();
+        self.system.factorised = false;
+        self.frames.push(Frame::new(id, time, state, None));
+        self.anchor = Some(Anchor { frame: 0, reference: state, sigmas });
+        Ok(())
+    }
+
+    /// Forgets all frames, landmarks and the prior; calibration stays.
+    pub fn clear(&mut self) {
+        for frame in self.frames.drain(..) {
+            self.spare.extend(frame.link.map(|link| link.readings));
+        }
+        self.free.clear();
+        self.slots.clear();
+        self.landmarks.clear();
+        self.anchor = None;
+        self.prior.clear();
+    }
+
+    /// Adds the next frame with a first guess of its state. `readings` run from the newest frame held to this one;
+    /// without them the frame hangs on its images alone (and its velocity and biases are left as given).
+    ///
+    /// # Errors
+    /// A full window, a frame that is not later than the newest, a state that is not finite.
+    pub fn add_frame(
+        &mut self,
+        id: FrameId,
+        time: Timestamp,
+        state: NavState,
+        readings: Option<Preintegration>,
+    ) -> Result<(), SmootherError> {
+        if !state.is_finite() {
+            return Err(SmootherError::BadState(id));
+        }
+        if self.frames.len() >= self.config.max_frames {
+            return Err(SmootherError::Full { held: self.frames.len() });
+        }
+        if let Some(newest) = self.frames.last().filter(|f| f.time >= time) {
+            return Err(SmootherError::NotNext { id, time, newest: newest.time });
+        }
+        self.system.factorised = false;
+        self.frames.push(Frame::new(id, time, state, readings.map(Link::new)));
+        Ok(())
+    }
+
+    /// Makes a frame a keyframe: only keyframes host landmarks, and only [`Smoother::marginalise`] removes them.
+    ///
+    /// # Errors
+    /// A frame that the window does not hold.
+    pub fn mark_keyframe(&mut self, id: FrameId) -> Result<(), SmootherError> {
+        let at = self.index(id)?;
+        self.frames[at].keyframe = true;
+        Ok(())
+    }
+
+    /// Says that the body stands still at a frame, up to `sigma_mps` per axis.
+    ///
+    /// # Errors
+    /// A frame that the window does not hold.
+    pub fn add_standstill(&mut self, id: FrameId, sigma_mps: f64) -> Result<(), SmootherError> {
+        let at = self.index(id)?;
+        self.system.factorised = false;
+        self.frames[at].standstill_sigma = (sigma_mps > 0.0 && sigma_mps.is_finite()).then_some(sigma_mps);
+        Ok(())
+    }
+
+    /// Adds a landmark hosted by `host.frame`, seen there at `host.pixel` with `host.covariance`, at `1 /
+    /// inverse_distance` metres along the ray.
+    ///
+    /// # Errors
+    /// A host that the window does not hold, a landmark that exists, measurements that are of no use.
+    pub fn add_landmark(&mut self, host: &Observation, inverse_distance: f64) -> Result<(), SmootherError> {
+        let bad = |what, found: String| SmootherError::BadMeasurement {
+            what,
+            landmark: host.landmark,
+            frame: host.frame,
+            found,
+        };
+        let frame = self.index(host.frame)?;
+        if self.slots.contains_key(&host.landmark) {
+            return Err(SmootherError::Twice { landmark: host.landmark, frame: host.frame });
+        }
+        let sighting = self.sighting(host, frame)?;
+        let bearing = self
+            .camera
+            .unproject(&host.pixel)
+            .ok_or_else(|| bad("pixel", format!("({:.2}, {:.2}) has no bearing", host.pixel.x, host.pixel.y)))?;
+        if !inverse_distance.is_finite() {
+            return Err(bad("inverse distance", inverse_distance.to_string()));
+        }
+        let rho = inverse_distance.max(window::MIN_INVERSE_DISTANCE);
+        let slot = self.free.pop().unwrap_or_else(|| {
+            self.landmarks.push(Landmark::empty());
+            self.landmarks.len() - 1
+        });
+        self.landmarks[slot].begin(host.landmark, sighting, bearing, rho);
+        self.slots.insert(host.landmark, slot);
+        Ok(())
+    }
+
+    /// Adds what a frame sees of a landmark.
+    ///
+    /// # Errors
+    /// A frame or landmark that is unknown, a second sighting in one frame, measurements that are of no use.
+    pub fn add_observation(&mut self, seen: &Observation) -> Result<(), SmootherError> {
+        let frame = self.index(seen.frame)?;
+        let slot = *self.slots.get(&seen.landmark).ok_or(SmootherError::NoSuchLandmark(seen.landmark))?;
+        if self.landmarks[slot].sees(frame) {
+            return Err(SmootherError::Twice { landmark: seen.landmark, frame: seen.frame });
+        }
+        let sighting = self.sighting(seen, frame)?;
+        self.system.factorised = false;
+        self.landmarks[slot].insert(sighting);
+        Ok(())
+    }
+
+    /// Takes back what a frame saw of a landmark; says whether there was anything. The host's sighting stays.
+    pub fn remove_observation(&mut self, frame: FrameId, landmark: LandmarkId) -> bool {
+        let (Ok(frame), Some(&slot)) = (self.index(frame), self.slots.get(&landmark)) else { return false };
+        let sightings = &mut self.landmarks[slot].sightings;
+        let before = sightings.len();
+        sightings.retain(|s| s.frame != frame);
+        self.system.factorised = false;
+        sightings.len() < before
+    }
+
+    /// Forgets a landmark; says whether there was one. What is in the prior of it stays.
+    pub fn remove_landmark(&mut self, landmark: LandmarkId) -> bool {
+        let Some(slot) = self.slots.remove(&landmark) else { return false };
+        self.system.factorised = false;
+        self.landmarks[slot].end();
+        self.free.push(slot);
+        true
+    }
+
+    fn sighting(&self, seen: &Observation, frame: usize) -> Result<Sighting, SmootherError> {
+        let bad = |what, found: String| SmootherError::BadMeasurement {
+            what,
+            landmark: seen.landmark,
+            frame: seen.frame,
+            found,
+        };
+        let finite = |v: &Vector2<f64>| v.x.is_finite() && v.y.is_finite();
+        if !finite(&seen.pixel) || !finite(&seen.pixel_velocity) {
+            return Err(bad("pixel", format!("({}, {})", seen.pixel.x, seen.pixel.y)));
+        }
+        let whitening = visual::whitening(&seen.covariance).ok_or_else(|| {
+            let c: &Matrix2<f64> = &seen.covariance;
+            bad("covariance", format!("[{} {}; {} {}]", c[(0, 0)], c[(0, 1)], c[(1, 0)], c[(1, 1)]))
+        })?;
+        Ok(Sighting { frame, pixel: seen.pixel, pixel_velocity: seen.pixel_velocity, whitening, chi2: 0.0 })
+    }
+
+    fn index(&self, id: FrameId) -> Result<usize, SmootherError> {
+        self.frames.iter().position(|f| f.id == id).ok_or(SmootherError::NoSuchFrame(id))
+    }
+
+    /// Frames held, oldest first.
+    pub fn frames(&self) -> impl DoubleEndedIterator<Item = FrameId> + ExactSizeIterator + '_ {
+        self.frames.iter().map(|f| f.id)
+    }
+
+    /// Keyframes held, oldest first.
+    pub fn keyframes(&self) -> impl DoubleEndedIterator<Item = FrameId> + '_ {
+        self.frames.iter().filter(|f| f.keyframe).map(|f| f.id)
+    }
+
+    /// Number of frames held.
+    pub fn len(&self) -> usize {
+        self.frames.len()
+    }
+
+    /// Whether nothing has begun.
+    pub fn is_empty(&self) -> bool {
+        self.frames.is_empty()
+    }
+
+    /// The state of a frame.
+    pub fn state(&self, id: FrameId) -> Option<&NavState> {
+        self.frames.iter().find(|f| f.id == id).map(|f| &f.state)
+    }
+
+    /// Newest frame: its name, time and state.
+    pub fn newest(&self) -> Option<(FrameId, Timestamp, &NavState)> {
+        self.frames.last().map(|f| (f.id, f.time, &f.state))
+    }
+
+    /// When a frame was taken.
+    pub fn time(&self, id: FrameId) -> Option<Timestamp> {
+        self.frames.iter().find(|f| f.id == id).map(|f| f.time)
+    }
+
+    /// The landmark as it is believed now.
+    pub fn landmark(&self, id: LandmarkId) -> Option<LandmarkEstimate> {
+        let landmark = &self.landmarks[*self.slots.get(&id)?];
+        Some(landmark.estimate(&self.frames, &self.calibration.body_from_camera))
+    }
+
+    /// All landmarks in the order of their storage (the same on every run).
+    pub fn landmarks(&self) -> impl Iterator<Item = LandmarkEstimate> + '_ {
+        let place = &self.calibration.body_from_camera;
+        self.landmarks.iter().filter(|l| l.alive).map(|l| l.estimate(&self.frames, place))
+    }
+
+    /// Number of landmarks.
+    pub fn landmark_count(&self) -> usize {
+        self.slots.len()
+    }
+
+    /// Whether a frame sees a landmark.
+    pub fn sees(&self, frame: FrameId, landmark: LandmarkId) -> bool {
+        match (self.index(frame), self.slots.get(&landmark)) {
+            (Ok(frame), Some(&slot)) => self.landmarks[slot].sees(frame),
+            _ => false,
+        }
+    }
+
+    /// Landmarks that a frame sees, hosted by it or not.
+    pub fn seen_by(&self, frame: FrameId) -> impl Iterator<Item = LandmarkId> + '_ {
+        let at = self.index(frame).unwrap_or(usize::MAX);
+        self.landmarks.iter().filter(move |l| l.alive && l.sees(at)).map(|l| l.id)
+    }
+
+    /// The camera's model.
+    pub fn camera(&self) -> &CameraModel {
+        &self.camera
+    }
+
+    /// Place of the camera on the body, as estimated.
+    pub fn body_from_camera(&self) -> &Se3 {
+        &self.calibration.body_from_camera
+    }
+
+    /// Correction of the camera's clock, as estimated: images were taken this much later than their frames say.
+    pub fn time_offset(&self) -> Duration {
+        Duration::from_secs_f64(self.calibration.time_offset_secs)
+    }
+
+    /// Pixel that a landmark is expected at in a frame, `None` if it does not project there.
+    pub fn predict_pixel(&self, frame: FrameId, landmark: LandmarkId) -> Option<Vector2<f64>> {
+        let target = &self.frames[self.index(frame).ok()?];
+        let estimate = self.landmark(landmark)?;
+        let host = &self.frames[self.index(estimate.host).ok()?];
+        let place = |f: &Frame| {
+            visual::CameraPlace::new(&f.state.world_from_body, &self.calibration.body_from_camera)
+        };
+        let q = visual::direction(&place(host), &place(target), &estimate.bearing, estimate.inverse_distance);
+        self.camera.project(&q)
+    }
+
+    /// Memory of readings that are not needed any more, to be filled again by [`Preintegration::restart`].
+    pub fn take_spare(&mut self) -> Option<Preintegration> {
+        self.spare.pop()
+    }
+
+    /// An IMU model that the window's readings carry, if any does.
+    pub fn imu_model(&self) -> Option<&ImuModel> {
+        self.frames.iter().rev().find_map(|f| f.link.as_ref()).map(|l| l.readings.model())
+    }
+}
+
+#[cfg(test)]
+mod tests;

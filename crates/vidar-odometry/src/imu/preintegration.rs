@@ -1,0 +1,334 @@
+//! Preintegrated motion between two instants, with bias derivatives and covariance.
+//!
+//! Readings are taken as linear between samples. One step of length `h` turns by the fourth-order Magnus expansion of a
+//! linear rate (`φ = ½(ω₀+ω₁)h + h²/12 ω₀×ω₁`, on each half step), and integrates the rotated specific force by
+//! Simpson's rule: fourth order, where the usual mid-point rule is second. Steps and longer stretches are joined by one
+//! rule ([`Delta::then`]), which also joins their derivatives and covariances.
+
+use super::{NavState, hat};
+use nalgebra::{Matrix3, SMatrix, Vector3};
+use vidar_core::{GRAVITY_MPS2, ImuNoise, ImuSample, LieGroup, Se3, So3};
+
+/// Biases of an IMU.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Bias {
+    /// Gyroscope, rad/s.
+    pub gyro: Vector3<f64>,
+    /// Accelerometer, m/s².
+    pub accel: Vector3<f64>,
+}
+
+impl Bias {
+    /// None at all.
+    pub const ZERO: Self = Self { gyro: Vector3::new(0.0, 0.0, 0.0), accel: Vector3::new(0.0, 0.0, 0.0) };
+}
+
+/// White noise to assume while integrating, and where readings saturate.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct StepNoise {
+    /// Gyroscope, rad/s/√Hz.
+    pub gyro_density: f64,
+    /// Accelerometer, m/s²/√Hz.
+    pub accel_density: f64,
+    /// Nominal time between readings, s; longer steps are gaps.
+    pub period_secs: f64,
+}
+
+/// What the estimator believes of the IMU: densities as inflated for vibration, and the limits of its ranges.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct ImuModel {
+    /// White noise.
+    pub noise: StepNoise,
+    /// Gyroscope bias random walk, rad/s²/√Hz.
+    pub gyro_walk: f64,
+    /// Accelerometer bias random walk, m/s³/√Hz.
+    pub accel_walk: f64,
+    /// Rate at which the gyroscope saturates, rad/s.
+    pub gyro_limit: f64,
+    /// Specific force at which the accelerometer saturates, m/s².
+    pub accel_limit: f64,
+}
+
+/// Walks below these are not believed of any MEMS IMU.
+const MIN_GYRO_WALK: f64 = 1e-5;
+const MIN_ACCEL_WALK: f64 = 1e-3;
+
+/// Densities at saturated readings, relative to ordinary ones.
+const SATURATED_FACTOR: f64 = 100.0;
+
+impl ImuModel {
+    /// From a data sheet, white noise times `gyro_factor` and `accel_factor` (vibration, scale errors), walks floored.
+    pub fn from_data_sheet(sheet: &ImuNoise, gyro_factor: f64, accel_factor: f64) -> Self {
+        Self {
+            noise: StepNoise {
+                gyro_density: sheet.gyro_noise_density * gyro_factor,
+                accel_density: sheet.accel_noise_density * accel_factor,
+                period_secs: 1.0 / sheet.rate_hz.max(1.0),
+            },
+            gyro_walk: sheet.gyro_random_walk.max(MIN_GYRO_WALK),
+            accel_walk: sheet.accel_random_walk.max(MIN_ACCEL_WALK),
+            gyro_limit: 17.0,
+            accel_limit: 170.0,
+        }
+    }
+}
+
+/// 9×9 in the order rotation, position, velocity.
+pub(crate) type Matrix9 = SMatrix<f64, 9, 9>;
+/// Derivative of rotation, position, velocity by one bias.
+pub(crate) type ByBias = SMatrix<f64, 9, 3>;
+
+/// Motion relative to its first instant, gravity left out.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) struct Delta {
+    pub(crate) secs: f64,
+    pub(crate) rotation: So3,
+    pub(crate) position: Vector3<f64>,
+    pub(crate) velocity: Vector3<f64>,
+    pub(crate) by_gyro_bias: ByBias,
+    pub(crate) by_accel_bias: ByBias,
+    pub(crate) covariance: Matrix9,
+}
+
+impl Delta {
+    pub(crate) const fn none() -> Self {
+        Self {
+            secs: 0.0,
+            rotation: So3::IDENTITY,
+            position: Vector3::new(0.0, 0.0, 0.0),
+            velocity: Vector3::new(0.0, 0.0, 0.0),
+            by_gyro_bias: ByBias::from_array_storage(nalgebra::ArrayStorage([[0.0; 9]; 3])),
+            by_accel_bias: ByBias::from_array_storage(nalgebra::ArrayStorage([[0.0; 9]; 3])),
+            covariance: Matrix9::from_array_storage(nalgebra::ArrayStorage([[0.0; 9]; 9])),
+        }
+    }
+
+    /// One step between neighbouring readings.
+    fn step(a: &ImuSample, b: &ImuSample, bias: &Bias, model: &ImuModel) -> Self {
+        let secs = (b.time - a.time).as_secs_f64();
+        let (w0, w1) = (a.gyro.0 - bias.gyro, b.gyro.0 - bias.gyro);
+        let (f0, f1) = (a.accel.0 - bias.accel, b.accel.0 - bias.accel);
+        let (wm, fm) = ((w0 + w1) * 0.5, (f0 + f1) * 0.5);
+        let half = 0.5 * secs;
+        let (phi1, d_phi1) = magnus(&w0, &wm, half);
+        let (phi2, d_phi2) = magnus(&wm, &w1, half);
+        let (to_mid, mid_to_end) = (So3::exp(&phi1), So3::exp(&phi2));
+        let end = to_mid * mid_to_end;
+        let (r_mid, r_end) = (to_mid.matrix(), end.matrix());
+        let mid_by_gyro = So3::right_jacobian(&phi1) * d_phi1;
+        let end_by_gyro =
+            mid_to_end.matrix().transpose() * mid_by_gyro + So3::right_jacobian(&phi2) * d_phi2;
+        let (force_mid, force_end) = (r_mid * fm, r_end * f1);
+        let (mid_force_by_gyro, end_force_by_gyro) =
+            (-(r_mid * hat(&fm)) * mid_by_gyro, -(r_end * hat(&f1)) * end_by_gyro);
+        let (c1, c2) = (secs / 6.0, secs * secs / 6.0);
+        let mut by_gyro_bias = ByBias::zeros();
+        by_gyro_bias.fixed_view_mut::<3, 3>(0, 0).copy_from(&end_by_gyro);
+        by_gyro_bias.fixed_view_mut::<3, 3>(3, 0).copy_from(&(mid_force_by_gyro * (2.0 * c2)));
+        by_gyro_bias
+            .fixed_view_mut::<3, 3>(6, 0)
+            .copy_from(&((mid_force_by_gyro * 4.0 + end_force_by_gyro) * c1));
+        let mut by_accel_bias = ByBias::zeros();
+        let identity = Matrix3::identity();
+        by_accel_bias.fixed_view_mut::<3, 3>(3, 0).copy_from(&((identity + r_mid * 2.0) * -c2));
+        by_accel_bias.fixed_view_mut::<3, 3>(6, 0).copy_from(&((identity + r_mid * 4.0 + r_end) * -c1));
+        // White noise of density σ, averaged over the step, acts as a bias of variance σ²/h.
+        let [gyro_variance, accel_variance] = step_variances(a, b, secs, model);
+        let covariance = by_gyro_bias * by_gyro_bias.transpose() * gyro_variance
+            + by_accel_bias * by_accel_bias.transpose() * accel_variance;
+        Self {
+            secs,
+            rotation: end,
+            position: (f0 + force_mid * 2.0) * c2,
+            velocity: (f0 + force_mid * 4.0 + force_end) * c1,
+            by_gyro_bias,
+            by_accel_bias,
+            covariance,
+        }
+    }
+
+    /// This motion followed by `next`; both linearised at the same biases.
+    pub(crate) fn then(&self, next: &Self) -> Self {
+        let turn = self.rotation.matrix();
+        let mut f = Matrix9::identity();
+        f.fixed_view_mut::<3, 3>(0, 0).copy_from(&next.rotation.matrix().transpose());
+        f.fixed_view_mut::<3, 3>(3, 0).copy_from(&(-(turn * hat(&next.position))));
+        f.fixed_view_mut::<3, 3>(3, 6).copy_from(&(Matrix3::identity() * next.secs));
+        f.fixed_view_mut::<3, 3>(6, 0).copy_from(&(-(turn * hat(&next.velocity))));
+        let mut g = Matrix9::zeros();
+        g.fixed_view_mut::<3, 3>(0, 0).copy_from(&Matrix3::identity());
+        g.fixed_view_mut::<3, 3>(3, 3).copy_from(&turn);
+        g.fixed_view_mut::<3, 3>(6, 6).copy_from(&turn);
+        let covariance = f * self.covariance * f.transpose() + g * next.covariance * g.transpose();
+        Self {
+            secs: self.secs + next.secs,
+            rotation: self.rotation * next.rotation,
+            position: self.position + self.velocity * next.secs + turn * next.position,
+            velocity: self.velocity + turn * next.velocity,
+            by_gyro_bias: f * self.by_gyro_bias + g * next.by_gyro_bias,
+            by_accel_bias: f * self.by_accel_bias + g * next.by_accel_bias,
+            covariance: (covariance + covariance.transpose()) * 0.5,
+        }
+    }
+}
+
+/// Rotation vector of a linear rate from `w0` to `w1` over `secs`, and its derivative by the gyroscope bias in both.
+fn magnus(w0: &Vector3<f64>, w1: &Vector3<f64>, secs: f64) -> (Vector3<f64>, Matrix3<f64>) {
+    let k = secs * secs / 12.0;
+    ((w0 + w1) * (0.5 * secs) + w0.cross(w1) * k, Matrix3::identity() * -secs + hat(&(w1 - w0)) * k)
+}
+
+fn step_variances(a: &ImuSample, b: &ImuSample, secs: f64, model: &ImuModel) -> [f64; 2] {
+    // Ten times the noise per 50 ms without readings, at most 1e4.
+    let missing_secs = (secs - 2.0 * model.noise.period_secs).max(0.0);
+    let gap_factor = 10.0_f64.powf((missing_secs / 0.05).min(4.0));
+    let beyond = |x: &Vector3<f64>, y: &Vector3<f64>, limit: f64| x.amax() > limit || y.amax() > limit;
+    let factor = |saturated: bool| gap_factor * if saturated { SATURATED_FACTOR } else { 1.0 };
+    let gyro = model.noise.gyro_density * factor(beyond(&a.gyro.0, &b.gyro.0, model.gyro_limit));
+    let accel = model.noise.accel_density * factor(beyond(&a.accel.0, &b.accel.0, model.accel_limit));
+    [gyro * gyro / secs, accel * accel / secs]
+}
+
+/// Raw readings are kept for exact re-integration up to this many; longer stretches are corrected to first order.
+const MAX_RAW_SAMPLES: usize = 4096;
+
+/// Re-integrate when the bias moved by more than this over the interval: rad, and m.
+const REINTEGRATE_RAD: f64 = 1e-3;
+const REINTEGRATE_M: f64 = 5e-3;
+
+/// Readings between two instants, integrated once and corrected for other biases to first order.
+#[derive(Clone, Debug)]
+pub struct Preintegration {
+    pub(crate) delta: Delta,
+    bias: Bias,
+    model: ImuModel,
+    samples: Vec<ImuSample>,
+    sealed: bool,
+}
+
+impl Preintegration {
+    /// Integrates `samples` (in the order of time; the first and last are the ends) at `bias`.
+    pub fn new(model: ImuModel, bias: Bias, samples: &[ImuSample]) -> Self {
+        let mut fresh =
+            Self { delta: Delta::none(), bias, model, samples: Vec::with_capacity(64), sealed: false };
+        fresh.restart(bias, samples);
+        fresh
+    }
+
+    /// Forgets everything and integrates `samples` at `bias`, in the memory already held.
+    pub fn restart(&mut self, bias: Bias, samples: &[ImuSample]) {
+        self.bias = bias;
+        self.sealed = samples.len() > MAX_RAW_SAMPLES;
+        self.delta = integrate(samples, &bias, &self.model);
+        self.samples.clear();
+        if !self.sealed {
+            self.samples.extend_from_slice(samples);
+        }
+    }
+
+    /// Integrates again at `bias`; without raw readings (very long stretches) the first-order correction stays.
+    pub fn reintegrate(&mut self, bias: Bias) {
+        if !self.sealed {
+            self.bias = bias;
+            self.delta = integrate(&self.samples, &bias, &self.model);
+        }
+    }
+
+    /// Re-integrates if `bias` lies so far from the one integrated with that the first order is not enough.
+    /// Says whether it did.
+    pub fn follow(&mut self, bias: &Bias) -> bool {
+        let t = self.delta.secs;
+        let turned_rad = (bias.gyro - self.bias.gyro).norm() * t;
+        let moved_m = (bias.accel - self.bias.accel).norm() * 0.5 * t * t;
+        let far = turned_rad > REINTEGRATE_RAD || moved_m > REINTEGRATE_M;
+        if far {
+            self.reintegrate(*bias);
+        }
+        far && !self.sealed
+    }
+
+    /// This stretch followed by `next`, which begins where this one ends; `next` is read at this stretch's biases.
+    pub fn append(&mut self, next: &Self) {
+        let joined = if next.bias == self.bias || next.sealed {
+            self.delta.then(&next.delta)
+        } else {
+            self.delta.then(&integrate(&next.samples, &self.bias, &self.model))
+        };
+        self.delta = joined;
+        self.sealed |= next.sealed || self.samples.len() + next.samples.len() > MAX_RAW_SAMPLES;
+        if self.sealed {
+            self.samples.clear();
+        } else {
+            // The first reading of `next` is the last of this stretch.
+            self.samples.extend_from_slice(next.samples.get(1..).unwrap_or(&[]));
+        }
+    }
+
+    /// Length of the stretch, s.
+    pub fn secs(&self) -> f64 {
+        self.delta.secs
+    }
+
+    /// Biases that were integrated with.
+    pub fn bias(&self) -> &Bias {
+        &self.bias
+    }
+
+    /// The IMU's model.
+    pub fn model(&self) -> &ImuModel {
+        &self.model
+    }
+
+    /// Readings kept, ends included; empty after very long stretches.
+    pub fn samples(&self) -> &[ImuSample] {
+        &self.samples
+    }
+
+    /// Rotation `first_from_last` for `bias`.
+    pub fn rotation(&self, bias: &Bias) -> So3 {
+        self.corrected(bias).0
+    }
+
+    /// Covariance of rotation (first side of the end), position and velocity, white noise only.
+    pub fn covariance(&self) -> &SMatrix<f64, 9, 9> {
+        &self.delta.covariance
+    }
+
+    /// Rotation, position and velocity for `bias`, to first order.
+    pub(crate) fn corrected(&self, bias: &Bias) -> (So3, Vector3<f64>, Vector3<f64>) {
+        let (dg, da) = (bias.gyro - self.bias.gyro, bias.accel - self.bias.accel);
+        let shift = self.delta.by_gyro_bias * dg + self.delta.by_accel_bias * da;
+        let turn = So3::exp(&shift.fixed_rows::<3>(0).into_owned());
+        (
+            self.delta.rotation * turn,
+            self.delta.position + shift.fixed_rows::<3>(3),
+            self.delta.velocity + shift.fixed_rows::<3>(6),
+        )
+    }
+
+    /// Where a body in `state` at the first instant is at the last.
+    pub fn predict(&self, state: &NavState) -> NavState {
+        let (rotation, position, velocity) = self.corrected(&state.bias);
+        let t = self.delta.secs;
+        let gravity = Vector3::new(0.0, 0.0, -GRAVITY_MPS2);
+        let start = &state.world_from_body;
+        NavState {
+            world_from_body: Se3::new(
+                start.rotation * rotation,
+                start.translation
+                    + state.velocity * t
+                    + gravity * (0.5 * t * t)
+                    + start.rotation * position,
+            ),
+            velocity: state.velocity + gravity * t + start.rotation * velocity,
+            bias: state.bias,
+        }
+    }
+}
+
+fn integrate(samples: &[ImuSample], bias: &Bias, model: &ImuModel) -> Delta {
+    samples
+        .windows(2)
+        .filter(|pair| pair[1].time > pair[0].time)
+        .fold(Delta::none(), |sum, pair| sum.then(&Delta::step(&pair[0], &pair[1], bias, model)))
+}

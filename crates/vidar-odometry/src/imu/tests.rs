@@ -1,0 +1,1 @@
+//! Preintegration and propagation against Runge-Kutta and numeric derivatives.
