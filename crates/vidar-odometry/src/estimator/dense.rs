@@ -140,10 +140,6 @@ impl Tall {
         self.cols
     }
 
-    pub(crate) fn capacity(&self) -> usize {
-        self.stride
-    }
-
     /// Adds `count` zero rows and returns the number of the first.
     pub(crate) fn add_rows(&mut self, count: usize) -> usize {
         let first = self.rows;

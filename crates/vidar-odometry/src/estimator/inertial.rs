@@ -80,7 +80,7 @@ pub(crate) fn jacobians(readings: &Preintegration, i: &NavState, j: &NavState) -
     let moved = back * (to.translation - from.translation - i.velocity * t - gravity() * (0.5 * t * t));
     let sped = back * (j.velocity - i.velocity - gravity() * t);
     let (mut by_i, mut by_j) = (Matrix15::zeros(), Matrix15::zeros());
-    let mut put = |m: &mut Matrix15, row: usize, col: usize, value: Matrix3<f64>| {
+    let put = |m: &mut Matrix15, row: usize, col: usize, value: Matrix3<f64>| {
         m.fixed_view_mut::<3, 3>(row, col).copy_from(&value);
     };
     put(&mut by_i, 0, 0, -log_slope * (to.rotation.inverse() * from.rotation).matrix());
@@ -149,12 +149,8 @@ impl AnchorSigmas {
     };
 }
 
-/// The anchor's residual and derivative, whitened. Every row but position and yaw is blind to shifts and to yaw.
-pub(crate) fn anchor(reference: &NavState, sigmas: &AnchorSigmas, state: &NavState) -> (Vector15, SMatrix<f64, 15, 15>) {
-    anchor_at(reference, sigmas, state, state)
-}
-
-/// As [`anchor`], with the derivative at `at`.
+/// The anchor's residual at `state` and derivative at `at`, whitened. Every row but position and yaw is blind to shifts
+/// and to yaw.
 pub(crate) fn anchor_at(
     reference: &NavState,
     sigmas: &AnchorSigmas,

@@ -11,7 +11,7 @@ use super::window::{CALIBRATION_DIM, Landmark, Sighting};
 use super::{Smoother, SmootherConfig};
 use crate::imu::NavState;
 use nalgebra::{Matrix3, SMatrix, SVector, Vector2, Vector3};
-use vidar_core::{CameraModel, Se3};
+use vidar_core::CameraModel;
 
 /// Whitened residual that a sighting which does not project counts as.
 const LOST_SIGMAS: f64 = 50.0;
@@ -507,9 +507,4 @@ fn add_landmark(system: &mut System, scene: &Scene<'_>, landmark: &mut Landmark,
     }
     system.eliminated.push(Eliminated { slot, inverse, gradient, cross_begin, cross_end, by_calibration });
     cost
-}
-
-/// The camera's place on the body at which derivatives are taken.
-pub(crate) fn camera_place_at(smoother: &Smoother) -> Se3 {
-    smoother.calibration.at(smoother.config.first_estimates)
 }

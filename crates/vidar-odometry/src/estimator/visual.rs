@@ -6,7 +6,7 @@
 
 use crate::imu::hat;
 use nalgebra::{Matrix2, Matrix2x3, Matrix3, Matrix3x2, SMatrix, Vector2, Vector3};
-use vidar_core::{CameraModel, LieGroup, Se3};
+use vidar_core::{CameraModel, Se3};
 
 /// A frame's camera as the factor needs it.
 #[derive(Clone, Copy, Debug)]

@@ -12,6 +12,7 @@ mod propagate;
 pub use buffer::{BufferError, Gap, ImuBuffer};
 pub use preintegration::{Bias, ImuModel, Preintegration, StepNoise};
 pub use propagate::{Propagated, propagate};
+pub(crate) use propagate::gravity;
 
 use nalgebra::{Matrix3, SMatrix, SVector, Vector3};
 use vidar_core::{LieGroup, Se3, So3};
