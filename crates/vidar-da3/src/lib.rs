@@ -1,1 +1,42 @@
 //! Depth Anything 3: views in, a prediction of depth, confidence and poses out.
+//!
+//! Written from the behaviour of the official code (Lin et al., *Depth Anything 3: Recovering the Visual Space from Any
+//! Views*, 2025) on the layers of `vidar-nn`; every published network runs from its own files.
+//!
+//! ```no_run
+//! use vidar_core::Image;
+//! use vidar_da3::{Da3, Da3Options, InferOptions, Inputs};
+//! # fn main() -> Result<(), vidar_da3::Da3Error> {
+//! let model = Da3::open("DA3-SMALL".as_ref(), &Da3Options::default())?;
+//! let pictures: Vec<Image<[u8; 3]>> = vec![Image::filled(640, 480, [90, 90, 90]); 2];
+//! let prediction = model.infer(&Inputs::images(&pictures), &InferOptions::default())?;
+//! let depth = &prediction.depth[0]; // 504 × 378
+//! # let _ = depth; Ok(()) }
+//! ```
+//!
+//! The conventions inside are the network's: poses `camera_from_world`, intrinsics with their origin at the *edge* of
+//! the top-left pixel ([`pose::to_edge`], [`pose::from_edge`]). [`Da3Model`] speaks `VIDAR`'s.
+
+pub mod align;
+pub mod check;
+pub mod config;
+mod da3;
+mod error;
+mod infer;
+mod model;
+pub mod pose;
+pub mod preprocess;
+pub mod ray_pose;
+mod run;
+mod sky;
+mod trace;
+pub mod weights;
+
+pub use config::{Da3Config, Variant};
+pub use da3::{Da3, Da3Options, WeightsOrigin};
+pub use error::Da3Error;
+pub use infer::{FeatureMaps, Hooks, InferOptions, Inputs, NetCameras, NetOutput, Prediction};
+pub use model::backbone::{Pixels, ReferenceStrategy};
+pub use trace::{Layout, Trace, Traced};
+pub use vidar_nn::{Isa, Precision};
+pub use weights::Residency;

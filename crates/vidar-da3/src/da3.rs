@@ -1,0 +1,157 @@
+//! A model that is open: [`Da3`].
+
+use crate::config::{Da3Config, Variant, json};
+use crate::error::Da3Error;
+use crate::infer::Hooks;
+use crate::model::Model;
+use crate::run::Run;
+use crate::weights::{DeterministicWeights, Residency, detect, verify};
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use vidar_nn::{Checkpoint, Compute, Isa, Precision, WeightSource};
+
+/// How a model computes.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Da3Options {
+    /// Matrix products of the backbone.
+    pub precision: Precision,
+    /// Matrix products of the dense head; `None` is the backbone's. The official code keeps the head in `f32`.
+    pub head_precision: Option<Precision>,
+    /// A set of kernels to insist on; `None` is the best of this machine.
+    pub isa: Option<Isa>,
+    /// Whether weights made by rule are kept. Files are mapped and cost nothing either way.
+    pub residency: Residency,
+}
+
+/// Depth Anything 3, ready to run. It can be shared between threads; runs do not influence each other.
+pub struct Da3 {
+    pub(crate) config: Da3Config,
+    pub(crate) model: Model,
+    backbone: Compute,
+    head: Compute,
+    source: WeightsOrigin,
+}
+
+/// Where the weights of an open model come from.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum WeightsOrigin {
+    /// A file.
+    File {
+        /// Its path.
+        path: PathBuf,
+        /// Its size.
+        bytes: u64,
+    },
+    /// Made by rule: the geometry means nothing.
+    Deterministic,
+    /// Given by the caller.
+    Given,
+}
+
+const WEIGHTS_FILE: &str = "model.safetensors";
+const CONFIG_FILE: &str = "config.json";
+
+impl Da3 {
+    /// Opens a folder with `model.safetensors` and `config.json` as they lie on the hub, or a safetensors file (with a
+    /// `config.json` beside it, if there is one). Without a description the network is told by its keys.
+    pub fn open(path: &Path, options: &Da3Options) -> Result<Self, Da3Error> {
+        let (weights, description) = locate(path)?;
+        let described = match description {
+            Some(file) => Some(json::parse(&read_config(&file)?, &file.display().to_string())?),
+            None => None,
+        };
+        let checkpoint = Checkpoint::open(&weights)?;
+        let config = match described {
+            Some(config) => config,
+            None => detect(&checkpoint)?.config(),
+        };
+        verify(&checkpoint, &config)?;
+        let bytes = checkpoint.file_bytes() as u64;
+        let origin = WeightsOrigin::File { path: weights, bytes };
+        let source: Arc<dyn WeightSource> = Arc::new(checkpoint);
+        Self::load(config, &source, options, origin)
+    }
+
+    /// A model whose weights come from elsewhere.
+    pub fn with_weights(
+        config: Da3Config,
+        source: Arc<dyn WeightSource>,
+        options: &Da3Options,
+    ) -> Result<Self, Da3Error> {
+        Self::load(config, &source, options, WeightsOrigin::Given)
+    }
+
+    /// An official variant with weights made by rule, for tests and timings: its geometry means nothing.
+    pub fn deterministic(variant: Variant, options: &Da3Options) -> Result<Self, Da3Error> {
+        Self::deterministic_of(variant.config(), options)
+    }
+
+    /// As [`Da3::deterministic`], for any description.
+    pub fn deterministic_of(config: Da3Config, options: &Da3Options) -> Result<Self, Da3Error> {
+        let source: Arc<dyn WeightSource> = Arc::new(DeterministicWeights);
+        Self::load(config, &source, options, WeightsOrigin::Deterministic)
+    }
+
+    fn load(
+        config: Da3Config,
+        source: &Arc<dyn WeightSource>,
+        options: &Da3Options,
+        origin: WeightsOrigin,
+    ) -> Result<Self, Da3Error> {
+        config.validate()?;
+        let backbone = match options.isa {
+            Some(isa) => Compute::with_isa(isa, options.precision)?,
+            None => Compute::new(options.precision),
+        };
+        Ok(Self {
+            model: Model::load(source, &config, options.residency)?,
+            config,
+            backbone,
+            head: backbone.at(options.head_precision.unwrap_or(options.precision)),
+            source: origin,
+        })
+    }
+
+    /// What the model is.
+    pub fn config(&self) -> &Da3Config {
+        &self.config
+    }
+
+    /// Where its weights come from.
+    pub fn origin(&self) -> &WeightsOrigin {
+        &self.source
+    }
+
+    /// Kernels and precision of the backbone.
+    pub fn compute(&self) -> Compute {
+        self.backbone
+    }
+
+    /// Whether it takes several views at once and answers cameras.
+    pub fn is_any_view(&self) -> bool {
+        self.config.main().is_any_view()
+    }
+
+    pub(crate) fn run<'a>(&self, hooks: &Hooks<'a>) -> Run<'a> {
+        Run { backbone: self.backbone, head: self.head, cancel: hooks.cancel, trace: hooks.trace }
+    }
+}
+
+fn locate(path: &Path) -> Result<(PathBuf, Option<PathBuf>), Da3Error> {
+    let weights = if path.is_dir() { path.join(WEIGHTS_FILE) } else { path.to_path_buf() };
+    if !weights.is_file() {
+        return Err(Da3Error::NoModel { path: path.to_path_buf() });
+    }
+    let description = weights.parent().map(|folder| folder.join(CONFIG_FILE)).filter(|file| file.is_file());
+    Ok((weights, description))
+}
+
+fn read_config(file: &Path) -> Result<String, Da3Error> {
+    let io = |source| Da3Error::Io { path: file.to_path_buf(), source };
+    let bytes = std::fs::metadata(file).map_err(io)?.len();
+    if bytes > json::MAX_BYTES {
+        let place = file.display().to_string();
+        return Err(Da3Error::ConfigTooLarge { place, bytes, max: json::MAX_BYTES });
+    }
+    std::fs::read_to_string(file).map_err(io)
+}

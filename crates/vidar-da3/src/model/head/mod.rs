@@ -1,0 +1,13 @@
+//! The dense heads, `head`: from features to maps at the picture's size. They run view by view.
+
+mod dpt;
+mod dual_dpt;
+mod fusion;
+mod map;
+mod stages;
+mod tail;
+mod uv;
+
+pub(crate) use dpt::Dpt;
+pub(crate) use dual_dpt::{DenseView, DualDpt, Embeddings};
+pub(crate) use map::Map;

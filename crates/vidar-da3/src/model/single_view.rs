@@ -1,0 +1,91 @@
+//! A network of single views: backbone and DPT head with sky (the metric and the monocular one).
+
+use super::backbone::{Backbone, CameraTokens, Feature, FeatureSink, Pixels, ReferenceStrategy};
+use super::head::{Dpt, Map};
+use crate::config::NetConfig;
+use crate::error::Da3Error;
+use crate::run::Run;
+use crate::sky;
+use crate::weights::{Residency, Scope};
+use std::collections::BTreeMap;
+
+/// The network's parts.
+pub(crate) struct SingleView {
+    config: NetConfig,
+    backbone: Backbone,
+    head: Dpt,
+}
+
+/// What the network says; all views one after the other.
+pub(crate) struct SingleAnswer {
+    /// `[views, H, W]`, sky filled.
+    pub depth: Vec<f32>,
+    /// `[views, H, W]`.
+    pub sky: Vec<f32>,
+    /// By layer and view: normalised patch tokens.
+    pub layers: BTreeMap<usize, Vec<Vec<f32>>>,
+}
+
+impl SingleView {
+    pub fn load(scope: &Scope, config: &NetConfig, residency: Residency) -> Result<Self, Da3Error> {
+        Ok(Self {
+            backbone: Backbone::load(&scope.at("backbone.pretrained"), &config.backbone, residency)?,
+            head: Dpt::load(&scope.at("head"), config.backbone.feature_dim(), &config.head)?,
+            config: config.clone(),
+        })
+    }
+
+    pub fn run(
+        &self,
+        run: &Run<'_>,
+        pixels: &Pixels<'_>,
+        layers: &[usize],
+    ) -> Result<SingleAnswer, Da3Error> {
+        let mut features = Features {
+            net: self,
+            size: pixels.patches(),
+            stages: (0..pixels.views).map(|_| Vec::with_capacity(4)).collect(),
+            layers: BTreeMap::new(),
+        };
+        let tokens = CameraTokens::Trained(ReferenceStrategy::First);
+        self.backbone.run(run, pixels, tokens, layers, &mut features)?;
+        let area = pixels.rows * pixels.columns;
+        let (mut depth, mut sky) =
+            (Vec::with_capacity(pixels.views * area), Vec::with_capacity(pixels.views * area));
+        for (view, stages) in features.stages.into_iter().enumerate() {
+            run.checkpoint()?;
+            let (view_depth, view_sky) = self.head.run(run, view, stages, (pixels.rows, pixels.columns))?;
+            run.show("head.depth_before_sky", view, &[pixels.rows, pixels.columns], &view_depth);
+            depth.extend(view_depth);
+            sky.extend(view_sky);
+        }
+        sky::fill(&mut depth, &sky);
+        Ok(SingleAnswer { depth, sky, layers: features.layers })
+    }
+}
+
+/// Takes features as the backbone yields them and keeps only their projections.
+struct Features<'a> {
+    net: &'a SingleView,
+    size: (usize, usize),
+    stages: Vec<Vec<Map>>,
+    layers: BTreeMap<usize, Vec<Vec<f32>>>,
+}
+
+impl FeatureSink for Features<'_> {
+    fn take(&mut self, run: &Run<'_>, feature: Feature<'_>) -> Result<(), Da3Error> {
+        let Feature { stage, view, global, .. } = feature;
+        let dim = self.net.config.backbone.dim;
+        run.show(&format!("camtok{stage}"), view, &[dim], &global[..dim]);
+        let mut normed = global[dim..].to_vec();
+        self.net.backbone.norm().apply_in_place(&mut normed);
+        run.show(&format!("feat{stage}"), view, &[normed.len() / dim, dim], &normed);
+        self.stages[view].push(self.net.head.project(run, (view, stage), &normed, self.size));
+        Ok(())
+    }
+
+    fn take_extra(&mut self, layer: usize, view: usize, patches: Vec<f32>) {
+        let views = self.stages.len();
+        self.layers.entry(layer).or_insert_with(|| vec![Vec::new(); views])[view] = patches;
+    }
+}

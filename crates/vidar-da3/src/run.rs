@@ -1,0 +1,41 @@
+//! What accompanies a run through the network: kernels, the wish to stop, somebody who looks on.
+
+use crate::error::Da3Error;
+use crate::trace::{Layout, Trace, Traced};
+use vidar_nn::Compute;
+
+/// Passed by reference to every part.
+#[derive(Clone, Copy)]
+pub(crate) struct Run<'a> {
+    /// Kernels and precision of backbone and camera parts.
+    pub backbone: Compute,
+    /// Kernels and precision of the dense head.
+    pub head: Compute,
+    /// Asked between blocks and views; `true` ends the run.
+    pub cancel: &'a (dyn Fn() -> bool + Sync),
+    /// Who looks on.
+    pub trace: Option<&'a dyn Trace>,
+}
+
+impl Run<'_> {
+    /// Stops the run when the caller wants it to.
+    pub fn checkpoint(&self) -> Result<(), Da3Error> {
+        if (self.cancel)() { Err(Da3Error::Cancelled) } else { Ok(()) }
+    }
+
+    /// Shows a result to whoever looks on.
+    pub fn show(&self, name: &str, view: usize, shape: &[usize], data: &[f32]) {
+        self.show_as(Layout::Rows, name, view, shape, data);
+    }
+
+    /// Shows a map `[rows, columns, channels]`.
+    pub fn show_map(&self, name: &str, view: usize, shape: [usize; 3], data: &[f32]) {
+        self.show_as(Layout::Map, name, view, &shape, data);
+    }
+
+    fn show_as(&self, layout: Layout, name: &str, view: usize, shape: &[usize], data: &[f32]) {
+        if let Some(trace) = self.trace.filter(|trace| trace.wants(name)) {
+            trace.record(Traced { name, view, shape, layout, data });
+        }
+    }
+}
