@@ -1,9 +1,14 @@
 //! Multi-head attention, computed block by block: memory grows with the number of tokens, not with its square.
 
-use rayon::prelude::*;
+use std::ops::Range;
 
-use crate::compute::Compute;
+use crate::compute::{Compute, Isa};
+use crate::kernels::attend::{
+    Attend, BLOCK, HeadLayout, LayoutOf, PackKeys, Prepare, QUERIES, Tokens, for_each_part,
+};
+use crate::kernels::scratch::{self, Role};
 use crate::kernels::shared::SharedMut;
+use crate::kernels::{Factors, dispatch_product};
 use crate::norm::LayerNorm;
 use crate::rope::RopeTable;
 
@@ -25,6 +30,16 @@ impl AttentionSpec<'_> {
     pub const fn width(&self) -> usize {
         self.heads * self.head_dim
     }
+
+    fn check(&self) {
+        let d = self.head_dim;
+        if let Some((q, k)) = self.qk_norm {
+            assert!(q.features() == d && k.features() == d, "attention: norms over {d} channels");
+        }
+        if let Some(rope) = self.rope {
+            assert_eq!(rope.head_dim(), d, "attention: rotation of {d} channels");
+        }
+    }
 }
 
 /// Rows of a token matrix that may be wider than what is used: token t is `data[t * stride..][..width]`.
@@ -45,10 +60,79 @@ impl<'a> TokenRows<'a> {
         [0, 1, 2].map(|i| Self { data: qkv.get(i * width..).unwrap_or(&[]), stride: 3 * width, tokens })
     }
 
-    fn token(&self, token: usize, width: usize) -> &'a [f32] {
-        &self.data[token * self.stride..][..width]
+    fn kernel(self) -> Tokens<'a> {
+        Tokens { data: self.data, stride: self.stride }
     }
 }
+
+/// Packed keys and values of one sequence, all heads: what queries meet. A sequence of many views can be pushed view by
+/// view, so that only this packed form of all views exists at a time (in bf16, 4 bytes per token and channel).
+#[derive(Debug, Clone)]
+pub struct KeyValues {
+    words: Vec<f32>,
+    layout: HeadLayout,
+    heads: usize,
+    tokens: usize,
+    isa: Isa,
+    factors: Factors,
+}
+
+impl KeyValues {
+    /// Room for `capacity` tokens.
+    pub fn new(c: &Compute, spec: &AttentionSpec<'_>, capacity: usize) -> Self {
+        let (isa, factors) = (c.isa(), Factors::of(c));
+        let layout = dispatch_product(isa, factors, LayoutOf { d: spec.head_dim, keys: capacity });
+        Self {
+            words: vec![0.0; layout.words() * spec.heads],
+            layout,
+            heads: spec.heads,
+            tokens: 0,
+            isa,
+            factors,
+        }
+    }
+
+    /// Tokens pushed so far.
+    pub fn tokens(&self) -> usize {
+        self.tokens
+    }
+
+    /// Bytes held.
+    pub fn bytes(&self) -> usize {
+        self.words.len() * 4
+    }
+
+    /// Appends the keys (normalised and rotated as `spec` says) and values of some tokens, whose rotation counts from the
+    /// first of them.
+    ///
+    /// # Panics
+    /// When there is no room, the numbers of keys and values differ, a slice is too short, or `spec` has other heads.
+    pub fn push(&mut self, spec: &AttentionSpec<'_>, k: TokenRows<'_>, v: TokenRows<'_>) {
+        assert_eq!((spec.heads, spec.head_dim), (self.heads, self.layout.d), "keys of other heads");
+        assert!(self.tokens + k.tokens <= self.layout.capacity, "{} + {} keys", self.tokens, k.tokens);
+        let words = SharedMut::new(&mut self.words);
+        push(self.isa, self.factors, spec, 0..self.heads, [k, v], self.layout, words, self.tokens);
+        self.tokens += k.tokens;
+    }
+
+    /// Attention of some queries to all tokens pushed so far; `out` is `[q.tokens, heads, head_dim]`. Queries' rotation counts
+    /// from the first of them.
+    ///
+    /// # Panics
+    /// When a slice has another length, nothing was pushed, or `spec` has other heads.
+    pub fn attend(&self, spec: &AttentionSpec<'_>, q: TokenRows<'_>, out: &mut [f32]) {
+        assert_eq!((spec.heads, spec.head_dim), (self.heads, self.layout.d), "queries of other heads");
+        assert_eq!(out.len(), q.tokens * spec.width(), "attention: output");
+        assert!(self.tokens > 0 || q.tokens == 0, "attention to no keys");
+        let words = scratch::as_words(&self.words);
+        let out = SharedMut::new(out);
+        attend(self.isa, self.factors, spec, 0..self.heads, q, (self.layout, words, self.tokens), out);
+    }
+}
+
+/// Words of packed keys and values that exist at a time when a whole sequence is at hand: more heads are packed at once
+/// for short sequences.
+const PACKED_WORDS: usize = 2 << 20;
 
 /// Self-attention of `sequences` sequences of `tokens` tokens each. `qkv` is `[sequences * tokens, 3, heads, head_dim]` as
 /// a linear layer writes it, `out` is `[sequences * tokens, heads, head_dim]`.
@@ -81,76 +165,97 @@ pub fn attention(
 /// # Panics
 /// When the numbers of keys and values differ, a slice is too short, or a norm or rotation has another head dimension.
 pub fn attention_separate(
-    _c: &Compute,
+    c: &Compute,
     q: TokenRows<'_>,
     k: TokenRows<'_>,
     v: TokenRows<'_>,
     spec: &AttentionSpec<'_>,
     out: &mut [f32],
 ) {
-    let (d, width) = (spec.head_dim, spec.width());
-    assert_eq!(k.tokens, v.tokens, "attention: keys and values");
-    assert_eq!(out.len(), q.tokens * width, "attention: output");
-    if let Some((qn, kn)) = spec.qk_norm {
-        assert!(qn.features() == d && kn.features() == d, "attention: norms over {d} channels");
+    assert_eq!(out.len(), q.tokens * spec.width(), "attention: output");
+    if out.is_empty() {
+        return;
     }
-    if let Some(rope) = spec.rope {
-        assert_eq!(rope.head_dim(), d, "attention: rotation of {d} channels");
-    }
+    assert!(k.tokens > 0, "attention to no keys");
+    let (isa, factors) = (c.isa(), Factors::of(c));
+    let layout = dispatch_product(isa, factors, LayoutOf { d: spec.head_dim, keys: k.tokens });
+    let at_once = (PACKED_WORDS / layout.words().max(1)).clamp(1, spec.heads);
     let out = SharedMut::new(out);
-    let prepare =
-        |rows: TokenRows<'_>, token: usize, head: usize, norm: Option<&LayerNorm>, to: &mut [f32]| {
-            to.copy_from_slice(&rows.token(token, width)[head * d..(head + 1) * d]);
-            if let Some(norm) = norm {
-                norm.row(to);
-            }
-            if let Some(rope) = spec.rope {
-                rope.rotate(token, to);
-            }
-        };
-    for head in 0..spec.heads {
-        let mut keys = vec![0.0; k.tokens * d];
-        keys.par_chunks_mut(d.max(1)).enumerate().for_each(|(t, to)| {
-            prepare(k, t, head, spec.qk_norm.map(|n| n.1), to);
-        });
-        let scale = 1.0 / (d as f32).sqrt();
-        (0..q.tokens).into_par_iter().with_min_len(16).for_each(|t| {
-            let mut query = vec![0.0; d];
-            prepare(q, t, head, spec.qk_norm.map(|n| n.0), &mut query);
-            query.iter_mut().for_each(|x| *x *= scale);
-            // SAFETY: each task writes its own token's part of this head.
-            let out = unsafe { out.part(t * width + head * d, d) };
-            out.fill(0.0);
-            let (mut top, mut total) = (f32::NEG_INFINITY, 0.0);
-            for first in (0..k.tokens).step_by(64) {
-                let count = 64.min(k.tokens - first);
-                let mut scores = [0.0f32; 64];
-                for (score, key) in
-                    scores.iter_mut().zip(keys[first * d..(first + count) * d].chunks_exact(d))
-                {
-                    let mut lanes = [0.0f32; 8];
-                    for (q, k) in query.chunks(8).zip(key.chunks(8)) {
-                        for ((lane, q), k) in lanes.iter_mut().zip(q).zip(k) {
-                            *lane += q * k;
-                        }
-                    }
-                    *score = lanes.iter().sum();
-                }
-                let block_top = scores[..count].iter().copied().fold(top, f32::max);
-                let shrink = (top - block_top).exp();
-                total *= shrink;
-                out.iter_mut().for_each(|o| *o *= shrink);
-                top = block_top;
-                for (i, score) in scores[..count].iter().enumerate() {
-                    let p = (score - top).exp();
-                    total += p;
-                    let value = &v.token(first + i, width)[head * d..(head + 1) * d];
-                    for (o, value) in out.iter_mut().zip(value) {
-                        *o += p * value;
-                    }
-                }
-            }
-            out.iter_mut().for_each(|o| *o /= total);
-        });
+    let mut packed = scratch::borrow(Role::Keys);
+    for first in (0..spec.heads).step_by(at_once) {
+        let heads = first..(first + at_once).min(spec.heads);
+        let packed = &mut packed.words(layout.words() * heads.len())[..layout.words() * heads.len()];
+        let words = SharedMut::new(scratch::as_floats_mut(packed));
+        push(isa, factors, spec, heads.clone(), [k, v], layout, words, 0);
+        attend(isa, factors, spec, heads, q, (layout, packed, k.tokens), out);
     }
+}
+
+/// Packs keys and values of some heads, one after the other in `words`, behind `before` keys already there.
+#[allow(clippy::too_many_arguments)] // two callers, both above
+fn push(
+    isa: Isa,
+    factors: Factors,
+    spec: &AttentionSpec<'_>,
+    heads: Range<usize>,
+    [k, v]: [TokenRows<'_>; 2],
+    layout: HeadLayout,
+    words: SharedMut<'_>,
+    before: usize,
+) {
+    spec.check();
+    assert_eq!(k.tokens, v.tokens, "attention: keys and values");
+    if k.tokens == 0 {
+        return;
+    }
+    let blocks = before / BLOCK..(before + k.tokens).div_ceil(BLOCK);
+    let prepare = Prepare { norm: spec.qk_norm.map(|n| n.1.view()), rope: spec.rope };
+    for_each_part(heads.len(), blocks.len(), |head, block| {
+        let block = blocks.start + block;
+        let first = before.max(block * BLOCK);
+        let count = ((block + 1) * BLOCK).min(before + k.tokens) - first;
+        let pack = PackKeys {
+            layout,
+            words,
+            base: head * layout.words(),
+            k: k.kernel(),
+            v: v.kernel(),
+            prepare,
+            channel: (heads.start + head) * spec.head_dim,
+            first,
+            token: first - before,
+            count,
+        };
+        dispatch_product(isa, factors, pack);
+    });
+}
+
+/// Takes queries of some heads through packed keys.
+fn attend(
+    isa: Isa,
+    factors: Factors,
+    spec: &AttentionSpec<'_>,
+    heads: Range<usize>,
+    q: TokenRows<'_>,
+    (layout, words, keys): (HeadLayout, &[u32], usize),
+    out: SharedMut<'_>,
+) {
+    spec.check();
+    let prepare = Prepare { norm: spec.qk_norm.map(|n| n.0.view()), rope: spec.rope };
+    for_each_part(heads.len(), q.tokens.div_ceil(QUERIES), |head, part| {
+        let first = part * QUERIES;
+        let task = Attend {
+            layout,
+            words: &words[head * layout.words()..(head + 1) * layout.words()],
+            keys,
+            q: q.kernel(),
+            prepare,
+            channel: (heads.start + head) * spec.head_dim,
+            first,
+            count: QUERIES.min(q.tokens - first),
+            out,
+            out_stride: spec.width(),
+        };
+        dispatch_product(isa, factors, task);
+    });
 }

@@ -93,7 +93,8 @@ impl Isa {
 
     /// The fastest kernel set of this machine.
     pub fn detect() -> Self {
-        Self::available().pop().unwrap_or(Self::Portable)
+        let by_speed = [Self::Amx, Self::Avx512, Self::Avx2, Self::Neon];
+        by_speed.into_iter().find(|isa| crate::kernels::is_available(*isa)).unwrap_or(Self::Portable)
     }
 }
 
@@ -122,6 +123,13 @@ impl FromStr for Isa {
 pub struct Compute {
     isa: Isa,
     precision: Precision,
+}
+
+impl Default for Compute {
+    /// The best kernel set of this machine, in `f32`.
+    fn default() -> Self {
+        Self::new(Precision::F32)
+    }
 }
 
 impl Compute {

@@ -5,8 +5,11 @@
 
 use crate::compute::Compute;
 use crate::error::NnError;
-use crate::kernels::gemm::{Columns, Product, Rows, Run};
-use crate::linear::{Epilogue, FlatRows, WeightRows, vector, wrong_shape};
+use crate::kernels::gemm::{End, OutLayout, Product};
+use crate::kernels::pack::Columns;
+use crate::kernels::scratch::{self, Role};
+use crate::kernels::source::{Bands, Fill, Source};
+use crate::linear::{Epilogue, vector, wrong_shape};
 use crate::weight::Weight;
 
 /// What is done with a convolution's input before it is used.
@@ -83,30 +86,52 @@ impl Conv2d {
         assert_eq!(x.data.len(), h * w * self.inputs, "input of a convolution");
         assert_eq!(out.len(), oh * ow * self.outputs, "output of a convolution");
         let end = epilogue.checked(self.outputs, out.len());
-        let bias = self.bias.as_deref();
-        if self.kernel == [1, 1] && self.stride == 1 && self.padding == 0 && input == ConvInput::None {
-            let rows = FlatRows::new(x.data, h * w, self.inputs, self.outputs);
-            let columns = WeightRows { weight: &self.weight, inner: self.inputs };
-            Product { rows: &rows, columns: &columns, width: self.outputs, bias, end }.run(c, out);
-            return;
+        let source =
+            if self.kernel == [1, 1] && self.stride == 1 && self.padding == 0 && input == ConvInput::None {
+                Source::Flat { x: x.data, rows: h * w, inner: self.inputs, norm: None }
+            } else {
+                let fill = match input {
+                    ConvInput::None => Fill::Copy(x.data),
+                    ConvInput::Relu => Fill::Relu(x.data),
+                };
+                Source::Bands(self.bands(fill, h, w))
+            };
+        let layout = OutLayout::dense(oh * ow, self.outputs);
+        Product { source, columns: self, width: self.outputs, bias: self.bias.as_deref(), end, layout }
+            .run(c, out);
+    }
+
+    pub(crate) fn bands<'a>(&self, fill: Fill<'a>, rows: usize, cols: usize) -> Bands<'a> {
+        let (out_rows, out_cols) = self.output_size(rows, cols);
+        Bands {
+            fill,
+            rows,
+            cols,
+            channels: self.inputs,
+            kernel: self.kernel,
+            stride: self.stride,
+            padding: self.padding,
+            out_rows,
+            out_cols,
         }
-        let band_rows = (TASK_PIXELS / ow.max(1)).clamp(1, oh.max(1));
-        let padded = w + 2 * self.padding;
-        let taps = (0..self.kernel[0]).map(|ky| ky * padded * self.inputs).collect();
-        let rows = Bands {
-            conv: self,
-            x: x.data,
-            h,
-            w,
-            oh,
-            ow,
-            band_rows,
-            padded,
-            taps,
-            relu: input == ConvInput::Relu,
-        };
-        let columns = ConvColumns { weight: &self.weight, inputs: self.inputs, kernel: self.kernel };
-        Product { rows: &rows, columns: &columns, width: self.outputs, bias, end }.run(c, out);
+    }
+}
+
+/// Columns of B are the kernels of the output channels, in the order [ky][kx][in] of the taps.
+impl Columns for Conv2d {
+    fn read(&self, column: usize, out: &mut [f32]) {
+        let area = self.kernel[0] * self.kernel[1];
+        if area == 1 {
+            return self.weight.read(column * out.len(), out);
+        }
+        let mut scratch = scratch::borrow(Role::Kernels);
+        let kernels = &mut scratch.floats(out.len())[..out.len()];
+        self.weight.read(column * kernels.len(), kernels);
+        for (i, kernel) in kernels.chunks_exact(area).enumerate() {
+            for (tap, value) in kernel.iter().enumerate() {
+                out[tap * self.inputs + i] = *value;
+            }
+        }
     }
 }
 
@@ -125,101 +150,6 @@ impl<'a> MapRef<'a> {
     /// A map of `rows` × `cols` pixels.
     pub const fn new(data: &'a [f32], rows: usize, cols: usize) -> Self {
         Self { data, rows, cols }
-    }
-}
-
-/// Output pixels of one task: enough to hide the repeated border rows, few enough to stay in the second-level cache.
-const TASK_PIXELS: usize = 1024;
-
-struct Bands<'a> {
-    conv: &'a Conv2d,
-    x: &'a [f32],
-    h: usize,
-    w: usize,
-    oh: usize,
-    ow: usize,
-    band_rows: usize,
-    padded: usize,
-    taps: Vec<usize>,
-    relu: bool,
-}
-
-impl Bands<'_> {
-    fn band(&self, chunk: usize) -> std::ops::Range<usize> {
-        let first = chunk * self.band_rows;
-        first..(first + self.band_rows).min(self.oh)
-    }
-}
-
-impl Rows for Bands<'_> {
-    fn chunks(&self) -> usize {
-        if self.ow == 0 { 0 } else { self.oh.div_ceil(self.band_rows) }
-    }
-    fn chunk<'s>(&'s self, chunk: usize, scratch: &'s mut Vec<f32>) -> &'s [f32] {
-        let (band, conv) = (self.band(chunk), self.conv);
-        let line = self.padded * conv.inputs;
-        let needed = (band.len() - 1) * conv.stride + conv.kernel[0];
-        scratch.clear();
-        scratch.resize(needed * line, 0.0);
-        if line == 0 {
-            return scratch;
-        }
-        for (i, to) in scratch.chunks_exact_mut(line).enumerate() {
-            let Some(row) =
-                (band.start * conv.stride + i).checked_sub(conv.padding).filter(|row| *row < self.h)
-            else {
-                continue;
-            };
-            let from = &self.x[row * self.w * conv.inputs..(row + 1) * self.w * conv.inputs];
-            let to = &mut to[conv.padding * conv.inputs..][..from.len()];
-            if self.relu {
-                for (to, from) in to.iter_mut().zip(from) {
-                    *to = if *from < 0.0 { 0.0 } else { *from };
-                }
-            } else {
-                to.copy_from_slice(from);
-            }
-        }
-        scratch
-    }
-    fn runs(&self, chunk: usize, run: &mut dyn FnMut(Run)) {
-        let band = self.band(chunk);
-        for (i, oy) in band.enumerate() {
-            let a = i * self.conv.stride * self.padded * self.conv.inputs;
-            run(Run { a, out: oy * self.ow * self.conv.outputs, len: self.ow });
-        }
-    }
-    fn taps(&self) -> &[usize] {
-        &self.taps
-    }
-    fn group(&self) -> usize {
-        self.conv.kernel[1] * self.conv.inputs
-    }
-    fn row_stride(&self) -> usize {
-        self.conv.stride * self.conv.inputs
-    }
-    fn out_stride(&self) -> usize {
-        self.conv.outputs
-    }
-}
-
-/// Columns of B are the kernels of the output channels, in the order [ky][kx][in] of the taps.
-struct ConvColumns<'a> {
-    weight: &'a Weight,
-    inputs: usize,
-    kernel: [usize; 2],
-}
-
-impl Columns for ConvColumns<'_> {
-    fn read(&self, column: usize, out: &mut [f32]) {
-        let area = self.kernel[0] * self.kernel[1];
-        let mut kernels = vec![0.0; out.len()];
-        self.weight.read(column * out.len(), &mut kernels);
-        for (i, kernel) in kernels.chunks_exact(area).enumerate() {
-            for (tap, value) in kernel.iter().enumerate() {
-                out[tap * self.inputs + i] = *value;
-            }
-        }
     }
 }
 
@@ -269,80 +199,47 @@ impl ConvTranspose2d {
         let k = self.kernel;
         assert_eq!(x.data.len(), h * w * self.inputs, "input of a transposed convolution");
         assert_eq!(out.len(), h * w * k * k * self.outputs, "output of a transposed convolution");
+        if self.inputs == 0 || out.is_empty() {
+            let bias = self.bias.as_deref().unwrap_or(&[]);
+            out.chunks_exact_mut(bias.len().max(1)).for_each(|out| out.copy_from_slice(bias));
+            return;
+        }
         // One product per row of the kernel: the k pixels that an input pixel gives in an output row are consecutive.
+        // The weight is small and in an unhandy order, so it is put in order once: [ky][kx][out][in].
+        let mut ordered = vec![0.0; self.weight.len()];
+        let mut row = vec![0.0; self.outputs * k * k];
+        for i in 0..self.inputs {
+            self.weight.read(i * row.len(), &mut row);
+            for (o, block) in row.chunks_exact(k * k).enumerate() {
+                for (tap, value) in block.iter().enumerate() {
+                    ordered[(tap * self.outputs + o) * self.inputs + i] = *value;
+                }
+            }
+        }
         let bias: Option<Vec<f32>> = self.bias.as_ref().map(|bias| bias.repeat(k));
-        for ky in 0..k {
-            let rows = SpreadRows { x: x.data, h, w, inputs: self.inputs, k, ky, outputs: self.outputs };
-            let columns = SpreadColumns {
-                weight: &self.weight,
-                inputs: self.inputs,
-                outputs: self.outputs,
-                kernel: k,
-                ky,
-            };
+        let width = k * self.outputs;
+        for (ky, kernel_row) in ordered.chunks_exact(width * self.inputs).enumerate() {
+            let line = w * width;
             let product = Product {
-                rows: &rows,
-                columns: &columns,
-                width: k * self.outputs,
+                source: Source::Flat { x: x.data, rows: h * w, inner: self.inputs, norm: None },
+                columns: &DenseColumns { values: kernel_row, inner: self.inputs },
+                width,
                 bias: bias.as_deref(),
-                end: crate::kernels::gemm::End::Store,
+                end: End::Store,
+                layout: OutLayout { line: w, line_stride: k * line, row_stride: width, offset: ky * line },
             };
             product.run(c, out);
         }
     }
 }
 
-struct SpreadRows<'a> {
-    x: &'a [f32],
-    h: usize,
-    w: usize,
-    inputs: usize,
-    k: usize,
-    ky: usize,
-    outputs: usize,
+struct DenseColumns<'a> {
+    values: &'a [f32],
+    inner: usize,
 }
 
-impl Rows for SpreadRows<'_> {
-    fn chunks(&self) -> usize {
-        if self.w == 0 { 0 } else { self.h }
-    }
-    fn chunk<'s>(&'s self, chunk: usize, _scratch: &'s mut Vec<f32>) -> &'s [f32] {
-        let line = self.w * self.inputs;
-        &self.x[chunk * line..(chunk + 1) * line]
-    }
-    fn runs(&self, chunk: usize, run: &mut dyn FnMut(Run)) {
-        let out = (chunk * self.k + self.ky) * self.w * self.k * self.outputs;
-        run(Run { a: 0, out, len: self.w });
-    }
-    fn taps(&self) -> &[usize] {
-        &[0]
-    }
-    fn group(&self) -> usize {
-        self.inputs
-    }
-    fn row_stride(&self) -> usize {
-        self.inputs
-    }
-    fn out_stride(&self) -> usize {
-        self.k * self.outputs
-    }
-}
-
-/// Column (kx, out channel) of kernel row `ky`.
-struct SpreadColumns<'a> {
-    weight: &'a Weight,
-    inputs: usize,
-    outputs: usize,
-    kernel: usize,
-    ky: usize,
-}
-
-impl Columns for SpreadColumns<'_> {
+impl Columns for DenseColumns<'_> {
     fn read(&self, column: usize, out: &mut [f32]) {
-        let (kx, channel) = (column / self.outputs, column % self.outputs);
-        for i in 0..self.inputs {
-            let at = ((i * self.outputs + channel) * self.kernel + self.ky) * self.kernel + kx;
-            self.weight.read(at, &mut out[i..=i]);
-        }
+        out.copy_from_slice(&self.values[column * self.inner..(column + 1) * self.inner]);
     }
 }

@@ -20,13 +20,15 @@ mod resize;
 mod rope;
 mod weight;
 
-pub use attention::{AttentionSpec, TokenRows, attention, attention_separate};
+pub use attention::{AttentionSpec, KeyValues, TokenRows, attention, attention_separate};
 pub use checkpoint::{Checkpoint, CheckpointError, Dtype, TensorView, WeightSource};
 pub use compute::{Compute, Isa, Precision};
 pub use conv::{Conv2d, ConvInput, ConvTranspose2d, MapRef};
 pub use error::NnError;
 pub use linear::{Epilogue, Linear};
 pub use norm::LayerNorm;
-pub use resize::{Corners, resize_bicubic_scaled, resize_bilinear};
+pub use resize::{
+    Corners, GridEmbedding, MapSize, resize_bicubic_scaled, resize_bilinear, resize_bilinear_on,
+};
 pub use rope::RopeTable;
 pub use weight::Weight;

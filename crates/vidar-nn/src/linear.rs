@@ -2,7 +2,10 @@
 
 use crate::compute::Compute;
 use crate::error::NnError;
-use crate::kernels::gemm::{Columns, End, Product, Rows, Run};
+use crate::kernels::gemm::{End, OutLayout, Product};
+use crate::kernels::pack::Columns;
+use crate::kernels::source::Source;
+use crate::norm::LayerNorm;
 use crate::weight::Weight;
 
 /// What is done with a layer's sums before they are stored.
@@ -82,13 +85,27 @@ impl Linear {
     /// # Panics
     /// When a slice has another length.
     pub fn apply(&self, c: &Compute, x: &[f32], rows: usize, out: &mut [f32], epilogue: Epilogue<'_>) {
-        assert_eq!(x.len(), rows * self.inputs, "input of a linear layer");
         assert_eq!(out.len(), rows * self.outputs, "output of a linear layer");
         let end = epilogue.checked(self.outputs, out.len());
-        let rows = FlatRows::new(x, rows, self.inputs, self.outputs);
-        let columns = WeightRows { weight: &self.weight, inner: self.inputs };
-        Product { rows: &rows, columns: &columns, width: self.outputs, bias: self.bias.as_deref(), end }
-            .run(c, out);
+        self.product(self.flat(x, rows, None), rows, self.outputs, end).run(c, out);
+    }
+
+    /// As [`Linear::apply`] of the layer norm of `x`, which is never stored.
+    ///
+    /// # Panics
+    /// When a slice has another length, or the norm another width.
+    pub fn apply_normed(
+        &self,
+        c: &Compute,
+        norm: &LayerNorm,
+        x: &[f32],
+        rows: usize,
+        out: &mut [f32],
+        epilogue: Epilogue<'_>,
+    ) {
+        assert_eq!(out.len(), rows * self.outputs, "output of a linear layer");
+        let end = epilogue.checked(self.outputs, out.len());
+        self.product(self.flat(x, rows, Some(norm)), rows, self.outputs, end).run(c, out);
     }
 
     /// The gated unit of SwiGLU: the first half of the layer's outputs gates the second, `out = silu(gate) * value`;
@@ -97,19 +114,49 @@ impl Linear {
     /// # Panics
     /// When a slice has another length, or the number of outputs is odd.
     pub fn apply_swiglu(&self, c: &Compute, x: &[f32], rows: usize, out: &mut [f32]) {
+        self.gated(c, None, x, rows, out);
+    }
+
+    /// As [`Linear::apply_swiglu`] of the layer norm of `x`, which is never stored.
+    ///
+    /// # Panics
+    /// When a slice has another length, the norm another width, or the number of outputs is odd.
+    pub fn apply_swiglu_normed(
+        &self,
+        c: &Compute,
+        norm: &LayerNorm,
+        x: &[f32],
+        rows: usize,
+        out: &mut [f32],
+    ) {
+        self.gated(c, Some(norm), x, rows, out);
+    }
+
+    fn gated(&self, c: &Compute, norm: Option<&LayerNorm>, x: &[f32], rows: usize, out: &mut [f32]) {
         assert_eq!(self.outputs % 2, 0, "a gated unit has an even number of outputs");
         assert_eq!(out.len(), rows * self.outputs / 2, "output of a gated unit");
-        let mut both = vec![0.0; rows * self.outputs];
-        self.apply(c, x, rows, &mut both, Epilogue::None);
-        let half = self.outputs / 2;
-        if half > 0 {
-            for (both, out) in both.chunks_exact(2 * half).zip(out.chunks_exact_mut(half)) {
-                let (gate, value) = both.split_at(half);
-                for ((out, gate), value) in out.iter_mut().zip(gate).zip(value) {
-                    *out = gate / (1.0 + (-gate).exp()) * value;
-                }
-            }
-        }
+        self.product(self.flat(x, rows, norm), rows, self.outputs / 2, End::SwiGlu).run(c, out);
+    }
+
+    fn flat<'a>(&self, x: &'a [f32], rows: usize, norm: Option<&'a LayerNorm>) -> Source<'a> {
+        assert_eq!(x.len(), rows * self.inputs, "input of a linear layer");
+        let norm = norm.map(|norm| {
+            assert_eq!(norm.features(), self.inputs, "norm before a linear layer");
+            norm.view()
+        });
+        Source::Flat { x, rows, inner: self.inputs, norm }
+    }
+
+    fn product<'a>(&'a self, source: Source<'a>, rows: usize, width: usize, end: End<'a>) -> Product<'a> {
+        let layout = OutLayout::dense(rows, width);
+        Product { source, columns: self, width: self.outputs, bias: self.bias.as_deref(), end, layout }
+    }
+}
+
+/// Columns of B are rows of the weight.
+impl Columns for Linear {
+    fn read(&self, column: usize, out: &mut [f32]) {
+        self.weight.read(column * self.inputs, out);
     }
 }
 
@@ -132,61 +179,5 @@ pub(crate) fn wrong_shape(layer: &'static str, weight: &Weight, expected: &str) 
         name: weight.name().to_owned(),
         found: weight.shape().to_vec(),
         expected: expected.to_owned(),
-    }
-}
-
-/// Columns of B are rows of a `[out, in]` weight.
-pub(crate) struct WeightRows<'a> {
-    pub(crate) weight: &'a Weight,
-    pub(crate) inner: usize,
-}
-
-impl Columns for WeightRows<'_> {
-    fn read(&self, column: usize, out: &mut [f32]) {
-        self.weight.read(column * self.inner, out);
-    }
-}
-
-/// Rows of A are the rows of a dense matrix.
-pub(crate) struct FlatRows<'a> {
-    x: &'a [f32],
-    rows: usize,
-    inner: usize,
-    width: usize,
-}
-
-/// Rows in a chunk: a multiple of every tile height, and small enough that a chunk stays in the second-level cache.
-const CHUNK_ROWS: usize = 48;
-
-impl<'a> FlatRows<'a> {
-    pub(crate) fn new(x: &'a [f32], rows: usize, inner: usize, width: usize) -> Self {
-        Self { x, rows, inner, width }
-    }
-}
-
-impl Rows for FlatRows<'_> {
-    fn chunks(&self) -> usize {
-        self.rows.div_ceil(CHUNK_ROWS)
-    }
-    fn chunk<'s>(&'s self, chunk: usize, _scratch: &'s mut Vec<f32>) -> &'s [f32] {
-        let start = chunk * CHUNK_ROWS;
-        let end = (start + CHUNK_ROWS).min(self.rows);
-        &self.x[start * self.inner..end * self.inner]
-    }
-    fn runs(&self, chunk: usize, run: &mut dyn FnMut(Run)) {
-        let start = chunk * CHUNK_ROWS;
-        run(Run { a: 0, out: start * self.width, len: CHUNK_ROWS.min(self.rows - start) });
-    }
-    fn taps(&self) -> &[usize] {
-        &[0]
-    }
-    fn group(&self) -> usize {
-        self.inner
-    }
-    fn row_stride(&self) -> usize {
-        self.inner
-    }
-    fn out_stride(&self) -> usize {
-        self.width
     }
 }

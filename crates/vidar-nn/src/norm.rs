@@ -2,7 +2,12 @@
 
 use rayon::prelude::*;
 
+use crate::compute::Compute;
 use crate::error::NnError;
+use crate::kernels::norm::{NormRef, norm_row};
+use crate::kernels::scratch::{self, Role};
+use crate::kernels::simd::Simd;
+use crate::kernels::{Kernel, dispatch};
 use crate::linear::{vector, wrong_shape};
 use crate::weight::Weight;
 
@@ -56,53 +61,85 @@ impl LayerNorm {
         self.eps
     }
 
-    /// Normalises each row of `x` (`[rows, features]`) into `out`.
+    /// Normalises each row of `x` (`[rows, features]`) into `out`, with the best kernel set of this machine.
     ///
     /// # Panics
     /// When the lengths differ or are no whole number of rows.
     pub fn apply(&self, x: &[f32], out: &mut [f32]) {
-        assert_eq!(x.len(), out.len(), "layer norm: input and output");
-        out.copy_from_slice(x);
-        self.apply_in_place(out);
+        self.apply_on(&Compute::default(), x, out);
     }
 
-    /// Normalises each row of `x` (`[rows, features]`) where it stands.
+    /// As [`LayerNorm::apply`], with a chosen kernel set.
     ///
     /// # Panics
-    /// When the length is no whole number of rows.
-    pub fn apply_in_place(&self, x: &mut [f32]) {
+    /// When the lengths differ or are no whole number of rows.
+    pub fn apply_on(&self, c: &Compute, x: &[f32], out: &mut [f32]) {
+        assert_eq!(x.len(), out.len(), "layer norm: input and output");
         let n = self.features();
         if n == 0 {
             return;
         }
         assert_eq!(x.len() % n, 0, "layer norm: whole rows of {n}");
-        x.par_chunks_mut(TASK_ROWS * n)
-            .for_each(|rows| rows.chunks_exact_mut(n).for_each(|row| self.row(row)));
+        x.par_chunks(TASK_ROWS * n).zip(out.par_chunks_mut(TASK_ROWS * n)).for_each(|(x, out)| {
+            dispatch(c.isa(), Rows { norm: self.view(), x: Some(x), out });
+        });
     }
 
-    /// Normalises one row.
-    pub(crate) fn row(&self, row: &mut [f32]) {
-        let n = row.len() as f32;
-        let mean = lane_sum(row, |x| x) / n;
-        let variance = lane_sum(row, |x| (x - mean) * (x - mean)) / n;
-        let scale = 1.0 / (variance + self.eps).sqrt();
-        for ((x, w), b) in row.iter_mut().zip(&self.weight).zip(&self.bias) {
-            *x = (*x - mean) * scale * w + b;
+    /// Normalises each row of `x` (`[rows, features]`) where it stands, with the best kernel set of this machine.
+    ///
+    /// # Panics
+    /// When the length is no whole number of rows.
+    pub fn apply_in_place(&self, x: &mut [f32]) {
+        self.apply_in_place_on(&Compute::default(), x);
+    }
+
+    /// As [`LayerNorm::apply_in_place`], with a chosen kernel set.
+    ///
+    /// # Panics
+    /// When the length is no whole number of rows.
+    pub fn apply_in_place_on(&self, c: &Compute, x: &mut [f32]) {
+        let n = self.features();
+        if n == 0 {
+            return;
         }
+        assert_eq!(x.len() % n, 0, "layer norm: whole rows of {n}");
+        x.par_chunks_mut(TASK_ROWS * n).for_each(|out| {
+            dispatch(c.isa(), Rows { norm: self.view(), x: None, out });
+        });
+    }
+
+    /// The kernels' form.
+    pub(crate) fn view(&self) -> NormRef<'_> {
+        NormRef { weight: &self.weight, bias: &self.bias, eps: self.eps }
     }
 }
 
-/// Sum in sixteen interleaved parts, so that it vectorises and loses little.
-fn lane_sum(row: &[f32], f: impl Fn(f32) -> f32) -> f32 {
-    let mut lanes = [0.0f32; 16];
-    let (chunks, rest) = row.as_chunks::<16>();
-    for chunk in chunks {
-        for (lane, x) in lanes.iter_mut().zip(chunk) {
-            *lane += f(*x);
+/// Some rows; without `x` they are normalised where they stand.
+struct Rows<'a> {
+    norm: NormRef<'a>,
+    x: Option<&'a [f32]>,
+    out: &'a mut [f32],
+}
+
+impl Kernel for Rows<'_> {
+    type Output = ();
+    #[inline(always)]
+    fn run<S: Simd>(self, s: S) {
+        let n = self.norm.weight.len();
+        match self.x {
+            Some(x) => {
+                for (x, out) in x.chunks_exact(n).zip(self.out.chunks_exact_mut(n)) {
+                    norm_row(s, self.norm, x, out);
+                }
+            }
+            None => {
+                let mut scratch = scratch::borrow(Role::Rows);
+                let copy = &mut scratch.floats(n)[..n];
+                for out in self.out.chunks_exact_mut(n) {
+                    copy.copy_from_slice(out);
+                    norm_row(s, self.norm, copy, out);
+                }
+            }
         }
     }
-    for (lane, x) in lanes.iter_mut().zip(rest) {
-        *lane += f(*x);
-    }
-    lanes.iter().sum()
 }

@@ -2,7 +2,11 @@
 
 use rayon::prelude::*;
 
+use crate::compute::Compute;
 use crate::conv::MapRef;
+use crate::kernels::resample::{Resampled, Tap};
+use crate::kernels::simd::Simd;
+use crate::kernels::{Kernel, dispatch};
 
 /// How output pixels map to input pixels.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -13,15 +17,8 @@ pub enum Corners {
     Edges,
 }
 
-/// One output index: two inputs and the weight of the second.
-#[derive(Debug, Clone, Copy)]
-struct Tap {
-    low: usize,
-    high: usize,
-    t: f32,
-}
-
-fn taps(n: usize, m: usize, corners: Corners) -> Vec<Tap> {
+/// The inputs of each output index.
+pub(crate) fn taps(n: usize, m: usize, corners: Corners) -> Vec<Tap> {
     let last = n.saturating_sub(1);
     (0..m)
         .map(|i| {
@@ -36,7 +33,71 @@ fn taps(n: usize, m: usize, corners: Corners) -> Vec<Tap> {
         .collect()
 }
 
-/// Bilinear resampling of `x` (`[rows, cols, channels]`) to `out` (`[out_rows, out_cols, channels]`).
+/// Rows and columns of a map to be made.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct MapSize {
+    /// Rows of pixels.
+    pub rows: usize,
+    /// Pixels of a row.
+    pub cols: usize,
+}
+
+/// An embedding of the pixel grid that is added to a map: the first half of the channels depends on the column, the second
+/// on the row.
+#[derive(Debug, Clone, PartialEq)]
+pub struct GridEmbedding {
+    /// `[cols, channels / 2]`
+    pub by_col: Vec<f32>,
+    /// `[rows, channels / 2]`
+    pub by_row: Vec<f32>,
+}
+
+impl GridEmbedding {
+    /// The tables, checked.
+    pub(crate) fn view(&self, channels: usize, size: MapSize) -> (&[f32], &[f32]) {
+        assert_eq!(channels % 2, 0, "an embedded map has an even number of channels");
+        assert_eq!(self.by_col.len(), size.cols * (channels / 2), "embedding by column");
+        assert_eq!(self.by_row.len(), size.rows * (channels / 2), "embedding by row");
+        (&self.by_col, &self.by_row)
+    }
+
+    /// Adds it to a map `[rows, cols, channels]` in place.
+    ///
+    /// # Panics
+    /// When a length does not fit.
+    pub fn add_to(&self, map: &mut [f32], channels: usize, size: MapSize) {
+        assert_eq!(map.len(), size.rows * size.cols * channels, "embedded map");
+        let (by_col, by_row) = self.view(channels, size);
+        let half = channels / 2;
+        if map.is_empty() {
+            return;
+        }
+        map.par_chunks_mut(size.cols * channels).zip(by_row.par_chunks(half)).for_each(|(line, by_row)| {
+            for (pixel, by_col) in line.chunks_exact_mut(channels).zip(by_col.chunks_exact(half)) {
+                let (first, second) = pixel.split_at_mut(half);
+                first.iter_mut().zip(by_col).for_each(|(x, e)| *x += e);
+                second.iter_mut().zip(by_row).for_each(|(x, e)| *x += e);
+            }
+        });
+    }
+}
+
+struct Line<'a> {
+    resampled: &'a Resampled<'a>,
+    row: usize,
+    out: &'a mut [f32],
+}
+
+impl Kernel for Line<'_> {
+    type Output = ();
+    #[inline(always)]
+    fn run<S: Simd>(self, s: S) {
+        self.resampled.line(s, self.row, self.out);
+    }
+}
+
+/// Bilinear resampling of `x` (`[rows, cols, channels]`) to `out` (`[out_rows, out_cols, channels]`), with the best kernel set
+/// of this machine.
 ///
 /// # Panics
 /// When a slice has another length, or a map without pixels is to be enlarged.
@@ -48,26 +109,38 @@ pub fn resize_bilinear(
     corners: Corners,
     out: &mut [f32],
 ) {
+    resize_bilinear_on(
+        &Compute::default(),
+        x,
+        channels,
+        MapSize { rows: out_rows, cols: out_cols },
+        corners,
+        out,
+    );
+}
+
+/// As [`resize_bilinear`], with a chosen kernel set.
+///
+/// # Panics
+/// When a slice has another length, or a map without pixels is to be enlarged.
+pub fn resize_bilinear_on(
+    c: &Compute,
+    x: MapRef<'_>,
+    channels: usize,
+    size: MapSize,
+    corners: Corners,
+    out: &mut [f32],
+) {
     assert_eq!(x.data.len(), x.rows * x.cols * channels, "resize: input");
-    assert_eq!(out.len(), out_rows * out_cols * channels, "resize: output");
+    assert_eq!(out.len(), size.rows * size.cols * channels, "resize: output");
     if out.is_empty() {
         return;
     }
     assert!(!x.data.is_empty(), "resize: a map without pixels");
-    let (ys, xs) = (taps(x.rows, out_rows, corners), taps(x.cols, out_cols, corners));
-    let line = x.cols * channels;
-    out.par_chunks_mut(out_cols * channels).zip(ys).for_each(|(out, y)| {
-        let (top, bottom) = (&x.data[y.low * line..][..line], &x.data[y.high * line..][..line]);
-        for (out, tap) in out.chunks_exact_mut(channels).zip(&xs) {
-            let (l, r) = (tap.low * channels, tap.high * channels);
-            let (tl, tr) = (&top[l..l + channels], &top[r..r + channels]);
-            let (bl, br) = (&bottom[l..l + channels], &bottom[r..r + channels]);
-            for i in 0..channels {
-                let upper = tl[i] + (tr[i] - tl[i]) * tap.t;
-                let lower = bl[i] + (br[i] - bl[i]) * tap.t;
-                out[i] = upper + (lower - upper) * y.t;
-            }
-        }
+    let (ys, xs) = (taps(x.rows, size.rows, corners), taps(x.cols, size.cols, corners));
+    let resampled = Resampled { x: x.data, cols: x.cols, channels, ys: &ys, xs: &xs, embedding: None };
+    out.par_chunks_mut(size.cols * channels).enumerate().for_each(|(row, out)| {
+        dispatch(c.isa(), Line { resampled: &resampled, row, out });
     });
 }
 

@@ -127,7 +127,7 @@ fn attention_matches_the_reference_with_and_without_norm_and_rotation() {
             let mut out = vec![0.0; expected.len()];
             attention(&c, &qkv, sequences, tokens, &spec, &mut out);
             let error = error_in_std(&out, &expected);
-            assert!(error < 2.0 * bound(c.precision()), "{c:?} {sequences}x{tokens}x{heads}x{d}: {error:e}");
+            assert!(error < 4.0 * bound(c.precision()), "{c:?} {sequences}x{tokens}x{heads}x{d}: {error:e}");
             // The first sequence's last queries alone give the same numbers as within the whole.
             if !dressed {
                 let [q, k, v] = TokenRows::split_qkv(&qkv[..tokens * 3 * width], width);

@@ -5,16 +5,23 @@
 //! linear layer has one tap; a k×k convolution over an NHWC map has k taps (the k pixels of a kernel row are consecutive),
 //! so that no im2col copy exists, only the input band with its border of zeros.
 //!
-//! Work is split into tasks of row chunks × column ranges; a task walks its columns panel by panel (one panel = the width
-//! of a tile), and each panel tile by tile. Every output number is one accumulation over the inner dimension in its order,
-//! whatever the split: the bits do not depend on the number of threads.
+//! B is packed panel by panel as it is needed, a few megabytes at a time; packing costs 1/rows of the work and spares a
+//! second copy of the weights. Work is split into tasks of row chunks × panel ranges. Every output number is one
+//! accumulation over the inner dimension in its order, whatever the split and whatever the height of its tile: the bits do
+//! not depend on the number of threads.
+
+use std::ops::Range;
 
 use rayon::prelude::*;
 
+use super::pack::{Columns, Pack};
+use super::scratch::{self, Role};
 use super::shared::SharedMut;
 use super::simd::Simd;
-use super::{Kernel, dispatch, math};
-use crate::compute::Compute;
+use super::source::{Geometry, Source};
+use super::tile::{MAX_ROWS, Multiply, Sums, tile};
+use super::{Factors, ProductKernel, dispatch_product, math};
+use crate::compute::{Compute, Precision};
 
 /// What happens to a sum before it is stored, after the bias.
 #[derive(Debug, Clone, Copy)]
@@ -26,196 +33,257 @@ pub(crate) enum End<'a> {
     Accumulate(Option<&'a [f32]>),
     /// `out = other + sum`, `other` laid out as `out`
     Add(&'a [f32]),
-    /// Columns come in pairs of panels (gate, value): `out = silu(gate) * value`.
+    /// The first half of the columns gates the second: `out = silu(gate) * value`, half as wide.
     SwiGlu,
 }
 
-/// Where the columns of B come from.
-pub(crate) trait Columns: Sync {
-    /// Writes column `column` of B (its whole inner dimension) to `out`.
-    fn read(&self, column: usize, out: &mut [f32]);
-}
-
-/// Where the rows of A come from: chunks, each a buffer that rows are addressed in.
-pub(crate) trait Rows: Sync {
-    /// How many chunks there are.
-    fn chunks(&self) -> usize;
-    /// The chunk's numbers; `scratch` may be used to make them.
-    fn chunk<'s>(&'s self, chunk: usize, scratch: &'s mut Vec<f32>) -> &'s [f32];
-    /// Calls `run` for each run of rows of the chunk that lie at a constant stride.
-    fn runs(&self, chunk: usize, run: &mut dyn FnMut(Run));
-    /// The taps: offsets from the row's start; each is `group` consecutive numbers.
-    fn taps(&self) -> &[usize];
-    fn group(&self) -> usize;
-    /// Distance between rows of a run in A and in the output.
-    fn row_stride(&self) -> usize;
-    fn out_stride(&self) -> usize;
-}
-
-/// `len` rows that start at `a` in the chunk's numbers and at `out` in the output.
+/// Where row m of the product goes: rows come in lines of `line`.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct Run {
-    pub(crate) a: usize,
-    pub(crate) out: usize,
-    pub(crate) len: usize,
+pub(crate) struct OutLayout {
+    pub(crate) line: usize,
+    pub(crate) line_stride: usize,
+    pub(crate) row_stride: usize,
+    pub(crate) offset: usize,
+}
+
+impl OutLayout {
+    /// Dense rows of `width`.
+    pub(crate) fn dense(rows: usize, width: usize) -> Self {
+        Self { line: rows.max(1), line_stride: rows * width, row_stride: width, offset: 0 }
+    }
+
+    fn at(&self, row: usize) -> usize {
+        self.offset + row / self.line * self.line_stride + row % self.line * self.row_stride
+    }
 }
 
 /// `out = end(A B + bias)`.
 pub(crate) struct Product<'a> {
-    pub(crate) rows: &'a dyn Rows,
+    pub(crate) source: Source<'a>,
     pub(crate) columns: &'a dyn Columns,
     /// Number of columns of B.
     pub(crate) width: usize,
     pub(crate) bias: Option<&'a [f32]>,
     pub(crate) end: End<'a>,
+    pub(crate) layout: OutLayout,
 }
 
-/// Rows of a tile. Panels are two vectors wide.
-const TILE_ROWS: usize = 4;
+/// Words of packed weights that exist at a time.
+const PACKED_WORDS: usize = 1 << 20;
+/// Tasks per thread that make their different speeds even out.
+const TASKS_PER_THREAD: usize = 8;
 
 impl Product<'_> {
     /// Computes it into `out`.
     pub(crate) fn run(&self, c: &Compute, out: &mut [f32]) {
-        if self.width == 0 || self.rows.chunks() == 0 {
+        let inner = self.source.inner();
+        let chunks = self.source.chunks();
+        if self.width == 0 || chunks == 0 {
             return;
         }
-        let isa = c.isa();
-        let panel = dispatch(isa, PanelWidth);
-        let inner = self.rows.taps().len() * self.rows.group();
-        let panels = self.width.div_ceil(panel);
-        let mut packed = vec![0.0; panels * panel * inner];
-        if inner > 0 {
-            packed.par_chunks_mut(panel * inner).enumerate().for_each(|(p, to)| {
-                self.pack(p * panel, panel, inner, to);
-            });
-        }
+        let (isa, factors) = (c.isa(), Factors::of(c));
+        let Shape { panel, step } = dispatch_product(isa, factors, ShapeOf);
+        let panel_words = panel * inner.words(step);
+        let gated = matches!(self.end, End::SwiGlu);
+        let width = if gated { self.width / 2 } else { self.width };
+        // For a gated unit panels come in pairs, gate and value.
+        let per_unit = if gated { 2 } else { 1 };
+        let units = width.div_ceil(panel);
+        let units_at_once = (PACKED_WORDS / (panel_words * per_unit).max(1)).clamp(1, units);
+        let column = |at: usize| -> Option<usize> {
+            let (p, j) = (at / panel, at % panel);
+            let i = p / per_unit * panel + j;
+            (i < width).then_some(i + p % per_unit * width)
+        };
         let out = SharedMut::new(out);
-        (0..self.rows.chunks()).into_par_iter().for_each_init(Vec::new, |scratch, chunk| {
-            let a = self.rows.chunk(chunk, scratch);
-            dispatch(isa, Task { product: self, a, chunk, packed: &packed, out });
-        });
-    }
-
-    /// Packs columns `first..first + panel` as [inner][panel], zeros beyond the last column.
-    fn pack(&self, first: usize, panel: usize, inner: usize, to: &mut [f32]) {
-        let mut column = vec![0.0; inner];
-        for j in 0..panel {
-            if first + j >= self.width {
-                break;
-            }
-            self.columns.read(first + j, &mut column);
-            for (k, value) in column.iter().enumerate() {
-                to[k * panel + j] = *value;
-            }
+        let mut packed = scratch::borrow(Role::Panels);
+        for first in (0..units).step_by(units_at_once) {
+            let count = units_at_once.min(units - first);
+            let packed = &mut packed.words(count * per_unit * panel_words)[..count * per_unit * panel_words];
+            let pack = Pack {
+                columns: self.columns,
+                column: &column,
+                inner,
+                round_to_f16: c.precision() == Precision::F16,
+                first: first * per_unit * panel,
+                to: packed,
+            };
+            pack.run(isa, factors);
+            let panels = Panels { words: packed, first, count, per_unit };
+            let splits = (TASKS_PER_THREAD * rayon::current_num_threads()).div_ceil(chunks).clamp(1, count);
+            (0..chunks * splits).into_par_iter().for_each(|task| {
+                let (chunk, split) = (task / splits, task % splits);
+                let units = split * count / splits..(split + 1) * count / splits;
+                dispatch_product(isa, factors, Task { product: self, chunk, panels, units, width, out });
+            });
         }
     }
 }
 
-struct PanelWidth;
+struct ShapeOf;
 
-impl Kernel for PanelWidth {
-    type Output = usize;
-    #[inline(always)]
-    fn run<S: Simd>(self, _: S) -> usize {
-        2 * S::LANES
+pub(crate) struct Shape {
+    pub(crate) panel: usize,
+    pub(crate) step: usize,
+}
+
+impl ProductKernel for ShapeOf {
+    type Output = Shape;
+    fn run<M: Multiply>(self, _: M) -> Shape {
+        Shape { panel: 2 * M::Simd::LANES, step: M::STEP }
     }
+}
+
+/// Packed columns: `count` units of one panel (or a pair) from unit `first` on.
+#[derive(Clone, Copy)]
+pub(crate) struct Panels<'a> {
+    pub(crate) words: &'a [u32],
+    pub(crate) first: usize,
+    pub(crate) count: usize,
+    pub(crate) per_unit: usize,
 }
 
 struct Task<'a> {
     product: &'a Product<'a>,
-    a: &'a [f32],
     chunk: usize,
-    packed: &'a [f32],
+    panels: Panels<'a>,
+    units: Range<usize>,
+    width: usize,
     out: SharedMut<'a>,
 }
 
-impl Kernel for Task<'_> {
+impl ProductKernel for Task<'_> {
     type Output = ();
     #[inline(always)]
-    fn run<S: Simd>(self, s: S) {
-        let rows = self.product.rows;
-        let panel = 2 * S::LANES;
-        let inner = rows.taps().len() * rows.group();
-        let width = self.product.width;
-        for first in (0..width).step_by(panel) {
-            let b = &self.packed[first * inner..(first + panel) * inner];
-            let columns = panel.min(width - first);
-            rows.runs(self.chunk, &mut |run: Run| {
-                let mut row = 0;
-                while row < run.len {
-                    let count = TILE_ROWS.min(run.len - row);
-                    let at = run.a + row * rows.row_stride();
-                    let mut tile = [[s.splat(0.0); 2]; TILE_ROWS];
-                    match count {
-                        4 => tile_rows::<S, 4>(s, self.a, at, rows, b, &mut tile),
-                        3 => tile_rows::<S, 3>(s, self.a, at, rows, b, &mut tile),
-                        2 => tile_rows::<S, 2>(s, self.a, at, rows, b, &mut tile),
-                        _ => tile_rows::<S, 1>(s, self.a, at, rows, b, &mut tile),
+    fn run<M: Multiply>(self, m: M) {
+        let product = self.product;
+        let mut scratch = scratch::borrow(Role::Rows);
+        let rows = product.source.rows(self.chunk);
+        let geometry = product.source.geometry::<M>();
+        let a = product.source.prepare(m, &geometry, self.chunk, &mut scratch);
+        let target = Target {
+            width: self.width,
+            bias: product.bias,
+            end: product.end,
+            layout: product.layout,
+            out: self.out,
+        };
+        multiply(m, a, &geometry, rows, self.panels, self.units, &target);
+    }
+}
+
+/// Where sums go and what is done with them.
+pub(crate) struct Target<'a> {
+    pub(crate) width: usize,
+    pub(crate) bias: Option<&'a [f32]>,
+    pub(crate) end: End<'a>,
+    pub(crate) layout: OutLayout,
+    pub(crate) out: SharedMut<'a>,
+}
+
+/// Multiplies rows `rows` of A (in `a`, which starts with the first of them) with some units of the panels.
+#[inline(always)]
+pub(crate) fn multiply<M: Multiply>(
+    m: M,
+    a: &[M::Number],
+    geometry: &Geometry,
+    rows: Range<usize>,
+    panels: Panels<'_>,
+    units: Range<usize>,
+    target: &Target<'_>,
+) {
+    let s = m.simd();
+    let panel = 2 * M::Simd::LANES;
+    let steps = geometry.inner.group.div_ceil(M::STEP);
+    let panel_words = panel * geometry.inner.taps * steps;
+    if rows.is_empty() || units.is_empty() {
+        return;
+    }
+    // Every address that a tile reads lies below this one.
+    let reach = geometry.at(rows.end - 1) - geometry.at(rows.start)
+        + geometry.taps.iter().max().copied().unwrap_or(0)
+        + steps * M::STEP;
+    assert!(panel_words == 0 || reach <= a.len(), "rows of a product: {reach} of {}", a.len());
+    assert!(units.end <= panels.count && panels.words.len() >= panels.count * panels.per_unit * panel_words);
+    let mut sums = [[s.splat(0.0); 2]; MAX_ROWS];
+    let mut gates = sums;
+    for unit in units {
+        let words = &panels.words[unit * panels.per_unit * panel_words..][..panels.per_unit * panel_words];
+        let first = (panels.first + unit) * panel;
+        let mut row = rows.start;
+        while row < rows.end {
+            let line_end = (row / geometry.line + 1) * geometry.line;
+            let run = row..line_end.min(rows.end);
+            let tiles = run.len().div_ceil(M::Simd::TILE_ROWS);
+            for i in 0..tiles {
+                // Heights as equal as possible: a last tile of one row would cost as much as one of four.
+                let from = run.start + i * run.len() / tiles;
+                let count = run.start + (i + 1) * run.len() / tiles - from;
+                let at = geometry.at(from) - geometry.at(rows.start);
+                let here = (a[at..].as_ptr(), geometry.row_stride);
+                // SAFETY: `reach` bounds every row and tap, and each panel has panel_words words.
+                unsafe {
+                    tile(m, count, here, &geometry.taps, steps, words.as_ptr(), &mut sums);
+                    if panels.per_unit == 2 {
+                        std::mem::swap(&mut gates, &mut sums);
+                        tile(m, count, here, &geometry.taps, steps, words[panel_words..].as_ptr(), &mut sums);
                     }
-                    for (i, sums) in tile.iter().enumerate().take(count) {
-                        let start = run.out + (row + i) * rows.out_stride() + first;
-                        self.end_row(s, *sums, first, columns, start);
-                    }
-                    row += count;
                 }
-            });
+                target.finish(s, &gates, &sums, from, count, first);
+            }
+            row = run.end;
         }
     }
 }
 
-impl Task<'_> {
-    /// Bias, end and store of one row of a tile.
+impl Target<'_> {
+    /// Bias, end and store of a tile.
     #[inline(always)]
-    fn end_row<S: Simd>(&self, s: S, sums: [S::V; 2], first: usize, columns: usize, start: usize) {
-        // SAFETY: rows and panels are disjoint between tasks and within one.
-        let out = unsafe { self.out.part(start, columns) };
-        for (half, sum) in sums.into_iter().enumerate() {
+    fn finish<S: Simd>(&self, s: S, gates: &Sums<S>, sums: &Sums<S>, row: usize, count: usize, first: usize) {
+        let columns = (2 * S::LANES).min(self.width - first);
+        for half in 0..2 {
             let from = half * S::LANES;
             if from >= columns {
                 return;
             }
             let to = (from + S::LANES).min(columns);
-            let mut v = sum;
-            if let Some(bias) = self.product.bias {
-                v = s.add(v, s.load_part(&bias[first + from..first + to]));
+            let of = |v: &[f32], base: usize| s.load_part(&v[base + first + from..base + first + to]);
+            let bias = self.bias.map_or(s.splat(0.0), |bias| of(bias, 0));
+            // Each end has its own loop over rows, so that the choice is made once per tile.
+            macro_rules! rows {
+                (|$start:ident, $out:ident, $v:ident, $r:ident| $value:expr) => {
+                    for $r in 0..count {
+                        let $start = self.layout.at(row + $r) + first + from;
+                        // SAFETY: rows and panels are disjoint between tasks and within one.
+                        let $out = unsafe { self.out.part($start, to - from) };
+                        let $v = s.add(sums[$r][half], bias);
+                        let value = $value;
+                        s.store_part($out, value);
+                    }
+                };
             }
-            let out = &mut out[from..to];
-            v = match self.product.end {
-                End::Store | End::SwiGlu => v,
-                End::Gelu => math::gelu(s, v),
-                End::Relu => math::relu(s, v),
-                End::Accumulate(None) => s.add(s.load_part(out), v),
+            match self.end {
+                End::Store => rows!(|_at, out, v, r| v),
+                End::Gelu => rows!(|_at, out, v, r| math::gelu(s, v)),
+                End::Relu => rows!(|_at, out, v, r| math::relu(s, v)),
+                End::Accumulate(None) => rows!(|_at, out, v, r| s.add(s.load_part(out), v)),
                 End::Accumulate(Some(gamma)) => {
-                    s.fma(s.load_part(&gamma[first + from..first + to]), v, s.load_part(out))
+                    let gamma = of(gamma, 0);
+                    rows!(|_at, out, v, r| s.fma(gamma, v, s.load_part(out)));
                 }
-                End::Add(other) => s.add(s.load_part(&other[start + from..start + to]), v),
-            };
-            s.store_part(out, v);
-        }
-    }
-}
-
-#[inline(always)]
-fn tile_rows<S: Simd, const R: usize>(
-    s: S,
-    a: &[f32],
-    at: usize,
-    rows: &dyn Rows,
-    b: &[f32],
-    tile: &mut [[S::V; 2]; TILE_ROWS],
-) {
-    let (group, stride) = (rows.group(), rows.row_stride());
-    let mut sums = [[s.splat(0.0); 2]; R];
-    for (tap, b) in rows.taps().iter().zip(b.chunks_exact(group * 2 * S::LANES)) {
-        let lines: [&[f32]; R] = std::array::from_fn(|r| &a[at + r * stride + tap..][..group]);
-        for (k, b) in b.chunks_exact(2 * S::LANES).enumerate() {
-            let (left, right) = b.split_at(S::LANES);
-            let (left, right) = (s.load(left), s.load(right));
-            for r in 0..R {
-                let x = s.splat(lines[r][k]);
-                sums[r] = [s.fma(x, left, sums[r][0]), s.fma(x, right, sums[r][1])];
+                End::Add(other) => rows!(|at, out, v, r| s.add(s.load_part(&other[at..at + to - from]), v)),
+                End::SwiGlu => {
+                    // `bias` is the gate's here; the value's lies `width` further.
+                    let value_bias = self.bias.map_or(s.splat(0.0), |bias| of(bias, self.width));
+                    for r in 0..count {
+                        let start = self.layout.at(row + r) + first + from;
+                        // SAFETY: rows and panels are disjoint between tasks and within one.
+                        let out = unsafe { self.out.part(start, to - from) };
+                        let gate = math::silu(s, s.add(gates[r][half], bias));
+                        s.store_part(out, s.mul(gate, s.add(sums[r][half], value_bias)));
+                    }
+                }
             }
         }
     }
-    tile[..R].copy_from_slice(&sums);
 }

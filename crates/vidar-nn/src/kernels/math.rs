@@ -22,6 +22,36 @@ pub(crate) fn exp<S: Simd>(s: S, x: S::V) -> S::V {
     s.scale_by_power(p, n)
 }
 
+/// 2^x for x <= 0 with a relative error below 2e-7; 0 below -150, NaN stays NaN.
+#[inline(always)]
+pub(crate) fn exp2_below<S: Simd>(s: S, x: S::V) -> S::V {
+    // Least largest relative error on |f| <= 1/2 for this degree: 7.5e-8.
+    exp2_polynomial(
+        s,
+        x,
+        [1.327_646_9e-3, 9.675_541e-3, 5.550_713_3e-2, 2.402_212e-1, 6.931_47e-1, 1.000_000_1],
+    )
+}
+
+/// 2^x for x <= 0 with a relative error below 1e-4: enough for a weight that is rounded to bf16 (4e-3) next.
+#[inline(always)]
+pub(crate) fn exp2_below_coarse<S: Simd>(s: S, x: S::V) -> S::V {
+    exp2_polynomial(s, x, [5.517_164e-2, 2.426_111_2e-1, 6.932_61e-1, 9.999_281e-1])
+}
+
+#[inline(always)]
+fn exp2_polynomial<S: Simd, const N: usize>(s: S, x: S::V, coefficients: [f32; N]) -> S::V {
+    // max(a, b) gives b for NaN, so NaN passes.
+    let x = s.max(s.splat(-151.0), x);
+    let n = s.round(x);
+    let f = s.sub(x, n);
+    let mut p = s.splat(coefficients[0]);
+    for c in &coefficients[1..] {
+        p = s.fma(p, f, s.splat(*c));
+    }
+    s.scale_by_power(p, n)
+}
+
 /// The complementary error function for x >= 0, relative error below 3e-7 + x² 2^-24.
 ///
 /// erfc(x) = e^(-x²) t Q(2t - 1) with t = 1 / (1 + 0.4 x): t Q is the scaled function erfcx, Q a polynomial of degree 8

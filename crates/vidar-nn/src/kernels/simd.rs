@@ -7,6 +7,8 @@ pub(crate) trait Simd: Copy + Send + Sync + 'static {
     /// `LANES` numbers.
     type V: Copy;
     const LANES: usize;
+    /// Rows of a product's tile of two vectors: as many as the registers hold.
+    const TILE_ROWS: usize;
 
     fn splat(self, x: f32) -> Self::V;
     /// The first `LANES` numbers of a slice that has at least as many.
@@ -19,9 +21,6 @@ pub(crate) trait Simd: Copy + Send + Sync + 'static {
     /// # Safety
     /// `x` must be readable for `LANES` numbers; no alignment is needed.
     unsafe fn load_at(self, x: *const f32) -> Self::V;
-    /// # Safety
-    /// `x` must be writable for `LANES` numbers; no alignment is needed.
-    unsafe fn store_at(self, x: *mut f32, v: Self::V);
 
     fn add(self, a: Self::V, b: Self::V) -> Self::V;
     fn sub(self, a: Self::V, b: Self::V) -> Self::V;
@@ -32,14 +31,29 @@ pub(crate) trait Simd: Copy + Send + Sync + 'static {
     fn max(self, a: Self::V, b: Self::V) -> Self::V;
     fn min(self, a: Self::V, b: Self::V) -> Self::V;
     fn abs(self, a: Self::V) -> Self::V;
-    /// `magnitude`, which must not be negative, with the sign of `sign`.
-    fn with_sign(self, magnitude: Self::V, sign: Self::V) -> Self::V;
     /// To the nearest integer, ties to even; |a| below 2^22.
     fn round(self, a: Self::V) -> Self::V;
     /// `a * 2^n` for an integral `n` in -252..=252; results below the normal range may become zero.
     fn scale_by_power(self, a: Self::V, n: Self::V) -> Self::V;
     fn sum(self, a: Self::V) -> f32;
     fn maximum(self, a: Self::V) -> f32;
+}
+
+/// A kernel set that multiplies bf16.
+pub(crate) trait SimdBf16: Simd {
+    /// `LANES` pairs of bf16.
+    type H: Copy;
+    /// # Safety
+    /// `x` must be readable for `LANES` words; no alignment is needed.
+    unsafe fn load_pairs(self, x: *const u32) -> Self::H;
+    fn splat_pair(self, pair: u32) -> Self::H;
+    /// `acc + a.0 * b.0 + a.1 * b.1` in each lane.
+    fn dot(self, a: Self::H, b: Self::H, acc: Self::V) -> Self::V;
+    /// Rounds to nearest even and stores `LANES` numbers.
+    ///
+    /// # Safety
+    /// `x` must be writable for `LANES` numbers; no alignment is needed.
+    unsafe fn store_bf16(self, x: *mut u16, v: Self::V);
 }
 
 /// Plain Rust; the compiler vectorises it for the target's baseline.
@@ -58,6 +72,7 @@ impl Portable {
 impl Simd for Portable {
     type V = [f32; LANES];
     const LANES: usize = LANES;
+    const TILE_ROWS: usize = 3;
 
     #[inline(always)]
     fn splat(self, x: f32) -> Self::V {
@@ -86,11 +101,6 @@ impl Simd for Portable {
     unsafe fn load_at(self, x: *const f32) -> Self::V {
         // SAFETY: readable for LANES numbers by the caller's promise; arrays of f32 may be read unaligned.
         unsafe { x.cast::<[f32; LANES]>().read_unaligned() }
-    }
-    #[inline(always)]
-    unsafe fn store_at(self, x: *mut f32, v: Self::V) {
-        // SAFETY: writable for LANES numbers by the caller's promise.
-        unsafe { x.cast::<[f32; LANES]>().write_unaligned(v) }
     }
     #[inline(always)]
     fn add(self, a: Self::V, b: Self::V) -> Self::V {
@@ -125,10 +135,6 @@ impl Simd for Portable {
         a.map(f32::abs)
     }
     #[inline(always)]
-    fn with_sign(self, magnitude: Self::V, sign: Self::V) -> Self::V {
-        Self::zip(magnitude, sign, f32::copysign)
-    }
-    #[inline(always)]
     fn round(self, a: Self::V) -> Self::V {
         const MAGIC: f32 = 12_582_912.0; // 1.5 * 2^23: adding it leaves no fraction bits, rounded to even
         a.map(|x| (x + MAGIC) - MAGIC)
@@ -149,5 +155,30 @@ impl Simd for Portable {
     #[inline(always)]
     fn maximum(self, a: Self::V) -> f32 {
         a.into_iter().fold(f32::NEG_INFINITY, |m, x| if x > m { x } else { m })
+    }
+}
+
+/// Emulated, to prove the packing and the loops on machines without bf16 products.
+impl SimdBf16 for Portable {
+    type H = [u32; LANES];
+
+    #[inline(always)]
+    unsafe fn load_pairs(self, x: *const u32) -> Self::H {
+        // SAFETY: readable for LANES words by the caller's promise.
+        unsafe { x.cast::<[u32; LANES]>().read_unaligned() }
+    }
+    #[inline(always)]
+    fn splat_pair(self, pair: u32) -> Self::H {
+        [pair; LANES]
+    }
+    #[inline(always)]
+    fn dot(self, a: Self::H, b: Self::H, acc: Self::V) -> Self::V {
+        let (low, high) = (|x: u32| f32::from_bits(x << 16), |x: u32| f32::from_bits(x & 0xFFFF_0000));
+        std::array::from_fn(|i| acc[i] + high(a[i]) * high(b[i]) + low(a[i]) * low(b[i]))
+    }
+    #[inline(always)]
+    unsafe fn store_bf16(self, x: *mut u16, v: Self::V) {
+        // SAFETY: writable for LANES numbers by the caller's promise.
+        unsafe { x.cast::<[u16; LANES]>().write_unaligned(v.map(|x| half::bf16::from_f32(x).to_bits())) }
     }
 }

@@ -39,21 +39,15 @@ pub fn f32_computes() -> Vec<Compute> {
     Isa::available().into_iter().map(|isa| Compute::with_isa(isa, Precision::F32).unwrap()).collect()
 }
 
-/// Largest |a - b| over the standard deviation of b.
+/// Largest |a - b| over the root mean square of b.
 pub fn error_in_std(a: &[f32], b: &[f64]) -> f64 {
     assert_eq!(a.len(), b.len());
     if b.is_empty() {
         return 0.0;
     }
-    let n = b.len() as f64;
-    let mean = b.iter().sum::<f64>() / n;
-    let std = (b.iter().map(|x| (x - mean) * (x - mean)).sum::<f64>() / n).sqrt().max(1e-3);
-    let worst = a
-        .iter()
-        .zip(b)
-        .map(|(a, b)| (f64::from(*a) - b).abs())
-        .fold(0.0, |m, x| if x > m || x.is_nan() { x } else { m });
-    worst / std
+    let rms = (b.iter().map(|x| x * x).sum::<f64>() / b.len() as f64).sqrt().max(1e-3);
+    let errors = a.iter().zip(b).map(|(a, b)| (f64::from(*a) - b).abs());
+    errors.fold(0.0, |m, x| if x > m || x.is_nan() { x } else { m }) / rms
 }
 
 /// What each precision must hold for one matrix product, in standard deviations of the output: the bound on the largest

@@ -1,0 +1,105 @@
+//! Weights into panels: `[taps][steps][2 LANES]` words, in the order in which a tile reads them.
+
+use rayon::prelude::*;
+
+use super::scratch::{self, Role};
+use super::simd::Simd;
+use super::tile::Multiply;
+use super::{Factors, ProductKernel, dispatch_product};
+use crate::compute::Isa;
+
+/// Where the columns of B come from.
+pub(crate) trait Columns: Sync {
+    /// Writes column `column` of B (its whole inner dimension, tap after tap) to `out`.
+    fn read(&self, column: usize, out: &mut [f32]);
+}
+
+/// The inner dimension: `taps` runs of `group` consecutive numbers.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Inner {
+    pub(crate) taps: usize,
+    pub(crate) group: usize,
+}
+
+impl Inner {
+    /// Words of a column when each holds `step` numbers: every tap starts with a new word.
+    pub(crate) fn words(self, step: usize) -> usize {
+        self.taps * self.group.div_ceil(step)
+    }
+}
+
+/// Packs the given columns, a panel's width of them at a time (the last panel is filled up with zeros).
+pub(crate) struct Pack<'a> {
+    pub(crate) columns: &'a dyn Columns,
+    /// The column of B for each column of the panels; `None` gives zeros.
+    pub(crate) column: &'a (dyn Fn(usize) -> Option<usize> + Sync),
+    pub(crate) inner: Inner,
+    /// Whether the numbers are rounded to f16 on the way.
+    pub(crate) round_to_f16: bool,
+    /// The first column, and a whole number of panels to fill.
+    pub(crate) first: usize,
+    pub(crate) to: &'a mut [u32],
+}
+
+impl Pack<'_> {
+    pub(crate) fn run(self, isa: Isa, factors: Factors) {
+        dispatch_product(isa, factors, self);
+    }
+}
+
+impl ProductKernel for Pack<'_> {
+    type Output = ();
+    fn run<M: Multiply>(self, m: M) {
+        let panel = 2 * M::Simd::LANES;
+        let words = self.inner.words(M::STEP);
+        if words == 0 {
+            return;
+        }
+        let Self { columns, column, inner, round_to_f16, first, to } = self;
+        to.par_chunks_exact_mut(panel * words).enumerate().for_each(|(p, to)| {
+            let numbers = inner.taps * inner.group;
+            let mut scratch = scratch::borrow(Role::Columns);
+            let (read, packed) = scratch
+                .words(numbers.next_multiple_of(16) + panel * words)
+                .split_at_mut(numbers.next_multiple_of(16));
+            let read = &mut scratch::as_floats_mut(read)[..numbers];
+            for j in 0..panel {
+                let packed = &mut packed[j * words..(j + 1) * words];
+                let Some(column) = column(first + p * panel + j) else {
+                    packed.fill(0);
+                    continue;
+                };
+                columns.read(column, read);
+                if round_to_f16 {
+                    read.iter_mut().for_each(|x| *x = half::f16::from_f32(*x).to_f32());
+                }
+                if let Some(rest) = inner.group.checked_rem(M::STEP).filter(|rest| *rest > 0) {
+                    for (read, packed) in
+                        read.chunks_exact(inner.group).zip(packed.chunks_exact_mut(words / inner.taps))
+                    {
+                        let whole = packed.len() - 1;
+                        m.convert(&read[..inner.group - rest], M::numbers(&mut packed[..whole]));
+                        packed[whole] = M::word(&read[inner.group - rest..]);
+                    }
+                } else {
+                    m.convert(read, M::numbers(packed));
+                }
+            }
+            transpose(&packed[..panel * words], words, to);
+        });
+    }
+}
+
+/// `to[k][j] = from[j][k]` for rows of `words`.
+pub(crate) fn transpose(from: &[u32], words: usize, to: &mut [u32]) {
+    const BLOCK: usize = 16;
+    let rows = from.len() / words;
+    for (b, to) in to.chunks_mut(BLOCK * rows).enumerate() {
+        let columns = to.len() / rows;
+        for (j, row) in from.chunks_exact(words).enumerate() {
+            for (k, word) in row[b * BLOCK..b * BLOCK + columns].iter().enumerate() {
+                to[k * rows + j] = *word;
+            }
+        }
+    }
+}

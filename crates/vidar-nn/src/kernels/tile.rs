@@ -1,0 +1,216 @@
+//! The innermost loop: a tile of a few rows by two vectors of columns, held in registers over the whole inner dimension.
+
+use super::simd::{Simd, SimdBf16};
+
+/// The largest `TILE_ROWS` of any kernel set.
+pub(crate) const MAX_ROWS: usize = 12;
+
+/// Sums of a tile; rows beyond the ones asked for are left alone.
+pub(crate) type Sums<S> = [[<S as Simd>::V; 2]; MAX_ROWS];
+
+/// A way to multiply: the number format of the factors and the kernel set.
+pub(crate) trait Multiply: Copy + Send + Sync {
+    type Simd: Simd;
+    /// Format of A's numbers.
+    type Number: Copy + Default + Send + Sync;
+    /// Numbers of the inner dimension that one word of packed B holds.
+    const STEP: usize;
+
+    fn simd(self) -> Self::Simd;
+
+    /// `f32` numbers as they are, if that is the number format.
+    fn direct(x: &[f32]) -> Option<&[Self::Number]>;
+
+    /// Rounds `from` into the number format.
+    fn convert(self, from: &[f32], to: &mut [Self::Number]);
+
+    /// A word of packed B from `STEP` numbers of a column.
+    fn word(values: &[f32]) -> u32;
+
+    /// Words of scratch as numbers.
+    fn numbers(words: &mut [u32]) -> &mut [Self::Number];
+
+    /// `sums[r] = Σ a[r] b` over taps and `steps` words of each, for `R` rows.
+    ///
+    /// # Safety
+    /// For each row r < R and tap, `a + r * stride + tap` must be readable for `steps * STEP` numbers, and `b` for
+    /// `taps * steps * 2 * LANES` words.
+    unsafe fn tile<const R: usize>(
+        self,
+        a: *const Self::Number,
+        stride: usize,
+        taps: &[usize],
+        steps: usize,
+        b: *const u32,
+        sums: &mut Sums<Self::Simd>,
+    );
+}
+
+/// Calls the tile function for a number of rows that is only known at run time.
+///
+/// # Safety
+/// As [`Multiply::tile`], for `rows` rows; `rows` is between 1 and the kernel set's `TILE_ROWS`.
+#[inline(always)]
+pub(crate) unsafe fn tile<M: Multiply>(
+    m: M,
+    rows: usize,
+    a: (*const M::Number, usize),
+    taps: &[usize],
+    steps: usize,
+    b: *const u32,
+    sums: &mut Sums<M::Simd>,
+) {
+    let (a, stride) = a;
+    macro_rules! rows {
+        ($($r:literal)*) => {
+            // Numbers of rows that this kernel set never asks for are not compiled.
+            match rows {
+                $($r if $r <= M::Simd::TILE_ROWS => {
+                    // SAFETY: the caller's promise.
+                    unsafe { m.tile::<$r>(a, stride, taps, steps, b, sums) }
+                })*
+                _ => debug_assert!(false, "a tile of {rows} rows"),
+            }
+        };
+    }
+    rows!(12 11 10 9 8 7 6 5 4 3 2 1);
+}
+
+/// Factors in `f32`.
+#[derive(Clone, Copy)]
+pub(crate) struct InF32<S>(pub(crate) S);
+
+impl<S: Simd> Multiply for InF32<S> {
+    type Simd = S;
+    type Number = f32;
+    const STEP: usize = 1;
+
+    #[inline(always)]
+    fn simd(self) -> S {
+        self.0
+    }
+
+    #[inline(always)]
+    fn direct(x: &[f32]) -> Option<&[f32]> {
+        Some(x)
+    }
+
+    #[inline(always)]
+    fn convert(self, from: &[f32], to: &mut [f32]) {
+        to.copy_from_slice(from);
+    }
+
+    #[inline(always)]
+    fn word(values: &[f32]) -> u32 {
+        values[0].to_bits()
+    }
+
+    #[inline(always)]
+    fn numbers(words: &mut [u32]) -> &mut [f32] {
+        super::scratch::as_floats_mut(words)
+    }
+
+    #[inline(always)]
+    unsafe fn tile<const R: usize>(
+        self,
+        a: *const f32,
+        stride: usize,
+        taps: &[usize],
+        steps: usize,
+        b: *const u32,
+        sums: &mut Sums<S>,
+    ) {
+        let s = self.0;
+        let mut acc = [[s.splat(0.0); 2]; R];
+        let mut b = b.cast::<f32>();
+        for tap in taps {
+            // SAFETY: all addresses are inside what the caller promises.
+            unsafe {
+                let a = a.add(*tap);
+                for k in 0..steps {
+                    let (left, right) = (s.load_at(b), s.load_at(b.add(S::LANES)));
+                    b = b.add(2 * S::LANES);
+                    for r in 0..R {
+                        let x = s.splat(*a.add(r * stride + k));
+                        acc[r] = [s.fma(x, left, acc[r][0]), s.fma(x, right, acc[r][1])];
+                    }
+                }
+            }
+        }
+        sums[..R].copy_from_slice(&acc);
+    }
+}
+
+/// Factors in bf16, two to a word; sums in `f32`.
+#[derive(Clone, Copy)]
+pub(crate) struct InBf16<S>(pub(crate) S);
+
+impl<S: SimdBf16> Multiply for InBf16<S> {
+    type Simd = S;
+    type Number = u16;
+    const STEP: usize = 2;
+
+    #[inline(always)]
+    fn simd(self) -> S {
+        self.0
+    }
+
+    #[inline(always)]
+    fn direct(_: &[f32]) -> Option<&[u16]> {
+        None
+    }
+
+    #[inline(always)]
+    fn convert(self, from: &[f32], to: &mut [u16]) {
+        let s = self.0;
+        let whole = from.len() / S::LANES * S::LANES;
+        for (from, to) in from.chunks_exact(S::LANES).zip(to.chunks_exact_mut(S::LANES)) {
+            // SAFETY: the chunk has room for LANES numbers.
+            unsafe { s.store_bf16(to.as_mut_ptr(), s.load(from)) };
+        }
+        for (from, to) in from[whole..].iter().zip(&mut to[whole..]) {
+            *to = half::bf16::from_f32(*from).to_bits();
+        }
+    }
+
+    #[inline(always)]
+    fn word(values: &[f32]) -> u32 {
+        let half = |i: usize| values.get(i).map_or(0, |x| u32::from(half::bf16::from_f32(*x).to_bits()));
+        half(0) | half(1) << 16
+    }
+
+    #[inline(always)]
+    fn numbers(words: &mut [u32]) -> &mut [u16] {
+        super::scratch::as_halves_mut(words)
+    }
+
+    #[inline(always)]
+    unsafe fn tile<const R: usize>(
+        self,
+        a: *const u16,
+        stride: usize,
+        taps: &[usize],
+        steps: usize,
+        b: *const u32,
+        sums: &mut Sums<S>,
+    ) {
+        let s = self.0;
+        let mut acc = [[s.splat(0.0); 2]; R];
+        let mut b = b;
+        for tap in taps {
+            // SAFETY: all addresses are inside what the caller promises; pairs need no alignment.
+            unsafe {
+                let a = a.add(*tap);
+                for k in 0..steps {
+                    let (left, right) = (s.load_pairs(b), s.load_pairs(b.add(S::LANES)));
+                    b = b.add(2 * S::LANES);
+                    for r in 0..R {
+                        let x = s.splat_pair(a.add(r * stride + 2 * k).cast::<u32>().read_unaligned());
+                        acc[r] = [s.dot(x, left, acc[r][0]), s.dot(x, right, acc[r][1])];
+                    }
+                }
+            }
+        }
+        sums[..R].copy_from_slice(&acc);
+    }
+}
