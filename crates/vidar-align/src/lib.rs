@@ -7,5 +7,6 @@
 //! fit changes nothing (section III-F).
 
 mod place;
+pub mod streaming;
 
 pub use place::{AlignConfig, AlignError, Anchor, ChunkAlignment, Verdict, aligned_views, place_chunk};
