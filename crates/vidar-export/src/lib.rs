@@ -14,7 +14,8 @@
 //! | [COLMAP](colmap) | `camera_from_world`; pixel corner is (0, 0) | views, points, colours | time, normals, confidence |
 //! | [transforms.json](transforms) | `world_from_camera`, OpenGL camera; pixel corner is (0, 0) | views, time | – |
 //!
-//! No format re-centres, rotates or rescales the world.
+//! None of these formats re-centres, rotates or rescales the world. [`official`] holds the files of the official Depth
+//! Anything 3 program (npz, GLB scene, depth pictures, COLMAP) with that program's own conventions.
 //!
 //! # Checked against other tools
 //!
@@ -35,6 +36,7 @@ pub mod depth;
 pub mod error;
 pub mod glb;
 mod json;
+pub mod official;
 pub mod ply;
 mod text;
 pub mod trajectory;
