@@ -4,11 +4,10 @@
 //! the way there and back ends within a pixel or so of its start and the depths differ by little. Where views agree
 //! their inverse depths are averaged, which removes part of each one's noise.
 
-use crate::cache::ViewDepth;
+use crate::chunk::ViewDepth;
 use crate::config::StereoConfig;
 use crate::warp::{Warp, neighbour_from_reference};
 use rayon::prelude::*;
-use std::sync::Arc;
 
 /// Largest distance between a pixel and where the way there and back ends, working pixels.
 const REPROJECTION_LIMIT_PX: f32 = 1.5;
@@ -36,7 +35,7 @@ struct Other<'a> {
 }
 
 /// Compares a view's own depth with that of `others`.
-pub(crate) fn support(own: &ViewDepth, others: &[Arc<ViewDepth>], config: &StereoConfig) -> Vec<Support> {
+pub(crate) fn support(own: &ViewDepth, others: &[&ViewDepth], config: &StereoConfig) -> Vec<Support> {
     let others: Vec<Other<'_>> = others
         .iter()
         .map(|other| {

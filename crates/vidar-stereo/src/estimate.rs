@@ -29,6 +29,8 @@ pub(crate) struct Estimate {
     pub margin: Vec<f32>,
     /// Standard deviation of the reference's window, grey levels.
     pub texture: Vec<f32>,
+    /// Growth of the cost away from the winner, per squared pixel of shift of the best neighbour.
+    pub curvature: Vec<f32>,
     /// Inverse-depth step that shifts the best neighbour by one working pixel, 1/m.
     pub rho_per_px: f32,
 }

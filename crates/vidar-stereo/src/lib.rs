@@ -19,12 +19,14 @@
 //! - **Poses** (`register`): corrected by a small bundle adjustment within the spread that the settings grant, before
 //!   anything else is matched; the prediction carries the corrected ones.
 //!
-//! The prediction is in the frame of the prior poses and in metres. A model follows one stream: a view that was placed
-//! and estimated in an earlier call is not worked out again (`cache`), so results depend on the calls before, and are
-//! the same bits for the same calls with any number of threads. Memory for one reference of `w × h` working pixels and `d` planes is about
-//! `w/2 · h/2 · d · 5` bytes for costs and sums and 20 bytes a pixel for each view's finished estimate.
+//! The prediction is in the frame of the prior poses and in metres. It is a function of the call's input alone, the same
+//! bits for any number of threads: a model keeps nothing between calls. Corrected poses are a chunk's own, so a view
+//! seen by two chunks may stand a few millimetres apart in them.
+//!
+//! Memory for one reference of `w × h` working pixels and `d` planes is about `w/2 · h/2 · d · 5` bytes for costs and
+//! sums and 24 bytes a pixel for each view's finished estimate, until the call ends.
 
-mod cache;
+mod chunk;
 mod confidence;
 mod config;
 mod consistency;
@@ -40,7 +42,7 @@ mod sgm;
 mod sweep;
 mod warp;
 
-pub use confidence::TOLERANCE_RATIO;
+pub use confidence::{Evidence, TOLERANCE_RATIO};
 pub use config::StereoConfig;
 pub use error::StereoError;
-pub use model::{OmittedView, StereoModel, StereoOutput};
+pub use model::{OmittedView, StereoModel, StereoOutput, ViewEvidence};

@@ -2,6 +2,7 @@
 
 use crate::config::StereoConfig;
 use crate::error::StereoError;
+use crate::register::Misfit;
 use vidar_core::{ChunkView, FrameId, Image, Pinhole, Se3};
 
 /// Fewest rows and columns of a working image: the coarsest level still holds a few windows then.
@@ -22,8 +23,8 @@ pub(crate) struct Level {
 pub(crate) struct Prepared {
     pub frame_id: FrameId,
     pub world_from_camera: Se3,
-    /// By how much the correction of the poses shifted what this view shares with others, working pixels.
-    pub shift_px: f32,
+    /// How well its pose suits the images; nothing is known where poses are taken as given.
+    pub misfit: Misfit,
     /// Working size, half of it, a quarter of it.
     pub levels: [Level; 3],
 }
@@ -62,7 +63,12 @@ pub(crate) fn prepare(view: &ChunkView, config: &StereoConfig) -> Result<Prepare
     }
     let half = halved(&working);
     let quarter = halved(&half);
-    Ok(Prepared { frame_id: frame, world_from_camera, shift_px: 0.0, levels: [working, half, quarter] })
+    Ok(Prepared {
+        frame_id: frame,
+        world_from_camera,
+        misfit: Misfit::default(),
+        levels: [working, half, quarter],
+    })
 }
 
 /// Mean over blocks of 2 × 2; an odd last row or column is left out.

@@ -21,6 +21,8 @@ struct Plane {
     gy: f32,
     score: f32,
     cost: f32,
+    /// Second derivative of the cost by inverse depth, m².
+    curvature: f32,
 }
 
 /// Pull towards the coarse solution per plane of difference, in units of a full mismatch.
@@ -93,12 +95,14 @@ pub(crate) fn refine(
     }
     let texture = (0..w * h).map(|i| patches.reference(i % w, i / w).variance.sqrt()).collect();
     let margin = (0..w * h).map(|i| winners.margin[coarse_index(coarse, i % w, i / w)]).collect();
+    let rho_per_px = 1.0 / shift_per_rho(fine, sources).max(f32::MIN_POSITIVE);
     Estimate {
+        curvature: state.iter().map(|p| p.curvature * rho_per_px * rho_per_px).collect(),
         rho: state.iter().map(|p| p.rho).collect(),
         cost: state.iter().map(|p| p.cost).collect(),
         margin,
         texture,
-        rho_per_px: 1.0 / shift_per_rho(fine, sources).max(f32::MIN_POSITIVE),
+        rho_per_px,
     }
 }
 
@@ -139,7 +143,7 @@ fn upsample(fine: &Level, coarse: &Level, winners: &Winners, planes: &Planes) ->
             // Fine pixel 2c + 0 lies a quarter of a coarse pixel before the centre of c, 2c + 1 a quarter after.
             let offset = |p: usize, c: usize| (p as f32 + 0.5) * 0.5 - 0.5 - c as f32;
             let rho = rho + gx * offset(x, (x / 2).min(cw - 1)) + gy * offset(y, (y / 2).min(ch - 1));
-            Plane { rho, gx: 0.5 * gx, gy: 0.5 * gy, score: f32::INFINITY, cost: 1.0 }
+            Plane { rho, gx: 0.5 * gx, gy: 0.5 * gy, score: f32::INFINITY, cost: 1.0, curvature: 0.0 }
         })
         .collect()
 }
@@ -215,18 +219,19 @@ impl Patches<'_> {
     fn settled(&self, plane: Plane, delta: f32, center: f32, step: f32, patch: &Patch) -> Plane {
         let at = |by: f32| self.scored(Plane { rho: plane.rho + by, ..plane }, center, step, patch);
         let (further, nearer) = (at(-delta), at(delta));
+        let bend = (further.cost - 2.0 * plane.cost + nearer.cost) / (delta * delta);
         if further.score < plane.score && further.score <= nearer.score && further.rho > 0.0 {
-            return further;
+            return Plane { curvature: bend, ..further };
         }
         if nearer.score < plane.score {
-            return nearer;
+            return Plane { curvature: bend, ..nearer };
         }
         let curvature = further.score - 2.0 * plane.score + nearer.score;
         if !(curvature > 1e-4) {
-            return plane;
+            return Plane { curvature: bend, ..plane };
         }
         let offset = (0.5 * (further.score - nearer.score) / curvature).clamp(-0.5, 0.5);
-        Plane { rho: plane.rho + offset * delta, ..plane }
+        Plane { rho: plane.rho + offset * delta, curvature: bend, ..plane }
     }
 
     /// Mean of `1 − ncc` over the better half of the neighbours; 1 where none sees the window.

@@ -16,7 +16,6 @@ use crate::select::select;
 use crate::warp::{Warp, neighbour_from_reference};
 use nalgebra::{Vector2, Vector3};
 use rayon::prelude::*;
-use std::sync::Arc;
 use vidar_core::Se3;
 
 /// One corner per square of this size, working pixels.
@@ -48,22 +47,24 @@ pub(crate) struct Track {
 /// A corrected pose.
 pub(crate) struct Placed {
     pub world_from_camera: Se3,
-    /// Median shift of what the view shares with others by the correction, working pixels.
+    /// How well the poses suited the images before, and how well they do now.
+    pub misfit: Misfit,
+}
+
+/// How the poses of a view and the images around it suit each other, medians in working pixels.
+#[derive(Clone, Copy, Debug, Default)]
+pub(crate) struct Misfit {
+    /// Shift of what the view shares with others by the correction.
     pub shift_px: f32,
+    /// What is left between matches and corrected poses.
+    pub residual_px: f32,
 }
 
 /// The views' poses, corrected; the given ones where there is nothing to correct them by.
-///
-/// Views that are `placed` already keep their pose, and the others are fitted to them.
-pub(crate) fn registered(
-    views: &[Prepared],
-    placed: &[bool],
-    probes: &[Option<Arc<Probe>>],
-    config: &StereoConfig,
-) -> Vec<Placed> {
+pub(crate) fn register(views: &[Prepared], probes: &[Option<Probe>], config: &StereoConfig) -> Vec<Placed> {
     let mut tracks: Vec<Track> = (0..views.len())
         .into_par_iter()
-        .flat_map_iter(|i| tracks_of(views, i, probes[i].as_deref(), config))
+        .flat_map_iter(|i| tracks_of(views, i, probes[i].as_ref(), config))
         .collect();
     let cameras: Vec<_> = views.iter().map(|v| v.levels[0].intrinsics).collect();
     let given: Vec<Se3> = views.iter().map(|v| v.world_from_camera).collect();
@@ -71,25 +72,28 @@ pub(crate) fn registered(
         rotation_rad: config.pose_spread_deg.to_radians(),
         translation_m: config.pose_spread_m,
     };
-    let poses = solve::adjusted(&given, placed, &cameras, &mut tracks, &spread);
-    let shifts_px = solve::shifts_px(&given, &poses, &cameras, &tracks);
-    let pair = |(world_from_camera, shift_px)| Placed { world_from_camera, shift_px };
-    poses.into_iter().zip(shifts_px).map(pair).collect()
+    let poses = solve::adjusted(&given, &cameras, &mut tracks, &spread);
+    let misfits = solve::misfits(&given, &poses, &cameras, &tracks);
+    poses
+        .into_iter()
+        .zip(misfits)
+        .map(|(world_from_camera, misfit)| Placed { world_from_camera, misfit })
+        .collect()
 }
 
 /// Corners of a view with known depth, each searched in the views that see it best.
 fn tracks_of(views: &[Prepared], anchor: usize, probe: Option<&Probe>, config: &StereoConfig) -> Vec<Track> {
     let Some(probe) = probe else { return Vec::new() };
-    let own = &views[anchor].levels[0];
-    let coarse = &views[anchor].levels[PROBE_LEVEL];
-    let neighbours = select(
+    let searched = select(
         views,
         anchor,
         &[probe.depth.median],
         &StereoConfig { neighbours: SEARCHED_VIEWS, ..config.clone() },
     )
     .neighbours;
-    let warps: Vec<Warp> = neighbours
+    let own = &views[anchor].levels[0];
+    let coarse = &views[anchor].levels[PROBE_LEVEL];
+    let warps: Vec<Warp> = searched
         .iter()
         .map(|&n| {
             let motion =
@@ -107,7 +111,7 @@ fn tracks_of(views: &[Prepared], anchor: usize, probe: Option<&Probe>, config: &
             continue;
         }
         let mut found = Vec::new();
-        for (warp, &n) in warps.iter().zip(&neighbours) {
+        for (warp, &n) in warps.iter().zip(&searched) {
             let Some((u, v, _)) = warp.project(x as f32, y as f32, rho) else { continue };
             if let Some(pixel) = template.search(&views[n].levels[0], u, v) {
                 found.push((n, pixel));

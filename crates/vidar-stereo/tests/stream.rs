@@ -38,7 +38,12 @@ fn part(all: &ChunkViews, range: Range<usize>) -> ChunkViews {
 }
 
 fn bits(views: &[ViewGeometry]) -> Vec<u32> {
-    views.iter().flat_map(|v| v.depth.image().data().iter().map(|z| z.to_bits())).collect()
+    let of = |v: &ViewGeometry| -> Vec<u32> {
+        let pose = v.chunk_from_camera.matrix().map(|m| m as f32);
+        let values = v.depth.image().data().iter().chain(v.confidence.image().data());
+        values.chain(pose.iter()).map(|z| z.to_bits()).collect()
+    };
+    views.iter().flat_map(of).collect()
 }
 
 fn ids(views: &[ViewGeometry]) -> Vec<u32> {
@@ -57,46 +62,38 @@ fn counted(model: &mut StereoModel, chunk: &ChunkViews, wanted: Range<usize>) ->
 }
 
 #[test]
-fn only_wanted_views_come_back_and_a_second_call_works_out_nothing_new() {
+fn only_wanted_views_come_back_and_the_others_are_worked_out_only_as_far_as_they_serve() {
     let all = views(&boxed(), &flight(8), |_| (1.0, 0.0), 2.0);
-    let mut model = model();
-    let (first, work) = counted(&mut model, &all, 3..5);
-    assert_eq!(ids(&first), [3, 4]);
-    // Eight probes and at most all estimates, and the probes are asked for again.
-    assert!(work > 8 + 2 && work <= 16, "{work}");
-    let (again, rest) = counted(&mut model, &all, 3..5);
-    assert!(bits(&first) == bits(&again) && rest == 8, "{rest}");
+    let (found, work) = counted(&mut model(), &all, 3..5);
+    assert_eq!(ids(&found), [3, 4]);
+    // Eight probes, the two wanted, and one or two more for each to be checked against.
+    assert!((8 + 3..=8 + 6).contains(&work), "{work}");
 }
 
 #[test]
-fn a_chunk_takes_over_what_the_chunk_before_it_estimated() {
+fn a_chunk_is_predicted_alike_whatever_was_predicted_before() {
     let all = views(&boxed(), &flight(12), |_| (1.0, 0.0), 2.0);
     let mut streaming = model();
     counted(&mut streaming, &part(&all, 0..8), 0..5);
-    let (second, work) = counted(&mut streaming, &part(&all, 4..12), 1..6);
-    let (_, fresh) = counted(&mut model(), &part(&all, 4..12), 1..6);
-    assert_eq!(ids(&second), [5, 6, 7, 8, 9]);
-    assert!(work < fresh, "{work} of {fresh}");
-    // The same calls again, on one thread: the same bits.
+    let (after, _) = counted(&mut streaming, &part(&all, 4..12), 1..6);
+    let (alone, _) = counted(&mut model(), &part(&all, 4..12), 1..6);
+    assert_eq!(ids(&after), [5, 6, 7, 8, 9]);
+    assert!(bits(&after) == bits(&alone));
+    // And once more the chunk before, on one thread.
     let pool = rayon::ThreadPoolBuilder::new().num_threads(1).build().expect("pool");
-    let one_thread = pool.install(|| {
-        let mut other = model();
-        counted(&mut other, &part(&all, 0..8), 0..5);
-        counted(&mut other, &part(&all, 4..12), 1..6).0
-    });
-    assert!(bits(&second) == bits(&one_thread));
+    let before = pool.install(|| counted(&mut streaming, &part(&all, 0..8), 0..5).0);
+    assert!(bits(&before) == bits(&counted(&mut model(), &part(&all, 0..8), 0..5).0));
 }
 
 #[test]
-fn another_image_under_a_known_number_is_another_view() {
-    let flight = flight(5);
-    let one = views(&boxed(), &flight, |_| (1.0, 0.0), 2.0);
-    let other = views(&WALL, &flight, |_| (1.0, 0.0), 2.0);
+fn views_that_nobody_asked_for_change_nothing_but_through_the_matching() {
+    // The same call twice, and the whole chunk in between: a model keeps nothing.
+    let all = views(&boxed(), &flight(6), |_| (1.0, 0.0), 2.0);
     let mut used = model();
-    used.predict_wanted(&one, 2..3, &|| false).expect("has parallax");
-    let after = used.predict_wanted(&other, 2..3, &|| false).expect("has parallax");
-    let fresh = model().predict_wanted(&other, 2..3, &|| false).expect("has parallax");
-    assert!(bits(&after.views) == bits(&fresh.views));
+    let first = used.predict_wanted(&all, 2..3, &|| false).expect("has parallax");
+    used.predict(&all).expect("has parallax");
+    let again = used.predict_wanted(&all, 2..3, &|| false).expect("has parallax");
+    assert!(bits(&first.views) == bits(&again.views));
 }
 
 #[test]

@@ -1,6 +1,6 @@
 //! The bundle adjustment: robust least squares over poses and inverse depths.
 
-use super::Track;
+use super::{Misfit, Track};
 use nalgebra::{DMatrix, DVector, Matrix2x3, Matrix3, Matrix6, SMatrix, Vector2, Vector3};
 use vidar_core::{LieGroup, Pinhole, Se3, So3};
 
@@ -16,8 +16,6 @@ const HALF_WEIGHT_PX: [f64; 8] = [4.0, 3.0, 2.0, 1.5, 1.0, 0.8, 0.8, 0.8];
 const SPREAD_WIDTH_PX: f64 = 320.0;
 /// Spread of a good match, working pixels.
 const MATCH_SPREAD_PX: f64 = 0.3;
-/// Weight that holds a placed view: a micrometre and a microradian.
-const PLACED_WEIGHT: f64 = 1e12;
 /// Fewest tracks that are worth adjusting for.
 const MIN_TRACKS: usize = 12;
 
@@ -34,10 +32,8 @@ struct Row {
 }
 
 /// The poses that explain `tracks` best, near `given`. The given ones if there are too few tracks or no solution.
-/// Those that are `placed` stay.
 pub(crate) fn adjusted(
     given: &[Se3],
-    placed: &[bool],
     cameras: &[Pinhole],
     tracks: &mut [Track],
     spread: &Spread,
@@ -47,40 +43,41 @@ pub(crate) fn adjusted(
         return poses;
     }
     for half_weight_px in HALF_WEIGHT_PX {
-        let Some(step) = step(&poses, given, placed, cameras, tracks, spread, half_weight_px) else {
+        let Some(step) = step(&poses, given, cameras, tracks, spread, half_weight_px) else {
             return given.to_vec();
         };
-        for (i, pose) in poses.iter_mut().enumerate().filter(|(i, _)| !placed[*i]) {
+        for (i, pose) in poses.iter_mut().enumerate() {
             let turn = Vector3::new(step[6 * i + 3], step[6 * i + 4], step[6 * i + 5]);
             let shift = Vector3::new(step[6 * i], step[6 * i + 1], step[6 * i + 2]);
             *pose = *pose * Se3::new(So3::exp(&turn), shift);
         }
     }
-    if !placed.contains(&true) {
-        restore_scale(&mut poses, given, spread);
-    }
+    restore_scale(&mut poses, given, spread);
     if poses.iter().all(Se3::is_finite) { poses } else { given.to_vec() }
 }
 
-/// By how much the correction moved the matches anchored in each view: their median shift, working pixels.
-pub(crate) fn shifts_px(given: &[Se3], poses: &[Se3], cameras: &[Pinhole], tracks: &[Track]) -> Vec<f32> {
+/// How far the correction moved the matches of each view, and how far they are from where they should be now.
+pub(crate) fn misfits(given: &[Se3], poses: &[Se3], cameras: &[Pinhole], tracks: &[Track]) -> Vec<Misfit> {
     let mut shifts: Vec<Vec<f64>> = vec![Vec::new(); poses.len()];
+    let mut residuals = shifts.clone();
     for track in tracks {
         let at_anchor = track.ray / track.rho;
-        for (other, _) in &track.found {
+        for (other, found) in &track.found {
             let pixel = |poses: &[Se3]| {
                 cameras[*other].project(&(poses[*other].inverse() * poses[track.anchor] * at_anchor))
             };
             if let (Some(before), Some(after)) = (pixel(given), pixel(poses)) {
                 shifts[track.anchor].push((after - before).norm());
+                residuals[track.anchor].push((after - found).norm());
             }
         }
     }
-    let median = |mut shifts: Vec<f64>| {
-        shifts.sort_unstable_by(f64::total_cmp);
-        shifts.get(shifts.len() / 2).map_or(0.0, |m| *m as f32)
+    let median = |mut values: Vec<f64>| {
+        values.sort_unstable_by(f64::total_cmp);
+        values.get(values.len() / 2).map_or(0.0, |m| *m as f32)
     };
-    shifts.into_iter().map(median).collect()
+    let misfit = |(shifts, residuals)| Misfit { shift_px: median(shifts), residual_px: median(residuals) };
+    shifts.into_iter().zip(residuals).map(misfit).collect()
 }
 
 /// Scales the corrected camera centres about their middle to the size of the given ones.
@@ -108,12 +105,10 @@ fn restore_scale(poses: &mut [Se3], given: &[Se3], spread: &Spread) {
     }
 }
 
-#[allow(clippy::too_many_arguments)] // poses as given and as they stand, and what they are judged by
 /// One Gauss-Newton step: updates the inverse depths and returns the poses' (shift, turn) in their own frames.
 fn step(
     poses: &[Se3],
     given: &[Se3],
-    placed: &[bool],
     cameras: &[Pinhole],
     tracks: &mut [Track],
     spread: &Spread,
@@ -122,11 +117,7 @@ fn step(
     let n = 6 * poses.len();
     let (mut h, mut g) = (DMatrix::<f64>::zeros(n, n), DVector::<f64>::zeros(n));
     for (i, (pose, given)) in poses.iter().zip(given).enumerate() {
-        let (wt, wr) = if placed[i] {
-            (PLACED_WEIGHT, PLACED_WEIGHT)
-        } else {
-            (spread.translation_m.powi(-2), spread.rotation_rad.powi(-2))
-        };
+        let (wt, wr) = (spread.translation_m.powi(-2), spread.rotation_rad.powi(-2));
         let moved = given.inverse() * *pose;
         let turned = moved.rotation.log();
         for k in 0..3 {

@@ -1,0 +1,74 @@
+//! Judges stereo view by view on recordings with sensor depth: how much is there, how right it is, and whether
+//! confidence is the share that is right.
+//!
+//! ```sh
+//! cargo run --release -p vidar-stereo --example judge_views -- RECORDING [FLAG VALUE]...
+//! ```
+//!
+//! Of the recording: `--camera-model`, `--depth-intrinsics`, `--color-from-depth` as `vidar run` takes them.
+//! Which keyframes: `--min-translation-m`, `--min-rotation-deg`, `--first N`, `--last N` (of the keyframes).
+//! Settings of stereo: `--set key=value`. What is worked into the input, so that it is no longer right: `--jitter-deg`,
+//! `--jitter-m` (noise of each pose), `--lag-ms` (poses late by so much), `--focal-ratio`, `--center-px`, `--seed N`.
+//! `--csv FILE` writes a sample of the evidence with the error, for `fit_confidence`.
+
+#![allow(clippy::print_stdout, reason = "its output is what the example is for")]
+
+mod input;
+mod score;
+
+use input::{Recording, Request};
+use score::Score;
+use std::error::Error;
+use vidar_core::{ChunkId, ChunkViews};
+use vidar_stereo::{StereoConfig, StereoModel};
+
+/// Keyframes of a chunk and of its context on each side, as the program's defaults are.
+const CHUNK: usize = 16;
+const CONTEXT: usize = 8;
+
+fn main() -> Result<(), Box<dyn Error>> {
+    let args: Vec<String> = std::env::args().skip(1).collect();
+    let request = Request::parse(&args)?;
+    let config: StereoConfig = toml::from_str(&request.settings.join("\n"))?;
+    let recording = Recording::open(&request)?;
+    let mut model = StereoModel::new(config)?;
+    let mut score = Score::default();
+    let count = recording.keyframes.len();
+    let wanted = request.first.min(count)..request.last.min(count);
+    let views = recording.views(&request)?;
+    let (mut omitted, before) = (0, processor_secs());
+    for (number, start) in wanted.clone().step_by(CHUNK).enumerate() {
+        let core = start..(start + CHUNK).min(wanted.end);
+        let seen = start.saturating_sub(CONTEXT)..(core.end + CONTEXT).min(count);
+        let chunk = ChunkViews { id: ChunkId(number as u32), views: views[seen.clone()].to_vec() };
+        let references: Vec<usize> = core.map(|i| i - seen.start).collect();
+        let (output, evidence) = model.predict_with_evidence(&chunk, &references, &|| false)?;
+        omitted += output.omitted.len();
+        for (view, evidence) in output.prediction.views.iter().zip(&evidence) {
+            let truth = recording.sensor_depth(view)?;
+            score.add(view, evidence, &truth);
+        }
+    }
+    let secs = processor_secs() - before;
+    println!("{}: {} keyframes, {omitted} without parallax", request.name(), wanted.len());
+    println!(
+        "  processor time {:.0} ms a view, with reading the truth",
+        1e3 * secs / wanted.len().max(1) as f64
+    );
+    score.print();
+    if let Some(path) = &request.csv {
+        std::fs::write(path, score.csv())?;
+    }
+    Ok(())
+}
+
+/// Processor time of this process so far, all threads, seconds; zero where the system does not tell.
+fn processor_secs() -> f64 {
+    let stat = std::fs::read_to_string("/proc/self/stat").unwrap_or_default();
+    // After the name in parentheses; user and system time are the 14th and 15th field, in hundredths of a second.
+    let fields: Vec<f64> = stat
+        .rsplit(')')
+        .next()
+        .map_or_else(Vec::new, |rest| rest.split_whitespace().map(|f| f.parse().unwrap_or(0.0)).collect());
+    fields.get(11..13).map_or(0.0, |times| times.iter().sum::<f64>() / 100.0)
+}

@@ -1,0 +1,121 @@
+//! One call's way from views to depth. Every step is a function of the call's input, and nothing outlives the call:
+//! corrected poses depend on all views of a chunk, so an estimate of another chunk would hardly ever be the same.
+
+use crate::config::StereoConfig;
+use crate::error::StereoError;
+use crate::estimate::{Estimate, Probe, estimate, probe};
+use crate::prepare::Prepared;
+use crate::register::register;
+use rayon::prelude::*;
+use std::collections::{BTreeMap, BTreeSet};
+use vidar_core::{Pinhole, Se3};
+
+/// Neighbours whose own depths are compared with a reference's.
+const CHECKED_NEIGHBOURS: usize = 4;
+/// As many of them have to be there even if nobody asked for their depth.
+const MIN_CHECKED: usize = 2;
+
+/// Depth of one view before the checks, with all that the checks of others need.
+#[derive(Debug)]
+pub(crate) struct ViewDepth {
+    /// The corrected pose.
+    pub world_from_camera: Se3,
+    /// Intrinsics at the working size.
+    pub intrinsics: Pinhole,
+    /// What the view alone says.
+    pub estimate: Estimate,
+    /// The views that it was matched with, best first: indices into the chunk.
+    pub neighbours: Vec<usize>,
+}
+
+/// Asked before each piece of work; `true` ends the call.
+pub(crate) type Cancel<'a> = &'a (dyn Fn() -> bool + Sync);
+
+/// A call in progress.
+pub(crate) struct Chunk<'a> {
+    /// The views; at their corrected poses once [`Chunk::work`] is done.
+    pub views: Vec<Prepared>,
+    /// Largest parallax that a view without depth was found to have, degrees.
+    pub parallax_deg: Vec<f64>,
+    /// Depths of the references and of the views that these are checked against.
+    pub depths: BTreeMap<usize, ViewDepth>,
+    /// The views whose depth is asked for.
+    references: &'a BTreeSet<usize>,
+    config: &'a StereoConfig,
+    cancel: Cancel<'a>,
+}
+
+impl<'a> Chunk<'a> {
+    pub fn new(
+        views: Vec<Prepared>,
+        references: &'a BTreeSet<usize>,
+        config: &'a StereoConfig,
+        cancel: Cancel<'a>,
+    ) -> Self {
+        let parallax_deg = vec![0.0; views.len()];
+        Self { views, parallax_deg, depths: BTreeMap::new(), references, config, cancel }
+    }
+
+    /// Depth of the references and of the views that they are checked against.
+    pub fn work(&mut self) -> Result<(), StereoError> {
+        let probes = self.probe()?;
+        if self.config.pose_spread_deg > 0.0 && self.config.pose_spread_m > 0.0 {
+            let placed = register(&self.views, &probes, self.config);
+            for (view, placed) in self.views.iter_mut().zip(placed) {
+                (view.world_from_camera, view.misfit) = (placed.world_from_camera, placed.misfit);
+            }
+        }
+        self.estimate(self.references, &probes)?;
+        let checks = self.references.iter().flat_map(|&r| self.checked(r)).collect();
+        self.estimate(&checks, &probes)
+    }
+
+    /// The views that a view with depth is checked against: those whose depth is asked for anyway come first.
+    pub fn checked(&self, view: usize) -> Vec<usize> {
+        let Some(depth) = self.depths.get(&view) else { return Vec::new() };
+        let (asked, context): (Vec<usize>, Vec<usize>) =
+            depth.neighbours.iter().partition(|n| self.references.contains(n));
+        let extra = MIN_CHECKED.saturating_sub(asked.len());
+        asked.into_iter().take(CHECKED_NEIGHBOURS).chain(context.into_iter().take(extra)).collect()
+    }
+
+    /// A rough look at every view; nothing for those without parallax.
+    fn probe(&mut self) -> Result<Vec<Option<Probe>>, StereoError> {
+        let of_view = |i| self.unless_cancelled(|| probe(&self.views, i, self.config));
+        let found = (0..self.views.len()).into_par_iter().map(of_view).collect::<Result<Vec<_>, _>>()?;
+        for (parallax_deg, probe) in self.parallax_deg.iter_mut().zip(&found) {
+            *parallax_deg = probe.as_ref().err().copied().unwrap_or(0.0);
+        }
+        Ok(found.into_iter().map(Result::ok).collect())
+    }
+
+    /// Estimates those of `wanted` that have no depth yet, views in parallel.
+    fn estimate(&mut self, wanted: &BTreeSet<usize>, probes: &[Option<Probe>]) -> Result<(), StereoError> {
+        let missing: Vec<(usize, &Probe)> = wanted
+            .iter()
+            .filter(|i| !self.depths.contains_key(i))
+            .filter_map(|&i| Some((i, probes[i].as_ref()?)))
+            .collect();
+        let done = missing
+            .into_par_iter()
+            .map(|(i, probe)| {
+                self.unless_cancelled(|| (i, estimate(&self.views, i, &probe.depth, self.config)))
+            })
+            .collect::<Result<Vec<_>, _>>()?;
+        for (i, outcome) in done {
+            match outcome {
+                Err(found_deg) => self.parallax_deg[i] = found_deg,
+                Ok((estimate, neighbours)) => {
+                    let (world_from_camera, intrinsics) =
+                        (self.views[i].world_from_camera, self.views[i].levels[0].intrinsics);
+                    self.depths.insert(i, ViewDepth { world_from_camera, intrinsics, estimate, neighbours });
+                }
+            }
+        }
+        Ok(())
+    }
+
+    fn unless_cancelled<T>(&self, work: impl FnOnce() -> T) -> Result<T, StereoError> {
+        if (self.cancel)() { Err(StereoError::Cancelled) } else { Ok(work()) }
+    }
+}
