@@ -10,6 +10,7 @@ mod nested;
 mod single_view;
 
 pub(crate) use any_view::{AnyView, Request};
+pub use nested::metres_per_canonical;
 pub(crate) use nested::{Nested, scale_to_metres};
 pub(crate) use single_view::{SingleAnswer, SingleView};
 

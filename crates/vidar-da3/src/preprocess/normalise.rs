@@ -7,6 +7,11 @@ const MEAN: [f32; 3] = [0.485, 0.456, 0.406];
 /// Channel deviations of ImageNet.
 const STD: [f32; 3] = [0.229, 0.224, 0.225];
 
+/// The same numbers as the official way back uses them, in double precision.
+const MEAN_EXACT: [f64; 3] = [0.485, 0.456, 0.406];
+/// As [`MEAN_EXACT`].
+const STD_EXACT: [f64; 3] = [0.229, 0.224, 0.225];
+
 /// The 256 values a byte can become, per channel.
 fn table() -> [[f32; 256]; 3] {
     std::array::from_fn(|c| std::array::from_fn(|v| (v as f32 / 255.0 - MEAN[c]) / STD[c]))
@@ -38,7 +43,7 @@ pub fn denormalise(planes: &[f32], width: usize, height: usize) -> Image<[u8; 3]
     Image::from_fn(width, height, |x, y| {
         std::array::from_fn(|c| {
             let value = planes.get(c * area + y * width + x).copied().unwrap_or(0.0);
-            ((value * STD[c] + MEAN[c]).clamp(0.0, 1.0) * 255.0) as u8
+            ((f64::from(value) * STD_EXACT[c] + MEAN_EXACT[c]).clamp(0.0, 1.0) * 255.0) as u8
         })
     })
 }
