@@ -166,13 +166,28 @@ impl Smoother {
         state: NavState,
         sigmas: AnchorSigmas,
     ) -> Result<(), SmootherError> {
-        if !state.is_finite() {
+        self.start_about(id, time, state, state, sigmas)
+    }
+
+    /// As [`Smoother::start`], with a first guess that is not what is believed: `reference` is, as well as `sigmas` say.
+    ///
+    /// # Errors
+    /// A state that is not finite.
+    pub fn start_about(
+        &mut self,
+        id: FrameId,
+        time: Timestamp,
+        guess: NavState,
+        reference: NavState,
+        sigmas: AnchorSigmas,
+    ) -> Result<(), SmootherError> {
+        if !guess.is_finite() || !reference.is_finite() {
             return Err(SmootherError::BadState(id));
         }
         self.clear();
         self.system.factorised = false;
-        self.frames.push(Frame::new(id, time, state, None));
-        self.anchor = Some(Anchor { frame: 0, reference: state, sigmas });
+        self.frames.push(Frame::new(id, time, guess, None));
+        self.anchor = Some(Anchor { frame: 0, reference, sigmas });
         Ok(())
     }
 
@@ -417,6 +432,18 @@ impl Smoother {
         };
         let q = visual::direction(&place(host), &place(target), &estimate.bearing, estimate.inverse_distance);
         self.camera.project(&q)
+    }
+
+    /// Squared whitened misfit of the readings between frames, per degree of freedom; 1 is what fits, 0 when there are
+    /// none.
+    pub fn inertial_chi2_per_dof(&self) -> f64 {
+        let mut sum = (0.0, 0.0);
+        for pair in self.frames.windows(2) {
+            let Some(link) = &pair[1].link else { continue };
+            let r = inertial::residual(&link.readings, &pair[0].state, &pair[1].state);
+            sum = (sum.0 + link.whitening.apply(&r).norm_squared(), sum.1 + 15.0);
+        }
+        if sum.1 > 0.0 { sum.0 / sum.1 } else { 0.0 }
     }
 
     /// Memory of readings that are not needed any more, to be filled again by [`Preintegration::restart`].

@@ -1,0 +1,92 @@
+//! Gyroscope bias from images alone.
+//!
+//! Rays `f_i`, `f_j` of one point in two views with relative rotation R span epipolar planes with normals
+//! `n = f_i × R f_j` that are all orthogonal to the translation: the smallest eigenvalue of `Σ n nᵀ` vanishes for the right
+//! rotation, whatever the translation, also for none (Kneip & Lynen, "Direct optimization of frame-to-frame rotation",
+//! ICCV 2013). The rotations of all pairs hang on one bias.
+
+use crate::imu::Bias;
+use nalgebra::{Matrix3, Vector3};
+use vidar_core::So3;
+
+/// Rays of common points in two views, with the rotation between the views as a function of the bias.
+pub(crate) struct RayPair<F: Fn(&Bias) -> So3> {
+    /// Unit rays in the cameras of both views.
+    pub(crate) rays: Vec<(Vector3<f64>, Vector3<f64>)>,
+    /// Rotation first_from_second between the cameras.
+    pub(crate) rotation: F,
+}
+
+/// Steps of Newton's method.
+const STEPS: usize = 12;
+
+/// Step of the numeric derivatives, rad/s.
+const H: f64 = 1e-4;
+
+/// Farthest that the bias is looked for from the start, rad/s.
+const REACH: f64 = 0.5;
+
+/// The bias that makes all pairs' epipolar planes agree best, from `start`.
+pub(crate) fn gyro_bias<F: Fn(&Bias) -> So3>(pairs: &[RayPair<F>], start: Vector3<f64>) -> Vector3<f64> {
+    let cost = |gyro: &Vector3<f64>| -> f64 {
+        let bias = Bias { gyro: *gyro, accel: Vector3::zeros() };
+        pairs.iter().map(|p| smallest_eigenvalue(&p.rays, &(p.rotation)(&bias).matrix())).sum()
+    };
+    let mut at = start;
+    let mut value = cost(&at);
+    let mut damping = 1e-3;
+    for _ in 0..STEPS {
+        let (gradient, hessian) = derivatives(&cost, &at, value);
+        let mut damped = hessian;
+        for k in 0..3 {
+            damped[(k, k)] += damping * hessian[(k, k)].abs() + 1e-12;
+        }
+        let Some(step) = damped.cholesky().map(|c| c.solve(&-gradient)) else {
+            damping = (damping * 10.0).max(1.0);
+            continue;
+        };
+        let next = at + step;
+        let next_value = cost(&next);
+        if next_value < value && (next - start).norm() < REACH {
+            let done = step.norm() < 1e-6;
+            (at, value) = (next, next_value);
+            damping *= 0.2;
+            if done {
+                break;
+            }
+        } else {
+            damping = (damping * 10.0).max(1e-3);
+        }
+    }
+    at
+}
+
+fn smallest_eigenvalue(rays: &[(Vector3<f64>, Vector3<f64>)], rotation: &Matrix3<f64>) -> f64 {
+    let mut m = Matrix3::zeros();
+    for (a, b) in rays {
+        let n = a.cross(&(rotation * b));
+        m += n * n.transpose();
+    }
+    m.symmetric_eigenvalues().min()
+}
+
+fn derivatives(
+    cost: &impl Fn(&Vector3<f64>) -> f64,
+    at: &Vector3<f64>,
+    value: f64,
+) -> (Vector3<f64>, Matrix3<f64>) {
+    let unit = |k: usize| Vector3::ith(k, H);
+    let (mut gradient, mut hessian) = (Vector3::zeros(), Matrix3::zeros());
+    for k in 0..3 {
+        let (plus, minus) = (cost(&(at + unit(k))), cost(&(at - unit(k))));
+        gradient[k] = (plus - minus) / (2.0 * H);
+        hessian[(k, k)] = (plus - 2.0 * value + minus) / (H * H);
+        for j in 0..k {
+            let (a, b) = (unit(k) + unit(j), unit(k) - unit(j));
+            let mixed = (cost(&(at + a)) - cost(&(at + b)) - cost(&(at - b)) + cost(&(at - a))) / (4.0 * H * H);
+            hessian[(k, j)] = mixed;
+            hessian[(j, k)] = mixed;
+        }
+    }
+    (gradient, hessian)
+}

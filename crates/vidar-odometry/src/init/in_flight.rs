@@ -1,0 +1,480 @@
+//! Start in motion.
+
+use super::condition::{Obstacle, Refusal};
+use super::gyro_bias::{RayPair, gyro_bias};
+use super::linear::{self, LinearSolution, LinearView, Rays};
+use super::still::leveled;
+use crate::estimator::{AnchorSigmas, Observation, Smoother, SmootherConfig, SmootherError};
+use crate::imu::{Bias, NavState, Preintegration};
+use nalgebra::{Matrix2, Matrix3, Vector2, Vector3};
+use rustc_hash::FxHashMap;
+use serde::{Deserialize, Serialize};
+use vidar_core::{CameraModel, FrameId, LandmarkId, LieGroup, Se3, So3, Timestamp};
+
+/// What a frame saw of a track.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Seen {
+    /// The track.
+    pub landmark: LandmarkId,
+    /// Where, pixels.
+    pub pixel: Vector2<f64>,
+    /// Covariance of `pixel`, px².
+    pub covariance: Matrix2<f64>,
+}
+
+/// A frame before there is a state: what it saw, and the readings since the frame before in the log.
+#[derive(Clone, Debug)]
+pub struct LoggedFrame {
+    /// Its number.
+    pub frame: FrameId,
+    /// When it was taken, in the clock of the IMU.
+    pub time: Timestamp,
+    /// Readings since the frame before; what the first frame holds is not used.
+    pub readings: Option<Preintegration>,
+    /// What it saw.
+    pub seen: Vec<Seen>,
+}
+
+/// When a start in motion is believed.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
+#[serde(default, deny_unknown_fields)]
+pub struct InFlightConfig {
+    /// Longest stretch of the log that is used, s, 0.5…10.
+    pub window_secs: f64,
+    /// Most frames that are chosen from it, 5…15.
+    pub keyframes: usize,
+    /// Fewest tracks that at least three chosen frames share, 10…500.
+    pub min_tracks: usize,
+    /// Least median parallax, degrees, 0.1…20.
+    pub min_parallax_deg: f64,
+    /// Most standard deviation of log(scale), 0.005…0.5. 0.03 lets half of the starts be within 2 %.
+    pub max_log_scale_sigma: f64,
+    /// Most change of scale between two successive solutions, relative, 0.01…1.
+    pub max_scale_change: f64,
+    /// Standard deviation of the accelerometer's bias before anything is known, m/s², 0.01…2.
+    pub accel_bias_sigma: f64,
+    /// Standard deviation of the gyroscope's bias before anything is known, rad/s, 0.001…0.5.
+    pub gyro_bias_sigma: f64,
+    /// Highest speed that is believed, m/s, 1…100.
+    pub max_speed_mps: f64,
+}
+
+impl Default for InFlightConfig {
+    fn default() -> Self {
+        Self {
+            window_secs: 2.8,
+            keyframes: 15,
+            min_tracks: 25,
+            min_parallax_deg: 1.0,
+            max_log_scale_sigma: 0.03,
+            max_scale_change: 0.1,
+            accel_bias_sigma: 0.15,
+            gyro_bias_sigma: 0.1,
+            max_speed_mps: 15.0,
+        }
+    }
+}
+
+/// A metric state was found.
+#[derive(Clone, Debug)]
+pub struct Started {
+    /// The window, solved; it goes on as the running smoother. World: z up, origin and heading of its first frame.
+    pub smoother: Smoother,
+    /// Standard deviation of log(scale).
+    pub log_scale_sigma: f64,
+    /// Median distance of landmarks from their first camera, m.
+    pub median_distance_m: f64,
+}
+
+/// What came of an attempt.
+#[derive(Clone, Debug)]
+pub enum Attempt {
+    /// A metric state.
+    Started(Box<Started>),
+    /// Not yet, and why.
+    Refused(Refusal),
+}
+
+/// Largest biases that are believed, m/s² and rad/s.
+const MAX_ACCEL_BIAS: f64 = 0.6;
+const MAX_GYRO_BIAS: f64 = 0.3;
+
+/// χ² per degree of freedom beyond which a fit is not believed.
+const MAX_MISFIT: f64 = 3.0;
+
+/// Steps of the window's solution.
+const STEPS: usize = 12;
+
+/// Finds the first metric state in motion. Give it the log whenever a frame came; it remembers its last solution.
+#[derive(Clone, Debug)]
+pub struct InFlightStart {
+    config: InFlightConfig,
+    smoother_config: SmootherConfig,
+    camera: CameraModel,
+    body_from_camera: Se3,
+    gyro_bias: Vector3<f64>,
+    last: Option<Vec<(FrameId, Vector3<f64>)>>,
+}
+
+/// A chosen frame, with readings from the chosen one before.
+struct View<'a> {
+    logged: &'a LoggedFrame,
+    readings: Option<Preintegration>,
+}
+
+/// A track over the chosen frames.
+struct Track {
+    landmark: LandmarkId,
+    /// View, what it saw, unit ray in its camera.
+    seen: Vec<(usize, Seen, Vector3<f64>)>,
+}
+
+impl InFlightStart {
+    /// Nothing is known yet but the calibration.
+    pub fn new(
+        config: InFlightConfig,
+        smoother_config: SmootherConfig,
+        camera: CameraModel,
+        body_from_camera: Se3,
+    ) -> Self {
+        Self {
+            config,
+            smoother_config,
+            camera,
+            body_from_camera,
+            gyro_bias: Vector3::zeros(),
+            last: None,
+        }
+    }
+
+    /// Gyroscope bias as found by the last attempt that came so far, rad/s.
+    pub fn gyro_bias(&self) -> &Vector3<f64> {
+        &self.gyro_bias
+    }
+
+    /// Starts over.
+    pub fn forget(&mut self) {
+        self.last = None;
+    }
+
+    /// Looks for a metric state in the log (oldest first).
+    ///
+    /// # Errors
+    /// A smoother that cannot be built, which is a fault of the settings.
+    pub fn attempt(&mut self, log: &[LoggedFrame]) -> Result<Attempt, SmootherError> {
+        match self.solve(log)? {
+            Ok(started) => Ok(Attempt::Started(Box::new(started))),
+            Err(refusal) => Ok(Attempt::Refused(refusal)),
+        }
+    }
+
+    fn solve(&mut self, log: &[LoggedFrame]) -> Result<Result<Started, Refusal>, SmootherError> {
+        let mut views = self.choose(log);
+        if views.len() < 5 {
+            return Ok(Err(Refusal::new(Obstacle::Frames, views.len() as f64, 5.0)));
+        }
+        let tracks = self.gather(&views);
+        if tracks.len() < self.config.min_tracks {
+            let wanted = self.config.min_tracks as f64;
+            return Ok(Err(Refusal::new(Obstacle::Tracks, tracks.len() as f64, wanted)));
+        }
+        self.find_gyro_bias(&views, &tracks);
+        let bias = Bias { gyro: self.gyro_bias, accel: Vector3::zeros() };
+        views.iter_mut().filter_map(|v| v.readings.as_mut()).for_each(|r| r.reintegrate(bias));
+        let turns = self.turns(&views, &bias);
+        let parallax = self.median_parallax_deg(&tracks, &turns);
+        if !(parallax >= self.config.min_parallax_deg) {
+            self.last = None;
+            return Ok(Err(Refusal::new(Obstacle::Parallax, parallax, self.config.min_parallax_deg)));
+        }
+        let Some(first) = self.linear_start(&views, &tracks, &turns) else {
+            return Ok(Err(Refusal::new(Obstacle::ScaleUncertainty, f64::INFINITY, self.config.max_log_scale_sigma)));
+        };
+        let mut smoother = self.build(&views, &tracks, &turns, &first)?;
+        let image_misfit = self.refine(&mut smoother);
+        Ok(self.judge(smoother, image_misfit))
+    }
+
+    /// Chooses frames over the end of the log and joins their readings.
+    fn choose<'a>(&self, log: &'a [LoggedFrame]) -> Vec<View<'a>> {
+        let Some(newest) = log.last() else { return Vec::new() };
+        // A frame without readings cannot be tied to what came before it.
+        let chained = log.iter().rposition(|f| f.readings.is_none()).unwrap_or(0);
+        let within = |f: &&LoggedFrame| (newest.time - f.time).as_secs_f64() <= self.config.window_secs + 1e-6;
+        let log = &log[chained..];
+        let log = &log[log.len() - log.iter().rev().take_while(within).count()..];
+        let most = self.config.keyframes.min(self.smoother_config.max_frames - 1).max(3);
+        // Frames on a grid that only ever doubles, so that successive attempts choose the same ones; and the newest.
+        let mut stride = 1;
+        while log.len().saturating_sub(1) / stride + 2 > most {
+            stride *= 2;
+        }
+        let mut chosen: Vec<usize> = (0..log.len()).filter(|&k| log[k].frame.index() % stride == 0).collect();
+        if chosen.last() != Some(&(log.len() - 1)) {
+            chosen.push(log.len() - 1);
+        }
+        let mut views = Vec::with_capacity(chosen.len());
+        let mut from = 0;
+        for (k, &at) in chosen.iter().enumerate() {
+            let mut readings: Option<Preintegration> = None;
+            if k > 0 {
+                for part in log[from + 1..=at].iter().filter_map(|f| f.readings.as_ref()) {
+                    match &mut readings {
+                        None => readings = Some(part.clone()),
+                        Some(sum) => sum.append(part),
+                    }
+                }
+            }
+            views.push(View { logged: &log[at], readings });
+            from = at;
+        }
+        views
+    }
+
+    /// Tracks that at least three chosen frames share, in the order of their names.
+    fn gather(&self, views: &[View<'_>]) -> Vec<Track> {
+        let mut at: FxHashMap<LandmarkId, usize> = FxHashMap::default();
+        let mut tracks: Vec<Track> = Vec::new();
+        for (k, view) in views.iter().enumerate() {
+            for seen in &view.logged.seen {
+                let Some(ray) = self.camera.unproject(&seen.pixel) else { continue };
+                let slot = *at.entry(seen.landmark).or_insert_with(|| {
+                    tracks.push(Track { landmark: seen.landmark, seen: Vec::new() });
+                    tracks.len() - 1
+                });
+                tracks[slot].seen.push((k, *seen, ray));
+            }
+        }
+        tracks.retain(|t| t.seen.len() >= 3);
+        tracks.sort_unstable_by_key(|t| t.landmark);
+        tracks
+    }
+
+    /// Step 1: gyroscope bias from pairs of neighbouring and next-but-one views.
+    fn find_gyro_bias(&mut self, views: &[View<'_>], tracks: &[Track]) {
+        let camera_turn = self.body_from_camera.rotation;
+        let mut pairs = Vec::new();
+        for apart in [1, 3] {
+            for i in 0..views.len().saturating_sub(apart) {
+                let j = i + apart;
+                let ray = |t: &Track, k: usize| t.seen.iter().find(|(v, ..)| *v == k).map(|(.., ray)| *ray);
+                let rays: Vec<_> = tracks.iter().filter_map(|t| Some((ray(t, i)?, ray(t, j)?))).collect();
+                if rays.len() < 10 {
+                    continue;
+                }
+                let readings = &views[i + 1..=j];
+                let rotation = move |bias: &Bias| {
+                    let turn = readings.iter().filter_map(|v| v.readings.as_ref());
+                    let body = turn.fold(So3::IDENTITY, |sum, r| sum * r.rotation(bias));
+                    camera_turn.inverse() * body * camera_turn
+                };
+                pairs.push(RayPair { rays, rotation });
+            }
+        }
+        if !pairs.is_empty() {
+            self.gyro_bias = gyro_bias(&pairs, self.gyro_bias);
+        }
+    }
+
+    /// Rotations first_from_body of all views.
+    fn turns(&self, views: &[View<'_>], bias: &Bias) -> Vec<So3> {
+        let mut turn = So3::IDENTITY;
+        let step = |v: &View<'_>| v.readings.as_ref().map_or(So3::IDENTITY, |r| r.rotation(bias));
+        let next = |v: &View<'_>| {
+            turn = turn * step(v);
+            turn
+        };
+        views.iter().map(next).collect()
+    }
+
+    /// Median over tracks of the widest angle between rays that rotation leaves.
+    fn median_parallax_deg(&self, tracks: &[Track], turns: &[So3]) -> f64 {
+        let camera = self.body_from_camera.rotation;
+        let mut widest: Vec<f64> = tracks
+            .iter()
+            .map(|t| {
+                let ray = |s: &(usize, Seen, Vector3<f64>)| turns[s.0] * (camera * s.2);
+                let first = ray(&t.seen[0]);
+                t.seen.iter().map(|s| first.cross(&ray(s)).norm().atan2(first.dot(&ray(s)))).fold(0.0, f64::max)
+            })
+            .collect();
+        widest.sort_unstable_by(f64::total_cmp);
+        widest.get(widest.len() / 2).map_or(0.0, |a| a.to_degrees())
+    }
+
+    /// Step 2: velocity, gravity, bias and points, linear.
+    fn linear_start(&self, views: &[View<'_>], tracks: &[Track], turns: &[So3]) -> Option<LinearSolution> {
+        let (mut secs, mut position, mut velocity) = (0.0, Vector3::zeros(), Vector3::zeros());
+        let (mut position_by, mut velocity_by) = (Matrix3::zeros(), Matrix3::zeros());
+        let mut before = So3::IDENTITY;
+        let mut linear_views = Vec::with_capacity(views.len());
+        for (view, turn) in views.iter().zip(turns) {
+            if let Some(r) = &view.readings {
+                let (_, dp, dv) = r.corrected(r.bias());
+                let t = r.secs();
+                let m = before.matrix();
+                position += velocity * t + before * dp;
+                position_by += velocity_by * t + m * r.delta.by_accel_bias.fixed_view::<3, 3>(3, 0);
+                velocity += before * dv;
+                velocity_by += m * r.delta.by_accel_bias.fixed_view::<3, 3>(6, 0);
+                secs += t;
+            }
+            before = *turn;
+            let offset = position + *turn * self.body_from_camera.translation;
+            linear_views.push(LinearView { secs, offset, by_accel_bias: position_by });
+        }
+        let camera = self.body_from_camera.rotation;
+        let rays: Vec<Rays> = tracks
+            .iter()
+            .map(|t| t.seen.iter().map(|(k, _, ray)| (*k, turns[*k] * (camera * *ray))).collect())
+            .collect();
+        linear::solve(&linear_views, &rays, self.ray_sigma_rad(tracks), self.config.accel_bias_sigma)
+    }
+
+    fn ray_sigma_rad(&self, tracks: &[Track]) -> f64 {
+        let mean = |of: &mut dyn Iterator<Item = f64>| {
+            let (sum, n) = of.fold((0.0, 0.0), |(s, n), v| (s + v, n + 1.0));
+            if n > 0.0 { sum / n } else { 1.0 }
+        };
+        let variances = tracks.iter().flat_map(|t| &t.seen).map(|(_, s, _)| 0.5 * s.covariance.trace());
+        let focal = 0.5 * (self.camera.intrinsics().fx + self.camera.intrinsics().fy);
+        (mean(&mut variances.into_iter()).sqrt() / focal).max(1e-5)
+    }
+
+    /// Step 3: the window as a smoother.
+    fn build(
+        &self,
+        views: &[View<'_>],
+        tracks: &[Track],
+        turns: &[So3],
+        first: &LinearSolution,
+    ) -> Result<Smoother, SmootherError> {
+        let world_from_first = leveled(&-first.gravity);
+        let bias = Bias { gyro: self.gyro_bias, accel: first.accel_bias };
+        let mut state = NavState {
+            world_from_body: Se3::new(world_from_first, Vector3::zeros()),
+            velocity: world_from_first * first.velocity,
+            bias,
+        };
+        let mut smoother =
+            Smoother::new(self.smoother_config.clone(), self.camera.clone(), self.body_from_camera)?;
+        let sigmas = AnchorSigmas {
+            gyro_bias: self.config.gyro_bias_sigma,
+            accel_bias: self.config.accel_bias_sigma,
+            ..AnchorSigmas::GAUGE
+        };
+        for (k, view) in views.iter().enumerate() {
+            let (id, time) = (view.logged.frame, view.logged.time);
+            match &view.readings {
+                Some(readings) if k > 0 => {
+                    state = readings.predict(&state);
+                    state.world_from_body.rotation = world_from_first * turns[k];
+                    smoother.add_frame(id, time, state, Some(readings.clone()))?;
+                }
+                _ => {
+                    // The bias is about zero, not about the start value.
+                    smoother.start_about(id, time, state, NavState { bias: Bias::ZERO, ..state }, sigmas)?;
+                }
+            }
+            smoother.mark_keyframe(id)?;
+        }
+        let fallback = median(first.points.iter().flatten().map(|p| p.norm())).unwrap_or(4.0);
+        for (track, point) in tracks.iter().zip(&first.points) {
+            let (host, seen, _) = track.seen[0];
+            let observation = |view: usize, seen: &Seen| Observation {
+                frame: views[view].logged.frame,
+                landmark: track.landmark,
+                pixel: seen.pixel,
+                covariance: seen.covariance,
+                pixel_velocity: Vector2::zeros(),
+            };
+            let at = smoother.state(views[host].logged.frame).map_or(Se3::IDENTITY, |s| s.world_from_body);
+            let distance = point.map_or(fallback, |p| {
+                (world_from_first * p - at.act(&self.body_from_camera.translation)).norm()
+            });
+            smoother.add_landmark(&observation(host, &seen), 1.0 / distance.clamp(0.1, 1e3))?;
+            for (view, seen, _) in &track.seen[1..] {
+                smoother.add_observation(&observation(*view, seen))?;
+            }
+        }
+        Ok(smoother)
+    }
+
+    /// Solves the window, leaves out what does not fit, and solves again. Returns χ² per degree of freedom.
+    fn refine(&self, smoother: &mut Smoother) -> f64 {
+        let mut report = smoother.optimise(STEPS);
+        for _ in 0..2 {
+            if report.outliers.is_empty() {
+                break;
+            }
+            for outlier in &report.outliers {
+                smoother.remove_observation(outlier.frame, outlier.landmark);
+            }
+            report = smoother.optimise(STEPS / 2);
+        }
+        let lonely: Vec<LandmarkId> = smoother.landmarks().filter(|l| l.sightings < 2).map(|l| l.id).collect();
+        for landmark in lonely {
+            smoother.remove_landmark(landmark);
+        }
+        report.chi2_per_dof
+    }
+
+    /// Step 4.
+    fn judge(&mut self, mut smoother: Smoother, image_misfit: f64) -> Result<Started, Refusal> {
+        let places: Vec<(FrameId, Vector3<f64>)> = smoother
+            .frames()
+            .filter_map(|id| Some((id, smoother.state(id)?.world_from_body.translation)))
+            .collect();
+        let previous = self.last.replace(places.clone());
+        let sigma = smoother.log_scale_sigma().unwrap_or(f64::INFINITY);
+        let fastest = smoother
+            .frames()
+            .filter_map(|id| Some(smoother.state(id)?.velocity.norm()))
+            .fold(0.0, f64::max);
+        let bias = smoother.newest().map_or(Bias::ZERO, |(.., s)| s.bias);
+        let median_distance_m = median(smoother.landmarks().map(|l| 1.0 / l.inverse_distance)).unwrap_or(0.0);
+        let at_most = [
+            (Obstacle::ScaleUncertainty, sigma, self.config.max_log_scale_sigma),
+            (Obstacle::ImageMisfit, image_misfit, MAX_MISFIT),
+            (Obstacle::InertialMisfit, smoother.inertial_chi2_per_dof(), MAX_MISFIT),
+            (Obstacle::Speed, fastest, self.config.max_speed_mps),
+            (Obstacle::AccelBias, bias.accel.norm(), MAX_ACCEL_BIAS),
+            (Obstacle::GyroBias, bias.gyro.norm(), MAX_GYRO_BIAS),
+            (Obstacle::SceneDistance, median_distance_m, 200.0),
+            (Obstacle::SceneDistance, 0.02 / median_distance_m.max(1e-9), 1.0),
+        ];
+        // A NaN must not pass.
+        if let Some((obstacle, measured, limit)) = at_most.into_iter().find(|(_, m, limit)| !(m <= limit)) {
+            return Err(Refusal::new(obstacle, measured, limit));
+        }
+        let change = previous.and_then(|p| scale_change(&p, &places)).unwrap_or(f64::INFINITY);
+        if !(change <= self.config.max_scale_change) {
+            return Err(Refusal::new(Obstacle::ScaleAgreement, change, self.config.max_scale_change));
+        }
+        self.last = None;
+        Ok(Started { smoother, log_scale_sigma: sigma, median_distance_m })
+    }
+}
+
+/// Relative change of the path's extent over the frames that both solutions know.
+fn scale_change(before: &[(FrameId, Vector3<f64>)], now: &[(FrameId, Vector3<f64>)]) -> Option<f64> {
+    let common: Vec<(Vector3<f64>, Vector3<f64>)> = before
+        .iter()
+        .filter_map(|(id, p)| Some((*p, now.iter().find(|(other, _)| other == id)?.1)))
+        .collect();
+    if common.len() < 3 {
+        return None;
+    }
+    let n = common.len() as f64;
+    let (a, b) = common.iter().fold((Vector3::zeros(), Vector3::zeros()), |(a, b), (p, q)| (a + p, b + q));
+    let (a, b) = (a / n, b / n);
+    let spread = |of: &dyn Fn(&(Vector3<f64>, Vector3<f64>)) -> f64| common.iter().map(of).sum::<f64>().sqrt();
+    let (before, now) = (spread(&|c| (c.0 - a).norm_squared()), spread(&|c| (c.1 - b).norm_squared()));
+    Some((now / before.max(1e-12)).ln().abs())
+}
+
+fn median(values: impl Iterator<Item = f64>) -> Option<f64> {
+    let mut all: Vec<f64> = values.collect();
+    all.sort_unstable_by(f64::total_cmp);
+    all.get(all.len() / 2).copied()
+}

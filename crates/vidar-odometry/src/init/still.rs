@@ -1,0 +1,104 @@
+//! Start from standstill: gyroscope bias and inclination are read off, velocity is zero.
+
+use super::condition::{Obstacle, Refusal};
+use crate::estimator::AnchorSigmas;
+use crate::imu::{Bias, NavState};
+use nalgebra::Vector3;
+use serde::{Deserialize, Serialize};
+use vidar_core::{GRAVITY_MPS2, ImuSample, LieGroup, Se3, So3};
+
+/// What counts as standing still.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
+#[serde(default, deny_unknown_fields)]
+pub struct RestConfig {
+    /// Most scatter (standard deviation) of the gyroscope per axis, rad/s, 0.001…0.5.
+    pub max_gyro_scatter: f64,
+    /// Most scatter of the accelerometer per axis, m/s², 0.01…5.
+    pub max_accel_scatter: f64,
+    /// Most mean motion in the image between frames, px, 0.05…5.
+    pub max_image_motion_px: f64,
+    /// Fewest seconds of readings, 0.1…10.
+    pub min_secs: f64,
+}
+
+impl Default for RestConfig {
+    fn default() -> Self {
+        Self { max_gyro_scatter: 0.02, max_accel_scatter: 0.15, max_image_motion_px: 0.3, min_secs: 0.5 }
+    }
+}
+
+/// A body at rest.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Rest {
+    /// At the origin, level, heading zero, without velocity; gyroscope bias as read.
+    pub state: NavState,
+    /// How well that is known.
+    pub sigmas: AnchorSigmas,
+}
+
+/// How far the mean specific force may lie from gravity before a bias is suspected, m/s².
+const SUSPICIOUS_FORCE: f64 = 0.3;
+
+/// How far it may lie at all.
+const IMPOSSIBLE_FORCE: f64 = 1.5;
+
+/// Reads the state of a body at rest from `readings`, if it is at rest. `image_motion_px` is the mean motion of tracks
+/// between frames, where there are any.
+///
+/// # Errors
+/// What shows that the body is not at rest, with the measured value.
+pub fn rest(readings: &[ImuSample], image_motion_px: Option<f64>, config: &RestConfig) -> Result<Rest, Refusal> {
+    let span = match (readings.first(), readings.last()) {
+        (Some(first), Some(last)) => (last.time - first.time).as_secs_f64(),
+        _ => 0.0,
+    };
+    if !(span >= config.min_secs) {
+        return Err(Refusal::new(Obstacle::Frames, span, config.min_secs));
+    }
+    let n = readings.len() as f64;
+    let mean = |of: fn(&ImuSample) -> Vector3<f64>| readings.iter().map(of).sum::<Vector3<f64>>() / n;
+    let (gyro, accel) = (mean(|s| s.gyro.0), mean(|s| s.accel.0));
+    let scatter = |of: fn(&ImuSample) -> Vector3<f64>, mean: Vector3<f64>| {
+        let squares = readings.iter().map(|s| (of(s) - mean).component_mul(&(of(s) - mean)));
+        (squares.sum::<Vector3<f64>>() / n).max().sqrt()
+    };
+    let checks = [
+        (Obstacle::GyroScatter, scatter(|s| s.gyro.0, gyro), config.max_gyro_scatter),
+        (Obstacle::AccelScatter, scatter(|s| s.accel.0, accel), config.max_accel_scatter),
+        (Obstacle::ImageMotion, image_motion_px.unwrap_or(0.0), config.max_image_motion_px),
+        (Obstacle::SpecificForce, (accel.norm() - GRAVITY_MPS2).abs(), IMPOSSIBLE_FORCE),
+    ];
+    // A NaN must not pass.
+    if let Some((obstacle, measured, limit)) = checks.into_iter().find(|(_, m, limit)| !(m <= limit)) {
+        return Err(Refusal::new(obstacle, measured, limit));
+    }
+    let suspicious = (accel.norm() - GRAVITY_MPS2).abs() > SUSPICIOUS_FORCE;
+    let accel_sigma = if suspicious { 0.3 } else { 0.1 };
+    let state = NavState {
+        world_from_body: Se3::new(leveled(&accel), Vector3::zeros()),
+        velocity: Vector3::zeros(),
+        bias: Bias { gyro, accel: Vector3::zeros() },
+    };
+    let sigmas = AnchorSigmas {
+        position_m: 1e-3,
+        yaw_rad: 1e-3,
+        // A horizontal accelerometer bias reads as inclination.
+        tilt_rad: accel_sigma / GRAVITY_MPS2,
+        velocity_mps: 0.02,
+        gyro_bias: (5e-3 / n.sqrt()).max(5e-4),
+        accel_bias: accel_sigma,
+    };
+    Ok(Rest { state, sigmas })
+}
+
+/// The rotation world_from_body of least angle that makes `up_in_body` vertical.
+pub(crate) fn leveled(up_in_body: &Vector3<f64>) -> So3 {
+    let axis = up_in_body.cross(&Vector3::z());
+    let angle = axis.norm().atan2(up_in_body.z);
+    match axis.try_normalize(1e-12 * up_in_body.norm()) {
+        Some(axis) => So3::exp(&(axis * angle)),
+        // Upside down, any horizontal axis will do.
+        None if up_in_body.z < 0.0 => So3::exp(&(Vector3::x() * std::f64::consts::PI)),
+        None => So3::IDENTITY,
+    }
+}

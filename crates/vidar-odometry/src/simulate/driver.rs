@@ -1,0 +1,373 @@
+//! Start and smoother run on tracks, as the whole odometry runs on images.
+
+use super::sensors::{SimulatedFrame, Simulation};
+use crate::estimator::{AnchorSigmas, Departure, Observation, OptimiseReport, Smoother, SmootherConfig, SmootherError};
+use crate::imu::{Bias, BufferError, ImuBuffer, ImuModel, NavState, Preintegration};
+use crate::init::{Attempt, InFlightConfig, InFlightStart, LoggedFrame, Refusal, Seen};
+use nalgebra::{Vector2, Vector3};
+use rustc_hash::{FxHashMap, FxHashSet};
+use vidar_core::{CameraModel, FrameId, ImuSample, LandmarkId, LieGroup, Se3, Timestamp};
+
+/// Settings of [`FeatureOdometry`].
+#[derive(Clone, Debug)]
+pub struct FeatureOdometryConfig {
+    /// The smoother.
+    pub smoother: SmootherConfig,
+    /// The start.
+    pub in_flight: InFlightConfig,
+    /// What is believed of the IMU.
+    pub imu: ImuModel,
+    /// Nominal rate of readings, Hz.
+    pub imu_rate_hz: f64,
+    /// Keyframes held.
+    pub keyframes: usize,
+    /// Other frames held.
+    pub recent: usize,
+    /// Steps of the smoother per frame.
+    pub iterations: usize,
+    /// Frames from keyframe to keyframe.
+    pub keyframe_every: usize,
+    /// Least angle between rays of a new landmark, degrees.
+    pub min_parallax_deg: f64,
+    /// Frames between attempts to start.
+    pub attempt_every: usize,
+}
+
+impl FeatureOdometryConfig {
+    /// For a simulation's IMU, its white noise inflated by `factor`.
+    pub fn new(noise: &vidar_core::ImuNoise, factor: f64) -> Self {
+        Self {
+            smoother: SmootherConfig::default(),
+            in_flight: InFlightConfig::default(),
+            imu: ImuModel::from_data_sheet(noise, factor, factor),
+            imu_rate_hz: noise.rate_hz,
+            keyframes: 10,
+            recent: 3,
+            iterations: 3,
+            keyframe_every: 4,
+            min_parallax_deg: 1.0,
+            attempt_every: 6,
+        }
+    }
+}
+
+/// What a frame led to.
+#[derive(Clone, Debug)]
+pub enum StepOutput {
+    /// There is no metric state; why not, when an attempt was made.
+    Waiting(Option<Refusal>),
+    /// The start succeeded with this frame.
+    Started {
+        /// State of the frame.
+        state: NavState,
+        /// Standard deviation of log(scale).
+        log_scale_sigma: f64,
+    },
+    /// The state of the frame.
+    Running(NavState),
+}
+
+/// See the module's head.
+#[derive(Clone, Debug)]
+pub struct FeatureOdometry {
+    config: FeatureOdometryConfig,
+    camera: CameraModel,
+    buffer: ImuBuffer,
+    start: InFlightStart,
+    log: Vec<LoggedFrame>,
+    smoother: Option<Smoother>,
+    tracks: FxHashMap<LandmarkId, Vec<(FrameId, Seen)>>,
+    banned: FxHashSet<LandmarkId>,
+    since_keyframe: usize,
+    last_time: Option<Timestamp>,
+    report: OptimiseReport,
+    departure: Departure,
+    scratch: Vec<ImuSample>,
+}
+
+/// Distance between prediction and sighting that is tried at all, px.
+const GATE_PX: f64 = 25.0;
+
+/// Misfit of a new landmark's sightings that is accepted, in standard deviations.
+const NEW_GATE_SIGMAS: f64 = 4.0;
+
+impl FeatureOdometry {
+    /// For one camera on a body.
+    pub fn new(config: FeatureOdometryConfig, camera: CameraModel, body_from_camera: Se3) -> Self {
+        let start = InFlightStart::new(
+            config.in_flight.clone(),
+            config.smoother.clone(),
+            camera.clone(),
+            body_from_camera,
+        );
+        Self {
+            buffer: ImuBuffer::new(config.imu_rate_hz),
+            config,
+            camera,
+            start,
+            log: Vec::new(),
+            smoother: None,
+            tracks: FxHashMap::default(),
+            banned: FxHashSet::default(),
+            since_keyframe: 0,
+            last_time: None,
+            report: OptimiseReport::default(),
+            departure: Departure::default(),
+            scratch: Vec::new(),
+        }
+    }
+
+    /// For a simulation, its readings taken in.
+    ///
+    /// # Errors
+    /// Readings out of order.
+    pub fn for_simulation(config: FeatureOdometryConfig, simulation: &Simulation) -> Result<Self, BufferError> {
+        let mut odometry = Self::new(config, simulation.camera.clone(), simulation.body_from_camera);
+        simulation.readings.iter().try_for_each(|s| odometry.buffer.push(*s))?;
+        Ok(odometry)
+    }
+
+    /// Begins at `frame` with a state that is known as well as `sigmas` say.
+    ///
+    /// # Errors
+    /// Settings outside their range, a state that is not finite.
+    pub fn start_at(
+        &mut self,
+        frame: &SimulatedFrame,
+        state: NavState,
+        sigmas: AnchorSigmas,
+    ) -> Result<(), SmootherError> {
+        let place = Simulation::body_from_camera();
+        let mut smoother = Smoother::new(self.config.smoother.clone(), self.camera.clone(), place)?;
+        smoother.start(frame.id, frame.time, state, sigmas)?;
+        smoother.mark_keyframe(frame.id)?;
+        self.smoother = Some(smoother);
+        self.since_keyframe = 0;
+        self.last_time = Some(frame.time);
+        self.remember(frame.id, &frame.seen);
+        Ok(())
+    }
+
+    /// The smoother, once there is one.
+    pub fn smoother(&mut self) -> Option<&mut Smoother> {
+        self.smoother.as_mut()
+    }
+
+    /// What the last optimisation did.
+    pub fn report(&self) -> &OptimiseReport {
+        &self.report
+    }
+
+    /// Takes the tracks of the next frame.
+    ///
+    /// # Errors
+    /// What the smoother refuses; readings that do not reach to the frame count as missing.
+    pub fn push(&mut self, id: FrameId, time: Timestamp, seen: &[Seen]) -> Result<StepOutput, SmootherError> {
+        let bias = match &self.smoother {
+            Some(smoother) => smoother.newest().map_or(Bias::ZERO, |(.., s)| s.bias),
+            None => Bias { gyro: *self.start.gyro_bias(), accel: Vector3::zeros() },
+        };
+        let readings = self.readings_until(time, bias);
+        self.last_time = Some(time);
+        match self.smoother.take() {
+            Some(mut smoother) => {
+                let state = self.advance(&mut smoother, id, time, seen, readings);
+                self.smoother = Some(smoother);
+                state.map(StepOutput::Running)
+            }
+            None => self.try_start(id, time, seen, readings),
+        }
+    }
+
+    fn readings_until(&mut self, time: Timestamp, bias: Bias) -> Option<Preintegration> {
+        let mut cut = std::mem::take(&mut self.scratch);
+        let covered = self.last_time.and_then(|from| self.buffer.interval(from, time, &mut cut).ok());
+        let spare = self.smoother.as_mut().and_then(Smoother::take_spare);
+        let readings = covered.map(|_| match spare {
+            Some(mut spare) => {
+                spare.restart(bias, &cut);
+                spare
+            }
+            None => Preintegration::new(self.config.imu, bias, &cut),
+        });
+        self.scratch = cut;
+        readings
+    }
+
+    fn try_start(
+        &mut self,
+        id: FrameId,
+        time: Timestamp,
+        seen: &[Seen],
+        readings: Option<Preintegration>,
+    ) -> Result<StepOutput, SmootherError> {
+        self.log.push(LoggedFrame { frame: id, time, readings, seen: seen.to_vec() });
+        let old = self.log.len().saturating_sub((self.config.in_flight.window_secs * 100.0) as usize);
+        self.log.drain(..old);
+        if self.log.len() % self.config.attempt_every != 0 {
+            return Ok(StepOutput::Waiting(None));
+        }
+        match self.start.attempt(&self.log)? {
+            Attempt::Refused(refusal) => Ok(StepOutput::Waiting(Some(refusal))),
+            Attempt::Started(started) => {
+                let mut smoother = started.smoother;
+                // What was not used by the start may still become landmarks.
+                let held: FxHashSet<FrameId> = smoother.frames().collect();
+                let log = std::mem::take(&mut self.log);
+                for frame in log.iter().filter(|f| held.contains(&f.frame)) {
+                    self.remember(frame.frame, &frame.seen);
+                }
+                let known: Vec<LandmarkId> = smoother.landmarks().map(|l| l.id).collect();
+                known.iter().for_each(|l| {
+                    self.tracks.remove(l);
+                });
+                self.since_keyframe = 0;
+                self.trim(&mut smoother)?;
+                let state = smoother.newest().map_or(NavState::REST, |(.., s)| *s);
+                self.smoother = Some(smoother);
+                Ok(StepOutput::Started { state, log_scale_sigma: started.log_scale_sigma })
+            }
+        }
+    }
+
+    /// The figure of one frame: predict, add sightings, optimise, leave out outliers, keyframe, window.
+    fn advance(
+        &mut self,
+        smoother: &mut Smoother,
+        id: FrameId,
+        time: Timestamp,
+        seen: &[Seen],
+        readings: Option<Preintegration>,
+    ) -> Result<NavState, SmootherError> {
+        let last = smoother.newest().map_or(NavState::REST, |(.., s)| *s);
+        let predicted = readings.as_ref().map_or(last, |r| r.predict(&last));
+        smoother.add_frame(id, time, predicted, readings)?;
+        self.remember(id, seen);
+        let mut tracked = 0;
+        for s in seen {
+            let near = smoother.predict_pixel(id, s.landmark).is_some_and(|p| (p - s.pixel).norm() < GATE_PX);
+            if near {
+                smoother.add_observation(&observation(id, s))?;
+                tracked += 1;
+            }
+        }
+        smoother.optimise_into(self.config.iterations, &mut self.report);
+        self.leave_out(smoother);
+        self.since_keyframe += 1;
+        if self.since_keyframe >= self.config.keyframe_every || tracked < 40 {
+            smoother.mark_keyframe(id)?;
+            self.since_keyframe = 0;
+            self.add_landmarks(smoother, id, seen)?;
+        }
+        let state = smoother.newest().map_or(predicted, |(.., s)| *s);
+        self.trim(smoother)?;
+        Ok(state)
+    }
+
+    fn remember(&mut self, id: FrameId, seen: &[Seen]) {
+        for s in seen.iter().filter(|s| !self.banned.contains(&s.landmark)) {
+            self.tracks.entry(s.landmark).or_default().push((id, *s));
+        }
+    }
+
+    fn leave_out(&mut self, smoother: &mut Smoother) {
+        for outlier in &self.report.outliers {
+            smoother.remove_observation(outlier.frame, outlier.landmark);
+            if smoother.landmark(outlier.landmark).is_some_and(|l| l.sightings < 2) {
+                smoother.remove_landmark(outlier.landmark);
+                self.banned.insert(outlier.landmark);
+                self.tracks.remove(&outlier.landmark);
+            }
+        }
+    }
+
+    /// Tracks with enough parallax become landmarks, hosted by the first keyframe that saw them.
+    fn add_landmarks(&mut self, smoother: &mut Smoother, id: FrameId, seen: &[Seen]) -> Result<(), SmootherError> {
+        let keyframes: Vec<FrameId> = smoother.keyframes().collect();
+        let held: Vec<FrameId> = smoother.frames().collect();
+        let body_from_camera = *smoother.body_from_camera();
+        for s in seen {
+            if smoother.landmark(s.landmark).is_some() {
+                continue;
+            }
+            let Some(history) = self.tracks.get_mut(&s.landmark) else { continue };
+            history.retain(|(f, _)| held.contains(f));
+            let Some((host, host_seen)) = history.iter().find(|(f, _)| keyframes.contains(f)).copied() else {
+                continue;
+            };
+            let camera_of = |f: FrameId| smoother.state(f).map(|x| x.world_from_body * body_from_camera);
+            let (Some(first), Some(now)) = (camera_of(host), camera_of(id)) else { continue };
+            let rays = (self.camera.unproject(&host_seen.pixel), self.camera.unproject(&s.pixel));
+            let (Some(ray), Some(ray_now)) = rays else { continue };
+            let Some(distance) = triangulate(&first, &ray, &now, &ray_now, self.config.min_parallax_deg) else {
+                continue;
+            };
+            let point = first.act(&(ray * distance));
+            let fits = |f: FrameId, seen: &Seen| {
+                let pixel = camera_of(f).and_then(|c| self.camera.project(&c.inverse().act(&point)));
+                let limit = NEW_GATE_SIGMAS * (0.5 * seen.covariance.trace()).sqrt() + 1.0;
+                pixel.is_some_and(|p| (p - seen.pixel).norm() < limit)
+            };
+            let fitting: Vec<(FrameId, Seen)> =
+                history.iter().filter(|(f, s)| *f != host && fits(*f, s)).copied().collect();
+            if fitting.len() < 2 || fitting.len() * 3 < history.len() {
+                continue;
+            }
+            smoother.add_landmark(&observation(host, &host_seen), 1.0 / distance)?;
+            for (frame, seen) in fitting.iter().filter(|(f, _)| *f >= host) {
+                smoother.add_observation(&observation(*frame, seen))?;
+            }
+        }
+        Ok(())
+    }
+
+    fn trim(&mut self, smoother: &mut Smoother) -> Result<(), SmootherError> {
+        loop {
+            let newest = smoother.newest().map(|(id, ..)| id);
+            let keyframes: FxHashSet<FrameId> = smoother.keyframes().collect();
+            let mut others = smoother.frames().filter(|f| !keyframes.contains(f) && Some(*f) != newest);
+            let (first_other, first) = (others.next(), smoother.frames().next());
+            let other_count = smoother.len() - keyframes.len();
+            if let Some(other) = first_other.filter(|_| other_count > self.config.recent) {
+                drop(others);
+                smoother.drop_frame(other, &mut self.departure)?;
+            } else if let Some(first) = first.filter(|_| keyframes.len() > self.config.keyframes) {
+                drop(others);
+                smoother.marginalise(first, &mut self.departure)?;
+            } else {
+                break;
+            }
+            for ended in &self.departure.ended {
+                // Its sightings are in the prior now.
+                self.tracks.remove(ended);
+            }
+        }
+        let held: FxHashSet<FrameId> = smoother.frames().collect();
+        self.tracks.retain(|_, history| history.last().is_some_and(|(f, _)| held.contains(f)));
+        Ok(())
+    }
+}
+
+fn observation(frame: FrameId, seen: &Seen) -> Observation {
+    Observation {
+        frame,
+        landmark: seen.landmark,
+        pixel: seen.pixel,
+        covariance: seen.covariance,
+        pixel_velocity: Vector2::zeros(),
+    }
+}
+
+/// Distance along the first ray of the point nearest to both rays, if their angle is wide enough and it lies ahead.
+fn triangulate(first: &Se3, ray: &Vector3<f64>, now: &Se3, ray_now: &Vector3<f64>, min_deg: f64) -> Option<f64> {
+    let (a, b) = (first.rotation * *ray, now.rotation * *ray_now);
+    let cross = a.cross(&b);
+    let sin2 = cross.norm_squared();
+    if sin2 < min_deg.to_radians().sin().powi(2) {
+        return None;
+    }
+    let base = now.translation - first.translation;
+    let along_first = base.cross(&b).dot(&cross) / sin2;
+    let along_now = base.cross(&a).dot(&cross) / sin2;
+    (along_first > 0.1 && along_now > 0.1 && along_first < 500.0).then_some(along_first)
+}

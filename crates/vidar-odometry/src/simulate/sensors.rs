@@ -1,0 +1,269 @@
+//! Readings and tracks of a flight.
+
+use super::course::Flight;
+use super::random::Random;
+use crate::imu::{Bias, NavState};
+use crate::init::Seen;
+use nalgebra::{Matrix2, Vector2, Vector3};
+use vidar_core::camera::RadTan;
+use vidar_core::{
+    AngularRate, CameraModel, FrameId, GRAVITY_MPS2, ImuNoise, ImuSample, LandmarkId, LieGroup, Pinhole, Se3, So3,
+    SpecificForce, Timestamp,
+};
+
+/// What to simulate.
+#[derive(Clone, Debug, PartialEq)]
+pub struct SimulationConfig {
+    /// Everything random follows from it.
+    pub seed: u64,
+    /// Readings per second.
+    pub imu_rate_hz: f64,
+    /// Frames per second.
+    pub camera_rate_hz: f64,
+    /// Noise of the IMU.
+    pub noise: ImuNoise,
+    /// Factor on noise, walks and first biases; 0 gives the exact motion.
+    pub noise_scale: f64,
+    /// Standard deviation of the first gyroscope bias, rad/s.
+    pub gyro_bias_sigma: f64,
+    /// Standard deviation of the first accelerometer bias, m/s².
+    pub accel_bias_sigma: f64,
+    /// Standard deviation of pixels, px.
+    pub pixel_sigma: f64,
+    /// Share of sightings that are wrong (up to 30 px off).
+    pub outlier_share: f64,
+    /// Share of tracks that is lost from frame to frame.
+    pub loss_share: f64,
+    /// Tracks held at once.
+    pub tracks: usize,
+    /// Distance between the flight's box and the walls, m.
+    pub wall_distance_m: f64,
+    /// Points on the walls, and a fifth of them within the room.
+    pub points: usize,
+    /// How much later images are taken than their stamps say, s.
+    pub time_offset_secs: f64,
+}
+
+impl Default for SimulationConfig {
+    fn default() -> Self {
+        Self {
+            seed: 1,
+            imu_rate_hz: 200.0,
+            camera_rate_hz: 20.0,
+            noise: ImuNoise::EUROC,
+            noise_scale: 1.0,
+            gyro_bias_sigma: 0.02,
+            accel_bias_sigma: 0.05,
+            pixel_sigma: 0.5,
+            outlier_share: 0.02,
+            loss_share: 0.02,
+            tracks: 110,
+            wall_distance_m: 2.0,
+            points: 2500,
+            time_offset_secs: 0.0,
+        }
+    }
+}
+
+/// One frame's truth and tracks.
+#[derive(Clone, Debug)]
+pub struct SimulatedFrame {
+    /// Its number.
+    pub id: FrameId,
+    /// Its stamp.
+    pub time: Timestamp,
+    /// The truth, biases included.
+    pub truth: NavState,
+    /// What it sees. A track that was lost comes back under another name.
+    pub seen: Vec<Seen>,
+}
+
+/// A flight as sensors tell it.
+#[derive(Clone, Debug)]
+pub struct Simulation {
+    /// The camera: EuRoC's.
+    pub camera: CameraModel,
+    /// Its place on the body.
+    pub body_from_camera: Se3,
+    /// Readings.
+    pub readings: Vec<ImuSample>,
+    /// True biases of the readings.
+    pub biases: Vec<Bias>,
+    /// Frames.
+    pub frames: Vec<SimulatedFrame>,
+}
+
+/// Nanoseconds of the first stamp: like real recordings, far from zero.
+const EPOCH_NANOS: i64 = 1_400_000_000_000_000_000;
+
+fn stamp(secs: f64) -> Timestamp {
+    Timestamp::from_nanos(EPOCH_NANOS + (secs * 1e9).round() as i64)
+}
+
+impl Simulation {
+    /// EuRoC's cam0.
+    pub fn camera() -> CameraModel {
+        let pinhole = Pinhole { fx: 458.654, fy: 457.296, cx: 367.215, cy: 248.375, width: 752, height: 480 };
+        match RadTan::new(pinhole, [-0.283_408_11, 0.073_959_07, 0.000_193_59, 1.761_871_14e-5]) {
+            Ok(model) => CameraModel::RadTan(model),
+            Err(_) => CameraModel::Pinhole(pinhole),
+        }
+    }
+
+    /// A camera that looks along the body's z, a hand's breadth off the IMU, slightly askew as real ones are.
+    pub fn body_from_camera() -> Se3 {
+        let quarter = So3::exp(&(Vector3::z() * std::f64::consts::FRAC_PI_2));
+        let askew = So3::exp(&Vector3::new(0.004, -0.026, 0.015));
+        Se3::new(quarter * askew, Vector3::new(-0.022, -0.065, 0.010))
+    }
+
+    /// Flies `flight` from `from_secs` for `secs`.
+    pub fn new(flight: &impl Flight, from_secs: f64, secs: f64, config: &SimulationConfig) -> Self {
+        let secs = secs.min(flight.duration_secs() - from_secs);
+        let mut random = Random::new(config.seed);
+        let (readings, biases) = simulate_imu(flight, from_secs, secs, config, &mut random);
+        let points = scatter_points(flight, config, &mut random);
+        let (camera, body_from_camera) = (Self::camera(), Self::body_from_camera());
+        let frames = (secs * config.camera_rate_hz + 1e-6).floor() as usize;
+        let mut tracker = Tracker { names: vec![None; points.len()], next: 0 };
+        let mut all = Vec::with_capacity(frames);
+        for k in 0..frames {
+            let at = k as f64 / config.camera_rate_hz;
+            let motion = flight.motion(from_secs + at);
+            let bias = biases[((at * config.imu_rate_hz).round() as usize).min(biases.len() - 1)];
+            let truth =
+                NavState { world_from_body: motion.world_from_body, velocity: motion.velocity, bias };
+            let exposed = flight.motion(from_secs + at + config.time_offset_secs).world_from_body;
+            let camera_from_world = (exposed * body_from_camera).inverse();
+            let seen = tracker.look(&points, &camera, &camera_from_world, config, &mut random);
+            all.push(SimulatedFrame { id: FrameId(k as u32), time: stamp(at), truth, seen });
+        }
+        Self { camera, body_from_camera, readings, biases, frames: all }
+    }
+}
+
+fn simulate_imu(
+    flight: &impl Flight,
+    from_secs: f64,
+    secs: f64,
+    config: &SimulationConfig,
+    random: &mut Random,
+) -> (Vec<ImuSample>, Vec<Bias>) {
+    let (scale, noise) = (config.noise_scale, &config.noise);
+    let root_rate = config.imu_rate_hz.sqrt();
+    let count = (secs * config.imu_rate_hz + 1e-6).floor() as usize + 2;
+    let mut bias = Bias {
+        gyro: random.normal3() * (scale * config.gyro_bias_sigma),
+        accel: random.normal3() * (scale * config.accel_bias_sigma),
+    };
+    let (mut readings, mut biases) = (Vec::with_capacity(count), Vec::with_capacity(count));
+    for k in 0..count {
+        let at = k as f64 / config.imu_rate_hz;
+        let motion = flight.motion(from_secs + at);
+        let gravity = Vector3::new(0.0, 0.0, -GRAVITY_MPS2);
+        let force = motion.world_from_body.rotation.inverse() * (motion.acceleration - gravity);
+        let gyro_noise = random.normal3() * (scale * noise.gyro_noise_density * root_rate);
+        let accel_noise = random.normal3() * (scale * noise.accel_noise_density * root_rate);
+        readings.push(ImuSample {
+            time: stamp(at),
+            gyro: AngularRate(motion.angular_rate + bias.gyro + gyro_noise),
+            accel: SpecificForce(force + bias.accel + accel_noise),
+        });
+        biases.push(bias);
+        bias.gyro += random.normal3() * (scale * noise.gyro_random_walk / root_rate);
+        bias.accel += random.normal3() * (scale * noise.accel_random_walk / root_rate);
+    }
+    (readings, biases)
+}
+
+/// Points on the walls of a room round the flight, and some within.
+fn scatter_points(flight: &impl Flight, config: &SimulationConfig, random: &mut Random) -> Vec<Vector3<f64>> {
+    let (mut low, mut high) = (Vector3::repeat(f64::INFINITY), Vector3::repeat(f64::NEG_INFINITY));
+    let steps = (flight.duration_secs() / 0.1).ceil().max(1.0) as usize;
+    for k in 0..=steps {
+        let at = flight.motion(flight.duration_secs() * k as f64 / steps as f64).world_from_body.translation;
+        low = low.inf(&at);
+        high = high.sup(&at);
+    }
+    let margin = Vector3::repeat(config.wall_distance_m);
+    let (low, high) = (low - margin, high + margin);
+    let size = high - low;
+    let areas = [size.y * size.z, size.x * size.z, size.x * size.y];
+    let total: f64 = areas.iter().sum();
+    let inside = |random: &mut Random| {
+        Vector3::new(random.between(low.x, high.x), random.between(low.y, high.y), random.between(low.z, high.z))
+    };
+    let mut points = Vec::with_capacity(config.points);
+    for k in 0..config.points {
+        let mut point = inside(random);
+        if k % 6 != 0 {
+            let mut pick = random.uniform() * total;
+            let mut axis = 0;
+            while axis < 2 && pick > areas[axis] {
+                pick -= areas[axis];
+                axis += 1;
+            }
+            point[axis] = if random.uniform() < 0.5 { low[axis] } else { high[axis] };
+        }
+        points.push(point);
+    }
+    points
+}
+
+/// Gives tracks their names.
+struct Tracker {
+    names: Vec<Option<LandmarkId>>,
+    next: u32,
+}
+
+impl Tracker {
+    fn look(
+        &mut self,
+        points: &[Vector3<f64>],
+        camera: &CameraModel,
+        camera_from_world: &Se3,
+        config: &SimulationConfig,
+        random: &mut Random,
+    ) -> Vec<Seen> {
+        let visible = |p: &Vector3<f64>| {
+            let q = camera_from_world.act(p);
+            // The distortion folds back far outside the image.
+            if q.z < 0.3 || q.xy().norm() > 1.2 * q.z {
+                return None;
+            }
+            camera.project(&q).filter(|pixel| camera.contains(pixel, 8.0))
+        };
+        let mut seen = Vec::with_capacity(config.tracks);
+        let mut fresh = Vec::new();
+        for (k, point) in points.iter().enumerate() {
+            match (visible(point), self.names[k]) {
+                (Some(pixel), Some(name)) => {
+                    if random.uniform() < config.loss_share {
+                        self.names[k] = None;
+                    } else {
+                        seen.push((name, pixel));
+                    }
+                }
+                (Some(pixel), None) => fresh.push((k, pixel)),
+                (None, _) => self.names[k] = None,
+            }
+        }
+        while seen.len() < config.tracks && !fresh.is_empty() {
+            let pick = ((random.uniform() * fresh.len() as f64) as usize).min(fresh.len() - 1);
+            let (k, pixel) = fresh.swap_remove(pick);
+            let name = LandmarkId(self.next);
+            self.next += 1;
+            self.names[k] = Some(name);
+            seen.push((name, pixel));
+        }
+        let variance = config.pixel_sigma.max(1e-3).powi(2);
+        let mut measured = |(landmark, pixel): (LandmarkId, Vector2<f64>)| {
+            let mut error = Vector2::new(random.normal(), random.normal()) * config.pixel_sigma;
+            if random.uniform() < config.outlier_share {
+                error = Vector2::new(random.between(-30.0, 30.0), random.between(-30.0, 30.0));
+            }
+            Seen { landmark, pixel: pixel + error, covariance: Matrix2::identity() * variance }
+        };
+        seen.into_iter().map(&mut measured).collect()
+    }
+}
