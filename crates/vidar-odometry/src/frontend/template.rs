@@ -10,7 +10,7 @@ use super::pyramid::{Pyramid, level_scale, to_level};
 use super::simd::dispatch;
 use nalgebra::{Matrix2, Matrix3x2, Vector2, Vector3};
 use vidar_core::camera::Pixel;
-use vidar_core::{CameraModel, Se3};
+use vidar_core::{CameraModel, Se3, So3};
 
 /// Side of the patch that is aligned, pixels.
 pub(crate) const SIDE: usize = 8;
@@ -49,6 +49,11 @@ impl Warp {
         let determinant = d_current_d_keyframe.determinant();
         // A mirrored or collapsed patch cannot be matched; a fourfold change of size is past any level.
         (determinant > 1.0 / 64.0 && determinant < 64.0).then_some(Self { pixel, d_current_d_keyframe })
+    }
+
+    /// The warp of a feature when the camera only turned, which is right for what is far away.
+    pub fn rotated(camera: &CameraModel, feature: &Feature, current_from_keyframe: &So3) -> Option<Self> {
+        Self::new(camera, feature, 0.0, &Se3::new(*current_from_keyframe, Vector3::zeros()))
     }
 
     /// A warp that only shifts.

@@ -15,7 +15,7 @@ use super::feature::FeatureKind;
 use super::pyramid::{Pyramid, from_level, level_scale};
 use fast::{Candidate, FastScanner};
 use nalgebra::Vector2;
-use structure::Structure;
+pub(crate) use structure::Structure;
 use vidar_core::Image;
 use vidar_core::camera::Pixel;
 

@@ -7,6 +7,9 @@
 //! The covariance follows from the same sums: `Σ_u = s²/a² · (Σ g gᵀ)⁻¹` with s² the variance of what offset, gain and
 //! shift could not explain, plus a floor for what the patch model does not know.
 
+#[cfg(test)]
+mod tests;
+
 use super::config::MatchingConfig;
 use super::feature::PixelMeasurement;
 use super::patch::{Bilinear, sum8};
@@ -87,6 +90,13 @@ fn sums(image: &Image<u8>, template: &Template, corner: &Pixel) -> Option<Sums> 
 
 const PIXELS: f64 = (SIDE * SIDE) as f64;
 
+/// Correlation with the patch centred on a place of the template's level; `None` outside the image.
+pub(crate) fn correlation(template: &Template, current: &Pyramid, centre: &Pixel) -> Option<f64> {
+    let corner = centre.add_scalar(-0.5 * (SIDE as f64 - 1.0));
+    let found = dispatch!(sums(current.level(template.level), template, &corner))?;
+    Some(found.with_template / (found.energy * template.energy).sqrt().max(1e-9))
+}
+
 /// Finds `template` in `current`, starting at `start` (level-0 pixels; usually the template's expected place).
 ///
 /// `noise_gray` is the standard deviation of the image noise: what differs by no more than noise is not refused for it.
@@ -156,7 +166,6 @@ impl StepSolver {
     }
 }
 
-#[allow(clippy::too_many_arguments)] // A private end of one function, kept apart for its length only.
 fn judge(
     template: &Template,
     found: &Sums,

@@ -1,0 +1,90 @@
+use super::*;
+use crate::frontend::testbed::Random;
+
+const SIGMA: f64 = 0.5 / 458.0;
+
+/// Pairs of rays of a cloud (or a plane), with noise and outliers.
+fn pairs(motion: &Se3, n: usize, outliers: usize, plane: bool, seed: u64) -> Vec<RayPair> {
+    let mut random = Random::new(seed);
+    (0..n)
+        .map(|k| {
+            let z = if plane { 4.0 } else { 2.0 + 6.0 * random.uniform() };
+            let p = Vector3::new(random.gaussian() * 0.5 * z, random.gaussian() * 0.4 * z, z);
+            let p = if plane { p + Vector3::new(0.0, 0.0, 0.2 * p.x) } else { p };
+            let mut noise = || random.vector() * SIGMA;
+            let (na, nb) = (noise(), noise());
+            let b = if k < outliers { random.vector() + Vector3::z() * 2.0 } else { *motion * p };
+            RayPair { a: (p.normalize() + na).normalize(), b: (b.normalize() + nb).normalize() }
+        })
+        .collect()
+}
+
+fn direction_error_deg(found: &Se3, truth: &Se3) -> f64 {
+    let t = truth.translation.normalize();
+    found.translation.cross(&t).norm().atan2(found.translation.dot(&t)).to_degrees()
+}
+
+fn motion() -> Se3 {
+    Se3::new(So3::exp(&Vector3::new(0.05, -0.12, 0.2)), Vector3::new(0.5, -0.1, 0.15))
+}
+
+#[test]
+fn two_points_and_the_rotation_give_the_direction_despite_outliers() {
+    for seed in 0..20 {
+        let all = pairs(&motion(), 100, 30, false, seed);
+        let mut solver = TwoViewSolver::new(TwoViewConfig::default());
+        let found = solver.with_rotation(&all, &motion().rotation, SIGMA).unwrap();
+        let error = direction_error_deg(&found.b_from_a, &motion());
+        assert!(error < 1.0, "seed {seed}: {error}");
+        assert!(found.inliers >= 66 && found.inliers <= 75, "{found:?}");
+        let kept = solver.inliers()[30..].iter().filter(|i| **i).count();
+        assert!(kept >= 66, "{kept}");
+        assert!(found.rms_rad < 1.3 * SIGMA && found.samples < 100, "{found:?}");
+    }
+}
+
+#[test]
+fn five_points_give_rotation_and_direction_for_clouds_and_planes() {
+    for plane in [false, true] {
+        for seed in 0..10 {
+            let all = pairs(&motion(), 120, 30, plane, seed);
+            let mut solver = TwoViewSolver::new(TwoViewConfig::default());
+            let found = solver.without_rotation(&all, SIGMA).unwrap();
+            let turn = (found.b_from_a.rotation.inverse() * motion().rotation).angle_rad().to_degrees();
+            let direction = direction_error_deg(&found.b_from_a, &motion());
+            let (turn_limit, direction_limit) = if plane { (0.8, 5.0) } else { (0.3, 2.0) };
+            assert!(
+                turn < turn_limit && direction < direction_limit,
+                "plane {plane} seed {seed}: {turn} {direction} {found:?}"
+            );
+            assert!(found.inliers >= 84, "{found:?}");
+        }
+    }
+}
+
+#[test]
+fn pure_rotation_is_told_from_motion() {
+    let turn = Se3::new(motion().rotation, Vector3::zeros());
+    let all = pairs(&turn, 100, 5, false, 1);
+    let mut solver = TwoViewSolver::new(TwoViewConfig::default());
+    let known = solver.with_rotation(&all, &turn.rotation, SIGMA);
+    assert!(matches!(known, Err(TwoViewFailure::NoParallax { .. })), "{known:?}");
+    let unknown = solver.without_rotation(&all, SIGMA);
+    assert!(unknown.is_err(), "{unknown:?}");
+}
+
+#[test]
+fn nonsense_and_too_few_pairs_are_refused() {
+    let mut solver = TwoViewSolver::new(TwoViewConfig::default());
+    let few = solver.without_rotation(&pairs(&motion(), 4, 0, false, 1), SIGMA);
+    assert!(matches!(few, Err(TwoViewFailure::TooFewPairs { found: 4, .. })));
+    let nonsense = solver.with_rotation(&pairs(&motion(), 80, 80, false, 1), &motion().rotation, SIGMA);
+    assert!(matches!(nonsense, Err(TwoViewFailure::NoConsensus { .. })), "{nonsense:?}");
+}
+
+#[test]
+fn the_same_pairs_give_the_same_bits() {
+    let all = pairs(&motion(), 100, 30, false, 4);
+    let solve = || TwoViewSolver::new(TwoViewConfig::default()).without_rotation(&all, SIGMA).unwrap();
+    assert_eq!(solve(), solve());
+}
