@@ -6,6 +6,7 @@
 //! (section III-D): `S_vio = Umeyama({c_i^pred}, {c_i^VIO})`, `M ← S_vio(M)`, with its guard that a rank-deficient
 //! fit changes nothing (section III-F).
 
+pub mod coupled;
 mod place;
 pub mod streaming;
 
