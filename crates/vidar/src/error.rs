@@ -110,6 +110,12 @@ pub enum Error {
     /// The geometry model failed.
     #[error("geometry: {0}")]
     Geometry(#[from] vidar_core::ModelError),
+    /// A checkpoint is missing, refused, or could not be fetched.
+    #[error("model: {0}")]
+    Hub(#[from] vidar_hub::HubError),
+    /// The network refused its weights or its input.
+    #[error("network: {0}")]
+    Da3(#[from] vidar_da3::Da3Error),
     /// The stereo model refused its configuration.
     #[error("stereo: {0}")]
     Stereo(#[from] vidar_stereo::StereoError),
@@ -199,6 +205,9 @@ impl Error {
             Self::NotARun { .. } => "E0207",
             Self::NoCalibration { .. } => "E0208",
             Self::Geometry(_) | Self::Stereo(_) => "E0301",
+            Self::Hub(error) => hub_code(error),
+            Self::Da3(vidar_da3::Da3Error::Cancelled) => "E1301",
+            Self::Da3(_) => "E0309",
             Self::Align(_) => "E0302",
             Self::Fusion(_) => "E0303",
             Self::Eval(_) => "E0304",
@@ -220,6 +229,7 @@ impl Error {
         use vidar_export::ExportError as Export;
         match self {
             Self::Io { source, .. }
+            | Self::Hub(vidar_hub::HubError::Io { source, .. })
             | Self::Export(Export::Write { source, .. } | Export::File { source, .. })
             | Self::Synth(vidar_synth::SynthError::Write { source, .. }) => Some(source),
             _ => None,
@@ -287,9 +297,28 @@ impl Error {
             Self::Eval(_) => "check that both are of the same recording, body and clock",
             Self::NotARun { .. } => "a run folder holds manifest.json; `vidar run PATH` makes one",
             Self::Dataset(error) => return Some(dataset_hint(error).to_owned()),
+            Self::Hub(error) => return error.hint(),
+            Self::Da3(_) => {
+                "`vidar model list` describes the networks; docs/guides/models.md tells what each one needs"
+            }
             _ => return None,
         };
         Some(text.to_owned())
+    }
+}
+
+/// The code of what happened to a checkpoint.
+fn hub_code(error: &vidar_hub::HubError) -> &'static str {
+    use vidar_hub::HubError as H;
+    match error {
+        H::UnknownModel { .. } | H::WrongLicence { .. } | H::BadSetting { .. } => "E0105",
+        H::LicenceNotAccepted { .. } => "E0404",
+        H::WrongSize { .. } | H::WrongHash { .. } | H::BadRecord { .. } | H::NotACheckpoint { .. } => "E0405",
+        H::Io { source, .. } if is_full(source) => "E0402",
+        H::Io { .. } => "E0401",
+        H::NoSpace { .. } => "E0402",
+        H::Cancelled => "E1301",
+        _ => "E0403",
     }
 }
 
@@ -364,8 +393,21 @@ pub const CODES: &[(&str, &str)] = &[
     ("E0306", "A file of an interchange format could not be written or read."),
     ("E0307", "A picture could not be drawn or encoded."),
     ("E0308", "The description of the synthetic world is not usable, or its files could not be written."),
+    (
+        "E0309",
+        "A network cannot be opened or run: the checkpoint is not the one its config.json describes (each key is named), or the images or cameras do not fit it.",
+    ),
     ("E0401", "A file or folder could not be read or written."),
     ("E0402", "The disk is full. Finished files are kept; unfinished ones are removed."),
+    (
+        "E0403",
+        "A checkpoint is not on this machine, and could not be fetched: no network, no access, no such file, or a server that does not answer. What was fetched is kept and continued.",
+    ),
+    (
+        "E0404",
+        "The weights may not be used commercially, and nobody here has accepted that: --accept-licence writes an acceptance down.",
+    ),
+    ("E0405", "A checkpoint or the record beside it is damaged, or is not the official one."),
     ("E0501", "A threshold given with --fail-above or --fail-below was missed."),
     (
         "E7001",

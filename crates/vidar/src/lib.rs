@@ -11,6 +11,7 @@
 
 pub mod config;
 pub mod demo;
+pub mod depth;
 pub mod doctor;
 pub mod error;
 pub mod evaluate;
@@ -19,6 +20,7 @@ pub mod export;
 pub mod input;
 pub mod inspect;
 pub mod keyframes;
+pub mod models;
 pub mod run;
 pub mod run_folder;
 pub mod system;
@@ -28,7 +30,10 @@ pub use error::{Error, ExitStatus};
 pub use events::{CancelToken, Event, Events};
 pub use run::{RunOutcome, RunRequest, run};
 pub use vidar_core as core;
+pub use vidar_da3 as da3;
 pub use vidar_dataset as dataset;
+pub use vidar_export as export_formats;
+pub use vidar_hub as hub;
 pub use vidar_synth as synth;
 
 /// Version of the program.

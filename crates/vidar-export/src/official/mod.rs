@@ -23,7 +23,7 @@ pub use colmap::{OriginalImage, write_official_colmap};
 pub use npy::{NpyArray, NpyData};
 pub use npz::{NpzLimits, read_npz, write_npz_arrays};
 pub use prediction::{read_prediction_npz, write_mini_npz, write_npz};
-pub use scene::{SceneOptions, SceneSummary, write_scene_glb};
+pub use scene::{SceneOptions, SceneSummary, thinned, write_scene_glb};
 pub use vis::{depth_colors, spectral, write_depth_vis};
 
 use crate::error::ExportError;
@@ -108,8 +108,8 @@ fn is_point(view: &PredictedView, x: usize, y: usize, least: f64) -> bool {
     sure && depth.is_finite() && depth > 0.0
 }
 
-/// The `percent` percentile of all confidences; 0 without any.
-fn confidence_percentile(prediction: &Prediction, percents: &[f64]) -> Vec<f64> {
+/// Percentiles of all confidences of a prediction; 0 without any.
+pub fn confidence_percentile(prediction: &Prediction, percents: &[f64]) -> Vec<f64> {
     let all: Vec<f32> = prediction
         .views
         .iter()

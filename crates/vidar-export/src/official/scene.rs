@@ -186,7 +186,7 @@ fn diagonal(points: &[Vector3<f64>]) -> f64 {
 }
 
 /// `keep` indices below `n`, ascending, each subset as likely (Knuth's selection sampling) and always the same.
-fn thinned(n: usize, keep: usize) -> Vec<usize> {
+pub fn thinned(n: usize, keep: usize) -> Vec<usize> {
     let mut state = 0x9E37_79B9_7F4A_7C15_u64;
     let mut random = || {
         // splitmix64

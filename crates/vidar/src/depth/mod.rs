@@ -1,0 +1,344 @@
+//! `vidar depth`: the plain use of Depth Anything 3. Images in; depth, confidence, cameras and a cloud out.
+//!
+//! ```text
+//! images ─▶ (cameras of the same images) ─▶ network ─▶ prediction ─▶ files
+//! ```
+//!
+//! All images are seen together. The run folder holds `predictions.json` (what was found, in VIDAR's conventions),
+//! `manifest.json` (with what it was found), and the formats asked for.
+
+mod at_input;
+mod format;
+mod inputs;
+mod record;
+mod write;
+
+pub use format::{DepthFormat, Resolution, parse_formats};
+
+use crate::error::Error;
+use crate::events::{CancelToken, Events};
+use crate::models::{self, LicenceAccepted, Located, MemoryPlan, ModelChoice, planned_memory};
+use crate::run::bytes;
+use crate::run_folder::{Place, RunFolder};
+use inputs::{Cameras, Picture};
+use serde::Serialize;
+use std::path::PathBuf;
+use vidar_core::Warning;
+use vidar_da3::preprocess::processed_size;
+use vidar_da3::{Da3, Da3Error, Da3Options, Hooks, InferOptions, Inputs, Prediction, Variant};
+use vidar_export::official::SceneOptions;
+use vidar_hub::Store;
+
+/// What to look at, with what, and what to write.
+#[derive(Clone, Debug)]
+pub struct DepthRequest {
+    /// Images, and folders of images, in order.
+    pub inputs: Vec<PathBuf>,
+    /// The network.
+    pub model: ModelChoice,
+    /// A licence that the user accepts.
+    pub accepted: Option<LicenceAccepted>,
+    /// The checkpoints of this machine.
+    pub store: Store,
+    /// How the network computes.
+    pub da3: Da3Options,
+    /// How it infers.
+    pub infer: InferOptions,
+    /// Known cameras: a `transforms.json`, a COLMAP model, or a run folder.
+    pub poses: Option<PathBuf>,
+    /// Focal length in pixels of the images, for the metric network.
+    pub focal_px: Option<f64>,
+    /// What to write.
+    pub formats: Vec<DepthFormat>,
+    /// At which size cloud and depth images are written.
+    pub resolution: Resolution,
+    /// What becomes a point.
+    pub scene: SceneOptions,
+    /// Where results go.
+    pub place: Place,
+    /// The command as typed.
+    pub command: Vec<String>,
+}
+
+/// What a run would do.
+#[derive(Clone, Debug)]
+pub struct DepthPlan {
+    /// The images in order.
+    pub images: Vec<PathBuf>,
+    /// Columns and rows at which the network sees them.
+    pub processed: (usize, usize),
+    /// The model, or why it cannot be used yet.
+    pub model: Result<Located, String>,
+    /// Memory, where the architecture is known.
+    pub memory: Option<MemoryPlan>,
+    /// Where known cameras come from.
+    pub cameras: Option<String>,
+    /// What was noticed.
+    pub warnings: Vec<Warning>,
+    name: String,
+    formats: Vec<DepthFormat>,
+}
+
+/// What a run made.
+#[derive(Clone, Debug, Serialize)]
+pub struct DepthOutcome {
+    /// The folder.
+    pub folder: PathBuf,
+    /// Views with depth.
+    pub views: usize,
+    /// Columns and rows of the prediction.
+    pub size: (usize, usize),
+    /// What one unit of depth is.
+    pub unit: Unit,
+    /// Why that is known, or not.
+    pub unit_reason: String,
+    /// Files, relative to the folder.
+    pub artifacts: Vec<String>,
+    /// What was noticed.
+    pub warnings: Vec<Warning>,
+    /// Wall time of the network, s.
+    pub network_secs: f64,
+    /// Wall time of everything, s.
+    pub seconds: f64,
+}
+
+/// What one unit of depth is.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Unit {
+    /// A metre.
+    Metre,
+    /// The unit of the cameras given.
+    GivenCameras,
+    /// The network's own: one unknown factor for all views.
+    Arbitrary,
+}
+
+/// Looks at images, cameras and model, and says what a run would do and need.
+pub fn plan(request: &DepthRequest) -> Result<DepthPlan, Error> {
+    let images = inputs::list(&request.inputs)?;
+    let sizes = images.iter().map(|p| inputs::size_of(p)).collect::<Result<Vec<_>, _>>()?;
+    let processed = joint_size(&sizes, request)?;
+    let cameras = request.poses.as_ref().map(|path| Cameras::read(path)).transpose()?;
+    if let Some(cameras) = &cameras {
+        cameras.of_images(&images, &sizes)?;
+    }
+    let mut warnings = Vec::new();
+    let model = match models::locate(&request.model, request.accepted.as_ref(), &request.store) {
+        Ok(located) => Ok(located),
+        Err(error @ Error::Hub(vidar_hub::HubError::NotInstalled { .. })) => Err(error.to_string()),
+        Err(error) => return Err(error),
+    };
+    let config = match (&model, models::architecture(&request.model)) {
+        (_, Some(config)) => Some(config),
+        (Ok(located), None) => Some(located.open(&request.da3)?.config().clone()),
+        (Err(_), None) => None,
+    };
+    let weights = model.as_ref().map_or(0, |m| m.identity.weights_bytes);
+    let threads = rayon::current_num_threads();
+    let memory = config.map(|c| planned_memory(&c, weights, images.len(), processed, threads));
+    warnings.extend(memory.as_ref().and_then(too_much));
+    Ok(DepthPlan {
+        processed,
+        memory,
+        cameras: cameras.map(|c| format!("{} of {}", c.source, c.count())),
+        warnings,
+        model,
+        images,
+        name: request.model.name(),
+        formats: request.formats.clone(),
+    })
+}
+
+fn too_much(plan: &MemoryPlan) -> Option<Warning> {
+    let there = crate::system::hardware().memory_bytes?;
+    (plan.total() > there).then(|| {
+        let message = format!("{} planned, this machine has {}", bytes(plan.total()), bytes(there));
+        Warning::new("memory", message)
+            .hint("fewer images at once, a smaller --process-res, or a smaller model")
+    })
+}
+
+/// Columns and rows after the smallest common crop, which is what a batch ends with.
+fn joint_size(sizes: &[(usize, usize)], request: &DepthRequest) -> Result<(usize, usize), Error> {
+    let mut joint = (usize::MAX, usize::MAX);
+    for &(width, height) in sizes {
+        let (w, h) = processed_size(width, height, &request.infer.preprocess)?;
+        joint = (joint.0.min(w), joint.1.min(h));
+    }
+    Ok(joint)
+}
+
+impl DepthPlan {
+    /// The plan in lines of label and text.
+    pub fn lines(&self) -> Vec<(&'static str, String)> {
+        let (model, licence) = match &self.model {
+            Ok(m) => (m.identity.name.clone(), m.identity.licence.clone()),
+            Err(reason) => (self.name.clone(), format!("not ready: {reason}")),
+        };
+        let formats: Vec<&str> = self.formats.iter().map(|f| f.name()).collect();
+        let mut lines = vec![
+            ("images", self.images.len().to_string()),
+            ("network sees", format!("{}x{} px", self.processed.0, self.processed.1)),
+            ("model", model),
+            ("licence", licence),
+            ("cameras", self.cameras.clone().unwrap_or_else(|| "to be found by the network".to_owned())),
+            ("writes", formats.join(", ")),
+        ];
+        if let Some(memory) = &self.memory {
+            let parts = format!(
+                "{} (weights {}, mapped; activations {}; images {})",
+                bytes(memory.total()),
+                bytes(memory.weights),
+                bytes(memory.activations),
+                bytes(memory.images)
+            );
+            lines.push(("memory", parts));
+        }
+        lines
+    }
+}
+
+/// Reads, predicts and writes.
+pub fn run(request: &DepthRequest, events: &Events, cancel: &CancelToken) -> Result<DepthOutcome, Error> {
+    let clock = std::time::Instant::now();
+    let plan = plan(request)?;
+    let located = models::locate(&request.model, request.accepted.as_ref(), &request.store)?;
+    let model = events.stage("open model", 0, || located.open(&request.da3))?;
+    check_formats(&model, request)?;
+    let pictures = events.stage("read", plan.images.len(), || inputs::read_all(&plan.images))?;
+    let cameras = given_cameras(request, &pictures)?;
+    // A folder is made only when there is something to put into it.
+    let network = std::time::Instant::now();
+    let mut prediction =
+        events.stage("depth", 0, || infer(&model, request, &pictures, cameras.as_ref(), cancel))?;
+    let network_secs = network.elapsed().as_secs_f64();
+    let (unit, unit_reason) = unit_of(&model, &mut prediction, request, &pictures, cameras.as_ref());
+    let folder = RunFolder::create(&request.place)?;
+    let mut outcome = DepthOutcome {
+        folder: folder.path().to_owned(),
+        views: prediction.depth.len(),
+        size: (prediction.width(), prediction.height()),
+        unit,
+        unit_reason,
+        artifacts: Vec::new(),
+        warnings: warnings(&plan, &located, &prediction),
+        network_secs,
+        seconds: 0.0,
+    };
+    events.stage("write", 0, || {
+        let mut writer = write::Writer::new(&folder, events, request, &pictures, &prediction, unit);
+        writer.formats()?;
+        record::predictions(&mut writer, &located, &outcome)?;
+        outcome.warnings.append(&mut writer.warnings);
+        outcome.artifacts.append(&mut writer.artifacts);
+        Ok::<(), Error>(())
+    })?;
+    outcome.warnings.iter().for_each(|w| events.warn(w));
+    outcome.seconds = clock.elapsed().as_secs_f64();
+    record::manifest(&folder, request, &located, &outcome)?;
+    Ok(outcome)
+}
+
+fn check_formats(model: &Da3, request: &DepthRequest) -> Result<(), Error> {
+    let usage = |what: String, hint: &str| Err(Error::Usage { what, hint: hint.to_owned() });
+    if model.is_any_view() {
+        return Ok(());
+    }
+    if let Some(format) = request.formats.iter().find(|f| f.needs_cameras()) {
+        let what = format!("--format {}: {} predicts no cameras", format.name(), request.model.name());
+        return usage(
+            what,
+            "choose an any-view network such as da3-small, or write depth_png, depth_vis, mini_npz",
+        );
+    }
+    if request.infer.use_ray_pose || request.poses.is_some() {
+        let what = format!("{} sees each image by itself and knows no cameras", request.model.name());
+        return usage(
+            what,
+            "leave --poses and --use-ray-pose out; --focal gives metric depth with da3-metric-large",
+        );
+    }
+    Ok(())
+}
+
+fn given_cameras(request: &DepthRequest, pictures: &[Picture]) -> Result<Option<inputs::Given>, Error> {
+    let Some(path) = &request.poses else { return Ok(None) };
+    let paths: Vec<PathBuf> = pictures.iter().map(|p| p.path.clone()).collect();
+    let sizes: Vec<(usize, usize)> = pictures.iter().map(|p| (p.image.width(), p.image.height())).collect();
+    Cameras::read(path)?.of_images(&paths, &sizes).map(Some)
+}
+
+fn infer(
+    model: &Da3,
+    request: &DepthRequest,
+    pictures: &[Picture],
+    cameras: Option<&inputs::Given>,
+    cancel: &CancelToken,
+) -> Result<Prediction, Error> {
+    let images: Vec<_> = pictures.iter().map(|p| p.image.clone()).collect();
+    let inputs = match cameras {
+        Some(given) => Inputs::posed(&images, &given.camera_from_world, &given.intrinsics),
+        None => Inputs::images(&images),
+    };
+    let is_cancelled = || cancel.is_cancelled();
+    let hooks = Hooks { cancel: &is_cancelled, trace: None };
+    model.infer_with(&inputs, &request.infer, &hooks).map_err(|error| match error {
+        Da3Error::Cancelled => Error::Interrupted { path: PathBuf::from(".") },
+        other => other.into(),
+    })
+}
+
+/// The metric network answers for a focal length of 300 px: metres = depth · focal / 300, in processed pixels.
+const CANONICAL_FOCAL_PX: f64 = 300.0;
+
+/// What a unit of depth is; a canonical depth whose focal length is known becomes metres.
+fn unit_of(
+    model: &Da3,
+    prediction: &mut Prediction,
+    request: &DepthRequest,
+    pictures: &[Picture],
+    cameras: Option<&inputs::Given>,
+) -> (Unit, String) {
+    if prediction.is_metric {
+        return (Unit::Metre, "the network's metric part".to_owned());
+    }
+    if model.config().variant == Some(Variant::MetricLarge) {
+        let Some(focal) = request.focal_px else {
+            return (
+                Unit::Arbitrary,
+                "metric for a focal length of 300 px; give --focal PX for metres".to_owned(),
+            );
+        };
+        for (depth, picture) in prediction.depth.iter_mut().zip(pictures) {
+            let scale = depth.width() as f64 / picture.image.width() as f64;
+            let factor = (focal * scale / CANONICAL_FOCAL_PX) as f32;
+            depth.data_mut().iter_mut().for_each(|d| *d *= factor);
+        }
+        return (Unit::Metre, format!("focal length {focal} px"));
+    }
+    match (&prediction.alignment, cameras) {
+        (Some(alignment), Some(given)) if request.infer.align_to_given => match alignment.evidence {
+            vidar_da3::align::ScaleEvidence::Nothing => {
+                (Unit::Arbitrary, "the cameras given stand in one place, which fixes no scale".to_owned())
+            }
+            evidence => (Unit::GivenCameras, format!("{} ({evidence:?})", given.source)),
+        },
+        _ => (Unit::Arbitrary, "one unknown factor for all views: no camera was given".to_owned()),
+    }
+}
+
+fn warnings(plan: &DepthPlan, located: &Located, prediction: &Prediction) -> Vec<Warning> {
+    let mut warnings = plan.warnings.clone();
+    if !located.identity.geometry_means_something {
+        let message = "the weights are made by rule: this geometry means nothing";
+        warnings.push(
+            Warning::new("untrained", message).hint("`vidar model pull da3-small` fetches trained weights"),
+        );
+    }
+    if prediction.was_cropped {
+        let message = "images of several shapes were cut to the smallest";
+        warnings.push(Warning::new("cropped", message).hint("predict them apart from each other"));
+    }
+    warnings
+}

@@ -1,0 +1,278 @@
+//! Which network, where its weights are, and under which terms: the one door to `vidar-hub` and `vidar-da3`.
+//!
+//! A model is named (`da3-small`), or it is a folder of one's own (`--model-dir`), or it is *untrained*
+//! (`da3-small-untrained`): the official architecture with weights made by rule, whose geometry means nothing and which
+//! serves to try the road and to measure time and memory without weights.
+
+mod memory;
+
+pub use memory::{MemoryPlan, planned_memory};
+
+use crate::error::Error;
+use serde::Serialize;
+use std::path::{Path, PathBuf};
+use vidar_da3::{Da3, Da3Config, Da3Options, Variant};
+use vidar_hub::catalogue::{self, CHECKPOINTS, WEIGHTS};
+use vidar_hub::{Acceptance, Checkpoint, HubError, HubSettings, Installed, PullOptions, Store, Watch};
+
+/// The end of a name that asks for weights made by rule.
+const UNTRAINED: &str = "-untrained";
+
+/// Which network.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum ModelChoice {
+    /// An official checkpoint.
+    Official(&'static Checkpoint),
+    /// A folder with `model.safetensors` and `config.json`, or a safetensors file.
+    Folder(PathBuf),
+    /// An official architecture with weights made by rule.
+    Untrained(Variant),
+}
+
+impl ModelChoice {
+    /// The checkpoint of a name.
+    pub fn named(name: &str) -> Result<Self, Error> {
+        if let Some(architecture) = name.strip_suffix(UNTRAINED) {
+            let checkpoint = catalogue::find(architecture)?;
+            return match Variant::from_name(checkpoint.architecture) {
+                Some(variant) => Ok(Self::Untrained(variant)),
+                None => Err(HubError::UnknownModel { name: name.to_owned(), known: names() }.into()),
+            };
+        }
+        Ok(Self::Official(catalogue::find(name)?))
+    }
+
+    /// What the user calls it.
+    pub fn name(&self) -> String {
+        match self {
+            Self::Official(checkpoint) => checkpoint.name.to_owned(),
+            Self::Folder(path) => path.display().to_string(),
+            Self::Untrained(variant) => format!("{}{UNTRAINED}", variant.name()),
+        }
+    }
+}
+
+/// That the user accepts a licence.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct LicenceAccepted {
+    /// The licence as the user named it.
+    pub licence: String,
+    /// Who.
+    pub by: String,
+}
+
+/// A model that is here and may be used.
+#[derive(Clone, Debug)]
+pub struct Located {
+    /// Which one.
+    pub choice: ModelChoice,
+    /// Its weights; `None` for weights made by rule.
+    pub path: Option<PathBuf>,
+    /// What manifests say of it.
+    pub identity: ModelIdentity,
+}
+
+/// What a manifest says of a model.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
+pub struct ModelIdentity {
+    /// Name as the user chose it.
+    pub name: String,
+    /// The official checkpoint that its weights are, where they are one's.
+    pub official: Option<&'static str>,
+    /// SPDX licence of the weights; `unknown` for weights of one's own.
+    pub licence: String,
+    /// SHA-256 of the weights; none for weights made by rule.
+    pub weights_sha256: Option<String>,
+    /// Length of the weights.
+    pub weights_bytes: u64,
+    /// Where they came from.
+    pub source: Option<String>,
+    /// Who accepted a licence that asks for it.
+    pub acceptance: Option<Acceptance>,
+    /// Whether its geometry means anything: not for weights made by rule.
+    pub geometry_means_something: bool,
+}
+
+/// The store that the environment describes; `offline` forbids the network besides.
+pub fn store(offline: bool) -> Result<Store, Error> {
+    let mut settings = HubSettings::from_environment(|name| std::env::var(name).ok())?;
+    settings.offline |= offline;
+    Ok(Store::new(settings))
+}
+
+/// Finds the model's weights and checks that they may be used. The network is never used for it.
+pub fn locate(
+    choice: &ModelChoice,
+    accepted: Option<&LicenceAccepted>,
+    store: &Store,
+) -> Result<Located, Error> {
+    match choice {
+        ModelChoice::Official(checkpoint) => official(checkpoint, accepted, store),
+        ModelChoice::Folder(path) => folder(path, accepted, store),
+        ModelChoice::Untrained(_) => Ok(Located {
+            choice: choice.clone(),
+            path: None,
+            identity: ModelIdentity {
+                name: choice.name(),
+                official: None,
+                licence: "MIT OR Apache-2.0".to_owned(),
+                weights_sha256: None,
+                weights_bytes: 0,
+                source: Some("weights made by rule".to_owned()),
+                acceptance: None,
+                geometry_means_something: false,
+            },
+        }),
+    }
+}
+
+/// The acceptance that the user gave with this command, as a record.
+pub fn acceptance_of(
+    checkpoint: &'static Checkpoint,
+    accepted: Option<&LicenceAccepted>,
+) -> Result<Option<Acceptance>, Error> {
+    // Nothing needs to be written down where everything is allowed.
+    let needed = accepted.filter(|_| !checkpoint.licence.allows_commercial_use());
+    let now = crate::run_folder::now_rfc3339();
+    Ok(needed.map(|a| Acceptance::new(checkpoint, &a.licence, &a.by, &now)).transpose()?)
+}
+
+/// Options of a pull or an import at this moment.
+pub fn pull_options(acceptance: Option<Acceptance>) -> PullOptions {
+    PullOptions { acceptance, now: crate::run_folder::now_rfc3339(), ..PullOptions::default() }
+}
+
+fn official(
+    checkpoint: &'static Checkpoint,
+    accepted: Option<&LicenceAccepted>,
+    store: &Store,
+) -> Result<Located, Error> {
+    // What is not there is said first: a licence is accepted for something.
+    if store.find(checkpoint)?.is_none() {
+        store.require(checkpoint)?;
+    }
+    if let Some(acceptance) = acceptance_of(checkpoint, accepted)? {
+        store.accept(checkpoint, &acceptance)?;
+    }
+    let installed = store.require(checkpoint)?;
+    let sha256 = match installed.recorded_sha256() {
+        Some(recorded) => recorded.to_owned(),
+        None => hash(&installed.weights())?,
+    };
+    Ok(Located {
+        choice: ModelChoice::Official(checkpoint),
+        path: Some(installed.folder.clone()),
+        identity: ModelIdentity {
+            name: checkpoint.name.to_owned(),
+            official: Some(checkpoint.name),
+            licence: checkpoint.licence.spdx().to_owned(),
+            weights_sha256: Some(sha256),
+            weights_bytes: length(&installed.weights())?,
+            source: source(&installed),
+            acceptance: installed.acceptance,
+            geometry_means_something: true,
+        },
+    })
+}
+
+fn source(installed: &Installed) -> Option<String> {
+    let record = installed.record.as_ref();
+    record.map(|r| r.source.clone()).or_else(|| Some(installed.folder.display().to_string()))
+}
+
+/// Weights of one's own. Those of an official length keep the terms of the official ones.
+fn folder(path: &Path, accepted: Option<&LicenceAccepted>, store: &Store) -> Result<Located, Error> {
+    let weights = if path.is_dir() { path.join(WEIGHTS) } else { path.to_owned() };
+    let bytes = length(&weights)?;
+    let sha256 = hash(&weights)?;
+    let official = catalogue::of_hash(&sha256).or_else(|| catalogue::of_size(bytes).next());
+    let mut acceptance = None;
+    if let Some(checkpoint) = official.filter(|c| !c.licence.allows_commercial_use()) {
+        if let Some(given) = acceptance_of(checkpoint, accepted)? {
+            store.accept(checkpoint, &given)?;
+        }
+        acceptance = store.require_acceptance(checkpoint)?;
+    }
+    Ok(Located {
+        choice: ModelChoice::Folder(path.to_owned()),
+        path: Some(path.to_owned()),
+        identity: ModelIdentity {
+            name: path.display().to_string(),
+            official: catalogue::of_hash(&sha256).map(|c| c.name),
+            licence: official.map_or_else(|| "unknown".to_owned(), |c| c.licence.spdx().to_owned()),
+            weights_sha256: Some(sha256),
+            weights_bytes: bytes,
+            source: Some(path.display().to_string()),
+            acceptance,
+            geometry_means_something: true,
+        },
+    })
+}
+
+fn length(weights: &Path) -> Result<u64, Error> {
+    std::fs::metadata(weights).map(|m| m.len()).map_err(|e| Error::io("read", weights, e))
+}
+
+fn hash(weights: &Path) -> Result<String, Error> {
+    let watch = Watch { progress: &|_| {}, cancel: &|| false };
+    Ok(vidar_hub::sha256_of(weights, &watch)?.1)
+}
+
+impl Located {
+    /// Opens the network. Weights are mapped, not copied.
+    pub fn open(&self, options: &Da3Options) -> Result<Da3, Error> {
+        match (&self.choice, &self.path) {
+            (ModelChoice::Untrained(variant), _) => Ok(Da3::deterministic(*variant, options)?),
+            (_, Some(path)) => Ok(Da3::open(path, options)?),
+            (_, None) => {
+                Err(HubError::NotInstalled { name: self.identity.name.clone(), looked: PathBuf::new() }
+                    .into())
+            }
+        }
+    }
+}
+
+/// The architecture, as far as it is known without weights.
+pub fn architecture(choice: &ModelChoice) -> Option<Da3Config> {
+    match choice {
+        ModelChoice::Official(checkpoint) => Variant::from_name(checkpoint.architecture).map(Variant::config),
+        ModelChoice::Untrained(variant) => Some(variant.config()),
+        ModelChoice::Folder(_) => None,
+    }
+}
+
+/// Names of all official checkpoints.
+pub fn names() -> String {
+    CHECKPOINTS.iter().map(|c| c.name).collect::<Vec<_>>().join(", ")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn names_are_official_or_untrained_or_refused() {
+        assert_eq!(ModelChoice::named("da3-base").unwrap().name(), "da3-base");
+        let untrained = ModelChoice::named("da3-metric-large-untrained").unwrap();
+        assert_eq!(untrained, ModelChoice::Untrained(Variant::MetricLarge));
+        assert!(ModelChoice::named("da3-enormous").is_err());
+        assert!(ModelChoice::named("da3-enormous-untrained").is_err());
+    }
+
+    #[test]
+    fn every_checkpoint_has_an_architecture_and_one_licence() {
+        for checkpoint in CHECKPOINTS {
+            let variant = Variant::from_name(checkpoint.architecture).unwrap();
+            assert_eq!(variant.licence(), checkpoint.licence.spdx(), "{}", checkpoint.name);
+        }
+    }
+
+    #[test]
+    fn weights_made_by_rule_say_so() {
+        let store = Store::new(HubSettings::new("/no/such".into()));
+        let located = locate(&ModelChoice::named("da3-small-untrained").unwrap(), None, &store).unwrap();
+        assert!(!located.identity.geometry_means_something && located.identity.weights_sha256.is_none());
+        let missing = locate(&ModelChoice::named("da3-small").unwrap(), None, &store).unwrap_err();
+        assert_eq!(missing.code(), "E0403");
+    }
+}
