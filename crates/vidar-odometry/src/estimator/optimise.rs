@@ -41,9 +41,19 @@ pub struct OptimiseReport {
 /// Smallest relative change of the cost that is worth another step.
 const CONVERGED_CHANGE: f64 = 1e-4;
 
+/// Nearly Gauss-Newton to begin with.
 const FIRST_LAMBDA: f64 = 1e-4;
 const LEAST_LAMBDA: f64 = 1e-9;
 const MOST_LAMBDA: f64 = 1e8;
+
+/// Inverse squares of the steps at which damping of 1 sets in: 0.1 rad, 1 m; 1 m/s, 0.05 rad/s, 0.5 m/s²; calibration
+/// 0.02 rad, 2 cm, 5 ms.
+///
+/// Damping by the system's own diagonal would hold biases in place: each is tied to its neighbours by a walk a million
+/// times stiffer than what is known of all of them together.
+const POSE_DAMPING: [f64; 6] = [1e2, 1e2, 1e2, 1.0, 1.0, 1.0];
+const MOTION_DAMPING: [f64; 9] = [1.0, 1.0, 1.0, 4e2, 4e2, 4e2, 4.0, 4.0, 4.0];
+const CALIBRATION_DAMPING: [f64; CALIBRATION_DIM] = [2.5e3, 2.5e3, 2.5e3, 2.5e3, 2.5e3, 2.5e3, 4e4];
 
 /// A frame's state before a step.
 #[derive(Clone, Copy, Debug)]
@@ -64,7 +74,7 @@ impl Smoother {
     pub fn optimise_into(&mut self, max_iterations: usize, report: &mut OptimiseReport) {
         let mut system = std::mem::take(&mut self.system);
         let mut lambda = FIRST_LAMBDA;
-        let mut growth = 2.0;
+        let mut growth = 4.0;
         let mut cost = self.linearise(&mut system, lambda);
         (report.iterations, report.converged, report.cost_before) = (0, false, cost);
         while report.iterations < max_iterations && !report.converged && lambda < MOST_LAMBDA {
@@ -72,8 +82,8 @@ impl Smoother {
             let calibration = self.save(&mut system);
             let gain = solve(&mut system, lambda);
             let Some(expected) = gain else {
-                lambda *= growth;
-                growth *= 2.0;
+                lambda = (lambda * growth).max(1e-3);
+                growth *= 4.0;
                 cost = self.linearise(&mut system, lambda);
                 continue;
             };
@@ -84,13 +94,13 @@ impl Smoother {
             if change >= 0.0 || -change < 1e-9 * cost {
                 let ratio = change / expected.max(1e-300);
                 lambda = (lambda * (1.0 - (2.0 * ratio - 1.0).powi(3)).clamp(1.0 / 3.0, 2.0)).max(LEAST_LAMBDA);
-                growth = 2.0;
+                growth = 4.0;
                 report.converged = change <= CONVERGED_CHANGE * cost;
                 cost = after;
             } else {
                 self.restore(&system, calibration);
-                lambda *= growth;
-                growth *= 2.0;
+                lambda = (lambda * growth).max(1e-3);
+                growth *= 4.0;
                 cost = self.linearise(&mut system, lambda);
             }
         }
@@ -178,9 +188,13 @@ impl Smoother {
 fn solve(system: &mut System, lambda: f64) -> Option<f64> {
     let n = system.n;
     system.damping.clear();
-    for i in 0..n {
-        system.damping.push(lambda * system.h[i * n + i].clamp(1e-6, 1e12));
+    let frames = system.frames;
+    system.damping.extend((0..frames).flat_map(|_| MOTION_DAMPING));
+    system.damping.extend((0..frames).flat_map(|_| POSE_DAMPING));
+    if n > 15 * frames {
+        system.damping.extend(CALIBRATION_DAMPING);
     }
+    system.damping.iter_mut().for_each(|d| *d *= lambda);
     if !system.cholesky.factorise(&system.h, &system.damping, &system.first) {
         return None;
     }

@@ -1,1 +1,377 @@
-//! Smoother tests.
+//! Factors against numeric derivatives, the prior against dense algebra, and what must stay unobservable.
+
+use super::inertial::{anchor_at, body_velocity, jacobians, residual};
+use super::linearise::System;
+use super::prior::Part;
+use super::visual::{self, CameraPlace};
+use super::*;
+use crate::imu::{Bias, Matrix15, Vector15};
+use crate::simulate::{
+    Course, CourseKind, FeatureOdometry, FeatureOdometryConfig, Random, Simulation, SimulationConfig, StepOutput,
+};
+use nalgebra::{DMatrix, DVector, SMatrix, SVector, Vector3};
+use vidar_core::testing::check_jacobian;
+use vidar_core::{ImuNoise, LieGroup, So3};
+
+fn random_state(random: &mut Random) -> NavState {
+    NavState {
+        world_from_body: Se3::new(So3::exp(&(random.normal3() * 0.8)), random.normal3()),
+        velocity: random.normal3(),
+        bias: Bias { gyro: random.normal3() * 0.02, accel: random.normal3() * 0.1 },
+    }
+}
+
+fn some_readings(bias: Bias) -> Preintegration {
+    let course = Course { kind: CourseKind::Eight, secs: 3.0, speed: 2.0, phase: 0.2 };
+    let simulation = Simulation::new(&course, 0.0, 2.0, &SimulationConfig::default());
+    let model = ImuModel::from_data_sheet(&ImuNoise::EUROC, 2.0, 2.0);
+    Preintegration::new(model, bias, &simulation.readings[20..80])
+}
+
+fn pose_plus(state: &NavState, d: &SVector<f64, 6>) -> Se3 {
+    let mut delta = Vector15::zeros();
+    delta.fixed_rows_mut::<6>(0).copy_from(d);
+    state.plus(&delta).world_from_body
+}
+
+#[test]
+fn inertial_factor_agrees_with_numeric_derivatives() {
+    let mut random = Random::new(11);
+    for _ in 0..5 {
+        let i = random_state(&mut random);
+        let readings = some_readings(Bias { gyro: i.bias.gyro * 0.9, accel: i.bias.accel * 0.8 });
+        let guess = Vector15::from_fn(|_, _| 0.1 * random.normal());
+        let j = readings.predict(&i).plus(&guess);
+        let (by_i, by_j) = jacobians(&readings, &i, &j);
+        let zero = Vector15::zeros();
+        check_jacobian("by i", &by_i, |d| residual(&readings, &i.plus(d), &j), &zero, 1e-6).unwrap();
+        check_jacobian("by j", &by_j, |d| residual(&readings, &i, &j.plus(d)), &zero, 1e-6).unwrap();
+    }
+}
+
+#[test]
+fn inertial_residual_vanishes_on_its_own_prediction() {
+    let i = random_state(&mut Random::new(12));
+    let readings = some_readings(i.bias);
+    assert!(residual(&readings, &i, &readings.predict(&i)).amax() < 1e-12);
+}
+
+#[test]
+fn anchor_and_standstill_agree_with_numeric_derivatives() {
+    let mut random = Random::new(13);
+    let sigmas = AnchorSigmas {
+        position_m: 0.5,
+        yaw_rad: 0.4,
+        tilt_rad: 0.3,
+        velocity_mps: 0.7,
+        gyro_bias: 0.9,
+        accel_bias: 1.3,
+    };
+    let reference = random_state(&mut random);
+    let state = reference.plus(&Vector15::from_fn(|_, _| 0.2 * random.normal()));
+    let zero = Vector15::zeros();
+    let (_, j) = anchor_at(&reference, &sigmas, &state, &state);
+    let f = |d: &Vector15| anchor_at(&reference, &sigmas, &state.plus(d), &state).0;
+    check_jacobian("anchor", &j, f, &zero, 1e-6).unwrap();
+    let (_, by_rotation, by_velocity) = body_velocity(&state);
+    let mut analytic = SMatrix::<f64, 3, 15>::zeros();
+    analytic.fixed_view_mut::<3, 3>(0, 0).copy_from(&by_rotation);
+    analytic.fixed_view_mut::<3, 3>(0, 6).copy_from(&by_velocity);
+    check_jacobian("standstill", &analytic, |d| body_velocity(&state.plus(d)).0, &zero, 1e-6).unwrap();
+}
+
+struct View {
+    host: NavState,
+    target: NavState,
+    place: Se3,
+    bearing: Vector3<f64>,
+    rho: f64,
+}
+
+fn some_view(random: &mut Random) -> View {
+    let host = random_state(random);
+    let small = Vector15::from_fn(|_, _| 0.1 * random.normal());
+    let bearing = Vector3::new(0.2 * random.normal(), 0.2 * random.normal(), 1.0).normalize();
+    View { target: host.plus(&small), host, place: Simulation::body_from_camera(), bearing, rho: 0.3 }
+}
+
+#[test]
+fn reprojection_agrees_with_numeric_derivatives() {
+    let mut random = Random::new(14);
+    let camera = Simulation::camera();
+    for _ in 0..8 {
+        let View { host, target, place, bearing, rho } = some_view(&mut random);
+        let pixel = |h: &Se3, t: &Se3, place: &Se3, bearing: &Vector3<f64>, rho: f64| {
+            let (h, t) = (CameraPlace::new(h, place), CameraPlace::new(t, place));
+            camera.project(&visual::direction(&h, &t, bearing, rho)).unwrap()
+        };
+        let (h, t) = (host.world_from_body, target.world_from_body);
+        let (at_h, at_t) = (CameraPlace::new(&h, &place), CameraPlace::new(&t, &place));
+        let j = visual::jacobians(&camera, &at_h, &at_t, &bearing, rho).unwrap();
+        let zero = SVector::<f64, 6>::zeros();
+        let by_host = |d: &SVector<f64, 6>| pixel(&pose_plus(&host, d), &t, &place, &bearing, rho);
+        check_jacobian("host", &j.by_host, by_host, &zero, 1e-6).unwrap();
+        let by_target = |d: &SVector<f64, 6>| pixel(&h, &pose_plus(&target, d), &place, &bearing, rho);
+        check_jacobian("target", &j.by_target, by_target, &zero, 1e-6).unwrap();
+        let by_landmark = |d: &Vector3<f64>| {
+            pixel(&h, &t, &place, &visual::bearing_plus(&bearing, &Vector2::new(d.x, d.y)), rho + d.z)
+        };
+        check_jacobian("landmark", &j.by_landmark, by_landmark, &Vector3::zeros(), 1e-6).unwrap();
+        let by_place = visual::by_body_from_camera(&camera, &at_h, &at_t, &bearing, rho).unwrap();
+        let moved = |d: &SVector<f64, 6>| {
+            let turn = So3::exp(&d.fixed_rows::<3>(0).into_owned());
+            let place = Se3::new(place.rotation * turn, place.translation + d.fixed_rows::<3>(3));
+            pixel(&h, &t, &place, &bearing, rho)
+        };
+        check_jacobian("camera's place", &by_place, moved, &zero, 1e-6).unwrap();
+    }
+}
+
+#[test]
+fn relative_pose_agrees_with_numeric_derivatives() {
+    let mut random = Random::new(15);
+    let (a, b) = (random_state(&mut random), random_state(&mut random));
+    let here = a.world_from_body.inverse() * b.world_from_body;
+    let f = |d: &SVector<f64, 12>| {
+        let a = pose_plus(&a, &d.fixed_rows::<6>(0).into_owned());
+        let b = pose_plus(&b, &d.fixed_rows::<6>(6).into_owned());
+        (a.inverse() * b).minus(&here)
+    };
+    let j = covariance::d_relative_d_poses(&a.world_from_body, &b.world_from_body);
+    check_jacobian("relative pose", &j, f, &SVector::zeros(), 1e-6).unwrap();
+}
+
+/// A smoother that flew for a while on a built-in flight.
+fn flown(seed: u64, secs: f64, change: impl Fn(&mut FeatureOdometryConfig, &mut AnchorSigmas)) -> (FeatureOdometry, Simulation) {
+    let course = Course { kind: CourseKind::Eight, secs: secs + 1.0, speed: 1.2, phase: 0.4 * seed as f64 };
+    let settings = SimulationConfig { seed, tracks: 60, ..Default::default() };
+    let simulation = Simulation::new(&course, 0.0, secs, &settings);
+    let mut config = FeatureOdometryConfig::new(&ImuNoise::EUROC, 1.0);
+    let mut sigmas = AnchorSigmas {
+        position_m: 1e-3,
+        yaw_rad: 1e-3,
+        tilt_rad: 0.01,
+        velocity_mps: 0.05,
+        gyro_bias: 0.02,
+        accel_bias: 0.05,
+    };
+    change(&mut config, &mut sigmas);
+    let mut odometry = FeatureOdometry::for_simulation(config, &simulation).unwrap();
+    let first = &simulation.frames[0];
+    odometry.start_at(first, NavState { bias: Bias::ZERO, ..first.truth }, sigmas).unwrap();
+    for frame in &simulation.frames[1..] {
+        let out = odometry.push(frame.id, frame.time, &frame.seen).unwrap();
+        assert!(matches!(out, StepOutput::Running(_)));
+    }
+    (odometry, simulation)
+}
+
+/// Directions that move the whole window: three shifts and a turn about the vertical, at the linearisation points.
+fn free_directions(smoother: &Smoother, parts: &[Part], dim: usize) -> DMatrix<f64> {
+    let mut n = DMatrix::zeros(dim, 4);
+    let mut at = 0;
+    let up = Vector3::z();
+    for part in parts {
+        if let Some(k) = part.frame() {
+            let state = smoother.frames[k].linearised;
+            match part {
+                Part::Pose(_) => {
+                    for axis in 0..3 {
+                        n[(at + 3 + axis, axis)] = 1.0;
+                    }
+                    let turn = state.world_from_body.rotation.inverse() * up;
+                    let shift = up.cross(&state.world_from_body.translation);
+                    n.view_mut((at, 3), (3, 1)).copy_from(&turn);
+                    n.view_mut((at + 3, 3), (3, 1)).copy_from(&shift);
+                }
+                _ => n.view_mut((at, 3), (3, 1)).copy_from(&up.cross(&state.velocity)),
+            }
+        }
+        at += part.dim();
+    }
+    n
+}
+
+#[test]
+fn shift_and_heading_stay_free_after_100_marginalisations() {
+    // Keyframes every second frame: 22 s give far more than 100 departures.
+    let (mut odometry, simulation) = flown(3, 11.5, |config, sigmas| {
+        config.keyframe_every = 2;
+        (sigmas.position_m, sigmas.yaw_rad) = (f64::INFINITY, f64::INFINITY);
+    });
+    let smoother = odometry.smoother().unwrap();
+    let departures = simulation.frames.len() / 2 - 10;
+    assert!(departures >= 100, "{departures} departures");
+    let prior = &smoother.prior;
+    let root = DMatrix::from_row_slice(prior.rows, prior.dim, &prior.root);
+    let n = free_directions(smoother, &prior.parts, prior.dim);
+    let worst = (0..4)
+        .map(|k| {
+            let direction = n.column(k).normalize();
+            (&root * direction).norm() / root.norm()
+        })
+        .fold(0.0, f64::max);
+    assert!(worst < 1e-6, "|J N| / |J| = {worst:.2e}");
+    // The test can fail: without first estimates the prior believes in a heading.
+    assert!(root.norm() > 1.0 && prior.rows > 50);
+}
+
+#[test]
+fn without_first_estimates_heading_seems_known() {
+    let (mut odometry, _) = flown(3, 6.0, |config, sigmas| {
+        config.keyframe_every = 2;
+        config.smoother.first_estimates = false;
+        (sigmas.position_m, sigmas.yaw_rad) = (f64::INFINITY, f64::INFINITY);
+    });
+    let smoother = odometry.smoother().unwrap();
+    let prior = &smoother.prior;
+    let root = DMatrix::from_row_slice(prior.rows, prior.dim, &prior.root);
+    let n = free_directions(smoother, &prior.parts, prior.dim);
+    let yaw = (&root * n.column(3).normalize()).norm() / root.norm();
+    assert!(yaw > 1e-6, "{yaw:.2e}");
+}
+
+/// Information and gradient over poses and motions, dense, in the order of the system.
+fn dense(smoother: &mut Smoother) -> (DMatrix<f64>, DVector<f64>) {
+    let mut system = System::default();
+    smoother.linearise(&mut system, 0.0);
+    let n = system.n;
+    let h = DMatrix::from_fn(n, n, |i, j| if i >= j { system.h[i * n + j] } else { system.h[j * n + i] });
+    (h, DVector::from_vec(system.gradient))
+}
+
+#[test]
+fn the_prior_is_the_dense_marginal() {
+    let (mut odometry, _) = flown(5, 4.0, |_, _| {});
+    let smoother = odometry.smoother().unwrap();
+    // Only what leaves may speak, or both sides would have the rest in common: no landmarks of other hosts, and none
+    // that lives on; robust weights stay as they are.
+    let first = smoother.frames().next().unwrap();
+    let elsewhere: Vec<LandmarkId> = smoother.landmarks().filter(|l| l.host != first).map(|l| l.id).collect();
+    elsewhere.iter().for_each(|l| {
+        smoother.remove_landmark(*l);
+    });
+    smoother.config.rehost_keyframes = 1;
+    smoother.config.outlier_chi2 = 100.0;
+    let keyframes: Vec<FrameId> = smoother.keyframes().collect();
+    let frames: Vec<FrameId> = smoother.frames().collect();
+    let hosted: Vec<LandmarkId> = smoother.landmarks().map(|l| l.id).collect();
+    for l in &hosted {
+        // Seen neither by frames that are no keyframes nor by the newest two: they all end.
+        for f in frames.iter().filter(|f| !keyframes.contains(f) || frames[frames.len() - 2..].contains(f)) {
+            smoother.remove_observation(*f, *l);
+        }
+    }
+    let mut departure = Departure::default();
+    let (h, g) = dense(smoother);
+    let k = smoother.len();
+    let leaving: Vec<usize> = (0..9).chain(9 * k..9 * k + 6).collect();
+    let staying: Vec<usize> = (0..15 * k).filter(|i| !leaving.contains(i)).collect();
+    let pick = |r: &[usize], c: &[usize]| DMatrix::from_fn(r.len(), c.len(), |i, j| h[(r[i], c[j])]);
+    let (mm, sm, ss) = (pick(&leaving, &leaving), pick(&staying, &leaving), pick(&staying, &staying));
+    let inverse = mm.try_inverse().unwrap();
+    let expected = &ss - &sm * &inverse * sm.transpose();
+    let gm = DVector::from_fn(15, |i, _| g[leaving[i]]);
+    let gs = DVector::from_fn(staying.len(), |i, _| g[staying[i]]);
+    let expected_gradient = gs - &sm * inverse * gm;
+
+    smoother.marginalise(first, &mut departure).unwrap();
+    assert!(departure.rehosted.is_empty() && departure.ended.len() == hosted.len() && hosted.len() > 5);
+    let (found, found_gradient) = dense(smoother);
+    let scale = expected.amax();
+    let error = (&found - &expected).amax() / scale;
+    assert!(error < 1e-8, "information differs by {error:.2e}");
+    let error = (&found_gradient - &expected_gradient).amax() / expected_gradient.amax().max(1.0);
+    assert!(error < 1e-8 * scale / expected_gradient.amax().max(1.0), "gradient differs by {error:.2e}");
+}
+
+#[test]
+fn the_gradient_is_the_slope_of_the_cost() {
+    let (mut odometry, _) = flown(6, 1.5, |config, _| config.smoother.huber_sigmas = 10.0);
+    // No frame has left yet: all derivatives are at the present states, so gradient and cost belong together.
+    let smoother = odometry.smoother().unwrap();
+    assert!(smoother.prior.parts.is_empty());
+    let all: Vec<LandmarkId> = smoother.landmarks().map(|l| l.id).collect();
+    all.iter().for_each(|l| {
+        smoother.remove_landmark(*l);
+    });
+    let mut system = System::default();
+    smoother.linearise(&mut system, 0.0);
+    let mut random = Random::new(4);
+    let direction: Vec<f64> = system.gradient.iter().map(|_| random.normal() * 1e-6).collect();
+    let slope: f64 = direction.iter().zip(&system.gradient).map(|(d, g)| d * g).sum();
+    let cost = |sign: f64| {
+        let mut moved = smoother.clone();
+        for (k, frame) in moved.frames.iter_mut().enumerate() {
+            let n = 9 * system.frames;
+            let pose = SVector::<f64, 6>::from_fn(|i, _| sign * direction[n + 6 * k + i]);
+            let motion = SVector::<f64, 9>::from_fn(|i, _| sign * direction[9 * k + i]);
+            frame.apply(&pose, &motion);
+        }
+        moved.linearise(&mut System::default(), 0.0)
+    };
+    let numeric = 0.5 * (cost(1.0) - cost(-1.0));
+    assert!((numeric - slope).abs() < 1e-3 * slope.abs().max(1e-9), "{numeric:.6e} {slope:.6e}");
+}
+
+#[test]
+fn dropping_a_frame_joins_its_readings() {
+    let (mut odometry, simulation) = flown(7, 2.0, |_, _| {});
+    let smoother = odometry.smoother().unwrap();
+    let keyframes: Vec<FrameId> = smoother.keyframes().collect();
+    let frames: Vec<FrameId> = smoother.frames().collect();
+    let at = frames.iter().rposition(|f| !keyframes.contains(f) && Some(f) != frames.last()).unwrap();
+    let before: f64 = smoother.frames[at].link.as_ref().unwrap().readings.secs();
+    let after: f64 = smoother.frames[at + 1].link.as_ref().unwrap().readings.secs();
+    let mut departure = Departure::default();
+    smoother.drop_frame(frames[at], &mut departure).unwrap();
+    let joined = smoother.frames[at].link.as_ref().unwrap().readings.secs();
+    assert!((joined - before - after).abs() < 1e-9, "{joined} {before} {after}");
+    assert_eq!(smoother.len(), frames.len() - 1);
+    let newest = smoother.newest().map(|(id, ..)| id);
+    assert_eq!(newest, simulation.frames.last().map(|f| f.id));
+}
+
+#[test]
+fn what_is_of_no_use_is_refused_in_words() {
+    let (mut odometry, _) = flown(8, 1.0, |_, _| {});
+    let smoother = odometry.smoother().unwrap();
+    let (frame, time, state) = smoother.newest().map(|(id, t, s)| (id, t, *s)).unwrap();
+    let seen = |landmark, covariance| Observation {
+        frame,
+        landmark: LandmarkId(landmark),
+        pixel: Vector2::new(100.0, 100.0),
+        covariance,
+        pixel_velocity: Vector2::zeros(),
+    };
+    let bad = seen(90_000, Matrix2::new(1.0, 2.0, 2.0, 1.0));
+    let told = smoother.add_landmark(&bad, 0.5).unwrap_err().to_string();
+    assert!(told.contains("covariance of landmark 90000") && told.contains("[1 2; 2 1]"), "{told}");
+    let good = seen(90_000, Matrix2::identity());
+    assert_eq!(smoother.add_observation(&good), Err(SmootherError::NoSuchLandmark(LandmarkId(90_000))));
+    smoother.add_landmark(&good, 0.5).unwrap();
+    assert!(matches!(smoother.add_landmark(&good, 0.5), Err(SmootherError::Twice { .. })));
+    assert!(matches!(smoother.add_observation(&good), Err(SmootherError::Twice { .. })));
+    assert!(smoother.add_landmark(&seen(90_001, Matrix2::identity()), f64::NAN).is_err());
+    assert!(matches!(smoother.add_frame(FrameId(9999), time, state, None), Err(SmootherError::NotNext { .. })));
+    let mut lost = state;
+    lost.velocity.x = f64::NAN;
+    assert_eq!(smoother.add_frame(FrameId(9999), time, lost, None), Err(SmootherError::BadState(FrameId(9999))));
+    assert!(SmootherConfig { huber_sigmas: f64::NAN, ..Default::default() }.validate().is_err());
+    assert!(SmootherConfig::default().validate().is_ok());
+}
+
+#[test]
+fn covariances_are_symmetric_and_positive() {
+    let (mut odometry, _) = flown(9, 3.0, |_, _| {});
+    let smoother = odometry.smoother().unwrap();
+    let full: Matrix15 = smoother.covariance_of_newest().unwrap();
+    assert!((full - full.transpose()).amax() < 1e-12 && full.cholesky().is_some());
+    let keyframes: Vec<FrameId> = smoother.keyframes().collect();
+    let [.., a, b] = keyframes[..] else { panic!("too few keyframes") };
+    let relative = smoother.relative_covariance(a, b).unwrap();
+    assert!(relative.cholesky().is_some());
+    let absolute = smoother.pose_covariance(b).unwrap();
+    assert!(relative.trace() < absolute.trace(), "neighbours know each other better than the origin");
+    assert!(smoother.log_scale_sigma().unwrap() < 0.1);
+}
