@@ -101,6 +101,24 @@ impl Conv2d {
             .run(c, out);
     }
 
+    /// Whether it is a 1×1 convolution, a linear map of each pixel.
+    pub(crate) fn is_pointwise(&self) -> bool {
+        self.kernel == [1, 1] && self.stride == 1 && self.padding == 0
+    }
+
+    /// Whether the output has the input's rows and columns.
+    pub(crate) fn keeps_size(&self) -> bool {
+        self.stride == 1 && self.kernel.iter().all(|k| *k == 2 * self.padding + 1)
+    }
+
+    pub(crate) fn weight(&self) -> &Weight {
+        &self.weight
+    }
+
+    pub(crate) fn bias(&self) -> Option<&[f32]> {
+        self.bias.as_deref()
+    }
+
     pub(crate) fn bands<'a>(&self, fill: Fill<'a>, rows: usize, cols: usize) -> Bands<'a> {
         let (out_rows, out_cols) = self.output_size(rows, cols);
         Bands {

@@ -13,6 +13,7 @@ mod checkpoint;
 mod compute;
 mod conv;
 mod error;
+mod head;
 mod kernels;
 mod linear;
 mod norm;
@@ -25,6 +26,7 @@ pub use checkpoint::{Checkpoint, CheckpointError, Dtype, TensorView, WeightSourc
 pub use compute::{Compute, Isa, Precision};
 pub use conv::{Conv2d, ConvInput, ConvTranspose2d, MapRef};
 pub use error::NnError;
+pub use head::{HeadBranch, HeadInput, head};
 pub use linear::{Epilogue, Linear};
 pub use norm::LayerNorm;
 pub use resize::{

@@ -120,7 +120,7 @@ impl Product<'_> {
     }
 }
 
-struct ShapeOf;
+pub(crate) struct ShapeOf;
 
 pub(crate) struct Shape {
     pub(crate) panel: usize,
@@ -168,7 +168,7 @@ impl ProductKernel for Task<'_> {
             layout: product.layout,
             out: self.out,
         };
-        multiply(m, a, &geometry, rows, self.panels, self.units, &target);
+        multiply(m, a, &geometry, rows, 0, self.panels, self.units, &target);
     }
 }
 
@@ -181,13 +181,16 @@ pub(crate) struct Target<'a> {
     pub(crate) out: SharedMut<'a>,
 }
 
-/// Multiplies rows `rows` of A (in `a`, which starts with the first of them) with some units of the panels.
+/// Multiplies rows `rows` of A (in `a`, which starts with the first of them) with some units of the panels. Row m of A goes to
+/// row `m - out_start` of the target.
 #[inline(always)]
+#[allow(clippy::too_many_arguments)] // two callers; each argument is a thing of its own
 pub(crate) fn multiply<M: Multiply>(
     m: M,
     a: &[M::Number],
     geometry: &Geometry,
     rows: Range<usize>,
+    out_start: usize,
     panels: Panels<'_>,
     units: Range<usize>,
     target: &Target<'_>,
@@ -229,7 +232,7 @@ pub(crate) fn multiply<M: Multiply>(
                         tile(m, count, here, &geometry.taps, steps, words[panel_words..].as_ptr(), &mut sums);
                     }
                 }
-                target.finish(s, &gates, &sums, from, count, first);
+                target.finish(s, &gates, &sums, from - out_start, count, first);
             }
             row = run.end;
         }

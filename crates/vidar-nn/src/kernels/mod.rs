@@ -6,6 +6,7 @@
 
 pub(crate) mod attend;
 pub(crate) mod gemm;
+pub(crate) mod head;
 pub(crate) mod map;
 pub(crate) mod math;
 #[cfg(target_arch = "aarch64")]

@@ -75,11 +75,13 @@ pub(crate) enum Role {
     Rows,
     /// Blocks of a task of attention, or a band of a fused head.
     Block,
+    /// Numbers between the two products of a fused head.
+    Middle,
     /// Keys and values of a call of attention.
     Keys,
 }
 
-const ROLES: usize = 6;
+const ROLES: usize = 7;
 
 thread_local! {
     static KEPT: RefCell<[Scratch; ROLES]> = const { RefCell::new([const { Scratch { lines: Vec::new() } }; ROLES]) };

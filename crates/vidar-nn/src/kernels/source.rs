@@ -65,8 +65,9 @@ const CHUNK_BYTES: usize = 256 << 10;
 const ROWS_UNIT: usize = 12;
 /// Chunks are not taller: more tasks even out better.
 const MAX_UNITS: usize = 8;
-/// Pixels of a band: enough to hide the border rows that neighbouring bands make twice.
-const BAND_PIXELS: usize = 768;
+/// Bytes of a band's input lines: what a second-level cache holds beside a panel. Neighbouring bands both make the border
+/// lines between them, so bands should not be thin.
+const BAND_BYTES: usize = 384 << 10;
 
 impl<'a> Source<'a> {
     pub(crate) fn inner(&self) -> Inner {
@@ -192,7 +193,8 @@ impl Bands<'_> {
     }
 
     fn band_lines(&self) -> usize {
-        (BAND_PIXELS / self.out_cols.max(1)).clamp(1, self.out_rows.max(1))
+        let lines = BAND_BYTES / (4 * self.pitch()).max(1);
+        (lines.saturating_sub(self.kernel[0] - 1) / self.stride).clamp(1, self.out_rows.max(1))
     }
 
     #[inline(always)]
