@@ -224,3 +224,75 @@ fn dot(a: &[f32; SIDE * SIDE], b: &[f32; SIDE * SIDE]) -> f64 {
     }
     f64::from(super::patch::sum8(&lanes))
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::frontend::testbed::Random;
+    use vidar_core::LieGroup;
+    use vidar_core::testing::check_jacobian;
+
+    #[test]
+    fn the_warp_is_the_derivative_of_the_map_through_the_plane() {
+        let mut random = Random::new(4);
+        for camera in CameraModel::examples() {
+            let centre = Pixel::new(camera.intrinsics().cx + 60.0, camera.intrinsics().cy - 40.0);
+            let Some(feature) = Feature::new(&camera, centre, 0, FeatureKind::Corner) else { continue };
+            for inverse_distance in [0.0, 0.1, 0.6] {
+                let current_from_keyframe =
+                    Se3::new(So3::exp(&(random.vector() * 0.1)), random.vector() * 0.1);
+                let warp = Warp::new(&camera, &feature, inverse_distance, &current_from_keyframe).unwrap();
+                let through = |key: &Pixel| -> Vector2<f64> {
+                    let ray = camera.unproject(key).unwrap();
+                    // On the plane across the bearing, at the bearing's distance (scaled, so that infinity works).
+                    let scaled = ray / ray.dot(&feature.bearing);
+                    let turned = current_from_keyframe.rotation * scaled;
+                    camera.project(&(turned + current_from_keyframe.translation * inverse_distance)).unwrap()
+                };
+                assert!((through(&centre) - warp.pixel).norm() < 1e-9);
+                // The cameras' own inverses are exact to 1e-10 or so, which differences enlarge.
+                check_jacobian("warp", &warp.d_current_d_keyframe, through, &centre, 1e-6).unwrap();
+            }
+        }
+    }
+
+    #[test]
+    fn a_patch_that_grows_is_looked_for_on_a_coarser_level() {
+        let warp =
+            |scale: f64| Warp { pixel: Pixel::zeros(), d_current_d_keyframe: Matrix2::identity() * scale };
+        assert_eq!(warp(1.0).search_level(0, 5), 0);
+        assert_eq!(warp(2.0).search_level(0, 5), 1);
+        assert_eq!(warp(1.0).search_level(2, 5), 2);
+        assert_eq!(warp(0.6).search_level(2, 5), 1);
+        assert_eq!(warp(8.0).search_level(2, 3), 2);
+    }
+
+    #[test]
+    fn what_is_behind_or_collapses_has_no_warp() {
+        let camera = CameraModel::examples().remove(0);
+        let centre = Pixel::new(camera.intrinsics().cx, camera.intrinsics().cy);
+        let feature = Feature::new(&camera, centre, 0, FeatureKind::Corner).unwrap();
+        let back = Se3::from_translation(Vector3::new(0.0, 0.0, -3.0));
+        assert!(Warp::new(&camera, &feature, 1.0, &back).is_none());
+        let far_away = Se3::from_translation(Vector3::new(0.0, 0.0, 50.0));
+        assert!(Warp::new(&camera, &feature, 1.0, &far_away).is_none());
+    }
+
+    #[test]
+    fn gradients_are_orthogonal_to_the_constant_and_to_the_intensities() {
+        let image = vidar_core::Image::from_fn(64, 64, |x, y| ((x * x + 3 * y * x + 7 * y) % 200) as u8);
+        let pyramid = Pyramid::of(&image, 2);
+        let feature = Feature {
+            pixel: Pixel::new(30.0, 31.0),
+            bearing: Vector3::z(),
+            level: 0,
+            kind: FeatureKind::Corner,
+        };
+        let mut template = Template::empty();
+        assert!(template.fill(&pyramid, &feature, &Warp::shift(feature.pixel)));
+        for gradient in [&template.gx, &template.gy] {
+            assert!(gradient.iter().sum::<f32>().abs() < 0.1);
+            assert!(dot(gradient, &template.intensity).abs() < 1e-3 * template.energy);
+        }
+    }
+}

@@ -7,6 +7,8 @@
 mod fast;
 mod occupancy;
 mod structure;
+#[cfg(test)]
+mod tests;
 
 pub use occupancy::OccupancyGrid;
 

@@ -1,5 +1,6 @@
 use super::*;
 use crate::frontend::testbed::Random;
+use vidar_core::LieGroup;
 
 const SIGMA: f64 = 0.5 / 458.0;
 

@@ -1,0 +1,197 @@
+//! Once its buffers have grown, the front end asks the allocator for nothing.
+
+use nalgebra::{Matrix6, Vector3, Vector6};
+use std::alloc::{GlobalAlloc, Layout, System};
+use std::cell::Cell;
+use vidar_core::{CameraModel, FrameImage, Image, LieGroup, Pinhole, Se3, So3};
+use vidar_odometry::frontend::{
+    AlignmentPoint, AlignmentReference, DepthFilter, Detection, Detector, Feature, FrontendConfig,
+    ImageAligner, ImageQuality, KltTracker, MotionMeter, MotionPrediction, OccupancyGrid, PointObservation,
+    Pyramid, RayPair, Seed, Template, TwoViewSolver, Warp, align_feature, refine_camera,
+};
+
+/// Counts what this thread asks for.
+struct Counting;
+
+thread_local! {
+    static REQUESTS: Cell<usize> = const { Cell::new(0) };
+}
+
+// SAFETY: every call goes on to the system's allocator unchanged.
+unsafe impl GlobalAlloc for Counting {
+    unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
+        let _ = REQUESTS.try_with(|r| r.set(r.get() + 1));
+        unsafe { System.alloc(layout) }
+    }
+    unsafe fn dealloc(&self, pointer: *mut u8, layout: Layout) {
+        unsafe { System.dealloc(pointer, layout) }
+    }
+    unsafe fn realloc(&self, pointer: *mut u8, layout: Layout, size: usize) -> *mut u8 {
+        let _ = REQUESTS.try_with(|r| r.set(r.get() + 1));
+        unsafe { System.realloc(pointer, layout, size) }
+    }
+}
+
+#[global_allocator]
+static ALLOCATOR: Counting = Counting;
+
+const SIZE: (usize, usize) = (376, 240);
+
+fn camera() -> CameraModel {
+    CameraModel::Pinhole(Pinhole::new(230.0, 230.0, 187.5, 119.5, SIZE.0, SIZE.1).unwrap())
+}
+
+/// A textured wall, 3 m ahead, seen from a camera shifted by `x` metres.
+fn wall(x: f64) -> FrameImage {
+    let shift = 230.0 * x / 3.0;
+    FrameImage::Gray8(Image::from_fn(SIZE.0, SIZE.1, |u, v| {
+        let (u, v) = (u as f64 + shift, v as f64);
+        let cell = (u / 13.0).floor() * 37.0 + (v / 11.0).floor() * 91.0;
+        let block = (cell.sin() * 43_758.545).fract().abs();
+        (40.0 + 120.0 * block + 20.0 * (0.3 * u + 0.2 * v).sin()) as u8
+    }))
+}
+
+/// Everything that lives from frame to frame.
+struct Frontend {
+    camera: CameraModel,
+    keyframe: Pyramid,
+    last: Pyramid,
+    current: Pyramid,
+    detector: Detector,
+    grid: OccupancyGrid,
+    found: Vec<Detection>,
+    features: Vec<Feature>,
+    seeds: Vec<Seed>,
+    points: Vec<AlignmentPoint>,
+    observations: Vec<PointObservation>,
+    pairs: Vec<RayPair>,
+    aligner: ImageAligner,
+    klt: KltTracker,
+    filter: DepthFilter,
+    two_view: TwoViewSolver,
+    meter: MotionMeter,
+    template: Template,
+    config: FrontendConfig,
+}
+
+impl Frontend {
+    fn new() -> Self {
+        let config = FrontendConfig::default();
+        let detector = Detector::new(config.detector.clone());
+        let pyramid = || Pyramid::new(SIZE.0, SIZE.1, config.pyramid.levels);
+        Self {
+            camera: camera(),
+            keyframe: pyramid(),
+            last: pyramid(),
+            current: pyramid(),
+            grid: detector.grid(SIZE.0, SIZE.1),
+            detector,
+            found: Vec::new(),
+            features: Vec::new(),
+            seeds: Vec::new(),
+            points: Vec::new(),
+            observations: Vec::new(),
+            pairs: Vec::new(),
+            aligner: ImageAligner::new(config.image_alignment.clone()),
+            klt: KltTracker::new(config.klt.clone(), config.matching.clone()),
+            filter: DepthFilter::new(config.depth_filter.clone(), config.matching.clone()),
+            two_view: TwoViewSolver::new(config.two_view.clone()),
+            meter: MotionMeter::new(config.klt.clone(), config.matching.clone(), 0.5),
+            template: Template::empty(),
+            config,
+        }
+    }
+
+    /// One frame with everything that ever runs; how many features each stage found.
+    fn frame(&mut self, images: &[FrameImage; 3], current_from_key: &Se3) -> [usize; 6] {
+        for (pyramid, image) in
+            [&mut self.keyframe, &mut self.last, &mut self.current].into_iter().zip(images)
+        {
+            pyramid.rebuild(image).unwrap();
+        }
+        let _ = ImageQuality::of(&self.current);
+        let motion = self.meter.measure(&self.last, &self.current, 1.0);
+        self.grid.clear();
+        self.detector.detect(&self.keyframe, &self.grid, &mut self.found);
+        self.features.clear();
+        self.features
+            .extend(self.found.iter().filter_map(|d| Feature::new(&self.camera, d.pixel, d.level, d.kind)));
+        let inverse = |f: &Feature| f.bearing.z / 3.0;
+        self.points.clear();
+        self.points.extend(self.features.iter().map(|f| AlignmentPoint {
+            pixel: f.pixel,
+            bearing: f.bearing,
+            inverse_distance: inverse(f),
+        }));
+        let reference = AlignmentReference {
+            pyramid: &self.keyframe,
+            anchor_from_reference: Se3::IDENTITY,
+            points: &self.points,
+        };
+        let off = Vector6::new(0.002, 0.002, 0.0, 0.005, 0.0, 0.0);
+        let prediction = MotionPrediction {
+            current_from_anchor: current_from_key.plus(&off),
+            information: Matrix6::identity(),
+        };
+        let aligned = self.aligner.align(&self.camera, &[reference], &self.current, &prediction);
+        self.observations.clear();
+        self.pairs.clear();
+        for feature in &self.features {
+            let Some(warp) = Warp::new(&self.camera, feature, inverse(feature), &aligned.current_from_anchor)
+            else {
+                continue;
+            };
+            if !self.template.fill(&self.keyframe, feature, &warp) {
+                continue;
+            }
+            let Ok(found) =
+                align_feature(&self.template, &self.current, &warp.pixel, 1.0, &self.config.matching)
+            else {
+                continue;
+            };
+            let point_in_anchor = feature.bearing / inverse(feature);
+            self.observations.push(PointObservation { point_in_anchor, measurement: found.measurement });
+            let Some(b) = self.camera.unproject(&found.measurement.pixel) else { continue };
+            self.pairs.push(RayPair { a: feature.bearing, b });
+        }
+        let refined = refine_camera(&self.camera, &self.observations, &prediction, &self.config.refinement);
+        let two_view = self.two_view.with_rotation(&self.pairs, &So3::IDENTITY, 0.2 / 230.0);
+        let both = self.two_view.without_rotation(&self.pairs, 0.2 / 230.0);
+        self.seeds.clear();
+        self.seeds.resize(self.features.len(), Seed::new(2.5, 1.0));
+        let mut followed = 0;
+        for (feature, seed) in self.features.iter().zip(&mut self.seeds) {
+            self.filter.update(
+                seed,
+                &self.camera,
+                feature,
+                &self.keyframe,
+                &self.current,
+                &aligned.current_from_anchor,
+                1.0,
+            );
+            if let Some(warp) = Warp::rotated(&self.camera, feature, &So3::IDENTITY) {
+                followed +=
+                    usize::from(self.klt.track(&self.last, &self.current, feature, &warp, 1.0).is_ok());
+            }
+        }
+        let inliers = refined.map_or(0, |r| r.inliers);
+        let agreed = two_view.map_or(0, |t| t.inliers).min(both.map_or(0, |t| t.inliers));
+        [motion.patches, aligned.patches, self.observations.len(), inliers, agreed, followed]
+    }
+}
+
+#[test]
+fn a_frame_asks_the_allocator_for_nothing_once_buffers_have_grown() {
+    let images = [0.0, 0.08, 0.1].map(wall);
+    let current_from_key = Se3::from_translation(Vector3::new(-0.1, 0.0, 0.0));
+    let mut frontend = Frontend::new();
+    let first = frontend.frame(&images, &current_from_key);
+    assert!(first.iter().all(|n| *n > 15), "every stage has work: {first:?}");
+    let before = REQUESTS.with(Cell::get);
+    let second = frontend.frame(&images, &current_from_key);
+    let requests = REQUESTS.with(Cell::get) - before;
+    assert_eq!(first, second);
+    assert_eq!(requests, 0, "requests to the allocator in a frame");
+}
