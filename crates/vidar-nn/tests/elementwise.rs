@@ -4,8 +4,8 @@ mod common;
 
 use common::{Numbers, all_computes, attend, bound, error_in_std, f32_computes, layer_norm, rope, wide};
 use vidar_nn::{
-    AttentionSpec, Corners, LayerNorm, MapRef, RopeTable, TokenRows, Weight, activation, attention,
-    attention_separate, resize_bicubic_scaled, resize_bilinear,
+    AttentionSpec, Corners, KeyValues, LayerNorm, MapRef, RopeTable, TokenRows, Weight, activation,
+    attention, attention_separate, resize_bicubic_scaled, resize_bilinear,
 };
 
 #[test]
@@ -224,4 +224,32 @@ fn bicubic_resampling_takes_its_scales_from_the_caller() {
     resize_bicubic_scaled(MapRef::new(&x, h, w), c, oh, ow, scales, &mut out);
     let error = error_in_std(&out, &expected);
     assert!(error < 3e-5, "{error:e}");
+}
+
+#[test]
+fn pushing_views_one_by_one_equals_one_long_sequence() {
+    const D: usize = 48;
+    let (views, tokens) = (3, 77); // views that do not end with a block of keys
+    let mut numbers = Numbers(32);
+    let qkv = numbers.vec(views * tokens * 3 * D);
+    let norm = LayerNorm::new(numbers.weight(&[24]), numbers.weight(&[24]), 1e-5).unwrap();
+    let positions: Vec<[f32; 2]> = (0..tokens).map(|t| [if t == 0 { 0.0 } else { 1.0 }; 2]).collect();
+    let rope = RopeTable::new(&positions, 24, 100.0);
+    let spec = AttentionSpec { heads: 2, head_dim: 24, qk_norm: Some((&norm, &norm)), rope: Some(&rope) };
+    for c in all_computes() {
+        let mut whole = vec![0.0; views * tokens * D];
+        attention(&c, &qkv, 1, views * tokens, &spec, &mut whole);
+        let mut store = KeyValues::new(&c, &spec, views * tokens);
+        for view in qkv.chunks_exact(tokens * 3 * D) {
+            let [_, k, v] = TokenRows::split_qkv(view, D);
+            store.push(&spec, k, v);
+        }
+        assert_eq!(store.tokens(), views * tokens);
+        for (view, whole) in qkv.chunks_exact(tokens * 3 * D).zip(whole.chunks_exact(tokens * D)) {
+            let [q, _, _] = TokenRows::split_qkv(view, D);
+            let mut out = vec![0.0; tokens * D];
+            store.attend(&spec, q, &mut out);
+            assert_eq!(out, whole, "{c:?}");
+        }
+    }
 }
