@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Fuses the same depth frames with vidar-fusion and with Open3D, in turns, and compares time and result.
 
-Needs: pip install open3d-cpu==0.19.0 numpy scipy pillow
+Needs: pip install open3d-cpu==0.19.0 numpy pillow
 (the ScalableTSDFVolume of the 0.20.0 wheel returns empty meshes, which this script reports).
 
   cargo build --release -p vidar-fusion --example fuse_folder
@@ -10,8 +10,9 @@ Needs: pip install open3d-cpu==0.19.0 numpy scipy pillow
 Every tool gets the same frames in memory, two threads, the same voxel, truncation and range, and no minimal
 number of views, and ours no limit of the viewing angle; reading files is not timed. Rounds alternate between the
 tools; medians over rounds of the median frame (of the mean frame for processor time) are given.
-Quality: distances between the vertices of the meshes, both ways, and how many vertices of each mesh any frame
-supports: a vertex is supported when some frame measured a depth within one voxel of the vertex's own z.
+Quality: distances from the vertices of one mesh to the triangles of the other, both ways (vertices lie on the edges
+of the voxel lattice, and that of ScalableTSDFVolume is half a voxel beside the others', so distances between vertices
+would measure the lattices), and how many vertices of each mesh any frame supports: a vertex is supported when some frame measured a depth within one voxel of the vertex's own z.
 """
 import argparse
 import glob
@@ -30,7 +31,6 @@ os.environ["OMP_WAIT_POLICY"] = "passive"  # so that processor time counts work,
 import numpy as np  # noqa: E402
 import open3d as o3d  # noqa: E402
 from PIL import Image  # noqa: E402
-from scipy.spatial import cKDTree  # noqa: E402
 
 FOCAL, CX, CY, WIDTH, HEIGHT = 585.0, 320.0, 240.0, 640, 480
 VOXEL, TRUNC_VOXELS, MAX_DEPTH = 0.02, 4.0, 6.0
@@ -63,7 +63,8 @@ def scalable(frames, color):
         cpu.append(1e3 * (time.process_time() - used))
     start = time.perf_counter()
     mesh = volume.extract_triangle_mesh()
-    return np.median(ms), np.mean(cpu), 1e3 * (time.perf_counter() - start), np.asarray(mesh.vertices)
+    return np.median(ms), np.mean(cpu), 1e3 * (time.perf_counter() - start), (
+        np.asarray(mesh.vertices, np.float32), np.asarray(mesh.triangles, np.uint32))
 
 
 def voxel_block_grid(frames, color):
@@ -89,22 +90,31 @@ def voxel_block_grid(frames, color):
         cpu.append(1e3 * (time.process_time() - used))
     start = time.perf_counter()
     mesh = grid.extract_triangle_mesh(0.5)
-    return np.median(ms), np.mean(cpu), 1e3 * (time.perf_counter() - start), mesh.vertex.positions.numpy()
+    return np.median(ms), np.mean(cpu), 1e3 * (time.perf_counter() - start), (
+        mesh.vertex.positions.numpy(), mesh.triangle.indices.numpy().astype(np.uint32))
 
 
 def ours(binary, folder, count, color, extra):
-    with tempfile.NamedTemporaryFile() as cloud:
+    with tempfile.NamedTemporaryFile() as cloud, tempfile.NamedTemporaryFile() as faces:
         command = [binary, folder, "--voxel", str(VOXEL), "--trunc", str(TRUNC_VOXELS), "--max-depth", str(MAX_DEPTH),
-                   "--frames", str(count), "--cloud", cloud.name, "--points", str(count), *extra] + (["--color"] if color else [])
+                   "--frames", str(count), "--cloud", cloud.name, "--triangles", faces.name, "--points", str(count), *extra] + (["--color"] if color else [])
         out = subprocess.run(command, env={**os.environ, "RAYON_NUM_THREADS": THREADS}, check=True,
                              capture_output=True, text=True).stdout
         result = json.loads(out)
-        return result["ms_per_frame"], result["cpu_ms_per_frame"], result["extract_ms"], np.fromfile(cloud.name, "<f4").reshape(-1, 3), result
+        return result["ms_per_frame"], result["cpu_ms_per_frame"], result["extract_ms"], (
+            np.fromfile(cloud.name, "<f4").reshape(-1, 3), np.fromfile(faces.name, "<u4").reshape(-1, 3)), result
+
+
+def distances(points, mesh):
+    """From each point to the surface of the mesh, metres."""
+    scene = o3d.t.geometry.RaycastingScene()
+    scene.add_triangles(*(o3d.core.Tensor(np.ascontiguousarray(part)) for part in mesh))
+    return scene.compute_distance(o3d.core.Tensor(np.ascontiguousarray(points, np.float32))).numpy()
 
 
 def closeness(a, b):
-    """Median and mean distance (mm) from a to b, and the share of a within one voxel of b."""
-    distance, _ = cKDTree(b).query(a, workers=2)
+    """Median and mean distance (mm) from the vertices of a to the surface of b, and the share within one voxel."""
+    distance = distances(a[0], b)
     return 1e3 * np.median(distance), 1e3 * np.mean(distance), np.mean(distance < VOXEL)
 
 
@@ -121,21 +131,21 @@ def views_in_support(vertices, frames):
     return views
 
 
-def support_lines(clouds, ours_by_setting, frames):
+def support_lines(meshes, ours_by_setting, frames):
     """What share of each mesh is supported, and what ours covers of the supported part of theirs."""
     lines = ["| mesh | vertices | supported by a frame | by three frames | covers of VoxelBlockGrid | of its part "
              "supported by one frame | by three |", "|---|---|---|---|---|---|---|"]
-    theirs = clouds["Open3D VoxelBlockGrid"]
+    theirs = meshes["Open3D VoxelBlockGrid"][0]
     support = views_in_support(theirs, frames)
-    for name, cloud in {**clouds, **ours_by_setting}.items():
-        if len(cloud) == 0:
+    for name, mesh in {**meshes, **ours_by_setting}.items():
+        if len(mesh[0]) == 0:
             continue
-        own = views_in_support(cloud, frames)
-        covered = cKDTree(cloud).query(theirs, workers=2)[0] < VOXEL
-        lines.append(f"| {name} | {len(cloud)} | {100 * np.mean(own > 0):.1f} % | {100 * np.mean(own > 2):.1f} % "
+        own = views_in_support(mesh[0], frames)
+        covered = distances(theirs, mesh) < VOXEL
+        lines.append(f"| {name} | {len(mesh[0])} | {100 * np.mean(own > 0):.1f} % | {100 * np.mean(own > 2):.1f} % "
                      f"| {100 * np.mean(covered):.1f} % | {100 * np.mean(covered[support > 0]):.1f} % "
                      f"| {100 * np.mean(covered[support > 2]):.1f} % |")
-    missed = cKDTree(clouds["vidar-fusion"]).query(theirs, workers=2)[0] >= VOXEL
+    missed = distances(theirs, meshes["vidar-fusion"]) >= VOXEL
     lines += ["", f"Of the vertices of VoxelBlockGrid that ours lacks at equal settings, "
               f"{100 * np.mean(support[missed] == 0):.0f} % are supported by no frame at all "
               f"({100 * np.mean(support[~missed] == 0):.0f} % of the others)."]
@@ -165,26 +175,26 @@ def main():
             "Open3D ScalableTSDFVolume": lambda: scalable(frames, color),
         }
         times = {name: [] for name in tools}
-        clouds, details = {}, {}
+        meshes, details = {}, {}
         for _ in range(args.rounds):
             for name, run in tools.items():
                 result = run()
                 times[name].append(result[:3])
-                clouds[name] = result[3]
+                meshes[name] = result[3]
                 details[name] = result[4] if len(result) > 4 else {}
         base = np.median(times["vidar-fusion"], axis=0)
         for name in tools:
             t = np.median(times[name], axis=0)
             label = f"{name}, {'colour' if color else 'depth only'}"
-            if len(clouds[name]) == 0:
+            if len(meshes[name][0]) == 0:
                 lines.append(f"| {label} | empty mesh: broken in this Open3D | | | | | | 0 |")
                 continue
             lines.append(f"| {label} | {t[0]:.2f} | {t[0] / base[0]:.1f}× | {t[1]:.2f} | {t[1] / base[1]:.1f}× "
                          f"| {t[2]:.1f} | {t[2] / base[2]:.1f}× "
-                         f"| {len(clouds[name])} |")
+                         f"| {len(meshes[name][0])} |")
             if not color and name.startswith("Open3D"):
-                there = closeness(clouds["vidar-fusion"], clouds[name])
-                back = closeness(clouds[name], clouds["vidar-fusion"])
+                there = closeness(meshes["vidar-fusion"], meshes[name])
+                back = closeness(meshes[name], meshes["vidar-fusion"])
                 quality.append(f"- to {name}: median {there[0]:.2f} mm, mean {there[1]:.2f} mm, {100 * there[2]:.1f} % "
                                f"within a voxel; back: median {back[0]:.2f} mm, mean {back[1]:.2f} mm, "
                                f"{100 * back[2]:.1f} % (the share of theirs that ours covers)")
@@ -195,12 +205,12 @@ def main():
                        "processor time")
         if not color:
             settings = [("80", "1"), ("90", "2"), ("80", "2")]
-            support = support_lines(clouds, {
+            support = support_lines(meshes, {
                 f"vidar-fusion, {angle}°, {views} view(s)": ours(
                     args.binary, args.folder, args.frames, False, ["--max-incidence", angle, "--min-views", views])[3]
                 for angle, views in settings}, frames)
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    text = "\n".join(lines + ["", "Vertices of our mesh (depth only):", *quality, "",
+    text = "\n".join(lines + ["", "Vertices of our mesh (depth only) to the surface of theirs, and back:", *quality, "",
                               "Support by the frames themselves (depth only):", "", *support]) + "\n"
     print(text)
     print(f"peak memory of this Python process {peak:.0f} MiB", file=sys.stderr)

@@ -1,7 +1,8 @@
 //! Fuses a 7-Scenes sequence and prints what it took, as one JSON line: the counterpart of `bench/fusion_vs_open3d.py`.
 //!
 //! `fuse_folder SEQUENCE_DIR [--voxel M] [--trunc VOXELS] [--max-depth M] [--carve M] [--min-views N] [--frames N]
-//! [--color] [--points FRAMES] [--cloud OUT.bin]`; the cloud is written as little-endian f32 x, y, z.
+//! [--color] [--points FRAMES] [--cloud OUT.bin] [--triangles OUT.bin]`; the mesh's vertices are written as
+//! little-endian f32 x, y, z, its triangles as three u32 each.
 
 use std::collections::HashMap;
 use std::error::Error;
@@ -78,15 +79,19 @@ fn main() -> Result<(), Box<dyn Error>> {
         let bytes: Vec<u8> = mesh.positions.iter().flatten().flat_map(|v| v.to_le_bytes()).collect();
         std::fs::write(path, bytes)?;
     }
+    if let Some(path) = options.get("--triangles") {
+        let bytes: Vec<u8> = mesh.triangles.iter().flatten().flat_map(|v| v.to_le_bytes()).collect();
+        std::fs::write(path, bytes)?;
+    }
     Ok(())
 }
 
-/// Processor time of all threads so far, in steps of 10 ms; 0 where `/proc` does not tell.
+/// Processor time of all threads so far; 0 where `/proc` does not tell.
 fn cpu_ms() -> f64 {
-    let stat = std::fs::read_to_string("/proc/self/stat").unwrap_or_default();
-    // Fields 14 and 15, in ticks of 1/100 s; the name in field 2 may hold spaces and ends with the last ')'.
-    let after_name = stat.rsplit(')').next().unwrap_or_default();
-    after_name.split_whitespace().skip(11).take(2).filter_map(|t| t.parse::<f64>().ok()).sum::<f64>() * 10.0
+    let tasks = std::fs::read_dir("/proc/self/task").into_iter().flatten().flatten();
+    let stats = tasks.filter_map(|task| std::fs::read_to_string(task.path().join("schedstat")).ok());
+    // The first number is the time on a processor, in nanoseconds.
+    stats.filter_map(|stat| stat.split_whitespace().next()?.parse::<f64>().ok()).sum::<f64>() * 1e-6
 }
 
 fn arguments() -> (PathBuf, HashMap<String, String>) {

@@ -68,7 +68,9 @@ impl Block {
     }
 
     pub fn add_color(&mut self) {
-        self.color.get_or_insert_with(|| Box::new([[[0; EDGE]; 4]; ROWS]));
+        // From a list, so that the zeros come with the memory and are not written to it.
+        let zeros = || vec![[[0; EDGE]; 4]; ROWS].into_boxed_slice().try_into();
+        self.color = self.color.take().or_else(|| zeros().ok());
     }
 
     /// To be called before each view that is added, so that the 32-bit sums of the rows cannot overflow.

@@ -214,7 +214,7 @@ impl<'a> Placer<'a> {
         let dv = y as f32 - self.k[3];
         for x in 0..n {
             let z = samples[x].depth;
-            let du = x as f32 - self.k[2];
+            let du = x as i32 as f32 - self.k[2];
             let gx = slope(before[x], here[x], after[x], per_step);
             let gy = slope(above[x], here[x], below[x], per_step);
             let normal = camera_normal(&self.k, du, dv, z, gx, gy);

@@ -91,6 +91,9 @@ pub(crate) struct SampledView {
     pub width: usize,
     pub height: usize,
     pub samples: Vec<Sample>,
+    /// Red, green and blue of each pixel, and one byte more, so that any pixel can be read as four bytes. Empty for
+    /// a view without colour.
+    pub colors: Vec<u8>,
     pub tiles: Vec<Tile>,
     pub tile_columns: usize,
     pub pixels_used: u64,
@@ -112,12 +115,24 @@ impl SampledView {
             }
             dispatch!(weigher.fill_tiles(tile_row, samples, tiles));
         });
+        self.fill_colors(view);
         self.pixels_used = self.tiles.iter().map(|t| u64::from(t.usable)).sum();
+    }
+
+    /// Copies the colours. Blocks look them up in no order that the processor could foresee, and waited for the
+    /// memory at each; read once from front to back here, they are in its cache by then.
+    fn fill_colors(&mut self, view: &AlignedView) {
+        let bytes = view.color().map_or(&[][..], |c| c.data().as_flattened());
+        self.colors.resize(if bytes.is_empty() { 0 } else { bytes.len() + 1 }, 0);
+        let chunk = 16 * TILE * self.width * 3;
+        (self.colors.par_chunks_mut(chunk).zip(bytes.par_chunks(chunk)))
+            .for_each(|(into, from)| into[..from.len()].copy_from_slice(from));
     }
 
     /// Bytes held while the view is integrated.
     pub fn scratch_bytes(&self) -> u64 {
-        (self.samples.len() * size_of::<Sample>() + self.tiles.len() * size_of::<Tile>()) as u64
+        (self.samples.len() * size_of::<Sample>() + self.colors.len() + self.tiles.len() * size_of::<Tile>())
+            as u64
     }
 }
 
@@ -222,7 +237,7 @@ impl<'a> Weigher<'a> {
         let (confidence, out) = (&confidence[first..][..n], &mut out[first..][..n]);
         for i in 0..n {
             let line = [before[i], here[i], after[i]];
-            out[i] = self.sample((first + i) as f32, y, line, [above[i], below[i]], confidence[i]);
+            out[i] = self.sample((first + i) as i32 as f32, y, line, [above[i], below[i]], confidence[i]);
         }
     }
 

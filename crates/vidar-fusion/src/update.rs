@@ -21,7 +21,8 @@ pub(crate) const NEAR_M: f32 = 1e-3;
 /// One view, ready to be added to blocks.
 pub(crate) struct BlockUpdate<'a> {
     pub samples: &'a [Sample],
-    pub colors: Option<&'a [[u8; 3]]>,
+    /// As [`SampledView::colors`](crate::sample::SampledView::colors).
+    pub colors: Option<&'a [u8]>,
     pub width: usize,
     pub height: usize,
     /// fx, fy, cx, cy.
@@ -100,7 +101,7 @@ impl BlockUpdate<'_> {
         }
         if let (Some(sums), Some(colors)) = (color, self.colors) {
             for i in (0..EDGE).filter(|&i| near[i] != 0) {
-                let (rgb, confidence) = (colors[pixel[i] as usize], packed[i] >> 16);
+                let (rgb, confidence) = (&colors[pixel[i] as usize * 3..][..3], packed[i] >> 16);
                 for c in 0..3 {
                     sums[c][i] += u32::from(rgb[c]) * confidence;
                 }
@@ -169,8 +170,7 @@ mod tests {
                     }
                 })
                 .collect();
-            let colors: Vec<[u8; 3]> =
-                (0..width * height).map(|_| [0; 3].map(|_: u8| (next() * 255.0) as u8)).collect();
+            let colors: Vec<u8> = (0..width * height * 3 + 1).map(|_| (next() * 255.0) as u8).collect();
             for round in 0..400 {
                 let mut steps = [[0.0; 3]; 3];
                 steps.iter_mut().flatten().for_each(|s| *s = (next() - 0.5) * 0.08);

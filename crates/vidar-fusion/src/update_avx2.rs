@@ -8,11 +8,11 @@ use crate::sample::{ROUND, Sample};
 use crate::update::{BlockUpdate, NEAR_M};
 use std::arch::x86_64::*;
 
-/// Whether the view's buffers hold a whole gather: indices are 32 bits, and a colour is read as four bytes.
+/// Whether the gathers' indices, of 32 bits, reach all of the view's buffers and no further.
 pub(crate) fn can_add(update: &BlockUpdate<'_>) -> bool {
     let pixels = update.samples.len();
     let fits = |items: usize| (2..=i32::MAX as usize / size_of::<Sample>()).contains(&items);
-    fits(pixels) && update.colors.is_none_or(|colors| colors.len() == pixels)
+    fits(pixels) && update.colors.is_none_or(|colors| colors.len() == 3 * pixels + 1)
 }
 
 /// What is the same for all rows, in vectors.
@@ -49,21 +49,78 @@ pub(crate) fn add_rows(update: &BlockUpdate<'_>, block: &mut Block, origin: [f32
         per_fade: _mm256_set1_ps(1.0 / (update.truncation_m - update.voxel_m)),
     };
     let mut colors = block.color.as_deref_mut();
-    for (at, row) in block.rows.iter_mut().enumerate() {
-        let start = update.row_start(at, origin);
-        add_row(update, &constants, row, colors.as_mut().map(|c| &mut c[at]), start);
+    for layer in 0..EDGE {
+        // What the rows see first, then what follows from it: a wrong guess at a branch of `add_row` throws away the
+        // work begun behind it, which would be the loads of the next rows. Their sums come closer meanwhile.
+        let mut seen = [Seen::NOTHING; EDGE];
+        for (y, seen) in seen.iter_mut().enumerate() {
+            let at = layer * EDGE + y;
+            prefetch(&block.rows[at]);
+            if let Some(colors) = &colors {
+                prefetch(&colors[at]);
+            }
+            *seen = look(update, &constants, update.row_start(at, origin));
+        }
+        for (y, seen) in seen.iter().enumerate() {
+            let at = layer * EDGE + y;
+            let row = &mut block.rows[at];
+            add_row(update, &constants, row, colors.as_mut().map(|c| &mut c[at]), seen);
+        }
     }
+}
+
+/// What the eight nodes of a row see.
+#[derive(Clone, Copy)]
+struct Seen {
+    /// Pixel of each node; not in the image where `packed` is 0.
+    pixel: __m256i,
+    /// Depth of the pixel minus z of the node.
+    distance: __m256,
+    /// Weight and confidence of the pixel.
+    packed: __m256i,
+}
+
+impl Seen {
+    const NOTHING: Self = {
+        // SAFETY: vectors are numbers for which all bits are valid.
+        unsafe { std::mem::zeroed() }
+    };
+}
+
+/// The samples at four pixels, each in 64 bits; 0 where not `inside`.
+///
+/// Loads, not gathers: those are many small steps on AMD and slowed down by a security patch on Intel.
+#[inline]
+#[target_feature(enable = "avx2")]
+fn samples_at(samples: &[Sample], pixel: __m128i, inside: __m128i) -> __m256i {
+    const { assert!(size_of::<Sample>() == size_of::<u64>()) };
+    let pixel = _mm_and_si128(pixel, inside);
+    let load = |two_pixels: i64| {
+        let [one, other] = [two_pixels as u32, (two_pixels as u64 >> 32) as u32];
+        let base = samples.as_ptr();
+        // SAFETY: a pixel is 0 or inside, so less than samples.len(), which is not 0 (`can_add`); a sample has 8 bytes.
+        let (one, other) = unsafe { (base.add(one as usize), base.add(other as usize)) };
+        // SAFETY: as above; neither access asks for alignment.
+        unsafe { _mm_loadh_pd(_mm_castsi128_pd(_mm_loadl_epi64(one.cast())), other.cast()) }
+    };
+    let first = load(_mm_cvtsi128_si64(pixel));
+    let second = load(_mm_extract_epi64::<1>(pixel));
+    let four = _mm256_castpd_si256(_mm256_set_m128d(second, first));
+    _mm256_and_si256(four, _mm256_cvtepi32_epi64(inside))
+}
+
+/// Asks for the memory of a row of sums, two lines of the cache, before it is needed.
+#[inline]
+#[target_feature(enable = "avx2")]
+fn prefetch<T>(row: &T) {
+    let first = std::ptr::from_ref(row).cast::<i8>();
+    _mm_prefetch::<_MM_HINT_T0>(first);
+    _mm_prefetch::<_MM_HINT_T0>(first.wrapping_add(64));
 }
 
 #[inline]
 #[target_feature(enable = "avx2")]
-fn add_row(
-    update: &BlockUpdate<'_>,
-    c: &Constants,
-    row: &mut Row,
-    color: Option<&mut ColorRow>,
-    start: [f32; 3],
-) {
+fn look(update: &BlockUpdate<'_>, c: &Constants, start: [f32; 3]) -> Seen {
     let [x, y, z] = [0, 1, 2].map(|a| _mm256_add_ps(_mm256_set1_ps(start[a]), c.ramp[a]));
     let per_z = _mm256_div_ps(_mm256_set1_ps(1.0), z);
     let u = _mm256_add_ps(_mm256_mul_ps(_mm256_mul_ps(c.k[0], x), per_z), c.k[2]);
@@ -80,25 +137,34 @@ fn add_row(
         _mm256_cmpgt_epi32(c.pixels, pixel),
     );
     let inside = _mm256_and_si256(inside, in_list);
-    if _mm256_testz_si256(inside, inside) != 0 {
-        return;
-    }
+    let (first, second) = (
+        samples_at(update.samples, _mm256_castsi256_si128(pixel), _mm256_castsi256_si128(inside)),
+        samples_at(
+            update.samples,
+            _mm256_extracti128_si256::<1>(pixel),
+            _mm256_extracti128_si256::<1>(inside),
+        ),
+    );
+    let (first, second) = (_mm256_castsi256_ps(first), _mm256_castsi256_ps(second));
+    // Halves of each sample side by side, within 128 bits; then in the order of nodes.
+    let depth = _mm256_castps_pd(_mm256_shuffle_ps::<0b10_00_10_00>(first, second));
+    let packed = _mm256_castps_pd(_mm256_shuffle_ps::<0b11_01_11_01>(first, second));
+    let depth = _mm256_castpd_ps(_mm256_permute4x64_pd::<0b11_01_10_00>(depth));
+    let packed = _mm256_castpd_si256(_mm256_permute4x64_pd::<0b11_01_10_00>(packed));
+    Seen { pixel, distance: _mm256_sub_ps(depth, z), packed }
+}
+
+#[inline]
+#[target_feature(enable = "avx2")]
+fn add_row(
+    update: &BlockUpdate<'_>,
+    c: &Constants,
+    row: &mut Row,
+    color: Option<&mut ColorRow>,
+    seen: &Seen,
+) {
+    let &Seen { pixel, distance, packed } = seen;
     let zero = _mm256_setzero_si256();
-    let base = update.samples.as_ptr();
-    // SAFETY: a lane is read only where 0 ≤ pixel < samples.len(); a sample is 8 bytes, repr(C), depth first, then
-    // weight and confidence.
-    let (depth, packed) = unsafe {
-        (
-            _mm256_mask_i32gather_ps::<8>(
-                _mm256_setzero_ps(),
-                base.cast::<f32>(),
-                pixel,
-                _mm256_castsi256_ps(inside),
-            ),
-            _mm256_mask_i32gather_epi32::<8>(zero, base.cast::<i32>().add(1), pixel, inside),
-        )
-    };
-    let distance = _mm256_sub_ps(depth, z);
     let one = _mm256_set1_ps(1.0);
     let fade = _mm256_mul_ps(_mm256_add_ps(distance, c.truncation), c.per_fade);
     let fade = clamp(fade, _mm256_setzero_ps(), one);
@@ -129,18 +195,13 @@ fn add_row(
 /// Adds the colours of the pixels where `near`, times their confidences.
 #[inline]
 #[target_feature(enable = "avx2")]
-fn add_colors(sums: &mut ColorRow, colors: &[[u8; 3]], pixel: __m256i, near: __m256i, confidence: __m256i) {
+fn add_colors(sums: &mut ColorRow, colors: &[u8], pixel: __m256i, near: __m256i, confidence: __m256i) {
     let at = _mm256_add_epi32(pixel, _mm256_slli_epi32::<1>(pixel));
-    // The last colour ends with the list, so it is read one byte early.
-    let last = _mm256_set1_epi32((colors.len() * 3) as i32 - 4);
-    let from = _mm256_min_epi32(at, last);
-    let late = _mm256_slli_epi32::<3>(_mm256_sub_epi32(at, from));
-    // SAFETY: a lane is read only where 0 ≤ pixel < colors.len() (`can_add` and the mask), hence from byte
-    // 0 ≤ `from` ≤ 3 · colors.len() − 4.
+    // SAFETY: a lane is read only where 0 ≤ pixel < samples.len() (the mask), hence up to byte
+    // 3 · samples.len() = colors.len() − 1 (`can_add`).
     let rgb = unsafe {
-        _mm256_mask_i32gather_epi32::<1>(_mm256_setzero_si256(), colors.as_ptr().cast::<i32>(), from, near)
+        _mm256_mask_i32gather_epi32::<1>(_mm256_setzero_si256(), colors.as_ptr().cast::<i32>(), at, near)
     };
-    let rgb = _mm256_srlv_epi32(rgb, late);
     let byte = _mm256_set1_epi32(0xff);
     let channels = [
         _mm256_and_si256(rgb, byte),

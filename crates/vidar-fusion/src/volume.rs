@@ -152,7 +152,7 @@ impl TsdfVolume {
         let k = view.intrinsics();
         let update = BlockUpdate {
             samples: &sampled.samples,
-            colors: view.color().map(|c| c.data()),
+            colors: view.color().map(|_| &sampled.colors[..]),
             width: sampled.width,
             height: sampled.height,
             k: [k.fx as f32, k.fy as f32, k.cx as f32, k.cy as f32],
