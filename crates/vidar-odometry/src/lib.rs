@@ -4,6 +4,10 @@ pub mod frontend;
 pub mod system;
 
 pub use system::{
-    DivergenceSign, ImuUse, InitCondition, InitProgress, LossReason, OdometryConfig, OdometryError, OdometryOutput, Status,
-    Tracking,
+    DivergenceSign, ImuUse, InputCounts, LossReason, Odometry, OdometryConfig, OdometryError, OdometryOutput,
+    Status, Tracking,
 };
+pub mod estimator;
+pub mod imu;
+pub mod init;
+pub mod simulate;

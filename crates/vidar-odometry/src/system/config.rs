@@ -1,6 +1,7 @@
 //! What can be tuned from outside. Everything else is a named constant with its reason beside the code.
 
 use super::error::OdometryError;
+use crate::estimator::SmootherConfig;
 use serde::{Deserialize, Serialize};
 
 /// Whether inertial readings are used.
@@ -67,6 +68,11 @@ impl Default for OdometryConfig {
 }
 
 impl OdometryConfig {
+    /// The smoother's settings.
+    pub(crate) fn smoother(&self) -> SmootherConfig {
+        SmootherConfig { max_frames: self.max_keyframes + 8, ..SmootherConfig::default() }
+    }
+
     /// Refuses values outside the ranges that the fields state, naming the key.
     pub fn validate(&self) -> Result<(), OdometryError> {
         let check = |key, found: f64, low: f64, high: f64, expected| {

@@ -1,7 +1,7 @@
 //! What the odometry refuses. A lost track is an outcome, not an error.
 
 use thiserror::Error;
-use vidar_core::{CameraId, Timestamp};
+use vidar_core::CameraId;
 
 /// Why the odometry refused its rig, its configuration or an event.
 #[derive(Clone, Debug, PartialEq, Error)]
@@ -32,22 +32,6 @@ pub enum OdometryError {
         found: f64,
         /// What can be.
         expected: &'static str,
-    },
-    /// An event lies before one that was already taken.
-    #[error("{what} at {time} s is not after the one before it at {previous} s")]
-    NotIncreasing {
-        /// Image or inertial reading.
-        what: &'static str,
-        /// Its time.
-        time: Timestamp,
-        /// The time before.
-        previous: Timestamp,
-    },
-    /// An inertial reading holds a number that is not finite.
-    #[error("inertial reading at {time} s is not finite")]
-    NotFinite {
-        /// Its time.
-        time: Timestamp,
     },
     /// An image is not of its camera's size.
     #[error("image is {found_width}x{found_height}, the camera's model is for {width}x{height}")]

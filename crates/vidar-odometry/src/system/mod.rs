@@ -1,9 +1,17 @@
 //! The odometry as a whole: events in, a state per image out.
 
+mod calibration;
 mod config;
 mod error;
+mod odometry;
 mod output;
+mod running;
+mod starting;
+mod stillness;
+mod track;
+mod tracker;
 
 pub use config::{ImuUse, OdometryConfig};
 pub use error::OdometryError;
-pub use output::{DivergenceSign, InitCondition, InitProgress, LossReason, OdometryOutput, Status, Tracking};
+pub use odometry::{InputCounts, Odometry};
+pub use output::{DivergenceSign, LossReason, OdometryOutput, Status, Tracking};

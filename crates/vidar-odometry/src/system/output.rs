@@ -1,5 +1,6 @@
 //! What the odometry says of every image.
 
+use crate::init::Refusal;
 use std::fmt;
 use vidar_core::{
     FrameId, Health, NavCovariance, NavState, OdometryKeyframe, RevisedPose, SparseLandmark, Timestamp,
@@ -20,7 +21,7 @@ pub struct OdometryOutput {
 #[derive(Clone, Debug, PartialEq)]
 pub enum Status {
     /// Not started yet; what is missing.
-    Waiting(InitProgress),
+    Waiting(Refusal),
     /// There is a state.
     Tracking(Box<Tracking>),
     /// There was one, and it cannot be kept.
@@ -67,90 +68,6 @@ pub struct Tracking {
     pub keyframe: Option<Box<OdometryKeyframe>>,
     /// Keyframes whose poses changed since the last output.
     pub revised: Vec<RevisedPose>,
-}
-
-/// What an initialisation still needs, and how far it is.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct InitProgress {
-    /// What is missing.
-    pub condition: InitCondition,
-    /// The value measured, in the condition's unit.
-    pub measured: f64,
-    /// The value needed.
-    pub needed: f64,
-}
-
-/// What an initialisation can wait for.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
-pub enum InitCondition {
-    /// Seconds of inertial readings before the image.
-    ImuData,
-    /// Corners found in the image.
-    Texture,
-    /// Features that were followed from an earlier image.
-    Tracks,
-    /// Parallax between views, degrees.
-    Parallax,
-    /// Frames with a visual reconstruction.
-    VisualFrames,
-    /// Change of the velocity over the window, m/s²: what makes a scale observable.
-    Excitation,
-    /// Standard deviation of ln(scale), which must fall below the value.
-    ScaleStd,
-    /// Factor between successive scale estimates, which must fall below the value.
-    ScaleAgreement,
-    /// Error of the inertial fit per degree of freedom, which must fall below the value.
-    InertialFit,
-}
-
-impl InitCondition {
-    /// The word as it stands in files.
-    pub fn word(self) -> &'static str {
-        match self {
-            Self::ImuData => "imu-data",
-            Self::Texture => "texture",
-            Self::Tracks => "tracks",
-            Self::Parallax => "parallax",
-            Self::VisualFrames => "visual-frames",
-            Self::Excitation => "excitation",
-            Self::ScaleStd => "scale-std",
-            Self::ScaleAgreement => "scale-agreement",
-            Self::InertialFit => "inertial-fit",
-        }
-    }
-}
-
-impl fmt::Display for InitProgress {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let (m, n) = (self.measured, self.needed);
-        match self.condition {
-            InitCondition::ImuData => write!(f, "{m:.2} s of IMU data < {n:.2} s: wait"),
-            InitCondition::Texture => write!(f, "{m:.0} corners < {n:.0}: turn to a textured surface"),
-            InitCondition::Tracks => write!(f, "{m:.0} tracks < {n:.0}: move more slowly or add light"),
-            InitCondition::Parallax => write!(f, "parallax {m:.1}° < {n:.1}°: move sideways"),
-            InitCondition::VisualFrames => write!(f, "{m:.0} frames reconstructed < {n:.0}: keep moving"),
-            InitCondition::Excitation => {
-                write!(f, "acceleration changes by {m:.2} m/s² < {n:.2} m/s²: speed up and slow down")
-            }
-            InitCondition::ScaleStd => {
-                write!(
-                    f,
-                    "scale known to {:.0} % > {:.0} %: move sideways and vary the speed",
-                    100.0 * m,
-                    100.0 * n
-                )
-            }
-            InitCondition::ScaleAgreement => {
-                write!(f, "two scale estimates differ by a factor {m:.2} > {n:.2}: keep moving")
-            }
-            InitCondition::InertialFit => {
-                write!(
-                    f,
-                    "inertial fit {m:.1} > {n:.1} per degree of freedom: check extrinsics and time offset"
-                )
-            }
-        }
-    }
 }
 
 /// Why a state was given up.
@@ -221,14 +138,6 @@ impl fmt::Display for LossReason {
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn waiting_says_what_is_missing_how_much_and_what_to_do() {
-        let progress = InitProgress { condition: InitCondition::Parallax, measured: 0.41, needed: 1.0 };
-        assert_eq!(progress.to_string(), "parallax 0.4° < 1.0°: move sideways");
-        let progress = InitProgress { condition: InitCondition::ScaleStd, measured: 0.4, needed: 0.15 };
-        assert_eq!(progress.to_string(), "scale known to 40 % > 15 %: move sideways and vary the speed");
-    }
 
     #[test]
     fn a_loss_names_its_reason_with_values() {

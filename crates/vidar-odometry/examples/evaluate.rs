@@ -1,0 +1,192 @@
+//! Runs the odometry over recorded or rendered sequences and prints a row of figures per sequence.
+//!
+//! ```text
+//! cargo run --release -p vidar-odometry --example evaluate -- [--mono] [--start S] [--secs S] [--quiet]
+//!     [--trajectory FILE] SEQUENCE...
+//! ```
+//!
+//! A sequence is any folder with images, IMU readings and ground truth that `vidar-dataset` reads. Figures: ATE after the best
+//! rigid motion and after the best similarity, |ln s|, relative error per metre, share of frames with a pose, seconds
+//! from the first image to the first metric pose, time per image on one core (decoding left out), peak memory.
+
+use std::path::{Path, PathBuf};
+use std::time::Instant;
+use vidar_core::{BodyFrame, Duration, Health, SensorEvent, StampedPose, Trajectory};
+use vidar_dataset::OpenOptions;
+use vidar_eval::{TrajectoryEvalConfig, evaluate_trajectory};
+use vidar_odometry::{ImuUse, Odometry, OdometryConfig, OdometryOutput, Status};
+
+type Failure = Box<dyn std::error::Error>;
+
+#[derive(Default)]
+struct Options {
+    sequences: Vec<PathBuf>,
+    mono: bool,
+    start_secs: f64,
+    secs: Option<f64>,
+    verbose: bool,
+    trajectory: Option<PathBuf>,
+}
+
+fn options() -> Result<Options, Failure> {
+    let mut found = Options::default();
+    let mut args = std::env::args().skip(1);
+    while let Some(arg) = args.next() {
+        let mut value = || args.next().ok_or(format!("{arg} needs a value"));
+        match arg.as_str() {
+            "--mono" => found.mono = true,
+            "--verbose" => found.verbose = true,
+            "--start" => found.start_secs = value()?.parse()?,
+            "--secs" => found.secs = Some(value()?.parse()?),
+            "--trajectory" => found.trajectory = Some(value()?.into()),
+            other if other.starts_with("--") => return Err(format!("unknown flag {other}").into()),
+            path => found.sequences.push(path.into()),
+        }
+    }
+    if found.sequences.is_empty() { Err("no sequence was named".into()) } else { Ok(found) }
+}
+
+fn main() -> Result<(), Failure> {
+    let options = options()?;
+    println!(
+        "{:<14} {:>7} {:>7} {:>7} {:>7} {:>8} {:>6} {:>6} {:>6} {:>6} {:>6} {:>6}",
+        "sequence",
+        "SE3 m",
+        "Sim3 m",
+        "|ln s|",
+        "rot deg",
+        "RPE m/m",
+        "done %",
+        "first",
+        "ms med",
+        "ms p95",
+        "MB",
+        "path m"
+    );
+    for path in &options.sequences {
+        evaluate(path, &options)?;
+    }
+    Ok(())
+}
+
+/// Everything that one run left behind.
+struct Run {
+    outputs: Vec<OdometryOutput>,
+    millis: Vec<f64>,
+    poses: Vec<StampedPose>,
+}
+
+fn evaluate(path: &Path, options: &Options) -> Result<(), Failure> {
+    let open = OpenOptions {
+        start: (options.start_secs > 0.0).then(|| Duration::from_secs_f64(options.start_secs)),
+        end: options.secs.map(|s| Duration::from_secs_f64(options.start_secs + s)),
+        ..OpenOptions::default()
+    };
+    let dataset = vidar_dataset::open(path, &open)?;
+    let name =
+        path.file_name().map_or_else(|| path.display().to_string(), |n| n.to_string_lossy().into_owned());
+    let run = run(&dataset, options)?;
+    if options.verbose {
+        tell(&run);
+    }
+    let Some(first_image) = dataset.images.first().map(|i| i.time) else { return Err("no images".into()) };
+    if run.poses.len() < 3 {
+        println!("{name:<14} no trajectory: {} poses", run.poses.len());
+        return Ok(());
+    }
+    let first_secs = (run.poses[0].time - first_image).as_secs_f64();
+    let done = 100.0 * run.poses.len() as f64 / dataset.images.len() as f64;
+    let estimate = Trajectory::new(BodyFrame::Imu, run.poses)?;
+    if let Some(file) = &options.trajectory {
+        std::fs::write(file, tum(&estimate))?;
+    }
+    let truth = dataset.ground_truth.as_ref().ok_or("no ground truth")?;
+    let report = evaluate_trajectory(&estimate, truth, &TrajectoryEvalConfig::default())?;
+    let mut millis = run.millis;
+    millis.sort_by(f64::total_cmp);
+    let percentile = |share: f64| millis[((millis.len() - 1) as f64 * share) as usize];
+    let or_nan = |v: Option<f64>| v.unwrap_or(f64::NAN);
+    println!(
+        "{name:<14} {:>7.4} {:>7.4} {:>7.4} {:>7.2} {:>8.4} {done:>6.1} {first_secs:>6.2} {:>6.2} {:>6.2} {:>6.0} {:>6.1}",
+        or_nan(report.ate_se3_m.map(|e| e.rmse)),
+        or_nan(report.ate_sim3_m.map(|e| e.rmse)),
+        or_nan(report.scale_error),
+        or_nan(report.orientation_se3_deg.map(|e| e.rmse)),
+        or_nan(report.rpe_metres.map(|e| e.translation_m.rmse)),
+        percentile(0.5),
+        percentile(0.95),
+        peak_megabytes(),
+        report.matched_truth_path_m,
+    );
+    Ok(())
+}
+
+fn run(dataset: &vidar_dataset::Dataset, options: &Options) -> Result<Run, Failure> {
+    let imu = if options.mono { ImuUse::Off } else { ImuUse::Auto };
+    let config = OdometryConfig { imu, ..OdometryConfig::default() };
+    let mut odometry = Odometry::new(&dataset.rig, dataset.camera, &config)?;
+    let mut run = Run { outputs: Vec::new(), millis: Vec::new(), poses: Vec::new() };
+    let mut since_image = 0.0;
+    for event in dataset.events() {
+        let event = event?;
+        if matches!(event, SensorEvent::GroundTruth { .. } | SensorEvent::Depth { .. }) {
+            continue;
+        }
+        let clock = Instant::now();
+        let output = odometry.push(event)?;
+        since_image += clock.elapsed().as_secs_f64();
+        if let Some(output) = output {
+            run.millis.push(1e3 * since_image);
+            since_image = 0.0;
+            keep(&mut run, output, options.mono);
+        }
+    }
+    for output in odometry.finish() {
+        keep(&mut run, output, options.mono);
+    }
+    Ok(run)
+}
+
+fn keep(run: &mut Run, output: OdometryOutput, mono: bool) {
+    if let Some(tracking) = output.tracking() {
+        if mono || tracking.health != Health::ScaleUnknown {
+            run.poses
+                .push(StampedPose { time: output.time, world_from_body: tracking.state.world_from_body });
+        }
+    }
+    run.outputs.push(output);
+}
+
+/// Says when things changed.
+fn tell(run: &Run) {
+    let mut last = String::new();
+    for output in &run.outputs {
+        let now = match &output.status {
+            Status::Waiting(progress) => format!("waiting: {progress}"),
+            Status::Tracking(tracking) => format!("tracking: {}", tracking.health),
+            Status::Lost(reason) => format!("lost: {reason}"),
+        };
+        if now != last {
+            eprintln!("  {} frame {}: {now}", output.time, output.frame_id);
+            last = now;
+        }
+    }
+}
+
+fn tum(trajectory: &Trajectory) -> String {
+    use std::fmt::Write as _;
+    let mut text = String::new();
+    for pose in trajectory.poses() {
+        let (t, q) = (pose.world_from_body.translation, pose.world_from_body.rotation.quaternion_xyzw());
+        let _ = writeln!(text, "{} {} {} {} {} {} {} {}", pose.time, t.x, t.y, t.z, q[0], q[1], q[2], q[3]);
+    }
+    text
+}
+
+/// Peak resident memory of this process; NaN where the system does not tell.
+fn peak_megabytes() -> f64 {
+    let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
+    let line = status.lines().find_map(|l| l.strip_prefix("VmHWM:"));
+    let kilobytes = line.and_then(|l| l.trim().trim_end_matches("kB").trim().parse::<f64>().ok());
+    kilobytes.map_or(f64::NAN, |kb| kb / 1024.0)
+}

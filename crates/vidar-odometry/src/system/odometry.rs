@@ -1,0 +1,313 @@
+//! Events in, one output per image.
+
+use super::config::{ImuUse, OdometryConfig};
+use super::error::OdometryError;
+use super::output::{LossReason, OdometryOutput, Status, Tracking};
+use super::running::{Running, Shot, Step};
+use super::starting::{Found, STILL_SECS, Starting, UNKNOWN_INVERSE};
+use super::stillness::ImuSpread;
+use super::track::HostImage;
+use super::tracker::Tracker;
+use crate::estimator::{Smoother, SmootherError};
+use crate::frontend::{FrontendConfig, Pyramid};
+use crate::imu::{Bias, ImuBuffer, ImuModel, Preintegration};
+use crate::init::{Obstacle, Refusal, RestConfig, rest};
+use nalgebra::Vector3;
+use std::collections::VecDeque;
+use std::rc::Rc;
+use vidar_core::{
+    CameraId, Duration, Frame, FrameId, Health, ImuSample, NavState, Rig, RigCamera, SensorEvent, Timestamp,
+};
+
+/// Images that may wait for readings of their time.
+const MAX_PENDING: usize = 40;
+
+/// Noise of images that the front end reckons with, grey levels.
+const IMAGE_NOISE_GRAY: f64 = 3.0;
+
+/// What was not used, counted.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct InputCounts {
+    /// Images taken.
+    pub images: usize,
+    /// Inertial readings taken.
+    pub readings: usize,
+    /// Images left out because their time did not advance.
+    pub images_out_of_order: usize,
+    /// Readings left out because their time did not advance or they were not finite.
+    pub readings_refused: usize,
+    /// Images that were the same as the one before, pixel by pixel.
+    pub images_repeated: usize,
+    /// Stretches without readings, longer than the rate explains.
+    pub imu_gaps: usize,
+}
+
+#[derive(Debug)]
+enum Phase {
+    Starting(Box<Starting>),
+    Running(Box<Running>),
+}
+
+/// Visual-inertial odometry of one camera and one IMU.
+#[derive(Debug)]
+pub struct Odometry {
+    config: OdometryConfig,
+    frontend: FrontendConfig,
+    camera_id: CameraId,
+    camera: RigCamera,
+    imu_model: Option<ImuModel>,
+    imu: ImuBuffer,
+    pending: VecDeque<Frame>,
+    phase: Phase,
+    counts: InputCounts,
+    last_image: Option<Timestamp>,
+    /// Time, in the IMU's clock, of the newest frame that the phase knows.
+    last_frame: Option<Timestamp>,
+    next_frame: u32,
+    segment: u32,
+    interval: Vec<ImuSample>,
+}
+
+impl Odometry {
+    /// An odometry for camera `camera` of `rig`.
+    ///
+    /// # Errors
+    /// A setting outside its range, a camera or IMU that the rig lacks, a calibration that cannot be true.
+    pub fn new(rig: &Rig, camera: CameraId, config: &OdometryConfig) -> Result<Self, OdometryError> {
+        config.validate()?;
+        let rig_camera = rig.camera(camera).ok_or(OdometryError::NoSuchCamera(camera))?.clone();
+        let noise = match config.imu {
+            ImuUse::Off => None,
+            ImuUse::Auto => rig.imu,
+            ImuUse::Required => Some(rig.imu.ok_or(OdometryError::NoImu)?),
+        };
+        super::calibration::check(&rig_camera)?;
+        let imu_model =
+            noise.map(|n| ImuModel::from_data_sheet(&n, config.gyro_noise_factor, config.accel_noise_factor));
+        let frontend = FrontendConfig::default();
+        let phase = Phase::Starting(Box::new(starting(config, &rig_camera, &frontend)));
+        Ok(Self {
+            config: config.clone(),
+            frontend,
+            camera_id: camera,
+            camera: rig_camera,
+            imu_model,
+            imu: ImuBuffer::new(noise.map_or(200.0, |n| n.rate_hz)),
+            pending: VecDeque::new(),
+            phase,
+            counts: InputCounts::default(),
+            last_image: None,
+            last_frame: None,
+            next_frame: 0,
+            segment: 0,
+            interval: Vec::new(),
+        })
+    }
+
+    /// Takes an event; says what is known after the oldest image that waited for it, if any did.
+    ///
+    /// An image is worked on when readings past its time have come, so the output may belong to an earlier image.
+    /// Events of other cameras, depth and ground truth are ignored. What is out of order or not finite is counted
+    /// ([`Odometry::counts`]) and left out.
+    ///
+    /// # Errors
+    /// An image of another size than its camera's model.
+    pub fn push(&mut self, event: SensorEvent) -> Result<Option<OdometryOutput>, OdometryError> {
+        match event {
+            SensorEvent::Imu(sample) if self.imu_model.is_some() => match self.imu.push(sample) {
+                Ok(()) => self.counts.readings += 1,
+                Err(_) => self.counts.readings_refused += 1,
+            },
+            SensorEvent::Image(frame) if frame.camera == self.camera_id => self.take_image(frame)?,
+            _ => {}
+        }
+        let ready =
+            self.pending.front().is_some_and(|f| self.is_ready(f) || self.pending.len() > MAX_PENDING);
+        if !ready {
+            return Ok(None);
+        }
+        let frame = self.pending.pop_front();
+        Ok(frame.and_then(|f| self.process(f)))
+    }
+
+    /// Works on the images that still wait, with the readings there are.
+    pub fn finish(&mut self) -> Vec<OdometryOutput> {
+        let mut outputs = Vec::new();
+        while let Some(frame) = self.pending.pop_front() {
+            outputs.extend(self.process(frame));
+        }
+        outputs
+    }
+
+    /// What was taken and what was left out so far.
+    pub fn counts(&self) -> InputCounts {
+        self.counts
+    }
+
+    fn take_image(&mut self, frame: Frame) -> Result<(), OdometryError> {
+        let (width, height) = (self.camera.model.width(), self.camera.model.height());
+        let (found_width, found_height) = (frame.image.width(), frame.image.height());
+        if (found_width, found_height) != (width, height) {
+            return Err(OdometryError::WrongImageSize { width, height, found_width, found_height });
+        }
+        if self.last_image.is_some_and(|last| frame.time <= last) {
+            self.counts.images_out_of_order += 1;
+            return Ok(());
+        }
+        self.last_image = Some(frame.time);
+        self.counts.images += 1;
+        self.pending.push_back(frame);
+        Ok(())
+    }
+
+    fn imu_time(&self, frame: &Frame) -> Timestamp {
+        frame.time + self.camera.time_offset
+    }
+
+    fn is_ready(&self, frame: &Frame) -> bool {
+        self.imu_model.is_none() || self.imu.newest().is_some_and(|newest| newest >= self.imu_time(frame))
+    }
+
+    /// One image. `None` when nothing can be said of it yet.
+    fn process(&mut self, frame: Frame) -> Option<OdometryOutput> {
+        let time = self.imu_time(&frame);
+        let readings = self.readings_until(time);
+        let id = FrameId(self.next_frame);
+        self.next_frame = self.next_frame.wrapping_add(1);
+        let mut pyramid =
+            Pyramid::new(frame.image.width(), frame.image.height(), self.frontend.pyramid.levels);
+        // The size was checked when the image came.
+        pyramid.rebuild(&frame.image).ok()?;
+        let host = Rc::new(HostImage { frame: id, pyramid });
+        let spread = self.recent_spread(time);
+        let imu_still = spread.is_some_and(|s| s.is_still());
+        let status = match &mut self.phase {
+            Phase::Starting(starting) => {
+                let found = starting.follow(host.clone(), time, readings);
+                let still = starting.images_still && imu_still;
+                match (spread.filter(|_| still), found) {
+                    (Some(_), _) => self.start_resting(&host, time),
+                    (None, Ok(found)) => self.start_in_flight(found, time),
+                    (None, Err(refusal)) => Status::Waiting(refusal),
+                }
+            }
+            Phase::Running(running) => {
+                let shot = Shot { host, time, readings, imu_still };
+                match running.step(shot) {
+                    Ok(step) => self.tell(&step, frame.time),
+                    Err(_) => self.lose(LossReason::NoFeatures { secs: 0.0 }),
+                }
+            }
+        };
+        self.last_frame = Some(time);
+        self.imu.forget_before(time - Duration::from_millis(1500));
+        Some(OdometryOutput { frame_id: frame.id, time: frame.time, status })
+    }
+
+    fn readings_until(&mut self, time: Timestamp) -> Option<Preintegration> {
+        let (model, from) = (self.imu_model?, self.last_frame?);
+        let gap = self.imu.interval(from, time, &mut self.interval).ok()?;
+        self.counts.imu_gaps += usize::from(gap.is_some());
+        let bias = match &self.phase {
+            Phase::Running(running) => running.state()?.bias,
+            Phase::Starting(starting) => Bias { gyro: starting.gyro_bias(), accel: Vector3::zeros() },
+        };
+        Some(Preintegration::new(model, bias, &self.interval))
+    }
+
+    /// Spread of the readings of the last half second.
+    fn recent_spread(&self, time: Timestamp) -> Option<ImuSpread> {
+        let from = time - Duration::from_secs_f64(STILL_SECS);
+        let first = self.imu.iter().next()?;
+        if first.time > from {
+            return None;
+        }
+        Some(ImuSpread::of(self.imu.iter().filter(|s| s.time >= from && s.time <= time)))
+    }
+
+    /// Starts from a body at rest: level and gyroscope bias are known, the velocity is zero, and the scale follows as
+    /// soon as the body moves.
+    fn start_resting(&mut self, host: &Rc<HostImage>, time: Timestamp) -> Status {
+        let readings: Vec<ImuSample> = self.imu.iter().filter(|s| s.time <= time).copied().collect();
+        let begin = readings.partition_point(|s| s.time < time - Duration::from_secs_f64(STILL_SECS));
+        let rest = match rest(&readings[begin..], None, &RestConfig::default()) {
+            Ok(rest) => rest,
+            Err(refusal) => return Status::Waiting(refusal),
+        };
+        let refusal = Refusal { obstacle: Obstacle::Frames, measured: 0.0, limit: 1.0 };
+        let Ok(mut smoother) = self.smoother() else { return Status::Waiting(refusal) };
+        let begun = smoother.start(host.frame, time, rest.state, rest.sigmas);
+        if begun.and_then(|()| smoother.mark_keyframe(host.frame)).is_err() {
+            return Status::Waiting(refusal);
+        }
+        let mut tracker = Tracker::new(self.camera.model.clone(), &self.frontend, IMAGE_NOISE_GRAY);
+        tracker.detect(host, 2 * self.config.max_landmarks, UNKNOWN_INVERSE);
+        let hosts = vec![host.clone()];
+        let running = Running::new(self.config.clone(), smoother, tracker, hosts, UNKNOWN_INVERSE);
+        let Some(running) = running else { return Status::Waiting(refusal) };
+        self.phase = Phase::Running(Box::new(running));
+        self.tell(&Step::default(), time - self.camera.time_offset)
+    }
+
+    /// Goes on with the smoother that solved the start.
+    fn start_in_flight(&mut self, found: Found, time: Timestamp) -> Status {
+        let (refusal, waiting) = (
+            Refusal { obstacle: Obstacle::Frames, measured: 0.0, limit: 1.0 },
+            Phase::Starting(Box::new(starting(&self.config, &self.camera, &self.frontend))),
+        );
+        let Phase::Starting(before) = std::mem::replace(&mut self.phase, waiting) else {
+            return Status::Waiting(refusal);
+        };
+        let typical = 1.0 / found.started.median_distance_m.clamp(0.1, 100.0);
+        let smoother = found.started.smoother;
+        let running = Running::new(self.config.clone(), smoother, before.tracker, found.hosts, typical);
+        let Some(running) = running else { return Status::Waiting(refusal) };
+        self.phase = Phase::Running(Box::new(running));
+        self.tell(&Step::default(), time - self.camera.time_offset)
+    }
+
+    fn smoother(&self) -> Result<Smoother, SmootherError> {
+        Smoother::new(self.config.smoother(), self.camera.model.clone(), self.camera.body_from_camera)
+    }
+
+    /// What is known after a step.
+    fn tell(&mut self, step: &Step, time: Timestamp) -> Status {
+        let Phase::Running(running) = &mut self.phase else {
+            return self.lose(LossReason::NoFeatures { secs: 0.0 });
+        };
+        let Some(state) = running.state() else { return self.lose(LossReason::NoFeatures { secs: 0.0 }) };
+        let covariance = running.smoother.covariance_of_newest().unwrap_or_else(nalgebra::SMatrix::zeros);
+        let scale_std = running.smoother.log_scale_sigma().unwrap_or(f64::INFINITY);
+        let tracked = step.counts.landmarks_found;
+        let health = if tracked < 15 { Health::LowFeatures } else { Health::Ok };
+        Status::Tracking(Box::new(Tracking {
+            segment: self.segment,
+            state: NavState {
+                time,
+                world_from_body: state.world_from_body,
+                velocity_in_world: state.velocity,
+                gyro_bias: state.bias.gyro,
+                accel_bias: state.bias.accel,
+            },
+            covariance,
+            scale_std,
+            health,
+            tracked,
+            landmarks: Vec::new(),
+            keyframe: None,
+            revised: Vec::new(),
+        }))
+    }
+
+    /// Gives the state up and starts anew.
+    fn lose(&mut self, reason: LossReason) -> Status {
+        self.phase = Phase::Starting(Box::new(starting(&self.config, &self.camera, &self.frontend)));
+        self.segment += 1;
+        Status::Lost(reason)
+    }
+}
+
+fn starting(config: &OdometryConfig, camera: &RigCamera, frontend: &FrontendConfig) -> Starting {
+    let tracker = Tracker::new(camera.model.clone(), frontend, IMAGE_NOISE_GRAY);
+    Starting::new(config.clone(), camera.body_from_camera, tracker)
+}

@@ -1,0 +1,454 @@
+//! The odometry while it runs: predict, measure, smooth, choose keyframes, keep the window small.
+
+use super::config::OdometryConfig;
+use super::stillness::ImageMotion;
+use super::track::{HostImage, Track, host_covariance, noisy_covariance, parallax, rotated_pixel};
+use super::tracker::{Places, Prediction, TrackCounts, Tracker};
+use crate::estimator::{Departure, Observation, OptimiseReport, Smoother, SmootherError};
+use crate::frontend::PixelMeasurement;
+use crate::imu::{NavState, Preintegration};
+use nalgebra::Vector2;
+use std::rc::Rc;
+use vidar_core::{CameraModel, FrameId, LandmarkId, LieGroup, Se3, Timestamp};
+
+/// Recent frames that are held whether they are keyframes or not.
+const RECENT_FRAMES: usize = 3;
+
+/// Standard deviation of the velocity of a body that stands still, m/s.
+const STANDSTILL_SIGMA_MPS: f64 = 0.01;
+
+/// Mean chi-square per measurement (two degrees of freedom) up to which a young track's distance is believed.
+const DISTANCE_GATE: f64 = 9.0;
+
+/// A young track becomes a landmark when its distance is known to this share...
+const PROMOTION_RELATIVE_STD: f64 = 0.25;
+/// ... its parallax is at least this, rad ...
+const PROMOTION_PARALLAX: f64 = 0.5 * std::f64::consts::PI / 180.0;
+/// ... and it was found in this many frames.
+const PROMOTION_FOUND: u32 = 4;
+
+/// A new keyframe is due when fewer than this share of the last one's landmarks are found ...
+const KEYFRAME_SHARE: f64 = 0.6;
+/// ... or the median parallax to it exceeds this, pixels at 460 px focal length ...
+const KEYFRAME_PARALLAX_PX: f64 = 20.0;
+/// ... or this time has passed, s; never before the third frame.
+const KEYFRAME_SECS: f64 = 3.0;
+const KEYFRAME_MIN_FRAMES: u32 = 3;
+
+/// Keyframes that share less than this of their landmarks with the newest frame leave first.
+const KEYFRAME_FORGOTTEN_SHARE: f64 = 0.1;
+
+/// A frame that arrives.
+pub(crate) struct Shot {
+    pub host: Rc<HostImage>,
+    /// In the clock of the IMU.
+    pub time: Timestamp,
+    /// Readings since the frame before.
+    pub readings: Option<Preintegration>,
+    /// Whether the IMU feels no motion.
+    pub imu_still: bool,
+}
+
+/// What one image did.
+#[derive(Debug, Default)]
+pub(crate) struct Step {
+    pub counts: TrackCounts,
+    pub report: OptimiseReport,
+    pub is_keyframe: bool,
+    pub is_still: bool,
+    /// Keyframes that left the window, with their last poses.
+    pub left: Vec<(FrameId, NavState)>,
+}
+
+/// The running odometry.
+#[derive(Debug)]
+pub(crate) struct Running {
+    config: OdometryConfig,
+    camera: CameraModel,
+    pub smoother: Smoother,
+    pub tracker: Tracker,
+    /// Images of the keyframes held.
+    hosts: Vec<Rc<HostImage>>,
+    last: FrameId,
+    last_keyframe: FrameId,
+    frames_since_keyframe: u32,
+    /// Landmarks that the last keyframe showed.
+    keyframe_landmarks: usize,
+    /// Typical inverse distance, 1/m.
+    typical_inverse: f64,
+    motion: ImageMotion,
+    departure: Departure,
+    scratch: Vec<(Se3, PixelMeasurement)>,
+}
+
+/// Poses of the frames that the smoother holds.
+struct Held<'a>(&'a Smoother);
+
+impl Places for Held<'_> {
+    fn world_from_camera(&self, frame: FrameId) -> Option<Se3> {
+        Some(self.0.state(frame)?.world_from_body * *self.0.body_from_camera())
+    }
+}
+
+impl Running {
+    /// Takes over a smoother that holds at least one frame; `hosts` are the images of its keyframes.
+    pub fn new(
+        config: OdometryConfig,
+        smoother: Smoother,
+        tracker: Tracker,
+        hosts: Vec<Rc<HostImage>>,
+        typical_inverse: f64,
+    ) -> Option<Self> {
+        let (last, ..) = smoother.newest()?;
+        let last_keyframe = smoother.keyframes().next_back().unwrap_or(last);
+        let camera = smoother.camera().clone();
+        let mut tracker = tracker;
+        // Tracks go on from the hosts that the smoother's landmarks have.
+        tracker.tracks.retain_mut(|track| {
+            track.is_landmark = smoother.landmark(track.id).is_some();
+            track.seen.clear();
+            !track.is_landmark || follow_host(track, &smoother, &hosts, &camera)
+        });
+        let keyframe_landmarks = tracker.tracks.iter().filter(|t| t.is_landmark).count();
+        Some(Self {
+            config,
+            camera,
+            smoother,
+            tracker,
+            hosts,
+            last,
+            last_keyframe,
+            frames_since_keyframe: 0,
+            keyframe_landmarks,
+            typical_inverse,
+            motion: ImageMotion::default(),
+            departure: Departure::default(),
+            scratch: Vec::new(),
+        })
+    }
+
+    /// The newest state.
+    pub fn state(&self) -> Option<NavState> {
+        self.smoother.newest().map(|(_, _, state)| *state)
+    }
+
+    /// One image: the road from its pixels to a smoothed state.
+    pub fn step(&mut self, shot: Shot) -> Result<Step, SmootherError> {
+        let frame = shot.host.frame;
+        let last_state = self.state().unwrap_or(NavState::REST);
+        let predicted = shot.readings.as_ref().map_or(last_state, |r| r.predict(&last_state));
+        let mut step = Step::default();
+
+        self.smoother.add_frame(frame, shot.time, predicted, shot.readings)?;
+        step.counts = self.measure(&shot.host, &last_state, &predicted);
+        step.is_still = self.motion.update(&self.tracker.tracks, frame) && shot.imu_still;
+        if step.is_still {
+            self.smoother.add_standstill(frame, STANDSTILL_SIGMA_MPS)?;
+        }
+        self.observe(frame);
+        step.report = self.smoother.optimise(self.config.iterations);
+        self.remove_outliers(&step.report, frame);
+        self.know_young_tracks(frame)?;
+
+        step.is_keyframe = !step.is_still && self.keyframe_is_due(frame, shot.time);
+        if step.is_keyframe {
+            self.make_keyframe(shot.host)?;
+        }
+        self.last = frame;
+        self.thin_window(&mut step)?;
+        Ok(step)
+    }
+
+    /// Measures all tracks from the predicted pose.
+    fn measure(&mut self, host: &Rc<HostImage>, last: &NavState, predicted: &NavState) -> TrackCounts {
+        let body_from_camera = *self.smoother.body_from_camera();
+        let world_from_current = predicted.world_from_body * body_from_camera;
+        let world_from_last = last.world_from_body * body_from_camera;
+        let prediction = Prediction {
+            places: &Held(&self.smoother),
+            world_from_current,
+            current_from_last: world_from_current.inverse() * world_from_last,
+            has_translation: true,
+            last: self.last,
+        };
+        self.tracker.measure(&host.pyramid, host.frame, &prediction)
+    }
+
+    /// Tells the smoother where the image shows its landmarks.
+    fn observe(&mut self, frame: FrameId) {
+        let noise = self.config.pixel_noise_px;
+        for track in self.tracker.tracks.iter_mut().filter(|t| t.is_landmark) {
+            let Some(measured) = &track.measured else { continue };
+            let seen = observation(frame, track.id, measured, noise);
+            if self.smoother.add_observation(&seen).is_err() {
+                track.measured = None;
+                track.missed += 1;
+            }
+        }
+    }
+
+    /// Takes sightings back that do not fit; a landmark that keeps misfitting goes.
+    fn remove_outliers(&mut self, report: &OptimiseReport, frame: FrameId) {
+        for outlier in &report.outliers {
+            self.smoother.remove_observation(outlier.frame, outlier.landmark);
+            if outlier.frame == frame {
+                self.tracker.reject(outlier.landmark);
+            }
+            let sightings = self.smoother.landmark(outlier.landmark).map_or(0, |l| l.sightings);
+            if sightings < 3 {
+                self.smoother.remove_landmark(outlier.landmark);
+                self.tracker.tracks.retain(|t| t.id != outlier.landmark);
+            }
+        }
+    }
+
+    /// Estimates the distances of young tracks and hands those that are known well enough to the smoother.
+    fn know_young_tracks(&mut self, frame: FrameId) -> Result<(), SmootherError> {
+        let held = Held(&self.smoother);
+        let Some(world_from_current) = held.world_from_camera(frame) else { return Ok(()) };
+        let (mut room, scratch, camera) = (
+            self.config.max_landmarks.saturating_sub(self.smoother.landmark_count()),
+            &mut self.scratch,
+            &self.camera,
+        );
+        let mut promoted = Vec::new();
+        self.tracker.tracks.retain_mut(|track| {
+            if track.is_landmark || track.measured.is_none() {
+                return true;
+            }
+            let Some(world_from_host) = held.world_from_camera(track.host.frame) else { return false };
+            track.seen.retain(|(f, _)| held.0.state(*f).is_some());
+            scratch.clear();
+            scratch.extend(
+                track
+                    .seen
+                    .iter()
+                    .filter_map(|(f, m)| Some((held.world_from_camera(*f)?.inverse() * world_from_host, *m))),
+            );
+            let prior = super::track::unknown_distance(self.typical_inverse);
+            let Some(belief) = prior.updated(camera, &track.feature, scratch, DISTANCE_GATE) else {
+                return false;
+            };
+            track.distance = belief;
+            let current_from_host = world_from_current.inverse() * world_from_host;
+            let apart = parallax(&track.feature, belief.mean, &current_from_host);
+            let known = belief.relative_std() < PROMOTION_RELATIVE_STD && apart > PROMOTION_PARALLAX;
+            if known && track.found >= PROMOTION_FOUND && room > 0 {
+                room -= 1;
+                track.is_landmark = true;
+                promoted.push(track.id);
+            }
+            true
+        });
+        for id in promoted {
+            self.hand_over(id)?;
+        }
+        Ok(())
+    }
+
+    /// Makes a track a landmark of the smoother, with all that the window's frames saw of it.
+    fn hand_over(&mut self, id: LandmarkId) -> Result<(), SmootherError> {
+        let Some(at) = self.tracker.tracks.iter().position(|t| t.id == id) else { return Ok(()) };
+        let track = &self.tracker.tracks[at];
+        let host = Observation {
+            frame: track.host.frame,
+            landmark: id,
+            pixel: track.feature.pixel,
+            covariance: host_covariance(track),
+            pixel_velocity: Vector2::zeros(),
+        };
+        self.smoother.add_landmark(&host, track.distance.mean)?;
+        for (frame, measured) in &track.seen {
+            let seen = observation(*frame, id, measured, self.config.pixel_noise_px);
+            if *frame != track.host.frame && self.smoother.add_observation(&seen).is_err() {
+                // A sighting of no use; the others remain.
+                continue;
+            }
+        }
+        self.tracker.tracks[at].seen.clear();
+        Ok(())
+    }
+
+    fn keyframe_is_due(&mut self, frame: FrameId, time: Timestamp) -> bool {
+        self.frames_since_keyframe += 1;
+        let tracked = self.tracker.tracks.iter().filter(|t| t.is_landmark && t.measured.is_some()).count();
+        let young = self.tracker.tracks.iter().filter(|t| !t.is_landmark && t.measured.is_some()).count();
+        let since =
+            self.smoother.time(self.last_keyframe).map_or(f64::INFINITY, |t| (time - t).as_secs_f64());
+        if since > KEYFRAME_SECS {
+            return true;
+        }
+        if self.frames_since_keyframe < KEYFRAME_MIN_FRAMES {
+            return false;
+        }
+        let few = (tracked as f64) < KEYFRAME_SHARE * self.keyframe_landmarks as f64
+            || tracked + young < self.config.max_landmarks / 2;
+        few || self.median_parallax_px(frame) > KEYFRAME_PARALLAX_PX * self.focal_px() / 460.0
+    }
+
+    fn focal_px(&self) -> f64 {
+        self.camera.intrinsics().fx
+    }
+
+    /// Median motion of pixels since the last keyframe that no rotation explains.
+    fn median_parallax_px(&self, frame: FrameId) -> f64 {
+        let held = Held(&self.smoother);
+        let places = (held.world_from_camera(frame), held.world_from_camera(self.last_keyframe));
+        let (Some(current), Some(keyframe)) = places else { return f64::INFINITY };
+        let current_from_keyframe = current.inverse() * keyframe;
+        let mut moved: Vec<f64> = self
+            .tracker
+            .tracks
+            .iter()
+            .filter_map(|t| {
+                let (measured, then) = (t.measured?, t.keyframe_pixel?);
+                Some((measured.pixel - rotated_pixel(&self.camera, &then, &current_from_keyframe)?).norm())
+            })
+            .collect();
+        if moved.is_empty() {
+            return f64::INFINITY;
+        }
+        let middle = moved.len() / 2;
+        *moved.select_nth_unstable_by(middle, f64::total_cmp).1
+    }
+
+    /// Marks the newest frame a keyframe and starts tracks in it.
+    fn make_keyframe(&mut self, host: Rc<HostImage>) -> Result<(), SmootherError> {
+        self.smoother.mark_keyframe(host.frame)?;
+        self.last_keyframe = host.frame;
+        self.frames_since_keyframe = 0;
+        self.update_typical_distance(host.frame);
+        for track in &mut self.tracker.tracks {
+            track.keyframe_pixel = track.measured.map(|m| m.pixel);
+        }
+        let held = self.tracker.tracks.iter().filter(|t| t.measured.is_some()).count();
+        let limit = (2 * self.config.max_landmarks).saturating_sub(held);
+        self.tracker.detect(&host, limit, self.typical_inverse);
+        self.keyframe_landmarks =
+            self.tracker.tracks.iter().filter(|t| t.is_landmark && t.measured.is_some()).count();
+        self.hosts.push(host);
+        Ok(())
+    }
+
+    fn update_typical_distance(&mut self, frame: FrameId) {
+        let Some(world_from_camera) = Held(&self.smoother).world_from_camera(frame) else { return };
+        let camera_from_world = world_from_camera.inverse();
+        let mut distances: Vec<f64> = self
+            .tracker
+            .tracks
+            .iter()
+            .filter(|t| t.is_landmark && t.measured.is_some())
+            .filter_map(|t| Some(camera_from_world.act(&self.smoother.landmark(t.id)?.in_world).norm()))
+            .collect();
+        if distances.len() >= 10 {
+            let middle = distances.len() / 2;
+            let median = *distances.select_nth_unstable_by(middle, f64::total_cmp).1;
+            self.typical_inverse = 1.0 / median.clamp(0.1, 100.0);
+        }
+    }
+
+    /// Drops frames and keyframes that are too many.
+    fn thin_window(&mut self, step: &mut Step) -> Result<(), SmootherError> {
+        let frames: Vec<FrameId> = self.smoother.frames().collect();
+        let keyframes: Vec<FrameId> = self.smoother.keyframes().collect();
+        let recent_from = frames.len().saturating_sub(RECENT_FRAMES);
+        for frame in &frames[..recent_from] {
+            if !keyframes.contains(frame) {
+                self.smoother.drop_frame(*frame, &mut self.departure)?;
+            }
+        }
+        if keyframes.len() > self.config.max_keyframes {
+            if let Some(leaving) = self.keyframe_to_remove(&keyframes) {
+                step.left.extend(self.smoother.state(leaving).map(|s| (leaving, *s)));
+                self.smoother.marginalise(leaving, &mut self.departure)?;
+                self.hosts.retain(|h| h.frame != leaving);
+                self.follow_new_hosts(leaving);
+            }
+        }
+        Ok(())
+    }
+
+    /// Landmarks of a keyframe that left live on with a newer host; their patches are taken from there.
+    fn follow_new_hosts(&mut self, left: FrameId) {
+        let (smoother, hosts, camera) = (&self.smoother, &self.hosts, &self.camera);
+        self.tracker.tracks.retain_mut(|track| {
+            if track.host.frame != left {
+                return true;
+            }
+            track.is_landmark && follow_host(track, smoother, hosts, camera)
+        });
+    }
+
+    /// The keyframe that is needed least: one that shows little of what is seen now, else by the distance score of
+    /// Engel, Koltun, Cremers, "Direct Sparse Odometry", 2016, section 3.1; the two newest stay.
+    fn keyframe_to_remove(&self, keyframes: &[FrameId]) -> Option<FrameId> {
+        let candidates = &keyframes[..keyframes.len().saturating_sub(2)];
+        let newest = self.last;
+        let forgotten = candidates.iter().find(|k| {
+            let (mut seen, mut shared) = (0_usize, 0_usize);
+            for landmark in self.smoother.seen_by(**k) {
+                seen += 1;
+                shared += usize::from(self.smoother.sees(newest, landmark));
+            }
+            (shared as f64) < KEYFRAME_FORGOTTEN_SHARE * seen as f64 || seen == 0
+        });
+        if let Some(forgotten) = forgotten {
+            return Some(*forgotten);
+        }
+        let place = |f: &FrameId| self.smoother.state(*f).map(|s| s.world_from_body.translation);
+        let here = place(&newest)?;
+        let score = |k: &FrameId| {
+            let at = place(k)?;
+            let crowd: f64 = keyframes
+                .iter()
+                .filter(|o| *o != k)
+                .filter_map(|o| Some(1.0 / ((place(o)? - at).norm() + 1e-3)))
+                .sum();
+            Some((at - here).norm().sqrt() * crowd)
+        };
+        let mut best: Option<(f64, FrameId)> = None;
+        for keyframe in candidates {
+            let Some(score) = score(keyframe) else { continue };
+            if best.is_none_or(|(most, _)| score > most) {
+                best = Some((score, *keyframe));
+            }
+        }
+        best.map(|(_, keyframe)| keyframe)
+    }
+}
+
+/// A measurement as the smoother takes it.
+fn observation(
+    frame: FrameId,
+    landmark: LandmarkId,
+    measured: &PixelMeasurement,
+    noise_px: f64,
+) -> Observation {
+    Observation {
+        frame,
+        landmark,
+        pixel: measured.pixel,
+        covariance: noisy_covariance(measured, noise_px),
+        pixel_velocity: Vector2::zeros(),
+    }
+}
+
+/// Lets a track continue with the host that the smoother gave its landmark.
+fn follow_host(
+    track: &mut Track,
+    smoother: &Smoother,
+    hosts: &[Rc<HostImage>],
+    camera: &CameraModel,
+) -> bool {
+    let Some(landmark) = smoother.landmark(track.id) else { return false };
+    let Some(host) = hosts.iter().find(|h| h.frame == landmark.host) else { return false };
+    let Some(pixel) = camera.project(&landmark.bearing) else { return false };
+    let Some(feature) = crate::frontend::Feature::new(camera, pixel, track.feature.level, track.feature.kind)
+    else {
+        return false;
+    };
+    track.host = host.clone();
+    track.feature = feature;
+    track.distance.mean = landmark.inverse_distance;
+    true
+}

@@ -1,0 +1,217 @@
+//! All tracks of the odometry: predicted, measured, gated, detected, dropped.
+
+use super::track::{
+    HostImage, InverseDistance, Measurer, Track, project_with_distance, rotated_pixel, unknown_distance,
+};
+use crate::frontend::{
+    Detection, Detector, Feature, FrontendConfig, MatchFailure, OccupancyGrid, PixelMeasurement, Pyramid,
+    Warp,
+};
+use nalgebra::Vector2;
+use std::rc::Rc;
+use vidar_core::camera::Pixel;
+use vidar_core::{CameraModel, FrameId, LandmarkId, LieGroup, Se3};
+
+/// Relative deviation of a distance below which the point's place is predicted from it rather than from its motion.
+const KNOWN_DISTANCE: f64 = 0.3;
+
+/// Frames in a row without being found after which a track without and with known distance is given up.
+const MAX_MISSED_YOUNG: u32 = 1;
+const MAX_MISSED_KNOWN: u32 = 3;
+
+/// Tracks may not come nearer than this to the border of the image, pixels.
+const BORDER_PX: f64 = 8.0;
+
+/// What happened to the tracks in one image.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub(crate) struct TrackCounts {
+    pub landmarks_tried: usize,
+    pub landmarks_found: usize,
+    pub young_tried: usize,
+    pub young_found: usize,
+}
+
+/// Where the camera of a frame is.
+pub(crate) trait Places {
+    /// Pose of the camera of `frame`, or `None` when it is not held.
+    fn world_from_camera(&self, frame: FrameId) -> Option<Se3>;
+}
+
+/// Holds and measures tracks.
+#[derive(Debug)]
+pub(crate) struct Tracker {
+    camera: CameraModel,
+    pub tracks: Vec<Track>,
+    measurer: Measurer,
+    detector: Detector,
+    grid: OccupancyGrid,
+    detections: Vec<Detection>,
+    next_id: u32,
+}
+
+/// The motion of the camera into the image that is measured, as predicted.
+pub(crate) struct Prediction<'a> {
+    pub places: &'a dyn Places,
+    pub world_from_current: Se3,
+    pub current_from_last: Se3,
+    /// Whether translations mean anything.
+    pub has_translation: bool,
+    pub last: FrameId,
+}
+
+impl Tracker {
+    pub fn new(camera: CameraModel, config: &FrontendConfig, noise_gray: f64) -> Self {
+        let detector = Detector::new(config.detector.clone());
+        let grid = detector.grid(camera.width(), camera.height());
+        let measurer = Measurer::new(config.matching.clone(), noise_gray);
+        Self { camera, tracks: Vec::new(), measurer, detector, grid, detections: Vec::new(), next_id: 0 }
+    }
+
+    pub fn camera(&self) -> &CameraModel {
+        &self.camera
+    }
+
+    /// Measures every track in `current`, the image `frame`; tracks that are lost for good are dropped.
+    pub fn measure(&mut self, current: &Pyramid, frame: FrameId, prediction: &Prediction<'_>) -> TrackCounts {
+        let mut counts = TrackCounts::default();
+        let (camera, measurer) = (&self.camera, &mut self.measurer);
+        self.tracks.retain_mut(|track| {
+            let Some(world_from_host) = prediction.places.world_from_camera(track.host.frame) else {
+                return false;
+            };
+            let current_from_host = prediction.world_from_current.inverse() * world_from_host;
+            let found = measure_one(camera, measurer, track, current, &current_from_host, prediction);
+            let (tried, count) = if track.is_landmark {
+                (&mut counts.landmarks_tried, &mut counts.landmarks_found)
+            } else {
+                (&mut counts.young_tried, &mut counts.young_found)
+            };
+            *tried += 1;
+            match found {
+                Ok(measurement) => {
+                    *count += 1;
+                    track.last_pixel = measurement.pixel;
+                    track.last_frame = frame;
+                    if !track.is_landmark {
+                        track.seen.push((frame, measurement));
+                    }
+                    track.found += 1;
+                    track.missed = 0;
+                    track.measured = Some(measurement);
+                    true
+                }
+                Err(failure) => {
+                    track.measured = None;
+                    track.missed += 1;
+                    let limit = if is_known(&track.distance, prediction.has_translation) {
+                        MAX_MISSED_KNOWN
+                    } else {
+                        MAX_MISSED_YOUNG
+                    };
+                    track.missed < limit && failure != MatchFailure::OutsideImage
+                }
+            }
+        });
+        counts
+    }
+
+    /// Forgets that `id` was found in this image, as if it had been missed.
+    pub fn reject(&mut self, id: LandmarkId) {
+        if let Some(track) = self.tracks.iter_mut().find(|t| t.id == id) {
+            track.measured = None;
+            track.missed += 1;
+        }
+    }
+
+    /// Starts tracks in the free cells of `host`, at most `limit`, with distances as `typical_inverse`.
+    pub fn detect(&mut self, host: &Rc<HostImage>, limit: usize, typical_inverse: f64) -> usize {
+        self.grid.clear();
+        for track in self.tracks.iter().filter(|t| t.measured.is_some()) {
+            self.grid.take(&track.last_pixel);
+        }
+        let mut detections = std::mem::take(&mut self.detections);
+        self.detector.detect(&host.pyramid, &self.grid, &mut detections);
+        let before = self.tracks.len();
+        for detection in detections.iter() {
+            if self.tracks.len() - before >= limit {
+                break;
+            }
+            if !self.camera.contains(&detection.pixel, BORDER_PX) {
+                continue;
+            }
+            let Some(feature) = Feature::new(&self.camera, detection.pixel, detection.level, detection.kind)
+            else {
+                continue;
+            };
+            let track = self.fresh_track(host, feature, unknown_distance(typical_inverse));
+            self.tracks.push(track);
+        }
+        self.detections = detections;
+        self.tracks.len() - before
+    }
+
+    fn fresh_track(&mut self, host: &Rc<HostImage>, feature: Feature, distance: InverseDistance) -> Track {
+        let id = LandmarkId(self.next_id);
+        self.next_id = self.next_id.wrapping_add(1);
+        Track {
+            id,
+            host: host.clone(),
+            feature,
+            distance,
+            is_landmark: false,
+            last_pixel: feature.pixel,
+            last_frame: host.frame,
+            drift: Vector2::zeros(),
+            keyframe_pixel: Some(feature.pixel),
+            seen: Vec::new(),
+            found: 1,
+            missed: 0,
+            measured: None,
+        }
+    }
+}
+
+fn is_known(distance: &InverseDistance, has_translation: bool) -> bool {
+    has_translation && distance.relative_std() < KNOWN_DISTANCE
+}
+
+fn measure_one(
+    camera: &CameraModel,
+    measurer: &mut Measurer,
+    track: &mut Track,
+    current: &Pyramid,
+    current_from_host: &Se3,
+    prediction: &Prediction<'_>,
+) -> Result<PixelMeasurement, MatchFailure> {
+    let known = is_known(&track.distance, prediction.has_translation);
+    let inverse = if prediction.has_translation { track.distance.mean.max(0.0) } else { 0.0 };
+    let mut warp =
+        Warp::new(camera, &track.feature, inverse, current_from_host).ok_or(MatchFailure::NotVisible)?;
+    let turned = (!known && track.last_frame == prediction.last)
+        .then(|| rotated_pixel(camera, &track.last_pixel, &prediction.current_from_last))
+        .flatten();
+    let expected = match turned {
+        Some(turned) => turned + track.drift,
+        None => warp.pixel,
+    };
+    if !camera.contains(&expected, BORDER_PX) {
+        return Err(MatchFailure::OutsideImage);
+    }
+    warp.pixel = expected;
+    let found = measurer.find(&track.host.pyramid, &track.feature, &warp, &expected, current, !known)?;
+    if let Some(turned) = turned {
+        track.drift = found.measurement.pixel - turned;
+    }
+    Ok(found.measurement)
+}
+
+/// Offsets of landmarks from where a pose and their distances put them, pixels; for gates and tests.
+pub(crate) fn reprojection_error(
+    camera: &CameraModel,
+    track: &Track,
+    current_from_host: &Se3,
+    measured: &Pixel,
+) -> Option<f64> {
+    let (pixel, _) = project_with_distance(camera, &track.feature, track.distance.mean, current_from_host)?;
+    Some((measured - pixel).norm())
+}
