@@ -1,5 +1,6 @@
 //! Every operation at sizes of DA3-SMALL and BASE (one view of 504×378: 27×36 patches, 973 tokens), on every kernel set of
 //! this machine and on one thread, so that the rate compares with one core's peak. `cargo bench -p vidar-nn`.
+#![allow(clippy::expect_used)] // a bench may stop at the first surprise
 
 use divan::Bencher;
 use divan::counter::{BytesCount, ItemsCount};

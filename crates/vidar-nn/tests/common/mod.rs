@@ -1,5 +1,5 @@
 //! Naive references in f64 and deterministic numbers.
-#![allow(dead_code)] // each test binary uses its own part
+#![allow(dead_code, clippy::unwrap_used)] // each test binary uses its own part; tests may stop at the first surprise
 
 use vidar_nn::{Compute, Isa, Precision, Weight};
 
