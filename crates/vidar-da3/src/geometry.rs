@@ -19,7 +19,7 @@ use vidar_core::{
 };
 
 /// Whether the network is told where the cameras are.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash, Serialize, Deserialize, schemars::JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum PoseMode {
     /// Pictures alone: the network finds poses and intrinsics in a frame and unit of its own.
@@ -30,7 +30,7 @@ pub enum PoseMode {
 }
 
 /// How the model is used on chunks.
-#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct Da3ModelConfig {
     /// Whether prior poses are given to the network. `conditioned` needs a pose for every view; change it when odometry

@@ -245,3 +245,6 @@ pub(crate) fn median(mut values: Vec<f64>) -> f64 {
         _ => f64::midpoint(values[n / 2 - 1], values[n / 2]),
     }
 }
+
+#[cfg(test)]
+mod tests;

@@ -215,3 +215,6 @@ fn four(list: &[usize], field: &str, place: &str) -> Result<[usize; 4], Da3Error
 fn bad(place: &str, field: &str, found: String, expected: &str) -> Da3Error {
     Da3Error::BadConfig { place: place.into(), field: field.into(), found, expected: expected.into() }
 }
+
+#[cfg(test)]
+mod tests;

@@ -144,7 +144,7 @@ mod tests {
 
     #[test]
     fn two_views_are_divided_by_the_least_median() {
-        let at = |x| compose(&Matrix3::identity(), &Vector3::new(-x, 0.0, 0.0));
+        let at = |x: f64| compose(&Matrix3::identity(), &Vector3::new(-x, 0.0, 0.0));
         let moved = normalise_world(&[at(1.0), at(3.0)]);
         assert!((centre(&moved[1]).x - 20.0).abs() < 1e-12);
         let moved = normalise_world(&[at(0.0), at(2.0), at(4.0)]);

@@ -19,7 +19,7 @@ use serde::{Deserialize, Serialize};
 use vidar_core::Image;
 
 /// Which side is scaled to the wanted length, and how multiples of the patch are reached.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash, Serialize, Deserialize, schemars::JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum ResizeMethod {
     /// The longer side; both sides are then stretched to the nearest multiple of 14.
@@ -34,7 +34,7 @@ pub enum ResizeMethod {
 }
 
 /// How pictures are brought to the network's size.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, schemars::JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct PreprocessConfig {
     /// Wanted length of the bounding side, pixels, 14 to 4096. More shows more detail at quadratic cost; networks were
@@ -268,3 +268,6 @@ pub fn follow(intrinsics: &Matrix3<f64>, (width, height): (usize, usize), step: 
     }
     k
 }
+
+#[cfg(test)]
+mod tests;

@@ -7,7 +7,7 @@
 use serde::{Deserialize, Serialize};
 
 /// How the reference view is chosen.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash, Serialize, Deserialize, schemars::JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum ReferenceStrategy {
     /// The view in the middle of similarity, norm and variance.
