@@ -1,8 +1,8 @@
 //! Uncertainty out of the factor of the normal equations.
 
+use super::Smoother;
 use super::linearise::System;
 use super::prior::Part;
-use super::Smoother;
 use crate::imu::{Matrix15, hat};
 use nalgebra::{Matrix6, SMatrix};
 use vidar_core::{FrameId, LieGroup};
@@ -52,10 +52,8 @@ impl Smoother {
         let columns: [usize; 12] = std::array::from_fn(|k| starts[k / 6] + k % 6);
         let mut joint = SMatrix::<f64, 12, 12>::zeros();
         self.system.inverse_block(&columns, |i, j, v| joint[(i, j)] = v);
-        let j = d_relative_d_poses(
-            &self.frames[a].state.world_from_body,
-            &self.frames[b].state.world_from_body,
-        );
+        let j =
+            d_relative_d_poses(&self.frames[a].state.world_from_body, &self.frames[b].state.world_from_body);
         Some(j * joint * j.transpose())
     }
 
@@ -130,8 +128,7 @@ impl System {
         // A⁻¹ = L⁻ᵀ L⁻¹, so its entries are dot products of the columns of L⁻¹.
         for i in 0..columns.len() {
             for j in 0..=i {
-                let value =
-                    super::dense::dot(&solved[i * n..(i + 1) * n], &solved[j * n..(j + 1) * n]);
+                let value = super::dense::dot(&solved[i * n..(i + 1) * n], &solved[j * n..(j + 1) * n]);
                 put(i, j, value);
                 put(j, i, value);
             }

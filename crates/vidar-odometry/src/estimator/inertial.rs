@@ -88,10 +88,7 @@ pub(crate) fn jacobians(readings: &Preintegration, i: &NavState, j: &NavState) -
         &mut by_i,
         0,
         9,
-        -log_slope
-            * So3::exp(&-turn).matrix()
-            * So3::right_jacobian(&(turn_by_gyro * d_gyro))
-            * turn_by_gyro,
+        -log_slope * So3::exp(&-turn).matrix() * So3::right_jacobian(&(turn_by_gyro * d_gyro)) * turn_by_gyro,
     );
     put(&mut by_j, 0, 0, log_slope);
     put(&mut by_i, 3, 0, hat(&moved));
@@ -167,7 +164,8 @@ pub(crate) fn anchor_at(
     j.fixed_view_mut::<3, 3>(0, 3).copy_from(&(Matrix3::identity() * w));
     // Yaw, row 3: vertical part of the rotation vector in the world.
     let w = weight(sigmas.yaw_rad);
-    let turned = |s: &NavState| (s.world_from_body.rotation * reference.world_from_body.rotation.inverse()).log();
+    let turned =
+        |s: &NavState| (s.world_from_body.rotation * reference.world_from_body.rotation.inverse()).log();
     r[3] = up.dot(&turned(state)) * w;
     let log_slope = So3::right_jacobian_inverse(&-turned(at)).unwrap_or_else(Matrix3::identity);
     let yaw_row = up.transpose() * log_slope * at.world_from_body.rotation.matrix() * w;

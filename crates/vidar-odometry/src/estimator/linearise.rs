@@ -114,7 +114,13 @@ impl System {
     }
 
     /// Adds a block at (`row`, `col`), `row ≥ col`; of diagonal blocks the upper half is ignored later.
-    fn add<const R: usize, const C: usize>(&mut self, row: usize, col: usize, block: &SMatrix<f64, R, C>, sign: f64) {
+    fn add<const R: usize, const C: usize>(
+        &mut self,
+        row: usize,
+        col: usize,
+        block: &SMatrix<f64, R, C>,
+        sign: f64,
+    ) {
         for i in 0..R {
             let target = &mut self.h[(row + i) * self.n + col..(row + i) * self.n + col + C];
             for j in 0..C {
@@ -196,8 +202,9 @@ impl Scene<'_> {
         jacobians.by_target = whiten * jacobians.by_target;
         jacobians.by_landmark = whiten * jacobians.by_landmark;
         let by_calibration = self.config.calibrates().then(|| {
-            let by_place = visual::by_body_from_camera(self.camera, host, target, &landmark.bearing, landmark.rho)
-                .unwrap_or_else(SMatrix::zeros);
+            let by_place =
+                visual::by_body_from_camera(self.camera, host, target, &landmark.bearing, landmark.rho)
+                    .unwrap_or_else(SMatrix::zeros);
             whiten * calibration_columns(self.config, &by_place, &s.pixel_velocity)
         });
         (cost, Some(WeightedSighting { residual: residual * weight.sqrt(), jacobians, by_calibration }))
@@ -431,7 +438,13 @@ impl Smoother {
     }
 }
 
-fn add_landmark(system: &mut System, scene: &Scene<'_>, landmark: &mut Landmark, slot: usize, lambda: f64) -> f64 {
+fn add_landmark(
+    system: &mut System,
+    scene: &Scene<'_>,
+    landmark: &mut Landmark,
+    slot: usize,
+    lambda: f64,
+) -> f64 {
     let Some((mut cost, own)) = scene.host(landmark) else { return 0.0 };
     let calibrates = scene.config.calibrates();
     let at_calibration = system.offset(Part::Calibration);
@@ -453,7 +466,9 @@ fn add_landmark(system: &mut System, scene: &Scene<'_>, landmark: &mut Landmark,
     for s in &mut sightings {
         let (part, weighted) = scene.sighting(landmark, s);
         cost += part;
-        let Some(WeightedSighting { residual: r, jacobians: j, by_calibration: c }) = weighted else { continue };
+        let Some(WeightedSighting { residual: r, jacobians: j, by_calibration: c }) = weighted else {
+            continue;
+        };
         let target = system.offset(Part::Pose(s.frame));
         host_square += j.by_host.transpose() * j.by_host;
         host_gradient += j.by_host.transpose() * r;

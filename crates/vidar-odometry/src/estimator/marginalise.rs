@@ -107,7 +107,8 @@ impl Smoother {
         let last = self.frames.len() - 1;
         let anchored = self.anchor.is_some_and(|a| a.frame == at);
         let hosts = self.landmarks.iter().any(|l| l.alive && l.host.frame == at);
-        let chained = at > 0 && at < last && self.frames[at].link.is_some() == self.frames[at + 1].link.is_some();
+        let chained =
+            at > 0 && at < last && self.frames[at].link.is_some() == self.frames[at + 1].link.is_some();
         if self.prior.touches(at) || anchored || hosts || !chained {
             return self.marginalise(id, departure);
         }
@@ -181,7 +182,8 @@ impl Smoother {
         }
         // The sighting that becomes the host's is the one that leaves `rehost_keyframes` keyframes, itself included.
         let skip = keyframes.saturating_sub(self.config.rehost_keyframes);
-        let in_keyframes = landmark.sightings.iter().enumerate().filter(|(_, s)| self.frames[s.frame].keyframe);
+        let in_keyframes =
+            landmark.sightings.iter().enumerate().filter(|(_, s)| self.frames[s.frame].keyframe);
         in_keyframes.map(|(at, _)| at).nth(skip).unwrap_or(landmark.sightings.len())
     }
 
@@ -270,7 +272,9 @@ impl Smoother {
     /// Readings on both sides, anchor and standstill of the leaving frame, and the calibration's own prior.
     fn stack_frame(&self, gone: usize, system: &System, bench: &mut Workbench) {
         for k in [gone, gone + 1] {
-            let Some(link) = self.frames.get(k).and_then(|f| f.link.as_ref()).filter(|_| k > 0) else { continue };
+            let Some(link) = self.frames.get(k).and_then(|f| f.link.as_ref()).filter(|_| k > 0) else {
+                continue;
+            };
             let (from, to) = (&self.frames[k - 1], &self.frames[k]);
             let r: Vector15 = link.whitening.apply(&residual(&link.readings, &from.state, &to.state));
             let (ji, jj) = jacobians(&link.readings, &system.states_at[k - 1], &system.states_at[k]);
@@ -336,9 +340,8 @@ impl Smoother {
         let Some((_, own)) = scene.host(landmark) else { return };
         let mut sightings = std::mem::take(&mut bench.parting);
         sightings.clear();
-        sightings.extend(
-            landmark.sightings[..count].iter().filter(|s| self.frames[s.frame].keyframe).copied(),
-        );
+        sightings
+            .extend(landmark.sightings[..count].iter().filter(|s| self.frames[s.frame].keyframe).copied());
         // The landmark's own three columns, then those of the stack.
         let mut one = std::mem::take(&mut bench.one);
         one.reset(2 * sightings.len() + 2, 3 + bench.stack.cols());

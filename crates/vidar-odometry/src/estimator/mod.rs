@@ -121,7 +121,11 @@ impl Smoother {
     ///
     /// # Errors
     /// A setting outside its range.
-    pub fn new(config: SmootherConfig, camera: CameraModel, body_from_camera: Se3) -> Result<Self, SmootherError> {
+    pub fn new(
+        config: SmootherConfig,
+        camera: CameraModel,
+        body_from_camera: Se3,
+    ) -> Result<Self, SmootherError> {
         config.validate()?;
         let frames = config.max_frames + 1;
         let mut slots = FxHashMap::default();
@@ -267,10 +271,9 @@ impl Smoother {
             return Err(SmootherError::Twice { landmark: host.landmark, frame: host.frame });
         }
         let sighting = self.sighting(host, frame)?;
-        let bearing = self
-            .camera
-            .unproject(&host.pixel)
-            .ok_or_else(|| bad("pixel", format!("({:.2}, {:.2}) has no bearing", host.pixel.x, host.pixel.y)))?;
+        let bearing = self.camera.unproject(&host.pixel).ok_or_else(|| {
+            bad("pixel", format!("({:.2}, {:.2}) has no bearing", host.pixel.x, host.pixel.y))
+        })?;
         if !inverse_distance.is_finite() {
             return Err(bad("inverse distance", inverse_distance.to_string()));
         }

@@ -1,9 +1,9 @@
 //! Levenberg-Marquardt over the window.
 
+use super::Smoother;
 use super::linearise::System;
 use super::prior::Part;
 use super::window::{CALIBRATION_DIM, Calibration};
-use super::Smoother;
 use crate::imu::{NavState, Vector15};
 use nalgebra::{SVector, Vector3};
 use vidar_core::{FrameId, LandmarkId};
@@ -72,8 +72,18 @@ impl Smoother {
 
     /// As [`Smoother::optimise`], into a report whose memory is used again.
     pub fn optimise_into(&mut self, max_iterations: usize, report: &mut OptimiseReport) {
+        self.optimise_from(FIRST_LAMBDA, max_iterations, report);
+    }
+
+    /// As [`Smoother::optimise_into`], with a damping to begin with (larger for rough starts).
+    pub(crate) fn optimise_from(
+        &mut self,
+        first_lambda: f64,
+        max_iterations: usize,
+        report: &mut OptimiseReport,
+    ) {
         let mut system = std::mem::take(&mut self.system);
-        let mut lambda = FIRST_LAMBDA;
+        let mut lambda = first_lambda;
         let mut growth = 4.0;
         let mut cost = self.linearise(&mut system, lambda);
         (report.iterations, report.converged, report.cost_before) = (0, false, cost);
@@ -93,7 +103,8 @@ impl Smoother {
             let change = cost - after;
             if change >= 0.0 || -change < 1e-9 * cost {
                 let ratio = change / expected.max(1e-300);
-                lambda = (lambda * (1.0 - (2.0 * ratio - 1.0).powi(3)).clamp(1.0 / 3.0, 2.0)).max(LEAST_LAMBDA);
+                lambda =
+                    (lambda * (1.0 - (2.0 * ratio - 1.0).powi(3)).clamp(1.0 / 3.0, 2.0)).max(LEAST_LAMBDA);
                 growth = 4.0;
                 report.converged = change <= CONVERGED_CHANGE * cost;
                 cost = after;

@@ -7,7 +7,8 @@ use super::visual::{self, CameraPlace};
 use super::*;
 use crate::imu::{Bias, Matrix15, Vector15};
 use crate::simulate::{
-    Course, CourseKind, FeatureOdometry, FeatureOdometryConfig, Random, Simulation, SimulationConfig, StepOutput,
+    Course, CourseKind, FeatureOdometry, FeatureOdometryConfig, Random, Simulation, SimulationConfig,
+    StepOutput,
 };
 use nalgebra::{DMatrix, DVector, SMatrix, SVector, Vector3};
 use vidar_core::testing::check_jacobian;
@@ -142,7 +143,11 @@ fn relative_pose_agrees_with_numeric_derivatives() {
 }
 
 /// A smoother that flew for a while on a built-in flight.
-fn flown(seed: u64, secs: f64, change: impl Fn(&mut FeatureOdometryConfig, &mut AnchorSigmas)) -> (FeatureOdometry, Simulation) {
+fn flown(
+    seed: u64,
+    secs: f64,
+    change: impl Fn(&mut FeatureOdometryConfig, &mut AnchorSigmas),
+) -> (FeatureOdometry, Simulation) {
     let course = Course { kind: CourseKind::Eight, secs: secs + 1.0, speed: 1.2, phase: 0.4 * seed as f64 };
     let settings = SimulationConfig { seed, tracks: 60, ..Default::default() };
     let simulation = Simulation::new(&course, 0.0, secs, &settings);
@@ -353,10 +358,16 @@ fn what_is_of_no_use_is_refused_in_words() {
     assert!(matches!(smoother.add_landmark(&good, 0.5), Err(SmootherError::Twice { .. })));
     assert!(matches!(smoother.add_observation(&good), Err(SmootherError::Twice { .. })));
     assert!(smoother.add_landmark(&seen(90_001, Matrix2::identity()), f64::NAN).is_err());
-    assert!(matches!(smoother.add_frame(FrameId(9999), time, state, None), Err(SmootherError::NotNext { .. })));
+    assert!(matches!(
+        smoother.add_frame(FrameId(9999), time, state, None),
+        Err(SmootherError::NotNext { .. })
+    ));
     let mut lost = state;
     lost.velocity.x = f64::NAN;
-    assert_eq!(smoother.add_frame(FrameId(9999), time, lost, None), Err(SmootherError::BadState(FrameId(9999))));
+    assert_eq!(
+        smoother.add_frame(FrameId(9999), time, lost, None),
+        Err(SmootherError::BadState(FrameId(9999)))
+    );
     assert!(SmootherConfig { huber_sigmas: f64::NAN, ..Default::default() }.validate().is_err());
     assert!(SmootherConfig::default().validate().is_ok());
 }

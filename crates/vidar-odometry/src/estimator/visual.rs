@@ -43,7 +43,12 @@ pub(crate) struct VisualJacobians {
 }
 
 /// Direction of the landmark in the target camera, up to scale.
-pub(crate) fn direction(host: &CameraPlace, target: &CameraPlace, bearing: &Vector3<f64>, rho: f64) -> Vector3<f64> {
+pub(crate) fn direction(
+    host: &CameraPlace,
+    target: &CameraPlace,
+    bearing: &Vector3<f64>,
+    rho: f64,
+) -> Vector3<f64> {
     target.turn.tr_mul(&(host.turn * bearing + (host.at - target.at) * rho))
 }
 
@@ -65,7 +70,9 @@ pub(crate) fn jacobians(
     let mut by_target = SMatrix::<f64, 2, 6>::zeros();
     by_host.fixed_view_mut::<2, 3>(0, 0).copy_from(&(crossed(&m, &from_host_body, -1.0) * host.body_turn));
     by_host.fixed_view_mut::<2, 3>(0, 3).copy_from(&(m * rho));
-    by_target.fixed_view_mut::<2, 3>(0, 0).copy_from(&(crossed(&m, &from_target_body, 1.0) * target.body_turn));
+    by_target
+        .fixed_view_mut::<2, 3>(0, 0)
+        .copy_from(&(crossed(&m, &from_target_body, 1.0) * target.body_turn));
     by_target.fixed_view_mut::<2, 3>(0, 3).copy_from(&(m * -rho));
     let mut by_landmark = SMatrix::<f64, 2, 3>::zeros();
     by_landmark.fixed_view_mut::<2, 2>(0, 0).copy_from(&(m * host.turn * tangent_basis(bearing)));
@@ -85,8 +92,7 @@ pub(crate) fn by_body_from_camera(
     let (_, by_direction) = camera.project_with_jacobian(&q)?;
     let m: Matrix2x3<f64> = by_direction * target.turn.transpose();
     let mut out = SMatrix::<f64, 2, 6>::zeros();
-    out.fixed_view_mut::<2, 3>(0, 0)
-        .copy_from(&(by_direction * hat(&q) - m * host.turn * hat(bearing)));
+    out.fixed_view_mut::<2, 3>(0, 0).copy_from(&(by_direction * hat(&q) - m * host.turn * hat(bearing)));
     out.fixed_view_mut::<2, 3>(0, 3).copy_from(&(m * (host.body_turn - target.body_turn) * rho));
     Some(out)
 }

@@ -136,8 +136,7 @@ impl Frame {
         if self.pose_in_prior {
             let mut step = self.step.fixed_rows_mut::<6>(0);
             step += pose;
-            self.state.world_from_body =
-                moved(&self.linearised.world_from_body, &self.step.as_slice()[..6]);
+            self.state.world_from_body = moved(&self.linearised.world_from_body, &self.step.as_slice()[..6]);
         } else {
             self.state.world_from_body = moved(&self.state.world_from_body, pose.as_slice());
         }

@@ -11,8 +11,8 @@ mod propagate;
 
 pub use buffer::{BufferError, Gap, ImuBuffer};
 pub use preintegration::{Bias, ImuModel, Preintegration, StepNoise};
-pub use propagate::{Propagated, propagate};
 pub(crate) use propagate::gravity;
+pub use propagate::{Propagated, propagate};
 
 use nalgebra::{Matrix3, SMatrix, SVector, Vector3};
 use vidar_core::{LieGroup, Se3, So3};

@@ -116,8 +116,7 @@ impl Delta {
         let end = to_mid * mid_to_end;
         let (r_mid, r_end) = (to_mid.matrix(), end.matrix());
         let mid_by_gyro = So3::right_jacobian(&phi1) * d_phi1;
-        let end_by_gyro =
-            mid_to_end.matrix().transpose() * mid_by_gyro + So3::right_jacobian(&phi2) * d_phi2;
+        let end_by_gyro = mid_to_end.matrix().transpose() * mid_by_gyro + So3::right_jacobian(&phi2) * d_phi2;
         let (force_mid, force_end) = (r_mid * fm, r_end * f1);
         let (mid_force_by_gyro, end_force_by_gyro) =
             (-(r_mid * hat(&fm)) * mid_by_gyro, -(r_end * hat(&f1)) * end_by_gyro);
@@ -315,10 +314,7 @@ impl Preintegration {
         NavState {
             world_from_body: Se3::new(
                 start.rotation * rotation,
-                start.translation
-                    + state.velocity * t
-                    + gravity * (0.5 * t * t)
-                    + start.rotation * position,
+                start.translation + state.velocity * t + gravity * (0.5 * t * t) + start.rotation * position,
             ),
             velocity: state.velocity + gravity * t + start.rotation * velocity,
             bias: state.bias,

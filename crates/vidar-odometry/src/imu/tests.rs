@@ -43,12 +43,10 @@ fn runge_kutta(from: f64, until: f64) -> (So3, Vector3<f64>, Vector3<f64>) {
         // The clock of readings is in whole nanoseconds; the rates are exact.
         (r.gyro.0, r.accel.0)
     };
-    let quaternion_rate = |q: &nalgebra::Quaternion<f64>, w: &Vector3<f64>| {
-        q * nalgebra::Quaternion::from_imag(*w) * 0.5
-    };
-    let turn = |q: &nalgebra::Quaternion<f64>, v: &Vector3<f64>| {
-        nalgebra::UnitQuaternion::from_quaternion(*q) * v
-    };
+    let quaternion_rate =
+        |q: &nalgebra::Quaternion<f64>, w: &Vector3<f64>| q * nalgebra::Quaternion::from_imag(*w) * 0.5;
+    let turn =
+        |q: &nalgebra::Quaternion<f64>, v: &Vector3<f64>| nalgebra::UnitQuaternion::from_quaternion(*q) * v;
     let (mut q, mut v, mut p) = (nalgebra::Quaternion::identity(), Vector3::zeros(), Vector3::zeros());
     for k in 0..n {
         let t = from + k as f64 * h;
@@ -137,7 +135,9 @@ fn covariance_of_motion_is_what_noisy_readings_scatter() {
             .iter()
             .map(|s| ImuSample {
                 time: s.time,
-                gyro: AngularRate(s.gyro.0 + random.normal3() * (model.noise.gyro_density * 200.0_f64.sqrt())),
+                gyro: AngularRate(
+                    s.gyro.0 + random.normal3() * (model.noise.gyro_density * 200.0_f64.sqrt()),
+                ),
                 accel: SpecificForce(
                     s.accel.0 + random.normal3() * (model.noise.accel_density * 200.0_f64.sqrt()),
                 ),
@@ -189,7 +189,8 @@ fn transition_agrees_with_numeric_derivatives() {
     let state = NavState { world_from_body: m.world_from_body, velocity: m.velocity, bias: small };
     let end = found.predict(&state);
     let f = |d: &Vector15| found.predict(&state.plus(d)).minus(&end);
-    check_jacobian("transition", &propagate::d_end_d_start(&state, &found), f, &Vector15::zeros(), 1e-6).unwrap();
+    check_jacobian("transition", &propagate::d_end_d_start(&state, &found), f, &Vector15::zeros(), 1e-6)
+        .unwrap();
 }
 
 #[test]
@@ -234,7 +235,10 @@ fn the_buffer_cuts_between_readings_and_tells_gaps() {
     assert!((cut[0].gyro.0 - expected).norm() < 1e-12);
     let gap = buffer.interval(ns(520_000_000), ns(600_000_000), &mut cut).unwrap().unwrap();
     assert_eq!((gap.after, gap.length), (ns(495_000_000), Duration::from_millis(155)));
-    assert!(matches!(buffer.interval(ns(0), ns(2_000_000_000), &mut cut), Err(BufferError::NotCovered { .. })));
+    assert!(matches!(
+        buffer.interval(ns(0), ns(2_000_000_000), &mut cut),
+        Err(BufferError::NotCovered { .. })
+    ));
     assert!(matches!(buffer.interval(ns(5), ns(5), &mut cut), Err(BufferError::NotCovered { .. })));
     assert!(matches!(buffer.push(all[3]), Err(BufferError::NotIncreasing { .. })));
     let mut broken = all[200];

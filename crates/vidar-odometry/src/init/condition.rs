@@ -8,6 +8,8 @@ use std::fmt;
 pub enum Obstacle {
     /// Frames with readings between them.
     Frames,
+    /// Seconds of frames or readings.
+    Seconds,
     /// Tracks that several frames share.
     Tracks,
     /// Parallax between the window's rays that rotation does not explain, degrees.
@@ -16,6 +18,8 @@ pub enum Obstacle {
     ScaleUncertainty,
     /// Change of the scale between successive solutions, relative.
     ScaleAgreement,
+    /// Share of sightings that fit no solution.
+    WrongSightings,
     /// Misfit of the images, χ² per degree of freedom.
     ImageMisfit,
     /// Misfit of the inertial readings, χ² per degree of freedom.
@@ -56,7 +60,7 @@ impl Refusal {
 
     /// Whether the value has to rise (parallax, tracks) rather than fall.
     pub fn wants_more(&self) -> bool {
-        matches!(self.obstacle, Obstacle::Frames | Obstacle::Tracks | Obstacle::Parallax)
+        matches!(self.obstacle, Obstacle::Frames | Obstacle::Seconds | Obstacle::Tracks | Obstacle::Parallax)
     }
 }
 
@@ -64,18 +68,26 @@ impl fmt::Display for Refusal {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let (name, unit, advice) = match self.obstacle {
             Obstacle::Frames => ("frames with readings", "", "wait"),
+            Obstacle::Seconds => ("recorded time", " s", "wait"),
             Obstacle::Tracks => ("shared tracks", "", "show more texture, move less abruptly"),
             Obstacle::Parallax => ("parallax", " deg", "move sideways"),
             Obstacle::ScaleUncertainty => ("std(log scale)", "", "speed up and slow down, move to and fro"),
             Obstacle::ScaleAgreement => ("change of scale between solutions", "", "keep moving"),
-            Obstacle::ImageMisfit => ("image misfit", " per dof", "check the camera calibration and clock offset"),
+            Obstacle::WrongSightings => ("share of sightings that do not fit", "", "avoid moving things"),
+            Obstacle::ImageMisfit => {
+                ("image misfit", " per dof", "check the camera calibration and clock offset")
+            }
             Obstacle::InertialMisfit => ("inertial misfit", " per dof", "check the IMU's noise and axes"),
             Obstacle::Speed => ("speed", " m/s", "check the calibration"),
             Obstacle::AccelBias => ("accelerometer bias", " m/s²", "move more, turn about two axes"),
             Obstacle::GyroBias => ("gyroscope bias", " rad/s", "check the gyroscope's units and axes"),
             Obstacle::SceneDistance => ("median distance", " m", "move sideways nearer to the scene"),
-            Obstacle::GyroScatter => ("gyroscope scatter", " rad/s", "hold still, or move and start in flight"),
-            Obstacle::AccelScatter => ("accelerometer scatter", " m/s²", "hold still, or move and start in flight"),
+            Obstacle::GyroScatter => {
+                ("gyroscope scatter", " rad/s", "hold still, or move and start in flight")
+            }
+            Obstacle::AccelScatter => {
+                ("accelerometer scatter", " m/s²", "hold still, or move and start in flight")
+            }
             Obstacle::ImageMotion => ("image motion", " px", "hold still, or move and start in flight"),
             Obstacle::SpecificForce => ("mean specific force", " m/s²", "check the accelerometer's units"),
         };

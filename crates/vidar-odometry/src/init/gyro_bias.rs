@@ -26,8 +26,28 @@ const H: f64 = 1e-4;
 /// Farthest that the bias is looked for from the start, rad/s.
 const REACH: f64 = 0.5;
 
-/// The bias that makes all pairs' epipolar planes agree best, from `start`.
-pub(crate) fn gyro_bias<F: Fn(&Bias) -> So3>(pairs: &[RayPair<F>], start: Vector3<f64>) -> Vector3<f64> {
+/// Rays whose normal leaves the epipolar plane by more than this many medians are wrong.
+const OUTLIER_MEDIANS: f64 = 4.0;
+
+/// The bias that makes all pairs' epipolar planes agree best, from `start`; found twice, the second time without rays
+/// that the first solution finds wrong.
+pub(crate) fn gyro_bias<F: Fn(&Bias) -> So3>(pairs: &mut [RayPair<F>], start: Vector3<f64>) -> Vector3<f64> {
+    let first = minimise(pairs, start);
+    let bias = Bias { gyro: first, accel: Vector3::zeros() };
+    for pair in pairs.iter_mut() {
+        let rotation = (pair.rotation)(&bias).matrix();
+        let eigen = scatter(&pair.rays, &rotation).symmetric_eigen();
+        let along = eigen.eigenvectors.column(eigen.eigenvalues.imin()).into_owned();
+        let misfit = |(a, b): &(Vector3<f64>, Vector3<f64>)| a.cross(&(rotation * b)).dot(&along).abs();
+        let mut all: Vec<f64> = pair.rays.iter().map(misfit).collect();
+        all.sort_unstable_by(f64::total_cmp);
+        let limit = OUTLIER_MEDIANS * all.get(all.len() / 2).copied().unwrap_or(0.0);
+        pair.rays.retain(|r| misfit(r) <= limit);
+    }
+    minimise(pairs, start)
+}
+
+fn minimise<F: Fn(&Bias) -> So3>(pairs: &[RayPair<F>], start: Vector3<f64>) -> Vector3<f64> {
     let cost = |gyro: &Vector3<f64>| -> f64 {
         let bias = Bias { gyro: *gyro, accel: Vector3::zeros() };
         pairs.iter().map(|p| smallest_eigenvalue(&p.rays, &(p.rotation)(&bias).matrix())).sum()
@@ -62,12 +82,17 @@ pub(crate) fn gyro_bias<F: Fn(&Bias) -> So3>(pairs: &[RayPair<F>], start: Vector
 }
 
 fn smallest_eigenvalue(rays: &[(Vector3<f64>, Vector3<f64>)], rotation: &Matrix3<f64>) -> f64 {
+    scatter(rays, rotation).symmetric_eigenvalues().min()
+}
+
+/// `Σ n nᵀ` of the epipolar planes' normals.
+fn scatter(rays: &[(Vector3<f64>, Vector3<f64>)], rotation: &Matrix3<f64>) -> Matrix3<f64> {
     let mut m = Matrix3::zeros();
     for (a, b) in rays {
         let n = a.cross(&(rotation * b));
         m += n * n.transpose();
     }
-    m.symmetric_eigenvalues().min()
+    m
 }
 
 fn derivatives(
@@ -83,7 +108,8 @@ fn derivatives(
         hessian[(k, k)] = (plus - 2.0 * value + minus) / (H * H);
         for j in 0..k {
             let (a, b) = (unit(k) + unit(j), unit(k) - unit(j));
-            let mixed = (cost(&(at + a)) - cost(&(at + b)) - cost(&(at - b)) + cost(&(at - a))) / (4.0 * H * H);
+            let mixed =
+                (cost(&(at + a)) - cost(&(at + b)) - cost(&(at - b)) + cost(&(at - a))) / (4.0 * H * H);
             hessian[(k, j)] = mixed;
             hessian[(j, k)] = mixed;
         }

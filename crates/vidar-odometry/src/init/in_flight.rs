@@ -4,7 +4,7 @@ use super::condition::{Obstacle, Refusal};
 use super::gyro_bias::{RayPair, gyro_bias};
 use super::linear::{self, LinearSolution, LinearView, Rays};
 use super::still::leveled;
-use crate::estimator::{AnchorSigmas, Observation, Smoother, SmootherConfig, SmootherError};
+use crate::estimator::{AnchorSigmas, Observation, OptimiseReport, Smoother, SmootherConfig, SmootherError};
 use crate::imu::{Bias, NavState, Preintegration};
 use nalgebra::{Matrix2, Matrix3, Vector2, Vector3};
 use rustc_hash::FxHashMap;
@@ -41,6 +41,8 @@ pub struct LoggedFrame {
 pub struct InFlightConfig {
     /// Longest stretch of the log that is used, s, 0.5…10.
     pub window_secs: f64,
+    /// Shortest stretch that is tried, s, 0.2…5.
+    pub min_secs: f64,
     /// Most frames that are chosen from it, 5…15.
     pub keyframes: usize,
     /// Fewest tracks that at least three chosen frames share, 10…500.
@@ -63,6 +65,7 @@ impl Default for InFlightConfig {
     fn default() -> Self {
         Self {
             window_secs: 2.8,
+            min_secs: 0.7,
             keyframes: 15,
             min_tracks: 25,
             min_parallax_deg: 1.0,
@@ -103,7 +106,49 @@ const MAX_GYRO_BIAS: f64 = 0.3;
 const MAX_MISFIT: f64 = 3.0;
 
 /// Steps of the window's solution.
-const STEPS: usize = 12;
+const STEPS: usize = 20;
+
+/// Damping that the window's solution begins with: its start is rough.
+const FIRST_LAMBDA: f64 = 3e-3;
+
+/// What rays miss their points by in the linear system, relative to their noise: rotations are only as good as the first
+/// gyroscope bias, and an accelerometer bias must not make up for that.
+const LINEAR_INFLATION: f64 = 100.0;
+
+/// A gyroscope bias that an earlier solution knows this well (rad/s) is taken over.
+const KNOWN_GYRO_BIAS: f64 = 5e-3;
+
+/// Scales of the linear solution that the window is solved from, until one fits.
+const SCALES: [f64; 4] = [1.0, 3.0, 9.0, 0.4];
+
+/// Inertial χ² per degree of freedom of a window that fits. Most of these degrees of freedom follow the images, so what
+/// fits lies far below 1.
+const GOOD_INERTIAL_FIT: f64 = 0.4;
+
+/// Share of sightings that may be left out as wrong.
+const MOST_LEFT_OUT: f64 = 0.2;
+
+/// How well a solved window fits.
+#[derive(Clone, Copy, Debug)]
+struct Fit {
+    /// χ² per degree of freedom of the sightings kept.
+    image: f64,
+    /// χ² per degree of freedom of the readings.
+    inertial: f64,
+    /// Share of sightings that were left out.
+    left_out: f64,
+    converged: bool,
+}
+
+impl Fit {
+    fn is_good(&self) -> bool {
+        self.converged && self.inertial < GOOD_INERTIAL_FIT && self.left_out < MOST_LEFT_OUT
+    }
+
+    fn badness(&self) -> f64 {
+        self.inertial / GOOD_INERTIAL_FIT + self.left_out / MOST_LEFT_OUT + f64::from(u8::from(!self.converged))
+    }
+}
 
 /// Finds the first metric state in motion. Give it the log whenever a frame came; it remembers its last solution.
 #[derive(Clone, Debug)]
@@ -113,6 +158,7 @@ pub struct InFlightStart {
     camera: CameraModel,
     body_from_camera: Se3,
     gyro_bias: Vector3<f64>,
+    gyro_bias_known: bool,
     last: Option<Vec<(FrameId, Vector3<f64>)>>,
 }
 
@@ -143,6 +189,7 @@ impl InFlightStart {
             camera,
             body_from_camera,
             gyro_bias: Vector3::zeros(),
+            gyro_bias_known: false,
             last: None,
         }
     }
@@ -154,6 +201,7 @@ impl InFlightStart {
 
     /// Starts over.
     pub fn forget(&mut self) {
+        self.gyro_bias_known = false;
         self.last = None;
     }
 
@@ -170,6 +218,13 @@ impl InFlightStart {
 
     fn solve(&mut self, log: &[LoggedFrame]) -> Result<Result<Started, Refusal>, SmootherError> {
         let mut views = self.choose(log);
+        let span = match (views.first(), views.last()) {
+            (Some(first), Some(last)) => (last.logged.time - first.logged.time).as_secs_f64(),
+            _ => 0.0,
+        };
+        if !(span >= self.config.min_secs) {
+            return Ok(Err(Refusal::new(Obstacle::Seconds, span, self.config.min_secs)));
+        }
         if views.len() < 5 {
             return Ok(Err(Refusal::new(Obstacle::Frames, views.len() as f64, 5.0)));
         }
@@ -178,7 +233,9 @@ impl InFlightStart {
             let wanted = self.config.min_tracks as f64;
             return Ok(Err(Refusal::new(Obstacle::Tracks, tracks.len() as f64, wanted)));
         }
-        self.find_gyro_bias(&views, &tracks);
+        if !self.gyro_bias_known {
+            self.find_gyro_bias(&views, &tracks);
+        }
         let bias = Bias { gyro: self.gyro_bias, accel: Vector3::zeros() };
         views.iter_mut().filter_map(|v| v.readings.as_mut()).for_each(|r| r.reintegrate(bias));
         let turns = self.turns(&views, &bias);
@@ -188,11 +245,30 @@ impl InFlightStart {
             return Ok(Err(Refusal::new(Obstacle::Parallax, parallax, self.config.min_parallax_deg)));
         }
         let Some(first) = self.linear_start(&views, &tracks, &turns) else {
-            return Ok(Err(Refusal::new(Obstacle::ScaleUncertainty, f64::INFINITY, self.config.max_log_scale_sigma)));
+            return Ok(Err(Refusal::new(
+                Obstacle::ScaleUncertainty,
+                f64::INFINITY,
+                self.config.max_log_scale_sigma,
+            )));
         };
-        let mut smoother = self.build(&views, &tracks, &turns, &first)?;
-        let image_misfit = self.refine(&mut smoother);
-        Ok(self.judge(smoother, image_misfit))
+        let mut best: Option<(Smoother, Fit)> = None;
+        // The linear system leans towards small scenes, where every miss is short; larger ones are tried when it failed.
+        for scale in SCALES {
+            let mut smoother = self.build(&views, &tracks, &turns, &first.scaled(scale))?;
+            let fit = self.refine(&mut smoother);
+            let good = fit.is_good();
+            if best.as_ref().is_none_or(|(_, held)| fit.badness() < held.badness()) {
+                best = Some((smoother, fit));
+            }
+            if good {
+                break;
+            }
+        }
+        let Some((mut smoother, fit)) = best else {
+            return Ok(Err(Refusal::new(Obstacle::Frames, 0.0, 1.0)));
+        };
+        self.learn_gyro_bias(&mut smoother);
+        Ok(self.judge(smoother, &fit))
     }
 
     /// Chooses frames over the end of the log and joins their readings.
@@ -200,7 +276,8 @@ impl InFlightStart {
         let Some(newest) = log.last() else { return Vec::new() };
         // A frame without readings cannot be tied to what came before it.
         let chained = log.iter().rposition(|f| f.readings.is_none()).unwrap_or(0);
-        let within = |f: &&LoggedFrame| (newest.time - f.time).as_secs_f64() <= self.config.window_secs + 1e-6;
+        let within =
+            |f: &&LoggedFrame| (newest.time - f.time).as_secs_f64() <= self.config.window_secs + 1e-6;
         let log = &log[chained..];
         let log = &log[log.len() - log.iter().rev().take_while(within).count()..];
         let most = self.config.keyframes.min(self.smoother_config.max_frames - 1).max(3);
@@ -254,7 +331,7 @@ impl InFlightStart {
     fn find_gyro_bias(&mut self, views: &[View<'_>], tracks: &[Track]) {
         let camera_turn = self.body_from_camera.rotation;
         let mut pairs = Vec::new();
-        for apart in [1, 3] {
+        for apart in [1, views.len() / 3, views.len() / 2] {
             for i in 0..views.len().saturating_sub(apart) {
                 let j = i + apart;
                 let ray = |t: &Track, k: usize| t.seen.iter().find(|(v, ..)| *v == k).map(|(.., ray)| *ray);
@@ -272,7 +349,7 @@ impl InFlightStart {
             }
         }
         if !pairs.is_empty() {
-            self.gyro_bias = gyro_bias(&pairs, self.gyro_bias);
+            self.gyro_bias = gyro_bias(&mut pairs, self.gyro_bias);
         }
     }
 
@@ -295,7 +372,10 @@ impl InFlightStart {
             .map(|t| {
                 let ray = |s: &(usize, Seen, Vector3<f64>)| turns[s.0] * (camera * s.2);
                 let first = ray(&t.seen[0]);
-                t.seen.iter().map(|s| first.cross(&ray(s)).norm().atan2(first.dot(&ray(s)))).fold(0.0, f64::max)
+                t.seen
+                    .iter()
+                    .map(|s| first.cross(&ray(s)).norm().atan2(first.dot(&ray(s))))
+                    .fold(0.0, f64::max)
             })
             .collect();
         widest.sort_unstable_by(f64::total_cmp);
@@ -328,7 +408,12 @@ impl InFlightStart {
             .iter()
             .map(|t| t.seen.iter().map(|(k, _, ray)| (*k, turns[*k] * (camera * *ray))).collect())
             .collect();
-        linear::solve(&linear_views, &rays, self.ray_sigma_rad(tracks), self.config.accel_bias_sigma)
+        linear::solve(
+            &linear_views,
+            &rays,
+            LINEAR_INFLATION * self.ray_sigma_rad(tracks),
+            self.config.accel_bias_sigma,
+        )
     }
 
     fn ray_sigma_rad(&self, tracks: &[Track]) -> f64 {
@@ -400,43 +485,63 @@ impl InFlightStart {
         Ok(smoother)
     }
 
-    /// Solves the window, leaves out what does not fit, and solves again. Returns χ² per degree of freedom.
-    fn refine(&self, smoother: &mut Smoother) -> f64 {
-        let mut report = smoother.optimise(STEPS);
-        for _ in 0..2 {
-            if report.outliers.is_empty() {
+    /// Solves the window, leaves out what does not fit, and solves again.
+    fn refine(&self, smoother: &mut Smoother) -> Fit {
+        let mut report = OptimiseReport::default();
+        smoother.optimise_from(FIRST_LAMBDA, STEPS, &mut report);
+        let all = report.sightings.max(1) as f64;
+        for _ in 0..3 {
+            if report.outliers.is_empty() && report.converged {
                 break;
             }
             for outlier in &report.outliers {
                 smoother.remove_observation(outlier.frame, outlier.landmark);
             }
-            report = smoother.optimise(STEPS / 2);
+            smoother.optimise_from(FIRST_LAMBDA, STEPS / 2, &mut report);
         }
         let lonely: Vec<LandmarkId> = smoother.landmarks().filter(|l| l.sightings < 2).map(|l| l.id).collect();
         for landmark in lonely {
             smoother.remove_landmark(landmark);
         }
-        report.chi2_per_dof
+        Fit {
+            image: report.chi2_per_dof,
+            inertial: smoother.inertial_chi2_per_dof(),
+            left_out: 1.0 - report.sightings as f64 / all,
+            converged: report.converged,
+        }
+    }
+
+    /// Takes over the gyroscope bias of a solution that knows it, accepted or not: it is the first thing to become sure,
+    /// and the next attempt starts the better for it.
+    fn learn_gyro_bias(&mut self, smoother: &mut Smoother) {
+        let sure = smoother
+            .covariance_of_newest()
+            .is_some_and(|c| (9..12).all(|k| c[(k, k)] < KNOWN_GYRO_BIAS * KNOWN_GYRO_BIAS));
+        if let (true, Some((.., state))) = (sure, smoother.newest()) {
+            if state.bias.gyro.norm() < MAX_GYRO_BIAS {
+                self.gyro_bias = state.bias.gyro;
+                self.gyro_bias_known = true;
+            }
+        }
     }
 
     /// Step 4.
-    fn judge(&mut self, mut smoother: Smoother, image_misfit: f64) -> Result<Started, Refusal> {
+    fn judge(&mut self, mut smoother: Smoother, fit: &Fit) -> Result<Started, Refusal> {
         let places: Vec<(FrameId, Vector3<f64>)> = smoother
             .frames()
             .filter_map(|id| Some((id, smoother.state(id)?.world_from_body.translation)))
             .collect();
         let previous = self.last.replace(places.clone());
         let sigma = smoother.log_scale_sigma().unwrap_or(f64::INFINITY);
-        let fastest = smoother
-            .frames()
-            .filter_map(|id| Some(smoother.state(id)?.velocity.norm()))
-            .fold(0.0, f64::max);
+        let fastest =
+            smoother.frames().filter_map(|id| Some(smoother.state(id)?.velocity.norm())).fold(0.0, f64::max);
         let bias = smoother.newest().map_or(Bias::ZERO, |(.., s)| s.bias);
         let median_distance_m = median(smoother.landmarks().map(|l| 1.0 / l.inverse_distance)).unwrap_or(0.0);
         let at_most = [
             (Obstacle::ScaleUncertainty, sigma, self.config.max_log_scale_sigma),
-            (Obstacle::ImageMisfit, image_misfit, MAX_MISFIT),
-            (Obstacle::InertialMisfit, smoother.inertial_chi2_per_dof(), MAX_MISFIT),
+            (Obstacle::WrongSightings, fit.left_out, MOST_LEFT_OUT),
+            (Obstacle::ImageMisfit, fit.image, MAX_MISFIT),
+            (Obstacle::InertialMisfit, fit.inertial, GOOD_INERTIAL_FIT),
             (Obstacle::Speed, fastest, self.config.max_speed_mps),
             (Obstacle::AccelBias, bias.accel.norm(), MAX_ACCEL_BIAS),
             (Obstacle::GyroBias, bias.gyro.norm(), MAX_GYRO_BIAS),
@@ -468,7 +573,8 @@ fn scale_change(before: &[(FrameId, Vector3<f64>)], now: &[(FrameId, Vector3<f64
     let n = common.len() as f64;
     let (a, b) = common.iter().fold((Vector3::zeros(), Vector3::zeros()), |(a, b), (p, q)| (a + p, b + q));
     let (a, b) = (a / n, b / n);
-    let spread = |of: &dyn Fn(&(Vector3<f64>, Vector3<f64>)) -> f64| common.iter().map(of).sum::<f64>().sqrt();
+    let spread =
+        |of: &dyn Fn(&(Vector3<f64>, Vector3<f64>)) -> f64| common.iter().map(of).sum::<f64>().sqrt();
     let (before, now) = (spread(&|c| (c.0 - a).norm_squared()), spread(&|c| (c.1 - b).norm_squared()));
     Some((now / before.max(1e-12)).ln().abs())
 }

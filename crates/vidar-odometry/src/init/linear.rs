@@ -31,6 +31,14 @@ pub(crate) struct LinearSolution {
     pub(crate) points: Vec<Option<Vector3<f64>>>,
 }
 
+impl LinearSolution {
+    /// The same with path and scene `scale` times as large; gravity stays.
+    pub(crate) fn scaled(&self, scale: f64) -> Self {
+        let points = self.points.iter().map(|p| p.map(|p| p * scale)).collect();
+        Self { velocity: self.velocity * scale, points, ..self.clone() }
+    }
+}
+
 /// Rounds of reweighting by distance and misfit.
 const ROUNDS: usize = 4;
 

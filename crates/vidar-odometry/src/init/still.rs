@@ -47,13 +47,17 @@ const IMPOSSIBLE_FORCE: f64 = 1.5;
 ///
 /// # Errors
 /// What shows that the body is not at rest, with the measured value.
-pub fn rest(readings: &[ImuSample], image_motion_px: Option<f64>, config: &RestConfig) -> Result<Rest, Refusal> {
+pub fn rest(
+    readings: &[ImuSample],
+    image_motion_px: Option<f64>,
+    config: &RestConfig,
+) -> Result<Rest, Refusal> {
     let span = match (readings.first(), readings.last()) {
         (Some(first), Some(last)) => (last.time - first.time).as_secs_f64(),
         _ => 0.0,
     };
     if !(span >= config.min_secs) {
-        return Err(Refusal::new(Obstacle::Frames, span, config.min_secs));
+        return Err(Refusal::new(Obstacle::Seconds, span, config.min_secs));
     }
     let n = readings.len() as f64;
     let mean = |of: fn(&ImuSample) -> Vector3<f64>| readings.iter().map(of).sum::<Vector3<f64>>() / n;

@@ -101,7 +101,8 @@ impl Flight for Course {
         let [position, velocity, acceleration] = self.position(t);
         let [yaw, pitch, roll] = self.angles(t);
         let about = |axis: Vector3<f64>, angle: f64| So3::exp(&(axis * angle));
-        let ahead = about(Vector3::z(), yaw[0]) * about(Vector3::y(), pitch[0]) * about(Vector3::x(), roll[0]);
+        let ahead =
+            about(Vector3::z(), yaw[0]) * about(Vector3::y(), pitch[0]) * about(Vector3::x(), roll[0]);
         // Body rate of R = Rz Ry Rx.
         let (sp, cp) = pitch[0].sin_cos();
         let (sr, cr) = roll[0].sin_cos();

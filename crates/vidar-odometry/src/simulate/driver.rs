@@ -1,7 +1,9 @@
 //! Start and smoother run on tracks, as the whole odometry runs on images.
 
 use super::sensors::{SimulatedFrame, Simulation};
-use crate::estimator::{AnchorSigmas, Departure, Observation, OptimiseReport, Smoother, SmootherConfig, SmootherError};
+use crate::estimator::{
+    AnchorSigmas, Departure, Observation, OptimiseReport, Smoother, SmootherConfig, SmootherError,
+};
 use crate::imu::{Bias, BufferError, ImuBuffer, ImuModel, NavState, Preintegration};
 use crate::init::{Attempt, InFlightConfig, InFlightStart, LoggedFrame, Refusal, Seen};
 use nalgebra::{Vector2, Vector3};
@@ -121,7 +123,10 @@ impl FeatureOdometry {
     ///
     /// # Errors
     /// Readings out of order.
-    pub fn for_simulation(config: FeatureOdometryConfig, simulation: &Simulation) -> Result<Self, BufferError> {
+    pub fn for_simulation(
+        config: FeatureOdometryConfig,
+        simulation: &Simulation,
+    ) -> Result<Self, BufferError> {
         let mut odometry = Self::new(config, simulation.camera.clone(), simulation.body_from_camera);
         simulation.readings.iter().try_for_each(|s| odometry.buffer.push(*s))?;
         Ok(odometry)
@@ -282,7 +287,12 @@ impl FeatureOdometry {
     }
 
     /// Tracks with enough parallax become landmarks, hosted by the first keyframe that saw them.
-    fn add_landmarks(&mut self, smoother: &mut Smoother, id: FrameId, seen: &[Seen]) -> Result<(), SmootherError> {
+    fn add_landmarks(
+        &mut self,
+        smoother: &mut Smoother,
+        id: FrameId,
+        seen: &[Seen],
+    ) -> Result<(), SmootherError> {
         let keyframes: Vec<FrameId> = smoother.keyframes().collect();
         let held: Vec<FrameId> = smoother.frames().collect();
         let body_from_camera = *smoother.body_from_camera();
@@ -299,7 +309,8 @@ impl FeatureOdometry {
             let (Some(first), Some(now)) = (camera_of(host), camera_of(id)) else { continue };
             let rays = (self.camera.unproject(&host_seen.pixel), self.camera.unproject(&s.pixel));
             let (Some(ray), Some(ray_now)) = rays else { continue };
-            let Some(distance) = triangulate(&first, &ray, &now, &ray_now, self.config.min_parallax_deg) else {
+            let Some(distance) = triangulate(&first, &ray, &now, &ray_now, self.config.min_parallax_deg)
+            else {
                 continue;
             };
             let point = first.act(&(ray * distance));
@@ -359,7 +370,13 @@ fn observation(frame: FrameId, seen: &Seen) -> Observation {
 }
 
 /// Distance along the first ray of the point nearest to both rays, if their angle is wide enough and it lies ahead.
-fn triangulate(first: &Se3, ray: &Vector3<f64>, now: &Se3, ray_now: &Vector3<f64>, min_deg: f64) -> Option<f64> {
+fn triangulate(
+    first: &Se3,
+    ray: &Vector3<f64>,
+    now: &Se3,
+    ray_now: &Vector3<f64>,
+    min_deg: f64,
+) -> Option<f64> {
     let (a, b) = (first.rotation * *ray, now.rotation * *ray_now);
     let cross = a.cross(&b);
     let sin2 = cross.norm_squared();

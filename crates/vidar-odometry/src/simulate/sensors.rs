@@ -7,8 +7,8 @@ use crate::init::Seen;
 use nalgebra::{Matrix2, Vector2, Vector3};
 use vidar_core::camera::RadTan;
 use vidar_core::{
-    AngularRate, CameraModel, FrameId, GRAVITY_MPS2, ImuNoise, ImuSample, LandmarkId, LieGroup, Pinhole, Se3, So3,
-    SpecificForce, Timestamp,
+    AngularRate, CameraModel, FrameId, GRAVITY_MPS2, ImuNoise, ImuSample, LandmarkId, LieGroup, Pinhole, Se3,
+    So3, SpecificForce, Timestamp,
 };
 
 /// What to simulate.
@@ -131,8 +131,7 @@ impl Simulation {
             let at = k as f64 / config.camera_rate_hz;
             let motion = flight.motion(from_secs + at);
             let bias = biases[((at * config.imu_rate_hz).round() as usize).min(biases.len() - 1)];
-            let truth =
-                NavState { world_from_body: motion.world_from_body, velocity: motion.velocity, bias };
+            let truth = NavState { world_from_body: motion.world_from_body, velocity: motion.velocity, bias };
             let exposed = flight.motion(from_secs + at + config.time_offset_secs).world_from_body;
             let camera_from_world = (exposed * body_from_camera).inverse();
             let seen = tracker.look(&points, &camera, &camera_from_world, config, &mut random);
@@ -191,7 +190,11 @@ fn scatter_points(flight: &impl Flight, config: &SimulationConfig, random: &mut 
     let areas = [size.y * size.z, size.x * size.z, size.x * size.y];
     let total: f64 = areas.iter().sum();
     let inside = |random: &mut Random| {
-        Vector3::new(random.between(low.x, high.x), random.between(low.y, high.y), random.between(low.z, high.z))
+        Vector3::new(
+            random.between(low.x, high.x),
+            random.between(low.y, high.y),
+            random.between(low.z, high.z),
+        )
     };
     let mut points = Vec::with_capacity(config.points);
     for k in 0..config.points {
