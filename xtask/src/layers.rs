@@ -31,6 +31,8 @@ const RESERVED: &[(&str, &[&str], &str)] = &[
     ("indicatif", &["vidar-cli"], "libraries emit events; the program draws them"),
     ("tiny-skia", &["vidar-view"], "pictures are drawn in one place"),
     ("kiddo", &["vidar-eval"], "nearest neighbours are searched in one place"),
+    ("ureq", &["vidar-hub"], "the network is used in one place, and only when asked for"),
+    ("zip", &["vidar-export"], "archives are read and written in one place, within bounds"),
 ];
 
 /// Reads the workspace's own dependency graph and names every arrow that must not be.
