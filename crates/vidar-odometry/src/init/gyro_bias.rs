@@ -26,25 +26,34 @@ const H: f64 = 1e-4;
 /// Farthest that the bias is looked for from the start, rad/s.
 const REACH: f64 = 0.5;
 
-/// Rays whose normal leaves the epipolar plane by more than this many medians are wrong.
-const OUTLIER_MEDIANS: f64 = 4.0;
+/// Rays whose normal leaves the epipolar plane by more than this many medians are left out of the next round.
+const OUTLIER_MEDIANS: f64 = 3.0;
 
-/// The bias that makes all pairs' epipolar planes agree best, from `start`; found twice, the second time without rays
-/// that the first solution finds wrong.
-pub(crate) fn gyro_bias<F: Fn(&Bias) -> So3>(pairs: &mut [RayPair<F>], start: Vector3<f64>) -> Vector3<f64> {
-    let first = minimise(pairs, start);
-    let bias = Bias { gyro: first, accel: Vector3::zeros() };
-    for pair in pairs.iter_mut() {
-        let rotation = (pair.rotation)(&bias).matrix();
-        let eigen = scatter(&pair.rays, &rotation).symmetric_eigen();
-        let along = eigen.eigenvectors.column(eigen.eigenvalues.imin()).into_owned();
-        let misfit = |(a, b): &(Vector3<f64>, Vector3<f64>)| a.cross(&(rotation * b)).dot(&along).abs();
-        let mut all: Vec<f64> = pair.rays.iter().map(misfit).collect();
-        all.sort_unstable_by(f64::total_cmp);
-        let limit = OUTLIER_MEDIANS * all.get(all.len() / 2).copied().unwrap_or(0.0);
-        pair.rays.retain(|r| misfit(r) <= limit);
+/// Rounds of minimising and choosing rays.
+const ROUNDS: usize = 4;
+
+/// The bias that makes all pairs' epipolar planes agree best, from `start`. Every round uses the rays that fit the
+/// solution of the round before.
+pub(crate) fn gyro_bias<F: Fn(&Bias) -> So3 + Copy>(pairs: &[RayPair<F>], start: Vector3<f64>) -> Vector3<f64> {
+    let mut found = minimise(pairs, start);
+    for _ in 1..ROUNDS {
+        let bias = Bias { gyro: found, accel: Vector3::zeros() };
+        let kept: Vec<RayPair<F>> = pairs.iter().map(|p| fitting(p, &bias)).collect();
+        found = minimise(&kept, found);
     }
-    minimise(pairs, start)
+    found
+}
+
+fn fitting<F: Fn(&Bias) -> So3 + Copy>(pair: &RayPair<F>, bias: &Bias) -> RayPair<F> {
+    let rotation = (pair.rotation)(bias).matrix();
+    let eigen = scatter(&pair.rays, &rotation).symmetric_eigen();
+    let along = eigen.eigenvectors.column(eigen.eigenvalues.imin()).into_owned();
+    let misfit = |(a, b): &(Vector3<f64>, Vector3<f64>)| a.cross(&(rotation * b)).dot(&along).abs();
+    let mut all: Vec<f64> = pair.rays.iter().map(misfit).collect();
+    all.sort_unstable_by(f64::total_cmp);
+    let limit = OUTLIER_MEDIANS * all.get(all.len() / 2).copied().unwrap_or(0.0);
+    let rays = pair.rays.iter().filter(|r| misfit(r) <= limit).copied().collect();
+    RayPair { rays, rotation: pair.rotation }
 }
 
 fn minimise<F: Fn(&Bias) -> So3>(pairs: &[RayPair<F>], start: Vector3<f64>) -> Vector3<f64> {

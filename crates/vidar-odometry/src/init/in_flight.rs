@@ -349,7 +349,7 @@ impl InFlightStart {
             }
         }
         if !pairs.is_empty() {
-            self.gyro_bias = gyro_bias(&mut pairs, self.gyro_bias);
+            self.gyro_bias = gyro_bias(&pairs, self.gyro_bias);
         }
     }
 

@@ -1,1 +1,190 @@
-//! Tests of the start.
+//! Starts that must happen, and those that must not.
+
+use super::gyro_bias::{RayPair, gyro_bias};
+use super::*;
+use crate::imu::{Bias, Preintegration};
+use crate::simulate::{
+    Course, CourseKind, FeatureOdometry, FeatureOdometryConfig, Random, Simulation, SimulationConfig, StepOutput,
+};
+use nalgebra::Vector3;
+use vidar_core::{FrameId, GRAVITY_MPS2, ImuNoise, ImuSample, LieGroup, So3};
+
+fn simulate(course: &Course, config: &SimulationConfig) -> Simulation {
+    Simulation::new(course, 0.0, course.secs, config)
+}
+
+/// Runs until a start is accepted or the recording ends; every refusal on the way, and the start if there was one.
+fn until_started(simulation: &Simulation) -> (Vec<Refusal>, Option<(FrameId, f64, FeatureOdometry)>) {
+    let config = FeatureOdometryConfig::new(&ImuNoise::EUROC, 2.0);
+    let mut odometry = FeatureOdometry::for_simulation(config, simulation).unwrap();
+    let mut refusals = Vec::new();
+    for frame in &simulation.frames {
+        match odometry.push(frame.id, frame.time, &frame.seen).unwrap() {
+            StepOutput::Waiting(refusal) => refusals.extend(refusal),
+            StepOutput::Started { log_scale_sigma, .. } => {
+                return (refusals, Some((frame.id, log_scale_sigma, odometry)));
+            }
+            StepOutput::Running(_) => unreachable!("it starts before it runs"),
+        }
+    }
+    (refusals, None)
+}
+
+#[test]
+fn a_flight_with_speeding_up_and_turning_is_started_metrically() {
+    for seed in [1, 2, 3] {
+        let course = Course { kind: CourseKind::Eight, secs: 8.0, speed: 1.6, phase: seed as f64 };
+        let simulation = simulate(&course, &SimulationConfig { seed, ..Default::default() });
+        let (refusals, started) = until_started(&simulation);
+        let (at, sigma, mut odometry) =
+            started.unwrap_or_else(|| panic!("never started, at last: {}", refusals.last().unwrap()));
+        assert!(sigma <= 0.03, "{sigma}");
+        let truth = &simulation.frames[at.index()].truth;
+        let (_, _, state) = odometry.smoother().unwrap().newest().unwrap();
+        // Gravity fixes inclination; the speed carries the scale.
+        let up = |s: &crate::imu::NavState| s.world_from_body.rotation.inverse() * Vector3::z();
+        let tilt_deg = up(state).angle(&up(truth)).to_degrees();
+        assert!(tilt_deg < 2.0, "seed {seed}: tilt off by {tilt_deg:.2} deg");
+        let ratio = state.velocity.norm() / truth.velocity.norm();
+        assert!((0.85..1.15).contains(&ratio), "seed {seed}: speed {ratio:.3} of the true one");
+        assert!((state.bias.gyro - truth.bias.gyro).norm() < 0.01);
+    }
+}
+
+#[test]
+fn constant_velocity_is_never_accepted() {
+    for (seed, speed) in [(1, 0.4), (2, 1.0), (3, 2.5), (4, 1.5)] {
+        let course = Course { kind: CourseKind::Straight, secs: 6.0, speed, phase: 0.4 * seed as f64 };
+        let simulation = simulate(&course, &SimulationConfig { seed, wall_distance_m: 4.0, ..Default::default() });
+        let (refusals, started) = until_started(&simulation);
+        assert!(started.is_none(), "accepted at {speed} m/s with sigma {:?}", started.map(|s| s.1));
+        let by_scale = refusals.iter().filter(|r| r.obstacle == Obstacle::ScaleUncertainty).count();
+        assert!(by_scale * 2 > refusals.len(), "{} of {} for the scale's sake", by_scale, refusals.len());
+    }
+}
+
+#[test]
+fn pure_rotation_is_never_accepted() {
+    for (seed, speed) in [(1, 0.3), (2, 1.0), (3, 2.0)] {
+        let course = Course { kind: CourseKind::Spin, secs: 6.0, speed, phase: 0.4 * seed as f64 };
+        let simulation = simulate(&course, &SimulationConfig { seed, ..Default::default() });
+        let (refusals, started) = until_started(&simulation);
+        assert!(started.is_none(), "accepted turning at {speed} rad/s with sigma {:?}", started.map(|s| s.1));
+        assert!(!refusals.is_empty());
+    }
+}
+
+#[test]
+fn standing_still_is_not_taken_for_flight() {
+    let course = Course { kind: CourseKind::Still, secs: 5.0, speed: 0.0, phase: 0.3 };
+    let (refusals, started) = until_started(&simulate(&course, &SimulationConfig::default()));
+    assert!(started.is_none());
+    let parallax = refusals.iter().find(|r| r.obstacle == Obstacle::Parallax).unwrap();
+    assert!(parallax.measured < 0.2, "{parallax}");
+    let told = parallax.to_string();
+    assert!(told.starts_with("parallax 0.") && told.ends_with("deg < 1.000 deg: move sideways"), "{told}");
+}
+
+#[test]
+fn gyroscope_bias_is_found_from_epipolar_planes_despite_wrong_tracks() {
+    let mut random = Random::new(21);
+    let truth = Vector3::new(0.03, -0.02, 0.015);
+    let mut pairs = Vec::new();
+    for k in 0..6 {
+        let turn = So3::exp(&(random.normal3() * 0.1));
+        let shift = random.normal3().normalize() * 0.3;
+        let secs = 0.3 + 0.1 * f64::from(k);
+        let mut rays = Vec::new();
+        for n in 0..60 {
+            let point = Vector3::new(random.normal(), random.normal(), 3.0 + random.uniform());
+            let noise = random.normal3() * 1e-3;
+            let a = (point + noise).normalize();
+            let b = (turn.inverse() * (point - shift)).normalize();
+            // One track of sixty is wrong by some 25 px.
+            let b = if n == 7 { (b + random.normal3() * 0.05).normalize() } else { b };
+            rays.push((a, b));
+        }
+        // The gyroscope with its bias reads another turn.
+        let read = turn * So3::exp(&(truth * secs));
+        pairs.push(RayPair { rays, rotation: move |bias: &Bias| read * So3::exp(&(bias.gyro * -secs)) });
+    }
+    let found = gyro_bias(&pairs, Vector3::zeros());
+    assert!((found - truth).norm() < 5e-3, "{found} {truth}");
+}
+
+fn resting(seed: u64) -> (Vec<ImuSample>, Simulation) {
+    let course = Course { kind: CourseKind::Still, secs: 2.0, speed: 0.0, phase: 0.8 };
+    let simulation = simulate(&course, &SimulationConfig { seed, ..Default::default() });
+    (simulation.readings.clone(), simulation)
+}
+
+#[test]
+fn a_body_at_rest_tells_its_inclination_and_gyroscope_bias() {
+    let (readings, simulation) = resting(4);
+    let rest = rest(&readings, Some(0.1), &RestConfig::default()).unwrap();
+    let truth = &simulation.frames[10].truth;
+    assert!((rest.state.bias.gyro - truth.bias.gyro).norm() < 5e-4);
+    let up = |s: &crate::imu::NavState| s.world_from_body.rotation.inverse() * Vector3::z();
+    let off = up(&rest.state).angle(&up(truth));
+    assert!(off < 3.0 * rest.sigmas.tilt_rad, "{off} {}", rest.sigmas.tilt_rad);
+    assert_eq!(rest.state.velocity, Vector3::zeros());
+}
+
+#[test]
+fn what_moves_is_not_at_rest_and_says_why() {
+    let course = Course { kind: CourseKind::Eight, secs: 3.0, speed: 1.0, phase: 0.1 };
+    let simulation = simulate(&course, &SimulationConfig::default());
+    let config = RestConfig::default();
+    let refused = rest(&simulation.readings, None, &config).unwrap_err();
+    assert_eq!(refused.obstacle, Obstacle::GyroScatter);
+    assert!(refused.to_string().contains("gyroscope scatter"), "{refused}");
+    let (mut readings, _) = resting(5);
+    assert_eq!(rest(&readings, Some(2.0), &config).unwrap_err().obstacle, Obstacle::ImageMotion);
+    assert_eq!(rest(&readings[..20], None, &config).unwrap_err().obstacle, Obstacle::Seconds);
+    assert_eq!(rest(&[], None, &config).unwrap_err().obstacle, Obstacle::Seconds);
+    readings.iter_mut().for_each(|r| r.accel.0 /= GRAVITY_MPS2);
+    assert_eq!(rest(&readings, None, &config).unwrap_err().obstacle, Obstacle::SpecificForce);
+    readings[7].accel.0.x = f64::NAN;
+    assert!(rest(&readings, None, &config).is_err());
+}
+
+#[test]
+fn upside_down_is_level_too() {
+    for up in [Vector3::z(), -Vector3::z(), Vector3::x(), Vector3::new(0.3, -0.9, 0.2).normalize()] {
+        let turned = still::leveled(&(up * GRAVITY_MPS2)) * up;
+        assert!((turned - Vector3::z()).norm() < 1e-9, "{up}");
+    }
+}
+
+#[test]
+fn a_log_without_readings_or_tracks_is_refused() {
+    let course = Course { kind: CourseKind::Eight, secs: 3.0, speed: 1.0, phase: 0.1 };
+    let simulation = simulate(&course, &SimulationConfig::default());
+    let mut start = InFlightStart::new(
+        InFlightConfig::default(),
+        crate::estimator::SmootherConfig::default(),
+        simulation.camera.clone(),
+        simulation.body_from_camera,
+    );
+    let refused = |start: &mut InFlightStart, log: &[LoggedFrame]| match start.attempt(log).unwrap() {
+        Attempt::Refused(refusal) => refusal.obstacle,
+        Attempt::Started(_) => panic!("started"),
+    };
+    assert_eq!(refused(&mut start, &[]), Obstacle::Seconds);
+    let frame = |k: usize, readings| LoggedFrame {
+        frame: simulation.frames[k].id,
+        time: simulation.frames[k].time,
+        readings,
+        seen: Vec::new(),
+    };
+    let apart: Vec<LoggedFrame> = (0..40).map(|k| frame(k, None)).collect();
+    assert_eq!(refused(&mut start, &apart), Obstacle::Seconds);
+    let model = crate::imu::ImuModel::from_data_sheet(&ImuNoise::EUROC, 2.0, 2.0);
+    let blind: Vec<LoggedFrame> = (0..40)
+        .map(|k| {
+            let cut = &simulation.readings[10 * k.max(1) - 10..=10 * k.max(1)];
+            frame(k, Some(Preintegration::new(model, Bias::ZERO, cut)))
+        })
+        .collect();
+    assert_eq!(refused(&mut start, &blind), Obstacle::Tracks);
+}
