@@ -126,8 +126,8 @@ pub struct OdometryKeyframe {
     pub world_from_camera: Se3,
     /// Covariance of its pose, relative to the first pose of the segment.
     pub pose_covariance: PoseCovariance,
-    /// The keyframe before it, and the covariance of the pose relative to that one (rotation in this
-    /// keyframe's body, position in that one's).
+    /// The keyframe before it, and the covariance of `previous_from_this · exp(δ)`: rotation, translation, both in
+    /// this keyframe's body axes (vidar-core's tangent).
     pub previous: Option<(KeyframeId, PoseCovariance)>,
     /// Gravity in the world, m/s².
     pub gravity_in_world: Vector3<f64>,

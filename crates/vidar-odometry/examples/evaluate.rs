@@ -2,15 +2,15 @@
 //!
 //! ```text
 //! cargo run --release -p vidar-odometry --example evaluate -- [--mono] [--start S] [--secs S] [--quiet]
-//!     [--trajectory FILE] SEQUENCE...
+//!     [--trajectory FILE] [--set KEY=VALUE]... SEQUENCE...
 //! ```
 //!
 //! A sequence is any folder with images, IMU readings and ground truth that `vidar-dataset` reads. Figures: ATE after the best
 //! rigid motion and after the best similarity, |ln s|, relative error per metre, share of frames with a pose, seconds
-//! from the first image to the first metric pose, time per image on one core (decoding left out), peak memory.
+//! from the first image to the first metric pose, processor time per image (decoding left out), peak memory. `--set` changes
+//! a number of the odometry's configuration.
 
 use std::path::{Path, PathBuf};
-use std::time::Instant;
 use vidar_core::{BodyFrame, Duration, Health, SensorEvent, StampedPose, Trajectory};
 use vidar_dataset::OpenOptions;
 use vidar_eval::{TrajectoryEvalConfig, evaluate_trajectory};
@@ -26,6 +26,7 @@ struct Options {
     secs: Option<f64>,
     verbose: bool,
     trajectory: Option<PathBuf>,
+    settings: Vec<(String, f64)>,
 }
 
 fn options() -> Result<Options, Failure> {
@@ -38,6 +39,11 @@ fn options() -> Result<Options, Failure> {
             "--verbose" => found.verbose = true,
             "--start" => found.start_secs = value()?.parse()?,
             "--secs" => found.secs = Some(value()?.parse()?),
+            "--set" => {
+                let text = value()?;
+                let (key, number) = text.split_once('=').ok_or("--set needs KEY=VALUE")?;
+                found.settings.push((key.to_owned(), number.parse()?));
+            }
             "--trajectory" => found.trajectory = Some(value()?.into()),
             other if other.starts_with("--") => return Err(format!("unknown flag {other}").into()),
             path => found.sequences.push(path.into()),
@@ -123,7 +129,10 @@ fn evaluate(path: &Path, options: &Options) -> Result<(), Failure> {
 
 fn run(dataset: &vidar_dataset::Dataset, options: &Options) -> Result<Run, Failure> {
     let imu = if options.mono { ImuUse::Off } else { ImuUse::Auto };
-    let config = OdometryConfig { imu, ..OdometryConfig::default() };
+    let mut config = OdometryConfig { imu, ..OdometryConfig::default() };
+    for (key, number) in &options.settings {
+        set(&mut config, key, *number)?;
+    }
     let mut odometry = Odometry::new(&dataset.rig, dataset.camera, &config)?;
     let mut run = Run { outputs: Vec::new(), millis: Vec::new(), poses: Vec::new() };
     let mut since_image = 0.0;
@@ -132,9 +141,9 @@ fn run(dataset: &vidar_dataset::Dataset, options: &Options) -> Result<Run, Failu
         if matches!(event, SensorEvent::GroundTruth { .. } | SensorEvent::Depth { .. }) {
             continue;
         }
-        let clock = Instant::now();
+        let clock = processor_secs();
         let output = odometry.push(event)?;
-        since_image += clock.elapsed().as_secs_f64();
+        since_image += processor_secs() - clock;
         if let Some(output) = output {
             run.millis.push(1e3 * since_image);
             since_image = 0.0;
@@ -145,6 +154,20 @@ fn run(dataset: &vidar_dataset::Dataset, options: &Options) -> Result<Run, Failu
         keep(&mut run, output, options.mono);
     }
     Ok(run)
+}
+
+/// Changes one number of the configuration.
+fn set(config: &mut OdometryConfig, key: &str, number: f64) -> Result<(), Failure> {
+    match key {
+        "max_landmarks" => config.max_landmarks = number as usize,
+        "max_keyframes" => config.max_keyframes = number as usize,
+        "iterations" => config.iterations = number as usize,
+        "pixel_noise_px" => config.pixel_noise_px = number,
+        "gyro_noise_factor" => config.gyro_noise_factor = number,
+        "accel_noise_factor" => config.accel_noise_factor = number,
+        other => return Err(format!("no number called {other} in the configuration").into()),
+    }
+    Ok(())
 }
 
 fn keep(run: &mut Run, output: OdometryOutput, mono: bool) {
@@ -181,6 +204,12 @@ fn tum(trajectory: &Trajectory) -> String {
         let _ = writeln!(text, "{} {} {} {} {} {} {} {}", pose.time, t.x, t.y, t.z, q[0], q[1], q[2], q[3]);
     }
     text
+}
+
+/// Processor time of this thread, s: other programs on the machine do not count. Zero where the system does not tell.
+fn processor_secs() -> f64 {
+    let told = std::fs::read_to_string("/proc/thread-self/schedstat").unwrap_or_default();
+    told.split_whitespace().next().and_then(|n| n.parse::<f64>().ok()).unwrap_or(0.0) * 1e-9
 }
 
 /// Peak resident memory of this process; NaN where the system does not tell.

@@ -3,6 +3,8 @@
 mod calibration;
 mod config;
 mod error;
+mod health;
+mod keyframes;
 mod odometry;
 mod output;
 mod running;

@@ -2,7 +2,9 @@
 
 use super::config::{ImuUse, OdometryConfig};
 use super::error::OdometryError;
-use super::output::{LossReason, OdometryOutput, Status, Tracking};
+use super::health::{MAX_IMU_GAP_SECS, Verdict, Watch};
+use super::keyframes::{KeyframeBook, Making, public_state, seen_landmarks};
+use super::output::{DivergenceSign, LossReason, OdometryOutput, Status, Tracking};
 use super::running::{Running, Shot, Step};
 use super::starting::{Found, STILL_SECS, Starting, UNKNOWN_INVERSE};
 use super::stillness::ImuSpread;
@@ -10,13 +12,13 @@ use super::track::HostImage;
 use super::tracker::Tracker;
 use crate::estimator::{Smoother, SmootherError};
 use crate::frontend::{FrontendConfig, Pyramid};
-use crate::imu::{Bias, ImuBuffer, ImuModel, Preintegration};
+use crate::imu::{Bias, ImuBuffer, ImuModel, Preintegration, propagate};
 use crate::init::{Obstacle, Refusal, RestConfig, rest};
 use nalgebra::Vector3;
 use std::collections::VecDeque;
 use std::rc::Rc;
 use vidar_core::{
-    CameraId, Duration, Frame, FrameId, Health, ImuSample, NavState, Rig, RigCamera, SensorEvent, Timestamp,
+    CameraId, Duration, Frame, FrameId, Health, ImuSample, Rig, RigCamera, SensorEvent, Timestamp,
 };
 
 /// Images that may wait for readings of their time.
@@ -66,6 +68,10 @@ pub struct Odometry {
     next_frame: u32,
     segment: u32,
     interval: Vec<ImuSample>,
+    last_host: Option<Rc<HostImage>>,
+    refusal: Refusal,
+    watch: Watch,
+    book: KeyframeBook,
 }
 
 impl Odometry {
@@ -101,6 +107,10 @@ impl Odometry {
             next_frame: 0,
             segment: 0,
             interval: Vec::new(),
+            last_host: None,
+            refusal: Refusal { obstacle: Obstacle::Frames, measured: 0.0, limit: 5.0 },
+            watch: Watch::default(),
+            book: KeyframeBook::default(),
         })
     }
 
@@ -168,10 +178,9 @@ impl Odometry {
         self.imu_model.is_none() || self.imu.newest().is_some_and(|newest| newest >= self.imu_time(frame))
     }
 
-    /// One image. `None` when nothing can be said of it yet.
+    /// One image. `None` when nothing can be said of it.
     fn process(&mut self, frame: Frame) -> Option<OdometryOutput> {
         let time = self.imu_time(&frame);
-        let readings = self.readings_until(time);
         let id = FrameId(self.next_frame);
         self.next_frame = self.next_frame.wrapping_add(1);
         let mut pyramid =
@@ -179,29 +188,97 @@ impl Odometry {
         // The size was checked when the image came.
         pyramid.rebuild(&frame.image).ok()?;
         let host = Rc::new(HostImage { frame: id, pyramid });
-        let spread = self.recent_spread(time);
-        let imu_still = spread.is_some_and(|s| s.is_still());
-        let status = match &mut self.phase {
+        let status = self.status_after(&frame, host, time);
+        self.imu.forget_before(self.last_frame.unwrap_or(time) - Duration::from_millis(1500));
+        Some(OdometryOutput { frame_id: frame.id, time: frame.time, status })
+    }
+
+    fn status_after(&mut self, frame: &Frame, host: Rc<HostImage>, time: Timestamp) -> Status {
+        if let Some(reason) = self.gap_before(time) {
+            self.last_frame = Some(time);
+            self.last_host = Some(host);
+            return self.lose(reason);
+        }
+        let readings = self.readings_until(time);
+        let repeated = self.last_host.as_ref().is_some_and(|l| l.pyramid.level(0) == host.pyramid.level(0));
+        if repeated {
+            self.counts.images_repeated += 1;
+            return self.coast(readings, frame.time);
+        }
+        self.last_host = Some(host.clone());
+        self.last_frame = Some(time);
+        let imu_still = self.recent_spread(time).is_some_and(|s| s.is_still());
+        match &mut self.phase {
             Phase::Starting(starting) => {
                 let found = starting.follow(host.clone(), time, readings);
-                let still = starting.images_still && imu_still;
-                match (spread.filter(|_| still), found) {
-                    (Some(_), _) => self.start_resting(&host, time),
-                    (None, Ok(found)) => self.start_in_flight(found, time),
-                    (None, Err(refusal)) => Status::Waiting(refusal),
+                let resting = starting.images_still && imu_still;
+                match found {
+                    _ if resting => self.start_resting(frame, &host, time),
+                    Ok(found) => self.start_in_flight(found, frame, &host),
+                    Err(refusal) => {
+                        self.refusal = refusal;
+                        Status::Waiting(refusal)
+                    }
                 }
             }
             Phase::Running(running) => {
-                let shot = Shot { host, time, readings, imu_still };
-                match running.step(shot) {
-                    Ok(step) => self.tell(&step, frame.time),
-                    Err(_) => self.lose(LossReason::NoFeatures { secs: 0.0 }),
+                let frame_id = host.frame;
+                match running.step(Shot { host, time, readings, imu_still }) {
+                    Ok(step) => self.tell(&step, frame, frame_id),
+                    Err(_) => {
+                        let (sign, found, limit) = (DivergenceSign::NotFinite, f64::NAN, 0.0);
+                        self.lose(LossReason::Diverged { sign, found, limit })
+                    }
                 }
             }
+        }
+    }
+
+    /// A stretch without images or readings that cannot be bridged.
+    fn gap_before(&mut self, time: Timestamp) -> Option<LossReason> {
+        let (Phase::Running(_), Some(last)) = (&self.phase, self.last_frame) else { return None };
+        let secs = (time - last).as_secs_f64();
+        if secs > self.config.max_blind_secs {
+            return Some(LossReason::ImageGap { secs });
+        }
+        self.imu_model?;
+        match self.imu.interval(last, time, &mut self.interval) {
+            Ok(Some(gap)) if gap.length.as_secs_f64() > MAX_IMU_GAP_SECS => {
+                Some(LossReason::ImuGap { secs: gap.length.as_secs_f64() })
+            }
+            Ok(_) => None,
+            Err(_) => Some(LossReason::ImuGap { secs }),
+        }
+    }
+
+    /// The state carried forward by the IMU, for an image that tells nothing.
+    fn coast(&mut self, readings: Option<Preintegration>, time: Timestamp) -> Status {
+        let Phase::Running(running) = &mut self.phase else { return Status::Waiting(self.refusal) };
+        let Some(state) = running.state() else { return Status::Waiting(self.refusal) };
+        let covariance = running.smoother.covariance_of_newest().unwrap_or_else(nalgebra::SMatrix::zeros);
+        let (state, covariance) = match &readings {
+            Some(readings) => {
+                let carried = propagate(&state, &covariance, readings);
+                (carried.state, carried.covariance)
+            }
+            None => (state, covariance),
         };
-        self.last_frame = Some(time);
-        self.imu.forget_before(time - Duration::from_millis(1500));
-        Some(OdometryOutput { frame_id: frame.id, time: frame.time, status })
+        let is_metric = self.imu_model.is_some();
+        let mut tracking = Tracking {
+            segment: self.segment,
+            state: public_state(&state, time),
+            covariance,
+            scale_std: self.watch.scale_std(None),
+            health: Health::Degraded,
+            tracked: 0,
+            landmarks: Vec::new(),
+            keyframe: None,
+            revised: Vec::new(),
+        };
+        if !is_metric {
+            tracking.scale_std = f64::INFINITY;
+        }
+        Status::Tracking(Box::new(tracking))
     }
 
     fn readings_until(&mut self, time: Timestamp) -> Option<Preintegration> {
@@ -227,43 +304,51 @@ impl Odometry {
 
     /// Starts from a body at rest: level and gyroscope bias are known, the velocity is zero, and the scale follows as
     /// soon as the body moves.
-    fn start_resting(&mut self, host: &Rc<HostImage>, time: Timestamp) -> Status {
+    fn start_resting(&mut self, frame: &Frame, host: &Rc<HostImage>, time: Timestamp) -> Status {
         let readings: Vec<ImuSample> = self.imu.iter().filter(|s| s.time <= time).copied().collect();
-        let begin = readings.partition_point(|s| s.time < time - Duration::from_secs_f64(STILL_SECS));
+        // A reading early, so that the span is not shorter than asked for by less than one period.
+        let from = time - Duration::from_secs_f64(STILL_SECS + 0.02);
+        let begin = readings.partition_point(|s| s.time < from);
         let rest = match rest(&readings[begin..], None, &RestConfig::default()) {
             Ok(rest) => rest,
-            Err(refusal) => return Status::Waiting(refusal),
+            Err(refusal) => return self.wait(refusal),
         };
-        let refusal = Refusal { obstacle: Obstacle::Frames, measured: 0.0, limit: 1.0 };
-        let Ok(mut smoother) = self.smoother() else { return Status::Waiting(refusal) };
+        let Ok(mut smoother) = self.smoother() else { return self.wait(self.refusal) };
         let begun = smoother.start(host.frame, time, rest.state, rest.sigmas);
         if begun.and_then(|()| smoother.mark_keyframe(host.frame)).is_err() {
-            return Status::Waiting(refusal);
+            return self.wait(self.refusal);
         }
         let mut tracker = Tracker::new(self.camera.model.clone(), &self.frontend, IMAGE_NOISE_GRAY);
         tracker.detect(host, 2 * self.config.max_landmarks, UNKNOWN_INVERSE);
         let hosts = vec![host.clone()];
         let running = Running::new(self.config.clone(), smoother, tracker, hosts, UNKNOWN_INVERSE);
-        let Some(running) = running else { return Status::Waiting(refusal) };
-        self.phase = Phase::Running(Box::new(running));
-        self.tell(&Step::default(), time - self.camera.time_offset)
+        let Some(running) = running else { return self.wait(self.refusal) };
+        self.begin(running, frame, host.frame)
     }
 
     /// Goes on with the smoother that solved the start.
-    fn start_in_flight(&mut self, found: Found, time: Timestamp) -> Status {
-        let (refusal, waiting) = (
-            Refusal { obstacle: Obstacle::Frames, measured: 0.0, limit: 1.0 },
-            Phase::Starting(Box::new(starting(&self.config, &self.camera, &self.frontend))),
-        );
+    fn start_in_flight(&mut self, found: Found, frame: &Frame, host: &Rc<HostImage>) -> Status {
+        let waiting = Phase::Starting(Box::new(starting(&self.config, &self.camera, &self.frontend)));
         let Phase::Starting(before) = std::mem::replace(&mut self.phase, waiting) else {
-            return Status::Waiting(refusal);
+            return Status::Waiting(self.refusal);
         };
         let typical = 1.0 / found.started.median_distance_m.clamp(0.1, 100.0);
+        self.watch.scale_std(Some(found.started.log_scale_sigma));
         let smoother = found.started.smoother;
         let running = Running::new(self.config.clone(), smoother, before.tracker, found.hosts, typical);
-        let Some(running) = running else { return Status::Waiting(refusal) };
+        let Some(running) = running else { return self.wait(self.refusal) };
+        self.begin(running, frame, host.frame)
+    }
+
+    fn begin(&mut self, running: Running, frame: &Frame, id: FrameId) -> Status {
         self.phase = Phase::Running(Box::new(running));
-        self.tell(&Step::default(), time - self.camera.time_offset)
+        let step = Step { just_started: true, is_keyframe: true, ..Step::default() };
+        self.tell(&step, frame, id)
+    }
+
+    fn wait(&mut self, refusal: Refusal) -> Status {
+        self.refusal = refusal;
+        Status::Waiting(refusal)
     }
 
     fn smoother(&self) -> Result<Smoother, SmootherError> {
@@ -271,38 +356,57 @@ impl Odometry {
     }
 
     /// What is known after a step.
-    fn tell(&mut self, step: &Step, time: Timestamp) -> Status {
-        let Phase::Running(running) = &mut self.phase else {
-            return self.lose(LossReason::NoFeatures { secs: 0.0 });
+    fn tell(&mut self, step: &Step, frame: &Frame, id: FrameId) -> Status {
+        let is_metric = self.imu_model.is_some();
+        let Phase::Running(running) = &mut self.phase else { return Status::Waiting(self.refusal) };
+        let Some(state) = running.state() else { return Status::Waiting(self.refusal) };
+        let smoother = &mut running.smoother;
+        let covariance = smoother.covariance_of_newest().unwrap_or_else(nalgebra::SMatrix::zeros);
+        let now = if is_metric { smoother.log_scale_sigma() } else { None };
+        let scale_std = self.watch.scale_std(now);
+        let health = match self.watch.judge(&state, step, frame.time, is_metric, scale_std, &self.config) {
+            Verdict::Health(health) => health,
+            Verdict::GiveUp(reason) => return self.lose(reason),
         };
-        let Some(state) = running.state() else { return self.lose(LossReason::NoFeatures { secs: 0.0 }) };
-        let covariance = running.smoother.covariance_of_newest().unwrap_or_else(nalgebra::SMatrix::zeros);
-        let scale_std = running.smoother.log_scale_sigma().unwrap_or(f64::INFINITY);
-        let tracked = step.counts.landmarks_found;
-        let health = if tracked < 15 { Health::LowFeatures } else { Health::Ok };
-        Status::Tracking(Box::new(Tracking {
+        let world_from_camera = state.world_from_body * *smoother.body_from_camera();
+        let landmarks = seen_landmarks(smoother, &running.tracker.tracks, &world_from_camera);
+        let mut tracking = Tracking {
             segment: self.segment,
-            state: NavState {
-                time,
-                world_from_body: state.world_from_body,
-                velocity_in_world: state.velocity,
-                gyro_bias: state.bias.gyro,
-                accel_bias: state.bias.accel,
-            },
+            state: public_state(&state, frame.time),
             covariance,
             scale_std,
             health,
-            tracked,
-            landmarks: Vec::new(),
+            tracked: step.fitting,
+            landmarks,
             keyframe: None,
             revised: Vec::new(),
-        }))
+        };
+        if step.is_keyframe {
+            let making = Making {
+                frame: id,
+                caller_frame: frame.id,
+                time: frame.time,
+                segment: self.segment,
+                state: &state,
+                covariance: &covariance,
+                scale_std,
+                health,
+                landmarks: &tracking.landmarks,
+            };
+            tracking.keyframe = Some(Box::new(self.book.make(smoother, &making)));
+        }
+        if step.is_keyframe || !step.left.is_empty() {
+            self.book.revise(smoother, &step.left, &mut tracking.revised);
+        }
+        Status::Tracking(Box::new(tracking))
     }
 
     /// Gives the state up and starts anew.
     fn lose(&mut self, reason: LossReason) -> Status {
         self.phase = Phase::Starting(Box::new(starting(&self.config, &self.camera, &self.frontend)));
-        self.segment += 1;
+        self.watch = Watch::default();
+        self.book.forget_held();
+        self.segment = self.segment.wrapping_add(1);
         Status::Lost(reason)
     }
 }

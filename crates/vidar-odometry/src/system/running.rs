@@ -35,6 +35,10 @@ const KEYFRAME_PARALLAX_PX: f64 = 20.0;
 const KEYFRAME_SECS: f64 = 3.0;
 const KEYFRAME_MIN_FRAMES: u32 = 3;
 
+/// With fewer tracks than this, keyframes are this many frames apart.
+const BLIND_TRACKS: usize = 10;
+const BLIND_FRAMES: u32 = 10;
+
 /// Keyframes that share less than this of their landmarks with the newest frame leave first.
 const KEYFRAME_FORGOTTEN_SHARE: f64 = 0.1;
 
@@ -54,8 +58,14 @@ pub(crate) struct Shot {
 pub(crate) struct Step {
     pub counts: TrackCounts,
     pub report: OptimiseReport,
+    /// Landmarks whose sighting in this image fits.
+    pub fitting: usize,
+    /// Landmarks whose sighting in this image contradicts the others.
+    pub contradicting: usize,
     pub is_keyframe: bool,
     pub is_still: bool,
+    /// This image began the state.
+    pub just_started: bool,
     /// Keyframes that left the window, with their last poses.
     pub left: Vec<(FrameId, NavState)>,
 }
@@ -147,7 +157,8 @@ impl Running {
         }
         self.observe(frame);
         step.report = self.smoother.optimise(self.config.iterations);
-        self.remove_outliers(&step.report, frame);
+        step.contradicting = self.remove_outliers(&step.report, frame);
+        step.fitting = self.tracker.tracks.iter().filter(|t| t.is_landmark && t.measured.is_some()).count();
         self.know_young_tracks(frame)?;
 
         step.is_keyframe = !step.is_still && self.keyframe_is_due(frame, shot.time);
@@ -187,11 +198,13 @@ impl Running {
         }
     }
 
-    /// Takes sightings back that do not fit; a landmark that keeps misfitting goes.
-    fn remove_outliers(&mut self, report: &OptimiseReport, frame: FrameId) {
+    /// Takes sightings back that do not fit; a landmark that keeps misfitting goes. How many of the newest frame's.
+    fn remove_outliers(&mut self, report: &OptimiseReport, frame: FrameId) -> usize {
+        let mut in_newest = 0;
         for outlier in &report.outliers {
             self.smoother.remove_observation(outlier.frame, outlier.landmark);
             if outlier.frame == frame {
+                in_newest += 1;
                 self.tracker.reject(outlier.landmark);
             }
             let sightings = self.smoother.landmark(outlier.landmark).map_or(0, |l| l.sightings);
@@ -200,17 +213,16 @@ impl Running {
                 self.tracker.tracks.retain(|t| t.id != outlier.landmark);
             }
         }
+        in_newest
     }
 
     /// Estimates the distances of young tracks and hands those that are known well enough to the smoother.
     fn know_young_tracks(&mut self, frame: FrameId) -> Result<(), SmootherError> {
         let held = Held(&self.smoother);
         let Some(world_from_current) = held.world_from_camera(frame) else { return Ok(()) };
-        let (mut room, scratch, camera) = (
-            self.config.max_landmarks.saturating_sub(self.smoother.landmark_count()),
-            &mut self.scratch,
-            &self.camera,
-        );
+        let measured = self.tracker.tracks.iter().filter(|t| t.is_landmark && t.measured.is_some()).count();
+        let (mut room, scratch, camera) =
+            (self.config.max_landmarks.saturating_sub(measured), &mut self.scratch, &self.camera);
         let mut promoted = Vec::new();
         self.tracker.tracks.retain_mut(|track| {
             if track.is_landmark || track.measured.is_none() {
@@ -279,6 +291,10 @@ impl Running {
             return true;
         }
         if self.frames_since_keyframe < KEYFRAME_MIN_FRAMES {
+            return false;
+        }
+        if tracked + young < BLIND_TRACKS && self.frames_since_keyframe < BLIND_FRAMES {
+            // Nothing to see: more keyframes would only push out those that know the scene.
             return false;
         }
         let few = (tracked as f64) < KEYFRAME_SHARE * self.keyframe_landmarks as f64

@@ -1,0 +1,173 @@
+//! Whether a running state may be believed, and when to give it up.
+
+use super::config::OdometryConfig;
+use super::output::{DivergenceSign, LossReason};
+use super::running::Step;
+use crate::imu::NavState;
+use vidar_core::{Health, Timestamp};
+
+/// Below these numbers of fitting landmarks a frame has few features, or is as good as blind.
+const FEW_LANDMARKS: usize = 15;
+const BLIND_LANDMARKS: usize = 5;
+
+/// Share of contradicting sightings that makes a frame suspicious; frames in a row that make the state so; and frames
+/// after which it is given up.
+const SUSPICIOUS_SHARE: f64 = 0.5;
+const SUSPICIOUS_FRAMES: u32 = 5;
+const SUSPICIOUS_LIMIT: u32 = 25;
+
+/// Largest biases that are believed, rad/s and m/s².
+const MAX_GYRO_BIAS: f64 = 0.5;
+const MAX_ACCEL_BIAS: f64 = 1.5;
+
+/// Standard deviation of ln(scale) below which the scale counts as settled.
+pub(crate) const SETTLED_SCALE_STD: f64 = 0.02;
+
+/// The longest stretch without readings that is bridged, s.
+pub(crate) const MAX_IMU_GAP_SECS: f64 = 0.5;
+
+/// Watches a running odometry.
+#[derive(Debug, Default)]
+pub(crate) struct Watch {
+    blind_since: Option<Timestamp>,
+    suspicious: u32,
+    /// Best knowledge of the scale so far; what was learned stays in the landmarks' depths.
+    scale_std: Option<f64>,
+}
+
+/// What the watch makes of a frame.
+pub(crate) enum Verdict {
+    Health(Health),
+    GiveUp(LossReason),
+}
+
+impl Watch {
+    /// The scale's standard deviation, after the window says `now`.
+    pub fn scale_std(&mut self, now: Option<f64>) -> f64 {
+        let best = match (self.scale_std, now.filter(|s| s.is_finite())) {
+            (Some(best), Some(now)) => Some(best.min(now)),
+            (best, now) => best.or(now),
+        };
+        self.scale_std = best;
+        best.unwrap_or(f64::INFINITY)
+    }
+
+    /// Judges the state after an image at `time`. `is_metric` says that an IMU gives the scale.
+    pub fn judge(
+        &mut self,
+        state: &NavState,
+        step: &Step,
+        time: Timestamp,
+        is_metric: bool,
+        scale_std: f64,
+        config: &OdometryConfig,
+    ) -> Verdict {
+        if let Some((sign, found, limit)) = self.divergence(state, step, is_metric, config) {
+            return Verdict::GiveUp(LossReason::Diverged { sign, found, limit });
+        }
+        // A body at rest needs no landmark: it is known not to move.
+        let blind = step.fitting < BLIND_LANDMARKS && !step.is_still && !step.just_started;
+        if blind {
+            let since = *self.blind_since.get_or_insert(time);
+            let secs = (time - since).as_secs_f64();
+            let limit = if is_metric { config.max_blind_secs } else { 0.2 * config.max_blind_secs };
+            if secs > limit {
+                return Verdict::GiveUp(LossReason::NoFeatures { secs });
+            }
+            return Verdict::Health(Health::Degraded);
+        }
+        self.blind_since = None;
+        Verdict::Health(match () {
+            () if self.suspicious >= SUSPICIOUS_FRAMES => Health::Suspect,
+            () if !is_metric => Health::ScaleUnknown,
+            () if step.fitting < FEW_LANDMARKS && !step.is_still => Health::LowFeatures,
+            () if scale_std > SETTLED_SCALE_STD => Health::ScaleConverging,
+            () => Health::Ok,
+        })
+    }
+
+    fn divergence(
+        &mut self,
+        state: &NavState,
+        step: &Step,
+        is_metric: bool,
+        config: &OdometryConfig,
+    ) -> Option<(DivergenceSign, f64, f64)> {
+        let share = step.contradicting as f64 / (step.contradicting + step.fitting).max(1) as f64;
+        let enough = step.contradicting + step.fitting >= FEW_LANDMARKS;
+        self.suspicious = if enough && share > SUSPICIOUS_SHARE { self.suspicious + 1 } else { 0 };
+        if !state.is_finite() {
+            return Some((DivergenceSign::NotFinite, f64::NAN, 0.0));
+        }
+        if self.suspicious >= SUSPICIOUS_LIMIT {
+            return Some((DivergenceSign::RejectedShare, share, SUSPICIOUS_SHARE));
+        }
+        if !is_metric {
+            return None;
+        }
+        let checks = [
+            (DivergenceSign::Speed, state.velocity.norm(), config.max_speed_mps),
+            (DivergenceSign::GyroBias, state.bias.gyro.norm(), MAX_GYRO_BIAS),
+            (DivergenceSign::AccelBias, state.bias.accel.norm(), MAX_ACCEL_BIAS),
+        ];
+        checks.into_iter().find(|(_, found, limit)| found > limit)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use vidar_core::Duration;
+
+    fn at(millis: i64) -> Timestamp {
+        Timestamp::from_nanos(0) + Duration::from_millis(millis)
+    }
+
+    fn judge(watch: &mut Watch, fitting: usize, contradicting: usize, millis: i64) -> Verdict {
+        let step = Step { fitting, contradicting, ..Step::default() };
+        watch.judge(&NavState::REST, &step, at(millis), true, 0.01, &OdometryConfig::default())
+    }
+
+    #[test]
+    fn blindness_degrades_at_once_and_is_lost_after_its_time() {
+        let mut watch = Watch::default();
+        assert!(matches!(judge(&mut watch, 50, 0, 0), Verdict::Health(Health::Ok)));
+        assert!(matches!(judge(&mut watch, 10, 0, 50), Verdict::Health(Health::LowFeatures)));
+        assert!(matches!(judge(&mut watch, 2, 0, 100), Verdict::Health(Health::Degraded)));
+        assert!(matches!(judge(&mut watch, 2, 0, 2000), Verdict::Health(Health::Degraded)));
+        let Verdict::GiveUp(LossReason::NoFeatures { secs }) = judge(&mut watch, 2, 0, 2150) else {
+            panic!("blind for more than two seconds")
+        };
+        assert!((secs - 2.05).abs() < 1e-9);
+    }
+
+    #[test]
+    fn contradiction_is_suspected_and_then_given_up() {
+        let mut watch = Watch::default();
+        let words: Vec<bool> = (0..24)
+            .map(|k| matches!(judge(&mut watch, 10, 30, k), Verdict::Health(Health::Suspect)))
+            .collect();
+        assert_eq!(words.iter().filter(|w| **w).count(), 20, "from the fifth frame on");
+        assert!(matches!(judge(&mut watch, 10, 30, 25), Verdict::GiveUp(LossReason::Diverged { .. })));
+        assert!(
+            matches!(judge(&mut watch, 50, 2, 26), Verdict::Health(Health::Ok)),
+            "one good frame clears it"
+        );
+    }
+
+    #[test]
+    fn impossible_states_are_given_up() {
+        let mut fast = NavState::REST;
+        fast.velocity.x = 25.0;
+        let mut biased = NavState::REST;
+        biased.bias.accel.y = -2.0;
+        let mut broken = NavState::REST;
+        broken.velocity.z = f64::NAN;
+        for state in [fast, biased, broken] {
+            let step = Step { fitting: 50, ..Step::default() };
+            let verdict =
+                Watch::default().judge(&state, &step, at(0), true, 0.01, &OdometryConfig::default());
+            assert!(matches!(verdict, Verdict::GiveUp(LossReason::Diverged { .. })));
+        }
+    }
+}

@@ -1,0 +1,114 @@
+//! Keyframes and landmarks as the rest of a map wants them.
+
+use super::track::Track;
+use crate::estimator::Smoother;
+use crate::imu::NavState;
+use nalgebra::Vector3;
+use vidar_core::{
+    FrameId, GRAVITY_MPS2, Health, KeyframeId, LieGroup, NavCovariance, OdometryKeyframe, PoseCovariance,
+    RevisedPose, Se3, SparseLandmark, Timestamp,
+};
+
+/// Names of the keyframes that the smoother holds.
+#[derive(Debug, Default)]
+pub(crate) struct KeyframeBook {
+    next: u32,
+    /// Frame of the smoother and name, oldest first.
+    held: Vec<(FrameId, KeyframeId)>,
+}
+
+/// What a keyframe is made from, besides the smoother.
+pub(crate) struct Making<'a> {
+    /// The frame as the smoother and as the caller know it.
+    pub frame: FrameId,
+    pub caller_frame: FrameId,
+    pub time: Timestamp,
+    pub segment: u32,
+    pub state: &'a NavState,
+    pub covariance: &'a NavCovariance,
+    pub scale_std: f64,
+    pub health: Health,
+    pub landmarks: &'a [SparseLandmark],
+}
+
+impl KeyframeBook {
+    /// Forgets what the smoother held; names go on.
+    pub fn forget_held(&mut self) {
+        self.held.clear();
+    }
+
+    pub fn make(&mut self, smoother: &mut Smoother, making: &Making<'_>) -> OdometryKeyframe {
+        let id = KeyframeId(self.next);
+        self.next = self.next.wrapping_add(1);
+        let previous = self.held.last().and_then(|(frame, id)| {
+            smoother.relative_covariance(*frame, making.frame).map(|covariance| (*id, covariance))
+        });
+        self.held.push((making.frame, id));
+        let pose_covariance: PoseCovariance = making.covariance.fixed_view::<6, 6>(0, 0).into_owned();
+        OdometryKeyframe {
+            id,
+            frame_id: making.caller_frame,
+            segment: making.segment,
+            state: public_state(making.state, making.time),
+            world_from_camera: making.state.world_from_body * *smoother.body_from_camera(),
+            pose_covariance,
+            previous,
+            gravity_in_world: Vector3::new(0.0, 0.0, -GRAVITY_MPS2),
+            scale_std: making.scale_std,
+            health: making.health,
+            landmarks: making.landmarks.to_vec(),
+        }
+    }
+
+    /// Poses of keyframes that left, then of those held.
+    pub fn revise(&mut self, smoother: &Smoother, left: &[(FrameId, NavState)], out: &mut Vec<RevisedPose>) {
+        for (frame, state) in left {
+            if let Some(at) = self.held.iter().position(|(f, _)| f == frame) {
+                let (_, id) = self.held.remove(at);
+                out.push(RevisedPose { id, world_from_camera: camera_of(smoother, state), is_final: true });
+            }
+        }
+        out.extend(self.held.iter().filter_map(|(frame, id)| {
+            let state = smoother.state(*frame)?;
+            Some(RevisedPose { id: *id, world_from_camera: camera_of(smoother, state), is_final: false })
+        }));
+    }
+}
+
+fn camera_of(smoother: &Smoother, state: &NavState) -> Se3 {
+    state.world_from_body * *smoother.body_from_camera()
+}
+
+/// The smoother's state in shared words.
+pub(crate) fn public_state(state: &NavState, time: Timestamp) -> vidar_core::NavState {
+    vidar_core::NavState {
+        time,
+        world_from_body: state.world_from_body,
+        velocity_in_world: state.velocity,
+        gyro_bias: state.bias.gyro,
+        accel_bias: state.bias.accel,
+    }
+}
+
+/// The landmarks that the newest image shows, with their depth from its camera.
+pub(crate) fn seen_landmarks(
+    smoother: &Smoother,
+    tracks: &[Track],
+    world_from_camera: &Se3,
+) -> Vec<SparseLandmark> {
+    let camera_from_world = world_from_camera.inverse();
+    let seen = tracks.iter().filter(|t| t.is_landmark).filter_map(|t| Some((t.id, t.measured?.pixel)));
+    seen.filter_map(|(id, pixel)| {
+        let landmark = smoother.landmark(id)?;
+        let z = camera_from_world.act(&landmark.in_world).z;
+        // The relative deviation is that of the host's ray: the poses' share is in their covariance.
+        let relative = landmark.inverse_distance_sigma / landmark.inverse_distance;
+        (z > 1e-3 && relative.is_finite()).then(|| SparseLandmark {
+            id,
+            pixel,
+            inverse_depth: 1.0 / z,
+            inverse_depth_std: relative / z,
+        })
+    })
+    .collect()
+}
