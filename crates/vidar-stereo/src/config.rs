@@ -59,7 +59,7 @@ impl Default for StereoConfig {
             pose_spread_m: 0.01,
             noise_gray: 1.0,
             agreement_ratio: 0.02,
-            min_confidence: 0.5,
+            min_confidence: 0.3,
         }
     }
 }

@@ -31,7 +31,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     let request = Request::parse(&args)?;
     let config: StereoConfig = toml::from_str(&request.settings.join("\n"))?;
     let recording = Recording::open(&request)?;
-    let mut model = StereoModel::new(config)?;
+    let model = StereoModel::new(config)?;
     let mut score = Score::default();
     let count = recording.keyframes.len();
     let wanted = request.first.min(count)..request.last.min(count);

@@ -55,7 +55,7 @@ impl Score {
                 *count += usize::from((z - t).abs() < limit_m);
             }
             let bin = ((confidence[i] * BINS as f32) as usize).min(BINS - 1);
-            let mut count = |bins: &mut [Bin; BINS]| {
+            let count = |bins: &mut [Bin; BINS]| {
                 bins[bin].count += 1;
                 bins[bin].right += usize::from(error.abs() < TOLERANCE_RATIO);
                 bins[bin].said += f64::from(confidence[i]);
@@ -86,7 +86,7 @@ impl Score {
             self.within_m[0] as f64 / n,
             self.within_m[1] as f64 / n,
         );
-        let mut list = |of: fn(&(f32, f32, f32)) -> f32| {
+        let list = |of: fn(&(f32, f32, f32)) -> f32| {
             let mut values: Vec<f32> = self.misfits.iter().map(of).collect();
             [0.1, 0.5, 0.9].map(|share| quantile(&mut values, share))
         };
