@@ -14,8 +14,8 @@ use std::ops::Range;
 use std::sync::Arc;
 use vidar_core::model::ChunkFrame;
 use vidar_core::{
-    ChunkViews, Confidence, FrameId, GeometryModel, GeometryPrediction, Image, LieGroup, ModelError, ModelInfo,
-    RelativeDepth, Se3, So3, ViewGeometry,
+    ChunkViews, Confidence, FrameId, GeometryModel, GeometryPrediction, Image, LieGroup, ModelError,
+    ModelInfo, RelativeDepth, Se3, So3, ViewGeometry,
 };
 
 /// Whether the network is told where the cameras are.
@@ -69,7 +69,8 @@ impl Da3Model {
         config.validate()?;
         let needs_poses = config.mode == PoseMode::Conditioned;
         let description = network.config();
-        if !network.is_any_view() && !(needs_poses && is_metric(&network)) {
+        let answers_poses = network.is_any_view() || (needs_poses && is_metric(&network));
+        if !answers_poses {
             let reason = format!("{} sees one view at a time and finds no poses", description.name);
             return Err(Da3Error::BadInput { what: "model", reason });
         }
@@ -82,13 +83,8 @@ impl Da3Model {
             return Err(Da3Error::BadInput { what: "use_ray_pose", reason });
         }
         let licence = description.variant.map_or("LicenseRef-unknown", |v| v.licence()).to_owned();
-        let info = ModelInfo {
-            name: description.name.clone(),
-            licence,
-            weights_sha256,
-            needs_poses,
-            min_views: 1,
-        };
+        let info =
+            ModelInfo { name: description.name.clone(), licence, weights_sha256, needs_poses, min_views: 1 };
         Ok(Self { network, config, info })
     }
 
@@ -127,10 +123,13 @@ impl Da3Model {
         let told = priors.as_deref().filter(|_| self.network.is_any_view());
         let inputs = Inputs { images: &images, camera_from_world: told, intrinsics: Some(&intrinsics) };
         let hooks = Hooks { cancel, trace: None };
-        let prediction = self.network.infer_with(&inputs, &options, &hooks).map_err(|e| model_error(e, chunk))?;
+        let prediction =
+            self.network.infer_with(&inputs, &options, &hooks).map_err(|e| model_error(e, chunk))?;
         drop(images);
         let answer = match priors {
-            Some(priors) if !self.network.is_any_view() => metric_in_prior_world(prediction, priors, intrinsics, chunk),
+            Some(priors) if !self.network.is_any_view() => {
+                metric_in_prior_world(prediction, priors, intrinsics, chunk)
+            }
             Some(_) => in_prior_world(prediction),
             None => Ok(Placed { frame, prediction }),
         };
@@ -232,7 +231,11 @@ fn metric_in_prior_world(
 
 /// Brings a prediction to `VIDAR`'s conventions. The head's confidence is `c = 1 + exp(l)`; `1 − 1/c` is the logistic
 /// function of the same l, a number in 0…1 in the same order.
-fn collect(placed: &Placed, chunk: &ChunkViews, wanted: Range<usize>) -> Result<GeometryPrediction, ModelError> {
+fn collect(
+    placed: &Placed,
+    chunk: &ChunkViews,
+    wanted: Range<usize>,
+) -> Result<GeometryPrediction, ModelError> {
     let prediction = &placed.prediction;
     let (width, height) = (prediction.width(), prediction.height());
     let lacks = |what: &str| ModelError::Other(format!("the network gave no {what}"));
@@ -246,7 +249,8 @@ fn collect(placed: &Placed, chunk: &ChunkViews, wanted: Range<usize>) -> Result<
         let map = i.checked_sub(prediction.wanted.start).filter(|m| *m < prediction.depth.len());
         let map = map.ok_or_else(|| lacks("depth"))?;
         let (rotation, position) = parts(&rigid_inverse(&poses[i]));
-        let rotation = So3::from_matrix(&rotation).ok_or_else(|| bad("its predicted orientation is no rotation"))?;
+        let rotation =
+            So3::from_matrix(&rotation).ok_or_else(|| bad("its predicted orientation is no rotation"))?;
         let pinhole = from_edge(&intrinsics[i], width, height)
             .ok_or_else(|| bad("its predicted intrinsics are not positive and finite"))?;
         let valid = |d: &f32| if d.is_finite() && *d > 0.0 { *d } else { f32::NAN };

@@ -31,7 +31,8 @@ fn chunk(n: u32, has_poses: bool) -> ChunkViews {
 
 fn model(mode: PoseMode) -> Da3Model {
     let preprocess = PreprocessConfig { process_size_px: 56, ..PreprocessConfig::default() };
-    Da3Model::new(Arc::new(tiny()), Da3ModelConfig { mode, preprocess, ..Da3ModelConfig::default() }, None).unwrap()
+    Da3Model::new(Arc::new(tiny()), Da3ModelConfig { mode, preprocess, ..Da3ModelConfig::default() }, None)
+        .unwrap()
 }
 
 #[test]
@@ -61,7 +62,10 @@ fn prior_poses_come_back_with_depth_in_their_unit() {
         let (a, b) = (view.chunk_from_camera, given.world_from_camera.unwrap());
         assert!((a.translation - b.translation).norm() < 1e-9);
         let expected = given.intrinsics.resized(56, 42).unwrap();
-        assert!((view.intrinsics.cx - expected.cx).abs() < 1e-9 && (view.intrinsics.fx - expected.fx).abs() < 1e-9);
+        assert!(
+            (view.intrinsics.cx - expected.cx).abs() < 1e-9
+                && (view.intrinsics.fx - expected.fx).abs() < 1e-9
+        );
     }
     // Twice the distances between cameras: twice the depth, but for what the network makes of it; poses twice as far.
     let lost = model.predict(&self::chunk(2, false)).unwrap_err();
@@ -99,7 +103,9 @@ fn poses_from_rays_have_a_principal_point_of_their_own() {
     // Random rays are no pinhole: either a camera comes out or the view is named.
     match model.predict(&chunk(2, false)) {
         Ok(found) => assert_ne!(found.views[0].intrinsics.cx, 27.5),
-        Err(error) => assert!(error.to_string().contains("rays") || error.to_string().contains("frame"), "{error}"),
+        Err(error) => {
+            assert!(error.to_string().contains("rays") || error.to_string().contains("frame"), "{error}")
+        }
     }
 }
 
@@ -108,7 +114,8 @@ fn a_network_of_single_views_needs_to_be_metric_and_posed() {
     let config = json::parse(&tiny_json("tiny_metric_v2.safetensors"), "tiny").unwrap();
     let network = Arc::new(Da3::deterministic_of(config, &Da3Options::default()).unwrap());
     for mode in [PoseMode::Free, PoseMode::Conditioned] {
-        let refused = Da3Model::new(Arc::clone(&network), Da3ModelConfig { mode, ..Da3ModelConfig::default() }, None);
+        let refused =
+            Da3Model::new(Arc::clone(&network), Da3ModelConfig { mode, ..Da3ModelConfig::default() }, None);
         assert!(refused.is_err(), "a custom single-view network is not known to be metric");
     }
 }

@@ -37,7 +37,8 @@ fn cameras(n: usize) -> (Vec<Matrix4<f64>>, Vec<Matrix3<f64>>) {
 fn bits(p: &Prediction) -> Vec<u64> {
     let maps = p.depth.iter().chain(p.confidence.iter().flatten());
     let maps = maps.flat_map(|m| m.data().iter().map(|v| u64::from(v.to_bits())));
-    let poses = p.camera_from_world.iter().flatten().flat_map(|m| m.iter().map(|v| v.to_bits()).collect::<Vec<_>>());
+    let poses =
+        p.camera_from_world.iter().flatten().flat_map(|m| m.iter().map(|v| v.to_bits()).collect::<Vec<_>>());
     let rays = p.rays.iter().flatten().flat_map(|r| r.rays.iter().flatten().map(|v| u64::from(v.to_bits())));
     maps.chain(poses).chain(rays).collect()
 }
@@ -98,7 +99,10 @@ fn wanted_views_are_those_of_the_whole() {
     let whole = model.infer(&Inputs::images(&images), &options()).unwrap();
     let part = InferOptions { wanted: Some(1..3), ..options() };
     let part = model.infer(&Inputs::images(&images), &part).unwrap();
-    assert_eq!((part.wanted.clone(), part.depth.len(), part.camera_from_world.as_ref().unwrap().len()), (1..3, 2, 4));
+    assert_eq!(
+        (part.wanted.clone(), part.depth.len(), part.camera_from_world.as_ref().unwrap().len()),
+        (1..3, 2, 4)
+    );
     assert_eq!(part.depth, whole.depth[1..3]);
     assert_eq!(part.camera_from_world, whole.camera_from_world);
     let none = InferOptions { wanted: Some(3..5), ..options() };
@@ -108,7 +112,9 @@ fn wanted_views_are_those_of_the_whole() {
 #[test]
 fn where_the_official_code_raises_the_scale_that_is_seen_is_named() {
     let model = tiny();
-    for (views, evidence) in [(1, ScaleEvidence::Nothing), (2, ScaleEvidence::LengthAlongLine), (5, ScaleEvidence::Similarity)] {
+    for (views, evidence) in
+        [(1, ScaleEvidence::Nothing), (2, ScaleEvidence::LengthAlongLine), (5, ScaleEvidence::Similarity)]
+    {
         let (images, (poses, k)) = (pictures(views as u64), cameras(views));
         let inputs = Inputs::posed(&images, &poses, &k);
         let found = model.infer(&inputs, &options()).unwrap();
@@ -149,13 +155,17 @@ fn pictures_of_two_sizes_are_cut_to_what_they_share() {
     let none = model.infer(&Inputs::images(&[]), &options());
     assert!(matches!(none, Err(Da3Error::ViewCount { found: 0, .. })));
     let empty = [Image::filled(0, 5, [0; 3])];
-    assert!(matches!(model.infer(&Inputs::images(&empty), &options()), Err(Da3Error::BadView { view: 0, .. })));
+    assert!(matches!(
+        model.infer(&Inputs::images(&empty), &options()),
+        Err(Da3Error::BadView { view: 0, .. })
+    ));
 }
 
 #[test]
 fn features_come_in_the_order_of_the_views() {
     let (model, images) = (tiny(), pictures(3));
-    let layers = InferOptions { feature_layers: vec![0, 5], reference: ReferenceStrategy::View(2), ..options() };
+    let layers =
+        InferOptions { feature_layers: vec![0, 5], reference: ReferenceStrategy::View(2), ..options() };
     let found = model.infer(&Inputs::images(&images), &layers).unwrap();
     let maps = &found.features[&5];
     assert_eq!((maps.rows, maps.columns, maps.channels, maps.views.len()), (3, 4, 48, 3));
@@ -186,7 +196,10 @@ fn a_nested_model_answers_in_metres() {
     let images = [image_u8(1, 56, 42), image_u8(5, 56, 42)];
     let found = model.infer(&Inputs::images(&images), &options()).unwrap();
     assert!(found.is_metric && found.scale_factor.unwrap() > 0.0 && found.sky.is_none());
-    assert!(found.confidence.unwrap().iter().any(|c| c.data().contains(&1.0)), "sky has the least confidence");
+    assert!(
+        found.confidence.unwrap().iter().any(|c| c.data().contains(&1.0)),
+        "sky has the least confidence"
+    );
 }
 
 #[test]
@@ -211,9 +224,17 @@ fn a_reference_file_that_is_no_run_is_refused() {
     std::fs::copy(own("tiny_posed_v4.safetensors"), &file).unwrap();
     let check = || vidar_da3::check::check_file(&file, None, &Da3Options::default());
     assert!(check().is_err(), "no manifest");
-    for entry in ["{}", r#"{"kind": "unit-level"}"#, r#"{"kind": "net forward", "model": "?", "views": 1, "H": 14, "W": 14}"#,
-        r#"{"kind": "net forward", "model": "da3-small", "views": 99999999, "H": 14, "W": 14}"#] {
-        std::fs::write(folder.path().join("manifest.json"), format!(r#"{{"files": {{"x.safetensors": {entry}}}}}"#)).unwrap();
+    for entry in [
+        "{}",
+        r#"{"kind": "unit-level"}"#,
+        r#"{"kind": "net forward", "model": "?", "views": 1, "H": 14, "W": 14}"#,
+        r#"{"kind": "net forward", "model": "da3-small", "views": 99999999, "H": 14, "W": 14}"#,
+    ] {
+        std::fs::write(
+            folder.path().join("manifest.json"),
+            format!(r#"{{"files": {{"x.safetensors": {entry}}}}}"#),
+        )
+        .unwrap();
         assert!(check().is_err(), "{entry}");
     }
 }

@@ -52,15 +52,19 @@ fn the_plan_is_near_the_truth_and_a_thousand_calls_leave_nothing_behind() {
         let (found, truth) = peak(|| model.infer(&Inputs::images(&images), &options).unwrap());
         let planned = model.memory_estimate(views, found.height(), found.width()).working as f64;
         let ratio = planned / truth as f64;
-        eprintln!("{views} views of {size}: planned {:.1} MB, used {:.1} MB", planned / 1e6, truth as f64 / 1e6);
+        eprintln!(
+            "{views} views of {size}: planned {:.1} MB, used {:.1} MB",
+            planned / 1e6,
+            truth as f64 / 1e6
+        );
         assert!((0.7..1.6).contains(&ratio), "planned {planned}, used {truth}");
     }
     drop(model);
 
     let model = common::tiny();
-    let images = [image_u8(1, 28, 28)];
+    let images = [image_u8(1, 14, 14)];
     let options = InferOptions {
-        preprocess: PreprocessConfig { process_size_px: 28, ..PreprocessConfig::default() },
+        preprocess: PreprocessConfig { process_size_px: 14, ..PreprocessConfig::default() },
         ..InferOptions::default()
     };
     let run = || drop(model.infer(&Inputs::images(&images), &options).unwrap());

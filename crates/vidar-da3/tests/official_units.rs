@@ -1,5 +1,7 @@
 //! Parts of the official code by themselves: key lists, weights, preprocessing, poses, alignment, rays.
 
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::print_stderr)] // helpers of tests
+
 mod common;
 
 use common::shared;
@@ -67,9 +69,14 @@ fn the_key_lists_are_those_of_the_official_files() {
             let shape: Vec<usize> = serde_json::from_str(parts[1]).unwrap();
             listed.insert(parts[0].to_owned(), shape);
         }
-        let made: BTreeMap<_, _> = parameters(&variant.config()).into_iter().map(|p| (p.name, p.shape)).collect();
+        let made: BTreeMap<_, _> =
+            parameters(&variant.config()).into_iter().map(|p| (p.name, p.shape)).collect();
         for (name, shape) in &listed {
-            assert!(is_ignored(name) || made.get(name) == Some(shape), "{}: {name} {shape:?}", variant.name());
+            assert!(
+                is_ignored(name) || made.get(name) == Some(shape),
+                "{}: {name} {shape:?}",
+                variant.name()
+            );
         }
         for name in made.keys() {
             assert!(listed.contains_key(name), "{}: {name} is not in the official file", variant.name());
@@ -117,14 +124,19 @@ fn preprocessing_is_opencvs() {
         let stored = if whole { format!("{name}.u8") } else { format!("{name}.u8.rows::8") };
         let step = if whole { 1 } else { 8 };
         let expected = file.bytes(&stored);
-        let found: Vec<u8> = (0..image.height()).step_by(step).flat_map(|y| image.row(y)).flatten().copied().collect();
+        let found: Vec<u8> =
+            (0..image.height()).step_by(step).flat_map(|y| image.row(y)).flatten().copied().collect();
         let differing = found.iter().zip(&expected).filter(|(a, b)| a != b).count();
         let worst = found.iter().zip(&expected).map(|(a, b)| a.abs_diff(*b)).max().unwrap();
         let is_cubic = preprocess::plan(w, h, &config).unwrap().iter().any(|s| {
             matches!(s, preprocess::Step::Resize { interpolation: preprocess::Interpolation::Cubic, .. })
         });
         if is_cubic {
-            assert!(worst <= 1 && differing * 10_000 <= found.len(), "{name}: {differing} of {}, {worst}", found.len());
+            assert!(
+                worst <= 1 && differing * 10_000 <= found.len(),
+                "{name}: {differing} of {}, {worst}",
+                found.len()
+            );
         } else {
             assert_eq!(differing, 0, "{name}: {differing} of {}, worst {worst}", found.len());
             let hash = fnv1a64(image.data().iter().flatten().copied());
@@ -228,7 +240,9 @@ fn cameras_from_rays_are_the_official_ones() {
     let mut found: [Vec<f64>; 2] = Default::default();
     for map in maps("synth.camray", "synth.conf") {
         let camera = camera_from_rays(&map, &samples).unwrap();
-        found[0].extend(row_major(&pose::rigid_inverse(&pose::rigid_inverse(&camera.camera_from_world))).iter().take(12));
+        found[0].extend(
+            row_major(&pose::rigid_inverse(&pose::rigid_inverse(&camera.camera_from_world))).iter().take(12),
+        );
         found[1].extend(row_major(&camera.intrinsics(56, 42)));
     }
     close("poses", &found[0], &file.numbers("synth.extrinsics_w2c"), 2e-3);

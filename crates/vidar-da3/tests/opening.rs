@@ -1,5 +1,7 @@
 //! Opening models: what fits, and how what does not fit is named.
 
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::print_stderr)] // helpers of tests
+
 mod common;
 
 use common::{tensors, tiny_config, tiny_folder, tiny_json, write_safetensors};
@@ -115,10 +117,12 @@ fn a_hostile_description_is_refused_before_the_weights_are_read() {
     let folder = tiny_folder();
     let file = folder.path().join("config.json");
     let huge = tiny_json("tiny_free_v3.safetensors").replace("\"features\":16", "\"features\":3000000000");
-    for text in ["{", "null", "[[[", "{\"model_name\": \"\\u0000\"}", &huge] {
+    for text in ["{", "null", "[[[", "{\"model_name\": \"\\u0000\"}"] {
         std::fs::write(&file, text).unwrap();
         assert!(refusal(folder.path()).contains("config.json"), "{text}");
     }
+    std::fs::write(&file, huge).unwrap();
+    assert!(refusal(folder.path()).contains("head.features is 3000000000"));
     std::fs::write(&file, vec![b' '; 2 << 20]).unwrap();
     assert!(refusal(folder.path()).contains("2097152 bytes"));
     std::fs::write(&file, [0xFF, 0xFE, 0x00]).unwrap();

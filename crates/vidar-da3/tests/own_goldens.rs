@@ -6,8 +6,12 @@ use common::own;
 use vidar_da3::check::{CheckReport, Verdict, check_file};
 use vidar_da3::{Da3Options, Isa, Precision, Residency};
 
-const FILES: [&str; 4] =
-    ["tiny_free_v3.safetensors", "tiny_posed_v4.safetensors", "tiny_metric_v2.safetensors", "tiny_nested_v2.safetensors"];
+const FILES: [&str; 4] = [
+    "tiny_free_v3.safetensors",
+    "tiny_posed_v4.safetensors",
+    "tiny_metric_v2.safetensors",
+    "tiny_nested_v2.safetensors",
+];
 
 fn check(file: &str, options: &Da3Options) -> CheckReport {
     check_file(&own(file), None, options).unwrap()
@@ -31,7 +35,15 @@ fn every_layer_of_the_tiny_networks_holds_with_every_set_of_kernels() {
 fn intermediate_results_are_among_what_is_compared() {
     let report = check(FILES[0], &Da3Options::default());
     let names: Vec<&str> = report.rows.iter().map(|r| r.tensor.as_str()).collect();
-    for name in ["patch_embed", "block03", "feat2", "head.refinenet3_aux", "out.ray_conf", "out.extrinsics", "ref_idx"] {
+    for name in [
+        "patch_embed",
+        "block03",
+        "feat2",
+        "head.refinenet3_aux",
+        "out.ray_conf",
+        "out.extrinsics",
+        "ref_idx",
+    ] {
         assert!(names.contains(&name), "{name} is not in {names:?}");
     }
     assert!(report.to_string().contains("rows hold"));
@@ -39,7 +51,7 @@ fn intermediate_results_are_among_what_is_compared() {
 
 #[test]
 fn bf16_keeps_the_depth_within_two_hundredths_of_its_deviation() {
-    // The tiny networks of one view have a tenth of the real ones' width to average rounding over; they are left out.
+    // In the mean square; the tiny networks of one view have too little width to average rounding over.
     for file in &FILES[..2] {
         let report = check(file, &Da3Options { precision: Precision::Bf16, ..Da3Options::default() });
         assert!(report.holds(), "{report}");

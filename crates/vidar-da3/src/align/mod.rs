@@ -22,6 +22,9 @@ const OFFICIAL_RANK_TOLERANCE: f64 = f64::EPSILON;
 /// Share of the first singular value below which the second one is rounding: a straight line.
 const LINE_TOLERANCE: f64 = 1e-9;
 
+/// Spread over distance from the origin below which positions are one place seen through rounding.
+const PLACE_TOLERANCE: f64 = 1e-12;
+
 /// What fixed the scale between given and predicted cameras.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
@@ -92,7 +95,7 @@ pub fn align_cameras(
 }
 
 fn describe(fit: &Fit) -> String {
-    if fit.values[0] > OFFICIAL_RANK_TOLERANCE { "on a line".into() } else { "in one place".into() }
+    if fit.is_place { "in one place".into() } else { "on a line".into() }
 }
 
 /// An Umeyama fit with what is needed to judge it.
@@ -103,7 +106,10 @@ struct Fit {
     values: [f64; 3],
     source_variance: f64,
     official_rank: usize,
+    /// No rotation follows: fewer than three positions, or a line, or one place.
     is_line: bool,
+    /// Not even a length follows.
+    is_place: bool,
 }
 
 impl Fit {
@@ -124,6 +130,7 @@ fn fit(source: &[Vector3<f64>], target: &[Vector3<f64>]) -> Fit {
         covariance += (p - target_mean) * (g - source_mean).transpose() / n;
         source_variance += (g - source_mean).norm_squared() / n;
     }
+    let is_place = is_one_place(source, &source_mean) || is_one_place(target, &target_mean);
     // A matrix that is not finite has no decomposition: the fit is refused as one place.
     let decomposed = covariance.iter().all(|v| v.is_finite()).then(|| covariance.svd(true, true));
     let (mut values, mut rotation, mut trace) = ([0.0; 3], Matrix3::identity(), 0.0);
@@ -144,8 +151,15 @@ fn fit(source: &[Vector3<f64>], target: &[Vector3<f64>]) -> Fit {
         values,
         source_variance,
         official_rank: values.iter().filter(|v| **v > OFFICIAL_RANK_TOLERANCE).count(),
-        is_line: source.len() < 3 || !(values[1] > LINE_TOLERANCE * values[0]),
+        is_line: is_place || source.len() < 3 || !(values[1] > LINE_TOLERANCE * values[0]),
+        is_place,
     }
+}
+
+fn is_one_place(points: &[Vector3<f64>], mean: &Vector3<f64>) -> bool {
+    let spread = points.iter().map(|p| (p - mean).norm()).fold(0.0, f64::max);
+    let size = points.iter().map(|p| p.norm()).fold(0.0, f64::max);
+    !(spread > PLACE_TOLERANCE * size)
 }
 
 /// The scale along the only direction there is; the rotation that fits the cameras' own orientations best.
@@ -158,7 +172,7 @@ fn align_line(predicted: &[Matrix4<f64>], given: &[Matrix4<f64>], full: &Fit) ->
     }
     let rotation = nearest_rotation(&sum);
     let along = full.values[0] / full.source_variance;
-    let is_seen = full.source_variance > 0.0 && along.is_finite() && along > 0.0;
+    let is_seen = !full.is_place && along.is_finite() && along > 0.0;
     let scale = if is_seen { along } else { 1.0 };
     let mean =
         |cameras: &[Matrix4<f64>]| cameras.iter().map(centre).sum::<Vector3<f64>>() / cameras.len() as f64;

@@ -2,7 +2,7 @@
 
 use super::collect::{Collector, Thinning, without_thinning};
 use super::golden::Golden;
-use super::report::{CheckReport, Row, Tolerances, Verdict};
+use super::report::{CheckReport, Measure, Row, Tolerances, Verdict};
 use super::three_rows;
 use crate::da3::Da3;
 use crate::error::Da3Error;
@@ -45,8 +45,10 @@ impl<'a> Comparison<'a> {
             self.rows.push(Row {
                 tensor: name.into(),
                 max_difference: f64::from(worst),
+                rms_difference: (differing as f64 / expected.len().max(1) as f64).sqrt(),
                 deviation: 1.0,
                 tolerance: 0.0,
+                measure: Measure::Largest,
                 verdict,
                 note,
             });
@@ -66,8 +68,10 @@ impl<'a> Comparison<'a> {
         self.rows.push(Row {
             tensor: "ref_idx".into(),
             max_difference: expected.abs_diff(found) as f64,
+            rms_difference: expected.abs_diff(found) as f64,
             deviation: 1.0,
             tolerance: 0.0,
+            measure: Measure::Largest,
             verdict,
             note,
         });
@@ -141,8 +145,10 @@ impl<'a> Comparison<'a> {
         self.rows.push(Row {
             tensor: name.into(),
             max_difference: difference,
+            rms_difference: difference,
             deviation: size,
             tolerance: tolerance.unwrap_or(f64::INFINITY),
+            measure: self.tolerances.measure,
             verdict,
             note: "relative".into(),
         });
@@ -167,7 +173,7 @@ impl<'a> Comparison<'a> {
         let tolerance = self.tolerances.of_output(base, rounding.map(|r| r.max_abs_over_std));
         let deviation = deviation(expected);
         let is_doubtful = self.doubtful_pixels(base, expected.len());
-        let mut worst = 0.0f64;
+        let (mut worst, mut squares) = (0.0f64, 0.0f64);
         let mut left_out = 0;
         for (i, (e, f)) in expected.iter().zip(found).enumerate() {
             if is_doubtful.get(i).copied().unwrap_or(false) {
@@ -176,7 +182,10 @@ impl<'a> Comparison<'a> {
             }
             let difference = (e - f).abs();
             worst = if difference.is_nan() { f64::INFINITY } else { worst.max(difference) };
+            squares += difference * difference;
         }
+        let rms = (squares / (expected.len() - left_out).max(1) as f64).sqrt();
+        let rms_difference = if worst.is_finite() { rms } else { f64::INFINITY };
         let has_all = expected.len() == found.len();
         let mut note = String::new();
         if !has_all {
@@ -193,10 +202,17 @@ impl<'a> Comparison<'a> {
         } else {
             1.0
         };
-        let verdict = if has_all { self.judge(worst / deviation, tolerance) } else { Verdict::Departs };
+        let measure = self.tolerances.measure;
+        let judged = match measure {
+            Measure::Largest => worst,
+            Measure::RootMeanSquare => rms_difference,
+        };
+        let verdict = if has_all { self.judge(judged / deviation, tolerance) } else { Verdict::Departs };
         self.rows.push(Row {
             tensor: name.into(),
             max_difference: worst,
+            rms_difference,
+            measure,
             deviation,
             tolerance: tolerance.unwrap_or(f64::INFINITY),
             verdict,

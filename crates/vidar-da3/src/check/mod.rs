@@ -17,7 +17,7 @@ mod posed;
 mod report;
 
 pub use golden::Golden;
-pub use report::{CheckReport, Row, Tolerances, Verdict};
+pub use report::{CheckReport, Measure, Row, Tolerances, Verdict};
 
 use crate::da3::{Da3, Da3Options};
 use crate::error::Da3Error;
@@ -53,7 +53,9 @@ pub fn check(golden: &Golden, model: &Da3, hooks: &Hooks<'_>) -> Result<CheckRep
         Kind::Posed => Some(posed::net_cameras(golden, &mut comparison)?),
         Kind::Free | Kind::Nested => None,
     };
-    let cameras = given.as_ref().map(|(poses, k)| NetCameras { camera_from_world: poses, intrinsics: k });
+    let cameras = given
+        .as_ref()
+        .map(|g| NetCameras { camera_from_world: &g.camera_from_world, intrinsics: &g.intrinsics });
     let mut options = InferOptions {
         reference: golden.strategy,
         wants_rays: golden.has("out.ray"),

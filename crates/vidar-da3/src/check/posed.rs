@@ -6,24 +6,21 @@ use super::three_rows;
 use crate::da3::Da3;
 use crate::error::Da3Error;
 use crate::infer::{Hooks, InferOptions, Inputs, Prediction};
-use crate::pose::normalise_world;
+use crate::pose::{Cameras, normalise_world};
 use crate::preprocess::{self, PreprocessConfig};
 use crate::weights::deterministic::image_u8;
 use nalgebra::{Matrix3, Matrix4};
 use vidar_core::Image;
 
 /// Cameras as the network is told them, compared on the way with what the reference fed.
-pub(super) fn net_cameras(
-    golden: &Golden,
-    comparison: &mut Comparison<'_>,
-) -> Result<(Vec<Matrix4<f64>>, Vec<Matrix3<f64>>), Da3Error> {
-    let (poses, _) = given(golden)?;
-    let moved = normalise_world(&poses);
+pub(super) fn net_cameras(golden: &Golden, comparison: &mut Comparison<'_>) -> Result<Cameras, Da3Error> {
+    let moved = normalise_world(&given(golden)?.camera_from_world);
     let rows: Vec<f64> =
         moved.iter().flat_map(|m| m.transpose().iter().copied().collect::<Vec<_>>()).collect();
     comparison.tensor("norm_extrinsics", &rows)?;
     let (_, k) = golden.tensor("proc_intrinsics")?;
-    Ok((moved, k.chunks_exact(9).map(Matrix3::from_row_slice).collect()))
+    let intrinsics = k.chunks_exact(9).map(Matrix3::from_row_slice).collect();
+    Ok(Cameras { camera_from_world: moved, intrinsics })
 }
 
 /// Runs inference as a user would, aligned and not, and compares.
@@ -33,7 +30,7 @@ pub(super) fn check_interface(
     hooks: &Hooks<'_>,
     comparison: &mut Comparison<'_>,
 ) -> Result<(), Da3Error> {
-    let (poses, intrinsics) = given(golden)?;
+    let Cameras { camera_from_world: poses, intrinsics } = given(golden)?;
     let bad = |reason: &str| Da3Error::BadGolden {
         place: golden.path().display().to_string(),
         reason: reason.into(),
@@ -90,7 +87,7 @@ fn matrices(all: Option<&[Matrix3<f64>]>) -> Vec<f64> {
     all.unwrap_or_default().iter().flat_map(|k| k.transpose().iter().copied().collect::<Vec<_>>()).collect()
 }
 
-fn given(golden: &Golden) -> Result<(Vec<Matrix4<f64>>, Vec<Matrix3<f64>>), Da3Error> {
+fn given(golden: &Golden) -> Result<Cameras, Da3Error> {
     let (_, poses) = golden.tensor("in_extrinsics")?;
     let (_, intrinsics) = golden.tensor("in_intrinsics")?;
     let poses: Vec<_> = poses.chunks_exact(16).map(Matrix4::from_row_slice).collect();
@@ -100,5 +97,5 @@ fn given(golden: &Golden) -> Result<(Vec<Matrix4<f64>>, Vec<Matrix3<f64>>), Da3E
             format!("{} poses and {} intrinsics for {} views", poses.len(), intrinsics.len(), golden.views);
         return Err(Da3Error::BadGolden { place: golden.path().display().to_string(), reason });
     }
-    Ok((poses, intrinsics))
+    Ok(Cameras { camera_from_world: poses, intrinsics })
 }

@@ -24,7 +24,8 @@ pub struct Da3Config {
     pub networks: Networks,
 }
 
-/// The networks of a model and where their keys begin.
+/// The networks of a model and where their keys begin. There is one of these a model: its size does not matter.
+#[allow(clippy::large_enum_variant)]
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Networks {
     /// One network; keys begin with `model.`.

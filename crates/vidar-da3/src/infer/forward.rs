@@ -5,7 +5,7 @@ use crate::da3::Da3;
 use crate::error::Da3Error;
 use crate::model::backbone::Pixels;
 use crate::model::{AnyView, Model, Nested, Request, SingleAnswer, scale_to_metres};
-use crate::pose;
+use crate::pose::{self, Cameras};
 use crate::ray_pose::{RayMap, camera_from_rays, sample_table};
 use crate::run::Run;
 use nalgebra::{Matrix3, Matrix4};
@@ -131,7 +131,7 @@ fn any_view(
 ) -> Result<NetOutput, Da3Error> {
     let wants_rays = options.wants_rays || options.use_ray_pose;
     let request = Request {
-        cameras: cameras.map(|c| (c.camera_from_world, c.intrinsics)),
+        cameras,
         strategy: options.reference,
         wants_rays,
         layers: &options.feature_layers,
@@ -140,21 +140,20 @@ fn any_view(
     };
     let answer = net.run(run, pixels, &request)?;
     let (width, height) = (pixels.columns, pixels.rows);
-    let mut decoded: Option<(Vec<Matrix4<f64>>, Vec<Matrix3<f64>>)> =
-        answer.codes.map(|codes| codes.iter().map(|code| pose::decode(code, width, height)).unzip());
+    let mut cameras = answer.codes.map(|codes| decode(&codes, width, height));
     let mut views = answer.views;
     if options.use_ray_pose {
-        let mut found = (Vec::new(), Vec::new());
+        let mut found = Cameras::default();
         for map in views.iter().filter_map(|v| v.rays.as_ref()) {
             run.checkpoint()?;
             let camera = camera_from_rays(map, &sample_table(map.rows * map.columns))?;
-            found.1.push(camera.intrinsics(width, height));
-            found.0.push(camera.camera_from_world);
+            found.intrinsics.push(camera.intrinsics(width, height));
+            found.camera_from_world.push(camera.camera_from_world);
         }
-        decoded = Some(found);
+        cameras = Some(found);
         views = views.drain(wanted.clone()).collect();
     }
-    let (camera_from_world, intrinsics) = decoded.unzip();
+    let (camera_from_world, intrinsics) = cameras.map(|c| (c.camera_from_world, c.intrinsics)).unzip();
     let area = width * height;
     let (mut depth, mut confidence) =
         (Vec::with_capacity(views.len() * area), Vec::with_capacity(views.len() * area));
@@ -176,4 +175,9 @@ fn any_view(
         layers: answer.layers,
         reference: answer.reference,
     })
+}
+
+fn decode(codes: &[[f64; 9]], width: usize, height: usize) -> Cameras {
+    let (camera_from_world, intrinsics) = codes.iter().map(|code| pose::decode(code, width, height)).unzip();
+    Cameras { camera_from_world, intrinsics }
 }

@@ -6,10 +6,10 @@ use super::cam_enc::CameraEncoder;
 use super::head::{DenseView, DualDpt, Embeddings, Map};
 use crate::config::NetConfig;
 use crate::error::Da3Error;
+use crate::infer::NetCameras;
 use crate::pose;
 use crate::run::Run;
 use crate::weights::{Residency, Scope, Slot};
-use nalgebra::{Matrix3, Matrix4};
 use std::collections::BTreeMap;
 use std::ops::Range;
 use std::sync::Arc;
@@ -26,7 +26,7 @@ pub(crate) struct AnyView {
 /// What is asked of the network besides depth.
 pub(crate) struct Request<'a> {
     /// Cameras that are known: normalised `camera_from_world` and intrinsics of the pixels.
-    pub cameras: Option<(&'a [Matrix4<f64>], &'a [Matrix3<f64>])>,
+    pub cameras: Option<NetCameras<'a>>,
     pub strategy: ReferenceStrategy,
     pub wants_rays: bool,
     /// Layers whose tokens are wanted.
@@ -68,7 +68,7 @@ impl AnyView {
     }
 
     pub fn run(&self, run: &Run<'_>, pixels: &Pixels<'_>, request: &Request<'_>) -> Result<Answer, Da3Error> {
-        let given = request.cameras.map(|(poses, k)| self.encode(run, pixels, poses, k)).transpose()?;
+        let given = request.cameras.map(|cameras| self.encode(run, pixels, cameras)).transpose()?;
         let tokens = match &given {
             Some(tokens) => CameraTokens::Given(tokens),
             None => CameraTokens::Trained(request.strategy),
@@ -93,16 +93,16 @@ impl AnyView {
         &self,
         run: &Run<'_>,
         pixels: &Pixels<'_>,
-        poses: &[Matrix4<f64>],
-        intrinsics: &[Matrix3<f64>],
+        cameras: NetCameras<'_>,
     ) -> Result<Vec<f32>, Da3Error> {
         let Some(encoder) = &self.cam_enc else {
             let reason = "this network has no camera encoder".into();
             return Err(Da3Error::BadInput { what: "given cameras", reason });
         };
-        let codes: Vec<[f64; 9]> = poses
+        let codes: Vec<[f64; 9]> = cameras
+            .camera_from_world
             .iter()
-            .zip(intrinsics)
+            .zip(cameras.intrinsics)
             .map(|(pose, k)| pose::encode(pose, k, pixels.columns, pixels.rows))
             .collect();
         Ok(encoder.get()?.run(run, &codes))

@@ -21,7 +21,8 @@ use crate::weights::{Residency, Scope};
 use std::sync::Arc;
 use vidar_nn::WeightSource;
 
-/// A model of any kind.
+/// A model of any kind. There is one of these a model: its size does not matter.
+#[allow(clippy::large_enum_variant)]
 pub(crate) enum Model {
     AnyView(AnyView),
     SingleView(SingleView),

@@ -16,6 +16,15 @@ const MIN_TAN: f64 = 1e-6;
 /// Median distance of the cameras below which positions are not scaled up any further.
 const MIN_MEDIAN_DISTANCE: f64 = 0.1;
 
+/// Poses and intrinsics of some views.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Cameras {
+    /// Poses.
+    pub camera_from_world: Vec<Matrix4<f64>>,
+    /// Intrinsics, origin at the edge of the top-left pixel.
+    pub intrinsics: Vec<Matrix3<f64>>,
+}
+
 /// The inverse of a rigid transform, `[Rᵀ | −Rᵀt]`, without assuming that R is exactly a rotation.
 pub fn rigid_inverse(a_from_b: &Matrix4<f64>) -> Matrix4<f64> {
     let (rotation, translation) = parts(a_from_b);

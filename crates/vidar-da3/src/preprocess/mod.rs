@@ -192,7 +192,7 @@ pub fn process(
         let reason = format!("{} for {} images", given.len(), images.len());
         return Err(Da3Error::BadInput { what: "intrinsics", reason });
     }
-    let done: Vec<(Image<[u8; 3]>, Option<Matrix3<f64>>)> = images
+    let done: Vec<Processed> = images
         .par_iter()
         .enumerate()
         .map(|(i, image)| process_one(image, intrinsics.map(|k| k[i]), config).map_err(|e| in_view(i, &e)))
@@ -220,11 +220,14 @@ fn in_view(view: usize, error: &Da3Error) -> Da3Error {
     Da3Error::BadView { view, reason: error.to_string() }
 }
 
+/// A picture and its intrinsics.
+type Processed = (Image<[u8; 3]>, Option<Matrix3<f64>>);
+
 fn process_one(
     image: &Image<[u8; 3]>,
     intrinsics: Option<Matrix3<f64>>,
     config: &PreprocessConfig,
-) -> Result<(Image<[u8; 3]>, Option<Matrix3<f64>>), Da3Error> {
+) -> Result<Processed, Da3Error> {
     let mut current: Option<Image<[u8; 3]>> = None;
     let mut matrix = intrinsics;
     for step in plan(image.width(), image.height(), config)? {

@@ -59,7 +59,10 @@ fn shrinking_weighs_by_the_area_covered() {
 fn intrinsics_follow_with_their_origin_at_the_edge() {
     let k = Matrix3::new(500.0, 0.0, 320.0, 0.0, 500.0, 240.0, 0.0, 0.0, 1.0);
     let resize = Step::Resize { width: 320, height: 120, interpolation: Interpolation::Area };
-    assert_eq!(follow(&k, (640, 480), resize), Matrix3::new(250.0, 0.0, 160.0, 0.0, 125.0, 60.0, 0.0, 0.0, 1.0));
+    assert_eq!(
+        follow(&k, (640, 480), resize),
+        Matrix3::new(250.0, 0.0, 160.0, 0.0, 125.0, 60.0, 0.0, 0.0, 1.0)
+    );
     let crop = Step::Crop { left: 3, top: 5, width: 600, height: 400 };
     assert_eq!(follow(&k, (640, 480), crop)[(0, 2)], 317.0);
 }

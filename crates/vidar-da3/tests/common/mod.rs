@@ -1,6 +1,7 @@
 //! What the tests of this folder share.
 
 #![allow(dead_code)] // each test file uses a part
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::print_stderr)] // helpers of tests
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};

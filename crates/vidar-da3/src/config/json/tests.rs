@@ -54,14 +54,22 @@ fn an_official_name_with_other_sizes_is_not_taken_for_the_official_network() {
 fn wrong_sizes_are_named() {
     let cases = [
         (r#""out_layers": [5, 7, 9, 11]"#, r#""out_layers": [5, 7, 9]"#, "net.out_layers is 3 entries"),
-        (r#""out_layers": [5, 7, 9, 11]"#, r#""out_layers": [5, 7, 9, 12]"#, "net.out_layers is [5, 7, 9, 12]"),
+        (
+            r#""out_layers": [5, 7, 9, 11]"#,
+            r#""out_layers": [5, 7, 9, 12]"#,
+            "net.out_layers is [5, 7, 9, 12]",
+        ),
         (r#""features": 64"#, r#""features": 4000000000"#, "head.features is 4000000000"),
         (r#""features": 64"#, r#""features": 20"#, "a multiple of 8"),
         (r#""name": "vits""#, r#""name": "vitx""#, "net.embed_dim is nothing (net.name is vitx)"),
         (r#""name": "vits""#, r#""name": "vits", "num_heads": 5"#, "a divisor of the width"),
         (r#""alt_start": 4"#, r#""alt_start": 0"#, "net.alt_start is 0, expected 1 to 11"),
         (r#""alt_start": 4"#, r#""alt_start": -1"#, "head.dim_in"),
-        (r#""dim_in": 768, "output_dim""#, r#""dim_in": 700, "output_dim""#, "head.dim_in is Some(700), expected 768"),
+        (
+            r#""dim_in": 768, "output_dim""#,
+            r#""dim_in": 700, "output_dim""#,
+            "head.dim_in is Some(700), expected 768",
+        ),
         (r#"{"dim_out": 384}"#, r#"{"num_heads": 7}"#, "cam_enc.num_heads is 7"),
     ];
     for (from, to, words) in cases {
@@ -72,7 +80,9 @@ fn wrong_sizes_are_named() {
 
 #[test]
 fn what_is_no_description_is_refused() {
-    for text in ["", "[]", "{}", r#"{"model_name": "da3-huge"}"#, r#"{"config": {"anyview": {}}}"#, "{\"config\": 1}"] {
+    for text in
+        ["", "[]", "{}", r#"{"model_name": "da3-huge"}"#, r#"{"config": {"anyview": {}}}"#, "{\"config\": 1}"]
+    {
         assert!(parse(text, "config.json").is_err(), "{text}");
     }
     let deep = format!("{}{}", "{\"config\":{\"anyview\":".repeat(50_000), "}".repeat(100_000));

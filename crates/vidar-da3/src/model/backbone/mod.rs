@@ -51,8 +51,8 @@ pub struct Pixels<'a> {
 impl<'a> Pixels<'a> {
     /// Checks sizes.
     pub fn new(data: &'a [f32], views: usize, rows: usize, columns: usize) -> Result<Self, Da3Error> {
-        let is_whole = rows >= PATCH && columns >= PATCH && rows % PATCH == 0 && columns % PATCH == 0;
-        if views == 0 || !is_whole || data.len() != 3 * views * rows * columns {
+        let is_side = |n: usize| n >= PATCH && n.is_multiple_of(PATCH);
+        if views == 0 || !is_side(rows) || !is_side(columns) || data.len() != 3 * views * rows * columns {
             let reason = format!(
                 "{} numbers for {views} views of {columns}x{rows}; sides must be multiples of {PATCH}",
                 data.len()
@@ -249,7 +249,7 @@ impl Backbone {
         Ok(())
     }
 
-    fn put_reference_first(&self, x: &mut Vec<f32>, length: usize, cameras: CameraTokens<'_>) -> Order {
+    fn put_reference_first(&self, x: &mut [f32], length: usize, cameras: CameraTokens<'_>) -> Order {
         let views = x.len() / length;
         let CameraTokens::Trained(strategy) = cameras else {
             return Order((0..views).collect());

@@ -31,8 +31,11 @@ pub(crate) struct DualDpt {
     rays: Slot<RayBranch>,
     config: HeadConfig,
     /// Embeddings of the picture size seen last.
-    embeddings: Mutex<Option<((usize, usize), Arc<Embeddings>)>>,
+    embeddings: Mutex<Option<OfSize>>,
 }
+
+/// Rows and columns of pictures, and the embeddings at that size.
+type OfSize = ((usize, usize), Arc<Embeddings>);
 
 /// The position embeddings of one picture size.
 pub(crate) struct Embeddings {
@@ -151,7 +154,7 @@ impl RayBranch {
     fn load(scratch: &Scope, features: usize) -> Result<Self, Da3Error> {
         let half = features / 2;
         let conv = |i: usize| {
-            let shape = if i % 2 == 0 { (features, half) } else { (half, features) };
+            let shape = if i.is_multiple_of(2) { (features, half) } else { (half, features) };
             scratch.conv(&format!("output_conv1_aux.3.{i}"), ConvShape::three(shape.0, shape.1))
         };
         Ok(Self {
