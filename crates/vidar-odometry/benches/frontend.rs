@@ -141,16 +141,21 @@ fn landmarks_150(bencher: Bencher<'_, '_>) {
     });
 }
 
-#[divan::bench]
-fn seeds_300(bencher: Bencher<'_, '_>) {
+/// Per cent by which the distance is unknown: new seeds search widely, most of a flight's seeds do not.
+#[divan::bench(args = [5, 20, 100])]
+fn seeds_300(bencher: Bencher<'_, '_>, unknown_percent: u32) {
     let s = scene();
     let config = FrontendConfig::default();
     let mut filter = DepthFilter::new(config.depth_filter, config.matching);
     let motion = s.motion(0, 2);
     bencher.bench_local(|| {
         let mut good = 0.0;
-        for (feature, _) in s.features[0].iter().cycle().take(SEEDS) {
+        for (feature, inverse) in s.features[0].iter().cycle().take(SEEDS) {
             let mut seed = Seed::new(3.0, 1.5);
+            if unknown_percent < 100 {
+                seed.mean = inverse * (1.0 + 0.005 * f64::from(unknown_percent));
+                seed.variance = (inverse * 0.01 * f64::from(unknown_percent)).powi(2);
+            }
             filter.update(&mut seed, &s.camera, feature, &s.pyramids[0], &s.pyramids[2], &motion, 1.0);
             good += seed.good;
         }

@@ -316,11 +316,11 @@ impl DepthFilter {
 /// Shortest segment that is scanned, pixels of the search level; alignment alone reaches as far.
 const DIRECT_PX: f64 = 2.0;
 
-/// Step of the scan, pixels of the search level: half of what correlation peaks measure.
-const STEP_PX: f64 = 0.7;
+/// Step of the scan, pixels of the search level: half of what correlation peaks measure, so that none is stepped over.
+const STEP_PX: f64 = 1.0;
 
 /// Steps within which two good places are the same peak: two pixels.
-const NEIGHBOUR_STEPS: usize = 3;
+const NEIGHBOUR_STEPS: usize = 2;
 
 /// Least cosine between an edge's normal and the epipolar curve (Forster 2017).
 const MIN_EDGE_COSINE: f64 = 0.7;
