@@ -88,6 +88,16 @@ fn unusable_points_are_left_out_and_unusable_queries_find_nothing() {
 }
 
 #[test]
+fn coordinates_at_the_end_of_the_range_neither_panic_nor_win() {
+    let index = NearestIndex::build(&[[f32::MAX, 0.0, 0.0], [1e30, 0.0, 0.0], [2.0, 0.0, 0.0]]).unwrap();
+    assert_eq!((index.len(), index.dropped()), (2, 1));
+    assert_eq!(index.nearest(&[0.0; 3], None).map(|n| (n.index, n.distance_m)), Some((2, 2.0)));
+    let far = NearestIndex::build(&[[1e30, 0.0, 0.0]]).unwrap();
+    // The square of such a distance is beyond single precision.
+    assert_eq!(far.nearest(&[0.0; 3], None), None);
+}
+
+#[test]
 fn one_thread_and_four_give_the_same_bits() {
     let mut state = 5_u64;
     let mut next = || {
@@ -95,7 +105,9 @@ fn one_thread_and_four_give_the_same_bits() {
         (state >> 40) as f32 / (1 << 22) as f32
     };
     // Enough points for the parallel build, enough queries for several tasks.
-    let points: Vec<[f32; 3]> = (0..20_000).map(|_| [next(), next(), 0.125]).collect();
+    let mut points: Vec<[f32; 3]> = (0..20_000).map(|_| [next(), next(), 0.125]).collect();
+    // Equal points are equally near; which of them is named must not depend on threads either.
+    points.extend_from_within(..5_000);
     let queries: Vec<[f32; 3]> = (0..20_000).map(|_| [next(), next(), next()]).collect();
     let with = |threads| {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
