@@ -2,6 +2,21 @@
 
 use serde::{Deserialize, Serialize};
 
+/// Where derivatives are taken, which decides what the smoother believes to know of its heading.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, schemars::JsonSchema)]
+#[serde(rename_all = "kebab-case")]
+pub enum Linearisation {
+    /// Everything at the present states; the prior is corrected by the smallest change that keeps heading as free as it
+    /// was (observability constraint: Hesch, Kottas, Bowman, Roumeliotis, "Camera-IMU-based localization", IJRR 2014).
+    #[default]
+    ObservabilityConstrained,
+    /// States in the prior keep the point of their first use (Huang, Mourikis, Roumeliotis, IJRR 2010). Just as honest
+    /// later, but the rough states of the first seconds stay in every derivative.
+    FirstEstimates,
+    /// Everything at the present states: heading seems better known than it is.
+    Present,
+}
+
 /// Settings of the fixed-lag smoother.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
 #[serde(default, deny_unknown_fields)]
@@ -16,8 +31,8 @@ pub struct SmootherConfig {
     /// Keyframes whose observations a landmark keeps when its host leaves and it lives on with a newer host, 1…20.
     /// What is older goes into the prior.
     pub rehost_keyframes: usize,
-    /// Whether states in the prior keep the linearisation point of their first use (FEJ). Off only for ablation.
-    pub first_estimates: bool,
+    /// How shift and heading stay unobservable. Other values than the default are for comparison.
+    pub linearisation: Linearisation,
     /// Whether the rotation of the camera on the body is estimated, starting from the given one.
     pub estimate_camera_rotation: bool,
     /// Whether the position of the camera on the body is estimated. Needs rotation about two axes.
@@ -39,7 +54,7 @@ impl Default for SmootherConfig {
             huber_sigmas: 1.345,
             outlier_chi2: 9.2,
             rehost_keyframes: 3,
-            first_estimates: true,
+            linearisation: Linearisation::default(),
             estimate_camera_rotation: false,
             estimate_camera_position: false,
             estimate_time_offset: false,
@@ -71,6 +86,10 @@ impl SmootherConfig {
             }
         }
         Ok(())
+    }
+
+    pub(crate) fn first_estimates(&self) -> bool {
+        self.linearisation == Linearisation::FirstEstimates
     }
 
     pub(crate) fn calibrates(&self) -> bool {

@@ -8,7 +8,7 @@ use super::inertial::{anchor_at, body_velocity, jacobians, residual};
 use super::prior::Part;
 use super::visual::{self, CameraPlace};
 use super::window::{CALIBRATION_DIM, Landmark, Sighting};
-use super::{Smoother, SmootherConfig};
+use super::{Linearisation, Smoother, SmootherConfig};
 use crate::imu::NavState;
 use nalgebra::{Matrix3, SMatrix, SVector, Vector2, Vector3};
 use vidar_core::CameraModel;
@@ -261,7 +261,7 @@ pub(crate) fn calibration_weights(config: &SmootherConfig) -> [f64; CALIBRATION_
 impl Smoother {
     /// Fills places and linearisation points of all frames.
     pub(crate) fn place_cameras(&self, system: &mut System) {
-        let fej = self.config.first_estimates;
+        let fej = self.config.first_estimates();
         let (now, at) = (self.calibration.body_from_camera, self.calibration.at(fej));
         system.places.clear();
         system.places_at.clear();
@@ -299,6 +299,8 @@ impl Smoother {
 
     fn add_prior(&mut self, system: &mut System) -> f64 {
         let cost = self.prior.evaluate(&self.frames, &self.calibration);
+        let constrained = self.config.linearisation == Linearisation::ObservabilityConstrained;
+        self.prior.constrain(&self.frames, constrained);
         let prior = &self.prior;
         for (a, &part_a) in prior.parts.iter().enumerate() {
             let row = system.offset(part_a);
@@ -315,11 +317,14 @@ impl Smoother {
                 }
                 system.couple(part_a, part_b);
                 for i in 0..part_a.dim() {
-                    let from = (prior.starts[a] + i) * prior.dim + prior.starts[b];
+                    let at = prior.starts[a] + i;
+                    let from = at * prior.dim + prior.starts[b];
                     let to = (row + i) * system.n + col;
                     let source = &prior.information[from..from + part_b.dim()];
-                    for (target, value) in system.h[to..to + part_b.dim()].iter_mut().zip(source) {
-                        *target += value;
+                    let columns = prior.starts[b]..prior.starts[b] + part_b.dim();
+                    let target = &mut system.h[to..to + part_b.dim()];
+                    for ((target, value), j) in target.iter_mut().zip(source).zip(columns) {
+                        *target += value + prior.correction(at, j);
                     }
                 }
             }

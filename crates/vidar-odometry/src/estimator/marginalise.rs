@@ -13,7 +13,7 @@ use super::linearise::{Scene, System, calibration_weights};
 use super::prior::Part;
 use super::visual;
 use super::window::{CALIBRATION_DIM, Landmark, MAX_INVERSE_DISTANCE, MIN_INVERSE_DISTANCE, Sighting};
-use super::{Smoother, SmootherError};
+use super::{Linearisation, Smoother, SmootherError};
 use crate::imu::Vector15;
 use nalgebra::{SMatrix, SVector};
 use vidar_core::{FrameId, LandmarkId};
@@ -140,6 +140,7 @@ impl Smoother {
         system.factorised = false;
         system.frames = self.frames.len();
         if self.frames.len() > 1 {
+            self.relinearise_prior();
             self.place_cameras(&mut system);
             self.choose_leaving(gone, &mut bench);
             self.lay_out(gone, &mut bench);
@@ -159,6 +160,20 @@ impl Smoother {
         self.workbench = bench;
         self.remove_frame(gone, NextLink::InPrior);
         Ok(())
+    }
+
+    /// Unless first estimates are kept, the prior's linearisation points become the present states.
+    fn relinearise_prior(&mut self) {
+        if self.config.first_estimates() {
+            return;
+        }
+        let constrained = self.config.linearisation == Linearisation::ObservabilityConstrained;
+        self.prior.relinearise(&self.frames, &self.calibration, constrained);
+        for frame in &mut self.frames {
+            frame.linearised = frame.state;
+            frame.step.fill(0.0);
+        }
+        self.calibration.relinearise();
     }
 
     /// Landmarks hosted by the leaving frame, each with how many of its sightings leave with it.
@@ -430,6 +445,7 @@ impl Smoother {
                 Part::Calibration => self.calibration.enter_prior(),
             }
         }
+        self.prior.note_heading(&self.frames);
     }
 
     /// Gives living landmarks their new host and ends the others.

@@ -3,9 +3,8 @@
 //! Per image: [`Smoother::add_frame`] → observations → [`Smoother::optimise`] → [`Smoother::drop_frame`] of a recent
 //! frame that is no keyframe, or [`Smoother::marginalise`] of a keyframe that leaves. A dropped frame's readings are
 //! joined to its neighbour's, so nothing inertial is lost; a marginalised frame becomes part of the prior by QR
-//! (Demmel et al., "Square root marginalization for sliding-window bundle adjustment", ICCV 2021), and the states in the
-//! prior keep their linearisation point from then on (first-estimates Jacobians: Huang, Mourikis, Roumeliotis 2010), so
-//! that shift and heading stay unobservable.
+//! (Demmel et al., "Square root marginalization for sliding-window bundle adjustment", ICCV 2021), and whatever the
+//! linearisation, shift and heading stay unobservable ([`Linearisation`] says how).
 //!
 //! Landmarks are a bearing and an inverse distance in their host keyframe; they are eliminated one by one (Schur) while
 //! optimising, and by Householder reflections when they enter the prior.
@@ -21,7 +20,7 @@ mod prior;
 mod visual;
 mod window;
 
-pub use config::SmootherConfig;
+pub use config::{Linearisation, SmootherConfig};
 pub use inertial::AnchorSigmas;
 pub use marginalise::Departure;
 pub use optimise::{OptimiseReport, Outlier};

@@ -299,6 +299,12 @@ impl Calibration {
         }
     }
 
+    pub(crate) fn relinearise(&mut self) {
+        self.linearised = self.body_from_camera;
+        self.linearised_offset_secs = self.time_offset_secs;
+        self.step.fill(0.0);
+    }
+
     pub(crate) fn apply(&mut self, step: &SVector<f64, CALIBRATION_DIM>) {
         let (from, from_secs, step) = if self.in_prior {
             self.step += step;
