@@ -102,6 +102,8 @@ pub struct Template {
     pub(crate) energy: f64,
     /// `Σ g gᵀ` of the projected gradients.
     pub(crate) hessian: Matrix2<f64>,
+    /// Share of clipped pixels.
+    pub(crate) saturated_share: f64,
     /// Direction across the edge in the current image, when the feature is an edgelet.
     pub(crate) normal: Option<Vector2<f64>>,
 }
@@ -117,6 +119,7 @@ impl Template {
             gy: [0.0; SIDE * SIDE],
             energy: 0.0,
             hessian: Matrix2::zeros(),
+            saturated_share: 0.0,
             normal: None,
         }
     }
@@ -194,6 +197,8 @@ impl Template {
     /// Removes mean and gain from intensities and gradients; whether enough texture is left.
     fn prepare(&mut self) -> bool {
         let n = (SIDE * SIDE) as f32;
+        let clipped = self.intensity.iter().filter(|v| **v > 254.5).count();
+        self.saturated_share = clipped as f64 / f64::from(n);
         for channel in [&mut self.intensity, &mut self.gx, &mut self.gy] {
             let mean = channel.iter().sum::<f32>() / n;
             channel.iter_mut().for_each(|v| *v -= mean);

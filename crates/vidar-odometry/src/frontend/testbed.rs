@@ -96,6 +96,18 @@ impl Scene {
         Pyramid::of(&image, LEVELS)
     }
 
+    /// `view` smeared over `length_px` (odd) along the rows, as by a turn during the exposure.
+    pub fn blurred(&self, view: usize, length_px: usize) -> Pyramid {
+        let image = &self.views[view].image;
+        let reach = (length_px / 2) as isize;
+        let blurred = Image::from_fn(image.width(), image.height(), |x, y| {
+            let at = |d: isize| (x as isize + d).clamp(0, image.width() as isize - 1) as usize;
+            let sum: u32 = (-reach..=reach).map(|d| u32::from(image[(at(d), y)])).sum();
+            (f64::from(sum) / (2 * reach + 1) as f64).round() as u8
+        });
+        Pyramid::of(&blurred, LEVELS)
+    }
+
     pub fn motion(&self, from: usize, to: usize) -> Se3 {
         self.views[to].world_from_camera.inverse() * self.views[from].world_from_camera
     }

@@ -11,7 +11,7 @@ use super::config::{DepthFilterConfig, MatchingConfig};
 use super::feature::{Feature, PixelMeasurement};
 use super::feature_alignment::{MatchFailure, align_feature, correlation};
 use super::pyramid::{Pyramid, level_scale, to_level};
-use super::template::{Template, Warp};
+use super::template::{SIDE, Template, Warp};
 use nalgebra::Vector2;
 use vidar_core::camera::Pixel;
 use vidar_core::{CameraModel, Se3};
@@ -242,6 +242,7 @@ impl DepthFilter {
         let mut best = (-1.0, Pixel::zeros());
         let mut rival = -1.0_f64;
         let (mut last_best, mut inside) = (None::<usize>, 0);
+        let (mut last_corner, half) = ([usize::MAX; 2], 0.5 * (SIDE as f64 - 1.0));
         for k in 0..=steps {
             // Places even in the image are even in inverse distance wherever the segment is short.
             let share = k as f64 / steps as f64;
@@ -249,9 +250,16 @@ impl DepthFilter {
             let scaled = current_from_keyframe.rotation * feature.bearing
                 + current_from_keyframe.translation * inverse;
             let Some(pixel) = camera.project(&scaled) else { continue };
-            let Some(ncc) = correlation(&self.template, current, &to_level(&pixel, level)) else {
+            let corner = to_level(&pixel, level).map(|c| (c - half).round());
+            if !(corner.x >= 0.0 && corner.y >= 0.0) {
                 continue;
-            };
+            }
+            let corner = [corner.x as usize, corner.y as usize];
+            if corner == last_corner {
+                continue;
+            }
+            last_corner = corner;
+            let Some(ncc) = correlation(&self.template, current, corner) else { continue };
             inside += 1;
             if ncc > best.0 {
                 // The one before becomes a rival if it is not a neighbour.
@@ -316,11 +324,11 @@ impl DepthFilter {
 /// Shortest segment that is scanned, pixels of the search level; alignment alone reaches as far.
 const DIRECT_PX: f64 = 2.0;
 
-/// Step of the scan, pixels of the search level: half of what correlation peaks measure, so that none is stepped over.
-const STEP_PX: f64 = 1.0;
+/// Step of the scan, pixels of the search level: less than a whole pixel, so that none is stepped over.
+const STEP_PX: f64 = 0.7;
 
 /// Steps within which two good places are the same peak: two pixels.
-const NEIGHBOUR_STEPS: usize = 2;
+const NEIGHBOUR_STEPS: usize = 3;
 
 /// Least cosine between an edge's normal and the epipolar curve (Forster 2017).
 const MIN_EDGE_COSINE: f64 = 0.7;

@@ -135,21 +135,26 @@ fn score_block(data: &[u8], at: usize, width: usize, threshold: u8) -> Block {
 }
 
 /// `better` over all arcs of nine of `worse` within the arc.
+///
+/// Two arcs that differ by one step share eight pixels: with `e` the worst of those, the better of the two arcs is
+/// `worse(e, better(first, last))`, so eight runs of eight do for sixteen arcs of nine.
 #[inline(always)]
 fn best_arc(
     ring: &[Block; 16],
     worse: impl Fn(&Block, &Block) -> Block,
     better: impl Fn(&Block, &Block) -> Block,
 ) -> Block {
-    let two: [Block; 16] = std::array::from_fn(|k| worse(&ring[k], &ring[(k + 1) % 16]));
-    let four: [Block; 16] = std::array::from_fn(|k| worse(&two[k], &two[(k + 2) % 16]));
-    let mut best: Option<Block> = None;
-    for k in 0..16 {
-        let eight = worse(&four[k], &four[(k + 4) % 16]);
-        let nine = worse(&eight, &ring[(k + 8) % 16]);
-        best = Some(best.map_or(nine, |b| better(&b, &nine)));
+    let two: [Block; 8] = std::array::from_fn(|k| worse(&ring[2 * k + 1], &ring[(2 * k + 2) % 16]));
+    let four: [Block; 8] = std::array::from_fn(|k| worse(&two[k], &two[(k + 1) % 8]));
+    let arcs = |k: usize| {
+        let eight = worse(&four[k], &four[(k + 2) % 8]);
+        worse(&eight, &better(&ring[2 * k], &ring[(2 * k + 9) % 16]))
+    };
+    let mut best = arcs(0);
+    for k in 1..8 {
+        best = better(&best, &arcs(k));
     }
-    best.unwrap_or([0; LANES])
+    best
 }
 
 #[inline(always)]

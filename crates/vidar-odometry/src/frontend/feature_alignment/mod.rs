@@ -90,11 +90,32 @@ fn sums(image: &Image<u8>, template: &Template, corner: &Pixel) -> Option<Sums> 
 
 const PIXELS: f64 = (SIDE * SIDE) as f64;
 
-/// Correlation with the patch centred on a place of the template's level; `None` outside the image.
-pub(crate) fn correlation(template: &Template, current: &Pyramid, centre: &Pixel) -> Option<f64> {
-    let corner = centre.add_scalar(-0.5 * (SIDE as f64 - 1.0));
-    let found = dispatch!(sums(current.level(template.level), template, &corner))?;
-    Some(found.with_template / (found.energy * template.energy).sqrt().max(1e-9))
+/// Correlation with the patch whose upper left pixel is `corner` on the template's level; `None` outside the image.
+pub(crate) fn correlation(template: &Template, current: &Pyramid, corner: [usize; 2]) -> Option<f64> {
+    let image = current.level(template.level);
+    if corner[0] + SIDE > image.width() || corner[1] + SIDE > image.height() {
+        return None;
+    }
+    let [mean, energy, with_template] = dispatch!(plain_sums(image, template, corner));
+    let energy = (energy - PIXELS * mean * mean).max(0.0);
+    Some(with_template / (energy * template.energy).sqrt().max(1e-9))
+}
+
+/// Mean, sum of squares and product with the template of a patch at whole pixels.
+#[inline(always)]
+fn plain_sums(image: &Image<u8>, template: &Template, corner: [usize; 2]) -> [f64; 3] {
+    let (mut sum, mut square, mut t) = ([0.0_f32; 8], [0.0_f32; 8], [0.0_f32; 8]);
+    for row in 0..SIDE {
+        let pixels = &image.data()[(corner[1] + row) * image.width() + corner[0]..][..SIDE];
+        let intensity = &template.intensity[row * SIDE..(row + 1) * SIDE];
+        for i in 0..SIDE {
+            let v = f32::from(pixels[i]);
+            sum[i] += v;
+            square[i] += v * v;
+            t[i] += v * intensity[i];
+        }
+    }
+    [f64::from(sum8(&sum)) / PIXELS, sum8(&square).into(), sum8(&t).into()]
 }
 
 /// Finds `template` in `current`, starting at `start` (level-0 pixels; usually the template's expected place).
@@ -127,9 +148,8 @@ pub fn align_feature(
         }
         if step.norm_squared() < config.min_step_px * config.min_step_px {
             let last = dispatch!(sums(image, template, &corner)).ok_or(MatchFailure::OutsideImage)?;
-            let pixel = from_level(&(corner + half), level);
             let moved_px = (corner - first).norm() * scale;
-            return judge(template, &last, &solve, pixel, moved_px, noise_gray, config);
+            return judge(template, current, &corner, &last, &solve, moved_px, noise_gray, config);
         }
     }
     Err(MatchFailure::Diverged)
@@ -166,11 +186,13 @@ impl StepSolver {
     }
 }
 
+#[allow(clippy::too_many_arguments)] // The private end of `align_feature`, kept apart for its length only.
 fn judge(
     template: &Template,
+    current: &Pyramid,
+    corner: &Pixel,
     found: &Sums,
     solve: &StepSolver,
-    pixel: Pixel,
     moved_px: f64,
     noise_gray: f64,
     config: &MatchingConfig,
@@ -183,10 +205,15 @@ fn judge(
     let ncc = found.with_template / (found.energy * template.energy).sqrt().max(1e-9);
     // Both patches carry noise, the keyframe's times the gain; bilinear sampling smooths it, so this is generous.
     let expected = noise_gray * noise_gray * (1.0 + gain * gain);
+    let clipped = saturated_share(current.level(template.level), corner);
+    if (clipped - template.saturated_share).abs() > MAX_SATURATED {
+        return Err(MatchFailure::Dissimilar);
+    }
     let alike = ncc >= config.min_ncc || (ncc >= config.min_noisy_ncc && variance <= expected);
     if !(alike && gain > config.min_gain && gain < 1.0 / config.min_gain) {
         return Err(MatchFailure::Dissimilar);
     }
+    let pixel = from_level(&corner.add_scalar(0.5 * (SIDE as f64 - 1.0)), template.level);
     let scale = level_scale(template.level);
     // What the residual shows, but never less than rounding to grey levels leaves.
     let noise = variance.max(QUANTISATION_VARIANCE) * config.variance_factor / (gain * gain);
@@ -209,6 +236,16 @@ fn judge(
         gain: gain as f32,
         moved_px,
     })
+}
+
+/// Share of pixels clipped in one patch but not in the other that shifts edges by more than the covariance says.
+const MAX_SATURATED: f64 = 0.15;
+
+/// Share of pixels of the patch that are as white as the sensor can tell.
+fn saturated_share(image: &Image<u8>, corner: &Pixel) -> f64 {
+    let (x, y) = (corner.x.max(0.0) as usize, corner.y.max(0.0) as usize);
+    let clipped = |row: usize| image.row(y + row)[x..x + SIDE].iter().filter(|p| **p == u8::MAX).count();
+    (0..SIDE).map(clipped).sum::<usize>() as f64 / PIXELS
 }
 
 /// Variance of rounding to whole grey levels, 1/12.
