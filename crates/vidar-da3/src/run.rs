@@ -33,6 +33,11 @@ impl Run<'_> {
         self.show_as(Layout::Map, name, view, &shape, data);
     }
 
+    /// Whether anybody wants a result of that name.
+    pub fn is_watched(&self, name: &str) -> bool {
+        self.trace.is_some_and(|trace| trace.wants(name))
+    }
+
     fn show_as(&self, layout: Layout, name: &str, view: usize, shape: &[usize], data: &[f32]) {
         if let Some(trace) = self.trace.filter(|trace| trace.wants(name)) {
             trace.record(Traced { name, view, shape, layout, data });

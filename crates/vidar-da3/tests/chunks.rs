@@ -1,5 +1,7 @@
 //! The network as a `GeometryModel`.
 
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::print_stderr)] // helpers of tests
+
 mod common;
 
 use common::{tiny, tiny_json};

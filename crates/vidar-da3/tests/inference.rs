@@ -1,5 +1,7 @@
 //! Inference as a user sees it, on tiny networks.
 
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::print_stderr)] // helpers of tests
+
 mod common;
 
 use common::{own, tiny, tiny_json};

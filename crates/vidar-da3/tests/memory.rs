@@ -1,5 +1,7 @@
 //! Planned memory against what a run allocates.
 
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::print_stderr)] // helpers of tests
+
 mod common;
 
 use std::alloc::{GlobalAlloc, Layout, System};

@@ -1,5 +1,7 @@
 //! Parity with recordings of the official code. They lie outside the repository; without them nothing is tested here.
 
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::print_stderr)] // helpers of tests
+
 mod common;
 
 use common::shared;

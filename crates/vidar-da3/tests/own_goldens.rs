@@ -1,5 +1,7 @@
 //! Parity with a reference in double precision on tiny networks (`tools/make_da3_goldens.py`), layer by layer.
 
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::print_stderr)] // helpers of tests
+
 mod common;
 
 use common::own;

@@ -7,7 +7,7 @@ use crate::config::Ffn;
 use crate::error::Da3Error;
 use crate::weights::Scope;
 use vidar_nn::{
-    AttentionSpec, Compute, Epilogue, LayerNorm, Linear, RopeTable, TokenRows, attention, attention_separate,
+    AttentionSpec, Compute, Epilogue, KeyValues, LayerNorm, Linear, RopeTable, TokenRows, attention,
 };
 
 /// Sizes of a block.
@@ -51,8 +51,10 @@ pub(crate) struct BlockScratch {
     normed: Vec<f32>,
     attended: Vec<f32>,
     hidden: Vec<f32>,
-    /// Queries, keys and values of a whole sequence, `[tokens, 3, D]`.
-    pub qkv: Vec<f32>,
+    /// `[tokens, 3, D]`.
+    qkv: Vec<f32>,
+    /// Queries of a sequence of all views, `[tokens, D]`.
+    pub queries: Vec<f32>,
 }
 
 /// Tokens that go through the feed-forward part at once: its inner width is four times the token's.
@@ -117,28 +119,51 @@ impl Block {
     }
 
     /// Queries, keys and values of some tokens: `[tokens, 3, D]`.
-    pub fn project_qkv(&self, c: &Compute, x: &[f32], qkv: &mut [f32], scratch: &mut BlockScratch) {
+    fn project_qkv(&self, c: &Compute, x: &[f32], qkv: &mut [f32], scratch: &mut BlockScratch) {
         resize(&mut scratch.normed, x.len());
         self.norm1.apply(x, &mut scratch.normed);
         self.attn.qkv.apply(c, &scratch.normed, x.len() / self.dim(), qkv, Epilogue::None);
     }
 
-    /// Runs the block on some tokens of a sequence of which `qkv` holds all: `x` starts at token `first`, a whole
-    /// number of `rope`'s lengths from the start.
-    pub fn run_part(
+    /// Room for the keys and values of a sequence of `tokens`.
+    pub fn key_values(&self, c: &Compute, tokens: usize) -> KeyValues {
+        KeyValues::new(c, &self.attn.spec(None), tokens)
+    }
+
+    /// Appends some tokens' keys and values to a sequence's, and writes their queries, `[tokens, D]`.
+    pub fn push(
+        &self,
+        c: &Compute,
+        x: &[f32],
+        rope: Option<&RopeTable>,
+        (sequence, queries): (&mut KeyValues, &mut [f32]),
+        scratch: &mut BlockScratch,
+    ) {
+        let dim = self.dim();
+        let mut qkv = std::mem::take(&mut scratch.qkv);
+        resize(&mut qkv, 3 * x.len());
+        self.project_qkv(c, x, &mut qkv, scratch);
+        let [_, keys, values] = TokenRows::split_qkv(&qkv, dim);
+        sequence.push(&self.attn.spec(rope), keys, values);
+        for (query, qkv) in queries.chunks_exact_mut(dim).zip(qkv.chunks_exact(3 * dim)) {
+            query.copy_from_slice(&qkv[..dim]);
+        }
+        scratch.qkv = qkv;
+    }
+
+    /// Runs the block on some tokens whose queries meet a whole sequence.
+    pub fn run_in_sequence(
         &self,
         c: &Compute,
         x: &mut [f32],
-        qkv: &[f32],
-        first: usize,
         rope: Option<&RopeTable>,
+        (sequence, queries): (&KeyValues, &[f32]),
         scratch: &mut BlockScratch,
     ) {
         let (rows, dim) = (x.len() / self.dim(), self.dim());
-        let [queries, keys, values] = TokenRows::split_qkv(qkv, dim);
-        let queries = TokenRows { data: &queries.data[first * 3 * dim..], stride: 3 * dim, tokens: rows };
         resize(&mut scratch.attended, x.len());
-        attention_separate(c, queries, keys, values, &self.attn.spec(rope), &mut scratch.attended);
+        let queries = TokenRows { data: queries, stride: dim, tokens: rows };
+        sequence.attend(&self.attn.spec(rope), queries, &mut scratch.attended);
         self.finish(c, x, scratch);
     }
 

@@ -5,9 +5,9 @@
 //! every view becomes a camera token: the reference's, the others', or an encoded camera that was given.
 //! After four blocks features are taken: the tokens after the last local block beside those after this one.
 //!
-//! Views stream: local blocks run on a few views at a time; a global block first writes queries, keys and values of
-//! all views, then runs view by view. Memory is that of the tokens (1), of queries, keys and values (3), and of a few
-//! views' intermediate results.
+//! Views stream: local blocks run on a few views at a time; a global block first packs keys and values of all views and
+//! writes their queries, then runs view by view. Memory is that of the tokens (1), queries (1), packed keys and values
+//! (2, half of it in bf16), and of a few views' intermediate results.
 //!
 //! Rotary positions: in local blocks the class token is at (0, 0) and patch (r, c) at (r+1, c+1). In global blocks
 //! every patch of every view is at (1, 1), so that patches do not turn against each other: the same is computed here
@@ -206,24 +206,25 @@ impl Backbone {
         scratch: &mut BlockScratch,
     ) -> Result<(), Da3Error> {
         let compute = step.run.backbone;
-        let mut qkv = std::mem::take(&mut scratch.qkv);
-        resize(&mut qkv, 3 * x.len());
-        for (x, qkv) in x.chunks(step.length).zip(qkv.chunks_mut(3 * step.length)) {
+        let mut queries = std::mem::take(&mut scratch.queries);
+        resize(&mut queries, x.len());
+        let mut sequence = block.key_values(&compute, x.len() / self.config.dim);
+        for (x, queries) in x.chunks(step.length).zip(queries.chunks_mut(step.length)) {
             step.run.checkpoint()?;
-            block.project_qkv(&compute, x, qkv, scratch);
+            block.push(&compute, x, rope, (&mut sequence, queries), scratch);
         }
-        let tokens = step.length / self.config.dim;
         let mut before = Vec::new();
-        for (i, x) in x.chunks_exact_mut(step.length).enumerate() {
+        let mut views = x.chunks_exact_mut(step.length).zip(queries.chunks_exact(step.length)).enumerate();
+        views.try_for_each(|(i, (x, queries))| {
             step.run.checkpoint()?;
             before.clear();
             if self.config.out_layers.contains(&step.layer) {
                 before.extend_from_slice(x);
             }
-            block.run_part(&compute, x, &qkv, i * tokens, rope, scratch);
-            self.hand_over(step, i, &before, x)?;
-        }
-        scratch.qkv = qkv;
+            block.run_in_sequence(&compute, x, rope, (&sequence, queries), scratch);
+            self.hand_over(step, i, &before, x)
+        })?;
+        scratch.queries = queries;
         Ok(())
     }
 

@@ -6,12 +6,12 @@
 use super::fusion::Fusion;
 use super::map::Map;
 use super::stages::Stages;
-use super::tail::{Pair, enlarged};
+use super::tail::{Pair, run_pairs, show_input};
 use crate::config::HeadConfig;
 use crate::error::Da3Error;
 use crate::run::Run;
 use crate::weights::{ConvShape, Scope};
-use vidar_nn::{Conv2d, activation};
+use vidar_nn::{Conv2d, ConvInput, Epilogue, activation};
 
 /// The head's layers.
 pub(crate) struct Dpt {
@@ -57,12 +57,15 @@ impl Dpt {
         run.checkpoint()?;
         let fused = self.fusion.run(run, view, &laterals)?;
         drop(laterals);
-        let full = enlarged(run, view, (&fused, &self.output_conv1), size, None);
+        let narrow = fused.convolved(&run.head, &self.output_conv1, ConvInput::None, Epilogue::None);
         drop(fused);
+        run.show_map("head.output_conv1", view, narrow.shape(), &narrow.data);
+        show_input(run, view, &narrow, size, None);
         run.checkpoint()?;
-        let depth = self.output_conv2.run(run, &full);
+        let pairs = [&self.output_conv2, &self.sky_output_conv2];
+        let mut logits = run_pairs(run, &narrow, size, None, &pairs);
+        let (depth, sky) = (logits.swap_remove(0), logits.swap_remove(0));
         run.show_map("head.output_conv2.logits", view, depth.shape(), &depth.data);
-        let sky = self.sky_output_conv2.run(run, &full);
         run.show_map("head.sky_output_conv2.logits", view, sky.shape(), &sky.data);
         let (mut depth, mut sky) = (depth.data, sky.data);
         activation::exp(&run.head, &mut depth);

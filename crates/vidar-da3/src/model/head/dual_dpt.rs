@@ -9,15 +9,15 @@
 use super::fusion::Fusion;
 use super::map::Map;
 use super::stages::Stages;
-use super::tail::{Pair, enlarged};
-use super::uv::Uv;
+use super::tail::{Pair, run_pairs, show_input};
+use super::uv::embedding;
 use crate::config::{HEAD_LAST, HeadConfig, PATCH};
 use crate::error::Da3Error;
 use crate::ray_pose::RayMap;
 use crate::run::Run;
 use crate::weights::{ConvShape, Residency, Scope, Slot};
 use std::sync::{Arc, Mutex, PoisonError};
-use vidar_nn::{Conv2d, ConvInput, Epilogue, LayerNorm, activation};
+use vidar_nn::{Conv2d, ConvInput, Epilogue, GridEmbedding, LayerNorm, activation};
 
 const EPS: f32 = 1e-5;
 
@@ -39,9 +39,9 @@ type OfSize = ((usize, usize), Arc<Embeddings>);
 
 /// The position embeddings of one picture size.
 pub(crate) struct Embeddings {
-    stages: Vec<Uv>,
-    full: Uv,
-    rays: Uv,
+    stages: Vec<GridEmbedding>,
+    full: GridEmbedding,
+    rays: GridEmbedding,
 }
 
 /// Depth and what comes with it, of one view.
@@ -58,9 +58,7 @@ pub(crate) struct DenseView {
 struct RayBranch {
     fusion: Fusion,
     convs: Vec<Conv2d>,
-    first: Conv2d,
-    norm: LayerNorm,
-    last: Conv2d,
+    pair: Pair,
 }
 
 impl DualDpt {
@@ -95,9 +93,9 @@ impl DualDpt {
         let (ph, pw, aspect) = (rows / PATCH, columns / PATCH, columns as f64 / rows as f64);
         let narrow = self.config.features / 2;
         let embeddings = Arc::new(Embeddings {
-            stages: self.config.out_channels.iter().map(|c| Uv::new(ph, pw, *c, aspect)).collect(),
-            full: Uv::new(rows, columns, narrow, aspect),
-            rays: Uv::new(8 * ph, 8 * pw, narrow, aspect),
+            stages: self.config.out_channels.iter().map(|c| embedding(ph, pw, *c, aspect)).collect(),
+            full: embedding(rows, columns, narrow, aspect),
+            rays: embedding(8 * ph, 8 * pw, narrow, aspect),
         });
         *kept = Some(((rows, columns), Arc::clone(&embeddings)));
         embeddings
@@ -114,7 +112,7 @@ impl DualDpt {
     ) -> Map {
         self.norm.apply_in_place(feature);
         let mut map = self.stages.project(run, view, k, feature, size);
-        embeddings.stages[k].add_to(&mut map);
+        map.embed(&embeddings.stages[k]);
         map
     }
 
@@ -130,10 +128,14 @@ impl DualDpt {
         let laterals = self.stages.laterals(run, view, stages);
         run.checkpoint()?;
         let fused = self.fusion.run(run, view, &laterals)?;
-        let full = enlarged(run, view, (&fused, &self.output_conv1), (rows, columns), Some(&embeddings.full));
+        let narrow = fused.convolved(&run.head, &self.output_conv1, ConvInput::None, Epilogue::None);
         drop(fused);
-        let logits = self.output_conv2.run(run, &full);
-        drop(full);
+        run.show_map("head.output_conv1", view, narrow.shape(), &narrow.data);
+        show_input(run, view, &narrow, (rows, columns), Some(&embeddings.full));
+        run.checkpoint()?;
+        let pairs = [&self.output_conv2];
+        let logits = run_pairs(run, &narrow, (rows, columns), Some(&embeddings.full), &pairs).swap_remove(0);
+        drop(narrow);
         run.show_map("head.output_conv2.logits", view, logits.shape(), &logits.data);
         let mut depth: Vec<f32> = logits.data.iter().step_by(2).copied().collect();
         let mut confidence: Vec<f32> = logits.data.iter().skip(1).step_by(2).copied().collect();
@@ -160,13 +162,23 @@ impl RayBranch {
         Ok(Self {
             fusion: Fusion::load(scratch, "_aux", features)?,
             convs: (0..5).map(conv).collect::<Result<_, _>>()?,
-            first: scratch.conv("output_conv2_aux.3.0", ConvShape::three(half, HEAD_LAST))?,
-            norm: scratch.norm("output_conv2_aux.0.2", HEAD_LAST, EPS)?,
-            last: scratch.conv("output_conv2_aux.3.5", ConvShape::point(HEAD_LAST, 7))?,
+            pair: Pair::load_normed(
+                scratch,
+                "output_conv2_aux.3",
+                half,
+                7,
+                scratch.norm("output_conv2_aux.0.2", HEAD_LAST, EPS)?,
+            )?,
         })
     }
 
-    fn run(&self, run: &Run<'_>, view: usize, laterals: &[Map], uv: &Uv) -> Result<RayMap, Da3Error> {
+    fn run(
+        &self,
+        run: &Run<'_>,
+        view: usize,
+        laterals: &[Map],
+        embedding: &GridEmbedding,
+    ) -> Result<RayMap, Da3Error> {
         let c = &run.head;
         let mut x = self.fusion.run(run, view, laterals)?;
         for conv in &self.convs {
@@ -174,11 +186,8 @@ impl RayBranch {
             x = x.convolved(c, conv, ConvInput::None, Epilogue::None);
         }
         run.show_map("head.output_conv1_aux.3", view, x.shape(), &x.data);
-        uv.add_to(&mut x);
-        let mut hidden = x.convolved(c, &self.first, ConvInput::None, Epilogue::None);
-        self.norm.apply_in_place(&mut hidden.data);
-        activation::relu(c, &mut hidden.data);
-        let logits = hidden.convolved(c, &self.last, ConvInput::None, Epilogue::None);
+        let size = (x.rows, x.columns);
+        let logits = run_pairs(run, &x, size, Some(embedding), &[&self.pair]).swap_remove(0);
         run.show_map("head.output_conv2_aux.3.logits", view, logits.shape(), &logits.data);
         let cells = logits.data.chunks_exact(7);
         let rays = cells.clone().map(|l| [l[0], l[1], l[2], l[3], l[4], l[5]]).collect();

@@ -84,7 +84,7 @@ impl Fusion {
                 0 => (2 * laterals[0].rows, 2 * laterals[0].columns),
                 _ => (laterals[level - 1].rows, laterals[level - 1].columns),
             };
-            x = mixed.resized(rows, columns);
+            x = mixed.resized(c, rows, columns);
             let name = format!("head.refinenet{}{}", level + 1, self.suffix);
             run.show_map(&name, view, x.shape(), &x.data);
         }

@@ -1,6 +1,8 @@
 //! A feature map that owns its numbers.
 
-use vidar_nn::{Compute, Conv2d, ConvInput, Corners, Epilogue, MapRef, resize_bilinear};
+use vidar_nn::{
+    Compute, Conv2d, ConvInput, Corners, Epilogue, GridEmbedding, MapRef, MapSize, resize_bilinear_on,
+};
 
 /// `[rows, columns, channels]` of one view.
 #[derive(Clone, Debug)]
@@ -33,9 +35,16 @@ impl Map {
     }
 
     /// This map enlarged (or shrunk) with the corner pixels' centres kept.
-    pub fn resized(&self, rows: usize, columns: usize) -> Self {
+    pub fn resized(&self, c: &Compute, rows: usize, columns: usize) -> Self {
         let mut out = Self::zeros(rows, columns, self.channels);
-        resize_bilinear(self.view(), self.channels, rows, columns, Corners::Aligned, &mut out.data);
+        let size = MapSize { rows, cols: columns };
+        resize_bilinear_on(c, self.view(), self.channels, size, Corners::Aligned, &mut out.data);
         out
+    }
+
+    /// Adds an embedding of this map's size.
+    pub fn embed(&mut self, embedding: &GridEmbedding) {
+        let size = MapSize { rows: self.rows, cols: self.columns };
+        embedding.add_to(&mut self.data, self.channels, size);
     }
 }
