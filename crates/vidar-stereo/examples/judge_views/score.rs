@@ -20,6 +20,19 @@ struct Bin {
     said: f64,
 }
 
+/// A pixel of the sample.
+struct Row {
+    view: usize,
+    x: usize,
+    y: usize,
+    truth_m: f32,
+    /// Relative, signed.
+    error: f32,
+    at_edge: bool,
+    kept: bool,
+    evidence: Evidence,
+}
+
 #[derive(Default)]
 pub struct Score {
     truths: usize,
@@ -29,7 +42,7 @@ pub struct Score {
     bins: [Bin; BINS],
     bins_off_edges: [Bin; BINS],
     misfits: Vec<(f32, f32, f32)>,
-    rows: Vec<(usize, usize, usize, f32, f32, bool, bool, Evidence)>,
+    sample: Vec<Row>,
     views: usize,
 }
 
@@ -44,7 +57,16 @@ impl Score {
             let (z, evidence) = (depth[i], evidence.pixels[i]);
             if (i % w * 31 + i / w * 17) % SAMPLED == 0 && evidence.agreeing > 0 {
                 let error = (1.0 / evidence.rho - t) / t;
-                self.rows.push((self.views, i % w, i / w, t, error, edges[i], z.is_finite(), evidence));
+                self.sample.push(Row {
+                    view: self.views,
+                    x: i % w,
+                    y: i / w,
+                    truth_m: t,
+                    error,
+                    at_edge: edges[i],
+                    kept: z.is_finite(),
+                    evidence,
+                });
             }
             if z.is_nan() {
                 continue;
@@ -127,11 +149,12 @@ impl Score {
             "view,x,y,truth_m,error,edge,kept,rho,agreeing,asked,spread,cost,margin,curvature,texture,\
              resolution_px,shift_px,residual_px,confidence\n",
         );
-        for (view, x, y, truth, error, edge, kept, e) in &self.rows {
+        for row in &self.sample {
+            let Row { view, x, y, truth_m, error, at_edge, kept, evidence: e } = row;
             let _ = writeln!(
                 out,
-                "{view},{x},{y},{truth},{error},{},{},{},{},{},{},{},{},{},{},{},{},{},{}",
-                u8::from(*edge),
+                "{view},{x},{y},{truth_m},{error},{},{},{},{},{},{},{},{},{},{},{},{},{},{}",
+                u8::from(*at_edge),
                 u8::from(*kept),
                 e.rho,
                 e.agreeing,
