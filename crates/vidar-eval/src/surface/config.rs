@@ -22,6 +22,7 @@ pub struct SurfaceEvalConfig {
     /// Absent: judge all. Use it when the reference covers a part of what was mapped.
     pub crop_margin_m: Option<f64>,
     /// Return the error of every given point, for colouring.
+    #[serde(skip)] // for callers that draw the errors; no setting of a user's
     pub keep_point_errors: bool,
 }
 
