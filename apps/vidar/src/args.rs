@@ -1,5 +1,6 @@
 //! The command line, as plain values. Validation and building happen in the commands.
 
+use crate::model_args::{DepthArgs, LicenceArgs, ModelCommand};
 use clap::{ArgAction, Args, Parser, Subcommand, ValueEnum, ValueHint};
 use std::path::PathBuf;
 
@@ -34,6 +35,9 @@ pub struct CommonArgs {
     /// Say nothing but errors and the result.
     #[arg(short, long, global = true, help_heading = "Output")]
     pub quiet: bool,
+    /// Never use the network.
+    #[arg(long, global = true, help_heading = "Output")]
+    pub offline: bool,
     /// Threads to use; 0 means all. The result does not depend on it.
     #[arg(long, default_value_t = 0, global = true, help_heading = "Output")]
     pub threads: usize,
@@ -80,6 +84,14 @@ pub enum Command {
         after_help = "Examples:\n  vidar export runs/demo/latest/run --to colmap -o colmap\n  vidar export runs/demo/latest/run --to nerfstudio -o ns\n  vidar export runs/demo/latest/run --to tum"
     )]
     Export(ExportArgs),
+    /// Depth, confidence, cameras and a cloud of plain images, by Depth Anything 3.
+    #[command(
+        after_help = "Examples:\n  vidar depth photos/\n  vidar depth a.jpg b.jpg --model da3-base --format ply,glb -o out\n  vidar depth frames/ --poses colmap/ --resolution input\n  vidar depth photos/ --dry-run"
+    )]
+    Depth(Box<DepthArgs>),
+    /// Checkpoints: list, pull, import, verify, check, where.
+    #[command(subcommand)]
+    Model(ModelCommand),
     /// Render a synthetic sequence in EuRoC layout with exact ground truth.
     #[command(
         after_help = "Examples:\n  vidar synth room1\n  vidar synth hall1 --scene hall --seed 3 --duration 20\n  vidar synth flight1 --trajectory flight.tum --euroc"
@@ -198,6 +210,15 @@ pub struct RunArgs {
     /// Where results go.
     #[command(flatten)]
     pub output: OutputArgs,
+    /// Source of depth: stereo, or a network of `vidar model list` such as da3-small.
+    #[arg(long, value_name = "NAME", help_heading = "Model")]
+    pub geometry: Option<String>,
+    /// A folder with model.safetensors and config.json of one's own.
+    #[arg(long, value_hint = ValueHint::AnyPath, help_heading = "Model")]
+    pub model_dir: Option<PathBuf>,
+    /// Acceptance of a licence.
+    #[command(flatten)]
+    pub licence: LicenceArgs,
     /// A cloud (PLY, metres, world of ground truth) to judge the map against.
     #[arg(long, value_hint = ValueHint::FilePath, help_heading = "Input")]
     pub reference: Option<PathBuf>,

@@ -1,6 +1,6 @@
 //! From flags to the library's values, each checked where it is used first.
 
-use crate::args::{ConfigArgs, InputArgs, OutputArgs, WorldArgs};
+use crate::args::{ConfigArgs, InputArgs, OutputArgs, RunArgs, WorldArgs};
 use std::path::Path;
 use vidar::config::Origin;
 use vidar::core::{BodyFrame, CameraId, Se3, So3};
@@ -45,6 +45,18 @@ pub fn apply_input_flags(layered: &mut Layered, input: &InputArgs) -> Result<(),
         if let Some(value) = value {
             layered.value(key, toml::Value::Integer(value), Origin::Flag(flag))?;
         }
+    }
+    Ok(())
+}
+
+/// The flags of `vidar run` that choose a model.
+pub fn apply_model_flags(layered: &mut Layered, args: &RunArgs) -> Result<(), Error> {
+    if let Some(source) = &args.geometry {
+        layered.value("geometry.source", toml::Value::String(source.clone()), Origin::Flag("--geometry"))?;
+    }
+    if let Some(dir) = &args.model_dir {
+        let dir = toml::Value::String(dir.display().to_string());
+        layered.value("model.dir", dir, Origin::Flag("--model-dir"))?;
     }
     Ok(())
 }

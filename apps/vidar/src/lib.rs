@@ -5,6 +5,7 @@
 pub mod args;
 mod build;
 mod commands;
+pub mod model_args;
 mod print;
 mod progress;
 pub mod reference;
@@ -85,6 +86,8 @@ fn dispatch(command: Command, context: &Context) -> Outcome {
         Command::Inspect(args) => commands::inspect::inspect(&args, context),
         Command::Eval(args) => commands::eval::eval(&args, context),
         Command::Export(args) => commands::export::export(&args, context),
+        Command::Depth(args) => commands::depth::depth(&args, context),
+        Command::Model(command) => commands::model::model(&command, context),
         Command::Synth(args) => commands::synth::synth(&args, context),
         Command::Doctor => commands::doctor::doctor(context),
         Command::Config(ConfigCommand::Show { config, origin }) => {

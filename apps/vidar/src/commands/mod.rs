@@ -1,11 +1,13 @@
 //! One file per verb.
 
 pub mod config;
+pub mod depth;
 pub mod doctor;
 pub mod eval;
 pub mod explain;
 pub mod export;
 pub mod inspect;
+pub mod model;
 pub mod run;
 pub mod synth;
 

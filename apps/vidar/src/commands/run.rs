@@ -12,6 +12,8 @@ use vidar::{Error, ExitStatus, RunOutcome, RunRequest};
 pub fn run(args: &RunArgs, context: &Context) -> Outcome {
     let mut layered = build::layered(&args.config, None)?;
     build::apply_input_flags(&mut layered, &args.input)?;
+    build::apply_model_flags(&mut layered, args)?;
+    accept_licence(&layered, args)?;
     let thresholds = Thresholds::parse(&args.fail_above, &args.fail_below)?;
     let request = RunRequest {
         path: args.path.clone(),
@@ -26,6 +28,16 @@ pub fn run(args: &RunArgs, context: &Context) -> Outcome {
     }
     let outcome = vidar::run(&request, &progress::events(&context.cli), &context.cancel)?;
     conclude(&outcome, &thresholds, context)
+}
+
+/// Writes an acceptance given with this command down, before the model is opened.
+fn accept_licence(layered: &vidar::Layered, args: &RunArgs) -> Result<(), Error> {
+    let (Some(accepted), Some(choice)) =
+        (super::model::accepted(&args.licence), vidar::models::geometry::chosen(&layered.build()?)?)
+    else {
+        return Ok(());
+    };
+    vidar::models::locate(&choice, Some(&accepted), &vidar::models::store(true)?).map(|_| ())
 }
 
 fn dry_run(request: &RunRequest, context: &Context) -> Outcome {

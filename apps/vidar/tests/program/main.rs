@@ -5,6 +5,8 @@
 mod config;
 mod docs;
 mod faults;
+mod keys;
+mod models;
 mod numbers;
 mod support;
 mod verbs;

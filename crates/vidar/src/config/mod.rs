@@ -79,7 +79,7 @@ impl Default for KeyframeConfig {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct GeometryConfig {
-    /// The model: `stereo` (needs poses, no weights).
+    /// The model: `stereo` (needs poses, no weights), or a network of `vidar model list` (`da3-small`).
     pub source: String,
     /// Keyframes whose depth is computed together. Larger chunks need more memory.
     pub chunk_keyframes: usize,
@@ -92,6 +92,44 @@ pub struct GeometryConfig {
 impl Default for GeometryConfig {
     fn default() -> Self {
         Self { source: "stereo".into(), chunk_keyframes: 16, context_keyframes: 8, max_width_px: 640 }
+    }
+}
+
+/// The network, where `geometry.source` names one.
+#[derive(Clone, Debug, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
+#[serde(default, deny_unknown_fields)]
+pub struct ModelConfig {
+    /// Folder with `model.safetensors` and `config.json` of one's own, instead of the network that `geometry.source` names.
+    pub dir: String,
+    /// Precision of the backbone. `bf16` is fastest where the processor multiplies it, `f32` is the reference.
+    pub precision: ModelPrecision,
+    /// How the network is used.
+    pub network: vidar_da3::Da3ModelConfig,
+}
+
+/// Precision of matrix products.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "kebab-case")]
+pub enum ModelPrecision {
+    /// 32 bits.
+    #[default]
+    F32,
+    /// Three products of 16 bits, close to 32.
+    F32Split,
+    /// Brain floats of 16 bits.
+    Bf16,
+    /// Weights of 16 bits.
+    F16,
+}
+
+impl From<ModelPrecision> for vidar_da3::Precision {
+    fn from(precision: ModelPrecision) -> Self {
+        match precision {
+            ModelPrecision::F32 => Self::F32,
+            ModelPrecision::F32Split => Self::F32Split,
+            ModelPrecision::Bf16 => Self::Bf16,
+            ModelPrecision::F16 => Self::F16,
+        }
     }
 }
 
@@ -150,6 +188,8 @@ pub struct Config {
     pub keyframes: KeyframeConfig,
     /// Which model sees them.
     pub geometry: GeometryConfig,
+    /// The network, where one is used.
+    pub model: ModelConfig,
     /// Multi-view stereo.
     pub stereo: vidar_stereo::StereoConfig,
     /// Placement of chunks.
@@ -194,10 +234,12 @@ impl Config {
                 self.geometry.max_width_px
             ));
         }
-        if self.geometry.source != "stereo" {
-            return bad(format!("geometry.source must be \"stereo\", found {:?}", self.geometry.source));
+        if crate::models::geometry::chosen(self).is_err() {
+            let (found, known) = (&self.geometry.source, crate::models::names());
+            return bad(format!("geometry.source must be \"stereo\" or one of {known}, found {found:?}"));
         }
         let stage = |result: Result<(), String>| result.map_err(|reason| Error::BadValue { reason });
+        stage(self.model.network.validate().map_err(|e| e.to_string()))?;
         stage(self.stereo.validate().map_err(|e| e.to_string()))?;
         stage(self.align.validate().map_err(|e| e.to_string()))?;
         stage(self.fusion.validate().map_err(|e| e.to_string()))?;

@@ -35,6 +35,11 @@ impl Mapping {
         Ok(Self { scale: (matrix[(0, 0)], matrix[(1, 1)]), offset })
     }
 
+    /// Processed pixels per pixel of the image, both ways averaged.
+    pub fn mean_scale(&self) -> f64 {
+        0.5 * (self.scale.0 + self.scale.1)
+    }
+
     /// A camera matrix of the maps as one of the image.
     pub fn intrinsics_of_image(&self, k: &Matrix3<f64>) -> Matrix3<f64> {
         let mut matrix = *k;

@@ -20,6 +20,7 @@ use crate::events::{CancelToken, Events};
 use crate::models::{self, LicenceAccepted, Located, MemoryPlan, ModelChoice, planned_memory};
 use crate::run::bytes;
 use crate::run_folder::{Place, RunFolder};
+use at_input::Mapping;
 use inputs::{Cameras, Picture};
 use serde::Serialize;
 use std::path::PathBuf;
@@ -134,10 +135,8 @@ pub fn plan(request: &DepthRequest) -> Result<DepthPlan, Error> {
         (Ok(located), None) => Some(located.open(&request.da3)?.config().clone()),
         (Err(_), None) => None,
     };
-    let weights = model.as_ref().map_or(0, |m| m.identity.weights_bytes);
-    let threads = rayon::current_num_threads();
-    let memory = config.map(|c| planned_memory(&c, weights, images.len(), processed, threads));
-    warnings.extend(memory.as_ref().and_then(too_much));
+    let memory = config.map(|c| planned_memory(&c, images.len(), processed));
+    warnings.extend(memory.as_ref().and_then(models::too_much));
     Ok(DepthPlan {
         processed,
         memory,
@@ -147,15 +146,6 @@ pub fn plan(request: &DepthRequest) -> Result<DepthPlan, Error> {
         images,
         name: request.model.name(),
         formats: request.formats.clone(),
-    })
-}
-
-fn too_much(plan: &MemoryPlan) -> Option<Warning> {
-    let there = crate::system::hardware().memory_bytes?;
-    (plan.total() > there).then(|| {
-        let message = format!("{} planned, this machine has {}", bytes(plan.total()), bytes(there));
-        Warning::new("memory", message)
-            .hint("fewer images at once, a smaller --process-res, or a smaller model")
     })
 }
 
@@ -187,11 +177,10 @@ impl DepthPlan {
         ];
         if let Some(memory) = &self.memory {
             let parts = format!(
-                "{} (weights {}, mapped; activations {}; images {})",
+                "{} (weights {}, mapped from their file; work {})",
                 bytes(memory.total()),
                 bytes(memory.weights),
-                bytes(memory.activations),
-                bytes(memory.images)
+                bytes(memory.working)
             );
             lines.push(("memory", parts));
         }
@@ -310,9 +299,11 @@ fn unit_of(
                 "metric for a focal length of 300 px; give --focal PX for metres".to_owned(),
             );
         };
+        let processed = (prediction.width(), prediction.height());
         for (depth, picture) in prediction.depth.iter_mut().zip(pictures) {
-            let scale = depth.width() as f64 / picture.image.width() as f64;
-            let factor = (focal * scale / CANONICAL_FOCAL_PX) as f32;
+            let size = (picture.image.width(), picture.image.height());
+            let Ok(mapping) = Mapping::new(size, processed, &request.infer.preprocess) else { continue };
+            let factor = (focal * mapping.mean_scale() / CANONICAL_FOCAL_PX) as f32;
             depth.data_mut().iter_mut().for_each(|d| *d *= factor);
         }
         return (Unit::Metre, format!("focal length {focal} px"));
@@ -330,12 +321,7 @@ fn unit_of(
 
 fn warnings(plan: &DepthPlan, located: &Located, prediction: &Prediction) -> Vec<Warning> {
     let mut warnings = plan.warnings.clone();
-    if !located.identity.geometry_means_something {
-        let message = "the weights are made by rule: this geometry means nothing";
-        warnings.push(
-            Warning::new("untrained", message).hint("`vidar model pull da3-small` fetches trained weights"),
-        );
-    }
+    warnings.extend(models::untrained(&located.identity));
     if prediction.was_cropped {
         let message = "images of several shapes were cut to the smallest";
         warnings.push(Warning::new("cropped", message).hint("predict them apart from each other"));

@@ -282,7 +282,7 @@ impl<'a> Writer<'a> {
             height: p.image.height(),
         };
         let originals: Vec<OriginalImage> = self.pictures.iter().map(original).collect();
-        let folder = self.folder.file("colmap/.")?;
+        let folder = self.folder.path().join("colmap");
         let percentile = self.request.scene.confidence_percentile;
         official::write_official_colmap(&folder, official, &originals, percentile)?;
         for name in ["cameras", "images", "points3D", "rigs", "frames"] {

@@ -4,13 +4,16 @@
 //! (`da3-small-untrained`): the official architecture with weights made by rule, whose geometry means nothing and which
 //! serves to try the road and to measure time and memory without weights.
 
+pub mod geometry;
 mod memory;
 
 pub use memory::{MemoryPlan, planned_memory};
 
 use crate::error::Error;
+use crate::run::bytes;
 use serde::Serialize;
 use std::path::{Path, PathBuf};
+use vidar_core::Warning;
 use vidar_da3::{Da3, Da3Config, Da3Options, Variant};
 use vidar_hub::catalogue::{self, CHECKPOINTS, WEIGHTS};
 use vidar_hub::{Acceptance, Checkpoint, HubError, HubSettings, Installed, PullOptions, Store, Watch};
@@ -239,6 +242,23 @@ pub fn architecture(choice: &ModelChoice) -> Option<Da3Config> {
         ModelChoice::Untrained(variant) => Some(variant.config()),
         ModelChoice::Folder(_) => None,
     }
+}
+
+/// A warning when the plan does not fit this machine.
+pub(crate) fn too_much(plan: &MemoryPlan) -> Option<Warning> {
+    let there = crate::system::hardware().memory_bytes?;
+    (plan.total() > there).then(|| {
+        let message = format!("{} planned, this machine has {}", bytes(plan.total()), bytes(there));
+        Warning::new("memory", message).hint("fewer images at once, a smaller size, or a smaller model")
+    })
+}
+
+/// A warning when the weights are made by rule.
+pub(crate) fn untrained(identity: &ModelIdentity) -> Option<Warning> {
+    (!identity.geometry_means_something).then(|| {
+        let message = "the weights are made by rule: this geometry means nothing";
+        Warning::new("untrained", message).hint("`vidar model pull da3-small` fetches trained weights")
+    })
 }
 
 /// Names of all official checkpoints.

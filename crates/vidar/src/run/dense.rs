@@ -6,6 +6,7 @@ use super::views::ViewWindow;
 use crate::config::Config;
 use crate::error::Error;
 use crate::events::{CancelToken, Event, Events};
+use crate::models;
 use crate::run_folder::{RunFolder, StoredView};
 use rayon::prelude::*;
 use vidar_align::{Anchor, aligned_views, place_chunk};
@@ -17,8 +18,10 @@ use vidar_stereo::StereoModel;
 
 /// The geometry model that the configuration names.
 pub fn model(config: &Config) -> Result<Box<dyn GeometryModel>, Error> {
-    // `Config::validate` admits no other source yet.
-    Ok(Box::new(StereoModel::new(config.stereo.clone())?))
+    match models::geometry::chosen(config)? {
+        None => Ok(Box::new(StereoModel::new(config.stereo.clone())?)),
+        Some(choice) => Ok(Box::new(models::geometry::open(&choice, config)?.0)),
+    }
 }
 
 /// Reads, predicts, places and fuses every chunk. Stops between chunks when cancelled and keeps what is fused.

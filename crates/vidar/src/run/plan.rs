@@ -4,6 +4,8 @@ use crate::config::Config;
 use crate::error::Error;
 use crate::input::{self, MetricAnchor};
 use crate::keyframes::{PosedFrame, select_keyframes};
+use crate::models::Located;
+use crate::models::geometry::{self, NetworkPlan};
 use std::ops::Range;
 use std::path::Path;
 use vidar_core::remap::undistorted_view;
@@ -42,6 +44,8 @@ pub struct Plan {
     pub view: Pinhole,
     /// The geometry model.
     pub model: ModelInfo,
+    /// The network it is, where it is one.
+    pub network: Option<NetworkPlan>,
     /// What the result will be judged against.
     pub reference: ReferenceSource,
     /// Units of the depth PNG per metre.
@@ -76,8 +80,8 @@ impl Plan {
         let anchor = input::metric_anchor(dataset, config)?;
         let (posed, mut warnings) = input::posed_frames(dataset, &anchor, config)?;
         let keyframes = select_keyframes(&posed, &config.keyframes);
-        let model = super::dense::model(config)?;
-        let needed = model.info().min_views;
+        let source = Source::open(config)?;
+        let needed = source.info().min_views;
         if keyframes.len() < needed {
             return Err(Error::TooFewKeyframes { found: keyframes.len(), needed });
         }
@@ -88,21 +92,20 @@ impl Plan {
             let seen = format!("the undistorted view sees {:.0} % of its pixels", coverage * 100.0);
             warnings.push(Warning::new("view-coverage", seen).hint("check the calibration's distortion"));
         }
+        let chunks = chunks(keyframes.len(), config.geometry.chunk_keyframes, config.geometry.context_keyframes);
+        let network = source.planned(config, &view, &chunks, &mut warnings)?;
         Ok(Self {
             started: crate::run_folder::now_rfc3339(),
             input: format!("{}: {} ({})", dataset.name, dataset.kind, dataset.reason),
             images: dataset.images.len(),
             posed: posed.len(),
-            chunks: chunks(
-                keyframes.len(),
-                config.geometry.chunk_keyframes,
-                config.geometry.context_keyframes,
-            ),
+            chunks,
             disk_bytes: disk_bytes(keyframes.len(), &view, config),
             keyframes,
             camera,
             view,
-            model: model.info().clone(),
+            model: source.info().clone(),
+            network,
             reference: reference_source(dataset, config, reference),
             depth_units_per_metre: config.output.depth_units_per_metre,
             volume_budget_bytes: config.fusion.memory_budget_bytes,
@@ -114,7 +117,7 @@ impl Plan {
     /// The plan in lines of label and text, for `--dry-run` and the report.
     pub fn lines(&self) -> Vec<(&'static str, String)> {
         let k = &self.view;
-        vec![
+        let mut lines = vec![
             ("input", self.input.clone()),
             ("metric poses", self.anchor.source.to_string()),
             ("images", format!("{} ({} with a pose)", self.images, self.posed)),
@@ -125,7 +128,60 @@ impl Plan {
             ("judged against", self.reference.to_string()),
             ("memory of the map", format!("at most {}", bytes(self.volume_budget_bytes))),
             ("disk", format!("at most {}", bytes(self.disk_bytes))),
-        ]
+        ];
+        if let Some(network) = &self.network {
+            let (memory, views) = (bytes(network.memory.total()), network.views_at_once);
+            lines.push(("memory of the network", format!("about {memory} for {views} views at once")));
+        }
+        lines
+    }
+
+    /// The model as manifests have it.
+    pub fn model_json(&self) -> serde_json::Value {
+        let mut value = serde_json::json!(self.model);
+        if let (Some(object), Some(network)) = (value.as_object_mut(), &self.network) {
+            object.insert("network".to_owned(), serde_json::json!(network));
+        }
+        value
+    }
+}
+
+/// The geometry model of a plan, opened to be asked what it is and needs.
+enum Source {
+    Stereo(Box<dyn vidar_core::GeometryModel>),
+    Network(Box<vidar_da3::Da3Model>, Located),
+}
+
+impl Source {
+    fn open(config: &Config) -> Result<Self, Error> {
+        Ok(match geometry::chosen(config)? {
+            None => Self::Stereo(super::dense::model(config)?),
+            Some(choice) => {
+                let (model, located) = geometry::open(&choice, config)?;
+                Self::Network(Box::new(model), located)
+            }
+        })
+    }
+
+    fn info(&self) -> &ModelInfo {
+        match self {
+            Self::Stereo(model) => model.info(),
+            Self::Network(model, _) => vidar_core::GeometryModel::info(model.as_ref()),
+        }
+    }
+
+    fn planned(
+        &self,
+        config: &Config,
+        view: &Pinhole,
+        chunks: &[ChunkPlan],
+        warnings: &mut Vec<Warning>,
+    ) -> Result<Option<NetworkPlan>, Error> {
+        let Self::Network(model, located) = self else { return Ok(None) };
+        let views = chunks.iter().map(|c| c.seen.len()).max().unwrap_or(0);
+        let (plan, noticed) = geometry::planned(model, located, config, view, views)?;
+        warnings.extend(noticed);
+        Ok(Some(plan))
     }
 }
 

@@ -114,7 +114,7 @@ impl About {
             }),
             dataset_sha256: sha256_hex(&dataset.fingerprint()?),
             config_sha256: sha256_hex(request.layered.to_toml(false).as_bytes()),
-            model: serde_json::json!(plan.model),
+            model: plan.model_json(),
             poses: serde_json::json!(plan.anchor.source),
             hardware: serde_json::json!(crate::system::hardware()),
             ..Manifest::default()

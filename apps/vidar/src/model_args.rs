@@ -1,0 +1,208 @@
+//! Flags of `vidar model` and `vidar depth`.
+
+use crate::args::OutputArgs;
+use clap::{Args, Subcommand, ValueEnum, ValueHint};
+use std::path::PathBuf;
+
+/// `vidar model`.
+#[derive(Debug, Subcommand)]
+pub enum ModelCommand {
+    /// Every official checkpoint: licence, size, what it can tell, and whether it is here.
+    #[command(after_help = "Examples:\n  vidar model list\n  vidar model list --json")]
+    List,
+    /// Fetch a checkpoint from the hub, going on where an earlier call stopped.
+    #[command(
+        after_help = "Examples:\n  vidar model pull da3-small\n  vidar model pull da3-large-1.1 --accept-licence CC-BY-NC-4.0\n  HF_ENDPOINT=https://mirror.example vidar model pull da3-base"
+    )]
+    Pull(PullArgs),
+    /// Take a copy of a checkpoint that is on this machine already.
+    #[command(
+        after_help = "Examples:\n  vidar model import model.safetensors\n  vidar model import DA3-SMALL/\n  vidar model import giant.safetensors --model da3-giant-1.1 --accept-licence CC-BY-NC-4.0"
+    )]
+    Import(ImportArgs),
+    /// Read every byte of a checkpoint and compare lengths and SHA-256.
+    #[command(after_help = "Examples:\n  vidar model verify\n  vidar model verify da3-small")]
+    Verify {
+        /// Which one; without it all that are here.
+        name: Option<String>,
+    },
+    /// Compare the network, layer by layer, with reference files.
+    #[command(
+        after_help = "Examples:\n  vidar model check goldens/\n  vidar model check small.safetensors --precision bf16\n  vidar model check small.safetensors --model-dir DA3-SMALL/"
+    )]
+    Check(CheckArgs),
+    /// The folder of a checkpoint, or of all.
+    #[command(after_help = "Examples:\n  vidar model where\n  vidar model where da3-small")]
+    Where {
+        /// Which one; without it the folder of all.
+        name: Option<String>,
+    },
+}
+
+/// Acceptance of a licence.
+#[derive(Args, Clone, Debug, Default)]
+pub struct LicenceArgs {
+    /// Accept the licence of the weights, named in full (CC-BY-NC-4.0); written down beside them.
+    #[arg(long, value_name = "LICENCE", help_heading = "Model")]
+    pub accept_licence: Option<String>,
+    /// Who accepts; default is the user of this system.
+    #[arg(long, value_name = "NAME", help_heading = "Model")]
+    pub accepted_by: Option<String>,
+}
+
+/// `vidar model pull`.
+#[derive(Args, Clone, Debug)]
+pub struct PullArgs {
+    /// Which checkpoint.
+    pub name: String,
+    /// Acceptance of a licence.
+    #[command(flatten)]
+    pub licence: LicenceArgs,
+    /// Another commit or branch of its repository; the hub alone then says what is right.
+    #[arg(long)]
+    pub revision: Option<String>,
+    /// Fetch again what is already here.
+    #[arg(long)]
+    pub again: bool,
+}
+
+/// `vidar model import`.
+#[derive(Args, Clone, Debug)]
+pub struct ImportArgs {
+    /// `model.safetensors`, or a folder with it and `config.json`.
+    #[arg(value_hint = ValueHint::AnyPath)]
+    pub path: PathBuf,
+    /// Which checkpoint it is, where its SHA-256 does not tell.
+    #[arg(long)]
+    pub model: Option<String>,
+    /// Acceptance of a licence.
+    #[command(flatten)]
+    pub licence: LicenceArgs,
+}
+
+/// `vidar model check`.
+#[derive(Args, Clone, Debug)]
+pub struct CheckArgs {
+    /// A reference file (.safetensors with a manifest.json beside it), or a folder of them.
+    #[arg(value_hint = ValueHint::AnyPath)]
+    pub path: PathBuf,
+    /// Check this model instead of weights made by rule.
+    #[arg(long, value_hint = ValueHint::AnyPath)]
+    pub model_dir: Option<PathBuf>,
+    /// Precision of the backbone.
+    #[arg(long, value_enum, default_value_t = PrecisionArg::F32)]
+    pub precision: PrecisionArg,
+    /// Print every tensor, not only the worst and what departs.
+    #[arg(long)]
+    pub all: bool,
+}
+
+/// Precision of matrix products.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum PrecisionArg {
+    /// 32 bits.
+    F32,
+    /// Three products of 16 bits, close to 32.
+    F32Split,
+    /// Brain floats of 16 bits.
+    Bf16,
+    /// Weights of 16 bits.
+    F16,
+}
+
+/// Which side of an image is scaled, and how multiples of 14 are reached.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum MethodArg {
+    /// The longer side; then stretched.
+    UpperBoundResize,
+    /// The longer side; then cut.
+    UpperBoundCrop,
+    /// The shorter side; then stretched.
+    LowerBoundResize,
+    /// The shorter side; then cut.
+    LowerBoundCrop,
+}
+
+/// How the reference view is chosen.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum RefViewArg {
+    /// In the middle of similarity, norm and variance.
+    SaddleBalanced,
+    /// With the widest range of similarities.
+    SaddleSimRange,
+    /// The first.
+    First,
+    /// The one in the middle.
+    Middle,
+}
+
+/// Size of clouds and depth images.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum ResolutionArg {
+    /// As the network answers.
+    Processed,
+    /// As the images came.
+    Input,
+}
+
+/// `vidar depth`.
+#[derive(Args, Clone, Debug)]
+pub struct DepthArgs {
+    /// Images, or folders of images; all are seen together, in this order.
+    #[arg(required = true, value_hint = ValueHint::AnyPath)]
+    pub inputs: Vec<PathBuf>,
+    /// The network: `vidar model list` names them; `…-untrained` has weights made by rule.
+    #[arg(long, default_value = "da3-small", help_heading = "Model")]
+    pub model: String,
+    /// A folder with model.safetensors and config.json of one's own.
+    #[arg(long, conflicts_with = "model", value_hint = ValueHint::AnyPath, help_heading = "Model")]
+    pub model_dir: Option<PathBuf>,
+    /// Acceptance of a licence.
+    #[command(flatten)]
+    pub licence: LicenceArgs,
+    /// Precision of the backbone.
+    #[arg(long, value_enum, default_value_t = PrecisionArg::F32, help_heading = "Model")]
+    pub precision: PrecisionArg,
+    /// Length of the bounding side of what the network sees, pixels.
+    #[arg(long, default_value_t = 504, help_heading = "Model")]
+    pub process_res: usize,
+    /// Which side that is, and how multiples of 14 are reached.
+    #[arg(long, value_enum, default_value_t = MethodArg::UpperBoundResize, help_heading = "Model")]
+    pub method: MethodArg,
+    /// Known cameras of the images: a transforms.json, a folder with a COLMAP model, or a run folder.
+    #[arg(long, value_hint = ValueHint::AnyPath, help_heading = "Model")]
+    pub poses: Option<PathBuf>,
+    /// With --poses: keep the network's scale and move the cameras instead.
+    #[arg(long, requires = "poses", help_heading = "Model")]
+    pub keep_scale: bool,
+    /// Focal length in pixels of the images: metres from da3-metric-large.
+    #[arg(long, value_name = "PX", help_heading = "Model")]
+    pub focal: Option<f64>,
+    /// Cameras from rays instead of the camera decoder: slower, with a principal point.
+    #[arg(long, help_heading = "Model")]
+    pub use_ray_pose: bool,
+    /// How the reference view is chosen.
+    #[arg(long, value_enum, default_value_t = RefViewArg::SaddleBalanced, help_heading = "Model")]
+    pub ref_view: RefViewArg,
+    /// Stop and round where the official program does, also where VIDAR does better.
+    #[arg(long, help_heading = "Model")]
+    pub compat: bool,
+    /// What to write, separated by commas: depth_png, ply, depth_vis, mini_npz, npz, glb, colmap.
+    #[arg(long, default_value = "depth_png,ply,depth_vis", help_heading = "Output")]
+    pub format: String,
+    /// Size of cloud and depth images.
+    #[arg(long, value_enum, default_value_t = ResolutionArg::Processed, help_heading = "Output")]
+    pub resolution: ResolutionArg,
+    /// Percentile of confidence below which pixels become no points.
+    #[arg(long, default_value_t = 40.0, help_heading = "Output")]
+    pub conf_percentile: f64,
+    /// Most points of a cloud.
+    #[arg(long, default_value_t = 1_000_000, help_heading = "Output")]
+    pub max_points: usize,
+    /// Where results go.
+    #[command(flatten)]
+    pub output: OutputArgs,
+    /// Say what would be done and what memory it takes, and stop.
+    #[arg(long)]
+    pub dry_run: bool,
+}

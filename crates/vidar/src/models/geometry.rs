@@ -1,0 +1,63 @@
+//! A network as the geometry model of a run.
+
+use super::{Located, ModelChoice, ModelIdentity, MemoryPlan, locate, planned_memory, store};
+use crate::config::Config;
+use crate::error::Error;
+use serde::Serialize;
+use std::path::PathBuf;
+use std::sync::Arc;
+use vidar_core::{Pinhole, Warning};
+use vidar_da3::preprocess::processed_size;
+use vidar_da3::{Da3Model, Da3Options, Precision};
+
+/// The source of geometry that needs no network.
+pub const STEREO: &str = "stereo";
+
+/// What a plan knows of the network.
+#[derive(Clone, Debug, Serialize)]
+pub struct NetworkPlan {
+    /// What manifests say of it.
+    #[serde(flatten)]
+    pub identity: ModelIdentity,
+    /// Views that it sees at once.
+    pub views_at_once: usize,
+    /// Memory for those, bytes.
+    pub memory: MemoryPlan,
+}
+
+/// The network that the configuration names; `None` where no network is needed.
+pub fn chosen(config: &Config) -> Result<Option<ModelChoice>, Error> {
+    match (config.model.dir.as_str(), config.geometry.source.as_str()) {
+        ("", STEREO) => Ok(None),
+        ("", name) => ModelChoice::named(name).map(Some),
+        (dir, _) => Ok(Some(ModelChoice::Folder(PathBuf::from(dir)))),
+    }
+}
+
+/// Opens the network. The network of computers is never used for it.
+pub fn open(choice: &ModelChoice, config: &Config) -> Result<(Da3Model, Located), Error> {
+    let located = locate(choice, None, &store(true)?)?;
+    // The dense head stays in 32 bits, as in the official program.
+    let head_precision = Some(Precision::F32);
+    let options = Da3Options { precision: config.model.precision.into(), head_precision, ..Da3Options::default() };
+    let network = Arc::new(located.open(&options)?);
+    let sha256 = located.identity.weights_sha256.clone();
+    let model = Da3Model::new(network, config.model.network.clone(), sha256)?;
+    Ok((model, located))
+}
+
+/// What running it on chunks of `views` such views takes, and what there is to warn of.
+pub fn planned(
+    model: &Da3Model,
+    located: &Located,
+    config: &Config,
+    view: &Pinhole,
+    views: usize,
+) -> Result<(NetworkPlan, Vec<Warning>), Error> {
+    let size = processed_size(view.width, view.height, &config.model.network.preprocess)?;
+    let identity = located.identity.clone();
+    let memory = planned_memory(model.network().config(), views, size);
+    let mut warnings: Vec<Warning> = super::too_much(&memory).into_iter().collect();
+    warnings.extend(super::untrained(&identity));
+    Ok((NetworkPlan { identity, views_at_once: views, memory }, warnings))
+}
