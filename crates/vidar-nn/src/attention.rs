@@ -6,7 +6,7 @@ use crate::compute::{Compute, Isa};
 use crate::kernels::attend::{
     Attend, BLOCK, HeadLayout, LayoutOf, PackKeys, Prepare, QUERIES, Tokens, for_each_part,
 };
-use crate::kernels::scratch::{self, Role};
+use crate::kernels::scratch::{self, Role, Scratch};
 use crate::kernels::shared::SharedMut;
 use crate::kernels::{Factors, dispatch_product};
 use crate::norm::LayerNorm;
@@ -67,9 +67,9 @@ impl<'a> TokenRows<'a> {
 
 /// Packed keys and values of one sequence, all heads: what queries meet. A sequence of many views can be pushed view by
 /// view, so that only this packed form of all views exists at a time (in bf16, 4 bytes per token and channel).
-#[derive(Debug, Clone)]
+#[derive(Debug)]
 pub struct KeyValues {
-    words: Vec<f32>,
+    words: Scratch,
     layout: HeadLayout,
     heads: usize,
     tokens: usize,
@@ -83,7 +83,7 @@ impl KeyValues {
         let (isa, factors) = (c.isa(), Factors::of(c));
         let layout = dispatch_product(isa, factors, LayoutOf { d: spec.head_dim, keys: capacity });
         Self {
-            words: vec![0.0; layout.words() * spec.heads],
+            words: Scratch::with_words(layout.words() * spec.heads),
             layout,
             heads: spec.heads,
             tokens: 0,
@@ -99,7 +99,7 @@ impl KeyValues {
 
     /// Bytes held.
     pub fn bytes(&self) -> usize {
-        self.words.len() * 4
+        self.words.bytes()
     }
 
     /// Appends the keys (normalised and rotated as `spec` says) and values of some tokens, whose rotation counts from the
@@ -110,7 +110,7 @@ impl KeyValues {
     pub fn push(&mut self, spec: &AttentionSpec<'_>, k: TokenRows<'_>, v: TokenRows<'_>) {
         assert_eq!((spec.heads, spec.head_dim), (self.heads, self.layout.d), "keys of other heads");
         assert!(self.tokens + k.tokens <= self.layout.capacity, "{} + {} keys", self.tokens, k.tokens);
-        let words = SharedMut::new(&mut self.words);
+        let words = SharedMut::new(self.words.floats(self.layout.words() * self.heads));
         push(self.isa, self.factors, spec, 0..self.heads, [k, v], self.layout, words, self.tokens);
         self.tokens += k.tokens;
     }
@@ -124,7 +124,7 @@ impl KeyValues {
         assert_eq!((spec.heads, spec.head_dim), (self.heads, self.layout.d), "queries of other heads");
         assert_eq!(out.len(), q.tokens * spec.width(), "attention: output");
         assert!(self.tokens > 0 || q.tokens == 0, "attention to no keys");
-        let words = scratch::as_words(&self.words);
+        let words = self.words.filled();
         let out = SharedMut::new(out);
         attend(self.isa, self.factors, spec, 0..self.heads, q, (self.layout, words, self.tokens), out);
     }

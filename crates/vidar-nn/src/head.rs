@@ -53,7 +53,6 @@ pub fn head(c: &Compute, input: &HeadInput<'_>, branches: &mut [HeadBranch<'_>])
     assert_eq!(map.data.len(), map.rows * map.cols * channels, "head: input");
     let embedding = input.embedding.map(|e| e.view(channels, size));
     let (isa, factors) = (c.isa(), Factors::of(c));
-    let shape = dispatch_product(isa, factors, ShapeOf);
     let mut lengths = Vec::with_capacity(branches.len());
     for branch in branches.iter() {
         let (conv, point) = (branch.conv, branch.point);
@@ -69,7 +68,8 @@ pub fn head(c: &Compute, input: &HeadInput<'_>, branches: &mut [HeadBranch<'_>])
         );
         assert_eq!(branch.out.len(), size.rows * size.cols * point.out_channels(), "head: output");
         let source = Source::Bands(conv.bands(Fill::Copy(&[]), size.rows, size.cols));
-        lengths.push(conv.out_channels().next_multiple_of(shape.panel) * source.inner().words(shape.step));
+        let shape = dispatch_product(isa, factors, ShapeOf { inner: source.inner() });
+        lengths.push(conv.out_channels().next_multiple_of(shape.panel) * shape.words);
     }
     if size.rows * size.cols * channels == 0 {
         for branch in branches {

@@ -13,7 +13,7 @@ use super::pack::transpose;
 use super::scratch::{self, Role, as_floats_mut, as_words_mut};
 use super::shared::SharedMut;
 use super::simd::Simd;
-use super::tile::{MAX_ROWS, Multiply, tile};
+use super::tile::{MAX_ROWS, Multiply, steps_of};
 use super::{ProductKernel, math};
 use crate::rope::RopeTable;
 
@@ -57,17 +57,15 @@ pub(crate) struct HeadLayout {
     pub(crate) capacity: usize,
     panel: usize,
     step: usize,
+    d_steps: usize,
 }
 
 impl HeadLayout {
-    fn d_steps(&self) -> usize {
-        self.d.div_ceil(self.step)
-    }
     fn d_panels(&self) -> usize {
         self.d.div_ceil(self.panel)
     }
     fn key_words(&self) -> usize {
-        self.capacity * self.d_steps()
+        self.capacity * self.d_steps
     }
     fn value_panel_words(&self) -> usize {
         self.capacity / self.step * self.panel
@@ -88,7 +86,13 @@ impl ProductKernel for LayoutOf {
     type Output = HeadLayout;
     fn run<M: Multiply>(self, _: M) -> HeadLayout {
         let capacity = self.keys.next_multiple_of(BLOCK);
-        HeadLayout { d: self.d, capacity, panel: 2 * M::Simd::LANES, step: M::STEP }
+        HeadLayout {
+            d: self.d,
+            capacity,
+            panel: 2 * M::Simd::LANES,
+            step: M::STEP,
+            d_steps: steps_of::<M>(self.d),
+        }
     }
 }
 
@@ -114,7 +118,7 @@ impl ProductKernel for PackKeys<'_> {
     #[inline(always)]
     fn run<M: Multiply>(self, m: M) {
         let (s, layout) = (m.simd(), self.layout);
-        let (d, panel, d_steps) = (layout.d, layout.panel, layout.d_steps());
+        let (d, panel, d_steps) = (layout.d, layout.panel, layout.d_steps);
         let block = self.first / BLOCK * BLOCK;
         let offset = self.first - block;
         debug_assert!(offset + self.count <= BLOCK);
@@ -141,7 +145,7 @@ impl ProductKernel for PackKeys<'_> {
             let to = &mut packed[(offset + i) * d_steps..(offset + i + 1) * d_steps];
             let whole = d / M::STEP;
             m.convert(&row[..whole * M::STEP], &mut M::numbers(&mut to[..whole])[..whole * M::STEP]);
-            if whole < d_steps {
+            if whole * M::STEP < d {
                 to[whole] = M::word(&row[whole * M::STEP..]);
             }
         }
@@ -201,13 +205,13 @@ impl ProductKernel for Attend<'_> {
     fn run<M: Multiply>(self, m: M) {
         let (s, layout) = (m.simd(), self.layout);
         let lanes = M::Simd::LANES;
-        let (d, panel, d_steps) = (layout.d, layout.panel, layout.d_steps());
+        let (d, panel, d_steps) = (layout.d, layout.panel, layout.d_steps);
         let d_wide = layout.d_panels() * panel;
-        let (n, tile_rows) = (self.count, M::Simd::TILE_ROWS);
+        let (n, tile_rows) = (self.count, M::ROWS);
         assert!(n <= QUERIES && self.words.len() >= layout.words() && self.keys <= layout.capacity);
 
         let mut scratch = scratch::borrow(Role::Block);
-        let q_stride = d.next_multiple_of(16); // in words: room enough for either format
+        let q_stride = d.next_multiple_of(32); // in words: room enough for either format
         let words = scratch.words(q_stride + QUERIES * (q_stride + 2 * BLOCK + d_wide + lanes));
         let (row, words) = words.split_at_mut(q_stride);
         let (q, words) = words.split_at_mut(QUERIES * q_stride);
@@ -233,6 +237,7 @@ impl ProductKernel for Attend<'_> {
             to[d..].fill(M::Number::default());
         }
 
+        m.enter();
         let mut tile_sums = [[s.splat(0.0); 2]; MAX_ROWS];
         for block in (0..self.keys).step_by(BLOCK) {
             let count = BLOCK.min(self.keys - block);
@@ -244,7 +249,7 @@ impl ProductKernel for Attend<'_> {
                     // SAFETY: `rows` rows of q with d_steps words each, and a whole panel of keys.
                     unsafe {
                         let here = (q[from * q_stride..].as_ptr(), q_stride);
-                        tile(m, rows, here, &[0], d_steps, k.as_ptr(), &mut tile_sums);
+                        m.tile(rows, here, &[0], d_steps, k.as_ptr(), &mut tile_sums);
                     }
                     for (r, sums) in tile_sums[..rows].iter().enumerate() {
                         let to = &mut scores[(from + r) * BLOCK + p..][..panel];
@@ -268,7 +273,7 @@ impl ProductKernel for Attend<'_> {
                     // SAFETY: `rows` rows of `wide` weights, and as many packed values.
                     unsafe {
                         let here = (weights[from * weight_stride..].as_ptr(), weight_stride);
-                        tile(m, rows, here, &[0], wide / M::STEP, v.as_ptr(), &mut tile_sums);
+                        m.tile(rows, here, &[0], wide / M::STEP, v.as_ptr(), &mut tile_sums);
                     }
                     for (r, add) in tile_sums[..rows].iter().enumerate() {
                         let to = &mut sums[(from + r) * d_wide + p * panel..][..panel];
@@ -280,6 +285,7 @@ impl ProductKernel for Attend<'_> {
                 }
             }
         }
+        m.leave();
         for i in 0..n {
             let scale = s.splat(1.0 / s.sum(s.load(&totals[i * lanes..])));
             // SAFETY: every task has its own queries of its own head.

@@ -14,12 +14,12 @@ use std::ops::Range;
 
 use rayon::prelude::*;
 
-use super::pack::{Columns, Pack};
+use super::pack::{Columns, Inner, Pack};
 use super::scratch::{self, Role};
 use super::shared::SharedMut;
 use super::simd::Simd;
 use super::source::{Geometry, Source};
-use super::tile::{MAX_ROWS, Multiply, Sums, tile};
+use super::tile::{MAX_ROWS, Multiply, Sums, steps_of, tile_start};
 use super::{Factors, ProductKernel, dispatch_product, math};
 use crate::compute::{Compute, Precision};
 
@@ -82,8 +82,8 @@ impl Product<'_> {
             return;
         }
         let (isa, factors) = (c.isa(), Factors::of(c));
-        let Shape { panel, step } = dispatch_product(isa, factors, ShapeOf);
-        let panel_words = panel * inner.words(step);
+        let Shape { panel, words } = dispatch_product(isa, factors, ShapeOf { inner });
+        let panel_words = panel * words;
         let gated = matches!(self.end, End::SwiGlu);
         let width = if gated { self.width / 2 } else { self.width };
         // For a gated unit panels come in pairs, gate and value.
@@ -120,17 +120,21 @@ impl Product<'_> {
     }
 }
 
-pub(crate) struct ShapeOf;
+/// Asks for the shape of panels.
+pub(crate) struct ShapeOf {
+    pub(crate) inner: Inner,
+}
 
+/// Columns of a panel, and words of a column.
 pub(crate) struct Shape {
     pub(crate) panel: usize,
-    pub(crate) step: usize,
+    pub(crate) words: usize,
 }
 
 impl ProductKernel for ShapeOf {
     type Output = Shape;
     fn run<M: Multiply>(self, _: M) -> Shape {
-        Shape { panel: 2 * M::Simd::LANES, step: M::STEP }
+        Shape { panel: 2 * M::Simd::LANES, words: self.inner.words::<M>() }
     }
 }
 
@@ -197,7 +201,7 @@ pub(crate) fn multiply<M: Multiply>(
 ) {
     let s = m.simd();
     let panel = 2 * M::Simd::LANES;
-    let steps = geometry.inner.group.div_ceil(M::STEP);
+    let steps = steps_of::<M>(geometry.inner.group);
     let panel_words = panel * geometry.inner.taps * steps;
     if rows.is_empty() || units.is_empty() {
         return;
@@ -205,11 +209,13 @@ pub(crate) fn multiply<M: Multiply>(
     // Every address that a tile reads lies below this one.
     let reach = geometry.at(rows.end - 1) - geometry.at(rows.start)
         + geometry.taps.iter().max().copied().unwrap_or(0)
+        + (M::READ_ROWS - 1) * geometry.row_stride
         + steps * M::STEP;
     assert!(panel_words == 0 || reach <= a.len(), "rows of a product: {reach} of {}", a.len());
     assert!(units.end <= panels.count && panels.words.len() >= panels.count * panels.per_unit * panel_words);
     let mut sums = [[s.splat(0.0); 2]; MAX_ROWS];
     let mut gates = sums;
+    m.enter();
     for unit in units {
         let words = &panels.words[unit * panels.per_unit * panel_words..][..panels.per_unit * panel_words];
         let first = (panels.first + unit) * panel;
@@ -217,19 +223,18 @@ pub(crate) fn multiply<M: Multiply>(
         while row < rows.end {
             let line_end = (row / geometry.line + 1) * geometry.line;
             let run = row..line_end.min(rows.end);
-            let tiles = run.len().div_ceil(M::Simd::TILE_ROWS);
+            let tiles = run.len().div_ceil(M::ROWS);
             for i in 0..tiles {
-                // Heights as equal as possible: a last tile of one row would cost as much as one of four.
-                let from = run.start + i * run.len() / tiles;
-                let count = run.start + (i + 1) * run.len() / tiles - from;
+                let from = run.start + tile_start::<M>(run.len(), i, tiles);
+                let count = run.start + tile_start::<M>(run.len(), i + 1, tiles) - from;
                 let at = geometry.at(from) - geometry.at(rows.start);
                 let here = (a[at..].as_ptr(), geometry.row_stride);
                 // SAFETY: `reach` bounds every row and tap, and each panel has panel_words words.
                 unsafe {
-                    tile(m, count, here, &geometry.taps, steps, words.as_ptr(), &mut sums);
+                    m.tile(count, here, &geometry.taps, steps, words.as_ptr(), &mut sums);
                     if panels.per_unit == 2 {
                         std::mem::swap(&mut gates, &mut sums);
-                        tile(m, count, here, &geometry.taps, steps, words[panel_words..].as_ptr(), &mut sums);
+                        m.tile(count, here, &geometry.taps, steps, words[panel_words..].as_ptr(), &mut sums);
                     }
                 }
                 target.finish(s, &gates, &sums, from - out_start, count, first);
@@ -237,6 +242,7 @@ pub(crate) fn multiply<M: Multiply>(
             row = run.end;
         }
     }
+    m.leave();
 }
 
 impl Target<'_> {

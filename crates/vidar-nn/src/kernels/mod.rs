@@ -4,6 +4,8 @@
 //! a struct that holds its arguments and implements [`Kernel`] or [`ProductKernel`]; [`dispatch`] and [`dispatch_product`]
 //! run it inside a function compiled for the processor features of the set.
 
+#[cfg(target_arch = "x86_64")]
+pub(crate) mod amx;
 pub(crate) mod attend;
 pub(crate) mod gemm;
 pub(crate) mod head;
@@ -71,6 +73,13 @@ pub(crate) fn is_available(isa: Isa) -> bool {
                 && is_x86_feature_detected!("avx512vl")
                 && is_x86_feature_detected!("fma")
         }
+        #[cfg(all(target_arch = "x86_64", target_os = "linux"))]
+        Isa::Amx => {
+            // In this crate's own tests plain Rust stands in for the tiles that a processor lacks.
+            is_available(Isa::Avx512)
+                && is_x86_feature_detected!("avx512bf16")
+                && (cfg!(test) || amx::permitted())
+        }
         #[cfg(target_arch = "aarch64")]
         Isa::Neon => std::arch::is_aarch64_feature_detected!("neon"),
         _ => false,
@@ -81,6 +90,7 @@ fn multiplies_bf16(isa: Isa) -> bool {
     match isa {
         #[cfg(target_arch = "x86_64")]
         Isa::Avx512 => is_x86_feature_detected!("avx512bf16"),
+        Isa::Amx => true,
         _ => false,
     }
 }
@@ -93,7 +103,7 @@ pub(crate) fn dispatch<K: Kernel>(isa: Isa, kernel: K) -> K::Output {
         Isa::Avx2 => unsafe { in_avx2(kernel) },
         #[cfg(target_arch = "x86_64")]
         // SAFETY: as above.
-        Isa::Avx512 => unsafe { in_avx512(kernel) },
+        Isa::Avx512 | Isa::Amx => unsafe { in_avx512(kernel) },
         #[cfg(target_arch = "aarch64")]
         // SAFETY: as above.
         Isa::Neon => unsafe { in_neon(kernel) },
@@ -107,6 +117,12 @@ pub(crate) fn dispatch_product<K: ProductKernel>(isa: Isa, factors: Factors, ker
         #[cfg(target_arch = "x86_64")]
         // SAFETY: bf16 is checked here, the rest before a kernel set reaches this point.
         (Isa::Avx512, Factors::Bf16) if multiplies_bf16(isa) => unsafe { in_avx512_bf16(kernel) },
+        #[cfg(all(test, target_arch = "x86_64", target_os = "linux"))]
+        // SAFETY: AVX-512-BF16 was detected before this kernel set reached this point.
+        (Isa::Amx, Factors::Bf16) if !amx::permitted() => unsafe { in_emulated_amx(kernel) },
+        #[cfg(all(target_arch = "x86_64", target_os = "linux"))]
+        // SAFETY: tiles were permitted before this kernel set reached this point.
+        (Isa::Amx, Factors::Bf16) => unsafe { in_amx(kernel) },
         (_, Factors::Bf16) => kernel.run(InBf16(Portable)),
         (_, Factors::F32) => dispatch(isa, F32Product(kernel)),
     }
@@ -141,6 +157,26 @@ unsafe fn in_avx512<K: Kernel>(kernel: K) -> K::Output {
 unsafe fn in_avx512_bf16<K: ProductKernel>(kernel: K) -> K::Output {
     // SAFETY: this function's own condition.
     kernel.run(InBf16(unsafe { x86::Avx512::<true>::new() }))
+}
+
+#[cfg(all(target_arch = "x86_64", target_os = "linux"))]
+#[target_feature(enable = "avx512f,avx512bw,avx512dq,avx512vl,avx512bf16,avx2,fma")]
+unsafe fn in_amx<K: ProductKernel>(kernel: K) -> K::Output {
+    // SAFETY: this function's own condition.
+    let (vectors, tiles) = unsafe { (x86::Avx512::<true>::new(), amx::Hardware::new()) };
+    kernel.run(amx::InAmx { vectors, tiles })
+}
+
+/// As [`in_amx`] with tiles in plain Rust.
+///
+/// # Safety
+/// The processor must have AVX-512-BF16.
+#[cfg(all(test, target_arch = "x86_64", target_os = "linux"))]
+#[target_feature(enable = "avx512f,avx512bw,avx512dq,avx512vl,avx512bf16,avx2,fma")]
+unsafe fn in_emulated_amx<K: ProductKernel>(kernel: K) -> K::Output {
+    // SAFETY: this function's own condition.
+    let vectors = unsafe { x86::Avx512::<true>::new() };
+    kernel.run(amx::InAmx { vectors, tiles: amx::Emulated })
 }
 
 #[cfg(target_arch = "aarch64")]

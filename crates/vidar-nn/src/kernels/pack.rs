@@ -4,7 +4,7 @@ use rayon::prelude::*;
 
 use super::scratch::{self, Role};
 use super::simd::Simd;
-use super::tile::Multiply;
+use super::tile::{Multiply, steps_of};
 use super::{Factors, ProductKernel, dispatch_product};
 use crate::compute::Isa;
 
@@ -22,9 +22,9 @@ pub(crate) struct Inner {
 }
 
 impl Inner {
-    /// Words of a column when each holds `step` numbers: every tap starts with a new word.
-    pub(crate) fn words(self, step: usize) -> usize {
-        self.taps * self.group.div_ceil(step)
+    /// Words of a column: every tap starts with a new one.
+    pub(crate) fn words<M: Multiply>(self) -> usize {
+        self.taps * steps_of::<M>(self.group)
     }
 }
 
@@ -51,7 +51,7 @@ impl ProductKernel for Pack<'_> {
     type Output = ();
     fn run<M: Multiply>(self, m: M) {
         let panel = 2 * M::Simd::LANES;
-        let words = self.inner.words(M::STEP);
+        let words = self.inner.words::<M>();
         if words == 0 {
             return;
         }
@@ -73,16 +73,16 @@ impl ProductKernel for Pack<'_> {
                 if round_to_f16 {
                     read.iter_mut().for_each(|x| *x = half::f16::from_f32(*x).to_f32());
                 }
-                if let Some(rest) = inner.group.checked_rem(M::STEP).filter(|rest| *rest > 0) {
-                    for (read, packed) in
-                        read.chunks_exact(inner.group).zip(packed.chunks_exact_mut(words / inner.taps))
-                    {
-                        let whole = packed.len() - 1;
-                        m.convert(&read[..inner.group - rest], M::numbers(&mut packed[..whole]));
-                        packed[whole] = M::word(&read[inner.group - rest..]);
+                let whole = inner.group / M::STEP;
+                for (read, packed) in
+                    read.chunks_exact(inner.group).zip(packed.chunks_exact_mut(words / inner.taps))
+                {
+                    let (even, rest) = read.split_at(whole * M::STEP);
+                    m.convert(even, M::numbers(&mut packed[..whole]));
+                    packed[whole..].fill(0);
+                    if !rest.is_empty() {
+                        packed[whole] = M::word(rest);
                     }
-                } else {
-                    m.convert(read, M::numbers(packed));
                 }
             }
             transpose(&packed[..panel * words], words, to);

@@ -12,6 +12,12 @@ pub(crate) struct Scratch {
     lines: Vec<Line>,
 }
 
+impl std::fmt::Debug for Scratch {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "Scratch({} bytes)", self.bytes())
+    }
+}
+
 impl Scratch {
     /// At least `len` words.
     pub(crate) fn words(&mut self, len: usize) -> &mut [u32] {
@@ -30,7 +36,20 @@ impl Scratch {
         as_floats_mut(self.words(len))
     }
 
-    fn bytes(&self) -> usize {
+    /// Room for `len` words, zeros.
+    pub(crate) fn with_words(len: usize) -> Self {
+        let mut scratch = Self::default();
+        scratch.words(len);
+        scratch
+    }
+
+    /// All words there are.
+    pub(crate) fn filled(&self) -> &[u32] {
+        // SAFETY: lines are arrays of 16 words without padding; all of them are initialised.
+        unsafe { std::slice::from_raw_parts(self.lines.as_ptr().cast(), self.lines.len() * 16) }
+    }
+
+    pub(crate) fn bytes(&self) -> usize {
         self.lines.len() * 64
     }
 }
@@ -39,12 +58,6 @@ impl Scratch {
 pub(crate) fn as_floats_mut(words: &mut [u32]) -> &mut [f32] {
     // SAFETY: f32 and u32 have the same size and alignment, and every bit pattern is valid for both.
     unsafe { std::slice::from_raw_parts_mut(words.as_mut_ptr().cast(), words.len()) }
-}
-
-/// The same numbers as words.
-pub(crate) fn as_words(floats: &[f32]) -> &[u32] {
-    // SAFETY: f32 and u32 have the same size and alignment, and every bit pattern is valid for both.
-    unsafe { std::slice::from_raw_parts(floats.as_ptr().cast(), floats.len()) }
 }
 
 /// The same numbers as words.

@@ -58,7 +58,7 @@ pub(crate) enum Fill<'a> {
 }
 
 /// Numbers beyond the last row that a tile may read (and multiply by zero).
-const SLACK: usize = 32;
+const SLACK: usize = 64;
 /// Bytes of prepared rows of a task: a quarter of a second-level cache.
 const CHUNK_BYTES: usize = 256 << 10;
 /// Rows of a chunk are a multiple of every kernel set's tile height.
@@ -113,7 +113,7 @@ impl<'a> Source<'a> {
                     *width
                 } else {
                     // Pairs stay aligned, and rows do not fall into the same cache sets.
-                    width.next_multiple_of(16) + 16
+                    width.next_multiple_of(32) + 16
                 };
                 Geometry {
                     inner,
@@ -156,7 +156,7 @@ impl<'a> Source<'a> {
                     return direct;
                 }
                 let stride = geometry.row_stride;
-                let numbers = rows.len() * stride + SLACK;
+                let numbers = (rows.len() + M::READ_ROWS - 1) * stride + SLACK;
                 let temporary = inner.next_multiple_of(16);
                 let (line, words) = scratch.words(temporary + numbers).split_at_mut(temporary);
                 let line = &mut scratch::as_floats_mut(line)[..*inner];
@@ -209,7 +209,7 @@ impl Bands<'_> {
         let needed = (lines.len() - 1) * self.stride + self.kernel[0];
         let width = self.cols * self.channels;
         let border = self.padding * self.channels;
-        let numbers = needed * pitch + SLACK;
+        let numbers = needed * pitch + (M::READ_ROWS - 1) * self.stride * self.channels + SLACK;
         let temporary = width.next_multiple_of(16);
         let (line, words) = scratch.words(temporary + numbers).split_at_mut(temporary);
         let line = &mut scratch::as_floats_mut(line)[..width];

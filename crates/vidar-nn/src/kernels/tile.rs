@@ -2,8 +2,8 @@
 
 use super::simd::{Simd, SimdBf16};
 
-/// The largest `TILE_ROWS` of any kernel set.
-pub(crate) const MAX_ROWS: usize = 12;
+/// The largest `ROWS` of any way to multiply.
+pub(crate) const MAX_ROWS: usize = 32;
 
 /// Sums of a tile; rows beyond the ones asked for are left alone.
 pub(crate) type Sums<S> = [[<S as Simd>::V; 2]; MAX_ROWS];
@@ -16,7 +16,18 @@ pub(crate) trait Multiply: Copy + Send + Sync {
     /// Numbers of the inner dimension that one word of packed B holds.
     const STEP: usize;
 
+    /// Words of a tap come in multiples of this, filled up with zeros.
+    const STEPS_UNIT: usize = 1;
+    /// The tallest tile.
+    const ROWS: usize;
+    /// Rows are read in groups of this many.
+    const READ_ROWS: usize = 1;
+
     fn simd(self) -> Self::Simd;
+
+    /// Called before a thread's tiles, and after them.
+    fn enter(self) {}
+    fn leave(self) {}
 
     /// `f32` numbers as they are, if that is the number format.
     fn direct(x: &[f32]) -> Option<&[Self::Number]>;
@@ -30,15 +41,15 @@ pub(crate) trait Multiply: Copy + Send + Sync {
     /// Words of scratch as numbers.
     fn numbers(words: &mut [u32]) -> &mut [Self::Number];
 
-    /// `sums[r] = Σ a[r] b` over taps and `steps` words of each, for `R` rows.
+    /// `sums[r] = Σ a[r] b` over taps and `steps` words of each, for `rows` rows that lie `a.1` numbers apart.
     ///
     /// # Safety
-    /// For each row r < R and tap, `a + r * stride + tap` must be readable for `steps * STEP` numbers, and `b` for
-    /// `taps * steps * 2 * LANES` words.
-    unsafe fn tile<const R: usize>(
+    /// `rows` is between 1 and `ROWS`. For each row r below `rows`, rounded up to `READ_ROWS`, and each tap,
+    /// `a.0 + r * a.1 + tap` must be readable for `steps * STEP` numbers, and `b` for `taps * steps * 2 * LANES` words.
+    unsafe fn tile(
         self,
-        a: *const Self::Number,
-        stride: usize,
+        rows: usize,
+        a: (*const Self::Number, usize),
         taps: &[usize],
         steps: usize,
         b: *const u32,
@@ -46,34 +57,33 @@ pub(crate) trait Multiply: Copy + Send + Sync {
     );
 }
 
-/// Calls the tile function for a number of rows that is only known at run time.
-///
-/// # Safety
-/// As [`Multiply::tile`], for `rows` rows; `rows` is between 1 and the kernel set's `TILE_ROWS`.
+/// Words of a tap of `group` numbers.
+pub(crate) fn steps_of<M: Multiply>(group: usize) -> usize {
+    group.div_ceil(M::STEP).next_multiple_of(M::STEPS_UNIT)
+}
+
+/// Where tile `i` of a run of `n` rows starts. Heights are as equal as possible: a last tile of one row would cost as much as
+/// one of four. Units that multiply whole groups of rows take full tiles first.
 #[inline(always)]
-pub(crate) unsafe fn tile<M: Multiply>(
-    m: M,
-    rows: usize,
-    a: (*const M::Number, usize),
-    taps: &[usize],
-    steps: usize,
-    b: *const u32,
-    sums: &mut Sums<M::Simd>,
-) {
-    let (a, stride) = a;
-    macro_rules! rows {
-        ($($r:literal)*) => {
-            // Numbers of rows that this kernel set never asks for are not compiled.
-            match rows {
-                $($r if $r <= M::Simd::TILE_ROWS => {
-                    // SAFETY: the caller's promise.
-                    unsafe { m.tile::<$r>(a, stride, taps, steps, b, sums) }
-                })*
-                _ => debug_assert!(false, "a tile of {rows} rows"),
-            }
-        };
-    }
-    rows!(12 11 10 9 8 7 6 5 4 3 2 1);
+pub(crate) fn tile_start<M: Multiply>(n: usize, i: usize, tiles: usize) -> usize {
+    if M::READ_ROWS == 1 { i * n / tiles } else { (i * M::ROWS).min(n) }
+}
+
+/// Calls a function for a number of rows that is only known at run time; numbers that the kernel set never asks for are not
+/// compiled.
+macro_rules! by_rows {
+    ($simd:ty, $rows:expr, $function:ident($($argument:expr),*)) => {
+        by_rows!(@ $simd, $rows, $function($($argument),*), 12 11 10 9 8 7 6 5 4 3 2 1)
+    };
+    (@ $simd:ty, $rows:expr, $function:ident $arguments:tt, $($r:literal)*) => {
+        match $rows {
+            $($r if $r <= <$simd>::TILE_ROWS => by_rows!(@@ $function, $r, $arguments),)*
+            _ => debug_assert!(false, "a tile of {} rows", $rows),
+        }
+    };
+    (@@ $function:ident, $r:literal, ($($argument:expr),*)) => {
+        $function::<_, $r>($($argument),*)
+    };
 }
 
 /// Factors in `f32`.
@@ -84,6 +94,7 @@ impl<S: Simd> Multiply for InF32<S> {
     type Simd = S;
     type Number = f32;
     const STEP: usize = 1;
+    const ROWS: usize = S::TILE_ROWS;
 
     #[inline(always)]
     fn simd(self) -> S {
@@ -111,34 +122,48 @@ impl<S: Simd> Multiply for InF32<S> {
     }
 
     #[inline(always)]
-    unsafe fn tile<const R: usize>(
+    unsafe fn tile(
         self,
-        a: *const f32,
-        stride: usize,
+        rows: usize,
+        (a, stride): (*const f32, usize),
         taps: &[usize],
         steps: usize,
         b: *const u32,
         sums: &mut Sums<S>,
     ) {
-        let s = self.0;
-        let mut acc = [[s.splat(0.0); 2]; R];
-        let mut b = b.cast::<f32>();
-        for tap in taps {
-            // SAFETY: all addresses are inside what the caller promises.
-            unsafe {
-                let a = a.add(*tap);
-                for k in 0..steps {
-                    let (left, right) = (s.load_at(b), s.load_at(b.add(S::LANES)));
-                    b = b.add(2 * S::LANES);
-                    for r in 0..R {
-                        let x = s.splat(*a.add(r * stride + k));
-                        acc[r] = [s.fma(x, left, acc[r][0]), s.fma(x, right, acc[r][1])];
-                    }
+        // SAFETY: the caller's promise.
+        unsafe { by_rows!(S, rows, f32_tile(self.0, a, stride, taps, steps, b.cast(), sums)) }
+    }
+}
+
+/// # Safety
+/// As [`Multiply::tile`], for `R` rows.
+#[inline(always)]
+unsafe fn f32_tile<S: Simd, const R: usize>(
+    s: S,
+    a: *const f32,
+    stride: usize,
+    taps: &[usize],
+    steps: usize,
+    mut b: *const f32,
+    sums: &mut Sums<S>,
+) {
+    let mut acc = [[s.splat(0.0); 2]; R];
+    for tap in taps {
+        // SAFETY: all addresses are inside what the caller promises.
+        unsafe {
+            let a = a.add(*tap);
+            for k in 0..steps {
+                let (left, right) = (s.load_at(b), s.load_at(b.add(S::LANES)));
+                b = b.add(2 * S::LANES);
+                for r in 0..R {
+                    let x = s.splat(*a.add(r * stride + k));
+                    acc[r] = [s.fma(x, left, acc[r][0]), s.fma(x, right, acc[r][1])];
                 }
             }
         }
-        sums[..R].copy_from_slice(&acc);
     }
+    sums[..R].copy_from_slice(&acc);
 }
 
 /// Factors in bf16, two to a word; sums in `f32`.
@@ -149,6 +174,7 @@ impl<S: SimdBf16> Multiply for InBf16<S> {
     type Simd = S;
     type Number = u16;
     const STEP: usize = 2;
+    const ROWS: usize = S::TILE_ROWS;
 
     #[inline(always)]
     fn simd(self) -> S {
@@ -185,32 +211,46 @@ impl<S: SimdBf16> Multiply for InBf16<S> {
     }
 
     #[inline(always)]
-    unsafe fn tile<const R: usize>(
+    unsafe fn tile(
         self,
-        a: *const u16,
-        stride: usize,
+        rows: usize,
+        (a, stride): (*const u16, usize),
         taps: &[usize],
         steps: usize,
         b: *const u32,
         sums: &mut Sums<S>,
     ) {
-        let s = self.0;
-        let mut acc = [[s.splat(0.0); 2]; R];
-        let mut b = b;
-        for tap in taps {
-            // SAFETY: all addresses are inside what the caller promises; pairs need no alignment.
-            unsafe {
-                let a = a.add(*tap);
-                for k in 0..steps {
-                    let (left, right) = (s.load_pairs(b), s.load_pairs(b.add(S::LANES)));
-                    b = b.add(2 * S::LANES);
-                    for r in 0..R {
-                        let x = s.splat_pair(a.add(r * stride + 2 * k).cast::<u32>().read_unaligned());
-                        acc[r] = [s.dot(x, left, acc[r][0]), s.dot(x, right, acc[r][1])];
-                    }
+        // SAFETY: the caller's promise.
+        unsafe { by_rows!(S, rows, bf16_tile(self.0, a, stride, taps, steps, b, sums)) }
+    }
+}
+
+/// # Safety
+/// As [`Multiply::tile`], for `R` rows.
+#[inline(always)]
+unsafe fn bf16_tile<S: SimdBf16, const R: usize>(
+    s: S,
+    a: *const u16,
+    stride: usize,
+    taps: &[usize],
+    steps: usize,
+    mut b: *const u32,
+    sums: &mut Sums<S>,
+) {
+    let mut acc = [[s.splat(0.0); 2]; R];
+    for tap in taps {
+        // SAFETY: all addresses are inside what the caller promises; pairs need no alignment.
+        unsafe {
+            let a = a.add(*tap);
+            for k in 0..steps {
+                let (left, right) = (s.load_pairs(b), s.load_pairs(b.add(S::LANES)));
+                b = b.add(2 * S::LANES);
+                for r in 0..R {
+                    let x = s.splat_pair(a.add(r * stride + 2 * k).cast::<u32>().read_unaligned());
+                    acc[r] = [s.dot(x, left, acc[r][0]), s.dot(x, right, acc[r][1])];
                 }
             }
         }
-        sums[..R].copy_from_slice(&acc);
     }
+    sums[..R].copy_from_slice(&acc);
 }
