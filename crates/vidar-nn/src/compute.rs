@@ -14,8 +14,9 @@ pub enum Precision {
     /// Factors in `f32`.
     #[default]
     F32,
-    /// Factors split into two bf16 parts, three bf16 products: close to `f32`, and faster where bf16 tiles exist.
-    /// Kernel sets whose bf16 rate is below three times their `f32` rate compute it in `f32`.
+    /// `f32`-like accuracy by the fastest way a kernel set has. Three bf16 products of split factors would be that way where
+    /// bf16 runs at more than three times the rate of `f32` (matrix tiles); vectors run it at twice the rate. So far every
+    /// kernel set computes it in `f32`.
     F32Split,
     /// Factors rounded to bf16 where the processor multiplies bf16; elsewhere `f32`, which is then as fast.
     Bf16,

@@ -49,8 +49,7 @@ pub(crate) enum Factors {
 }
 
 impl Factors {
-    /// What a kernel set does for a precision: bf16 only where the processor multiplies it (elsewhere `f32` is as fast),
-    /// and three bf16 products only where they would be faster than one of `f32`, which no vector unit offers.
+    /// What a kernel set does for a precision: bf16 only where the processor multiplies it (elsewhere `f32` is as fast).
     pub(crate) fn of(c: &Compute) -> Self {
         match c.precision() {
             Precision::Bf16 if multiplies_bf16(c.isa()) => Self::Bf16,
