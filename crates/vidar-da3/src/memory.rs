@@ -1,7 +1,8 @@
 //! How much memory a run takes, before it starts.
 
-use crate::config::{Da3Config, Ffn, HEAD_LAST, HeadKind, NetConfig, Networks, PATCH};
+use crate::config::{Da3Config, Ffn, NetConfig, Networks, PATCH};
 use crate::da3::Da3;
+use crate::model::backbone::{FFN_ROWS, GROUP_TOKENS};
 use crate::weights::inventory::parameters;
 
 /// Bytes of a run.
@@ -16,6 +17,8 @@ pub struct MemoryEstimate {
 }
 
 const FLOAT: u64 = 4;
+/// Words of keys and values that the kernels pack at a time within one view.
+const PACKED_WORDS: u64 = 2 << 20;
 
 /// Bytes for `views` views processed at `height` × `width` pixels (see [`crate::preprocess::processed_size`]).
 pub fn memory_estimate(
@@ -69,21 +72,26 @@ fn network(net: &NetConfig, size: &Size, wants_rays: bool) -> u64 {
         Ffn::Mlp { hidden } => hidden as u64,
         Ffn::SwiGlu { hidden } => 3 * hidden as u64,
     };
-    // Tokens; queries, keys and values; then, of a group of views: normed, attended; a slice of the inner width.
-    let group = tokens.min((size.patches + 1).max(4096));
-    let sequence = if net.is_any_view() { tokens } else { group };
-    let backbone = tokens * dim + 3 * sequence * dim + 2 * group * dim + group.min(1024) * hidden;
-    (stages + backbone.max(head(net, size, wants_rays))) * FLOAT
+    // Tokens; queries and packed keys and values of all views (in bf16 half of the latter); then, of a group of views,
+    // queries, keys, values, normed and attended tokens; a slice of the inner width.
+    let group = tokens.min((size.patches + 1).max(GROUP_TOKENS as u64));
+    let sequence = if net.is_any_view() { 3 * tokens * dim } else { 0 };
+    let backbone = tokens * dim + sequence + 5 * group * dim + group.min(FFN_ROWS as u64) * hidden;
+    // What kernels hold while they run: a layer's packed weight, and packed keys and values of some heads.
+    let kernels = (3 * dim * dim).max(dim * hidden) + (2 * group * dim).min(PACKED_WORDS);
+    (stages + kernels + backbone.max(head(net, size, wants_rays))) * FLOAT
 }
 
-/// One view in the head: at the end of the fusion, or at the picture's size.
+/// One view in the head: the finest stage, the end of the fusion, or the last layers, whichever is largest.
 fn head(net: &NetConfig, size: &Size, wants_rays: bool) -> u64 {
     let (features, patches) = (net.head.features as u64, size.patches);
-    let laterals = patches * features * 21;
+    let laterals = patches * features * 85 / 4;
     let coarse = patches * net.head.out_channels[0] as u64 * 16;
-    // At 8ph × 8pw: the map before and after the enlargement, and a narrow copy.
-    let fusion = 64 * patches * (features + features / 2) + 16 * patches * 2 * features;
-    let full = size.pixels * (features / 2 + HEAD_LAST as u64 + 4) + 64 * patches * features / 2;
-    let kept = if wants_rays || net.head.kind == HeadKind::DualDpt { laterals } else { 0 };
-    (laterals + coarse).max(laterals + fusion).max(kept + full)
+    // At 4ph × 4pw: the map, its inner copy and the mixed one; at 8ph × 8pw: before and after `output_conv1`.
+    let unit = 3 * 16 * patches * features;
+    let fused = 64 * patches * (features + features / 2);
+    let last = 64 * patches * features / 2 + 4 * size.pixels;
+    // The ray branch has two maps of F and F/2 channels at 8ph × 8pw as well, after depth is done.
+    let rays = if wants_rays { fused + 7 * 64 * patches } else { 0 };
+    (laterals + unit.max(fused + 16 * patches * features).max(last).max(rays)).max(laterals + coarse)
 }

@@ -175,6 +175,9 @@ fn features_come_in_the_order_of_the_views() {
     // The first block looks at one view at a time: its tokens are those of the view by itself.
     let alone = model.infer(&Inputs::images(&images[2..]), &layers).unwrap();
     assert_eq!(found.features[&0].views[2], alone.features[&0].views[0]);
+    let compat = InferOptions { compat: true, ..layers.clone() };
+    let compat = model.infer(&Inputs::images(&images), &compat).unwrap();
+    assert_eq!(compat.features[&5].views[0], found.features[&5].views[2], "the reference comes first");
     let beyond = InferOptions { feature_layers: vec![6], ..options() };
     assert!(model.infer(&Inputs::images(&images), &beyond).unwrap_err().to_string().contains("layer 6 of 6"));
 }

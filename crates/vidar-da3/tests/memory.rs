@@ -59,7 +59,7 @@ fn the_plan_is_near_the_truth_and_a_thousand_calls_leave_nothing_behind() {
             planned / 1e6,
             truth as f64 / 1e6
         );
-        assert!((0.7..1.6).contains(&ratio), "planned {planned}, used {truth}");
+        assert!((0.6..1.7).contains(&ratio), "planned {planned}, used {truth}");
     }
     drop(model);
 

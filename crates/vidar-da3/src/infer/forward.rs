@@ -153,6 +153,11 @@ fn any_view(
         cameras = Some(found);
         views = views.drain(wanted.clone()).collect();
     }
+    let mut layers = answer.layers;
+    if options.compat {
+        // The reference first, as the blocks had it.
+        layers.values_mut().for_each(|views| views[..=answer.reference].rotate_right(1));
+    }
     let (camera_from_world, intrinsics) = cameras.map(|c| (c.camera_from_world, c.intrinsics)).unzip();
     let area = width * height;
     let (mut depth, mut confidence) =
@@ -172,7 +177,7 @@ fn any_view(
         intrinsics,
         rays: wants_rays.then_some(rays),
         scale_factor: None,
-        layers: answer.layers,
+        layers,
         reference: answer.reference,
     })
 }

@@ -58,7 +58,7 @@ pub(crate) struct BlockScratch {
 }
 
 /// Tokens that go through the feed-forward part at once: its inner width is four times the token's.
-const FFN_ROWS: usize = 1024;
+pub(crate) const FFN_ROWS: usize = 1024;
 
 impl Block {
     pub fn load(scope: &Scope, shape: BlockShape) -> Result<Self, Da3Error> {

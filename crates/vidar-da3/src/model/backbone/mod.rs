@@ -17,7 +17,8 @@ mod block;
 mod embed;
 mod reference;
 
-pub(crate) use block::{Block, BlockScratch, BlockShape, resize};
+use block::resize;
+pub(crate) use block::{Block, BlockScratch, BlockShape, FFN_ROWS};
 pub use reference::{ReferenceStrategy, choose as choose_reference};
 
 use crate::config::{BackboneConfig, PATCH};
@@ -33,7 +34,7 @@ const BLOCK_EPS: f32 = 1e-6;
 const NORM_EPS: f32 = 1e-5;
 const ROPE_BASE: f32 = 100.0;
 /// Tokens that go through a local block at once.
-const GROUP_TOKENS: usize = 4096;
+pub(crate) const GROUP_TOKENS: usize = 4096;
 
 /// Normalised pictures: `[views, 3, rows, columns]`, sides multiples of the patch.
 #[derive(Clone, Copy, Debug)]
