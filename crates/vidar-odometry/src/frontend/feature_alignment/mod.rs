@@ -4,6 +4,9 @@
 //! template T and its gradients g made orthogonal to 1 and T, the shift that is left is `δ = (Σ g gᵀ)⁻¹ Σ g I / a` with
 //! the gain `a = Σ T I / Σ T²`. The patch is then looked up at `u − δ`.
 //!
+//! A patch found on a coarse level is not measured again on finer ones: on rendered rooms that halves no error at 2 grey
+//! levels of noise and doubles the error at 8.
+//!
 //! The covariance follows from the same sums: `Σ_u = s²/a² · (Σ g gᵀ)⁻¹` with s² the variance of what offset, gain and
 //! shift could not explain, plus a floor for what the patch model does not know.
 

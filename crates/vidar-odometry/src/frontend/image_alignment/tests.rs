@@ -81,21 +81,21 @@ fn two_references_share_one_motion_and_exposures_are_their_own() {
 fn hard_images_are_aligned_within_a_pixel() {
     let scene = scene();
     let points = points(scene, 0);
-    for (name, gain, sigma) in
-        [("exposure doubled", 2.0, 2.0), ("noise 8", 1.0, 8.0), ("exposure halved", 0.5, 2.0)]
-    {
+    let spoiled = |gain, sigma| scene.spoiled(2, gain, sigma);
+    for (name, sigma, current) in [
+        ("exposure doubled", 2.0, spoiled(2.0, 2.0)),
+        ("noise 8", 8.0, spoiled(1.0, 8.0)),
+        ("exposure halved", 2.0, spoiled(0.5, 2.0)),
+        ("blur of 9 px", 0.0, scene.blurred(2, 9)),
+    ] {
         let keyframe = scene.spoiled(0, 1.0, sigma);
         let reference =
             AlignmentReference { pyramid: &keyframe, anchor_from_reference: Se3::IDENTITY, points: &points };
         let truth = scene.motion(0, 2);
         let off = Vector6::new(0.01, 0.01, -0.01, 0.02, 0.02, -0.02);
         let config = ImageAlignmentConfig { finest_level: 1, ..ImageAlignmentConfig::default() };
-        let found = ImageAligner::new(config).align(
-            &scene.camera,
-            &[reference],
-            &scene.spoiled(2, gain, sigma),
-            &prediction(&truth, &off),
-        );
+        let found =
+            ImageAligner::new(config).align(&scene.camera, &[reference], &current, &prediction(&truth, &off));
         let mut worst: Vec<f64> = points
             .iter()
             .filter_map(|p| {
