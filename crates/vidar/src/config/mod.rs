@@ -91,7 +91,7 @@ pub struct GeometryConfig {
 
 impl Default for GeometryConfig {
     fn default() -> Self {
-        Self { source: "stereo".into(), chunk_keyframes: 16, context_keyframes: 8, max_width_px: 640 }
+        Self { source: "stereo".into(), chunk_keyframes: 16, context_keyframes: 16, max_width_px: 640 }
     }
 }
 
