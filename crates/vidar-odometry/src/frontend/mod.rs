@@ -45,7 +45,7 @@ pub use error::FrontendError;
 pub use feature::{Feature, FeatureKind, PixelMeasurement};
 pub use feature_alignment::{AlignedFeature, MatchFailure, align_feature};
 pub use image_alignment::{
-    AlignmentPoint, AlignmentReference, ImageAligner, ImageAlignment, MotionPrediction,
+    AlignmentPoint, AlignmentReference, ImageAligner, ImageAlignment, MAX_REFERENCES, MotionPrediction,
 };
 pub use klt::{KltStep, KltTracker};
 pub use pyramid::{Pyramid, from_level, level_scale, to_level};
