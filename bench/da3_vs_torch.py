@@ -47,8 +47,9 @@ def peak_kb():
 
 def torch_worker(model_name, views, rows, columns, precision, threads):
     """One forward pass a line of standard input."""
-    import contextlib
-
+    # The official code logs to standard output: answers get a channel of their own.
+    answers = os.fdopen(os.dup(1), "w")
+    os.dup2(2, 1)
     import torch
 
     import depth_anything_3
@@ -57,8 +58,7 @@ def torch_worker(model_name, views, rows, columns, precision, threads):
     torch.set_num_threads(threads)
     torch.manual_seed(1)
     folder = list(depth_anything_3.__path__)[0]
-    with contextlib.redirect_stdout(sys.stderr):
-        model = create_object(load_config(f"{folder}/configs/{model_name}.yaml")).eval()
+    model = create_object(load_config(f"{folder}/configs/{model_name}.yaml")).eval()
     pixels = torch.randn(1, views, 3, rows, columns)
     weights = peak_kb()
     for _ in sys.stdin:
@@ -66,7 +66,7 @@ def torch_worker(model_name, views, rows, columns, precision, threads):
             cpu, start = cpu_seconds(), time.perf_counter()
             model(pixels)
             wall, cpu = time.perf_counter() - start, cpu_seconds() - cpu
-        print(json.dumps({"wall_s": wall, "cpu_s": cpu, "peak_kb": peak_kb(), "weights_kb": weights}), flush=True)
+        print(json.dumps({"wall_s": wall, "cpu_s": cpu, "peak_kb": peak_kb(), "weights_kb": weights}), file=answers, flush=True)
 
 
 def start(engine, model, views, size, arguments):
