@@ -3,12 +3,15 @@
 //! The short form is part of the suite. The long form flies 50 runs of 20 s:
 //! `cargo test --release -p vidar-odometry --test monte_carlo -- --ignored --nocapture`
 
+#![allow(clippy::unwrap_used, clippy::panic, clippy::print_stdout)] // helpers of tests are test code, though not marked so
+
 use nalgebra::Vector3;
 use vidar_core::{FrameId, ImuNoise, LieGroup, So3};
 use vidar_odometry::estimator::{AnchorSigmas, Smoother};
 use vidar_odometry::imu::{Bias, NavState};
 use vidar_odometry::simulate::{
-    Course, CourseKind, FeatureOdometry, FeatureOdometryConfig, Random, Simulation, SimulationConfig, StepOutput,
+    Course, CourseKind, FeatureOdometry, FeatureOdometryConfig, Random, Simulation, SimulationConfig,
+    StepOutput,
 };
 
 const SIGMAS: AnchorSigmas = AnchorSigmas {

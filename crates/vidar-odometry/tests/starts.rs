@@ -4,6 +4,8 @@
 //! trajectories, found by `VIDAR_SHARED` or beside the checkout) and follows each start for ten seconds:
 //! `cargo test --release -p vidar-odometry --test starts -- --ignored --nocapture`
 
+#![allow(clippy::unwrap_used, clippy::print_stdout, clippy::print_stderr)] // helpers of tests are test code, though not marked so
+
 use nalgebra::Vector3;
 use std::path::PathBuf;
 use vidar_core::{BodyFrame, FrameId, ImuNoise, Se3, So3, StampedPose, Timestamp, Trajectory};

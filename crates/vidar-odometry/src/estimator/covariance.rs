@@ -22,11 +22,8 @@ impl Smoother {
 
     fn covariance_at(&mut self, at: usize) -> Option<Matrix15> {
         self.factorise()?;
-        let parts = [Part::Pose(at), Part::Motion(at)];
-        let mut columns = Vec::with_capacity(15);
-        for part in parts {
-            columns.extend((0..part.dim()).map(|k| self.system.offset(part) + k));
-        }
+        let (pose, motion) = (self.system.offset(Part::Pose(at)), self.system.offset(Part::Motion(at)));
+        let columns: [usize; 15] = std::array::from_fn(|k| if k < 6 { pose + k } else { motion + k - 6 });
         let mut out = Matrix15::zeros();
         self.system.inverse_block(&columns, |i, j, v| out[(i, j)] = v);
         Some(out)
@@ -69,15 +66,19 @@ impl Smoother {
         if !(spread > 0.0) {
             return Some(f64::INFINITY);
         }
-        let system = &self.system;
-        let mut direction = vec![0.0; system.n];
+        let system = &mut self.system;
+        let mut direction = std::mem::take(&mut system.solved);
+        direction.clear();
+        direction.resize(system.n, 0.0);
         for k in 0..self.frames.len() {
             let at = system.offset(Part::Pose(k)) + 3;
-            let slope = (place(k) - mean) / spread;
+            let slope = (self.frames[k].state.world_from_body.translation - mean) / spread;
             direction[at..at + 3].copy_from_slice(slope.as_slice());
         }
         system.cholesky.forward(&mut direction);
-        Some(super::dense::dot(&direction, &direction).sqrt())
+        let sigma = super::dense::dot(&direction, &direction).sqrt();
+        system.solved = direction;
+        Some(sigma)
     }
 
     /// Standard deviations of the calibration: rotation (rad), position (m), clock offset (s); `None` when nothing is
@@ -117,9 +118,11 @@ impl Smoother {
 
 impl System {
     /// Entries of the inverse at `columns` × `columns`.
-    fn inverse_block(&self, columns: &[usize], mut put: impl FnMut(usize, usize, f64)) {
+    fn inverse_block(&mut self, columns: &[usize], mut put: impl FnMut(usize, usize, f64)) {
         let n = self.cholesky.dim();
-        let mut solved = vec![0.0; n * columns.len()];
+        let solved = &mut self.solved;
+        solved.clear();
+        solved.resize(n * columns.len(), 0.0);
         for (k, &column) in columns.iter().enumerate() {
             let unit = &mut solved[k * n..(k + 1) * n];
             unit[column] = 1.0;

@@ -48,6 +48,8 @@ pub(crate) struct System {
     pub(crate) damping: Vec<f64>,
     pub(crate) step: Vec<f64>,
     pub(crate) cholesky: Cholesky,
+    /// Columns of the factor's inverse, for covariances.
+    pub(crate) solved: Vec<f64>,
     /// Whether `cholesky` is of the undamped system at the present states.
     pub(crate) factorised: bool,
     pub(crate) places: Vec<CameraPlace>,
@@ -67,6 +69,7 @@ impl System {
             first: Vec::with_capacity(n),
             damping: Vec::with_capacity(n),
             step: Vec::with_capacity(n),
+            solved: Vec::with_capacity(15 * n),
             cholesky: Cholesky::with_capacity(n),
             eliminated: Vec::with_capacity(1024),
             cross: Vec::with_capacity(16 * 1024),
@@ -178,12 +181,15 @@ impl Scene<'_> {
         }
     }
 
-    /// Whitened residual of a sighting, `None` if it does not project.
-    fn residual(&self, landmark: &Landmark, s: &Sighting) -> Option<Vector2<f64>> {
+    /// Whitened residual of a sighting whose landmark projects to `pixel`.
+    fn residual(&self, pixel: &Vector2<f64>, s: &Sighting) -> Vector2<f64> {
+        s.whitening * (pixel - s.pixel + s.pixel_velocity * self.time_offset_secs)
+    }
+
+    /// Where a landmark projects at the present states.
+    fn pixel(&self, landmark: &Landmark, s: &Sighting) -> Option<Vector2<f64>> {
         let (host, target) = (&self.places[landmark.host.frame], &self.places[s.frame]);
-        let q = visual::direction(host, target, &landmark.bearing, landmark.rho);
-        let pixel = self.camera.project(&q)?;
-        Some(s.whitening * (pixel - s.pixel - s.pixel_velocity * self.time_offset_secs))
+        self.camera.project(&visual::direction(host, target, &landmark.bearing, landmark.rho))
     }
 
     /// Evaluates a sighting: stores its χ², returns its cost and, if it projects, what the system needs.
@@ -191,10 +197,16 @@ impl Scene<'_> {
         let (host, target) = (&self.places_at[landmark.host.frame], &self.places_at[s.frame]);
         let lost = self.huber(LOST_SIGMAS * LOST_SIGMAS).1;
         let jacobians = visual::jacobians(self.camera, host, target, &landmark.bearing, landmark.rho);
-        let (Some(residual), Some(mut jacobians)) = (self.residual(landmark, s), jacobians) else {
+        let now = match &jacobians {
+            // Derivatives are taken at the present states, and the pixel came with them.
+            Some(j) if !self.config.first_estimates() => Some(j.pixel),
+            _ => self.pixel(landmark, s),
+        };
+        let (Some(now), Some(mut jacobians)) = (now, jacobians) else {
             s.chi2 = LOST_SIGMAS * LOST_SIGMAS;
             return (lost, None);
         };
+        let residual = self.residual(&now, s);
         s.chi2 = residual.norm_squared();
         let (weight, cost) = self.huber(s.chi2);
         let whiten = s.whitening * weight.sqrt();
@@ -213,8 +225,8 @@ impl Scene<'_> {
     /// The host's own sighting: it fixes the bearing (and the clock) only.
     pub(crate) fn host(&self, landmark: &mut Landmark) -> Option<(f64, WeightedSighting)> {
         let (pixel, by_direction) = self.camera.project_with_jacobian(&landmark.bearing)?;
+        let residual = self.residual(&pixel, &landmark.host);
         let s = &mut landmark.host;
-        let residual = s.whitening * (pixel - s.pixel - s.pixel_velocity * self.time_offset_secs);
         s.chi2 = residual.norm_squared();
         let mut by_landmark = SMatrix::<f64, 2, 3>::zeros();
         let by_bearing = s.whitening * by_direction * visual::tangent_basis(&landmark.bearing);
@@ -224,7 +236,7 @@ impl Scene<'_> {
             .config
             .calibrates()
             .then(|| s.whitening * calibration_columns(self.config, &SMatrix::zeros(), &s.pixel_velocity));
-        let jacobians = visual::VisualJacobians { by_host: zero, by_target: zero, by_landmark };
+        let jacobians = visual::VisualJacobians { pixel, by_host: zero, by_target: zero, by_landmark };
         Some((0.5 * s.chi2, WeightedSighting { residual, jacobians, by_calibration }))
     }
 }
@@ -242,7 +254,7 @@ fn calibration_columns(
         out.fixed_view_mut::<2, 3>(0, 3).copy_from(&by_place.fixed_view::<2, 3>(0, 3));
     }
     if config.estimate_time_offset {
-        out.fixed_view_mut::<2, 1>(0, 6).copy_from(&-pixel_velocity);
+        out.fixed_view_mut::<2, 1>(0, 6).copy_from(pixel_velocity);
     }
     out
 }

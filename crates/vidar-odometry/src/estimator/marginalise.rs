@@ -401,11 +401,11 @@ impl Smoother {
         for s in &mut sightings {
             let (_, weighted) = scene.sighting(landmark, s);
             let target = bench.column(Part::Pose(s.frame)).map(|c| (s.frame, c + 3));
-            if let (Some(weighted), Some(target)) = (weighted, target) {
-                if s.chi2 <= self.config.outlier_chi2 {
-                    write(&weighted, Some(target));
-                    used += 1;
-                }
+            if let (Some(weighted), Some(target)) = (weighted, target)
+                && s.chi2 <= self.config.outlier_chi2
+            {
+                write(&weighted, Some(target));
+                used += 1;
             }
         }
         if used > 0 {

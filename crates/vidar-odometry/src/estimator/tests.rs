@@ -325,6 +325,54 @@ fn the_gradient_is_the_slope_of_the_cost() {
     assert!((numeric - slope).abs() < 1e-3 * slope.abs().max(1e-9), "{numeric:.6e} {slope:.6e}");
 }
 
+/// Flies with a calibration that is off and lets it be estimated.
+fn calibrated(off: &So3, offset_secs: f64, change: impl Fn(&mut SmootherConfig)) -> (Se3, f64, [f64; 7]) {
+    let course = Course { kind: CourseKind::Eight, secs: 9.0, speed: 1.6, phase: 0.9 };
+    let settings =
+        SimulationConfig { seed: 5, tracks: 60, time_offset_secs: offset_secs, ..Default::default() };
+    let simulation = Simulation::new(&course, 0.0, 8.0, &settings);
+    let mut config = FeatureOdometryConfig::new(&ImuNoise::EUROC, 1.0);
+    change(&mut config.smoother);
+    let truth = simulation.body_from_camera;
+    let believed = Se3::new(truth.rotation * *off, truth.translation);
+    let mut odometry = FeatureOdometry::new(config, simulation.camera.clone(), believed);
+    simulation.readings.iter().for_each(|r| odometry.take(*r).unwrap());
+    let sigmas = AnchorSigmas { velocity_mps: 0.2, tilt_rad: 0.02, ..AnchorSigmas::GAUGE };
+    let first = &simulation.frames[0];
+    odometry.start_at(first, NavState { bias: Bias::ZERO, ..first.truth }, sigmas).unwrap();
+    for frame in &simulation.frames[1..] {
+        odometry.push(frame.id, frame.time, &frame.seen).unwrap();
+    }
+    let smoother = odometry.smoother().unwrap();
+    let sigmas = smoother.calibration_sigmas().unwrap();
+    let place = *smoother.body_from_camera();
+    (place, smoother.time_offset().as_secs_f64(), sigmas)
+}
+
+#[test]
+fn a_camera_that_is_turned_by_two_degrees_is_found() {
+    let off = So3::exp(&(Vector3::new(0.5, -0.6, 0.62).normalize() * 2.0_f64.to_radians()));
+    let (place, _, sigmas) = calibrated(&off, 0.0, |config| {
+        config.estimate_camera_rotation = true;
+        config.camera_rotation_sigma_deg = 2.0;
+    });
+    let left = (place.rotation.inverse() * Simulation::body_from_camera().rotation).angle_rad().to_degrees();
+    assert!(left < 0.2, "{left:.3} deg left of 2");
+    assert!(sigmas[0] < 0.2_f64.to_radians() && sigmas[0] > 0.0);
+}
+
+#[test]
+fn a_clock_that_is_10_ms_off_is_found() {
+    for offset in [-0.01, 0.01] {
+        let (_, found, sigmas) = calibrated(&So3::IDENTITY, offset, |config| {
+            config.estimate_time_offset = true;
+            config.time_offset_sigma_ms = 10.0;
+        });
+        assert!((found - offset).abs() < 1.5e-3, "{:.2} ms instead of {:.0}", found * 1e3, offset * 1e3);
+        assert!(sigmas[6] < 2e-3, "{}", sigmas[6]);
+    }
+}
+
 #[test]
 fn dropping_a_frame_joins_its_readings() {
     let (mut odometry, simulation) = flown(7, 2.0, |_, _| {});

@@ -2,7 +2,8 @@
 //!
 //! A landmark is a unit bearing `b` in its host camera and an inverse distance ρ. In the target camera it lies along
 //! `q = C_tᵀ (C_h b + ρ (c_h − c_t))`, with `C` the rotation world_from_camera and `c` the camera's place: well defined
-//! at infinity (ρ = 0). Residual: `π(q) − u − t_d u̇`.
+//! at infinity (ρ = 0). Residual: `π(q) − (u − t_d u̇)`, with t_d how much later
+//! the image was taken than the state holds.
 
 use crate::imu::hat;
 use nalgebra::{Matrix2, Matrix2x3, Matrix3, Matrix3x2, SMatrix, Vector2, Vector3};
@@ -36,6 +37,8 @@ impl CameraPlace {
 /// Derivatives of a pixel by everything it depends on.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct VisualJacobians {
+    /// The pixel itself.
+    pub(crate) pixel: Vector2<f64>,
     pub(crate) by_host: SMatrix<f64, 2, 6>,
     pub(crate) by_target: SMatrix<f64, 2, 6>,
     /// Bearing in the basis of [`tangent_basis`], then inverse distance.
@@ -60,7 +63,7 @@ pub(crate) fn jacobians(
     bearing: &Vector3<f64>,
     rho: f64,
 ) -> Option<VisualJacobians> {
-    let (_, by_direction) = camera.project_with_jacobian(&direction(host, target, bearing, rho))?;
+    let (pixel, by_direction) = camera.project_with_jacobian(&direction(host, target, bearing, rho))?;
     // d_pixel_d_(point in world axes)
     let m: Matrix2x3<f64> = by_direction * target.turn.transpose();
     let far = host.turn * bearing;
@@ -77,7 +80,7 @@ pub(crate) fn jacobians(
     let mut by_landmark = SMatrix::<f64, 2, 3>::zeros();
     by_landmark.fixed_view_mut::<2, 2>(0, 0).copy_from(&(m * host.turn * tangent_basis(bearing)));
     by_landmark.fixed_view_mut::<2, 1>(0, 2).copy_from(&(m * (host.at - target.at)));
-    Some(VisualJacobians { by_host, by_target, by_landmark })
+    Some(VisualJacobians { pixel, by_host, by_target, by_landmark })
 }
 
 /// Derivative of the pixel by the camera's place on the body (rotation on its right side, translation).

@@ -34,7 +34,10 @@ const ROUNDS: usize = 4;
 
 /// The bias that makes all pairs' epipolar planes agree best, from `start`. Every round uses the rays that fit the
 /// solution of the round before.
-pub(crate) fn gyro_bias<F: Fn(&Bias) -> So3 + Copy>(pairs: &[RayPair<F>], start: Vector3<f64>) -> Vector3<f64> {
+pub(crate) fn gyro_bias<F: Fn(&Bias) -> So3 + Copy>(
+    pairs: &[RayPair<F>],
+    start: Vector3<f64>,
+) -> Vector3<f64> {
     let mut found = minimise(pairs, start);
     for _ in 1..ROUNDS {
         let bias = Bias { gyro: found, accel: Vector3::zeros() };

@@ -146,7 +146,9 @@ impl Fit {
     }
 
     fn badness(&self) -> f64 {
-        self.inertial / GOOD_INERTIAL_FIT + self.left_out / MOST_LEFT_OUT + f64::from(u8::from(!self.converged))
+        self.inertial / GOOD_INERTIAL_FIT
+            + self.left_out / MOST_LEFT_OUT
+            + f64::from(u8::from(!self.converged))
     }
 }
 
@@ -286,7 +288,8 @@ impl InFlightStart {
         while log.len().saturating_sub(1) / stride + 2 > most {
             stride *= 2;
         }
-        let mut chosen: Vec<usize> = (0..log.len()).filter(|&k| log[k].frame.index() % stride == 0).collect();
+        let mut chosen: Vec<usize> =
+            (0..log.len()).filter(|&k| log[k].frame.index().is_multiple_of(stride)).collect();
         if chosen.last() != Some(&(log.len() - 1)) {
             chosen.push(log.len() - 1);
         }
@@ -499,7 +502,8 @@ impl InFlightStart {
             }
             smoother.optimise_from(FIRST_LAMBDA, STEPS / 2, &mut report);
         }
-        let lonely: Vec<LandmarkId> = smoother.landmarks().filter(|l| l.sightings < 2).map(|l| l.id).collect();
+        let lonely: Vec<LandmarkId> =
+            smoother.landmarks().filter(|l| l.sightings < 2).map(|l| l.id).collect();
         for landmark in lonely {
             smoother.remove_landmark(landmark);
         }
@@ -517,11 +521,11 @@ impl InFlightStart {
         let sure = smoother
             .covariance_of_newest()
             .is_some_and(|c| (9..12).all(|k| c[(k, k)] < KNOWN_GYRO_BIAS * KNOWN_GYRO_BIAS));
-        if let (true, Some((.., state))) = (sure, smoother.newest()) {
-            if state.bias.gyro.norm() < MAX_GYRO_BIAS {
-                self.gyro_bias = state.bias.gyro;
-                self.gyro_bias_known = true;
-            }
+        if let (true, Some((.., state))) = (sure, smoother.newest())
+            && state.bias.gyro.norm() < MAX_GYRO_BIAS
+        {
+            self.gyro_bias = state.bias.gyro;
+            self.gyro_bias_known = true;
         }
     }
 
@@ -573,9 +577,8 @@ fn scale_change(before: &[(FrameId, Vector3<f64>)], now: &[(FrameId, Vector3<f64
     let n = common.len() as f64;
     let (a, b) = common.iter().fold((Vector3::zeros(), Vector3::zeros()), |(a, b), (p, q)| (a + p, b + q));
     let (a, b) = (a / n, b / n);
-    let spread =
-        |of: &dyn Fn(&(Vector3<f64>, Vector3<f64>)) -> f64| common.iter().map(of).sum::<f64>().sqrt();
-    let (before, now) = (spread(&|c| (c.0 - a).norm_squared()), spread(&|c| (c.1 - b).norm_squared()));
+    let before = common.iter().map(|c| (c.0 - a).norm_squared()).sum::<f64>().sqrt();
+    let now = common.iter().map(|c| (c.1 - b).norm_squared()).sum::<f64>().sqrt();
     Some((now / before.max(1e-12)).ln().abs())
 }
 

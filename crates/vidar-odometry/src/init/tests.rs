@@ -4,7 +4,8 @@ use super::gyro_bias::{RayPair, gyro_bias};
 use super::*;
 use crate::imu::{Bias, Preintegration};
 use crate::simulate::{
-    Course, CourseKind, FeatureOdometry, FeatureOdometryConfig, Random, Simulation, SimulationConfig, StepOutput,
+    Course, CourseKind, FeatureOdometry, FeatureOdometryConfig, Random, Simulation, SimulationConfig,
+    StepOutput,
 };
 use nalgebra::Vector3;
 use vidar_core::{FrameId, GRAVITY_MPS2, ImuNoise, ImuSample, LieGroup, So3};
@@ -55,7 +56,8 @@ fn a_flight_with_speeding_up_and_turning_is_started_metrically() {
 fn constant_velocity_is_never_accepted() {
     for (seed, speed) in [(1, 0.4), (2, 1.0), (3, 2.5), (4, 1.5)] {
         let course = Course { kind: CourseKind::Straight, secs: 6.0, speed, phase: 0.4 * seed as f64 };
-        let simulation = simulate(&course, &SimulationConfig { seed, wall_distance_m: 4.0, ..Default::default() });
+        let simulation =
+            simulate(&course, &SimulationConfig { seed, wall_distance_m: 4.0, ..Default::default() });
         let (refusals, started) = until_started(&simulation);
         assert!(started.is_none(), "accepted at {speed} m/s with sigma {:?}", started.map(|s| s.1));
         let by_scale = refusals.iter().filter(|r| r.obstacle == Obstacle::ScaleUncertainty).count();

@@ -74,11 +74,15 @@ pub enum StepOutput {
 pub struct FeatureOdometry {
     config: FeatureOdometryConfig,
     camera: CameraModel,
+    body_from_camera: Se3,
     buffer: ImuBuffer,
     start: InFlightStart,
     log: Vec<LoggedFrame>,
     smoother: Option<Smoother>,
     tracks: FxHashMap<LandmarkId, Vec<(FrameId, Seen)>>,
+    /// Pixels of the frame before, and how they move.
+    before: FxHashMap<LandmarkId, Vector2<f64>>,
+    velocities: FxHashMap<(FrameId, LandmarkId), Vector2<f64>>,
     banned: FxHashSet<LandmarkId>,
     since_keyframe: usize,
     last_time: Option<Timestamp>,
@@ -106,10 +110,13 @@ impl FeatureOdometry {
             buffer: ImuBuffer::new(config.imu_rate_hz),
             config,
             camera,
+            body_from_camera,
             start,
             log: Vec::new(),
             smoother: None,
             tracks: FxHashMap::default(),
+            before: FxHashMap::default(),
+            velocities: FxHashMap::default(),
             banned: FxHashSet::default(),
             since_keyframe: 0,
             last_time: None,
@@ -128,8 +135,16 @@ impl FeatureOdometry {
         simulation: &Simulation,
     ) -> Result<Self, BufferError> {
         let mut odometry = Self::new(config, simulation.camera.clone(), simulation.body_from_camera);
-        simulation.readings.iter().try_for_each(|s| odometry.buffer.push(*s))?;
+        simulation.readings.iter().try_for_each(|s| odometry.take(*s))?;
         Ok(odometry)
+    }
+
+    /// Takes a reading.
+    ///
+    /// # Errors
+    /// A reading out of order or not finite.
+    pub fn take(&mut self, reading: ImuSample) -> Result<(), BufferError> {
+        self.buffer.push(reading)
     }
 
     /// Begins at `frame` with a state that is known as well as `sigmas` say.
@@ -142,8 +157,8 @@ impl FeatureOdometry {
         state: NavState,
         sigmas: AnchorSigmas,
     ) -> Result<(), SmootherError> {
-        let place = Simulation::body_from_camera();
-        let mut smoother = Smoother::new(self.config.smoother.clone(), self.camera.clone(), place)?;
+        let mut smoother =
+            Smoother::new(self.config.smoother.clone(), self.camera.clone(), self.body_from_camera)?;
         smoother.start(frame.id, frame.time, state, sigmas)?;
         smoother.mark_keyframe(frame.id)?;
         self.smoother = Some(smoother);
@@ -173,6 +188,7 @@ impl FeatureOdometry {
             None => Bias { gyro: *self.start.gyro_bias(), accel: Vector3::zeros() },
         };
         let readings = self.readings_until(time, bias);
+        self.watch(id, seen, self.last_time.map(|last| (time - last).as_secs_f64()));
         self.last_time = Some(time);
         match self.smoother.take() {
             Some(mut smoother) => {
@@ -182,6 +198,22 @@ impl FeatureOdometry {
             }
             None => self.try_start(id, time, seen, readings),
         }
+    }
+
+    /// Notes how pixels move since the frame before.
+    fn watch(&mut self, id: FrameId, seen: &[Seen], secs: Option<f64>) {
+        for s in seen {
+            let moved =
+                self.before.get(&s.landmark).zip(secs).map(|(before, secs)| (s.pixel - before) / secs);
+            self.velocities.insert((id, s.landmark), moved.unwrap_or_else(Vector2::zeros));
+        }
+        self.before.clear();
+        self.before.extend(seen.iter().map(|s| (s.landmark, s.pixel)));
+    }
+
+    fn observation(&self, frame: FrameId, seen: &Seen) -> Observation {
+        let moved = self.velocities.get(&(frame, seen.landmark)).copied();
+        Observation { pixel_velocity: moved.unwrap_or_else(Vector2::zeros), ..observation(frame, seen) }
     }
 
     fn readings_until(&mut self, time: Timestamp, bias: Bias) -> Option<Preintegration> {
@@ -209,7 +241,7 @@ impl FeatureOdometry {
         self.log.push(LoggedFrame { frame: id, time, readings, seen: seen.to_vec() });
         let old = self.log.len().saturating_sub((self.config.in_flight.window_secs * 100.0) as usize);
         self.log.drain(..old);
-        if self.log.len() % self.config.attempt_every != 0 {
+        if !self.log.len().is_multiple_of(self.config.attempt_every) {
             return Ok(StepOutput::Waiting(None));
         }
         match self.start.attempt(&self.log)? {
@@ -252,7 +284,7 @@ impl FeatureOdometry {
         for s in seen {
             let near = smoother.predict_pixel(id, s.landmark).is_some_and(|p| (p - s.pixel).norm() < GATE_PX);
             if near {
-                smoother.add_observation(&observation(id, s))?;
+                smoother.add_observation(&self.observation(id, s))?;
                 tracked += 1;
             }
         }
@@ -324,9 +356,9 @@ impl FeatureOdometry {
             if fitting.len() < 2 || fitting.len() * 3 < history.len() {
                 continue;
             }
-            smoother.add_landmark(&observation(host, &host_seen), 1.0 / distance)?;
+            smoother.add_landmark(&self.observation(host, &host_seen), 1.0 / distance)?;
             for (frame, seen) in fitting.iter().filter(|(f, _)| *f >= host) {
-                smoother.add_observation(&observation(*frame, seen))?;
+                smoother.add_observation(&self.observation(*frame, seen))?;
             }
         }
         Ok(())
@@ -354,6 +386,7 @@ impl FeatureOdometry {
             }
         }
         let held: FxHashSet<FrameId> = smoother.frames().collect();
+        self.velocities.retain(|(frame, _), _| held.contains(frame));
         self.tracks.retain(|_, history| history.last().is_some_and(|(f, _)| held.contains(f)));
         Ok(())
     }
