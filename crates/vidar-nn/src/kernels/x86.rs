@@ -54,11 +54,18 @@ impl Simd for Avx2 {
     }
     #[inline(always)]
     fn load_part(self, x: &[f32]) -> __m256 {
+        if x.len() >= 8 {
+            return self.load(x);
+        }
         // SAFETY: see above; masked lanes are not touched.
         unsafe { _mm256_maskload_ps(x.as_ptr(), mask8(x.len())) }
     }
     #[inline(always)]
     fn store_part(self, x: &mut [f32], v: __m256) {
+        // Masked stores are slow on some processors, so whole vectors do without.
+        if x.len() >= 8 {
+            return self.store(x, v);
+        }
         // SAFETY: see above; masked lanes are not touched.
         unsafe { _mm256_maskstore_ps(x.as_mut_ptr(), mask8(x.len()), v) }
     }
