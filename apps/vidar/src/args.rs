@@ -63,7 +63,7 @@ pub enum ProgressMode {
 pub enum Command {
     /// Everything: poses, depth, one surface, judgement, files.
     #[command(after_help = RUN_EXAMPLES)]
-    Run(RunArgs),
+    Run(Box<RunArgs>),
     /// A synthetic room, flown, mapped and judged; nothing is downloaded.
     #[command(
         after_help = "Examples:\n  vidar demo\n  vidar demo -o my_demo --seed 7\n  vidar demo --scene corridor --set fusion.voxel_size_m=0.03"

@@ -81,7 +81,13 @@ fn read_json(path: &Path) -> Value {
 }
 
 fn matrix(value: &Value) -> Vec<f64> {
-    value.as_array().unwrap().iter().flat_map(|r| r.as_array().unwrap()).map(|v| v.as_f64().unwrap()).collect()
+    value
+        .as_array()
+        .unwrap()
+        .iter()
+        .flat_map(|r| r.as_array().unwrap())
+        .map(|v| v.as_f64().unwrap())
+        .collect()
 }
 
 #[test]
@@ -123,7 +129,8 @@ fn depth_writes_every_format_and_says_with_what() {
         let w = matrix(&stored["world_from_camera"]);
         let e = view.extrinsics.unwrap();
         for r in 0..3 {
-            let back: f64 = (0..3).map(|c| f64::from(e[r][c]) * w[c * 4 + 3]).sum::<f64>() + f64::from(e[r][3]);
+            let back: f64 =
+                (0..3).map(|c| f64::from(e[r][c]) * w[c * 4 + 3]).sum::<f64>() + f64::from(e[r][3]);
             assert!(back.abs() < 1e-3, "the centre of a camera is its own origin: {back}");
         }
     }
@@ -131,7 +138,9 @@ fn depth_writes_every_format_and_says_with_what() {
     let model = &manifest["model"];
     assert_eq!(model["weights_sha256"].as_str().unwrap().len(), 64);
     assert_eq!((&model["licence"], &model["acceptance"]), (&json!("unknown"), &Value::Null));
-    assert!(manifest["artifacts"].as_array().unwrap().iter().all(|a| out.join(a.as_str().unwrap()).is_file()));
+    assert!(
+        manifest["artifacts"].as_array().unwrap().iter().all(|a| out.join(a.as_str().unwrap()).is_file())
+    );
     let ply = std::fs::read(out.join("points.ply")).unwrap();
     assert!(vidar::export_formats::read_ply(&ply).unwrap().cloud.len() > 100);
     assert!(vidar::export_formats::read_colmap(&out.join("colmap")).unwrap().views.len() == 3);
@@ -172,11 +181,13 @@ fn two_cameras_are_scaled_by_their_distance_and_compat_refuses_them_as_the_offic
                 "transform_matrix": [[1, 0, 0, i as f64 * 0.3], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]] })
     };
     let poses = b.root.join("two.json");
-    std::fs::write(&poses, json!({ "camera_model": "OPENCV", "frames": [frame(0), frame(1)] }).to_string()).unwrap();
+    std::fs::write(&poses, json!({ "camera_model": "OPENCV", "frames": [frame(0), frame(1)] }).to_string())
+        .unwrap();
     let (one, two) = (b.images.join("0.png"), b.images.join("1.png"));
     let run = |out: &str, more: &[&str]| {
         let out = b.root.join(out);
-        let mut args = vec!["depth", text(&one), text(&two), "--model-dir", text(&b.model), "--process-res", "56", "-q"];
+        let mut args =
+            vec!["depth", text(&one), text(&two), "--model-dir", text(&b.model), "--process-res", "56", "-q"];
         args.extend(["--poses", text(&poses), "--format", "mini_npz", "-o", text(&out), "--json"]);
         args.extend(more);
         vidar(&args)
@@ -192,7 +203,8 @@ fn a_dry_run_of_depth_plans_memory_and_writes_nothing() {
     let b = bench();
     let folder = tempfile::tempdir().unwrap();
     let images = text(&b.images);
-    let ran = vidar_in(folder.path(), &["depth", images, "--model", "da3-giant-untrained", "--dry-run"]).ends_with(0);
+    let ran = vidar_in(folder.path(), &["depth", images, "--model", "da3-giant-untrained", "--dry-run"])
+        .ends_with(0);
     for word in ["3", "504x322", "da3-giant-untrained", "memory", "weights", "writes"] {
         assert!(ran.stdout.contains(word), "{word:?} is missing in\n{}", ran.stdout);
     }
@@ -215,7 +227,9 @@ fn what_depth_cannot_do_is_refused_with_the_next_step() {
     let small = ["depth", text(&b.images), "--model", "da3-small-untrained", "--process-res", "5"];
     vidar(&small).ends_with(1).says(&["E0309", "14 to 4096"]);
     vidar(&["depth", text(&b.images), "--model", "da3-huge"]).ends_with(2).says(&["da3-huge", "da3-small"]);
-    vidar(&["depth", "no/such/image.png", "--model", "da3-small-untrained"]).ends_with(1).says(&["no/such/image.png"]);
+    vidar(&["depth", "no/such/image.png", "--model", "da3-small-untrained"])
+        .ends_with(1)
+        .says(&["no/such/image.png"]);
     let folder = tempfile::tempdir().unwrap();
     let mut command = command_with_store(folder.path());
     let ran: Ran = command.args(["depth", text(&b.images)]).output().unwrap().into();
@@ -223,17 +237,28 @@ fn what_depth_cannot_do_is_refused_with_the_next_step() {
     // A damaged checkpoint is named key by key.
     let broken = b.root.join("broken");
     write_checkpoint(&broken);
-    std::fs::write(broken.join("config.json"), tiny_config().replace("\"ffn_hidden\":112", "\"ffn_hidden\":96")).unwrap();
-    vidar(&["depth", text(&b.images), "--model-dir", text(&broken)])
-        .ends_with(1)
-        .says(&["error[E0309]", "blocks.0.mlp.fc1.weight", "[96, 48]"]);
+    std::fs::write(
+        broken.join("config.json"),
+        tiny_config().replace("\"ffn_hidden\":112", "\"ffn_hidden\":96"),
+    )
+    .unwrap();
+    vidar(&["depth", text(&b.images), "--model-dir", text(&broken)]).ends_with(1).says(&[
+        "error[E0309]",
+        "blocks.0.mlp.fc1.weight",
+        "[96, 48]",
+    ]);
 }
 
 /// The program with a store and a hub cache of its own, and no network.
 fn command_with_store(root: &Path) -> Command {
     let mut command = command();
-    command.current_dir(root).env("VIDAR_MODELS", root.join("models")).env("HF_HUB_CACHE", root.join("cache"));
-    for name in ["HF_ENDPOINT", "HF_TOKEN", "HF_HUB_OFFLINE", "HTTP_PROXY", "http_proxy", "ALL_PROXY", "all_proxy"] {
+    command
+        .current_dir(root)
+        .env("VIDAR_MODELS", root.join("models"))
+        .env("HF_HUB_CACHE", root.join("cache"));
+    for name in
+        ["HF_ENDPOINT", "HF_TOKEN", "HF_HUB_OFFLINE", "HTTP_PROXY", "http_proxy", "ALL_PROXY", "all_proxy"]
+    {
         command.env_remove(name);
     }
     command
@@ -263,9 +288,17 @@ fn hub() -> String {
 #[test]
 fn models_are_listed_with_licence_size_and_what_they_can() {
     let folder = tempfile::tempdir().unwrap();
-    let run = |args: &[&str]| -> Ran { command_with_store(folder.path()).args(args).output().unwrap().into() };
+    let run =
+        |args: &[&str]| -> Ran { command_with_store(folder.path()).args(args).output().unwrap().into() };
     let ran = run(&["model", "list"]).ends_with(0);
-    for word in ["da3-small", "Apache-2.0", "CC-BY-NC-4.0 (no commercial use)", "130.9 MiB", "cameras", "metric depth"] {
+    for word in [
+        "da3-small",
+        "Apache-2.0",
+        "CC-BY-NC-4.0 (no commercial use)",
+        "130.9 MiB",
+        "cameras",
+        "metric depth",
+    ] {
         assert!(ran.stdout.contains(word), "{word:?} is missing in\n{}", ran.stdout);
     }
     let json = run(&["model", "list", "--json"]).ends_with(0).json();
@@ -307,13 +340,26 @@ fn pulling_asks_the_mirror_needs_acceptance_and_stays_offline_when_told() {
     let ran = run(&["model", "pull", "da3-small", "-q"]).ends_with(4);
     let ran = ran.says(&["error[E0403]", "answered 404", "depth-anything/DA3-SMALL/resolve/"]);
     assert!(ran.stderr.contains(&hub), "{}", ran.stderr);
-    run(&["model", "pull", "da3-large-1.1", "-q"])
-        .ends_with(4)
-        .says(&["error[E0404]", "--accept-licence CC-BY-NC-4.0", "legalcode"]);
-    run(&["model", "pull", "da3-large-1.1", "-q", "--accept-licence", "MIT"]).ends_with(2).says(&["CC-BY-NC-4.0"]);
+    run(&["model", "pull", "da3-large-1.1", "-q"]).ends_with(4).says(&[
+        "error[E0404]",
+        "--accept-licence CC-BY-NC-4.0",
+        "legalcode",
+    ]);
+    run(&["model", "pull", "da3-large-1.1", "-q", "--accept-licence", "MIT"])
+        .ends_with(2)
+        .says(&["CC-BY-NC-4.0"]);
     let acceptance = folder.path().join("models/da3-large-1.1/acceptance.json");
     assert!(!acceptance.exists());
-    let accepting = ["model", "pull", "da3-large-1.1", "-q", "--accept-licence", "CC-BY-NC-4.0", "--accepted-by", "A. Person"];
+    let accepting = [
+        "model",
+        "pull",
+        "da3-large-1.1",
+        "-q",
+        "--accept-licence",
+        "CC-BY-NC-4.0",
+        "--accepted-by",
+        "A. Person",
+    ];
     run(&accepting).ends_with(4).says(&["error[E0403]", "answered 403", "HF_TOKEN"]);
     let written = read_json(&acceptance);
     assert_eq!((&written["accepted_by"], &written["model"]), (&json!("A. Person"), &json!("da3-large-1.1")));
@@ -324,7 +370,8 @@ fn pulling_asks_the_mirror_needs_acceptance_and_stays_offline_when_told() {
 fn what_is_no_official_checkpoint_is_not_imported() {
     let folder = tempfile::tempdir().unwrap();
     let b = bench();
-    let run = |args: &[&str]| -> Ran { command_with_store(folder.path()).args(args).output().unwrap().into() };
+    let run =
+        |args: &[&str]| -> Ran { command_with_store(folder.path()).args(args).output().unwrap().into() };
     run(&["model", "import", text(&b.model), "-q"]).ends_with(4).says(&["error[E0405]", "--model-dir"]);
     run(&["model", "import", text(&b.model), "--model", "da3-small", "-q"])
         .ends_with(4)
@@ -350,7 +397,8 @@ fn a_model_is_checked_against_references_and_a_departure_ends_with_5() {
     let mut bytes = std::fs::read(&weights).unwrap();
     let header = 8 + u64::from_le_bytes(bytes[..8].try_into().unwrap()) as usize;
     let document: Value = serde_json::from_slice(&bytes[8..header]).unwrap();
-    let at = document["model.backbone.pretrained.patch_embed.proj.bias"]["data_offsets"][0].as_u64().unwrap() as usize;
+    let at = document["model.backbone.pretrained.patch_embed.proj.bias"]["data_offsets"][0].as_u64().unwrap()
+        as usize;
     bytes[header + at..header + at + 4].copy_from_slice(&5.0_f32.to_le_bytes());
     std::fs::write(&weights, bytes).unwrap();
     let ran = vidar(&["model", "check", &one, "--model-dir", text(&spoilt), "-q"]).ends_with(5);
@@ -405,6 +453,7 @@ fn a_dry_run_shows_the_network_its_terms_and_its_memory() {
     vidar(&["run", sequence, "--geometry", "magic", "--dry-run"]).ends_with(2).says(&["magic", "da3-small"]);
     let folder = tempfile::tempdir().unwrap();
     let mut command = command_with_store(folder.path());
-    let ran: Ran = command.args(["run", sequence, "--geometry", "da3-giant-1.1", "--dry-run"]).output().unwrap().into();
+    let ran: Ran =
+        command.args(["run", sequence, "--geometry", "da3-giant-1.1", "--dry-run"]).output().unwrap().into();
     ran.ends_with(4).says(&["error[E0403]"]);
 }

@@ -1,6 +1,6 @@
 //! A network as the geometry model of a run.
 
-use super::{Located, ModelChoice, ModelIdentity, MemoryPlan, locate, planned_memory, store};
+use super::{Located, MemoryPlan, ModelChoice, ModelIdentity, locate, planned_memory, store};
 use crate::config::Config;
 use crate::error::Error;
 use serde::Serialize;
@@ -39,7 +39,8 @@ pub fn open(choice: &ModelChoice, config: &Config) -> Result<(Da3Model, Located)
     let located = locate(choice, None, &store(true)?)?;
     // The dense head stays in 32 bits, as in the official program.
     let head_precision = Some(Precision::F32);
-    let options = Da3Options { precision: config.model.precision.into(), head_precision, ..Da3Options::default() };
+    let options =
+        Da3Options { precision: config.model.precision.into(), head_precision, ..Da3Options::default() };
     let network = Arc::new(located.open(&options)?);
     let sha256 = located.identity.weights_sha256.clone();
     let model = Da3Model::new(network, config.model.network.clone(), sha256)?;

@@ -92,7 +92,8 @@ impl Plan {
             let seen = format!("the undistorted view sees {:.0} % of its pixels", coverage * 100.0);
             warnings.push(Warning::new("view-coverage", seen).hint("check the calibration's distortion"));
         }
-        let chunks = chunks(keyframes.len(), config.geometry.chunk_keyframes, config.geometry.context_keyframes);
+        let chunks =
+            chunks(keyframes.len(), config.geometry.chunk_keyframes, config.geometry.context_keyframes);
         let network = source.planned(config, &view, &chunks, &mut warnings)?;
         Ok(Self {
             started: crate::run_folder::now_rfc3339(),
@@ -149,24 +150,21 @@ impl Plan {
 /// The geometry model of a plan, opened to be asked what it is and needs.
 enum Source {
     Stereo(Box<dyn vidar_core::GeometryModel>),
-    Network(Box<vidar_da3::Da3Model>, Located),
+    Network(Box<(vidar_da3::Da3Model, Located)>),
 }
 
 impl Source {
     fn open(config: &Config) -> Result<Self, Error> {
         Ok(match geometry::chosen(config)? {
             None => Self::Stereo(super::dense::model(config)?),
-            Some(choice) => {
-                let (model, located) = geometry::open(&choice, config)?;
-                Self::Network(Box::new(model), located)
-            }
+            Some(choice) => Self::Network(Box::new(geometry::open(&choice, config)?)),
         })
     }
 
     fn info(&self) -> &ModelInfo {
         match self {
             Self::Stereo(model) => model.info(),
-            Self::Network(model, _) => vidar_core::GeometryModel::info(model.as_ref()),
+            Self::Network(network) => vidar_core::GeometryModel::info(&network.0),
         }
     }
 
@@ -177,7 +175,8 @@ impl Source {
         chunks: &[ChunkPlan],
         warnings: &mut Vec<Warning>,
     ) -> Result<Option<NetworkPlan>, Error> {
-        let Self::Network(model, located) = self else { return Ok(None) };
+        let Self::Network(network) = self else { return Ok(None) };
+        let (model, located) = network.as_ref();
         let views = chunks.iter().map(|c| c.seen.len()).max().unwrap_or(0);
         let (plan, noticed) = geometry::planned(model, located, config, view, views)?;
         warnings.extend(noticed);
