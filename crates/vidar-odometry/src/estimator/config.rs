@@ -37,7 +37,8 @@ pub struct SmootherConfig {
     pub estimate_camera_rotation: bool,
     /// Whether the position of the camera on the body is estimated. Needs rotation about two axes.
     pub estimate_camera_position: bool,
-    /// Whether the offset between camera and IMU clocks is estimated. Needs pixel velocities with observations.
+    /// Whether the offset between camera and IMU clocks is estimated. Needs pixel velocities with observations. Not to be
+    /// relied on yet: its test (`a_clock_that_is_10_ms_off_is_found`) fails.
     pub estimate_time_offset: bool,
     /// Standard deviation of the given camera rotation, degrees, 0.01…10.
     pub camera_rotation_sigma_deg: f64,
