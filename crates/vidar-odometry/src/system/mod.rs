@@ -5,6 +5,7 @@ mod config;
 mod error;
 mod health;
 mod keyframes;
+mod mono_start;
 mod odometry;
 mod output;
 mod running;

@@ -91,7 +91,7 @@ impl Odometry {
         let imu_model =
             noise.map(|n| ImuModel::from_data_sheet(&n, config.gyro_noise_factor, config.accel_noise_factor));
         let frontend = FrontendConfig::default();
-        let phase = Phase::Starting(Box::new(starting(config, &rig_camera, &frontend)));
+        let phase = Phase::Starting(Box::new(starting(config, imu_model.is_none(), &rig_camera, &frontend)));
         Ok(Self {
             config: config.clone(),
             frontend,
@@ -255,7 +255,7 @@ impl Odometry {
     fn coast(&mut self, readings: Option<Preintegration>, time: Timestamp) -> Status {
         let Phase::Running(running) = &mut self.phase else { return Status::Waiting(self.refusal) };
         let Some(state) = running.state() else { return Status::Waiting(self.refusal) };
-        let covariance = running.smoother.covariance_of_newest().unwrap_or_else(nalgebra::SMatrix::zeros);
+        let covariance = running.smoother.covariance_of_newest().unwrap_or_else(unknown_covariance);
         let (state, covariance) = match &readings {
             Some(readings) => {
                 let carried = propagate(&state, &covariance, readings);
@@ -328,14 +328,18 @@ impl Odometry {
 
     /// Goes on with the smoother that solved the start.
     fn start_in_flight(&mut self, found: Found, frame: &Frame, host: &Rc<HostImage>) -> Status {
-        let waiting = Phase::Starting(Box::new(starting(&self.config, &self.camera, &self.frontend)));
+        let waiting = Phase::Starting(Box::new(starting(
+            &self.config,
+            self.imu_model.is_none(),
+            &self.camera,
+            &self.frontend,
+        )));
         let Phase::Starting(before) = std::mem::replace(&mut self.phase, waiting) else {
             return Status::Waiting(self.refusal);
         };
-        let typical = 1.0 / found.started.median_distance_m.clamp(0.1, 100.0);
-        self.watch.scale_std(Some(found.started.log_scale_sigma));
-        let smoother = found.started.smoother;
-        let running = Running::new(self.config.clone(), smoother, before.tracker, found.hosts, typical);
+        let typical = 1.0 / found.median_distance.clamp(0.1, 100.0);
+        self.watch.scale_std(found.log_scale_sigma);
+        let running = Running::new(self.config.clone(), found.smoother, before.tracker, found.hosts, typical);
         let Some(running) = running else { return self.wait(self.refusal) };
         self.begin(running, frame, host.frame)
     }
@@ -361,7 +365,7 @@ impl Odometry {
         let Phase::Running(running) = &mut self.phase else { return Status::Waiting(self.refusal) };
         let Some(state) = running.state() else { return Status::Waiting(self.refusal) };
         let smoother = &mut running.smoother;
-        let covariance = smoother.covariance_of_newest().unwrap_or_else(nalgebra::SMatrix::zeros);
+        let covariance = smoother.covariance_of_newest().unwrap_or_else(unknown_covariance);
         let now = if is_metric { smoother.log_scale_sigma() } else { None };
         let scale_std = self.watch.scale_std(now);
         let health = match self.watch.judge(&state, step, frame.time, is_metric, scale_std, &self.config) {
@@ -403,7 +407,12 @@ impl Odometry {
 
     /// Gives the state up and starts anew.
     fn lose(&mut self, reason: LossReason) -> Status {
-        self.phase = Phase::Starting(Box::new(starting(&self.config, &self.camera, &self.frontend)));
+        self.phase = Phase::Starting(Box::new(starting(
+            &self.config,
+            self.imu_model.is_none(),
+            &self.camera,
+            &self.frontend,
+        )));
         self.watch = Watch::default();
         self.book.forget_held();
         self.segment = self.segment.wrapping_add(1);
@@ -411,7 +420,17 @@ impl Odometry {
     }
 }
 
-fn starting(config: &OdometryConfig, camera: &RigCamera, frontend: &FrontendConfig) -> Starting {
+/// Nothing is known.
+fn unknown_covariance() -> vidar_core::NavCovariance {
+    vidar_core::NavCovariance::from_diagonal_element(f64::INFINITY)
+}
+
+fn starting(
+    config: &OdometryConfig,
+    is_mono: bool,
+    camera: &RigCamera,
+    frontend: &FrontendConfig,
+) -> Starting {
     let tracker = Tracker::new(camera.model.clone(), frontend, IMAGE_NOISE_GRAY);
-    Starting::new(config.clone(), camera.body_from_camera, tracker)
+    Starting::new(config.clone(), is_mono, camera.body_from_camera, tracker)
 }

@@ -5,11 +5,17 @@ use super::stillness::ImageMotion;
 use super::track::{HostImage, Track, host_covariance, noisy_covariance, parallax, rotated_pixel};
 use super::tracker::{Places, Prediction, TrackCounts, Tracker};
 use crate::estimator::{Departure, Observation, OptimiseReport, Smoother, SmootherError};
-use crate::frontend::PixelMeasurement;
+use crate::frontend::{
+    AlignmentPoint, AlignmentReference, ImageAligner, ImageAlignmentConfig, MotionPrediction,
+    PixelMeasurement,
+};
 use crate::imu::{NavState, Preintegration};
 use nalgebra::Vector2;
 use std::rc::Rc;
 use vidar_core::{CameraModel, FrameId, LandmarkId, LieGroup, Se3, Timestamp};
+
+/// Standard deviation of a motion that is only guessed, rad, and as a share of the scene's distance.
+const GUESS_SIGMA_RAD: f64 = 0.1;
 
 /// Recent frames that are held whether they are keyframes or not.
 const RECENT_FRAMES: usize = 3;
@@ -80,6 +86,10 @@ pub(crate) struct Running {
     /// Images of the keyframes held.
     hosts: Vec<Rc<HostImage>>,
     last: FrameId,
+    last_host: Option<Rc<HostImage>>,
+    /// Pose of the frame before the last.
+    before_last: Option<Se3>,
+    aligner: ImageAligner,
     last_keyframe: FrameId,
     frames_since_keyframe: u32,
     /// Landmarks that the last keyframe showed.
@@ -127,6 +137,9 @@ impl Running {
             tracker,
             hosts,
             last,
+            last_host: None,
+            before_last: None,
+            aligner: ImageAligner::new(ImageAlignmentConfig::default()),
             last_keyframe,
             frames_since_keyframe: 0,
             keyframe_landmarks,
@@ -148,7 +161,12 @@ impl Running {
         let last_state = self.state().unwrap_or(NavState::REST);
         let predicted = shot.readings.as_ref().map_or(last_state, |r| r.predict(&last_state));
         let mut step = Step::default();
+        let image = shot.host.clone();
 
+        let predicted = match shot.readings {
+            Some(_) => predicted,
+            None => self.predict_by_image(&shot.host, &last_state),
+        };
         self.smoother.add_frame(frame, shot.time, predicted, shot.readings)?;
         step.counts = self.measure(&shot.host, &last_state, &predicted);
         step.is_still = self.motion.update(&self.tracker.tracks, frame) && shot.imu_still;
@@ -166,8 +184,50 @@ impl Running {
             self.make_keyframe(shot.host)?;
         }
         self.last = frame;
+        self.last_host = Some(image);
+        self.before_last = Some(last_state.world_from_body);
         self.thin_window(&mut step)?;
         Ok(step)
+    }
+
+    /// The pose without an IMU: the last motion goes on, and the last image's patches correct it.
+    fn predict_by_image(&mut self, host: &Rc<HostImage>, last: &NavState) -> NavState {
+        let body_from_camera = *self.smoother.body_from_camera();
+        let last_from_before = self.before_last.map_or(Se3::IDENTITY, |b| b.inverse() * last.world_from_body);
+        let mut predicted = NavState { world_from_body: last.world_from_body * last_from_before, ..*last };
+        let Some(reference) = self.last_host.clone() else { return predicted };
+        let world_from_last = last.world_from_body * body_from_camera;
+        let last_from_world = world_from_last.inverse();
+        let points: Vec<AlignmentPoint> = self
+            .tracker
+            .tracks
+            .iter()
+            .filter(|t| t.is_landmark && t.last_frame == self.last)
+            .filter_map(|t| {
+                let distance = last_from_world.act(&self.smoother.landmark(t.id)?.in_world).norm();
+                let bearing = self.camera.unproject(&t.last_pixel)?;
+                Some(AlignmentPoint { pixel: t.last_pixel, bearing, inverse_distance: 1.0 / distance })
+            })
+            .collect();
+        let motion = (predicted.world_from_body * body_from_camera).inverse() * world_from_last;
+        let loose = [GUESS_SIGMA_RAD, GUESS_SIGMA_RAD, GUESS_SIGMA_RAD];
+        let far = GUESS_SIGMA_RAD / self.typical_inverse;
+        let sigmas = nalgebra::Vector6::new(loose[0], loose[1], loose[2], far, far, far);
+        let prediction = MotionPrediction {
+            current_from_anchor: motion,
+            information: nalgebra::Matrix6::from_diagonal(&sigmas.map(|s| 1.0 / (s * s))),
+        };
+        let references = [AlignmentReference {
+            pyramid: &reference.pyramid,
+            anchor_from_reference: Se3::IDENTITY,
+            points: &points,
+        }];
+        let found = self.aligner.align(&self.camera, &references, &host.pyramid, &prediction);
+        if found.converged {
+            let world_from_camera = world_from_last * found.current_from_anchor.inverse();
+            predicted.world_from_body = world_from_camera * body_from_camera.inverse();
+        }
+        predicted
     }
 
     /// Measures all tracks from the predicted pose.

@@ -4,8 +4,9 @@ use super::config::OdometryConfig;
 use super::stillness::ImageMotion;
 use super::track::{HostImage, host_covariance, noisy_covariance};
 use super::tracker::{Places, Prediction, Tracker};
+use crate::estimator::Smoother;
 use crate::imu::{Bias, Preintegration};
-use crate::init::{Attempt, InFlightConfig, InFlightStart, LoggedFrame, Obstacle, Refusal, Seen, Started};
+use crate::init::{Attempt, InFlightConfig, InFlightStart, LoggedFrame, Obstacle, Refusal, Seen};
 use nalgebra::Vector3;
 use std::rc::Rc;
 use vidar_core::{FrameId, LieGroup, Se3, So3, Timestamp};
@@ -40,6 +41,7 @@ struct Turn {
 #[derive(Debug)]
 pub(crate) struct Starting {
     config: OdometryConfig,
+    is_mono: bool,
     body_from_camera: Se3,
     pub tracker: Tracker,
     log: Vec<LoggedFrame>,
@@ -53,7 +55,11 @@ pub(crate) struct Starting {
 
 /// A start that was found.
 pub(crate) struct Found {
-    pub started: Box<Started>,
+    pub smoother: Smoother,
+    /// Standard deviation of ln(scale), where there is a scale.
+    pub log_scale_sigma: Option<f64>,
+    /// Median distance of the landmarks.
+    pub median_distance: f64,
     /// Images of the frames that the smoother holds.
     pub hosts: Vec<Rc<HostImage>>,
 }
@@ -77,7 +83,7 @@ fn turned_camera(first_from_body: &So3, body_from_camera: &Se3) -> Se3 {
 }
 
 impl Starting {
-    pub fn new(config: OdometryConfig, body_from_camera: Se3, tracker: Tracker) -> Self {
+    pub fn new(config: OdometryConfig, is_mono: bool, body_from_camera: Se3, tracker: Tracker) -> Self {
         let in_flight = InFlightStart::new(
             InFlightConfig::default(),
             config.smoother(),
@@ -86,6 +92,7 @@ impl Starting {
         );
         Self {
             config,
+            is_mono,
             body_from_camera,
             tracker,
             log: Vec::new(),
@@ -123,17 +130,35 @@ impl Starting {
             let found = self.tracker.tracks.len() as f64;
             return Err(Refusal { obstacle: Obstacle::Tracks, measured: found, limit: MIN_FEATURES as f64 });
         }
-        if !chained || frame.0 % ATTEMPT_EVERY != 0 {
+        if frame.0 % ATTEMPT_EVERY != 0 {
+            return Err(self.refusal);
+        }
+        let attempt = if self.is_mono { self.attempt_mono() } else { self.attempt_in_flight(chained) };
+        if let Err(refusal) = &attempt {
+            self.refusal = *refusal;
+        }
+        attempt
+    }
+
+    fn attempt_in_flight(&mut self, chained: bool) -> Result<Found, Refusal> {
+        if !chained {
             return Err(self.refusal);
         }
         match self.in_flight.attempt(&self.log) {
-            Ok(Attempt::Started(started)) => Ok(self.found(started)),
-            Ok(Attempt::Refused(refusal)) => {
-                self.refusal = refusal;
-                Err(refusal)
+            Ok(Attempt::Started(started)) => {
+                let (log_scale_sigma, median_distance_m) =
+                    (started.log_scale_sigma, started.median_distance_m);
+                Ok(self.found(started.smoother, Some(log_scale_sigma), median_distance_m))
             }
+            Ok(Attempt::Refused(refusal)) => Err(refusal),
             Err(_) => Err(self.refusal),
         }
+    }
+
+    fn attempt_mono(&mut self) -> Result<Found, Refusal> {
+        let camera = self.tracker.camera().clone();
+        let smoother = super::mono_start::start(&self.log, &camera, &self.body_from_camera, &self.config)?;
+        Ok(self.found(smoother, None, 1.0 / UNKNOWN_INVERSE))
     }
 
     /// Measures all tracks in the newest image; how many were found.
@@ -182,9 +207,9 @@ impl Starting {
         self.turns.drain(..excess);
     }
 
-    fn found(&mut self, started: Box<Started>) -> Found {
-        let held = |t: &&Turn| started.smoother.frames().any(|f| f == t.frame);
+    fn found(&self, smoother: Smoother, log_scale_sigma: Option<f64>, median_distance: f64) -> Found {
+        let held = |t: &&Turn| smoother.frames().any(|f| f == t.frame);
         let hosts = self.turns.iter().filter(held).map(|t| t.host.clone()).collect();
-        Found { started, hosts }
+        Found { smoother, log_scale_sigma, median_distance, hosts }
     }
 }

@@ -6,8 +6,10 @@ use rustc_hash::FxHashMap;
 use vidar_core::LandmarkId;
 use vidar_core::{FrameId, ImuSample, camera::Pixel};
 
-/// Median motion from frame to frame below which an image shows stillness, pixels.
-const STILL_PX: f64 = 0.3;
+/// Median motion from frame to frame, per axis, below which an image shows stillness, pixels: noise of single tracks cancels.
+const STILL_SHIFT_PX: f64 = 0.15;
+/// Median length of the motion of single tracks, their noise included, pixels.
+const STILL_PX: f64 = 0.7;
 /// Images in a row that must show it.
 const STILL_FRAMES: u32 = 8;
 /// Tracks that are needed to say so.
@@ -21,9 +23,7 @@ const STILL_ACCEL: f64 = 0.15;
 pub(crate) struct ImageMotion {
     last: FxHashMap<LandmarkId, Pixel>,
     still_frames: u32,
-    moved: Vec<f64>,
-    /// Median motion in the last image, pixels.
-    pub median_px: f64,
+    moved: Vec<[f64; 3]>,
 }
 
 impl ImageMotion {
@@ -32,19 +32,23 @@ impl ImageMotion {
         self.moved.clear();
         for track in tracks.iter().filter(|t| t.last_frame == frame) {
             if let Some(before) = self.last.get(&track.id) {
-                self.moved.push((track.last_pixel - before).norm());
+                let d = track.last_pixel - before;
+                self.moved.push([d.x, d.y, d.norm()]);
             }
         }
         self.last.clear();
         self.last.extend(tracks.iter().filter(|t| t.last_frame == frame).map(|t| (t.id, t.last_pixel)));
         if self.moved.len() < STILL_TRACKS {
             self.still_frames = 0;
-            self.median_px = f64::INFINITY;
             return false;
         }
         let middle = self.moved.len() / 2;
-        self.median_px = *self.moved.select_nth_unstable_by(middle, f64::total_cmp).1;
-        self.still_frames = if self.median_px < STILL_PX { self.still_frames + 1 } else { 0 };
+        let mut median = |axis: usize| {
+            self.moved.select_nth_unstable_by(middle, |a, b| a[axis].total_cmp(&b[axis])).1[axis]
+        };
+        let [x, y, length] = [median(0), median(1), median(2)];
+        let still = x.abs() < STILL_SHIFT_PX && y.abs() < STILL_SHIFT_PX && length < STILL_PX;
+        self.still_frames = if still { self.still_frames + 1 } else { 0 };
         self.still_frames >= STILL_FRAMES
     }
 }

@@ -1,15 +1,12 @@
 //! All tracks of the odometry: predicted, measured, gated, detected, dropped.
 
-use super::track::{
-    HostImage, InverseDistance, Measurer, Track, project_with_distance, rotated_pixel, unknown_distance,
-};
+use super::track::{HostImage, InverseDistance, Measurer, Track, rotated_pixel, unknown_distance};
 use crate::frontend::{
     Detection, Detector, Feature, FrontendConfig, MatchFailure, OccupancyGrid, PixelMeasurement, Pyramid,
     Warp,
 };
 use nalgebra::Vector2;
 use std::rc::Rc;
-use vidar_core::camera::Pixel;
 use vidar_core::{CameraModel, FrameId, LandmarkId, LieGroup, Se3};
 
 /// Relative deviation of a distance below which the point's place is predicted from it rather than from its motion.
@@ -203,15 +200,4 @@ fn measure_one(
         track.drift = found.measurement.pixel - turned;
     }
     Ok(found.measurement)
-}
-
-/// Offsets of landmarks from where a pose and their distances put them, pixels; for gates and tests.
-pub(crate) fn reprojection_error(
-    camera: &CameraModel,
-    track: &Track,
-    current_from_host: &Se3,
-    measured: &Pixel,
-) -> Option<f64> {
-    let (pixel, _) = project_with_distance(camera, &track.feature, track.distance.mean, current_from_host)?;
-    Some((measured - pixel).norm())
 }
