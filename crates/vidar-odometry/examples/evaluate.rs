@@ -10,6 +10,8 @@
 //! from the first image to the first metric pose, processor time per image (decoding left out), peak memory. `--set` changes
 //! a number of the odometry's configuration.
 
+#![allow(clippy::print_stdout, clippy::print_stderr)] // a program
+
 use std::path::{Path, PathBuf};
 use vidar_core::{BodyFrame, Duration, Health, SensorEvent, StampedPose, Trajectory};
 use vidar_dataset::OpenOptions;
@@ -171,11 +173,10 @@ fn set(config: &mut OdometryConfig, key: &str, number: f64) -> Result<(), Failur
 }
 
 fn keep(run: &mut Run, output: OdometryOutput, mono: bool) {
-    if let Some(tracking) = output.tracking() {
-        if mono || tracking.health != Health::ScaleUnknown {
-            run.poses
-                .push(StampedPose { time: output.time, world_from_body: tracking.state.world_from_body });
-        }
+    if let Some(tracking) = output.tracking()
+        && (mono || tracking.health != Health::ScaleUnknown)
+    {
+        run.poses.push(StampedPose { time: output.time, world_from_body: tracking.state.world_from_body });
     }
     run.outputs.push(output);
 }

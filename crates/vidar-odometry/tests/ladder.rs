@@ -3,6 +3,8 @@
 //! What is demanded is never accuracy alone but honesty: a state that is told as healthy is right, and what cannot be
 //! right is refused, degraded or lost with a reason.
 
+#![allow(clippy::unwrap_used, clippy::panic)] // helpers of tests are test code, though not marked so
+
 use nalgebra::Vector3;
 use std::sync::OnceLock;
 use vidar_core::{

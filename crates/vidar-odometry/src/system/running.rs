@@ -433,13 +433,13 @@ impl Running {
                 self.smoother.drop_frame(*frame, &mut self.departure)?;
             }
         }
-        if keyframes.len() > self.config.max_keyframes {
-            if let Some(leaving) = self.keyframe_to_remove(&keyframes) {
-                step.left.extend(self.smoother.state(leaving).map(|s| (leaving, *s)));
-                self.smoother.marginalise(leaving, &mut self.departure)?;
-                self.hosts.retain(|h| h.frame != leaving);
-                self.follow_new_hosts(leaving);
-            }
+        if keyframes.len() > self.config.max_keyframes
+            && let Some(leaving) = self.keyframe_to_remove(&keyframes)
+        {
+            step.left.extend(self.smoother.state(leaving).map(|s| (leaving, *s)));
+            self.smoother.marginalise(leaving, &mut self.departure)?;
+            self.hosts.retain(|h| h.frame != leaving);
+            self.follow_new_hosts(leaving);
         }
         Ok(())
     }

@@ -130,7 +130,7 @@ impl Starting {
             let found = self.tracker.tracks.len() as f64;
             return Err(Refusal { obstacle: Obstacle::Tracks, measured: found, limit: MIN_FEATURES as f64 });
         }
-        if frame.0 % ATTEMPT_EVERY != 0 {
+        if !frame.0.is_multiple_of(ATTEMPT_EVERY) {
             return Err(self.refusal);
         }
         let attempt = if self.is_mono { self.attempt_mono() } else { self.attempt_in_flight(chained) };

@@ -88,12 +88,11 @@ impl Measurer {
         let mut start = *expected;
         if search_wide {
             let coarse = Feature { level: feature.level + 2, ..*feature };
-            if self.template.fill(host, &coarse, warp) {
-                if let Ok(found) =
+            if self.template.fill(host, &coarse, warp)
+                && let Ok(found) =
                     align_feature(&self.template, current, &start, self.noise_gray, &self.config)
-                {
-                    start = found.measurement.pixel;
-                }
+            {
+                start = found.measurement.pixel;
             }
         }
         if !self.template.fill(host, feature, warp) {
