@@ -92,6 +92,11 @@ pub enum Command {
     /// Checkpoints: list, pull, import, verify, check, where.
     #[command(subcommand)]
     Model(ModelCommand),
+    /// The metric trajectory of a recording from its own camera and IMU.
+    #[command(
+        after_help = "Examples:\n  vidar odometry mav0/ -o result\n  vidar odometry my_recording/ --mono\n  vidar odometry my_recording/ --set odometry.max_landmarks=200 --json"
+    )]
+    Odometry(OdometryArgs),
     /// Render a synthetic sequence in EuRoC layout with exact ground truth.
     #[command(
         after_help = "Examples:\n  vidar synth room1\n  vidar synth hall1 --scene hall --seed 3 --duration 20\n  vidar synth flight1 --trajectory flight.tum --euroc"
@@ -276,6 +281,26 @@ pub struct InspectArgs {
     /// How the input is read.
     #[command(flatten)]
     pub input: InputArgs,
+}
+
+/// `vidar odometry`.
+#[derive(Args, Clone, Debug)]
+pub struct OdometryArgs {
+    /// The recording: images and an IMU, in EuRoC or TUM layout.
+    #[arg(value_hint = ValueHint::AnyPath)]
+    pub path: PathBuf,
+    /// The camera alone, without its IMU: a trajectory up to scale.
+    #[arg(long)]
+    pub mono: bool,
+    /// How the input is read.
+    #[command(flatten)]
+    pub input: InputArgs,
+    /// How settings are given.
+    #[command(flatten)]
+    pub config: ConfigArgs,
+    /// Where results go.
+    #[command(flatten)]
+    pub output: OutputArgs,
 }
 
 /// `vidar eval`.

@@ -88,6 +88,7 @@ fn dispatch(command: Command, context: &Context) -> Outcome {
         Command::Export(args) => commands::export::export(&args, context),
         Command::Depth(args) => commands::depth::depth(&args, context),
         Command::Model(command) => commands::model::model(&command, context),
+        Command::Odometry(args) => commands::odometry::odometry(&args, context),
         Command::Synth(args) => commands::synth::synth(&args, context),
         Command::Doctor => commands::doctor::doctor(context),
         Command::Config(ConfigCommand::Show { config, origin }) => {

@@ -89,6 +89,14 @@ pub enum Error {
         /// Dataset name.
         name: String,
     },
+    /// Camera and IMU gave no metric poses.
+    #[error("the odometry of {name} never gave a metric pose: {reason}")]
+    NoOdometry {
+        /// Dataset name.
+        name: String,
+        /// What it waited for.
+        reason: String,
+    },
     /// Images and trajectory do not meet in time.
     #[error("no image has a pose: images span {images}, the trajectory spans {poses}")]
     NoOverlap {
@@ -119,6 +127,9 @@ pub enum Error {
     /// The stereo model refused its configuration.
     #[error("stereo: {0}")]
     Stereo(#[from] vidar_stereo::StereoError),
+    /// The odometry refused its rig, its configuration or an image.
+    #[error("odometry: {0}")]
+    Odometry(#[from] vidar_odometry::OdometryError),
     /// A chunk could not be placed.
     #[error("align: {0}")]
     Align(#[from] vidar_align::AlignError),
@@ -204,10 +215,12 @@ impl Error {
             Self::Trajectory(_) => "E0206",
             Self::NotARun { .. } => "E0207",
             Self::NoCalibration { .. } => "E0208",
+            Self::NoOdometry { .. } => "E0209",
             Self::Geometry(_) | Self::Stereo(_) => "E0301",
             Self::Hub(error) => hub_code(error),
             Self::Da3(vidar_da3::Da3Error::Cancelled) => "E1301",
             Self::Da3(_) => "E0309",
+            Self::Odometry(_) => "E0310",
             Self::Align(_) => "E0302",
             Self::Fusion(_) => "E0303",
             Self::Eval(_) => "E0304",
@@ -283,6 +296,9 @@ impl Error {
             Self::NoCalibration { .. } => {
                 "give --calibration FILE (EuRoC sensor.yaml, Kalibr camchain) or --camera-model pinhole:fx,fy,cx,cy"
             }
+            Self::NoOdometry { .. } => {
+                "move sideways at the start; `vidar odometry PATH` tells every image's state in odometry/health.csv"
+            }
             Self::Camera(_) => {
                 "check fx, fy, cx, cy and the distortion in the calibration, or give --camera-model"
             }
@@ -293,6 +309,9 @@ impl Error {
                 "the message names the place in the file; write it anew with the program it came from"
             }
             Self::Synth(_) => "`vidar synth --help` lists what can be set, --world-config takes all of it",
+            Self::Odometry(_) => {
+                "`vidar inspect PATH` prints camera, extrinsics and IMU as they were read; --calibration corrects them"
+            }
             Self::Threshold(_) => "`vidar eval RUN` shows every score",
             Self::Eval(_) => "check that both are of the same recording, body and clock",
             Self::NotARun { .. } => "a run folder holds manifest.json; `vidar run PATH` makes one",
@@ -385,6 +404,10 @@ pub const CODES: &[(&str, &str)] = &[
         "E0208",
         "The images carry no calibration. A camera guessed from the size of the images bends every surface, so no metric map is made with it.",
     ),
+    (
+        "E0209",
+        "Camera and IMU gave no metric poses: the odometry never started; the message says what it waited for.",
+    ),
     ("E0301", "The geometry model could not predict depth for any chunk."),
     ("E0302", "Predicted geometry could not be placed in the metric world."),
     ("E0303", "Fusion refused its configuration or a view, or met its memory bound."),
@@ -396,6 +419,10 @@ pub const CODES: &[(&str, &str)] = &[
     (
         "E0309",
         "A network cannot be opened or run: the checkpoint is not the one its config.json describes (each key is named), or the images or cameras do not fit it.",
+    ),
+    (
+        "E0310",
+        "The odometry refused its settings, the camera's place on the IMU, or an image of another size.",
     ),
     ("E0401", "A file or folder could not be read or written."),
     ("E0402", "The disk is full. Finished files are kept; unfinished ones are removed."),

@@ -2,6 +2,7 @@
 
 use crate::config::{Config, PoseSource};
 use crate::error::Error;
+use crate::events::{CancelToken, Events};
 use crate::keyframes::PosedFrame;
 use serde::Serialize;
 use std::path::{Path, PathBuf};
@@ -19,6 +20,8 @@ pub enum AnchorSource {
     },
     /// The dataset's ground truth: scores made with it are an upper bound.
     GroundTruth,
+    /// Odometry of the recording's own camera and IMU.
+    Odometry,
 }
 
 impl std::fmt::Display for AnchorSource {
@@ -26,6 +29,7 @@ impl std::fmt::Display for AnchorSource {
         match self {
             Self::External { file } => write!(f, "external trajectory {file}"),
             Self::GroundTruth => f.write_str("ground truth (upper bound)"),
+            Self::Odometry => f.write_str("odometry of camera and IMU"),
         }
     }
 }
@@ -37,6 +41,8 @@ pub struct MetricAnchor {
     pub source: AnchorSource,
     /// Poses of the camera in use.
     pub camera_trajectory: Trajectory,
+    /// What there is to say of it.
+    pub warnings: Vec<Warning>,
 }
 
 /// Applies the configuration's part of the options and opens the dataset.
@@ -58,9 +64,30 @@ pub fn metric_anchor(dataset: &Dataset, config: &Config) -> Result<MetricAnchor,
         PoseSource::Auto => external.or(truth),
         PoseSource::External => external,
         PoseSource::GroundTruth => truth,
+        PoseSource::Odometry => None,
     };
-    let (trajectory, source) = chosen.ok_or_else(|| Error::NoAnchor { name: dataset.name.clone() })?;
-    Ok(MetricAnchor { source, camera_trajectory: in_camera(trajectory, dataset)? })
+    let may_track = matches!(config.input.poses, PoseSource::Auto | PoseSource::Odometry);
+    match chosen {
+        Some((trajectory, source)) => {
+            let camera_trajectory = in_camera(trajectory, dataset)?;
+            Ok(MetricAnchor { source, camera_trajectory, warnings: Vec::new() })
+        }
+        None if may_track && dataset.rig.imu.is_some() => odometry_anchor(dataset, config),
+        None => Err(Error::NoAnchor { name: dataset.name.clone() }),
+    }
+}
+
+/// The longest span that the odometry tracked in metres.
+fn odometry_anchor(dataset: &Dataset, config: &Config) -> Result<MetricAnchor, Error> {
+    require_calibration(dataset)?;
+    let tracked = crate::odometry::track(dataset, config, &Events::none(), &CancelToken::new())?;
+    let trajectory = tracked.longest_segment().filter(|_| tracked.is_metric);
+    let trajectory = trajectory.ok_or_else(|| Error::NoOdometry {
+        name: dataset.name.clone(),
+        reason: tracked.why_not_started().unwrap_or_else(|| "it is told to leave the IMU out".into()),
+    })?;
+    let camera_trajectory = in_camera(&trajectory, dataset)?;
+    Ok(MetricAnchor { source: AnchorSource::Odometry, camera_trajectory, warnings: tracked.warnings() })
 }
 
 /// Ground truth told of the camera in use, if there is any that can be.

@@ -21,6 +21,7 @@ pub mod input;
 pub mod inspect;
 pub mod keyframes;
 pub mod models;
+pub mod odometry;
 pub mod run;
 pub mod run_folder;
 pub mod system;
@@ -34,6 +35,7 @@ pub use vidar_da3 as da3;
 pub use vidar_dataset as dataset;
 pub use vidar_export as export_formats;
 pub use vidar_hub as hub;
+pub use vidar_odometry as odometry_stage;
 pub use vidar_synth as synth;
 
 /// Version of the program.

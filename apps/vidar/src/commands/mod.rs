@@ -8,6 +8,7 @@ pub mod explain;
 pub mod export;
 pub mod inspect;
 pub mod model;
+pub mod odometry;
 pub mod run;
 pub mod synth;
 

@@ -8,5 +8,6 @@ mod faults;
 mod keys;
 mod models;
 mod numbers;
+mod odometry;
 mod support;
 mod verbs;

@@ -36,12 +36,14 @@ pub struct InputConfig {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum PoseSource {
-    /// The external trajectory if given, else ground truth.
+    /// The external trajectory if given, else ground truth, else the odometry.
     Auto,
     /// The external trajectory only.
     External,
     /// Ground truth only.
     GroundTruth,
+    /// The odometry of camera and IMU, on the images that `input.stride` leaves.
+    Odometry,
 }
 
 impl Default for InputConfig {
@@ -190,6 +192,8 @@ pub struct Config {
     pub geometry: GeometryConfig,
     /// The network, where one is used.
     pub model: ModelConfig,
+    /// Visual-inertial odometry.
+    pub odometry: vidar_odometry::OdometryConfig,
     /// Multi-view stereo.
     pub stereo: vidar_stereo::StereoConfig,
     /// Placement of chunks.
@@ -240,6 +244,7 @@ impl Config {
         }
         let stage = |result: Result<(), String>| result.map_err(|reason| Error::BadValue { reason });
         stage(self.model.network.validate().map_err(|e| e.to_string()))?;
+        stage(self.odometry.validate().map_err(|e| e.to_string()))?;
         stage(self.stereo.validate().map_err(|e| e.to_string()))?;
         stage(self.align.validate().map_err(|e| e.to_string()))?;
         stage(self.fusion.validate().map_err(|e| e.to_string()))?;

@@ -79,6 +79,7 @@ impl Plan {
         input::require_calibration(dataset)?;
         let anchor = input::metric_anchor(dataset, config)?;
         let (posed, mut warnings) = input::posed_frames(dataset, &anchor, config)?;
+        warnings.extend(anchor.warnings.iter().cloned());
         let keyframes = select_keyframes(&posed, &config.keyframes);
         let source = Source::open(config)?;
         let needed = source.info().min_views;

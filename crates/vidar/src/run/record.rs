@@ -35,6 +35,7 @@ const DEGRADING: &[&str] = &[
     "no-parallax",
     "depth-unreadable",
     "not-judged",
+    "track-lost",
 ];
 
 impl Recorder {

@@ -1,0 +1,141 @@
+//! `vidar odometry`: a metric trajectory from camera and IMU alone.
+
+use crate::support::{Ran, command, copy_tree, files_under, shared, vidar};
+use serde_json::Value;
+use std::path::{Path, PathBuf};
+use std::sync::OnceLock;
+
+/// Small images at 20 Hz, six seconds: long enough to start and to be judged.
+const WORLD: &str = "duration_secs = 6.0\ncamera_rate_hz = 20.0\nwidth = 376\nheight = 240\nblur_samples = 1\n\
+    exposure_secs = 0.0\nscan_spacing_m = 0.1\n";
+
+fn flight() -> &'static Path {
+    static FLIGHT: OnceLock<PathBuf> = OnceLock::new();
+    FLIGHT.get_or_init(|| {
+        let world = shared().root.join("flight.toml");
+        std::fs::write(&world, WORLD).unwrap();
+        let sequence = shared().root.join("flight to track");
+        let made = command()
+            .args(["synth".as_ref(), sequence.as_os_str(), "--world-config".as_ref(), world.as_os_str()])
+            .output();
+        Ran::from(made.unwrap()).ends_with(0);
+        sequence
+    })
+}
+
+fn odometry(sequence: &Path, out: &Path, more: &[&str]) -> Ran {
+    let mut command = command();
+    command.arg("odometry").arg(sequence).arg("-o").arg(out).args(["--json", "-q"]).args(more);
+    command.output().unwrap().into()
+}
+
+#[test]
+fn a_rendered_flight_is_tracked_in_metres_and_its_trajectory_anchors_a_map() {
+    let out = shared().root.join("tracked");
+    let json = odometry(flight(), &out, &[]).ends_with(0).json();
+    assert_eq!(json["schema"], "vidar.odometry/1");
+    assert_eq!(json["is_metric"], true);
+    let number = |v: &Value| v.as_f64().unwrap();
+    assert!(number(&json["images_with_state"]) > 0.5 * number(&json["images"]), "{json}");
+    assert!(number(&json["trajectory"]["ate_se3_m"]["rmse"]) < 0.05, "{json}");
+    assert!(number(&json["trajectory"]["scale_error"]) < 0.03, "{json}");
+    let files = files_under(&out);
+    for name in [
+        "manifest.json",
+        "odometry/health.csv",
+        "odometry/keyframes.json",
+        "odometry/landmarks.csv",
+        "odometry/report.json",
+        "trajectory/odometry_body.euroc.csv",
+        "trajectory/odometry_body.tum",
+    ] {
+        assert!(files.iter().any(|f| f == name), "{name} is missing in {files:?}");
+    }
+    let keyframes: Value =
+        serde_json::from_slice(&std::fs::read(out.join("odometry/keyframes.json")).unwrap()).unwrap();
+    let first = &keyframes["keyframes"][0];
+    assert_eq!(first["pose_covariance"].as_array().unwrap().len(), 6);
+    assert!(first["landmarks"].as_u64().unwrap() > 10, "{first}");
+    let health = std::fs::read_to_string(out.join("odometry/health.csv")).unwrap();
+    assert_eq!(health.lines().count() as u64, 1 + json["images"].as_u64().unwrap());
+
+    // The trajectory is a metric anchor like any other.
+    let map = shared().root.join("map on odometry");
+    let trajectory = out.join("trajectory/odometry_body.tum");
+    let mut command = command();
+    command.arg("run").arg(flight()).arg("-o").arg(&map).arg("--trajectory").arg(&trajectory);
+    command.args(["--trajectory-body", "imu", "-q", "--config"]).arg(&shared().settings);
+    command.args(["--set", "geometry.max_width_px=160", "--set", "input.stride=4"]);
+    let ran: Ran = command.output().unwrap().into();
+    assert!([0, 3].contains(&ran.code), "{}", ran.stderr);
+    assert!(map.join("map/mesh.ply").is_file());
+}
+
+#[test]
+fn without_any_trajectory_the_odometry_anchors_the_map() {
+    let sequence = shared().root.join("flight without truth");
+    copy_tree(flight(), &sequence);
+    std::fs::remove_dir_all(sequence.join("mav0/state_groundtruth_estimate0")).unwrap();
+    let out = shared().root.join("map without truth");
+    let mut command = command();
+    command.arg("run").arg(&sequence).arg("-o").arg(&out).args(["-q", "--config"]).arg(&shared().settings);
+    command.args(["--set", "geometry.max_width_px=160", "--set", "keyframes.max_count=12"]);
+    let ran: Ran = command.output().unwrap().into();
+    assert!([0, 3].contains(&ran.code), "{}", ran.stderr);
+    let manifest: Value = serde_json::from_slice(&std::fs::read(out.join("manifest.json")).unwrap()).unwrap();
+    assert_eq!(manifest["poses"]["source"], "odometry");
+    assert!(out.join("map/mesh.ply").is_file());
+}
+
+#[test]
+fn the_same_recording_gives_the_same_bits() {
+    let folders = ["1", "3"].map(|threads| {
+        let out = shared().root.join(format!("tracked by {threads}"));
+        odometry(flight(), &out, &["--threads", threads]).ends_with(0);
+        std::fs::read(out.join("trajectory/odometry_body.euroc.csv")).unwrap()
+    });
+    assert!(folders[0] == folders[1]);
+}
+
+#[test]
+fn what_never_starts_is_an_outcome_with_its_reason() {
+    // Two and a half seconds at 8 Hz of 160x104 pixels are no flight to start on.
+    let out = shared().root.join("never started");
+    let ran = odometry(&shared().sequence, &out, &[]);
+    if ran.code == 0 {
+        // It did start; then it must be right.
+        assert!(ran.json()["trajectory"]["scale_error"].as_f64().unwrap() < 0.1);
+        return;
+    }
+    let json = ran.ends_with(3).json();
+    assert!(json["path_m"].is_null() || !json["lost"].as_array().unwrap().is_empty(), "{json}");
+    let manifest: Value = serde_json::from_slice(&std::fs::read(out.join("manifest.json")).unwrap()).unwrap();
+    assert_eq!(manifest["exit"], 3);
+    let warned = &manifest["warnings"];
+    assert!(warned["odometry-never-started"] == 1 || warned["track-lost"].as_u64() > Some(0), "{warned}");
+}
+
+#[test]
+fn settings_of_the_odometry_are_checked() {
+    vidar(&["odometry", flight().to_str().unwrap(), "--set", "odometry.max_landmarks=0"])
+        .ends_with(2)
+        .says(&["max_landmarks"]);
+}
+
+#[test]
+fn real_frames_are_tracked_to_a_centimetre() {
+    let shared_data = std::env::var_os("VIDAR_SHARED").map_or_else(
+        || PathBuf::from(concat!(env!("CARGO_MANIFEST_DIR"), "/../../../shared")),
+        PathBuf::from,
+    );
+    let excerpt = shared_data.join("data/euroc_MH_01_real_11s");
+    if !excerpt.is_dir() {
+        eprintln!("skipped: no recording at {}", excerpt.display());
+        return;
+    }
+    let out = shared().root.join("real");
+    let json = odometry(&excerpt, &out, &[]).ends_with(0).json();
+    assert!(json["trajectory"]["ate_se3_m"]["rmse"].as_f64().unwrap() < 0.01, "{json}");
+    assert!(json["trajectory"]["scale_error"].as_f64().unwrap() < 0.02, "{json}");
+    assert!(json["first_state_secs"].as_f64().unwrap() < 1.5, "{json}");
+}

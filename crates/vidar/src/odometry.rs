@@ -1,0 +1,345 @@
+//! The metric trajectory of a recording from its own camera and IMU: `vidar odometry`.
+
+mod files;
+
+use crate::config::{Config, Layered};
+use crate::error::{Error, ExitStatus};
+use crate::events::{CancelToken, Event, Events};
+use crate::input;
+use crate::run_folder::{MANIFEST_SCHEMA, Manifest, Place, RunFolder};
+use serde_json::{Value, json};
+use std::path::PathBuf;
+use std::time::Instant;
+use vidar_core::{BodyFrame, OdometryKeyframe, RevisedPose, SensorEvent, StampedPose, Trajectory, Warning};
+use vidar_dataset::{Dataset, OpenOptions};
+use vidar_eval::TrajectoryReport;
+use vidar_odometry::{ImuUse, InputCounts, Odometry, OdometryOutput, Status};
+
+/// What to run the odometry on, how, and where to.
+#[derive(Clone, Debug)]
+pub struct OdometryRequest {
+    /// The recording.
+    pub path: PathBuf,
+    /// How to read it.
+    pub open: OpenOptions,
+    /// The configuration with its origins.
+    pub layered: Layered,
+    /// Where results go.
+    pub place: Place,
+    /// The command as typed, for the manifest.
+    pub command: Vec<String>,
+}
+
+/// One image as the odometry left it.
+#[derive(Clone, Debug)]
+pub struct TrackedFrame {
+    /// What was said of it; landmarks, keyframe and revisions are kept elsewhere.
+    pub output: OdometryOutput,
+    /// Wall time that it took, s, decoding left out.
+    pub seconds: f64,
+}
+
+/// A span of images without a state, after there had been one.
+#[derive(Clone, Debug, PartialEq, serde::Serialize)]
+pub struct LostSpan {
+    /// First image of the span, ns.
+    pub from_ns: i64,
+    /// First image with a state again, ns; `None` when there was none.
+    pub until_ns: Option<i64>,
+    /// Why the state was given up.
+    pub reason: String,
+}
+
+/// Everything that the odometry said of a recording.
+#[derive(Clone, Debug, Default)]
+pub struct Tracked {
+    /// Every image, in order.
+    pub frames: Vec<TrackedFrame>,
+    /// Keyframes with their last poses.
+    pub keyframes: Vec<OdometryKeyframe>,
+    /// Spans without a state.
+    pub lost: Vec<LostSpan>,
+    /// What was taken and left out.
+    pub counts: InputCounts,
+    /// Whether lengths are metres.
+    pub is_metric: bool,
+}
+
+/// What a run of the odometry made.
+#[derive(Debug)]
+pub struct OdometryOutcome {
+    /// The run folder.
+    pub folder: PathBuf,
+    /// Done, degraded (a lost span, or no trajectory at all) or interrupted.
+    pub status: ExitStatus,
+    /// What was tracked.
+    pub tracked: Tracked,
+    /// The longest segment's poses of the body.
+    pub trajectory: Option<Trajectory>,
+    /// Against ground truth, where there is any.
+    pub report: Option<TrajectoryReport>,
+    /// Every warning, in order.
+    pub warnings: Vec<Warning>,
+    /// Wall time, s.
+    pub seconds: f64,
+}
+
+/// Runs the odometry and writes trajectory, keyframes, landmarks, health per image and figures.
+pub fn odometry(
+    request: &OdometryRequest,
+    events: &Events,
+    cancel: &CancelToken,
+) -> Result<OdometryOutcome, Error> {
+    let clock = Instant::now();
+    let started = crate::run_folder::now_rfc3339();
+    let config = request.layered.build()?;
+    let dataset = events.stage("read", 0, || input::open_dataset(&request.path, &request.open, &config))?;
+    input::require_calibration(&dataset)?;
+    let folder = RunFolder::create(&request.place)?;
+    folder.write("config.resolved.toml", request.layered.to_toml(true).as_bytes())?;
+    let total = dataset.images.len();
+    let tracked = events.stage("odometry", total, || track(&dataset, &config, events, cancel))?;
+
+    let mut warnings = dataset.warnings.clone();
+    warnings.extend(tracked.warnings());
+    warnings.iter().for_each(|w| events.warn(w));
+    let trajectory = tracked.longest_segment();
+    let report = match (&trajectory, &dataset.ground_truth) {
+        (Some(trajectory), Some(truth)) => judge(trajectory, truth, &dataset, &config)?,
+        _ => None,
+    };
+    let status = match (cancel.is_cancelled(), trajectory.is_none() || !tracked.lost.is_empty()) {
+        (true, _) => ExitStatus::Interrupted,
+        (false, true) => ExitStatus::Degraded,
+        (false, false) => ExitStatus::Done,
+    };
+    let outcome = OdometryOutcome {
+        folder: folder.path().to_owned(),
+        status,
+        tracked,
+        trajectory,
+        report,
+        warnings,
+        seconds: clock.elapsed().as_secs_f64(),
+    };
+    let artifacts = events.stage("write", 0, || files::write(&outcome, &folder, events))?;
+    folder.write_manifest(&manifest(request, &dataset, &outcome, started, artifacts)?)?;
+    events.emit(&Event::Finished { exit: status as i32, seconds: outcome.seconds });
+    Ok(outcome)
+}
+
+/// Feeds a dataset to the odometry.
+pub(crate) fn track(
+    dataset: &Dataset,
+    config: &Config,
+    events: &Events,
+    cancel: &CancelToken,
+) -> Result<Tracked, Error> {
+    let settings = &config.odometry;
+    let mut odometry = Odometry::new(&dataset.rig, dataset.camera, settings)?;
+    let is_metric = settings.imu != ImuUse::Off && dataset.rig.imu.is_some();
+    let mut tracked = Tracked { is_metric, ..Tracked::default() };
+    let total = dataset.images.len();
+    let mut spent = 0.0;
+    for event in dataset.events() {
+        if cancel.is_cancelled() {
+            break;
+        }
+        let event = event?;
+        if matches!(event, SensorEvent::GroundTruth { .. } | SensorEvent::Depth { .. }) {
+            continue;
+        }
+        let clock = Instant::now();
+        let output = odometry.push(event)?;
+        spent += clock.elapsed().as_secs_f64();
+        if let Some(output) = output {
+            tracked.keep(output, std::mem::take(&mut spent));
+            let done = tracked.frames.len();
+            events.emit(&Event::Progress { stage: "odometry", done, total });
+        }
+    }
+    for output in odometry.finish() {
+        tracked.keep(output, 0.0);
+    }
+    tracked.counts = odometry.counts();
+    Ok(tracked)
+}
+
+impl Tracked {
+    fn keep(&mut self, mut output: OdometryOutput, seconds: f64) {
+        let time_ns = output.time.nanos();
+        match &mut output.status {
+            Status::Tracking(tracking) => {
+                if let Some(open) = self.lost.last_mut().filter(|l| l.until_ns.is_none()) {
+                    open.until_ns = Some(time_ns);
+                }
+                self.keyframes.extend(tracking.keyframe.take().map(|k| *k));
+                let revised = std::mem::take(&mut tracking.revised);
+                revised.iter().for_each(|r| self.revise(r));
+                tracking.landmarks.clear();
+            }
+            Status::Lost(reason) => {
+                self.lost.push(LostSpan { from_ns: time_ns, until_ns: None, reason: reason.to_string() });
+            }
+            Status::Waiting(_) => {}
+        }
+        self.frames.push(TrackedFrame { output, seconds });
+    }
+
+    fn revise(&mut self, revised: &RevisedPose) {
+        if let Some(keyframe) = self.keyframes.iter_mut().rev().find(|k| k.id == revised.id) {
+            keyframe.world_from_camera = revised.world_from_camera;
+        }
+    }
+
+    /// Poses of the body in the segment with the most images; `None` when there are fewer than two.
+    pub fn longest_segment(&self) -> Option<Trajectory> {
+        let with_state = || self.frames.iter().filter_map(|f| Some((f.output.time, f.output.tracking()?)));
+        let mut counts = std::collections::BTreeMap::<u32, usize>::new();
+        with_state().for_each(|(_, t)| *counts.entry(t.segment).or_default() += 1);
+        // Of equally long segments the first.
+        let (segment, _) = counts.iter().max_by_key(|(segment, n)| (**n, std::cmp::Reverse(**segment)))?;
+        let poses: Vec<StampedPose> = with_state()
+            .filter(|(_, t)| t.segment == *segment)
+            .map(|(time, t)| StampedPose { time, world_from_body: t.state.world_from_body })
+            .collect();
+        (poses.len() >= 2).then(|| Trajectory::new(BodyFrame::Imu, poses).ok()).flatten()
+    }
+
+    /// Seconds from the first image to the first state.
+    pub fn first_state_secs(&self) -> Option<f64> {
+        let first = self.frames.first()?.output.time;
+        let state = self.frames.iter().find(|f| f.output.tracking().is_some())?;
+        Some((state.output.time - first).as_secs_f64())
+    }
+
+    /// What it waited for at the end, if it never had a state.
+    pub(crate) fn why_not_started(&self) -> Option<String> {
+        self.frames.iter().rev().find_map(|f| match &f.output.status {
+            Status::Waiting(refusal) => Some(refusal.to_string()),
+            _ => None,
+        })
+    }
+
+    pub(crate) fn warnings(&self) -> Vec<Warning> {
+        let mut warnings = Vec::new();
+        for span in &self.lost {
+            let at = vidar_core::Timestamp::from_nanos(span.from_ns);
+            warnings
+                .push(Warning::new("track-lost", format!("at {at} s: {}", span.reason)).hint(
+                    "poses after it are a segment of their own; odometry/health.csv tells every image",
+                ));
+        }
+        if !self.frames.iter().any(|f| f.output.tracking().is_some()) {
+            let why = self.why_not_started().unwrap_or_else(|| "no images".into());
+            let text = format!("the odometry never started: {why}");
+            warnings.push(Warning::new("odometry-never-started", text));
+        }
+        if !self.is_metric {
+            let text =
+                "one camera without an IMU: the trajectory is known up to scale, lengths are not metres";
+            warnings.push(Warning::new("scale-unknown", text));
+        }
+        warnings
+    }
+}
+
+fn judge(
+    trajectory: &Trajectory,
+    truth: &Trajectory,
+    dataset: &Dataset,
+    config: &Config,
+) -> Result<Option<TrajectoryReport>, Error> {
+    let Ok(truth) = truth.in_frame(BodyFrame::Imu, &dataset.rig) else { return Ok(None) };
+    match vidar_eval::evaluate_trajectory(trajectory, &truth, &config.eval.trajectory) {
+        Ok(report) => Ok(Some(report)),
+        Err(vidar_eval::EvalError::NoMatches { .. }) => Ok(None),
+        Err(other) => Err(other.into()),
+    }
+}
+
+impl OdometryOutcome {
+    /// Counts and scores as JSON.
+    pub fn result_json(&self) -> Value {
+        let tracked = &self.tracked;
+        let with_state = tracked.frames.iter().filter(|f| f.output.tracking().is_some()).count();
+        let mut health = std::collections::BTreeMap::<&str, usize>::new();
+        for frame in &tracked.frames {
+            *health.entry(files::word(&frame.output)).or_default() += 1;
+        }
+        json!({
+            "is_metric": tracked.is_metric,
+            "images": tracked.frames.len(),
+            "images_with_state": with_state,
+            "first_state_secs": tracked.first_state_secs(),
+            "keyframes": tracked.keyframes.len(),
+            "path_m": self.trajectory.as_ref().map(Trajectory::path_length_m),
+            "health": health,
+            "lost": tracked.lost,
+            "images_out_of_order": tracked.counts.images_out_of_order,
+            "images_repeated": tracked.counts.images_repeated,
+            "readings_refused": tracked.counts.readings_refused,
+            "imu_gaps": tracked.counts.imu_gaps,
+            "milliseconds_per_image": files::milliseconds(tracked),
+            "trajectory": self.report,
+        })
+    }
+
+    /// What was made and how far to trust it.
+    pub fn summary_lines(&self) -> Vec<(&'static str, String)> {
+        let tracked = &self.tracked;
+        let with_state = tracked.frames.iter().filter(|f| f.output.tracking().is_some()).count();
+        let unit = if tracked.is_metric { "m" } else { "units (up to scale)" };
+        let mut lines = vec![
+            ("images", format!("{with_state} of {} with a state", tracked.frames.len())),
+            ("keyframes", tracked.keyframes.len().to_string()),
+        ];
+        if let Some(trajectory) = &self.trajectory {
+            lines.push(("path", format!("{:.2} {unit}", trajectory.path_length_m())));
+        }
+        if let Some(secs) = tracked.first_state_secs() {
+            lines.push(("first state", format!("{secs:.2} s after the first image")));
+        }
+        let ate = |e: Option<vidar_eval::ErrorStats>| e.map_or("-".into(), |e| format!("{:.4} m", e.rmse));
+        if let Some(report) = &self.report {
+            lines.push(("ATE SE(3)", ate(report.ate_se3_m)));
+            lines.push(("ATE Sim(3)", ate(report.ate_sim3_m)));
+            lines.push(("|ln s|", report.scale_error.map_or("-".into(), |s| format!("{s:.4}"))));
+        }
+        for span in &tracked.lost {
+            let at = vidar_core::Timestamp::from_nanos(span.from_ns);
+            lines.push(("lost", format!("at {at} s: {}", span.reason)));
+        }
+        lines.push(("folder", self.folder.display().to_string()));
+        lines
+    }
+}
+
+fn manifest(
+    request: &OdometryRequest,
+    dataset: &Dataset,
+    outcome: &OdometryOutcome,
+    started: String,
+    artifacts: Vec<String>,
+) -> Result<Manifest, Error> {
+    let mut counts = std::collections::BTreeMap::<String, u64>::new();
+    outcome.warnings.iter().for_each(|w| *counts.entry(w.kind.clone()).or_default() += 1);
+    Ok(Manifest {
+        schema: MANIFEST_SCHEMA.into(),
+        version: crate::VERSION.into(),
+        command: request.command.clone(),
+        started,
+        dataset: json!({
+            "name": dataset.name, "kind": dataset.kind.to_string(), "path": request.path.display().to_string(),
+            "images": dataset.images.len(), "imu_samples": dataset.imu.len(),
+        }),
+        poses: json!({ "source": "odometry" }),
+        hardware: json!(crate::system::hardware()),
+        peak_memory_bytes: crate::system::peak_memory_bytes(),
+        result: outcome.result_json(),
+        warnings: json!(counts),
+        artifacts,
+        exit: outcome.status as i32,
+        ..Manifest::default()
+    })
+}
