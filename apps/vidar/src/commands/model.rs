@@ -6,6 +6,7 @@ use crate::{Context, Outcome, print, progress};
 use serde_json::json;
 use std::cell::Cell;
 use std::path::{Path, PathBuf};
+use vidar::core::Warning;
 use vidar::da3::{self, Da3Options, check};
 use vidar::hub::{Ability, Checkpoint, Installed, Progress, Watch, catalogue};
 use vidar::models::{self, LicenceAccepted};
@@ -208,17 +209,26 @@ fn check_files(args: &CheckArgs, context: &Context) -> Outcome {
     let files = references(&args.path)?;
     let options = Da3Options { precision: precision(args.precision), ..Da3Options::default() };
     let events = progress::events(&context.cli);
-    let mut reports = Vec::new();
+    let (mut reports, mut left_out) = (Vec::new(), 0usize);
     events.stage("check", files.len(), || {
         for (i, file) in files.iter().enumerate() {
             if context.cancel.is_cancelled() {
                 return Err(Error::Interrupted { path: PathBuf::from(".") });
             }
-            let report = check::check_file(file, args.model_dir.as_deref(), &options)?;
-            if !context.cli.json {
-                tell_report(&report, args.all);
+            match check::check_file(file, args.model_dir.as_deref(), &options) {
+                Ok(report) => {
+                    if !context.cli.json {
+                        tell_report(&report, args.all);
+                    }
+                    reports.push(report);
+                }
+                // One of a folder that cannot be judged must not hide the others.
+                Err(error @ da3::Da3Error::BadGolden { .. }) if files.len() > 1 => {
+                    events.warn(&Warning::new("reference-left-out", error.to_string()));
+                    left_out += 1;
+                }
+                Err(error) => return Err(error.into()),
             }
-            reports.push(report);
             events.emit(&Event::Progress { stage: "check", done: i + 1, total: files.len() });
         }
         Ok(())
@@ -230,7 +240,7 @@ fn check_files(args: &CheckArgs, context: &Context) -> Outcome {
     if departed > 0 {
         return Err(Error::Threshold(format!("{departed} of {} reference files are not met", reports.len())));
     }
-    Ok(ExitStatus::Done)
+    Ok(if left_out > 0 { ExitStatus::Degraded } else { ExitStatus::Done })
 }
 
 fn tell_report(report: &check::CheckReport, all: bool) {
