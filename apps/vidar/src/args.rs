@@ -137,7 +137,7 @@ pub struct InputArgs {
     /// Calibration: EuRoC sensor.yaml, Kalibr camchain or imu yaml. Repeatable.
     #[arg(long, value_hint = ValueHint::FilePath, help_heading = "Input")]
     pub calibration: Vec<PathBuf>,
-    /// Camera from numbers: pinhole:fx,fy,cx,cy  radtan:…,k1,k2,p1,p2[,k3]  kb4:…,k1,k2,k3,k4  ds:…,xi,alpha  fov:…,w.
+    /// Camera from numbers: pinhole:fx,fy,cx,cy  radtan:…,k1,k2,p1,p2(,k3)  kb4:…,k1,k2,k3,k4  ds:…,xi,alpha  fov:…,w.
     #[arg(long, allow_hyphen_values = true, help_heading = "Input")]
     pub camera_model: Option<String>,
     /// Metric trajectory of the same recording: the anchor.
