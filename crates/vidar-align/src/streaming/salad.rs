@@ -9,18 +9,18 @@ use super::StreamingError;
 /// Two linear layers with a rectifier between, applied to each column.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Perceptron {
-    /// First layer, row-major [hidden, input].
+    /// First layer, row-major `[hidden, input]`.
     pub first: Vec<f32>,
-    /// Its bias [hidden].
+    /// Its bias `[hidden]`.
     pub first_bias: Vec<f32>,
-    /// Second layer, row-major [output, hidden].
+    /// Second layer, row-major `[output, hidden]`.
     pub second: Vec<f32>,
-    /// Its bias [output].
+    /// Its bias `[output]`.
     pub second_bias: Vec<f32>,
 }
 
 impl Perceptron {
-    /// Output for `inputs` of n columns, row-major [input, n].
+    /// Output for `inputs` of n columns, row-major `[input, n]`.
     fn apply(&self, inputs: &[f64], n: usize, what: &'static str) -> Result<Vec<f64>, StreamingError> {
         let hidden = dense(&self.first, &self.first_bias, inputs, n, what)?;
         let hidden: Vec<f64> = hidden.into_iter().map(|v| v.max(0.0)).collect();
@@ -71,7 +71,7 @@ const SINKHORN_ROUNDS: usize = 3;
 impl SaladHead {
     /// The unit-length descriptor of one image: global vector, then clusters, row-major (feature, cluster).
     ///
-    /// `patches` is row-major [channels, tokens], `class_token` [channels].
+    /// `patches` is row-major `[channels, tokens]`, `class_token` `[channels]`.
     ///
     /// # Errors
     /// [`StreamingError::WrongLength`] naming the layer whose size does not fit.
@@ -113,7 +113,7 @@ impl SaladHead {
     }
 }
 
-/// How much of each token goes to each cluster, row-major [clusters, tokens]; the dustbin takes the rest.
+/// How much of each token goes to each cluster, row-major `[clusters, tokens]`; the dustbin takes the rest.
 fn transport(scores: &[f64], clusters: usize, tokens: usize, dust_bin: f64) -> Vec<f64> {
     let mut matrix = scores.to_vec();
     matrix.resize((clusters + 1) * tokens, dust_bin);
