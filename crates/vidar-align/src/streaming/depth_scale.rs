@@ -1,5 +1,6 @@
 //! The scale between two predictions of the same pixels from their depths alone, `d₁ ≈ s d₂`.
 
+use super::overlap::median;
 use super::{Compat, StreamingError};
 use rand::seq::index::sample;
 use rand_chacha::ChaCha8Rng;
@@ -133,16 +134,6 @@ fn by_quantile(pixels: &[Pixel], compat: Compat) -> DepthScale {
     let scale = ratios[at.unwrap_or(ratios.len() - 1)].0;
     let entropy: f64 = ratios.iter().filter(|(_, w)| *w > 0.0).map(|(_, w)| -w * w.ln()).sum();
     DepthScale { scale, quality: 1.0 - entropy / (ratios.len() as f64).ln() }
-}
-
-fn median(values: &[f32]) -> f32 {
-    let mut sorted = values.to_vec();
-    sorted.sort_by(f32::total_cmp);
-    match sorted.len() {
-        0 => 0.0,
-        n if n % 2 == 1 => sorted[n / 2],
-        n => 0.5 * (sorted[n / 2 - 1] + sorted[n / 2]),
-    }
 }
 
 #[cfg(test)]

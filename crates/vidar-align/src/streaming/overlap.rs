@@ -93,7 +93,7 @@ pub fn align_overlap(
 }
 
 /// The middle value, the mean of the two middle ones for an even count; 0 for none. NaN counts as smallest.
-fn median(values: &[f32]) -> f32 {
+pub(super) fn median(values: &[f32]) -> f32 {
     let mut sorted: Vec<f32> =
         values.iter().map(|v| if v.is_nan() { f32::NEG_INFINITY } else { *v }).collect();
     if sorted.is_empty() {
