@@ -117,7 +117,7 @@ impl System {
     }
 
     /// Adds a block at (`row`, `col`), `row ≥ col`; of diagonal blocks the upper half is ignored later.
-    fn add<const R: usize, const C: usize>(
+    pub(crate) fn add<const R: usize, const C: usize>(
         &mut self,
         row: usize,
         col: usize,
@@ -147,7 +147,7 @@ impl System {
         }
     }
 
-    fn add_gradient<const N: usize>(&mut self, at: usize, value: &SVector<f64, N>, sign: f64) {
+    pub(crate) fn add_gradient<const N: usize>(&mut self, at: usize, value: &SVector<f64, N>, sign: f64) {
         for (g, v) in self.gradient[at..at + N].iter_mut().zip(value.iter()) {
             *g += sign * v;
         }
@@ -295,6 +295,7 @@ impl Smoother {
         for k in 0..self.frames.len() {
             cost += self.add_link(system, k);
             cost += self.add_standstill_factor(system, k);
+            cost += self.add_rest_factor(system, k);
         }
         if self.config.calibrates() {
             cost += self.add_calibration(system);

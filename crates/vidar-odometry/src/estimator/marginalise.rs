@@ -123,6 +123,9 @@ impl Smoother {
             next.whitening = super::inertial::Whitening::of(&next.readings);
             self.spare.push(used);
         }
+        // Who rests on a frame that itself rests on another rests on that.
+        let both = self.frames[at].rest.and(self.frames[at + 1].rest);
+        self.frames[at + 1].rest = both;
         self.remove_frame(at, NextLink::Joined);
         Ok(())
     }
@@ -222,7 +225,13 @@ impl Smoother {
         if self.frames.get(gone + 1).is_some_and(|f| f.link.is_some()) {
             tied[gone + 1] = 3;
         }
-        let mut rows = self.prior.rows + 2 * 15 + 15 + 3 + CALIBRATION_DIM;
+        if self.frames[gone].rest.is_some() && gone > 0 {
+            tied[gone - 1] |= 1;
+        }
+        if self.frames.get(gone + 1).is_some_and(|f| f.rest.is_some()) {
+            tied[gone + 1] |= 1;
+        }
+        let mut rows = self.prior.rows + 2 * (15 + 6) + 15 + 3 + CALIBRATION_DIM;
         for &(slot, leaving) in &bench.leaving {
             let landmark = &self.landmarks[slot];
             for s in landmark.sightings[..leaving].iter().filter(|s| self.frames[s.frame].keyframe) {
@@ -297,6 +306,15 @@ impl Smoother {
             bench.put_rhs(row, r.as_slice());
             self.put_state(bench, row, k - 1, &link.whitening.apply(&ji));
             self.put_state(bench, row, k, &link.whitening.apply(&jj));
+        }
+        for k in [gone, gone + 1] {
+            let Some(rest) = self.frames.get(k).and_then(|f| f.rest).filter(|_| k > 0) else { continue };
+            let r = rest.residual(&self.frames[k - 1].state, &self.frames[k].state);
+            let (ji, jj) = rest.jacobians(&system.states_at[k - 1], &system.states_at[k]);
+            let row = bench.stack.add_rows(6);
+            bench.put_rhs(row, r.as_slice());
+            bench.put(row, Part::Pose(k - 1), &ji, self.pose_step(k - 1));
+            bench.put(row, Part::Pose(k), &jj, self.pose_step(k));
         }
         if let Some(anchor) = self.anchor.as_ref().filter(|a| a.frame == gone) {
             let state = &self.frames[gone].state;
@@ -477,6 +495,7 @@ impl Smoother {
         self.spare.extend(frame.link.map(|link| link.readings));
         if let (NextLink::InPrior, Some(next)) = (next, self.frames.get_mut(gone)) {
             self.spare.extend(next.link.take().map(|link| link.readings));
+            next.rest = None;
         }
         self.spare.truncate(MOST_SPARE);
         self.anchor = self.anchor.filter(|a| a.frame != gone).map(|mut a| {

@@ -17,6 +17,7 @@ mod linearise;
 mod marginalise;
 mod optimise;
 mod prior;
+mod rest;
 mod visual;
 mod window;
 

@@ -83,6 +83,8 @@ pub(crate) struct Frame {
     pub(crate) motion_in_prior: bool,
     pub(crate) link: Option<Link>,
     pub(crate) standstill_sigma: Option<f64>,
+    /// What is known of the motion since the frame before: that there was none.
+    pub(crate) rest: Option<super::rest::Rest>,
 }
 
 impl Frame {
@@ -98,6 +100,7 @@ impl Frame {
             motion_in_prior: false,
             link,
             standstill_sigma: None,
+            rest: None,
         }
     }
 

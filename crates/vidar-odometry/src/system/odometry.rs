@@ -207,7 +207,7 @@ impl Odometry {
         }
         self.last_host = Some(host.clone());
         self.last_frame = Some(time);
-        let imu_still = self.recent_spread(time).is_some_and(|s| s.is_still());
+        let imu_still = self.imu_is_still(time);
         match &mut self.phase {
             Phase::Starting(starting) => {
                 let found = starting.follow(host.clone(), time, readings);
@@ -292,14 +292,12 @@ impl Odometry {
         Some(Preintegration::new(model, bias, &self.interval))
     }
 
-    /// Spread of the readings of the last half second.
-    fn recent_spread(&self, time: Timestamp) -> Option<ImuSpread> {
+    /// Whether the readings of the last half second are those of a body at rest.
+    fn imu_is_still(&self, time: Timestamp) -> bool {
         let from = time - Duration::from_secs_f64(STILL_SECS);
-        let first = self.imu.iter().next()?;
-        if first.time > from {
-            return None;
-        }
-        Some(ImuSpread::of(self.imu.iter().filter(|s| s.time >= from && s.time <= time)))
+        let (Some(model), Some(first)) = (&self.imu_model, self.imu.iter().next()) else { return false };
+        let recent = self.imu.iter().filter(|s| s.time >= from && s.time <= time);
+        first.time <= from && ImuSpread::of(recent).is_still(&model.noise)
     }
 
     /// Starts from a body at rest: level and gyroscope bias are known, the velocity is zero, and the scale follows as
@@ -322,7 +320,8 @@ impl Odometry {
         tracker.detect(host, 2 * self.config.max_landmarks, UNKNOWN_INVERSE);
         let hosts = vec![host.clone()];
         let running = Running::new(self.config.clone(), smoother, tracker, hosts, UNKNOWN_INVERSE);
-        let Some(running) = running else { return self.wait(self.refusal) };
+        let Some(mut running) = running else { return self.wait(self.refusal) };
+        running.stand(time);
         self.begin(running, frame, host.frame)
     }
 

@@ -20,8 +20,13 @@ const GUESS_SIGMA_RAD: f64 = 0.1;
 /// Recent frames that are held whether they are keyframes or not.
 const RECENT_FRAMES: usize = 3;
 
-/// Standard deviation of the velocity of a body that stands still, m/s.
+/// Standard deviations of the velocity of a body that stands still, m/s, and of its motion from image to image, m and rad.
 const STANDSTILL_SIGMA_MPS: f64 = 0.01;
+const REST_SIGMA_M: f64 = 5e-4;
+const REST_SIGMA_RAD: f64 = 2e-4;
+
+/// Readings of a rest are put into the prior after this long, s.
+const REST_FOLD_SECS: f64 = 1.0;
 
 /// Mean chi-square per measurement (two degrees of freedom) up to which a young track's distance is believed.
 const DISTANCE_GATE: f64 = 9.0;
@@ -97,6 +102,8 @@ pub(crate) struct Running {
     /// Typical inverse distance, 1/m.
     typical_inverse: f64,
     motion: ImageMotion,
+    /// The frame since which the body stands still, and the time from which its readings are not yet in the prior.
+    rest: Option<(FrameId, Timestamp)>,
     departure: Departure,
     scratch: Vec<(Se3, PixelMeasurement)>,
 }
@@ -145,6 +152,7 @@ impl Running {
             keyframe_landmarks,
             typical_inverse,
             motion: ImageMotion::default(),
+            rest: None,
             departure: Departure::default(),
             scratch: Vec::new(),
         })
@@ -168,10 +176,13 @@ impl Running {
             None => self.predict_by_image(&shot.host, &last_state),
         };
         self.smoother.add_frame(frame, shot.time, predicted, shot.readings)?;
-        step.counts = self.measure(&shot.host, &last_state, &predicted);
-        step.is_still = self.motion.update(&self.tracker.tracks, frame) && shot.imu_still;
+        step.counts = self.measure(&shot.host, shot.time, &last_state, &predicted);
+        step.is_still = self.motion.update(&self.tracker.tracks, frame, shot.time) && shot.imu_still;
         if step.is_still {
             self.smoother.add_standstill(frame, STANDSTILL_SIGMA_MPS)?;
+            if self.rest.is_some() {
+                self.smoother.add_rest(frame, REST_SIGMA_M, REST_SIGMA_RAD)?;
+            }
         }
         self.observe(frame);
         step.report = self.smoother.optimise(self.config.iterations);
@@ -179,15 +190,54 @@ impl Running {
         step.fitting = self.tracker.tracks.iter().filter(|t| t.is_landmark && t.measured.is_some()).count();
         self.know_young_tracks(frame)?;
 
-        step.is_keyframe = !step.is_still && self.keyframe_is_due(frame, shot.time);
+        step.is_keyframe = match step.is_still {
+            // The first frame of a rest stands for all of it.
+            true => self.rest.is_none(),
+            false => self.keyframe_is_due(frame, shot.time),
+        };
         if step.is_keyframe {
             self.make_keyframe(shot.host)?;
         }
         self.last = frame;
+        self.rest_or_move(&step, shot.time)?;
         self.last_host = Some(image);
         self.before_last = Some(last_state.world_from_body);
         self.thin_window(&mut step)?;
         Ok(step)
+    }
+
+    /// The body stands at the newest frame, which is a keyframe.
+    pub fn stand(&mut self, time: Timestamp) {
+        self.rest = Some((self.last, time));
+        self.motion.stand(&self.tracker.tracks, self.last, time);
+    }
+
+    /// Holds a rest of any length by its first frame and the newest one.
+    fn rest_or_move(&mut self, step: &Step, time: Timestamp) -> Result<(), SmootherError> {
+        if !step.is_still {
+            self.rest = None;
+            return Ok(());
+        }
+        let Some((first, folded)) = self.rest else {
+            self.rest = Some((self.last, time));
+            return Ok(());
+        };
+        let (newest, between) = (self.last, self.smoother.frames().rev().nth(1));
+        if let Some(between) = between.filter(|b| *b != first) {
+            self.smoother.drop_frame(between, &mut self.departure)?;
+        }
+        if (time - folded).as_secs_f64() < REST_FOLD_SECS {
+            return Ok(());
+        }
+        if let Some(stays) = self.smoother.rest_in_place(&mut self.departure)? {
+            self.last = stays;
+            for track in self.tracker.tracks.iter_mut().filter(|t| t.last_frame == newest) {
+                track.last_frame = stays;
+                track.seen.retain(|(frame, _)| *frame != newest);
+            }
+        }
+        self.rest = Some((first, time));
+        Ok(())
     }
 
     /// The pose without an IMU: the last motion goes on, and the last image's patches correct it.
@@ -231,7 +281,13 @@ impl Running {
     }
 
     /// Measures all tracks from the predicted pose.
-    fn measure(&mut self, host: &Rc<HostImage>, last: &NavState, predicted: &NavState) -> TrackCounts {
+    fn measure(
+        &mut self,
+        host: &Rc<HostImage>,
+        time: Timestamp,
+        last: &NavState,
+        predicted: &NavState,
+    ) -> TrackCounts {
         let body_from_camera = *self.smoother.body_from_camera();
         let world_from_current = predicted.world_from_body * body_from_camera;
         let world_from_last = last.world_from_body * body_from_camera;
@@ -241,6 +297,7 @@ impl Running {
             current_from_last: world_from_current.inverse() * world_from_last,
             has_translation: true,
             last: self.last,
+            secs: self.smoother.time(self.last).map_or(0.0, |t| (time - t).as_secs_f64()),
         };
         self.tracker.measure(&host.pyramid, host.frame, &prediction)
     }

@@ -117,7 +117,7 @@ impl Starting {
         readings: Option<Preintegration>,
     ) -> Result<Found, Refusal> {
         let frame = host.frame;
-        let followed = self.track(&host, readings.as_ref());
+        let followed = self.track(&host, time, readings.as_ref());
         let readings = readings.filter(|_| !self.log.is_empty());
         let chained = readings.is_some();
         self.log.push(LoggedFrame { frame, time, readings, seen: Vec::new() });
@@ -162,12 +162,13 @@ impl Starting {
     }
 
     /// Measures all tracks in the newest image; how many were found.
-    fn track(&mut self, host: &Rc<HostImage>, readings: Option<&Preintegration>) -> usize {
+    fn track(&mut self, host: &Rc<HostImage>, time: Timestamp, readings: Option<&Preintegration>) -> usize {
         let frame = host.frame;
         let bias = Bias { gyro: self.gyro_bias(), accel: Vector3::zeros() };
         let turn = readings.map_or(So3::IDENTITY, |r| r.rotation(&bias));
         let last = self.turns.last().map(|l| (l.frame, l.first_from_body));
         let first_from_body = last.map_or(So3::IDENTITY, |(_, first_from_last)| first_from_last * turn);
+        let secs = self.log.last().map_or(0.0, |l| (time - l.time).as_secs_f64());
         if let Some((last, first_from_last)) = last {
             let world_from_current = turned_camera(&first_from_body, &self.body_from_camera);
             let world_from_last = turned_camera(&first_from_last, &self.body_from_camera);
@@ -178,10 +179,11 @@ impl Starting {
                 current_from_last: world_from_current.inverse() * world_from_last,
                 has_translation: false,
                 last,
+                secs,
             };
             self.tracker.measure(&host.pyramid, frame, &prediction);
         }
-        self.images_still = self.motion.update(&self.tracker.tracks, frame);
+        self.images_still = self.motion.update(&self.tracker.tracks, frame, time);
         self.turns.push(Turn { frame, first_from_body, host: host.clone() });
         self.tracker.tracks.iter().filter(|t| t.measured.is_some()).count()
     }

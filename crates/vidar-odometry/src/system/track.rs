@@ -45,7 +45,7 @@ pub(crate) struct Track {
     pub keyframe_pixel: Option<Pixel>,
     /// Where frames of the window showed it, while the smoother does not know it.
     pub seen: Vec<(FrameId, PixelMeasurement)>,
-    /// What the last prediction was off by, pixels: continues into the next one while no depth is known.
+    /// What the last prediction was off by, pixels per second: continues into the next one while no depth is known.
     pub drift: Vector2<f64>,
     /// Frames in which it was found.
     pub found: u32,

@@ -54,6 +54,8 @@ pub(crate) struct Prediction<'a> {
     /// Whether translations mean anything.
     pub has_translation: bool,
     pub last: FrameId,
+    /// Seconds since it.
+    pub secs: f64,
 }
 
 impl Tracker {
@@ -188,7 +190,7 @@ fn measure_one(
         .then(|| rotated_pixel(camera, &track.last_pixel, &prediction.current_from_last))
         .flatten();
     let expected = match turned {
-        Some(turned) => turned + track.drift,
+        Some(turned) => turned + track.drift * prediction.secs,
         None => warp.pixel,
     };
     if !camera.contains(&expected, BORDER_PX) {
@@ -197,7 +199,7 @@ fn measure_one(
     warp.pixel = expected;
     let found = measurer.find(&track.host.pyramid, &track.feature, &warp, &expected, current, !known)?;
     if let Some(turned) = turned {
-        track.drift = found.measurement.pixel - turned;
+        track.drift = (found.measurement.pixel - turned) / prediction.secs.max(1e-3);
     }
     Ok(found.measurement)
 }
