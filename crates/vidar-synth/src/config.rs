@@ -192,7 +192,7 @@ impl SynthConfig {
     }
 }
 
-fn ensure(
+pub(crate) fn ensure(
     holds: bool,
     key: &'static str,
     expected: &'static str,
@@ -201,7 +201,7 @@ fn ensure(
     if holds { Ok(()) } else { Err(SynthError::BadConfig { key, expected, found: found.to_string() }) }
 }
 
-fn within(
+pub(crate) fn within(
     key: &'static str,
     value: f64,
     low: f64,

@@ -14,6 +14,7 @@ mod imu;
 mod layout;
 mod photometry;
 mod png_file;
+pub mod predict;
 mod random;
 mod render;
 mod rig;

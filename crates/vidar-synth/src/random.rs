@@ -13,18 +13,35 @@ pub(crate) enum Purpose {
     Frame(usize),
     /// Points on one face.
     Scan(usize),
+    /// Frame, motion and focal length of a chunk's prediction.
+    Chunk(u32),
+    /// Deformation that belongs to a chunk.
+    ChunkField(u32),
+    /// Deformation that belongs to a frame.
+    FrameField(u32),
+    /// Pixels of a frame in a chunk's prediction.
+    Prediction(u32, u32),
 }
 
 /// The stream of `purpose` under `seed`.
 pub(crate) fn stream(seed: u64, purpose: Purpose) -> ChaCha8Rng {
-    let mut rng = ChaCha8Rng::seed_from_u64(seed);
     let (kind, index) = match purpose {
         Purpose::Furniture => (1, 0),
         Purpose::Imu => (2, 0),
         Purpose::Exposure => (3, 0),
         Purpose::Frame(k) => (4, k as u64),
         Purpose::Scan(k) => (5, k as u64),
+        Purpose::Chunk(k) => (6, u64::from(k)),
+        Purpose::ChunkField(k) => (7, u64::from(k)),
+        Purpose::FrameField(k) => (8, u64::from(k)),
+        Purpose::Prediction(_, frame) => (9, u64::from(frame)),
     };
+    let seed = match purpose {
+        // Two numbers of 32 bits do not fit a stream's 48: the chunk goes into the seed.
+        Purpose::Prediction(chunk, _) => seed ^ u64::from(chunk).wrapping_mul(0x9E37_79B9_7F4A_7C15),
+        _ => seed,
+    };
+    let mut rng = ChaCha8Rng::seed_from_u64(seed);
     rng.set_stream((kind << 48) | index);
     rng
 }

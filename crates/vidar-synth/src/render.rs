@@ -90,6 +90,23 @@ pub(crate) fn expose(world: &World, rays: &RayTable, world_from_camera: &[Se3]) 
     Exposed { radiance, depth }
 }
 
+/// z-depth at the pixel centres from one pose, m; NaN where there is none.
+pub(crate) fn depth_image(world: &World, rays: &RayTable, world_from_camera: &Se3) -> Image<f32> {
+    let rotation = world_from_camera.rotation.matrix();
+    let origin = world_from_camera.translation;
+    let directions = &rays.samples[rays.centre()];
+    Image::from_fn(rays.width, rays.height, |x, y| {
+        let [u, v] = directions[y * rays.width + x];
+        // A direction that is not a number meets nothing.
+        let direction = rotation * Vector3::new(u, v, 1.0);
+        if u.is_nan() {
+            f32::NAN
+        } else {
+            world.cast(&origin, &direction).map_or(f32::NAN, |hit| hit.t as f32)
+        }
+    })
+}
+
 /// Width of the surface that a pixel sees: between the axes of its ellipse, halfway from their mean to the longer one.
 ///
 /// The shorter axis would alias at grazing angles, the longer one would blur floors away.
