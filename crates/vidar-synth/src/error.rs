@@ -2,7 +2,7 @@
 
 use std::path::{Path, PathBuf};
 use thiserror::Error;
-use vidar_core::{CameraError, TrajectoryError};
+use vidar_core::{CameraError, ChunkId, TrajectoryError};
 
 /// Why a synthetic sequence cannot be made.
 #[derive(Debug, Error)]
@@ -43,6 +43,32 @@ pub enum SynthError {
         path: PathBuf,
         /// What the system said.
         source: std::io::Error,
+    },
+    /// A file of a written sequence cannot be read.
+    #[error("cannot read {path}: {source}")]
+    Read {
+        /// Which file.
+        path: PathBuf,
+        /// What the system said.
+        source: std::io::Error,
+    },
+    /// A file is not one that a sequence was written with.
+    #[error("{path}: {reason}")]
+    BadSequence {
+        /// Which file.
+        path: PathBuf,
+        /// What is wrong with it.
+        reason: String,
+    },
+    /// Two neighbouring chunks do not share enough to be joined.
+    #[error("chunks {earlier} and {later} cannot be joined: {reason}")]
+    Unchained {
+        /// The earlier chunk.
+        earlier: ChunkId,
+        /// The later chunk.
+        later: ChunkId,
+        /// Why not.
+        reason: String,
     },
     /// The configuration cannot be written as TOML.
     #[error("cannot write the configuration as TOML: {0}")]

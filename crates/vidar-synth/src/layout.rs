@@ -21,6 +21,11 @@ pub(crate) fn stamp(k: usize, rate_hz: f64) -> (Timestamp, f64) {
     (Timestamp::from_nanos(EPOCH_NANOS + nanos), nanos as f64 * 1e-9)
 }
 
+/// Seconds after the sequence's beginning of a stamp; the inverse of [`stamp`].
+pub(crate) fn secs(time: Timestamp) -> f64 {
+    (time.nanos().saturating_sub(EPOCH_NANOS)) as f64 * 1e-9
+}
+
 /// `data.csv` of a camera or a depth camera.
 pub(crate) fn image_list(times: &[Timestamp]) -> String {
     let mut text = String::from("#timestamp [ns],filename\n");

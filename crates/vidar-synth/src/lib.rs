@@ -12,6 +12,7 @@ mod error;
 mod flight;
 mod imu;
 mod layout;
+pub mod odometry;
 mod photometry;
 mod png_file;
 pub mod predict;
@@ -20,6 +21,7 @@ mod render;
 mod rig;
 mod scan;
 mod sequence;
+mod simulation;
 mod world;
 
 pub use config::{FlightKind, SceneKind, Start, SynthConfig};
@@ -29,6 +31,7 @@ pub use imu::{ImuRecord, simulate_imu};
 pub use render::{RenderedView, SynthView, render_views};
 pub use rig::{euroc_body_from_camera, euroc_camera, euroc_rig};
 pub use sequence::{SynthSummary, write_sequence};
+pub use simulation::Simulation;
 pub use world::{Extent, Hit, World};
 
 #[cfg(test)]

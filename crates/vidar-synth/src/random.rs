@@ -19,6 +19,10 @@ pub(crate) enum Purpose {
     ChunkField(u32),
     /// Deformation that belongs to a frame.
     FrameField(u32),
+    /// Steps of a simulated odometry.
+    Odometry,
+    /// Points that a simulated odometry sees.
+    Landmarks,
     /// Pixels of a frame in a chunk's prediction.
     Prediction(u32, u32),
 }
@@ -34,6 +38,8 @@ pub(crate) fn stream(seed: u64, purpose: Purpose) -> ChaCha8Rng {
         Purpose::Chunk(k) => (6, u64::from(k)),
         Purpose::ChunkField(k) => (7, u64::from(k)),
         Purpose::FrameField(k) => (8, u64::from(k)),
+        Purpose::Odometry => (10, 0),
+        Purpose::Landmarks => (11, 0),
         Purpose::Prediction(_, frame) => (9, u64::from(frame)),
     };
     let seed = match purpose {

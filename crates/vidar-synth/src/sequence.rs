@@ -10,12 +10,13 @@ use crate::png_file;
 use crate::render::{RayTable, expose};
 use crate::rig;
 use crate::scan::{Scan, Witness, scan_observed_surface};
+use crate::simulation::{CONFIG_FILE, FLIGHT_FILE, flight_list};
 use crate::world::World;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
-use vidar_core::{CameraModel, Se3, Timestamp, Trajectory};
+use vidar_core::{BodyFrame, CameraModel, Se3, Timestamp, Trajectory};
 
 /// What was written.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -37,7 +38,8 @@ pub struct SynthSummary {
 /// Told how many frames of how many are done; `false` stops the work. Called from several threads.
 pub type Progress<'a> = dyn Fn(usize, usize) -> bool + Sync + 'a;
 
-/// Writes the sequence that `config` describes to `out/mav0` and the configuration to `out/synth.toml`.
+/// Writes the sequence that `config` describes to `out/mav0`, the configuration to `out/synth.toml` and a given flight
+/// to `out/flight.csv`; [`crate::Simulation::open`] brings all of it back.
 ///
 /// `flight` takes the place of the built-in flight; the world is built around it. Everything is first written to a
 /// hidden folder inside `out` and then renamed, so that after an error or a cancellation nothing is left.
@@ -69,7 +71,7 @@ pub fn write_sequence(
     writer.write_camera_texts(&times)?;
     let imu_samples = writer.write_inertial()?;
     let scan_points = writer.write_scan(&witnesses)?;
-    writer.write_config(&staging.folder, flight.is_some())?;
+    writer.write_config(&staging.folder, flight)?;
     if !progress(times.len(), times.len()) {
         return Err(SynthError::Cancelled);
     }
@@ -213,18 +215,24 @@ impl Writer<'_> {
         Ok(points.len())
     }
 
-    fn write_config(&self, folder: &Path, flown_trajectory: bool) -> Result<(), SynthError> {
+    fn write_config(&self, folder: &Path, flown: Option<&Trajectory>) -> Result<(), SynthError> {
         layout::write_text(
             &self.mav.join("body.yaml"),
             "%YAML:1.0\ncomment: simulated micro aerial vehicle\n",
         )?;
-        let flight = if flown_trajectory { "flown along a given trajectory" } else { "built-in flight" };
+        if let Some(flown) = flown {
+            // Told of the body, so that the sequence can be simulated again without knowing whose it was.
+            let flown =
+                flown.in_frame(BodyFrame::Imu, &rig::euroc_rig(self.config.width, self.config.height)?)?;
+            layout::write_text(&folder.join(FLIGHT_FILE), &flight_list(&flown))?;
+        }
+        let flight = if flown.is_some() { "flown along flight.csv" } else { "built-in flight" };
         let text = format!(
             "# vidar-synth {}, {flight}\n{}",
             env!("CARGO_PKG_VERSION"),
             toml::to_string(self.config)?
         );
-        layout::write_text(&folder.join("synth.toml"), &text)
+        layout::write_text(&folder.join(CONFIG_FILE), &text)
     }
 }
 
@@ -255,9 +263,11 @@ impl Staging {
 
     /// Moves what was written to its place; `mav0` last, so that where it stands everything stands.
     fn publish(mut self) -> Result<(), SynthError> {
-        for name in ["synth.toml", "mav0"] {
-            let goal = self.out.join(name);
-            std::fs::rename(self.folder.join(name), &goal).map_err(SynthError::write(&goal))?;
+        for name in [FLIGHT_FILE, CONFIG_FILE, "mav0"] {
+            let (made, goal) = (self.folder.join(name), self.out.join(name));
+            if name != FLIGHT_FILE || made.exists() {
+                std::fs::rename(made, &goal).map_err(SynthError::write(&goal))?;
+            }
         }
         self.made = None;
         Ok(())

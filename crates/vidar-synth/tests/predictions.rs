@@ -1,0 +1,194 @@
+//! A written sequence is simulated again, and a network that sees it stands behind the trait of all models.
+
+use nalgebra::Vector3;
+use std::sync::Arc;
+use vidar_core::model::ChunkFrame;
+use vidar_core::{
+    BodyFrame, ChunkId, ChunkView, ChunkViews, FrameId, FrameImage, GeometryModel, Image, LieGroup,
+    ModelError, Pinhole, Se3, StampedPose, Timestamp, Trajectory, umeyama_sim3,
+};
+use vidar_synth::predict::{
+    Conditioning, PredictionErrors, SyntheticModel, TruePlace, chain_chunks, chunk_ranges, predict_chunk,
+    true_views,
+};
+use vidar_synth::{Simulation, SynthConfig, SynthError, write_sequence};
+
+fn tiny() -> SynthConfig {
+    SynthConfig {
+        width: 64,
+        height: 40,
+        duration_secs: 4.0,
+        camera_rate_hz: 5.0,
+        imu_rate_hz: 50.0,
+        blur_samples: 1,
+        clutter: 6,
+        scan_spacing_m: 0.2,
+        ..SynthConfig::default()
+    }
+}
+
+fn given_flight() -> Trajectory {
+    let pose = |k: i64| {
+        let t = 0.05 * k as f64;
+        let rotation = vidar_core::So3::from_axis_angle(&Vector3::new(0.1, 0.2, 1.0), 0.1 * t);
+        let position = Vector3::new(0.5 * t + 0.123_456_789_012_345, t.sin(), 1.5);
+        StampedPose {
+            time: Timestamp::from_nanos(k * 50_000_000),
+            world_from_body: Se3::new(rotation, position),
+        }
+    };
+    Trajectory::new(BodyFrame::Imu, (0..100).map(pose).collect()).unwrap()
+}
+
+#[test]
+fn a_written_sequence_is_simulated_again_exactly() {
+    let flown = given_flight();
+    for flight in [None, Some(&flown)] {
+        let folder = tempfile::tempdir().unwrap();
+        let out = folder.path().join("sequence");
+        write_sequence(&out, &tiny(), flight, &|_, _| true).unwrap();
+        assert_eq!(out.join("flight.csv").exists(), flight.is_some());
+        let again = Simulation::open(&out).unwrap();
+        let before = Simulation::new(&tiny(), flight).unwrap();
+        for k in 0..15 {
+            let time = again.frame_time(k);
+            let (a, b) = (again.world_from_camera(time).unwrap(), before.world_from_camera(time).unwrap());
+            assert!((a.matrix() - b.matrix()).amax() < 1e-12);
+            let ray = |s: &Simulation, p: &Se3| {
+                s.world().cast(&p.translation, &p.rotation.act(&Vector3::z())).unwrap().t
+            };
+            assert!((ray(&again, &a) - ray(&before, &b)).abs() < 1e-9);
+        }
+        assert!(again.world_from_camera(Timestamp::from_nanos(0)).is_none());
+        assert!(again.world_from_camera(again.frame_time(1000)).is_none());
+    }
+}
+
+#[test]
+fn what_is_no_sequence_is_refused_with_its_place() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = |name: &str| folder.path().join(name);
+    assert!(matches!(Simulation::open(folder.path()), Err(SynthError::Read { .. })));
+    std::fs::write(path("synth.toml"), "seed = \"one\"").unwrap();
+    assert!(matches!(Simulation::open(folder.path()), Err(SynthError::BadSequence { .. })));
+    std::fs::write(path("synth.toml"), "seed = 1").unwrap();
+    for bad in [
+        "1,2,3",
+        "1,0,0,0,0,0,0,0",
+        "x,0,0,0,0,0,0,1",
+        "1,0,0,0,0,0,0,1\n1,0,0,0,0,0,0,1",
+        "1,0,0,nan,0,0,0,1",
+    ] {
+        std::fs::write(path("flight.csv"), bad).unwrap();
+        match Simulation::open(folder.path()).err() {
+            Some(SynthError::BadSequence { .. } | SynthError::BadTrajectory { .. }) => {}
+            other => panic!("{bad:?}: {other:?}"),
+        }
+    }
+}
+
+fn chunk(simulation: &Simulation, posed: bool) -> ChunkViews {
+    let intrinsics = Pinhole::new(300.0, 300.0, 375.5, 239.5, 752, 480).unwrap();
+    let view = |k: usize| {
+        let time = simulation.frame_time(k);
+        ChunkView {
+            frame_id: FrameId(k as u32),
+            time,
+            image: FrameImage::Gray8(Image::filled(752, 480, 0)),
+            intrinsics,
+            world_from_camera: posed.then(|| simulation.world_from_camera(time).unwrap()),
+        }
+    };
+    ChunkViews { id: ChunkId(2), views: (0..12).map(view).collect() }
+}
+
+#[test]
+fn a_simulated_network_predicts_what_it_is_shown() {
+    let simulation = Arc::new(Simulation::new(&tiny(), None).unwrap());
+    let model = |errors: &PredictionErrors, conditioning| {
+        SyntheticModel::new(Arc::clone(&simulation), errors.clone(), conditioning, 84, 3).unwrap()
+    };
+    let exact =
+        model(&PredictionErrors::NONE, Conditioning::PoseFree).predict(&chunk(&simulation, false)).unwrap();
+    assert_eq!((exact.frame, exact.views.len()), (ChunkFrame::ModelNative, 12));
+    // 480 · 84/752 = 53.6: four patches of 14.
+    assert_eq!((exact.views[0].intrinsics.width, exact.views[0].intrinsics.height), (84, 56));
+    for (k, view) in exact.views.iter().enumerate() {
+        let truth = simulation.world_from_camera(simulation.frame_time(k)).unwrap();
+        assert!((view.chunk_from_camera.matrix() - truth.matrix()).amax() < 1e-12);
+        let direction = truth.rotation.act(&view.intrinsics.ray(40.0, 30.0));
+        let hit = simulation.world().cast(&truth.translation, &direction).unwrap();
+        assert_eq!(view.depth.image()[(40, 30)], hit.t as f32);
+    }
+    let mut posed = model(&PredictionErrors::default(), Conditioning::PosesInjected);
+    assert!(posed.info().needs_poses);
+    assert_eq!(posed.predict(&chunk(&simulation, true)).unwrap().frame, ChunkFrame::PriorWorld);
+    let lost = posed.predict(&chunk(&simulation, false)).unwrap_err();
+    assert!(matches!(lost, ModelError::MissingPose { frame: FrameId(0) }), "{lost}");
+    let wanted = posed.predict_wanted(&chunk(&simulation, true), 3..5, &|| false).unwrap();
+    assert_eq!(wanted.views.iter().map(|v| v.frame_id.0).collect::<Vec<_>>(), [3, 4]);
+    let mut late = chunk(&simulation, true);
+    late.views[4].time = simulation.frame_time(10_000);
+    assert!(matches!(posed.predict(&late).unwrap_err(), ModelError::BadView { frame: FrameId(4), .. }));
+    let none = posed.predict(&ChunkViews { id: ChunkId(0), views: Vec::new() }).unwrap_err();
+    assert!(matches!(none, ModelError::TooFewViews { .. }));
+}
+
+#[test]
+fn chunks_are_cut_by_the_references_rule() {
+    let cut = |n, size, overlap| chunk_ranges(n, size, overlap).unwrap();
+    assert_eq!(cut(10, 30, 10), [0..10]);
+    assert_eq!(cut(30, 30, 10), [0..30]);
+    assert_eq!(cut(31, 30, 10), [0..30, 20..31]);
+    assert_eq!(cut(50, 30, 10), [0..30, 20..50]);
+    assert_eq!(cut(7, 3, 0), [0..3, 3..6, 6..7]);
+    assert!(cut(0, 3, 0).is_empty());
+    assert!(chunk_ranges(9, 3, 3).is_err() && chunk_ranges(9, 0, 0).is_err());
+}
+
+#[test]
+fn a_chain_of_chunks_is_one_reconstruction_up_to_scale_and_drifts() {
+    let simulation = Simulation::new(&tiny(), None).unwrap();
+    let place = |k: usize| {
+        let time = simulation.frame_time(k);
+        let world_from_camera = simulation.world_from_camera(time).unwrap();
+        TruePlace { frame_id: FrameId(k as u32), time, world_from_camera }
+    };
+    let intrinsics = Pinhole::new(45.0, 45.0, 41.5, 27.5, 84, 56).unwrap();
+    let truth = true_views(simulation.world(), &(0..20).map(place).collect::<Vec<_>>(), &intrinsics);
+    let chained = |errors: &PredictionErrors| {
+        let chunks: Vec<_> = chunk_ranges(20, 8, 4)
+            .unwrap()
+            .into_iter()
+            .enumerate()
+            .map(|(k, range)| predict_chunk(ChunkId(k as u32), &truth[range], None, errors, 5).unwrap())
+            .collect();
+        chain_chunks(&chunks).unwrap()
+    };
+    let misfit = |views: &[vidar_core::ViewGeometry]| {
+        let (a, b): (Vec<_>, Vec<_>) = views
+            .iter()
+            .zip(&truth)
+            .map(|(v, t)| (v.chunk_from_camera.translation, t.world_from_camera.translation))
+            .unzip();
+        let fit = umeyama_sim3(&a, &b).unwrap();
+        (a.iter().zip(&b).map(|(a, b)| (fit.act(a) - b).norm_squared()).sum::<f64>() / 20.0).sqrt()
+    };
+    let gauges = PredictionErrors {
+        gauge_scale_sigma: 0.3,
+        gauge_rotation_deg: 50.0,
+        gauge_shift_m: 2.0,
+        ..PredictionErrors::NONE
+    };
+    let clean = chained(&gauges);
+    assert_eq!(clean.iter().map(|v| v.frame_id.0).collect::<Vec<_>>(), (0..20).collect::<Vec<_>>());
+    assert!(misfit(&clean) < 1e-5, "{}", misfit(&clean));
+    let real = misfit(&chained(&PredictionErrors::default()));
+    assert!((0.002..0.2).contains(&real), "{real} m");
+    let apart = [
+        predict_chunk(ChunkId(0), &truth[..4], None, &gauges, 5).unwrap(),
+        predict_chunk(ChunkId(1), &truth[4..8], None, &gauges, 5).unwrap(),
+    ];
+    let refused = chain_chunks(&apart).unwrap_err();
+    assert!(refused.to_string().starts_with("chunks 0 and 1 cannot be joined"), "{refused}");
+}
