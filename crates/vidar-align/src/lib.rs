@@ -6,8 +6,19 @@
 //! (section III-D): `S_vio = Umeyama({c_i^pred}, {c_i^VIO})`, `M ← S_vio(M)`, with its guard that a rank-deficient
 //! fit changes nothing (section III-F).
 
+//!
+//! [`aligner::Aligner`] does the same for a whole run, chunk by chunk, in all modes: the reference's chain, the paper's
+//! couplings, and the coupled graph that is VIDAR's own.
+
+pub mod aligner;
 pub mod coupled;
+pub mod depth_field;
+pub mod landmark_scale;
+pub mod overlap;
 mod place;
 pub mod streaming;
 
+pub use aligner::{
+    Aligner, AlignerConfig, ChunkObservation, CouplingMode, FrameObservation, MetricAnchor, Placement,
+};
 pub use place::{AlignConfig, AlignError, Anchor, ChunkAlignment, Verdict, aligned_views, place_chunk};

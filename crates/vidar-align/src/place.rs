@@ -55,12 +55,18 @@ pub enum Verdict {
     RankDeficient,
     /// The fit exists but leaves the anchors further off than the configuration allows.
     Inconsistent,
+    /// The chunk stands where its neighbours put it; its own cameras have no anchor, or one that is not believed.
+    Chained,
+    /// The prediction contradicts its neighbour and its anchors, or holds no number: left out.
+    Garbage,
+    /// Neither anchor nor neighbour says where it is: left out.
+    Unplaced,
 }
 
 impl Verdict {
     /// Whether the chunk may enter the map.
     pub fn is_usable(self) -> bool {
-        matches!(self, Self::PriorWorld | Self::Fitted)
+        matches!(self, Self::PriorWorld | Self::Fitted | Self::Chained)
     }
 }
 
@@ -90,6 +96,24 @@ pub enum AlignError {
         key: &'static str,
         /// The value.
         found: f64,
+    },
+    /// A configuration value is outside of its range.
+    #[error("align.{key} must be between {least} and {most}, found {found}")]
+    OutOfRange {
+        /// Which key.
+        key: &'static str,
+        /// The value.
+        found: f64,
+        /// Smallest value allowed.
+        least: f64,
+        /// Largest value allowed.
+        most: f64,
+    },
+    /// A chunk was pushed twice.
+    #[error("chunk {chunk} was given before")]
+    RepeatedChunk {
+        /// Which chunk.
+        chunk: ChunkId,
     },
     /// No camera of the chunk has an anchor.
     #[error("chunk {chunk}: none of its {views} views has a metric pose")]

@@ -10,7 +10,7 @@ use serde::{Deserialize, Serialize};
 use vidar_core::{Sim3, So3};
 
 /// What is estimated between two chunks.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, schemars::JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum AlignMethod {
     /// Rotation, translation and scale from the points.

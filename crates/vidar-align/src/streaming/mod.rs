@@ -34,7 +34,9 @@ pub use unproject::unproject;
 use thiserror::Error;
 
 /// Whether to follow the reference where it errs.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
+#[derive(
+    Clone, Copy, Debug, Default, PartialEq, Eq, serde::Serialize, serde::Deserialize, schemars::JsonSchema,
+)]
 #[serde(rename_all = "kebab-case")]
 pub enum Compat {
     /// What the reference meant.

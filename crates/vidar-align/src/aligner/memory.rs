@@ -1,0 +1,158 @@
+//! What the machine keeps of chunks and frames.
+
+use super::AlignerConfig;
+use super::anchored::Pair;
+use super::observation::MetricAnchor;
+use super::report::Guard;
+use crate::Verdict;
+use crate::depth_field::DepthField;
+use crate::landmark_scale::LogScale;
+use crate::overlap::{OverlapFit, SampledView};
+use std::collections::BTreeMap;
+use vidar_core::model::ChunkFrame;
+use vidar_core::{ChunkId, FrameId, GeometryPrediction, Se3, Sim3, Timestamp};
+
+/// A view of a chunk.
+#[derive(Clone, Debug)]
+pub(super) struct View {
+    pub frame_id: FrameId,
+    pub chunk_from_camera: Se3,
+    /// Middle depth, chunk units.
+    pub median_depth: f64,
+    /// A few hundred depths, for loops and for frames that come back.
+    pub thin: SampledView,
+    pub field: Option<DepthField>,
+}
+
+/// A chunk after its dense geometry is gone.
+#[derive(Clone, Debug)]
+pub(super) struct Chunk {
+    pub id: ChunkId,
+    pub frame: ChunkFrame,
+    pub views: Vec<View>,
+    pub verdict: Verdict,
+    /// The tie to the last usable chunk before, by its index.
+    pub tie: Option<Tie>,
+    /// Further ties to older chunks that hold some of the same frames.
+    pub revisits: Vec<Tie>,
+    /// ln(metres per unit) as landmarks tell it.
+    pub landmark_scale: Option<LogScale>,
+    pub guards: Vec<Guard>,
+    /// Where anchors and overlap put it when it came.
+    pub first_guess: Option<Sim3>,
+    pub log_scale_std: f64,
+    /// Whether the odometry is believed within it.
+    pub odometry_trusted: bool,
+}
+
+/// `earlier_from_this` of an overlap.
+#[derive(Clone, Debug)]
+pub(super) struct Tie {
+    pub to: usize,
+    pub frames: usize,
+    pub fit: OverlapFit,
+}
+
+/// A frame as it goes through the run.
+#[derive(Clone, Debug)]
+pub(super) struct Keyframe {
+    pub frame_id: FrameId,
+    pub time: Timestamp,
+    pub anchor: Option<MetricAnchor>,
+}
+
+/// Frames in the order of time.
+#[derive(Clone, Debug, Default)]
+pub(super) struct Frames {
+    by_id: BTreeMap<FrameId, Keyframe>,
+}
+
+impl Frames {
+    /// Takes what is new; what came later is the last word of the odometry.
+    pub fn learn(&mut self, frame_id: FrameId, time: Timestamp, anchor: Option<MetricAnchor>) {
+        let finite = anchor.filter(|a| a.world_from_camera.is_finite());
+        let known = self.by_id.entry(frame_id).or_insert(Keyframe { frame_id, time, anchor: None });
+        known.time = time;
+        if finite.is_some() {
+            known.anchor = finite;
+        }
+    }
+
+    pub fn get(&self, frame: FrameId) -> Option<&Keyframe> {
+        self.by_id.get(&frame)
+    }
+
+    pub fn iter(&self) -> impl Iterator<Item = &Keyframe> {
+        self.by_id.values()
+    }
+
+    pub fn len(&self) -> usize {
+        self.by_id.len()
+    }
+
+    /// The metric anchor of a frame, if it may be believed.
+    pub fn anchor(&self, frame: FrameId) -> Option<&MetricAnchor> {
+        self.by_id.get(&frame)?.anchor.as_ref().filter(|a| a.is_trusted)
+    }
+}
+
+impl Chunk {
+    /// Cameras that have anchors, as both have them.
+    pub fn pairs(&self, frames: &Frames) -> Vec<Pair> {
+        self.views
+            .iter()
+            .filter_map(|v| {
+                let anchor = frames.anchor(v.frame_id)?;
+                Some(Pair {
+                    chunk_from_camera: v.chunk_from_camera,
+                    world_from_camera: anchor.world_from_camera,
+                })
+            })
+            .collect()
+    }
+
+    /// Middle of the views' middle depths, chunk units; 1 without views.
+    pub fn median_depth(&self) -> f64 {
+        let mut depths: Vec<f64> = self.views.iter().map(|v| v.median_depth).collect();
+        let middle = depths.len() / 2;
+        if depths.is_empty() { 1.0 } else { *depths.select_nth_unstable_by(middle, f64::total_cmp).1 }
+    }
+
+    pub fn view(&self, frame: FrameId) -> Option<&View> {
+        self.views.iter().find(|v| v.frame_id == frame)
+    }
+
+    pub fn is_usable(&self) -> bool {
+        self.verdict.is_usable()
+    }
+}
+
+/// The views of a prediction that can be used, sampled; how many could not.
+pub(super) fn sampled_views(
+    prediction: &GeometryPrediction,
+    config: &AlignerConfig,
+) -> (Vec<View>, Vec<SampledView>, usize) {
+    let mut views: Vec<View> = Vec::with_capacity(prediction.views.len());
+    let mut dense: Vec<SampledView> = Vec::with_capacity(prediction.views.len());
+    for view in &prediction.views {
+        let sampled = SampledView::new(view, config.overlap.samples_per_view);
+        let Some(median_depth) = sampled.median_depth() else { continue };
+        // A frame given twice in one chunk is one view.
+        if views.iter().any(|v| v.frame_id == view.frame_id) {
+            continue;
+        }
+        views.push(View {
+            frame_id: view.frame_id,
+            chunk_from_camera: view.chunk_from_camera,
+            median_depth,
+            thin: SampledView::new(view, THIN_SAMPLES),
+            field: None,
+        });
+        dense.push(sampled);
+    }
+    let dropped = prediction.views.len() - views.len();
+    (views, dense, dropped)
+}
+
+/// Depths kept of every view of every chunk: 4 kB.
+pub(super) const THIN_SAMPLES: usize = 512;

@@ -1,0 +1,349 @@
+//! The machine that a run drives chunk by chunk: predictions in, one world out.
+//!
+//! ```text
+//!              ┌─ tie to the chunk before (frames both hold)      ┌─ da3-streaming, pose-free: chain, loops, Sim(3) graph
+//! push(chunk) ─┼─ fit to its anchors (centres, rotations)   ──▶  ─┼─ hybrid: the chain, then one similarity onto the anchors
+//!              ├─ scale from landmarks                            ├─ pose-conditioned, ground-truth: anchors, scale per chunk
+//!              └─ descriptors ─▶ loop_candidates ─▶ push_loop     └─ coupled: one graph of all of it
+//!                                                            placement_so_far / finish ─▶ Placement
+//! ```
+//!
+//! It owns no thread, file or clock. Of a chunk it keeps poses, a few hundred depths per view and what was measured; of
+//! the chunk before also some thousand depths per view (with [`Compat::Reference`](crate::streaming::Compat) its views
+//! in full). What is wrong with a chunk is no error: the chunk is left out or held by its neighbours, the guard that acted
+//! is counted, and [`Placement::guards`] tells. Same input, same bits.
+
+mod anchored;
+mod chain;
+mod config;
+mod memory;
+mod observation;
+mod report;
+mod tie;
+mod world;
+
+pub use config::{AlignerConfig, CouplingMode, GraphWeights, LoopsConfig};
+pub use observation::{ChunkObservation, FrameObservation, MetricAnchor, covariance_in_camera};
+pub use report::{
+    ChunkPlacement, ChunkReport, DriftReport, GraphReport, Guard, GuardCounts, KeyframePlacement,
+    LoopRefusal, LoopReport, OverlapReport, Placement, ViewPlacement,
+};
+
+use crate::overlap::SampledView;
+use crate::streaming::Compat;
+use crate::{AlignError, Verdict};
+use anchored::{Pair, PoseFit, center_rms, fit_about_rotations, robust_umeyama};
+use memory::{Chunk, Frames, Tie, sampled_views};
+use vidar_core::model::ChunkFrame;
+use vidar_core::{GeometryPrediction, LieGroup, Sim3, ViewGeometry};
+
+/// The machine.
+#[derive(Debug)]
+pub struct Aligner {
+    mode: CouplingMode,
+    config: AlignerConfig,
+    frames: Frames,
+    chunks: Vec<Chunk>,
+    previous: Previous,
+    loops: Vec<LoopReport>,
+}
+
+/// Geometry of the last usable chunk.
+#[derive(Debug, Default)]
+struct Previous {
+    chunk: usize,
+    sampled: Vec<SampledView>,
+    /// Only when the reference is followed number for number.
+    full: Vec<ViewGeometry>,
+}
+
+/// Rotations of a chunk this far (rad, RMS) from their anchors' say that one of the two is wrong.
+const GROSS_ROTATION_RAD: f64 = 0.14;
+/// Centres this far from their anchors, as a share of the chunk's own radius, say the same.
+const GROSS_CENTERS: f64 = 0.2;
+/// Below this (m) distances of centres say nothing.
+const SMALL_CENTERS_M: f64 = 0.08;
+
+impl Aligner {
+    /// A machine that has seen nothing.
+    ///
+    /// # Errors
+    /// What [`AlignerConfig::validate`] says.
+    pub fn new(mode: CouplingMode, config: &AlignerConfig) -> Result<Self, AlignError> {
+        config.validate()?;
+        Ok(Self {
+            mode,
+            config: config.clone(),
+            frames: Frames::default(),
+            chunks: Vec::new(),
+            previous: Previous::default(),
+            loops: Vec::new(),
+        })
+    }
+
+    /// How prediction and odometry are coupled.
+    pub fn mode(&self) -> CouplingMode {
+        self.mode
+    }
+
+    /// Takes the next chunk.
+    ///
+    /// # Errors
+    /// [`AlignError::RepeatedChunk`]. A chunk that is no good is no error: its report says so.
+    pub fn push(&mut self, observation: ChunkObservation) -> Result<ChunkReport, AlignError> {
+        let ChunkObservation { prediction, frames } = observation;
+        if self.chunks.iter().any(|c| c.id == prediction.chunk_id) {
+            return Err(AlignError::RepeatedChunk { chunk: prediction.chunk_id });
+        }
+        for frame in &frames {
+            self.frames.learn(frame.frame_id, frame.time, frame.anchor.clone());
+        }
+        let (views, sampled, dropped) = sampled_views(&prediction, &self.config);
+        let mut guards = vec![Guard::ViewNotFinite; dropped];
+        let tie = self.tie(&sampled, &prediction, &mut guards);
+        let mut chunk = Chunk {
+            id: prediction.chunk_id,
+            frame: prediction.frame,
+            views,
+            verdict: Verdict::Chained,
+            tie,
+            revisits: Vec::new(),
+            landmark_scale: None,
+            guards,
+            first_guess: None,
+            log_scale_std: f64::INFINITY,
+            odometry_trusted: true,
+        };
+        let pairs = chunk.pairs(&self.frames);
+        self.judge(&mut chunk, &pairs);
+        let report = self.report(&chunk, &pairs);
+        if chunk.is_usable() {
+            let full = if self.config.compat == Compat::Reference { prediction.views } else { Vec::new() };
+            self.previous = Previous { chunk: self.chunks.len(), sampled, full };
+        }
+        self.chunks.push(chunk);
+        Ok(report)
+    }
+
+    /// Accepted loops as (later, earlier, `earlier_from_later`), chunks by index.
+    fn accepted_loops(&self) -> Vec<(usize, usize, Sim3)> {
+        let index = |id| self.chunks.iter().position(|c| c.id == id);
+        self.loops
+            .iter()
+            .filter(|l| l.refusal.is_none())
+            .filter_map(|l| Some((index(l.later)?, index(l.earlier)?, l.earlier_from_later?)))
+            .collect()
+    }
+
+    /// Where everything stands with what is known now.
+    pub fn placement_so_far(&self) -> Placement {
+        world::place(self)
+    }
+
+    /// The last word.
+    pub fn finish(self) -> Placement {
+        world::place(&self)
+    }
+
+    /// Bytes held, without allocator overhead.
+    pub fn memory_bytes(&self) -> usize {
+        let thin: usize = self.chunks.iter().flat_map(|c| &c.views).map(|v| v.thin.bytes()).sum();
+        let dense: usize = self.previous.sampled.iter().map(SampledView::bytes).sum();
+        let full: usize = self.previous.full.iter().map(|v| v.depth.image().data().len() * 8).sum();
+        thin + dense + full + self.frames.len() * size_of::<memory::Keyframe>()
+    }
+
+    /// The tie to the last usable chunk, if both hold frames and the two agree.
+    fn tie(
+        &self,
+        sampled: &[SampledView],
+        prediction: &GeometryPrediction,
+        guards: &mut Vec<Guard>,
+    ) -> Option<Tie> {
+        if self.chunks.is_empty() {
+            return None;
+        }
+        let views = tie::shared(self.previous.sampled.iter(), sampled.iter());
+        if views.is_empty() {
+            guards.push(Guard::NoOverlap);
+            return None;
+        }
+        let verbatim = self.config.compat == Compat::Reference && self.mode == CouplingMode::Da3Streaming;
+        let fit = if verbatim {
+            let earlier = &self.previous.full;
+            let both: Vec<(&ViewGeometry, &ViewGeometry)> = prediction
+                .views
+                .iter()
+                .filter_map(|l| earlier.iter().find(|e| e.frame_id == l.frame_id).map(|e| (e, l)))
+                .collect();
+            tie::verbatim(&both, &self.config)
+        } else if matches!(self.mode, CouplingMode::Coupled) {
+            tie::robust(&views, &self.config)
+        } else {
+            tie::reference(&views, &self.config)
+        };
+        // The reference takes every fit for true.
+        let believed = |fit: &crate::overlap::OverlapFit| {
+            verbatim || fit.inlier_ratio >= self.config.overlap.min_inlier_ratio
+        };
+        match fit {
+            Some(fit) if believed(&fit) => Some(Tie { to: self.previous.chunk, frames: views.len(), fit }),
+            _ => {
+                guards.push(Guard::NoOverlap);
+                None
+            }
+        }
+    }
+
+    /// Decides how a chunk stands and where it goes first.
+    fn judge(&self, chunk: &mut Chunk, pairs: &[Pair]) {
+        if chunk.views.is_empty() {
+            chunk.verdict = Verdict::Garbage;
+            chunk.guards.push(Guard::GarbageChunk);
+            return;
+        }
+        match self.mode {
+            CouplingMode::Da3Streaming | CouplingMode::PoseFree => self.judge_unanchored(chunk),
+            CouplingMode::PoseConditioned | CouplingMode::GroundTruth => self.judge_conditioned(chunk, pairs),
+            CouplingMode::Hybrid => self.judge_unanchored(chunk),
+            CouplingMode::Coupled => self.judge_coupled(chunk, pairs),
+        }
+    }
+
+    /// Without anchors only the neighbour can vouch for a chunk. The first one vouches for itself.
+    fn judge_unanchored(&self, chunk: &mut Chunk) {
+        let disagrees = chunk.tie.is_none() && self.shares_frames(chunk);
+        chunk.verdict = if disagrees { Verdict::Garbage } else { Verdict::Chained };
+        if disagrees {
+            chunk.guards.push(Guard::GarbageChunk);
+        }
+        chunk.first_guess = match &chunk.tie {
+            Some(tie) => self.chunks[tie.to].first_guess.map(|g| g * tie.fit.target_from_source),
+            None if self.chunks.iter().any(Chunk::is_usable) => None,
+            None => Some(Sim3::IDENTITY),
+        };
+    }
+
+    fn shares_frames(&self, chunk: &Chunk) -> bool {
+        chunk.views.iter().any(|v| self.previous.sampled.iter().any(|s| s.frame_id == v.frame_id))
+    }
+
+    /// The paper's pose-conditioned coupling: `D ← D / s*`, guards.
+    fn judge_conditioned(&self, chunk: &mut Chunk, pairs: &[Pair]) {
+        if pairs.is_empty() {
+            chunk.verdict = Verdict::Unplaced;
+            return;
+        }
+        let fitted = match chunk.frame {
+            ChunkFrame::PriorWorld => Ok((Sim3::IDENTITY, Verdict::PriorWorld)),
+            ChunkFrame::ModelNative => {
+                robust_umeyama(pairs, u64::from(chunk.id.0)).map(|s| (s, Verdict::Fitted))
+            }
+        };
+        let (mut place, verdict) = fitted.unwrap_or((Sim3::IDENTITY, Verdict::RankDeficient));
+        chunk.verdict = verdict;
+        if verdict == Verdict::RankDeficient {
+            chunk.guards.push(Guard::RankDeficient);
+        }
+        if let Some(guarded) = self.clamped_scale(chunk, &place) {
+            place = rescaled_about_centers(&place, guarded, pairs);
+            chunk.guards.push(Guard::ScaleOutOfRange);
+        }
+        if verdict.is_usable() && center_rms(&place, pairs) > self.config.max_center_rms_m {
+            chunk.verdict = Verdict::Inconsistent;
+        }
+        chunk.log_scale_std =
+            self.pose_fit(chunk, pairs, place.scale).map_or(f64::INFINITY, |f| f.log_scale_std);
+        chunk.first_guess = Some(place);
+    }
+
+    /// The scale that makes the step from the chunk before equal to what their overlap says, where the fitted one leaves
+    /// [0.85, 1.20] of it: between metric chunks the ratio is 1 (the paper's clamp).
+    fn clamped_scale(&self, chunk: &Chunk, place: &Sim3) -> Option<f64> {
+        let tie = chunk.tie.as_ref()?;
+        let before = self.chunks[tie.to].first_guess.filter(|_| chunk.verdict.is_usable())?;
+        let expected = before.scale * tie.fit.target_from_source.scale;
+        let ratio = place.scale / expected;
+        let [low, high] = self.config.scale_range;
+        (!(ratio >= low && ratio <= high)).then_some(expected)
+    }
+
+    fn pose_fit(&self, chunk: &Chunk, pairs: &[Pair], scale_hint: f64) -> Option<PoseFit> {
+        let floor = self.config.graph.attachment_depth_ratio * chunk.median_depth() * scale_hint;
+        fit_about_rotations(pairs, scale_hint, floor)
+    }
+
+    /// Anchors, neighbour and landmarks vouch for a chunk; one that contradicts all is left out.
+    fn judge_coupled(&self, chunk: &mut Chunk, pairs: &[Pair]) {
+        let before = chunk
+            .tie
+            .as_ref()
+            .and_then(|t| self.chunks[t.to].first_guess.map(|g| g * t.fit.target_from_source));
+        let hint = before.map_or(1.0, |b| b.scale);
+        let fit = match chunk.frame {
+            ChunkFrame::PriorWorld => self.pose_fit(chunk, pairs, 1.0),
+            ChunkFrame::ModelNative => self.pose_fit(chunk, pairs, hint),
+        };
+        let Some(fit) = fit else {
+            self.judge_unanchored(chunk);
+            return;
+        };
+        chunk.log_scale_std = fit.log_scale_std;
+        let gross = is_gross(&fit, pairs.len(), self.config.max_center_rms_m);
+        (chunk.verdict, chunk.first_guess) = match (gross, before) {
+            (false, _) => (Verdict::Fitted, Some(fit.world_from_chunk)),
+            (true, Some(chained)) => {
+                chunk.guards.push(Guard::OdometryDistrusted);
+                chunk.odometry_trusted = false;
+                (Verdict::Chained, Some(chained))
+            }
+            (true, None) => {
+                chunk.guards.push(Guard::GarbageChunk);
+                (Verdict::Garbage, None)
+            }
+        };
+        if chunk.frame == ChunkFrame::PriorWorld && chunk.verdict == Verdict::Fitted {
+            chunk.verdict = Verdict::PriorWorld;
+        }
+    }
+
+    fn report(&self, chunk: &Chunk, pairs: &[Pair]) -> ChunkReport {
+        let overlap = chunk.tie.as_ref().map(|t| OverlapReport {
+            with: self.chunks[t.to].id,
+            frames: t.frames,
+            earlier_from_later: t.fit.target_from_source,
+            pairs: t.fit.pairs,
+            inlier_ratio: t.fit.inlier_ratio,
+            median_residual: t.fit.median_residual,
+            log_scale_std: t.fit.log_scale_std(),
+        });
+        ChunkReport {
+            chunk_id: chunk.id,
+            verdict: chunk.verdict,
+            world_from_chunk: chunk.first_guess,
+            matched: pairs.len(),
+            center_rms_m: chunk.first_guess.map_or(f64::NAN, |g| center_rms(&g, pairs)),
+            overlap,
+            log_scale_std: chunk.log_scale_std,
+            guards: chunk.guards.clone(),
+        }
+    }
+}
+
+/// Whether a chunk's cameras and their anchors cannot both be right.
+fn is_gross(fit: &PoseFit, pairs: usize, max_center_rms_m: f64) -> bool {
+    if pairs < 3 {
+        return false;
+    }
+    let limit = (GROSS_CENTERS * fit.radius_m).max(SMALL_CENTERS_M).min(max_center_rms_m);
+    fit.rotation_rms_rad > GROSS_ROTATION_RAD || fit.center_rms_m > limit
+}
+
+/// The same place with another scale, the mean of the cameras kept.
+fn rescaled_about_centers(place: &Sim3, scale: f64, pairs: &[Pair]) -> Sim3 {
+    let n = pairs.len().max(1) as f64;
+    let mean = pairs.iter().map(|p| p.chunk_from_camera.translation).sum::<nalgebra::Vector3<f64>>() / n;
+    let kept = place.act(&mean);
+    let moved = Sim3 { scale, ..*place };
+    Sim3 { translation: place.translation + kept - moved.act(&mean), ..moved }
+}

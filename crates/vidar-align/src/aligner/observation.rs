@@ -1,0 +1,97 @@
+//! What a run tells the machine of a chunk.
+
+use nalgebra::{Matrix6, UnitVector3};
+use vidar_core::{
+    FrameId, GeometryPrediction, LieGroup, OdometryKeyframe, PoseCovariance, Se3, SparseLandmark, Timestamp,
+};
+
+/// A chunk's prediction with what is known of its frames from elsewhere.
+#[derive(Clone, Debug)]
+pub struct ChunkObservation {
+    /// What the model said. Views that were seen in an earlier chunk, too, tie the two; they are told by their frame.
+    pub prediction: GeometryPrediction,
+    /// What else is known, one entry per frame; frames without geometry may have one (odometry goes on), frames
+    /// without an entry are placed through their chunk.
+    pub frames: Vec<FrameObservation>,
+}
+
+/// What is known of a frame besides its predicted geometry.
+#[derive(Clone, Debug)]
+pub struct FrameObservation {
+    /// Which frame.
+    pub frame_id: FrameId,
+    /// When it was taken.
+    pub time: Timestamp,
+    /// Its metric pose, if any.
+    pub anchor: Option<MetricAnchor>,
+    /// Points of known metric depth. `pixel` is at the depth image's size, distortion removed.
+    pub landmarks: Vec<SparseLandmark>,
+    /// Unit-length descriptor of the place, if revisits are sought. The same length for all frames of a run.
+    pub descriptor: Option<Vec<f32>>,
+}
+
+impl FrameObservation {
+    /// A frame of which only the time is known.
+    pub fn new(frame_id: FrameId, time: Timestamp) -> Self {
+        Self { frame_id, time, anchor: None, landmarks: Vec::new(), descriptor: None }
+    }
+
+    /// The same with a metric pose.
+    pub fn with_anchor(mut self, anchor: MetricAnchor) -> Self {
+        self.anchor = Some(anchor);
+        self
+    }
+}
+
+/// A metric pose from odometry, a given trajectory or ground truth.
+#[derive(Clone, Debug, PartialEq)]
+pub struct MetricAnchor {
+    /// The camera's pose, m. All anchors of a run share one world, z up, unless `segment` differs.
+    pub world_from_camera: Se3,
+    /// Covariance of δ in `previous_from_this · exp(δ)`, rotation then translation in this camera's axes, the previous one
+    /// being the anchored frame before; none: typical odometry.
+    pub relative_covariance: Option<PoseCovariance>,
+    /// The world's up in the camera, from an inertial sensor.
+    pub up_in_camera: Option<UnitVector3<f64>>,
+    /// Anchors of different segments share no world: nothing ties the two.
+    pub segment: u32,
+    /// Whether the source itself says that this is metric and backed by images. Others place nothing.
+    pub is_trusted: bool,
+}
+
+impl MetricAnchor {
+    /// A pose of which nothing else is known (a trajectory file, ground truth).
+    pub fn known(world_from_camera: Se3) -> Self {
+        Self {
+            world_from_camera,
+            relative_covariance: None,
+            up_in_camera: None,
+            segment: 0,
+            is_trusted: true,
+        }
+    }
+
+    /// What an odometry keyframe says of its camera. `body_from_camera` turns covariances, which are in the body's axes.
+    pub fn from_odometry(keyframe: &OdometryKeyframe, body_from_camera: &Se3) -> Self {
+        let world_from_camera = keyframe.world_from_camera;
+        let up_in_world = UnitVector3::try_new(-keyframe.gravity_in_world, 1e-9);
+        let camera_from_world = world_from_camera.rotation.inverse();
+        Self {
+            relative_covariance: keyframe
+                .previous
+                .map(|(_, covariance)| covariance_in_camera(&covariance, body_from_camera)),
+            up_in_camera: up_in_world
+                .map(|up| UnitVector3::new_normalize(camera_from_world.act(&up.into_inner()))),
+            segment: keyframe.segment,
+            is_trusted: keyframe.health.is_metric(),
+            world_from_camera,
+        }
+    }
+}
+
+/// The covariance of `b_from_a · exp(δ)` between cameras, from that between bodies:
+/// `exp(δ_camera) = camera_from_body · exp(δ_body) · body_from_camera`, so `δ_camera = Ad(camera_from_body) δ_body`.
+pub fn covariance_in_camera(in_body: &PoseCovariance, body_from_camera: &Se3) -> PoseCovariance {
+    let turn: Matrix6<f64> = body_from_camera.inverse().adjoint();
+    turn * in_body * turn.transpose()
+}
