@@ -24,7 +24,7 @@ pub fn chunk_ranges(frames: usize, size: usize, overlap: usize) -> Result<Vec<Ra
         });
     }
     if frames <= size {
-        return Ok(if frames == 0 { Vec::new() } else { vec![0..frames] });
+        return Ok(std::iter::once(0..frames).filter(|all| !all.is_empty()).collect());
     }
     let step = size - overlap;
     let chunks = (frames - overlap).div_ceil(step);
