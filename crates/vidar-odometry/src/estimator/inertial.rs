@@ -1,6 +1,6 @@
 //! Inertial factors: preintegrated motion between neighbouring frames, standstill, and the anchor of the first frame.
 
-use crate::imu::{Matrix15, NavState, Preintegration, Vector15, gravity, hat};
+use crate::imu::{Matrix15, NavState, Preintegration, Vector15, hat};
 use nalgebra::{Matrix3, SMatrix, Vector3};
 use serde::{Deserialize, Serialize};
 use vidar_core::{LieGroup, So3};
@@ -54,8 +54,9 @@ pub(crate) fn residual(readings: &Preintegration, i: &NavState, j: &NavState) ->
     let (from, to) = (&i.world_from_body, &j.world_from_body);
     let back = from.rotation.inverse();
     let turn = (rotation.inverse() * (back * to.rotation)).log();
-    let moved = back * (to.translation - from.translation - i.velocity * t - gravity() * (0.5 * t * t));
-    let sped = back * (j.velocity - i.velocity - gravity() * t);
+    let gravity = readings.model().gravity();
+    let moved = back * (to.translation - from.translation - i.velocity * t - gravity * (0.5 * t * t));
+    let sped = back * (j.velocity - i.velocity - gravity * t);
     let mut r = Vector15::zeros();
     r.fixed_rows_mut::<3>(0).copy_from(&turn);
     r.fixed_rows_mut::<3>(3).copy_from(&(moved - position));
@@ -77,8 +78,9 @@ pub(crate) fn jacobians(readings: &Preintegration, i: &NavState, j: &NavState) -
     let log_slope = So3::right_jacobian_inverse(&turn).unwrap_or_else(Matrix3::identity);
     let d_gyro = i.bias.gyro - readings.bias().gyro;
     let turn_by_gyro: Matrix3<f64> = delta.by_gyro_bias.fixed_view::<3, 3>(0, 0).into_owned();
-    let moved = back * (to.translation - from.translation - i.velocity * t - gravity() * (0.5 * t * t));
-    let sped = back * (j.velocity - i.velocity - gravity() * t);
+    let gravity = readings.model().gravity();
+    let moved = back * (to.translation - from.translation - i.velocity * t - gravity * (0.5 * t * t));
+    let sped = back * (j.velocity - i.velocity - gravity * t);
     let (mut by_i, mut by_j) = (Matrix15::zeros(), Matrix15::zeros());
     let put = |m: &mut Matrix15, row: usize, col: usize, value: Matrix3<f64>| {
         m.fixed_view_mut::<3, 3>(row, col).copy_from(&value);

@@ -51,12 +51,7 @@ impl Smoother {
     ///
     /// # Errors
     /// A frame that the window does not hold.
-    pub fn add_rest(
-        &mut self,
-        id: FrameId,
-        position_m: f64,
-        rotation_rad: f64,
-    ) -> Result<(), SmootherError> {
+    pub fn add_rest(&mut self, id: FrameId, position_m: f64, rotation_rad: f64) -> Result<(), SmootherError> {
         let at = self.index(id)?;
         self.system.factorised = false;
         let useful = [position_m, rotation_rad].iter().all(|s| *s > 0.0 && s.is_finite());

@@ -11,7 +11,6 @@ mod propagate;
 
 pub use buffer::{BufferError, Gap, ImuBuffer};
 pub use preintegration::{Bias, ImuModel, Preintegration, StepNoise};
-pub(crate) use propagate::gravity;
 pub use propagate::{Propagated, propagate};
 
 use nalgebra::{Matrix3, SMatrix, SVector, Vector3};

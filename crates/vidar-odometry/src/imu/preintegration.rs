@@ -47,6 +47,8 @@ pub struct ImuModel {
     pub gyro_limit: f64,
     /// Specific force at which the accelerometer saturates, m/s².
     pub accel_limit: f64,
+    /// Strength of gravity where the IMU is, m/s².
+    pub gravity_mps2: f64,
 }
 
 /// Walks below these are not believed of any MEMS IMU.
@@ -69,7 +71,19 @@ impl ImuModel {
             accel_walk: sheet.accel_random_walk.max(MIN_ACCEL_WALK),
             gyro_limit: 17.0,
             accel_limit: 170.0,
+            gravity_mps2: GRAVITY_MPS2,
         }
+    }
+
+    /// The same where gravity is `gravity_mps2` strong.
+    #[must_use]
+    pub const fn with_gravity(self, gravity_mps2: f64) -> Self {
+        Self { gravity_mps2, ..self }
+    }
+
+    /// Gravity in the world, m/s².
+    pub(crate) const fn gravity(&self) -> Vector3<f64> {
+        Vector3::new(0.0, 0.0, -self.gravity_mps2)
     }
 }
 
@@ -309,7 +323,7 @@ impl Preintegration {
     pub fn predict(&self, state: &NavState) -> NavState {
         let (rotation, position, velocity) = self.corrected(&state.bias);
         let t = self.delta.secs;
-        let gravity = Vector3::new(0.0, 0.0, -GRAVITY_MPS2);
+        let gravity = self.model.gravity();
         let start = &state.world_from_body;
         NavState {
             world_from_body: Se3::new(

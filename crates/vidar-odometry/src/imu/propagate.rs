@@ -2,7 +2,7 @@
 
 use super::{Matrix15, NavState, Preintegration, hat};
 use nalgebra::{Matrix3, Vector3};
-use vidar_core::{GRAVITY_MPS2, LieGroup, So3};
+use vidar_core::{LieGroup, So3};
 
 /// A state with its uncertainty.
 #[derive(Clone, Debug, PartialEq)]
@@ -51,9 +51,4 @@ pub(crate) fn d_end_d_start(state: &NavState, readings: &Preintegration) -> Matr
     }
     f.fixed_view_mut::<3, 3>(3, 6).copy_from(&(Matrix3::identity() * t));
     f
-}
-
-/// Gravity in the world, m/s².
-pub(crate) fn gravity() -> Vector3<f64> {
-    Vector3::new(0.0, 0.0, -GRAVITY_MPS2)
 }

@@ -387,6 +387,7 @@ impl InFlightStart {
 
     /// Step 2: velocity, gravity, bias and points, linear.
     fn linear_start(&self, views: &[View<'_>], tracks: &[Track], turns: &[So3]) -> Option<LinearSolution> {
+        let gravity_mps2 = views.iter().find_map(|v| v.readings.as_ref())?.model().gravity_mps2;
         let (mut secs, mut position, mut velocity) = (0.0, Vector3::zeros(), Vector3::zeros());
         let (mut position_by, mut velocity_by) = (Matrix3::zeros(), Matrix3::zeros());
         let mut before = So3::IDENTITY;
@@ -416,6 +417,7 @@ impl InFlightStart {
             &rays,
             LINEAR_INFLATION * self.ray_sigma_rad(tracks),
             self.config.accel_bias_sigma,
+            gravity_mps2,
         )
     }
 

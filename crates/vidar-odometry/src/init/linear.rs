@@ -5,7 +5,6 @@
 //! of g is known (Dong-Si & Mourikis, "Estimator initialization in vision-aided inertial navigation", IROS 2012).
 
 use nalgebra::{Matrix3, SMatrix, SVector, Vector3};
-use vidar_core::GRAVITY_MPS2;
 
 /// A view as the linear system needs it, in the first body's frame.
 #[derive(Clone, Copy, Debug)]
@@ -46,17 +45,19 @@ type Matrix9 = SMatrix<f64, 9, 9>;
 type Vector9 = SVector<f64, 9>;
 type By = SMatrix<f64, 3, 9>;
 
-/// Solves for motion and points. `ray_sigma_rad` is the noise of rays, `accel_bias_sigma` that of the bias about zero.
+/// Solves for motion and points. `ray_sigma_rad` is the noise of rays, `accel_bias_sigma` that of the bias about zero,
+/// `gravity_mps2` the strength of gravity.
 pub(crate) fn solve(
     views: &[LinearView],
     tracks: &[Rays],
     ray_sigma_rad: f64,
     accel_bias_sigma: f64,
+    gravity_mps2: f64,
 ) -> Option<LinearSolution> {
     let mut weights: Vec<Vec<f64>> = tracks.iter().map(|rays| vec![1.0; rays.len()]).collect();
     let mut best = None;
     for _ in 0..ROUNDS {
-        let motion = solve_motion(views, tracks, &weights, ray_sigma_rad, accel_bias_sigma)?;
+        let motion = solve_motion(views, tracks, &weights, ray_sigma_rad, accel_bias_sigma, gravity_mps2)?;
         let points: Vec<_> =
             tracks.iter().zip(&weights).map(|(rays, w)| point(views, rays, w, &motion)).collect();
         reweigh(views, tracks, &points, &motion, ray_sigma_rad, &mut weights);
@@ -89,6 +90,7 @@ fn solve_motion(
     weights: &[Vec<f64>],
     ray_sigma_rad: f64,
     accel_bias_sigma: f64,
+    gravity_mps2: f64,
 ) -> Option<Vector9> {
     let (mut n, mut d) = (Matrix9::zeros(), Vector9::zeros());
     for (rays, weights) in tracks.iter().zip(weights) {
@@ -113,11 +115,11 @@ fn solve_motion(
     for k in 6..9 {
         n[(k, k)] += 1.0 / (accel_bias_sigma * accel_bias_sigma);
     }
-    with_gravity_length(&n, &d)
+    with_gravity_length(&n, &d, gravity_mps2)
 }
 
 /// Minimises `xᵀ N x − 2 dᵀ x` with |x₃…₅| = g: velocity and bias eliminated, then the secular equation for gravity.
-fn with_gravity_length(n: &Matrix9, d: &Vector9) -> Option<Vector9> {
+fn with_gravity_length(n: &Matrix9, d: &Vector9, strength: f64) -> Option<Vector9> {
     let keep = [0, 1, 2, 6, 7, 8];
     let rest = SMatrix::<f64, 6, 6>::from_fn(|i, j| n[(keep[i], keep[j])]);
     let cross = SMatrix::<f64, 6, 3>::from_fn(|i, j| n[(keep[i], 3 + j)]);
@@ -136,21 +138,21 @@ fn with_gravity_length(n: &Matrix9, d: &Vector9) -> Option<Vector9> {
     };
     // The global minimum has the only root above −λ_min, where the length falls from infinity to zero.
     let lowest = -eigen.eigenvalues.min();
-    let spread = eigen.eigenvalues.max().abs().max(along.norm() / GRAVITY_MPS2).max(1e-12);
+    let spread = eigen.eigenvalues.max().abs().max(along.norm() / strength).max(1e-12);
     let (mut low, mut high) = (lowest, lowest + spread);
     for _ in 0..200 {
-        if length(high) < GRAVITY_MPS2 {
+        if length(high) < strength {
             break;
         }
         high = lowest + (high - lowest) * 2.0;
     }
     for _ in 0..200 {
         let middle = 0.5 * (low + high);
-        if length(middle) > GRAVITY_MPS2 { low = middle } else { high = middle }
+        if length(middle) > strength { low = middle } else { high = middle }
     }
     let lambda = 0.5 * (low + high);
     let scaled = Vector3::from_fn(|k, _| along[k] / (eigen.eigenvalues[k] + lambda));
-    let gravity = (eigen.eigenvectors * scaled).try_normalize(1e-9)? * GRAVITY_MPS2;
+    let gravity = (eigen.eigenvectors * scaled).try_normalize(1e-9)? * strength;
     let others = factor.solve(&(rest_d - cross * gravity));
     let mut x = Vector9::zeros();
     for (k, &at) in keep.iter().enumerate() {

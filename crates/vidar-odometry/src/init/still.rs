@@ -19,11 +19,19 @@ pub struct RestConfig {
     pub max_image_motion_px: f64,
     /// Fewest seconds of readings, 0.1…10.
     pub min_secs: f64,
+    /// Strength of gravity, m/s², 9.5…10.
+    pub gravity_mps2: f64,
 }
 
 impl Default for RestConfig {
     fn default() -> Self {
-        Self { max_gyro_scatter: 0.02, max_accel_scatter: 0.15, max_image_motion_px: 0.3, min_secs: 0.5 }
+        Self {
+            max_gyro_scatter: 0.02,
+            max_accel_scatter: 0.15,
+            max_image_motion_px: 0.3,
+            min_secs: 0.5,
+            gravity_mps2: GRAVITY_MPS2,
+        }
     }
 }
 
@@ -70,13 +78,13 @@ pub fn rest(
         (Obstacle::GyroScatter, scatter(|s| s.gyro.0, gyro), config.max_gyro_scatter),
         (Obstacle::AccelScatter, scatter(|s| s.accel.0, accel), config.max_accel_scatter),
         (Obstacle::ImageMotion, image_motion_px.unwrap_or(0.0), config.max_image_motion_px),
-        (Obstacle::SpecificForce, (accel.norm() - GRAVITY_MPS2).abs(), IMPOSSIBLE_FORCE),
+        (Obstacle::SpecificForce, (accel.norm() - config.gravity_mps2).abs(), IMPOSSIBLE_FORCE),
     ];
     // A NaN must not pass.
     if let Some((obstacle, measured, limit)) = checks.into_iter().find(|(_, m, limit)| !(m <= limit)) {
         return Err(Refusal::new(obstacle, measured, limit));
     }
-    let suspicious = (accel.norm() - GRAVITY_MPS2).abs() > SUSPICIOUS_FORCE;
+    let suspicious = (accel.norm() - config.gravity_mps2).abs() > SUSPICIOUS_FORCE;
     let accel_sigma = if suspicious { 0.3 } else { 0.1 };
     let state = NavState {
         world_from_body: Se3::new(leveled(&accel), Vector3::zeros()),
@@ -87,7 +95,7 @@ pub fn rest(
         position_m: 1e-3,
         yaw_rad: 1e-3,
         // A horizontal accelerometer bias reads as inclination.
-        tilt_rad: accel_sigma / GRAVITY_MPS2,
+        tilt_rad: accel_sigma / config.gravity_mps2,
         velocity_mps: 0.02,
         gyro_bias: (5e-3 / n.sqrt()).max(5e-4),
         accel_bias: accel_sigma,

@@ -151,6 +151,34 @@ fn what_moves_is_not_at_rest_and_says_why() {
 }
 
 #[test]
+fn gravity_is_as_strong_as_it_is_told() {
+    let course = Course { kind: CourseKind::Eight, secs: 8.0, speed: 1.6, phase: 2.0 };
+    // At the equator.
+    let simulation = simulate(&course, &SimulationConfig { gravity_mps2: 9.78, ..Default::default() });
+    let up_bias = |believed: f64| {
+        let mut config = FeatureOdometryConfig::new(&ImuNoise::EUROC, 2.0);
+        config.imu = config.imu.with_gravity(believed);
+        let mut odometry = FeatureOdometry::for_simulation(config, &simulation).unwrap();
+        for frame in &simulation.frames {
+            odometry.push(frame.id, frame.time, &frame.seen).unwrap();
+        }
+        let (.., state) = odometry.smoother().unwrap().newest().unwrap();
+        let truth = &simulation.frames[simulation.frames.len() - 1].truth;
+        (truth.world_from_body.rotation * (state.bias.accel - truth.bias.accel)).z
+    };
+    // What is not told of gravity is found in the accelerometer's bias.
+    let (told, not_told) = (up_bias(9.78), up_bias(9.82));
+    assert!(told.abs() < 0.015, "{told}");
+    assert!((not_told - told + 0.04).abs() < 0.01, "{not_told} {told}");
+    let (mut readings, _) = resting(6);
+    readings.iter_mut().for_each(|r| r.accel.0 *= 1.2);
+    let stronger = RestConfig { gravity_mps2: 1.2 * GRAVITY_MPS2, ..RestConfig::default() };
+    assert!(
+        rest(&readings, None, &stronger).is_ok() && rest(&readings, None, &RestConfig::default()).is_err()
+    );
+}
+
+#[test]
 fn upside_down_is_level_too() {
     for up in [Vector3::z(), -Vector3::z(), Vector3::x(), Vector3::new(0.3, -0.9, 0.2).normalize()] {
         let turned = still::leveled(&(up * GRAVITY_MPS2)) * up;

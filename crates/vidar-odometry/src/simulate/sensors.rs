@@ -42,6 +42,8 @@ pub struct SimulationConfig {
     pub points: usize,
     /// How much later images are taken than their stamps say, s.
     pub time_offset_secs: f64,
+    /// Strength of gravity, m/s².
+    pub gravity_mps2: f64,
 }
 
 impl Default for SimulationConfig {
@@ -61,6 +63,7 @@ impl Default for SimulationConfig {
             wall_distance_m: 2.0,
             points: 2500,
             time_offset_secs: 0.0,
+            gravity_mps2: GRAVITY_MPS2,
         }
     }
 }
@@ -159,7 +162,7 @@ fn simulate_imu(
     for k in 0..count {
         let at = k as f64 / config.imu_rate_hz;
         let motion = flight.motion(from_secs + at);
-        let gravity = Vector3::new(0.0, 0.0, -GRAVITY_MPS2);
+        let gravity = Vector3::new(0.0, 0.0, -config.gravity_mps2);
         let force = motion.world_from_body.rotation.inverse() * (motion.acceleration - gravity);
         let gyro_noise = random.normal3() * (scale * noise.gyro_noise_density * root_rate);
         let accel_noise = random.normal3() * (scale * noise.accel_noise_density * root_rate);

@@ -53,7 +53,9 @@ impl KeyframeBook {
             world_from_camera: making.state.world_from_body * *smoother.body_from_camera(),
             pose_covariance,
             previous,
-            gravity_in_world: Vector3::new(0.0, 0.0, -GRAVITY_MPS2),
+            gravity_in_world: smoother
+                .imu_model()
+                .map_or(Vector3::new(0.0, 0.0, -GRAVITY_MPS2), |imu| imu.gravity()),
             scale_std: making.scale_std,
             health: making.health,
             landmarks: making.landmarks.to_vec(),

@@ -88,8 +88,10 @@ impl Odometry {
             ImuUse::Required => Some(rig.imu.ok_or(OdometryError::NoImu)?),
         };
         super::calibration::check(&rig_camera)?;
-        let imu_model =
-            noise.map(|n| ImuModel::from_data_sheet(&n, config.gyro_noise_factor, config.accel_noise_factor));
+        let imu_model = noise.map(|n| {
+            ImuModel::from_data_sheet(&n, config.gyro_noise_factor, config.accel_noise_factor)
+                .with_gravity(config.gravity_mps2)
+        });
         let frontend = FrontendConfig::default();
         let phase = Phase::Starting(Box::new(starting(config, imu_model.is_none(), &rig_camera, &frontend)));
         Ok(Self {
@@ -307,7 +309,8 @@ impl Odometry {
         // A reading early, so that the span is not shorter than asked for by less than one period.
         let from = time - Duration::from_secs_f64(STILL_SECS + 0.02);
         let begin = readings.partition_point(|s| s.time < from);
-        let rest = match rest(&readings[begin..], None, &RestConfig::default()) {
+        let rest_config = RestConfig { gravity_mps2: self.config.gravity_mps2, ..RestConfig::default() };
+        let rest = match rest(&readings[begin..], None, &rest_config) {
             Ok(rest) => rest,
             Err(refusal) => return self.wait(refusal),
         };
