@@ -102,6 +102,11 @@ pub enum Command {
         after_help = "Examples:\n  vidar synth room1\n  vidar synth hall1 --scene hall --seed 3 --duration 20\n  vidar synth flight1 --trajectory flight.tum --euroc"
     )]
     Synth(SynthArgs),
+    /// The paper's tables: every sequence of a dataset under every coupling, judged alike.
+    #[command(
+        after_help = "Examples:\n  vidar bench euroc EuRoC/ --sequences V1,V2 --geometry da3-small -o tables\n  vidar bench euroc --synthetic --geometry simulated -o tables\n  vidar bench tum TUM/ --modes pose-free,pose-conditioned"
+    )]
+    Bench(Box<BenchArgs>),
     /// What is possible with what is there.
     Doctor,
     /// Settings: show, explain, presets, schema.
@@ -215,9 +220,12 @@ pub struct RunArgs {
     /// Where results go.
     #[command(flatten)]
     pub output: OutputArgs,
-    /// Source of depth: stereo, or a network of `vidar model list` such as da3-small.
+    /// Source of depth: stereo, a network of `vidar model list` such as da3-small, or recorded:DIR.
     #[arg(long, value_name = "NAME", help_heading = "Model")]
     pub geometry: Option<String>,
+    /// How depth and metric poses are coupled: coupled, hybrid, pose-conditioned, ground-truth, pose-free, da3-streaming.
+    #[arg(long, value_name = "MODE", help_heading = "Model")]
+    pub mode: Option<String>,
     /// A folder with model.safetensors and config.json of one's own.
     #[arg(long, value_hint = ValueHint::AnyPath, help_heading = "Model")]
     pub model_dir: Option<PathBuf>,
@@ -230,6 +238,9 @@ pub struct RunArgs {
     /// Say what would be done, and stop.
     #[arg(long)]
     pub dry_run: bool,
+    /// Go on in the folder of -o where an interrupted run stopped; what is there and still holds is not computed again.
+    #[arg(long, requires = "output", conflicts_with = "force", help_heading = "Output")]
+    pub resume: bool,
     /// End with status 5 when a score is above its bound: ate, scale, chamfer (e.g. ate=0.1). Repeatable.
     #[arg(long, value_name = "NAME=VALUE")]
     pub fail_above: Vec<String>,
@@ -355,6 +366,53 @@ pub struct SynthArgs {
     /// A TOML file with every setting of the world.
     #[arg(long, value_hint = ValueHint::FilePath)]
     pub world_config: Option<PathBuf>,
+}
+
+/// `vidar bench`.
+#[derive(Args, Clone, Debug)]
+pub struct BenchArgs {
+    /// Which dataset.
+    #[arg(value_enum)]
+    pub dataset: BenchDataset,
+    /// The folder where the dataset was unpacked. With --synthetic only its ground truth is used, to fly along.
+    #[arg(value_hint = ValueHint::DirPath)]
+    pub root: Option<PathBuf>,
+    /// Render the sequences (EuRoC's camera and IMU) instead of reading images.
+    #[arg(long, help_heading = "World")]
+    pub synthetic: bool,
+    /// A TOML file with every setting of the rendered worlds.
+    #[arg(long, value_hint = ValueHint::FilePath, requires = "synthetic", help_heading = "World")]
+    pub world_config: Option<PathBuf>,
+    /// Beginnings of the names of the sequences wanted, separated by commas; default: all.
+    #[arg(long, value_delimiter = ',', help_heading = "Input")]
+    pub sequences: Vec<String>,
+    /// Couplings to compare, separated by commas; default: those of the paper's tables that the geometry can do, and coupled.
+    #[arg(long, value_delimiter = ',', help_heading = "Model")]
+    pub modes: Vec<String>,
+    /// Source of depth: as for `vidar run`, or simulated (with --synthetic: a network's errors on true depth).
+    #[arg(long, value_name = "NAME", help_heading = "Model")]
+    pub geometry: Option<String>,
+    /// A folder with model.safetensors and config.json of one's own.
+    #[arg(long, value_hint = ValueHint::AnyPath, help_heading = "Model")]
+    pub model_dir: Option<PathBuf>,
+    /// Leave out the odometry's own rows of Table I.
+    #[arg(long, help_heading = "Output")]
+    pub no_trajectories: bool,
+    /// How settings are given.
+    #[command(flatten)]
+    pub config: ConfigArgs,
+    /// Folder of runs and tables; the same folder goes on where it stopped.
+    #[arg(short, long, value_hint = ValueHint::DirPath, default_value = "bench", help_heading = "Output")]
+    pub output: PathBuf,
+}
+
+/// A dataset that `vidar bench` knows.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum BenchDataset {
+    /// EuRoC MAV: a folder with mav0/ per sequence.
+    Euroc,
+    /// TUM RGB-D: rgbd_dataset_*/.
+    Tum,
 }
 
 /// `vidar config`.

@@ -51,10 +51,23 @@ pub fn apply_input_flags(layered: &mut Layered, input: &InputArgs) -> Result<(),
 
 /// The flags of `vidar run` that choose a model.
 pub fn apply_model_flags(layered: &mut Layered, args: &RunArgs) -> Result<(), Error> {
-    if let Some(source) = &args.geometry {
-        layered.value("geometry.source", toml::Value::String(source.clone()), Origin::Flag("--geometry"))?;
+    if let Some(mode) = &args.mode {
+        layered.value("coupling.mode", toml::Value::String(mode.clone()), Origin::Flag("--mode"))?;
     }
-    if let Some(dir) = &args.model_dir {
+    apply_source_flags(layered, args.geometry.as_deref(), args.model_dir.as_deref())
+}
+
+/// The flags that choose a source of geometry.
+pub fn apply_source_flags(
+    layered: &mut Layered,
+    geometry: Option<&str>,
+    model_dir: Option<&Path>,
+) -> Result<(), Error> {
+    if let Some(source) = geometry {
+        let source = toml::Value::String(source.to_owned());
+        layered.value("geometry.source", source, Origin::Flag("--geometry"))?;
+    }
+    if let Some(dir) = model_dir {
         let dir = toml::Value::String(dir.display().to_string());
         layered.value("model.dir", dir, Origin::Flag("--model-dir"))?;
     }

@@ -90,6 +90,7 @@ fn dispatch(command: Command, context: &Context) -> Outcome {
         Command::Model(command) => commands::model::model(&command, context),
         Command::Odometry(args) => commands::odometry::odometry(&args, context),
         Command::Synth(args) => commands::synth::synth(&args, context),
+        Command::Bench(args) => commands::bench::bench(&args, context),
         Command::Doctor => commands::doctor::doctor(context),
         Command::Config(ConfigCommand::Show { config, origin }) => {
             commands::config::show(&config, origin, context)

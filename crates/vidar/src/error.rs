@@ -180,6 +180,14 @@ pub enum Error {
         /// What is missing.
         reason: String,
     },
+    /// A recorded prediction cannot be used.
+    #[error("{path}: {reason}", path = path.display())]
+    NotARecording {
+        /// Which file or folder.
+        path: PathBuf,
+        /// What is wrong with it.
+        reason: String,
+    },
     /// A threshold was missed.
     #[error("{0}")]
     Threshold(String),
@@ -216,6 +224,7 @@ impl Error {
             Self::NotARun { .. } => "E0207",
             Self::NoCalibration { .. } => "E0208",
             Self::NoOdometry { .. } => "E0209",
+            Self::NotARecording { .. } => "E0210",
             Self::Geometry(_) | Self::Stereo(_) => "E0301",
             Self::Hub(error) => hub_code(error),
             Self::Da3(vidar_da3::Da3Error::Cancelled) => "E1301",
@@ -314,6 +323,10 @@ impl Error {
             }
             Self::Threshold(_) => "`vidar eval RUN` shows every score",
             Self::Eval(_) => "check that both are of the same recording, body and clock",
+            Self::NotARecording { .. } => {
+                "docs/guides/recorded-geometry.md tells what is read; --stride, --start, geometry.chunk_keyframes and \
+                 geometry.overlap_keyframes must be those of the recording"
+            }
             Self::NotARun { .. } => "a run folder holds manifest.json; `vidar run PATH` makes one",
             Self::Dataset(error) => return Some(dataset_hint(error).to_owned()),
             Self::Hub(error) => return error.hint(),
@@ -408,6 +421,7 @@ pub const CODES: &[(&str, &str)] = &[
         "E0209",
         "Camera and IMU gave no metric poses: the odometry never started; the message says what it waited for.",
     ),
+    ("E0210", "A recorded prediction is missing, damaged, or of other images than those at hand."),
     ("E0301", "The geometry model could not predict depth for any chunk."),
     ("E0302", "Predicted geometry could not be placed in the metric world."),
     ("E0303", "Fusion refused its configuration or a view, or met its memory bound."),

@@ -45,10 +45,10 @@ pub enum Event {
     ChunkAligned {
         /// Chunk number.
         chunk: u32,
-        /// Metres per chunk unit.
-        scale: f64,
-        /// RMS distance of camera centres, m.
-        center_rms_m: f64,
+        /// Metres per chunk unit, as far as it is known by now.
+        scale: Option<f64>,
+        /// RMS distance of camera centres to their anchors, m.
+        center_rms_m: Option<f64>,
         /// The judgement.
         verdict: vidar_align::Verdict,
     },

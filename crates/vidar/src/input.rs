@@ -4,10 +4,12 @@ use crate::config::{Config, PoseSource};
 use crate::error::Error;
 use crate::events::{CancelToken, Events};
 use crate::keyframes::PosedFrame;
+use crate::odometry::Tracked;
 use serde::Serialize;
 use std::path::{Path, PathBuf};
-use vidar_core::{BodyFrame, CameraId, Duration, Trajectory, Warning};
-use vidar_dataset::{Dataset, OpenOptions};
+use std::sync::Arc;
+use vidar_core::{BodyFrame, CameraId, Duration, Se3, Trajectory, Warning};
+use vidar_dataset::{Dataset, ImageEntry, OpenOptions};
 
 /// Where the metric poses of a run came from.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
@@ -43,6 +45,21 @@ pub struct MetricAnchor {
     pub camera_trajectory: Trajectory,
     /// What there is to say of it.
     pub warnings: Vec<Warning>,
+    /// All that the odometry said, where the poses are its.
+    pub tracked: Option<Arc<Tracked>>,
+}
+
+/// Opens the recording with all of its images between start and end: odometry wants every one, whatever
+/// `input.stride` leaves for depth.
+pub fn open_every_image(path: &Path, options: &OpenOptions, config: &Config) -> Result<Dataset, Error> {
+    let mut config = config.clone();
+    config.input.stride = 1;
+    open_dataset(path, options, &config)
+}
+
+/// The images that `input.stride` leaves.
+pub fn strided(dataset: &Dataset, config: &Config) -> Vec<ImageEntry> {
+    dataset.images.iter().step_by(config.input.stride.max(1)).cloned().collect()
 }
 
 /// Applies the configuration's part of the options and opens the dataset.
@@ -56,7 +73,12 @@ pub fn open_dataset(path: &Path, options: &OpenOptions, config: &Config) -> Resu
 }
 
 /// The metric trajectory that the configuration asks for.
-pub fn metric_anchor(dataset: &Dataset, config: &Config) -> Result<MetricAnchor, Error> {
+pub fn metric_anchor(
+    dataset: &Dataset,
+    config: &Config,
+    events: &Events,
+    cancel: &CancelToken,
+) -> Result<MetricAnchor, Error> {
     let external =
         dataset.anchor.as_ref().map(|a| (&a.trajectory, AnchorSource::External { file: shown(&a.source) }));
     let truth = dataset.ground_truth.as_ref().map(|t| (t, AnchorSource::GroundTruth));
@@ -70,24 +92,33 @@ pub fn metric_anchor(dataset: &Dataset, config: &Config) -> Result<MetricAnchor,
     match chosen {
         Some((trajectory, source)) => {
             let camera_trajectory = in_camera(trajectory, dataset)?;
-            Ok(MetricAnchor { source, camera_trajectory, warnings: Vec::new() })
+            Ok(MetricAnchor { source, camera_trajectory, warnings: Vec::new(), tracked: None })
         }
-        None if may_track && dataset.rig.imu.is_some() => odometry_anchor(dataset, config),
+        None if may_track && dataset.rig.imu.is_some() => odometry_anchor(dataset, config, events, cancel),
         None => Err(Error::NoAnchor { name: dataset.name.clone() }),
     }
 }
 
 /// The longest span that the odometry tracked in metres.
-fn odometry_anchor(dataset: &Dataset, config: &Config) -> Result<MetricAnchor, Error> {
+fn odometry_anchor(
+    dataset: &Dataset,
+    config: &Config,
+    events: &Events,
+    cancel: &CancelToken,
+) -> Result<MetricAnchor, Error> {
     require_calibration(dataset)?;
-    let tracked = crate::odometry::track(dataset, config, &Events::none(), &CancelToken::new())?;
+    let total = dataset.images.len();
+    let tracked = events
+        .stage("odometry", total, || crate::odometry::track(dataset, config, events, cancel))
+        .map(Arc::new)?;
     let trajectory = tracked.longest_segment().filter(|_| tracked.is_metric);
     let trajectory = trajectory.ok_or_else(|| Error::NoOdometry {
         name: dataset.name.clone(),
         reason: tracked.why_not_started().unwrap_or_else(|| "it is told to leave the IMU out".into()),
     })?;
     let camera_trajectory = in_camera(&trajectory, dataset)?;
-    Ok(MetricAnchor { source: AnchorSource::Odometry, camera_trajectory, warnings: tracked.warnings() })
+    let warnings = tracked.warnings();
+    Ok(MetricAnchor { source: AnchorSource::Odometry, camera_trajectory, warnings, tracked: Some(tracked) })
 }
 
 /// Ground truth told of the camera in use, if there is any that can be.
@@ -102,37 +133,42 @@ fn in_camera(trajectory: &Trajectory, dataset: &Dataset) -> Result<Trajectory, E
 /// Every image that has a pose. Images outside the trajectory are counted in a warning; none at all is an error.
 pub fn posed_frames(
     dataset: &Dataset,
+    images: &[ImageEntry],
     anchor: &MetricAnchor,
     config: &Config,
 ) -> Result<(Vec<PosedFrame>, Vec<Warning>), Error> {
-    let max_gap = Duration::from_secs_f64(config.input.max_pose_gap_secs);
-    let offset = dataset.rig.camera(dataset.camera).map_or(Duration::ZERO, |c| c.time_offset);
-    let frames: Vec<PosedFrame> = dataset
-        .images
-        .iter()
-        .filter_map(|image| {
-            // Poses are in the IMU's clock: t_imu = t_camera + offset.
-            let world_from_camera = anchor.camera_trajectory.interpolate(image.time + offset, max_gap)?;
-            Some(PosedFrame { image: image.clone(), world_from_camera })
-        })
-        .collect();
+    let pose_of = poses_at(dataset, anchor, config);
+    let posed =
+        |image: &ImageEntry| Some(PosedFrame { image: image.clone(), world_from_camera: pose_of(image)? });
+    let frames: Vec<PosedFrame> = images.iter().filter_map(posed).collect();
     if frames.is_empty() {
-        let images = range(dataset.images.first().map(|i| i.time).zip(dataset.images.last().map(|i| i.time)));
         let poses = anchor.camera_trajectory.time_range();
-        let slip =
-            dataset.images.first().zip(poses).and_then(|(image, (pose, _))| unit_slip(image.time, pose));
+        let slip = images.first().zip(poses).and_then(|(image, (pose, _))| unit_slip(image.time, pose));
+        let images = range(images.first().map(|i| i.time).zip(images.last().map(|i| i.time)));
         return Err(Error::NoOverlap { images, poses: range(poses), slip });
     }
-    let missing = dataset.images.len() - frames.len();
+    let missing = images.len() - frames.len();
     let mut warnings = Vec::new();
     if missing > 0 {
-        let message = format!("{missing} of {} images have no pose and are left out", dataset.images.len());
+        let message = format!("{missing} of {} images have no pose and are left out", images.len());
         warnings.push(
             Warning::new("images-without-pose", message)
                 .hint("they lie outside the trajectory, or in a gap longer than input.max_pose_gap_secs"),
         );
     }
     Ok((frames, warnings))
+}
+
+/// The anchor's pose of the camera when an image was taken.
+pub fn poses_at<'a>(
+    dataset: &Dataset,
+    anchor: &'a MetricAnchor,
+    config: &Config,
+) -> impl Fn(&ImageEntry) -> Option<Se3> + 'a {
+    let max_gap = Duration::from_secs_f64(config.input.max_pose_gap_secs);
+    let offset = dataset.rig.camera(dataset.camera).map_or(Duration::ZERO, |c| c.time_offset);
+    // Poses are in the IMU's clock: t_imu = t_camera + offset.
+    move |image| anchor.camera_trajectory.interpolate(image.time + offset, max_gap)
 }
 
 /// Two clocks that differ by a factor of about 10³, 10⁶ or 10⁹ are one clock in two units.

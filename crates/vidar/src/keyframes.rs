@@ -1,8 +1,41 @@
 //! Frames that carry geometry: those with a metric pose, far enough from the last one.
 
 use crate::config::KeyframeConfig;
-use vidar_core::{LieGroup, Se3};
+use vidar_core::{Duration, LieGroup, Se3};
 use vidar_dataset::ImageEntry;
+
+/// A frame that carries geometry.
+#[derive(Clone, Debug)]
+pub struct Keyframe {
+    /// The image.
+    pub image: ImageEntry,
+    /// Pose of its camera, where one is known before the map is made.
+    pub world_from_camera: Option<Se3>,
+}
+
+impl From<PosedFrame> for Keyframe {
+    fn from(frame: PosedFrame) -> Self {
+        Self { image: frame.image, world_from_camera: Some(frame.world_from_camera) }
+    }
+}
+
+/// Chooses keyframes where no pose tells motion: one every `keyframes.unposed_interval_secs`.
+pub fn select_by_time(images: &[ImageEntry], config: &KeyframeConfig) -> Vec<Keyframe> {
+    let mut interval = Duration::from_secs_f64(config.unposed_interval_secs);
+    let chosen = loop {
+        let mut chosen: Vec<Keyframe> = Vec::new();
+        for image in images {
+            if chosen.last().is_none_or(|last| image.time - last.image.time >= interval) {
+                chosen.push(Keyframe { image: image.clone(), world_from_camera: None });
+            }
+        }
+        if config.max_count == 0 || chosen.len() <= config.max_count {
+            break chosen;
+        }
+        interval = Duration::from_secs_f64(interval.as_secs_f64() * 1.1);
+    };
+    chosen
+}
 
 /// A frame with its metric pose.
 #[derive(Clone, Debug)]
@@ -78,7 +111,8 @@ mod tests {
 
     #[test]
     fn moving_or_turning_enough_makes_a_keyframe() {
-        let config = KeyframeConfig { min_translation_m: 0.1, min_rotation_deg: 10.0, max_count: 0 };
+        let config =
+            KeyframeConfig { min_translation_m: 0.1, min_rotation_deg: 10.0, ..KeyframeConfig::default() };
         let frames: Vec<_> = (0..11).map(|i| frame(i, f64::from(i) * 0.0401, 0.0)).collect();
         assert_eq!(ids(&select_keyframes(&frames, &config)), [0, 3, 6, 9]);
         let turning: Vec<_> = (0..7).map(|i| frame(i, 0.0, f64::from(i) * 0.0901)).collect();
@@ -95,10 +129,32 @@ mod tests {
 
     #[test]
     fn a_limit_widens_the_distance_evenly() {
-        let config = KeyframeConfig { min_translation_m: 0.01, min_rotation_deg: 10.0, max_count: 10 };
+        let config = KeyframeConfig {
+            min_translation_m: 0.01,
+            min_rotation_deg: 10.0,
+            max_count: 10,
+            ..KeyframeConfig::default()
+        };
         let frames: Vec<_> = (0..1000).map(|i| frame(i, f64::from(i) * 0.02, 0.0)).collect();
         let chosen = ids(&select_keyframes(&frames, &config));
         assert_eq!(chosen.len(), 10);
         assert!(*chosen.last().unwrap() > 880, "the end of the path is covered: {chosen:?}");
+    }
+
+    #[test]
+    fn without_poses_time_makes_keyframes() {
+        let images: Vec<_> = (0..100_i64)
+            .map(|i| {
+                let mut image = frame(i as u32, 0.0, 0.0).image;
+                image.time = Timestamp::from_nanos(i * 50_000_000);
+                image
+            })
+            .collect();
+        let config = KeyframeConfig { unposed_interval_secs: 0.2, ..KeyframeConfig::default() };
+        let chosen = select_by_time(&images, &config);
+        assert_eq!(chosen.iter().map(|k| k.image.frame_id.0).take(3).collect::<Vec<_>>(), [0, 4, 8]);
+        assert!(chosen.iter().all(|k| k.world_from_camera.is_none()));
+        let few = select_by_time(&images, &KeyframeConfig { max_count: 5, ..config });
+        assert!((4..=5).contains(&few.len()), "{}", few.len());
     }
 }

@@ -9,6 +9,8 @@
 //!
 //! [`run::run`] is that figure as code; the program in `apps/vidar` only parses, calls it and prints.
 
+pub mod bench;
+pub mod chunks;
 pub mod config;
 pub mod demo;
 pub mod depth;
@@ -30,6 +32,7 @@ pub use config::{Config, Layered};
 pub use error::{Error, ExitStatus};
 pub use events::{CancelToken, Event, Events};
 pub use run::{RunOutcome, RunRequest, run};
+pub use vidar_align as align;
 pub use vidar_core as core;
 pub use vidar_da3 as da3;
 pub use vidar_dataset as dataset;

@@ -32,6 +32,11 @@ pub enum Place {
         /// Move an existing folder aside instead of refusing.
         force: bool,
     },
+    /// In a folder that an earlier run left, or a new one; files are replaced one by one, whole.
+    Resumed {
+        /// The folder.
+        path: PathBuf,
+    },
     /// `runs/<dataset>/<time>/` under this folder, with a `latest` link beside it.
     Dated {
         /// Usually the current folder.
@@ -47,6 +52,10 @@ impl Place {
         match self {
             Self::Exact { path, force } => {
                 make_way(path, *force)?;
+                create_dir(path)?;
+                Ok(path.clone())
+            }
+            Self::Resumed { path } => {
                 create_dir(path)?;
                 Ok(path.clone())
             }
@@ -120,7 +129,12 @@ impl RunFolder {
     pub fn create(place: &Place) -> Result<Self, Error> {
         let root = place.reserve()?;
         let path = root.join("log.jsonl");
-        let log = File::create(&path).map_err(|e| Error::io("create", &path, e))?;
+        let mut options = File::options();
+        let log = match place {
+            Place::Resumed { .. } => options.create(true).append(true),
+            Place::Exact { .. } | Place::Dated { .. } => options.create(true).write(true).truncate(true),
+        };
+        let log = log.open(&path).map_err(|e| Error::io("create", &path, e))?;
         Ok(Self { root, log: Mutex::new(Some(log)) })
     }
 

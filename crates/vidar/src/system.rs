@@ -34,6 +34,12 @@ pub fn peak_memory_bytes() -> Option<u64> {
     kib_of("/proc/self/status", "VmHWM")
 }
 
+/// Forgets the peak so far, where the system can (Linux), so that the next one is of what follows.
+pub fn reset_peak_memory() {
+    // Elsewhere, or without the right, the peak stays that of the whole process: an upper bound.
+    let _ = std::fs::write("/proc/self/clear_refs", "5");
+}
+
 fn cpu_features() -> Vec<&'static str> {
     #[cfg(target_arch = "x86_64")]
     {

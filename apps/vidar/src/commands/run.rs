@@ -5,6 +5,7 @@ use crate::{Context, Outcome, build, print, progress};
 use serde_json::json;
 use vidar::demo::DemoRequest;
 use vidar::evaluate::Thresholds;
+use vidar::run_folder::Place;
 use vidar::synth::SynthConfig;
 use vidar::{Error, ExitStatus, RunOutcome, RunRequest};
 
@@ -20,7 +21,10 @@ pub fn run(args: &RunArgs, context: &Context) -> Outcome {
         open: build::open_options(&args.input)?,
         layered,
         reference: args.reference.clone(),
-        place: build::place(&args.output, &build::name_of(&args.path)),
+        place: match (&args.output.output, args.resume) {
+            (Some(path), true) => Place::Resumed { path: path.clone() },
+            _ => build::place(&args.output, &build::name_of(&args.path)),
+        },
         command: context.command.clone(),
     };
     if args.dry_run {

@@ -3,6 +3,7 @@
 use crate::args::SynthArgs;
 use crate::build::{self, usage};
 use crate::{Context, Outcome, print, progress};
+use std::path::Path;
 use vidar::dataset::TrajectoryReadOptions;
 use vidar::synth::SynthConfig;
 use vidar::{Error, ExitStatus};
@@ -10,11 +11,7 @@ use vidar::{Error, ExitStatus};
 /// Renders a synthetic sequence in EuRoC layout.
 pub fn synth(args: &SynthArgs, context: &Context) -> Outcome {
     let base = match &args.world_config {
-        Some(path) => {
-            let fail = |reason: String| Error::ConfigFile { path: path.clone(), reason };
-            let text = std::fs::read_to_string(path).map_err(|e| fail(e.to_string()))?;
-            toml::from_str(&text).map_err(|e| fail(e.to_string()))?
-        }
+        Some(path) => world_file(path)?,
         None if args.euroc => SynthConfig::euroc(),
         None => SynthConfig::demo(),
     };
@@ -46,4 +43,11 @@ pub fn synth(args: &SynthArgs, context: &Context) -> Outcome {
         print::talk(format!("next: vidar run {}", args.out.display()));
     }
     Ok(ExitStatus::Done)
+}
+
+/// A file with every setting of the world.
+pub fn world_file(path: &Path) -> Result<SynthConfig, Error> {
+    let fail = |reason: String| Error::ConfigFile { path: path.to_owned(), reason };
+    let text = std::fs::read_to_string(path).map_err(|e| fail(e.to_string()))?;
+    toml::from_str(&text).map_err(|e| fail(e.to_string()))
 }

@@ -21,7 +21,7 @@ mod vis;
 
 pub use colmap::{OriginalImage, write_official_colmap};
 pub use npy::{NpyArray, NpyData};
-pub use npz::{NpzLimits, read_npz, write_npz_arrays};
+pub use npz::{NpzLimits, Packing, read_npz, write_npz_arrays, write_npz_arrays_with};
 pub use prediction::{read_prediction_npz, write_mini_npz, write_npz};
 pub use scene::{SceneOptions, SceneSummary, thinned, write_scene_glb};
 pub use vis::{depth_colors, spectral, write_depth_vis};

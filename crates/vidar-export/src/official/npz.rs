@@ -25,14 +25,37 @@ impl Default for NpzLimits {
     }
 }
 
+/// Whether arrays are squeezed.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Packing {
+    /// As `numpy.savez_compressed`.
+    #[default]
+    Deflated,
+    /// As `numpy.savez`: larger, and as fast as the disk.
+    Stored,
+}
+
 /// Writes arrays in the order given, each deflated under its name.
 pub fn write_npz_arrays<W: Write + Seek>(w: W, arrays: &[(&str, &NpyArray)]) -> Result<(), ExportError> {
+    write_npz_arrays_with(w, arrays, Packing::Deflated)
+}
+
+/// Writes arrays in the order given, each under its name.
+pub fn write_npz_arrays_with<W: Write + Seek>(
+    w: W,
+    arrays: &[(&str, &NpyArray)],
+    packing: Packing,
+) -> Result<(), ExportError> {
     let failed =
         |e: zip::result::ZipError| ExportError::Write { format: FORMAT, source: std::io::Error::other(e) };
     let mut archive = ZipWriter::new(w);
     for (name, array) in arrays {
+        let method = match packing {
+            Packing::Deflated => CompressionMethod::Deflated,
+            Packing::Stored => CompressionMethod::Stored,
+        };
         let options = SimpleFileOptions::default()
-            .compression_method(CompressionMethod::Deflated)
+            .compression_method(method)
             // numpy does the same; only entries beyond 4 GiB need it.
             .large_file(array.data.bytes() > u64::from(u32::MAX) / 2);
         archive.start_file(format!("{name}.npy"), options).map_err(failed)?;

@@ -69,11 +69,14 @@ pub struct KeyframeConfig {
     pub min_rotation_deg: f64,
     /// Most keyframes; beyond it the distances are widened evenly. 0 means no limit.
     pub max_count: usize,
+    /// Where no poses are known beforehand (`coupling.mode` `pose-free` or `da3-streaming` without any), a keyframe every so
+    /// many seconds. Lower it for fast motion.
+    pub unposed_interval_secs: f64,
 }
 
 impl Default for KeyframeConfig {
     fn default() -> Self {
-        Self { min_translation_m: 0.05, min_rotation_deg: 8.0, max_count: 0 }
+        Self { min_translation_m: 0.05, min_rotation_deg: 8.0, max_count: 0, unposed_interval_secs: 0.2 }
     }
 }
 
@@ -81,11 +84,15 @@ impl Default for KeyframeConfig {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct GeometryConfig {
-    /// The model: `stereo` (needs poses, no weights), or a network of `vidar model list` (`da3-small`).
+    /// The model: `stereo` (needs poses, no weights), a network of `vidar model list` (`da3-small`), or `recorded:DIR`,
+    /// predictions that another program left there.
     pub source: String,
-    /// Keyframes whose depth is computed together. Larger chunks need more memory.
+    /// Keyframes that are seen together. Larger chunks need more memory and agree better within themselves.
     pub chunk_keyframes: usize,
-    /// Keyframes on each side that are seen as context only.
+    /// Keyframes that a chunk shares with the one before it: what ties the two together. Networks and recordings only;
+    /// smaller than the chunk.
+    pub overlap_keyframes: usize,
+    /// Keyframes on each side that are seen as context only. Stereo only.
     pub context_keyframes: usize,
     /// Widest undistorted image (px) that the model gets; larger images are reduced.
     pub max_width_px: usize,
@@ -93,8 +100,23 @@ pub struct GeometryConfig {
 
 impl Default for GeometryConfig {
     fn default() -> Self {
-        Self { source: "stereo".into(), chunk_keyframes: 16, context_keyframes: 16, max_width_px: 640 }
+        Self {
+            source: "stereo".into(),
+            chunk_keyframes: 16,
+            overlap_keyframes: 4,
+            context_keyframes: 16,
+            max_width_px: 640,
+        }
     }
+}
+
+/// How depth and metric poses are coupled.
+#[derive(Clone, Debug, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
+#[serde(default, deny_unknown_fields)]
+pub struct CouplingConfig {
+    /// `coupled` estimates poses and chunks together; `pose-conditioned` and `hybrid` are the paper's; `ground-truth` is
+    /// pose-conditioned on true poses, an upper bound; `pose-free` and `da3-streaming` use no metric poses and give no metres.
+    pub mode: vidar_align::CouplingMode,
 }
 
 /// The network, where `geometry.source` names one.
@@ -172,11 +194,21 @@ pub struct OutputConfig {
     pub mesh_glb: bool,
     /// Draw pictures and the HTML report.
     pub report: bool,
+    /// Keep what the geometry model said of each chunk in `chunks/`, for `--geometry recorded:RUN/chunks`. Otherwise it is
+    /// removed when the run is done.
+    pub keep_chunks: bool,
 }
 
 impl Default for OutputConfig {
     fn default() -> Self {
-        Self { depth_png: true, depth_units_per_metre: 1000.0, images: true, mesh_glb: true, report: true }
+        Self {
+            depth_png: true,
+            depth_units_per_metre: 1000.0,
+            images: true,
+            mesh_glb: true,
+            report: true,
+            keep_chunks: false,
+        }
     }
 }
 
@@ -196,8 +228,10 @@ pub struct Config {
     pub odometry: vidar_odometry::OdometryConfig,
     /// Multi-view stereo.
     pub stereo: vidar_stereo::StereoConfig,
+    /// How depth and metric poses are coupled.
+    pub coupling: CouplingConfig,
     /// Placement of chunks.
-    pub align: vidar_align::AlignConfig,
+    pub align: vidar_align::AlignerConfig,
     /// Fusion into one surface.
     pub fusion: vidar_fusion::FusionConfig,
     /// Judgement.
@@ -230,8 +264,15 @@ impl Config {
         }
         positive("input.max_pose_gap_secs", self.input.max_pose_gap_secs)?;
         positive("keyframes.min_translation_m", self.keyframes.min_translation_m)?;
+        positive("keyframes.unposed_interval_secs", self.keyframes.unposed_interval_secs)?;
         positive("keyframes.min_rotation_deg", self.keyframes.min_rotation_deg)?;
         positive("output.depth_units_per_metre", self.output.depth_units_per_metre)?;
+        let (chunk, overlap) = (self.geometry.chunk_keyframes, self.geometry.overlap_keyframes);
+        if overlap >= chunk {
+            return bad(format!(
+                "geometry.overlap_keyframes must be smaller than geometry.chunk_keyframes ({chunk}), found {overlap}"
+            ));
+        }
         if !(32..=8192).contains(&self.geometry.max_width_px) {
             return bad(format!(
                 "geometry.max_width_px must be 32 to 8192, found {}",
@@ -240,7 +281,9 @@ impl Config {
         }
         if crate::models::geometry::chosen(self).is_err() {
             let (found, known) = (&self.geometry.source, crate::models::names());
-            return bad(format!("geometry.source must be \"stereo\" or one of {known}, found {found:?}"));
+            return bad(format!(
+                "geometry.source must be \"stereo\", \"recorded:DIR\" or one of {known}, found {found:?}"
+            ));
         }
         let stage = |result: Result<(), String>| result.map_err(|reason| Error::BadValue { reason });
         stage(self.model.network.validate().map_err(|e| e.to_string()))?;

@@ -1,6 +1,7 @@
 //! A network as the geometry model of a run.
 
 use super::{Located, MemoryPlan, ModelChoice, ModelIdentity, locate, planned_memory, store};
+use crate::chunks::RECORDED;
 use crate::config::Config;
 use crate::error::Error;
 use serde::Serialize;
@@ -8,10 +9,37 @@ use std::path::PathBuf;
 use std::sync::Arc;
 use vidar_core::{Pinhole, Warning};
 use vidar_da3::preprocess::processed_size;
-use vidar_da3::{Da3Model, Da3Options, Precision};
+use vidar_da3::{Da3Model, Da3ModelConfig, Da3Options, PoseMode, Precision};
 
 /// The source of geometry that needs no network.
 pub const STEREO: &str = "stereo";
+
+/// What a configuration names as its source of geometry.
+#[derive(Clone, Debug)]
+pub enum SourceChoice {
+    /// Multi-view stereo.
+    Stereo,
+    /// A network.
+    Network(ModelChoice),
+    /// Predictions in a folder.
+    Recorded(PathBuf),
+    /// A simulated network over a synthetic recording.
+    Simulated,
+}
+
+/// The source of geometry that tells the truth of a synthetic recording, wrong as a network would be.
+pub const SIMULATED: &str = "simulated";
+
+/// The source of geometry that the configuration names.
+pub fn source(config: &Config) -> Result<SourceChoice, Error> {
+    match config.geometry.source.strip_prefix(RECORDED) {
+        Some(folder) if config.model.dir.is_empty() => Ok(SourceChoice::Recorded(PathBuf::from(folder))),
+        None if config.model.dir.is_empty() && config.geometry.source == SIMULATED => {
+            Ok(SourceChoice::Simulated)
+        }
+        _ => Ok(chosen(config)?.map_or(SourceChoice::Stereo, SourceChoice::Network)),
+    }
+}
 
 /// What a plan knows of the network.
 #[derive(Clone, Debug, Serialize)]
@@ -29,13 +57,14 @@ pub struct NetworkPlan {
 pub fn chosen(config: &Config) -> Result<Option<ModelChoice>, Error> {
     match (config.model.dir.as_str(), config.geometry.source.as_str()) {
         ("", STEREO) => Ok(None),
+        ("", name) if name.starts_with(RECORDED) || name == SIMULATED => Ok(None),
         ("", name) => ModelChoice::named(name).map(Some),
         (dir, _) => Ok(Some(ModelChoice::Folder(PathBuf::from(dir)))),
     }
 }
 
 /// Opens the network. The network of computers is never used for it.
-pub fn open(choice: &ModelChoice, config: &Config) -> Result<(Da3Model, Located), Error> {
+pub fn open(choice: &ModelChoice, config: &Config, mode: PoseMode) -> Result<(Da3Model, Located), Error> {
     let located = locate(choice, None, &store(true)?)?;
     // The dense head stays in 32 bits, as in the official program.
     let head_precision = Some(Precision::F32);
@@ -43,7 +72,8 @@ pub fn open(choice: &ModelChoice, config: &Config) -> Result<(Da3Model, Located)
         Da3Options { precision: config.model.precision.into(), head_precision, ..Da3Options::default() };
     let network = Arc::new(located.open(&options)?);
     let sha256 = located.identity.weights_sha256.clone();
-    let model = Da3Model::new(network, config.model.network.clone(), sha256)?;
+    let network_config = Da3ModelConfig { mode, ..config.model.network.clone() };
+    let model = Da3Model::new(network, network_config, sha256)?;
     Ok((model, located))
 }
 

@@ -1,144 +1,255 @@
 //! Keyframes into one metric surface, chunk after chunk.
 
 use super::MetricMap;
+use super::observation::{self, Known};
+use super::placed::{color_at_size, placed_view};
 use super::plan::{ChunkPlan, Plan};
+use super::source::Source;
 use super::views::ViewWindow;
+use crate::chunks::{ChunkStore, StoredChunk};
 use crate::config::Config;
 use crate::error::Error;
 use crate::events::{CancelToken, Event, Events};
-use crate::models;
 use crate::run_folder::{RunFolder, StoredView};
 use rayon::prelude::*;
-use vidar_align::{Anchor, aligned_views, place_chunk};
+use serde_json::json;
+use sha2::{Digest, Sha256};
+use vidar_align::{Aligner, Placement};
+use vidar_core::model::ChunkFrame;
 use vidar_core::remap::RemapTable;
-use vidar_core::{AlignedView, ChunkId, ChunkView, ChunkViews, GeometryModel, ModelError, Warning};
+use vidar_core::{
+    AlignedView, ChunkId, ChunkView, ChunkViews, GeometryPrediction, Image, ModelError, Se3, ViewGeometry,
+    Warning,
+};
 use vidar_dataset::Dataset;
 use vidar_fusion::{PointFusion, TsdfVolume};
-use vidar_stereo::StereoModel;
 
-/// The geometry model that the configuration names.
-pub fn model(config: &Config) -> Result<Box<dyn GeometryModel>, Error> {
-    match models::geometry::chosen(config)? {
-        None => Ok(Box::new(StereoModel::new(config.stereo.clone())?)),
-        Some(choice) => Ok(Box::new(models::geometry::open(&choice, config)?.0)),
-    }
-}
-
-/// Reads, predicts, places and fuses every chunk. Stops between chunks when cancelled and keeps what is fused.
+/// Predicts every chunk, places them all, fuses them. Stops between chunks when cancelled and keeps what is there.
 pub fn build(
     dataset: &Dataset,
     plan: &Plan,
+    source: Source,
     config: &Config,
     folder: &RunFolder,
     events: &Events,
     cancel: &CancelToken,
 ) -> Result<MetricMap, Error> {
-    let remap = RemapTable::new(&plan.camera, &plan.view);
-    let mut window = ViewWindow::new(dataset, &plan.keyframes, &remap);
-    let mut model = model(config)?;
-    let mut surface =
-        Surface { volume: TsdfVolume::new(&config.fusion)?, points: PointFusion::new(&config.fusion)? };
-    let mut map = MetricMap::default();
-    let mut failures: Vec<String> = Vec::new();
-    events.stage("depth", plan.keyframes.len(), || -> Result<(), Error> {
-        for (number, chunk) in plan.chunks.iter().enumerate() {
-            if cancel.is_cancelled() {
-                break;
-            }
-            window.advance(&chunk.seen, events);
-            let id = ChunkId(u32::try_from(number).unwrap_or(u32::MAX));
-            let views =
-                predict_and_place(&mut window, chunk, id, model.as_mut(), plan, config, events, cancel)?;
-            match views {
-                Ok(views) => {
-                    surface.fuse(&views, events)?;
-                    map.depth_scores.add(dataset, &views);
-                    map.views.extend(store(&views, config, folder, events)?);
-                }
-                Err(reason) => failures.push(reason),
-            }
-            let (done, total) = (chunk.core.end, plan.keyframes.len());
-            events.emit(&Event::Progress { stage: "depth", done, total });
-        }
-        Ok(())
-    })?;
-    if map.views.is_empty() && !cancel.is_cancelled() {
-        let reason = failures.pop().unwrap_or_else(|| "no keyframe image could be read".into());
-        return Err(Error::Empty { keyframes: plan.keyframes.len(), reason });
+    let store = ChunkStore::new(folder.path().join("chunks"));
+    let mut road = Road { dataset, plan, config, folder, store, events, cancel };
+    let count = plan.keyframes.len();
+    let placement = events.stage("depth", count, || road.observe(source))?;
+    let mut map = events.stage("surface", count, || road.fuse(&placement))?;
+    map.placement = Some(placement);
+    if !(config.output.keep_chunks || cancel.is_cancelled()) {
+        (0..plan.chunks.len()).for_each(|k| road.store.remove(number(k)));
     }
-    events.stage("surface", 0, || {
-        surface.extract(&mut map);
-        Ok::<(), Error>(())
-    })?;
     map.warnings.iter().for_each(|w| events.warn(w));
     Ok(map)
 }
 
-/// The chunk's metric views, or the reason why it has none (already warned of).
-#[allow(clippy::too_many_arguments)] // the stage's collaborators, each used once; a bundle would only rename them
-fn predict_and_place(
-    window: &mut ViewWindow<'_>,
-    chunk: &ChunkPlan,
-    id: ChunkId,
-    model: &mut dyn GeometryModel,
-    plan: &Plan,
-    config: &Config,
-    events: &Events,
-    cancel: &CancelToken,
-) -> Result<Result<Vec<AlignedView>, String>, Error> {
-    let (views, wanted, indices) = window.take(&chunk.core);
-    let views = ChunkViews { id, views };
-    let prediction = model.predict_wanted(&views, wanted, &|| cancel.is_cancelled());
-    let placed = match prediction {
-        Err(ModelError::Cancelled) => Ok(Vec::new()),
-        Err(error) => Err(Warning::new("chunk-failed", error.to_string()).at(format!("chunk {id}"))),
-        Ok(prediction) => {
-            let anchors: Vec<Anchor> = plan.keyframes[chunk.seen.clone()]
-                .iter()
-                .map(|k| Anchor { frame_id: k.image.frame_id, world_from_camera: k.world_from_camera })
-                .collect();
-            let missing = chunk.core.len().saturating_sub(prediction.views.len());
-            if missing > 0 && !prediction.views.is_empty() {
-                let message = format!("{missing} of {} keyframes got no depth", chunk.core.len());
-                events.warn(&Warning::new("keyframes-without-depth", message).at(format!("chunk {id}")));
-            }
-            place(prediction, &anchors, &views.views, config, events)?
-        }
-    };
-    window.put_back(views.views, indices);
-    Ok(placed.map_err(|warning| {
-        events.warn(&warning);
-        warning.message
-    }))
+fn number(chunk: usize) -> ChunkId {
+    ChunkId(u32::try_from(chunk).unwrap_or(u32::MAX))
 }
 
-fn place(
-    prediction: vidar_core::GeometryPrediction,
-    anchors: &[Anchor],
-    views: &[ChunkView],
-    config: &Config,
-    events: &Events,
-) -> Result<Result<Vec<AlignedView>, Warning>, Error> {
-    if prediction.views.is_empty() {
-        let place = format!("chunk {}", prediction.chunk_id);
-        return Ok(Err(Warning::new("no-parallax", "no keyframe of the chunk got depth").at(place)));
+/// What the stages share.
+struct Road<'a> {
+    dataset: &'a Dataset,
+    plan: &'a Plan,
+    config: &'a Config,
+    folder: &'a RunFolder,
+    store: ChunkStore,
+    events: &'a Events,
+    cancel: &'a CancelToken,
+}
+
+impl Road<'_> {
+    /// Chunk after chunk: images in, a prediction kept on disk, its place found.
+    fn observe(&mut self, mut source: Source) -> Result<Placement, Error> {
+        let remap = RemapTable::new(&self.plan.camera, &self.plan.view);
+        let mut window = ViewWindow::new(self.dataset, &self.plan.keyframes, &remap);
+        let mut aligner = Aligner::new(self.plan.mode, &self.config.align)?;
+        let identity = identity(self.dataset, self.plan, self.config)?;
+        let camera = self.dataset.rig.camera(self.dataset.camera);
+        let known = Known::new(self.plan, camera.map_or(Se3::IDENTITY, |c| c.body_from_camera));
+        let mut failures: Vec<String> = Vec::new();
+        for (k, chunk) in self.plan.chunks.iter().enumerate() {
+            if self.cancel.is_cancelled() {
+                break;
+            }
+            let key = key_of(&identity, self.plan, chunk);
+            let stored = match self.store.find(number(k), &key)? {
+                Some(kept) => kept,
+                None => match self.predict(&mut source, &mut window, k, chunk, &key)? {
+                    Some(predicted) => predicted,
+                    None => break,
+                },
+            };
+            match stored.failure {
+                Some(reason) => {
+                    self.events.warn(&Warning::new("chunk-failed", reason.clone()).at(format!("chunk {k}")));
+                    failures.push(reason);
+                }
+                None => failures.extend(self.align(&mut aligner, &known, chunk, stored)?),
+            }
+            let (done, total) = (chunk.seen.end, self.plan.keyframes.len());
+            self.events.emit(&Event::Progress { stage: "depth", done, total });
+        }
+        let placement = aligner.finish();
+        if placement.views.is_empty() && !self.cancel.is_cancelled() {
+            let reason = failures.pop().unwrap_or_else(|| "no keyframe image could be read".into());
+            return Err(Error::Empty { keyframes: self.plan.keyframes.len(), reason });
+        }
+        Ok(placement)
     }
-    let alignment = place_chunk(&prediction, anchors, &config.align)?;
-    events.emit(&Event::ChunkAligned {
-        chunk: alignment.chunk_id.0,
-        scale: alignment.world_from_chunk.scale,
-        center_rms_m: alignment.center_rms_m,
-        verdict: alignment.verdict,
-    });
-    if !alignment.verdict.is_usable() {
+
+    /// What the model says of a chunk, as it then lies on disk; `None` when cancelled.
+    fn predict(
+        &self,
+        source: &mut Source,
+        window: &mut ViewWindow<'_>,
+        k: usize,
+        chunk: &ChunkPlan,
+        key: &str,
+    ) -> Result<Option<StoredChunk>, Error> {
+        window.advance(&chunk.seen, self.events);
+        let wanted = if source.overlaps() { &chunk.seen } else { &chunk.core };
+        let (views, range, indices) = window.take(wanted);
+        let expected = range.len();
+        let views = ChunkViews { id: number(k), views };
+        let predicted = match source.predict(&views, range, &|| self.cancel.is_cancelled()) {
+            Err(ModelError::Cancelled) => None,
+            Err(error) => Some(failed(number(k), error.to_string())),
+            Ok(prediction) if prediction.views.is_empty() => {
+                Some(failed(number(k), "no keyframe of the chunk got depth".into()))
+            }
+            Ok(prediction) => {
+                let missing = expected.saturating_sub(prediction.views.len());
+                if missing > 0 {
+                    let message = format!("{missing} of {expected} keyframes got no depth");
+                    let place = format!("chunk {k}");
+                    self.events.warn(&Warning::new("keyframes-without-depth", message).at(place));
+                }
+                Some(colored(prediction, &views.views, source.take_colors()))
+            }
+        };
+        window.put_back(views.views, indices);
+        let Some(predicted) = predicted else { return Ok(None) };
+        self.store.write(&predicted, key)?;
+        // Read back, so that a run that was interrupted goes on from the very same numbers.
+        self.store.read(number(k)).map(Some)
+    }
+
+    /// Tells the aligner of a chunk. A chunk that finds no place is a named loss, not the end of the run.
+    fn align(
+        &self,
+        aligner: &mut Aligner,
+        known: &Known<'_>,
+        chunk: &ChunkPlan,
+        stored: StoredChunk,
+    ) -> Result<Option<String>, Error> {
+        let observation = observation::of(self.plan, known, chunk, stored.prediction);
+        let report = aligner.push(observation)?;
+        self.events.emit(&Event::ChunkAligned {
+            chunk: report.chunk_id.0,
+            scale: report.world_from_chunk.map(|s| s.scale),
+            center_rms_m: Some(report.center_rms_m).filter(|m| m.is_finite()),
+            verdict: report.verdict,
+        });
+        if report.verdict.is_usable() {
+            return Ok(None);
+        }
         let message = format!(
             "placement is {:?}: camera centres {:.3} m RMS off their anchors",
-            alignment.verdict, alignment.center_rms_m
+            report.verdict, report.center_rms_m
         );
-        let place = format!("chunk {}", alignment.chunk_id);
-        return Ok(Err(Warning::new("chunk-not-placed", message).at(place)));
+        let warning = Warning::new("chunk-not-placed", message.clone());
+        self.events.warn(&warning.at(format!("chunk {}", report.chunk_id)));
+        Ok(Some(message))
     }
-    Ok(Ok(aligned_views(prediction, &alignment, views)?))
+
+    /// Every placed chunk's own keyframes into one surface; depth and images are written as they go by.
+    fn fuse(&self, placement: &Placement) -> Result<MetricMap, Error> {
+        let mut surface = Surface {
+            volume: TsdfVolume::new(&self.config.fusion)?,
+            points: PointFusion::new(&self.config.fusion)?,
+        };
+        let mut map = MetricMap::default();
+        for (k, chunk) in self.plan.chunks.iter().enumerate() {
+            if !placement.views.iter().any(|v| v.owner == number(k)) {
+                continue;
+            }
+            let views = aligned(placement, self.store.read(number(k))?)?;
+            surface.fuse(&views, self.events)?;
+            map.depth_scores.add(self.dataset, &views);
+            map.views.extend(store(&views, self.config, self.folder, self.events)?);
+            let (done, total) = (chunk.core.end, self.plan.keyframes.len());
+            self.events.emit(&Event::Progress { stage: "surface", done, total });
+        }
+        surface.extract(&mut map);
+        Ok(map)
+    }
+}
+
+/// The views that a chunk owns, in metres and in the world.
+fn aligned(placement: &Placement, stored: StoredChunk) -> Result<Vec<AlignedView>, Error> {
+    let id = stored.prediction.chunk_id;
+    let mut colors = stored.colors.into_iter();
+    let mut views = Vec::new();
+    for (view, time) in stored.prediction.views.into_iter().zip(stored.times) {
+        let color = colors.next();
+        let Some(place) = placement.view(view.frame_id).filter(|p| p.owner == id) else { continue };
+        views.push(placed_view(view, time, place, color)?);
+    }
+    Ok(views)
+}
+
+fn failed(chunk_id: ChunkId, reason: String) -> StoredChunk {
+    let prediction = GeometryPrediction { chunk_id, frame: ChunkFrame::ModelNative, views: Vec::new() };
+    StoredChunk { prediction, times: Vec::new(), colors: Vec::new(), failure: Some(reason) }
+}
+
+/// A prediction with the times and pictures of its views; `given` pictures come before those of the input.
+fn colored(prediction: GeometryPrediction, views: &[ChunkView], given: Vec<Image<[u8; 3]>>) -> StoredChunk {
+    let of = |id| views.iter().find(|v| v.frame_id == id);
+    let times =
+        prediction.views.iter().map(|v| of(v.frame_id).map_or_else(Default::default, |v| v.time)).collect();
+    let picture = |v: &ViewGeometry| {
+        of(v.frame_id).map(|image| color_at_size(&image.image, v.intrinsics.width, v.intrinsics.height))
+    };
+    let colors = match given.len() == prediction.views.len() && !given.is_empty() {
+        true => given,
+        false => prediction.views.par_iter().map(picture).collect::<Option<_>>().unwrap_or_default(),
+    };
+    StoredChunk { prediction, times, colors, failure: None }
+}
+
+/// What all of a run's predictions are made of, besides their own frames.
+fn identity(dataset: &Dataset, plan: &Plan, config: &Config) -> Result<Vec<u8>, Error> {
+    let part = json!({
+        "version": crate::VERSION,
+        "model": plan.model_json(),
+        "mode": plan.mode,
+        "view": plan.view,
+        "camera": format!("{:?}", plan.camera),
+        "stereo": config.stereo,
+        "network": config.model,
+    });
+    let mut bytes = dataset.fingerprint()?;
+    bytes.extend(part.to_string().into_bytes());
+    Ok(bytes)
+}
+
+/// The key of a chunk: SHA-256 of all that its prediction is made of.
+fn key_of(identity: &[u8], plan: &Plan, chunk: &ChunkPlan) -> String {
+    let mut hash = Sha256::new_with_prefix(identity);
+    hash.update(format!("{:?}", chunk.core));
+    for keyframe in &plan.keyframes[chunk.seen.clone()] {
+        hash.update(keyframe.image.time.nanos().to_le_bytes());
+        if let Some(pose) = &keyframe.world_from_camera {
+            pose.matrix().iter().for_each(|v| hash.update(v.to_le_bytes()));
+        }
+    }
+    hash.finalize().iter().map(|b| format!("{b:02x}")).collect()
 }
 
 /// Both forms of the surface, fed with the same views.

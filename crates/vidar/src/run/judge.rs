@@ -1,14 +1,14 @@
 //! How good the result is, where that can be known.
 
 use super::plan::Plan;
-use super::{MetricMap, anchored_by_truth, reference};
+use super::{MetricMap, anchored_by_truth, keyframe_trajectory, reference};
 use crate::config::Config;
 use crate::error::Error;
 use crate::events::Events;
 use crate::input::truth_in_camera;
 use rayon::prelude::*;
 use serde::Serialize;
-use vidar_core::{AlignedView, PointCloud, Se3, TriangleMesh, Warning};
+use vidar_core::{AlignedView, PointCloud, Se3, Trajectory, TriangleMesh, Warning};
 use vidar_dataset::Dataset;
 use vidar_eval::{
     DepthAccumulator, DepthSummary, EvalError, PlacementStart, SampleDensity, SurfaceEvalConfig,
@@ -18,8 +18,10 @@ use vidar_eval::{
 /// Scores, each with what it was judged against.
 #[derive(Clone, Debug, Default, Serialize)]
 pub struct Judgement {
-    /// Poses of the anchor against ground truth; absent when ground truth is the anchor.
+    /// The map's camera poses against ground truth; absent when they are ground truth.
     pub trajectory: Option<TrajectoryReport>,
+    /// Poses of the anchor against ground truth, where the map's are not the anchor's.
+    pub anchor: Option<TrajectoryReport>,
     /// Surface against the reference.
     pub surface: Option<SurfaceReport>,
     /// Depth of keyframes against the depth sensor.
@@ -49,15 +51,33 @@ pub fn judge(
     let warn =
         |what: &str, reason: String| events.warn(&Warning::new("not-judged", format!("{what}: {reason}")));
     let mut start = PlacementStart::from(Se3::IDENTITY);
-    if let (false, Some(truth)) = (anchored_by_truth(plan), truth_in_camera(dataset)) {
-        match vidar_eval::evaluate_trajectory(&plan.anchor.camera_trajectory, &truth, &config.eval.trajectory)
-        {
+    if let Some(truth) = truth_in_camera(dataset) {
+        let against_truth = |what: &str, estimate: &Trajectory| match vidar_eval::evaluate_trajectory(
+            estimate,
+            &truth,
+            &config.eval.trajectory,
+        ) {
             Ok(report) => {
                 report.warnings.iter().for_each(|w| events.warn(w));
-                start = placement_start(&report);
-                judgement.trajectory = Some(report);
+                Some(report)
             }
-            Err(e) => warn("trajectory", e.to_string()),
+            Err(e) => {
+                warn(what, e.to_string());
+                None
+            }
+        };
+        let anchor = plan.anchor.as_ref().filter(|_| !anchored_by_truth(plan));
+        let anchor = anchor.and_then(|a| against_truth("trajectory", &a.camera_trajectory));
+        let moved = plan.mode.chains().then(|| keyframe_trajectory(plan, map)).flatten();
+        match moved {
+            Some(trajectory) => {
+                judgement.trajectory = against_truth("map's poses", &trajectory);
+                judgement.anchor = anchor;
+            }
+            None => judgement.trajectory = anchor,
+        }
+        if let Some(report) = &judgement.trajectory {
+            start = placement_start(report);
         }
     }
     // By now the map is made; a reference that cannot be read must not cost it.

@@ -2,11 +2,14 @@
 
 mod dense;
 mod judge;
+mod observation;
 mod outputs;
 mod pictures;
+mod placed;
 mod plan;
 mod record;
 mod reference;
+mod source;
 mod views;
 
 pub use judge::{DepthScore, Judgement};
@@ -19,9 +22,11 @@ use crate::events::{CancelToken, Event, Events};
 use crate::input::{self, AnchorSource};
 use crate::run_folder::{Place, RunFolder, StoredView};
 use record::Recorder;
+use source::Source;
 use std::path::PathBuf;
 use std::sync::Arc;
-use vidar_core::{PointCloud, Trajectory, TriangleMesh, Warning};
+use vidar_align::Placement;
+use vidar_core::{BodyFrame, PointCloud, StampedPose, Trajectory, TriangleMesh, Warning};
 use vidar_dataset::{Dataset, OpenOptions};
 use vidar_fusion::CoverageReport;
 
@@ -82,6 +87,8 @@ pub struct MetricMap {
     pub cloud: PointCloud,
     /// Area, volume and how often it was seen.
     pub coverage: CoverageReport,
+    /// Where chunks and keyframes stand, and how far to trust it.
+    pub placement: Option<Placement>,
     /// Keyframes that got depth.
     pub views: Vec<StoredView>,
     /// Largest memory of the volume, bytes.
@@ -95,8 +102,9 @@ pub struct MetricMap {
 /// Looks at the input and says what a run would do, without doing it.
 pub fn plan(request: &RunRequest) -> Result<Plan, Error> {
     let config = request.layered.build()?;
-    let dataset = input::open_dataset(&request.path, &request.open, &config)?;
-    Plan::make(&dataset, &config, request.reference.as_deref())
+    let dataset = input::open_every_image(&request.path, &request.open, &config)?;
+    let (events, cancel) = (Events::none(), CancelToken::new());
+    Ok(Plan::make(&dataset, &config, request.reference.as_deref(), &events, &cancel)?.0)
 }
 
 /// Runs all of it. On Ctrl-C what is finished is fused, written and judged, and the status says so. A run that fails
@@ -106,14 +114,15 @@ pub fn run(request: &RunRequest, events: &Events, cancel: &CancelToken) -> Resul
     let recorder = Recorder::default();
     let events = recorder.listen(events.clone());
     let config = request.layered.build()?;
-    let dataset = events.stage("read", 0, || input::open_dataset(&request.path, &request.open, &config))?;
-    let plan = Plan::make(&dataset, &config, request.reference.as_deref())?;
+    let dataset =
+        events.stage("read", 0, || input::open_every_image(&request.path, &request.open, &config))?;
+    let (plan, source) = Plan::make(&dataset, &config, request.reference.as_deref(), &events, cancel)?;
     let folder = Arc::new(RunFolder::create(&request.place)?);
     recorder.keep_log_in(folder.clone());
     dataset.warnings.iter().chain(&plan.warnings).for_each(|w| events.warn(w));
     let about = record::About::new(request, &dataset, &plan)?;
 
-    let made = carry_out(request, &config, &dataset, plan, &folder, &events, cancel, &recorder);
+    let made = carry_out(request, &config, &dataset, (plan, source), &folder, &events, cancel, &recorder);
     let made = made.map(|outcome| RunOutcome {
         seconds: clock.elapsed().as_secs_f64(),
         warnings: recorder.warnings(),
@@ -136,14 +145,14 @@ fn carry_out(
     request: &RunRequest,
     config: &Config,
     dataset: &Dataset,
-    plan: Plan,
+    (plan, source): (Plan, Source),
     folder: &RunFolder,
     events: &Events,
     cancel: &CancelToken,
     recorder: &Recorder,
 ) -> Result<RunOutcome, Error> {
     folder.write("config.resolved.toml", request.layered.to_toml(true).as_bytes())?;
-    let map = dense::build(dataset, &plan, config, folder, events, cancel)?;
+    let map = dense::build(dataset, &plan, source, config, folder, events, cancel)?;
     let judgement = events.stage("judge", 0, || judge::judge(dataset, &plan, &map, config, events))?;
     let status = match (cancel.is_cancelled(), recorder.is_degraded() || map.mesh.triangles.is_empty()) {
         (true, _) => ExitStatus::Interrupted,
@@ -166,17 +175,20 @@ fn carry_out(
     Ok(outcome)
 }
 
-/// The trajectory that anchored the run and where it came from.
+/// Whether the metric poses are ground truth.
 pub(crate) fn anchored_by_truth(plan: &Plan) -> bool {
-    plan.anchor.source == AnchorSource::GroundTruth
+    plan.anchor.as_ref().is_some_and(|a| a.source == AnchorSource::GroundTruth)
 }
 
-/// The keyframes' poses as a trajectory of the camera.
-pub(crate) fn keyframe_trajectory(plan: &Plan) -> Option<Trajectory> {
-    let poses = plan
+/// The keyframes' poses in the map as a trajectory of the camera.
+pub(crate) fn keyframe_trajectory(plan: &Plan, map: &MetricMap) -> Option<Trajectory> {
+    let placement = map.placement.as_ref()?;
+    let time = |frame| plan.keyframes.iter().find(|k| k.image.frame_id == frame).map(|k| k.image.time);
+    let poses = placement
         .keyframes
         .iter()
-        .map(|k| vidar_core::StampedPose { time: k.image.time, world_from_body: k.world_from_camera })
+        .filter_map(|k| Some(StampedPose { time: time(k.frame_id)?, world_from_body: k.world_from_camera }))
         .collect();
-    Trajectory::new(plan.anchor.camera_trajectory.body(), poses).ok()
+    let camera = plan.keyframes.first()?.image.camera;
+    Trajectory::new(BodyFrame::Camera(camera), poses).ok()
 }

@@ -6,6 +6,8 @@ use crate::error::Error;
 use crate::events::{Event, Events};
 use crate::run_folder::{MANIFEST_SCHEMA, RunFolder, StoredView, VIEWS_SCHEMA, pretty};
 use serde_json::{Value, json};
+use vidar_align::Placement;
+use vidar_align::aligner::{ChunkPlacement, LoopReport};
 use vidar_core::{FrameId, Se3, Timestamp, Trajectory};
 use vidar_export::{DepthFrame, DepthSidecar, ExportError};
 
@@ -19,8 +21,10 @@ pub fn write(
 ) -> Result<(), Error> {
     let writer = Writer { folder, events };
     let plan = &outcome.plan;
-    writer.trajectory("trajectory/anchor_camera", &plan.anchor.camera_trajectory, plan)?;
-    if let Some(keyframes) = keyframe_trajectory(plan) {
+    if let Some(anchor) = &plan.anchor {
+        writer.trajectory("trajectory/anchor_camera", &anchor.camera_trajectory, plan)?;
+    }
+    if let Some(keyframes) = keyframe_trajectory(plan, &outcome.map) {
         writer.trajectory("trajectory/keyframes_camera", &keyframes, plan)?;
     }
     writer.bytes("views.json", &pretty(&json!({ "schema": VIEWS_SCHEMA, "views": outcome.map.views })))?;
@@ -29,8 +33,9 @@ pub fn write(
     }
     let comments = vec![
         "VIDAR metric map".to_owned(),
-        "frame: world, right-handed; unit: metre".to_owned(),
-        format!("metric poses: {}", plan.anchor.source),
+        format!("frame: world, right-handed; unit: {}", if plan.is_metric() { "metre" } else { "arbitrary" }),
+        format!("metric poses: {}", plan.poses()),
+        format!("coupling: {}", plan.mode),
         format!("geometry: {}", plan.model.name),
     ];
     let map = &outcome.map;
@@ -70,7 +75,7 @@ impl Writer<'_> {
     }
 
     fn trajectory(&self, stem: &str, trajectory: &Trajectory, plan: &Plan) -> Result<(), Error> {
-        let note = format!("metric poses: {}", plan.anchor.source);
+        let note = format!("metric poses: {}", plan.poses());
         self.export(&format!("{stem}.tum"), |w| vidar_export::write_tum(w, trajectory, &note))?;
         self.export(&format!("{stem}.euroc.csv"), |w| vidar_export::write_euroc_csv(w, trajectory, &note))
     }
@@ -104,7 +109,8 @@ pub fn pose_of(view: &StoredView) -> Option<Se3> {
 fn metrics(judgement: &Judgement, plan: &Plan) -> Value {
     json!({
         "schema": "vidar.metrics/1",
-        "metric_poses": plan.anchor.source,
+        "metric_poses": source_json(plan),
+        "coupling": plan.mode,
         "poses_are_ground_truth": anchored_by_truth(plan),
         "reference": plan.reference.to_string(),
         "scores": crate::evaluate::scores(judgement),
@@ -122,9 +128,47 @@ pub fn result_json(outcome: &RunOutcome) -> Value {
         "points": outcome.map.cloud.len(),
         "coverage": outcome.map.coverage,
         "volume_bytes": outcome.map.volume_bytes,
-        "metric_poses": outcome.plan.anchor.source,
+        "metric_poses": source_json(&outcome.plan),
+        "coupling": outcome.plan.mode,
+        "is_metric": outcome.plan.is_metric(),
+        "placement": outcome.map.placement.as_ref().map(placement_json),
         "judgement": judgement,
         "seconds": outcome.seconds,
+    })
+}
+
+/// Where metric poses came from; null where there are none.
+pub fn source_json(plan: &Plan) -> Value {
+    json!(plan.anchor.as_ref().map(|a| &a.source))
+}
+
+/// What the alignment says of itself: guards, loops, drift, scales.
+fn placement_json(placement: &Placement) -> Value {
+    let finite = |v: f64| v.is_finite().then_some(v);
+    let chunk = |c: &ChunkPlacement| {
+        json!({
+            "chunk": c.chunk_id, "verdict": c.verdict, "metres_per_unit": c.world_from_chunk.scale,
+            "log_scale_std": finite(c.log_scale_std),
+        })
+    };
+    let revisit = |l: &LoopReport| {
+        json!({
+            "later": l.later, "earlier": l.earlier, "similarity": l.similarity, "inlier_ratio": finite(l.inlier_ratio),
+            "chi2": finite(l.chi2), "refused": l.refusal,
+        })
+    };
+    json!({
+        "chunks": placement.chunks.iter().map(chunk).collect::<Vec<_>>(),
+        "loops": placement.loops.iter().map(revisit).collect::<Vec<_>>(),
+        "guards": placement.guards,
+        "graph": placement.graph.as_ref().map(|g| json!({
+            "mode": g.mode, "iterations": g.iterations, "cost": g.cost, "odometry_chi2": finite(g.odometry_chi2),
+        })),
+        "drift": {
+            "center_rms_m": finite(placement.drift.center_rms_m), "center_max_m": finite(placement.drift.center_max_m),
+            "scale_step_std": finite(placement.drift.scale_step_std), "matched": placement.drift.matched,
+        },
+        "fields": placement.views.iter().filter(|v| v.field.is_some()).count(),
     })
 }
 

@@ -27,11 +27,17 @@ pub fn draw(
     events: &Events,
 ) -> Result<(), Error> {
     let mut album = Album { folder, events };
-    let path = keyframe_trajectory(&outcome.plan);
-    let up = vidar_view::up_of_world(path.as_ref().unwrap_or(&outcome.plan.anchor.camera_trajectory));
+    let path = keyframe_trajectory(&outcome.plan, &outcome.map);
+    let anchor = outcome.plan.anchor.as_ref().map(|a| &a.camera_trajectory);
+    let up = path.as_ref().or(anchor).map_or_else(nalgebra::Vector3::z, vidar_view::up_of_world);
     let report = Report {
         title: format!("VIDAR: {}", dataset.name),
-        subtitle: format!("{}; metric poses: {}", outcome.plan.input, outcome.plan.anchor.source),
+        subtitle: format!(
+            "{}; metric poses: {}; coupling: {}",
+            outcome.plan.input,
+            outcome.plan.poses(),
+            outcome.plan.mode
+        ),
         verdict: Some(verdict(outcome)),
         summary: summary(outcome),
         sections: vec![
@@ -120,7 +126,8 @@ pub fn summary_lines(outcome: &RunOutcome) -> Vec<(&'static str, String)> {
                 map.coverage.surface_area_m2, map.coverage.mean_observations
             ),
         ),
-        ("metric poses", outcome.plan.anchor.source.to_string()),
+        ("metric poses", outcome.plan.poses()),
+        ("coupling", coupling_line(outcome)),
     ];
     match &outcome.judgement.trajectory {
         Some(t) => {
@@ -132,6 +139,9 @@ pub fn summary_lines(outcome: &RunOutcome) -> Vec<(&'static str, String)> {
             ));
         }
         None if anchored_by_truth(&outcome.plan) => lines.push(("scale", "metric by ground truth".into())),
+        None if !outcome.plan.is_metric() => {
+            lines.push(("scale", "arbitrary: this coupling uses no metric poses".into()));
+        }
         None => {
             lines.push(("scale", "as metric as the trajectory given; no ground truth to check it".into()))
         }
@@ -169,6 +179,31 @@ pub fn summary_lines(outcome: &RunOutcome) -> Vec<(&'static str, String)> {
     let shown = if report.exists() { report } else { outcome.folder.join("map/mesh.ply") };
     lines.push(("look at it", shown.display().to_string()));
     lines
+}
+
+/// How chunks were coupled, how well their scales are known, and which guards acted.
+fn coupling_line(outcome: &RunOutcome) -> String {
+    let mut text = outcome.plan.mode.to_string();
+    let Some(placement) = &outcome.map.placement else { return text };
+    let mut stds: Vec<f64> =
+        placement.chunks.iter().map(|c| c.log_scale_std).filter(|s| s.is_finite()).collect();
+    stds.sort_unstable_by(f64::total_cmp);
+    if let Some(median) = stds.get(stds.len() / 2) {
+        text += &format!(", scale of a chunk known to {:.1} %", median * 100.0);
+    }
+    let accepted = placement.loops.iter().filter(|l| l.refusal.is_none()).count();
+    if !placement.loops.is_empty() {
+        text += &format!(", {accepted} of {} loops believed", placement.loops.len());
+    }
+    let guards: Vec<String> = placement
+        .guards
+        .iter()
+        .map(|(guard, n)| format!("{} {n}x", serde_json::json!(guard).as_str().unwrap_or_default()))
+        .collect();
+    if !guards.is_empty() {
+        text += &format!("; guards: {}", guards.join(", "));
+    }
+    text
 }
 
 fn summary(outcome: &RunOutcome) -> Vec<SummaryItem> {
@@ -333,20 +368,39 @@ fn trajectory_section(
     album: &mut Album<'_>,
 ) -> Result<Section, Error> {
     let mut section = Section { heading: "Trajectory".into(), ..Section::default() };
-    let anchor = &outcome.plan.anchor.camera_trajectory;
     let truth = truth_in_camera(dataset);
-    let aligned = outcome.judgement.trajectory.as_ref().and_then(|t| {
-        section.tables.push(table("Anchor against ground truth", trajectory_lines(t)));
-        aligned(anchor, t.truth_from_estimate_se3?.to_se3()?)
-    });
+    let (judgement, plan) = (&outcome.judgement, &outcome.plan);
+    let moved = plan.mode.chains().then(|| keyframe_trajectory(plan, &outcome.map)).flatten();
+    let anchor = plan.anchor.as_ref().map(|a| a.camera_trajectory.clone());
+    let (map, anchor) = match moved {
+        Some(map) => {
+            (Some((map, "map", &judgement.trajectory)), anchor.map(|a| (a, "anchor", &judgement.anchor)))
+        }
+        None => (anchor.map(|a| (a, "anchor", &judgement.trajectory)), None),
+    };
+    let mut placed = Vec::new();
+    for (trajectory, name, report) in [map, anchor].into_iter().flatten() {
+        let truth_from = report.as_ref().and_then(|t| {
+            section
+                .tables
+                .push(table(&format!("Poses of the {name} against ground truth"), trajectory_lines(t)));
+            t.truth_from_estimate_se3?.to_se3()
+        });
+        let is_truth = name == "anchor" && anchored_by_truth(plan);
+        let shown = truth_from.and_then(|t| aligned(&trajectory, t)).unwrap_or(trajectory);
+        placed.push((shown, name, is_truth));
+    }
     let mut shown = Vec::new();
-    if let (Some(truth), false) = (&truth, anchored_by_truth(&outcome.plan)) {
+    if let (Some(truth), false) = (&truth, placed.iter().any(|(_, _, is_truth)| *is_truth)) {
         shown.push(PlotTrajectory::ground_truth("ground truth", truth));
     }
-    shown.push(match anchored_by_truth(&outcome.plan) {
-        true => PlotTrajectory::ground_truth("ground truth (the anchor)", anchor),
-        false => PlotTrajectory::estimate("anchor, rigidly aligned", aligned.as_ref().unwrap_or(anchor)),
-    });
+    let labels: Vec<String> = placed.iter().map(|(_, name, _)| format!("{name}, rigidly aligned")).collect();
+    for ((trajectory, _, is_truth), label) in placed.iter().zip(&labels) {
+        shown.push(match is_truth {
+            true => PlotTrajectory::ground_truth("ground truth (the anchor)", trajectory),
+            false => PlotTrajectory::estimate(label, trajectory),
+        });
+    }
     let plot = TrajectoryPlot { up: *up, ..TrajectoryPlot::default() };
     let picture = vidar_view::plot_trajectories(&shown, &plot, size(PLOT_SIZE));
     section.figures.push(album.figure(

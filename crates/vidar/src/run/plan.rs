@@ -1,16 +1,19 @@
 //! What a run would do, before it does anything.
 
-use crate::config::Config;
+use super::source::{Opened, Source};
+use crate::config::{Config, PoseSource};
 use crate::error::Error;
+use crate::events::{CancelToken, Events};
 use crate::input::{self, MetricAnchor};
-use crate::keyframes::{PosedFrame, select_keyframes};
-use crate::models::Located;
-use crate::models::geometry::{self, NetworkPlan};
+use crate::keyframes::{Keyframe, select_by_time, select_keyframes};
+use crate::models::geometry::NetworkPlan;
 use std::ops::Range;
 use std::path::Path;
+use vidar_align::CouplingMode;
+use vidar_align::streaming::chunk_ranges;
 use vidar_core::remap::undistorted_view;
-use vidar_core::{CameraModel, ModelInfo, Pinhole, Warning};
-use vidar_dataset::Dataset;
+use vidar_core::{CameraModel, ModelInfo, Pinhole, Se3, Warning};
+use vidar_dataset::{Dataset, ImageEntry};
 
 /// A chunk: the keyframes whose depth is wanted, inside those that are seen.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -28,14 +31,16 @@ pub struct Plan {
     pub started: String,
     /// Dataset name and kind, and why that kind.
     pub input: String,
-    /// The metric trajectory.
-    pub anchor: MetricAnchor,
+    /// How depth is coupled to the metric poses.
+    pub mode: CouplingMode,
+    /// The metric trajectory; none where the mode needs none and there is none.
+    pub anchor: Option<MetricAnchor>,
     /// Images in the input.
     pub images: usize,
     /// Images with a pose.
     pub posed: usize,
     /// The frames that carry geometry.
-    pub keyframes: Vec<PosedFrame>,
+    pub keyframes: Vec<Keyframe>,
     /// The chunks in order.
     pub chunks: Vec<ChunkPlan>,
     /// The camera as it is.
@@ -70,21 +75,27 @@ pub enum ReferenceSource {
 }
 
 impl Plan {
-    /// Looks at poses, camera and configuration.
-    pub fn make(dataset: &Dataset, config: &Config, reference: Option<&Path>) -> Result<Self, Error> {
+    /// Looks at poses, camera and configuration, and opens the source of geometry.
+    pub fn make(
+        dataset: &Dataset,
+        config: &Config,
+        reference: Option<&Path>,
+        events: &Events,
+        cancel: &CancelToken,
+    ) -> Result<(Self, Source), Error> {
         if let Some(path) = reference {
             // Better said now than after an hour of depth.
             std::fs::File::open(path).map_err(|e| Error::io("read", path, e))?;
         }
         input::require_calibration(dataset)?;
-        let anchor = input::metric_anchor(dataset, config)?;
-        let (posed, mut warnings) = input::posed_frames(dataset, &anchor, config)?;
-        warnings.extend(anchor.warnings.iter().cloned());
-        let keyframes = select_keyframes(&posed, &config.keyframes);
-        let source = Source::open(config)?;
-        let needed = source.info().min_views;
-        if keyframes.len() < needed {
-            return Err(Error::TooFewKeyframes { found: keyframes.len(), needed });
+        let images = input::strided(dataset, config);
+        let Opened { source, chunks: recorded } = Source::open(dataset, &images, config)?;
+        let anchor = anchor(dataset, config, events, cancel)?;
+        let mut warnings = anchor.as_ref().map_or_else(Vec::new, |a| a.warnings.clone());
+        let chosen = choose(dataset, &images, anchor.as_ref(), recorded, &source, config, &mut warnings)?;
+        let (needed, found) = (source.info().min_views, chosen.keyframes.len());
+        if found < needed.max(1) {
+            return Err(Error::TooFewKeyframes { found, needed });
         }
         let camera = camera_model(dataset)?;
         let view = model_view(&camera, config)?;
@@ -93,17 +104,17 @@ impl Plan {
             let seen = format!("the undistorted view sees {:.0} % of its pixels", coverage * 100.0);
             warnings.push(Warning::new("view-coverage", seen).hint("check the calibration's distortion"));
         }
-        let chunks =
-            chunks(keyframes.len(), config.geometry.chunk_keyframes, config.geometry.context_keyframes);
-        let network = source.planned(config, &view, &chunks, &mut warnings)?;
-        Ok(Self {
+        let views_at_once = chosen.chunks.iter().map(|c| c.seen.len()).max().unwrap_or(0);
+        let network = source.planned(config, &view, views_at_once, &mut warnings)?;
+        let plan = Self {
             started: crate::run_folder::now_rfc3339(),
             input: format!("{}: {} ({})", dataset.name, dataset.kind, dataset.reason),
-            images: dataset.images.len(),
-            posed: posed.len(),
-            chunks,
-            disk_bytes: disk_bytes(keyframes.len(), &view, config),
-            keyframes,
+            mode: config.coupling.mode,
+            images: images.len(),
+            posed: chosen.posed,
+            disk_bytes: disk_bytes(chosen.keyframes.len(), &chosen.chunks, &view, config),
+            keyframes: chosen.keyframes,
+            chunks: chosen.chunks,
             camera,
             view,
             model: source.info().clone(),
@@ -113,7 +124,20 @@ impl Plan {
             volume_budget_bytes: config.fusion.memory_budget_bytes,
             anchor,
             warnings,
-        })
+        };
+        Ok((plan, source))
+    }
+
+    /// Where metric poses come from, in words.
+    pub fn poses(&self) -> String {
+        self.anchor
+            .as_ref()
+            .map_or_else(|| "none: lengths are not metres".to_owned(), |a| a.source.to_string())
+    }
+
+    /// Whether the map comes out in metres.
+    pub fn is_metric(&self) -> bool {
+        self.anchor.is_some() && self.mode.uses_anchors()
     }
 
     /// The plan in lines of label and text, for `--dry-run` and the report.
@@ -121,7 +145,8 @@ impl Plan {
         let k = &self.view;
         let mut lines = vec![
             ("input", self.input.clone()),
-            ("metric poses", self.anchor.source.to_string()),
+            ("metric poses", self.poses()),
+            ("coupling", self.mode.to_string()),
             ("images", format!("{} ({} with a pose)", self.images, self.posed)),
             ("keyframes", format!("{} in {} chunks", self.keyframes.len(), self.chunks.len())),
             ("camera", format!("{} {}x{}", self.camera.name(), self.camera.width(), self.camera.height())),
@@ -148,41 +173,113 @@ impl Plan {
     }
 }
 
-/// The geometry model of a plan, opened to be asked what it is and needs.
-enum Source {
-    Stereo(Box<dyn vidar_core::GeometryModel>),
-    Network(Box<(vidar_da3::Da3Model, Located)>),
+/// Metric poses, where there are any; a mode that needs none goes without.
+fn anchor(
+    dataset: &Dataset,
+    config: &Config,
+    events: &Events,
+    cancel: &CancelToken,
+) -> Result<Option<MetricAnchor>, Error> {
+    let mode = config.coupling.mode;
+    let mut config = config.clone();
+    if mode == CouplingMode::GroundTruth {
+        config.input.poses = PoseSource::GroundTruth;
+    }
+    match input::metric_anchor(dataset, &config, events, cancel) {
+        Err(Error::NoAnchor { .. } | Error::NoOdometry { .. }) if !mode.uses_anchors() => Ok(None),
+        other => other.map(Some),
+    }
 }
 
-impl Source {
-    fn open(config: &Config) -> Result<Self, Error> {
-        Ok(match geometry::chosen(config)? {
-            None => Self::Stereo(super::dense::model(config)?),
-            Some(choice) => Self::Network(Box::new(geometry::open(&choice, config)?)),
-        })
-    }
+/// Which images carry geometry, and how they are cut.
+struct Chosen {
+    keyframes: Vec<Keyframe>,
+    posed: usize,
+    chunks: Vec<ChunkPlan>,
+}
 
-    fn info(&self) -> &ModelInfo {
-        match self {
-            Self::Stereo(model) => model.info(),
-            Self::Network(network) => vidar_core::GeometryModel::info(&network.0),
+fn choose(
+    dataset: &Dataset,
+    images: &[ImageEntry],
+    anchor: Option<&MetricAnchor>,
+    recorded: Option<Vec<Vec<usize>>>,
+    source: &Source,
+    config: &Config,
+    warnings: &mut Vec<Warning>,
+) -> Result<Chosen, Error> {
+    let posed = match anchor {
+        None => None,
+        Some(anchor) => {
+            let (frames, noticed) = input::posed_frames(dataset, images, anchor, config)?;
+            warnings.extend(noticed);
+            Some(frames)
         }
+    };
+    let count = posed.as_ref().map_or(0, Vec::len);
+    if let Some(chunks) = recorded {
+        let pose_of = anchor.map(|a| input::poses_at(dataset, a, config));
+        let (keyframes, chunks) = recorded_keyframes(images, &chunks, pose_of)?;
+        return Ok(Chosen { keyframes, posed: count, chunks });
     }
+    let keyframes: Vec<Keyframe> = match posed {
+        Some(frames) => {
+            select_keyframes(&frames, &config.keyframes).into_iter().map(Keyframe::from).collect()
+        }
+        None => select_by_time(images, &config.keyframes),
+    };
+    let geometry = &config.geometry;
+    let chunks = match source.overlaps() {
+        true => overlapping(keyframes.len(), geometry.chunk_keyframes, geometry.overlap_keyframes)?,
+        false => chunks(keyframes.len(), geometry.chunk_keyframes, geometry.context_keyframes),
+    };
+    Ok(Chosen { keyframes, posed: count, chunks })
+}
 
-    fn planned(
-        &self,
-        config: &Config,
-        view: &Pinhole,
-        chunks: &[ChunkPlan],
-        warnings: &mut Vec<Warning>,
-    ) -> Result<Option<NetworkPlan>, Error> {
-        let Self::Network(network) = self else { return Ok(None) };
-        let (model, located) = network.as_ref();
-        let views = chunks.iter().map(|c| c.seen.len()).max().unwrap_or(0);
-        let (plan, noticed) = geometry::planned(model, located, config, view, views)?;
-        warnings.extend(noticed);
-        Ok(Some(plan))
-    }
+/// The images that a recording is of, and its chunks as spans of them.
+fn recorded_keyframes(
+    images: &[ImageEntry],
+    recorded: &[Vec<usize>],
+    pose_of: Option<impl Fn(&ImageEntry) -> Option<Se3>>,
+) -> Result<(Vec<Keyframe>, Vec<ChunkPlan>), Error> {
+    let mut used: Vec<usize> = recorded.iter().flatten().copied().collect();
+    used.sort_unstable();
+    used.dedup();
+    let keyframe = |&i: &usize| Keyframe {
+        image: images[i].clone(),
+        world_from_camera: pose_of.as_ref().and_then(|f| f(&images[i])),
+    };
+    let keyframes = used.iter().map(keyframe).collect();
+    let span = |images: &Vec<usize>| {
+        let first = images.first().and_then(|i| used.binary_search(i).ok())?;
+        let range = first..first + images.len();
+        (used.get(range.clone())? == images.as_slice()).then_some(range)
+    };
+    let spans: Option<Vec<Range<usize>>> = recorded.iter().map(span).collect();
+    let spans = spans.ok_or_else(|| Error::BadValue {
+        reason: "the recorded chunks are not spans of consecutive frames".into(),
+    })?;
+    Ok((keyframes, owned(spans)))
+}
+
+/// Chunks of `size` keyframes that share `overlap` with their neighbour.
+fn overlapping(keyframes: usize, size: usize, overlap: usize) -> Result<Vec<ChunkPlan>, Error> {
+    let ranges =
+        chunk_ranges(keyframes, size, overlap).map_err(|e| Error::BadValue { reason: e.to_string() })?;
+    Ok(owned(ranges.into_iter().map(|r| r.frames).collect()))
+}
+
+/// Each keyframe belongs to one chunk; what two share is halved between them, because geometry is worst at a chunk's ends.
+fn owned(spans: Vec<Range<usize>>) -> Vec<ChunkPlan> {
+    let middle = |a: &Range<usize>, b: &Range<usize>| {
+        let shared = a.end.saturating_sub(b.start);
+        b.start + shared / 2
+    };
+    let core = |k: usize| {
+        let start = if k == 0 { spans[0].start } else { middle(&spans[k - 1], &spans[k]) };
+        let end = spans.get(k + 1).map_or(spans[k].end, |next| middle(&spans[k], next));
+        start..end.max(start)
+    };
+    (0..spans.len()).map(|k| ChunkPlan { core: core(k), seen: spans[k].clone() }).collect()
 }
 
 impl std::fmt::Display for ReferenceSource {
@@ -244,11 +341,13 @@ fn reference_source(dataset: &Dataset, config: &Config, given: Option<&Path>) ->
     }
 }
 
-/// Upper bound: raw 16-bit depth and 24-bit colour per keyframe, and the volume's share for map files.
-fn disk_bytes(keyframes: usize, view: &Pinhole, config: &Config) -> u64 {
-    let pixels = (view.width * view.height * keyframes) as u64;
+/// Upper bound: raw 16-bit depth and 24-bit colour per keyframe, every chunk's prediction (depth and confidence of
+/// 32 bits, colour), and the volume's share for map files.
+fn disk_bytes(keyframes: usize, chunks: &[ChunkPlan], view: &Pinhole, config: &Config) -> u64 {
+    let pixels = (view.width * view.height) as u64;
     let per_pixel = 2 * u64::from(config.output.depth_png) + 3 * u64::from(config.output.images);
-    pixels * per_pixel + (256 << 20)
+    let predicted: usize = chunks.iter().map(|c| c.seen.len()).sum();
+    pixels * (per_pixel * keyframes as u64 + 11 * predicted as u64) + (256 << 20)
 }
 
 #[cfg(test)]
@@ -263,6 +362,16 @@ mod tests {
         assert_eq!(plan[1], ChunkPlan { core: 16..32, seen: 12..36 });
         assert_eq!(plan[2], ChunkPlan { core: 32..37, seen: 28..37 });
         assert!(chunks(0, 16, 4).is_empty());
+    }
+
+    #[test]
+    fn overlapping_chunks_own_every_keyframe_once() {
+        let plan = overlapping(37, 16, 4).unwrap();
+        assert_eq!(plan[0], ChunkPlan { core: 0..14, seen: 0..16 });
+        assert_eq!(plan[1], ChunkPlan { core: 14..26, seen: 12..28 });
+        assert_eq!(plan[2], ChunkPlan { core: 26..37, seen: 24..37 });
+        assert!(overlapping(10, 4, 4).is_err());
+        assert_eq!(overlapping(3, 16, 4).unwrap(), [ChunkPlan { core: 0..3, seen: 0..3 }]);
     }
 
     #[test]

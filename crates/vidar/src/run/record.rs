@@ -116,7 +116,7 @@ impl About {
             dataset_sha256: sha256_hex(&dataset.fingerprint()?),
             config_sha256: sha256_hex(request.layered.to_toml(false).as_bytes()),
             model: plan.model_json(),
-            poses: serde_json::json!(plan.anchor.source),
+            poses: super::outputs::source_json(plan),
             hardware: serde_json::json!(crate::system::hardware()),
             ..Manifest::default()
         }))

@@ -1,7 +1,7 @@
 //! Keyframes as the model sees them: read, undistorted, with their prior pose.
 
 use crate::events::Events;
-use crate::keyframes::PosedFrame;
+use crate::keyframes::Keyframe;
 use rayon::prelude::*;
 use std::ops::Range;
 use vidar_core::remap::RemapTable;
@@ -11,7 +11,7 @@ use vidar_dataset::Dataset;
 /// A window of undistorted keyframes that moves forward through the sequence; each image is read once.
 pub struct ViewWindow<'a> {
     dataset: &'a Dataset,
-    keyframes: &'a [PosedFrame],
+    keyframes: &'a [Keyframe],
     remap: &'a RemapTable,
     /// Keyframe index with its view, ascending. Unreadable images are missing.
     views: Vec<(usize, ChunkView)>,
@@ -20,7 +20,7 @@ pub struct ViewWindow<'a> {
 
 impl<'a> ViewWindow<'a> {
     /// An empty window before the first keyframe.
-    pub fn new(dataset: &'a Dataset, keyframes: &'a [PosedFrame], remap: &'a RemapTable) -> Self {
+    pub fn new(dataset: &'a Dataset, keyframes: &'a [Keyframe], remap: &'a RemapTable) -> Self {
         Self { dataset, keyframes, remap, views: Vec::new(), next: 0 }
     }
 
@@ -64,7 +64,7 @@ impl<'a> ViewWindow<'a> {
             time: keyframe.image.time,
             image: self.remap.apply(&image),
             intrinsics: *self.remap.target(),
-            world_from_camera: Some(keyframe.world_from_camera),
+            world_from_camera: keyframe.world_from_camera,
         })
     }
 }

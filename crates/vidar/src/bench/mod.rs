@@ -1,0 +1,228 @@
+//! The paper's tables in one command: every sequence, every coupling, judged alike.
+//!
+//! ```text
+//! sequences ─▶ odometry (camera + IMU, camera alone) ─▶ Table I
+//!          └─▶ run per coupling mode ─▶ judged against scan and truth ─▶ Tables II and III
+//! ```
+//!
+//! A run that fails is a row that says why; it is counted and left out of the means. What is finished is kept: the same
+//! command in the same folder goes on where it stopped.
+
+mod figures;
+mod paper;
+mod row;
+mod sequences;
+mod tables;
+
+pub use row::{BenchRow, OdometryRow};
+pub use sequences::Sequence;
+pub use tables::Cells;
+
+use crate::config::{Layered, Origin};
+use crate::error::{Error, ExitStatus};
+use crate::events::{CancelToken, Event, Events};
+use crate::run_folder::pretty;
+use serde::Serialize;
+use std::path::{Path, PathBuf};
+use vidar_align::CouplingMode;
+use vidar_core::Trajectory;
+use vidar_dataset::{OpenOptions, TrajectoryReadOptions};
+use vidar_synth::{FlightKind, SceneKind, SynthConfig};
+
+/// Schema of `bench.json`.
+pub const BENCH_SCHEMA: &str = "vidar.bench/1";
+
+/// Which dataset.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum BenchKind {
+    /// EuRoC MAV.
+    Euroc,
+    /// TUM RGB-D.
+    Tum,
+}
+
+/// What to run.
+#[derive(Clone, Debug)]
+pub struct BenchRequest {
+    /// Which dataset.
+    pub kind: BenchKind,
+    /// The folder with its sequences. With `synthetic`, only its ground truth is used: rooms are flown along it.
+    pub root: Option<PathBuf>,
+    /// Render the sequences instead of reading their images.
+    pub synthetic: Option<SyntheticBench>,
+    /// Beginnings of the names wanted; empty = all.
+    pub sequences: Vec<String>,
+    /// Couplings to compare.
+    pub modes: Vec<CouplingMode>,
+    /// Whether the odometry alone is judged, too (Table I).
+    pub trajectories: bool,
+    /// Settings of all runs; `coupling.mode` is set per run.
+    pub layered: Layered,
+    /// Where everything goes.
+    pub out: PathBuf,
+    /// The command as typed.
+    pub command: Vec<String>,
+}
+
+/// How sequences are rendered.
+#[derive(Clone, Debug)]
+pub struct SyntheticBench {
+    /// The world; its scene and flight are set per sequence.
+    pub world: SynthConfig,
+}
+
+/// Everything that was measured.
+#[derive(Debug)]
+pub struct BenchOutcome {
+    /// The folder.
+    pub folder: PathBuf,
+    /// Sequences in order.
+    pub sequences: Vec<String>,
+    /// One row per sequence and coupling.
+    pub rows: Vec<BenchRow>,
+    /// One row per sequence and kind of odometry.
+    pub odometry: Vec<OdometryRow>,
+    /// The tables as Markdown.
+    pub markdown: String,
+    /// Done, or degraded when a run failed.
+    pub status: ExitStatus,
+}
+
+/// Runs everything that is not there yet, and writes tables, figures and report.
+pub fn bench(request: &BenchRequest, events: &Events, cancel: &CancelToken) -> Result<BenchOutcome, Error> {
+    let sequences = sequences_of(request, events, cancel)?;
+    let (mut rows, mut odometry) = (Vec::new(), Vec::new());
+    let total = sequences.len() * request.modes.len();
+    events.stage("bench", total, || -> Result<(), Error> {
+        for sequence in &sequences {
+            if request.trajectories && request.kind == BenchKind::Euroc {
+                for with_imu in [true, false] {
+                    interrupted(request, cancel)?;
+                    odometry.push(row::odometry_row(request, sequence, with_imu, cancel)?);
+                }
+            }
+            for mode in &request.modes {
+                interrupted(request, cancel)?;
+                rows.push(row::run_row(request, sequence, *mode, cancel)?);
+                events.emit(&Event::Progress { stage: "bench", done: rows.len(), total });
+            }
+        }
+        Ok(())
+    })?;
+    interrupted(request, cancel)?;
+    let failed = rows.iter().any(|r| r.failure.is_some()) || odometry.iter().any(|r| r.failure.is_some());
+    let names: Vec<String> = sequences.iter().map(|s| s.name.clone()).collect();
+    let cells = Cells::new(request, &names, &rows, &odometry);
+    let outcome = BenchOutcome {
+        folder: request.out.clone(),
+        markdown: cells.markdown(),
+        sequences: names,
+        rows,
+        odometry,
+        status: if failed { ExitStatus::Degraded } else { ExitStatus::Done },
+    };
+    write(request, &outcome, &cells)?;
+    Ok(outcome)
+}
+
+fn interrupted(request: &BenchRequest, cancel: &CancelToken) -> Result<(), Error> {
+    match cancel.is_cancelled() {
+        true => Err(Error::Interrupted { path: request.out.clone() }),
+        false => Ok(()),
+    }
+}
+
+fn write(request: &BenchRequest, outcome: &BenchOutcome, cells: &Cells) -> Result<(), Error> {
+    let put = |name: &str, bytes: &[u8]| -> Result<(), Error> {
+        Ok(vidar_export::atomic::write_file_atomically(&request.out.join(name), bytes)?)
+    };
+    let json = serde_json::json!({
+        "schema": BENCH_SCHEMA, "kind": request.kind, "synthetic": request.synthetic.is_some(),
+        "command": request.command, "sequences": outcome.sequences, "runs": outcome.rows,
+        "odometry": outcome.odometry,
+    });
+    put("bench.json", &pretty(&json))?;
+    put("tables.md", outcome.markdown.as_bytes())?;
+    put("report.html", figures::report(request, outcome, cells)?.as_bytes())
+}
+
+/// The sequences as they lie below the root, or rendered ones.
+fn sequences_of(
+    request: &BenchRequest,
+    events: &Events,
+    cancel: &CancelToken,
+) -> Result<Vec<Sequence>, Error> {
+    let real = |root: &Path| sequences::find(root, request.kind, &request.sequences);
+    std::fs::create_dir_all(&request.out).map_err(|e| Error::io("create", &request.out, e))?;
+    let Some(synthetic) = &request.synthetic else {
+        let root = request.root.as_ref().ok_or_else(|| Error::Usage {
+            what: "no folder of sequences was given".into(),
+            hint: "name the folder where the dataset was unpacked, or add --synthetic".into(),
+        })?;
+        return real(root);
+    };
+    let flights: Vec<(String, Option<Trajectory>, SynthConfig)> = match &request.root {
+        Some(root) => real(root)?
+            .into_iter()
+            .map(|s| {
+                let flight = truth_of(&s.path)?;
+                Ok((
+                    s.name.clone(),
+                    Some(flight),
+                    SynthConfig { scene: scene_of(&s.name), ..synthetic.world.clone() },
+                ))
+            })
+            .collect::<Result<_, Error>>()?,
+        None => built_in(&synthetic.world, &request.sequences),
+    };
+    let mut rendered = Vec::new();
+    for (name, flight, world) in flights {
+        let path = request.out.join("sequences").join(&name);
+        // The last part that a rendered sequence gets tells that it is whole.
+        if !path.join("mav0").exists() {
+            if path.exists() {
+                std::fs::remove_dir_all(&path).map_err(|e| Error::io("remove", &path, e))?;
+            }
+            crate::demo::synthesise(&path, &world, flight.as_ref(), events, cancel)?;
+        }
+        rendered.push(Sequence { name, path });
+    }
+    Ok(rendered)
+}
+
+/// The machine hall of EuRoC is a hall, its Vicon room a room.
+fn scene_of(name: &str) -> SceneKind {
+    if name.starts_with("MH") { SceneKind::Hall } else { SceneKind::Room }
+}
+
+/// Ground truth of a EuRoC sequence without looking at its images.
+fn truth_of(sequence: &Path) -> Result<Trajectory, Error> {
+    let file = sequence.join("mav0/state_groundtruth_estimate0/data.csv");
+    Ok(vidar_dataset::read_trajectory(&file, &TrajectoryReadOptions::default())?.0)
+}
+
+/// Flights that need no dataset: three kinds in two rooms each, named after the rooms that they stand for.
+fn built_in(world: &SynthConfig, wanted: &[String]) -> Vec<(String, Option<Trajectory>, SynthConfig)> {
+    let flights = [FlightKind::Sweep, FlightKind::Orbit, FlightKind::Aggressive];
+    let all = (1..=2_u64).flat_map(|room| {
+        flights.iter().enumerate().map(move |(k, flight)| {
+            let seed = world.seed.wrapping_mul(100).wrapping_add(room * 10 + k as u64);
+            (format!("room{room}_{}", k + 1), None, SynthConfig { seed, flight: *flight, ..world.clone() })
+        })
+    });
+    all.filter(|(name, ..)| wanted.is_empty() || wanted.iter().any(|w| name.starts_with(w.as_str())))
+        .collect()
+}
+
+/// The settings of one run.
+fn layered_for(request: &BenchRequest, mode: CouplingMode) -> Result<Layered, Error> {
+    let mut layered = request.layered.clone();
+    layered.value("coupling.mode", toml::Value::String(mode.to_string()), Origin::Flag("bench"))?;
+    Ok(layered)
+}
+
+/// How sequences are opened.
+fn open_options() -> OpenOptions {
+    OpenOptions::default()
+}

@@ -1,0 +1,99 @@
+//! The sequences under a folder as the datasets are downloaded and unpacked.
+
+use super::BenchKind;
+use crate::error::Error;
+use std::path::{Path, PathBuf};
+
+/// A sequence to run on.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Sequence {
+    /// Short name, as in the paper's tables: `V1_01`, `fr1_xyz`.
+    pub name: String,
+    /// Where it lies.
+    pub path: PathBuf,
+}
+
+/// How deep sequences may lie below the root: `machine_hall/MH_01_easy/mav0`.
+const DEPTH: usize = 3;
+
+/// Every sequence of the kind below `root`, by name. Only those whose name begins with one of `wanted`, unless that is empty.
+pub fn find(root: &Path, kind: BenchKind, wanted: &[String]) -> Result<Vec<Sequence>, Error> {
+    let mut found = Vec::new();
+    walk(root, kind, DEPTH, &mut found)?;
+    found.sort_by(|a, b| a.name.cmp(&b.name));
+    found.dedup_by(|a, b| a.name == b.name);
+    let all = found.len();
+    found.retain(|s| wanted.is_empty() || wanted.iter().any(|w| s.name.starts_with(w.as_str())));
+    match (found.is_empty(), kind) {
+        (false, _) => Ok(found),
+        (true, BenchKind::Euroc) => {
+            Err(nothing(root, all, "a folder with mav0/ per sequence, as EuRoC's archives unpack"))
+        }
+        (true, BenchKind::Tum) => {
+            Err(nothing(root, all, "rgbd_dataset_*/ with rgb.txt, as TUM's archives unpack"))
+        }
+    }
+}
+
+fn nothing(root: &Path, all: usize, expected: &str) -> Error {
+    let what = match all {
+        0 => format!("no sequence below {}", root.display()),
+        n => format!("none of the {n} sequences below {} was asked for", root.display()),
+    };
+    Error::Usage { what, hint: format!("expected {expected}; --sequences names some of them") }
+}
+
+fn walk(folder: &Path, kind: BenchKind, depth: usize, found: &mut Vec<Sequence>) -> Result<(), Error> {
+    let is_sequence = match kind {
+        BenchKind::Euroc => folder.join("mav0").is_dir(),
+        BenchKind::Tum => folder.join("rgb.txt").is_file(),
+    };
+    if is_sequence {
+        let name = folder.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default();
+        found.push(Sequence { name: short(&name), path: folder.to_owned() });
+        return Ok(());
+    }
+    if depth == 0 {
+        return Ok(());
+    }
+    let entries = std::fs::read_dir(folder).map_err(|e| Error::io("open", folder, e))?;
+    let mut folders: Vec<PathBuf> =
+        entries.filter_map(|e| Some(e.ok()?.path())).filter(|p| p.is_dir()).collect();
+    folders.sort();
+    folders.iter().try_for_each(|f| walk(f, kind, depth - 1, found))
+}
+
+/// `V1_01_easy` is `V1_01`, `rgbd_dataset_freiburg1_xyz` is `fr1_xyz`.
+fn short(name: &str) -> String {
+    let name = name.strip_prefix("rgbd_dataset_").unwrap_or(name).replace("freiburg", "fr");
+    let ending = ["_easy", "_medium", "_difficult"].iter().find_map(|e| name.strip_suffix(e));
+    ending.unwrap_or(&name).to_owned()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn sequences_are_found_as_they_are_unpacked_and_named_as_in_the_paper() {
+        let root = tempfile::tempdir().unwrap();
+        for path in [
+            "vicon_room1/V1_01_easy/mav0/cam0",
+            "MH_05_difficult/mav0",
+            "rgbd_dataset_freiburg1_xyz",
+            "notes",
+        ] {
+            std::fs::create_dir_all(root.path().join(path)).unwrap();
+        }
+        std::fs::write(root.path().join("rgbd_dataset_freiburg1_xyz/rgb.txt"), "").unwrap();
+        let names = |kind, wanted: &[&str]| -> Vec<String> {
+            let wanted: Vec<String> = wanted.iter().map(|w| (*w).to_owned()).collect();
+            find(root.path(), kind, &wanted).unwrap().into_iter().map(|s| s.name).collect()
+        };
+        assert_eq!(names(BenchKind::Euroc, &[]), ["MH_05", "V1_01"]);
+        assert_eq!(names(BenchKind::Euroc, &["V1"]), ["V1_01"]);
+        assert_eq!(names(BenchKind::Tum, &[]), ["fr1_xyz"]);
+        let error = find(root.path(), BenchKind::Euroc, &["V9".into()]).unwrap_err();
+        assert!(error.to_string().contains("none of the 2 sequences"), "{error}");
+    }
+}

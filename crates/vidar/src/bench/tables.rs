@@ -1,0 +1,377 @@
+//! Tables I, II and III of the paper, ours beside it.
+
+use super::{BenchKind, BenchRequest, BenchRow, OdometryRow, paper};
+use std::fmt::Write as _;
+use vidar_align::CouplingMode;
+
+/// One table as text cells; the report and the Markdown file are made of the same ones.
+#[derive(Clone, Debug)]
+pub(super) struct Grid {
+    pub caption: String,
+    pub columns: Vec<String>,
+    pub rows: Vec<Vec<String>>,
+}
+
+/// Every table of a bench.
+#[derive(Clone, Debug)]
+pub struct Cells {
+    pub(super) grids: Vec<Grid>,
+    pub(super) notes: Vec<String>,
+    title: String,
+}
+
+impl Cells {
+    pub(super) fn new(
+        request: &BenchRequest,
+        sequences: &[String],
+        rows: &[BenchRow],
+        odometry: &[OdometryRow],
+    ) -> Self {
+        let table = Table { request, sequences, rows, odometry };
+        let name = match request.kind {
+            BenchKind::Euroc => "EuRoC MAV",
+            BenchKind::Tum => "TUM RGB-D",
+        };
+        let rendered = if request.synthetic.is_some() { ", rendered" } else { "" };
+        let mut grids = vec![table.trajectories()];
+        if request.kind == BenchKind::Euroc {
+            grids.extend([table.dense(0.10), table.dense(0.05), table.metricness()]);
+        } else {
+            grids.push(table.dense(0.10));
+            grids.push(table.dense(0.05));
+        }
+        grids.push(table.cost());
+        grids.extend(table.failures());
+        Self { grids, notes: notes(request), title: format!("{name}{rendered}") }
+    }
+
+    /// All tables as one Markdown text.
+    pub fn markdown(&self) -> String {
+        let mut text = format!("# {}\n\n", self.title);
+        self.notes.iter().for_each(|n| {
+            let _ = writeln!(text, "- {n}");
+        });
+        for grid in &self.grids {
+            let _ = writeln!(text, "\n## {}\n", grid.caption);
+            let _ = writeln!(text, "| {} |", grid.columns.join(" | "));
+            let line: Vec<&str> =
+                grid.columns.iter().enumerate().map(|(i, _)| if i == 0 { "---" } else { "--:" }).collect();
+            let _ = writeln!(text, "|{}|", line.join("|"));
+            for row in &grid.rows {
+                let cells: Vec<String> = row.iter().map(|c| c.replace('|', "\\|")).collect();
+                let _ = writeln!(text, "| {} |", cells.join(" | "));
+            }
+        }
+        text
+    }
+}
+
+fn notes(request: &BenchRequest) -> Vec<String> {
+    let mut notes = vec![
+        "F after native-scale bounded placement (paper, section IV-B); numbers in brackets are the paper's."
+            .to_owned(),
+        "Means are over valid runs; failed ones are counted and listed with their reason.".to_owned(),
+    ];
+    if request.synthetic.is_some() {
+        notes.push(
+            "Rendered sequences: easier than real ones and not comparable with the paper's numbers, which stand here for order only.".to_owned(),
+        );
+    }
+    notes
+}
+
+struct Table<'a> {
+    request: &'a BenchRequest,
+    sequences: &'a [String],
+    rows: &'a [BenchRow],
+    odometry: &'a [OdometryRow],
+}
+
+impl Table<'_> {
+    fn of(&self, sequence: &str, mode: CouplingMode) -> Option<&BenchRow> {
+        self.rows.iter().find(|r| r.sequence == sequence && r.mode == mode)
+    }
+
+    fn modes(&self) -> impl Iterator<Item = CouplingMode> {
+        self.request.modes.clone().into_iter()
+    }
+
+    /// Table I: method, valid sequences, mean and median Sim(3) RMSE.
+    fn trajectories(&self) -> Grid {
+        let mut rows = Vec::new();
+        let mut add = |name: String, ates: Vec<Option<f64>>, papers: Option<(&str, f64, f64)>| {
+            let valid: Vec<f64> = ates.iter().flatten().copied().collect();
+            if ates.is_empty() {
+                return;
+            }
+            let beside = |ours: Option<f64>, paper: Option<f64>| with_paper(ours, paper, 3);
+            rows.push(vec![
+                name,
+                format!(
+                    "{}/{}{}",
+                    valid.len(),
+                    ates.len(),
+                    papers.map_or_else(String::new, |p| format!(" [{}]", p.0))
+                ),
+                beside(mean(&valid), papers.map(|p| p.1)),
+                beside(median(&valid), papers.map(|p| p.2)),
+            ]);
+        };
+        let euroc = self.request.kind == BenchKind::Euroc;
+        for (with_imu, name, k) in
+            [(false, "odometry, camera alone", 0), (true, "odometry, camera and IMU", 1)]
+        {
+            let of: Vec<_> = self
+                .odometry
+                .iter()
+                .filter(|r| r.with_imu == with_imu)
+                .map(|r| r.trajectory.ate_sim3_m)
+                .collect();
+            let p = paper::EUROC_TRAJECTORY[k];
+            add(name.to_owned(), of, euroc.then_some((p.1, p.2, p.3)));
+        }
+        for mode in self.modes().filter(|m| m.chains()) {
+            let of: Vec<_> = self
+                .sequences
+                .iter()
+                .filter_map(|s| self.of(s, mode))
+                .map(|r| r.trajectory.ate_sim3_m)
+                .collect();
+            let p = match (euroc, mode) {
+                (true, CouplingMode::Da3Streaming) => Some(paper::EUROC_TRAJECTORY[2]),
+                (false, CouplingMode::PoseFree) => Some(paper::TUM_TRAJECTORY[1]),
+                _ => None,
+            };
+            add(format!("map, {mode}"), of, p.map(|p| (p.1, p.2, p.3)));
+        }
+        Grid {
+            caption: "Table I: trajectories, Sim(3)-aligned RMSE".into(),
+            columns: ["Method", "Valid", "Mean, m", "Median, m"].map(String::from).to_vec(),
+            rows,
+        }
+    }
+
+    /// Table II: F per sequence and coupling.
+    fn dense(&self, threshold_m: f64) -> Grid {
+        let score = |r: &BenchRow| if threshold_m < 0.075 { r.f05 } else { r.f10 };
+        let paper_of = |row: &paper::DenseRow, mode| {
+            let values = if threshold_m < 0.075 { row.2 } else { row.1 };
+            paper_column(mode).and_then(|k| values[k])
+        };
+        let mut rows: Vec<Vec<String>> = self
+            .sequences
+            .iter()
+            .map(|sequence| {
+                let known = paper::DENSE.iter().find(|row| row.0 == sequence);
+                let cell = |mode| {
+                    let row = self.of(sequence, mode);
+                    match row.and_then(|r| r.failure.as_ref()) {
+                        Some(_) => "failed".to_owned(),
+                        None => with_paper(row.and_then(score), known.and_then(|k| paper_of(k, mode)), 3),
+                    }
+                };
+                std::iter::once(sequence.clone()).chain(self.modes().map(cell)).collect()
+            })
+            .collect();
+        let euroc = self.request.kind == BenchKind::Euroc;
+        let average = |mode| {
+            let values: Vec<f64> = self.sequences.iter().filter_map(|s| score(self.of(s, mode)?)).collect();
+            let paper = match (euroc, mode) {
+                (false, _) => None,
+                (true, CouplingMode::Hybrid) if threshold_m > 0.075 => Some(paper::HYBRID_F10),
+                (true, mode) => paper_of(&paper::DENSE_MEAN, mode),
+            };
+            format!("{} ({}/{})", with_paper(mean(&values), paper, 3), values.len(), self.sequences.len())
+        };
+        rows.push(std::iter::once("mean (valid)".to_owned()).chain(self.modes().map(average)).collect());
+        Grid {
+            caption: format!("Table II: F@{threshold_m:.2} against the scan"),
+            columns: std::iter::once("Sequence".to_owned())
+                .chain(self.modes().map(|m| m.to_string()))
+                .collect(),
+            rows,
+        }
+    }
+
+    /// Table III: how metric each coupling is.
+    fn metricness(&self) -> Grid {
+        let values = |mode, value: fn(&BenchRow) -> Option<f64>| -> Vec<f64> {
+            self.sequences.iter().filter_map(|s| value(self.of(s, mode)?)).collect()
+        };
+        let statistic = |name: &str, mode| -> Option<f64> {
+            let logs = values(mode, |r| r.trajectory.log_scale);
+            match name {
+                "mean |ln s|" => mean(&logs.iter().map(|s| s.abs()).collect::<Vec<_>>()),
+                "std(ln s)" => deviation(&logs),
+                "F@0.10 native" => mean(&values(mode, |r| r.f10)),
+                "F@0.10 free" => mean(&values(mode, |r| r.f10_free)),
+                _ => mean(&values(mode, |r| Some(r.f10_free? - r.f10?))),
+            }
+        };
+        let rows = paper::METRICNESS.iter().map(|(name, papers)| {
+            let cell = |mode| with_paper(statistic(name, mode), paper_column(mode).map(|k| papers[k]), 4);
+            std::iter::once((*name).to_owned()).chain(self.modes().map(cell)).collect()
+        });
+        Grid {
+            caption: "Table III: how metric the result is".into(),
+            columns: std::iter::once("Metric".to_owned())
+                .chain(self.modes().map(|m| m.to_string()))
+                .collect(),
+            rows: rows.collect(),
+        }
+    }
+
+    fn cost(&self) -> Grid {
+        let row = |mode: CouplingMode| {
+            let of: Vec<&BenchRow> = self
+                .sequences
+                .iter()
+                .filter_map(|s| self.of(s, mode))
+                .filter(|r| r.failure.is_none() && r.keyframes > 0)
+                .collect();
+            let per: Vec<f64> = of.iter().map(|r| r.seconds / r.keyframes as f64).collect();
+            let peak = of.iter().filter_map(|r| r.peak_memory_bytes).max();
+            vec![
+                mode.to_string(),
+                of.iter().map(|r| r.keyframes).sum::<usize>().to_string(),
+                number(median(&per), 3),
+                peak.map_or_else(|| "–".into(), crate::run::bytes),
+                "none used".to_owned(),
+            ]
+        };
+        Grid {
+            caption: format!("Cost (the paper's GPU memory: {:.1} GB at most)", paper::GPU_BYTES / 1e9),
+            columns: [
+                "Coupling",
+                "Keyframes",
+                "Seconds per keyframe, median",
+                "CPU memory, peak",
+                "GPU memory",
+            ]
+            .map(String::from)
+            .to_vec(),
+            rows: self.modes().map(row).collect(),
+        }
+    }
+
+    fn failures(&self) -> Option<Grid> {
+        let runs =
+            self.rows.iter().filter_map(|r| Some((&r.sequence, r.mode.to_string(), r.failure.clone()?)));
+        let odometry = self.odometry.iter().filter_map(|r| {
+            let name = if r.with_imu { "odometry" } else { "odometry, camera alone" };
+            Some((&r.sequence, name.to_owned(), r.failure.clone()?))
+        });
+        let rows: Vec<_> = runs.chain(odometry).map(|(s, m, why)| vec![s.clone(), m, why]).collect();
+        (!rows.is_empty()).then(|| Grid {
+            caption: "Failed".into(),
+            columns: ["Sequence", "What", "Why"].map(String::from).to_vec(),
+            rows,
+        })
+    }
+}
+
+/// Which of the paper's columns PF, VIO, GT a coupling is.
+fn paper_column(mode: CouplingMode) -> Option<usize> {
+    match mode {
+        CouplingMode::PoseFree => Some(0),
+        CouplingMode::PoseConditioned => Some(1),
+        CouplingMode::GroundTruth => Some(2),
+        _ => None,
+    }
+}
+
+fn number(value: Option<f64>, digits: usize) -> String {
+    value.map_or_else(|| "–".to_owned(), |v| format!("{v:.digits$}"))
+}
+
+fn with_paper(ours: Option<f64>, paper: Option<f64>, digits: usize) -> String {
+    match paper {
+        Some(paper) => format!("{} [{paper:.3}]", number(ours, digits)),
+        None => number(ours, digits),
+    }
+}
+
+fn mean(values: &[f64]) -> Option<f64> {
+    (!values.is_empty()).then(|| values.iter().sum::<f64>() / values.len() as f64)
+}
+
+fn median(values: &[f64]) -> Option<f64> {
+    let mut sorted = values.to_vec();
+    sorted.sort_unstable_by(f64::total_cmp);
+    let n = sorted.len();
+    match n {
+        0 => None,
+        _ => Some(0.5 * (sorted[(n - 1) / 2] + sorted[n / 2])),
+    }
+}
+
+/// Standard deviation over sequences (of the sample).
+fn deviation(values: &[f64]) -> Option<f64> {
+    let middle = mean(values)?;
+    let squares: f64 = values.iter().map(|v| (v - middle).powi(2)).sum();
+    (values.len() > 1).then(|| (squares / (values.len() - 1) as f64).sqrt())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::bench::row::TrajectoryScores;
+    use crate::config::Layered;
+
+    fn row(sequence: &str, mode: CouplingMode, f10: f64, log_scale: f64) -> BenchRow {
+        BenchRow {
+            sequence: sequence.into(),
+            mode,
+            f10: Some(f10),
+            f05: Some(f10 / 2.0),
+            f10_free: Some(f10 + 0.1),
+            trajectory: TrajectoryScores {
+                ate_sim3_m: Some(0.02),
+                log_scale: Some(log_scale),
+                ..TrajectoryScores::default()
+            },
+            keyframes: 10,
+            seconds: 5.0,
+            ..BenchRow::default()
+        }
+    }
+
+    #[test]
+    fn tables_hold_valid_runs_and_count_the_failed_ones() {
+        let (pf, hybrid) = (CouplingMode::PoseFree, CouplingMode::Hybrid);
+        let request = BenchRequest {
+            kind: BenchKind::Euroc,
+            root: None,
+            synthetic: None,
+            sequences: Vec::new(),
+            modes: vec![pf, hybrid],
+            trajectories: false,
+            layered: Layered::defaults().unwrap(),
+            out: "out".into(),
+            command: Vec::new(),
+        };
+        let names = ["V1_01".to_owned(), "V1_02".to_owned()];
+        let failed = BenchRow { failure: Some("E0305 nothing".into()), ..row("V1_02", hybrid, 0.0, 0.0) };
+        let rows = [
+            row("V1_01", pf, 0.4, 0.5),
+            row("V1_02", pf, 0.2, -0.3),
+            row("V1_01", hybrid, 0.7, 0.01),
+            BenchRow {
+                f10: None,
+                f05: None,
+                f10_free: None,
+                trajectory: TrajectoryScores::default(),
+                ..failed
+            },
+        ];
+        let text = Cells::new(&request, &names, &rows, &[]).markdown();
+        assert!(text.contains("| V1_01 | 0.400 [0.583] | 0.700 |"), "{text}");
+        assert!(text.contains("| V1_02 | 0.200 [0.025] | failed |"), "{text}");
+        assert!(text.contains("| mean (valid) | 0.300 [0.405] (2/2) | 0.700 [0.676] (1/2) |"), "{text}");
+        assert!(text.contains("| mean \\|ln s\\| | 0.4000 [0.458] | 0.0100 |"), "{text}");
+        assert!(text.contains("| ΔF | 0.1000 [0.256] | 0.1000 |"), "{text}");
+        assert!(text.contains("| V1_02 | hybrid | E0305 nothing |"), "{text}");
+        assert_eq!((median(&[3.0, 1.0]), median(&[])), (Some(2.0), None));
+        assert_eq!(deviation(&[1.0]), None);
+    }
+}

@@ -1,0 +1,105 @@
+//! What the odometry knows of a chunk's frames, in the aligner's terms.
+
+use super::plan::{ChunkPlan, Plan};
+use crate::keyframes::Keyframe;
+use nalgebra::Vector2;
+use std::collections::BTreeMap;
+use vidar_align::aligner::covariance_in_camera;
+use vidar_align::{ChunkObservation, FrameObservation, MetricAnchor};
+use vidar_core::{
+    CameraModel, FrameId, GeometryPrediction, KeyframeId, LieGroup, OdometryKeyframe, Pinhole,
+    PoseCovariance, Se3, SparseLandmark,
+};
+
+/// A chunk's prediction with poses, covariances, gravity and landmarks of its frames.
+pub fn of(
+    plan: &Plan,
+    known: &Known<'_>,
+    chunk: &ChunkPlan,
+    prediction: GeometryPrediction,
+) -> ChunkObservation {
+    let frames = chunk
+        .seen
+        .clone()
+        .map(|k| {
+            let keyframe = &plan.keyframes[k];
+            let size =
+                prediction.views.iter().find(|v| v.frame_id == keyframe.image.frame_id).map(|v| v.intrinsics);
+            known.frame(plan, k, keyframe, size)
+        })
+        .collect();
+    ChunkObservation { prediction, frames }
+}
+
+/// The odometry's keyframes by frame, where poses are its.
+pub struct Known<'a> {
+    by_frame: BTreeMap<FrameId, &'a OdometryKeyframe>,
+    by_id: BTreeMap<KeyframeId, &'a OdometryKeyframe>,
+    body_from_camera: Se3,
+}
+
+impl<'a> Known<'a> {
+    /// What the plan's anchor knows; `body_from_camera` is the camera's place on the rig.
+    pub fn new(plan: &'a Plan, body_from_camera: Se3) -> Self {
+        let tracked = plan.anchor.as_ref().and_then(|a| a.tracked.as_ref());
+        let keyframes = || tracked.iter().flat_map(|t| &t.keyframes);
+        Self {
+            by_frame: keyframes().map(|k| (k.frame_id, k)).collect(),
+            by_id: keyframes().map(|k| (k.id, k)).collect(),
+            body_from_camera,
+        }
+    }
+
+    fn frame(&self, plan: &Plan, k: usize, keyframe: &Keyframe, depth: Option<Pinhole>) -> FrameObservation {
+        let mut frame = FrameObservation::new(keyframe.image.frame_id, keyframe.image.time);
+        let Some(pose) = keyframe.world_from_camera else { return frame };
+        let Some(odometry) = self.by_frame.get(&keyframe.image.frame_id) else {
+            return frame.with_anchor(MetricAnchor::known(pose));
+        };
+        let before = k.checked_sub(1).and_then(|k| self.by_frame.get(&plan.keyframes[k].image.frame_id));
+        let mut anchor = MetricAnchor::from_odometry(odometry, &self.body_from_camera);
+        // The trajectory in use may be smoother than what the keyframe was first given.
+        anchor.world_from_camera = pose;
+        anchor.relative_covariance = before
+            .and_then(|before| self.since(odometry, before))
+            .map(|covariance| covariance_in_camera(&covariance, &self.body_from_camera));
+        if let Some(depth) = depth {
+            let to_depth = |l: &SparseLandmark| in_depth_image(l, &plan.camera, &plan.view, &depth);
+            frame.landmarks = odometry.landmarks.iter().filter_map(to_depth).collect();
+        }
+        frame.with_anchor(anchor)
+    }
+
+    /// Covariance of the motion between two keyframes that need not be neighbours, in the later body's axes:
+    /// `X₁ exp(δ₁) X₂ exp(δ₂) = X₁ X₂ exp(Ad(X₂⁻¹) δ₁) exp(δ₂)`.
+    fn since(&self, later: &OdometryKeyframe, earlier: &OdometryKeyframe) -> Option<PoseCovariance> {
+        let mut total = PoseCovariance::zeros();
+        let mut at = later;
+        while at.id != earlier.id {
+            let (previous, covariance) = at.previous?;
+            let at_from_later = at.state.world_from_body.inverse() * later.state.world_from_body;
+            let turn = at_from_later.inverse().adjoint();
+            total += turn * covariance * turn.transpose();
+            at = self.by_id.get(&previous)?;
+        }
+        Some(total)
+    }
+}
+
+/// A landmark of the raw image where the depth image shows it; `None` outside.
+fn in_depth_image(
+    landmark: &SparseLandmark,
+    camera: &CameraModel,
+    view: &Pinhole,
+    depth: &Pinhole,
+) -> Option<SparseLandmark> {
+    let seen = view.project(&camera.unproject(&landmark.pixel)?)?;
+    let scaled = |c: f64, from: usize, to: usize| (c + 0.5) * to as f64 / from as f64 - 0.5;
+    let pixel =
+        Vector2::new(scaled(seen.x, view.width, depth.width), scaled(seen.y, view.height, depth.height));
+    let inside = pixel.x >= 0.0
+        && pixel.y >= 0.0
+        && pixel.x <= (depth.width - 1) as f64
+        && pixel.y <= (depth.height - 1) as f64;
+    inside.then_some(SparseLandmark { pixel, ..*landmark })
+}

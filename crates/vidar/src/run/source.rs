@@ -1,0 +1,157 @@
+//! Where depth comes from: stereo, a network, or a recording, behind one trait.
+
+use crate::chunks::{RecordedModel, Recording};
+use crate::config::Config;
+use crate::error::Error;
+use crate::models::Located;
+use crate::models::geometry::{self, NetworkPlan, SourceChoice};
+use std::sync::Arc;
+use vidar_align::CouplingMode;
+use vidar_core::{
+    ChunkViews, GeometryModel, GeometryPrediction, Image, ModelError, ModelInfo, Pinhole, Warning,
+};
+use vidar_da3::{Da3Model, PoseMode};
+use vidar_dataset::{Dataset, ImageEntry};
+use vidar_stereo::StereoModel;
+use vidar_synth::Simulation;
+use vidar_synth::predict::{Conditioning, PredictionErrors, SyntheticModel};
+
+/// Longer side of a simulated network's predictions, as of a small one.
+const SIMULATED_SIDE_PX: usize = 280;
+
+/// An open source of geometry.
+pub enum Source {
+    /// Multi-view stereo: needs poses, answers in their world.
+    Stereo(StereoModel),
+    /// A network.
+    Network(Box<(Da3Model, Located)>),
+    /// Predictions made elsewhere.
+    Recorded(RecordedModel),
+    /// A simulated network that knows a synthetic recording's world.
+    Simulated(SyntheticModel),
+}
+
+/// What a source asks of the plan.
+pub struct Opened {
+    /// The source.
+    pub source: Source,
+    /// Images per chunk, where the recording prescribes them.
+    pub chunks: Option<Vec<Vec<usize>>>,
+}
+
+impl Source {
+    /// Opens what the configuration names. `images` are those that a recording may be of.
+    pub fn open(dataset: &Dataset, images: &[ImageEntry], config: &Config) -> Result<Opened, Error> {
+        let mode = config.coupling.mode;
+        let mut chunks = None;
+        let source = match geometry::source(config)? {
+            SourceChoice::Stereo
+                if matches!(
+                    mode,
+                    CouplingMode::Da3Streaming | CouplingMode::PoseFree | CouplingMode::Hybrid
+                ) =>
+            {
+                return Err(Error::Usage {
+                    what: format!(
+                        "coupling mode {mode} needs a source of geometry that finds poses, stereo is given them"
+                    ),
+                    hint: "choose --geometry da3-small (or another network), or --mode pose-conditioned"
+                        .into(),
+                });
+            }
+            SourceChoice::Stereo => Self::Stereo(StereoModel::new(config.stereo.clone())?),
+            SourceChoice::Network(choice) => {
+                Self::Network(Box::new(geometry::open(&choice, config, pose_mode(config))?))
+            }
+            SourceChoice::Recorded(folder) => {
+                let geometry = &config.geometry;
+                let recording =
+                    Recording::open(&folder, images, geometry.chunk_keyframes, geometry.overlap_keyframes)?;
+                chunks = Some(recording.chunks.iter().map(|c| c.images.clone()).collect());
+                Self::Recorded(RecordedModel::new(recording))
+            }
+            SourceChoice::Simulated => Self::Simulated(simulated(dataset, config)?),
+        };
+        Ok(Opened { source, chunks })
+    }
+
+    /// Whether chunks are tied by keyframes that both hold; stereo's are tied by the poses that it is given.
+    pub fn overlaps(&self) -> bool {
+        !matches!(self, Self::Stereo(_))
+    }
+
+    fn model(&mut self) -> &mut dyn GeometryModel {
+        match self {
+            Self::Stereo(model) => model,
+            Self::Network(network) => &mut network.0,
+            Self::Recorded(model) => model,
+            Self::Simulated(model) => model,
+        }
+    }
+
+    /// What it is.
+    pub fn info(&self) -> &ModelInfo {
+        match self {
+            Self::Stereo(model) => model.info(),
+            Self::Network(network) => network.0.info(),
+            Self::Recorded(model) => model.info(),
+            Self::Simulated(model) => model.info(),
+        }
+    }
+
+    /// Depth of the views `wanted`.
+    pub fn predict(
+        &mut self,
+        views: &ChunkViews,
+        wanted: std::ops::Range<usize>,
+        cancel: &(dyn Fn() -> bool + Sync),
+    ) -> Result<GeometryPrediction, ModelError> {
+        self.model().predict_wanted(views, wanted, cancel)
+    }
+
+    /// Pictures at the depth's size that came with the last prediction, one per view; empty where none did.
+    pub fn take_colors(&mut self) -> Vec<Image<[u8; 3]>> {
+        match self {
+            Self::Recorded(model) => model.take_colors(),
+            Self::Stereo(_) | Self::Network(_) | Self::Simulated(_) => Vec::new(),
+        }
+    }
+
+    /// What running it on chunks of `views` such views takes; warnings join `warnings`.
+    pub fn planned(
+        &self,
+        config: &Config,
+        view: &Pinhole,
+        views: usize,
+        warnings: &mut Vec<Warning>,
+    ) -> Result<Option<NetworkPlan>, Error> {
+        let Self::Network(network) = self else { return Ok(None) };
+        let (model, located) = network.as_ref();
+        let (plan, noticed) = geometry::planned(model, located, config, view, views)?;
+        warnings.extend(noticed);
+        Ok(Some(plan))
+    }
+}
+
+/// The simulated network of a recording that `vidar synth` made.
+fn simulated(dataset: &Dataset, config: &Config) -> Result<SyntheticModel, Error> {
+    // `mav0/` lies inside the folder that was written.
+    let inner = dataset.root.ends_with("mav0").then(|| dataset.root.parent()).flatten();
+    let simulation = Arc::new(Simulation::open(inner.unwrap_or(&dataset.root))?);
+    let seed = simulation.config().seed;
+    let conditioning = match pose_mode(config) {
+        PoseMode::Free => Conditioning::PoseFree,
+        PoseMode::Conditioned => Conditioning::PosesInjected,
+    };
+    let errors = PredictionErrors::default();
+    Ok(SyntheticModel::new(simulation, errors, conditioning, SIMULATED_SIDE_PX, seed)?)
+}
+
+/// Whether the network is told where the cameras are.
+fn pose_mode(config: &Config) -> PoseMode {
+    match config.coupling.mode {
+        CouplingMode::PoseConditioned | CouplingMode::GroundTruth => PoseMode::Conditioned,
+        CouplingMode::Da3Streaming | CouplingMode::PoseFree | CouplingMode::Hybrid => PoseMode::Free,
+        _ => config.model.network.mode,
+    }
+}
