@@ -8,11 +8,12 @@ use std::path::Path;
 const LAYERS: &[(&str, &[&str])] = &[
     ("vidar-core", &[]),
     ("vidar-nn", &[]),
+    ("vidar-gpu", &[]),
     ("vidar-hub", &[]),
     ("vidar-solve", &["vidar-core"]),
     ("vidar-dataset", &["vidar-core"]),
     ("vidar-odometry", &["vidar-core", "vidar-solve"]),
-    ("vidar-da3", &["vidar-core", "vidar-nn"]),
+    ("vidar-da3", &["vidar-core", "vidar-nn", "vidar-gpu"]),
     ("vidar-stereo", &["vidar-core"]),
     ("vidar-align", &["vidar-core", "vidar-solve"]),
     ("vidar-fusion", &["vidar-core"]),
@@ -32,6 +33,7 @@ const RESERVED: &[(&str, &[&str], &str)] = &[
     ("tiny-skia", &["vidar-view"], "pictures are drawn in one place"),
     ("kiddo", &["vidar-eval"], "nearest neighbours are searched in one place"),
     ("ureq", &["vidar-hub"], "the network is used in one place, and only when asked for"),
+    ("wgpu", &["vidar-gpu"], "graphics processors are spoken to in one place"),
     ("zip", &["vidar-export"], "archives are read and written in one place, within bounds"),
 ];
 

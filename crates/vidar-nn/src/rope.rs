@@ -36,6 +36,16 @@ impl RopeTable {
         self.head_dim
     }
 
+    /// Cosines, `[tokens, 2, head_dim / 4]`.
+    pub fn cos(&self) -> &[f32] {
+        &self.cos
+    }
+
+    /// Sines, laid out as the cosines.
+    pub fn sin(&self) -> &[f32] {
+        &self.sin
+    }
+
     /// Turns one head of token `token` where it stands.
     pub fn rotate(&self, token: usize, head: &mut [f32]) {
         debug_assert_eq!(head.len(), self.head_dim);
