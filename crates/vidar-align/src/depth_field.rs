@@ -2,7 +2,13 @@
 //!
 //! `log D'(u) = log D(u) + β + Σₘ φₘ(u) gₘ`, φ = bilinear weights of a 6 × 4 grid over the image. A model's depth of one
 //! view is off by a factor that varies slowly across the image, which no similarity of a chunk can repair.
+//!
+//! Minimised is `Σ ρ((rⱼ − β − φ(uⱼ)·g)/sⱼ) + β²/0.02² + |g|²/0.03² + |∇g|²/0.02²` with Cauchy's loss, in closed form per
+//! reweighting (25 unknowns). The grid is kept only if, fitted to one half of the landmarks, it lowers the error of the
+//! other half, both ways round; else β alone corrects the view.
 
+use crate::landmark_scale::DepthRatio;
+use nalgebra::{SMatrix, SVector};
 use serde::{Deserialize, Serialize};
 use vidar_core::Image;
 
@@ -53,4 +59,214 @@ fn weights(x: f64, y: f64, width: usize, height: usize) -> [(usize, f64); 4] {
         (node(0, 1), (1.0 - fx) * fy),
         (node(1, 1), fx * fy),
     ]
+}
+
+/// What fitting came to.
+#[derive(Clone, Debug, PartialEq)]
+pub struct FieldFit {
+    /// The correction.
+    pub field: DepthField,
+    /// Whether the grid improved held-out landmarks and was kept.
+    pub keeps_grid: bool,
+    /// Middle error of held-out landmarks: uncorrected, with the offset, with the grid.
+    pub held_out: [f64; 3],
+}
+
+const UNKNOWNS: usize = 1 + NODES;
+type Matrix = SMatrix<f64, UNKNOWNS, UNKNOWNS>;
+type Vector = SVector<f64, UNKNOWNS>;
+
+/// Prior spread of the offset, of the grid's nodes and of neighbouring nodes' difference, ln.
+const OFFSET_STD: f64 = 0.02;
+const NODE_STD: f64 = 0.03;
+const SLOPE_STD: f64 = 0.02;
+const CAUCHY: f64 = 2.0;
+const ROUNDS: usize = 5;
+/// The grid must lower the held-out error by this share to be kept.
+const IMPROVEMENT: f64 = 0.03;
+
+/// Fits a view's field to landmarks. `log_scale` is the chunk's; ratios are this view's. `None` below `min_landmarks`
+/// (fewer than 15 fix no field) or when that is 0.
+pub fn fit_depth_field(
+    ratios: &[DepthRatio],
+    log_scale: f64,
+    size: (usize, usize),
+    min_landmarks: usize,
+) -> Option<FieldFit> {
+    if min_landmarks == 0 || ratios.len() < min_landmarks.max(15) {
+        return None;
+    }
+    let rows: Vec<Row> = ratios
+        .iter()
+        .map(|r| Row {
+            residual: r.log_ratio - log_scale,
+            std: r.std,
+            nodes: weights(r.pixel[0], r.pixel[1], size.0, size.1),
+            // Which half: by the landmark, so that no landmark is on both sides.
+            half: (r.landmark.0.wrapping_mul(0x9e37_79b9) >> 31) as usize,
+        })
+        .collect();
+    let mut errors: [Vec<f64>; 3] = Default::default();
+    let mut improves_both = true;
+    for half in 0..2 {
+        let (fitted, held): (Vec<&Row>, Vec<&Row>) = rows.iter().partition(|r| r.half == half);
+        let (offset, grid) = (solve(&fitted, 1), solve(&fitted, UNKNOWNS));
+        let by = |x: &Vector| held.iter().map(|r| r.error(x).abs()).collect::<Vec<f64>>();
+        let (with_offset, with_grid) = (by(&offset), by(&grid));
+        improves_both &= middle(with_grid.clone()) < middle(with_offset.clone());
+        errors[0].extend(by(&Vector::zeros()));
+        errors[1].extend(with_offset);
+        errors[2].extend(with_grid);
+    }
+    let held_out = errors.map(middle);
+    let keeps_grid = improves_both && held_out[2] < (1.0 - IMPROVEMENT) * held_out[1];
+    let all: Vec<&Row> = rows.iter().collect();
+    let found = solve(&all, if keeps_grid { UNKNOWNS } else { 1 });
+    let field = DepthField { offset: found[0], grid: std::array::from_fn(|m| found[m + 1]) };
+    Some(FieldFit { field, keeps_grid, held_out })
+}
+
+struct Row {
+    residual: f64,
+    std: f64,
+    nodes: [(usize, f64); 4],
+    half: usize,
+}
+
+impl Row {
+    fn error(&self, x: &Vector) -> f64 {
+        self.residual - x[0] - self.nodes.iter().map(|(m, w)| w * x[m + 1]).sum::<f64>()
+    }
+}
+
+/// The first `unknowns` of offset and grid, the others zero.
+fn solve(rows: &[&Row], unknowns: usize) -> Vector {
+    let mut x = Vector::zeros();
+    for _ in 0..ROUNDS {
+        let (mut information, mut right) = prior();
+        for row in rows {
+            let e = row.error(&x) / row.std;
+            let weight = 1.0 / ((1.0 + (e / CAUCHY).powi(2)) * row.std * row.std);
+            let terms: [(usize, f64); 5] = [
+                (0, 1.0),
+                (row.nodes[0].0 + 1, row.nodes[0].1),
+                (row.nodes[1].0 + 1, row.nodes[1].1),
+                (row.nodes[2].0 + 1, row.nodes[2].1),
+                (row.nodes[3].0 + 1, row.nodes[3].1),
+            ];
+            for (i, a) in terms {
+                right[i] += weight * a * row.residual;
+                for (j, b) in terms {
+                    information[(i, j)] += weight * a * b;
+                }
+            }
+        }
+        for m in unknowns..UNKNOWNS {
+            information.row_mut(m).fill(0.0);
+            information.column_mut(m).fill(0.0);
+            information[(m, m)] = 1.0;
+            right[m] = 0.0;
+        }
+        // The prior makes it positive definite.
+        let Some(factor) = information.cholesky() else { return Vector::zeros() };
+        x = factor.solve(&right);
+    }
+    x
+}
+
+fn prior() -> (Matrix, Vector) {
+    let mut information = Matrix::identity() / (NODE_STD * NODE_STD);
+    information[(0, 0)] = 1.0 / (OFFSET_STD * OFFSET_STD);
+    let slope = 1.0 / (SLOPE_STD * SLOPE_STD);
+    let mut tie = |a: usize, b: usize| {
+        information[(a, a)] += slope;
+        information[(b, b)] += slope;
+        information[(a, b)] -= slope;
+        information[(b, a)] -= slope;
+    };
+    for row in 0..FIELD_ROWS {
+        for column in 0..FIELD_COLUMNS {
+            let node = 1 + row * FIELD_COLUMNS + column;
+            if column + 1 < FIELD_COLUMNS {
+                tie(node, node + 1);
+            }
+            if row + 1 < FIELD_ROWS {
+                tie(node, node + FIELD_COLUMNS);
+            }
+        }
+    }
+    (information, Vector::zeros())
+}
+
+fn middle(mut values: Vec<f64>) -> f64 {
+    let at = values.len() / 2;
+    if values.is_empty() { 0.0 } else { *values.select_nth_unstable_by(at, f64::total_cmp).1 }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use rand_chacha::ChaCha8Rng;
+    use rand_chacha::rand_core::{RngCore, SeedableRng};
+    use vidar_core::{FrameId, LandmarkId};
+
+    const SIZE: (usize, usize) = (504, 322);
+
+    fn ratios(n: u32, seed: u64, noise: f64, field: impl Fn(f64, f64) -> f64) -> Vec<DepthRatio> {
+        let mut rng = ChaCha8Rng::seed_from_u64(seed);
+        let mut uniform = || (rng.next_u64() >> 11) as f64 / (1u64 << 53) as f64;
+        (0..n)
+            .map(|k| {
+                let (x, y) = (503.0 * uniform(), 321.0 * uniform());
+                let error = noise * (0..6).map(|_| uniform() - 0.5).sum::<f64>() * 2.0_f64.sqrt();
+                let gross = if k % 9 == 0 { 0.5 } else { 0.0 };
+                DepthRatio {
+                    frame_id: FrameId(0),
+                    landmark: LandmarkId(k),
+                    pixel: [x, y],
+                    log_ratio: 0.3 + field(x, y) + error + gross,
+                    std: noise.max(0.01),
+                }
+            })
+            .collect()
+    }
+
+    #[test]
+    fn a_smooth_field_is_found_and_halves_the_error_or_better() {
+        let truth = |x: f64, y: f64| 0.05 * (x / 503.0 - 0.5) - 0.04 * (y / 321.0 - 0.5) + 0.01;
+        let fit = fit_depth_field(&ratios(150, 1, 0.005, truth), 0.3, SIZE, 15).unwrap();
+        assert!(fit.keeps_grid, "{:?}", fit.held_out);
+        assert!(fit.held_out[2] < 0.6 * fit.held_out[1], "{:?}", fit.held_out);
+        let worst = [(50.0, 50.0), (450.0, 280.0), (252.0, 161.0), (450.0, 40.0)]
+            .iter()
+            .map(|&(x, y)| (fit.field.log_factor(x, y, SIZE.0, SIZE.1) - truth(x, y)).abs())
+            .fold(0.0, f64::max);
+        assert!(worst < 0.012, "{worst}");
+    }
+
+    #[test]
+    fn noise_alone_keeps_no_grid_and_few_landmarks_change_nothing() {
+        let kept = (0..40)
+            .filter(|seed| {
+                let all = ratios(60, *seed, 0.03, |_, _| 0.0);
+                fit_depth_field(&all, 0.3, SIZE, 15).unwrap().keeps_grid
+            })
+            .count();
+        assert!(kept <= 10, "{kept} of 40");
+        assert!(fit_depth_field(&ratios(14, 1, 0.01, |_, _| 0.0), 0.3, SIZE, 1).is_none());
+        assert!(fit_depth_field(&ratios(200, 1, 0.01, |_, _| 0.0), 0.3, SIZE, 0).is_none());
+    }
+
+    #[test]
+    fn the_corner_nodes_are_the_corner_pixels_and_holes_stay_holes() {
+        let mut field = DepthField { offset: 0.1, grid: [0.0; NODES] };
+        field.grid[0] = 0.2;
+        assert!((field.log_factor(0.0, 0.0, 10, 8) - 0.3).abs() < 1e-12);
+        assert!((field.log_factor(9.0, 7.0, 10, 8) - 0.1).abs() < 1e-12);
+        let mut depth = Image::filled(10, 8, 2.0_f32);
+        depth.data_mut()[0] = f32::NAN;
+        let corrected = field.apply(&depth);
+        assert!(corrected[(0, 0)].is_nan());
+        assert!((f64::from(corrected[(9, 7)]) - 2.0 * 0.1_f64.exp()).abs() < 1e-6);
+    }
 }

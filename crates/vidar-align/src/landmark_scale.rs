@@ -1,4 +1,34 @@
 //! The scale of a chunk from landmarks whose metric depth is known.
+//!
+//! Odometry knows some points' depth in metres; the model predicts the depth at the same pixels in its own unit. The
+//! chunk's scale is the weighted median of `log d − log D` over all of them, which neither travel nor its shape can make
+//! degenerate: in simulation 0.8 to 0.9 % whatever the camera did, where centres need 0.7 m of travel to match it. Its
+//! variance is `1.57 σ²/n + s²/f`: σ from the median absolute deviation, n counted per landmark and not per observation
+//! (a landmark's error is the same in all views), f views of jitter s each (1.57 = π/2, the price of a median).
+
+use serde::{Deserialize, Serialize};
+use std::collections::{BTreeMap, BTreeSet};
+use vidar_core::{FrameId, Image, LandmarkId, SparseLandmark, ViewGeometry};
+
+/// How landmarks are compared with predicted depth.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
+#[serde(default, deny_unknown_fields)]
+pub struct LandmarkConfig {
+    /// Error of predicted depth at one pixel, as a share of it (0.005 to 0.3).
+    pub model_noise: f64,
+    /// Error that all pixels of one view share, as a share of depth (0 to 0.2).
+    pub view_jitter: f64,
+    /// Landmarks whose inverse depth is less certain than this share of it say nothing (0.01 to 1).
+    pub max_relative_std: f64,
+    /// Fewest landmarks that correct a view's depth; 0 never corrects, else 15 or more.
+    pub min_for_field: usize,
+}
+
+impl Default for LandmarkConfig {
+    fn default() -> Self {
+        Self { model_noise: 0.04, view_jitter: 0.015, max_relative_std: 0.25, min_for_field: 15 }
+    }
+}
 
 /// ln(metres per chunk unit) with its evidence.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -11,4 +41,213 @@ pub struct LogScale {
     pub effective: f64,
     /// Observations used.
     pub observations: usize,
+}
+
+/// A landmark against the depth predicted at its pixel.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct DepthRatio {
+    /// In which view.
+    pub frame_id: FrameId,
+    /// Which landmark.
+    pub landmark: LandmarkId,
+    /// Where.
+    pub pixel: [f64; 2],
+    /// log d − log D.
+    pub log_ratio: f64,
+    /// Standard deviation of it, from landmark and model.
+    pub std: f64,
+}
+
+/// Fewest observations and landmarks that say anything.
+const MIN_OBSERVATIONS: usize = 8;
+const MIN_LANDMARKS: usize = 5;
+/// Relative range of the 3 × 3 neighbours above which a landmark lies on a depth edge.
+const EDGE_RANGE: f32 = 0.08;
+
+/// Landmarks of a view against its depth. Those on depth edges, outside of the image, without depth or uncertain are left out.
+pub fn depth_ratios(
+    view: &ViewGeometry,
+    landmarks: &[SparseLandmark],
+    config: &LandmarkConfig,
+) -> Vec<DepthRatio> {
+    let depth = view.depth.image();
+    let ratio = |l: &SparseLandmark| {
+        let relative = l.inverse_depth_std / l.inverse_depth;
+        let usable = l.inverse_depth.is_finite() && l.inverse_depth > 0.0 && relative >= 0.0;
+        if !usable || relative > config.max_relative_std {
+            return None;
+        }
+        let predicted = smooth_depth(depth, l.pixel.x, l.pixel.y)?;
+        Some(DepthRatio {
+            frame_id: view.frame_id,
+            landmark: l.id,
+            pixel: [l.pixel.x, l.pixel.y],
+            log_ratio: -l.inverse_depth.ln() - f64::from(predicted).ln(),
+            std: relative.hypot(config.model_noise),
+        })
+    };
+    landmarks.iter().filter_map(ratio).filter(|r| r.log_ratio.is_finite()).collect()
+}
+
+/// Depth at the nearest pixel, unless an edge runs through its neighbourhood.
+fn smooth_depth(depth: &Image<f32>, x: f64, y: f64) -> Option<f32> {
+    let (x, y) = (x.round(), y.round());
+    if !(x >= 0.0 && y >= 0.0) {
+        return None;
+    }
+    let (x, y) = (x as usize, y as usize);
+    let z = *depth.get(x, y)?;
+    if !z.is_finite() {
+        return None;
+    }
+    let (mut low, mut high) = (z, z);
+    for ny in y.saturating_sub(1)..(y + 2).min(depth.height()) {
+        for v in &depth.row(ny)[x.saturating_sub(1)..(x + 2).min(depth.width())] {
+            low = low.min(*v);
+            high = high.max(*v);
+        }
+    }
+    (high - low <= EDGE_RANGE * z).then_some(z)
+}
+
+/// The chunk's scale; `None` with too few landmarks.
+pub fn landmark_scale(ratios: &[DepthRatio], config: &LandmarkConfig) -> Option<LogScale> {
+    let mut seen: BTreeMap<LandmarkId, f64> = BTreeMap::new();
+    ratios.iter().for_each(|r| *seen.entry(r.landmark).or_insert(0.0) += 1.0);
+    if ratios.len() < MIN_OBSERVATIONS || seen.len() < MIN_LANDMARKS {
+        return None;
+    }
+    // A landmark seen in many views is one landmark.
+    let weight = |r: &DepthRatio| 1.0 / (r.std * r.std * seen[&r.landmark]);
+    let weighted: Vec<(f64, f64)> = ratios.iter().map(|r| (r.log_ratio, weight(r))).collect();
+    let log_scale = weighted_median(weighted.clone())?;
+    let off = weighted.iter().map(|(l, w)| ((l - log_scale).abs(), *w)).collect();
+    let sigma = 1.4826 * weighted_median(off)?;
+    let mut per_landmark: BTreeMap<LandmarkId, f64> = BTreeMap::new();
+    ratios.iter().for_each(|r| *per_landmark.entry(r.landmark).or_insert(0.0) += weight(r));
+    let (sum, squares) = per_landmark.values().fold((0.0, 0.0), |(s, q), w| (s + w, q + w * w));
+    let effective = sum * sum / squares;
+    let views = ratios.iter().map(|r| r.frame_id).collect::<BTreeSet<_>>().len() as f64;
+    let variance = std::f64::consts::FRAC_PI_2 * sigma * sigma / effective
+        + config.view_jitter * config.view_jitter / views;
+    // Perfect agreement of a handful proves nothing beyond what the depths resolve.
+    let std = variance.sqrt().max(1e-3);
+    Some(LogScale { log_scale, std, effective, observations: ratios.len() })
+}
+
+/// The value below which half of the weight lies.
+fn weighted_median(mut values: Vec<(f64, f64)>) -> Option<f64> {
+    values.sort_by(|a, b| a.0.total_cmp(&b.0));
+    let half = 0.5 * values.iter().map(|v| v.1).sum::<f64>();
+    let mut sum = 0.0;
+    values
+        .iter()
+        .find(|v| {
+            sum += v.1;
+            sum >= half
+        })
+        .map(|v| v.0)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use nalgebra::Vector2;
+    use rand_chacha::ChaCha8Rng;
+    use rand_chacha::rand_core::{RngCore, SeedableRng};
+    use vidar_core::{Confidence, Pinhole, RelativeDepth, Se3};
+
+    fn normal(rng: &mut ChaCha8Rng) -> f64 {
+        let uniform = |r: &mut ChaCha8Rng| (r.next_u64() >> 11) as f64 / (1u64 << 53) as f64;
+        let radius = (-2.0 * (1.0 - uniform(rng)).ln()).sqrt();
+        radius * (std::f64::consts::TAU * uniform(rng)).cos()
+    }
+
+    /// 120 observations of 60 landmarks in 12 views: 4 % noise each side, 1.5 % per view, 12 % gross.
+    fn ratios(seed: u64, truth: f64) -> Vec<DepthRatio> {
+        let mut rng = ChaCha8Rng::seed_from_u64(seed);
+        let own: Vec<f64> = (0..60).map(|_| 0.04 * normal(&mut rng)).collect();
+        let view: Vec<f64> = (0..12).map(|_| 0.015 * normal(&mut rng)).collect();
+        (0..120)
+            .map(|k| {
+                let gross = if k % 8 == 0 { 0.6 * normal(&mut rng) } else { 0.0 };
+                DepthRatio {
+                    frame_id: FrameId(k % 12),
+                    landmark: LandmarkId(k % 60),
+                    pixel: [0.0, 0.0],
+                    log_ratio: truth
+                        + own[(k % 60) as usize]
+                        + view[(k % 12) as usize]
+                        + 0.04 * normal(&mut rng)
+                        + gross,
+                    std: 0.056,
+                }
+            })
+            .collect()
+    }
+
+    #[test]
+    fn the_scale_is_told_to_about_a_percent_and_its_uncertainty_is_honest() {
+        let config = LandmarkConfig::default();
+        let trials = 400;
+        let (mut squares, mut chi2) = (0.0, 0.0);
+        for seed in 0..trials {
+            let found = landmark_scale(&ratios(seed, 0.7), &config).unwrap();
+            let error = found.log_scale - 0.7;
+            squares += error * error;
+            chi2 += (error / found.std).powi(2);
+        }
+        let rms = (squares / trials as f64).sqrt();
+        let chi2 = chi2 / trials as f64;
+        assert!(rms < 0.0125, "{rms}");
+        assert!(chi2 > 0.4 && chi2 < 1.6, "{chi2}");
+    }
+
+    #[test]
+    fn one_landmark_seen_often_is_one_landmark() {
+        let mut many = ratios(3, 0.0);
+        let once = landmark_scale(&many, &LandmarkConfig::default()).unwrap();
+        for _ in 0..200 {
+            many.push(DepthRatio { landmark: LandmarkId(5), log_ratio: 3.0, ..many[5] });
+        }
+        let often = landmark_scale(&many, &LandmarkConfig::default()).unwrap();
+        assert!((often.log_scale - once.log_scale).abs() < 0.02);
+        assert!(often.effective < 1.05 * once.effective);
+        many.truncate(4);
+        assert!(landmark_scale(&many, &LandmarkConfig::default()).is_none());
+    }
+
+    #[test]
+    fn landmarks_on_edges_outside_or_uncertain_are_left_out() {
+        let depth = Image::from_fn(40, 30, |x, y| match (x < 20, y) {
+            (_, 25..) => f32::NAN,
+            (true, _) => 2.0,
+            (false, _) => 4.0,
+        });
+        let view = ViewGeometry {
+            frame_id: FrameId(1),
+            chunk_from_camera: Se3::IDENTITY,
+            intrinsics: Pinhole::new(30.0, 30.0, 19.5, 14.5, 40, 30).unwrap(),
+            depth: RelativeDepth::new(depth),
+            confidence: Confidence::full(40, 30),
+        };
+        let at = |x: f64, y: f64, std: f64| SparseLandmark {
+            id: LandmarkId(0),
+            pixel: Vector2::new(x, y),
+            inverse_depth: 0.25,
+            inverse_depth_std: std,
+        };
+        let all = [
+            at(5.2, 5.0, 0.01),
+            at(20.0, 5.0, 0.01),
+            at(5.0, 27.0, 0.01),
+            at(-3.0, 5.0, 0.01),
+            at(5.0, 5.0, 0.2),
+            at(5.0, f64::NAN, 0.01),
+            at(80.0, 5.0, 0.01),
+        ];
+        let kept = depth_ratios(&view, &all, &LandmarkConfig::default());
+        assert_eq!(kept.len(), 1);
+        assert!((kept[0].log_ratio - 2.0_f64.ln()).abs() < 1e-12);
+    }
 }

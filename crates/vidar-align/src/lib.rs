@@ -16,6 +16,7 @@ pub mod depth_field;
 pub mod landmark_scale;
 pub mod overlap;
 mod place;
+pub mod place_recognition;
 pub mod streaming;
 
 pub use aligner::{

@@ -109,6 +109,12 @@ pub enum AlignError {
         /// Largest value allowed.
         most: f64,
     },
+    /// A loop names a chunk that was never given.
+    #[error("chunk {chunk} was never given")]
+    UnknownChunk {
+        /// Which chunk.
+        chunk: ChunkId,
+    },
     /// A chunk was pushed twice.
     #[error("chunk {chunk} was given before")]
     RepeatedChunk {
@@ -177,16 +183,19 @@ pub fn aligned_views(
         let depth = view.depth.to_metric(alignment.world_from_chunk.scale).map_err(geometry)?;
         let world_from_camera = alignment.world_from_chunk.transform_pose(&view.chunk_from_camera);
         let time = image.map_or_else(Default::default, |v| v.time);
-        let mut metric =
+        let metric =
             AlignedView::new(view.frame_id, time, world_from_camera, view.intrinsics, depth, view.confidence)
                 .map_err(geometry)?;
-        if let Some(image) = image {
-            let color = color_at_size(&image.image, view.intrinsics.width, view.intrinsics.height);
-            metric = metric.with_color(color).map_err(geometry)?;
-        }
-        aligned.push(metric);
+        aligned.push(colored(metric, image).map_err(geometry)?);
     }
     Ok(aligned)
+}
+
+/// The same view with the colours of its image, if there is one.
+pub(crate) fn colored(view: AlignedView, image: Option<&ChunkView>) -> Result<AlignedView, GeometryError> {
+    let Some(image) = image else { return Ok(view) };
+    let color = color_at_size(&image.image, view.intrinsics().width, view.intrinsics().height);
+    view.with_color(color)
 }
 
 /// The image's colours at the depth's size: bilinear, pixel centres kept (`c' = (c + 0.5)·s − 0.5`).

@@ -309,17 +309,10 @@ fn coupled(world: &World) -> (f64, f64) {
         }
         factors.push(Factor::Scale { k, log_scale: -world.landmark_log[k], std: 0.01, kernel: robust });
     }
-    let link = |k, l, l_from_k, rotation_deg: f64, translation_std_m, log_scale_std, kernel| {
-        let rotation_std_rad = rotation_deg.to_radians();
-        Factor::Relative(RelativeChunk {
-            k,
-            l,
-            l_from_k,
-            rotation_std_rad,
-            translation_std_m,
-            log_scale_std,
-            kernel,
-        })
+    let link = |k: usize, l, l_from_k, rotation_deg: f64, translation_std_m: f64, log_scale_std, kernel| {
+        let translation = translation_std_m / start.chunks[k].scale;
+        let stds = [rotation_deg.to_radians(), translation, log_scale_std];
+        Factor::Relative(RelativeChunk::from_stds(k, l, l_from_k, stds, kernel))
     };
     for (l, l_from_k) in world.overlaps.iter().enumerate() {
         factors.push(link(l + 1, l, *l_from_k, 1.2, 0.06, 0.018, robust));

@@ -2,6 +2,7 @@
 
 use crate::AlignError;
 use crate::coupled::CoupledConfig;
+use crate::landmark_scale::LandmarkConfig;
 use crate::overlap::OverlapConfig;
 use crate::streaming::{AlignMethod, Compat};
 use serde::{Deserialize, Serialize};
@@ -83,6 +84,8 @@ pub struct AlignerConfig {
     pub overlap: OverlapConfig,
     /// Loops.
     pub loops: LoopsConfig,
+    /// Landmarks of known depth.
+    pub landmarks: LandmarkConfig,
     /// The coupled graph.
     pub graph: GraphWeights,
 }
@@ -96,6 +99,7 @@ impl Default for AlignerConfig {
             scale_range: [0.85, 1.20],
             overlap: OverlapConfig::default(),
             loops: LoopsConfig::default(),
+            landmarks: LandmarkConfig::default(),
             graph: GraphWeights::default(),
         }
     }
@@ -215,6 +219,9 @@ impl AlignerConfig {
             ("overlap.max_pairs", o.max_pairs as f64, 1000.0, 1e6),
             ("overlap.min_pairs", o.min_pairs as f64, 3.0, 1e6),
             ("overlap.min_inlier_ratio", o.min_inlier_ratio, 0.0, 1.0),
+            ("landmarks.model_noise", self.landmarks.model_noise, 0.005, 0.3),
+            ("landmarks.view_jitter", self.landmarks.view_jitter, 0.0, 0.2),
+            ("landmarks.max_relative_std", self.landmarks.max_relative_std, 0.01, 1.0),
             ("loops.min_similarity", f64::from(l.min_similarity), 0.0, 1.0),
             ("loops.top_k", l.top_k as f64, 1.0, 20.0),
             ("loops.min_gap_s", l.min_gap_s, 0.0, 1e6),

@@ -1,16 +1,19 @@
 //! What the machine keeps of chunks and frames.
 
-use super::AlignerConfig;
 use super::anchored::Pair;
 use super::observation::MetricAnchor;
 use super::report::Guard;
+use super::{AlignerConfig, GraphWeights};
 use crate::Verdict;
 use crate::depth_field::DepthField;
 use crate::landmark_scale::LogScale;
 use crate::overlap::{OverlapFit, SampledView};
+use nalgebra::Vector6;
 use std::collections::BTreeMap;
 use vidar_core::model::ChunkFrame;
-use vidar_core::{ChunkId, FrameId, GeometryPrediction, Se3, Sim3, Timestamp};
+use vidar_core::{
+    ChunkId, FrameId, GeometryPrediction, LieGroup, PoseCovariance, Se3, Sim3, Timestamp, ViewGeometry,
+};
 
 /// A view of a chunk.
 #[derive(Clone, Debug)]
@@ -53,6 +56,32 @@ pub(super) struct Tie {
     pub fit: OverlapFit,
 }
 
+/// From one anchored frame to the next.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Step {
+    pub from: FrameId,
+    pub to: FrameId,
+    pub from_from_to: Se3,
+    pub world_from_to: Se3,
+    dt_s: f64,
+    relative_covariance: Option<PoseCovariance>,
+}
+
+impl Step {
+    /// Covariance of δ in `from_from_to · exp(δ)`: the odometry's own, or what odometry is like.
+    pub fn covariance(&self, weights: &GraphWeights) -> PoseCovariance {
+        let usable =
+            |c: &PoseCovariance| c.iter().all(|v| v.is_finite()) && c.diagonal().iter().all(|v| *v > 0.0);
+        self.relative_covariance.filter(usable).unwrap_or_else(|| {
+            let position = (weights.odometry_per_metre * self.from_from_to.translation.norm())
+                .max(weights.odometry_floor_m);
+            let rotation = weights.odometry_rotation_deg.to_radians() * self.dt_s.clamp(0.02, 10.0).sqrt();
+            let (r, p) = (rotation * rotation, position * position);
+            PoseCovariance::from_diagonal(&Vector6::new(r, r, r, p, p, p))
+        })
+    }
+}
+
 /// A frame as it goes through the run.
 #[derive(Clone, Debug)]
 pub(super) struct Keyframe {
@@ -65,6 +94,8 @@ pub(super) struct Keyframe {
 #[derive(Clone, Debug, Default)]
 pub(super) struct Frames {
     by_id: BTreeMap<FrameId, Keyframe>,
+    /// The segment of the first trusted anchor: its world is the world.
+    segment: Option<u32>,
 }
 
 impl Frames {
@@ -73,13 +104,12 @@ impl Frames {
         let finite = anchor.filter(|a| a.world_from_camera.is_finite());
         let known = self.by_id.entry(frame_id).or_insert(Keyframe { frame_id, time, anchor: None });
         known.time = time;
-        if finite.is_some() {
-            known.anchor = finite;
+        if let Some(anchor) = finite {
+            if anchor.is_trusted && self.segment.is_none() {
+                self.segment = Some(anchor.segment);
+            }
+            known.anchor = Some(anchor);
         }
-    }
-
-    pub fn get(&self, frame: FrameId) -> Option<&Keyframe> {
-        self.by_id.get(&frame)
     }
 
     pub fn iter(&self) -> impl Iterator<Item = &Keyframe> {
@@ -90,9 +120,34 @@ impl Frames {
         self.by_id.len()
     }
 
-    /// The metric anchor of a frame, if it may be believed.
+    /// The metric anchor of a frame, if it may be believed and shares the world of the first one.
     pub fn anchor(&self, frame: FrameId) -> Option<&MetricAnchor> {
-        self.by_id.get(&frame)?.anchor.as_ref().filter(|a| a.is_trusted)
+        let anchor = self.by_id.get(&frame)?.anchor.as_ref()?;
+        (anchor.is_trusted && Some(anchor.segment) == self.segment).then_some(anchor)
+    }
+}
+
+impl Frames {
+    /// Steps between neighbouring anchored frames of one segment.
+    pub fn steps(&self) -> impl Iterator<Item = Step> + '_ {
+        let anchored = || self.by_id.values().filter_map(|k| Some((k, k.anchor.as_ref()?)));
+        anchored().zip(anchored().skip(1)).filter(|(a, b)| a.1.segment == b.1.segment).map(
+            |((i, a), (j, b))| Step {
+                from: i.frame_id,
+                to: j.frame_id,
+                from_from_to: a.world_from_camera.inverse() * b.world_from_camera,
+                world_from_to: b.world_from_camera,
+                dt_s: j.time.since(i.time).as_secs_f64().abs(),
+                relative_covariance: b.relative_covariance,
+            },
+        )
+    }
+
+    /// Length of the anchored way up to a frame, m; `None` without anchors.
+    pub fn travel_m(&self, frame: FrameId) -> Option<f64> {
+        let mut steps = self.steps().take_while(|s| s.to <= frame).peekable();
+        steps.peek()?;
+        Some(steps.map(|s| s.from_from_to.translation.norm()).sum())
     }
 }
 
@@ -145,7 +200,7 @@ pub(super) fn sampled_views(
             frame_id: view.frame_id,
             chunk_from_camera: view.chunk_from_camera,
             median_depth,
-            thin: SampledView::new(view, THIN_SAMPLES),
+            thin: sampled_thin(view),
             field: None,
         });
         dense.push(sampled);
@@ -155,4 +210,9 @@ pub(super) fn sampled_views(
 }
 
 /// Depths kept of every view of every chunk: 4 kB.
-pub(super) const THIN_SAMPLES: usize = 512;
+const THIN_SAMPLES: usize = 512;
+
+/// A view as it is kept for good.
+pub(super) fn sampled_thin(view: &ViewGeometry) -> SampledView {
+    SampledView::new(view, THIN_SAMPLES)
+}

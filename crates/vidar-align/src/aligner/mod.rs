@@ -16,26 +16,35 @@
 mod anchored;
 mod chain;
 mod config;
+mod coupled;
+mod loops;
 mod memory;
 mod observation;
 mod report;
 mod tie;
+mod views;
 mod world;
 
 pub use config::{AlignerConfig, CouplingMode, GraphWeights, LoopsConfig};
+pub use loops::LoopCandidate;
 pub use observation::{ChunkObservation, FrameObservation, MetricAnchor, covariance_in_camera};
 pub use report::{
     ChunkPlacement, ChunkReport, DriftReport, GraphReport, Guard, GuardCounts, KeyframePlacement,
     LoopRefusal, LoopReport, OverlapReport, Placement, ViewPlacement,
 };
 
+use crate::depth_field::fit_depth_field;
+use crate::landmark_scale::{DepthRatio, depth_ratios, landmark_scale};
 use crate::overlap::SampledView;
+use crate::place_recognition::PlaceIndex;
 use crate::streaming::Compat;
 use crate::{AlignError, Verdict};
 use anchored::{Pair, PoseFit, center_rms, fit_about_rotations, robust_umeyama};
+use loops::{Lookalike, MeasuredLoop};
 use memory::{Chunk, Frames, Tie, sampled_views};
+use std::collections::{BTreeMap, BTreeSet};
 use vidar_core::model::ChunkFrame;
-use vidar_core::{GeometryPrediction, LieGroup, Sim3, ViewGeometry};
+use vidar_core::{FrameId, GeometryPrediction, LieGroup, Sim3, ViewGeometry};
 
 /// The machine.
 #[derive(Debug)]
@@ -45,7 +54,11 @@ pub struct Aligner {
     frames: Frames,
     chunks: Vec<Chunk>,
     previous: Previous,
-    loops: Vec<LoopReport>,
+    loops: Vec<MeasuredLoop>,
+    places: PlaceIndex,
+    known_places: BTreeSet<FrameId>,
+    /// Best look-alike frames per (later, earlier) chunk.
+    lookalikes: BTreeMap<(usize, usize), Lookalike>,
 }
 
 /// Geometry of the last usable chunk.
@@ -78,6 +91,9 @@ impl Aligner {
             chunks: Vec::new(),
             previous: Previous::default(),
             loops: Vec::new(),
+            places: PlaceIndex::default(),
+            known_places: BTreeSet::new(),
+            lookalikes: BTreeMap::new(),
         })
     }
 
@@ -114,25 +130,22 @@ impl Aligner {
             log_scale_std: f64::INFINITY,
             odometry_trusted: true,
         };
+        if self.mode == CouplingMode::Coupled {
+            self.learn_landmarks(&mut chunk, &prediction, &frames);
+        }
         let pairs = chunk.pairs(&self.frames);
         self.judge(&mut chunk, &pairs);
+        if self.mode.chains() && chunk.is_usable() {
+            chunk.revisits = self.revisits(&chunk);
+        }
         let report = self.report(&chunk, &pairs);
         if chunk.is_usable() {
             let full = if self.config.compat == Compat::Reference { prediction.views } else { Vec::new() };
             self.previous = Previous { chunk: self.chunks.len(), sampled, full };
         }
         self.chunks.push(chunk);
+        self.learn_places(&frames);
         Ok(report)
-    }
-
-    /// Accepted loops as (later, earlier, `earlier_from_later`), chunks by index.
-    fn accepted_loops(&self) -> Vec<(usize, usize, Sim3)> {
-        let index = |id| self.chunks.iter().position(|c| c.id == id);
-        self.loops
-            .iter()
-            .filter(|l| l.refusal.is_none())
-            .filter_map(|l| Some((index(l.later)?, index(l.earlier)?, l.earlier_from_later?)))
-            .collect()
     }
 
     /// Where everything stands with what is known now.
@@ -150,7 +163,7 @@ impl Aligner {
         let thin: usize = self.chunks.iter().flat_map(|c| &c.views).map(|v| v.thin.bytes()).sum();
         let dense: usize = self.previous.sampled.iter().map(SampledView::bytes).sum();
         let full: usize = self.previous.full.iter().map(|v| v.depth.image().data().len() * 8).sum();
-        thin + dense + full + self.frames.len() * size_of::<memory::Keyframe>()
+        thin + dense + full + self.places.memory_bytes() + self.frames.len() * size_of::<memory::Keyframe>()
     }
 
     /// The tie to the last usable chunk, if both hold frames and the two agree.
@@ -193,6 +206,47 @@ impl Aligner {
                 None
             }
         }
+    }
+
+    /// The chunk's scale from landmarks, and each view's depth field.
+    fn learn_landmarks(
+        &self,
+        chunk: &mut Chunk,
+        prediction: &GeometryPrediction,
+        frames: &[FrameObservation],
+    ) {
+        let config = &self.config.landmarks;
+        let seen = |view: &ViewGeometry| {
+            let frame = frames.iter().find(|f| f.frame_id == view.frame_id);
+            frame.map_or(Vec::new(), |f| depth_ratios(view, &f.landmarks, config))
+        };
+        let per_view: Vec<(&ViewGeometry, Vec<DepthRatio>)> =
+            prediction.views.iter().map(|v| (v, seen(v))).collect();
+        let all: Vec<DepthRatio> = per_view.iter().flat_map(|(_, r)| r.iter().copied()).collect();
+        let Some(scale) = landmark_scale(&all, config) else { return };
+        chunk.landmark_scale = Some(scale);
+        for (view, ratios) in per_view {
+            let size = (view.intrinsics.width, view.intrinsics.height);
+            let Some(fit) = fit_depth_field(&ratios, scale.log_scale, size, config.min_for_field) else {
+                continue;
+            };
+            if !fit.keeps_grid {
+                chunk.guards.push(Guard::DepthFieldRefused);
+            }
+            if let Some(kept) = chunk.views.iter_mut().find(|v| v.frame_id == view.frame_id) {
+                kept.field = Some(fit.field);
+            }
+        }
+    }
+
+    /// Older chunks that hold some of the chunk's frames: a loop closed within an ordinary chunk.
+    fn revisits(&self, chunk: &Chunk) -> Vec<Tie> {
+        let older =
+            self.chunks.iter().enumerate().filter(|(k, c)| *k != self.previous.chunk && c.is_usable());
+        older
+            .filter_map(|(k, c)| tie::revisit(&c.views, &chunk.views, k, &self.config))
+            .filter(|t| t.fit.inlier_ratio > self.config.loops.min_inlier_ratio)
+            .collect()
     }
 
     /// Decides how a chunk stands and where it goes first.
@@ -288,6 +342,7 @@ impl Aligner {
             self.judge_unanchored(chunk);
             return;
         };
+        let fit = self.with_landmarks(fit, chunk, pairs);
         chunk.log_scale_std = fit.log_scale_std;
         let gross = is_gross(&fit, pairs.len(), self.config.max_center_rms_m);
         (chunk.verdict, chunk.first_guess) = match (gross, before) {
@@ -305,6 +360,18 @@ impl Aligner {
         if chunk.frame == ChunkFrame::PriorWorld && chunk.verdict == Verdict::Fitted {
             chunk.verdict = Verdict::PriorWorld;
         }
+    }
+
+    /// The same place with the scale that centres and landmarks tell together, by inverse variance.
+    fn with_landmarks(&self, fit: PoseFit, chunk: &Chunk, pairs: &[Pair]) -> PoseFit {
+        let Some(landmarks) = chunk.landmark_scale else { return fit };
+        let information = [fit.log_scale_std.powi(-2), landmarks.std.powi(-2)];
+        let sum = information[0] + information[1];
+        let log =
+            (information[0] * fit.world_from_chunk.scale.ln() + information[1] * landmarks.log_scale) / sum;
+        let world_from_chunk = rescaled_about_centers(&fit.world_from_chunk, log.exp(), pairs);
+        let center_rms_m = center_rms(&world_from_chunk, pairs);
+        PoseFit { world_from_chunk, center_rms_m, log_scale_std: sum.powf(-0.5), ..fit }
     }
 
     fn report(&self, chunk: &Chunk, pairs: &[Pair]) -> ChunkReport {

@@ -1,6 +1,8 @@
 //! One world from what is known, each mode in its way.
 
 use super::chain::chain;
+use super::coupled::coupled;
+use super::loops::MeasuredLoop;
 use super::memory::Chunk;
 use super::report::{ChunkPlacement, DriftReport, Guard, GuardCounts, KeyframePlacement, ViewPlacement};
 use super::{Aligner, CouplingMode, GraphReport, LoopReport, Placement};
@@ -29,23 +31,25 @@ pub(super) fn place(machine: &Aligner) -> Placement {
         CouplingMode::Da3Streaming | CouplingMode::PoseFree => pose_free(machine),
         CouplingMode::Hybrid => hybrid(machine),
         CouplingMode::PoseConditioned | CouplingMode::GroundTruth => conditioned(machine),
-        CouplingMode::Coupled => conditioned(machine),
+        CouplingMode::Coupled => coupled(machine),
     };
     assemble(machine, world)
 }
 
 /// The first chain; chunks of other chains share nothing with it.
-fn pose_free(machine: &Aligner) -> World {
-    let links = chain(&machine.chunks, &machine.accepted_loops());
+pub(super) fn pose_free(machine: &Aligner) -> World {
+    let judged = machine.judged_loops();
+    let links = chain(&machine.chunks, &machine.loop_edges(&judged));
     let root = links.iter().flatten().map(|l| l.root).next();
     let chunks =
         links.iter().map(|l| l.filter(|l| Some(l.root) == root).map(|l| l.root_from_chunk)).collect();
-    World::of(machine, chunks, false)
+    World { loops: reports(judged), ..World::of(machine, chunks, false) }
 }
 
 /// Each chain by one similarity of all its camera centres onto their anchors.
 fn hybrid(machine: &Aligner) -> World {
-    let links = chain(&machine.chunks, &machine.accepted_loops());
+    let judged = machine.judged_loops();
+    let links = chain(&machine.chunks, &machine.loop_edges(&judged));
     let mut roots: Vec<usize> = links.iter().flatten().map(|l| l.root).collect();
     roots.sort_unstable();
     roots.dedup();
@@ -78,7 +82,7 @@ fn hybrid(machine: &Aligner) -> World {
         };
         members().for_each(|(k, link)| chunks[k] = Some(onto * link.root_from_chunk));
     }
-    World { guards, ..World::of(machine, chunks, is_metric) }
+    World { guards, loops: reports(judged), ..World::of(machine, chunks, is_metric) }
 }
 
 /// Each chunk where its anchors put it; poses are the anchors' own.
@@ -103,9 +107,14 @@ impl World {
             is_metric,
             guards: Vec::new(),
             graph: None,
-            loops: machine.loops.clone(),
+            loops: reports(machine.judged_loops()),
         }
     }
+}
+
+/// What is told of loops.
+pub(super) fn reports(loops: Vec<MeasuredLoop>) -> Vec<LoopReport> {
+    loops.into_iter().map(|l| l.report).collect()
 }
 
 fn assemble(machine: &Aligner, world: World) -> Placement {

@@ -87,7 +87,7 @@ pub struct Attachment {
     pub moves_keyframe: bool,
 }
 
-/// `r = W Log(Z⁻¹ Xₗ⁻¹ Xₖ)`, its translation part times the scale of k, so that it is metres.
+/// `r = W Log(Z⁻¹ Xₗ⁻¹ Xₖ)`, in the units of chunk k, so that no chunk grows small to please it.
 #[derive(Clone, Debug)]
 pub struct RelativeChunk {
     /// The chunk that is mapped.
@@ -96,14 +96,34 @@ pub struct RelativeChunk {
     pub l: usize,
     /// Measured `chunk_l_from_chunk_k`.
     pub l_from_k: Sim3,
-    /// Standard deviation of the rotation, rad.
-    pub rotation_std_rad: f64,
-    /// Standard deviation of the translation, m.
-    pub translation_std_m: f64,
-    /// Standard deviation of ln(scale).
-    pub log_scale_std: f64,
+    /// W, with `Wᵀ W` the information of δ in `l_from_k · exp(δ)`; tangent order.
+    pub whitening: Box<SMatrix<f64, 7, 7>>,
     /// Overlaps and above all loops may be false.
     pub kernel: Kernel,
+}
+
+impl RelativeChunk {
+    /// From standard deviations: rotation (rad), translation (units of chunk k), ln(scale).
+    pub fn from_stds(k: usize, l: usize, l_from_k: Sim3, stds: [f64; 3], kernel: Kernel) -> Self {
+        let [rotation, translation, log_scale] = stds.map(|s| 1.0 / s);
+        let diagonal = [rotation, rotation, rotation, translation, translation, translation, log_scale];
+        let whitening = SMatrix::from_diagonal(&SVector::from(diagonal));
+        Self { k, l, l_from_k, whitening: Box::new(whitening), kernel }
+    }
+
+    /// From the covariance of δ; `None` when it is not positive definite.
+    pub fn from_covariance(
+        k: usize,
+        l: usize,
+        l_from_k: Sim3,
+        covariance: &SMatrix<f64, 7, 7>,
+        kernel: Kernel,
+    ) -> Option<Self> {
+        let symmetric = (covariance + covariance.transpose()) * 0.5;
+        let information = symmetric.cholesky()?.inverse();
+        let whitening = ((information + information.transpose()) * 0.5).cholesky()?.l().transpose();
+        Some(Self { k, l, l_from_k, whitening: Box::new(whitening), kernel })
+    }
 }
 
 /// Which unknown a block belongs to.
@@ -242,22 +262,12 @@ fn relative(r: &RelativeChunk, world_from_k: &Sim3, world_from_l: &Sim3) -> Opti
     let error = (r.l_from_k.inverse() * predicted).log();
     let d_k = Sim3::right_jacobian_inverse(&error)?;
     let d_l = -d_k * predicted.inverse().adjoint();
-    let (wr, wt, ws) =
-        (1.0 / r.rotation_std_rad, world_from_k.scale / r.translation_std_m, 1.0 / r.log_scale_std);
-    let weights = SVector::<f64, 7>::from_column_slice(&[wr, wr, wr, wt, wt, wt, ws]);
-    let residual = error.component_mul(&weights);
-    let whiten = |mut m: SMatrix<f64, 7, 7>| {
-        m.row_iter_mut().zip(weights.iter()).for_each(|(mut row, w)| row *= *w);
-        m
-    };
-    let mut d_k = whiten(d_k);
-    // The factor that makes metres of the translation is k's own scale.
-    for row in 3..6 {
-        d_k[(row, 6)] += residual[row];
-    }
     Some(Linearised {
-        residual: residual.as_slice().to_vec(),
-        jacobians: vec![(Variable::Chunk(r.k), dynamic(d_k)), (Variable::Chunk(r.l), dynamic(whiten(d_l)))],
+        residual: (*r.whitening * error).as_slice().to_vec(),
+        jacobians: vec![
+            (Variable::Chunk(r.k), dynamic(*r.whitening * d_k)),
+            (Variable::Chunk(r.l), dynamic(*r.whitening * d_l)),
+        ],
     })
 }
 

@@ -82,15 +82,8 @@ fn a_false_loop_is_let_go_and_a_true_one_is_kept() {
         other => other,
     }));
     let link = |l_from_k| {
-        Factor::Relative(RelativeChunk {
-            k: 1,
-            l: 0,
-            l_from_k,
-            rotation_std_rad: 0.01,
-            translation_std_m: 0.05,
-            log_scale_std: 0.02,
-            kernel: Kernel::GemanMcClure { k: 4.0 },
-        })
+        let stds = [0.01, 0.05 / gauges[1].scale, 0.02];
+        Factor::Relative(RelativeChunk::from_stds(1, 0, l_from_k, stds, Kernel::GemanMcClure { k: 4.0 }))
     };
     let right = gauges[0].inverse() * gauges[1];
     let wrong =
