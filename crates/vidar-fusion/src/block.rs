@@ -140,6 +140,73 @@ impl Block {
     }
 }
 
+/// All sums of one node.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub(crate) struct NodeSums {
+    /// Σ w·d.
+    pub weighted_distance: i64,
+    /// Σ w.
+    pub weight: u32,
+    /// Views within the truncation.
+    pub observations: u32,
+    /// Σ confidence.
+    pub confidence: u32,
+    /// Red, green, blue times confidence, and confidence, of the coloured views.
+    pub color: [u32; 4],
+}
+
+impl Block {
+    /// The sums of a node.
+    pub fn sums(&self, node: usize) -> NodeSums {
+        let row = &self.rows[node / EDGE];
+        let low = row.near[node % EDGE] >> CONFIDENCE_SHIFT;
+        NodeSums {
+            weighted_distance: self.weighted_distance(node),
+            weight: row.weight[node % EDGE],
+            observations: self.observations(node),
+            confidence: low + (u32::from(self.confidence_above[node]) << CONFIDENCE_BITS),
+            color: self.color.as_ref().map_or([0; 4], |c| c[node / EDGE].map(|lanes| lanes[node % EDGE])),
+        }
+    }
+
+    /// Puts sums, of at most [`crate::grid::MAX_VIEWS`] views, in the place of a node's; colours only where there
+    /// is room for them.
+    pub fn put(&mut self, node: usize, sums: &NodeSums) {
+        let (at, i) = (node / EDGE, node % EDGE);
+        let row = &mut self.rows[at];
+        self.distance_above[node] = (sums.weighted_distance >> DISTANCE_BITS) as i16;
+        row.distance[i] = (sums.weighted_distance & ((1 << DISTANCE_BITS) - 1)) as i32;
+        row.weight[i] = sums.weight;
+        self.confidence_above[node] = (sums.confidence >> CONFIDENCE_BITS) as u16;
+        let low = sums.confidence & ((1 << CONFIDENCE_BITS) - 1);
+        row.near[i] = low << CONFIDENCE_SHIFT | sums.observations;
+        if let Some(color) = self.color.as_mut() {
+            for (lanes, value) in color[at].iter_mut().zip(sums.color) {
+                lanes[i] = value;
+            }
+        }
+    }
+
+    /// Adds the sums of `other`; both together hold at most [`crate::grid::MAX_VIEWS`] views.
+    pub fn add(&mut self, other: &Self) {
+        for node in 0..NODES {
+            let more = other.sums(node);
+            if more.weight == 0 && more.observations == 0 {
+                continue;
+            }
+            let mut sums = self.sums(node);
+            sums.weighted_distance += more.weighted_distance;
+            sums.weight += more.weight;
+            sums.observations += more.observations;
+            sums.confidence += more.confidence;
+            for (sum, value) in sums.color.iter_mut().zip(more.color) {
+                *sum += value;
+            }
+            self.put(node, &sums);
+        }
+    }
+}
+
 /// What replaces a distance of exactly zero, in truncations.
 const ZERO_NUDGE: f32 = 1.0 / (4.0 * DISTANCE_ONE);
 

@@ -1,7 +1,7 @@
 //! What can go wrong in fusion.
 
 use thiserror::Error;
-use vidar_core::FrameId;
+use vidar_core::{ChunkId, FrameId};
 
 /// Why a volume cannot be made, or a view not be fused. A refused view leaves the volume as it was.
 #[derive(Clone, Debug, PartialEq, Error)]
@@ -56,5 +56,39 @@ pub enum FusionError {
         frame: FrameId,
         /// The limit.
         limit: u32,
+    },
+    /// A keyframe that a chunk has fused already: each is fused once, by its owner.
+    #[error("frame {frame} was fused by chunk {owner} already, chunk {chunk} cannot fuse it again")]
+    FusedAlready {
+        /// Which view.
+        frame: FrameId,
+        /// The chunk that fused it.
+        owner: ChunkId,
+        /// The chunk that was to fuse it now.
+        chunk: ChunkId,
+    },
+    /// No view of that chunk was fused.
+    #[error("chunk {chunk} holds no views")]
+    NoSuchChunk {
+        /// Which chunk.
+        chunk: ChunkId,
+    },
+    /// A keyframe of another chunk, or of none.
+    #[error("frame {frame} was not fused by chunk {chunk}")]
+    NotOfChunk {
+        /// Which view.
+        frame: FrameId,
+        /// The chunk that was told to move it.
+        chunk: ChunkId,
+    },
+    /// A revised pose or scale is not finite, or the scale not positive.
+    #[error(
+        "frame {frame} of chunk {chunk} cannot move there: its pose or its depth factor is not finite and positive"
+    )]
+    BadMove {
+        /// Which view.
+        frame: FrameId,
+        /// Its chunk.
+        chunk: ChunkId,
     },
 }

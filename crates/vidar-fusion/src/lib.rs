@@ -31,7 +31,9 @@
 //!
 //! The path of a view: [`sample`] weighs its pixels, [`allocate`] finds the blocks it touches, [`update`] adds it to
 //! the sums of each [`block`], [`carve`] votes for what it sees empty. The way out: [`field`] reads distances, [`cubes`] has the
-//! triangles, [`extract`] makes the mesh, [`tidy`] drops crumbs, [`coverage`] counts.
+//! triangles, [`extract`] makes the mesh, [`tidy`] drops crumbs, [`coverage`] counts, [`double_wall`] finds ghosts.
+//!
+//! A map whose poses still change is fused in [`SubVolumes`], one per chunk, which move with the graph.
 
 mod allocate;
 mod block;
@@ -39,6 +41,7 @@ mod carve;
 mod config;
 mod coverage;
 mod cubes;
+mod double_wall;
 mod error;
 mod extract;
 mod field;
@@ -47,6 +50,7 @@ mod pixels;
 mod points;
 mod sample;
 mod simd;
+mod sub_volumes;
 mod tidy;
 mod update;
 #[cfg(target_arch = "x86_64")]
@@ -55,6 +59,8 @@ mod volume;
 
 pub use config::FusionConfig;
 pub use coverage::{CoverageReport, DensityCell, DensityMap, surface_area_m2};
+pub use double_wall::{DoubleWallReport, DoubleWalls};
 pub use error::FusionError;
 pub use points::PointFusion;
+pub use sub_volumes::{RevisedView, Revision, SubVolumeConfig, SubVolumeReport, SubVolumes};
 pub use volume::{IntegrationStats, TsdfVolume};

@@ -185,6 +185,55 @@ impl TsdfVolume {
         dropped
     }
 
+    /// Adds all sums of `other`, a volume of the same voxels, as if its views had been fused here.
+    ///
+    /// How many blocks and votes the budget refused.
+    pub(crate) fn add(&mut self, other: &Self) -> u64 {
+        self.count_views(other);
+        let blocks = other.keys.iter().copied().zip(other.blocks.iter().map(|b| &**b));
+        self.add_blocks(blocks) + self.add_votes(&other.votes())
+    }
+
+    /// Adds sums block by block; how many blocks the budget refused.
+    pub(crate) fn add_blocks<'a>(&mut self, more: impl Iterator<Item = (BlockKey, &'a Block)>) -> u64 {
+        let mut dropped = 0;
+        for (key, block) in more {
+            let (touched, refused) = self.allocate(&[key], block.color.is_some());
+            dropped += refused;
+            for at in touched {
+                self.blocks[at as usize].add(block);
+            }
+        }
+        self.dropped += dropped;
+        self.peak_bytes = self.peak_bytes.max(self.memory_bytes());
+        dropped
+    }
+
+    /// Adds votes for empty blocks of another volume; how many the budget refused.
+    pub(crate) fn add_votes(&mut self, votes: &[Vote]) -> u64 {
+        let dropped = self.vote(votes);
+        self.dropped += dropped;
+        dropped
+    }
+
+    /// The votes for empty blocks, in the order of their keys.
+    pub(crate) fn votes(&self) -> Vec<Vote> {
+        let mut votes: Vec<Vote> = self.free.iter().map(|(key, weight)| (*key, *weight)).collect();
+        votes.sort_unstable();
+        votes
+    }
+
+    /// Counts views whose sums come by [`Self::add_blocks`].
+    pub(crate) fn count_views(&mut self, other: &Self) {
+        self.views += other.views;
+        self.shortened_views += other.shortened_views;
+    }
+
+    /// Changes how much memory the volume may hold; what it holds already stays.
+    pub(crate) fn set_budget(&mut self, bytes: u64) {
+        self.config.memory_budget_bytes = bytes;
+    }
+
     /// Degradations so far: `fusion-memory-budget` when new space was refused, `fusion-carve-range` when the
     /// carving range was shortened because it holds too many blocks.
     pub fn warnings(&self) -> Vec<Warning> {

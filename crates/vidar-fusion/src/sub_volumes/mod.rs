@@ -1,0 +1,328 @@
+//! One volume per chunk, which moves when the graph moves its chunk (Voxgraph: Reijgwart et al., RA-L 2020).
+//!
+//! Views are fused where the graph puts them when they come. When a loop closes, the graph moves the keyframes of
+//! earlier chunks; their sub-volumes are then placed anew, by the similarity that fits the motion of their surfaces
+//! best, and a chunk that moved by more than a voxel is [stale](Revision::stale): it is resampled where it lies now
+//! until its views are fused again ([`SubVolumes::rebuild`]), which is exact also when the chunk bent. Chunks that
+//! moved less stay as they are, to the bit.
+//!
+//! [`SubVolumes::merged`] adds all sub-volumes to one. Sums are integers, so as long as nothing moved the result is
+//! the volume that fusing all views at once would have made, to the bit, and with any motion it does not depend on
+//! the order in which chunks came or on the number of threads.
+
+mod placement;
+mod resample;
+
+use crate::{FusionConfig, FusionError, IntegrationStats, TsdfVolume};
+use placement::Probe;
+use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
+use vidar_core::{AlignedView, ChunkId, FrameId, LieGroup, Se3, Sim3, TriangleMesh, Warning};
+
+/// Settings of sub-volumes.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
+#[serde(default, deny_unknown_fields)]
+pub struct SubVolumeConfig {
+    /// Settings of each sub-volume and of the merged one. `memory_budget_bytes` is for all sub-volumes together; the
+    /// merged volume may hold as much again while it exists.
+    pub fusion: FusionConfig,
+    /// Motion of a chunk's surface, voxels, 0.01 to 100, from which on the chunk is moved and due to be fused again.
+    pub move_tolerance_voxels: f64,
+}
+
+impl Default for SubVolumeConfig {
+    fn default() -> Self {
+        Self { fusion: FusionConfig::default(), move_tolerance_voxels: 1.0 }
+    }
+}
+
+impl SubVolumeConfig {
+    /// Checks every field against the range in its description.
+    pub fn validate(&self) -> Result<(), FusionError> {
+        self.fusion.validate()?;
+        let found = self.move_tolerance_voxels;
+        if !(0.01..=100.0).contains(&found) {
+            return Err(FusionError::BadConfig {
+                field: "move_tolerance_voxels",
+                min: 0.01,
+                max: 100.0,
+                found,
+            });
+        }
+        Ok(())
+    }
+}
+
+/// Where the graph puts a keyframe now.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct RevisedView {
+    /// Which keyframe.
+    pub frame_id: FrameId,
+    /// Its pose now.
+    pub world_from_camera: Se3,
+    /// Its depth now per depth as it was fused (e^dσ of its chunk).
+    pub depth_factor: f64,
+}
+
+/// What a graph update did to a chunk.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Revision {
+    /// How far the farthest-moving piece of its surface is from where it was fused, m.
+    pub moved_m: f64,
+    /// How far a piece of its surface is at most from where it is placed now, m: what no rigid motion can follow.
+    pub bent_m: f64,
+    /// Whether it moved by more than the tolerance and its views should be fused again.
+    pub stale: bool,
+}
+
+/// State of all sub-volumes.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct SubVolumeReport {
+    /// Chunks with views.
+    pub chunks: u64,
+    /// Views fused.
+    pub views: u64,
+    /// Chunks that lie elsewhere than where they were fused.
+    pub stale: u64,
+    /// Chunks that were fused again so far.
+    pub rebuilt: u64,
+    /// Bytes held now.
+    pub memory_bytes: u64,
+    /// Most bytes held at once.
+    pub peak_memory_bytes: u64,
+    /// Times that a block was refused for lack of memory.
+    pub dropped_by_budget: u64,
+}
+
+/// A volume per chunk.
+#[derive(Clone, Debug)]
+pub struct SubVolumes {
+    config: SubVolumeConfig,
+    chunks: BTreeMap<ChunkId, SubVolume>,
+    owners: BTreeMap<FrameId, ChunkId>,
+    rebuilt: u64,
+    peak_bytes: u64,
+    dropped: u64,
+}
+
+#[derive(Clone, Debug)]
+struct SubVolume {
+    volume: TsdfVolume,
+    /// Where the chunk lies now, told of where it was fused.
+    now_from_fused: Sim3,
+    /// Points of its surface by which its motion is judged.
+    probes: BTreeMap<FrameId, Probe>,
+    revision: Revision,
+}
+
+impl SubVolumes {
+    /// No chunks yet; refuses a configuration that is out of range.
+    pub fn new(config: &SubVolumeConfig) -> Result<Self, FusionError> {
+        config.validate()?;
+        Ok(Self {
+            config: config.clone(),
+            chunks: BTreeMap::new(),
+            owners: BTreeMap::new(),
+            rebuilt: 0,
+            peak_bytes: 0,
+            dropped: 0,
+        })
+    }
+
+    /// The settings.
+    pub fn config(&self) -> &SubVolumeConfig {
+        &self.config
+    }
+
+    /// Chunks with views, in the order of their numbers.
+    pub fn chunks(&self) -> impl Iterator<Item = ChunkId> + '_ {
+        self.chunks.keys().copied()
+    }
+
+    /// Which chunk fused a keyframe.
+    pub fn owner(&self, frame: FrameId) -> Option<ChunkId> {
+        self.owners.get(&frame).copied()
+    }
+
+    /// Fuses a keyframe into its chunk. Each keyframe is fused once, by the chunk that owns it.
+    ///
+    /// A chunk that has been moved takes views where it was fused: they are moved with it.
+    ///
+    /// # Errors
+    /// A keyframe that was fused already, and what [`TsdfVolume::integrate`] refuses; nothing changes then.
+    pub fn integrate(&mut self, chunk: ChunkId, view: &AlignedView) -> Result<IntegrationStats, FusionError> {
+        let frame = view.frame_id();
+        if let Some(owner) = self.owner(frame) {
+            return Err(FusionError::FusedAlready { frame, owner, chunk });
+        }
+        let others = self.memory_bytes() - self.chunks.get(&chunk).map_or(0, |c| c.volume.memory_bytes());
+        let budget = self.config.fusion.memory_budget_bytes.saturating_sub(others);
+        let mut fresh = None;
+        let part = match self.chunks.get_mut(&chunk) {
+            Some(part) => part,
+            None => fresh.insert(SubVolume::new(&self.config.fusion)?),
+        };
+        part.volume.set_budget(budget);
+        let stats = part.integrate(view)?;
+        if let Some(fresh) = fresh {
+            self.chunks.insert(chunk, fresh);
+        }
+        self.owners.insert(frame, chunk);
+        self.dropped += stats.dropped_by_budget;
+        self.peak_bytes = self.peak_bytes.max(self.memory_bytes());
+        Ok(stats)
+    }
+
+    /// Places a chunk where the graph puts its keyframes now; keyframes that are not named move with the others.
+    ///
+    /// # Errors
+    /// A chunk without views, a keyframe that is not the chunk's, a pose that is not finite; nothing changes then.
+    pub fn revise(&mut self, chunk: ChunkId, revised: &[RevisedView]) -> Result<Revision, FusionError> {
+        let part = self.chunks.get_mut(&chunk).ok_or(FusionError::NoSuchChunk { chunk })?;
+        let mut pairs = Vec::with_capacity(revised.len());
+        for view in revised {
+            let frame = view.frame_id;
+            let probe = part.probes.get(&frame).ok_or(FusionError::NotOfChunk { frame, chunk })?;
+            let factor = view.depth_factor;
+            if !(view.world_from_camera.is_finite() && factor.is_finite() && factor > 0.0) {
+                return Err(FusionError::BadMove { frame, chunk });
+            }
+            pairs.push((probe, view));
+        }
+        let voxel_m = self.config.fusion.voxel_size_m;
+        let tolerance_m = self.config.move_tolerance_voxels * voxel_m;
+        let (now_from_fused, revision) = placement::fit(&pairs, tolerance_m);
+        part.now_from_fused = now_from_fused;
+        part.revision = revision;
+        Ok(revision)
+    }
+
+    /// The chunks that lie elsewhere than where they were fused, farthest first.
+    pub fn stale(&self) -> Vec<(ChunkId, Revision)> {
+        let mut stale: Vec<_> =
+            self.chunks.iter().map(|(id, part)| (*id, part.revision)).filter(|(_, r)| r.stale).collect();
+        stale.sort_by(|a, b| b.1.moved_m.total_cmp(&a.1.moved_m).then(a.0.cmp(&b.0)));
+        stale
+    }
+
+    /// Fuses a chunk again from its views where they are now, in the place of what it held.
+    ///
+    /// # Errors
+    /// A chunk without views, a keyframe that another chunk owns, and what [`TsdfVolume::integrate`] refuses; the
+    /// chunk is then as it was.
+    pub fn rebuild(
+        &mut self,
+        chunk: ChunkId,
+        views: impl IntoIterator<Item = AlignedView>,
+    ) -> Result<IntegrationStats, FusionError> {
+        let old = self.chunks.get(&chunk).ok_or(FusionError::NoSuchChunk { chunk })?;
+        let others = self.memory_bytes() - old.volume.memory_bytes();
+        let mut part = SubVolume::new(&self.config.fusion)?;
+        part.volume.set_budget(self.config.fusion.memory_budget_bytes.saturating_sub(others));
+        let mut total = IntegrationStats::default();
+        for view in views {
+            let frame = view.frame_id();
+            if let Some(owner) = self
+                .owner(frame)
+                .filter(|owner| *owner != chunk)
+                .or(part.probes.contains_key(&frame).then_some(chunk))
+            {
+                return Err(FusionError::FusedAlready { frame, owner, chunk });
+            }
+            let stats = part.integrate(&view)?;
+            total.pixels_used += stats.pixels_used;
+            total.blocks_touched += stats.blocks_touched;
+            total.blocks_total = stats.blocks_total;
+            total.dropped_by_budget += stats.dropped_by_budget;
+            total.blocks_carved += stats.blocks_carved;
+        }
+        // Both exist for a moment.
+        self.peak_bytes = self.peak_bytes.max(self.memory_bytes() + part.volume.memory_bytes());
+        self.dropped += total.dropped_by_budget;
+        self.owners.retain(|_, owner| *owner != chunk);
+        self.owners.extend(part.probes.keys().map(|frame| (*frame, chunk)));
+        self.chunks.insert(chunk, part);
+        self.rebuilt += 1;
+        Ok(total)
+    }
+
+    /// All sub-volumes where they lie now, as one volume.
+    ///
+    /// Chunks that did not move are added sum by sum, the others are resampled (trilinear, in space and in all sums).
+    ///
+    /// # Errors
+    /// More than 65535 views.
+    pub fn merged(&self) -> Result<TsdfVolume, FusionError> {
+        let mut merged = TsdfVolume::new(&self.config.fusion)?;
+        for part in self.chunks.values() {
+            let limit = crate::grid::MAX_VIEWS;
+            if merged.views() + part.volume.views() > limit {
+                let frame = part.probes.keys().next().copied().unwrap_or_default();
+                return Err(FusionError::TooManyViews { frame, limit });
+            }
+            if part.now_from_fused == Sim3::IDENTITY {
+                merged.add(&part.volume);
+            } else {
+                resample::add_moved(&mut merged, &part.volume, &part.now_from_fused);
+            }
+        }
+        Ok(merged)
+    }
+
+    /// The surface of [`Self::merged`].
+    ///
+    /// # Errors
+    /// As [`Self::merged`].
+    pub fn extract_mesh(&self) -> Result<TriangleMesh, FusionError> {
+        Ok(self.merged()?.extract_mesh())
+    }
+
+    /// Bytes held now by all sub-volumes; never above the budget.
+    pub fn memory_bytes(&self) -> u64 {
+        self.chunks.values().map(|part| part.volume.memory_bytes()).sum()
+    }
+
+    /// Counts and memory.
+    pub fn report(&self) -> SubVolumeReport {
+        SubVolumeReport {
+            chunks: self.chunks.len() as u64,
+            views: self.owners.len() as u64,
+            stale: self.chunks.values().filter(|part| part.revision.stale).count() as u64,
+            rebuilt: self.rebuilt,
+            memory_bytes: self.memory_bytes(),
+            peak_memory_bytes: self.peak_bytes,
+            dropped_by_budget: self.dropped,
+        }
+    }
+
+    /// Degradations so far, as [`TsdfVolume::warnings`] of each chunk, each kind once.
+    pub fn warnings(&self) -> Vec<Warning> {
+        let mut warnings: Vec<Warning> = Vec::new();
+        for warning in self.chunks.values().flat_map(|part| part.volume.warnings()) {
+            if !warnings.iter().any(|w| w.kind == warning.kind) {
+                warnings.push(warning);
+            }
+        }
+        warnings
+    }
+}
+
+impl SubVolume {
+    fn new(config: &FusionConfig) -> Result<Self, FusionError> {
+        let volume = TsdfVolume::new(config)?;
+        let revision = Revision::default();
+        Ok(Self { volume, now_from_fused: Sim3::IDENTITY, probes: BTreeMap::new(), revision })
+    }
+
+    fn integrate(&mut self, view: &AlignedView) -> Result<IntegrationStats, FusionError> {
+        if self.now_from_fused == Sim3::IDENTITY {
+            let stats = self.volume.integrate(view)?;
+            self.probes.insert(view.frame_id(), Probe::new(view, self.volume.config()));
+            return Ok(stats);
+        }
+        let there = placement::moved(view, &self.now_from_fused.inverse())?;
+        let stats = self.volume.integrate(&there)?;
+        self.probes.insert(view.frame_id(), Probe::new(&there, self.volume.config()));
+        Ok(stats)
+    }
+}
