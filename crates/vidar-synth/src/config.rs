@@ -127,9 +127,9 @@ impl Default for SynthConfig {
 }
 
 impl SynthConfig {
-    /// The demo's room: 376 × 240 at 10 Hz for ten seconds.
+    /// The demo's room: 376 × 240 at 10 Hz, a second of stillness and ten of flight.
     pub fn demo() -> Self {
-        Self::default()
+        Self { start: Start::Static { secs: 1.0 }, duration_secs: 11.0, ..Self::default() }
     }
 
     /// As EuRoC's recordings: 752 × 480 at 20 Hz, IMU at 200 Hz with data-sheet noise, 60 s after a static start.
