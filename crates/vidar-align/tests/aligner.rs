@@ -35,7 +35,9 @@ fn an_exact_model_gives_the_exact_world_in_every_metric_mode() {
         let error = absolute_error(&placement, &truth);
         assert!(error < 1e-4, "{mode}: {error}");
         assert!(placement.chunks.iter().all(|c| c.verdict.is_usable()));
-        assert!(placement.guards.is_empty(), "{mode}: {:?}", placement.guards);
+        // The last chunk is short: its motion alone does not tell its scale to 3 %.
+        let unexpected = placement.guards.iter().find(|(g, _)| *g != Guard::ScaleUnobservable);
+        assert_eq!(unexpected, None, "{mode}");
         // A frame of an overlap belongs to the later chunk.
         let owners: Vec<u32> = placement.views.iter().map(|v| v.owner.0).collect();
         assert!(owners.windows(2).all(|o| o[0] <= o[1]) && owners[8] == 1, "{owners:?}");

@@ -132,14 +132,25 @@ pub fn predict(
     model: Model,
     noise: &mut Noise,
 ) -> GeometryPrediction {
+    predict_frames(truth, &range.collect::<Vec<_>>(), id, model, noise)
+}
+
+/// What the model says of some frames of a flight, in the order given.
+pub fn predict_frames(
+    truth: &[Se3],
+    frames: &[usize],
+    id: u32,
+    model: Model,
+    noise: &mut Noise,
+) -> GeometryPrediction {
     let gauge = if model.has_gauge { noise.gauge() } else { Sim3::IDENTITY };
     let chunk_from_world = gauge.inverse();
-    let mut bent = truth[range.start];
+    let mut bent = truth[frames[0]];
     let mut walk = 0.0_f64;
     let mut views = Vec::new();
-    for i in range.clone() {
-        if i > range.start {
-            let step = truth[i - 1].inverse() * truth[i];
+    for (n, &i) in frames.iter().enumerate() {
+        if n > 0 {
+            let step = truth[frames[n - 1]].inverse() * truth[i];
             walk += model.stretch * noise.normal();
             bent = bent
                 * Se3::new(
