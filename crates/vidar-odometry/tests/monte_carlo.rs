@@ -1,12 +1,14 @@
 //! The smoother's claims against the truth, over many simulated flights.
 //!
-//! The short form is part of the suite. The long form flies 50 runs of 20 s:
+//! Poses, the clock offset between camera and IMU, and the camera's place on the body.
+//!
+//! The short forms are part of the suite. The long forms fly 50 runs of 20 s:
 //! `cargo test --release -p vidar-odometry --test monte_carlo -- --ignored --nocapture`
 
 #![allow(clippy::unwrap_used, clippy::panic, clippy::print_stdout)] // helpers of tests are test code, though not marked so
 
 use nalgebra::Vector3;
-use vidar_core::{FrameId, ImuNoise, LieGroup, So3};
+use vidar_core::{FrameId, ImuNoise, LieGroup, Se3, So3};
 use vidar_odometry::estimator::{AnchorSigmas, Smoother};
 use vidar_odometry::imu::{Bias, NavState};
 use vidar_odometry::simulate::{
@@ -112,4 +114,107 @@ fn pose_covariance_is_honest_over_50_short_flights() {
 fn pose_covariance_is_honest_over_50_long_flights() {
     let runs: Vec<Run> = (0..50).map(|seed| fly(seed, 20.0, 110, 20.0)).collect();
     judge(&runs, 0.06);
+}
+
+/// What is wrong with the calibration, and what of it was left.
+struct Calibrated {
+    /// Clock offset that is not told, s, and the error of its estimate over its standard deviation.
+    offset_secs: f64,
+    offset_error_secs: f64,
+    offset_normalised: f64,
+    /// Error of the camera's rotation, degrees, and over its standard deviation (3 degrees of freedom), squared.
+    turn_error_deg: f64,
+    turn_nees: f64,
+    velocity_error_mps: f64,
+}
+
+/// Flies with a clock offset and a camera turned by `turn_deg` that nobody tells, both estimated.
+fn calibrate(seed: u64, secs: f64, tracks: usize, offset_secs: f64, turn_deg: f64) -> Calibrated {
+    let course = Course { kind: CourseKind::Eight, secs: secs + 2.0, speed: 1.4, phase: 0.37 * seed as f64 };
+    let settings =
+        SimulationConfig { seed, tracks, time_offset_secs: offset_secs, ..SimulationConfig::default() };
+    let simulation = Simulation::new(&course, 0.5, secs, &settings);
+    let mut config = FeatureOdometryConfig::new(&ImuNoise::EUROC, 1.0);
+    config.smoother.estimate_time_offset = true;
+    config.smoother.estimate_camera_rotation = turn_deg != 0.0;
+    let mut random = Random::new(9_000 + seed);
+    let off = So3::exp(&(random.normal3().normalize() * turn_deg.to_radians()));
+    let truth = simulation.body_from_camera;
+    let believed = Se3::new(truth.rotation * off, truth.translation);
+    let mut odometry = FeatureOdometry::new(config, simulation.camera.clone(), believed);
+    simulation.readings.iter().for_each(|r| odometry.take(*r).unwrap());
+    let first = &simulation.frames[0];
+    let sigmas = AnchorSigmas { velocity_mps: 0.2, ..SIGMAS };
+    odometry.start_at(first, disturbed(&first.truth, &mut random), sigmas).unwrap();
+    let mut velocity_error_mps = f64::NAN;
+    for frame in &simulation.frames[1..] {
+        let StepOutput::Running(state) = odometry.push(frame.id, frame.time, &frame.seen).unwrap() else {
+            panic!("it was started");
+        };
+        let in_body = |s: &NavState| s.world_from_body.rotation.inverse() * s.velocity;
+        velocity_error_mps = (in_body(&state) - in_body(&frame.truth)).norm();
+    }
+    let smoother = odometry.smoother().unwrap();
+    let sigmas = smoother.calibration_sigmas().unwrap();
+    let offset_error_secs = smoother.time_offset().as_secs_f64() - offset_secs;
+    let turn = (truth.rotation.inverse() * smoother.body_from_camera().rotation).log();
+    Calibrated {
+        offset_secs,
+        offset_error_secs,
+        offset_normalised: offset_error_secs / sigmas[6],
+        turn_error_deg: turn.norm().to_degrees(),
+        turn_nees: (0..3).map(|k| (turn[k] / sigmas[k]).powi(2)).sum(),
+        velocity_error_mps,
+    }
+}
+
+fn judge_clocks(runs: &[Calibrated]) {
+    let worst = runs.iter().map(|r| r.offset_error_secs.abs()).fold(0.0, f64::max);
+    let rms = mean(runs.iter().map(|r| r.offset_normalised.powi(2))).sqrt();
+    let velocity = runs.iter().map(|r| r.velocity_error_mps).fold(0.0, f64::max);
+    println!(
+        "{} clocks: worst error {:.3} ms, over its sigma {rms:.2} rms, velocity off by at most {velocity:.3} m/s",
+        runs.len(),
+        worst * 1e3
+    );
+    for r in runs {
+        let (error, offset) = (r.offset_error_secs * 1e3, r.offset_secs * 1e3);
+        assert!(error.abs() < 1.0, "{error:.3} ms off where {offset:.0} ms were to be found");
+    }
+    assert!((0.4..2.0).contains(&rms), "errors are {rms:.2} of what is told");
+    assert!(velocity < 0.3, "{velocity}");
+}
+
+fn judge_turns(runs: &[Calibrated]) {
+    let worst = runs.iter().map(|r| r.turn_error_deg).fold(0.0, f64::max);
+    let nees = mean(runs.iter().map(|r| r.turn_nees)) / 3.0;
+    println!("{} cameras: worst rotation left {worst:.3} deg, NEES per dimension {nees:.2}", runs.len());
+    assert!(worst < 0.2, "{worst:.3} deg left");
+    assert!((0.3..3.0).contains(&nees), "{nees:.2}");
+}
+
+#[test]
+fn clocks_that_are_off_by_up_to_20_ms_are_set_within_a_millisecond() {
+    let offsets = [-0.02, -0.01, 0.0, 0.003, 0.01, 0.02];
+    let runs: Vec<Calibrated> =
+        offsets.iter().zip(0..).map(|(offset, seed)| calibrate(seed, 5.0, 40, *offset, 0.0)).collect();
+    judge_clocks(&runs);
+}
+
+#[test]
+fn cameras_that_are_turned_by_two_degrees_are_set_right_with_their_clocks() {
+    let runs: Vec<Calibrated> = (0..4).map(|seed| calibrate(seed, 5.0, 40, 0.005, 2.0)).collect();
+    judge_turns(&runs);
+    judge_clocks(&runs);
+}
+
+#[test]
+#[ignore = "long: 50 flights of 20 s at 20 Hz"]
+fn clocks_and_cameras_are_set_right_over_50_long_flights() {
+    let offset = |seed: u64| (seed % 9) as f64 * 0.005 - 0.02;
+    let clocks: Vec<Calibrated> = (0..50).map(|seed| calibrate(seed, 20.0, 110, offset(seed), 0.0)).collect();
+    judge_clocks(&clocks);
+    let both: Vec<Calibrated> = (0..50).map(|seed| calibrate(seed, 20.0, 110, offset(seed), 2.0)).collect();
+    judge_turns(&both);
+    judge_clocks(&both);
 }

@@ -37,8 +37,7 @@ pub struct SmootherConfig {
     pub estimate_camera_rotation: bool,
     /// Whether the position of the camera on the body is estimated. Needs rotation about two axes.
     pub estimate_camera_position: bool,
-    /// Whether the offset between camera and IMU clocks is estimated. Needs pixel velocities with observations. Not to be
-    /// relied on yet: its test (`a_clock_that_is_10_ms_off_is_found`) fails.
+    /// Whether the offset between camera and IMU clocks is estimated. Seen as soon as the body's turning changes.
     pub estimate_time_offset: bool,
     /// Standard deviation of the given camera rotation, degrees, 0.01…10.
     pub camera_rotation_sigma_deg: f64,
@@ -94,6 +93,10 @@ impl SmootherConfig {
     }
 
     pub(crate) fn calibrates(&self) -> bool {
-        self.estimate_camera_rotation || self.estimate_camera_position || self.estimate_time_offset
+        self.calibrates_camera() || self.estimate_time_offset
+    }
+
+    pub(crate) fn calibrates_camera(&self) -> bool {
+        self.estimate_camera_rotation || self.estimate_camera_position
     }
 }

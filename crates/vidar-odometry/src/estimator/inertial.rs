@@ -1,6 +1,6 @@
 //! Inertial factors: preintegrated motion between neighbouring frames, standstill, and the anchor of the first frame.
 
-use crate::imu::{Matrix15, NavState, Preintegration, Vector15, hat};
+use crate::imu::{Matrix15, NavState, Preintegration, Rates, Vector15, hat};
 use nalgebra::{Matrix3, SMatrix, Vector3};
 use serde::{Deserialize, Serialize};
 use vidar_core::{LieGroup, So3};
@@ -45,36 +45,106 @@ impl Whitening {
     }
 }
 
+/// How much later than the readings' first and last instant the two states are, s: the clock offset as it is believed now
+/// minus what was believed when the readings were cut.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub(crate) struct Shift {
+    pub(crate) begin: f64,
+    pub(crate) end: f64,
+}
+
+impl Shift {
+    #[cfg(test)]
+    pub(crate) const NONE: Self = Self { begin: 0.0, end: 0.0 };
+
+    fn is_none(self) -> bool {
+        self.begin == 0.0 && self.end == 0.0
+    }
+}
+
+/// Motion over a stretch, gravity left out: an element of the group whose product is [`Moved::then`].
+#[derive(Clone, Copy, Debug)]
+struct Moved {
+    secs: f64,
+    turn: So3,
+    position: Vector3<f64>,
+    velocity: Vector3<f64>,
+}
+
+impl Moved {
+    /// At constant rates; `secs` may be negative.
+    fn at(rates: &Rates, secs: f64) -> Self {
+        Self {
+            secs,
+            turn: So3::exp(&(rates.turn * secs)),
+            position: rates.force * (0.5 * secs * secs),
+            velocity: rates.force * secs,
+        }
+    }
+
+    fn then(&self, next: &Self) -> Self {
+        Self {
+            secs: self.secs + next.secs,
+            turn: self.turn * next.turn,
+            position: self.position + self.velocity * next.secs + self.turn * next.position,
+            velocity: self.velocity + self.turn * next.velocity,
+        }
+    }
+}
+
+/// The readings' motion as integrated, and before and after it what the shift takes off or adds.
+fn moved(readings: &Preintegration, i: &NavState, shift: Shift) -> [Moved; 3] {
+    let (turn, position, velocity) = readings.corrected(&i.bias);
+    let [first, last] = readings.ends();
+    let integrated = Moved { secs: readings.secs(), turn, position, velocity };
+    [Moved::at(&first, -shift.begin), integrated, Moved::at(&last, shift.end)]
+}
+
+fn whole([before, integrated, after]: &[Moved; 3], shift: Shift) -> Moved {
+    if shift.is_none() { *integrated } else { before.then(&integrated.then(after)) }
+}
+
 /// Residual between two states, in the order of the error state:
 /// `r_θ = Log(ΔR(b)ᵀ R_iᵀ R_j)`, `r_p = R_iᵀ(p_j − p_i − v_i t − ½ g t²) − Δp(b)`,
 /// `r_v = R_iᵀ(v_j − v_i − g t) − Δv(b)`, `r_b = b_j − b_i` (Forster 2017, eq. 45).
-pub(crate) fn residual(readings: &Preintegration, i: &NavState, j: &NavState) -> Vector15 {
-    let t = readings.secs();
-    let (rotation, position, velocity) = readings.corrected(&i.bias);
+///
+/// With clocks that are off, Δ is the motion between the shifted instants: `E(−s_i) · Δ · E(s_j)`, where E is motion at the
+/// rates that the readings show at their ends. The states stay those of the images' true instants, so the images' factors
+/// know nothing of clocks, and shift and heading stay free.
+pub(crate) fn residual(readings: &Preintegration, i: &NavState, j: &NavState, shift: Shift) -> Vector15 {
+    let delta = whole(&moved(readings, i, shift), shift);
+    let t = delta.secs;
     let (from, to) = (&i.world_from_body, &j.world_from_body);
     let back = from.rotation.inverse();
-    let turn = (rotation.inverse() * (back * to.rotation)).log();
     let gravity = readings.model().gravity();
+    let turn = (delta.turn.inverse() * (back * to.rotation)).log();
     let moved = back * (to.translation - from.translation - i.velocity * t - gravity * (0.5 * t * t));
     let sped = back * (j.velocity - i.velocity - gravity * t);
     let mut r = Vector15::zeros();
     r.fixed_rows_mut::<3>(0).copy_from(&turn);
-    r.fixed_rows_mut::<3>(3).copy_from(&(moved - position));
-    r.fixed_rows_mut::<3>(6).copy_from(&(sped - velocity));
+    r.fixed_rows_mut::<3>(3).copy_from(&(moved - delta.position));
+    r.fixed_rows_mut::<3>(6).copy_from(&(sped - delta.velocity));
     r.fixed_rows_mut::<3>(9).copy_from(&(j.bias.gyro - i.bias.gyro));
     r.fixed_rows_mut::<3>(12).copy_from(&(j.bias.accel - i.bias.accel));
     r
 }
 
 /// Derivatives of [`residual`] by the error states of both ends.
-pub(crate) fn jacobians(readings: &Preintegration, i: &NavState, j: &NavState) -> (Matrix15, Matrix15) {
-    let t = readings.secs();
+pub(crate) fn jacobians(
+    readings: &Preintegration,
+    i: &NavState,
+    j: &NavState,
+    shift: Shift,
+) -> (Matrix15, Matrix15) {
     let delta = &readings.delta;
-    let (rotation, ..) = readings.corrected(&i.bias);
+    let parts = moved(readings, i, shift);
+    let all = whole(&parts, shift);
+    let [before, _, after] = &parts;
+    let t = all.secs;
     let (from, to) = (&i.world_from_body, &j.world_from_body);
     let back = from.rotation.inverse();
     let back_m = back.matrix();
-    let turn = (rotation.inverse() * (back * to.rotation)).log();
+    let turn = (all.turn.inverse() * (back * to.rotation)).log();
     let log_slope = So3::right_jacobian_inverse(&turn).unwrap_or_else(Matrix3::identity);
     let d_gyro = i.bias.gyro - readings.bias().gyro;
     let turn_by_gyro: Matrix3<f64> = delta.by_gyro_bias.fixed_view::<3, 3>(0, 0).into_owned();
@@ -86,12 +156,10 @@ pub(crate) fn jacobians(readings: &Preintegration, i: &NavState, j: &NavState) -
         m.fixed_view_mut::<3, 3>(row, col).copy_from(&value);
     };
     put(&mut by_i, 0, 0, -log_slope * (to.rotation.inverse() * from.rotation).matrix());
-    put(
-        &mut by_i,
-        0,
-        9,
-        -log_slope * So3::exp(&-turn).matrix() * So3::right_jacobian(&(turn_by_gyro * d_gyro)) * turn_by_gyro,
-    );
+    // The integrated motion's own error, turned on its right side.
+    let own_turn = So3::right_jacobian(&(turn_by_gyro * d_gyro)) * turn_by_gyro;
+    let after_turn = after.turn.matrix().transpose();
+    put(&mut by_i, 0, 9, -log_slope * So3::exp(&-turn).matrix() * after_turn * own_turn);
     put(&mut by_j, 0, 0, log_slope);
     put(&mut by_i, 3, 0, hat(&moved));
     put(&mut by_i, 3, 3, -back_m);
@@ -100,15 +168,52 @@ pub(crate) fn jacobians(readings: &Preintegration, i: &NavState, j: &NavState) -
     put(&mut by_i, 6, 0, hat(&sped));
     put(&mut by_i, 6, 6, -back_m);
     put(&mut by_j, 6, 6, back_m);
-    for row in [3, 6] {
-        put(&mut by_i, row, 9, -delta.by_gyro_bias.fixed_view::<3, 3>(row, 0).into_owned());
-        put(&mut by_i, row, 12, -delta.by_accel_bias.fixed_view::<3, 3>(row, 0).into_owned());
+    let before_turn = before.turn.matrix();
+    let turned = parts[1].turn.matrix();
+    for (col, by, by_turn) in
+        [(9, &delta.by_gyro_bias, own_turn), (12, &delta.by_accel_bias, Matrix3::zeros())]
+    {
+        let (position, velocity) = (by.fixed_view::<3, 3>(3, 0), by.fixed_view::<3, 3>(6, 0));
+        let position =
+            position + velocity * after.secs - turned * hat(&after.position) * by_turn;
+        let velocity = velocity - turned * hat(&after.velocity) * by_turn;
+        put(&mut by_i, 3, col, -(before_turn * position));
+        put(&mut by_i, 6, col, -(before_turn * velocity));
     }
     for row in [9, 12] {
         put(&mut by_i, row, row, -Matrix3::identity());
         put(&mut by_j, row, row, Matrix3::identity());
     }
     (by_i, by_j)
+}
+
+/// Derivative of [`residual`] by the clock offset, which shifts both ends alike.
+pub(crate) fn by_time_offset(
+    readings: &Preintegration,
+    i: &NavState,
+    j: &NavState,
+    shift: Shift,
+) -> Vector15 {
+    let parts = moved(readings, i, shift);
+    let [before, integrated, after] = &parts;
+    let [first, last] = readings.ends();
+    let rest = integrated.then(after);
+    let all = before.then(&rest);
+    let back = i.world_from_body.rotation.inverse();
+    let q = all.turn.inverse() * (back * j.world_from_body.rotation);
+    let turn = q.log();
+    let log_slope = So3::right_jacobian_inverse(&turn).unwrap_or_else(Matrix3::identity);
+    let d_turn = last.turn - rest.turn.inverse() * first.turn;
+    let d_velocity = -first.force
+        + before.turn * (integrated.turn * last.force - first.turn.cross(&rest.velocity));
+    let d_rest_position = integrated.velocity + integrated.turn * (last.force * shift.end);
+    let d_position = first.force * shift.begin - first.force * rest.secs + before.velocity
+        + before.turn * (d_rest_position - first.turn.cross(&rest.position));
+    let mut by = Vector15::zeros();
+    by.fixed_rows_mut::<3>(0).copy_from(&-(log_slope * (q.inverse() * d_turn)));
+    by.fixed_rows_mut::<3>(3).copy_from(&-d_position);
+    by.fixed_rows_mut::<3>(6).copy_from(&-d_velocity);
+    by
 }
 
 /// Velocity in the body's axes, the residual of standstill, with its derivatives by rotation and velocity.

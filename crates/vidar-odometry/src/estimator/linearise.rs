@@ -4,10 +4,10 @@
 //! runs of leading zeros in their rows.
 
 use super::dense::Cholesky;
-use super::inertial::{anchor_at, body_velocity, jacobians, residual};
+use super::inertial::{Shift, anchor_at, body_velocity, by_time_offset, jacobians, residual};
 use super::prior::Part;
 use super::visual::{self, CameraPlace};
-use super::window::{CALIBRATION_DIM, Landmark, Sighting};
+use super::window::{CALIBRATION_DIM, Calibration, Frame, Landmark, OFFSET_AT, Sighting};
 use super::{Linearisation, Smoother, SmootherConfig};
 use crate::imu::NavState;
 use nalgebra::{Matrix3, SMatrix, SVector, Vector2, Vector3};
@@ -167,7 +167,6 @@ pub(crate) struct Scene<'a> {
     pub(crate) config: &'a SmootherConfig,
     pub(crate) places: &'a [CameraPlace],
     pub(crate) places_at: &'a [CameraPlace],
-    pub(crate) time_offset_secs: f64,
 }
 
 impl Scene<'_> {
@@ -183,7 +182,7 @@ impl Scene<'_> {
 
     /// Whitened residual of a sighting whose landmark projects to `pixel`.
     fn residual(&self, pixel: &Vector2<f64>, s: &Sighting) -> Vector2<f64> {
-        s.whitening * (pixel - s.pixel + s.pixel_velocity * self.time_offset_secs)
+        s.whitening * (pixel - s.pixel)
     }
 
     /// Where a landmark projects at the present states.
@@ -213,16 +212,16 @@ impl Scene<'_> {
         jacobians.by_host = whiten * jacobians.by_host;
         jacobians.by_target = whiten * jacobians.by_target;
         jacobians.by_landmark = whiten * jacobians.by_landmark;
-        let by_calibration = self.config.calibrates().then(|| {
+        let by_calibration = self.config.calibrates_camera().then(|| {
             let by_place =
                 visual::by_body_from_camera(self.camera, host, target, &landmark.bearing, landmark.rho)
                     .unwrap_or_else(SMatrix::zeros);
-            whiten * calibration_columns(self.config, &by_place, &s.pixel_velocity)
+            whiten * calibration_columns(self.config, &by_place)
         });
         (cost, Some(WeightedSighting { residual: residual * weight.sqrt(), jacobians, by_calibration }))
     }
 
-    /// The host's own sighting: it fixes the bearing (and the clock) only.
+    /// The host's own sighting: it fixes the bearing only.
     pub(crate) fn host(&self, landmark: &mut Landmark) -> Option<(f64, WeightedSighting)> {
         let (pixel, by_direction) = self.camera.project_with_jacobian(&landmark.bearing)?;
         let residual = self.residual(&pixel, &landmark.host);
@@ -232,20 +231,12 @@ impl Scene<'_> {
         let by_bearing = s.whitening * by_direction * visual::tangent_basis(&landmark.bearing);
         by_landmark.fixed_view_mut::<2, 2>(0, 0).copy_from(&by_bearing);
         let zero = SMatrix::zeros();
-        let by_calibration = self
-            .config
-            .calibrates()
-            .then(|| s.whitening * calibration_columns(self.config, &SMatrix::zeros(), &s.pixel_velocity));
         let jacobians = visual::VisualJacobians { pixel, by_host: zero, by_target: zero, by_landmark };
-        Some((0.5 * s.chi2, WeightedSighting { residual, jacobians, by_calibration }))
+        Some((0.5 * s.chi2, WeightedSighting { residual, jacobians, by_calibration: None }))
     }
 }
 
-fn calibration_columns(
-    config: &SmootherConfig,
-    by_place: &SMatrix<f64, 2, 6>,
-    pixel_velocity: &Vector2<f64>,
-) -> ByCalibration {
+fn calibration_columns(config: &SmootherConfig, by_place: &SMatrix<f64, 2, 6>) -> ByCalibration {
     let mut out = ByCalibration::zeros();
     if config.estimate_camera_rotation {
         out.fixed_view_mut::<2, 3>(0, 0).copy_from(&by_place.fixed_view::<2, 3>(0, 0));
@@ -253,10 +244,13 @@ fn calibration_columns(
     if config.estimate_camera_position {
         out.fixed_view_mut::<2, 3>(0, 3).copy_from(&by_place.fixed_view::<2, 3>(0, 3));
     }
-    if config.estimate_time_offset {
-        out.fixed_view_mut::<2, 1>(0, 6).copy_from(pixel_velocity);
-    }
     out
+}
+
+/// How far the instants of two frames lie from where the readings between them were cut.
+pub(crate) fn shift_between(calibration: &Calibration, from: &Frame, to: &Frame) -> Shift {
+    let now = calibration.time_offset_secs;
+    Shift { begin: now - from.clock_secs, end: now - to.clock_secs }
 }
 
 /// Inverse standard deviations of the calibration's own prior; 0 for what is not estimated.
@@ -368,10 +362,15 @@ impl Smoother {
         }
         let (before, rest) = self.frames.split_at_mut(k);
         let (from, to) = (&before[k - 1], &mut rest[0]);
+        let shift = shift_between(&self.calibration, from, to);
         let Some(link) = &mut to.link else { return 0.0 };
         link.follow(&from.state);
-        let r = link.whitening.apply(&residual(&link.readings, &from.state, &to.state));
-        let (ji, jj) = jacobians(&link.readings, &system.states_at[k - 1], &system.states_at[k]);
+        let r = link.whitening.apply(&residual(&link.readings, &from.state, &to.state, shift));
+        let (state_i, state_j) = (&system.states_at[k - 1], &system.states_at[k]);
+        let (ji, jj) = jacobians(&link.readings, state_i, state_j, shift);
+        let by_offset = self.config.estimate_time_offset.then(|| {
+            link.whitening.apply(&by_time_offset(&link.readings, state_i, state_j, shift))
+        });
         let (ji, jj) = (link.whitening.apply(&ji), link.whitening.apply(&jj));
         let parts = [Part::Motion(k - 1), Part::Motion(k), Part::Pose(k - 1), Part::Pose(k)];
         for a in 0..4 {
@@ -395,6 +394,16 @@ impl Smoother {
             let g = j.transpose() * r;
             system.add_gradient(m, &g.fixed_rows::<9>(6).into_owned(), 1.0);
             system.add_gradient(p, &g.fixed_rows::<6>(0).into_owned(), 1.0);
+        }
+        if let Some(d) = by_offset {
+            let at = system.offset(Part::Calibration) + OFFSET_AT;
+            system.add(at, at, &(d.transpose() * d), 1.0);
+            for (j, m, p) in [(&ji, mi, pi), (&jj, mj, pj)] {
+                let row = d.transpose() * j;
+                system.add(at, m, &row.fixed_columns::<9>(6).into_owned(), 1.0);
+                system.add(at, p, &row.fixed_columns::<6>(0).into_owned(), 1.0);
+            }
+            system.gradient[at] += d.dot(&r);
         }
         0.5 * r.norm_squared()
     }
@@ -442,7 +451,6 @@ impl Smoother {
             config: &self.config,
             places: &places,
             places_at: &places_at,
-            time_offset_secs: self.calibration.time_offset_secs,
         };
         let mut cost = 0.0;
         for (slot, landmark) in self.landmarks.iter_mut().enumerate() {
@@ -464,7 +472,7 @@ fn add_landmark(
     lambda: f64,
 ) -> f64 {
     let Some((mut cost, own)) = scene.host(landmark) else { return 0.0 };
-    let calibrates = scene.config.calibrates();
+    let calibrates = scene.config.calibrates_camera();
     let at_calibration = system.offset(Part::Calibration);
     let host = landmark.host.frame;
     let at_host = system.offset(Part::Pose(host));
@@ -473,11 +481,6 @@ fn add_landmark(
     let mut host_square = SMatrix::<f64, 6, 6>::zeros();
     let mut host_gradient = SVector::<f64, 6>::zeros();
     let mut by_calibration = SMatrix::<f64, CALIBRATION_DIM, 3>::zeros();
-    if let Some(c) = &own.by_calibration {
-        by_calibration += c.transpose() * own.jacobians.by_landmark;
-        system.add(at_calibration, at_calibration, &(c.transpose() * c), 1.0);
-        system.add_gradient(at_calibration, &(c.transpose() * own.residual), 1.0);
-    }
     let cross_begin = system.cross.len();
     system.cross.push(Cross { frame: host, value: SMatrix::zeros() });
     let mut sightings = std::mem::take(&mut landmark.sightings);

@@ -8,11 +8,11 @@
 //! its newer ones stay, and none is used twice.
 
 use super::dense::Tall;
-use super::inertial::{anchor_at, body_velocity, jacobians, residual};
-use super::linearise::{Scene, System, calibration_weights};
+use super::inertial::{anchor_at, body_velocity, by_time_offset, jacobians, residual};
+use super::linearise::{Scene, System, calibration_weights, shift_between};
 use super::prior::Part;
 use super::visual;
-use super::window::{CALIBRATION_DIM, Landmark, MAX_INVERSE_DISTANCE, MIN_INVERSE_DISTANCE, Sighting};
+use super::window::{CALIBRATION_DIM, Landmark, OFFSET_AT, MAX_INVERSE_DISTANCE, MIN_INVERSE_DISTANCE, Sighting};
 use super::{Linearisation, Smoother, SmootherError};
 use crate::imu::Vector15;
 use nalgebra::{SMatrix, SVector};
@@ -221,9 +221,11 @@ impl Smoother {
         }
         if self.frames[gone].link.is_some() && gone > 0 {
             tied[gone - 1] = 3;
+            calibration |= self.config.estimate_time_offset;
         }
         if self.frames.get(gone + 1).is_some_and(|f| f.link.is_some()) {
             tied[gone + 1] = 3;
+            calibration |= self.config.estimate_time_offset;
         }
         if self.frames[gone].rest.is_some() && gone > 0 {
             tied[gone - 1] |= 1;
@@ -237,7 +239,7 @@ impl Smoother {
             for s in landmark.sightings[..leaving].iter().filter(|s| self.frames[s.frame].keyframe) {
                 tied[s.frame] |= 1;
                 rows += 2;
-                calibration |= self.config.calibrates();
+                calibration |= self.config.calibrates_camera();
             }
             rows += 2;
         }
@@ -288,6 +290,10 @@ impl Smoother {
         frame.motion_in_prior.then(|| frame.step.fixed_rows::<9>(6).into_owned())
     }
 
+    fn calibration_step(&self) -> Option<SVector<f64, CALIBRATION_DIM>> {
+        self.calibration.in_prior.then_some(self.calibration.step)
+    }
+
     fn put_state(&self, bench: &mut Workbench, row: usize, k: usize, j: &SMatrix<f64, 15, 15>) {
         bench.put(row, Part::Pose(k), &j.fixed_columns::<6>(0).into_owned(), self.pose_step(k));
         bench.put(row, Part::Motion(k), &j.fixed_columns::<9>(6).into_owned(), self.motion_step(k));
@@ -300,12 +306,20 @@ impl Smoother {
                 continue;
             };
             let (from, to) = (&self.frames[k - 1], &self.frames[k]);
-            let r: Vector15 = link.whitening.apply(&residual(&link.readings, &from.state, &to.state));
-            let (ji, jj) = jacobians(&link.readings, &system.states_at[k - 1], &system.states_at[k]);
+            let shift = shift_between(&self.calibration, from, to);
+            let r: Vector15 = link.whitening.apply(&residual(&link.readings, &from.state, &to.state, shift));
+            let (state_i, state_j) = (&system.states_at[k - 1], &system.states_at[k]);
+            let (ji, jj) = jacobians(&link.readings, state_i, state_j, shift);
             let row = bench.stack.add_rows(15);
             bench.put_rhs(row, r.as_slice());
             self.put_state(bench, row, k - 1, &link.whitening.apply(&ji));
             self.put_state(bench, row, k, &link.whitening.apply(&jj));
+            if self.config.estimate_time_offset {
+                let by = link.whitening.apply(&by_time_offset(&link.readings, state_i, state_j, shift));
+                let mut block = SMatrix::<f64, 15, CALIBRATION_DIM>::zeros();
+                block.set_column(OFFSET_AT, &by);
+                bench.put(row, Part::Calibration, &block, self.calibration_step());
+            }
         }
         for k in [gone, gone + 1] {
             let Some(rest) = self.frames.get(k).and_then(|f| f.rest).filter(|_| k > 0) else { continue };
@@ -368,7 +382,6 @@ impl Smoother {
             config: &self.config,
             places: &system.places,
             places_at: &system.places_at,
-            time_offset_secs: self.calibration.time_offset_secs,
         };
         let Some((_, own)) = scene.host(landmark) else { return };
         let mut sightings = std::mem::take(&mut bench.parting);
@@ -380,7 +393,7 @@ impl Smoother {
         one.reset(2 * sightings.len() + 2, 3 + bench.stack.cols());
         let rhs = 3 + bench.rhs();
         let calibration = bench.column(Part::Calibration).map(|c| c + 3);
-        let calibration_step = self.calibration.in_prior.then_some(self.calibration.step);
+        let calibration_step = self.calibration_step();
         let host = bench.column(Part::Pose(gone)).map_or(3, |c| c + 3);
         let mut used = 0;
         let mut write = |w: &super::linearise::WeightedSighting, target: Option<(usize, usize)>| {

@@ -98,6 +98,10 @@ pub enum SmootherError {
     BadState(FrameId),
 }
 
+/// The clock offset that frames are stamped with changes by no more than this from frame to frame, s: less than the time
+/// between images of any camera that is used.
+const MAX_CLOCK_STEP_SECS: f64 = 2e-3;
+
 /// The smoother; see the module's head.
 #[derive(Clone, Debug)]
 pub struct Smoother {
@@ -151,14 +155,6 @@ impl Smoother {
         &self.config
     }
 
-    /// Changes what is calibrated online from now on.
-    pub fn set_calibrating(&mut self, rotation: bool, position: bool, time_offset: bool) {
-        self.system.factorised = false;
-        self.config.estimate_camera_rotation = rotation;
-        self.config.estimate_camera_position = position;
-        self.config.estimate_time_offset = time_offset;
-    }
-
     /// Begins with one frame, whose `state` is believed as well as `sigmas` say. Everything held before is forgotten.
     ///
     /// # Errors
@@ -207,7 +203,8 @@ impl Smoother {
         self.prior.clear();
     }
 
-    /// Adds the next frame with a first guess of its state. `readings` run from the newest frame held to this one;
+    /// Adds the next frame with a first guess of its state. `time` is its image's stamp plus
+    /// [`Smoother::next_frame_offset`]; `readings` run from the newest frame's time to this one's;
     /// without them the frame hangs on its images alone (and its velocity and biases are left as given).
     ///
     /// # Errors
@@ -229,7 +226,8 @@ impl Smoother {
             return Err(SmootherError::NotNext { id, time, newest: newest.time });
         }
         self.system.factorised = false;
-        self.frames.push(Frame::new(id, time, state, readings.map(Link::new)));
+        let clock_secs = self.next_frame_offset().as_secs_f64();
+        self.frames.push(Frame { clock_secs, ..Frame::new(id, time, state, readings.map(Link::new)) });
         Ok(())
     }
 
@@ -330,14 +328,14 @@ impl Smoother {
             found,
         };
         let finite = |v: &Vector2<f64>| v.x.is_finite() && v.y.is_finite();
-        if !finite(&seen.pixel) || !finite(&seen.pixel_velocity) {
+        if !finite(&seen.pixel) {
             return Err(bad("pixel", format!("({}, {})", seen.pixel.x, seen.pixel.y)));
         }
         let whitening = visual::whitening(&seen.covariance).ok_or_else(|| {
             let c: &Matrix2<f64> = &seen.covariance;
             bad("covariance", format!("[{} {}; {} {}]", c[(0, 0)], c[(0, 1)], c[(1, 0)], c[(1, 1)]))
         })?;
-        Ok(Sighting { frame, pixel: seen.pixel, pixel_velocity: seen.pixel_velocity, whitening, chi2: 0.0 })
+        Ok(Sighting { frame, pixel: seen.pixel, whitening, chi2: 0.0 })
     }
 
     fn index(&self, id: FrameId) -> Result<usize, SmootherError> {
@@ -420,9 +418,22 @@ impl Smoother {
         &self.calibration.body_from_camera
     }
 
-    /// Correction of the camera's clock, as estimated: images were taken this much later than their frames say.
+    /// Correction of the camera's clock, as estimated: images were taken this much later than their stamps say (which
+    /// hold what was known of the offset before). Its standard deviation is in [`Smoother::calibration_sigmas`].
     pub fn time_offset(&self) -> Duration {
         Duration::from_secs_f64(self.calibration.time_offset_secs)
+    }
+
+    /// What to add to the next image's stamp before its frame is added and its readings are cut: the clock offset as
+    /// estimated, but never more than 2 ms away from that of the newest frame, so that time advances whatever the
+    /// estimate does. Zero as long as the offset is not estimated.
+    ///
+    /// [`Smoother::add_frame`] takes its `time` to be stamped like that. The states held are those of the true instants
+    /// of the images, as far as the offset is known.
+    pub fn next_frame_offset(&self) -> Duration {
+        let newest = self.frames.last().map_or(0.0, |f| f.clock_secs);
+        let change = self.calibration.time_offset_secs - newest;
+        Duration::from_secs_f64(newest + change.clamp(-MAX_CLOCK_STEP_SECS, MAX_CLOCK_STEP_SECS))
     }
 
     /// Pixel that a landmark is expected at in a frame, `None` if it does not project there.
@@ -443,7 +454,8 @@ impl Smoother {
         let mut sum = (0.0, 0.0);
         for pair in self.frames.windows(2) {
             let Some(link) = &pair[1].link else { continue };
-            let r = inertial::residual(&link.readings, &pair[0].state, &pair[1].state);
+            let shift = linearise::shift_between(&self.calibration, &pair[0], &pair[1]);
+            let r = inertial::residual(&link.readings, &pair[0].state, &pair[1].state, shift);
             sum = (sum.0 + link.whitening.apply(&r).norm_squared(), sum.1 + 15.0);
         }
         if sum.1 > 0.0 { sum.0 / sum.1 } else { 0.0 }

@@ -70,10 +70,11 @@ impl Smoother {
         if newest.rest.is_none() {
             return Ok(None);
         }
-        let (id, time, stays) = (newest.id, newest.time, before.id);
+        let (id, time, clock_secs, stays) = (newest.id, newest.time, newest.clock_secs, before.id);
         self.marginalise(id, departure)?;
         if let Some(frame) = self.frames.last_mut() {
             frame.time = time;
+            frame.clock_secs = clock_secs;
         }
         Ok(Some(stays))
     }

@@ -1,6 +1,6 @@
 //! Factors against numeric derivatives, the prior against dense algebra, and what must stay unobservable.
 
-use super::inertial::{anchor_at, body_velocity, jacobians, residual};
+use super::inertial::{Shift, anchor_at, body_velocity, by_time_offset, jacobians, residual};
 use super::linearise::System;
 use super::prior::Part;
 use super::visual::{self, CameraPlace};
@@ -10,7 +10,7 @@ use crate::simulate::{
     Course, CourseKind, FeatureOdometry, FeatureOdometryConfig, Random, Simulation, SimulationConfig,
     StepOutput,
 };
-use nalgebra::{DMatrix, DVector, SMatrix, SVector, Vector3};
+use nalgebra::{DMatrix, DVector, SMatrix, SVector, Vector1, Vector3};
 use vidar_core::testing::check_jacobian;
 use vidar_core::{ImuNoise, LieGroup, So3};
 
@@ -43,18 +43,46 @@ fn inertial_factor_agrees_with_numeric_derivatives() {
         let readings = some_readings(Bias { gyro: i.bias.gyro * 0.9, accel: i.bias.accel * 0.8 });
         let guess = Vector15::from_fn(|_, _| 0.1 * random.normal());
         let j = readings.predict(&i).plus(&guess);
-        let (by_i, by_j) = jacobians(&readings, &i, &j);
-        let zero = Vector15::zeros();
-        check_jacobian("by i", &by_i, |d| residual(&readings, &i.plus(d), &j), &zero, 1e-6).unwrap();
-        check_jacobian("by j", &by_j, |d| residual(&readings, &i, &j.plus(d)), &zero, 1e-6).unwrap();
+        for shift in [Shift::NONE, Shift { begin: 4e-3, end: -7e-3 }, Shift { begin: -0.02, end: -0.02 }] {
+            let (by_i, by_j) = jacobians(&readings, &i, &j, shift);
+            let zero = Vector15::zeros();
+            let of = |i: &NavState, j: &NavState| residual(&readings, i, j, shift);
+            check_jacobian("by i", &by_i, |d| of(&i.plus(d), &j), &zero, 1e-6).unwrap();
+            check_jacobian("by j", &by_j, |d| of(&i, &j.plus(d)), &zero, 1e-6).unwrap();
+            let by_offset = by_time_offset(&readings, &i, &j, shift);
+            let later = |d: &Vector1<f64>| {
+                let shift = Shift { begin: shift.begin + d.x, end: shift.end + d.x };
+                residual(&readings, &i, &j, shift)
+            };
+            check_jacobian("by clock", &by_offset, later, &Vector1::zeros(), 1e-6).unwrap();
+        }
     }
+}
+
+#[test]
+fn shifted_readings_are_those_of_the_shifted_stretch() {
+    let course = Course { kind: CourseKind::Eight, secs: 3.0, speed: 1.2, phase: 0.2 };
+    let settings = SimulationConfig { noise_scale: 0.0, imu_rate_hz: 1000.0, ..Default::default() };
+    let simulation = Simulation::new(&course, 0.0, 2.0, &settings);
+    let model = ImuModel::from_data_sheet(&ImuNoise::EUROC, 2.0, 2.0);
+    let cut = |from: usize, until: usize| {
+        Preintegration::new(model, Bias::ZERO, &simulation.readings[from..=until])
+    };
+    let state = |k: usize| simulation.frames[0].truth.plus(&Vector15::from_element(k as f64 * 0.01));
+    let (i, j) = (state(1), state(7));
+    // Three milliseconds later at one end, two at the other.
+    let shifted = residual(&cut(100, 300), &i, &j, Shift { begin: 3e-3, end: 2e-3 });
+    let exact = residual(&cut(103, 302), &i, &j, Shift::NONE);
+    let not_at_all = residual(&cut(100, 300), &i, &j, Shift::NONE);
+    let (left, before) = ((shifted - exact).amax(), (not_at_all - exact).amax());
+    assert!(left < 1e-3 * before, "{left:.2e} of {before:.2e}");
 }
 
 #[test]
 fn inertial_residual_vanishes_on_its_own_prediction() {
     let i = random_state(&mut Random::new(12));
     let readings = some_readings(i.bias);
-    assert!(residual(&readings, &i, &readings.predict(&i)).amax() < 1e-12);
+    assert!(residual(&readings, &i, &readings.predict(&i), Shift::NONE).amax() < 1e-12);
 }
 
 #[test]
@@ -354,7 +382,6 @@ fn a_camera_that_is_turned_by_two_degrees_is_found() {
     let off = So3::exp(&(Vector3::new(0.5, -0.6, 0.62).normalize() * 2.0_f64.to_radians()));
     let (place, _, sigmas) = calibrated(&off, 0.0, |config| {
         config.estimate_camera_rotation = true;
-        config.camera_rotation_sigma_deg = 2.0;
     });
     let left = (place.rotation.inverse() * Simulation::body_from_camera().rotation).angle_rad().to_degrees();
     assert!(left < 0.2, "{left:.3} deg left of 2");
@@ -362,15 +389,13 @@ fn a_camera_that_is_turned_by_two_degrees_is_found() {
 }
 
 #[test]
-#[ignore = "fails: a clock 10 ms off is estimated as 0.2 ms; the clock offset must stay off until this is understood"]
 fn a_clock_that_is_10_ms_off_is_found() {
     for offset in [-0.01, 0.01] {
         let (_, found, sigmas) = calibrated(&So3::IDENTITY, offset, |config| {
             config.estimate_time_offset = true;
-            config.time_offset_sigma_ms = 10.0;
         });
-        assert!((found - offset).abs() < 1.5e-3, "{:.2} ms instead of {:.0}", found * 1e3, offset * 1e3);
-        assert!(sigmas[6] < 2e-3, "{}", sigmas[6]);
+        assert!((found - offset).abs() < 1e-3, "{:.2} ms instead of {:.0}", found * 1e3, offset * 1e3);
+        assert!(sigmas[6] < 5e-4, "{}", sigmas[6]);
     }
 }
 
@@ -402,7 +427,6 @@ fn what_is_of_no_use_is_refused_in_words() {
         landmark: LandmarkId(landmark),
         pixel: Vector2::new(100.0, 100.0),
         covariance,
-        pixel_velocity: Vector2::zeros(),
     };
     let bad = seen(90_000, Matrix2::new(1.0, 2.0, 2.0, 1.0));
     let told = smoother.add_landmark(&bad, 0.5).unwrap_err().to_string();

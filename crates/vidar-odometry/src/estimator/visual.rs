@@ -2,8 +2,8 @@
 //!
 //! A landmark is a unit bearing `b` in its host camera and an inverse distance ρ. In the target camera it lies along
 //! `q = C_tᵀ (C_h b + ρ (c_h − c_t))`, with `C` the rotation world_from_camera and `c` the camera's place: well defined
-//! at infinity (ρ = 0). Residual: `π(q) − (u − t_d u̇)`, with t_d how much later
-//! the image was taken than the state holds.
+//! at infinity (ρ = 0). Residual: `π(q) − u`. States are those of the images' true instants; clocks that are off are the
+//! inertial factor's affair.
 
 use crate::imu::hat;
 use nalgebra::{Matrix2, Matrix2x3, Matrix3, Matrix3x2, SMatrix, Vector2, Vector3};

@@ -9,6 +9,9 @@ use vidar_core::{FrameId, LandmarkId, LieGroup, Se3, So3, Timestamp};
 /// Dimensions of the calibration: camera rotation, camera position, clock offset.
 pub(crate) const CALIBRATION_DIM: usize = 7;
 
+/// Place of the clock offset among them.
+pub(crate) const OFFSET_AT: usize = 6;
+
 /// Landmarks are held nearer than 10 km, so that the inverse distance stays on the right side of infinity.
 pub(crate) const MIN_INVERSE_DISTANCE: f64 = 1e-4;
 
@@ -26,8 +29,6 @@ pub struct Observation {
     pub pixel: Vector2<f64>,
     /// Covariance of `pixel`, px². A wide ellipse along an edge makes an edgelet.
     pub covariance: Matrix2<f64>,
-    /// Motion of the pixel over time, px/s; used for the clock offset only, zero when unknown.
-    pub pixel_velocity: Vector2<f64>,
 }
 
 /// A landmark as believed.
@@ -73,6 +74,8 @@ impl Link {
 pub(crate) struct Frame {
     pub(crate) id: FrameId,
     pub(crate) time: Timestamp,
+    /// Clock offset that `time` and the readings up to it are cut with, s.
+    pub(crate) clock_secs: f64,
     pub(crate) keyframe: bool,
     pub(crate) state: NavState,
     /// Linearisation point of the parts that are in the prior.
@@ -92,6 +95,7 @@ impl Frame {
         Self {
             id,
             time,
+            clock_secs: 0.0,
             keyframe: false,
             state,
             linearised: state,
@@ -164,7 +168,6 @@ impl Frame {
 pub(crate) struct Sighting {
     pub(crate) frame: usize,
     pub(crate) pixel: Vector2<f64>,
-    pub(crate) pixel_velocity: Vector2<f64>,
     pub(crate) whitening: Matrix2<f64>,
     /// Squared whitened residual at the last linearisation.
     pub(crate) chi2: f64,
@@ -193,7 +196,6 @@ impl Landmark {
         let host = Sighting {
             frame: 0,
             pixel: Vector2::zeros(),
-            pixel_velocity: Vector2::zeros(),
             whitening: Matrix2::identity(),
             chi2: 0.0,
         };

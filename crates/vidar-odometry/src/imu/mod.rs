@@ -10,6 +10,7 @@ mod preintegration;
 mod propagate;
 
 pub use buffer::{BufferError, Gap, ImuBuffer};
+pub(crate) use preintegration::Rates;
 pub use preintegration::{Bias, ImuModel, Preintegration, StepNoise};
 pub use propagate::{Propagated, propagate};
 

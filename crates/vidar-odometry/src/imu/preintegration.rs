@@ -217,13 +217,32 @@ pub struct Preintegration {
     model: ImuModel,
     samples: Vec<ImuSample>,
     sealed: bool,
+    /// First and last reading, kept however long the stretch is.
+    ends: [Rates; 2],
+}
+
+/// Angular rate, rad/s, and specific force, m/s², at one instant.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Rates {
+    pub(crate) turn: Vector3<f64>,
+    pub(crate) force: Vector3<f64>,
+}
+
+impl Rates {
+    const NONE: Self = Self { turn: Vector3::new(0.0, 0.0, 0.0), force: Vector3::new(0.0, 0.0, 0.0) };
+
+    fn of(sample: &ImuSample) -> Self {
+        Self { turn: sample.gyro.0, force: sample.accel.0 }
+    }
 }
 
 impl Preintegration {
     /// Integrates `samples` (in the order of time; the first and last are the ends) at `bias`.
     pub fn new(model: ImuModel, bias: Bias, samples: &[ImuSample]) -> Self {
+        let samples_held = Vec::with_capacity(64);
+        let ends = [Rates::NONE; 2];
         let mut fresh =
-            Self { delta: Delta::none(), bias, model, samples: Vec::with_capacity(64), sealed: false };
+            Self { delta: Delta::none(), bias, model, samples: samples_held, sealed: false, ends };
         fresh.restart(bias, samples);
         fresh
     }
@@ -233,6 +252,7 @@ impl Preintegration {
         self.bias = bias;
         self.sealed = samples.len() > MAX_RAW_SAMPLES;
         self.delta = integrate(samples, &bias, &self.model);
+        self.ends = [samples.first(), samples.last()].map(|s| s.map_or(Rates::NONE, Rates::of));
         self.samples.clear();
         if !self.sealed {
             self.samples.extend_from_slice(samples);
@@ -268,6 +288,7 @@ impl Preintegration {
             self.delta.then(&integrate(&next.samples, &self.bias, &self.model))
         };
         self.delta = joined;
+        self.ends[1] = next.ends[1];
         self.sealed |= next.sealed || self.samples.len() + next.samples.len() > MAX_RAW_SAMPLES;
         if self.sealed {
             self.samples.clear();
@@ -275,6 +296,14 @@ impl Preintegration {
             // The first reading of `next` is the last of this stretch.
             self.samples.extend_from_slice(next.samples.get(1..).unwrap_or(&[]));
         }
+    }
+
+    /// Whether a reading kept lies beyond the range of its sensor: what was felt is less than what was.
+    pub fn is_saturated(&self) -> bool {
+        let beyond = |s: &ImuSample| {
+            s.gyro.0.amax() > self.model.gyro_limit || s.accel.0.amax() > self.model.accel_limit
+        };
+        self.samples.iter().any(beyond)
     }
 
     /// Length of the stretch, s.
@@ -290,6 +319,11 @@ impl Preintegration {
     /// The IMU's model.
     pub fn model(&self) -> &ImuModel {
         &self.model
+    }
+
+    /// What the first and the last reading say, the biases that were integrated with taken off.
+    pub(crate) fn ends(&self) -> [Rates; 2] {
+        self.ends.map(|r| Rates { turn: r.turn - self.bias.gyro, force: r.force - self.bias.accel })
     }
 
     /// Readings kept, ends included; empty after very long stretches.

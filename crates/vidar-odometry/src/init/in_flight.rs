@@ -476,7 +476,6 @@ impl InFlightStart {
                 landmark: track.landmark,
                 pixel: seen.pixel,
                 covariance: seen.covariance,
-                pixel_velocity: Vector2::zeros(),
             };
             let at = smoother.state(views[host].logged.frame).map_or(Se3::IDENTITY, |s| s.world_from_body);
             let distance = point.map_or(fallback, |p| {

@@ -6,9 +6,9 @@ use crate::estimator::{
 };
 use crate::imu::{Bias, BufferError, ImuBuffer, ImuModel, NavState, Preintegration};
 use crate::init::{Attempt, InFlightConfig, InFlightStart, LoggedFrame, Refusal, Seen};
-use nalgebra::{Vector2, Vector3};
+use nalgebra::Vector3;
 use rustc_hash::{FxHashMap, FxHashSet};
-use vidar_core::{CameraModel, FrameId, ImuSample, LandmarkId, LieGroup, Se3, Timestamp};
+use vidar_core::{CameraModel, Duration, FrameId, ImuSample, LandmarkId, LieGroup, Se3, Timestamp};
 
 /// Settings of [`FeatureOdometry`].
 #[derive(Clone, Debug)]
@@ -80,9 +80,6 @@ pub struct FeatureOdometry {
     log: Vec<LoggedFrame>,
     smoother: Option<Smoother>,
     tracks: FxHashMap<LandmarkId, Vec<(FrameId, Seen)>>,
-    /// Pixels of the frame before, and how they move.
-    before: FxHashMap<LandmarkId, Vector2<f64>>,
-    velocities: FxHashMap<(FrameId, LandmarkId), Vector2<f64>>,
     banned: FxHashSet<LandmarkId>,
     since_keyframe: usize,
     last_time: Option<Timestamp>,
@@ -115,8 +112,6 @@ impl FeatureOdometry {
             log: Vec::new(),
             smoother: None,
             tracks: FxHashMap::default(),
-            before: FxHashMap::default(),
-            velocities: FxHashMap::default(),
             banned: FxHashSet::default(),
             since_keyframe: 0,
             last_time: None,
@@ -178,7 +173,7 @@ impl FeatureOdometry {
         &self.report
     }
 
-    /// Takes the tracks of the next frame.
+    /// Takes the tracks of the next frame, with its stamp.
     ///
     /// # Errors
     /// What the smoother refuses; readings that do not reach to the frame count as missing.
@@ -187,8 +182,9 @@ impl FeatureOdometry {
             Some(smoother) => smoother.newest().map_or(Bias::ZERO, |(.., s)| s.bias),
             None => Bias { gyro: *self.start.gyro_bias(), accel: Vector3::zeros() },
         };
+        // Stamps as far right as is known.
+        let time = time + self.smoother.as_ref().map_or(Duration::ZERO, Smoother::next_frame_offset);
         let readings = self.readings_until(time, bias);
-        self.watch(id, seen, self.last_time.map(|last| (time - last).as_secs_f64()));
         self.last_time = Some(time);
         match self.smoother.take() {
             Some(mut smoother) => {
@@ -198,22 +194,6 @@ impl FeatureOdometry {
             }
             None => self.try_start(id, time, seen, readings),
         }
-    }
-
-    /// Notes how pixels move since the frame before.
-    fn watch(&mut self, id: FrameId, seen: &[Seen], secs: Option<f64>) {
-        for s in seen {
-            let moved =
-                self.before.get(&s.landmark).zip(secs).map(|(before, secs)| (s.pixel - before) / secs);
-            self.velocities.insert((id, s.landmark), moved.unwrap_or_else(Vector2::zeros));
-        }
-        self.before.clear();
-        self.before.extend(seen.iter().map(|s| (s.landmark, s.pixel)));
-    }
-
-    fn observation(&self, frame: FrameId, seen: &Seen) -> Observation {
-        let moved = self.velocities.get(&(frame, seen.landmark)).copied();
-        Observation { pixel_velocity: moved.unwrap_or_else(Vector2::zeros), ..observation(frame, seen) }
     }
 
     fn readings_until(&mut self, time: Timestamp, bias: Bias) -> Option<Preintegration> {
@@ -284,7 +264,7 @@ impl FeatureOdometry {
         for s in seen {
             let near = smoother.predict_pixel(id, s.landmark).is_some_and(|p| (p - s.pixel).norm() < GATE_PX);
             if near {
-                smoother.add_observation(&self.observation(id, s))?;
+                smoother.add_observation(&observation(id, s))?;
                 tracked += 1;
             }
         }
@@ -356,9 +336,9 @@ impl FeatureOdometry {
             if fitting.len() < 2 || fitting.len() * 3 < history.len() {
                 continue;
             }
-            smoother.add_landmark(&self.observation(host, &host_seen), 1.0 / distance)?;
+            smoother.add_landmark(&observation(host, &host_seen), 1.0 / distance)?;
             for (frame, seen) in fitting.iter().filter(|(f, _)| *f >= host) {
-                smoother.add_observation(&self.observation(*frame, seen))?;
+                smoother.add_observation(&observation(*frame, seen))?;
             }
         }
         Ok(())
@@ -386,7 +366,6 @@ impl FeatureOdometry {
             }
         }
         let held: FxHashSet<FrameId> = smoother.frames().collect();
-        self.velocities.retain(|(frame, _), _| held.contains(frame));
         self.tracks.retain(|_, history| history.last().is_some_and(|(f, _)| held.contains(f)));
         Ok(())
     }
@@ -398,7 +377,6 @@ fn observation(frame: FrameId, seen: &Seen) -> Observation {
         landmark: seen.landmark,
         pixel: seen.pixel,
         covariance: seen.covariance,
-        pixel_velocity: Vector2::zeros(),
     }
 }
 

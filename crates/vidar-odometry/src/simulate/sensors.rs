@@ -75,7 +75,7 @@ pub struct SimulatedFrame {
     pub id: FrameId,
     /// Its stamp.
     pub time: Timestamp,
-    /// The truth, biases included.
+    /// The truth when it was exposed, biases included.
     pub truth: NavState,
     /// What it sees. A track that was lost comes back under another name.
     pub seen: Vec<Seen>,
@@ -132,11 +132,11 @@ impl Simulation {
         let mut all = Vec::with_capacity(frames);
         for k in 0..frames {
             let at = k as f64 / config.camera_rate_hz;
-            let motion = flight.motion(from_secs + at);
-            let bias = biases[((at * config.imu_rate_hz).round() as usize).min(biases.len() - 1)];
+            let exposed = at + config.time_offset_secs;
+            let motion = flight.motion(from_secs + exposed);
+            let bias = biases[((exposed * config.imu_rate_hz).round() as usize).min(biases.len() - 1)];
             let truth = NavState { world_from_body: motion.world_from_body, velocity: motion.velocity, bias };
-            let exposed = flight.motion(from_secs + at + config.time_offset_secs).world_from_body;
-            let camera_from_world = (exposed * body_from_camera).inverse();
+            let camera_from_world = (motion.world_from_body * body_from_camera).inverse();
             let seen = tracker.look(&points, &camera, &camera_from_world, config, &mut random);
             all.push(SimulatedFrame { id: FrameId(k as u32), time: stamp(at), truth, seen });
         }
@@ -153,6 +153,7 @@ fn simulate_imu(
 ) -> (Vec<ImuSample>, Vec<Bias>) {
     let (scale, noise) = (config.noise_scale, &config.noise);
     let root_rate = config.imu_rate_hz.sqrt();
+    let secs = secs + 2.0 * config.time_offset_secs.max(0.0);
     let count = (secs * config.imu_rate_hz + 1e-6).floor() as usize + 2;
     let mut bias = Bias {
         gyro: random.normal3() * (scale * config.gyro_bias_sigma),

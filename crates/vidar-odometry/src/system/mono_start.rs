@@ -6,7 +6,6 @@ use crate::estimator::{AnchorSigmas, Observation, Smoother};
 use crate::frontend::{RayPair, TwoViewConfig, TwoViewFailure, TwoViewSolver, triangulate};
 use crate::imu::NavState;
 use crate::init::{LoggedFrame, Obstacle, Refusal, Seen};
-use nalgebra::Vector2;
 use vidar_core::{CameraModel, LieGroup, Se3};
 
 /// Least median parallax between the two views, degrees.
@@ -139,7 +138,6 @@ fn build(
             landmark: seen.landmark,
             pixel: seen.pixel,
             covariance: seen.covariance,
-            pixel_velocity: Vector2::zeros(),
         };
         smoother.add_landmark(&observation(first.frame, a), inverse * scale).ok()?;
         smoother.add_observation(&observation(second.frame, b)).ok()?;

@@ -10,7 +10,6 @@ use crate::frontend::{
     PixelMeasurement,
 };
 use crate::imu::{NavState, Preintegration};
-use nalgebra::Vector2;
 use std::rc::Rc;
 use vidar_core::{CameraModel, FrameId, LandmarkId, LieGroup, Se3, Timestamp};
 
@@ -384,7 +383,6 @@ impl Running {
             landmark: id,
             pixel: track.feature.pixel,
             covariance: host_covariance(track),
-            pixel_velocity: Vector2::zeros(),
         };
         self.smoother.add_landmark(&host, track.distance.mean)?;
         for (frame, measured) in &track.seen {
@@ -562,7 +560,6 @@ fn observation(
         landmark,
         pixel: measured.pixel,
         covariance: noisy_covariance(measured, noise_px),
-        pixel_velocity: Vector2::zeros(),
     }
 }
 
