@@ -91,4 +91,18 @@ pub enum FusionError {
         /// Its chunk.
         chunk: ChunkId,
     },
+    /// A chunk's volume waits elsewhere.
+    #[error("chunk {chunk} was set aside; bring it back first")]
+    SetAside {
+        /// Which chunk.
+        chunk: ChunkId,
+    },
+    /// Bytes that are not those of a volume that was set aside.
+    #[error("a volume that was set aside is broken at byte {at}: expected {what}")]
+    BadSnapshot {
+        /// What was expected.
+        what: &'static str,
+        /// Where, bytes from the beginning.
+        at: u64,
+    },
 }

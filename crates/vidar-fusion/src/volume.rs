@@ -229,6 +229,16 @@ impl TsdfVolume {
         self.shortened_views += other.shortened_views;
     }
 
+    /// Views fused, and how many of them carved a shorter range.
+    pub(crate) fn view_counts(&self) -> (u32, u32) {
+        (self.views, self.shortened_views)
+    }
+
+    /// Sets what [`Self::view_counts`] tells.
+    pub(crate) fn set_view_counts(&mut self, views: u32, shortened: u32) {
+        (self.views, self.shortened_views) = (views, shortened);
+    }
+
     /// Changes how much memory the volume may hold; what it holds already stays.
     pub(crate) fn set_budget(&mut self, bytes: u64) {
         self.config.memory_budget_bytes = bytes;

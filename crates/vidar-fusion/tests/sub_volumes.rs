@@ -311,3 +311,72 @@ fn the_map_is_the_same_for_any_number_of_threads_and_order_of_chunks() {
     assert!(same_bits(&one, &mesh(4, [0, 1, 2])));
     assert!(same_bits(&one, &mesh(3, [2, 0, 1])));
 }
+
+#[test]
+fn chunks_that_wait_elsewhere_move_and_merge_as_if_they_were_here() {
+    let views: Vec<AlignedView> = views_around(130, 1.3, ball(0.4)).into_iter().map(colored).collect();
+    let fusion = FusionConfig { carve_range_m: 2.0, voxel_size_m: 0.04, ..config() };
+    let mut here = dealt(&settings(fusion.clone()), &views, 5);
+    let mut away = here.clone();
+    let mut shelf = std::collections::BTreeMap::new();
+    let full = away.memory_bytes();
+    for chunk in 0..4 {
+        shelf.insert(ChunkId(chunk), away.set_aside(ChunkId(chunk)).unwrap());
+    }
+    let bytes: usize = shelf.values().map(Vec::len).sum();
+    assert!(away.memory_bytes() < full / 3 && (bytes as u64) < full / 2, "{bytes} of {full}");
+    assert_eq!(away.aside().collect::<Vec<_>>(), (0..4).map(ChunkId).collect::<Vec<_>>());
+    let by = Sim3::new(So3::exp(&Vec3::new(0.0, 0.1, 0.2)), Vec3::new(0.1, 0.0, 0.2), 0.98).unwrap();
+    for parts in [&mut here, &mut away] {
+        let moves: Vec<_> = views[26..52].iter().map(|v| revised(v, &by)).collect();
+        assert!(parts.revise(ChunkId(1), &moves).unwrap().stale);
+    }
+    let wanted = here.extract_mesh().unwrap();
+    let load = |chunk: ChunkId| Ok::<_, FusionError>(shelf[&chunk].clone());
+    assert!(same_bits(&wanted, &away.merged_with(load).unwrap().extract_mesh()));
+    assert_eq!(away.merged().unwrap_err(), FusionError::SetAside { chunk: ChunkId(0) });
+    assert_eq!(away.set_aside(ChunkId(0)).unwrap_err(), FusionError::SetAside { chunk: ChunkId(0) });
+    let late = &views_around(131, 1.3, ball(0.4))[130];
+    assert!(matches!(away.integrate(ChunkId(0), late), Err(FusionError::SetAside { .. })));
+    for (chunk, bytes) in &shelf {
+        away.bring_back(*chunk, bytes).unwrap();
+    }
+    assert!(same_bits(&wanted, &away.extract_mesh().unwrap()));
+    assert_eq!(away.memory_bytes(), here.memory_bytes());
+    assert_eq!(away.set_aside(ChunkId(2)).unwrap(), shelf[&ChunkId(2)], "equal volumes, equal bytes");
+}
+
+#[test]
+fn broken_bytes_are_refused_and_never_panic() {
+    let views = views_around(6, 1.3, ball(0.4));
+    let fusion = FusionConfig { carve_range_m: 1.0, voxel_size_m: 0.05, ..config() };
+    let mut parts = dealt(&settings(fusion), &views, 1);
+    let good = parts.set_aside(ChunkId(0)).unwrap();
+    let mut state = 1_u64;
+    let mut random = |below: usize| {
+        state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+        (state >> 33) as usize % below
+    };
+    let mut refused = 0;
+    for round in 0..400 {
+        let mut bytes = good.clone();
+        if round % 2 == 0 {
+            bytes.truncate(random(good.len()));
+        } else {
+            bytes[random(good.len())] ^= 1 << random(8);
+        }
+        // A flipped bit of a sum may still be a sum; whatever is read can be made a mesh.
+        match parts.merged_with(|_| Ok::<_, FusionError>(bytes.clone())) {
+            Ok(volume) => drop(volume.extract_mesh()),
+            Err(FusionError::BadSnapshot { .. }) => refused += 1,
+            Err(other) => panic!("{other}"),
+        }
+    }
+    assert!(refused >= 200, "{refused}");
+    assert!(parts.bring_back(ChunkId(0), b"VSUB2").is_err());
+    let mut endless = b"VSUB1".to_vec();
+    endless.extend([0xFF; 20]);
+    assert!(parts.bring_back(ChunkId(0), &endless).is_err());
+    parts.bring_back(ChunkId(0), &good).unwrap();
+    assert!(parts.extract_mesh().unwrap().positions.len() > 100);
+}

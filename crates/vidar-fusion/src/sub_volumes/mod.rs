@@ -6,12 +6,16 @@
 //! until its views are fused again ([`SubVolumes::rebuild`]), which is exact also when the chunk bent. Chunks that
 //! moved less stay as they are, to the bit.
 //!
+//! A chunk that is done can be [set aside](SubVolumes::set_aside) as bytes, for instance in a file, and still moves; so
+//! memory stays flat however long the sequence is.
+//!
 //! [`SubVolumes::merged`] adds all sub-volumes to one. Sums are integers, so as long as nothing moved the result is
 //! the volume that fusing all views at once would have made, to the bit, and with any motion it does not depend on
 //! the order in which chunks came or on the number of threads.
 
 mod placement;
 mod resample;
+mod snapshot;
 
 use crate::{FusionConfig, FusionError, IntegrationStats, TsdfVolume};
 use placement::Probe;
@@ -113,6 +117,8 @@ struct SubVolume {
     /// Points of its surface by which its motion is judged.
     probes: BTreeMap<FrameId, Probe>,
     revision: Revision,
+    /// Whether `volume` is empty here because its bytes are elsewhere.
+    is_aside: bool,
 }
 
 impl SubVolumes {
@@ -162,6 +168,9 @@ impl SubVolumes {
             Some(part) => part,
             None => fresh.insert(SubVolume::new(&self.config.fusion)?),
         };
+        if part.is_aside {
+            return Err(FusionError::SetAside { chunk });
+        }
         part.volume.set_budget(budget);
         let stats = part.integrate(view)?;
         if let Some(fresh) = fresh {
@@ -246,24 +255,81 @@ impl SubVolumes {
         Ok(total)
     }
 
+    /// Takes a chunk's sums out of memory: its bytes, to be given back by [`Self::bring_back`] or to
+    /// [`Self::merged_with`]. Its place is still revised meanwhile, and [`Self::rebuild`] does not need them.
+    ///
+    /// # Errors
+    /// A chunk without views, or one that was set aside already.
+    pub fn set_aside(&mut self, chunk: ChunkId) -> Result<Vec<u8>, FusionError> {
+        let empty = TsdfVolume::new(&self.config.fusion)?;
+        let part = self.chunks.get_mut(&chunk).ok_or(FusionError::NoSuchChunk { chunk })?;
+        if part.is_aside {
+            return Err(FusionError::SetAside { chunk });
+        }
+        let bytes = snapshot::write(&part.volume);
+        part.volume = empty;
+        part.is_aside = true;
+        Ok(bytes)
+    }
+
+    /// Gives back what [`Self::set_aside`] returned; a chunk that is in memory stays as it is.
+    ///
+    /// # Errors
+    /// A chunk without views, bytes that are none of a volume, or too large for what is left of the budget.
+    pub fn bring_back(&mut self, chunk: ChunkId, bytes: &[u8]) -> Result<(), FusionError> {
+        let budget = self.config.fusion.memory_budget_bytes.saturating_sub(self.memory_bytes());
+        let part = self.chunks.get_mut(&chunk).ok_or(FusionError::NoSuchChunk { chunk })?;
+        if part.is_aside {
+            let budget = budget.max(FusionConfig::MIN_MEMORY_BUDGET_BYTES);
+            let config = FusionConfig { memory_budget_bytes: budget, ..self.config.fusion.clone() };
+            part.volume = snapshot::read(bytes, &config)?;
+            part.is_aside = false;
+        }
+        self.peak_bytes = self.peak_bytes.max(self.memory_bytes());
+        Ok(())
+    }
+
+    /// Chunks whose sums are elsewhere.
+    pub fn aside(&self) -> impl Iterator<Item = ChunkId> + '_ {
+        self.chunks.iter().filter(|(_, part)| part.is_aside).map(|(id, _)| *id)
+    }
+
     /// All sub-volumes where they lie now, as one volume.
     ///
     /// Chunks that did not move are added sum by sum, the others are resampled (trilinear, in space and in all sums).
     ///
     /// # Errors
-    /// More than 65535 views.
+    /// More than 65535 views, or a chunk that was set aside: see [`Self::merged_with`].
     pub fn merged(&self) -> Result<TsdfVolume, FusionError> {
+        self.merged_with(|chunk| Err(FusionError::SetAside { chunk }))
+    }
+
+    /// As [`Self::merged`]; `load` is asked for the bytes of each chunk that was set aside, one at a time.
+    ///
+    /// # Errors
+    /// More than 65535 views, whatever `load` returns, or bytes that are none of a volume.
+    pub fn merged_with<E: From<FusionError>>(
+        &self,
+        mut load: impl FnMut(ChunkId) -> Result<Vec<u8>, E>,
+    ) -> Result<TsdfVolume, E> {
         let mut merged = TsdfVolume::new(&self.config.fusion)?;
-        for part in self.chunks.values() {
+        for (chunk, part) in &self.chunks {
+            let loaded;
+            let volume = if part.is_aside {
+                loaded = snapshot::read(&load(*chunk)?, &self.config.fusion)?;
+                &loaded
+            } else {
+                &part.volume
+            };
             let limit = crate::grid::MAX_VIEWS;
-            if merged.views() + part.volume.views() > limit {
+            if merged.views() + volume.views() > limit {
                 let frame = part.probes.keys().next().copied().unwrap_or_default();
-                return Err(FusionError::TooManyViews { frame, limit });
+                return Err(FusionError::TooManyViews { frame, limit }.into());
             }
             if part.now_from_fused == Sim3::IDENTITY {
-                merged.add(&part.volume);
+                merged.add(volume);
             } else {
-                resample::add_moved(&mut merged, &part.volume, &part.now_from_fused);
+                resample::add_moved(&mut merged, volume, &part.now_from_fused);
             }
         }
         Ok(merged)
@@ -311,7 +377,8 @@ impl SubVolume {
     fn new(config: &FusionConfig) -> Result<Self, FusionError> {
         let volume = TsdfVolume::new(config)?;
         let revision = Revision::default();
-        Ok(Self { volume, now_from_fused: Sim3::IDENTITY, probes: BTreeMap::new(), revision })
+        let probes = BTreeMap::new();
+        Ok(Self { volume, now_from_fused: Sim3::IDENTITY, probes, revision, is_aside: false })
     }
 
     fn integrate(&mut self, view: &AlignedView) -> Result<IntegrationStats, FusionError> {
