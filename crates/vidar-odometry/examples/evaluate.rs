@@ -2,13 +2,13 @@
 //!
 //! ```text
 //! cargo run --release -p vidar-odometry --example evaluate -- [--mono] [--start S] [--secs S] [--quiet]
-//!     [--trajectory FILE] [--set KEY=VALUE]... SEQUENCE...
+//!     [--trajectory FILE] [--frames FILE] [--set KEY=VALUE]... SEQUENCE...
 //! ```
 //!
 //! A sequence is any folder with images, IMU readings and ground truth that `vidar-dataset` reads. Figures: ATE after the best
 //! rigid motion and after the best similarity, |ln s|, relative error per metre, share of frames with a pose, seconds
 //! from the first image to the first metric pose, processor time per image (decoding left out), peak memory. `--set` changes
-//! a number of the odometry's configuration.
+//! a number of the odometry's configuration; `--frames` writes what became of the tracks in every image.
 
 #![allow(clippy::print_stdout, clippy::print_stderr)] // a program
 
@@ -28,6 +28,7 @@ struct Options {
     secs: Option<f64>,
     verbose: bool,
     trajectory: Option<PathBuf>,
+    frames: Option<PathBuf>,
     settings: Vec<(String, f64)>,
 }
 
@@ -46,6 +47,7 @@ fn options() -> Result<Options, Failure> {
                 let (key, number) = text.split_once('=').ok_or("--set needs KEY=VALUE")?;
                 found.settings.push((key.to_owned(), number.parse()?));
             }
+            "--frames" => found.frames = Some(value()?.into()),
             "--trajectory" => found.trajectory = Some(value()?.into()),
             other if other.starts_with("--") => return Err(format!("unknown flag {other}").into()),
             path => found.sequences.push(path.into()),
@@ -96,6 +98,9 @@ fn evaluate(path: &Path, options: &Options) -> Result<(), Failure> {
     let run = run(&dataset, options)?;
     if options.verbose {
         tell(&run);
+    }
+    if let Some(file) = &options.frames {
+        std::fs::write(file, frames(&run))?;
     }
     let Some(first_image) = dataset.images.first().map(|i| i.time) else { return Err("no images".into()) };
     if run.poses.len() < 3 {
@@ -195,6 +200,28 @@ fn tell(run: &Run) {
             last = now;
         }
     }
+}
+
+fn frames(run: &Run) -> String {
+    use std::fmt::Write as _;
+    let mut text = String::from("#time,health,landmarks_found,tried,young_found,tried,contradicting,chi2,keyframe\n");
+    for (output, tracking) in run.outputs.iter().filter_map(|o| Some((o, o.tracking()?))) {
+        let t = &tracking.tracks;
+        let _ = writeln!(
+            text,
+            "{},{},{},{},{},{},{},{:.3},{}",
+            output.time,
+            tracking.health,
+            t.landmarks_found,
+            t.landmarks_tried,
+            t.young_found,
+            t.young_tried,
+            t.contradicting,
+            t.chi2_per_dof,
+            u8::from(tracking.keyframe.is_some())
+        );
+    }
+    text
 }
 
 fn tum(trajectory: &Trajectory) -> String {

@@ -40,6 +40,8 @@ pub enum Obstacle {
     ImageMotion,
     /// Mean specific force, m/s², which must be near gravity.
     SpecificForce,
+    /// Angle between the camera's orientation as given and as gyroscope and images tell it together, degrees.
+    CameraOrientation,
 }
 
 /// An obstacle with its measured value and the limit.
@@ -89,6 +91,11 @@ impl fmt::Display for Refusal {
                 ("accelerometer scatter", " m/s²", "hold still, or move and start in flight")
             }
             Obstacle::ImageMotion => ("image motion", " px", "hold still, or move and start in flight"),
+            Obstacle::CameraOrientation => (
+                "the camera's orientation on the IMU is off by",
+                " deg",
+                "check the extrinsic calibration (inverted?)",
+            ),
             Obstacle::SpecificForce => ("mean specific force", " m/s²", "check the accelerometer's units"),
         };
         let sign = if self.wants_more() { '<' } else { '>' };

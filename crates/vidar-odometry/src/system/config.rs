@@ -55,7 +55,7 @@ impl Default for OdometryConfig {
             max_landmarks: 150,
             max_keyframes: 10,
             iterations: 4,
-            pixel_noise_px: 0.5,
+            pixel_noise_px: 0.3,
             gyro_noise_factor: 2.0,
             accel_noise_factor: 4.0,
             gravity_mps2: vidar_core::GRAVITY_MPS2,
@@ -70,7 +70,14 @@ impl Default for OdometryConfig {
 impl OdometryConfig {
     /// The smoother's settings.
     pub(crate) fn smoother(&self) -> SmootherConfig {
-        SmootherConfig { max_frames: self.max_keyframes + 8, ..SmootherConfig::default() }
+        let has_imu = self.imu != ImuUse::Off;
+        SmootherConfig {
+            max_frames: self.max_keyframes + 8,
+            estimate_time_offset: has_imu && self.estimate_time_offset,
+            estimate_camera_rotation: has_imu && self.estimate_extrinsics,
+            estimate_camera_position: has_imu && self.estimate_extrinsics,
+            ..SmootherConfig::default()
+        }
     }
 
     /// Refuses values outside the ranges that the fields state, naming the key.

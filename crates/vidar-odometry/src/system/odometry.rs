@@ -4,25 +4,30 @@ use super::config::{ImuUse, OdometryConfig};
 use super::error::OdometryError;
 use super::health::{MAX_IMU_GAP_SECS, Verdict, Watch};
 use super::keyframes::{KeyframeBook, Making, public_state, seen_landmarks};
-use super::output::{DivergenceSign, LossReason, OdometryOutput, Status, Tracking};
+use super::output::{DivergenceSign, LossReason, OdometryOutput, Status, TrackSummary, Tracking};
+use super::rotation_check::{MAX_TURN_DEG, RotationCheck};
 use super::running::{Running, Shot, Step};
 use super::starting::{Found, STILL_SECS, Starting, UNKNOWN_INVERSE};
 use super::stillness::ImuSpread;
+use super::track::{ImagePool, TrackRecord};
 use super::track::HostImage;
 use super::tracker::Tracker;
-use crate::estimator::{Smoother, SmootherError};
-use crate::frontend::{FrontendConfig, Pyramid};
+use crate::estimator::{CalibrationEstimate, Smoother, SmootherError};
+use crate::frontend::FrontendConfig;
 use crate::imu::{Bias, ImuBuffer, ImuModel, Preintegration, propagate};
 use crate::init::{Obstacle, Refusal, RestConfig, rest};
 use nalgebra::Vector3;
 use std::collections::VecDeque;
 use std::rc::Rc;
 use vidar_core::{
-    CameraId, Duration, Frame, FrameId, Health, ImuSample, Rig, RigCamera, SensorEvent, Timestamp,
+    CameraId, Duration, Frame, FrameId, Health, ImuSample, LieGroup, Rig, RigCamera, SensorEvent, Timestamp,
 };
 
 /// Images that may wait for readings of their time.
 const MAX_PENDING: usize = 40;
+
+/// A clock offset known this well outlives a loss, s.
+const SURE_CLOCK_SECS: f64 = 1e-3;
 
 /// Noise of images that the front end reckons with, grey levels.
 const IMAGE_NOISE_GRAY: f64 = 3.0;
@@ -72,6 +77,8 @@ pub struct Odometry {
     refusal: Refusal,
     watch: Watch,
     book: KeyframeBook,
+    check: RotationCheck,
+    images: ImagePool,
 }
 
 impl Odometry {
@@ -98,6 +105,8 @@ impl Odometry {
             config: config.clone(),
             frontend,
             camera_id: camera,
+            check: RotationCheck::new(&rig_camera.body_from_camera.rotation),
+            images: ImagePool::default(),
             camera: rig_camera,
             imu_model,
             imu: ImuBuffer::new(noise.map_or(200.0, |n| n.rate_hz)),
@@ -156,6 +165,14 @@ impl Odometry {
         self.counts
     }
 
+    /// All tracks as the newest image showed them, for plots; none before the start.
+    pub fn tracks(&self) -> Vec<TrackRecord> {
+        match &self.phase {
+            Phase::Starting(_) => Vec::new(),
+            Phase::Running(running) => running.records(),
+        }
+    }
+
     fn take_image(&mut self, frame: Frame) -> Result<(), OdometryError> {
         let (width, height) = (self.camera.model.width(), self.camera.model.height());
         let (found_width, found_height) = (frame.image.width(), frame.image.height());
@@ -173,7 +190,24 @@ impl Odometry {
     }
 
     fn imu_time(&self, frame: &Frame) -> Timestamp {
-        frame.time + self.camera.time_offset
+        frame.time + self.camera.time_offset + self.estimated_offset()
+    }
+
+    /// Correction of the clock offset that the next frame is stamped with.
+    fn estimated_offset(&self) -> Duration {
+        match &self.phase {
+            Phase::Running(running) => running.smoother.next_frame_offset(),
+            Phase::Starting(_) => Duration::ZERO,
+        }
+    }
+
+    /// The calibration as estimated on the way: where the camera is on the body, and what to add to image stamps to get
+    /// the IMU's time. `None` before the start.
+    pub fn calibration(&mut self) -> Option<CalibrationEstimate> {
+        let Phase::Running(running) = &mut self.phase else { return None };
+        let estimate = running.smoother.calibration();
+        let time_offset_secs = self.camera.time_offset.as_secs_f64() + estimate.time_offset_secs;
+        Some(CalibrationEstimate { time_offset_secs, ..estimate })
     }
 
     fn is_ready(&self, frame: &Frame) -> bool {
@@ -185,11 +219,8 @@ impl Odometry {
         let time = self.imu_time(&frame);
         let id = FrameId(self.next_frame);
         self.next_frame = self.next_frame.wrapping_add(1);
-        let mut pyramid =
-            Pyramid::new(frame.image.width(), frame.image.height(), self.frontend.pyramid.levels);
         // The size was checked when the image came.
-        pyramid.rebuild(&frame.image).ok()?;
-        let host = Rc::new(HostImage { frame: id, pyramid });
+        let host = self.images.take(id, &frame.image, self.frontend.pyramid.levels)?;
         let status = self.status_after(&frame, host, time);
         self.imu.forget_before(self.last_frame.unwrap_or(time) - Duration::from_millis(1500));
         Some(OdometryOutput { frame_id: frame.id, time: frame.time, status })
@@ -203,16 +234,23 @@ impl Odometry {
         }
         let readings = self.readings_until(time);
         let repeated = self.last_host.as_ref().is_some_and(|l| l.pyramid.level(0) == host.pyramid.level(0));
-        if repeated {
-            self.counts.images_repeated += 1;
+        let imu_still = self.imu_is_still(time);
+        self.counts.images_repeated += usize::from(repeated);
+        // The same image again is what a body at rest would see; of a moving one it tells nothing.
+        if repeated && !imu_still {
             return self.coast(readings, frame.time);
         }
         self.last_host = Some(host.clone());
         self.last_frame = Some(time);
-        let imu_still = self.imu_is_still(time);
+        let felt = readings.as_ref().map(|r| (r.rotation(r.bias()).log(), r.secs()));
         match &mut self.phase {
             Phase::Starting(starting) => {
                 let found = starting.follow(host.clone(), time, readings);
+                self.check.add(&self.camera.model, &starting.tracker.tracks, host.frame, felt);
+                if let Some(turn_deg) = self.check.doubt() {
+                    let obstacle = Obstacle::CameraOrientation;
+                    return self.wait(Refusal { obstacle, measured: turn_deg, limit: MAX_TURN_DEG });
+                }
                 let resting = starting.images_still && imu_still;
                 match found {
                     _ if resting => self.start_resting(frame, &host, time),
@@ -225,7 +263,13 @@ impl Odometry {
             }
             Phase::Running(running) => {
                 let frame_id = host.frame;
-                match running.step(Shot { host, time, readings, imu_still }) {
+                let step = running.step(Shot { host, time, readings, imu_still });
+                self.check.add(&self.camera.model, &running.tracker.tracks, frame_id, felt);
+                if let Some(found) = self.check.doubt() {
+                    let (sign, limit) = (DivergenceSign::CameraOrientation, MAX_TURN_DEG);
+                    return self.lose(LossReason::Diverged { sign, found, limit });
+                }
+                match step {
                     Ok(step) => self.tell(&step, frame, frame_id),
                     Err(_) => {
                         let (sign, found, limit) = (DivergenceSign::NotFinite, f64::NAN, 0.0);
@@ -273,6 +317,7 @@ impl Odometry {
             scale_std: self.watch.scale_std(None),
             health: Health::Degraded,
             tracked: 0,
+            tracks: TrackSummary::default(),
             landmarks: Vec::new(),
             keyframe: None,
             revised: Vec::new(),
@@ -383,6 +428,7 @@ impl Odometry {
             scale_std,
             health,
             tracked: step.fitting,
+            tracks: step.summary(),
             landmarks,
             keyframe: None,
             revised: Vec::new(),
@@ -407,8 +453,19 @@ impl Odometry {
         Status::Tracking(Box::new(tracking))
     }
 
+    /// A clock offset that is well known is not forgotten with the state.
+    fn keep_clock(&mut self, reason: &LossReason) {
+        let Phase::Running(running) = &mut self.phase else { return };
+        let estimate = running.smoother.calibration();
+        let is_sure = estimate.time_offset_sigma_secs.is_some_and(|s| s < SURE_CLOCK_SECS);
+        if is_sure && !matches!(reason, LossReason::Diverged { .. }) {
+            self.camera.time_offset += Duration::from_secs_f64(estimate.time_offset_secs);
+        }
+    }
+
     /// Gives the state up and starts anew.
     fn lose(&mut self, reason: LossReason) -> Status {
+        self.keep_clock(&reason);
         self.phase = Phase::Starting(Box::new(starting(
             &self.config,
             self.imu_model.is_none(),

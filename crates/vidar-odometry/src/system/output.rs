@@ -62,12 +62,31 @@ pub struct Tracking {
     pub health: Health,
     /// Landmarks of the smoother that this image shows.
     pub tracked: usize,
+    /// What became of all tracks in this image.
+    pub tracks: TrackSummary,
     /// Those landmarks, with their depth from this image.
     pub landmarks: Vec<SparseLandmark>,
     /// The keyframe that this image became, if it did.
     pub keyframe: Option<Box<OdometryKeyframe>>,
     /// Keyframes whose poses changed since the last output.
     pub revised: Vec<RevisedPose>,
+}
+
+/// Tracks of one image, counted.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct TrackSummary {
+    /// Landmarks that were looked for.
+    pub landmarks_tried: usize,
+    /// Landmarks that were found.
+    pub landmarks_found: usize,
+    /// Tracks without a known distance that were looked for.
+    pub young_tried: usize,
+    /// Tracks without a known distance that were found.
+    pub young_found: usize,
+    /// Landmarks that were found and contradict the others.
+    pub contradicting: usize,
+    /// Mean squared misfit of the window's sightings in their standard deviations, per degree of freedom; 1 is what fits.
+    pub chi2_per_dof: f64,
 }
 
 /// Why a state was given up.
@@ -110,6 +129,8 @@ pub enum DivergenceSign {
     AccelBias,
     /// Share of measurements that contradict the prediction.
     RejectedShare,
+    /// Angle between the camera's orientation as given and as gyroscope and images tell it together, degrees.
+    CameraOrientation,
     /// A number that is not finite.
     NotFinite,
 }
@@ -128,6 +149,9 @@ impl fmt::Display for LossReason {
                 }
                 DivergenceSign::RejectedShare => {
                     write!(f, "{:.0} % of the measurements contradict the prediction", 100.0 * found)
+                }
+                DivergenceSign::CameraOrientation => {
+                    write!(f, "gyroscope and images disagree: the camera's orientation is off by {found:.0} deg")
                 }
                 DivergenceSign::NotFinite => write!(f, "the state is not finite"),
             },

@@ -1,7 +1,9 @@
 //! The odometry while it runs: predict, measure, smooth, choose keyframes, keep the window small.
 
 use super::config::OdometryConfig;
+use super::output::TrackSummary;
 use super::stillness::ImageMotion;
+use super::track::TrackRecord;
 use super::track::{HostImage, Track, host_covariance, noisy_covariance, parallax, rotated_pixel};
 use super::tracker::{Places, Prediction, TrackCounts, Tracker};
 use crate::estimator::{Departure, Observation, OptimiseReport, Smoother, SmootherError};
@@ -78,6 +80,20 @@ pub(crate) struct Step {
     pub just_started: bool,
     /// Keyframes that left the window, with their last poses.
     pub left: Vec<(FrameId, NavState)>,
+}
+
+impl Step {
+    /// What became of the tracks, for the outside.
+    pub fn summary(&self) -> TrackSummary {
+        TrackSummary {
+            landmarks_tried: self.counts.landmarks_tried,
+            landmarks_found: self.counts.landmarks_found,
+            young_tried: self.counts.young_tried,
+            young_found: self.counts.young_found,
+            contradicting: self.contradicting,
+            chi2_per_dof: self.report.chi2_per_dof,
+        }
+    }
 }
 
 /// The running odometry.
@@ -162,6 +178,28 @@ impl Running {
         self.smoother.newest().map(|(_, _, state)| *state)
     }
 
+    /// All tracks as the newest image shows them.
+    pub fn records(&self) -> Vec<TrackRecord> {
+        let seen = self.tracker.tracks.iter().filter_map(|t| Some((t, t.measured?.pixel)));
+        seen.map(|(track, pixel)| {
+            let landmark = self.smoother.landmark(track.id);
+            let inverse_distance = landmark.map_or_else(
+                || [track.distance.mean, track.distance.variance.sqrt()],
+                |l| [l.inverse_distance, l.inverse_distance_sigma],
+            );
+            let expected = self.smoother.predict_pixel(self.last, track.id);
+            TrackRecord {
+                id: track.id,
+                level: track.feature.level,
+                is_landmark: track.is_landmark,
+                pixel,
+                residual: expected.map(|e| pixel - e),
+                inverse_distance,
+            }
+        })
+        .collect()
+    }
+
     /// One image: the road from its pixels to a smoothed state.
     pub fn step(&mut self, shot: Shot) -> Result<Step, SmootherError> {
         let frame = shot.host.frame;
@@ -170,10 +208,8 @@ impl Running {
         let mut step = Step::default();
         let image = shot.host.clone();
 
-        let predicted = match shot.readings {
-            Some(_) => predicted,
-            None => self.predict_by_image(&shot.host, &last_state),
-        };
+        let believed = shot.readings.as_ref().is_some_and(|r| !r.is_saturated());
+        let predicted = if believed { predicted } else { self.predict_by_image(&shot.host, &last_state) };
         self.smoother.add_frame(frame, shot.time, predicted, shot.readings)?;
         step.counts = self.measure(&shot.host, shot.time, &last_state, &predicted);
         step.is_still = self.motion.update(&self.tracker.tracks, frame, shot.time) && shot.imu_still;

@@ -7,7 +7,7 @@ use crate::frontend::{
 use nalgebra::{Matrix2, Matrix2x1, Vector2};
 use std::rc::Rc;
 use vidar_core::camera::Pixel;
-use vidar_core::{CameraModel, FrameId, LandmarkId, LieGroup, Se3};
+use vidar_core::{CameraModel, FrameId, FrameImage, LandmarkId, LieGroup, Se3};
 
 /// An image whose patches are followed.
 #[derive(Debug)]
@@ -16,6 +16,31 @@ pub(crate) struct HostImage {
     pub frame: FrameId,
     /// Its grey levels.
     pub pyramid: Pyramid,
+}
+
+/// Images whose memory is used again once nobody holds them.
+#[derive(Debug, Default)]
+pub(crate) struct ImagePool {
+    images: Vec<Rc<HostImage>>,
+}
+
+impl ImagePool {
+    /// The pyramid of `image`, called `frame`; `None` for an image of another size than those before.
+    pub fn take(&mut self, frame: FrameId, image: &FrameImage, levels: usize) -> Option<Rc<HostImage>> {
+        let free = self.images.iter_mut().find_map(Rc::get_mut);
+        match free {
+            Some(host) => {
+                host.frame = frame;
+                host.pyramid.rebuild(image).ok()?;
+            }
+            None => {
+                let mut pyramid = Pyramid::new(image.width(), image.height(), levels);
+                pyramid.rebuild(image).ok()?;
+                self.images.push(Rc::new(HostImage { frame, pyramid }));
+            }
+        }
+        self.images.iter().find(|h| h.frame == frame).cloned()
+    }
 }
 
 /// Whitened residual from which a measurement pulls only linearly.
@@ -58,6 +83,23 @@ pub(crate) struct Track {
 /// The belief of an inverse distance of which only a typical value is known: 0 to three times it within 2 σ.
 pub(crate) fn unknown_distance(typical_inverse: f64) -> InverseDistance {
     InverseDistance { mean: typical_inverse, variance: typical_inverse * typical_inverse }
+}
+
+/// One track in one image, for plots.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct TrackRecord {
+    /// Its name.
+    pub id: LandmarkId,
+    /// Pyramid level that it is measured on.
+    pub level: u8,
+    /// Whether the smoother knows it.
+    pub is_landmark: bool,
+    /// Where the image shows it, pixels.
+    pub pixel: Pixel,
+    /// That, less where the state says it should be, pixels; `None` without a known distance.
+    pub residual: Option<Vector2<f64>>,
+    /// Inverse of its distance from its host, 1/m, and standard deviation.
+    pub inverse_distance: [f64; 2],
 }
 
 /// Measures features; holds the buffers.

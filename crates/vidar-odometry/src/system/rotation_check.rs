@@ -1,0 +1,199 @@
+//! Whether the gyroscope and the images tell the same rotation: the camera's orientation on the body is the part of a
+//! calibration that is wrong most often (inverted, or of another convention), and wrong by much.
+//!
+//! Both rates are compared without their means, so a gyroscope bias does not matter. The rotation of the images is the
+//! one that fits the motion of bearings best; translation disturbs it, which is why what counts is not a small residual but
+//! whether another orientation would explain much more.
+
+use super::track::Track;
+use nalgebra::{Matrix3, Vector3};
+use rustc_hash::FxHashMap;
+use vidar_core::{CameraModel, FrameId, LandmarkId, LieGroup, So3, camera::Pixel};
+
+/// Tracks that a comparison needs.
+const MIN_TRACKS: usize = 15;
+/// Images before anything is said, and after which nothing more is.
+const MIN_IMAGES: usize = 20;
+const MAX_IMAGES: usize = 400;
+/// Root mean square rate of rotation, mean removed, that is needed, rad/s.
+const MIN_RATE: f64 = 0.12;
+/// Share of the images' rotation that the given orientation leaves unexplained, from which it is doubted ...
+const DOUBTED_SHARE: f64 = 0.7;
+/// ... provided that the best orientation leaves less than this share of that.
+const BETTER_SHARE: f64 = 0.6;
+/// Orientations nearer than this to the best one are not doubted, degrees.
+pub(crate) const MAX_TURN_DEG: f64 = 15.0;
+
+/// Sums over pairs of successive images.
+#[derive(Debug)]
+pub(crate) struct RotationCheck {
+    camera_from_body: So3,
+    last: FxHashMap<LandmarkId, Pixel>,
+    pairs: Vec<(Vector3<f64>, Vector3<f64>)>,
+    images: usize,
+    seen_sum: Vector3<f64>,
+    felt_sum: Vector3<f64>,
+    seen_square: f64,
+    felt_square: f64,
+    /// Σ felt seenᵀ.
+    cross: Matrix3<f64>,
+}
+
+impl RotationCheck {
+    pub fn new(body_from_camera: &So3) -> Self {
+
+        Self {
+            camera_from_body: body_from_camera.inverse(),
+            last: FxHashMap::default(),
+            pairs: Vec::new(),
+            images: 0,
+            seen_sum: Vector3::zeros(),
+            felt_sum: Vector3::zeros(),
+            seen_square: 0.0,
+            felt_square: 0.0,
+            cross: Matrix3::zeros(),
+        }
+    }
+
+    /// Takes the tracks as measured in `frame`, and the rotation vector `last_from_current` of the body that the gyroscope
+    /// felt since the image before, over `secs`.
+    pub fn add(
+        &mut self,
+        camera: &CameraModel,
+        tracks: &[Track],
+        frame: FrameId,
+        felt: Option<(Vector3<f64>, f64)>,
+    ) {
+        if self.images >= MAX_IMAGES {
+            return;
+        }
+        self.pairs.clear();
+        for track in tracks.iter().filter(|t| t.last_frame == frame) {
+            let Some(before) = self.last.get(&track.id) else { continue };
+            let rays = (camera.unproject(before), camera.unproject(&track.last_pixel));
+            if let (Some(before), Some(now)) = rays {
+                self.pairs.push((before, now));
+            }
+        }
+        self.last.clear();
+        self.last.extend(tracks.iter().filter(|t| t.last_frame == frame).map(|t| (t.id, t.last_pixel)));
+        if let (Some((turn, secs)), Some(seen)) = (felt.filter(|f| f.1 > 0.0), rotation_of(&self.pairs)) {
+            let (felt, seen) = (self.camera_from_body * (turn / secs), seen / secs);
+            self.images += 1;
+            self.felt_sum += felt;
+            self.seen_sum += seen;
+            self.felt_square += felt.norm_squared();
+            self.seen_square += seen.norm_squared();
+            self.cross += felt * seen.transpose();
+        }
+    }
+
+    /// Angle in degrees by which the given orientation is off, when it cannot be true.
+    pub fn doubt(&self) -> Option<f64> {
+        if self.images < MIN_IMAGES {
+            return None;
+        }
+        let n = self.images as f64;
+        let felt2 = self.felt_square / n - (self.felt_sum / n).norm_squared();
+        let seen2 = self.seen_square / n - (self.seen_sum / n).norm_squared();
+        let cross = self.cross / n - (self.felt_sum / n) * (self.seen_sum / n).transpose();
+        if !(felt2.min(seen2) > MIN_RATE * MIN_RATE) {
+            return None;
+        }
+        // Σ |seen − R felt|² = Σ |seen|² + Σ |felt|² − 2 tr(R Σ felt seenᵀ), least for R = V D Uᵀ of the sum's U S Vᵀ.
+        let svd = cross.svd(true, true);
+        let (u, v_t) = (svd.u?, svd.v_t?);
+        let mut signs = Vector3::new(1.0, 1.0, 1.0);
+        signs[2] = (u * v_t).determinant().signum();
+        let best = v_t.transpose() * Matrix3::from_diagonal(&signs) * u.transpose();
+        let share = |trace: f64| (seen2 + felt2 - 2.0 * trace) / seen2;
+        let (given, least) = (share(cross.trace()), share((best * cross).trace()));
+        let turn_deg = (0.5 * (best.trace() - 1.0)).clamp(-1.0, 1.0).acos().to_degrees();
+        let doubted = given > DOUBTED_SHARE && least < BETTER_SHARE * given && turn_deg > MAX_TURN_DEG;
+        doubted.then_some(turn_deg)
+    }
+}
+
+/// Rotation vector `before_from_now` that explains most of the motion of bearings (before, now): Gauss-Newton with weights
+/// that forget what fits badly.
+fn rotation_of(pairs: &[(Vector3<f64>, Vector3<f64>)]) -> Option<Vector3<f64>> {
+    if pairs.len() < MIN_TRACKS {
+        return None;
+    }
+    let mut turn = Vector3::zeros();
+    let mut scale2 = f64::INFINITY;
+    for _ in 0..4 {
+        let rotation = So3::exp(&turn);
+        let (mut h, mut g, mut sum, mut weights) = (Matrix3::<f64>::zeros(), Vector3::zeros(), 0.0, 0.0);
+        for (before, now) in pairs {
+            let turned = rotation * *now;
+            // before ≈ turned + δ × turned.
+            let left = before - turned;
+            let r2 = left.norm_squared();
+            let weight = if scale2.is_finite() { 1.0 / (1.0 + r2 / scale2) } else { 1.0 };
+            h += (Matrix3::identity() - turned * turned.transpose()) * weight;
+            g += turned.cross(&left) * weight;
+            sum += weight * r2;
+            weights += weight;
+        }
+        let step = h.try_inverse()? * g;
+        turn = (So3::exp(&step) * rotation).log();
+        scale2 = (sum / weights).max(1e-8);
+    }
+    turn.iter().all(|x| x.is_finite()).then_some(turn)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// What a camera sees that turns and moves through points some metres away.
+    fn pairs(turn: &Vector3<f64>, shift: &Vector3<f64>) -> Vec<(Vector3<f64>, Vector3<f64>)> {
+        let points = (0..60).map(|k| {
+            let k = f64::from(k);
+            Vector3::new((1.3 * k).sin() * 2.0, (2.1 * k).cos() * 1.5, 3.0 + (0.7 * k).sin())
+        });
+        points
+            .map(|p| {
+                let now = So3::exp(&-*turn) * (p - shift);
+                (p.normalize(), now.normalize())
+            })
+            .collect()
+    }
+
+    fn check_with(given: So3, truth: So3) -> Option<f64> {
+        let mut check = RotationCheck::new(&given);
+        for k in 0..60 {
+            let t = 0.05 * f64::from(k);
+            let rate = Vector3::new((2.0 * t).sin(), 0.7 * (3.1 * t).cos(), 0.5 * (1.7 * t).sin());
+            let shift = Vector3::new(0.02, -0.01, 0.015) * (2.3 * t).cos();
+            let seen = rotation_of(&pairs(&(truth.inverse() * (rate * 0.05)), &shift)).unwrap();
+            let bias = Vector3::new(0.05, -0.03, 0.02);
+            let (felt, seen) = (check.camera_from_body * (rate + bias), seen / 0.05);
+            check.images += 1;
+            check.felt_sum += felt;
+            check.seen_sum += seen;
+            check.felt_square += felt.norm_squared();
+            check.seen_square += seen.norm_squared();
+            check.cross += felt * seen.transpose();
+        }
+        check.doubt()
+    }
+
+    #[test]
+    fn a_turn_is_read_off_bearings_in_spite_of_translation() {
+        let turn = Vector3::new(0.02, -0.01, 0.03);
+        let found = rotation_of(&pairs(&turn, &Vector3::new(0.0, 0.0, 0.02))).unwrap();
+        assert!((found - turn).norm() < 0.003, "{found}");
+    }
+
+    #[test]
+    fn a_true_orientation_is_not_doubted_and_an_inverted_one_is() {
+        let truth = So3::exp(&Vector3::new(0.02, -0.03, 1.55));
+        assert_eq!(check_with(truth, truth), None);
+        let nearly = truth * So3::exp(&Vector3::new(0.05, -0.05, 0.03));
+        assert_eq!(check_with(nearly, truth), None);
+        let off = check_with(truth.inverse(), truth).unwrap();
+        assert!((off - 177.0).abs() < 12.0, "{off}");
+    }
+}
