@@ -82,20 +82,29 @@ pub fn metric_anchor(
     let external =
         dataset.anchor.as_ref().map(|a| (&a.trajectory, AnchorSource::External { file: shown(&a.source) }));
     let truth = dataset.ground_truth.as_ref().map(|t| (t, AnchorSource::GroundTruth));
-    let chosen = match config.input.poses {
-        PoseSource::Auto => external.or(truth),
-        PoseSource::External => external,
-        PoseSource::GroundTruth => truth,
-        PoseSource::Odometry => None,
+    let given = |chosen: Option<(&Trajectory, AnchorSource)>| {
+        let (trajectory, source) = chosen.ok_or_else(|| Error::NoAnchor { name: dataset.name.clone() })?;
+        let camera_trajectory = in_camera(trajectory, dataset)?;
+        Ok(MetricAnchor { source, camera_trajectory, warnings: Vec::new(), tracked: None })
     };
-    let may_track = matches!(config.input.poses, PoseSource::Auto | PoseSource::Odometry);
-    match chosen {
-        Some((trajectory, source)) => {
-            let camera_trajectory = in_camera(trajectory, dataset)?;
-            Ok(MetricAnchor { source, camera_trajectory, warnings: Vec::new(), tracked: None })
-        }
-        None if may_track && dataset.rig.imu.is_some() => odometry_anchor(dataset, config, events, cancel),
-        None => Err(Error::NoAnchor { name: dataset.name.clone() }),
+    let has_imu = dataset.rig.imu.is_some() && !dataset.imu.is_empty();
+    match config.input.poses {
+        PoseSource::External => given(external),
+        PoseSource::GroundTruth => given(truth),
+        PoseSource::Odometry => odometry_anchor(dataset, config, events, cancel),
+        PoseSource::Auto if external.is_some() => given(external),
+        PoseSource::Auto if has_imu => match odometry_anchor(dataset, config, events, cancel) {
+            Err(Error::NoOdometry { reason, .. }) if truth.is_some() => {
+                let mut anchor = given(truth)?;
+                let message =
+                    format!("the odometry never gave a metric pose ({reason}): ground truth is used");
+                let hint = "scores are an upper bound; --set input.poses=odometry refuses to do without";
+                anchor.warnings.push(Warning::new("odometry-not-used", message).hint(hint));
+                Ok(anchor)
+            }
+            other => other,
+        },
+        PoseSource::Auto => given(truth),
     }
 }
 

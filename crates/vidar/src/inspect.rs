@@ -260,12 +260,16 @@ fn possible(dataset: &Dataset) -> Vec<String> {
         );
         return lines;
     }
+    let has_imu = dataset.rig.imu.is_some() && !dataset.imu.is_empty();
     match (&dataset.anchor, &dataset.ground_truth) {
+        (None, _) if has_imu => {
+            lines.push("vidar run: metric map anchored by the odometry of camera and IMU".into());
+        }
         (Some(_), _) => lines.push("vidar run: metric map anchored by the external trajectory".into()),
         (None, Some(_)) => {
             lines.push("vidar run: metric map anchored by ground truth (an upper bound)".into())
         }
-        (None, None) => lines.push("vidar run: not yet; give metric poses with --trajectory FILE".into()),
+        (None, None) => lines.push("vidar run: not in metres; give metric poses with --trajectory FILE, or --mode pose-free with a network".into()),
     }
     if dataset.reference_cloud.is_some() || dataset.depth_sensor.is_some() {
         lines.push("the map will be judged against the scan or the depth sensor".into());

@@ -1,7 +1,7 @@
 //! Frames that carry geometry: those with a metric pose, far enough from the last one.
 
 use crate::config::KeyframeConfig;
-use vidar_core::{Duration, LieGroup, Se3};
+use vidar_core::{Duration, FrameId, LieGroup, Se3};
 use vidar_dataset::ImageEntry;
 
 /// A frame that carries geometry.
@@ -48,10 +48,15 @@ pub struct PosedFrame {
 
 /// Chooses keyframes: the first frame, then each that moved or turned enough since the last one chosen.
 ///
-/// With `max_count`, the distances are widened by the smallest factor (searched by bisection) that obeys it.
-pub fn select_keyframes(frames: &[PosedFrame], config: &KeyframeConfig) -> Vec<PosedFrame> {
-    let chosen = choose(frames, config, 1.0);
-    let count = |factor: f64| choose(frames, config, factor).len();
+/// `preferred` frames, those of which more is known than their pose, are chosen wherever they come. With `max_count`, the
+/// distances are widened by the smallest factor (searched by bisection) that obeys it, and no frame is preferred.
+pub fn select_keyframes(
+    frames: &[PosedFrame],
+    config: &KeyframeConfig,
+    preferred: &dyn Fn(FrameId) -> bool,
+) -> Vec<PosedFrame> {
+    let chosen = choose(frames, config, 1.0, preferred);
+    let count = |factor: f64| choose(frames, config, factor, &|_| false).len();
     if config.max_count == 0 || chosen.len() <= config.max_count {
         return pick(frames, &chosen);
     }
@@ -63,10 +68,15 @@ pub fn select_keyframes(frames: &[PosedFrame], config: &KeyframeConfig) -> Vec<P
         let middle = 0.5 * (low + high);
         if count(middle) > config.max_count { low = middle } else { high = middle }
     }
-    pick(frames, &choose(frames, config, high))
+    pick(frames, &choose(frames, config, high, &|_| false))
 }
 
-fn choose(frames: &[PosedFrame], config: &KeyframeConfig, factor: f64) -> Vec<usize> {
+fn choose(
+    frames: &[PosedFrame],
+    config: &KeyframeConfig,
+    factor: f64,
+    preferred: &dyn Fn(FrameId) -> bool,
+) -> Vec<usize> {
     let mut chosen: Vec<usize> = Vec::new();
     let far = config.min_translation_m * factor;
     let turned = config.min_rotation_deg.to_radians() * factor;
@@ -76,7 +86,8 @@ fn choose(frames: &[PosedFrame], config: &KeyframeConfig, factor: f64) -> Vec<us
             continue;
         };
         let last_from_this = frames[last].world_from_camera.inverse() * frame.world_from_camera;
-        if last_from_this.translation.norm() >= far || last_from_this.rotation.angle_rad() >= turned {
+        let moved = last_from_this.translation.norm() >= far || last_from_this.rotation.angle_rad() >= turned;
+        if moved || preferred(frame.image.frame_id) {
             chosen.push(index);
         }
     }
@@ -91,7 +102,7 @@ fn pick(frames: &[PosedFrame], chosen: &[usize]) -> Vec<PosedFrame> {
 mod tests {
     use super::*;
     use nalgebra::Vector3;
-    use vidar_core::{CameraId, FrameId, So3, Timestamp};
+    use vidar_core::{CameraId, So3, Timestamp};
 
     fn frame(i: u32, x: f64, yaw: f64) -> PosedFrame {
         PosedFrame {
@@ -109,22 +120,34 @@ mod tests {
         frames.iter().map(|f| f.image.frame_id.0).collect()
     }
 
+    const NONE: fn(FrameId) -> bool = |_| false;
+
+    #[test]
+    fn preferred_frames_are_chosen_besides() {
+        let config =
+            KeyframeConfig { min_translation_m: 0.1, min_rotation_deg: 10.0, ..KeyframeConfig::default() };
+        let frames: Vec<_> = (0..11).map(|i| frame(i, f64::from(i) * 0.0401, 0.0)).collect();
+        assert_eq!(ids(&select_keyframes(&frames, &config, &|id| id == FrameId(4))), [0, 3, 4, 7, 10]);
+        let few = KeyframeConfig { max_count: 2, ..config };
+        assert!(select_keyframes(&frames, &few, &|_| true).len() <= 2);
+    }
+
     #[test]
     fn moving_or_turning_enough_makes_a_keyframe() {
         let config =
             KeyframeConfig { min_translation_m: 0.1, min_rotation_deg: 10.0, ..KeyframeConfig::default() };
         let frames: Vec<_> = (0..11).map(|i| frame(i, f64::from(i) * 0.0401, 0.0)).collect();
-        assert_eq!(ids(&select_keyframes(&frames, &config)), [0, 3, 6, 9]);
+        assert_eq!(ids(&select_keyframes(&frames, &config, &NONE)), [0, 3, 6, 9]);
         let turning: Vec<_> = (0..7).map(|i| frame(i, 0.0, f64::from(i) * 0.0901)).collect();
-        assert_eq!(ids(&select_keyframes(&turning, &config)), [0, 2, 4, 6]);
+        assert_eq!(ids(&select_keyframes(&turning, &config, &NONE)), [0, 2, 4, 6]);
     }
 
     #[test]
     fn standing_still_gives_one_keyframe_and_nothing_gives_none() {
         let config = KeyframeConfig::default();
         let still: Vec<_> = (0..50).map(|i| frame(i, 0.0, 0.0)).collect();
-        assert_eq!(ids(&select_keyframes(&still, &config)), [0]);
-        assert!(select_keyframes(&[], &config).is_empty());
+        assert_eq!(ids(&select_keyframes(&still, &config, &NONE)), [0]);
+        assert!(select_keyframes(&[], &config, &NONE).is_empty());
     }
 
     #[test]
@@ -136,7 +159,7 @@ mod tests {
             ..KeyframeConfig::default()
         };
         let frames: Vec<_> = (0..1000).map(|i| frame(i, f64::from(i) * 0.02, 0.0)).collect();
-        let chosen = ids(&select_keyframes(&frames, &config));
+        let chosen = ids(&select_keyframes(&frames, &config, &NONE));
         assert_eq!(chosen.len(), 10);
         assert!(*chosen.last().unwrap() > 880, "the end of the path is covered: {chosen:?}");
     }

@@ -2,7 +2,9 @@
 // Helpers of tests are tests: they stop at the first surprise and say loudly what they skip.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::print_stderr)]
 
+mod bench;
 mod config;
+mod coupling;
 mod docs;
 mod faults;
 mod keys;

@@ -26,7 +26,8 @@ pub struct InputConfig {
     pub end_secs: f64,
     /// Use every n-th image, 1 or more. Raise it for high frame rates.
     pub stride: usize,
-    /// Where metric poses come from: `auto` (external trajectory, else ground truth), `external`, `ground-truth`.
+    /// Where metric poses come from: `auto` (an external trajectory, else the odometry of camera and IMU, else ground truth),
+    /// `external`, `odometry`, `ground-truth`.
     pub poses: PoseSource,
     /// Longest gap (s) between two poses that is bridged by interpolation. Raise it for keyframe-only trajectories.
     pub max_pose_gap_secs: f64,
@@ -36,13 +37,13 @@ pub struct InputConfig {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum PoseSource {
-    /// The external trajectory if given, else ground truth, else the odometry.
+    /// The external trajectory if given, else the odometry where there is an IMU, else ground truth.
     Auto,
     /// The external trajectory only.
     External,
     /// Ground truth only.
     GroundTruth,
-    /// The odometry of camera and IMU, on the images that `input.stride` leaves.
+    /// The odometry of camera and IMU, on every image.
     Odometry,
 }
 

@@ -77,7 +77,7 @@ impl Road<'_> {
                 break;
             }
             let key = key_of(&identity, self.plan, chunk);
-            let stored = match self.store.find(number(k), &key)? {
+            let stored = match self.store.find(number(k), &key) {
                 Some(kept) => kept,
                 None => match self.predict(&mut source, &mut window, k, chunk, &key)? {
                     Some(predicted) => predicted,

@@ -7,6 +7,7 @@ use crate::events::{CancelToken, Events};
 use crate::input::{self, MetricAnchor};
 use crate::keyframes::{Keyframe, select_by_time, select_keyframes};
 use crate::models::geometry::NetworkPlan;
+use std::collections::BTreeSet;
 use std::ops::Range;
 use std::path::Path;
 use vidar_align::CouplingMode;
@@ -223,7 +224,11 @@ fn choose(
     }
     let keyframes: Vec<Keyframe> = match posed {
         Some(frames) => {
-            select_keyframes(&frames, &config.keyframes).into_iter().map(Keyframe::from).collect()
+            // The odometry's keyframes come with landmarks, which tell a chunk's scale.
+            let tracked = anchor.and_then(|a| a.tracked.as_ref()).filter(|_| knows_landmarks(config, source));
+            let known: BTreeSet<_> = tracked.iter().flat_map(|t| &t.keyframes).map(|k| k.frame_id).collect();
+            let chosen = select_keyframes(&frames, &config.keyframes, &|id| known.contains(&id));
+            chosen.into_iter().map(Keyframe::from).collect()
         }
         None => select_by_time(images, &config.keyframes),
     };
@@ -233,6 +238,11 @@ fn choose(
         false => chunks(keyframes.len(), geometry.chunk_keyframes, geometry.context_keyframes),
     };
     Ok(Chosen { keyframes, posed: count, chunks })
+}
+
+/// Whether landmarks of the odometry matter: where chunks have a scale of their own that is to be found.
+fn knows_landmarks(config: &Config, source: &Source) -> bool {
+    config.coupling.mode == CouplingMode::Coupled && source.overlaps()
 }
 
 /// The images that a recording is of, and its chunks as spans of them.
