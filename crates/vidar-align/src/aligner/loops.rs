@@ -15,7 +15,7 @@ use super::memory::{Chunk, View, sampled_thin};
 use super::report::{LoopRefusal, LoopReport};
 use super::{Aligner, CouplingMode, tie};
 use crate::AlignError;
-use crate::overlap::{OverlapFit, SampledView};
+use crate::overlap::{OverlapFit, SampledView, shared_views};
 use crate::streaming::Compat;
 use nalgebra::SMatrix;
 use vidar_core::{ChunkId, FrameId, GeometryPrediction, LieGroup, Sim3};
@@ -162,7 +162,7 @@ impl Aligner {
     ) -> Option<OverlapFit> {
         let loop_views: Vec<SampledView> = prediction.views.iter().map(sampled_thin).collect();
         let side = |chunk: usize| {
-            let views = tie::shared(self.chunks[chunk].views.iter().map(|v| &v.thin), loop_views.iter());
+            let views = shared_views(self.chunks[chunk].views.iter().map(|v| &v.thin), loop_views.iter());
             tie::robust(&views, &self.config)
         };
         let (a, b) = (side(later)?, side(earlier)?);

@@ -35,7 +35,7 @@ pub use report::{
 
 use crate::depth_field::fit_depth_field;
 use crate::landmark_scale::{DepthRatio, depth_ratios, landmark_scale};
-use crate::overlap::SampledView;
+use crate::overlap::{SampledView, shared_views};
 use crate::place_recognition::PlaceIndex;
 use crate::streaming::Compat;
 use crate::{AlignError, Verdict};
@@ -176,7 +176,7 @@ impl Aligner {
         if self.chunks.is_empty() {
             return None;
         }
-        let views = tie::shared(self.previous.sampled.iter(), sampled.iter());
+        let views = shared_views(self.previous.sampled.iter(), sampled.iter());
         if views.is_empty() {
             guards.push(Guard::NoOverlap);
             return None;

@@ -2,16 +2,14 @@
 
 use super::AlignerConfig;
 use super::memory::{Tie, View};
-use crate::overlap::{OverlapFit, PointPairs, SampledView, fit_overlap, judge};
+use crate::overlap::{
+    OverlapFit, PATCH_PIXELS, PointPairs, SampledView, fit_overlap, judge, pair_mapped, pair_views,
+    shared_views,
+};
 use crate::streaming::{
     AlignMethod, IrlsConfig, PointMap, ScaleMethod, align_overlap, depth_scale, fit_irls, unproject,
 };
 use vidar_core::ViewGeometry;
-
-/// Share of the smaller median that a confidence must exceed (the reference's 0.1).
-const CONFIDENCE_SHARE: f32 = 0.1;
-/// Pixels of an independent patch: errors of a network are shared within one token.
-const PATCH_PIXELS: usize = 14 * 14;
 
 /// The reference's confidence, 0 or more, of a probability: Depth Anything's conversion is `c = 1 − 1/(1 + odds)`.
 fn odds(confidence: f32) -> f32 {
@@ -19,41 +17,9 @@ fn odds(confidence: f32) -> f32 {
     c / (1.0 - c)
 }
 
-fn median(mut values: Vec<f32>) -> f32 {
-    let middle = values.len() / 2;
-    if values.is_empty() { 0.0 } else { *values.select_nth_unstable_by(middle, f32::total_cmp).1 }
-}
-
-/// Views of the same frames, earlier then later chunk.
-pub(super) fn shared<'a>(
-    earlier: impl Iterator<Item = &'a SampledView> + Clone,
-    later: impl Iterator<Item = &'a SampledView>,
-) -> Vec<(&'a SampledView, &'a SampledView)> {
-    later.filter_map(|l| earlier.clone().find(|e| e.frame_id == l.frame_id).map(|e| (e, l))).collect()
-}
-
-/// Pairs of all shared views, `map` applied to confidences, thinned to `max_pairs`.
-fn pairs(views: &[(&SampledView, &SampledView)], map: fn(f32) -> f32, max_pairs: usize) -> PointPairs {
-    let earlier = median(views.iter().flat_map(|v| v.0.confidences()).collect());
-    let later = median(views.iter().flat_map(|v| v.1.confidences()).collect());
-    let lower = earlier.min(later);
-    // `map` grows, so the threshold on mapped values is one on the values themselves.
-    let threshold = CONFIDENCE_SHARE * map(lower);
-    let total: usize = views.iter().map(|v| v.0.len()).sum();
-    let stride = total.div_ceil(max_pairs.max(1)).max(1);
-    let mut found = PointPairs::default();
-    for (earlier, later) in views {
-        let weigh = |a: f32, b: f32| f64::from((map(a) * map(b)).sqrt());
-        earlier.pair_with(later, stride, |c| map(c) > threshold, weigh, &mut found);
-    }
-    let pixels = views.first().map_or(0, |v| v.0.intrinsics.width * v.0.intrinsics.height);
-    found.independent = (pixels / PATCH_PIXELS).max(7);
-    found
-}
-
 /// VIDAR's own estimate.
 pub(super) fn robust(views: &[(&SampledView, &SampledView)], config: &AlignerConfig) -> Option<OverlapFit> {
-    let pairs = pairs(views, |c| c, config.overlap.max_pairs);
+    let pairs = pair_views(views, config.overlap.max_pairs);
     fit_overlap(&pairs, &config.overlap).ok()
 }
 
@@ -62,7 +28,7 @@ pub(super) fn reference(
     views: &[(&SampledView, &SampledView)],
     config: &AlignerConfig,
 ) -> Option<OverlapFit> {
-    let mut pairs = pairs(views, odds, config.overlap.max_pairs);
+    let mut pairs = pair_mapped(views, odds, config.overlap.max_pairs);
     if pairs.len() < config.overlap.min_pairs.max(3) {
         return None;
     }
@@ -131,7 +97,7 @@ pub(super) fn verbatim(
 
 /// Ties by thin samples: a chunk that comes back to frames of an older one.
 pub(super) fn revisit(earlier: &[View], later: &[View], to: usize, config: &AlignerConfig) -> Option<Tie> {
-    let views = shared(earlier.iter().map(|v| &v.thin), later.iter().map(|v| &v.thin));
+    let views = shared_views(earlier.iter().map(|v| &v.thin), later.iter().map(|v| &v.thin));
     let frames = views.len();
     (frames > 0).then(|| robust(&views, config)).flatten().map(|fit| Tie { to, frames, fit })
 }

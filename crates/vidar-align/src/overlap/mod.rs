@@ -12,10 +12,13 @@
 //! per 14 × 14 pixels of one frame, widened three times, whatever the number of samples.
 
 mod fit;
+mod pairs;
 mod sample;
 
 pub(crate) use fit::judge;
 pub use fit::{OverlapConfig, OverlapFit, PointPairs, fit_overlap};
+pub(crate) use pairs::{PATCH_PIXELS, pair_mapped};
+pub use pairs::{pair_views, shared_views};
 pub use sample::SampledView;
 
 #[cfg(test)]

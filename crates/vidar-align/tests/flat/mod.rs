@@ -13,8 +13,8 @@ use vidar_core::{
     Se3, Sim3, So3, SparseLandmark, Timestamp, ViewGeometry,
 };
 
-pub const WIDTH: usize = 64;
-pub const HEIGHT: usize = 42;
+pub const WIDTH: usize = 48;
+pub const HEIGHT: usize = 32;
 
 pub struct Noise(pub ChaCha8Rng);
 
@@ -43,7 +43,7 @@ impl Noise {
 }
 
 pub fn camera() -> Pinhole {
-    Pinhole::new(50.0, 50.0, 31.5, 20.5, WIDTH, HEIGHT).unwrap()
+    Pinhole::new(38.0, 38.0, 23.5, 15.5, WIDTH, HEIGHT).unwrap()
 }
 
 /// Boxes: the room itself (seen from inside) and furniture.
@@ -210,7 +210,7 @@ pub fn landmarks(
     let image = depth(pose);
     (0..count)
         .map(|k| {
-            let (x, y) = (1 + (noise.uniform() * 62.0) as usize, 1 + (noise.uniform() * 40.0) as usize);
+            let (x, y) = (1 + (noise.uniform() * 46.0) as usize, 1 + (noise.uniform() * 30.0) as usize);
             let wild = if noise.uniform() < gross { (0.6 * noise.normal()).exp() } else { 1.0 };
             let z = f64::from(image[(x.min(WIDTH - 1), y.min(HEIGHT - 1))]);
             SparseLandmark {
