@@ -61,6 +61,8 @@ pub struct Tracked {
     pub lost: Vec<LostSpan>,
     /// What was taken and left out.
     pub counts: InputCounts,
+    /// What was said of images that could not be read; they are left out.
+    pub unreadable: Vec<String>,
     /// Whether lengths are metres.
     pub is_metric: bool,
 }
@@ -145,7 +147,14 @@ pub(crate) fn track(
         if cancel.is_cancelled() {
             break;
         }
-        let event = event?;
+        let event = match event {
+            Ok(event) => event,
+            // A broken image is a gap in the stream, not the end of the flight.
+            Err(error) => {
+                tracked.unreadable.push(error.to_string());
+                continue;
+            }
+        };
         if matches!(event, SensorEvent::GroundTruth { .. } | SensorEvent::Depth { .. }) {
             continue;
         }
@@ -223,6 +232,10 @@ impl Tracked {
 
     pub(crate) fn warnings(&self) -> Vec<Warning> {
         let mut warnings = Vec::new();
+        if let Some(first) = self.unreadable.first() {
+            let text = format!("{} images left out; the first: {first}", self.unreadable.len());
+            warnings.push(Warning::new("odometry-image-unreadable", text));
+        }
         for span in &self.lost {
             let at = vidar_core::Timestamp::from_nanos(span.from_ns);
             warnings

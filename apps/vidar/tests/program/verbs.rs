@@ -112,11 +112,14 @@ fn a_run_as_json_has_stable_keys() {
             "coverage",
             "volume_bytes",
             "metric_poses",
+            "coupling",
+            "is_metric",
+            "placement",
             "judgement",
             "seconds"
         ]
     );
-    assert_eq!(keys(&json["result"]["judgement"], 1), ["trajectory", "surface", "depth"]);
+    assert_eq!(keys(&json["result"]["judgement"], 1), ["trajectory", "anchor", "surface", "depth"]);
     let scores: Vec<&str> = json["scores"].as_object().unwrap().keys().map(String::as_str).collect();
     for name in ["abs-rel", "chamfer", "delta-f", "f@0.05", "f@0.10"] {
         assert!(scores.contains(&name), "{name} in {scores:?}");
@@ -346,7 +349,7 @@ fn synth_never_overwrites_and_the_same_seed_makes_the_same_files() {
 #[test]
 fn the_demo_ends_with_what_was_made_how_good_it_is_and_how_to_look_at_it() {
     let folder = tempfile::tempdir().unwrap();
-    let args = ["demo", "-o", "d", "--duration", "1.5", "--set", "fusion.voxel_size_m=0.05", "-q"];
+    let args = ["demo", "-o", "d", "--duration", "3", "--set", "fusion.voxel_size_m=0.05", "-q"];
     let ran = vidar_in(folder.path(), &args).ends_with(0);
     let report = folder.path().join("d/run/report.html");
     let html = std::fs::read_to_string(&report).unwrap();

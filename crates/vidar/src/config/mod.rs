@@ -11,6 +11,7 @@ pub use layers::{Layered, Origin};
 pub use presets::{PRESETS, Preset};
 
 use crate::error::Error;
+use crate::models::geometry::SourceChoice;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -269,7 +270,8 @@ impl Config {
         positive("keyframes.min_rotation_deg", self.keyframes.min_rotation_deg)?;
         positive("output.depth_units_per_metre", self.output.depth_units_per_metre)?;
         let (chunk, overlap) = (self.geometry.chunk_keyframes, self.geometry.overlap_keyframes);
-        if overlap >= chunk {
+        let overlaps = !matches!(crate::models::geometry::source(self), Ok(SourceChoice::Stereo));
+        if overlaps && overlap >= chunk {
             return bad(format!(
                 "geometry.overlap_keyframes must be smaller than geometry.chunk_keyframes ({chunk}), found {overlap}"
             ));

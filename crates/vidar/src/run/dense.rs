@@ -174,7 +174,12 @@ impl Road<'_> {
             points: PointFusion::new(&self.config.fusion)?,
         };
         let mut map = MetricMap::default();
+        // Asked to stop while predicting, what was predicted is fused; asked to stop now, fusing stops.
+        let was_cancelled = self.cancel.is_cancelled();
         for (k, chunk) in self.plan.chunks.iter().enumerate() {
+            if self.cancel.is_cancelled() && !was_cancelled {
+                break;
+            }
             if !placement.views.iter().any(|v| v.owner == number(k)) {
                 continue;
             }
