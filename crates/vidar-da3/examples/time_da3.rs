@@ -46,6 +46,7 @@ fn arguments() -> Fallible<Arguments> {
             }
             "--precision" => found.options.precision = value()?.parse()?,
             "--head-precision" => found.options.head_precision = Some(value()?.parse()?),
+            "--exact-blocks" => found.options.exact_blocks = Some(value()?.parse()?),
             "--isa" => found.options.isa = Some(value()?.parse()?),
             "--runs" => found.runs = value()?.parse()?,
             "--rays" => found.infer.wants_rays = true,
@@ -87,7 +88,7 @@ fn main() -> Fallible<()> {
         let cpu = cpu_seconds().zip(cpu).map(|(after, before)| after - before);
         let line = serde_json::json!({
             "model": arguments.variant.name(), "views": views, "rows": rows, "columns": columns,
-            "isa": model.compute().isa().name(), "precision": model.compute().precision().name(),
+            "arithmetic": model.arithmetic().to_string(),
             "wall_s": wall, "cpu_s": cpu, "peak_kb": peak_kilobytes(), "weights_kb": weights,
             "depth_mean": answer.depth.iter().map(|d| f64::from(*d)).sum::<f64>() / answer.depth.len() as f64,
         });

@@ -1,5 +1,6 @@
 //! A model that is open: [`Da3`].
 
+use crate::arithmetic::{Arithmetic, Precision};
 use crate::config::{Da3Config, Variant, json};
 use crate::error::Da3Error;
 use crate::infer::Hooks;
@@ -8,15 +9,19 @@ use crate::run::Run;
 use crate::weights::{DeterministicWeights, Residency, detect, verify};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use vidar_nn::{Checkpoint, Compute, Isa, Precision, WeightSource};
+use vidar_nn::{Checkpoint, Compute, Isa, WeightSource};
 
 /// How a model computes.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Da3Options {
-    /// Matrix products of the backbone.
+    /// Matrix products of the backbone. `auto` is bf16 where the processor multiplies it and `f32` elsewhere.
     pub precision: Precision,
-    /// Matrix products of the dense head; `None` is the backbone's. The official code keeps the head in `f32`.
+    /// Matrix products of the dense head; `None` is `f32` beside a bf16 backbone, as in the official code, and the
+    /// backbone's precision otherwise.
     pub head_precision: Option<Precision>,
+    /// With a bf16 backbone: how many of its leading blocks (and, unless none, the patch embedding) stay in `f32`.
+    /// `None` is a third of them, which bounds the largest error of depth; 0 is fastest.
+    pub exact_blocks: Option<usize>,
     /// A set of kernels to insist on; `None` is the best of this machine.
     pub isa: Option<Isa>,
     /// Whether weights made by rule are kept. Files are mapped and cost nothing either way.
@@ -29,6 +34,7 @@ pub struct Da3 {
     pub(crate) model: Model,
     backbone: Compute,
     head: Compute,
+    arithmetic: Arithmetic,
     source: WeightsOrigin,
 }
 
@@ -99,15 +105,16 @@ impl Da3 {
         origin: WeightsOrigin,
     ) -> Result<Self, Da3Error> {
         config.validate()?;
-        let backbone = match options.isa {
-            Some(isa) => Compute::with_isa(isa, options.precision)?,
-            None => Compute::new(options.precision),
-        };
+        let isa = options.isa.unwrap_or_else(Isa::detect);
+        let (precision, head, exact) = (options.precision, options.head_precision, options.exact_blocks);
+        let arithmetic = Arithmetic::resolve(precision, head, isa, exact);
+        let backbone = Compute::with_isa(isa, arithmetic.backbone)?;
         Ok(Self {
             model: Model::load(source, &config, options.residency)?,
             config,
             backbone,
-            head: backbone.at(options.head_precision.unwrap_or(options.precision)),
+            head: backbone.at(arithmetic.head),
+            arithmetic,
             source: origin,
         })
     }
@@ -122,6 +129,11 @@ impl Da3 {
         &self.source
     }
 
+    /// What it computes with: the options resolved for this machine.
+    pub fn arithmetic(&self) -> Arithmetic {
+        self.arithmetic
+    }
+
     /// Kernels and precision of the backbone.
     pub fn compute(&self) -> Compute {
         self.backbone
@@ -133,7 +145,13 @@ impl Da3 {
     }
 
     pub(crate) fn run<'a>(&self, hooks: &Hooks<'a>) -> Run<'a> {
-        Run { backbone: self.backbone, head: self.head, cancel: hooks.cancel, trace: hooks.trace }
+        Run {
+            backbone: self.backbone,
+            exact_blocks: self.arithmetic.exact_blocks,
+            head: self.head,
+            cancel: hooks.cancel,
+            trace: hooks.trace,
+        }
     }
 }
 

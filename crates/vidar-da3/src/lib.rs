@@ -18,6 +18,7 @@
 //! the top-left pixel ([`pose::to_edge`], [`pose::from_edge`]). [`Da3Model`] speaks `VIDAR`'s.
 
 pub mod align;
+mod arithmetic;
 pub mod check;
 pub mod config;
 mod da3;
@@ -34,6 +35,7 @@ mod sky;
 mod trace;
 pub mod weights;
 
+pub use arithmetic::{Arithmetic, Precision};
 pub use config::{Da3Config, Variant};
 pub use da3::{Da3, Da3Options, WeightsOrigin};
 pub use error::Da3Error;
@@ -43,5 +45,5 @@ pub use memory::{MemoryEstimate, memory_estimate};
 pub use model::backbone::{Pixels, ReferenceStrategy};
 pub use model::metres_per_canonical;
 pub use trace::{Layout, Trace, Traced};
-pub use vidar_nn::{Isa, Precision};
+pub use vidar_nn::Isa;
 pub use weights::Residency;

@@ -1,5 +1,6 @@
 //! What accompanies a run through the network: kernels, the wish to stop, somebody who looks on.
 
+use crate::arithmetic::{exact, exact_blocks};
 use crate::error::Da3Error;
 use crate::trace::{Layout, Trace, Traced};
 use vidar_nn::Compute;
@@ -7,8 +8,10 @@ use vidar_nn::Compute;
 /// Passed by reference to every part.
 #[derive(Clone, Copy)]
 pub(crate) struct Run<'a> {
-    /// Kernels and precision of backbone and camera parts.
+    /// Kernels and precision of the backbone.
     pub backbone: Compute,
+    /// Leading blocks that stay in `f32` under a bf16 backbone; `None` is a third.
+    pub exact_blocks: Option<usize>,
     /// Kernels and precision of the dense head.
     pub head: Compute,
     /// Asked between blocks and views; `true` ends the run.
@@ -18,6 +21,16 @@ pub(crate) struct Run<'a> {
 }
 
 impl Run<'_> {
+    /// Kernels and precision of block `i` of `depth`.
+    pub fn block(&self, i: usize, depth: usize) -> Compute {
+        if i < exact_blocks(self.exact_blocks, depth) { exact(self.backbone) } else { self.backbone }
+    }
+
+    /// Kernels and precision of the patch embedding.
+    pub fn embedding(&self) -> Compute {
+        if self.exact_blocks == Some(0) { self.backbone } else { exact(self.backbone) }
+    }
+
     /// Stops the run when the caller wants it to.
     pub fn checkpoint(&self) -> Result<(), Da3Error> {
         if (self.cancel)() { Err(Da3Error::Cancelled) } else { Ok(()) }

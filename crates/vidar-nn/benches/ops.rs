@@ -6,7 +6,7 @@ use divan::Bencher;
 use divan::counter::{BytesCount, ItemsCount};
 use vidar_nn::{
     AttentionSpec, Compute, Conv2d, ConvInput, ConvTranspose2d, Corners, Epilogue, Isa, LayerNorm, Linear,
-    MapRef, MapSize, Precision, Weight, activation, attention, resize_bilinear_on,
+    MapRef, MapSize, Precision, Weight, activation, attention, resize_bilinear,
 };
 
 fn main() {
@@ -125,7 +125,7 @@ fn layer_norm_973x384(bencher: Bencher<'_, '_>, how: &How) {
     let norm = LayerNorm::new(weight(&[384]), weight(&[384]), 1e-6).expect("shapes fit");
     let x = numbers(TOKENS * 384);
     let mut out = vec![0.0; TOKENS * 384];
-    bench_bytes(bencher, 8 * TOKENS * 384, || norm.apply_on(&how.0, &x, &mut out));
+    bench_bytes(bencher, 8 * TOKENS * 384, || norm.apply(&how.0, &x, &mut out));
 }
 
 #[divan::bench(args = how())]
@@ -140,6 +140,6 @@ fn bilinear_108x144_to_216x288_64(bencher: Bencher<'_, '_>, how: &How) {
     let mut out = vec![0.0; 4 * 108 * 144 * 64];
     let size = MapSize { rows: 216, cols: 288 };
     bench_bytes(bencher, 20 * 108 * 144 * 64, || {
-        resize_bilinear_on(&how.0, MapRef::new(&x, 108, 144), 64, size, Corners::Aligned, &mut out);
+        resize_bilinear(&how.0, MapRef::new(&x, 108, 144), 64, size, Corners::Aligned, &mut out);
     });
 }

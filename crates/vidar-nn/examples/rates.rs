@@ -1,12 +1,16 @@
 //! GFLOP per CPU second of each matrix operation and the share of the peak, for busy machines where wall time says little:
 //! `cargo run --release -p vidar-nn --example rates [KERNELS] [PRECISION]`. Linux only (reads `/proc`).
 //!
-//! The share is of the best rate seen so far in the same run; the first row is small enough to show the kernel alone.
+//! The share is of the peak, which is measured first (registers only), or of the best rate so far for kernel sets without
+//! a peak loop. `stages` sums the operations of a network up.
 #![allow(clippy::print_stdout, clippy::expect_used, reason = "a measuring program")]
 
+mod measure;
+
+use measure::{peak, time};
 use vidar_nn::{
     AttentionSpec, Compute, Conv2d, ConvInput, ConvTranspose2d, Corners, Epilogue, HeadBranch, HeadInput,
-    LayerNorm, Linear, MapRef, MapSize, Precision, Weight, activation, attention, head, resize_bilinear_on,
+    LayerNorm, Linear, MapRef, MapSize, Precision, Weight, activation, attention, head, resize_bilinear,
 };
 
 fn numbers(n: usize) -> Vec<f32> {
@@ -15,31 +19,6 @@ fn numbers(n: usize) -> Vec<f32> {
 
 fn weight(shape: &[usize]) -> Weight {
     Weight::owned("w", shape, numbers(shape.iter().product()))
-}
-
-/// Nanoseconds that this thread has run.
-fn cpu_ns() -> f64 {
-    let stat = std::fs::read_to_string("/proc/thread-self/schedstat").expect("Linux");
-    stat.split_whitespace().next().and_then(|word| word.parse().ok()).expect("nanoseconds first")
-}
-
-/// Best and median nanoseconds of a run. The clock ticks every few milliseconds, so runs are timed in batches.
-fn time(mut work: impl FnMut()) -> (f64, f64) {
-    let start = cpu_ns();
-    let mut batch = 0;
-    while cpu_ns() - start < 50e6 {
-        work();
-        batch += 1;
-    }
-    let mut runs: Vec<f64> = (0..11)
-        .map(|_| {
-            let before = cpu_ns();
-            (0..batch).for_each(|_| work());
-            (cpu_ns() - before) / f64::from(batch)
-        })
-        .collect();
-    runs.sort_by(f64::total_cmp);
-    (runs[0], runs[runs.len() / 2])
 }
 
 struct Table {
@@ -74,7 +53,9 @@ fn main() {
     };
     let _pool = rayon::ThreadPoolBuilder::new().num_threads(1).use_current_thread().build().expect("a pool");
     println!("{} {}", c.isa(), c.precision());
-    let mut table = Table { only: words.get(2).cloned(), peak: 1e-9 };
+    let peak = peak(&c).unwrap_or(1e-9);
+    println!("{:36} {:45}{peak:8.1} GF/s  100 %", "registers only", "");
+    let mut table = Table { only: words.get(2).cloned(), peak };
     linears(&c, &mut table);
     attentions(&c, &mut table);
     convolutions(&c, &mut table);
@@ -163,12 +144,12 @@ fn convolutions(c: &Compute, table: &mut Table) {
 fn elementwise(c: &Compute, table: &mut Table) {
     let norm = LayerNorm::new(weight(&[384]), weight(&[384]), 1e-6).expect("shapes fit");
     let (x, mut out) = (numbers(973 * 384), vec![0.0; 973 * 384]);
-    table.row("norm 973x384 (GB/s)", 8 * 973 * 384, || norm.apply_on(c, &x, &mut out));
+    table.row("norm 973x384 (GB/s)", 8 * 973 * 384, || norm.apply(c, &x, &mut out));
     let mut x = numbers(973 * 1536);
     table.row("gelu 973x1536 (GB/s)", 8 * 973 * 1536, || activation::gelu(c, &mut x));
     let (x, mut out) = (numbers(108 * 144 * 64), vec![0.0; 4 * 108 * 144 * 64]);
     let size = MapSize { rows: 216, cols: 288 };
     table.row("bilinear 108x144x64 to 216x288 (GB/s)", 20 * 108 * 144 * 64, || {
-        resize_bilinear_on(c, MapRef::new(&x, 108, 144), 64, size, Corners::Aligned, &mut out);
+        resize_bilinear(c, MapRef::new(&x, 108, 144), 64, size, Corners::Aligned, &mut out);
     });
 }

@@ -100,6 +100,20 @@ impl Isa {
     }
 }
 
+impl Isa {
+    /// The kernel sets that operations of this process ran on since the last question, for tests that a forced one is
+    /// honoured. Kept in builds with debug assertions only; otherwise empty.
+    #[doc(hidden)]
+    pub fn take_ran() -> Vec<Self> {
+        crate::kernels::take_ran()
+    }
+
+    /// Whether the kernel set multiplies bf16 on this machine; where it does not, bf16 is computed in `f32`.
+    pub fn multiplies_bf16(self) -> bool {
+        crate::kernels::multiplies_bf16(self)
+    }
+}
+
 impl fmt::Display for Isa {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(self.name())

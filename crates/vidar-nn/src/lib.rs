@@ -1,8 +1,9 @@
 //! Checkpoint reading and CPU kernels: the only crate that knows how a network is computed.
 //!
 //! Numbers are `f32` at every boundary, row-major; feature maps are NHWC (`[rows, cols, channels]`). Operations take slices
-//! and write slices; a [`Compute`] says which kernel set and which precision of matrix products to use. They run on the
-//! rayon pool they are called in and give the same bits for any number of threads.
+//! and write slices; a [`Compute`] says which kernel set and which precision of matrix products to use, and every
+//! operation with kernels asks for one, so that a forced kernel set is used throughout. They run on the rayon pool they are
+//! called in and give the same bits for any number of threads.
 //!
 //! Slice lengths are the caller's own doing and asserted; everything that comes from a file is checked when it is read
 //! ([`Checkpoint`]) or when a layer is put together (`new`), and answered with an error.
@@ -29,8 +30,6 @@ pub use error::NnError;
 pub use head::{HeadBranch, HeadInput, head};
 pub use linear::{Epilogue, Linear};
 pub use norm::LayerNorm;
-pub use resize::{
-    Corners, GridEmbedding, MapSize, resize_bicubic_scaled, resize_bilinear, resize_bilinear_on,
-};
+pub use resize::{Corners, GridEmbedding, MapSize, resize_bicubic_scaled, resize_bilinear};
 pub use rope::RopeTable;
 pub use weight::Weight;

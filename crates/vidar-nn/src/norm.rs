@@ -61,19 +61,11 @@ impl LayerNorm {
         self.eps
     }
 
-    /// Normalises each row of `x` (`[rows, features]`) into `out`, with the best kernel set of this machine.
+    /// Normalises each row of `x` (`[rows, features]`) into `out`.
     ///
     /// # Panics
     /// When the lengths differ or are no whole number of rows.
-    pub fn apply(&self, x: &[f32], out: &mut [f32]) {
-        self.apply_on(&Compute::default(), x, out);
-    }
-
-    /// As [`LayerNorm::apply`], with a chosen kernel set.
-    ///
-    /// # Panics
-    /// When the lengths differ or are no whole number of rows.
-    pub fn apply_on(&self, c: &Compute, x: &[f32], out: &mut [f32]) {
+    pub fn apply(&self, c: &Compute, x: &[f32], out: &mut [f32]) {
         assert_eq!(x.len(), out.len(), "layer norm: input and output");
         let n = self.features();
         if n == 0 {
@@ -85,19 +77,11 @@ impl LayerNorm {
         });
     }
 
-    /// Normalises each row of `x` (`[rows, features]`) where it stands, with the best kernel set of this machine.
+    /// Normalises each row of `x` (`[rows, features]`) where it stands.
     ///
     /// # Panics
     /// When the length is no whole number of rows.
-    pub fn apply_in_place(&self, x: &mut [f32]) {
-        self.apply_in_place_on(&Compute::default(), x);
-    }
-
-    /// As [`LayerNorm::apply_in_place`], with a chosen kernel set.
-    ///
-    /// # Panics
-    /// When the length is no whole number of rows.
-    pub fn apply_in_place_on(&self, c: &Compute, x: &mut [f32]) {
+    pub fn apply_in_place(&self, c: &Compute, x: &mut [f32]) {
         let n = self.features();
         if n == 0 {
             return;

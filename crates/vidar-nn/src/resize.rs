@@ -96,34 +96,11 @@ impl Kernel for Line<'_> {
     }
 }
 
-/// Bilinear resampling of `x` (`[rows, cols, channels]`) to `out` (`[out_rows, out_cols, channels]`), with the best kernel set
-/// of this machine.
+/// Bilinear resampling of `x` (`[rows, cols, channels]`) to `out` (`[size.rows, size.cols, channels]`).
 ///
 /// # Panics
 /// When a slice has another length, or a map without pixels is to be enlarged.
 pub fn resize_bilinear(
-    x: MapRef<'_>,
-    channels: usize,
-    out_rows: usize,
-    out_cols: usize,
-    corners: Corners,
-    out: &mut [f32],
-) {
-    resize_bilinear_on(
-        &Compute::default(),
-        x,
-        channels,
-        MapSize { rows: out_rows, cols: out_cols },
-        corners,
-        out,
-    );
-}
-
-/// As [`resize_bilinear`], with a chosen kernel set.
-///
-/// # Panics
-/// When a slice has another length, or a map without pixels is to be enlarged.
-pub fn resize_bilinear_on(
     c: &Compute,
     x: MapRef<'_>,
     channels: usize,

@@ -9,7 +9,7 @@ use std::sync::atomic::{AtomicIsize, Ordering};
 use common::{Numbers, all_computes};
 use vidar_nn::{
     AttentionSpec, Compute, Conv2d, ConvInput, ConvTranspose2d, Corners, Epilogue, HeadBranch, HeadInput,
-    LayerNorm, Linear, MapRef, MapSize, RopeTable, activation, attention, head, resize_bilinear_on,
+    LayerNorm, Linear, MapRef, MapSize, RopeTable, activation, attention, head, resize_bilinear,
 };
 
 /// Counts the bytes that are allocated and not yet freed.
@@ -92,7 +92,7 @@ impl Net {
         self.down.apply(c, MapRef::new(&map, ROWS, COLS), &mut small, ConvInput::None, Epilogue::Gelu);
         let mut back = vec![0.0; tokens * D];
         let size = MapSize { rows: ROWS, cols: COLS };
-        resize_bilinear_on(c, MapRef::new(&small, h, w), D, size, Corners::Aligned, &mut back);
+        resize_bilinear(c, MapRef::new(&small, h, w), D, size, Corners::Aligned, &mut back);
         let mut wide = vec![0.0; tokens * 4 * 10];
         self.spread.apply(c, MapRef::new(&back, ROWS, COLS), &mut wide);
         let size = MapSize { rows: 3 * ROWS, cols: 3 * COLS };

@@ -4,7 +4,7 @@ mod common;
 
 use common::{Numbers, all_computes, attend, bound, error_in_std, f32_computes, layer_norm, rope, wide};
 use vidar_nn::{
-    AttentionSpec, Corners, KeyValues, LayerNorm, MapRef, RopeTable, TokenRows, Weight, activation,
+    AttentionSpec, Corners, KeyValues, LayerNorm, MapRef, MapSize, RopeTable, TokenRows, Weight, activation,
     attention, attention_separate, resize_bicubic_scaled, resize_bilinear,
 };
 
@@ -62,13 +62,15 @@ fn layer_norm_matches_the_reference_for_odd_widths() {
             LayerNorm::new(Weight::owned("w", &[n], w.clone()), Weight::owned("b", &[n], b.clone()), 1e-6)
                 .unwrap();
         let expected = layer_norm(&wide(&x), &w, &b, 1e-6);
-        let mut out = vec![0.0; x.len()];
-        norm.apply(&x, &mut out);
-        let error = error_in_std(&out, &expected);
-        assert!(error < 5e-6, "{rows}x{n}: {error:e}");
-        let mut in_place = x.clone();
-        norm.apply_in_place(&mut in_place);
-        assert_eq!(out, in_place);
+        for c in f32_computes() {
+            let mut out = vec![0.0; x.len()];
+            norm.apply(&c, &x, &mut out);
+            let error = error_in_std(&out, &expected);
+            assert!(error < 5e-6, "{rows}x{n} {}: {error:e}", c.isa());
+            let mut in_place = x.clone();
+            norm.apply_in_place(&c, &mut in_place);
+            assert_eq!(out, in_place);
+        }
     }
 }
 
@@ -177,10 +179,13 @@ fn bilinear_resampling_matches_the_reference_for_both_corner_rules() {
                     }
                 }
             }
-            let mut out = vec![0.0; expected.len()];
-            resize_bilinear(MapRef::new(&x, h, w), c, oh, ow, corners, &mut out);
-            let error = error_in_std(&out, &expected);
-            assert!(error < 1e-5, "{h}x{w}x{c} to {oh}x{ow} {corners:?}: {error:e}");
+            for compute in f32_computes() {
+                let mut out = vec![0.0; expected.len()];
+                let size = MapSize { rows: oh, cols: ow };
+                resize_bilinear(&compute, MapRef::new(&x, h, w), c, size, corners, &mut out);
+                let error = error_in_std(&out, &expected);
+                assert!(error < 1e-5, "{h}x{w}x{c} to {oh}x{ow} {corners:?} {}: {error:e}", compute.isa());
+            }
         }
     }
 }

@@ -9,7 +9,7 @@ use crate::error::Da3Error;
 use crate::infer::NetOutput;
 use crate::model::backbone::ReferenceStrategy;
 
-/// Sky this near to the threshold may fall on either side.
+/// Sky this near to the threshold may fall on either side; in rounded arithmetic, twice what depth is allowed.
 const SKY_MARGIN: f64 = 1e-4;
 const SKY_THRESHOLD: f64 = 0.3;
 
@@ -45,6 +45,7 @@ impl<'a> Comparison<'a> {
             self.rows.push(Row {
                 tensor: name.into(),
                 max_difference: f64::from(worst),
+                p999_difference: f64::from(worst),
                 rms_difference: (differing as f64 / expected.len().max(1) as f64).sqrt(),
                 deviation: 1.0,
                 tolerance: 0.0,
@@ -68,6 +69,7 @@ impl<'a> Comparison<'a> {
         self.rows.push(Row {
             tensor: "ref_idx".into(),
             max_difference: expected.abs_diff(found) as f64,
+            p999_difference: expected.abs_diff(found) as f64,
             rms_difference: expected.abs_diff(found) as f64,
             deviation: 1.0,
             tolerance: 0.0,
@@ -145,6 +147,7 @@ impl<'a> Comparison<'a> {
         self.rows.push(Row {
             tensor: name.into(),
             max_difference: difference,
+            p999_difference: difference,
             rms_difference: difference,
             deviation: size,
             tolerance: tolerance.unwrap_or(f64::INFINITY),
@@ -175,6 +178,7 @@ impl<'a> Comparison<'a> {
         let is_doubtful = self.doubtful_pixels(base, expected.len());
         let (mut worst, mut squares) = (0.0f64, 0.0f64);
         let mut left_out = 0;
+        let mut all = Vec::with_capacity(expected.len());
         for (i, (e, f)) in expected.iter().zip(found).enumerate() {
             if is_doubtful.get(i).copied().unwrap_or(false) {
                 left_out += 1;
@@ -183,7 +187,9 @@ impl<'a> Comparison<'a> {
             let difference = (e - f).abs();
             worst = if difference.is_nan() { f64::INFINITY } else { worst.max(difference) };
             squares += difference * difference;
+            all.push(if difference.is_nan() { f64::INFINITY } else { difference });
         }
+        let p999_difference = high_quantile(&mut all);
         let rms = (squares / (expected.len() - left_out).max(1) as f64).sqrt();
         let rms_difference = if worst.is_finite() { rms } else { f64::INFINITY };
         let has_all = expected.len() == found.len();
@@ -211,6 +217,7 @@ impl<'a> Comparison<'a> {
         self.rows.push(Row {
             tensor: name.into(),
             max_difference: worst,
+            p999_difference,
             rms_difference,
             measure,
             deviation,
@@ -235,7 +242,12 @@ impl<'a> Comparison<'a> {
             _ => return Vec::new(),
         };
         let sky = sky_name.iter().find_map(|name| self.golden.tensor(name).ok()).map(|t| t.1);
-        let is_near = |s: &f64| (s - SKY_THRESHOLD).abs() < SKY_MARGIN;
+        let margin = |sky: &[f64]| match self.tolerances.others {
+            Some(_) => SKY_MARGIN,
+            None => SKY_MARGIN.max(2.0 * self.tolerances.depth * deviation(sky)),
+        };
+        let margin = sky.as_deref().map_or(SKY_MARGIN, margin);
+        let is_near = |s: &f64| (s - SKY_THRESHOLD).abs() < margin;
         sky.filter(|s| s.len() == length).map(|s| s.iter().map(is_near).collect()).unwrap_or_default()
     }
 
@@ -243,10 +255,18 @@ impl<'a> Comparison<'a> {
         CheckReport {
             file: self.golden.path().to_path_buf(),
             model: model.config().name.clone(),
-            compute: format!("{} {}", model.compute().isa(), model.compute().precision()),
+            compute: model.arithmetic().to_string(),
+            measure: self.tolerances.measure,
             rows: self.rows,
         }
     }
+}
+
+/// What one number in a thousand exceeds; the largest of fewer than a thousand.
+fn high_quantile(values: &mut [f64]) -> f64 {
+    let Some(last) = values.len().checked_sub(1) else { return 0.0 };
+    let at = last - values.len() / 1000;
+    *values.select_nth_unstable_by(at, f64::total_cmp).1
 }
 
 fn deviation(values: &[f64]) -> f64 {

@@ -151,7 +151,7 @@ impl FeatureSink for Features<'_> {
             return Ok(());
         }
         let mut normed = global[dim..].to_vec();
-        self.net.backbone.norm().apply_in_place(&mut normed);
+        self.net.backbone.norm().apply_in_place(&run.head, &mut normed);
         self.joined.clear();
         for (local, global) in local[dim..].chunks_exact(dim).zip(normed.chunks_exact(dim)) {
             self.joined.extend_from_slice(local);

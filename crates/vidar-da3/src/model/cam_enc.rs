@@ -45,12 +45,12 @@ impl CameraEncoder {
         self.fc1.apply(&compute, &input, views, &mut hidden, Epilogue::Gelu);
         let mut tokens = vec![0.0; views * dim];
         self.fc2.apply(&compute, &hidden, views, &mut tokens, Epilogue::None);
-        self.token_norm.apply_in_place(&mut tokens);
+        self.token_norm.apply_in_place(&compute, &mut tokens);
         let mut scratch = BlockScratch::default();
         for block in &self.trunk {
             block.run(&compute, &mut tokens, 1, None, &mut scratch);
         }
-        self.trunk_norm.apply_in_place(&mut tokens);
+        self.trunk_norm.apply_in_place(&compute, &mut tokens);
         for (view, (code, token)) in input.chunks_exact(9).zip(tokens.chunks_exact(dim)).enumerate() {
             run.show("cam_enc_pose9", view, &[9], code);
             run.show("cam_enc_tokens", view, &[dim], token);

@@ -78,7 +78,7 @@ impl FeatureSink for Features<'_> {
         let dim = self.net.config.backbone.dim;
         run.show(&format!("camtok{stage}"), view, &[dim], &global[..dim]);
         let mut normed = global[dim..].to_vec();
-        self.net.backbone.norm().apply_in_place(&mut normed);
+        self.net.backbone.norm().apply_in_place(&run.head, &mut normed);
         run.show(&format!("feat{stage}"), view, &[normed.len() / dim, dim], &normed);
         self.stages[view].push(self.net.head.project(run, (view, stage), &normed, self.size));
         Ok(())

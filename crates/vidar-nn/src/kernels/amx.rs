@@ -78,6 +78,10 @@ impl<S: SimdBf16, T: Tiles> Multiply for InAmx<S, T> {
         InBf16(self.vectors).convert(from, to);
     }
     #[inline(always)]
+    fn store(self, to: &mut [u16], v: S::V) {
+        InBf16(self.vectors).store(to, v);
+    }
+    #[inline(always)]
     fn word(values: &[f32]) -> u32 {
         InBf16::<S>::word(values)
     }

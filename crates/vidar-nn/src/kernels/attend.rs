@@ -319,11 +319,15 @@ fn soften<M: Multiply>(
     }
     // A NaN score must not hide: the comparison keeps the running maximum, and exp2 of NaN makes the row NaN.
     let new = s.maximum(s.max(highest[0], highest[1]));
-    let shrink = if *top == f32::NEG_INFINITY { 0.0 } else { (*top - new).exp2() };
+    let shrink = match *top {
+        top if top == new => 1.0,
+        f32::NEG_INFINITY => 0.0,
+        top => (top - new).exp2(),
+    };
     *top = new;
     let new = s.splat(new);
     let mut sum = s.mul(s.load(total), s.splat(shrink));
-    for (scores, weights) in row.chunks_exact_mut(lanes).zip(weights.chunks_exact_mut(lanes)) {
+    for (scores, weights) in row.chunks_exact(lanes).zip(weights.chunks_exact_mut(lanes)) {
         let difference = s.sub(s.load(scores), new);
         let w = if M::STEP == 1 {
             math::exp2_below(s, difference)
@@ -331,8 +335,7 @@ fn soften<M: Multiply>(
             math::exp2_below_coarse(s, difference)
         };
         sum = s.add(sum, w);
-        s.store(scores, w);
-        m.convert(scores, weights);
+        m.store(weights, w);
     }
     s.store(total, sum);
     shrink

@@ -24,6 +24,8 @@ pub(crate) mod tile;
 #[cfg(target_arch = "x86_64")]
 mod x86;
 
+use std::sync::atomic::{AtomicU8, Ordering};
+
 use crate::compute::{Compute, Isa, Precision};
 use simd::{Portable, Simd};
 use tile::{InBf16, InF32, Multiply};
@@ -85,7 +87,7 @@ pub(crate) fn is_available(isa: Isa) -> bool {
     }
 }
 
-fn multiplies_bf16(isa: Isa) -> bool {
+pub(crate) fn multiplies_bf16(isa: Isa) -> bool {
     match isa {
         #[cfg(target_arch = "x86_64")]
         Isa::Avx512 => is_x86_feature_detected!("avx512bf16"),
@@ -94,8 +96,26 @@ fn multiplies_bf16(isa: Isa) -> bool {
     }
 }
 
+/// A bit for each kernel set that ran.
+static RAN: AtomicU8 = AtomicU8::new(0);
+
+/// Takes note of a kernel set in builds with debug assertions.
+#[inline(always)]
+fn note(isa: Isa) {
+    if cfg!(debug_assertions) {
+        RAN.fetch_or(1 << isa as u8, Ordering::Relaxed);
+    }
+}
+
+/// The kernel sets that ran since the last question, in this process.
+pub(crate) fn take_ran() -> Vec<Isa> {
+    let ran = RAN.swap(0, Ordering::Relaxed);
+    Isa::ALL.into_iter().filter(|isa| ran >> *isa as u8 & 1 == 1).collect()
+}
+
 /// Runs a kernel on a kernel set, which must be available (a `Compute` proves it).
 pub(crate) fn dispatch<K: Kernel>(isa: Isa, kernel: K) -> K::Output {
+    note(isa);
     match isa {
         #[cfg(target_arch = "x86_64")]
         // SAFETY: a kernel set reaches this point only after `is_available`.
@@ -112,6 +132,7 @@ pub(crate) fn dispatch<K: Kernel>(isa: Isa, kernel: K) -> K::Output {
 
 /// Runs a kernel on a kernel set, which must be available, with factors in a number format.
 pub(crate) fn dispatch_product<K: ProductKernel>(isa: Isa, factors: Factors, kernel: K) -> K::Output {
+    note(isa);
     match (isa, factors) {
         #[cfg(target_arch = "x86_64")]
         // SAFETY: bf16 is checked here, the rest before a kernel set reaches this point.

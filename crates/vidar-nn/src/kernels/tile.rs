@@ -35,6 +35,9 @@ pub(crate) trait Multiply: Copy + Send + Sync {
     /// Rounds `from` into the number format.
     fn convert(self, from: &[f32], to: &mut [Self::Number]);
 
+    /// Rounds a vector into the number format.
+    fn store(self, to: &mut [Self::Number], v: <Self::Simd as Simd>::V);
+
     /// A word of packed B from `STEP` numbers of a column.
     fn word(values: &[f32]) -> u32;
 
@@ -109,6 +112,11 @@ impl<S: Simd> Multiply for InF32<S> {
     #[inline(always)]
     fn convert(self, from: &[f32], to: &mut [f32]) {
         to.copy_from_slice(from);
+    }
+
+    #[inline(always)]
+    fn store(self, to: &mut [f32], v: S::V) {
+        self.0.store(to, v);
     }
 
     #[inline(always)]
@@ -197,6 +205,13 @@ impl<S: SimdBf16> Multiply for InBf16<S> {
         for (from, to) in from[whole..].iter().zip(&mut to[whole..]) {
             *to = half::bf16::from_f32(*from).to_bits();
         }
+    }
+
+    #[inline(always)]
+    fn store(self, to: &mut [u16], v: S::V) {
+        assert!(to.len() >= S::LANES);
+        // SAFETY: there is room for LANES numbers.
+        unsafe { self.0.store_bf16(to.as_mut_ptr(), v) };
     }
 
     #[inline(always)]

@@ -121,7 +121,7 @@ impl Block {
     /// Queries, keys and values of some tokens: `[tokens, 3, D]`.
     fn project_qkv(&self, c: &Compute, x: &[f32], qkv: &mut [f32], scratch: &mut BlockScratch) {
         resize(&mut scratch.normed, x.len());
-        self.norm1.apply(x, &mut scratch.normed);
+        self.norm1.apply(c, x, &mut scratch.normed);
         self.attn.qkv.apply(c, &scratch.normed, x.len() / self.dim(), qkv, Epilogue::None);
     }
 
@@ -176,7 +176,7 @@ impl Block {
         for x in x.chunks_mut(FFN_ROWS * dim) {
             let rows = x.len() / dim;
             resize(&mut scratch.normed, x.len());
-            self.norm2.apply(x, &mut scratch.normed);
+            self.norm2.apply(c, x, &mut scratch.normed);
             let residual = Epilogue::Accumulate { gamma: Some(&self.ls2) };
             match &self.mlp {
                 FeedForward::Mlp { fc1, fc2 } => {

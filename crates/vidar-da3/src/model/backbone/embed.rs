@@ -62,7 +62,7 @@ impl Embed {
         let (first, patches) = tokens.split_at_mut(self.dim);
         first.copy_from_slice(&self.cls_token);
         let map = MapRef::new(&interleaved, rows, columns);
-        self.proj.apply(&run.backbone, map, patches, ConvInput::None, Epilogue::None);
+        self.proj.apply(&run.embedding(), map, patches, ConvInput::None, Epilogue::None);
         run.show("patch_embed", view, &[patches.len() / self.dim, self.dim], patches);
         let positions = self.positions(rows / PATCH, columns / PATCH);
         for (token, position) in tokens.iter_mut().zip(positions.iter()) {

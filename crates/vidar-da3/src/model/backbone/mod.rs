@@ -26,7 +26,7 @@ use crate::error::Da3Error;
 use crate::run::Run;
 use crate::weights::{Residency, Scope, Slot};
 use embed::Embed;
-use vidar_nn::{LayerNorm, RopeTable};
+use vidar_nn::{Compute, LayerNorm, RopeTable};
 
 /// Epsilon of the blocks' norms.
 const BLOCK_EPS: f32 = 1e-6;
@@ -168,7 +168,8 @@ impl Backbone {
             if self.config.alternate_from == Some(i) {
                 self.place_camera_tokens(&mut x, length, cameras);
             }
-            let mut step = Step { run, order: &order, layer: i, length, extra, sink: &mut *sink };
+            let compute = run.block(i, self.config.depth);
+            let mut step = Step { run, compute, order: &order, layer: i, length, extra, sink: &mut *sink };
             let block = self.blocks[i].get()?;
             if self.config.is_global(i) {
                 self.global(&mut step, &block, &mut x, rope.global(self.config.has_rope(i)), &mut scratch)?;
@@ -190,7 +191,7 @@ impl Backbone {
         let views = (GROUP_TOKENS / (step.length / self.config.dim)).max(1);
         for (group, x) in x.chunks_mut(views * step.length).enumerate() {
             step.run.checkpoint()?;
-            block.run(&step.run.backbone, x, x.len() / step.length, rope, scratch);
+            block.run(&step.compute, x, x.len() / step.length, rope, scratch);
             for (i, x) in x.chunks_exact(step.length).enumerate() {
                 self.hand_over(step, group * views + i, x, x)?;
             }
@@ -206,7 +207,7 @@ impl Backbone {
         rope: Option<&RopeTable>,
         scratch: &mut BlockScratch,
     ) -> Result<(), Da3Error> {
-        let compute = step.run.backbone;
+        let compute = step.compute;
         let mut queries = std::mem::take(&mut scratch.queries);
         resize(&mut queries, x.len());
         let mut sequence = block.key_values(&compute, x.len() / self.config.dim);
@@ -245,7 +246,7 @@ impl Backbone {
         }
         if step.extra.contains(&layer) {
             let mut patches = global[dim..].to_vec();
-            self.norm.apply_in_place(&mut patches);
+            self.norm.apply_in_place(&step.compute, &mut patches);
             step.sink.take_extra(layer, view, patches);
         }
         Ok(())
@@ -305,6 +306,7 @@ fn block_shape(config: &BackboneConfig, i: usize) -> BlockShape {
 /// What a block's run shares with its neighbours.
 struct Step<'a, 's> {
     run: &'a Run<'a>,
+    compute: Compute,
     order: &'a Order,
     layer: usize,
     /// Numbers of one view.

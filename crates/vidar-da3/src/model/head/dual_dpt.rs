@@ -110,7 +110,7 @@ impl DualDpt {
         size: (usize, usize),
         embeddings: &Embeddings,
     ) -> Map {
-        self.norm.apply_in_place(feature);
+        self.norm.apply_in_place(&run.head, feature);
         let mut map = self.stages.project(run, view, k, feature, size);
         map.embed(&embeddings.stages[k]);
         map

@@ -1,7 +1,7 @@
 //! A feature map that owns its numbers.
 
 use vidar_nn::{
-    Compute, Conv2d, ConvInput, Corners, Epilogue, GridEmbedding, MapRef, MapSize, resize_bilinear_on,
+    Compute, Conv2d, ConvInput, Corners, Epilogue, GridEmbedding, MapRef, MapSize, resize_bilinear,
 };
 
 /// `[rows, columns, channels]` of one view.
@@ -38,7 +38,7 @@ impl Map {
     pub fn resized(&self, c: &Compute, rows: usize, columns: usize) -> Self {
         let mut out = Self::zeros(rows, columns, self.channels);
         let size = MapSize { rows, cols: columns };
-        resize_bilinear_on(c, self.view(), self.channels, size, Corners::Aligned, &mut out.data);
+        resize_bilinear(c, self.view(), self.channels, size, Corners::Aligned, &mut out.data);
         out
     }
 

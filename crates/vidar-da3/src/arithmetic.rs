@@ -1,0 +1,193 @@
+//! In what numbers a model computes.
+//!
+//! bf16 keeps eight bits, so every rounded factor is off by up to 0.4 %. What that does to depth depends on *where* it
+//! happens: errors of the patch embedding and of the first blocks grow through all later ones, and errors of the dense
+//! head fall on the answer directly, while those of the later blocks are averaged away. So a bf16 backbone has its patch
+//! embedding and its first third of blocks in `f32`, and `f32` heads (as the official code's, whose `autocast` leaves the
+//! head out). The residual stream, norms, softmax and all sums are `f32` in every precision. Depth is then within two
+//! hundredths of its standard deviation at every pixel of every reference, where bf16 throughout (as the official code
+//! has its backbone) reaches four to eight; a third of the local blocks' products cost twice the time of the others.
+
+use serde::{Deserialize, Serialize};
+use std::fmt;
+use std::str::FromStr;
+use vidar_nn::{Compute, Isa, NnError};
+
+/// Precision of a model's matrix products.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default, Serialize, Deserialize, schemars::JsonSchema)]
+#[serde(rename_all = "kebab-case")]
+pub enum Precision {
+    /// `bf16` where the processor multiplies it, `f32` elsewhere: the fastest that keeps depth within two hundredths of
+    /// its standard deviation. [`Arithmetic`] tells which of the two it is.
+    #[default]
+    Auto,
+    /// Everything in `f32`: the reference.
+    F32,
+    /// `f32`-like accuracy by the fastest way the processor has.
+    F32Split,
+    /// Backbone in bf16 but for its first third, heads in `f32`. A processor that does not multiply bf16 computes it in
+    /// `f32`, which is then as fast.
+    Bf16,
+    /// Weights rounded to f16, arithmetic in `f32`.
+    F16,
+}
+
+impl Precision {
+    /// All of them.
+    pub const ALL: [Self; 5] = [Self::Auto, Self::F32, Self::F32Split, Self::Bf16, Self::F16];
+
+    /// The word used in configuration and on the command line.
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Auto => "auto",
+            Self::F32 => "f32",
+            Self::F32Split => "f32-split",
+            Self::Bf16 => "bf16",
+            Self::F16 => "f16",
+        }
+    }
+
+    /// What a set of kernels computes it in.
+    fn on(self, isa: Isa) -> vidar_nn::Precision {
+        match self {
+            Self::Auto | Self::Bf16 if isa.multiplies_bf16() => vidar_nn::Precision::Bf16,
+            Self::Auto | Self::Bf16 | Self::F32 => vidar_nn::Precision::F32,
+            Self::F32Split => vidar_nn::Precision::F32Split,
+            Self::F16 => vidar_nn::Precision::F16,
+        }
+    }
+}
+
+impl fmt::Display for Precision {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(self.name())
+    }
+}
+
+impl FromStr for Precision {
+    type Err = NnError;
+    fn from_str(word: &str) -> Result<Self, NnError> {
+        Self::ALL.into_iter().find(|p| p.name() == word).ok_or_else(|| NnError::UnknownName {
+            what: "precision",
+            found: word.to_owned(),
+            expected: "auto, f32, f32-split, bf16, f16",
+        })
+    }
+}
+
+/// What an open model computes with: the precision asked for, resolved for this machine. Its words name it in manifests
+/// and reports: `bf16 (patch embedding, first third of the blocks and heads f32) on avx512`.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+pub struct Arithmetic {
+    /// The kernels.
+    pub isa: Isa,
+    /// Matrix products of the backbone.
+    pub backbone: vidar_nn::Precision,
+    /// Matrix products of the dense heads.
+    pub head: vidar_nn::Precision,
+    /// Leading blocks in `f32` under a bf16 backbone; `None` is the first third.
+    pub exact_blocks: Option<usize>,
+}
+
+impl Arithmetic {
+    /// Resolves what was asked for.
+    pub(crate) fn resolve(
+        precision: Precision,
+        head: Option<Precision>,
+        isa: Isa,
+        exact_blocks: Option<usize>,
+    ) -> Self {
+        let backbone = precision.on(isa);
+        let own = if backbone == vidar_nn::Precision::Bf16 { Precision::F32 } else { precision };
+        Self { isa, backbone, head: head.unwrap_or(own).on(isa), exact_blocks }
+    }
+
+    /// Whether all of it has `f32`'s accuracy.
+    pub(crate) fn is_exact(&self) -> bool {
+        is_exact(self.backbone) && is_exact(self.head)
+    }
+
+    /// Whether the largest error of depth is bounded, not only its mean square: all but the middle and the end of the
+    /// backbone is exact.
+    pub(crate) fn is_guarded(&self) -> bool {
+        let is_rounded_late = self.backbone == vidar_nn::Precision::Bf16 && self.exact_blocks.is_none();
+        is_exact(self.head) && (is_exact(self.backbone) || is_rounded_late)
+    }
+}
+
+fn is_exact(precision: vidar_nn::Precision) -> bool {
+    matches!(precision, vidar_nn::Precision::F32 | vidar_nn::Precision::F32Split)
+}
+
+impl fmt::Display for Arithmetic {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self { backbone, head, exact_blocks, .. } = self;
+        let place = self.isa.name();
+        if *backbone != vidar_nn::Precision::Bf16 {
+            write!(f, "{backbone}")?;
+            return if head == backbone {
+                write!(f, " on {place}")
+            } else {
+                write!(f, " (heads {head}) on {place}")
+            };
+        }
+        let leading = match exact_blocks {
+            None => "patch embedding, first third of the blocks".to_owned(),
+            Some(0) => String::new(),
+            Some(1) => "patch embedding, first block".to_owned(),
+            Some(n) => format!("patch embedding, first {n} blocks"),
+        };
+        match (leading.as_str(), *head) {
+            ("", vidar_nn::Precision::Bf16) => write!(f, "bf16 on {place}"),
+            ("", head) => write!(f, "bf16 (heads {head}) on {place}"),
+            (leading, vidar_nn::Precision::F32) => write!(f, "bf16 ({leading} and heads f32) on {place}"),
+            (leading, head) => write!(f, "bf16 ({leading} f32; heads {head}) on {place}"),
+        }
+    }
+}
+
+/// Leading blocks of a backbone of `depth` blocks that are computed in `f32`, and whether the patch embedding is.
+pub(crate) fn exact_blocks(asked: Option<usize>, depth: usize) -> usize {
+    asked.unwrap_or(depth / 3).min(depth)
+}
+
+/// Kernels and precision of the exact part of a backbone.
+pub(crate) fn exact(backbone: Compute) -> Compute {
+    match backbone.precision() {
+        vidar_nn::Precision::Bf16 => backbone.at(vidar_nn::Precision::F32),
+        _ => backbone,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn words_name_what_is_computed_and_not_what_was_asked_for() {
+        let said = |p, head, isa, n| Arithmetic::resolve(p, head, isa, n).to_string();
+        assert_eq!(said(Precision::Auto, None, Isa::Portable, None), "f32 on portable");
+        assert_eq!(said(Precision::Bf16, None, Isa::Avx2, None), "f32 on avx2");
+        assert_eq!(said(Precision::F16, None, Isa::Avx2, None), "f16 on avx2");
+        assert_eq!(said(Precision::F16, Some(Precision::F32), Isa::Avx2, None), "f16 (heads f32) on avx2");
+        assert_eq!(
+            said(Precision::Auto, None, Isa::Amx, None),
+            "bf16 (patch embedding, first third of the blocks and heads f32) on amx"
+        );
+        assert_eq!(said(Precision::Bf16, Some(Precision::Bf16), Isa::Amx, Some(0)), "bf16 on amx");
+        assert_eq!(
+            said(Precision::Bf16, Some(Precision::Bf16), Isa::Amx, Some(2)),
+            "bf16 (patch embedding, first 2 blocks f32; heads bf16) on amx"
+        );
+        for precision in Precision::ALL {
+            assert_eq!(precision.name().parse::<Precision>().ok(), Some(precision));
+        }
+        assert!("double".parse::<Precision>().is_err());
+    }
+
+    #[test]
+    fn the_first_third_is_exact_unless_said_otherwise() {
+        assert_eq!([12, 24, 40, 2].map(|depth| exact_blocks(None, depth)), [4, 8, 13, 0]);
+        assert_eq!((exact_blocks(Some(0), 12), exact_blocks(Some(99), 12)), (0, 12));
+    }
+}
