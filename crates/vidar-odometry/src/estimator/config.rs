@@ -58,7 +58,7 @@ impl Default for SmootherConfig {
             estimate_camera_rotation: false,
             estimate_camera_position: false,
             estimate_time_offset: false,
-            camera_rotation_sigma_deg: 0.5,
+            camera_rotation_sigma_deg: 1.0,
             camera_position_sigma_m: 0.01,
             time_offset_sigma_ms: 5.0,
         }

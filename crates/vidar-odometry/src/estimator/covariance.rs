@@ -5,9 +5,37 @@ use super::linearise::System;
 use super::prior::Part;
 use crate::imu::{Matrix15, hat};
 use nalgebra::{Matrix6, SMatrix};
-use vidar_core::{FrameId, LieGroup};
+use vidar_core::{FrameId, LieGroup, Se3};
+
+/// Calibration as estimated on the way, with standard deviations.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct CalibrationEstimate {
+    /// Place of the camera on the body.
+    pub body_from_camera: Se3,
+    /// Standard deviation of its rotation, rad per axis of the camera; `None` where it is not estimated.
+    pub rotation_sigma_rad: Option<[f64; 3]>,
+    /// Standard deviation of its position, m per axis of the body; `None` where it is not estimated.
+    pub position_sigma_m: Option<[f64; 3]>,
+    /// What to add to image stamps to get the IMU's time, s.
+    pub time_offset_secs: f64,
+    /// Its standard deviation, s; `None` where it is not estimated.
+    pub time_offset_sigma_secs: Option<f64>,
+}
 
 impl Smoother {
+    /// Calibration as estimated, with standard deviations where the states are known.
+    pub fn calibration(&mut self) -> CalibrationEstimate {
+        let sigmas = self.calibration_sigmas();
+        let three = |at: usize| sigmas.map(|s| [s[at], s[at + 1], s[at + 2]]);
+        CalibrationEstimate {
+            body_from_camera: self.calibration.body_from_camera,
+            rotation_sigma_rad: three(0).filter(|_| self.config.estimate_camera_rotation),
+            position_sigma_m: three(3).filter(|_| self.config.estimate_camera_position),
+            time_offset_secs: self.calibration.time_offset_secs,
+            time_offset_sigma_secs: sigmas.map(|s| s[6]).filter(|_| self.config.estimate_time_offset),
+        }
+    }
+
     /// Covariance of the newest frame's error state. `None` when empty or when nothing holds the world's origin.
     pub fn covariance_of_newest(&mut self) -> Option<Matrix15> {
         let newest = self.frames.len().checked_sub(1)?;

@@ -22,6 +22,7 @@ mod visual;
 mod window;
 
 pub use config::{Linearisation, SmootherConfig};
+pub use covariance::CalibrationEstimate;
 pub use inertial::AnchorSigmas;
 pub use marginalise::Departure;
 pub use optimise::{OptimiseReport, Outlier};
