@@ -4,19 +4,29 @@
 //! textures are read with the ray's footprint. Depth is that of the pixel's centre at the middle of the exposure.
 
 use crate::error::SynthError;
-use crate::world::World;
-use nalgebra::Vector3;
+use crate::world::{TileBounds, TileHits, World};
+use nalgebra::{Matrix3, Vector3};
 use rayon::prelude::*;
 use vidar_core::{CameraModel, FrameImage, Image, MetricDepth, Se3};
+
+/// Pixels along the sides of a tile, whose rays are cast together.
+const TILE: usize = 8;
 
 /// The directions (z = 1) into which a camera's pixels look, for each of a set of places within the pixel.
 pub(crate) struct RayTable {
     width: usize,
     height: usize,
-    /// Per sample, per pixel: x and y at z = 1; NaN where the camera model does not hold.
-    samples: Vec<Vec<[f64; 2]>>,
+    samples: Vec<Sample>,
     /// Angle between neighbouring pixels near the axis, rad.
     pixel_angle: f64,
+}
+
+/// The rays of one place within the pixel.
+struct Sample {
+    /// Per pixel, x and y at z = 1; NaN where the camera model does not hold.
+    rays: Vec<[f64; 2]>,
+    /// Bounds of each tile's rays, row by row of tiles.
+    tiles: Vec<TileBounds>,
 }
 
 impl RayTable {
@@ -30,7 +40,13 @@ impl RayTable {
                     let pixel = nalgebra::Vector2::new((i % width) as f64 + dx, (i / width) as f64 + dy);
                     camera.unproject(&pixel).map_or([f64::NAN; 2], |r| [r.x / r.z, r.y / r.z])
                 };
-                (0..width * height).into_par_iter().map(ray).collect()
+                let rays: Vec<[f64; 2]> = (0..width * height).into_par_iter().map(ray).collect();
+                let columns = width.div_ceil(TILE);
+                let mut tiles = vec![TileBounds::EMPTY; columns * height.div_ceil(TILE)];
+                for (i, ray) in rays.iter().enumerate() {
+                    tiles[(i / width / TILE) * columns + (i % width) / TILE].add(*ray);
+                }
+                Sample { rays, tiles }
             })
             .collect();
         Self { width, height, samples, pixel_angle: 1.0 / camera.intrinsics().fx }
@@ -65,46 +81,86 @@ pub(crate) fn expose(world: &World, rays: &RayTable, world_from_camera: &[Se3]) 
     let mut radiance = vec![0.0_f32; n];
     let mut depth = vec![f32::NAN; n];
     let share = 1.0 / rays.samples.len() as f32;
-    for (s, directions) in rays.samples.iter().enumerate() {
-        let rotation = world_from_camera[s].rotation.matrix();
-        let origin = world_from_camera[s].translation;
-        let is_centre = s == rays.centre();
-        let pixels = radiance.par_chunks_mut(rays.width).zip(depth.par_chunks_mut(rays.width));
-        pixels.zip(directions.par_chunks(rays.width)).for_each(|((radiance, depth), directions)| {
-            for ((radiance, depth), &[x, y]) in radiance.iter_mut().zip(depth).zip(directions) {
-                if x.is_nan() {
-                    continue;
-                }
-                let direction = rotation * Vector3::new(x, y, 1.0);
-                let Some(hit) = world.cast(&origin, &direction) else {
-                    continue;
-                };
-                *radiance += share
-                    * world.radiance(&hit, footprint_m(&hit.normal, &direction, hit.t, rays.pixel_angle));
+    let band = TILE * rays.width;
+    let bands = radiance.par_chunks_mut(band).zip(depth.par_chunks_mut(band)).enumerate();
+    bands.for_each(|(row, (radiance, depth))| {
+        let mut hits = TileHits::default();
+        for (s, world_from_camera) in world_from_camera.iter().enumerate().take(rays.samples.len()) {
+            let eye = Eye::new(world_from_camera);
+            let is_centre = s == rays.centre();
+            eye.cast_band(world, rays, s, row, &mut hits, |hits, ray, pixel| {
+                let Some(hit) = world.tile_hit(hits, ray, &eye.origin) else { return };
+                let footprint = footprint_m(&hit.normal, &hits.directions[ray], hit.t, rays.pixel_angle);
+                radiance[pixel] += share * world.radiance(&hit, footprint);
                 if is_centre {
-                    *depth = hit.t as f32;
+                    depth[pixel] = hit.t as f32;
                 }
-            }
-        });
-    }
+            });
+        }
+    });
     Exposed { radiance, depth }
 }
 
 /// z-depth at the pixel centres from one pose, m; NaN where there is none.
 pub(crate) fn depth_image(world: &World, rays: &RayTable, world_from_camera: &Se3) -> Image<f32> {
-    let rotation = world_from_camera.rotation.matrix();
-    let origin = world_from_camera.translation;
-    let directions = &rays.samples[rays.centre()];
-    Image::from_fn(rays.width, rays.height, |x, y| {
-        let [u, v] = directions[y * rays.width + x];
-        // A direction that is not a number meets nothing.
-        let direction = rotation * Vector3::new(u, v, 1.0);
-        if u.is_nan() {
-            f32::NAN
-        } else {
-            world.cast(&origin, &direction).map_or(f32::NAN, |hit| hit.t as f32)
+    let eye = Eye::new(world_from_camera);
+    let mut depth = Image::filled(rays.width, rays.height, f32::NAN);
+    let bands = depth.data_mut().par_chunks_mut(TILE * rays.width).enumerate();
+    bands.for_each(|(row, depth)| {
+        eye.cast_band(world, rays, rays.centre(), row, &mut TileHits::default(), |hits, ray, pixel| {
+            if let Some(z) = World::tile_depth(hits, ray) {
+                depth[pixel] = z as f32;
+            }
+        });
+    });
+    depth
+}
+
+/// A camera's place and axes in the world.
+struct Eye {
+    origin: Vector3<f64>,
+    rotation: Matrix3<f64>,
+    axes: [Vector3<f64>; 3],
+}
+
+impl Eye {
+    fn new(world_from_camera: &Se3) -> Self {
+        let rotation = world_from_camera.rotation.matrix();
+        let axes = [0, 1, 2].map(|k| rotation.column(k).into_owned());
+        Self { origin: world_from_camera.translation, rotation, axes }
+    }
+
+    /// Casts sample `sample` of a row of tiles and tells of each ray and its pixel (counted from the band's first).
+    fn cast_band(
+        &self,
+        world: &World,
+        rays: &RayTable,
+        sample: usize,
+        band: usize,
+        hits: &mut TileHits,
+        mut pixel_of: impl FnMut(&TileHits, usize, usize),
+    ) {
+        let Sample { rays: table, tiles } = &rays.samples[sample];
+        let columns = rays.width.div_ceil(TILE);
+        let rows = TILE * band..(TILE * (band + 1)).min(rays.height);
+        for column in 0..columns {
+            let xs = TILE * column..(TILE * (column + 1)).min(rays.width);
+            let bounds = &tiles[band * columns + column];
+            hits.directions.clear();
+            for y in rows.clone() {
+                let of_row = table[y * rays.width..][xs.clone()].iter();
+                hits.directions.extend(of_row.map(|[x, y]| self.rotation * Vector3::new(*x, *y, 1.0)));
+            }
+            world.cast_tile(bounds, &self.origin, &self.axes, hits);
+            for ray in 0..hits.directions.len() {
+                let (x, y) = (xs.start + ray % xs.len(), ray / xs.len());
+                // A ray that is none has no direction.
+                if !hits.directions[ray].x.is_nan() {
+                    pixel_of(hits, ray, y * rays.width + x);
+                }
+            }
         }
-    })
+    }
 }
 
 /// Width of the surface that a pixel sees: between the axes of its ellipse, halfway from their mean to the longer one.

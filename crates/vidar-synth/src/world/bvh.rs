@@ -1,6 +1,7 @@
 //! A bounding-volume hierarchy over shapes, split at the median of the longest axis.
 
 use super::shape::{Extent, Shape};
+use super::tile::Pyramid;
 use nalgebra::Vector3;
 
 /// Shapes per leaf at most.
@@ -54,6 +55,33 @@ impl Bvh {
         self.nodes[node].start = self.nodes.len() as u32;
         self.nodes[node].count = 0;
         self.split(extents, middle, until);
+    }
+
+    /// Tells of every shape of the leaves that a pyramid may meet.
+    pub(super) fn within(&self, pyramid: &Pyramid, mut found: impl FnMut(usize)) {
+        // As deep as in `nearest`.
+        let mut waiting = [0_u32; 40];
+        let mut depth = 0;
+        let mut node = 0_usize;
+        loop {
+            if let Some(n) = self.nodes.get(node)
+                && pyramid.may_meet(&n.extent.center(), &((n.extent.max - n.extent.min) * 0.5))
+            {
+                if n.count == 0 {
+                    waiting[depth] = n.start;
+                    depth += 1;
+                    node += 1;
+                    continue;
+                }
+                let leaf = &self.order[n.start as usize..(n.start + n.count) as usize];
+                leaf.iter().for_each(|&i| found(i as usize));
+            }
+            if depth == 0 {
+                return;
+            }
+            depth -= 1;
+            node = waiting[depth] as usize;
+        }
     }
 
     /// The nearest shape that a ray meets before `limit`: its index and `t`.

@@ -7,9 +7,11 @@ mod material;
 mod noise;
 mod shape;
 mod texture;
+mod tile;
 
 pub use shape::Extent;
 pub(crate) use shape::Shape;
+pub(crate) use tile::{TileBounds, TileHits};
 
 use crate::config::{SceneKind, SynthConfig};
 use crate::error::SynthError;
@@ -41,6 +43,8 @@ pub struct World {
     /// Shape 0 is the room's shell, seen from inside.
     shapes: Vec<Shape>,
     bvh: Bvh,
+    /// Boxes around the shapes after the shell.
+    extents: Vec<Extent>,
     /// Index of each shape's first face.
     first_face: Vec<u32>,
     textures: Vec<Texture>,
@@ -97,7 +101,8 @@ impl World {
                 paint(surface, light, exposure, shapes[i].face_size(f), texel_m)
             })
             .collect();
-        Self { shapes, bvh, first_face, textures }
+        let extents = shapes[1..].iter().map(Shape::extent).collect();
+        Self { shapes, bvh, extents, first_face, textures }
     }
 
     /// The room's own box.
@@ -113,10 +118,15 @@ impl World {
     /// The nearest surface along a ray (`direction` need not be of unit length); `None` from outside the room.
     pub fn cast(&self, origin: &Vector3<f64>, direction: &Vector3<f64>) -> Option<Hit> {
         let (shape, t) = nearest_hit(&self.shapes, &self.bvh, origin, direction)?;
+        Some(self.hit(shape, t, origin, direction))
+    }
+
+    /// The place at `t` on a ray that meets `shape` there.
+    fn hit(&self, shape: usize, t: f64, origin: &Vector3<f64>, direction: &Vector3<f64>) -> Hit {
         let point = origin + direction * t;
         let place = self.shapes[shape].resolve(&point, direction);
         let face = self.first_face[shape] + place.face as u32;
-        Some(Hit { t, point, normal: place.normal, face, uv: place.uv })
+        Hit { t, point, normal: place.normal, face, uv: place.uv }
     }
 
     /// Radiance (0…1, exposure 1) of a hit, averaged over about `footprint_m` of surface.
