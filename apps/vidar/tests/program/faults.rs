@@ -300,14 +300,13 @@ fn an_output_that_cannot_be_made_ends_with_4() {
 fn a_full_disk_ends_with_4_keeps_what_is_finished_and_leaves_no_half_file() {
     let folder = tempfile::tempdir().unwrap();
     let out = folder.path().join("out");
-    // No file may grow beyond 512 blocks of 512 or 1024 bytes: images and depth fit, the mesh does not.
-    let script = "trap '' XFSZ; ulimit -f 512; exec \"$0\" \"$@\"";
+    // No file may grow beyond 1600 blocks of 512 or 1024 bytes: images, depth and chunks of four views fit, the mesh does not.
+    let script = "trap '' XFSZ; ulimit -f 1600; exec \"$0\" \"$@\"";
     let ran: Ran = Command::new("sh")
         .args(["-c", script, VIDAR, "run"])
         .arg(&shared().sequence)
-        .args(["-q", "-o", text(&out), "--set", "fusion.voxel_size_m=0.02", "--set", "output.report=false"])
-        // The prediction of a chunk fits, too.
-        .args(["--set", "geometry.chunk_keyframes=1"])
+        .args(["-q", "-o", text(&out), "--set", "fusion.voxel_size_m=0.012", "--set", "output.report=false"])
+        .args(["--set", "geometry.chunk_keyframes=4", "--set", "eval.mode=off"])
         .output()
         .unwrap()
         .into();
