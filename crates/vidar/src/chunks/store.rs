@@ -103,11 +103,17 @@ impl ChunkStore {
         self.load(&self.sidecar(id)?.ok_or_else(missing)?)
     }
 
-    /// Removes a chunk's files.
-    pub fn remove(&self, id: ChunkId) {
-        // The chunk first ceases to exist; what cannot be removed is only left behind.
-        let _ = std::fs::remove_file(self.path(id, "json"));
-        let _ = std::fs::remove_file(self.path(id, "npz"));
+    /// Removes every chunk, and the folder where nothing else lies in it.
+    pub fn remove_all(&self) {
+        let Ok(entries) = std::fs::read_dir(&self.folder) else { return };
+        let ours = |p: &PathBuf| {
+            let number = p.file_stem().and_then(|s| s.to_str()).is_some_and(|s| s.parse::<u32>().is_ok());
+            number && p.extension().is_some_and(|e| e == "npz" || e == "json")
+        };
+        // What cannot be removed is only left behind.
+        for path in entries.filter_map(|e| Some(e.ok()?.path())).filter(ours) {
+            let _ = std::fs::remove_file(path);
+        }
         let _ = std::fs::remove_dir(&self.folder);
     }
 

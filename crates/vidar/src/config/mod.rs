@@ -119,6 +119,9 @@ pub struct CouplingConfig {
     /// `coupled` estimates poses and chunks together; `pose-conditioned` and `hybrid` are the paper's; `ground-truth` is
     /// pose-conditioned on true poses, an upper bound; `pose-free` and `da3-streaming` use no metric poses and give no metres.
     pub mode: vidar_align::CouplingMode,
+    /// Show both ends of a loop to the network together, as DA3-Streaming does: one more prediction per loop. Otherwise what is
+    /// stored of the two chunks is compared.
+    pub loop_chunks: bool,
 }
 
 /// The network, where `geometry.source` names one.

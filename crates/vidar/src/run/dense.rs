@@ -14,6 +14,7 @@ use crate::run_folder::{RunFolder, StoredView};
 use rayon::prelude::*;
 use serde_json::json;
 use sha2::{Digest, Sha256};
+use vidar_align::aligner::LoopCandidate;
 use vidar_align::{Aligner, Placement};
 use vidar_core::model::ChunkFrame;
 use vidar_core::remap::RemapTable;
@@ -41,7 +42,7 @@ pub fn build(
     let mut map = events.stage("surface", count, || road.fuse(&placement))?;
     map.placement = Some(placement);
     if !(config.output.keep_chunks || cancel.is_cancelled()) {
-        (0..plan.chunks.len()).for_each(|k| road.store.remove(number(k)));
+        road.store.remove_all();
     }
     map.warnings.iter().for_each(|w| events.warn(w));
     Ok(map)
@@ -76,7 +77,7 @@ impl Road<'_> {
             if self.cancel.is_cancelled() {
                 break;
             }
-            let key = key_of(&identity, self.plan, chunk);
+            let key = key_of(&identity, self.plan, chunk.core.clone().chain(chunk.seen.clone()));
             let stored = match self.store.find(number(k), &key) {
                 Some(kept) => kept,
                 None => match self.predict(&mut source, &mut window, k, chunk, &key)? {
@@ -91,6 +92,7 @@ impl Road<'_> {
                 }
                 None => failures.extend(self.align(&mut aligner, &known, chunk, stored)?),
             }
+            self.close_loops(&mut aligner, &mut source, &window, &identity)?;
             let (done, total) = (chunk.seen.end, self.plan.keyframes.len());
             self.events.emit(&Event::Progress { stage: "depth", done, total });
         }
@@ -147,7 +149,7 @@ impl Road<'_> {
         chunk: &ChunkPlan,
         stored: StoredChunk,
     ) -> Result<Option<String>, Error> {
-        let observation = observation::of(self.plan, known, chunk, stored.prediction);
+        let observation = observation::of(self.plan, known, chunk, stored);
         let report = aligner.push(observation)?;
         self.events.emit(&Event::ChunkAligned {
             chunk: report.chunk_id.0,
@@ -165,6 +167,58 @@ impl Road<'_> {
         let warning = Warning::new("chunk-not-placed", message.clone());
         self.events.warn(&warning.at(format!("chunk {}", report.chunk_id)));
         Ok(Some(message))
+    }
+
+    /// Judges the revisits that the newest chunk brought: by what is stored of both ends, or by a chunk of both ends.
+    fn close_loops(
+        &self,
+        aligner: &mut Aligner,
+        source: &mut Source,
+        window: &ViewWindow<'_>,
+        identity: &[u8],
+    ) -> Result<(), Error> {
+        for candidate in aligner.loop_candidates() {
+            let together = match source.sees_any_views() && self.config.coupling.loop_chunks {
+                true => self.predict_loop(&candidate, source, window, identity)?,
+                false => None,
+            };
+            aligner.push_loop(&candidate, together.as_ref())?;
+        }
+        Ok(())
+    }
+
+    /// What the model says of both ends of a revisit together; `None` where it has nothing to say.
+    fn predict_loop(
+        &self,
+        candidate: &LoopCandidate,
+        source: &mut Source,
+        window: &ViewWindow<'_>,
+        identity: &[u8],
+    ) -> Result<Option<GeometryPrediction>, Error> {
+        let frames = candidate.earlier_window.iter().chain(&candidate.later_window);
+        let place = |id| self.plan.keyframes.iter().position(|k| k.image.frame_id == id);
+        let seen: Vec<usize> = frames.filter_map(|id| place(*id)).collect();
+        let key = key_of(identity, self.plan, seen.iter().copied());
+        // Numbers beyond those of any chunk, one per pair of chunks.
+        let pair = candidate.later.0.wrapping_mul(LOOP_IDS).wrapping_add(candidate.earlier.0);
+        let id = ChunkId(u32::MAX - pair % (u32::MAX / 2));
+        if let Some(kept) = self.store.find(id, &key) {
+            return Ok(Some(kept.prediction));
+        }
+        let views: Result<Vec<ChunkView>, Warning> = seen.iter().map(|k| window.load(*k)).collect();
+        let Ok(views) = views else { return Ok(None) };
+        let (views, count) = (ChunkViews { id, views }, seen.len());
+        let Ok(prediction) = source.predict(&views, 0..count, &|| self.cancel.is_cancelled()) else {
+            return Ok(None);
+        };
+        let stored = StoredChunk {
+            times: prediction.views.iter().map(|_| Default::default()).collect(),
+            prediction,
+            colors: Vec::new(),
+            failure: None,
+        };
+        self.store.write(&stored, &key)?;
+        Ok(Some(self.store.read(id)?.prediction))
     }
 
     /// Every placed chunk's own keyframes into one surface; depth and images are written as they go by.
@@ -228,6 +282,9 @@ fn colored(prediction: GeometryPrediction, views: &[ChunkView], given: Vec<Image
     StoredChunk { prediction, times, colors, failure: None }
 }
 
+/// Chunk numbers below this give loops numbers of their own.
+const LOOP_IDS: u32 = 40_000;
+
 /// What all of a run's predictions are made of, besides their own frames.
 fn identity(dataset: &Dataset, plan: &Plan, config: &Config) -> Result<Vec<u8>, Error> {
     let part = json!({
@@ -245,10 +302,9 @@ fn identity(dataset: &Dataset, plan: &Plan, config: &Config) -> Result<Vec<u8>, 
 }
 
 /// The key of a chunk: SHA-256 of all that its prediction is made of.
-fn key_of(identity: &[u8], plan: &Plan, chunk: &ChunkPlan) -> String {
+fn key_of(identity: &[u8], plan: &Plan, keyframes: impl Iterator<Item = usize>) -> String {
     let mut hash = Sha256::new_with_prefix(identity);
-    hash.update(format!("{:?}", chunk.core));
-    for keyframe in &plan.keyframes[chunk.seen.clone()] {
+    for keyframe in keyframes.map(|k| &plan.keyframes[k]) {
         hash.update(keyframe.image.time.nanos().to_le_bytes());
         if let Some(pose) = &keyframe.world_from_camera {
             pose.matrix().iter().for_each(|v| hash.update(v.to_le_bytes()));

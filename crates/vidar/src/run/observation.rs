@@ -1,23 +1,23 @@
-//! What the odometry knows of a chunk's frames, in the aligner's terms.
+//! What the odometry knows of a chunk's frames and how they look, in the aligner's terms.
 
 use super::plan::{ChunkPlan, Plan};
+use crate::chunks::StoredChunk;
 use crate::keyframes::Keyframe;
 use nalgebra::Vector2;
+use rayon::prelude::*;
 use std::collections::BTreeMap;
 use vidar_align::aligner::covariance_in_camera;
+use vidar_align::place_recognition::describe_image;
 use vidar_align::{ChunkObservation, FrameObservation, MetricAnchor};
 use vidar_core::{
-    CameraModel, FrameId, GeometryPrediction, KeyframeId, LieGroup, OdometryKeyframe, Pinhole,
-    PoseCovariance, Se3, SparseLandmark,
+    CameraModel, FrameId, Image, KeyframeId, LieGroup, OdometryKeyframe, Pinhole, PoseCovariance, Se3,
+    SparseLandmark,
 };
 
 /// A chunk's prediction with poses, covariances, gravity and landmarks of its frames.
-pub fn of(
-    plan: &Plan,
-    known: &Known<'_>,
-    chunk: &ChunkPlan,
-    prediction: GeometryPrediction,
-) -> ChunkObservation {
+pub fn of(plan: &Plan, known: &Known<'_>, chunk: &ChunkPlan, stored: StoredChunk) -> ChunkObservation {
+    let StoredChunk { prediction, colors, .. } = stored;
+    let looks: Vec<Vec<f32>> = colors.par_iter().map(|c| describe_image(&gray(c))).collect();
     let frames = chunk
         .seen
         .clone()
@@ -25,10 +25,17 @@ pub fn of(
             let keyframe = &plan.keyframes[k];
             let size =
                 prediction.views.iter().find(|v| v.frame_id == keyframe.image.frame_id).map(|v| v.intrinsics);
-            known.frame(plan, k, keyframe, size)
+            let mut frame = known.frame(plan, k, keyframe, size);
+            let view = prediction.views.iter().position(|v| v.frame_id == frame.frame_id);
+            frame.descriptor = view.and_then(|v| looks.get(v)).filter(|d| !d.is_empty()).cloned();
+            frame
         })
         .collect();
     ChunkObservation { prediction, frames }
+}
+
+fn gray(color: &Image<[u8; 3]>) -> Image<f32> {
+    color.map(|[r, g, b]| 0.299 * f32::from(*r) + 0.587 * f32::from(*g) + 0.114 * f32::from(*b))
 }
 
 /// The odometry's keyframes by frame, where poses are its.

@@ -80,6 +80,11 @@ impl Source {
         !matches!(self, Self::Stereo(_))
     }
 
+    /// Whether it answers to any set of views, also to both ends of a loop together.
+    pub fn sees_any_views(&self) -> bool {
+        matches!(self, Self::Network(_) | Self::Simulated(_))
+    }
+
     fn model(&mut self) -> &mut dyn GeometryModel {
         match self {
             Self::Stereo(model) => model,

@@ -52,7 +52,8 @@ impl<'a> ViewWindow<'a> {
         self.views = indices.into_iter().zip(views).collect();
     }
 
-    fn load(&self, index: usize) -> Result<ChunkView, Warning> {
+    /// Reads one keyframe, wherever it lies.
+    pub fn load(&self, index: usize) -> Result<ChunkView, Warning> {
         let keyframe = &self.keyframes[index];
         let place = || keyframe.image.path.display().to_string();
         let image = self
