@@ -84,3 +84,82 @@ fn the_same_input_gives_the_same_bits() {
         assert_eq!(once.views, again.views, "{mode}");
     }
 }
+
+/// A depth that leans across the image, as no similarity of a chunk can repair.
+fn lean(prediction: &mut vidar_core::GeometryPrediction) {
+    for view in &mut prediction.views {
+        let depth = view.depth.image().clone();
+        let leaning = vidar_core::Image::from_fn(WIDTH, HEIGHT, |x, y| {
+            let across = x as f32 / (WIDTH - 1) as f32 - 0.5;
+            depth[(x, y)] * (0.12 * across).exp()
+        });
+        view.depth = vidar_core::RelativeDepth::new(leaning);
+    }
+}
+
+#[test]
+fn landmarks_straighten_a_leaning_depth_and_tell_the_scale() {
+    let truth = laps(24, 0.6);
+    let mut noise = Noise::new(11);
+    let mut points = Noise::new(12);
+    let mut machine = Aligner::new(CouplingMode::Coupled, &AlignerConfig::default()).unwrap();
+    let mut predictions = Vec::new();
+    for (k, range) in chunk_ranges(24, 12, 4).unwrap().into_iter().enumerate() {
+        let mut prediction = predict(&truth, range.frames.clone(), k as u32, EXACT, &mut noise);
+        lean(&mut prediction);
+        predictions.push(prediction.clone());
+        let seen: Vec<_> =
+            range.frames.map(|i| (i, landmarks(&truth[i], i, 80, 0.02, 0.05, &mut points))).collect();
+        let of = |i: usize| seen.iter().find(|s| s.0 == i).map_or(Vec::new(), |s| s.1.clone());
+        machine.push(observe(prediction, Some(&truth), of)).unwrap();
+    }
+    let placement = machine.finish();
+    assert!(placement.views.iter().all(|v| v.field.is_some()));
+    let kept =
+        placement.views.len() - placement.guards.of(Guard::DepthFieldRefused).min(placement.views.len());
+    assert!(kept * 2 > placement.views.len(), "{kept} of {}", placement.views.len());
+    let (mut before, mut after, mut count) = (0.0, 0.0, 0.0);
+    for prediction in predictions {
+        let raw = prediction.clone();
+        for view in placement.aligned_views(prediction, &[]).unwrap() {
+            let place = placement.view(view.frame_id()).unwrap();
+            let exact = depth(&truth[view.frame_id().index()]);
+            let rough = raw.views.iter().find(|v| v.frame_id == view.frame_id()).unwrap();
+            for (k, z) in exact.data().iter().enumerate() {
+                let unit = rough.depth.image().data()[k] as f64 * place.metres_per_unit;
+                before += (unit / f64::from(*z)).ln().abs();
+                after += f64::from(view.depth().image().data()[k] / z).ln().abs();
+                count += 1.0;
+            }
+        }
+    }
+    assert!(after < 0.75 * before, "{} before, {} after", before / count, after / count);
+}
+
+#[test]
+fn what_is_kept_grows_by_a_few_kilobytes_per_view_and_no_more() {
+    let truth = laps(200, 3.0);
+    let mut noise = Noise::new(13);
+    let mut machine = Aligner::new(CouplingMode::Coupled, &AlignerConfig::default()).unwrap();
+    let mut sizes = Vec::new();
+    for (k, range) in chunk_ranges(200, 12, 4).unwrap().into_iter().enumerate() {
+        let prediction = predict(&truth, range.frames, k as u32, REAL, &mut noise);
+        machine.push(observe(prediction, Some(&truth), none)).unwrap();
+        sizes.push(machine.memory_bytes());
+    }
+    let growth = (sizes[sizes.len() - 1] - sizes[1]) as f64 / ((sizes.len() - 2) * 12) as f64;
+    assert!(growth < 6000.0, "{growth} bytes per view");
+}
+
+#[test]
+fn settings_out_of_range_are_named_and_modes_have_their_words() {
+    let mut config = AlignerConfig::default();
+    config.validate().unwrap();
+    config.loops.top_k = 0;
+    let error = Aligner::new(CouplingMode::Coupled, &config).unwrap_err();
+    assert_eq!(error.to_string(), "align.loops.top_k must be between 1 and 20, found 0");
+    for mode in CouplingMode::ALL {
+        let word = serde_json::to_string(&mode).unwrap();
+        assert_eq!(word, format!("\"{mode}\""));
+    }
+}

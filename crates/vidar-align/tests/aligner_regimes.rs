@@ -13,7 +13,7 @@ use vidar_align::streaming::chunk_ranges;
 use vidar_align::{Aligner, AlignerConfig, CouplingMode, Placement};
 use vidar_core::{GeometryPrediction, LieGroup, Se3, Sim3, So3, umeyama_se3};
 
-const FRAMES: usize = 144;
+const FRAMES: usize = 120;
 
 /// A descriptor that knows a place and a heading: random Fourier features of both.
 fn descriptor(pose: &Se3) -> Vec<f32> {

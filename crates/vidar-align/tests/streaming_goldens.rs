@@ -399,6 +399,86 @@ fn a_whole_run_ends_in_the_same_poses() {
 }
 
 #[test]
+fn gross_errors_on_one_side_leave_the_robust_scale_within_a_fifth_of_a_percent() {
+    for (name, reference_error) in [("outlier20", -0.035), ("big", -0.016)] {
+        let Some(golden) = Golden::open(&format!("align_{name}")) else { return };
+        let (target, source) = (point_map(&golden, "1"), point_map(&golden, "2"));
+        let truth = golden.get("gt_s")[0];
+        let config = IrlsConfig { compat: Compat::Reference, ..Default::default() };
+        let theirs = align_overlap(&target, &source, AlignMethod::Sim3, 1.0, &config).unwrap();
+        let error = theirs.target_from_source.scale / truth - 1.0;
+        assert!((error - reference_error).abs() < 2e-3, "{name}: the reference is {error} off");
+        let mut pairs = vidar_align::overlap::PointPairs::default();
+        let shared = target.points.len().min(source.points.len());
+        let tau = 0.1;
+        for i in 0..shared {
+            let (y, x) = (target.points[i], source.points[i]);
+            let (a, b) = (target.confidence[i], source.confidence[i]);
+            let usable = a > tau && b > tau && y.iter().chain(x.iter()).all(|v| v.is_finite());
+            if usable {
+                // The recording holds points only; their distance stands for their depth.
+                pairs.push(x, y, x.norm(), y.norm(), f64::from((a * b).sqrt()));
+            }
+        }
+        let ours = vidar_align::overlap::fit_overlap(&pairs, &Default::default()).unwrap();
+        let error = ours.target_from_source.scale / truth - 1.0;
+        assert!(error.abs() < 2e-3, "{name}: {error}");
+        assert!(error.abs() < 0.25 * reference_error.abs());
+    }
+}
+
+/// A chunk of the end-to-end recording as a prediction.
+fn recorded_chunk(golden: &Golden, k: usize, first_frame: usize) -> vidar_core::GeometryPrediction {
+    let stem = format!("chunk{k}");
+    let (width, height) = (28, 14);
+    let n = width * height;
+    let (depth, confidence) = (golden.f32(&format!("{stem}.depth")), golden.f32(&format!("{stem}.conf")));
+    let image = |values: &[f32]| vidar_core::Image::from_vec(width, height, values.to_vec()).unwrap();
+    let views =
+        cameras(golden, &stem, width, height).into_iter().enumerate().map(|(f, (intrinsics, pose))| {
+            // The network's confidence less 1, 0 or more, as the probability that the geometry model makes of it.
+            let odds = &confidence[f * n..(f + 1) * n];
+            let probability: Vec<f32> = odds.iter().map(|c| c / (1.0 + c)).collect();
+            vidar_core::ViewGeometry {
+                frame_id: vidar_core::FrameId((first_frame + f) as u32),
+                chunk_from_camera: pose,
+                intrinsics,
+                depth: vidar_core::RelativeDepth::new(image(&depth[f * n..(f + 1) * n])),
+                confidence: vidar_core::Confidence::new(image(&probability)),
+            }
+        });
+    vidar_core::GeometryPrediction {
+        chunk_id: vidar_core::ChunkId(k as u32),
+        frame: vidar_core::model::ChunkFrame::ModelNative,
+        views: views.collect(),
+    }
+}
+
+#[test]
+fn the_machine_chains_the_recorded_run_as_the_official_code_does() {
+    let Some(input) = Golden::open("e2e_inputs") else { return };
+    let golden = Golden::open("e2e_sim3_numpy").unwrap();
+    let expected = accumulate(&golden.similarities("seq_before_"));
+    for (compat, tolerance) in [(Compat::Reference, 1e-4), (Compat::Off, 0.05)] {
+        let config = vidar_align::AlignerConfig { compat, ..Default::default() };
+        let mode = vidar_align::CouplingMode::Da3Streaming;
+        let mut machine = vidar_align::Aligner::new(mode, &config).unwrap();
+        let chunks = chunk_ranges(40, 12, 6).unwrap();
+        for (k, chunk) in chunks.iter().enumerate() {
+            let prediction = recorded_chunk(&input, k, chunk.frames.start);
+            machine.push(vidar_align::ChunkObservation { prediction, frames: Vec::new() }).unwrap();
+        }
+        let placement = machine.finish();
+        let found: Vec<Sim3> = placement.chunks.iter().skip(1).map(|c| c.world_from_chunk).collect();
+        all_within(&found, &expected, tolerance, "chain");
+        for view in &placement.views {
+            let owner = chunks.iter().position(|c| c.owned.contains(&view.frame_id.index())).unwrap();
+            assert_eq!(view.owner.index(), owner, "frame {}", view.frame_id);
+        }
+    }
+}
+
+#[test]
 fn descriptors_of_salad_are_met() {
     let Some(golden) = Golden::open("salad_small") else { return };
     let perceptron = |name: &str, second: usize| Perceptron {

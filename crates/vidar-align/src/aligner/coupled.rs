@@ -48,6 +48,8 @@ pub(super) fn coupled(machine: &Aligner) -> World {
     let (index, start) = unknowns(machine, &places);
     let mut built = Built::default();
     built.odometry(machine, &index);
+    built.has_loops = judged.iter().any(|l| l.report.refusal.is_none())
+        || machine.chunks.iter().any(|c| !c.revisits.is_empty());
     built.chunks(machine, &index, &start);
     built.loops(machine, &index, &judged);
     let config = CoupledConfig {
@@ -159,6 +161,7 @@ struct Built {
     /// (judged loop, factor).
     loop_factors: Vec<(usize, usize)>,
     guards: Vec<Guard>,
+    has_loops: bool,
     /// Information on ln(scale) per chunk.
     scale_information: BTreeMap<usize, f64>,
 }
@@ -247,7 +250,9 @@ impl Built {
                 rotation_std_rad,
                 position_std_m,
                 kernel: ROBUST,
-                moves_keyframe: chunk.frame == ChunkFrame::ModelNative,
+                // A model that was given the poses repeats them and says nothing new, but a loop must reach keyframes
+                // through their chunks.
+                moves_keyframe: chunk.frame == ChunkFrame::ModelNative || self.has_loops,
             }));
         }
     }

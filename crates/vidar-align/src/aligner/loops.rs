@@ -181,7 +181,8 @@ impl Aligner {
 
     /// Learns how the places of the newest chunk look, and whether any was seen before.
     pub(super) fn learn_places(&mut self, frames: &[super::FrameObservation]) {
-        let Some(newest) = self.chunks.len().checked_sub(1) else { return };
+        // Where chunks are not tied to each other, a loop has nothing to close.
+        let Some(newest) = self.chunks.len().checked_sub(1).filter(|_| self.mode.chains()) else { return };
         let l = &self.config.loops;
         let has_travel = self.mode.uses_anchors();
         for frame in frames {

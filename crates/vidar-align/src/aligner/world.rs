@@ -56,6 +56,7 @@ fn hybrid(machine: &Aligner) -> World {
     let mut chunks: Vec<Option<Sim3>> = vec![None; links.len()];
     let mut guards = Vec::new();
     let mut is_metric = true;
+    let mut log_scale_std = vec![f64::INFINITY; links.len()];
     for root in &roots {
         let members = || (0..links.len()).filter_map(|k| Some((k, links[k].filter(|l| l.root == *root)?)));
         let mut centers: BTreeMap<FrameId, (Vector3<f64>, Vector3<f64>)> = BTreeMap::new();
@@ -80,9 +81,22 @@ fn hybrid(machine: &Aligner) -> World {
                 Sim3::IDENTITY
             }
         };
-        members().for_each(|(k, link)| chunks[k] = Some(onto * link.root_from_chunk));
+        let std = spread(&onto, &chained, &anchored);
+        members().for_each(|(k, link)| {
+            chunks[k] = Some(onto * link.root_from_chunk);
+            log_scale_std[k] = std;
+        });
     }
-    World { guards, loops: reports(judged), ..World::of(machine, chunks, is_metric) }
+    World { guards, log_scale_std, loops: reports(judged), ..World::of(machine, chunks, is_metric) }
+}
+
+/// Standard deviation of ln(scale) of a similarity over correlated centres: its residual over their radius.
+fn spread(onto: &Sim3, chained: &[Vector3<f64>], anchored: &[Vector3<f64>]) -> f64 {
+    let n = anchored.len().max(1) as f64;
+    let mean = anchored.iter().sum::<Vector3<f64>>() / n;
+    let radius: f64 = anchored.iter().map(|a| (a - mean).norm_squared()).sum();
+    let residual: f64 = chained.iter().zip(anchored).map(|(c, a)| (onto.act(c) - a).norm_squared()).sum();
+    (residual / radius).sqrt()
 }
 
 /// Each chunk where its anchors put it; poses are the anchors' own.
