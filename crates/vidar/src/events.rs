@@ -52,6 +52,15 @@ pub enum Event {
         /// The judgement.
         verdict: vidar_align::Verdict,
     },
+    /// The map so far was written (`output.live_map`); the path is relative to the run folder.
+    MapGrew {
+        /// Where.
+        path: String,
+        /// How large, bytes.
+        bytes: u64,
+        /// Triangles in it.
+        triangles: usize,
+    },
     /// A file was written; the path is relative to the run folder.
     ArtifactWritten {
         /// Where.

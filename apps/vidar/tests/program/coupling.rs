@@ -249,6 +249,55 @@ fn a_killed_run_goes_on_and_ends_with_the_same_bits() {
 }
 
 #[test]
+fn the_map_grows_while_chunks_come_and_ends_as_it_would_have() {
+    let (ran, plain) = simulated("not watched", &["--mode", "coupled"]);
+    assert!([0, 3].contains(&ran.code), "{}", ran.stderr);
+    let (ran, watched) = simulated("watched", &["--mode", "coupled", "--set", "output.live_map=true"]);
+    assert!([0, 3].contains(&ran.code), "{}", ran.stderr);
+    let log = std::fs::read_to_string(watched.join("log.jsonl")).unwrap();
+    let grown: Vec<u64> = log
+        .lines()
+        .filter_map(|l| serde_json::from_str::<Value>(l).ok())
+        .filter(|e| e["event"] == "map-grew")
+        .map(|e| e["triangles"].as_u64().unwrap())
+        .collect();
+    assert!(grown.len() >= 3 && grown[0] > 1000 && grown.last() > grown.first(), "{grown:?}");
+    assert!(surface(&plain) == surface(&watched));
+    assert!(!watched.join("map/so_far.ply").exists() && !watched.join("volumes").exists());
+}
+
+#[test]
+fn a_revisit_is_found_judged_and_told() {
+    // More than one lap round a room: the last keyframes see what the first ones saw.
+    let sequence = shared().root.join("round and round");
+    let world = shared().root.join("back.toml");
+    let settings = "flight = \"orbit\"\nduration_secs = 24.0\ncamera_rate_hz = 3.0\nwidth = 160\nheight = 104\n\
+        blur_samples = 1\nexposure_secs = 0.0\ndepth = false\nscan_spacing_m = 0.1\n";
+    std::fs::write(&world, settings).unwrap();
+    let (sequence_arg, world_arg) = (sequence.to_str().unwrap(), world.to_str().unwrap());
+    crate::support::vidar(&["synth", sequence_arg, "--world-config", world_arg, "-q"]).ends_with(0);
+    let mut found = Vec::new();
+    for more in
+        [&["--set", "coupling.loop_chunks=true"][..], &[], &["--set", "align.loops.min_similarity=1.0"]]
+    {
+        let out = out(&format!("loops {}", found.len()));
+        let settings = [&SHORT[..], more, &["--set", "align.loops.min_similarity=0.7"]].concat();
+        let settings = if more.len() == 2 && more[1].contains("similarity") {
+            [&SHORT[..], more].concat()
+        } else {
+            settings
+        };
+        let ran = run_on(&sequence, &out, &settings);
+        assert!([0, 3].contains(&ran.code), "{}", ran.stderr);
+        let loops = manifest(&out)["result"]["placement"]["loops"].as_array().unwrap().clone();
+        let believed = loops.iter().filter(|l| l["refused"].is_null()).count();
+        found.push((loops.len(), believed));
+    }
+    assert!(found[0].1 > 0, "a loop chunk ties the two visits: {found:?}");
+    assert_eq!(found[2], (0, 0), "nothing looks exactly alike: {found:?}");
+}
+
+#[test]
 fn poses_are_not_needed_where_no_metres_are_asked_for() {
     let (ran, run) = simulated("unposed", &["--mode", "pose-free", "--set", "input.poses=external"]);
     assert!([0, 3].contains(&ran.code), "{}", ran.stderr);

@@ -139,6 +139,7 @@ const SETTINGS: &[(&str, &str, Beside)] = &[
 /// Settings that are shown to matter elsewhere, with the place.
 const ELSEWHERE: &[(&str, &str)] = &[
     ("input.camera", "there is one camera here; faults.rs asks for another"),
+    ("output.live_map", "it leaves nothing; coupling.rs watches it grow"),
     ("coupling.loop_chunks", "it needs a revisit; coupling.rs has one"),
     ("input.poses", "verbs.rs runs with another trajectory"),
     ("eval.trajectory.low_coverage_ratio", "it decides a warning; vidar-eval's tests"),

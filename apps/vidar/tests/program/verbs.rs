@@ -111,6 +111,7 @@ fn a_run_as_json_has_stable_keys() {
             "points",
             "coverage",
             "volume_bytes",
+            "double_walls",
             "metric_poses",
             "coupling",
             "is_metric",

@@ -202,6 +202,9 @@ pub struct OutputConfig {
     /// Keep what the geometry model said of each chunk in `chunks/`, for `--geometry recorded:RUN/chunks`. Otherwise it is
     /// removed when the run is done.
     pub keep_chunks: bool,
+    /// Write `map/so_far.ply` after every chunk, at provisional places, for whoever watches. Costs a fusion more; the final
+    /// map is the same.
+    pub live_map: bool,
 }
 
 impl Default for OutputConfig {
@@ -213,6 +216,7 @@ impl Default for OutputConfig {
             mesh_glb: true,
             report: true,
             keep_chunks: false,
+            live_map: false,
         }
     }
 }

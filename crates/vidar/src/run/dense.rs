@@ -1,6 +1,7 @@
 //! Keyframes into one metric surface, chunk after chunk.
 
 use super::MetricMap;
+use super::live::LiveMap;
 use super::observation::{self, Known};
 use super::placed::{color_at_size, placed_view};
 use super::plan::{ChunkPlan, Plan};
@@ -23,7 +24,7 @@ use vidar_core::{
     Warning,
 };
 use vidar_dataset::Dataset;
-use vidar_fusion::{PointFusion, TsdfVolume};
+use vidar_fusion::{DoubleWalls, PointFusion, TsdfVolume};
 
 /// Predicts every chunk, places them all, fuses them. Stops between chunks when cancelled and keeps what is there.
 pub fn build(
@@ -72,6 +73,8 @@ impl Road<'_> {
         let identity = identity(self.dataset, self.plan, self.config)?;
         let camera = self.dataset.rig.camera(self.dataset.camera);
         let known = Known::new(self.plan, camera.map_or(Se3::IDENTITY, |c| c.body_from_camera));
+        let live = self.config.output.live_map.then(|| LiveMap::new(self.config, self.folder));
+        let mut live = live.transpose()?;
         let mut failures: Vec<String> = Vec::new();
         for (k, chunk) in self.plan.chunks.iter().enumerate() {
             if self.cancel.is_cancelled() {
@@ -93,8 +96,16 @@ impl Road<'_> {
                 None => failures.extend(self.align(&mut aligner, &known, chunk, stored)?),
             }
             self.close_loops(&mut aligner, &mut source, &window, &identity)?;
+            if let Some(live) = &mut live {
+                let so_far = aligner.placement_so_far();
+                let views = aligned(&so_far, self.store.read(number(k))?)?;
+                live.grow(number(k), &views, &so_far, self.folder, self.events)?;
+            }
             let (done, total) = (chunk.seen.end, self.plan.keyframes.len());
             self.events.emit(&Event::Progress { stage: "depth", done, total });
+        }
+        if let Some(live) = &live {
+            live.clear(self.folder);
         }
         let placement = aligner.finish();
         if placement.views.is_empty() && !self.cancel.is_cancelled() {
@@ -337,6 +348,15 @@ impl Surface {
         map.mesh = self.volume.extract_mesh();
         map.coverage = self.volume.coverage(&map.mesh);
         map.volume_bytes = self.volume.peak_memory_bytes();
+        let voxel_m = self.volume.config().voxel_size_m;
+        // About two voxels: nearer ones are the roughness of one surface.
+        let walls = DoubleWalls {
+            nearest_m: 2.0 * voxel_m,
+            farthest_m: (12.0 * voxel_m).max(0.25),
+            beside_m: voxel_m,
+            ..DoubleWalls::default()
+        };
+        map.double_walls = walls.of_mesh(&map.mesh).ok();
         map.warnings = self.volume.warnings();
         map.warnings.extend(self.points.warnings());
         map.cloud = self.points.finish();

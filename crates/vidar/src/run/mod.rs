@@ -2,6 +2,7 @@
 
 mod dense;
 mod judge;
+mod live;
 mod observation;
 mod outputs;
 mod pictures;
@@ -28,7 +29,7 @@ use std::sync::Arc;
 use vidar_align::Placement;
 use vidar_core::{BodyFrame, PointCloud, StampedPose, Trajectory, TriangleMesh, Warning};
 use vidar_dataset::{Dataset, OpenOptions};
-use vidar_fusion::CoverageReport;
+use vidar_fusion::{CoverageReport, DoubleWallReport};
 
 /// What to run on, how, and where to.
 #[derive(Clone, Debug)]
@@ -93,6 +94,8 @@ pub struct MetricMap {
     pub views: Vec<StoredView>,
     /// Largest memory of the volume, bytes.
     pub volume_bytes: u64,
+    /// How much of the surface is there twice.
+    pub double_walls: Option<DoubleWallReport>,
     /// Depth against the depth sensor, where there is one.
     pub depth_scores: judge::DepthScorer,
     /// What the volume had to say.

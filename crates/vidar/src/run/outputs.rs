@@ -128,6 +128,7 @@ pub fn result_json(outcome: &RunOutcome) -> Value {
         "points": outcome.map.cloud.len(),
         "coverage": outcome.map.coverage,
         "volume_bytes": outcome.map.volume_bytes,
+        "double_walls": outcome.map.double_walls,
         "metric_poses": source_json(&outcome.plan),
         "coupling": outcome.plan.mode,
         "is_metric": outcome.plan.is_metric(),

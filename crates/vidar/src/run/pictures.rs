@@ -289,6 +289,10 @@ fn map_section(
             vec!["observed volume".into(), format!("{:.2} m³", c.observed_volume_m3)],
             vec!["views per surface voxel".into(), format!("{:.1}", c.mean_observations)],
             vec!["seen by three views or more".into(), format!("{:.1} %", c.share_seen_by_3_or_more * 100.0)],
+            vec![
+                "there twice (ghosts; real layers count too)".into(),
+                outcome.map.double_walls.map_or_else(|| "–".into(), |d| format!("{:.1} %", d.rate * 100.0)),
+            ],
         ],
     });
     Ok(section)
