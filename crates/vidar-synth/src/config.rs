@@ -17,6 +17,18 @@ pub enum SceneKind {
     Corridor,
 }
 
+/// How much places of one kind differ from seed to seed.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Variety {
+    /// Size, light and taste of the place are always the same; furniture, textures and pictures differ.
+    #[default]
+    Usual,
+    /// Size, light, materials and kinds of furniture differ as well, windows and lamps may shine, walls may be bare:
+    /// places to train networks on. Built-in flights shrink and grow with the place.
+    Wild,
+}
+
 /// Built-in flights; a trajectory file takes their place when one is given.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
@@ -51,6 +63,8 @@ pub struct SynthConfig {
     pub seed: u64,
     /// Which kind of place.
     pub scene: SceneKind,
+    /// How much places differ from seed to seed.
+    pub variety: Variety,
     /// Which built-in flight; unused when a trajectory is given.
     pub flight: FlightKind,
     /// Whether the body first sits still. Visual-inertial odometry needs either kind tested.
@@ -101,6 +115,7 @@ impl Default for SynthConfig {
         Self {
             seed: 1,
             scene: SceneKind::Room,
+            variety: Variety::Usual,
             flight: FlightKind::Sweep,
             start: Start::InFlight,
             duration_secs: 10.0,

@@ -24,7 +24,7 @@ mod sequence;
 mod simulation;
 mod world;
 
-pub use config::{FlightKind, SceneKind, Start, SynthConfig};
+pub use config::{FlightKind, SceneKind, Start, SynthConfig, Variety};
 pub use error::SynthError;
 pub use flight::{FlightPath, FlightState};
 pub use imu::{ImuRecord, simulate_imu};

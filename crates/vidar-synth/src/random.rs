@@ -8,6 +8,10 @@ use rand_chacha::ChaCha8Rng;
 pub(crate) enum Purpose {
     Furniture,
     Imu,
+    /// Size of a wild place.
+    Size,
+    /// Light of a wild place.
+    Light,
     Exposure,
     /// Sensor noise of one frame.
     Frame(usize),
@@ -32,6 +36,8 @@ pub(crate) fn stream(seed: u64, purpose: Purpose) -> ChaCha8Rng {
     let (kind, index) = match purpose {
         Purpose::Furniture => (1, 0),
         Purpose::Imu => (2, 0),
+        Purpose::Size => (12, 0),
+        Purpose::Light => (13, 0),
         Purpose::Exposure => (3, 0),
         Purpose::Frame(k) => (4, k as u64),
         Purpose::Scan(k) => (5, k as u64),

@@ -1,7 +1,7 @@
 //! Built-in flights: analytic courses through the scene.
 
 use super::smooth_step;
-use crate::config::{FlightKind, SceneKind, SynthConfig};
+use crate::config::{FlightKind, SceneKind, SynthConfig, Variety};
 use nalgebra::{Matrix3, Vector3};
 use std::f64::consts::PI;
 use vidar_core::{Se3, So3};
@@ -35,6 +35,13 @@ impl Course {
             (SceneKind::Corridor, FlightKind::Aggressive) => ([8.0, 0.3], 1.5),
             (SceneKind::Corridor, _) => ([11.0, 0.35], 1.5),
         };
+        // A wild place is smaller or larger than usual, and the flight with it.
+        let grown = crate::world::room_size(config).component_div(&crate::world::room_size(&SynthConfig {
+            variety: Variety::Usual,
+            ..config.clone()
+        }));
+        let half = [half[0] * grown.x, half[1] * grown.y];
+        let height_m = height_m * grown.z;
         let speed = match config.flight {
             FlightKind::Sweep => 0.9,
             FlightKind::Orbit => 1.1,
@@ -47,7 +54,8 @@ impl Course {
         // A figure of eight is longer than its ellipse.
         let stretch = if config.flight == FlightKind::Aggressive && !corridor { 1.6 } else { 1.0 };
         let rate = speed / (mean_radius * stretch);
-        let height_swing_m = if config.scene == SceneKind::Hall { 0.5 } else { 0.3 };
+        let usual_swing_m = if config.scene == SceneKind::Hall { 0.5 } else { 0.3 };
+        let height_swing_m = usual_swing_m * grown.z.min(1.0);
         Self { kind: config.flight, corridor, half, height_m, height_swing_m, rate, phase }
     }
 

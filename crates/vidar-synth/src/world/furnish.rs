@@ -2,7 +2,8 @@
 
 use super::material::{Decal, Kind, Material, Surface};
 use super::shape::{Extent, Shape};
-use crate::config::{SceneKind, SynthConfig};
+use super::wild;
+use crate::config::{SceneKind, SynthConfig, Variety};
 use crate::random::{Purpose, stream};
 use nalgebra::{Rotation3, Vector3};
 use rand::Rng;
@@ -31,13 +32,21 @@ pub(super) struct Furnished {
 /// Furnishes `room` for `config`, keeping clear of the flight's `positions`.
 pub(super) fn furnish(config: &SynthConfig, room: &Extent, positions: &[Vector3<f64>]) -> Furnished {
     let mut rng = stream(config.seed, Purpose::Furniture);
-    let shell = shell_surfaces(config.scene, room, &mut rng);
+    let wild = config.variety == Variety::Wild;
+    let shell = if wild { wild::shell(room, &mut rng) } else { shell_surfaces(config.scene, room, &mut rng) };
     let mut space = Space { room: *room, positions, taken: Vec::new() };
     let mut pieces = Vec::new();
     for _ in 0..group_count(config, room) {
-        let kind = Group::random(config.scene, &mut rng);
+        // Wild places hold what any usual place holds, and more.
+        let scene =
+            if wild { [SceneKind::Room, SceneKind::Hall][rng.random_range(0..2)] } else { config.scene };
+        let own = wild && rng.random::<f64>() < 0.35;
+        let kind = Group::random(scene, &mut rng);
         for _ in 0..ATTEMPTS {
-            let group = kind.build(room, &mut rng);
+            let mut group = if own { wild::furniture(room, &mut rng) } else { kind.build(room, &mut rng) };
+            if wild {
+                wild::restyle(&mut group, &mut rng);
+            }
             if space.take(&group) {
                 pieces.extend(group);
                 break;
@@ -191,38 +200,38 @@ impl Group {
     }
 }
 
-fn between(rng: &mut ChaCha8Rng, low: f64, high: f64) -> f64 {
+pub(super) fn between(rng: &mut ChaCha8Rng, low: f64, high: f64) -> f64 {
     low + (high - low) * rng.random::<f64>()
 }
 
-fn material(kind: Kind, tone: f64, rng: &mut ChaCha8Rng) -> Material {
+pub(super) fn material(kind: Kind, tone: f64, rng: &mut ChaCha8Rng) -> Material {
     Material { kind, seed: rng.random(), tone: (tone + between(rng, -0.08, 0.08)) as f32 }
 }
 
-fn plain(material: Material) -> Surface {
+pub(super) fn plain(material: Material) -> Surface {
     Surface { base: material, decals: Vec::new() }
 }
 
-fn piece(shape: Shape, kind: Kind, tone: f64, rng: &mut ChaCha8Rng) -> Piece {
+pub(super) fn piece(shape: Shape, kind: Kind, tone: f64, rng: &mut ChaCha8Rng) -> Piece {
     Piece { shape, surface: plain(material(kind, tone, rng)) }
 }
 
 /// A random place on the floor, `margin` from the walls.
-fn on_floor(room: &Extent, margin: f64, rng: &mut ChaCha8Rng) -> Vector3<f64> {
+pub(super) fn on_floor(room: &Extent, margin: f64, rng: &mut ChaCha8Rng) -> Vector3<f64> {
     let axis = |k: usize, rng: &mut ChaCha8Rng| between(rng, room.min[k] + margin, room.max[k] - margin);
     Vector3::new(axis(0, rng), axis(1, rng), room.min.z)
 }
 
 /// A wall's own frame: a point on it at floor height, the direction along it and into the room.
-struct WallPlace {
-    foot: Vector3<f64>,
+pub(super) struct WallPlace {
+    pub foot: Vector3<f64>,
     along: Vector3<f64>,
-    inward: Vector3<f64>,
+    pub inward: Vector3<f64>,
 }
 
 impl WallPlace {
     /// A random place on a random wall with `half_width` of wall on both sides; long walls are chosen more often.
-    fn random(room: &Extent, half_width: f64, rng: &mut ChaCha8Rng) -> Self {
+    pub(super) fn random(room: &Extent, half_width: f64, rng: &mut ChaCha8Rng) -> Self {
         let size = room.max - room.min;
         let on_long_y = rng.random::<f64>() * (size.x + size.y) < size.x;
         let (axis, across) = if on_long_y { (0, 1) } else { (1, 0) };
@@ -239,7 +248,7 @@ impl WallPlace {
     }
 
     /// A block `offset` along the wall, its back `gap` from the wall and its foot `height` above the floor.
-    fn block(&self, offset: f64, gap: f64, height: f64, size: [f64; 3]) -> Shape {
+    pub(super) fn block(&self, offset: f64, gap: f64, height: f64, size: [f64; 3]) -> Shape {
         let [width, depth, tall] = size;
         let foot =
             self.foot + self.along * offset + self.inward * (gap + 0.5 * depth) + Vector3::z() * height;
@@ -433,7 +442,8 @@ fn picture(room: &Extent, rng: &mut ChaCha8Rng) -> Vec<Piece> {
     let kind = if rng.random::<f64>() < 0.7 { Kind::Poster } else { Kind::Board };
     let base = material(kind, 0.5, rng);
     let shape = wall.block(0.0, 0.0, z, [width, between(rng, 0.02, 0.06), tall]);
-    let framed = Decal { corner: [0.0; 2], size: [width as f32, tall as f32], material: base, frame: 0.03 };
+    let framed =
+        Decal { corner: [0.0; 2], size: [width as f32, tall as f32], material: base, frame: 0.03, glow: 0.0 };
     vec![Piece { shape, surface: Surface { base, decals: vec![framed] } }]
 }
 
@@ -509,7 +519,7 @@ fn wall_decals(size: [f64; 2], bare: bool, rng: &mut ChaCha8Rng) -> Vec<Decal> {
         for _ in 0..12 {
             let left = between(rng, 0.05, size[0] - w - 0.05);
             let corner = [left as f32, bottom as f32];
-            let decal = Decal { corner, size: [w as f32, h as f32], material, frame };
+            let decal = Decal { corner, size: [w as f32, h as f32], material, frame, glow: 0.0 };
             let free = |d: &Decal| {
                 (0..2).any(|k| d.corner[k] > corner[k] + decal.size[k] || corner[k] > d.corner[k] + d.size[k])
             };

@@ -27,17 +27,39 @@ pub(super) struct Lamp {
     pub power: f64,
 }
 
-/// A grid of lamps under the ceiling, of slightly different power.
-pub(super) fn lamps(room: &Extent, seed: u32) -> Vec<Lamp> {
+/// How a place is lit.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Lighting {
+    /// Distance between lamps, m.
+    pub spacing_m: f64,
+    /// Power of the weakest lamp, and what the strongest one has more, per square metre of height.
+    pub least_power: f64,
+    pub power_range: f64,
+    /// Lamps hang this far below the ceiling, m.
+    pub drop_m: f64,
+    /// Light from everywhere.
+    pub ambient: f64,
+    /// Factor on the exposure.
+    pub gain: f32,
+}
+
+impl Lighting {
+    pub const USUAL: Self =
+        Self { spacing_m: 4.5, least_power: 0.12, power_range: 0.1, drop_m: 0.25, ambient: 0.22, gain: 1.0 };
+}
+
+/// A grid of lamps under the ceiling, of different power.
+pub(super) fn lamps(room: &Extent, lighting: &Lighting, seed: u32) -> Vec<Lamp> {
     let size = room.max - room.min;
-    let [nx, ny] = [size.x, size.y].map(|s| (s / 4.5).round().clamp(1.0, 8.0) as i32);
+    let [nx, ny] = [size.x, size.y].map(|s| (s / lighting.spacing_m).round().clamp(1.0, 8.0) as i32);
     let mut lamps = Vec::new();
     for i in 0..nx {
         for j in 0..ny {
             let x = room.min.x + size.x * (f64::from(i) + 0.5) / f64::from(nx);
             let y = room.min.y + size.y * (f64::from(j) + 0.5) / f64::from(ny);
-            let power = size.z * size.z * (0.12 + 0.1 * f64::from(cell(i, j, seed)));
-            lamps.push(Lamp { position: Vector3::new(x, y, room.max.z - 0.25), power });
+            let power =
+                size.z * size.z * (lighting.least_power + lighting.power_range * f64::from(cell(i, j, seed)));
+            lamps.push(Lamp { position: Vector3::new(x, y, room.max.z - lighting.drop_m), power });
         }
     }
     lamps
@@ -109,6 +131,8 @@ pub(super) struct Scene<'a> {
     pub shapes: &'a [Shape],
     pub bvh: &'a Bvh,
     pub lamps: &'a [Lamp],
+    /// Light from everywhere.
+    pub ambient: f64,
 }
 
 impl Scene<'_> {
@@ -134,7 +158,7 @@ impl Scene<'_> {
             open += hit.map_or(1.0, |t| (t / AMBIENT_REACH_M).sqrt());
         }
         // Light from above is stronger than light that the floor throws back.
-        let ambient = 0.22 * (1.0 + 0.25 * normal.z) * (0.25 + 0.75 * open / f64::from(AMBIENT_RAYS));
+        let ambient = self.ambient * (1.0 + 0.25 * normal.z) * (0.25 + 0.75 * open / f64::from(AMBIENT_RAYS));
         (direct + ambient) as f32
     }
 

@@ -40,6 +40,8 @@ pub(super) struct Decal {
     pub material: Material,
     /// Width of the frame, m; 0 for none.
     pub frame: f32,
+    /// Light of its own, as a factor on its albedo: 0 for none, 1 about as bright as lit by the room.
+    pub glow: f32,
 }
 
 /// A face's material with everything on it; later decals cover earlier ones.
@@ -67,6 +69,15 @@ impl Surface {
             }
         }
         self.base.albedo(u, v, size, texel)
+    }
+
+    /// Light of its own at `(u, v)`, as a factor on the albedo.
+    pub(super) fn glow(&self, u: f32, v: f32) -> f32 {
+        let inside = |d: &&Decal| {
+            let (x, y) = (u - d.corner[0], v - d.corner[1]);
+            x >= d.frame && y >= d.frame && x < d.size[0] - d.frame && y < d.size[1] - d.frame
+        };
+        self.decals.iter().rev().find(inside).map_or(0.0, |d| d.glow)
     }
 }
 

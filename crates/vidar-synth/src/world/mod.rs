@@ -8,17 +8,19 @@ mod noise;
 mod shape;
 mod texture;
 mod tile;
+mod wild;
 
 pub use shape::Extent;
 pub(crate) use shape::Shape;
 pub(crate) use tile::{TileBounds, TileHits};
+pub(crate) use wild::room_size;
 
 use crate::config::{SceneKind, SynthConfig};
 use crate::error::SynthError;
 use crate::flight::FlightPath;
 use crate::rig::euroc_camera;
 use bvh::Bvh;
-use light::LightMap;
+use light::{LightMap, Lighting};
 use material::Surface;
 use nalgebra::Vector3;
 use rayon::prelude::*;
@@ -66,7 +68,7 @@ impl World {
     /// A key outside its domain; a flight wider than 500 m, for which no room is built.
     pub fn build(config: &SynthConfig, flight: &FlightPath) -> Result<Self, SynthError> {
         config.validate()?;
-        let room = room_around(config.scene, &flight.extent())?;
+        let room = room_around(config, &flight.extent())?;
         let furnished = furnish::furnish(config, &room, &flight.positions(0.02));
         let mut shapes = vec![Shape::Shell { min: room.min, max: room.max }];
         let mut surfaces = furnished.shell;
@@ -75,10 +77,17 @@ impl World {
             shapes.push(piece.shape);
         }
         let focal = euroc_camera(config.width, config.height)?.intrinsics().fx;
-        Ok(Self::bake(shapes, &surfaces, SHARP_DISTANCE_M / focal, config.seed as u32))
+        let lighting = wild::lighting(config);
+        Ok(Self::bake(shapes, &surfaces, SHARP_DISTANCE_M / focal, &lighting, config.seed as u32))
     }
 
-    fn bake(shapes: Vec<Shape>, surfaces: &[Surface], wanted_texel_m: f64, seed: u32) -> Self {
+    fn bake(
+        shapes: Vec<Shape>,
+        surfaces: &[Surface],
+        wanted_texel_m: f64,
+        lighting: &Lighting,
+        seed: u32,
+    ) -> Self {
         let bvh = Bvh::new(&shapes[1..]);
         let mut first_face = Vec::with_capacity(shapes.len());
         let mut faces = Vec::new();
@@ -88,11 +97,11 @@ impl World {
         }
         let area: f64 = faces.iter().map(|&(i, f)| shapes[i].face_size(f)).map(|[u, v]| u * v).sum();
         let texel_m = wanted_texel_m.max((area / TEXEL_BUDGET).sqrt());
-        let lamps = light::lamps(&room_of(&shapes), seed);
-        let scene = light::Scene { shapes: &shapes, bvh: &bvh, lamps: &lamps };
+        let lamps = light::lamps(&room_of(&shapes), lighting, seed);
+        let scene = light::Scene { shapes: &shapes, bvh: &bvh, lamps: &lamps, ambient: lighting.ambient };
         let light: Vec<LightMap> =
             faces.par_iter().map(|&(i, f)| LightMap::new(&scene, i, f, texel_m)).collect();
-        let exposure = EXPOSURE / light::mean(&light[..shapes[0].face_count()]);
+        let exposure = lighting.gain * EXPOSURE / light::mean(&light[..shapes[0].face_count()]);
         let textures = faces
             .par_iter()
             .zip(&light)
@@ -177,24 +186,21 @@ fn paint(surface: &Surface, light: &LightMap, exposure: f32, size: [f64; 2], tex
     Texture::bake(size, texel_m, |v, us, out| {
         for (&u, texel) in us.iter().zip(out) {
             let albedo = surface.albedo(u as f32, v as f32, size32, texel_m as f32);
-            let radiance = 1.0 - (-exposure * albedo * light.at(u, v)).exp();
+            let own = surface.glow(u as f32, v as f32);
+            let radiance = 1.0 - (-exposure * albedo * light.at(u, v) - albedo * own).exp();
             *texel = (radiance.clamp(0.0, 1.0) * 65_535.0) as u16;
         }
     })
 }
 
 /// The room of its usual size, grown where the flight needs it.
-fn room_around(scene: SceneKind, flight: &Extent) -> Result<Extent, SynthError> {
+fn room_around(config: &SynthConfig, flight: &Extent) -> Result<Extent, SynthError> {
     let span = flight.max - flight.min;
     if !(span.max() <= 500.0) {
         let reason = format!("it spans {:.1} m, rooms are built up to 500 m", span.max());
         return Err(SynthError::BadTrajectory { reason });
     }
-    let usual = match scene {
-        SceneKind::Room => Vector3::new(8.0, 8.0, 4.0),
-        SceneKind::Hall => Vector3::new(20.0, 15.0, 7.0),
-        SceneKind::Corridor => Vector3::new(30.0, 3.0, 3.0),
-    };
+    let (scene, usual) = (config.scene, room_size(config));
     // A corridor runs along the longer side of the flight.
     let along_y = scene == SceneKind::Corridor && span.y > span.x;
     let usual = if along_y { Vector3::new(usual.y, usual.x, usual.z) } else { usual };
