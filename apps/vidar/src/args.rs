@@ -303,6 +303,9 @@ pub struct OdometryArgs {
     /// The camera alone, without its IMU: a trajectory up to scale.
     #[arg(long)]
     pub mono: bool,
+    /// Write tracks, residuals and states as tables (odometry/debug_tracks.csv, odometry/debug_states.csv).
+    #[arg(long)]
+    pub debug_dump: bool,
     /// How the input is read.
     #[command(flatten)]
     pub input: InputArgs,

@@ -1,6 +1,8 @@
 //! The metric trajectory of a recording from its own camera and IMU: `vidar odometry`.
 
+mod dump;
 mod files;
+mod report;
 
 use crate::config::{Config, Layered};
 use crate::error::{Error, ExitStatus};
@@ -28,6 +30,8 @@ pub struct OdometryRequest {
     pub place: Place,
     /// The command as typed, for the manifest.
     pub command: Vec<String>,
+    /// Whether tracks, residuals and states are written out as tables.
+    pub debug_dump: bool,
 }
 
 /// One image as the odometry left it.
@@ -100,7 +104,11 @@ pub fn odometry(
     let folder = RunFolder::create(&request.place)?;
     folder.write("config.resolved.toml", request.layered.to_toml(true).as_bytes())?;
     let total = dataset.images.len();
-    let tracked = events.stage("odometry", total, || track(&dataset, &config, events, cancel))?;
+    let mut dump = if request.debug_dump { Some(dump::Dump::create(&folder)?) } else { None };
+    let tracked =
+        events.stage("odometry", total, || track_into(&dataset, &config, events, cancel, dump.as_mut()))?;
+    let dumped = dump.is_some();
+    dump.map_or(Ok(()), dump::Dump::finish)?;
 
     let mut warnings = dataset.warnings.clone();
     warnings.extend(tracked.warnings());
@@ -124,7 +132,13 @@ pub fn odometry(
         warnings,
         seconds: clock.elapsed().as_secs_f64(),
     };
-    let artifacts = events.stage("write", 0, || files::write(&outcome, &folder, events))?;
+    let mut artifacts = events.stage("write", 0, || files::write(&outcome, &folder, events))?;
+    if dumped {
+        artifacts.extend([dump::TRACKS, dump::STATES].map(String::from));
+    }
+    let truth = dataset.ground_truth.as_ref().and_then(|t| t.in_frame(BodyFrame::Imu, &dataset.rig).ok());
+    let made = report::write(&outcome, truth.as_ref(), &dataset.name, &request.command, &folder)?;
+    artifacts.extend(made);
     folder.write_manifest(&manifest(request, &dataset, &outcome, started, artifacts)?)?;
     events.emit(&Event::Finished { exit: status as i32, seconds: outcome.seconds });
     Ok(outcome)
@@ -136,6 +150,16 @@ pub(crate) fn track(
     config: &Config,
     events: &Events,
     cancel: &CancelToken,
+) -> Result<Tracked, Error> {
+    track_into(dataset, config, events, cancel, None)
+}
+
+fn track_into(
+    dataset: &Dataset,
+    config: &Config,
+    events: &Events,
+    cancel: &CancelToken,
+    mut dump: Option<&mut dump::Dump>,
 ) -> Result<Tracked, Error> {
     let settings = &config.odometry;
     let mut odometry = Odometry::new(&dataset.rig, dataset.camera, settings)?;
@@ -162,6 +186,9 @@ pub(crate) fn track(
         let output = odometry.push(event)?;
         spent += clock.elapsed().as_secs_f64();
         if let Some(output) = output {
+            if let Some(dump) = &mut dump {
+                dump.add(&output, &odometry.tracks())?;
+            }
             tracked.keep(output, std::mem::take(&mut spent));
             let done = tracked.frames.len();
             events.emit(&Event::Progress { stage: "odometry", done, total });

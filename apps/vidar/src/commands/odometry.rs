@@ -18,6 +18,7 @@ pub fn odometry(args: &OdometryArgs, context: &Context) -> Outcome {
         layered,
         place: build::place(&args.output, &build::name_of(&args.path)),
         command: context.command.clone(),
+        debug_dump: args.debug_dump,
     };
     let outcome = vidar::odometry::odometry(&request, &progress::events(&context.cli), &context.cancel)?;
     if context.cli.json {

@@ -170,6 +170,7 @@ pub(super) fn odometry_row(
         layered,
         place: Place::Resumed { path: place.clone() },
         command: request.command.clone(),
+        debug_dump: false,
     };
     let mut row = OdometryRow { sequence: sequence.name.clone(), with_imu, folder, ..OdometryRow::default() };
     match odometry(&odometry_request, &Events::none(), cancel) {

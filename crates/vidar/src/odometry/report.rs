@@ -1,0 +1,184 @@
+//! `report.html` of `vidar odometry`: the path, and over time tracks, time per image, biases and standard deviations.
+
+use super::OdometryOutcome;
+use crate::error::{Error, ExitStatus};
+use crate::run_folder::RunFolder;
+use vidar_core::{StampedPose, Trajectory};
+use vidar_odometry::Tracking;
+use vidar_view::{
+    AxisSpec, Figure, FigureWidth, LinePlot, PictureSize, PlotTrajectory, Report, Section, Series,
+    SummaryItem, TrajectoryPlot, Verdict, VerdictLevel,
+};
+
+/// Columns and rows of the pictures.
+const PLOT_SIZE: (usize, usize) = (720, 320);
+const PATH_SIZE: (usize, usize) = (1100, 560);
+
+/// Writes the report and its pictures; names of the files made.
+pub(super) fn write(
+    outcome: &OdometryOutcome,
+    truth: Option<&Trajectory>,
+    title: &str,
+    command: &[String],
+    folder: &RunFolder,
+) -> Result<Vec<String>, Error> {
+    let mut made = Vec::new();
+    let mut figure = |name: &str, picture: vidar_view::Picture, caption: &str, width| {
+        let png = vidar_view::encode_png(&picture)?;
+        let path = format!("pictures/{name}.png");
+        folder.write(&path, &png)?;
+        made.push(path);
+        Ok::<_, Error>(Figure { png, caption: caption.to_owned(), alt: caption.to_owned(), width })
+    };
+    let mut path = Section { heading: "Path".into(), ..Section::default() };
+    if let Some(trajectory) = &outcome.trajectory {
+        let picture = path_picture(outcome, trajectory, truth);
+        let caption =
+            "Path of the body from above and from the side, aligned with ground truth where there is one";
+        path.figures.push(figure("odometry_path", picture, caption, FigureWidth::Full)?);
+    }
+    path.paragraphs.extend(outcome.tracked.lost.iter().map(|l| {
+        let at = vidar_core::Timestamp::from_nanos(l.from_ns);
+        format!("Lost at {at} s: {}.", l.reason)
+    }));
+    let mut time = Section { heading: "Over time".into(), ..Section::default() };
+    for (name, plot, caption) in plots(outcome) {
+        let picture = vidar_view::plot_lines(&plot, PictureSize::new(PLOT_SIZE.0, PLOT_SIZE.1));
+        time.figures.push(figure(name, picture, caption, FigureWidth::Half)?);
+    }
+    let summary = outcome.summary_lines().into_iter().map(|(label, value)| SummaryItem {
+        label: label.into(),
+        value,
+        explanation: String::new(),
+    });
+    let report = Report {
+        title: format!("VIDAR odometry: {title}"),
+        subtitle: unit(outcome).into(),
+        verdict: Some(verdict(outcome)),
+        summary: summary.collect(),
+        sections: vec![path, time],
+        warnings: outcome.warnings.clone(),
+        provenance: vec![("command".into(), command.join(" ")), ("version".into(), crate::VERSION.into())],
+    };
+    folder.write("report.html", vidar_view::render_html(&report).as_bytes())?;
+    made.push("report.html".into());
+    Ok(made)
+}
+
+fn unit(outcome: &OdometryOutcome) -> &'static str {
+    if outcome.tracked.is_metric { "lengths in metres" } else { "up to scale: lengths are not metres" }
+}
+
+fn verdict(outcome: &OdometryOutcome) -> Verdict {
+    let tracked = &outcome.tracked;
+    let (level, text) = match (outcome.status, &outcome.report) {
+        (ExitStatus::Interrupted, _) => {
+            (VerdictLevel::Bad, "interrupted: only a part was tracked".to_owned())
+        }
+        _ if outcome.trajectory.is_none() => {
+            let why = tracked.why_not_started().unwrap_or_else(|| "no images".into());
+            (VerdictLevel::Bad, format!("never started: {why}"))
+        }
+        (ExitStatus::Degraded, _) => {
+            (VerdictLevel::Caution, format!("lost {} times; segments cannot be compared", tracked.lost.len()))
+        }
+        (_, Some(report)) => {
+            let ate = report.ate_se3_m.map_or("-".into(), |e| format!("{:.4} m", e.rmse));
+            (VerdictLevel::Good, format!("tracked throughout; ATE SE(3) {ate} against ground truth"))
+        }
+        (_, None) => (VerdictLevel::Unjudged, "tracked throughout; no ground truth to judge it by".into()),
+    };
+    Verdict { level, text }
+}
+
+fn path_picture(
+    outcome: &OdometryOutcome,
+    trajectory: &Trajectory,
+    truth: Option<&Trajectory>,
+) -> vidar_view::Picture {
+    let plot = TrajectoryPlot { up: nalgebra::Vector3::z(), ..TrajectoryPlot::default() };
+    let size = PictureSize::new(PATH_SIZE.0, PATH_SIZE.1);
+    let record = outcome.report.as_ref().and_then(|r| match outcome.tracked.is_metric {
+        true => r.truth_from_estimate_se3,
+        false => r.truth_from_estimate_sim3,
+    });
+    let aligned = record.and_then(|r| moved(trajectory, &r));
+    let mut shown = vec![PlotTrajectory::estimate("odometry", aligned.as_ref().unwrap_or(trajectory))];
+    if let (Some(truth), true) = (truth, aligned.is_some()) {
+        shown.push(PlotTrajectory::ground_truth("ground truth", truth));
+    }
+    vidar_view::plot_trajectories(&shown, &plot, size)
+}
+
+/// The trajectory as `record` places it.
+fn moved(trajectory: &Trajectory, record: &vidar_eval::TransformRecord) -> Option<Trajectory> {
+    let rigid = vidar_eval::TransformRecord { scale: 1.0, ..*record }.to_se3()?;
+    let poses = trajectory.poses().iter().map(|p| {
+        let mut world_from_body = p.world_from_body;
+        world_from_body.translation *= record.scale;
+        StampedPose { world_from_body: rigid * world_from_body, ..*p }
+    });
+    Trajectory::new(trajectory.body(), poses.collect()).ok()
+}
+
+/// Name, plot and caption of every picture over time.
+fn plots(outcome: &OdometryOutcome) -> Vec<(&'static str, LinePlot, &'static str)> {
+    let frames = &outcome.tracked.frames;
+    let begin = frames.first().map_or(0, |f| f.output.time.nanos());
+    let secs = |ns: i64| (ns - begin) as f64 * 1e-9;
+    let over_time = |value: &dyn Fn(&Tracking) -> f64| -> Vec<[f64; 2]> {
+        let state = |f: &super::TrackedFrame| f.output.tracking().map_or(f64::NAN, value);
+        frames.iter().map(|f| [secs(f.output.time.nanos()), state(f)]).collect()
+    };
+    let line = |label: &str, value: &dyn Fn(&Tracking) -> f64| Series::line(label, over_time(value));
+    let sigma =
+        |t: &Tracking, at: usize| (0..3).map(|k| t.covariance[(at + k, at + k)]).sum::<f64>().max(0.0).sqrt();
+    let plot = |y: AxisSpec, series: Vec<Series>| LinePlot {
+        x: AxisSpec::new("time", "s"),
+        y,
+        series,
+        ..LinePlot::default()
+    };
+    let tracks = vec![
+        line("landmarks that fit", &|t| t.tracked as f64),
+        line("landmarks looked for", &|t| t.tracks.landmarks_tried as f64),
+        line("young tracks", &|t| t.tracks.young_found as f64),
+        line("contradicting", &|t| t.tracks.contradicting as f64),
+    ];
+    let millis = frames.iter().map(|f| [secs(f.output.time.nanos()), 1e3 * f.seconds]).collect();
+    let axes = ["x", "y", "z"];
+    let gyro = (0..3).map(|k| line(axes[k], &|t| t.state.gyro_bias[k])).collect();
+    let accel = (0..3).map(|k| line(axes[k], &|t| t.state.accel_bias[k])).collect();
+    let mut all = vec![
+        ("odometry_tracks", plot(AxisSpec::new("tracks", "").from_zero(), tracks), "Tracks in every image"),
+        (
+            "odometry_time",
+            plot(AxisSpec::new("time per image", "ms").from_zero(), vec![Series::dots("", millis)]),
+            "Wall time per image, decoding left out",
+        ),
+    ];
+    if outcome.tracked.is_metric {
+        all.extend([
+            ("odometry_gyro_bias", plot(AxisSpec::new("gyroscope bias", "rad/s"), gyro), "Gyroscope bias"),
+            (
+                "odometry_accel_bias",
+                plot(AxisSpec::new("accelerometer bias", "m/s²"), accel),
+                "Accelerometer bias",
+            ),
+            (
+                "odometry_scale",
+                plot(
+                    AxisSpec::new("σ of ln(scale)", "").from_zero(),
+                    vec![line("", &|t| if t.scale_std.is_finite() { t.scale_std } else { f64::NAN })],
+                ),
+                "Standard deviation of the logarithm of the scale",
+            ),
+            (
+                "odometry_sigma",
+                plot(AxisSpec::new("σ of position", "m").from_zero(), vec![line("", &|t| sigma(t, 3))]),
+                "Standard deviation of the position, relative to the start",
+            ),
+        ]);
+    }
+    all
+}
