@@ -8,12 +8,14 @@
 
 Both sides run the network's forward pass on the same number of pixels with the same number of threads; weights are made
 up on both sides (time does not depend on them). For each model and number of views every engine gets its own process;
-rounds go through the engines in turn, the first round is a warm-up. Reported are medians of process CPU seconds and of
-wall seconds, and the process's largest memory beyond what it had with weights loaded. The official code works its ray
-branch out and throws it away when it is not asked for; here it is skipped: the answers are the same.
+rounds go through the engines in turn, after warm-up rounds. Reported are medians of process CPU seconds and of wall
+seconds, and the process's largest memory beyond what it had with weights loaded. On a busy machine trust CPU seconds. The
+official code works its ray branch out and throws it away when it is not asked for; here it is skipped: the answers are
+the same. What a worker writes to standard error is shown when it ends early.
 
 Engines: torch-f32, torch-bf16 (autocast, which leaves the head in f32), torch-f32-avx2 (oneDNN, MKL and ATen held to AVX2);
-ours-f32, ours-f32-split, ours-bf16, ours-bf16-head32 (head in f32 like the official code), ours-f32-avx2.
+ours-default (precision `auto`), ours-f32, ours-f32-split, ours-bf16-head32 (the whole backbone in bf16 and the head in f32,
+like the official code), ours-bf16 (everything in bf16), ours-f32-avx2.
 """
 import argparse
 import json
@@ -22,17 +24,20 @@ import resource
 import statistics
 import subprocess
 import sys
+import tempfile
 import time
 
 AVX2 = {"ATEN_CPU_CAPABILITY": "avx2", "ONEDNN_MAX_CPU_ISA": "AVX2", "MKL_ENABLE_INSTRUCTIONS": "AVX2"}
 OURS = {
+    "ours-default": [],
     "ours-f32": ["--precision", "f32"],
     "ours-f32-split": ["--precision", "f32-split"],
-    "ours-bf16": ["--precision", "bf16"],
-    "ours-bf16-head32": ["--precision", "bf16", "--head-precision", "f32"],
+    "ours-bf16": ["--precision", "bf16", "--head-precision", "bf16", "--exact-blocks", "0"],
+    "ours-bf16-head32": ["--precision", "bf16", "--head-precision", "f32", "--exact-blocks", "0"],
     "ours-f32-avx2": ["--precision", "f32", "--isa", "avx2"],
 }
-DEFAULT = ["torch-f32", "torch-bf16", "ours-f32", "ours-bf16", "ours-bf16-head32"]
+DEFAULT = ["torch-f32", "torch-bf16", "ours-default", "ours-f32"]
+TORCH = ["torch-f32", "torch-bf16", "torch-f32-avx2"]
 
 
 def cpu_seconds():
@@ -79,29 +84,56 @@ def start(engine, model, views, size, arguments):
         env.update(AVX2 if engine.endswith("avx2") else {})
         worker = [model, views, rows, columns, precision, arguments.threads]
         command = [sys.executable, "-W", "ignore", __file__, "--worker", *map(str, worker)]
-    return subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True, env=env)
+    said = tempfile.TemporaryFile(mode="w+")
+    process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=said, text=True, env=env)
+    process.said = said
+    return process
 
 
-def ask(process):
-    process.stdin.write("\n")
-    process.stdin.flush()
-    line = process.stdout.readline()
-    if not line.startswith("{"):
-        raise SystemExit(f"a worker ended: {process.args} said {line!r}")
-    return json.loads(line)
+def ask(engine, process):
+    """One run of a worker; its last words when it has ended."""
+    try:
+        process.stdin.write("\n")
+        process.stdin.flush()
+        line = process.stdout.readline()
+    except BrokenPipeError:
+        line = ""
+    if line.startswith("{"):
+        return json.loads(line)
+    try:
+        status = process.wait(timeout=10)
+    except subprocess.TimeoutExpired:
+        status = None
+    process.said.seek(0)
+    words = process.said.read().strip().splitlines()[-15:]
+    why = "still runs" if status is None else f"was ended by signal {-status}" if status < 0 else f"ended with status {status}"
+    if status == -9:
+        why += " (often: the system was out of memory)"
+    command = " ".join(process.args)
+    raise SystemExit("\n".join([f"{engine}: the worker {why} and answered {line!r}; it was started as", f"  {command}",
+                                "and its last words on standard error were:", *(f"  {word}" for word in words or ["(none)"])]))
 
 
 def compare(model, views, size, arguments):
-    processes = {engine: start(engine, model, views, size, arguments) for engine in arguments.engines}
-    answers = {engine: [] for engine in processes}
-    for round_number in range(arguments.rounds + 1):
-        for engine, process in processes.items():
-            answer = ask(process)
-            if round_number > 0:
-                answers[engine].append(answer)
-    for process in processes.values():
-        process.stdin.close()
-        process.wait()
+    processes = {}
+    try:
+        processes.update((engine, start(engine, model, views, size, arguments)) for engine in arguments.engines)
+        answers = {engine: [] for engine in processes}
+        for round_number in range(arguments.warmups + arguments.rounds):
+            for engine, process in processes.items():
+                answer = ask(engine, process)
+                if round_number >= arguments.warmups:
+                    answers[engine].append(answer)
+    finally:
+        for process in processes.values():
+            try:
+                process.stdin.close()
+            except BrokenPipeError:
+                pass
+            try:
+                process.wait(timeout=30)
+            except subprocess.TimeoutExpired:
+                process.kill()
     rows = []
     for engine, runs in answers.items():
         middle = lambda key: statistics.median(run[key] for run in runs)
@@ -129,9 +161,16 @@ def main():
     parser.add_argument("--size", default="378x504", help="rows x columns, multiples of 14")
     parser.add_argument("--engines", nargs="+", default=DEFAULT)
     parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--warmups", type=int, default=1, help="rounds that are not counted, before the others")
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--out", help="where all numbers go, as JSON")
     arguments = parser.parse_args()
+    if unknown := [engine for engine in arguments.engines if engine not in OURS and engine not in TORCH]:
+        parser.error(f"unknown engines {unknown}; there are {[*TORCH, *OURS]}")
+    if arguments.rounds < 1 or arguments.warmups < 0:
+        parser.error("at least one round is needed")
+    if any(engine in OURS for engine in arguments.engines) and not os.access(arguments.ours, os.X_OK):
+        parser.error(f"{arguments.ours} is no program; build it first (see the head of this file)")
     size = [int(side) for side in arguments.size.split("x")]
     print("| model | views | engine | CPU s | wall s | torch f32 / this | torch bf16 / this | working MB | peak MB |")
     print("|---|---|---|---|---|---|---|---|---|")

@@ -15,8 +15,9 @@ pub enum Precision {
     #[default]
     F32,
     /// `f32`-like accuracy by the fastest way a kernel set has. Three bf16 products of split factors would be that way where
-    /// bf16 runs at more than three times the rate of `f32` (matrix tiles); vectors run it at twice the rate. So far every
-    /// kernel set computes it in `f32`.
+    /// bf16 runs at more than three times the rate of `f32`: on matrix tiles. Vectors do not get there (AVX-512-BF16 on
+    /// Zen 5: 1.7 times, `examples/rates.rs`), so three products would take 1.8 times as long as `f32` itself. So far every
+    /// kernel set computes it in `f32`, tiles included.
     F32Split,
     /// Factors rounded to bf16 where the processor multiplies bf16; elsewhere `f32`, which is then as fast.
     Bf16,

@@ -43,6 +43,9 @@ pub fn peak(c: &Compute) -> Option<f64> {
         (Isa::Avx512, false) => (|| unsafe { x86::sums_of_16() }, 24 * 32),
         #[cfg(target_arch = "x86_64")]
         (Isa::Avx2, _) => (|| unsafe { x86::sums_of_8() }, 12 * 16),
+        #[cfg(target_arch = "aarch64")]
+        // SAFETY: as above.
+        (Isa::Neon, _) => (|| unsafe { neon::sums_of_4() }, 24 * 8),
         _ => return None,
     };
     Some((flops * STEPS) as f64 / time(|| black_box(work)()).0)
@@ -79,6 +82,22 @@ mod x86 {
         let mut sums = [y; 12];
         for _ in 0..STEPS {
             sums.iter_mut().for_each(|s| *s = _mm256_fmadd_ps(*s, x, y));
+        }
+        black_box(sums);
+    }
+}
+
+#[cfg(target_arch = "aarch64")]
+mod neon {
+    use super::{STEPS, black_box};
+    use std::arch::aarch64::*;
+
+    #[target_feature(enable = "neon")]
+    pub fn sums_of_4() {
+        let (x, y) = black_box((vdupq_n_f32(0.999), vdupq_n_f32(1e-3)));
+        let mut sums = [y; 24];
+        for _ in 0..STEPS {
+            sums.iter_mut().for_each(|s| *s = vfmaq_f32(y, *s, x));
         }
         black_box(sums);
     }

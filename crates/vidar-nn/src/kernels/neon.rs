@@ -1,4 +1,13 @@
 //! NEON vectors of 64-bit ARM: four lanes, thirty-two registers.
+//!
+//! On another machine the tests run under an emulator (Debian: `qemu-user gcc-aarch64-linux-gnu libc6-dev-arm64-cross`):
+//!
+//! ```sh
+//! rustup target add aarch64-unknown-linux-gnu
+//! export CARGO_TARGET_AARCH64_UNKNOWN_LINUX_GNU_LINKER=aarch64-linux-gnu-gcc
+//! export CARGO_TARGET_AARCH64_UNKNOWN_LINUX_GNU_RUNNER="qemu-aarch64 -L /usr/aarch64-linux-gnu"
+//! cargo test -p vidar-nn --target aarch64-unknown-linux-gnu
+//! ```
 
 use std::arch::aarch64::*;
 
