@@ -238,6 +238,9 @@ pub struct RunArgs {
     /// Say what would be done, and stop.
     #[arg(long)]
     pub dry_run: bool,
+    /// Memory to plan for, such as 4GiB or 800MB; default: what the parts ask for.
+    #[arg(long, value_name = "SIZE", help_heading = "Model")]
+    pub memory_budget: Option<String>,
     /// Go on in the folder of -o where an interrupted run stopped; what is there and still holds is not computed again.
     #[arg(long, requires = "output", conflicts_with = "force", help_heading = "Output")]
     pub resume: bool,

@@ -54,7 +54,31 @@ pub fn apply_model_flags(layered: &mut Layered, args: &RunArgs) -> Result<(), Er
     if let Some(mode) = &args.mode {
         layered.value("coupling.mode", toml::Value::String(mode.clone()), Origin::Flag("--mode"))?;
     }
+    if let Some(size) = &args.memory_budget {
+        let bytes = toml::Value::Integer(byte_count(size)?);
+        layered.value("limits.memory_bytes", bytes, Origin::Flag("--memory-budget"))?;
+    }
     apply_source_flags(layered, args.geometry.as_deref(), args.model_dir.as_deref())
+}
+
+/// `4GiB`, `800MB`, `1.5G`, or bytes.
+fn byte_count(text: &str) -> Result<i64, Error> {
+    let wrong =
+        || usage(format!("--memory-budget {text:?} is no size"), "write 4GiB, 800MB or a number of bytes");
+    let split = text.find(|c: char| !(c.is_ascii_digit() || c == '.')).unwrap_or(text.len());
+    let number: f64 = text[..split].parse().map_err(|_| wrong())?;
+    let unit = match text[split..].trim().to_ascii_lowercase().as_str() {
+        "" | "b" => 1.0,
+        "k" | "kb" => 1e3,
+        "kib" => 1024.0,
+        "m" | "mb" => 1e6,
+        "mib" => 1_048_576.0,
+        "g" | "gb" => 1e9,
+        "gib" => 1_073_741_824.0,
+        _ => return Err(wrong()),
+    };
+    let bytes = number * unit;
+    if bytes.is_finite() && (1.0..1e15).contains(&bytes) { Ok(bytes as i64) } else { Err(wrong()) }
 }
 
 /// The flags that choose a source of geometry.

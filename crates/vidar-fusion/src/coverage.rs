@@ -105,7 +105,8 @@ impl TsdfVolume {
 pub fn surface_area_m2(mesh: &TriangleMesh) -> f64 {
     let point = |i: u32| nalgebra::Vector3::from(mesh.positions[i as usize].map(f64::from));
     let area = |&[a, b, c]: &[u32; 3]| 0.5 * (point(b) - point(a)).cross(&(point(c) - point(a))).norm();
-    mesh.triangles.iter().map(area).sum()
+    // A sum of nothing is −0.
+    mesh.triangles.iter().map(area).sum::<f64>() + 0.0
 }
 
 fn bounds(mesh: &TriangleMesh) -> Option<[[f32; 3]; 2]> {

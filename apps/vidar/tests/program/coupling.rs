@@ -308,3 +308,20 @@ fn poses_are_not_needed_where_no_metres_are_asked_for() {
     let (ran, _) = simulated("unposed hybrid", &["--mode", "hybrid", "--set", "input.poses=external"]);
     ran.ends_with(1).says(&["E0202"]);
 }
+
+#[test]
+fn a_memory_budget_is_planned_with_and_refused_when_nothing_fits() {
+    let plan = |size: &str| {
+        let more = ["--memory-budget", size, "--dry-run", "--json"];
+        let all: Vec<&str> = SHORT.iter().chain(&more).copied().collect();
+        run_on(&shared().sequence, &out("planned"), &all)
+    };
+    let json = plan("200MB").ends_with(0).json();
+    // (200 MB − 96 MiB − a chunk) · 2/5
+    let map = json["plan"]["memory_of_the_map"].as_str().unwrap();
+    assert!(map.contains("MiB") && !map.contains("2.00 GiB"), "{map}");
+    let json = plan("64GiB").ends_with(0).json();
+    assert_eq!(json["plan"]["memory_of_the_map"], "at most 2.00 GiB");
+    plan("100MB").ends_with(2).says(&["limits.memory_bytes", "chunk of", "lower geometry.chunk_keyframes"]);
+    plan("much").ends_with(2).says(&["--memory-budget", "4GiB"]);
+}

@@ -24,6 +24,8 @@ enum Beside {
     Simulated,
     /// No poses are known beforehand.
     Unposed,
+    /// Voxels are so small that the map is large.
+    Fine,
     /// Only turning makes a keyframe.
     Turning,
     /// Only moving makes a keyframe.
@@ -41,6 +43,7 @@ impl Beside {
                 "eval.surface.scale_bounds.max=1.0000001",
             ],
             Self::Pictures => &["output.mesh_glb=true"],
+            Self::Fine => &["fusion.voxel_size_m=0.01"],
             Self::Chunked => &["geometry.chunk_keyframes=3"],
             Self::Simulated => {
                 &["geometry.source=simulated", "geometry.chunk_keyframes=4", "geometry.overlap_keyframes=2"]
@@ -65,7 +68,9 @@ impl Beside {
     }
 }
 
-use Beside::{Chunked, Judged, Moving, Nothing, Odometry, Pictures, Refused, Simulated, Turning, Unposed};
+use Beside::{
+    Chunked, Fine, Judged, Moving, Nothing, Odometry, Pictures, Refused, Simulated, Turning, Unposed,
+};
 
 /// Ground truth at 10 Hz, 2 cm off on the way: a trajectory that must be interpolated and is worth judging.
 fn sparse_truth() -> String {
@@ -129,6 +134,7 @@ const SETTINGS: &[(&str, &str, Beside)] = &[
     ("keyframes.min_rotation_deg", "60.0", Turning),
     ("keyframes.min_translation_m", "1.0", Moving),
     ("output.keep_chunks", "true", Nothing),
+    ("limits.memory_bytes", "150000000", Fine),
     ("output.depth_png", "false", Nothing),
     ("output.depth_units_per_metre", "500.0", Nothing),
     ("output.images", "false", Nothing),
@@ -192,7 +198,8 @@ fn every_setting_of_the_dense_road_is_in_the_list() {
 
 #[test]
 fn every_setting_changes_what_a_run_leaves() {
-    let all = [Nothing, Judged, Refused, Pictures, Odometry, Chunked, Simulated, Unposed, Turning, Moving];
+    let all =
+        [Fine, Nothing, Judged, Refused, Pictures, Odometry, Chunked, Simulated, Unposed, Turning, Moving];
     let bases: BTreeMap<Beside, BTreeMap<String, Vec<u8>>> = all
         .into_iter()
         .map(|beside| (beside, run(&format!("base {beside:?}"), &beside.arguments())))

@@ -221,6 +221,15 @@ impl Default for OutputConfig {
     }
 }
 
+/// What a run may take.
+#[derive(Clone, Debug, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema)]
+#[serde(default, deny_unknown_fields)]
+pub struct LimitsConfig {
+    /// Memory (bytes) that a run plans for; 0 means what its parts ask for. What network and chunk leave of it is the map's: a
+    /// map that does not fit is cut, with a warning. Set it where other programs run beside.
+    pub memory_bytes: u64,
+}
+
 /// All of it.
 #[derive(Clone, Debug, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
@@ -247,6 +256,8 @@ pub struct Config {
     pub eval: EvalConfig,
     /// What is written.
     pub output: OutputConfig,
+    /// What a run may take.
+    pub limits: LimitsConfig,
 }
 
 impl Config {

@@ -24,7 +24,7 @@ use vidar_core::{
     Warning,
 };
 use vidar_dataset::Dataset;
-use vidar_fusion::{DoubleWalls, PointFusion, TsdfVolume};
+use vidar_fusion::{DoubleWalls, FusionConfig, PointFusion, TsdfVolume};
 
 /// Predicts every chunk, places them all, fuses them. Stops between chunks when cancelled and keeps what is there.
 pub fn build(
@@ -234,10 +234,9 @@ impl Road<'_> {
 
     /// Every placed chunk's own keyframes into one surface; depth and images are written as they go by.
     fn fuse(&self, placement: &Placement) -> Result<MetricMap, Error> {
-        let mut surface = Surface {
-            volume: TsdfVolume::new(&self.config.fusion)?,
-            points: PointFusion::new(&self.config.fusion)?,
-        };
+        let fusion =
+            FusionConfig { memory_budget_bytes: self.plan.volume_budget_bytes, ..self.config.fusion.clone() };
+        let mut surface = Surface { volume: TsdfVolume::new(&fusion)?, points: PointFusion::new(&fusion)? };
         let mut map = MetricMap::default();
         // Asked to stop while predicting, what was predicted is fused; asked to stop now, fusing stops.
         let was_cancelled = self.cancel.is_cancelled();

@@ -107,6 +107,7 @@ impl Plan {
         }
         let views_at_once = chosen.chunks.iter().map(|c| c.seen.len()).max().unwrap_or(0);
         let network = source.planned(config, &view, views_at_once, &mut warnings)?;
+        let volume_budget_bytes = map_budget(config, views_at_once, &view, network.as_ref())?;
         let plan = Self {
             started: crate::run_folder::now_rfc3339(),
             input: format!("{}: {} ({})", dataset.name, dataset.kind, dataset.reason),
@@ -122,7 +123,7 @@ impl Plan {
             network,
             reference: reference_source(dataset, config, reference),
             depth_units_per_metre: config.output.depth_units_per_metre,
-            volume_budget_bytes: config.fusion.memory_budget_bytes,
+            volume_budget_bytes,
             anchor,
             warnings,
         };
@@ -350,6 +351,46 @@ fn reference_source(dataset: &Dataset, config: &Config, given: Option<&Path>) ->
         _ => ReferenceSource::None,
     }
 }
+
+/// What the map may take: the fusion's own bound, or what `limits.memory_bytes` leaves beside network and chunk.
+fn map_budget(
+    config: &Config,
+    views: usize,
+    view: &Pinhole,
+    network: Option<&NetworkPlan>,
+) -> Result<u64, Error> {
+    let asked = config.fusion.memory_budget_bytes;
+    if config.limits.memory_bytes == 0 {
+        return Ok(asked);
+    }
+    // Images read and undistorted, depth and confidence as predicted, packed for the disk, and read back.
+    let chunk = (views * view.width * view.height) as u64 * CHUNK_BYTES_PER_PIXEL;
+    let network = network.map_or(0, |n| n.memory.total());
+    let taken = PROGRAM_BYTES + chunk + network;
+    // The surface is extracted, judged and written beside the volume: about as much again, and half.
+    let left = config.limits.memory_bytes.saturating_sub(taken) * 2 / 5;
+    if left < LEAST_MAP_BYTES {
+        return Err(Error::BadValue {
+            reason: format!(
+                "limits.memory_bytes is {}, but the program takes {}, a chunk of {views} views {}, the network {}, and a map \
+                 at least {}: lower geometry.chunk_keyframes or geometry.max_width_px, take a smaller network, or allow more",
+                bytes(config.limits.memory_bytes),
+                bytes(PROGRAM_BYTES),
+                bytes(chunk),
+                bytes(network),
+                bytes(LEAST_MAP_BYTES * 5 / 2),
+            ),
+        });
+    }
+    Ok(asked.min(left))
+}
+
+/// Code, tables, the odometry and the aligner's samples.
+const PROGRAM_BYTES: u64 = 96 << 20;
+/// Largest number of bytes that a pixel of a chunk takes at once.
+const CHUNK_BYTES_PER_PIXEL: u64 = 48;
+/// A map smaller than this is not worth a run.
+const LEAST_MAP_BYTES: u64 = 16 << 20;
 
 /// Upper bound: raw 16-bit depth and 24-bit colour per keyframe, every chunk's prediction (depth and confidence of
 /// 32 bits, colour), and the volume's share for map files.
