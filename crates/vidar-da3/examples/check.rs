@@ -1,4 +1,4 @@
-//! Checks a model against reference files: `check FILE... [--precision P] [--head-precision P] [--exact-blocks N] [--isa I] [--weights DIR]`.
+//! Checks a model against reference files: `check FILE... [--precision P] [--head-precision P] [--exact-blocks N] [--isa I] [--device cpu|gpu|gpu:N|auto] [--weights DIR]`.
 
 use std::path::PathBuf;
 use vidar_da3::{Da3Options, check};
@@ -13,6 +13,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
             "--precision" => options.precision = value()?.parse()?,
             "--head-precision" => options.head_precision = Some(value()?.parse()?),
             "--exact-blocks" => options.exact_blocks = Some(value()?.parse()?),
+            "--device" => options.device = value()?.parse()?,
             "--isa" => options.isa = Some(value()?.parse()?),
             "--weights" => weights = Some(PathBuf::from(value()?)),
             "--on-demand" => options.residency = vidar_da3::Residency::OnDemand,

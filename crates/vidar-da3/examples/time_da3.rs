@@ -47,6 +47,7 @@ fn arguments() -> Fallible<Arguments> {
             "--precision" => found.options.precision = value()?.parse()?,
             "--head-precision" => found.options.head_precision = Some(value()?.parse()?),
             "--exact-blocks" => found.options.exact_blocks = Some(value()?.parse()?),
+            "--device" => found.options.device = value()?.parse()?,
             "--isa" => found.options.isa = Some(value()?.parse()?),
             "--runs" => found.runs = value()?.parse()?,
             "--rays" => found.infer.wants_rays = true,
@@ -72,6 +73,14 @@ fn peak_kilobytes() -> Option<u64> {
     line.split_whitespace().nth(1)?.parse().ok()
 }
 
+/// Most bytes held on a device so far.
+fn device_peak(model: &Da3) -> Option<u64> {
+    #[cfg(feature = "gpu")]
+    return model.gpu().map(|gpu| gpu.peak_bytes());
+    #[cfg(not(feature = "gpu"))]
+    return model.device_name().map(|_| 0);
+}
+
 fn main() -> Fallible<()> {
     let arguments = arguments()?;
     let model = Da3::deterministic(arguments.variant, &arguments.options)?;
@@ -88,7 +97,7 @@ fn main() -> Fallible<()> {
         let cpu = cpu_seconds().zip(cpu).map(|(after, before)| after - before);
         let line = serde_json::json!({
             "model": arguments.variant.name(), "views": views, "rows": rows, "columns": columns,
-            "arithmetic": model.arithmetic().to_string(),
+            "arithmetic": model.describe_compute(), "device_peak_bytes": device_peak(&model),
             "wall_s": wall, "cpu_s": cpu, "peak_kb": peak_kilobytes(), "weights_kb": weights,
             "depth_mean": answer.depth.iter().map(|d| f64::from(*d)).sum::<f64>() / answer.depth.len() as f64,
         });

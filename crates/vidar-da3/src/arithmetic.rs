@@ -87,6 +87,9 @@ pub struct Arithmetic {
     pub head: vidar_nn::Precision,
     /// Leading blocks in `f32` under a bf16 backbone; `None` is the first third.
     pub exact_blocks: Option<usize>,
+    /// Whether backbone and heads are on a graphics processor, where this is how weights are stored: sums and activations
+    /// are `f32` there.
+    pub on_device: bool,
 }
 
 impl Arithmetic {
@@ -99,7 +102,24 @@ impl Arithmetic {
     ) -> Self {
         let backbone = precision.on(isa);
         let own = if backbone == vidar_nn::Precision::Bf16 { Precision::F32 } else { precision };
-        Self { isa, backbone, head: head.unwrap_or(own).on(isa), exact_blocks }
+        Self { isa, backbone, head: head.unwrap_or(own).on(isa), exact_blocks, on_device: false }
+    }
+
+    /// As [`Arithmetic::resolve`], for a graphics processor: it has all formats.
+    pub(crate) fn on_device(
+        precision: Precision,
+        head: Option<Precision>,
+        isa: Isa,
+        exact_blocks: Option<usize>,
+    ) -> Self {
+        let stored = |precision| match precision {
+            Precision::Auto | Precision::Bf16 => vidar_nn::Precision::Bf16,
+            Precision::F32 => vidar_nn::Precision::F32,
+            Precision::F32Split => vidar_nn::Precision::F32Split,
+            Precision::F16 => vidar_nn::Precision::F16,
+        };
+        let head = head.map_or(vidar_nn::Precision::F32, stored);
+        Self { isa, backbone: stored(precision), head, exact_blocks, on_device: true }
     }
 
     /// Whether all of it has `f32`'s accuracy.
@@ -122,7 +142,7 @@ fn is_exact(precision: vidar_nn::Precision) -> bool {
 impl fmt::Display for Arithmetic {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let Self { backbone, head, exact_blocks, .. } = self;
-        let place = self.isa.name();
+        let place = if self.on_device { "gpu" } else { self.isa.name() };
         if *backbone != vidar_nn::Precision::Bf16 {
             write!(f, "{backbone}")?;
             return if head == backbone {

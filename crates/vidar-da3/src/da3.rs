@@ -2,9 +2,10 @@
 
 use crate::arithmetic::{Arithmetic, Precision};
 use crate::config::{Da3Config, Variant, json};
+use crate::device::{self, Device, Opened};
 use crate::error::Da3Error;
 use crate::infer::Hooks;
-use crate::model::Model;
+use crate::model::{DeviceLoader, Model};
 use crate::run::Run;
 use crate::weights::{DeterministicWeights, Residency, detect, verify};
 use std::path::{Path, PathBuf};
@@ -22,6 +23,10 @@ pub struct Da3Options {
     /// With a bf16 backbone: how many of its leading blocks (and, unless none, the patch embedding) stay in `f32`.
     /// `None` is a third of them, which bounds the largest error of depth; 0 is fastest.
     pub exact_blocks: Option<usize>,
+    /// Where backbone and dense head are computed.
+    pub device: Device,
+    /// Bytes of a device's memory that may be held at a time; `None` is whatever it gives.
+    pub max_device_bytes: Option<u64>,
     /// A set of kernels to insist on; `None` is the best of this machine.
     pub isa: Option<Isa>,
     /// Whether weights made by rule are kept. Files are mapped and cost nothing either way.
@@ -35,6 +40,7 @@ pub struct Da3 {
     backbone: Compute,
     head: Compute,
     arithmetic: Arithmetic,
+    opened: Option<Opened>,
     source: WeightsOrigin,
 }
 
@@ -106,11 +112,18 @@ impl Da3 {
     ) -> Result<Self, Da3Error> {
         config.validate()?;
         let isa = options.isa.unwrap_or_else(Isa::detect);
+        let opened = device::open(options.device, options.max_device_bytes)?;
         let (precision, head, exact) = (options.precision, options.head_precision, options.exact_blocks);
-        let arithmetic = Arithmetic::resolve(precision, head, isa, exact);
+        let arithmetic = match &opened {
+            Some(_) => Arithmetic::on_device(precision, head, isa, exact),
+            None => Arithmetic::resolve(precision, head, isa, exact),
+        };
         let backbone = Compute::with_isa(isa, arithmetic.backbone)?;
+        let loader = opened.as_ref().map(|device| device.loader(arithmetic));
+        let loader = loader.as_ref().map(|loader| loader as &dyn DeviceLoader);
         Ok(Self {
-            model: Model::load(source, &config, options.residency)?,
+            model: Model::load(source, &config, options.residency, loader)?,
+            opened,
             config,
             backbone,
             head: backbone.at(arithmetic.head),
@@ -132,6 +145,25 @@ impl Da3 {
     /// What it computes with: the options resolved for this machine.
     pub fn arithmetic(&self) -> Arithmetic {
         self.arithmetic
+    }
+
+    /// The name of the device that backbone and head are computed on; `None` is the CPU.
+    pub fn device_name(&self) -> Option<String> {
+        self.opened.as_ref().map(Opened::name)
+    }
+
+    /// What it computes with and where, in words.
+    pub fn describe_compute(&self) -> String {
+        match self.device_name() {
+            Some(name) => format!("{} ({name})", self.arithmetic),
+            None => self.arithmetic.to_string(),
+        }
+    }
+
+    /// The device that backbone and head are computed on, if it is not the CPU.
+    #[cfg(feature = "gpu")]
+    pub fn gpu(&self) -> Option<&vidar_gpu::Gpu> {
+        self.opened.as_ref().map(Opened::gpu)
     }
 
     /// Kernels and precision of the backbone.

@@ -126,6 +126,18 @@ pub enum Da3Error {
         /// What is wrong with it.
         reason: String,
     },
+    /// A device that this build has no code for.
+    #[error(
+        "{device}: this program was built without graphics processors; build it with `--features gpu`, or compute on the CPU"
+    )]
+    NoDeviceSupport {
+        /// What was asked for.
+        device: crate::Device,
+    },
+    /// The device is not there, does not suit, or failed.
+    #[cfg(feature = "gpu")]
+    #[error(transparent)]
+    Gpu(#[from] vidar_gpu::GpuError),
     /// The caller asked to stop.
     #[error("cancelled")]
     Cancelled,

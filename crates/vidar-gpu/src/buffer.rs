@@ -32,6 +32,14 @@ impl Account {
         self.peak.store(self.held(), Ordering::Relaxed);
     }
 
+    pub fn allows(&self, what: &str, bytes: u64) -> Result<(), GpuError> {
+        let held = self.held();
+        match self.allowed.filter(|allowed| held + bytes > *allowed) {
+            Some(allowed) => Err(GpuError::OverBudget { what: what.to_owned(), bytes, held, allowed }),
+            None => Ok(()),
+        }
+    }
+
     fn take(&self, what: &str, bytes: u64) -> Result<(), GpuError> {
         let held = self.held.fetch_add(bytes, Ordering::Relaxed);
         match self.allowed.filter(|allowed| held + bytes > *allowed) {

@@ -175,6 +175,14 @@ impl Gpu {
         self.shared.limits.max_buffer_size.min(self.shared.limits.max_storage_buffer_binding_size)
     }
 
+    /// Refuses bytes that, beside those held, are more than allowed.
+    ///
+    /// # Errors
+    /// [`GpuError::OverBudget`].
+    pub fn allows(&self, what: &str, bytes: u64) -> Result<(), GpuError> {
+        self.shared.account.allows(what, bytes)
+    }
+
     /// A buffer of `len` numbers, of no certain content.
     ///
     /// # Errors

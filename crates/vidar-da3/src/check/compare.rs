@@ -255,7 +255,7 @@ impl<'a> Comparison<'a> {
         CheckReport {
             file: self.golden.path().to_path_buf(),
             model: model.config().name.clone(),
-            compute: model.arithmetic().to_string(),
+            compute: model.describe_compute(),
             measure: self.tolerances.measure,
             rows: self.rows,
         }

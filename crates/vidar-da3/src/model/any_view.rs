@@ -4,6 +4,7 @@ use super::backbone::{Backbone, CameraTokens, Feature, FeatureSink, Pixels, Refe
 use super::cam_dec::CameraDecoder;
 use super::cam_enc::CameraEncoder;
 use super::head::{DenseView, DualDpt, Embeddings, Map};
+use super::{Dense, DeviceLoader, DeviceNet};
 use crate::config::NetConfig;
 use crate::error::Da3Error;
 use crate::infer::NetCameras;
@@ -16,10 +17,22 @@ use std::sync::Arc;
 
 /// The network's parts.
 pub(crate) struct AnyView {
-    config: NetConfig,
-    backbone: Backbone,
     cam_enc: Option<Slot<CameraEncoder>>,
     cam_dec: Option<Slot<CameraDecoder>>,
+    parts: Parts,
+}
+
+/// Where backbone and head are. There is one of these a network: its size does not matter.
+#[allow(clippy::large_enum_variant)]
+enum Parts {
+    Here(Host),
+    OnDevice(Box<dyn DeviceNet>),
+}
+
+/// Backbone and head on the CPU.
+struct Host {
+    config: NetConfig,
+    backbone: Backbone,
     head: DualDpt,
 }
 
@@ -48,7 +61,12 @@ pub(crate) struct Answer {
 }
 
 impl AnyView {
-    pub fn load(scope: &Scope, config: &NetConfig, residency: Residency) -> Result<Self, Da3Error> {
+    pub fn load(
+        scope: &Scope,
+        config: &NetConfig,
+        residency: Residency,
+        device: Option<&dyn DeviceLoader>,
+    ) -> Result<Self, Da3Error> {
         let (dim, width) = (config.backbone.dim, config.backbone.feature_dim());
         let cam_enc = config.camera_encoder.map(|encoder| {
             let scope = scope.at("cam_enc");
@@ -58,13 +76,15 @@ impl AnyView {
             let scope = scope.at("cam_dec");
             Slot::new(residency, move || CameraDecoder::load(&scope, width))
         });
-        Ok(Self {
-            backbone: Backbone::load(&scope.at("backbone.pretrained"), &config.backbone, residency)?,
-            cam_enc: cam_enc.transpose()?,
-            cam_dec: cam_dec.transpose()?,
-            head: DualDpt::load(&scope.at("head"), width, &config.head, residency)?,
-            config: config.clone(),
-        })
+        let parts = match device {
+            Some(device) => Parts::OnDevice(device.load(scope, config, residency)?),
+            None => Parts::Here(Host {
+                backbone: Backbone::load(&scope.at("backbone.pretrained"), &config.backbone, residency)?,
+                head: DualDpt::load(&scope.at("head"), width, &config.head, residency)?,
+                config: config.clone(),
+            }),
+        };
+        Ok(Self { cam_enc: cam_enc.transpose()?, cam_dec: cam_dec.transpose()?, parts })
     }
 
     pub fn run(&self, run: &Run<'_>, pixels: &Pixels<'_>, request: &Request<'_>) -> Result<Answer, Da3Error> {
@@ -73,19 +93,15 @@ impl AnyView {
             Some(tokens) => CameraTokens::Given(tokens),
             None => CameraTokens::Trained(request.strategy),
         };
-        let mut features = Features::new(self, pixels, request.wanted.clone());
-        let reference = self.backbone.run(run, pixels, tokens, request.layers, &mut features)?;
-        let Features { embeddings, stages, camera_tokens, layers, .. } = features;
+        let wanted = (request.wanted.clone(), request.wants_rays);
+        let Dense { views, camera_tokens, layers, reference } = match &self.parts {
+            Parts::Here(host) => host.run(run, pixels, tokens, request.layers, wanted)?,
+            Parts::OnDevice(device) => device.run(run, pixels, tokens, request.layers, wanted)?,
+        };
         let codes = match &self.cam_dec {
             Some(decoder) => Some(decoder.get()?.run(run, &camera_tokens)),
             None => None,
         };
-        let size = (pixels.rows, pixels.columns);
-        let mut views = Vec::with_capacity(request.wanted.len());
-        for (view, stages) in stages.into_iter().enumerate().filter(|(v, _)| request.wanted.contains(v)) {
-            run.checkpoint()?;
-            views.push(self.head.run(run, view, stages, size, (&embeddings, request.wants_rays))?);
-        }
         Ok(Answer { views, codes, layers, reference })
     }
 
@@ -109,9 +125,31 @@ impl AnyView {
     }
 }
 
+impl Host {
+    fn run(
+        &self,
+        run: &Run<'_>,
+        pixels: &Pixels<'_>,
+        tokens: CameraTokens<'_>,
+        layers: &[usize],
+        (wanted, wants_rays): (Range<usize>, bool),
+    ) -> Result<Dense, Da3Error> {
+        let mut features = Features::new(self, pixels, wanted.clone());
+        let reference = self.backbone.run(run, pixels, tokens, layers, &mut features)?;
+        let Features { embeddings, stages, camera_tokens, layers, .. } = features;
+        let size = (pixels.rows, pixels.columns);
+        let mut views = Vec::with_capacity(wanted.len());
+        for (view, stages) in stages.into_iter().enumerate().filter(|(view, _)| wanted.contains(view)) {
+            run.checkpoint()?;
+            views.push(self.head.run(run, view, stages, size, (&embeddings, wants_rays))?);
+        }
+        Ok(Dense { views, camera_tokens, layers, reference })
+    }
+}
+
 /// Takes features as the backbone yields them and keeps only their projections.
 struct Features<'a> {
-    net: &'a AnyView,
+    net: &'a Host,
     size: (usize, usize),
     wanted: Range<usize>,
     embeddings: Arc<Embeddings>,
@@ -124,7 +162,7 @@ struct Features<'a> {
 }
 
 impl<'a> Features<'a> {
-    fn new(net: &'a AnyView, pixels: &Pixels<'_>, wanted: Range<usize>) -> Self {
+    fn new(net: &'a Host, pixels: &Pixels<'_>, wanted: Range<usize>) -> Self {
         Self {
             net,
             size: pixels.patches(),

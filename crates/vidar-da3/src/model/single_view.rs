@@ -1,7 +1,8 @@
 //! A network of single views: backbone and DPT head with sky (the metric and the monocular one).
 
 use super::backbone::{Backbone, CameraTokens, Feature, FeatureSink, Pixels, ReferenceStrategy};
-use super::head::{Dpt, Map};
+use super::head::{DenseView, Dpt, Map};
+use super::{Dense, DeviceLoader, DeviceNet};
 use crate::config::NetConfig;
 use crate::error::Da3Error;
 use crate::run::Run;
@@ -11,6 +12,18 @@ use std::collections::BTreeMap;
 
 /// The network's parts.
 pub(crate) struct SingleView {
+    parts: Parts,
+}
+
+/// Where they are. There is one of these a network: its size does not matter.
+#[allow(clippy::large_enum_variant)]
+enum Parts {
+    Here(Host),
+    OnDevice(Box<dyn DeviceNet>),
+}
+
+/// Backbone and head on the CPU.
+struct Host {
     config: NetConfig,
     backbone: Backbone,
     head: Dpt,
@@ -27,12 +40,21 @@ pub(crate) struct SingleAnswer {
 }
 
 impl SingleView {
-    pub fn load(scope: &Scope, config: &NetConfig, residency: Residency) -> Result<Self, Da3Error> {
-        Ok(Self {
-            backbone: Backbone::load(&scope.at("backbone.pretrained"), &config.backbone, residency)?,
-            head: Dpt::load(&scope.at("head"), config.backbone.feature_dim(), &config.head)?,
-            config: config.clone(),
-        })
+    pub fn load(
+        scope: &Scope,
+        config: &NetConfig,
+        residency: Residency,
+        device: Option<&dyn DeviceLoader>,
+    ) -> Result<Self, Da3Error> {
+        let parts = match device {
+            Some(device) => Parts::OnDevice(device.load(scope, config, residency)?),
+            None => Parts::Here(Host {
+                backbone: Backbone::load(&scope.at("backbone.pretrained"), &config.backbone, residency)?,
+                head: Dpt::load(&scope.at("head"), config.backbone.feature_dim(), &config.head)?,
+                config: config.clone(),
+            }),
+        };
+        Ok(Self { parts })
     }
 
     pub fn run(
@@ -41,32 +63,53 @@ impl SingleView {
         pixels: &Pixels<'_>,
         layers: &[usize],
     ) -> Result<SingleAnswer, Da3Error> {
+        let tokens = CameraTokens::Trained(ReferenceStrategy::First);
+        let dense = match &self.parts {
+            Parts::Here(host) => host.run(run, pixels, tokens, layers)?,
+            Parts::OnDevice(device) => device.run(run, pixels, tokens, layers, (0..pixels.views, false))?,
+        };
+        let area = pixels.rows * pixels.columns;
+        let (mut depth, mut sky) =
+            (Vec::with_capacity(pixels.views * area), Vec::with_capacity(pixels.views * area));
+        for (view, answer) in dense.views.into_iter().enumerate() {
+            run.show("head.depth_before_sky", view, &[pixels.rows, pixels.columns], &answer.depth);
+            depth.extend(answer.depth);
+            sky.extend(answer.confidence);
+        }
+        sky::fill(&mut depth, &sky);
+        Ok(SingleAnswer { depth, sky, layers: dense.layers })
+    }
+}
+
+impl Host {
+    /// Sky stands where any-view networks have confidence.
+    fn run(
+        &self,
+        run: &Run<'_>,
+        pixels: &Pixels<'_>,
+        tokens: CameraTokens<'_>,
+        layers: &[usize],
+    ) -> Result<Dense, Da3Error> {
         let mut features = Features {
             net: self,
             size: pixels.patches(),
             stages: (0..pixels.views).map(|_| Vec::with_capacity(4)).collect(),
             layers: BTreeMap::new(),
         };
-        let tokens = CameraTokens::Trained(ReferenceStrategy::First);
-        self.backbone.run(run, pixels, tokens, layers, &mut features)?;
-        let area = pixels.rows * pixels.columns;
-        let (mut depth, mut sky) =
-            (Vec::with_capacity(pixels.views * area), Vec::with_capacity(pixels.views * area));
+        let reference = self.backbone.run(run, pixels, tokens, layers, &mut features)?;
+        let mut views = Vec::with_capacity(pixels.views);
         for (view, stages) in features.stages.into_iter().enumerate() {
             run.checkpoint()?;
-            let (view_depth, view_sky) = self.head.run(run, view, stages, (pixels.rows, pixels.columns))?;
-            run.show("head.depth_before_sky", view, &[pixels.rows, pixels.columns], &view_depth);
-            depth.extend(view_depth);
-            sky.extend(view_sky);
+            let (depth, sky) = self.head.run(run, view, stages, (pixels.rows, pixels.columns))?;
+            views.push(DenseView { depth, confidence: sky, rays: None });
         }
-        sky::fill(&mut depth, &sky);
-        Ok(SingleAnswer { depth, sky, layers: features.layers })
+        Ok(Dense { views, camera_tokens: Vec::new(), layers: features.layers, reference })
     }
 }
 
 /// Takes features as the backbone yields them and keeps only their projections.
 struct Features<'a> {
-    net: &'a SingleView,
+    net: &'a Host,
     size: (usize, usize),
     stages: Vec<Vec<Map>>,
     layers: BTreeMap<usize, Vec<Vec<f32>>>,

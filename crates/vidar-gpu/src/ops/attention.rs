@@ -222,7 +222,7 @@ fn attend_source(d: usize) -> String {
         let _ = writeln!(text, "  {words}");
     };
     for j in 0..d {
-        line(&mut query, format!("let q{j} = qkv[from + {j}u] * p.factor;"));
+        line(&mut query, format!("let q{j} = qkv[start + {j}u] * p.factor;"));
         line(&mut query, format!("var o{j} = vec4<f32>();"));
         line(&mut shrink, format!("      o{j} *= shrink;"));
         line(&mut store, format!("y[to + {j}u] = o{j} * share;"));

@@ -24,7 +24,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(local_invocation_index
   let wanted = group.x * 64u + i;
   let query = group.z * p.queries + min(wanted, p.queries - 1u);
   let first = p.k_first + group.z * p.keys;
-  let from = ((p.q_first + query) * 3u * p.heads + head) * D;
+  let start = ((p.q_first + query) * 3u * p.heads + head) * D;
 {{QUERY}}
   var top = -3.0e38;
   var total = 0.0;

@@ -31,16 +31,16 @@ fn over_row(i: u32, own: f32) -> f32 {
 fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(local_invocation_index) i: u32) {
   let wanted = (group.x + group.y * 32768u) * 8u + i / 8u;
   let row = min(wanted, p.rows - 1u);
-  let from = p.in_at + row * p.in_stride;
+  let start = p.in_at + row * p.in_stride;
   var sum = vec4<f32>();
   for (var c = i % 8u; c < p.width; c += 8u) {
-    sum += x[from + c];
+    sum += x[start + c];
   }
   let count = f32(p.width * 4u);
   let mean = over_row(i, sum.x + sum.y + sum.z + sum.w) / count;
   var square = vec4<f32>();
   for (var c = i % 8u; c < p.width; c += 8u) {
-    let d = x[from + c] - mean;
+    let d = x[start + c] - mean;
     square = fma(d, d, square);
   }
   let variance = over_row(i, square.x + square.y + square.z + square.w) / count;
@@ -48,6 +48,6 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(local_invocation_index
   if wanted >= p.rows { return; }
   let to = p.out_at + row * p.out_stride;
   for (var c = i % 8u; c < p.width; c += 8u) {
-    y[to + c] = fma((x[from + c] - mean) * scale, weight[c], bias[c]);
+    y[to + c] = fma((x[start + c] - mean) * scale, weight[c], bias[c]);
   }
 }

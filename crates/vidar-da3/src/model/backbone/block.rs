@@ -43,7 +43,7 @@ enum FeedForward {
 }
 
 /// Epsilon of the norms over queries and keys.
-const QK_EPS: f32 = 1e-5;
+pub(crate) const QK_EPS: f32 = 1e-5;
 
 /// Buffers that the blocks of a run share.
 #[derive(Default)]

@@ -17,21 +17,23 @@ mod block;
 mod embed;
 mod reference;
 
+#[cfg(feature = "gpu")]
+pub(crate) use block::QK_EPS;
 use block::resize;
 pub(crate) use block::{Block, BlockScratch, BlockShape, FFN_ROWS};
+pub(crate) use embed::Embed;
 pub use reference::{ReferenceStrategy, choose as choose_reference};
 
 use crate::config::{BackboneConfig, PATCH};
 use crate::error::Da3Error;
 use crate::run::Run;
 use crate::weights::{Residency, Scope, Slot};
-use embed::Embed;
 use vidar_nn::{Compute, LayerNorm, RopeTable};
 
 /// Epsilon of the blocks' norms.
 const BLOCK_EPS: f32 = 1e-6;
 /// Epsilon of the final norm.
-const NORM_EPS: f32 = 1e-5;
+pub(crate) const NORM_EPS: f32 = 1e-5;
 const ROPE_BASE: f32 = 100.0;
 /// Tokens that go through a local block at once.
 pub(crate) const GROUP_TOKENS: usize = 4096;
@@ -157,7 +159,7 @@ impl Backbone {
             run.checkpoint()?;
             self.embed.apply(run, view, pixels.view(view), (pixels.rows, pixels.columns), tokens);
         }
-        let rope = self.rope_tables(rows, columns);
+        let rope = RopeTables { tables: rope_tables(&self.config, rows, columns) };
         let mut order = Order((0..pixels.views).collect());
         let mut scratch = BlockScratch::default();
         for i in 0..self.config.depth {
@@ -279,21 +281,24 @@ impl Backbone {
             view[..dim].copy_from_slice(token);
         }
     }
-
-    fn rope_tables(&self, rows: usize, columns: usize) -> RopeTables {
-        let Some(_) = self.config.rope_from else {
-            return RopeTables { tables: None };
-        };
-        let patches = || (0..rows).flat_map(|r| (0..columns).map(move |c| [(r + 1) as f32, (c + 1) as f32]));
-        let local: Vec<[f32; 2]> = std::iter::once([0.0, 0.0]).chain(patches()).collect();
-        let global: Vec<[f32; 2]> =
-            std::iter::once([-1.0, -1.0]).chain(patches().map(|_| [0.0, 0.0])).collect();
-        let table = |positions: &[[f32; 2]]| RopeTable::new(positions, self.config.head_dim(), ROPE_BASE);
-        RopeTables { tables: Some((table(&local), table(&global))) }
-    }
 }
 
-fn block_shape(config: &BackboneConfig, i: usize) -> BlockShape {
+/// Rotations of local and of global blocks for views of `rows` × `columns` patches, if the network has any.
+pub(crate) fn rope_tables(
+    config: &BackboneConfig,
+    rows: usize,
+    columns: usize,
+) -> Option<(RopeTable, RopeTable)> {
+    config.rope_from?;
+    let patches = || (0..rows).flat_map(|r| (0..columns).map(move |c| [(r + 1) as f32, (c + 1) as f32]));
+    let local: Vec<[f32; 2]> = std::iter::once([0.0, 0.0]).chain(patches()).collect();
+    let global: Vec<[f32; 2]> = std::iter::once([-1.0, -1.0]).chain(patches().map(|_| [0.0, 0.0])).collect();
+    let table = |positions: &[[f32; 2]]| RopeTable::new(positions, config.head_dim(), ROPE_BASE);
+    Some((table(&local), table(&global)))
+}
+
+/// Sizes of block `i`.
+pub(crate) fn block_shape(config: &BackboneConfig, i: usize) -> BlockShape {
     BlockShape {
         dim: config.dim,
         heads: config.heads,

@@ -11,3 +11,5 @@ mod uv;
 pub(crate) use dpt::Dpt;
 pub(crate) use dual_dpt::{DenseView, DualDpt, Embeddings};
 pub(crate) use map::Map;
+#[cfg(feature = "gpu")]
+pub(crate) use uv::embedding;
