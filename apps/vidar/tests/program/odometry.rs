@@ -32,7 +32,7 @@ fn odometry(sequence: &Path, out: &Path, more: &[&str]) -> Ran {
 #[test]
 fn a_rendered_flight_is_tracked_in_metres_and_its_trajectory_anchors_a_map() {
     let out = shared().root.join("tracked");
-    let json = odometry(flight(), &out, &[]).ends_with(0).json();
+    let json = odometry(flight(), &out, &["--debug-dump"]).ends_with(0).json();
     assert_eq!(json["schema"], "vidar.odometry/1");
     assert_eq!(json["is_metric"], true);
     let number = |v: &Value| v.as_f64().unwrap();
@@ -42,10 +42,14 @@ fn a_rendered_flight_is_tracked_in_metres_and_its_trajectory_anchors_a_map() {
     let files = files_under(&out);
     for name in [
         "manifest.json",
+        "odometry/debug_states.csv",
+        "odometry/debug_tracks.csv",
         "odometry/health.csv",
         "odometry/keyframes.json",
         "odometry/landmarks.csv",
         "odometry/report.json",
+        "pictures/odometry_tracks.png",
+        "report.html",
         "trajectory/odometry_body.euroc.csv",
         "trajectory/odometry_body.tum",
     ] {
@@ -58,6 +62,13 @@ fn a_rendered_flight_is_tracked_in_metres_and_its_trajectory_anchors_a_map() {
     assert!(first["landmarks"].as_u64().unwrap() > 10, "{first}");
     let health = std::fs::read_to_string(out.join("odometry/health.csv")).unwrap();
     assert_eq!(health.lines().count() as u64, 1 + json["images"].as_u64().unwrap());
+
+    let states = std::fs::read_to_string(out.join("odometry/debug_states.csv")).unwrap();
+    assert_eq!(states.lines().count() as u64, 1 + json["images_with_state"].as_u64().unwrap());
+    let columns = states.lines().next().unwrap().split(',').count();
+    assert!(states.lines().all(|l| l.split(',').count() == columns), "{columns} columns");
+    let tracks = std::fs::read_to_string(out.join("odometry/debug_tracks.csv")).unwrap();
+    assert!(tracks.lines().count() > 1000, "{} tracks", tracks.lines().count());
 
     // The trajectory is a metric anchor like any other.
     let map = shared().root.join("map on odometry");

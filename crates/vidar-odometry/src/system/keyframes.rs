@@ -100,7 +100,8 @@ pub(crate) fn seen_landmarks(
 ) -> Vec<SparseLandmark> {
     let camera_from_world = world_from_camera.inverse();
     let seen = tracks.iter().filter(|t| t.is_landmark).filter_map(|t| Some((t.id, t.measured?.pixel)));
-    seen.filter_map(|(id, pixel)| {
+    let mut landmarks = Vec::with_capacity(tracks.len());
+    landmarks.extend(seen.filter_map(|(id, pixel)| {
         let landmark = smoother.landmark(id)?;
         let z = camera_from_world.act(&landmark.in_world).z;
         // The relative deviation is that of the host's ray: the poses' share is in their covariance.
@@ -111,6 +112,6 @@ pub(crate) fn seen_landmarks(
             inverse_depth: 1.0 / z,
             inverse_depth_std: relative / z,
         })
-    })
-    .collect()
+    }));
+    landmarks
 }

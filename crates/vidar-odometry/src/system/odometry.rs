@@ -9,8 +9,8 @@ use super::rotation_check::{MAX_TURN_DEG, RotationCheck};
 use super::running::{Running, Shot, Step};
 use super::starting::{Found, STILL_SECS, Starting, UNKNOWN_INVERSE};
 use super::stillness::ImuSpread;
-use super::track::{ImagePool, TrackRecord};
 use super::track::HostImage;
+use super::track::{ImagePool, TrackRecord};
 use super::tracker::Tracker;
 use crate::estimator::{CalibrationEstimate, Smoother, SmootherError};
 use crate::frontend::FrontendConfig;
@@ -100,9 +100,12 @@ impl Odometry {
                 .with_gravity(config.gravity_mps2)
         });
         let frontend = FrontendConfig::default();
-        let phase = Phase::Starting(Box::new(starting(config, imu_model.is_none(), &rig_camera, &frontend)));
+        // From here on `off` says what is, not only what was asked for.
+        let imu = if imu_model.is_some() { config.imu } else { ImuUse::Off };
+        let config = OdometryConfig { imu, ..config.clone() };
+        let phase = Phase::Starting(Box::new(starting(&config, imu_model.is_none(), &rig_camera, &frontend)));
         Ok(Self {
-            config: config.clone(),
+            config,
             frontend,
             camera_id: camera,
             check: RotationCheck::new(&rig_camera.body_from_camera.rotation),
@@ -332,11 +335,13 @@ impl Odometry {
         let (model, from) = (self.imu_model?, self.last_frame?);
         let gap = self.imu.interval(from, time, &mut self.interval).ok()?;
         self.counts.imu_gaps += usize::from(gap.is_some());
-        let bias = match &self.phase {
-            Phase::Running(running) => running.state()?.bias,
-            Phase::Starting(starting) => Bias { gyro: starting.gyro_bias(), accel: Vector3::zeros() },
+        let (bias, spare) = match &mut self.phase {
+            Phase::Running(running) => (running.state()?.bias, running.spare_readings()),
+            Phase::Starting(starting) => (Bias { gyro: starting.gyro_bias(), accel: Vector3::zeros() }, None),
         };
-        Some(Preintegration::new(model, bias, &self.interval))
+        let Some(mut readings) = spare else { return Some(Preintegration::new(model, bias, &self.interval)) };
+        readings.restart(bias, &self.interval);
+        Some(readings)
     }
 
     /// Whether the readings of the last half second are those of a body at rest.

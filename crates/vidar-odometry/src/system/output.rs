@@ -151,7 +151,10 @@ impl fmt::Display for LossReason {
                     write!(f, "{:.0} % of the measurements contradict the prediction", 100.0 * found)
                 }
                 DivergenceSign::CameraOrientation => {
-                    write!(f, "gyroscope and images disagree: the camera's orientation is off by {found:.0} deg")
+                    write!(
+                        f,
+                        "gyroscope and images disagree: the camera's orientation is off by {found:.0} deg"
+                    )
                 }
                 DivergenceSign::NotFinite => write!(f, "the state is not finite"),
             },

@@ -41,7 +41,6 @@ pub(crate) struct RotationCheck {
 
 impl RotationCheck {
     pub fn new(body_from_camera: &So3) -> Self {
-
         Self {
             camera_from_body: body_from_camera.inverse(),
             last: FxHashMap::default(),

@@ -69,7 +69,8 @@ pub(crate) struct Shot {
 #[derive(Debug, Default)]
 pub(crate) struct Step {
     pub counts: TrackCounts,
-    pub report: OptimiseReport,
+    /// Mean squared misfit of the window's sightings per degree of freedom.
+    pub chi2_per_dof: f64,
     /// Landmarks whose sighting in this image fits.
     pub fitting: usize,
     /// Landmarks whose sighting in this image contradicts the others.
@@ -91,7 +92,7 @@ impl Step {
             young_tried: self.counts.young_tried,
             young_found: self.counts.young_found,
             contradicting: self.contradicting,
-            chi2_per_dof: self.report.chi2_per_dof,
+            chi2_per_dof: self.chi2_per_dof,
         }
     }
 }
@@ -120,7 +121,18 @@ pub(crate) struct Running {
     /// The frame since which the body stands still, and the time from which its readings are not yet in the prior.
     rest: Option<(FrameId, Timestamp)>,
     departure: Departure,
-    scratch: Vec<(Se3, PixelMeasurement)>,
+    report: OptimiseReport,
+    scratch: Scratch,
+}
+
+/// Memory that is used again in every image.
+#[derive(Debug, Default)]
+struct Scratch {
+    sightings: Vec<(Se3, PixelMeasurement)>,
+    promoted: Vec<LandmarkId>,
+    values: Vec<f64>,
+    frames: Vec<FrameId>,
+    keyframes: Vec<FrameId>,
 }
 
 /// Poses of the frames that the smoother holds.
@@ -169,7 +181,8 @@ impl Running {
             motion: ImageMotion::default(),
             rest: None,
             departure: Departure::default(),
-            scratch: Vec::new(),
+            report: OptimiseReport::default(),
+            scratch: Scratch::default(),
         })
     }
 
@@ -220,8 +233,9 @@ impl Running {
             }
         }
         self.observe(frame);
-        step.report = self.smoother.optimise(self.config.iterations);
-        step.contradicting = self.remove_outliers(&step.report, frame);
+        self.smoother.optimise_into(self.config.iterations, &mut self.report);
+        step.chi2_per_dof = self.report.chi2_per_dof;
+        step.contradicting = self.remove_outliers(frame);
         step.fitting = self.tracker.tracks.iter().filter(|t| t.is_landmark && t.measured.is_some()).count();
         self.know_young_tracks(frame)?;
 
@@ -351,9 +365,9 @@ impl Running {
     }
 
     /// Takes sightings back that do not fit; a landmark that keeps misfitting goes. How many of the newest frame's.
-    fn remove_outliers(&mut self, report: &OptimiseReport, frame: FrameId) -> usize {
+    fn remove_outliers(&mut self, frame: FrameId) -> usize {
         let mut in_newest = 0;
-        for outlier in &report.outliers {
+        for outlier in &self.report.outliers {
             self.smoother.remove_observation(outlier.frame, outlier.landmark);
             if outlier.frame == frame {
                 in_newest += 1;
@@ -373,9 +387,10 @@ impl Running {
         let held = Held(&self.smoother);
         let Some(world_from_current) = held.world_from_camera(frame) else { return Ok(()) };
         let measured = self.tracker.tracks.iter().filter(|t| t.is_landmark && t.measured.is_some()).count();
-        let (mut room, scratch, camera) =
-            (self.config.max_landmarks.saturating_sub(measured), &mut self.scratch, &self.camera);
-        let mut promoted = Vec::new();
+        let mut room = self.config.max_landmarks.saturating_sub(measured);
+        let (scratch, camera) = (&mut self.scratch.sightings, &self.camera);
+        let mut promoted = std::mem::take(&mut self.scratch.promoted);
+        promoted.clear();
         self.tracker.tracks.retain_mut(|track| {
             if track.is_landmark || track.measured.is_none() {
                 return true;
@@ -404,9 +419,10 @@ impl Running {
             }
             true
         });
-        for id in promoted {
-            self.hand_over(id)?;
+        for id in &promoted {
+            self.hand_over(*id)?;
         }
+        self.scratch.promoted = promoted;
         Ok(())
     }
 
@@ -430,6 +446,11 @@ impl Running {
         }
         self.tracker.tracks[at].seen.clear();
         Ok(())
+    }
+
+    /// Memory of readings that are not needed any more.
+    pub fn spare_readings(&mut self) -> Option<Preintegration> {
+        self.smoother.take_spare()
     }
 
     fn keyframe_is_due(&mut self, frame: FrameId, time: Timestamp) -> bool {
@@ -458,20 +479,17 @@ impl Running {
     }
 
     /// Median motion of pixels since the last keyframe that no rotation explains.
-    fn median_parallax_px(&self, frame: FrameId) -> f64 {
+    fn median_parallax_px(&mut self, frame: FrameId) -> f64 {
         let held = Held(&self.smoother);
         let places = (held.world_from_camera(frame), held.world_from_camera(self.last_keyframe));
         let (Some(current), Some(keyframe)) = places else { return f64::INFINITY };
         let current_from_keyframe = current.inverse() * keyframe;
-        let mut moved: Vec<f64> = self
-            .tracker
-            .tracks
-            .iter()
-            .filter_map(|t| {
-                let (measured, then) = (t.measured?, t.keyframe_pixel?);
-                Some((measured.pixel - rotated_pixel(&self.camera, &then, &current_from_keyframe)?).norm())
-            })
-            .collect();
+        let (moved, camera) = (&mut self.scratch.values, &self.camera);
+        moved.clear();
+        moved.extend(self.tracker.tracks.iter().filter_map(|t| {
+            let (measured, then) = (t.measured?, t.keyframe_pixel?);
+            Some((measured.pixel - rotated_pixel(camera, &then, &current_from_keyframe)?).norm())
+        }));
         if moved.is_empty() {
             return f64::INFINITY;
         }
@@ -516,8 +534,12 @@ impl Running {
 
     /// Drops frames and keyframes that are too many.
     fn thin_window(&mut self, step: &mut Step) -> Result<(), SmootherError> {
-        let frames: Vec<FrameId> = self.smoother.frames().collect();
-        let keyframes: Vec<FrameId> = self.smoother.keyframes().collect();
+        let (mut frames, mut keyframes) =
+            (std::mem::take(&mut self.scratch.frames), std::mem::take(&mut self.scratch.keyframes));
+        frames.clear();
+        keyframes.clear();
+        frames.extend(self.smoother.frames());
+        keyframes.extend(self.smoother.keyframes());
         let recent_from = frames.len().saturating_sub(RECENT_FRAMES);
         for frame in &frames[..recent_from] {
             if !keyframes.contains(frame) {
@@ -532,6 +554,7 @@ impl Running {
             self.hosts.retain(|h| h.frame != leaving);
             self.follow_new_hosts(leaving);
         }
+        (self.scratch.frames, self.scratch.keyframes) = (frames, keyframes);
         Ok(())
     }
 
@@ -591,12 +614,7 @@ fn observation(
     measured: &PixelMeasurement,
     noise_px: f64,
 ) -> Observation {
-    Observation {
-        frame,
-        landmark,
-        pixel: measured.pixel,
-        covariance: noisy_covariance(measured, noise_px),
-    }
+    Observation { frame, landmark, pixel: measured.pixel, covariance: noisy_covariance(measured, noise_px) }
 }
 
 /// Lets a track continue with the host that the smoother gave its landmark.

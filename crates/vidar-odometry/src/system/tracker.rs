@@ -16,6 +16,9 @@ const KNOWN_DISTANCE: f64 = 0.3;
 const MAX_MISSED_YOUNG: u32 = 1;
 const MAX_MISSED_KNOWN: u32 = 3;
 
+/// Sightings of a young track that there is room for without asking: as many as a window holds frames.
+const SEEN_FRAMES: usize = 24;
+
 /// Tracks may not come nearer than this to the border of the image, pixels.
 const BORDER_PX: f64 = 8.0;
 
@@ -162,7 +165,7 @@ impl Tracker {
             last_frame: host.frame,
             drift: Vector2::zeros(),
             keyframe_pixel: Some(feature.pixel),
-            seen: Vec::new(),
+            seen: Vec::with_capacity(SEEN_FRAMES),
             found: 1,
             missed: 0,
             measured: None,
