@@ -74,7 +74,7 @@ def scene(outliers):
         second[:3, :3] = gauge.T @ pose[:3, :3]
         second[:3, 3] = gauge.T @ (pose[:3, 3] - shift) / SCALE
         t2[i] = second
-    return dict(depth1=d1, depth2=d2, conf1=c1, conf2=c2, c2w1=t1, c2w2=t2, K=K), (SCALE, gauge, shift)
+    return dict(depth1=d1, depth2=d2, conf1=c1, conf2=c2, chunk_from_camera1=t1, chunk_from_camera2=t2, K=K), (SCALE, gauge, shift)
 
 
 def points(depth, pose):
@@ -103,7 +103,7 @@ def closed(x, y, w):
 
 def reference(data):
     """DA3-Streaming on a CPU, numpy flavour."""
-    p1, p2 = points(data["depth1"], data["c2w1"]), points(data["depth2"], data["c2w2"])
+    p1, p2 = points(data["depth1"], data["chunk_from_camera1"]), points(data["depth2"], data["chunk_from_camera2"])
     odds = lambda c: c / (1 - c)
     c1, c2 = odds(data["conf1"]), odds(data["conf2"])
     tau = 0.1 * min(np.median(c1), np.median(c2))

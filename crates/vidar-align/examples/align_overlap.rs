@@ -1,7 +1,7 @@
 //! Aligns one overlap given as a safetensors file and prints time and answer as JSON: the Rust half of
 //! `bench/align_vs_reference.py`.
 //!
-//! Usage: `align_overlap FILE ROUNDS`. The file holds `depth1`, `conf1` (probabilities), `c2w1` and the same with 2, and
+//! Usage: `align_overlap FILE ROUNDS`. The file holds `depth1`, `conf1` (probabilities), `chunk_from_camera1` and the same with 2, and
 //! `K`: `[frames, height, width]`, `[frames, 4, 4]`, `[3, 3]`, all f32.
 
 #![allow(clippy::print_stdout)] // its output is the purpose of an example
@@ -21,7 +21,7 @@ fn numbers(file: &SafeTensors<'_>, name: &str) -> Result<(Vec<usize>, Vec<f32>),
 fn views(file: &SafeTensors<'_>, which: char) -> Result<Vec<ViewGeometry>, Box<dyn Error>> {
     let (shape, depth) = numbers(file, &format!("depth{which}"))?;
     let (_, confidence) = numbers(file, &format!("conf{which}"))?;
-    let (_, poses) = numbers(file, &format!("c2w{which}"))?;
+    let (_, poses) = numbers(file, &format!("chunk_from_camera{which}"))?;
     let (_, k) = numbers(file, "K")?;
     let (h, w) = (shape[1], shape[2]);
     let k: Vec<f64> = k.into_iter().map(f64::from).collect();

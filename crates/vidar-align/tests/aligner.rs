@@ -163,3 +163,29 @@ fn settings_out_of_range_are_named_and_modes_have_their_words() {
         assert_eq!(word, format!("\"{mode}\""));
     }
 }
+
+#[test]
+fn a_metric_scale_that_jumps_between_neighbours_is_clamped_and_counted() {
+    let truth = laps(60, 1.0);
+    // Between frames 17 and 27 the odometry takes steps for 1.6 times as long as they are.
+    let mut odometry = vec![truth[0]];
+    for (i, pair) in truth.windows(2).enumerate() {
+        let mut step = pair[0].inverse() * pair[1];
+        if (17..27).contains(&i) {
+            step.translation *= 1.6;
+        }
+        odometry.push(odometry[i] * step);
+    }
+    let mut noise = Noise::new(21);
+    let mut machine = Aligner::new(CouplingMode::PoseConditioned, &AlignerConfig::default()).unwrap();
+    let mut gauges = Vec::new();
+    for (k, range) in chunk_ranges(60, 12, 4).unwrap().into_iter().enumerate() {
+        gauges.push(Noise(noise.0.clone()).gauge());
+        let prediction = predict(&truth, range.frames, k as u32, EXACT, &mut noise);
+        machine.push(observe(prediction, Some(&odometry), none)).unwrap();
+    }
+    let placement = machine.finish();
+    assert!(placement.guards.of(Guard::ScaleOutOfRange) >= 1, "{:?}", placement.guards);
+    let jump = placement.chunks[2].world_from_chunk.scale / gauges[2].scale;
+    assert!((jump - 1.0).abs() < 0.2, "{jump}");
+}

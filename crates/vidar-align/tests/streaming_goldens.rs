@@ -193,12 +193,12 @@ fn chains_and_loop_constraints_compose_alike() {
 
 fn cameras(golden: &Golden, stem: &str, width: usize, height: usize) -> Vec<(Pinhole, Se3)> {
     let prefix = if stem.is_empty() { String::new() } else { format!("{stem}.") };
-    let w2c = if stem.is_empty() { "extrinsics_w2c".into() } else { format!("{prefix}extrinsics") };
+    let key = if stem.is_empty() { "extrinsics_w2c".into() } else { format!("{prefix}extrinsics") };
     let intrinsics = golden.get(&format!("{prefix}intrinsics"));
-    let extrinsics = golden.get(&w2c);
+    let rows = golden.get(&key);
     intrinsics
         .chunks_exact(9)
-        .zip(extrinsics.chunks_exact(12))
+        .zip(rows.chunks_exact(12))
         .map(|(k, e)| {
             let camera = Pinhole { fx: k[0], fy: k[4], cx: k[2], cy: k[5], width, height };
             let rotation = Matrix3::new(e[0], e[1], e[2], e[4], e[5], e[6], e[8], e[9], e[10]);

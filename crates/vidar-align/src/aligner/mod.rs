@@ -12,6 +12,40 @@
 //! the chunk before also some thousand depths per view (with [`Compat::Reference`](crate::streaming::Compat) its views
 //! in full). What is wrong with a chunk is no error: the chunk is left out or held by its neighbours, the guard that acted
 //! is counted, and [`Placement::guards`] tells. Same input, same bits.
+//!
+//! ```
+//! use nalgebra::Vector3;
+//! use vidar_align::aligner::{Aligner, AlignerConfig, ChunkObservation, CouplingMode, FrameObservation, MetricAnchor};
+//! use vidar_core::model::ChunkFrame;
+//! use vidar_core::{
+//!     ChunkId, Confidence, FrameId, GeometryPrediction, Image, Pinhole, RelativeDepth, Se3, Timestamp, ViewGeometry,
+//! };
+//!
+//! // A wall two units away; the model takes one unit for half a metre.
+//! let view = |i: u32| ViewGeometry {
+//!     frame_id: FrameId(i),
+//!     chunk_from_camera: Se3::from_translation(Vector3::new(f64::from(i), f64::from(i * i) * 0.1, 0.0)),
+//!     intrinsics: Pinhole { fx: 20.0, fy: 20.0, cx: 15.5, cy: 11.5, width: 32, height: 24 },
+//!     depth: RelativeDepth::new(Image::filled(32, 24, 2.0)),
+//!     confidence: Confidence::full(32, 24),
+//! };
+//! let views: Vec<ViewGeometry> = (0..5).map(view).collect();
+//! let frames = views.iter().map(|v| {
+//!     let mut metric = v.chunk_from_camera;
+//!     metric.translation *= 0.5;
+//!     FrameObservation::new(v.frame_id, Timestamp::from_nanos(i64::from(v.frame_id.0) * 100_000_000))
+//!         .with_anchor(MetricAnchor::known(metric))
+//! });
+//! let frames = frames.collect();
+//! let prediction = GeometryPrediction { chunk_id: ChunkId(0), frame: ChunkFrame::ModelNative, views };
+//!
+//! let mut machine = Aligner::new(CouplingMode::Coupled, &AlignerConfig::default())?;
+//! machine.push(ChunkObservation { prediction: prediction.clone(), frames })?;
+//! let world = machine.finish();
+//! let metric = world.aligned_views(prediction, &[])?;
+//! assert!((metric[0].depth().image()[(16, 12)] - 1.0).abs() < 1e-3);
+//! # Ok::<(), vidar_align::AlignError>(())
+//! ```
 
 mod anchored;
 mod chain;
