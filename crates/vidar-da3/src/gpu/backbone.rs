@@ -53,11 +53,11 @@ pub(super) struct Features<'a> {
     /// `[views, feature width]`.
     camera: Buffer,
     /// By view, then by stage.
-    pub stages: Vec<Vec<Buffer>>,
+    stages: Vec<Vec<Buffer>>,
     /// Of the last stage, `[views, feature width]`.
-    pub camera_tokens: Vec<f32>,
+    camera_tokens: Vec<f32>,
     /// By layer and view: normalised patch tokens.
-    pub layers: BTreeMap<usize, Vec<Vec<f32>>>,
+    layers: BTreeMap<usize, Vec<Vec<f32>>>,
 }
 
 /// What stays the same during a run.
@@ -218,7 +218,7 @@ impl Backbone {
         let (tokens, scratch) = (walk.tokens, &walk.scratch);
         let rotation = walk.rotations.as_ref().filter(|_| self.config.has_rope(i));
         let groups = || (0..walk.views).step_by(walk.group).map(|v| (v, walk.group.min(walk.views - v)));
-        if self.config.out_layers.contains(&i) {
+        if is_global && self.config.out_layers.contains(&i) {
             recorder.copy((&state.x, 0), (&state.before, 0), state.x.len());
         }
         if !is_global {
@@ -350,6 +350,11 @@ impl<'a> Features<'a> {
             camera_tokens: Vec::new(),
             layers: BTreeMap::new(),
         })
+    }
+
+    /// Stages by view, camera tokens, and tokens of layers.
+    pub fn into_parts(self) -> (Vec<Vec<Buffer>>, Vec<f32>, BTreeMap<usize, Vec<Vec<f32>>>) {
+        (self.stages, self.camera_tokens, self.layers)
     }
 
     /// The local half stays as it is, the global half is normed; the camera token is neither. Networks of single views have

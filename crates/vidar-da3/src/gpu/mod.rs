@@ -107,7 +107,8 @@ impl DeviceNet for Network {
         let grids = self.head.grids(&self.gpu, pixels.rows, pixels.columns)?;
         let mut features = backbone::Features::new(self, pixels, wanted.clone(), &grids)?;
         let reference = self.backbone.run(run, &mut recorder, pixels, tokens, layers, &mut features)?;
-        let backbone::Features { stages, camera_tokens, layers, .. } = features;
+        // Gives the feature buffers back before the head takes its own.
+        let (stages, camera_tokens, layers) = features.into_parts();
         let mut scratch = head::Scratch::new(&self.gpu, &self.net, pixels, wants_rays)?;
         let mut views = Vec::with_capacity(wanted.len());
         for (view, stages) in stages.into_iter().enumerate().filter(|(view, _)| wanted.contains(view)) {
