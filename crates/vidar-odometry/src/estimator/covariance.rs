@@ -168,10 +168,7 @@ impl System {
 }
 
 /// Derivative of the tangent of `a_from_b` by the poses of a and b (rotation on the body side, position in the world).
-pub(crate) fn d_relative_d_poses(
-    world_from_a: &vidar_core::Se3,
-    world_from_b: &vidar_core::Se3,
-) -> SMatrix<f64, 6, 12> {
+pub(crate) fn d_relative_d_poses(world_from_a: &Se3, world_from_b: &Se3) -> SMatrix<f64, 6, 12> {
     let b_from_world = world_from_b.rotation.matrix().transpose();
     let b_from_a = b_from_world * world_from_a.rotation.matrix();
     let apart = world_from_b.translation - world_from_a.translation;

@@ -174,8 +174,7 @@ pub(crate) fn jacobians(
         [(9, &delta.by_gyro_bias, own_turn), (12, &delta.by_accel_bias, Matrix3::zeros())]
     {
         let (position, velocity) = (by.fixed_view::<3, 3>(3, 0), by.fixed_view::<3, 3>(6, 0));
-        let position =
-            position + velocity * after.secs - turned * hat(&after.position) * by_turn;
+        let position = position + velocity * after.secs - turned * hat(&after.position) * by_turn;
         let velocity = velocity - turned * hat(&after.velocity) * by_turn;
         put(&mut by_i, 3, col, -(before_turn * position));
         put(&mut by_i, 6, col, -(before_turn * velocity));
@@ -204,10 +203,11 @@ pub(crate) fn by_time_offset(
     let turn = q.log();
     let log_slope = So3::right_jacobian_inverse(&turn).unwrap_or_else(Matrix3::identity);
     let d_turn = last.turn - rest.turn.inverse() * first.turn;
-    let d_velocity = -first.force
-        + before.turn * (integrated.turn * last.force - first.turn.cross(&rest.velocity));
+    let d_velocity =
+        -first.force + before.turn * (integrated.turn * last.force - first.turn.cross(&rest.velocity));
     let d_rest_position = integrated.velocity + integrated.turn * (last.force * shift.end);
-    let d_position = first.force * shift.begin - first.force * rest.secs + before.velocity
+    let d_position = first.force * shift.begin - first.force * rest.secs
+        + before.velocity
         + before.turn * (d_rest_position - first.turn.cross(&rest.position));
     let mut by = Vector15::zeros();
     by.fixed_rows_mut::<3>(0).copy_from(&-(log_slope * (q.inverse() * d_turn)));

@@ -368,9 +368,10 @@ impl Smoother {
         let r = link.whitening.apply(&residual(&link.readings, &from.state, &to.state, shift));
         let (state_i, state_j) = (&system.states_at[k - 1], &system.states_at[k]);
         let (ji, jj) = jacobians(&link.readings, state_i, state_j, shift);
-        let by_offset = self.config.estimate_time_offset.then(|| {
-            link.whitening.apply(&by_time_offset(&link.readings, state_i, state_j, shift))
-        });
+        let by_offset = self
+            .config
+            .estimate_time_offset
+            .then(|| link.whitening.apply(&by_time_offset(&link.readings, state_i, state_j, shift)));
         let (ji, jj) = (link.whitening.apply(&ji), link.whitening.apply(&jj));
         let parts = [Part::Motion(k - 1), Part::Motion(k), Part::Pose(k - 1), Part::Pose(k)];
         for a in 0..4 {
@@ -446,12 +447,8 @@ impl Smoother {
     fn add_landmarks(&mut self, system: &mut System, lambda: f64) -> f64 {
         let places = std::mem::take(&mut system.places);
         let places_at = std::mem::take(&mut system.places_at);
-        let scene = Scene {
-            camera: &self.camera,
-            config: &self.config,
-            places: &places,
-            places_at: &places_at,
-        };
+        let scene =
+            Scene { camera: &self.camera, config: &self.config, places: &places, places_at: &places_at };
         let mut cost = 0.0;
         for (slot, landmark) in self.landmarks.iter_mut().enumerate() {
             if landmark.alive && !landmark.sightings.is_empty() {

@@ -12,7 +12,9 @@ use super::inertial::{anchor_at, body_velocity, by_time_offset, jacobians, resid
 use super::linearise::{Scene, System, calibration_weights, shift_between};
 use super::prior::Part;
 use super::visual;
-use super::window::{CALIBRATION_DIM, Landmark, OFFSET_AT, MAX_INVERSE_DISTANCE, MIN_INVERSE_DISTANCE, Sighting};
+use super::window::{
+    CALIBRATION_DIM, Landmark, MAX_INVERSE_DISTANCE, MIN_INVERSE_DISTANCE, OFFSET_AT, Sighting,
+};
 use super::{Linearisation, Smoother, SmootherError};
 use crate::imu::Vector15;
 use nalgebra::{SMatrix, SVector};
@@ -136,6 +138,14 @@ impl Smoother {
     /// A frame that the window does not hold.
     pub fn marginalise(&mut self, id: FrameId, departure: &mut Departure) -> Result<(), SmootherError> {
         let gone = self.index(id)?;
+        self.eliminate(gone, gone, departure);
+        self.remove_frame(gone, NextLink::InPrior);
+        Ok(())
+    }
+
+    /// Puts into the prior what is known through the pose of frame `gone` and the motion (velocity, biases) of frame
+    /// `motion`, which is the same or the one before.
+    pub(crate) fn eliminate(&mut self, gone: usize, motion: usize, departure: &mut Departure) {
         departure.rehosted.clear();
         departure.ended.clear();
         let mut system = std::mem::take(&mut self.system);
@@ -146,9 +156,9 @@ impl Smoother {
             self.relinearise_prior();
             self.place_cameras(&mut system);
             self.choose_leaving(gone, &mut bench);
-            self.lay_out(gone, &mut bench);
+            self.lay_out(gone, motion, &mut bench);
             self.stack_prior(&mut bench);
-            self.stack_frame(gone, &system, &mut bench);
+            self.stack_frame(gone, motion, &system, &mut bench);
             self.stack_landmarks(gone, &system, &mut bench);
             self.new_prior(gone, &mut bench);
             self.move_hosts(gone, &system, &bench, departure);
@@ -161,8 +171,6 @@ impl Smoother {
         }
         self.system = system;
         self.workbench = bench;
-        self.remove_frame(gone, NextLink::InPrior);
-        Ok(())
     }
 
     /// Unless first estimates are kept, the prior's linearisation points become the present states.
@@ -206,10 +214,10 @@ impl Smoother {
     }
 
     /// Columns: the leaving frame first, then everything it is tied to, in the order of frames, calibration last.
-    fn lay_out(&self, gone: usize, bench: &mut Workbench) {
+    fn lay_out(&self, gone: usize, motion: usize, bench: &mut Workbench) {
         bench.parts.clear();
         bench.insert(Part::Pose(gone));
-        bench.insert(Part::Motion(gone));
+        bench.insert(Part::Motion(motion));
         let mut tied = [0_u8; 64];
         let mut calibration = false;
         for part in &self.prior.parts {
@@ -219,8 +227,8 @@ impl Smoother {
                 Part::Calibration => calibration = true,
             }
         }
-        if self.frames[gone].link.is_some() && gone > 0 {
-            tied[gone - 1] = 3;
+        for k in [gone, motion].into_iter().filter(|&k| k > 0 && self.frames[k].link.is_some()) {
+            tied[k - 1] = 3;
             calibration |= self.config.estimate_time_offset;
         }
         if self.frames.get(gone + 1).is_some_and(|f| f.link.is_some()) {
@@ -233,7 +241,7 @@ impl Smoother {
         if self.frames.get(gone + 1).is_some_and(|f| f.rest.is_some()) {
             tied[gone + 1] |= 1;
         }
-        let mut rows = self.prior.rows + 2 * (15 + 6) + 15 + 3 + CALIBRATION_DIM;
+        let mut rows = self.prior.rows + 3 * (15 + 6) + 15 + 2 * 3 + CALIBRATION_DIM;
         for &(slot, leaving) in &bench.leaving {
             let landmark = &self.landmarks[slot];
             for s in landmark.sightings[..leaving].iter().filter(|s| self.frames[s.frame].keyframe) {
@@ -242,6 +250,9 @@ impl Smoother {
                 calibration |= self.config.calibrates_camera();
             }
             rows += 2;
+        }
+        if motion != gone {
+            bench.insert(Part::Motion(gone));
         }
         for k in (0..self.frames.len()).filter(|&k| k != gone) {
             if tied[k] & 1 != 0 {
@@ -300,8 +311,8 @@ impl Smoother {
     }
 
     /// Readings on both sides, anchor and standstill of the leaving frame, and the calibration's own prior.
-    fn stack_frame(&self, gone: usize, system: &System, bench: &mut Workbench) {
-        for k in [gone, gone + 1] {
+    fn stack_frame(&self, gone: usize, motion: usize, system: &System, bench: &mut Workbench) {
+        for k in motion..=gone + 1 {
             let Some(link) = self.frames.get(k).and_then(|f| f.link.as_ref()).filter(|_| k > 0) else {
                 continue;
             };
@@ -330,24 +341,26 @@ impl Smoother {
             bench.put(row, Part::Pose(k - 1), &ji, self.pose_step(k - 1));
             bench.put(row, Part::Pose(k), &jj, self.pose_step(k));
         }
-        if let Some(anchor) = self.anchor.as_ref().filter(|a| a.frame == gone) {
-            let state = &self.frames[gone].state;
-            let (r, j) = anchor_at(&anchor.reference, &anchor.sigmas, state, &system.states_at[gone]);
+        if let Some(anchor) = self.anchor.as_ref().filter(|a| a.frame == gone || a.frame == motion) {
+            let k = anchor.frame;
+            let state = &self.frames[k].state;
+            let (r, j) = anchor_at(&anchor.reference, &anchor.sigmas, state, &system.states_at[k]);
             let row = bench.stack.add_rows(15);
             bench.put_rhs(row, r.as_slice());
-            self.put_state(bench, row, gone, &j);
+            self.put_state(bench, row, k, &j);
         }
-        if let Some(sigma) = self.frames[gone].standstill_sigma {
-            let r = body_velocity(&self.frames[gone].state).0 / sigma;
-            let (_, by_rotation, by_velocity) = body_velocity(&system.states_at[gone]);
+        for k in motion..=gone {
+            let Some(sigma) = self.frames[k].standstill_sigma else { continue };
+            let r = body_velocity(&self.frames[k].state).0 / sigma;
+            let (_, by_rotation, by_velocity) = body_velocity(&system.states_at[k]);
             let mut by_pose = SMatrix::<f64, 3, 6>::zeros();
             by_pose.fixed_view_mut::<3, 3>(0, 0).copy_from(&(by_rotation / sigma));
             let mut by_motion = SMatrix::<f64, 3, 9>::zeros();
             by_motion.fixed_view_mut::<3, 3>(0, 0).copy_from(&(by_velocity / sigma));
             let row = bench.stack.add_rows(3);
             bench.put_rhs(row, r.as_slice());
-            bench.put(row, Part::Pose(gone), &by_pose, self.pose_step(gone));
-            bench.put(row, Part::Motion(gone), &by_motion, self.motion_step(gone));
+            bench.put(row, Part::Pose(k), &by_pose, self.pose_step(k));
+            bench.put(row, Part::Motion(k), &by_motion, self.motion_step(k));
         }
         if bench.column(Part::Calibration).is_some() && !self.calibration.in_prior {
             let weights = SVector::<f64, CALIBRATION_DIM>::from(calibration_weights(&self.config));
@@ -500,6 +513,12 @@ impl Smoother {
             landmark.rho = (landmark.rho / length).clamp(MIN_INVERSE_DISTANCE, MAX_INVERSE_DISTANCE);
             departure.rehosted.push(landmark.id);
         }
+    }
+
+    /// Removes the newest frame, which the prior speaks of no more.
+    pub(crate) fn remove_newest(&mut self) {
+        let gone = self.frames.len() - 1;
+        self.remove_frame(gone, NextLink::InPrior);
     }
 
     /// Removes a frame and every sighting in it; places in the window move up.

@@ -60,8 +60,8 @@ impl Smoother {
     }
 
     /// The newest frame, which rests on the one before ([`Smoother::add_rest`]), becomes one with it: what its readings
-    /// say of biases and inclination goes into the prior, and the frame before takes its time. A rest of any length is
-    /// held by two frames this way. Its name; `None` when the newest frame does not rest.
+    /// say of biases and inclination goes into the prior, and the frame before takes its time, velocity and biases (which
+    /// walked on while the body rested). A rest of any length is held by two frames this way. Its name; `None` when the newest frame does not rest.
     ///
     /// # Errors
     /// None that an own frame could cause.
@@ -70,13 +70,37 @@ impl Smoother {
         if newest.rest.is_none() {
             return Ok(None);
         }
-        let (id, time, clock_secs, stays) = (newest.id, newest.time, newest.clock_secs, before.id);
-        self.marginalise(id, departure)?;
+        let (time, clock_secs, stays) = (newest.time, newest.clock_secs, before.id);
+        let gone = self.frames.len() - 1;
+        self.eliminate(gone, gone - 1, departure);
+        self.inherit_motion(gone);
+        self.remove_newest();
         if let Some(frame) = self.frames.last_mut() {
             frame.time = time;
             frame.clock_secs = clock_secs;
         }
         Ok(Some(stays))
+    }
+
+    /// The frame before `gone` has the motion of `gone` from now on, in the prior too; all that was said of its own motion
+    /// is in the prior.
+    fn inherit_motion(&mut self, gone: usize) {
+        let (left, right) = self.frames.split_at_mut(gone);
+        let (Some(before), Some(newest)) = (left.last_mut(), right.first()) else { return };
+        for (to, from) in [(&mut before.state, &newest.state), (&mut before.linearised, &newest.linearised)] {
+            to.velocity = from.velocity;
+            to.bias = from.bias;
+        }
+        before.step.fixed_rows_mut::<9>(6).copy_from(&newest.step.fixed_rows::<9>(6));
+        before.motion_in_prior = newest.motion_in_prior;
+        before.standstill_sigma = None;
+        self.spare.extend(before.link.take().map(|link| link.readings));
+        self.anchor = self.anchor.filter(|a| a.frame + 1 != gone);
+        for part in &mut self.prior.parts {
+            if *part == Part::Motion(gone) {
+                *part = Part::Motion(gone - 1);
+            }
+        }
     }
 
     pub(crate) fn add_rest_factor(&self, system: &mut System, k: usize) -> f64 {

@@ -193,12 +193,7 @@ impl Landmark {
 
     /// A landmark without memory, to stand in for another for a moment.
     pub(crate) fn placeholder() -> Self {
-        let host = Sighting {
-            frame: 0,
-            pixel: Vector2::zeros(),
-            whitening: Matrix2::identity(),
-            chi2: 0.0,
-        };
+        let host = Sighting { frame: 0, pixel: Vector2::zeros(), whitening: Matrix2::identity(), chi2: 0.0 };
         Self {
             id: LandmarkId(0),
             alive: false,

@@ -69,6 +69,13 @@ pub enum StepOutput {
     Running(NavState),
 }
 
+/// Standard deviations of a resting body's velocity, m/s, and motion from frame to frame, m and rad; after this long its
+/// readings go into the prior, s.
+const REST_SIGMA_MPS: f64 = 0.01;
+const REST_SIGMA_M: f64 = 5e-4;
+const REST_SIGMA_RAD: f64 = 2e-4;
+const REST_FOLD_SECS: f64 = 1.0;
+
 /// See the module's head.
 #[derive(Clone, Debug)]
 pub struct FeatureOdometry {
@@ -82,6 +89,10 @@ pub struct FeatureOdometry {
     tracks: FxHashMap<LandmarkId, Vec<(FrameId, Seen)>>,
     banned: FxHashSet<LandmarkId>,
     since_keyframe: usize,
+    /// Whether the frame that comes is told to rest.
+    resting: bool,
+    /// The frame since which the body rests, and the time from which its readings are not in the prior yet.
+    rest: Option<(FrameId, Timestamp)>,
     last_time: Option<Timestamp>,
     report: OptimiseReport,
     departure: Departure,
@@ -114,6 +125,8 @@ impl FeatureOdometry {
             tracks: FxHashMap::default(),
             banned: FxHashSet::default(),
             since_keyframe: 0,
+            resting: false,
+            rest: None,
             last_time: None,
             report: OptimiseReport::default(),
             departure: Departure::default(),
@@ -196,6 +209,22 @@ impl FeatureOdometry {
         }
     }
 
+    /// As [`FeatureOdometry::push`] for a frame of which it is known that the body stands still.
+    ///
+    /// # Errors
+    /// As [`FeatureOdometry::push`].
+    pub fn push_resting(
+        &mut self,
+        id: FrameId,
+        time: Timestamp,
+        seen: &[Seen],
+    ) -> Result<StepOutput, SmootherError> {
+        self.resting = true;
+        let output = self.push(id, time, seen);
+        self.resting = false;
+        output
+    }
+
     fn readings_until(&mut self, time: Timestamp, bias: Bias) -> Option<Preintegration> {
         let mut cut = std::mem::take(&mut self.scratch);
         let covered = self.last_time.and_then(|from| self.buffer.interval(from, time, &mut cut).ok());
@@ -259,6 +288,12 @@ impl FeatureOdometry {
         let last = smoother.newest().map_or(NavState::REST, |(.., s)| *s);
         let predicted = readings.as_ref().map_or(last, |r| r.predict(&last));
         smoother.add_frame(id, time, predicted, readings)?;
+        if self.resting {
+            smoother.add_standstill(id, REST_SIGMA_MPS)?;
+            if self.rest.is_some() {
+                smoother.add_rest(id, REST_SIGMA_M, REST_SIGMA_RAD)?;
+            }
+        }
         self.remember(id, seen);
         let mut tracked = 0;
         for s in seen {
@@ -271,14 +306,45 @@ impl FeatureOdometry {
         smoother.optimise_into(self.config.iterations, &mut self.report);
         self.leave_out(smoother);
         self.since_keyframe += 1;
-        if self.since_keyframe >= self.config.keyframe_every || tracked < 40 {
+        let is_due = match self.resting {
+            // The first frame of a rest stands for all of it.
+            true => self.rest.is_none(),
+            false => self.since_keyframe >= self.config.keyframe_every || tracked < 40,
+        };
+        if is_due {
             smoother.mark_keyframe(id)?;
             self.since_keyframe = 0;
             self.add_landmarks(smoother, id, seen)?;
         }
         let state = smoother.newest().map_or(predicted, |(.., s)| *s);
+        self.rest_or_move(smoother, id, time)?;
         self.trim(smoother)?;
         Ok(state)
+    }
+
+    /// Holds a rest of any length by its first frame and the newest one.
+    fn rest_or_move(
+        &mut self,
+        smoother: &mut Smoother,
+        id: FrameId,
+        time: Timestamp,
+    ) -> Result<(), SmootherError> {
+        self.rest = match self.rest {
+            _ if !self.resting => None,
+            None => Some((id, time)),
+            Some((first, folded)) => {
+                let between = smoother.frames().rev().nth(1);
+                if let Some(between) = between.filter(|b| *b != first) {
+                    smoother.drop_frame(between, &mut self.departure)?;
+                }
+                let is_long = (time - folded).as_secs_f64() >= REST_FOLD_SECS;
+                if is_long {
+                    smoother.rest_in_place(&mut self.departure)?;
+                }
+                Some((first, if is_long { time } else { folded }))
+            }
+        };
+        Ok(())
     }
 
     fn remember(&mut self, id: FrameId, seen: &[Seen]) {
@@ -372,12 +438,7 @@ impl FeatureOdometry {
 }
 
 fn observation(frame: FrameId, seen: &Seen) -> Observation {
-    Observation {
-        frame,
-        landmark: seen.landmark,
-        pixel: seen.pixel,
-        covariance: seen.covariance,
-    }
+    Observation { frame, landmark: seen.landmark, pixel: seen.pixel, covariance: seen.covariance }
 }
 
 /// Distance along the first ray of the point nearest to both rays, if their angle is wide enough and it lies ahead.

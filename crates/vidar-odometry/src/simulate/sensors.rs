@@ -94,6 +94,9 @@ pub struct Simulation {
     pub biases: Vec<Bias>,
     /// Frames.
     pub frames: Vec<SimulatedFrame>,
+    /// Points in the world, and of every track the number of its point.
+    points: Vec<Vector3<f64>>,
+    point_of: Vec<usize>,
 }
 
 /// Nanoseconds of the first stamp: like real recordings, far from zero.
@@ -128,7 +131,7 @@ impl Simulation {
         let points = scatter_points(flight, config, &mut random);
         let (camera, body_from_camera) = (Self::camera(), Self::body_from_camera());
         let frames = (secs * config.camera_rate_hz + 1e-6).floor() as usize;
-        let mut tracker = Tracker { names: vec![None; points.len()], next: 0 };
+        let mut tracker = Tracker { names: vec![None; points.len()], point_of: Vec::new() };
         let mut all = Vec::with_capacity(frames);
         for k in 0..frames {
             let at = k as f64 / config.camera_rate_hz;
@@ -140,7 +143,13 @@ impl Simulation {
             let seen = tracker.look(&points, &camera, &camera_from_world, config, &mut random);
             all.push(SimulatedFrame { id: FrameId(k as u32), time: stamp(at), truth, seen });
         }
-        Self { camera, body_from_camera, readings, biases, frames: all }
+        let point_of = tracker.point_of;
+        Self { camera, body_from_camera, readings, biases, frames: all, points, point_of }
+    }
+
+    /// Where the point of a track is in the world, m.
+    pub fn point(&self, track: LandmarkId) -> Option<Vector3<f64>> {
+        self.points.get(*self.point_of.get(track.index())?).copied()
     }
 }
 
@@ -220,7 +229,8 @@ fn scatter_points(flight: &impl Flight, config: &SimulationConfig, random: &mut 
 /// Gives tracks their names.
 struct Tracker {
     names: Vec<Option<LandmarkId>>,
-    next: u32,
+    /// Points of all names given so far.
+    point_of: Vec<usize>,
 }
 
 impl Tracker {
@@ -258,8 +268,8 @@ impl Tracker {
         while seen.len() < config.tracks && !fresh.is_empty() {
             let pick = ((random.uniform() * fresh.len() as f64) as usize).min(fresh.len() - 1);
             let (k, pixel) = fresh.swap_remove(pick);
-            let name = LandmarkId(self.next);
-            self.next += 1;
+            let name = LandmarkId(self.point_of.len() as u32);
+            self.point_of.push(k);
             self.names[k] = Some(name);
             seen.push((name, pixel));
         }
