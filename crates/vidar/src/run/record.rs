@@ -31,7 +31,7 @@ const DEGRADING: &[&str] = &[
     "image-missing",
     "chunk-failed",
     "chunk-not-placed",
-    "memory-budget",
+    "fusion-memory-budget",
     "no-parallax",
     "depth-unreadable",
     "not-judged",
