@@ -22,7 +22,7 @@ impl From<PosedFrame> for Keyframe {
 /// Chooses keyframes where no pose tells motion: one every `keyframes.unposed_interval_secs`.
 pub fn select_by_time(images: &[ImageEntry], config: &KeyframeConfig) -> Vec<Keyframe> {
     let mut interval = Duration::from_secs_f64(config.unposed_interval_secs);
-    let chosen = loop {
+    loop {
         let mut chosen: Vec<Keyframe> = Vec::new();
         for image in images {
             if chosen.last().is_none_or(|last| image.time - last.image.time >= interval) {
@@ -30,11 +30,10 @@ pub fn select_by_time(images: &[ImageEntry], config: &KeyframeConfig) -> Vec<Key
             }
         }
         if config.max_count == 0 || chosen.len() <= config.max_count {
-            break chosen;
+            return chosen;
         }
         interval = Duration::from_secs_f64(interval.as_secs_f64() * 1.1);
-    };
-    chosen
+    }
 }
 
 /// A frame with its metric pose.

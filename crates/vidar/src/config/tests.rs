@@ -33,7 +33,12 @@ fn later_layers_win_and_every_value_knows_its_origin() {
     let config = layered.build().unwrap();
     assert_eq!(
         config.keyframes,
-        KeyframeConfig { min_translation_m: 0.5, min_rotation_deg: 4.0, max_count: 12 }
+        KeyframeConfig {
+            min_translation_m: 0.5,
+            min_rotation_deg: 4.0,
+            max_count: 12,
+            ..KeyframeConfig::default()
+        }
     );
     let origin = |key: &str| layered.entries().into_iter().find(|(k, _, _)| k == key).unwrap().2;
     assert_eq!(origin("keyframes.min_translation_m"), Origin::File(file));
