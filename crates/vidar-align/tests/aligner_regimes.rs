@@ -3,7 +3,7 @@
 //! Three laps of a room; revisits are found by descriptors, answered by loop chunks of the model, some of which put the
 //! two sides together falsely. No number here forecasts real data; what is claimed is the order.
 
-#![allow(clippy::unwrap_used)] // helpers of tests are test code, though not marked so
+#![allow(clippy::unwrap_used, clippy::print_stderr)] // helpers of tests are test code, though not marked so
 
 mod flat;
 
@@ -94,6 +94,7 @@ fn the_coupled_world_is_at_least_as_good_as_the_better_of_the_papers_two_in_ever
             "odometry x{drift}, {false_share} of loops false: pose-conditioned {conditioned:.3} m, hybrid {hybrid:.3} m, \
              coupled {coupled:.3} m"
         );
+        eprintln!("{shown}");
         assert!(coupled <= conditioned.min(hybrid), "{shown}");
     }
 }
@@ -140,4 +141,44 @@ fn a_loop_can_be_measured_without_asking_the_model_again() {
     }
     assert!(accepted * 2 >= candidates.len(), "{accepted} of {}", candidates.len());
     assert!(machine.loop_candidates().len() < candidates.len());
+}
+
+#[test]
+fn old_frames_within_a_chunk_close_the_loop_without_a_loop_chunk() {
+    let truth = laps(64, 2.0);
+    let error = |takes_old_frames: bool, seed: u64| {
+        let odometry = drifting(&truth, 4.0, &mut Noise::new(300 + seed));
+        let mut noise = Noise::new(seed);
+        let mut config = AlignerConfig::default();
+        config.graph.odometry_per_metre *= 4.0;
+        config.graph.odometry_rotation_deg *= 4.0;
+        let mut machine = Aligner::new(CouplingMode::Coupled, &config).unwrap();
+        for (k, range) in chunk_ranges(64, 12, 4).unwrap().into_iter().enumerate() {
+            let mut frames: Vec<usize> = range.frames.clone().collect();
+            if takes_old_frames && range.frames.start >= 36 {
+                // The same places one lap before.
+                let old = range.frames.start - 32;
+                frames.splice(0..0, old..old + 4);
+            }
+            let prediction = predict_frames(&truth, &frames, k as u32, REAL, &mut noise);
+            machine.push(observe(prediction, Some(&odometry), none)).unwrap();
+        }
+        let placement = machine.finish();
+        assert_eq!(placement.views.len(), 64);
+        let owners: Vec<u32> = placement.views.iter().map(|v| v.owner.0).collect();
+        assert!(
+            owners.windows(2).all(|o| o[0] <= o[1]),
+            "a frame that comes back keeps its owner: {owners:?}"
+        );
+        let (placed, exact): (Vec<_>, Vec<_>) = placement
+            .views
+            .iter()
+            .map(|v| (v.world_from_camera.translation, truth[v.frame_id.index()].translation))
+            .unzip();
+        let fit = umeyama_se3(&placed, &exact).unwrap();
+        placed.iter().zip(&exact).map(|(p, e)| (fit.act(p) - e).norm_squared()).sum::<f64>().sqrt()
+    };
+    let sum = |takes: bool| (0..4).map(|seed| error(takes, seed)).sum::<f64>();
+    let (without, with) = (sum(false), sum(true));
+    assert!(with < without, "{with} with, {without} without");
 }

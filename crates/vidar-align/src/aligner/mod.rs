@@ -104,6 +104,8 @@ struct Previous {
     full: Vec<ViewGeometry>,
 }
 
+/// Chunks this far apart or further share a frame only because it came back.
+const NEIGHBOURS: usize = 3;
 /// Rotations of a chunk this far (rad, RMS) from their anchors' say that one of the two is wrong.
 const GROSS_ROTATION_RAD: f64 = 0.14;
 /// Centres this far from their anchors, as a share of the chunk's own radius, say the same.
@@ -169,7 +171,8 @@ impl Aligner {
         }
         let pairs = chunk.pairs(&self.frames);
         self.judge(&mut chunk, &pairs);
-        if self.mode.chains() && chunk.is_usable() {
+        // The reference knows no such chunks.
+        if self.mode.chains() && self.mode != CouplingMode::Da3Streaming && chunk.is_usable() {
             chunk.revisits = self.revisits(&chunk);
         }
         let report = self.report(&chunk, &pairs);
@@ -275,8 +278,11 @@ impl Aligner {
 
     /// Older chunks that hold some of the chunk's frames: a loop closed within an ordinary chunk.
     fn revisits(&self, chunk: &Chunk) -> Vec<Tie> {
-        let older =
-            self.chunks.iter().enumerate().filter(|(k, c)| *k != self.previous.chunk && c.is_usable());
+        // Next neighbours share frames when overlaps are long; their chain of ties says the same already.
+        let distant = self.chunks.len().saturating_sub(NEIGHBOURS - 1);
+        let tied = chunk.tie.as_ref().map(|t| t.to);
+        let older = self.chunks.iter().take(distant).enumerate();
+        let older = older.filter(|(k, c)| Some(*k) != tied && c.is_usable());
         older
             .filter_map(|(k, c)| tie::revisit(&c.views, &chunk.views, k, &self.config))
             .filter(|t| t.fit.inlier_ratio > self.config.loops.min_inlier_ratio)

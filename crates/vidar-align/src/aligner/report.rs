@@ -124,7 +124,8 @@ pub struct ChunkPlacement {
 pub struct ViewPlacement {
     /// Which frame.
     pub frame_id: FrameId,
-    /// The chunk whose depth is to be used for it: the last usable one that holds it.
+    /// The chunk whose depth is to be used for it: the later of neighbours that hold it, if it is usable. A frame that comes
+    /// back in a distant chunk keeps its owner.
     pub owner: ChunkId,
     /// Its pose, m.
     pub world_from_camera: Se3,

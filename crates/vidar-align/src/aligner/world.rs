@@ -5,7 +5,7 @@ use super::coupled::coupled;
 use super::loops::MeasuredLoop;
 use super::memory::Chunk;
 use super::report::{ChunkPlacement, DriftReport, Guard, GuardCounts, KeyframePlacement, ViewPlacement};
-use super::{Aligner, CouplingMode, GraphReport, LoopReport, Placement};
+use super::{Aligner, CouplingMode, GraphReport, LoopReport, NEIGHBOURS, Placement};
 use crate::Verdict;
 use nalgebra::Vector3;
 use std::collections::BTreeMap;
@@ -144,10 +144,17 @@ fn assemble(machine: &Aligner, world: World) -> Placement {
         log_scale_std: if world.is_metric { *std } else { f64::INFINITY },
     });
     let mut views: BTreeMap<FrameId, ViewPlacement> = BTreeMap::new();
-    for (chunk, place) in machine.chunks.iter().zip(&world.chunks) {
+    let mut owners: BTreeMap<FrameId, usize> = BTreeMap::new();
+    for (k, (chunk, place)) in machine.chunks.iter().zip(&world.chunks).enumerate() {
         let Some(place) = place else { continue };
-        // A later chunk takes over: it has seen what comes after.
+        // The later of two neighbours takes over: it has seen what comes after. A frame that came back much later stays
+        // where it was, and so does what was fused of it.
         for view in &chunk.views {
+            let owner = owners.entry(view.frame_id).or_insert(k);
+            if k - *owner >= NEIGHBOURS {
+                continue;
+            }
+            *owner = k;
             let chained = place.transform_pose(&view.chunk_from_camera);
             let placed = ViewPlacement {
                 frame_id: view.frame_id,
