@@ -12,8 +12,8 @@ use vidar_core::{FrameId, ImuNoise, LieGroup, Se3, So3};
 use vidar_odometry::estimator::{AnchorSigmas, Smoother};
 use vidar_odometry::imu::{Bias, NavState};
 use vidar_odometry::simulate::{
-    Course, CourseKind, FeatureOdometry, FeatureOdometryConfig, Random, Simulation, SimulationConfig,
-    StepOutput,
+    Course, CourseKind, FeatureOdometry, FeatureOdometryConfig, Flight, Motion, Random, Simulation,
+    SimulationConfig, StepOutput,
 };
 
 const SIGMAS: AnchorSigmas = AnchorSigmas {
@@ -125,6 +125,7 @@ struct Calibrated {
     /// Error of the camera's rotation, degrees, and over its standard deviation (3 degrees of freedom), squared.
     turn_error_deg: f64,
     turn_nees: f64,
+    turn_sigma_deg: f64,
     velocity_error_mps: f64,
 }
 
@@ -163,6 +164,7 @@ fn calibrate(seed: u64, secs: f64, tracks: usize, offset_secs: f64, turn_deg: f6
         offset_error_secs,
         offset_normalised: offset_error_secs / sigmas[6],
         turn_error_deg: turn.norm().to_degrees(),
+        turn_sigma_deg: sigmas[..3].iter().fold(0.0_f64, |most, s| most.max(*s)).to_degrees(),
         turn_nees: (0..3).map(|k| (turn[k] / sigmas[k]).powi(2)).sum(),
         velocity_error_mps,
     }
@@ -188,7 +190,11 @@ fn judge_clocks(runs: &[Calibrated]) {
 fn judge_turns(runs: &[Calibrated]) {
     let worst = runs.iter().map(|r| r.turn_error_deg).fold(0.0, f64::max);
     let nees = mean(runs.iter().map(|r| r.turn_nees)) / 3.0;
-    println!("{} cameras: worst rotation left {worst:.3} deg, NEES per dimension {nees:.2}", runs.len());
+    let sigma = runs.iter().map(|r| r.turn_sigma_deg).fold(0.0, f64::max);
+    println!(
+        "{} cameras: worst rotation left {worst:.3} deg, largest sigma {sigma:.3}, NEES per dimension {nees:.2}",
+        runs.len()
+    );
     assert!(worst < 0.2, "{worst:.3} deg left");
     assert!((0.3..3.0).contains(&nees), "{nees:.2}");
 }
@@ -197,13 +203,13 @@ fn judge_turns(runs: &[Calibrated]) {
 fn clocks_that_are_off_by_up_to_20_ms_are_set_within_a_millisecond() {
     let offsets = [-0.02, -0.01, 0.0, 0.003, 0.01, 0.02];
     let runs: Vec<Calibrated> =
-        offsets.iter().zip(0..).map(|(offset, seed)| calibrate(seed, 5.0, 40, *offset, 0.0)).collect();
+        offsets.iter().zip(0..).map(|(offset, seed)| calibrate(seed, 8.0, 70, *offset, 0.0)).collect();
     judge_clocks(&runs);
 }
 
 #[test]
 fn cameras_that_are_turned_by_two_degrees_are_set_right_with_their_clocks() {
-    let runs: Vec<Calibrated> = (0..4).map(|seed| calibrate(seed, 5.0, 40, 0.005, 2.0)).collect();
+    let runs: Vec<Calibrated> = (0..4).map(|seed| calibrate(seed, 8.0, 70, 0.005, 2.0)).collect();
     judge_turns(&runs);
     judge_clocks(&runs);
 }
@@ -217,4 +223,123 @@ fn clocks_and_cameras_are_set_right_over_50_long_flights() {
     let both: Vec<Calibrated> = (0..50).map(|seed| calibrate(seed, 20.0, 110, offset(seed), 2.0)).collect();
     judge_turns(&both);
     judge_clocks(&both);
+}
+
+/// A flight that pauses: its own time slows down to a halt within a second, rests, and goes on.
+struct Paused {
+    flight: Course,
+    from_secs: f64,
+    rest_secs: f64,
+}
+
+impl Paused {
+    /// Time of the flight and its first two derivatives.
+    fn time(&self, t: f64) -> [f64; 3] {
+        // τ' falls from 1 to 0 as (1 + cos πx)/2 over a second, which takes half a second of the flight's time.
+        let pi = std::f64::consts::PI;
+        let slow = |x: f64| {
+            [0.5 * (x + (pi * x).sin() / pi), 0.5 * (1.0 + (pi * x).cos()), -0.5 * pi * (pi * x).sin()]
+        };
+        let (begin, end) = (self.from_secs, self.from_secs + 1.0 + self.rest_secs);
+        if t < begin {
+            [t, 1.0, 0.0]
+        } else if t < begin + 1.0 {
+            let [tau, rate, change] = slow(t - begin);
+            [begin + tau, rate, change]
+        } else if t < end {
+            [begin + 0.5, 0.0, 0.0]
+        } else if t < end + 1.0 {
+            let [tau, rate, change] = slow(1.0 - (t - end));
+            [begin + 1.0 - tau, rate, -change]
+        } else {
+            [begin + 1.0 + t - end - 1.0, 1.0, 0.0]
+        }
+    }
+}
+
+impl Flight for Paused {
+    fn motion(&self, secs: f64) -> Motion {
+        let [tau, rate, change] = self.time(secs);
+        let motion = self.flight.motion(tau);
+        Motion {
+            velocity: motion.velocity * rate,
+            acceleration: motion.acceleration * (rate * rate) + motion.velocity * change,
+            angular_rate: motion.angular_rate * rate,
+            ..motion
+        }
+    }
+
+    fn duration_secs(&self) -> f64 {
+        self.flight.secs + self.rest_secs
+    }
+}
+
+/// Rests in the middle of a flight: drift while resting, m, and normalised squared errors, per dimension, of pose and
+/// biases at the end of the rest and of the pose two seconds later relative to the rest.
+fn pause(seed: u64, rest_secs: f64) -> (f64, [f64; 3]) {
+    let flight = Course { kind: CourseKind::Eight, secs: 8.0, speed: 1.2, phase: 0.37 * seed as f64 };
+    let paused = Paused { flight, from_secs: 4.0, rest_secs };
+    let settings = SimulationConfig { seed, tracks: 60, ..SimulationConfig::default() };
+    let simulation = Simulation::new(&paused, 0.0, 4.0 + 1.0 + rest_secs + 3.0, &settings);
+    let config = FeatureOdometryConfig::new(&ImuNoise::EUROC, 1.0);
+    let mut odometry = FeatureOdometry::for_simulation(config, &simulation).unwrap();
+    let mut random = Random::new(11_000 + seed);
+    let first = &simulation.frames[0];
+    odometry.start_at(first, disturbed(&first.truth, &mut random), SIGMAS).unwrap();
+    let (mut at_rest, mut drift) = (None, 0.0_f64);
+    let mut nees = [f64::NAN; 3];
+    for (k, frame) in simulation.frames.iter().enumerate().skip(1) {
+        let secs = k as f64 / settings.camera_rate_hz;
+        // Known after a moment, as in truth.
+        let rests = (5.4..5.0 + rest_secs).contains(&secs);
+        let push = if rests { FeatureOdometry::push_resting } else { FeatureOdometry::push };
+        let StepOutput::Running(state) = push(&mut odometry, frame.id, frame.time, &frame.seen).unwrap()
+        else {
+            panic!("it was started");
+        };
+        let smoother = odometry.smoother().unwrap();
+        if rests {
+            let place = state.world_from_body.translation;
+            drift = drift.max((place - *at_rest.get_or_insert(place)).norm());
+        }
+        let normalised = |smoother: &mut Smoother, from: usize, n: usize| {
+            let (id, _, state) = smoother.newest().map(|(id, t, s)| (id, t, *s)).unwrap();
+            let error = state.minus(&frame.truth).rows(from, n).into_owned();
+            let covariance = smoother.covariance(id).unwrap().view((from, from), (n, n)).into_owned();
+            error.dot(&covariance.cholesky().unwrap().solve(&error)) / n as f64
+        };
+        if (secs - (4.9 + rest_secs)).abs() < 1e-6 {
+            nees[0] = normalised(smoother, 0, 6);
+            nees[1] = normalised(smoother, 9, 6);
+        }
+        if (secs - (7.5 + rest_secs)).abs() < 1e-6 {
+            nees[2] = normalised(smoother, 0, 6);
+        }
+    }
+    (drift, nees)
+}
+
+fn judge_pauses(count: u64, rest_secs: f64) {
+    let runs: Vec<(f64, [f64; 3])> = (0..count).map(|seed| pause(seed, rest_secs)).collect();
+    let drift = runs.iter().map(|r| r.0).fold(0.0, f64::max);
+    let [pose, bias, later] = std::array::from_fn(|k| mean(runs.iter().map(|r| r.1[k])));
+    println!(
+        "{count} rests of {rest_secs} s: drift at most {:.2} mm; per dimension NEES of the pose {pose:.2}, of biases {bias:.2}, of the pose after moving on {later:.2}",
+        drift * 1e3
+    );
+    assert!(drift < 0.02, "{drift} m");
+    for (what, nees) in [("pose", pose), ("biases", bias), ("pose later", later)] {
+        assert!(nees < 2.5, "{what}: NEES per dimension {nees:.2}");
+    }
+}
+
+#[test]
+fn a_rest_of_a_minute_drifts_by_less_than_two_centimetres() {
+    judge_pauses(2, 60.0);
+}
+
+#[test]
+#[ignore = "long: 20 rests of a minute"]
+fn rests_of_a_minute_are_honest_over_20_runs() {
+    judge_pauses(20, 60.0);
 }
