@@ -11,7 +11,8 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex};
 use vidar_core::Image;
 use vidar_da3::config::json;
-use vidar_da3::gpu::{GpuError, adapters, memory_plan};
+use vidar_da3::gpu::{GpuError, MemoryPlan, adapters, memory_plan};
+use vidar_da3::preprocess::PreprocessConfig;
 use vidar_da3::weights::DeterministicWeights;
 use vidar_da3::weights::inventory::parameters;
 use vidar_da3::{Da3, Da3Error, Da3Options, Device, Hooks, InferOptions, Inputs, Precision};
@@ -30,6 +31,18 @@ fn pictures(views: usize) -> Vec<Image<[u8; 3]>> {
     (0..views)
         .map(|v| Image::from_fn(84, 56, |x, y| [(3 * x + 20 * v) as u8, (5 * y) as u8, (x * y) as u8]))
         .collect()
+}
+
+/// Small pictures' size on the network's side: rows and columns.
+const SIZE: (usize, usize) = (56, 84);
+
+fn small() -> InferOptions {
+    let preprocess = PreprocessConfig { process_size_px: SIZE.1, ..PreprocessConfig::default() };
+    InferOptions { preprocess, ..InferOptions::default() }
+}
+
+fn plan(model: &Da3, views: usize, wants_rays: bool) -> MemoryPlan {
+    memory_plan(model.config(), (views, SIZE.0, SIZE.1), wants_rays)
 }
 
 /// Remembers what was asked for.
@@ -68,14 +81,14 @@ fn a_run_holds_no_more_device_memory_than_planned_and_gives_it_back() {
     let gpu = model.gpu().unwrap();
     let weights = gpu.held_bytes();
     for (views, wants_rays) in [(1, false), (5, false), (3, true)] {
-        let plan = memory_plan(model.config(), (views, 336, 504), wants_rays);
-        assert!(weights <= plan.weights + (64 << 10), "{weights} of {plan:?}");
+        let planned = plan(&model, views, wants_rays);
+        assert!(weights <= planned.weights + (64 << 10), "{weights} of {planned:?}");
         gpu.reset_peak();
-        let infer = InferOptions { wants_rays, ..InferOptions::default() };
+        let infer = InferOptions { wants_rays, ..small() };
         model.infer(&Inputs::images(&pictures(views)), &infer).unwrap();
         let peak = gpu.peak_bytes() - weights;
-        eprintln!("{views} views: peak {peak}, planned {}", plan.working);
-        assert!(peak <= plan.working && 2 * peak > plan.working, "peak {peak} of {plan:?}");
+        eprintln!("{views} views: peak {peak}, planned {}", planned.working);
+        assert!(peak <= planned.working && 2 * peak > planned.working, "peak {peak} of {planned:?}");
         assert_eq!(gpu.held_bytes(), weights);
     }
 }
@@ -85,14 +98,17 @@ fn a_run_that_may_not_hold_its_memory_is_refused_before_it_starts() {
     let Some(options) = any_device() else { return };
     let model = Da3::deterministic_of(tiny_config(), &options).unwrap();
     let weights = model.gpu().unwrap().held_bytes();
-    let plan = memory_plan(model.config(), (4, 336, 504), false);
+    let (one, twelve) = (plan(&model, 1, false), plan(&model, 12, false));
     drop(model);
-    let tight = Da3Options { max_device_bytes: Some(weights + plan.working / 2), ..options };
+    let tight = Da3Options {
+        max_device_bytes: Some(weights + u64::midpoint(one.working, twelve.working)),
+        ..options
+    };
     let model = Da3::deterministic_of(tiny_config(), &tight).unwrap();
-    let said = model.infer(&Inputs::images(&pictures(4)), &InferOptions::default()).err().unwrap();
+    let said = model.infer(&Inputs::images(&pictures(12)), &small()).err().unwrap();
     assert!(matches!(said, Da3Error::Gpu(GpuError::OverBudget { .. })), "{said}");
     // Fewer views still run.
-    model.infer(&Inputs::images(&pictures(1)), &InferOptions::default()).unwrap();
+    model.infer(&Inputs::images(&pictures(1)), &small()).unwrap();
 }
 
 #[test]
@@ -102,11 +118,11 @@ fn a_run_on_a_device_stops_when_asked_to() {
     let asked = AtomicUsize::new(0);
     let cancel = || asked.fetch_add(1, Ordering::Relaxed) >= 6;
     let hooks = Hooks { cancel: &cancel, trace: None };
-    let said = model.infer_with(&Inputs::images(&pictures(3)), &InferOptions::default(), &hooks);
+    let said = model.infer_with(&Inputs::images(&pictures(3)), &small(), &hooks);
     assert!(matches!(said, Err(Da3Error::Cancelled)));
     assert!(asked.load(Ordering::Relaxed) < 10);
     // The next run is as if nothing had been.
-    model.infer(&Inputs::images(&pictures(3)), &InferOptions::default()).unwrap();
+    model.infer(&Inputs::images(&pictures(3)), &small()).unwrap();
 }
 
 #[test]
@@ -114,7 +130,7 @@ fn two_models_on_one_device_answer_as_each_alone() {
     let Some(options) = any_device() else { return };
     let model = Da3::deterministic_of(tiny_config(), &options).unwrap();
     let run = |views: usize| {
-        let answer = model.infer(&Inputs::images(&pictures(views)), &InferOptions::default()).unwrap();
+        let answer = model.infer(&Inputs::images(&pictures(views)), &small()).unwrap();
         answer.depth.iter().flat_map(|d| d.data().to_vec()).map(f32::to_bits).collect::<Vec<_>>()
     };
     let alone = (run(2), run(3));
