@@ -100,6 +100,8 @@ pub struct CheckArgs {
 /// Precision of matrix products.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 pub enum PrecisionArg {
+    /// Brain floats of 16 bits where the processor multiplies them, 32 bits elsewhere.
+    Auto,
     /// 32 bits.
     F32,
     /// Three products of 16 bits, close to 32.
@@ -161,7 +163,7 @@ pub struct DepthArgs {
     #[command(flatten)]
     pub licence: LicenceArgs,
     /// Precision of the backbone.
-    #[arg(long, value_enum, default_value_t = PrecisionArg::F32, help_heading = "Model")]
+    #[arg(long, value_enum, default_value_t = PrecisionArg::Auto, help_heading = "Model")]
     pub precision: PrecisionArg,
     /// Length of the bounding side of what the network sees, pixels.
     #[arg(long, default_value_t = 504, help_heading = "Model")]

@@ -198,6 +198,7 @@ fn locate(name: Option<&str>, context: &Context) -> Outcome {
 /// How the network computes.
 pub fn precision(arg: PrecisionArg) -> da3::Precision {
     match arg {
+        PrecisionArg::Auto => da3::Precision::Auto,
         PrecisionArg::F32 => da3::Precision::F32,
         PrecisionArg::F32Split => da3::Precision::F32Split,
         PrecisionArg::Bf16 => da3::Precision::Bf16,

@@ -145,7 +145,8 @@ fn streaming_folder(chunks: &Path, into: &Path) {
     let mut poses = String::new();
     for i in 0..n {
         let image = |v: &[f64]| v[i * h * w..(i + 1) * h * w].iter().map(|v| *v as f32).collect::<Vec<f32>>();
-        let conf = image(&probability).iter().map(|p| 1.0 / (1.0 - p.min(0.999))).collect();
+        // DA3-Streaming takes 1 off the head's confidence.
+        let conf = image(&probability).iter().map(|p| 1.0 / (1.0 - p.min(0.999)) - 1.0).collect();
         let array = |shape: Vec<usize>, v: Vec<f32>| NpyArray::new(shape, NpyData::F32(v)).unwrap();
         let k = intrinsics[i * 9..i * 9 + 9].iter().map(|v| *v as f32).collect();
         let (depth, conf, k) =

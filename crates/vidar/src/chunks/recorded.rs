@@ -105,7 +105,7 @@ impl Recording {
         let number = ChunkId(u32::try_from(chunk).unwrap_or(u32::MAX));
         let recorded = self.chunks.get(chunk).ok_or_else(|| self.bad(format!("it has no chunk {chunk}")))?;
         match &recorded.files {
-            Files::Plain(npz) => read_views(npz, ids, number, ChunkFrame::ModelNative),
+            Files::Plain(npz) => read_views(npz, ids, number, ChunkFrame::ModelNative, 1.0),
             Files::Described { npz, json } => {
                 let sidecar =
                     read_sidecar(json)?.ok_or_else(|| self.bad(format!("chunk {chunk} went away")))?;
@@ -129,7 +129,7 @@ impl Recording {
     ) -> Result<StoredChunk, Error> {
         let mut all: Option<StoredChunk> = None;
         for ((file, id), image) in files.iter().zip(ids).zip(&recorded.images) {
-            let mut one = read_views(file, &[*id], number, ChunkFrame::ModelNative)?;
+            let mut one = read_views(file, &[*id], number, ChunkFrame::ModelNative, 0.0)?;
             let pose = self.poses.get(*image).ok_or_else(|| {
                 self.bad(format!("camera_poses.txt has {} lines, frame {image} has none", self.poses.len()))
             })?;

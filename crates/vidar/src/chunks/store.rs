@@ -153,7 +153,7 @@ pub(super) fn load(npz: &Path, sidecar: &Sidecar) -> Result<StoredChunk, Error> 
     let ids: Vec<FrameId> = sidecar.frames.iter().copied().map(FrameId).collect();
     let mut chunk = match ids.is_empty() {
         true => empty(sidecar),
-        false => read_views(npz, &ids, ChunkId(sidecar.id), sidecar.frame)?,
+        false => read_views(npz, &ids, ChunkId(sidecar.id), sidecar.frame, 1.0)?,
     };
     chunk.times = sidecar.times_ns.iter().copied().map(Timestamp::from_nanos).collect();
     chunk.failure = sidecar.failure.clone();
@@ -206,11 +206,14 @@ fn rows(m: &Matrix4<f64>) -> Vec<f64> {
 }
 
 /// The arrays of an `npz` as the views `ids`: ours, or the official program's of a chunk or of one frame.
+///
+/// `least_confidence` is what `conf` starts from: 1 as the head gives it, 0 as DA3-Streaming writes it.
 pub(super) fn read_views(
     path: &Path,
     ids: &[FrameId],
     chunk_id: ChunkId,
     frame: ChunkFrame,
+    least_confidence: f32,
 ) -> Result<StoredChunk, Error> {
     let file = File::open(path).map_err(|e| Error::io("read", path, e))?;
     let mut arrays = read_npz(BufReader::new(file), NpzLimits::default()).map_err(|e| at(path, e))?;
@@ -245,7 +248,8 @@ pub(super) fn read_views(
         (Some(ours), _) => planes("probability", ours)?,
         // The head's confidence is c = 1 + exp(l); 1 − 1/c is the logistic function of the same l.
         (None, Some(c)) => {
-            planes("conf", c)?.into_iter().map(|i| i.map(|c| 1.0 - 1.0 / c.max(1.0))).collect()
+            let head = |c: &f32| (c + 1.0 - least_confidence).max(1.0);
+            planes("conf", c)?.into_iter().map(|i| i.map(|c| 1.0 - 1.0 / head(c))).collect()
         }
         (None, None) => vec![Image::filled(width, height, 1.0); n],
     };

@@ -130,36 +130,11 @@ pub struct CouplingConfig {
 pub struct ModelConfig {
     /// Folder with `model.safetensors` and `config.json` of one's own, instead of the network that `geometry.source` names.
     pub dir: String,
-    /// Precision of the backbone. `bf16` is fastest where the processor multiplies it, `f32` is the reference.
-    pub precision: ModelPrecision,
+    /// Precision of the backbone. `auto` is bf16 where the processor multiplies it and f32 elsewhere (the manifest says which);
+    /// `f32` is the reference.
+    pub precision: vidar_da3::Precision,
     /// How the network is used.
     pub network: vidar_da3::Da3ModelConfig,
-}
-
-/// Precision of matrix products.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema)]
-#[serde(rename_all = "kebab-case")]
-pub enum ModelPrecision {
-    /// 32 bits.
-    #[default]
-    F32,
-    /// Three products of 16 bits, close to 32.
-    F32Split,
-    /// Brain floats of 16 bits.
-    Bf16,
-    /// Weights of 16 bits.
-    F16,
-}
-
-impl From<ModelPrecision> for vidar_da3::Precision {
-    fn from(precision: ModelPrecision) -> Self {
-        match precision {
-            ModelPrecision::F32 => Self::F32,
-            ModelPrecision::F32Split => Self::F32Split,
-            ModelPrecision::Bf16 => Self::Bf16,
-            ModelPrecision::F16 => Self::F16,
-        }
-    }
 }
 
 /// What is judged, and against what.

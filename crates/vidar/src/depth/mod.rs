@@ -225,7 +225,7 @@ pub fn run(request: &DepthRequest, events: &Events, cancel: &CancelToken) -> Res
     })?;
     outcome.warnings.iter().for_each(|w| events.warn(w));
     outcome.seconds = clock.elapsed().as_secs_f64();
-    record::manifest(&folder, request, &located, &outcome)?;
+    record::manifest(&folder, request, &located, &model.describe_compute(), &outcome)?;
     Ok(outcome)
 }
 

@@ -71,6 +71,7 @@ pub(super) fn manifest(
     folder: &RunFolder,
     request: &DepthRequest,
     located: &Located,
+    arithmetic: &str,
     outcome: &DepthOutcome,
 ) -> Result<(), Error> {
     let infer = &request.infer;
@@ -88,6 +89,7 @@ pub(super) fn manifest(
             "align_to_given": infer.align_to_given,
             "compat": infer.compat,
             "precision": request.da3.precision.name(),
+            "arithmetic": arithmetic,
             "poses": request.poses,
             "focal_px": request.focal_px,
         },

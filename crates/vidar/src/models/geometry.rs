@@ -51,6 +51,8 @@ pub struct NetworkPlan {
     pub views_at_once: usize,
     /// Memory for those, bytes.
     pub memory: MemoryPlan,
+    /// What it computes with, and where.
+    pub arithmetic: String,
 }
 
 /// The network that the configuration names; `None` where no network is needed.
@@ -68,8 +70,7 @@ pub fn open(choice: &ModelChoice, config: &Config, mode: PoseMode) -> Result<(Da
     let located = locate(choice, None, &store(true)?)?;
     // The dense head stays in 32 bits, as in the official program.
     let head_precision = Some(Precision::F32);
-    let options =
-        Da3Options { precision: config.model.precision.into(), head_precision, ..Da3Options::default() };
+    let options = Da3Options { precision: config.model.precision, head_precision, ..Da3Options::default() };
     let network = Arc::new(located.open(&options)?);
     let sha256 = located.identity.weights_sha256.clone();
     let network_config = Da3ModelConfig { mode, ..config.model.network.clone() };
@@ -90,5 +91,6 @@ pub fn planned(
     let memory = planned_memory(model.network().config(), views, size);
     let mut warnings: Vec<Warning> = super::too_much(&memory).into_iter().collect();
     warnings.extend(super::untrained(&identity));
-    Ok((NetworkPlan { identity, views_at_once: views, memory }, warnings))
+    let arithmetic = model.network().describe_compute();
+    Ok((NetworkPlan { identity, views_at_once: views, memory, arithmetic }, warnings))
 }
