@@ -9,6 +9,7 @@
 //!
 //! Everything stands behind the feature `device`; without it this crate is empty.
 
+#![cfg_attr(not(feature = "device"), allow(rustdoc::broken_intra_doc_links))]
 #![cfg(feature = "device")]
 #![forbid(unsafe_code)]
 
