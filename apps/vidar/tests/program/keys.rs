@@ -134,7 +134,7 @@ const SETTINGS: &[(&str, &str, Beside)] = &[
     ("keyframes.min_rotation_deg", "60.0", Turning),
     ("keyframes.min_translation_m", "1.0", Moving),
     ("output.keep_chunks", "true", Nothing),
-    ("limits.memory_bytes", "150000000", Fine),
+    ("limits.memory_bytes", "165000000", Fine),
     ("output.depth_png", "false", Nothing),
     ("output.depth_units_per_metre", "500.0", Nothing),
     ("output.images", "false", Nothing),

@@ -167,11 +167,8 @@ fn sequences_of(
             .into_iter()
             .map(|s| {
                 let flight = truth_of(&s.path)?;
-                Ok((
-                    s.name.clone(),
-                    Some(flight),
-                    SynthConfig { scene: scene_of(&s.name), ..synthetic.world.clone() },
-                ))
+                let (scene, seed) = (scene_of(&s.name), seed_of(&s.name, synthetic.world.seed));
+                Ok((s.name, Some(flight), SynthConfig { scene, seed, ..synthetic.world.clone() }))
             })
             .collect::<Result<_, Error>>()?,
         None => built_in(&synthetic.world, &request.sequences),
@@ -194,6 +191,11 @@ fn sequences_of(
 /// The machine hall of EuRoC is a hall, its Vicon room a room.
 fn scene_of(name: &str) -> SceneKind {
     if name.starts_with("MH") { SceneKind::Hall } else { SceneKind::Room }
+}
+
+/// Every sequence gets a room, noise and simulated network of its own; the same name gets the same ones again.
+fn seed_of(name: &str, base: u64) -> u64 {
+    name.bytes().fold(base, |seed, b| seed.wrapping_mul(31).wrapping_add(u64::from(b))) & (u64::MAX >> 1)
 }
 
 /// Ground truth of a EuRoC sequence without looking at its images.
