@@ -129,7 +129,7 @@ impl Recorder {
         });
         self.encoder().copy_buffer_to_buffer(&from.raw, at as u64 * 4, &staging, 0, size);
         self.submit()?;
-        let (tell, told) = mpsc::channel();
+        let (tell, told) = mpsc::sync_channel(1);
         staging.slice(..).map_async(wgpu::MapMode::Read, move |result| {
             let _ = tell.send(result.map_err(|error| error.to_string()));
         });

@@ -13,7 +13,8 @@ fn every_shader_is_valid_and_fits_every_device() {
     for (name, text) in all {
         let module =
             wgsl::parse_str(&text).unwrap_or_else(|e| panic!("{name}: {}\n{text}", e.emit_to_string(&text)));
-        let capabilities = valid::Capabilities::IMMEDIATES;
+        let halves = valid::Capabilities::SHADER_FLOAT16_IN_FLOAT32;
+        let capabilities = valid::Capabilities::IMMEDIATES | halves;
         let info = valid::Validator::new(valid::ValidationFlags::all(), capabilities).validate(&module);
         info.unwrap_or_else(|e| panic!("{name}: {}\n{text}", e.emit_to_string(&text)));
         let size = |inner: &wgpu::naga::TypeInner| inner.size(module.to_ctx());

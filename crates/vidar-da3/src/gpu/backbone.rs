@@ -57,8 +57,11 @@ pub(super) struct Features<'a> {
     /// Of the last stage, `[views, feature width]`.
     camera_tokens: Vec<f32>,
     /// By layer and view: normalised patch tokens.
-    layers: BTreeMap<usize, Vec<Vec<f32>>>,
+    layers: Layers,
 }
+
+/// Tokens by layer and view.
+type Layers = BTreeMap<usize, Vec<Vec<f32>>>;
 
 /// What stays the same during a run.
 struct Walk<'a> {
@@ -353,7 +356,7 @@ impl<'a> Features<'a> {
     }
 
     /// Stages by view, camera tokens, and tokens of layers.
-    pub fn into_parts(self) -> (Vec<Vec<Buffer>>, Vec<f32>, BTreeMap<usize, Vec<Vec<f32>>>) {
+    pub fn into_parts(self) -> (Vec<Vec<Buffer>>, Vec<f32>, Layers) {
         (self.stages, self.camera_tokens, self.layers)
     }
 

@@ -10,10 +10,6 @@ use crate::recorder::Recorder;
 use std::fmt::Write as _;
 
 /// Channels of a head that workgroup memory has room for.
-pub const fn max_head_dim() -> usize {
-    MOST_CHANNELS
-}
-
 const MOST_CHANNELS: usize = 128;
 
 /// Cosines and sines of positions; token t uses position t modulo their number.

@@ -7,7 +7,7 @@ mod matmul;
 mod norm;
 mod resample;
 
-pub use attention::{AttendSpec, Rotation, attend, max_head_dim, prepare_heads};
+pub use attention::{AttendSpec, Rotation, attend, prepare_heads};
 pub use convolution::{Convolution, MapShape, Spread, convolve, spread};
 pub use elementwise::{Activation, PointLayer, add, copy_rows, patchify, point};
 pub use matmul::{End, Rows, product, product_into};
