@@ -102,6 +102,9 @@ pub struct FeatureOdometry {
 /// Distance between prediction and sighting that is tried at all, px.
 const GATE_PX: f64 = 25.0;
 
+/// Least way from keyframe to keyframe, as a share of the scene's distance.
+const MIN_KEYFRAME_BASE: f64 = 2e-3;
+
 /// Misfit of a new landmark's sightings that is accepted, in standard deviations.
 const NEW_GATE_SIGMAS: f64 = 4.0;
 
@@ -309,7 +312,10 @@ impl FeatureOdometry {
         let is_due = match self.resting {
             // The first frame of a rest stands for all of it.
             true => self.rest.is_none(),
-            false => self.since_keyframe >= self.config.keyframe_every || tracked < 40,
+            false => {
+                let few = self.since_keyframe >= self.config.keyframe_every || tracked < 40;
+                few && has_moved(smoother, id)
+            }
         };
         if is_due {
             smoother.mark_keyframe(id)?;
@@ -435,6 +441,19 @@ impl FeatureOdometry {
         self.tracks.retain(|_, history| history.last().is_some_and(|(f, _)| held.contains(f)));
         Ok(())
     }
+}
+
+/// Whether a frame is as far from the last keyframe as a new one should be: without a base, keyframes would only push out
+/// those that know the scene.
+fn has_moved(smoother: &Smoother, id: FrameId) -> bool {
+    let place = |f: FrameId| smoother.state(f).map(|s| s.world_from_body.translation);
+    let Some((here, last)) = place(id).zip(smoother.keyframes().next_back().and_then(place)) else {
+        return true;
+    };
+    let mut inverse: Vec<f64> = smoother.landmarks().map(|l| l.inverse_distance).collect();
+    inverse.sort_unstable_by(f64::total_cmp);
+    let Some(median) = inverse.get(inverse.len() / 2) else { return true };
+    (here - last).norm() * median > MIN_KEYFRAME_BASE
 }
 
 fn observation(frame: FrameId, seen: &Seen) -> Observation {
