@@ -215,7 +215,10 @@ impl Aligner {
         }
         let views = shared_views(self.previous.sampled.iter(), sampled.iter());
         if views.is_empty() {
-            guards.push(Guard::NoOverlap);
+            // Chunks in the anchors' own world are tied by the anchors: nothing is missing.
+            if prediction.frame != ChunkFrame::PriorWorld {
+                guards.push(Guard::NoOverlap);
+            }
             return None;
         }
         let verbatim = self.config.compat == Compat::Reference && self.mode == CouplingMode::Da3Streaming;
