@@ -22,4 +22,6 @@ pub mod streaming;
 pub use aligner::{
     Aligner, AlignerConfig, ChunkObservation, CouplingMode, FrameObservation, MetricAnchor, Placement,
 };
-pub use place::{AlignConfig, AlignError, Anchor, ChunkAlignment, Verdict, aligned_views, place_chunk};
+pub use place::{
+    AlignConfig, AlignError, Anchor, ChunkAlignment, Verdict, aligned_views, color_at_size, place_chunk,
+};

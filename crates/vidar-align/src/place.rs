@@ -199,7 +199,7 @@ pub(crate) fn colored(view: AlignedView, image: Option<&ChunkView>) -> Result<Al
 }
 
 /// The image's colours at the depth's size: bilinear, pixel centres kept (`c' = (c + 0.5)·s − 0.5`).
-fn color_at_size(image: &FrameImage, width: usize, height: usize) -> Image<[u8; 3]> {
+pub fn color_at_size(image: &FrameImage, width: usize, height: usize) -> Image<[u8; 3]> {
     let color = image.to_rgb8();
     let (w, h) = (color.width(), color.height());
     if (w, h) == (width, height) || w == 0 || h == 0 {

@@ -3,7 +3,7 @@
 use super::MetricMap;
 use super::live::LiveMap;
 use super::observation::{self, Known};
-use super::placed::{color_at_size, placed_view};
+use super::placed::placed_view;
 use super::plan::{ChunkPlan, Plan};
 use super::source::Source;
 use super::views::ViewWindow;
@@ -16,7 +16,7 @@ use rayon::prelude::*;
 use serde_json::json;
 use sha2::{Digest, Sha256};
 use vidar_align::aligner::LoopCandidate;
-use vidar_align::{Aligner, Placement};
+use vidar_align::{Aligner, Placement, color_at_size};
 use vidar_core::model::ChunkFrame;
 use vidar_core::remap::RemapTable;
 use vidar_core::{
