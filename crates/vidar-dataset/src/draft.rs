@@ -7,6 +7,7 @@ use crate::decode::{self, ImageLimits};
 use crate::error::DatasetError;
 use crate::options::{DatasetKind, OpenOptions};
 use crate::parse::{self, Source};
+use crate::plausible;
 use crate::settle::{cut, first_readable_size, guessed_model, keep_existing, name_of};
 use crate::source::read_file_up_to;
 use crate::trajectory_file::{self, ReadPoses};
@@ -141,6 +142,11 @@ impl Draft {
             checks::check_imu(&dataset.imu, &root, notes);
             checks::check_imu_coverage(&dataset.images, &dataset.imu, &root, notes);
         }
+        let place = match &dataset.calibration {
+            CalibrationSource::File(path) => path,
+            _ => &root,
+        };
+        plausible::check_rig(&dataset.rig, self.chosen, &dataset.imu, place, notes);
         checks::put_in_order(&mut dataset.accelerometer, |s| s.time, "accelerometer readings", &root, notes);
         let norms: Vec<_> = dataset.accelerometer.iter().map(|s| (s.time, s.accel.0.norm())).collect();
         checks::check_gravity(&norms, &root, notes);

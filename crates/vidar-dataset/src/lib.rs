@@ -13,6 +13,7 @@ mod folder;
 mod image_folder;
 mod options;
 pub mod parse;
+mod plausible;
 mod posed_folder;
 mod settle;
 mod seven_scenes;

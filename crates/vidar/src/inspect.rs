@@ -1,10 +1,11 @@
 //! `vidar inspect`: what is in a recording, and is it healthy.
 
+mod calibration;
+
 use crate::error::Error;
-use nalgebra::Vector3;
 use serde::Serialize;
 use std::path::Path;
-use vidar_core::{CameraModel, FrameImage, RigCamera, Timestamp, Trajectory, Warning};
+use vidar_core::{FrameImage, Timestamp, Trajectory, Warning};
 use vidar_dataset::{Dataset, OpenOptions};
 
 /// A recording in numbers.
@@ -91,7 +92,7 @@ pub fn inspect(path: &Path, options: &OpenOptions) -> Result<Inspection, Error> 
         kind: dataset.kind.to_string(),
         reason: dataset.reason.clone(),
         streams,
-        camera: camera_words(&dataset),
+        camera: calibration::camera_words(&dataset),
         imu: imu_words(&dataset),
         poses: pose_words(&dataset),
         images: image_health(&dataset),
@@ -119,60 +120,6 @@ fn stream(what: &str, times: &[Timestamp]) -> Option<Stream> {
     })
 }
 
-fn camera_words(dataset: &Dataset) -> Vec<String> {
-    let Some(camera) = dataset.rig.camera(dataset.camera) else { return Vec::new() };
-    let model = &camera.model;
-    let k = model.intrinsics();
-    let mut words = vec![format!(
-        "{} {}x{}, f {:.1}/{:.1} px, centre {:.1}/{:.1} px, calibration: {:?}",
-        model.name(),
-        k.width,
-        k.height,
-        k.fx,
-        k.fy,
-        k.cx,
-        k.cy,
-        dataset.calibration
-    )];
-    if let Some((across, down)) = field_of_view_deg(model) {
-        words.push(format!("sees {across:.0} x {down:.0} degrees"));
-    }
-    words.push(place_words(camera));
-    words
-}
-
-/// Angles between the directions of opposite border pixels.
-fn field_of_view_deg(model: &CameraModel) -> Option<(f64, f64)> {
-    let (w, h) = (model.width() as f64 - 1.0, model.height() as f64 - 1.0);
-    let ray = |x: f64, y: f64| model.unproject(&nalgebra::Vector2::new(x, y));
-    let across = ray(0.0, h / 2.0)?.angle(&ray(w, h / 2.0)?);
-    let down = ray(w / 2.0, 0.0)?.angle(&ray(w / 2.0, h)?);
-    Some((across.to_degrees(), down.to_degrees()))
-}
-
-/// Where the camera sits on the body, as a person would say it.
-fn place_words(camera: &RigCamera) -> String {
-    let t = camera.body_from_camera.translation;
-    let forward = camera.body_from_camera.rotation * Vector3::z();
-    let centimetres: Vec<String> = ["x", "y", "z"]
-        .iter()
-        .zip(t.iter())
-        .map(|(axis, v)| format!("{axis} {:+.1} cm", v * 100.0))
-        .collect();
-    let axis = |v: Vector3<f64>| {
-        let (index, name) = [(0, "x"), (1, "y"), (2, "z")]
-            .into_iter()
-            .max_by(|a, b| v[a.0].abs().total_cmp(&v[b.0].abs()))
-            .unwrap_or((2, "z"));
-        format!("{}{name}", if v[index] < 0.0 { "-" } else { "+" })
-    };
-    format!(
-        "body_from_camera: sits at {} of the body, looks along body {}",
-        centimetres.join(", "),
-        axis(forward)
-    )
-}
-
 fn imu_words(dataset: &Dataset) -> Vec<String> {
     if dataset.imu.is_empty() {
         return vec!["none: scale can come from an external trajectory only".into()];
@@ -186,10 +133,7 @@ fn imu_words(dataset: &Dataset) -> Vec<String> {
         gyro.to_degrees()
     ));
     match &dataset.rig.imu {
-        Some(noise) => words.push(format!(
-            "noise: gyro {:.1e} rad/s/sqrt(Hz), accel {:.1e} m/s2/sqrt(Hz), {} Hz",
-            noise.gyro_noise_density, noise.accel_noise_density, noise.rate_hz
-        )),
+        Some(noise) => words.extend(calibration::noise_words(noise)),
         None => words.push("noise: not in the calibration".into()),
     }
     words

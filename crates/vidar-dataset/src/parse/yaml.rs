@@ -9,7 +9,7 @@ use crate::source::Source;
 use nalgebra::Matrix4;
 use serde::de::{Deserialize, Deserializer, MapAccess, SeqAccess, Visitor};
 use std::fmt;
-use vidar_core::{CameraModel, Duration, ImuNoise, Se3, Warning};
+use vidar_core::{CameraModel, Duration, ImuNoise, LieGroup, Se3, Warning};
 
 /// A calibration file has a few kilobytes; a megabyte is something else.
 pub const MAX_YAML_BYTES: usize = 1 << 20;
@@ -205,6 +205,20 @@ impl<'a> Document<'a> {
         }
     }
 
+    /// Kalibr's `T_cam_imu`, or OpenVINS' `T_imu_cam`, its inverse; both only when they agree.
+    fn camera_from_imu(&self, map: &Node) -> Result<Option<Se3>, DatasetError> {
+        let kalibr = self.motion(map, "T_cam_imu")?;
+        let open_vins = self.motion(map, "T_imu_cam")?.map(|m| m.inverse());
+        if let (Some(one), Some(other)) = (kalibr, open_vins) {
+            let apart = (one.inverse() * other).log();
+            if !(apart.amax() < 1e-3) {
+                let found = format!("a motion {:.3} from the inverse of T_cam_imu", apart.amax());
+                return Err(self.wrong("T_imu_cam", &found, "the inverse of T_cam_imu, or only one of them"));
+            }
+        }
+        Ok(kalibr.or(open_vins))
+    }
+
     fn resolution(&self, map: &Node) -> Result<Option<(usize, usize)>, DatasetError> {
         let Some(list) = self.list(map, "resolution")? else { return Ok(None) };
         match list[..] {
@@ -333,7 +347,7 @@ pub struct KalibrCamera {
     pub number: u32,
     /// The camera.
     pub calibration: CameraCalibration,
-    /// `T_cam_imu`, or put together from `T_cn_cnm1`: maps IMU coordinates to the camera.
+    /// `T_cam_imu`, the inverse of `T_imu_cam` (OpenVINS), or put together from `T_cn_cnm1`: maps IMU coordinates to the camera.
     pub camera_from_imu: Option<Se3>,
 }
 
@@ -368,7 +382,7 @@ pub fn kalibr_yaml(source: &Source<'_>) -> Result<(KalibrFile, Vec<Warning>), Da
             }
             _ => None,
         };
-        let camera_from_imu = doc.motion(node, "T_cam_imu")?.or(chained);
+        let camera_from_imu = doc.camera_from_imu(node)?.or(chained);
         previous = Some((number, camera_from_imu));
         file.cameras.push(KalibrCamera { number, calibration, camera_from_imu });
     }
@@ -376,7 +390,11 @@ pub fn kalibr_yaml(source: &Source<'_>) -> Result<(KalibrFile, Vec<Warning>), Da
     file.imu = doc.noise(imu_map)?.map(|noise| ImuCalibration { noise });
     if file.cameras.is_empty() && file.imu.is_none() {
         let keys: Vec<&str> = entries.iter().take(8).map(|(k, _)| k.as_str()).collect();
-        let expected = "cam0: …, or imu0: / gyroscope_noise_density and accelerometer_noise_density";
+        let expected = if entries.iter().any(|(k, _)| k.starts_with("relative_config_")) {
+            "the files that relative_config_imucam and relative_config_imu name"
+        } else {
+            "cam0: …, or imu0: / gyroscope_noise_density and accelerometer_noise_density"
+        };
         return Err(source.garbage(1, format!("the keys {}", keys.join(", ")), expected));
     }
     Ok((file, notes))

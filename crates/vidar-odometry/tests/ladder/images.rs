@@ -12,7 +12,7 @@ fn a_third_of_the_images_may_be_missing_from_the_first_on() {
         k % 3 != 0
     });
     let outputs = recording.run();
-    let (ate, share) = recording.error_and_share(&outputs);
+    let (ate, share) = recording.error_and_share("every third image missing", &outputs);
     assert!(ate < 0.05 && share > 0.5, "{ate} m, {share} of the images");
 }
 
@@ -27,7 +27,7 @@ fn images_may_be_missing_by_chance() {
             (state >> 33) % 100 >= percent
         });
         let outputs = recording.run();
-        let (ate, share) = recording.error_and_share(&outputs);
+        let (ate, share) = recording.error_and_share(&format!("{percent} % of the images missing"), &outputs);
         assert!(ate < 0.05 && share > 0.5, "{percent} % missing: {ate} m, {share} of the images");
     }
 }
@@ -42,7 +42,7 @@ fn repeated_images_are_left_out() {
     assert_eq!(odometry.counts().images_repeated, 10);
     let degraded = outputs.iter().filter(|o| o.health() == Health::Degraded).count();
     assert!(degraded >= 10, "{degraded}");
-    within(&recording, &outputs, 0.05);
+    within("ten images repeated", &recording, &outputs, 0.05);
 }
 
 #[test]
@@ -55,7 +55,7 @@ fn a_second_without_texture_is_degraded_and_survived() {
     assert!(outputs[98..114].iter().all(|o| o.health() == Health::Degraded), "no image helps");
     assert!(lost(&outputs).is_empty(), "{:?}", lost(&outputs));
     assert!(outputs[138].health().is_metric(), "{:?}", outputs[138].health());
-    within(&recording, &outputs, 0.1);
+    within("a second without texture", &recording, &outputs, 0.1);
 }
 
 #[test]
@@ -67,7 +67,7 @@ fn the_exposure_may_double_and_the_noise_may_be_strong() {
     }
     let outputs = recording.run();
     assert!(lost(&outputs).is_empty(), "{:?}", lost(&outputs));
-    within(&recording, &outputs, 0.1);
+    within("exposure doubled, noise of 8 grey levels", &recording, &outputs, 0.1);
 }
 
 #[test]
@@ -76,5 +76,5 @@ fn images_may_be_blurred_by_20_ms_of_exposure() {
     let recording = rendered(7.0, 0.02, 5);
     let outputs = recording.run();
     assert!(lost(&outputs).is_empty(), "{:?}", lost(&outputs));
-    within(&recording, &outputs, 0.05);
+    within("20 ms of exposure", &recording, &outputs, 0.05);
 }

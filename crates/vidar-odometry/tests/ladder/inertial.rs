@@ -10,7 +10,7 @@ fn a_gap_of_readings_is_bridged() {
     let from = EPOCH + Duration::from_millis(5010);
     recording.imu.retain(|s| s.time < from || s.time > from + Duration::from_millis(100));
     let (outputs, odometry) = recording.run_events(recording.events());
-    within(&recording, &outputs, 0.05);
+    within("100 ms without readings", &recording, &outputs, 0.05);
     assert!(odometry.counts().imu_gaps >= 1 && lost(&outputs).is_empty());
 }
 
@@ -37,7 +37,7 @@ fn a_saturated_gyroscope_is_not_believed() {
     }
     let outputs = recording.run();
     assert!(lost(&outputs).is_empty(), "{:?}", lost(&outputs));
-    within(&recording, &outputs, 0.1);
+    within("gyroscope saturated for 60 ms", &recording, &outputs, 0.1);
 }
 
 fn inverted() -> Recording {
@@ -76,7 +76,7 @@ fn clocks_may_differ_by_20_ms() {
         let recording = late(millis);
         let outputs = recording.run();
         assert!(lost(&outputs).is_empty(), "{millis} ms: {:?}", lost(&outputs));
-        let (ate, share) = recording.error_and_share(&outputs);
+        let (ate, share) = recording.error_and_share(&format!("images stamped {millis} ms late"), &outputs);
         assert!(ate < 0.08 && share > 0.5, "{millis} ms: {ate} m, {share} of the images");
     }
 }
@@ -91,5 +91,5 @@ fn the_camera_may_be_turned_by_2_degrees() {
     recording.config.estimate_extrinsics = true;
     let outputs = recording.run();
     assert!(lost(&outputs).is_empty(), "{:?}", lost(&outputs));
-    within(&recording, &outputs, 0.08);
+    within("camera turned by 2°, estimated", &recording, &outputs, 0.08);
 }

@@ -149,10 +149,25 @@ impl Recording {
         evaluate_trajectory(&estimate, &truth, &TrajectoryEvalConfig::default()).unwrap()
     }
 
-    /// Error of the metric poses after the best rigid motion, and the share of images with one.
-    pub fn error_and_share(&self, outputs: &[OdometryOutput]) -> (f64, f64) {
+    /// Error of the metric poses after the best rigid motion, and the share of images with one; with `--nocapture` also
+    /// the row of the table in `BENCHMARK.md` that is called `rung`.
+    pub fn error_and_share(&self, rung: &str, outputs: &[OdometryOutput]) -> (f64, f64) {
         let report = self.judge(outputs);
-        (report.ate_se3_m.unwrap().rmse, report.estimate_poses as f64 / self.images.len() as f64)
+        let error = report.ate_se3_m.unwrap().rmse;
+        let share = report.estimate_poses as f64 / self.images.len() as f64;
+        let scale = report.scale_error.unwrap_or(f64::NAN);
+        let first = outputs.iter().find(|o| o.health().is_metric()).map_or(f64::NAN, |o| self.secs(o));
+        eprintln!(
+            "| {rung} | {error:.4} | {scale:.4} | {:.0} % | {first:.2} | {} |",
+            100.0 * share,
+            lost(outputs).len()
+        );
+        (error, share)
+    }
+
+    /// Seconds from the first image to that of an output.
+    fn secs(&self, output: &OdometryOutput) -> f64 {
+        (output.time - self.images[0].0).as_secs_f64()
     }
 }
 
@@ -165,9 +180,9 @@ pub fn lost(outputs: &[OdometryOutput]) -> Vec<String> {
 }
 
 /// Whether every pose told as healthy and metric is within `limit_m` of the truth after the best rigid motion.
-pub fn within(recording: &Recording, outputs: &[OdometryOutput], limit_m: f64) {
-    let (ate, share) = recording.error_and_share(outputs);
-    assert!(ate < limit_m, "{ate} m of {limit_m} m, {share} of the images");
+pub fn within(rung: &str, recording: &Recording, outputs: &[OdometryOutput], limit_m: f64) {
+    let (ate, share) = recording.error_and_share(rung, outputs);
+    assert!(ate < limit_m, "{rung}: {ate} m of {limit_m} m, {share} of the images");
 }
 
 impl Recording {

@@ -22,6 +22,7 @@ fn stand(secs: i64) {
     let states = outputs.iter().filter(|o| o.tracking().is_some()).count();
     assert!(states as i64 > 10 * secs - 20, "{states}");
     let far = drift(&outputs, 0.0, 1e9);
+    eprintln!("| standing {secs} s | {far:.4} (drift) | | | | |");
     assert!(far < 0.02, "{far}");
     let bias = outputs.last().unwrap().tracking().unwrap().state.gyro_bias;
     assert!((bias - Vector3::new(0.01, 0.0, 0.0)).norm() < 1e-3, "{bias}");
@@ -76,8 +77,10 @@ fn pause(more_secs: i64) {
     let outputs = recording.run();
     assert!(lost(&outputs).is_empty(), "{:?}", lost(&outputs));
     let far = drift(&outputs, 5.0, 7.0 + more_secs as f64);
+    eprintln!("drift of {:.1} mm at rest", 1e3 * far);
     assert!(far < 0.02, "{far} m while standing");
-    let (ate, share) = recording.error_and_share(&outputs);
+    let (ate, share) =
+        recording.error_and_share(&format!("a rest of {} s in flight", more_secs + 4), &outputs);
     assert!(ate < 0.05 && share > 0.6, "{ate} m, {share} of the images");
 }
 

@@ -1,0 +1,151 @@
+//! Whether a calibration can be true: what no rig has is named when it is read, before it spoils a run.
+//!
+//! Nothing here stops a run. The limits are wide: they catch another unit, a swapped or inverted entry, a forgotten one,
+//! not an unusual rig. What only motion can show (an inverted camera orientation) the odometry checks in its first seconds.
+
+use std::path::Path;
+use vidar_core::{CameraModel, Duration, ImuNoise, ImuSample, LieGroup, Rig, RigCamera, Se3, Warning};
+
+/// Cameras sit nearer to their IMU than this, m.
+const MAX_LEVER_M: f64 = 1.0;
+/// Clocks of camera and IMU are closer than this, s.
+const MAX_OFFSET_SECS: f64 = 0.1;
+/// Focal length over the longer side of the image: 8° to 136° across without distortion.
+const FOCAL_RATIO: std::ops::RangeInclusive<f64> = 0.2..=7.0;
+/// Pixels are square within this factor.
+const MAX_PIXEL_ASPECT: f64 = 1.25;
+/// The principal point lies within this share of the image's side from its middle.
+const MAX_CENTRE_SHIFT: f64 = 0.25;
+/// A border pixel must come back to itself within this, pixels.
+const MAX_RETURN_PX: f64 = 0.5;
+/// White noise of inertial sensors from tactical grade to telephones, with tenfold room, rad/s/√Hz and m/s²/√Hz.
+const GYRO_NOISE: std::ops::RangeInclusive<f64> = 1e-6..=2e-2;
+const ACCEL_NOISE: std::ops::RangeInclusive<f64> = 1e-5..=0.5;
+/// Largest factor between the stated rate and that of the readings.
+const MAX_RATE_FACTOR: f64 = 1.25;
+/// Baselines of two cameras on one body, m.
+const BASELINE_M: std::ops::RangeInclusive<f64> = 1e-3..=3.0;
+
+/// Names what cannot be true of the rig. `chosen` is the camera in use; `imu` are the readings.
+pub(crate) fn check_rig(rig: &Rig, chosen: usize, imu: &[ImuSample], place: &Path, notes: &mut Vec<Warning>) {
+    let mut say = |kind: &str, message: String, hint: &str| {
+        notes.push(Warning::new(kind, message).at(place.display()).hint(hint));
+    };
+    if let Some(camera) = rig.cameras.get(chosen) {
+        check_model(&camera.model, &mut say);
+        if !imu.is_empty() {
+            check_place(camera, &mut say);
+        }
+        for (number, other) in rig.cameras.iter().enumerate().filter(|(k, _)| *k != chosen) {
+            let baseline = (camera.body_from_camera.inverse() * other.body_from_camera).translation.norm();
+            let known = |c: &RigCamera| c.body_from_camera != Se3::IDENTITY;
+            if (known(camera) || known(other)) && !BASELINE_M.contains(&baseline) {
+                let message =
+                    format!("cameras {chosen} and {number} are {baseline:.4} m apart, not 1 mm to 3 m");
+                say("calibration-baseline", message, "places of cameras are in metres, on the body");
+            }
+        }
+    }
+    if let Some(noise) = &rig.imu
+        && !imu.is_empty()
+    {
+        check_noise(noise, imu, &mut say);
+    }
+}
+
+fn check_model(model: &CameraModel, say: &mut impl FnMut(&str, String, &str)) {
+    let k = model.intrinsics();
+    let (w, h) = (k.width as f64, k.height as f64);
+    let ratio = k.fx / w.max(h);
+    if !FOCAL_RATIO.contains(&ratio) {
+        let message = format!("focal length {:.1} px is {ratio:.2} of the image's {} px", k.fx, w.max(h));
+        say("calibration-focal", message, "are intrinsics and images of one size?");
+    }
+    let aspect = (k.fx / k.fy).max(k.fy / k.fx);
+    if aspect > MAX_PIXEL_ASPECT {
+        let message = format!("fx {:.1} and fy {:.1} px differ by a factor of {aspect:.2}", k.fx, k.fy);
+        say("calibration-focal", message, "the order is fx, fy, cx, cy");
+    }
+    let shift = [(k.cx + 0.5 - w / 2.0) / w, (k.cy + 0.5 - h / 2.0) / h];
+    if shift.iter().any(|s| s.abs() > MAX_CENTRE_SHIFT) {
+        let message = format!("principal point {:.1}, {:.1} of a {w} x {h} image", k.cx, k.cy);
+        say(
+            "calibration-centre",
+            message,
+            "are intrinsics and images of one size? The order is fx, fy, cx, cy",
+        );
+    }
+    let (right, low) = (w - 1.0, h - 1.0);
+    let border =
+        [(0.0, 0.0), (0.5, 0.0), (1.0, 0.0), (0.0, 0.5), (1.0, 0.5), (0.0, 1.0), (0.5, 1.0), (1.0, 1.0)];
+    let returns = |&(x, y): &(f64, f64)| {
+        let pixel = nalgebra::Vector2::new(x * right, y * low);
+        let back = model.unproject(&pixel).and_then(|ray| model.project(&ray));
+        back.is_some_and(|b| (b - pixel).norm() < MAX_RETURN_PX)
+    };
+    let failing = border.iter().filter(|p| !returns(p)).count();
+    if failing > 0 {
+        let message = format!(
+            "the distortion has no way back at {failing} of 8 points of the image's border (it folds over)"
+        );
+        say("calibration-distortion", message, "the order is k1, k2, p1, p2 (radtan), k1 … k4 (equidistant)");
+    }
+}
+
+fn check_place(camera: &RigCamera, say: &mut impl FnMut(&str, String, &str)) {
+    let lever = camera.body_from_camera.translation.norm();
+    if camera.body_from_camera == Se3::IDENTITY {
+        say(
+            "extrinsics-identity",
+            "the camera is said to be the IMU: same place, same axes".into(),
+            "no rig is built so; give T_BS (EuRoC), T_cam_imu (Kalibr) or T_imu_cam (OpenVINS)",
+        );
+    } else if lever > MAX_LEVER_M {
+        let message = format!("camera and IMU are {lever:.2} m apart");
+        say("calibration-lever", message, "places are in metres");
+    }
+    if camera.time_offset > Duration::from_secs_f64(MAX_OFFSET_SECS)
+        || camera.time_offset < Duration::from_secs_f64(-MAX_OFFSET_SECS)
+    {
+        let message = format!("clocks are {:.4} s apart", camera.time_offset.as_secs_f64());
+        say("calibration-clock", message, "timeshift_cam_imu is in seconds, t_imu = t_camera + shift");
+    }
+}
+
+fn check_noise(noise: &ImuNoise, imu: &[ImuSample], say: &mut impl FnMut(&str, String, &str)) {
+    let density = "densities are asked for: not per reading (that is sqrt(rate) times as much), not in degrees, not in g";
+    let given = [
+        ("gyroscope", noise.gyro_noise_density, GYRO_NOISE, "rad/s/sqrt(Hz)"),
+        ("accelerometer", noise.accel_noise_density, ACCEL_NOISE, "m/s2/sqrt(Hz)"),
+    ];
+    for (sensor, value, range, unit) in given.into_iter().filter(|g| !g.2.contains(&g.1)) {
+        let (low, high) = (range.start(), range.end());
+        let message = format!("{sensor} noise {value:.2e} {unit} is not of {low:e} to {high:e}");
+        say("imu-noise-range", message, density);
+    }
+    let walks = [
+        ("gyroscope", noise.gyro_random_walk, noise.gyro_noise_density),
+        ("accelerometer", noise.accel_random_walk, noise.accel_noise_density),
+    ];
+    for (sensor, walk, white) in walks {
+        if walk == 0.0 {
+            let message = format!("the {sensor}'s bias is said never to change (random walk 0)");
+            say("imu-noise-range", message, "a hundredth of the white noise is usual for a gyroscope");
+        } else if walk > 100.0 * white {
+            let message = format!(
+                "the {sensor}'s bias is said to walk {walk:.1e} a second, {:.0} times its white noise",
+                walk / white
+            );
+            say("imu-noise-range", message, "with that the IMU hardly tells the scale");
+        }
+    }
+    let mut steps: Vec<i64> = imu.windows(2).map(|w| (w[1].time - w[0].time).nanos()).collect();
+    steps.sort_unstable();
+    let Some(&step) = steps.get(steps.len() / 2).filter(|s| **s > 0) else { return };
+    let rate = 1e9 / step as f64;
+    if (noise.rate_hz / rate).max(rate / noise.rate_hz) > MAX_RATE_FACTOR {
+        let message =
+            format!("the IMU is said to run at {} Hz; its readings come at {rate:.1} Hz", noise.rate_hz);
+        say("imu-rate", message, "the rate of the readings is used where it matters");
+    }
+}
