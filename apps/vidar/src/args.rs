@@ -3,6 +3,7 @@
 use crate::model_args::{DepthArgs, LicenceArgs, ModelCommand};
 use clap::{ArgAction, Args, Parser, Subcommand, ValueEnum, ValueHint};
 use std::path::PathBuf;
+use vidar::da3::Device;
 
 /// One camera and metric poses into a metric dense 3-D map.
 #[derive(Debug, Parser)]
@@ -229,6 +230,9 @@ pub struct RunArgs {
     /// A folder with model.safetensors and config.json of one's own.
     #[arg(long, value_hint = ValueHint::AnyPath, help_heading = "Model")]
     pub model_dir: Option<PathBuf>,
+    /// Where a network is computed: cpu, gpu, gpu:N or auto; `vidar doctor` lists graphics processors.
+    #[arg(long, value_name = "DEVICE", help_heading = "Model")]
+    pub device: Option<Device>,
     /// Acceptance of a licence.
     #[command(flatten)]
     pub licence: LicenceArgs,

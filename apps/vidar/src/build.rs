@@ -58,6 +58,9 @@ pub fn apply_model_flags(layered: &mut Layered, args: &RunArgs) -> Result<(), Er
         let bytes = toml::Value::Integer(byte_count(size)?);
         layered.value("limits.memory_bytes", bytes, Origin::Flag("--memory-budget"))?;
     }
+    if let Some(device) = args.device {
+        layered.value("model.device", toml::Value::String(device.to_string()), Origin::Flag("--device"))?;
+    }
     apply_source_flags(layered, args.geometry.as_deref(), args.model_dir.as_deref())
 }
 

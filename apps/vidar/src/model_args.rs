@@ -3,6 +3,7 @@
 use crate::args::OutputArgs;
 use clap::{Args, Subcommand, ValueEnum, ValueHint};
 use std::path::PathBuf;
+use vidar::da3::Device;
 
 /// `vidar model`.
 #[derive(Debug, Subcommand)]
@@ -92,6 +93,9 @@ pub struct CheckArgs {
     /// Precision of the backbone.
     #[arg(long, value_enum, default_value_t = PrecisionArg::F32)]
     pub precision: PrecisionArg,
+    /// Where the network is computed: cpu, gpu, gpu:N or auto; `vidar doctor` lists graphics processors.
+    #[arg(long, default_value_t, value_name = "DEVICE")]
+    pub device: Device,
     /// Print every tensor, not only the worst and what departs.
     #[arg(long)]
     pub all: bool,
@@ -165,6 +169,9 @@ pub struct DepthArgs {
     /// Precision of the backbone.
     #[arg(long, value_enum, default_value_t = PrecisionArg::Auto, help_heading = "Model")]
     pub precision: PrecisionArg,
+    /// Where the network is computed: cpu, gpu, gpu:N or auto; `vidar doctor` lists graphics processors.
+    #[arg(long, default_value_t, value_name = "DEVICE", help_heading = "Model")]
+    pub device: Device,
     /// Length of the bounding side of what the network sees, pixels.
     #[arg(long, default_value_t = 504, help_heading = "Model")]
     pub process_res: usize,

@@ -2,7 +2,7 @@
 
 use crate::arithmetic::{Arithmetic, Precision};
 use crate::config::{Da3Config, Variant, json};
-use crate::device::{self, Device, Opened};
+use crate::device::{self, Device, DevicePlan, Opened};
 use crate::error::Da3Error;
 use crate::infer::Hooks;
 use crate::model::{DeviceLoader, Model};
@@ -150,6 +150,19 @@ impl Da3 {
     /// The name of the device that backbone and head are computed on; `None` is the CPU.
     pub fn device_name(&self) -> Option<String> {
         self.opened.as_ref().map(Opened::name)
+    }
+
+    /// What `views` views at `height` × `width` processed pixels take on the device; `None` is the CPU
+    /// ([`Da3::memory_estimate`]).
+    pub fn device_plan(
+        &self,
+        views: usize,
+        height: usize,
+        width: usize,
+        wants_rays: bool,
+    ) -> Option<DevicePlan> {
+        let size = (views, height, width);
+        self.opened.as_ref().map(|device| device.plan(&self.config, size, wants_rays))
     }
 
     /// What it computes with and where, in words.

@@ -1,6 +1,7 @@
 //! Where a model computes.
 
 use crate::arithmetic::Arithmetic;
+use crate::config::Da3Config;
 use crate::error::Da3Error;
 use crate::model::DeviceLoader;
 use serde::{Deserialize, Serialize};
@@ -71,6 +72,75 @@ impl From<Device> for String {
     }
 }
 
+/// A device and what a run takes there, before it starts. All in bytes.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub struct DevicePlan {
+    /// The device in words.
+    pub device: String,
+    /// All weights, in `f32`; the backbone's take half of it in bf16 or f16.
+    pub weights: u64,
+    /// Largest sum of buffers during a run, weights aside.
+    pub working: u64,
+    /// The largest single buffer, weights aside: devices bound these, some at 128 MiB.
+    pub largest: u64,
+    /// What the largest buffer is for.
+    pub largest_is: &'static str,
+}
+
+impl Device {
+    /// The device of this machine that is meant, unless it is the CPU, and what `views` views at `height` × `width`
+    /// pixels take there. Nothing is opened.
+    ///
+    /// # Errors
+    /// [`Da3Error::NoDeviceSupport`], or [`Da3Error::Gpu`](crate::Da3Error) when there is no such device.
+    #[cfg(feature = "gpu")]
+    pub fn plan(
+        self,
+        config: &Da3Config,
+        (views, height, width): (usize, usize, usize),
+        wants_rays: bool,
+    ) -> Result<Option<DevicePlan>, Da3Error> {
+        let find = |adapter| vidar_gpu::find(&vidar_gpu::GpuOptions { adapter, memory_limit: None });
+        let adapter = match self {
+            Self::Cpu => None,
+            Self::Gpu { adapter } => Some(find(adapter)?),
+            Self::Auto => find(None).ok(),
+        };
+        let size = (views, height, width);
+        Ok(adapter.map(|adapter| crate::gpu::device_plan(&adapter, config, size, wants_rays)))
+    }
+
+    /// The device of this machine that is meant, unless it is the CPU, and what `views` views at `height` × `width`
+    /// pixels take there. Nothing is opened.
+    ///
+    /// # Errors
+    /// [`Da3Error::NoDeviceSupport`].
+    #[cfg(not(feature = "gpu"))]
+    pub fn plan(
+        self,
+        _config: &Da3Config,
+        (_views, _height, _width): (usize, usize, usize),
+        _wants_rays: bool,
+    ) -> Result<Option<DevicePlan>, Da3Error> {
+        open(self, None).map(|_| None)
+    }
+
+    /// Every graphics processor of this machine by its word and its name, the best first; `None` when this program was
+    /// built without them.
+    #[must_use]
+    pub fn list() -> Option<Vec<(Self, String)>> {
+        #[cfg(feature = "gpu")]
+        return Some(
+            vidar_gpu::adapters()
+                .into_iter()
+                .map(|a| (Self::Gpu { adapter: Some(a.index) }, a.to_string()))
+                .collect(),
+        );
+        #[cfg(not(feature = "gpu"))]
+        None
+    }
+}
+
 /// A device that was opened.
 #[cfg(feature = "gpu")]
 pub(crate) struct Opened(vidar_gpu::Gpu);
@@ -110,6 +180,17 @@ impl Opened {
     #[cfg(not(feature = "gpu"))]
     pub fn loader(&self, _arithmetic: Arithmetic) -> NoLoader {
         match *self {}
+    }
+
+    /// What a run takes on it.
+    pub fn plan(&self, config: &Da3Config, size: (usize, usize, usize), wants_rays: bool) -> DevicePlan {
+        #[cfg(feature = "gpu")]
+        return crate::gpu::device_plan(self.0.adapter(), config, size, wants_rays);
+        #[cfg(not(feature = "gpu"))]
+        {
+            let _ = (config, size, wants_rays);
+            match *self {}
+        }
     }
 
     /// The device's name.

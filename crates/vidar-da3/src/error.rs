@@ -127,9 +127,7 @@ pub enum Da3Error {
         reason: String,
     },
     /// A device that this build has no code for.
-    #[error(
-        "{device}: this program was built without graphics processors; build it with `--features gpu`, or compute on the CPU"
-    )]
+    #[error("device {device}: this program was built without graphics processors")]
     NoDeviceSupport {
         /// What was asked for.
         device: crate::Device,
@@ -141,4 +139,34 @@ pub enum Da3Error {
     /// The caller asked to stop.
     #[error("cancelled")]
     Cancelled,
+}
+
+impl Da3Error {
+    /// What to do about a device that cannot be used; `None` when the trouble is not with a device.
+    pub fn device_advice(&self) -> Option<&'static str> {
+        #[cfg(feature = "gpu")]
+        if let Self::Gpu(error) = self {
+            return Some(gpu_advice(error));
+        }
+        let is_absent = matches!(self, Self::NoDeviceSupport { .. });
+        is_absent.then_some("take --device cpu, or build the program with `--features gpu`")
+    }
+}
+
+#[cfg(feature = "gpu")]
+fn gpu_advice(error: &vidar_gpu::GpuError) -> &'static str {
+    use vidar_gpu::GpuError as G;
+    match error {
+        G::NoAdapter { .. } => "`vidar doctor` lists the graphics processors; --device cpu needs none",
+        G::NotOpened { .. } | G::Unsuitable { .. } => {
+            "update the graphics driver, name another device (`vidar doctor` lists them), or take --device cpu"
+        }
+        G::BufferTooLarge { .. } | G::OutOfMemory { .. } | G::OverBudget { .. } => {
+            "take fewer views at once, a smaller size or a smaller network, or --device cpu; --dry-run shows what each takes"
+        }
+        G::Shape { .. } => "no official network has such sizes; --device cpu runs every size",
+        _ => {
+            "try again; if it recurs, update the graphics driver, take fewer views at once, or take --device cpu"
+        }
+    }
 }

@@ -57,6 +57,8 @@ pub struct Da3Model {
     network: Arc<Da3>,
     config: Da3ModelConfig,
     info: ModelInfo,
+    place_layer: Option<usize>,
+    place_tokens: Vec<Vec<f32>>,
 }
 
 impl Da3Model {
@@ -85,7 +87,24 @@ impl Da3Model {
         let licence = description.variant.map_or("LicenseRef-unknown", |v| v.licence()).to_owned();
         let info =
             ModelInfo { name: description.name.clone(), licence, weights_sha256, needs_poses, min_views: 1 };
-        Ok(Self { network, config, info })
+        Ok(Self { network, config, info, place_layer: None, place_tokens: Vec::new() })
+    }
+
+    /// From now on keeps the tokens by which a place can be told again ([`Da3Model::take_place_tokens`]): those of the last
+    /// block before views look at each other, so that a picture's do not depend on what it was seen with.
+    pub fn keep_place_tokens(&mut self) {
+        let backbone = &self.network.config().main().backbone;
+        self.place_layer = Some(backbone.alternate_from.unwrap_or(backbone.depth).saturating_sub(1));
+    }
+
+    /// Patch tokens `[patches, channels]` of each view of the last prediction, in its order; empty unless they are kept.
+    pub fn take_place_tokens(&mut self) -> Vec<Vec<f32>> {
+        std::mem::take(&mut self.place_tokens)
+    }
+
+    /// Channels of a token.
+    pub fn token_channels(&self) -> usize {
+        self.network.config().main().backbone.dim
     }
 
     /// The network.
@@ -94,7 +113,7 @@ impl Da3Model {
     }
 
     fn predict_some(
-        &self,
+        &mut self,
         chunk: &ChunkViews,
         wanted: Range<usize>,
         cancel: &(dyn Fn() -> bool + Sync),
@@ -118,14 +137,17 @@ impl Da3Model {
             reference: self.config.reference,
             use_ray_pose: self.config.use_ray_pose,
             wanted: Some(wanted.clone()),
+            feature_layers: self.place_layer.into_iter().collect(),
             ..InferOptions::default()
         };
         let told = priors.as_deref().filter(|_| self.network.is_any_view());
         let inputs = Inputs { images: &images, camera_from_world: told, intrinsics: Some(&intrinsics) };
         let hooks = Hooks { cancel, trace: None };
-        let prediction =
+        let mut prediction =
             self.network.infer_with(&inputs, &options, &hooks).map_err(|e| model_error(e, chunk))?;
         drop(images);
+        let tokens = std::mem::take(&mut prediction.features).into_values().next();
+        self.place_tokens = tokens.map_or_else(Vec::new, |t| t.views[wanted.clone()].to_vec());
         let answer = match priors {
             Some(priors) if !self.network.is_any_view() => {
                 metric_in_prior_world(prediction, priors, intrinsics, chunk)

@@ -4,6 +4,7 @@ use crate::buffer::{Account, Buffer};
 use crate::error::GpuError;
 use crate::kernel::{Kernel, Layouts};
 use std::collections::HashMap;
+use std::fmt;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 /// What stands behind an adapter.
@@ -34,6 +35,26 @@ pub struct Adapter {
     pub interface: String,
     /// The driver and its version.
     pub driver: String,
+}
+
+/// As people are told of it: name, kind, interface and driver.
+impl fmt::Display for Adapter {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self { name, kind, interface, driver, .. } = self;
+        write!(f, "{name} ({kind}, {interface}, {driver})")
+    }
+}
+
+impl fmt::Display for AdapterKind {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::Discrete => "discrete",
+            Self::Integrated => "integrated",
+            Self::Virtual => "virtual",
+            Self::Unknown => "of unknown kind",
+            Self::Software => "software: shaders run on the CPU",
+        })
+    }
 }
 
 /// Which device, and how much of it.
@@ -109,6 +130,28 @@ pub fn adapters() -> Vec<Adapter> {
     enumerate(&instance()).into_iter().map(|(adapter, _)| adapter).collect()
 }
 
+/// The adapter that options name, without opening it.
+///
+/// # Errors
+/// [`GpuError::NoAdapter`] when there is none of the kind asked for.
+pub fn find(options: &GpuOptions) -> Result<Adapter, GpuError> {
+    choose(options, enumerate(&instance())).map(|(adapter, _)| adapter)
+}
+
+fn choose(
+    options: &GpuOptions,
+    mut all: Vec<(Adapter, wgpu::Adapter)>,
+) -> Result<(Adapter, wgpu::Adapter), GpuError> {
+    let wanted = match options.adapter {
+        Some(index) => (index < all.len()).then_some(index),
+        None => all.iter().position(|(a, _)| a.kind != AdapterKind::Software),
+    };
+    match wanted {
+        Some(index) => Ok(all.swap_remove(index)),
+        None => Err(no_adapter(options, &all)),
+    }
+}
+
 impl Gpu {
     /// Opens a device.
     ///
@@ -116,14 +159,7 @@ impl Gpu {
     /// [`GpuError::NoAdapter`] when there is none of the kind asked for, [`GpuError::Unsuitable`] when it lacks something,
     /// [`GpuError::NotOpened`] when the driver refuses.
     pub fn open(options: &GpuOptions) -> Result<Self, GpuError> {
-        let instance = instance();
-        let mut all = enumerate(&instance);
-        let wanted = match options.adapter {
-            Some(index) => (index < all.len()).then_some(index),
-            None => all.iter().position(|(a, _)| a.kind != AdapterKind::Software),
-        };
-        let Some(index) = wanted else { return Err(no_adapter(options, &all)) };
-        let (adapter, raw) = all.swap_remove(index);
+        let (adapter, raw) = choose(options, enumerate(&instance()))?;
         let limits = required_limits(&adapter, &raw)?;
         let not_opened = |reason: String| GpuError::NotOpened { adapter: adapter.name.clone(), reason };
         let (device, queue) = pollster::block_on(raw.request_device(&wgpu::DeviceDescriptor {
@@ -271,8 +307,7 @@ impl Gpu {
 }
 
 fn no_adapter(options: &GpuOptions, all: &[(Adapter, wgpu::Adapter)]) -> GpuError {
-    let names: Vec<String> =
-        all.iter().map(|(a, _)| format!("{} ({}, {:?})", a.name, a.interface, a.kind)).collect();
+    let names: Vec<String> = all.iter().map(|(a, _)| a.to_string()).collect();
     let advice = if all.is_empty() {
         "Install the graphics driver with its Vulkan part, or compute on the CPU".to_owned()
     } else if options.adapter.is_some() {

@@ -22,7 +22,7 @@ mod recorder;
 mod weight;
 
 pub use buffer::Buffer;
-pub use device::{Adapter, AdapterKind, Gpu, GpuOptions, adapters};
+pub use device::{Adapter, AdapterKind, Gpu, GpuOptions, adapters, find};
 pub use error::GpuError;
 pub use recorder::Recorder;
 pub use weight::{Matrix, Storage};

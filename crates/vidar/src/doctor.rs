@@ -3,6 +3,7 @@
 use crate::system::{Hardware, hardware};
 use serde::Serialize;
 use std::path::Path;
+use vidar_da3::Device;
 
 /// One finding.
 #[derive(Clone, Debug, Serialize)]
@@ -43,9 +44,33 @@ pub fn examine(folder: &Path) -> Vec<Finding> {
             "stereo: built in, needs metric poses, no weights (MIT OR Apache-2.0)".into(),
         ),
         finding("weights", State::Optional, "none are read by this version (see WEIGHTS.md)".into()),
-        finding("gpu", State::Optional, "not used by this version; everything runs on the CPU".into()),
-        environment(),
     ]
+    .into_iter()
+    .chain(graphics_processors())
+    .chain([environment()])
+    .collect()
+}
+
+/// What networks can be computed on beside the CPU.
+fn graphics_processors() -> Vec<Finding> {
+    let absent = |found: &str, advice: &str| {
+        let (found, advice) = (found.to_owned(), Some(advice.to_owned()));
+        vec![Finding { what: "gpu", state: State::Optional, found, advice }]
+    };
+    match Device::list() {
+        None => absent(
+            "this program was built without graphics processors; everything runs on the CPU",
+            "build it with `--features gpu` to run networks on one",
+        ),
+        Some(all) if all.is_empty() => absent(
+            "no Vulkan, Metal or DirectX 12 device; everything runs on the CPU",
+            "install the graphics driver with its Vulkan part",
+        ),
+        Some(all) => all
+            .into_iter()
+            .map(|(word, name)| finding("gpu", State::Ok, format!("{name}: --device {word}")))
+            .collect(),
+    }
 }
 
 fn finding(what: &'static str, state: State, found: String) -> Finding {

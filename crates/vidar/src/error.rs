@@ -228,6 +228,7 @@ impl Error {
             Self::Geometry(_) | Self::Stereo(_) => "E0301",
             Self::Hub(error) => hub_code(error),
             Self::Da3(vidar_da3::Da3Error::Cancelled) => "E1301",
+            Self::Da3(error) if error.device_advice().is_some() => "E0311",
             Self::Da3(_) => "E0309",
             Self::Odometry(_) => "E0310",
             Self::Align(_) => "E0302",
@@ -262,7 +263,7 @@ impl Error {
     pub fn exit_status(&self) -> ExitStatus {
         match self.code().as_bytes() {
             [b'E', b'0', b'1', ..] => ExitStatus::Usage,
-            [b'E', b'0', b'4', ..] => ExitStatus::ResourceMissing,
+            [b'E', b'0', b'4', ..] | b"E0311" => ExitStatus::ResourceMissing,
             [b'E', b'0', b'5', ..] => ExitStatus::ThresholdFailed,
             [b'E', b'1', ..] => ExitStatus::Interrupted,
             _ => ExitStatus::BadInput,
@@ -330,6 +331,7 @@ impl Error {
             Self::NotARun { .. } => "a run folder holds manifest.json; `vidar run PATH` makes one",
             Self::Dataset(error) => return Some(dataset_hint(error).to_owned()),
             Self::Hub(error) => return error.hint(),
+            Self::Da3(error) if let Some(advice) = error.device_advice() => advice,
             Self::Da3(_) => {
                 "`vidar model list` describes the networks; docs/guides/models.md tells what each one needs"
             }
@@ -437,6 +439,10 @@ pub const CODES: &[(&str, &str)] = &[
     (
         "E0310",
         "The odometry refused its settings, the camera's place on the IMU, or an image of another size.",
+    ),
+    (
+        "E0311",
+        "The graphics processor that was asked for cannot be used: the program was built without them, there is none of that number, it lacks something, its memory does not suffice, or it failed. --device cpu needs none.",
     ),
     ("E0401", "A file or folder could not be read or written."),
     ("E0402", "The disk is full. Finished files are kept; unfinished ones are removed."),

@@ -77,6 +77,7 @@ fn request(args: &DepthArgs, context: &Context) -> Result<DepthRequest, Error> {
             precision: precision(args.precision),
             // The dense head stays in 32 bits, as in the official program.
             head_precision: Some(Precision::F32),
+            device: args.device,
             ..Da3Options::default()
         },
         infer: infer_options(args),
@@ -124,7 +125,9 @@ fn dry_run(request: &DepthRequest, context: &Context) -> Outcome {
     if context.cli.json {
         let lines: serde_json::Map<String, serde_json::Value> =
             plan.lines().into_iter().map(|(k, v)| (k.replace(' ', "_"), v.into())).collect();
-        print::json(&json!({ "schema": "vidar.plan/1", "plan": lines, "memory": plan.memory }));
+        print::json(
+            &json!({ "schema": "vidar.plan/1", "plan": lines, "memory": plan.memory, "device": plan.device }),
+        );
     } else {
         print::pairs(plan.lines());
         print::warnings(&plan.warnings);

@@ -208,7 +208,8 @@ pub fn precision(arg: PrecisionArg) -> da3::Precision {
 
 fn check_files(args: &CheckArgs, context: &Context) -> Outcome {
     let files = references(&args.path)?;
-    let options = Da3Options { precision: precision(args.precision), ..Da3Options::default() };
+    let (precision, device) = (precision(args.precision), args.device);
+    let options = Da3Options { precision, device, ..Da3Options::default() };
     let events = progress::events(&context.cli);
     let (mut reports, mut left_out) = (Vec::new(), 0usize);
     events.stage("check", files.len(), || {
@@ -252,6 +253,7 @@ fn tell_report(report: &check::CheckReport, all: bool) {
     let worst = report
         .worst()
         .map(|row| format!("worst {} {:.1e} of {:.1e} allowed", row.tensor, row.ratio(), row.tolerance));
+    let worst = worst.map(|words| format!("{words}, by {}", report.measure));
     let name = report.file.file_stem().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default();
     let (model, rows) = (&report.model, report.rows.len());
     print::data(format!("{name:<32} {model:<22} {rows:>4} tensors hold  {}", worst.unwrap_or_default()));

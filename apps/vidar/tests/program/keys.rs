@@ -147,6 +147,8 @@ const ELSEWHERE: &[(&str, &str)] = &[
     ("input.camera", "there is one camera here; faults.rs asks for another"),
     ("output.live_map", "it leaves nothing; coupling.rs watches it grow"),
     ("coupling.loop_chunks", "it needs a revisit; coupling.rs has one"),
+    ("coupling.places", "damage.rs has a run of each"),
+    ("coupling.salad_checkpoint", "damage.rs has a small one"),
     ("input.poses", "verbs.rs runs with another trajectory"),
     ("eval.trajectory.low_coverage_ratio", "it decides a warning; vidar-eval's tests"),
     ("geometry.source", "one source needs no weights"),

@@ -5,6 +5,7 @@
 mod bench;
 mod config;
 mod coupling;
+mod damage;
 mod docs;
 mod faults;
 mod keys;

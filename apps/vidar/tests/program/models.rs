@@ -457,3 +457,43 @@ fn a_dry_run_shows_the_network_its_terms_and_its_memory() {
         command.args(["run", sequence, "--geometry", "da3-giant-1.1", "--dry-run"]).output().unwrap().into();
     ran.ends_with(4).says(&["error[E0403]"]);
 }
+
+#[test]
+fn a_device_that_this_program_or_machine_lacks_is_refused_with_the_next_step() {
+    let b = bench();
+    let references = concat!(env!("CARGO_MANIFEST_DIR"), "/../../crates/vidar-da3/tests/data");
+    let one = format!("{references}/tiny_free_v3.safetensors");
+    // No machine has that many, and a program without the feature has none.
+    let absent = "gpu:999";
+    let (images, model, sequence) = (text(&b.images), text(&b.model), text(&shared().sequence));
+    let out = b.root.join("absent device");
+    let commands: [&[&str]; 5] = [
+        &["model", "check", &one, "--device", absent, "-q"],
+        &["depth", images, "--model-dir", model, "--device", absent, "-q", "-o", text(&out)],
+        &["depth", images, "--model", "da3-small-untrained", "--device", absent, "--dry-run"],
+        &["run", sequence, "--model-dir", model, "--device", absent, "--dry-run"],
+        &["run", sequence, "--model-dir", model, "--set", "model.device=gpu:999", "-q", "-o", text(&out)],
+    ];
+    let reason = if cfg!(feature = "gpu") { "number 999" } else { "built without graphics processors" };
+    for command in commands {
+        vidar(command).ends_with(4).says(&["error[E0311]", reason, "--device cpu"]);
+    }
+    assert!(!out.exists(), "a refused run left a folder");
+    vidar(&["model", "check", &one, "--device", "cuda"]).ends_with(2).says(&["cuda", "cpu, gpu, gpu:N"]);
+    vidar(&["run", sequence, "--set", "model.device=gpu:-1", "--dry-run"])
+        .ends_with(2)
+        .says(&["error[E0102]", "cpu, gpu, gpu:N"]);
+    vidar(&["explain", "E0311"]).ends_with(0);
+}
+
+#[test]
+fn where_a_network_computed_stands_in_plans_and_manifests() {
+    let (ran, out) = depth("on the cpu", &["--device", "cpu", "--format", "mini_npz"]);
+    ran.ends_with(0);
+    let options = &read_json(&out.join("manifest.json"))["options"];
+    assert_eq!(options["device"], "cpu", "{options}");
+    // Whatever there is: a graphics processor, or the CPU.
+    let auto = ["run", text(&shared().sequence), "--geometry", "da3-small-untrained", "--device", "auto"];
+    let ran = vidar(&[&auto[..], &["--dry-run"]].concat()).ends_with(0);
+    assert!(ran.stdout.contains("computes"), "{}", ran.stdout);
+}

@@ -111,6 +111,8 @@ impl Default for AlignerConfig {
 pub struct LoopsConfig {
     /// Smallest inner product of two places' descriptors (0 to 1). The paper's τ_loop.
     pub min_similarity: f32,
+    /// The same where places are told by the geometry model's tokens, less what all places have in common (−1 to 1).
+    pub min_token_similarity: f32,
     /// Nearest places asked for per keyframe, after those near in time were left out (1 to 20).
     pub top_k: usize,
     /// Seconds that must lie between the two ends. Raise it for slow motion.
@@ -132,6 +134,7 @@ impl Default for LoopsConfig {
     fn default() -> Self {
         Self {
             min_similarity: 0.85,
+            min_token_similarity: 0.6,
             top_k: 5,
             min_gap_s: 10.0,
             min_travel_m: 3.0,
@@ -223,6 +226,7 @@ impl AlignerConfig {
             ("landmarks.view_jitter", self.landmarks.view_jitter, 0.0, 0.2),
             ("landmarks.max_relative_std", self.landmarks.max_relative_std, 0.01, 1.0),
             ("loops.min_similarity", f64::from(l.min_similarity), 0.0, 1.0),
+            ("loops.min_token_similarity", f64::from(l.min_token_similarity), -1.0, 1.0),
             ("loops.top_k", l.top_k as f64, 1.0, 20.0),
             ("loops.min_gap_s", l.min_gap_s, 0.0, 1e6),
             ("loops.min_travel_m", l.min_travel_m, 0.0, 1e6),

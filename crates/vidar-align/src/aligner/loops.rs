@@ -185,6 +185,7 @@ impl Aligner {
         let Some(newest) = self.chunks.len().checked_sub(1).filter(|_| self.mode.chains()) else { return };
         let l = &self.config.loops;
         let has_travel = self.mode.uses_anchors();
+        let least = if self.places.is_whitened() { l.min_token_similarity } else { l.min_similarity };
         for frame in frames {
             let Some(descriptor) = &frame.descriptor else { continue };
             if self.chunks[newest].view(frame.frame_id).is_none() {
@@ -194,7 +195,7 @@ impl Aligner {
             let min_travel = if has_travel && travel.is_some() { l.min_travel_m } else { 0.0 };
             let travel = travel.unwrap_or(0.0);
             let found = self.places.search(frame.time, travel, descriptor, l.top_k, l.min_gap_s, min_travel);
-            for place in found.into_iter().filter(|m| m.similarity > l.min_similarity) {
+            for place in found.into_iter().filter(|m| m.similarity > least) {
                 let holds = |c: &Chunk| c.is_usable() && c.view(place.frame_id).is_some();
                 let Some(earlier) = self.chunks[..newest].iter().rposition(holds) else { continue };
                 if !self.chunks[newest].is_usable() || newest - earlier <= 1 {

@@ -133,6 +133,14 @@ impl Aligner {
         })
     }
 
+    /// Compares places by what sets them apart from the average place ([`PlaceIndex::whitened`]), and takes those for alike
+    /// that [`LoopsConfig::min_token_similarity`] says: for descriptors that are averages of a model's tokens.
+    #[must_use]
+    pub fn with_whitened_places(mut self) -> Self {
+        self.places = PlaceIndex::whitened();
+        self
+    }
+
     /// How prediction and odometry are coupled.
     pub fn mode(&self) -> CouplingMode {
         self.mode

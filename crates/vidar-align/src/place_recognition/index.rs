@@ -9,7 +9,21 @@ pub struct PlaceIndex {
     /// Row-major, in units of each row's `step`.
     values: Vec<i16>,
     places: Vec<Place>,
+    /// How places look on average; none where descriptors are compared as they are.
+    common: Option<Common>,
 }
+
+/// Sums over all places, channel by channel.
+#[derive(Clone, Debug, Default)]
+struct Common {
+    sum: Vec<f64>,
+    squares: Vec<f64>,
+}
+
+/// Before so many places their average says nothing.
+const FEW_PLACES: usize = 16;
+/// Channels that vary less than this share of the average channel are not blown up further.
+const LEAST_VARIANCE: f64 = 0.01;
 
 #[derive(Clone, Copy, Debug)]
 struct Place {
@@ -29,6 +43,18 @@ pub struct PlaceMatch {
 }
 
 impl PlaceIndex {
+    /// An index for descriptors that are all alike, as averaged tokens are: similarity is the correlation of what sets two
+    /// places apart from the average of all so far, each channel in units of its spread (a diagonal whitening). Until
+    /// there are some places nothing is found.
+    pub fn whitened() -> Self {
+        Self { common: Some(Common::default()), ..Self::default() }
+    }
+
+    /// Whether the average look is removed before places are compared.
+    pub fn is_whitened(&self) -> bool {
+        self.common.is_some()
+    }
+
     /// Number of places.
     pub fn len(&self) -> usize {
         self.places.len()
@@ -58,6 +84,9 @@ impl PlaceIndex {
         // 15 bits of the largest entry: an inner product is off by less than 1e-4.
         let largest = descriptor.iter().fold(0.0_f32, |a, v| a.max(v.abs())).max(f32::MIN_POSITIVE);
         let step = largest / f32::from(i16::MAX);
+        if let Some(common) = &mut self.common {
+            common.add(descriptor);
+        }
         self.values.extend(descriptor.iter().map(|v| (v / step).round() as i16));
         self.places.push(Place { frame_id, time, travel_m, step });
         true
@@ -82,10 +111,15 @@ impl PlaceIndex {
         let far = |p: &Place| {
             time.since(p.time).as_secs_f64() >= min_gap_s && travel_m - p.travel_m >= min_travel_m
         };
+        let likeness: Box<dyn Fn(&[i16], f32) -> f32> = match &self.common {
+            None => Box::new(|row, step| inner(row, descriptor) * step),
+            Some(_) if self.len() < FEW_PLACES => return Vec::new(),
+            Some(common) => common.correlation(self.len(), descriptor),
+        };
         let rows = self.places.iter().zip(self.values.chunks_exact(self.dimension));
         let mut found: Vec<PlaceMatch> = rows
             .filter(|(p, _)| far(p))
-            .map(|(p, row)| PlaceMatch { frame_id: p.frame_id, similarity: inner(row, descriptor) * p.step })
+            .map(|(p, row)| PlaceMatch { frame_id: p.frame_id, similarity: likeness(row, p.step) })
             .filter(|m| m.similarity.is_finite())
             .collect();
         let order = |a: &PlaceMatch, b: &PlaceMatch| {
@@ -97,6 +131,39 @@ impl PlaceIndex {
         found.truncate(top_k);
         found.sort_unstable_by(order);
         found
+    }
+}
+
+impl Common {
+    fn add(&mut self, descriptor: &[f32]) {
+        self.sum.resize(descriptor.len(), 0.0);
+        self.squares.resize(descriptor.len(), 0.0);
+        for ((sum, square), v) in self.sum.iter_mut().zip(&mut self.squares).zip(descriptor) {
+            *sum += f64::from(*v);
+            *square += f64::from(*v).powi(2);
+        }
+    }
+
+    /// Of a descriptor with a row of the index: both less the mean, each channel weighed by the inverse of its variance.
+    fn correlation(&self, places: usize, descriptor: &[f32]) -> Box<dyn Fn(&[i16], f32) -> f32> {
+        let n = places as f64;
+        let mean: Vec<f64> = self.sum.iter().map(|s| s / n).collect();
+        let variance: Vec<f64> =
+            self.squares.iter().zip(&mean).map(|(s, m)| (s / n - m * m).max(0.0)).collect();
+        let floor = LEAST_VARIANCE * variance.iter().sum::<f64>() / variance.len().max(1) as f64;
+        let weight: Vec<f32> = variance.iter().map(|v| (1.0 / (v + floor).max(1e-30)) as f32).collect();
+        let mean: Vec<f32> = mean.into_iter().map(|m| m as f32).collect();
+        let own: Vec<f32> = descriptor.iter().zip(&mean).map(|(d, m)| d - m).collect();
+        let length = own.iter().zip(&weight).map(|(d, w)| d * d * w).sum::<f32>().sqrt();
+        Box::new(move |row, step| {
+            let (mut product, mut square) = (0.0_f32, 0.0_f32);
+            for (((r, m), w), d) in row.iter().zip(&mean).zip(&weight).zip(&own) {
+                let other = f32::from(*r) * step - m;
+                product += other * w * d;
+                square += other * w * other;
+            }
+            product / (length * square.sqrt()).max(1e-30)
+        })
     }
 }
 

@@ -57,6 +57,38 @@ fn similarities_are_those_of_the_descriptors_to_four_digits() {
     assert!(index.search(at(1.0), 0.0, &[1.0], 5, 0.0, 0.0).is_empty());
 }
 
+#[test]
+fn places_that_share_a_common_look_are_told_apart_once_it_is_removed() {
+    // As averaged tokens are: nine tenths of every descriptor is the same, channels differ in size a hundredfold.
+    let n = 64;
+    let (common, sizes) = (direction(1, n), direction(2, n));
+    let look = |place: usize, visit: u64| -> Vec<f32> {
+        let (own, noise) = (direction(100 + place as u64, n), direction(5000 + 97 * place as u64 + visit, n));
+        let mixed = (0..n).map(|c| {
+            let size = if sizes[c] > 0.0 { 1.0 } else { 0.01 };
+            common[c] + 0.1 * size * (own[c] + 0.3 * noise[c])
+        });
+        let mixed: Vec<f32> = mixed.collect();
+        let length = mixed.iter().map(|v| v * v).sum::<f32>().sqrt();
+        mixed.into_iter().map(|v| v / length).collect()
+    };
+    let (mut plain, mut whitened) = (PlaceIndex::default(), PlaceIndex::whitened());
+    for place in 0..60 {
+        let (id, time) = (FrameId(place as u32), at(place as f64));
+        if place == 10 {
+            assert!(whitened.search(at(100.0), 0.0, &look(3, 1), 5, 10.0, 0.0).is_empty(), "too few places");
+        }
+        assert!(plain.add(id, time, 0.0, &look(place, 0)) && whitened.add(id, time, 0.0, &look(place, 0)));
+    }
+    for place in 0..60 {
+        let found = whitened.search(at(100.0), 0.0, &look(place, 1), 2, 10.0, 0.0);
+        assert_eq!(found[0].frame_id.index(), place);
+        // The nearest of sixty strangers in 64 dimensions is still far.
+        assert!(found[0].similarity > 0.78 && found[1].similarity < 0.75, "{place}: {found:?}");
+        assert!(plain.search(at(100.0), 0.0, &look(place, 1), 60, 10.0, 0.0)[59].similarity > 0.97);
+    }
+}
+
 fn scene(seed: f32, shift: f32, gain: f32, offset: f32) -> Image<f32> {
     Image::from_fn(160, 120, |x, y| {
         let (x, y) = (x as f32 + shift, y as f32);

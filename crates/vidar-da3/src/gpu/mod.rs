@@ -18,6 +18,7 @@ mod load;
 mod plan;
 mod stages;
 
+pub(crate) use plan::device_plan;
 pub use plan::{MemoryPlan, memory_plan};
 
 use crate::arithmetic::{Arithmetic, exact_blocks};

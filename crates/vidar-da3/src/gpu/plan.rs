@@ -4,8 +4,9 @@ use super::backbone::{FFN_ROWS, group_views};
 use super::block::inner_width;
 use super::head::ScratchSizes;
 use crate::config::{Da3Config, NetConfig, Networks, PATCH};
+use crate::device::DevicePlan;
 use crate::weights::inventory::parameters;
-use vidar_gpu::{Gpu, GpuError};
+use vidar_gpu::{Adapter, Gpu, GpuError};
 
 const FLOAT: u64 = 4;
 
@@ -43,6 +44,17 @@ pub fn memory_plan(
         }
     };
     MemoryPlan { weights, ..working }
+}
+
+/// [`memory_plan`] with the device that it is of.
+pub(crate) fn device_plan(
+    adapter: &Adapter,
+    config: &Da3Config,
+    size: (usize, usize, usize),
+    wants_rays: bool,
+) -> DevicePlan {
+    let MemoryPlan { weights, working, largest, largest_is } = memory_plan(config, size, wants_rays);
+    DevicePlan { device: adapter.to_string(), weights, working, largest, largest_is }
 }
 
 /// Sizes of a run of one network.

@@ -29,6 +29,8 @@ pub struct StoredChunk {
     pub times: Vec<Timestamp>,
     /// Each view's picture at the depth's size; empty where there are none.
     pub colors: Vec<Image<[u8; 3]>>,
+    /// Each view's look, by which its place is told again; empty where pictures serve.
+    pub looks: Vec<Vec<f32>>,
     /// Why there is no prediction.
     pub failure: Option<String>,
 }
@@ -163,7 +165,7 @@ pub(super) fn load(npz: &Path, sidecar: &Sidecar) -> Result<StoredChunk, Error> 
 fn empty(sidecar: &Sidecar) -> StoredChunk {
     let prediction =
         GeometryPrediction { chunk_id: ChunkId(sidecar.id), frame: sidecar.frame, views: Vec::new() };
-    StoredChunk { prediction, times: Vec::new(), colors: Vec::new(), failure: None }
+    StoredChunk { prediction, times: Vec::new(), colors: Vec::new(), looks: Vec::new(), failure: None }
 }
 
 fn pack(chunk: &StoredChunk) -> Result<Vec<u8>, Error> {
@@ -194,6 +196,11 @@ fn pack(chunk: &StoredChunk) -> Result<Vec<u8>, Error> {
         let bytes = chunk.colors.iter().flat_map(|c| c.data().as_flattened()).copied().collect();
         image = NpyArray::new(vec![n, height, width, 3], NpyData::U8(bytes))?;
         arrays.push(("image", &image));
+    }
+    let looks;
+    if let Some(first) = chunk.looks.first().filter(|_| chunk.looks.len() == n) {
+        looks = NpyArray::new(vec![n, first.len()], NpyData::F32(chunk.looks.concat()))?;
+        arrays.push(("place", &looks));
     }
     let mut packed = std::io::Cursor::new(Vec::new());
     write_npz_arrays_with(&mut packed, &arrays, Packing::Stored)?;
@@ -279,8 +286,15 @@ pub(super) fn read_views(
             .collect(),
         _ => Vec::new(),
     };
+    let looks = match take(&["place"]) {
+        Some(array) if array.shape.first() == Some(&n) && array.shape.len() == 2 => {
+            let length = array.shape[1].max(1);
+            array.into_f32().map_or_else(Vec::new, |v| v.chunks(length).map(<[f32]>::to_vec).collect())
+        }
+        _ => Vec::new(),
+    };
     let prediction = GeometryPrediction { chunk_id, frame, views };
-    Ok(StoredChunk { prediction, times: vec![Timestamp::default(); n], colors, failure: None })
+    Ok(StoredChunk { prediction, times: vec![Timestamp::default(); n], colors, looks, failure: None })
 }
 
 /// `n` matrices of three rows and `columns` columns; a fourth row is left out.

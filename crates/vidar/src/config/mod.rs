@@ -122,6 +122,28 @@ pub struct CouplingConfig {
     /// Show both ends of a loop to the network together, as DA3-Streaming does: one more prediction per loop. Otherwise what is
     /// stored of the two chunks is compared.
     pub loop_chunks: bool,
+    /// How places are told again: `salad` (needs `coupling.salad_checkpoint`), `model` (the geometry network's own tokens, at
+    /// no further cost), `pictures` (knows the same view again, not a place from another side), or `auto`, the first of these
+    /// that there is.
+    pub places: PlacesConfig,
+    /// SALAD's published checkpoint, converted by `tools/salad_to_safetensors.py`. One more network of 350 MB to run per
+    /// keyframe; it knows places from other sides.
+    pub salad_checkpoint: String,
+}
+
+/// How places are told again.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "kebab-case")]
+pub enum PlacesConfig {
+    /// The best there is.
+    #[default]
+    Auto,
+    /// SALAD's descriptors.
+    Salad,
+    /// Averaged tokens of the geometry network.
+    Model,
+    /// Brightness and gradients of the pictures.
+    Pictures,
 }
 
 /// The network, where `geometry.source` names one.
@@ -133,6 +155,10 @@ pub struct ModelConfig {
     /// Precision of the backbone. `auto` is bf16 where the processor multiplies it and f32 elsewhere (the manifest says which);
     /// `f32` is the reference.
     pub precision: vidar_da3::Precision,
+    /// Where the network is computed: `cpu`, `gpu` (the best that does not run its shaders on the CPU), `gpu:N` (as `vidar doctor`
+    /// numbers them), or `auto` (a graphics processor where there is one). All but `cpu` need a program built with `--features gpu`.
+    #[schemars(with = "String")]
+    pub device: vidar_da3::Device,
     /// How the network is used.
     pub network: vidar_da3::Da3ModelConfig,
 }
@@ -243,6 +269,9 @@ impl Config {
             true => Ok(()),
             false => bad(format!("{key} must be finite and positive, found {value}")),
         };
+        if self.coupling.places == PlacesConfig::Salad && self.coupling.salad_checkpoint.is_empty() {
+            return bad("coupling.places = \"salad\" needs coupling.salad_checkpoint".into());
+        }
         for (key, value) in
             [("input.start_secs", self.input.start_secs), ("input.end_secs", self.input.end_secs)]
         {

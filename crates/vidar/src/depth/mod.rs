@@ -26,7 +26,7 @@ use serde::Serialize;
 use std::path::PathBuf;
 use vidar_core::Warning;
 use vidar_da3::preprocess::processed_size;
-use vidar_da3::{Da3, Da3Error, Da3Options, Hooks, InferOptions, Inputs, Prediction, Variant};
+use vidar_da3::{Da3, Da3Error, Da3Options, DevicePlan, Hooks, InferOptions, Inputs, Prediction, Variant};
 use vidar_export::official::SceneOptions;
 use vidar_hub::Store;
 
@@ -72,6 +72,8 @@ pub struct DepthPlan {
     pub model: Result<Located, String>,
     /// Memory, where the architecture is known.
     pub memory: Option<MemoryPlan>,
+    /// The graphics processor and what it must hold; none where the CPU computes, or nothing is known of the network.
+    pub device: Option<DevicePlan>,
     /// Where known cameras come from.
     pub cameras: Option<String>,
     /// What was noticed.
@@ -135,9 +137,15 @@ pub fn plan(request: &DepthRequest) -> Result<DepthPlan, Error> {
         (Ok(located), None) => Some(located.open(&request.da3)?.config().clone()),
         (Err(_), None) => None,
     };
-    let memory = config.map(|c| planned_memory(&c, images.len(), processed));
-    warnings.extend(memory.as_ref().and_then(models::too_much));
+    let memory = config.as_ref().map(|c| planned_memory(c, images.len(), processed));
+    let size = (images.len(), processed.1, processed.0);
+    let planned =
+        config.map(|c| request.da3.device.plan(&c, size, request.infer.use_ray_pose)).transpose()?;
+    let device = planned.flatten();
+    // What a device computes takes the device's memory.
+    warnings.extend(memory.as_ref().filter(|_| device.is_none()).and_then(models::too_much));
     Ok(DepthPlan {
+        device,
         processed,
         memory,
         cameras: cameras.map(|c| format!("{} of {}", c.source, c.count())),
@@ -184,6 +192,10 @@ impl DepthPlan {
             );
             lines.push(("memory", parts));
         }
+        if let Some(device) = &self.device {
+            lines.push(("device", device.device.clone()));
+            lines.push(("memory of the device", models::device_memory(device)));
+        }
         lines
     }
 }
@@ -225,7 +237,7 @@ pub fn run(request: &DepthRequest, events: &Events, cancel: &CancelToken) -> Res
     })?;
     outcome.warnings.iter().for_each(|w| events.warn(w));
     outcome.seconds = clock.elapsed().as_secs_f64();
-    record::manifest(&folder, request, &located, &model.describe_compute(), &outcome)?;
+    record::manifest(&folder, request, &located, &model, &outcome)?;
     Ok(outcome)
 }
 

@@ -6,6 +6,7 @@ use crate::error::Error;
 use crate::models::Located;
 use crate::run_folder::{RunFolder, now_rfc3339, pretty};
 use serde_json::{Value, json};
+use vidar_da3::Da3;
 
 /// Schema of `predictions.json`.
 const PREDICTIONS_SCHEMA: &str = "vidar.depth/1";
@@ -71,7 +72,7 @@ pub(super) fn manifest(
     folder: &RunFolder,
     request: &DepthRequest,
     located: &Located,
-    arithmetic: &str,
+    network: &Da3,
     outcome: &DepthOutcome,
 ) -> Result<(), Error> {
     let infer = &request.infer;
@@ -89,7 +90,8 @@ pub(super) fn manifest(
             "align_to_given": infer.align_to_given,
             "compat": infer.compat,
             "precision": request.da3.precision.name(),
-            "arithmetic": arithmetic,
+            "arithmetic": network.describe_compute(),
+            "device": network.device_name().unwrap_or_else(|| "cpu".to_owned()),
             "poses": request.poses,
             "focal_px": request.focal_px,
         },

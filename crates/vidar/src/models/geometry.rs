@@ -2,14 +2,14 @@
 
 use super::{Located, MemoryPlan, ModelChoice, ModelIdentity, locate, planned_memory, store};
 use crate::chunks::RECORDED;
-use crate::config::Config;
+use crate::config::{Config, ModelConfig};
 use crate::error::Error;
 use serde::Serialize;
 use std::path::PathBuf;
 use std::sync::Arc;
 use vidar_core::{Pinhole, Warning};
 use vidar_da3::preprocess::processed_size;
-use vidar_da3::{Da3Model, Da3ModelConfig, Da3Options, PoseMode, Precision};
+use vidar_da3::{Da3Model, Da3ModelConfig, Da3Options, DevicePlan, PoseMode, Precision};
 
 /// The source of geometry that needs no network.
 pub const STEREO: &str = "stereo";
@@ -53,6 +53,8 @@ pub struct NetworkPlan {
     pub memory: MemoryPlan,
     /// What it computes with, and where.
     pub arithmetic: String,
+    /// The graphics processor and what it must hold; none where the CPU computes.
+    pub device: Option<DevicePlan>,
 }
 
 /// The network that the configuration names; `None` where no network is needed.
@@ -70,7 +72,8 @@ pub fn open(choice: &ModelChoice, config: &Config, mode: PoseMode) -> Result<(Da
     let located = locate(choice, None, &store(true)?)?;
     // The dense head stays in 32 bits, as in the official program.
     let head_precision = Some(Precision::F32);
-    let options = Da3Options { precision: config.model.precision, head_precision, ..Da3Options::default() };
+    let ModelConfig { precision, device, .. } = config.model;
+    let options = Da3Options { precision, head_precision, device, ..Da3Options::default() };
     let network = Arc::new(located.open(&options)?);
     let sha256 = located.identity.weights_sha256.clone();
     let network_config = Da3ModelConfig { mode, ..config.model.network.clone() };
@@ -89,8 +92,12 @@ pub fn planned(
     let size = processed_size(view.width, view.height, &config.model.network.preprocess)?;
     let identity = located.identity.clone();
     let memory = planned_memory(model.network().config(), views, size);
-    let mut warnings: Vec<Warning> = super::too_much(&memory).into_iter().collect();
+    let wants_rays = config.model.network.use_ray_pose;
+    let device = model.network().device_plan(views, size.1, size.0, wants_rays);
+    // What a device computes takes the device's memory.
+    let mut warnings: Vec<Warning> = Vec::new();
+    warnings.extend(super::too_much(&memory).filter(|_| device.is_none()));
     warnings.extend(super::untrained(&identity));
     let arithmetic = model.network().describe_compute();
-    Ok((NetworkPlan { identity, views_at_once: views, memory, arithmetic }, warnings))
+    Ok((NetworkPlan { identity, views_at_once: views, memory, arithmetic, device }, warnings))
 }

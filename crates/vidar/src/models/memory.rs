@@ -1,7 +1,8 @@
 //! What a network will need, before it runs, as manifests and plans have it.
 
+use crate::run::bytes;
 use serde::Serialize;
-use vidar_da3::{Da3Config, memory_estimate};
+use vidar_da3::{Da3Config, DevicePlan, memory_estimate};
 
 /// Planned memory, bytes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
@@ -17,6 +18,18 @@ impl MemoryPlan {
     pub fn total(&self) -> u64 {
         self.weights + self.working
     }
+}
+
+/// What a device must hold, in words.
+pub fn device_memory(plan: &DevicePlan) -> String {
+    let DevicePlan { weights, working, largest, largest_is, .. } = plan;
+    format!(
+        "{} (weights at most {}, work {}, largest buffer {} for {largest_is})",
+        bytes(weights + working),
+        bytes(*weights),
+        bytes(*working),
+        bytes(*largest),
+    )
 }
 
 /// The plan for `views` views of `width` × `height` processed pixels at once.

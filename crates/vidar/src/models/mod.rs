@@ -6,8 +6,9 @@
 
 pub mod geometry;
 mod memory;
+pub mod salad;
 
-pub use memory::{MemoryPlan, planned_memory};
+pub use memory::{MemoryPlan, device_memory, planned_memory};
 
 use crate::error::Error;
 use crate::run::bytes;

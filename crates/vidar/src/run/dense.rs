@@ -2,6 +2,7 @@
 
 use super::MetricMap;
 use super::live::LiveMap;
+use super::looks::Looks;
 use super::observation::{self, Known};
 use super::placed::placed_view;
 use super::plan::{ChunkPlan, Plan};
@@ -69,7 +70,11 @@ impl Road<'_> {
     fn observe(&mut self, mut source: Source) -> Result<Placement, Error> {
         let remap = RemapTable::new(&self.plan.camera, &self.plan.view);
         let mut window = ViewWindow::new(self.dataset, &self.plan.keyframes, &remap);
+        let looks = Looks::open(self.config, &mut source)?;
         let mut aligner = Aligner::new(self.plan.mode, &self.config.align)?;
+        if looks.are_whitened() {
+            aligner = aligner.with_whitened_places();
+        }
         let identity = identity(self.dataset, self.plan, self.config)?;
         let camera = self.dataset.rig.camera(self.dataset.camera);
         let known = Known::new(self.plan, camera.map_or(Se3::IDENTITY, |c| c.body_from_camera));
@@ -83,7 +88,7 @@ impl Road<'_> {
             let key = key_of(&identity, self.plan, chunk.core.clone().chain(chunk.seen.clone()));
             let stored = match self.store.find(number(k), &key) {
                 Some(kept) => kept,
-                None => match self.predict(&mut source, &mut window, k, chunk, &key)? {
+                None => match self.predict((&mut source, &looks), &mut window, k, chunk, &key)? {
                     Some(predicted) => predicted,
                     None => break,
                 },
@@ -93,7 +98,7 @@ impl Road<'_> {
                     self.events.warn(&Warning::new("chunk-failed", reason.clone()).at(format!("chunk {k}")));
                     failures.push(reason);
                 }
-                None => failures.extend(self.align(&mut aligner, &known, chunk, stored)?),
+                None => failures.extend(self.align(&mut aligner, (&known, &looks), chunk, stored)?),
             }
             self.close_loops(&mut aligner, &mut source, &window, &identity)?;
             if let Some(live) = &mut live {
@@ -118,7 +123,7 @@ impl Road<'_> {
     /// What the model says of a chunk, as it then lies on disk; `None` when cancelled.
     fn predict(
         &self,
-        source: &mut Source,
+        (source, looks): (&mut Source, &Looks),
         window: &mut ViewWindow<'_>,
         k: usize,
         chunk: &ChunkPlan,
@@ -142,7 +147,9 @@ impl Road<'_> {
                     let place = format!("chunk {k}");
                     self.events.warn(&Warning::new("keyframes-without-depth", message).at(place));
                 }
-                Some(colored(prediction, &views.views, source.take_colors()))
+                let mut stored = colored(prediction, &views.views, source.take_colors());
+                looks.describe(&mut stored, &source.take_place_tokens())?;
+                Some(stored)
             }
         };
         window.put_back(views.views, indices);
@@ -156,11 +163,11 @@ impl Road<'_> {
     fn align(
         &self,
         aligner: &mut Aligner,
-        known: &Known<'_>,
+        (known, looks): (&Known<'_>, &Looks),
         chunk: &ChunkPlan,
         stored: StoredChunk,
     ) -> Result<Option<String>, Error> {
-        let observation = observation::of(self.plan, known, chunk, stored);
+        let observation = observation::of(self.plan, known, looks, chunk, stored);
         let report = aligner.push(observation)?;
         self.events.emit(&Event::ChunkAligned {
             chunk: report.chunk_id.0,
@@ -226,6 +233,7 @@ impl Road<'_> {
             times: prediction.views.iter().map(|_| Default::default()).collect(),
             prediction,
             colors: Vec::new(),
+            looks: Vec::new(),
             failure: None,
         };
         self.store.write(&stored, &key)?;
@@ -274,7 +282,13 @@ fn aligned(placement: &Placement, stored: StoredChunk) -> Result<Vec<AlignedView
 
 fn failed(chunk_id: ChunkId, reason: String) -> StoredChunk {
     let prediction = GeometryPrediction { chunk_id, frame: ChunkFrame::ModelNative, views: Vec::new() };
-    StoredChunk { prediction, times: Vec::new(), colors: Vec::new(), failure: Some(reason) }
+    StoredChunk {
+        prediction,
+        times: Vec::new(),
+        colors: Vec::new(),
+        looks: Vec::new(),
+        failure: Some(reason),
+    }
 }
 
 /// A prediction with the times and pictures of its views; `given` pictures come before those of the input.
@@ -289,7 +303,7 @@ fn colored(prediction: GeometryPrediction, views: &[ChunkView], given: Vec<Image
         true => given,
         false => prediction.views.par_iter().map(picture).collect::<Option<_>>().unwrap_or_default(),
     };
-    StoredChunk { prediction, times, colors, failure: None }
+    StoredChunk { prediction, times, colors, looks: Vec::new(), failure: None }
 }
 
 /// Chunk numbers below this give loops numbers of their own.
@@ -305,6 +319,7 @@ fn identity(dataset: &Dataset, plan: &Plan, config: &Config) -> Result<Vec<u8>, 
         "camera": format!("{:?}", plan.camera),
         "stereo": config.stereo,
         "network": config.model,
+        "places": plan.places,
     });
     let mut bytes = dataset.fingerprint()?;
     bytes.extend(part.to_string().into_bytes());

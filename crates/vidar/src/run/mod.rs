@@ -3,6 +3,7 @@
 mod dense;
 mod judge;
 mod live;
+mod looks;
 mod observation;
 mod outputs;
 mod pictures;

@@ -1,23 +1,28 @@
 //! What the odometry knows of a chunk's frames and how they look, in the aligner's terms.
 
+use super::looks::Looks;
 use super::plan::{ChunkPlan, Plan};
 use crate::chunks::StoredChunk;
 use crate::keyframes::Keyframe;
 use nalgebra::Vector2;
-use rayon::prelude::*;
 use std::collections::BTreeMap;
 use vidar_align::aligner::covariance_in_camera;
-use vidar_align::place_recognition::describe_image;
 use vidar_align::{ChunkObservation, FrameObservation, MetricAnchor};
 use vidar_core::{
-    CameraModel, FrameId, Image, KeyframeId, LieGroup, OdometryKeyframe, Pinhole, PoseCovariance, Se3,
+    CameraModel, FrameId, KeyframeId, LieGroup, OdometryKeyframe, Pinhole, PoseCovariance, Se3,
     SparseLandmark,
 };
 
 /// A chunk's prediction with poses, covariances, gravity and landmarks of its frames.
-pub fn of(plan: &Plan, known: &Known<'_>, chunk: &ChunkPlan, stored: StoredChunk) -> ChunkObservation {
-    let StoredChunk { prediction, colors, .. } = stored;
-    let looks: Vec<Vec<f32>> = colors.par_iter().map(|c| describe_image(&gray(c))).collect();
+pub fn of(
+    plan: &Plan,
+    known: &Known<'_>,
+    looks: &Looks,
+    chunk: &ChunkPlan,
+    stored: StoredChunk,
+) -> ChunkObservation {
+    let looks = looks.of(&stored);
+    let prediction = stored.prediction;
     let frames = chunk
         .seen
         .clone()
@@ -32,10 +37,6 @@ pub fn of(plan: &Plan, known: &Known<'_>, chunk: &ChunkPlan, stored: StoredChunk
         })
         .collect();
     ChunkObservation { prediction, frames }
-}
-
-fn gray(color: &Image<[u8; 3]>) -> Image<f32> {
-    color.map(|[r, g, b]| 0.299 * f32::from(*r) + 0.587 * f32::from(*g) + 0.114 * f32::from(*b))
 }
 
 /// The odometry's keyframes by frame, where poses are its.

@@ -131,6 +131,7 @@ pub fn result_json(outcome: &RunOutcome) -> Value {
         "double_walls": outcome.map.double_walls,
         "metric_poses": source_json(&outcome.plan),
         "coupling": outcome.plan.mode,
+        "places": outcome.plan.places,
         "is_metric": outcome.plan.is_metric(),
         "placement": outcome.map.placement.as_ref().map(placement_json),
         "judgement": judgement,

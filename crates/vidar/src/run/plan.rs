@@ -1,11 +1,13 @@
 //! What a run would do, before it does anything.
 
+use super::looks::Looks;
 use super::source::{Opened, Source};
 use crate::config::{Config, PoseSource};
 use crate::error::Error;
 use crate::events::{CancelToken, Events};
 use crate::input::{self, MetricAnchor};
 use crate::keyframes::{Keyframe, select_by_time, select_keyframes};
+use crate::models::device_memory;
 use crate::models::geometry::NetworkPlan;
 use std::collections::BTreeSet;
 use std::ops::Range;
@@ -52,6 +54,8 @@ pub struct Plan {
     pub model: ModelInfo,
     /// The network it is, where it is one.
     pub network: Option<NetworkPlan>,
+    /// How places are told again: `salad`, `model` or `pictures`.
+    pub places: &'static str,
     /// What the result will be judged against.
     pub reference: ReferenceSource,
     /// Units of the depth PNG per metre.
@@ -90,7 +94,9 @@ impl Plan {
         }
         input::require_calibration(dataset)?;
         let images = input::strided(dataset, config);
-        let Opened { source, chunks: recorded } = Source::open(dataset, &images, config)?;
+        let Opened { mut source, chunks: recorded } = Source::open(dataset, &images, config)?;
+        // Better a wrong checkpoint now than after the odometry.
+        let places = Looks::open(config, &mut source)?.word();
         let anchor = anchor(dataset, config, events, cancel)?;
         let mut warnings = anchor.as_ref().map_or_else(Vec::new, |a| a.warnings.clone());
         let chosen = choose(dataset, &images, anchor.as_ref(), recorded, &source, config, &mut warnings)?;
@@ -120,6 +126,7 @@ impl Plan {
             camera,
             view,
             model: source.info().clone(),
+            places,
             network,
             reference: reference_source(dataset, config, reference),
             depth_units_per_metre: config.output.depth_units_per_metre,
@@ -154,6 +161,7 @@ impl Plan {
             ("camera", format!("{} {}x{}", self.camera.name(), self.camera.width(), self.camera.height())),
             ("model view", format!("{}x{} px, f {:.1}/{:.1} px, undistorted", k.width, k.height, k.fx, k.fy)),
             ("geometry", format!("{} ({})", self.model.name, self.model.licence)),
+            ("places told by", self.places.to_owned()),
             ("judged against", self.reference.to_string()),
             ("memory of the map", format!("at most {}", bytes(self.volume_budget_bytes))),
             ("disk", format!("at most {}", bytes(self.disk_bytes))),
@@ -161,6 +169,11 @@ impl Plan {
         if let Some(network) = &self.network {
             let (memory, views) = (bytes(network.memory.total()), network.views_at_once);
             lines.push(("memory of the network", format!("about {memory} for {views} views at once")));
+            lines.push(("computes", network.arithmetic.clone()));
+            if let Some(device) = &network.device {
+                lines.push(("device", device.device.clone()));
+                lines.push(("memory of the device", device_memory(device)));
+            }
         }
         lines
     }

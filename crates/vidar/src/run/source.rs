@@ -114,6 +114,29 @@ impl Source {
         self.model().predict_wanted(views, wanted, cancel)
     }
 
+    /// Channels of the tokens that a network can tell places by.
+    pub fn token_channels(&self) -> Option<usize> {
+        match self {
+            Self::Network(network) => Some(network.0.token_channels()),
+            Self::Stereo(_) | Self::Recorded(_) | Self::Simulated(_) => None,
+        }
+    }
+
+    /// From now on tokens are kept.
+    pub fn keep_place_tokens(&mut self) {
+        if let Self::Network(network) = self {
+            network.0.keep_place_tokens();
+        }
+    }
+
+    /// Tokens of the last prediction's views; empty where none are kept.
+    pub fn take_place_tokens(&mut self) -> Vec<Vec<f32>> {
+        match self {
+            Self::Network(network) => network.0.take_place_tokens(),
+            Self::Stereo(_) | Self::Recorded(_) | Self::Simulated(_) => Vec::new(),
+        }
+    }
+
     /// Pictures at the depth's size that came with the last prediction, one per view; empty where none did.
     pub fn take_colors(&mut self) -> Vec<Image<[u8; 3]>> {
         match self {
