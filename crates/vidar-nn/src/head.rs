@@ -4,6 +4,7 @@ use rayon::prelude::*;
 
 use crate::compute::{Compute, Precision};
 use crate::conv::{Conv2d, MapRef};
+use crate::kernels::centre::{Bias, centre_of};
 use crate::kernels::gemm::ShapeOf;
 use crate::kernels::head::{Band, Branch};
 use crate::kernels::pack::Pack;
@@ -79,41 +80,45 @@ pub fn head(c: &Compute, input: &HeadInput<'_>, branches: &mut [HeadBranch<'_>])
     }
     assert!(!map.data.is_empty(), "head: a map without pixels");
 
-    let mut packed = scratch::borrow(Role::Panels);
-    let total: usize = lengths.iter().sum();
-    let mut rest = &mut packed.words(total)[..total];
-    let mut panels: Vec<&[u32]> = Vec::with_capacity(branches.len());
-    for (branch, len) in branches.iter().zip(&lengths) {
-        let (to, after) = rest.split_at_mut(*len);
-        rest = after;
-        let pack = Pack {
-            columns: branch.conv,
-            column: &|at| (at < branch.conv.out_channels()).then_some(at),
-            inner: Source::Bands(branch.conv.bands(Fill::Copy(&[]), size.rows, size.cols)).inner(),
-            round_to_f16: c.precision() == Precision::F16,
-            first: 0,
-            to: &mut *to,
-        };
-        pack.run(isa, factors);
-        panels.push(to);
-    }
-    let points: Vec<Vec<f32>> = branches.iter().map(|branch| branch.point.weight().to_f32()).collect();
-    let (ys, xs) = (taps(map.rows, size.rows, input.corners), taps(map.cols, size.cols, input.corners));
-    let resampled = Resampled { x: map.data, cols: map.cols, channels, ys: &ys, xs: &xs, embedding };
     let Some(conv) = branches.first().map(|branch| branch.conv) else { return };
     assert!(
         branches.iter().all(|b| b.conv.weight().shape()[2..] == conv.weight().shape()[2..]),
         "head: equal kernels"
     );
+    let (ys, xs) = (taps(map.rows, size.rows, input.corners), taps(map.cols, size.cols, input.corners));
+    let resampled = Resampled { x: map.data, cols: map.cols, channels, ys: &ys, xs: &xs, embedding };
     let source = Source::Bands(conv.bands(Fill::Resampled(&resampled), size.rows, size.cols));
+
+    let centre = centre_of(isa, factors, &source);
+    let mut packed = scratch::borrow(Role::Panels);
+    let total: usize = lengths.iter().sum();
+    let mut rest = &mut packed.words(total)[..total];
+    let mut panels: Vec<(&[u32], Bias<'_>)> = Vec::with_capacity(branches.len());
+    for (branch, len) in branches.iter().zip(&lengths) {
+        let (to, after) = rest.split_at_mut(*len);
+        rest = after;
+        let mut bias = Bias::new(branch.conv.bias(), centre.as_deref(), branch.conv.out_channels());
+        let pack = Pack {
+            columns: branch.conv,
+            column: &|at| (at < branch.conv.out_channels()).then_some(at),
+            inner: source.inner(),
+            round_to_f16: c.precision() == Precision::F16,
+            centre: centre.as_deref().zip(bias.products()),
+            first: 0,
+            to: &mut *to,
+        };
+        pack.run(isa, factors);
+        panels.push((to, bias));
+    }
+    let points: Vec<Vec<f32>> = branches.iter().map(|branch| branch.point.weight().to_f32()).collect();
     let branches: Vec<Branch<'_>> = branches
         .iter_mut()
-        .zip(panels)
+        .zip(&panels)
         .zip(&points)
-        .map(|((branch, panels), point)| Branch {
+        .map(|((branch, (panels, bias)), point)| Branch {
             panels,
             middle: branch.conv.out_channels(),
-            bias: branch.conv.bias(),
+            bias: bias.get(),
             norm: branch.norm.map(LayerNorm::view),
             point,
             point_bias: branch.point.bias(),
@@ -123,6 +128,10 @@ pub fn head(c: &Compute, input: &HeadInput<'_>, branches: &mut [HeadBranch<'_>])
         .filter(|branch| branch.middle > 0 && branch.outputs > 0)
         .collect();
     (0..source.chunks()).into_par_iter().for_each(|chunk| {
-        dispatch_product(isa, factors, Band { source, branches: &branches, chunk });
+        dispatch_product(
+            isa,
+            factors,
+            Band { source, branches: &branches, chunk, centre: centre.as_deref() },
+        );
     });
 }

@@ -49,7 +49,7 @@ struct Net {
     x: Vec<f32>,
 }
 
-const ROWS: usize = 17;
+const ROWS: usize = 19;
 const COLS: usize = 13;
 const D: usize = 48;
 

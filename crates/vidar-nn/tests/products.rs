@@ -88,6 +88,9 @@ fn convolutions_match_the_reference_for_every_kernel_stride_and_padding_of_the_n
         case(9, 13, 16, 33, 3, 1, 1),
         case(1, 1, 4, 6, 3, 1, 1),
         case(6, 26, 32, 32, 3, 1, 1),
+        // Large enough for the way with fewer multiplications: more than a segment of tiles, odd sides, part of a panel.
+        case(7, 101, 16, 33, 3, 1, 1),
+        case(18, 17, 48, 64, 3, 1, 1),
         case(7, 9, 8, 17, 3, 2, 1),
         case(8, 10, 8, 16, 3, 2, 1),
         case(28, 42, 3, 20, 14, 14, 0),

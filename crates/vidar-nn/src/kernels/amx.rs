@@ -78,6 +78,10 @@ impl<S: SimdBf16, T: Tiles> Multiply for InAmx<S, T> {
         InBf16(self.vectors).convert(from, to);
     }
     #[inline(always)]
+    fn convert_around(self, from: &[f32], centre: &[f32], to: &mut [u16]) {
+        InBf16(self.vectors).convert_around(from, centre, to);
+    }
+    #[inline(always)]
     fn store(self, to: &mut [u16], v: S::V) {
         InBf16(self.vectors).store(to, v);
     }

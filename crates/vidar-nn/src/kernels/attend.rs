@@ -19,6 +19,8 @@ use crate::rope::RopeTable;
 
 /// Keys of a block: a multiple of every panel width.
 pub(crate) const BLOCK: usize = 128;
+/// Words between the weights of neighbouring queries: rows would otherwise compete for the same cache sets.
+const WEIGHT_GAP: usize = 16;
 /// Queries of a task: a multiple of every tile height.
 pub(crate) const QUERIES: usize = 48;
 
@@ -136,7 +138,7 @@ impl ProductKernel for PackKeys<'_> {
             for (words, rows) in
                 keys.chunks_exact(panel * d_steps).zip(packed.chunks_exact_mut(panel * d_steps))
             {
-                transpose(words, panel, rows);
+                transpose(s, words, panel, rows);
             }
         }
         for i in 0..self.count {
@@ -151,7 +153,7 @@ impl ProductKernel for PackKeys<'_> {
         }
         for (rows, words) in packed.chunks_exact(panel * d_steps).zip(keys.chunks_exact_mut(panel * d_steps))
         {
-            transpose(rows, d_steps, words);
+            transpose(s, rows, d_steps, words);
         }
 
         // Values: `STEP` keys of a channel to a word.
@@ -212,15 +214,17 @@ impl ProductKernel for Attend<'_> {
 
         let mut scratch = scratch::borrow(Role::Block);
         let q_stride = d.next_multiple_of(32); // in words: room enough for either format
-        let words = scratch.words(q_stride + QUERIES * (q_stride + 2 * BLOCK + d_wide + lanes));
+        // Scores and weights are of one tile, weights with room for the rows that a tile reads beyond it.
+        let words = scratch
+            .words(q_stride + QUERIES * (q_stride + d_wide + lanes) + MAX_ROWS * (2 * BLOCK + WEIGHT_GAP));
         let (row, words) = words.split_at_mut(q_stride);
         let (q, words) = words.split_at_mut(QUERIES * q_stride);
-        let (scores, words) = words.split_at_mut(QUERIES * BLOCK);
-        let (weights, words) = words.split_at_mut(QUERIES * BLOCK);
+        let (scores, words) = words.split_at_mut(MAX_ROWS * BLOCK);
+        let (weights, words) = words.split_at_mut(MAX_ROWS * (BLOCK + WEIGHT_GAP));
         let (sums, totals) = words.split_at_mut(QUERIES * d_wide);
         let (row, scores) = (&mut as_floats_mut(row)[..d], as_floats_mut(scores));
         let (sums, totals) = (as_floats_mut(sums), &mut as_floats_mut(totals)[..QUERIES * lanes]);
-        let (q_stride, weight_stride) = (q_stride * M::STEP, BLOCK * M::STEP);
+        let (q_stride, weight_stride) = (q_stride * M::STEP, BLOCK + WEIGHT_GAP * M::STEP);
         let (q, weights) = (M::numbers(q), M::numbers(weights));
         let mut tops = [f32::NEG_INFINITY; QUERIES];
         sums[..n * d_wide].fill(0.0);
@@ -242,6 +246,7 @@ impl ProductKernel for Attend<'_> {
         for block in (0..self.keys).step_by(BLOCK) {
             let count = BLOCK.min(self.keys - block);
             let wide = count.next_multiple_of(panel);
+            // One tile of queries at a time: its scores and weights stay in the first-level cache beside the block.
             for from in (0..n).step_by(tile_rows) {
                 let rows = tile_rows.min(n - from);
                 for p in (0..wide).step_by(panel) {
@@ -251,33 +256,30 @@ impl ProductKernel for Attend<'_> {
                         let here = (q[from * q_stride..].as_ptr(), q_stride);
                         m.tile(rows, here, &[0], d_steps, k.as_ptr(), &mut tile_sums);
                     }
-                    for (r, sums) in tile_sums[..rows].iter().enumerate() {
-                        let to = &mut scores[(from + r) * BLOCK + p..][..panel];
+                    for (scores, sums) in scores.chunks_exact_mut(BLOCK).zip(&tile_sums[..rows]) {
+                        let to = &mut scores[p..][..panel];
                         s.store(to, sums[0]);
                         s.store(&mut to[lanes..], sums[1]);
                     }
                 }
-            }
-            let mut shrinks = [1.0f32; QUERIES];
-            for i in 0..n {
-                let row = &mut scores[i * BLOCK..(i + 1) * BLOCK];
-                let total = &mut totals[i * lanes..(i + 1) * lanes];
-                shrinks[i] =
-                    soften::<M>(m, row, count, wide, &mut tops[i], total, &mut weights[i * weight_stride..]);
-            }
-            for from in (0..n).step_by(tile_rows) {
-                let rows = tile_rows.min(n - from);
+                let mut shrinks = [1.0f32; MAX_ROWS];
+                for r in 0..rows {
+                    let (i, row) = (from + r, &mut scores[r * BLOCK..(r + 1) * BLOCK]);
+                    let total = &mut totals[i * lanes..(i + 1) * lanes];
+                    let weights = &mut weights[r * weight_stride..];
+                    shrinks[r] = soften::<M>(m, row, count, wide, &mut tops[i], total, weights);
+                }
                 for p in 0..layout.d_panels() {
                     let start = layout.key_words() + p * layout.value_panel_words() + block / M::STEP * panel;
                     let v = &self.words[start..][..wide / M::STEP * panel];
                     // SAFETY: `rows` rows of `wide` weights, and as many packed values.
                     unsafe {
-                        let here = (weights[from * weight_stride..].as_ptr(), weight_stride);
+                        let here = (weights.as_ptr(), weight_stride);
                         m.tile(rows, here, &[0], wide / M::STEP, v.as_ptr(), &mut tile_sums);
                     }
                     for (r, add) in tile_sums[..rows].iter().enumerate() {
                         let to = &mut sums[(from + r) * d_wide + p * panel..][..panel];
-                        let shrink = s.splat(shrinks[from + r]);
+                        let shrink = s.splat(shrinks[r]);
                         let (a, b) = to.split_at_mut(lanes);
                         s.store(a, s.fma(s.load(a), shrink, add[0]));
                         s.store(b, s.fma(s.load(b), shrink, add[1]));

@@ -14,13 +14,14 @@ use std::ops::Range;
 
 use rayon::prelude::*;
 
+use super::centre::{Bias, centre_of};
 use super::pack::{Columns, Inner, Pack};
 use super::scratch::{self, Role};
 use super::shared::SharedMut;
 use super::simd::Simd;
 use super::source::{Geometry, Source};
 use super::tile::{MAX_ROWS, Multiply, Sums, steps_of, tile_start};
-use super::{Factors, ProductKernel, dispatch_product, math};
+use super::{Factors, ProductKernel, dispatch_product, math, winograd};
 use crate::compute::{Compute, Precision};
 
 /// What happens to a sum before it is stored, after the bias.
@@ -69,7 +70,7 @@ pub(crate) struct Product<'a> {
 }
 
 /// Words of packed weights that exist at a time.
-const PACKED_WORDS: usize = 1 << 20;
+pub(crate) const PACKED_WORDS: usize = 1 << 20;
 /// Tasks per thread that make their different speeds even out.
 const TASKS_PER_THREAD: usize = 8;
 
@@ -82,6 +83,11 @@ impl Product<'_> {
             return;
         }
         let (isa, factors) = (c.isa(), Factors::of(c));
+        if let Source::Bands(bands) = &self.source
+            && winograd::is_for(bands, factors)
+        {
+            return winograd::run(self, bands, c, out);
+        }
         let Shape { panel, words } = dispatch_product(isa, factors, ShapeOf { inner });
         let panel_words = panel * words;
         let gated = matches!(self.end, End::SwiGlu);
@@ -96,6 +102,9 @@ impl Product<'_> {
             (i < width).then_some(i + p % per_unit * width)
         };
         let out = SharedMut::new(out);
+        let centre = centre_of(isa, factors, &self.source);
+        let centre = centre.as_deref();
+        let mut bias = Bias::new(self.bias, centre, self.width);
         let mut packed = scratch::borrow(Role::Panels);
         for first in (0..units).step_by(units_at_once) {
             let count = units_at_once.min(units - first);
@@ -105,16 +114,22 @@ impl Product<'_> {
                 column: &column,
                 inner,
                 round_to_f16: c.precision() == Precision::F16,
+                centre: centre.zip(bias.products()),
                 first: first * per_unit * panel,
                 to: packed,
             };
             pack.run(isa, factors);
+            let bias = bias.get();
             let panels = Panels { words: packed, first, count, per_unit };
             let splits = (TASKS_PER_THREAD * rayon::current_num_threads()).div_ceil(chunks).clamp(1, count);
             (0..chunks * splits).into_par_iter().for_each(|task| {
                 let (chunk, split) = (task / splits, task % splits);
                 let units = split * count / splits..(split + 1) * count / splits;
-                dispatch_product(isa, factors, Task { product: self, chunk, panels, units, width, out });
+                dispatch_product(
+                    isa,
+                    factors,
+                    Task { product: self, bias, centre, chunk, panels, units, width, out },
+                );
             });
         }
     }
@@ -149,6 +164,8 @@ pub(crate) struct Panels<'a> {
 
 struct Task<'a> {
     product: &'a Product<'a>,
+    bias: Option<&'a [f32]>,
+    centre: Option<&'a [f32]>,
     chunk: usize,
     panels: Panels<'a>,
     units: Range<usize>,
@@ -164,10 +181,10 @@ impl ProductKernel for Task<'_> {
         let mut scratch = scratch::borrow(Role::Rows);
         let rows = product.source.rows(self.chunk);
         let geometry = product.source.geometry::<M>();
-        let a = product.source.prepare(m, &geometry, self.chunk, &mut scratch);
+        let a = product.source.prepare(m, &geometry, self.chunk, self.centre, &mut scratch);
         let target = Target {
             width: self.width,
-            bias: product.bias,
+            bias: self.bias,
             end: product.end,
             layout: product.layout,
             out: self.out,
@@ -237,7 +254,7 @@ pub(crate) fn multiply<M: Multiply>(
                         m.tile(count, here, &geometry.taps, steps, words[panel_words..].as_ptr(), &mut sums);
                     }
                 }
-                target.finish(s, &gates, &sums, from - out_start, count, first);
+                target.finish(m, &gates, &sums, from - out_start, count, first);
             }
             row = run.end;
         }
@@ -248,21 +265,34 @@ pub(crate) fn multiply<M: Multiply>(
 impl Target<'_> {
     /// Bias, end and store of a tile.
     #[inline(always)]
-    fn finish<S: Simd>(&self, s: S, gates: &Sums<S>, sums: &Sums<S>, row: usize, count: usize, first: usize) {
-        let columns = (2 * S::LANES).min(self.width - first);
+    pub(crate) fn finish<M: Multiply>(
+        &self,
+        m: M,
+        gates: &Sums<M::Simd>,
+        sums: &Sums<M::Simd>,
+        row: usize,
+        count: usize,
+        first: usize,
+    ) {
+        let (s, lanes) = (m.simd(), M::Simd::LANES);
+        let columns = (2 * lanes).min(self.width - first);
+        // Rows of a tile mostly lie in one line: dividing for each of them would cost a tenth of the product.
+        let (base, in_line) = (self.layout.at(row), row % self.layout.line + count <= self.layout.line);
+        let start_of =
+            |r: usize| if in_line { base + r * self.layout.row_stride } else { self.layout.at(row + r) };
         for half in 0..2 {
-            let from = half * S::LANES;
+            let from = half * lanes;
             if from >= columns {
                 return;
             }
-            let to = (from + S::LANES).min(columns);
+            let to = (from + lanes).min(columns);
             let of = |v: &[f32], base: usize| s.load_part(&v[base + first + from..base + first + to]);
             let bias = self.bias.map_or(s.splat(0.0), |bias| of(bias, 0));
             // Each end has its own loop over rows, so that the choice is made once per tile.
             macro_rules! rows {
                 (|$start:ident, $out:ident, $v:ident, $r:ident| $value:expr) => {
                     for $r in 0..count {
-                        let $start = self.layout.at(row + $r) + first + from;
+                        let $start = start_of($r) + first + from;
                         // SAFETY: rows and panels are disjoint between tasks and within one.
                         let $out = unsafe { self.out.part($start, to - from) };
                         let $v = s.add(sums[$r][half], bias);
@@ -273,6 +303,8 @@ impl Target<'_> {
             }
             match self.end {
                 End::Store => rows!(|_at, out, v, r| v),
+                // What is rounded to bf16 next needs no more than that.
+                End::Gelu if M::STEP == 2 => rows!(|_at, out, v, r| math::gelu_coarse(s, v)),
                 End::Gelu => rows!(|_at, out, v, r| math::gelu(s, v)),
                 End::Relu => rows!(|_at, out, v, r| math::relu(s, v)),
                 End::Accumulate(None) => rows!(|_at, out, v, r| s.add(s.load_part(out), v)),
@@ -285,7 +317,7 @@ impl Target<'_> {
                     // `bias` is the gate's here; the value's lies `width` further.
                     let value_bias = self.bias.map_or(s.splat(0.0), |bias| of(bias, self.width));
                     for r in 0..count {
-                        let start = self.layout.at(row + r) + first + from;
+                        let start = start_of(r) + first + from;
                         // SAFETY: rows and panels are disjoint between tasks and within one.
                         let out = unsafe { self.out.part(start, to - from) };
                         let gate = math::silu(s, s.add(gates[r][half], bias));

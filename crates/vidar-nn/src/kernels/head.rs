@@ -28,6 +28,7 @@ pub(crate) struct Band<'a> {
     pub(crate) source: Source<'a>,
     pub(crate) branches: &'a [Branch<'a>],
     pub(crate) chunk: usize,
+    pub(crate) centre: Option<&'a [f32]>,
 }
 
 impl ProductKernel for Band<'_> {
@@ -38,7 +39,7 @@ impl ProductKernel for Band<'_> {
         let rows = self.source.rows(self.chunk);
         let geometry = self.source.geometry::<M>();
         let mut scratch = scratch::borrow(Role::Rows);
-        let a = self.source.prepare(m, &geometry, self.chunk, &mut scratch);
+        let a = self.source.prepare(m, &geometry, self.chunk, self.centre, &mut scratch);
         let panel = 2 * M::Simd::LANES;
         for branch in self.branches {
             let n = branch.middle;

@@ -7,6 +7,7 @@
 #[cfg(target_arch = "x86_64")]
 pub(crate) mod amx;
 pub(crate) mod attend;
+pub(crate) mod centre;
 pub(crate) mod gemm;
 pub(crate) mod head;
 pub(crate) mod map;
@@ -21,6 +22,7 @@ pub(crate) mod shared;
 pub(crate) mod simd;
 pub(crate) mod source;
 pub(crate) mod tile;
+pub(crate) mod winograd;
 #[cfg(target_arch = "x86_64")]
 mod x86;
 

@@ -37,6 +37,19 @@ pub(crate) trait Simd: Copy + Send + Sync + 'static {
     fn scale_by_power(self, a: Self::V, n: Self::V) -> Self::V;
     fn sum(self, a: Self::V) -> f32;
     fn maximum(self, a: Self::V) -> f32;
+    /// `to[k * to_stride + j] = from[j * from_stride + k]` for j and k below `LANES`.
+    ///
+    /// # Safety
+    /// These words must be readable and writable.
+    #[inline(always)]
+    unsafe fn transpose(self, from: *const u32, from_stride: usize, to: *mut u32, to_stride: usize) {
+        for k in 0..Self::LANES {
+            for j in 0..Self::LANES {
+                // SAFETY: the caller's promise.
+                unsafe { *to.add(k * to_stride + j) = *from.add(j * from_stride + k) };
+            }
+        }
+    }
 }
 
 /// A kernel set that multiplies bf16.

@@ -136,13 +136,22 @@ impl<'a> Source<'a> {
         }
     }
 
-    /// The chunk's rows, from its first one on, in the multiplication's number format.
+    /// Numbers of a pixel or row, which a centre has one of each of.
+    pub(crate) fn channels(&self) -> usize {
+        match self {
+            Self::Flat { inner, .. } => *inner,
+            Self::Bands(b) => b.channels,
+        }
+    }
+
+    /// The chunk's rows, from its first one on, in the multiplication's number format and around a centre if there is one.
     #[inline(always)]
     pub(crate) fn prepare<'s, M: Multiply>(
         &'s self,
         m: M,
         geometry: &Geometry,
         chunk: usize,
+        centre: Option<&[f32]>,
         scratch: &'s mut Scratch,
     ) -> &'s [M::Number] {
         let rows = self.rows(chunk);
@@ -165,17 +174,19 @@ impl<'a> Source<'a> {
                     for (x, to) in x.chunks_exact(*inner).zip(to.chunks_exact_mut(stride)) {
                         let (to, rest) = to.split_at_mut(*inner);
                         rest.fill(M::Number::default());
-                        if let Some(norm) = norm {
-                            norm_row(m.simd(), *norm, x, line);
-                            m.convert(line, to);
-                        } else {
-                            m.convert(x, to);
-                        }
+                        let x = match norm {
+                            Some(norm) => {
+                                norm_row(m.simd(), *norm, x, line);
+                                &*line
+                            }
+                            None => x,
+                        };
+                        round(m, x, centre, to);
                     }
                 }
                 to
             }
-            Self::Bands(b) => b.prepare(m, rows, scratch),
+            Self::Bands(b) => b.prepare(m, rows, centre, scratch),
         }
     }
 }
@@ -202,6 +213,7 @@ impl Bands<'_> {
         &self,
         m: M,
         rows: Range<usize>,
+        centre: Option<&[f32]>,
         scratch: &'s mut Scratch,
     ) -> &'s [M::Number] {
         let lines = rows.start / self.out_cols..rows.end / self.out_cols;
@@ -219,27 +231,53 @@ impl Bands<'_> {
             let row =
                 (lines.start * self.stride + i).checked_sub(self.padding).filter(|row| *row < self.rows);
             let Some(row) = row else {
-                to.fill(M::Number::default());
+                round_zeros(m, centre, to);
                 continue;
             };
-            to[..border].fill(M::Number::default());
-            to[border + width..].fill(M::Number::default());
+            round_zeros(m, centre, &mut to[..border]);
+            round_zeros(m, centre, &mut to[border + width..]);
             let to = &mut to[border..border + width];
             match self.fill {
-                Fill::Copy(x) => m.convert(&x[row * width..(row + 1) * width], to),
+                Fill::Copy(x) => round(m, &x[row * width..(row + 1) * width], centre, to),
                 Fill::Relu(x) => {
                     for (line, x) in line.iter_mut().zip(&x[row * width..(row + 1) * width]) {
                         *line = if *x < 0.0 { 0.0 } else { *x }; // NaN stays NaN
                     }
-                    m.convert(line, to);
+                    round(m, line, centre, to);
                 }
                 Fill::Resampled(resampled) => {
                     resampled.line(m.simd(), row, line);
-                    m.convert(line, to);
+                    round(m, line, centre, to);
                 }
             }
         }
         to[needed * pitch..].fill(M::Number::default());
         to
+    }
+}
+
+/// Rounds whole pixels (or a row) around a centre, repeated as often as needed.
+#[inline(always)]
+fn round<M: Multiply>(m: M, x: &[f32], centre: Option<&[f32]>, to: &mut [M::Number]) {
+    let Some(centre) = centre.filter(|centre| !centre.is_empty()) else {
+        return m.convert(x, to);
+    };
+    for (x, to) in x.chunks(centre.len()).zip(to.chunks_mut(centre.len())) {
+        m.convert_around(x, &centre[..x.len()], to);
+    }
+}
+
+/// Whole pixels outside of a map.
+#[inline(always)]
+fn round_zeros<M: Multiply>(m: M, centre: Option<&[f32]>, to: &mut [M::Number]) {
+    const ZEROS: [f32; 256] = [0.0; 256];
+    let Some(centre) = centre.filter(|centre| !centre.is_empty()) else {
+        return to.fill(M::Number::default());
+    };
+    for to in to.chunks_mut(centre.len()) {
+        let centre = &centre[..to.len()];
+        for (centre, to) in centre.chunks(ZEROS.len()).zip(to.chunks_mut(ZEROS.len())) {
+            m.convert_around(&ZEROS[..centre.len()], centre, to);
+        }
     }
 }

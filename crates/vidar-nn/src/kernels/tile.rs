@@ -35,6 +35,9 @@ pub(crate) trait Multiply: Copy + Send + Sync {
     /// Rounds `from` into the number format.
     fn convert(self, from: &[f32], to: &mut [Self::Number]);
 
+    /// Rounds `from - centre` into the number format.
+    fn convert_around(self, from: &[f32], centre: &[f32], to: &mut [Self::Number]);
+
     /// Rounds a vector into the number format.
     fn store(self, to: &mut [Self::Number], v: <Self::Simd as Simd>::V);
 
@@ -112,6 +115,11 @@ impl<S: Simd> Multiply for InF32<S> {
     #[inline(always)]
     fn convert(self, from: &[f32], to: &mut [f32]) {
         to.copy_from_slice(from);
+    }
+
+    #[inline(always)]
+    fn convert_around(self, from: &[f32], centre: &[f32], to: &mut [f32]) {
+        to.iter_mut().zip(from).zip(centre).for_each(|((to, x), c)| *to = x - c);
     }
 
     #[inline(always)]
@@ -204,6 +212,21 @@ impl<S: SimdBf16> Multiply for InBf16<S> {
         }
         for (from, to) in from[whole..].iter().zip(&mut to[whole..]) {
             *to = half::bf16::from_f32(*from).to_bits();
+        }
+    }
+
+    #[inline(always)]
+    fn convert_around(self, from: &[f32], centre: &[f32], to: &mut [u16]) {
+        let s = self.0;
+        let whole = from.len() / S::LANES * S::LANES;
+        for ((from, centre), to) in
+            from.chunks_exact(S::LANES).zip(centre.chunks_exact(S::LANES)).zip(to.chunks_exact_mut(S::LANES))
+        {
+            // SAFETY: the chunk has room for LANES numbers.
+            unsafe { s.store_bf16(to.as_mut_ptr(), s.sub(s.load(from), s.load(centre))) };
+        }
+        for ((from, centre), to) in from[whole..].iter().zip(&centre[whole..]).zip(&mut to[whole..]) {
+            *to = half::bf16::from_f32(*from - *centre).to_bits();
         }
     }
 

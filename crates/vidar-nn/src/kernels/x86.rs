@@ -150,6 +150,35 @@ impl Simd for Avx2 {
             _mm_cvtss_f32(_mm_max_ss(x, _mm_movehdup_ps(x)))
         }
     }
+    #[inline(always)]
+    unsafe fn transpose(self, from: *const u32, from_stride: usize, to: *mut u32, to_stride: usize) {
+        // SAFETY: see above, and the caller's promise.
+        unsafe {
+            let r: [__m256i; 8] =
+                std::array::from_fn(|j| _mm256_loadu_si256(from.add(j * from_stride).cast()));
+            // Row pairs, then fours: lane l of four[i][c] is column 4l + c of rows 4i to 4i + 3.
+            let pairs: [[__m256i; 2]; 4] = std::array::from_fn(|i| {
+                let (a, b) = (r[2 * i], r[2 * i + 1]);
+                [_mm256_unpacklo_epi32(a, b), _mm256_unpackhi_epi32(a, b)]
+            });
+            let four: [[__m256i; 4]; 2] = std::array::from_fn(|i| {
+                let (a, b) = (pairs[2 * i], pairs[2 * i + 1]);
+                [
+                    _mm256_unpacklo_epi64(a[0], b[0]),
+                    _mm256_unpackhi_epi64(a[0], b[0]),
+                    _mm256_unpacklo_epi64(a[1], b[1]),
+                    _mm256_unpackhi_epi64(a[1], b[1]),
+                ]
+            });
+            for (c, (a, b)) in four[0].into_iter().zip(four[1]).enumerate() {
+                let columns =
+                    [_mm256_permute2x128_si256::<0x20>(a, b), _mm256_permute2x128_si256::<0x31>(a, b)];
+                for (lane, column) in columns.into_iter().enumerate() {
+                    _mm256_storeu_si256(to.add((4 * lane + c) * to_stride).cast(), column);
+                }
+            }
+        }
+    }
 }
 
 /// AVX-512 F, BW, DQ and VL: sixteen lanes. `BF16` says that AVX-512-BF16 is there too.
@@ -268,6 +297,43 @@ impl<const BF16: bool> Simd for Avx512<BF16> {
     fn maximum(self, a: __m512) -> f32 {
         // SAFETY: see above.
         unsafe { _mm512_reduce_max_ps(a) }
+    }
+    #[inline(always)]
+    unsafe fn transpose(self, from: *const u32, from_stride: usize, to: *mut u32, to_stride: usize) {
+        // SAFETY: see above, and the caller's promise.
+        unsafe {
+            let r: [__m512i; 16] =
+                std::array::from_fn(|j| _mm512_loadu_si512(from.add(j * from_stride).cast()));
+            // Row pairs, then fours: lane l of four[i][c] is column 4l + c of rows 4i to 4i + 3.
+            let pairs: [[__m512i; 2]; 8] = std::array::from_fn(|i| {
+                let (a, b) = (r[2 * i], r[2 * i + 1]);
+                [_mm512_unpacklo_epi32(a, b), _mm512_unpackhi_epi32(a, b)]
+            });
+            let four: [[__m512i; 4]; 4] = std::array::from_fn(|i| {
+                let (a, b) = (pairs[2 * i], pairs[2 * i + 1]);
+                [
+                    _mm512_unpacklo_epi64(a[0], b[0]),
+                    _mm512_unpackhi_epi64(a[0], b[0]),
+                    _mm512_unpacklo_epi64(a[1], b[1]),
+                    _mm512_unpackhi_epi64(a[1], b[1]),
+                ]
+            });
+            for c in 0..4 {
+                // Even lanes (0x88) and odd ones (0xdd), twice: columns c and 8 + c, 4 + c and 12 + c.
+                let [a, b, e, f] = [four[0][c], four[1][c], four[2][c], four[3][c]];
+                let even = [_mm512_shuffle_i32x4::<0x88>(a, b), _mm512_shuffle_i32x4::<0x88>(e, f)];
+                let odd = [_mm512_shuffle_i32x4::<0xdd>(a, b), _mm512_shuffle_i32x4::<0xdd>(e, f)];
+                let columns = [
+                    _mm512_shuffle_i32x4::<0x88>(even[0], even[1]),
+                    _mm512_shuffle_i32x4::<0x88>(odd[0], odd[1]),
+                    _mm512_shuffle_i32x4::<0xdd>(even[0], even[1]),
+                    _mm512_shuffle_i32x4::<0xdd>(odd[0], odd[1]),
+                ];
+                for (lane, column) in columns.into_iter().enumerate() {
+                    _mm512_storeu_si512(to.add((4 * lane + c) * to_stride).cast(), column);
+                }
+            }
+        }
     }
 }
 
