@@ -48,7 +48,7 @@ impl CameraEncoder {
         self.token_norm.apply_in_place(&compute, &mut tokens);
         let mut scratch = BlockScratch::default();
         for block in &self.trunk {
-            block.run(&compute, &mut tokens, 1, None, &mut scratch);
+            block.run(&compute.into(), &mut tokens, 1, None, &mut scratch);
         }
         self.trunk_norm.apply_in_place(&compute, &mut tokens);
         for (view, (code, token)) in input.chunks_exact(9).zip(tokens.chunks_exact(dim)).enumerate() {

@@ -45,6 +45,23 @@ enum FeedForward {
 /// Epsilon of the norms over queries and keys.
 pub(crate) const QK_EPS: f32 = 1e-5;
 
+/// Kernels and precision of a block's layers, and of its attention.
+///
+/// Scores and weights are averages over channels and keys: bf16 there leaves no trace in depth, not even in the first
+/// blocks, whose layers must not be rounded.
+#[derive(Clone, Copy)]
+pub(crate) struct BlockCompute {
+    pub layers: Compute,
+    pub attention: Compute,
+}
+
+impl From<Compute> for BlockCompute {
+    /// Both alike.
+    fn from(compute: Compute) -> Self {
+        Self { layers: compute, attention: compute }
+    }
+}
+
 /// Buffers that the blocks of a run share.
 #[derive(Default)]
 pub(crate) struct BlockScratch {
@@ -101,7 +118,7 @@ impl Block {
     /// Runs the block on `sequences` sequences of equal length, each attending to itself.
     pub fn run(
         &self,
-        c: &Compute,
+        c: &BlockCompute,
         x: &mut [f32],
         sequences: usize,
         rope: Option<&RopeTable>,
@@ -113,27 +130,27 @@ impl Block {
         self.project_qkv(c, x, &mut qkv, scratch);
         resize(&mut scratch.attended, x.len());
         let spec = self.attn.spec(rope);
-        attention(c, &qkv, sequences, rows / sequences.max(1), &spec, &mut scratch.attended);
+        attention(&c.attention, &qkv, sequences, rows / sequences.max(1), &spec, &mut scratch.attended);
         scratch.qkv = qkv;
         self.finish(c, x, scratch);
     }
 
     /// Queries, keys and values of some tokens: `[tokens, 3, D]`.
-    fn project_qkv(&self, c: &Compute, x: &[f32], qkv: &mut [f32], scratch: &mut BlockScratch) {
+    fn project_qkv(&self, c: &BlockCompute, x: &[f32], qkv: &mut [f32], scratch: &mut BlockScratch) {
         resize(&mut scratch.normed, x.len());
-        self.norm1.apply(c, x, &mut scratch.normed);
-        self.attn.qkv.apply(c, &scratch.normed, x.len() / self.dim(), qkv, Epilogue::None);
+        self.norm1.apply(&c.layers, x, &mut scratch.normed);
+        self.attn.qkv.apply(&c.layers, &scratch.normed, x.len() / self.dim(), qkv, Epilogue::None);
     }
 
     /// Room for the keys and values of a sequence of `tokens`.
-    pub fn key_values(&self, c: &Compute, tokens: usize) -> KeyValues {
-        KeyValues::new(c, &self.attn.spec(None), tokens)
+    pub fn key_values(&self, c: &BlockCompute, tokens: usize) -> KeyValues {
+        KeyValues::new(&c.attention, &self.attn.spec(None), tokens)
     }
 
     /// Appends some tokens' keys and values to a sequence's, and writes their queries, `[tokens, D]`.
     pub fn push(
         &self,
-        c: &Compute,
+        c: &BlockCompute,
         x: &[f32],
         rope: Option<&RopeTable>,
         (sequence, queries): (&mut KeyValues, &mut [f32]),
@@ -154,7 +171,7 @@ impl Block {
     /// Runs the block on some tokens whose queries meet a whole sequence.
     pub fn run_in_sequence(
         &self,
-        c: &Compute,
+        c: &BlockCompute,
         x: &mut [f32],
         rope: Option<&RopeTable>,
         (sequence, queries): (&KeyValues, &[f32]),
@@ -168,26 +185,26 @@ impl Block {
     }
 
     /// The rest of the block after attention: projection, residual, feed-forward part.
-    fn finish(&self, c: &Compute, x: &mut [f32], scratch: &mut BlockScratch) {
+    fn finish(&self, c: &BlockCompute, x: &mut [f32], scratch: &mut BlockScratch) {
         let dim = self.dim();
         let rows = x.len() / dim;
         let residual = Epilogue::Accumulate { gamma: Some(&self.ls1) };
-        self.attn.proj.apply(c, &scratch.attended, rows, x, residual);
+        self.attn.proj.apply(&c.layers, &scratch.attended, rows, x, residual);
         for x in x.chunks_mut(FFN_ROWS * dim) {
             let rows = x.len() / dim;
             resize(&mut scratch.normed, x.len());
-            self.norm2.apply(c, x, &mut scratch.normed);
+            self.norm2.apply(&c.layers, x, &mut scratch.normed);
             let residual = Epilogue::Accumulate { gamma: Some(&self.ls2) };
             match &self.mlp {
                 FeedForward::Mlp { fc1, fc2 } => {
                     resize(&mut scratch.hidden, rows * fc1.out_features());
-                    fc1.apply(c, &scratch.normed, rows, &mut scratch.hidden, Epilogue::Gelu);
-                    fc2.apply(c, &scratch.hidden, rows, x, residual);
+                    fc1.apply(&c.layers, &scratch.normed, rows, &mut scratch.hidden, Epilogue::Gelu);
+                    fc2.apply(&c.layers, &scratch.hidden, rows, x, residual);
                 }
                 FeedForward::SwiGlu { w12, w3 } => {
                     resize(&mut scratch.hidden, rows * w3.in_features());
-                    w12.apply_swiglu(c, &scratch.normed, rows, &mut scratch.hidden);
-                    w3.apply(c, &scratch.hidden, rows, x, residual);
+                    w12.apply_swiglu(&c.layers, &scratch.normed, rows, &mut scratch.hidden);
+                    w3.apply(&c.layers, &scratch.hidden, rows, x, residual);
                 }
             }
         }

@@ -20,7 +20,7 @@ mod reference;
 #[cfg(feature = "gpu")]
 pub(crate) use block::QK_EPS;
 use block::resize;
-pub(crate) use block::{Block, BlockScratch, BlockShape, FFN_ROWS};
+pub(crate) use block::{Block, BlockCompute, BlockScratch, BlockShape, FFN_ROWS};
 pub(crate) use embed::Embed;
 pub use reference::{ReferenceStrategy, choose as choose_reference};
 
@@ -28,7 +28,7 @@ use crate::config::{BackboneConfig, PATCH};
 use crate::error::Da3Error;
 use crate::run::Run;
 use crate::weights::{Residency, Scope, Slot};
-use vidar_nn::{Compute, LayerNorm, RopeTable};
+use vidar_nn::{LayerNorm, RopeTable};
 
 /// Epsilon of the blocks' norms.
 const BLOCK_EPS: f32 = 1e-6;
@@ -170,7 +170,7 @@ impl Backbone {
             if self.config.alternate_from == Some(i) {
                 self.place_camera_tokens(&mut x, length, cameras);
             }
-            let compute = run.block(i, self.config.depth);
+            let compute = BlockCompute { layers: run.block(i, self.config.depth), attention: run.backbone };
             let mut step = Step { run, compute, order: &order, layer: i, length, extra, sink: &mut *sink };
             let block = self.blocks[i].get()?;
             if self.config.is_global(i) {
@@ -248,7 +248,7 @@ impl Backbone {
         }
         if step.extra.contains(&layer) {
             let mut patches = global[dim..].to_vec();
-            self.norm.apply_in_place(&step.compute, &mut patches);
+            self.norm.apply_in_place(&step.compute.layers, &mut patches);
             step.sink.take_extra(layer, view, patches);
         }
         Ok(())
@@ -311,7 +311,7 @@ pub(crate) fn block_shape(config: &BackboneConfig, i: usize) -> BlockShape {
 /// What a block's run shares with its neighbours.
 struct Step<'a, 's> {
     run: &'a Run<'a>,
-    compute: Compute,
+    compute: BlockCompute,
     order: &'a Order,
     layer: usize,
     /// Numbers of one view.
