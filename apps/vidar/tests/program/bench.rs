@@ -6,7 +6,11 @@ use std::path::Path;
 
 /// Small images and short flights; ground truth as poses, because so little is no flight to track.
 fn bench(out: &Path, more: &[&str]) -> Ran {
-    let world = shared().world.to_str().unwrap();
+    bench_of(&shared().world, out, more)
+}
+
+fn bench_of(world: &Path, out: &Path, more: &[&str]) -> Ran {
+    let world = world.to_str().unwrap();
     let settings = shared().settings.to_str().unwrap();
     let mut all = vec!["bench", "euroc", "--synthetic", "--world-config", world, "--config", settings];
     all.extend(["--geometry", "simulated", "--sequences", "room1_1,room2_3", "--no-trajectories"]);
@@ -58,6 +62,15 @@ fn a_bench_writes_the_papers_tables_and_is_not_done_twice() {
     assert_eq!(stamp(mesh), before, "what is there is not made again");
     assert_eq!(std::fs::read_to_string(out.join("tables.md")).unwrap(), text);
     assert!(files_under(&out).iter().any(|f| f == "bench.json"));
+
+    // Another world under the same names is another table.
+    let world = shared().root.join("another world.toml");
+    let text = std::fs::read_to_string(&shared().world).unwrap();
+    std::fs::write(&world, format!("image_noise_sigma = 3.0\n{text}")).unwrap();
+    let before = stamp("sequences/room1_1/synth.toml");
+    bench_of(&world, &out, &["--modes", "hybrid"]).ends_with(0);
+    assert!(stamp("sequences/room1_1/synth.toml") > before);
+    assert!(stamp("runs/room1_1/hybrid/map/mesh.ply") > before);
 }
 
 #[test]

@@ -27,7 +27,7 @@ use std::path::{Path, PathBuf};
 use vidar_align::CouplingMode;
 use vidar_core::Trajectory;
 use vidar_dataset::{OpenOptions, TrajectoryReadOptions};
-use vidar_synth::{FlightKind, SceneKind, SynthConfig};
+use vidar_synth::{FlightKind, SceneKind, Simulation, SynthConfig};
 
 /// Schema of `bench.json`.
 pub const BENCH_SCHEMA: &str = "vidar.bench/1";
@@ -176,8 +176,10 @@ fn sequences_of(
     let mut rendered = Vec::new();
     for (name, flight, world) in flights {
         let path = request.out.join("sequences").join(&name);
-        // The last part that a rendered sequence gets tells that it is whole.
-        if !path.join("mav0").exists() {
+        // The last part that a rendered sequence gets tells that it is whole; another world is rendered anew.
+        let is_whole = path.join("mav0").exists();
+        let is_same = || Simulation::open(&path).is_ok_and(|s| *s.config() == world);
+        if !(is_whole && is_same()) {
             if path.exists() {
                 std::fs::remove_dir_all(&path).map_err(|e| Error::io("remove", &path, e))?;
             }

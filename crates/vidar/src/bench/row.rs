@@ -203,7 +203,9 @@ fn matters_to_all(error: &Error) -> bool {
 /// What a row was made of.
 fn key(sequence: &Sequence, settings: &str) -> Result<String, Error> {
     let mut hash = Sha256::new();
-    for part in [crate::VERSION, &sequence.path.display().to_string(), settings] {
+    // A rendered sequence says which world it is of; one that was recorded has no such file.
+    let world = std::fs::read_to_string(sequence.path.join("synth.toml")).unwrap_or_default();
+    for part in [crate::VERSION, &sequence.path.display().to_string(), settings, &world] {
         hash.update(part.as_bytes());
         hash.update([0]);
     }
