@@ -7,6 +7,7 @@
 //! Every random number is drawn from a stream that belongs to its purpose and frame, so that the same [`SynthConfig`]
 //! gives the same bytes for any number of threads.
 
+pub mod clip;
 mod config;
 mod error;
 mod flight;

@@ -27,6 +27,12 @@ pub(crate) enum Purpose {
     Odometry,
     /// Points that a simulated odometry sees.
     Landmarks,
+    /// Kind of place and flight of a room for clips.
+    ClipRoom,
+    /// Camera and path of a clip.
+    Clip(u32),
+    /// Sensor noise of a clip.
+    ClipNoise(u32),
     /// Pixels of a frame in a chunk's prediction.
     Prediction(u32, u32),
 }
@@ -46,6 +52,9 @@ pub(crate) fn stream(seed: u64, purpose: Purpose) -> ChaCha8Rng {
         Purpose::FrameField(k) => (8, u64::from(k)),
         Purpose::Odometry => (10, 0),
         Purpose::Landmarks => (11, 0),
+        Purpose::ClipRoom => (14, 0),
+        Purpose::Clip(k) => (15, u64::from(k)),
+        Purpose::ClipNoise(k) => (16, u64::from(k)),
         Purpose::Prediction(_, frame) => (9, u64::from(frame)),
     };
     let seed = match purpose {

@@ -4,7 +4,7 @@
 //! textures are read with the ray's footprint. Depth is that of the pixel's centre at the middle of the exposure.
 
 use crate::error::SynthError;
-use crate::world::{TileBounds, TileHits, World};
+use crate::world::{Hit, TileBounds, TileHits, World};
 use nalgebra::{Matrix3, Vector3};
 use rayon::prelude::*;
 use vidar_core::{CameraModel, FrameImage, Image, MetricDepth, Se3};
@@ -77,8 +77,27 @@ pub(crate) struct Exposed {
 
 /// Renders the frame whose sample `s` is taken from pose `world_from_camera(s)`.
 pub(crate) fn expose(world: &World, rays: &RayTable, world_from_camera: &[Se3]) -> Exposed {
+    let of_channels = expose_hits(world, rays, world_from_camera, |_, radiance| [radiance]);
+    Exposed { radiance: of_channels.radiance.into_flattened(), depth: of_channels.depth }
+}
+
+/// As [`Exposed`], with several channels.
+pub(crate) struct ExposedChannels<const C: usize> {
+    /// Mean radiance over the exposure, 0…1 for grey surfaces.
+    pub radiance: Vec<[f32; C]>,
+    /// z-depth of the pixel's centre at the middle of the exposure, m; NaN where there is none.
+    pub depth: Vec<f32>,
+}
+
+/// As [`expose`]; `colour` makes channels of the radiance at a hit.
+pub(crate) fn expose_hits<const C: usize>(
+    world: &World,
+    rays: &RayTable,
+    world_from_camera: &[Se3],
+    colour: impl Fn(&Hit, f32) -> [f32; C] + Sync,
+) -> ExposedChannels<C> {
     let n = rays.width * rays.height;
-    let mut radiance = vec![0.0_f32; n];
+    let mut radiance = vec![[0.0_f32; C]; n];
     let mut depth = vec![f32::NAN; n];
     let share = 1.0 / rays.samples.len() as f32;
     let band = TILE * rays.width;
@@ -91,14 +110,17 @@ pub(crate) fn expose(world: &World, rays: &RayTable, world_from_camera: &[Se3]) 
             eye.cast_band(world, rays, s, row, &mut hits, |hits, ray, pixel| {
                 let Some(hit) = world.tile_hit(hits, ray, &eye.origin) else { return };
                 let footprint = footprint_m(&hit.normal, &hits.directions[ray], hit.t, rays.pixel_angle);
-                radiance[pixel] += share * world.radiance(&hit, footprint);
+                let channels = colour(&hit, world.radiance(&hit, footprint));
+                for (sum, channel) in radiance[pixel].iter_mut().zip(channels) {
+                    *sum += share * channel;
+                }
                 if is_centre {
                     depth[pixel] = hit.t as f32;
                 }
             });
         }
     });
-    Exposed { radiance, depth }
+    ExposedChannels { radiance, depth }
 }
 
 /// z-depth at the pixel centres from one pose, m; NaN where there is none.

@@ -40,6 +40,13 @@ pub struct Hit {
     uv: [f64; 2],
 }
 
+impl Hit {
+    /// Which of the world's faces was met.
+    pub(crate) fn face_number(&self) -> u32 {
+        self.face
+    }
+}
+
 /// A furnished place through which a flight passes freely.
 pub struct World {
     /// Shape 0 is the room's shell, seen from inside.

@@ -1,0 +1,104 @@
+"""Writes a trained network as `config.json` and `model.safetensors` (f16, official key names), and reads it back.
+
+    python -m nano.export --run RUN_FOLDER --out ../models/da3-nano [--weights ema|model]
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+
+import torch
+from safetensors.torch import load_file, save_file
+from torch import Tensor
+
+from .config import POSITION_GRID, NanoConfig, from_dict
+from .model import Nano
+
+PREFIX = "model."
+BACKBONE = "backbone.pretrained."
+OWN_POSITION = (f"{BACKBONE}pos_grid", f"{BACKBONE}pos_special")
+POSITION = f"{BACKBONE}pos_embed"
+
+
+def exported(model: Nano) -> dict[str, Tensor]:
+    """Every tensor under its official key; the trained position grid becomes the full one."""
+    tensors = {
+        PREFIX + name: p.detach().contiguous() for name, p in model.named_parameters() if name not in OWN_POSITION
+    }
+    backbone = model.backbone["pretrained"]
+    grid = backbone.full_grid().detach().flatten(2).transpose(1, 2)
+    tensors[PREFIX + POSITION] = torch.cat([backbone.pos_special.detach(), grid], 1).contiguous()
+    return tensors
+
+
+def imported(tensors: dict[str, Tensor], config: NanoConfig) -> Nano:
+    """The network of exported tensors, in f32."""
+    model = Nano(config)
+    plain = {name.removeprefix(PREFIX): t.float() for name, t in tensors.items()}
+    position = plain.pop(POSITION)
+    backbone = model.backbone["pretrained"]
+    plain[OWN_POSITION[0]] = backbone.pos_grid.detach()
+    plain[OWN_POSITION[1]] = position[:, :1].clone()
+    model.load_state_dict(plain)
+    grid = position[:, 1:].transpose(1, 2).unflatten(2, (POSITION_GRID, POSITION_GRID))
+    backbone.pos_full = grid.contiguous()
+    return model.eval()
+
+
+def write(model: Nano, folder: Path) -> None:
+    """`config.json` and `model.safetensors`."""
+    folder.mkdir(parents=True, exist_ok=True)
+    tensors = {name: t.half() for name, t in exported(model).items()}
+    if not all(torch.isfinite(t).all() for t in tensors.values()):
+        raise ValueError("a weight does not fit 16 bits")
+    save_file(tensors, folder / "model.safetensors")
+    model.config.write(folder / "config.json")
+
+
+def read(folder: Path) -> Nano:
+    """A network that `write` wrote."""
+    raw = json.loads((folder / "config.json").read_text())
+    net, head, cam_enc = (raw["config"][k] for k in ("net", "head", "cam_enc"))
+    config = NanoConfig(
+        name=raw["model_name"],
+        dim=net["embed_dim"],
+        depth=net["depth"],
+        heads=net["num_heads"],
+        out_layers=tuple(net["out_layers"]),
+        alt_start=net["alt_start"],
+        qknorm_start=net["qknorm_start"],
+        rope_start=net["rope_start"],
+        features=head["features"],
+        out_channels=tuple(head["out_channels"]),
+        cam_enc_heads=cam_enc["num_heads"],
+        cam_enc_depth=cam_enc["trunk_depth"],
+        cam_enc_ratio=cam_enc["mlp_ratio"],
+    )
+    return imported(load_file(folder / "model.safetensors"), config)
+
+
+def trained(run: Path, which: str) -> tuple[Nano, dict]:
+    """The network of a run (`ema` or `model`) and what else its state says."""
+    state = torch.load(run / "state.pt", weights_only=True)
+    model = Nano(from_dict(state["config"]))
+    model.load_state_dict(state[which])
+    return model.eval(), state
+
+
+def main() -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--run", type=Path, required=True)
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--weights", choices=["ema", "model"], default="ema")
+    arguments = parser.parse_args()
+    model, state = trained(arguments.run, arguments.weights)
+    write(model, arguments.out)
+    count = sum(t.numel() for t in exported(model).values())
+    print(f"step {state['step']}, {count} numbers, {(arguments.out / 'model.safetensors').stat().st_size} bytes")
+
+
+if __name__ == "__main__":
+    main()

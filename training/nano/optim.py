@@ -1,0 +1,65 @@
+"""Momentum with orthogonalised steps for hidden matrices, Adam with decoupled decay for everything else."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+
+def orthogonalised(matrix: Tensor, steps: int = 5) -> Tensor:
+    """About the nearest matrix with orthonormal rows or columns, by a quintic Newton-Schulz iteration (Jordan 2024).
+
+    [k, rows, columns] or [rows, columns]; in bf16, which is exact enough for a direction.
+    """
+    a, b, c = 3.4445, -4.7750, 2.0315
+    tall = matrix.shape[-2] > matrix.shape[-1]
+    x = matrix.bfloat16()
+    if tall:
+        x = x.mT.contiguous()
+    x = x / (x.norm(dim=(-2, -1), keepdim=True) + 1e-7)
+    for _ in range(steps):
+        gram = x @ x.mT
+        x = a * x + (b * gram + c * gram @ gram) @ x
+    return (x.mT if tall else x).float()
+
+
+class Muon(torch.optim.Optimizer):
+    """Nesterov momentum whose step is orthogonalised; joint projections (`attn.qkv`) are treated as three matrices."""
+
+    def __init__(self, params: list[nn.Parameter], lr: float, momentum: float = 0.95, decay: float = 0.01) -> None:
+        super().__init__(params, {"lr": lr, "momentum": momentum, "decay": decay})
+
+    @torch.no_grad()
+    def step(self, closure: None = None) -> None:
+        """One step."""
+        for group in self.param_groups:
+            for p in group["params"]:
+                if p.grad is None:
+                    continue
+                buffer = self.state[p].setdefault("momentum", torch.zeros_like(p))
+                buffer.lerp_(p.grad, 1 - group["momentum"])
+                step = p.grad.lerp(buffer, group["momentum"])
+                parts = 3 if p.shape[0] == 3 * p.shape[1] else 1
+                direction = orthogonalised(step.view(parts, p.shape[0] // parts, p.shape[1])).reshape(p.shape)
+                rows, columns = p.shape[0] // parts, p.shape[1]
+                p.mul_(1 - group["lr"] * group["decay"])
+                p.add_(direction, alpha=-group["lr"] * max(1.0, rows / columns) ** 0.5)
+
+
+def optimisers(model: nn.Module, muon_lr: float, adam_lr: float) -> list[torch.optim.Optimizer]:
+    """The two optimisers of a network."""
+    hidden, rest, plain = [], [], []
+    for name, p in model.named_parameters():
+        in_blocks = ".blocks." in name or ".trunk." in name
+        if in_blocks and p.dim() == 2:
+            hidden.append(p)
+        elif p.dim() >= 2 and name.endswith("weight"):
+            rest.append(p)
+        else:
+            plain.append(p)
+    groups = [{"params": rest, "weight_decay": 0.01}, {"params": plain, "weight_decay": 0.0}]
+    groups[0]["share"] = 1.0
+    # Biases and gains see the same gradient step after step: at the full rate they would outgrow the signal.
+    groups[1]["share"] = 0.25
+    adam = torch.optim.AdamW(groups, lr=adam_lr, betas=(0.9, 0.98), eps=1e-9, fused=True)
+    return [Muon(hidden, muon_lr), adam]

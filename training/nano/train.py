@@ -1,0 +1,276 @@
+"""Trains the network on endless rendered rooms; stops and goes on at any time.
+
+    python -m nano.train --run RUN_FOLDER [--recipe recipe.json] [--stream stream_views] [--threads 1]
+
+`RUN_FOLDER/state.pt` holds everything that is needed to go on and is replaced every few minutes; `train.csv` and
+`validation.csv` grow. The recipe is read at every start, so a later session can add stages.
+"""
+
+from __future__ import annotations
+
+import argparse
+import copy
+import csv
+import json
+import os
+import random
+import subprocess
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+
+from .config import NanoConfig, from_dict
+from .data import Clip, Pool, Renderer, Scenes, clips_of, normalise, scenes
+from .losses import total
+from .metrics import Tally, add_scenes
+from .model import Nano, whiten_patches
+from .optim import optimisers
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+@dataclass
+class Stage:
+    """Part of the recipe: until which step, which sizes (`stream_views --sizes`), how many views a step."""
+
+    until_step: int
+    sizes: str
+    views_per_step: int
+    views_per_clip: int = 8
+    lr_from: float = 1.0
+    lr_to: float = 1.0
+
+
+@dataclass
+class Recipe:
+    """How training goes; see `recipe.json`."""
+
+    muon_lr: float
+    adam_lr: float
+    warmup_steps: int
+    ema_decay: float
+    posed_share: float
+    ray_share: float
+    clips_per_room: int
+    clip_uses: int
+    stages: list[Stage]
+
+    @staticmethod
+    def read(path: Path) -> Recipe:
+        """From JSON."""
+        raw = json.loads(path.read_text())
+        stages = [Stage(**s) for s in raw.pop("stages")]
+        return Recipe(**raw, stages=stages)
+
+    def stage(self, step: int) -> tuple[int, Stage] | None:
+        """The stage of a step and where it begins; None after the last."""
+        begin = 0
+        for stage in self.stages:
+            if step < stage.until_step:
+                return begin, stage
+            begin = stage.until_step
+        return None
+
+    def lr_factor(self, step: int) -> float:
+        """Warm-up, then linear within each stage."""
+        begin, stage = self.stage(step) or (0, self.stages[-1])
+        share = (step - begin) / max(1, stage.until_step - begin)
+        return min(1.0, (step + 1) / self.warmup_steps) * (stage.lr_from + (stage.lr_to - stage.lr_from) * share)
+
+
+class Trainer:
+    """Model, optimisers, averages and where training stands."""
+
+    def __init__(self, run: Path, recipe: Recipe, stream: Path) -> None:
+        self.run, self.recipe, self.stream = run, recipe, stream
+        self.step, self.room, self.seconds, self.views_seen = 0, 0, 0.0, 0
+        self.distinct_views = 0
+        saved = run / "state.pt"
+        state = torch.load(saved, weights_only=True) if saved.exists() else None
+        self.config = from_dict(state["config"]) if state else NanoConfig()
+        torch.manual_seed(1)
+        self.model = Nano(self.config)
+        if not state:
+            clips = sample_clips(run, stream, "train", "112x70")
+            whiten_patches(self.model, torch.cat([normalise(clip.image[None])[0] for clip in clips]))
+        self.optimisers = optimisers(self.model, recipe.muon_lr, recipe.adam_lr)
+        if state:
+            self.model.load_state_dict(state["model"])
+            for optimiser, values in zip(self.optimisers, state["optimisers"]):
+                optimiser.load_state_dict(values)
+            self.step, self.room, self.seconds = state["step"], state["room"], state["seconds"]
+            self.views_seen, self.distinct_views = state["views_seen"], state["distinct_views"]
+        self.ema = copy.deepcopy(self.model)
+        if state:
+            self.ema.load_state_dict(state["ema"])
+        self.bases = (recipe.muon_lr, recipe.adam_lr)
+        self.rng = random.Random(1000 + self.step)
+
+    def save(self) -> None:
+        """Replaces `state.pt` at once, so that a crash leaves the old or the new one."""
+        state = {
+            "config": self.config.as_dict(),
+            "model": self.model.state_dict(),
+            "ema": self.ema.state_dict(),
+            "optimisers": [o.state_dict() for o in self.optimisers],
+            "step": self.step,
+            "room": self.room,
+            "seconds": self.seconds,
+            "views_seen": self.views_seen,
+            "distinct_views": self.distinct_views,
+        }
+        partial = self.run / "state.pt.partial"
+        torch.save(state, partial)
+        os.replace(partial, self.run / "state.pt")
+
+    def batch(self, pool: Pool, stage: Stage) -> tuple[Scenes, bool]:
+        """Scenes of a random number of views, and whether cameras are given."""
+        per_clip = stage.views_per_clip
+        clips = pool.draw(max(1, stage.views_per_step // per_clip))
+        views = self.rng.choices([1, 2, 3, 4, 6, 8, 16], [4, 12, 8, 22, 10, 44, 0 if per_clip < 16 else 30])[0]
+        views = min(views, len(clips[0].image))
+        parts = []
+        for clip in clips:
+            parts.extend((clip, own, mirrored) for own, mirrored in self.split(len(clip.image), views))
+        return scenes(parts), self.rng.random() < self.recipe.posed_share
+
+    def split(self, available: int, views: int) -> list[tuple[list[int], bool]]:
+        """Disjoint groups of views of a clip: neighbours or spread out, in random order, mirrored or not."""
+        groups = available // views
+        index = list(range(available))
+        if self.rng.random() < 0.5:
+            chosen = [index[g * views : (g + 1) * views] for g in range(groups)]
+        else:
+            chosen = [index[g::groups][:views] for g in range(groups)]
+        for group in chosen:
+            self.rng.shuffle(group)
+        return [(group, self.rng.random() < 0.5) for group in chosen]
+
+    def learn(self, batch: Scenes, posed: bool) -> dict[str, float]:
+        """One step."""
+        factor = self.recipe.lr_factor(self.step)
+        for optimiser, base in zip(self.optimisers, self.bases):
+            for group in optimiser.param_groups:
+                group["lr"] = base * factor * group.get("share", 1.0)
+        rays = self.rng.random() < self.recipe.ray_share
+        output = self.model(batch.images, batch.pose9 if posed else None, wants_rays=rays, autocast=True)
+        loss, terms = total(output, batch)
+        for optimiser in self.optimisers:
+            optimiser.zero_grad(set_to_none=True)
+        loss.backward()
+        norm = torch.nn.utils.clip_grad_norm_(self.model.parameters(), 2.0)
+        if torch.isfinite(norm):
+            for optimiser in self.optimisers:
+                optimiser.step()
+        self.step += 1
+        self.views_seen += batch.images.shape[0] * batch.images.shape[1]
+        decay = min(self.recipe.ema_decay, (1 + self.step) / (10 + self.step))
+        with torch.no_grad():
+            kept = list(self.ema.parameters())
+            torch._foreach_lerp_(kept, list(self.model.parameters()), 1 - decay)
+        return {"loss": loss.item(), "norm": norm.item(), **terms}
+
+    def validate(self) -> None:
+        """Appends errors on rooms of the validation split."""
+        for size in ("112x70", "224x140"):
+            clips = sample_clips(self.run, self.stream, "val", size)
+            for views, posed in ((1, False), (4, False), (8, False), (8, True)):
+                # The low size is for the curve, the native one for the truth.
+                tally = Tally()
+                for clip in clips[: 24 if size == "112x70" else 12]:
+                    step = len(clip.image) // views
+                    add_scenes(tally, self.ema, scenes([(clip, list(range(0, len(clip.image), step))[:views], False)]), posed)
+                row = {"step": self.step, "hours": round(self.seconds / 3600, 3), "size": size, "views": views}
+                append(self.run / "validation.csv", {**row, "posed": int(posed), **rounded(tally.row())})
+
+    def train(self, save_every_secs: float, validate_every: int) -> None:
+        """Until the recipe ends."""
+        began = saved = time.monotonic()
+        while (found := self.recipe.stage(self.step)) is not None:
+            begin, stage = found
+            first_room = self.room
+            arguments = ["--sizes", stage.sizes, "--views", str(stage.views_per_clip)]
+            arguments += ["--clips", str(self.recipe.clips_per_room), "--first-room", str(first_room)]
+            renderer = Renderer(self.stream, arguments)
+            pool = Pool(iter(renderer), 600 if stage.views_per_clip <= 8 else 300, self.recipe.clip_uses, self.rng)
+            print(f"step {self.step}: {stage}, rooms from {first_room}", flush=True)
+            seen_before = self.distinct_views
+            sums: dict[str, list[float]] = {}
+            while self.step < stage.until_step:
+                tick = time.monotonic()
+                batch, posed = self.batch(pool, stage)
+                waited = time.monotonic() - tick
+                terms = self.learn(batch, posed)
+                terms["waited"] = waited
+                terms["took"] = time.monotonic() - tick
+                self.seconds += terms["took"]
+                self.room, self.distinct_views = max(self.room, pool.rooms), seen_before + pool.views
+                for name, value in terms.items():
+                    sums.setdefault(name, []).append(value)
+                if self.step % 25 == 0:
+                    means = {name: sum(v) / len(v) for name, v in sums.items()}
+                    head = {"step": self.step, "hours": round(self.seconds / 3600, 3), "views": self.views_seen}
+                    head |= {"distinct_views": self.distinct_views, "rooms": self.room}
+                    names = "loss norm depth aligned gradient ray t q fov waited took".split()
+                    row = {**head, **rounded({n: means.get(n, float("nan")) for n in names})}
+                    append(self.run / "train.csv", row)
+                    print(" ".join(f"{k} {v}" for k, v in row.items()), flush=True)
+                    sums = {}
+                if self.step % validate_every == 0:
+                    self.validate()
+                if time.monotonic() - saved > save_every_secs:
+                    self.save()
+                    saved = time.monotonic()
+            renderer.stop()
+            self.save()
+        self.validate()
+        print(f"the recipe's last step is done after {time.monotonic() - began:.0f} s", flush=True)
+
+
+def rounded(row: dict[str, float]) -> dict[str, float]:
+    """Four digits are enough for a log."""
+    return {name: float(f"{value:.4g}") for name, value in row.items()}
+
+
+def append(path: Path, row: dict[str, float | str]) -> None:
+    """One line of CSV; the first call writes the names."""
+    is_new = not path.exists()
+    with path.open("a", newline="") as out:
+        writer = csv.DictWriter(out, list(row))
+        if is_new:
+            writer.writeheader()
+        writer.writerow(row)
+
+
+def sample_clips(run: Path, stream: Path, split: str, size: str) -> list[Clip]:
+    """One clip of each of 24 rooms of a split, rendered once."""
+    path = run / f"{split}_{size}.bin"
+    if not path.exists():
+        partial = path.with_suffix(".partial")
+        with partial.open("wb") as out:
+            arguments = ["--split", split, "--rooms", "24", "--clips", "1", "--views", "8", "--sizes", size]
+            subprocess.run([str(stream), *arguments], stdout=out, check=True)
+        os.replace(partial, path)
+    return clips_of(path)
+
+
+def main() -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--run", type=Path, required=True)
+    parser.add_argument("--recipe", type=Path, default=ROOT / "recipe.json")
+    parser.add_argument("--stream", type=Path, default=ROOT.parent / "target/release/examples/stream_views")
+    parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--save-every", type=float, default=180.0, help="seconds")
+    parser.add_argument("--validate-every", type=int, default=500, help="steps")
+    arguments = parser.parse_args()
+    torch.set_num_threads(arguments.threads)
+    arguments.run.mkdir(parents=True, exist_ok=True)
+    trainer = Trainer(arguments.run, Recipe.read(arguments.recipe), arguments.stream)
+    trainer.train(arguments.save_every, arguments.validate_every)
+
+
+if __name__ == "__main__":
+    main()

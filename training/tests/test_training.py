@@ -1,0 +1,176 @@
+"""Tests of the training code; a few seconds on one core: `python -m pytest training/tests`."""
+
+from __future__ import annotations
+
+import io
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from nano.config import NanoConfig  # noqa: E402
+from nano.data import Clip, read_clip, scenes, write_clip  # noqa: E402
+from nano.export import exported, imported  # noqa: E402
+from nano.geometry import inverse, homogeneous, matrix_from_quaternion, quaternion_from_matrix  # noqa: E402
+from nano.losses import total  # noqa: E402
+from nano.metrics import depth_errors, pair_errors, scale_from_poses  # noqa: E402
+from nano.model import Nano, Output, position_operator, reference_first  # noqa: E402
+from nano.optim import orthogonalised  # noqa: E402
+
+SMALL = NanoConfig(dim=32, heads=2, features=8, out_channels=(8, 8, 8, 8), cam_enc_heads=2, cam_enc_depth=1)
+
+
+def rotations(count: int) -> torch.Tensor:
+    """Random rotations, half turns among them."""
+    torch.manual_seed(0)
+    q = torch.randn(count, 4, dtype=torch.float64)
+    q[0] = torch.tensor([1.0, 0, 0, 0])
+    return matrix_from_quaternion(q)
+
+
+def clip(views: int = 4, height: int = 28, width: int = 42) -> Clip:
+    """A clip of a plane that faces the first camera, 2 m ahead, seen by cameras that step sideways."""
+    rng = np.random.default_rng(1)
+    image = rng.integers(0, 256, (views, height, width, 3), dtype=np.uint8)
+    pose = np.tile(np.eye(4, dtype=np.float32)[:3], (views, 1, 1))
+    pose[:, 0, 3] = 0.3 * np.arange(views)
+    pose[:, 1, 3] = 0.05 * np.arange(views) ** 2
+    return Clip(7, 3, image, np.full((views, height, width), 2, np.float32), pose, (40.0, 41.0))
+
+
+def perfect(batch) -> Output:  # noqa: ANN001
+    """The answer without error."""
+    views, (height, width) = batch.depth.shape[1], batch.depth.shape[2:]
+    quaternion = quaternion_from_matrix(batch.first_from_camera[..., :3, :3])
+    size = torch.tensor([height, width], dtype=torch.float32)
+    fov = 2 * torch.atan(0.5 * size / batch.focal.flip(-1))
+    pose = torch.cat([batch.first_from_camera[..., :3, 3], quaternion, fov], -1)
+    ones = torch.ones_like(batch.depth)
+    return Output(batch.depth, 1 + ones, batch.depth.log(), None, None, pose, torch.zeros(1, views))
+
+
+def test_a_clip_survives_the_stream():
+    stream = io.BytesIO()
+    for _ in range(2):
+        write_clip(clip(), stream)
+    stream.seek(0)
+    first, second, end = read_clip(stream), read_clip(stream), read_clip(stream)
+    assert end is None and first is not None and second is not None
+    assert (first.seed, first.number, first.focal) == (7, 3, (40.0, 41.0))
+    assert np.array_equal(second.image, clip().image) and np.array_equal(second.depth, clip().depth)
+    assert np.array_equal(first.world_from_camera, clip().world_from_camera)
+
+
+def test_a_cut_or_foreign_stream_is_refused():
+    stream = io.BytesIO()
+    write_clip(clip(), stream)
+    with pytest.raises(ValueError, match="ends within"):
+        read_clip(io.BytesIO(stream.getvalue()[:-5]))
+    with pytest.raises(ValueError, match="expected"):
+        read_clip(io.BytesIO(b"x" * 100))
+
+
+def test_quaternions_go_there_and_back():
+    matrices = rotations(50)
+    back = matrix_from_quaternion(quaternion_from_matrix(matrices))
+    assert torch.allclose(back, matrices, atol=1e-9)
+    assert (quaternion_from_matrix(matrices)[:, 3] >= 0).all()
+
+
+def test_a_mirrored_scene_projects_mirrored():
+    batch = scenes([(clip(), [0, 1, 2, 3], True)])
+    # A step to the right becomes a step to the left.
+    assert (batch.first_from_camera[0, 1:, 0, 3] < 0).all() and (batch.first_from_camera[0, 1:, 1, 3] > 0).all()
+    assert torch.equal(batch.images[0, 0], scenes([(clip(), [0], False)]).images[0, 0].flip(-1))
+
+
+def test_the_gauge_makes_the_mean_distance_one():
+    batch = scenes([(clip(), [0], False)])
+    assert 0.9 < batch.depth.mean().item() < 1.0
+    assert 2.0 < batch.scale.item() < 2.2
+
+
+def test_the_perfect_answer_has_the_least_loss():
+    batch = scenes([(clip(), [0, 1, 2, 3], False)])
+    best, terms = total(perfect(batch), batch)
+    assert terms["t"] < 1e-3 and terms["q"] < 1e-3 and terms["fov"] < 1e-3
+    for spoil in ("depth", "pose"):
+        answer = perfect(batch)
+        if spoil == "depth":
+            answer.log_depth = answer.log_depth + 0.1 * torch.randn_like(answer.log_depth)
+        else:
+            answer.pose_enc = answer.pose_enc + 0.1
+        assert total(answer, batch)[0] > best + 0.01
+
+
+def test_exported_networks_answer_as_before_and_have_official_keys():
+    torch.manual_seed(2)
+    model = Nano(SMALL).eval()
+    tensors = exported(model)
+    for key in (
+        "model.backbone.pretrained.pos_embed",
+        "model.backbone.pretrained.camera_token",
+        "model.backbone.pretrained.blocks.11.attn.q_norm.weight",
+        "model.cam_enc.trunk.0.ls1.gamma",
+        "model.cam_dec.fc_fov.0.weight",
+        "model.head.scratch.refinenet4_aux.resConfUnit2.conv1.weight",
+        "model.head.scratch.output_conv1_aux.3.4.bias",
+        "model.head.scratch.output_conv2_aux.0.2.weight",
+        "model.head.scratch.output_conv2_aux.3.5.weight",
+    ):
+        assert key in tensors, key
+    assert not any("pos_grid" in key or "pos_special" in key for key in tensors)
+    again = imported(tensors, SMALL)
+    images = scenes([(clip(), [0, 1, 2, 3], False)]).images
+    with torch.no_grad():
+        a, b = model(images, select=True), again(images, select=True)
+    assert torch.allclose(a.depth, b.depth, rtol=1e-4) and torch.allclose(a.pose_enc, b.pose_enc, atol=1e-5)
+
+
+def test_views_do_not_mix_between_scenes_and_their_order_does_not_matter():
+    torch.manual_seed(3)
+    model = Nano(SMALL).eval()
+    images = scenes([(clip(), [0, 1, 2], False), (clip(), [3, 2, 1], True)]).images
+    with torch.no_grad():
+        both, alone = model(images), model(images[1:])
+        turned = model(images[:, [0, 2, 1]])
+    assert torch.allclose(both.depth[1:], alone.depth, rtol=1e-4)
+    assert torch.allclose(both.depth[:, [0, 2, 1]], turned.depth, rtol=1e-3)
+
+
+def test_positions_of_any_size_lie_within_the_trained_ones():
+    for rows, columns in ((5, 8), (10, 16), (13, 20), (37, 37)):
+        weights = position_operator(7, rows, columns)
+        assert weights.shape == (49, rows * columns)
+        assert torch.allclose(weights.sum(0), torch.ones(rows * columns), atol=1e-5)
+
+
+def test_the_reference_comes_first_and_the_others_keep_their_order():
+    torch.manual_seed(4)
+    order = reference_first(torch.randn(6, 5, 16))
+    for row in order.tolist():
+        assert sorted(row) == list(range(5)) and row[1:] == sorted(row[1:])
+
+
+def test_orthogonalised_steps_have_singular_values_near_one():
+    torch.manual_seed(5)
+    for shape in ((24, 96), (96, 24)):
+        values = torch.linalg.svdvals(orthogonalised(torch.randn(shape)))
+        assert values.min() > 0.5 and values.max() < 1.4
+
+
+def test_errors_of_a_scaled_truth_are_zero():
+    batch = scenes([(clip(), [0, 1, 2, 3], False)])
+    assert depth_errors(3 * batch.depth[0], batch.depth[0])[0] < 1e-6
+    poses = batch.first_from_camera[0]
+    rotation, direction = pair_errors(poses, poses, 1.0)
+    assert rotation.max() < 0.1 and direction.max() < 0.1
+    larger = poses.clone()
+    larger[:, :3, 3] *= 2
+    assert abs(scale_from_poses(larger, poses).item() - 0.5) < 1e-5
+    assert torch.allclose(inverse(inverse(poses)), poses, atol=1e-6)
+    assert homogeneous(poses[:, :3]).shape == poses.shape
