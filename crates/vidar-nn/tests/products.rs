@@ -3,7 +3,7 @@
 mod common;
 
 use common::{Conv, Numbers, all_computes, bound, conv, error_in_std, gelu, linear, wide};
-use vidar_nn::{Conv2d, ConvInput, ConvTranspose2d, Epilogue, Linear, MapRef, Weight};
+use vidar_nn::{Conv2d, ConvInput, ConvTranspose2d, Epilogue, Linear, MapRef, Precision, Weight};
 
 #[test]
 fn linear_layers_match_the_reference_on_odd_and_even_sizes() {
@@ -175,4 +175,67 @@ fn empty_inputs_give_empty_or_bias_only_outputs() {
         conv.apply(&c, MapRef::new(&[0.0; 30], 2, 5), &mut [], ConvInput::None, Epilogue::None);
     }
     assert_eq!(wide(&[1.0]), [1.0]);
+}
+
+/// Numbers whose rows share a part that is ten times as large as what tells them apart.
+fn with_common_part(numbers: &mut Numbers, rows: usize, width: usize) -> Vec<f32> {
+    let common: Vec<f32> = numbers.vec(width).iter().map(|x| 10.0 * x).collect();
+    (0..rows * width).map(|i| common[i % width] + numbers.next()).collect()
+}
+
+/// Largest error of what tells rows apart, in its own standard deviations.
+fn error_beside_common_part(out: &[f32], expected: &[f64], width: usize) -> f64 {
+    let rows = (expected.len() / width) as f64;
+    let mut means = vec![0.0; width];
+    expected.iter().enumerate().for_each(|(i, x)| means[i % width] += x / rows);
+    let apart: Vec<f64> = expected.iter().enumerate().map(|(i, x)| x - means[i % width]).collect();
+    let error = out.iter().zip(expected).map(|(a, b)| (f64::from(*a) - b).abs()).fold(0.0, f64::max);
+    error / (apart.iter().map(|x| x * x).sum::<f64>() / apart.len() as f64).sqrt()
+}
+
+#[test]
+fn bf16_keeps_what_tells_rows_apart_beside_what_they_share() {
+    let mut numbers = Numbers(9);
+    let (rows, inner, width) = (200, 96, 64);
+    let x = with_common_part(&mut numbers, rows, inner);
+    let (w, b) = (numbers.vec(width * inner), numbers.vec(width));
+    let bias = Some(Weight::owned("b", &[width], b.clone()));
+    let layer = Linear::new(Weight::owned("w", &[width, inner], w.clone()), bias).unwrap();
+    let expected = linear(&x, &w, Some(&b), rows, inner, width);
+    for c in all_computes().into_iter().filter(|c| c.precision() == Precision::Bf16) {
+        let mut out = vec![0.0; rows * width];
+        layer.apply(&c, &x, rows, &mut out, Epilogue::None);
+        // Rounding the numbers as they are gives 9.5e-2.
+        let error = error_beside_common_part(&out, &expected, width);
+        assert!(error < 2e-2, "linear, {c:?}: {error:e}");
+    }
+
+    // Without a border: the zeros around a map are themselves far from what its pixels share.
+    let p = Conv { h: 12, w: 11, inputs: 48, outputs: 40, kernel: [3, 3], stride: 1, padding: 0 };
+    let shape = [p.outputs, p.inputs, 3, 3];
+    let (x, w) = (with_common_part(&mut numbers, p.h * p.w, p.inputs), numbers.vec(shape.iter().product()));
+    let layer = Conv2d::new(Weight::owned("w", &shape, w.clone()), None, 1, 0).unwrap();
+    let (expected, ..) = conv(&p, &x, &w, None, false);
+    for c in all_computes().into_iter().filter(|c| c.precision() == Precision::Bf16) {
+        let mut out = vec![0.0; expected.len()];
+        layer.apply(&c, MapRef::new(&x, p.h, p.w), &mut out, ConvInput::None, Epilogue::None);
+        let error = error_beside_common_part(&out, &expected, p.outputs);
+        assert!(error < 2e-2, "convolution, {c:?}: {error:e}");
+    }
+}
+
+#[test]
+fn a_row_that_is_not_a_number_stays_alone() {
+    let mut numbers = Numbers(10);
+    let (rows, inner, width) = (70, 32, 16);
+    let mut x = numbers.vec(rows * inner);
+    x[5 * inner + 3] = f32::NAN;
+    let layer = Linear::new(numbers.weight(&[width, inner]), None).unwrap();
+    for c in all_computes() {
+        let mut out = vec![0.0; rows * width];
+        layer.apply(&c, &x, rows, &mut out, Epilogue::Gelu);
+        for (row, out) in out.chunks_exact(width).enumerate() {
+            assert!(out.iter().all(|y| y.is_nan() == (row == 5)), "{c:?}, row {row}: {out:?}");
+        }
+    }
 }
