@@ -1,8 +1,10 @@
-"""Reads what `vidar depth --format npz,mini_npz,glb,colmap,depth_vis` wrote with numpy, pycolmap and Pillow.
+"""Reads what `vidar depth --format npz,mini_npz,glb,colmap,depth_vis` wrote with numpy, pycolmap, trimesh and Pillow.
 
     python tools/check_official_exports.py FOLDER
 
-Needs numpy; pycolmap and Pillow where their files are to be checked. Prints what it found and fails on contradictions.
+Needs numpy; pycolmap, trimesh and Pillow where their files are to be checked. Prints what it found and fails on
+contradictions: keys, shapes and rounding of the arrays are the official program's, the cameras of every format are those of
+`predictions.json`, and points of the COLMAP model project to where they were seen.
 """
 
 import json
@@ -14,10 +16,22 @@ import numpy as np
 
 folder = Path(sys.argv[1])
 arrays = {}
+cameras = ["conf", "extrinsics", "intrinsics"]
+views = json.loads((folder / "predictions.json").read_text())["views"]
 for kind in ("npz", "mini_npz"):
     path = folder / "exports" / kind / "results.npz"
     if path.exists():
         arrays = dict(np.load(path))
+        expected = (["image"] if kind == "npz" else []) + ["depth"] + [k for k in cameras if k in arrays]
+        assert list(np.load(path).files) == expected, (list(np.load(path).files), expected)
+        places = 6 if kind == "npz" else 8
+        assert np.array_equal(arrays["depth"], np.round(arrays["depth"], places))
+        assert "conf" not in arrays or np.array_equal(arrays["conf"], np.round(arrays["conf"], 2))
+        for i, view in enumerate(views if "extrinsics" in arrays else []):
+            world_from_camera = np.array(view["world_from_camera"], float).reshape(-1, 4)
+            camera_from_world = np.vstack([arrays["extrinsics"][i], [0, 0, 0, 1]]).astype(float)
+            world_from_camera = np.vstack([world_from_camera[:3], [0, 0, 0, 1]])
+            assert np.allclose(camera_from_world @ world_from_camera, np.eye(4), atol=1e-5)
         print(path, {k: (v.dtype.str, v.shape) for k, v in arrays.items()})
         n, h, w = arrays["depth"].shape
         assert arrays["depth"].dtype == np.float32 and np.isfinite(arrays["depth"]).all()
@@ -37,6 +51,14 @@ if (folder / "scene.glb").exists():
     values = np.frombuffer(data, np.float32, points["count"] * 3, start + view["byteOffset"]).reshape(-1, 3)
     assert np.allclose(values.min(0), points["min"]) and np.allclose(values.max(0), points["max"])
     assert np.abs(np.median(values, 0)).max() < 1e-3 * np.ptp(values)
+    import trimesh
+
+    scene = trimesh.load(folder / "scene.glb")
+    clouds = [g for g in scene.geometry.values() if isinstance(g, trimesh.points.PointCloud)]
+    frusta = [g for g in scene.geometry.values() if isinstance(g, trimesh.path.Path3D)]
+    assert len(clouds) == 1 and np.allclose(clouds[0].vertices, values) and len(clouds[0].colors) == len(values)
+    assert len(frusta) == len(document["meshes"]) - 1 == len(views)
+    assert all(sum(len(e.points) - 1 for e in path.entities) == 8 for path in frusta)
     print("scene.glb", points["count"], "points,", len(document["meshes"]) - 1, "cameras")
 
 if (folder / "colmap").exists():
@@ -44,6 +66,14 @@ if (folder / "colmap").exists():
 
     model = pycolmap.Reconstruction(folder / "colmap")
     print("colmap", model.num_cameras(), "cameras", model.num_reg_images(), "images", model.num_points3D(), "points")
+    assert model.num_reg_images() == len(views)
+    by_id = sorted(model.images.items())
+    for i, (_, image) in enumerate(by_id if "extrinsics" in arrays else []):
+        assert np.allclose(image.cam_from_world().matrix(), arrays["extrinsics"][i], atol=1e-5)
+        size = np.array([model.cameras[image.camera_id].width, model.cameras[image.camera_id].height])
+        scale = size / np.array(arrays["depth"].shape[2:0:-1])
+        focal = np.diag(arrays["intrinsics"][i])[:2] * scale
+        assert np.allclose(model.cameras[image.camera_id].params[:2], focal, rtol=1e-5), (focal, image)
     errors = []
     for point_id, point in list(model.points3D.items())[::997]:
         element = point.track.elements[0]
