@@ -1,13 +1,12 @@
-//! Each stage of the front end on rendered 752 × 480 images: about 150 landmarks, 300 seeds.
+//! Each stage of the front end on rendered 752 × 480 images: about 150 landmarks.
 
 use divan::{Bencher, black_box};
 use nalgebra::{Matrix6, Vector6};
 use std::sync::OnceLock;
 use vidar_core::{CameraModel, FrameImage, LieGroup, Se3};
 use vidar_odometry::frontend::{
-    AlignmentPoint, AlignmentReference, DepthFilter, Detector, DetectorConfig, Feature, FrontendConfig,
-    ImageAligner, ImageQuality, KltTracker, MotionMeter, MotionPrediction, PointObservation, Pyramid,
-    RayPair, Seed, Template, TwoViewSolver, Warp, align_feature, refine_camera,
+    AlignmentPoint, AlignmentReference, Detector, DetectorConfig, Feature, FrontendConfig, ImageAligner,
+    MotionPrediction, Pyramid, RayPair, Template, TwoViewSolver, Warp, align_feature,
 };
 use vidar_synth::{
     FlightKind, FlightPath, SynthConfig, SynthView, World, euroc_body_from_camera, euroc_camera, render_views,
@@ -28,7 +27,6 @@ struct Scene {
 }
 
 const LANDMARKS: usize = 150;
-const SEEDS: usize = 300;
 
 fn scene() -> &'static Scene {
     static SCENE: OnceLock<Scene> = OnceLock::new();
@@ -141,44 +139,6 @@ fn landmarks_150(bencher: Bencher<'_, '_>) {
     });
 }
 
-/// Per cent by which the distance is unknown: new seeds search widely, most of a flight's seeds do not.
-#[divan::bench(args = [5, 20, 100])]
-fn seeds_300(bencher: Bencher<'_, '_>, unknown_percent: u32) {
-    let s = scene();
-    let config = FrontendConfig::default();
-    let mut filter = DepthFilter::new(config.depth_filter, config.matching);
-    let motion = s.motion(0, 2);
-    bencher.bench_local(|| {
-        let mut good = 0.0;
-        for (feature, inverse) in s.features[0].iter().cycle().take(SEEDS) {
-            let mut seed = Seed::new(3.0, 1.5);
-            if unknown_percent < 100 {
-                seed.mean = inverse * (1.0 + 0.005 * f64::from(unknown_percent));
-                seed.variance = (inverse * 0.01 * f64::from(unknown_percent)).powi(2);
-            }
-            filter.update(&mut seed, &s.camera, feature, &s.pyramids[0], &s.pyramids[2], &motion, 1.0);
-            good += seed.good;
-        }
-        good
-    });
-}
-
-#[divan::bench]
-fn young_tracks_100(bencher: Bencher<'_, '_>) {
-    let s = scene();
-    let config = FrontendConfig::default();
-    let mut tracker = KltTracker::new(config.klt, config.matching);
-    let turn = s.motion(1, 2).rotation;
-    bencher.bench_local(|| {
-        let mut found = 0;
-        for (feature, _) in s.features[1].iter().take(100) {
-            let Some(warp) = Warp::rotated(&s.camera, feature, &turn) else { continue };
-            found += usize::from(tracker.track(&s.pyramids[1], &s.pyramids[2], feature, &warp, 1.0).is_ok());
-        }
-        found
-    });
-}
-
 /// Pairs of rays of landmarks found in the current frame, a tenth of them wrong.
 fn pairs() -> Vec<RayPair> {
     let s = scene();
@@ -203,36 +163,4 @@ fn two_view_five_point(bencher: Bencher<'_, '_>) {
     let pairs = pairs();
     let mut solver = TwoViewSolver::new(FrontendConfig::default().two_view);
     bencher.bench_local(|| solver.without_rotation(black_box(&pairs), 0.5 / 458.0));
-}
-
-#[divan::bench]
-fn camera_refinement(bencher: Bencher<'_, '_>) {
-    let s = scene();
-    let motion = s.motion(0, 2);
-    let config = FrontendConfig::default();
-    let mut template = Template::empty();
-    let observe = |(f, inverse): &(Feature, f64)| {
-        let warp = Warp::new(&s.camera, f, *inverse, &motion)?;
-        if !template.fill(&s.pyramids[0], f, &warp) {
-            return None;
-        }
-        let found = align_feature(&template, &s.pyramids[2], &warp.pixel, 1.0, &config.matching).ok()?;
-        Some(PointObservation { point_in_anchor: f.bearing / *inverse, measurement: found.measurement })
-    };
-    let observations: Vec<PointObservation> = s.landmarks().iter().filter_map(observe).collect();
-    let prior = MotionPrediction { current_from_anchor: motion, information: Matrix6::identity() };
-    bencher.bench_local(|| refine_camera(&s.camera, black_box(&observations), &prior, &config.refinement));
-}
-
-#[divan::bench]
-fn image_quality(bencher: Bencher<'_, '_>) {
-    bencher.bench_local(|| ImageQuality::of(black_box(&scene().pyramids[2])));
-}
-
-#[divan::bench]
-fn motion_meter(bencher: Bencher<'_, '_>) {
-    let s = scene();
-    let config = FrontendConfig::default();
-    let mut meter = MotionMeter::new(config.klt, config.matching, 0.5);
-    bencher.bench_local(|| meter.measure(&s.pyramids[1], black_box(&s.pyramids[2]), 1.0));
 }

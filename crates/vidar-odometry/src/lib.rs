@@ -5,7 +5,7 @@ pub mod system;
 
 pub use system::{
     DivergenceSign, ImuUse, InputCounts, LossReason, Odometry, OdometryConfig, OdometryError, OdometryOutput,
-    Status, TrackRecord, TrackSummary, Tracking,
+    Stage, StageTimes, Status, TrackRecord, TrackSummary, Tracking,
 };
 pub mod estimator;
 pub mod imu;

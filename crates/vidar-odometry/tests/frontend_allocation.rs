@@ -12,9 +12,8 @@ use vidar_core::{
     So3, Timestamp,
 };
 use vidar_odometry::frontend::{
-    AlignmentPoint, AlignmentReference, DepthFilter, Detection, Detector, Feature, FrontendConfig,
-    ImageAligner, ImageQuality, KltTracker, MotionMeter, MotionPrediction, OccupancyGrid, PointObservation,
-    Pyramid, RayPair, Seed, Template, TwoViewSolver, Warp, align_feature, refine_camera,
+    AlignmentPoint, AlignmentReference, Detection, Detector, Feature, FrontendConfig, ImageAligner,
+    MotionPrediction, OccupancyGrid, Pyramid, RayPair, Template, TwoViewSolver, Warp, align_feature,
 };
 use vidar_odometry::{Odometry, OdometryConfig};
 use vidar_synth::{FlightPath, Start, SynthConfig, SynthView, World, render_views, simulate_imu};
@@ -71,15 +70,10 @@ struct Frontend {
     grid: OccupancyGrid,
     found: Vec<Detection>,
     features: Vec<Feature>,
-    seeds: Vec<Seed>,
     points: Vec<AlignmentPoint>,
-    observations: Vec<PointObservation>,
     pairs: Vec<RayPair>,
     aligner: ImageAligner,
-    klt: KltTracker,
-    filter: DepthFilter,
     two_view: TwoViewSolver,
-    meter: MotionMeter,
     template: Template,
     config: FrontendConfig,
 }
@@ -98,29 +92,22 @@ impl Frontend {
             detector,
             found: Vec::new(),
             features: Vec::new(),
-            seeds: Vec::new(),
             points: Vec::new(),
-            observations: Vec::new(),
             pairs: Vec::new(),
             aligner: ImageAligner::new(config.image_alignment.clone()),
-            klt: KltTracker::new(config.klt.clone(), config.matching.clone()),
-            filter: DepthFilter::new(config.depth_filter.clone(), config.matching.clone()),
             two_view: TwoViewSolver::new(config.two_view.clone()),
-            meter: MotionMeter::new(config.klt.clone(), config.matching.clone(), 0.5),
             template: Template::empty(),
             config,
         }
     }
 
     /// One frame with everything that ever runs; how many features each stage found.
-    fn frame(&mut self, images: &[FrameImage; 3], current_from_key: &Se3) -> [usize; 6] {
+    fn frame(&mut self, images: &[FrameImage; 3], current_from_key: &Se3) -> [usize; 3] {
         for (pyramid, image) in
             [&mut self.keyframe, &mut self.last, &mut self.current].into_iter().zip(images)
         {
             pyramid.rebuild(image).unwrap();
         }
-        let _ = ImageQuality::of(&self.current);
-        let motion = self.meter.measure(&self.last, &self.current, 1.0);
         self.grid.clear();
         self.detector.detect(&self.keyframe, &self.grid, &mut self.found);
         self.features.clear();
@@ -144,7 +131,6 @@ impl Frontend {
             information: Matrix6::identity(),
         };
         let aligned = self.aligner.align(&self.camera, &[reference], &self.current, &prediction);
-        self.observations.clear();
         self.pairs.clear();
         for feature in &self.features {
             let Some(warp) = Warp::new(&self.camera, feature, inverse(feature), &aligned.current_from_anchor)
@@ -159,35 +145,13 @@ impl Frontend {
             else {
                 continue;
             };
-            let point_in_anchor = feature.bearing / inverse(feature);
-            self.observations.push(PointObservation { point_in_anchor, measurement: found.measurement });
             let Some(b) = self.camera.unproject(&found.measurement.pixel) else { continue };
             self.pairs.push(RayPair { a: feature.bearing, b });
         }
-        let refined = refine_camera(&self.camera, &self.observations, &prediction, &self.config.refinement);
         let two_view = self.two_view.with_rotation(&self.pairs, &So3::IDENTITY, 0.2 / 230.0);
         let both = self.two_view.without_rotation(&self.pairs, 0.2 / 230.0);
-        self.seeds.clear();
-        self.seeds.resize(self.features.len(), Seed::new(2.5, 1.0));
-        let mut followed = 0;
-        for (feature, seed) in self.features.iter().zip(&mut self.seeds) {
-            self.filter.update(
-                seed,
-                &self.camera,
-                feature,
-                &self.keyframe,
-                &self.current,
-                &aligned.current_from_anchor,
-                1.0,
-            );
-            if let Some(warp) = Warp::rotated(&self.camera, feature, &So3::IDENTITY) {
-                followed +=
-                    usize::from(self.klt.track(&self.last, &self.current, feature, &warp, 1.0).is_ok());
-            }
-        }
-        let inliers = refined.map_or(0, |r| r.inliers);
         let agreed = two_view.map_or(0, |t| t.inliers).min(both.map_or(0, |t| t.inliers));
-        [motion.patches, aligned.patches, self.observations.len(), inliers, agreed, followed]
+        [aligned.patches, self.pairs.len(), agreed]
     }
 }
 

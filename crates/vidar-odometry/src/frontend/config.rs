@@ -15,14 +15,8 @@ pub struct FrontendConfig {
     pub image_alignment: ImageAlignmentConfig,
     /// Alignment of single features, which measures.
     pub matching: MatchingConfig,
-    /// Tracks of unknown depth from image to image.
-    pub klt: KltConfig,
     /// Motion between two views from rays alone.
     pub two_view: TwoViewConfig,
-    /// Depth of features by epipolar search.
-    pub depth_filter: DepthFilterConfig,
-    /// Refinement of single cameras and points, for vision without an IMU.
-    pub refinement: RefinementConfig,
 }
 
 /// Image pyramids.
@@ -143,22 +137,6 @@ impl Default for MatchingConfig {
     }
 }
 
-/// Tracks of unknown depth from image to image.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
-#[serde(default, deny_unknown_fields)]
-pub struct KltConfig {
-    /// Pyramid levels above a feature's own on which it is looked for first, 0…4. Each doubles the reach.
-    pub extra_levels: usize,
-    /// Furthest that the way back may end from where the way began, pixels of the feature's level, 0.01…5.
-    pub max_round_trip_px: f64,
-}
-
-impl Default for KltConfig {
-    fn default() -> Self {
-        Self { extra_levels: 2, max_round_trip_px: 0.5 }
-    }
-}
-
 /// Motion between two views from rays alone.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
 #[serde(default, deny_unknown_fields)]
@@ -187,64 +165,6 @@ impl Default for TwoViewConfig {
     }
 }
 
-/// Depth of features by epipolar search.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
-#[serde(default, deny_unknown_fields)]
-pub struct DepthFilterConfig {
-    /// Half of the interval that is searched, standard deviations, 1…5.
-    pub search_sigmas: f64,
-    /// Most places that are tried along the epipolar curve, 10…1000.
-    pub max_steps: usize,
-    /// Least correlation of the best place, 0…1.
-    pub min_scan_ncc: f64,
-    /// One minus the best correlation over one minus that of the best elsewhere, at most, 0.1…1.
-    pub second_best_ratio: f64,
-    /// Error of the pixel predicted by the motion, 0…5 px: what the motion's own error adds to that of the alignment.
-    pub motion_sigma_px: f64,
-    /// Standard deviation over the inverse distance below which a seed is known, 0.001…1.
-    pub converged_relative_sigma: f64,
-    /// Least share of good measurements of a known seed, 0…1.
-    pub min_inlier_ratio: f64,
-    /// Share of good measurements below which a seed is dropped, 0…1.
-    pub hopeless_inlier_ratio: f64,
-    /// Distance to the border within which seeds are left alone, pixels, 0…100.
-    pub border_px: f64,
-}
-
-impl Default for DepthFilterConfig {
-    fn default() -> Self {
-        Self {
-            search_sigmas: 2.0,
-            max_steps: 100,
-            min_scan_ncc: 0.7,
-            second_best_ratio: 0.8,
-            motion_sigma_px: 0.3,
-            converged_relative_sigma: 0.05,
-            min_inlier_ratio: 0.55,
-            hopeless_inlier_ratio: 0.25,
-            border_px: 9.0,
-        }
-    }
-}
-
-/// Refinement of single cameras and points.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
-#[serde(default, deny_unknown_fields)]
-pub struct RefinementConfig {
-    /// Most Gauss-Newton steps, 1…50.
-    pub max_iterations: usize,
-    /// Error at which the loss turns from square to absolute, standard deviations, 0.5…10.
-    pub huber_sigmas: f64,
-    /// Error beyond which an observation is an outlier, standard deviations, 1…20.
-    pub outlier_sigmas: f64,
-}
-
-impl Default for RefinementConfig {
-    fn default() -> Self {
-        Self { max_iterations: 10, huber_sigmas: 1.345, outlier_sigmas: 3.5 }
-    }
-}
-
 fn within(
     key: &'static str,
     found: f64,
@@ -270,17 +190,7 @@ impl FrontendConfig {
         self.detector.validate()?;
         self.image_alignment.validate()?;
         self.matching.validate()?;
-        self.klt.validate()?;
-        self.two_view.validate()?;
-        self.depth_filter.validate()?;
-        self.refinement.validate()
-    }
-}
-
-impl KltConfig {
-    fn validate(&self) -> Result<(), FrontendError> {
-        within("klt.extra_levels", self.extra_levels as f64, 0.0, 4.0, "0 to 4")?;
-        within("klt.max_round_trip_px", self.max_round_trip_px, 0.01, 5.0, "0.01 to 5 px")
+        self.two_view.validate()
     }
 }
 
@@ -291,29 +201,6 @@ impl TwoViewConfig {
         within("two_view.max_samples", self.max_samples as f64, 1.0, 10_000.0, "1 to 10000")?;
         within("two_view.confidence", self.confidence, 0.5, 0.9999, "0.5 to 0.9999")?;
         within("two_view.min_parallax_sigmas", self.min_parallax_sigmas, 0.0, 100.0, "0 to 100")
-    }
-}
-
-impl DepthFilterConfig {
-    fn validate(&self) -> Result<(), FrontendError> {
-        within("depth_filter.search_sigmas", self.search_sigmas, 1.0, 5.0, "1 to 5")?;
-        within("depth_filter.max_steps", self.max_steps as f64, 10.0, 1000.0, "10 to 1000")?;
-        within("depth_filter.min_scan_ncc", self.min_scan_ncc, 0.0, 1.0, "0 to 1")?;
-        within("depth_filter.second_best_ratio", self.second_best_ratio, 0.1, 1.0, "0.1 to 1")?;
-        within("depth_filter.motion_sigma_px", self.motion_sigma_px, 0.0, 5.0, "0 to 5 px")?;
-        let (relative, share) = (self.converged_relative_sigma, "0 to 1");
-        within("depth_filter.converged_relative_sigma", relative, 0.001, 1.0, "0.001 to 1")?;
-        within("depth_filter.min_inlier_ratio", self.min_inlier_ratio, 0.0, 1.0, share)?;
-        within("depth_filter.hopeless_inlier_ratio", self.hopeless_inlier_ratio, 0.0, 1.0, share)?;
-        within("depth_filter.border_px", self.border_px, 0.0, 100.0, "0 to 100 px")
-    }
-}
-
-impl RefinementConfig {
-    fn validate(&self) -> Result<(), FrontendError> {
-        within("refinement.max_iterations", self.max_iterations as f64, 1.0, 50.0, "1 to 50")?;
-        within("refinement.huber_sigmas", self.huber_sigmas, 0.5, 10.0, "0.5 to 10")?;
-        within("refinement.outlier_sigmas", self.outlier_sigmas, 1.0, 20.0, "1 to 20")
     }
 }
 
@@ -362,15 +249,12 @@ mod tests {
     fn the_defaults_are_valid_and_a_bad_key_is_named() {
         FrontendConfig::default().validate().unwrap();
         type Spoil = fn(&mut FrontendConfig);
-        let cases: [(&str, Spoil); 8] = [
+        let cases: [(&str, Spoil); 5] = [
             ("pyramid.levels", |c| c.pyramid.levels = 0),
             ("detector.fast_threshold", |c| c.detector.fast_threshold = 0),
             ("image_alignment.coarsest_level", |c| c.image_alignment.coarsest_level = 1),
             ("matching.min_ncc", |c| c.matching.min_ncc = f64::NAN),
-            ("klt.max_round_trip_px", |c| c.klt.max_round_trip_px = -1.0),
             ("two_view.confidence", |c| c.two_view.confidence = 1.0),
-            ("depth_filter.second_best_ratio", |c| c.depth_filter.second_best_ratio = 2.0),
-            ("refinement.huber_sigmas", |c| c.refinement.huber_sigmas = f64::INFINITY),
         ];
         for (name, spoil) in cases {
             let mut config = FrontendConfig::default();

@@ -6,6 +6,8 @@ use crate::estimator::{
 };
 use crate::imu::{Bias, BufferError, ImuBuffer, ImuModel, NavState, Preintegration};
 use crate::init::{Attempt, InFlightConfig, InFlightStart, LoggedFrame, Refusal, Seen};
+use crate::system::starting::STILL_SECS;
+use crate::system::stillness::{ImageMotion, ImuSpread};
 use nalgebra::Vector3;
 use rustc_hash::{FxHashMap, FxHashSet};
 use vidar_core::{CameraModel, Duration, FrameId, ImuSample, LandmarkId, LieGroup, Se3, Timestamp};
@@ -33,6 +35,9 @@ pub struct FeatureOdometryConfig {
     pub min_parallax_deg: f64,
     /// Frames between attempts to start.
     pub attempt_every: usize,
+    /// Whether tracks and readings tell when the body rests, as in the whole odometry; else only
+    /// [`FeatureOdometry::push_resting`] does.
+    pub notices_rest: bool,
 }
 
 impl FeatureOdometryConfig {
@@ -49,6 +54,7 @@ impl FeatureOdometryConfig {
             keyframe_every: 4,
             min_parallax_deg: 1.0,
             attempt_every: 6,
+            notices_rest: true,
         }
     }
 }
@@ -89,8 +95,10 @@ pub struct FeatureOdometry {
     tracks: FxHashMap<LandmarkId, Vec<(FrameId, Seen)>>,
     banned: FxHashSet<LandmarkId>,
     since_keyframe: usize,
-    /// Whether the frame that comes is told to rest.
+    /// Whether the frame that comes is told to rest, and whether it is told or seen to.
+    told_to_rest: bool,
     resting: bool,
+    motion: ImageMotion,
     /// The frame since which the body rests, and the time from which its readings are not in the prior yet.
     rest: Option<(FrameId, Timestamp)>,
     last_time: Option<Timestamp>,
@@ -128,7 +136,9 @@ impl FeatureOdometry {
             tracks: FxHashMap::default(),
             banned: FxHashSet::default(),
             since_keyframe: 0,
+            told_to_rest: false,
             resting: false,
+            motion: ImageMotion::default(),
             rest: None,
             last_time: None,
             report: OptimiseReport::default(),
@@ -201,6 +211,8 @@ impl FeatureOdometry {
         // Stamps as far right as is known.
         let time = time + self.smoother.as_ref().map_or(Duration::ZERO, Smoother::next_frame_offset);
         let readings = self.readings_until(time, bias);
+        let still = self.motion.update(seen.iter().map(|s| (s.landmark, s.pixel)), time);
+        self.resting = self.told_to_rest || (self.config.notices_rest && still && self.imu_rests(time));
         self.last_time = Some(time);
         match self.smoother.take() {
             Some(mut smoother) => {
@@ -210,6 +222,13 @@ impl FeatureOdometry {
             }
             None => self.try_start(id, time, seen, readings),
         }
+    }
+
+    /// Whether the readings of the last half second are those of a body at rest.
+    fn imu_rests(&self, time: Timestamp) -> bool {
+        let from = time - Duration::from_secs_f64(STILL_SECS);
+        let recent = self.buffer.iter().filter(|s| s.time >= from && s.time <= time);
+        ImuSpread::of(recent).is_still(&self.config.imu.noise)
     }
 
     /// As [`FeatureOdometry::push`] for a frame of which it is known that the body stands still.
@@ -222,9 +241,9 @@ impl FeatureOdometry {
         time: Timestamp,
         seen: &[Seen],
     ) -> Result<StepOutput, SmootherError> {
-        self.resting = true;
+        self.told_to_rest = true;
         let output = self.push(id, time, seen);
-        self.resting = false;
+        self.told_to_rest = false;
         output
     }
 
@@ -253,7 +272,7 @@ impl FeatureOdometry {
         self.log.push(LoggedFrame { frame: id, time, readings, seen: seen.to_vec() });
         let old = self.log.len().saturating_sub((self.config.in_flight.window_secs * 100.0) as usize);
         self.log.drain(..old);
-        if !self.log.len().is_multiple_of(self.config.attempt_every) {
+        if self.resting || !self.log.len().is_multiple_of(self.config.attempt_every) {
             return Ok(StepOutput::Waiting(None));
         }
         match self.start.attempt(&self.log)? {

@@ -10,8 +10,9 @@ mod odometry;
 mod output;
 mod rotation_check;
 mod running;
-mod starting;
-mod stillness;
+mod stages;
+pub(crate) mod starting;
+pub(crate) mod stillness;
 mod track;
 mod tracker;
 
@@ -19,4 +20,5 @@ pub use config::{ImuUse, OdometryConfig};
 pub use error::OdometryError;
 pub use odometry::{InputCounts, Odometry};
 pub use output::{DivergenceSign, LossReason, OdometryOutput, Status, TrackSummary, Tracking};
+pub use stages::{Stage, StageTimes};
 pub use track::TrackRecord;

@@ -7,6 +7,7 @@ use super::keyframes::{KeyframeBook, Making, public_state, seen_landmarks};
 use super::output::{DivergenceSign, LossReason, OdometryOutput, Status, TrackSummary, Tracking};
 use super::rotation_check::{MAX_TURN_DEG, RotationCheck};
 use super::running::{Running, Shot, Step};
+use super::stages::{Stage, StageClock, StageTimes};
 use super::starting::{Found, STILL_SECS, Starting, UNKNOWN_INVERSE};
 use super::stillness::ImuSpread;
 use super::track::HostImage;
@@ -79,6 +80,7 @@ pub struct Odometry {
     book: KeyframeBook,
     check: RotationCheck,
     images: ImagePool,
+    clock: StageClock,
 }
 
 impl Odometry {
@@ -110,6 +112,7 @@ impl Odometry {
             camera_id: camera,
             check: RotationCheck::new(&rig_camera.body_from_camera.rotation),
             images: ImagePool::default(),
+            clock: StageClock::start(),
             camera: rig_camera,
             imu_model,
             imu: ImuBuffer::new(noise.map_or(200.0, |n| n.rate_hz)),
@@ -168,6 +171,11 @@ impl Odometry {
         self.counts
     }
 
+    /// Where the time of the newest image went.
+    pub fn stage_times(&self) -> StageTimes {
+        self.clock.times()
+    }
+
     /// All tracks as the newest image showed them, for plots; none before the start.
     pub fn tracks(&self) -> Vec<TrackRecord> {
         match &self.phase {
@@ -219,12 +227,15 @@ impl Odometry {
 
     /// One image. `None` when nothing can be said of it.
     fn process(&mut self, frame: Frame) -> Option<OdometryOutput> {
+        self.clock = StageClock::start();
         let time = self.imu_time(&frame);
         let id = FrameId(self.next_frame);
         self.next_frame = self.next_frame.wrapping_add(1);
         // The size was checked when the image came.
         let host = self.images.take(id, &frame.image, self.frontend.pyramid.levels)?;
+        let was_starting = matches!(self.phase, Phase::Starting(_));
         let status = self.status_after(&frame, host, time);
+        self.clock.lap(if was_starting { Stage::Start } else { Stage::Tell });
         self.imu.forget_before(self.last_frame.unwrap_or(time) - Duration::from_millis(1500));
         Some(OdometryOutput { frame_id: frame.id, time: frame.time, status })
     }
@@ -236,6 +247,7 @@ impl Odometry {
             return self.lose(reason);
         }
         let readings = self.readings_until(time);
+        self.clock.lap(Stage::Pyramid);
         let repeated = self.last_host.as_ref().is_some_and(|l| l.pyramid.level(0) == host.pyramid.level(0));
         let imu_still = self.imu_is_still(time);
         self.counts.images_repeated += usize::from(repeated);
@@ -266,7 +278,7 @@ impl Odometry {
             }
             Phase::Running(running) => {
                 let frame_id = host.frame;
-                let step = running.step(Shot { host, time, readings, imu_still });
+                let step = running.step(Shot { host, time, readings, imu_still }, &mut self.clock);
                 self.check.add(&self.camera.model, &running.tracker.tracks, frame_id, felt);
                 if let Some(found) = self.check.doubt() {
                     let (sign, limit) = (DivergenceSign::CameraOrientation, MAX_TURN_DEG);

@@ -1,7 +1,7 @@
 //! The odometry before it has a metric state: tracks are followed with the gyroscope's help and logged.
 
 use super::config::OdometryConfig;
-use super::stillness::ImageMotion;
+use super::stillness::{ImageMotion, found_in};
 use super::track::{HostImage, host_covariance, noisy_covariance};
 use super::tracker::{Places, Prediction, Tracker};
 use crate::estimator::Smoother;
@@ -183,7 +183,7 @@ impl Starting {
             };
             self.tracker.measure(&host.pyramid, frame, &prediction);
         }
-        self.images_still = self.motion.update(&self.tracker.tracks, frame, time);
+        self.images_still = self.motion.update(found_in(&self.tracker.tracks, frame), time);
         self.turns.push(Turn { frame, first_from_body, host: host.clone() });
         self.tracker.tracks.iter().filter(|t| t.measured.is_some()).count()
     }

@@ -2,15 +2,15 @@
 
 use super::track::Track;
 use crate::imu::StepNoise;
-use nalgebra::Vector3;
+use nalgebra::{Vector2, Vector3};
 use rustc_hash::FxHashMap;
 use vidar_core::{Duration, FrameId, ImuSample, LandmarkId, Timestamp, camera::Pixel};
 
-/// Median motion since the body is thought to stand, per axis, that is still standing, pixels: noise of
-/// single tracks cancels.
+/// Median motion since the body is thought to stand that is still standing, pixels: along both axes, away from the middle
+/// of the tracks and around it. Noise of single tracks cancels.
 const STILL_SHIFT_PX: f64 = 0.4;
-/// Median length of the motion of single tracks, their noise included, pixels: motion along the axis of the camera.
-const STILL_PX: f64 = 0.8;
+/// Median length of the motion of single tracks, their noise included, pixels: what moves differently everywhere.
+const STILL_PX: f64 = 1.2;
 /// How long images must show it, s, and how many of them.
 const STILL_SECS: f64 = 0.4;
 const STILL_FRAMES: u32 = 4;
@@ -23,42 +23,55 @@ const STILL_ACCEL: f64 = 0.15;
 /// Motion of tracks since the body was last seen to move.
 ///
 /// Standing is judged against one place in the past, not from image to image: what creeps slowly gets away from it.
-#[derive(Debug, Default)]
+#[derive(Clone, Debug, Default)]
 pub(crate) struct ImageMotion {
     reference: FxHashMap<LandmarkId, Pixel>,
     since: Option<Timestamp>,
     frames: u32,
-    moved: Vec<[f64; 3]>,
+    /// Place before and motion of every track that was there before.
+    moved: Vec<(Pixel, Vector2<f64>)>,
+    values: Vec<f64>,
+}
+
+/// Tracks that `frame` shows, with their places.
+pub(crate) fn found_in(
+    tracks: &[Track],
+    frame: FrameId,
+) -> impl Iterator<Item = (LandmarkId, Pixel)> + Clone + '_ {
+    tracks.iter().filter(move |t| t.last_frame == frame).map(|t| (t.id, t.last_pixel))
 }
 
 impl ImageMotion {
-    /// Takes the tracks as measured in `frame` at `time`; whether the images have been still for a while.
-    pub fn update(&mut self, tracks: &[Track], frame: FrameId, time: Timestamp) -> bool {
+    /// Takes the tracks as measured in the image at `time`; whether the images have been still for a while.
+    pub fn update(
+        &mut self,
+        seen: impl Iterator<Item = (LandmarkId, Pixel)> + Clone,
+        time: Timestamp,
+    ) -> bool {
         self.moved.clear();
-        for track in tracks.iter().filter(|t| t.last_frame == frame) {
-            if let Some(before) = self.reference.get(&track.id) {
-                let d = track.last_pixel - before;
-                self.moved.push([d.x, d.y, d.norm()]);
+        for (id, pixel) in seen.clone() {
+            if let Some(before) = self.reference.get(&id) {
+                self.moved.push((*before, pixel - before));
             }
         }
         let (Some(since), true) = (self.since, self.stands()) else {
-            self.begin(tracks, frame, time);
+            self.begin(seen, time);
             return false;
         };
         self.frames += 1;
         self.frames >= STILL_FRAMES && (time - since).as_secs_f64() >= STILL_SECS
     }
 
-    /// The body is known to stand at `frame`.
-    pub fn stand(&mut self, tracks: &[Track], frame: FrameId, time: Timestamp) {
-        self.begin(tracks, frame, time);
+    /// The body is known to stand at `time`.
+    pub fn stand(&mut self, seen: impl Iterator<Item = (LandmarkId, Pixel)>, time: Timestamp) {
+        self.begin(seen, time);
         self.since = Some(time - Duration::from_secs_f64(STILL_SECS));
         self.frames = STILL_FRAMES;
     }
 
-    fn begin(&mut self, tracks: &[Track], frame: FrameId, time: Timestamp) {
+    fn begin(&mut self, seen: impl Iterator<Item = (LandmarkId, Pixel)>, time: Timestamp) {
         self.reference.clear();
-        self.reference.extend(tracks.iter().filter(|t| t.last_frame == frame).map(|t| (t.id, t.last_pixel)));
+        self.reference.extend(seen);
         (self.since, self.frames) = (Some(time), 0);
     }
 
@@ -66,12 +79,19 @@ impl ImageMotion {
         if self.moved.len() < STILL_TRACKS {
             return false;
         }
-        let middle = self.moved.len() / 2;
-        let mut median = |axis: usize| {
-            self.moved.select_nth_unstable_by(middle, |a, b| a[axis].total_cmp(&b[axis])).1[axis]
+        let middle = self.moved.iter().map(|m| m.0).sum::<Vector2<f64>>() / self.moved.len() as f64;
+        let outward = |(at, _): &(Pixel, Vector2<f64>)| (at - middle).try_normalize(1.0).unwrap_or_default();
+        type Measure<'a> = &'a dyn Fn(&(Pixel, Vector2<f64>)) -> f64;
+        let around = |m: &(Pixel, Vector2<f64>)| outward(m).perp(&m.1);
+        let shifts: [Measure<'_>; 4] = [&|m| m.1.x, &|m| m.1.y, &|m| outward(m).dot(&m.1), &around];
+        let (moved, values) = (&self.moved, &mut self.values);
+        let mut median = |of: Measure<'_>| {
+            values.clear();
+            values.extend(moved.iter().map(of));
+            let middle = values.len() / 2;
+            *values.select_nth_unstable_by(middle, f64::total_cmp).1
         };
-        let [x, y, length] = [median(0), median(1), median(2)];
-        x.abs() < STILL_SHIFT_PX && y.abs() < STILL_SHIFT_PX && length < STILL_PX
+        shifts.into_iter().all(|of| median(of).abs() < STILL_SHIFT_PX) && median(&|m| m.1.norm()) < STILL_PX
     }
 }
 
@@ -119,5 +139,45 @@ impl ImuSpread {
         let gyro = STILL_GYRO.max(white(noise.gyro_density));
         let accel = STILL_ACCEL.max(white(noise.accel_density));
         self.samples >= 10 && self.std_gyro < gyro && self.std_accel < accel
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::simulate::Random;
+
+    /// Whether 60 tracks with noise of `sigma` pixels are told to be still after a second of `motion` (pixels per second at
+    /// a place, from the middle).
+    fn is_still(sigma: f64, motion: impl Fn(Vector2<f64>) -> Vector2<f64>) -> bool {
+        let mut random = Random::new(5);
+        let mut images = ImageMotion::default();
+        let places: Vec<Vector2<f64>> = (0..60)
+            .map(|k| Vector2::new(100.0 * f64::from(k % 10) - 450.0, 80.0 * f64::from(k / 10) - 200.0))
+            .collect();
+        let mut still = false;
+        for frame in 0..21_i64 {
+            let secs = frame as f64 * 0.05;
+            let seen: Vec<(LandmarkId, Pixel)> = places
+                .iter()
+                .enumerate()
+                .map(|(k, p)| {
+                    let noise = Vector2::new(random.normal(), random.normal()) * sigma;
+                    (LandmarkId(k as u32), p + motion(*p) * secs + noise)
+                })
+                .collect();
+            still = images.update(seen.into_iter(), Timestamp::from_nanos(frame * 50_000_000));
+        }
+        still
+    }
+
+    #[test]
+    fn noise_is_still_and_every_kind_of_motion_is_not() {
+        for sigma in [0.1, 0.3, 0.5] {
+            assert!(is_still(sigma, |_| Vector2::zeros()), "{sigma}");
+            assert!(!is_still(sigma, |_| Vector2::new(3.0, 0.0)), "{sigma} sideways");
+            assert!(!is_still(sigma, |p| p * 0.02), "{sigma} ahead");
+            assert!(!is_still(sigma, |p| Vector2::new(-p.y, p.x) * 0.02), "{sigma} about the axis");
+        }
     }
 }

@@ -4,7 +4,7 @@
 //! right is refused, degraded or lost with a reason. The long forms are run with
 //! `cargo test --release -p vidar-odometry --test ladder -- --ignored`.
 
-#![allow(clippy::unwrap_used, clippy::panic)] // helpers of tests are test code, though not marked so
+#![allow(clippy::unwrap_used, clippy::panic, clippy::print_stderr)] // helpers of tests are test code, though not marked so
 
 mod images;
 mod inertial;

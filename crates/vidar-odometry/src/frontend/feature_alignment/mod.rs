@@ -93,34 +93,6 @@ fn sums(image: &Image<u8>, template: &Template, corner: &Pixel) -> Option<Sums> 
 
 const PIXELS: f64 = (SIDE * SIDE) as f64;
 
-/// Correlation with the patch whose upper left pixel is `corner` on the template's level; `None` outside the image.
-pub(crate) fn correlation(template: &Template, current: &Pyramid, corner: [usize; 2]) -> Option<f64> {
-    let image = current.level(template.level);
-    if corner[0] + SIDE > image.width() || corner[1] + SIDE > image.height() {
-        return None;
-    }
-    let [mean, energy, with_template] = dispatch!(plain_sums(image, template, corner));
-    let energy = (energy - PIXELS * mean * mean).max(0.0);
-    Some(with_template / (energy * template.energy).sqrt().max(1e-9))
-}
-
-/// Mean, sum of squares and product with the template of a patch at whole pixels.
-#[inline(always)]
-fn plain_sums(image: &Image<u8>, template: &Template, corner: [usize; 2]) -> [f64; 3] {
-    let (mut sum, mut square, mut t) = ([0.0_f32; 8], [0.0_f32; 8], [0.0_f32; 8]);
-    for row in 0..SIDE {
-        let pixels = &image.data()[(corner[1] + row) * image.width() + corner[0]..][..SIDE];
-        let intensity = &template.intensity[row * SIDE..(row + 1) * SIDE];
-        for i in 0..SIDE {
-            let v = f32::from(pixels[i]);
-            sum[i] += v;
-            square[i] += v * v;
-            t[i] += v * intensity[i];
-        }
-    }
-    [f64::from(sum8(&sum)) / PIXELS, sum8(&square).into(), sum8(&t).into()]
-}
-
 /// Finds `template` in `current`, starting at `start` (level-0 pixels; usually the template's expected place).
 ///
 /// `noise_gray` is the standard deviation of the image noise: what differs by no more than noise is not refused for it.
