@@ -12,8 +12,9 @@ from .model import Output
 CONFIDENCE = 0.4  # weight of the logarithm that keeps the confidence from vanishing
 GRADIENT = 0.5
 ALIGNED = 0.5
-RAYS = 0.5
+RAYS = 1.0
 CAMERA = 1.0
+SMALL = 0.03
 
 
 def masked_mean(value: Tensor, mask: Tensor) -> Tensor:
@@ -63,7 +64,8 @@ def camera_terms(output: Output, scenes: Scenes) -> dict[str, Tensor]:
     quaternion = quaternion_from_matrix(scenes.first_from_camera[..., :3, :3])
     size = torch.tensor([height, width], dtype=torch.float32)
     fov = 2 * torch.atan(0.5 * size / scenes.focal.flip(-1))
-    length = lambda v: (v.square().sum(-1) + 1e-8).sqrt().mean()  # noqa: E731
+    # Smooth near zero: errors below SMALL need not pull as hard as large ones.
+    length = lambda v: ((v.square().sum(-1) + SMALL**2).sqrt() - SMALL).mean()  # noqa: E731
     return {
         "t": length(found[..., :3] - scenes.first_from_camera[..., :3, 3]),
         "q": length(found[..., 3:7] - quaternion),

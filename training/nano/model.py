@@ -510,8 +510,9 @@ def initialise(model: Nano) -> None:
             p.normal_(0, 0.5)
         elif leaf == "pos_grid":
             p.normal_(0, 0.5)
-    for block in [m for m in model.backbone["pretrained"].blocks]:
+    for block in model.backbone["pretrained"].blocks:
         similar_attention(block.attn)
+    spread_poses(model.cam_enc)
     scratch = model.head.scratch
     for unit in [m for m in scratch.modules() if isinstance(m, ResidualUnit)]:
         unit.conv2.weight *= 0.2
@@ -535,6 +536,16 @@ def similar_attention(attention: Attention) -> None:
     if attention.qk_norm:
         attention.q_norm.weight.fill_(0.8)
         attention.k_norm.weight.fill_(0.8)
+
+
+@torch.no_grad()
+def spread_poses(encoder: CameraEncoder) -> None:
+    """Makes tokens of neighbouring cameras differ from the start: rotations of a few degrees are small numbers."""
+    first, second = encoder.pose_branch.fc1, encoder.pose_branch.fc2
+    sensitivity = torch.tensor([1.0, 1, 1, 5, 5, 5, 1, 2, 2])
+    first.weight.copy_(torch.randn_like(first.weight) * sensitivity)
+    first.bias.uniform_(-2, 2)
+    second.weight.normal_(0, 2 / math.sqrt(second.in_features))
 
 
 @torch.no_grad()

@@ -129,7 +129,7 @@ class Trainer:
         """Scenes of a random number of views, and whether cameras are given."""
         per_clip = stage.views_per_clip
         clips = pool.draw(max(1, stage.views_per_step // per_clip))
-        views = self.rng.choices([1, 2, 3, 4, 6, 8, 16], [4, 12, 8, 22, 10, 44, 0 if per_clip < 16 else 30])[0]
+        views = self.rng.choices([1, 2, 3, 4, 6, 8, 16], [4, 30, 10, 26, 6, 24, 0 if per_clip < 16 else 20])[0]
         views = min(views, len(clips[0].image))
         parts = []
         for clip in clips:
