@@ -5,14 +5,14 @@ use rayon::prelude::*;
 use crate::compute::{Compute, Precision};
 use crate::conv::{Conv2d, MapRef};
 use crate::kernels::centre::{Bias, centre_of};
-use crate::kernels::gemm::ShapeOf;
-use crate::kernels::head::{Band, Branch};
+use crate::kernels::gemm::{Shape, ShapeOf};
+use crate::kernels::head::{Band, Branch, Part};
 use crate::kernels::pack::Pack;
 use crate::kernels::resample::Resampled;
 use crate::kernels::scratch::{self, Role};
 use crate::kernels::shared::SharedMut;
 use crate::kernels::source::{Fill, Source};
-use crate::kernels::{Factors, dispatch_product};
+use crate::kernels::{Factors, dispatch_product, winograd};
 use crate::norm::LayerNorm;
 use crate::resize::{Corners, GridEmbedding, MapSize, taps};
 
@@ -68,9 +68,12 @@ pub fn head(c: &Compute, input: &HeadInput<'_>, branches: &mut [HeadBranch<'_>])
             "head: channels of the norm"
         );
         assert_eq!(branch.out.len(), size.rows * size.cols * point.out_channels(), "head: output");
-        let source = Source::Bands(conv.bands(Fill::Copy(&[]), size.rows, size.cols));
-        let shape = dispatch_product(isa, factors, ShapeOf { inner: source.inner() });
-        lengths.push(conv.out_channels().next_multiple_of(shape.panel) * shape.words);
+        let bands = conv.bands(Fill::Copy(&[]), size.rows, size.cols);
+        let inner = Source::Bands(bands).inner();
+        let Shape { panel, words } = dispatch_product(isa, factors, ShapeOf { inner });
+        let is_in_tiles = winograd::is_for(&bands, factors);
+        let words = if is_in_tiles { winograd::panel_words(channels, panel) } else { panel * words };
+        lengths.push((panel, conv.out_channels().div_ceil(panel) * words));
     }
     if size.rows * size.cols * channels == 0 {
         for branch in branches {
@@ -87,17 +90,24 @@ pub fn head(c: &Compute, input: &HeadInput<'_>, branches: &mut [HeadBranch<'_>])
     );
     let (ys, xs) = (taps(map.rows, size.rows, input.corners), taps(map.cols, size.cols, input.corners));
     let resampled = Resampled { x: map.data, cols: map.cols, channels, ys: &ys, xs: &xs, embedding };
-    let source = Source::Bands(conv.bands(Fill::Resampled(&resampled), size.rows, size.cols));
+    let bands = conv.bands(Fill::Resampled(&resampled), size.rows, size.cols);
+    let source = Source::Bands(bands);
+    let is_in_tiles = winograd::is_for(&bands, factors);
 
     let centre = centre_of(isa, factors, &source);
     let mut packed = scratch::borrow(Role::Panels);
-    let total: usize = lengths.iter().sum();
+    let total: usize = lengths.iter().map(|(_, length)| length).sum();
     let mut rest = &mut packed.words(total)[..total];
     let mut panels: Vec<(&[u32], Bias<'_>)> = Vec::with_capacity(branches.len());
-    for (branch, len) in branches.iter().zip(&lengths) {
+    for (branch, (panel, len)) in branches.iter().zip(&lengths) {
         let (to, after) = rest.split_at_mut(*len);
         rest = after;
         let mut bias = Bias::new(branch.conv.bias(), centre.as_deref(), branch.conv.out_channels());
+        if is_in_tiles {
+            winograd::pack(c, branch.conv, channels, 0..branch.conv.out_channels(), *panel, to);
+            panels.push((to, bias));
+            continue;
+        }
         let pack = Pack {
             columns: branch.conv,
             column: &|at| (at < branch.conv.out_channels()).then_some(at),
@@ -127,11 +137,12 @@ pub fn head(c: &Compute, input: &HeadInput<'_>, branches: &mut [HeadBranch<'_>])
         })
         .filter(|branch| branch.middle > 0 && branch.outputs > 0)
         .collect();
-    (0..source.chunks()).into_par_iter().for_each(|chunk| {
-        dispatch_product(
-            isa,
-            factors,
-            Band { source, branches: &branches, chunk, centre: centre.as_deref() },
-        );
-    });
+    let (branches, centre) = (&branches[..], centre.as_deref());
+    let run = |part| dispatch_product(isa, factors, Band { bands, branches, part, centre });
+    if is_in_tiles {
+        let plan = winograd::Plan::new(&bands);
+        (0..plan.tasks).into_par_iter().for_each(|task| run(Part::Tiles(plan.range(task, &bands))));
+    } else {
+        (0..source.chunks()).into_par_iter().for_each(|chunk| run(Part::Chunk(chunk)));
+    }
 }

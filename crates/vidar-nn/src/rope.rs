@@ -47,6 +47,7 @@ impl RopeTable {
     }
 
     /// Turns one head of token `token` where it stands.
+    #[inline(always)] // into code that is compiled for a kernel set
     pub fn rotate(&self, token: usize, head: &mut [f32]) {
         debug_assert_eq!(head.len(), self.head_dim);
         let quarter = self.head_dim / 4;

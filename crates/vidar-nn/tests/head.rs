@@ -36,6 +36,7 @@ fn the_fused_head_equals_its_parts_for_one_and_two_branches() {
         (5, 7, 32, MapSize { rows: 11, cols: 13 }, 32, 2),
         (6, 6, 18, MapSize { rows: 6, cols: 6 }, 20, 7),
         (3, 2, 8, MapSize { rows: 50, cols: 29 }, 33, 1),
+        (9, 14, 16, MapSize { rows: 31, cols: 45 }, 40, 2),
     ] {
         let x = numbers.vec(h * w * c);
         let embedding =

@@ -1,14 +1,16 @@
 //! The end of a dense head, band by band: resampling, embedding, convolution, activation and the last 1×1 convolution without
 //! any map of full size in between.
 
+use std::ops::Range;
+
 use super::gemm::{End, OutLayout, Panels, Target, multiply};
 use super::norm::{NormRef, norm_row};
 use super::scratch::{self, Role};
 use super::shared::SharedMut;
 use super::simd::Simd;
-use super::source::Source;
+use super::source::{Bands, Source};
 use super::tile::Multiply;
-use super::{ProductKernel, math};
+use super::{ProductKernel, math, winograd};
 
 /// One branch: a convolution to `middle` channels, a norm where there is one, relu, and a linear map of each pixel.
 pub(crate) struct Branch<'a> {
@@ -25,10 +27,18 @@ pub(crate) struct Branch<'a> {
 
 /// One band of all branches.
 pub(crate) struct Band<'a> {
-    pub(crate) source: Source<'a>,
+    pub(crate) bands: Bands<'a>,
     pub(crate) branches: &'a [Branch<'a>],
-    pub(crate) chunk: usize,
+    pub(crate) part: Part,
     pub(crate) centre: Option<&'a [f32]>,
+}
+
+/// Which band, by the way in which it is convolved.
+pub(crate) enum Part {
+    /// A chunk of the product.
+    Chunk(usize),
+    /// Lines of tiles ([`winograd`]).
+    Tiles(Range<usize>),
 }
 
 impl ProductKernel for Band<'_> {
@@ -36,10 +46,19 @@ impl ProductKernel for Band<'_> {
     #[inline(always)]
     fn run<M: Multiply>(self, m: M) {
         let s = m.simd();
-        let rows = self.source.rows(self.chunk);
-        let geometry = self.source.geometry::<M>();
-        let mut scratch = scratch::borrow(Role::Rows);
-        let a = self.source.prepare(m, &geometry, self.chunk, self.centre, &mut scratch);
+        let source = Source::Bands(self.bands);
+        let geometry = source.geometry::<M>();
+        let mut scratch = scratch::borrow(Role::Band);
+        let width = self.bands.out_cols;
+        let (rows, a) = match &self.part {
+            Part::Chunk(chunk) => {
+                (source.rows(*chunk), source.prepare(m, &geometry, *chunk, self.centre, &mut scratch))
+            }
+            Part::Tiles(lines) => {
+                let end = (2 * lines.end).min(self.bands.out_rows);
+                (2 * lines.start * width..end * width, &[][..])
+            }
+        };
         let panel = 2 * M::Simd::LANES;
         for branch in self.branches {
             let n = branch.middle;
@@ -51,8 +70,16 @@ impl ProductKernel for Band<'_> {
             let end = if branch.norm.is_some() { End::Store } else { End::Relu };
             let target = Target { width: n, bias: branch.bias, end, layout, out: SharedMut::new(between) };
             let count = n.div_ceil(panel);
-            let panels = Panels { words: branch.panels, first: 0, count, per_unit: 1 };
-            multiply(m, a, &geometry, rows.clone(), rows.start, panels, 0..count, &target);
+            match &self.part {
+                Part::Chunk(_) => {
+                    let panels = Panels { words: branch.panels, first: 0, count, per_unit: 1 };
+                    multiply(m, a, &geometry, rows.clone(), rows.start, panels, 0..count, &target);
+                }
+                Part::Tiles(lines) => {
+                    let panels = winograd::Panels { words: branch.panels, first: 0, count };
+                    winograd::convolve(m, &self.bands, lines.clone(), rows.start, panels, &target);
+                }
+            }
             // SAFETY: the bands' pixels are disjoint.
             let out = unsafe { branch.out.part(rows.start * branch.outputs, rows.len() * branch.outputs) };
             for (middle, out) in between.chunks_exact_mut(n).zip(out.chunks_exact_mut(branch.outputs)) {

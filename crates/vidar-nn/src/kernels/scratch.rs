@@ -86,6 +86,8 @@ pub(crate) enum Role {
     Kernels,
     /// Input rows of a task.
     Rows,
+    /// Input rows of a band of a fused head.
+    Band,
     /// Blocks of a task of attention, or a band of a fused head.
     Block,
     /// Numbers between the two products of a fused head.
@@ -94,7 +96,7 @@ pub(crate) enum Role {
     Keys,
 }
 
-const ROLES: usize = 7;
+const ROLES: usize = 8;
 
 thread_local! {
     static KEPT: RefCell<[Scratch; ROLES]> = const { RefCell::new([const { Scratch { lines: Vec::new() } }; ROLES]) };
