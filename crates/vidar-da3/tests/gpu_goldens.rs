@@ -96,13 +96,15 @@ fn official(files: &[&str], precision: Precision) {
 
 #[test]
 fn small_holds_on_a_device() {
-    official(&["small_v2_42x56_full", "small_v5_42x56_saddle_balanced", "small_posed_v3"], Precision::F32);
+    official(&["small_v2_42x56_full"], Precision::F32);
 }
 
 #[test]
 #[ignore = "minutes on a device that runs shaders on the CPU"]
 fn small_in_all_forms_holds_on_a_device() {
     let files = [
+        "small_v5_42x56_saddle_balanced",
+        "small_posed_v3",
         "small_v1_70x98",
         "small_v2_70x98",
         "small_v3_56x84",

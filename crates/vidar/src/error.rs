@@ -153,8 +153,19 @@ pub enum Error {
     Empty {
         /// Keyframes tried.
         keyframes: usize,
-        /// The reason that occurred most.
+        /// The reason of the last chunk.
         reason: String,
+    },
+    /// Nothing was reconstructed, as is to be expected of weights made by rule.
+    #[error(
+        "nothing was reconstructed from {keyframes} keyframes: the weights of {model} are made by rule, so its depth and cameras \
+         are noise, and no chunk of them could be laid on the metric poses"
+    )]
+    Untrained {
+        /// Keyframes tried.
+        keyframes: usize,
+        /// The network.
+        model: String,
     },
     /// A camera or view cannot be made.
     #[error("camera: {0}")]
@@ -234,7 +245,7 @@ impl Error {
             Self::Align(_) => "E0302",
             Self::Fusion(_) => "E0303",
             Self::Eval(_) => "E0304",
-            Self::Empty { .. } => "E0305",
+            Self::Empty { .. } | Self::Untrained { .. } => "E0305",
             Self::Export(_) | Self::View(_) | Self::Synth(_) | Self::Io { .. } => match self.file_system() {
                 Some(source) if is_full(source) => "E0402",
                 Some(_) => "E0401",
@@ -295,6 +306,10 @@ impl Error {
             }
             Self::TooFewKeyframes { .. } => {
                 "lower keyframes.min_translation_m, or give a longer part of the sequence"
+            }
+            Self::Untrained { .. } => {
+                "`vidar model pull da3-small` fetches trained weights (131 MiB, Apache-2.0) for --geometry da3-small; --geometry \
+                 stereo needs none; --mode pose-conditioned tries the road without meaning"
             }
             Self::Empty { .. } => {
                 "look at depth/ in the run folder; try --preset quality, or another depth range"
@@ -428,7 +443,10 @@ pub const CODES: &[(&str, &str)] = &[
     ("E0302", "Predicted geometry could not be placed in the metric world."),
     ("E0303", "Fusion refused its configuration or a view, or met its memory bound."),
     ("E0304", "There is nothing to compare, or what is compared does not match (body, time, empty cloud)."),
-    ("E0305", "Depth was computed but nothing passed confidence and consistency."),
+    (
+        "E0305",
+        "Depth was computed but nothing passed confidence and consistency, or no chunk fits the metric poses. Weights made by rule (`…-untrained`) end so where the network must find the cameras itself: what they say is noise.",
+    ),
     ("E0306", "A file of an interchange format could not be written or read."),
     ("E0307", "A picture could not be drawn or encoded."),
     ("E0308", "The description of the synthetic world is not usable, or its files could not be written."),

@@ -497,3 +497,14 @@ fn where_a_network_computed_stands_in_plans_and_manifests() {
     let ran = vidar(&[&auto[..], &["--dry-run"]].concat()).ends_with(0);
     assert!(ran.stdout.contains("computes"), "{}", ran.stdout);
 }
+
+#[test]
+fn a_coupled_run_on_weights_made_by_rule_says_that_they_mean_nothing_and_where_trained_ones_are() {
+    let out = bench().root.join("coupled untrained");
+    let small = "model.network.preprocess.process_size_px=56";
+    let network = ["--geometry", "da3-small-untrained", "--mode", "coupled", "--stride", "2", "--set", small];
+    let mut command = run_command(&shared().sequence, &out, &[&network[..], &["-q"]].concat());
+    let ran: Ran = command.output().unwrap().into();
+    let words = ["error[E0305]", "da3-small-untrained are made by rule", "vidar model pull da3-small"];
+    ran.ends_with(1).says(&words);
+}

@@ -115,9 +115,19 @@ impl Road<'_> {
         let placement = aligner.finish();
         if placement.views.is_empty() && !self.cancel.is_cancelled() {
             let reason = failures.pop().unwrap_or_else(|| "no keyframe image could be read".into());
-            return Err(Error::Empty { keyframes: self.plan.keyframes.len(), reason });
+            return Err(self.nothing_placed(reason));
         }
         Ok(placement)
+    }
+
+    /// Why there is no map.
+    fn nothing_placed(&self, reason: String) -> Error {
+        let keyframes = self.plan.keyframes.len();
+        let network = self.plan.network.as_ref().map(|network| &network.identity);
+        match network.filter(|identity| !identity.geometry_means_something) {
+            Some(identity) => Error::Untrained { keyframes, model: identity.name.clone() },
+            None => Error::Empty { keyframes, reason },
+        }
     }
 
     /// What the model says of a chunk, as it then lies on disk; `None` when cancelled.
