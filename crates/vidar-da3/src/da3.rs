@@ -21,7 +21,7 @@ pub struct Da3Options {
     /// backbone's precision otherwise.
     pub head_precision: Option<Precision>,
     /// With a bf16 backbone: how many of its leading blocks (and, unless none, the patch embedding) stay in `f32`.
-    /// `None` is a third of them, which bounds the largest error of depth; 0 is fastest.
+    /// `None` is a third of them, or all but twenty, which bounds the largest error of depth; 0 is fastest.
     pub exact_blocks: Option<usize>,
     /// Where backbone and dense head are computed.
     pub device: Device,

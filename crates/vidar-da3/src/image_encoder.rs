@@ -5,9 +5,7 @@
 
 use crate::config::{BackboneConfig, Ffn, PATCH};
 use crate::error::Da3Error;
-use crate::model::backbone::{
-    Backbone, CameraTokens, Feature, FeatureSink, Pixels, ReferenceStrategy,
-};
+use crate::model::backbone::{Backbone, CameraTokens, Feature, FeatureSink, Pixels, ReferenceStrategy};
 use crate::run::Run;
 use crate::weights::{Residency, Scope};
 use std::sync::Arc;

@@ -25,9 +25,9 @@ mod da3;
 mod device;
 mod error;
 mod geometry;
-mod image_encoder;
 #[cfg(feature = "gpu")]
 pub mod gpu;
+mod image_encoder;
 mod infer;
 mod memory;
 mod model;

@@ -10,7 +10,7 @@ use vidar_nn::Compute;
 pub(crate) struct Run<'a> {
     /// Kernels and precision of the backbone.
     pub backbone: Compute,
-    /// Leading blocks that stay in `f32` under a bf16 backbone; `None` is a third.
+    /// Leading blocks that stay in `f32` under a bf16 backbone; `None` is a third, or all but twenty.
     pub exact_blocks: Option<usize>,
     /// Kernels and precision of the dense head.
     pub head: Compute,

@@ -65,5 +65,7 @@ fn base_metric_and_large_hold() {
 #[test]
 #[ignore = "makes 12 GB of weights, block by block; cargo test -p vidar-da3 --test official_goldens -- --ignored giant"]
 fn giant_and_nested_hold() {
-    all_hold(&["giant_v2_28x42", "giant_posed_v3", "nested_giant_large_v2_28x42"], Precision::F32);
+    let files = ["giant_v2_28x42", "giant_posed_v3", "nested_giant_large_v2_28x42"];
+    all_hold(&files, Precision::F32);
+    all_hold(&files, Precision::Auto);
 }
