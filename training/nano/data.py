@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from .geometry import gauge, inverse, homogeneous, normalised_poses, pose_vector
+from .geometry import gauge, homogeneous, inverse, normalised_poses, pose_vector
 
 MAGIC = b"VIDARCL1"
 HEAD = struct.Struct("<8sQIIII4f")
@@ -189,7 +189,11 @@ class Pool:
         # At the start the pool grows while it is used, so that training need not wait for it.
         self._fill(min(self.capacity, max(4 * count, len(self.clips) + count)))
         first = self.rng.choice(self.clips)[0]
-        places = [i for i, (clip, _) in enumerate(self.clips) if clip.size == first.size and len(clip.image) == len(first.image)]
+        places = [
+            i
+            for i, (clip, _) in enumerate(self.clips)
+            if clip.size == first.size and len(clip.image) == len(first.image)
+        ]
         chosen = self.rng.sample(places, min(count, len(places)))
         found = [self.clips[i][0] for i in chosen]
         for i in chosen:

@@ -3,8 +3,8 @@
     python -m nano.evaluate --model ../models/da3-nano --stream stream_views [--rooms 40] [--size 224x140]
                             [--real SHARED_DATA_FOLDER] [--out table.md]
 
-Depth is compared after one scale per scene (median ratio); poses by relative rotation and direction of the baseline over
-all pairs of views. `by poses` is the depth after the scale that the given camera centres imply.
+Depth is compared after one scale per scene (median ratio); poses by relative rotation and direction of the baseline
+over all pairs of views. `by poses` is the depth after the scale that the given camera centres imply.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Writes a trained network as `config.json` and `model.safetensors` (f16, official key names), and reads it back.
 
-    python -m nano.export --run RUN_FOLDER --out ../models/da3-nano [--weights ema|model]
+python -m nano.export --run RUN_FOLDER --out ../models/da3-nano [--weights ema|model]
 """
 
 from __future__ import annotations

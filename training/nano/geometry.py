@@ -1,7 +1,8 @@
 """Rotations, cameras and the gauge in which the network answers.
 
-Poses are 3 x 4 or 4 x 4 matrices `a_from_b`; quaternions are xyzw; focal lengths are pixels of the processed image, whose
-first pixel's centre is (0.5, 0.5) here (the network's convention), lengths are metres before `Gauge` and relative after.
+Poses are 3 x 4 or 4 x 4 matrices `a_from_b`; quaternions are xyzw; focal lengths are pixels of the processed image,
+whose first pixel's centre is (0.5, 0.5) here (the network's convention); lengths are metres before `gauge` and relative
+after.
 """
 
 from __future__ import annotations
@@ -61,7 +62,7 @@ def matrix_from_quaternion(quaternion: Tensor) -> Tensor:
 
 
 def normalised_poses(world_from_camera: Tensor) -> Tensor:
-    """What the camera encoder is given: [B, S, 4, 4] `first_from_camera`, over the lower median distance, at least 0.1."""
+    """What the camera encoder is given: `first_from_camera` [B, S, 4, 4] over the lower median distance (>= 0.1)."""
     first_from_world = inverse(world_from_camera[:, :1])
     relative = first_from_world @ world_from_camera
     distance = relative[..., :3, 3].norm(dim=-1)
@@ -80,7 +81,7 @@ def pose_vector(first_from_camera: Tensor, focal: Tensor, height: int, width: in
 
 
 def rays_in_camera(focal: Tensor, height: int, width: int, rows: int, columns: int) -> Tensor:
-    """Directions with z = 1 through the cell centres of a rows x columns grid over the image: [B, S, rows, columns, 3]."""
+    """Directions (z = 1) through the cell centres of a grid over the image: [B, S, rows, columns, 3]."""
     ys = (torch.arange(rows, dtype=focal.dtype) + 0.5) * (height / rows) - 0.5 * height
     xs = (torch.arange(columns, dtype=focal.dtype) + 0.5) * (width / columns) - 0.5 * width
     shape = (*focal.shape[:2], rows, columns)

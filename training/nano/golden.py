@@ -16,7 +16,7 @@ import torch
 from safetensors.numpy import save_file
 from torch import Tensor
 
-from .config import POSITION_GRID, NanoConfig
+from .config import NanoConfig
 from .data import normalise
 from .export import exported, imported, read
 from .geometry import homogeneous, inverse, normalised_poses, pose_vector

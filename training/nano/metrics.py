@@ -27,7 +27,7 @@ class Tally:
     constant_within: list[float] = field(default_factory=list)
 
     def row(self) -> dict[str, float]:
-        """Means of depth errors, medians of pose errors (degrees)."""
+        """Means of depth errors after alignment, medians of errors by poses and of poses (degrees)."""
 
         def median(parts: list[Tensor]) -> float:
             joined = torch.cat(parts) if parts else torch.zeros(0)
@@ -39,7 +39,8 @@ class Tally:
         return {
             "abs_rel": mean(self.abs_rel),
             "delta125": mean(self.within),
-            "abs_rel_by_poses": mean(self.posed_abs_rel),
+            # A scene whose centres all fall on one place has no scale at all: one such would spoil a mean.
+            "abs_rel_by_poses": median([torch.tensor(self.posed_abs_rel)]),
             "rotation_deg": median(self.rotation),
             "direction_deg": median(self.direction),
             "constant_abs_rel": mean(self.constant),
@@ -83,9 +84,7 @@ def scale_from_poses(found: Tensor, truth: Tensor) -> Tensor:
 @torch.no_grad()
 def add_scenes(tally: Tally, model: Nano, scenes: Scenes, posed: bool, autocast: bool = True) -> None:
     """Runs the network as inference does and adds its errors."""
-    output = model(
-        scenes.images, scenes.pose9 if posed else None, wants_rays=False, select=True, autocast=autocast
-    )
+    output = model(scenes.images, scenes.pose9 if posed else None, wants_rays=False, select=True, autocast=autocast)
     found = homogeneous(output.world_from_camera().float())
     for b in range(found.shape[0]):
         truth = scenes.depth[b]

@@ -354,13 +354,11 @@ class Scratch(nn.Module):
         self.output_conv1 = nn.Conv2d(f, half, 3, padding=1)
         self.output_conv2 = last_convolutions(half, 2)
         widths = [f, half, f, half, f, half]
-        chain = [nn.Conv2d(a, b, 3, padding=1) for a, b in zip(widths, widths[1:])]
+        chain = [nn.Conv2d(a, b, 3, padding=1) for a, b in zip(widths, widths[1:], strict=False)]
         self.output_conv1_aux = nn.ModuleDict({"3": nn.Sequential(*chain)})
         self.output_conv2_aux = nn.ModuleDict(
             {
-                "3": nn.ModuleDict(
-                    {"0": nn.Conv2d(half, HEAD_LAST, 3, padding=1), "5": nn.Conv2d(HEAD_LAST, 7, 1)}
-                ),
+                "3": nn.ModuleDict({"0": nn.Conv2d(half, HEAD_LAST, 3, padding=1), "5": nn.Conv2d(HEAD_LAST, 7, 1)}),
                 # The norm is shared by all levels and stored under the first.
                 "0": nn.ModuleDict({"2": ChannelNorm(HEAD_LAST, eps=1e-5)}),
             }

@@ -77,7 +77,7 @@ def commonroom(folder: Path, size: tuple[int, int], stride: int, views: int) -> 
     focal = (k[0, 0] * scale[0], k[1, 1] * scale[1])
     poses = np.loadtxt(folder / "poses.txt").reshape(-1, 4, 4)
     frames = []
-    for image, pose in zip(sorted((folder / "images").glob("*.png")), poses):
+    for image, pose in zip(sorted((folder / "images").glob("*.png")), poses, strict=True):
         depth = np.asarray(Image.open(folder / "depth" / image.name))
         points = unprojected(depth, (k[0, 0], k[1, 1]), centre)
         frames.append((resized_colour(image, box, size), splatted(points, focal, size), pose[:3]))

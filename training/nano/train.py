@@ -2,7 +2,8 @@
 
     python -m nano.train --run RUN_FOLDER [--recipe recipe.json] [--stream stream_views] [--threads 1]
 
-`RUN_FOLDER/state.pt` holds everything that is needed to go on and is replaced every few minutes; `train.csv` and
+`RUN_FOLDER/state.pt` holds everything that is needed to go on and is replaced every few minutes, and on SIGTERM, which
+ends training after the step under way; `train.csv` and
 `validation.csv` grow. The recipe is read at every start, so a later session can add stages.
 """
 
@@ -14,6 +15,7 @@ import csv
 import json
 import os
 import random
+import signal
 import subprocess
 import time
 from dataclasses import dataclass
@@ -98,7 +100,7 @@ class Trainer:
         self.optimisers = optimisers(self.model, recipe.muon_lr, recipe.adam_lr)
         if state:
             self.model.load_state_dict(state["model"])
-            for optimiser, values in zip(self.optimisers, state["optimisers"]):
+            for optimiser, values in zip(self.optimisers, state["optimisers"], strict=True):
                 optimiser.load_state_dict(values)
             self.step, self.room, self.seconds = state["step"], state["room"], state["seconds"]
             self.views_seen, self.distinct_views = state["views_seen"], state["distinct_views"]
@@ -107,6 +109,7 @@ class Trainer:
             self.ema.load_state_dict(state["ema"])
         self.bases = (recipe.muon_lr, recipe.adam_lr)
         self.rng = random.Random(1000 + self.step)
+        self.stopping = False
 
     def save(self) -> None:
         """Replaces `state.pt` at once, so that a crash leaves the old or the new one."""
@@ -151,7 +154,7 @@ class Trainer:
     def learn(self, batch: Scenes, posed: bool) -> dict[str, float]:
         """One step."""
         factor = self.recipe.lr_factor(self.step)
-        for optimiser, base in zip(self.optimisers, self.bases):
+        for optimiser, base in zip(self.optimisers, self.bases, strict=True):
             for group in optimiser.param_groups:
                 group["lr"] = base * factor * group.get("share", 1.0)
         rays = self.rng.random() < self.recipe.ray_share
@@ -181,14 +184,17 @@ class Trainer:
                 tally = Tally()
                 for clip in clips[: 24 if size == "112x70" else 12]:
                     step = len(clip.image) // views
-                    add_scenes(tally, self.ema, scenes([(clip, list(range(0, len(clip.image), step))[:views], False)]), posed)
+                    add_scenes(
+                        tally, self.ema, scenes([(clip, list(range(0, len(clip.image), step))[:views], False)]), posed
+                    )
                 row = {"step": self.step, "hours": round(self.seconds / 3600, 3), "size": size, "views": views}
                 append(self.run / "validation.csv", {**row, "posed": int(posed), **rounded(tally.row())})
 
     def train(self, save_every_secs: float, validate_every: int) -> None:
         """Until the recipe ends."""
         began = saved = time.monotonic()
-        while (found := self.recipe.stage(self.step)) is not None:
+        signal.signal(signal.SIGTERM, lambda *_: setattr(self, "stopping", True))
+        while (found := self.recipe.stage(self.step)) is not None and not self.stopping:
             begin, stage = found
             first_room = self.room
             arguments = ["--sizes", stage.sizes, "--views", str(stage.views_per_clip)]
@@ -198,7 +204,7 @@ class Trainer:
             print(f"step {self.step}: {stage}, rooms from {first_room}", flush=True)
             seen_before = self.distinct_views
             sums: dict[str, list[float]] = {}
-            while self.step < stage.until_step:
+            while self.step < stage.until_step and not self.stopping:
                 tick = time.monotonic()
                 batch, posed = self.batch(pool, stage)
                 waited = time.monotonic() - tick
@@ -225,6 +231,9 @@ class Trainer:
                     saved = time.monotonic()
             renderer.stop()
             self.save()
+        if self.stopping:
+            print(f"stopped and saved at step {self.step}", flush=True)
+            return
         self.validate()
         print(f"the recipe's last step is done after {time.monotonic() - began:.0f} s", flush=True)
 

@@ -15,7 +15,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from nano.config import NanoConfig  # noqa: E402
 from nano.data import Clip, read_clip, scenes, write_clip  # noqa: E402
 from nano.export import exported, imported  # noqa: E402
-from nano.geometry import inverse, homogeneous, matrix_from_quaternion, quaternion_from_matrix  # noqa: E402
+from nano.geometry import homogeneous, inverse, matrix_from_quaternion, quaternion_from_matrix  # noqa: E402
 from nano.losses import total  # noqa: E402
 from nano.metrics import depth_errors, pair_errors, scale_from_poses  # noqa: E402
 from nano.model import Nano, Output, position_operator, reference_first  # noqa: E402

@@ -4,7 +4,7 @@
 
 use super::noise::cell;
 use super::shape::{Extent, Shape};
-use super::{Bvh, nearest_hit};
+use super::Bvh;
 use nalgebra::Vector3;
 
 /// Spacing of the grid on which light is computed, m; coarser where textures are coarse.
@@ -162,8 +162,11 @@ impl Scene<'_> {
         (direct + ambient) as f32
     }
 
+    /// The nearest surface before `limit`; nothing beyond it is looked for.
     fn first_hit(&self, from: &Vector3<f64>, direction: &Vector3<f64>, limit: f64) -> Option<f64> {
-        nearest_hit(self.shapes, self.bvh, from, direction).map(|(_, t)| t).filter(|&t| t < limit)
+        let wall = self.shapes[0].intersect(from, direction, f64::INFINITY).filter(|&t| t < limit);
+        let piece = self.bvh.nearest(&self.shapes[1..], from, direction, wall.unwrap_or(limit));
+        piece.map(|(_, t)| t).or(wall).filter(|&t| t < limit)
     }
 }
 
