@@ -23,7 +23,7 @@ impl Bias {
     pub const ZERO: Self = Self { gyro: Vector3::new(0.0, 0.0, 0.0), accel: Vector3::new(0.0, 0.0, 0.0) };
 }
 
-/// White noise to assume while integrating, and where readings saturate.
+/// White noise to assume while integrating.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct StepNoise {
     /// Gyroscope, rad/s/√Hz.
@@ -54,9 +54,6 @@ pub struct ImuModel {
 /// Walks below these are not believed of any MEMS IMU.
 const MIN_GYRO_WALK: f64 = 1e-5;
 const MIN_ACCEL_WALK: f64 = 1e-3;
-
-/// Densities at saturated readings, relative to ordinary ones.
-const SATURATED_FACTOR: f64 = 100.0;
 
 impl ImuModel {
     /// From a data sheet, white noise times `gyro_factor` and `accel_factor` (vibration, scale errors), walks floored.
@@ -196,10 +193,17 @@ fn step_variances(a: &ImuSample, b: &ImuSample, secs: f64, model: &ImuModel) -> 
     let missing_secs = (secs - 2.0 * model.noise.period_secs).max(0.0);
     let gap_factor = 10.0_f64.powf((missing_secs / 0.05).min(4.0));
     let beyond = |x: &Vector3<f64>, y: &Vector3<f64>, limit: f64| x.amax() > limit || y.amax() > limit;
-    let factor = |saturated: bool| gap_factor * if saturated { SATURATED_FACTOR } else { 1.0 };
-    let gyro = model.noise.gyro_density * factor(beyond(&a.gyro.0, &b.gyro.0, model.gyro_limit));
-    let accel = model.noise.accel_density * factor(beyond(&a.accel.0, &b.accel.0, model.accel_limit));
-    [gyro * gyro / secs, accel * accel / secs]
+    // Beyond its range a sensor says only that much: what was may be off by the range again.
+    let variance = |density: f64, saturated: bool, limit: f64| {
+        let white = (density * gap_factor).powi(2) / secs;
+        if saturated { white.max(limit * limit) } else { white }
+    };
+    let gyro_saturated = beyond(&a.gyro.0, &b.gyro.0, model.gyro_limit);
+    let accel_saturated = beyond(&a.accel.0, &b.accel.0, model.accel_limit);
+    [
+        variance(model.noise.gyro_density, gyro_saturated, model.gyro_limit),
+        variance(model.noise.accel_density, accel_saturated, model.accel_limit),
+    ]
 }
 
 /// Raw readings are kept for exact re-integration up to this many; longer stretches are corrected to first order.

@@ -37,7 +37,7 @@ fn a_saturated_gyroscope_is_not_believed() {
     }
     let outputs = recording.run();
     assert!(lost(&outputs).is_empty(), "{:?}", lost(&outputs));
-    within("gyroscope saturated for 60 ms", &recording, &outputs, 0.1);
+    within("gyroscope saturated for 60 ms", &recording, &outputs, 0.05);
 }
 
 fn inverted() -> Recording {

@@ -215,23 +215,23 @@ mod tests {
             "looks along body +z (1.5 deg off); its right is body +y (1.7 deg off), its down is body -x (0.9 deg off)"
         );
         assert_eq!(clock_words(&camera), "clock: image stamps are taken as IMU time");
-        let late = RigCamera { time_offset: Duration::from_micros(-7_500), ..camera };
+        let late = RigCamera { time_offset: Duration::from_nanos(-7_500_000), ..camera };
         assert_eq!(clock_words(&late), "clock: IMU time is the image's stamp -7.50 ms");
     }
 
     #[test]
     fn a_corner_is_moved_by_what_the_model_says() {
-        // One radial term: r becomes r(1 + k1 r²); the corner (-1, -0.75) of a 90 degree camera.
-        let pinhole = Pinhole::new(50.0, 50.0, 49.5, 37.0, 100, 75).unwrap();
+        // One radial term: r becomes r(1 + k1 r²).
+        let pinhole = Pinhole::new(100.0, 100.0, 49.5, 37.0, 100, 75).unwrap();
         let model = |k1| CameraModel::RadTan(RadTan::new(pinhole, [k1, 0.0, 0.0, 0.0]).unwrap());
         let shown = corner_words(&model(-0.1), &pinhole).unwrap();
-        // r_distorted = 1.2360 at the corner; the ray is at r with r(1 - 0.1 r²) = r_distorted.
-        let distorted = (49.5_f64 / 50.0).hypot(37.0 / 50.0);
+        // The corner is at r_distorted; its ray at r with r(1 - 0.1 r²) = r_distorted.
+        let distorted = (49.5_f64 / 100.0).hypot(37.0 / 100.0);
         let mut r = distorted;
         for _ in 0..200 {
             r = distorted + 0.1 * r * r * r;
         }
-        let expected = format!("by {:.1} px, inwards", (r - distorted) * 50.0);
+        let expected = format!("by {:.1} px, inwards", (r - distorted) * 100.0);
         assert!(shown.contains(&expected), "{shown}: {expected}");
         assert!(corner_words(&model(0.1), &pinhole).unwrap().contains("outwards"));
         assert_eq!(corner_words(&CameraModel::Pinhole(pinhole), &pinhole).unwrap(), "no distortion");
