@@ -189,3 +189,29 @@ fn a_metric_scale_that_jumps_between_neighbours_is_clamped_and_counted() {
     let jump = placement.chunks[2].world_from_chunk.scale / gauges[2].scale;
     assert!((jump - 1.0).abs() < 0.2, "{jump}");
 }
+
+#[test]
+fn a_chunk_predicted_in_the_anchors_world_keeps_its_metres_though_its_cameras_sit_beside_the_anchors() {
+    // As where the trajectory is of another sensor of the rig: every camera 3 cm beside its anchor, on a short way.
+    let truth = laps(120, 0.5);
+    let beside = Se3::new(vidar_core::So3::IDENTITY, nalgebra::Vector3::new(-0.025, 0.012, 0.01));
+    let anchors: Vec<Se3> = truth.iter().map(|t| *t * beside).collect();
+    let mut machine = Aligner::new(CouplingMode::Coupled, &AlignerConfig::default()).unwrap();
+    for (k, start) in [0, 12, 24].into_iter().enumerate() {
+        let mut noise = Noise::new(3);
+        let mut prediction = predict(&truth, start..start + 12, k as u32, EXACT, &mut noise);
+        prediction.frame = vidar_core::model::ChunkFrame::PriorWorld;
+        for view in &mut prediction.views {
+            let pose = truth[view.frame_id.index()];
+            view.chunk_from_camera = pose;
+            view.depth = vidar_core::RelativeDepth::new(depth(&pose));
+        }
+        machine.push(observe(prediction, Some(&anchors), none)).unwrap();
+    }
+    let placement = machine.finish();
+    assert_eq!(placement.views.len(), 36);
+    for chunk in &placement.chunks {
+        assert!((chunk.world_from_chunk.scale.ln()).abs() < 2e-3, "{:?}", chunk.world_from_chunk);
+        assert!(chunk.log_scale_std < 0.006, "{}", chunk.log_scale_std);
+    }
+}

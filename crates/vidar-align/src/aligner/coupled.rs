@@ -26,6 +26,8 @@ const LOOP: Kernel = Kernel::GemanMcClure { k: 4.0 };
 const LOOSENED: f64 = 30.0;
 /// A loop that ends with less weight than this was let go.
 const LET_GO: f64 = 0.05;
+/// How far the unit of a chunk that was predicted in the anchors' own world is from a metre, standard deviation of ln.
+const PRIOR_WORLD_SCALE: f64 = 0.005;
 /// Deformation between neighbours that no overlap's covariance knows of: rotation (rad), share of depth, ln(scale).
 const OVERLAP_FLOOR: [f64; 3] = [0.004, 0.004, 0.004];
 
@@ -260,6 +262,11 @@ impl Built {
     /// The landmarks' factor, and the information on ln(scale) from centres and landmarks together.
     fn own_scale(&mut self, machine: &Aligner, chunk: &Chunk, k: usize, scale: f64) -> f64 {
         let mut information = 0.0;
+        if chunk.frame == ChunkFrame::PriorWorld {
+            // Its depth was seen with the anchors' baselines; where its centres lie says less.
+            self.factors.push(Factor::Scale { k, log_scale: 0.0, std: PRIOR_WORLD_SCALE, kernel: ROBUST });
+            information += PRIOR_WORLD_SCALE.powi(-2);
+        }
         if chunk.odometry_trusted {
             let centers = machine.pose_fit(chunk, &chunk.pairs(&machine.frames), scale);
             information += centers.map_or(0.0, |c| c.log_scale_std.powi(-2));
