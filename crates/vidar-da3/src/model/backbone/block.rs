@@ -47,8 +47,8 @@ pub(crate) const QK_EPS: f32 = 1e-5;
 
 /// Kernels and precision of a block's layers, and of its attention.
 ///
-/// Scores and weights are averages over channels and keys: bf16 there leaves no trace in depth, not even in the first
-/// blocks, whose layers must not be rounded.
+/// Scores and weights are averages over channels and keys: in backbones of up to 24 blocks bf16 there leaves no trace in
+/// depth, not even in the first blocks, whose layers must not be rounded.
 #[derive(Clone, Copy)]
 pub(crate) struct BlockCompute {
     pub layers: Compute,

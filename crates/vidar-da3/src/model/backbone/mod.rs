@@ -24,6 +24,7 @@ pub(crate) use block::{Block, BlockCompute, BlockScratch, BlockShape, FFN_ROWS};
 pub(crate) use embed::Embed;
 pub use reference::{ReferenceStrategy, choose as choose_reference};
 
+use crate::arithmetic::is_deep;
 use crate::config::{BackboneConfig, PATCH};
 use crate::error::Da3Error;
 use crate::run::Run;
@@ -170,7 +171,9 @@ impl Backbone {
             if self.config.alternate_from == Some(i) {
                 self.place_camera_tokens(&mut x, length, cameras);
             }
-            let compute = BlockCompute { layers: run.block(i, self.config.depth), attention: run.backbone };
+            let layers = run.block(i, self.config.depth);
+            let attention = if is_deep(self.config.depth) { layers } else { run.backbone };
+            let compute = BlockCompute { layers, attention };
             let mut step = Step { run, compute, order: &order, layer: i, length, extra, sink: &mut *sink };
             let block = self.blocks[i].get()?;
             if self.config.is_global(i) {
