@@ -13,6 +13,9 @@ pub struct PlaceIndex {
     common: Option<Common>,
 }
 
+/// How much a row of the index, in units of its step, looks like what is searched for.
+type Likeness<'a> = Box<dyn Fn(&[i16], f32) -> f32 + 'a>;
+
 /// Sums over all places, channel by channel.
 #[derive(Clone, Debug, Default)]
 struct Common {
@@ -111,7 +114,7 @@ impl PlaceIndex {
         let far = |p: &Place| {
             time.since(p.time).as_secs_f64() >= min_gap_s && travel_m - p.travel_m >= min_travel_m
         };
-        let likeness: Box<dyn Fn(&[i16], f32) -> f32> = match &self.common {
+        let likeness: Likeness<'_> = match &self.common {
             None => Box::new(|row, step| inner(row, descriptor) * step),
             Some(_) if self.len() < FEW_PLACES => return Vec::new(),
             Some(common) => common.correlation(self.len(), descriptor),
@@ -145,7 +148,7 @@ impl Common {
     }
 
     /// Of a descriptor with a row of the index: both less the mean, each channel weighed by the inverse of its variance.
-    fn correlation(&self, places: usize, descriptor: &[f32]) -> Box<dyn Fn(&[i16], f32) -> f32> {
+    fn correlation(&self, places: usize, descriptor: &[f32]) -> Likeness<'static> {
         let n = places as f64;
         let mean: Vec<f64> = self.sum.iter().map(|s| s / n).collect();
         let variance: Vec<f64> =
