@@ -2,9 +2,9 @@
 //!
 //! It is computed once on a coarse grid of every face and baked into the textures, so that all views agree.
 
+use super::Bvh;
 use super::noise::cell;
 use super::shape::{Extent, Shape};
-use super::Bvh;
 use nalgebra::Vector3;
 
 /// Spacing of the grid on which light is computed, m; coarser where textures are coarse.
