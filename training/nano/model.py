@@ -519,6 +519,8 @@ def initialise(model: Nano) -> None:
     scratch.output_conv2_aux["3"]["5"].bias[2] = 0.8
     for last in (model.cam_dec.fc_t, model.cam_dec.fc_qvec, model.cam_dec.fc_fov[0]):
         last.weight *= 0.1
+    # Camera tokens reach the decoder without a norm and grow to several units: its rectifiers must survive that.
+    model.cam_dec.backbone[0].weight *= 0.3
     model.cam_dec.fc_qvec.bias[3] = 1
     model.cam_dec.fc_fov[0].bias.fill_(1)
 
