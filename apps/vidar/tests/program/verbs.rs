@@ -114,6 +114,7 @@ fn a_run_as_json_has_stable_keys() {
             "double_walls",
             "metric_poses",
             "coupling",
+            "places",
             "is_metric",
             "placement",
             "judgement",
