@@ -11,14 +11,12 @@ use std::path::Path;
 use std::sync::Arc;
 use vidar_align::streaming::{Perceptron, SaladHead};
 use vidar_core::Image;
+use vidar_da3::preprocess::normalise;
 use vidar_da3::{Da3Error, ImageEncoder};
 use vidar_nn::Checkpoint;
 
 /// Side of the picture that the network sees, px (DA3-Streaming's `image_size`).
 const SIDE: usize = 336;
-/// What DINOv2 was trained with.
-const MEAN: [f32; 3] = [0.485, 0.456, 0.406];
-const STD: [f32; 3] = [0.229, 0.224, 0.225];
 const ENCODER: &str = "backbone.model";
 
 /// SALAD, ready to describe pictures.
@@ -56,7 +54,7 @@ impl Salad {
     /// # Errors
     /// Weights whose sizes do not fit each other.
     pub fn describe(&self, picture: &Image<[u8; 3]>) -> Result<Vec<f32>, Error> {
-        self.describe_pixels(&normalised(picture), SIDE, SIDE)
+        self.describe_pixels(&normalise(&resized(picture)), SIDE, SIDE)
     }
 
     fn describe_pixels(&self, pixels: &[f32], rows: usize, columns: usize) -> Result<Vec<f32>, Error> {
@@ -73,20 +71,14 @@ impl Salad {
     }
 }
 
-/// `[3, SIDE, SIDE]`, resized with a triangle filter as wide as the reduction, as Pillow's bilinear is.
-fn normalised(picture: &Image<[u8; 3]>) -> Vec<f32> {
+/// At `SIDE` × `SIDE`, by a triangle filter as wide as the reduction, as Pillow's bilinear is.
+fn resized(picture: &Image<[u8; 3]>) -> Image<[u8; 3]> {
     let (width, height) = (picture.width() as u32, picture.height() as u32);
     let bytes = picture.data().as_flattened().to_vec();
     let buffer: ImageBuffer<Rgb<u8>, Vec<u8>> =
         ImageBuffer::from_raw(width, height, bytes).unwrap_or_else(|| ImageBuffer::new(1, 1));
     let small = resize(&buffer, SIDE as u32, SIDE as u32, FilterType::Triangle);
-    let mut pixels = vec![0.0; 3 * SIDE * SIDE];
-    for (i, pixel) in small.pixels().enumerate() {
-        for c in 0..3 {
-            pixels[c * SIDE * SIDE + i] = (f32::from(pixel.0[c]) / 255.0 - MEAN[c]) / STD[c];
-        }
-    }
-    pixels
+    Image::from_fn(SIDE, SIDE, |x, y| small.get_pixel(x as u32, y as u32).0)
 }
 
 fn head(checkpoint: &Checkpoint) -> Result<SaladHead, String> {

@@ -31,7 +31,7 @@ use vidar_fusion::{DoubleWalls, FusionConfig, PointFusion, TsdfVolume};
 pub fn build(
     dataset: &Dataset,
     plan: &Plan,
-    source: Source,
+    (source, looks): (Source, Looks),
     config: &Config,
     folder: &RunFolder,
     events: &Events,
@@ -40,7 +40,7 @@ pub fn build(
     let store = ChunkStore::new(folder.path().join("chunks"));
     let mut road = Road { dataset, plan, config, folder, store, events, cancel };
     let count = plan.keyframes.len();
-    let placement = events.stage("depth", count, || road.observe(source))?;
+    let placement = events.stage("depth", count, || road.observe(source, &looks))?;
     let mut map = events.stage("surface", count, || road.fuse(&placement))?;
     map.placement = Some(placement);
     if !(config.output.keep_chunks || cancel.is_cancelled()) {
@@ -67,10 +67,9 @@ struct Road<'a> {
 
 impl Road<'_> {
     /// Chunk after chunk: images in, a prediction kept on disk, its place found.
-    fn observe(&mut self, mut source: Source) -> Result<Placement, Error> {
+    fn observe(&mut self, mut source: Source, looks: &Looks) -> Result<Placement, Error> {
         let remap = RemapTable::new(&self.plan.camera, &self.plan.view);
         let mut window = ViewWindow::new(self.dataset, &self.plan.keyframes, &remap);
-        let looks = Looks::open(self.config, &mut source)?;
         let mut aligner = Aligner::new(self.plan.mode, &self.config.align)?;
         if looks.are_whitened() {
             aligner = aligner.with_whitened_places();
@@ -88,7 +87,7 @@ impl Road<'_> {
             let key = key_of(&identity, self.plan, chunk.core.clone().chain(chunk.seen.clone()));
             let stored = match self.store.find(number(k), &key) {
                 Some(kept) => kept,
-                None => match self.predict((&mut source, &looks), &mut window, k, chunk, &key)? {
+                None => match self.predict((&mut source, looks), &mut window, k, chunk, &key)? {
                     Some(predicted) => predicted,
                     None => break,
                 },
@@ -98,7 +97,7 @@ impl Road<'_> {
                     self.events.warn(&Warning::new("chunk-failed", reason.clone()).at(format!("chunk {k}")));
                     failures.push(reason);
                 }
-                None => failures.extend(self.align(&mut aligner, (&known, &looks), chunk, stored)?),
+                None => failures.extend(self.align(&mut aligner, (&known, looks), chunk, stored)?),
             }
             self.close_loops(&mut aligner, &mut source, &window, &identity)?;
             if let Some(live) = &mut live {

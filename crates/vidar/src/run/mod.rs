@@ -23,6 +23,7 @@ use crate::error::{Error, ExitStatus};
 use crate::events::{CancelToken, Event, Events};
 use crate::input::{self, AnchorSource};
 use crate::run_folder::{Place, RunFolder, StoredView};
+use looks::Looks;
 use record::Recorder;
 use source::Source;
 use std::path::PathBuf;
@@ -120,13 +121,13 @@ pub fn run(request: &RunRequest, events: &Events, cancel: &CancelToken) -> Resul
     let config = request.layered.build()?;
     let dataset =
         events.stage("read", 0, || input::open_every_image(&request.path, &request.open, &config))?;
-    let (plan, source) = Plan::make(&dataset, &config, request.reference.as_deref(), &events, cancel)?;
+    let (plan, sight) = Plan::make(&dataset, &config, request.reference.as_deref(), &events, cancel)?;
     let folder = Arc::new(RunFolder::create(&request.place)?);
     recorder.keep_log_in(folder.clone());
     dataset.warnings.iter().chain(&plan.warnings).for_each(|w| events.warn(w));
     let about = record::About::new(request, &dataset, &plan)?;
 
-    let made = carry_out(request, &config, &dataset, (plan, source), &folder, &events, cancel, &recorder);
+    let made = carry_out(request, &config, &dataset, (plan, sight), &folder, &events, cancel, &recorder);
     let made = made.map(|outcome| RunOutcome {
         seconds: clock.elapsed().as_secs_f64(),
         warnings: recorder.warnings(),
@@ -149,14 +150,14 @@ fn carry_out(
     request: &RunRequest,
     config: &Config,
     dataset: &Dataset,
-    (plan, source): (Plan, Source),
+    (plan, sight): (Plan, (Source, Looks)),
     folder: &RunFolder,
     events: &Events,
     cancel: &CancelToken,
     recorder: &Recorder,
 ) -> Result<RunOutcome, Error> {
     folder.write("config.resolved.toml", request.layered.to_toml(true).as_bytes())?;
-    let map = dense::build(dataset, &plan, source, config, folder, events, cancel)?;
+    let map = dense::build(dataset, &plan, sight, config, folder, events, cancel)?;
     let judgement = events.stage("judge", 0, || judge::judge(dataset, &plan, &map, config, events))?;
     let status = match (cancel.is_cancelled(), recorder.is_degraded() || map.mesh.triangles.is_empty()) {
         (true, _) => ExitStatus::Interrupted,

@@ -80,14 +80,14 @@ pub enum ReferenceSource {
 }
 
 impl Plan {
-    /// Looks at poses, camera and configuration, and opens the source of geometry.
+    /// Looks at poses, camera and configuration, and opens the source of geometry and what tells places.
     pub fn make(
         dataset: &Dataset,
         config: &Config,
         reference: Option<&Path>,
         events: &Events,
         cancel: &CancelToken,
-    ) -> Result<(Self, Source), Error> {
+    ) -> Result<(Self, (Source, Looks)), Error> {
         if let Some(path) = reference {
             // Better said now than after an hour of depth.
             std::fs::File::open(path).map_err(|e| Error::io("read", path, e))?;
@@ -96,7 +96,7 @@ impl Plan {
         let images = input::strided(dataset, config);
         let Opened { mut source, chunks: recorded } = Source::open(dataset, &images, config)?;
         // Better a wrong checkpoint now than after the odometry.
-        let places = Looks::open(config, &mut source)?.word();
+        let looks = Looks::open(config, &mut source)?;
         let anchor = anchor(dataset, config, events, cancel)?;
         let mut warnings = anchor.as_ref().map_or_else(Vec::new, |a| a.warnings.clone());
         let chosen = choose(dataset, &images, anchor.as_ref(), recorded, &source, config, &mut warnings)?;
@@ -126,7 +126,7 @@ impl Plan {
             camera,
             view,
             model: source.info().clone(),
-            places,
+            places: looks.word(),
             network,
             reference: reference_source(dataset, config, reference),
             depth_units_per_metre: config.output.depth_units_per_metre,
@@ -134,7 +134,7 @@ impl Plan {
             anchor,
             warnings,
         };
-        Ok((plan, source))
+        Ok((plan, (source, looks)))
     }
 
     /// Where metric poses come from, in words.
