@@ -101,6 +101,10 @@ class Scenes:
     pose9: Tensor
     scale: Tensor
 
+    def to(self, device: str) -> Scenes:
+        """A copy there."""
+        return Scenes(**{name: value.to(device) for name, value in vars(self).items()})
+
 
 def normalise(image: np.ndarray) -> Tensor:
     """u8 [B, S, H, W, 3] -> [B, S, 3, H, W]."""

@@ -82,8 +82,8 @@ def pose_vector(first_from_camera: Tensor, focal: Tensor, height: int, width: in
 
 def rays_in_camera(focal: Tensor, height: int, width: int, rows: int, columns: int) -> Tensor:
     """Directions (z = 1) through the cell centres of a grid over the image: [B, S, rows, columns, 3]."""
-    ys = (torch.arange(rows, dtype=focal.dtype) + 0.5) * (height / rows) - 0.5 * height
-    xs = (torch.arange(columns, dtype=focal.dtype) + 0.5) * (width / columns) - 0.5 * width
+    ys = (torch.arange(rows, dtype=focal.dtype, device=focal.device) + 0.5) * (height / rows) - 0.5 * height
+    xs = (torch.arange(columns, dtype=focal.dtype, device=focal.device) + 0.5) * (width / columns) - 0.5 * width
     shape = (*focal.shape[:2], rows, columns)
     x = (xs / focal[..., None, None, 0]).expand(shape)
     y = (ys[:, None] / focal[..., None, None, 1]).expand(shape)
@@ -105,6 +105,46 @@ def gauge(depth: Tensor, first_from_camera: Tensor, focal: Tensor) -> Tensor:
     seen = (some > 0).flatten(2)
     distance = flat.norm(dim=-1) * seen
     return distance.sum((1, 2)) / seen.sum((1, 2)).clamp(min=1)
+
+
+@torch.no_grad()
+def matches(
+    depth: Tensor, first_from_camera: Tensor, focal: Tensor, rows: int, columns: int
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Where each patch of each view is seen in each other view.
+
+    depth [B, S, H, W] (0: none). Returns indices of the four patches round it [B, S, n, S, 4], their bilinear weights,
+    and whether it is seen there at all [B, S, n, S] (inside, not hidden; never in its own view).
+    """
+    scenes, views, height, width = depth.shape
+    side = height // rows
+    # The pixel next to the middle of each patch stands for the patch.
+    middle = depth[..., side // 2 :: side, side // 2 :: side]
+    ys = torch.arange(rows, device=depth.device) * side + side // 2 + 0.5 - 0.5 * height
+    xs = torch.arange(columns, device=depth.device) * side + side // 2 + 0.5 - 0.5 * width
+    x = (xs / focal[..., None, None, 0]).expand_as(middle)
+    y = (ys[:, None] / focal[..., None, None, 1]).expand_as(middle)
+    points = (torch.stack([x, y, torch.ones_like(x)], -1) * middle[..., None]).flatten(2, 3)
+    other_from_own = inverse(first_from_camera)[:, None] @ first_from_camera[:, :, None]
+    there = torch.einsum("bijrc,bipc->bipjr", other_from_own[..., :3, :3], points)
+    there = there + other_from_own[:, :, None, :, :3, 3]
+    z = there[..., 2]
+    pixel = there[..., :2] / z.clamp(min=1e-6)[..., None] * focal[:, None, None]
+    u, v = pixel[..., 0] + 0.5 * width, pixel[..., 1] + 0.5 * height
+    inside = (z > 1e-3) & (u >= 0) & (u < width) & (v >= 0) & (v < height)
+    # What stands at that pixel, to tell what is hidden.
+    flat = (v.clamp(0, height - 1).long() * width + u.clamp(0, width - 1).long()).permute(0, 3, 1, 2).flatten(2)
+    stands = depth.flatten(2).gather(2, flat).unflatten(2, (views, rows * columns)).permute(0, 2, 3, 1)
+    seen = inside & ((stands - z).abs() < 0.1 * z) & (middle.flatten(2) > 0)[..., None]
+    seen &= ~torch.eye(views, dtype=torch.bool, device=depth.device)[:, None]
+    column = ((u - side // 2 - 0.5) / side).clamp(0, columns - 1)
+    row = ((v - side // 2 - 0.5) / side).clamp(0, rows - 1)
+    left, above = column.floor().clamp(max=columns - 2), row.floor().clamp(max=rows - 2)
+    a, b = column - left, row - above
+    first = (above * columns + left).long()
+    index = torch.stack([first, first + 1, first + columns, first + columns + 1], -1)
+    weight = torch.stack([(1 - a) * (1 - b), a * (1 - b), (1 - a) * b, a * b], -1)
+    return index, weight, seen
 
 
 def rotation_angle(a: Tensor, b: Tensor) -> Tensor:

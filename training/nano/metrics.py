@@ -84,11 +84,19 @@ def scale_from_poses(found: Tensor, truth: Tensor) -> Tensor:
 @torch.no_grad()
 def add_scenes(tally: Tally, model: Nano, scenes: Scenes, posed: bool, autocast: bool = True) -> None:
     """Runs the network as inference does and adds its errors."""
-    output = model(scenes.images, scenes.pose9 if posed else None, wants_rays=False, select=True, autocast=autocast)
-    found = homogeneous(output.world_from_camera().float())
+    device = next(model.parameters()).device
+    output = model(
+        scenes.images.to(device),
+        scenes.pose9.to(device) if posed else None,
+        wants_rays=False,
+        select=True,
+        autocast=autocast,
+    )
+    found = homogeneous(output.world_from_camera().float()).cpu()
+    depth = output.depth.float().cpu()
     for b in range(found.shape[0]):
         truth = scenes.depth[b]
-        relative, within = depth_errors(output.depth[b].float(), truth)
+        relative, within = depth_errors(depth[b], truth)
         tally.abs_rel.append(relative)
         tally.within.append(within)
         flat = torch.full_like(truth, 1.0)
@@ -101,4 +109,4 @@ def add_scenes(tally: Tally, model: Nano, scenes: Scenes, posed: bool, autocast:
             tally.direction.append(direction)
         if found.shape[1] >= 3:
             scale = scale_from_poses(found[b], scenes.first_from_camera[b])
-            tally.posed_abs_rel.append(depth_errors(output.depth[b].float(), truth, scale)[0])
+            tally.posed_abs_rel.append(depth_errors(depth[b], truth, scale)[0])

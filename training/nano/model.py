@@ -7,7 +7,7 @@ exported file is loaded by the same code. `B` scenes of `S` views; `n` patches a
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache
 
 import torch
@@ -23,6 +23,7 @@ class Output:
     """What the network says. Views are in the order of the input.
 
     depth, depth_conf [B, S, H, W]; ray [B, S, 6, 8ph, 8pw], ray_conf [B, S, 8ph, 8pw] or None; pose_enc [B, S, 9].
+    logits: of the blocks that are watched, by block [B, heads, S N, S N]; only where the order of views was kept.
     """
 
     depth: Tensor
@@ -32,6 +33,7 @@ class Output:
     ray_conf: Tensor | None
     pose_enc: Tensor
     reference: Tensor
+    logits: dict[int, Tensor] = field(default_factory=dict)
 
     def world_from_camera(self) -> Tensor:
         """[B, S, 3, 4] in the gauge of the depth."""
@@ -74,6 +76,9 @@ class Attention(nn.Module):
             self.q_norm = nn.LayerNorm(dim // heads, eps=1e-5)
             self.k_norm = nn.LayerNorm(dim // heads, eps=1e-5)
         self.qk_norm = qk_norm
+        # Training looks at the logits of some blocks (`losses.match_terms`).
+        self.is_watched = False
+        self.logits: Tensor | None = None
 
     def forward(self, x: Tensor, rope: tuple[Tensor, Tensor] | None) -> Tensor:
         batch, tokens, dim = x.shape
@@ -84,7 +89,9 @@ class Attention(nn.Module):
             q, k = rotate(q, *rope), rotate(k, *rope)
         q, k, v = (t.to(v.dtype).transpose(1, 2) for t in (q, k, v))
         # On a CPU and for few tokens this is several times faster than `scaled_dot_product_attention`.
-        weights = torch.softmax((q * q.shape[-1] ** -0.5) @ k.transpose(-1, -2), -1)
+        logits = (q * q.shape[-1] ** -0.5) @ k.transpose(-1, -2)
+        self.logits = logits if self.is_watched else None
+        weights = torch.softmax(logits, -1)
         mixed = weights.to(v.dtype) @ v
         return self.proj(mixed.transpose(1, 2).reshape(batch, tokens, dim))
 
@@ -109,7 +116,7 @@ class Block(nn.Module):
 def rope_tables(positions: Tensor, head_dim: int) -> tuple[Tensor, Tensor]:
     """Cosines and sines [tokens, 1, head_dim] of row-column positions [tokens, 2]; base 100."""
     half = head_dim // 2
-    rates = 100.0 ** (-torch.arange(half // 2, dtype=torch.float32) * 2 / half)
+    rates = 100.0 ** (-torch.arange(half // 2, dtype=torch.float32, device=positions.device) * 2 / half)
     angles = [positions[:, k : k + 1] * rates for k in (0, 1)]
     full = torch.cat([angles[0], angles[0], angles[1], angles[1]], -1)[:, None]
     return full.cos(), full.sin()
@@ -177,6 +184,15 @@ class Backbone(nn.Module):
         )
         self.norm = nn.LayerNorm(dim, eps=1e-5)
 
+    def watch(self, blocks: tuple[int, ...]) -> None:
+        """Keeps the attention logits of these blocks from now on."""
+        for i, block in enumerate(self.blocks):
+            block.attn.is_watched = i in blocks
+
+    def watched(self) -> dict[int, Tensor]:
+        """Logits of the last run by block."""
+        return {i: b.attn.logits for i, b in enumerate(self.blocks) if b.attn.logits is not None}
+
     def full_grid(self) -> Tensor:
         """[1, dim, 37, 37]."""
         return enlarged(self.pos_grid) if self.pos_full is None else self.pos_full
@@ -185,7 +201,8 @@ class Backbone(nn.Module):
         """[1, n, dim] for a picture of rows x columns patches: the exported grid, resized as inference does."""
         if self.pos_full is not None:
             return resized(self.pos_full, rows, columns).flatten(2).transpose(1, 2)
-        return (self.pos_grid.flatten(2)[0] @ position_operator(self.config.trained_grid, rows, columns)).T[None]
+        operator = position_operator(self.config.trained_grid, rows, columns).to(self.pos_grid.device)
+        return (self.pos_grid.flatten(2)[0] @ operator).T[None]
 
     def forward(
         self, images: Tensor, camera_tokens: Tensor | None, select: bool
@@ -203,7 +220,7 @@ class Backbone(nn.Module):
         x = torch.cat([special, x], 1)
         tokens = x.shape[1]
         local_rope, global_rope = self.ropes(rows, columns, views)
-        order = torch.arange(views).expand(scenes, views)
+        order = torch.arange(views, device=x.device).expand(scenes, views)
         features, local = [], x
         for i, block in enumerate(self.blocks):
             if i == config.alt_start - 1 and select and views >= 3 and camera_tokens is None:
@@ -227,7 +244,8 @@ class Backbone(nn.Module):
         grid = torch.cartesian_prod(torch.arange(rows), torch.arange(columns)).float() + 1
         local = torch.cat([torch.zeros(1, 2), grid])
         flat = (local > 0).float()
-        head_dim = self.config.dim // self.config.heads
+        head_dim, device = self.config.dim // self.config.heads, self.cls_token.device
+        local, flat = local.to(device), flat.to(device)
         return rope_tables(local, head_dim), rope_tables(flat.repeat(views, 1), head_dim)
 
     def special_tokens(self, given: Tensor | None, scenes: int, views: int) -> Tensor:
@@ -248,7 +266,7 @@ class Backbone(nn.Module):
 
 def pick_views(x: Tensor, order: Tensor) -> Tensor:
     """[B, S, ...] in another order [B, S] of views."""
-    return x[torch.arange(x.shape[0])[:, None], order]
+    return x[torch.arange(x.shape[0], device=x.device)[:, None], order]
 
 
 def reference_first(tokens: Tensor) -> Tensor:
@@ -257,14 +275,14 @@ def reference_first(tokens: Tensor) -> Tensor:
     size = tokens.norm(dim=-1)
     unit = tokens / size[..., None]
     views = tokens.shape[1]
-    similar = (unit @ unit.transpose(1, 2) - torch.eye(views)).sum(-1) / (views - 1)
+    similar = (unit @ unit.transpose(1, 2) - torch.eye(views, device=tokens.device)).sum(-1) / (views - 1)
 
     def balance(value: Tensor) -> Tensor:
         low, high = value.amin(1, keepdim=True), value.amax(1, keepdim=True)
         return ((value - low) / (high - low + 1e-8) - 0.5).abs()
 
     reference = (balance(similar) + balance(size) + balance(unit.var(-1))).argmin(1)
-    index = torch.arange(views).expand(tokens.shape[0], views)
+    index = torch.arange(views, device=tokens.device).expand(tokens.shape[0], views)
     key = torch.where(index == reference[:, None], -1, index)
     return key.argsort(1)
 
@@ -419,12 +437,12 @@ class DualDpt(nn.Module):
         s = self.scratch
         main = s.output_conv1(self.chain(levels, fine, ""))
         main = F.interpolate(main, (height, width), mode="bilinear", align_corners=True)
-        main = s.output_conv2(main + uv_embedding(main.shape[1], height, width, aspect)).float()
+        main = s.output_conv2(main + uv_embedding(main.shape[1], height, width, aspect).to(main.device)).float()
         if not wants_rays:
             return main[:, 0], main[:, 1], None, None
         aux = s.output_conv1_aux["3"](self.chain(levels, fine, "_aux"))
         last = s.output_conv2_aux["3"]
-        aux = last["0"](aux + uv_embedding(aux.shape[1], *fine, aspect))
+        aux = last["0"](aux + uv_embedding(aux.shape[1], *fine, aspect).to(aux.device))
         aux = last["5"](F.relu(s.output_conv2_aux["0"]["2"](aux))).float()
         return main[:, 0], main[:, 1], aux[:, :6], aux[:, 6]
 
@@ -433,7 +451,7 @@ class DualDpt(nn.Module):
         project = self.projects[k]
         x = F.linear(x, project.weight.flatten(1), project.bias)
         x = x.transpose(1, 2).reshape(x.shape[0], -1, rows, columns)
-        x = x + uv_embedding(x.shape[1], rows, columns, aspect)
+        x = x + uv_embedding(x.shape[1], rows, columns, aspect).to(x.device)
         x = self.resize_layers[k](x.contiguous(memory_format=torch.channels_last))
         return getattr(self.scratch, f"layer{k + 1}_rn")(x)
 
@@ -472,10 +490,10 @@ class Nano(nn.Module):
     ) -> Output:
         """Normalised images [B, S, 3, H, W] and given cameras [B, S, 9] or None."""
         scenes, views, _, height, width = images.shape
-        with torch.autocast("cpu", torch.bfloat16, enabled=autocast):
+        with torch.autocast(images.device.type, torch.bfloat16, enabled=autocast):
             tokens = None if pose9 is None else self.cam_enc(pose9)
             features, reference = self.backbone["pretrained"](images, tokens, select)
-        with torch.autocast("cpu", torch.bfloat16, enabled=autocast):
+        with torch.autocast(images.device.type, torch.bfloat16, enabled=autocast):
             patches = [f.flatten(0, 1) for f, _ in features]
             log_depth, log_conf, ray, log_ray_conf = self.head(patches, height, width, wants_rays)
         pose = self.cam_dec(features[-1][1].float())
@@ -488,6 +506,7 @@ class Nano(nn.Module):
             ray_conf=None if log_ray_conf is None else 1 + log_ray_conf.exp().unflatten(0, shape),
             pose_enc=pose,
             reference=reference,
+            logits=self.backbone["pretrained"].watched(),
         )
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 from torch import Tensor, nn
 
@@ -28,22 +30,46 @@ class Muon(torch.optim.Optimizer):
 
     def __init__(self, params: list[nn.Parameter], lr: float, momentum: float = 0.95, decay: float = 0.01) -> None:
         super().__init__(params, {"lr": lr, "momentum": momentum, "decay": decay})
+        # Several processes that hold the same gradients share the work: each makes some of the directions.
+        self.rank, self.processes = 0, 1
+        self.shared: Tensor | None = None
+        self.wait: Callable[[], object] = lambda: None
+
+    def divide(self, rank: int, processes: int, shared: Tensor, wait: Callable[[], object]) -> None:
+        """From now on process `rank` makes every `processes`-th direction; `shared` has room for all our numbers."""
+        self.rank, self.processes, self.shared, self.wait = rank, processes, shared, wait
 
     @torch.no_grad()
     def step(self, closure: None = None) -> None:
         """One step."""
         for group in self.param_groups:
-            for p in group["params"]:
-                if p.grad is None:
-                    continue
+            used = [p for p in group["params"] if p.grad is not None]
+            directions = {}
+            at = 0
+            for k, p in enumerate(used):
                 buffer = self.state[p].setdefault("momentum", torch.zeros_like(p))
                 buffer.lerp_(p.grad, 1 - group["momentum"])
-                step = p.grad.lerp(buffer, group["momentum"])
-                parts = 3 if p.shape[0] == 3 * p.shape[1] else 1
-                direction = orthogonalised(step.view(parts, p.shape[0] // parts, p.shape[1])).reshape(p.shape)
-                rows, columns = p.shape[0] // parts, p.shape[1]
+                parts = self.parts(p)
+                directions[p] = p.grad
+                if self.shared is not None:
+                    directions[p] = self.shared[at : at + p.numel()].view_as(p)
+                    at += p.numel()
+                # Four matrices make a block.
+                if k // 4 % self.processes == self.rank:
+                    step = p.grad.lerp(buffer, group["momentum"])
+                    found = orthogonalised(step.view(parts, p.shape[0] // parts, p.shape[1])).reshape(p.shape)
+                    directions[p].copy_(found)
+            self.wait()
+            for p in used:
+                rows, columns = p.shape[0] // self.parts(p), p.shape[1]
                 p.mul_(1 - group["lr"] * group["decay"])
-                p.add_(direction, alpha=-group["lr"] * max(1.0, rows / columns) ** 0.5)
+                p.add_(directions[p], alpha=-group["lr"] * max(1.0, rows / columns) ** 0.5)
+            self.wait()
+
+    @staticmethod
+    def parts(p: nn.Parameter) -> int:
+        """Matrices that a parameter holds."""
+        return 3 if p.shape[0] == 3 * p.shape[1] else 1
 
 
 def optimisers(model: nn.Module, muon_lr: float, adam_lr: float) -> list[torch.optim.Optimizer]:

@@ -1,6 +1,10 @@
 """Trains the network on endless rendered rooms; stops and goes on at any time.
 
-    python -m nano.train --run RUN_FOLDER [--recipe recipe.json] [--stream stream_views] [--threads 1]
+    python -m nano.train --run RUN_FOLDER [--recipe recipe.json] [--stream stream_views]
+                         [--processes 2] [--threads 1] [--device cpu]
+
+On a CPU let every core have a process of one thread: each works on scenes and with a renderer of its own, and gradients
+are averaged in shared memory. On a graphics processor one process is enough.
 
 `RUN_FOLDER/state.pt` holds everything that is needed to go on and is replaced every few minutes, and on SIGTERM, which
 ends training after the step under way; `train.csv` and
@@ -22,15 +26,18 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import torch
+import torch.multiprocessing as multiprocessing
+from torch import Tensor
 
 from .config import NanoConfig, from_dict
 from .data import Clip, Pool, Renderer, Scenes, clips_of, normalise, scenes
-from .losses import total
+from .losses import WATCHED, total
 from .metrics import Tally, add_scenes
 from .model import Nano, whiten_patches
 from .optim import optimisers
 
 ROOT = Path(__file__).resolve().parents[1]
+ROOMS_APART = 1 << 20  # between the rooms of two processes
 
 
 @dataclass
@@ -82,11 +89,42 @@ class Recipe:
         return min(1.0, (step + 1) / self.warmup_steps) * (stage.lr_from + (stage.lr_to - stage.lr_from) * share)
 
 
-class Trainer:
-    """Model, optimisers, averages and where training stands."""
+class Team:
+    """Processes that average what they found; each is as far as every other."""
 
-    def __init__(self, run: Path, recipe: Recipe, stream: Path) -> None:
-        self.run, self.recipe, self.stream = run, recipe, stream
+    def __init__(self, processes: int, numbers: int) -> None:
+        self.processes = processes
+        # The last number of each row asks to stop.
+        self.rows = torch.zeros(processes, numbers + 1).share_memory_()
+        self.directions = torch.zeros(numbers).share_memory_()
+        self.barrier = multiprocessing.get_context("spawn").Barrier(processes, timeout=3600)
+
+    def average(self, rank: int, parameters: list[Tensor], stopping: bool) -> bool:
+        """Replaces gradients by their mean over all processes; whether any of them wants to stop."""
+        if self.processes == 1:
+            return stopping
+        row, at = self.rows[rank], 0
+        for p in parameters:
+            own = row[at : at + p.numel()]
+            own.zero_() if p.grad is None else own.copy_(p.grad.flatten())
+            at += p.numel()
+        row[-1] = stopping
+        self.barrier.wait()
+        mean, at = self.rows.mean(0), 0
+        self.barrier.wait()
+        for p in parameters:
+            own = mean[at : at + p.numel()]
+            # What no process used stays as if it were not there.
+            p.grad = own.view_as(p).to(p.device) if p.grad is not None or own.any() else None
+            at += p.numel()
+        return bool(mean[-1] > 0)
+
+
+class Trainer:
+    """Model, optimisers, averages and where training stands; one per process."""
+
+    def __init__(self, run: Path, recipe: Recipe, stream: Path, device: str = "cpu", rank: int = 0) -> None:
+        self.run, self.recipe, self.stream, self.device, self.rank = run, recipe, stream, device, rank
         self.step, self.room, self.seconds, self.views_seen = 0, 0, 0.0, 0
         self.distinct_views = 0
         saved = run / "state.pt"
@@ -97,6 +135,7 @@ class Trainer:
         if not state:
             clips = sample_clips(run, stream, "train", "112x70")
             whiten_patches(self.model, torch.cat([normalise(clip.image[None])[0] for clip in clips]))
+        self.model.to(device).backbone["pretrained"].watch(WATCHED)
         self.optimisers = optimisers(self.model, recipe.muon_lr, recipe.adam_lr)
         if state:
             self.model.load_state_dict(state["model"])
@@ -105,11 +144,21 @@ class Trainer:
             self.step, self.room, self.seconds = state["step"], state["room"], state["seconds"]
             self.views_seen, self.distinct_views = state["views_seen"], state["distinct_views"]
         self.ema = copy.deepcopy(self.model)
+        self.ema.backbone["pretrained"].watch(())
         if state:
             self.ema.load_state_dict(state["ema"])
         self.bases = (recipe.muon_lr, recipe.adam_lr)
-        self.rng = random.Random(1000 + self.step)
-        self.stopping = False
+        self.rng = random.Random(1000 * (rank + 1) + self.step)
+        # What all processes must choose alike.
+        self.common_rng = random.Random(self.step)
+        self.team = Team(1, 0)
+        # Somebody asked for the end; all processes stop after the same step.
+        self.asked, self.stopping = False, False
+
+    def join(self, team: Team) -> None:
+        """Works as one of several from now on."""
+        self.team = team
+        self.optimisers[0].divide(self.rank, team.processes, team.directions, team.barrier.wait)
 
     def save(self) -> None:
         """Replaces `state.pt` at once, so that a crash leaves the old or the new one."""
@@ -137,7 +186,7 @@ class Trainer:
         parts = []
         for clip in clips:
             parts.extend((clip, own, mirrored) for own, mirrored in self.split(len(clip.image), views))
-        return scenes(parts), self.rng.random() < self.recipe.posed_share
+        return scenes(parts).to(self.device), self.common_rng.random() < self.recipe.posed_share
 
     def split(self, available: int, views: int) -> list[tuple[list[int], bool]]:
         """Disjoint groups of views of a clip: neighbours or spread out, in random order, mirrored or not."""
@@ -157,18 +206,19 @@ class Trainer:
         for optimiser, base in zip(self.optimisers, self.bases, strict=True):
             for group in optimiser.param_groups:
                 group["lr"] = base * factor * group.get("share", 1.0)
-        rays = self.rng.random() < self.recipe.ray_share
+        rays = self.common_rng.random() < self.recipe.ray_share
         output = self.model(batch.images, batch.pose9 if posed else None, wants_rays=rays, autocast=True)
         loss, terms = total(output, batch)
         for optimiser in self.optimisers:
             optimiser.zero_grad(set_to_none=True)
         loss.backward()
+        self.stopping = self.team.average(self.rank, list(self.model.parameters()), self.asked)
         norm = torch.nn.utils.clip_grad_norm_(self.model.parameters(), 2.0)
         if torch.isfinite(norm):
             for optimiser in self.optimisers:
                 optimiser.step()
         self.step += 1
-        self.views_seen += batch.images.shape[0] * batch.images.shape[1]
+        self.views_seen += batch.images.shape[0] * batch.images.shape[1] * self.team.processes
         decay = min(self.recipe.ema_decay, (1 + self.step) / (10 + self.step))
         with torch.no_grad():
             kept = list(self.ema.parameters())
@@ -193,10 +243,11 @@ class Trainer:
     def train(self, save_every_secs: float, validate_every: int) -> None:
         """Until the recipe ends."""
         began = saved = time.monotonic()
-        signal.signal(signal.SIGTERM, lambda *_: setattr(self, "stopping", True))
+        signal.signal(signal.SIGTERM, lambda *_: setattr(self, "asked", True))
         while (found := self.recipe.stage(self.step)) is not None and not self.stopping:
             begin, stage = found
-            first_room = self.room
+            # Each process has its own rooms.
+            first_room = self.room + self.rank * ROOMS_APART
             arguments = ["--sizes", stage.sizes, "--views", str(stage.views_per_clip)]
             arguments += ["--clips", str(self.recipe.clips_per_room), "--first-room", str(first_room)]
             renderer = Renderer(self.stream, arguments)
@@ -212,30 +263,43 @@ class Trainer:
                 terms["waited"] = waited
                 terms["took"] = time.monotonic() - tick
                 self.seconds += terms["took"]
-                self.room, self.distinct_views = max(self.room, pool.rooms), seen_before + pool.views
+                self.room = max(self.room, pool.rooms - self.rank * ROOMS_APART)
+                self.distinct_views = seen_before + pool.views * self.team.processes
                 for name, value in terms.items():
                     sums.setdefault(name, []).append(value)
-                if self.step % 25 == 0:
+                if self.step % 25 == 0 and self.rank == 0:
                     means = {name: sum(v) / len(v) for name, v in sums.items()}
                     head = {"step": self.step, "hours": round(self.seconds / 3600, 3), "views": self.views_seen}
                     head |= {"distinct_views": self.distinct_views, "rooms": self.room}
-                    names = "loss norm depth aligned gradient ray t q fov waited took".split()
+                    names = "loss norm depth aligned gradient ray t q fov pair first waited took".split()
                     row = {**head, **rounded({n: means.get(n, float("nan")) for n in names})}
                     append(self.run / "train.csv", row)
                     print(" ".join(f"{k} {v}" for k, v in row.items()), flush=True)
                     sums = {}
-                if self.step % validate_every == 0:
+                if self.step % validate_every == 0 and self.rank == 0:
                     self.validate()
-                if time.monotonic() - saved > save_every_secs:
+                if time.monotonic() - saved > save_every_secs and self.rank == 0:
                     self.save()
                     saved = time.monotonic()
             renderer.stop()
-            self.save()
+            if self.rank == 0:
+                self.save()
+        if self.rank > 0:
+            return
         if self.stopping:
             print(f"stopped and saved at step {self.step}", flush=True)
             return
         self.validate()
         print(f"the recipe's last step is done after {time.monotonic() - began:.0f} s", flush=True)
+
+
+def work(rank: int, arguments: argparse.Namespace, team: Team | None) -> None:
+    """One process of training."""
+    torch.set_num_threads(arguments.threads)
+    trainer = Trainer(arguments.run, Recipe.read(arguments.recipe), arguments.stream, arguments.device, rank)
+    if team is not None:
+        trainer.join(team)
+    trainer.train(arguments.save_every, arguments.validate_every)
 
 
 def rounded(row: dict[str, float]) -> dict[str, float]:
@@ -272,13 +336,24 @@ def main() -> None:
     parser.add_argument("--recipe", type=Path, default=ROOT / "recipe.json")
     parser.add_argument("--stream", type=Path, default=ROOT.parent / "target/release/examples/stream_views")
     parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--processes", type=int, default=1)
+    parser.add_argument("--device", default="cpu")
     parser.add_argument("--save-every", type=float, default=180.0, help="seconds")
     parser.add_argument("--validate-every", type=int, default=500, help="steps")
     arguments = parser.parse_args()
-    torch.set_num_threads(arguments.threads)
     arguments.run.mkdir(parents=True, exist_ok=True)
-    trainer = Trainer(arguments.run, Recipe.read(arguments.recipe), arguments.stream)
-    trainer.train(arguments.save_every, arguments.validate_every)
+    if arguments.processes == 1:
+        work(0, arguments, None)
+        return
+    numbers = sum(p.numel() for p in Nano(NanoConfig()).parameters())
+    team = Team(arguments.processes, numbers)
+    spawn = multiprocessing.get_context("spawn")
+    others = [spawn.Process(target=work, args=(r, arguments, team), daemon=True) for r in range(1, arguments.processes)]
+    for process in others:
+        process.start()
+    work(0, arguments, team)
+    for process in others:
+        process.join()
 
 
 if __name__ == "__main__":

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import sys
+import threading
 from pathlib import Path
 
 import numpy as np
@@ -15,11 +16,12 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from nano.config import NanoConfig  # noqa: E402
 from nano.data import Clip, read_clip, scenes, write_clip  # noqa: E402
 from nano.export import exported, imported  # noqa: E402
-from nano.geometry import homogeneous, inverse, matrix_from_quaternion, quaternion_from_matrix  # noqa: E402
-from nano.losses import total  # noqa: E402
+from nano.geometry import homogeneous, inverse, matches, matrix_from_quaternion, quaternion_from_matrix  # noqa: E402
+from nano.losses import WATCHED, match_terms, total  # noqa: E402
 from nano.metrics import depth_errors, pair_errors, scale_from_poses  # noqa: E402
 from nano.model import Nano, Output, position_operator, reference_first  # noqa: E402
-from nano.optim import orthogonalised  # noqa: E402
+from nano.optim import Muon, orthogonalised  # noqa: E402
+from nano.train import Team  # noqa: E402
 
 SMALL = NanoConfig(dim=32, heads=2, features=8, out_channels=(8, 8, 8, 8), cam_enc_heads=2, cam_enc_depth=1)
 
@@ -174,3 +176,78 @@ def test_errors_of_a_scaled_truth_are_zero():
     assert abs(scale_from_poses(larger, poses).item() - 0.5) < 1e-5
     assert torch.allclose(inverse(inverse(poses)), poses, atol=1e-6)
     assert homogeneous(poses[:, :3]).shape == poses.shape
+
+
+def test_patches_are_found_again_where_the_camera_moved():
+    batch = scenes([(clip(2), [0, 1], False)])
+    index, weight, seen = matches(batch.depth, batch.first_from_camera, batch.focal, 2, 3)
+    column = (weight * (index % 3)).sum(-1)
+    row = (weight * (index // 3)).sum(-1)
+    # 40 px of focal length, 0.3 m aside and 0.05 m down, 2 m away, patches of 14 px.
+    shift = torch.tensor([40 * 0.3, 41 * 0.05]) / 2 / 14
+    own = torch.arange(6)
+    assert seen[0, 0, :, 1].all(), "all centres stay in the picture"
+    assert not seen[0, 0, :, 0].any() and not seen[0, 1, :, 1].any(), "nobody is matched with itself"
+    assert torch.allclose(weight.sum(-1), torch.ones(()))
+    for p in range(6):
+        assert abs(column[0, 0, p, 1] - (own[p] % 3 - shift[0]).clamp(min=0)) < 1e-5
+        assert abs(row[0, 0, p, 1] - (own[p] // 3 - shift[1]).clamp(min=0)) < 1e-5
+
+
+def test_what_something_hides_is_not_matched():
+    batch = scenes([(clip(3), [0, 2], False)])
+    far = matches(batch.depth, batch.first_from_camera, batch.focal, 2, 3)[2][0, 0, :, 1]
+    assert far.tolist() == [False, True, True] * 2, "what leaves the picture on the left is not seen"
+    batch.depth[:, 1] *= 0.5
+    assert not matches(batch.depth, batch.first_from_camera, batch.focal, 2, 3)[2][0, 0, :, 1].any()
+
+
+def test_attention_to_the_right_patches_costs_nothing():
+    batch = scenes([(clip(3), [0, 1, 2], False)])
+    index, weight, seen = matches(batch.depth, batch.first_from_camera, batch.focal, 2, 3)
+    tokens, scale = 7, 30.0
+    logits = torch.full((1, 2, 3, tokens, 3, tokens), -scale)
+    patches = torch.full((1, 3, 6, 3, 6), -scale).scatter(-1, index, weight.clamp(min=1e-12).log())
+    logits[:, 0, :, 1:, :, 1:] = patches
+    logits[:, 1, :, 1:, 0, 1:] = patches[:, :, :, 0]
+    logits = logits.reshape(1, 2, 3 * tokens, 3 * tokens)
+    right = perfect(batch)
+    right.logits = {block: logits for block in WATCHED}
+    wrong = perfect(batch)
+    wrong.logits = {block: torch.zeros_like(logits) for block in WATCHED}
+    good, bad = match_terms(right, batch), match_terms(wrong, batch)
+    assert all(abs(good[name]) < 1e-3 for name in good), good
+    assert bad["pair"] > 0.5 and bad["first"] > bad["pair"], bad
+
+
+def test_processes_average_their_gradients_and_share_the_directions():
+    torch.manual_seed(0)
+    shapes = [(24, 8), (8, 8), (32, 8), (8, 32)] * 3
+    starts = [torch.randn(shape) for shape in shapes]
+    found = [[torch.randn(shape) for shape in shapes] for _ in range(2)]
+    alone = [torch.nn.Parameter(p.clone()) for p in starts]
+    for p, a, b in zip(alone, *found, strict=True):
+        p.grad = 0.5 * (a + b)
+    Muon(alone, 0.01).step()
+    team = Team(2, sum(p.numel() for p in alone) + 3)
+    together = [[torch.nn.Parameter(p.clone()) for p in starts] for _ in range(2)]
+    unused = [torch.nn.Parameter(torch.zeros(3)) for _ in range(2)]
+    stops = [False, False]
+
+    def work(rank: int) -> None:
+        for p, g in zip(together[rank], found[rank], strict=True):
+            p.grad = g.clone()
+        optimiser = Muon(together[rank], 0.01)
+        optimiser.divide(rank, 2, team.directions, team.barrier.wait)
+        stops[rank] = team.average(rank, [*together[rank], unused[rank]], rank == 1)
+        optimiser.step()
+
+    threads = [threading.Thread(target=work, args=(rank,)) for rank in range(2)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert stops == [True, True], "who wants to stop stops all"
+    assert unused[0].grad is None and unused[1].grad is None
+    for one, a, b in zip(alone, *together, strict=True):
+        assert torch.allclose(one, a, atol=1e-6) and torch.equal(a, b)
