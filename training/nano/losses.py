@@ -1,13 +1,14 @@
 """Losses in the gauge of the network: depth, its gradient, rays, cameras, weighted by the confidence they train.
 
-One more than the paper has: some heads of some global blocks are told which patches see the same place. From so few
-pictures correspondence does not emerge by itself; after 92 000 views without it the rotations were those of a constant.
+Two more than the paper has, because from so few pictures correspondence does not emerge by itself (after 92 000 views
+without them rotations were those of a constant): some heads of some global blocks are told which patches see the same
+place, and a linear map that is not kept reads from the patches half-way how far they moved since the first view.
 """
 
 from __future__ import annotations
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from .config import PATCH
 from .data import Scenes
@@ -20,6 +21,7 @@ ALIGNED = 0.5
 RAYS = 1.0
 CAMERA = 1.0
 MATCH = 0.1
+MOVED = 2.0
 SMALL = 0.03
 # (block, head) that learn where a patch is in every other view, and where it is in the first one.
 PAIR_HEADS = ((3, 0), (5, 0))
@@ -83,10 +85,11 @@ def camera_terms(output: Output, scenes: Scenes) -> dict[str, Tensor]:
     }
 
 
-def match_terms(output: Output, scenes: Scenes) -> dict[str, Tensor]:
+def match_terms(output: Output, scenes: Scenes, reader: nn.Module | None = None) -> dict[str, Tensor]:
     """Cross-entropy, less that of the truth, between attention and the patches that see the same place.
 
-    `pair` compares within each other view, whatever attention the views get; `first` over all tokens of the scene.
+    `pair` compares within each other view, whatever attention the views get; `first` over all tokens of the scene;
+    `moved` is how wrong `reader` is about the way to the first view, in widths of the image.
     """
     some = next(iter(output.logits.values()))
     views, (height, width) = scenes.depth.shape[1], scenes.depth.shape[-2:]
@@ -99,14 +102,21 @@ def match_terms(output: Output, scenes: Scenes) -> dict[str, Tensor]:
         logits = output.logits[block][:, head].unflatten(2, split).unflatten(1, split)[:, :, 1:, :, 1:]
         found = (weight * logits.float().log_softmax(-1).gather(-1, index)).sum(-1)
         pair = pair + masked_mean(-found - entropy, seen)
+    index, weight, seen, entropy = index[..., 0, :], weight[..., 0, :], seen[..., 0], entropy[..., 0]
     for block, head in FIRST_HEADS:
         share = output.logits[block][:, head].float().log_softmax(-1).unflatten(2, split).unflatten(1, split)
-        found = (weight[..., 0, :] * share[:, :, 1:, 0, 1:].gather(-1, index[..., 0, :])).sum(-1)
-        first = first + masked_mean(-found - entropy[..., 0], seen[..., 0])
-    return {"pair": pair / len(PAIR_HEADS), "first": first / len(FIRST_HEADS)}
+        found = (weight * share[:, :, 1:, 0, 1:].gather(-1, index)).sum(-1)
+        first = first + masked_mean(-found - entropy, seen)
+    terms = {"pair": pair / len(PAIR_HEADS), "first": first / len(FIRST_HEADS)}
+    if reader is not None and output.patches is not None:
+        own = torch.arange(rows * columns, device=some.device)
+        there = torch.stack([(weight * (index % columns)).sum(-1), (weight * (index // columns)).sum(-1)], -1)
+        way = (there - torch.stack([own % columns, own // columns], -1)) / columns
+        terms["moved"] = masked_mean((reader(output.patches.float()) - way).norm(dim=-1), seen)
+    return terms
 
 
-def total(output: Output, scenes: Scenes) -> tuple[Tensor, dict[str, float]]:
+def total(output: Output, scenes: Scenes, reader: nn.Module | None = None) -> tuple[Tensor, dict[str, float]]:
     """The sum that is minimised, and its terms."""
     terms = depth_terms(output, scenes)
     loss = terms["depth"] + ALIGNED * terms["aligned"] + GRADIENT * terms["gradient"]
@@ -114,9 +124,9 @@ def total(output: Output, scenes: Scenes) -> tuple[Tensor, dict[str, float]]:
         terms["ray"] = ray_term(output, scenes)
         loss = loss + RAYS * terms["ray"]
     if output.logits and scenes.depth.shape[1] > 1:
-        found = match_terms(output, scenes)
+        found = match_terms(output, scenes, reader)
         terms.update(found)
-        loss = loss + MATCH * (found["pair"] + found["first"])
+        loss = loss + MATCH * (found["pair"] + found["first"]) + MOVED * found.get("moved", 0.0)
     cameras = camera_terms(output, scenes)
     terms.update(cameras)
     loss = loss + CAMERA * (cameras["t"] + 3 * cameras["q"] + 0.5 * cameras["fov"])

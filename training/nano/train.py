@@ -27,7 +27,7 @@ from pathlib import Path
 
 import torch
 import torch.multiprocessing as multiprocessing
-from torch import Tensor
+from torch import Tensor, nn
 
 from .config import NanoConfig, from_dict
 from .data import Clip, Pool, Renderer, Scenes, clips_of, normalise, scenes
@@ -139,7 +139,7 @@ class Trainer:
         self.optimisers = optimisers(self.model, recipe.muon_lr, recipe.adam_lr)
         if state:
             self.model.load_state_dict(state["model"])
-            for optimiser, values in zip(self.optimisers, state["optimisers"], strict=True):
+            for optimiser, values in zip(self.optimisers, state["optimisers"][:2], strict=True):
                 optimiser.load_state_dict(values)
             self.step, self.room, self.seconds = state["step"], state["room"], state["seconds"]
             self.views_seen, self.distinct_views = state["views_seen"], state["distinct_views"]
@@ -147,13 +147,24 @@ class Trainer:
         self.ema.backbone["pretrained"].watch(())
         if state:
             self.ema.load_state_dict(state["ema"])
-        self.bases = (recipe.muon_lr, recipe.adam_lr)
+        # Reads from the patches how far they moved; see `losses.match_terms`.
+        width = 2 * self.config.dim
+        self.reader = nn.Sequential(nn.LayerNorm(width), nn.Linear(width, 2)).to(device)
+        nn.init.zeros_(self.reader[1].weight)
+        self.optimisers.append(torch.optim.AdamW(self.reader.parameters(), lr=recipe.adam_lr, weight_decay=0.01))
+        if state and "reader" in state:
+            self.reader.load_state_dict(state["reader"])
+        self.bases = (recipe.muon_lr, recipe.adam_lr, recipe.adam_lr)
         self.rng = random.Random(1000 * (rank + 1) + self.step)
         # What all processes must choose alike.
         self.common_rng = random.Random(self.step)
         self.team = Team(1, 0)
         # Somebody asked for the end; all processes stop after the same step.
         self.asked, self.stopping = False, False
+
+    def parameters(self) -> list[nn.Parameter]:
+        """All that is learned."""
+        return [*self.model.parameters(), *self.reader.parameters()]
 
     def join(self, team: Team) -> None:
         """Works as one of several from now on."""
@@ -166,6 +177,7 @@ class Trainer:
             "config": self.config.as_dict(),
             "model": self.model.state_dict(),
             "ema": self.ema.state_dict(),
+            "reader": self.reader.state_dict(),
             "optimisers": [o.state_dict() for o in self.optimisers],
             "step": self.step,
             "room": self.room,
@@ -208,11 +220,11 @@ class Trainer:
                 group["lr"] = base * factor * group.get("share", 1.0)
         rays = self.common_rng.random() < self.recipe.ray_share
         output = self.model(batch.images, batch.pose9 if posed else None, wants_rays=rays, autocast=True)
-        loss, terms = total(output, batch)
+        loss, terms = total(output, batch, self.reader)
         for optimiser in self.optimisers:
             optimiser.zero_grad(set_to_none=True)
         loss.backward()
-        self.stopping = self.team.average(self.rank, list(self.model.parameters()), self.asked)
+        self.stopping = self.team.average(self.rank, self.parameters(), self.asked)
         norm = torch.nn.utils.clip_grad_norm_(self.model.parameters(), 2.0)
         if torch.isfinite(norm):
             for optimiser in self.optimisers:
@@ -271,7 +283,7 @@ class Trainer:
                     means = {name: sum(v) / len(v) for name, v in sums.items()}
                     head = {"step": self.step, "hours": round(self.seconds / 3600, 3), "views": self.views_seen}
                     head |= {"distinct_views": self.distinct_views, "rooms": self.room}
-                    names = "loss norm depth aligned gradient ray t q fov pair first waited took".split()
+                    names = "loss norm depth aligned gradient ray t q fov pair first moved waited took".split()
                     row = {**head, **rounded({n: means.get(n, float("nan")) for n in names})}
                     append(self.run / "train.csv", row)
                     print(" ".join(f"{k} {v}" for k, v in row.items()), flush=True)
@@ -342,10 +354,11 @@ def main() -> None:
     parser.add_argument("--validate-every", type=int, default=500, help="steps")
     arguments = parser.parse_args()
     arguments.run.mkdir(parents=True, exist_ok=True)
+    recipe = Recipe.read(arguments.recipe)
     if arguments.processes == 1:
         work(0, arguments, None)
         return
-    numbers = sum(p.numel() for p in Nano(NanoConfig()).parameters())
+    numbers = sum(p.numel() for p in Trainer(arguments.run, recipe, arguments.stream).parameters())
     team = Team(arguments.processes, numbers)
     spawn = multiprocessing.get_context("spawn")
     others = [spawn.Process(target=work, args=(r, arguments, team), daemon=True) for r in range(1, arguments.processes)]

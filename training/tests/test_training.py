@@ -215,9 +215,13 @@ def test_attention_to_the_right_patches_costs_nothing():
     right.logits = {block: logits for block in WATCHED}
     wrong = perfect(batch)
     wrong.logits = {block: torch.zeros_like(logits) for block in WATCHED}
-    good, bad = match_terms(right, batch), match_terms(wrong, batch)
+    column = (weight[..., 0, :] * (index[..., 0, :] % 3)).sum(-1) - torch.arange(6) % 3
+    row = (weight[..., 0, :] * (index[..., 0, :] // 3)).sum(-1) - torch.arange(6) // 3
+    right.patches = torch.stack([column, row], -1) / 3
+    wrong.patches = torch.zeros_like(right.patches)
+    good, bad = match_terms(right, batch, torch.nn.Identity()), match_terms(wrong, batch, torch.nn.Identity())
     assert all(abs(good[name]) < 1e-3 for name in good), good
-    assert bad["pair"] > 0.5 and bad["first"] > bad["pair"], bad
+    assert bad["pair"] > 0.5 and bad["first"] > bad["pair"] and bad["moved"] > 0.05, bad
 
 
 def test_processes_average_their_gradients_and_share_the_directions():
