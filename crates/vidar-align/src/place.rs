@@ -68,6 +68,19 @@ impl Verdict {
     pub fn is_usable(self) -> bool {
         matches!(self, Self::PriorWorld | Self::Fitted | Self::Chained)
     }
+
+    /// In words, for messages.
+    pub fn words(self) -> &'static str {
+        match self {
+            Self::PriorWorld => "predicted in the anchors' own frame",
+            Self::Fitted => "fitted to its anchors",
+            Self::RankDeficient => "its cameras stand on a line or are too few to fix a place",
+            Self::Inconsistent => "its cameras do not fit their anchors",
+            Self::Chained => "placed by its neighbours",
+            Self::Garbage => "it contradicts its neighbour and its anchors, or holds no number",
+            Self::Unplaced => "neither anchor nor neighbour says where it is",
+        }
+    }
 }
 
 /// A placement together with its evidence.

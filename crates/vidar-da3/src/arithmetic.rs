@@ -86,8 +86,8 @@ pub struct Arithmetic {
     pub backbone: vidar_nn::Precision,
     /// Matrix products of the dense heads.
     pub head: vidar_nn::Precision,
-    /// Leading blocks in `f32` under a bf16 backbone; `None` is the first third, and
-    /// all but the last twenty.
+    /// Leading blocks in `f32` under a bf16 backbone; `None` is the first third, or all but the last twenty where those are
+    /// more.
     pub exact_blocks: Option<usize>,
     /// Whether backbone and heads are on a graphics processor, where this is how weights are stored: sums and activations
     /// are `f32` there.

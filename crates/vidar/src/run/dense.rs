@@ -187,10 +187,10 @@ impl Road<'_> {
         if report.verdict.is_usable() {
             return Ok(None);
         }
-        let message = format!(
-            "placement is {:?}: camera centres {:.3} m RMS off their anchors",
-            report.verdict, report.center_rms_m
-        );
+        let mut message = format!("not placed: {}", report.verdict.words());
+        if report.center_rms_m.is_finite() {
+            message += &format!(" (camera centres {:.3} m RMS off)", report.center_rms_m);
+        }
         let warning = Warning::new("chunk-not-placed", message.clone());
         self.events.warn(&warning.at(format!("chunk {}", report.chunk_id)));
         Ok(Some(message))
