@@ -3,6 +3,7 @@
 use crate::config::Layered;
 use crate::error::Error;
 use crate::events::{CancelToken, Event, Events};
+use crate::models::{self, geometry};
 use crate::run::{RunOutcome, RunRequest, run};
 use crate::run_folder::Place;
 use std::path::{Path, PathBuf};
@@ -25,6 +26,10 @@ pub struct DemoRequest {
 
 /// Renders the sequence into `sequence/` and runs on it into `run/`.
 pub fn demo(request: &DemoRequest, events: &Events, cancel: &CancelToken) -> Result<RunOutcome, Error> {
+    // Better a missing checkpoint now than after rendering.
+    if let Some(network) = geometry::chosen(&request.layered.build()?)? {
+        models::locate(&network, None, &models::store(true)?)?;
+    }
     let root = request.place.reserve()?;
     let sequence = root.join("sequence");
     synthesise(&sequence, &request.world, None, events, cancel)?;

@@ -325,6 +325,8 @@ fn models_are_listed_with_licence_size_and_what_they_can() {
     let ran = run(&["model", "where"]).ends_with(0);
     assert_eq!(ran.stdout.trim(), text(&folder.path().join("models")));
     run(&["model", "where", "da3-small"]).ends_with(4).says(&["error[E0403]", "vidar model pull da3-small"]);
+    run(&["demo", "--model", "da3-small", "-q"]).ends_with(4).says(&["error[E0403]"]);
+    assert!(!folder.path().join("runs").exists(), "said before anything was rendered");
     run(&["model", "verify"]).ends_with(0);
     run(&["model", "verify", "da3-small"]).ends_with(4);
     run(&["model", "pull", "da3-huge"]).ends_with(2).says(&["error[E0105]", "da3-small"]);

@@ -13,12 +13,16 @@ pub use memory::{MemoryPlan, device_memory, planned_memory};
 use crate::error::Error;
 use crate::run::bytes;
 use serde::Serialize;
+use std::fs::File;
+use std::io::Read as _;
 use std::path::{Path, PathBuf};
 use vidar_core::Warning;
 use vidar_da3::{Da3, Da3Config, Da3Options, Variant};
 use vidar_hub::catalogue::{self, CHECKPOINTS, WEIGHTS};
 use vidar_hub::{Acceptance, Checkpoint, HubError, HubSettings, Installed, PullOptions, Store, Watch};
 
+/// How much of a card is looked at.
+const CARD_HEAD_BYTES: u64 = 64 << 10;
 /// The end of a name that asks for weights made by rule.
 const UNTRAINED: &str = "-untrained";
 
@@ -83,7 +87,7 @@ pub struct ModelIdentity {
     pub name: String,
     /// The official checkpoint that its weights are, where they are one's.
     pub official: Option<&'static str>,
-    /// SPDX licence of the weights; `unknown` for weights of one's own.
+    /// SPDX licence of the weights; for weights of one's own what the card beside them says, else `unknown`.
     pub licence: String,
     /// SHA-256 of the weights; none for weights made by rule.
     pub weights_sha256: Option<String>,
@@ -203,7 +207,10 @@ fn folder(path: &Path, accepted: Option<&LicenceAccepted>, store: &Store) -> Res
         identity: ModelIdentity {
             name: path.display().to_string(),
             official: catalogue::of_hash(&sha256).map(|c| c.name),
-            licence: official.map_or_else(|| "unknown".to_owned(), |c| c.licence.spdx().to_owned()),
+            licence: match official {
+                Some(checkpoint) => checkpoint.licence.spdx().to_owned(),
+                None => weights.parent().and_then(card_licence).unwrap_or_else(|| "unknown".to_owned()),
+            },
             weights_sha256: Some(sha256),
             weights_bytes: bytes,
             source: Some(path.display().to_string()),
@@ -211,6 +218,18 @@ fn folder(path: &Path, accepted: Option<&LicenceAccepted>, store: &Store) -> Res
             geometry_means_something: true,
         },
     })
+}
+
+/// What `README.md` beside the weights names as `license:` in its head, as cards on the hub do.
+fn card_licence(folder: &Path) -> Option<String> {
+    let mut head = Vec::new();
+    File::open(folder.join("README.md")).ok()?.take(CARD_HEAD_BYTES).read_to_end(&mut head).ok()?;
+    let text = String::from_utf8_lossy(&head);
+    let front = text.strip_prefix("---")?.split("\n---").next()?;
+    let named = front.lines().find_map(|line| line.strip_prefix("license:"))?.trim();
+    let named = named.trim_matches(['"', '\'']);
+    let is_plain = |c: char| c.is_ascii_alphanumeric() || " .+-()".contains(c);
+    ((1..=64).contains(&named.len()) && named.chars().all(is_plain)).then(|| named.to_owned())
 }
 
 fn length(weights: &Path) -> Result<u64, Error> {
@@ -286,6 +305,20 @@ mod tests {
             let variant = Variant::from_name(checkpoint.architecture).unwrap();
             assert_eq!(variant.licence(), checkpoint.licence.spdx(), "{}", checkpoint.name);
         }
+    }
+
+    #[test]
+    fn a_card_tells_the_licence_of_weights_of_ones_own() {
+        let folder = tempfile::tempdir().unwrap();
+        let says = |text: &str| {
+            std::fs::write(folder.path().join("README.md"), text).unwrap();
+            card_licence(folder.path())
+        };
+        assert_eq!(says("---\ntags: [x]\nlicense: 'cc-by-4.0'\n---\n# Card\n").as_deref(), Some("cc-by-4.0"));
+        assert_eq!(says("# Card\nlicense: mit\n"), None, "only the head counts");
+        assert_eq!(says("---\nlicense: \u{1b}[31m\n---\n"), None);
+        assert_eq!(says(&format!("---\nlicense: {}\n---\n", "x".repeat(65))), None);
+        assert_eq!(card_licence(&folder.path().join("nowhere")), None);
     }
 
     #[test]
