@@ -127,7 +127,9 @@ fn graph_of_500_keyframes_per_iteration(bencher: Bencher<'_, '_>) {
     let (start, factors) = graph();
     let config = CoupledConfig { max_iterations: 4, tolerance: 0.0, ..Default::default() };
     let iterations = solve(&start, &factors, &config).expect("a solution").iterations;
-    bencher.counter(ItemsCount::new(iterations)).bench_local(|| solve(&start, &factors, &config).expect("a solution"));
+    bencher
+        .counter(ItemsCount::new(iterations))
+        .bench_local(|| solve(&start, &factors, &config).expect("a solution"));
 }
 
 /// One query among 50 000 places of 512 numbers.
