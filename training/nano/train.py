@@ -305,12 +305,16 @@ class Trainer:
         print(f"the recipe's last step is done after {time.monotonic() - began:.0f} s", flush=True)
 
 
-def work(rank: int, arguments: argparse.Namespace, team: Team | None) -> None:
-    """One process of training."""
+def trainer_of(arguments: argparse.Namespace, rank: int) -> Trainer:
+    """The trainer of one process."""
     torch.set_num_threads(arguments.threads)
-    trainer = Trainer(arguments.run, Recipe.read(arguments.recipe), arguments.stream, arguments.device, rank)
-    if team is not None:
-        trainer.join(team)
+    return Trainer(arguments.run, Recipe.read(arguments.recipe), arguments.stream, arguments.device, rank)
+
+
+def work(rank: int, arguments: argparse.Namespace, team: Team) -> None:
+    """Another process of training."""
+    trainer = trainer_of(arguments, rank)
+    trainer.join(team)
     trainer.train(arguments.save_every, arguments.validate_every)
 
 
@@ -354,17 +358,18 @@ def main() -> None:
     parser.add_argument("--validate-every", type=int, default=500, help="steps")
     arguments = parser.parse_args()
     arguments.run.mkdir(parents=True, exist_ok=True)
-    recipe = Recipe.read(arguments.recipe)
-    if arguments.processes == 1:
-        work(0, arguments, None)
-        return
-    numbers = sum(p.numel() for p in Trainer(arguments.run, recipe, arguments.stream).parameters())
-    team = Team(arguments.processes, numbers)
-    spawn = multiprocessing.get_context("spawn")
-    others = [spawn.Process(target=work, args=(r, arguments, team), daemon=True) for r in range(1, arguments.processes)]
+    # The first makes what all need (sample clips) before the others look for it.
+    first = trainer_of(arguments, 0)
+    others = []
+    if arguments.processes > 1:
+        team = Team(arguments.processes, sum(p.numel() for p in first.parameters()))
+        first.join(team)
+        spawn = multiprocessing.get_context("spawn")
+        others = [spawn.Process(target=work, args=(r, arguments, team)) for r in range(1, arguments.processes)]
     for process in others:
+        process.daemon = True
         process.start()
-    work(0, arguments, team)
+    first.train(arguments.save_every, arguments.validate_every)
     for process in others:
         process.join()
 
