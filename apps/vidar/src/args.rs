@@ -222,7 +222,7 @@ pub struct RunArgs {
     #[command(flatten)]
     pub output: OutputArgs,
     /// Source of depth: stereo, a network of `vidar model list` such as da3-small, or recorded:DIR.
-    #[arg(long, value_name = "NAME", help_heading = "Model")]
+    #[arg(long, visible_alias = "model", value_name = "NAME", help_heading = "Model")]
     pub geometry: Option<String>,
     /// How depth and metric poses are coupled: coupled, hybrid, pose-conditioned, ground-truth, pose-free, da3-streaming.
     #[arg(long, value_name = "MODE", help_heading = "Model")]
@@ -282,6 +282,12 @@ pub struct DemoArgs {
     /// What to simulate.
     #[command(flatten)]
     pub world: WorldArgs,
+    /// Where depth comes from: da3-nano (in the program), stereo, or another network; `vidar model list` names them.
+    #[arg(long, visible_alias = "model", value_name = "NAME", help_heading = "Model")]
+    pub geometry: Option<String>,
+    /// A folder with model.safetensors and config.json of one's own.
+    #[arg(long, value_hint = ValueHint::AnyPath, help_heading = "Model")]
+    pub model_dir: Option<PathBuf>,
     /// How settings are given.
     #[command(flatten)]
     pub config: ConfigArgs,
@@ -400,7 +406,7 @@ pub struct BenchArgs {
     #[arg(long, value_delimiter = ',', help_heading = "Model")]
     pub modes: Vec<String>,
     /// Source of depth: as for `vidar run`, or simulated (with --synthetic: a network's errors on true depth).
-    #[arg(long, value_name = "NAME", help_heading = "Model")]
+    #[arg(long, visible_alias = "model", value_name = "NAME", help_heading = "Model")]
     pub geometry: Option<String>,
     /// A folder with model.safetensors and config.json of one's own.
     #[arg(long, value_hint = ValueHint::AnyPath, help_heading = "Model")]

@@ -59,9 +59,11 @@ fn dry_run(request: &RunRequest, context: &Context) -> Outcome {
 
 /// A synthetic room, flown, mapped and judged.
 pub fn demo(args: &DemoArgs, context: &Context) -> Outcome {
+    let mut layered = build::layered(&args.config, Some("demo"))?;
+    build::apply_source_flags(&mut layered, args.geometry.as_deref(), args.model_dir.as_deref())?;
     let request = DemoRequest {
         world: build::world(&args.world, SynthConfig::demo())?,
-        layered: build::layered(&args.config, Some("demo"))?,
+        layered,
         place: build::place(&args.output, "demo"),
         command: context.command.clone(),
     };

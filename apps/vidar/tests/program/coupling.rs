@@ -1,6 +1,6 @@
 //! Couplings, recorded predictions and interrupted runs: the real program on a simulated network.
 
-use crate::support::{Ran, files_under, run_command, run_on, shared};
+use crate::support::{Ran, files_under, manifest, run_command, run_on, shared};
 use serde_json::Value;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
@@ -38,10 +38,6 @@ fn recorded(name: &str, folder: &Path, more: &[&str]) -> (Ran, PathBuf) {
     all[2] = &source;
     all.extend(more);
     (run_on(&shared().sequence, &out, &all), out)
-}
-
-fn manifest(run: &Path) -> Value {
-    serde_json::from_slice(&std::fs::read(run.join("manifest.json")).unwrap()).unwrap()
 }
 
 fn mesh(run: &Path) -> Vec<u8> {

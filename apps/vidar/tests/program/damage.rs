@@ -1,7 +1,6 @@
 //! Predictions and poses that are wrong: every coupling ends with a map and counts what acted, or says what it cannot do.
 
-use crate::support::{Ran, run_on, shared};
-use serde_json::Value;
+use crate::support::{Ran, manifest, run_on, shared};
 use std::fs::File;
 use std::path::{Path, PathBuf};
 use vidar::export_formats::official::{NpyArray, NpyData, NpzLimits, read_npz, write_npz_arrays};
@@ -35,10 +34,6 @@ fn run(name: &str, source: &str, more: &[&str]) -> (Ran, PathBuf) {
     }
     all.extend(more);
     (run_on(&shared().sequence, &out, &all), out)
-}
-
-fn manifest(run: &Path) -> Value {
-    serde_json::from_slice(&std::fs::read(run.join("manifest.json")).unwrap()).unwrap()
 }
 
 /// Predictions of a healthy run, made once.

@@ -189,3 +189,8 @@ pub fn keys(value: &Value, depth: usize) -> Vec<String> {
     }
     found
 }
+
+/// The manifest of a run.
+pub fn manifest(run: &Path) -> Value {
+    serde_json::from_slice(&std::fs::read(run.join("manifest.json")).unwrap()).unwrap()
+}

@@ -185,7 +185,10 @@ impl Table<'_> {
         };
         rows.push(std::iter::once("mean (valid)".to_owned()).chain(self.modes().map(average)).collect());
         Grid {
-            caption: format!("Table II: F@{threshold_m:.2} against the scan"),
+            caption: format!(
+                "Table II: F@{threshold_m:.2} against {}",
+                if euroc { "the scan" } else { "the depth sensor" }
+            ),
             columns: std::iter::once("Sequence".to_owned())
                 .chain(self.modes().map(|m| m.to_string()))
                 .collect(),

@@ -1,9 +1,10 @@
 //! Which network, where its weights are, and under which terms: the one door to `vidar-hub` and `vidar-da3`.
 //!
-//! A model is named (`da3-small`), or it is a folder of one's own (`--model-dir`), or it is *untrained*
+//! A model is named (`da3-small`), or it is in the program (`da3-nano`), or it is a folder of one's own (`--model-dir`), or it is *untrained*
 //! (`da3-small-untrained`): the official architecture with weights made by rule, whose geometry means nothing and which
 //! serves to try the road and to measure time and memory without weights.
 
+pub mod bundled;
 pub mod geometry;
 mod memory;
 pub mod salad;
@@ -13,12 +14,17 @@ pub use memory::{MemoryPlan, device_memory, planned_memory};
 use crate::error::Error;
 use crate::run::bytes;
 use serde::Serialize;
+use std::fs::File;
+use std::io::Read as _;
 use std::path::{Path, PathBuf};
 use vidar_core::Warning;
+use vidar_da3::preprocess::PreprocessConfig;
 use vidar_da3::{Da3, Da3Config, Da3Options, Variant};
 use vidar_hub::catalogue::{self, CHECKPOINTS, WEIGHTS};
 use vidar_hub::{Acceptance, Checkpoint, HubError, HubSettings, Installed, PullOptions, Store, Watch};
 
+/// How much of a card is looked at.
+const CARD_HEAD_BYTES: u64 = 64 << 10;
 /// The end of a name that asks for weights made by rule.
 const UNTRAINED: &str = "-untrained";
 
@@ -27,6 +33,8 @@ const UNTRAINED: &str = "-untrained";
 pub enum ModelChoice {
     /// An official checkpoint.
     Official(&'static Checkpoint),
+    /// The network that is part of the program.
+    Bundled,
     /// A folder with `model.safetensors` and `config.json`, or a safetensors file.
     Folder(PathBuf),
     /// An official architecture with weights made by rule.
@@ -36,6 +44,9 @@ pub enum ModelChoice {
 impl ModelChoice {
     /// The checkpoint of a name.
     pub fn named(name: &str) -> Result<Self, Error> {
+        if name == bundled::NAME {
+            return Ok(Self::Bundled);
+        }
         if let Some(architecture) = name.strip_suffix(UNTRAINED) {
             let checkpoint = catalogue::find(architecture)?;
             return match Variant::from_name(checkpoint.architecture) {
@@ -50,6 +61,7 @@ impl ModelChoice {
     pub fn name(&self) -> String {
         match self {
             Self::Official(checkpoint) => checkpoint.name.to_owned(),
+            Self::Bundled => bundled::NAME.to_owned(),
             Self::Folder(path) => path.display().to_string(),
             Self::Untrained(variant) => format!("{}{UNTRAINED}", variant.name()),
         }
@@ -70,7 +82,7 @@ pub struct LicenceAccepted {
 pub struct Located {
     /// Which one.
     pub choice: ModelChoice,
-    /// Its weights; `None` for weights made by rule.
+    /// Its weights; `None` for those in the program and those made by rule.
     pub path: Option<PathBuf>,
     /// What manifests say of it.
     pub identity: ModelIdentity,
@@ -83,7 +95,7 @@ pub struct ModelIdentity {
     pub name: String,
     /// The official checkpoint that its weights are, where they are one's.
     pub official: Option<&'static str>,
-    /// SPDX licence of the weights; `unknown` for weights of one's own.
+    /// SPDX licence of the weights; for weights of one's own what the card beside them says, else `unknown`.
     pub licence: String,
     /// SHA-256 of the weights; none for weights made by rule.
     pub weights_sha256: Option<String>,
@@ -112,6 +124,9 @@ pub fn locate(
 ) -> Result<Located, Error> {
     match choice {
         ModelChoice::Official(checkpoint) => official(checkpoint, accepted, store),
+        ModelChoice::Bundled => {
+            Ok(Located { choice: choice.clone(), path: None, identity: bundled::identity() })
+        }
         ModelChoice::Folder(path) => folder(path, accepted, store),
         ModelChoice::Untrained(_) => Ok(Located {
             choice: choice.clone(),
@@ -203,7 +218,10 @@ fn folder(path: &Path, accepted: Option<&LicenceAccepted>, store: &Store) -> Res
         identity: ModelIdentity {
             name: path.display().to_string(),
             official: catalogue::of_hash(&sha256).map(|c| c.name),
-            licence: official.map_or_else(|| "unknown".to_owned(), |c| c.licence.spdx().to_owned()),
+            licence: match official {
+                Some(checkpoint) => checkpoint.licence.spdx().to_owned(),
+                None => weights.parent().and_then(card_licence).unwrap_or_else(|| "unknown".to_owned()),
+            },
             weights_sha256: Some(sha256),
             weights_bytes: bytes,
             source: Some(path.display().to_string()),
@@ -211,6 +229,18 @@ fn folder(path: &Path, accepted: Option<&LicenceAccepted>, store: &Store) -> Res
             geometry_means_something: true,
         },
     })
+}
+
+/// What `README.md` beside the weights names as `license:` in its head, as cards on the hub do.
+fn card_licence(folder: &Path) -> Option<String> {
+    let mut head = Vec::new();
+    File::open(folder.join("README.md")).ok()?.take(CARD_HEAD_BYTES).read_to_end(&mut head).ok()?;
+    let text = String::from_utf8_lossy(&head);
+    let front = text.strip_prefix("---")?.split("\n---").next()?;
+    let named = front.lines().find_map(|line| line.strip_prefix("license:"))?.trim();
+    let named = named.trim_matches(['"', '\'']);
+    let is_plain = |c: char| c.is_ascii_alphanumeric() || " .+-()".contains(c);
+    ((1..=64).contains(&named.len()) && named.chars().all(is_plain)).then(|| named.to_owned())
 }
 
 fn length(weights: &Path) -> Result<u64, Error> {
@@ -227,6 +257,7 @@ impl Located {
     pub fn open(&self, options: &Da3Options) -> Result<Da3, Error> {
         match (&self.choice, &self.path) {
             (ModelChoice::Untrained(variant), _) => Ok(Da3::deterministic(*variant, options)?),
+            (ModelChoice::Bundled, _) => bundled::open(options),
             (_, Some(path)) => Ok(Da3::open(path, options)?),
             (_, None) => {
                 Err(HubError::NotInstalled { name: self.identity.name.clone(), looked: PathBuf::new() }
@@ -241,7 +272,16 @@ pub fn architecture(choice: &ModelChoice) -> Option<Da3Config> {
     match choice {
         ModelChoice::Official(checkpoint) => Variant::from_name(checkpoint.architecture).map(Variant::config),
         ModelChoice::Untrained(variant) => Some(variant.config()),
+        ModelChoice::Bundled => bundled::config().ok(),
         ModelChoice::Folder(_) => None,
+    }
+}
+
+/// Length of the bounding side at which a network is happiest, px.
+pub fn process_size_px(choice: &ModelChoice) -> usize {
+    match choice {
+        ModelChoice::Bundled => bundled::PROCESS_SIZE_PX,
+        _ => PreprocessConfig::default().process_size_px,
     }
 }
 
@@ -262,9 +302,9 @@ pub(crate) fn untrained(identity: &ModelIdentity) -> Option<Warning> {
     })
 }
 
-/// Names of all official checkpoints.
+/// Names of all networks that can be chosen.
 pub fn names() -> String {
-    CHECKPOINTS.iter().map(|c| c.name).collect::<Vec<_>>().join(", ")
+    std::iter::once(bundled::NAME).chain(CHECKPOINTS.iter().map(|c| c.name)).collect::<Vec<_>>().join(", ")
 }
 
 #[cfg(test)]
@@ -286,6 +326,20 @@ mod tests {
             let variant = Variant::from_name(checkpoint.architecture).unwrap();
             assert_eq!(variant.licence(), checkpoint.licence.spdx(), "{}", checkpoint.name);
         }
+    }
+
+    #[test]
+    fn a_card_tells_the_licence_of_weights_of_ones_own() {
+        let folder = tempfile::tempdir().unwrap();
+        let says = |text: &str| {
+            std::fs::write(folder.path().join("README.md"), text).unwrap();
+            card_licence(folder.path())
+        };
+        assert_eq!(says("---\ntags: [x]\nlicense: 'cc-by-4.0'\n---\n# Card\n").as_deref(), Some("cc-by-4.0"));
+        assert_eq!(says("# Card\nlicense: mit\n"), None, "only the head counts");
+        assert_eq!(says("---\nlicense: \u{1b}[31m\n---\n"), None);
+        assert_eq!(says(&format!("---\nlicense: {}\n---\n", "x".repeat(65))), None);
+        assert_eq!(card_licence(&folder.path().join("nowhere")), None);
     }
 
     #[test]
