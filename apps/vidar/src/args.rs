@@ -282,7 +282,7 @@ pub struct DemoArgs {
     /// What to simulate.
     #[command(flatten)]
     pub world: WorldArgs,
-    /// Source of depth: stereo, or a network of `vidar model list` that is here.
+    /// Where depth comes from: da3-nano (in the program), stereo, or another network; `vidar model list` names them.
     #[arg(long, visible_alias = "model", value_name = "NAME", help_heading = "Model")]
     pub geometry: Option<String>,
     /// A folder with model.safetensors and config.json of one's own.

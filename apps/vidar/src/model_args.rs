@@ -157,7 +157,7 @@ pub struct DepthArgs {
     /// Images, or folders of images; all are seen together, in this order.
     #[arg(required = true, value_hint = ValueHint::AnyPath)]
     pub inputs: Vec<PathBuf>,
-    /// The network: `vidar model list` names them; `…-untrained` has weights made by rule.
+    /// The network: `vidar model list` names them (da3-nano needs no download); `…-untrained` has weights made by rule.
     #[arg(long, default_value = "da3-small", help_heading = "Model")]
     pub model: String,
     /// A folder with model.safetensors and config.json of one's own.
@@ -172,9 +172,9 @@ pub struct DepthArgs {
     /// Where the network is computed: cpu, gpu, gpu:N or auto; `vidar doctor` lists graphics processors.
     #[arg(long, default_value_t, value_name = "DEVICE", help_heading = "Model")]
     pub device: Device,
-    /// Length of the bounding side of what the network sees, pixels.
-    #[arg(long, default_value_t = 504, help_heading = "Model")]
-    pub process_res: usize,
+    /// Length of the bounding side of what the network sees, pixels; default: 504, for da3-nano what it was trained for.
+    #[arg(long, value_name = "PX", help_heading = "Model")]
+    pub process_res: Option<usize>,
     /// Which side that is, and how multiples of 14 are reached.
     #[arg(long, value_enum, default_value_t = MethodArg::UpperBoundResize, help_heading = "Model")]
     pub method: MethodArg,

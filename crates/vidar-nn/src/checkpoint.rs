@@ -103,6 +103,14 @@ impl Checkpoint {
         Self::from_mapping(Mapping::from(bytes), origin)
     }
 
+    /// Reads a file that is part of the program, without copying it; `origin` names it in errors.
+    ///
+    /// # Errors
+    /// [`CheckpointError::Invalid`].
+    pub fn from_static(bytes: &'static [u8], origin: &str) -> Result<Self, CheckpointError> {
+        Self::from_mapping(Mapping::Static(bytes), origin)
+    }
+
     fn from_mapping(mapping: Mapping, origin: &str) -> Result<Self, CheckpointError> {
         let parsed = header::parse(mapping.bytes())
             .map_err(|what| CheckpointError::Invalid { origin: origin.to_owned(), what })?;

@@ -67,6 +67,7 @@ fn request(args: &DepthArgs, context: &Context) -> Result<DepthRequest, Error> {
     if let Some(focal) = args.focal.filter(|f| !(f.is_finite() && *f > 0.0)) {
         return Err(usage(format!("--focal {focal}"), "give the focal length in pixels of the images"));
     }
+    let infer = infer_options(args, &model);
     let name = args.inputs.first().map(|path| build::name_of(path)).unwrap_or_default();
     Ok(DepthRequest {
         inputs: args.inputs.clone(),
@@ -80,7 +81,7 @@ fn request(args: &DepthArgs, context: &Context) -> Result<DepthRequest, Error> {
             device: args.device,
             ..Da3Options::default()
         },
-        infer: infer_options(args),
+        infer,
         poses: args.poses.clone(),
         focal_px: args.focal,
         formats: parse_formats(&args.format)?,
@@ -98,7 +99,8 @@ fn request(args: &DepthArgs, context: &Context) -> Result<DepthRequest, Error> {
     })
 }
 
-fn infer_options(args: &DepthArgs) -> InferOptions {
+fn infer_options(args: &DepthArgs, model: &ModelChoice) -> InferOptions {
+    let process_size_px = args.process_res.unwrap_or_else(|| models::process_size_px(model));
     let method = match args.method {
         MethodArg::UpperBoundResize => ResizeMethod::UpperBoundResize,
         MethodArg::UpperBoundCrop => ResizeMethod::UpperBoundCrop,
@@ -106,7 +108,7 @@ fn infer_options(args: &DepthArgs) -> InferOptions {
         MethodArg::LowerBoundCrop => ResizeMethod::LowerBoundCrop,
     };
     InferOptions {
-        preprocess: PreprocessConfig { process_size_px: args.process_res, method },
+        preprocess: PreprocessConfig { process_size_px, method },
         reference: match args.ref_view {
             RefViewArg::SaddleBalanced => ReferenceStrategy::SaddleBalanced,
             RefViewArg::SaddleSimRange => ReferenceStrategy::SaddleSimRange,

@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 use vidar::core::Warning;
 use vidar::da3::{self, Da3Options, check};
 use vidar::hub::{Ability, Checkpoint, Installed, Progress, Watch, catalogue};
-use vidar::models::{self, LicenceAccepted};
+use vidar::models::{self, LicenceAccepted, bundled};
 use vidar::run::bytes;
 use vidar::{Error, Event, Events, ExitStatus};
 
@@ -27,7 +27,14 @@ pub fn model(command: &ModelCommand, context: &Context) -> Outcome {
 
 fn list(context: &Context) -> Outcome {
     let store = models::store(context.cli.offline)?;
-    let mut rows = Vec::new();
+    let mut rows = vec![bundled_row()?];
+    if !context.cli.json {
+        let (name, size) = (bundled::NAME, bytes(bundled::bytes()));
+        let words: Vec<&str> = BUNDLED_ABILITIES.iter().map(|a| a.words()).collect();
+        print::data(format!("{name:<26} {:<5} {size:>9}  {}", "here", bundled::LICENCE));
+        print::data(format!("    {}; {} M parameters", words.join(", "), bundled::parameters()? / 1_000_000));
+        print::data(format!("    {}", bundled::NOTE));
+    }
     for (checkpoint, installed) in store.list()? {
         let abilities: Vec<&str> = checkpoint.abilities.iter().map(|a| a.words()).collect();
         if context.cli.json {
@@ -56,6 +63,30 @@ fn list(context: &Context) -> Outcome {
         print::json(&json!({ "schema": "vidar.models/1", "models": rows }));
     }
     Ok(ExitStatus::Done)
+}
+
+const BUNDLED_ABILITIES: [Ability; 2] = [Ability::MultiViewDepth, Ability::Cameras];
+
+fn bundled_row() -> Result<serde_json::Value, Error> {
+    Ok(json!({
+        "name": bundled::NAME, "repository": null, "licence": bundled::LICENCE, "commercial_use": true,
+        "parameters": bundled::parameters()?, "bytes": bundled::bytes(), "sha256": bundled::sha256(),
+        "abilities": BUNDLED_ABILITIES, "note": bundled::NOTE, "installed": bundled::SOURCE, "place": "program",
+    }))
+}
+
+/// Says that nothing is to be done for the network in the program; whether `name` is that one.
+fn is_in_program(name: &str, schema: &str, context: &Context) -> bool {
+    let is_it = name == bundled::NAME;
+    if is_it && context.cli.json {
+        let (name, place, sha256) = (bundled::NAME, "program", bundled::sha256());
+        print::json(
+            &json!({ "schema": schema, "name": name, "folder": null, "place": place, "sha256": sha256 }),
+        );
+    } else if is_it {
+        print::data(format!("{name} is {}; sha256 {}", bundled::SOURCE, bundled::sha256()));
+    }
+    is_it
 }
 
 fn ability(ability: &Ability) -> serde_json::Value {
@@ -90,6 +121,9 @@ fn watched<T>(
 }
 
 fn pull(args: &PullArgs, context: &Context) -> Outcome {
+    if is_in_program(&args.name, "vidar.model/1", context) {
+        return Ok(ExitStatus::Done);
+    }
     let checkpoint = catalogue::find(&args.name)?;
     let store = models::store(context.cli.offline)?;
     let acceptance = models::acceptance_of(checkpoint, accepted(&args.licence).as_ref())?;
@@ -148,6 +182,9 @@ fn told(installed: &Installed, context: &Context) -> Outcome {
 }
 
 fn verify(name: Option<&str>, context: &Context) -> Outcome {
+    if name.is_some_and(|name| is_in_program(name, "vidar.verify/1", context)) {
+        return Ok(ExitStatus::Done);
+    }
     let store = models::store(true)?;
     let wanted: Vec<&'static Checkpoint> = match name {
         Some(name) => vec![catalogue::find(name)?],
@@ -173,6 +210,9 @@ fn verify(name: Option<&str>, context: &Context) -> Outcome {
 }
 
 fn locate(name: Option<&str>, context: &Context) -> Outcome {
+    if name.is_some_and(|name| is_in_program(name, "vidar.where/1", context)) {
+        return Ok(ExitStatus::Done);
+    }
     let store = models::store(true)?;
     let folder = match name {
         Some(name) => {

@@ -304,7 +304,7 @@ fn models_are_listed_with_licence_size_and_what_they_can() {
     let json = run(&["model", "list", "--json"]).ends_with(0).json();
     assert_eq!(json["schema"], "vidar.models/1");
     let models = json["models"].as_array().unwrap();
-    assert_eq!(models.len(), 10);
+    assert_eq!(models.len(), 11);
     assert_eq!(
         keys(&models[0], 1),
         [
@@ -321,7 +321,9 @@ fn models_are_listed_with_licence_size_and_what_they_can() {
             "place"
         ]
     );
-    assert!(models.iter().all(|m| m["installed"].is_null()));
+    assert_eq!((&models[0]["name"], &models[0]["place"]), (&json!("da3-nano"), &json!("program")));
+    assert!(models.iter().all(|m| keys(m, 1) == keys(&models[0], 1)));
+    assert!(models[1..].iter().all(|m| m["installed"].is_null()));
     let ran = run(&["model", "where"]).ends_with(0);
     assert_eq!(ran.stdout.trim(), text(&folder.path().join("models")));
     run(&["model", "where", "da3-small"]).ends_with(4).says(&["error[E0403]", "vidar model pull da3-small"]);
@@ -329,7 +331,27 @@ fn models_are_listed_with_licence_size_and_what_they_can() {
     assert!(!folder.path().join("runs").exists(), "said before anything was rendered");
     run(&["model", "verify"]).ends_with(0);
     run(&["model", "verify", "da3-small"]).ends_with(4);
+    for verb in ["where", "verify", "pull"] {
+        let ran = run(&["model", verb, "da3-nano"]).ends_with(0);
+        assert!(ran.stdout.contains("part of the program"), "{}", ran.stdout);
+        assert_eq!(run(&["model", verb, "da3-nano", "--json"]).ends_with(0).json()["place"], "program");
+    }
     run(&["model", "pull", "da3-huge"]).ends_with(2).says(&["error[E0105]", "da3-small"]);
+}
+
+#[test]
+fn the_network_in_the_program_needs_nothing_and_says_what_it_is() {
+    let b = bench();
+    let out = b.root.join("nano");
+    let args = ["depth", text(&b.images), "--model", "da3-nano", "-o", text(&out), "-q"];
+    let mut command = command_with_store(&b.root);
+    let ran: Ran = command.args(args).output().unwrap().into();
+    ran.ends_with(0).says(&["small-network", "vidar model pull da3-small"]);
+    let manifest = read_json(&out.join("manifest.json"));
+    let model = &manifest["model"];
+    assert_eq!((&model["name"], &model["licence"]), (&json!("da3-nano"), &json!("MIT OR Apache-2.0")));
+    assert_eq!(model["weights_sha256"].as_str().map(str::len), Some(64));
+    assert_eq!(read_json(&out.join("predictions.json"))["width"], 224, "the size that it was trained for");
 }
 
 #[test]

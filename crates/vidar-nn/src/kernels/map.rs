@@ -1,4 +1,4 @@
-//! A read-only view of a file's bytes: mapped, or owned.
+//! A read-only view of a file's bytes: mapped, owned, or part of the program.
 
 use std::fs::File;
 use std::path::Path;
@@ -9,6 +9,7 @@ use memmap2::Mmap;
 pub(crate) enum Mapping {
     Mapped(Mmap),
     Owned(Vec<u8>),
+    Static(&'static [u8]),
 }
 
 impl Mapping {
@@ -27,6 +28,7 @@ impl Mapping {
         match self {
             Self::Mapped(map) => map,
             Self::Owned(bytes) => bytes,
+            Self::Static(bytes) => bytes,
         }
     }
 }

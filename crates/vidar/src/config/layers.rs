@@ -2,10 +2,15 @@
 
 use super::{Config, PRESETS};
 use crate::error::Error;
+use crate::models::bundled;
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt;
 use std::path::{Path, PathBuf};
 use toml::{Table, Value};
+use vidar_da3::preprocess::PreprocessConfig;
+
+const SOURCE: &str = "geometry.source";
+const PROCESS_SIZE: &str = "model.network.preprocess.process_size_px";
 
 /// Where a value came from.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -130,7 +135,24 @@ impl Layered {
         )?;
         store(&mut self.values, key, value);
         self.origins.insert(key.to_owned(), origin);
+        if key == SOURCE {
+            self.follow_source();
+        }
         Ok(())
+    }
+
+    /// A network that is happy with less than the usual size gets that, unless somebody chose another.
+    fn follow_source(&mut self) {
+        if !matches!(self.origins.get(PROCESS_SIZE), Some(Origin::Default | Origin::Derived(_))) {
+            return;
+        }
+        let is_bundled = lookup(&self.values, SOURCE).and_then(Value::as_str) == Some(bundled::NAME);
+        let (size, origin) = match is_bundled {
+            true => (bundled::PROCESS_SIZE_PX, Origin::Derived("the size that da3-nano was trained for")),
+            false => (PreprocessConfig::default().process_size_px, Origin::Default),
+        };
+        store(&mut self.values, PROCESS_SIZE, Value::Integer(size as i64));
+        self.origins.insert(PROCESS_SIZE.to_owned(), origin);
     }
 
     fn table(&mut self, text: &str, origin: &Origin) -> Result<(), Error> {

@@ -99,3 +99,19 @@ fn a_bad_file_is_named() {
     std::fs::write(&file, "[keyframes\n").unwrap();
     assert_eq!(defaults().file(&file).unwrap_err().code(), "E0103");
 }
+
+#[test]
+fn the_network_in_the_program_gets_its_own_size_unless_one_is_asked_for() {
+    let size = |layered: &Layered| layered.build().unwrap().model.network.preprocess.process_size_px;
+    let mut layered = defaults();
+    layered.set("geometry.source=da3-nano").unwrap();
+    assert_eq!(size(&layered), crate::models::bundled::PROCESS_SIZE_PX);
+    let entries = layered.entries();
+    let entry = entries.iter().find(|(key, ..)| key == "model.network.preprocess.process_size_px").unwrap();
+    assert!(matches!(entry.2, Origin::Derived(_)), "{}", entry.2);
+    layered.set("geometry.source=da3-small").unwrap();
+    assert_eq!(size(&layered), 504, "another network does not inherit it");
+    layered.set("model.network.preprocess.process_size_px=140").unwrap();
+    layered.set("geometry.source=da3-nano").unwrap();
+    assert_eq!(size(&layered), 140, "what was asked for stays");
+}

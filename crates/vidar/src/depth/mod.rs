@@ -334,6 +334,7 @@ fn unit_of(
 fn warnings(plan: &DepthPlan, located: &Located, prediction: &Prediction) -> Vec<Warning> {
     let mut warnings = plan.warnings.clone();
     warnings.extend(models::untrained(&located.identity));
+    warnings.extend(models::bundled::modest(&located.identity));
     if prediction.was_cropped {
         let message = "images of several shapes were cut to the smallest";
         warnings.push(Warning::new("cropped", message).hint("predict them apart from each other"));

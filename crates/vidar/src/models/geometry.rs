@@ -98,6 +98,7 @@ pub fn planned(
     let mut warnings: Vec<Warning> = Vec::new();
     warnings.extend(super::too_much(&memory).filter(|_| device.is_none()));
     warnings.extend(super::untrained(&identity));
+    warnings.extend(super::bundled::modest(&identity));
     let arithmetic = model.network().describe_compute();
     Ok((NetworkPlan { identity, views_at_once: views, memory, arithmetic, device }, warnings))
 }

@@ -1,9 +1,10 @@
 //! Which network, where its weights are, and under which terms: the one door to `vidar-hub` and `vidar-da3`.
 //!
-//! A model is named (`da3-small`), or it is a folder of one's own (`--model-dir`), or it is *untrained*
+//! A model is named (`da3-small`), or it is in the program (`da3-nano`), or it is a folder of one's own (`--model-dir`), or it is *untrained*
 //! (`da3-small-untrained`): the official architecture with weights made by rule, whose geometry means nothing and which
 //! serves to try the road and to measure time and memory without weights.
 
+pub mod bundled;
 pub mod geometry;
 mod memory;
 pub mod salad;
@@ -17,6 +18,7 @@ use std::fs::File;
 use std::io::Read as _;
 use std::path::{Path, PathBuf};
 use vidar_core::Warning;
+use vidar_da3::preprocess::PreprocessConfig;
 use vidar_da3::{Da3, Da3Config, Da3Options, Variant};
 use vidar_hub::catalogue::{self, CHECKPOINTS, WEIGHTS};
 use vidar_hub::{Acceptance, Checkpoint, HubError, HubSettings, Installed, PullOptions, Store, Watch};
@@ -31,6 +33,8 @@ const UNTRAINED: &str = "-untrained";
 pub enum ModelChoice {
     /// An official checkpoint.
     Official(&'static Checkpoint),
+    /// The network that is part of the program.
+    Bundled,
     /// A folder with `model.safetensors` and `config.json`, or a safetensors file.
     Folder(PathBuf),
     /// An official architecture with weights made by rule.
@@ -40,6 +44,9 @@ pub enum ModelChoice {
 impl ModelChoice {
     /// The checkpoint of a name.
     pub fn named(name: &str) -> Result<Self, Error> {
+        if name == bundled::NAME {
+            return Ok(Self::Bundled);
+        }
         if let Some(architecture) = name.strip_suffix(UNTRAINED) {
             let checkpoint = catalogue::find(architecture)?;
             return match Variant::from_name(checkpoint.architecture) {
@@ -54,6 +61,7 @@ impl ModelChoice {
     pub fn name(&self) -> String {
         match self {
             Self::Official(checkpoint) => checkpoint.name.to_owned(),
+            Self::Bundled => bundled::NAME.to_owned(),
             Self::Folder(path) => path.display().to_string(),
             Self::Untrained(variant) => format!("{}{UNTRAINED}", variant.name()),
         }
@@ -74,7 +82,7 @@ pub struct LicenceAccepted {
 pub struct Located {
     /// Which one.
     pub choice: ModelChoice,
-    /// Its weights; `None` for weights made by rule.
+    /// Its weights; `None` for those in the program and those made by rule.
     pub path: Option<PathBuf>,
     /// What manifests say of it.
     pub identity: ModelIdentity,
@@ -116,6 +124,9 @@ pub fn locate(
 ) -> Result<Located, Error> {
     match choice {
         ModelChoice::Official(checkpoint) => official(checkpoint, accepted, store),
+        ModelChoice::Bundled => {
+            Ok(Located { choice: choice.clone(), path: None, identity: bundled::identity() })
+        }
         ModelChoice::Folder(path) => folder(path, accepted, store),
         ModelChoice::Untrained(_) => Ok(Located {
             choice: choice.clone(),
@@ -246,6 +257,7 @@ impl Located {
     pub fn open(&self, options: &Da3Options) -> Result<Da3, Error> {
         match (&self.choice, &self.path) {
             (ModelChoice::Untrained(variant), _) => Ok(Da3::deterministic(*variant, options)?),
+            (ModelChoice::Bundled, _) => bundled::open(options),
             (_, Some(path)) => Ok(Da3::open(path, options)?),
             (_, None) => {
                 Err(HubError::NotInstalled { name: self.identity.name.clone(), looked: PathBuf::new() }
@@ -260,7 +272,16 @@ pub fn architecture(choice: &ModelChoice) -> Option<Da3Config> {
     match choice {
         ModelChoice::Official(checkpoint) => Variant::from_name(checkpoint.architecture).map(Variant::config),
         ModelChoice::Untrained(variant) => Some(variant.config()),
+        ModelChoice::Bundled => bundled::config().ok(),
         ModelChoice::Folder(_) => None,
+    }
+}
+
+/// Length of the bounding side at which a network is happiest, px.
+pub fn process_size_px(choice: &ModelChoice) -> usize {
+    match choice {
+        ModelChoice::Bundled => bundled::PROCESS_SIZE_PX,
+        _ => PreprocessConfig::default().process_size_px,
     }
 }
 
@@ -281,9 +302,9 @@ pub(crate) fn untrained(identity: &ModelIdentity) -> Option<Warning> {
     })
 }
 
-/// Names of all official checkpoints.
+/// Names of all networks that can be chosen.
 pub fn names() -> String {
-    CHECKPOINTS.iter().map(|c| c.name).collect::<Vec<_>>().join(", ")
+    std::iter::once(bundled::NAME).chain(CHECKPOINTS.iter().map(|c| c.name)).collect::<Vec<_>>().join(", ")
 }
 
 #[cfg(test)]

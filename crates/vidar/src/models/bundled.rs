@@ -1,0 +1,93 @@
+//! da3-nano: a small network of our own that is part of the program. How it was made is in `training/`, what it can and
+//! cannot do in `models/da3-nano/README.md`.
+
+use super::ModelIdentity;
+use crate::error::Error;
+use sha2::{Digest, Sha256};
+use std::sync::Arc;
+use std::sync::OnceLock;
+use vidar_core::Warning;
+use vidar_da3::config::json;
+use vidar_da3::{Da3, Da3Config, Da3Options};
+use vidar_nn::Checkpoint;
+
+/// What the user calls it.
+pub const NAME: &str = "da3-nano";
+/// Licence of its weights.
+pub const LICENCE: &str = "MIT OR Apache-2.0";
+/// Longer side of the pictures that it was trained for, px.
+pub const PROCESS_SIZE_PX: usize = 224;
+/// What one should know before choosing it.
+pub const NOTE: &str =
+    "in the program; trained on rendered rooms, to try things out: for real recordings take da3-small";
+/// Where weights and description come from, for errors and manifests.
+pub const SOURCE: &str = "part of the program (models/da3-nano)";
+
+static WEIGHTS: &[u8] = include_bytes!("../../../../models/da3-nano/model.safetensors");
+static DESCRIPTION: &str = include_str!("../../../../models/da3-nano/config.json");
+
+/// Its architecture.
+pub fn config() -> Result<Da3Config, Error> {
+    Ok(json::parse(DESCRIPTION, SOURCE)?)
+}
+
+/// Length of its weights, bytes.
+pub fn bytes() -> u64 {
+    WEIGHTS.len() as u64
+}
+
+/// Numbers that the network has.
+pub fn parameters() -> Result<u64, Error> {
+    let shapes = vidar_da3::weights::inventory::parameters(&config()?);
+    Ok(shapes.iter().filter(|p| p.is_read).map(|p| p.shape.iter().product::<usize>() as u64).sum())
+}
+
+/// SHA-256 of its weights.
+pub fn sha256() -> &'static str {
+    static FOUND: OnceLock<String> = OnceLock::new();
+    FOUND.get_or_init(|| Sha256::digest(WEIGHTS).iter().map(|byte| format!("{byte:02x}")).collect())
+}
+
+/// Opens the network; its weights are read where they are.
+pub fn open(options: &Da3Options) -> Result<Da3, Error> {
+    let checkpoint = Checkpoint::from_static(WEIGHTS, SOURCE).map_err(vidar_da3::Da3Error::from)?;
+    Ok(Da3::with_weights(config()?, Arc::new(checkpoint), options)?)
+}
+
+/// What manifests say of it.
+pub fn identity() -> ModelIdentity {
+    ModelIdentity {
+        name: NAME.to_owned(),
+        official: None,
+        licence: LICENCE.to_owned(),
+        weights_sha256: Some(sha256().to_owned()),
+        weights_bytes: bytes(),
+        source: Some(SOURCE.to_owned()),
+        acceptance: None,
+        geometry_means_something: true,
+    }
+}
+
+/// What everybody should know who uses it.
+pub(crate) fn modest(identity: &ModelIdentity) -> Option<Warning> {
+    (identity.name == NAME).then(|| {
+        let message = "da3-nano is small and has seen rendered rooms only";
+        let hint = "for recordings of your own fetch official weights: `vidar model pull da3-small`";
+        Warning::new("small-network", message).hint(hint)
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use vidar_da3::weights::verify;
+
+    #[test]
+    fn it_is_whole_and_small() {
+        let checkpoint = Checkpoint::from_static(WEIGHTS, SOURCE).unwrap();
+        verify(&checkpoint, &config().unwrap()).unwrap();
+        assert!(bytes() <= 16 << 20, "{} bytes", bytes());
+        assert_eq!(sha256().len(), 64);
+        open(&Da3Options::default()).unwrap();
+    }
+}
