@@ -90,7 +90,7 @@ pub fn depth_ratios(
 }
 
 /// Depth at the nearest pixel, unless an edge runs through its neighbourhood.
-fn smooth_depth(depth: &Image<f32>, x: f64, y: f64) -> Option<f32> {
+pub(crate) fn smooth_depth(depth: &Image<f32>, x: f64, y: f64) -> Option<f32> {
     let (x, y) = (x.round(), y.round());
     if !(x >= 0.0 && y >= 0.0) {
         return None;

@@ -8,7 +8,8 @@ use flat::*;
 use vidar_align::aligner::Guard;
 use vidar_align::streaming::chunk_ranges;
 use vidar_align::{Aligner, AlignerConfig, CouplingMode, Placement, Verdict};
-use vidar_core::{LieGroup, Se3, umeyama_sim3};
+use vidar_core::model::ChunkFrame;
+use vidar_core::{GeometryPrediction, Image, LieGroup, RelativeDepth, Se3, umeyama_sim3};
 
 fn run(mode: CouplingMode, truth: &[Se3], odometry: Option<&[Se3]>, model: Model, seed: u64) -> Placement {
     let mut noise = Noise::new(seed);
@@ -86,14 +87,14 @@ fn the_same_input_gives_the_same_bits() {
 }
 
 /// A depth that leans across the image, as no similarity of a chunk can repair.
-fn lean(prediction: &mut vidar_core::GeometryPrediction) {
+fn lean(prediction: &mut GeometryPrediction) {
     for view in &mut prediction.views {
         let depth = view.depth.image().clone();
-        let leaning = vidar_core::Image::from_fn(WIDTH, HEIGHT, |x, y| {
+        let leaning = Image::from_fn(WIDTH, HEIGHT, |x, y| {
             let across = x as f32 / (WIDTH - 1) as f32 - 0.5;
             depth[(x, y)] * (0.12 * across).exp()
         });
-        view.depth = vidar_core::RelativeDepth::new(leaning);
+        view.depth = RelativeDepth::new(leaning);
     }
 }
 
@@ -134,6 +135,74 @@ fn landmarks_straighten_a_leaning_depth_and_tell_the_scale() {
         }
     }
     assert!(after < 0.75 * before, "{} before, {} after", before / count, after / count);
+}
+
+/// What a small network that was given the poses may say: too near by a fifth, and bent its own way in each view.
+fn rough(truth: &[Se3], range: std::ops::Range<usize>, id: u32, noise: &mut Noise) -> GeometryPrediction {
+    let mut prediction = predict(truth, range, id, Model { has_gauge: false, ..EXACT }, noise);
+    prediction.frame = ChunkFrame::PriorWorld;
+    for view in &mut prediction.views {
+        let (offset, across, down) = (0.08 * noise.normal(), 0.25 * noise.normal(), 0.25 * noise.normal());
+        let exact = view.depth.image().clone();
+        let bent = Image::from_fn(WIDTH, HEIGHT, |x, y| {
+            let (x_share, y_share) = (x as f64 / WIDTH as f64 - 0.5, y as f64 / HEIGHT as f64 - 0.5);
+            let off = (-0.22 + offset + across * x_share + down * y_share).exp();
+            (f64::from(exact[(x, y)]) * off) as f32
+        });
+        view.depth = RelativeDepth::new(bent);
+    }
+    prediction
+}
+
+/// Middle of |ln| of depth over truth, of a run of rough predictions; landmarks in every `step`-th frame.
+fn rough_run(step: usize) -> (f64, Placement) {
+    let truth = laps(36, 0.7);
+    let (mut noise, mut points) = (Noise::new(21), Noise::new(22));
+    let mut machine = Aligner::new(CouplingMode::Coupled, &AlignerConfig::default()).unwrap();
+    let mut predictions = Vec::new();
+    for (k, range) in chunk_ranges(36, 12, 4).unwrap().into_iter().enumerate() {
+        let prediction = rough(&truth, range.frames.clone(), k as u32, &mut noise);
+        predictions.push(prediction.clone());
+        let seen: Vec<_> = range
+            .frames
+            .map(|i| {
+                let count = if i % step == 0 { 50 } else { 0 };
+                (i, landmarks(&truth[i], i, count, 0.02, 0.05, &mut points))
+            })
+            .collect();
+        let of = |i: usize| seen.iter().find(|s| s.0 == i).map_or(Vec::new(), |s| s.1.clone());
+        machine.push(observe(prediction, Some(&truth), of)).unwrap();
+    }
+    let placement = machine.finish();
+    let mut off: Vec<f64> = Vec::new();
+    for prediction in predictions {
+        for view in placement.aligned_views(prediction, &[]).unwrap() {
+            let exact = depth(&truth[view.frame_id().index()]);
+            let ratios = view.depth().image().data().iter().zip(exact.data()).map(|(d, z)| f64::from(d / z));
+            off.extend(ratios.map(|r| r.ln().abs()));
+        }
+    }
+    off.sort_by(f64::total_cmp);
+    (off[off.len() / 2], placement)
+}
+
+#[test]
+fn a_rough_depth_in_the_anchors_world_is_brought_to_landmarks_and_its_poses_stay() {
+    let (error, placement) = rough_run(1);
+    assert_eq!(placement.guards.of(Guard::DepthRescaled), placement.chunks.len());
+    assert_eq!(placement.guards.of(Guard::OdometryDistrusted) + placement.guards.of(Guard::GarbageChunk), 0);
+    assert_eq!(placement.views.len(), 36);
+    let moved = absolute_error(&placement, &laps(36, 0.7));
+    assert!(moved < 0.02, "{moved}");
+    // Uncorrected it is off by more than a fifth.
+    assert!(error < 0.04, "{error}");
+}
+
+#[test]
+fn views_without_landmarks_are_corrected_by_their_neighbours() {
+    let (error, placement) = rough_run(3);
+    assert!(placement.views.iter().all(|v| v.field.is_some()));
+    assert!(error < 0.06, "{error}");
 }
 
 #[test]
@@ -200,11 +269,11 @@ fn a_chunk_predicted_in_the_anchors_world_keeps_its_metres_though_its_cameras_si
     for (k, start) in [0, 12, 24].into_iter().enumerate() {
         let mut noise = Noise::new(3);
         let mut prediction = predict(&truth, start..start + 12, k as u32, EXACT, &mut noise);
-        prediction.frame = vidar_core::model::ChunkFrame::PriorWorld;
+        prediction.frame = ChunkFrame::PriorWorld;
         for view in &mut prediction.views {
             let pose = truth[view.frame_id.index()];
             view.chunk_from_camera = pose;
-            view.depth = vidar_core::RelativeDepth::new(depth(&pose));
+            view.depth = RelativeDepth::new(depth(&pose));
         }
         machine.push(observe(prediction, Some(&anchors), none)).unwrap();
     }

@@ -3,7 +3,7 @@
 //! ```text
 //!              ┌─ tie to the chunk before (frames both hold)      ┌─ da3-streaming, pose-free: chain, loops, Sim(3) graph
 //! push(chunk) ─┼─ fit to its anchors (centres, rotations)   ──▶  ─┼─ hybrid: the chain, then one similarity onto the anchors
-//!              ├─ scale from landmarks                            ├─ pose-conditioned, ground-truth: anchors, scale per chunk
+//!              ├─ scale and fields of depth from landmarks        ├─ pose-conditioned, ground-truth: anchors, scale per chunk
 //!              └─ descriptors ─▶ loop_candidates ─▶ push_loop     └─ coupled: one graph of all of it
 //!                                                            placement_so_far / finish ─▶ Placement
 //! ```
@@ -47,10 +47,12 @@
 //! # Ok::<(), vidar_align::AlignError>(())
 //! ```
 
+mod agreement;
 mod anchored;
 mod chain;
 mod config;
 mod coupled;
+mod landmarks;
 mod loops;
 mod memory;
 mod observation;
@@ -67,13 +69,12 @@ pub use report::{
     LoopRefusal, LoopReport, OverlapReport, Placement, ViewPlacement,
 };
 
-use crate::depth_field::fit_depth_field;
-use crate::landmark_scale::{DepthRatio, depth_ratios, landmark_scale};
 use crate::overlap::{SampledView, shared_views};
 use crate::place_recognition::PlaceIndex;
 use crate::streaming::Compat;
 use crate::{AlignError, Verdict};
 use anchored::{Pair, PoseFit, center_rms, fit_about_rotations, robust_umeyama};
+use landmarks::Landmarks;
 use loops::{Lookalike, MeasuredLoop};
 use memory::{Chunk, Frames, Tie, sampled_views};
 use std::collections::{BTreeMap, BTreeSet};
@@ -158,8 +159,17 @@ impl Aligner {
         for frame in &frames {
             self.frames.learn(frame.frame_id, frame.time, frame.anchor.clone());
         }
-        let (views, sampled, dropped) = sampled_views(&prediction, &self.config);
-        let mut guards = vec![Guard::ViewNotFinite; dropped];
+        let landmarks = match self.mode {
+            CouplingMode::Coupled => Landmarks::learn(&prediction, &frames, &self.config.landmarks),
+            _ => Landmarks::default(),
+        };
+        let prediction = landmarks.corrected(prediction);
+        let (mut views, sampled, dropped) = sampled_views(&prediction, &self.config);
+        for view in &mut views {
+            view.field = landmarks.fields.get(&view.frame_id).cloned();
+        }
+        let mut guards = landmarks.guards;
+        guards.extend(vec![Guard::ViewNotFinite; dropped]);
         let tie = self.tie(&sampled, &prediction, &mut guards);
         let mut chunk = Chunk {
             id: prediction.chunk_id,
@@ -168,15 +178,12 @@ impl Aligner {
             verdict: Verdict::Chained,
             tie,
             revisits: Vec::new(),
-            landmark_scale: None,
+            landmark_scale: landmarks.scale,
             guards,
             first_guess: None,
             log_scale_std: f64::INFINITY,
             odometry_trusted: true,
         };
-        if self.mode == CouplingMode::Coupled {
-            self.learn_landmarks(&mut chunk, &prediction, &frames);
-        }
         let pairs = chunk.pairs(&self.frames);
         self.judge(&mut chunk, &pairs);
         // The reference knows no such chunks.
@@ -252,37 +259,6 @@ impl Aligner {
             _ => {
                 guards.push(Guard::NoOverlap);
                 None
-            }
-        }
-    }
-
-    /// The chunk's scale from landmarks, and each view's depth field.
-    fn learn_landmarks(
-        &self,
-        chunk: &mut Chunk,
-        prediction: &GeometryPrediction,
-        frames: &[FrameObservation],
-    ) {
-        let config = &self.config.landmarks;
-        let seen = |view: &ViewGeometry| {
-            let frame = frames.iter().find(|f| f.frame_id == view.frame_id);
-            frame.map_or(Vec::new(), |f| depth_ratios(view, &f.landmarks, config))
-        };
-        let per_view: Vec<(&ViewGeometry, Vec<DepthRatio>)> =
-            prediction.views.iter().map(|v| (v, seen(v))).collect();
-        let all: Vec<DepthRatio> = per_view.iter().flat_map(|(_, r)| r.iter().copied()).collect();
-        let Some(scale) = landmark_scale(&all, config) else { return };
-        chunk.landmark_scale = Some(scale);
-        for (view, ratios) in per_view {
-            let size = (view.intrinsics.width, view.intrinsics.height);
-            let Some(fit) = fit_depth_field(&ratios, scale.log_scale, size, config.min_for_field) else {
-                continue;
-            };
-            if !fit.keeps_grid {
-                chunk.guards.push(Guard::DepthFieldRefused);
-            }
-            if let Some(kept) = chunk.views.iter_mut().find(|v| v.frame_id == view.frame_id) {
-                kept.field = Some(fit.field);
             }
         }
     }

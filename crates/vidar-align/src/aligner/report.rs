@@ -32,6 +32,8 @@ pub enum Guard {
     LoopRefused,
     /// A fitted depth field did not improve held-out landmarks; only the view's own scale was kept.
     DepthFieldRefused,
+    /// Landmarks contradict the depth of a chunk whose poses were given; the depth was brought to them.
+    DepthRescaled,
     /// The graph had no answer; chunks stay where anchors and overlaps put them.
     GraphFailed,
 }

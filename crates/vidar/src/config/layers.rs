@@ -11,6 +11,7 @@ use vidar_da3::preprocess::PreprocessConfig;
 
 const SOURCE: &str = "geometry.source";
 const PROCESS_SIZE: &str = "model.network.preprocess.process_size_px";
+const POSE_MODE: &str = "model.network.mode";
 
 /// Where a value came from.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -141,18 +142,26 @@ impl Layered {
         Ok(())
     }
 
-    /// A network that is happy with less than the usual size gets that, unless somebody chose another.
+    /// The network in the program gets pictures of the size that it was trained for and is told where the cameras are, unless
+    /// somebody chose otherwise; another network gets what all get.
     fn follow_source(&mut self) {
-        if !matches!(self.origins.get(PROCESS_SIZE), Some(Origin::Default | Origin::Derived(_))) {
-            return;
-        }
         let is_bundled = lookup(&self.values, SOURCE).and_then(Value::as_str) == Some(bundled::NAME);
-        let (size, origin) = match is_bundled {
-            true => (bundled::PROCESS_SIZE_PX, Origin::Derived("the size that da3-nano was trained for")),
-            false => (PreprocessConfig::default().process_size_px, Origin::Default),
+        let size = match is_bundled {
+            true => bundled::PROCESS_SIZE_PX,
+            false => PreprocessConfig::default().process_size_px,
         };
-        store(&mut self.values, PROCESS_SIZE, Value::Integer(size as i64));
-        self.origins.insert(PROCESS_SIZE.to_owned(), origin);
+        let mode = if is_bundled { "conditioned" } else { "free" };
+        let followers = [
+            (PROCESS_SIZE, Value::Integer(size as i64), "the size that da3-nano was trained for"),
+            (POSE_MODE, Value::String(mode.into()), "cameras that da3-nano finds itself are coarse"),
+        ];
+        for (key, value, why) in followers {
+            if matches!(self.origins.get(key), Some(Origin::Default | Origin::Derived(_))) {
+                store(&mut self.values, key, value);
+                let origin = if is_bundled { Origin::Derived(why) } else { Origin::Default };
+                self.origins.insert(key.to_owned(), origin);
+            }
+        }
     }
 
     fn table(&mut self, text: &str, origin: &Origin) -> Result<(), Error> {

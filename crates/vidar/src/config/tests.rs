@@ -109,8 +109,11 @@ fn the_network_in_the_program_gets_its_own_size_unless_one_is_asked_for() {
     let entries = layered.entries();
     let entry = entries.iter().find(|(key, ..)| key == "model.network.preprocess.process_size_px").unwrap();
     assert!(matches!(entry.2, Origin::Derived(_)), "{}", entry.2);
+    let mode = |layered: &Layered| layered.build().unwrap().model.network.mode;
+    assert_eq!(mode(&layered), vidar_da3::PoseMode::Conditioned);
     layered.set("geometry.source=da3-small").unwrap();
     assert_eq!(size(&layered), 504, "another network does not inherit it");
+    assert_eq!(mode(&layered), vidar_da3::PoseMode::Free);
     layered.set("model.network.preprocess.process_size_px=140").unwrap();
     layered.set("geometry.source=da3-nano").unwrap();
     assert_eq!(size(&layered), 140, "what was asked for stays");

@@ -76,7 +76,8 @@ impl Road<'_> {
         }
         let identity = identity(self.dataset, self.plan, self.config)?;
         let camera = self.dataset.rig.camera(self.dataset.camera);
-        let known = Known::new(self.plan, camera.map_or(Se3::IDENTITY, |c| c.body_from_camera));
+        let body_from_camera = camera.map_or(Se3::IDENTITY, |c| c.body_from_camera);
+        let known = Known::new(self.plan, body_from_camera, source.overlaps());
         let live = self.config.output.live_map.then(|| LiveMap::new(self.config, self.folder));
         let mut live = live.transpose()?;
         let mut failures: Vec<String> = Vec::new();

@@ -5,13 +5,15 @@ use super::plan::{ChunkPlan, Plan};
 use crate::chunks::StoredChunk;
 use crate::keyframes::Keyframe;
 use nalgebra::Vector2;
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use vidar_align::aligner::covariance_in_camera;
 use vidar_align::{ChunkObservation, FrameObservation, MetricAnchor};
 use vidar_core::{
-    CameraModel, FrameId, KeyframeId, LieGroup, OdometryKeyframe, Pinhole, PoseCovariance, Se3,
-    SparseLandmark,
+    FrameId, KeyframeId, LandmarkId, LieGroup, OdometryKeyframe, Pinhole, PoseCovariance, Se3, SparseLandmark,
 };
+
+/// Landmarks are carried from keyframes at most so many frames away.
+const MAX_STEPS: usize = 10;
 
 /// A chunk's prediction with poses, covariances, gravity and landmarks of its frames.
 pub fn of(
@@ -44,17 +46,21 @@ pub struct Known<'a> {
     by_frame: BTreeMap<FrameId, &'a OdometryKeyframe>,
     by_id: BTreeMap<KeyframeId, &'a OdometryKeyframe>,
     body_from_camera: Se3,
+    /// Whether frames between two of the odometry's keyframes get the landmarks that both see.
+    carries_landmarks: bool,
 }
 
 impl<'a> Known<'a> {
-    /// What the plan's anchor knows; `body_from_camera` is the camera's place on the rig.
-    pub fn new(plan: &'a Plan, body_from_camera: Se3) -> Self {
+    /// What the plan's anchor knows; `body_from_camera` is the camera's place on the rig. A network's depth is corrected in
+    /// every view (`carries_landmarks`); stereo is better than what landmarks between keyframes say.
+    pub fn new(plan: &'a Plan, body_from_camera: Se3, carries_landmarks: bool) -> Self {
         let tracked = plan.anchor.as_ref().and_then(|a| a.tracked.as_ref());
         let keyframes = || tracked.iter().flat_map(|t| &t.keyframes);
         Self {
             by_frame: keyframes().map(|k| (k.frame_id, k)).collect(),
             by_id: keyframes().map(|k| (k.id, k)).collect(),
             body_from_camera,
+            carries_landmarks,
         }
     }
 
@@ -62,6 +68,9 @@ impl<'a> Known<'a> {
         let mut frame = FrameObservation::new(keyframe.image.frame_id, keyframe.image.time);
         let Some(pose) = keyframe.world_from_camera else { return frame };
         let Some(odometry) = self.by_frame.get(&keyframe.image.frame_id) else {
+            if let (true, Some(depth)) = (self.carries_landmarks, depth) {
+                frame.landmarks = self.carried(plan, k, &pose, &depth);
+            }
             return frame.with_anchor(MetricAnchor::known(pose));
         };
         let before = k.checked_sub(1).and_then(|k| self.by_frame.get(&plan.keyframes[k].image.frame_id));
@@ -72,10 +81,46 @@ impl<'a> Known<'a> {
             .and_then(|before| self.since(odometry, before))
             .map(|covariance| covariance_in_camera(&covariance, &self.body_from_camera));
         if let Some(depth) = depth {
-            let to_depth = |l: &SparseLandmark| in_depth_image(l, &plan.camera, &plan.view, &depth);
+            let to_depth = |l: &SparseLandmark| {
+                let seen = plan.view.project(&plan.camera.unproject(&l.pixel)?)?;
+                Some(SparseLandmark { pixel: in_depth_image(&seen, &plan.view, &depth)?, ..*l })
+            };
             frame.landmarks = odometry.landmarks.iter().filter_map(to_depth).collect();
         }
         frame.with_anchor(anchor)
+    }
+
+    /// Landmarks of a frame that lies between two of the odometry's keyframes: those that both see, from where the nearer one
+    /// sees them.
+    fn carried(&self, plan: &Plan, k: usize, pose: &Se3, depth: &Pinhole) -> Vec<SparseLandmark> {
+        let known = |k: &usize| {
+            let keyframe = &plan.keyframes[*k];
+            Some((
+                *self.by_frame.get(&keyframe.image.frame_id)?,
+                keyframe.world_from_camera?,
+                keyframe.image.time,
+            ))
+        };
+        let before = (0..k).rev().take(MAX_STEPS).find_map(|k| known(&k));
+        let after = (k + 1..plan.keyframes.len()).take(MAX_STEPS).find_map(|k| known(&k));
+        let (Some(before), Some(after)) = (before, after) else { return Vec::new() };
+        if before.0.segment != after.0.segment {
+            return Vec::new();
+        }
+        let time = plan.keyframes[k].image.time;
+        let is_before_nearer = time.since(before.2) <= after.2.since(time);
+        let (near, far) = if is_before_nearer { (before, after) } else { (after, before) };
+        let seen: BTreeSet<LandmarkId> = far.0.landmarks.iter().map(|l| l.id).collect();
+        let camera_from_near = pose.inverse() * near.1;
+        let carry = |l: &SparseLandmark| {
+            let ray = plan.camera.unproject(&l.pixel).filter(|ray| ray.z > 0.0)?;
+            let here = camera_from_near.act(&(ray / (ray.z * l.inverse_depth)));
+            let inverse_depth = 1.0 / here.z;
+            let pixel = in_depth_image(&plan.view.project(&here)?, &plan.view, depth)?;
+            let inverse_depth_std = l.inverse_depth_std / l.inverse_depth * inverse_depth;
+            (here.z > 0.0).then_some(SparseLandmark { pixel, inverse_depth, inverse_depth_std, ..*l })
+        };
+        near.0.landmarks.iter().filter(|l| seen.contains(&l.id)).filter_map(carry).collect()
     }
 
     /// Covariance of the motion between two keyframes that need not be neighbours, in the later body's axes:
@@ -94,14 +139,8 @@ impl<'a> Known<'a> {
     }
 }
 
-/// A landmark of the raw image where the depth image shows it; `None` outside.
-fn in_depth_image(
-    landmark: &SparseLandmark,
-    camera: &CameraModel,
-    view: &Pinhole,
-    depth: &Pinhole,
-) -> Option<SparseLandmark> {
-    let seen = view.project(&camera.unproject(&landmark.pixel)?)?;
+/// A pixel of the undistorted view where the depth image shows it; `None` outside.
+fn in_depth_image(seen: &Vector2<f64>, view: &Pinhole, depth: &Pinhole) -> Option<Vector2<f64>> {
     let scaled = |c: f64, from: usize, to: usize| (c + 0.5) * to as f64 / from as f64 - 0.5;
     let pixel =
         Vector2::new(scaled(seen.x, view.width, depth.width), scaled(seen.y, view.height, depth.height));
@@ -109,5 +148,5 @@ fn in_depth_image(
         && pixel.y >= 0.0
         && pixel.x <= (depth.width - 1) as f64
         && pixel.y <= (depth.height - 1) as f64;
-    inside.then_some(SparseLandmark { pixel, ..*landmark })
+    inside.then_some(pixel)
 }
