@@ -199,6 +199,29 @@ fn a_rough_depth_in_the_anchors_world_is_brought_to_landmarks_and_its_poses_stay
 }
 
 #[test]
+fn chunks_in_the_anchors_world_keep_their_scale_whatever_their_overlap_says() {
+    let truth = laps(28, 0.6);
+    let mut noise = Noise::new(31);
+    let mut machine = Aligner::new(CouplingMode::PoseConditioned, &AlignerConfig::default()).unwrap();
+    for (k, range) in chunk_ranges(28, 12, 4).unwrap().into_iter().enumerate() {
+        let mut prediction =
+            predict(&truth, range.frames, k as u32, Model { has_gauge: false, ..EXACT }, &mut noise);
+        prediction.frame = ChunkFrame::PriorWorld;
+        // Every other chunk is seen at two thirds of its size.
+        let factor = if k % 2 == 1 { 0.67 } else { 1.0 };
+        for view in &mut prediction.views {
+            view.depth = RelativeDepth::new(view.depth.image().map(|z| z * factor));
+        }
+        machine.push(observe(prediction, Some(&truth), none)).unwrap();
+    }
+    let placement = machine.finish();
+    assert!(placement.guards.of(Guard::ScaleOutOfRange) >= 2, "{:?}", placement.guards);
+    for chunk in &placement.chunks {
+        assert!((chunk.world_from_chunk.scale - 1.0).abs() < 1e-12, "{}", chunk.world_from_chunk.scale);
+    }
+}
+
+#[test]
 fn views_without_landmarks_are_corrected_by_their_neighbours() {
     let (error, placement) = rough_run(3);
     assert!(placement.views.iter().all(|v| v.field.is_some()));

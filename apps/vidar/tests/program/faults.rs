@@ -1,8 +1,8 @@
 //! Bad input and bad luck: a clear error or a named degradation, its exit code, nothing lost.
 
 use crate::support::{
-    Ran, VIDAR, copy_of_sequence, files_under, finished, images_of, run_command, run_on, shared, vidar,
-    vidar_in,
+    Ran, VIDAR, copy_of_sequence, files_under, finished, images_of, manifest, run_command, run_on, shared,
+    vidar, vidar_in,
 };
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -319,8 +319,7 @@ fn a_full_disk_ends_with_4_keeps_what_is_finished_and_leaves_no_half_file() {
     }
     assert!(!files.contains(&"map/mesh.ply".to_owned()), "{files:?}");
     // What happened is written down where the finished files are.
-    let manifest: serde_json::Value =
-        serde_json::from_slice(&fs::read(out.join("manifest.json")).unwrap()).unwrap();
+    let manifest = manifest(&out);
     assert_eq!(manifest["exit"], 4);
     assert_eq!(manifest["result"]["error"]["code"], "E0402");
     assert!(manifest["seconds"]["read"].as_f64().unwrap() > 0.0);
@@ -391,8 +390,7 @@ fn a_signal_finishes_the_files_and_ends_with_130() {
         let out = folder.path().join("out");
         let ran = interrupted_by(signal, &out).ends_with(130).says(&["stopping", "error[E1301]"]);
         assert!(ran.stderr.contains(text(&out)), "{}", ran.stderr);
-        let manifest: serde_json::Value =
-            serde_json::from_slice(&fs::read(out.join("manifest.json")).unwrap()).unwrap();
+        let manifest = manifest(&out);
         assert_eq!(manifest["exit"], 130);
         let done = manifest["result"]["keyframes_with_depth"].as_u64().unwrap();
         assert!(done >= 1 && done < manifest["result"]["keyframes"].as_u64().unwrap(), "{done}");

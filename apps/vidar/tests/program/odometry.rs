@@ -1,6 +1,6 @@
 //! `vidar odometry`: a metric trajectory from camera and IMU alone.
 
-use crate::support::{Ran, command, copy_tree, files_under, shared, vidar};
+use crate::support::{Ran, command, copy_tree, files_under, manifest, shared, vidar};
 use serde_json::Value;
 use std::path::{Path, PathBuf};
 use std::sync::OnceLock;
@@ -93,7 +93,7 @@ fn without_any_trajectory_the_odometry_anchors_the_map() {
     command.args(["--set", "geometry.max_width_px=160", "--set", "keyframes.max_count=12"]);
     let ran: Ran = command.output().unwrap().into();
     assert!([0, 3].contains(&ran.code), "{}", ran.stderr);
-    let manifest: Value = serde_json::from_slice(&std::fs::read(out.join("manifest.json")).unwrap()).unwrap();
+    let manifest = manifest(&out);
     assert_eq!(manifest["poses"]["source"], "odometry");
     assert!(out.join("map/mesh.ply").is_file());
 }
@@ -120,7 +120,7 @@ fn what_never_starts_is_an_outcome_with_its_reason() {
     }
     let json = ran.ends_with(3).json();
     assert!(json["path_m"].is_null() || !json["lost"].as_array().unwrap().is_empty(), "{json}");
-    let manifest: Value = serde_json::from_slice(&std::fs::read(out.join("manifest.json")).unwrap()).unwrap();
+    let manifest = manifest(&out);
     assert_eq!(manifest["exit"], 3);
     let warned = &manifest["warnings"];
     assert!(warned["odometry-never-started"] == 1 || warned["track-lost"].as_u64() > Some(0), "{warned}");

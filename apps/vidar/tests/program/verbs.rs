@@ -1,6 +1,6 @@
 //! Every verb, its help, its exit codes and its machine-readable form.
 
-use crate::support::{command, files_under, finished, keys, run_on, shared, vidar, vidar_in};
+use crate::support::{command, files_under, finished, keys, manifest, run_on, shared, vidar, vidar_in};
 use serde_json::Value;
 
 const VERBS: &[&[&str]] = &[
@@ -149,8 +149,7 @@ fn the_run_folder_holds_what_its_readme_says_and_the_manifest_knows_it() {
         assert!(files.iter().any(|f| f == file), "{file} is missing in {files:?}");
     }
     assert!(files.iter().all(|f| !f.ends_with(".part") && !f.contains(".tmp")), "unfinished: {files:?}");
-    let manifest: Value =
-        serde_json::from_slice(&std::fs::read(folder.join("manifest.json")).unwrap()).unwrap();
+    let manifest = manifest(&folder);
     assert_eq!(
         keys(&manifest, 1),
         [

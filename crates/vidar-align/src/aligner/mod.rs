@@ -327,7 +327,10 @@ impl Aligner {
             chunk.guards.push(Guard::RankDeficient);
         }
         if let Some(guarded) = self.clamped_scale(chunk, &place) {
-            place = rescaled_about_centers(&place, guarded, pairs);
+            // In the anchors' own world the scale is 1 already: what the overlap says instead is what is not believed.
+            if chunk.frame != ChunkFrame::PriorWorld {
+                place = rescaled_about_centers(&place, guarded, pairs);
+            }
             chunk.guards.push(Guard::ScaleOutOfRange);
         }
         if verdict.is_usable() && center_rms(&place, pairs) > self.config.max_center_rms_m {

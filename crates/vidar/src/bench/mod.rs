@@ -9,6 +9,7 @@
 //! command in the same folder goes on where it stopped.
 
 mod figures;
+mod orderings;
 mod paper;
 mod row;
 mod sequences;

@@ -1,5 +1,6 @@
 //! Tables I, II and III of the paper, ours beside it.
 
+use super::orderings::orderings;
 use super::{BenchKind, BenchRequest, BenchRow, OdometryRow, paper};
 use std::fmt::Write as _;
 use vidar_align::CouplingMode;
@@ -39,6 +40,9 @@ impl Cells {
         } else {
             grids.push(table.dense(0.10));
             grids.push(table.dense(0.05));
+        }
+        if request.kind == BenchKind::Euroc {
+            grids.extend(orderings(&request.modes, sequences, rows));
         }
         grids.push(table.cost());
         grids.extend(table.failures());
@@ -294,7 +298,7 @@ fn with_paper(ours: Option<f64>, paper: Option<f64>, digits: usize) -> String {
     }
 }
 
-fn mean(values: &[f64]) -> Option<f64> {
+pub(super) fn mean(values: &[f64]) -> Option<f64> {
     (!values.is_empty()).then(|| values.iter().sum::<f64>() / values.len() as f64)
 }
 

@@ -1,0 +1,122 @@
+//! Which of the paper's orderings a bench shows, said by its own numbers.
+
+use super::BenchRow;
+use super::tables::{Grid, mean};
+use vidar_align::CouplingMode;
+
+/// Scores this close are a tie.
+const TIE: f64 = 0.005;
+/// A borrowed scale that gains more than this (F@0.10) says that the map was not metric. The paper's pose-free column gains 0.256,
+/// its pose-conditioned one 0.018.
+const METRIC_GAIN: f64 = 0.05;
+
+/// The claims that the couplings run can tell of; `None` with fewer than two couplings.
+pub(super) fn orderings(modes: &[CouplingMode], sequences: &[String], rows: &[BenchRow]) -> Option<Grid> {
+    use CouplingMode::{Coupled, GroundTruth, Hybrid, PoseConditioned, PoseFree};
+    let bench = Bench { modes, sequences, rows };
+    let claims = [
+        bench.gains("pose-free loses the metric scale", PoseFree, true),
+        bench.gains("pose-conditioned is metric", PoseConditioned, false),
+        bench.beats("pose-conditioned beats pose-free", PoseConditioned, PoseFree),
+        bench.beats("true poses are at least as good as the odometry's", GroundTruth, PoseConditioned),
+        bench.beats("hybrid beats pose-conditioned", Hybrid, PoseConditioned),
+        bench.beats("coupled beats pose-conditioned (ours)", Coupled, PoseConditioned),
+        bench.beats("coupled beats hybrid (ours)", Coupled, Hybrid),
+    ];
+    let rows: Vec<Vec<String>> = claims.into_iter().flatten().collect();
+    (modes.len() > 1 && !rows.is_empty()).then(|| Grid {
+        caption: "What the paper says, and whether it holds here (F@0.10, a failed run counts as 0)".into(),
+        columns: ["Claim", "Holds", "On average", "Sequences"].map(String::from).to_vec(),
+        rows,
+    })
+}
+
+struct Bench<'a> {
+    modes: &'a [CouplingMode],
+    sequences: &'a [String],
+    rows: &'a [BenchRow],
+}
+
+impl Bench<'_> {
+    fn of(&self, sequence: &str, mode: CouplingMode) -> Option<&BenchRow> {
+        self.rows.iter().find(|r| r.sequence == sequence && r.mode == mode)
+    }
+
+    /// One coupling against another, sequence by sequence.
+    fn beats(&self, claim: &str, better: CouplingMode, worse: CouplingMode) -> Option<Vec<String>> {
+        if !(self.modes.contains(&better) && self.modes.contains(&worse)) {
+            return None;
+        }
+        let score = |r: &BenchRow| r.f10.unwrap_or(0.0);
+        let pairs: Vec<(f64, f64)> = self
+            .sequences
+            .iter()
+            .filter_map(|s| Some((score(self.of(s, better)?), score(self.of(s, worse)?))))
+            .collect();
+        let (a, b): (Vec<f64>, Vec<f64>) = pairs.iter().copied().unzip();
+        let (a, b) = (mean(&a)?, mean(&b)?);
+        let wins = pairs.iter().filter(|(a, b)| *a >= b - TIE).count();
+        let holds = if a > b + TIE {
+            "yes"
+        } else if a >= b - TIE {
+            "tie"
+        } else {
+            "no"
+        };
+        Some(cells(claim, holds, format!("{a:.3} and {b:.3}"), wins, pairs.len()))
+    }
+
+    /// What a borrowed scale gains.
+    fn gains(&self, claim: &str, mode: CouplingMode, should: bool) -> Option<Vec<String>> {
+        let gains: Vec<f64> = self
+            .sequences
+            .iter()
+            .filter_map(|s| self.of(s, mode))
+            .filter_map(|r| Some(r.f10_free? - r.f10?))
+            .collect();
+        let gain = mean(&gains)?;
+        let as_said = gains.iter().filter(|g| (**g > METRIC_GAIN) == should).count();
+        let holds = if (gain > METRIC_GAIN) == should { "yes" } else { "no" };
+        Some(cells(claim, holds, format!("a borrowed scale gains {gain:.3}"), as_said, gains.len()))
+    }
+}
+
+fn cells(claim: &str, holds: &str, numbers: String, count: usize, of: usize) -> Vec<String> {
+    vec![claim.to_owned(), holds.to_owned(), numbers, format!("{count} of {of}")]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn row(sequence: &str, mode: CouplingMode, f10: Option<f64>, free: Option<f64>) -> BenchRow {
+        BenchRow { sequence: sequence.into(), mode, f10, f10_free: free, ..BenchRow::default() }
+    }
+
+    #[test]
+    fn claims_follow_the_numbers_and_failures_count_as_nothing() {
+        use CouplingMode::{Coupled, PoseConditioned, PoseFree};
+        let modes = [PoseFree, PoseConditioned, Coupled];
+        let names = ["V1_01".to_owned(), "V1_02".to_owned()];
+        let rows = [
+            row("V1_01", PoseFree, Some(0.1), Some(0.5)),
+            row("V1_02", PoseFree, None, None),
+            row("V1_01", PoseConditioned, Some(0.5), Some(0.52)),
+            row("V1_02", PoseConditioned, Some(0.6), Some(0.6)),
+            row("V1_01", Coupled, Some(0.4), Some(0.4)),
+            row("V1_02", Coupled, Some(0.6), Some(0.6)),
+        ];
+        let grid = orderings(&modes, &names, &rows).unwrap();
+        let said: Vec<[&str; 4]> =
+            grid.rows.iter().map(|r| [&r[0], &r[1], &r[2], &r[3]].map(String::as_str)).collect();
+        assert_eq!(
+            said[0],
+            ["pose-free loses the metric scale", "yes", "a borrowed scale gains 0.400", "1 of 1"]
+        );
+        assert_eq!(said[1][1..], ["yes", "a borrowed scale gains 0.010", "2 of 2"]);
+        assert_eq!(said[2][1..], ["yes", "0.550 and 0.050", "2 of 2"]);
+        assert_eq!(said[3][1..], ["no", "0.500 and 0.550", "1 of 2"]);
+        assert_eq!(said.len(), 4, "nothing is claimed of couplings that were not run");
+        assert!(orderings(&modes[..1], &names, &rows[..2]).is_none());
+    }
+}
