@@ -149,7 +149,7 @@ fn the_run_folder_holds_what_its_readme_says_and_the_manifest_knows_it() {
         assert!(files.iter().any(|f| f == file), "{file} is missing in {files:?}");
     }
     assert!(files.iter().all(|f| !f.ends_with(".part") && !f.contains(".tmp")), "unfinished: {files:?}");
-    let manifest = manifest(&folder);
+    let manifest = manifest(folder);
     assert_eq!(
         keys(&manifest, 1),
         [
