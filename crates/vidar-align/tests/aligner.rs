@@ -222,6 +222,31 @@ fn chunks_in_the_anchors_world_keep_their_scale_whatever_their_overlap_says() {
 }
 
 #[test]
+fn given_poses_do_not_make_a_depth_metric_that_its_neighbours_contradict() {
+    let truth = laps(36, 0.7);
+    let known_to = |mode: CouplingMode, factor: f64| {
+        let mut noise = Noise::new(41);
+        let mut machine = Aligner::new(mode, &AlignerConfig::default()).unwrap();
+        for (k, range) in chunk_ranges(36, 12, 4).unwrap().into_iter().enumerate() {
+            let model = Model { has_gauge: false, ..EXACT };
+            let mut prediction = predict(&truth, range.frames, k as u32, model, &mut noise);
+            prediction.frame = ChunkFrame::PriorWorld;
+            let factor = if k % 2 == 1 { factor as f32 } else { 1.0 };
+            for view in &mut prediction.views {
+                view.depth = RelativeDepth::new(view.depth.image().map(|z| z * factor));
+            }
+            machine.push(observe(prediction, Some(&truth), none)).unwrap();
+        }
+        let stds: Vec<f64> = machine.finish().chunks.iter().map(|c| c.log_scale_std).collect();
+        stds.into_iter().fold(0.0, f64::max)
+    };
+    for mode in [CouplingMode::PoseConditioned, CouplingMode::Coupled] {
+        assert!(known_to(mode, 1.0) < 0.006, "{mode}: {}", known_to(mode, 1.0));
+        assert!(known_to(mode, 0.8) > 0.05, "{mode}: {}", known_to(mode, 0.8));
+    }
+}
+
+#[test]
 fn views_without_landmarks_are_corrected_by_their_neighbours() {
     let (error, placement) = rough_run(3);
     assert!(placement.views.iter().all(|v| v.field.is_some()));

@@ -26,8 +26,6 @@ const LOOP: Kernel = Kernel::GemanMcClure { k: 4.0 };
 const LOOSENED: f64 = 30.0;
 /// A loop that ends with less weight than this was let go.
 const LET_GO: f64 = 0.05;
-/// How far the unit of a chunk that was predicted in the anchors' own world is from a metre, standard deviation of ln.
-const PRIOR_WORLD_SCALE: f64 = 0.005;
 /// Deformation between neighbours that no overlap's covariance knows of: rotation (rad), share of depth, ln(scale).
 const OVERLAP_FLOOR: [f64; 3] = [0.004, 0.004, 0.004];
 
@@ -216,7 +214,7 @@ impl Built {
             let Some(k) = index.chunks[number] else { continue };
             let scale = start.chunks[k].scale;
             self.attach(chunk, k, index, scale, weights);
-            let own = self.own_scale(machine, chunk, k, scale);
+            let own = self.own_scale(machine, number, k, scale);
             self.scale_information.insert(number, own);
             let tie = chunk.tie.as_ref().and_then(|t| Some((t, index.chunks[t.to]?)));
             if let Some((tie, l)) = tie {
@@ -260,16 +258,20 @@ impl Built {
     }
 
     /// The landmarks' factor, and the information on ln(scale) from centres and landmarks together.
-    fn own_scale(&mut self, machine: &Aligner, chunk: &Chunk, k: usize, scale: f64) -> f64 {
+    fn own_scale(&mut self, machine: &Aligner, number: usize, k: usize, scale: f64) -> f64 {
+        let chunk = &machine.chunks[number];
         let mut information = 0.0;
         if chunk.frame == ChunkFrame::PriorWorld {
-            // Its depth was seen with the anchors' baselines; where its centres lie says less.
-            self.factors.push(Factor::Scale { k, log_scale: 0.0, std: PRIOR_WORLD_SCALE, kernel: ROBUST });
-            information += PRIOR_WORLD_SCALE.powi(-2);
+            // Its depth was seen with the anchors' baselines; where its centres lie, which were given, says nothing of it.
+            let std = prior_world_std(&machine.chunks, number);
+            self.factors.push(Factor::Scale { k, log_scale: 0.0, std, kernel: ROBUST });
+            information += std.powi(-2);
         }
         if chunk.odometry_trusted {
-            let centers = machine.pose_fit(chunk, &chunk.pairs(&machine.frames), scale);
-            information += centers.map_or(0.0, |c| c.log_scale_std.powi(-2));
+            if chunk.frame == ChunkFrame::ModelNative {
+                let centers = machine.pose_fit(chunk, &chunk.pairs(&machine.frames), scale);
+                information += centers.map_or(0.0, |c| c.log_scale_std.powi(-2));
+            }
             if let Some(z) = chunk.landmark_scale {
                 self.factors.push(Factor::Scale { k, log_scale: z.log_scale, std: z.std, kernel: ROBUST });
                 information += z.std.powi(-2);
@@ -325,6 +327,13 @@ impl Built {
         }
         (0..n).map(|k| (own(k) + forward[k] + backward[k]).powf(-0.5)).collect()
     }
+}
+
+/// How far the depth of a chunk in the anchors' world may be trusted: no farther than both its neighbours bear out.
+fn prior_world_std(chunks: &[Chunk], number: usize) -> f64 {
+    let next = chunks.get(number + 1).filter(|c| c.frame == ChunkFrame::PriorWorld);
+    let by_next = next.filter(|c| c.tie.as_ref().is_none_or(|t| t.to == number)).map(Chunk::prior_world_std);
+    by_next.into_iter().fold(chunks[number].prior_world_std(), f64::max)
 }
 
 /// A covariance with what the model is off by besides: lengths are shares of `depth`.

@@ -48,6 +48,11 @@ pub(super) struct Chunk {
     pub odometry_trusted: bool,
 }
 
+/// How far the unit of a chunk that was predicted in the anchors' own world is from a metre, where no neighbour contradicts it.
+const PRIOR_WORLD_SCALE: f64 = 0.005;
+/// The same where it and the chunk before see shared frames so differently that nothing ties them.
+const PRIOR_WORLD_UNKNOWN: f64 = 0.3;
+
 /// `earlier_from_this` of an overlap.
 #[derive(Clone, Debug)]
 pub(super) struct Tie {
@@ -179,6 +184,17 @@ impl Chunk {
 
     pub fn is_usable(&self) -> bool {
         self.verdict.is_usable()
+    }
+
+    /// How far the depth of a chunk in the anchors' own world may be trusted, standard deviation of ln: no farther than the chunk
+    /// before bears out on the frames that both hold. Stereo's agree to a per mille; a small network that was given the poses
+    /// may see each chunk at another size. Its centres, which were given, say nothing of it.
+    pub fn prior_world_std(&self) -> f64 {
+        match &self.tie {
+            Some(tie) => tie.fit.target_from_source.scale.ln().abs().max(PRIOR_WORLD_SCALE),
+            None if self.guards.contains(&Guard::NoOverlap) => PRIOR_WORLD_UNKNOWN,
+            None => PRIOR_WORLD_SCALE,
+        }
     }
 }
 

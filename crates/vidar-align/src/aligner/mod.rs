@@ -336,8 +336,12 @@ impl Aligner {
         if verdict.is_usable() && center_rms(&place, pairs) > self.config.max_center_rms_m {
             chunk.verdict = Verdict::Inconsistent;
         }
-        chunk.log_scale_std =
-            self.pose_fit(chunk, pairs, place.scale).map_or(f64::INFINITY, |f| f.log_scale_std);
+        chunk.log_scale_std = match chunk.frame {
+            ChunkFrame::PriorWorld => chunk.prior_world_std(),
+            ChunkFrame::ModelNative => {
+                self.pose_fit(chunk, pairs, place.scale).map_or(f64::INFINITY, |f| f.log_scale_std)
+            }
+        };
         chunk.first_guess = Some(place);
     }
 
