@@ -103,13 +103,10 @@ pub fn fit_depth_field(
     }
     let rows: Vec<Row> = ratios
         .iter()
-        .map(|r| Row {
-            residual: r.log_ratio - log_scale,
-            std: r.std,
-            share: 1.0,
-            nodes: weights(r.pixel[0], r.pixel[1], size.0, size.1),
+        .map(|r| {
             // Which half: by the landmark, so that no landmark is on both sides.
-            half: (r.landmark.0.wrapping_mul(0x9e37_79b9) >> 31) as usize,
+            let half = (r.landmark.0.wrapping_mul(0x9e37_79b9) >> 31) as usize;
+            Row { half, ..Row::new(&Evidence::of_landmark(r, log_scale), size) }
         })
         .collect();
     let best = LOOSENESS.map(|looseness| held_out(&rows, looseness)).into_iter().reduce(|best, looser| {
@@ -138,16 +135,16 @@ pub(crate) struct Evidence {
     pub share: f64,
 }
 
+impl Evidence {
+    /// What a landmark asks of a depth that already has the chunk's scale.
+    pub fn of_landmark(ratio: &DepthRatio, log_scale: f64) -> Self {
+        Self { pixel: ratio.pixel, log_factor: ratio.log_ratio - log_scale, std: ratio.std, share: 1.0 }
+    }
+}
+
 /// The field of evidence of all kinds, with a prior of this looseness.
 pub(crate) fn field_from(evidence: &[Evidence], looseness: f64, size: (usize, usize)) -> DepthField {
-    let row = |e: &Evidence| Row {
-        residual: e.log_factor,
-        std: e.std,
-        share: e.share,
-        nodes: weights(e.pixel[0], e.pixel[1], size.0, size.1),
-        half: 0,
-    };
-    let rows: Vec<Row> = evidence.iter().map(row).collect();
+    let rows: Vec<Row> = evidence.iter().map(|e| Row::new(e, size)).collect();
     field_of(&solve(&rows.iter().collect::<Vec<_>>(), UNKNOWNS, looseness))
 }
 
@@ -195,6 +192,11 @@ struct Row {
 }
 
 impl Row {
+    fn new(evidence: &Evidence, size: (usize, usize)) -> Self {
+        let nodes = weights(evidence.pixel[0], evidence.pixel[1], size.0, size.1);
+        Self { residual: evidence.log_factor, std: evidence.std, share: evidence.share, nodes, half: 0 }
+    }
+
     fn error(&self, x: &Vector) -> f64 {
         self.residual - x[0] - self.nodes.iter().map(|(m, w)| w * x[m + 1]).sum::<f64>()
     }

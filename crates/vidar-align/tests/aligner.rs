@@ -198,23 +198,27 @@ fn a_rough_depth_in_the_anchors_world_is_brought_to_landmarks_and_its_poses_stay
     assert!(error < 0.04, "{error}");
 }
 
-#[test]
-fn chunks_in_the_anchors_world_keep_their_scale_whatever_their_overlap_says() {
-    let truth = laps(28, 0.6);
+/// Chunks with true poses given, every other one seen at `factor` times its size.
+fn with_given_poses(mode: CouplingMode, factor: f32) -> Placement {
+    let truth = laps(36, 0.7);
     let mut noise = Noise::new(31);
-    let mut machine = Aligner::new(CouplingMode::PoseConditioned, &AlignerConfig::default()).unwrap();
-    for (k, range) in chunk_ranges(28, 12, 4).unwrap().into_iter().enumerate() {
-        let mut prediction =
-            predict(&truth, range.frames, k as u32, Model { has_gauge: false, ..EXACT }, &mut noise);
+    let mut machine = Aligner::new(mode, &AlignerConfig::default()).unwrap();
+    for (k, range) in chunk_ranges(36, 12, 4).unwrap().into_iter().enumerate() {
+        let model = Model { has_gauge: false, ..EXACT };
+        let mut prediction = predict(&truth, range.frames, k as u32, model, &mut noise);
         prediction.frame = ChunkFrame::PriorWorld;
-        // Every other chunk is seen at two thirds of its size.
-        let factor = if k % 2 == 1 { 0.67 } else { 1.0 };
+        let seen = if k % 2 == 1 { factor } else { 1.0 };
         for view in &mut prediction.views {
-            view.depth = RelativeDepth::new(view.depth.image().map(|z| z * factor));
+            view.depth = RelativeDepth::new(view.depth.image().map(|z| z * seen));
         }
         machine.push(observe(prediction, Some(&truth), none)).unwrap();
     }
-    let placement = machine.finish();
+    machine.finish()
+}
+
+#[test]
+fn chunks_in_the_anchors_world_keep_their_scale_whatever_their_overlap_says() {
+    let placement = with_given_poses(CouplingMode::PoseConditioned, 0.67);
     assert!(placement.guards.of(Guard::ScaleOutOfRange) >= 2, "{:?}", placement.guards);
     for chunk in &placement.chunks {
         assert!((chunk.world_from_chunk.scale - 1.0).abs() < 1e-12, "{}", chunk.world_from_chunk.scale);
@@ -223,26 +227,13 @@ fn chunks_in_the_anchors_world_keep_their_scale_whatever_their_overlap_says() {
 
 #[test]
 fn given_poses_do_not_make_a_depth_metric_that_its_neighbours_contradict() {
-    let truth = laps(36, 0.7);
-    let known_to = |mode: CouplingMode, factor: f64| {
-        let mut noise = Noise::new(41);
-        let mut machine = Aligner::new(mode, &AlignerConfig::default()).unwrap();
-        for (k, range) in chunk_ranges(36, 12, 4).unwrap().into_iter().enumerate() {
-            let model = Model { has_gauge: false, ..EXACT };
-            let mut prediction = predict(&truth, range.frames, k as u32, model, &mut noise);
-            prediction.frame = ChunkFrame::PriorWorld;
-            let factor = if k % 2 == 1 { factor as f32 } else { 1.0 };
-            for view in &mut prediction.views {
-                view.depth = RelativeDepth::new(view.depth.image().map(|z| z * factor));
-            }
-            machine.push(observe(prediction, Some(&truth), none)).unwrap();
-        }
-        let stds: Vec<f64> = machine.finish().chunks.iter().map(|c| c.log_scale_std).collect();
-        stds.into_iter().fold(0.0, f64::max)
-    };
     for mode in [CouplingMode::PoseConditioned, CouplingMode::Coupled] {
-        assert!(known_to(mode, 1.0) < 0.006, "{mode}: {}", known_to(mode, 1.0));
-        assert!(known_to(mode, 0.8) > 0.05, "{mode}: {}", known_to(mode, 0.8));
+        let known_to = |factor: f32| {
+            let chunks = with_given_poses(mode, factor).chunks;
+            chunks.iter().map(|c| c.log_scale_std).fold(0.0, f64::max)
+        };
+        assert!(known_to(1.0) < 0.006, "{mode}: {}", known_to(1.0));
+        assert!(known_to(0.8) > 0.05, "{mode}: {}", known_to(0.8));
     }
 }
 

@@ -27,8 +27,10 @@ pub fn model(command: &ModelCommand, context: &Context) -> Outcome {
 
 fn list(context: &Context) -> Outcome {
     let store = models::store(context.cli.offline)?;
-    let mut rows = vec![bundled_row()?];
-    if !context.cli.json {
+    let mut rows = Vec::new();
+    if context.cli.json {
+        rows.push(bundled_row()?);
+    } else {
         let (name, size) = (bundled::NAME, bytes(bundled::bytes()));
         let words: Vec<&str> = BUNDLED_ABILITIES.iter().map(|a| a.words()).collect();
         print::data(format!("{name:<26} {:<5} {size:>9}  {}", "here", bundled::LICENCE));

@@ -14,14 +14,16 @@ use vidar_core::{LieGroup, ViewGeometry};
 /// A view with what is known of its correction.
 pub(super) struct Refined<'a> {
     pub view: &'a ViewGeometry,
-    /// What landmarks ask for.
+    /// ln of what brings its depth into the unit of its pose.
+    pub shift: f64,
+    /// What landmarks ask for beyond that.
     pub landmarks: Vec<Evidence>,
     /// The correction so far.
     pub field: Option<DepthField>,
 }
 
 impl Refined<'_> {
-    /// ln of the factor at a pixel.
+    /// ln of the correction at a pixel, beyond the unit.
     fn log_factor(&self, x: f64, y: f64) -> f64 {
         let depth = self.view.depth.image();
         self.field.as_ref().map_or(0.0, |f| f.log_factor(x, y, depth.width(), depth.height()))
@@ -67,7 +69,7 @@ fn by_neighbour(of: &Refined<'_>, by: &Refined<'_>) -> Vec<Evidence> {
         for x in (STRIDE / 2..w).step_by(STRIDE) {
             let pixel = [x as f64, y as f64];
             let now = of.log_factor(pixel[0], pixel[1]);
-            let z = f64::from(depth[(x, y)]) * now.exp();
+            let z = f64::from(depth[(x, y)]) * (of.shift + now).exp();
             if !(z.is_finite() && z > 0.0) {
                 continue;
             }
@@ -92,5 +94,5 @@ fn surface(view: &Refined<'_>, point: &Vector3<f64>) -> Option<f64> {
     }
     let (x, y) = (k.fx * point.x / point.z + k.cx, k.fy * point.y / point.z + k.cy);
     let z = smooth_depth(view.view.depth.image(), x, y)?;
-    Some(f64::from(z) * view.log_factor(x, y).exp())
+    Some(f64::from(z) * (view.shift + view.log_factor(x, y)).exp())
 }

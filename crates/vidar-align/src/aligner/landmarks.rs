@@ -51,12 +51,9 @@ impl Landmarks {
         if is_off {
             found.guards.push(Guard::DepthRescaled);
         }
-        // In metres where the chunk's poses are, else in its own unit: what landmarks ask for is counted from there.
-        let unit = DepthField { offset: shift, ..DepthField::default() };
-        let scaled: Vec<ViewGeometry> = per_view.iter().map(|(view, _)| corrected(view, &unit)).collect();
         let mut refined = Vec::new();
         let mut looseness = Vec::new();
-        for (view, (_, ratios)) in scaled.iter().zip(&per_view) {
+        for (view, ratios) in &per_view {
             let size = (view.intrinsics.width, view.intrinsics.height);
             let fit = fit_depth_field(ratios, scale.log_scale, size, config.min_for_field);
             if fit.as_ref().is_some_and(|f| !f.keeps_grid) {
@@ -65,7 +62,9 @@ impl Landmarks {
             looseness.extend(fit.as_ref().map(|f| f.looseness));
             refined.push(Refined {
                 view,
-                landmarks: ratios.iter().map(|r| evidence(r, scale.log_scale)).collect(),
+                // In metres where the chunk's poses are, else in its own unit: what landmarks ask for is counted from there.
+                shift,
+                landmarks: ratios.iter().map(|r| Evidence::of_landmark(r, scale.log_scale)).collect(),
                 field: fit.map(|f| f.field),
             });
         }
@@ -87,18 +86,9 @@ impl Landmarks {
     pub fn corrected(&self, mut prediction: GeometryPrediction) -> GeometryPrediction {
         for view in &mut prediction.views {
             if let Some(field) = self.fields.get(&view.frame_id) {
-                *view = corrected(view, field);
+                view.depth = RelativeDepth::new(field.apply(view.depth.image()));
             }
         }
         prediction
     }
-}
-
-fn corrected(view: &ViewGeometry, field: &DepthField) -> ViewGeometry {
-    ViewGeometry { depth: RelativeDepth::new(field.apply(view.depth.image())), ..view.clone() }
-}
-
-/// What a landmark asks of a depth that already has the chunk's scale.
-fn evidence(ratio: &DepthRatio, log_scale: f64) -> Evidence {
-    Evidence { pixel: ratio.pixel, log_factor: ratio.log_ratio - log_scale, std: ratio.std, share: 1.0 }
 }

@@ -1,7 +1,7 @@
 //! Which of the paper's orderings a bench shows, said by its own numbers.
 
 use super::BenchRow;
-use super::tables::{Grid, mean};
+use super::tables::{Grid, Table, mean};
 use vidar_align::CouplingMode;
 
 /// Scores this close are a tie.
@@ -10,41 +10,31 @@ const TIE: f64 = 0.005;
 /// its pose-conditioned one 0.018.
 const METRIC_GAIN: f64 = 0.05;
 
-/// The claims that the couplings run can tell of; `None` with fewer than two couplings.
-pub(super) fn orderings(modes: &[CouplingMode], sequences: &[String], rows: &[BenchRow]) -> Option<Grid> {
-    use CouplingMode::{Coupled, GroundTruth, Hybrid, PoseConditioned, PoseFree};
-    let bench = Bench { modes, sequences, rows };
-    let claims = [
-        bench.gains("pose-free loses the metric scale", PoseFree, true),
-        bench.gains("pose-conditioned is metric", PoseConditioned, false),
-        bench.beats("pose-conditioned beats pose-free", PoseConditioned, PoseFree),
-        bench.beats("true poses are at least as good as the odometry's", GroundTruth, PoseConditioned),
-        bench.beats("hybrid beats pose-conditioned", Hybrid, PoseConditioned),
-        bench.beats("coupled beats pose-conditioned (ours)", Coupled, PoseConditioned),
-        bench.beats("coupled beats hybrid (ours)", Coupled, Hybrid),
-    ];
-    let rows: Vec<Vec<String>> = claims.into_iter().flatten().collect();
-    (modes.len() > 1 && !rows.is_empty()).then(|| Grid {
-        caption: "What the paper says, and whether it holds here (F@0.10, a failed run counts as 0)".into(),
-        columns: ["Claim", "Holds", "On average", "Sequences"].map(String::from).to_vec(),
-        rows,
-    })
-}
-
-struct Bench<'a> {
-    modes: &'a [CouplingMode],
-    sequences: &'a [String],
-    rows: &'a [BenchRow],
-}
-
-impl Bench<'_> {
-    fn of(&self, sequence: &str, mode: CouplingMode) -> Option<&BenchRow> {
-        self.rows.iter().find(|r| r.sequence == sequence && r.mode == mode)
+impl Table<'_> {
+    /// The claims that the couplings run can tell of; `None` with fewer than two couplings.
+    pub(super) fn orderings(&self) -> Option<Grid> {
+        use CouplingMode::{Coupled, GroundTruth, Hybrid, PoseConditioned, PoseFree};
+        let claims = [
+            self.gains("pose-free loses the metric scale", PoseFree, true),
+            self.gains("pose-conditioned is metric", PoseConditioned, false),
+            self.beats("pose-conditioned beats pose-free", PoseConditioned, PoseFree),
+            self.beats("true poses are at least as good as the odometry's", GroundTruth, PoseConditioned),
+            self.beats("hybrid beats pose-conditioned", Hybrid, PoseConditioned),
+            self.beats("coupled beats pose-conditioned (ours)", Coupled, PoseConditioned),
+            self.beats("coupled beats hybrid (ours)", Coupled, Hybrid),
+        ];
+        let rows: Vec<Vec<String>> = claims.into_iter().flatten().collect();
+        (self.request.modes.len() > 1 && !rows.is_empty()).then(|| Grid {
+            caption: "What the paper says, and whether it holds here (F@0.10, a failed run counts as 0)"
+                .into(),
+            columns: ["Claim", "Holds", "On average", "Sequences"].map(String::from).to_vec(),
+            rows,
+        })
     }
 
     /// One coupling against another, sequence by sequence.
     fn beats(&self, claim: &str, better: CouplingMode, worse: CouplingMode) -> Option<Vec<String>> {
-        if !(self.modes.contains(&better) && self.modes.contains(&worse)) {
+        if !(self.request.modes.contains(&better) && self.request.modes.contains(&worse)) {
             return None;
         }
         let score = |r: &BenchRow| r.f10.unwrap_or(0.0);
@@ -87,6 +77,7 @@ fn cells(claim: &str, holds: &str, numbers: String, count: usize, of: usize) -> 
 
 #[cfg(test)]
 mod tests {
+    use super::super::tables::tests::request;
     use super::*;
 
     fn row(sequence: &str, mode: CouplingMode, f10: Option<f64>, free: Option<f64>) -> BenchRow {
@@ -106,7 +97,11 @@ mod tests {
             row("V1_01", Coupled, Some(0.4), Some(0.4)),
             row("V1_02", Coupled, Some(0.6), Some(0.6)),
         ];
-        let grid = orderings(&modes, &names, &rows).unwrap();
+        let said_of = |modes: &[CouplingMode], rows: &[BenchRow]| {
+            let request = &request(modes.to_vec());
+            Table { request, sequences: &names, rows, odometry: &[] }.orderings()
+        };
+        let grid = said_of(&modes, &rows).unwrap();
         let said: Vec<[&str; 4]> =
             grid.rows.iter().map(|r| [&r[0], &r[1], &r[2], &r[3]].map(String::as_str)).collect();
         assert_eq!(
@@ -117,6 +112,6 @@ mod tests {
         assert_eq!(said[2][1..], ["yes", "0.550 and 0.050", "2 of 2"]);
         assert_eq!(said[3][1..], ["no", "0.500 and 0.550", "1 of 2"]);
         assert_eq!(said.len(), 4, "nothing is claimed of couplings that were not run");
-        assert!(orderings(&modes[..1], &names, &rows[..2]).is_none());
+        assert!(said_of(&modes[..1], &rows[..2]).is_none());
     }
 }

@@ -1,6 +1,5 @@
 //! Tables I, II and III of the paper, ours beside it.
 
-use super::orderings::orderings;
 use super::{BenchKind, BenchRequest, BenchRow, OdometryRow, paper};
 use std::fmt::Write as _;
 use vidar_align::CouplingMode;
@@ -42,7 +41,7 @@ impl Cells {
             grids.push(table.dense(0.05));
         }
         if request.kind == BenchKind::Euroc {
-            grids.extend(orderings(&request.modes, sequences, rows));
+            grids.extend(table.orderings());
         }
         grids.push(table.cost());
         grids.extend(table.failures());
@@ -84,15 +83,15 @@ fn notes(request: &BenchRequest) -> Vec<String> {
     notes
 }
 
-struct Table<'a> {
-    request: &'a BenchRequest,
-    sequences: &'a [String],
-    rows: &'a [BenchRow],
-    odometry: &'a [OdometryRow],
+pub(super) struct Table<'a> {
+    pub request: &'a BenchRequest,
+    pub sequences: &'a [String],
+    pub rows: &'a [BenchRow],
+    pub odometry: &'a [OdometryRow],
 }
 
 impl Table<'_> {
-    fn of(&self, sequence: &str, mode: CouplingMode) -> Option<&BenchRow> {
+    pub fn of(&self, sequence: &str, mode: CouplingMode) -> Option<&BenchRow> {
         self.rows.iter().find(|r| r.sequence == sequence && r.mode == mode)
     }
 
@@ -320,10 +319,24 @@ fn deviation(values: &[f64]) -> Option<f64> {
 }
 
 #[cfg(test)]
-mod tests {
+pub(super) mod tests {
     use super::*;
     use crate::bench::row::TrajectoryScores;
     use crate::config::Layered;
+
+    pub(in super::super) fn request(modes: Vec<CouplingMode>) -> BenchRequest {
+        BenchRequest {
+            kind: BenchKind::Euroc,
+            root: None,
+            synthetic: None,
+            sequences: Vec::new(),
+            modes,
+            trajectories: false,
+            layered: Layered::defaults().unwrap(),
+            out: "out".into(),
+            command: Vec::new(),
+        }
+    }
 
     fn row(sequence: &str, mode: CouplingMode, f10: f64, log_scale: f64) -> BenchRow {
         BenchRow {
@@ -346,17 +359,7 @@ mod tests {
     #[test]
     fn tables_hold_valid_runs_and_count_the_failed_ones() {
         let (pf, hybrid) = (CouplingMode::PoseFree, CouplingMode::Hybrid);
-        let request = BenchRequest {
-            kind: BenchKind::Euroc,
-            root: None,
-            synthetic: None,
-            sequences: Vec::new(),
-            modes: vec![pf, hybrid],
-            trajectories: false,
-            layered: Layered::defaults().unwrap(),
-            out: "out".into(),
-            command: Vec::new(),
-        };
+        let request = request(vec![pf, hybrid]);
         let names = ["V1_01".to_owned(), "V1_02".to_owned()];
         let failed = BenchRow { failure: Some("E0305 nothing".into()), ..row("V1_02", hybrid, 0.0, 0.0) };
         let rows = [

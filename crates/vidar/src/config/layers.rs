@@ -7,7 +7,6 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::fmt;
 use std::path::{Path, PathBuf};
 use toml::{Table, Value};
-use vidar_da3::preprocess::PreprocessConfig;
 
 const SOURCE: &str = "geometry.source";
 const PROCESS_SIZE: &str = "model.network.preprocess.process_size_px";
@@ -137,31 +136,33 @@ impl Layered {
         store(&mut self.values, key, value);
         self.origins.insert(key.to_owned(), origin);
         if key == SOURCE {
-            self.follow_source();
+            self.follow_source()?;
         }
         Ok(())
     }
 
     /// The network in the program gets pictures of the size that it was trained for and is told where the cameras are, unless
     /// somebody chose otherwise; another network gets what all get.
-    fn follow_source(&mut self) {
+    fn follow_source(&mut self) -> Result<(), Error> {
         let is_bundled = lookup(&self.values, SOURCE).and_then(Value::as_str) == Some(bundled::NAME);
-        let size = match is_bundled {
-            true => bundled::PROCESS_SIZE_PX,
-            false => PreprocessConfig::default().process_size_px,
-        };
-        let mode = if is_bundled { "conditioned" } else { "free" };
-        let followers = [
-            (PROCESS_SIZE, Value::Integer(size as i64), "the size that da3-nano was trained for"),
-            (POSE_MODE, Value::String(mode.into()), "cameras that da3-nano finds itself are coarse"),
+        let size = Value::Integer(bundled::PROCESS_SIZE_PX as i64);
+        let wishes = [
+            (PROCESS_SIZE, size, "the size that da3-nano was trained for"),
+            (POSE_MODE, Value::String("conditioned".into()), "cameras that da3-nano finds itself are coarse"),
         ];
-        for (key, value, why) in followers {
-            if matches!(self.origins.get(key), Some(Origin::Default | Origin::Derived(_))) {
-                store(&mut self.values, key, value);
-                let origin = if is_bundled { Origin::Derived(why) } else { Origin::Default };
-                self.origins.insert(key.to_owned(), origin);
-            }
+        for (key, wish, why) in wishes {
+            let (value, origin) = match (is_bundled, self.origins.get(key)) {
+                (true, Some(Origin::Default)) => (Some(wish), Origin::Derived(why)),
+                (false, Some(Origin::Derived(_))) => {
+                    (lookup(&Self::defaults()?.values, key).cloned(), Origin::Default)
+                }
+                _ => (None, Origin::Default),
+            };
+            let Some(value) = value else { continue };
+            store(&mut self.values, key, value);
+            self.origins.insert(key.to_owned(), origin);
         }
+        Ok(())
     }
 
     fn table(&mut self, text: &str, origin: &Origin) -> Result<(), Error> {

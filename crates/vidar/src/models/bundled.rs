@@ -3,7 +3,7 @@
 
 use super::ModelIdentity;
 use crate::error::Error;
-use sha2::{Digest, Sha256};
+use crate::run::sha256_hex;
 use std::sync::Arc;
 use std::sync::OnceLock;
 use vidar_core::Warning;
@@ -45,7 +45,7 @@ pub fn parameters() -> Result<u64, Error> {
 /// SHA-256 of its weights.
 pub fn sha256() -> &'static str {
     static FOUND: OnceLock<String> = OnceLock::new();
-    FOUND.get_or_init(|| Sha256::digest(WEIGHTS).iter().map(|byte| format!("{byte:02x}")).collect())
+    FOUND.get_or_init(|| sha256_hex(WEIGHTS))
 }
 
 /// Opens the network; its weights are read where they are.

@@ -25,6 +25,7 @@ use crate::input::{self, AnchorSource};
 use crate::run_folder::{Place, RunFolder, StoredView};
 use looks::Looks;
 use record::Recorder;
+pub(crate) use record::sha256_hex;
 use source::Source;
 use std::path::PathBuf;
 use std::sync::Arc;

@@ -115,10 +115,10 @@ impl<'a> Known<'a> {
         let carry = |l: &SparseLandmark| {
             let ray = plan.camera.unproject(&l.pixel).filter(|ray| ray.z > 0.0)?;
             let here = camera_from_near.act(&(ray / (ray.z * l.inverse_depth)));
-            let inverse_depth = 1.0 / here.z;
             let pixel = in_depth_image(&plan.view.project(&here)?, &plan.view, depth)?;
+            let inverse_depth = 1.0 / here.z;
             let inverse_depth_std = l.inverse_depth_std / l.inverse_depth * inverse_depth;
-            (here.z > 0.0).then_some(SparseLandmark { pixel, inverse_depth, inverse_depth_std, ..*l })
+            Some(SparseLandmark { pixel, inverse_depth, inverse_depth_std, ..*l })
         };
         near.0.landmarks.iter().filter(|l| seen.contains(&l.id)).filter_map(carry).collect()
     }

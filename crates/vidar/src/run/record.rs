@@ -128,7 +128,7 @@ pub(super) fn failure_json(error: &Error) -> serde_json::Value {
     serde_json::json!({ "error": { "code": error.code(), "message": error.to_string(), "hint": error.hint() } })
 }
 
-fn sha256_hex(bytes: &[u8]) -> String {
+pub(crate) fn sha256_hex(bytes: &[u8]) -> String {
     use sha2::{Digest, Sha256};
     Sha256::digest(bytes).iter().map(|b| format!("{b:02x}")).collect()
 }
