@@ -91,6 +91,19 @@ fn every_coupling_makes_a_map_and_says_what_it_is() {
 }
 
 #[test]
+fn what_stereo_is_sure_of_straightens_a_networks_depth_where_only_poses_are_known() {
+    let error = |name: &str, landmarks: &str| {
+        let landmarks = format!("coupling.stereo_landmarks={landmarks}");
+        let (ran, run) = simulated(name, &["--set", &landmarks, "--set", "eval.mode=auto"]);
+        assert!([0, 3].contains(&ran.code), "{}", ran.stderr);
+        let depth = &manifest(&run)["result"]["judgement"]["depth"]["pixel_weighted"];
+        depth["metric"]["abs_rel"].as_f64().unwrap()
+    };
+    let (held, free) = (error("held", "true"), error("free", "false"));
+    assert!(held < 0.8 * free, "{held} {free}");
+}
+
+#[test]
 fn stereo_is_no_pose_free_model() {
     let ran = run_on(&shared().sequence, &out("stereo hybrid"), &["-q", "--mode", "hybrid"]);
     ran.ends_with(2).says(&["stereo is given them", "da3-small", "--mode pose-conditioned"]);

@@ -97,6 +97,7 @@ fn sparse_truth() -> String {
 const SETTINGS: &[(&str, &str, Beside)] = &[
     ("align.max_center_rms_m", "1e-12", Simulated),
     ("coupling.mode", "hybrid", Simulated),
+    ("coupling.stereo_landmarks", "false", Simulated),
     ("eval.mode", "auto", Nothing),
     ("eval.surface.crop_margin_m", "0.1", Judged),
     ("eval.surface.on_refusal", "refine_rigid", Refused),

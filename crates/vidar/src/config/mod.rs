@@ -113,7 +113,7 @@ impl Default for GeometryConfig {
 }
 
 /// How depth and metric poses are coupled.
-#[derive(Clone, Debug, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct CouplingConfig {
     /// `coupled` estimates poses and chunks together; `pose-conditioned` and `hybrid` are the paper's; `ground-truth` is
@@ -122,6 +122,9 @@ pub struct CouplingConfig {
     /// Show both ends of a loop to the network together, as DA3-Streaming does: one more prediction per loop. Otherwise what is
     /// stored of the two chunks is compared.
     pub loop_chunks: bool,
+    /// Hold a network's depth to what stereo is sure of in the same pictures, beside the odometry's landmarks (`coupled` only).
+    /// A tenth of a second of processor time per keyframe.
+    pub stereo_landmarks: bool,
     /// How places are told again: `salad` (needs `coupling.salad_checkpoint`), `model` (the geometry network's own tokens, at
     /// no further cost), `pictures` (knows the same view again, not a place from another side), or `auto`, the first of these
     /// that there is.
@@ -129,6 +132,18 @@ pub struct CouplingConfig {
     /// SALAD's published checkpoint, converted by `tools/salad_to_safetensors.py`. One more network of 350 MB to run per
     /// keyframe; it knows places from other sides.
     pub salad_checkpoint: String,
+}
+
+impl Default for CouplingConfig {
+    fn default() -> Self {
+        Self {
+            mode: vidar_align::CouplingMode::default(),
+            stereo_landmarks: true,
+            loop_chunks: false,
+            places: PlacesConfig::Auto,
+            salad_checkpoint: String::new(),
+        }
+    }
 }
 
 /// How places are told again.

@@ -7,6 +7,7 @@ use super::observation::{self, Known};
 use super::placed::placed_view;
 use super::plan::{ChunkPlan, Plan};
 use super::source::Source;
+use super::sparse::{self, Sparse};
 use super::views::ViewWindow;
 use crate::chunks::{ChunkStore, StoredChunk};
 use crate::config::Config;
@@ -16,13 +17,14 @@ use crate::run_folder::{RunFolder, StoredView};
 use rayon::prelude::*;
 use serde_json::json;
 use sha2::{Digest, Sha256};
+use std::collections::BTreeMap;
 use vidar_align::aligner::LoopCandidate;
-use vidar_align::{Aligner, Placement, color_at_size};
+use vidar_align::{Aligner, ChunkObservation, Placement, color_at_size};
 use vidar_core::model::ChunkFrame;
 use vidar_core::remap::RemapTable;
 use vidar_core::{
-    AlignedView, ChunkId, ChunkView, ChunkViews, GeometryPrediction, Image, ModelError, Se3, ViewGeometry,
-    Warning,
+    AlignedView, ChunkId, ChunkView, ChunkViews, FrameId, GeometryPrediction, Image, ModelError, Se3,
+    ViewGeometry, Warning,
 };
 use vidar_dataset::Dataset;
 use vidar_fusion::{DoubleWalls, FusionConfig, PointFusion, TsdfVolume};
@@ -78,6 +80,7 @@ impl Road<'_> {
         let camera = self.dataset.rig.camera(self.dataset.camera);
         let body_from_camera = camera.map_or(Se3::IDENTITY, |c| c.body_from_camera);
         let known = Known::new(self.plan, body_from_camera, source.overlaps());
+        let sparse = Sparse::wanted(self.plan, &source, self.config)?;
         let live = self.config.output.live_map.then(|| LiveMap::new(self.config, self.folder));
         let mut live = live.transpose()?;
         let mut failures: Vec<String> = Vec::new();
@@ -98,7 +101,14 @@ impl Road<'_> {
                     self.events.warn(&Warning::new("chunk-failed", reason.clone()).at(format!("chunk {k}")));
                     failures.push(reason);
                 }
-                None => failures.extend(self.align(&mut aligner, (&known, looks), chunk, stored)?),
+                None => {
+                    let by_stereo = match &sparse {
+                        Some(sparse) => self.landmarks(sparse, &mut window, k, chunk),
+                        None => BTreeMap::new(),
+                    };
+                    let observation = observation::of(self.plan, (&known, looks), chunk, stored, &by_stereo);
+                    failures.extend(self.align(&mut aligner, observation)?);
+                }
             }
             self.close_loops(&mut aligner, &mut source, &window, &identity)?;
             if let Some(live) = &mut live {
@@ -169,15 +179,27 @@ impl Road<'_> {
         self.store.read(number(k)).map(Some)
     }
 
-    /// Tells the aligner of a chunk. A chunk that finds no place is a named loss, not the end of the run.
-    fn align(
+    /// What stereo is sure of in a chunk's views; the map does without where it fails.
+    fn landmarks(
         &self,
-        aligner: &mut Aligner,
-        (known, looks): (&Known<'_>, &Looks),
+        sparse: &Sparse,
+        window: &mut ViewWindow<'_>,
+        k: usize,
         chunk: &ChunkPlan,
-        stored: StoredChunk,
-    ) -> Result<Option<String>, Error> {
-        let observation = observation::of(self.plan, known, looks, chunk, stored);
+    ) -> BTreeMap<FrameId, sparse::OfFrame> {
+        window.advance(&chunk.seen, self.events);
+        let (views, _, indices) = window.take(&chunk.seen);
+        let found = sparse.of(number(k), &views, &|| self.cancel.is_cancelled());
+        window.put_back(views, indices);
+        found.unwrap_or_else(|error| {
+            self.events
+                .warn(&Warning::new("no-stereo-landmarks", error.to_string()).at(format!("chunk {k}")));
+            BTreeMap::new()
+        })
+    }
+
+    /// Tells the aligner of a chunk. A chunk that finds no place is a named loss, not the end of the run.
+    fn align(&self, aligner: &mut Aligner, observation: ChunkObservation) -> Result<Option<String>, Error> {
         let report = aligner.push(observation)?;
         self.events.emit(&Event::ChunkAligned {
             chunk: report.chunk_id.0,

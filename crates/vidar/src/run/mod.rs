@@ -12,6 +12,7 @@ mod plan;
 mod record;
 mod reference;
 mod source;
+mod sparse;
 mod views;
 
 pub use judge::{DepthScore, Judgement};

@@ -2,12 +2,13 @@
 
 use super::looks::Looks;
 use super::plan::{ChunkPlan, Plan};
+use super::sparse;
 use crate::chunks::StoredChunk;
 use crate::keyframes::Keyframe;
-use nalgebra::Vector2;
 use std::collections::{BTreeMap, BTreeSet};
 use vidar_align::aligner::covariance_in_camera;
 use vidar_align::{ChunkObservation, FrameObservation, MetricAnchor};
+use vidar_core::camera::Pixel;
 use vidar_core::{
     FrameId, KeyframeId, LandmarkId, LieGroup, OdometryKeyframe, Pinhole, PoseCovariance, Se3, SparseLandmark,
 };
@@ -15,13 +16,13 @@ use vidar_core::{
 /// Landmarks are carried from keyframes at most so many frames away.
 const MAX_STEPS: usize = 10;
 
-/// A chunk's prediction with poses, covariances, gravity and landmarks of its frames.
+/// A chunk's prediction with poses, covariances, gravity and landmarks of its frames: the odometry's and those of `by_stereo`.
 pub fn of(
     plan: &Plan,
-    known: &Known<'_>,
-    looks: &Looks,
+    (known, looks): (&Known<'_>, &Looks),
     chunk: &ChunkPlan,
     stored: StoredChunk,
+    by_stereo: &BTreeMap<FrameId, sparse::OfFrame>,
 ) -> ChunkObservation {
     let looks = looks.of(&stored);
     let prediction = stored.prediction;
@@ -33,6 +34,12 @@ pub fn of(
             let size =
                 prediction.views.iter().find(|v| v.frame_id == keyframe.image.frame_id).map(|v| v.intrinsics);
             let mut frame = known.frame(plan, k, keyframe, size);
+            if let (Some(depth), Some((camera, landmarks))) = (size, by_stereo.get(&frame.frame_id)) {
+                let to_depth = |l: &SparseLandmark| {
+                    Some(SparseLandmark { pixel: in_depth_image(&l.pixel, camera, &depth)?, ..*l })
+                };
+                frame.landmarks.extend(landmarks.iter().filter_map(to_depth));
+            }
             let view = prediction.views.iter().position(|v| v.frame_id == frame.frame_id);
             frame.descriptor = view.and_then(|v| looks.get(v)).filter(|d| !d.is_empty()).cloned();
             frame
@@ -140,10 +147,10 @@ impl<'a> Known<'a> {
 }
 
 /// A pixel of the undistorted view where the depth image shows it; `None` outside.
-fn in_depth_image(seen: &Vector2<f64>, view: &Pinhole, depth: &Pinhole) -> Option<Vector2<f64>> {
+fn in_depth_image(seen: &Pixel, view: &Pinhole, depth: &Pinhole) -> Option<Pixel> {
     let scaled = |c: f64, from: usize, to: usize| (c + 0.5) * to as f64 / from as f64 - 0.5;
     let pixel =
-        Vector2::new(scaled(seen.x, view.width, depth.width), scaled(seen.y, view.height, depth.height));
+        Pixel::new(scaled(seen.x, view.width, depth.width), scaled(seen.y, view.height, depth.height));
     let inside = pixel.x >= 0.0
         && pixel.y >= 0.0
         && pixel.x <= (depth.width - 1) as f64
