@@ -91,16 +91,27 @@ fn every_coupling_makes_a_map_and_says_what_it_is() {
 }
 
 #[test]
-fn what_stereo_is_sure_of_straightens_a_networks_depth_where_only_poses_are_known() {
-    let error = |name: &str, landmarks: &str| {
+fn what_stereo_is_sure_of_straightens_a_small_networks_depth_and_leaves_a_good_ones() {
+    let run = |name: &str, source: &str, landmarks: &str| {
+        let out = out(name);
         let landmarks = format!("coupling.stereo_landmarks={landmarks}");
-        let (ran, run) = simulated(name, &["--set", &landmarks, "--set", "eval.mode=auto"]);
+        let more = ["--geometry", source, "--set", &landmarks, "--set", "eval.mode=auto"];
+        let all: Vec<&str> =
+            SHORT.iter().filter(|a| !["--geometry", "simulated"].contains(a)).chain(&more).copied().collect();
+        let ran = run_on(&shared().sequence, &out, &all);
         assert!([0, 3].contains(&ran.code), "{}", ran.stderr);
-        let depth = &manifest(&run)["result"]["judgement"]["depth"]["pixel_weighted"];
+        out
+    };
+    let error = |run: &Path| {
+        let depth = &manifest(run)["result"]["judgement"]["depth"]["pixel_weighted"];
         depth["metric"]["abs_rel"].as_f64().unwrap()
     };
-    let (held, free) = (error("held", "true"), error("free", "false"));
+    // Poses are true and come without landmarks.
+    let held = error(&run("small held", "da3-nano", "true"));
+    let free = error(&run("small free", "da3-nano", "false"));
     assert!(held < 0.8 * free, "{held} {free}");
+    let (held, free) = (run("good held", "simulated", "true"), run("good free", "simulated", "false"));
+    assert!(mesh(&held) == mesh(&free), "{} {}", error(&held), error(&free));
 }
 
 #[test]

@@ -22,6 +22,8 @@ enum Beside {
     Chunked,
     /// A simulated network in short chunks.
     Simulated,
+    /// The network in the program.
+    Learned,
     /// No poses are known beforehand.
     Unposed,
     /// Voxels are so small that the map is large.
@@ -48,6 +50,7 @@ impl Beside {
             Self::Simulated => {
                 &["geometry.source=simulated", "geometry.chunk_keyframes=4", "geometry.overlap_keyframes=2"]
             }
+            Self::Learned => &["geometry.source=da3-nano"],
             Self::Unposed => &[
                 "geometry.source=simulated",
                 "coupling.mode=pose-free",
@@ -69,7 +72,7 @@ impl Beside {
 }
 
 use Beside::{
-    Chunked, Fine, Judged, Moving, Nothing, Odometry, Pictures, Refused, Simulated, Turning, Unposed,
+    Chunked, Fine, Judged, Learned, Moving, Nothing, Odometry, Pictures, Refused, Simulated, Turning, Unposed,
 };
 
 /// Ground truth at 10 Hz, 2 cm off on the way: a trajectory that must be interpolated and is worth judging.
@@ -97,7 +100,7 @@ fn sparse_truth() -> String {
 const SETTINGS: &[(&str, &str, Beside)] = &[
     ("align.max_center_rms_m", "1e-12", Simulated),
     ("coupling.mode", "hybrid", Simulated),
-    ("coupling.stereo_landmarks", "false", Simulated),
+    ("coupling.stereo_landmarks", "false", Learned),
     ("eval.mode", "auto", Nothing),
     ("eval.surface.crop_margin_m", "0.1", Judged),
     ("eval.surface.on_refusal", "refine_rigid", Refused),
@@ -201,8 +204,10 @@ fn every_setting_of_the_dense_road_is_in_the_list() {
 
 #[test]
 fn every_setting_changes_what_a_run_leaves() {
-    let all =
-        [Fine, Nothing, Judged, Refused, Pictures, Odometry, Chunked, Simulated, Unposed, Turning, Moving];
+    let all = [
+        Fine, Nothing, Judged, Refused, Pictures, Odometry, Chunked, Simulated, Learned, Unposed, Turning,
+        Moving,
+    ];
     let bases: BTreeMap<Beside, BTreeMap<String, Vec<u8>>> = all
         .into_iter()
         .map(|beside| (beside, run(&format!("base {beside:?}"), &beside.arguments())))

@@ -122,8 +122,8 @@ pub struct CouplingConfig {
     /// Show both ends of a loop to the network together, as DA3-Streaming does: one more prediction per loop. Otherwise what is
     /// stored of the two chunks is compared.
     pub loop_chunks: bool,
-    /// Hold a network's depth to what stereo is sure of in the same pictures, beside the odometry's landmarks (`coupled` only).
-    /// A tenth of a second of processor time per keyframe.
+    /// Hold a network's depth to what stereo is sure of in the same pictures, beside the odometry's landmarks, where
+    /// the two differ by more than stereo is wrong itself (`coupled` only). A tenth of a second of processor time per keyframe.
     pub stereo_landmarks: bool,
     /// How places are told again: `salad` (needs `coupling.salad_checkpoint`), `model` (the geometry network's own tokens, at
     /// no further cost), `pictures` (knows the same view again, not a place from another side), or `auto`, the first of these

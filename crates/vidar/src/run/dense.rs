@@ -7,7 +7,7 @@ use super::observation::{self, Known};
 use super::placed::placed_view;
 use super::plan::{ChunkPlan, Plan};
 use super::source::Source;
-use super::sparse::{self, Sparse};
+use super::sparse::Sparse;
 use super::views::ViewWindow;
 use crate::chunks::{ChunkStore, StoredChunk};
 use crate::config::Config;
@@ -24,7 +24,7 @@ use vidar_core::model::ChunkFrame;
 use vidar_core::remap::RemapTable;
 use vidar_core::{
     AlignedView, ChunkId, ChunkView, ChunkViews, FrameId, GeometryPrediction, Image, ModelError, Se3,
-    ViewGeometry, Warning,
+    SparseLandmark, ViewGeometry, Warning,
 };
 use vidar_dataset::Dataset;
 use vidar_fusion::{DoubleWalls, FusionConfig, PointFusion, TsdfVolume};
@@ -103,7 +103,7 @@ impl Road<'_> {
                 }
                 None => {
                     let by_stereo = match &sparse {
-                        Some(sparse) => self.landmarks(sparse, &mut window, k, chunk),
+                        Some(sparse) => self.landmarks(sparse, &mut window, chunk, &stored.prediction),
                         None => BTreeMap::new(),
                     };
                     let observation = observation::of(self.plan, (&known, looks), chunk, stored, &by_stereo);
@@ -184,16 +184,18 @@ impl Road<'_> {
         &self,
         sparse: &Sparse,
         window: &mut ViewWindow<'_>,
-        k: usize,
         chunk: &ChunkPlan,
-    ) -> BTreeMap<FrameId, sparse::OfFrame> {
+        prediction: &GeometryPrediction,
+    ) -> BTreeMap<FrameId, Vec<SparseLandmark>> {
         window.advance(&chunk.seen, self.events);
         let (views, _, indices) = window.take(&chunk.seen);
-        let found = sparse.of(number(k), &views, &|| self.cancel.is_cancelled());
+        let found = sparse.of(prediction, &views, &|| self.cancel.is_cancelled());
         window.put_back(views, indices);
         found.unwrap_or_else(|error| {
-            self.events
-                .warn(&Warning::new("no-stereo-landmarks", error.to_string()).at(format!("chunk {k}")));
+            self.events.warn(
+                &Warning::new("no-stereo-landmarks", error.to_string())
+                    .at(format!("chunk {}", prediction.chunk_id)),
+            );
             BTreeMap::new()
         })
     }

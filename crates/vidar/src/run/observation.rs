@@ -2,7 +2,6 @@
 
 use super::looks::Looks;
 use super::plan::{ChunkPlan, Plan};
-use super::sparse;
 use crate::chunks::StoredChunk;
 use crate::keyframes::Keyframe;
 use std::collections::{BTreeMap, BTreeSet};
@@ -22,7 +21,7 @@ pub fn of(
     (known, looks): (&Known<'_>, &Looks),
     chunk: &ChunkPlan,
     stored: StoredChunk,
-    by_stereo: &BTreeMap<FrameId, sparse::OfFrame>,
+    by_stereo: &BTreeMap<FrameId, Vec<SparseLandmark>>,
 ) -> ChunkObservation {
     let looks = looks.of(&stored);
     let prediction = stored.prediction;
@@ -34,12 +33,7 @@ pub fn of(
             let size =
                 prediction.views.iter().find(|v| v.frame_id == keyframe.image.frame_id).map(|v| v.intrinsics);
             let mut frame = known.frame(plan, k, keyframe, size);
-            if let (Some(depth), Some((camera, landmarks))) = (size, by_stereo.get(&frame.frame_id)) {
-                let to_depth = |l: &SparseLandmark| {
-                    Some(SparseLandmark { pixel: in_depth_image(&l.pixel, camera, &depth)?, ..*l })
-                };
-                frame.landmarks.extend(landmarks.iter().filter_map(to_depth));
-            }
+            frame.landmarks.extend(by_stereo.get(&frame.frame_id).into_iter().flatten());
             let view = prediction.views.iter().position(|v| v.frame_id == frame.frame_id);
             frame.descriptor = view.and_then(|v| looks.get(v)).filter(|d| !d.is_empty()).cloned();
             frame
@@ -146,8 +140,8 @@ impl<'a> Known<'a> {
     }
 }
 
-/// A pixel of the undistorted view where the depth image shows it; `None` outside.
-fn in_depth_image(seen: &Pixel, view: &Pinhole, depth: &Pinhole) -> Option<Pixel> {
+/// A pixel of an undistorted view where a depth image of another size shows it; `None` outside.
+pub(super) fn in_depth_image(seen: &Pixel, view: &Pinhole, depth: &Pinhole) -> Option<Pixel> {
     let scaled = |c: f64, from: usize, to: usize| (c + 0.5) * to as f64 / from as f64 - 0.5;
     let pixel =
         Pixel::new(scaled(seen.x, view.width, depth.width), scaled(seen.y, view.height, depth.height));

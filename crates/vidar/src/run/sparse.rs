@@ -1,18 +1,20 @@
 //! Landmarks by stereo: the points of a chunk's pictures that matching between known places is surest of.
 //!
 //! The odometry follows few points, and a trajectory that was given comes with none. A network's depth, off by a factor that
-//! varies slowly over each picture, can be held to these as well.
+//! varies slowly over each picture, can be held to these as well, as long as it is off by more than stereo is.
 
+use super::observation::in_depth_image;
 use super::plan::Plan;
 use super::source::Source;
 use crate::config::Config;
 use crate::error::Error;
 use std::collections::BTreeMap;
 use vidar_align::CouplingMode;
+use vidar_align::landmark_scale::{LandmarkConfig, depth_ratios};
 use vidar_core::camera::Pixel;
+use vidar_core::model::ChunkFrame;
 use vidar_core::{
-    ChunkId, ChunkView, ChunkViews, FrameId, GeometryPrediction, LandmarkId, Pinhole, SparseLandmark,
-    ViewGeometry,
+    ChunkView, ChunkViews, FrameId, GeometryPrediction, LandmarkId, SparseLandmark, ViewGeometry,
 };
 use vidar_stereo::{StereoConfig, StereoError, StereoModel, TOLERANCE_RATIO};
 
@@ -23,11 +25,15 @@ const MAX_WIDTH_PX: usize = 240;
 /// The least probability that the depth is right to within [`TOLERANCE_RATIO`].
 const MIN_CONFIDENCE: f32 = 0.75;
 
-/// Landmarks of a frame, with the camera whose pixels they are given in.
-pub type OfFrame = (Pinhole, Vec<SparseLandmark>);
+/// A network that differs from stereo by less, in the middle, may be the better of the two: stereo's errors are those of whole
+/// regions, which held-out landmarks cannot tell. 1.5 times what stereo calls right.
+const CONTRADICTS: f64 = 1.5 * TOLERANCE_RATIO as f64;
 
 /// Finds landmarks by stereo.
-pub struct Sparse(StereoModel);
+pub struct Sparse {
+    stereo: StereoModel,
+    config: LandmarkConfig,
+}
 
 impl Sparse {
     /// `None` where nothing is held to landmarks, or these are not wanted.
@@ -38,31 +44,60 @@ impl Sparse {
         }
         let max_width_px = config.stereo.max_width_px.min(MAX_WIDTH_PX);
         let quick = StereoConfig { max_width_px, refine_rounds: 0, ..config.stereo.clone() };
-        Ok(Some(Self(StereoModel::new(quick)?)))
+        Ok(Some(Self { stereo: StereoModel::new(quick)?, config: config.align.landmarks.clone() }))
     }
 
-    /// Landmarks of those of a chunk's views that have a pose. None at all where the camera hardly moved.
+    /// Landmarks of those of a prediction's `views` that have a pose, at the pixels of its depth. None at all where the camera
+    /// hardly moved, or where stereo and the prediction agree.
     pub fn of(
         &self,
-        id: ChunkId,
+        prediction: &GeometryPrediction,
         views: &[ChunkView],
         cancel: &(dyn Fn() -> bool + Sync),
-    ) -> Result<BTreeMap<FrameId, OfFrame>, StereoError> {
+    ) -> Result<BTreeMap<FrameId, Vec<SparseLandmark>>, StereoError> {
         let views: Vec<ChunkView> = views.iter().filter(|v| v.world_from_camera.is_some()).cloned().collect();
         let references: Vec<usize> = (0..views.len()).collect();
-        match self.0.predict_with(&ChunkViews { id, views }, &references, cancel) {
-            Ok(output) => Ok(landmarks(&output.prediction)),
+        let views = ChunkViews { id: prediction.chunk_id, views };
+        let by_stereo = match self.stereo.predict_with(&views, &references, cancel) {
+            Ok(output) => output.prediction.views,
             Err(
                 StereoError::NoParallax { .. } | StereoError::TooFewViews { .. } | StereoError::Cancelled,
-            ) => Ok(BTreeMap::new()),
-            Err(error) => Err(error),
-        }
+            ) => return Ok(BTreeMap::new()),
+            Err(error) => return Err(error),
+        };
+        let seen = |view: &ViewGeometry| {
+            let stereo = by_stereo.iter().find(|s| s.frame_id == view.frame_id)?;
+            let moved = |l: SparseLandmark| {
+                let pixel = in_depth_image(&l.pixel, &stereo.intrinsics, &view.intrinsics)?;
+                Some(SparseLandmark { pixel, ..l })
+            };
+            Some((view.frame_id, surest(stereo).into_iter().filter_map(moved).collect()))
+        };
+        let landmarks: BTreeMap<_, _> = prediction.views.iter().filter_map(seen).collect();
+        Ok(if self.contradict(prediction, &landmarks) { landmarks } else { BTreeMap::new() })
+    }
+
+    /// Whether a chunk's depth is farther from its landmarks than stereo can be wrong.
+    fn contradict(
+        &self,
+        prediction: &GeometryPrediction,
+        landmarks: &BTreeMap<FrameId, Vec<SparseLandmark>>,
+    ) -> bool {
+        let of = |v: &ViewGeometry| {
+            landmarks.get(&v.frame_id).map_or(Vec::new(), |l| depth_ratios(v, l, &self.config))
+        };
+        let logs: Vec<f64> = prediction.views.iter().flat_map(of).map(|r| r.log_ratio).collect();
+        // The unit of a chunk in a frame of its own is free.
+        let unit = if prediction.frame == ChunkFrame::ModelNative { middle(&logs) } else { Some(0.0) };
+        let off = |unit: f64| middle(&logs.iter().map(|l| (l - unit).abs()).collect::<Vec<_>>());
+        unit.and_then(off).is_some_and(|off| off > CONTRADICTS)
     }
 }
 
-fn landmarks(prediction: &GeometryPrediction) -> BTreeMap<FrameId, OfFrame> {
-    let of = |view: &ViewGeometry| (view.frame_id, (view.intrinsics, surest(view)));
-    prediction.views.iter().map(of).collect()
+fn middle(values: &[f64]) -> Option<f64> {
+    let mut sorted = values.to_vec();
+    sorted.sort_by(f64::total_cmp);
+    sorted.get(sorted.len() / 2).copied()
 }
 
 /// The surest pixel of each block.
@@ -93,7 +128,17 @@ fn surest(view: &ViewGeometry) -> Vec<SparseLandmark> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use vidar_core::{Confidence, Image, RelativeDepth, Se3};
+    use vidar_core::{ChunkId, Confidence, Image, Pinhole, RelativeDepth, Se3};
+
+    fn view(width: usize, height: usize, depth: Image<f32>, confidence: Image<f32>) -> ViewGeometry {
+        ViewGeometry {
+            frame_id: FrameId(3),
+            chunk_from_camera: Se3::IDENTITY,
+            intrinsics: Pinhole::new(150.0, 150.0, 99.5, 69.5, width, height).unwrap(),
+            depth: RelativeDepth::new(depth),
+            confidence: Confidence::new(confidence),
+        }
+    }
 
     /// A wall 2 m away of which stereo is sure on the left half alone, more so at one pixel of each block.
     #[test]
@@ -106,13 +151,7 @@ mod tests {
             (true, false) => 0.8,
             (true, true) => 0.9,
         };
-        let view = ViewGeometry {
-            frame_id: FrameId(3),
-            chunk_from_camera: Se3::IDENTITY,
-            intrinsics: Pinhole::new(150.0, 150.0, 99.5, 69.5, width, height).unwrap(),
-            depth: RelativeDepth::new(depth),
-            confidence: Confidence::new(Image::from_fn(width, height, sure)),
-        };
+        let view = view(width, height, depth, Image::from_fn(width, height, sure));
         let found = surest(&view);
         assert_eq!(found.len(), 10 * 14);
         for landmark in &found {
@@ -122,5 +161,33 @@ mod tests {
         }
         let ids: std::collections::BTreeSet<_> = found.iter().map(|l| l.id).collect();
         assert_eq!(ids.len(), found.len());
+    }
+
+    /// A wall that a network sees 10 % too far contradicts landmarks in metres, not those of a chunk whose unit is free; one
+    /// that it sees 2 % too far contradicts neither.
+    #[test]
+    fn a_network_is_contradicted_where_it_is_off_by_more_than_stereo() {
+        let (width, height) = (200, 140);
+        let seen =
+            |z: f32| view(width, height, Image::filled(width, height, z), Image::filled(width, height, 1.0));
+        let stereo = StereoModel::new(StereoConfig::default()).unwrap();
+        let sparse = Sparse { stereo, config: LandmarkConfig::default() };
+        let landmarks = BTreeMap::from([(FrameId(3), surest(&seen(2.0)))]);
+        let is_contradicted = |z: f32, frame: ChunkFrame| {
+            let prediction = GeometryPrediction { chunk_id: ChunkId(0), frame, views: vec![seen(z)] };
+            sparse.contradict(&prediction, &landmarks)
+        };
+        assert!(is_contradicted(2.2, ChunkFrame::PriorWorld));
+        assert!(!is_contradicted(2.04, ChunkFrame::PriorWorld));
+        assert!(!is_contradicted(2.2, ChunkFrame::ModelNative));
+        let bent = view(
+            width,
+            height,
+            Image::from_fn(width, height, |x, _| if x < width / 2 { 2.0 } else { 2.4 }),
+            Image::filled(width, height, 1.0),
+        );
+        let bent =
+            GeometryPrediction { chunk_id: ChunkId(0), frame: ChunkFrame::ModelNative, views: vec![bent] };
+        assert!(sparse.contradict(&bent, &landmarks));
     }
 }
