@@ -183,7 +183,7 @@ mod tests {
         let bent = view(
             width,
             height,
-            Image::from_fn(width, height, |x, _| if x < width / 2 { 2.0 } else { 2.4 }),
+            Image::from_fn(width, height, |x, _| 2.0 + 0.6 * x as f32 / width as f32),
             Image::filled(width, height, 1.0),
         );
         let bent =
