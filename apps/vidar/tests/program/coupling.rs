@@ -25,19 +25,20 @@ fn out(name: &str) -> PathBuf {
     shared().root.join("coupling").join(name)
 }
 
-fn simulated(name: &str, more: &[&str]) -> (Ran, PathBuf) {
+fn with_geometry(source: &str, name: &str, more: &[&str]) -> (Ran, PathBuf) {
     let out = out(name);
-    let all: Vec<&str> = SHORT.iter().chain(more).copied().collect();
+    let mut all = SHORT.to_vec();
+    all[2] = source;
+    all.extend(more);
     (run_on(&shared().sequence, &out, &all), out)
 }
 
+fn simulated(name: &str, more: &[&str]) -> (Ran, PathBuf) {
+    with_geometry("simulated", name, more)
+}
+
 fn recorded(name: &str, folder: &Path, more: &[&str]) -> (Ran, PathBuf) {
-    let source = format!("recorded:{}", folder.display());
-    let out = out(name);
-    let mut all = SHORT.to_vec();
-    all[2] = &source;
-    all.extend(more);
-    (run_on(&shared().sequence, &out, &all), out)
+    with_geometry(&format!("recorded:{}", folder.display()), name, more)
 }
 
 fn mesh(run: &Path) -> Vec<u8> {
@@ -93,12 +94,8 @@ fn every_coupling_makes_a_map_and_says_what_it_is() {
 #[test]
 fn what_stereo_is_sure_of_straightens_a_small_networks_depth_and_leaves_a_good_ones() {
     let run = |name: &str, source: &str, landmarks: &str| {
-        let out = out(name);
         let landmarks = format!("coupling.stereo_landmarks={landmarks}");
-        let more = ["--geometry", source, "--set", &landmarks, "--set", "eval.mode=auto"];
-        let all: Vec<&str> =
-            SHORT.iter().filter(|a| !["--geometry", "simulated"].contains(a)).chain(&more).copied().collect();
-        let ran = run_on(&shared().sequence, &out, &all);
+        let (ran, out) = with_geometry(source, name, &["--set", &landmarks, "--set", "eval.mode=auto"]);
         assert!([0, 3].contains(&ran.code), "{}", ran.stderr);
         out
     };
