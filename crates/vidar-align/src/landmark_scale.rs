@@ -41,6 +41,8 @@ pub struct LogScale {
     pub effective: f64,
     /// Observations used.
     pub observations: usize,
+    /// Standard deviation of an error that the landmarks of the whole run share: no number of them lowers it.
+    pub shared_std: f64,
 }
 
 /// A landmark against the depth predicted at its pixel.
@@ -132,7 +134,7 @@ pub fn landmark_scale(ratios: &[DepthRatio], config: &LandmarkConfig) -> Option<
         + config.view_jitter * config.view_jitter / views;
     // Perfect agreement of a handful proves nothing beyond what the depths resolve.
     let std = variance.sqrt().max(1e-3);
-    Some(LogScale { log_scale, std, effective, observations: ratios.len() })
+    Some(LogScale { log_scale, std, effective, observations: ratios.len(), shared_std: 0.0 })
 }
 
 /// The value below which half of the weight lies.

@@ -156,6 +156,11 @@ fn rough(truth: &[Se3], range: std::ops::Range<usize>, id: u32, noise: &mut Nois
 
 /// Middle of |ln| of depth over truth, of a run of rough predictions; landmarks in every `step`-th frame.
 fn rough_run(step: usize) -> (f64, Placement) {
+    rough_run_sharing(step, 0.0)
+}
+
+/// The same with landmarks that have an error in common.
+fn rough_run_sharing(step: usize, shared_std: f64) -> (f64, Placement) {
     let truth = laps(36, 0.7);
     let (mut noise, mut points) = (Noise::new(21), Noise::new(22));
     let mut machine = Aligner::new(CouplingMode::Coupled, &AlignerConfig::default()).unwrap();
@@ -171,7 +176,9 @@ fn rough_run(step: usize) -> (f64, Placement) {
             })
             .collect();
         let of = |i: usize| seen.iter().find(|s| s.0 == i).map_or(Vec::new(), |s| s.1.clone());
-        machine.push(observe(prediction, Some(&truth), of)).unwrap();
+        let mut observation = observe(prediction, Some(&truth), of);
+        observation.frames.iter_mut().for_each(|f| f.shared_landmark_std = shared_std);
+        machine.push(observation).unwrap();
     }
     let placement = machine.finish();
     let mut off: Vec<f64> = Vec::new();
@@ -234,6 +241,17 @@ fn given_poses_do_not_make_a_depth_metric_that_its_neighbours_contradict() {
         };
         assert!(known_to(1.0) < 0.006, "{mode}: {}", known_to(1.0));
         assert!(known_to(0.8) > 0.05, "{mode}: {}", known_to(0.8));
+    }
+}
+
+#[test]
+fn no_number_of_landmarks_makes_a_scale_surer_than_what_they_share() {
+    let (alone, shared) = (rough_run(1).1, rough_run_sharing(1, 0.02).1);
+    for (alone, shared) in alone.chunks.iter().zip(&shared.chunks) {
+        assert!(alone.log_scale_std < 0.01, "{}", alone.log_scale_std);
+        assert!((shared.log_scale_std - alone.log_scale_std.hypot(0.02)).abs() < 1e-12);
+        // It is known of, not acted on.
+        assert_eq!(alone.world_from_chunk, shared.world_from_chunk);
     }
 }
 

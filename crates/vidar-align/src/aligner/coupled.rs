@@ -325,7 +325,9 @@ impl Built {
                 backward[tie.to] += passed(own(k) + backward[k], std);
             }
         }
-        (0..n).map(|k| (own(k) + forward[k] + backward[k]).powf(-0.5)).collect()
+        // What the landmarks of all chunks share, neighbours do not average out.
+        let shared = |k: usize| machine.chunks[k].landmark_scale.map_or(0.0, |z| z.shared_std);
+        (0..n).map(|k| (own(k) + forward[k] + backward[k]).powf(-0.5).hypot(shared(k))).collect()
     }
 }
 

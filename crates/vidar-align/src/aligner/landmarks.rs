@@ -43,11 +43,14 @@ impl Landmarks {
             prediction.views.iter().map(|v| (v, seen(v))).collect();
         let all: Vec<DepthRatio> = per_view.iter().flat_map(|(_, r)| r.iter().copied()).collect();
         let Some(scale) = landmark_scale(&all, config) else { return Self::default() };
+        let shared_std = shared_std(&all, frames);
         let doubt = CONTRADICTS * METRIC_DEPTH_STD.hypot(scale.std);
         let is_off = prediction.frame == ChunkFrame::PriorWorld && scale.log_scale.abs() > doubt;
         let shift = if is_off { scale.log_scale } else { 0.0 };
-        let mut found =
-            Self { scale: Some(LogScale { log_scale: scale.log_scale - shift, ..scale }), ..Self::default() };
+        let mut found = Self {
+            scale: Some(LogScale { log_scale: scale.log_scale - shift, shared_std, ..scale }),
+            ..Self::default()
+        };
         if is_off {
             found.guards.push(Guard::DepthRescaled);
         }
@@ -91,4 +94,12 @@ impl Landmarks {
         }
         prediction
     }
+}
+
+/// What the landmarks used have in common, on average over them.
+fn shared_std(ratios: &[DepthRatio], frames: &[FrameObservation]) -> f64 {
+    let of = |r: &DepthRatio| {
+        frames.iter().find(|f| f.frame_id == r.frame_id).map_or(0.0, |f| f.shared_landmark_std)
+    };
+    ratios.iter().map(of).sum::<f64>() / ratios.len().max(1) as f64
 }

@@ -405,7 +405,12 @@ impl Aligner {
             (information[0] * fit.world_from_chunk.scale.ln() + information[1] * landmarks.log_scale) / sum;
         let world_from_chunk = rescaled_about_centers(&fit.world_from_chunk, log.exp(), pairs);
         let center_rms_m = center_rms(&world_from_chunk, pairs);
-        PoseFit { world_from_chunk, center_rms_m, log_scale_std: sum.powf(-0.5), ..fit }
+        PoseFit {
+            world_from_chunk,
+            center_rms_m,
+            log_scale_std: sum.powf(-0.5).hypot(landmarks.shared_std),
+            ..fit
+        }
     }
 
     fn report(&self, chunk: &Chunk, pairs: &[Pair]) -> ChunkReport {

@@ -26,6 +26,8 @@ pub struct FrameObservation {
     pub anchor: Option<MetricAnchor>,
     /// Points of known metric depth. `pixel` is at the depth image's size, distortion removed.
     pub landmarks: Vec<SparseLandmark>,
+    /// Standard deviation of an error of ln(depth) that the landmarks of all frames share; 0 where each has its own alone.
+    pub shared_landmark_std: f64,
     /// Unit-length descriptor of the place, if revisits are sought. The same length for all frames of a run.
     pub descriptor: Option<Vec<f32>>,
 }
@@ -33,7 +35,14 @@ pub struct FrameObservation {
 impl FrameObservation {
     /// A frame of which only the time is known.
     pub fn new(frame_id: FrameId, time: Timestamp) -> Self {
-        Self { frame_id, time, anchor: None, landmarks: Vec::new(), descriptor: None }
+        Self {
+            frame_id,
+            time,
+            anchor: None,
+            landmarks: Vec::new(),
+            shared_landmark_std: 0.0,
+            descriptor: None,
+        }
     }
 
     /// The same with a metric pose.

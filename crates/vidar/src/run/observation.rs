@@ -2,6 +2,7 @@
 
 use super::looks::Looks;
 use super::plan::{ChunkPlan, Plan};
+use super::sparse;
 use crate::chunks::StoredChunk;
 use crate::keyframes::Keyframe;
 use std::collections::{BTreeMap, BTreeSet};
@@ -33,7 +34,11 @@ pub fn of(
             let size =
                 prediction.views.iter().find(|v| v.frame_id == keyframe.image.frame_id).map(|v| v.intrinsics);
             let mut frame = known.frame(plan, k, keyframe, size);
-            frame.landmarks.extend(by_stereo.get(&frame.frame_id).into_iter().flatten());
+            if let Some(by_stereo) = by_stereo.get(&frame.frame_id).filter(|l| !l.is_empty()) {
+                frame.landmarks.extend(by_stereo);
+                let share = by_stereo.len() as f64 / frame.landmarks.len() as f64;
+                frame.shared_landmark_std = share * sparse::SHARED_STD;
+            }
             let view = prediction.views.iter().position(|v| v.frame_id == frame.frame_id);
             frame.descriptor = view.and_then(|v| looks.get(v)).filter(|d| !d.is_empty()).cloned();
             frame

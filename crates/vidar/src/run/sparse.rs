@@ -29,6 +29,10 @@ const MIN_CONFIDENCE: f32 = 0.75;
 /// regions, which held-out landmarks cannot tell. 1.5 times what stereo calls right.
 const CONTRADICTS: f64 = 1.5 * TOLERANCE_RATIO as f64;
 
+/// What stereo's errors have in common from point to point and chunk to chunk (calibration, poses, exposure), of ln(depth):
+/// half of its tolerance.
+pub const SHARED_STD: f64 = 0.5 * TOLERANCE_RATIO as f64;
+
 /// Finds landmarks by stereo.
 pub struct Sparse {
     stereo: StereoModel,
@@ -113,10 +117,11 @@ fn surest(view: &ViewGeometry) -> Vec<SparseLandmark> {
             .filter(|&at| depth[at].is_finite() && confidence[at] >= MIN_CONFIDENCE);
         let (x, y) = places.reduce(|a, b| if confidence[b] > confidence[a] { b } else { a })?;
         let inverse_depth = 1.0 / f64::from(depth[(x, y)]);
-        // No point is followed from frame to frame: each view's own are told apart by its frame.
+        // No point is followed from frame to frame: each view's own are told apart by its frame, and from the odometry's by
+        // the top bit.
         let number = (view.frame_id.0).wrapping_mul((BLOCKS.0 * BLOCKS.1) as u32).wrapping_add(block as u32);
         Some(SparseLandmark {
-            id: LandmarkId(number),
+            id: LandmarkId(number | 1 << 31),
             pixel: Pixel::new(x as f64, y as f64),
             inverse_depth,
             inverse_depth_std: f64::from(TOLERANCE_RATIO) * inverse_depth,
