@@ -7,6 +7,8 @@ place, and a linear map that is not kept reads from the patches half-way how far
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor, nn
 
@@ -17,12 +19,13 @@ from .model import Output
 
 CONFIDENCE = 0.4  # weight of the logarithm that keeps the confidence from vanishing
 GRADIENT = 0.5
-ALIGNED = 0.5
+ALIGNED = 2.0
 RAYS = 1.0
 CAMERA = 1.0
 MATCH = 0.1
 MOVED = 2.0
 SMALL = 0.03
+STEEP = 1.0  # log-ratio from which a relative error grows linearly in it
 # (block, head) that learn where a patch is in every other view, and where it is in the first one.
 PAIR_HEADS = ((3, 0), (5, 0))
 FIRST_HEADS = ((5, 1), (7, 1))
@@ -39,20 +42,35 @@ def confident(error: Tensor, confidence: Tensor, mask: Tensor) -> Tensor:
     return masked_mean(confidence * error - CONFIDENCE * confidence.log(), mask)
 
 
+def middle(value: Tensor, mask: Tensor) -> Tensor:
+    """Median of each scene over the mask, B x 1 x 1 x 1."""
+    flat = value.masked_fill(~mask, float("nan")).flatten(1)
+    return flat.nanmedian(1).values.nan_to_num()[:, None, None, None]
+
+
+def relative(log_ratio: Tensor) -> Tensor:
+    """What depth is wrong by, as a share of the truth, from the logarithm of their ratio; linear once far too deep."""
+    gentle = log_ratio.clamp(max=STEEP)
+    return gentle.expm1().abs() + math.exp(STEEP) * (log_ratio - gentle)
+
+
 def depth_terms(output: Output, scenes: Scenes) -> dict[str, Tensor]:
-    """Relative errors (of the logarithm) of depth and of its differences between neighbouring pixels."""
+    """Errors of the logarithm of depth and of its differences between neighbouring pixels, and the relative error that
+    is left after one scale per scene, which is what depth is judged by: near surfaces seen too far cost more there."""
     mask = scenes.depth > 0
     target = scenes.depth.clamp(min=1e-4).log()
     wrong = output.log_depth - target
     count = mask.sum((1, 2, 3), keepdim=True).clamp(min=1)
-    offset = (wrong * mask).sum((1, 2, 3), keepdim=True) / count
+    mean = (wrong * mask).sum((1, 2, 3), keepdim=True) / count
+    # The scale is the median's; its gradient is spread over all pixels, so that this term does not pull at the scale.
+    offset = middle(wrong.detach(), mask) + mean - mean.detach()
     both_x, both_y = mask[..., 1:] & mask[..., :-1], mask[..., 1:, :] & mask[..., :-1, :]
     gradient = masked_mean((wrong[..., 1:] - wrong[..., :-1]).abs(), both_x) + masked_mean(
         (wrong[..., 1:, :] - wrong[..., :-1, :]).abs(), both_y
     )
     return {
         "depth": confident(wrong.abs(), output.depth_conf, mask),
-        "aligned": masked_mean((wrong - offset).abs(), mask),
+        "aligned": masked_mean(relative(wrong - offset), mask),
         "gradient": gradient,
     }
 

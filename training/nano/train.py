@@ -42,7 +42,8 @@ ROOMS_APART = 1 << 20  # between the rooms of two processes
 
 @dataclass
 class Stage:
-    """Part of the recipe: until which step, which sizes (`stream_views --sizes`), how many views a step."""
+    """Part of the recipe: until which step, which sizes (`stream_views --sizes`), how many views a step, and how often
+    a scene has how many of them."""
 
     until_step: int
     sizes: str
@@ -50,6 +51,7 @@ class Stage:
     views_per_clip: int = 8
     lr_from: float = 1.0
     lr_to: float = 1.0
+    scene_views: str = "1:4,2:30,3:10,4:26,6:6,8:24,16:20"
 
 
 @dataclass
@@ -193,8 +195,9 @@ class Trainer:
         """Scenes of a random number of views, and whether cameras are given."""
         per_clip = stage.views_per_clip
         clips = pool.draw(max(1, stage.views_per_step // per_clip))
-        views = self.rng.choices([1, 2, 3, 4, 6, 8, 16], [4, 30, 10, 26, 6, 24, 0 if per_clip < 16 else 20])[0]
-        views = min(views, len(clips[0].image))
+        shares = dict(map(int, part.split(":")) for part in stage.scene_views.split(","))
+        possible = [views for views in shares if views <= per_clip]
+        views = self.rng.choices(possible, [shares[v] for v in possible])[0]
         parts = []
         for clip in clips:
             parts.extend((clip, own, mirrored) for own, mirrored in self.split(len(clip.image), views))

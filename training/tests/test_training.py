@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import io
+import math
 import sys
 import threading
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +19,7 @@ from nano.config import NanoConfig  # noqa: E402
 from nano.data import Clip, read_clip, scenes, write_clip  # noqa: E402
 from nano.export import exported, imported  # noqa: E402
 from nano.geometry import homogeneous, inverse, matches, matrix_from_quaternion, quaternion_from_matrix  # noqa: E402
-from nano.losses import WATCHED, match_terms, total  # noqa: E402
+from nano.losses import WATCHED, depth_terms, match_terms, relative, total  # noqa: E402
 from nano.metrics import depth_errors, pair_errors, scale_from_poses  # noqa: E402
 from nano.model import Nano, Output, position_operator, reference_first  # noqa: E402
 from nano.optim import Muon, orthogonalised  # noqa: E402
@@ -65,6 +67,27 @@ def test_a_clip_survives_the_stream():
     assert (first.seed, first.number, first.focal) == (7, 3, (40.0, 41.0))
     assert np.array_equal(second.image, clip().image) and np.array_equal(second.depth, clip().depth)
     assert np.array_equal(first.world_from_camera, clip().world_from_camera)
+
+
+def test_the_aligned_term_is_what_depth_is_judged_by():
+    batch = scenes([(clip(), [0, 1, 2, 3], False)])
+    torch.manual_seed(3)
+    wrong = (0.2 * torch.randn_like(batch.depth)).requires_grad_()
+    answer = replace(perfect(batch), log_depth=batch.depth.log() + 0.4 + wrong)
+    term = depth_terms(answer, batch)["aligned"]
+    judged = depth_errors(answer.log_depth.detach().exp()[0], batch.depth[0])[0]
+    assert term.item() == pytest.approx(judged, rel=1e-3)
+    # However wrong the common scale is, it is neither judged nor pulled at here.
+    (gradient,) = torch.autograd.grad(term, wrong)
+    assert abs(gradient.sum()) < 1e-5 * gradient.abs().sum()
+
+
+def test_relative_errors_stay_finite_however_far_too_deep():
+    ratio = torch.tensor([-50.0, -0.1, 0.0, 0.1, 1.0, 1.001, 50.0])
+    found = relative(ratio)
+    assert torch.allclose(found[:5], (ratio[:5].exp() - 1).abs())
+    assert found[-1] < 150
+    assert (found[5] - found[4]).item() == pytest.approx(0.001 * math.e, rel=0.01)
 
 
 def test_a_cut_or_foreign_stream_is_refused():
