@@ -2,11 +2,12 @@
 //!
 //! ```text
 //! stream_views [--split train|val|test] [--first-room R] [--rooms N] [--clips C] [--views V]
-//!              [--sizes 112x70:3,98x84:1] [--samples S]
+//!              [--sizes 112x70:3,98x84:1] [--samples S] [--lived-in SHARE]
 //! ```
 //!
 //! Rooms `R`, `R + 1`, … of the split (`--rooms 0`: without end) give `C` clips each of `V` views; a clip's size is
-//! drawn by weight. The stream is the same for the same arguments. All numbers are little-endian:
+//! drawn by weight. `--lived-in` makes that share of the rooms homes, looked over from near by. The stream is the
+//! same for the same arguments. All numbers are little-endian:
 //!
 //! | bytes | what |
 //! |---|---|
@@ -34,6 +35,7 @@ struct Arguments {
     views: usize,
     samples: usize,
     sizes: Vec<([usize; 2], u64)>,
+    lived_in: f64,
 }
 
 fn main() -> Result<(), Box<dyn Error>> {
@@ -52,7 +54,7 @@ fn stream(arguments: &Arguments, out: &mut impl Write) -> Result<(), Box<dyn Err
     let last =
         if arguments.rooms == 0 { u32::MAX } else { arguments.first_room.saturating_add(arguments.rooms) };
     for index in arguments.first_room..last {
-        let room = ClipRoom::new(arguments.split, index, widest)?;
+        let room = ClipRoom::lived_in(arguments.split, index, widest, arguments.lived_in)?;
         for number in 0..arguments.clips {
             let [width, height] = size_of(&arguments.sizes, room.seed(), number);
             let settings = ClipSettings { views: arguments.views, width, height, samples: arguments.samples };
@@ -116,6 +118,7 @@ fn arguments() -> Result<Arguments, Box<dyn Error>> {
         views: 8,
         samples: 3,
         sizes: vec![([112, 70], 1)],
+        lived_in: 0.0,
     };
     let mut rest = std::env::args().skip(1);
     while let Some(key) = rest.next() {
@@ -133,6 +136,7 @@ fn arguments() -> Result<Arguments, Box<dyn Error>> {
             "--rooms" => found.rooms = value.parse()?,
             "--clips" => found.clips = value.parse()?,
             "--views" => found.views = value.parse()?,
+            "--lived-in" => found.lived_in = value.parse()?,
             "--samples" => found.samples = value.parse()?,
             "--sizes" => found.sizes = value.split(',').map(size).collect::<Result<_, _>>()?,
             other => return Err(format!("unknown argument {other}; see the program's head").into()),

@@ -27,6 +27,9 @@ pub enum Variety {
     /// Size, light, materials and kinds of furniture differ as well, windows and lamps may shine, walls may be bare:
     /// places to train networks on. Built-in flights shrink and grow with the place.
     Wild,
+    /// Wild places of a home's size, with kitchens, set tables, desks and beds full of small things. Whatever
+    /// [`SceneKind`] asks for, rooms are as rooms of a home are.
+    Lived,
 }
 
 /// Built-in flights; a trajectory file takes their place when one is given.

@@ -1,4 +1,4 @@
-//! Wild places differ from seed to seed in everything, and nothing stands in the flight's way.
+//! Wild places and homes differ from seed to seed in everything, and nothing stands in the flight's way.
 
 #![allow(clippy::unwrap_used, clippy::panic)] // a helper that fails is a test that fails
 
@@ -9,11 +9,15 @@ use vidar_synth::{
 };
 
 fn wild(seed: u64, scene: SceneKind, flight: FlightKind) -> Simulation {
+    varied(seed, Variety::Wild, scene, flight)
+}
+
+fn varied(seed: u64, variety: Variety, scene: SceneKind, flight: FlightKind) -> Simulation {
     let config = SynthConfig {
         seed,
         scene,
         flight,
-        variety: Variety::Wild,
+        variety,
         width: 64,
         height: 40,
         duration_secs: 6.0,
@@ -33,15 +37,17 @@ fn picture(simulation: &Simulation) -> Vec<u8> {
 }
 
 #[test]
-fn flights_are_free_in_every_wild_place() {
+fn flights_are_free_in_every_wild_place_and_home() {
     let scenes = [SceneKind::Room, SceneKind::Hall, SceneKind::Corridor];
     let flights = [FlightKind::Sweep, FlightKind::Orbit, FlightKind::Aggressive];
     for seed in 0..9 {
-        let simulation = wild(seed, scenes[seed as usize % 3], flights[seed as usize / 3]);
-        for position in simulation.path().positions(0.05) {
-            let clearance = simulation.world().clearance_m(&position);
-            assert!(clearance >= 0.25, "seed {seed}: {clearance} m");
-            assert_eq!(simulation.world().extent().distance(&position), 0.0);
+        for variety in [Variety::Wild, Variety::Lived] {
+            let simulation = varied(seed, variety, scenes[seed as usize % 3], flights[seed as usize / 3]);
+            for position in simulation.path().positions(0.05) {
+                let clearance = simulation.world().clearance_m(&position);
+                assert!(clearance >= 0.25, "{variety:?}, seed {seed}: {clearance} m");
+                assert_eq!(simulation.world().extent().distance(&position), 0.0);
+            }
         }
     }
 }

@@ -81,6 +81,8 @@ pub struct Clip {
 pub struct ClipRoom {
     seed: u64,
     simulation: Simulation,
+    /// Whether people live there: looked over from near by, in richer colours.
+    is_home: bool,
 }
 
 /// Paths that are tried before a clip is taken as it comes.
@@ -92,9 +94,19 @@ impl ClipRoom {
     /// # Errors
     /// A width that no camera has.
     pub fn new(split: Split, index: u32, width: usize) -> Result<Self, SynthError> {
+        Self::lived_in(split, index, width, 0.0)
+    }
+
+    /// As [`ClipRoom::new`], but `share` (0…1) of the rooms are [`Variety::Lived`], of which clips are taken as by
+    /// somebody who looks things over: from near by, often from above. The other rooms are the same as without them.
+    ///
+    /// # Errors
+    /// A width that no camera has, a share outside 0…1.
+    pub fn lived_in(split: Split, index: u32, width: usize, share: f64) -> Result<Self, SynthError> {
+        crate::config::ensure((0.0..=1.0).contains(&share), "share", "0 to 1", share)?;
         let seed = split.seed(index);
         let mut rng = stream(seed, Purpose::ClipRoom);
-        let config = SynthConfig {
+        let mut config = SynthConfig {
             seed,
             scene: match rng.random_range(0..10) {
                 0..6 => SceneKind::Room,
@@ -114,7 +126,13 @@ impl ClipRoom {
             height: (width * 5 / 8).max(16),
             ..SynthConfig::default()
         };
-        Ok(Self { seed, simulation: Simulation::new(&config, None)? })
+        let is_home = rng.random::<f64>() < share;
+        if is_home {
+            // No flight leads through a home: what it has may stand anywhere.
+            config =
+                SynthConfig { variety: Variety::Lived, scene: SceneKind::Room, duration_secs: 0.1, ..config };
+        }
+        Ok(Self { seed, simulation: Simulation::new(&config, None)?, is_home })
     }
 
     /// Seed of the room.
@@ -136,18 +154,21 @@ impl ClipRoom {
         let mut rng = stream(self.seed, Purpose::Clip(number));
         let camera = camera(width, height, &mut rng)?;
         let world = self.simulation.world();
-        let mut poses = paths::path(&self.simulation, views, &mut rng);
+        let path = if self.is_home { paths::at_home } else { paths::path };
+        let nearest = if self.is_home { [0.15, 0.45] } else { [0.25, 0.7] };
+        let mut poses = path(&self.simulation, views, &mut rng);
         for _ in 0..TRIES {
-            if poses.iter().all(|pose| is_worth_a_look(world, &camera, pose)) {
+            if poses.iter().all(|pose| is_worth_a_look(world, &camera, pose, nearest)) {
                 break;
             }
-            poses = paths::path(&self.simulation, views, &mut rng);
+            poses = path(&self.simulation, views, &mut rng);
         }
         let sensor = Sensor::new(&mut rng);
-        let palette = Palette::new(self.seed, &mut rng);
+        let colours = if self.is_home { Palette::of_a_home } else { Palette::new };
+        let palette = colours(self.seed, &mut rng);
         let table = RayTable::new(&CameraModel::Pinhole(camera), samples);
         let mut noise = Gaussian::new(stream(self.seed, Purpose::ClipNoise(number)));
-        let tint = |hit: &Hit, radiance: f32| palette.tint(hit.face_number()).map(|t| radiance * t);
+        let tint = |hit: &Hit, radiance: f32| palette.tint(world, hit).map(|t| radiance * t);
         let exposed: Vec<ExposedChannels<3>> = (0..poses.len())
             .map(|k| expose_hits(world, &table, &sensor.shutter(&poses, k, samples), tint))
             .collect();
@@ -178,8 +199,9 @@ fn camera(width: usize, height: usize, rng: &mut ChaCha8Rng) -> Result<Pinhole, 
     })
 }
 
-/// Whether a view is neither inside nor right in front of something.
-fn is_worth_a_look(world: &World, camera: &Pinhole, world_from_camera: &Se3) -> bool {
+/// Whether a view is neither inside nor right in front of something: hardly anything is nearer than the first of
+/// `nearest` and half of it is beyond the second, m.
+fn is_worth_a_look(world: &World, camera: &Pinhole, world_from_camera: &Se3, nearest: [f64; 2]) -> bool {
     let origin = world_from_camera.translation;
     let (columns, rows) = (7, 5);
     let mut depths = Vec::with_capacity(columns * rows);
@@ -193,7 +215,7 @@ fn is_worth_a_look(world: &World, camera: &Pinhole, world_from_camera: &Se3) -> 
         }
     }
     depths.sort_by(f64::total_cmp);
-    depths[1] > 0.25 && depths[depths.len() / 2] > 0.7
+    depths[1] > nearest[0] && depths[depths.len() / 2] > nearest[1]
 }
 
 /// The camera's electronics during one clip.

@@ -1,11 +1,12 @@
 //! Where the views of a clip are taken from.
 //!
 //! Flights keep the pace of the built-in courses; hand-held paths walk and turn by small uneven steps, or walk round
-//! something and look at it. Steps between neighbouring views are 5 to 70 cm and up to about 20°.
+//! something and look at it; in homes they look over its things from near by. Steps between neighbouring views
+//! are 5 to 70 cm and up to about 20°.
 
 use crate::rig::euroc_body_from_camera;
 use crate::simulation::Simulation;
-use crate::world::World;
+use crate::world::{Extent, World};
 use nalgebra::{Matrix3, Vector3};
 use rand::Rng;
 use rand_chacha::ChaCha8Rng;
@@ -24,6 +25,16 @@ pub(super) fn path(simulation: &Simulation, views: usize, rng: &mut ChaCha8Rng) 
         0..7 => along_flight(simulation, views, rng),
         7..14 => walk(simulation.world(), views, rng),
         _ => walk_round(simulation.world(), views, rng),
+    }
+}
+
+/// Poses of `views` views in a place where people live: mostly looking over its things from near by.
+pub(super) fn at_home(simulation: &Simulation, views: usize, rng: &mut ChaCha8Rng) -> Vec<Se3> {
+    let world = simulation.world();
+    match rng.random_range(0..20) {
+        0..12 => inspection(world, views, rng),
+        12..16 => walk(world, views, rng),
+        _ => walk_round(world, views, rng),
     }
 }
 
@@ -134,6 +145,54 @@ fn walk_round(world: &World, views: usize, rng: &mut ChaCha8Rng) -> Vec<Se3> {
             pose
         })
         .collect()
+}
+
+/// Looks over something from 0.5 to 2.3 m, mostly from above, while stepping aside and letting the eye wander.
+fn inspection(world: &World, views: usize, rng: &mut ChaCha8Rng) -> Vec<Se3> {
+    let Some((mut place, mut target)) = vantage(world, rng) else { return walk_round(world, views, rng) };
+    let reach = (target - place).norm();
+    let length = stride(rng).min(0.25 * reach);
+    let to = target - place;
+    let side = if rng.random::<bool>() { 0.5 * PI } else { -0.5 * PI };
+    let mut heading = to.y.atan2(to.x) + side + 0.6 * normal(rng);
+    let wander = Vector3::new(normal(rng), normal(rng), 0.3 * normal(rng)) * (0.04 * reach);
+    let (lean, unrest) = (0.08 * normal(rng), uniform(rng, 0.01, 0.05));
+    (0..views)
+        .map(|_| {
+            let to = target - place;
+            let (yaw, pitch) = (to.y.atan2(to.x), -(to.z.atan2(to.x.hypot(to.y))));
+            let (yaw, pitch) = (yaw + unrest * normal(rng), pitch + unrest * normal(rng));
+            let pose = Se3::new(looking(yaw, pitch.clamp(-1.2, 1.2), lean + unrest * normal(rng)), place);
+            place = free_step(world, &place, &mut heading, length, rng);
+            target += wander;
+            pose
+        })
+        .collect()
+}
+
+/// A free place and a thing that is seen from there.
+fn vantage(world: &World, rng: &mut ChaCha8Rng) -> Option<(Vector3<f64>, Vector3<f64>)> {
+    // The first shape is the room itself.
+    let (room, things) = (world.extent(), &world.shapes()[1..]);
+    for _ in 0..8 * TRIES {
+        let thing = things.get(rng.random_range(0..things.len().max(1)))?.extent();
+        let middle = thing.center();
+        let target = Vector3::new(middle.x, middle.y, thing.max.z.min(room.max.z - 0.8));
+        let (azimuth, elevation) = (uniform(rng, -PI, PI), uniform(rng, 0.05, 0.95));
+        let away = uniform(rng, 0.5, 2.3);
+        let (sin, cos) = elevation.sin_cos();
+        let place = target + Vector3::new(cos * azimuth.cos(), cos * azimuth.sin(), sin) * away;
+        let height = place.z - room.min.z;
+        let inside = room.grown(-CLEARANCE_M).holds(&Extent { min: place, max: place });
+        if !inside || !(0.5..2.2).contains(&height) || world.clearance_m(&place) < CLEARANCE_M {
+            continue;
+        }
+        let seen = world.cast(&place, &(target - place)).is_some_and(|hit| hit.t > 0.75);
+        if seen {
+            return Some((place, target));
+        }
+    }
+    None
 }
 
 /// Rotation of a camera that looks along `yaw` about the world's z, `pitch` downward, rolled about its axis; radians.

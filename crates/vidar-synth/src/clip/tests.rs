@@ -74,3 +74,48 @@ fn settings_outside_their_domain_are_refused() {
         assert!(room.clip(0, &bad).is_err());
     }
 }
+
+#[test]
+fn homes_take_only_their_share_and_change_no_other_room() {
+    assert!(ClipRoom::lived_in(Split::Train, 0, 56, 1.5).is_err());
+    let mut homes = 0;
+    for index in 0..6 {
+        let mixed = ClipRoom::lived_in(Split::Train, index, 56, 0.5).unwrap();
+        if mixed.is_home {
+            homes += 1;
+            continue;
+        }
+        let usual = ClipRoom::new(Split::Train, index, 56).unwrap();
+        let [a, b] = [&mixed, &usual].map(|room| room.clip(0, &settings()).unwrap());
+        assert!(a.views.iter().zip(&b.views).all(|(a, b)| a.image.data() == b.image.data()));
+    }
+    assert!((1..6).contains(&homes), "{homes} of 6");
+}
+
+#[test]
+fn homes_are_small_full_and_seen_from_near_by_and_above() {
+    let (mut depths, mut tilts) = (Vec::new(), Vec::new());
+    for index in 0..5 {
+        let room = ClipRoom::lived_in(Split::Train, index, 56, 1.0).unwrap();
+        let extent = room.simulation.world().extent();
+        let size = extent.max - extent.min;
+        assert!(size.x < 7.0 && size.y < 7.0 && size.z < 3.1, "{size:?}");
+        assert!(room.simulation.world().shape_count() > 40, "{}", room.simulation.world().shape_count());
+        for number in 0..6 {
+            for view in room.clip(number, &settings()).unwrap().views {
+                let mut seen: Vec<f32> =
+                    view.depth.data().iter().copied().filter(|d| d.is_finite()).collect();
+                seen.sort_by(f32::total_cmp);
+                depths.push(seen[seen.len() / 2]);
+                tilts.push((view.world_from_camera.rotation * Vector3::z()).z);
+            }
+        }
+    }
+    let middle = |values: &mut Vec<f32>| {
+        values.sort_by(f32::total_cmp);
+        values[values.len() / 2]
+    };
+    assert!((0.8..2.2).contains(&middle(&mut depths)), "median depth {} m", middle(&mut depths));
+    let down = tilts.iter().filter(|z| **z < -0.25).count();
+    assert!(3 * down > tilts.len(), "{down} of {} look down", tilts.len());
+}

@@ -2,7 +2,7 @@
 
 use super::material::{Decal, Kind, Material, Surface};
 use super::shape::{Extent, Shape};
-use super::wild;
+use super::{lived, wild};
 use crate::config::{SceneKind, SynthConfig, Variety};
 use crate::random::{Purpose, stream};
 use nalgebra::{Rotation3, Vector3};
@@ -32,7 +32,7 @@ pub(super) struct Furnished {
 /// Furnishes `room` for `config`, keeping clear of the flight's `positions`.
 pub(super) fn furnish(config: &SynthConfig, room: &Extent, positions: &[Vector3<f64>]) -> Furnished {
     let mut rng = stream(config.seed, Purpose::Furniture);
-    let wild = config.variety == Variety::Wild;
+    let wild = config.variety != Variety::Usual;
     let shell = if wild { wild::shell(room, &mut rng) } else { shell_surfaces(config.scene, room, &mut rng) };
     let mut space = Space { room: *room, positions, taken: Vec::new() };
     let mut pieces = Vec::new();
@@ -41,10 +41,16 @@ pub(super) fn furnish(config: &SynthConfig, room: &Extent, positions: &[Vector3<
         let scene =
             if wild { [SceneKind::Room, SceneKind::Hall][rng.random_range(0..2)] } else { config.scene };
         let own = wild && rng.random::<f64>() < 0.35;
+        let at_home = config.variety == Variety::Lived && rng.random::<f64>() < 0.6;
         let kind = Group::random(scene, &mut rng);
         for _ in 0..ATTEMPTS {
-            let mut group = if own { wild::furniture(room, &mut rng) } else { kind.build(room, &mut rng) };
-            if wild {
+            let mut group = match (at_home, own) {
+                (true, _) => lived::furniture(room, &mut rng),
+                (false, true) => wild::furniture(room, &mut rng),
+                (false, false) => kind.build(room, &mut rng),
+            };
+            // What belongs together in a home keeps its materials.
+            if wild && !at_home {
                 wild::restyle(&mut group, &mut rng);
             }
             if space.take(&group) {

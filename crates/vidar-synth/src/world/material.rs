@@ -82,6 +82,11 @@ impl Surface {
 }
 
 impl Material {
+    /// The same for all that is cut from one stock: of one kind and brightness, whatever its grain.
+    pub(super) fn number(&self) -> u32 {
+        hash(self.kind as i32, self.tone.to_bits() as i32, 0x5EED)
+    }
+
     /// Albedo at `(u, v)` (m) of a face of `size` (m).
     pub(super) fn albedo(&self, u: f32, v: f32, size: [f32; 2], texel: f32) -> f32 {
         let s = self.seed;

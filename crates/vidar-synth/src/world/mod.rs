@@ -3,6 +3,7 @@
 mod bvh;
 mod furnish;
 mod light;
+mod lived;
 mod material;
 mod noise;
 mod shape;
@@ -57,6 +58,8 @@ pub struct World {
     /// Index of each shape's first face.
     first_face: Vec<u32>,
     textures: Vec<Texture>,
+    /// Of each face, a number that faces of one material share.
+    materials: Vec<u32>,
 }
 
 /// Texels of all faces together at most: bounds memory (about 3 bytes each) and the time to bake.
@@ -118,7 +121,8 @@ impl World {
             })
             .collect();
         let extents = shapes[1..].iter().map(Shape::extent).collect();
-        Self { shapes, bvh, extents, first_face, textures }
+        let materials = surfaces.iter().map(|s| s.base.number()).collect();
+        Self { shapes, bvh, extents, first_face, textures, materials }
     }
 
     /// The room's own box.
@@ -143,6 +147,11 @@ impl World {
         let place = self.shapes[shape].resolve(&point, direction);
         let face = self.first_face[shape] + place.face as u32;
         Hit { t, point, normal: place.normal, face, uv: place.uv }
+    }
+
+    /// A number that faces of one kind and brightness of material share.
+    pub(crate) fn material_number(&self, hit: &Hit) -> u32 {
+        self.materials[hit.face as usize]
     }
 
     /// Radiance (0…1, exposure 1) of a hit, averaged over about `footprint_m` of surface.

@@ -22,6 +22,10 @@ pub(crate) fn room_size(config: &SynthConfig) -> Vector3<f64> {
         SceneKind::Hall => Vector3::new(20.0, 15.0, 7.0),
         SceneKind::Corridor => Vector3::new(30.0, 3.0, 3.0),
     };
+    if config.variety == Variety::Lived {
+        let mut rng = stream(config.seed, Purpose::Size);
+        return [(2.6, 6.8), (2.6, 6.0), (2.3, 3.0)].map(|(low, high)| between(&mut rng, low, high)).into();
+    }
     if config.variety == Variety::Usual {
         return usual;
     }
