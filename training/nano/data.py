@@ -188,11 +188,12 @@ class Pool:
             self.rooms = max(self.rooms, (clip.seed & 0xFFFF_FFFF) + 1)
             self.clips.append([clip, self.uses])
 
-    def draw(self, count: int) -> list[Clip]:
-        """`count` clips of one size."""
+    def draw(self, count: int, wanted: tuple[int, int] | None = None) -> list[Clip]:
+        """`count` clips of one size (height, width): the wanted one where there are enough."""
         # At the start the pool grows while it is used, so that training need not wait for it.
         self._fill(min(self.capacity, max(4 * count, len(self.clips) + count)))
-        first = self.rng.choice(self.clips)[0]
+        of_wanted = [clip for clip, _ in self.clips if clip.size == wanted]
+        first = self.rng.choice(of_wanted if len(of_wanted) >= count else [clip for clip, _ in self.clips])
         places = [
             i
             for i, (clip, _) in enumerate(self.clips)

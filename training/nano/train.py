@@ -43,7 +43,8 @@ ROOMS_APART = 1 << 20  # between the rooms of two processes
 @dataclass
 class Stage:
     """Part of the recipe: until which step, which sizes (`stream_views --sizes`), how many views a step, and how often
-    a scene has how many of them."""
+    a scene has how many of them, which share of the rooms are homes (`stream_views --lived-in`), and how strongly
+    correspondence is taught."""
 
     until_step: int
     sizes: str
@@ -52,6 +53,17 @@ class Stage:
     lr_from: float = 1.0
     lr_to: float = 1.0
     scene_views: str = "1:4,2:30,3:10,4:26,6:6,8:24,16:20"
+    lived_in: float = 0.0
+    match: float = 1.0
+
+    def weighted_sizes(self) -> dict[tuple[int, int], int]:
+        """Weight of each (height, width)."""
+        found = {}
+        for part in self.sizes.split(","):
+            size, _, weight = part.partition(":")
+            width, height = map(int, size.split("x"))
+            found[height, width] = int(weight or 1)
+        return found
 
 
 @dataclass
@@ -194,10 +206,13 @@ class Trainer:
     def batch(self, pool: Pool, stage: Stage) -> tuple[Scenes, bool]:
         """Scenes of a random number of views, and whether cameras are given."""
         per_clip = stage.views_per_clip
-        clips = pool.draw(max(1, stage.views_per_step // per_clip))
+        # What decides how long a step takes is the same for all processes, since they wait for each other.
+        sizes = stage.weighted_sizes()
+        size = self.common_rng.choices(list(sizes), list(sizes.values()))[0]
+        clips = pool.draw(max(1, stage.views_per_step // per_clip), size)
         shares = dict(map(int, part.split(":")) for part in stage.scene_views.split(","))
         possible = [views for views in shares if views <= per_clip]
-        views = self.rng.choices(possible, [shares[v] for v in possible])[0]
+        views = self.common_rng.choices(possible, [shares[v] for v in possible])[0]
         parts = []
         for clip in clips:
             parts.extend((clip, own, mirrored) for own, mirrored in self.split(len(clip.image), views))
@@ -215,15 +230,15 @@ class Trainer:
             self.rng.shuffle(group)
         return [(group, self.rng.random() < 0.5) for group in chosen]
 
-    def learn(self, batch: Scenes, posed: bool) -> dict[str, float]:
-        """One step."""
+    def learn(self, batch: Scenes, posed: bool, match: float = 1.0) -> dict[str, float]:
+        """One step; `match` as in `Stage`."""
         factor = self.recipe.lr_factor(self.step)
         for optimiser, base in zip(self.optimisers, self.bases, strict=True):
             for group in optimiser.param_groups:
                 group["lr"] = base * factor * group.get("share", 1.0)
         rays = self.common_rng.random() < self.recipe.ray_share
         output = self.model(batch.images, batch.pose9 if posed else None, wants_rays=rays, autocast=True)
-        loss, terms = total(output, batch, self.reader)
+        loss, terms = total(output, batch, self.reader, match)
         for optimiser in self.optimisers:
             optimiser.zero_grad(set_to_none=True)
         loss.backward()
@@ -265,6 +280,7 @@ class Trainer:
             first_room = self.room + self.rank * ROOMS_APART
             arguments = ["--sizes", stage.sizes, "--views", str(stage.views_per_clip)]
             arguments += ["--clips", str(self.recipe.clips_per_room), "--first-room", str(first_room)]
+            arguments += ["--lived-in", str(stage.lived_in)]
             renderer = Renderer(self.stream, arguments)
             pool = Pool(iter(renderer), 600 if stage.views_per_clip <= 8 else 300, self.recipe.clip_uses, self.rng)
             print(f"step {self.step}: {stage}, rooms from {first_room}", flush=True)
@@ -274,7 +290,7 @@ class Trainer:
                 tick = time.monotonic()
                 batch, posed = self.batch(pool, stage)
                 waited = time.monotonic() - tick
-                terms = self.learn(batch, posed)
+                terms = self.learn(batch, posed, stage.match)
                 terms["waited"] = waited
                 terms["took"] = time.monotonic() - tick
                 self.seconds += terms["took"]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import math
+import random
 import sys
 import threading
 from dataclasses import replace
@@ -15,15 +16,17 @@ import torch
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
+from nano.begin import trainable  # noqa: E402
 from nano.config import NanoConfig  # noqa: E402
-from nano.data import Clip, read_clip, scenes, write_clip  # noqa: E402
+from nano.data import Clip, Pool, read_clip, scenes, write_clip  # noqa: E402
 from nano.export import exported, imported  # noqa: E402
+from nano.fast import pointwise, relu  # noqa: E402
 from nano.geometry import homogeneous, inverse, matches, matrix_from_quaternion, quaternion_from_matrix  # noqa: E402
-from nano.losses import WATCHED, depth_terms, match_terms, relative, total  # noqa: E402
+from nano.losses import FIRST_HEADS, PAIR_HEADS, WATCHED, depth_terms, match_terms, relative, total  # noqa: E402
 from nano.metrics import depth_errors, pair_errors, scale_from_poses  # noqa: E402
 from nano.model import Nano, Output, position_operator, reference_first  # noqa: E402
 from nano.optim import Muon, orthogonalised  # noqa: E402
-from nano.train import Team  # noqa: E402
+from nano.train import Stage, Team  # noqa: E402
 
 SMALL = NanoConfig(dim=32, heads=2, features=8, out_channels=(8, 8, 8, 8), cam_enc_heads=2, cam_enc_depth=1)
 
@@ -229,15 +232,17 @@ def test_attention_to_the_right_patches_costs_nothing():
     batch = scenes([(clip(3), [0, 1, 2], False)])
     index, weight, seen = matches(batch.depth, batch.first_from_camera, batch.focal, 2, 3)
     tokens, scale = 7, 30.0
-    logits = torch.full((1, 2, 3, tokens, 3, tokens), -scale)
+    pair = torch.full((1, 3, tokens, 3, tokens), -scale)
+    first = pair.clone()
     patches = torch.full((1, 3, 6, 3, 6), -scale).scatter(-1, index, weight.clamp(min=1e-12).log())
-    logits[:, 0, :, 1:, :, 1:] = patches
-    logits[:, 1, :, 1:, 0, 1:] = patches[:, :, :, 0]
-    logits = logits.reshape(1, 2, 3 * tokens, 3 * tokens)
+    pair[:, :, 1:, :, 1:] = patches
+    first[:, :, 1:, 0, 1:] = patches[:, :, :, 0]
+    flat = (1, 3 * tokens, 3 * tokens)
+    logits = {key: pair.reshape(flat) for key in PAIR_HEADS} | {key: first.reshape(flat) for key in FIRST_HEADS}
     right = perfect(batch)
-    right.logits = {block: logits for block in WATCHED}
+    right.logits = logits
     wrong = perfect(batch)
-    wrong.logits = {block: torch.zeros_like(logits) for block in WATCHED}
+    wrong.logits = {key: torch.zeros(flat) for key in WATCHED}
     column = (weight[..., 0, :] * (index[..., 0, :] % 3)).sum(-1) - torch.arange(6) % 3
     row = (weight[..., 0, :] * (index[..., 0, :] // 3)).sum(-1) - torch.arange(6) // 3
     right.patches = torch.stack([column, row], -1) / 3
@@ -278,3 +283,46 @@ def test_processes_average_their_gradients_and_share_the_directions():
     assert unused[0].grad is None and unused[1].grad is None
     for one, a, b in zip(alone, *together, strict=True):
         assert torch.allclose(one, a, atol=1e-6) and torch.equal(a, b)
+
+
+def test_training_goes_on_from_an_exported_network():
+    torch.manual_seed(4)
+    config = NanoConfig(dim=48, depth=4, heads=3, out_layers=(0, 1, 2, 3), cam_enc_depth=1)
+    before = Nano(config).eval()
+    after = trainable(imported({name: t.half() for name, t in exported(before).items()}, config)).eval()
+    assert after.backbone["pretrained"].pos_full is None
+    grids = [m.backbone["pretrained"].pos_grid for m in (before, after)]
+    assert torch.allclose(*grids, atol=2e-3)
+    images = torch.randn(1, 2, 3, 28, 42)
+    with torch.no_grad():
+        assert torch.allclose(before(images).log_depth, after(images).log_depth, atol=2e-2)
+
+
+def test_fast_backward_passes_are_those_of_the_usual_ones():
+    torch.manual_seed(5)
+    for outputs in (2, 7):
+        conv = torch.nn.Conv2d(6, outputs, 1)
+        x = torch.randn(2, 6, 3, 4, requires_grad=True)
+        weights = torch.randn(2, outputs, 3, 4)
+        everything = [x, conv.weight, conv.bias]
+        own = torch.autograd.grad((pointwise(relu(x), conv) * weights).sum(), everything)
+        usual = torch.autograd.grad((conv(torch.relu(x)) * weights).sum(), everything)
+        for a, b in zip(own, usual, strict=True):
+            assert torch.allclose(a, b, atol=1e-5)
+
+
+def test_processes_draw_clips_of_the_size_they_agreed_on():
+    sizes = Stage(1, "168x112:3,98x84", 32).weighted_sizes()
+    assert sizes == {(112, 168): 3, (84, 98): 1}
+
+    def stored(width: int) -> Clip:
+        whole = clip()
+        return replace(whole, image=whole.image[:, :, :width], depth=whole.depth[:, :, :width])
+
+    wide = clip().size[1]
+    endless = iter([stored(wide), stored(wide - 2)] * 20)
+    pool = Pool(endless, 12, 2, random.Random(1))
+    for width in (wide, wide - 2, wide, wide):
+        assert {c.size[1] for c in pool.draw(2, (clip().size[0], width))} == {width}
+    # What is not there cannot be had: any other size will do.
+    assert len(pool.draw(2, (1, 1))) == 2
