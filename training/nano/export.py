@@ -1,6 +1,6 @@
 """Writes a trained network as `config.json` and `model.safetensors` (f16, official key names), and reads it back.
 
-python -m nano.export --run RUN_FOLDER --out ../models/da3-nano [--weights ema|model]
+python -m nano.export --run RUN_FOLDER --out ../models/da3-nano [--weights ema|model] [--mean-with FOLDER]
 """
 
 from __future__ import annotations
@@ -79,6 +79,15 @@ def read(folder: Path) -> Nano:
     return imported(load_file(folder / "model.safetensors"), config)
 
 
+def mean(first: Nano, second: Nano) -> Nano:
+    """The network half-way between two ends of one training: often as good as either on rooms like those trained on,
+    and better on others (Wortsman et al. 2022)."""
+    if first.config != second.config:
+        raise ValueError("networks of different sizes have no mean")
+    others = exported(second)
+    return imported({name: (t.float() + others[name].float()) / 2 for name, t in exported(first).items()}, first.config)
+
+
 def trained(run: Path, which: str) -> tuple[Nano, dict]:
     """The network of a run (`ema` or `model`) and what else its state says."""
     state = torch.load(run / "state.pt", weights_only=True)
@@ -93,8 +102,11 @@ def main() -> None:
     parser.add_argument("--run", type=Path, required=True)
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--weights", choices=["ema", "model"], default="ema")
+    parser.add_argument("--mean-with", type=Path, help="a folder that was exported before: the mean of both is written")
     arguments = parser.parse_args()
     model, state = trained(arguments.run, arguments.weights)
+    if arguments.mean_with:
+        model = mean(model, read(arguments.mean_with))
     write(model, arguments.out)
     count = sum(t.numel() for t in exported(model).values())
     print(f"step {state['step']}, {count} numbers, {(arguments.out / 'model.safetensors').stat().st_size} bytes")

@@ -19,7 +19,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from nano.begin import trainable  # noqa: E402
 from nano.config import NanoConfig  # noqa: E402
 from nano.data import Clip, Pool, read_clip, scenes, write_clip  # noqa: E402
-from nano.export import exported, imported  # noqa: E402
+from nano.export import exported, imported, mean  # noqa: E402
 from nano.fast import pointwise, relu  # noqa: E402
 from nano.geometry import homogeneous, inverse, matches, matrix_from_quaternion, quaternion_from_matrix  # noqa: E402
 from nano.losses import FIRST_HEADS, PAIR_HEADS, WATCHED, depth_terms, match_terms, relative, total  # noqa: E402
@@ -326,3 +326,14 @@ def test_processes_draw_clips_of_the_size_they_agreed_on():
         assert {c.size[1] for c in pool.draw(2, (clip().size[0], width))} == {width}
     # What is not there cannot be had: any other size will do.
     assert len(pool.draw(2, (1, 1))) == 2
+
+
+def test_the_mean_of_two_networks_lies_half_way():
+    config = NanoConfig(dim=48, depth=4, heads=3, out_layers=(0, 1, 2, 3), cam_enc_depth=1)
+    torch.manual_seed(6)
+    one, other = Nano(config), Nano(config)
+    tensors = [exported(m) for m in (one, other, mean(one, other))]
+    for name, found in tensors[2].items():
+        assert torch.allclose(found, (tensors[0][name] + tensors[1][name]) / 2, atol=1e-6), name
+    with pytest.raises(ValueError, match="different sizes"):
+        mean(one, Nano(replace(config, dim=96)))
