@@ -29,7 +29,7 @@ STEEP = 1.0  # log-ratio from which a relative error grows linearly in it
 # (block, head) that learn where a patch is in every other view, and where it is in the first one.
 PAIR_HEADS = ((3, 0), (5, 0))
 FIRST_HEADS = ((5, 1), (7, 1))
-WATCHED = PAIR_HEADS + FIRST_HEADS
+WATCHED = tuple(sorted({block for block, _ in PAIR_HEADS + FIRST_HEADS}))
 
 
 def masked_mean(value: Tensor, mask: Tensor) -> Tensor:
@@ -117,12 +117,12 @@ def match_terms(output: Output, scenes: Scenes, reader: nn.Module | None = None)
     pair, first = some.new_zeros((), dtype=torch.float32), some.new_zeros((), dtype=torch.float32)
     split = (views, rows * columns + 1)
     for block, head in PAIR_HEADS:
-        logits = output.logits[block, head].unflatten(2, split).unflatten(1, split)[:, :, 1:, :, 1:]
+        logits = output.logits[block][:, head].unflatten(2, split).unflatten(1, split)[:, :, 1:, :, 1:]
         found = (weight * logits.float().log_softmax(-1).gather(-1, index)).sum(-1)
         pair = pair + masked_mean(-found - entropy, seen)
     index, weight, seen, entropy = index[..., 0, :], weight[..., 0, :], seen[..., 0], entropy[..., 0]
     for block, head in FIRST_HEADS:
-        share = output.logits[block, head].float().log_softmax(-1).unflatten(2, split).unflatten(1, split)
+        share = output.logits[block][:, head].float().log_softmax(-1).unflatten(2, split).unflatten(1, split)
         found = (weight * share[:, :, 1:, 0, 1:].gather(-1, index)).sum(-1)
         first = first + masked_mean(-found - entropy, seen)
     terms = {"pair": pair / len(PAIR_HEADS), "first": first / len(FIRST_HEADS)}

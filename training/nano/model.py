@@ -15,7 +15,6 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from .config import HEAD_LAST, PATCH, POSITION_GRID, NanoConfig
-from .fast import pointwise, relu
 from .geometry import matrix_from_quaternion
 
 
@@ -24,7 +23,7 @@ class Output:
     """What the network says. Views are in the order of the input.
 
     depth, depth_conf [B, S, H, W]; ray [B, S, 6, 8ph, 8pw], ray_conf [B, S, 8ph, 8pw] or None; pose_enc [B, S, 9].
-    logits: of the heads that are watched, by block and head [B, S N, S N]; only where the order of views was kept.
+    logits: of the blocks that are watched, by block [B, heads, S N, S N]; only where the order of views was kept.
     patches: the second of the four features [B, S, n, 2 dim].
     """
 
@@ -35,7 +34,7 @@ class Output:
     ray_conf: Tensor | None
     pose_enc: Tensor
     reference: Tensor
-    logits: dict[tuple[int, int], Tensor] = field(default_factory=dict)
+    logits: dict[int, Tensor] = field(default_factory=dict)
     patches: Tensor | None = None
 
     def world_from_camera(self) -> Tensor:
@@ -79,9 +78,9 @@ class Attention(nn.Module):
             self.q_norm = nn.LayerNorm(dim // heads, eps=1e-5)
             self.k_norm = nn.LayerNorm(dim // heads, eps=1e-5)
         self.qk_norm = qk_norm
-        # Training looks at the logits of some heads (`losses.match_terms`).
-        self.watched: tuple[int, ...] = ()
-        self.logits: dict[int, Tensor] = {}
+        # Training looks at the logits of some blocks (`losses.match_terms`).
+        self.is_watched = False
+        self.logits: Tensor | None = None
 
     def forward(self, x: Tensor, rope: tuple[Tensor, Tensor] | None) -> Tensor:
         batch, tokens, dim = x.shape
@@ -92,13 +91,9 @@ class Attention(nn.Module):
             q, k = rotate(q, *rope), rotate(k, *rope)
         q, k, v = (t.to(v.dtype).transpose(1, 2) for t in (q, k, v))
         # On a CPU and for few tokens this is several times faster than `scaled_dot_product_attention`.
-        q = q * q.shape[-1] ** -0.5
-        # Once more for the watched heads: cheaper than gradients that are as large as all heads' logits.
-        self.logits = {head: q[:, head] @ k[:, head].transpose(-1, -2) for head in self.watched}
-        logits = q @ k.transpose(-1, -2)
-        # Autocast would make f32 copies of the largest tensors here; the sums within are f32 anyway.
-        with torch.autocast(x.device.type, enabled=False):
-            weights = torch.softmax(logits, -1)
+        logits = (q * q.shape[-1] ** -0.5) @ k.transpose(-1, -2)
+        self.logits = logits if self.is_watched else None
+        weights = torch.softmax(logits, -1)
         mixed = weights.to(v.dtype) @ v
         return self.proj(mixed.transpose(1, 2).reshape(batch, tokens, dim))
 
@@ -191,14 +186,14 @@ class Backbone(nn.Module):
         )
         self.norm = nn.LayerNorm(dim, eps=1e-5)
 
-    def watch(self, heads: tuple[tuple[int, int], ...]) -> None:
-        """Keeps the attention logits of these (block, head) from now on."""
+    def watch(self, blocks: tuple[int, ...]) -> None:
+        """Keeps the attention logits of these blocks from now on."""
         for i, block in enumerate(self.blocks):
-            block.attn.watched = tuple(head for number, head in heads if number == i)
+            block.attn.is_watched = i in blocks
 
-    def watched(self) -> dict[tuple[int, int], Tensor]:
-        """Logits of the last run by block and head."""
-        return {(i, head): logits for i, b in enumerate(self.blocks) for head, logits in b.attn.logits.items()}
+    def watched(self) -> dict[int, Tensor]:
+        """Logits of the last run by block."""
+        return {i: b.attn.logits for i, b in enumerate(self.blocks) if b.attn.logits is not None}
 
     def full_grid(self) -> Tensor:
         """[1, dim, 37, 37]."""
@@ -338,7 +333,7 @@ class ResidualUnit(nn.Module):
         self.conv2 = nn.Conv2d(features, features, 3, padding=1)
 
     def forward(self, x: Tensor) -> Tensor:
-        return x + self.conv2(relu(self.conv1(relu(x))))
+        return x + self.conv2(F.relu(self.conv1(F.relu(x))))
 
 
 class Fusion(nn.Module):
@@ -444,15 +439,13 @@ class DualDpt(nn.Module):
         s = self.scratch
         main = s.output_conv1(self.chain(levels, fine, ""))
         main = F.interpolate(main, (height, width), mode="bilinear", align_corners=True)
-        main = main + uv_embedding(main.shape[1], height, width, aspect).to(main)
-        wide, _, narrow = s.output_conv2
-        main = pointwise(relu(wide(main)), narrow).float()
+        main = s.output_conv2(main + uv_embedding(main.shape[1], height, width, aspect).to(main.device)).float()
         if not wants_rays:
             return main[:, 0], main[:, 1], None, None
         aux = s.output_conv1_aux["3"](self.chain(levels, fine, "_aux"))
         last = s.output_conv2_aux["3"]
-        aux = last["0"](aux + uv_embedding(aux.shape[1], *fine, aspect).to(aux))
-        aux = pointwise(relu(s.output_conv2_aux["0"]["2"](aux)), last["5"]).float()
+        aux = last["0"](aux + uv_embedding(aux.shape[1], *fine, aspect).to(aux.device))
+        aux = last["5"](F.relu(s.output_conv2_aux["0"]["2"](aux))).float()
         return main[:, 0], main[:, 1], aux[:, :6], aux[:, 6]
 
     def stage(self, k: int, feature: Tensor, rows: int, columns: int, aspect: float) -> Tensor:

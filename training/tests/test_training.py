@@ -20,9 +20,8 @@ from nano.begin import trainable  # noqa: E402
 from nano.config import NanoConfig  # noqa: E402
 from nano.data import Clip, Pool, read_clip, scenes, write_clip  # noqa: E402
 from nano.export import exported, imported, mean  # noqa: E402
-from nano.fast import pointwise, relu  # noqa: E402
 from nano.geometry import homogeneous, inverse, matches, matrix_from_quaternion, quaternion_from_matrix  # noqa: E402
-from nano.losses import FIRST_HEADS, PAIR_HEADS, WATCHED, depth_terms, match_terms, relative, total  # noqa: E402
+from nano.losses import WATCHED, depth_terms, match_terms, relative, total  # noqa: E402
 from nano.metrics import depth_errors, pair_errors, scale_from_poses  # noqa: E402
 from nano.model import Nano, Output, position_operator, reference_first  # noqa: E402
 from nano.optim import Muon, orthogonalised  # noqa: E402
@@ -232,17 +231,15 @@ def test_attention_to_the_right_patches_costs_nothing():
     batch = scenes([(clip(3), [0, 1, 2], False)])
     index, weight, seen = matches(batch.depth, batch.first_from_camera, batch.focal, 2, 3)
     tokens, scale = 7, 30.0
-    pair = torch.full((1, 3, tokens, 3, tokens), -scale)
-    first = pair.clone()
+    logits = torch.full((1, 2, 3, tokens, 3, tokens), -scale)
     patches = torch.full((1, 3, 6, 3, 6), -scale).scatter(-1, index, weight.clamp(min=1e-12).log())
-    pair[:, :, 1:, :, 1:] = patches
-    first[:, :, 1:, 0, 1:] = patches[:, :, :, 0]
-    flat = (1, 3 * tokens, 3 * tokens)
-    logits = {key: pair.reshape(flat) for key in PAIR_HEADS} | {key: first.reshape(flat) for key in FIRST_HEADS}
+    logits[:, 0, :, 1:, :, 1:] = patches
+    logits[:, 1, :, 1:, 0, 1:] = patches[:, :, :, 0]
+    logits = logits.reshape(1, 2, 3 * tokens, 3 * tokens)
     right = perfect(batch)
-    right.logits = logits
+    right.logits = {block: logits for block in WATCHED}
     wrong = perfect(batch)
-    wrong.logits = {key: torch.zeros(flat) for key in WATCHED}
+    wrong.logits = {block: torch.zeros_like(logits) for block in WATCHED}
     column = (weight[..., 0, :] * (index[..., 0, :] % 3)).sum(-1) - torch.arange(6) % 3
     row = (weight[..., 0, :] * (index[..., 0, :] // 3)).sum(-1) - torch.arange(6) // 3
     right.patches = torch.stack([column, row], -1) / 3
@@ -296,19 +293,6 @@ def test_training_goes_on_from_an_exported_network():
     images = torch.randn(1, 2, 3, 28, 42)
     with torch.no_grad():
         assert torch.allclose(before(images).log_depth, after(images).log_depth, atol=2e-2)
-
-
-def test_fast_backward_passes_are_those_of_the_usual_ones():
-    torch.manual_seed(5)
-    for outputs in (2, 7):
-        conv = torch.nn.Conv2d(6, outputs, 1)
-        x = torch.randn(2, 6, 3, 4, requires_grad=True)
-        weights = torch.randn(2, outputs, 3, 4)
-        everything = [x, conv.weight, conv.bias]
-        own = torch.autograd.grad((pointwise(relu(x), conv) * weights).sum(), everything)
-        usual = torch.autograd.grad((conv(torch.relu(x)) * weights).sum(), everything)
-        for a, b in zip(own, usual, strict=True):
-            assert torch.allclose(a, b, atol=1e-5)
 
 
 def test_processes_draw_clips_of_the_size_they_agreed_on():
