@@ -123,51 +123,70 @@ fn walk(world: &World, views: usize, rng: &mut ChaCha8Rng) -> Vec<Se3> {
         .collect()
 }
 
+/// Where a hand-held camera looks.
+struct Gaze {
+    target: Vector3<f64>,
+    /// By how much the target moves from view to view, m.
+    wander: Vector3<f64>,
+    /// Roll, and the deviation of all three angles, rad.
+    lean: f64,
+    unrest: f64,
+}
+
+impl Gaze {
+    /// Poses from `place` on, a free step of about `length` apart, beginning along `heading`.
+    fn while_stepping(
+        mut self,
+        world: &World,
+        mut place: Vector3<f64>,
+        mut heading: f64,
+        length: f64,
+        views: usize,
+        rng: &mut ChaCha8Rng,
+    ) -> Vec<Se3> {
+        let (lean, unrest) = (self.lean, self.unrest);
+        (0..views)
+            .map(|_| {
+                let to = self.target - place;
+                let (yaw, pitch) = (to.y.atan2(to.x), -(to.z.atan2(to.x.hypot(to.y))));
+                let (yaw, pitch) = (yaw + unrest * normal(rng), pitch + unrest * normal(rng));
+                let pose = Se3::new(looking(yaw, pitch.clamp(-1.2, 1.2), lean + unrest * normal(rng)), place);
+                place = free_step(world, &place, &mut heading, length, rng);
+                self.target += self.wander;
+                pose
+            })
+            .collect()
+    }
+}
+
 /// Walks sideways round something and keeps it about the middle of the view.
 fn walk_round(world: &World, views: usize, rng: &mut ChaCha8Rng) -> Vec<Se3> {
-    let mut place = free_place(world, rng);
+    let place = free_place(world, rng);
     let yaw = uniform(rng, -PI, PI);
     let pitch = 0.15 + 0.2 * normal(rng);
     let ahead = looking(yaw, pitch, 0.0) * Vector3::z();
     let reach = world.cast(&place, &ahead).map_or(2.0, |hit| hit.t);
     let target = place + ahead * (reach * uniform(rng, 0.6, 1.1));
     let length = stride(rng).min(0.3 * reach);
-    let mut heading = yaw + 0.5 * PI * if rng.random::<bool>() { 1.0 } else { -1.0 } + 0.4 * normal(rng);
+    let heading = yaw + 0.5 * PI * if rng.random::<bool>() { 1.0 } else { -1.0 } + 0.4 * normal(rng);
     let lean = 0.07 * normal(rng);
     let unrest = uniform(rng, 0.01, 0.06);
-    (0..views)
-        .map(|_| {
-            let to = target - place;
-            let (yaw, pitch) = (to.y.atan2(to.x), -(to.z.atan2(to.x.hypot(to.y))));
-            let (yaw, pitch) = (yaw + unrest * normal(rng), pitch + unrest * normal(rng));
-            let pose = Se3::new(looking(yaw, pitch.clamp(-1.2, 1.2), lean + unrest * normal(rng)), place);
-            place = free_step(world, &place, &mut heading, length, rng);
-            pose
-        })
-        .collect()
+    let gaze = Gaze { target, wander: Vector3::zeros(), lean, unrest };
+    gaze.while_stepping(world, place, heading, length, views, rng)
 }
 
 /// Looks over something from 0.5 to 2.3 m, mostly from above, while stepping aside and letting the eye wander.
 fn inspection(world: &World, views: usize, rng: &mut ChaCha8Rng) -> Vec<Se3> {
-    let Some((mut place, mut target)) = vantage(world, rng) else { return walk_round(world, views, rng) };
+    let Some((place, target)) = vantage(world, rng) else { return walk_round(world, views, rng) };
     let reach = (target - place).norm();
     let length = stride(rng).min(0.25 * reach);
     let to = target - place;
     let side = if rng.random::<bool>() { 0.5 * PI } else { -0.5 * PI };
-    let mut heading = to.y.atan2(to.x) + side + 0.6 * normal(rng);
+    let heading = to.y.atan2(to.x) + side + 0.6 * normal(rng);
     let wander = Vector3::new(normal(rng), normal(rng), 0.3 * normal(rng)) * (0.04 * reach);
     let (lean, unrest) = (0.08 * normal(rng), uniform(rng, 0.01, 0.05));
-    (0..views)
-        .map(|_| {
-            let to = target - place;
-            let (yaw, pitch) = (to.y.atan2(to.x), -(to.z.atan2(to.x.hypot(to.y))));
-            let (yaw, pitch) = (yaw + unrest * normal(rng), pitch + unrest * normal(rng));
-            let pose = Se3::new(looking(yaw, pitch.clamp(-1.2, 1.2), lean + unrest * normal(rng)), place);
-            place = free_step(world, &place, &mut heading, length, rng);
-            target += wander;
-            pose
-        })
-        .collect()
+    let gaze = Gaze { target, wander, lean, unrest };
+    gaze.while_stepping(world, place, heading, length, views, rng)
 }
 
 /// A free place and a thing that is seen from there.

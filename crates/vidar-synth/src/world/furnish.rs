@@ -184,7 +184,7 @@ impl Group {
                 Curtain,
             ],
         };
-        choice[rng.random_range(0..choice.len())]
+        pick(choice, rng)
     }
 
     fn build(self, room: &Extent, rng: &mut ChaCha8Rng) -> Vec<Piece> {
@@ -208,6 +208,10 @@ impl Group {
 
 pub(super) fn between(rng: &mut ChaCha8Rng, low: f64, high: f64) -> f64 {
     low + (high - low) * rng.random::<f64>()
+}
+
+pub(super) fn pick<T: Copy>(choice: &[T], rng: &mut ChaCha8Rng) -> T {
+    choice[rng.random_range(0..choice.len())]
 }
 
 pub(super) fn material(kind: Kind, tone: f64, rng: &mut ChaCha8Rng) -> Material {

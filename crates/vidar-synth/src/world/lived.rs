@@ -3,7 +3,7 @@
 //! A camera in the hand looks down on such things from near, where the usual places and the wild ones have little. The
 //! furniture's own frame has x along the wall or the longer side, y into the room and z up.
 
-use super::furnish::{Piece, WallPlace, between, material, on_floor, plain};
+use super::furnish::{Piece, WallPlace, between, material, on_floor, pick, plain};
 use super::material::{Kind, Material};
 use super::shape::{Extent, Shape};
 use nalgebra::{Rotation3, Vector3};
@@ -103,10 +103,6 @@ impl Build {
             thing.stand(self, [x, y, middle[2]], rng);
         }
     }
-}
-
-fn pick<T: Copy>(choice: &[T], rng: &mut ChaCha8Rng) -> T {
-    choice[rng.random_range(0..choice.len())]
 }
 
 /// A material of any of `kinds`, from dark to bright.

@@ -4,7 +4,7 @@
 //! places keep their size and taste, [`crate::Variety::Wild`] draws them anew for each seed, and adds furniture that
 //! the usual places lack: stairs, sofas, lamps, plants, rugs, windows that shine.
 
-use super::furnish::{Piece, WallPlace, between, material, on_floor, piece, plain};
+use super::furnish::{Piece, WallPlace, between, material, on_floor, pick, piece, plain};
 use super::light::Lighting;
 use super::material::{Decal, Kind, Material, Surface};
 use super::shape::{Extent, Shape};
@@ -88,10 +88,6 @@ pub(super) fn shell(room: &Extent, rng: &mut ChaCha8Rng) -> Vec<Surface> {
     above.decals = ceiling_lights([size.x, size.y], rng);
     surfaces.push(above);
     surfaces
-}
-
-fn pick<T: Copy>(choice: &[T], rng: &mut ChaCha8Rng) -> T {
-    choice[rng.random_range(0..choice.len())]
 }
 
 fn wall_decals(size: [f64; 2], rng: &mut ChaCha8Rng) -> Vec<Decal> {
