@@ -173,7 +173,7 @@ class Renderer:
 
 
 class Pool:
-    """A shuffled store of clips by size; each clip is given out `uses` times before it leaves."""
+    """A shuffled store of clips by size; a clip leaves when as much of it was given out as `uses` times the whole."""
 
     def __init__(self, source: Iterator[Clip], capacity: int, uses: int, rng: random.Random) -> None:
         self.source, self.capacity, self.uses, self.rng = source, capacity, uses, rng
@@ -188,10 +188,10 @@ class Pool:
             self.rooms = max(self.rooms, (clip.seed & 0xFFFF_FFFF) + 1)
             self.clips.append([clip, self.uses])
 
-    def draw(self, count: int, wanted: tuple[int, int] | None = None) -> list[Clip]:
-        """`count` clips of one size (height, width): the wanted one where there are enough."""
+    def draw(self, count: int, wanted: tuple[int, int] | None = None, share: float = 1.0) -> list[Clip]:
+        """`count` clips of one size (height, width), the wanted one where there are enough; a share of each is used."""
         # At the start the pool grows while it is used, so that training need not wait for it.
-        self._fill(min(self.capacity, max(4 * count, len(self.clips) + count)))
+        self._fill(min(self.capacity, max(4 * count, len(self.clips) + round(share * count))))
         of_wanted = [clip for clip, _ in self.clips if clip.size == wanted]
         first = self.rng.choice(of_wanted if len(of_wanted) >= count else [clip for clip, _ in self.clips])
         places = [
@@ -202,8 +202,8 @@ class Pool:
         chosen = self.rng.sample(places, min(count, len(places)))
         found = [self.clips[i][0] for i in chosen]
         for i in chosen:
-            self.clips[i][1] -= 1
-        self.clips = [entry for entry in self.clips if entry[1] > 0]
+            self.clips[i][1] -= share
+        self.clips = [entry for entry in self.clips if entry[1] > 1e-6]
         return found
 
 

@@ -18,8 +18,14 @@ from .geometry import matches, quaternion_from_matrix, rays_in_camera
 from .model import Output
 
 CONFIDENCE = 0.4  # weight of the logarithm that keeps the confidence from vanishing
-GRADIENT = 0.5
-ALIGNED = 2.0
+# Confidence weighs pixels by one over their error: alone it teaches most where little is left to learn, so that edges
+# and rooms that are hard would hardly count. The relative error, which is what depth is judged by, leads instead.
+DEPTH = 0.4
+ALIGNED = 4.0
+GRADIENT = 2.0
+# Differences over several distances (pixels): those over one pixel alone cost least where an edge is not drawn at all,
+# and errors of whole surfaces hide what the other terms would say about detail.
+DISTANCES = (1, 4, 12)
 RAYS = 1.0
 CAMERA = 1.0
 MATCH = 0.1
@@ -55,8 +61,8 @@ def relative(log_ratio: Tensor) -> Tensor:
 
 
 def depth_terms(output: Output, scenes: Scenes) -> dict[str, Tensor]:
-    """Errors of the logarithm of depth and of its differences between neighbouring pixels, and the relative error that
-    is left after one scale per scene, which is what depth is judged by: near surfaces seen too far cost more there."""
+    """Errors of the logarithm of depth and of its differences between pixels near each other, and the relative error
+    that is left after one scale per scene, which is what depth is judged by: near surfaces seen too far cost more."""
     mask = scenes.depth > 0
     target = scenes.depth.clamp(min=1e-4).log()
     wrong = output.log_depth - target
@@ -64,15 +70,23 @@ def depth_terms(output: Output, scenes: Scenes) -> dict[str, Tensor]:
     mean = (wrong * mask).sum((1, 2, 3), keepdim=True) / count
     # The scale is the median's; its gradient is spread over all pixels, so that this term does not pull at the scale.
     offset = middle(wrong.detach(), mask) + mean - mean.detach()
-    both_x, both_y = mask[..., 1:] & mask[..., :-1], mask[..., 1:, :] & mask[..., :-1, :]
-    gradient = masked_mean((wrong[..., 1:] - wrong[..., :-1]).abs(), both_x) + masked_mean(
-        (wrong[..., 1:, :] - wrong[..., :-1, :]).abs(), both_y
-    )
+    gradient = sum(differences(wrong, mask, distance) for distance in DISTANCES) / len(DISTANCES)
     return {
         "depth": confident(wrong.abs(), output.depth_conf, mask),
         "aligned": masked_mean(relative(wrong - offset), mask),
         "gradient": gradient,
     }
+
+
+def differences(wrong: Tensor, mask: Tensor, distance: int) -> Tensor:
+    """Mean size of the differences of [B, S, H, W] between pixels so far apart in a row, and in a column."""
+    found = wrong.new_zeros(())
+    for axis in (2, 3):
+        length = wrong.shape[axis] - distance
+        a, b = wrong.narrow(axis, 0, length), wrong.narrow(axis, distance, length)
+        both = mask.narrow(axis, 0, length) & mask.narrow(axis, distance, length)
+        found = found + masked_mean((a - b).abs(), both)
+    return found
 
 
 def ray_term(output: Output, scenes: Scenes) -> Tensor:
@@ -139,7 +153,7 @@ def total(
 ) -> tuple[Tensor, dict[str, float]]:
     """The sum that is minimised, and its terms; `match` is a factor on those of correspondence."""
     terms = depth_terms(output, scenes)
-    loss = terms["depth"] + ALIGNED * terms["aligned"] + GRADIENT * terms["gradient"]
+    loss = DEPTH * terms["depth"] + ALIGNED * terms["aligned"] + GRADIENT * terms["gradient"]
     if output.ray is not None:
         terms["ray"] = ray_term(output, scenes)
         loss = loss + RAYS * terms["ray"]

@@ -24,7 +24,7 @@ class Output:
 
     depth, depth_conf [B, S, H, W]; ray [B, S, 6, 8ph, 8pw], ray_conf [B, S, 8ph, 8pw] or None; pose_enc [B, S, 9].
     logits: of the blocks that are watched, by block [B, heads, S N, S N]; only where the order of views was kept.
-    patches: the second of the four features [B, S, n, 2 dim].
+    patches: the third of the four features [B, S, n, 2 dim].
     """
 
     depth: Tensor
@@ -509,7 +509,7 @@ class Nano(nn.Module):
             pose_enc=pose,
             reference=reference,
             logits=self.backbone["pretrained"].watched(),
-            patches=features[1][0],
+            patches=features[2][0],
         )
 
 

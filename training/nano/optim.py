@@ -1,4 +1,4 @@
-"""Momentum with orthogonalised steps for hidden matrices, Adam with decoupled decay for everything else."""
+"""Momentum with orthogonalised steps for hidden matrices and convolutions, Adam with decoupled decay for the rest."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ from collections.abc import Callable
 
 import torch
 from torch import Tensor, nn
+
+LAST_ROWS = 7  # rows of the largest of the head's last convolutions (a ray and its confidence)
 
 
 def orthogonalised(matrix: Tensor, steps: int = 5) -> Tensor:
@@ -57,11 +59,12 @@ class Muon(torch.optim.Optimizer):
                 # Four matrices make a block.
                 if k // 4 % self.processes == self.rank:
                     step = p.grad.lerp(buffer, group["momentum"])
-                    found = orthogonalised(step.view(parts, p.shape[0] // parts, p.shape[1])).reshape(p.shape)
+                    # A convolution is the matrix of its unrolled windows.
+                    found = orthogonalised(step.reshape(parts, p.shape[0] // parts, -1)).reshape(p.shape)
                     directions[p].copy_(found)
             self.wait()
             for p in used:
-                rows, columns = p.shape[0] // self.parts(p), p.shape[1]
+                rows, columns = p.shape[0] // self.parts(p), p[0].numel()
                 p.mul_(1 - group["lr"] * group["decay"])
                 p.add_(directions[p], alpha=-group["lr"] * max(1.0, rows / columns) ** 0.5)
             self.wait()
@@ -69,7 +72,7 @@ class Muon(torch.optim.Optimizer):
     @staticmethod
     def parts(p: nn.Parameter) -> int:
         """Matrices that a parameter holds."""
-        return 3 if p.shape[0] == 3 * p.shape[1] else 1
+        return 3 if p.dim() == 2 and p.shape[0] == 3 * p.shape[1] else 1
 
 
 def optimisers(model: nn.Module, muon_lr: float, adam_lr: float) -> list[torch.optim.Optimizer]:
@@ -77,7 +80,9 @@ def optimisers(model: nn.Module, muon_lr: float, adam_lr: float) -> list[torch.o
     hidden, rest, plain = [], [], []
     for name, p in model.named_parameters():
         in_blocks = ".blocks." in name or ".trunk." in name
-        if in_blocks and p.dim() == 2:
+        # The head's convolutions but for the last ones, whose few rows are the answers themselves.
+        in_head = name.startswith("head.") and p.dim() == 4 and p.shape[0] > LAST_ROWS
+        if in_blocks and p.dim() == 2 or in_head:
             hidden.append(p)
         elif p.dim() >= 2 and name.endswith("weight"):
             rest.append(p)

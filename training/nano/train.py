@@ -38,6 +38,7 @@ from .optim import optimisers
 
 ROOT = Path(__file__).resolve().parents[1]
 ROOMS_APART = 1 << 20  # between the rooms of two processes
+MOST_CLIPS = 8  # that a process takes scenes from in one step
 
 
 @dataclass
@@ -137,13 +138,21 @@ class Team:
 class Trainer:
     """Model, optimisers, averages and where training stands; one per process."""
 
-    def __init__(self, run: Path, recipe: Recipe, stream: Path, device: str = "cpu", rank: int = 0) -> None:
+    def __init__(
+        self,
+        run: Path,
+        recipe: Recipe,
+        stream: Path,
+        device: str = "cpu",
+        rank: int = 0,
+        config: NanoConfig | None = None,
+    ) -> None:
         self.run, self.recipe, self.stream, self.device, self.rank = run, recipe, stream, device, rank
         self.step, self.room, self.seconds, self.views_seen = 0, 0, 0.0, 0
         self.distinct_views = 0
         saved = run / "state.pt"
         state = torch.load(saved, weights_only=True) if saved.exists() else None
-        self.config = from_dict(state["config"]) if state else NanoConfig()
+        self.config = from_dict(state["config"]) if state else config or NanoConfig()
         torch.manual_seed(1)
         self.model = Nano(self.config)
         if not state:
@@ -209,23 +218,28 @@ class Trainer:
         # What decides how long a step takes is the same for all processes, since they wait for each other.
         sizes = stage.weighted_sizes()
         size = self.common_rng.choices(list(sizes), list(sizes.values()))[0]
-        clips = pool.draw(max(1, stage.views_per_step // per_clip), size)
         shares = dict(map(int, part.split(":")) for part in stage.scene_views.split(","))
         possible = [views for views in shares if views <= per_clip]
         views = self.common_rng.choices(possible, [shares[v] for v in possible])[0]
+        # Scenes of one clip resemble each other: they come from as many clips as can be.
+        wanted = max(1, stage.views_per_step // views)
+        clips = pool.draw(min(wanted, MOST_CLIPS), size, wanted / min(wanted, MOST_CLIPS) * views / per_clip)
         parts = []
-        for clip in clips:
-            parts.extend((clip, own, mirrored) for own, mirrored in self.split(len(clip.image), views))
+        for k, clip in enumerate(clips):
+            groups = wanted // len(clips) + (k < wanted % len(clips))
+            parts.extend((clip, own, mirrored) for own, mirrored in self.split(len(clip.image), views, groups))
         return scenes(parts).to(self.device), self.common_rng.random() < self.recipe.posed_share
 
-    def split(self, available: int, views: int) -> list[tuple[list[int], bool]]:
-        """Disjoint groups of views of a clip: neighbours or spread out, in random order, mirrored or not."""
+    def split(self, available: int, views: int, wanted: int) -> list[tuple[list[int], bool]]:
+        """At most `wanted` disjoint groups of views of a clip: neighbours or spread out, in random order, mirrored or
+        not."""
         groups = available // views
         index = list(range(available))
         if self.rng.random() < 0.5:
             chosen = [index[g * views : (g + 1) * views] for g in range(groups)]
         else:
             chosen = [index[g::groups][:views] for g in range(groups)]
+        chosen = self.rng.sample(chosen, min(wanted, groups))
         for group in chosen:
             self.rng.shuffle(group)
         return [(group, self.rng.random() < 0.5) for group in chosen]
@@ -282,7 +296,7 @@ class Trainer:
             arguments += ["--clips", str(self.recipe.clips_per_room), "--first-room", str(first_room)]
             arguments += ["--lived-in", str(stage.lived_in)]
             renderer = Renderer(self.stream, arguments)
-            pool = Pool(iter(renderer), 600 if stage.views_per_clip <= 8 else 300, self.recipe.clip_uses, self.rng)
+            pool = Pool(iter(renderer), 800 if stage.views_per_clip <= 8 else 400, self.recipe.clip_uses, self.rng)
             print(f"step {self.step}: {stage}, rooms from {first_room}", flush=True)
             seen_before = self.distinct_views
             sums: dict[str, list[float]] = {}

@@ -16,16 +16,16 @@ import torch
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from nano.begin import trainable  # noqa: E402
+from nano.begin import tapped, trainable, widened  # noqa: E402
 from nano.config import NanoConfig  # noqa: E402
 from nano.data import Clip, Pool, read_clip, scenes, write_clip  # noqa: E402
 from nano.export import exported, imported, mean  # noqa: E402
 from nano.geometry import homogeneous, inverse, matches, matrix_from_quaternion, quaternion_from_matrix  # noqa: E402
-from nano.losses import WATCHED, depth_terms, match_terms, relative, total  # noqa: E402
+from nano.losses import WATCHED, depth_terms, differences, match_terms, relative, total  # noqa: E402
 from nano.metrics import depth_errors, pair_errors, scale_from_poses  # noqa: E402
 from nano.model import Nano, Output, position_operator, reference_first  # noqa: E402
-from nano.optim import Muon, orthogonalised  # noqa: E402
-from nano.train import Stage, Team  # noqa: E402
+from nano.optim import Muon, optimisers, orthogonalised  # noqa: E402
+from nano.train import Recipe, Stage, Team, Trainer  # noqa: E402
 
 SMALL = NanoConfig(dim=32, heads=2, features=8, out_channels=(8, 8, 8, 8), cam_enc_heads=2, cam_enc_depth=1)
 
@@ -90,6 +90,22 @@ def test_relative_errors_stay_finite_however_far_too_deep():
     assert torch.allclose(found[:5], (ratio[:5].exp() - 1).abs())
     assert found[-1] < 150
     assert (found[5] - found[4]).item() == pytest.approx(0.001 * math.e, rel=0.01)
+
+
+def test_differences_see_detail_where_whole_surfaces_are_off_and_where_depth_is_known():
+    truth = torch.zeros(1, 1, 20, 40)
+    truth[..., 20:] = 1.0
+    ramp = ((torch.arange(40.0) - 14) / 12).clamp(0, 1).expand_as(truth)
+    known = torch.ones_like(truth, dtype=torch.bool)
+    cost = {d: [differences(p - truth, known, d).item() for p in (ramp, torch.zeros_like(truth))] for d in (1, 12)}
+    assert cost[1][0] > cost[1][1], "over one pixel no edge at all is cheaper than a blurred one"
+    assert cost[12][0] < 0.7 * cost[12][1], "and over twelve it is dearer"
+    shifted = differences(ramp - truth + 0.3, known, 12).item()
+    assert shifted == pytest.approx(cost[12][0], rel=1e-4), "a whole surface's error is not counted"
+    wrong = ramp - truth
+    wrong[..., 5] = 100.0
+    known[..., 5] = False
+    assert differences(wrong, known, 12) < 1, "what is not known does not count"
 
 
 def test_a_cut_or_foreign_stream_is_refused():
@@ -188,6 +204,20 @@ def test_orthogonalised_steps_have_singular_values_near_one():
     for shape in ((24, 96), (96, 24)):
         values = torch.linalg.svdvals(orthogonalised(torch.randn(shape)))
         assert values.min() > 0.5 and values.max() < 1.4
+
+
+def test_convolutions_of_the_head_get_orthogonal_steps_and_its_answers_do_not():
+    model = Nano(SMALL)
+    hidden = {id(p) for group in optimisers(model, 0.01, 0.01)[0].param_groups for p in group["params"]}
+    scratch = model.head.scratch
+    assert id(scratch.layer1_rn.weight) in hidden and id(model.head.projects[0].weight) in hidden
+    assert id(scratch.output_conv2[2].weight) not in hidden
+    assert id(scratch.output_conv2_aux["3"]["5"].weight) not in hidden
+    convolution = torch.nn.Parameter(torch.zeros(8, 4, 3, 3))
+    convolution.grad = torch.randn_like(convolution)
+    Muon([convolution], 1.0, decay=0.0).step()
+    values = torch.linalg.svdvals(convolution.detach().flatten(1))
+    assert values.min() > 0.5 and values.max() < 1.4
 
 
 def test_errors_of_a_scaled_truth_are_zero():
@@ -295,6 +325,38 @@ def test_training_goes_on_from_an_exported_network():
         assert torch.allclose(before(images).log_depth, after(images).log_depth, atol=2e-2)
 
 
+def test_a_head_with_more_channels_answers_as_before_and_learns_with_them():
+    torch.manual_seed(6)
+    narrow = Nano(SMALL).eval()
+    wide = widened(narrow, (32, 16, 8, 16)).eval()
+    images = torch.randn(1, 2, 3, 28, 42)
+    with torch.no_grad():
+        assert torch.allclose(narrow(images).log_depth, wide(images).log_depth, atol=1e-5)
+        assert torch.allclose(narrow(images).ray, wide(images).ray, atol=1e-5)
+    wide(images).log_depth.square().sum().backward()
+    heard = wide.head.scratch.layer1_rn.weight.grad[:, 1::2]
+    assert heard.abs().amax((0, 2, 3)).min() > 0, "the new channels carry something"
+    with pytest.raises(ValueError, match="several times"):
+        widened(narrow, (12, 8, 8, 8))
+
+
+def test_a_head_that_reads_other_blocks_hears_about_the_same():
+    torch.manual_seed(8)
+    before = Nano(SMALL).eval()
+    images = torch.randn(1, 4, 3, 56, 84)
+    layers = (3, 7, 9, 11)
+    fitted = tapped(before, layers, images).eval()
+    assert fitted.config.out_layers == layers
+    careless = Nano(replace(SMALL, out_layers=layers)).eval()
+    careless.load_state_dict(before.state_dict())
+    with torch.no_grad():
+        truth, *others = (m(images).log_depth for m in (before, fitted, careless))
+    near, far = ((other - truth).abs().mean() for other in others)
+    assert 0 < near < 0.7 * far
+    with torch.no_grad():
+        assert torch.allclose(tapped(before, SMALL.out_layers, images)(images).log_depth, truth, atol=1e-6)
+
+
 def test_processes_draw_clips_of_the_size_they_agreed_on():
     sizes = Stage(1, "168x112:3,98x84", 32).weighted_sizes()
     assert sizes == {(112, 168): 3, (84, 98): 1}
@@ -310,6 +372,37 @@ def test_processes_draw_clips_of_the_size_they_agreed_on():
         assert {c.size[1] for c in pool.draw(2, (clip().size[0], width))} == {width}
     # What is not there cannot be had: any other size will do.
     assert len(pool.draw(2, (1, 1))) == 2
+
+
+def test_a_clip_stays_until_all_of_it_was_used_often_enough():
+    clips = [replace(clip(), number=k) for k in range(20)]
+    pool = Pool(iter(clips), 1, 2, random.Random(1))
+    drawn = [pool.draw(1, share=0.5)[0].number for _ in range(16)]
+    assert all(drawn.count(k) == 4 for k in drawn), "half of it, four times"
+
+
+def test_a_step_takes_its_scenes_from_many_clips(tmp_path):
+    trainer = Trainer.__new__(Trainer)
+    trainer.device, trainer.rng, trainer.common_rng = "cpu", random.Random(1), random.Random(1)
+    trainer.recipe = Recipe(0, 0, 0, 0, 0.5, 0, 1, 2, [])
+    stage = Stage(1, "42x28", 32, views_per_clip=16, scene_views="1:1,3:1,8:1,16:1")
+    endless = (replace(clip(16), number=k) for k in range(10**6))
+    drawn = []
+
+    class Watched(Pool):
+        def draw(self, *arguments):  # noqa: ANN002, ANN202
+            drawn.append(super().draw(*arguments))
+            return drawn[-1]
+
+    pool = Watched(endless, 40, 2, random.Random(2))
+    seen = set()
+    for _ in range(40):
+        batch, _ = trainer.batch(pool, stage)
+        count, views = batch.depth.shape[:2]
+        seen.add(views)
+        assert count == {1: 32, 3: 10, 8: 4, 16: 2}[views]
+        assert len({c.number for c in drawn[-1]}) == min(count, 8)
+    assert seen == {1, 3, 8, 16}
 
 
 def test_the_mean_of_two_networks_lies_half_way():
