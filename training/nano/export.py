@@ -1,6 +1,6 @@
 """Writes a trained network as `config.json` and `model.safetensors` (f16, official key names), and reads it back.
 
-python -m nano.export --run RUN_FOLDER --out ../models/da3-nano [--weights ema|model] [--mean-with FOLDER]
+python -m nano.export --run RUN_FOLDER --out ../models/da3-nano [--weights ema|model] [--mean-with FOLDER:SHARE]…
 """
 
 from __future__ import annotations
@@ -79,13 +79,24 @@ def read(folder: Path) -> Nano:
     return imported(load_file(folder / "model.safetensors"), config)
 
 
-def mean(first: Nano, second: Nano) -> Nano:
-    """The network half-way between two ends of one training: often as good as either on rooms like those trained on,
-    and better on others (Wortsman et al. 2022)."""
-    if first.config != second.config:
-        raise ValueError("networks of different sizes have no mean")
-    others = exported(second)
-    return imported({name: (t.float() + others[name].float()) / 2 for name, t in exported(first).items()}, first.config)
+def mean(networks: list[tuple[Nano, float]]) -> Nano:
+    """The weighted mean of ends of one training: often as good as the best of them on rooms like those trained on, and
+    better on others (Wortsman et al. 2022). It has the first one's shape; what another one's head reads from other
+    blocks, or in other sizes, plays no part."""
+    first = networks[0][0]
+    parts = [(exported(network), network.config.out_layers, share) for network, share in networks]
+
+    def of(name: str, tensor: Tensor) -> Tensor:
+        level = name.removeprefix(f"{PREFIX}head.projects.").split(".")[0]
+        same = [
+            (tensors[name], share)
+            for tensors, layers, share in parts
+            if tensors[name].shape == tensor.shape
+            and not (level.isdigit() and layers[int(level)] != first.config.out_layers[int(level)])
+        ]
+        return sum(t.float() * share for t, share in same) / sum(share for _, share in same)
+
+    return imported({name: of(name, t) for name, t in parts[0][0].items()}, first.config)
 
 
 def trained(run: Path, which: str) -> tuple[Nano, dict]:
@@ -102,11 +113,19 @@ def main() -> None:
     parser.add_argument("--run", type=Path, required=True)
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--weights", choices=["ema", "model"], default="ema")
-    parser.add_argument("--mean-with", type=Path, help="a folder that was exported before: the mean of both is written")
+    parser.add_argument(
+        "--mean-with",
+        action="append",
+        default=[],
+        help="FOLDER:SHARE of an export that so much is taken from; repeatable",
+    )
     arguments = parser.parse_args()
     model, state = trained(arguments.run, arguments.weights)
     if arguments.mean_with:
-        model = mean(model, read(arguments.mean_with))
+        others = [
+            (read(Path(folder)), float(share)) for folder, _, share in (m.rpartition(":") for m in arguments.mean_with)
+        ]
+        model = mean([(model, 1 - sum(share for _, share in others)), *others])
     write(model, arguments.out)
     count = sum(t.numel() for t in exported(model).values())
     print(f"step {state['step']}, {count} numbers, {(arguments.out / 'model.safetensors').stat().st_size} bytes")

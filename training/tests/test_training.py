@@ -405,12 +405,16 @@ def test_a_step_takes_its_scenes_from_many_clips(tmp_path):
     assert seen == {1, 3, 8, 16}
 
 
-def test_the_mean_of_two_networks_lies_half_way():
-    config = NanoConfig(dim=48, depth=4, heads=3, out_layers=(0, 1, 2, 3), cam_enc_depth=1)
+def test_the_mean_of_networks_lies_between_them():
+    config = NanoConfig(dim=48, depth=5, heads=3, out_layers=(1, 2, 3, 4), cam_enc_depth=1)
     torch.manual_seed(6)
     one, other = Nano(config), Nano(config)
-    tensors = [exported(m) for m in (one, other, mean(one, other))]
-    for name, found in tensors[2].items():
-        assert torch.allclose(found, (tensors[0][name] + tensors[1][name]) / 2, atol=1e-6), name
-    with pytest.raises(ValueError, match="different sizes"):
-        mean(one, Nano(replace(config, dim=96)))
+    grown = Nano(replace(config, out_layers=(0, 2, 3, 4), out_channels=(24, 96, 96, 96)))
+    a, b, c = (exported(m) for m in (one, other, grown))
+    for name, found in exported(mean([(one, 0.25), (other, 0.75)])).items():
+        assert torch.allclose(found, 0.25 * a[name] + 0.75 * b[name], atol=1e-6), name
+    mixed = mean([(grown, 0.5), (one, 0.5)])
+    assert mixed.config == grown.config
+    for name, found in exported(mixed).items():
+        own = a[name].shape != c[name].shape or "head.projects.0." in name
+        assert torch.allclose(found, c[name] if own else (a[name] + c[name]) / 2, atol=1e-6), name
