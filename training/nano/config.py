@@ -19,12 +19,13 @@ class NanoConfig:
     dim: int = 192
     depth: int = 12
     heads: int = 3
-    out_layers: tuple[int, int, int, int] = (5, 7, 9, 11)
+    # The finest level reads an early block: later ones have forgotten most of the picture (decision 12).
+    out_layers: tuple[int, int, int, int] = (1, 5, 9, 11)
     alt_start: int = 2
     qknorm_start: int = 0
     rope_start: int = 0
     features: int = 32
-    out_channels: tuple[int, int, int, int] = (24, 48, 96, 96)
+    out_channels: tuple[int, int, int, int] = (96, 96, 96, 96)
     cam_enc_heads: int = 6
     cam_enc_depth: int = 2
     cam_enc_ratio: int = 4
