@@ -45,7 +45,6 @@ def widened(model: Nano, channels: tuple[int, int, int, int]) -> Nano:
     if any(b % a for a, b in zip(few, channels, strict=True)):
         raise ValueError(f"channels can stay or become several times as many: {few} cannot become {channels}")
     wide = Nano(replace(model.config, out_channels=channels))
-    wide.backbone["pretrained"].pos_full = model.backbone["pretrained"].pos_full
     new = wide.state_dict()
     for name, old in model.state_dict().items():
         # Sines and cosines of the place are added to these channels: of twice as many every other one has an old rate,
@@ -67,7 +66,6 @@ def tapped(model: Nano, layers: tuple[int, int, int, int], images: Tensor) -> Na
     heard before, by least squares over pictures [B, S, 3, H, W]."""
     other = Nano(replace(model.config, out_layers=layers))
     other.load_state_dict(model.state_dict())
-    other.backbone["pretrained"].pos_full = model.backbone["pretrained"].pos_full
     before, after = (
         [
             m.head.norm(patches).flatten(0, -2).double()

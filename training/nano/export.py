@@ -84,19 +84,16 @@ def mean(networks: list[tuple[Nano, float]]) -> Nano:
     better on others (Wortsman et al. 2022). It has the first one's shape; what another one's head reads from other
     blocks, or in other sizes, plays no part."""
     first = networks[0][0]
-    parts = [(exported(network), network.config.out_layers, share) for network, share in networks]
-
-    def of(name: str, tensor: Tensor) -> Tensor:
-        level = name.removeprefix(f"{PREFIX}head.projects.").split(".")[0]
-        same = [
-            (tensors[name], share)
-            for tensors, layers, share in parts
-            if tensors[name].shape == tensor.shape
-            and not (level.isdigit() and layers[int(level)] != first.config.out_layers[int(level)])
-        ]
-        return sum(t.float() * share for t, share in same) / sum(share for _, share in same)
-
-    return imported({name: of(name, t) for name, t in parts[0][0].items()}, first.config)
+    weight = dict.fromkeys(exported(first), 0.0)
+    total = {name: torch.zeros_like(t) for name, t in exported(first).items()}
+    for network, share in networks:
+        levels = enumerate(zip(network.config.out_layers, first.config.out_layers, strict=True))
+        other = tuple(f"{PREFIX}head.projects.{k}." for k, (own, wanted) in levels if own != wanted)
+        for name, tensor in exported(network).items():
+            if tensor.shape == total[name].shape and not name.startswith(other):
+                total[name] += share * tensor
+                weight[name] += share
+    return imported({name: t / weight[name] for name, t in total.items()}, first.config)
 
 
 def trained(run: Path, which: str) -> tuple[Nano, dict]:

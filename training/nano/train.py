@@ -223,7 +223,8 @@ class Trainer:
         views = self.common_rng.choices(possible, [shares[v] for v in possible])[0]
         # Scenes of one clip resemble each other: they come from as many clips as can be.
         wanted = max(1, stage.views_per_step // views)
-        clips = pool.draw(min(wanted, MOST_CLIPS), size, wanted / min(wanted, MOST_CLIPS) * views / per_clip)
+        sources = min(wanted, MOST_CLIPS)
+        clips = pool.draw(sources, size, wanted / sources * views / per_clip)
         parts = []
         for k, clip in enumerate(clips):
             groups = wanted // len(clips) + (k < wanted % len(clips))
