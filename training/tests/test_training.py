@@ -16,6 +16,7 @@ import torch
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
+from nano.anatomy import beyond_plane, cells, parts, read_linearly, smooth  # noqa: E402
 from nano.begin import tapped, trainable, widened  # noqa: E402
 from nano.config import NanoConfig  # noqa: E402
 from nano.data import Clip, Pool, read_clip, scenes, write_clip  # noqa: E402
@@ -418,3 +419,20 @@ def test_the_mean_of_networks_lies_between_them():
     for name, found in exported(mixed).items():
         own = a[name].shape != c[name].shape or "head.projects.0." in name
         assert torch.allclose(found, c[name] if own else (a[name] + c[name]) / 2, atol=1e-6), name
+
+
+def test_errors_of_layout_and_of_detail_are_told_apart():
+    torch.manual_seed(9)
+    truth = torch.ones(2, 70, 112)
+    truth[..., 56:] = 3.0
+    blurred, tilted = smooth(truth.log(), 7).exp(), truth * torch.linspace(1, 1.5, 112)
+    assert max(parts(2 * truth, truth).values()) < 1e-5
+    detail, layout = parts(blurred, truth), parts(tilted, truth)
+    assert detail["near a step"] > 10 * detail["elsewhere"]
+    assert detail["true below 14 px"] < 0.5 * detail["all"] < detail["true beyond 14 px"]
+    assert layout["true beyond 14 px"] < 0.5 * layout["all"] < layout["true below 14 px"]
+    plane = torch.linspace(0, 1, 112) + torch.linspace(0, 2, 70)[:, None]
+    assert beyond_plane(cells(plane[None])).abs().max() < 1e-5 < cells(plane[None]).abs().max()
+    tokens = torch.randn(400, 8)
+    assert read_linearly(tokens, tokens @ torch.randn(8, 3) + 2) > 0.999
+    assert read_linearly(tokens, torch.randn(400, 3)) < 0.1
