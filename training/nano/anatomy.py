@@ -1,8 +1,8 @@
 """Where the error of depth sits: which rooms, layout or detail, and what the tokens know of their patches.
 
-    python -m nano.anatomy --model ../models/da3-nano --stream stream_views [--split val] [--rooms 24]
+    python -m nano.anatomy --model ../models/da3-nano --stream stream_views [--split val] [--rooms 24] [--size 224x140]
 
-Scenes of 8 views at 224 x 140, each after one scale (median ratio). Structure is parted by a Gaussian of the logarithm.
+Scenes of 8 views, each after one scale (median ratio). Structure is parted by a Gaussian of the logarithm.
 """
 
 from __future__ import annotations
@@ -14,25 +14,17 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from .config import PATCH
+from .config import NATIVE, PATCH
 from .data import scenes
 from .evaluate import rendered
 from .export import read
+from .filters import smooth
 from .metrics import depth_errors
 from .model import Nano
 
 VIEWS = 8
 STEP = 0.3  # log-ratio of depth within a window about a patch wide from which it counts as a step
 CELLS = 7  # a patch is compared as so many means a side
-
-
-def smooth(x: Tensor, sigma: float) -> Tensor:
-    """[V, H, W] under a Gaussian of `sigma` pixels; the border is repeated."""
-    reach = int(3 * sigma)
-    kernel = torch.exp(-torch.arange(-reach, reach + 1.0).square() / (2 * sigma**2))
-    kernel = (kernel / kernel.sum())[None, None, None]
-    x = F.conv2d(F.pad(x[:, None], (reach,) * 4, mode="replicate"), kernel)
-    return F.conv2d(x, kernel.mT)[:, 0]
 
 
 def cells(x: Tensor) -> Tensor:
@@ -108,11 +100,12 @@ def main() -> None:
     parser.add_argument("--stream", type=Path, required=True)
     parser.add_argument("--split", choices=["val", "test"], default="val")
     parser.add_argument("--rooms", type=int, default=24)
+    parser.add_argument("--size", default=NATIVE)
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     model = read(arguments.model)
     rows, detail, tokens, pictures = [], torch.zeros(2), [], []
-    for clip in rendered(arguments.stream, arguments.split, arguments.rooms, VIEWS, "224x140"):
+    for clip in rendered(arguments.stream, arguments.split, arguments.rooms, VIEWS, arguments.size):
         batch = scenes([(clip, list(range(VIEWS)), False)])
         output = model(batch.images, None, wants_rays=False, select=True, autocast=True)
         found, truth = output.depth.float()[0], batch.depth[0]

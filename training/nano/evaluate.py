@@ -1,10 +1,11 @@
 """Errors on rooms that were never trained on and on real frames, beside a constant depth.
 
     python -m nano.evaluate --model ../models/da3-nano --stream stream_views [--rooms 40] [--size 224x140]
-                            [--real SHARED_DATA_FOLDER] [--out table.md]
+                            [--soften 0.5] [--real SHARED_DATA_FOLDER] [--out table.md]
 
 Depth is compared after one scale per scene (median ratio); poses by relative rotation and direction of the baseline
-over all pairs of views. `by poses` is the depth after the scale that the given camera centres imply.
+over all pairs of views. `by poses` is the depth after the scale that the given camera centres imply. `--soften` blurs
+what the network sees.
 """
 
 from __future__ import annotations
@@ -12,12 +13,16 @@ from __future__ import annotations
 import argparse
 import subprocess
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import torch
 
+from .config import NATIVE
 from .data import Clip, clips_of, scenes
 from .export import read, trained
+from .filters import smooth
 from .metrics import Tally, add_scenes
 from .model import Nano
 from .real import real_clips
@@ -39,6 +44,15 @@ def rendered(stream: Path, split: str, rooms: int, views: int, size: str) -> lis
         arguments = ["--split", split, "--rooms", str(rooms), "--clips", "1", "--views", str(views), "--sizes", size]
         subprocess.run([str(stream), *arguments], stdout=file, check=True)
         return clips_of(Path(file.name))
+
+
+def softened(clip: Clip, sigma: float) -> Clip:
+    """The clip as it looks under a Gaussian of `sigma` pixels."""
+    if sigma <= 0:
+        return clip
+    channels = torch.from_numpy(np.array(clip.image)).float().movedim(-1, 0)
+    image = torch.stack([smooth(c, sigma) for c in channels], -1)
+    return replace(clip, image=image.round().byte().numpy())
 
 
 def errors(model: Nano, clips: list[Clip], views: int, posed: bool, autocast: bool) -> dict[str, float]:
@@ -74,8 +88,9 @@ def main() -> None:
     parser.add_argument("--stream", type=Path, required=True)
     parser.add_argument("--split", choices=["val", "test"], default="test")
     parser.add_argument("--rooms", type=int, default=40)
-    parser.add_argument("--size", default="224x140")
+    parser.add_argument("--size", default=NATIVE)
     parser.add_argument("--real", type=Path)
+    parser.add_argument("--soften", type=float, default=0.0, help="deviation of a Gaussian, pixels")
     parser.add_argument("--exact", action="store_true", help="f32 throughout")
     parser.add_argument("--out", type=Path)
     arguments = parser.parse_args()
@@ -89,6 +104,8 @@ def main() -> None:
         for views in (1, 4, 8, 16):
             for name, found in real_clips(arguments.real, (height, width), max(views, 4)).items():
                 places.setdefault(name, {})[views] = found
+    soft = lambda clips: [softened(clip, arguments.soften) for clip in clips]  # noqa: E731
+    places = {name: {views: soft(clips) for views, clips in rows.items()} for name, rows in places.items()}
     text = table(model, places, not arguments.exact)
     if arguments.out:
         arguments.out.write_text(text)

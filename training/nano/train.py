@@ -29,7 +29,8 @@ import torch
 import torch.multiprocessing as multiprocessing
 from torch import Tensor, nn
 
-from .config import NanoConfig, from_dict
+from .augment import varied
+from .config import NATIVE, NanoConfig, from_dict
 from .data import Clip, Pool, Renderer, Scenes, clips_of, normalise, scenes
 from .losses import WATCHED, total
 from .metrics import Tally, add_scenes
@@ -44,8 +45,8 @@ MOST_CLIPS = 8  # that a process takes scenes from in one step
 @dataclass
 class Stage:
     """Part of the recipe: until which step, which sizes (`stream_views --sizes`), how many views a step, and how often
-    a scene has how many of them, which share of the rooms are homes (`stream_views --lived-in`), and how strongly
-    correspondence is taught."""
+    a scene has how many of them, which share of the rooms are homes (`stream_views --lived-in`), how strongly
+    correspondence is taught, and which share of the scenes look different (`augment.varied`)."""
 
     until_step: int
     sizes: str
@@ -56,6 +57,7 @@ class Stage:
     scene_views: str = "1:4,2:30,3:10,4:26,6:6,8:24,16:20"
     lived_in: float = 0.0
     match: float = 1.0
+    augmented: float = 0.0
 
     def weighted_sizes(self) -> dict[tuple[int, int], int]:
         """Weight of each (height, width)."""
@@ -229,7 +231,9 @@ class Trainer:
         for k, clip in enumerate(clips):
             groups = wanted // len(clips) + (k < wanted % len(clips))
             parts.extend((clip, own, mirrored) for own, mirrored in self.split(len(clip.image), views, groups))
-        return scenes(parts).to(self.device), self.common_rng.random() < self.recipe.posed_share
+        found = scenes(parts)
+        found.images = varied(found.images, stage.augmented, self.rng)
+        return found.to(self.device), self.common_rng.random() < self.recipe.posed_share
 
     def split(self, available: int, views: int, wanted: int) -> list[tuple[list[int], bool]]:
         """At most `wanted` disjoint groups of views of a clip: neighbours or spread out, in random order, mirrored or
@@ -272,7 +276,7 @@ class Trainer:
 
     def validate(self) -> None:
         """Appends errors on rooms of the validation split."""
-        for size in ("112x70", "224x140"):
+        for size in ("112x70", NATIVE):
             clips = sample_clips(self.run, self.stream, "val", size)
             for views, posed in ((1, False), (4, False), (8, False), (8, True)):
                 # The low size is for the curve, the native one for the truth.

@@ -16,11 +16,14 @@ import torch
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from nano.anatomy import beyond_plane, cells, parts, read_linearly, smooth  # noqa: E402
+from nano.anatomy import beyond_plane, cells, parts, read_linearly  # noqa: E402
+from nano.augment import repainted, varied
 from nano.begin import tapped, trainable, widened  # noqa: E402
 from nano.config import NanoConfig  # noqa: E402
 from nano.data import Clip, Pool, read_clip, scenes, write_clip  # noqa: E402
+from nano.evaluate import softened  # noqa: E402
 from nano.export import exported, imported, mean  # noqa: E402
+from nano.filters import smooth  # noqa: E402
 from nano.geometry import homogeneous, inverse, matches, matrix_from_quaternion, quaternion_from_matrix  # noqa: E402
 from nano.losses import WATCHED, depth_terms, differences, match_terms, relative, total  # noqa: E402
 from nano.metrics import depth_errors, pair_errors, scale_from_poses  # noqa: E402
@@ -436,3 +439,33 @@ def test_errors_of_layout_and_of_detail_are_told_apart():
     tokens = torch.randn(400, 8)
     assert read_linearly(tokens, tokens @ torch.randn(8, 3) + 2) > 0.999
     assert read_linearly(tokens, torch.randn(400, 3)) < 0.1
+
+
+def test_a_share_of_the_scenes_look_different_and_their_views_alike() -> None:
+    images = ((torch.rand(1, 1, 3, 14, 28) - 0.45) / 0.225).expand(200, 2, 3, 14, 28)
+    assert varied(images, 0.0, random.Random(1)) is images
+    changed = varied(images, 0.5, random.Random(1))
+    assert torch.equal(changed, varied(images, 0.5, random.Random(1)))
+    untouched = (changed == images).flatten(1).all(1)
+    assert 60 < untouched.sum() < 140
+    assert changed.isfinite().all()
+    # Views of a scene differ by their exposure alone.
+    views = torch.linspace(0.2, 0.6, 14 * 28).view(1, 1, 14, 28).expand(2, 3, 14, 28)
+    for seed in range(20):
+        a, b = repainted(views, random.Random(seed))
+        inside = (a > 0.01) & (a < 0.99) & (b > 0.01) & (b < 0.99)
+        ratio = (a / b)[inside]
+        assert 0 <= min(a.min(), b.min()) and max(a.max(), b.max()) <= 1
+        assert ratio.numel() == 0 or ratio.max() - ratio.min() < 1e-3
+
+
+def test_softening_blurs_pictures_alone() -> None:
+    image = np.zeros((2, 14, 28, 3), np.uint8)
+    image[:, 7, 14] = (200, 100, 50)
+    clip = Clip(0, 0, image, np.ones((2, 14, 28), np.float16), np.zeros((2, 3, 4), np.float32), (20.0, 20.0))
+    assert softened(clip, 0.0) is clip
+    soft = softened(clip, 0.8)
+    assert soft.depth is clip.depth and soft.image.dtype == np.uint8 and soft.image.shape == image.shape
+    assert 0 < soft.image[0, 7, 15, 0] < soft.image[0, 7, 14, 0] < 200
+    # What a point loses its neighbours get.
+    assert abs(int(soft.image[0, :, :, 0].sum()) - 200) < 10
