@@ -149,11 +149,11 @@ def match_terms(output: Output, scenes: Scenes, reader: nn.Module | None = None)
 
 
 def total(
-    output: Output, scenes: Scenes, reader: nn.Module | None = None, match: float = 1.0
+    output: Output, scenes: Scenes, reader: nn.Module | None = None, match: float = 1.0, depth: float = 1.0
 ) -> tuple[Tensor, dict[str, float]]:
-    """The sum that is minimised, and its terms; `match` is a factor on those of correspondence."""
+    """The sum that is minimised, and its terms; `match` and `depth` are factors on correspondence and on depth."""
     terms = depth_terms(output, scenes)
-    loss = DEPTH * terms["depth"] + ALIGNED * terms["aligned"] + GRADIENT * terms["gradient"]
+    loss = depth * (DEPTH * terms["depth"] + ALIGNED * terms["aligned"] + GRADIENT * terms["gradient"])
     if output.ray is not None:
         terms["ray"] = ray_term(output, scenes)
         loss = loss + RAYS * terms["ray"]

@@ -46,7 +46,7 @@ MOST_CLIPS = 8  # that a process takes scenes from in one step
 class Stage:
     """Part of the recipe: until which step, which sizes (`stream_views --sizes`), how many views a step, and how often
     a scene has how many of them, which share of the rooms are homes (`stream_views --lived-in`), how strongly
-    correspondence is taught, and which share of the scenes look different (`augment.varied`)."""
+    correspondence and depth are taught, and which share of the scenes look different (`augment.varied`)."""
 
     until_step: int
     sizes: str
@@ -57,6 +57,7 @@ class Stage:
     scene_views: str = "1:4,2:30,3:10,4:26,6:6,8:24,16:20"
     lived_in: float = 0.0
     match: float = 1.0
+    depth: float = 1.0
     augmented: float = 0.0
 
     def weighted_sizes(self) -> dict[tuple[int, int], int]:
@@ -249,15 +250,15 @@ class Trainer:
             self.rng.shuffle(group)
         return [(group, self.rng.random() < 0.5) for group in chosen]
 
-    def learn(self, batch: Scenes, posed: bool, match: float = 1.0) -> dict[str, float]:
-        """One step; `match` as in `Stage`."""
+    def learn(self, batch: Scenes, posed: bool, match: float = 1.0, depth: float = 1.0) -> dict[str, float]:
+        """One step; `match` and `depth` as in `Stage`."""
         factor = self.recipe.lr_factor(self.step)
         for optimiser, base in zip(self.optimisers, self.bases, strict=True):
             for group in optimiser.param_groups:
                 group["lr"] = base * factor * group.get("share", 1.0)
         rays = self.common_rng.random() < self.recipe.ray_share
         output = self.model(batch.images, batch.pose9 if posed else None, wants_rays=rays, autocast=True)
-        loss, terms = total(output, batch, self.reader, match)
+        loss, terms = total(output, batch, self.reader, match, depth)
         for optimiser in self.optimisers:
             optimiser.zero_grad(set_to_none=True)
         loss.backward()
@@ -309,7 +310,7 @@ class Trainer:
                 tick = time.monotonic()
                 batch, posed = self.batch(pool, stage)
                 waited = time.monotonic() - tick
-                terms = self.learn(batch, posed, stage.match)
+                terms = self.learn(batch, posed, stage.match, stage.depth)
                 terms["waited"] = waited
                 terms["took"] = time.monotonic() - tick
                 self.seconds += terms["took"]

@@ -152,6 +152,11 @@ def test_the_perfect_answer_has_the_least_loss():
         else:
             answer.pose_enc = answer.pose_enc + 0.1
         assert total(answer, batch)[0] > best + 0.01
+    # With a factor, the same terms count for more.
+    twice, once = (total(perfect(batch), batch, depth=factor)[0] for factor in (2.0, 1.0))
+    none = total(perfect(batch), batch, depth=0.0)[0]
+    torch.testing.assert_close(twice - once, once - none)
+    assert abs(once - none) > 0.01
 
 
 def test_exported_networks_answer_as_before_and_have_official_keys():
