@@ -4,6 +4,7 @@ depth: a scene's views get the same ones, as one camera would.
 
 from __future__ import annotations
 
+import math
 import random
 
 import torch
@@ -33,13 +34,13 @@ def repainted(views: Tensor, rng: random.Random) -> Tensor:
     """[S, 3, H, W] in 0 to 1 as another camera would show them: sharpness, colours, tone, exposure."""
     views = refocused(views, rng)
     views = recoloured(views, rng).clamp(min=1e-3, max=1)
-    views = views ** torch.tensor(rng.gauss(0, EXPONENT)).exp().item()
+    views = views ** math.exp(rng.gauss(0, EXPONENT))
     exposure = torch.tensor([rng.gauss(0, EXPOSURE) for _ in views]).exp().view(-1, 1, 1, 1)
     return (views * exposure.to(views)).clamp(0, 1)
 
 
 def refocused(views: Tensor, rng: random.Random) -> Tensor:
-    """Sharpened in half of the cases, blurred in a sixth: rendered pictures are softer than larger ones made small."""
+    """Sharpened in half of the cases, blurred in a sixth."""
     kind = rng.random()
     if kind > 2 / 3:
         return views

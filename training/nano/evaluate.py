@@ -104,8 +104,9 @@ def main() -> None:
         for views in (1, 4, 8, 16):
             for name, found in real_clips(arguments.real, (height, width), max(views, 4)).items():
                 places.setdefault(name, {})[views] = found
-    soft = lambda clips: [softened(clip, arguments.soften) for clip in clips]  # noqa: E731
-    places = {name: {views: soft(clips) for views, clips in rows.items()} for name, rows in places.items()}
+    for by_views in places.values():
+        for views, found in by_views.items():
+            by_views[views] = [softened(clip, arguments.soften) for clip in found]
     text = table(model, places, not arguments.exact)
     if arguments.out:
         arguments.out.write_text(text)

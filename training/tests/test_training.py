@@ -17,7 +17,7 @@ import torch
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from nano.anatomy import beyond_plane, cells, parts, read_linearly  # noqa: E402
-from nano.augment import repainted, varied
+from nano.augment import repainted, varied  # noqa: E402
 from nano.begin import tapped, trainable, widened  # noqa: E402
 from nano.config import NanoConfig  # noqa: E402
 from nano.data import Clip, Pool, read_clip, scenes, write_clip  # noqa: E402
