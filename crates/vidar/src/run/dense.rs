@@ -8,12 +8,13 @@ use super::placed::placed_view;
 use super::plan::{ChunkPlan, Plan};
 use super::source::Source;
 use super::sparse::Sparse;
+use super::surface::{Surface, store};
 use super::views::ViewWindow;
 use crate::chunks::{ChunkStore, StoredChunk};
 use crate::config::Config;
 use crate::error::Error;
 use crate::events::{CancelToken, Event, Events};
-use crate::run_folder::{RunFolder, StoredView};
+use crate::run_folder::RunFolder;
 use rayon::prelude::*;
 use serde_json::json;
 use sha2::{Digest, Sha256};
@@ -27,7 +28,7 @@ use vidar_core::{
     SparseLandmark, ViewGeometry, Warning,
 };
 use vidar_dataset::Dataset;
-use vidar_fusion::{DoubleWalls, FusionConfig, PointFusion, TsdfVolume};
+use vidar_fusion::FusionConfig;
 
 /// Predicts every chunk, places them all, fuses them. Stops between chunks when cancelled and keeps what is there.
 pub fn build(
@@ -278,7 +279,7 @@ impl Road<'_> {
     fn fuse(&self, placement: &Placement) -> Result<MetricMap, Error> {
         let fusion =
             FusionConfig { memory_budget_bytes: self.plan.volume_budget_bytes, ..self.config.fusion.clone() };
-        let mut surface = Surface { volume: TsdfVolume::new(&fusion)?, points: PointFusion::new(&fusion)? };
+        let mut surface = Surface::new(&fusion)?;
         let mut map = MetricMap::default();
         // Asked to stop while predicting, what was predicted is fused; asked to stop now, fusing stops.
         let was_cancelled = self.cancel.is_cancelled();
@@ -370,99 +371,4 @@ fn key_of(identity: &[u8], plan: &Plan, keyframes: impl Iterator<Item = usize>) 
         }
     }
     hash.finalize().iter().map(|b| format!("{b:02x}")).collect()
-}
-
-/// Both forms of the surface, fed with the same views.
-struct Surface {
-    volume: TsdfVolume,
-    points: PointFusion,
-}
-
-impl Surface {
-    fn fuse(&mut self, views: &[AlignedView], events: &Events) -> Result<(), Error> {
-        for view in views {
-            // A view that cannot be fused is a named degradation of the map, not the end of the run.
-            for result in [self.volume.integrate(view).map(|_| ()), self.points.integrate(view).map(|_| ())] {
-                if let Err(error) = result {
-                    let place = format!("frame {}", view.frame_id());
-                    events.warn(&Warning::new("view-not-fused", error.to_string()).at(place));
-                }
-            }
-        }
-        Ok(())
-    }
-
-    fn extract(self, map: &mut MetricMap) {
-        map.mesh = self.volume.extract_mesh();
-        map.coverage = self.volume.coverage(&map.mesh);
-        map.volume_bytes = self.volume.peak_memory_bytes();
-        let voxel_m = self.volume.config().voxel_size_m;
-        // About two voxels: nearer ones are the roughness of one surface.
-        let walls = DoubleWalls {
-            nearest_m: 2.0 * voxel_m,
-            farthest_m: (12.0 * voxel_m).max(0.25),
-            beside_m: voxel_m,
-            ..DoubleWalls::default()
-        };
-        map.double_walls = walls.of_mesh(&map.mesh).ok();
-        map.warnings = self.volume.warnings();
-        map.warnings.extend(self.points.warnings());
-        map.cloud = self.points.finish();
-    }
-}
-
-/// Writes depth and image of every view as it is finished, so that a crash later loses nothing.
-fn store(
-    views: &[AlignedView],
-    config: &Config,
-    folder: &RunFolder,
-    events: &Events,
-) -> Result<Vec<StoredView>, Error> {
-    folder.file("depth/.")?;
-    folder.file("images/.")?;
-    let stored: Result<Vec<_>, Error> =
-        views.par_iter().map(|view| store_one(view, config, folder)).collect();
-    let stored = stored?;
-    for (_, artifacts) in &stored {
-        for (path, bytes) in artifacts {
-            events.emit(&Event::ArtifactWritten { path: path.clone(), bytes: *bytes });
-        }
-    }
-    Ok(stored.into_iter().map(|(view, _)| view).collect())
-}
-
-type Artifacts = Vec<(String, u64)>;
-
-fn store_one(
-    view: &AlignedView,
-    config: &Config,
-    folder: &RunFolder,
-) -> Result<(StoredView, Artifacts), Error> {
-    let mut artifacts = Artifacts::new();
-    let name = format!("{:06}.png", view.frame_id().0);
-    let mut depth = None;
-    if config.output.depth_png {
-        let path = format!("depth/{name}");
-        let mut bytes = Vec::new();
-        vidar_export::write_depth_png(&mut bytes, view.depth(), config.output.depth_units_per_metre)?;
-        artifacts.push((path.clone(), folder.write(&path, &bytes)?));
-        depth = Some(path);
-    }
-    let mut image = None;
-    if let (true, Some(color)) = (config.output.images, view.color()) {
-        let path = format!("images/{name}");
-        artifacts.push((path.clone(), folder.write(&path, &vidar_view::encode_png(color)?)?));
-        image = Some(path);
-    }
-    let m = view.world_from_camera().matrix();
-    let rows = std::array::from_fn(|r| std::array::from_fn(|c| m[(r, c)]));
-    let stored = StoredView {
-        frame: view.frame_id().0,
-        time_ns: view.time().nanos(),
-        image,
-        depth,
-        intrinsics: *view.intrinsics(),
-        world_from_camera: rows,
-    };
-    Ok((stored, artifacts))
 }

@@ -13,6 +13,7 @@ mod record;
 mod reference;
 mod source;
 mod sparse;
+mod surface;
 mod views;
 
 pub use judge::{DepthScore, Judgement};
