@@ -1,6 +1,6 @@
 """Where the error of depth sits: which rooms, layout or detail, and what the tokens know of their patches.
 
-    python -m nano.anatomy --model ../models/da3-nano --stream stream_views [--split val] [--rooms 24] [--size 224x140]
+    python -m nano.anatomy --model ../models/da3-nano --stream stream_views [--split val] [--rooms 24] [--size 280x182]
 
 Scenes of 8 views, each after one scale (median ratio). Structure is parted by a Gaussian of the logarithm.
 """

@@ -8,7 +8,7 @@ from pathlib import Path
 
 PATCH = 14  # side of a patch, pixels
 POSITION_GRID = 37  # rows and columns of the exported position embedding
-NATIVE = "224x140"  # width and height of the pictures that the shipped network is used with
+NATIVE = "280x182"  # width and height of the pictures that the shipped network is used with
 HEAD_LAST = 32  # inner width of the head's last convolutions, fixed by the architecture
 
 

@@ -193,7 +193,7 @@ class Pool:
         # At the start the pool grows while it is used, so that training need not wait for it.
         self._fill(min(self.capacity, max(4 * count, len(self.clips) + round(share * count))))
         of_wanted = [clip for clip, _ in self.clips if clip.size == wanted]
-        first = self.rng.choice(of_wanted if len(of_wanted) >= count else [clip for clip, _ in self.clips])
+        first = self.rng.choice(of_wanted) if len(of_wanted) >= count else self.rng.choice(self.clips)[0]
         places = [
             i
             for i, (clip, _) in enumerate(self.clips)

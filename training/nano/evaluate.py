@@ -1,6 +1,6 @@
 """Errors on rooms that were never trained on and on real frames, beside a constant depth.
 
-    python -m nano.evaluate --model ../models/da3-nano --stream stream_views [--rooms 40] [--size 224x140]
+    python -m nano.evaluate --model ../models/da3-nano --stream stream_views [--rooms 40] [--size 280x182]
                             [--soften 0.5] [--real SHARED_DATA_FOLDER] [--out table.md]
 
 Depth is compared after one scale per scene (median ratio); poses by relative rotation and direction of the baseline
@@ -98,15 +98,13 @@ def main() -> None:
     model = read(arguments.model) if arguments.model else trained(arguments.run, "ema")[0]
     width, height = map(int, arguments.size.split("x"))
     clips = rendered(arguments.stream, arguments.split, arguments.rooms, 16, arguments.size)
+    clips = [softened(clip, arguments.soften) for clip in clips]
     short = [Clip(c.seed, c.number, c.image[:8], c.depth[:8], c.world_from_camera[:8], c.focal) for c in clips]
     places = {f"rendered {arguments.split} rooms": {1: short, 4: short, 8: short, 16: clips}}
     if arguments.real:
         for views in (1, 4, 8, 16):
             for name, found in real_clips(arguments.real, (height, width), max(views, 4)).items():
-                places.setdefault(name, {})[views] = found
-    for by_views in places.values():
-        for views, found in by_views.items():
-            by_views[views] = [softened(clip, arguments.soften) for clip in found]
+                places.setdefault(name, {})[views] = [softened(clip, arguments.soften) for clip in found]
     text = table(model, places, not arguments.exact)
     if arguments.out:
         arguments.out.write_text(text)

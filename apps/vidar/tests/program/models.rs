@@ -351,7 +351,7 @@ fn the_network_in_the_program_needs_nothing_and_says_what_it_is() {
     let model = &manifest["model"];
     assert_eq!((&model["name"], &model["licence"]), (&json!("da3-nano"), &json!("MIT OR Apache-2.0")));
     assert_eq!(model["weights_sha256"].as_str().map(str::len), Some(64));
-    assert_eq!(read_json(&out.join("predictions.json"))["width"], 224, "the size that it was trained for");
+    assert_eq!(read_json(&out.join("predictions.json"))["width"], 280, "the size that it was trained for");
 }
 
 #[test]

@@ -16,7 +16,7 @@ pub const NAME: &str = "da3-nano";
 /// Licence of its weights.
 pub const LICENCE: &str = "MIT OR Apache-2.0";
 /// Longer side of the pictures that it was trained for, px.
-pub const PROCESS_SIZE_PX: usize = 224;
+pub const PROCESS_SIZE_PX: usize = 280;
 /// What one should know before choosing it.
 pub const NOTE: &str =
     "in the program; trained on rendered rooms, to try things out: for real recordings take da3-small";
