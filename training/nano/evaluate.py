@@ -99,7 +99,7 @@ def main() -> None:
     width, height = map(int, arguments.size.split("x"))
     clips = rendered(arguments.stream, arguments.split, arguments.rooms, 16, arguments.size)
     clips = [softened(clip, arguments.soften) for clip in clips]
-    short = [Clip(c.seed, c.number, c.image[:8], c.depth[:8], c.world_from_camera[:8], c.focal) for c in clips]
+    short = [replace(c, image=c.image[:8], depth=c.depth[:8], world_from_camera=c.world_from_camera[:8]) for c in clips]
     places = {f"rendered {arguments.split} rooms": {1: short, 4: short, 8: short, 16: clips}}
     if arguments.real:
         for views in (1, 4, 8, 16):
