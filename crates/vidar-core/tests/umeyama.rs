@@ -79,8 +79,10 @@ proptest! {
         let truth = Se3::new(truth.rotation, truth.translation);
         let target: Points = source.iter().map(|p| truth * *p).collect();
         let found = umeyama_se3(&source, &target).unwrap();
+        // Coordinates near 100 m are rounded to 1.4e-14, and a cloud of 5 m by 1 cm turns that into 1.1e-12 at worst
+        // (of 400 000 draws).
         for p in &source {
-            prop_assert!((found * *p - truth * *p).norm() < 1e-12);
+            prop_assert!((found * *p - truth * *p).norm() < 1e-11);
         }
     }
 
