@@ -1,13 +1,30 @@
 //! Visual-inertial odometry: images and IMU samples in, metric states, keyframes and covariance out.
+//!
+//! The modules follow an image through the odometry:
+//!
+//! - [`frontend`]: image pyramids, feature detection, patch alignment, two-view geometry;
+//! - [`imu`]: the buffer of IMU samples, preintegration, propagation of state and covariance;
+//! - [`initialization`]: the first metric state, from standstill, in motion, or up to scale without an IMU;
+//! - `tracking`: features followed from image to image, seeds, keyframes and the sliding window of frames;
+//! - [`backend`]: the fixed-lag smoother that estimates the window's states and landmarks;
+//! - `pipeline`: [`Odometry`], the push machine that connects them and monitors their health.
 
+pub mod backend;
+mod config;
+mod error;
 pub mod frontend;
-pub mod system;
-
-pub use system::{
-    DivergenceSign, ImuUse, InputCounts, LossReason, Odometry, OdometryConfig, OdometryError, OdometryOutput,
-    Stage, StageTimes, Status, TrackRecord, TrackSummary, Tracking,
-};
-pub mod estimator;
 pub mod imu;
-pub mod init;
+pub mod initialization;
+mod pipeline;
+#[cfg(any(test, feature = "simulation"))]
 pub mod simulate;
+mod stages;
+mod tracking;
+
+pub use config::{ImuUse, OdometryConfig};
+pub use error::OdometryError;
+pub use pipeline::{
+    DivergenceSign, InputCounts, LossReason, Odometry, OdometryOutput, Status, TrackSummary, Tracking,
+};
+pub use stages::{Stage, StageTimes};
+pub use tracking::TrackRecord;

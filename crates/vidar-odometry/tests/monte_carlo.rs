@@ -9,7 +9,7 @@
 
 use nalgebra::Vector3;
 use vidar_core::{FrameId, ImuNoise, LieGroup, Se3, So3};
-use vidar_odometry::estimator::{AnchorSigmas, Smoother};
+use vidar_odometry::backend::{AnchorSigmas, Smoother};
 use vidar_odometry::imu::{Bias, NavState};
 use vidar_odometry::simulate::{
     Course, CourseKind, FeatureOdometry, FeatureOdometryConfig, Flight, Motion, Random, Simulation,

@@ -11,9 +11,9 @@ use nalgebra::Vector3;
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use vidar_core::{BodyFrame, FrameId, ImuNoise, LieGroup, Se3, So3, StampedPose, Timestamp, Trajectory};
-use vidar_odometry::estimator::Smoother;
+use vidar_odometry::backend::Smoother;
 use vidar_odometry::imu::NavState;
-use vidar_odometry::init::{InFlightConfig, RestConfig, rest};
+use vidar_odometry::initialization::{InFlightConfig, RestConfig, rest};
 use vidar_odometry::simulate::{
     Course, CourseKind, FeatureOdometry, FeatureOdometryConfig, Flight, Motion, Simulation, SimulationConfig,
     StepOutput,
@@ -108,7 +108,7 @@ fn log_scale_error(smoother: &Smoother, simulation: &Simulation) -> f64 {
     if extent > RESTING_M * (ids.len() as f64).sqrt() {
         return (spread(found) / extent).ln();
     }
-    let ratio = |l: vidar_odometry::estimator::LandmarkEstimate| {
+    let ratio = |l: vidar_odometry::backend::LandmarkEstimate| {
         let camera = truth(l.host) * simulation.body_from_camera;
         Some(-(l.inverse_distance * (simulation.point(l.id)? - camera.translation).norm()).ln())
     };

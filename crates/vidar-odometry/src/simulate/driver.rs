@@ -1,13 +1,13 @@
 //! Start and smoother run on tracks, as the whole odometry runs on images.
 
 use super::sensors::{SimulatedFrame, Simulation};
-use crate::estimator::{
+use crate::backend::{
     AnchorSigmas, Departure, Observation, OptimiseReport, Smoother, SmootherConfig, SmootherError,
 };
 use crate::imu::{Bias, BufferError, ImuBuffer, ImuModel, NavState, Preintegration};
-use crate::init::{Attempt, InFlightConfig, InFlightStart, LoggedFrame, Refusal, Seen};
-use crate::system::starting::STILL_SECS;
-use crate::system::stillness::{ImageMotion, ImuSpread};
+use crate::initialization::STILL_SECS;
+use crate::initialization::{Attempt, InFlightConfig, InFlightStart, LoggedFrame, Refusal, Seen};
+use crate::tracking::{ImageMotion, ImuSpread};
 use nalgebra::Vector3;
 use rustc_hash::{FxHashMap, FxHashSet};
 use vidar_core::{CameraModel, Duration, FrameId, ImuSample, LandmarkId, LieGroup, Se3, Timestamp};

@@ -3,7 +3,7 @@
 use super::course::Flight;
 use super::random::Random;
 use crate::imu::{Bias, NavState};
-use crate::init::Seen;
+use crate::initialization::Seen;
 use nalgebra::{Matrix2, Vector2, Vector3};
 use vidar_core::camera::RadTan;
 use vidar_core::{

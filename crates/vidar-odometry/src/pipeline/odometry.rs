@@ -1,22 +1,22 @@
 //! Events in, one output per image.
 
-use super::config::{ImuUse, OdometryConfig};
-use super::error::OdometryError;
 use super::health::{MAX_IMU_GAP_SECS, Verdict, Watch};
 use super::keyframes::{KeyframeBook, Making, public_state, seen_landmarks};
+use super::orientation_check::{MAX_TURN_DEG, RotationCheck};
 use super::output::{DivergenceSign, LossReason, OdometryOutput, Status, TrackSummary, Tracking};
-use super::rotation_check::{MAX_TURN_DEG, RotationCheck};
-use super::running::{Running, Shot, Step};
-use super::stages::{Stage, StageClock, StageTimes};
-use super::starting::{Found, STILL_SECS, Starting, UNKNOWN_INVERSE};
-use super::stillness::ImuSpread;
-use super::track::HostImage;
-use super::track::{ImagePool, TrackRecord};
-use super::tracker::Tracker;
-use crate::estimator::{CalibrationEstimate, Smoother, SmootherError};
+use crate::backend::{CalibrationEstimate, Smoother, SmootherError};
+use crate::config::{ImuUse, OdometryConfig};
+use crate::error::OdometryError;
 use crate::frontend::FrontendConfig;
 use crate::imu::{Bias, ImuBuffer, ImuModel, Preintegration, propagate};
-use crate::init::{Obstacle, Refusal, RestConfig, rest};
+use crate::initialization::{Found, STILL_SECS, Starting, UNKNOWN_INVERSE};
+use crate::initialization::{Obstacle, Refusal, RestConfig, rest};
+use crate::stages::{Stage, StageClock, StageTimes};
+use crate::tracking::HostImage;
+use crate::tracking::ImuSpread;
+use crate::tracking::Tracker;
+use crate::tracking::{ImagePool, TrackRecord};
+use crate::tracking::{Running, Shot, Step};
 use nalgebra::Vector3;
 use std::collections::VecDeque;
 use std::rc::Rc;

@@ -3,7 +3,7 @@
 use super::Running;
 use crate::frontend::{AlignmentPoint, AlignmentReference, MotionPrediction};
 use crate::imu::NavState;
-use crate::system::track::HostImage;
+use crate::tracking::HostImage;
 use std::rc::Rc;
 use vidar_core::{LieGroup, Se3};
 

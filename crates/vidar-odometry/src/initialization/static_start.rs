@@ -1,7 +1,7 @@
 //! Start from standstill: gyroscope bias and inclination are read off, velocity is zero.
 
-use super::condition::{Obstacle, Refusal};
-use crate::estimator::AnchorSigmas;
+use super::failure::{Obstacle, Refusal};
+use crate::backend::AnchorSigmas;
 use crate::imu::{Bias, NavState};
 use nalgebra::Vector3;
 use serde::{Deserialize, Serialize};

@@ -1,10 +1,10 @@
 //! Start in motion.
 
-use super::condition::{Obstacle, Refusal};
+use super::failure::{Obstacle, Refusal};
 use super::gyro_bias::{RayPair, gyro_bias};
 use super::linear::{self, LinearSolution, LinearView, Rays};
-use super::still::leveled;
-use crate::estimator::{AnchorSigmas, Observation, OptimiseReport, Smoother, SmootherConfig, SmootherError};
+use super::static_start::leveled;
+use crate::backend::{AnchorSigmas, Observation, OptimiseReport, Smoother, SmootherConfig, SmootherError};
 use crate::imu::{Bias, NavState, Preintegration};
 use nalgebra::{Matrix2, Matrix3, Vector2, Vector3};
 use rustc_hash::FxHashMap;

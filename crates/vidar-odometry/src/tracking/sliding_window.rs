@@ -1,21 +1,21 @@
 //! The odometry while it runs: predict, measure, smooth, choose keyframes, keep the window small.
 
-mod by_image;
-mod rest;
-mod window;
-mod young;
+mod image_prediction;
+mod keyframes;
+mod seeds;
+mod standstill;
 
-use super::config::OdometryConfig;
-use super::output::TrackSummary;
-use super::stages::{Stage, StageClock};
-use super::stillness::{ImageMotion, found_in};
+use super::standstill::{ImageMotion, found_in};
 use super::track::TrackRecord;
 use super::track::{HostImage, Track, noisy_covariance};
 use super::tracker::{Places, Prediction, TrackCounts, Tracker};
-use crate::estimator::{Departure, Observation, OptimiseReport, Smoother, SmootherError};
+use crate::backend::{Departure, Observation, OptimiseReport, Smoother, SmootherError};
+use crate::config::OdometryConfig;
 use crate::frontend::{ImageAligner, ImageAlignmentConfig, PixelMeasurement};
 use crate::imu::{NavState, Preintegration};
-use rest::{REST_SIGMA_M, REST_SIGMA_RAD, STANDSTILL_SIGMA_MPS};
+use crate::pipeline::TrackSummary;
+use crate::stages::{Stage, StageClock};
+use standstill::{REST_SIGMA_M, REST_SIGMA_RAD, STANDSTILL_SIGMA_MPS};
 use std::rc::Rc;
 use vidar_core::{CameraModel, FrameId, LandmarkId, LieGroup, Se3, Timestamp};
 

@@ -1,6 +1,6 @@
 //! What the odometry says of every image.
 
-use crate::init::Refusal;
+use crate::initialization::Refusal;
 use std::fmt;
 use vidar_core::{
     FrameId, Health, NavCovariance, NavState, OdometryKeyframe, RevisedPose, SparseLandmark, Timestamp,

@@ -1,12 +1,12 @@
 //! The odometry before it has a metric state: tracks are followed with the gyroscope's help and logged.
 
-use super::config::OdometryConfig;
-use super::stillness::{ImageMotion, found_in};
-use super::track::{HostImage, host_covariance, noisy_covariance};
-use super::tracker::{Places, Prediction, Tracker};
-use crate::estimator::Smoother;
+use super::{Attempt, InFlightConfig, InFlightStart, LoggedFrame, Obstacle, Refusal, Seen};
+use crate::backend::Smoother;
+use crate::config::OdometryConfig;
 use crate::imu::{Bias, Preintegration};
-use crate::init::{Attempt, InFlightConfig, InFlightStart, LoggedFrame, Obstacle, Refusal, Seen};
+use crate::tracking::{HostImage, host_covariance, noisy_covariance};
+use crate::tracking::{ImageMotion, found_in};
+use crate::tracking::{Places, Prediction, Tracker};
 use nalgebra::Vector3;
 use std::rc::Rc;
 use vidar_core::{FrameId, LieGroup, Se3, So3, Timestamp};
@@ -157,7 +157,7 @@ impl Starting {
 
     fn attempt_mono(&mut self) -> Result<Found, Refusal> {
         let camera = self.tracker.camera().clone();
-        let smoother = super::mono_start::start(&self.log, &camera, &self.body_from_camera, &self.config)?;
+        let smoother = super::monocular::start(&self.log, &camera, &self.body_from_camera, &self.config)?;
         Ok(self.found(smoother, None, 1.0 / UNKNOWN_INVERSE))
     }
 

@@ -1,9 +1,9 @@
 //! Tracks whose distance is not known yet, until the smoother takes them as landmarks.
 
 use super::{Held, Running, observation};
-use crate::estimator::{Observation, SmootherError};
-use crate::system::track::{host_covariance, parallax, unknown_distance};
-use crate::system::tracker::Places;
+use crate::backend::{Observation, SmootherError};
+use crate::tracking::Places;
+use crate::tracking::{host_covariance, parallax, unknown_distance};
 use vidar_core::{FrameId, LandmarkId, LieGroup};
 
 /// Mean chi-square per measurement (two degrees of freedom) up to which a young track's distance is believed.

@@ -11,15 +11,18 @@
 //! What stands in the way is told as a named condition with its measured value. The smoother that solved the window goes
 //! on as the running one, so nothing is linearised at a scale that was not yet known.
 
-mod condition;
+mod failure;
 mod gyro_bias;
 mod in_flight;
+mod initializer;
 mod linear;
-mod still;
+mod monocular;
+mod static_start;
 
-pub use condition::{Obstacle, Refusal};
+pub use failure::{Obstacle, Refusal};
 pub use in_flight::{Attempt, InFlightConfig, InFlightStart, LoggedFrame, Seen, Started};
-pub use still::{Rest, RestConfig, rest};
+pub(crate) use initializer::{Found, STILL_SECS, Starting, UNKNOWN_INVERSE};
+pub use static_start::{Rest, RestConfig, rest};
 
 #[cfg(test)]
 mod tests;

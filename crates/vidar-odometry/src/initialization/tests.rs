@@ -192,7 +192,7 @@ fn a_log_without_readings_or_tracks_is_refused() {
     let simulation = simulate(&course, &SimulationConfig::default());
     let mut start = InFlightStart::new(
         InFlightConfig::default(),
-        crate::estimator::SmootherConfig::default(),
+        crate::backend::SmootherConfig::default(),
         simulation.camera.clone(),
         simulation.body_from_camera,
     );

@@ -1,9 +1,9 @@
 //! Which frames become keyframes, and which keyframes leave.
 
 use super::{Held, Running, Step, follow_host};
-use crate::estimator::SmootherError;
-use crate::system::track::{HostImage, rotated_pixel};
-use crate::system::tracker::Places;
+use crate::backend::SmootherError;
+use crate::tracking::Places;
+use crate::tracking::{HostImage, rotated_pixel};
 use std::rc::Rc;
 use vidar_core::{FrameId, LieGroup, Timestamp};
 

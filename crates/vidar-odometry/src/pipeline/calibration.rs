@@ -1,6 +1,6 @@
 //! Whether a calibration can be true.
 
-use super::error::OdometryError;
+use crate::error::OdometryError;
 use vidar_core::RigCamera;
 
 /// Cameras sit nearer to their IMU than this, m.

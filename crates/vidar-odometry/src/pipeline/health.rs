@@ -1,9 +1,9 @@
 //! Whether a running state may be believed, and when to give it up.
 
-use super::config::OdometryConfig;
 use super::output::{DivergenceSign, LossReason};
-use super::running::Step;
+use crate::config::OdometryConfig;
 use crate::imu::NavState;
+use crate::tracking::Step;
 use vidar_core::{Health, Timestamp};
 
 /// Below these numbers of fitting landmarks a frame has few features, or is as good as blind.

@@ -1,8 +1,8 @@
 //! A body that rests: its first frame and the newest one stand for a rest of any length.
 
 use super::{Running, Step};
-use crate::estimator::SmootherError;
-use crate::system::stillness::found_in;
+use crate::backend::SmootherError;
+use crate::tracking::standstill::found_in;
 use vidar_core::Timestamp;
 
 /// Standard deviations of the velocity of a body that stands still, m/s, and of its motion from image to image, m and rad.

@@ -1,7 +1,7 @@
 //! What can be tuned from outside. Everything else is a named constant with its reason beside the code.
 
-use super::error::OdometryError;
-use crate::estimator::{Linearisation, SmootherConfig};
+use crate::backend::{Linearisation, SmootherConfig};
+use crate::error::OdometryError;
 use serde::{Deserialize, Serialize};
 
 /// Whether inertial readings are used.

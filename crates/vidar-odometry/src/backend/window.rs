@@ -87,7 +87,7 @@ pub(crate) struct Frame {
     pub(crate) link: Option<Link>,
     pub(crate) standstill_sigma: Option<f64>,
     /// What is known of the motion since the frame before: that there was none.
-    pub(crate) rest: Option<super::rest::Rest>,
+    pub(crate) rest: Option<super::standstill::Rest>,
 }
 
 impl Frame {

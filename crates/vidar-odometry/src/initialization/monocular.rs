@@ -1,11 +1,11 @@
 //! A start without an IMU: two views give motion and structure up to scale, and the scale is set by convention.
 
-use super::config::OdometryConfig;
-use super::starting::UNKNOWN_INVERSE;
-use crate::estimator::{AnchorSigmas, Observation, Smoother};
+use super::initializer::UNKNOWN_INVERSE;
+use super::{LoggedFrame, Obstacle, Refusal, Seen};
+use crate::backend::{AnchorSigmas, Observation, Smoother};
+use crate::config::OdometryConfig;
 use crate::frontend::{RayPair, TwoViewConfig, TwoViewFailure, TwoViewSolver, triangulate};
 use crate::imu::NavState;
-use crate::init::{LoggedFrame, Obstacle, Refusal, Seen};
 use vidar_core::{CameraModel, LieGroup, Se3};
 
 /// Least median parallax between the two views, degrees.

@@ -17,7 +17,7 @@ mod linearise;
 mod marginalise;
 mod optimise;
 mod prior;
-mod rest;
+mod standstill;
 mod visual;
 mod window;
 

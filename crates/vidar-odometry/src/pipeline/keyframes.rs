@@ -1,8 +1,8 @@
 //! Keyframes and landmarks as the rest of a map wants them.
 
-use super::track::Track;
-use crate::estimator::Smoother;
+use crate::backend::Smoother;
 use crate::imu::NavState;
+use crate::tracking::Track;
 use nalgebra::Vector3;
 use vidar_core::{
     FrameId, GRAVITY_MPS2, Health, KeyframeId, LieGroup, NavCovariance, OdometryKeyframe, PoseCovariance,

@@ -5,7 +5,7 @@
 //! one that fits the motion of bearings best; translation disturbs it, which is why what counts is not a small residual but
 //! whether another orientation would explain much more.
 
-use super::track::Track;
+use crate::tracking::Track;
 use nalgebra::{Matrix3, Vector3};
 use rustc_hash::FxHashMap;
 use vidar_core::{CameraModel, FrameId, LandmarkId, LieGroup, So3, camera::Pixel};

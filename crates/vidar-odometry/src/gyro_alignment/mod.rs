@@ -1,0 +1,123 @@
+//! What consumer recordings leave unsaid about time and rotation: the camera's clock offset, the rolling shutter's
+//! readout time and the rotation of the camera on the body, from feature tracks and gyroscope samples.
+//!
+//! [`GyroAlignmentLog`] collects both while the odometry runs and is asked for an [`Alignment`] from time to time.
+//! [`RollingShutter`] applies the readout time to pixels.
+
+mod path;
+mod shutter;
+mod solver;
+#[cfg(test)]
+mod tests;
+
+pub(crate) use shutter::RollingShutter;
+pub(crate) use solver::Alignment;
+
+use path::RateSample;
+use solver::{ImageFeatures, Problem};
+use std::collections::VecDeque;
+use nalgebra::Vector3;
+use vidar_core::{CameraModel, ImuSample, LandmarkId, So3, Timestamp, camera::Pixel};
+
+/// Images nearer in time than this add little and cost as much, s.
+const IMAGE_SPACING_SECS: f64 = 0.045;
+/// Longest stretch of images that is used, s.
+const SPAN_SECS: f64 = 5.0;
+/// Shortest stretch that is tried, and the time between two attempts, s.
+const MIN_SPAN_SECS: f64 = 1.5;
+const ATTEMPT_SECS: f64 = 0.5;
+/// Gyroscope samples this far beyond an image must be there: the largest offset that is searched, and half a readout.
+const LOOKAHEAD_SECS: f64 = 0.19;
+/// Root mean square of the angular rate about its mean that a solution needs, rad/s: below it, a clock offset of 50 ms
+/// moves pixels by less than two.
+const MIN_RATE_RMS: f64 = 0.08;
+/// Fewest pairs of images.
+const MIN_PAIRS: usize = 12;
+
+/// What is known or assumed before a solution.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Guess {
+    pub body_from_camera: So3,
+    /// `t_imu = stamp + offset`, s.
+    pub offset_secs: f64,
+    /// Time from the first to the last row, s.
+    pub readout_secs: f64,
+    /// Try all clock offsets rather than those near `offset_secs`.
+    pub search: bool,
+    /// The focal length is a guess, too.
+    pub estimates_focal: bool,
+}
+
+/// Feature tracks and gyroscope samples of the last seconds.
+#[derive(Debug, Default)]
+pub(crate) struct GyroAlignmentLog {
+    images: VecDeque<(Timestamp, Vec<(LandmarkId, Pixel)>)>,
+    gyro: VecDeque<(Timestamp, Vector3<f64>)>,
+    last_attempt: Option<Timestamp>,
+}
+
+impl GyroAlignmentLog {
+    /// Takes a gyroscope sample; samples come in the order of time.
+    pub fn add_gyro(&mut self, sample: &ImuSample) {
+        self.gyro.push_back((sample.time, sample.gyro.0));
+        while self.gyro.len() > 2
+            && (sample.time - self.gyro[1].0).as_secs_f64() > SPAN_SECS + 4.0 * LOOKAHEAD_SECS
+        {
+            self.gyro.pop_front();
+        }
+    }
+
+    /// Takes the features of an image with its own stamp, no clock offset added.
+    pub fn add_image(&mut self, stamp: Timestamp, features: impl Iterator<Item = (LandmarkId, Pixel)>) {
+        if self.images.back().is_some_and(|(last, _)| (stamp - *last).as_secs_f64() < IMAGE_SPACING_SECS) {
+            return;
+        }
+        let mut features: Vec<(LandmarkId, Pixel)> = features.collect();
+        features.sort_unstable_by_key(|f| f.0);
+        self.images.push_back((stamp, features));
+        while self.images.front().is_some_and(|(first, _)| (stamp - *first).as_secs_f64() > SPAN_SECS) {
+            self.images.pop_front();
+        }
+    }
+
+    /// Solves for the alignment if enough came since the last attempt.
+    pub fn attempt(&mut self, camera: &CameraModel, guess: &Guess) -> Option<Alignment> {
+        let (newest, origin) = (self.gyro.back()?.0, self.images.front()?.0);
+        let last_image = self.images.back()?.0;
+        if self.last_attempt.is_some_and(|t| (last_image - t).as_secs_f64() < ATTEMPT_SECS) {
+            return None;
+        }
+        let images: Vec<ImageFeatures> = self
+            .images
+            .iter()
+            .filter(|(stamp, _)| (newest - *stamp).as_secs_f64() > LOOKAHEAD_SECS)
+            .map(|(stamp, f)| ImageFeatures { secs: (*stamp - origin).as_secs_f64(), features: f.clone() })
+            .collect();
+        if images.last().is_none_or(|i| i.secs < MIN_SPAN_SECS) {
+            return None;
+        }
+        self.last_attempt = Some(last_image);
+        let samples: Vec<RateSample> = self
+            .gyro
+            .iter()
+            .map(|(time, rate)| RateSample { secs: (*time - origin).as_secs_f64(), rate: *rate })
+            .collect();
+        let covered = samples.first().is_some_and(|s| s.secs < -LOOKAHEAD_SECS) || samples.len() > 50;
+        if !covered || rate_rms(&samples) < MIN_RATE_RMS {
+            return None;
+        }
+        let mut problem =
+            Problem::new(camera, guess.estimates_focal, guess.body_from_camera, &images, &samples);
+        if problem.pair_count() < MIN_PAIRS {
+            return None;
+        }
+        problem.solve((guess.offset_secs, guess.readout_secs), guess.search)
+    }
+}
+
+/// Root mean square of the rates about their mean, rad/s.
+fn rate_rms(samples: &[RateSample]) -> f64 {
+    let n = samples.len().max(1) as f64;
+    let mean = samples.iter().map(|s| s.rate).sum::<Vector3<f64>>() / n;
+    (samples.iter().map(|s| (s.rate - mean).norm_squared()).sum::<f64>() / n).sqrt()
+}

@@ -1,0 +1,388 @@
+//! Gyroscope–camera alignment: clock offset, rolling-shutter readout, rotation of the camera on the body and gyroscope
+//! bias from feature tracks and gyroscope samples alone.
+//!
+//! For a pair of images the gyroscope gives the rotation between the exposure times of any two rows. With both rays of a
+//! feature rotated to common axes, `w_i` and `w_j`, a static point satisfies the epipolar constraint
+//! `(w_i × w_j) · t = 0`, where `t` is the pair's direction of translation. `t` has two degrees of freedom per pair and is
+//! eliminated (variable projection: Golub, Pereyra 1973; the derivative is Kaufman's approximation). What remains is a
+//! small nonlinear least-squares problem in the parameters. Without translation the products vanish for any `t`, so
+//! turning on the spot needs no special case. Rows and clocks follow Jia, Evans, "Probabilistic 3-D motion estimation for
+//! rolling shutter video rectification", 2012, and Kelly, Sukhatme, "A general framework for temporal calibration", 2014.
+
+use super::path::{OrientationPath, RateSample};
+use nalgebra::{Matrix2, Matrix3, SMatrix, SVector, Vector2, Vector3};
+use vidar_core::{CameraModel, LandmarkId, LieGroup, So3, camera::Pixel};
+
+/// Parameters: clock offset (s), readout (s), rotation of the camera (rad, right perturbation), gyroscope bias (rad/s),
+/// logarithm of the focal length over the given one.
+const DIM: usize = 9;
+const OFFSET: usize = 0;
+const READOUT: usize = 1;
+const ROTATION: usize = 2;
+const BIAS: usize = 5;
+const FOCAL: usize = 8;
+
+/// Orientations are interpolated linearly between so many row times per image: at 5 rad/s and 33 ms the chord of a
+/// segment is off by less than 2e-5 rad.
+const ROW_SEGMENTS: usize = 8;
+
+/// Standard deviation of a feature's position in one image, pixels, tracking drift included.
+const PIXEL_SIGMA: f64 = 0.7;
+
+/// Whitened residual from which a match loses weight (Cauchy).
+const CAUCHY: f64 = 2.0;
+
+/// Each ray takes part in up to four pairs, so residuals are correlated: covariances are multiplied by this.
+const SHARED_RAYS: f64 = 4.0;
+
+/// The rotation of the camera is biased when parallax is small: on slow motion its error was up to ten times its formal
+/// standard deviation (this module's tests), so that is multiplied by this.
+const ROTATION_INFLATION: f64 = 6.0;
+
+/// Standard deviations of the prior about the given values, in the order of the parameters.
+const PRIOR: [f64; DIM] = [0.1, 0.02, 0.1, 0.1, 0.1, 0.05, 0.05, 0.05, 0.2];
+
+/// Steps of the numeric derivatives.
+const STEPS: [f64; DIM] = [1e-4, 1e-4, 1e-5, 1e-5, 1e-5, 1e-4, 1e-4, 1e-4, 1e-4];
+
+/// The clock offset is searched on a grid of ±[`SEARCH_SECS`] in steps of [`SEARCH_STEP_SECS`]; the optimum's basin is as
+/// wide as the fastest change of rate allows, some 30 ms for a lively hand.
+const SEARCH_SECS: f64 = 0.15;
+const SEARCH_STEP_SECS: f64 = 0.0125;
+
+/// Feature positions in one image. `secs`: the image's stamp, before any clock offset, since the common origin.
+#[derive(Clone, Debug)]
+pub(crate) struct ImageFeatures {
+    pub secs: f64,
+    /// In the order of ids.
+    pub features: Vec<(LandmarkId, Pixel)>,
+}
+
+/// The parameters and how well they are known.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Alignment {
+    /// `t_imu = stamp + offset`, s.
+    pub offset_secs: f64,
+    /// Time from the first to the last row, s; stamps are those of the centre row once the offset is added.
+    pub readout_secs: f64,
+    /// Rotation body_from_camera.
+    pub body_from_camera: So3,
+    /// Gyroscope bias, rad/s.
+    pub gyro_bias: Vector3<f64>,
+    /// Focal length over the given one; 1 where it is not estimated.
+    pub focal_ratio: f64,
+    /// Standard deviations: offset (s), readout (s), rotation (rad, the largest of three axes).
+    pub offset_sigma: f64,
+    pub readout_sigma: f64,
+    pub rotation_sigma: f64,
+    /// Standard deviation of ln(`focal_ratio`).
+    pub focal_sigma: f64,
+    /// Mean squared whitened residual.
+    pub chi2_per_dof: f64,
+}
+
+/// Matches of one pair of images: indices of the images and of their features.
+struct Pair {
+    images: [usize; 2],
+    matches: Vec<[usize; 2]>,
+    /// Direction of translation in common axes, at the last linearisation.
+    direction: Vector3<f64>,
+}
+
+/// The problem: images with unit rays in the camera, and pairs.
+pub(crate) struct Problem<'a> {
+    camera: &'a CameraModel,
+    samples: &'a [RateSample],
+    images: &'a [ImageFeatures],
+    /// Unit rays for the given focal length.
+    rays: Vec<Vec<Option<Vector3<f64>>>>,
+    pairs: Vec<Pair>,
+    given: So3,
+    estimates_focal: bool,
+    ray_sigma: f64,
+}
+
+type Parameters = SVector<f64, DIM>;
+
+impl<'a> Problem<'a> {
+    /// `images` and `samples` in the order of time; pairs are images about 0.1 and 0.25 s apart. `estimates_focal`: the
+    /// focal length of `camera` is a guess.
+    pub fn new(
+        camera: &'a CameraModel,
+        estimates_focal: bool,
+        body_from_camera: So3,
+        images: &'a [ImageFeatures],
+        samples: &'a [RateSample],
+    ) -> Self {
+        let rays = rays_of(camera, images, 1.0);
+        let mut pairs = Vec::new();
+        for (k, image) in images.iter().enumerate() {
+            for apart in [0.1, 0.25] {
+                let Some(j) = (k + 1..images.len()).find(|j| images[*j].secs - image.secs >= apart) else { continue };
+                if images[j].secs - image.secs < apart + 0.15 {
+                    let matches = common(image, &images[j]);
+                    if matches.len() >= 12 {
+                        pairs.push(Pair { images: [k, j], matches, direction: Vector3::zeros() });
+                    }
+                }
+            }
+        }
+        let ray_sigma = PIXEL_SIGMA / camera.intrinsics().fx;
+        Self { camera, samples, images, rays, pairs, given: body_from_camera, estimates_focal, ray_sigma }
+    }
+
+    /// Number of pairs of images.
+    pub fn pair_count(&self) -> usize {
+        self.pairs.len()
+    }
+
+    /// Solves for all parameters; `start` is the best guess of the clock offset and readout. `search` tries offsets over
+    /// the whole range first.
+    pub fn solve(&mut self, start: (f64, f64), search: bool) -> Option<Alignment> {
+        let mut x = Parameters::zeros();
+        (x[OFFSET], x[READOUT]) = start;
+        let prior = x;
+        if search {
+            let steps = (2.0 * SEARCH_SECS / SEARCH_STEP_SECS).round() as i32;
+            let mut best = f64::INFINITY;
+            for k in 0..=steps {
+                let mut trial = prior;
+                trial[OFFSET] = -SEARCH_SECS + f64::from(k) * SEARCH_STEP_SECS;
+                let only_bias = |p: usize| (BIAS..FOCAL).contains(&p);
+                self.iterate(&mut trial, &prior, only_bias, 2)?;
+                let (_, _, cost) = self.linearise(&trial, only_bias);
+                if cost < best {
+                    (best, x) = (cost, trial);
+                }
+            }
+        }
+        self.iterate(&mut x, &prior, |p| p == OFFSET || (BIAS..FOCAL).contains(&p), 6)?;
+        let focal = self.estimates_focal;
+        let is_free = move |p: usize| focal || p != FOCAL;
+        self.iterate(&mut x, &prior, |p| p != FOCAL, 10)?;
+        if focal {
+            self.iterate(&mut x, &prior, is_free, 10)?;
+        }
+        let (mut h, _, _) = self.linearise(&x, is_free);
+        let chi2 = self.chi2_per_dof(&x);
+        for p in 0..DIM {
+            h[(p, p)] += 1.0 / (PRIOR[p] * PRIOR[p]);
+        }
+        let covariance = h.try_inverse()? * (SHARED_RAYS * chi2.max(1.0));
+        let sigma = |p: usize| covariance[(p, p)].sqrt();
+        let alignment = Alignment {
+            offset_secs: x[OFFSET],
+            readout_secs: x[READOUT],
+            body_from_camera: self.rotation(&x),
+            gyro_bias: bias_of(&x),
+            focal_ratio: x[FOCAL].exp(),
+            focal_sigma: sigma(FOCAL),
+            offset_sigma: sigma(OFFSET),
+            readout_sigma: sigma(READOUT),
+            rotation_sigma: ROTATION_INFLATION * (ROTATION..ROTATION + 3).map(sigma).fold(0.0, f64::max),
+            chi2_per_dof: chi2,
+        };
+        (x.iter().all(|v| v.is_finite()) && alignment.offset_sigma.is_finite()).then_some(alignment)
+    }
+
+    fn rotation(&self, x: &Parameters) -> So3 {
+        self.given * So3::exp(&Vector3::new(x[ROTATION], x[ROTATION + 1], x[ROTATION + 2]))
+    }
+
+    /// Gauss-Newton over the parameters that `is_free` names.
+    fn iterate(
+        &mut self,
+        x: &mut Parameters,
+        prior: &Parameters,
+        is_free: impl Fn(usize) -> bool + Copy,
+        rounds: usize,
+    ) -> Option<()> {
+        for _ in 0..rounds {
+            let (mut h, mut g, _) = self.linearise(x, is_free);
+            for p in 0..DIM {
+                let information = 1.0 / (PRIOR[p] * PRIOR[p]);
+                if is_free(p) {
+                    h[(p, p)] += information;
+                    g[p] += information * (prior[p] - x[p]);
+                } else {
+                    (h[(p, p)], g[p]) = (1.0, 0.0);
+                }
+            }
+            let mut step = h.cholesky()?.solve(&g);
+            // A step beyond the basin of the clock is cut; the others follow in proportion.
+            let cut = (0.02 / step[OFFSET].abs().max(1e-12)).min(1.0);
+            step *= cut;
+            *x += step;
+            x[OFFSET] = x[OFFSET].clamp(-1.2 * SEARCH_SECS, 1.2 * SEARCH_SECS);
+            x[READOUT] = x[READOUT].clamp(-0.01, 0.06);
+            x[FOCAL] = x[FOCAL].clamp(-0.7, 0.7);
+            if step[OFFSET].abs() < 1e-5 && step[READOUT].abs() < 1e-4 && step.norm() < 1e-3 {
+                break;
+            }
+        }
+        Some(())
+    }
+
+    /// All rays in common axes for the parameters `x`.
+    fn turned(&self, x: &Parameters) -> Vec<Vec<Option<Vector3<f64>>>> {
+        let path = OrientationPath::new(self.samples, &bias_of(x));
+        let body_from_camera = self.rotation(x);
+        let last_row = self.camera.height() as f64 - 1.0;
+        let other = (x[FOCAL] != 0.0).then(|| rays_of(self.camera, self.images, x[FOCAL].exp()));
+        let rays = other.as_ref().unwrap_or(&self.rays);
+        let turn_image = |(image, rays): (&ImageFeatures, &Vec<Option<Vector3<f64>>>)| {
+            let row_turns: Vec<Matrix3<f64>> = (0..=ROW_SEGMENTS)
+                .map(|k| {
+                    let row = k as f64 / ROW_SEGMENTS as f64 - 0.5;
+                    (path.at(image.secs + x[OFFSET] + row * x[READOUT]) * body_from_camera).matrix()
+                })
+                .collect();
+            let turn = |((_, pixel), ray): (&(LandmarkId, Pixel), &Option<Vector3<f64>>)| {
+                let at = (pixel.y / last_row).clamp(0.0, 1.0) * ROW_SEGMENTS as f64;
+                let k = (at as usize).min(ROW_SEGMENTS - 1);
+                let part = at - k as f64;
+                ray.map(|r| row_turns[k] * r * (1.0 - part) + row_turns[k + 1] * r * part)
+            };
+            image.features.iter().zip(rays).map(turn).collect()
+        };
+        self.images.iter().zip(rays).map(turn_image).collect()
+    }
+
+    /// Normal equations `H δ = g` without prior, and the robust cost; directions of translation are updated.
+    fn linearise(
+        &mut self,
+        x: &Parameters,
+        is_free: impl Fn(usize) -> bool,
+    ) -> (SMatrix<f64, DIM, DIM>, Parameters, f64) {
+        let at = self.turned(x);
+        let moved: Vec<Option<Vec<Vec<Option<Vector3<f64>>>>>> = (0..DIM)
+            .map(|p| {
+                is_free(p).then(|| {
+                    let mut there = *x;
+                    there[p] += STEPS[p];
+                    self.turned(&there)
+                })
+            })
+            .collect();
+        let (mut h, mut g, mut cost) = (SMatrix::<f64, DIM, DIM>::zeros(), Parameters::zeros(), 0.0);
+        let ray_sigma = self.ray_sigma;
+        for pair in &mut self.pairs {
+            let normals = |rays: &[Vec<Option<Vector3<f64>>>], m: &[usize; 2]| {
+                let (a, b) = (rays[pair.images[0]][m[0]]?, rays[pair.images[1]][m[1]]?);
+                Some((a.cross(&b), a, b))
+            };
+            pair.direction = direction(pair.matches.iter().filter_map(|m| normals(&at, m)), ray_sigma);
+            let t = pair.direction;
+            let tangents = tangents(&t);
+            let mut h_pair = SMatrix::<f64, DIM, DIM>::zeros();
+            let mut g_pair = Parameters::zeros();
+            let mut cross = SMatrix::<f64, DIM, 2>::zeros();
+            let (mut tt, mut tg) = (Matrix2::<f64>::zeros(), Vector2::zeros());
+            for m in &pair.matches {
+                let Some((n, a, b)) = normals(&at, m) else { continue };
+                let sigma = residual_sigma(&a, &b, &t, ray_sigma);
+                let r = n.dot(&t) / sigma;
+                let weight = 1.0 / (1.0 + r * r / (CAUCHY * CAUCHY));
+                cost += 0.5 * CAUCHY * CAUCHY * (1.0 + r * r / (CAUCHY * CAUCHY)).ln();
+                let mut j = Parameters::zeros();
+                for p in 0..DIM {
+                    if let Some((there, ..)) = moved[p].as_ref().and_then(|rays| normals(rays, m)) {
+                        j[p] = (there - n).dot(&t) / (STEPS[p] * sigma);
+                    }
+                }
+                let jt = Vector2::new(n.dot(&tangents[0]), n.dot(&tangents[1])) / sigma;
+                h_pair += j * j.transpose() * weight;
+                g_pair -= j * (r * weight);
+                cross += j * jt.transpose() * weight;
+                tt += jt * jt.transpose() * weight;
+                tg -= jt * (r * weight);
+            }
+            // A pair without parallax says nothing of the direction: the unit information keeps that harmless.
+            tt += Matrix2::identity();
+            if let Some(inverse) = tt.try_inverse() {
+                h_pair -= cross * inverse * cross.transpose();
+                g_pair -= cross * inverse * tg;
+            }
+            h += h_pair;
+            g += g_pair;
+        }
+        (h, g, cost)
+    }
+
+    fn chi2_per_dof(&self, x: &Parameters) -> f64 {
+        let at = self.turned(x);
+        let (mut sum, mut weights) = (0.0, 0.0);
+        for pair in &self.pairs {
+            for m in &pair.matches {
+                let rays = (at[pair.images[0]][m[0]], at[pair.images[1]][m[1]]);
+                let (Some(a), Some(b)) = rays else { continue };
+                let sigma = residual_sigma(&a, &b, &pair.direction, self.ray_sigma);
+                let r = a.cross(&b).dot(&pair.direction) / sigma;
+                let weight = 1.0 / (1.0 + r * r / (CAUCHY * CAUCHY));
+                sum += weight * r * r;
+                weights += weight;
+            }
+        }
+        if weights > 0.0 { sum / weights } else { f64::INFINITY }
+    }
+}
+
+/// Unit rays of all features when the focal length is `focal_ratio` times that of `camera`.
+fn rays_of(camera: &CameraModel, images: &[ImageFeatures], focal_ratio: f64) -> Vec<Vec<Option<Vector3<f64>>>> {
+    let centre = Pixel::new(camera.intrinsics().cx, camera.intrinsics().cy);
+    let ray = |pixel: &Pixel| camera.unproject(&(centre + (pixel - centre) / focal_ratio));
+    images.iter().map(|i| i.features.iter().map(|(_, pixel)| ray(pixel)).collect()).collect()
+}
+
+fn bias_of(x: &Parameters) -> Vector3<f64> {
+    Vector3::new(x[BIAS], x[BIAS + 1], x[BIAS + 2])
+}
+
+/// Indices of features that both images show, both in the order of ids.
+fn common(a: &ImageFeatures, b: &ImageFeatures) -> Vec<[usize; 2]> {
+    let (mut i, mut j, mut out) = (0, 0, Vec::new());
+    while i < a.features.len() && j < b.features.len() {
+        match a.features[i].0.cmp(&b.features[j].0) {
+            std::cmp::Ordering::Less => i += 1,
+            std::cmp::Ordering::Greater => j += 1,
+            std::cmp::Ordering::Equal => {
+                out.push([i, j]);
+                (i, j) = (i + 1, j + 1);
+            }
+        }
+    }
+    out
+}
+
+/// Standard deviation of `(a × b) · t` for rays with independent errors.
+fn residual_sigma(a: &Vector3<f64>, b: &Vector3<f64>, t: &Vector3<f64>, ray_sigma: f64) -> f64 {
+    ray_sigma * (b.cross(t).norm_squared() + a.cross(t).norm_squared() + 1e-4).sqrt()
+}
+
+/// Direction of translation: the least eigenvector of Σ w n nᵀ, weighted anew three times.
+fn direction(
+    normals: impl Iterator<Item = (Vector3<f64>, Vector3<f64>, Vector3<f64>)> + Clone,
+    ray_sigma: f64,
+) -> Vector3<f64> {
+    let mut t: Option<Vector3<f64>> = None;
+    for _ in 0..3 {
+        let mut sum = Matrix3::zeros();
+        for (n, a, b) in normals.clone() {
+            let weight = t.map_or(1.0, |t| {
+                let sigma = residual_sigma(&a, &b, &t, ray_sigma);
+                let r = n.dot(&t) / sigma;
+                1.0 / (1.0 + r * r / (CAUCHY * CAUCHY)) / (sigma * sigma)
+            });
+            sum += n * n.transpose() * weight;
+        }
+        let eigen = sum.symmetric_eigen();
+        t = Some(eigen.eigenvectors.column(eigen.eigenvalues.imin()).into_owned());
+    }
+    t.unwrap_or_else(Vector3::z)
+}
+
+fn tangents(t: &Vector3<f64>) -> [Vector3<f64>; 2] {
+    let axis = if t.z.abs() < 0.9 { Vector3::z() } else { Vector3::x() };
+    let first = t.cross(&axis).normalize();
+    [first, t.cross(&first)]
+}

@@ -1,0 +1,11 @@
+//! The odometry as a push machine: sensor events in, one output per image out.
+
+mod calibration;
+mod health;
+mod keyframes;
+mod odometry;
+mod orientation_check;
+mod output;
+
+pub use odometry::{InputCounts, Odometry};
+pub use output::{DivergenceSign, LossReason, OdometryOutput, Status, TrackSummary, Tracking};
