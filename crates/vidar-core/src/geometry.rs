@@ -1,7 +1,6 @@
 //! Depth in chunk units and depth in metres are different types, so that one cannot be fused as the other.
 //!
-//! A function that wants metres cannot be given chunk units; the way across is [`RelativeDepth::to_metric`], which
-//! asks for the scale:
+//! [`RelativeDepth::to_metric`] converts with a given scale:
 //!
 //! ```
 //! use vidar_core::{Image, MetricDepth, RelativeDepth};
@@ -20,7 +19,7 @@
 //! fuse(&predicted);
 //! ```
 //!
-//! Nor can an aligned view be made of chunk units:
+//! An aligned view cannot be made of chunk units either:
 //!
 //! ```compile_fail,E0308
 //! use vidar_core::{AlignedView, Confidence, FrameId, Image, Pinhole, RelativeDepth, Se3, Timestamp};
@@ -49,7 +48,7 @@ pub struct MetricDepth(Image<f32>);
 #[derive(Clone, Debug, PartialEq)]
 pub struct Confidence(Image<f32>);
 
-/// Why geometry cannot be put together.
+/// Why a view cannot be assembled.
 #[derive(Clone, Debug, PartialEq, Error)]
 #[non_exhaustive]
 pub enum GeometryError {
@@ -58,9 +57,9 @@ pub enum GeometryError {
     SizeMismatch {
         /// Which image.
         what: &'static str,
-        /// Columns wanted.
+        /// Columns expected.
         expected_width: usize,
-        /// Rows wanted.
+        /// Rows expected.
         expected_height: usize,
         /// Columns found.
         width: usize,
@@ -81,7 +80,7 @@ pub enum GeometryError {
     },
 }
 
-/// Turns what cannot be a depth (zero, negative, infinite) into NaN.
+/// Replaces invalid depths (zero, negative, infinite) by NaN.
 fn cleaned(mut image: Image<f32>) -> Image<f32> {
     for z in image.data_mut() {
         if !(z.is_finite() && *z > 0.0) {
@@ -152,7 +151,7 @@ impl Confidence {
     }
 }
 
-/// A view whose depth is metric and whose pose is in the world: the only thing fusion accepts.
+/// A view with metric depth and a pose in the world frame: the only input that fusion accepts.
 #[derive(Clone, Debug)]
 pub struct AlignedView {
     frame_id: FrameId,
@@ -165,7 +164,7 @@ pub struct AlignedView {
 }
 
 impl AlignedView {
-    /// Puts a metric view together. Alignment, RGB-D readers and synthetic worlds do this; models do not.
+    /// Assembles a metric view. Alignment, RGB-D readers and synthetic worlds do this; models do not.
     ///
     /// `intrinsics`, `depth`, `confidence` and `color` share one size.
     pub fn new(
@@ -197,7 +196,7 @@ impl AlignedView {
         self.frame_id
     }
 
-    /// When it was taken.
+    /// Time of the exposure.
     pub fn time(&self) -> Timestamp {
         self.time
     }

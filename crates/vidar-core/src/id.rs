@@ -1,4 +1,4 @@
-//! Identifiers that cannot be mixed up: a frame is not a keyframe, a chunk is not a camera.
+//! Identifiers, one type each, so that the compiler rejects a frame's number where a keyframe's is expected.
 
 macro_rules! id_type {
     ($(#[$doc:meta])* $name:ident) => {
@@ -29,15 +29,15 @@ id_type!(
     FrameId
 );
 id_type!(
-    /// A frame that was chosen to carry geometry.
+    /// A keyframe: a frame selected for optimisation and dense reconstruction.
     KeyframeId
 );
 id_type!(
-    /// A group of keyframes that a geometry model sees together.
+    /// A group of keyframes that a geometry model processes together.
     ChunkId
 );
 id_type!(
-    /// A sparse 3-D point of the odometry.
+    /// A sparse 3-D point estimated by the odometry.
     LandmarkId
 );
 id_type!(

@@ -1,6 +1,6 @@
-//! VIDAR's shared vocabulary, without any input or output.
+//! The types that all crates of VIDAR share, without any input or output.
 //!
-//! Every crate of the workspace speaks in these types, and the stage crates know nothing else of each other.
+//! The stage crates depend on this crate and not on each other.
 //!
 //! Conventions, written once and used everywhere:
 //! - **Frames.** `a_from_b` maps coordinates in *b* to coordinates in *a*: `p_in_a = a_from_b * p_in_b`.
@@ -10,24 +10,25 @@
 //! - **Units.** SI and radians; a scalar in another unit says so in its name. Time is integer nanoseconds.
 //! - **Perturbation.** Right: `T ⊞ δ = T · exp(δ)`, tangent order [rotation, translation, log-scale].
 //!
-//! `docs/concepts/frames-and-units.md` says the same with pictures in words and the conversions at the borders.
+//! `docs/concepts/frames-and-units.md` explains them with the conversions to other programs' conventions.
 //!
 //! # Example
 //!
-//! Where does a camera on a flying body see a point of the room?
+//! Projects a point of the world into a camera that is mounted on a moving body.
 //!
 //! ```
 //! use nalgebra::{Matrix3, Vector3};
 //! use vidar_core::{
-//!     BodyFrame, CameraId, CameraModel, Duration, Pinhole, Rig, Se3, So3, StampedPose, Timestamp, Trajectory,
+//!     BodyFrame, CameraId, CameraModel, Duration, Pinhole, Rig, RigCamera, Se3, So3, StampedPose, Timestamp, Trajectory,
 //! };
 //!
 //! // A camera 10 cm ahead of the IMU that looks along the body's x axis (x ahead, y left, z up).
 //! let model = CameraModel::Pinhole(Pinhole::new(400.0, 400.0, 319.5, 239.5, 640, 480)?);
 //! let columns = [-Vector3::y(), -Vector3::z(), Vector3::x()]; // the camera's x, y, z in the body
-//! let looks_ahead = So3::from_matrix(&Matrix3::from_columns(&columns)).ok_or("not a rotation")?;
-//! let mut rig = Rig::single_camera(model);
-//! rig.cameras[0].body_from_camera = Se3::new(looks_ahead, Vector3::new(0.1, 0.0, 0.0));
+//! let body_from_camera_rotation = So3::from_matrix(&Matrix3::from_columns(&columns)).ok_or("not a rotation")?;
+//! let body_from_camera = Se3::new(body_from_camera_rotation, Vector3::new(0.1, 0.0, 0.0));
+//! let camera = RigCamera { model, body_from_camera, time_offset: Duration::ZERO, rate_hz: None };
+//! let rig = Rig { cameras: vec![camera], imu: None };
 //!
 //! // The body flies 1 m ahead in 50 ms.
 //! let start = Timestamp::parse_secs("1403636580.838555648")?;
@@ -37,8 +38,8 @@
 //! };
 //! let flight = Trajectory::new(BodyFrame::Imu, vec![pose(0, 0.0), pose(50, 1.0)])?;
 //!
-//! // Half way, told of the camera: p_in_camera = world_from_camera⁻¹ · p_in_world.
-//! let camera_flight = flight.in_camera_frame(CameraId(0), &rig)?;
+//! // The camera's pose half way: p_in_camera = world_from_camera⁻¹ · p_in_world.
+//! let camera_flight = flight.in_frame(BodyFrame::Camera(CameraId(0)), &rig)?;
 //! let half_way = start + Duration::from_millis(25);
 //! let world_from_camera =
 //!     camera_flight.interpolate(half_way, Duration::from_millis(50)).ok_or("outside the flight")?;
@@ -87,7 +88,7 @@ pub use surface::{PointCloud, TriangleMesh};
 pub use time::{Duration, TimeError, Timestamp};
 pub use trajectory::{BodyFrame, StampedPose, Trajectory, TrajectoryError};
 pub use umeyama::{UmeyamaError, umeyama_se3, umeyama_sim3, umeyama_sim3_weighted};
-pub use warning::Warning;
+pub use warning::{Severity, Warning};
 
 /// Standard gravity magnitude used for synthetic data, m/s².
 pub const GRAVITY_MPS2: f64 = 9.81;

@@ -1,4 +1,4 @@
-//! What every source of dense geometry looks like: views in, a prediction in its own units out.
+//! The interface of dense geometry models: views in, a prediction in the model's own units out.
 
 use crate::camera::Pinhole;
 use crate::geometry::{Confidence, RelativeDepth};
@@ -15,7 +15,7 @@ use thiserror::Error;
 pub struct ChunkView {
     /// Which frame it is.
     pub frame_id: FrameId,
-    /// When it was taken.
+    /// Time of the exposure.
     pub time: Timestamp,
     /// The undistorted image.
     pub image: FrameImage,
@@ -25,7 +25,7 @@ pub struct ChunkView {
     pub world_from_camera: Option<Se3>,
 }
 
-/// What a model sees at once.
+/// The views that a model processes together.
 #[derive(Clone, Debug)]
 pub struct ChunkViews {
     /// The chunk's number.
@@ -49,13 +49,13 @@ pub struct ViewGeometry {
     pub confidence: Confidence,
 }
 
-/// In which frame and units a prediction is.
+/// The frame and the units of a prediction.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum ChunkFrame {
-    /// The frame of the prior poses that were given, in metres.
+    /// The frame of the given prior poses, in metres.
     PriorWorld,
-    /// A frame and scale of the model's own.
+    /// A frame and scale that the model chooses.
     ModelNative,
 }
 
@@ -64,9 +64,9 @@ pub enum ChunkFrame {
 pub struct GeometryPrediction {
     /// Which chunk.
     pub chunk_id: ChunkId,
-    /// In which frame and units.
+    /// Its frame and units.
     pub frame: ChunkFrame,
-    /// One entry per view that got geometry, in the order of the views given.
+    /// One entry per view with geometry, in the order of the input views.
     pub views: Vec<ViewGeometry>,
 }
 
@@ -116,12 +116,12 @@ pub enum ModelError {
     /// The caller asked to stop.
     #[error("cancelled")]
     Cancelled,
-    /// Anything else, in the model's own words.
+    /// Any other error, as the model describes it.
     #[error("{0}")]
     Other(String),
 }
 
-/// A source of dense geometry.
+/// A model that predicts dense geometry from views.
 pub trait GeometryModel: Send {
     /// Which model this is.
     fn info(&self) -> &ModelInfo;
@@ -129,14 +129,14 @@ pub trait GeometryModel: Send {
     /// Predicts depth, confidence and poses of a chunk. Same input, same bits, for any thread count.
     fn predict(&mut self, views: &ChunkViews) -> Result<GeometryPrediction, ModelError>;
 
-    /// Predicts a chunk of which only the views `wanted` (indices into `views.views`) are needed.
+    /// Predicts the views `requested` (indices into `views.views`) of a chunk.
     ///
-    /// The others are context. `cancel` is asked now and then; `true` ends the work with
-    /// [`ModelError::Cancelled`]. The default predicts everything and keeps what is wanted.
-    fn predict_wanted(
+    /// The other views are context. `cancel` is polled; `true` ends the work with [`ModelError::Cancelled`]. The
+    /// default implementation predicts all views and keeps the requested ones.
+    fn predict_views(
         &mut self,
         views: &ChunkViews,
-        wanted: Range<usize>,
+        requested: Range<usize>,
         cancel: &(dyn Fn() -> bool + Sync),
     ) -> Result<GeometryPrediction, ModelError> {
         if cancel() {
@@ -147,7 +147,7 @@ pub trait GeometryModel: Send {
             .views
             .iter()
             .enumerate()
-            .filter(|(i, _)| wanted.contains(i))
+            .filter(|(i, _)| requested.contains(i))
             .map(|(_, v)| v.frame_id)
             .collect();
         prediction.views.retain(|v| ids.contains(&v.frame_id));
@@ -161,7 +161,7 @@ mod tests {
     use crate::image::Image;
     use nalgebra::Vector3;
 
-    /// Says that everything is one unit away, where it was told to stand.
+    /// Predicts depth one everywhere and repeats the prior poses.
     struct Wall(ModelInfo);
 
     impl GeometryModel for Wall {

@@ -1,7 +1,7 @@
-//! What a metric odometry says of each frame and of each keyframe.
+//! Outputs of a metric odometry per frame and per keyframe.
 //!
-//! The error state of a frame is `[δθ, δp, δv, δb_gyro, δb_accel]`, three numbers each: `R · exp(δθ)` in the body,
-//! `p + δp` and `v + δv` in the world, biases added. Covariances are ordered and scaled alike.
+//! The error state of a frame is `[δθ, δp, δv, δb_gyro, δb_accel]`, three numbers each: `R · exp(δθ)` in the body
+//! frame, `p + δp` and `v + δv` in the world frame, additive biases. Covariances have the same order and units.
 
 use crate::camera::Pixel;
 use crate::id::{FrameId, KeyframeId, LandmarkId};
@@ -17,23 +17,23 @@ pub type NavCovariance = SMatrix<f64, 15, 15>;
 /// Covariance of a pose: rotation in the body (rad), position in the world (m).
 pub type PoseCovariance = SMatrix<f64, 6, 6>;
 
-/// Where the body is, how fast it moves, and how far its IMU is off.
+/// Navigation state: pose, velocity and IMU biases.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct NavState {
-    /// When it holds, in the clock of the images.
+    /// Time of the state, in the clock of the images.
     pub time: Timestamp,
     /// Pose of the body (IMU) in a world whose z axis points up.
     pub world_from_body: Se3,
     /// Velocity of the body in the world, m/s.
     pub velocity_in_world: Vector3<f64>,
-    /// Bias of the gyroscope, rad/s: subtract it from readings.
+    /// Bias of the gyroscope, rad/s: subtract it from measurements.
     pub gyro_bias: Vector3<f64>,
-    /// Bias of the accelerometer, m/s²: subtract it from readings.
+    /// Bias of the accelerometer, m/s²: subtract it from measurements.
     pub accel_bias: Vector3<f64>,
 }
 
 impl NavState {
-    /// At rest at the origin with true sensors.
+    /// At rest at the origin, biases zero.
     pub fn at_rest(time: Timestamp) -> Self {
         let zero = Vector3::zeros();
         Self {
@@ -52,29 +52,29 @@ impl NavState {
     }
 }
 
-/// How far a frame's state may be trusted, worst reason first.
+/// Tracking health of a frame; greater is worse, and the worst condition that holds is reported.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Health {
-    /// All is well.
+    /// No condition below holds.
     Ok,
-    /// Metric, but the scale is known to worse than two percent yet.
+    /// Metric, but the scale's standard deviation is still above two percent.
     ScaleConverging,
-    /// Up to scale: there is no IMU, or it has not told the scale yet. Lengths are not metres.
+    /// Up to scale: there is no IMU, or the scale is not observable yet. Lengths are not metres.
     ScaleUnknown,
-    /// Few landmarks are seen.
+    /// Few landmarks are observed.
     LowFeatures,
-    /// No image helps; the state follows from the IMU alone.
+    /// No image measurement was used; the state is propagated by the IMU alone.
     Degraded,
-    /// What sensors say contradicts the state.
+    /// Measurements contradict the state.
     Suspect,
-    /// No state is known.
+    /// No state is estimated.
     Lost,
 }
 
 impl Health {
-    /// The word as it stands in files.
-    pub fn word(self) -> &'static str {
+    /// The name used in files.
+    pub fn as_str(self) -> &'static str {
         match self {
             Self::Ok => "ok",
             Self::ScaleConverging => "scale-converging",
@@ -86,7 +86,7 @@ impl Health {
         }
     }
 
-    /// Whether lengths are metres and the state is backed by images: what may be fused into a metric map.
+    /// Whether lengths are metres and images support the state: the condition for fusion into a metric map.
     pub fn is_metric(self) -> bool {
         matches!(self, Self::Ok | Self::ScaleConverging | Self::LowFeatures)
     }
@@ -94,31 +94,31 @@ impl Health {
 
 impl fmt::Display for Health {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(self.word())
+        f.write_str(self.as_str())
     }
 }
 
-/// A point of the world as a keyframe sees it.
+/// A landmark as observed in one keyframe.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct SparseLandmark {
-    /// Which point; the same in every keyframe that sees it.
+    /// The landmark; the same in every keyframe that observes it.
     pub id: LandmarkId,
-    /// Where the keyframe's image shows it.
+    /// Its position in the keyframe's image.
     pub pixel: Pixel,
-    /// One over its z-depth in the keyframe's camera, 1/m (1/unit while the scale is unknown).
+    /// Inverse of its z-depth in the keyframe's camera, 1/m (1/unit while the scale is unknown).
     pub inverse_depth: f64,
     /// Standard deviation of `inverse_depth`.
     pub inverse_depth_std: f64,
 }
 
-/// A keyframe as the dense part of a map needs it.
+/// A keyframe of the odometry, input of dense reconstruction.
 #[derive(Clone, Debug, PartialEq)]
 pub struct OdometryKeyframe {
     /// Its number, counted from the first of the sequence.
     pub id: KeyframeId,
-    /// The frame it is.
+    /// The frame it was made from.
     pub frame_id: FrameId,
-    /// Its segment: poses of different segments share no world.
+    /// Its segment: poses of different segments have no common world frame.
     pub segment: u32,
     /// Its state; `state.time` is the frame's.
     pub state: NavState,
@@ -131,22 +131,22 @@ pub struct OdometryKeyframe {
     pub previous: Option<(KeyframeId, PoseCovariance)>,
     /// Gravity in the world, m/s².
     pub gravity_in_world: Vector3<f64>,
-    /// How well the scale is known: standard deviation of ln(scale); infinite when it is not.
+    /// Standard deviation of ln(scale); infinite while the scale is not observable.
     pub scale_std: f64,
-    /// Its health when it was made.
+    /// Tracking health when it was created.
     pub health: Health,
-    /// The landmarks it sees.
+    /// The landmarks it observes.
     pub landmarks: Vec<SparseLandmark>,
 }
 
-/// A keyframe's pose after later frames corrected it.
+/// A keyframe's pose, re-estimated with later frames.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct RevisedPose {
     /// Which keyframe.
     pub id: KeyframeId,
-    /// Its pose now.
+    /// Its present pose.
     pub world_from_camera: Se3,
-    /// Whether this is the last word: the keyframe left the window.
+    /// Whether the pose is final: the keyframe was marginalised out of the window.
     pub is_final: bool,
 }
 
@@ -165,9 +165,9 @@ mod tests {
             Health::Suspect,
             Health::Lost,
         ];
-        let metric: Vec<&str> = all.iter().filter(|h| h.is_metric()).map(|h| h.word()).collect();
+        let metric: Vec<&str> = all.iter().filter(|h| h.is_metric()).map(|h| h.as_str()).collect();
         assert_eq!(metric, ["ok", "scale-converging", "low-features"]);
-        assert!(all.windows(2).all(|w| w[0] < w[1]), "the worst word is the greatest");
+        assert!(all.windows(2).all(|w| w[0] < w[1]), "the worst condition is the greatest");
     }
 
     #[test]

@@ -1,9 +1,9 @@
-//! Undistortion and resizing with intrinsics that stay right.
+//! Undistortion and resizing of images together with their intrinsics.
 //!
-//! A [`RemapTable`] holds, for each pixel of a distortion-free view, where the camera's own image shows the same
-//! direction. Where a pixel of the view covers several pixels of the image (a reduced view), the table holds a grid
+//! A [`RemapTable`] holds, for each pixel of a distortion-free view, the position of the same direction in the
+//! camera's own image. Where a pixel of the view covers several pixels of the image (a reduced view), the table holds a grid
 //! of positions spread over the pixel's area and [`RemapTable::apply`] averages them: an area average, so that fine
-//! texture becomes grey instead of a false pattern.
+//! texture becomes grey instead of aliasing.
 
 use crate::camera::{CameraError, CameraModel, Pinhole};
 use crate::image::{FrameImage, Image};
@@ -13,24 +13,22 @@ use rayon::prelude::*;
 /// Most sample positions along one side of a pixel; a reduction beyond it is no longer a full average.
 const MAX_SAMPLES_PER_SIDE: usize = 16;
 
-/// A pixel may cover this many source pixels more than it has samples; bilinear reading spans a full pixel anyway.
+/// A pixel may cover this many source pixels more than it has samples; bilinear interpolation spans a full pixel anyway.
 const SAMPLE_SLACK: f64 = 0.25;
 
-/// For each pixel of a pinhole view, where to look in the camera's own image.
+/// For each pixel of a pinhole view, the positions to sample in the camera's own image.
 #[derive(Clone, Debug)]
 pub struct RemapTable {
     target: Pinhole,
-    source_width: usize,
-    source_height: usize,
     samples_per_side: usize,
-    /// Source positions, x then y; the samples of one pixel lie together. NaN where the camera sees nothing.
+    /// Source positions, x then y; the samples of one pixel lie together. NaN outside the camera's image.
     source: Vec<[f32; 2]>,
 }
 
 impl RemapTable {
     /// The map from `camera` to the distortion-free view `target`.
     ///
-    /// A pixel of the view is seen when all of its samples lie on the image, whose area reaches half a pixel beyond
+    /// A pixel of the view is covered when all of its samples lie on the image, whose area reaches half a pixel beyond
     /// the centres of its border pixels.
     pub fn new(camera: &CameraModel, target: &Pinhole) -> Self {
         let samples_per_side = samples_per_side(camera, target);
@@ -52,47 +50,26 @@ impl RemapTable {
                 }
             }
         });
-        Self {
-            target: *target,
-            source_width: camera.width(),
-            source_height: camera.height(),
-            samples_per_side,
-            source,
-        }
+        Self { target: *target, samples_per_side, source }
     }
 
-    /// The map that resizes a distortion-free image to `width` × `height`; [`RemapTable::target`] has its intrinsics.
-    pub fn resizing(source: &Pinhole, width: usize, height: usize) -> Result<Self, CameraError> {
-        Ok(Self::new(&CameraModel::Pinhole(*source), &source.resized(width, height)?))
-    }
-
-    /// The view that the map makes.
+    /// The intrinsics of the resulting view.
     pub fn target(&self) -> &Pinhole {
         &self.target
     }
 
-    /// Columns and rows of the images that the map reads.
-    pub fn source_size(&self) -> (usize, usize) {
-        (self.source_width, self.source_height)
-    }
-
-    /// Share of the target's pixels that the camera sees, 0…1.
+    /// Share of the target's pixels that the camera covers, 0…1.
     pub fn coverage(&self) -> f64 {
         let per_pixel = self.samples_per_side * self.samples_per_side;
-        let seen = self.source.iter().step_by(per_pixel).filter(|s| !s[0].is_nan()).count();
-        (seen * per_pixel) as f64 / self.source.len().max(1) as f64
+        let covered = self.source.iter().step_by(per_pixel).filter(|s| !s[0].is_nan()).count();
+        (covered * per_pixel) as f64 / self.source.len().max(1) as f64
     }
 
-    /// Whether target pixel `(x, y)` is seen by the camera.
-    pub fn is_seen(&self, x: usize, y: usize) -> bool {
-        !self.samples(x, y)[0][0].is_nan()
-    }
-
-    /// The image as the target view sees it: bilinear, averaged over the pixel's area where the view is reduced;
-    /// black where the camera sees nothing.
+    /// The image resampled to the target view: bilinear, averaged over the pixel's area where the view is reduced;
+    /// black outside the camera's image.
     ///
     /// Rows are done in parallel; the result is the same for any number of threads. The image must have the size of
-    /// the camera ([`RemapTable::source_size`]); of a smaller one the border pixels are repeated.
+    /// the camera; of a smaller one the border pixels are repeated.
     pub fn apply(&self, image: &FrameImage) -> FrameImage {
         match image {
             FrameImage::Gray8(i) => {
@@ -109,7 +86,7 @@ impl RemapTable {
         }
     }
 
-    /// The value of the source pixel nearest to each target pixel, `outside` where the camera sees nothing.
+    /// The value of the source pixel nearest to each target pixel, `outside` where the camera has no pixel.
     ///
     /// For values that must not be mixed: depths with holes, labels, masks.
     pub fn apply_nearest<P: Copy + Send + Sync>(&self, image: &Image<P>, outside: P) -> Image<P> {
@@ -169,7 +146,7 @@ impl RemapTable {
     }
 }
 
-/// The value between the four pixels around `at`; positions beyond the border centres read the border.
+/// Bilinear interpolation at `at`; beyond the border's pixel centres the border value is repeated.
 fn bilinear<P, const C: usize>(
     image: &Image<P>,
     load: impl Fn(&P) -> [f32; C],
@@ -209,10 +186,10 @@ fn samples_per_side(camera: &CameraModel, target: &Pinhole) -> usize {
     ((widest - SAMPLE_SLACK).ceil() as usize).clamp(1, MAX_SAMPLES_PER_SIDE)
 }
 
-/// A distortion-free view of `width` × `height` inside what `camera` sees, keeping its aspect of pixels.
+/// A distortion-free view of `width` × `height` inside the field of view of `camera`, keeping its pixel aspect ratio.
 ///
 /// The focal length is the smallest one, between 0.2 and 5 times the camera's own, for which the whole border of the
-/// view is seen; the principal point stays in place. A pinhole camera is only resized.
+/// view is covered; the principal point stays in place. A pinhole camera is only resized.
 pub fn undistorted_view(camera: &CameraModel, width: usize, height: usize) -> Result<Pinhole, CameraError> {
     let k = camera.intrinsics().resized(width, height)?;
     if matches!(camera, CameraModel::Pinhole(_)) {
@@ -221,22 +198,22 @@ pub fn undistorted_view(camera: &CameraModel, width: usize, height: usize) -> Re
     let view = |zoom: f64| Pinhole::new(k.fx * zoom, k.fy * zoom, k.cx, k.cy, width, height);
     // Zooming in shrinks the field of view; 0.2 to 5 spans every lens that a pinhole view can serve.
     let (mut low, mut high) = (0.2, 5.0);
-    if !border_is_seen(camera, &view(high)?) {
+    if !border_is_covered(camera, &view(high)?) {
         return Err(CameraError::NoUndistortedView { width, height, max_focal_px: k.fx.max(k.fy) * high });
     }
     for _ in 0..40 {
-        let middle = 0.5 * (low + high);
-        if border_is_seen(camera, &view(middle)?) { high = middle } else { low = middle }
+        let mid = 0.5 * (low + high);
+        if border_is_covered(camera, &view(mid)?) { high = mid } else { low = mid }
     }
     view(high)
 }
 
 /// Whether the outline of the view's area, half a pixel outside its border centres, falls on the camera's image.
-fn border_is_seen(camera: &CameraModel, view: &Pinhole) -> bool {
-    let seen = |x: f64, y: f64| {
+fn border_is_covered(camera: &CameraModel, view: &Pinhole) -> bool {
+    let covered = |x: f64, y: f64| {
         camera.project(&view.ray(x, y)).is_some_and(|p: Vector2<f64>| camera.contains(&p, 0.0))
     };
     let (right, bottom) = (view.width as f64 - 0.5, view.height as f64 - 0.5);
-    (0..=view.width).all(|i| seen(i as f64 - 0.5, -0.5) && seen(i as f64 - 0.5, bottom))
-        && (0..=view.height).all(|i| seen(-0.5, i as f64 - 0.5) && seen(right, i as f64 - 0.5))
+    (0..=view.width).all(|i| covered(i as f64 - 0.5, -0.5) && covered(i as f64 - 0.5, bottom))
+        && (0..=view.height).all(|i| covered(-0.5, i as f64 - 0.5) && covered(right, i as f64 - 0.5))
 }

@@ -11,11 +11,11 @@ use serde::{Deserialize, Serialize};
 pub struct RigCamera {
     /// How it projects.
     pub model: CameraModel,
-    /// Its place on the body: maps points in the camera frame to the body (IMU) frame.
+    /// Its pose on the body: maps points in the camera frame to the body (IMU) frame.
     pub body_from_camera: Se3,
     /// `t_imu = t_camera + time_offset`, as Kalibr's `timeshift_cam_imu`.
     pub time_offset: Duration,
-    /// Nominal frame rate, Hz, where the calibration tells it.
+    /// Nominal frame rate, Hz, where the calibration states it.
     pub rate_hz: Option<f64>,
 }
 
@@ -56,13 +56,6 @@ pub struct Rig {
 }
 
 impl Rig {
-    /// A rig of one camera that is itself the body.
-    pub fn single_camera(model: CameraModel) -> Self {
-        let camera =
-            RigCamera { model, body_from_camera: Se3::IDENTITY, time_offset: Duration::ZERO, rate_hz: None };
-        Self { cameras: vec![camera], imu: None }
-    }
-
     /// The camera of that number, if the rig has it.
     pub fn camera(&self, id: CameraId) -> Option<&RigCamera> {
         self.cameras.get(id.index())

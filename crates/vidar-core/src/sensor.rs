@@ -1,4 +1,4 @@
-//! What sensors say, in time order.
+//! Sensor measurements in time order.
 
 use crate::geometry::MetricDepth;
 use crate::id::{CameraId, FrameId};
@@ -7,22 +7,22 @@ use crate::lie::Se3;
 use crate::time::Timestamp;
 use nalgebra::Vector3;
 
-/// Angular rate as the gyroscope gives it (bias included), rad/s, in the IMU frame.
+/// Angular rate as measured by the gyroscope (bias included), rad/s, in the IMU frame.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct AngularRate(pub Vector3<f64>);
 
-/// Specific force as the accelerometer gives it (bias and gravity reaction included), m/s², in the IMU frame.
+/// Specific force as measured by the accelerometer (bias and gravity reaction included), m/s², in the IMU frame.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct SpecificForce(pub Vector3<f64>);
 
-/// One inertial reading.
+/// One IMU sample.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ImuSample {
     /// When it was taken, in the dataset's clock.
     pub time: Timestamp,
-    /// Gyroscope.
+    /// Gyroscope measurement.
     pub gyro: AngularRate,
-    /// Accelerometer.
+    /// Accelerometer measurement.
     pub accel: SpecificForce,
 }
 
@@ -31,7 +31,7 @@ pub struct ImuSample {
 pub struct Frame {
     /// Its number in the sequence.
     pub id: FrameId,
-    /// Middle of the exposure where the dataset knows it.
+    /// Middle of the exposure, where the dataset states it.
     pub time: Timestamp,
     /// Which camera took it.
     pub camera: CameraId,
@@ -39,12 +39,12 @@ pub struct Frame {
     pub image: FrameImage,
 }
 
-/// One reading of any sensor. Streams are time-ordered; at equal times the IMU comes first.
+/// One measurement of any sensor. Streams are time-ordered; at equal times the IMU comes first.
 #[derive(Clone, Debug)]
 pub enum SensorEvent {
     /// An image.
     Image(Frame),
-    /// An inertial reading.
+    /// An IMU sample.
     Imu(ImuSample),
     /// A depth image of a depth camera.
     Depth {
@@ -55,7 +55,7 @@ pub enum SensorEvent {
         /// z-depth in metres.
         depth: MetricDepth,
     },
-    /// A reference pose, for judgement only.
+    /// A reference pose, for evaluation only.
     GroundTruth {
         /// When it holds.
         time: Timestamp,

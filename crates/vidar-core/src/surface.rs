@@ -1,4 +1,4 @@
-//! Surfaces: what fusion makes, export writes and evaluation judges. All in metres, in the world frame.
+//! Point clouds and triangle meshes, in metres, in the world frame: outputs of fusion, inputs of export and evaluation.
 
 /// Points with optional attributes; an attribute list is either empty or as long as `positions`.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -38,7 +38,7 @@ impl PointCloud {
     }
 }
 
-/// A triangle mesh with shared vertices; counter-clockwise seen from outside (the observed side).
+/// A triangle mesh with shared vertices; triangles are counter-clockwise from the observed side.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct TriangleMesh {
     /// Vertex positions in the world, metres.
@@ -54,7 +54,7 @@ pub struct TriangleMesh {
 }
 
 impl TriangleMesh {
-    /// Whether attributes fit the vertices and every index names a vertex.
+    /// Whether attributes fit the vertices and every index is that of a vertex.
     pub fn is_consistent(&self) -> bool {
         let n = self.positions.len();
         [self.normals.len(), self.colors.len(), self.confidences.len()]

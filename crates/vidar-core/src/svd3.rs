@@ -94,7 +94,7 @@ mod tests {
                 prop_assert!((svd.values[i] - d[i]).abs() <= 1e-14 * first, "{:?} {d:?}", svd.values);
             }
             prop_assert!((svd.rotation.determinant() - 1.0).abs() < 1e-14);
-            // The rotation is as sure as its gap, d1 + d2, allows.
+            // The rotation's error grows with the inverse of the gap d1 + d2.
             let error = (svd.rotation - u * v.transpose()).amax();
             prop_assert!(error <= 1e-14 * first / (d.y + d.z).max(1e-30), "{error:.2e} {d:?}");
         }

@@ -1,9 +1,9 @@
-//! Helpers for tests: the one way in which derivatives are checked in this project.
+//! Helpers for tests: checks of analytic derivatives, used by all crates.
 
 use nalgebra::{SMatrix, SVector};
 
 /// Jacobian of `f` at `x` by central differences with Richardson extrapolation.
-pub fn numeric_jacobian<const M: usize, const N: usize>(
+fn numeric_jacobian<const M: usize, const N: usize>(
     f: impl Fn(&SVector<f64, N>) -> SVector<f64, M>,
     x: &SVector<f64, N>,
 ) -> SMatrix<f64, M, N> {
@@ -26,7 +26,7 @@ pub fn numeric_jacobian<const M: usize, const N: usize>(
 
 /// Largest absolute entry, NaN as soon as any entry is NaN.
 ///
-/// nalgebra's `amax` compares and so passes over a NaN: a broken matrix would look small.
+/// nalgebra's `amax` compares and so ignores a NaN: a matrix with NaN would appear small.
 pub fn largest_entry<const M: usize, const N: usize>(matrix: &SMatrix<f64, M, N>) -> f64 {
     matrix.iter().fold(
         0.0,

@@ -1,4 +1,4 @@
-//! Time-ordered poses of a body that has a name.
+//! Time-ordered poses of a named frame of the rig.
 
 use crate::id::CameraId;
 use crate::lie::{LieGroup, Se3};
@@ -7,14 +7,15 @@ use crate::time::{Duration, Timestamp};
 use std::fmt;
 use thiserror::Error;
 
-/// Whose poses a trajectory holds. Mixing these up moves an ATE by the lever arm, so it is never implicit.
+/// The frame of the rig that a trajectory describes. It is explicit, because confusing two frames changes an ATE by
+/// the lever arm.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum BodyFrame {
     /// The IMU, which is the body frame.
     Imu,
     /// A camera of the rig.
     Camera(CameraId),
-    /// Something else that the dataset tracks and whose place on the rig is unknown (a prism, a marker set).
+    /// Another tracked object whose pose on the rig is unknown (a prism, a marker set).
     Other,
 }
 
@@ -28,10 +29,10 @@ impl fmt::Display for BodyFrame {
     }
 }
 
-/// A pose and when it holds.
+/// A pose and its time.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct StampedPose {
-    /// When.
+    /// Time of the pose.
     pub time: Timestamp,
     /// Pose of the trajectory's body in the world.
     pub world_from_body: Se3,
@@ -44,7 +45,7 @@ pub struct Trajectory {
     poses: Vec<StampedPose>,
 }
 
-/// Why poses are not a trajectory.
+/// Why poses do not form a trajectory.
 #[derive(Clone, Debug, PartialEq, Eq, Error)]
 #[non_exhaustive]
 pub enum TrajectoryError {
@@ -69,8 +70,8 @@ pub enum TrajectoryError {
     /// The rig has no such camera.
     #[error("the rig has no camera {0}")]
     NoSuchCamera(CameraId),
-    /// The place of this body on the rig is unknown.
-    #[error("poses of a {0} cannot be moved to another frame of the rig")]
+    /// The pose of this body on the rig is unknown.
+    #[error("poses of a {0} cannot be expressed in another frame of the rig")]
     UnknownBody(BodyFrame),
 }
 
@@ -89,7 +90,7 @@ impl Trajectory {
         Ok(Self { body, poses })
     }
 
-    /// Whose poses these are.
+    /// The frame whose poses these are.
     pub fn body(&self) -> BodyFrame {
         self.body
     }
@@ -152,12 +153,7 @@ impl Trajectory {
             .filter(|p| (p.time - time).abs() <= max_difference)
     }
 
-    /// The same motion told of a camera of `rig`.
-    pub fn in_camera_frame(&self, camera: CameraId, rig: &Rig) -> Result<Self, TrajectoryError> {
-        self.in_frame(BodyFrame::Camera(camera), rig)
-    }
-
-    /// The same motion told of another frame of `rig`.
+    /// The same motion expressed for another frame of `rig`.
     pub fn in_frame(&self, target: BodyFrame, rig: &Rig) -> Result<Self, TrajectoryError> {
         if target == self.body {
             return Ok(self.clone());

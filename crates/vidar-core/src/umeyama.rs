@@ -3,14 +3,14 @@
 //! Given source points x, target points y and weights w, the similarity that minimises `Σ w |y − (s R x + t)|²` comes
 //! from the means, the cross-covariance `Σ_xy = Σ w (y − ȳ)(x − x̄)ᵀ / Σ w = U D Vᵀ` and the source variance σ²:
 //! `R = U diag(1, 1, det U det V) Vᵀ`, `s = tr(D diag(1, 1, det U det V))/σ²`, `t = ȳ − s R x̄` (eq. 40–43).
-//! Points in a plane are enough; points on a line leave the rotation free and are refused.
+//! Points in a plane are enough; points on a line leave the rotation undetermined and are an error.
 
 use crate::lie::{Se3, Sim3, So3};
 use crate::svd3::proper_svd;
 use nalgebra::{Matrix3, Vector3};
 use thiserror::Error;
 
-/// Why paired points do not fix a transform.
+/// Why paired points do not determine a transform.
 #[derive(Clone, Debug, PartialEq, Error)]
 #[non_exhaustive]
 pub enum UmeyamaError {
@@ -22,8 +22,8 @@ pub enum UmeyamaError {
         /// Points to reach.
         target_len: usize,
     },
-    /// Fewer than three pairs with a weight (two for a scale alone).
-    #[error("{found} point pairs, at least 3 are needed (2 for a scale alone)")]
+    /// Fewer than three pairs with a positive weight.
+    #[error("{found} point pairs, at least 3 are needed")]
     TooFewPoints {
         /// Pairs given.
         found: usize,
@@ -34,14 +34,12 @@ pub enum UmeyamaError {
         /// Which pair.
         index: usize,
     },
-    /// The points coincide or lie on a line, so that the rotation is free.
-    #[error(
-        "points are degenerate: second spread {second:.3e} of first {first:.3e} (on a line or in one place)"
-    )]
+    /// The points coincide or lie on a line, so that the rotation is undetermined.
+    #[error("points are degenerate: singular values {first:.3e} and {second:.3e} (on a line or coincident)")]
     Degenerate {
         /// Largest singular value of the cross-covariance.
         first: f64,
-        /// What holds the rotation about the first direction: the second singular value plus the signed third.
+        /// The second singular value plus the signed third: curvature of the cost about the first direction.
         second: f64,
     },
     /// Points and weights differ in number.
@@ -62,18 +60,18 @@ pub enum UmeyamaError {
     },
 }
 
-/// Share of the spread below which the rotation counts as free: a line of 1 m with 30 µm across still passes.
+/// Relative size of `second` below which the rotation is undetermined: a line of 1 m that is 30 µm wide still passes.
 const RANK_TOLERANCE: f64 = 1e-9;
 
-/// Spread over distance from the origin below which a cloud is one place seen through rounding.
-const PLACE_TOLERANCE: f64 = 1e-12;
+/// Standard deviation over distance from the origin below which points coincide up to rounding.
+const COINCIDENCE_TOLERANCE: f64 = 1e-12;
 
 /// The similarity `target_from_source` that minimises `Σ |y − (s R x + t)|²` (Umeyama 1991, eq. 40–43).
 ///
 /// The least-squares scale `tr(D S)/σ_x²` is used; the paper's section III-E writes the ratio of RMS radii
-/// `σ_t/σ_s`, which agrees for noise-free pairs and is available as [`rms_radius_scale`].
+/// `σ_t/σ_s`, which agrees for noise-free pairs.
 pub fn umeyama_sim3(source: &[Vector3<f64>], target: &[Vector3<f64>]) -> Result<Sim3, UmeyamaError> {
-    check(source, target, 3)?;
+    check(source, target)?;
     similarity(&fit(source, target, |_| 1.0)?)
 }
 
@@ -90,41 +88,8 @@ pub fn umeyama_sim3_weighted(
 
 /// The rigid motion `target_from_source` that minimises `Σ |y − (R x + t)|²`.
 pub fn umeyama_se3(source: &[Vector3<f64>], target: &[Vector3<f64>]) -> Result<Se3, UmeyamaError> {
-    check(source, target, 3)?;
+    check(source, target)?;
     Ok(rigid(&fit(source, target, |_| 1.0)?))
-}
-
-/// The rigid motion that minimises `Σ w |y − (R x + t)|²`; weights as in [`umeyama_sim3_weighted`].
-pub fn umeyama_se3_weighted(
-    source: &[Vector3<f64>],
-    target: &[Vector3<f64>],
-    weights: &[f64],
-) -> Result<Se3, UmeyamaError> {
-    Ok(rigid(&weighted_fit(source, target, weights)?))
-}
-
-/// The paper's closed form of the scale, `σ_t/σ_s` with RMS radii (section III-E).
-///
-/// It needs no rotation, but noise on either side biases it; [`scale_about_rotation`] is the least-squares one.
-pub fn rms_radius_scale(source: &[Vector3<f64>], target: &[Vector3<f64>]) -> Result<f64, UmeyamaError> {
-    check(source, target, 2)?;
-    let moments = moments(source, target, |_| 1.0)?;
-    positive_scale((moments.target_variance / moments.source_variance).sqrt(), &moments)
-}
-
-/// The scale that minimises `Σ |y − (s R x + t)|²` for a known rotation R: `Σ (y − ȳ)·R(x − x̄) / Σ |x − x̄|²`.
-///
-/// The paper's `UmeyamaScale` of predicted onto odometry camera centres when the chunk's orientation is already
-/// given; points on a line and two points are enough.
-pub fn scale_about_rotation(
-    source: &[Vector3<f64>],
-    target: &[Vector3<f64>],
-    target_from_source: &So3,
-) -> Result<f64, UmeyamaError> {
-    check(source, target, 2)?;
-    let moments = moments(source, target, |_| 1.0)?;
-    let along = target_from_source.matrix().component_mul(&moments.covariance).sum();
-    positive_scale(along / moments.source_variance, &moments)
 }
 
 fn similarity(fit: &Fit) -> Result<Sim3, UmeyamaError> {
@@ -137,13 +102,6 @@ fn similarity(fit: &Fit) -> Result<Sim3, UmeyamaError> {
 
 fn rigid(fit: &Fit) -> Se3 {
     Se3::new(fit.rotation, fit.target_mean - fit.rotation * fit.source_mean)
-}
-
-fn positive_scale(scale: f64, moments: &Moments) -> Result<f64, UmeyamaError> {
-    if scale.is_finite() && scale > 0.0 {
-        return Ok(scale);
-    }
-    Err(UmeyamaError::Degenerate { first: moments.source_variance, second: moments.target_variance })
 }
 
 struct Fit {
@@ -163,11 +121,11 @@ struct Moments {
     covariance: Matrix3<f64>,
 }
 
-fn check(source: &[Vector3<f64>], target: &[Vector3<f64>], needed: usize) -> Result<(), UmeyamaError> {
+fn check(source: &[Vector3<f64>], target: &[Vector3<f64>]) -> Result<(), UmeyamaError> {
     if source.len() != target.len() {
         return Err(UmeyamaError::LengthMismatch { source_len: source.len(), target_len: target.len() });
     }
-    if source.len() < needed {
+    if source.len() < 3 {
         return Err(UmeyamaError::TooFewPoints { found: source.len() });
     }
     let finite = |p: &Vector3<f64>| p.iter().all(|v| v.is_finite());
@@ -182,7 +140,7 @@ fn weighted_fit(
     target: &[Vector3<f64>],
     weights: &[f64],
 ) -> Result<Fit, UmeyamaError> {
-    check(source, target, 3)?;
+    check(source, target)?;
     if weights.len() != source.len() {
         return Err(UmeyamaError::WeightCountMismatch { points: source.len(), weights: weights.len() });
     }
@@ -208,7 +166,7 @@ fn mean(points: &[Vector3<f64>], weight: impl Fn(usize) -> f64) -> Vector3<f64> 
     about(about(Vector3::zeros()))
 }
 
-/// Means, variances and cross-covariance; an error when a cloud is one place, seen through rounding.
+/// Means, variances and cross-covariance; an error when the points of a cloud coincide up to rounding.
 fn moments(
     source: &[Vector3<f64>],
     target: &[Vector3<f64>],
@@ -225,10 +183,10 @@ fn moments(
         total += w;
     }
     let (source_variance, target_variance) = (source_variance / total, target_variance / total);
-    let one_place = |variance: f64, mean: &Vector3<f64>| {
-        !(variance.is_finite() && variance.sqrt() > PLACE_TOLERANCE * mean.norm() && variance > 0.0)
+    let coincident = |variance: f64, mean: &Vector3<f64>| {
+        !(variance.is_finite() && variance.sqrt() > COINCIDENCE_TOLERANCE * mean.norm() && variance > 0.0)
     };
-    if one_place(source_variance, &source_mean) || one_place(target_variance, &target_mean) {
+    if coincident(source_variance, &source_mean) || coincident(target_variance, &target_mean) {
         return Err(UmeyamaError::Degenerate { first: source_variance, second: target_variance });
     }
     let covariance = covariance / total;
@@ -245,13 +203,13 @@ fn fit(
     let svd =
         proper_svd(&covariance).ok_or(UmeyamaError::Degenerate { first: covariance.amax(), second: 0.0 })?;
     let [first, second, third] = svd.values;
-    // Turning about the first direction changes the cost by second + third: zero on a line, and for the mirror image
-    // of a cloud with two equal spreads, where two rotations are equally good.
-    let hold = second + third;
-    let degenerate = UmeyamaError::Degenerate { first, second: hold };
-    if !(hold > RANK_TOLERANCE * (source_variance * target_variance).sqrt()) {
+    // Rotating about the first direction changes the cost by second + third: zero on a line, and for the mirror
+    // image of a cloud with two equal variances, where two rotations are equally good.
+    let curvature = second + third;
+    let degenerate = UmeyamaError::Degenerate { first, second: curvature };
+    if !(curvature > RANK_TOLERANCE * (source_variance * target_variance).sqrt()) {
         return Err(degenerate);
     }
     let rotation = So3::from_matrix(&svd.rotation).ok_or(degenerate)?;
-    Ok(Fit { rotation, source_mean, target_mean, source_variance, signed_trace: first + hold })
+    Ok(Fit { rotation, source_mean, target_mean, source_variance, signed_trace: first + curvature })
 }

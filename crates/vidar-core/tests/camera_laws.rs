@@ -173,18 +173,18 @@ macro_rules! model_suite {
             #[test]
             fn pixels_of_the_image_survive_the_round_trip() {
                 for camera in models() {
-                    let (mut seen, mut all) = (0, 0);
+                    let (mut with_ray, mut all) = (0, 0);
                     for y in (0..camera.height()).step_by(7) {
                         for x in (0..camera.width()).step_by(7) {
                             let pixel = Vector2::new(x as f64 + 0.25, y as f64 - 0.25);
                             all += 1;
                             let Some(ray) = camera.unproject(&pixel) else { continue };
-                            seen += 1;
+                            with_ray += 1;
                             let back = camera.project(&ray).unwrap();
                             assert!((back - pixel).norm() < 1e-9, "{camera:?}: {pixel:?} came back as {back:?}");
                         }
                     }
-                    assert!(2 * seen > all, "{camera:?}: only {seen} of {all} pixels have a ray");
+                    assert!(2 * with_ray > all, "{camera:?}: only {with_ray} of {all} pixels have a ray");
                 }
             }
 

@@ -174,16 +174,16 @@ fn difference_laws<const N: usize, G: LieGroup<N>>(
         let size = reach(&a.inverse(), reach(a, reach(&step, 1.0))) + reach(&step.inverse(), 1.0);
         close(&a.plus(delta).minus(a), delta, size + delta.norm(), "(a + d) - a = d")?;
     }
-    // The middle is equally far from both ends, when the way is unique.
+    // The midpoint is equally far from both ends, when the geodesic is unique.
     if angle_of(&b.minus(a)) < NEAR_PI {
-        let middle = a.interpolate(b, 0.5);
-        let size = reach(&middle.inverse(), size) + reach(&b.inverse(), size);
-        close(&middle.minus(a), &b.minus(&middle), size, "the middle halves the way")?;
+        let midpoint = a.interpolate(b, 0.5);
+        let size = reach(&midpoint.inverse(), size) + reach(&b.inverse(), size);
+        close(&midpoint.minus(a), &b.minus(&midpoint), size, "the midpoint is equally far from both ends")?;
     }
     Ok(())
 }
 
-/// A length between 0 and π with the hard places drawn often.
+/// A length between 0 and π with difficult values drawn often.
 fn angle() -> impl Strategy<Value = f64> {
     prop_oneof![
         3 => prop::sample::select(vec![0.0, 1e-12, 1e-8, 1e-4, 0.3, 1.0, PI - 1e-4, PI - 1e-9, PI]),
@@ -268,7 +268,7 @@ macro_rules! law_suite {
             }
 
             #[test]
-            fn inverse_jacobian_is_refused_at_a_full_turn() {
+            fn inverse_jacobian_is_none_at_a_full_turn() {
                 let mut t = SVector::<f64, $dof>::zeros();
                 t[0] = 2.0 * PI;
                 assert!(G::right_jacobian_inverse(&t).is_none());

@@ -30,7 +30,7 @@ fn flight() -> Trajectory {
 const GAP: Duration = Duration::from_millis(50);
 
 #[test]
-fn stamps_are_met_exactly_and_the_outside_is_nothing() {
+fn poses_at_stamps_are_exact_and_times_outside_give_none() {
     let flight = flight();
     for pose in flight.poses() {
         assert_eq!(flight.interpolate(pose.time, Duration::ZERO), Some(pose.world_from_body));
@@ -95,7 +95,7 @@ fn the_nearest_pose_is_found_within_its_limit() {
 }
 
 #[test]
-fn poses_out_of_order_or_not_finite_are_refused_with_their_place() {
+fn poses_out_of_order_or_not_finite_are_an_error_with_their_index() {
     let mut poses = flight().poses().to_vec();
     poses[2].time = poses[1].time;
     let (time, previous) = (poses[2].time, poses[1].time);
@@ -115,8 +115,8 @@ fn poses_out_of_order_or_not_finite_are_refused_with_their_place() {
 fn rig() -> Rig {
     let model = CameraModel::Pinhole(Pinhole::new(400.0, 400.0, 320.0, 240.0, 640, 480).unwrap());
     // Columns: the camera's right, down and forward in the body's axes (x ahead, y left, z up).
-    let looks = Matrix3::from_columns(&[-Vector3::y(), -Vector3::z(), Vector3::x()]);
-    let body_from_camera = Se3::new(So3::from_matrix(&looks).unwrap(), Vector3::new(0.1, 0.05, 0.0));
+    let axes = Matrix3::from_columns(&[-Vector3::y(), -Vector3::z(), Vector3::x()]);
+    let body_from_camera = Se3::new(So3::from_matrix(&axes).unwrap(), Vector3::new(0.1, 0.05, 0.0));
     let camera = |body_from_camera| RigCamera {
         model: model.clone(),
         body_from_camera,
@@ -134,13 +134,13 @@ fn the_lever_arm_turns_with_the_body() {
         at(100, Vector3::z() * FRAC_PI_2, Vector3::new(5.0, 5.0, 1.0)),
     ];
     let body = Trajectory::new(BodyFrame::Imu, poses).unwrap();
-    let camera = body.in_camera_frame(CameraId(0), &rig()).unwrap();
+    let camera = body.in_frame(BodyFrame::Camera(CameraId(0)), &rig()).unwrap();
     assert_eq!(camera.body(), BodyFrame::Camera(CameraId(0)));
-    let places = [Vector3::new(5.1, 5.05, 1.0), Vector3::new(4.95, 5.1, 1.0)];
+    let positions = [Vector3::new(5.1, 5.05, 1.0), Vector3::new(4.95, 5.1, 1.0)];
     let ahead = [Vector3::x(), Vector3::y()];
     for i in 0..2 {
         let pose = camera.poses()[i].world_from_body;
-        assert!((pose.translation - places[i]).norm() < 1e-14, "{i}: {}", pose.translation);
+        assert!((pose.translation - positions[i]).norm() < 1e-14, "{i}: {}", pose.translation);
         assert!((pose.rotation * Vector3::z() - ahead[i]).norm() < 1e-14);
         assert_eq!(camera.poses()[i].time, body.poses()[i].time);
     }
@@ -152,11 +152,11 @@ fn the_lever_arm_turns_with_the_body() {
 #[test]
 fn frames_can_be_changed_there_and_back_and_across() {
     let (rig, flight) = (rig(), flight());
-    let camera0 = flight.in_camera_frame(CameraId(0), &rig).unwrap();
+    let camera0 = flight.in_frame(BodyFrame::Camera(CameraId(0)), &rig).unwrap();
     let camera1 = camera0.in_frame(BodyFrame::Camera(CameraId(1)), &rig).unwrap();
     let back = camera1.in_frame(BodyFrame::Imu, &rig).unwrap();
     assert_eq!(back.body(), BodyFrame::Imu);
-    let direct = flight.in_camera_frame(CameraId(1), &rig).unwrap();
+    let direct = flight.in_frame(BodyFrame::Camera(CameraId(1)), &rig).unwrap();
     for i in 0..flight.len() {
         assert!(back.poses()[i].world_from_body.minus(&flight.poses()[i].world_from_body).norm() < 1e-14);
         assert!(direct.poses()[i].world_from_body.minus(&camera1.poses()[i].world_from_body).norm() < 1e-14);
@@ -165,12 +165,18 @@ fn frames_can_be_changed_there_and_back_and_across() {
 }
 
 #[test]
-fn a_body_whose_place_is_unknown_is_never_relabelled() {
+fn poses_of_a_body_with_unknown_mounting_are_never_relabelled() {
     let (rig, flight) = (rig(), flight());
-    assert_eq!(flight.in_camera_frame(CameraId(2), &rig), Err(TrajectoryError::NoSuchCamera(CameraId(2))));
+    assert_eq!(
+        flight.in_frame(BodyFrame::Camera(CameraId(2)), &rig),
+        Err(TrajectoryError::NoSuchCamera(CameraId(2)))
+    );
     let prism = Trajectory::new(BodyFrame::Other, flight.poses().to_vec()).unwrap();
-    let error = prism.in_camera_frame(CameraId(0), &rig).unwrap_err();
+    let error = prism.in_frame(BodyFrame::Camera(CameraId(0)), &rig).unwrap_err();
     assert_eq!(error, TrajectoryError::UnknownBody(BodyFrame::Other));
-    assert_eq!(error.to_string(), "poses of a tracked-object cannot be moved to another frame of the rig");
+    assert_eq!(
+        error.to_string(),
+        "poses of a tracked-object cannot be expressed in another frame of the rig"
+    );
     assert_eq!(flight.in_frame(BodyFrame::Other, &rig), Err(TrajectoryError::UnknownBody(BodyFrame::Other)));
 }

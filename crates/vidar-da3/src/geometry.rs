@@ -168,7 +168,7 @@ impl GeometryModel for Da3Model {
         self.predict_some(views, 0..views.views.len(), &|| false)
     }
 
-    fn predict_wanted(
+    fn predict_views(
         &mut self,
         views: &ChunkViews,
         wanted: Range<usize>,

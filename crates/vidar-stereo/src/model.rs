@@ -218,7 +218,7 @@ impl GeometryModel for StereoModel {
 
     /// Views without parallax are left out, even if that leaves none; the context is estimated as far as the checks
     /// of the wanted views need it.
-    fn predict_wanted(
+    fn predict_views(
         &mut self,
         views: &ChunkViews,
         wanted: Range<usize>,

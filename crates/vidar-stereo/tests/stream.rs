@@ -57,7 +57,7 @@ fn counted(model: &mut StereoModel, chunk: &ChunkViews, wanted: Range<usize>) ->
         asked.fetch_add(1, Ordering::Relaxed);
         false
     };
-    let prediction = model.predict_wanted(chunk, wanted, &cancel).expect("has parallax");
+    let prediction = model.predict_views(chunk, wanted, &cancel).expect("has parallax");
     (prediction.views, asked.into_inner())
 }
 
@@ -90,9 +90,9 @@ fn views_that_nobody_asked_for_change_nothing_but_through_the_matching() {
     // The same call twice, and the whole chunk in between: a model keeps nothing.
     let all = views(&boxed(), &flight(6), |_| (1.0, 0.0), 2.0);
     let mut used = model();
-    let first = used.predict_wanted(&all, 2..3, &|| false).expect("has parallax");
+    let first = used.predict_views(&all, 2..3, &|| false).expect("has parallax");
     used.predict(&all).expect("has parallax");
-    let again = used.predict_wanted(&all, 2..3, &|| false).expect("has parallax");
+    let again = used.predict_views(&all, 2..3, &|| false).expect("has parallax");
     assert!(bits(&first.views) == bits(&again.views));
 }
 
@@ -102,14 +102,14 @@ fn wanted_views_without_parallax_are_left_out_and_cancelling_is_heard() {
         .map(|i| Se3::new(So3::exp(&Vector3::new(0.0, 0.05 * i as f64, 0.0)), Vector3::zeros()))
         .collect();
     let chunk = views(&WALL, &turns, |_| (1.0, 0.0), 0.0);
-    let prediction = model().predict_wanted(&chunk, 1..3, &|| false).expect("nothing is no error here");
+    let prediction = model().predict_views(&chunk, 1..3, &|| false).expect("nothing is no error here");
     assert!(prediction.views.is_empty());
     let chunk = views(&WALL, &flight(4), |_| (1.0, 0.0), 0.0);
-    assert!(matches!(model().predict_wanted(&chunk, 1..3, &|| true), Err(ModelError::Cancelled)));
+    assert!(matches!(model().predict_views(&chunk, 1..3, &|| true), Err(ModelError::Cancelled)));
     // Heard as well in the middle of the work.
     let asked = AtomicUsize::new(0);
     let late = || asked.fetch_add(1, Ordering::Relaxed) > 5;
-    assert!(matches!(model().predict_wanted(&chunk, 0..4, &late), Err(ModelError::Cancelled)));
+    assert!(matches!(model().predict_views(&chunk, 0..4, &late), Err(ModelError::Cancelled)));
 }
 
 /// Share of pixels within 2 % of the truth.
@@ -137,7 +137,7 @@ fn poses_that_jitter_are_straightened_by_the_images() {
     let taken_as_given = StereoConfig { pose_spread_deg: 0.0, ..StereoConfig::default() };
     let score = |config: StereoConfig| {
         let mut model = StereoModel::new(config).expect("valid");
-        let found = model.predict_wanted(&chunk, 4..5, &|| false).expect("has parallax");
+        let found = model.predict_views(&chunk, 4..5, &|| false).expect("has parallax");
         assert_eq!(found.views[0].frame_id, FrameId(4));
         right(&boxed(), &true_poses[4], &found.views[0])
     };

@@ -10,7 +10,7 @@ use super::{CameraError, InvalidExample, ParametricCamera, Pinhole, Pixel, finit
 use nalgebra::{Matrix2x3, RowVector3, SMatrix, Vector2, Vector3};
 use std::f64::consts::PI;
 
-/// A direction as this model sees it.
+/// Intermediate values of a projection.
 struct Direction {
     r: f64,
     norm2: f64,
@@ -46,8 +46,8 @@ impl Equidistant {
         if let Some(first) = (1..=4096).find(|&step| !grows(at(step))) {
             let (mut low, mut high) = (at(first - 1), at(first));
             for _ in 0..50 {
-                let middle = 0.5 * (low + high);
-                if grows(middle) { low = middle } else { high = middle }
+                let mid = 0.5 * (low + high);
+                if grows(mid) { low = mid } else { high = mid }
             }
             camera.max_theta = low;
         }
@@ -110,7 +110,7 @@ impl Equidistant {
         Some((pixel, jacobian))
     }
 
-    /// See [`super::CameraModel::unproject`]. Newton's method on θ with bisection as a guard.
+    /// See [`super::CameraModel::unproject`]. Newton's method on θ safeguarded by bisection.
     pub fn unproject(&self, pixel: &Pixel) -> Option<Vector3<f64>> {
         let k = &self.pinhole;
         let m = Vector2::new((pixel.x - k.cx) / k.fx, (pixel.y - k.cy) / k.fy);

@@ -7,7 +7,7 @@ use super::parametric::invalid_intrinsics;
 use super::{CameraError, InvalidExample, ParametricCamera, Pinhole, Pixel, finite};
 use nalgebra::{Matrix2x3, RowVector3, SMatrix, Vector2, Vector3};
 
-/// What a projection needs to know of a point.
+/// Intermediate values of a projection.
 struct Radius {
     r: f64,
     /// 2·tan(ω/2).

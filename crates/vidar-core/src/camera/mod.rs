@@ -22,7 +22,7 @@ use thiserror::Error;
 /// A pixel position, sub-pixel, `x` right and `y` down.
 pub type Pixel = Vector2<f64>;
 
-/// Why numbers are not a camera.
+/// Why parameters are not a valid camera.
 #[derive(Clone, Debug, PartialEq, Error)]
 #[non_exhaustive]
 pub enum CameraError {
@@ -31,7 +31,7 @@ pub enum CameraError {
     BadParameter {
         /// Which parameter.
         parameter: &'static str,
-        /// What it must be.
+        /// Its domain.
         expected: &'static str,
         /// The value found.
         found: f64,
@@ -54,26 +54,26 @@ pub enum CameraError {
         /// Parameters given.
         found: usize,
     },
-    /// No distortion-free view of the camera fits what it sees.
+    /// No distortion-free view fits inside the camera's field of view.
     #[error(
         "no distortion-free view of {width}x{height} fits this camera (tried focal lengths up to {max_focal_px:.0} px)"
     )]
     NoUndistortedView {
-        /// Columns of the view wanted.
+        /// Columns of the requested view.
         width: usize,
-        /// Rows of the view wanted.
+        /// Rows of the requested view.
         height: usize,
         /// Longest focal length tried.
         max_focal_px: f64,
     },
 }
 
-/// A pixel whose coordinates are numbers; what overflowed is nowhere.
+/// The pixel, or `None` when a coordinate overflowed.
 fn finite(pixel: Pixel) -> Option<Pixel> {
     (pixel.x.is_finite() && pixel.y.is_finite()).then_some(pixel)
 }
 
-/// Any camera that VIDAR knows.
+/// Any supported camera model.
 #[derive(Clone, Debug, PartialEq)]
 pub enum CameraModel {
     /// No distortion.
@@ -167,7 +167,7 @@ impl CameraModel {
         }
     }
 
-    /// The examples of every model, as real data sets use them.
+    /// The examples of every model, from real data sets.
     pub fn examples() -> Vec<Self> {
         let mut all: Vec<Self> = Pinhole::examples().into_iter().map(Self::Pinhole).collect();
         all.extend(RadTan::examples().into_iter().map(Self::RadTan));

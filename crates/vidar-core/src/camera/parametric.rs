@@ -1,4 +1,4 @@
-//! What every camera model tells about its own parameters: names, order, derivatives, good and bad examples.
+//! The parameters of a camera model: names, order, derivatives, valid and invalid examples for tests.
 
 use super::{CameraError, Pixel};
 use nalgebra::{SMatrix, Vector3};
@@ -24,14 +24,14 @@ pub trait ParametricCamera<const N: usize>: Sized + Copy {
         point_in_camera: &Vector3<f64>,
     ) -> Option<(Pixel, SMatrix<f64, 2, N>)>;
 
-    /// Cameras of this model as real data sets use them.
+    /// Cameras of this model from real data sets.
     fn examples() -> Vec<Self>;
 
-    /// Parameters that are not a camera, each with the error it must give.
+    /// Invalid parameters, each with the error it must give.
     fn invalid_examples() -> Vec<InvalidExample<N>>;
 }
 
-/// Arguments of [`ParametricCamera::from_parameters`] that must be refused.
+/// Arguments of [`ParametricCamera::from_parameters`] that must be rejected.
 #[derive(Clone, Debug, PartialEq)]
 pub struct InvalidExample<const N: usize> {
     /// The parameters.
@@ -45,7 +45,7 @@ pub struct InvalidExample<const N: usize> {
 }
 
 impl<const N: usize> InvalidExample<N> {
-    /// `good` with the parameter at `index` replaced by `found`, which must be refused as not `expected`.
+    /// `good` with the parameter at `index` replaced by `found`, which must be rejected as not `expected`.
     pub(super) fn of_parameter(
         good: [f64; N],
         index: usize,
@@ -60,7 +60,7 @@ impl<const N: usize> InvalidExample<N> {
     }
 }
 
-/// The bad focal lengths, principal points and sizes that every model must refuse.
+/// The invalid focal lengths, principal points and sizes that every model must reject.
 pub(super) fn invalid_intrinsics<const N: usize>(good: [f64; N]) -> Vec<InvalidExample<N>> {
     let names = ["fx", "fy", "cx", "cy"];
     let mut examples = Vec::new();

@@ -232,8 +232,8 @@ fn one_to_one_limit([k1, k2, p1, p2]: [f64; 4], k3: f64) -> f64 {
         let mut high = 1.02 * low;
         if !holds(high) {
             for _ in 0..60 {
-                let middle = 0.5 * (low + high);
-                if holds(middle) { low = middle } else { high = middle }
+                let mid = 0.5 * (low + high);
+                if holds(mid) { low = mid } else { high = mid }
             }
             return low * low;
         }

@@ -16,15 +16,15 @@ pub(crate) use so3::{hat, left_jacobian as so3_left_jacobian, trig_quotients};
 
 use nalgebra::{SMatrix, SVector, Vector3};
 
-/// What VIDAR asks of a group of transforms; `DOF` is the dimension of its tangent space.
+/// A Lie group of transforms; `DOF` is the dimension of its tangent space.
 pub trait LieGroup<const DOF: usize>: Copy + std::fmt::Debug {
-    /// The transform that changes nothing.
+    /// The identity.
     fn identity() -> Self;
 
-    /// The transform reached from the identity along `tangent` in unit time.
+    /// The exponential map of `tangent`.
     fn exp(tangent: &SVector<f64, DOF>) -> Self;
 
-    /// The tangent whose exponential this is; rotation part in [0, π].
+    /// The logarithm: the tangent with `exp(tangent) = self`, of rotation angle in [0, π].
     fn log(&self) -> SVector<f64, DOF>;
 
     /// `b_from_a` of an `a_from_b`.

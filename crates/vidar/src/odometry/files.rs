@@ -79,7 +79,7 @@ fn keyframes_json(tracked: &Tracked) -> Value {
             "previous": previous,
             "gravity_in_world": k.gravity_in_world.as_slice(),
             "scale_std": finite(k.scale_std),
-            "health": k.health.word(), "landmarks": k.landmarks.len(),
+            "health": k.health.as_str(), "landmarks": k.landmarks.len(),
         })
     };
     let all: Vec<Value> = tracked.keyframes.iter().map(one).collect();
@@ -120,7 +120,7 @@ fn landmarks_csv(keyframes: &[OdometryKeyframe]) -> String {
 pub(super) fn word(output: &OdometryOutput) -> &'static str {
     match &output.status {
         Status::Waiting(_) => "waiting",
-        Status::Tracking(tracking) => tracking.health.word(),
+        Status::Tracking(tracking) => tracking.health.as_str(),
         Status::Lost(_) => "lost",
     }
 }

@@ -111,7 +111,7 @@ impl Source {
         wanted: std::ops::Range<usize>,
         cancel: &(dyn Fn() -> bool + Sync),
     ) -> Result<GeometryPrediction, ModelError> {
-        self.model().predict_wanted(views, wanted, cancel)
+        self.model().predict_views(views, wanted, cancel)
     }
 
     /// Channels of the tokens that a network can tell places by.
