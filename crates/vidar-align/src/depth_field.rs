@@ -70,7 +70,7 @@ pub struct FieldFit {
     /// Whether the grid improved held-out landmarks and was kept.
     pub keeps_grid: bool,
     /// How much wider than a good network's the prior had to be: 1, 4 or 16.
-    pub looseness: f64,
+    pub prior_scale: f64,
     /// Middle error of held-out landmarks: uncorrected, with the offset, with the grid.
     pub held_out: [f64; 3],
 }
@@ -88,7 +88,7 @@ const ROUNDS: usize = 5;
 /// The grid must lower the held-out error by this share to be kept, and a looser prior too.
 const IMPROVEMENT: f64 = 0.03;
 /// How much wider than usual the prior may be.
-const LOOSENESS: [f64; 3] = [1.0, 4.0, 16.0];
+const PRIOR_SCALES: [f64; 3] = [1.0, 4.0, 16.0];
 
 /// Fits a view's field to landmarks. `log_scale` is the chunk's; ratios are this view's. `None` below `min_landmarks`
 /// (fewer than 15 fix no field) or when that is 0.
@@ -109,14 +109,15 @@ pub fn fit_depth_field(
             Row { half, ..Row::new(&Evidence::of_landmark(r, log_scale), size) }
         })
         .collect();
-    let best = LOOSENESS.map(|looseness| held_out(&rows, looseness)).into_iter().reduce(|best, looser| {
-        let is_better = looser.error() < (1.0 - IMPROVEMENT) * best.error();
-        if is_better { looser } else { best }
-    })?;
+    let best =
+        PRIOR_SCALES.map(|prior_scale| held_out(&rows, prior_scale)).into_iter().reduce(|best, looser| {
+            let is_better = looser.error() < (1.0 - IMPROVEMENT) * best.error();
+            if is_better { looser } else { best }
+        })?;
     let all: Vec<&Row> = rows.iter().collect();
-    let found = solve(&all, if best.keeps_grid { UNKNOWNS } else { 1 }, best.looseness);
-    let (keeps_grid, looseness) = (best.keeps_grid, best.looseness);
-    Some(FieldFit { field: field_of(&found), keeps_grid, looseness, held_out: best.errors })
+    let found = solve(&all, if best.keeps_grid { UNKNOWNS } else { 1 }, best.prior_scale);
+    let (keeps_grid, prior_scale) = (best.keeps_grid, best.prior_scale);
+    Some(FieldFit { field: field_of(&found), keeps_grid, prior_scale, held_out: best.errors })
 }
 
 fn field_of(x: &Vector) -> DepthField {
@@ -142,15 +143,15 @@ impl Evidence {
     }
 }
 
-/// The field of evidence of all kinds, with a prior of this looseness.
-pub(crate) fn field_from(evidence: &[Evidence], looseness: f64, size: (usize, usize)) -> DepthField {
+/// The field of evidence of all kinds, with a prior of this prior_scale.
+pub(crate) fn field_from(evidence: &[Evidence], prior_scale: f64, size: (usize, usize)) -> DepthField {
     let rows: Vec<Row> = evidence.iter().map(|e| Row::new(e, size)).collect();
-    field_of(&solve(&rows.iter().collect::<Vec<_>>(), UNKNOWNS, looseness))
+    field_of(&solve(&rows.iter().collect::<Vec<_>>(), UNKNOWNS, prior_scale))
 }
 
-/// What a prior of some looseness is worth.
+/// What a prior of some prior_scale is worth.
 struct HeldOut {
-    looseness: f64,
+    prior_scale: f64,
     /// Middle error: uncorrected, with the offset, with the grid.
     errors: [f64; 3],
     keeps_grid: bool,
@@ -164,12 +165,12 @@ impl HeldOut {
 }
 
 /// Fits each half of the landmarks and asks the other.
-fn held_out(rows: &[Row], looseness: f64) -> HeldOut {
+fn held_out(rows: &[Row], prior_scale: f64) -> HeldOut {
     let mut errors: [Vec<f64>; 3] = Default::default();
     let mut improves_both = true;
     for half in 0..2 {
         let (fitted, held): (Vec<&Row>, Vec<&Row>) = rows.iter().partition(|r| r.half == half);
-        let (offset, grid) = (solve(&fitted, 1, looseness), solve(&fitted, UNKNOWNS, looseness));
+        let (offset, grid) = (solve(&fitted, 1, prior_scale), solve(&fitted, UNKNOWNS, prior_scale));
         let by = |x: &Vector| held.iter().map(|r| r.error(x).abs()).collect::<Vec<f64>>();
         let (with_offset, with_grid) = (by(&offset), by(&grid));
         improves_both &= middle(with_grid.clone()) < middle(with_offset.clone());
@@ -179,7 +180,7 @@ fn held_out(rows: &[Row], looseness: f64) -> HeldOut {
     }
     let errors = errors.map(middle);
     let keeps_grid = improves_both && errors[2] < (1.0 - IMPROVEMENT) * errors[1];
-    HeldOut { looseness, errors, keeps_grid }
+    HeldOut { prior_scale, errors, keeps_grid }
 }
 
 struct Row {
@@ -203,10 +204,10 @@ impl Row {
 }
 
 /// The first `unknowns` of offset and grid, the others zero.
-fn solve(rows: &[&Row], unknowns: usize, looseness: f64) -> Vector {
+fn solve(rows: &[&Row], unknowns: usize, prior_scale: f64) -> Vector {
     let mut x = Vector::zeros();
     for _ in 0..ROUNDS {
-        let (mut information, mut right) = prior(looseness);
+        let (mut information, mut right) = prior(prior_scale);
         // What most landmarks are off by is no outlier, only more noise than was told.
         let wider = (1.4826 * middle(rows.iter().map(|r| (r.error(&x) / r.std).abs()).collect())).max(1.0);
         for row in rows {
@@ -240,8 +241,8 @@ fn solve(rows: &[&Row], unknowns: usize, looseness: f64) -> Vector {
     x
 }
 
-fn prior(looseness: f64) -> (Matrix, Vector) {
-    let told = |std: f64| (looseness * std).powi(-2);
+fn prior(prior_scale: f64) -> (Matrix, Vector) {
+    let told = |std: f64| (prior_scale * std).powi(-2);
     let mut information = Matrix::identity() * told(NODE_STD);
     information[(0, 0)] = told(OFFSET_STD);
     let slope = told(SLOPE_STD);
@@ -315,7 +316,7 @@ mod tests {
     fn a_small_network_gets_a_looser_prior_and_a_good_one_does_not() {
         let bent = |x: f64, y: f64| 0.25 * (5.0 * x / 503.0).sin() - 0.3 * (y / 321.0 - 0.5) - 0.2;
         let fit = fit_depth_field(&ratios(80, 4, 0.06, bent), 0.3, SIZE, 15).unwrap();
-        assert!(fit.keeps_grid && fit.looseness > 1.0, "{fit:?}");
+        assert!(fit.keeps_grid && fit.prior_scale > 1.0, "{fit:?}");
         let off = |field: &DepthField| {
             let places = (0..60).map(|k| (40.0 + 7.0 * f64::from(k), 20.0 + 4.5 * f64::from((k * 17) % 60)));
             let squares = places.map(|(x, y)| (field.log_factor(x, y, SIZE.0, SIZE.1) - bent(x, y)).powi(2));
@@ -325,7 +326,7 @@ mod tests {
         assert!(corrected < 0.3 * uncorrected, "{corrected} of {uncorrected}");
         let slight = |x: f64, _: f64| 0.03 * (x / 503.0 - 0.5);
         let loose = (0..20).filter(|seed| {
-            fit_depth_field(&ratios(80, *seed, 0.02, slight), 0.3, SIZE, 15).unwrap().looseness > 1.0
+            fit_depth_field(&ratios(80, *seed, 0.02, slight), 0.3, SIZE, 15).unwrap().prior_scale > 1.0
         });
         assert!(loose.count() <= 3);
     }

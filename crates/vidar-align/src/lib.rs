@@ -1,27 +1,31 @@
-//! Placement of predicted chunks in the metric world.
+//! Alignment of predicted chunks in one metric world.
 //!
-//! A geometry model predicts in the frame and units of its chunk; the anchor (odometry, an external trajectory or
-//! ground truth) knows the same cameras in metres. [`place_chunk`] finds the similarity between the two, and
-//! [`aligned_views`] carries depth and poses over. This is the paper's *decoupled hybrid* for one chunk
-//! (section III-D): `S_vio = Umeyama({c_i^pred}, {c_i^VIO})`, `M ← S_vio(M)`, with its guard that a rank-deficient
-//! fit changes nothing (section III-F).
-
+//! A geometry model predicts depth and camera poses in the frame and unit of its chunk. Odometry, an external trajectory or
+//! ground truth gives the same cameras in metres. [`Aligner`] takes both, chunk by chunk, and returns a [`Placement`]: one
+//! similarity `world_from_chunk` per chunk and one pose per keyframe. How the two sources are combined is chosen by
+//! [`CouplingMode`]: the paper's pose-free, pose-conditioned and hybrid couplings (sections III-D to III-F), and the
+//! coupled graph ([`coupled`]) that is VIDAR's own.
 //!
-//! [`aligner::Aligner`] does the same for a whole run, chunk by chunk, in all modes: the reference's chain, the paper's
-//! couplings, and the coupled graph that is VIDAR's own.
+//! | Module | Content |
+//! |---|---|
+//! | [`aligner`] | The push machine, its configuration, observations and reports. |
+//! | [`coupled`] | Factors and solver of the coupled graph. |
+//! | [`overlap`] | Robust similarity between two predictions of the same frames. |
+//! | [`landmark_scale`], [`depth_field`] | Scale and smooth depth correction from landmarks. |
+//! | [`place_recognition`] | Image descriptors and their index. |
+//! | [`streaming`] | DA3-Streaming number for number: what the golden tests run. |
 
 pub mod aligner;
 pub mod coupled;
 pub mod depth_field;
+mod error;
 pub mod landmark_scale;
 pub mod overlap;
-mod place;
 pub mod place_recognition;
 pub mod streaming;
 
 pub use aligner::{
-    Aligner, AlignerConfig, ChunkObservation, CouplingMode, FrameObservation, MetricAnchor, Placement,
+    Aligner, AlignerConfig, ChunkObservation, ChunkStatus, CouplingMode, FrameObservation, Placement,
+    PosePrior, color_at_size,
 };
-pub use place::{
-    AlignConfig, AlignError, Anchor, ChunkAlignment, Verdict, aligned_views, color_at_size, place_chunk,
-};
+pub use error::AlignError;

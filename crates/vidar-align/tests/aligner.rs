@@ -5,9 +5,9 @@
 mod flat;
 
 use flat::*;
-use vidar_align::aligner::Guard;
+use vidar_align::aligner::RejectionReason;
 use vidar_align::streaming::chunk_ranges;
-use vidar_align::{Aligner, AlignerConfig, CouplingMode, Placement, Verdict};
+use vidar_align::{Aligner, AlignerConfig, ChunkStatus, CouplingMode, Placement};
 use vidar_core::model::ChunkFrame;
 use vidar_core::{GeometryPrediction, Image, LieGroup, RelativeDepth, Se3, umeyama_sim3};
 
@@ -35,9 +35,9 @@ fn an_exact_model_gives_the_exact_world_in_every_metric_mode() {
         assert_eq!(placement.views.len(), truth.len(), "{mode}");
         let error = absolute_error(&placement, &truth);
         assert!(error < 1e-4, "{mode}: {error}");
-        assert!(placement.chunks.iter().all(|c| c.verdict.is_usable()));
+        assert!(placement.chunks.iter().all(|c| c.status.is_usable()));
         // The last chunk is short: its motion alone does not tell its scale to 3 %.
-        let unexpected = placement.guards.iter().find(|(g, _)| *g != Guard::ScaleUnobservable);
+        let unexpected = placement.rejections.iter().find(|(g, _)| *g != RejectionReason::ScaleUnobservable);
         assert_eq!(unexpected, None, "{mode}");
         // A frame of an overlap belongs to the later chunk.
         let owners: Vec<u32> = placement.views.iter().map(|v| v.owner.0).collect();
@@ -72,7 +72,9 @@ fn anchors_change_nothing_where_the_mode_does_not_use_them() {
     let with = run(CouplingMode::PoseFree, &truth, Some(&truth), REAL, 3);
     let without = run(CouplingMode::PoseFree, &truth, None, REAL, 3);
     assert_eq!(with.views, without.views);
-    assert!(with.guards.of(Guard::NoOverlap) == 0 && with.chunks[0].verdict == Verdict::Chained);
+    assert!(
+        with.rejections.of(RejectionReason::NoOverlap) == 0 && with.chunks[0].status == ChunkStatus::Chained
+    );
 }
 
 #[test]
@@ -116,8 +118,8 @@ fn landmarks_straighten_a_leaning_depth_and_tell_the_scale() {
     }
     let placement = machine.finish();
     assert!(placement.views.iter().all(|v| v.field.is_some()));
-    let kept =
-        placement.views.len() - placement.guards.of(Guard::DepthFieldRefused).min(placement.views.len());
+    let kept = placement.views.len()
+        - placement.rejections.of(RejectionReason::DepthFieldRejected).min(placement.views.len());
     assert!(kept * 2 > placement.views.len(), "{kept} of {}", placement.views.len());
     let (mut before, mut after, mut count) = (0.0, 0.0, 0.0);
     for prediction in predictions {
@@ -196,8 +198,12 @@ fn rough_run_sharing(step: usize, shared_std: f64) -> (f64, Placement) {
 #[test]
 fn a_rough_depth_in_the_anchors_world_is_brought_to_landmarks_and_its_poses_stay() {
     let (error, placement) = rough_run(1);
-    assert_eq!(placement.guards.of(Guard::DepthRescaled), placement.chunks.len());
-    assert_eq!(placement.guards.of(Guard::OdometryDistrusted) + placement.guards.of(Guard::GarbageChunk), 0);
+    assert_eq!(placement.rejections.of(RejectionReason::DepthRescaled), placement.chunks.len());
+    assert_eq!(
+        placement.rejections.of(RejectionReason::OdometryDownweighted)
+            + placement.rejections.of(RejectionReason::InconsistentChunk),
+        0
+    );
     assert_eq!(placement.views.len(), 36);
     let moved = absolute_error(&placement, &laps(36, 0.7));
     assert!(moved < 0.02, "{moved}");
@@ -226,7 +232,7 @@ fn with_given_poses(mode: CouplingMode, factor: f32) -> Placement {
 #[test]
 fn chunks_in_the_anchors_world_keep_their_scale_whatever_their_overlap_says() {
     let placement = with_given_poses(CouplingMode::PoseConditioned, 0.67);
-    assert!(placement.guards.of(Guard::ScaleOutOfRange) >= 2, "{:?}", placement.guards);
+    assert!(placement.rejections.of(RejectionReason::ScaleOutOfRange) >= 2, "{:?}", placement.rejections);
     for chunk in &placement.chunks {
         assert!((chunk.world_from_chunk.scale - 1.0).abs() < 1e-12, "{}", chunk.world_from_chunk.scale);
     }
@@ -311,7 +317,7 @@ fn a_metric_scale_that_jumps_between_neighbours_is_clamped_and_counted() {
         machine.push(observe(prediction, Some(&odometry), none)).unwrap();
     }
     let placement = machine.finish();
-    assert!(placement.guards.of(Guard::ScaleOutOfRange) >= 1, "{:?}", placement.guards);
+    assert!(placement.rejections.of(RejectionReason::ScaleOutOfRange) >= 1, "{:?}", placement.rejections);
     let jump = placement.chunks[2].world_from_chunk.scale / gauges[2].scale;
     assert!((jump - 1.0).abs() < 0.2, "{jump}");
 }

@@ -6,9 +6,9 @@ mod flat;
 
 use flat::*;
 use nalgebra::Vector3;
-use vidar_align::aligner::Guard;
+use vidar_align::aligner::RejectionReason;
 use vidar_align::streaming::chunk_ranges;
-use vidar_align::{Aligner, AlignerConfig, ChunkObservation, CouplingMode, Placement, Verdict};
+use vidar_align::{Aligner, AlignerConfig, ChunkObservation, ChunkStatus, CouplingMode, Placement};
 use vidar_core::{ChunkId, GeometryPrediction, Image, LieGroup, RelativeDepth, Se3, Sim3, So3};
 
 fn machine(mode: CouplingMode) -> Aligner {
@@ -55,9 +55,9 @@ fn numbers_that_are_none_leave_the_rest_as_it_was() {
                 p.views[6].chunk_from_camera.translation.z = f64::NAN;
             }
         });
-        assert_eq!(placement.guards.of(Guard::ViewNotFinite), 3, "{mode}");
+        assert_eq!(placement.rejections.of(RejectionReason::ViewNotFinite), 3, "{mode}");
         assert!(all_finite(&placement), "{mode}");
-        if mode.uses_anchors() {
+        if mode.uses_pose_priors() {
             assert!(
                 absolute_error(&placement, &truth) < 0.06,
                 "{mode}: {}",
@@ -87,12 +87,12 @@ fn a_garbage_chunk_is_left_out_and_the_others_stand() {
                 garbage(p, noise);
             }
         });
-        assert!(!placement.chunks[3].verdict.is_usable(), "{mode}: {:?}", placement.chunks[3]);
+        assert!(!placement.chunks[3].status.is_usable(), "{mode}: {:?}", placement.chunks[3]);
         assert!(placement.views.iter().all(|v| v.owner != ChunkId(3)), "{mode}");
         let error = absolute_error(&placement, &truth);
         assert!(error < 0.06, "{mode}: {error}");
         if mode == CouplingMode::Coupled {
-            assert_eq!(placement.guards.of(Guard::GarbageChunk), 1);
+            assert_eq!(placement.rejections.of(RejectionReason::InconsistentChunk), 1);
             // Its frames still have poses: odometry went on.
             assert!(placement.keyframes.iter().any(|k| k.frame_id.0 == 30));
         }
@@ -103,8 +103,8 @@ fn a_garbage_chunk_is_left_out_and_the_others_stand() {
             garbage(p, noise);
         }
     });
-    assert_eq!(placement.chunks[3].verdict, Verdict::Garbage);
-    assert!(placement.chunks[4..].iter().all(|c| c.verdict == Verdict::Unplaced));
+    assert_eq!(placement.chunks[3].status, ChunkStatus::Rejected);
+    assert!(placement.chunks[4..].iter().all(|c| c.status == ChunkStatus::Unplaced));
     assert!(all_finite(&placement) && placement.views.iter().all(|v| v.owner.0 < 3));
 }
 
@@ -112,13 +112,13 @@ fn a_garbage_chunk_is_left_out_and_the_others_stand() {
 fn chunks_that_share_nothing_are_placed_by_their_anchors_or_not_at_all() {
     let truth = laps(48, 1.0);
     let coupled = run(CouplingMode::Coupled, &truth, &truth, 0, |_, _, _| {});
-    assert_eq!(coupled.guards.of(Guard::NoOverlap), 3);
+    assert_eq!(coupled.rejections.of(RejectionReason::NoOverlap), 3);
     assert_eq!(coupled.views.len(), 48);
     assert!(absolute_error(&coupled, &truth) < 0.05, "{}", absolute_error(&coupled, &truth));
     let hybrid = run(CouplingMode::Hybrid, &truth, &truth, 0, |_, _, _| {});
     assert!(hybrid.is_metric && absolute_error(&hybrid, &truth) < 0.1);
     let free = run(CouplingMode::PoseFree, &truth, &truth, 0, |_, _, _| {});
-    assert_eq!(free.chunks.iter().filter(|c| c.verdict == Verdict::Unplaced).count(), 3);
+    assert_eq!(free.chunks.iter().filter(|c| c.status == ChunkStatus::Unplaced).count(), 3);
     assert_eq!(free.views.len(), 12);
 }
 
@@ -143,7 +143,10 @@ fn nothing_one_frame_and_one_chunk_are_answered() {
         let mut prediction = predict(&truth, 0..3, 0, REAL, &mut noise);
         prediction.views.clear();
         let report = empty.push(ChunkObservation { prediction, frames: Vec::new() }).unwrap();
-        assert_eq!((report.verdict, report.guards), (Verdict::Garbage, vec![Guard::GarbageChunk]));
+        assert_eq!(
+            (report.status, report.rejections),
+            (ChunkStatus::Rejected, vec![RejectionReason::InconsistentChunk])
+        );
         assert!(empty.finish().views.is_empty());
     }
 }
@@ -162,7 +165,7 @@ fn a_straight_line_is_identity_in_the_papers_modes_and_a_map_in_the_coupled_one(
         machine.finish()
     };
     let conditioned = run(CouplingMode::PoseConditioned);
-    assert!(conditioned.guards.of(Guard::RankDeficient) >= 1 && conditioned.views.is_empty());
+    assert!(conditioned.rejections.of(RejectionReason::RankDeficient) >= 1 && conditioned.views.is_empty());
     assert!(conditioned.chunks.iter().all(|c| c.world_from_chunk == Sim3::IDENTITY));
     let coupled = run(CouplingMode::Coupled);
     assert_eq!(coupled.views.len(), 36);
@@ -198,7 +201,7 @@ fn standing_still_says_nothing_of_scale_unless_landmarks_do() {
         (machine.finish(), gauges)
     };
     let (blind, _) = run(false);
-    assert!(all_finite(&blind) && blind.guards.of(Guard::ScaleUnobservable) >= 1);
+    assert!(all_finite(&blind) && blind.rejections.of(RejectionReason::ScaleUnobservable) >= 1);
     assert!(blind.chunks.iter().all(|c| c.log_scale_std > 0.03), "{:?}", blind.chunks);
     assert!(absolute_error(&blind, &truth) < 0.02);
     let (seen, gauges) = run(true);
@@ -252,7 +255,11 @@ fn an_odometry_that_flies_away_half_way_does_not_take_the_map_along() {
         .collect();
     diverged = broken;
     let placement = run(CouplingMode::Coupled, &truth, &diverged, 4, |_, _, _| {});
-    assert!(placement.guards.of(Guard::OdometryDistrusted) >= 1, "{:?}", placement.guards);
+    assert!(
+        placement.rejections.of(RejectionReason::OdometryDownweighted) >= 1,
+        "{:?}",
+        placement.rejections
+    );
     let error = absolute_error(&placement, &truth);
     let odometry_error = {
         let squares: f64 =
@@ -260,7 +267,11 @@ fn an_odometry_that_flies_away_half_way_does_not_take_the_map_along() {
         (squares / 60.0).sqrt()
     };
     assert!(odometry_error > 1.0);
-    assert!(error < 0.25 * odometry_error, "{error} m against {odometry_error} m; {:?}", placement.guards);
+    assert!(
+        error < 0.25 * odometry_error,
+        "{error} m against {odometry_error} m; {:?}",
+        placement.rejections
+    );
     let early: f64 = placement.views[..24]
         .iter()
         .map(|v| (v.world_from_camera.translation - truth[v.frame_id.index()].translation).norm())

@@ -8,7 +8,7 @@
 mod flat;
 
 use flat::*;
-use vidar_align::aligner::LoopRefusal;
+use vidar_align::aligner::LoopRejection;
 use vidar_align::streaming::chunk_ranges;
 use vidar_align::{Aligner, AlignerConfig, CouplingMode, Placement};
 use vidar_core::{GeometryPrediction, LieGroup, Se3, Sim3, So3, umeyama_se3};
@@ -103,10 +103,10 @@ fn the_coupled_world_is_at_least_as_good_as_the_better_of_the_papers_two_in_ever
 fn false_loops_are_refused_and_true_ones_kept() {
     let clean = run(CouplingMode::Coupled, 1, 1.0, 0.0);
     let loops = &clean.placement.loops;
-    let kept = loops.iter().filter(|l| l.refusal.is_none()).count();
+    let kept = loops.iter().filter(|l| l.rejection.is_none()).count();
     assert!(loops.len() >= 6 && kept * 10 >= loops.len() * 8, "{kept} of {}: {loops:?}", loops.len());
     let misled = run(CouplingMode::Coupled, 1, 1.0, 0.3);
-    assert!(misled.placement.loops.iter().any(|l| l.refusal == Some(LoopRefusal::Implausible)));
+    assert!(misled.placement.loops.iter().any(|l| l.rejection == Some(LoopRejection::Chi2TooLarge)));
     assert!(misled.ate < 1.3 * clean.ate + 0.005, "{} against {}", misled.ate, clean.ate);
 }
 
@@ -130,7 +130,7 @@ fn a_loop_can_be_measured_without_asking_the_model_again() {
     let mut accepted = 0;
     for candidate in &candidates {
         let report = machine.push_loop(candidate, None).unwrap();
-        if report.refusal.is_some() {
+        if report.rejection.is_some() {
             continue;
         }
         accepted += 1;

@@ -12,7 +12,7 @@ use nalgebra::{Matrix6, SVector, UnitVector3, Vector3, Vector6};
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::{RngCore, SeedableRng};
 use vidar_align::coupled::{
-    Attachment, CoupledConfig, CoupledState, Factor, Kernel, Mode, RelativeChunk, inflation, solve,
+    Attachment, CoupledConfig, CoupledState, Factor, InformationFlow, Kernel, RelativeChunk, inflation, solve,
 };
 use vidar_align::streaming::{
     ChunkRange, LoopConstraint, PoseGraphConfig, accumulate, chunk_ranges, optimise_chain,
@@ -271,7 +271,7 @@ fn coupled(world: &World) -> (f64, f64) {
         })
         .collect();
     let start = CoupledState { keyframes: world.odometry.clone(), chunks };
-    let mut factors = vec![Factor::Anchor {
+    let mut factors = vec![Factor::GaugePrior {
         i: 0,
         world_from_camera: world.odometry[0],
         position_std_m: 1e-3,
@@ -321,7 +321,7 @@ fn coupled(world: &World) -> (f64, f64) {
         factors.push(link(l.a, l.b, l.b_from_a, 0.6, 0.04, 0.015, Kernel::GemanMcClure { k: 4.0 }));
     }
     let solved = solve(&start, &factors, &CoupledConfig::default()).unwrap();
-    assert_eq!(solved.mode, Mode::Coupled, "{}", solved.odometry_chi2);
+    assert_eq!(solved.flow, InformationFlow::Coupled, "{}", solved.odometry_chi2);
     let gauges = &solved.state.chunks;
     assert!(gauges.iter().all(Sim3::is_finite));
     judge(world, &solved.state.keyframes, |frame| gauges[owner(world, frame)].scale)

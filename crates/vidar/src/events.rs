@@ -50,7 +50,7 @@ pub enum Event {
         /// RMS distance of camera centres to their anchors, m.
         center_rms_m: Option<f64>,
         /// The judgement.
-        verdict: vidar_align::Verdict,
+        status: vidar_align::ChunkStatus,
     },
     /// The map so far was written (`output.live_map`); the path is relative to the run folder.
     MapGrew {

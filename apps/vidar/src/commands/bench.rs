@@ -76,8 +76,8 @@ fn modes(args: &BenchArgs, layered: &Layered) -> Result<Vec<CouplingMode>, Error
 }
 
 fn mode(name: &str) -> Result<CouplingMode, Error> {
-    CouplingMode::ALL.into_iter().find(|m| m.word() == name).ok_or_else(|| {
-        let known: Vec<&str> = CouplingMode::ALL.iter().map(|m| m.word()).collect();
+    CouplingMode::ALL.into_iter().find(|m| m.name() == name).ok_or_else(|| {
+        let known: Vec<&str> = CouplingMode::ALL.iter().map(|m| m.name()).collect();
         usage(format!("--modes {name:?} is no coupling"), format!("couplings: {}", known.join(", ")))
     })
 }

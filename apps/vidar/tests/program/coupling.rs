@@ -308,8 +308,8 @@ fn a_revisit_is_found_judged_and_told() {
         let ran = run_on(&sequence, &out, &settings);
         assert!([0, 3].contains(&ran.code), "{}", ran.stderr);
         let loops = manifest(&out)["result"]["placement"]["loops"].as_array().unwrap().clone();
-        let believed = loops.iter().filter(|l| l["refused"].is_null()).count();
-        found.push((loops.len(), believed));
+        let accepted = loops.iter().filter(|l| l["rejection"].is_null()).count();
+        found.push((loops.len(), accepted));
     }
     assert!(found[0].1 > 0, "a loop chunk ties the two visits: {found:?}");
     assert_eq!(found[2], (0, 0), "nothing looks exactly alike: {found:?}");

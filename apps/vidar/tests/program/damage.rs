@@ -94,9 +94,9 @@ fn survives(name: &str, source: &str, acted: &[&str], counted_by: &[&str]) {
         assert!([0, 3].contains(&ran.code), "{name}, {mode}: {} {}", ran.code, ran.stderr);
         let result = &manifest(&folder)["result"];
         assert!(vertices(&folder) > 100, "{name}, {mode}");
-        let guards = result["placement"]["guards"].as_object().unwrap();
-        let counted = acted.iter().any(|g| guards.contains_key(*g));
-        assert!(counted || !counted_by.contains(&mode), "{name}, {mode}: {guards:?}");
+        let rejections = result["placement"]["rejections"].as_object().unwrap();
+        let counted = acted.iter().any(|g| rejections.contains_key(*g));
+        assert!(counted || !counted_by.contains(&mode), "{name}, {mode}: {rejections:?}");
     }
 }
 
@@ -117,8 +117,8 @@ fn numbers_that_are_none_are_left_out_and_counted_in_every_coupling() {
 }
 
 #[test]
-fn a_garbage_chunk_is_left_out_where_anything_contradicts_it() {
-    let source = damaged("garbage", |chunk, key, values| {
+fn an_inconsistent_chunk_is_left_out_where_anything_contradicts_it() {
+    let source = damaged("inconsistent", |chunk, key, values| {
         if chunk == 1 && key == "depth" {
             let n = values.len();
             values
@@ -136,8 +136,8 @@ fn a_garbage_chunk_is_left_out_where_anything_contradicts_it() {
         }
     });
     // `pose-conditioned` divides by one scale and has no neighbour to ask: it sees centres far from their anchors.
-    let acted = ["garbage-chunk", "no-overlap", "scale-out-of-range", "rank-deficient"];
-    survives("garbage", &source, &acted, &["pose-free", "hybrid", "coupled"]);
+    let acted = ["inconsistent-chunk", "no-overlap", "scale-out-of-range", "rank-deficient"];
+    survives("inconsistent", &source, &acted, &["pose-free", "hybrid", "coupled"]);
 }
 
 #[test]
@@ -210,7 +210,7 @@ fn poses_that_fly_away_half_way_are_counted_and_do_not_take_the_coupled_map_alon
         assert!([0, 3].contains(&ran.code), "{mode}: {}", ran.stderr);
         assert!(vertices(&folder) > 100);
         let placement = &manifest(&folder)["result"]["placement"];
-        let named = placement["guards"].as_object().is_some_and(|g| !g.is_empty());
+        let named = placement["rejections"].as_object().is_some_and(|g| !g.is_empty());
         let off = placement["drift"]["center_rms_m"].as_f64().is_none_or(|m| m > 0.02);
         assert!(mode != "coupled" || named || off, "{placement}");
     }

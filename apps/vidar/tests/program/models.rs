@@ -463,7 +463,7 @@ fn a_run_uses_a_network_with_and_without_poses_and_names_it_in_the_manifest() {
         .filter(|e: &Value| e["event"] == "chunk-aligned")
         .collect();
     assert!(!aligned.is_empty(), "{log}");
-    assert!(aligned.iter().all(|e| e["verdict"] != "prior-world"), "{aligned:?}");
+    assert!(aligned.iter().all(|e| e["status"] != "prior-world"), "{aligned:?}");
 }
 
 #[test]

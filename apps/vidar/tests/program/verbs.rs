@@ -192,7 +192,7 @@ fn progress_as_json_is_one_event_a_line_and_the_log_has_the_same_shape() {
             "stage-started" => &["schema", "event", "stage", "total"],
             "progress" => &["schema", "event", "stage", "done", "total"],
             "stage-finished" => &["schema", "event", "stage", "seconds"],
-            "chunk-aligned" => &["schema", "event", "chunk", "scale", "center_rms_m", "verdict"],
+            "chunk-aligned" => &["schema", "event", "chunk", "scale", "center_rms_m", "status"],
             "artifact-written" => &["schema", "event", "path", "bytes"],
             "warning" => &["schema", "event", "kind", "message", "place", "hint"],
             "finished" => &["schema", "event", "exit", "seconds"],

@@ -43,7 +43,7 @@ const OCCLUDED: f64 = 0.4;
 const SWEEPS: usize = 8;
 
 /// Changes the fields of a chunk's views so that they agree.
-pub(super) fn agree(views: &mut [Refined<'_>], looseness: f64) {
+pub(super) fn agree(views: &mut [Refined<'_>], prior_scale: f64) {
     for _ in 0..SWEEPS {
         for i in 0..views.len() {
             let mut evidence = views[i].landmarks.clone();
@@ -54,7 +54,7 @@ pub(super) fn agree(views: &mut [Refined<'_>], looseness: f64) {
                 evidence.extend(said.into_iter().map(|e| Evidence { share, ..e }));
             }
             let size = (views[i].view.intrinsics.width, views[i].view.intrinsics.height);
-            views[i].field = Some(field_from(&evidence, looseness, size));
+            views[i].field = Some(field_from(&evidence, prior_scale, size));
         }
     }
 }

@@ -1,6 +1,6 @@
 //! A chunk onto its anchors alone.
 
-use super::report::Guard;
+use super::report::RejectionReason;
 use nalgebra::{Matrix3, Vector3};
 use rand::seq::index::sample;
 use rand_chacha::ChaCha8Rng;
@@ -22,11 +22,11 @@ const TRIALS: usize = 10;
 /// for 10 views and more by consensus over ten halves. Its inverse is returned, `world_from_chunk`.
 ///
 /// # Errors
-/// [`Guard::RankDeficient`].
-pub(super) fn robust_umeyama(pairs: &[Pair], seed: u64) -> Result<Sim3, Guard> {
+/// [`RejectionReason::RankDeficient`].
+pub(super) fn robust_umeyama(pairs: &[Pair], seed: u64) -> Result<Sim3, RejectionReason> {
     let metric: Vec<Vector3<f64>> = pairs.iter().map(|p| p.world_from_camera.translation).collect();
     let predicted: Vec<Vector3<f64>> = pairs.iter().map(|p| p.chunk_from_camera.translation).collect();
-    let all = umeyama_sim3(&metric, &predicted).map_err(|_| Guard::RankDeficient)?;
+    let all = umeyama_sim3(&metric, &predicted).map_err(|_| RejectionReason::RankDeficient)?;
     if pairs.len() < CONSENSUS_FROM {
         return Ok(all.inverse());
     }

@@ -29,7 +29,7 @@ pub enum CouplingMode {
 
 impl CouplingMode {
     /// The word as it stands in files and on the command line.
-    pub fn word(self) -> &'static str {
+    pub fn name(self) -> &'static str {
         match self {
             Self::Da3Streaming => "da3-streaming",
             Self::PoseFree => "pose-free",
@@ -56,14 +56,14 @@ impl CouplingMode {
     }
 
     /// Whether metric anchors take part at all.
-    pub fn uses_anchors(self) -> bool {
+    pub fn uses_pose_priors(self) -> bool {
         !matches!(self, Self::Da3Streaming | Self::PoseFree)
     }
 }
 
 impl std::fmt::Display for CouplingMode {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.write_str(self.word())
+        f.write_str(self.name())
     }
 }
 

@@ -6,12 +6,13 @@
 //! neighbour. Where odometry was seen to contradict chunks that agree with each other, it is loosened.
 
 use super::loops::MeasuredLoop;
-use super::memory::{Chunk, Tie};
-use super::report::{GraphReport, Guard, LoopRefusal};
+use super::memory::{Chunk, OverlapConstraint};
+use super::report::{GraphReport, LoopRejection, RejectionReason};
 use super::world::{World, reports};
 use super::{Aligner, GraphWeights};
 use crate::coupled::{
-    Attachment, CoupledConfig, CoupledState, Factor, Kernel, Mode, RelativeChunk, Solution, inflation, solve,
+    Attachment, CoupledConfig, CoupledState, Factor, InformationFlow, Kernel, RelativeChunk, Solution,
+    inflation, solve,
 };
 use nalgebra::Matrix6;
 use std::collections::BTreeMap;
@@ -39,16 +40,16 @@ struct Index {
 
 /// The coupled world. Without a single usable anchor it is the pose-free one.
 pub(super) fn coupled(machine: &Aligner) -> World {
-    let anchored = machine.frames.iter().any(|f| machine.frames.anchor(f.frame_id).is_some());
+    let anchored = machine.frames.iter().any(|f| machine.frames.pose_prior(f.frame_id).is_some());
     let places = first_places(machine);
     if !anchored || places.iter().all(Option::is_none) {
         return super::world::pose_free(machine);
     }
-    let mut judged = machine.judged_loops();
+    let mut judged = machine.evaluated_loops();
     let (index, start) = unknowns(machine, &places);
     let mut built = Built::default();
     built.odometry(machine, &index);
-    built.has_loops = judged.iter().any(|l| l.report.refusal.is_none())
+    built.has_loops = judged.iter().any(|l| l.report.rejection.is_none())
         || machine.chunks.iter().any(|c| !c.revisits.is_empty());
     built.chunks(machine, &index, &start);
     built.loops(machine, &index, &judged);
@@ -58,14 +59,14 @@ pub(super) fn coupled(machine: &Aligner) -> World {
         ..CoupledConfig::default()
     };
     let mut world = World::of(machine, places, true);
-    world.guards.append(&mut built.guards);
+    world.rejections.append(&mut built.rejections);
     match solve(&start, &built.factors, &config) {
         Ok(solution) if is_sound(&solution) => {
             built.loop_factors.iter().filter(|(_, f)| solution.weights[*f] < LET_GO).for_each(|(l, _)| {
-                judged[*l].report.refusal = Some(LoopRefusal::LetGo);
+                judged[*l].report.rejection = Some(LoopRejection::GraphOutlier);
             });
-            if solution.mode == Mode::OneWay {
-                world.guards.push(Guard::OneWay);
+            if solution.flow == InformationFlow::OneWay {
+                world.rejections.push(RejectionReason::OneWay);
             }
             world.graph = Some(report(&solution));
             for (k, at) in index.chunks.iter().enumerate() {
@@ -75,7 +76,7 @@ pub(super) fn coupled(machine: &Aligner) -> World {
             world.keyframes.extend(poses);
         }
         _ => {
-            world.guards.push(Guard::GraphFailed);
+            world.rejections.push(RejectionReason::GraphFailed);
             world.keyframes.extend(index.keyframes.iter().copied().zip(start.keyframes));
         }
     }
@@ -90,7 +91,7 @@ fn is_sound(solution: &Solution) -> bool {
 
 fn report(solution: &Solution) -> GraphReport {
     GraphReport {
-        mode: solution.mode,
+        flow: solution.flow,
         keyframes: solution.state.keyframes.len(),
         chunks: solution.state.chunks.len(),
         iterations: solution.iterations,
@@ -140,7 +141,7 @@ fn unknowns(machine: &Aligner, places: &[Option<Sim3>]) -> (Index, CoupledState)
         }
     }
     for frame in machine.frames.iter() {
-        if let Some(anchor) = machine.frames.anchor(frame.frame_id) {
+        if let Some(anchor) = machine.frames.pose_prior(frame.frame_id) {
             let loose =
                 machine.chunks.iter().any(|c| !c.odometry_trusted && c.view(frame.frame_id).is_some());
             if !(loose && poses.contains_key(&frame.frame_id)) {
@@ -160,7 +161,7 @@ struct Built {
     factors: Vec<Factor>,
     /// (judged loop, factor).
     loop_factors: Vec<(usize, usize)>,
-    guards: Vec<Guard>,
+    rejections: Vec<RejectionReason>,
     has_loops: bool,
     /// Information on ln(scale) per chunk.
     scale_information: BTreeMap<usize, f64>,
@@ -169,10 +170,12 @@ struct Built {
 impl Built {
     fn odometry(&mut self, machine: &Aligner, index: &Index) {
         let weights = &machine.config.graph;
-        let anchored =
-            index.keyframes.iter().filter_map(|f| Some((*f, index.by_frame[f], machine.frames.anchor(*f)?)));
+        let anchored = index
+            .keyframes
+            .iter()
+            .filter_map(|f| Some((*f, index.by_frame[f], machine.frames.pose_prior(*f)?)));
         if let Some((_, i, anchor)) = anchored.clone().next() {
-            self.factors.push(Factor::Anchor {
+            self.factors.push(Factor::GaugePrior {
                 i,
                 world_from_camera: anchor.world_from_camera,
                 position_std_m: 1e-3,
@@ -194,8 +197,8 @@ impl Built {
                 continue;
             };
             // A step of a frame that is not believed itself is not odometry.
-            let known =
-                machine.frames.anchor(step.from).is_some() && machine.frames.anchor(step.to).is_some();
+            let known = machine.frames.pose_prior(step.from).is_some()
+                && machine.frames.pose_prior(step.to).is_some();
             let loose = distrusted.iter().any(|c| c.view(step.from).is_some() || c.view(step.to).is_some());
             if !known {
                 continue;
@@ -221,7 +224,7 @@ impl Built {
                 self.relative(tie, k, l, machine.chunks[tie.to].median_depth(), ROBUST);
                 let std = if own > 0.0 { 1.0 / own.sqrt() } else { f64::INFINITY };
                 if std > weights.max_log_scale_std {
-                    self.guards.push(Guard::ScaleUnobservable);
+                    self.rejections.push(RejectionReason::ScaleUnobservable);
                     let log_ratio = tie.fit.target_from_source.scale.ln();
                     let std = weights.scale_walk.hypot(tie.fit.log_scale_std());
                     self.factors.push(Factor::ScaleWalk { k, l, log_ratio, std });
@@ -280,7 +283,7 @@ impl Built {
         information
     }
 
-    fn relative(&mut self, tie: &Tie, k: usize, l: usize, depth_in_l: f64, kernel: Kernel) {
+    fn relative(&mut self, tie: &OverlapConstraint, k: usize, l: usize, depth_in_l: f64, kernel: Kernel) {
         let s = tie.fit.target_from_source;
         let covariance = with_floor(&tie.fit.covariance, depth_in_l / s.scale, OVERLAP_FLOOR);
         self.factors
@@ -288,7 +291,7 @@ impl Built {
     }
 
     fn loops(&mut self, machine: &Aligner, index: &Index, judged: &[MeasuredLoop]) {
-        for (number, found) in judged.iter().enumerate().filter(|(_, l)| l.report.refusal.is_none()) {
+        for (number, found) in judged.iter().enumerate().filter(|(_, l)| l.report.rejection.is_none()) {
             let (Some(k), Some(l)) = (index.chunks[found.later], index.chunks[found.earlier]) else {
                 continue;
             };

@@ -7,7 +7,7 @@
 
 use super::agreement::{Refined, agree};
 use super::observation::FrameObservation;
-use super::report::Guard;
+use super::report::RejectionReason;
 use crate::depth_field::{DepthField, Evidence, fit_depth_field};
 use crate::landmark_scale::{DepthRatio, LandmarkConfig, LogScale, depth_ratios, landmark_scale};
 use std::collections::BTreeMap;
@@ -26,7 +26,7 @@ pub(super) struct Landmarks {
     pub scale: Option<LogScale>,
     /// Corrections of views' depths.
     pub fields: BTreeMap<FrameId, DepthField>,
-    pub guards: Vec<Guard>,
+    pub rejections: Vec<RejectionReason>,
 }
 
 impl Landmarks {
@@ -52,17 +52,17 @@ impl Landmarks {
             ..Self::default()
         };
         if is_off {
-            found.guards.push(Guard::DepthRescaled);
+            found.rejections.push(RejectionReason::DepthRescaled);
         }
         let mut refined = Vec::new();
-        let mut looseness = Vec::new();
+        let mut prior_scale = Vec::new();
         for (view, ratios) in &per_view {
             let size = (view.intrinsics.width, view.intrinsics.height);
             let fit = fit_depth_field(ratios, scale.log_scale, size, config.min_for_field);
             if fit.as_ref().is_some_and(|f| !f.keeps_grid) {
-                found.guards.push(Guard::DepthFieldRefused);
+                found.rejections.push(RejectionReason::DepthFieldRejected);
             }
-            looseness.extend(fit.as_ref().map(|f| f.looseness));
+            prior_scale.extend(fit.as_ref().map(|f| f.prior_scale));
             refined.push(Refined {
                 view,
                 // In metres where the chunk's poses are, else in its own unit: what landmarks ask for is counted from there.
@@ -72,9 +72,9 @@ impl Landmarks {
             });
         }
         // Neighbours correct each other where most views need more than a good network does.
-        looseness.sort_by(f64::total_cmp);
-        if let Some(looseness) = looseness.get(looseness.len() / 2).filter(|l| **l > 1.0) {
-            agree(&mut refined, *looseness);
+        prior_scale.sort_by(f64::total_cmp);
+        if let Some(prior_scale) = prior_scale.get(prior_scale.len() / 2).filter(|l| **l > 1.0) {
+            agree(&mut refined, *prior_scale);
         }
         for view in refined {
             if let Some(mut field) = view.field.or(is_off.then(DepthField::default)) {

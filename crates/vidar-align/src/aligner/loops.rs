@@ -12,7 +12,7 @@ mod direct;
 mod plausible;
 
 use super::memory::{Chunk, View, sampled_thin};
-use super::report::{LoopRefusal, LoopReport};
+use super::report::{LoopRejection, LoopReport};
 use super::{Aligner, CouplingMode, tie};
 use crate::AlignError;
 use crate::overlap::{OverlapFit, SampledView, shared_views};
@@ -52,22 +52,22 @@ pub(super) struct MeasuredLoop {
 
 /// The best look-alike of a pair of chunks so far.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Lookalike {
+pub(super) struct FrameMatch {
     pub later_frame: FrameId,
     pub earlier_frame: FrameId,
     pub similarity: f32,
-    pub is_judged: bool,
+    pub is_evaluated: bool,
 }
 
 impl Aligner {
-    /// Revisits that wait for a verdict ([`Aligner::push_loop`]), most similar first: the best pair of frames per pair of
+    /// Revisits that wait for a status ([`Aligner::push_loop`]), most similar first: the best pair of frames per pair of
     /// chunks, neighbours left out, at most so many per chunk.
     pub fn loop_candidates(&self) -> Vec<LoopCandidate> {
-        let mut waiting: Vec<(&(usize, usize), &Lookalike)> =
-            self.lookalikes.iter().filter(|(_, l)| !l.is_judged).collect();
+        let mut waiting: Vec<(&(usize, usize), &FrameMatch)> =
+            self.frame_matches.iter().filter(|(_, l)| !l.is_evaluated).collect();
         waiting.sort_by(|a, b| b.1.similarity.total_cmp(&a.1.similarity).then(a.0.cmp(b.0)));
         let judged =
-            |chunk: usize| self.lookalikes.iter().filter(|(k, l)| k.0 == chunk && l.is_judged).count();
+            |chunk: usize| self.frame_matches.iter().filter(|(k, l)| k.0 == chunk && l.is_evaluated).count();
         let mut taken = vec![0usize; self.chunks.len()];
         let mut candidates = Vec::new();
         for (&(later, earlier), look) in waiting {
@@ -103,8 +103,8 @@ impl Aligner {
             self.chunks.iter().position(|c: &Chunk| c.id == id).ok_or(AlignError::UnknownChunk { chunk: id })
         };
         let (later, earlier) = (index(candidate.later)?, index(candidate.earlier)?);
-        if let Some(look) = self.lookalikes.get_mut(&(later, earlier)) {
-            look.is_judged = true;
+        if let Some(look) = self.frame_matches.get_mut(&(later, earlier)) {
+            look.is_evaluated = true;
         }
         let measured = match prediction {
             Some(prediction) => self.measure_by_chunk(later, earlier, prediction),
@@ -117,14 +117,14 @@ impl Aligner {
             earlier_from_later: None,
             inlier_ratio: 0.0,
             chi2: f64::NAN,
-            refusal: Some(LoopRefusal::NoGeometry),
+            rejection: Some(LoopRejection::NoGeometry),
         };
         if let Some(fit) = measured {
             let (transform, covariance) = (fit.target_from_source, fit.covariance);
             report.earlier_from_later = Some(transform);
             report.inlier_ratio = fit.inlier_ratio;
             report.chi2 = plausible::chi2(self, later, earlier, candidate, &fit).unwrap_or(f64::NAN);
-            report.refusal = self.refusal(&report);
+            report.rejection = self.rejection(&report);
             let report = report.clone();
             self.loops.push(MeasuredLoop {
                 later,
@@ -142,15 +142,15 @@ impl Aligner {
         Ok(report)
     }
 
-    fn refusal(&self, report: &LoopReport) -> Option<LoopRefusal> {
+    fn rejection(&self, report: &LoopReport) -> Option<LoopRejection> {
         if self.mode == CouplingMode::Da3Streaming && self.config.compat == Compat::Reference {
             return None;
         }
         if report.inlier_ratio <= self.config.loops.min_inlier_ratio {
-            return Some(LoopRefusal::FewInliers);
+            return Some(LoopRejection::FewInliers);
         }
         // Without anchors there is nothing to be implausible against.
-        (report.chi2 > self.config.loops.max_chi2).then_some(LoopRefusal::Implausible)
+        (report.chi2 > self.config.loops.max_chi2).then_some(LoopRejection::Chi2TooLarge)
     }
 
     /// `b_from_a = b_from_loop ∘ a_from_loop⁻¹`, each by the frames the loop chunk shares with that side.
@@ -184,7 +184,7 @@ impl Aligner {
         // Where chunks are not tied to each other, a loop has nothing to close.
         let Some(newest) = self.chunks.len().checked_sub(1).filter(|_| self.mode.chains()) else { return };
         let l = &self.config.loops;
-        let has_travel = self.mode.uses_anchors();
+        let has_travel = self.mode.uses_pose_priors();
         let least = if self.places.is_whitened() { l.min_token_similarity } else { l.min_similarity };
         for frame in frames {
             let Some(descriptor) = &frame.descriptor else { continue };
@@ -201,14 +201,14 @@ impl Aligner {
                 if !self.chunks[newest].is_usable() || newest - earlier <= 1 {
                     continue;
                 }
-                let look = Lookalike {
+                let look = FrameMatch {
                     later_frame: frame.frame_id,
                     earlier_frame: place.frame_id,
                     similarity: place.similarity,
-                    is_judged: false,
+                    is_evaluated: false,
                 };
-                let best = self.lookalikes.entry((newest, earlier)).or_insert(look);
-                if !best.is_judged && look.similarity > best.similarity {
+                let best = self.frame_matches.entry((newest, earlier)).or_insert(look);
+                if !best.is_evaluated && look.similarity > best.similarity {
                     *best = look;
                 }
             }
@@ -219,10 +219,10 @@ impl Aligner {
     }
 
     /// All loops as they stand: those that passed their own gates are held against each other.
-    pub(super) fn judged_loops(&self) -> Vec<MeasuredLoop> {
+    pub(super) fn evaluated_loops(&self) -> Vec<MeasuredLoop> {
         let mut loops = self.loops.clone();
         let verbatim = self.mode == CouplingMode::Da3Streaming && self.config.compat == Compat::Reference;
-        let open: Vec<usize> = (0..loops.len()).filter(|&i| loops[i].report.refusal.is_none()).collect();
+        let open: Vec<usize> = (0..loops.len()).filter(|&i| loops[i].report.rejection.is_none()).collect();
         if open.len() < 3 || verbatim {
             return loops;
         }
@@ -231,7 +231,7 @@ impl Aligner {
         let kept = clique::largest(open.len(), agree);
         for (position, &i) in open.iter().enumerate() {
             if !kept.contains(&position) {
-                loops[i].report.refusal = Some(LoopRefusal::Inconsistent);
+                loops[i].report.rejection = Some(LoopRejection::Inconsistent);
             }
         }
         loops
@@ -246,7 +246,7 @@ impl Aligner {
             .flat_map(|(k, c)| c.revisits.iter().map(move |t| (k, t.to, t.fit.target_from_source)));
         judged
             .iter()
-            .filter(|l| l.report.refusal.is_none())
+            .filter(|l| l.report.rejection.is_none())
             .map(|l| (l.later, l.earlier, l.earlier_from_later))
             .chain(revisits)
             .collect()

@@ -1,10 +1,9 @@
 //! What the machine keeps of chunks and frames.
 
 use super::anchored::Pair;
-use super::observation::MetricAnchor;
-use super::report::Guard;
+use super::observation::PosePrior;
+use super::report::{ChunkStatus, RejectionReason};
 use super::{AlignerConfig, GraphWeights};
-use crate::Verdict;
 use crate::depth_field::DepthField;
 use crate::landmark_scale::LogScale;
 use crate::overlap::{OverlapFit, SampledView};
@@ -33,14 +32,14 @@ pub(super) struct Chunk {
     pub id: ChunkId,
     pub frame: ChunkFrame,
     pub views: Vec<View>,
-    pub verdict: Verdict,
+    pub status: ChunkStatus,
     /// The tie to the last usable chunk before, by its index.
-    pub tie: Option<Tie>,
+    pub tie: Option<OverlapConstraint>,
     /// Further ties to older chunks that hold some of the same frames.
-    pub revisits: Vec<Tie>,
+    pub revisits: Vec<OverlapConstraint>,
     /// ln(metres per unit) as landmarks tell it.
     pub landmark_scale: Option<LogScale>,
-    pub guards: Vec<Guard>,
+    pub rejections: Vec<RejectionReason>,
     /// Where anchors and overlap put it when it came.
     pub first_guess: Option<Sim3>,
     pub log_scale_std: f64,
@@ -55,7 +54,7 @@ const PRIOR_WORLD_UNKNOWN: f64 = 0.3;
 
 /// `earlier_from_this` of an overlap.
 #[derive(Clone, Debug)]
-pub(super) struct Tie {
+pub(super) struct OverlapConstraint {
     pub to: usize,
     pub frames: usize,
     pub fit: OverlapFit,
@@ -89,35 +88,35 @@ impl Step {
 
 /// A frame as it goes through the run.
 #[derive(Clone, Debug)]
-pub(super) struct Keyframe {
+pub(super) struct GraphKeyframe {
     pub frame_id: FrameId,
     pub time: Timestamp,
-    pub anchor: Option<MetricAnchor>,
+    pub pose_prior: Option<PosePrior>,
 }
 
 /// Frames in the order of time.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Frames {
-    by_id: BTreeMap<FrameId, Keyframe>,
+    by_id: BTreeMap<FrameId, GraphKeyframe>,
     /// The segment of the first trusted anchor: its world is the world.
     segment: Option<u32>,
 }
 
 impl Frames {
     /// Takes what is new; what came later is the last word of the odometry.
-    pub fn learn(&mut self, frame_id: FrameId, time: Timestamp, anchor: Option<MetricAnchor>) {
+    pub fn learn(&mut self, frame_id: FrameId, time: Timestamp, anchor: Option<PosePrior>) {
         let finite = anchor.filter(|a| a.world_from_camera.is_finite());
-        let known = self.by_id.entry(frame_id).or_insert(Keyframe { frame_id, time, anchor: None });
+        let known = self.by_id.entry(frame_id).or_insert(GraphKeyframe { frame_id, time, pose_prior: None });
         known.time = time;
         if let Some(anchor) = finite {
             if anchor.is_trusted && self.segment.is_none() {
                 self.segment = Some(anchor.segment);
             }
-            known.anchor = Some(anchor);
+            known.pose_prior = Some(anchor);
         }
     }
 
-    pub fn iter(&self) -> impl Iterator<Item = &Keyframe> {
+    pub fn iter(&self) -> impl Iterator<Item = &GraphKeyframe> {
         self.by_id.values()
     }
 
@@ -126,8 +125,8 @@ impl Frames {
     }
 
     /// The metric anchor of a frame, if it may be believed and shares the world of the first one.
-    pub fn anchor(&self, frame: FrameId) -> Option<&MetricAnchor> {
-        let anchor = self.by_id.get(&frame)?.anchor.as_ref()?;
+    pub fn pose_prior(&self, frame: FrameId) -> Option<&PosePrior> {
+        let anchor = self.by_id.get(&frame)?.pose_prior.as_ref()?;
         (anchor.is_trusted && Some(anchor.segment) == self.segment).then_some(anchor)
     }
 }
@@ -135,7 +134,7 @@ impl Frames {
 impl Frames {
     /// Steps between neighbouring anchored frames of one segment.
     pub fn steps(&self) -> impl Iterator<Item = Step> + '_ {
-        let anchored = || self.by_id.values().filter_map(|k| Some((k, k.anchor.as_ref()?)));
+        let anchored = || self.by_id.values().filter_map(|k| Some((k, k.pose_prior.as_ref()?)));
         anchored().zip(anchored().skip(1)).filter(|(a, b)| a.1.segment == b.1.segment).map(
             |((i, a), (j, b))| Step {
                 from: i.frame_id,
@@ -162,7 +161,7 @@ impl Chunk {
         self.views
             .iter()
             .filter_map(|v| {
-                let anchor = frames.anchor(v.frame_id)?;
+                let anchor = frames.pose_prior(v.frame_id)?;
                 Some(Pair {
                     chunk_from_camera: v.chunk_from_camera,
                     world_from_camera: anchor.world_from_camera,
@@ -183,7 +182,7 @@ impl Chunk {
     }
 
     pub fn is_usable(&self) -> bool {
-        self.verdict.is_usable()
+        self.status.is_usable()
     }
 
     /// How far the depth of a chunk in the anchors' own world may be trusted, standard deviation of ln: no farther than the chunk
@@ -192,7 +191,7 @@ impl Chunk {
     pub fn prior_world_std(&self) -> f64 {
         match &self.tie {
             Some(tie) => tie.fit.target_from_source.scale.ln().abs().max(PRIOR_WORLD_SCALE),
-            None if self.guards.contains(&Guard::NoOverlap) => PRIOR_WORLD_UNKNOWN,
+            None if self.rejections.contains(&RejectionReason::NoOverlap) => PRIOR_WORLD_UNKNOWN,
             None => PRIOR_WORLD_SCALE,
         }
     }

@@ -11,11 +11,11 @@
 //! It owns no thread, file or clock. Of a chunk it keeps poses, a few hundred depths per view and what was measured; of
 //! the chunk before also some thousand depths per view (with [`Compat::Reference`](crate::streaming::Compat) its views
 //! in full). What is wrong with a chunk is no error: the chunk is left out or held by its neighbours, the guard that acted
-//! is counted, and [`Placement::guards`] tells. Same input, same bits.
+//! is counted, and [`Placement::rejections`] tells. Same input, same bits.
 //!
 //! ```
 //! use nalgebra::Vector3;
-//! use vidar_align::aligner::{Aligner, AlignerConfig, ChunkObservation, CouplingMode, FrameObservation, MetricAnchor};
+//! use vidar_align::aligner::{Aligner, AlignerConfig, ChunkObservation, CouplingMode, FrameObservation, PosePrior};
 //! use vidar_core::model::ChunkFrame;
 //! use vidar_core::{
 //!     ChunkId, Confidence, FrameId, GeometryPrediction, Image, Pinhole, RelativeDepth, Se3, Timestamp, ViewGeometry,
@@ -34,7 +34,7 @@
 //!     let mut metric = v.chunk_from_camera;
 //!     metric.translation *= 0.5;
 //!     FrameObservation::new(v.frame_id, Timestamp::from_nanos(i64::from(v.frame_id.0) * 100_000_000))
-//!         .with_anchor(MetricAnchor::known(metric))
+//!         .with_pose_prior(PosePrior::new(metric))
 //! });
 //! let frames = frames.collect();
 //! let prediction = GeometryPrediction { chunk_id: ChunkId(0), frame: ChunkFrame::ModelNative, views };
@@ -63,20 +63,21 @@ mod world;
 
 pub use config::{AlignerConfig, CouplingMode, GraphWeights, LoopsConfig};
 pub use loops::LoopCandidate;
-pub use observation::{ChunkObservation, FrameObservation, MetricAnchor, covariance_in_camera};
+pub use observation::{ChunkObservation, FrameObservation, PosePrior, covariance_in_camera};
 pub use report::{
-    ChunkPlacement, ChunkReport, DriftReport, GraphReport, Guard, GuardCounts, KeyframePlacement,
-    LoopRefusal, LoopReport, OverlapReport, Placement, ViewPlacement,
+    ChunkPlacement, ChunkReport, ChunkStatus, DriftReport, GraphReport, KeyframePlacement, LoopRejection,
+    LoopReport, OverlapReport, Placement, RejectionCounts, RejectionReason, ViewPlacement,
 };
+pub use views::color_at_size;
 
+use crate::AlignError;
 use crate::overlap::{SampledView, shared_views};
 use crate::place_recognition::PlaceIndex;
 use crate::streaming::Compat;
-use crate::{AlignError, Verdict};
 use anchored::{Pair, PoseFit, center_rms, fit_about_rotations, robust_umeyama};
 use landmarks::Landmarks;
-use loops::{Lookalike, MeasuredLoop};
-use memory::{Chunk, Frames, Tie, sampled_views};
+use loops::{FrameMatch, MeasuredLoop};
+use memory::{Chunk, Frames, OverlapConstraint, sampled_views};
 use std::collections::{BTreeMap, BTreeSet};
 use vidar_core::model::ChunkFrame;
 use vidar_core::{FrameId, GeometryPrediction, LieGroup, Sim3, ViewGeometry};
@@ -93,7 +94,7 @@ pub struct Aligner {
     places: PlaceIndex,
     known_places: BTreeSet<FrameId>,
     /// Best look-alike frames per (later, earlier) chunk.
-    lookalikes: BTreeMap<(usize, usize), Lookalike>,
+    frame_matches: BTreeMap<(usize, usize), FrameMatch>,
 }
 
 /// Geometry of the last usable chunk.
@@ -130,14 +131,14 @@ impl Aligner {
             loops: Vec::new(),
             places: PlaceIndex::default(),
             known_places: BTreeSet::new(),
-            lookalikes: BTreeMap::new(),
+            frame_matches: BTreeMap::new(),
         })
     }
 
     /// Compares places by what sets them apart from the average place ([`PlaceIndex::whitened`]), and takes those for alike
     /// that [`LoopsConfig::min_token_similarity`] says: for descriptors that are averages of a model's tokens.
     #[must_use]
-    pub fn with_whitened_places(mut self) -> Self {
+    pub fn with_whitened_descriptors(mut self) -> Self {
         self.places = PlaceIndex::whitened();
         self
     }
@@ -157,7 +158,7 @@ impl Aligner {
             return Err(AlignError::RepeatedChunk { chunk: prediction.chunk_id });
         }
         for frame in &frames {
-            self.frames.learn(frame.frame_id, frame.time, frame.anchor.clone());
+            self.frames.learn(frame.frame_id, frame.time, frame.pose_prior.clone());
         }
         let landmarks = match self.mode {
             CouplingMode::Coupled => Landmarks::learn(&prediction, &frames, &self.config.landmarks),
@@ -168,18 +169,18 @@ impl Aligner {
         for view in &mut views {
             view.field = landmarks.fields.get(&view.frame_id).cloned();
         }
-        let mut guards = landmarks.guards;
-        guards.extend(vec![Guard::ViewNotFinite; dropped]);
-        let tie = self.tie(&sampled, &prediction, &mut guards);
+        let mut rejections = landmarks.rejections;
+        rejections.extend(vec![RejectionReason::ViewNotFinite; dropped]);
+        let tie = self.tie(&sampled, &prediction, &mut rejections);
         let mut chunk = Chunk {
             id: prediction.chunk_id,
             frame: prediction.frame,
             views,
-            verdict: Verdict::Chained,
+            status: ChunkStatus::Chained,
             tie,
             revisits: Vec::new(),
             landmark_scale: landmarks.scale,
-            guards,
+            rejections,
             first_guess: None,
             log_scale_std: f64::INFINITY,
             odometry_trusted: true,
@@ -215,7 +216,10 @@ impl Aligner {
         let thin: usize = self.chunks.iter().flat_map(|c| &c.views).map(|v| v.thin.bytes()).sum();
         let dense: usize = self.previous.sampled.iter().map(SampledView::bytes).sum();
         let full: usize = self.previous.full.iter().map(|v| v.depth.image().data().len() * 8).sum();
-        thin + dense + full + self.places.memory_bytes() + self.frames.len() * size_of::<memory::Keyframe>()
+        thin + dense
+            + full
+            + self.places.memory_bytes()
+            + self.frames.len() * size_of::<memory::GraphKeyframe>()
     }
 
     /// The tie to the last usable chunk, if both hold frames and the two agree.
@@ -223,8 +227,8 @@ impl Aligner {
         &self,
         sampled: &[SampledView],
         prediction: &GeometryPrediction,
-        guards: &mut Vec<Guard>,
-    ) -> Option<Tie> {
+        rejections: &mut Vec<RejectionReason>,
+    ) -> Option<OverlapConstraint> {
         if self.chunks.is_empty() {
             return None;
         }
@@ -232,7 +236,7 @@ impl Aligner {
         if views.is_empty() {
             // Chunks in the anchors' own world are tied by the anchors: nothing is missing.
             if prediction.frame != ChunkFrame::PriorWorld {
-                guards.push(Guard::NoOverlap);
+                rejections.push(RejectionReason::NoOverlap);
             }
             return None;
         }
@@ -255,16 +259,18 @@ impl Aligner {
             verbatim || fit.inlier_ratio >= self.config.overlap.min_inlier_ratio
         };
         match fit {
-            Some(fit) if believed(&fit) => Some(Tie { to: self.previous.chunk, frames: views.len(), fit }),
+            Some(fit) if believed(&fit) => {
+                Some(OverlapConstraint { to: self.previous.chunk, frames: views.len(), fit })
+            }
             _ => {
-                guards.push(Guard::NoOverlap);
+                rejections.push(RejectionReason::NoOverlap);
                 None
             }
         }
     }
 
     /// Older chunks that hold some of the chunk's frames: a loop closed within an ordinary chunk.
-    fn revisits(&self, chunk: &Chunk) -> Vec<Tie> {
+    fn revisits(&self, chunk: &Chunk) -> Vec<OverlapConstraint> {
         // Next neighbours share frames when overlaps are long; their chain of ties says the same already.
         let distant = self.chunks.len().saturating_sub(NEIGHBOURS - 1);
         let tied = chunk.tie.as_ref().map(|t| t.to);
@@ -279,8 +285,8 @@ impl Aligner {
     /// Decides how a chunk stands and where it goes first.
     fn judge(&self, chunk: &mut Chunk, pairs: &[Pair]) {
         if chunk.views.is_empty() {
-            chunk.verdict = Verdict::Garbage;
-            chunk.guards.push(Guard::GarbageChunk);
+            chunk.status = ChunkStatus::Rejected;
+            chunk.rejections.push(RejectionReason::InconsistentChunk);
             return;
         }
         match self.mode {
@@ -294,9 +300,9 @@ impl Aligner {
     /// Without anchors only the neighbour can vouch for a chunk. The first one vouches for itself.
     fn judge_unanchored(&self, chunk: &mut Chunk) {
         let disagrees = chunk.tie.is_none() && self.shares_frames(chunk);
-        chunk.verdict = if disagrees { Verdict::Garbage } else { Verdict::Chained };
+        chunk.status = if disagrees { ChunkStatus::Rejected } else { ChunkStatus::Chained };
         if disagrees {
-            chunk.guards.push(Guard::GarbageChunk);
+            chunk.rejections.push(RejectionReason::InconsistentChunk);
         }
         chunk.first_guess = match &chunk.tie {
             Some(tie) => self.chunks[tie.to].first_guess.map(|g| g * tie.fit.target_from_source),
@@ -309,32 +315,32 @@ impl Aligner {
         chunk.views.iter().any(|v| self.previous.sampled.iter().any(|s| s.frame_id == v.frame_id))
     }
 
-    /// The paper's pose-conditioned coupling: `D ← D / s*`, guards.
+    /// The paper's pose-conditioned coupling: `D ← D / s*`, rejections.
     fn judge_conditioned(&self, chunk: &mut Chunk, pairs: &[Pair]) {
         if pairs.is_empty() {
-            chunk.verdict = Verdict::Unplaced;
+            chunk.status = ChunkStatus::Unplaced;
             return;
         }
         let fitted = match chunk.frame {
-            ChunkFrame::PriorWorld => Ok((Sim3::IDENTITY, Verdict::PriorWorld)),
+            ChunkFrame::PriorWorld => Ok((Sim3::IDENTITY, ChunkStatus::PriorWorld)),
             ChunkFrame::ModelNative => {
-                robust_umeyama(pairs, u64::from(chunk.id.0)).map(|s| (s, Verdict::Fitted))
+                robust_umeyama(pairs, u64::from(chunk.id.0)).map(|s| (s, ChunkStatus::Fitted))
             }
         };
-        let (mut place, verdict) = fitted.unwrap_or((Sim3::IDENTITY, Verdict::RankDeficient));
-        chunk.verdict = verdict;
-        if verdict == Verdict::RankDeficient {
-            chunk.guards.push(Guard::RankDeficient);
+        let (mut place, status) = fitted.unwrap_or((Sim3::IDENTITY, ChunkStatus::RankDeficient));
+        chunk.status = status;
+        if status == ChunkStatus::RankDeficient {
+            chunk.rejections.push(RejectionReason::RankDeficient);
         }
         if let Some(guarded) = self.clamped_scale(chunk, &place) {
             // In the anchors' own world the scale is 1 already: what the overlap says instead is what is not believed.
             if chunk.frame != ChunkFrame::PriorWorld {
                 place = rescaled_about_centers(&place, guarded, pairs);
             }
-            chunk.guards.push(Guard::ScaleOutOfRange);
+            chunk.rejections.push(RejectionReason::ScaleOutOfRange);
         }
-        if verdict.is_usable() && center_rms(&place, pairs) > self.config.max_center_rms_m {
-            chunk.verdict = Verdict::Inconsistent;
+        if status.is_usable() && center_rms(&place, pairs) > self.config.max_center_rms_m {
+            chunk.status = ChunkStatus::Inconsistent;
         }
         chunk.log_scale_std = match chunk.frame {
             ChunkFrame::PriorWorld => chunk.prior_world_std(),
@@ -349,7 +355,7 @@ impl Aligner {
     /// [0.85, 1.20] of it: between metric chunks the ratio is 1 (the paper's clamp).
     fn clamped_scale(&self, chunk: &Chunk, place: &Sim3) -> Option<f64> {
         let tie = chunk.tie.as_ref()?;
-        let before = self.chunks[tie.to].first_guess.filter(|_| chunk.verdict.is_usable())?;
+        let before = self.chunks[tie.to].first_guess.filter(|_| chunk.status.is_usable())?;
         let expected = before.scale * tie.fit.target_from_source.scale;
         let ratio = place.scale / expected;
         let [low, high] = self.config.scale_range;
@@ -379,20 +385,20 @@ impl Aligner {
         let fit = self.with_landmarks(fit, chunk, pairs);
         chunk.log_scale_std = fit.log_scale_std;
         let gross = is_gross(&fit, pairs.len(), self.config.max_center_rms_m);
-        (chunk.verdict, chunk.first_guess) = match (gross, before) {
-            (false, _) => (Verdict::Fitted, Some(fit.world_from_chunk)),
+        (chunk.status, chunk.first_guess) = match (gross, before) {
+            (false, _) => (ChunkStatus::Fitted, Some(fit.world_from_chunk)),
             (true, Some(chained)) => {
-                chunk.guards.push(Guard::OdometryDistrusted);
+                chunk.rejections.push(RejectionReason::OdometryDownweighted);
                 chunk.odometry_trusted = false;
-                (Verdict::Chained, Some(chained))
+                (ChunkStatus::Chained, Some(chained))
             }
             (true, None) => {
-                chunk.guards.push(Guard::GarbageChunk);
-                (Verdict::Garbage, None)
+                chunk.rejections.push(RejectionReason::InconsistentChunk);
+                (ChunkStatus::Rejected, None)
             }
         };
-        if chunk.frame == ChunkFrame::PriorWorld && chunk.verdict == Verdict::Fitted {
-            chunk.verdict = Verdict::PriorWorld;
+        if chunk.frame == ChunkFrame::PriorWorld && chunk.status == ChunkStatus::Fitted {
+            chunk.status = ChunkStatus::PriorWorld;
         }
     }
 
@@ -425,13 +431,13 @@ impl Aligner {
         });
         ChunkReport {
             chunk_id: chunk.id,
-            verdict: chunk.verdict,
+            status: chunk.status,
             world_from_chunk: chunk.first_guess,
             matched: pairs.len(),
             center_rms_m: chunk.first_guess.map_or(f64::NAN, |g| center_rms(&g, pairs)),
             overlap,
             log_scale_std: chunk.log_scale_std,
-            guards: chunk.guards.clone(),
+            rejections: chunk.rejections.clone(),
         }
     }
 }

@@ -23,7 +23,7 @@ pub struct FrameObservation {
     /// When it was taken.
     pub time: Timestamp,
     /// Its metric pose, if any.
-    pub anchor: Option<MetricAnchor>,
+    pub pose_prior: Option<PosePrior>,
     /// Points of known metric depth. `pixel` is at the depth image's size, distortion removed.
     pub landmarks: Vec<SparseLandmark>,
     /// Standard deviation of an error of ln(depth) that the landmarks of all frames share; 0 where each has its own alone.
@@ -38,7 +38,7 @@ impl FrameObservation {
         Self {
             frame_id,
             time,
-            anchor: None,
+            pose_prior: None,
             landmarks: Vec::new(),
             shared_landmark_std: 0.0,
             descriptor: None,
@@ -46,15 +46,15 @@ impl FrameObservation {
     }
 
     /// The same with a metric pose.
-    pub fn with_anchor(mut self, anchor: MetricAnchor) -> Self {
-        self.anchor = Some(anchor);
+    pub fn with_pose_prior(mut self, pose_prior: PosePrior) -> Self {
+        self.pose_prior = Some(pose_prior);
         self
     }
 }
 
 /// A metric pose from odometry, a given trajectory or ground truth.
 #[derive(Clone, Debug, PartialEq)]
-pub struct MetricAnchor {
+pub struct PosePrior {
     /// The camera's pose, m. All anchors of a run share one world, z up, unless `segment` differs.
     pub world_from_camera: Se3,
     /// Covariance of δ in `previous_from_this · exp(δ)`, rotation then translation in this camera's axes, the previous one
@@ -68,9 +68,9 @@ pub struct MetricAnchor {
     pub is_trusted: bool,
 }
 
-impl MetricAnchor {
+impl PosePrior {
     /// A pose of which nothing else is known (a trajectory file, ground truth).
-    pub fn known(world_from_camera: Se3) -> Self {
+    pub fn new(world_from_camera: Se3) -> Self {
         Self {
             world_from_camera,
             relative_covariance: None,

@@ -1,17 +1,56 @@
 //! What the machine says: of a chunk when it comes, of a loop when it is judged, of the world when asked.
 
 use super::CouplingMode;
-use crate::Verdict;
-use crate::coupled::Mode;
+use crate::coupled::InformationFlow;
 use crate::depth_field::DepthField;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use vidar_core::{ChunkId, FrameId, Se3, Sim3};
 
+/// How a chunk stands in the map.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum ChunkStatus {
+    /// The prediction is in the world of its pose priors; nothing was fitted.
+    PriorWorld,
+    /// A similarity onto the pose priors was fitted and agrees with them.
+    Fitted,
+    /// The camera centres do not determine a similarity (collinear, or fewer than three): identity (section III-F).
+    RankDeficient,
+    /// The fitted similarity leaves camera centres farther from their pose priors than `max_center_rms_m`.
+    Inconsistent,
+    /// Placed by overlap constraints; its own cameras have no pose prior, or one that was rejected.
+    Chained,
+    /// The prediction contradicts its neighbour and its pose priors, or holds no finite view: left out of the map.
+    Rejected,
+    /// Neither a pose prior nor a neighbour determines its place: left out of the map.
+    Unplaced,
+}
+
+impl ChunkStatus {
+    /// Whether the chunk may enter the map.
+    pub fn is_usable(self) -> bool {
+        matches!(self, Self::PriorWorld | Self::Fitted | Self::Chained)
+    }
+
+    /// A clause for messages.
+    pub fn description(self) -> &'static str {
+        match self {
+            Self::PriorWorld => "predicted in the world of its pose priors",
+            Self::Fitted => "fitted to its pose priors",
+            Self::RankDeficient => "its cameras are collinear or too few to determine a similarity",
+            Self::Inconsistent => "its cameras do not fit their pose priors",
+            Self::Chained => "placed by its neighbours",
+            Self::Rejected => "it contradicts its neighbour and its pose priors, or holds no finite view",
+            Self::Unplaced => "neither a pose prior nor a neighbour determines its place",
+        }
+    }
+}
+
 /// Something went wrong and was kept from spreading.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
-pub enum Guard {
+pub enum RejectionReason {
     /// A metric scale ratio left its range and was taken as 1 (the paper's clamp).
     ScaleOutOfRange,
     /// Camera centres fix no similarity (a line, a place): identity in the paper's modes, rotation from rotations in `coupled`.
@@ -19,19 +58,19 @@ pub enum Guard {
     /// A view's pose or all of its depth is not a number; the view was left out.
     ViewNotFinite,
     /// A chunk has no usable view, or contradicts its neighbour and its anchors; it was left out.
-    GarbageChunk,
+    InconsistentChunk,
     /// A chunk shares no usable frame with those before.
     NoOverlap,
     /// Neither motion nor landmarks tell a chunk's scale; overlap and a random-walk prior hold it.
     ScaleUnobservable,
     /// Odometry contradicts chunks that agree with each other; it was loosened there.
-    OdometryDistrusted,
+    OdometryDownweighted,
     /// Coupled poses would have bent the odometry beyond belief; information flowed one way only.
     OneWay,
     /// A loop was refused.
-    LoopRefused,
+    LoopRejected,
     /// A fitted depth field did not improve held-out landmarks; only the view's own scale was kept.
-    DepthFieldRefused,
+    DepthFieldRejected,
     /// Landmarks contradict the depth of a chunk whose poses were given; the depth was brought to them.
     DepthRescaled,
     /// The graph had no answer; chunks stay where anchors and overlaps put them.
@@ -41,16 +80,16 @@ pub enum Guard {
 /// How often each guard acted.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(transparent)]
-pub struct GuardCounts(BTreeMap<Guard, usize>);
+pub struct RejectionCounts(BTreeMap<RejectionReason, usize>);
 
-impl GuardCounts {
+impl RejectionCounts {
     /// How often one acted.
-    pub fn of(&self, guard: Guard) -> usize {
+    pub fn of(&self, guard: RejectionReason) -> usize {
         self.0.get(&guard).copied().unwrap_or(0)
     }
 
     /// Those that acted, in order.
-    pub fn iter(&self) -> impl Iterator<Item = (Guard, usize)> + '_ {
+    pub fn iter(&self) -> impl Iterator<Item = (RejectionReason, usize)> + '_ {
         self.0.iter().map(|(g, n)| (*g, *n))
     }
 
@@ -59,12 +98,12 @@ impl GuardCounts {
         self.0.is_empty()
     }
 
-    pub(crate) fn add(&mut self, guard: Guard) {
+    pub(crate) fn add(&mut self, guard: RejectionReason) {
         *self.0.entry(guard).or_insert(0) += 1;
     }
 
-    pub(crate) fn extend(&mut self, guards: &[Guard]) {
-        guards.iter().for_each(|g| self.add(*g));
+    pub(crate) fn extend(&mut self, rejections: &[RejectionReason]) {
+        rejections.iter().for_each(|g| self.add(*g));
     }
 }
 
@@ -93,7 +132,7 @@ pub struct ChunkReport {
     /// Which chunk.
     pub chunk_id: ChunkId,
     /// How it stands.
-    pub verdict: Verdict,
+    pub status: ChunkStatus,
     /// Where it would be placed now; later chunks and loops may move it. `None` when nothing places it.
     pub world_from_chunk: Option<Sim3>,
     /// Views whose camera has a metric anchor.
@@ -105,7 +144,7 @@ pub struct ChunkReport {
     /// Standard deviation of ln(metres per unit) from this chunk's own motion and landmarks; infinite when neither tells.
     pub log_scale_std: f64,
     /// Guards that acted.
-    pub guards: Vec<Guard>,
+    pub rejections: Vec<RejectionReason>,
 }
 
 /// A chunk's place.
@@ -114,7 +153,7 @@ pub struct ChunkPlacement {
     /// Which chunk.
     pub chunk_id: ChunkId,
     /// How it stands; unusable chunks own no view.
-    pub verdict: Verdict,
+    pub status: ChunkStatus,
     /// Maps chunk coordinates and units to the world and metres (to the first chunk's in modes that are not metric).
     pub world_from_chunk: Sim3,
     /// Standard deviation of ln(scale): how far to trust it. Infinite where nothing metric tells.
@@ -162,30 +201,30 @@ pub struct LoopReport {
     /// χ² against the prediction, 7 degrees of freedom; NaN where none could be made.
     pub chi2: f64,
     /// Why it was refused; `None` = accepted.
-    pub refusal: Option<LoopRefusal>,
+    pub rejection: Option<LoopRejection>,
 }
 
 /// Why a loop is not believed.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
-pub enum LoopRefusal {
+pub enum LoopRejection {
     /// No geometry could be compared.
     NoGeometry,
     /// Too few points agree on one side.
     FewInliers,
     /// It contradicts odometry and overlaps beyond their covariance.
-    Implausible,
+    Chi2TooLarge,
     /// It contradicts the other loops.
     Inconsistent,
     /// The graph let it go.
-    LetGo,
+    GraphOutlier,
 }
 
 /// How the coupled graph ended.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct GraphReport {
     /// Which way information flowed.
-    pub mode: Mode,
+    pub flow: InformationFlow,
     /// Keyframes and chunks estimated.
     pub keyframes: usize,
     /// Chunks estimated.
@@ -227,7 +266,7 @@ pub struct Placement {
     /// Loops judged.
     pub loops: Vec<LoopReport>,
     /// Guards that acted.
-    pub guards: GuardCounts,
+    pub rejections: RejectionCounts,
     /// The graph, in mode `coupled`.
     pub graph: Option<GraphReport>,
     /// Chain against anchors.

@@ -1,7 +1,7 @@
 //! Two chunks tied by the frames both hold.
 
 use super::AlignerConfig;
-use super::memory::{Tie, View};
+use super::memory::{OverlapConstraint, View};
 use crate::overlap::{
     OverlapFit, PATCH_PIXELS, PointPairs, SampledView, fit_overlap, judge, pair_mapped, pair_views,
     shared_views,
@@ -96,8 +96,13 @@ pub(super) fn verbatim(
 }
 
 /// Ties by thin samples: a chunk that comes back to frames of an older one.
-pub(super) fn revisit(earlier: &[View], later: &[View], to: usize, config: &AlignerConfig) -> Option<Tie> {
+pub(super) fn revisit(
+    earlier: &[View],
+    later: &[View],
+    to: usize,
+    config: &AlignerConfig,
+) -> Option<OverlapConstraint> {
     let views = shared_views(earlier.iter().map(|v| &v.thin), later.iter().map(|v| &v.thin));
     let frames = views.len();
-    (frames > 0).then(|| robust(&views, config)).flatten().map(|fit| Tie { to, frames, fit })
+    (frames > 0).then(|| robust(&views, config)).flatten().map(|fit| OverlapConstraint { to, frames, fit })
 }

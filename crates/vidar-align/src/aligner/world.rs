@@ -4,9 +4,11 @@ use super::chain::chain;
 use super::coupled::coupled;
 use super::loops::MeasuredLoop;
 use super::memory::Chunk;
-use super::report::{ChunkPlacement, DriftReport, Guard, GuardCounts, KeyframePlacement, ViewPlacement};
+use super::report::{
+    ChunkPlacement, ChunkStatus, DriftReport, KeyframePlacement, RejectionCounts, RejectionReason,
+    ViewPlacement,
+};
 use super::{Aligner, CouplingMode, GraphReport, LoopReport, NEIGHBOURS, Placement};
-use crate::Verdict;
 use nalgebra::Vector3;
 use std::collections::BTreeMap;
 use vidar_core::{FrameId, LieGroup, Se3, Sim3, umeyama_sim3};
@@ -20,7 +22,7 @@ pub(super) struct World {
     /// Standard deviation of ln(scale) per chunk.
     pub log_scale_std: Vec<f64>,
     pub is_metric: bool,
-    pub guards: Vec<Guard>,
+    pub rejections: Vec<RejectionReason>,
     pub graph: Option<GraphReport>,
     pub loops: Vec<LoopReport>,
 }
@@ -38,7 +40,7 @@ pub(super) fn place(machine: &Aligner) -> Placement {
 
 /// The first chain; chunks of other chains share nothing with it.
 pub(super) fn pose_free(machine: &Aligner) -> World {
-    let judged = machine.judged_loops();
+    let judged = machine.evaluated_loops();
     let links = chain(&machine.chunks, &machine.loop_edges(&judged));
     let root = links.iter().flatten().map(|l| l.root).next();
     let chunks =
@@ -48,13 +50,13 @@ pub(super) fn pose_free(machine: &Aligner) -> World {
 
 /// Each chain by one similarity of all its camera centres onto their anchors.
 fn hybrid(machine: &Aligner) -> World {
-    let judged = machine.judged_loops();
+    let judged = machine.evaluated_loops();
     let links = chain(&machine.chunks, &machine.loop_edges(&judged));
     let mut roots: Vec<usize> = links.iter().flatten().map(|l| l.root).collect();
     roots.sort_unstable();
     roots.dedup();
     let mut chunks: Vec<Option<Sim3>> = vec![None; links.len()];
-    let mut guards = Vec::new();
+    let mut rejections = Vec::new();
     let mut is_metric = true;
     let mut log_scale_std = vec![f64::INFINITY; links.len()];
     for root in &roots {
@@ -62,7 +64,7 @@ fn hybrid(machine: &Aligner) -> World {
         let mut centers: BTreeMap<FrameId, (Vector3<f64>, Vector3<f64>)> = BTreeMap::new();
         for (k, link) in members() {
             for view in &machine.chunks[k].views {
-                if let Some(anchor) = machine.frames.anchor(view.frame_id) {
+                if let Some(anchor) = machine.frames.pose_prior(view.frame_id) {
                     let placed = link.root_from_chunk.act(&view.chunk_from_camera.translation);
                     centers.insert(view.frame_id, (placed, anchor.world_from_camera.translation));
                 }
@@ -73,7 +75,7 @@ fn hybrid(machine: &Aligner) -> World {
             Ok(onto) => onto,
             Err(_) => {
                 // The paper's guard: identity. A second chain that nothing places is left out.
-                guards.push(Guard::RankDeficient);
+                rejections.push(RejectionReason::RankDeficient);
                 is_metric = false;
                 if *root != roots[0] {
                     continue;
@@ -87,7 +89,7 @@ fn hybrid(machine: &Aligner) -> World {
             log_scale_std[k] = std;
         });
     }
-    World { guards, log_scale_std, loops: reports(judged), ..World::of(machine, chunks, is_metric) }
+    World { rejections, log_scale_std, loops: reports(judged), ..World::of(machine, chunks, is_metric) }
 }
 
 /// Standard deviation of ln(scale) of a similarity over correlated centres: its residual over their radius.
@@ -105,7 +107,7 @@ fn conditioned(machine: &Aligner) -> World {
         machine.chunks.iter().map(|c| c.first_guess.filter(|_| c.is_usable())).collect();
     let mut world = World::of(machine, chunks, true);
     for frame in machine.frames.iter() {
-        if let Some(anchor) = machine.frames.anchor(frame.frame_id) {
+        if let Some(anchor) = machine.frames.pose_prior(frame.frame_id) {
             world.keyframes.insert(frame.frame_id, anchor.world_from_camera);
         }
     }
@@ -119,9 +121,9 @@ impl World {
             keyframes: BTreeMap::new(),
             log_scale_std: machine.chunks.iter().map(|c| c.log_scale_std).collect(),
             is_metric,
-            guards: Vec::new(),
+            rejections: Vec::new(),
             graph: None,
-            loops: reports(machine.judged_loops()),
+            loops: reports(machine.evaluated_loops()),
         }
     }
 }
@@ -132,14 +134,18 @@ pub(super) fn reports(loops: Vec<MeasuredLoop>) -> Vec<LoopReport> {
 }
 
 fn assemble(machine: &Aligner, world: World) -> Placement {
-    let mut guards = GuardCounts::default();
-    machine.chunks.iter().for_each(|c| guards.extend(&c.guards));
-    guards.extend(&world.guards);
-    world.loops.iter().filter(|l| l.refusal.is_some()).for_each(|_| guards.add(Guard::LoopRefused));
+    let mut rejections = RejectionCounts::default();
+    machine.chunks.iter().for_each(|c| rejections.extend(&c.rejections));
+    rejections.extend(&world.rejections);
+    world
+        .loops
+        .iter()
+        .filter(|l| l.rejection.is_some())
+        .for_each(|_| rejections.add(RejectionReason::LoopRejected));
     let chunks = machine.chunks.iter().zip(&world.chunks).zip(&world.log_scale_std);
     let chunks = chunks.map(|((c, place), std)| ChunkPlacement {
         chunk_id: c.id,
-        verdict: if place.is_none() && c.is_usable() { Verdict::Unplaced } else { c.verdict },
+        status: if place.is_none() && c.is_usable() { ChunkStatus::Unplaced } else { c.status },
         world_from_chunk: place.unwrap_or(Sim3::IDENTITY),
         log_scale_std: if world.is_metric { *std } else { f64::INFINITY },
     });
@@ -181,7 +187,7 @@ fn assemble(machine: &Aligner, world: World) -> Placement {
             .map(|(frame_id, world_from_camera)| KeyframePlacement { frame_id, world_from_camera })
             .collect(),
         loops: world.loops,
-        guards,
+        rejections,
         graph: world.graph,
     }
 }

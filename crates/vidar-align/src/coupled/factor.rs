@@ -55,7 +55,7 @@ pub enum Factor {
         std: f64,
     },
     /// Fixes what nothing can measure: position and heading of one keyframe.
-    Anchor {
+    GaugePrior {
         /// Which keyframe.
         i: usize,
         /// Where it is.
@@ -155,7 +155,7 @@ impl Factor {
         use Variable::{Chunk, Keyframe};
         match self {
             Self::Odometry { i, j, .. } => vec![Keyframe(*i), Keyframe(*j)],
-            Self::Gravity { i, .. } | Self::Anchor { i, .. } => vec![Keyframe(*i)],
+            Self::Gravity { i, .. } | Self::GaugePrior { i, .. } => vec![Keyframe(*i)],
             Self::Attachment(a) => vec![Keyframe(a.i), Chunk(a.k)],
             Self::Relative(r) => vec![Chunk(r.k), Chunk(r.l)],
             Self::Scale { k, .. } => vec![Chunk(*k)],
@@ -186,8 +186,8 @@ impl Factor {
                     jacobians: vec![(k, scale_row(1.0 / std)), (l, scale_row(-1.0 / std))],
                 })
             }
-            Self::Anchor { i, world_from_camera, position_std_m, heading_std_rad } => {
-                anchor(*i, &keyframes[*i], world_from_camera, *position_std_m, *heading_std_rad)
+            Self::GaugePrior { i, world_from_camera, position_std_m, heading_std_rad } => {
+                gauge_prior(*i, &keyframes[*i], world_from_camera, *position_std_m, *heading_std_rad)
             }
         }
     }
@@ -271,7 +271,7 @@ fn relative(r: &RelativeChunk, world_from_k: &Sim3, world_from_l: &Sim3) -> Opti
     })
 }
 
-fn anchor(
+fn gauge_prior(
     i: usize,
     world_from_i: &Se3,
     given: &Se3,

@@ -39,7 +39,7 @@ impl Default for CoupledConfig {
 /// Which way information flowed.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
-pub enum Mode {
+pub enum InformationFlow {
     /// Chunks corrected keyframes and keyframes chunks.
     Coupled,
     /// The chunks would have bent the odometry beyond belief: keyframes come from odometry alone, chunks are fitted to them.
@@ -52,7 +52,7 @@ pub struct Solution {
     /// The estimate.
     pub state: CoupledState,
     /// Which way information flowed.
-    pub mode: Mode,
+    pub flow: InformationFlow,
     /// Robust cost at the start and at the end.
     pub cost: [f64; 2],
     /// Iterations of all descents.
@@ -103,15 +103,15 @@ pub fn solve(
     let all: Vec<&Factor> = factors.iter().collect();
     let (state, iterations) = descend_graduated(start, &all, config)?;
     let odometry_chi2 = odometry_chi2(&state, factors);
-    let (state, mode, iterations) = if odometry_chi2 <= config.max_odometry_chi2 {
-        (state, Mode::Coupled, iterations)
+    let (state, flow, iterations) = if odometry_chi2 <= config.max_odometry_chi2 {
+        (state, InformationFlow::Coupled, iterations)
     } else {
         let (state, more) = one_way(start, factors, config)?;
-        (state, Mode::OneWay, iterations + more)
+        (state, InformationFlow::OneWay, iterations + more)
     };
     let weights = factors.iter().map(|f| f.kernel().weight(squared_error(f, &state))).collect();
     let cost = [cost(start, &all, 1.0), cost(&state, &all, 1.0)];
-    Ok(Solution { state, mode, cost, iterations, odometry_chi2, weights })
+    Ok(Solution { state, flow, cost, iterations, odometry_chi2, weights })
 }
 
 /// Keyframes from what is known of them without chunks, then chunks with keyframes held.

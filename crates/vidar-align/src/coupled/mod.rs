@@ -19,7 +19,7 @@ mod graph;
 mod kernel;
 
 pub use factor::{Attachment, Factor, RelativeChunk};
-pub use graph::{CoupledConfig, CoupledState, GraphError, Mode, Solution, solve};
+pub use graph::{CoupledConfig, CoupledState, GraphError, InformationFlow, Solution, solve};
 pub use kernel::Kernel;
 
 /// By how much the standard deviations of n measurements that share one error are widened so that they count as one:

@@ -6,7 +6,7 @@ use nalgebra::{UnitVector3, Vector2, Vector3};
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::{RngCore, SeedableRng};
 use std::ops::Range;
-use vidar_align::{ChunkObservation, FrameObservation, MetricAnchor};
+use vidar_align::{ChunkObservation, FrameObservation, PosePrior};
 use vidar_core::model::ChunkFrame;
 use vidar_core::{
     ChunkId, Confidence, FrameId, GeometryPrediction, Image, LandmarkId, LieGroup, Pinhole, RelativeDepth,
@@ -238,10 +238,10 @@ pub fn observe(
             frame.landmarks = landmarks(i);
             match odometry {
                 Some(poses) => {
-                    let mut anchor = MetricAnchor::known(poses[i]);
+                    let mut anchor = PosePrior::new(poses[i]);
                     let up = poses[i].rotation.inverse().act(&Vector3::z());
                     anchor.up_in_camera = Some(UnitVector3::new_normalize(up));
-                    frame.with_anchor(anchor)
+                    frame.with_pose_prior(anchor)
                 }
                 None => frame,
             }

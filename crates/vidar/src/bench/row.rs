@@ -40,7 +40,7 @@ pub struct BenchRow {
     pub seconds: f64,
     /// Largest resident memory of the run, bytes, where the system tells.
     pub peak_memory_bytes: Option<u64>,
-    /// Guards that acted, and loops believed of those judged.
+    /// Rejections, and loops accepted of those evaluated.
     pub placement: serde_json::Value,
     /// The run folder, relative to the bench's.
     pub folder: PathBuf,
@@ -96,7 +96,7 @@ pub(super) fn run_row(
     mode: CouplingMode,
     cancel: &CancelToken,
 ) -> Result<BenchRow, Error> {
-    let folder = PathBuf::from("runs").join(&sequence.name).join(mode.word());
+    let folder = PathBuf::from("runs").join(&sequence.name).join(mode.name());
     let layered = layered_for(request, mode)?;
     let key = key(sequence, &layered.to_toml(false))?;
     let place = request.out.join(&folder);

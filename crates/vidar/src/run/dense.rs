@@ -75,7 +75,7 @@ impl Road<'_> {
         let mut window = ViewWindow::new(self.dataset, &self.plan.keyframes, &remap);
         let mut aligner = Aligner::new(self.plan.mode, &self.config.align)?;
         if looks.are_whitened() {
-            aligner = aligner.with_whitened_places();
+            aligner = aligner.with_whitened_descriptors();
         }
         let identity = identity(self.dataset, self.plan, self.config)?;
         let camera = self.dataset.rig.camera(self.dataset.camera);
@@ -208,12 +208,12 @@ impl Road<'_> {
             chunk: report.chunk_id.0,
             scale: report.world_from_chunk.map(|s| s.scale),
             center_rms_m: Some(report.center_rms_m).filter(|m| m.is_finite()),
-            verdict: report.verdict,
+            status: report.status,
         });
-        if report.verdict.is_usable() {
+        if report.status.is_usable() {
             return Ok(None);
         }
-        let mut message = format!("not placed: {}", report.verdict.words());
+        let mut message = format!("not placed: {}", report.status.description());
         if report.center_rms_m.is_finite() {
             message += &format!(" (camera centres {:.3} m RMS off)", report.center_rms_m);
         }

@@ -7,7 +7,7 @@ use crate::chunks::StoredChunk;
 use crate::keyframes::Keyframe;
 use std::collections::{BTreeMap, BTreeSet};
 use vidar_align::aligner::covariance_in_camera;
-use vidar_align::{ChunkObservation, FrameObservation, MetricAnchor};
+use vidar_align::{ChunkObservation, FrameObservation, PosePrior};
 use vidar_core::camera::Pixel;
 use vidar_core::{
     FrameId, KeyframeId, LandmarkId, LieGroup, OdometryKeyframe, Pinhole, PoseCovariance, Se3, SparseLandmark,
@@ -77,13 +77,13 @@ impl<'a> Known<'a> {
             if let (true, Some(depth)) = (self.carries_landmarks, depth) {
                 frame.landmarks = self.carried(plan, k, &pose, &depth);
             }
-            return frame.with_anchor(MetricAnchor::known(pose));
+            return frame.with_pose_prior(PosePrior::new(pose));
         };
         let before = k.checked_sub(1).and_then(|k| self.by_frame.get(&plan.keyframes[k].image.frame_id));
-        let mut anchor = MetricAnchor::from_odometry(odometry, &self.body_from_camera);
+        let mut prior = PosePrior::from_odometry(odometry, &self.body_from_camera);
         // The trajectory in use may be smoother than what the keyframe was first given.
-        anchor.world_from_camera = pose;
-        anchor.relative_covariance = before
+        prior.world_from_camera = pose;
+        prior.relative_covariance = before
             .and_then(|before| self.since(odometry, before))
             .map(|covariance| covariance_in_camera(&covariance, &self.body_from_camera));
         if let Some(depth) = depth {
@@ -93,7 +93,7 @@ impl<'a> Known<'a> {
             };
             frame.landmarks = odometry.landmarks.iter().filter_map(to_depth).collect();
         }
-        frame.with_anchor(anchor)
+        frame.with_pose_prior(prior)
     }
 
     /// Landmarks of a frame that lies between two of the odometry's keyframes: those that both see, from where the nearer one

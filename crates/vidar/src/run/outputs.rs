@@ -144,27 +144,27 @@ pub fn source_json(plan: &Plan) -> Value {
     json!(plan.anchor.as_ref().map(|a| &a.source))
 }
 
-/// What the alignment says of itself: guards, loops, drift, scales.
+/// The alignment: chunk status and scale, loops, rejections, graph, drift.
 fn placement_json(placement: &Placement) -> Value {
     let finite = |v: f64| v.is_finite().then_some(v);
     let chunk = |c: &ChunkPlacement| {
         json!({
-            "chunk": c.chunk_id, "verdict": c.verdict, "metres_per_unit": c.world_from_chunk.scale,
+            "chunk": c.chunk_id, "status": c.status, "metres_per_unit": c.world_from_chunk.scale,
             "log_scale_std": finite(c.log_scale_std),
         })
     };
     let revisit = |l: &LoopReport| {
         json!({
             "later": l.later, "earlier": l.earlier, "similarity": l.similarity, "inlier_ratio": finite(l.inlier_ratio),
-            "chi2": finite(l.chi2), "refused": l.refusal,
+            "chi2": finite(l.chi2), "rejection": l.rejection,
         })
     };
     json!({
         "chunks": placement.chunks.iter().map(chunk).collect::<Vec<_>>(),
         "loops": placement.loops.iter().map(revisit).collect::<Vec<_>>(),
-        "guards": placement.guards,
+        "rejections": placement.rejections,
         "graph": placement.graph.as_ref().map(|g| json!({
-            "mode": g.mode, "iterations": g.iterations, "cost": g.cost, "odometry_chi2": finite(g.odometry_chi2),
+            "flow": g.flow, "iterations": g.iterations, "cost": g.cost, "odometry_chi2": finite(g.odometry_chi2),
         })),
         "drift": {
             "center_rms_m": finite(placement.drift.center_rms_m), "center_max_m": finite(placement.drift.center_max_m),

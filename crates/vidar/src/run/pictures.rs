@@ -10,7 +10,7 @@ use vidar_core::Trajectory;
 use vidar_dataset::Dataset;
 use vidar_view::{
     AxisSpec, Figure, FigureWidth, Histogram, MapCamera, MapSurface, Picture, PictureSize, PlotTrajectory,
-    Report, Section, Shading, SummaryItem, Table, TrajectoryPlot, Verdict, VerdictLevel, Viewpoint,
+    Report, Section, Shading, SummaryItem, Table, TrajectoryPlot, Assessment, AssessmentLevel, Viewpoint,
 };
 
 const MAP_SIZE: (usize, usize) = (960, 640);
@@ -38,7 +38,7 @@ pub fn draw(
             outcome.plan.poses(),
             outcome.plan.mode
         ),
-        verdict: Some(verdict(outcome)),
+        assessment: Some(assessment(outcome)),
         summary: summary(outcome),
         sections: vec![
             map_section(outcome, path.as_ref(), &up, &mut album)?,
@@ -82,7 +82,7 @@ impl Album<'_> {
     }
 }
 
-fn verdict(outcome: &RunOutcome) -> Verdict {
+fn assessment(outcome: &RunOutcome) -> Assessment {
     let upper = if anchored_by_truth(&outcome.plan) {
         "; poses are ground truth, so this is an upper bound"
     } else {
@@ -91,18 +91,18 @@ fn verdict(outcome: &RunOutcome) -> Verdict {
     let (level, text) =
         match (outcome.status, outcome.judgement.surface.as_ref().and_then(|s| s.native.last())) {
             (ExitStatus::Interrupted, _) => {
-                (VerdictLevel::Bad, "interrupted: only a part was mapped".to_owned())
+                (AssessmentLevel::Bad, "interrupted: only a part was mapped".to_owned())
             }
             (ExitStatus::Degraded, _) => {
-                (VerdictLevel::Caution, "finished, but part of the input is missing (see warnings)".into())
+                (AssessmentLevel::Caution, "finished, but part of the input is missing (see warnings)".into())
             }
             (_, Some(s)) => (
-                if s.f >= 0.5 { VerdictLevel::Good } else { VerdictLevel::Caution },
+                if s.f >= 0.5 { AssessmentLevel::Good } else { AssessmentLevel::Caution },
                 format!("F {:.3} at {:.2} m against the reference{upper}", s.f, s.threshold_m),
             ),
-            (_, None) => (VerdictLevel::Unjudged, "there is no reference to judge the surface by".to_owned()),
+            (_, None) => (AssessmentLevel::NotEvaluated, "there is no reference to judge the surface by".to_owned()),
         };
-    Verdict { level, text }
+    Assessment { level, text }
 }
 
 /// What was made, how far to trust it, how long it took, what next.
@@ -181,7 +181,7 @@ pub fn summary_lines(outcome: &RunOutcome) -> Vec<(&'static str, String)> {
     lines
 }
 
-/// How chunks were coupled, how well their scales are known, and which guards acted.
+/// How chunks were coupled, how well their scales are known, and which rejection reasons applied.
 fn coupling_line(outcome: &RunOutcome) -> String {
     let mut text = outcome.plan.mode.to_string();
     let Some(placement) = &outcome.map.placement else { return text };
@@ -191,17 +191,17 @@ fn coupling_line(outcome: &RunOutcome) -> String {
     if let Some(median) = stds.get(stds.len() / 2) {
         text += &format!(", scale of a chunk known to {:.1} %", median * 100.0);
     }
-    let accepted = placement.loops.iter().filter(|l| l.refusal.is_none()).count();
+    let accepted = placement.loops.iter().filter(|l| l.rejection.is_none()).count();
     if !placement.loops.is_empty() {
         text += &format!(", {accepted} of {} loops believed", placement.loops.len());
     }
-    let guards: Vec<String> = placement
-        .guards
+    let rejections: Vec<String> = placement
+        .rejections
         .iter()
-        .map(|(guard, n)| format!("{} {n}x", serde_json::json!(guard).as_str().unwrap_or_default()))
+        .map(|(reason, n)| format!("{} {n}x", serde_json::json!(reason).as_str().unwrap_or_default()))
         .collect();
-    if !guards.is_empty() {
-        text += &format!("; guards: {}", guards.join(", "));
+    if !rejections.is_empty() {
+        text += &format!("; rejections: {}", rejections.join(", "));
     }
     text
 }

@@ -146,7 +146,7 @@ impl Plan {
 
     /// Whether the map comes out in metres.
     pub fn is_metric(&self) -> bool {
-        self.anchor.is_some() && self.mode.uses_anchors()
+        self.anchor.is_some() && self.mode.uses_pose_priors()
     }
 
     /// The plan in lines of label and text, for `--dry-run` and the report.
@@ -201,7 +201,7 @@ fn anchor(
         config.input.poses = PoseSource::GroundTruth;
     }
     match input::metric_anchor(dataset, &config, events, cancel) {
-        Err(Error::NoAnchor { .. } | Error::NoOdometry { .. }) if !mode.uses_anchors() => Ok(None),
+        Err(Error::NoAnchor { .. } | Error::NoOdometry { .. }) if !mode.uses_pose_priors() => Ok(None),
         other => other.map(Some),
     }
 }

@@ -27,7 +27,8 @@ pub(super) fn chi2(
     candidate: &LoopCandidate,
     fit: &OverlapFit,
 ) -> Option<f64> {
-    if !machine.mode.uses_anchors() || !machine.chunks[earlier..=later].iter().all(|c| c.odometry_trusted) {
+    if !machine.mode.uses_pose_priors() || !machine.chunks[earlier..=later].iter().all(|c| c.odometry_trusted)
+    {
         return None;
     }
     let (a, b) = (&machine.chunks[later], &machine.chunks[earlier]);
@@ -153,8 +154,8 @@ impl super::super::memory::Frames {
         second: FrameId,
         weights: &super::super::GraphWeights,
     ) -> Option<(Se3, Matrix6<f64>)> {
-        let end = self.anchor(second)?.world_from_camera;
-        let start = self.anchor(first)?.world_from_camera;
+        let end = self.pose_prior(second)?.world_from_camera;
+        let start = self.pose_prior(first)?.world_from_camera;
         let mut covariance = Matrix6::zeros();
         for step in self.steps().filter(|s| s.from >= first && s.to <= second) {
             let carry = (end.inverse() * step.world_from_to).adjoint();

@@ -55,7 +55,12 @@ fn factors() -> Vec<Factor> {
         )),
         Factor::Scale { k: 1, log_scale: 0.4, std: 0.02, kernel: Kernel::Quadratic },
         Factor::ScaleWalk { k: 1, l: 0, log_ratio: 0.8, std: 0.02 },
-        Factor::Anchor { i: 0, world_from_camera: t[0] * near, position_std_m: 1e-2, heading_std_rad: 1e-2 },
+        Factor::GaugePrior {
+            i: 0,
+            world_from_camera: t[0] * near,
+            position_std_m: 1e-2,
+            heading_std_rad: 1e-2,
+        },
     ]
 }
 

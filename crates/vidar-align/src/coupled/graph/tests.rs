@@ -24,7 +24,7 @@ fn odometry(poses: &[Se3]) -> Vec<Factor> {
 }
 
 fn anchor(pose: &Se3) -> Factor {
-    Factor::Anchor { i: 0, world_from_camera: *pose, position_std_m: 1e-3, heading_std_rad: 1e-3 }
+    Factor::GaugePrior { i: 0, world_from_camera: *pose, position_std_m: 1e-3, heading_std_rad: 1e-3 }
 }
 
 fn attach(poses: &[Se3], k: usize, gauge: &Sim3) -> Vec<Factor> {
@@ -63,7 +63,7 @@ fn a_chunk_finds_its_gauge_and_keyframes_stay_when_all_agree() {
     let start = CoupledState { keyframes: truth.clone(), chunks: vec![gauge() * Sim3::exp(&off)] };
     let solved =
         solve(&start, &factors, &CoupledConfig { max_iterations: 60, ..Default::default() }).unwrap();
-    assert_eq!(solved.mode, Mode::Coupled);
+    assert_eq!(solved.flow, InformationFlow::Coupled);
     assert!(solved.state.chunks[0].minus(&gauge()).norm() < 1e-6, "{:?}", solved.state.chunks[0]);
     for (a, b) in solved.state.keyframes.iter().zip(&truth) {
         assert!(a.minus(b).norm() < 1e-6);
@@ -124,7 +124,7 @@ fn a_model_that_contradicts_the_odometry_does_not_bend_it() {
     }));
     let start = CoupledState { keyframes: truth.clone(), chunks: vec![Sim3::IDENTITY] };
     let solved = solve(&start, &factors, &CoupledConfig::default()).unwrap();
-    assert_eq!(solved.mode, Mode::OneWay);
+    assert_eq!(solved.flow, InformationFlow::OneWay);
     assert!(solved.odometry_chi2 > 2.0);
     for (a, b) in solved.state.keyframes.iter().zip(&truth) {
         assert!(a.minus(b).norm() < 1e-6);
