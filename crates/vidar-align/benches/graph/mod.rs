@@ -24,7 +24,7 @@ pub fn graph() -> (CoupledState, Vec<Factor>) {
                 .expect("a similarity")
         })
         .collect();
-    let mut factors = vec![Factor::Anchor {
+    let mut factors = vec![Factor::GaugePrior {
         i: 0,
         world_from_camera: truth[0],
         position_std_m: 1e-3,
