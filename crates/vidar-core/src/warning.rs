@@ -3,9 +3,24 @@
 use serde::{Deserialize, Serialize};
 use std::fmt;
 
+/// What a warning means for the result.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Severity {
+    /// The result is what was asked for; the user should know this about the input or the way it was made.
+    #[default]
+    Info,
+    /// A part of the result is missing, or it was made in a weaker way than asked for. A run that raised one ends as
+    /// degraded (exit code 3).
+    Degraded,
+}
+
 /// Something the user should know, though the work went on.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Warning {
+    /// What it means for the result.
+    #[serde(default)]
+    pub severity: Severity,
     /// Stable kebab-case kind, for grouping and for scripts (`time-gap`, `image-truncated`).
     pub kind: String,
     /// What was found, with numbers and units.
@@ -17,9 +32,20 @@ pub struct Warning {
 }
 
 impl Warning {
-    /// A warning of `kind` saying `message`.
+    /// A warning of `kind` saying `message`, of severity [`Severity::Info`].
     pub fn new(kind: impl Into<String>, message: impl Into<String>) -> Self {
-        Self { kind: kind.into(), message: message.into(), place: String::new(), hint: None }
+        Self {
+            severity: Severity::Info,
+            kind: kind.into(),
+            message: message.into(),
+            place: String::new(),
+            hint: None,
+        }
+    }
+
+    /// A warning of `kind` saying `message`: a part of the result is missing or weaker than asked for.
+    pub fn degraded(kind: impl Into<String>, message: impl Into<String>) -> Self {
+        Self { severity: Severity::Degraded, ..Self::new(kind, message) }
     }
 
     /// The same warning with its place.

@@ -124,7 +124,7 @@ impl PointFusion {
             self.dropped
         );
         let hint = "raise fusion.memory_budget_bytes or fusion.voxel_size_m";
-        vec![Warning::new("fusion-memory-budget", message).at("fusion.memory_budget_bytes").hint(hint)]
+        vec![Warning::degraded("fusion-memory-budget", message).at("fusion.memory_budget_bytes").hint(hint)]
     }
 
     /// Bytes held now; never above the budget.

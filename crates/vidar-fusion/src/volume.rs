@@ -257,7 +257,7 @@ impl TsdfVolume {
             );
             let hint =
                 "raise fusion.memory_budget_bytes, or fusion.voxel_size_m (memory falls with its square)";
-            let warning = Warning::new("fusion-memory-budget", message).at("fusion.memory_budget_bytes");
+            let warning = Warning::degraded("fusion-memory-budget", message).at("fusion.memory_budget_bytes");
             warnings.push(warning.hint(hint));
         }
         if self.shortened_views > 0 {
