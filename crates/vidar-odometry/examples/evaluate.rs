@@ -6,7 +6,7 @@
 //!     [--trajectory FILE] [--frames FILE] [--set KEY=VALUE]... SEQUENCE...
 //! ```
 //!
-//! A sequence is any folder with images, IMU readings and ground truth that `vidar-dataset` reads. Figures: ATE after the best
+//! A sequence is any folder with images, IMU measurements and ground truth that `vidar-dataset` reads. Figures: ATE after the best
 //! rigid motion and after the best similarity, |ln s|, relative error per metre, share of frames with a pose, seconds
 //! from the first image to the first metric pose, time per image (decoding left out), peak memory. `--set` changes
 //! a number of the odometry's configuration; `--frames` writes what became of the tracks in every image.
@@ -14,7 +14,7 @@
 //! Time is wall time. On a machine that others use too, `--repeat 5` runs a sequence five times (the results are the same
 //! bits) and takes the least of every image's five times. `--stages` splits the median and the 95 % quantile by stage.
 //!
-//! `--image-noise`, `--imu-noise` spoil what is read: noise of so many grey levels; so much more inertial noise that
+//! `--image-noise`, `--imu-noise` corrupt what is read: noise of so many grey levels; so much more inertial noise that
 //! its whole is FACTOR times the data sheet's (the bias stays). `--halve` averages 2 × 2 pixels.
 
 #![allow(clippy::print_stdout, clippy::print_stderr)] // a program
@@ -185,17 +185,17 @@ fn stages(times: &[StageTimes]) -> String {
         let _ = write!(text, "\n  {name:<12} {n:>7} {median:>7.3} {high:>7.3} {mean:>7.3}");
     };
     let millis = |secs: std::time::Duration| 1e3 * secs.as_secs_f64();
-    let running = |t: &&StageTimes| t.of(Stage::Start).is_zero();
+    let running = |t: &&StageTimes| t.of(Stage::Initialise).is_zero();
     for stage in Stage::ALL {
-        let passed = times.iter().filter(|t| running(t) == (stage != Stage::Start));
+        let passed = times.iter().filter(|t| running(t) == (stage != Stage::Initialise));
         row(stage.name(), passed.map(|t| millis(t.of(stage))).collect());
     }
     row("all, running", times.iter().filter(running).map(|t| millis(t.total())).collect());
     text
 }
 
-/// What spoils a recording while it is read.
-struct Spoiler {
+/// What corrupts a recording while it is read.
+struct Corruptor {
     random: Random,
     image_noise: f64,
     /// Standard deviations per reading: rad/s, m/s².
@@ -203,7 +203,7 @@ struct Spoiler {
     halve: bool,
 }
 
-impl Spoiler {
+impl Corruptor {
     fn new(options: &Options, noise: Option<ImuNoise>) -> Self {
         // Variances add up: what is missing to FACTOR times the data sheet's.
         let more = (options.imu_noise * options.imu_noise - 1.0).max(0.0).sqrt();
@@ -214,7 +214,7 @@ impl Spoiler {
         Self { random: Random::new(7), image_noise: options.image_noise, imu_noise, halve: options.halve }
     }
 
-    fn spoil(&mut self, event: &mut SensorEvent) {
+    fn corrupt(&mut self, event: &mut SensorEvent) {
         match event {
             SensorEvent::Imu(sample) => {
                 let [gyro, accel] = self.imu_noise;
@@ -271,7 +271,7 @@ fn run(dataset: &Dataset, options: &Options) -> Result<Run, Failure> {
             camera.model = halved_camera(&camera.model)?;
         }
     }
-    let mut spoiler = Spoiler::new(options, rig.imu);
+    let mut corruptor = Corruptor::new(options, rig.imu);
     let mut odometry = Odometry::new(&rig, dataset.camera, &config)?;
     let mut run = Run { outputs: Vec::new(), times: Vec::new(), poses: Vec::new() };
     for event in dataset.events() {
@@ -279,7 +279,7 @@ fn run(dataset: &Dataset, options: &Options) -> Result<Run, Failure> {
         if matches!(event, SensorEvent::GroundTruth { .. } | SensorEvent::Depth { .. }) {
             continue;
         }
-        spoiler.spoil(&mut event);
+        corruptor.corrupt(&mut event);
         if let Some(output) = odometry.push(event)? {
             run.times.push(odometry.stage_times());
             keep(&mut run, output, options.mono);
@@ -333,7 +333,7 @@ fn tell(run: &Run) {
 fn frames(run: &Run) -> String {
     use std::fmt::Write as _;
     let mut text =
-        String::from("#time,health,landmarks_found,tried,young_found,tried,contradicting,chi2,keyframe\n");
+        String::from("#time,health,landmarks_found,tried,seeds_found,tried,contradicting,chi2,keyframe\n");
     for (output, tracking) in run.outputs.iter().filter_map(|o| Some((o, o.tracking()?))) {
         let t = &tracking.tracks;
         let _ = writeln!(
@@ -343,8 +343,8 @@ fn frames(run: &Run) -> String {
             tracking.health,
             t.landmarks_found,
             t.landmarks_tried,
-            t.young_found,
-            t.young_tried,
+            t.seeds_found,
+            t.seeds_tried,
             t.contradicting,
             t.chi2_per_dof,
             u8::from(tracking.keyframe.is_some())

@@ -4,7 +4,7 @@ use crate::backend::{Linearisation, SmootherConfig};
 use crate::error::OdometryError;
 use serde::{Deserialize, Serialize};
 
-/// Whether inertial readings are used.
+/// Whether IMU measurements are used.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, schemars::JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum ImuUse {
@@ -21,7 +21,7 @@ pub enum ImuUse {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct OdometryConfig {
-    /// Whether inertial readings are used: `auto`, `required` or `off` (the camera alone, up to scale).
+    /// Whether IMU measurements are used: `auto`, `required` or `off` (the camera alone, up to scale).
     pub imu: ImuUse,
     /// Landmarks followed at once, 20…400. More are more accurate and cost time in proportion.
     pub max_landmarks: usize,
@@ -44,7 +44,7 @@ pub struct OdometryConfig {
     pub estimate_extrinsics: bool,
     /// Fastest speed that is believed, m/s, 0.1…100.
     pub max_speed_mps: f64,
-    /// After this long without landmarks or readings the state is given up, s, 0.1…10.
+    /// After this long without landmarks or IMU measurements the state is given up, s, 0.1…10.
     pub max_blind_secs: f64,
 }
 
@@ -110,8 +110,8 @@ mod tests {
 
     #[test]
     fn each_bad_key_is_named() {
-        type Spoil = fn(&mut OdometryConfig);
-        let cases: [(&str, Spoil); 9] = [
+        type Corrupt = fn(&mut OdometryConfig);
+        let cases: [(&str, Corrupt); 9] = [
             ("max_landmarks", |c| c.max_landmarks = 3),
             ("max_keyframes", |c| c.max_keyframes = 100),
             ("iterations", |c| c.iterations = 0),
@@ -123,9 +123,9 @@ mod tests {
             ("max_blind_secs", |c| c.max_blind_secs = f64::INFINITY),
         ];
         OdometryConfig::default().validate().unwrap();
-        for (name, spoil) in cases {
+        for (name, corrupt) in cases {
             let mut config = OdometryConfig::default();
-            spoil(&mut config);
+            corrupt(&mut config);
             match config.validate() {
                 Err(OdometryError::BadConfig { key, .. }) => assert_eq!(key, name),
                 other => panic!("{name}: {other:?}"),

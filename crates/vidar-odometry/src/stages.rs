@@ -5,52 +5,52 @@ use std::time::{Duration, Instant};
 /// A stage of the work on one image.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Stage {
-    /// The image at several resolutions, and the readings up to it.
+    /// The image at several resolutions, and the IMU measurements up to it.
     Pyramid,
     /// The search for a first metric state.
-    Start,
-    /// The state's prediction by readings or, without an IMU, by image alignment.
+    Initialise,
+    /// The state's prediction by IMU measurements or, without an IMU, by image alignment.
     Predict,
-    /// Landmarks and young tracks measured against their keyframes' patches.
+    /// Landmarks and seeds measured against their keyframes' patches.
     Match,
-    /// The window's states and landmarks, and which sightings do not fit.
+    /// The window's states and landmarks, and which observations do not fit.
     Smooth,
-    /// Distances of young tracks.
+    /// Distances of seeds.
     Distances,
     /// A new keyframe: detection of features.
     Keyframe,
     /// Frames that leave the window.
     Marginalise,
     /// Covariances, health and what is told.
-    Tell,
+    Output,
 }
 
 impl Stage {
     /// All stages, in the order in which an image passes them.
     pub const ALL: [Self; 9] = [
         Self::Pyramid,
-        Self::Start,
+        Self::Initialise,
         Self::Predict,
         Self::Match,
         Self::Smooth,
         Self::Distances,
         Self::Keyframe,
         Self::Marginalise,
-        Self::Tell,
+        Self::Output,
     ];
 
     /// Its name.
     pub fn name(self) -> &'static str {
         match self {
             Self::Pyramid => "pyramid",
-            Self::Start => "start",
+            Self::Initialise => "start",
             Self::Predict => "predict",
             Self::Match => "match",
             Self::Smooth => "smooth",
             Self::Distances => "distances",
             Self::Keyframe => "keyframe",
             Self::Marginalise => "marginalise",
-            Self::Tell => "tell",
+            Self::Output => "tell",
         }
     }
 }
@@ -107,7 +107,7 @@ mod tests {
         }
         let times = clock.times();
         assert_eq!(times.total(), clock.last - begin);
-        assert_eq!(times.of(Stage::Start), Duration::ZERO);
+        assert_eq!(times.of(Stage::Initialise), Duration::ZERO);
         assert!(Stage::ALL.iter().enumerate().all(|(k, s)| *s as usize == k));
     }
 }

@@ -48,7 +48,7 @@ const IMAGE_MS: i64 = 50;
 struct Round {
     rig: vidar_core::Rig,
     images: Vec<Image<u8>>,
-    readings: Vec<ImuSample>,
+    imu_samples: Vec<ImuSample>,
     truth: Vec<Se3>,
 }
 
@@ -98,8 +98,8 @@ fn round() -> Round {
     let all = simulate_imu(&flight, &config).samples;
     let (from, length) = (all[0].time + Duration::from_millis(1000 * ROUND_SECS), 1000 * ROUND_SECS);
     let within = all.iter().filter(|s| s.time >= from && s.time < from + Duration::from_millis(length));
-    let readings = within.map(|s| ImuSample { time: epoch + (s.time - from), ..*s }).collect();
-    Round { rig: vidar_synth::euroc_rig(config.width, config.height).unwrap(), images, readings, truth }
+    let imu_samples = within.map(|s| ImuSample { time: epoch + (s.time - from), ..*s }).collect();
+    Round { rig: vidar_synth::euroc_rig(config.width, config.height).unwrap(), images, imu_samples, truth }
 }
 
 /// What the odometry holds after every round, bytes; its worst misjudgement of a round's way, as a share of it; losses.
@@ -120,12 +120,12 @@ fn fly(round: &Round, rounds: i64) -> Flown {
     let mut places: Vec<Vector3<f64>> = Vec::with_capacity(truth.len());
     for lap in 0..rounds {
         let begin = Timestamp::from_nanos(1_000_000_000) + Duration::from_millis(1000 * ROUND_SECS * lap);
-        let mut readings = round.readings.iter().peekable();
+        let mut imu_samples = round.imu_samples.iter().peekable();
         places.clear();
         for (k, image) in round.images.iter().enumerate() {
             let at = Duration::from_millis(IMAGE_MS * k as i64);
-            while let Some(s) =
-                readings.next_if(|s| s.time - Timestamp::from_nanos(0) < at + Duration::from_millis(IMAGE_MS))
+            while let Some(s) = imu_samples
+                .next_if(|s| s.time - Timestamp::from_nanos(0) < at + Duration::from_millis(IMAGE_MS))
             {
                 let time = begin + (s.time - Timestamp::from_nanos(0));
                 let _ = odometry
@@ -172,7 +172,7 @@ fn note(flown: &mut Flown, places: &mut Vec<Vector3<f64>>, output: &vidar_odomet
 /// From round to round the window holds now a few more landmarks, now a few less: nothing but that may change.
 const SWING_BYTES: isize = 4 << 20;
 
-fn judge(flown: &Flown) {
+fn evaluate(flown: &Flown) {
     assert_eq!((flown.losses, flown.missing), (0, 0), "losses and images without a state");
     assert!(flown.worst_scale < 0.02, "a round was {} off in length", flown.worst_scale);
     let (first, last) = (flown.held[1], flown.held[flown.held.len() - 1]);
@@ -183,7 +183,7 @@ fn judge(flown: &Flown) {
 
 #[test]
 fn rounds_leave_no_memory_behind() {
-    judge(&fly(&round(), 3));
+    evaluate(&fly(&round(), 3));
 }
 
 #[test]
@@ -195,5 +195,5 @@ fn an_hour_is_flown_in_bounded_memory() {
         "held after two rounds {first}, after an hour {last} bytes; worst round {:.4}",
         flown.worst_scale
     );
-    judge(&flown);
+    evaluate(&flown);
 }

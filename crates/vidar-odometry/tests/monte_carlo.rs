@@ -9,14 +9,14 @@
 
 use nalgebra::Vector3;
 use vidar_core::{FrameId, ImuNoise, LieGroup, Se3, So3};
-use vidar_odometry::backend::{AnchorSigmas, Smoother};
+use vidar_odometry::backend::{GaugePriorSigmas, Smoother};
 use vidar_odometry::imu::{Bias, NavState};
 use vidar_odometry::simulate::{
     Course, CourseKind, FeatureOdometry, FeatureOdometryConfig, Flight, Motion, Random, Simulation,
     SimulationConfig, StepOutput,
 };
 
-const SIGMAS: AnchorSigmas = AnchorSigmas {
+const SIGMAS: GaugePriorSigmas = GaugePriorSigmas {
     position_m: 1e-3,
     yaw_rad: 1e-3,
     tilt_rad: 0.01,
@@ -58,7 +58,9 @@ fn fly(seed: u64, secs: f64, tracks: usize, rate_hz: f64) -> Run {
     odometry.start_at(first, disturbed(&first.truth, &mut random), SIGMAS).unwrap();
     let mut run = Run { nees: Vec::new(), relative_nees: Vec::new(), squared_errors: 0.0, frames: 0.0 };
     for (k, frame) in simulation.frames.iter().enumerate().skip(1) {
-        let StepOutput::Running(state) = odometry.push(frame.id, frame.time, &frame.seen).unwrap() else {
+        let StepOutput::SlidingWindowOdometry(state) =
+            odometry.push(frame.id, frame.time, &frame.observations).unwrap()
+        else {
             panic!("it was started");
         };
         let error = state.minus(&frame.truth);
@@ -92,7 +94,7 @@ fn mean(values: impl Iterator<Item = f64>) -> f64 {
     sum / n
 }
 
-fn judge(runs: &[Run], worst_ate_m: f64) {
+fn evaluate(runs: &[Run], worst_ate_m: f64) {
     let nees = mean(runs.iter().flat_map(|r| r.nees.iter().copied()));
     let relative = mean(runs.iter().flat_map(|r| r.relative_nees.iter().copied()));
     let ate = mean(runs.iter().map(|r| (r.squared_errors / r.frames).sqrt()));
@@ -106,14 +108,14 @@ fn judge(runs: &[Run], worst_ate_m: f64) {
 #[test]
 fn pose_covariance_is_honest_over_50_short_flights() {
     let runs: Vec<Run> = (0..50).map(|seed| fly(seed, 4.0, 40, 10.0)).collect();
-    judge(&runs, 0.06);
+    evaluate(&runs, 0.06);
 }
 
 #[test]
 #[ignore = "long: 50 flights of 20 s at 20 Hz"]
 fn pose_covariance_is_honest_over_50_long_flights() {
     let runs: Vec<Run> = (0..50).map(|seed| fly(seed, 20.0, 110, 20.0)).collect();
-    judge(&runs, 0.06);
+    evaluate(&runs, 0.06);
 }
 
 /// What is wrong with the calibration, and what of it was left.
@@ -141,15 +143,17 @@ fn calibrate(seed: u64, secs: f64, tracks: usize, offset_secs: f64, turn_deg: f6
     let mut random = Random::new(9_000 + seed);
     let off = So3::exp(&(random.normal3().normalize() * turn_deg.to_radians()));
     let truth = simulation.body_from_camera;
-    let believed = Se3::new(truth.rotation * off, truth.translation);
-    let mut odometry = FeatureOdometry::new(config, simulation.camera.clone(), believed);
-    simulation.readings.iter().for_each(|r| odometry.take(*r).unwrap());
+    let is_valid_imu = Se3::new(truth.rotation * off, truth.translation);
+    let mut odometry = FeatureOdometry::new(config, simulation.camera.clone(), is_valid_imu);
+    simulation.imu_samples.iter().for_each(|r| odometry.take(*r).unwrap());
     let first = &simulation.frames[0];
-    let sigmas = AnchorSigmas { velocity_mps: 0.2, ..SIGMAS };
+    let sigmas = GaugePriorSigmas { velocity_mps: 0.2, ..SIGMAS };
     odometry.start_at(first, disturbed(&first.truth, &mut random), sigmas).unwrap();
     let mut velocity_error_mps = f64::NAN;
     for frame in &simulation.frames[1..] {
-        let StepOutput::Running(state) = odometry.push(frame.id, frame.time, &frame.seen).unwrap() else {
+        let StepOutput::SlidingWindowOdometry(state) =
+            odometry.push(frame.id, frame.time, &frame.observations).unwrap()
+        else {
             panic!("it was started");
         };
         let in_body = |s: &NavState| s.world_from_body.rotation.inverse() * s.velocity;
@@ -293,7 +297,8 @@ fn pause(seed: u64, rest_secs: f64) -> (f64, [f64; 3]) {
         // Known after a moment, as in truth.
         let rests = (5.4..5.0 + rest_secs).contains(&secs);
         let push = if rests { FeatureOdometry::push_resting } else { FeatureOdometry::push };
-        let StepOutput::Running(state) = push(&mut odometry, frame.id, frame.time, &frame.seen).unwrap()
+        let StepOutput::SlidingWindowOdometry(state) =
+            push(&mut odometry, frame.id, frame.time, &frame.observations).unwrap()
         else {
             panic!("it was started");
         };

@@ -318,7 +318,7 @@ impl OdometryOutcome {
             "lost": tracked.lost,
             "images_out_of_order": tracked.counts.images_out_of_order,
             "images_repeated": tracked.counts.images_repeated,
-            "readings_refused": tracked.counts.readings_refused,
+            "imu_samples_rejected": tracked.counts.imu_samples_rejected,
             "imu_gaps": tracked.counts.imu_gaps,
             "milliseconds_per_image": files::milliseconds(tracked),
             "trajectory": self.report,

@@ -16,11 +16,11 @@ pub(crate) struct Whitening {
 }
 
 impl Whitening {
-    pub(crate) fn of(readings: &Preintegration) -> Self {
-        let model = readings.model();
-        let root_t = readings.secs().max(1e-9).sqrt();
+    pub(crate) fn of(preintegration: &Preintegration) -> Self {
+        let model = preintegration.model();
+        let root_t = preintegration.secs().max(1e-9).sqrt();
         // A floor keeps exact test data and empty stretches invertible.
-        let mut covariance = *readings.covariance();
+        let mut covariance = *preintegration.covariance();
         for k in 0..9 {
             covariance[(k, k)] += 1e-18;
         }
@@ -45,8 +45,8 @@ impl Whitening {
     }
 }
 
-/// How much later than the readings' first and last instant the two states are, s: the clock offset as it is believed now
-/// minus what was believed when the readings were cut.
+/// How much later than the IMU measurements' first and last instant the two states are, s: the clock offset as it is believed now
+/// minus what was believed when the IMU measurements were cut.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub(crate) struct Shift {
     pub(crate) begin: f64,
@@ -62,16 +62,16 @@ impl Shift {
     }
 }
 
-/// Motion over a stretch, gravity left out: an element of the group whose product is [`Moved::then`].
+/// Motion over a stretch, gravity left out: an element of the group whose product is [`MotionIncrement::then`].
 #[derive(Clone, Copy, Debug)]
-struct Moved {
+struct MotionIncrement {
     secs: f64,
     turn: So3,
     position: Vector3<f64>,
     velocity: Vector3<f64>,
 }
 
-impl Moved {
+impl MotionIncrement {
     /// At constant rates; `secs` may be negative.
     fn at(rates: &Rates, secs: f64) -> Self {
         Self {
@@ -92,15 +92,15 @@ impl Moved {
     }
 }
 
-/// The readings' motion as integrated, and before and after it what the shift takes off or adds.
-fn moved(readings: &Preintegration, i: &NavState, shift: Shift) -> [Moved; 3] {
-    let (turn, position, velocity) = readings.corrected(&i.bias);
-    let [first, last] = readings.ends();
-    let integrated = Moved { secs: readings.secs(), turn, position, velocity };
-    [Moved::at(&first, -shift.begin), integrated, Moved::at(&last, shift.end)]
+/// The IMU measurements' motion as integrated, and before and after it what the shift takes off or adds.
+fn moved(preintegration: &Preintegration, i: &NavState, shift: Shift) -> [MotionIncrement; 3] {
+    let (turn, position, velocity) = preintegration.corrected(&i.bias);
+    let [first, last] = preintegration.ends();
+    let integrated = MotionIncrement { secs: preintegration.secs(), turn, position, velocity };
+    [MotionIncrement::at(&first, -shift.begin), integrated, MotionIncrement::at(&last, shift.end)]
 }
 
-fn whole([before, integrated, after]: &[Moved; 3], shift: Shift) -> Moved {
+fn whole([before, integrated, after]: &[MotionIncrement; 3], shift: Shift) -> MotionIncrement {
     if shift.is_none() { *integrated } else { before.then(&integrated.then(after)) }
 }
 
@@ -109,14 +109,19 @@ fn whole([before, integrated, after]: &[Moved; 3], shift: Shift) -> Moved {
 /// `r_v = R_iᵀ(v_j − v_i − g t) − Δv(b)`, `r_b = b_j − b_i` (Forster 2017, eq. 45).
 ///
 /// With clocks that are off, Δ is the motion between the shifted instants: `E(−s_i) · Δ · E(s_j)`, where E is motion at the
-/// rates that the readings show at their ends. The states stay those of the images' true instants, so the images' factors
+/// rates that the IMU measurements show at their ends. The states stay those of the images' true instants, so the images' factors
 /// know nothing of clocks, and shift and heading stay free.
-pub(crate) fn residual(readings: &Preintegration, i: &NavState, j: &NavState, shift: Shift) -> Vector15 {
-    let delta = whole(&moved(readings, i, shift), shift);
+pub(crate) fn residual(
+    preintegration: &Preintegration,
+    i: &NavState,
+    j: &NavState,
+    shift: Shift,
+) -> Vector15 {
+    let delta = whole(&moved(preintegration, i, shift), shift);
     let t = delta.secs;
     let (from, to) = (&i.world_from_body, &j.world_from_body);
     let back = from.rotation.inverse();
-    let gravity = readings.model().gravity();
+    let gravity = preintegration.model().gravity();
     let turn = (delta.turn.inverse() * (back * to.rotation)).log();
     let moved = back * (to.translation - from.translation - i.velocity * t - gravity * (0.5 * t * t));
     let sped = back * (j.velocity - i.velocity - gravity * t);
@@ -131,13 +136,13 @@ pub(crate) fn residual(readings: &Preintegration, i: &NavState, j: &NavState, sh
 
 /// Derivatives of [`residual`] by the error states of both ends.
 pub(crate) fn jacobians(
-    readings: &Preintegration,
+    preintegration: &Preintegration,
     i: &NavState,
     j: &NavState,
     shift: Shift,
 ) -> (Matrix15, Matrix15) {
-    let delta = &readings.delta;
-    let parts = moved(readings, i, shift);
+    let delta = &preintegration.delta;
+    let parts = moved(preintegration, i, shift);
     let all = whole(&parts, shift);
     let [before, _, after] = &parts;
     let t = all.secs;
@@ -146,9 +151,9 @@ pub(crate) fn jacobians(
     let back_m = back.matrix();
     let turn = (all.turn.inverse() * (back * to.rotation)).log();
     let log_slope = So3::right_jacobian_inverse(&turn).unwrap_or_else(Matrix3::identity);
-    let d_gyro = i.bias.gyro - readings.bias().gyro;
+    let d_gyro = i.bias.gyro - preintegration.bias().gyro;
     let turn_by_gyro: Matrix3<f64> = delta.by_gyro_bias.fixed_view::<3, 3>(0, 0).into_owned();
-    let gravity = readings.model().gravity();
+    let gravity = preintegration.model().gravity();
     let moved = back * (to.translation - from.translation - i.velocity * t - gravity * (0.5 * t * t));
     let sped = back * (j.velocity - i.velocity - gravity * t);
     let (mut by_i, mut by_j) = (Matrix15::zeros(), Matrix15::zeros());
@@ -188,14 +193,14 @@ pub(crate) fn jacobians(
 
 /// Derivative of [`residual`] by the clock offset, which shifts both ends alike.
 pub(crate) fn by_time_offset(
-    readings: &Preintegration,
+    preintegration: &Preintegration,
     i: &NavState,
     j: &NavState,
     shift: Shift,
 ) -> Vector15 {
-    let parts = moved(readings, i, shift);
+    let parts = moved(preintegration, i, shift);
     let [before, integrated, after] = &parts;
-    let [first, last] = readings.ends();
+    let [first, last] = preintegration.ends();
     let rest = integrated.then(after);
     let all = before.then(&rest);
     let back = i.world_from_body.rotation.inverse();
@@ -226,7 +231,7 @@ pub(crate) fn body_velocity(state: &NavState) -> (Vector3<f64>, Matrix3<f64>, Ma
 
 /// What is known of the first state. `f64::INFINITY` says that nothing is.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-pub struct AnchorSigmas {
+pub struct GaugePriorSigmas {
     /// Position in the world, m per axis. Fixes the freedom of the world's origin.
     pub position_m: f64,
     /// Heading about the vertical, rad. Fixes the freedom of the world's heading.
@@ -241,7 +246,7 @@ pub struct AnchorSigmas {
     pub accel_bias: f64,
 }
 
-impl AnchorSigmas {
+impl GaugePriorSigmas {
     /// Origin and heading fixed, everything else as good as unknown; biases as MEMS parts have them.
     pub const GAUGE: Self = Self {
         position_m: 1e-3,
@@ -255,9 +260,9 @@ impl AnchorSigmas {
 
 /// The anchor's residual at `state` and derivative at `at`, whitened. Every row but position and yaw is blind to shifts
 /// and to yaw.
-pub(crate) fn anchor_at(
+pub(crate) fn gauge_prior_at(
     reference: &NavState,
-    sigmas: &AnchorSigmas,
+    sigmas: &GaugePriorSigmas,
     state: &NavState,
     at: &NavState,
 ) -> (Vector15, SMatrix<f64, 15, 15>) {

@@ -4,23 +4,23 @@
 //! runs of leading zeros in their rows.
 
 use super::dense::Cholesky;
-use super::inertial::{Shift, anchor_at, body_velocity, by_time_offset, jacobians, residual};
+use super::inertial::{Shift, body_velocity, by_time_offset, gauge_prior_at, jacobians, residual};
 use super::prior::Part;
-use super::visual::{self, CameraPlace};
-use super::window::{CALIBRATION_DIM, Calibration, Frame, Landmark, OFFSET_AT, Sighting};
+use super::visual::{self, CameraPose};
+use super::window::{CALIBRATION_DIM, Calibration, Frame, Landmark, LandmarkObservation, OFFSET_AT};
 use super::{Linearisation, Smoother, SmootherConfig};
 use crate::imu::NavState;
 use nalgebra::{Matrix3, SMatrix, SVector, Vector2, Vector3};
 use vidar_core::CameraModel;
 
-/// Whitened residual that a sighting which does not project counts as.
-const LOST_SIGMAS: f64 = 50.0;
+/// Whitened residual that a observation which does not project counts as.
+const UNPROJECTABLE_SIGMAS: f64 = 50.0;
 
 type ByCalibration = SMatrix<f64, 2, CALIBRATION_DIM>;
 
 /// A landmark's part in the last linearisation, for back substitution.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct Eliminated {
+pub(crate) struct EliminatedLandmark {
     pub(crate) slot: usize,
     pub(crate) inverse: Matrix3<f64>,
     pub(crate) gradient: Vector3<f64>,
@@ -31,7 +31,7 @@ pub(crate) struct Eliminated {
 
 /// `J_poseᵀ J_landmark` of one frame.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct Cross {
+pub(crate) struct PoseLandmarkBlock {
     pub(crate) frame: usize,
     pub(crate) value: SMatrix<f64, 6, 3>,
 }
@@ -52,12 +52,12 @@ pub(crate) struct System {
     pub(crate) solved: Vec<f64>,
     /// Whether `cholesky` is of the undamped system at the present states.
     pub(crate) factorised: bool,
-    pub(crate) places: Vec<CameraPlace>,
-    pub(crate) places_at: Vec<CameraPlace>,
+    pub(crate) camera_poses: Vec<CameraPose>,
+    pub(crate) camera_poses_at: Vec<CameraPose>,
     pub(crate) states_at: Vec<NavState>,
-    pub(crate) eliminated: Vec<Eliminated>,
-    pub(crate) cross: Vec<Cross>,
-    pub(crate) saved: Vec<super::optimise::Saved>,
+    pub(crate) eliminated: Vec<EliminatedLandmark>,
+    pub(crate) cross: Vec<PoseLandmarkBlock>,
+    pub(crate) saved: Vec<super::optimise::StateBackup>,
     pub(crate) saved_landmarks: Vec<(usize, Vector3<f64>, f64)>,
 }
 
@@ -75,8 +75,8 @@ impl System {
             cross: Vec::with_capacity(16 * 1024),
             saved: Vec::with_capacity(n / 15 + 1),
             saved_landmarks: Vec::with_capacity(1024),
-            places: Vec::with_capacity(n / 15 + 1),
-            places_at: Vec::with_capacity(n / 15 + 1),
+            camera_poses: Vec::with_capacity(n / 15 + 1),
+            camera_poses_at: Vec::with_capacity(n / 15 + 1),
             states_at: Vec::with_capacity(n / 15 + 1),
             ..Self::default()
         }
@@ -154,19 +154,19 @@ impl System {
     }
 }
 
-/// One sighting, whitened, weighted and differentiated.
-pub(crate) struct WeightedSighting {
+/// One observation, whitened, weighted and differentiated.
+pub(crate) struct WeightedObservation {
     pub(crate) residual: Vector2<f64>,
     pub(crate) jacobians: visual::VisualJacobians,
     pub(crate) by_calibration: Option<ByCalibration>,
 }
 
-/// What sightings need to know beside themselves.
+/// What observations need to know beside themselves.
 pub(crate) struct Scene<'a> {
     pub(crate) camera: &'a CameraModel,
     pub(crate) config: &'a SmootherConfig,
-    pub(crate) places: &'a [CameraPlace],
-    pub(crate) places_at: &'a [CameraPlace],
+    pub(crate) camera_poses: &'a [CameraPose],
+    pub(crate) camera_poses_at: &'a [CameraPose],
 }
 
 impl Scene<'_> {
@@ -180,21 +180,25 @@ impl Scene<'_> {
         }
     }
 
-    /// Whitened residual of a sighting whose landmark projects to `pixel`.
-    fn residual(&self, pixel: &Vector2<f64>, s: &Sighting) -> Vector2<f64> {
+    /// Whitened residual of a observation whose landmark projects to `pixel`.
+    fn residual(&self, pixel: &Vector2<f64>, s: &LandmarkObservation) -> Vector2<f64> {
         s.whitening * (pixel - s.pixel)
     }
 
     /// Where a landmark projects at the present states.
-    fn pixel(&self, landmark: &Landmark, s: &Sighting) -> Option<Vector2<f64>> {
-        let (host, target) = (&self.places[landmark.host.frame], &self.places[s.frame]);
+    fn pixel(&self, landmark: &Landmark, s: &LandmarkObservation) -> Option<Vector2<f64>> {
+        let (host, target) = (&self.camera_poses[landmark.host.frame], &self.camera_poses[s.frame]);
         self.camera.project(&visual::direction(host, target, &landmark.bearing, landmark.rho))
     }
 
-    /// Evaluates a sighting: stores its χ², returns its cost and, if it projects, what the system needs.
-    pub(crate) fn sighting(&self, landmark: &Landmark, s: &mut Sighting) -> (f64, Option<WeightedSighting>) {
-        let (host, target) = (&self.places_at[landmark.host.frame], &self.places_at[s.frame]);
-        let lost = self.huber(LOST_SIGMAS * LOST_SIGMAS).1;
+    /// Evaluates a observation: stores its χ², returns its cost and, if it projects, what the system needs.
+    pub(crate) fn observation(
+        &self,
+        landmark: &Landmark,
+        s: &mut LandmarkObservation,
+    ) -> (f64, Option<WeightedObservation>) {
+        let (host, target) = (&self.camera_poses_at[landmark.host.frame], &self.camera_poses_at[s.frame]);
+        let lost = self.huber(UNPROJECTABLE_SIGMAS * UNPROJECTABLE_SIGMAS).1;
         let jacobians = visual::jacobians(self.camera, host, target, &landmark.bearing, landmark.rho);
         let now = match &jacobians {
             // Derivatives are taken at the present states, and the pixel came with them.
@@ -202,7 +206,7 @@ impl Scene<'_> {
             _ => self.pixel(landmark, s),
         };
         let (Some(now), Some(mut jacobians)) = (now, jacobians) else {
-            s.chi2 = LOST_SIGMAS * LOST_SIGMAS;
+            s.chi2 = UNPROJECTABLE_SIGMAS * UNPROJECTABLE_SIGMAS;
             return (lost, None);
         };
         let residual = self.residual(&now, s);
@@ -218,11 +222,11 @@ impl Scene<'_> {
                     .unwrap_or_else(SMatrix::zeros);
             whiten * calibration_columns(self.config, &by_place)
         });
-        (cost, Some(WeightedSighting { residual: residual * weight.sqrt(), jacobians, by_calibration }))
+        (cost, Some(WeightedObservation { residual: residual * weight.sqrt(), jacobians, by_calibration }))
     }
 
-    /// The host's own sighting: it fixes the bearing only.
-    pub(crate) fn host(&self, landmark: &mut Landmark) -> Option<(f64, WeightedSighting)> {
+    /// The host's own observation: it fixes the bearing only.
+    pub(crate) fn host(&self, landmark: &mut Landmark) -> Option<(f64, WeightedObservation)> {
         let (pixel, by_direction) = self.camera.project_with_jacobian(&landmark.bearing)?;
         let residual = self.residual(&pixel, &landmark.host);
         let s = &mut landmark.host;
@@ -232,7 +236,7 @@ impl Scene<'_> {
         by_landmark.fixed_view_mut::<2, 2>(0, 0).copy_from(&by_bearing);
         let zero = SMatrix::zeros();
         let jacobians = visual::VisualJacobians { pixel, by_host: zero, by_target: zero, by_landmark };
-        Some((0.5 * s.chi2, WeightedSighting { residual, jacobians, by_calibration: None }))
+        Some((0.5 * s.chi2, WeightedObservation { residual, jacobians, by_calibration: None }))
     }
 }
 
@@ -247,7 +251,7 @@ fn calibration_columns(config: &SmootherConfig, by_place: &SMatrix<f64, 2, 6>) -
     out
 }
 
-/// How far the instants of two frames lie from where the readings between them were cut.
+/// How far the instants of two frames lie from where the IMU measurements between them were cut.
 pub(crate) fn shift_between(calibration: &Calibration, from: &Frame, to: &Frame) -> Shift {
     let now = calibration.time_offset_secs;
     Shift { begin: now - from.clock_secs, end: now - to.clock_secs }
@@ -269,13 +273,13 @@ impl Smoother {
     pub(crate) fn place_cameras(&self, system: &mut System) {
         let fej = self.config.first_estimates();
         let (now, at) = (self.calibration.body_from_camera, self.calibration.at(fej));
-        system.places.clear();
-        system.places_at.clear();
+        system.camera_poses.clear();
+        system.camera_poses_at.clear();
         system.states_at.clear();
         for frame in &self.frames {
             let state_at = frame.at(fej);
-            system.places.push(CameraPlace::new(&frame.state.world_from_body, &now));
-            system.places_at.push(CameraPlace::new(&state_at.world_from_body, &at));
+            system.camera_poses.push(CameraPose::new(&frame.state.world_from_body, &now));
+            system.camera_poses_at.push(CameraPose::new(&state_at.world_from_body, &at));
             system.states_at.push(state_at);
         }
     }
@@ -340,10 +344,14 @@ impl Smoother {
     }
 
     fn add_anchor(&self, system: &mut System) -> f64 {
-        let Some(anchor) = &self.anchor else { return 0.0 };
-        let k = anchor.frame;
-        let (r, j) =
-            anchor_at(&anchor.reference, &anchor.sigmas, &self.frames[k].state, &system.states_at[k]);
+        let Some(gauge_prior) = &self.gauge_prior else { return 0.0 };
+        let k = gauge_prior.frame;
+        let (r, j) = gauge_prior_at(
+            &gauge_prior.reference,
+            &gauge_prior.sigmas,
+            &self.frames[k].state,
+            &system.states_at[k],
+        );
         let (pose, motion) = (Part::Pose(k), Part::Motion(k));
         let (jp, jm) = (j.fixed_columns::<6>(0).into_owned(), j.fixed_columns::<9>(6).into_owned());
         let (at_pose, at_motion) = (system.offset(pose), system.offset(motion));
@@ -363,16 +371,16 @@ impl Smoother {
         let (before, rest) = self.frames.split_at_mut(k);
         let (from, to) = (&before[k - 1], &mut rest[0]);
         let shift = shift_between(&self.calibration, from, to);
-        let Some(link) = &mut to.link else { return 0.0 };
-        link.follow(&from.state);
-        let r = link.whitening.apply(&residual(&link.readings, &from.state, &to.state, shift));
+        let Some(imu_factor) = &mut to.imu_factor else { return 0.0 };
+        imu_factor.follow(&from.state);
+        let r =
+            imu_factor.whitening.apply(&residual(&imu_factor.preintegration, &from.state, &to.state, shift));
         let (state_i, state_j) = (&system.states_at[k - 1], &system.states_at[k]);
-        let (ji, jj) = jacobians(&link.readings, state_i, state_j, shift);
-        let by_offset = self
-            .config
-            .estimate_time_offset
-            .then(|| link.whitening.apply(&by_time_offset(&link.readings, state_i, state_j, shift)));
-        let (ji, jj) = (link.whitening.apply(&ji), link.whitening.apply(&jj));
+        let (ji, jj) = jacobians(&imu_factor.preintegration, state_i, state_j, shift);
+        let by_offset = self.config.estimate_time_offset.then(|| {
+            imu_factor.whitening.apply(&by_time_offset(&imu_factor.preintegration, state_i, state_j, shift))
+        });
+        let (ji, jj) = (imu_factor.whitening.apply(&ji), imu_factor.whitening.apply(&jj));
         let parts = [Part::Motion(k - 1), Part::Motion(k), Part::Pose(k - 1), Part::Pose(k)];
         for a in 0..4 {
             for b in 0..a {
@@ -445,18 +453,22 @@ impl Smoother {
     }
 
     fn add_landmarks(&mut self, system: &mut System, lambda: f64) -> f64 {
-        let places = std::mem::take(&mut system.places);
-        let places_at = std::mem::take(&mut system.places_at);
-        let scene =
-            Scene { camera: &self.camera, config: &self.config, places: &places, places_at: &places_at };
+        let camera_poses = std::mem::take(&mut system.camera_poses);
+        let camera_poses_at = std::mem::take(&mut system.camera_poses_at);
+        let scene = Scene {
+            camera: &self.camera,
+            config: &self.config,
+            camera_poses: &camera_poses,
+            camera_poses_at: &camera_poses_at,
+        };
         let mut cost = 0.0;
         for (slot, landmark) in self.landmarks.iter_mut().enumerate() {
-            if landmark.alive && !landmark.sightings.is_empty() {
+            if landmark.alive && !landmark.observations.is_empty() {
                 cost += add_landmark(system, &scene, landmark, slot, lambda);
             }
         }
-        system.places = places;
-        system.places_at = places_at;
+        system.camera_poses = camera_poses;
+        system.camera_poses_at = camera_poses_at;
         cost
     }
 }
@@ -479,12 +491,12 @@ fn add_landmark(
     let mut host_gradient = SVector::<f64, 6>::zeros();
     let mut by_calibration = SMatrix::<f64, CALIBRATION_DIM, 3>::zeros();
     let cross_begin = system.cross.len();
-    system.cross.push(Cross { frame: host, value: SMatrix::zeros() });
-    let mut sightings = std::mem::take(&mut landmark.sightings);
-    for s in &mut sightings {
-        let (part, weighted) = scene.sighting(landmark, s);
+    system.cross.push(PoseLandmarkBlock { frame: host, value: SMatrix::zeros() });
+    let mut observations = std::mem::take(&mut landmark.observations);
+    for s in &mut observations {
+        let (part, weighted) = scene.observation(landmark, s);
         cost += part;
-        let Some(WeightedSighting { residual: r, jacobians: j, by_calibration: c }) = weighted else {
+        let Some(WeightedObservation { residual: r, jacobians: j, by_calibration: c }) = weighted else {
             continue;
         };
         let target = system.offset(Part::Pose(s.frame));
@@ -496,7 +508,9 @@ fn add_landmark(
         square += j.by_landmark.transpose() * j.by_landmark;
         gradient += j.by_landmark.transpose() * r;
         system.cross[cross_begin].value += j.by_host.transpose() * j.by_landmark;
-        system.cross.push(Cross { frame: s.frame, value: j.by_target.transpose() * j.by_landmark });
+        system
+            .cross
+            .push(PoseLandmarkBlock { frame: s.frame, value: j.by_target.transpose() * j.by_landmark });
         if let Some(c) = c {
             by_calibration += c.transpose() * j.by_landmark;
             system.add(at_calibration, at_calibration, &(c.transpose() * c), 1.0);
@@ -505,7 +519,7 @@ fn add_landmark(
             system.add_gradient(at_calibration, &(c.transpose() * r), 1.0);
         }
     }
-    landmark.sightings = sightings;
+    landmark.observations = observations;
     system.add(at_host, at_host, &host_square, 1.0);
     system.add_gradient(at_host, &host_gradient, 1.0);
     let mut damped = square;
@@ -520,7 +534,7 @@ fn add_landmark(
     // Schur complement: H −= W V⁻¹ Wᵀ, g −= W V⁻¹ g_l.
     let cross_end = system.cross.len();
     for a in cross_begin..cross_end {
-        let Cross { frame, value } = system.cross[a];
+        let PoseLandmarkBlock { frame, value } = system.cross[a];
         let weighted = value * inverse;
         let row = system.offset(Part::Pose(frame));
         system.add_gradient(row, &(weighted * gradient), -1.0);
@@ -538,6 +552,13 @@ fn add_landmark(
         system.add(at_calibration, at_calibration, &(weighted * by_calibration.transpose()), -1.0);
         system.add_gradient(at_calibration, &(weighted * gradient), -1.0);
     }
-    system.eliminated.push(Eliminated { slot, inverse, gradient, cross_begin, cross_end, by_calibration });
+    system.eliminated.push(EliminatedLandmark {
+        slot,
+        inverse,
+        gradient,
+        cross_begin,
+        cross_end,
+        by_calibration,
+    });
     cost
 }

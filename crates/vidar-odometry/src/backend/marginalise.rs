@@ -1,19 +1,19 @@
 //! Frames that leave the window.
 //!
-//! A frame that is marginalised hands over everything that is said of it: readings on both sides, the anchor, the prior,
+//! A frame that is marginalised passes on everything that is said of it: IMU measurements on both sides, the anchor, the prior,
 //! and the landmarks that it hosts. Every landmark's rows lose their landmark by three Householder steps, what is left is
 //! stacked with the rest, and a QR of the stack with the frame's columns in front leaves the new prior below them.
 //!
-//! A landmark that is still seen lives on with a newer keyframe as its host: its older sightings go into the prior,
+//! A landmark that is still seen lives on with a newer keyframe as its host: its older observations go into the prior,
 //! its newer ones stay, and none is used twice.
 
 use super::dense::Tall;
-use super::inertial::{anchor_at, body_velocity, by_time_offset, jacobians, residual};
+use super::inertial::{body_velocity, by_time_offset, gauge_prior_at, jacobians, residual};
 use super::linearise::{Scene, System, calibration_weights, shift_between};
 use super::prior::Part;
 use super::visual;
 use super::window::{
-    CALIBRATION_DIM, Landmark, MAX_INVERSE_DISTANCE, MIN_INVERSE_DISTANCE, OFFSET_AT, Sighting,
+    CALIBRATION_DIM, Landmark, LandmarkObservation, MAX_INVERSE_DISTANCE, MIN_INVERSE_DISTANCE, OFFSET_AT,
 };
 use super::{Linearisation, Smoother, SmootherError};
 use crate::imu::Vector15;
@@ -22,37 +22,37 @@ use vidar_core::{FrameId, LandmarkId};
 
 /// What happened to landmarks when a frame left. Refill one to stay free of allocations.
 #[derive(Clone, Debug, Default, PartialEq)]
-pub struct Departure {
+pub struct MarginalisationReport {
     /// Landmarks that have a new host now.
     pub rehosted: Vec<LandmarkId>,
     /// Landmarks that are gone.
     pub ended: Vec<LandmarkId>,
 }
 
-/// What became of the readings after a frame that leaves.
+/// What became of the IMU measurements after a frame that leaves.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum NextLink {
+enum NextImuFactor {
     /// They are in the prior.
     InPrior,
     /// They were joined with those before the frame.
     Joined,
 }
 
-/// Readings' memory that is kept for later.
+/// IMU measurements' memory that is kept for later.
 const MOST_SPARE: usize = 8;
 
 /// Memory for marginalising.
 #[derive(Clone, Debug, Default)]
-pub(crate) struct Workbench {
+pub(crate) struct Workspace {
     parts: Vec<Part>,
     starts: Vec<usize>,
     stack: Tall,
     one: Tall,
     leaving: Vec<(usize, usize)>,
-    parting: Vec<Sighting>,
+    parting: Vec<LandmarkObservation>,
 }
 
-impl Workbench {
+impl Workspace {
     fn column(&self, part: Part) -> Option<usize> {
         self.parts.iter().position(|&p| p == part).map(|at| self.starts[at])
     }
@@ -99,36 +99,41 @@ impl Workbench {
 }
 
 impl Smoother {
-    /// Takes a frame that is no keyframe out of the window: what it saw is forgotten, its readings are joined to the next
+    /// Takes a frame that is no keyframe out of the window: what it saw is forgotten, its IMU measurements are joined to the next
     /// frame's. Where that is not possible (the prior speaks of it, or it is the last) it is marginalised.
     ///
     /// # Errors
     /// A frame that the window does not hold.
-    pub fn drop_frame(&mut self, id: FrameId, departure: &mut Departure) -> Result<(), SmootherError> {
+    pub fn drop_frame(
+        &mut self,
+        id: FrameId,
+        marginalisation: &mut MarginalisationReport,
+    ) -> Result<(), SmootherError> {
         let at = self.index(id)?;
         let last = self.frames.len() - 1;
-        let anchored = self.anchor.is_some_and(|a| a.frame == at);
+        let anchored = self.gauge_prior.is_some_and(|a| a.frame == at);
         let hosts = self.landmarks.iter().any(|l| l.alive && l.host.frame == at);
-        let chained =
-            at > 0 && at < last && self.frames[at].link.is_some() == self.frames[at + 1].link.is_some();
+        let chained = at > 0
+            && at < last
+            && self.frames[at].imu_factor.is_some() == self.frames[at + 1].imu_factor.is_some();
         if self.prior.touches(at) || anchored || hosts || !chained {
-            return self.marginalise(id, departure);
+            return self.marginalise(id, marginalisation);
         }
-        departure.rehosted.clear();
-        departure.ended.clear();
+        marginalisation.rehosted.clear();
+        marginalisation.ended.clear();
         self.system.factorised = false;
         let (left, right) = self.frames.split_at_mut(at + 1);
-        if let (Some(link), Some(next)) = (left[at].link.take(), &mut right[0].link) {
-            let mut joined = link.readings;
-            joined.append(&next.readings);
-            let used = std::mem::replace(&mut next.readings, joined);
-            next.whitening = super::inertial::Whitening::of(&next.readings);
+        if let (Some(imu_factor), Some(next)) = (left[at].imu_factor.take(), &mut right[0].imu_factor) {
+            let mut joined = imu_factor.preintegration;
+            joined.append(&next.preintegration);
+            let used = std::mem::replace(&mut next.preintegration, joined);
+            next.whitening = super::inertial::Whitening::of(&next.preintegration);
             self.spare.push(used);
         }
         // Who rests on a frame that itself rests on another rests on that.
-        let both = self.frames[at].rest.and(self.frames[at + 1].rest);
-        self.frames[at + 1].rest = both;
-        self.remove_frame(at, NextLink::Joined);
+        let both = self.frames[at].zero_motion.and(self.frames[at + 1].zero_motion);
+        self.frames[at + 1].zero_motion = both;
+        self.remove_frame(at, NextImuFactor::Joined);
         Ok(())
     }
 
@@ -136,20 +141,29 @@ impl Smoother {
     ///
     /// # Errors
     /// A frame that the window does not hold.
-    pub fn marginalise(&mut self, id: FrameId, departure: &mut Departure) -> Result<(), SmootherError> {
+    pub fn marginalise(
+        &mut self,
+        id: FrameId,
+        marginalisation: &mut MarginalisationReport,
+    ) -> Result<(), SmootherError> {
         let gone = self.index(id)?;
-        self.eliminate(gone, gone, departure);
-        self.remove_frame(gone, NextLink::InPrior);
+        self.eliminate(gone, gone, marginalisation);
+        self.remove_frame(gone, NextImuFactor::InPrior);
         Ok(())
     }
 
     /// Puts into the prior what is known through the pose of frame `gone` and the motion (velocity, biases) of frame
     /// `motion`, which is the same or the one before.
-    pub(crate) fn eliminate(&mut self, gone: usize, motion: usize, departure: &mut Departure) {
-        departure.rehosted.clear();
-        departure.ended.clear();
+    pub(crate) fn eliminate(
+        &mut self,
+        gone: usize,
+        motion: usize,
+        marginalisation: &mut MarginalisationReport,
+    ) {
+        marginalisation.rehosted.clear();
+        marginalisation.ended.clear();
         let mut system = std::mem::take(&mut self.system);
-        let mut bench = std::mem::take(&mut self.workbench);
+        let mut bench = std::mem::take(&mut self.workspace);
         system.factorised = false;
         system.frames = self.frames.len();
         if self.frames.len() > 1 {
@@ -161,16 +175,16 @@ impl Smoother {
             self.stack_frame(gone, motion, &system, &mut bench);
             self.stack_landmarks(gone, &system, &mut bench);
             self.new_prior(gone, &mut bench);
-            self.move_hosts(gone, &system, &bench, departure);
+            self.move_hosts(gone, &system, &bench, marginalisation);
         } else {
             self.prior.clear();
-            departure.ended.extend(self.landmarks.iter().filter(|l| l.alive).map(|l| l.id));
-            for &landmark in &departure.ended {
+            marginalisation.ended.extend(self.landmarks.iter().filter(|l| l.alive).map(|l| l.id));
+            for &landmark in &marginalisation.ended {
                 self.remove_landmark(landmark);
             }
         }
         self.system = system;
-        self.workbench = bench;
+        self.workspace = bench;
     }
 
     /// Unless first estimates are kept, the prior's linearisation points become the present states.
@@ -187,8 +201,8 @@ impl Smoother {
         self.calibration.relinearise();
     }
 
-    /// Landmarks hosted by the leaving frame, each with how many of its sightings leave with it.
-    fn choose_leaving(&self, gone: usize, bench: &mut Workbench) {
+    /// Landmarks hosted by the leaving frame, each with how many of its observations leave with it.
+    fn choose_leaving(&self, gone: usize, bench: &mut Workspace) {
         bench.leaving.clear();
         for (slot, landmark) in self.landmarks.iter().enumerate() {
             if !landmark.alive || landmark.host.frame != gone {
@@ -198,23 +212,23 @@ impl Smoother {
         }
     }
 
-    /// How many sightings of a landmark go into the prior: all when it is not seen any more, else the older ones.
+    /// How many observations of a landmark go into the prior: all when it is not seen any more, else the older ones.
     fn split(&self, landmark: &Landmark) -> usize {
         let recent = self.frames.len().saturating_sub(2);
-        let alive = landmark.sightings.last().is_some_and(|s| s.frame >= recent);
-        let keyframes = landmark.sightings.iter().filter(|s| self.frames[s.frame].keyframe).count();
+        let alive = landmark.observations.last().is_some_and(|s| s.frame >= recent);
+        let keyframes = landmark.observations.iter().filter(|s| self.frames[s.frame].keyframe).count();
         if !alive || keyframes == 0 {
-            return landmark.sightings.len();
+            return landmark.observations.len();
         }
-        // The sighting that becomes the host's is the one that leaves `rehost_keyframes` keyframes, itself included.
+        // The observation that becomes the host's is the one that leaves `rehost_keyframes` keyframes, itself included.
         let skip = keyframes.saturating_sub(self.config.rehost_keyframes);
         let in_keyframes =
-            landmark.sightings.iter().enumerate().filter(|(_, s)| self.frames[s.frame].keyframe);
-        in_keyframes.map(|(at, _)| at).nth(skip).unwrap_or(landmark.sightings.len())
+            landmark.observations.iter().enumerate().filter(|(_, s)| self.frames[s.frame].keyframe);
+        in_keyframes.map(|(at, _)| at).nth(skip).unwrap_or(landmark.observations.len())
     }
 
     /// Columns: the leaving frame first, then everything it is tied to, in the order of frames, calibration last.
-    fn lay_out(&self, gone: usize, motion: usize, bench: &mut Workbench) {
+    fn lay_out(&self, gone: usize, motion: usize, bench: &mut Workspace) {
         bench.parts.clear();
         bench.insert(Part::Pose(gone));
         bench.insert(Part::Motion(motion));
@@ -227,24 +241,24 @@ impl Smoother {
                 Part::Calibration => calibration = true,
             }
         }
-        for k in [gone, motion].into_iter().filter(|&k| k > 0 && self.frames[k].link.is_some()) {
+        for k in [gone, motion].into_iter().filter(|&k| k > 0 && self.frames[k].imu_factor.is_some()) {
             tied[k - 1] = 3;
             calibration |= self.config.estimate_time_offset;
         }
-        if self.frames.get(gone + 1).is_some_and(|f| f.link.is_some()) {
+        if self.frames.get(gone + 1).is_some_and(|f| f.imu_factor.is_some()) {
             tied[gone + 1] = 3;
             calibration |= self.config.estimate_time_offset;
         }
-        if self.frames[gone].rest.is_some() && gone > 0 {
+        if self.frames[gone].zero_motion.is_some() && gone > 0 {
             tied[gone - 1] |= 1;
         }
-        if self.frames.get(gone + 1).is_some_and(|f| f.rest.is_some()) {
+        if self.frames.get(gone + 1).is_some_and(|f| f.zero_motion.is_some()) {
             tied[gone + 1] |= 1;
         }
         let mut rows = self.prior.rows + 3 * (15 + 6) + 15 + 2 * 3 + CALIBRATION_DIM;
         for &(slot, leaving) in &bench.leaving {
             let landmark = &self.landmarks[slot];
-            for s in landmark.sightings[..leaving].iter().filter(|s| self.frames[s.frame].keyframe) {
+            for s in landmark.observations[..leaving].iter().filter(|s| self.frames[s.frame].keyframe) {
                 tied[s.frame] |= 1;
                 rows += 2;
                 calibration |= self.config.calibrates_camera();
@@ -274,7 +288,7 @@ impl Smoother {
         bench.stack.reset(rows, at + 1);
     }
 
-    fn stack_prior(&self, bench: &mut Workbench) {
+    fn stack_prior(&self, bench: &mut Workspace) {
         let prior = &self.prior;
         let row = bench.stack.add_rows(prior.rows);
         let rhs = bench.rhs();
@@ -305,35 +319,48 @@ impl Smoother {
         self.calibration.in_prior.then_some(self.calibration.step)
     }
 
-    fn put_state(&self, bench: &mut Workbench, row: usize, k: usize, j: &SMatrix<f64, 15, 15>) {
+    fn put_state(&self, bench: &mut Workspace, row: usize, k: usize, j: &SMatrix<f64, 15, 15>) {
         bench.put(row, Part::Pose(k), &j.fixed_columns::<6>(0).into_owned(), self.pose_step(k));
         bench.put(row, Part::Motion(k), &j.fixed_columns::<9>(6).into_owned(), self.motion_step(k));
     }
 
-    /// Readings on both sides, anchor and standstill of the leaving frame, and the calibration's own prior.
-    fn stack_frame(&self, gone: usize, motion: usize, system: &System, bench: &mut Workbench) {
+    /// IMU measurements on both sides, anchor and standstill of the leaving frame, and the calibration's own prior.
+    fn stack_frame(&self, gone: usize, motion: usize, system: &System, bench: &mut Workspace) {
         for k in motion..=gone + 1 {
-            let Some(link) = self.frames.get(k).and_then(|f| f.link.as_ref()).filter(|_| k > 0) else {
+            let Some(imu_factor) = self.frames.get(k).and_then(|f| f.imu_factor.as_ref()).filter(|_| k > 0)
+            else {
                 continue;
             };
             let (from, to) = (&self.frames[k - 1], &self.frames[k]);
             let shift = shift_between(&self.calibration, from, to);
-            let r: Vector15 = link.whitening.apply(&residual(&link.readings, &from.state, &to.state, shift));
+            let r: Vector15 = imu_factor.whitening.apply(&residual(
+                &imu_factor.preintegration,
+                &from.state,
+                &to.state,
+                shift,
+            ));
             let (state_i, state_j) = (&system.states_at[k - 1], &system.states_at[k]);
-            let (ji, jj) = jacobians(&link.readings, state_i, state_j, shift);
+            let (ji, jj) = jacobians(&imu_factor.preintegration, state_i, state_j, shift);
             let row = bench.stack.add_rows(15);
             bench.put_rhs(row, r.as_slice());
-            self.put_state(bench, row, k - 1, &link.whitening.apply(&ji));
-            self.put_state(bench, row, k, &link.whitening.apply(&jj));
+            self.put_state(bench, row, k - 1, &imu_factor.whitening.apply(&ji));
+            self.put_state(bench, row, k, &imu_factor.whitening.apply(&jj));
             if self.config.estimate_time_offset {
-                let by = link.whitening.apply(&by_time_offset(&link.readings, state_i, state_j, shift));
+                let by = imu_factor.whitening.apply(&by_time_offset(
+                    &imu_factor.preintegration,
+                    state_i,
+                    state_j,
+                    shift,
+                ));
                 let mut block = SMatrix::<f64, 15, CALIBRATION_DIM>::zeros();
                 block.set_column(OFFSET_AT, &by);
                 bench.put(row, Part::Calibration, &block, self.calibration_step());
             }
         }
         for k in [gone, gone + 1] {
-            let Some(rest) = self.frames.get(k).and_then(|f| f.rest).filter(|_| k > 0) else { continue };
+            let Some(rest) = self.frames.get(k).and_then(|f| f.zero_motion).filter(|_| k > 0) else {
+                continue;
+            };
             let r = rest.residual(&self.frames[k - 1].state, &self.frames[k].state);
             let (ji, jj) = rest.jacobians(&system.states_at[k - 1], &system.states_at[k]);
             let row = bench.stack.add_rows(6);
@@ -341,10 +368,12 @@ impl Smoother {
             bench.put(row, Part::Pose(k - 1), &ji, self.pose_step(k - 1));
             bench.put(row, Part::Pose(k), &jj, self.pose_step(k));
         }
-        if let Some(anchor) = self.anchor.as_ref().filter(|a| a.frame == gone || a.frame == motion) {
-            let k = anchor.frame;
+        if let Some(gauge_prior) = self.gauge_prior.as_ref().filter(|a| a.frame == gone || a.frame == motion)
+        {
+            let k = gauge_prior.frame;
             let state = &self.frames[k].state;
-            let (r, j) = anchor_at(&anchor.reference, &anchor.sigmas, state, &system.states_at[k]);
+            let (r, j) =
+                gauge_prior_at(&gauge_prior.reference, &gauge_prior.sigmas, state, &system.states_at[k]);
             let row = bench.stack.add_rows(15);
             bench.put_rhs(row, r.as_slice());
             self.put_state(bench, row, k, &j);
@@ -370,8 +399,8 @@ impl Smoother {
         }
     }
 
-    /// Sightings that leave, each landmark eliminated.
-    fn stack_landmarks(&mut self, gone: usize, system: &System, bench: &mut Workbench) {
+    /// Observations that leave, each landmark eliminated.
+    fn stack_landmarks(&mut self, gone: usize, system: &System, bench: &mut Workspace) {
         let mut leaving = std::mem::take(&mut bench.leaving);
         for (slot, count) in &leaving {
             let mut landmark = std::mem::replace(&mut self.landmarks[*slot], Landmark::placeholder());
@@ -388,28 +417,28 @@ impl Smoother {
         landmark: &mut Landmark,
         count: usize,
         system: &System,
-        bench: &mut Workbench,
+        bench: &mut Workspace,
     ) {
         let scene = Scene {
             camera: &self.camera,
             config: &self.config,
-            places: &system.places,
-            places_at: &system.places_at,
+            camera_poses: &system.camera_poses,
+            camera_poses_at: &system.camera_poses_at,
         };
         let Some((_, own)) = scene.host(landmark) else { return };
-        let mut sightings = std::mem::take(&mut bench.parting);
-        sightings.clear();
-        sightings
-            .extend(landmark.sightings[..count].iter().filter(|s| self.frames[s.frame].keyframe).copied());
+        let mut observations = std::mem::take(&mut bench.parting);
+        observations.clear();
+        observations
+            .extend(landmark.observations[..count].iter().filter(|s| self.frames[s.frame].keyframe).copied());
         // The landmark's own three columns, then those of the stack.
         let mut one = std::mem::take(&mut bench.one);
-        one.reset(2 * sightings.len() + 2, 3 + bench.stack.cols());
+        one.reset(2 * observations.len() + 2, 3 + bench.stack.cols());
         let rhs = 3 + bench.rhs();
         let calibration = bench.column(Part::Calibration).map(|c| c + 3);
         let calibration_step = self.calibration_step();
         let host = bench.column(Part::Pose(gone)).map_or(3, |c| c + 3);
         let mut used = 0;
-        let mut write = |w: &super::linearise::WeightedSighting, target: Option<(usize, usize)>| {
+        let mut write = |w: &super::linearise::WeightedObservation, target: Option<(usize, usize)>| {
             let row = one.add_rows(2);
             let mut r = w.residual;
             let mut put = |col: usize, block: &SMatrix<f64, 2, 6>, step: Option<SVector<f64, 6>>| {
@@ -442,8 +471,8 @@ impl Smoother {
             one.add(row + 1, rhs, r.y);
         };
         write(&own, None);
-        for s in &mut sightings {
-            let (_, weighted) = scene.sighting(landmark, s);
+        for s in &mut observations {
+            let (_, weighted) = scene.observation(landmark, s);
             let target = bench.column(Part::Pose(s.frame)).map(|c| (s.frame, c + 3));
             if let (Some(weighted), Some(target)) = (weighted, target)
                 && s.chi2 <= self.config.outlier_chi2
@@ -463,11 +492,11 @@ impl Smoother {
             }
         }
         bench.one = one;
-        bench.parting = sightings;
+        bench.parting = observations;
     }
 
     /// Eliminates the leaving frame's columns; what is left is the prior.
-    fn new_prior(&mut self, gone: usize, bench: &mut Workbench) {
+    fn new_prior(&mut self, gone: usize, bench: &mut Workspace) {
         let leaving = Part::Pose(gone).dim() + Part::Motion(gone).dim();
         let variables = bench.rhs();
         let begin = bench.stack.triangularise(0, 0, leaving);
@@ -493,52 +522,58 @@ impl Smoother {
     }
 
     /// Gives living landmarks their new host and ends the others.
-    fn move_hosts(&mut self, gone: usize, system: &System, bench: &Workbench, departure: &mut Departure) {
+    fn move_hosts(
+        &mut self,
+        gone: usize,
+        system: &System,
+        bench: &Workspace,
+        marginalisation: &mut MarginalisationReport,
+    ) {
         for &(slot, count) in &bench.leaving {
             let landmark = &mut self.landmarks[slot];
-            if count >= landmark.sightings.len() {
+            if count >= landmark.observations.len() {
                 let id = landmark.id;
-                departure.ended.push(id);
+                marginalisation.ended.push(id);
                 self.remove_landmark(id);
                 continue;
             }
-            let host = landmark.sightings[count];
-            let (old, new) = (&system.places[gone], &system.places[host.frame]);
+            let host = landmark.observations[count];
+            let (old, new) = (&system.camera_poses[gone], &system.camera_poses[host.frame]);
             // Unit bearing over inverse distance in the old host; the length of the direction scales the inverse distance.
             let q = visual::direction(old, new, &landmark.bearing, landmark.rho);
             let length = q.norm();
-            landmark.sightings.drain(..=count);
+            landmark.observations.drain(..=count);
             landmark.host = host;
             landmark.bearing = q / length;
             landmark.rho = (landmark.rho / length).clamp(MIN_INVERSE_DISTANCE, MAX_INVERSE_DISTANCE);
-            departure.rehosted.push(landmark.id);
+            marginalisation.rehosted.push(landmark.id);
         }
     }
 
     /// Removes the newest frame, which the prior speaks of no more.
     pub(crate) fn remove_newest(&mut self) {
         let gone = self.frames.len() - 1;
-        self.remove_frame(gone, NextLink::InPrior);
+        self.remove_frame(gone, NextImuFactor::InPrior);
     }
 
-    /// Removes a frame and every sighting in it; places in the window move up.
-    fn remove_frame(&mut self, gone: usize, next: NextLink) {
+    /// Removes a frame and every observation in it; places in the window move up.
+    fn remove_frame(&mut self, gone: usize, next: NextImuFactor) {
         let frame = self.frames.remove(gone);
-        self.spare.extend(frame.link.map(|link| link.readings));
-        if let (NextLink::InPrior, Some(next)) = (next, self.frames.get_mut(gone)) {
-            self.spare.extend(next.link.take().map(|link| link.readings));
-            next.rest = None;
+        self.spare.extend(frame.imu_factor.map(|imu_factor| imu_factor.preintegration));
+        if let (NextImuFactor::InPrior, Some(next)) = (next, self.frames.get_mut(gone)) {
+            self.spare.extend(next.imu_factor.take().map(|imu_factor| imu_factor.preintegration));
+            next.zero_motion = None;
         }
         self.spare.truncate(MOST_SPARE);
-        self.anchor = self.anchor.filter(|a| a.frame != gone).map(|mut a| {
+        self.gauge_prior = self.gauge_prior.filter(|a| a.frame != gone).map(|mut a| {
             a.frame -= usize::from(a.frame > gone);
             a
         });
         self.prior.frame_left(gone);
         for landmark in self.landmarks.iter_mut().filter(|l| l.alive) {
-            landmark.sightings.retain(|s| s.frame != gone);
+            landmark.observations.retain(|s| s.frame != gone);
             landmark.host.frame -= usize::from(landmark.host.frame > gone);
-            for s in &mut landmark.sightings {
+            for s in &mut landmark.observations {
                 s.frame -= usize::from(s.frame > gone);
             }
         }

@@ -1,7 +1,7 @@
 //! The fixed-lag smoother: keyframes and recent frames with full inertial states, landmarks, and a square-root prior.
 //!
 //! Per image: [`Smoother::add_frame`] → observations → [`Smoother::optimise`] → [`Smoother::drop_frame`] of a recent
-//! frame that is no keyframe, or [`Smoother::marginalise`] of a keyframe that leaves. A dropped frame's readings are
+//! frame that is no keyframe, or [`Smoother::marginalise`] of a keyframe that leaves. A dropped frame's IMU measurements are
 //! joined to its neighbour's, so nothing inertial is lost; a marginalised frame becomes part of the prior by QR
 //! (Demmel et al., "Square root marginalization for sliding-window bundle adjustment", ICCV 2021), and whatever the
 //! linearisation, shift and heading stay unobservable ([`Linearisation`] says how).
@@ -23,8 +23,8 @@ mod window;
 
 pub use config::{Linearisation, SmootherConfig};
 pub use covariance::CalibrationEstimate;
-pub use inertial::AnchorSigmas;
-pub use marginalise::Departure;
+pub use inertial::GaugePriorSigmas;
+pub use marginalise::MarginalisationReport;
 pub use optimise::{OptimiseReport, Outlier};
 pub use window::{LandmarkEstimate, Observation};
 
@@ -34,7 +34,7 @@ use nalgebra::{Matrix2, Vector2};
 use prior::Prior;
 use rustc_hash::FxHashMap;
 use vidar_core::{CameraModel, Duration, FrameId, LandmarkId, Se3, Timestamp};
-use window::{Anchor, Calibration, Frame, Landmark, Link, Sighting};
+use window::{Calibration, Frame, GaugePrior, ImuFactor, Landmark, LandmarkObservation};
 
 /// Why the smoother refuses.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
@@ -114,11 +114,11 @@ pub struct Smoother {
     /// Slots of `landmarks` that are free.
     free: Vec<usize>,
     slots: FxHashMap<LandmarkId, usize>,
-    anchor: Option<Anchor>,
+    gauge_prior: Option<GaugePrior>,
     prior: Prior,
     system: System,
     spare: Vec<Preintegration>,
-    workbench: marginalise::Workbench,
+    workspace: marginalise::Workspace,
 }
 
 impl Smoother {
@@ -142,11 +142,11 @@ impl Smoother {
             landmarks: Vec::with_capacity(512),
             free: Vec::with_capacity(512),
             slots,
-            anchor: None,
+            gauge_prior: None,
             prior: Prior::default(),
             system: System::with_capacity(15 * frames + window::CALIBRATION_DIM),
             spare: Vec::with_capacity(8),
-            workbench: marginalise::Workbench::default(),
+            workspace: marginalise::Workspace::default(),
             config,
         })
     }
@@ -165,7 +165,7 @@ impl Smoother {
         id: FrameId,
         time: Timestamp,
         state: NavState,
-        sigmas: AnchorSigmas,
+        sigmas: GaugePriorSigmas,
     ) -> Result<(), SmootherError> {
         self.start_about(id, time, state, state, sigmas)
     }
@@ -180,7 +180,7 @@ impl Smoother {
         time: Timestamp,
         guess: NavState,
         reference: NavState,
-        sigmas: AnchorSigmas,
+        sigmas: GaugePriorSigmas,
     ) -> Result<(), SmootherError> {
         if !guess.is_finite() || !reference.is_finite() {
             return Err(SmootherError::BadState(id));
@@ -188,24 +188,24 @@ impl Smoother {
         self.clear();
         self.system.factorised = false;
         self.frames.push(Frame::new(id, time, guess, None));
-        self.anchor = Some(Anchor { frame: 0, reference, sigmas });
+        self.gauge_prior = Some(GaugePrior { frame: 0, reference, sigmas });
         Ok(())
     }
 
     /// Forgets all frames, landmarks and the prior; calibration stays.
     pub fn clear(&mut self) {
         for frame in self.frames.drain(..) {
-            self.spare.extend(frame.link.map(|link| link.readings));
+            self.spare.extend(frame.imu_factor.map(|imu_factor| imu_factor.preintegration));
         }
         self.free.clear();
         self.slots.clear();
         self.landmarks.clear();
-        self.anchor = None;
+        self.gauge_prior = None;
         self.prior.clear();
     }
 
     /// Adds the next frame with a first guess of its state. `time` is its image's stamp plus
-    /// [`Smoother::next_frame_offset`]; `readings` run from the newest frame's time to this one's;
+    /// [`Smoother::next_frame_offset`]; `IMU measurements` run from the newest frame's time to this one's;
     /// without them the frame hangs on its images alone (and its velocity and biases are left as given).
     ///
     /// # Errors
@@ -215,7 +215,7 @@ impl Smoother {
         id: FrameId,
         time: Timestamp,
         state: NavState,
-        readings: Option<Preintegration>,
+        preintegration: Option<Preintegration>,
     ) -> Result<(), SmootherError> {
         if !state.is_finite() {
             return Err(SmootherError::BadState(id));
@@ -228,7 +228,8 @@ impl Smoother {
         }
         self.system.factorised = false;
         let clock_secs = self.next_frame_offset().as_secs_f64();
-        self.frames.push(Frame { clock_secs, ..Frame::new(id, time, state, readings.map(Link::new)) });
+        self.frames
+            .push(Frame { clock_secs, ..Frame::new(id, time, state, preintegration.map(ImuFactor::new)) });
         Ok(())
     }
 
@@ -246,7 +247,7 @@ impl Smoother {
     ///
     /// # Errors
     /// A frame that the window does not hold.
-    pub fn add_standstill(&mut self, id: FrameId, sigma_mps: f64) -> Result<(), SmootherError> {
+    pub fn add_zero_velocity(&mut self, id: FrameId, sigma_mps: f64) -> Result<(), SmootherError> {
         let at = self.index(id)?;
         self.system.factorised = false;
         self.frames[at].standstill_sigma = (sigma_mps > 0.0 && sigma_mps.is_finite()).then_some(sigma_mps);
@@ -269,7 +270,7 @@ impl Smoother {
         if self.slots.contains_key(&host.landmark) {
             return Err(SmootherError::Twice { landmark: host.landmark, frame: host.frame });
         }
-        let sighting = self.sighting(host, frame)?;
+        let observation = self.observation(host, frame)?;
         let bearing = self.camera.unproject(&host.pixel).ok_or_else(|| {
             bad("pixel", format!("({:.2}, {:.2}) has no bearing", host.pixel.x, host.pixel.y))
         })?;
@@ -281,7 +282,7 @@ impl Smoother {
             self.landmarks.push(Landmark::empty());
             self.landmarks.len() - 1
         });
-        self.landmarks[slot].begin(host.landmark, sighting, bearing, rho);
+        self.landmarks[slot].begin(host.landmark, observation, bearing, rho);
         self.slots.insert(host.landmark, slot);
         Ok(())
     }
@@ -289,27 +290,27 @@ impl Smoother {
     /// Adds what a frame sees of a landmark.
     ///
     /// # Errors
-    /// A frame or landmark that is unknown, a second sighting in one frame, measurements that are of no use.
+    /// A frame or landmark that is unknown, a second observation in one frame, measurements that are of no use.
     pub fn add_observation(&mut self, seen: &Observation) -> Result<(), SmootherError> {
         let frame = self.index(seen.frame)?;
         let slot = *self.slots.get(&seen.landmark).ok_or(SmootherError::NoSuchLandmark(seen.landmark))?;
         if self.landmarks[slot].sees(frame) {
             return Err(SmootherError::Twice { landmark: seen.landmark, frame: seen.frame });
         }
-        let sighting = self.sighting(seen, frame)?;
+        let observation = self.observation(seen, frame)?;
         self.system.factorised = false;
-        self.landmarks[slot].insert(sighting);
+        self.landmarks[slot].insert(observation);
         Ok(())
     }
 
-    /// Takes back what a frame saw of a landmark; says whether there was anything. The host's sighting stays.
+    /// Takes back what a frame saw of a landmark; says whether there was anything. The host's observation stays.
     pub fn remove_observation(&mut self, frame: FrameId, landmark: LandmarkId) -> bool {
         let (Ok(frame), Some(&slot)) = (self.index(frame), self.slots.get(&landmark)) else { return false };
-        let sightings = &mut self.landmarks[slot].sightings;
-        let before = sightings.len();
-        sightings.retain(|s| s.frame != frame);
+        let observations = &mut self.landmarks[slot].observations;
+        let before = observations.len();
+        observations.retain(|s| s.frame != frame);
         self.system.factorised = false;
-        sightings.len() < before
+        observations.len() < before
     }
 
     /// Forgets a landmark; says whether there was one. What is in the prior of it stays.
@@ -321,7 +322,7 @@ impl Smoother {
         true
     }
 
-    fn sighting(&self, seen: &Observation, frame: usize) -> Result<Sighting, SmootherError> {
+    fn observation(&self, seen: &Observation, frame: usize) -> Result<LandmarkObservation, SmootherError> {
         let bad = |what, found: String| SmootherError::BadMeasurement {
             what,
             landmark: seen.landmark,
@@ -336,7 +337,7 @@ impl Smoother {
             let c: &Matrix2<f64> = &seen.covariance;
             bad("covariance", format!("[{} {}; {} {}]", c[(0, 0)], c[(0, 1)], c[(1, 0)], c[(1, 1)]))
         })?;
-        Ok(Sighting { frame, pixel: seen.pixel, whitening, chi2: 0.0 })
+        Ok(LandmarkObservation { frame, pixel: seen.pixel, whitening, chi2: 0.0 })
     }
 
     fn index(&self, id: FrameId) -> Result<usize, SmootherError> {
@@ -425,7 +426,7 @@ impl Smoother {
         Duration::from_secs_f64(self.calibration.time_offset_secs)
     }
 
-    /// What to add to the next image's stamp before its frame is added and its readings are cut: the clock offset as
+    /// What to add to the next image's stamp before its frame is added and its IMU measurements are cut: the clock offset as
     /// estimated, but never more than 2 ms away from that of the newest frame, so that time advances whatever the
     /// estimate does. Zero as long as the offset is not estimated.
     ///
@@ -442,34 +443,33 @@ impl Smoother {
         let target = &self.frames[self.index(frame).ok()?];
         let estimate = self.landmark(landmark)?;
         let host = &self.frames[self.index(estimate.host).ok()?];
-        let place = |f: &Frame| {
-            visual::CameraPlace::new(&f.state.world_from_body, &self.calibration.body_from_camera)
-        };
+        let place =
+            |f: &Frame| visual::CameraPose::new(&f.state.world_from_body, &self.calibration.body_from_camera);
         let q = visual::direction(&place(host), &place(target), &estimate.bearing, estimate.inverse_distance);
         self.camera.project(&q)
     }
 
-    /// Squared whitened misfit of the readings between frames, per degree of freedom; 1 is what fits, 0 when there are
+    /// Squared whitened residual of the IMU measurements between frames, per degree of freedom; 1 is what fits, 0 when there are
     /// none.
     pub fn inertial_chi2_per_dof(&self) -> f64 {
         let mut sum = (0.0, 0.0);
         for pair in self.frames.windows(2) {
-            let Some(link) = &pair[1].link else { continue };
+            let Some(imu_factor) = &pair[1].imu_factor else { continue };
             let shift = linearise::shift_between(&self.calibration, &pair[0], &pair[1]);
-            let r = inertial::residual(&link.readings, &pair[0].state, &pair[1].state, shift);
-            sum = (sum.0 + link.whitening.apply(&r).norm_squared(), sum.1 + 15.0);
+            let r = inertial::residual(&imu_factor.preintegration, &pair[0].state, &pair[1].state, shift);
+            sum = (sum.0 + imu_factor.whitening.apply(&r).norm_squared(), sum.1 + 15.0);
         }
         if sum.1 > 0.0 { sum.0 / sum.1 } else { 0.0 }
     }
 
-    /// Memory of readings that are not needed any more, to be filled again by [`Preintegration::restart`].
+    /// Memory of IMU measurements that are not needed any more, to be filled again by [`Preintegration::restart`].
     pub fn take_spare(&mut self) -> Option<Preintegration> {
         self.spare.pop()
     }
 
-    /// An IMU model that the window's readings carry, if any does.
+    /// An IMU model that the window's IMU measurements carry, if any does.
     pub fn imu_model(&self) -> Option<&ImuModel> {
-        self.frames.iter().rev().find_map(|f| f.link.as_ref()).map(|l| l.readings.model())
+        self.frames.iter().rev().find_map(|f| f.imu_factor.as_ref()).map(|l| l.preintegration.model())
     }
 }
 

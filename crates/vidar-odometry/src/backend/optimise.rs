@@ -8,7 +8,7 @@ use crate::imu::{NavState, Vector15};
 use nalgebra::{SVector, Vector3};
 use vidar_core::{FrameId, LandmarkId};
 
-/// A sighting that does not fit.
+/// A observation that does not fit.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Outlier {
     /// The frame.
@@ -30,11 +30,11 @@ pub struct OptimiseReport {
     pub cost_after: f64,
     /// Whether the last step changed the cost by less than a 1e-4th.
     pub converged: bool,
-    /// Sightings beyond the outlier limit, for the caller to remove.
+    /// Observations beyond the outlier limit, for the caller to remove.
     pub outliers: Vec<Outlier>,
-    /// Sightings in the system.
-    pub sightings: usize,
-    /// Mean squared whitened residual per dimension over the sightings that are no outliers; 1 is what fits.
+    /// Observations in the system.
+    pub observations: usize,
+    /// Mean squared whitened residual per dimension over the observations that are no outliers; 1 is what fits.
     pub chi2_per_dof: f64,
 }
 
@@ -57,7 +57,7 @@ const CALIBRATION_DAMPING: [f64; CALIBRATION_DIM] = [2.5e3, 2.5e3, 2.5e3, 2.5e3,
 
 /// A frame's state before a step.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct Saved {
+pub(crate) struct StateBackup {
     state: NavState,
     step: Vector15,
 }
@@ -122,7 +122,7 @@ impl Smoother {
 
     fn save(&self, system: &mut System) -> Calibration {
         system.saved.clear();
-        system.saved.extend(self.frames.iter().map(|f| Saved { state: f.state, step: f.step }));
+        system.saved.extend(self.frames.iter().map(|f| StateBackup { state: f.state, step: f.step }));
         system.saved_landmarks.clear();
         for e in &system.eliminated {
             let landmark = &self.landmarks[e.slot];
@@ -178,7 +178,7 @@ impl Smoother {
         report.outliers.clear();
         let (mut sum, mut fitting, mut all) = (0.0, 0_usize, 0);
         for landmark in self.landmarks.iter().filter(|l| l.alive) {
-            for s in &landmark.sightings {
+            for s in &landmark.observations {
                 all += 1;
                 if s.chi2 > self.config.outlier_chi2 {
                     let frame = self.frames[s.frame].id;
@@ -189,7 +189,7 @@ impl Smoother {
                 }
             }
         }
-        report.sightings = all;
+        report.observations = all;
         report.chi2_per_dof = if fitting > 0 { sum / (2 * fitting) as f64 } else { 0.0 };
     }
 }

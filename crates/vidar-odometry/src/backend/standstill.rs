@@ -2,19 +2,19 @@
 
 use super::linearise::System;
 use super::prior::Part;
-use super::{Departure, Smoother, SmootherError};
+use super::{MarginalisationReport, Smoother, SmootherError};
 use crate::imu::NavState;
 use nalgebra::{Matrix3, Matrix6, Vector6};
 use vidar_core::{FrameId, LieGroup, So3};
 
 /// How well a pose is known to be that of the frame before.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(crate) struct Rest {
+pub(crate) struct ZeroMotionFactor {
     position_m: f64,
     rotation_rad: f64,
 }
 
-impl Rest {
+impl ZeroMotionFactor {
     fn weights(&self) -> Vector6<f64> {
         let (r, p) = (1.0 / self.rotation_rad, 1.0 / self.position_m);
         Vector6::new(r, r, r, p, p, p)
@@ -27,7 +27,7 @@ impl Rest {
         Vector6::new(turn.x, turn.y, turn.z, shift.x, shift.y, shift.z).component_mul(&self.weights())
     }
 
-    /// Whitened derivatives of [`Rest::residual`] by the pose steps of both.
+    /// Whitened derivatives of [`ZeroMotionFactor::residual`] by the pose steps of both.
     pub(crate) fn jacobians(&self, i: &NavState, j: &NavState) -> (Matrix6<f64>, Matrix6<f64>) {
         let (from, to) = (&i.world_from_body, &j.world_from_body);
         let back = from.rotation.inverse();
@@ -51,28 +51,36 @@ impl Smoother {
     ///
     /// # Errors
     /// A frame that the window does not hold.
-    pub fn add_rest(&mut self, id: FrameId, position_m: f64, rotation_rad: f64) -> Result<(), SmootherError> {
+    pub fn add_zero_motion(
+        &mut self,
+        id: FrameId,
+        position_m: f64,
+        rotation_rad: f64,
+    ) -> Result<(), SmootherError> {
         let at = self.index(id)?;
         self.system.factorised = false;
         let useful = [position_m, rotation_rad].iter().all(|s| *s > 0.0 && s.is_finite());
-        self.frames[at].rest = useful.then_some(Rest { position_m, rotation_rad });
+        self.frames[at].zero_motion = useful.then_some(ZeroMotionFactor { position_m, rotation_rad });
         Ok(())
     }
 
-    /// The newest frame, which rests on the one before ([`Smoother::add_rest`]), becomes one with it: what its readings
+    /// The newest frame, which rests on the one before ([`Smoother::add_zero_motion`]), becomes one with it: what its IMU measurements
     /// say of biases and inclination goes into the prior, and the frame before takes its time, velocity and biases (which
     /// walked on while the body rested). A rest of any length is held by two frames this way. Its name; `None` when the newest frame does not rest.
     ///
     /// # Errors
     /// None that an own frame could cause.
-    pub fn rest_in_place(&mut self, departure: &mut Departure) -> Result<Option<FrameId>, SmootherError> {
+    pub fn fold_standstill(
+        &mut self,
+        marginalisation: &mut MarginalisationReport,
+    ) -> Result<Option<FrameId>, SmootherError> {
         let Some([before, newest]) = self.frames.last_chunk::<2>() else { return Ok(None) };
-        if newest.rest.is_none() {
+        if newest.zero_motion.is_none() {
             return Ok(None);
         }
         let (time, clock_secs, stays) = (newest.time, newest.clock_secs, before.id);
         let gone = self.frames.len() - 1;
-        self.eliminate(gone, gone - 1, departure);
+        self.eliminate(gone, gone - 1, marginalisation);
         self.inherit_motion(gone);
         self.remove_newest();
         if let Some(frame) = self.frames.last_mut() {
@@ -94,8 +102,8 @@ impl Smoother {
         before.step.fixed_rows_mut::<9>(6).copy_from(&newest.step.fixed_rows::<9>(6));
         before.motion_in_prior = newest.motion_in_prior;
         before.standstill_sigma = None;
-        self.spare.extend(before.link.take().map(|link| link.readings));
-        self.anchor = self.anchor.filter(|a| a.frame + 1 != gone);
+        self.spare.extend(before.imu_factor.take().map(|imu_factor| imu_factor.preintegration));
+        self.gauge_prior = self.gauge_prior.filter(|a| a.frame + 1 != gone);
         for part in &mut self.prior.parts {
             if *part == Part::Motion(gone) {
                 *part = Part::Motion(gone - 1);
@@ -104,9 +112,9 @@ impl Smoother {
     }
 
     pub(crate) fn add_rest_factor(&self, system: &mut System, k: usize) -> f64 {
-        let Some(rest) = self.frames[k].rest.filter(|_| k > 0) else { return 0.0 };
-        let r = rest.residual(&self.frames[k - 1].state, &self.frames[k].state);
-        let (ji, jj) = rest.jacobians(&system.states_at[k - 1], &system.states_at[k]);
+        let Some(zero_motion) = self.frames[k].zero_motion.filter(|_| k > 0) else { return 0.0 };
+        let r = zero_motion.residual(&self.frames[k - 1].state, &self.frames[k].state);
+        let (ji, jj) = zero_motion.jacobians(&system.states_at[k - 1], &system.states_at[k]);
         let (i, j) = (system.offset(Part::Pose(k - 1)), system.offset(Part::Pose(k)));
         system.add(i, i, &(ji.transpose() * ji), 1.0);
         system.add(j, i, &(jj.transpose() * ji), 1.0);
@@ -130,9 +138,9 @@ mod tests {
 
     #[test]
     fn the_jacobians_are_the_numeric_ones() {
-        let rest = Rest { position_m: 0.5, rotation_rad: 0.2 };
+        let zero_motion = ZeroMotionFactor { position_m: 0.5, rotation_rad: 0.2 };
         let states = [at([0.3, -0.2, 0.5], [1.0, 2.0, -0.5]), at([0.35, -0.1, 0.45], [1.2, 1.9, -0.4])];
-        let (by_i, by_j) = rest.jacobians(&states[0], &states[1]);
+        let (by_i, by_j) = zero_motion.jacobians(&states[0], &states[1]);
         for (which, analytic) in [(0, by_i), (1, by_j)] {
             for k in 0..6 {
                 let moved = |h: f64| {
@@ -142,7 +150,7 @@ mod tests {
                     d[k] = h;
                     pose.rotation = pose.rotation * So3::exp(&Vector3::new(d[0], d[1], d[2]));
                     pose.translation += Vector3::new(d[3], d[4], d[5]);
-                    rest.residual(&s[0], &s[1])
+                    zero_motion.residual(&s[0], &s[1])
                 };
                 let numeric = (moved(1e-6) - moved(-1e-6)) / 2e-6;
                 assert!((numeric - analytic.column(k)).amax() < 1e-7, "{which} {k}");
@@ -151,7 +159,8 @@ mod tests {
         // Turning and shifting everything changes nothing.
         let turn = Se3::new(So3::exp(&Vector3::new(0.0, 0.0, 0.7)), Vector3::new(3.0, -1.0, 2.0));
         let turned = states.map(|s| NavState { world_from_body: turn * s.world_from_body, ..s });
-        let change = rest.residual(&turned[0], &turned[1]) - rest.residual(&states[0], &states[1]);
+        let change =
+            zero_motion.residual(&turned[0], &turned[1]) - zero_motion.residual(&states[0], &states[1]);
         assert!(change.amax() < 1e-12);
     }
 }

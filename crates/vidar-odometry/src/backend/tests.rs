@@ -1,9 +1,9 @@
 //! Factors against numeric derivatives, the prior against dense algebra, and what must stay unobservable.
 
-use super::inertial::{Shift, anchor_at, body_velocity, by_time_offset, jacobians, residual};
+use super::inertial::{Shift, body_velocity, by_time_offset, gauge_prior_at, jacobians, residual};
 use super::linearise::System;
 use super::prior::Part;
-use super::visual::{self, CameraPlace};
+use super::visual::{self, CameraPose};
 use super::*;
 use crate::imu::{Bias, Matrix15, Vector15};
 use crate::simulate::{
@@ -22,11 +22,11 @@ fn random_state(random: &mut Random) -> NavState {
     }
 }
 
-fn some_readings(bias: Bias) -> Preintegration {
+fn some_preintegration(bias: Bias) -> Preintegration {
     let course = Course { kind: CourseKind::Eight, secs: 3.0, speed: 2.0, phase: 0.2 };
     let simulation = Simulation::new(&course, 0.0, 2.0, &SimulationConfig::default());
     let model = ImuModel::from_data_sheet(&ImuNoise::EUROC, 2.0, 2.0);
-    Preintegration::new(model, bias, &simulation.readings[20..80])
+    Preintegration::new(model, bias, &simulation.imu_samples[20..80])
 }
 
 fn pose_plus(state: &NavState, d: &SVector<f64, 6>) -> Se3 {
@@ -40,19 +40,19 @@ fn inertial_factor_agrees_with_numeric_derivatives() {
     let mut random = Random::new(11);
     for _ in 0..5 {
         let i = random_state(&mut random);
-        let readings = some_readings(Bias { gyro: i.bias.gyro * 0.9, accel: i.bias.accel * 0.8 });
+        let preintegration = some_preintegration(Bias { gyro: i.bias.gyro * 0.9, accel: i.bias.accel * 0.8 });
         let guess = Vector15::from_fn(|_, _| 0.1 * random.normal());
-        let j = readings.predict(&i).plus(&guess);
+        let j = preintegration.predict(&i).plus(&guess);
         for shift in [Shift::NONE, Shift { begin: 4e-3, end: -7e-3 }, Shift { begin: -0.02, end: -0.02 }] {
-            let (by_i, by_j) = jacobians(&readings, &i, &j, shift);
+            let (by_i, by_j) = jacobians(&preintegration, &i, &j, shift);
             let zero = Vector15::zeros();
-            let of = |i: &NavState, j: &NavState| residual(&readings, i, j, shift);
+            let of = |i: &NavState, j: &NavState| residual(&preintegration, i, j, shift);
             check_jacobian("by i", &by_i, |d| of(&i.plus(d), &j), &zero, 1e-6).unwrap();
             check_jacobian("by j", &by_j, |d| of(&i, &j.plus(d)), &zero, 1e-6).unwrap();
-            let by_offset = by_time_offset(&readings, &i, &j, shift);
+            let by_offset = by_time_offset(&preintegration, &i, &j, shift);
             let later = |d: &Vector1<f64>| {
                 let shift = Shift { begin: shift.begin + d.x, end: shift.end + d.x };
-                residual(&readings, &i, &j, shift)
+                residual(&preintegration, &i, &j, shift)
             };
             check_jacobian("by clock", &by_offset, later, &Vector1::zeros(), 1e-6).unwrap();
         }
@@ -68,7 +68,7 @@ fn shifted_readings_are_those_of_the_shifted_stretch() {
     let state = |k: usize| simulation.frames[0].truth.plus(&Vector15::from_element(k as f64 * 0.01));
     let (i, j) = (state(1), state(7));
     let cut = |bias: Bias, from: usize, until: usize| {
-        Preintegration::new(model, bias, &simulation.readings[from..=until])
+        Preintegration::new(model, bias, &simulation.imu_samples[from..=until])
     };
     // Later by so many milliseconds at one end and at the other; how much of the difference is left.
     let left = |bias: Bias, begin: usize, end: usize| {
@@ -83,7 +83,7 @@ fn shifted_readings_are_those_of_the_shifted_stretch() {
     assert!(lefts[0].0 < 0.1 * lefts[0].1, "{lefts:?}");
     assert!(lefts.windows(2).all(|w| w[1].0 < 0.3 * w[0].0), "a quarter per halving: {lefts:?}");
     // Its rates are those at the bias of the integration; a bias that moved since by 0.01 rad/s and 0.01 m/s² leaves a
-    // part of first order, and readings are integrated anew long before.
+    // part of first order, and IMU measurements are integrated anew long before.
     let (moved, before) = left(Bias::ZERO, 2, 1);
     assert!(moved < lefts[2].0 + 0.05 * before, "{moved:.2e} of {before:.2e}");
 }
@@ -91,14 +91,14 @@ fn shifted_readings_are_those_of_the_shifted_stretch() {
 #[test]
 fn inertial_residual_vanishes_on_its_own_prediction() {
     let i = random_state(&mut Random::new(12));
-    let readings = some_readings(i.bias);
-    assert!(residual(&readings, &i, &readings.predict(&i), Shift::NONE).amax() < 1e-12);
+    let preintegration = some_preintegration(i.bias);
+    assert!(residual(&preintegration, &i, &preintegration.predict(&i), Shift::NONE).amax() < 1e-12);
 }
 
 #[test]
 fn anchor_and_standstill_agree_with_numeric_derivatives() {
     let mut random = Random::new(13);
-    let sigmas = AnchorSigmas {
+    let sigmas = GaugePriorSigmas {
         position_m: 0.5,
         yaw_rad: 0.4,
         tilt_rad: 0.3,
@@ -109,8 +109,8 @@ fn anchor_and_standstill_agree_with_numeric_derivatives() {
     let reference = random_state(&mut random);
     let state = reference.plus(&Vector15::from_fn(|_, _| 0.2 * random.normal()));
     let zero = Vector15::zeros();
-    let (_, j) = anchor_at(&reference, &sigmas, &state, &state);
-    let f = |d: &Vector15| anchor_at(&reference, &sigmas, &state.plus(d), &state).0;
+    let (_, j) = gauge_prior_at(&reference, &sigmas, &state, &state);
+    let f = |d: &Vector15| gauge_prior_at(&reference, &sigmas, &state.plus(d), &state).0;
     check_jacobian("anchor", &j, f, &zero, 1e-6).unwrap();
     let (_, by_rotation, by_velocity) = body_velocity(&state);
     let mut analytic = SMatrix::<f64, 3, 15>::zeros();
@@ -141,11 +141,11 @@ fn reprojection_agrees_with_numeric_derivatives() {
     for _ in 0..8 {
         let View { host, target, place, bearing, rho } = some_view(&mut random);
         let pixel = |h: &Se3, t: &Se3, place: &Se3, bearing: &Vector3<f64>, rho: f64| {
-            let (h, t) = (CameraPlace::new(h, place), CameraPlace::new(t, place));
+            let (h, t) = (CameraPose::new(h, place), CameraPose::new(t, place));
             camera.project(&visual::direction(&h, &t, bearing, rho)).unwrap()
         };
         let (h, t) = (host.world_from_body, target.world_from_body);
-        let (at_h, at_t) = (CameraPlace::new(&h, &place), CameraPlace::new(&t, &place));
+        let (at_h, at_t) = (CameraPose::new(&h, &place), CameraPose::new(&t, &place));
         let j = visual::jacobians(&camera, &at_h, &at_t, &bearing, rho).unwrap();
         let zero = SVector::<f64, 6>::zeros();
         let by_host = |d: &SVector<f64, 6>| pixel(&pose_plus(&host, d), &t, &place, &bearing, rho);
@@ -184,13 +184,13 @@ fn relative_pose_agrees_with_numeric_derivatives() {
 fn flown(
     seed: u64,
     secs: f64,
-    change: impl Fn(&mut FeatureOdometryConfig, &mut AnchorSigmas),
+    change: impl Fn(&mut FeatureOdometryConfig, &mut GaugePriorSigmas),
 ) -> (FeatureOdometry, Simulation) {
     let course = Course { kind: CourseKind::Eight, secs: secs + 1.0, speed: 1.2, phase: 0.4 * seed as f64 };
     let settings = SimulationConfig { seed, tracks: 60, ..Default::default() };
     let simulation = Simulation::new(&course, 0.0, secs, &settings);
     let mut config = FeatureOdometryConfig::new(&ImuNoise::EUROC, 1.0);
-    let mut sigmas = AnchorSigmas {
+    let mut sigmas = GaugePriorSigmas {
         position_m: 1e-3,
         yaw_rad: 1e-3,
         tilt_rad: 0.01,
@@ -203,8 +203,8 @@ fn flown(
     let first = &simulation.frames[0];
     odometry.start_at(first, NavState { bias: Bias::ZERO, ..first.truth }, sigmas).unwrap();
     for frame in &simulation.frames[1..] {
-        let out = odometry.push(frame.id, frame.time, &frame.seen).unwrap();
-        assert!(matches!(out, StepOutput::Running(_)));
+        let out = odometry.push(frame.id, frame.time, &frame.observations).unwrap();
+        assert!(matches!(out, StepOutput::SlidingWindowOdometry(_)));
     }
     (odometry, simulation)
 }
@@ -311,7 +311,7 @@ fn the_prior_is_the_dense_marginal() {
             smoother.remove_observation(*f, *l);
         }
     }
-    let mut departure = Departure::default();
+    let mut marginalisation = MarginalisationReport::default();
     let (h, g) = dense(smoother);
     let k = smoother.len();
     let leaving: Vec<usize> = (0..9).chain(9 * k..9 * k + 6).collect();
@@ -324,8 +324,12 @@ fn the_prior_is_the_dense_marginal() {
     let gs = DVector::from_fn(staying.len(), |i, _| g[staying[i]]);
     let expected_gradient = gs - &sm * inverse * gm;
 
-    smoother.marginalise(first, &mut departure).unwrap();
-    assert!(departure.rehosted.is_empty() && departure.ended.len() == hosted.len() && hosted.len() > 5);
+    smoother.marginalise(first, &mut marginalisation).unwrap();
+    assert!(
+        marginalisation.rehosted.is_empty()
+            && marginalisation.ended.len() == hosted.len()
+            && hosted.len() > 5
+    );
     let (found, found_gradient) = dense(smoother);
     let scale = expected.amax();
     let error = (&found - &expected).amax() / scale;
@@ -372,14 +376,14 @@ fn calibrated(off: &So3, offset_secs: f64, change: impl Fn(&mut SmootherConfig))
     let mut config = FeatureOdometryConfig::new(&ImuNoise::EUROC, 1.0);
     change(&mut config.smoother);
     let truth = simulation.body_from_camera;
-    let believed = Se3::new(truth.rotation * *off, truth.translation);
-    let mut odometry = FeatureOdometry::new(config, simulation.camera.clone(), believed);
-    simulation.readings.iter().for_each(|r| odometry.take(*r).unwrap());
-    let sigmas = AnchorSigmas { velocity_mps: 0.2, tilt_rad: 0.02, ..AnchorSigmas::GAUGE };
+    let is_valid_imu = Se3::new(truth.rotation * *off, truth.translation);
+    let mut odometry = FeatureOdometry::new(config, simulation.camera.clone(), is_valid_imu);
+    simulation.imu_samples.iter().for_each(|r| odometry.take(*r).unwrap());
+    let sigmas = GaugePriorSigmas { velocity_mps: 0.2, tilt_rad: 0.02, ..GaugePriorSigmas::GAUGE };
     let first = &simulation.frames[0];
     odometry.start_at(first, NavState { bias: Bias::ZERO, ..first.truth }, sigmas).unwrap();
     for frame in &simulation.frames[1..] {
-        odometry.push(frame.id, frame.time, &frame.seen).unwrap();
+        odometry.push(frame.id, frame.time, &frame.observations).unwrap();
     }
     let smoother = odometry.smoother().unwrap();
     let sigmas = smoother.calibration_sigmas().unwrap();
@@ -416,11 +420,11 @@ fn dropping_a_frame_joins_its_readings() {
     let keyframes: Vec<FrameId> = smoother.keyframes().collect();
     let frames: Vec<FrameId> = smoother.frames().collect();
     let at = frames.iter().rposition(|f| !keyframes.contains(f) && Some(f) != frames.last()).unwrap();
-    let before: f64 = smoother.frames[at].link.as_ref().unwrap().readings.secs();
-    let after: f64 = smoother.frames[at + 1].link.as_ref().unwrap().readings.secs();
-    let mut departure = Departure::default();
-    smoother.drop_frame(frames[at], &mut departure).unwrap();
-    let joined = smoother.frames[at].link.as_ref().unwrap().readings.secs();
+    let before: f64 = smoother.frames[at].imu_factor.as_ref().unwrap().preintegration.secs();
+    let after: f64 = smoother.frames[at + 1].imu_factor.as_ref().unwrap().preintegration.secs();
+    let mut marginalisation = MarginalisationReport::default();
+    smoother.drop_frame(frames[at], &mut marginalisation).unwrap();
+    let joined = smoother.frames[at].imu_factor.as_ref().unwrap().preintegration.secs();
     assert!((joined - before - after).abs() < 1e-9, "{joined} {before} {after}");
     assert_eq!(smoother.len(), frames.len() - 1);
     let newest = smoother.newest().map(|(id, ..)| id);

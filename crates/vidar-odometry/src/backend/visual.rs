@@ -11,7 +11,7 @@ use vidar_core::{CameraModel, Se3};
 
 /// A frame's camera as the factor needs it.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct CameraPlace {
+pub(crate) struct CameraPose {
     /// world_from_body rotation.
     pub(crate) body_turn: Matrix3<f64>,
     /// Body's place in the world.
@@ -22,7 +22,7 @@ pub(crate) struct CameraPlace {
     pub(crate) at: Vector3<f64>,
 }
 
-impl CameraPlace {
+impl CameraPose {
     pub(crate) fn new(world_from_body: &Se3, body_from_camera: &Se3) -> Self {
         let camera = *world_from_body * *body_from_camera;
         Self {
@@ -47,8 +47,8 @@ pub(crate) struct VisualJacobians {
 
 /// Direction of the landmark in the target camera, up to scale.
 pub(crate) fn direction(
-    host: &CameraPlace,
-    target: &CameraPlace,
+    host: &CameraPose,
+    target: &CameraPose,
     bearing: &Vector3<f64>,
     rho: f64,
 ) -> Vector3<f64> {
@@ -58,8 +58,8 @@ pub(crate) fn direction(
 /// Derivatives of the pixel at the given places; `None` where the landmark does not project.
 pub(crate) fn jacobians(
     camera: &CameraModel,
-    host: &CameraPlace,
-    target: &CameraPlace,
+    host: &CameraPose,
+    target: &CameraPose,
     bearing: &Vector3<f64>,
     rho: f64,
 ) -> Option<VisualJacobians> {
@@ -86,8 +86,8 @@ pub(crate) fn jacobians(
 /// Derivative of the pixel by the camera's place on the body (rotation on its right side, translation).
 pub(crate) fn by_body_from_camera(
     camera: &CameraModel,
-    host: &CameraPlace,
-    target: &CameraPlace,
+    host: &CameraPose,
+    target: &CameraPose,
     bearing: &Vector3<f64>,
     rho: f64,
 ) -> Option<SMatrix<f64, 2, 6>> {

@@ -1,6 +1,6 @@
 //! What the window holds.
 
-use super::inertial::{AnchorSigmas, Whitening};
+use super::inertial::{GaugePriorSigmas, Whitening};
 use super::visual::bearing_plus;
 use crate::imu::{NavState, Preintegration, Vector15};
 use nalgebra::{Matrix2, SVector, Vector2, Vector3};
@@ -46,26 +46,26 @@ pub struct LandmarkEstimate {
     pub inverse_distance_sigma: f64,
     /// Its place in the world, m.
     pub in_world: Vector3<f64>,
-    /// Sightings in the window, the host's included.
-    pub sightings: usize,
+    /// Observations in the window, the host's included.
+    pub observations: usize,
 }
 
-/// Readings since the frame before.
+/// IMU measurements since the frame before.
 #[derive(Clone, Debug)]
-pub(crate) struct Link {
-    pub(crate) readings: Preintegration,
+pub(crate) struct ImuFactor {
+    pub(crate) preintegration: Preintegration,
     pub(crate) whitening: Whitening,
 }
 
-impl Link {
-    pub(crate) fn new(readings: Preintegration) -> Self {
-        let whitening = Whitening::of(&readings);
-        Self { readings, whitening }
+impl ImuFactor {
+    pub(crate) fn new(preintegration: Preintegration) -> Self {
+        let whitening = Whitening::of(&preintegration);
+        Self { preintegration, whitening }
     }
 
     pub(crate) fn follow(&mut self, state: &NavState) {
-        if self.readings.follow(&state.bias) {
-            self.whitening = Whitening::of(&self.readings);
+        if self.preintegration.follow(&state.bias) {
+            self.whitening = Whitening::of(&self.preintegration);
         }
     }
 }
@@ -74,7 +74,7 @@ impl Link {
 pub(crate) struct Frame {
     pub(crate) id: FrameId,
     pub(crate) time: Timestamp,
-    /// Clock offset that `time` and the readings up to it are cut with, s.
+    /// Clock offset that `time` and the IMU measurements up to it are cut with, s.
     pub(crate) clock_secs: f64,
     pub(crate) keyframe: bool,
     pub(crate) state: NavState,
@@ -84,14 +84,14 @@ pub(crate) struct Frame {
     pub(crate) step: Vector15,
     pub(crate) pose_in_prior: bool,
     pub(crate) motion_in_prior: bool,
-    pub(crate) link: Option<Link>,
+    pub(crate) imu_factor: Option<ImuFactor>,
     pub(crate) standstill_sigma: Option<f64>,
     /// What is known of the motion since the frame before: that there was none.
-    pub(crate) rest: Option<super::standstill::Rest>,
+    pub(crate) zero_motion: Option<super::standstill::ZeroMotionFactor>,
 }
 
 impl Frame {
-    pub(crate) fn new(id: FrameId, time: Timestamp, state: NavState, link: Option<Link>) -> Self {
+    pub(crate) fn new(id: FrameId, time: Timestamp, state: NavState, imu_factor: Option<ImuFactor>) -> Self {
         Self {
             id,
             time,
@@ -102,9 +102,9 @@ impl Frame {
             step: Vector15::zeros(),
             pose_in_prior: false,
             motion_in_prior: false,
-            link,
+            imu_factor,
             standstill_sigma: None,
-            rest: None,
+            zero_motion: None,
         }
     }
 
@@ -163,9 +163,9 @@ impl Frame {
     }
 }
 
-/// One sighting, with the frame by its place in the window.
+/// One observation, with the frame by its place in the window.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct Sighting {
+pub(crate) struct LandmarkObservation {
     pub(crate) frame: usize,
     pub(crate) pixel: Vector2<f64>,
     pub(crate) whitening: Matrix2<f64>,
@@ -177,23 +177,28 @@ pub(crate) struct Sighting {
 pub(crate) struct Landmark {
     pub(crate) id: LandmarkId,
     pub(crate) alive: bool,
-    pub(crate) host: Sighting,
+    pub(crate) host: LandmarkObservation,
     pub(crate) bearing: Vector3<f64>,
     pub(crate) rho: f64,
     pub(crate) rho_sigma: f64,
-    /// Sightings in other frames, in the order of frames.
-    pub(crate) sightings: Vec<Sighting>,
+    /// Observations in other frames, in the order of frames.
+    pub(crate) observations: Vec<LandmarkObservation>,
 }
 
 impl Landmark {
-    /// A landmark with room for sightings.
+    /// A landmark with room for observations.
     pub(crate) fn empty() -> Self {
-        Self { sightings: Vec::with_capacity(24), ..Self::placeholder() }
+        Self { observations: Vec::with_capacity(24), ..Self::placeholder() }
     }
 
     /// A landmark without memory, to stand in for another for a moment.
     pub(crate) fn placeholder() -> Self {
-        let host = Sighting { frame: 0, pixel: Vector2::zeros(), whitening: Matrix2::identity(), chi2: 0.0 };
+        let host = LandmarkObservation {
+            frame: 0,
+            pixel: Vector2::zeros(),
+            whitening: Matrix2::identity(),
+            chi2: 0.0,
+        };
         Self {
             id: LandmarkId(0),
             alive: false,
@@ -201,32 +206,38 @@ impl Landmark {
             bearing: Vector3::z(),
             rho: 1.0,
             rho_sigma: f64::INFINITY,
-            sightings: Vec::new(),
+            observations: Vec::new(),
         }
     }
 
-    pub(crate) fn begin(&mut self, id: LandmarkId, host: Sighting, bearing: Vector3<f64>, rho: f64) {
+    pub(crate) fn begin(
+        &mut self,
+        id: LandmarkId,
+        host: LandmarkObservation,
+        bearing: Vector3<f64>,
+        rho: f64,
+    ) {
         self.id = id;
         self.alive = true;
         self.host = host;
         self.bearing = bearing;
         self.rho = rho;
         self.rho_sigma = f64::INFINITY;
-        self.sightings.clear();
+        self.observations.clear();
     }
 
     pub(crate) fn end(&mut self) {
         self.alive = false;
-        self.sightings.clear();
+        self.observations.clear();
     }
 
     pub(crate) fn sees(&self, frame: usize) -> bool {
-        self.host.frame == frame || self.sightings.iter().any(|s| s.frame == frame)
+        self.host.frame == frame || self.observations.iter().any(|s| s.frame == frame)
     }
 
-    pub(crate) fn insert(&mut self, sighting: Sighting) {
-        let at = self.sightings.partition_point(|s| s.frame < sighting.frame);
-        self.sightings.insert(at, sighting);
+    pub(crate) fn insert(&mut self, observation: LandmarkObservation) {
+        let at = self.observations.partition_point(|s| s.frame < observation.frame);
+        self.observations.insert(at, observation);
     }
 
     pub(crate) fn apply(&mut self, step: &Vector3<f64>) {
@@ -247,17 +258,17 @@ impl Landmark {
             inverse_distance: self.rho,
             inverse_distance_sigma: self.rho_sigma,
             in_world: self.in_world(frames, body_from_camera),
-            sightings: self.sightings.len() + 1,
+            observations: self.observations.len() + 1,
         }
     }
 }
 
 /// What is known of the first frame, as long as it is in the window.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct Anchor {
+pub(crate) struct GaugePrior {
     pub(crate) frame: usize,
     pub(crate) reference: NavState,
-    pub(crate) sigmas: AnchorSigmas,
+    pub(crate) sigmas: GaugePriorSigmas,
 }
 
 /// The camera's place on the body and its clock, with linearisation point and step once they are in the prior.

@@ -248,17 +248,17 @@ mod tests {
     #[test]
     fn the_defaults_are_valid_and_a_bad_key_is_named() {
         FrontendConfig::default().validate().unwrap();
-        type Spoil = fn(&mut FrontendConfig);
-        let cases: [(&str, Spoil); 5] = [
+        type Corrupt = fn(&mut FrontendConfig);
+        let cases: [(&str, Corrupt); 5] = [
             ("pyramid.levels", |c| c.pyramid.levels = 0),
             ("detector.fast_threshold", |c| c.detector.fast_threshold = 0),
             ("image_alignment.coarsest_level", |c| c.image_alignment.coarsest_level = 1),
             ("matching.min_ncc", |c| c.matching.min_ncc = f64::NAN),
             ("two_view.confidence", |c| c.two_view.confidence = 1.0),
         ];
-        for (name, spoil) in cases {
+        for (name, corrupt) in cases {
             let mut config = FrontendConfig::default();
-            spoil(&mut config);
+            corrupt(&mut config);
             match config.validate() {
                 Err(FrontendError::BadConfig { key, .. }) => assert_eq!(key, name),
                 other => panic!("{name}: {other:?}"),

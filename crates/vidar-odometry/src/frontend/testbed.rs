@@ -88,7 +88,7 @@ impl Scene {
     }
 
     /// `view` as a worse camera saw it: grey levels times `gain` plus noise, clipped.
-    pub fn spoiled(&self, view: usize, gain: f64, sigma: f64) -> Pyramid {
+    pub fn degraded(&self, view: usize, gain: f64, sigma: f64) -> Pyramid {
         let mut random = Random::new(17 + view as u64);
         let image = self.views[view]
             .image

@@ -1,14 +1,14 @@
-//! Readings by time, cut at arbitrary instants.
+//! IMU measurements by time, cut at arbitrary instants.
 
 use std::collections::VecDeque;
 use vidar_core::{AngularRate, Duration, ImuSample, SpecificForce, Timestamp};
 
-/// Why a reading is not taken or an interval cannot be given.
+/// Why an IMU sample is not taken or an interval cannot be given.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 #[non_exhaustive]
 pub enum BufferError {
     /// Time does not advance.
-    #[error("IMU reading at {found} s is not after the one before it at {previous} s; it is left out")]
+    #[error("IMU sample at {found} s is not after the one before it at {previous} s; it is left out")]
     NotIncreasing {
         /// Time of the reading.
         found: Timestamp,
@@ -16,13 +16,13 @@ pub enum BufferError {
         previous: Timestamp,
     },
     /// A component is not a number.
-    #[error("IMU reading at {found} s is not finite; it is left out")]
+    #[error("IMU sample at {found} s is not finite; it is left out")]
     NotFinite {
         /// Time of the reading.
         found: Timestamp,
     },
-    /// The readings held do not reach as far back or ahead as asked.
-    #[error("IMU readings from {from} s to {until} s were asked for, held are {held}")]
+    /// The IMU measurements held do not reach as far back or ahead as asked.
+    #[error("IMU measurements from {from} s to {until} s were asked for, held are {held}")]
     NotCovered {
         /// Begin of the interval.
         from: Timestamp,
@@ -33,7 +33,7 @@ pub enum BufferError {
     },
 }
 
-/// A stretch without readings, longer than the IMU's rate explains.
+/// A stretch without IMU measurements, longer than the IMU's rate explains.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Gap {
     /// Last reading before it.
@@ -42,10 +42,10 @@ pub struct Gap {
     pub length: Duration,
 }
 
-/// A gap is told when two readings lie further apart than this many nominal periods.
+/// A gap is told when two IMU measurements lie further apart than this many nominal periods.
 const GAP_PERIODS: f64 = 3.5;
 
-/// Readings in the order of time; the oldest are forgotten by [`ImuBuffer::forget_before`].
+/// IMU measurements in the order of time; the oldest are forgotten by [`ImuBuffer::forget_before`].
 #[derive(Clone, Debug)]
 pub struct ImuBuffer {
     samples: VecDeque<ImuSample>,
@@ -53,13 +53,13 @@ pub struct ImuBuffer {
 }
 
 impl ImuBuffer {
-    /// An empty buffer for readings at about `rate_hz`.
+    /// An empty buffer for IMU measurements at about `rate_hz`.
     pub fn new(rate_hz: f64) -> Self {
         let nominal_period = Duration::from_secs_f64(1.0 / rate_hz.max(1.0));
         Self { samples: VecDeque::with_capacity(4096), nominal_period }
     }
 
-    /// Takes a reading.
+    /// Takes an IMU sample.
     ///
     /// # Errors
     /// Time that does not advance, values that are not finite. The buffer is unchanged then.
@@ -76,13 +76,13 @@ impl ImuBuffer {
 
     /// Forgets what is not needed for intervals that begin at `time` or later.
     pub fn forget_before(&mut self, time: Timestamp) {
-        // One reading at or before `time` stays, to interpolate from.
+        // One sample at or before `time` stays, to interpolate from.
         while self.samples.len() > 1 && self.samples[1].time <= time {
             self.samples.pop_front();
         }
     }
 
-    /// Readings held.
+    /// IMU measurements held.
     pub fn len(&self) -> usize {
         self.samples.len()
     }
@@ -97,7 +97,7 @@ impl ImuBuffer {
         self.samples.back().map(|s| s.time)
     }
 
-    /// The readings held, oldest first.
+    /// The IMU measurements held, oldest first.
     pub fn iter(&self) -> impl DoubleEndedIterator<Item = &ImuSample> + ExactSizeIterator {
         self.samples.iter()
     }
@@ -107,7 +107,7 @@ impl ImuBuffer {
         self.nominal_period
     }
 
-    /// The reading at `time`, linear between its neighbours; `None` outside what is held.
+    /// The sample at `time`, linear between its neighbours; `None` outside what is held.
     pub fn at(&self, time: Timestamp) -> Option<ImuSample> {
         let after = self.samples.partition_point(|s| s.time < time);
         let next = self.samples.get(after)?;
@@ -117,11 +117,11 @@ impl ImuBuffer {
         Some(between(self.samples.get(after.checked_sub(1)?)?, next, time))
     }
 
-    /// Writes the readings from `from` to `until` into `out` (cleared first), interpolated at both ends, and returns
+    /// Writes the IMU measurements from `from` to `until` into `out` (cleared first), interpolated at both ends, and returns
     /// the longest gap among them, if any is longer than the rate explains.
     ///
     /// # Errors
-    /// The interval is empty or reaches beyond the readings held.
+    /// The interval is empty or reaches beyond the IMU measurements held.
     pub fn interval(
         &self,
         from: Timestamp,

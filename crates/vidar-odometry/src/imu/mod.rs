@@ -1,4 +1,4 @@
-//! Inertial readings between images: buffer, preintegration, propagation with covariance.
+//! IMU measurements between images: buffer, preintegration, propagation with covariance.
 //!
 //! The error state of a [`NavState`] has 15 dimensions in the order rotation (body side), position (world), velocity
 //! (world), gyroscope bias, accelerometer bias: `R ← R · Exp(δθ)`, `p ← p + δp`, `v ← v + δv`, `b ← b + δb`

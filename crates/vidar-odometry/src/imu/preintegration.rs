@@ -1,6 +1,6 @@
 //! Preintegrated motion between two instants, with bias derivatives and covariance.
 //!
-//! Readings are taken as linear between samples. One step of length `h` turns by the fourth-order Magnus expansion of a
+//! IMU measurements are taken as linear between samples. One step of length `h` turns by the fourth-order Magnus expansion of a
 //! linear rate (`φ = ½(ω₀+ω₁)h + h²/12 ω₀×ω₁`, on each half step), and integrates the rotated specific force by
 //! Simpson's rule: fourth order, where the usual mid-point rule is second. Steps and longer stretches are joined by one
 //! rule ([`Delta::then`]), which also joins their derivatives and covariances.
@@ -30,7 +30,7 @@ pub struct StepNoise {
     pub gyro_density: f64,
     /// Accelerometer, m/s²/√Hz.
     pub accel_density: f64,
-    /// Nominal time between readings, s; longer steps are gaps.
+    /// Nominal time between IMU measurements, s; longer steps are gaps.
     pub period_secs: f64,
 }
 
@@ -114,7 +114,7 @@ impl Delta {
         }
     }
 
-    /// One step between neighbouring readings.
+    /// One step between neighbouring IMU measurements.
     fn step(a: &ImuSample, b: &ImuSample, bias: &Bias, model: &ImuModel) -> Self {
         let secs = (b.time - a.time).as_secs_f64();
         let (w0, w1) = (a.gyro.0 - bias.gyro, b.gyro.0 - bias.gyro);
@@ -189,7 +189,7 @@ fn magnus(w0: &Vector3<f64>, w1: &Vector3<f64>, secs: f64) -> (Vector3<f64>, Mat
 }
 
 fn step_variances(a: &ImuSample, b: &ImuSample, secs: f64, model: &ImuModel) -> [f64; 2] {
-    // Ten times the noise per 50 ms without readings, at most 1e4.
+    // Ten times the noise per 50 ms without IMU measurements, at most 1e4.
     let missing_secs = (secs - 2.0 * model.noise.period_secs).max(0.0);
     let gap_factor = 10.0_f64.powf((missing_secs / 0.05).min(4.0));
     let beyond = |x: &Vector3<f64>, y: &Vector3<f64>, limit: f64| x.amax() > limit || y.amax() > limit;
@@ -206,14 +206,14 @@ fn step_variances(a: &ImuSample, b: &ImuSample, secs: f64, model: &ImuModel) -> 
     ]
 }
 
-/// Raw readings are kept for exact re-integration up to this many; longer stretches are corrected to first order.
+/// Raw IMU measurements are kept for exact re-integration up to this many; longer stretches are corrected to first order.
 const MAX_RAW_SAMPLES: usize = 4096;
 
 /// Re-integrate when the bias moved by more than this over the interval: rad, and m.
 const REINTEGRATE_RAD: f64 = 1e-3;
 const REINTEGRATE_M: f64 = 5e-3;
 
-/// Readings between two instants, integrated once and corrected for other biases to first order.
+/// IMU measurements between two instants, integrated once and corrected for other biases to first order.
 #[derive(Clone, Debug)]
 pub struct Preintegration {
     pub(crate) delta: Delta,
@@ -263,7 +263,7 @@ impl Preintegration {
         }
     }
 
-    /// Integrates again at `bias`; without raw readings (very long stretches) the first-order correction stays.
+    /// Integrates again at `bias`; without raw IMU measurements (very long stretches) the first-order correction stays.
     pub fn reintegrate(&mut self, bias: Bias) {
         if !self.sealed {
             self.bias = bias;
@@ -302,7 +302,7 @@ impl Preintegration {
         }
     }
 
-    /// Whether a reading kept lies beyond the range of its sensor: what was felt is less than what was.
+    /// Whether an IMU sample kept lies beyond the range of its sensor: what was felt is less than what was.
     pub fn is_saturated(&self) -> bool {
         let beyond = |s: &ImuSample| {
             s.gyro.0.amax() > self.model.gyro_limit || s.accel.0.amax() > self.model.accel_limit
@@ -330,7 +330,7 @@ impl Preintegration {
         self.ends.map(|r| Rates { turn: r.turn - self.bias.gyro, force: r.force - self.bias.accel })
     }
 
-    /// Readings kept, ends included; empty after very long stretches.
+    /// IMU measurements kept, ends included; empty after very long stretches.
     pub fn samples(&self) -> &[ImuSample] {
         &self.samples
     }

@@ -1,4 +1,4 @@
-//! A state and its covariance carried forward by readings.
+//! A state and its covariance carried forward by IMU measurements.
 
 use super::{Matrix15, NavState, Preintegration, hat};
 use nalgebra::{Matrix3, Vector3};
@@ -13,33 +13,33 @@ pub struct Propagated {
     pub covariance: Matrix15,
 }
 
-/// Carries `state` and its `covariance` over the stretch of `readings`, bias walks included.
-pub fn propagate(state: &NavState, covariance: &Matrix15, readings: &Preintegration) -> Propagated {
-    let t = readings.secs();
-    let transition = d_end_d_start(state, readings);
+/// Carries `state` and its `covariance` over the stretch of `IMU measurements`, bias walks included.
+pub fn propagate(state: &NavState, covariance: &Matrix15, preintegration: &Preintegration) -> Propagated {
+    let t = preintegration.secs();
+    let transition = d_end_d_start(state, preintegration);
     let mut noise = Matrix15::zeros();
     // Preintegration's error is on the body side of the end for rotation, in the first frame for the rest.
     let turn = state.world_from_body.rotation.matrix();
     let mut g = nalgebra::SMatrix::<f64, 9, 9>::identity();
     g.fixed_view_mut::<3, 3>(3, 3).copy_from(&turn);
     g.fixed_view_mut::<3, 3>(6, 6).copy_from(&turn);
-    noise.fixed_view_mut::<9, 9>(0, 0).copy_from(&(g * readings.covariance() * g.transpose()));
-    let model = readings.model();
+    noise.fixed_view_mut::<9, 9>(0, 0).copy_from(&(g * preintegration.covariance() * g.transpose()));
+    let model = preintegration.model();
     let walk = Matrix3::identity() * t;
     noise.fixed_view_mut::<3, 3>(9, 9).copy_from(&(walk * model.gyro_walk.powi(2)));
     noise.fixed_view_mut::<3, 3>(12, 12).copy_from(&(walk * model.accel_walk.powi(2)));
     let carried = transition * covariance * transition.transpose() + noise;
-    Propagated { state: readings.predict(state), covariance: (carried + carried.transpose()) * 0.5 }
+    Propagated { state: preintegration.predict(state), covariance: (carried + carried.transpose()) * 0.5 }
 }
 
 /// Derivative of the error state at the end by that at the start.
-pub(crate) fn d_end_d_start(state: &NavState, readings: &Preintegration) -> Matrix15 {
-    let delta = &readings.delta;
+pub(crate) fn d_end_d_start(state: &NavState, preintegration: &Preintegration) -> Matrix15 {
+    let delta = &preintegration.delta;
     let t = delta.secs;
-    let (rotation, position, velocity) = readings.corrected(&state.bias);
+    let (rotation, position, velocity) = preintegration.corrected(&state.bias);
     let turn = state.world_from_body.rotation.matrix();
     let shift: Vector3<f64> =
-        delta.by_gyro_bias.fixed_view::<3, 3>(0, 0) * (state.bias.gyro - readings.bias().gyro);
+        delta.by_gyro_bias.fixed_view::<3, 3>(0, 0) * (state.bias.gyro - preintegration.bias().gyro);
     let mut f = Matrix15::identity();
     f.fixed_view_mut::<3, 3>(0, 0).copy_from(&rotation.matrix().transpose());
     f.fixed_view_mut::<3, 3>(0, 9)

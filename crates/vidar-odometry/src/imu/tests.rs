@@ -23,7 +23,7 @@ fn reading(flight: &impl Flight, secs: f64, bias: &Bias) -> ImuSample {
     }
 }
 
-fn readings(from: f64, until: f64, rate: f64, bias: &Bias) -> Vec<ImuSample> {
+fn imu_samples(from: f64, until: f64, rate: f64, bias: &Bias) -> Vec<ImuSample> {
     let n = ((until - from) * rate).round() as usize;
     (0..=n).map(|k| reading(&COURSE, from + k as f64 / rate, bias)).collect()
 }
@@ -40,7 +40,7 @@ fn runge_kutta(from: f64, until: f64) -> (So3, Vector3<f64>, Vector3<f64>) {
     let none = Bias::ZERO;
     let at = |t: f64| {
         let r = reading(&COURSE, t, &none);
-        // The clock of readings is in whole nanoseconds; the rates are exact.
+        // The clock of IMU measurements is in whole nanoseconds; the rates are exact.
         (r.gyro.0, r.accel.0)
     };
     let quaternion_rate =
@@ -70,13 +70,13 @@ fn runge_kutta(from: f64, until: f64) -> (So3, Vector3<f64>, Vector3<f64>) {
 
 #[test]
 fn preintegration_agrees_with_runge_kutta_at_10_khz() {
-    // What is left is that readings are not linear between samples: second order in their distance. Over half a second
+    // What is left is that IMU measurements are not linear between samples: second order in their distance. Over half a second
     // of a 2.5 m/s flight; the noise of EuRoC's IMU alone is 1.2e-4 rad and 1.4e-3 m/s.
     for rate in [100.0, 200.0, 1000.0] {
         let (rad, m, mps) = (0.5 / (rate * rate), 0.5 / (rate * rate), 2.0 / (rate * rate));
         for from in [0.4, 3.0, 7.7] {
             let (rotation, position, velocity) = runge_kutta(from, from + 0.5);
-            let found = Preintegration::new(model(), bias(), &readings(from, from + 0.5, rate, &bias()));
+            let found = Preintegration::new(model(), bias(), &imu_samples(from, from + 0.5, rate, &bias()));
             let (r, p, v) = found.corrected(&bias());
             let turned = (rotation.inverse() * r).angle_rad();
             assert!(turned < rad, "{rate} Hz from {from}: rotation off by {turned:.2e} rad");
@@ -93,7 +93,7 @@ fn prediction_arrives_where_the_flight_does() {
         let m = COURSE.motion(t);
         NavState { world_from_body: m.world_from_body, velocity: m.velocity, bias: bias() }
     };
-    let found = Preintegration::new(model(), bias(), &readings(from, until, 1000.0, &bias()));
+    let found = Preintegration::new(model(), bias(), &imu_samples(from, until, 1000.0, &bias()));
     let error = found.predict(&state(from)).minus(&state(until));
     assert!(error.amax() < 1e-6, "{error}");
 }
@@ -105,7 +105,7 @@ fn delta_of(samples: &[ImuSample], b: &SVector<f64, 6>) -> Delta {
 
 #[test]
 fn derivatives_by_biases_agree_with_numeric_ones() {
-    let samples = readings(1.0, 1.5, 200.0, &bias());
+    let samples = imu_samples(1.0, 1.5, 200.0, &bias());
     let at = SVector::<f64, 6>::from([0.01, 0.02, -0.01, 0.2, -0.1, 0.05]);
     let here = delta_of(&samples, &at);
     let mut analytic = SMatrix::<f64, 9, 6>::zeros();
@@ -125,7 +125,7 @@ fn derivatives_by_biases_agree_with_numeric_ones() {
 #[test]
 fn covariance_of_motion_is_what_noisy_readings_scatter() {
     let model = model();
-    let clean = readings(0.5, 0.8, 200.0, &Bias::ZERO);
+    let clean = imu_samples(0.5, 0.8, 200.0, &Bias::ZERO);
     let exact = Preintegration::new(model, Bias::ZERO, &clean);
     let mut random = Random::new(3);
     let runs = 3000;
@@ -158,7 +158,7 @@ fn covariance_of_motion_is_what_noisy_readings_scatter() {
 
 #[test]
 fn two_stretches_joined_are_the_whole() {
-    let samples = readings(1.0, 1.6, 200.0, &bias());
+    let samples = imu_samples(1.0, 1.6, 200.0, &bias());
     let whole = Preintegration::new(model(), Bias::ZERO, &samples);
     let mut joined = Preintegration::new(model(), Bias::ZERO, &samples[..60]);
     // The second stretch was integrated at other biases and is read again.
@@ -171,7 +171,7 @@ fn two_stretches_joined_are_the_whole() {
 
 #[test]
 fn a_bias_that_moved_far_is_integrated_again_and_a_near_one_is_not() {
-    let samples = readings(1.0, 1.6, 200.0, &bias());
+    let samples = imu_samples(1.0, 1.6, 200.0, &bias());
     let mut found = Preintegration::new(model(), Bias::ZERO, &samples);
     let near = Bias { gyro: Vector3::new(1e-4, 0.0, 0.0), accel: Vector3::new(1e-3, 0.0, 0.0) };
     assert!(!found.follow(&near) && found.bias() == &Bias::ZERO);
@@ -182,7 +182,7 @@ fn a_bias_that_moved_far_is_integrated_again_and_a_near_one_is_not() {
 
 #[test]
 fn transition_agrees_with_numeric_derivatives() {
-    let samples = readings(1.0, 1.3, 200.0, &bias());
+    let samples = imu_samples(1.0, 1.3, 200.0, &bias());
     let found = Preintegration::new(model(), Bias::ZERO, &samples);
     let m = COURSE.motion(1.0);
     let small = Bias { gyro: Vector3::new(2e-3, 1e-3, -1e-3), accel: Vector3::new(0.01, 0.0, 0.02) };
@@ -195,7 +195,7 @@ fn transition_agrees_with_numeric_derivatives() {
 
 #[test]
 fn propagated_covariance_grows_and_stays_symmetric() {
-    let samples = readings(1.0, 1.5, 200.0, &bias());
+    let samples = imu_samples(1.0, 1.5, 200.0, &bias());
     let found = Preintegration::new(model(), bias(), &samples);
     let m = COURSE.motion(1.0);
     let state = NavState { world_from_body: m.world_from_body, velocity: m.velocity, bias: bias() };
@@ -209,7 +209,7 @@ fn propagated_covariance_grows_and_stays_symmetric() {
 
 #[test]
 fn a_gap_and_a_saturated_reading_inflate_the_noise() {
-    let mut samples = readings(1.0, 1.5, 200.0, &Bias::ZERO);
+    let mut samples = imu_samples(1.0, 1.5, 200.0, &Bias::ZERO);
     let plain = Preintegration::new(model(), Bias::ZERO, &samples).delta.covariance;
     let mut clipped = samples.clone();
     clipped[40].gyro.0.x = 17.5;
@@ -222,9 +222,9 @@ fn a_gap_and_a_saturated_reading_inflate_the_noise() {
 #[test]
 fn the_buffer_cuts_between_readings_and_tells_gaps() {
     let mut buffer = ImuBuffer::new(200.0);
-    let all = readings(0.0, 1.0, 200.0, &Bias::ZERO);
+    let all = imu_samples(0.0, 1.0, 200.0, &Bias::ZERO);
     for (k, s) in all.iter().enumerate().filter(|(k, _)| !(100..130).contains(k)) {
-        buffer.push(*s).unwrap_or_else(|e| panic!("reading {k}: {e}"));
+        buffer.push(*s).unwrap_or_else(|e| panic!("sample {k}: {e}"));
     }
     let ns = Timestamp::from_nanos;
     let mut cut = Vec::new();

@@ -5,10 +5,10 @@ use std::fmt;
 /// What stands in the way.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[non_exhaustive]
-pub enum Obstacle {
-    /// Frames with readings between them.
+pub enum InitFailureReason {
+    /// Frames with IMU measurements between them.
     Frames,
-    /// Seconds of frames or readings.
+    /// Seconds of frames or IMU measurements.
     Seconds,
     /// Tracks that several frames share.
     Tracks,
@@ -18,12 +18,12 @@ pub enum Obstacle {
     ScaleUncertainty,
     /// Change of the scale between successive solutions, relative.
     ScaleAgreement,
-    /// Share of sightings that fit no solution.
-    WrongSightings,
-    /// Misfit of the images, χ² per degree of freedom.
-    ImageMisfit,
-    /// Misfit of the inertial readings, χ² per degree of freedom.
-    InertialMisfit,
+    /// Share of observations that fit no solution.
+    OutlierShare,
+    /// Residual of the images, χ² per degree of freedom.
+    ImageChi2,
+    /// Residual of the IMU measurements, χ² per degree of freedom.
+    ImuChi2,
     /// Speed, m/s.
     Speed,
     /// Accelerometer bias, m/s².
@@ -33,9 +33,9 @@ pub enum Obstacle {
     /// Median distance of the scene, m.
     SceneDistance,
     /// Scatter of the gyroscope while standing still, rad/s.
-    GyroScatter,
+    GyroStd,
     /// Scatter of the accelerometer while standing still, m/s².
-    AccelScatter,
+    AccelStd,
     /// Motion in the image while standing still, px.
     ImageMotion,
     /// Mean specific force, m/s², which must be near gravity.
@@ -44,59 +44,77 @@ pub enum Obstacle {
     CameraOrientation,
 }
 
-/// An obstacle with its measured value and the limit.
+/// An failure reason with its measured value and the limit.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Refusal {
+pub struct InitFailure {
     /// What stands in the way.
-    pub obstacle: Obstacle,
+    pub reason: InitFailureReason,
     /// What was measured.
     pub measured: f64,
-    /// What it would have to be: at least, or at most, as [`Refusal::wants_more`] says.
+    /// What it would have to be: at least, or at most, as [`InitFailure::wants_more`] says.
     pub limit: f64,
 }
 
-impl Refusal {
-    pub(crate) fn new(obstacle: Obstacle, measured: f64, limit: f64) -> Self {
-        Self { obstacle, measured, limit }
+impl InitFailure {
+    pub(crate) fn new(reason: InitFailureReason, measured: f64, limit: f64) -> Self {
+        Self { reason, measured, limit }
     }
 
     /// Whether the value has to rise (parallax, tracks) rather than fall.
     pub fn wants_more(&self) -> bool {
-        matches!(self.obstacle, Obstacle::Frames | Obstacle::Seconds | Obstacle::Tracks | Obstacle::Parallax)
+        matches!(
+            self.reason,
+            InitFailureReason::Frames
+                | InitFailureReason::Seconds
+                | InitFailureReason::Tracks
+                | InitFailureReason::Parallax
+        )
     }
 }
 
-impl fmt::Display for Refusal {
+impl fmt::Display for InitFailure {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let (name, unit, advice) = match self.obstacle {
-            Obstacle::Frames => ("frames with readings", "", "wait"),
-            Obstacle::Seconds => ("recorded time", " s", "wait"),
-            Obstacle::Tracks => ("shared tracks", "", "show more texture, move less abruptly"),
-            Obstacle::Parallax => ("parallax", " deg", "move sideways"),
-            Obstacle::ScaleUncertainty => ("std(log scale)", "", "speed up and slow down, move to and fro"),
-            Obstacle::ScaleAgreement => ("change of scale between solutions", "", "keep moving"),
-            Obstacle::WrongSightings => ("share of sightings that do not fit", "", "avoid moving things"),
-            Obstacle::ImageMisfit => {
-                ("image misfit", " per dof", "check the camera calibration and clock offset")
+        let (name, unit, advice) = match self.reason {
+            InitFailureReason::Frames => ("frames with IMU measurements", "", "wait"),
+            InitFailureReason::Seconds => ("recorded time", " s", "wait"),
+            InitFailureReason::Tracks => ("shared tracks", "", "show more texture, move less abruptly"),
+            InitFailureReason::Parallax => ("parallax", " deg", "move sideways"),
+            InitFailureReason::ScaleUncertainty => {
+                ("std(log scale)", "", "speed up and slow down, move to and fro")
             }
-            Obstacle::InertialMisfit => ("inertial misfit", " per dof", "check the IMU's noise and axes"),
-            Obstacle::Speed => ("speed", " m/s", "check the calibration"),
-            Obstacle::AccelBias => ("accelerometer bias", " m/s²", "move more, turn about two axes"),
-            Obstacle::GyroBias => ("gyroscope bias", " rad/s", "check the gyroscope's units and axes"),
-            Obstacle::SceneDistance => ("median distance", " m", "move sideways nearer to the scene"),
-            Obstacle::GyroScatter => {
+            InitFailureReason::ScaleAgreement => ("change of scale between solutions", "", "keep moving"),
+            InitFailureReason::OutlierShare => {
+                ("share of observations that do not fit", "", "avoid moving things")
+            }
+            InitFailureReason::ImageChi2 => {
+                ("image residual", " per dof", "check the camera calibration and clock offset")
+            }
+            InitFailureReason::ImuChi2 => ("inertial residual", " per dof", "check the IMU's noise and axes"),
+            InitFailureReason::Speed => ("speed", " m/s", "check the calibration"),
+            InitFailureReason::AccelBias => ("accelerometer bias", " m/s²", "move more, turn about two axes"),
+            InitFailureReason::GyroBias => {
+                ("gyroscope bias", " rad/s", "check the gyroscope's units and axes")
+            }
+            InitFailureReason::SceneDistance => {
+                ("median distance", " m", "move sideways nearer to the scene")
+            }
+            InitFailureReason::GyroStd => {
                 ("gyroscope scatter", " rad/s", "hold still, or move and start in flight")
             }
-            Obstacle::AccelScatter => {
+            InitFailureReason::AccelStd => {
                 ("accelerometer scatter", " m/s²", "hold still, or move and start in flight")
             }
-            Obstacle::ImageMotion => ("image motion", " px", "hold still, or move and start in flight"),
-            Obstacle::CameraOrientation => (
+            InitFailureReason::ImageMotion => {
+                ("image motion", " px", "hold still, or move and start in flight")
+            }
+            InitFailureReason::CameraOrientation => (
                 "the camera's orientation on the IMU is off by",
                 " deg",
                 "check the extrinsic calibration (inverted?)",
             ),
-            Obstacle::SpecificForce => ("mean specific force", " m/s²", "check the accelerometer's units"),
+            InitFailureReason::SpecificForce => {
+                ("mean specific force", " m/s²", "check the accelerometer's units")
+            }
         };
         let sign = if self.wants_more() { '<' } else { '>' };
         write!(f, "{name} {:.3}{unit} {sign} {:.3}{unit}: {advice}", self.measured, self.limit)

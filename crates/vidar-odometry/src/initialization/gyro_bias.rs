@@ -51,11 +51,11 @@ fn fitting<F: Fn(&Bias) -> So3 + Copy>(pair: &RayPair<F>, bias: &Bias) -> RayPai
     let rotation = (pair.rotation)(bias).matrix();
     let eigen = scatter(&pair.rays, &rotation).symmetric_eigen();
     let along = eigen.eigenvectors.column(eigen.eigenvalues.imin()).into_owned();
-    let misfit = |(a, b): &(Vector3<f64>, Vector3<f64>)| a.cross(&(rotation * b)).dot(&along).abs();
-    let mut all: Vec<f64> = pair.rays.iter().map(misfit).collect();
+    let residual = |(a, b): &(Vector3<f64>, Vector3<f64>)| a.cross(&(rotation * b)).dot(&along).abs();
+    let mut all: Vec<f64> = pair.rays.iter().map(residual).collect();
     all.sort_unstable_by(f64::total_cmp);
     let limit = OUTLIER_MEDIANS * all.get(all.len() / 2).copied().unwrap_or(0.0);
-    let rays = pair.rays.iter().filter(|r| misfit(r) <= limit).copied().collect();
+    let rays = pair.rays.iter().filter(|r| residual(r) <= limit).copied().collect();
     RayPair { rays, rotation: pair.rotation }
 }
 

@@ -1,10 +1,12 @@
 //! Start in motion.
 
-use super::failure::{Obstacle, Refusal};
+use super::failure::{InitFailure, InitFailureReason};
 use super::gyro_bias::{RayPair, gyro_bias};
 use super::linear::{self, LinearSolution, LinearView, Rays};
 use super::static_start::leveled;
-use crate::backend::{AnchorSigmas, Observation, OptimiseReport, Smoother, SmootherConfig, SmootherError};
+use crate::backend::{
+    GaugePriorSigmas, Observation, OptimiseReport, Smoother, SmootherConfig, SmootherError,
+};
 use crate::imu::{Bias, NavState, Preintegration};
 use nalgebra::{Matrix2, Matrix3, Vector2, Vector3};
 use rustc_hash::FxHashMap;
@@ -13,7 +15,7 @@ use vidar_core::{CameraModel, FrameId, LandmarkId, LieGroup, Se3, So3, Timestamp
 
 /// What a frame saw of a track.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Seen {
+pub struct TrackObservation {
     /// The track.
     pub landmark: LandmarkId,
     /// Where, pixels.
@@ -22,17 +24,17 @@ pub struct Seen {
     pub covariance: Matrix2<f64>,
 }
 
-/// A frame before there is a state: what it saw, and the readings since the frame before in the log.
+/// A frame before there is a state: what it saw, and the IMU measurements since the frame before in the log.
 #[derive(Clone, Debug)]
 pub struct LoggedFrame {
     /// Its number.
     pub frame: FrameId,
     /// When it was taken, in the clock of the IMU.
     pub time: Timestamp,
-    /// Readings since the frame before; what the first frame holds is not used.
-    pub readings: Option<Preintegration>,
+    /// IMU measurements since the frame before; what the first frame holds is not used.
+    pub preintegration: Option<Preintegration>,
     /// What it saw.
-    pub seen: Vec<Seen>,
+    pub observations: Vec<TrackObservation>,
 }
 
 /// When a start in motion is believed.
@@ -78,9 +80,9 @@ impl Default for InFlightConfig {
     }
 }
 
-/// A metric state was found.
+/// A metric state found in motion.
 #[derive(Clone, Debug)]
-pub struct Started {
+pub struct InFlightSolution {
     /// The window, solved; it goes on as the running smoother. World: z up, origin and heading of its first frame.
     pub smoother: Smoother,
     /// Standard deviation of log(scale).
@@ -89,13 +91,13 @@ pub struct Started {
     pub median_distance_m: f64,
 }
 
-/// What came of an attempt.
+/// Result of an attempt to initialise.
 #[derive(Clone, Debug)]
-pub enum Attempt {
+pub enum InitOutcome {
     /// A metric state.
-    Started(Box<Started>),
-    /// Not yet, and why.
-    Refused(Refusal),
+    Solved(Box<InFlightSolution>),
+    /// No metric state yet, and why.
+    Failed(InitFailure),
 }
 
 /// Largest biases that are believed, m/s² and rad/s.
@@ -103,7 +105,7 @@ const MAX_ACCEL_BIAS: f64 = 0.6;
 const MAX_GYRO_BIAS: f64 = 0.3;
 
 /// χ² per degree of freedom beyond which a fit is not believed.
-const MAX_MISFIT: f64 = 3.0;
+const MAX_CHI2_PER_DOF: f64 = 3.0;
 
 /// Steps of the window's solution.
 const STEPS: usize = 20;
@@ -125,17 +127,17 @@ const SCALES: [f64; 4] = [1.0, 3.0, 9.0, 0.4];
 /// fits lies far below 1.
 const GOOD_INERTIAL_FIT: f64 = 0.4;
 
-/// Share of sightings that may be left out as wrong.
+/// Share of observations that may be left out as wrong.
 const MOST_LEFT_OUT: f64 = 0.2;
 
 /// How well a solved window fits.
 #[derive(Clone, Copy, Debug)]
 struct Fit {
-    /// χ² per degree of freedom of the sightings kept.
+    /// χ² per degree of freedom of the observations kept.
     image: f64,
-    /// χ² per degree of freedom of the readings.
+    /// χ² per degree of freedom of the IMU measurements.
     inertial: f64,
-    /// Share of sightings that were left out.
+    /// Share of observations that were left out.
     left_out: f64,
     converged: bool,
 }
@@ -145,7 +147,7 @@ impl Fit {
         self.converged && self.inertial < GOOD_INERTIAL_FIT && self.left_out < MOST_LEFT_OUT
     }
 
-    fn badness(&self) -> f64 {
+    fn score(&self) -> f64 {
         self.inertial / GOOD_INERTIAL_FIT
             + self.left_out / MOST_LEFT_OUT
             + f64::from(u8::from(!self.converged))
@@ -154,7 +156,7 @@ impl Fit {
 
 /// Finds the first metric state in motion. Give it the log whenever a frame came; it remembers its last solution.
 #[derive(Clone, Debug)]
-pub struct InFlightStart {
+pub struct InFlightInitializer {
     config: InFlightConfig,
     smoother_config: SmootherConfig,
     camera: CameraModel,
@@ -164,20 +166,20 @@ pub struct InFlightStart {
     last: Option<Vec<(FrameId, Vector3<f64>)>>,
 }
 
-/// A chosen frame, with readings from the chosen one before.
+/// A chosen frame, with IMU measurements from the chosen one before.
 struct View<'a> {
     logged: &'a LoggedFrame,
-    readings: Option<Preintegration>,
+    preintegration: Option<Preintegration>,
 }
 
 /// A track over the chosen frames.
 struct Track {
     landmark: LandmarkId,
     /// View, what it saw, unit ray in its camera.
-    seen: Vec<(usize, Seen, Vector3<f64>)>,
+    observations: Vec<(usize, TrackObservation, Vector3<f64>)>,
 }
 
-impl InFlightStart {
+impl InFlightInitializer {
     /// Nothing is known yet but the calibration.
     pub fn new(
         config: InFlightConfig,
@@ -211,44 +213,48 @@ impl InFlightStart {
     ///
     /// # Errors
     /// A smoother that cannot be built, which is a fault of the settings.
-    pub fn attempt(&mut self, log: &[LoggedFrame]) -> Result<Attempt, SmootherError> {
+    pub fn attempt(&mut self, log: &[LoggedFrame]) -> Result<InitOutcome, SmootherError> {
         match self.solve(log)? {
-            Ok(started) => Ok(Attempt::Started(Box::new(started))),
-            Err(refusal) => Ok(Attempt::Refused(refusal)),
+            Ok(started) => Ok(InitOutcome::Solved(Box::new(started))),
+            Err(failure) => Ok(InitOutcome::Failed(failure)),
         }
     }
 
-    fn solve(&mut self, log: &[LoggedFrame]) -> Result<Result<Started, Refusal>, SmootherError> {
+    fn solve(&mut self, log: &[LoggedFrame]) -> Result<Result<InFlightSolution, InitFailure>, SmootherError> {
         let mut views = self.choose(log);
         let span = match (views.first(), views.last()) {
             (Some(first), Some(last)) => (last.logged.time - first.logged.time).as_secs_f64(),
             _ => 0.0,
         };
         if !(span >= self.config.min_secs) {
-            return Ok(Err(Refusal::new(Obstacle::Seconds, span, self.config.min_secs)));
+            return Ok(Err(InitFailure::new(InitFailureReason::Seconds, span, self.config.min_secs)));
         }
         if views.len() < 5 {
-            return Ok(Err(Refusal::new(Obstacle::Frames, views.len() as f64, 5.0)));
+            return Ok(Err(InitFailure::new(InitFailureReason::Frames, views.len() as f64, 5.0)));
         }
         let tracks = self.gather(&views);
         if tracks.len() < self.config.min_tracks {
             let wanted = self.config.min_tracks as f64;
-            return Ok(Err(Refusal::new(Obstacle::Tracks, tracks.len() as f64, wanted)));
+            return Ok(Err(InitFailure::new(InitFailureReason::Tracks, tracks.len() as f64, wanted)));
         }
         if !self.gyro_bias_known {
             self.find_gyro_bias(&views, &tracks);
         }
         let bias = Bias { gyro: self.gyro_bias, accel: Vector3::zeros() };
-        views.iter_mut().filter_map(|v| v.readings.as_mut()).for_each(|r| r.reintegrate(bias));
+        views.iter_mut().filter_map(|v| v.preintegration.as_mut()).for_each(|r| r.reintegrate(bias));
         let turns = self.turns(&views, &bias);
         let parallax = self.median_parallax_deg(&tracks, &turns);
         if !(parallax >= self.config.min_parallax_deg) {
             self.last = None;
-            return Ok(Err(Refusal::new(Obstacle::Parallax, parallax, self.config.min_parallax_deg)));
+            return Ok(Err(InitFailure::new(
+                InitFailureReason::Parallax,
+                parallax,
+                self.config.min_parallax_deg,
+            )));
         }
         let Some(first) = self.linear_start(&views, &tracks, &turns) else {
-            return Ok(Err(Refusal::new(
-                Obstacle::ScaleUncertainty,
+            return Ok(Err(InitFailure::new(
+                InitFailureReason::ScaleUncertainty,
                 f64::INFINITY,
                 self.config.max_log_scale_sigma,
             )));
@@ -259,7 +265,7 @@ impl InFlightStart {
             let mut smoother = self.build(&views, &tracks, &turns, &first.scaled(scale))?;
             let fit = self.refine(&mut smoother);
             let good = fit.is_good();
-            if best.as_ref().is_none_or(|(_, held)| fit.badness() < held.badness()) {
+            if best.as_ref().is_none_or(|(_, held)| fit.score() < held.score()) {
                 best = Some((smoother, fit));
             }
             if good {
@@ -267,17 +273,17 @@ impl InFlightStart {
             }
         }
         let Some((mut smoother, fit)) = best else {
-            return Ok(Err(Refusal::new(Obstacle::Frames, 0.0, 1.0)));
+            return Ok(Err(InitFailure::new(InitFailureReason::Frames, 0.0, 1.0)));
         };
         self.learn_gyro_bias(&mut smoother);
-        Ok(self.judge(smoother, &fit))
+        Ok(self.evaluate(smoother, &fit))
     }
 
-    /// Chooses frames over the end of the log and joins their readings.
+    /// Chooses frames over the end of the log and joins their IMU measurements.
     fn choose<'a>(&self, log: &'a [LoggedFrame]) -> Vec<View<'a>> {
         let Some(newest) = log.last() else { return Vec::new() };
-        // A frame without readings cannot be tied to what came before it.
-        let chained = log.iter().rposition(|f| f.readings.is_none()).unwrap_or(0);
+        // A frame without IMU measurements cannot be tied to what came before it.
+        let chained = log.iter().rposition(|f| f.preintegration.is_none()).unwrap_or(0);
         let within =
             |f: &&LoggedFrame| (newest.time - f.time).as_secs_f64() <= self.config.window_secs + 1e-6;
         let log = &log[chained..];
@@ -296,16 +302,16 @@ impl InFlightStart {
         let mut views = Vec::with_capacity(chosen.len());
         let mut from = 0;
         for (k, &at) in chosen.iter().enumerate() {
-            let mut readings: Option<Preintegration> = None;
+            let mut preintegration: Option<Preintegration> = None;
             if k > 0 {
-                for part in log[from + 1..=at].iter().filter_map(|f| f.readings.as_ref()) {
-                    match &mut readings {
-                        None => readings = Some(part.clone()),
+                for part in log[from + 1..=at].iter().filter_map(|f| f.preintegration.as_ref()) {
+                    match &mut preintegration {
+                        None => preintegration = Some(part.clone()),
                         Some(sum) => sum.append(part),
                     }
                 }
             }
-            views.push(View { logged: &log[at], readings });
+            views.push(View { logged: &log[at], preintegration });
             from = at;
         }
         views
@@ -316,16 +322,16 @@ impl InFlightStart {
         let mut at: FxHashMap<LandmarkId, usize> = FxHashMap::default();
         let mut tracks: Vec<Track> = Vec::new();
         for (k, view) in views.iter().enumerate() {
-            for seen in &view.logged.seen {
-                let Some(ray) = self.camera.unproject(&seen.pixel) else { continue };
-                let slot = *at.entry(seen.landmark).or_insert_with(|| {
-                    tracks.push(Track { landmark: seen.landmark, seen: Vec::new() });
+            for observations in &view.logged.observations {
+                let Some(ray) = self.camera.unproject(&observations.pixel) else { continue };
+                let slot = *at.entry(observations.landmark).or_insert_with(|| {
+                    tracks.push(Track { landmark: observations.landmark, observations: Vec::new() });
                     tracks.len() - 1
                 });
-                tracks[slot].seen.push((k, *seen, ray));
+                tracks[slot].observations.push((k, *observations, ray));
             }
         }
-        tracks.retain(|t| t.seen.len() >= 3);
+        tracks.retain(|t| t.observations.len() >= 3);
         tracks.sort_unstable_by_key(|t| t.landmark);
         tracks
     }
@@ -337,14 +343,15 @@ impl InFlightStart {
         for apart in [1, views.len() / 3, views.len() / 2] {
             for i in 0..views.len().saturating_sub(apart) {
                 let j = i + apart;
-                let ray = |t: &Track, k: usize| t.seen.iter().find(|(v, ..)| *v == k).map(|(.., ray)| *ray);
+                let ray =
+                    |t: &Track, k: usize| t.observations.iter().find(|(v, ..)| *v == k).map(|(.., ray)| *ray);
                 let rays: Vec<_> = tracks.iter().filter_map(|t| Some((ray(t, i)?, ray(t, j)?))).collect();
                 if rays.len() < 10 {
                     continue;
                 }
-                let readings = &views[i + 1..=j];
+                let preintegration = &views[i + 1..=j];
                 let rotation = move |bias: &Bias| {
-                    let turn = readings.iter().filter_map(|v| v.readings.as_ref());
+                    let turn = preintegration.iter().filter_map(|v| v.preintegration.as_ref());
                     let body = turn.fold(So3::IDENTITY, |sum, r| sum * r.rotation(bias));
                     camera_turn.inverse() * body * camera_turn
                 };
@@ -359,7 +366,7 @@ impl InFlightStart {
     /// Rotations first_from_body of all views.
     fn turns(&self, views: &[View<'_>], bias: &Bias) -> Vec<So3> {
         let mut turn = So3::IDENTITY;
-        let step = |v: &View<'_>| v.readings.as_ref().map_or(So3::IDENTITY, |r| r.rotation(bias));
+        let step = |v: &View<'_>| v.preintegration.as_ref().map_or(So3::IDENTITY, |r| r.rotation(bias));
         let next = |v: &View<'_>| {
             turn = turn * step(v);
             turn
@@ -373,9 +380,9 @@ impl InFlightStart {
         let mut widest: Vec<f64> = tracks
             .iter()
             .map(|t| {
-                let ray = |s: &(usize, Seen, Vector3<f64>)| turns[s.0] * (camera * s.2);
-                let first = ray(&t.seen[0]);
-                t.seen
+                let ray = |s: &(usize, TrackObservation, Vector3<f64>)| turns[s.0] * (camera * s.2);
+                let first = ray(&t.observations[0]);
+                t.observations
                     .iter()
                     .map(|s| first.cross(&ray(s)).norm().atan2(first.dot(&ray(s))))
                     .fold(0.0, f64::max)
@@ -387,13 +394,13 @@ impl InFlightStart {
 
     /// Step 2: velocity, gravity, bias and points, linear.
     fn linear_start(&self, views: &[View<'_>], tracks: &[Track], turns: &[So3]) -> Option<LinearSolution> {
-        let gravity_mps2 = views.iter().find_map(|v| v.readings.as_ref())?.model().gravity_mps2;
+        let gravity_mps2 = views.iter().find_map(|v| v.preintegration.as_ref())?.model().gravity_mps2;
         let (mut secs, mut position, mut velocity) = (0.0, Vector3::zeros(), Vector3::zeros());
         let (mut position_by, mut velocity_by) = (Matrix3::zeros(), Matrix3::zeros());
         let mut before = So3::IDENTITY;
         let mut linear_views = Vec::with_capacity(views.len());
         for (view, turn) in views.iter().zip(turns) {
-            if let Some(r) = &view.readings {
+            if let Some(r) = &view.preintegration {
                 let (_, dp, dv) = r.corrected(r.bias());
                 let t = r.secs();
                 let m = before.matrix();
@@ -410,7 +417,7 @@ impl InFlightStart {
         let camera = self.body_from_camera.rotation;
         let rays: Vec<Rays> = tracks
             .iter()
-            .map(|t| t.seen.iter().map(|(k, _, ray)| (*k, turns[*k] * (camera * *ray))).collect())
+            .map(|t| t.observations.iter().map(|(k, _, ray)| (*k, turns[*k] * (camera * *ray))).collect())
             .collect();
         linear::solve(
             &linear_views,
@@ -426,7 +433,8 @@ impl InFlightStart {
             let (sum, n) = of.fold((0.0, 0.0), |(s, n), v| (s + v, n + 1.0));
             if n > 0.0 { sum / n } else { 1.0 }
         };
-        let variances = tracks.iter().flat_map(|t| &t.seen).map(|(_, s, _)| 0.5 * s.covariance.trace());
+        let variances =
+            tracks.iter().flat_map(|t| &t.observations).map(|(_, s, _)| 0.5 * s.covariance.trace());
         let focal = 0.5 * (self.camera.intrinsics().fx + self.camera.intrinsics().fy);
         (mean(&mut variances.into_iter()).sqrt() / focal).max(1e-5)
     }
@@ -448,18 +456,18 @@ impl InFlightStart {
         };
         let mut smoother =
             Smoother::new(self.smoother_config.clone(), self.camera.clone(), self.body_from_camera)?;
-        let sigmas = AnchorSigmas {
+        let sigmas = GaugePriorSigmas {
             gyro_bias: self.config.gyro_bias_sigma,
             accel_bias: self.config.accel_bias_sigma,
-            ..AnchorSigmas::GAUGE
+            ..GaugePriorSigmas::GAUGE
         };
         for (k, view) in views.iter().enumerate() {
             let (id, time) = (view.logged.frame, view.logged.time);
-            match &view.readings {
-                Some(readings) if k > 0 => {
-                    state = readings.predict(&state);
+            match &view.preintegration {
+                Some(preintegration) if k > 0 => {
+                    state = preintegration.predict(&state);
                     state.world_from_body.rotation = world_from_first * turns[k];
-                    smoother.add_frame(id, time, state, Some(readings.clone()))?;
+                    smoother.add_frame(id, time, state, Some(preintegration.clone()))?;
                 }
                 _ => {
                     // The bias is about zero, not about the start value.
@@ -470,20 +478,20 @@ impl InFlightStart {
         }
         let fallback = median(first.points.iter().flatten().map(|p| p.norm())).unwrap_or(4.0);
         for (track, point) in tracks.iter().zip(&first.points) {
-            let (host, seen, _) = track.seen[0];
-            let observation = |view: usize, seen: &Seen| Observation {
+            let (host, observations, _) = track.observations[0];
+            let observation = |view: usize, observations: &TrackObservation| Observation {
                 frame: views[view].logged.frame,
                 landmark: track.landmark,
-                pixel: seen.pixel,
-                covariance: seen.covariance,
+                pixel: observations.pixel,
+                covariance: observations.covariance,
             };
             let at = smoother.state(views[host].logged.frame).map_or(Se3::IDENTITY, |s| s.world_from_body);
             let distance = point.map_or(fallback, |p| {
                 (world_from_first * p - at.act(&self.body_from_camera.translation)).norm()
             });
-            smoother.add_landmark(&observation(host, &seen), 1.0 / distance.clamp(0.1, 1e3))?;
-            for (view, seen, _) in &track.seen[1..] {
-                smoother.add_observation(&observation(*view, seen))?;
+            smoother.add_landmark(&observation(host, &observations), 1.0 / distance.clamp(0.1, 1e3))?;
+            for (view, observations, _) in &track.observations[1..] {
+                smoother.add_observation(&observation(*view, observations))?;
             }
         }
         Ok(smoother)
@@ -493,7 +501,7 @@ impl InFlightStart {
     fn refine(&self, smoother: &mut Smoother) -> Fit {
         let mut report = OptimiseReport::default();
         smoother.optimise_from(FIRST_LAMBDA, STEPS, &mut report);
-        let all = report.sightings.max(1) as f64;
+        let all = report.observations.max(1) as f64;
         for _ in 0..3 {
             if report.outliers.is_empty() && report.converged {
                 break;
@@ -504,14 +512,14 @@ impl InFlightStart {
             smoother.optimise_from(FIRST_LAMBDA, STEPS / 2, &mut report);
         }
         let lonely: Vec<LandmarkId> =
-            smoother.landmarks().filter(|l| l.sightings < 2).map(|l| l.id).collect();
+            smoother.landmarks().filter(|l| l.observations < 2).map(|l| l.id).collect();
         for landmark in lonely {
             smoother.remove_landmark(landmark);
         }
         Fit {
             image: report.chi2_per_dof,
             inertial: smoother.inertial_chi2_per_dof(),
-            left_out: 1.0 - report.sightings as f64 / all,
+            left_out: 1.0 - report.observations as f64 / all,
             converged: report.converged,
         }
     }
@@ -531,7 +539,7 @@ impl InFlightStart {
     }
 
     /// Step 4.
-    fn judge(&mut self, mut smoother: Smoother, fit: &Fit) -> Result<Started, Refusal> {
+    fn evaluate(&mut self, mut smoother: Smoother, fit: &Fit) -> Result<InFlightSolution, InitFailure> {
         let places: Vec<(FrameId, Vector3<f64>)> = smoother
             .frames()
             .filter_map(|id| Some((id, smoother.state(id)?.world_from_body.translation)))
@@ -543,26 +551,30 @@ impl InFlightStart {
         let bias = smoother.newest().map_or(Bias::ZERO, |(.., s)| s.bias);
         let median_distance_m = median(smoother.landmarks().map(|l| 1.0 / l.inverse_distance)).unwrap_or(0.0);
         let at_most = [
-            (Obstacle::ScaleUncertainty, sigma, self.config.max_log_scale_sigma),
-            (Obstacle::WrongSightings, fit.left_out, MOST_LEFT_OUT),
-            (Obstacle::ImageMisfit, fit.image, MAX_MISFIT),
-            (Obstacle::InertialMisfit, fit.inertial, GOOD_INERTIAL_FIT),
-            (Obstacle::Speed, fastest, self.config.max_speed_mps),
-            (Obstacle::AccelBias, bias.accel.norm(), MAX_ACCEL_BIAS),
-            (Obstacle::GyroBias, bias.gyro.norm(), MAX_GYRO_BIAS),
-            (Obstacle::SceneDistance, median_distance_m, 200.0),
-            (Obstacle::SceneDistance, 0.02 / median_distance_m.max(1e-9), 1.0),
+            (InitFailureReason::ScaleUncertainty, sigma, self.config.max_log_scale_sigma),
+            (InitFailureReason::OutlierShare, fit.left_out, MOST_LEFT_OUT),
+            (InitFailureReason::ImageChi2, fit.image, MAX_CHI2_PER_DOF),
+            (InitFailureReason::ImuChi2, fit.inertial, GOOD_INERTIAL_FIT),
+            (InitFailureReason::Speed, fastest, self.config.max_speed_mps),
+            (InitFailureReason::AccelBias, bias.accel.norm(), MAX_ACCEL_BIAS),
+            (InitFailureReason::GyroBias, bias.gyro.norm(), MAX_GYRO_BIAS),
+            (InitFailureReason::SceneDistance, median_distance_m, 200.0),
+            (InitFailureReason::SceneDistance, 0.02 / median_distance_m.max(1e-9), 1.0),
         ];
         // A NaN must not pass.
-        if let Some((obstacle, measured, limit)) = at_most.into_iter().find(|(_, m, limit)| !(m <= limit)) {
-            return Err(Refusal::new(obstacle, measured, limit));
+        if let Some((reason, measured, limit)) = at_most.into_iter().find(|(_, m, limit)| !(m <= limit)) {
+            return Err(InitFailure::new(reason, measured, limit));
         }
         let change = previous.and_then(|p| scale_change(&p, &places)).unwrap_or(f64::INFINITY);
         if !(change <= self.config.max_scale_change) {
-            return Err(Refusal::new(Obstacle::ScaleAgreement, change, self.config.max_scale_change));
+            return Err(InitFailure::new(
+                InitFailureReason::ScaleAgreement,
+                change,
+                self.config.max_scale_change,
+            ));
         }
         self.last = None;
-        Ok(Started { smoother, log_scale_sigma: sigma, median_distance_m })
+        Ok(InFlightSolution { smoother, log_scale_sigma: sigma, median_distance_m })
     }
 }
 

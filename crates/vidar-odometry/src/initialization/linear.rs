@@ -11,7 +11,7 @@ use nalgebra::{Matrix3, SMatrix, SVector, Vector3};
 pub(crate) struct LinearView {
     /// Time after the first view, s.
     pub(crate) secs: f64,
-    /// Camera's place as far as readings alone tell: `Δp + R p_bc`.
+    /// Camera's place as far as IMU measurements alone tell: `Δp + R p_bc`.
     pub(crate) offset: Vector3<f64>,
     /// Derivative of `Δp` by the accelerometer bias.
     pub(crate) by_accel_bias: Matrix3<f64>,
@@ -38,7 +38,7 @@ impl LinearSolution {
     }
 }
 
-/// Rounds of reweighting by distance and misfit.
+/// Rounds of reweighting by distance and residual.
 const ROUNDS: usize = 4;
 
 type Matrix9 = SMatrix<f64, 9, 9>;
@@ -60,7 +60,7 @@ pub(crate) fn solve(
         let motion = solve_motion(views, tracks, &weights, ray_sigma_rad, accel_bias_sigma, gravity_mps2)?;
         let points: Vec<_> =
             tracks.iter().zip(&weights).map(|(rays, w)| point(views, rays, w, &motion)).collect();
-        reweigh(views, tracks, &points, &motion, ray_sigma_rad, &mut weights);
+        reweight(views, tracks, &points, &motion, ray_sigma_rad, &mut weights);
         best = Some(LinearSolution {
             velocity: motion.fixed_rows::<3>(0).into_owned(),
             gravity: motion.fixed_rows::<3>(3).into_owned(),
@@ -179,8 +179,8 @@ fn point(views: &[LinearView], rays: &Rays, weights: &[f64], motion: &Vector9) -
     (ahead && point.iter().all(|v| v.is_finite())).then_some(point)
 }
 
-/// Weights 1/distance² make the misfit an angle; rays that miss their point by many sigmas lose weight.
-fn reweigh(
+/// Weights 1/distance² make the residual an angle; rays that miss their point by many sigmas lose weight.
+fn reweight(
     views: &[LinearView],
     tracks: &[Rays],
     points: &[Option<Vector3<f64>>],
@@ -198,9 +198,9 @@ fn reweigh(
             };
             let to = point - place(&views[*view], motion);
             let distance = to.norm().max(0.05 * typical);
-            let misfit = (across(ray) * to).norm() / distance;
+            let residual = (across(ray) * to).norm() / distance;
             // The linear stage knows the rotation only so well: ten sigmas are still believed in full.
-            let robust = (10.0 * ray_sigma_rad / misfit.max(1e-12)).min(1.0);
+            let robust = (10.0 * ray_sigma_rad / residual.max(1e-12)).min(1.0);
             *w = robust / (distance * distance);
         }
     }

@@ -1,6 +1,6 @@
 //! How the odometry gets its first metric state.
 //!
-//! [`rest`] reads it from a body that stands still. [`InFlightStart`] finds it in motion, from tracks and readings of the
+//! [`initialize_static`] reads it from a body that stands still. [`InFlightInitializer`] finds it in motion, from tracks and IMU measurements of the
 //! last seconds:
 //! 1. gyroscope bias from epipolar planes alone ([`gyro_bias`], after Kneip & Lynen, ICCV 2013);
 //! 2. velocity, gravity and accelerometer bias from one linear system over all rays with |g| known ([`linear`], after
@@ -19,10 +19,12 @@ mod linear;
 mod monocular;
 mod static_start;
 
-pub use failure::{Obstacle, Refusal};
-pub use in_flight::{Attempt, InFlightConfig, InFlightStart, LoggedFrame, Seen, Started};
-pub(crate) use initializer::{Found, STILL_SECS, Starting, UNKNOWN_INVERSE};
-pub use static_start::{Rest, RestConfig, rest};
+pub use failure::{InitFailure, InitFailureReason};
+pub use in_flight::{
+    InFlightConfig, InFlightInitializer, InFlightSolution, InitOutcome, LoggedFrame, TrackObservation,
+};
+pub(crate) use initializer::{INITIAL_INVERSE_DISTANCE, InitialState, Initializer, STILL_SECS};
+pub use static_start::{StaticInitConfig, StaticState, initialize_static};
 
 #[cfg(test)]
 mod tests;

@@ -1,8 +1,8 @@
 //! A start without an IMU: two views give motion and structure up to scale, and the scale is set by convention.
 
-use super::initializer::UNKNOWN_INVERSE;
-use super::{LoggedFrame, Obstacle, Refusal, Seen};
-use crate::backend::{AnchorSigmas, Observation, Smoother};
+use super::initializer::INITIAL_INVERSE_DISTANCE;
+use super::{InitFailure, InitFailureReason, LoggedFrame, TrackObservation};
+use crate::backend::{GaugePriorSigmas, Observation, Smoother};
 use crate::config::OdometryConfig;
 use crate::frontend::{RayPair, TwoViewConfig, TwoViewFailure, TwoViewSolver, triangulate};
 use crate::imu::NavState;
@@ -22,15 +22,17 @@ const MAX_RELATIVE_SIGMA: f64 = 0.3;
 
 /// Tries the newest frame of the log against earlier ones, the oldest that shares enough first.
 ///
-/// The smoother returned holds both frames as keyframes; the median distance is `1 / UNKNOWN_INVERSE`.
+/// The smoother returned holds both frames as keyframes; the median distance is `1 / INITIAL_INVERSE_DISTANCE`.
 pub(crate) fn start(
     log: &[LoggedFrame],
     camera: &CameraModel,
     body_from_camera: &Se3,
     config: &OdometryConfig,
-) -> Result<Smoother, Refusal> {
-    let refuse = |obstacle, measured, limit| Refusal { obstacle, measured, limit };
-    let Some((newest, earlier)) = log.split_last() else { return Err(refuse(Obstacle::Frames, 0.0, 2.0)) };
+) -> Result<Smoother, InitFailure> {
+    let refuse = |reason, measured, limit| InitFailure { reason, measured, limit };
+    let Some((newest, earlier)) = log.split_last() else {
+        return Err(refuse(InitFailureReason::Frames, 0.0, 2.0));
+    };
     let mut most = 0;
     for reference in earlier {
         let shared = shared_tracks(reference, newest);
@@ -39,50 +41,50 @@ pub(crate) fn start(
             return between(reference, newest, &shared, camera, body_from_camera, config);
         }
     }
-    Err(refuse(Obstacle::Tracks, most as f64, MIN_SHARED as f64))
+    Err(refuse(InitFailureReason::Tracks, most as f64, MIN_SHARED as f64))
 }
 
-fn shared_tracks(a: &LoggedFrame, b: &LoggedFrame) -> Vec<(Seen, Seen)> {
-    let mut seen: Vec<&Seen> = b.seen.iter().collect();
-    seen.sort_unstable_by_key(|s| s.landmark);
-    let partner = |s: &Seen| {
-        let at = seen.binary_search_by_key(&s.landmark, |o| o.landmark).ok()?;
-        Some((*s, *seen[at]))
+fn shared_tracks(a: &LoggedFrame, b: &LoggedFrame) -> Vec<(TrackObservation, TrackObservation)> {
+    let mut observations: Vec<&TrackObservation> = b.observations.iter().collect();
+    observations.sort_unstable_by_key(|s| s.landmark);
+    let partner = |s: &TrackObservation| {
+        let at = observations.binary_search_by_key(&s.landmark, |o| o.landmark).ok()?;
+        Some((*s, *observations[at]))
     };
-    a.seen.iter().filter_map(partner).collect()
+    a.observations.iter().filter_map(partner).collect()
 }
 
 fn between(
     first: &LoggedFrame,
     second: &LoggedFrame,
-    shared: &[(Seen, Seen)],
+    shared: &[(TrackObservation, TrackObservation)],
     camera: &CameraModel,
     body_from_camera: &Se3,
     config: &OdometryConfig,
-) -> Result<Smoother, Refusal> {
-    let refuse = |obstacle, measured, limit| Refusal { obstacle, measured, limit };
+) -> Result<Smoother, InitFailure> {
+    let refuse = |reason, measured, limit| InitFailure { reason, measured, limit };
     let sigma_rad = RAY_SIGMA_PX / camera.intrinsics().fx;
-    let ray = |s: &Seen| camera.unproject(&s.pixel);
-    let with_rays: Vec<(Seen, Seen, RayPair)> =
+    let ray = |s: &TrackObservation| camera.unproject(&s.pixel);
+    let with_rays: Vec<(TrackObservation, TrackObservation, RayPair)> =
         shared.iter().filter_map(|(a, b)| Some((*a, *b, RayPair { a: ray(a)?, b: ray(b)? }))).collect();
     let pairs: Vec<RayPair> = with_rays.iter().map(|w| w.2).collect();
     let mut solver = TwoViewSolver::new(TwoViewConfig::default());
     let found = solver.without_rotation(&pairs, sigma_rad).map_err(|failure| match failure {
         TwoViewFailure::NoParallax { median_rad, .. } => {
-            refuse(Obstacle::Parallax, median_rad.to_degrees(), MIN_PARALLAX_DEG)
+            refuse(InitFailureReason::Parallax, median_rad.to_degrees(), MIN_PARALLAX_DEG)
         }
         TwoViewFailure::NoConsensus { inliers, needed } => {
-            refuse(Obstacle::Tracks, inliers as f64, needed as f64)
+            refuse(InitFailureReason::Tracks, inliers as f64, needed as f64)
         }
         TwoViewFailure::TooFewPairs { found, needed } => {
-            refuse(Obstacle::Tracks, found as f64, needed as f64)
+            refuse(InitFailureReason::Tracks, found as f64, needed as f64)
         }
     })?;
     let parallax_deg = found.median_parallax_rad.to_degrees();
     if parallax_deg < MIN_PARALLAX_DEG {
-        return Err(refuse(Obstacle::Parallax, parallax_deg, MIN_PARALLAX_DEG));
+        return Err(refuse(InitFailureReason::Parallax, parallax_deg, MIN_PARALLAX_DEG));
     }
-    let mut points: Vec<(Seen, Seen, f64)> = Vec::new();
+    let mut points: Vec<(TrackObservation, TrackObservation, f64)> = Vec::new();
     for ((a, b, pair), inlier) in with_rays.iter().zip(solver.inliers()) {
         let Some(point) = triangulate(pair, &found.b_from_a, sigma_rad).filter(|_| *inlier) else { continue };
         if point.inverse_distance > 0.0 && point.sigma < MAX_RELATIVE_SIGMA * point.inverse_distance {
@@ -90,21 +92,21 @@ fn between(
         }
     }
     if points.len() < MIN_SHARED / 2 {
-        return Err(refuse(Obstacle::Tracks, points.len() as f64, 0.5 * MIN_SHARED as f64));
+        return Err(refuse(InitFailureReason::Tracks, points.len() as f64, 0.5 * MIN_SHARED as f64));
     }
     let mut inverses: Vec<f64> = points.iter().map(|p| p.2).collect();
     inverses.sort_unstable_by(f64::total_cmp);
-    let scale = UNKNOWN_INVERSE / inverses[inverses.len() / 2];
+    let scale = INITIAL_INVERSE_DISTANCE / inverses[inverses.len() / 2];
     let b_from_a = Se3::new(found.b_from_a.rotation, found.b_from_a.translation / scale);
     build(first, second, &points, scale, &b_from_a, camera, body_from_camera, config)
-        .ok_or_else(|| refuse(Obstacle::ImageMisfit, f64::INFINITY, 3.0))
+        .ok_or_else(|| refuse(InitFailureReason::ImageChi2, f64::INFINITY, 3.0))
 }
 
 #[allow(clippy::too_many_arguments)] // the end of one function, kept apart for its length only
 fn build(
     first: &LoggedFrame,
     second: &LoggedFrame,
-    points: &[(Seen, Seen, f64)],
+    points: &[(TrackObservation, TrackObservation, f64)],
     scale: f64,
     b_from_a: &Se3,
     camera: &CameraModel,
@@ -118,7 +120,7 @@ fn build(
         nalgebra::Vector3::zeros(),
     ) * body_from_camera.inverse();
     let state = NavState { world_from_body: world_from_first, ..NavState::REST };
-    let sigmas = AnchorSigmas {
+    let sigmas = GaugePriorSigmas {
         position_m: 1e-3,
         yaw_rad: 1e-3,
         tilt_rad: 1e-3,
@@ -133,11 +135,11 @@ fn build(
     smoother.mark_keyframe(first.frame).ok()?;
     smoother.mark_keyframe(second.frame).ok()?;
     for (a, b, inverse) in points {
-        let observation = |frame, seen: &Seen| Observation {
+        let observation = |frame, observations: &TrackObservation| Observation {
             frame,
-            landmark: seen.landmark,
-            pixel: seen.pixel,
-            covariance: seen.covariance,
+            landmark: observations.landmark,
+            pixel: observations.pixel,
+            covariance: observations.covariance,
         };
         smoother.add_landmark(&observation(first.frame, a), inverse * scale).ok()?;
         smoother.add_observation(&observation(second.frame, b)).ok()?;

@@ -1,7 +1,7 @@
 //! Start from standstill: gyroscope bias and inclination are read off, velocity is zero.
 
-use super::failure::{Obstacle, Refusal};
-use crate::backend::AnchorSigmas;
+use super::failure::{InitFailure, InitFailureReason};
+use crate::backend::GaugePriorSigmas;
 use crate::imu::{Bias, NavState};
 use nalgebra::Vector3;
 use serde::{Deserialize, Serialize};
@@ -10,24 +10,24 @@ use vidar_core::{GRAVITY_MPS2, ImuSample, LieGroup, Se3, So3};
 /// What counts as standing still.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
 #[serde(default, deny_unknown_fields)]
-pub struct RestConfig {
+pub struct StaticInitConfig {
     /// Most scatter (standard deviation) of the gyroscope per axis, rad/s, 0.001…0.5.
-    pub max_gyro_scatter: f64,
+    pub max_gyro_std: f64,
     /// Most scatter of the accelerometer per axis, m/s², 0.01…5.
-    pub max_accel_scatter: f64,
+    pub max_accel_std: f64,
     /// Most mean motion in the image between frames, px, 0.05…5.
     pub max_image_motion_px: f64,
-    /// Fewest seconds of readings, 0.1…10.
+    /// Fewest seconds of IMU measurements, 0.1…10.
     pub min_secs: f64,
     /// Strength of gravity, m/s², 9.5…10.
     pub gravity_mps2: f64,
 }
 
-impl Default for RestConfig {
+impl Default for StaticInitConfig {
     fn default() -> Self {
         Self {
-            max_gyro_scatter: 0.02,
-            max_accel_scatter: 0.15,
+            max_gyro_std: 0.02,
+            max_accel_std: 0.15,
             max_image_motion_px: 0.3,
             min_secs: 0.5,
             gravity_mps2: GRAVITY_MPS2,
@@ -37,11 +37,11 @@ impl Default for RestConfig {
 
 /// A body at rest.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Rest {
+pub struct StaticState {
     /// At the origin, level, heading zero, without velocity; gyroscope bias as read.
     pub state: NavState,
     /// How well that is known.
-    pub sigmas: AnchorSigmas,
+    pub sigmas: GaugePriorSigmas,
 }
 
 /// How far the mean specific force may lie from gravity before a bias is suspected, m/s².
@@ -50,39 +50,39 @@ const SUSPICIOUS_FORCE: f64 = 0.3;
 /// How far it may lie at all.
 const IMPOSSIBLE_FORCE: f64 = 1.5;
 
-/// Reads the state of a body at rest from `readings`, if it is at rest. `image_motion_px` is the mean motion of tracks
+/// Reads the state of a body at rest from `IMU measurements`, if it is at rest. `image_motion_px` is the mean motion of tracks
 /// between frames, where there are any.
 ///
 /// # Errors
 /// What shows that the body is not at rest, with the measured value.
-pub fn rest(
-    readings: &[ImuSample],
+pub fn initialize_static(
+    samples: &[ImuSample],
     image_motion_px: Option<f64>,
-    config: &RestConfig,
-) -> Result<Rest, Refusal> {
-    let span = match (readings.first(), readings.last()) {
+    config: &StaticInitConfig,
+) -> Result<StaticState, InitFailure> {
+    let span = match (samples.first(), samples.last()) {
         (Some(first), Some(last)) => (last.time - first.time).as_secs_f64(),
         _ => 0.0,
     };
     if !(span >= config.min_secs) {
-        return Err(Refusal::new(Obstacle::Seconds, span, config.min_secs));
+        return Err(InitFailure::new(InitFailureReason::Seconds, span, config.min_secs));
     }
-    let n = readings.len() as f64;
-    let mean = |of: fn(&ImuSample) -> Vector3<f64>| readings.iter().map(of).sum::<Vector3<f64>>() / n;
+    let n = samples.len() as f64;
+    let mean = |of: fn(&ImuSample) -> Vector3<f64>| samples.iter().map(of).sum::<Vector3<f64>>() / n;
     let (gyro, accel) = (mean(|s| s.gyro.0), mean(|s| s.accel.0));
-    let scatter = |of: fn(&ImuSample) -> Vector3<f64>, mean: Vector3<f64>| {
-        let squares = readings.iter().map(|s| (of(s) - mean).component_mul(&(of(s) - mean)));
+    let std = |of: fn(&ImuSample) -> Vector3<f64>, mean: Vector3<f64>| {
+        let squares = samples.iter().map(|s| (of(s) - mean).component_mul(&(of(s) - mean)));
         (squares.sum::<Vector3<f64>>() / n).max().sqrt()
     };
     let checks = [
-        (Obstacle::GyroScatter, scatter(|s| s.gyro.0, gyro), config.max_gyro_scatter),
-        (Obstacle::AccelScatter, scatter(|s| s.accel.0, accel), config.max_accel_scatter),
-        (Obstacle::ImageMotion, image_motion_px.unwrap_or(0.0), config.max_image_motion_px),
-        (Obstacle::SpecificForce, (accel.norm() - config.gravity_mps2).abs(), IMPOSSIBLE_FORCE),
+        (InitFailureReason::GyroStd, std(|s| s.gyro.0, gyro), config.max_gyro_std),
+        (InitFailureReason::AccelStd, std(|s| s.accel.0, accel), config.max_accel_std),
+        (InitFailureReason::ImageMotion, image_motion_px.unwrap_or(0.0), config.max_image_motion_px),
+        (InitFailureReason::SpecificForce, (accel.norm() - config.gravity_mps2).abs(), IMPOSSIBLE_FORCE),
     ];
     // A NaN must not pass.
-    if let Some((obstacle, measured, limit)) = checks.into_iter().find(|(_, m, limit)| !(m <= limit)) {
-        return Err(Refusal::new(obstacle, measured, limit));
+    if let Some((reason, measured, limit)) = checks.into_iter().find(|(_, m, limit)| !(m <= limit)) {
+        return Err(InitFailure::new(reason, measured, limit));
     }
     let suspicious = (accel.norm() - config.gravity_mps2).abs() > SUSPICIOUS_FORCE;
     let accel_sigma = if suspicious { 0.3 } else { 0.1 };
@@ -91,7 +91,7 @@ pub fn rest(
         velocity: Vector3::zeros(),
         bias: Bias { gyro, accel: Vector3::zeros() },
     };
-    let sigmas = AnchorSigmas {
+    let sigmas = GaugePriorSigmas {
         position_m: 1e-3,
         yaw_rad: 1e-3,
         // A horizontal accelerometer bias reads as inclination.
@@ -100,7 +100,7 @@ pub fn rest(
         gyro_bias: (5e-3 / n.sqrt()).max(5e-4),
         accel_bias: accel_sigma,
     };
-    Ok(Rest { state, sigmas })
+    Ok(StaticState { state, sigmas })
 }
 
 /// The rotation world_from_body of least angle that makes `up_in_body` vertical.

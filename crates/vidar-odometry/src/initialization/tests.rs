@@ -14,21 +14,21 @@ fn simulate(course: &Course, config: &SimulationConfig) -> Simulation {
     Simulation::new(course, 0.0, course.secs, config)
 }
 
-/// Runs until a start is accepted or the recording ends; every refusal on the way, and the start if there was one.
-fn until_started(simulation: &Simulation) -> (Vec<Refusal>, Option<(FrameId, f64, FeatureOdometry)>) {
+/// Runs until a start is accepted or the recording ends; every initialisation failure on the way, and the start if there was one.
+fn until_started(simulation: &Simulation) -> (Vec<InitFailure>, Option<(FrameId, f64, FeatureOdometry)>) {
     let config = FeatureOdometryConfig::new(&ImuNoise::EUROC, 2.0);
     let mut odometry = FeatureOdometry::for_simulation(config, simulation).unwrap();
-    let mut refusals = Vec::new();
+    let mut failures = Vec::new();
     for frame in &simulation.frames {
-        match odometry.push(frame.id, frame.time, &frame.seen).unwrap() {
-            StepOutput::Waiting(refusal) => refusals.extend(refusal),
-            StepOutput::Started { log_scale_sigma, .. } => {
-                return (refusals, Some((frame.id, log_scale_sigma, odometry)));
+        match odometry.push(frame.id, frame.time, &frame.observations).unwrap() {
+            StepOutput::Waiting(failure) => failures.extend(failure),
+            StepOutput::InFlightSolution { log_scale_sigma, .. } => {
+                return (failures, Some((frame.id, log_scale_sigma, odometry)));
             }
-            StepOutput::Running(_) => unreachable!("it starts before it runs"),
+            StepOutput::SlidingWindowOdometry(_) => unreachable!("it starts before it runs"),
         }
     }
-    (refusals, None)
+    (failures, None)
 }
 
 #[test]
@@ -36,9 +36,9 @@ fn a_flight_with_speeding_up_and_turning_is_started_metrically() {
     for seed in [1, 2, 3] {
         let course = Course { kind: CourseKind::Eight, secs: 8.0, speed: 1.6, phase: seed as f64 };
         let simulation = simulate(&course, &SimulationConfig { seed, ..Default::default() });
-        let (refusals, started) = until_started(&simulation);
+        let (failures, started) = until_started(&simulation);
         let (at, sigma, mut odometry) =
-            started.unwrap_or_else(|| panic!("never started, at last: {}", refusals.last().unwrap()));
+            started.unwrap_or_else(|| panic!("never started, at last: {}", failures.last().unwrap()));
         assert!(sigma <= 0.03, "{sigma}");
         let truth = &simulation.frames[at.index()].truth;
         let (_, _, state) = odometry.smoother().unwrap().newest().unwrap();
@@ -58,10 +58,10 @@ fn constant_velocity_is_never_accepted() {
         let course = Course { kind: CourseKind::Straight, secs: 6.0, speed, phase: 0.4 * seed as f64 };
         let simulation =
             simulate(&course, &SimulationConfig { seed, wall_distance_m: 4.0, ..Default::default() });
-        let (refusals, started) = until_started(&simulation);
+        let (failures, started) = until_started(&simulation);
         assert!(started.is_none(), "accepted at {speed} m/s with sigma {:?}", started.map(|s| s.1));
-        let by_scale = refusals.iter().filter(|r| r.obstacle == Obstacle::ScaleUncertainty).count();
-        assert!(by_scale * 2 > refusals.len(), "{} of {} for the scale's sake", by_scale, refusals.len());
+        let by_scale = failures.iter().filter(|r| r.reason == InitFailureReason::ScaleUncertainty).count();
+        assert!(by_scale * 2 > failures.len(), "{} of {} for the scale's sake", by_scale, failures.len());
     }
 }
 
@@ -70,18 +70,18 @@ fn pure_rotation_is_never_accepted() {
     for (seed, speed) in [(1, 0.3), (2, 1.0), (3, 2.0)] {
         let course = Course { kind: CourseKind::Spin, secs: 6.0, speed, phase: 0.4 * seed as f64 };
         let simulation = simulate(&course, &SimulationConfig { seed, ..Default::default() });
-        let (refusals, started) = until_started(&simulation);
+        let (failures, started) = until_started(&simulation);
         assert!(started.is_none(), "accepted turning at {speed} rad/s with sigma {:?}", started.map(|s| s.1));
-        assert!(!refusals.is_empty());
+        assert!(!failures.is_empty());
     }
 }
 
 #[test]
 fn standing_still_is_not_taken_for_flight() {
     let course = Course { kind: CourseKind::Still, secs: 5.0, speed: 0.0, phase: 0.3 };
-    let (refusals, started) = until_started(&simulate(&course, &SimulationConfig::default()));
+    let (failures, started) = until_started(&simulate(&course, &SimulationConfig::default()));
     assert!(started.is_none());
-    let parallax = refusals.iter().find(|r| r.obstacle == Obstacle::Parallax).unwrap();
+    let parallax = failures.iter().find(|r| r.reason == InitFailureReason::Parallax).unwrap();
     assert!(parallax.measured < 0.2, "{parallax}");
     let told = parallax.to_string();
     assert!(told.starts_with("parallax 0.") && told.ends_with("deg < 1.000 deg: move sideways"), "{told}");
@@ -117,13 +117,13 @@ fn gyroscope_bias_is_found_from_epipolar_planes_despite_wrong_tracks() {
 fn resting(seed: u64) -> (Vec<ImuSample>, Simulation) {
     let course = Course { kind: CourseKind::Still, secs: 2.0, speed: 0.0, phase: 0.8 };
     let simulation = simulate(&course, &SimulationConfig { seed, ..Default::default() });
-    (simulation.readings.clone(), simulation)
+    (simulation.imu_samples.clone(), simulation)
 }
 
 #[test]
 fn a_body_at_rest_tells_its_inclination_and_gyroscope_bias() {
-    let (readings, simulation) = resting(4);
-    let rest = rest(&readings, Some(0.1), &RestConfig::default()).unwrap();
+    let (imu_samples, simulation) = resting(4);
+    let rest = initialize_static(&imu_samples, Some(0.1), &StaticInitConfig::default()).unwrap();
     let truth = &simulation.frames[10].truth;
     assert!((rest.state.bias.gyro - truth.bias.gyro).norm() < 5e-4);
     let up = |s: &crate::imu::NavState| s.world_from_body.rotation.inverse() * Vector3::z();
@@ -136,18 +136,27 @@ fn a_body_at_rest_tells_its_inclination_and_gyroscope_bias() {
 fn what_moves_is_not_at_rest_and_says_why() {
     let course = Course { kind: CourseKind::Eight, secs: 3.0, speed: 1.0, phase: 0.1 };
     let simulation = simulate(&course, &SimulationConfig::default());
-    let config = RestConfig::default();
-    let refused = rest(&simulation.readings, None, &config).unwrap_err();
-    assert_eq!(refused.obstacle, Obstacle::GyroScatter);
-    assert!(refused.to_string().contains("gyroscope scatter"), "{refused}");
-    let (mut readings, _) = resting(5);
-    assert_eq!(rest(&readings, Some(2.0), &config).unwrap_err().obstacle, Obstacle::ImageMotion);
-    assert_eq!(rest(&readings[..20], None, &config).unwrap_err().obstacle, Obstacle::Seconds);
-    assert_eq!(rest(&[], None, &config).unwrap_err().obstacle, Obstacle::Seconds);
-    readings.iter_mut().for_each(|r| r.accel.0 /= GRAVITY_MPS2);
-    assert_eq!(rest(&readings, None, &config).unwrap_err().obstacle, Obstacle::SpecificForce);
-    readings[7].accel.0.x = f64::NAN;
-    assert!(rest(&readings, None, &config).is_err());
+    let config = StaticInitConfig::default();
+    let failed = initialize_static(&simulation.imu_samples, None, &config).unwrap_err();
+    assert_eq!(failed.reason, InitFailureReason::GyroStd);
+    assert!(failed.to_string().contains("gyroscope scatter"), "{failed}");
+    let (mut imu_samples, _) = resting(5);
+    assert_eq!(
+        initialize_static(&imu_samples, Some(2.0), &config).unwrap_err().reason,
+        InitFailureReason::ImageMotion
+    );
+    assert_eq!(
+        initialize_static(&imu_samples[..20], None, &config).unwrap_err().reason,
+        InitFailureReason::Seconds
+    );
+    assert_eq!(initialize_static(&[], None, &config).unwrap_err().reason, InitFailureReason::Seconds);
+    imu_samples.iter_mut().for_each(|r| r.accel.0 /= GRAVITY_MPS2);
+    assert_eq!(
+        initialize_static(&imu_samples, None, &config).unwrap_err().reason,
+        InitFailureReason::SpecificForce
+    );
+    imu_samples[7].accel.0.x = f64::NAN;
+    assert!(initialize_static(&imu_samples, None, &config).is_err());
 }
 
 #[test]
@@ -155,12 +164,12 @@ fn gravity_is_as_strong_as_it_is_told() {
     let course = Course { kind: CourseKind::Eight, secs: 8.0, speed: 1.6, phase: 2.0 };
     // At the equator.
     let simulation = simulate(&course, &SimulationConfig { gravity_mps2: 9.78, ..Default::default() });
-    let up_bias = |believed: f64| {
+    let up_bias = |is_valid_imu: f64| {
         let mut config = FeatureOdometryConfig::new(&ImuNoise::EUROC, 2.0);
-        config.imu = config.imu.with_gravity(believed);
+        config.imu = config.imu.with_gravity(is_valid_imu);
         let mut odometry = FeatureOdometry::for_simulation(config, &simulation).unwrap();
         for frame in &simulation.frames {
-            odometry.push(frame.id, frame.time, &frame.seen).unwrap();
+            odometry.push(frame.id, frame.time, &frame.observations).unwrap();
         }
         let (.., state) = odometry.smoother().unwrap().newest().unwrap();
         let truth = &simulation.frames[simulation.frames.len() - 1].truth;
@@ -170,18 +179,19 @@ fn gravity_is_as_strong_as_it_is_told() {
     let (told, not_told) = (up_bias(9.78), up_bias(9.82));
     assert!(told.abs() < 0.015, "{told}");
     assert!((not_told - told + 0.04).abs() < 0.01, "{not_told} {told}");
-    let (mut readings, _) = resting(6);
-    readings.iter_mut().for_each(|r| r.accel.0 *= 1.2);
-    let stronger = RestConfig { gravity_mps2: 1.2 * GRAVITY_MPS2, ..RestConfig::default() };
+    let (mut imu_samples, _) = resting(6);
+    imu_samples.iter_mut().for_each(|r| r.accel.0 *= 1.2);
+    let stronger = StaticInitConfig { gravity_mps2: 1.2 * GRAVITY_MPS2, ..StaticInitConfig::default() };
     assert!(
-        rest(&readings, None, &stronger).is_ok() && rest(&readings, None, &RestConfig::default()).is_err()
+        initialize_static(&imu_samples, None, &stronger).is_ok()
+            && initialize_static(&imu_samples, None, &StaticInitConfig::default()).is_err()
     );
 }
 
 #[test]
 fn upside_down_is_level_too() {
     for up in [Vector3::z(), -Vector3::z(), Vector3::x(), Vector3::new(0.3, -0.9, 0.2).normalize()] {
-        let turned = still::leveled(&(up * GRAVITY_MPS2)) * up;
+        let turned = static_start::leveled(&(up * GRAVITY_MPS2)) * up;
         assert!((turned - Vector3::z()).norm() < 1e-9, "{up}");
     }
 }
@@ -190,31 +200,31 @@ fn upside_down_is_level_too() {
 fn a_log_without_readings_or_tracks_is_refused() {
     let course = Course { kind: CourseKind::Eight, secs: 3.0, speed: 1.0, phase: 0.1 };
     let simulation = simulate(&course, &SimulationConfig::default());
-    let mut start = InFlightStart::new(
+    let mut start = InFlightInitializer::new(
         InFlightConfig::default(),
         crate::backend::SmootherConfig::default(),
         simulation.camera.clone(),
         simulation.body_from_camera,
     );
-    let refused = |start: &mut InFlightStart, log: &[LoggedFrame]| match start.attempt(log).unwrap() {
-        Attempt::Refused(refusal) => refusal.obstacle,
-        Attempt::Started(_) => panic!("started"),
+    let failed = |start: &mut InFlightInitializer, log: &[LoggedFrame]| match start.attempt(log).unwrap() {
+        InitOutcome::Failed(failure) => failure.reason,
+        InitOutcome::Solved(_) => panic!("started"),
     };
-    assert_eq!(refused(&mut start, &[]), Obstacle::Seconds);
-    let frame = |k: usize, readings| LoggedFrame {
+    assert_eq!(failed(&mut start, &[]), InitFailureReason::Seconds);
+    let frame = |k: usize, preintegration| LoggedFrame {
         frame: simulation.frames[k].id,
         time: simulation.frames[k].time,
-        readings,
-        seen: Vec::new(),
+        preintegration,
+        observations: Vec::new(),
     };
     let apart: Vec<LoggedFrame> = (0..40).map(|k| frame(k, None)).collect();
-    assert_eq!(refused(&mut start, &apart), Obstacle::Seconds);
+    assert_eq!(failed(&mut start, &apart), InitFailureReason::Seconds);
     let model = crate::imu::ImuModel::from_data_sheet(&ImuNoise::EUROC, 2.0, 2.0);
     let blind: Vec<LoggedFrame> = (0..40)
         .map(|k| {
-            let cut = &simulation.readings[10 * k.max(1) - 10..=10 * k.max(1)];
+            let cut = &simulation.imu_samples[10 * k.max(1) - 10..=10 * k.max(1)];
             frame(k, Some(Preintegration::new(model, Bias::ZERO, cut)))
         })
         .collect();
-    assert_eq!(refused(&mut start, &blind), Obstacle::Tracks);
+    assert_eq!(failed(&mut start, &blind), InitFailureReason::Tracks);
 }

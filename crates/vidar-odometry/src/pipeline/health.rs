@@ -3,14 +3,14 @@
 use super::output::{DivergenceSign, LossReason};
 use crate::config::OdometryConfig;
 use crate::imu::NavState;
-use crate::tracking::Step;
+use crate::tracking::StepReport;
 use vidar_core::{Health, Timestamp};
 
 /// Below these numbers of fitting landmarks a frame has few features, or is as good as blind.
 const FEW_LANDMARKS: usize = 15;
 const BLIND_LANDMARKS: usize = 5;
 
-/// Share of contradicting sightings that makes a frame suspicious; frames in a row that make the state so; and frames
+/// Share of contradicting observations that makes a frame suspicious; frames in a row that make the state so; and frames
 /// after which it is given up.
 const SUSPICIOUS_SHARE: f64 = 0.5;
 const SUSPICIOUS_FRAMES: u32 = 5;
@@ -23,12 +23,12 @@ const MAX_ACCEL_BIAS: f64 = 1.5;
 /// Standard deviation of ln(scale) below which the scale counts as settled.
 pub(crate) const SETTLED_SCALE_STD: f64 = 0.02;
 
-/// The longest stretch without readings that is bridged, s.
+/// The longest stretch without IMU measurements that is bridged, s.
 pub(crate) const MAX_IMU_GAP_SECS: f64 = 0.5;
 
 /// Watches a running odometry.
 #[derive(Debug, Default)]
-pub(crate) struct Watch {
+pub(crate) struct HealthMonitor {
     blind_since: Option<Timestamp>,
     suspicious: u32,
     /// Best knowledge of the scale so far; what was learned stays in the landmarks' depths.
@@ -36,12 +36,12 @@ pub(crate) struct Watch {
 }
 
 /// What the watch makes of a frame.
-pub(crate) enum Verdict {
-    Health(Health),
-    GiveUp(LossReason),
+pub(crate) enum HealthDecision {
+    Continue(Health),
+    Lost(LossReason),
 }
 
-impl Watch {
+impl HealthMonitor {
     /// The scale's standard deviation, after the window says `now`.
     pub fn scale_std(&mut self, now: Option<f64>) -> f64 {
         let best = match (self.scale_std, now.filter(|s| s.is_finite())) {
@@ -53,17 +53,17 @@ impl Watch {
     }
 
     /// Judges the state after an image at `time`. `is_metric` says that an IMU gives the scale.
-    pub fn judge(
+    pub fn evaluate(
         &mut self,
         state: &NavState,
-        step: &Step,
+        step: &StepReport,
         time: Timestamp,
         is_metric: bool,
         scale_std: f64,
         config: &OdometryConfig,
-    ) -> Verdict {
+    ) -> HealthDecision {
         if let Some((sign, found, limit)) = self.divergence(state, step, is_metric, config) {
-            return Verdict::GiveUp(LossReason::Diverged { sign, found, limit });
+            return HealthDecision::Lost(LossReason::Diverged { sign, found, limit });
         }
         // A body at rest needs no landmark: it is known not to move.
         let blind = step.fitting < BLIND_LANDMARKS && !step.is_still && !step.just_started;
@@ -72,12 +72,12 @@ impl Watch {
             let secs = (time - since).as_secs_f64();
             let limit = if is_metric { config.max_blind_secs } else { 0.2 * config.max_blind_secs };
             if secs > limit {
-                return Verdict::GiveUp(LossReason::NoFeatures { secs });
+                return HealthDecision::Lost(LossReason::NoFeatures { secs });
             }
-            return Verdict::Health(Health::Degraded);
+            return HealthDecision::Continue(Health::Degraded);
         }
         self.blind_since = None;
-        Verdict::Health(match () {
+        HealthDecision::Continue(match () {
             () if self.suspicious >= SUSPICIOUS_FRAMES => Health::Suspect,
             () if !is_metric => Health::ScaleUnknown,
             () if step.fitting < FEW_LANDMARKS && !step.is_still => Health::LowFeatures,
@@ -89,7 +89,7 @@ impl Watch {
     fn divergence(
         &mut self,
         state: &NavState,
-        step: &Step,
+        step: &StepReport,
         is_metric: bool,
         config: &OdometryConfig,
     ) -> Option<(DivergenceSign, f64, f64)> {
@@ -123,19 +123,34 @@ mod tests {
         Timestamp::from_nanos(0) + Duration::from_millis(millis)
     }
 
-    fn judge(watch: &mut Watch, fitting: usize, contradicting: usize, millis: i64) -> Verdict {
-        let step = Step { fitting, contradicting, ..Step::default() };
-        watch.judge(&NavState::REST, &step, at(millis), true, 0.01, &OdometryConfig::default())
+    fn evaluate(
+        health_monitor: &mut HealthMonitor,
+        fitting: usize,
+        contradicting: usize,
+        millis: i64,
+    ) -> HealthDecision {
+        let step = StepReport { fitting, contradicting, ..StepReport::default() };
+        health_monitor.evaluate(&NavState::REST, &step, at(millis), true, 0.01, &OdometryConfig::default())
     }
 
     #[test]
     fn blindness_degrades_at_once_and_is_lost_after_its_time() {
-        let mut watch = Watch::default();
-        assert!(matches!(judge(&mut watch, 50, 0, 0), Verdict::Health(Health::Ok)));
-        assert!(matches!(judge(&mut watch, 10, 0, 50), Verdict::Health(Health::LowFeatures)));
-        assert!(matches!(judge(&mut watch, 2, 0, 100), Verdict::Health(Health::Degraded)));
-        assert!(matches!(judge(&mut watch, 2, 0, 2000), Verdict::Health(Health::Degraded)));
-        let Verdict::GiveUp(LossReason::NoFeatures { secs }) = judge(&mut watch, 2, 0, 2150) else {
+        let mut health_monitor = HealthMonitor::default();
+        assert!(matches!(evaluate(&mut health_monitor, 50, 0, 0), HealthDecision::Continue(Health::Ok)));
+        assert!(matches!(
+            evaluate(&mut health_monitor, 10, 0, 50),
+            HealthDecision::Continue(Health::LowFeatures)
+        ));
+        assert!(matches!(
+            evaluate(&mut health_monitor, 2, 0, 100),
+            HealthDecision::Continue(Health::Degraded)
+        ));
+        assert!(matches!(
+            evaluate(&mut health_monitor, 2, 0, 2000),
+            HealthDecision::Continue(Health::Degraded)
+        ));
+        let HealthDecision::Lost(LossReason::NoFeatures { secs }) = evaluate(&mut health_monitor, 2, 0, 2150)
+        else {
             panic!("blind for more than two seconds")
         };
         assert!((secs - 2.05).abs() < 1e-9);
@@ -143,14 +158,19 @@ mod tests {
 
     #[test]
     fn contradiction_is_suspected_and_then_given_up() {
-        let mut watch = Watch::default();
+        let mut health_monitor = HealthMonitor::default();
         let words: Vec<bool> = (0..24)
-            .map(|k| matches!(judge(&mut watch, 10, 30, k), Verdict::Health(Health::Suspect)))
+            .map(|k| {
+                matches!(evaluate(&mut health_monitor, 10, 30, k), HealthDecision::Continue(Health::Suspect))
+            })
             .collect();
         assert_eq!(words.iter().filter(|w| **w).count(), 20, "from the fifth frame on");
-        assert!(matches!(judge(&mut watch, 10, 30, 25), Verdict::GiveUp(LossReason::Diverged { .. })));
+        assert!(matches!(
+            evaluate(&mut health_monitor, 10, 30, 25),
+            HealthDecision::Lost(LossReason::Diverged { .. })
+        ));
         assert!(
-            matches!(judge(&mut watch, 50, 2, 26), Verdict::Health(Health::Ok)),
+            matches!(evaluate(&mut health_monitor, 50, 2, 26), HealthDecision::Continue(Health::Ok)),
             "one good frame clears it"
         );
     }
@@ -164,10 +184,16 @@ mod tests {
         let mut broken = NavState::REST;
         broken.velocity.z = f64::NAN;
         for state in [fast, biased, broken] {
-            let step = Step { fitting: 50, ..Step::default() };
-            let verdict =
-                Watch::default().judge(&state, &step, at(0), true, 0.01, &OdometryConfig::default());
-            assert!(matches!(verdict, Verdict::GiveUp(LossReason::Diverged { .. })));
+            let step = StepReport { fitting: 50, ..StepReport::default() };
+            let decision = HealthMonitor::default().evaluate(
+                &state,
+                &step,
+                at(0),
+                true,
+                0.01,
+                &OdometryConfig::default(),
+            );
+            assert!(matches!(decision, HealthDecision::Lost(LossReason::Diverged { .. })));
         }
     }
 }

@@ -11,14 +11,14 @@ use vidar_core::{
 
 /// Names of the keyframes that the smoother holds.
 #[derive(Debug, Default)]
-pub(crate) struct KeyframeBook {
+pub(crate) struct KeyframeRegistry {
     next: u32,
     /// Frame of the smoother and name, oldest first.
     held: Vec<(FrameId, KeyframeId)>,
 }
 
 /// What a keyframe is made from, besides the smoother.
-pub(crate) struct Making<'a> {
+pub(crate) struct KeyframeInput<'a> {
     /// The frame as the smoother and as the caller know it.
     pub frame: FrameId,
     pub caller_frame: FrameId,
@@ -31,34 +31,34 @@ pub(crate) struct Making<'a> {
     pub landmarks: &'a [SparseLandmark],
 }
 
-impl KeyframeBook {
+impl KeyframeRegistry {
     /// Forgets what the smoother held; names go on.
     pub fn forget_held(&mut self) {
         self.held.clear();
     }
 
-    pub fn make(&mut self, smoother: &mut Smoother, making: &Making<'_>) -> OdometryKeyframe {
+    pub fn make(&mut self, smoother: &mut Smoother, input: &KeyframeInput<'_>) -> OdometryKeyframe {
         let id = KeyframeId(self.next);
         self.next = self.next.wrapping_add(1);
         let previous = self.held.last().and_then(|(frame, id)| {
-            smoother.relative_covariance(*frame, making.frame).map(|covariance| (*id, covariance))
+            smoother.relative_covariance(*frame, input.frame).map(|covariance| (*id, covariance))
         });
-        self.held.push((making.frame, id));
-        let pose_covariance: PoseCovariance = making.covariance.fixed_view::<6, 6>(0, 0).into_owned();
+        self.held.push((input.frame, id));
+        let pose_covariance: PoseCovariance = input.covariance.fixed_view::<6, 6>(0, 0).into_owned();
         OdometryKeyframe {
             id,
-            frame_id: making.caller_frame,
-            segment: making.segment,
-            state: public_state(making.state, making.time),
-            world_from_camera: making.state.world_from_body * *smoother.body_from_camera(),
+            frame_id: input.caller_frame,
+            segment: input.segment,
+            state: public_state(input.state, input.time),
+            world_from_camera: input.state.world_from_body * *smoother.body_from_camera(),
             pose_covariance,
             previous,
             gravity_in_world: smoother
                 .imu_model()
                 .map_or(Vector3::new(0.0, 0.0, -GRAVITY_MPS2), |imu| imu.gravity()),
-            scale_std: making.scale_std,
-            health: making.health,
-            landmarks: making.landmarks.to_vec(),
+            scale_std: input.scale_std,
+            health: input.health,
+            landmarks: input.landmarks.to_vec(),
         }
     }
 

@@ -1,22 +1,22 @@
 //! Events in, one output per image.
 
-use super::health::{MAX_IMU_GAP_SECS, Verdict, Watch};
-use super::keyframes::{KeyframeBook, Making, public_state, seen_landmarks};
-use super::orientation_check::{MAX_TURN_DEG, RotationCheck};
+use super::health::{HealthDecision, HealthMonitor, MAX_IMU_GAP_SECS};
+use super::keyframes::{KeyframeInput, KeyframeRegistry, public_state, seen_landmarks};
+use super::orientation_check::{MAX_TURN_DEG, OrientationCheck};
 use super::output::{DivergenceSign, LossReason, OdometryOutput, Status, TrackSummary, Tracking};
 use crate::backend::{CalibrationEstimate, Smoother, SmootherError};
 use crate::config::{ImuUse, OdometryConfig};
 use crate::error::OdometryError;
 use crate::frontend::FrontendConfig;
 use crate::imu::{Bias, ImuBuffer, ImuModel, Preintegration, propagate};
-use crate::initialization::{Found, STILL_SECS, Starting, UNKNOWN_INVERSE};
-use crate::initialization::{Obstacle, Refusal, RestConfig, rest};
+use crate::initialization::{INITIAL_INVERSE_DISTANCE, InitialState, Initializer, STILL_SECS};
+use crate::initialization::{InitFailure, InitFailureReason, StaticInitConfig, initialize_static};
 use crate::stages::{Stage, StageClock, StageTimes};
 use crate::tracking::HostImage;
-use crate::tracking::ImuSpread;
+use crate::tracking::ImuStatistics;
 use crate::tracking::Tracker;
+use crate::tracking::{FrameInput, SlidingWindowOdometry, StepReport};
 use crate::tracking::{ImagePool, TrackRecord};
-use crate::tracking::{Running, Shot, Step};
 use nalgebra::Vector3;
 use std::collections::VecDeque;
 use std::rc::Rc;
@@ -24,11 +24,11 @@ use vidar_core::{
     CameraId, Duration, Frame, FrameId, Health, ImuSample, LieGroup, Rig, RigCamera, SensorEvent, Timestamp,
 };
 
-/// Images that may wait for readings of their time.
+/// Images that may wait for IMU measurements of their time.
 const MAX_PENDING: usize = 40;
 
 /// A clock offset known this well outlives a loss, s.
-const SURE_CLOCK_SECS: f64 = 1e-3;
+const KNOWN_CLOCK_SECS: f64 = 1e-3;
 
 /// Noise of images that the front end reckons with, grey levels.
 const IMAGE_NOISE_GRAY: f64 = 3.0;
@@ -38,22 +38,22 @@ const IMAGE_NOISE_GRAY: f64 = 3.0;
 pub struct InputCounts {
     /// Images taken.
     pub images: usize,
-    /// Inertial readings taken.
-    pub readings: usize,
+    /// IMU measurements taken.
+    pub imu_samples: usize,
     /// Images left out because their time did not advance.
     pub images_out_of_order: usize,
-    /// Readings left out because their time did not advance or they were not finite.
-    pub readings_refused: usize,
+    /// IMU measurements left out because their time did not advance or they were not finite.
+    pub imu_samples_rejected: usize,
     /// Images that were the same as the one before, pixel by pixel.
     pub images_repeated: usize,
-    /// Stretches without readings, longer than the rate explains.
+    /// Stretches without IMU measurements, longer than the rate explains.
     pub imu_gaps: usize,
 }
 
 #[derive(Debug)]
 enum Phase {
-    Starting(Box<Starting>),
-    Running(Box<Running>),
+    Initializing(Box<Initializer>),
+    SlidingWindowOdometry(Box<SlidingWindowOdometry>),
 }
 
 /// Visual-inertial odometry of one camera and one IMU.
@@ -75,10 +75,10 @@ pub struct Odometry {
     segment: u32,
     interval: Vec<ImuSample>,
     last_host: Option<Rc<HostImage>>,
-    refusal: Refusal,
-    watch: Watch,
-    book: KeyframeBook,
-    check: RotationCheck,
+    failure: InitFailure,
+    health_monitor: HealthMonitor,
+    keyframes: KeyframeRegistry,
+    check: OrientationCheck,
     images: ImagePool,
     clock: StageClock,
 }
@@ -105,12 +105,13 @@ impl Odometry {
         // From here on `off` says what is, not only what was asked for.
         let imu = if imu_model.is_some() { config.imu } else { ImuUse::Off };
         let config = OdometryConfig { imu, ..config.clone() };
-        let phase = Phase::Starting(Box::new(starting(&config, imu_model.is_none(), &rig_camera, &frontend)));
+        let phase =
+            Phase::Initializing(Box::new(initializer(&config, imu_model.is_none(), &rig_camera, &frontend)));
         Ok(Self {
             config,
             frontend,
             camera_id: camera,
-            check: RotationCheck::new(&rig_camera.body_from_camera.rotation),
+            check: OrientationCheck::new(&rig_camera.body_from_camera.rotation),
             images: ImagePool::default(),
             clock: StageClock::start(),
             camera: rig_camera,
@@ -125,15 +126,15 @@ impl Odometry {
             segment: 0,
             interval: Vec::new(),
             last_host: None,
-            refusal: Refusal { obstacle: Obstacle::Frames, measured: 0.0, limit: 5.0 },
-            watch: Watch::default(),
-            book: KeyframeBook::default(),
+            failure: InitFailure { reason: InitFailureReason::Frames, measured: 0.0, limit: 5.0 },
+            health_monitor: HealthMonitor::default(),
+            keyframes: KeyframeRegistry::default(),
         })
     }
 
     /// Takes an event; says what is known after the oldest image that waited for it, if any did.
     ///
-    /// An image is worked on when readings past its time have come, so the output may belong to an earlier image.
+    /// An image is worked on when IMU measurements past its time have come, so the output may belong to an earlier image.
     /// Events of other cameras, depth and ground truth are ignored. What is out of order or not finite is counted
     /// ([`Odometry::counts`]) and left out.
     ///
@@ -142,8 +143,8 @@ impl Odometry {
     pub fn push(&mut self, event: SensorEvent) -> Result<Option<OdometryOutput>, OdometryError> {
         match event {
             SensorEvent::Imu(sample) if self.imu_model.is_some() => match self.imu.push(sample) {
-                Ok(()) => self.counts.readings += 1,
-                Err(_) => self.counts.readings_refused += 1,
+                Ok(()) => self.counts.imu_samples += 1,
+                Err(_) => self.counts.imu_samples_rejected += 1,
             },
             SensorEvent::Image(frame) if frame.camera == self.camera_id => self.take_image(frame)?,
             _ => {}
@@ -157,7 +158,7 @@ impl Odometry {
         Ok(frame.and_then(|f| self.process(f)))
     }
 
-    /// Works on the images that still wait, with the readings there are.
+    /// Works on the images that still wait, with the IMU measurements there are.
     pub fn finish(&mut self) -> Vec<OdometryOutput> {
         let mut outputs = Vec::new();
         while let Some(frame) = self.pending.pop_front() {
@@ -179,8 +180,8 @@ impl Odometry {
     /// All tracks as the newest image showed them, for plots; none before the start.
     pub fn tracks(&self) -> Vec<TrackRecord> {
         match &self.phase {
-            Phase::Starting(_) => Vec::new(),
-            Phase::Running(running) => running.records(),
+            Phase::Initializing(_) => Vec::new(),
+            Phase::SlidingWindowOdometry(window) => window.records(),
         }
     }
 
@@ -207,16 +208,16 @@ impl Odometry {
     /// Correction of the clock offset that the next frame is stamped with.
     fn estimated_offset(&self) -> Duration {
         match &self.phase {
-            Phase::Running(running) => running.smoother.next_frame_offset(),
-            Phase::Starting(_) => Duration::ZERO,
+            Phase::SlidingWindowOdometry(window) => window.smoother.next_frame_offset(),
+            Phase::Initializing(_) => Duration::ZERO,
         }
     }
 
     /// The calibration as estimated on the way: where the camera is on the body, and what to add to image stamps to get
     /// the IMU's time. `None` before the start.
     pub fn calibration(&mut self) -> Option<CalibrationEstimate> {
-        let Phase::Running(running) = &mut self.phase else { return None };
-        let estimate = running.smoother.calibration();
+        let Phase::SlidingWindowOdometry(window) = &mut self.phase else { return None };
+        let estimate = window.smoother.calibration();
         let time_offset_secs = self.camera.time_offset.as_secs_f64() + estimate.time_offset_secs;
         Some(CalibrationEstimate { time_offset_secs, ..estimate })
     }
@@ -233,9 +234,9 @@ impl Odometry {
         self.next_frame = self.next_frame.wrapping_add(1);
         // The size was checked when the image came.
         let host = self.images.take(id, &frame.image, self.frontend.pyramid.levels)?;
-        let was_starting = matches!(self.phase, Phase::Starting(_));
+        let was_starting = matches!(self.phase, Phase::Initializing(_));
         let status = self.status_after(&frame, host, time);
-        self.clock.lap(if was_starting { Stage::Start } else { Stage::Tell });
+        self.clock.lap(if was_starting { Stage::Initialise } else { Stage::Output });
         self.imu.forget_before(self.last_frame.unwrap_or(time) - Duration::from_millis(1500));
         Some(OdometryOutput { frame_id: frame.id, time: frame.time, status })
     }
@@ -246,46 +247,46 @@ impl Odometry {
             self.last_host = Some(host);
             return self.lose(reason);
         }
-        let readings = self.readings_until(time);
+        let preintegration = self.preintegrate_until(time);
         self.clock.lap(Stage::Pyramid);
         let repeated = self.last_host.as_ref().is_some_and(|l| l.pyramid.level(0) == host.pyramid.level(0));
         let imu_still = self.imu_is_still(time);
         self.counts.images_repeated += usize::from(repeated);
         // The same image again is what a body at rest would see; of a moving one it tells nothing.
         if repeated && !imu_still {
-            return self.coast(readings, frame.time);
+            return self.coast(preintegration, frame.time);
         }
         self.last_host = Some(host.clone());
         self.last_frame = Some(time);
-        let felt = readings.as_ref().map(|r| (r.rotation(r.bias()).log(), r.secs()));
+        let gyro = preintegration.as_ref().map(|r| (r.rotation(r.bias()).log(), r.secs()));
         match &mut self.phase {
-            Phase::Starting(starting) => {
-                let found = starting.follow(host.clone(), time, readings);
-                self.check.add(&self.camera.model, &starting.tracker.tracks, host.frame, felt);
-                if let Some(turn_deg) = self.check.doubt() {
-                    let obstacle = Obstacle::CameraOrientation;
-                    return self.wait(Refusal { obstacle, measured: turn_deg, limit: MAX_TURN_DEG });
+            Phase::Initializing(initializer) => {
+                let found = initializer.follow(host.clone(), time, preintegration);
+                self.check.add(&self.camera.model, &initializer.tracker.tracks, host.frame, gyro);
+                if let Some(turn_deg) = self.check.inconsistency_deg() {
+                    let reason = InitFailureReason::CameraOrientation;
+                    return self.wait(InitFailure { reason, measured: turn_deg, limit: MAX_TURN_DEG });
                 }
-                let resting = starting.images_still && imu_still;
+                let resting = initializer.images_still && imu_still;
                 match found {
-                    _ if resting => self.start_resting(frame, &host, time),
+                    _ if resting => self.start_static(frame, &host, time),
                     Ok(found) => self.start_in_flight(found, frame, &host),
-                    Err(refusal) => {
-                        self.refusal = refusal;
-                        Status::Waiting(refusal)
+                    Err(failure) => {
+                        self.failure = failure;
+                        Status::Waiting(failure)
                     }
                 }
             }
-            Phase::Running(running) => {
+            Phase::SlidingWindowOdometry(window) => {
                 let frame_id = host.frame;
-                let step = running.step(Shot { host, time, readings, imu_still }, &mut self.clock);
-                self.check.add(&self.camera.model, &running.tracker.tracks, frame_id, felt);
-                if let Some(found) = self.check.doubt() {
+                let step = window.step(FrameInput { host, time, preintegration, imu_still }, &mut self.clock);
+                self.check.add(&self.camera.model, &window.tracker.tracks, frame_id, gyro);
+                if let Some(found) = self.check.inconsistency_deg() {
                     let (sign, limit) = (DivergenceSign::CameraOrientation, MAX_TURN_DEG);
                     return self.lose(LossReason::Diverged { sign, found, limit });
                 }
                 match step {
-                    Ok(step) => self.tell(&step, frame, frame_id),
+                    Ok(step) => self.report(&step, frame, frame_id),
                     Err(_) => {
                         let (sign, found, limit) = (DivergenceSign::NotFinite, f64::NAN, 0.0);
                         self.lose(LossReason::Diverged { sign, found, limit })
@@ -295,9 +296,11 @@ impl Odometry {
         }
     }
 
-    /// A stretch without images or readings that cannot be bridged.
+    /// A stretch without images or IMU measurements that cannot be bridged.
     fn gap_before(&mut self, time: Timestamp) -> Option<LossReason> {
-        let (Phase::Running(_), Some(last)) = (&self.phase, self.last_frame) else { return None };
+        let (Phase::SlidingWindowOdometry(_), Some(last)) = (&self.phase, self.last_frame) else {
+            return None;
+        };
         let secs = (time - last).as_secs_f64();
         if secs > self.config.max_blind_secs {
             return Some(LossReason::ImageGap { secs });
@@ -313,13 +316,15 @@ impl Odometry {
     }
 
     /// The state carried forward by the IMU, for an image that tells nothing.
-    fn coast(&mut self, readings: Option<Preintegration>, time: Timestamp) -> Status {
-        let Phase::Running(running) = &mut self.phase else { return Status::Waiting(self.refusal) };
-        let Some(state) = running.state() else { return Status::Waiting(self.refusal) };
-        let covariance = running.smoother.covariance_of_newest().unwrap_or_else(unknown_covariance);
-        let (state, covariance) = match &readings {
-            Some(readings) => {
-                let carried = propagate(&state, &covariance, readings);
+    fn coast(&mut self, preintegration: Option<Preintegration>, time: Timestamp) -> Status {
+        let Phase::SlidingWindowOdometry(window) = &mut self.phase else {
+            return Status::Waiting(self.failure);
+        };
+        let Some(state) = window.state() else { return Status::Waiting(self.failure) };
+        let covariance = window.smoother.covariance_of_newest().unwrap_or_else(unknown_covariance);
+        let (state, covariance) = match &preintegration {
+            Some(preintegration) => {
+                let carried = propagate(&state, &covariance, preintegration);
                 (carried.state, carried.covariance)
             }
             None => (state, covariance),
@@ -329,7 +334,7 @@ impl Odometry {
             segment: self.segment,
             state: public_state(&state, time),
             covariance,
-            scale_std: self.watch.scale_std(None),
+            scale_std: self.health_monitor.scale_std(None),
             health: Health::Degraded,
             tracked: 0,
             tracks: TrackSummary::default(),
@@ -343,80 +348,97 @@ impl Odometry {
         Status::Tracking(Box::new(tracking))
     }
 
-    fn readings_until(&mut self, time: Timestamp) -> Option<Preintegration> {
+    fn preintegrate_until(&mut self, time: Timestamp) -> Option<Preintegration> {
         let (model, from) = (self.imu_model?, self.last_frame?);
         let gap = self.imu.interval(from, time, &mut self.interval).ok()?;
         self.counts.imu_gaps += usize::from(gap.is_some());
         let (bias, spare) = match &mut self.phase {
-            Phase::Running(running) => (running.state()?.bias, running.spare_readings()),
-            Phase::Starting(starting) => (Bias { gyro: starting.gyro_bias(), accel: Vector3::zeros() }, None),
+            Phase::SlidingWindowOdometry(window) => (window.state()?.bias, window.spare_preintegration()),
+            Phase::Initializing(initializer) => {
+                (Bias { gyro: initializer.gyro_bias(), accel: Vector3::zeros() }, None)
+            }
         };
-        let Some(mut readings) = spare else { return Some(Preintegration::new(model, bias, &self.interval)) };
-        readings.restart(bias, &self.interval);
-        Some(readings)
+        let Some(mut preintegration) = spare else {
+            return Some(Preintegration::new(model, bias, &self.interval));
+        };
+        preintegration.restart(bias, &self.interval);
+        Some(preintegration)
     }
 
-    /// Whether the readings of the last half second are those of a body at rest.
+    /// Whether the IMU measurements of the last half second are those of a body at rest.
     fn imu_is_still(&self, time: Timestamp) -> bool {
         let from = time - Duration::from_secs_f64(STILL_SECS);
         let (Some(model), Some(first)) = (&self.imu_model, self.imu.iter().next()) else { return false };
         let recent = self.imu.iter().filter(|s| s.time >= from && s.time <= time);
-        first.time <= from && ImuSpread::of(recent).is_still(&model.noise)
+        first.time <= from && ImuStatistics::of(recent).is_still(&model.noise)
     }
 
     /// Starts from a body at rest: level and gyroscope bias are known, the velocity is zero, and the scale follows as
     /// soon as the body moves.
-    fn start_resting(&mut self, frame: &Frame, host: &Rc<HostImage>, time: Timestamp) -> Status {
-        let readings: Vec<ImuSample> = self.imu.iter().filter(|s| s.time <= time).copied().collect();
-        // A reading early, so that the span is not shorter than asked for by less than one period.
+    fn start_static(&mut self, frame: &Frame, host: &Rc<HostImage>, time: Timestamp) -> Status {
+        let samples: Vec<ImuSample> = self.imu.iter().filter(|s| s.time <= time).copied().collect();
+        // An IMU sample early, so that the span is not shorter than asked for by less than one period.
         let from = time - Duration::from_secs_f64(STILL_SECS + 0.02);
-        let begin = readings.partition_point(|s| s.time < from);
-        let rest_config = RestConfig { gravity_mps2: self.config.gravity_mps2, ..RestConfig::default() };
-        let rest = match rest(&readings[begin..], None, &rest_config) {
-            Ok(rest) => rest,
-            Err(refusal) => return self.wait(refusal),
+        let begin = samples.partition_point(|s| s.time < from);
+        let rest_config =
+            StaticInitConfig { gravity_mps2: self.config.gravity_mps2, ..StaticInitConfig::default() };
+        let at_rest = match initialize_static(&samples[begin..], None, &rest_config) {
+            Ok(at_rest) => at_rest,
+            Err(failure) => return self.wait(failure),
         };
-        let Ok(mut smoother) = self.smoother() else { return self.wait(self.refusal) };
-        let begun = smoother.start(host.frame, time, rest.state, rest.sigmas);
+        let Ok(mut smoother) = self.smoother() else { return self.wait(self.failure) };
+        let begun = smoother.start(host.frame, time, at_rest.state, at_rest.sigmas);
         if begun.and_then(|()| smoother.mark_keyframe(host.frame)).is_err() {
-            return self.wait(self.refusal);
+            return self.wait(self.failure);
         }
         let mut tracker = Tracker::new(self.camera.model.clone(), &self.frontend, IMAGE_NOISE_GRAY);
-        tracker.detect(host, 2 * self.config.max_landmarks, UNKNOWN_INVERSE);
+        tracker.detect(host, 2 * self.config.max_landmarks, INITIAL_INVERSE_DISTANCE);
         let hosts = vec![host.clone()];
-        let running = Running::new(self.config.clone(), smoother, tracker, hosts, UNKNOWN_INVERSE);
-        let Some(mut running) = running else { return self.wait(self.refusal) };
-        running.stand(time);
-        self.begin(running, frame, host.frame)
+        let window = SlidingWindowOdometry::new(
+            self.config.clone(),
+            smoother,
+            tracker,
+            hosts,
+            INITIAL_INVERSE_DISTANCE,
+        );
+        let Some(mut window) = window else { return self.wait(self.failure) };
+        window.stand(time);
+        self.begin(window, frame, host.frame)
     }
 
     /// Goes on with the smoother that solved the start.
-    fn start_in_flight(&mut self, found: Found, frame: &Frame, host: &Rc<HostImage>) -> Status {
-        let waiting = Phase::Starting(Box::new(starting(
+    fn start_in_flight(&mut self, found: InitialState, frame: &Frame, host: &Rc<HostImage>) -> Status {
+        let waiting = Phase::Initializing(Box::new(initializer(
             &self.config,
             self.imu_model.is_none(),
             &self.camera,
             &self.frontend,
         )));
-        let Phase::Starting(before) = std::mem::replace(&mut self.phase, waiting) else {
-            return Status::Waiting(self.refusal);
+        let Phase::Initializing(before) = std::mem::replace(&mut self.phase, waiting) else {
+            return Status::Waiting(self.failure);
         };
         let typical = 1.0 / found.median_distance.clamp(0.1, 100.0);
-        self.watch.scale_std(found.log_scale_sigma);
-        let running = Running::new(self.config.clone(), found.smoother, before.tracker, found.hosts, typical);
-        let Some(running) = running else { return self.wait(self.refusal) };
-        self.begin(running, frame, host.frame)
+        self.health_monitor.scale_std(found.log_scale_sigma);
+        let window = SlidingWindowOdometry::new(
+            self.config.clone(),
+            found.smoother,
+            before.tracker,
+            found.hosts,
+            typical,
+        );
+        let Some(window) = window else { return self.wait(self.failure) };
+        self.begin(window, frame, host.frame)
     }
 
-    fn begin(&mut self, running: Running, frame: &Frame, id: FrameId) -> Status {
-        self.phase = Phase::Running(Box::new(running));
-        let step = Step { just_started: true, is_keyframe: true, ..Step::default() };
-        self.tell(&step, frame, id)
+    fn begin(&mut self, window: SlidingWindowOdometry, frame: &Frame, id: FrameId) -> Status {
+        self.phase = Phase::SlidingWindowOdometry(Box::new(window));
+        let step = StepReport { just_started: true, is_keyframe: true, ..StepReport::default() };
+        self.report(&step, frame, id)
     }
 
-    fn wait(&mut self, refusal: Refusal) -> Status {
-        self.refusal = refusal;
-        Status::Waiting(refusal)
+    fn wait(&mut self, failure: InitFailure) -> Status {
+        self.failure = failure;
+        Status::Waiting(failure)
     }
 
     fn smoother(&self) -> Result<Smoother, SmootherError> {
@@ -424,20 +446,29 @@ impl Odometry {
     }
 
     /// What is known after a step.
-    fn tell(&mut self, step: &Step, frame: &Frame, id: FrameId) -> Status {
+    fn report(&mut self, step: &StepReport, frame: &Frame, id: FrameId) -> Status {
         let is_metric = self.imu_model.is_some();
-        let Phase::Running(running) = &mut self.phase else { return Status::Waiting(self.refusal) };
-        let Some(state) = running.state() else { return Status::Waiting(self.refusal) };
-        let smoother = &mut running.smoother;
+        let Phase::SlidingWindowOdometry(window) = &mut self.phase else {
+            return Status::Waiting(self.failure);
+        };
+        let Some(state) = window.state() else { return Status::Waiting(self.failure) };
+        let smoother = &mut window.smoother;
         let covariance = smoother.covariance_of_newest().unwrap_or_else(unknown_covariance);
         let now = if is_metric { smoother.log_scale_sigma() } else { None };
-        let scale_std = self.watch.scale_std(now);
-        let health = match self.watch.judge(&state, step, frame.time, is_metric, scale_std, &self.config) {
-            Verdict::Health(health) => health,
-            Verdict::GiveUp(reason) => return self.lose(reason),
+        let scale_std = self.health_monitor.scale_std(now);
+        let health = match self.health_monitor.evaluate(
+            &state,
+            step,
+            frame.time,
+            is_metric,
+            scale_std,
+            &self.config,
+        ) {
+            HealthDecision::Continue(health) => health,
+            HealthDecision::Lost(reason) => return self.lose(reason),
         };
         let world_from_camera = state.world_from_body * *smoother.body_from_camera();
-        let landmarks = seen_landmarks(smoother, &running.tracker.tracks, &world_from_camera);
+        let landmarks = seen_landmarks(smoother, &window.tracker.tracks, &world_from_camera);
         let mut tracking = Tracking {
             segment: self.segment,
             state: public_state(&state, frame.time),
@@ -451,7 +482,7 @@ impl Odometry {
             revised: Vec::new(),
         };
         if step.is_keyframe {
-            let making = Making {
+            let input = KeyframeInput {
                 frame: id,
                 caller_frame: frame.id,
                 time: frame.time,
@@ -462,35 +493,35 @@ impl Odometry {
                 health,
                 landmarks: &tracking.landmarks,
             };
-            tracking.keyframe = Some(Box::new(self.book.make(smoother, &making)));
+            tracking.keyframe = Some(Box::new(self.keyframes.make(smoother, &input)));
         }
         if step.is_keyframe || !step.left.is_empty() {
-            self.book.revise(smoother, &step.left, &mut tracking.revised);
+            self.keyframes.revise(smoother, &step.left, &mut tracking.revised);
         }
         Status::Tracking(Box::new(tracking))
     }
 
     /// A clock offset that is well known is not forgotten with the state.
-    fn keep_clock(&mut self, reason: &LossReason) {
-        let Phase::Running(running) = &mut self.phase else { return };
-        let estimate = running.smoother.calibration();
-        let is_sure = estimate.time_offset_sigma_secs.is_some_and(|s| s < SURE_CLOCK_SECS);
-        if is_sure && !matches!(reason, LossReason::Diverged { .. }) {
+    fn keep_clock_offset(&mut self, reason: &LossReason) {
+        let Phase::SlidingWindowOdometry(window) = &mut self.phase else { return };
+        let estimate = window.smoother.calibration();
+        let is_known = estimate.time_offset_sigma_secs.is_some_and(|s| s < KNOWN_CLOCK_SECS);
+        if is_known && !matches!(reason, LossReason::Diverged { .. }) {
             self.camera.time_offset += Duration::from_secs_f64(estimate.time_offset_secs);
         }
     }
 
     /// Gives the state up and starts anew.
     fn lose(&mut self, reason: LossReason) -> Status {
-        self.keep_clock(&reason);
-        self.phase = Phase::Starting(Box::new(starting(
+        self.keep_clock_offset(&reason);
+        self.phase = Phase::Initializing(Box::new(initializer(
             &self.config,
             self.imu_model.is_none(),
             &self.camera,
             &self.frontend,
         )));
-        self.watch = Watch::default();
-        self.book.forget_held();
+        self.health_monitor = HealthMonitor::default();
+        self.keyframes.forget_held();
         self.segment = self.segment.wrapping_add(1);
         Status::Lost(reason)
     }
@@ -501,12 +532,12 @@ fn unknown_covariance() -> vidar_core::NavCovariance {
     vidar_core::NavCovariance::from_diagonal_element(f64::INFINITY)
 }
 
-fn starting(
+fn initializer(
     config: &OdometryConfig,
     is_mono: bool,
     camera: &RigCamera,
     frontend: &FrontendConfig,
-) -> Starting {
+) -> Initializer {
     let tracker = Tracker::new(camera.model.clone(), frontend, IMAGE_NOISE_GRAY);
-    Starting::new(config.clone(), is_mono, camera.body_from_camera, tracker)
+    Initializer::new(config.clone(), is_mono, camera.body_from_camera, tracker)
 }

@@ -18,7 +18,7 @@ const MAX_IMAGES: usize = 400;
 /// Root mean square rate of rotation, mean removed, that is needed, rad/s.
 const MIN_RATE: f64 = 0.12;
 /// Share of the images' rotation that the given orientation leaves unexplained, from which it is doubted ...
-const DOUBTED_SHARE: f64 = 0.7;
+const MAX_UNEXPLAINED_SHARE: f64 = 0.7;
 /// ... provided that the best orientation leaves less than this share of that.
 const BETTER_SHARE: f64 = 0.6;
 /// Orientations nearer than this to the best one are not doubted, degrees.
@@ -26,30 +26,30 @@ pub(crate) const MAX_TURN_DEG: f64 = 15.0;
 
 /// Sums over pairs of successive images.
 #[derive(Debug)]
-pub(crate) struct RotationCheck {
+pub(crate) struct OrientationCheck {
     camera_from_body: So3,
     last: FxHashMap<LandmarkId, Pixel>,
     pairs: Vec<(Vector3<f64>, Vector3<f64>)>,
     images: usize,
-    seen_sum: Vector3<f64>,
-    felt_sum: Vector3<f64>,
-    seen_square: f64,
-    felt_square: f64,
+    image_sum: Vector3<f64>,
+    gyro_sum: Vector3<f64>,
+    image_square: f64,
+    gyro_square: f64,
     /// Σ felt seenᵀ.
     cross: Matrix3<f64>,
 }
 
-impl RotationCheck {
+impl OrientationCheck {
     pub fn new(body_from_camera: &So3) -> Self {
         Self {
             camera_from_body: body_from_camera.inverse(),
             last: FxHashMap::default(),
             pairs: Vec::new(),
             images: 0,
-            seen_sum: Vector3::zeros(),
-            felt_sum: Vector3::zeros(),
-            seen_square: 0.0,
-            felt_square: 0.0,
+            image_sum: Vector3::zeros(),
+            gyro_sum: Vector3::zeros(),
+            image_square: 0.0,
+            gyro_square: 0.0,
             cross: Matrix3::zeros(),
         }
     }
@@ -61,7 +61,7 @@ impl RotationCheck {
         camera: &CameraModel,
         tracks: &[Track],
         frame: FrameId,
-        felt: Option<(Vector3<f64>, f64)>,
+        gyro: Option<(Vector3<f64>, f64)>,
     ) {
         if self.images >= MAX_IMAGES {
             return;
@@ -76,27 +76,27 @@ impl RotationCheck {
         }
         self.last.clear();
         self.last.extend(tracks.iter().filter(|t| t.last_frame == frame).map(|t| (t.id, t.last_pixel)));
-        if let (Some((turn, secs)), Some(seen)) = (felt.filter(|f| f.1 > 0.0), rotation_of(&self.pairs)) {
-            let (felt, seen) = (self.camera_from_body * (turn / secs), seen / secs);
+        if let (Some((turn, secs)), Some(seen)) = (gyro.filter(|f| f.1 > 0.0), rotation_of(&self.pairs)) {
+            let (gyro, seen) = (self.camera_from_body * (turn / secs), seen / secs);
             self.images += 1;
-            self.felt_sum += felt;
-            self.seen_sum += seen;
-            self.felt_square += felt.norm_squared();
-            self.seen_square += seen.norm_squared();
-            self.cross += felt * seen.transpose();
+            self.gyro_sum += gyro;
+            self.image_sum += seen;
+            self.gyro_square += gyro.norm_squared();
+            self.image_square += seen.norm_squared();
+            self.cross += gyro * seen.transpose();
         }
     }
 
     /// Angle in degrees by which the given orientation is off, when it cannot be true.
-    pub fn doubt(&self) -> Option<f64> {
+    pub fn inconsistency_deg(&self) -> Option<f64> {
         if self.images < MIN_IMAGES {
             return None;
         }
         let n = self.images as f64;
-        let felt2 = self.felt_square / n - (self.felt_sum / n).norm_squared();
-        let seen2 = self.seen_square / n - (self.seen_sum / n).norm_squared();
-        let cross = self.cross / n - (self.felt_sum / n) * (self.seen_sum / n).transpose();
-        if !(felt2.min(seen2) > MIN_RATE * MIN_RATE) {
+        let gyro2 = self.gyro_square / n - (self.gyro_sum / n).norm_squared();
+        let image2 = self.image_square / n - (self.image_sum / n).norm_squared();
+        let cross = self.cross / n - (self.gyro_sum / n) * (self.image_sum / n).transpose();
+        if !(gyro2.min(image2) > MIN_RATE * MIN_RATE) {
             return None;
         }
         // Σ |seen − R felt|² = Σ |seen|² + Σ |felt|² − 2 tr(R Σ felt seenᵀ), least for R = V D Uᵀ of the sum's U S Vᵀ.
@@ -105,11 +105,12 @@ impl RotationCheck {
         let mut signs = Vector3::new(1.0, 1.0, 1.0);
         signs[2] = (u * v_t).determinant().signum();
         let best = v_t.transpose() * Matrix3::from_diagonal(&signs) * u.transpose();
-        let share = |trace: f64| (seen2 + felt2 - 2.0 * trace) / seen2;
+        let share = |trace: f64| (image2 + gyro2 - 2.0 * trace) / image2;
         let (given, least) = (share(cross.trace()), share((best * cross).trace()));
         let turn_deg = (0.5 * (best.trace() - 1.0)).clamp(-1.0, 1.0).acos().to_degrees();
-        let doubted = given > DOUBTED_SHARE && least < BETTER_SHARE * given && turn_deg > MAX_TURN_DEG;
-        doubted.then_some(turn_deg)
+        let inconsistent =
+            given > MAX_UNEXPLAINED_SHARE && least < BETTER_SHARE * given && turn_deg > MAX_TURN_DEG;
+        inconsistent.then_some(turn_deg)
     }
 }
 
@@ -161,22 +162,22 @@ mod tests {
     }
 
     fn check_with(given: So3, truth: So3) -> Option<f64> {
-        let mut check = RotationCheck::new(&given);
+        let mut check = OrientationCheck::new(&given);
         for k in 0..60 {
             let t = 0.05 * f64::from(k);
             let rate = Vector3::new((2.0 * t).sin(), 0.7 * (3.1 * t).cos(), 0.5 * (1.7 * t).sin());
             let shift = Vector3::new(0.02, -0.01, 0.015) * (2.3 * t).cos();
             let seen = rotation_of(&pairs(&(truth.inverse() * (rate * 0.05)), &shift)).unwrap();
             let bias = Vector3::new(0.05, -0.03, 0.02);
-            let (felt, seen) = (check.camera_from_body * (rate + bias), seen / 0.05);
+            let (gyro, seen) = (check.camera_from_body * (rate + bias), seen / 0.05);
             check.images += 1;
-            check.felt_sum += felt;
-            check.seen_sum += seen;
-            check.felt_square += felt.norm_squared();
-            check.seen_square += seen.norm_squared();
-            check.cross += felt * seen.transpose();
+            check.gyro_sum += gyro;
+            check.image_sum += seen;
+            check.gyro_square += gyro.norm_squared();
+            check.image_square += seen.norm_squared();
+            check.cross += gyro * seen.transpose();
         }
-        check.doubt()
+        check.inconsistency_deg()
     }
 
     #[test]

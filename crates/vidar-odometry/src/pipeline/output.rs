@@ -1,6 +1,6 @@
 //! What the odometry says of every image.
 
-use crate::initialization::Refusal;
+use crate::initialization::InitFailure;
 use std::fmt;
 use vidar_core::{
     FrameId, Health, NavCovariance, NavState, OdometryKeyframe, RevisedPose, SparseLandmark, Timestamp,
@@ -21,7 +21,7 @@ pub struct OdometryOutput {
 #[derive(Clone, Debug, PartialEq)]
 pub enum Status {
     /// Not started yet; what is missing.
-    Waiting(Refusal),
+    Waiting(InitFailure),
     /// There is a state.
     Tracking(Box<Tracking>),
     /// There was one, and it cannot be kept.
@@ -80,12 +80,12 @@ pub struct TrackSummary {
     /// Landmarks that were found.
     pub landmarks_found: usize,
     /// Tracks without a known distance that were looked for.
-    pub young_tried: usize,
+    pub seeds_tried: usize,
     /// Tracks without a known distance that were found.
-    pub young_found: usize,
+    pub seeds_found: usize,
     /// Landmarks that were found and contradict the others.
     pub contradicting: usize,
-    /// Mean squared misfit of the window's sightings in their standard deviations, per degree of freedom; 1 is what fits.
+    /// χ² of the window's observations per degree of freedom; 1 is expected.
     pub chi2_per_dof: f64,
 }
 
@@ -97,7 +97,7 @@ pub enum LossReason {
         /// How long nothing was seen, s.
         secs: f64,
     },
-    /// No inertial reading for too long.
+    /// No IMU measurement for too long.
     ImuGap {
         /// Length of the gap, s.
         secs: f64,
@@ -139,7 +139,7 @@ impl fmt::Display for LossReason {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Self::NoFeatures { secs } => write!(f, "no landmark was seen for {secs:.2} s"),
-            Self::ImuGap { secs } => write!(f, "no inertial reading for {secs:.2} s"),
+            Self::ImuGap { secs } => write!(f, "no IMU measurement for {secs:.2} s"),
             Self::ImageGap { secs } => write!(f, "no image for {secs:.2} s"),
             Self::Diverged { sign, found, limit } => match sign {
                 DivergenceSign::Speed => write!(f, "speed {found:.1} m/s > {limit:.1} m/s"),
@@ -170,6 +170,6 @@ mod tests {
     fn a_loss_names_its_reason_with_values() {
         let reason = LossReason::Diverged { sign: DivergenceSign::Speed, found: 31.0, limit: 20.0 };
         assert_eq!(reason.to_string(), "speed 31.0 m/s > 20.0 m/s");
-        assert_eq!(LossReason::ImuGap { secs: 0.75 }.to_string(), "no inertial reading for 0.75 s");
+        assert_eq!(LossReason::ImuGap { secs: 0.75 }.to_string(), "no IMU measurement for 0.75 s");
     }
 }

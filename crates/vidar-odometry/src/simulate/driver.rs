@@ -2,12 +2,15 @@
 
 use super::sensors::{SimulatedFrame, Simulation};
 use crate::backend::{
-    AnchorSigmas, Departure, Observation, OptimiseReport, Smoother, SmootherConfig, SmootherError,
+    GaugePriorSigmas, MarginalisationReport, Observation, OptimiseReport, Smoother, SmootherConfig,
+    SmootherError,
 };
 use crate::imu::{Bias, BufferError, ImuBuffer, ImuModel, NavState, Preintegration};
 use crate::initialization::STILL_SECS;
-use crate::initialization::{Attempt, InFlightConfig, InFlightStart, LoggedFrame, Refusal, Seen};
-use crate::tracking::{ImageMotion, ImuSpread};
+use crate::initialization::{
+    InFlightConfig, InFlightInitializer, InitFailure, InitOutcome, LoggedFrame, TrackObservation,
+};
+use crate::tracking::{ImageMotion, ImuStatistics};
 use nalgebra::Vector3;
 use rustc_hash::{FxHashMap, FxHashSet};
 use vidar_core::{CameraModel, Duration, FrameId, ImuSample, LandmarkId, LieGroup, Se3, Timestamp};
@@ -21,7 +24,7 @@ pub struct FeatureOdometryConfig {
     pub in_flight: InFlightConfig,
     /// What is believed of the IMU.
     pub imu: ImuModel,
-    /// Nominal rate of readings, Hz.
+    /// Nominal rate of IMU measurements, Hz.
     pub imu_rate_hz: f64,
     /// Keyframes held.
     pub keyframes: usize,
@@ -35,7 +38,7 @@ pub struct FeatureOdometryConfig {
     pub min_parallax_deg: f64,
     /// Frames between attempts to start.
     pub attempt_every: usize,
-    /// Whether tracks and readings tell when the body rests, as in the whole odometry; else only
+    /// Whether tracks and IMU measurements tell when the body rests, as in the whole odometry; else only
     /// [`FeatureOdometry::push_resting`] does.
     pub notices_rest: bool,
 }
@@ -63,24 +66,24 @@ impl FeatureOdometryConfig {
 #[derive(Clone, Debug)]
 pub enum StepOutput {
     /// There is no metric state; why not, when an attempt was made.
-    Waiting(Option<Refusal>),
+    Waiting(Option<InitFailure>),
     /// The start succeeded with this frame.
-    Started {
+    InFlightSolution {
         /// State of the frame.
         state: NavState,
         /// Standard deviation of log(scale).
         log_scale_sigma: f64,
     },
     /// The state of the frame.
-    Running(NavState),
+    SlidingWindowOdometry(NavState),
 }
 
 /// Standard deviations of a resting body's velocity, m/s, and motion from frame to frame, m and rad; after this long its
-/// readings go into the prior, s.
+/// IMU measurements go into the prior, s.
 const REST_SIGMA_MPS: f64 = 0.01;
-const REST_SIGMA_M: f64 = 5e-4;
-const REST_SIGMA_RAD: f64 = 2e-4;
-const REST_FOLD_SECS: f64 = 1.0;
+const ZERO_MOTION_SIGMA_M: f64 = 5e-4;
+const ZERO_MOTION_SIGMA_RAD: f64 = 2e-4;
+const STANDSTILL_FOLD_SECS: f64 = 1.0;
 
 /// See the module's head.
 #[derive(Clone, Debug)]
@@ -89,37 +92,37 @@ pub struct FeatureOdometry {
     camera: CameraModel,
     body_from_camera: Se3,
     buffer: ImuBuffer,
-    start: InFlightStart,
+    start: InFlightInitializer,
     log: Vec<LoggedFrame>,
     smoother: Option<Smoother>,
-    tracks: FxHashMap<LandmarkId, Vec<(FrameId, Seen)>>,
+    tracks: FxHashMap<LandmarkId, Vec<(FrameId, TrackObservation)>>,
     banned: FxHashSet<LandmarkId>,
     since_keyframe: usize,
     /// Whether the frame that comes is told to rest, and whether it is told or seen to.
     told_to_rest: bool,
     resting: bool,
     motion: ImageMotion,
-    /// The frame since which the body rests, and the time from which its readings are not in the prior yet.
+    /// The frame since which the body rests, and the time from which its IMU measurements are not in the prior yet.
     rest: Option<(FrameId, Timestamp)>,
     last_time: Option<Timestamp>,
     report: OptimiseReport,
-    departure: Departure,
+    marginalisation: MarginalisationReport,
     scratch: Vec<ImuSample>,
 }
 
-/// Distance between prediction and sighting that is tried at all, px.
+/// Distance between prediction and observation that is tried at all, px.
 const GATE_PX: f64 = 25.0;
 
 /// Least way from keyframe to keyframe, as a share of the scene's distance.
 const MIN_KEYFRAME_BASE: f64 = 2e-3;
 
-/// Misfit of a new landmark's sightings that is accepted, in standard deviations.
+/// Residual of a new landmark's observations that is accepted, in standard deviations.
 const NEW_GATE_SIGMAS: f64 = 4.0;
 
 impl FeatureOdometry {
     /// For one camera on a body.
     pub fn new(config: FeatureOdometryConfig, camera: CameraModel, body_from_camera: Se3) -> Self {
-        let start = InFlightStart::new(
+        let start = InFlightInitializer::new(
             config.in_flight.clone(),
             config.smoother.clone(),
             camera.clone(),
@@ -142,28 +145,28 @@ impl FeatureOdometry {
             rest: None,
             last_time: None,
             report: OptimiseReport::default(),
-            departure: Departure::default(),
+            marginalisation: MarginalisationReport::default(),
             scratch: Vec::new(),
         }
     }
 
-    /// For a simulation, its readings taken in.
+    /// For a simulation, its IMU measurements taken in.
     ///
     /// # Errors
-    /// Readings out of order.
+    /// IMU measurements out of order.
     pub fn for_simulation(
         config: FeatureOdometryConfig,
         simulation: &Simulation,
     ) -> Result<Self, BufferError> {
         let mut odometry = Self::new(config, simulation.camera.clone(), simulation.body_from_camera);
-        simulation.readings.iter().try_for_each(|s| odometry.take(*s))?;
+        simulation.imu_samples.iter().try_for_each(|s| odometry.take(*s))?;
         Ok(odometry)
     }
 
-    /// Takes a reading.
+    /// Takes an IMU sample.
     ///
     /// # Errors
-    /// A reading out of order or not finite.
+    /// An IMU sample out of order or not finite.
     pub fn take(&mut self, reading: ImuSample) -> Result<(), BufferError> {
         self.buffer.push(reading)
     }
@@ -176,7 +179,7 @@ impl FeatureOdometry {
         &mut self,
         frame: &SimulatedFrame,
         state: NavState,
-        sigmas: AnchorSigmas,
+        sigmas: GaugePriorSigmas,
     ) -> Result<(), SmootherError> {
         let mut smoother =
             Smoother::new(self.config.smoother.clone(), self.camera.clone(), self.body_from_camera)?;
@@ -185,7 +188,7 @@ impl FeatureOdometry {
         self.smoother = Some(smoother);
         self.since_keyframe = 0;
         self.last_time = Some(frame.time);
-        self.remember(frame.id, &frame.seen);
+        self.remember(frame.id, &frame.observations);
         Ok(())
     }
 
@@ -202,33 +205,38 @@ impl FeatureOdometry {
     /// Takes the tracks of the next frame, with its stamp.
     ///
     /// # Errors
-    /// What the smoother refuses; readings that do not reach to the frame count as missing.
-    pub fn push(&mut self, id: FrameId, time: Timestamp, seen: &[Seen]) -> Result<StepOutput, SmootherError> {
+    /// What the smoother refuses; IMU measurements that do not reach to the frame count as missing.
+    pub fn push(
+        &mut self,
+        id: FrameId,
+        time: Timestamp,
+        observations: &[TrackObservation],
+    ) -> Result<StepOutput, SmootherError> {
         let bias = match &self.smoother {
             Some(smoother) => smoother.newest().map_or(Bias::ZERO, |(.., s)| s.bias),
             None => Bias { gyro: *self.start.gyro_bias(), accel: Vector3::zeros() },
         };
         // Stamps as far right as is known.
         let time = time + self.smoother.as_ref().map_or(Duration::ZERO, Smoother::next_frame_offset);
-        let readings = self.readings_until(time, bias);
-        let still = self.motion.update(seen.iter().map(|s| (s.landmark, s.pixel)), time);
+        let preintegration = self.preintegrate_until(time, bias);
+        let still = self.motion.update(observations.iter().map(|s| (s.landmark, s.pixel)), time);
         self.resting = self.told_to_rest || (self.config.notices_rest && still && self.imu_rests(time));
         self.last_time = Some(time);
         match self.smoother.take() {
             Some(mut smoother) => {
-                let state = self.advance(&mut smoother, id, time, seen, readings);
+                let state = self.advance(&mut smoother, id, time, observations, preintegration);
                 self.smoother = Some(smoother);
-                state.map(StepOutput::Running)
+                state.map(StepOutput::SlidingWindowOdometry)
             }
-            None => self.try_start(id, time, seen, readings),
+            None => self.try_start(id, time, observations, preintegration),
         }
     }
 
-    /// Whether the readings of the last half second are those of a body at rest.
+    /// Whether the IMU measurements of the last half second are those of a body at rest.
     fn imu_rests(&self, time: Timestamp) -> bool {
         let from = time - Duration::from_secs_f64(STILL_SECS);
         let recent = self.buffer.iter().filter(|s| s.time >= from && s.time <= time);
-        ImuSpread::of(recent).is_still(&self.config.imu.noise)
+        ImuStatistics::of(recent).is_still(&self.config.imu.noise)
     }
 
     /// As [`FeatureOdometry::push`] for a frame of which it is known that the body stands still.
@@ -239,19 +247,19 @@ impl FeatureOdometry {
         &mut self,
         id: FrameId,
         time: Timestamp,
-        seen: &[Seen],
+        observations: &[TrackObservation],
     ) -> Result<StepOutput, SmootherError> {
         self.told_to_rest = true;
-        let output = self.push(id, time, seen);
+        let output = self.push(id, time, observations);
         self.told_to_rest = false;
         output
     }
 
-    fn readings_until(&mut self, time: Timestamp, bias: Bias) -> Option<Preintegration> {
+    fn preintegrate_until(&mut self, time: Timestamp, bias: Bias) -> Option<Preintegration> {
         let mut cut = std::mem::take(&mut self.scratch);
         let covered = self.last_time.and_then(|from| self.buffer.interval(from, time, &mut cut).ok());
         let spare = self.smoother.as_mut().and_then(Smoother::take_spare);
-        let readings = covered.map(|_| match spare {
+        let preintegration = covered.map(|_| match spare {
             Some(mut spare) => {
                 spare.restart(bias, &cut);
                 spare
@@ -259,31 +267,31 @@ impl FeatureOdometry {
             None => Preintegration::new(self.config.imu, bias, &cut),
         });
         self.scratch = cut;
-        readings
+        preintegration
     }
 
     fn try_start(
         &mut self,
         id: FrameId,
         time: Timestamp,
-        seen: &[Seen],
-        readings: Option<Preintegration>,
+        observations: &[TrackObservation],
+        preintegration: Option<Preintegration>,
     ) -> Result<StepOutput, SmootherError> {
-        self.log.push(LoggedFrame { frame: id, time, readings, seen: seen.to_vec() });
+        self.log.push(LoggedFrame { frame: id, time, preintegration, observations: observations.to_vec() });
         let old = self.log.len().saturating_sub((self.config.in_flight.window_secs * 100.0) as usize);
         self.log.drain(..old);
         if self.resting || !self.log.len().is_multiple_of(self.config.attempt_every) {
             return Ok(StepOutput::Waiting(None));
         }
         match self.start.attempt(&self.log)? {
-            Attempt::Refused(refusal) => Ok(StepOutput::Waiting(Some(refusal))),
-            Attempt::Started(started) => {
+            InitOutcome::Failed(failure) => Ok(StepOutput::Waiting(Some(failure))),
+            InitOutcome::Solved(started) => {
                 let mut smoother = started.smoother;
                 // What was not used by the start may still become landmarks.
                 let held: FxHashSet<FrameId> = smoother.frames().collect();
                 let log = std::mem::take(&mut self.log);
                 for frame in log.iter().filter(|f| held.contains(&f.frame)) {
-                    self.remember(frame.frame, &frame.seen);
+                    self.remember(frame.frame, &frame.observations);
                 }
                 let known: Vec<LandmarkId> = smoother.landmarks().map(|l| l.id).collect();
                 known.iter().for_each(|l| {
@@ -293,32 +301,32 @@ impl FeatureOdometry {
                 self.trim(&mut smoother)?;
                 let state = smoother.newest().map_or(NavState::REST, |(.., s)| *s);
                 self.smoother = Some(smoother);
-                Ok(StepOutput::Started { state, log_scale_sigma: started.log_scale_sigma })
+                Ok(StepOutput::InFlightSolution { state, log_scale_sigma: started.log_scale_sigma })
             }
         }
     }
 
-    /// The figure of one frame: predict, add sightings, optimise, leave out outliers, keyframe, window.
+    /// The figure of one frame: predict, add observations, optimise, leave out outliers, keyframe, window.
     fn advance(
         &mut self,
         smoother: &mut Smoother,
         id: FrameId,
         time: Timestamp,
-        seen: &[Seen],
-        readings: Option<Preintegration>,
+        observations: &[TrackObservation],
+        preintegration: Option<Preintegration>,
     ) -> Result<NavState, SmootherError> {
         let last = smoother.newest().map_or(NavState::REST, |(.., s)| *s);
-        let predicted = readings.as_ref().map_or(last, |r| r.predict(&last));
-        smoother.add_frame(id, time, predicted, readings)?;
+        let predicted = preintegration.as_ref().map_or(last, |r| r.predict(&last));
+        smoother.add_frame(id, time, predicted, preintegration)?;
         if self.resting {
-            smoother.add_standstill(id, REST_SIGMA_MPS)?;
+            smoother.add_zero_velocity(id, REST_SIGMA_MPS)?;
             if self.rest.is_some() {
-                smoother.add_rest(id, REST_SIGMA_M, REST_SIGMA_RAD)?;
+                smoother.add_zero_motion(id, ZERO_MOTION_SIGMA_M, ZERO_MOTION_SIGMA_RAD)?;
             }
         }
-        self.remember(id, seen);
+        self.remember(id, observations);
         let mut tracked = 0;
-        for s in seen {
+        for s in observations {
             let near = smoother.predict_pixel(id, s.landmark).is_some_and(|p| (p - s.pixel).norm() < GATE_PX);
             if near {
                 smoother.add_observation(&observation(id, s))?;
@@ -339,16 +347,16 @@ impl FeatureOdometry {
         if is_due {
             smoother.mark_keyframe(id)?;
             self.since_keyframe = 0;
-            self.add_landmarks(smoother, id, seen)?;
+            self.add_landmarks(smoother, id, observations)?;
         }
         let state = smoother.newest().map_or(predicted, |(.., s)| *s);
-        self.rest_or_move(smoother, id, time)?;
+        self.update_standstill(smoother, id, time)?;
         self.trim(smoother)?;
         Ok(state)
     }
 
     /// Holds a rest of any length by its first frame and the newest one.
-    fn rest_or_move(
+    fn update_standstill(
         &mut self,
         smoother: &mut Smoother,
         id: FrameId,
@@ -360,11 +368,11 @@ impl FeatureOdometry {
             Some((first, folded)) => {
                 let between = smoother.frames().rev().nth(1);
                 if let Some(between) = between.filter(|b| *b != first) {
-                    smoother.drop_frame(between, &mut self.departure)?;
+                    smoother.drop_frame(between, &mut self.marginalisation)?;
                 }
-                let is_long = (time - folded).as_secs_f64() >= REST_FOLD_SECS;
+                let is_long = (time - folded).as_secs_f64() >= STANDSTILL_FOLD_SECS;
                 if is_long {
-                    smoother.rest_in_place(&mut self.departure)?;
+                    smoother.fold_standstill(&mut self.marginalisation)?;
                 }
                 Some((first, if is_long { time } else { folded }))
             }
@@ -372,8 +380,8 @@ impl FeatureOdometry {
         Ok(())
     }
 
-    fn remember(&mut self, id: FrameId, seen: &[Seen]) {
-        for s in seen.iter().filter(|s| !self.banned.contains(&s.landmark)) {
+    fn remember(&mut self, id: FrameId, observations: &[TrackObservation]) {
+        for s in observations.iter().filter(|s| !self.banned.contains(&s.landmark)) {
             self.tracks.entry(s.landmark).or_default().push((id, *s));
         }
     }
@@ -381,7 +389,7 @@ impl FeatureOdometry {
     fn leave_out(&mut self, smoother: &mut Smoother) {
         for outlier in &self.report.outliers {
             smoother.remove_observation(outlier.frame, outlier.landmark);
-            if smoother.landmark(outlier.landmark).is_some_and(|l| l.sightings < 2) {
+            if smoother.landmark(outlier.landmark).is_some_and(|l| l.observations < 2) {
                 smoother.remove_landmark(outlier.landmark);
                 self.banned.insert(outlier.landmark);
                 self.tracks.remove(&outlier.landmark);
@@ -394,12 +402,12 @@ impl FeatureOdometry {
         &mut self,
         smoother: &mut Smoother,
         id: FrameId,
-        seen: &[Seen],
+        observations: &[TrackObservation],
     ) -> Result<(), SmootherError> {
         let keyframes: Vec<FrameId> = smoother.keyframes().collect();
         let held: Vec<FrameId> = smoother.frames().collect();
         let body_from_camera = *smoother.body_from_camera();
-        for s in seen {
+        for s in observations {
             if smoother.landmark(s.landmark).is_some() {
                 continue;
             }
@@ -417,19 +425,19 @@ impl FeatureOdometry {
                 continue;
             };
             let point = first.act(&(ray * distance));
-            let fits = |f: FrameId, seen: &Seen| {
+            let fits = |f: FrameId, observations: &TrackObservation| {
                 let pixel = camera_of(f).and_then(|c| self.camera.project(&c.inverse().act(&point)));
-                let limit = NEW_GATE_SIGMAS * (0.5 * seen.covariance.trace()).sqrt() + 1.0;
-                pixel.is_some_and(|p| (p - seen.pixel).norm() < limit)
+                let limit = NEW_GATE_SIGMAS * (0.5 * observations.covariance.trace()).sqrt() + 1.0;
+                pixel.is_some_and(|p| (p - observations.pixel).norm() < limit)
             };
-            let fitting: Vec<(FrameId, Seen)> =
+            let fitting: Vec<(FrameId, TrackObservation)> =
                 history.iter().filter(|(f, s)| *f != host && fits(*f, s)).copied().collect();
             if fitting.len() < 2 || fitting.len() * 3 < history.len() {
                 continue;
             }
             smoother.add_landmark(&observation(host, &host_seen), 1.0 / distance)?;
-            for (frame, seen) in fitting.iter().filter(|(f, _)| *f >= host) {
-                smoother.add_observation(&observation(*frame, seen))?;
+            for (frame, observations) in fitting.iter().filter(|(f, _)| *f >= host) {
+                smoother.add_observation(&observation(*frame, observations))?;
             }
         }
         Ok(())
@@ -444,15 +452,15 @@ impl FeatureOdometry {
             let other_count = smoother.len() - keyframes.len();
             if let Some(other) = first_other.filter(|_| other_count > self.config.recent) {
                 drop(others);
-                smoother.drop_frame(other, &mut self.departure)?;
+                smoother.drop_frame(other, &mut self.marginalisation)?;
             } else if let Some(first) = first.filter(|_| keyframes.len() > self.config.keyframes) {
                 drop(others);
-                smoother.marginalise(first, &mut self.departure)?;
+                smoother.marginalise(first, &mut self.marginalisation)?;
             } else {
                 break;
             }
-            for ended in &self.departure.ended {
-                // Its sightings are in the prior now.
+            for ended in &self.marginalisation.ended {
+                // Its observations are in the prior now.
                 self.tracks.remove(ended);
             }
         }
@@ -475,8 +483,13 @@ fn has_moved(smoother: &Smoother, id: FrameId) -> bool {
     (here - last).norm() * median > MIN_KEYFRAME_BASE
 }
 
-fn observation(frame: FrameId, seen: &Seen) -> Observation {
-    Observation { frame, landmark: seen.landmark, pixel: seen.pixel, covariance: seen.covariance }
+fn observation(frame: FrameId, observations: &TrackObservation) -> Observation {
+    Observation {
+        frame,
+        landmark: observations.landmark,
+        pixel: observations.pixel,
+        covariance: observations.covariance,
+    }
 }
 
 /// Distance along the first ray of the point nearest to both rays, if their angle is wide enough and it lies ahead.

@@ -1,4 +1,4 @@
-//! Feature-level simulation: a flight becomes IMU readings and pixels of landmarks, without images.
+//! Feature-level simulation: a flight becomes IMU measurements and pixels of landmarks, without images.
 //!
 //! A hundred times faster than rendering, so that the back end can be tried by Monte Carlo: [`Simulation`] makes the
 //! sensors' data from any [`Flight`], [`FeatureOdometry`] runs start and smoother on them as the whole odometry does on

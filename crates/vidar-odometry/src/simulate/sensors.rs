@@ -1,9 +1,9 @@
-//! Readings and tracks of a flight.
+//! IMU measurements and tracks of a flight.
 
 use super::course::Flight;
 use super::random::Random;
 use crate::imu::{Bias, NavState};
-use crate::initialization::Seen;
+use crate::initialization::TrackObservation;
 use nalgebra::{Matrix2, Vector2, Vector3};
 use vidar_core::camera::RadTan;
 use vidar_core::{
@@ -16,7 +16,7 @@ use vidar_core::{
 pub struct SimulationConfig {
     /// Everything random follows from it.
     pub seed: u64,
-    /// Readings per second.
+    /// IMU measurements per second.
     pub imu_rate_hz: f64,
     /// Frames per second.
     pub camera_rate_hz: f64,
@@ -30,7 +30,7 @@ pub struct SimulationConfig {
     pub accel_bias_sigma: f64,
     /// Standard deviation of pixels, px.
     pub pixel_sigma: f64,
-    /// Share of sightings that are wrong (up to 30 px off).
+    /// Share of observations that are wrong (up to 30 px off).
     pub outlier_share: f64,
     /// Share of tracks that is lost from frame to frame.
     pub loss_share: f64,
@@ -78,7 +78,7 @@ pub struct SimulatedFrame {
     /// The truth when it was exposed, biases included.
     pub truth: NavState,
     /// What it sees. A track that was lost comes back under another name.
-    pub seen: Vec<Seen>,
+    pub observations: Vec<TrackObservation>,
 }
 
 /// A flight as sensors tell it.
@@ -88,9 +88,9 @@ pub struct Simulation {
     pub camera: CameraModel,
     /// Its place on the body.
     pub body_from_camera: Se3,
-    /// Readings.
-    pub readings: Vec<ImuSample>,
-    /// True biases of the readings.
+    /// IMU measurements.
+    pub imu_samples: Vec<ImuSample>,
+    /// True biases of the IMU measurements.
     pub biases: Vec<Bias>,
     /// Frames.
     pub frames: Vec<SimulatedFrame>,
@@ -127,7 +127,7 @@ impl Simulation {
     pub fn new(flight: &impl Flight, from_secs: f64, secs: f64, config: &SimulationConfig) -> Self {
         let secs = secs.min(flight.duration_secs() - from_secs);
         let mut random = Random::new(config.seed);
-        let (readings, biases) = simulate_imu(flight, from_secs, secs, config, &mut random);
+        let (imu_samples, biases) = simulate_imu(flight, from_secs, secs, config, &mut random);
         let points = scatter_points(flight, config, &mut random);
         let (camera, body_from_camera) = (Self::camera(), Self::body_from_camera());
         let frames = (secs * config.camera_rate_hz + 1e-6).floor() as usize;
@@ -140,11 +140,11 @@ impl Simulation {
             let bias = biases[((exposed * config.imu_rate_hz).round() as usize).min(biases.len() - 1)];
             let truth = NavState { world_from_body: motion.world_from_body, velocity: motion.velocity, bias };
             let camera_from_world = (motion.world_from_body * body_from_camera).inverse();
-            let seen = tracker.look(&points, &camera, &camera_from_world, config, &mut random);
-            all.push(SimulatedFrame { id: FrameId(k as u32), time: stamp(at), truth, seen });
+            let observations = tracker.look(&points, &camera, &camera_from_world, config, &mut random);
+            all.push(SimulatedFrame { id: FrameId(k as u32), time: stamp(at), truth, observations });
         }
         let point_of = tracker.point_of;
-        Self { camera, body_from_camera, readings, biases, frames: all, points, point_of }
+        Self { camera, body_from_camera, imu_samples, biases, frames: all, points, point_of }
     }
 
     /// Where the point of a track is in the world, m.
@@ -168,7 +168,7 @@ fn simulate_imu(
         gyro: random.normal3() * (scale * config.gyro_bias_sigma),
         accel: random.normal3() * (scale * config.accel_bias_sigma),
     };
-    let (mut readings, mut biases) = (Vec::with_capacity(count), Vec::with_capacity(count));
+    let (mut imu_samples, mut biases) = (Vec::with_capacity(count), Vec::with_capacity(count));
     for k in 0..count {
         let at = k as f64 / config.imu_rate_hz;
         let motion = flight.motion(from_secs + at);
@@ -176,7 +176,7 @@ fn simulate_imu(
         let force = motion.world_from_body.rotation.inverse() * (motion.acceleration - gravity);
         let gyro_noise = random.normal3() * (scale * noise.gyro_noise_density * root_rate);
         let accel_noise = random.normal3() * (scale * noise.accel_noise_density * root_rate);
-        readings.push(ImuSample {
+        imu_samples.push(ImuSample {
             time: stamp(at),
             gyro: AngularRate(motion.angular_rate + bias.gyro + gyro_noise),
             accel: SpecificForce(force + bias.accel + accel_noise),
@@ -185,7 +185,7 @@ fn simulate_imu(
         bias.gyro += random.normal3() * (scale * noise.gyro_random_walk / root_rate);
         bias.accel += random.normal3() * (scale * noise.accel_random_walk / root_rate);
     }
-    (readings, biases)
+    (imu_samples, biases)
 }
 
 /// Points on the walls of a room round the flight, and some within.
@@ -241,7 +241,7 @@ impl Tracker {
         camera_from_world: &Se3,
         config: &SimulationConfig,
         random: &mut Random,
-    ) -> Vec<Seen> {
+    ) -> Vec<TrackObservation> {
         let visible = |p: &Vector3<f64>| {
             let q = camera_from_world.act(p);
             // The distortion folds back far outside the image.
@@ -250,7 +250,7 @@ impl Tracker {
             }
             camera.project(&q).filter(|pixel| camera.contains(pixel, 8.0))
         };
-        let mut seen = Vec::with_capacity(config.tracks);
+        let mut observations = Vec::with_capacity(config.tracks);
         let mut fresh = Vec::new();
         for (k, point) in points.iter().enumerate() {
             match (visible(point), self.names[k]) {
@@ -258,20 +258,20 @@ impl Tracker {
                     if random.uniform() < config.loss_share {
                         self.names[k] = None;
                     } else {
-                        seen.push((name, pixel));
+                        observations.push((name, pixel));
                     }
                 }
                 (Some(pixel), None) => fresh.push((k, pixel)),
                 (None, _) => self.names[k] = None,
             }
         }
-        while seen.len() < config.tracks && !fresh.is_empty() {
+        while observations.len() < config.tracks && !fresh.is_empty() {
             let pick = ((random.uniform() * fresh.len() as f64) as usize).min(fresh.len() - 1);
             let (k, pixel) = fresh.swap_remove(pick);
             let name = LandmarkId(self.point_of.len() as u32);
             self.point_of.push(k);
             self.names[k] = Some(name);
-            seen.push((name, pixel));
+            observations.push((name, pixel));
         }
         let variance = config.pixel_sigma.max(1e-3).powi(2);
         let mut measured = |(landmark, pixel): (LandmarkId, Vector2<f64>)| {
@@ -279,8 +279,8 @@ impl Tracker {
             if random.uniform() < config.outlier_share {
                 error = Vector2::new(random.between(-30.0, 30.0), random.between(-30.0, 30.0));
             }
-            Seen { landmark, pixel: pixel + error, covariance: Matrix2::identity() * variance }
+            TrackObservation { landmark, pixel: pixel + error, covariance: Matrix2::identity() * variance }
         };
-        seen.into_iter().map(&mut measured).collect()
+        observations.into_iter().map(&mut measured).collect()
     }
 }

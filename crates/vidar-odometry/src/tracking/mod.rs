@@ -12,10 +12,10 @@ pub(crate) mod standstill;
 mod track;
 mod tracker;
 
-pub(crate) use sliding_window::{Running, Shot, Step};
-pub(crate) use standstill::{ImageMotion, ImuSpread, found_in};
+pub(crate) use sliding_window::{FrameInput, SlidingWindowOdometry, StepReport};
+pub(crate) use standstill::{ImageMotion, ImuStatistics, tracks_in};
 pub use track::TrackRecord;
 pub(crate) use track::{
     HostImage, ImagePool, Track, host_covariance, noisy_covariance, parallax, rotated_pixel, unknown_distance,
 };
-pub(crate) use tracker::{Places, Prediction, Tracker};
+pub(crate) use tracker::{CameraPoses, Prediction, Tracker};

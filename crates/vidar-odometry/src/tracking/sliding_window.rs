@@ -5,40 +5,40 @@ mod keyframes;
 mod seeds;
 mod standstill;
 
-use super::standstill::{ImageMotion, found_in};
+use super::standstill::{ImageMotion, tracks_in};
 use super::track::TrackRecord;
 use super::track::{HostImage, Track, noisy_covariance};
-use super::tracker::{Places, Prediction, TrackCounts, Tracker};
-use crate::backend::{Departure, Observation, OptimiseReport, Smoother, SmootherError};
+use super::tracker::{CameraPoses, Prediction, TrackCounts, Tracker};
+use crate::backend::{MarginalisationReport, Observation, OptimiseReport, Smoother, SmootherError};
 use crate::config::OdometryConfig;
 use crate::frontend::{ImageAligner, ImageAlignmentConfig, PixelMeasurement};
 use crate::imu::{NavState, Preintegration};
 use crate::pipeline::TrackSummary;
 use crate::stages::{Stage, StageClock};
-use standstill::{REST_SIGMA_M, REST_SIGMA_RAD, STANDSTILL_SIGMA_MPS};
+use standstill::{ZERO_MOTION_SIGMA_M, ZERO_MOTION_SIGMA_RAD, ZERO_VELOCITY_SIGMA_MPS};
 use std::rc::Rc;
 use vidar_core::{CameraModel, FrameId, LandmarkId, LieGroup, Se3, Timestamp};
 
 /// A frame that arrives.
-pub(crate) struct Shot {
+pub(crate) struct FrameInput {
     pub host: Rc<HostImage>,
     /// In the clock of the IMU.
     pub time: Timestamp,
-    /// Readings since the frame before.
-    pub readings: Option<Preintegration>,
+    /// IMU measurements since the frame before.
+    pub preintegration: Option<Preintegration>,
     /// Whether the IMU feels no motion.
     pub imu_still: bool,
 }
 
 /// What one image did.
 #[derive(Debug, Default)]
-pub(crate) struct Step {
+pub(crate) struct StepReport {
     pub counts: TrackCounts,
-    /// Mean squared misfit of the window's sightings per degree of freedom.
+    /// χ² of the window's observations per degree of freedom.
     pub chi2_per_dof: f64,
-    /// Landmarks whose sighting in this image fits.
+    /// Landmarks whose observation in this image fits.
     pub fitting: usize,
-    /// Landmarks whose sighting in this image contradicts the others.
+    /// Landmarks whose observation in this image contradicts the others.
     pub contradicting: usize,
     pub is_keyframe: bool,
     pub is_still: bool,
@@ -48,14 +48,14 @@ pub(crate) struct Step {
     pub left: Vec<(FrameId, NavState)>,
 }
 
-impl Step {
+impl StepReport {
     /// What became of the tracks, for the outside.
     pub fn summary(&self) -> TrackSummary {
         TrackSummary {
             landmarks_tried: self.counts.landmarks_tried,
             landmarks_found: self.counts.landmarks_found,
-            young_tried: self.counts.young_tried,
-            young_found: self.counts.young_found,
+            seeds_tried: self.counts.seeds_tried,
+            seeds_found: self.counts.seeds_found,
             contradicting: self.contradicting,
             chi2_per_dof: self.chi2_per_dof,
         }
@@ -64,7 +64,7 @@ impl Step {
 
 /// The running odometry.
 #[derive(Debug)]
-pub(crate) struct Running {
+pub(crate) struct SlidingWindowOdometry {
     config: OdometryConfig,
     camera: CameraModel,
     pub smoother: Smoother,
@@ -83,9 +83,9 @@ pub(crate) struct Running {
     /// Typical inverse distance, 1/m.
     typical_inverse: f64,
     motion: ImageMotion,
-    /// The frame since which the body stands still, and the time from which its readings are not yet in the prior.
+    /// The frame since which the body stands still, and the time from which its IMU measurements are not yet in the prior.
     rest: Option<(FrameId, Timestamp)>,
-    departure: Departure,
+    marginalisation: MarginalisationReport,
     report: OptimiseReport,
     scratch: Scratch,
 }
@@ -93,7 +93,7 @@ pub(crate) struct Running {
 /// Memory that is used again in every image.
 #[derive(Debug, Default)]
 struct Scratch {
-    sightings: Vec<(Se3, PixelMeasurement)>,
+    observations: Vec<(Se3, PixelMeasurement)>,
     promoted: Vec<LandmarkId>,
     values: Vec<f64>,
     frames: Vec<FrameId>,
@@ -101,15 +101,15 @@ struct Scratch {
 }
 
 /// Poses of the frames that the smoother holds.
-struct Held<'a>(&'a Smoother);
+struct WindowPoses<'a>(&'a Smoother);
 
-impl Places for Held<'_> {
+impl CameraPoses for WindowPoses<'_> {
     fn world_from_camera(&self, frame: FrameId) -> Option<Se3> {
         Some(self.0.state(frame)?.world_from_body * *self.0.body_from_camera())
     }
 }
 
-impl Running {
+impl SlidingWindowOdometry {
     /// Takes over a smoother that holds at least one frame; `hosts` are the images of its keyframes.
     pub fn new(
         config: OdometryConfig,
@@ -125,7 +125,7 @@ impl Running {
         // Tracks go on from the hosts that the smoother's landmarks have.
         tracker.tracks.retain_mut(|track| {
             track.is_landmark = smoother.landmark(track.id).is_some();
-            track.seen.clear();
+            track.observations.clear();
             !track.is_landmark || follow_host(track, &smoother, &hosts, &camera)
         });
         let keyframe_landmarks = tracker.tracks.iter().filter(|t| t.is_landmark).count();
@@ -145,7 +145,7 @@ impl Running {
             typical_inverse,
             motion: ImageMotion::default(),
             rest: None,
-            departure: Departure::default(),
+            marginalisation: MarginalisationReport::default(),
             report: OptimiseReport::default(),
             scratch: Scratch::default(),
         })
@@ -179,24 +179,25 @@ impl Running {
     }
 
     /// One image: the road from its pixels to a smoothed state.
-    pub fn step(&mut self, shot: Shot, clock: &mut StageClock) -> Result<Step, SmootherError> {
-        let frame = shot.host.frame;
+    pub fn step(&mut self, input: FrameInput, clock: &mut StageClock) -> Result<StepReport, SmootherError> {
+        let frame = input.host.frame;
         let last_state = self.state().unwrap_or(NavState::REST);
-        let predicted = shot.readings.as_ref().map_or(last_state, |r| r.predict(&last_state));
-        let mut step = Step::default();
-        let image = shot.host.clone();
+        let predicted = input.preintegration.as_ref().map_or(last_state, |r| r.predict(&last_state));
+        let mut step = StepReport::default();
+        let image = input.host.clone();
 
-        let believed = shot.readings.as_ref().is_some_and(|r| !r.is_saturated());
-        let predicted = if believed { predicted } else { self.predict_by_image(&shot.host, &last_state) };
-        self.smoother.add_frame(frame, shot.time, predicted, shot.readings)?;
+        let is_valid_imu = input.preintegration.as_ref().is_some_and(|r| !r.is_saturated());
+        let predicted =
+            if is_valid_imu { predicted } else { self.predict_by_image(&input.host, &last_state) };
+        self.smoother.add_frame(frame, input.time, predicted, input.preintegration)?;
         clock.lap(Stage::Predict);
-        step.counts = self.measure(&shot.host, shot.time, &last_state, &predicted);
+        step.counts = self.measure(&input.host, input.time, &last_state, &predicted);
         step.is_still =
-            self.motion.update(found_in(&self.tracker.tracks, frame), shot.time) && shot.imu_still;
+            self.motion.update(tracks_in(&self.tracker.tracks, frame), input.time) && input.imu_still;
         if step.is_still {
-            self.smoother.add_standstill(frame, STANDSTILL_SIGMA_MPS)?;
+            self.smoother.add_zero_velocity(frame, ZERO_VELOCITY_SIGMA_MPS)?;
             if self.rest.is_some() {
-                self.smoother.add_rest(frame, REST_SIGMA_M, REST_SIGMA_RAD)?;
+                self.smoother.add_zero_motion(frame, ZERO_MOTION_SIGMA_M, ZERO_MOTION_SIGMA_RAD)?;
             }
         }
         self.observe(frame);
@@ -206,23 +207,23 @@ impl Running {
         step.contradicting = self.remove_outliers(frame);
         step.fitting = self.tracker.tracks.iter().filter(|t| t.is_landmark && t.measured.is_some()).count();
         clock.lap(Stage::Smooth);
-        self.know_young_tracks(frame)?;
+        self.update_seeds(frame)?;
         clock.lap(Stage::Distances);
 
         step.is_keyframe = match step.is_still {
             // The first frame of a rest stands for all of it.
             true => self.rest.is_none(),
-            false => self.keyframe_is_due(frame, shot.time),
+            false => self.keyframe_is_due(frame, input.time),
         };
         if step.is_keyframe {
-            self.make_keyframe(shot.host)?;
+            self.make_keyframe(input.host)?;
         }
         clock.lap(Stage::Keyframe);
         self.last = frame;
-        self.rest_or_move(&step, shot.time)?;
+        self.update_standstill(&step, input.time)?;
         self.last_host = Some(image);
         self.before_last = Some(last_state.world_from_body);
-        self.thin_window(&mut step)?;
+        self.reduce_window(&mut step)?;
         clock.lap(Stage::Marginalise);
         Ok(step)
     }
@@ -239,7 +240,7 @@ impl Running {
         let world_from_current = predicted.world_from_body * body_from_camera;
         let world_from_last = last.world_from_body * body_from_camera;
         let prediction = Prediction {
-            places: &Held(&self.smoother),
+            poses: &WindowPoses(&self.smoother),
             world_from_current,
             current_from_last: world_from_current.inverse() * world_from_last,
             has_translation: true,
@@ -262,7 +263,7 @@ impl Running {
         }
     }
 
-    /// Takes sightings back that do not fit; a landmark that keeps misfitting goes. How many of the newest frame's.
+    /// Takes observations back that do not fit; a landmark that keeps being an outlier goes. How many of the newest frame's.
     fn remove_outliers(&mut self, frame: FrameId) -> usize {
         let mut in_newest = 0;
         for outlier in &self.report.outliers {
@@ -271,8 +272,8 @@ impl Running {
                 in_newest += 1;
                 self.tracker.reject(outlier.landmark);
             }
-            let sightings = self.smoother.landmark(outlier.landmark).map_or(0, |l| l.sightings);
-            if sightings < 3 {
+            let observations = self.smoother.landmark(outlier.landmark).map_or(0, |l| l.observations);
+            if observations < 3 {
                 self.smoother.remove_landmark(outlier.landmark);
                 self.tracker.tracks.retain(|t| t.id != outlier.landmark);
             }
@@ -280,8 +281,8 @@ impl Running {
         in_newest
     }
 
-    /// Memory of readings that are not needed any more.
-    pub fn spare_readings(&mut self) -> Option<Preintegration> {
+    /// Memory of IMU measurements that are not needed any more.
+    pub fn spare_preintegration(&mut self) -> Option<Preintegration> {
         self.smoother.take_spare()
     }
 }

@@ -16,7 +16,7 @@ const STILL_SECS: f64 = 0.4;
 const STILL_FRAMES: u32 = 4;
 /// Tracks that are needed to say so.
 const STILL_TRACKS: usize = 10;
-/// Standard deviations within which readings of a resting IMU stay, unless its own noise is stronger, rad/s and m/s².
+/// Standard deviations within which IMU measurements of a resting IMU stay, unless its own noise is stronger, rad/s and m/s².
 const STILL_GYRO: f64 = 0.02;
 const STILL_ACCEL: f64 = 0.15;
 
@@ -34,7 +34,7 @@ pub(crate) struct ImageMotion {
 }
 
 /// Tracks that `frame` shows, with their places.
-pub(crate) fn found_in(
+pub(crate) fn tracks_in(
     tracks: &[Track],
     frame: FrameId,
 ) -> impl Iterator<Item = (LandmarkId, Pixel)> + Clone + '_ {
@@ -95,9 +95,9 @@ impl ImageMotion {
     }
 }
 
-/// Mean and standard deviation of readings over a span.
+/// Mean and standard deviation of IMU measurements over a span.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(crate) struct ImuSpread {
+pub(crate) struct ImuStatistics {
     pub mean_gyro: Vector3<f64>,
     pub mean_accel: Vector3<f64>,
     pub std_gyro: f64,
@@ -105,7 +105,7 @@ pub(crate) struct ImuSpread {
     pub samples: usize,
 }
 
-impl ImuSpread {
+impl ImuStatistics {
     pub fn of<'a>(samples: impl Iterator<Item = &'a ImuSample>) -> Self {
         let (mut n, mut gyro, mut accel) = (0.0_f64, Vector3::zeros(), Vector3::zeros());
         let (mut gyro2, mut accel2) = (0.0, 0.0);
@@ -132,7 +132,7 @@ impl ImuSpread {
         }
     }
 
-    /// Whether the readings scatter no more than those of a body at rest.
+    /// Whether the IMU measurements scatter no more than those of a body at rest.
     pub fn is_still(&self, noise: &StepNoise) -> bool {
         // Standard deviation of the length of three axes of white noise.
         let white = |density: f64| density * (3.0 / noise.period_secs.max(1e-4)).sqrt();

@@ -69,7 +69,7 @@ pub(crate) struct Track {
     /// Where the newest keyframe shows it.
     pub keyframe_pixel: Option<Pixel>,
     /// Where frames of the window showed it, while the smoother does not know it.
-    pub seen: Vec<(FrameId, PixelMeasurement)>,
+    pub observations: Vec<(FrameId, PixelMeasurement)>,
     /// What the last prediction was off by, pixels per second: continues into the next one while no depth is known.
     pub drift: Vector2<f64>,
     /// Frames in which it was found.
@@ -166,7 +166,7 @@ impl InverseDistance {
         &self,
         camera: &CameraModel,
         feature: &Feature,
-        seen: &[(Se3, PixelMeasurement)],
+        observations: &[(Se3, PixelMeasurement)],
         gate: f64,
     ) -> Option<Self> {
         let prior_information = 1.0 / self.variance;
@@ -175,7 +175,7 @@ impl InverseDistance {
             let mut gradient = prior_information * (self.mean - mean);
             information = prior_information;
             chi2 = 0.0;
-            for (current_from_host, measured) in seen {
+            for (current_from_host, measured) in observations {
                 let (pixel, d_pixel) = project_with_distance(camera, feature, mean, current_from_host)?;
                 let left = measured.pixel - pixel;
                 let error2 = left.dot(&(measured.information * left));
@@ -192,7 +192,7 @@ impl InverseDistance {
                 break;
             }
         }
-        let fits = chi2 <= gate * seen.len() as f64;
+        let fits = chi2 <= gate * observations.len() as f64;
         (fits && mean.is_finite() && mean < 20.0).then_some(Self { mean, variance: 1.0 / information })
     }
 
@@ -241,19 +241,19 @@ mod tests {
         let camera = CameraModel::Pinhole(Pinhole::new(458.0, 457.0, 367.0, 248.0, 752, 480).unwrap());
         let feature = Feature::new(&camera, Pixel::new(300.0, 200.0), 0, FeatureKind::Corner).unwrap();
         let truth = 1.0 / 2.5;
-        let mut seen = Vec::new();
+        let mut observations = Vec::new();
         for k in 1..=8 {
             let x = 0.03 * f64::from(k);
             let turn = So3::exp(&Vector3::new(0.01, 0.02 * f64::from(k), 0.0));
             let current_from_host = Se3::new(turn, Vector3::new(-x, 0.3 * x, 0.1 * x));
             let (pixel, _) = project_with_distance(&camera, &feature, truth, &current_from_host).unwrap();
-            seen.push((current_from_host, PixelMeasurement::isotropic(pixel, 0.3)));
+            observations.push((current_from_host, PixelMeasurement::isotropic(pixel, 0.3)));
         }
-        let belief = unknown_distance(0.2).updated(&camera, &feature, &seen, 9.0).unwrap();
-        assert!((belief.mean - truth).abs() < 0.5 * belief.variance.sqrt(), "{belief:?}");
-        assert!(belief.relative_std() < 0.01, "{belief:?}");
-        seen[3].1.pixel.y += 30.0;
-        assert!(unknown_distance(0.2).updated(&camera, &feature, &seen, 9.0).is_none());
+        let estimate = unknown_distance(0.2).updated(&camera, &feature, &observations, 9.0).unwrap();
+        assert!((estimate.mean - truth).abs() < 0.5 * estimate.variance.sqrt(), "{estimate:?}");
+        assert!(estimate.relative_std() < 0.01, "{estimate:?}");
+        observations[3].1.pixel.y += 30.0;
+        assert!(unknown_distance(0.2).updated(&camera, &feature, &observations, 9.0).is_none());
         let aside = Se3::from_translation(Vector3::new(-0.2, 0.0, 0.0));
         assert!((parallax(&feature, truth, &aside) - 0.08).abs() < 0.01);
     }

@@ -13,10 +13,10 @@ use vidar_core::{CameraModel, FrameId, LandmarkId, LieGroup, Se3};
 const KNOWN_DISTANCE: f64 = 0.3;
 
 /// Frames in a row without being found after which a track without and with known distance is given up.
-const MAX_MISSED_YOUNG: u32 = 1;
+const MAX_MISSED_SEED: u32 = 1;
 const MAX_MISSED_KNOWN: u32 = 3;
 
-/// Sightings of a young track that there is room for without asking: as many as a window holds frames.
+/// Observations of a seed that there is room for without asking: as many as a window holds frames.
 const SEEN_FRAMES: usize = 24;
 
 /// Tracks may not come nearer than this to the border of the image, pixels.
@@ -27,12 +27,12 @@ const BORDER_PX: f64 = 8.0;
 pub(crate) struct TrackCounts {
     pub landmarks_tried: usize,
     pub landmarks_found: usize,
-    pub young_tried: usize,
-    pub young_found: usize,
+    pub seeds_tried: usize,
+    pub seeds_found: usize,
 }
 
 /// Where the camera of a frame is.
-pub(crate) trait Places {
+pub(crate) trait CameraPoses {
     /// Pose of the camera of `frame`, or `None` when it is not held.
     fn world_from_camera(&self, frame: FrameId) -> Option<Se3>;
 }
@@ -51,7 +51,7 @@ pub(crate) struct Tracker {
 
 /// The motion of the camera into the image that is measured, as predicted.
 pub(crate) struct Prediction<'a> {
-    pub places: &'a dyn Places,
+    pub poses: &'a dyn CameraPoses,
     pub world_from_current: Se3,
     pub current_from_last: Se3,
     /// Whether translations mean anything.
@@ -78,7 +78,7 @@ impl Tracker {
         let mut counts = TrackCounts::default();
         let (camera, measurer) = (&self.camera, &mut self.measurer);
         self.tracks.retain_mut(|track| {
-            let Some(world_from_host) = prediction.places.world_from_camera(track.host.frame) else {
+            let Some(world_from_host) = prediction.poses.world_from_camera(track.host.frame) else {
                 return false;
             };
             let current_from_host = prediction.world_from_current.inverse() * world_from_host;
@@ -86,7 +86,7 @@ impl Tracker {
             let (tried, count) = if track.is_landmark {
                 (&mut counts.landmarks_tried, &mut counts.landmarks_found)
             } else {
-                (&mut counts.young_tried, &mut counts.young_found)
+                (&mut counts.seeds_tried, &mut counts.seeds_found)
             };
             *tried += 1;
             match found {
@@ -95,7 +95,7 @@ impl Tracker {
                     track.last_pixel = measurement.pixel;
                     track.last_frame = frame;
                     if !track.is_landmark {
-                        track.seen.push((frame, measurement));
+                        track.observations.push((frame, measurement));
                     }
                     track.found += 1;
                     track.missed = 0;
@@ -108,7 +108,7 @@ impl Tracker {
                     let limit = if is_known(&track.distance, prediction.has_translation) {
                         MAX_MISSED_KNOWN
                     } else {
-                        MAX_MISSED_YOUNG
+                        MAX_MISSED_SEED
                     };
                     track.missed < limit && failure != MatchFailure::OutsideImage
                 }
@@ -165,7 +165,7 @@ impl Tracker {
             last_frame: host.frame,
             drift: Vector2::zeros(),
             keyframe_pixel: Some(feature.pixel),
-            seen: Vec::with_capacity(SEEN_FRAMES),
+            observations: Vec::with_capacity(SEEN_FRAMES),
             found: 1,
             missed: 0,
             measured: None,

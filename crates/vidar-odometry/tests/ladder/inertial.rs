@@ -1,4 +1,4 @@
-//! Readings that are missing or saturated, clocks and places that are wrong.
+//! IMU measurements that are missing or saturated, clocks and places that are wrong.
 
 use crate::recording::{EPOCH, Recording, lost, recording, within};
 use nalgebra::Vector3;
@@ -10,7 +10,7 @@ fn a_gap_of_readings_is_bridged() {
     let from = EPOCH + Duration::from_millis(5010);
     recording.imu.retain(|s| s.time < from || s.time > from + Duration::from_millis(100));
     let (outputs, odometry) = recording.run_events(recording.events());
-    within("100 ms without readings", &recording, &outputs, 0.05);
+    within("100 ms without IMU measurements", &recording, &outputs, 0.05);
     assert!(odometry.counts().imu_gaps >= 1 && lost(&outputs).is_empty());
 }
 
@@ -21,7 +21,7 @@ fn a_second_without_readings_is_a_loss_with_its_reason_and_a_new_segment() {
     recording.imu.retain(|s| s.time < from || s.time > from + Duration::from_millis(1000));
     let outputs = recording.run();
     let reasons = lost(&outputs);
-    assert!(reasons.len() == 1 && reasons[0].starts_with("no inertial reading for 1.0"), "{reasons:?}");
+    assert!(reasons.len() == 1 && reasons[0].starts_with("no IMU measurement for 1.0"), "{reasons:?}");
     let segments: Vec<u32> = outputs.iter().filter_map(|o| Some(o.tracking()?.segment)).collect();
     assert!(segments.first() == Some(&0) && segments.iter().all(|s| *s <= 1), "{segments:?}");
 }
@@ -53,7 +53,7 @@ fn an_inverted_extrinsic_is_refused_in_words() {
     let healthy = outputs.iter().filter(|o| o.health() == Health::Ok).count();
     assert!(healthy < outputs.len() / 20, "{healthy} of {}", outputs.len());
     let said = outputs.iter().any(|o| match &o.status {
-        vidar_odometry::Status::Waiting(refusal) => refusal.to_string().contains("orientation on the IMU"),
+        vidar_odometry::Status::Waiting(failure) => failure.to_string().contains("orientation on the IMU"),
         vidar_odometry::Status::Lost(reason) => reason.to_string().contains("gyroscope and images disagree"),
         vidar_odometry::Status::Tracking(_) => false,
     });

@@ -1,4 +1,4 @@
-//! The robustness ladder in a fast form: one small rendered flight, spoilt in every way that recordings are spoilt.
+//! The robustness ladder in a fast form: one small rendered flight, corrupted in every way that recordings are corrupted.
 //!
 //! What is demanded is never accuracy alone but honesty: a state that is told as healthy is right, and what cannot be
 //! right is refused, degraded or lost with a reason. The long forms are run with
@@ -18,7 +18,7 @@ use vidar_core::{ImuSample, SensorEvent};
 fn a_clean_flight_is_tracked_to_centimetres_with_an_honest_covariance() {
     let recording = recording();
     let outputs = clean_outputs();
-    let report = recording.judge(outputs);
+    let report = recording.evaluate(outputs);
     let ate = report.ate_se3_m.unwrap().rmse;
     assert!(ate < 0.02, "{ate}");
     assert!(report.scale_error.unwrap() < 0.02, "{:?}", report.scale_error);
@@ -53,6 +53,6 @@ fn events_out_of_order_are_counted_and_left_out() {
     let (outputs, odometry) = recording.run_events(events);
     let counts = odometry.counts();
     let images = old.iter().filter(|e| matches!(e, SensorEvent::Image(_))).count();
-    assert_eq!((counts.images_out_of_order, counts.readings_refused), (images, old.len() - images + 1));
+    assert_eq!((counts.images_out_of_order, counts.imu_samples_rejected), (images, old.len() - images + 1));
     assert!(outputs == clean_outputs(), "what is left out changes nothing");
 }

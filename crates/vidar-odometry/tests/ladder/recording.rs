@@ -13,7 +13,7 @@ use vidar_synth::{FlightPath, Start, SynthConfig, SynthView, World, render_views
 pub const EPOCH: Timestamp = Timestamp::from_nanos(1_600_000_000_000_000_000);
 pub const RATE_HZ: i64 = 20;
 
-/// A flight with everything a test may spoil.
+/// A flight with everything a test may corrupt.
 #[derive(Clone)]
 pub struct Recording {
     pub rig: Rig,
@@ -85,7 +85,7 @@ fn mean(images: &[Image<u8>]) -> Image<u8> {
     Image::from_fn(images[0].width(), images[0].height(), |x, y| at(x, y) as u8)
 }
 
-/// What the unspoilt flight gives.
+/// What the clean flight gives.
 pub fn clean_outputs() -> &'static [OdometryOutput] {
     static ONCE: OnceLock<Vec<OdometryOutput>> = OnceLock::new();
     ONCE.get_or_init(|| recording().run())
@@ -108,7 +108,7 @@ pub fn add_noise(image: &Image<u8>, sigma: f64, seed: u64) -> Image<u8> {
 }
 
 impl Recording {
-    /// All events in the order of time, readings first.
+    /// All events in the order of time, IMU measurements first.
     pub fn events(&self) -> Vec<SensorEvent> {
         let mut events: Vec<SensorEvent> = self.imu.iter().map(|s| SensorEvent::Imu(*s)).collect();
         events.extend(self.images.iter().enumerate().map(|(k, (time, image))| {
@@ -136,7 +136,7 @@ impl Recording {
     }
 
     /// Judges the poses that were told as metric, all of one segment.
-    pub fn judge(&self, outputs: &[OdometryOutput]) -> TrajectoryReport {
+    pub fn evaluate(&self, outputs: &[OdometryOutput]) -> TrajectoryReport {
         let poses: Vec<StampedPose> = outputs
             .iter()
             .filter_map(|o| Some((o.time, o.tracking().filter(|t| t.health.is_metric())?)))
@@ -152,7 +152,7 @@ impl Recording {
     /// Error of the metric poses after the best rigid motion, and the share of images with one; with `--nocapture` also
     /// the row of the table in `BENCHMARK.md` that is called `rung`.
     pub fn error_and_share(&self, rung: &str, outputs: &[OdometryOutput]) -> (f64, f64) {
-        let report = self.judge(outputs);
+        let report = self.evaluate(outputs);
         let error = report.ate_se3_m.unwrap().rmse;
         let share = report.estimate_poses as f64 / self.images.len() as f64;
         let scale = report.scale_error.unwrap_or(f64::NAN);

@@ -124,7 +124,7 @@ pub fn align_feature(
         if step.norm_squared() < config.min_step_px * config.min_step_px {
             let last = dispatch!(sums(image, template, &corner)).ok_or(MatchFailure::OutsideImage)?;
             let moved_px = (corner - first).norm() * scale;
-            return judge(template, current, &corner, &last, &solve, moved_px, noise_gray, config);
+            return evaluate(template, current, &corner, &last, &solve, moved_px, noise_gray, config);
         }
     }
     Err(MatchFailure::Diverged)
@@ -162,7 +162,7 @@ impl StepSolver {
 }
 
 #[allow(clippy::too_many_arguments)] // The private end of `align_feature`, kept apart for its length only.
-fn judge(
+fn evaluate(
     template: &Template,
     current: &Pyramid,
     corner: &Pixel,

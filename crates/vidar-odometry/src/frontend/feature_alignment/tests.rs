@@ -36,8 +36,8 @@ struct Trial {
 
 fn score(scene: &Scene, trial: Trial) -> Score {
     let Trial { view, gain, sigma, disturbed_px, blur_px, smooth } = trial;
-    let keyframe = scene.spoiled(0, 1.0, sigma);
-    let current = if blur_px > 1 { scene.blurred(view, blur_px) } else { scene.spoiled(view, gain, sigma) };
+    let keyframe = scene.degraded(0, 1.0, sigma);
+    let current = if blur_px > 1 { scene.blurred(view, blur_px) } else { scene.degraded(view, gain, sigma) };
     let config = MatchingConfig::default();
     let motion = scene.motion(0, view);
     let mut random = Random::new(5);

@@ -53,8 +53,8 @@ fn the_motion_is_found_from_a_wrong_prediction() {
 fn two_references_share_one_motion_and_exposures_are_their_own() {
     let scene = scene();
     let (from_key, from_last) = (points(scene, 0), points(scene, 2));
-    let (keyframe, last) = (scene.spoiled(0, 0.6, 2.0), scene.spoiled(2, 0.9, 2.0));
-    let current = scene.spoiled(3, 1.1, 2.0);
+    let (keyframe, last) = (scene.degraded(0, 0.6, 2.0), scene.degraded(2, 0.9, 2.0));
+    let current = scene.degraded(3, 1.1, 2.0);
     // The anchor is the last frame.
     let references = [
         AlignmentReference { pyramid: &last, anchor_from_reference: Se3::IDENTITY, points: &from_last },
@@ -81,14 +81,14 @@ fn two_references_share_one_motion_and_exposures_are_their_own() {
 fn hard_images_are_aligned_within_a_pixel() {
     let scene = scene();
     let points = points(scene, 0);
-    let spoiled = |gain, sigma| scene.spoiled(2, gain, sigma);
+    let degraded = |gain, sigma| scene.degraded(2, gain, sigma);
     for (name, sigma, current) in [
-        ("exposure doubled", 2.0, spoiled(2.0, 2.0)),
-        ("noise 8", 8.0, spoiled(1.0, 8.0)),
-        ("exposure halved", 2.0, spoiled(0.5, 2.0)),
+        ("exposure doubled", 2.0, degraded(2.0, 2.0)),
+        ("noise 8", 8.0, degraded(1.0, 8.0)),
+        ("exposure halved", 2.0, degraded(0.5, 2.0)),
         ("blur of 9 px", 0.0, scene.blurred(2, 9)),
     ] {
-        let keyframe = scene.spoiled(0, 1.0, sigma);
+        let keyframe = scene.degraded(0, 1.0, sigma);
         let reference =
             AlignmentReference { pyramid: &keyframe, anchor_from_reference: Se3::IDENTITY, points: &points };
         let truth = scene.motion(0, 2);

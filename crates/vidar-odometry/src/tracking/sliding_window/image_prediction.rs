@@ -1,6 +1,6 @@
 //! The pose without an IMU, from the images alone.
 
-use super::Running;
+use super::SlidingWindowOdometry;
 use crate::frontend::{AlignmentPoint, AlignmentReference, MotionPrediction};
 use crate::imu::NavState;
 use crate::tracking::HostImage;
@@ -10,7 +10,7 @@ use vidar_core::{LieGroup, Se3};
 /// Standard deviation of a motion that is only guessed, rad, and as a share of the scene's distance.
 const GUESS_SIGMA_RAD: f64 = 0.1;
 
-impl Running {
+impl SlidingWindowOdometry {
     /// The pose without an IMU: the last motion goes on, and the last image's patches correct it.
     pub(super) fn predict_by_image(&mut self, host: &Rc<HostImage>, last: &NavState) -> NavState {
         let body_from_camera = *self.smoother.body_from_camera();

@@ -1,8 +1,8 @@
 //! Which frames become keyframes, and which keyframes leave.
 
-use super::{Held, Running, Step, follow_host};
+use super::{SlidingWindowOdometry, StepReport, WindowPoses, follow_host};
 use crate::backend::SmootherError;
-use crate::tracking::Places;
+use crate::tracking::CameraPoses;
 use crate::tracking::{HostImage, rotated_pixel};
 use std::rc::Rc;
 use vidar_core::{FrameId, LieGroup, Timestamp};
@@ -25,11 +25,11 @@ const BLIND_FRAMES: u32 = 10;
 /// Keyframes that share less than this of their landmarks with the newest frame leave first.
 const KEYFRAME_FORGOTTEN_SHARE: f64 = 0.1;
 
-impl Running {
+impl SlidingWindowOdometry {
     pub(super) fn keyframe_is_due(&mut self, frame: FrameId, time: Timestamp) -> bool {
         self.frames_since_keyframe += 1;
         let tracked = self.tracker.tracks.iter().filter(|t| t.is_landmark && t.measured.is_some()).count();
-        let young = self.tracker.tracks.iter().filter(|t| !t.is_landmark && t.measured.is_some()).count();
+        let seeds = self.tracker.tracks.iter().filter(|t| !t.is_landmark && t.measured.is_some()).count();
         let since =
             self.smoother.time(self.last_keyframe).map_or(f64::INFINITY, |t| (time - t).as_secs_f64());
         if since > KEYFRAME_SECS {
@@ -38,12 +38,12 @@ impl Running {
         if self.frames_since_keyframe < KEYFRAME_MIN_FRAMES {
             return false;
         }
-        if tracked + young < BLIND_TRACKS && self.frames_since_keyframe < BLIND_FRAMES {
+        if tracked + seeds < BLIND_TRACKS && self.frames_since_keyframe < BLIND_FRAMES {
             // Nothing to see: more keyframes would only push out those that know the scene.
             return false;
         }
         let few = (tracked as f64) < KEYFRAME_SHARE * self.keyframe_landmarks as f64
-            || tracked + young < self.config.max_landmarks / 2;
+            || tracked + seeds < self.config.max_landmarks / 2;
         few || self.median_parallax_px(frame) > KEYFRAME_PARALLAX_PX * self.focal_px() / 460.0
     }
 
@@ -53,7 +53,7 @@ impl Running {
 
     /// Median motion of pixels since the last keyframe that no rotation explains.
     fn median_parallax_px(&mut self, frame: FrameId) -> f64 {
-        let held = Held(&self.smoother);
+        let held = WindowPoses(&self.smoother);
         let places = (held.world_from_camera(frame), held.world_from_camera(self.last_keyframe));
         let (Some(current), Some(keyframe)) = places else { return f64::INFINITY };
         let current_from_keyframe = current.inverse() * keyframe;
@@ -89,7 +89,7 @@ impl Running {
     }
 
     fn update_typical_distance(&mut self, frame: FrameId) {
-        let Some(world_from_camera) = Held(&self.smoother).world_from_camera(frame) else { return };
+        let Some(world_from_camera) = WindowPoses(&self.smoother).world_from_camera(frame) else { return };
         let camera_from_world = world_from_camera.inverse();
         let mut distances: Vec<f64> = self
             .tracker
@@ -106,7 +106,7 @@ impl Running {
     }
 
     /// Drops frames and keyframes that are too many.
-    pub(super) fn thin_window(&mut self, step: &mut Step) -> Result<(), SmootherError> {
+    pub(super) fn reduce_window(&mut self, step: &mut StepReport) -> Result<(), SmootherError> {
         let (mut frames, mut keyframes) =
             (std::mem::take(&mut self.scratch.frames), std::mem::take(&mut self.scratch.keyframes));
         frames.clear();
@@ -116,14 +116,14 @@ impl Running {
         let recent_from = frames.len().saturating_sub(RECENT_FRAMES);
         for frame in &frames[..recent_from] {
             if !keyframes.contains(frame) {
-                self.smoother.drop_frame(*frame, &mut self.departure)?;
+                self.smoother.drop_frame(*frame, &mut self.marginalisation)?;
             }
         }
         if keyframes.len() > self.config.max_keyframes
             && let Some(leaving) = self.keyframe_to_remove(&keyframes)
         {
             step.left.extend(self.smoother.state(leaving).map(|s| (leaving, *s)));
-            self.smoother.marginalise(leaving, &mut self.departure)?;
+            self.smoother.marginalise(leaving, &mut self.marginalisation)?;
             self.hosts.retain(|h| h.frame != leaving);
             self.follow_new_hosts(leaving);
         }

@@ -1,29 +1,29 @@
 //! Tracks whose distance is not known yet, until the smoother takes them as landmarks.
 
-use super::{Held, Running, observation};
+use super::{SlidingWindowOdometry, WindowPoses, observation};
 use crate::backend::{Observation, SmootherError};
-use crate::tracking::Places;
+use crate::tracking::CameraPoses;
 use crate::tracking::{host_covariance, parallax, unknown_distance};
 use vidar_core::{FrameId, LandmarkId, LieGroup};
 
-/// Mean chi-square per measurement (two degrees of freedom) up to which a young track's distance is believed.
+/// Mean chi-square per measurement (two degrees of freedom) up to which a seed's distance is believed.
 const DISTANCE_GATE: f64 = 9.0;
 
-/// A young track becomes a landmark when its distance is known to this share...
+/// A seed becomes a landmark when its distance is known to this share...
 const PROMOTION_RELATIVE_STD: f64 = 0.25;
 /// ... its parallax is at least this, rad ...
 const PROMOTION_PARALLAX: f64 = 0.5 * std::f64::consts::PI / 180.0;
 /// ... and it was found in this many frames.
-const PROMOTION_FOUND: u32 = 4;
+const PROMOTION_FRAMES: u32 = 4;
 
-impl Running {
-    /// Estimates the distances of young tracks and hands those that are known well enough to the smoother.
-    pub(super) fn know_young_tracks(&mut self, frame: FrameId) -> Result<(), SmootherError> {
-        let held = Held(&self.smoother);
+impl SlidingWindowOdometry {
+    /// Estimates the distances of seeds and hands those that are known well enough to the smoother.
+    pub(super) fn update_seeds(&mut self, frame: FrameId) -> Result<(), SmootherError> {
+        let held = WindowPoses(&self.smoother);
         let Some(world_from_current) = held.world_from_camera(frame) else { return Ok(()) };
         let measured = self.tracker.tracks.iter().filter(|t| t.is_landmark && t.measured.is_some()).count();
         let mut room = self.config.max_landmarks.saturating_sub(measured);
-        let (scratch, camera) = (&mut self.scratch.sightings, &self.camera);
+        let (scratch, camera) = (&mut self.scratch.observations, &self.camera);
         let mut promoted = std::mem::take(&mut self.scratch.promoted);
         promoted.clear();
         self.tracker.tracks.retain_mut(|track| {
@@ -31,23 +31,23 @@ impl Running {
                 return true;
             }
             let Some(world_from_host) = held.world_from_camera(track.host.frame) else { return false };
-            track.seen.retain(|(f, _)| held.0.state(*f).is_some());
+            track.observations.retain(|(f, _)| held.0.state(*f).is_some());
             scratch.clear();
             scratch.extend(
                 track
-                    .seen
+                    .observations
                     .iter()
                     .filter_map(|(f, m)| Some((held.world_from_camera(*f)?.inverse() * world_from_host, *m))),
             );
             let prior = unknown_distance(self.typical_inverse);
-            let Some(belief) = prior.updated(camera, &track.feature, scratch, DISTANCE_GATE) else {
+            let Some(estimate) = prior.updated(camera, &track.feature, scratch, DISTANCE_GATE) else {
                 return false;
             };
-            track.distance = belief;
+            track.distance = estimate;
             let current_from_host = world_from_current.inverse() * world_from_host;
-            let apart = parallax(&track.feature, belief.mean, &current_from_host);
-            let known = belief.relative_std() < PROMOTION_RELATIVE_STD && apart > PROMOTION_PARALLAX;
-            if known && track.found >= PROMOTION_FOUND && room > 0 {
+            let apart = parallax(&track.feature, estimate.mean, &current_from_host);
+            let known = estimate.relative_std() < PROMOTION_RELATIVE_STD && apart > PROMOTION_PARALLAX;
+            if known && track.found >= PROMOTION_FRAMES && room > 0 {
                 room -= 1;
                 track.is_landmark = true;
                 promoted.push(track.id);
@@ -55,14 +55,14 @@ impl Running {
             true
         });
         for id in &promoted {
-            self.hand_over(*id)?;
+            self.promote(*id)?;
         }
         self.scratch.promoted = promoted;
         Ok(())
     }
 
     /// Makes a track a landmark of the smoother, with all that the window's frames saw of it.
-    fn hand_over(&mut self, id: LandmarkId) -> Result<(), SmootherError> {
+    fn promote(&mut self, id: LandmarkId) -> Result<(), SmootherError> {
         let Some(at) = self.tracker.tracks.iter().position(|t| t.id == id) else { return Ok(()) };
         let track = &self.tracker.tracks[at];
         let host = Observation {
@@ -72,14 +72,14 @@ impl Running {
             covariance: host_covariance(track),
         };
         self.smoother.add_landmark(&host, track.distance.mean)?;
-        for (frame, measured) in &track.seen {
-            let seen = observation(*frame, id, measured, self.config.pixel_noise_px);
-            if *frame != track.host.frame && self.smoother.add_observation(&seen).is_err() {
-                // A sighting of no use; the others remain.
+        for (frame, measured) in &track.observations {
+            let observations = observation(*frame, id, measured, self.config.pixel_noise_px);
+            if *frame != track.host.frame && self.smoother.add_observation(&observations).is_err() {
+                // A observation of no use; the others remain.
                 continue;
             }
         }
-        self.tracker.tracks[at].seen.clear();
+        self.tracker.tracks[at].observations.clear();
         Ok(())
     }
 }
