@@ -196,20 +196,23 @@ mod tests {
     use super::*;
 
     #[test]
-    fn words_name_what_is_computed_and_not_what_was_asked_for() {
-        let said = |p, head, isa, n| Arithmetic::resolve(p, head, isa, n).to_string();
-        assert_eq!(said(Precision::Auto, None, Isa::Portable, None), "f32 on portable");
-        assert_eq!(said(Precision::Bf16, None, Isa::Avx2, None), "f32 on avx2");
-        assert_eq!(said(Precision::F16, None, Isa::Avx2, None), "f16 on avx2");
-        assert_eq!(said(Precision::F16, Some(Precision::F32), Isa::Avx2, None), "f16 (heads f32) on avx2");
+    fn the_description_names_what_is_computed_and_not_what_was_asked_for() {
+        let on_cpu = |p, head, isa, n| Arithmetic::resolve(p, head, isa, n).to_string();
+        assert_eq!(on_cpu(Precision::Auto, None, Isa::Portable, None), "f32 on portable");
+        assert_eq!(on_cpu(Precision::Bf16, None, Isa::Avx2, None), "f32 on avx2");
+        assert_eq!(on_cpu(Precision::F16, None, Isa::Avx2, None), "f16 on avx2");
+        assert_eq!(on_cpu(Precision::F16, Some(Precision::F32), Isa::Avx2, None), "f16 (heads f32) on avx2");
+        let with_bf16 = "bf16 (patch embedding, leading blocks and heads f32) on avx512";
+        let expected = if Isa::Avx512.multiplies_bf16() { with_bf16 } else { "f32 on avx512" };
+        assert_eq!(on_cpu(Precision::Auto, None, Isa::Avx512, None), expected);
+        // A graphics processor has every format, so these descriptions do not depend on the machine.
+        let on_gpu = |p, head, n| Arithmetic::on_device(p, head, Isa::Portable, n).to_string();
+        let exact_ends = "bf16 (patch embedding, leading blocks and heads f32) on gpu";
+        assert_eq!(on_gpu(Precision::Auto, None, None), exact_ends);
+        assert_eq!(on_gpu(Precision::Bf16, Some(Precision::Bf16), Some(0)), "bf16 on gpu");
         assert_eq!(
-            said(Precision::Auto, None, Isa::Amx, None),
-            "bf16 (patch embedding, leading blocks and heads f32) on amx"
-        );
-        assert_eq!(said(Precision::Bf16, Some(Precision::Bf16), Isa::Amx, Some(0)), "bf16 on amx");
-        assert_eq!(
-            said(Precision::Bf16, Some(Precision::Bf16), Isa::Amx, Some(2)),
-            "bf16 (patch embedding, first 2 blocks f32; heads bf16) on amx"
+            on_gpu(Precision::Bf16, Some(Precision::Bf16), Some(2)),
+            "bf16 (patch embedding, first 2 blocks f32; heads bf16) on gpu"
         );
         for precision in Precision::ALL {
             assert_eq!(precision.name().parse::<Precision>().ok(), Some(precision));

@@ -27,14 +27,14 @@ fn a_forced_kernel_set_is_the_only_one_that_runs() {
     for isa in Isa::available() {
         for precision in [Precision::Auto, Precision::F32] {
             let options = Da3Options { isa: Some(isa), precision, ..Da3Options::default() };
-            Isa::take_ran();
+            Isa::take_used();
             let model = Da3::deterministic_of(tiny_config(), &options).unwrap();
             assert_eq!(model.arithmetic().isa, isa);
             model.infer(&Inputs::images(&images), &all).unwrap();
             model.infer(&Inputs::posed(&images, &poses, &k), &plain).unwrap();
             let model = Da3::deterministic_of(nested.clone(), &options).unwrap();
             model.infer(&Inputs::images(&images), &plain).unwrap();
-            assert_eq!(Isa::take_ran(), [isa], "{}", model.arithmetic());
+            assert_eq!(Isa::take_used(), [isa], "{}", model.arithmetic());
         }
     }
 }

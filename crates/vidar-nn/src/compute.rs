@@ -14,10 +14,9 @@ pub enum Precision {
     /// Factors in `f32`.
     #[default]
     F32,
-    /// `f32`-like accuracy by the fastest way a kernel set has. Three bf16 products of split factors would be that way where
-    /// bf16 runs at more than three times the rate of `f32`: on matrix tiles. Vectors do not get there (AVX-512-BF16 on
-    /// Zen 5: 1.7 times, `examples/rates.rs`), so three products would take 1.8 times as long as `f32` itself. So far every
-    /// kernel set computes it in `f32`, tiles included.
+    /// The accuracy of `f32` by the fastest way that a kernel set has. Splitting each factor into two bf16 numbers takes
+    /// three products, which pays off only where bf16 runs at more than three times the rate of `f32`. AVX-512-BF16 does
+    /// not (1.7 times on Zen 5, `examples/rates.rs`), so every kernel set computes this precision in `f32`.
     F32Split,
     /// Factors rounded to bf16 where the processor multiplies bf16; elsewhere `f32`, which is then as fast.
     Bf16,
@@ -67,15 +66,13 @@ pub enum Isa {
     Avx2,
     /// x86-64 with AVX-512 (F, BW, DQ, VL); bf16 products where the processor also has AVX-512-BF16.
     Avx512,
-    /// [`Isa::Avx512`] plus bf16 matrix tiles (AMX).
-    Amx,
     /// 64-bit ARM.
     Neon,
 }
 
 impl Isa {
     /// All kernel sets, whether they run here or not.
-    pub const ALL: [Self; 5] = [Self::Portable, Self::Avx2, Self::Avx512, Self::Amx, Self::Neon];
+    pub const ALL: [Self; 4] = [Self::Portable, Self::Avx2, Self::Avx512, Self::Neon];
 
     /// The word used in configuration and on the command line.
     pub const fn name(self) -> &'static str {
@@ -83,7 +80,6 @@ impl Isa {
             Self::Portable => "portable",
             Self::Avx2 => "avx2",
             Self::Avx512 => "avx512",
-            Self::Amx => "amx",
             Self::Neon => "neon",
         }
     }
@@ -93,8 +89,7 @@ impl Isa {
         Self::ALL.into_iter().filter(|isa| crate::kernels::is_available(*isa)).collect()
     }
 
-    /// The fastest proved kernel set of this machine. [`Isa::Amx`] must be asked for: its instructions have not been run by this
-    /// project's tests on a processor that has them.
+    /// The fastest kernel set of this machine.
     pub fn detect() -> Self {
         let by_speed = [Self::Avx512, Self::Avx2, Self::Neon];
         by_speed.into_iter().find(|isa| crate::kernels::is_available(*isa)).unwrap_or(Self::Portable)
@@ -102,11 +97,11 @@ impl Isa {
 }
 
 impl Isa {
-    /// The kernel sets that operations of this process ran on since the last question, for tests that a forced one is
-    /// honoured. Kept in builds with debug assertions only; otherwise empty.
+    /// The kernel sets that this process has run since the last call; tests check with it that a chosen set is used
+    /// throughout. Recorded in builds with debug assertions only; otherwise empty.
     #[doc(hidden)]
-    pub fn take_ran() -> Vec<Self> {
-        crate::kernels::take_ran()
+    pub fn take_used() -> Vec<Self> {
+        crate::kernels::take_used()
     }
 
     /// Whether the kernel set multiplies bf16 on this machine; where it does not, bf16 is computed in `f32`.
@@ -127,7 +122,7 @@ impl FromStr for Isa {
         Self::ALL.into_iter().find(|isa| isa.name() == word).ok_or_else(|| NnError::UnknownName {
             what: "kernel set",
             found: word.to_owned(),
-            expected: "portable, avx2, avx512, amx, neon",
+            expected: "portable, avx2, avx512, neon",
         })
     }
 }

@@ -241,7 +241,6 @@ impl ProductKernel for Attend<'_> {
             to[d..].fill(M::Number::default());
         }
 
-        m.enter();
         let mut tile_sums = [[s.splat(0.0); 2]; MAX_ROWS];
         for block in (0..self.keys).step_by(BLOCK) {
             let count = BLOCK.min(self.keys - block);
@@ -287,7 +286,6 @@ impl ProductKernel for Attend<'_> {
                 }
             }
         }
-        m.leave();
         for i in 0..n {
             let scale = s.splat(1.0 / s.sum(s.load(&totals[i * lanes..])));
             // SAFETY: every task has its own queries of its own head.

@@ -226,13 +226,11 @@ pub(crate) fn multiply<M: Multiply>(
     // Every address that a tile reads lies below this one.
     let reach = geometry.at(rows.end - 1) - geometry.at(rows.start)
         + geometry.taps.iter().max().copied().unwrap_or(0)
-        + (M::READ_ROWS - 1) * geometry.row_stride
         + steps * M::STEP;
     assert!(panel_words == 0 || reach <= a.len(), "rows of a product: {reach} of {}", a.len());
     assert!(units.end <= panels.count && panels.words.len() >= panels.count * panels.per_unit * panel_words);
     let mut sums = [[s.splat(0.0); 2]; MAX_ROWS];
     let mut gates = sums;
-    m.enter();
     for unit in units {
         let words = &panels.words[unit * panels.per_unit * panel_words..][..panels.per_unit * panel_words];
         let first = (panels.first + unit) * panel;
@@ -242,8 +240,8 @@ pub(crate) fn multiply<M: Multiply>(
             let run = row..line_end.min(rows.end);
             let tiles = run.len().div_ceil(M::ROWS);
             for i in 0..tiles {
-                let from = run.start + tile_start::<M>(run.len(), i, tiles);
-                let count = run.start + tile_start::<M>(run.len(), i + 1, tiles) - from;
+                let from = run.start + tile_start(run.len(), i, tiles);
+                let count = run.start + tile_start(run.len(), i + 1, tiles) - from;
                 let at = geometry.at(from) - geometry.at(rows.start);
                 let here = (a[at..].as_ptr(), geometry.row_stride);
                 // SAFETY: `reach` bounds every row and tap, and each panel has panel_words words.
@@ -259,7 +257,6 @@ pub(crate) fn multiply<M: Multiply>(
             row = run.end;
         }
     }
-    m.leave();
 }
 
 impl Target<'_> {

@@ -4,8 +4,6 @@
 //! a struct that holds its arguments and implements [`Kernel`] or [`ProductKernel`]; [`dispatch`] and [`dispatch_product`]
 //! run it inside a function compiled for the processor features of the set.
 
-#[cfg(target_arch = "x86_64")]
-pub(crate) mod amx;
 pub(crate) mod attend;
 pub(crate) mod centre;
 pub(crate) mod gemm;
@@ -45,7 +43,7 @@ pub(crate) trait ProductKernel {
     fn run<M: Multiply>(self, multiply: M) -> Self::Output;
 }
 
-/// The number format in which factors meet.
+/// The number format of the factors of a product.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Factors {
     F32,
@@ -76,13 +74,6 @@ pub(crate) fn is_available(isa: Isa) -> bool {
                 && is_x86_feature_detected!("avx512vl")
                 && is_x86_feature_detected!("fma")
         }
-        #[cfg(all(target_arch = "x86_64", target_os = "linux"))]
-        Isa::Amx => {
-            // In this crate's own tests plain Rust stands in for the tiles that a processor lacks.
-            is_available(Isa::Avx512)
-                && is_x86_feature_detected!("avx512bf16")
-                && (cfg!(test) || amx::permitted())
-        }
         #[cfg(target_arch = "aarch64")]
         Isa::Neon => std::arch::is_aarch64_feature_detected!("neon"),
         _ => false,
@@ -93,38 +84,37 @@ pub(crate) fn multiplies_bf16(isa: Isa) -> bool {
     match isa {
         #[cfg(target_arch = "x86_64")]
         Isa::Avx512 => is_x86_feature_detected!("avx512bf16"),
-        Isa::Amx => true,
         _ => false,
     }
 }
 
-/// A bit for each kernel set that ran.
-static RAN: AtomicU8 = AtomicU8::new(0);
+/// One bit per kernel set that has run.
+static USED: AtomicU8 = AtomicU8::new(0);
 
-/// Takes note of a kernel set in builds with debug assertions.
+/// Records a kernel set in builds with debug assertions.
 #[inline(always)]
-fn note(isa: Isa) {
+fn record(isa: Isa) {
     if cfg!(debug_assertions) {
-        RAN.fetch_or(1 << isa as u8, Ordering::Relaxed);
+        USED.fetch_or(1 << isa as u8, Ordering::Relaxed);
     }
 }
 
-/// The kernel sets that ran since the last question, in this process.
-pub(crate) fn take_ran() -> Vec<Isa> {
-    let ran = RAN.swap(0, Ordering::Relaxed);
-    Isa::ALL.into_iter().filter(|isa| ran >> *isa as u8 & 1 == 1).collect()
+/// The kernel sets that this process has run since the last call.
+pub(crate) fn take_used() -> Vec<Isa> {
+    let used = USED.swap(0, Ordering::Relaxed);
+    Isa::ALL.into_iter().filter(|isa| used >> *isa as u8 & 1 == 1).collect()
 }
 
 /// Runs a kernel on a kernel set, which must be available (a `Compute` proves it).
 pub(crate) fn dispatch<K: Kernel>(isa: Isa, kernel: K) -> K::Output {
-    note(isa);
+    record(isa);
     match isa {
         #[cfg(target_arch = "x86_64")]
         // SAFETY: a kernel set reaches this point only after `is_available`.
         Isa::Avx2 => unsafe { in_avx2(kernel) },
         #[cfg(target_arch = "x86_64")]
         // SAFETY: as above.
-        Isa::Avx512 | Isa::Amx => unsafe { in_avx512(kernel) },
+        Isa::Avx512 => unsafe { in_avx512(kernel) },
         #[cfg(target_arch = "aarch64")]
         // SAFETY: as above.
         Isa::Neon => unsafe { in_neon(kernel) },
@@ -134,17 +124,11 @@ pub(crate) fn dispatch<K: Kernel>(isa: Isa, kernel: K) -> K::Output {
 
 /// Runs a kernel on a kernel set, which must be available, with factors in a number format.
 pub(crate) fn dispatch_product<K: ProductKernel>(isa: Isa, factors: Factors, kernel: K) -> K::Output {
-    note(isa);
+    record(isa);
     match (isa, factors) {
         #[cfg(target_arch = "x86_64")]
         // SAFETY: bf16 is checked here, the rest before a kernel set reaches this point.
         (Isa::Avx512, Factors::Bf16) if multiplies_bf16(isa) => unsafe { in_avx512_bf16(kernel) },
-        #[cfg(all(test, target_arch = "x86_64", target_os = "linux"))]
-        // SAFETY: AVX-512-BF16 was detected before this kernel set reached this point.
-        (Isa::Amx, Factors::Bf16) if !amx::permitted() => unsafe { in_emulated_amx(kernel) },
-        #[cfg(all(target_arch = "x86_64", target_os = "linux"))]
-        // SAFETY: tiles were permitted before this kernel set reached this point.
-        (Isa::Amx, Factors::Bf16) => unsafe { in_amx(kernel) },
         (_, Factors::Bf16) => kernel.run(InBf16(Portable)),
         (_, Factors::F32) => dispatch(isa, F32Product(kernel)),
     }
@@ -179,26 +163,6 @@ unsafe fn in_avx512<K: Kernel>(kernel: K) -> K::Output {
 unsafe fn in_avx512_bf16<K: ProductKernel>(kernel: K) -> K::Output {
     // SAFETY: this function's own condition.
     kernel.run(InBf16(unsafe { x86::Avx512::<true>::new() }))
-}
-
-#[cfg(all(target_arch = "x86_64", target_os = "linux"))]
-#[target_feature(enable = "avx512f,avx512bw,avx512dq,avx512vl,avx512bf16,avx2,fma")]
-unsafe fn in_amx<K: ProductKernel>(kernel: K) -> K::Output {
-    // SAFETY: this function's own condition.
-    let (vectors, tiles) = unsafe { (x86::Avx512::<true>::new(), amx::Hardware::new()) };
-    kernel.run(amx::InAmx { vectors, tiles })
-}
-
-/// As [`in_amx`] with tiles in plain Rust.
-///
-/// # Safety
-/// The processor must have AVX-512-BF16.
-#[cfg(all(test, target_arch = "x86_64", target_os = "linux"))]
-#[target_feature(enable = "avx512f,avx512bw,avx512dq,avx512vl,avx512bf16,avx2,fma")]
-unsafe fn in_emulated_amx<K: ProductKernel>(kernel: K) -> K::Output {
-    // SAFETY: this function's own condition.
-    let vectors = unsafe { x86::Avx512::<true>::new() };
-    kernel.run(amx::InAmx { vectors, tiles: amx::Emulated })
 }
 
 #[cfg(target_arch = "aarch64")]

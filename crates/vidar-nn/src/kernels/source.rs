@@ -165,7 +165,7 @@ impl<'a> Source<'a> {
                     return direct;
                 }
                 let stride = geometry.row_stride;
-                let numbers = (rows.len() + M::READ_ROWS - 1) * stride + SLACK;
+                let numbers = rows.len() * stride + SLACK;
                 let temporary = inner.next_multiple_of(16);
                 let (line, words) = scratch.words(temporary + numbers).split_at_mut(temporary);
                 let line = &mut scratch::as_floats_mut(line)[..*inner];
@@ -221,7 +221,7 @@ impl Bands<'_> {
         let needed = (lines.len() - 1) * self.stride + self.kernel[0];
         let width = self.cols * self.channels;
         let border = self.padding * self.channels;
-        let numbers = needed * pitch + (M::READ_ROWS - 1) * self.stride * self.channels + SLACK;
+        let numbers = needed * pitch + SLACK;
         let temporary = width.next_multiple_of(16);
         let (line, words) = scratch.words(temporary + numbers).split_at_mut(temporary);
         let line = &mut scratch::as_floats_mut(line)[..width];

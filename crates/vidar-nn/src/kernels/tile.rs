@@ -3,7 +3,7 @@
 use super::simd::{Simd, SimdBf16};
 
 /// The largest `ROWS` of any way to multiply.
-pub(crate) const MAX_ROWS: usize = 32;
+pub(crate) const MAX_ROWS: usize = 12;
 
 /// Sums of a tile; rows beyond the ones asked for are left alone.
 pub(crate) type Sums<S> = [[<S as Simd>::V; 2]; MAX_ROWS];
@@ -15,19 +15,10 @@ pub(crate) trait Multiply: Copy + Send + Sync {
     type Number: Copy + Default + Send + Sync;
     /// Numbers of the inner dimension that one word of packed B holds.
     const STEP: usize;
-
-    /// Words of a tap come in multiples of this, filled up with zeros.
-    const STEPS_UNIT: usize = 1;
     /// The tallest tile.
     const ROWS: usize;
-    /// Rows are read in groups of this many.
-    const READ_ROWS: usize = 1;
 
     fn simd(self) -> Self::Simd;
-
-    /// Called before a thread's tiles, and after them.
-    fn enter(self) {}
-    fn leave(self) {}
 
     /// `f32` numbers as they are, if that is the number format.
     fn direct(x: &[f32]) -> Option<&[Self::Number]>;
@@ -50,8 +41,8 @@ pub(crate) trait Multiply: Copy + Send + Sync {
     /// `sums[r] = Σ a[r] b` over taps and `steps` words of each, for `rows` rows that lie `a.1` numbers apart.
     ///
     /// # Safety
-    /// `rows` is between 1 and `ROWS`. For each row r below `rows`, rounded up to `READ_ROWS`, and each tap,
-    /// `a.0 + r * a.1 + tap` must be readable for `steps * STEP` numbers, and `b` for `taps * steps * 2 * LANES` words.
+    /// `rows` is between 1 and `ROWS`. For each row r below `rows` and each tap, `a.0 + r * a.1 + tap`
+    /// must be readable for `steps * STEP` numbers, and `b` for `taps * steps * 2 * LANES` words.
     unsafe fn tile(
         self,
         rows: usize,
@@ -65,14 +56,14 @@ pub(crate) trait Multiply: Copy + Send + Sync {
 
 /// Words of a tap of `group` numbers.
 pub(crate) fn steps_of<M: Multiply>(group: usize) -> usize {
-    group.div_ceil(M::STEP).next_multiple_of(M::STEPS_UNIT)
+    group.div_ceil(M::STEP)
 }
 
 /// Where tile `i` of a run of `n` rows starts. Heights are as equal as possible: a last tile of one row would cost as much as
-/// one of four. Units that multiply whole groups of rows take full tiles first.
+/// one of four.
 #[inline(always)]
-pub(crate) fn tile_start<M: Multiply>(n: usize, i: usize, tiles: usize) -> usize {
-    if M::READ_ROWS == 1 { i * n / tiles } else { (i * M::ROWS).min(n) }
+pub(crate) fn tile_start(n: usize, i: usize, tiles: usize) -> usize {
+    i * n / tiles
 }
 
 /// Calls a function for a number of rows that is only known at run time; numbers that the kernel set never asks for are not

@@ -183,8 +183,8 @@ pub(crate) fn convolve<M: Multiply>(
                 let words = &panels.words[p * panel_words(n, panel)..][..panel_words(n, panel)];
                 let parts = count.div_ceil(M::ROWS);
                 for i in 0..parts {
-                    let start = tile_start::<M>(count, i, parts);
-                    let height = tile_start::<M>(count, i + 1, parts) - start;
+                    let start = tile_start(count, i, parts);
+                    let height = tile_start(count, i + 1, parts) - start;
                     for at in 0..PLACES {
                         // SAFETY: `height` rows of `n` numbers, and a panel of `n` words.
                         unsafe {
