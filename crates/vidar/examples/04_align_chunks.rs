@@ -3,7 +3,7 @@
 
 use std::sync::Arc;
 use vidar_align::{
-    Aligner, AlignerConfig, ChunkObservation, CouplingMode, FrameObservation, MetricAnchor, Placement,
+    Aligner, AlignerConfig, ChunkObservation, CouplingMode, FrameObservation, Placement, PosePrior,
 };
 use vidar_core::{ChunkId, ChunkView, ChunkViews, FrameId, FrameImage, GeometryModel, Image, Pinhole};
 use vidar_synth::predict::{Conditioning, PredictionErrors, SyntheticModel, chunk_ranges};
@@ -44,7 +44,7 @@ fn align(simulation: &Arc<Simulation>) -> Result<Placement, Failure> {
             let time = simulation.frame_time(k);
             let frame = FrameObservation::new(FrameId(k as u32), time);
             match simulation.world_from_camera(time).filter(|_| k % 4 == 0) {
-                Some(world_from_camera) => frame.with_anchor(MetricAnchor::known(world_from_camera)),
+                Some(world_from_camera) => frame.with_pose_prior(PosePrior::new(world_from_camera)),
                 None => frame,
             }
         });
