@@ -27,6 +27,16 @@ pub enum AlignError {
         /// Largest value allowed.
         most: f64,
     },
+    /// An overlap as long as the chunk never advances.
+    #[error(
+        "chunks of {size} keyframes cannot overlap by {overlap}: the overlap must be smaller than the chunk"
+    )]
+    BadChunking {
+        /// Keyframes per chunk.
+        size: usize,
+        /// Keyframes shared by neighbours.
+        overlap: usize,
+    },
     /// A loop names a chunk that was never pushed.
     #[error("chunk {chunk} was never pushed")]
     UnknownChunk {

@@ -13,13 +13,19 @@
 //! | [`overlap`] | Robust similarity between two predictions of the same frames. |
 //! | [`landmark_scale`], [`depth_field`] | Scale and smooth depth correction from landmarks. |
 //! | [`place_recognition`] | Image descriptors and their index. |
+//! | [`keyframe_selection`], [`chunking`] | Which frames become keyframes, and which keyframes form a chunk. |
+//! | [`landmark_transfer`], [`covariance`] | Odometry landmarks at the pixels of a depth image; covariances along a chain. |
 //! | [`streaming`] | DA3-Streaming number for number: what the golden tests run. |
 
 pub mod aligner;
+pub mod chunking;
 pub mod coupled;
+pub mod covariance;
 pub mod depth_field;
 mod error;
+pub mod keyframe_selection;
 pub mod landmark_scale;
+pub mod landmark_transfer;
 pub mod overlap;
 pub mod place_recognition;
 pub mod streaming;

@@ -1,9 +1,8 @@
-//! Places by their looks: descriptors, and an exact search among them.
+//! Place recognition: image descriptors without a network of their own, and an exact search among descriptors.
 //!
-//! A descriptor is a unit-length vector; two images of one place have an inner product near 1. Where the geometry model has
-//! tokens, their mean describes the image ([`describe_tokens`]); where there are only images, [`describe_image`] does it
-//! from brightness and gradients on a coarse grid. SALAD's head, for those who have its checkpoint, is
-//! [`crate::streaming::SaladHead`].
+//! A descriptor is a unit-length vector; two images of one place have an inner product near 1. It is the mean of a geometry
+//! network's tokens ([`describe_tokens`]), or brightness and gradients on a coarse grid ([`describe_image`]), or comes from
+//! SALAD (`vidar_da3::salad`); the index does not depend on which.
 
 mod describe;
 mod index;

@@ -63,7 +63,7 @@ mod world;
 
 pub use config::{AlignerConfig, CouplingMode, GraphWeights, LoopsConfig};
 pub use loops::LoopCandidate;
-pub use observation::{ChunkObservation, FrameObservation, PosePrior, covariance_in_camera};
+pub use observation::{ChunkObservation, FrameObservation, PosePrior};
 pub use report::{
     ChunkPlacement, ChunkReport, ChunkStatus, DriftReport, GraphReport, KeyframePlacement, LoopRejection,
     LoopReport, OverlapReport, Placement, RejectionCounts, RejectionReason, ViewPlacement,

@@ -1,6 +1,7 @@
 //! What a run tells the machine of a chunk.
 
-use nalgebra::{Matrix6, UnitVector3};
+use crate::covariance::covariance_in_camera;
+use nalgebra::UnitVector3;
 use vidar_core::{
     FrameId, GeometryPrediction, LieGroup, OdometryKeyframe, PoseCovariance, Se3, SparseLandmark, Timestamp,
 };
@@ -96,11 +97,4 @@ impl PosePrior {
             world_from_camera,
         }
     }
-}
-
-/// The covariance of `b_from_a · exp(δ)` between cameras, from that between bodies:
-/// `exp(δ_camera) = camera_from_body · exp(δ_body) · body_from_camera`, so `δ_camera = Ad(camera_from_body) δ_body`.
-pub fn covariance_in_camera(in_body: &PoseCovariance, body_from_camera: &Se3) -> PoseCovariance {
-    let turn: Matrix6<f64> = body_from_camera.inverse().adjoint();
-    turn * in_body * turn.transpose()
 }

@@ -1,4 +1,4 @@
-//! Descriptors without a network of their own.
+//! Descriptors that need no network of their own.
 
 use vidar_core::Image;
 
@@ -8,16 +8,14 @@ const ROWS: usize = 6;
 const DIRECTIONS: usize = 8;
 const PER_CELL: usize = 1 + DIRECTIONS;
 
-/// Length of what [`describe_image`] gives.
+/// Length of the descriptors of [`describe_image`].
 pub const IMAGE_DESCRIPTOR_LEN: usize = COLUMNS * ROWS * PER_CELL;
 
-/// Describes a token grid of a geometry model: the mean over tokens of each channel, whitened by the spread over tokens.
+/// The descriptor of an image from a geometry network's tokens: the mean of the unit-length tokens, of unit length.
 ///
-/// `tokens` is row-major `[tokens, channels]`. Each token is first brought to unit length, so that no bright patch rules;
-/// channels that are alike in all tokens say little of the place and are weighed down by nothing else than the mean
-/// direction being removed when `mean_direction` (length `channels`, from images of many places) is given. An empty or
-/// non-finite grid gives an empty descriptor.
-pub fn describe_tokens(tokens: &[f32], channels: usize, mean_direction: Option<&[f32]>) -> Vec<f32> {
+/// `tokens` is row-major `[tokens, channels]`. Tokens are normalised first so that one with a large norm does not dominate
+/// the mean. Empty for an empty grid or one with values that are not finite.
+pub fn describe_tokens(tokens: &[f32], channels: usize) -> Vec<f32> {
     if channels == 0 || tokens.len() < channels || !tokens.iter().all(|v| v.is_finite()) {
         return Vec::new();
     }
@@ -26,17 +24,13 @@ pub fn describe_tokens(tokens: &[f32], channels: usize, mean_direction: Option<&
         let length = token.iter().map(|v| f64::from(*v).powi(2)).sum::<f64>().sqrt().max(1e-12);
         mean.iter_mut().zip(token).for_each(|(m, v)| *m += f64::from(*v) / length);
     }
-    if let Some(common) = mean_direction.filter(|c| c.len() == channels) {
-        let count = (tokens.len() / channels) as f64;
-        mean.iter_mut().zip(common).for_each(|(m, c)| *m -= count * f64::from(*c));
-    }
     unit(mean)
 }
 
-/// Describes an image by brightness and gradient directions on an 8 × 6 grid, contrast removed.
+/// The descriptor of an image from brightness and gradient directions on an 8 × 6 grid, normalised for contrast.
 ///
-/// Meant for the stereo path, where no network runs: it knows the same view again (from within about a cell of
-/// displacement and under other exposure), not the same place from another side.
+/// Used where no network runs. It recognises the same view under another exposure and up to about one cell of displacement,
+/// but not the same place from another direction.
 pub fn describe_image(gray: &Image<f32>) -> Vec<f32> {
     let (w, h) = (gray.width(), gray.height());
     if w < 2 * COLUMNS || h < 2 * ROWS {
@@ -65,7 +59,7 @@ pub fn describe_image(gray: &Image<f32>) -> Vec<f32> {
         }
     }
     let count = cells.len() as f64;
-    // Brightness counts as its pattern over the image; its mean and contrast belong to the exposure.
+    // Only the pattern of brightness counts; its mean and contrast depend on the exposure.
     let mean = cells.iter().map(|c| c[0]).sum::<f64>() / count;
     let contrast = (cells.iter().map(|c| (c[0] - mean).powi(2)).sum::<f64>() / count).sqrt().max(1e-9);
     let total: f64 = cells.iter().flat_map(|c| &c[1..]).sum::<f64>().max(1e-9);
@@ -73,7 +67,7 @@ pub fn describe_image(gray: &Image<f32>) -> Vec<f32> {
     let mut values = Vec::with_capacity(IMAGE_DESCRIPTOR_LEN);
     for cell in &cells {
         values.push((cell[0] - mean) / contrast);
-        // The root keeps one strong edge from ruling (as in RootSIFT); the mean says nothing of the place.
+        // The square root limits the weight of one strong edge (as in RootSIFT); the mean carries no information.
         values.extend(cell[1..].iter().map(|g| (g / typical).sqrt() - 0.9));
     }
     unit(values)

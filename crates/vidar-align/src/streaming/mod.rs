@@ -17,7 +17,6 @@ mod irls;
 mod loops;
 mod overlap;
 mod pose_graph;
-mod salad;
 mod unproject;
 
 pub use chain::{accumulate, loop_constraint};
@@ -28,7 +27,6 @@ pub use irls::{IrlsConfig, IrlsOutcome, IrlsStep, fit_irls, huber_loss, huber_we
 pub use loops::{FramePair, LoopDetection, LoopWindow, detect_loops, loop_windows};
 pub use overlap::{OverlapFit, PointMap, align_overlap};
 pub use pose_graph::{LmStep, LoopConstraint, PoseGraphConfig, PoseGraphOutcome, optimise_chain};
-pub use salad::{Perceptron, SaladHead};
 pub use unproject::unproject;
 
 use thiserror::Error;

@@ -6,7 +6,7 @@ use super::sparse;
 use crate::chunks::StoredChunk;
 use crate::keyframes::Keyframe;
 use std::collections::{BTreeMap, BTreeSet};
-use vidar_align::aligner::covariance_in_camera;
+use vidar_align::covariance::covariance_in_camera;
 use vidar_align::{ChunkObservation, FrameObservation, PosePrior};
 use vidar_core::camera::Pixel;
 use vidar_core::{
