@@ -1,9 +1,10 @@
-//! How far predicted depth is from the truth, pixel by pixel (Eigen et al., NeurIPS 2014, section 4.2).
+//! Depth errors per pixel (Eigen et al., NeurIPS 2014, section 4.2).
 
 use crate::error::EvalError;
 use crate::stats::median_of_sorted;
+use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
-use vidar_core::MetricDepth;
+use vidar_core::{AlignedView, MetricDepth};
 
 /// Depth errors over a set of pixels; `d` predicted, `g` true.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
@@ -35,11 +36,11 @@ pub struct DepthReport {
     pub predicted_pixels: usize,
     /// Pixels with both: the errors are over these.
     pub valid_pixels: usize,
-    /// `valid_pixels / truth_pixels`, 0…1: a prediction with holes is judged on less.
+    /// `valid_pixels / truth_pixels`, 0…1: the errors of a prediction with holes cover fewer pixels.
     pub completeness: f64,
     /// Errors as predicted; `None` without a valid pixel.
     pub metric: Option<DepthErrors>,
-    /// Errors after the prediction was multiplied by `median_scale`: the shape alone.
+    /// Errors after multiplying the prediction by `median_scale`, which removes an error of scale.
     pub median_scaled: Option<DepthErrors>,
     /// median(g) / median(d) over valid pixels.
     pub median_scale: Option<f64>,
@@ -124,11 +125,6 @@ impl FrameSums {
     }
 }
 
-/// Judges one predicted depth image; fails when the sizes differ.
-pub fn evaluate_depth(predicted: &MetricDepth, truth: &MetricDepth) -> Result<DepthReport, EvalError> {
-    Ok(frame_sums(predicted, truth)?.report())
-}
-
 fn frame_sums(predicted: &MetricDepth, truth: &MetricDepth) -> Result<FrameSums, EvalError> {
     let (predicted, truth) = (predicted.image(), truth.image());
     let (width, height) = (predicted.width(), predicted.height());
@@ -164,25 +160,25 @@ fn frame_sums(predicted: &MetricDepth, truth: &MetricDepth) -> Result<FrameSums,
 /// Depth errors over many frames.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct DepthSummary {
-    /// Frames given.
+    /// Frames added.
     pub frames: usize,
     /// Frames with at least one valid pixel: `frame_mean` is over these.
-    pub frames_judged: usize,
-    /// Every pixel counts the same; `median_scale` is `None`, as each frame has its own.
+    pub frames_evaluated: usize,
+    /// Over all pixels, each of equal weight; `median_scale` is `None`, as each frame has its own.
     pub pixel_weighted: DepthReport,
-    /// Mean over frames of the frames' errors: every frame counts the same, as benchmarks report it.
-    pub frame_mean: Option<DepthErrors>,
+    /// Mean of the frames' errors, each frame of equal weight, as benchmarks report it.
+    pub frame_mean: DepthErrors,
     /// The same after each frame's own median scaling.
-    pub frame_mean_median_scaled: Option<DepthErrors>,
+    pub frame_mean_median_scaled: DepthErrors,
     /// Mean over frames of the median scale.
-    pub mean_median_scale: Option<f64>,
+    pub mean_median_scale: f64,
 }
 
-/// Collects depth errors frame by frame in constant memory.
+/// Accumulates depth errors frame by frame in constant memory.
 #[derive(Clone, Debug, Default)]
 pub struct DepthAccumulator {
     frames: usize,
-    judged: usize,
+    evaluated: usize,
     total: FrameSums,
     metric: [f64; 8],
     scaled: [f64; 8],
@@ -195,9 +191,31 @@ impl DepthAccumulator {
         Self::default()
     }
 
-    /// Judges one frame, adds it, and returns its own report; fails when the sizes differ.
+    /// Evaluates one frame, adds it, and returns its own report; fails when the sizes differ.
     pub fn push(&mut self, predicted: &MetricDepth, truth: &MetricDepth) -> Result<DepthReport, EvalError> {
-        let sums = frame_sums(predicted, truth)?;
+        Ok(self.add(&frame_sums(predicted, truth)?))
+    }
+
+    /// Evaluates those of `views` for which `truth_of` gives a true depth image at the view's size.
+    ///
+    /// `truth_of` is called and the pixels are compared in parallel; sums are taken in the order of `views`, so that
+    /// the result has the same bits for any number of threads. Fails when the sizes of a pair differ.
+    pub fn push_views(
+        &mut self,
+        views: &[AlignedView],
+        truth_of: impl Fn(&AlignedView) -> Option<MetricDepth> + Sync,
+    ) -> Result<(), EvalError> {
+        let compared: Vec<Option<FrameSums>> = views
+            .par_iter()
+            .map(|view| truth_of(view).map(|truth| frame_sums(view.depth(), &truth)).transpose())
+            .collect::<Result<_, _>>()?;
+        for sums in compared.iter().flatten() {
+            self.add(sums);
+        }
+        Ok(())
+    }
+
+    fn add(&mut self, sums: &FrameSums) -> DepthReport {
         let report = sums.report();
         self.frames += 1;
         self.total.truth_pixels += sums.truth_pixels;
@@ -207,37 +225,39 @@ impl DepthAccumulator {
         if let (Some(metric), Some(scaled), Some(scale)) =
             (report.metric, report.median_scaled, report.median_scale)
         {
-            self.judged += 1;
-            add(&mut self.metric, &metric);
-            add(&mut self.scaled, &scaled);
+            self.evaluated += 1;
+            add_errors(&mut self.metric, &metric);
+            add_errors(&mut self.scaled, &scaled);
             self.scales += scale;
         }
-        Ok(report)
+        report
     }
 
-    /// The errors over all frames so far.
-    pub fn summary(&self) -> DepthSummary {
-        let any = self.judged > 0;
-        let n = self.judged as f64;
-        DepthSummary {
-            frames: self.frames,
-            frames_judged: self.judged,
-            pixel_weighted: self.total.report(),
-            frame_mean: any.then(|| from_sums(&self.metric, n)),
-            frame_mean_median_scaled: any.then(|| from_sums(&self.scaled, n)),
-            mean_median_scale: any.then(|| self.scales / n),
+    /// The errors over all frames so far; `None` while no frame had a valid pixel.
+    pub fn summary(&self) -> Option<DepthSummary> {
+        if self.evaluated == 0 {
+            return None;
         }
+        let n = self.evaluated as f64;
+        Some(DepthSummary {
+            frames: self.frames,
+            frames_evaluated: self.evaluated,
+            pixel_weighted: self.total.report(),
+            frame_mean: mean_errors(&self.metric, n),
+            frame_mean_median_scaled: mean_errors(&self.scaled, n),
+            mean_median_scale: self.scales / n,
+        })
     }
 }
 
-fn add(sums: &mut [f64; 8], e: &DepthErrors) {
+fn add_errors(sums: &mut [f64; 8], e: &DepthErrors) {
     let values = [e.abs_rel, e.sq_rel_m, e.rmse_m, e.mae_m, e.rmse_log, e.delta_1, e.delta_2, e.delta_3];
     for (sum, value) in sums.iter_mut().zip(values) {
         *sum += value;
     }
 }
 
-fn from_sums(sums: &[f64; 8], n: f64) -> DepthErrors {
+fn mean_errors(sums: &[f64; 8], n: f64) -> DepthErrors {
     let [abs_rel, sq_rel_m, rmse_m, mae_m, rmse_log, delta_1, delta_2, delta_3] = sums.map(|s| s / n);
     DepthErrors { abs_rel, sq_rel_m, rmse_m, mae_m, rmse_log, delta_1, delta_2, delta_3 }
 }

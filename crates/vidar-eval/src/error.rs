@@ -1,9 +1,9 @@
-//! Why something cannot be judged.
+//! Errors of evaluation.
 
 use thiserror::Error;
 use vidar_core::{BodyFrame, Duration, Timestamp};
 
-/// Why something cannot be judged.
+/// Why an evaluation failed.
 #[derive(Clone, Debug, PartialEq, Error)]
 #[non_exhaustive]
 pub enum EvalError {
@@ -34,7 +34,7 @@ pub enum EvalError {
         /// `estimated` or `ground-truth`.
         which: &'static str,
     },
-    /// No pose of one trajectory has a partner in the other.
+    /// No pose of one trajectory matches one of the other.
     #[error(
         "no stamps of the two trajectories lie within {max_difference_ms} ms: estimate {estimate_first} … \
          {estimate_last} s, ground truth {truth_first} … {truth_last} s, nearest pair {nearest} apart; {hint}"
@@ -52,7 +52,7 @@ pub enum EvalError {
         truth_last: Timestamp,
         /// Smallest difference between a stamp of one and a stamp of the other.
         nearest: Duration,
-        /// The likely reason, in words.
+        /// The likely reason.
         hint: String,
     },
     /// A cloud has no usable point.
@@ -63,16 +63,16 @@ pub enum EvalError {
         /// Points given, all of them unusable.
         given: usize,
     },
-    /// Cropping to the reference left nothing to judge.
+    /// Cropping to the reference removed all points.
     #[error(
         "no estimated point lies within {margin_m} m of the reference's bounding box: \
-         the clouds are in different worlds, or the placement is wrong"
+         the clouds are in different world frames, or the placement is wrong"
     )]
     NothingInBounds {
         /// Margin around the reference's bounding box, metres.
         margin_m: f64,
     },
-    /// More points than indices can name.
+    /// More points than an index can hold.
     #[error("{found} points are more than the {limit} that one index can hold; downsample first")]
     TooManyPoints {
         /// Points given.
@@ -88,7 +88,7 @@ pub enum EvalError {
         /// Largest extent of the cloud, metres.
         extent_m: f64,
     },
-    /// The placement that the clouds are to start from is not finite.
+    /// The initial placement is not finite.
     #[error("the placement truth_from_estimate is not finite")]
     BadPlacement,
     /// Two depth images differ in size.

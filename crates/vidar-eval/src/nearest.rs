@@ -1,9 +1,9 @@
 //! Exact nearest neighbours among millions of points.
 //!
-//! The search is kiddo's immutable k-d tree. What is added here is the order of the queries: along a Morton curve, so
-//! that one finds in the processor's cache what the query before it looked at, which halves the time and more. The
-//! tree compares squared distances in `f32`; the winner's distance is then computed again in `f64`. What remains is the
-//! `f32` choice among near-ties, a relative error below 3e-7. Why kiddo, with numbers:
+//! The search is kiddo's immutable k-d tree. Queries are sorted along a
+//! Morton curve, so that successive queries visit nodes that are in the processor's cache; this more than halves the time. The
+//! tree compares squared distances in `f32`; the distance of the nearest is then computed again in `f64`. What remains is
+//! the `f32` choice among near-ties, a relative error below 3e-7. Comparison with other libraries:
 //! `docs/decisions/0005-nearest-neighbours.md`.
 //!
 //! Memory: 20 bytes per point for the tree, as much again while it is built, 16 bytes per query.
@@ -18,7 +18,7 @@ const QUERY_CHUNK: usize = 4096;
 /// Queries sorted at a time, which bounds the extra memory.
 const QUERY_BLOCK: usize = 1 << 24;
 
-/// An answer: which point, and how far.
+/// The point nearest to a query.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Neighbour {
     /// Index into the points that the index was built from.
@@ -34,7 +34,7 @@ pub struct Neighbour {
 pub struct NearestIndex {
     /// None without points.
     tree: Option<ImmutableKdTree<f32, 3>>,
-    /// The points in the tree, in the order of its items: asked for points, kiddo 6.3 looks at every one.
+    /// The points in the tree, in the order of its items (kiddo 6.3 visits every item to return one point).
     points: Vec<[f32; 3]>,
     /// The index among the points given of each point in the tree; empty when all points given are in it.
     ids: Vec<u32>,
@@ -45,7 +45,7 @@ pub struct NearestIndex {
 impl NearestIndex {
     /// Builds the index; points with a coordinate that is not finite are left out and counted.
     ///
-    /// Fails only for more than 2³²−2 points. An index of no points answers every query with "nothing".
+    /// Fails only for more than 2³²−2 points. An index without points gives `None` for every query.
     pub fn build(points: &[[f32; 3]]) -> Result<Self, EvalError> {
         let limit = u32::MAX as usize - 1;
         let too_many = || EvalError::TooManyPoints { found: points.len(), limit };
@@ -108,7 +108,7 @@ impl NearestIndex {
         self.map_nearest(queries, max_distance_m, None, |neighbour| neighbour)
     }
 
-    /// `f` of each query's answer, in the queries' order.
+    /// `f` of each query's neighbour, in the queries' order.
     fn map_nearest<T: Copy + Send + Sync>(
         &self,
         queries: &[[f32; 3]],
@@ -119,10 +119,10 @@ impl NearestIndex {
         let mut out = vec![blank; queries.len()];
         for (block, out) in queries.chunks(QUERY_BLOCK).zip(out.chunks_mut(QUERY_BLOCK)) {
             let order = morton_order(block);
-            let answer = |&key: &u64| f(self.nearest(&block[key as u32 as usize], max_distance_m));
-            let along_curve: Vec<T> = order.par_iter().with_min_len(QUERY_CHUNK).map(answer).collect();
-            for (&key, answer) in order.iter().zip(along_curve) {
-                out[key as u32 as usize] = answer;
+            let search = |&key: &u64| f(self.nearest(&block[key as u32 as usize], max_distance_m));
+            let along_curve: Vec<T> = order.par_iter().with_min_len(QUERY_CHUNK).map(search).collect();
+            for (&key, value) in order.iter().zip(along_curve) {
+                out[key as u32 as usize] = value;
             }
         }
         out
@@ -132,7 +132,7 @@ impl NearestIndex {
 /// Distance in metres from each query to its nearest point of `index`, in the queries' order.
 ///
 /// `f32::INFINITY` where nothing lies within `max_distance_m` (strictly) or the index is empty; NaN for a query that
-/// is not finite. The answer does not depend on the number of threads.
+/// is not finite. The result does not depend on the number of threads.
 pub fn nearest_distances(
     queries: &[[f32; 3]],
     index: &NearestIndex,
@@ -149,9 +149,9 @@ pub fn nearest_distances(
     distances
 }
 
-/// Whether a point can be searched for: the tree wants numbers, and keeps the largest one for itself.
+/// Whether a point can be searched for: the tree requires numbers, and reserves the largest one.
 fn usable(p: &[f32; 3]) -> bool {
-    // NaN is less than nothing.
+    // Comparisons with NaN are false.
     p.iter().all(|c| c.abs() < f32::MAX)
 }
 
@@ -171,9 +171,9 @@ fn morton_order(queries: &[[f32; 3]]) -> Vec<u64> {
         .par_iter()
         .enumerate()
         .map(|(i, q)| {
-            // Casts saturate and send NaN to zero: such queries sort somewhere and find nothing.
+            // Casts saturate and turn NaN into zero: the order of such queries is irrelevant, as they have no neighbour.
             let cell = |k: usize| ((q[k] - min[k]) * steps) as u32 & 1023;
-            let code = spread(cell(0)) | spread(cell(1)) << 1 | spread(cell(2)) << 2;
+            let code = interleave(cell(0)) | interleave(cell(1)) << 1 | interleave(cell(2)) << 2;
             u64::from(code) << 32 | i as u64
         })
         .collect();
@@ -182,7 +182,7 @@ fn morton_order(queries: &[[f32; 3]]) -> Vec<u64> {
 }
 
 /// Puts two zero bits between the ten low bits of `v`.
-fn spread(v: u32) -> u32 {
+fn interleave(v: u32) -> u32 {
     let v = (v | v << 16) & 0x0300_00ff;
     let v = (v | v << 8) & 0x0300_f00f;
     let v = (v | v << 4) & 0x030c_30c3;

@@ -1,7 +1,7 @@
-//! A mesh as points spread evenly over its area.
+//! Even sampling of a mesh by area.
 //!
-//! Sample k of n lies at area (k + ½)/n of the mesh's total, counted triangle by triangle, so that every patch gets
-//! its share to within one point; within the triangle it takes the k-th point of the R₂ low-discrepancy sequence
+//! Sample k of n lies at area (k + ½)/n of the mesh's total, counted triangle by triangle, so that the number of
+//! samples of a patch is proportional to its area to within one; within the triangle it takes the k-th point of the R₂ low-discrepancy sequence
 //! (Roberts 2018), folded from the unit square. No random numbers: the same mesh gives the same points.
 
 use crate::error::EvalError;
@@ -34,7 +34,7 @@ pub fn sample_mesh(mesh: &TriangleMesh, density: SampleDensity) -> Result<PointC
         reason,
     };
     if !mesh.is_consistent() {
-        return Err(bad("an index names no vertex, or an attribute list does not fit the vertices"));
+        return Err(bad("a vertex index is out of range, or an attribute list does not fit the vertices"));
     }
     let mut total = 0.0;
     let cumulative: Vec<f64> = (0..mesh.triangles.len())
@@ -130,7 +130,7 @@ mod tests {
     }
 
     #[test]
-    fn samples_lie_on_the_mesh_and_share_out_by_area() {
+    fn samples_lie_on_the_mesh_in_proportion_to_area() {
         let cloud = sample_mesh(&two_sheets(), SampleDensity::SpacingM(0.02)).unwrap();
         assert_eq!(cloud.len(), 10_000);
         assert!(cloud.is_consistent());

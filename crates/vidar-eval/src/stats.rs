@@ -11,7 +11,7 @@ pub struct ErrorStats {
     pub rmse: f64,
     /// Mean.
     pub mean: f64,
-    /// Median; the mean of the two middle ones for an even number.
+    /// Median; the mean of the two central values for an even number.
     pub median: f64,
     /// Standard deviation about the mean.
     pub std: f64,
@@ -45,7 +45,7 @@ impl ErrorStats {
     }
 }
 
-/// The middle of sorted values; the mean of the two middle ones for an even number.
+/// Median of sorted values; the mean of the two central values for an even number.
 pub(crate) fn median_of_sorted(sorted: &[f64]) -> Option<f64> {
     let upper = *sorted.get(sorted.len() / 2)?;
     if sorted.len() % 2 == 1 {

@@ -1,10 +1,10 @@
-//! How far an estimated trajectory is from the truth.
+//! Errors of an estimated trajectory against ground truth.
 //!
-//! Stamps are paired ([`associate`]), the paired positions are laid onto each other in closed form under SE(3) and
-//! under Sim(3) (Umeyama 1991; the paper's section III-E), and what is left is the absolute trajectory error:
+//! Stamps are paired ([`associate`]), the paired positions are aligned in closed form under SE(3) and under
+//! Sim(3) (Umeyama 1991; the paper's section III-E), and the remaining distance is the absolute trajectory error:
 //! `ATE = |p_truth − (s R p_estimate + t)|` (Sturm et al., IROS 2012; the paper's section IV-B uses Sim(3)).
 //! The scale error is `|ln s|` with the Sim(3) fit's `s`, metres of truth per unit of the estimate. The relative
-//! error compares motions instead of places and needs no alignment: [`RpeReport`]. Numbers agree with evo.
+//! error compares motions instead of positions and needs no alignment: [`RpeReport`]. Numbers agree with evo.
 
 mod association;
 mod config;
@@ -29,9 +29,9 @@ struct Matched<'a> {
     truth: &'a StampedPose,
 }
 
-/// Judges `estimate` against `truth`, which must be of the same body.
+/// Evaluates `estimate` against `truth`, which must be of the same body.
 ///
-/// Motions that do not fix an alignment (standing still, a straight line) leave the fields that need it `None` and
+/// Motions that do not determine an alignment (standing still, a straight line) leave the fields that need it `None` and
 /// add a warning. Fails when the bodies differ, when a trajectory is empty, and when no stamps match.
 pub fn evaluate_trajectory(
     estimate: &Trajectory,
@@ -72,11 +72,11 @@ pub fn evaluate_trajectory(
             Warning::new(
                 "low-coverage",
                 format!(
-                    "matched poses cover {:.1} % of the ground truth's time, so the errors say nothing of the rest",
+                    "matched poses cover {:.1} % of the ground truth's time, the errors do not cover the rest",
                     100.0 * coverage.truth_time_ratio
                 ),
             )
-            .hint("an estimate that stops early or is lost for a while looks better than it is"),
+            .hint("errors over a part of the recording understate those over the whole"),
         );
     }
     let scale = similar.map(|s| s.scale);
@@ -104,7 +104,7 @@ pub fn evaluate_trajectory(
     })
 }
 
-/// The fit, or a warning that says why there is none.
+/// The fit, or a warning with the reason why there is none.
 fn fit<T, E: std::fmt::Display>(what: &str, fit: Result<T, E>, warnings: &mut Vec<Warning>) -> Option<T> {
     match fit {
         Ok(transform) => Some(transform),
@@ -114,7 +114,7 @@ fn fit<T, E: std::fmt::Display>(what: &str, fit: Result<T, E>, warnings: &mut Ve
                     "alignment-undetermined",
                     format!("no {what} alignment of the trajectories: {error}"),
                 )
-                .hint("the motion must leave a straight line for its alignment, ATE and scale to be defined"),
+                .hint("alignment, ATE and scale are defined only for a motion that is not a straight line"),
             );
             None
         }

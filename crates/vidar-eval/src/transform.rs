@@ -1,4 +1,4 @@
-//! Transforms as they stand in reports.
+//! Transforms in reports.
 
 use nalgebra::Vector3;
 use serde::{Deserialize, Serialize};
@@ -39,7 +39,7 @@ impl TransformRecord {
         Sim3::new(rotation, Vector3::from(self.translation_m), self.scale).filter(Sim3::is_finite)
     }
 
-    /// Its rotation and translation, leaving the scale out; `None` when the numbers are not a transform.
+    /// Its rotation and translation, without the scale; `None` when the numbers are not a transform.
     pub fn to_se3(&self) -> Option<Se3> {
         self.to_sim3().map(|t| Se3::new(t.rotation, t.translation))
     }

@@ -74,7 +74,7 @@ fn assert_rpe(what: &str, report: Option<&vidar_eval::RpeReport>, golden: &Value
     assert_stats(&format!("{what}: {key} rotation"), Some(&report.rotation_deg), expected);
 }
 
-fn judge_and_compare(what: &str, truth: &Path, estimate: &Path, golden: &Value) {
+fn evaluate_and_compare(what: &str, truth: &Path, estimate: &Path, golden: &Value) {
     let (truth, estimate) = (read_tum(truth), read_tum(estimate));
     let config = TrajectoryEvalConfig::default();
     let report = evaluate_trajectory(&estimate, &truth, &config).unwrap();
@@ -89,7 +89,7 @@ fn judge_and_compare(what: &str, truth: &Path, estimate: &Path, golden: &Value) 
 #[test]
 fn a_made_up_flight_is_judged_as_evo_judges_it() {
     let golden = json("evo_synthetic.json");
-    judge_and_compare(
+    evaluate_and_compare(
         "synthetic",
         &data("synthetic_truth.tum"),
         &data("synthetic_estimate.tum"),
@@ -129,7 +129,7 @@ fn real_euroc_estimates_are_judged_as_evo_judges_them() {
         let name = result["estimate"].as_str().unwrap();
         let sequence = result["sequence"].as_str().unwrap();
         let truth = folder.join("euroc_imu_gt_all11").join(sequence).join("groundtruth_openvins_tum.txt");
-        judge_and_compare(name, &truth, &root.join(name), result);
+        evaluate_and_compare(name, &truth, &root.join(name), result);
     }
     std::fs::remove_dir_all(&folder).unwrap();
 }

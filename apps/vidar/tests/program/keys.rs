@@ -1,28 +1,28 @@
-//! No setting is a dead letter: each one of the dense road changes what a run leaves.
+//! Every setting has an effect: each one of the dense pipeline changes the result of a run.
 
-use crate::support::{Ran, files_under, run_command, shared, vidar};
+use crate::support::{ProgramOutput, files_under, run_command, shared, vidar};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Mutex, OnceLock};
 
-/// What must be set besides for a setting to matter.
+/// Additional settings that are needed for a setting to have an effect.
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Debug)]
-enum Beside {
+enum ExtraSettings {
     Nothing,
-    /// The map is judged.
-    Judged,
-    /// It is judged, and a coarse surface lets the similarity be refused.
+    /// The map is evaluated.
+    Evaluated,
+    /// It is evaluated, and a coarse surface lets the similarity be refused.
     Refused,
     /// The mesh is written as GLB too.
     Pictures,
-    /// The poses come from a trajectory of low rate, which is judged against ground truth.
+    /// The poses come from a trajectory of low rate, which is evaluated against ground truth.
     Odometry,
     /// Chunks are short.
     Chunked,
     /// A simulated network in short chunks.
     Simulated,
-    /// The network in the program.
+    /// The built-in network.
     Learned,
     /// No poses are known beforehand.
     Unposed,
@@ -34,11 +34,11 @@ enum Beside {
     Moving,
 }
 
-impl Beside {
+impl ExtraSettings {
     fn arguments(self) -> Vec<String> {
         let settings: &[&str] = match self {
             Self::Nothing => &[],
-            Self::Judged | Self::Odometry => &["eval.mode=auto"],
+            Self::Evaluated | Self::Odometry => &["eval.mode=auto"],
             Self::Refused => &[
                 "eval.mode=auto",
                 "eval.surface.scale_bounds.min=0.9999999",
@@ -71,11 +71,11 @@ impl Beside {
     }
 }
 
-use Beside::{
-    Chunked, Fine, Judged, Learned, Moving, Nothing, Odometry, Pictures, Refused, Simulated, Turning, Unposed,
+use ExtraSettings::{
+    Chunked, Fine, Evaluated, Learned, Moving, Nothing, Odometry, Pictures, Refused, Simulated, Turning, Unposed,
 };
 
-/// Ground truth at 10 Hz, 2 cm off on the way: a trajectory that must be interpolated and is worth judging.
+/// Ground truth at 10 Hz, 2 cm off on the way: a trajectory that must be interpolated and differs from ground truth.
 fn sparse_truth() -> String {
     static FILE: OnceLock<String> = OnceLock::new();
     FILE.get_or_init(|| {
@@ -97,21 +97,21 @@ fn sparse_truth() -> String {
 }
 
 /// Every setting of the dense road, another value for it, and what must be set besides.
-const SETTINGS: &[(&str, &str, Beside)] = &[
+const SETTINGS: &[(&str, &str, ExtraSettings)] = &[
     ("align.max_center_rms_m", "1e-12", Simulated),
     ("coupling.mode", "hybrid", Simulated),
     ("coupling.stereo_landmarks", "false", Learned),
     ("eval.mode", "auto", Nothing),
-    ("eval.surface.crop_margin_m", "0.1", Judged),
-    ("eval.surface.on_refusal", "refine_rigid", Refused),
-    ("eval.surface.thresholds_m", "[0.07]", Judged),
-    ("eval.surface.voxel_size_m", "0.2", Judged),
-    ("eval.surface.icp.keep_ratio", "0.5", Judged),
-    ("eval.surface.icp.max_iterations", "1", Judged),
-    ("eval.surface.icp.max_points", "100", Judged),
-    ("eval.surface.icp.tolerance_m", "0.1", Judged),
-    ("eval.surface.scale_bounds.max", "1.000001", Judged),
-    ("eval.surface.scale_bounds.min", "0.999999", Judged),
+    ("eval.surface.crop_margin_m", "0.1", Evaluated),
+    ("eval.surface.on_rejection", "refine_rigid", Refused),
+    ("eval.surface.thresholds_m", "[0.07]", Evaluated),
+    ("eval.surface.voxel_size_m", "0.2", Evaluated),
+    ("eval.surface.icp.keep_ratio", "0.5", Evaluated),
+    ("eval.surface.icp.max_iterations", "1", Evaluated),
+    ("eval.surface.icp.max_points", "100", Evaluated),
+    ("eval.surface.icp.tolerance_m", "0.1", Evaluated),
+    ("eval.surface.scale_bounds.max", "1.000001", Evaluated),
+    ("eval.surface.scale_bounds.min", "0.999999", Evaluated),
     ("eval.trajectory.coverage_gap_ms", "1.0", Odometry),
     ("eval.trajectory.max_time_difference_ms", "0.000001", Odometry),
     ("eval.trajectory.rpe_distance_m", "0.2", Odometry),
@@ -151,7 +151,7 @@ const ELSEWHERE: &[(&str, &str)] = &[
     ("input.camera", "there is one camera here; faults.rs asks for another"),
     ("output.live_map", "it leaves nothing; coupling.rs watches it grow"),
     ("coupling.loop_chunks", "it needs a revisit; coupling.rs has one"),
-    ("coupling.places", "damage.rs has a run of each"),
+    ("coupling.place_recognition", "damage.rs has a run of each"),
     ("coupling.salad_checkpoint", "damage.rs has a small one"),
     ("input.poses", "verbs.rs runs with another trajectory"),
     ("eval.trajectory.low_coverage_ratio", "it decides a warning; vidar-eval's tests"),
@@ -163,7 +163,7 @@ const ELSEWHERE: &[(&str, &str)] = &[
 ];
 
 /// Everything a run leaves but what the clock or the command line decides.
-fn leavings(out: &Path, ran: &Ran) -> BTreeMap<String, Vec<u8>> {
+fn leavings(out: &Path, ran: &ProgramOutput) -> BTreeMap<String, Vec<u8>> {
     let clocked = ["manifest.json", "log.jsonl", "README.txt", "config.resolved.toml", "report.html"];
     let mut found: BTreeMap<String, Vec<u8>> = files_under(out)
         .into_iter()
@@ -181,7 +181,7 @@ fn run(name: &str, arguments: &[String]) -> BTreeMap<String, Vec<u8>> {
     let out: PathBuf = shared().root.join("keys").join(name);
     let small = ["-q", "--threads", "1", "--set", "input.stride=2"];
     let mut command = run_command(&shared().sequence, &out, &small);
-    let ran: Ran = command.args(arguments).output().unwrap().into();
+    let ran: ProgramOutput = command.args(arguments).output().unwrap().into();
     assert!([0, 1, 3].contains(&ran.code), "{name}: {} {}", ran.code, ran.stderr);
     let left = leavings(&out, &ran);
     std::fs::remove_dir_all(&out).unwrap_or(());
@@ -205,10 +205,10 @@ fn every_setting_of_the_dense_road_is_in_the_list() {
 #[test]
 fn every_setting_changes_what_a_run_leaves() {
     let all = [
-        Fine, Nothing, Judged, Refused, Pictures, Odometry, Chunked, Simulated, Learned, Unposed, Turning,
+        Fine, Nothing, Evaluated, Refused, Pictures, Odometry, Chunked, Simulated, Learned, Unposed, Turning,
         Moving,
     ];
-    let bases: BTreeMap<Beside, BTreeMap<String, Vec<u8>>> = all
+    let bases: BTreeMap<ExtraSettings, BTreeMap<String, Vec<u8>>> = all
         .into_iter()
         .map(|beside| (beside, run(&format!("base {beside:?}"), &beside.arguments())))
         .collect();

@@ -1,4 +1,4 @@
-//! The points that take part: finite, placed, cropped, thinned.
+//! The evaluated points: finite, transformed, cropped, thinned.
 
 use super::config::SurfaceEvalConfig;
 use crate::error::EvalError;
@@ -17,7 +17,7 @@ pub(super) fn finite_positions(cloud: &PointCloud, which: &'static str) -> Resul
     Ok(points)
 }
 
-/// The points in the other world.
+/// The points in the other world frame.
 pub(super) fn transformed(points: &[[f32; 3]], b_from_a: &Sim3) -> Vec<[f32; 3]> {
     if *b_from_a == Sim3::IDENTITY {
         return points.to_vec();
@@ -32,8 +32,8 @@ pub(super) fn transformed(points: &[[f32; 3]], b_from_a: &Sim3) -> Vec<[f32; 3]>
         .collect()
 }
 
-/// The placed points that are judged, and how many were cropped.
-pub(super) fn judged_points(
+/// The placed points that are evaluated, and how many were cropped.
+pub(super) fn evaluated_points(
     mut placed: Vec<[f32; 3]>,
     reference: &NearestIndex,
     config: &SurfaceEvalConfig,

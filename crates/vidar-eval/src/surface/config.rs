@@ -1,32 +1,32 @@
-//! What can be set about the judgement of surfaces.
+//! Settings of surface evaluation.
 
 use crate::error::EvalError;
 use serde::{Deserialize, Serialize};
 
-/// How a surface is judged; the defaults are the paper's protocol.
+/// Settings of surface evaluation; the defaults are the paper's protocol.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct SurfaceEvalConfig {
-    /// Distances τ below which (strictly) a point counts as right, metres, each above 0. ΔF is taken at the largest.
+    /// Distances τ below which (strictly) a point counts as correct, metres, each above 0. ΔF is taken at the largest.
     pub thresholds_m: Vec<f64>,
-    /// Scales between which the native placement's refinement is taken.
+    /// Scales between which the native placement's refinement is accepted.
     pub scale_bounds: ScaleBounds,
-    /// What to do when the refinement's scale is out of bounds.
-    pub on_refusal: OnRefusal,
+    /// What to do when the refinement is rejected: its scale is out of bounds, or the fit became worse.
+    pub on_rejection: OnRejection,
     /// The refinement.
     pub icp: IcpConfig,
-    /// Put one point (their mean) in each voxel of this edge in both clouds before judging, metres, above 0. Absent:
-    /// judge the points as given. Use it when sampling is uneven; keep it well below the smallest threshold.
+    /// Put one point (their mean) in each voxel of this edge in both clouds before evaluation, metres, above 0.
+    /// Absent: evaluate the points as given. Use it when sampling is uneven; keep it well below the smallest threshold.
     pub voxel_size_m: Option<f64>,
     /// Leave out estimated points further than this outside the reference's bounding box, metres, at least 0.
-    /// Absent: judge all. Use it when the reference covers a part of what was mapped.
+    /// Absent: evaluate all. Use it when the reference covers a part of what was mapped.
     pub crop_margin_m: Option<f64>,
     /// Return the error of every given point, for colouring.
-    #[serde(skip)] // for callers that draw the errors; no setting of a user's
+    #[serde(skip)] // for callers that draw the errors; not a user setting
     pub keep_point_errors: bool,
 }
 
-/// Scales between which a refinement is taken, ends included; metres of truth per unit of the estimate.
+/// Scales between which a refinement is accepted, ends included; metres of truth per unit of the estimate.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct ScaleBounds {
@@ -36,10 +36,10 @@ pub struct ScaleBounds {
     pub max: f64,
 }
 
-/// What to do when the refinement's scale is out of bounds.
+/// What to do when the refinement is rejected.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, schemars::JsonSchema)]
 #[serde(rename_all = "snake_case")]
-pub enum OnRefusal {
+pub enum OnRejection {
     /// Keep the SE(3) fit as it is: the paper's protocol.
     KeepRigidFit,
     /// Refine the SE(3) fit by ICP without scale.
@@ -66,7 +66,7 @@ impl Default for SurfaceEvalConfig {
         Self {
             thresholds_m: vec![0.05, 0.10],
             scale_bounds: ScaleBounds::default(),
-            on_refusal: OnRefusal::KeepRigidFit,
+            on_rejection: OnRejection::KeepRigidFit,
             icp: IcpConfig::default(),
             voxel_size_m: None,
             crop_margin_m: None,

@@ -1,30 +1,30 @@
-//! Laying the estimate onto the reference: the bounded native placement and the free ones.
+//! Placement of the estimate in the reference's world frame: the bounded native one and the free ones.
 
 use super::PlacementStart;
 use super::cloud::{subset, transformed};
-use super::config::{IcpConfig, OnRefusal, SurfaceEvalConfig};
+use super::config::{IcpConfig, OnRejection, SurfaceEvalConfig};
 use super::report::PlacementReport;
 use crate::error::EvalError;
 use crate::nearest::NearestIndex;
 use nalgebra::Vector3;
 use vidar_core::{Se3, Sim3, UmeyamaError, Warning, umeyama_se3, umeyama_sim3};
 
-/// A placement and the start that led to it.
+/// A placement and the start of its refinement.
 pub(super) struct Placement {
     pub start: &'static str,
     pub truth_from_estimate: Sim3,
 }
 
-/// The native placement with the evidence for it.
+/// The native placement and how it was determined.
 pub(super) struct Refinement {
     pub truth_from_estimate: Sim3,
     accepted: bool,
     reason: String,
-    /// Where the similarity ICP ended, taken or not.
+    /// Result of the similarity ICP, accepted or not.
     refined: Option<IcpResult>,
 }
 
-/// Where an ICP ended.
+/// Result of an ICP.
 #[derive(Clone, Copy)]
 struct IcpResult {
     truth_from_estimate: Sim3,
@@ -52,7 +52,7 @@ pub(super) fn native_placement(
     let points = subset(estimated, config.icp.max_points);
     let bounds = &config.scale_bounds;
     let refined = icp(&points, reference, &rigid, Motion::Similarity, &config.icp);
-    let refusal = match &refined {
+    let rejection = match &refined {
         Err(error) => format!("refinement failed: {error}"),
         Ok(r) if !bounds.contains(r.truth_from_estimate.scale) => format!(
             "refined scale {:.4} is outside [{}, {}]",
@@ -68,17 +68,17 @@ pub(super) fn native_placement(
             return Ok(Refinement { truth_from_estimate, accepted: true, reason, refined: Some(*r) });
         }
     };
-    let kept = match config.on_refusal {
-        OnRefusal::KeepRigidFit => rigid,
-        OnRefusal::RefineRigid => icp(&points, reference, &rigid, Motion::Rigid, &config.icp)
+    let kept = match config.on_rejection {
+        OnRejection::KeepRigidFit => rigid,
+        OnRejection::RefineRigid => icp(&points, reference, &rigid, Motion::Rigid, &config.icp)
             .ok()
             .filter(|r| r.rms_after_m <= r.rms_before_m)
             .map_or(rigid, |r| r.truth_from_estimate),
     };
-    Ok(Refinement { truth_from_estimate: kept, accepted: false, reason: refusal, refined: refined.ok() })
+    Ok(Refinement { truth_from_estimate: kept, accepted: false, reason: rejection, refined: refined.ok() })
 }
 
-/// Placements of any scale: the refinement that was refused, and one from the trajectories' Sim(3) fit.
+/// Placements of any scale: the rejected refinement, and those from the trajectories' Sim(3) fit.
 pub(super) fn free_candidates(
     estimated: &[[f32; 3]],
     reference: &NearestIndex,
@@ -87,8 +87,9 @@ pub(super) fn free_candidates(
     native: &Refinement,
 ) -> Result<Vec<Placement>, EvalError> {
     let mut candidates = Vec::new();
-    if let (false, Some(refused)) = (native.accepted, &native.refined) {
-        candidates.push(Placement { start: "rigid-start", truth_from_estimate: refused.truth_from_estimate });
+    if let (false, Some(rejected)) = (native.accepted, &native.refined) {
+        candidates
+            .push(Placement { start: "rigid-start", truth_from_estimate: rejected.truth_from_estimate });
     }
     if let Some(similarity) = &start.truth_from_estimate_sim3 {
         candidates.push(Placement { start: "similarity-start", truth_from_estimate: *similarity });
@@ -139,7 +140,7 @@ fn rigid_step(pairs: &Pairs, scale: f64) -> Result<Sim3, UmeyamaError> {
     Ok(Sim3 { rotation, translation, scale })
 }
 
-/// Points of the estimate (in its own world) with their nearest points of the reference.
+/// Points of the estimate (in its own world frame) with their nearest points of the reference.
 struct Pairs {
     source: Vec<Vector3<f64>>,
     target: Vec<Vector3<f64>>,
@@ -183,13 +184,13 @@ impl Refinement {
         }
     }
 
-    pub(super) fn refusal_warning(&self, config: &SurfaceEvalConfig) -> Option<Warning> {
-        let kept = match config.on_refusal {
-            OnRefusal::KeepRigidFit => "the SE(3) fit was kept",
-            OnRefusal::RefineRigid => "the SE(3) fit was refined without scale",
+    pub(super) fn rejection_warning(&self, config: &SurfaceEvalConfig) -> Option<Warning> {
+        let kept = match config.on_rejection {
+            OnRejection::KeepRigidFit => "the SE(3) fit was kept",
+            OnRejection::RefineRigid => "the SE(3) fit was refined without scale",
         };
         (!self.accepted).then(|| {
-            Warning::new("placement-refused", format!("{}; {kept}", self.reason))
+            Warning::new("refinement-rejected", format!("{}; {kept}", self.reason))
                 .hint("compare scale_free and delta_f: a large difference means that the scale is not metric")
         })
     }

@@ -1,4 +1,4 @@
-//! What is found out about a surface.
+//! Results of surface evaluation.
 
 use super::placement::{Placement, Refinement};
 use crate::transform::TransformRecord;
@@ -18,7 +18,7 @@ pub struct Scores {
     pub f: f64,
 }
 
-/// Distances from cloud to cloud, metres, over the judged points under the native placement.
+/// Distances from cloud to cloud, metres, over the evaluated points under the native placement.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Chamfer {
     /// Mean of `accuracy_mean_m` and `completeness_mean_m`.
@@ -33,20 +33,20 @@ pub struct Chamfer {
     pub completeness_median_m: f64,
 }
 
-/// How the native placement came about.
+/// How the native placement was determined.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct PlacementReport {
     /// The placement under which `native` was scored.
     pub truth_from_estimate: TransformRecord,
-    /// Whether the similarity refinement was taken.
+    /// Whether the similarity refinement was accepted.
     pub accepted: bool,
-    /// Why, in words with numbers.
+    /// The reason, with numbers.
     pub reason: String,
-    /// Scale at which the refinement ended, taken or not; absent when it could not be computed.
+    /// Scale at which the refinement ended, accepted or not; absent when it could not be computed.
     pub refined_scale: Option<f64>,
     /// Steps of the refinement.
     pub iterations: usize,
-    /// Whether it came to rest before its last step.
+    /// Whether it converged before its last step.
     pub converged: bool,
     /// RMS of the trimmed pairs before it, metres.
     pub rms_before_m: Option<f64>,
@@ -54,10 +54,10 @@ pub struct PlacementReport {
     pub rms_after_m: Option<f64>,
 }
 
-/// The free placement that counted.
+/// The free placement with the highest F.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct FreePlacement {
-    /// Where it came from: `native`; `rigid-start`, the refinement that was refused; `similarity-start`, the Sim(3) fit
+    /// Its origin: `native`; `rigid-start`, the rejected refinement; `similarity-start`, the Sim(3) fit
     /// of the trajectories; `similarity-start-refined`, an ICP from there.
     pub start: String,
     /// The placement.
@@ -77,7 +77,7 @@ pub struct PointErrors {
     pub reference_m: Vec<f32>,
 }
 
-/// Agreement of a surface with its reference, with what it rests on.
+/// Agreement of a surface with its reference, and the basis of the comparison.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct SurfaceReport {
     /// Scores under the native-scale bounded placement, one per threshold.
@@ -88,7 +88,7 @@ pub struct SurfaceReport {
     pub delta_f: f64,
     /// The largest threshold, metres.
     pub delta_f_threshold_m: f64,
-    /// Scale of the native placement: 1 when no refinement was taken.
+    /// Scale of the native placement: 1 when no refinement was accepted.
     pub scale_native: f64,
     /// Scale of the free placement.
     pub scale_free: f64,
@@ -104,18 +104,18 @@ pub struct SurfaceReport {
     pub reference_points_not_finite: usize,
     /// Points dropped because they lie outside the reference's box and margin.
     pub estimate_points_cropped: usize,
-    /// Points that were judged, after cropping and voxels.
-    pub estimate_points_judged: usize,
-    /// Points that were judged, after voxels.
-    pub reference_points_judged: usize,
-    /// How the native placement came about.
+    /// Points that were evaluated, after cropping and voxels.
+    pub estimate_points_evaluated: usize,
+    /// Points that were evaluated, after voxels.
+    pub reference_points_evaluated: usize,
+    /// How the native placement was determined.
     pub placement: PlacementReport,
     /// The free placement.
     pub free_placement: FreePlacement,
     /// Errors per point, when asked for; not part of the JSON.
     #[serde(skip)]
     pub point_errors: Option<PointErrors>,
-    /// What the reader should know.
+    /// Warnings about the input and the placement.
     pub warnings: Vec<Warning>,
 }
 
@@ -147,7 +147,7 @@ impl Chamfer {
     }
 }
 
-/// Both of a non-empty list.
+/// Mean and median of a non-empty list.
 fn mean_and_median(mut distances: Vec<f32>) -> (f64, f64) {
     let n = distances.len().max(1);
     let mean = distances.iter().map(|&d| f64::from(d)).sum::<f64>() / n as f64;
@@ -183,7 +183,7 @@ impl FreePlacement {
     }
 }
 
-/// A similarity as its numbers.
+/// Serialises a similarity as a [`TransformRecord`].
 mod as_record {
     use super::{Sim3, TransformRecord};
     use serde::{Deserialize, Deserializer, Serialize, Serializer, de::Error};

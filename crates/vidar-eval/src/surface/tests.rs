@@ -53,7 +53,7 @@ fn config() -> SurfaceEvalConfig {
 
 #[test]
 fn scores_of_seven_points_are_those_computed_by_hand() {
-    // On a line no placement can be refined, so the clouds are judged where they are.
+    // On a line no placement can be refined, so the clouds are evaluated as placed.
     let reference = cloud([0.0, 1.0, 2.0, 3.0].map(|x| [x, 0.0, 0.0]).to_vec());
     let estimate = cloud([0.04, 1.25, 2.0].map(|x| [x, 0.0, 0.0]).to_vec());
     let config = SurfaceEvalConfig { thresholds_m: vec![0.05, 0.25], keep_point_errors: true, ..config() };
@@ -104,7 +104,7 @@ fn a_scale_of_one_point_three_is_refused_natively_and_borrowed_freely() {
     assert!((report.scale_free - 1.3).abs() < 0.01, "{}", report.scale_free);
     assert!(report.delta_f > 0.5, "{} from {:?} and {:?}", report.delta_f, report.native, report.free);
     assert!((report.delta_f - (report.free[1].f - report.native[1].f)).abs() < 1e-15);
-    assert!(report.warnings.iter().any(|w| w.kind == "placement-refused"), "{:?}", report.warnings);
+    assert!(report.warnings.iter().any(|w| w.kind == "refinement-rejected"), "{:?}", report.warnings);
 }
 
 #[test]
@@ -116,11 +116,11 @@ fn bounds_decide_what_is_refused_and_rigid_refinement_can_follow() {
     let narrow = SurfaceEvalConfig { scale_bounds: ScaleBounds { min: 0.95, max: 1.05 }, ..config() };
     let kept = evaluate_surface(&estimate, &reference, &off, &narrow).unwrap();
     assert!(!kept.placement.accepted && kept.scale_native == 1.0);
-    let refine = SurfaceEvalConfig { on_refusal: OnRefusal::RefineRigid, ..narrow };
+    let refine = SurfaceEvalConfig { on_rejection: OnRejection::RefineRigid, ..narrow };
     let refined = evaluate_surface(&estimate, &reference, &off, &refine).unwrap();
     assert_eq!(refined.scale_native, 1.0);
     assert!(refined.chamfer.accuracy_mean_m < kept.chamfer.accuracy_mean_m);
-    // The refused refinement still shows what a free scale would give.
+    // The rejected refinement is still a candidate of the free placement.
     assert!(
         kept.delta_f > 0.3 && (kept.scale_free - 1.1).abs() < 0.01,
         "{} {}",
@@ -173,12 +173,12 @@ fn cropping_leaves_out_what_the_reference_cannot_judge() {
         .positions
         .extend((0..given / 2).map(|i| [8.0 + (i % 50) as f32 * 0.02, (i / 50) as f32 * 0.02, 1.0]));
     let reference = cloud(room(0.05, 0.5));
-    let judge = |crop_margin_m| {
+    let evaluate = |crop_margin_m| {
         let config = SurfaceEvalConfig { crop_margin_m, ..config() };
         let config = SurfaceEvalConfig { icp: IcpConfig { keep_ratio: 0.6, ..config.icp }, ..config };
         evaluate_surface(&estimate, &reference, &Se3::IDENTITY, &config).unwrap()
     };
-    let (all, cropped) = (judge(None), judge(Some(0.5)));
+    let (all, cropped) = (evaluate(None), evaluate(Some(0.5)));
     assert_eq!((all.estimate_points_cropped, cropped.estimate_points_cropped), (0, given / 2));
     assert!((all.native[1].precision - 2.0 / 3.0).abs() < 0.01, "{:?}", all.native);
     assert!(cropped.native[1].precision > 0.99, "{:?}", cropped.native);
@@ -187,7 +187,7 @@ fn cropping_leaves_out_what_the_reference_cannot_judge() {
 
 #[test]
 fn voxels_weigh_crowded_places_like_others() {
-    // Ten good points and one bad place that was seen a thousand times.
+    // Ten good points and one wrong point that occurs a thousand times.
     let good: Vec<[f32; 3]> = (0..10).map(|i| [i as f32, 0.0, 0.0]).collect();
     let mut crowded = good.clone();
     crowded.extend((0..1000).map(|i| [4.5 + i as f32 * 1e-6, 0.0, 0.0]));
@@ -195,7 +195,7 @@ fn voxels_weigh_crowded_places_like_others() {
         let config = SurfaceEvalConfig { voxel_size_m, ..config() };
         let report =
             evaluate_surface(&cloud(crowded.clone()), &cloud(good.clone()), &Se3::IDENTITY, &config).unwrap();
-        (report.estimate_points_judged, report.native[0].precision)
+        (report.estimate_points_evaluated, report.native[0].precision)
     };
     assert_eq!(precision(None), (1010, 10.0 / 1010.0));
     assert_eq!(precision(Some(0.02)), (11, 10.0 / 11.0));
@@ -227,8 +227,8 @@ fn the_report_has_stable_keys() {
     assert_eq!(
         keys(&value),
         "native free delta_f delta_f_threshold_m scale_native scale_free chamfer estimate_points reference_points \
-         estimate_points_not_finite reference_points_not_finite estimate_points_cropped estimate_points_judged \
-         reference_points_judged placement free_placement warnings"
+         estimate_points_not_finite reference_points_not_finite estimate_points_cropped estimate_points_evaluated \
+         reference_points_evaluated placement free_placement warnings"
     );
     assert_eq!(keys(&value["native"][0]), "threshold_m precision recall f");
     assert_eq!(
@@ -275,7 +275,7 @@ proptest! {
         b in prop::collection::vec(prop::array::uniform3(0.0_f32..0.6), 1..80),
     ) {
         let here = |estimated: &[[f32; 3]], reference: &[[f32; 3]]| {
-            judge(estimated, &Truth::new(reference.to_vec()).unwrap(), &Sim3::IDENTITY, &config()).unwrap()
+            score(estimated, &Reference::new(reference.to_vec()).unwrap(), &Sim3::IDENTITY, &config()).unwrap()
         };
         let (there, back) = (here(&a, &b), here(&b, &a));
         for (x, y) in there.scores.iter().zip(&back.scores) {

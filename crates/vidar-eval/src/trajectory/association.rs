@@ -1,8 +1,8 @@
-//! Which pose of the estimate belongs to which of the truth.
+//! Association of the estimate's poses with those of ground truth by time.
 //!
 //! The rule is evo's: each stamp of the trajectory with fewer poses (the estimate, when both have as many) takes the
 //! nearest stamp of the other one, the earlier of two equally near, and is dropped when that one is more than the
-//! largest difference away. A pose of the longer trajectory may serve twice. Unlike evo, differences are integer
+//! largest difference away. A pose of the longer trajectory may be matched twice. Unlike evo, differences are integer
 //! nanoseconds, so a pair exactly at the limit counts whatever the epoch.
 
 use crate::error::EvalError;
@@ -70,7 +70,7 @@ fn no_matches(
     }
 }
 
-/// The likely reason for stamps that do not meet, in words.
+/// The likely reason for stamps that do not match.
 fn likely_reason(
     estimate: (Timestamp, Timestamp),
     truth: (Timestamp, Timestamp),

@@ -1,10 +1,10 @@
-//! What can be set about the judgement of trajectories.
+//! Settings of trajectory evaluation.
 
 use crate::error::EvalError;
 use serde::{Deserialize, Serialize};
 use vidar_core::Duration;
 
-/// How a trajectory is judged. The defaults are evo's.
+/// Settings of trajectory evaluation. The defaults are evo's.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct TrajectoryEvalConfig {

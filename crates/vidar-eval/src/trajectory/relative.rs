@@ -1,4 +1,4 @@
-//! Relative trajectory error: how well the motion between two poses is known.
+//! Relative pose error (RPE): error of the motion between two poses.
 
 use super::Matched;
 use super::report::{RpeReport, RpeStep};

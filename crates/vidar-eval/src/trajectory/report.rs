@@ -1,4 +1,4 @@
-//! What is found out about a trajectory.
+//! Results of trajectory evaluation.
 
 use super::Matched;
 use crate::stats::ErrorStats;
@@ -6,10 +6,10 @@ use crate::transform::TransformRecord;
 use serde::{Deserialize, Serialize};
 use vidar_core::{Duration, Trajectory, Warning};
 
-/// Errors of a trajectory, with what they rest on.
+/// Errors of a trajectory, and the basis of the comparison.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct TrajectoryReport {
-    /// Whose poses were compared.
+    /// The frame of the rig whose poses were compared.
     pub body: String,
     /// Number of pairs.
     pub matched: usize,
@@ -19,11 +19,11 @@ pub struct TrajectoryReport {
     pub truth_poses: usize,
     /// How much of both was compared.
     pub coverage: Coverage,
-    /// Absolute error after the best rigid motion, metres: what a metric method is judged by.
+    /// Absolute error after the best rigid motion, metres: the ATE of a metric method.
     pub ate_se3_m: Option<ErrorStats>,
-    /// Absolute error after the best similarity, metres: the shape alone.
+    /// Absolute error after the best similarity, metres: the ATE regardless of scale.
     pub ate_sim3_m: Option<ErrorStats>,
-    /// Absolute error with the worlds as given, metres: of use only when both share one.
+    /// Absolute error without alignment, metres: meaningful only when both share one world frame.
     pub ate_unaligned_m: Option<ErrorStats>,
     /// Angle between orientations after the rigid motion that fits the positions, degrees.
     pub orientation_se3_deg: Option<ErrorStats>,
@@ -47,14 +47,14 @@ pub struct TrajectoryReport {
     pub truth_from_estimate_se3: Option<TransformRecord>,
     /// The similarity alignment that was used.
     pub truth_from_estimate_sim3: Option<TransformRecord>,
-    /// What could not be determined and why.
+    /// Quantities that could not be determined, and why.
     pub warnings: Vec<Warning>,
 }
 
 /// How much of the two trajectories was compared.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Coverage {
-    /// Share of the estimate's poses that have a partner, 0…1.
+    /// Share of the estimate's poses that are matched, 0…1.
     pub estimate_ratio: f64,
     /// Share of the ground truth's time between matched poses that are not further apart than the gap, 0…1.
     pub truth_time_ratio: f64,

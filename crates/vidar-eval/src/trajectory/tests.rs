@@ -34,7 +34,7 @@ fn some_similarity(scale: f64) -> Sim3 {
     Sim3::new(So3::exp(&Vector3::new(0.4, -1.2, 2.0)), Vector3::new(5.0, -30.0, 1.0), scale).unwrap()
 }
 
-fn judge(estimate: &Trajectory, truth: &Trajectory) -> TrajectoryReport {
+fn evaluate(estimate: &Trajectory, truth: &Trajectory) -> TrajectoryReport {
     evaluate_trajectory(estimate, truth, &TrajectoryEvalConfig::default()).unwrap()
 }
 
@@ -42,7 +42,7 @@ fn judge(estimate: &Trajectory, truth: &Trajectory) -> TrajectoryReport {
 fn a_flight_told_in_another_world_and_unit_is_recovered_exactly() {
     let truth = along((0..200).map(|i| i * 50), flight);
     let estimate = moved(&truth, &some_similarity(0.8));
-    let report = judge(&estimate, &truth);
+    let report = evaluate(&estimate, &truth);
     assert_eq!(
         (report.matched, report.coverage.estimate_ratio, report.coverage.truth_time_ratio),
         (200, 1.0, 1.0)
@@ -61,7 +61,7 @@ fn a_flight_told_in_another_world_and_unit_is_recovered_exactly() {
 #[test]
 fn scale_errors_of_inverse_scales_are_equal() {
     let truth = along((0..100).map(|i| i * 50), flight);
-    let error = |s| judge(&moved(&truth, &some_similarity(s)), &truth).scale_error.unwrap();
+    let error = |s| evaluate(&moved(&truth, &some_similarity(s)), &truth).scale_error.unwrap();
     assert!((error(0.5) - error(2.0)).abs() < 1e-12);
     assert!(error(1.0) < 1e-12);
 }
@@ -81,7 +81,7 @@ fn coverage_tells_of_late_starts_holes_and_strays() {
     // Starts at 2 s, is lost from 5 s to 8 s, ends at 9 s; five poses lie after the truth's end.
     let times =
         (200..=900).filter(|i| !(501..800).contains(i)).map(|i| i * 10).chain((1100..1105).map(|i| i * 10));
-    let report = judge(&along(times, flight), &truth);
+    let report = evaluate(&along(times, flight), &truth);
     assert_eq!((report.matched, report.estimate_poses, report.truth_poses), (402, 407, 1001));
     assert!((report.coverage.estimate_ratio - 402.0 / 407.0).abs() < 1e-12);
     assert!((report.coverage.truth_time_ratio - 0.4).abs() < 1e-9);
@@ -99,7 +99,7 @@ fn straight_lines_stillness_and_two_poses_leave_blanks_and_never_nan() {
         along([0, 100], flight),
     );
     for trajectory in [&line, &rest, &pair] {
-        let report = judge(trajectory, trajectory);
+        let report = evaluate(trajectory, trajectory);
         assert_eq!(
             (report.ate_se3_m, report.ate_sim3_m, report.scale, report.scale_error),
             (None, None, None, None)
@@ -110,9 +110,9 @@ fn straight_lines_stillness_and_two_poses_leave_blanks_and_never_nan() {
         assert_eq!(report.ate_unaligned_m.unwrap().max, 0.0);
         assert!(report.rpe_frames.unwrap().translation_m.rmse < 1e-12);
     }
-    assert!(judge(&rest, &rest).rpe_metres.is_none());
+    assert!(evaluate(&rest, &rest).rpe_metres.is_none());
     let single = along([0], flight);
-    let report = judge(&single, &single);
+    let report = evaluate(&single, &single);
     assert_eq!((report.matched, report.rpe_frames, report.coverage.truth_time_ratio), (1, None, 1.0));
 }
 
@@ -200,7 +200,7 @@ fn every_setting_changes_something() {
 #[test]
 fn the_report_has_stable_keys() {
     let truth = along((0..100).map(|i| i * 50), flight);
-    let value = serde_json::to_value(judge(&truth, &truth)).unwrap();
+    let value = serde_json::to_value(evaluate(&truth, &truth)).unwrap();
     let keys: Vec<&str> = value.as_object().unwrap().keys().map(String::as_str).collect();
     let expected = "body matched estimate_poses truth_poses coverage ate_se3_m ate_sim3_m ate_unaligned_m \
                     orientation_se3_deg scale scale_error rpe_frames rpe_metres estimate_path_m truth_path_m \
@@ -230,7 +230,7 @@ proptest! {
             Se3::new(p.rotation, p.translation + Vector3::new((9.0 * t).sin(), (7.0 * t).cos(), (5.0 * t).sin()) * 0.05)
         });
         let motion = Sim3::from_se3(&Se3::new(So3::exp(&Vector3::from(turn)), Vector3::from(shift)));
-        let (a, b) = (judge(&wobbly, &truth), judge(&moved(&wobbly, &motion), &truth));
+        let (a, b) = (evaluate(&wobbly, &truth), evaluate(&moved(&wobbly, &motion), &truth));
         let close = |x: f64, y: f64| (x - y).abs() < 1e-9;
         prop_assert!(close(a.ate_se3_m.unwrap().rmse, b.ate_se3_m.unwrap().rmse));
         prop_assert!(close(a.ate_sim3_m.unwrap().rmse, b.ate_sim3_m.unwrap().rmse));
