@@ -7,8 +7,8 @@ Needs: pip install numpy safetensors numba
 
 The reference is what the official code does on a CPU, without and with numba, written from its behaviour: point maps of all pixels,
 a confidence threshold of a tenth of the smaller median, weights sqrt(c1 c2), five reweightings with Huber's loss at 0.1,
-float32 throughout. Both get the same depth, confidence and poses in memory; reading files is not timed. Given is
-processor time of all threads, so that a busy machine does not matter, and, for what it is worth, the best wall time. The scene is a
+float32 throughout. Both get the same depth, confidence and poses in memory; reading files is not timed. The output is
+processor time of all threads, which a busy machine affects little, and the best wall time. The scene is a
 wavy wall seen by a turning camera; the second chunk has a gauge of its own, smooth errors that neighbouring pixels share,
 and a share of pixels that are grossly off to one side (as behind edges and on glass).
 """

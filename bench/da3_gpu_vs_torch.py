@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Times Depth Anything 3 here against the official PyTorch code on one graphics processor, in turn, in one run.
 
-NOT YET RUN: prepared where no graphics processor was at hand. Read the first run's numbers as the script's own test too.
+NOT YET RUN: no GPU was available. The first run is also the test of this script.
 
     cargo build --release -p vidar-da3 --features gpu --example time_da3 --example check
     target/release/examples/check --device gpu --precision f32 --on-demand .../small_v2_42x56_full.safetensors   # parity first
@@ -10,7 +10,7 @@ NOT YET RUN: prepared where no graphics processor was at hand. Read the first ru
     venv/bin/python bench/da3_gpu_vs_torch.py --ours target/release/examples/time_da3 --out da3-gpu.json
 
 Both sides run the network's forward pass on the same number of pixels, pixels from and depth to the machine's memory
-included; weights are made up on both sides (time does not depend on them). Every engine has its own process; rounds go through
+included; weights are random on both sides (time does not depend on them). Every engine has its own process; rounds go through
 the engines in turn, the first two are warm-up. Reported are medians of wall seconds, their quartiles, and the most device memory
 held: for PyTorch what its allocator reserved, here the sum of buffers. Engines: torch-bf16 (autocast, head in f32, as the
 official code runs), torch-f32 (TF32 off), ours-bf16, ours-f16, ours-f32.

@@ -6,11 +6,11 @@
     venv/bin/pip install --no-deps depth-anything-3==0.1.1
     venv/bin/python bench/da3_vs_torch.py --ours target/release/examples/time_da3 --out da3.json
 
-Both sides run the network's forward pass on the same number of pixels with the same number of threads; weights are made
-up on both sides (time does not depend on them). For each model and number of views every engine gets its own process;
+Both sides run the network's forward pass on the same number of pixels with the same number of threads; weights are
+random on both sides (time does not depend on them). For each model and number of views every engine gets its own process;
 rounds go through the engines in turn, after warm-up rounds. Reported are medians of process CPU seconds and of wall
 seconds, and the process's largest memory beyond what it had with weights loaded. On a busy machine trust CPU seconds. The
-official code works its ray branch out and throws it away when it is not asked for; here it is skipped: the answers are
+official code computes its ray branch and discards it when it is not requested; here it is skipped: the results are
 the same. What a worker writes to standard error is shown when it ends early.
 
 Engines: torch-f32, torch-bf16 (autocast, which leaves the head in f32), torch-f32-avx2 (oneDNN, MKL and ATen held to AVX2);

@@ -7,10 +7,10 @@ Needs: pip install numpy scipy safetensors
 
 The reference is what the official code does on a CPU, written from its behaviour: Levenberg-Marquardt over the chunks' Sim(3)
 logarithms, damped with the diagonal, edges and their Jacobians by truncated series, J^T J by a sparse product, SciPy's direct
-solver, at most 30 iterations, refused ones counted. The official code builds the Jacobians with PyTorch; here all edges go through
+solver, at most 30 iterations, rejected ones counted. The official code builds the Jacobians with PyTorch; here all edges go through
 numpy at once, which is quicker. Three measurements: the same graph of 25 chunks and 16 loops on both sides; the same with 525
 nodes, as many as the coupled graph has; and the coupled graph itself (500 keyframes, 25 chunks), which the reference lacks.
-Time is processor time of all threads, so that a busy machine matters less, and the best round's wall time. The two answers to one
+Time is processor time of all threads, so that a busy machine matters less, and the best round's wall time. The two results of one
 graph are compared.
 """
 

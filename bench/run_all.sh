@@ -188,7 +188,7 @@ nano() {
 }
 
 # The example that compares stereo's confidence with the truth.
-STEREO_EXAMPLE=judge_views
+STEREO_EXAMPLE=evaluate_views
 
 step build cargo build --release -p vidar-cli
 for group in "${groups[@]}"; do
