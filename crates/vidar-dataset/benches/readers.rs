@@ -1,4 +1,4 @@
-//! How long it takes to read inertial csv and to decode an image: `cargo bench -p vidar-dataset`.
+//! Time to read an IMU csv file and to decode an image: `cargo bench -p vidar-dataset`.
 
 use divan::counter::{BytesCount, ItemsCount};
 use std::fmt::Write as _;

@@ -1,4 +1,4 @@
-//! From the words and numbers of calibration files to camera models.
+//! Builds camera models from the entries of calibration files.
 
 use crate::error::DatasetError;
 use nalgebra::Matrix4;
@@ -23,7 +23,7 @@ pub(crate) fn model_from_parts(
         found: format!("{camera:?} with distortion {distortion:?}"),
         expected: SUPPORTED,
     };
-    let count = |what: &str, found: usize, expected: &str| DatasetError::Garbage {
+    let count = |what: &str, found: usize, expected: &str| DatasetError::Malformed {
         path: path.to_path_buf(),
         line: 0,
         found: format!("{key}: {found} {what}"),
@@ -71,7 +71,7 @@ pub(crate) fn model_from_parts(
     }
 }
 
-/// How a matrix departs from a rigid motion, in numbers.
+/// Describes in numbers how a matrix deviates from a rigid transform.
 pub(crate) fn departure(m: &Matrix4<f64>) -> String {
     if m.iter().any(|v| !v.is_finite()) {
         return "a value that is not finite".into();
@@ -79,7 +79,7 @@ pub(crate) fn departure(m: &Matrix4<f64>) -> String {
     let r = m.fixed_view::<3, 3>(0, 0);
     let deviation = (r.transpose() * r - nalgebra::Matrix3::identity()).amax();
     format!(
-        "RᵀR departs from the identity by {deviation:.3e}, determinant {:.4}, last row {} {} {} {}",
+        "RᵀR deviates from the identity by {deviation:.3e}, determinant {:.4}, last row {} {} {} {}",
         r.determinant(),
         m[(3, 0)],
         m[(3, 1)],

@@ -1,4 +1,4 @@
-//! A camera in one word: `pinhole:fx,fy,cx,cy`, `radtan:…,k1,k2,p1,p2[,k3]`, `kb4:…,k1,k2,k3,k4`, `ds:…,xi,alpha`,
+//! A camera model as one command-line value: `pinhole:fx,fy,cx,cy`, `radtan:…,k1,k2,p1,p2[,k3]`, `kb4:…,k1,k2,k3,k4`, `ds:…,xi,alpha`,
 //! `fov:…,omega`.
 
 use crate::error::DatasetError;
@@ -6,7 +6,7 @@ use std::str::FromStr;
 use vidar_core::camera::{DoubleSphere, Equidistant, Fov, RadTan};
 use vidar_core::{CameraError, CameraModel, Pinhole};
 
-/// A camera model read from a flag. Its size is 0×0 until an image tells it, see [`with_size`].
+/// A camera model read from a flag. Its size is 0×0 until it is taken from an image, see [`with_size`].
 #[derive(Clone, Debug, PartialEq)]
 pub struct CameraFlag(pub CameraModel);
 
@@ -33,7 +33,7 @@ impl FromStr for CameraFlag {
     }
 }
 
-/// The model of a name and its numbers, size 0×0; `None` when the name or the count of numbers is unknown.
+/// The model with this name and these parameters, size 0×0; `None` for an unknown name or number of parameters.
 fn from_parameters(name: &str, numbers: &[f64]) -> Option<Result<CameraModel, CameraError>> {
     let (&[fx, fy, cx, cy], rest) = numbers.split_first_chunk::<4>()?;
     // The checks of `Pinhole::new` hold for any size; 1x1 stands in until the image is known.
@@ -96,7 +96,7 @@ mod tests {
     }
 
     #[test]
-    fn flags_that_are_no_camera_say_what_is_expected() {
+    fn invalid_camera_flags_are_refused_with_the_expected_form() {
         for text in [
             "",
             "pinhole",

@@ -1,12 +1,12 @@
-//! Faults of time and of inertial readings, found and named.
+//! Checks of timestamps and IMU samples. Each fault becomes a warning.
 
 use std::path::Path;
 use vidar_core::{Duration, ImuSample, Timestamp, Trajectory, Warning};
 
 /// A gap is longer than this many median steps …
 const GAP_STEPS: i64 = 3;
-/// … and than this: a dropped image or two at 20 Hz, and ten lost readings at 200 Hz, are within what odometry
-/// and interpolation bridge.
+/// … and than this: odometry and interpolation bridge one or two dropped images at
+/// 20 Hz, and ten lost IMU samples at 200 Hz.
 pub(crate) const IMAGE_GAP_FLOOR: Duration = Duration::from_millis(200);
 pub(crate) const IMU_GAP_FLOOR: Duration = Duration::from_millis(20);
 pub(crate) const POSE_GAP_FLOOR: Duration = Duration::from_millis(500);
@@ -43,7 +43,7 @@ pub(crate) fn put_in_order<T>(
     }
 }
 
-/// Names the gaps in strictly increasing times.
+/// Adds one warning for the gaps in strictly increasing times.
 pub(crate) fn find_gaps(
     times: impl Iterator<Item = Timestamp>,
     floor: Duration,
@@ -84,7 +84,7 @@ pub(crate) fn resting_norm(samples: &[(Timestamp, f64)]) -> Option<(f64, bool)> 
         let end = samples[from].0 + Duration::from_millis(1000);
         let until = from + samples[from..].partition_point(|s| s.0 < end);
         let window = &samples[from..until];
-        // A second that the recording cuts short, or of a few readings, proves nothing.
+        // An incomplete second, or one with few samples, is not enough for a mean.
         if until < samples.len() && window.len() >= 10 {
             let mean = mean(window);
             let variance = window.iter().map(|s| (s.1 - mean).powi(2)).sum::<f64>() / window.len() as f64;
@@ -101,7 +101,7 @@ fn mean(samples: &[(Timestamp, f64)]) -> f64 {
     samples.iter().map(|s| s.1).sum::<f64>() / samples.len() as f64
 }
 
-/// Checks that gravity has the right size.
+/// Checks the norm of gravity.
 pub(crate) fn check_gravity(norms: &[(Timestamp, f64)], place: &Path, notes: &mut Vec<Warning>) {
     let Some((norm, still)) = resting_norm(norms) else { return };
     if GRAVITY_RANGE_MPS2.contains(&norm) {
@@ -111,7 +111,7 @@ pub(crate) fn check_gravity(norms: &[(Timestamp, f64)], place: &Path, notes: &mu
     let guess = match norm {
         n if (0.8..1.2).contains(&n) => "; it looks like units of g",
         n if (800.0..1200.0).contains(&n) => "; it looks like units of mg",
-        n if n < 0.5 => "; gravity seems to have been taken out",
+        n if n < 0.5 => "; gravity seems to have been removed",
         _ => "",
     };
     let message = format!("mean |accel| {when} is {norm:.3} m/s², not 8.5 to 11{guess}");
@@ -119,20 +119,20 @@ pub(crate) fn check_gravity(norms: &[(Timestamp, f64)], place: &Path, notes: &mu
     notes.push(Warning::new("gravity-norm", message).at(place.display()).hint(hint));
 }
 
-/// Checks the readings of an IMU that are in order.
+/// Checks IMU samples, which must be in order of time.
 pub(crate) fn check_imu(imu: &[ImuSample], place: &Path, notes: &mut Vec<Warning>) {
-    find_gaps(imu.iter().map(|s| s.time), IMU_GAP_FLOOR, "imu-gap", "the inertial readings", place, notes);
+    find_gaps(imu.iter().map(|s| s.time), IMU_GAP_FLOOR, "imu-gap", "the IMU samples", place, notes);
     let norms: Vec<_> = imu.iter().map(|s| (s.time, s.accel.0.norm())).collect();
     check_gravity(&norms, place, notes);
     let fastest = imu.iter().map(|s| s.gyro.0.amax()).fold(0.0, f64::max);
     if fastest > GYRO_FULL_SCALE_RADPS {
         let message =
-            format!("gyroscope reads up to {fastest:.1} rad/s, more than 2000 °/s; it looks like °/s");
+            format!("the gyroscope measures up to {fastest:.1} rad/s, more than 2000 °/s; it looks like °/s");
         notes.push(Warning::new("gyro-range", message).at(place.display()));
     }
 }
 
-/// Checks that inertial readings surround every image.
+/// Checks that there are IMU samples before and after every image.
 pub(crate) fn check_imu_coverage(
     images: &[crate::dataset::ImageEntry],
     imu: &[ImuSample],
@@ -143,7 +143,7 @@ pub(crate) fn check_imu_coverage(
     let outside = images.iter().filter(|i| i.time < first.time || i.time > last.time).count();
     if outside > 0 {
         let message = format!(
-            "{outside} of {} images lie outside the inertial readings ({} to {} s)",
+            "{outside} of {} images lie outside the time of the IMU samples ({} to {} s)",
             images.len(),
             first.time,
             last.time
@@ -152,7 +152,7 @@ pub(crate) fn check_imu_coverage(
     }
 }
 
-/// Checks that images and a trajectory are of one time.
+/// Checks that images and a trajectory overlap in time.
 pub(crate) fn check_overlap(
     images: Option<(Timestamp, Timestamp)>,
     trajectory: &Trajectory,
@@ -175,20 +175,20 @@ pub(crate) fn check_overlap(
     notes.push(
         Warning::new("no-overlap", message)
             .at(place.display())
-            .hint("bring both files into one clock: the same unit and the same zero"),
+            .hint("give both files the same clock: the same unit and the same origin"),
     );
 }
 
-/// The factor of a thousand that would bring the ranges together, or the clock that starts at zero.
+/// The likely reason why the ranges do not overlap: a power of a thousand between the units, or a clock that starts at zero.
 fn slip_between(images: (Timestamp, Timestamp), poses: (Timestamp, Timestamp)) -> String {
     let secs = |r: (Timestamp, Timestamp)| (r.0.as_secs_f64(), r.1.as_secs_f64());
     let ((i0, i1), (p0, p1)) = (secs(images), secs(poses));
     for factor in [1e3, 1e6, 1e9] {
         if p0 * factor <= i1 && i0 <= p1 * factor {
-            return format!("; the poses' times times {factor:e} would fit: a unit slip");
+            return format!("; pose times multiplied by {factor:e} would fit: they are in another unit");
         }
         if p0 / factor <= i1 && i0 <= p1 / factor {
-            return format!("; the poses' times over {factor:e} would fit: a unit slip");
+            return format!("; pose times divided by {factor:e} would fit: they are in another unit");
         }
     }
     if p0.abs() < 1e3 && i0 > 1e8 {

@@ -1,4 +1,4 @@
-//! What every reader returns.
+//! The dataset that every reader returns.
 
 use crate::decode::{self, ImageLimits};
 use crate::error::{DatasetError, io_error};
@@ -49,7 +49,7 @@ pub struct DepthSensor {
     pub invalid: Vec<u16>,
 }
 
-/// One reading of an accelerometer that comes without a gyroscope (TUM RGB-D's `accelerometer.txt`).
+/// One sample of an accelerometer without gyroscope (TUM RGB-D's `accelerometer.txt`).
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct AccelSample {
     /// When.
@@ -58,9 +58,9 @@ pub struct AccelSample {
     pub accel: SpecificForce,
 }
 
-/// A metric trajectory that the user brought.
+/// A metric trajectory given by the user.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Anchor {
+pub struct ExternalTrajectory {
     /// The poses.
     pub trajectory: Trajectory,
     /// Their file.
@@ -76,7 +76,7 @@ pub enum CalibrationSource {
     Flags,
     /// What is published for this kind of dataset; a warning says so.
     DatasetDefault,
-    /// A guess from the size of the images; a warning says so. Nothing metric should rest on it.
+    /// A guess from the size of the images; a warning says so. It must not be used for metric results.
     Guessed,
 }
 
@@ -87,9 +87,9 @@ pub struct Dataset {
     pub name: String,
     /// Its layout.
     pub kind: DatasetKind,
-    /// Why this layout was decided.
+    /// Why this layout was chosen.
     pub reason: String,
-    /// The folder that paths are told relative to.
+    /// The folder that printed paths are relative to.
     pub root: PathBuf,
     /// Cameras and IMU.
     pub rig: Rig,
@@ -99,9 +99,9 @@ pub struct Dataset {
     pub calibration: CalibrationSource,
     /// Images, strictly increasing in time.
     pub images: Vec<ImageEntry>,
-    /// Inertial readings, strictly increasing in time.
+    /// IMU samples, strictly increasing in time.
     pub imu: Vec<ImuSample>,
-    /// Accelerometer readings without a gyroscope, strictly increasing in time.
+    /// Accelerometer samples without gyroscope, strictly increasing in time.
     pub accelerometer: Vec<AccelSample>,
     /// Depth images, strictly increasing in time.
     pub depths: Vec<DepthEntry>,
@@ -109,11 +109,11 @@ pub struct Dataset {
     pub depth_sensor: Option<DepthSensor>,
     /// Reference poses.
     pub ground_truth: Option<Trajectory>,
-    /// The metric trajectory the user brought.
-    pub anchor: Option<Anchor>,
+    /// The metric trajectory given by the user.
+    pub external_trajectory: Option<ExternalTrajectory>,
     /// A reference cloud of the scene (PLY).
     pub reference_cloud: Option<PathBuf>,
-    /// What was found and is not quite right.
+    /// Problems that were found.
     pub warnings: Vec<Warning>,
     /// Every text file that was read (lists, calibration, poses).
     pub text_files: Vec<PathBuf>,
@@ -162,13 +162,13 @@ impl Dataset {
 
     /// All sensors in the order of time, images loaded when their turn comes.
     ///
-    /// At equal times: IMU, ground truth, depth, image; so that an image finds everything of its moment known.
+    /// At equal times: IMU, ground truth, depth, image; so that everything with an image's time is known when the image arrives.
     pub fn events(&self) -> impl Iterator<Item = Result<vidar_core::SensorEvent, DatasetError>> + '_ {
         Events::new(self)
     }
 
-    /// What a digest of the dataset must cover: name and size of every image and depth image, and every byte of
-    /// every text file that was read. Two datasets with equal fingerprints read the same.
+    /// The bytes to hash for a fingerprint of the dataset: name and size of every image and depth image, and every byte of
+    /// every text file that was read. Two datasets with equal fingerprints give the same data.
     pub fn fingerprint(&self) -> Result<Vec<u8>, DatasetError> {
         let mut out = format!("vidar-dataset 1 {} camera {}\n", self.kind, self.camera).into_bytes();
         let images = self.images.iter().map(|e| (e.time, &e.path));
@@ -185,15 +185,15 @@ impl Dataset {
         Ok(out)
     }
 
-    /// The path as told to people: relative to the root where it lies inside.
+    /// The path as printed: relative to the root if it lies inside.
     pub fn relative(&self, path: &Path) -> String {
         path.strip_prefix(&self.root).unwrap_or(path).display().to_string()
     }
 }
 
 impl DepthSensor {
-    /// The same depth without distortion: nearest pixel, since depths must not be mixed across an edge. A ray keeps
-    /// its z-depth, so values stay as they are.
+    /// The same depth without distortion. Takes the nearest pixel, because depths must not be mixed across an edge. The
+    /// z-depth of a ray does not change, so values are copied.
     fn rectified(&self, metres: Image<f32>) -> Image<f32> {
         match &self.distorted {
             Some(model) => RemapTable::new(model, &self.intrinsics).apply_nearest(&metres, f32::NAN),
@@ -233,7 +233,7 @@ mod tests {
     use vidar_core::camera::RadTan;
 
     #[test]
-    fn distortion_of_a_depth_camera_is_taken_out() {
+    fn distortion_of_a_depth_camera_is_removed() {
         let intrinsics = Pinhole::new(110.0, 110.0, 79.5, 51.5, 160, 104).unwrap();
         let model = CameraModel::RadTan(RadTan::new(intrinsics, [-0.28, 0.07, 2e-4, 1.8e-5]).unwrap());
         let depth_along = |ray: &nalgebra::Vector3<f64>| 2.0 + ray.x + 0.5 * ray.y;

@@ -1,8 +1,8 @@
 //! Pixels from PNG and JPEG files of unknown origin.
 //!
-//! The header is judged before a pixel is allocated: each side, the decoded bytes and, for PNG, what the file's
-//! bytes can at most inflate to. A JPEG that ends before its end-of-image marker is refused, because the decoder
-//! would fill the rest with grey and a stereo matcher would believe it.
+//! The header is checked before a pixel is allocated: each side, the number of decoded bytes and, for PNG, the largest
+//! size that the compressed bytes can inflate to. A JPEG without end-of-image marker is refused: the decoder would fill
+//! the rest with grey, which a stereo matcher would take for image content.
 
 use crate::error::DatasetError;
 use crate::source::read_file_up_to;
@@ -11,7 +11,7 @@ use std::io::Cursor;
 use std::path::Path;
 use vidar_core::{FrameImage, Image};
 
-/// What an image file may at most claim.
+/// Limits on the size of an image file.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct ImageLimits {
     /// Largest width and height, pixels.
@@ -47,7 +47,7 @@ pub fn read_depth(path: &Path, limits: &ImageLimits) -> Result<Image<u16>, Datas
     }
 }
 
-/// The size that the header of an image file tells, columns and rows.
+/// The size in the header of an image file, columns and rows.
 pub fn read_size(path: &Path, limits: &ImageLimits) -> Result<(usize, usize), DatasetError> {
     // Headers may follow kilobytes of metadata, so the decoder decides how much it reads.
     let bytes = read_file_up_to(path, limits.max_file_bytes)?;
@@ -80,7 +80,7 @@ fn format_of(bytes: &[u8]) -> Result<Format, String> {
     }
 }
 
-/// A decoder whose claims were checked against the limits.
+/// A decoder whose header was checked against the limits.
 fn open_decoder<'a>(bytes: &'a [u8], limits: &ImageLimits) -> Result<Box<dyn ImageDecoder + 'a>, String> {
     let mut image_limits = image::Limits::default();
     image_limits.max_image_width = Some(limits.max_side_px);
@@ -105,12 +105,12 @@ fn open_decoder<'a>(bytes: &'a [u8], limits: &ImageLimits) -> Result<Box<dyn Ima
     }
     if width > limits.max_side_px || height > limits.max_side_px {
         let limit = limits.max_side_px;
-        return Err(format!("the header says {width}x{height} pixels; at most {limit} a side are read"));
+        return Err(format!("the header says {width}x{height} pixels; the limit is {limit} a side"));
     }
     let decoded = decoder.total_bytes();
     if decoded > limits.max_decoded_bytes {
         let limit = limits.max_decoded_bytes;
-        return Err(format!("{width}x{height} pixels need {decoded} bytes; at most {limit} are given"));
+        return Err(format!("{width}x{height} pixels need {decoded} bytes; the limit is {limit}"));
     }
     // EXPAND turns 1-bit grey into 8-bit and palettes into colour: at most 24 times what deflate delivers.
     if matches!(format, Format::Png)
@@ -125,7 +125,7 @@ fn open_decoder<'a>(bytes: &'a [u8], limits: &ImageLimits) -> Result<Box<dyn Ima
     Ok(decoder)
 }
 
-/// Decodes a PNG or JPEG held in memory; the error is the reason in words.
+/// Decodes a PNG or JPEG held in memory; the error is the reason as text.
 pub fn decode_image(bytes: &[u8], limits: &ImageLimits) -> Result<FrameImage, String> {
     if matches!(format_of(bytes)?, Format::Jpeg) && !jpeg_is_complete(bytes) {
         return Err(format!("truncated: {} bytes of JPEG without an end-of-image marker", bytes.len()));

@@ -1,14 +1,14 @@
-//! From what a reader found to a dataset that holds together: calibration, order, sizes, cuts, anchor.
+//! Completes the output of a reader to a consistent dataset: calibration, order, sizes, cuts, external trajectory.
 
+use crate::assemble::{cut, first_readable_size, guessed_model, keep_existing, name_of};
 use crate::camera_flag::with_size;
 use crate::checks::{self, IMAGE_GAP_FLOOR};
-use crate::dataset::{Anchor, CalibrationSource, Dataset, DepthEntry, DepthSensor, ImageEntry};
+use crate::dataset::{CalibrationSource, Dataset, DepthEntry, DepthSensor, ExternalTrajectory, ImageEntry};
 use crate::decode::{self, ImageLimits};
 use crate::error::DatasetError;
 use crate::options::{DatasetKind, OpenOptions};
 use crate::parse::{self, Source};
-use crate::plausible;
-use crate::settle::{cut, first_readable_size, guessed_model, keep_existing, name_of};
+use crate::rig_checks;
 use crate::source::read_file_up_to;
 use crate::trajectory_file::{self, ReadPoses};
 use crate::tum_rgbd;
@@ -18,7 +18,7 @@ use vidar_core::{
     StampedPose, Timestamp, Trajectory, Warning,
 };
 
-/// A camera of the dataset while its calibration is being put together.
+/// A camera of the dataset whose calibration is not complete yet.
 pub(crate) struct DraftCamera {
     /// N of `camN`.
     pub number: u32,
@@ -43,21 +43,21 @@ impl DraftCamera {
     }
 }
 
-/// What a reader knows of the depth camera.
+/// The depth camera, as a reader found it.
 pub(crate) struct DraftDepth {
     pub intrinsics: Option<[f64; 4]>,
-    /// The depth camera with its distortion, where the dataset knows one.
+    /// The depth camera with its distortion, if the dataset has one.
     pub distorted: Option<CameraModel>,
     pub units_per_metre: Option<f64>,
-    /// Raw units that this kind of dataset uses when nothing says otherwise.
+    /// Raw units of this kind of dataset, used when no file states them.
     pub default_units: f64,
     pub body_from_depth: Option<Se3>,
     pub invalid: Vec<u16>,
-    /// Whether the dataset promises depth in the colour camera's pixels.
+    /// Whether depth is registered to the colour camera.
     pub is_registered: bool,
 }
 
-/// What a reader found.
+/// The output of a reader.
 pub(crate) struct Draft {
     pub kind: DatasetKind,
     pub reason: String,
@@ -101,20 +101,20 @@ impl Draft {
         }
     }
 
-    /// Reads a text file and remembers that it belongs to the dataset.
+    /// Reads a text file and lists it among the files of the dataset.
     pub(crate) fn read(&mut self, path: &Path) -> Result<Vec<u8>, DatasetError> {
         let bytes = crate::source::read_text_file(path)?;
         self.text_files.push(path.to_path_buf());
         Ok(bytes)
     }
 
-    /// Puts everything together, in the order in which one thing needs another.
+    /// Completes the dataset. The order of the steps follows their dependencies.
     pub(crate) fn finish(mut self, options: &OpenOptions) -> Result<Dataset, DatasetError> {
         for path in &options.calibration {
             self.apply_calibration(path)?;
         }
-        let images = self.settle_images()?;
-        self.settle_model(options, &images)?;
+        let images = self.complete_images()?;
+        self.complete_model(options, &images)?;
         let chosen = CameraId(self.chosen as u32);
         let mut dataset = Dataset {
             name: name_of(&self.root),
@@ -130,14 +130,14 @@ impl Draft {
             depths: Vec::new(),
             depth_sensor: None,
             ground_truth: None,
-            anchor: None,
+            external_trajectory: None,
             reference_cloud: self.reference_cloud.take(),
             warnings: std::mem::take(&mut self.warnings),
             text_files: std::mem::take(&mut self.text_files),
         };
         let root = self.root.clone();
         let notes = &mut dataset.warnings;
-        checks::put_in_order(&mut dataset.imu, |s| s.time, "inertial readings", &root, notes);
+        checks::put_in_order(&mut dataset.imu, |s| s.time, "IMU samples", &root, notes);
         if !dataset.imu.is_empty() {
             checks::check_imu(&dataset.imu, &root, notes);
             checks::check_imu_coverage(&dataset.images, &dataset.imu, &root, notes);
@@ -146,12 +146,12 @@ impl Draft {
             CalibrationSource::File(path) => path,
             _ => &root,
         };
-        plausible::check_rig(&dataset.rig, self.chosen, &dataset.imu, place, notes);
-        checks::put_in_order(&mut dataset.accelerometer, |s| s.time, "accelerometer readings", &root, notes);
+        rig_checks::check_rig(&dataset.rig, self.chosen, &dataset.imu, place, notes);
+        checks::put_in_order(&mut dataset.accelerometer, |s| s.time, "accelerometer samples", &root, notes);
         let norms: Vec<_> = dataset.accelerometer.iter().map(|s| (s.time, s.accel.0.norm())).collect();
         checks::check_gravity(&norms, &root, notes);
-        self.settle_depth(options, &mut dataset)?;
-        self.read_anchor(options, &mut dataset)?;
+        self.complete_depth(options, &mut dataset)?;
+        self.read_external_trajectory(options, &mut dataset)?;
         let range = image_range(&dataset.images);
         if let Some((truth, place)) = self.ground_truth.take() {
             checks::check_overlap(range, &truth, "ground truth", &place, &mut dataset.warnings);
@@ -162,13 +162,13 @@ impl Draft {
     }
 
     /// Existing images in the order of time, numbered.
-    fn settle_images(&mut self) -> Result<Vec<ImageEntry>, DatasetError> {
+    fn complete_images(&mut self) -> Result<Vec<ImageEntry>, DatasetError> {
         let listed = self.images.len();
         let list = self.image_list.clone();
         let mut images = std::mem::take(&mut self.images);
         keep_existing(&mut images, "images", &list, &mut self.warnings)?;
         if images.is_empty() {
-            let found = format!("{listed} files named, none of them there with content");
+            let found = format!("{listed} files listed, none of them exists with content");
             let expected = "to read (PNG or JPEG)".to_string();
             return Err(DatasetError::NoImages { path: list, found, expected });
         }
@@ -183,7 +183,7 @@ impl Draft {
     }
 
     /// The chosen camera's model at the size of its images.
-    fn settle_model(&mut self, options: &OpenOptions, images: &[ImageEntry]) -> Result<(), DatasetError> {
+    fn complete_model(&mut self, options: &OpenOptions, images: &[ImageEntry]) -> Result<(), DatasetError> {
         let Some(first) = images.first() else { return Ok(()) };
         let size = first_readable_size(images)?;
         let camera = &mut self.cameras[self.chosen];
@@ -232,7 +232,7 @@ impl Draft {
     fn rig(&mut self) -> Rig {
         let mut rig = Rig { cameras: Vec::new(), imu: self.imu_noise };
         for camera in &self.cameras {
-            // A camera without model or size cannot project; only the chosen one is promised.
+            // A camera without model or size cannot project; only the chosen one must have both.
             let fallback = || self.cameras[self.chosen].model.clone();
             if let Some(model) = camera.model.clone().or_else(fallback) {
                 rig.cameras.push(RigCamera {
@@ -246,7 +246,7 @@ impl Draft {
         rig
     }
 
-    /// Takes what a calibration file says, EuRoC's or Kalibr's.
+    /// Applies a calibration file, EuRoC's or Kalibr's.
     pub(crate) fn apply_calibration(&mut self, path: &Path) -> Result<(), DatasetError> {
         let bytes = read_file_up_to(path, parse::yaml::MAX_YAML_BYTES as u64)?;
         self.text_files.push(path.to_path_buf());
@@ -291,7 +291,7 @@ impl Draft {
             self.warnings.push(
                 Warning::new(
                     "extrinsics-missing",
-                    format!("no place of cam{} on the IMU; {}", camera.number, "the one known before stands"),
+                    format!("no extrinsics of cam{}; {}", camera.number, "the earlier ones are kept"),
                 )
                 .at(path.display())
                 .hint("Kalibr writes T_cam_imu after its camera-imu calibration"),
@@ -304,7 +304,7 @@ impl Draft {
         camera.source = CalibrationSource::File(path.to_path_buf());
     }
 
-    fn settle_depth(&mut self, options: &OpenOptions, dataset: &mut Dataset) -> Result<(), DatasetError> {
+    fn complete_depth(&mut self, options: &OpenOptions, dataset: &mut Dataset) -> Result<(), DatasetError> {
         let Some(mut depth) = self.depth.take() else { return Ok(()) };
         let mut depths = std::mem::take(&mut self.depths);
         let notes = &mut dataset.warnings;
@@ -326,7 +326,7 @@ impl Draft {
                     notes.push(
                         Warning::new(
                             "depth-intrinsics",
-                            "no intrinsics of the depth camera; the colour camera's are used",
+                            "no intrinsics of the depth camera; those of the colour camera are used",
                         )
                         .at(self.root.display())
                         .hint("--depth-intrinsics fx,fy,cx,cy"),
@@ -335,7 +335,7 @@ impl Draft {
                 camera.model.intrinsics().resized(width, height).map_err(bad("depth intrinsics"))?
             }
         };
-        // Numbers given by hand describe images without distortion, and so does a model of another size.
+        // Intrinsics from a flag describe images without distortion, and so does a model of another size.
         let distorted = depth.distorted.take().filter(|model| {
             options.depth_intrinsics.is_none() && (model.width(), model.height()) == (width, height)
         });
@@ -343,7 +343,7 @@ impl Draft {
             Some(units) => units,
             None => {
                 let message = format!(
-                    "nothing tells the unit of depth; {} a metre, as usual for {}",
+                    "the unit of depth is not stated; assumed: {} per metre, as usual for {}",
                     depth.default_units, self.kind
                 );
                 notes.push(
@@ -361,7 +361,7 @@ impl Draft {
                     notes.push(
                         Warning::new(
                             "depth-extrinsics",
-                            "the depth camera is taken to be where the colour camera is",
+                            "no pose of the depth camera is given; assumed: that of the colour camera",
                         )
                         .at(self.root.display())
                         .hint("--color-from-depth"),
@@ -381,7 +381,11 @@ impl Draft {
         Ok(())
     }
 
-    fn read_anchor(&mut self, options: &OpenOptions, dataset: &mut Dataset) -> Result<(), DatasetError> {
+    fn read_external_trajectory(
+        &mut self,
+        options: &OpenOptions,
+        dataset: &mut Dataset,
+    ) -> Result<(), DatasetError> {
         let Some(path) = &options.trajectory else { return Ok(()) };
         let bytes = crate::source::read_text_file(path)?;
         let read = crate::TrajectoryReadOptions {
@@ -400,7 +404,7 @@ impl Draft {
             path,
             &mut dataset.warnings,
         );
-        dataset.anchor = Some(Anchor { trajectory, source: path.clone() });
+        dataset.external_trajectory = Some(ExternalTrajectory { trajectory, source: path.clone() });
         dataset.text_files.push(path.clone());
         Ok(())
     }

@@ -16,19 +16,19 @@ pub enum DatasetError {
         /// The system's reason.
         source: std::io::Error,
     },
-    /// Nothing that a reader knows lies at the path.
-    #[error("{} is no dataset that VIDAR knows: found {found}; expected {expected}", path.display())]
+    /// The path holds no known layout.
+    #[error("{} is not a known dataset layout: found {found}; expected {expected}", path.display())]
     UnknownLayout {
-        /// Where it was looked for.
+        /// The path that was searched.
         path: PathBuf,
-        /// What lies there.
+        /// What was found there.
         found: String,
-        /// What was looked for.
+        /// What was expected.
         expected: String,
     },
-    /// A text file does not hold what its format says.
+    /// A text file does not follow its format.
     #[error("{}:{line}: found {found}, expected {expected}", path.display())]
-    Garbage {
+    Malformed {
         /// Which file.
         path: PathBuf,
         /// Line, counted from 1; 0 when the whole file is meant.
@@ -39,7 +39,7 @@ pub enum DatasetError {
         expected: String,
     },
     /// The camera asked for is not in the dataset.
-    #[error("{} has no camera {camera}; it has {found}", path.display())]
+    #[error("{} has no camera {camera}; available: {found}", path.display())]
     MissingCamera {
         /// The dataset.
         path: PathBuf,
@@ -55,11 +55,11 @@ pub enum DatasetError {
         path: PathBuf,
         /// What was found instead.
         found: String,
-        /// What was wanted.
+        /// What was expected.
         expected: String,
     },
-    /// No usable pose is left.
-    #[error("{}: no usable pose: {found}", path.display())]
+    /// No valid pose is left.
+    #[error("{}: no valid pose: {found}", path.display())]
     NoPoses {
         /// Which file.
         path: PathBuf,
@@ -76,7 +76,7 @@ pub enum DatasetError {
         /// What is wrong.
         source: CameraError,
     },
-    /// The calibration names a model that VIDAR does not have.
+    /// The calibration names a model that VIDAR does not support.
     #[error("{}: {key}: camera model {found} is not supported; expected {expected}", path.display())]
     UnsupportedCamera {
         /// The calibration file.
@@ -98,7 +98,7 @@ pub enum DatasetError {
         path: PathBuf,
         /// Which entry.
         key: String,
-        /// How it departs.
+        /// How it deviates.
         found: String,
     },
     /// An image cannot be decoded.
@@ -123,8 +123,8 @@ pub enum DatasetError {
         /// Rows of the camera.
         expected_height: usize,
     },
-    /// A file is larger than a reader takes into memory.
-    #[error("{}: {found} bytes; at most {limit} bytes are read from such a file", path.display())]
+    /// A file is larger than a reader loads into memory.
+    #[error("{}: {found} bytes; the limit for such a file is {limit} bytes", path.display())]
     TooLarge {
         /// Which file.
         path: PathBuf,
@@ -143,14 +143,14 @@ pub enum DatasetError {
         /// Times known.
         times: usize,
     },
-    /// An option holds a value that cannot be.
+    /// An option has an invalid value.
     #[error("{option}: found {found}, expected {expected}")]
     BadOption {
         /// Which option.
         option: &'static str,
         /// The value.
         found: String,
-        /// What it may be.
+        /// The valid values.
         expected: String,
     },
 }

@@ -1,7 +1,7 @@
 //! EuRoC's ASL layout: `mav0/{cam0,imu0,state_groundtruth_estimate0,…}/{data.csv,data/,sensor.yaml}`.
 //!
-//! `T_BS` of each `sensor.yaml` maps sensor coordinates to the body. VIDAR's body is the IMU, so every place is told
-//! relative to `imu0`, which in EuRoC's own recordings is the body anyway.
+//! `T_BS` of each `sensor.yaml` maps sensor coordinates to the body. VIDAR's body is the IMU, so all sensor poses are
+//! converted to be relative to `imu0`, which in EuRoC's own recordings is the body.
 
 use crate::dataset::CalibrationSource;
 use crate::draft::{Draft, DraftCamera, DraftDepth};
@@ -15,26 +15,26 @@ use vidar_core::{
     BodyFrame, CameraModel, ImuNoise, LieGroup, Se3, StampedPose, Timestamp, Trajectory, Warning,
 };
 
-/// Where the layout lies and which camera the path itself names.
-pub(crate) struct Found {
+/// The folder of a detected layout and the camera that the path names.
+pub(crate) struct EurocLayout {
     root: PathBuf,
     camera: Option<u32>,
-    /// The path is one camera without anything beside it.
-    lone: bool,
+    /// The path is one camera folder without other sensors next to it.
+    is_single_camera: bool,
     reason: String,
 }
 
-/// Looks for the layout at `path`, in it, and around it.
-pub(crate) fn detect(path: &Path) -> Option<Found> {
-    let found = |root: &Path, camera, lone, reason: String| {
-        Some(Found { root: root.to_path_buf(), camera, lone, reason })
+/// Looks for the layout at `path`, in its subfolders and in its parent.
+pub(crate) fn detect(path: &Path) -> Option<EurocLayout> {
+    let found = |root: &Path, camera, is_single_camera, reason: String| {
+        Some(EurocLayout { root: root.to_path_buf(), camera, is_single_camera, reason })
     };
     if is_camera(path) {
         let name = path.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default();
         let number = camera_number(&name);
         return match path.parent() {
             Some(parent) if number.is_some() && parent.join("imu0").is_dir() => {
-                found(parent, number, false, format!("{name} lies beside imu0"))
+                found(parent, number, false, format!("{name} is next to imu0"))
             }
             _ => found(
                 path,
@@ -85,13 +85,13 @@ fn camera_numbers(root: &Path) -> Vec<u32> {
 }
 
 /// Reads the layout.
-pub(crate) fn open(path: &Path, found: Found, options: &OpenOptions) -> Result<Draft, DatasetError> {
-    let mut draft = Draft::new(DatasetKind::EurocAsl, &found.root, found.reason.clone());
+pub(crate) fn open(path: &Path, layout: EurocLayout, options: &OpenOptions) -> Result<Draft, DatasetError> {
+    let mut draft = Draft::new(DatasetKind::EurocAsl, &layout.root, layout.reason.clone());
     let body_from_imu = read_imu(&mut draft, options)?;
-    read_cameras(&mut draft, path, &found, &body_from_imu, options)?;
+    read_cameras(&mut draft, path, &layout, &body_from_imu, options)?;
     read_truth(&mut draft, &body_from_imu)?;
     read_depth(&mut draft, &body_from_imu, options)?;
-    draft.reference_cloud = Some(found.root.join("pointcloud0").join("data.ply")).filter(|p| p.is_file());
+    draft.reference_cloud = Some(layout.root.join("pointcloud0").join("data.ply")).filter(|p| p.is_file());
     Ok(draft)
 }
 
@@ -106,7 +106,7 @@ fn read_sensor(draft: &mut Draft, folder: &Path) -> Result<Option<(EurocSensor, 
     Ok(Some((sensor, path)))
 }
 
-/// Reads the IMU and returns where it sits on EuRoC's body.
+/// Reads the IMU and returns its pose on EuRoC's body.
 fn read_imu(draft: &mut Draft, options: &OpenOptions) -> Result<Se3, DatasetError> {
     let folder = draft.root.join("imu0");
     let list = folder.join("data.csv");
@@ -121,7 +121,7 @@ fn read_imu(draft: &mut Draft, options: &OpenOptions) -> Result<Se3, DatasetErro
     let sensor = read_sensor(draft, &folder)?.map(|(s, _)| s);
     draft.imu_noise = sensor.as_ref().and_then(|s| s.imu);
     if draft.imu_noise.is_none() {
-        let message = "no noise densities of the IMU; those of EuRoC's ADIS16448 are used";
+        let message = "the IMU's noise densities are not given; those of EuRoC's ADIS16448 are used";
         draft.warnings.push(
             Warning::new("imu-noise", message).at(folder.display()).hint("--calibration imu.yaml (Kalibr)"),
         );
@@ -133,12 +133,12 @@ fn read_imu(draft: &mut Draft, options: &OpenOptions) -> Result<Se3, DatasetErro
 fn read_cameras(
     draft: &mut Draft,
     path: &Path,
-    found: &Found,
+    layout: &EurocLayout,
     body_from_imu: &Se3,
     options: &OpenOptions,
 ) -> Result<(), DatasetError> {
-    let wanted = found.camera.unwrap_or(options.camera.0);
-    let numbers = if found.lone { vec![wanted] } else { camera_numbers(&found.root) };
+    let wanted = layout.camera.unwrap_or(options.camera.0);
+    let numbers = if layout.is_single_camera { vec![wanted] } else { camera_numbers(&layout.root) };
     if !numbers.contains(&wanted) {
         return Err(DatasetError::MissingCamera {
             path: path.to_path_buf(),
@@ -148,7 +148,11 @@ fn read_cameras(
     }
     draft.cameras.clear();
     for number in numbers {
-        let folder = if found.lone { found.root.clone() } else { found.root.join(format!("cam{number}")) };
+        let folder = if layout.is_single_camera {
+            layout.root.clone()
+        } else {
+            layout.root.join(format!("cam{number}"))
+        };
         let chosen = number == wanted;
         match read_camera(draft, &folder, number, body_from_imu) {
             Ok(camera) if chosen || camera.model.is_some() => {
@@ -167,9 +171,11 @@ fn read_cameras(
         }
     }
     if draft.cameras.get(draft.chosen).is_some_and(|c| c.number as usize != draft.chosen) {
-        let message =
-            format!("cam{wanted} is camera {} of the rig, as cameras before it are missing", draft.chosen);
-        draft.warnings.push(Warning::new("camera-renumbered", message).at(found.root.display()));
+        let message = format!(
+            "cam{wanted} becomes camera {} of the rig, because cameras with lower numbers are missing",
+            draft.chosen
+        );
+        draft.warnings.push(Warning::new("camera-renumbered", message).at(layout.root.display()));
     }
     Ok(())
 }
@@ -226,7 +232,7 @@ fn list_by_names(draft: &mut Draft, data: &Path) -> Result<Vec<(Timestamp, PathB
         .map(|name| {
             let time = Timestamp::parse_unit(crate::folder::stem(&name), 9).map_err(|_| {
                 let (found, expected) = (crate::source::quoted(&name), "a name that is a time in ns".into());
-                DatasetError::Garbage { path: data.to_path_buf(), line: 0, found, expected }
+                DatasetError::Malformed { path: data.to_path_buf(), line: 0, found, expected }
             })?;
             Ok((time, data.join(name)))
         })
@@ -250,7 +256,7 @@ fn read_truth(draft: &mut Draft, body_from_imu: &Se3) -> Result<(), DatasetError
         draft.ground_truth = Some((trajectory, list));
         return Ok(());
     }
-    // The file tells poses of its own sensor: world_from_sensor · sensor_from_body · body_from_imu.
+    // The file holds poses of its own sensor: world_from_sensor · sensor_from_body · body_from_imu.
     let sensor = read_sensor(draft, &folder)?;
     let body_from_sensor = sensor.and_then(|(s, _)| s.body_from_sensor).unwrap_or(Se3::IDENTITY);
     let sensor_from_imu = body_from_sensor.inverse() * *body_from_imu;

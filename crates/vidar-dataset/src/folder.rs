@@ -1,4 +1,4 @@
-//! Looking into folders: names in natural order, numbers in names, synthesised times.
+//! Contents of folders: names in natural order, numbers in names, synthesised times.
 
 use crate::error::{DatasetError, io_error};
 use std::cmp::Ordering;
@@ -22,7 +22,7 @@ pub(crate) fn images_in(folder: &Path) -> Result<Vec<String>, DatasetError> {
     Ok(names)
 }
 
-/// Compares runs of digits by value and everything else by character; ties by the plain text.
+/// Compares runs of digits by value and everything else by character; equal names are compared as plain text.
 pub(crate) fn natural_order(a: &str, b: &str) -> Ordering {
     let (mut x, mut y) = (a.as_bytes(), b.as_bytes());
     while let (Some(&p), Some(&q)) = (x.first(), y.first()) {
@@ -65,7 +65,7 @@ pub(crate) fn frame_number(name: &str) -> Option<u64> {
     stem.get(start..end).or_else(|| stem[..end].rsplit(|c: char| !c.is_ascii_digit()).next())?.parse().ok()
 }
 
-/// The rate at which frames without times are laid out, Hz.
+/// The rate assumed for frames without times, Hz.
 pub(crate) const SYNTHETIC_RATE_HZ: i64 = 30;
 
 /// Time of frame number `n` at 30 Hz.
@@ -74,12 +74,12 @@ pub(crate) fn synthetic_time(n: u64) -> Timestamp {
     Timestamp::from_nanos(i64::try_from(nanos).unwrap_or(i64::MAX))
 }
 
-/// What is said about synthesised times.
+/// The warning about synthesised times.
 pub(crate) fn synthetic_warning(place: &Path) -> Warning {
     Warning::new(
         "times-synthesised",
         format!(
-            "no times; frame numbers are laid out at {SYNTHETIC_RATE_HZ} Hz, so speeds and IMU mean nothing"
+            "no image times; they are made from frame numbers at {SYNTHETIC_RATE_HZ} Hz, so speeds and IMU data are meaningless"
         ),
     )
     .at(place.display())
@@ -102,7 +102,7 @@ pub(crate) fn first_file(folder: &Path, names: &[&str]) -> Option<PathBuf> {
     names.iter().map(|n| folder.join(n)).find(|p| p.is_file())
 }
 
-/// Longest step between neighbours that still lets a frame number be a time in seconds.
+/// Longest step between neighbours for which a frame number may be a time in seconds.
 pub(crate) const MAX_NAME_STEP: Duration = Duration::from_millis(10_000);
 
 #[cfg(test)]
@@ -110,7 +110,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn names_are_ordered_as_people_count() {
+    fn names_are_in_natural_order() {
         let mut names = vec!["img10.png", "img9.png", "img010.png", "Img1.PNG", "a", "img9a.png", ""];
         names.sort_by(|a, b| natural_order(a, b));
         assert_eq!(names, ["", "a", "Img1.PNG", "img9.png", "img9a.png", "img010.png", "img10.png"]);

@@ -25,7 +25,7 @@ pub(crate) fn detect(path: &Path) -> Option<(PathBuf, String)> {
             0 => None,
             n => Some((folder.clone(), format!("{n} images in {}", folder.display()))),
         }),
-        n => Some((path.to_path_buf(), format!("{n} images and no layout that VIDAR knows"))),
+        n => Some((path.to_path_buf(), format!("{n} images and no known layout"))),
     }
 }
 
@@ -55,7 +55,7 @@ pub(crate) fn open(
     Ok(draft)
 }
 
-/// The user's file of times, or one that lies there under a usual name.
+/// The user's file of times, or a file with a usual name in the folder.
 pub(crate) fn find_times(folder: &Path, options: &OpenOptions) -> Option<PathBuf> {
     let usual = ["timestamps.txt", "times.txt", "timestamps.csv", "times.csv"];
     options.timestamps.clone().or_else(|| first_file(folder, &usual))
@@ -89,12 +89,12 @@ pub(crate) fn images_by_list(
     let timed: Vec<_> =
         names.iter().filter_map(|n| Some((*by_name.get(n.as_str())?, folder.join(n)))).collect();
     if timed.len() < names.len() {
-        let message = format!("{} images have no time in the list; left out", names.len() - timed.len());
+        let message = format!("{} images have no time in the list; skipped", names.len() - timed.len());
         draft.warnings.push(Warning::new("time-missing", message).at(list.display()));
     }
     if timed.len() < by_name.len() {
-        let message = format!("{} files of the list are not there", by_name.len() - timed.len());
-        draft.warnings.push(Warning::new("image-missing", message).at(list.display()));
+        let message = format!("{} files of the list do not exist", by_name.len() - timed.len());
+        draft.warnings.push(Warning::degraded("image-missing", message).at(list.display()));
     }
     Ok(timed)
 }
@@ -127,7 +127,7 @@ fn times_from_stems(
     if stems.is_empty() || !stems.iter().all(is_number) {
         return None;
     }
-    // Whole numbers that begin low are frame numbers, not times, unless the user says a unit.
+    // Whole numbers that begin low are frame numbers, not times, unless the user gives a unit.
     let has_fraction = stems.iter().any(|s| s.contains('.'));
     let largest = stems.iter().filter_map(|s| s.parse::<f64>().ok()).fold(0.0, f64::max);
     if options.time_unit.is_none() && !has_fraction && largest < 1e9 {
@@ -148,7 +148,7 @@ fn times_from_stems(
     Some(times)
 }
 
-/// A matrix of intrinsics or an EuRoC or Kalibr file that lies beside the images.
+/// A matrix of intrinsics or an EuRoC or Kalibr file next to the images.
 fn read_intrinsics(draft: &mut Draft, folder: &Path) -> Result<(), DatasetError> {
     let matrices = ["K.txt", "intrinsics.txt", "camera-intrinsics.txt"];
     let root = draft.root.clone();

@@ -1,5 +1,6 @@
 #![doc = include_str!("../README.md")]
 
+mod assemble;
 mod calibration;
 pub mod camera_flag;
 mod checks;
@@ -13,9 +14,8 @@ mod folder;
 mod image_folder;
 mod options;
 pub mod parse;
-mod plausible;
 mod posed_folder;
-mod settle;
+mod rig_checks;
 mod seven_scenes;
 mod source;
 mod trajectory_file;
@@ -23,7 +23,8 @@ mod tum_rgbd;
 
 pub use camera_flag::{CameraFlag, with_size};
 pub use dataset::{
-    AccelSample, Anchor, CalibrationSource, DEPTH_TOLERANCE, Dataset, DepthEntry, DepthSensor, ImageEntry,
+    AccelSample, CalibrationSource, DEPTH_TOLERANCE, Dataset, DepthEntry, DepthSensor, ExternalTrajectory,
+    ImageEntry,
 };
 pub use error::DatasetError;
 pub use options::{DatasetKind, OpenOptions, TimeUnit, TrajectoryFormat, TrajectoryReadOptions};
@@ -32,9 +33,9 @@ pub use trajectory_file::{read_trajectory, trajectory_from};
 
 use std::path::Path;
 
-/// Opens the dataset at `path`: by the format the user names, else by looking at what lies there.
+/// Opens the dataset at `path`, in the format that the user names or else in the one that is detected.
 ///
-/// The layouts are tried from the most to the least particular; [`Dataset::reason`] tells what decided.
+/// Layouts are tried from the most to the least specific; [`Dataset::reason`] states why one was chosen.
 pub fn open(path: &Path, options: &OpenOptions) -> Result<Dataset, DatasetError> {
     options.validate()?;
     if !path.is_dir() {
@@ -57,7 +58,7 @@ pub fn open(path: &Path, options: &OpenOptions) -> Result<Dataset, DatasetError>
     Err(unknown(path, found))
 }
 
-/// Reads `path` as one kind; `None` when it does not look like it.
+/// Reads `path` as one kind; `None` when the path does not have that layout.
 fn try_kind(
     kind: DatasetKind,
     path: &Path,

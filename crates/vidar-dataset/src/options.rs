@@ -1,4 +1,4 @@
-//! What the user may say about a dataset.
+//! Options for reading datasets and trajectories.
 
 use crate::error::DatasetError;
 use std::fmt;
@@ -156,10 +156,10 @@ fn by_name<T: Copy>(
     })
 }
 
-/// What the user says about a dataset; everything may be left to the dataset itself.
+/// Options for opening a dataset. By default everything is taken from the dataset itself.
 #[derive(Clone, Debug, PartialEq)]
 pub struct OpenOptions {
-    /// The layout, where looking at the path would decide otherwise.
+    /// The layout; `None` detects it.
     pub format: Option<DatasetKind>,
     /// The camera whose images are read, as the dataset numbers it (`cam0`, `cam1`, …).
     pub camera: CameraId,
@@ -174,15 +174,15 @@ pub struct OpenOptions {
     pub depth_scale: Option<f64>,
     /// Maps points in the depth camera to the chosen colour camera.
     pub color_from_depth: Option<Se3>,
-    /// A metric trajectory of the same recording, to anchor the map.
+    /// A metric trajectory of the same recording, used as poses of the map.
     pub trajectory: Option<PathBuf>,
-    /// Its format, where looking at the file would decide otherwise.
+    /// Its format; `None` detects it.
     pub trajectory_format: Option<TrajectoryFormat>,
-    /// Whose poses it holds.
+    /// The body whose poses it holds.
     pub trajectory_body: Option<BodyFrame>,
     /// A file of image times (image folders).
     pub timestamps: Option<PathBuf>,
-    /// Unit of the times in image lists and file names, where their size would decide otherwise.
+    /// Unit of the times in image lists and file names; `None` detects it.
     pub time_unit: Option<TimeUnit>,
     /// Leaves out what is earlier than this after the first image.
     pub start: Option<Duration>,
@@ -245,11 +245,11 @@ impl OpenOptions {
 /// How to read a trajectory file.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct TrajectoryReadOptions {
-    /// The format; `None`: by looking at the file.
+    /// The format; `None` detects it.
     pub format: Option<TrajectoryFormat>,
-    /// Whose poses; `None`: what the file's header says, else the IMU for EuRoC csv and TUM and camera 0 for KITTI.
+    /// The body whose poses they are; `None`: that of the file's header, else the IMU for EuRoC csv and TUM, camera 0 for KITTI.
     pub body: Option<BodyFrame>,
-    /// Unit of time; `None`: what the format says, unless the size of the numbers speaks against it.
+    /// Unit of time; `None`: that of the format, unless the numbers are implausible in it.
     pub time_unit: Option<TimeUnit>,
     /// One time per pose, for KITTI files.
     pub times: Option<Vec<Timestamp>>,

@@ -14,7 +14,7 @@ use vidar_core::{BodyFrame, CameraId, CameraModel, StampedPose, Trajectory, Warn
 /// Looks for the layout at `path`.
 pub(crate) fn detect(path: &Path) -> Option<String> {
     let has = path.join("images").is_dir() && path.join("poses.txt").is_file();
-    has.then(|| "a folder images beside poses.txt".into())
+    has.then(|| "a folder images next to poses.txt".into())
 }
 
 /// Reads the layout.
@@ -61,7 +61,7 @@ fn read_poses(draft: &mut Draft) -> Result<(), DatasetError> {
     }
     let lost = poses.iter().filter(|p| p.is_none()).count();
     if lost > 0 {
-        let message = format!("{lost} poses hold NaN or infinity (tracking lost); left out");
+        let message = format!("{lost} poses contain NaN or infinity (tracking lost); skipped");
         draft.warnings.push(Warning::new("pose-not-finite", message).at(path.display()));
     }
     let mut stamped: Vec<StampedPose> = draft
@@ -80,7 +80,7 @@ fn read_poses(draft: &mut Draft) -> Result<(), DatasetError> {
     Ok(())
 }
 
-/// Depth images belong to the image of the same stem.
+/// A depth image belongs to the image with the same file stem.
 fn read_depth(draft: &mut Draft) -> Result<(), DatasetError> {
     let folder = draft.root.join("depth");
     if !folder.is_dir() {

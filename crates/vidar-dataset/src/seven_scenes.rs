@@ -1,6 +1,6 @@
 //! 7-Scenes: `frame-000000.color.png` (or `.jpg`), `.depth.png` in millimetres, `.pose.txt` with world_from_camera.
 //!
-//! The files hold no times (frames are laid out at 30 Hz) and only the depth camera's intrinsics. Poses are those of
+//! The files hold no times (30 Hz is assumed) and only the depth camera's intrinsics. Poses are those of
 //! the depth camera, metric, from KinectFusion.
 
 use crate::draft::{Draft, DraftDepth};
@@ -57,10 +57,10 @@ pub(crate) fn open(folder: &Path, reason: String, options: &OpenOptions) -> Resu
             poses.push((time, read_pose(&mut draft, &pose)?, pose));
         }
     }
-    // The layout has no place for times, so there is nothing to hint at.
+    // The layout has no file of times, so there is no hint to give.
     draft.warnings.push(Warning { hint: None, ..synthetic_warning(folder) });
-    settle_poses(&mut draft, poses)?;
-    settle_cameras(&mut draft, options)?;
+    complete_poses(&mut draft, poses)?;
+    complete_cameras(&mut draft, options)?;
     Ok(draft)
 }
 
@@ -70,7 +70,7 @@ fn read_pose(draft: &mut Draft, path: &Path) -> Result<Option<Se3>, DatasetError
     parse::single_pose(&Source { path, bytes: &bytes })
 }
 
-/// A tracker that stood within this of the origin may truly be there; further away an identity is a placeholder.
+/// An identity pose whose neighbours are within this distance of the origin may be real; otherwise it is a placeholder.
 const NEAR_ORIGIN_M: f64 = 0.25;
 const NEAR_ORIGIN_RAD: f64 = 0.35;
 
@@ -78,8 +78,8 @@ fn is_near_identity(pose: &Se3) -> bool {
     pose.translation.norm() < NEAR_ORIGIN_M && pose.rotation.log().norm() < NEAR_ORIGIN_RAD
 }
 
-/// Leaves out NaN poses and identities that are placeholders; the rest is the ground truth.
-fn settle_poses(
+/// Skips NaN poses and placeholder identities; the rest is the ground truth.
+fn complete_poses(
     draft: &mut Draft,
     poses: Vec<(Timestamp, Option<Se3>, PathBuf)>,
 ) -> Result<(), DatasetError> {
@@ -106,12 +106,12 @@ fn settle_poses(
     }
     if let Some(first) = skipped.first() {
         let message =
-            format!("{} poses are NaN or an identity far from their neighbours; left out", skipped.len());
+            format!("{} poses are NaN or an identity far from their neighbours; skipped", skipped.len());
         draft.warnings.push(Warning::new("pose-not-finite", message).at(first.display()));
     }
     if kept.is_empty() {
         if !poses.is_empty() {
-            let message = format!("none of {} poses is usable; there is no ground truth", poses.len());
+            let message = format!("none of {} poses is valid; there is no ground truth", poses.len());
             draft.warnings.push(Warning::new("no-poses", message).at(draft.root.display()));
         }
         return Ok(());
@@ -122,8 +122,8 @@ fn settle_poses(
     Ok(())
 }
 
-/// The colour camera is taken to be the depth camera unless the user knows better.
-fn settle_cameras(draft: &mut Draft, options: &OpenOptions) -> Result<(), DatasetError> {
+/// Uses the depth camera's model for the colour camera unless the user gives another.
+fn complete_cameras(draft: &mut Draft, options: &OpenOptions) -> Result<(), DatasetError> {
     let names = ["camera-intrinsics.txt", "intrinsics.txt", "K.txt"];
     let parent = draft.root.parent().map(Path::to_path_buf);
     let file = first_file(&draft.root, &names).or_else(|| first_file(&parent?, &names));
@@ -148,7 +148,7 @@ fn settle_cameras(draft: &mut Draft, options: &OpenOptions) -> Result<(), Datase
     };
     let from_user = options.camera_model.is_some() || !options.calibration.is_empty();
     if !from_user {
-        let message = "the colour camera is taken to be the depth camera; on a Kinect they are 2.5 cm and 10 % of focal length apart";
+        let message = "no calibration of the colour camera; that of the depth camera is used, although on a Kinect they differ by 2.5 cm and 10 % of focal length";
         draft.warnings.push(
             Warning::new("color-is-depth-camera", message)
                 .at(place.display())

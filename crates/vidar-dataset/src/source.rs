@@ -1,4 +1,4 @@
-//! Text files of unknown origin: bounded in size and line length, byte-order mark and CRLF found and named.
+//! Text files of unknown origin: bounded in size and line length, byte-order mark and CRLF detected.
 
 use crate::error::{DatasetError, io_error};
 use std::io::Read;
@@ -15,7 +15,7 @@ pub(crate) fn read_text_file(path: &Path) -> Result<Vec<u8>, DatasetError> {
     read_file_up_to(path, MAX_TEXT_BYTES)
 }
 
-/// Reads a file of at most `limit` bytes, whatever it holds.
+/// Reads a file of at most `limit` bytes.
 pub(crate) fn read_file_up_to(path: &Path, limit: u64) -> Result<Vec<u8>, DatasetError> {
     let file = std::fs::File::open(path).map_err(io_error(path))?;
     let found = file.metadata().map_err(io_error(path))?.len();
@@ -47,25 +47,25 @@ pub(crate) struct Row<'a> {
     pub text: &'a str,
 }
 
-/// The lines of a file, told apart.
+/// The rows and comments of a file.
 pub(crate) struct Lines<'a> {
     pub rows: Vec<Row<'a>>,
     /// The first comments, without their `#`.
     pub comments: Vec<&'a str>,
 }
 
-/// Comments kept for their content; a header has a few lines, a file of comments may have millions.
+/// Most comments that are kept; a header has a few lines, a file of comments may have millions.
 const MAX_COMMENTS: usize = 32;
 
 impl<'a> Source<'a> {
     /// An error about a line of this file.
-    pub(crate) fn garbage(
+    pub(crate) fn malformed(
         &self,
         line: usize,
         found: impl Into<String>,
         expected: impl Into<String>,
     ) -> DatasetError {
-        DatasetError::Garbage {
+        DatasetError::Malformed {
             path: self.path.to_path_buf(),
             line,
             found: found.into(),
@@ -73,11 +73,11 @@ impl<'a> Source<'a> {
         }
     }
 
-    /// The text without byte-order mark; UTF-16 is refused by name.
+    /// The text without byte-order mark; UTF-16 is refused.
     fn without_bom(&self, notes: &mut Vec<Warning>) -> Result<&'a [u8], DatasetError> {
         match self.bytes {
             [0xff, 0xfe, ..] | [0xfe, 0xff, ..] => {
-                Err(self.garbage(1, "UTF-16 text (its byte-order mark)", "UTF-8 text"))
+                Err(self.malformed(1, "UTF-16 text (its byte-order mark)", "UTF-8 text"))
             }
             [0xef, 0xbb, 0xbf, rest @ ..] => {
                 notes.push(
@@ -99,7 +99,7 @@ impl<'a> Source<'a> {
         std::str::from_utf8(bytes).map_err(|e| {
             let line =
                 1 + bytes.get(..e.valid_up_to()).unwrap_or_default().iter().filter(|&&b| b == b'\n').count();
-            self.garbage(line, "bytes that are not UTF-8", "UTF-8 text")
+            self.malformed(line, "bytes that are not UTF-8", "UTF-8 text")
         })
     }
 
@@ -111,11 +111,11 @@ impl<'a> Source<'a> {
             let line = index + 1;
             if raw.len() > MAX_LINE_BYTES {
                 let found = format!("a line of {} bytes", raw.len());
-                return Err(self.garbage(line, found, format!("at most {MAX_LINE_BYTES} bytes a line")));
+                return Err(self.malformed(line, found, format!("at most {MAX_LINE_BYTES} bytes a line")));
             }
             crlf |= raw.last() == Some(&b'\r');
             let text = std::str::from_utf8(raw)
-                .map_err(|_| self.garbage(line, "bytes that are not UTF-8", "UTF-8 text"))?
+                .map_err(|_| self.malformed(line, "bytes that are not UTF-8", "UTF-8 text"))?
                 .trim();
             if let Some(comment) = text.strip_prefix('#') {
                 if out.comments.len() < MAX_COMMENTS {
@@ -125,7 +125,7 @@ impl<'a> Source<'a> {
                 out.comments.push(text);
             } else if !text.is_empty() {
                 if out.rows.len() == MAX_ROWS {
-                    return Err(self.garbage(line, format!("more than {MAX_ROWS} rows"), "a shorter file"));
+                    return Err(self.malformed(line, format!("more than {MAX_ROWS} rows"), "a shorter file"));
                 }
                 out.rows.push(Row { line, text });
             }
@@ -142,7 +142,7 @@ impl<'a> Source<'a> {
     pub(crate) fn number(&self, row: &Row<'_>, field: &str, what: &str) -> Result<f64, DatasetError> {
         field
             .parse::<f64>()
-            .map_err(|_| self.garbage(row.line, quoted(field), format!("a number for {what}")))
+            .map_err(|_| self.malformed(row.line, quoted(field), format!("a number for {what}")))
     }
 }
 

@@ -1,4 +1,4 @@
-//! Trajectory files as [`Trajectory`] with a body that has a name.
+//! Trajectory files as [`Trajectory`], with the body whose poses they are.
 
 use crate::checks::{POSE_GAP_FLOOR, find_gaps, put_in_order};
 use crate::error::DatasetError;
@@ -10,7 +10,7 @@ use vidar_core::{BodyFrame, CameraId, StampedPose, Timestamp, Trajectory, Warnin
 
 /// Reads a trajectory file (TUM, EuRoC csv, KITTI).
 ///
-/// Poses come out strictly increasing in time; what had to be sorted, dropped or assumed is in the warnings.
+/// Poses are strictly increasing in time. Warnings report what was sorted, dropped or assumed.
 pub fn read_trajectory(
     path: &Path,
     options: &TrajectoryReadOptions,
@@ -31,27 +31,30 @@ pub fn trajectory_from(
     Ok((read.trajectory, read.notes))
 }
 
-/// What is said when neither the user nor the file tells whose poses they are.
+/// The warning when neither the user nor the file states whose poses they are.
 pub(crate) fn assumed_body(body: BodyFrame, path: &Path) -> Warning {
     let whose = match body {
         BodyFrame::Imu => "the IMU (body)".to_string(),
         BodyFrame::Camera(id) => format!("camera {id}"),
         BodyFrame::Other => "a tracked object that is neither IMU nor camera".to_string(),
     };
-    Warning::new("trajectory-body", format!("the trajectory is taken to be of {whose}"))
-        .at(path.display())
-        .hint("--trajectory-body body|cameraN says it for certain")
+    Warning::new(
+        "trajectory-body",
+        format!("it is not stated whose poses the trajectory holds; assumed: {whose}"),
+    )
+    .at(path.display())
+    .hint("--trajectory-body imu|camera0 sets the body")
 }
 
-/// A trajectory and how sure its body is.
+/// A trajectory, and whether its body is stated or assumed.
 pub(crate) struct ReadPoses {
     pub trajectory: Trajectory,
     pub notes: Vec<Warning>,
-    /// Neither the user nor the file said whose poses they are.
+    /// Neither the user nor the file states whose poses they are.
     pub body_is_assumed: bool,
 }
 
-/// Reads a trajectory without judging what it was called for.
+/// Reads a trajectory without a warning about an assumed body.
 pub(crate) fn read_poses(
     source: &Source<'_>,
     options: &TrajectoryReadOptions,
@@ -80,10 +83,10 @@ fn not_a_trajectory(source: &Source<'_>) -> DatasetError {
         return DatasetError::NoPoses { path: source.path.to_path_buf(), found: "an empty file".into() };
     }
     let expected = "rows of TUM (8 columns), EuRoC csv (4, 8, 11 or 17) or KITTI (12)";
-    source.garbage(1, "no trajectory that VIDAR knows", expected)
+    source.malformed(1, "no known trajectory format", expected)
 }
 
-/// The user's word, else the header's, else what the format's own tools write.
+/// The body given by the user, else that of the header, else that of the format's own tools.
 fn body_of(file: &PoseFile, format: TrajectoryFormat, given: Option<BodyFrame>) -> BodyFrame {
     let by_format = match (file.positions_only, format) {
         (true, _) => BodyFrame::Other,
@@ -93,7 +96,7 @@ fn body_of(file: &PoseFile, format: TrajectoryFormat, given: Option<BodyFrame>) 
     given.or(file.body).unwrap_or(by_format)
 }
 
-/// Gives every pose its time, and the poses their order.
+/// Assigns times to poses and sorts them.
 fn finish(
     path: &Path,
     file: PoseFile,

@@ -1,7 +1,7 @@
 //! TUM RGB-D: `rgb.txt`, `depth.txt`, `groundtruth.txt`, `accelerometer.txt`.
 //!
 //! Depth is registered to the colour camera, in units of 1/5000 m; poses are the colour camera's. The files hold no
-//! calibration: what the dataset's authors publish for each of the three cameras is used, and a warning says so.
+//! calibration: the calibration that the dataset's authors publish for each of the three cameras is used, with a warning.
 
 use crate::dataset::CalibrationSource;
 use crate::draft::{Draft, DraftDepth};
@@ -21,8 +21,8 @@ pub(crate) fn detect(path: &Path) -> Option<String> {
     let has = |n: &str| path.join(n).is_file();
     let beside = ["depth.txt", "groundtruth.txt", "accelerometer.txt"].into_iter().find(|n| has(n));
     match (has("rgb.txt"), beside) {
-        (true, Some(other)) => Some(format!("rgb.txt beside {other}")),
-        (true, None) if path.join("rgb").is_dir() => Some("rgb.txt beside a folder rgb".into()),
+        (true, Some(other)) => Some(format!("rgb.txt next to {other}")),
+        (true, None) if path.join("rgb").is_dir() => Some("rgb.txt next to a folder rgb".into()),
         _ => None,
     }
 }
@@ -51,7 +51,7 @@ pub(crate) fn open(path: &Path, reason: String, options: &OpenOptions) -> Result
         let (samples, notes) = parse::accelerometer_list(&Source { path: &list, bytes: &bytes }, rule)?;
         draft.warnings.extend(notes);
         draft.accelerometer = samples;
-        let message = "the accelerometer comes without a gyroscope, so it is no IMU; it tells gravity only";
+        let message = "the accelerometer has no gyroscope, so there is no IMU; it is used for gravity only";
         draft.warnings.push(Warning::new("imu-incomplete", message).at(list.display()));
     }
     let truth = path.join("groundtruth.txt");

@@ -1,4 +1,4 @@
-//! Calibrations as the usual tools write them, and ones that cannot be true.
+//! Calibrations as the usual tools write them, and implausible ones.
 
 #![allow(
     clippy::unwrap_used,
@@ -82,7 +82,7 @@ fn camera(dataset: &Dataset) -> &vidar_core::RigCamera {
 }
 
 #[test]
-fn kalibr_and_open_vins_tell_the_same_rig() {
+fn kalibr_and_open_vins_files_give_the_same_rig() {
     let (kalibr, open_vins) = (with(KALIBR, IMU).unwrap(), with(OPENVINS, IMU).unwrap());
     for d in [&kalibr, &open_vins] {
         assert_eq!(kinds(d), Vec::<&str>::new());
@@ -95,7 +95,7 @@ fn kalibr_and_open_vins_tell_the_same_rig() {
 }
 
 #[test]
-fn two_places_that_contradict_each_other_are_refused() {
+fn contradicting_extrinsics_are_refused() {
     let block = |text: &str, key: &str| {
         let lines: Vec<&str> = text.lines().collect();
         let at = lines.iter().position(|l| l.contains(key)).unwrap();
@@ -112,14 +112,14 @@ fn two_places_that_contradict_each_other_are_refused() {
 }
 
 #[test]
-fn the_head_file_of_open_vins_is_answered_with_what_to_give() {
+fn the_main_config_of_open_vins_is_refused_with_the_files_to_give() {
     let head = "%YAML:1.0\nverbosity: INFO\nuse_fej: true\nrelative_config_imu: kalibr_imu_chain.yaml\nrelative_config_imucam: kalibr_imucam_chain.yaml\n";
     let error = with(head, IMU).unwrap_err().to_string();
     assert!(error.contains("relative_config_imucam"), "{error}");
 }
 
 #[test]
-fn what_cannot_be_true_is_named() {
+fn implausible_values_are_reported() {
     let edited = |from: &str, to: &str| (KALIBR.replace(from, to), IMU.to_string());
     let noisy = |from: &str, to: &str| (KALIBR.to_string(), IMU.replace(from, to));
     let identity = "  - [1, 0, 0, 0]\n  - [0, 1, 0, 0]\n  - [0, 0, 1, 0]\n  - [0.0, 0.0, 0.0, 1.0]";
@@ -134,15 +134,15 @@ fn what_cannot_be_true_is_named() {
         ("calibration-distortion", "folds over", edited("-0.28340811, 0.07395907", "-0.28340811, -0.9")),
         ("imu-noise-range", "gyroscope noise 9.72", noisy("1.6968e-04", "0.0972")),
         ("imu-noise-range", "accelerometer noise 0.00e0", noisy("2.0e-3", "0.0")),
-        ("imu-noise-range", "never to change", noisy("1.9393e-05", "0.0")),
+        ("imu-noise-range", "never changes", noisy("1.9393e-05", "0.0")),
         ("imu-noise-range", "hardly", noisy("1.9393e-05", "0.03")),
-        ("imu-rate", "said to run at 800 Hz", noisy("update_rate: 200", "update_rate: 800")),
+        ("imu-rate", "an IMU rate of 800 Hz", noisy("update_rate: 200", "update_rate: 800")),
     ];
     for (kind, words, (camera, imu)) in cases {
         let d = with(&camera, &imu).unwrap();
         let found = d.warnings.iter().find(|w| w.kind == kind);
-        let told = found.map(|w| format!("{} {}", w.message, w.hint.clone().unwrap_or_default()));
-        assert!(told.as_ref().is_some_and(|t| t.contains(words)), "{kind}, {words}: {:?}", d.warnings);
+        let text = found.map(|w| format!("{} {}", w.message, w.hint.clone().unwrap_or_default()));
+        assert!(text.as_ref().is_some_and(|t| t.contains(words)), "{kind}, {words}: {:?}", d.warnings);
     }
 }
 

@@ -1,4 +1,4 @@
-//! Every fault is found and named: an error that says where and what, or a warning.
+//! Every fault of a recording is reported: an error with place and cause, or a warning.
 
 #![allow(
     clippy::unwrap_used,
@@ -26,7 +26,7 @@ fn fails<T: std::fmt::Debug>(result: Result<T, DatasetError>, parts: &[&str]) ->
 }
 
 #[test]
-fn what_is_no_dataset_is_refused_with_what_was_looked_for() {
+fn an_unknown_layout_is_refused_with_the_files_that_were_expected() {
     let f = Folder::new();
     fails(f.open(), &["an empty folder", "mav0/cam0/data.csv", "rgb.txt"]);
     f.write("readme.md", "hello");
@@ -44,7 +44,7 @@ fn a_missing_camera_names_those_there_are() {
 }
 
 #[test]
-fn a_camera_whose_forerunners_are_missing_is_renumbered_and_said() {
+fn a_camera_is_renumbered_with_a_warning_when_lower_numbers_are_missing() {
     let f = euroc();
     std::fs::rename(f.join("mav0/cam0"), f.join("mav0/cam1")).unwrap();
     let d = f.open_with(&OpenOptions { camera: CameraId(1), ..Default::default() }).unwrap();
@@ -64,7 +64,7 @@ fn a_broken_second_camera_does_not_stop_the_first() {
 }
 
 #[test]
-fn garbage_in_lists_is_told_with_file_and_line() {
+fn malformed_lists_are_reported_with_file_and_line() {
     let f = euroc();
     f.edit("mav0/imu0/data.csv", |s| s.replacen(",0.1,0,9.8\n", ",0.1,zero,9.8\n", 3));
     fails(f.open(), &["imu0/data.csv:2", "\"zero\"", "accel"]);
@@ -92,11 +92,11 @@ fn garbage_in_lists_is_told_with_file_and_line() {
 fn lists_without_images_are_an_error() {
     let f = euroc();
     f.write("mav0/cam0/data.csv", "#timestamp [ns],filename\n");
-    fails(f.open(), &["cam0/data.csv", "no image", "0 files named"]);
+    fails(f.open(), &["cam0/data.csv", "no image", "0 files listed"]);
     let f = euroc();
     std::fs::remove_dir_all(f.join("mav0/cam0/data")).unwrap();
     std::fs::create_dir(f.join("mav0/cam0/data")).unwrap();
-    fails(f.open(), &["10 files named", "none of them there"]);
+    fails(f.open(), &["10 files listed", "none of them exists"]);
 }
 
 #[test]
@@ -113,7 +113,7 @@ fn missing_and_empty_images_are_left_out_and_counted() {
 }
 
 #[test]
-fn truncated_images_fail_when_loaded_and_say_so() {
+fn truncated_images_fail_when_they_are_loaded() {
     let f = euroc();
     let d = f.open().unwrap();
     let whole = std::fs::read(&d.images[5].path).unwrap();
@@ -138,7 +138,7 @@ fn an_image_of_another_size_is_refused() {
 }
 
 #[test]
-fn disorder_duplicates_and_gaps_are_named() {
+fn unordered_times_duplicates_and_gaps_are_reported() {
     let f = euroc();
     f.edit("mav0/cam0/data.csv", |s| {
         let mut lines: Vec<&str> = s.lines().collect();
@@ -167,7 +167,7 @@ fn disorder_duplicates_and_gaps_are_named() {
 }
 
 #[test]
-fn unit_slips_are_read_right_and_named() {
+fn times_in_another_unit_are_corrected_with_a_warning() {
     for (digits, unit) in [(9, "s"), (6, "ms"), (3, "us")] {
         let f = euroc();
         // The same list with times in s, ms, µs: the decimal point moves left.
@@ -192,19 +192,19 @@ fn unit_slips_are_read_right_and_named() {
 }
 
 #[test]
-fn readings_that_are_not_finite_are_left_out() {
+fn imu_samples_that_are_not_finite_are_skipped() {
     let f = euroc();
     f.edit("mav0/imu0/data.csv", |s| {
         s.replacen("0.01,0,-0.01", "NaN,0,-0.01", 2).replacen("0.01,0,", "1e999,0,", 1)
     });
     let d = f.open().unwrap();
     assert_eq!(d.imu.len(), 117);
-    assert!(warning(&d, "reading-not-finite").message.starts_with("3 readings"));
+    assert!(warning(&d, "sample-not-finite").message.starts_with("3 samples"));
 }
 
 #[test]
-fn gravity_of_the_wrong_size_is_named_with_a_guess() {
-    for (accel, guess) in [("1.0", "units of g"), ("0.02", "taken out"), ("-19.0", "not 8.5 to 11")] {
+fn a_wrong_gravity_norm_is_reported_with_its_likely_cause() {
+    for (accel, guess) in [("1.0", "units of g"), ("0.02", "removed"), ("-19.0", "not 8.5 to 11")] {
         let f = euroc();
         f.edit("mav0/imu0/data.csv", |s| s.replace(",0.1,0,9.8", &format!(",0.01,0,{accel}")));
         let d = f.open().unwrap();
@@ -216,7 +216,7 @@ fn gravity_of_the_wrong_size_is_named_with_a_guess() {
 }
 
 #[test]
-fn crlf_and_byte_order_marks_are_read_and_named() {
+fn crlf_and_byte_order_marks_are_accepted_with_a_warning() {
     let f = euroc();
     f.edit("mav0/cam0/data.csv", |s| s.replace('\n', "\r\n"));
     f.edit("mav0/imu0/data.csv", |s| format!("\u{feff}{s}"));
@@ -228,7 +228,7 @@ fn crlf_and_byte_order_marks_are_read_and_named() {
 }
 
 #[test]
-fn images_and_trajectory_without_common_time_name_both_ranges_and_the_slip() {
+fn images_and_trajectory_without_common_time_report_both_ranges_and_the_likely_unit() {
     let f = euroc();
     let rows = |scale: f64, offset: f64| -> String {
         (0..10).map(|i| format!("{:.9} {i} 0 0 0 0 0 1\n", (offset + 0.05 * f64::from(i)) * scale)).collect()
@@ -236,7 +236,7 @@ fn images_and_trajectory_without_common_time_name_both_ranges_and_the_slip() {
     for (text, words) in [
         (rows(1.0, 0.0), "starts near zero"),
         (rows(1.0, 1_403_636_680.0), "no overlap"),
-        (rows(1e-3, 1_403_636_580.0), "unit slip"),
+        (rows(1e-3, 1_403_636_580.0), "another unit"),
     ] {
         f.write("t.txt", text);
         let d =
@@ -267,16 +267,16 @@ fn poses_of_a_lost_tracker_are_left_out_and_wrong_columns_are_an_error() {
     );
     assert!(notes.iter().any(|n| n.kind == "time-not-increasing"));
     fails(read(&format!("{good}1.2 0 0 0 0 0 0 2\n")), &["t.txt:3", "length 2.0000", "unit quaternion"]);
-    fails(read("1.0 nan 0 0 0 0 0 1\n"), &["no usable pose", "1 rows"]);
-    fails(read(""), &["no usable pose", "empty"]);
-    fails(read("hello world\n"), &["no trajectory that VIDAR knows"]);
+    fails(read("1.0 nan 0 0 0 0 0 1\n"), &["no valid pose", "1 rows"]);
+    fails(read(""), &["no valid pose", "empty"]);
+    fails(read("hello world\n"), &["no known trajectory format"]);
     fails(read("1.0 0 0 0 0 0 0 1\n1.1 0 0 0\n"), &["t.txt:2", "4 columns"]);
     fails(read(&"1 0 0 0 0 1 0 0 0 0 1 0\n".repeat(3)), &["3 poses", "0 times"]);
     fails(read("1 0 0 0 0 2 0 0 0 0 1 0\n"), &["t.txt:1", "rigid motion", "determinant 2"]);
 }
 
 #[test]
-fn calibration_that_cannot_be_is_told_with_its_key() {
+fn an_invalid_calibration_is_reported_with_its_key() {
     let with = |from: &str, to: &str| {
         let f = euroc();
         f.edit("mav0/cam0/sensor.yaml", |s| s.replace(from, to));
@@ -287,7 +287,7 @@ fn calibration_that_cannot_be_is_told_with_its_key() {
     fails(with("[10.0, 11.0, 7.5, 5.5]", "[10.0, 11.0, 7.5]"), &["3 intrinsics", "4: fu, fv, cu, cv"]);
     fails(with("[10.0, 11.0, 7.5, 5.5]", "[10.0, eleven, 7.5, 5.5]"), &["sensor.yaml:14", "eleven"]);
     fails(with("0.0, 0.0, 1.0, 0.3", "0.0, 0.0, -1.0, 0.3"), &["T_BS (line 4)", "determinant -1"]);
-    fails(with("1.0, 0.0, 0.0, 0.2", "1.5, 0.0, 0.0, 0.2"), &["T_BS", "departs from the identity"]);
+    fails(with("1.0, 0.0, 0.0, 0.2", "1.5, 0.0, 0.0, 0.2"), &["T_BS", "deviates from the identity"]);
     fails(with("0.0, 0.0, 0.0, 1.0]", "0.0, 1.0]"), &["14 numbers", "16 numbers"]);
     fails(with("[16, 12]", "[16, -12]"), &["resolution"]);
     fails(with("camera_model: pinhole", "camera_model: omni"), &["omni", "not supported"]);
@@ -307,11 +307,11 @@ fn calibration_that_cannot_be_is_told_with_its_key() {
     f.write("K.txt", "9 0 3.5 0 9");
     fails(f.open(), &["K.txt", "5 numbers"]);
     f.write("K.txt", "9 2 3.5 0 9 2.5 0 0 1");
-    fails(f.open(), &["no pinhole"]);
+    fails(f.open(), &["not a pinhole"]);
 }
 
 #[test]
-fn placeholder_poses_of_seven_scenes_are_skipped_and_an_honest_origin_is_kept() {
+fn placeholder_poses_of_seven_scenes_are_skipped_and_a_real_pose_at_the_origin_is_kept() {
     let f = seven_scenes();
     f.write("seq-01/frame-000002.pose.txt", "1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n");
     f.write("seq-01/frame-000004.pose.txt", "nan nan nan nan\n".repeat(4));
@@ -345,7 +345,7 @@ fn a_posed_folder_needs_one_pose_an_image() {
 }
 
 #[test]
-fn options_that_cannot_be_are_refused() {
+fn invalid_options_are_refused() {
     let f = euroc();
     fails(f.open_with(&OpenOptions { stride: 0, ..Default::default() }), &["stride", "1 or more"]);
     fails(f.open_with(&OpenOptions { depth_scale: Some(0.0), ..Default::default() }), &["depth scale"]);
@@ -355,12 +355,12 @@ fn options_that_cannot_be_are_refused() {
     let model = "pinhole:9,9,7,5".parse::<CameraFlag>().unwrap().0;
     let d = f.open_with(&OpenOptions { camera_model: Some(model), ..Default::default() }).unwrap();
     assert_eq!(d.rig.cameras[0].model.width(), 16);
-    // The place of the camera on the rig is still the file's.
+    // The camera's pose on the rig is still that of the file.
     assert_eq!(d.rig.cameras[0].body_from_camera.translation.x, 0.1);
 }
 
 #[test]
-fn tum_lists_in_nanoseconds_and_wrong_accelerometer_units_are_named() {
+fn tum_lists_in_nanoseconds_and_wrong_accelerometer_units_are_reported() {
     let f = tum();
     f.edit("rgb.txt", |s| s.replace(".5 rgb", "500000000 rgb"));
     f.edit("accelerometer.txt", |s| s.replace("-9.7", "-0.99"));

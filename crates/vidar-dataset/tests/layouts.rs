@@ -1,4 +1,4 @@
-//! Every layout as it should be.
+//! Every layout in its regular form.
 
 #![allow(
     clippy::unwrap_used,
@@ -137,7 +137,7 @@ fn tum_rgbd_opens_with_published_intrinsics_registered_depth_and_camera_poses() 
 }
 
 #[test]
-fn seven_scenes_depth_and_colour_cameras_can_be_told_apart() {
+fn seven_scenes_may_have_separate_depth_and_colour_cameras() {
     let f = seven_scenes();
     let options = OpenOptions {
         camera_model: Some("pinhole:523,523,3.5,2.5".parse::<CameraFlag>().unwrap().0),
@@ -182,7 +182,7 @@ fn an_image_folder_is_read_in_natural_order_whatever_the_case() {
 }
 
 #[test]
-fn files_of_times_are_understood_in_every_form() {
+fn files_of_times_are_read_in_every_form() {
     let forms = [
         ("t.txt", "1.5\n1.6\n1.7\n", 1_500_000_000),
         (
@@ -273,11 +273,11 @@ fn external_trajectories_are_read_in_three_formats() {
     ] {
         f.write(name, text);
         let d = f.open_with(&OpenOptions { trajectory: Some(f.join(name)), ..Default::default() }).unwrap();
-        let anchor = d.anchor.as_ref().unwrap();
-        assert_eq!((anchor.trajectory.len(), anchor.trajectory.body()), (10, body), "{name}");
-        assert_eq!(anchor.trajectory.poses()[3].time, d.images[3].time, "{name}");
-        assert_eq!(anchor.trajectory.poses()[3].world_from_body.translation.x, 3.0, "{name}");
-        // A header that names the body leaves nothing to assume.
+        let external = d.external_trajectory.as_ref().unwrap();
+        assert_eq!((external.trajectory.len(), external.trajectory.body()), (10, body), "{name}");
+        assert_eq!(external.trajectory.poses()[3].time, d.images[3].time, "{name}");
+        assert_eq!(external.trajectory.poses()[3].world_from_body.translation.x, 3.0, "{name}");
+        // A header that names the body needs no assumption.
         assert_eq!(kinds(&d).contains(&"trajectory-body"), name != "marked.txt");
     }
     let given = TrajectoryReadOptions {
@@ -305,7 +305,7 @@ fn names_of_options_are_read_back() {
 }
 
 #[test]
-fn the_format_flag_decides_against_the_look() {
+fn the_format_flag_overrides_detection() {
     let f = posed();
     let options = OpenOptions { format: Some(DatasetKind::ImageFolder), ..Default::default() };
     let d = f.open_with(&options).unwrap();
@@ -315,13 +315,13 @@ fn the_format_flag_decides_against_the_look() {
 }
 
 #[test]
-fn the_fingerprint_notices_every_kind_of_change() {
+fn the_fingerprint_changes_with_every_kind_of_change() {
     let f = euroc();
     let print = || f.open().unwrap().fingerprint().unwrap();
     let before = print();
     assert!(before == print(), "nothing changed");
     f.edit("mav0/imu0/data.csv", |s| s.replacen("0.01,0,-0.01", "0.02,0,-0.01", 1));
-    assert!(before != print(), "a reading changed");
+    assert!(before != print(), "an IMU sample changed");
     let then = print();
     f.write(&format!("mav0/cam0/data/{}.png", frame_ns(4)), [gray_png(16, 12, 9), vec![0; 9]].concat());
     assert!(then != print(), "an image changed");

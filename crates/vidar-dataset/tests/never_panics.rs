@@ -1,4 +1,4 @@
-//! Whatever the bytes, parsers return a value or an error.
+//! Parsers return a value or an error for any bytes.
 
 use proptest::prelude::*;
 use std::path::Path;

@@ -1,4 +1,4 @@
-//! The real recordings in `shared/data`, where they are there.
+//! The real recordings in `shared/data`, if they are present.
 
 #![allow(
     clippy::unwrap_used,
@@ -66,7 +66,7 @@ fn euroc_mh_01_opens_with_everything_it_has() {
 }
 
 #[test]
-fn events_of_the_real_flight_are_ordered_and_inertial_first() {
+fn events_of_the_real_flight_are_ordered_and_imu_samples_come_first() {
     let Some(path) = shared("euroc_MH_01_real_11s") else { return };
     let options = OpenOptions { end: Some(vidar_core::Duration::from_millis(500)), ..Default::default() };
     let d = open(&path, &options).unwrap();
@@ -75,11 +75,7 @@ fn events_of_the_real_flight_are_ordered_and_inertial_first() {
     assert!(events.windows(2).all(|w| w[0].time() <= w[1].time()));
     for w in events.windows(2) {
         if w[0].time() == w[1].time() {
-            assert!(
-                !matches!(w[1], SensorEvent::Imu(_)),
-                "an inertial reading comes first at {}",
-                w[0].time()
-            );
+            assert!(!matches!(w[1], SensorEvent::Imu(_)), "an IMU sample comes first at {}", w[0].time());
         }
     }
     assert_eq!(events.iter().filter(|e| matches!(e, SensorEvent::Image(_))).count(), 11);

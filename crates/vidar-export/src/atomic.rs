@@ -1,6 +1,6 @@
 //! Files that are either complete or absent.
 //!
-//! The bytes go to a temporary file beside the target, which takes the target's name only after everything was
+//! The bytes go to a temporary file next to the target, which is renamed to the target only after everything was
 //! written. A crash, a full disk or an error of the caller leaves the old file (or none) in place; the temporary
 //! file is removed on every failure that this process survives.
 
@@ -11,7 +11,7 @@ use std::io::{self, BufWriter, Write};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicU64, Ordering};
 
-/// How sure the file must be on the disk when the call returns.
+/// Durability of the file when the call returns.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Durability {
     /// Handed to the system: survives a crash of this process, not a power cut within seconds.
@@ -36,13 +36,13 @@ pub fn write_file_atomically(path: &Path, bytes: &[u8]) -> Result<(), ExportErro
     write_atomically(path, |w| w.write_all(bytes).map_err(|source| file_error("write", path, source)))
 }
 
-/// Writes `path` through `f`, all or nothing, as durably as asked.
+/// Writes `path` through `f`, all or nothing, with the given durability.
 pub fn write_atomically_with<T, E: From<ExportError>>(
     path: &Path,
     durability: Durability,
     f: impl FnOnce(&mut dyn Write) -> Result<T, E>,
 ) -> Result<T, E> {
-    let (temporary, file) = create_beside(path)?;
+    let (temporary, file) = create_sibling(path)?;
     // From here on the temporary file is removed unless the rename took it away.
     let guard = RemoveOnDrop(Some(temporary.clone()));
     let value = write_through(file, path, durability, f)?;
@@ -57,7 +57,7 @@ fn write_through<T, E: From<ExportError>>(
     durability: Durability,
     f: impl FnOnce(&mut dyn Write) -> Result<T, E>,
 ) -> Result<T, E> {
-    let mut writer = Remembering { inner: BufWriter::new(file), failure: None };
+    let mut writer = ErrorRecordingWriter { inner: BufWriter::new(file), failure: None };
     let outcome = f(&mut writer).and_then(|value| {
         writer.flush().map_err(|source| file_error("write", path, source))?;
         if durability == Durability::Device {
@@ -66,7 +66,7 @@ fn write_through<T, E: From<ExportError>>(
         Ok(value)
     });
     let failure = writer.failure.take();
-    // Dropping a BufWriter writes what it still holds; after a failure that must not be tried again.
+    // Dropping a BufWriter flushes its buffer; after a failure it must not do that.
     let (file, _unwritten) = writer.inner.into_parts();
     drop(file);
     match (outcome, failure) {
@@ -79,15 +79,15 @@ fn file_error(action: &'static str, path: &Path, source: io::Error) -> ExportErr
     ExportError::File { action, path: path.to_path_buf(), source }
 }
 
-/// Opens a new file in the folder of `path`, under a name nobody else uses.
-fn create_beside(path: &Path) -> Result<(PathBuf, File), ExportError> {
+/// Opens a new file in the folder of `path`, under an unused name.
+fn create_sibling(path: &Path) -> Result<(PathBuf, File), ExportError> {
     static COUNTER: AtomicU64 = AtomicU64::new(0);
     let Some(name) = path.file_name() else {
         let source = io::Error::new(io::ErrorKind::InvalidInput, "the path has no file name");
         return Err(file_error("create", path, source));
     };
     let mut last = io::Error::from(io::ErrorKind::AlreadyExists);
-    // A name can be taken only by the leavings of a dead process with this number; a few steps pass them.
+    // A name can only be in use by a leftover of an ended process with the same id; a few tries skip these.
     for _ in 0..64 {
         let mut temporary_name = OsString::from(".");
         temporary_name.push(name);
@@ -103,7 +103,7 @@ fn create_beside(path: &Path) -> Result<(PathBuf, File), ExportError> {
     Err(file_error("create", path, last))
 }
 
-/// Removes a file unless told to keep it.
+/// Removes a file on drop, unless it is kept.
 struct RemoveOnDrop(Option<PathBuf>);
 
 impl RemoveOnDrop {
@@ -115,20 +115,20 @@ impl RemoveOnDrop {
 impl Drop for RemoveOnDrop {
     fn drop(&mut self) {
         if let Some(path) = self.0.take() {
-            // Nothing more can be done about a temporary file that cannot be removed.
+            // If the temporary file cannot be removed, it is left there.
             let _ = fs::remove_file(path);
         }
     }
 }
 
-/// A writer that keeps its first failure, so that the path can be named whatever the caller made of it.
-struct Remembering<W> {
+/// A writer that stores its first failure, so that the error can name the path.
+struct ErrorRecordingWriter<W> {
     inner: W,
     failure: Option<io::Error>,
 }
 
-impl<W> Remembering<W> {
-    fn remember<T>(&mut self, result: io::Result<T>) -> io::Result<T> {
+impl<W> ErrorRecordingWriter<W> {
+    fn record_error<T>(&mut self, result: io::Result<T>) -> io::Result<T> {
         if let Err(error) = &result
             && self.failure.is_none()
             && error.kind() != io::ErrorKind::Interrupted
@@ -142,15 +142,15 @@ impl<W> Remembering<W> {
     }
 }
 
-impl<W: Write> Write for Remembering<W> {
+impl<W: Write> Write for ErrorRecordingWriter<W> {
     fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
         let result = self.inner.write(bytes);
-        self.remember(result)
+        self.record_error(result)
     }
 
     fn flush(&mut self) -> io::Result<()> {
         let result = self.inner.flush();
-        self.remember(result)
+        self.record_error(result)
     }
 }
 
@@ -184,7 +184,7 @@ mod tests {
     }
 
     #[test]
-    fn a_target_that_is_a_folder_is_left_alone() {
+    fn a_target_that_is_a_folder_is_not_changed() {
         let dir = tempfile::tempdir().unwrap();
         let target = dir.path().join("is-a-folder");
         fs::create_dir_all(target.join("x")).unwrap();
@@ -219,7 +219,7 @@ mod tests {
     }
 
     #[test]
-    fn a_path_that_cannot_be_written_is_named_with_the_reason() {
+    fn an_unwritable_path_is_reported_with_the_reason() {
         let dir = tempfile::tempdir().unwrap();
         let file = dir.path().join("file");
         fs::write(&file, "x").unwrap();
@@ -239,7 +239,7 @@ mod tests {
 
     #[cfg(target_os = "linux")]
     #[test]
-    fn a_full_device_is_named_even_when_the_caller_speaks_of_something_else() {
+    fn a_full_device_is_reported_even_if_the_caller_returns_another_error() {
         let path = Path::new("/somewhere/map.ply");
         for durability in [Durability::Process, Durability::Device] {
             let full = OpenOptions::new().write(true).open("/dev/full").unwrap();

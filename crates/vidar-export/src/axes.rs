@@ -1,4 +1,4 @@
-//! The only place where VIDAR's axes meet OpenGL's.
+//! Conversion between VIDAR's and OpenGL's axes; the only place where it is done.
 //!
 //! VIDAR: world z up; camera x right, y down, z forward (OpenCV). glTF: world y up. nerfstudio: world z up as here,
 //! camera x right, y up, z back.

@@ -67,7 +67,7 @@ impl<'a> Cursor<'a> {
         }
     }
 
-    /// A count of records of at least `least` bytes each, held against the bytes that are there.
+    /// A count of records of at least `least` bytes each, checked against the remaining bytes.
     pub fn count(&mut self, least: usize, what: &str) -> Result<usize, ExportError> {
         let count = self.u64(what)?;
         match usize::try_from(count).ok().filter(|&n| n.saturating_mul(least) <= self.remaining()) {

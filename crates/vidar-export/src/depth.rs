@@ -1,7 +1,7 @@
-//! 16-bit depth PNG with a JSON beside it that says what the numbers mean.
+//! 16-bit depth PNG with a JSON sidecar that defines scale, camera and poses.
 //!
-//! A pixel is `round(z · units_per_metre)`; 0 means no depth. What does not fit (further than 65535 units, nearer
-//! than half a unit) is written as 0 and counted: a clamped depth would be a false wall. NaN in memory becomes 0 and
+//! A pixel is `round(z · units_per_metre)`; 0 means no depth. Depths out of range (above 65535 units, below
+//! half a unit) are written as 0 and counted: a clamped depth would be a false wall. NaN in memory becomes 0 and
 //! 0 becomes NaN again.
 
 use crate::error::{ExportError, write_error};
@@ -17,17 +17,17 @@ pub const MILLIMETRES: f64 = 1000.0;
 /// The TUM RGB-D benchmark's scale, 0 to 13.1 m.
 pub const TUM_SCALE: f64 = 5000.0;
 
-/// Largest image read, pixels: 16384², above every sensor; a bound for files that lie about their size.
+/// Largest image read, pixels: 16384², above every sensor; a limit for files with a wrong header.
 const MAX_PIXELS: u64 = 1 << 28;
 
-/// What became of the pixels of a depth image.
+/// Counts of the pixels of a written depth image.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct DepthPngStats {
     /// Pixels with a depth in the file.
     pub written: usize,
     /// Pixels that had no depth.
     pub invalid: usize,
-    /// Pixels whose depth lies outside what the scale can tell; written as invalid.
+    /// Pixels whose depth is out of the range of the scale; written as invalid.
     pub clipped: usize,
 }
 
@@ -40,7 +40,7 @@ pub fn write_depth_png(
     check_units(FORMAT, units_per_metre)?;
     let image = depth.image();
     let (Ok(width), Ok(height)) = (u32::try_from(image.width()), u32::try_from(image.height())) else {
-        return Err(ExportError::unwritable(FORMAT, "the image", "a side is longer than 32 bits can tell"));
+        return Err(ExportError::unwritable(FORMAT, "the image", "a side exceeds 32 bits"));
     };
     if width == 0 || height == 0 {
         return Err(ExportError::unwritable(FORMAT, "the image", "it has no pixels"));
@@ -117,7 +117,7 @@ pub fn read_depth_png(bytes: &[u8], units_per_metre: f64) -> Result<MetricDepth,
         let found = format!("{width}x{height}");
         return Err(ExportError::malformed(FORMAT, "header", format!("at most {MAX_PIXELS} pixels"), found));
     }
-    // Rows are appended as they decode, so a header that lies costs no memory.
+    // Rows are appended as they are decoded, so a wrong header costs no memory.
     let mut depths = Vec::new();
     while let Some(row) = reader.next_row().map_err(broken)? {
         depths.extend(row.data().chunks_exact(2).map(|b| match u16::from_be_bytes([b[0], b[1]]) {
@@ -139,7 +139,7 @@ fn check_units(format: &'static str, units_per_metre: f64) -> Result<(), ExportE
     Err(ExportError::unwritable(format, format!("a scale of {units_per_metre} units per metre"), reason))
 }
 
-/// The JSON beside a folder of depth images: what the numbers mean, and whose they are.
+/// The JSON sidecar of a folder of depth images: scale, camera and poses.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct DepthSidecar {
@@ -149,7 +149,7 @@ pub struct DepthSidecar {
     pub scale: f64,
     /// `z`: distance along the optical axis, not along the ray.
     pub kind: DepthKind,
-    /// What one metre is called; always metres.
+    /// The unit of length; always metres.
     pub unit: LengthUnit,
     /// The pixel value that means "no depth"; always 0.
     pub invalid: u16,
@@ -163,7 +163,7 @@ pub struct DepthSidecar {
     pub frames: Vec<DepthFrame>,
 }
 
-/// What a depth is measured along.
+/// The direction along which depth is measured.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum DepthKind {

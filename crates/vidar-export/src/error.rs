@@ -1,4 +1,4 @@
-//! Why something cannot be written or read: where, what was found, what was expected.
+//! Errors of writing and reading files: place, found value, expected value.
 
 use std::io;
 use std::path::PathBuf;
@@ -8,7 +8,7 @@ use vidar_core::trajectory::TrajectoryError;
 /// Longest piece of a foreign file that an error repeats, characters.
 const QUOTED_CHARS: usize = 48;
 
-/// Why an export or the reading of one failed.
+/// Errors of writing or reading a file.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum ExportError {
@@ -37,9 +37,9 @@ pub enum ExportError {
         format: &'static str,
         /// Where: a line, a byte, an element.
         place: String,
-        /// What belongs there.
+        /// The expected content.
         expected: String,
-        /// What is there, shortened.
+        /// The content found, shortened.
         found: String,
     },
     /// The file is valid but uses a part of the format that VIDAR does not read.
@@ -49,12 +49,12 @@ pub enum ExportError {
         format: &'static str,
         /// Where.
         place: String,
-        /// What is used.
+        /// The unsupported part.
         feature: String,
         /// What to do instead.
         hint: &'static str,
     },
-    /// The data cannot be told in this format (not finite, inconsistent, too large).
+    /// The data cannot be represented in this format (not finite, inconsistent, too large).
     #[error("{format} cannot hold {what}: {reason}")]
     Unwritable {
         /// Which format.

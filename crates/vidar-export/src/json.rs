@@ -1,4 +1,4 @@
-//! JSON with the place in every error.
+//! JSON parsing with the position in every error.
 
 use crate::error::ExportError;
 use serde::de::DeserializeOwned;

@@ -1,16 +1,16 @@
 //! Trajectories, PLY, GLB, COLMAP, transforms.json and depth PNG, written and read back.
 //!
 //! Every writer takes any [`std::io::Write`]; [`atomic::write_atomically`] makes a file of it that is either complete
-//! or absent. Every reader takes untrusted bytes: it never panics, allocates in proportion to what is really
-//! there, and its error names the place.
+//! or absent. Every reader takes untrusted bytes: it never panics, allocates in proportion to the
+//! file size, and its error names the position.
 //!
 //! | Format | Frames and units | Kept | Lost |
 //! |---|---|---|---|
 //! | [TUM, EuRoC csv](trajectory) | `world_from_body`, the body named in a comment; m | time to 1 ns, pose to 1e-9 | – |
 //! | [KITTI](trajectory) | same, body and times in a second file; m | pose to 13 digits | – |
 //! | [PLY](ply) | world z up; m | every value | – |
-//! | [GLB](glb) | vertices in the world; a root node turns them y up | every value | – |
-//! | [depth PNG](depth) | z-depth, steps per metre in a sidecar | depth to half a step | what the scale cannot tell, counted |
+//! | [GLB](glb) | vertices in the world; a root node rotates them to y up | every value | – |
+//! | [depth PNG](depth) | z-depth, steps per metre in a sidecar | depth to half a step | depths out of range, counted |
 //! | [COLMAP](colmap) | `camera_from_world`; pixel corner is (0, 0) | views, points, colours | time, normals, confidence |
 //! | [transforms.json](transforms) | `world_from_camera`, OpenGL camera; pixel corner is (0, 0) | views, time | – |
 //!
@@ -19,14 +19,14 @@
 //!
 //! # Checked against other tools
 //!
-//! Once, by hand, on the small data of the tests (three vertices with all attributes, two views, two poses):
+//! Checked manually once, on the small data of the tests (three vertices with all attributes, two views, two poses):
 //! - pycolmap 4.2.1 loads the text and the binary model; 1000 random points project through it to VIDAR's pixels plus
 //!   (0.5, 0.5) within 1.2e-13 px; positions, colours and the error −1 are the same.
 //! - Open3D 0.20.0 reads positions, normals, colours, triangles of the PLY files (and `confidence` through its tensor
-//!   reader), and the GLB mesh turned y up with its colours as linear light. It was not asked to read a GLB of
-//!   points.
+//!   reader), and the GLB mesh turned y up with its colours as linear light. A GLB of points was not
+//!   checked.
 //! - evo 1.38.1 reads the TUM, EuRoC and KITTI files; positions and quaternions are the same.
-//! - Pillow's 16-bit PNG is read, and ours has its header byte for byte (a test).
+//! - Pillow's 16-bit PNG is read, and the written header is byte for byte the same (a test).
 
 pub mod atomic;
 mod axes;

@@ -101,7 +101,7 @@ impl<'a> Line<'a> {
     }
 }
 
-/// What stands between the columns of a line.
+/// The separator of columns in a line.
 #[derive(Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Separator {
     /// One or more blanks or tabs.

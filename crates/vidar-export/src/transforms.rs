@@ -1,9 +1,9 @@
 //! nerfstudio's `transforms.json`, also read by brush, instant-ngp and gsplat.
 //!
 //! - `transform_matrix` is `world_from_camera` with OpenGL camera axes (x right, y up, z back), metres, world z up.
-//! - Pixels count from the image's corner: 0.5 is added to the principal point on the way out, taken off on the way in.
-//! - `camera_model` is OPENCV with zero distortion, the name every reader knows. Equal intrinsics stand once at the
-//!   top, else in each frame.
+//! - Pixels count from the image's corner: 0.5 is added to the principal point on export, subtracted on import.
+//! - `camera_model` is OPENCV with zero distortion, which every reader supports. Equal intrinsics are written once at the
+//!   top, others in each frame.
 //! - `applied_transform` is the identity: the world is neither re-centred, rotated nor rescaled.
 //! - `frame_id` and `timestamp_ns` in each frame are VIDAR's; other readers ignore them.
 //! - NaN is refused in both directions (JSON has none).
@@ -27,18 +27,18 @@ const IDENTITY_3X4: [[f64; 4]; 3] = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0],
 /// Largest difference from a fixed entry (0, 1) that is still rounding of printed digits.
 const ENTRY_TOLERANCE: f64 = 1e-6;
 
-/// What a `transforms.json` holds that VIDAR knows.
+/// The supported content of a `transforms.json`.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Transforms {
     /// The posed images, in the order of the file, in the file's world.
     pub views: Vec<ImportedView>,
     /// The cloud to start a radiance field from, relative to the file.
     pub ply_path: Option<String>,
-    /// What was done to the original world before the file was written; VIDAR writes the identity.
+    /// Transform of the original world before the file was written; VIDAR writes the identity.
     pub applied_transform: [[f64; 4]; 3],
 }
 
-/// The document, as far as it is read; keys that are not listed are other tools'.
+/// The document, as far as it is read; other keys are ignored.
 #[derive(Debug, Deserialize)]
 struct RawFile {
     camera_model: Option<String>,
@@ -77,7 +77,7 @@ struct RawIntrinsics {
     p2: Option<f64>,
 }
 
-/// Writes the views; image names are relative to the file (nerfstudio's habit is `images/…`), and so is `ply_path`.
+/// Writes the views; image names are relative to the file (usually `images/…` for nerfstudio), and so is `ply_path`.
 pub fn write_transforms_json(
     mut w: impl Write,
     views: &[ExportView],
@@ -211,7 +211,7 @@ fn pinhole(own: &RawIntrinsics, shared: &RawIntrinsics, place: &str) -> Result<P
         }
     }
     let fx = either(own.fl_x, shared.fl_x, "fl_x")?;
-    // A lone fl_x means square pixels.
+    // fl_x without fl_y means square pixels.
     let fy = own.fl_y.or(own.fl_x).or(shared.fl_y).unwrap_or(fx);
     let (cx, cy) = (either(own.cx, shared.cx, "cx")?, either(own.cy, shared.cy, "cy")?);
     let side = |value: f64, key: &str| {

@@ -1,4 +1,4 @@
-//! The vertices of a cloud or of a mesh, seen alike by the writers.
+//! Common view of the vertices of a cloud or a mesh, for the writers.
 
 use crate::error::ExportError;
 use vidar_core::{PointCloud, TriangleMesh};
@@ -33,8 +33,8 @@ impl<'a> Vertices<'a> {
 
     /// Refuses attribute lists of other lengths and values that are not finite.
     ///
-    /// Viewers differ in what a NaN does to them (from a missing point to an endless bounding box), so none is
-    /// ever written; the caller drops such points knowingly.
+    /// Viewers handle NaN differently (from a missing point to an infinite bounding box), so it is never
+    /// written; the caller must remove such points.
     pub fn check(&self, format: &'static str) -> Result<(), ExportError> {
         let n = self.positions.len();
         let lengths = [
@@ -64,7 +64,7 @@ impl<'a> Vertices<'a> {
     }
 }
 
-/// Refuses triangles that name vertices which are not there.
+/// Refuses triangles with indices out of range.
 pub(crate) fn check_triangles(
     format: &'static str,
     triangles: &[[u32; 3]],

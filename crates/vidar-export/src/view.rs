@@ -1,10 +1,10 @@
-//! What COLMAP and nerfstudio need of a frame, and what can be read back of it.
+//! Frames as exported to COLMAP and nerfstudio, and as read from them.
 
 use crate::error::ExportError;
 use std::collections::BTreeSet;
 use vidar_core::{FrameId, Pinhole, Se3, Timestamp};
 
-/// An image with its place and its distortion-free camera, as radiance-field tools want it.
+/// An image with its pose and its pinhole camera, as radiance-field tools require.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ExportView {
     /// Which frame.
@@ -19,12 +19,12 @@ pub struct ExportView {
     pub intrinsics: Pinhole,
 }
 
-/// A view as a foreign model tells it; what the format does not hold is `None`.
+/// A view of another program's model; data that the format lacks is `None`.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ImportedView {
-    /// Which frame, if the file tells.
+    /// Which frame, if the file has it.
     pub frame_id: Option<FrameId>,
-    /// When it was taken, if the file tells (COLMAP never does).
+    /// When it was taken, if the file has it (COLMAP files never do).
     pub time: Option<Timestamp>,
     /// The image's path as written in the file.
     pub image_name: String,
@@ -52,7 +52,7 @@ pub(crate) fn pinhole_from_corner_origin(
     Pinhole::new(focal.0, focal.1, cx, cy, size.0, size.1)
 }
 
-/// Checks what every format needs: finite poses, valid intrinsics, names that are there and differ.
+/// Checks the requirements of every format: finite poses, valid intrinsics, unique non-empty names.
 pub(crate) fn check_views(format: &'static str, views: &[ExportView]) -> Result<(), ExportError> {
     let mut names = BTreeSet::new();
     let mut frames = BTreeSet::new();

@@ -1,4 +1,4 @@
-//! The bytes of small files, so that no format drifts unnoticed. Binary ones are put together here field by field
+//! The exact bytes of small files, so that changes of a format are noticed. Binary files are composed field by field
 //! from each format's specification, not copied from a run.
 #![allow(clippy::unwrap_used, clippy::panic)] // Helpers of tests may stop at the first surprise, as tests may.
 
@@ -13,7 +13,7 @@ fn text(bytes: Vec<u8>) -> String {
 }
 
 #[test]
-fn tum_looks_as_it_always_did() {
+fn tum_is_unchanged() {
     let expected = "\
 # world_from_body, body = camera0
 # vidar test
@@ -25,7 +25,7 @@ fn tum_looks_as_it_always_did() {
 }
 
 #[test]
-fn euroc_csv_looks_as_it_always_did() {
+fn euroc_csv_is_unchanged() {
     let expected = "\
 # world_from_body, body = camera0
 #timestamp [ns],p_RS_R_x [m],p_RS_R_y [m],p_RS_R_z [m],q_RS_w [],q_RS_x [],q_RS_y [],q_RS_z []
@@ -36,7 +36,7 @@ fn euroc_csv_looks_as_it_always_did() {
 }
 
 #[test]
-fn kitti_and_its_times_look_as_they_always_did() {
+fn kitti_and_its_times_are_unchanged() {
     let lines = text(written(|w| write_kitti(w, &small_trajectory())));
     let second: Vec<f64> = lines.lines().nth(1).unwrap().split(' ').map(|t| t.parse().unwrap()).collect();
     let expected = [0.0, -1.0, 0.0, 1.0, 1.0, 0.0, 0.0, -2.5, 0.0, 0.0, 1.0, 0.25];
@@ -50,7 +50,7 @@ fn kitti_and_its_times_look_as_they_always_did() {
 }
 
 #[test]
-fn ply_looks_as_it_always_did() {
+fn ply_is_unchanged() {
     let mesh = small_mesh();
     let mut expected = b"ply
 format binary_little_endian 1.0
@@ -91,7 +91,7 @@ end_header
 }
 
 #[test]
-fn glb_looks_as_it_always_did() {
+fn glb_is_unchanged() {
     let mesh = TriangleMesh { normals: vec![], confidences: vec![], ..small_mesh() };
     let json = concat!(
         r#"{"asset":{"version":"2.0","generator":"vidar","extras":{"#,
@@ -148,7 +148,7 @@ fn an_empty_cloud_is_a_valid_file_in_every_format() {
 }
 
 #[test]
-fn colmap_text_looks_as_it_always_did() {
+fn colmap_text_is_unchanged() {
     let dir = tempfile::tempdir().unwrap();
     write_colmap(dir.path(), ColmapFormat::Text, &small_views(), &cloud_of(&small_mesh())).unwrap();
     let read = |name: &str| std::fs::read_to_string(dir.path().join(name)).unwrap();
@@ -178,7 +178,7 @@ fn colmap_text_looks_as_it_always_did() {
 }
 
 #[test]
-fn colmap_binary_looks_as_it_always_did() {
+fn colmap_binary_is_unchanged() {
     let dir = tempfile::tempdir().unwrap();
     let views = &small_views()[..1];
     let cloud =
@@ -194,7 +194,7 @@ fn colmap_binary_looks_as_it_always_did() {
     let name = b"images/a.png\0".to_vec();
     let expected =
         [number(1), id(1), reals(&[1.0, 0.0, 0.0, 0.0]), reals(&[0.0; 3]), id(1), name, number(0)].concat();
-    // −0 and 0 are both an origin; the sign bit is not part of the promise.
+    // −0 and 0 are both an origin; the sign bit is not specified.
     assert_eq!(images.len(), expected.len());
     assert!(images.iter().zip(&expected).all(|(a, b)| a == b || (*a == 0x80 && *b == 0)));
     let points = [number(1), number(1), reals(&[1.0, 0.0, 0.5]), vec![1, 2, 3], reals(&[-1.0]), number(0)];
@@ -202,7 +202,7 @@ fn colmap_binary_looks_as_it_always_did() {
 }
 
 #[test]
-fn transforms_json_looks_as_it_always_did() {
+fn transforms_json_is_unchanged() {
     let file = text(written(|w| write_transforms_json(w, &small_views()[..1], Some("points.ply"))));
     let compact: String = file.split_whitespace().collect();
     let expected = concat!(
@@ -217,7 +217,7 @@ fn transforms_json_looks_as_it_always_did() {
 }
 
 #[test]
-fn a_depth_png_of_another_encoder_is_read_and_ours_has_its_header() {
+fn a_depth_png_of_another_encoder_is_read_and_the_written_header_is_the_same() {
     // Pillow 12: uint16 [[0, 1, 1000], [65535, 2500, 256]].
     let pillow = [
         0x89, 0x50, 0x4e, 0x47, 0x0d, 0x0a, 0x1a, 0x0a, 0x00, 0x00, 0x00, 0x0d, 0x49, 0x48, 0x44, 0x52, 0x00,

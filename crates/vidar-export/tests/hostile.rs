@@ -1,4 +1,4 @@
-//! Files that lie, end early or are garbage; and places that cannot be written.
+//! Invalid, truncated and random files, and paths that cannot be written.
 #![allow(clippy::unwrap_used, clippy::panic)] // Helpers of tests may stop at the first surprise, as tests may.
 
 mod common;
@@ -13,7 +13,7 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use vidar_core::{Image, MetricDepth, PointCloud, Timestamp};
 use vidar_export::*;
 
-/// Remembers the largest single request, so that "does not allocate" is a number.
+/// Records the largest single allocation.
 struct LargestRequest;
 
 static LARGEST: AtomicUsize = AtomicUsize::new(0);
@@ -41,21 +41,21 @@ unsafe impl GlobalAlloc for LargestRequest {
 static ALLOCATOR: LargestRequest = LargestRequest;
 
 /// All files of this test are small; the test harness and the PNG decoder's fixed buffers stay well below this.
-const MODEST_BYTES: usize = 4 << 20;
+const MAX_ALLOCATION_BYTES: usize = 4 << 20;
 
-fn assert_modest() {
+fn assert_small_allocations() {
     let largest = LARGEST.load(Ordering::Relaxed);
-    assert!(largest < MODEST_BYTES, "a request of {largest} bytes for a file of a few hundred");
+    assert!(largest < MAX_ALLOCATION_BYTES, "a request of {largest} bytes for a file of a few hundred");
 }
 
 type Reader = fn(&[u8]) -> Result<(), ExportError>;
 
-/// A small valid file, its reader, and whether a file cut anywhere can be told from a whole one.
+/// A small valid file, its reader, and whether truncation at any byte is detected.
 struct Sample {
     name: &'static str,
     bytes: Vec<u8>,
     read: Reader,
-    cut_is_seen: bool,
+    truncation_is_detected: bool,
 }
 
 fn colmap_file(format: ColmapFormat, name: &str) -> Vec<u8> {
@@ -74,7 +74,12 @@ fn samples() -> Vec<Sample> {
     let ascii_ply =
         b"ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n\
         element face 1\nproperty list uchar int vertex_indices\nend_header\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n";
-    let sample = |name, bytes, read: Reader, cut_is_seen| Sample { name, bytes, read, cut_is_seen };
+    let sample = |name, bytes, read: Reader, truncation_is_detected| Sample {
+        name,
+        bytes,
+        read,
+        truncation_is_detected,
+    };
     use ColmapFormat::{Binary, Text};
     vec![
         sample("tum", written(|w| write_tum(w, &trajectory, "note")), |b| read_tum(b).map(drop), false),
@@ -155,8 +160,8 @@ fn samples() -> Vec<Sample> {
     ]
 }
 
-/// An error of a reader says where, in words.
-fn assert_placed(name: &str, error: &ExportError) {
+/// An error of a reader has a position, an expected and a found value.
+fn assert_has_position(name: &str, error: &ExportError) {
     match error {
         ExportError::Malformed { place, expected, found, .. } => {
             assert!(!place.is_empty() && !expected.is_empty() && !found.is_empty(), "{name}: {error}");
@@ -170,17 +175,17 @@ fn assert_placed(name: &str, error: &ExportError) {
 }
 
 #[test]
-fn a_file_cut_at_any_byte_is_an_error_that_names_the_place() {
+fn a_file_truncated_at_any_byte_is_an_error_with_a_position() {
     for sample in samples() {
         (sample.read)(&sample.bytes).unwrap_or_else(|e| panic!("{}: {e}", sample.name));
         let mut refused = 0;
         for end in 0..sample.bytes.len() {
             match (sample.read)(&sample.bytes[..end]) {
                 Ok(()) => {
-                    assert!(!sample.cut_is_seen, "{} cut at byte {end} was taken for whole", sample.name)
+                    assert!(!sample.truncation_is_detected, "{} cut at byte {end} was accepted", sample.name)
                 }
                 Err(error) => {
-                    assert_placed(sample.name, &error);
+                    assert_has_position(sample.name, &error);
                     refused += 1;
                 }
             }
@@ -188,7 +193,7 @@ fn a_file_cut_at_any_byte_is_an_error_that_names_the_place() {
         // Text may be cut between lines, within a comment or through the digits of its last number; not elsewhere.
         assert!(refused > 10, "{}: {refused} of {}", sample.name, sample.bytes.len());
     }
-    assert_modest();
+    assert_small_allocations();
 }
 
 #[test]
@@ -200,20 +205,20 @@ fn no_changed_byte_makes_a_reader_panic_or_reserve_memory() {
             for value in [0, b'9', b'-', b'"', 0x7F, 0xFF, original ^ 1, original ^ 0x80] {
                 bytes[at] = value;
                 if let Err(error) = (sample.read)(&bytes) {
-                    assert_placed(sample.name, &error);
+                    assert_has_position(sample.name, &error);
                 }
             }
             bytes[at] = original;
         }
     }
-    assert_modest();
+    assert_small_allocations();
 }
 
 proptest! {
     #![proptest_config(ProptestConfig { cases: 128, failure_persistence: None, ..ProptestConfig::default() })]
 
     #[test]
-    fn garbage_behind_a_true_beginning_never_panics(
+    fn random_bytes_after_a_valid_beginning_never_panic(
         keep in 0.0..1.0,
         garbage in proptest::collection::vec(any::<u8>(), 0..64),
     ) {
@@ -222,25 +227,25 @@ proptest! {
             bytes.truncate((bytes.len() as f64 * keep) as usize);
             bytes.extend(&garbage);
             if let Err(error) = (sample.read)(&bytes) {
-                assert_placed(sample.name, &error);
+                assert_has_position(sample.name, &error);
             }
         }
-        assert_modest();
+        assert_small_allocations();
     }
 }
 
 fn refused<T: std::fmt::Debug>(result: Result<T, ExportError>, words: &[&str]) {
     let error = result.unwrap_err();
-    assert_placed("refused", &error);
+    assert_has_position("refused", &error);
     let text = error.to_string();
     for word in words {
         assert!(text.contains(word), "{word:?} is missing in: {text}");
     }
-    assert_modest();
+    assert_small_allocations();
 }
 
 #[test]
-fn counts_that_no_file_can_hold_cost_no_memory() {
+fn impossible_counts_cost_no_memory() {
     let vertex = "property float x\nproperty float y\nproperty float z\n";
     for encoding in ["ascii", "binary_little_endian", "binary_big_endian"] {
         for count in ["1000000000", "18446744073709551615"] {
@@ -298,7 +303,7 @@ fn glb_of(document: &str, binary: &[u8]) -> Vec<u8> {
 }
 
 #[test]
-fn a_glb_that_lies_or_repeats_itself_is_refused() {
+fn a_glb_with_wrong_or_repeated_data_is_refused() {
     let glb = |nodes: &str, roots: &str, count: u64, length: u64| {
         let document = format!(
             r#"{{"asset":{{"version":"2.0"}},"scene":0,"scenes":[{{"nodes":{roots}}}],"nodes":{nodes},
@@ -326,7 +331,7 @@ fn a_glb_that_lies_or_repeats_itself_is_refused() {
 }
 
 #[test]
-fn nonsense_in_text_names_its_line() {
+fn malformed_text_is_reported_with_its_line() {
     refused(read_tum(b"# c\n1 0 0 0 0 0 0 1\n2 0 0 nan 0 0 0 1\n"), &["line 3", "nan"]);
     refused(read_tum(b"1 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 1\n"), &["line 2", "after 1.000000000"]);
     refused(read_tum(b"1 0 0 0 0 0 0 2\n"), &["line 1", "length 2"]);
@@ -396,7 +401,7 @@ fn values_that_a_format_cannot_hold_are_refused_before_a_byte_is_written() {
 
 #[cfg(target_os = "linux")]
 #[test]
-fn every_writer_tells_of_a_full_device() {
+fn every_writer_reports_a_full_device() {
     let (trajectory, mesh, views) = (small_trajectory(), small_mesh(), small_views());
     let depth = MetricDepth::new(Image::filled(3, 3, 1.0));
     let sidecar = DepthSidecar::new(1000.0, &views[0].intrinsics, vec![]);
@@ -425,7 +430,7 @@ fn every_writer_tells_of_a_full_device() {
 }
 
 #[test]
-fn a_model_in_a_place_that_cannot_be_made_or_read_names_the_path() {
+fn a_model_at_an_invalid_path_is_reported_with_the_path() {
     let dir = tempfile::tempdir().unwrap();
     let file = dir.path().join("eine Datei ä");
     fs::File::create(&file).unwrap().write_all(b"x").unwrap();

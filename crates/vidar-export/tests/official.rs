@@ -1,4 +1,4 @@
-//! The official program's files: read from numpy, written for it, and held against its own numbers.
+//! The official program's files: read from numpy, written for it, and compared with its numbers.
 #![allow(clippy::unwrap_used, clippy::panic, clippy::print_stderr)] // Helpers of tests may stop at the first surprise, as tests may.
 
 use serde_json::Value;
@@ -46,12 +46,12 @@ fn written(write: impl FnOnce(&mut Cursor<Vec<u8>>)) -> Vec<u8> {
 }
 
 #[test]
-fn what_numpy_wrote_is_read() {
+fn files_of_numpy_are_read() {
     assert_eq!(read(&numpy_file()).unwrap(), known());
 }
 
 #[test]
-fn what_is_written_comes_back() {
+fn written_predictions_are_restored() {
     let whole = written(|w| write_npz(w, &known()).unwrap());
     assert_eq!(read(&whole).unwrap(), known());
     let mini = written(|w| write_mini_npz(w, &known()).unwrap());
@@ -68,7 +68,7 @@ fn what_is_written_comes_back() {
 }
 
 #[test]
-fn other_names_and_square_matrices_are_understood() {
+fn other_names_and_square_matrices_are_accepted() {
     let array = |shape: &[usize], data| NpyArray::new(shape.to_vec(), data).unwrap();
     let depth = array(&[1, 1, 2], NpyData::F64(vec![1.0, 2.0]));
     let square: Vec<f32> = (0..16).map(|i| i as f32).collect();
@@ -82,7 +82,7 @@ fn other_names_and_square_matrices_are_understood() {
 }
 
 #[test]
-fn contradictions_are_named() {
+fn contradictions_are_reported() {
     let floats = |shape: &[usize]| {
         NpyArray::new(shape.to_vec(), NpyData::F32(vec![1.0; shape.iter().product()])).unwrap()
     };
@@ -118,7 +118,7 @@ fn contradictions_are_named() {
 }
 
 #[test]
-fn a_bomb_is_not_inflated_and_damage_never_panics() {
+fn a_zip_bomb_is_not_inflated_and_damage_never_panics() {
     let zeros = NpyArray::new(vec![64 << 20], NpyData::U8(vec![0; 64 << 20])).unwrap();
     let bomb = written(|w| write_npz_arrays(w, &[("depth", &zeros)]).unwrap());
     assert!(bomb.len() < 1 << 20, "{}", bomb.len());
@@ -147,7 +147,7 @@ fn a_bomb_is_not_inflated_and_damage_never_panics() {
 struct Golden(BTreeMap<String, (Vec<usize>, Vec<u8>)>);
 
 impl Golden {
-    /// `None`, loudly, without the folder of shared data.
+    /// `None`, with a message, without the folder of shared data.
     fn open() -> Option<Self> {
         let default = concat!(env!("CARGO_MANIFEST_DIR"), "/../../../shared");
         let shared = std::env::var("VIDAR_SHARED").unwrap_or_else(|_| default.to_owned());
@@ -302,7 +302,7 @@ fn depth_pictures_have_the_official_colours() {
 }
 
 #[test]
-fn an_official_colmap_model_holds_what_it_should() {
+fn an_official_colmap_model_has_the_expected_content() {
     let folder = tempfile::tempdir().unwrap();
     let original = |name: &str| OriginalImage { name: name.to_owned(), width: 40, height: 60 };
     let originals = [original("a.png"), original("b c.png")];
@@ -312,7 +312,7 @@ fn an_official_colmap_model_holds_what_it_should() {
     assert_eq!(model.views.len(), 2);
     assert_eq!(model.views[1].image_name, "b c.png");
     let k = model.views[1].intrinsics;
-    // 4x3 to 40x60; COLMAP's corner origin is half a pixel from ours.
+    // 4x3 to 40x60; COLMAP's corner origin is half a pixel from VIDAR's.
     assert_eq!((k.fx, k.fy, k.cx, k.cy, k.width, k.height), (50.0, 120.0, 19.5, 29.5, 40, 60));
     assert!((model.views[1].world_from_camera.translation.x - 0.25).abs() < 1e-12);
     assert_eq!(model.points.len(), 12);
@@ -329,7 +329,7 @@ fn an_official_colmap_model_holds_what_it_should() {
 }
 
 #[test]
-fn single_view_networks_have_no_scene_and_say_why() {
+fn single_view_networks_have_no_scene_and_report_why() {
     let mut prediction = known();
     prediction.views.iter_mut().for_each(|v| v.intrinsics = None);
     let error = write_scene_glb(&mut Vec::new(), &prediction, &SceneOptions::default()).unwrap_err();

@@ -1,4 +1,4 @@
-//! What is written comes back: as properties over all formats, and with the conventions of other tools checked.
+//! Written data is restored: as properties over all formats, with the conventions of other tools checked.
 #![allow(clippy::unwrap_used, clippy::panic)] // Helpers of tests may stop at the first surprise, as tests may.
 
 mod common;
@@ -213,7 +213,7 @@ fn views_of_different_cameras_keep_their_own_intrinsics_in_transforms_json() {
 }
 
 #[test]
-fn glb_turns_the_world_by_its_root_node_and_leaves_vertices_alone() {
+fn glb_rotates_the_world_by_its_root_node_and_keeps_vertices() {
     let mesh = small_mesh();
     let bytes = written(|w| write_glb_mesh(w, &mesh, &[]));
     let length = u32::from_le_bytes(bytes[12..16].try_into().unwrap()) as usize;
@@ -232,7 +232,7 @@ fn glb_turns_the_world_by_its_root_node_and_leaves_vertices_alone() {
 }
 
 #[test]
-fn a_trajectory_file_without_a_named_body_is_of_an_unknown_one() {
+fn a_trajectory_file_without_body_has_an_unknown_body() {
     let t = read_tum(b"# timestamp tx ty tz qx qy qz qw\r\n1.5 1 2 3 0 0 0 1\r\n").unwrap();
     assert_eq!(t.body(), BodyFrame::Other);
     assert_eq!(t.poses()[0].time, Timestamp::from_nanos(1_500_000_000));
@@ -278,7 +278,7 @@ fn a_ply_of_another_tool_is_read_in_all_three_encodings() {
 }
 
 #[test]
-fn colmap_models_of_other_tools_are_read_and_distorted_ones_named() {
+fn colmap_models_of_other_tools_are_read_and_distorted_ones_refused() {
     let cameras = "# Number of cameras: 1\n3 SIMPLE_PINHOLE 64 48 100 32 24\n";
     let images = "# Number of images: 1, mean observations per image: 2\n\
                   9 2 0 0 0 1 2 3 3 a.png\n1.5 2.5 -1 3.5 4.5 17\n";

@@ -1,4 +1,4 @@
-//! Where a redirect leads: as much of RFC 3986 as a `Location` needs.
+//! Targets of redirects: the part of RFC 3986 that a `Location` header needs.
 
 /// The parts of an `http` or `https` address that matter here.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -10,9 +10,9 @@ pub(crate) struct Address {
 }
 
 impl Address {
-    /// Takes an absolute address apart; `None` for anything but http and https with a host.
+    /// Parses an absolute address; `None` for anything but http and https with a host.
     pub fn parse(text: &str) -> Option<Self> {
-        // What a browser would repair is refused: a hub does not send it.
+        // Addresses that a browser would repair are refused: a hub does not send them.
         if !text.chars().all(|c| c.is_ascii_graphic() && c != '\\') {
             return None;
         }
@@ -31,7 +31,7 @@ impl Address {
         Some(Self { scheme, authority: authority.to_ascii_lowercase(), path })
     }
 
-    /// The address that `location` names, seen from here.
+    /// The address of `location`, relative to this one.
     pub fn join(&self, location: &str) -> Option<Self> {
         if location.contains("://") && !location.starts_with(['/', '?']) {
             return Self::parse(location);
@@ -50,7 +50,7 @@ impl Address {
         Self::parse(&joined)
     }
 
-    /// Whether a token meant for `self` may be sent to `other`.
+    /// Whether a token for `self` may be sent to `other`.
     pub fn same_origin(&self, other: &Self) -> bool {
         (&self.scheme, &self.authority) == (&other.scheme, &other.authority)
     }
@@ -73,7 +73,7 @@ mod tests {
     use proptest::prelude::*;
 
     #[test]
-    fn locations_are_seen_from_where_they_were_said() {
+    fn locations_are_resolved_relative_to_their_address() {
         let here = Address::parse("https://Hub.example:8443/a/b/file?x=1#part").unwrap();
         let to = |location: &str| here.join(location).map(|a| a.to_string());
         assert_eq!(here.to_string(), "https://hub.example:8443/a/b/file?x=1");
@@ -93,7 +93,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn no_location_makes_it_panic_and_what_it_gives_can_be_parsed(location in ".{0,60}", tail in "[ -~]{0,40}") {
+        fn no_location_panics_and_every_result_can_be_parsed(location in ".{0,60}", tail in "[ -~]{0,40}") {
             let here = Address::parse("https://hub.example/a/b").unwrap();
             for text in [location.clone(), format!("//{tail}"), format!("http://{tail}"), tail.clone()] {
                 if let Some(address) = here.join(&text) {

@@ -1,8 +1,8 @@
-//! The official checkpoints of Depth Anything 3, as they lie on the hub.
+//! The official checkpoints of Depth Anything 3 on the hub.
 //!
-//! Sizes and hashes identify the official files: whatever else arrives under their name is refused. Where the hash of a
-//! file is not known here, the one that the hub announces (`X-Linked-ETag`) is used, and the record says so.
-//! `-1.1` checkpoints are trained anew after a mistake in training; their predecessors are kept for comparisons.
+//! Sizes and hashes identify the official files: any other file under their name is refused. Where the hash of a
+//! file is not known here, the one that the hub announces (`X-Linked-ETag`) is used, and the record states this.
+//! `-1.1` checkpoints were retrained after a training bug; their predecessors are kept for comparisons.
 
 use crate::error::HubError;
 use serde::{Deserialize, Serialize};
@@ -47,13 +47,13 @@ impl std::fmt::Display for Licence {
     }
 }
 
-/// What a checkpoint can tell about images.
+/// What a checkpoint can estimate from images.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Ability {
     /// Depth and confidence, consistent over many views, up to one scale.
     MultiViewDepth,
-    /// Where the cameras stand and what their lenses are, or depth for cameras that are known.
+    /// Poses and intrinsics of the cameras, or depth for known cameras.
     Cameras,
     /// Depth of one image in metres, given the focal length.
     MetricDepth,
@@ -64,7 +64,7 @@ pub enum Ability {
 }
 
 impl Ability {
-    /// In words.
+    /// As text.
     pub fn words(self) -> &'static str {
         match self {
             Self::MultiViewDepth => "multi-view depth",
@@ -79,11 +79,11 @@ impl Ability {
 /// One official file.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct OfficialFile {
-    /// Name in the repository and beside the weights.
+    /// Name in the repository and next to the weights.
     pub name: &'static str,
     /// Its length, where known.
     pub bytes: Option<u64>,
-    /// Its SHA-256 in small hexadecimal letters, where known.
+    /// Its SHA-256 as lower-case hexadecimal digits, where known.
     pub sha256: Option<&'static str>,
 }
 
@@ -111,9 +111,9 @@ pub struct Checkpoint {
     pub tensors: usize,
     /// `config.json`, then the weights.
     pub files: [OfficialFile; 2],
-    /// What it can tell.
+    /// What it can estimate.
     pub abilities: &'static [Ability],
-    /// What else one should know before choosing it.
+    /// Advice on when to choose it.
     pub note: &'static str,
 }
 
@@ -133,7 +133,7 @@ impl Checkpoint {
         format!("{}/{}", endpoint.trim_end_matches('/'), self.repo)
     }
 
-    /// Where a file of it lies on a hub: `{endpoint}/{repo}/resolve/{revision}/{file}`.
+    /// Address of one of its files on a hub: `{endpoint}/{repo}/resolve/{revision}/{file}`.
     pub fn url(&self, endpoint: &str, revision: &str, file: &str) -> String {
         format!("{}/resolve/{revision}/{file}", self.page(endpoint))
     }
@@ -198,7 +198,7 @@ pub const CHECKPOINTS: &[Checkpoint] = &[
             weights(1_336_734_448, Some("bbea5b0b3ee389849cffa7ddae89de064a90abd2b055fc5aa99aac68db324776")),
         ],
         abilities: METRIC,
-        note: "each image by itself; no confidence, no cameras; metres need the focal length",
+        note: "each image separately; no confidence, no cameras; metres need the focal length",
     },
     Checkpoint {
         name: "da3-mono-large",
@@ -210,7 +210,7 @@ pub const CHECKPOINTS: &[Checkpoint] = &[
         tensors: 406,
         files: [config(None, None), weights(1_336_734_448, None)],
         abilities: MONO,
-        note: "each image by itself; no confidence, no cameras",
+        note: "each image separately; no confidence, no cameras",
     },
     Checkpoint {
         name: "da3-large-1.1",
@@ -225,7 +225,7 @@ pub const CHECKPOINTS: &[Checkpoint] = &[
             weights(1_643_843_860, Some("739905c423cf0d6ccaf9e61a8401d82ba1ac32d7f4d3ee6dca8f92b377633f64")),
         ],
         abilities: ANY_VIEW,
-        note: "its page on the hub is reported to say Apache-2.0 where the authors' README says CC BY-NC 4.0; \
+        note: "its page on the hub is reported to state Apache-2.0, the authors' README states CC BY-NC 4.0; \
                the stricter one is taken",
     },
     Checkpoint {
@@ -283,7 +283,7 @@ pub const CHECKPOINTS: &[Checkpoint] = &[
             weights(6_759_558_100, Some("8ebe871a022ed58d2fc8fdfb2ebdb31d57b60fe39611c849095851a7b7c6020c")),
         ],
         abilities: NESTED,
-        note: "giant for the shape, metric-large for the scale",
+        note: "giant estimates the shape, metric-large the scale",
     },
     Checkpoint {
         name: "da3-nested-giant-large",
@@ -302,7 +302,7 @@ pub const CHECKPOINTS: &[Checkpoint] = &[
     },
 ];
 
-/// The checkpoint of that name. `DA3-SMALL`, `depth-anything/DA3-SMALL` and `da3metric-large` are understood too.
+/// The checkpoint of that name. `DA3-SMALL`, `depth-anything/DA3-SMALL` and `da3metric-large` are accepted, too.
 pub fn find(name: &str) -> Result<&'static Checkpoint, HubError> {
     let plain = |text: &str| {
         let last = text.rsplit('/').next().unwrap_or(text).to_lowercase();
@@ -344,7 +344,7 @@ mod tests {
     }
 
     #[test]
-    fn hashes_and_sizes_are_well_formed_and_tell_checkpoints_apart() {
+    fn hashes_and_sizes_are_well_formed_and_distinguish_checkpoints() {
         let mut seen = Vec::new();
         for checkpoint in CHECKPOINTS {
             assert_eq!([checkpoint.files[0].name, checkpoint.files[1].name], [CONFIG, WEIGHTS]);

@@ -1,7 +1,7 @@
-//! One request after the other, redirects followed by hand.
+//! HTTP requests one after the other; redirects are followed here, not by the HTTP library.
 //!
-//! By hand, because the hub tells hash and length of a file in the answer that redirects to its storage
-//! (`X-Linked-ETag`, `X-Linked-Size`), and because a token must not be carried to another host.
+//! The hub states hash and length of a file in the response that redirects to its storage (`X-Linked-ETag`,
+//! `X-Linked-Size`), and a token must not be sent to another host.
 
 use crate::address::Address;
 use crate::error::HubError;
@@ -11,50 +11,50 @@ use std::time::Duration;
 use ureq::Agent;
 use ureq::http::HeaderMap;
 
-/// More redirects than any hub needs.
+/// Limit on redirects, above what a hub needs.
 const MOST_REDIRECTS: usize = 10;
-/// More header than any hub sends, bytes.
+/// Limit on the size of headers, above what a hub sends, bytes.
 const MOST_HEADER: usize = 32 << 10;
-/// Characters of an answer's explanation that an error repeats.
+/// Characters of a response's explanation that an error message repeats.
 const MOST_DETAIL: usize = 120;
 
-/// How an attempt ended when it did not succeed.
+/// How an attempt failed.
 #[derive(Debug)]
 pub(crate) enum Failure {
     /// Another attempt may succeed, after this wait if the server named one.
-    Passing(HubError, Option<Duration>),
+    Temporary(HubError, Option<Duration>),
     /// No attempt will succeed.
     Final(HubError),
 }
 
-/// What the hub says about a file, gathered along its redirects.
+/// Metadata of a file in the hub's responses, gathered along its redirects.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
-pub(crate) struct Announced {
+pub(crate) struct FileMetadata {
     pub bytes: Option<u64>,
     pub sha256: Option<String>,
     pub revision: Option<String>,
 }
 
-/// A successful answer.
-pub(crate) struct Answer {
+/// A successful response.
+pub(crate) struct Response {
     pub status: u16,
     pub headers: HeaderMap,
-    pub announced: Announced,
+    pub metadata: FileMetadata,
     pub body: Box<dyn Read>,
 }
 
-/// Talks to one hub.
+/// HTTP client of one hub.
 pub(crate) struct Client<'a> {
     agent: Agent,
     settings: &'a HubSettings,
-    /// The repository's page, for those who lack access.
+    /// The repository's page, for error messages about missing access.
     page: String,
 }
 
 #[derive(Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Method {
     Head,
-    /// From this byte on.
+    /// Starting at this byte.
     Get(u64),
 }
 
@@ -76,19 +76,19 @@ impl<'a> Client<'a> {
         Self { agent: builder.build().new_agent(), settings, page }
     }
 
-    /// Asks for `url`, follows redirects, and tells success from failure.
-    pub fn ask(&self, method: Method, url: &str) -> Result<Answer, Failure> {
+    /// Requests `url` and follows redirects.
+    pub fn ask(&self, method: Method, url: &str) -> Result<Response, Failure> {
         let redirect = |reason: String| Failure::Final(HubError::Redirect { url: url.to_owned(), reason });
         let start = Address::parse(url).ok_or_else(|| redirect("not an http address".to_owned()))?;
-        let mut announced = Announced::default();
+        let mut metadata = FileMetadata::default();
         let mut visited = vec![start.clone()];
         let mut here = start.clone();
         loop {
             let response = self.send(method, &here, here.same_origin(&start))?;
             let status = response.status().as_u16();
-            gather(&mut announced, response.headers());
+            gather(&mut metadata, response.headers());
             if !matches!(status, 301 | 302 | 303 | 307 | 308) {
-                return self.finish(status, url, response, announced, here.same_origin(&start));
+                return self.finish(status, url, response, metadata, here.same_origin(&start));
             }
             let location =
                 response.headers().get("location").and_then(|v| v.to_str().ok()).unwrap_or_default();
@@ -98,7 +98,7 @@ impl<'a> Client<'a> {
                 return Err(redirect(format!("redirected from https to {next}")));
             }
             if visited.contains(&next) {
-                return Err(redirect(format!("redirected in a circle, back to {next}")));
+                return Err(redirect(format!("redirected in a loop, back to {next}")));
             }
             if visited.len() > MOST_REDIRECTS {
                 return Err(redirect(format!("redirected more than {MOST_REDIRECTS} times")));
@@ -132,7 +132,7 @@ impl<'a> Client<'a> {
                 ureq::Error::BadUri(_) | ureq::Error::Tls(_) | ureq::Error::InvalidProxyUrl => {
                     Failure::Final(error)
                 }
-                _ => Failure::Passing(error, None),
+                _ => Failure::Temporary(error, None),
             }
         })
     }
@@ -142,22 +142,22 @@ impl<'a> Client<'a> {
         status: u16,
         url: &str,
         response: ureq::http::Response<ureq::Body>,
-        announced: Announced,
+        metadata: FileMetadata,
         on_hub: bool,
-    ) -> Result<Answer, Failure> {
+    ) -> Result<Response, Failure> {
         let url = url.to_owned();
         let headers = response.headers().clone();
         match status {
             200 | 206 | 416 => {
                 let body: Box<dyn Read> = Box::new(response.into_body().into_reader());
-                Ok(Answer { status, headers, announced, body })
+                Ok(Response { status, headers, metadata, body })
             }
             401 | 403 => {
                 let detail = shortened(header(&headers, "x-error-message").unwrap_or_default());
                 let (page, with_token) = (self.page.clone(), self.settings.token.is_some());
                 let error = HubError::NoAccess { url, status, detail, page, with_token };
-                // A signed address of the storage that has run out is refused like this; the hub signs a new one.
-                Err(if on_hub { Failure::Final(error) } else { Failure::Passing(error, None) })
+                // The storage refuses an expired signed address with this status; the hub signs a new one.
+                Err(if on_hub { Failure::Final(error) } else { Failure::Temporary(error, None) })
             }
             404 | 410 => Err(Failure::Final(HubError::NotFound { url })),
             429 => {
@@ -166,10 +166,10 @@ impl<'a> Client<'a> {
                 let wait = retry_after_secs.map(Duration::from_secs);
                 Err(match wait.is_some_and(|w| w > self.settings.longest_wait) {
                     true => Failure::Final(error),
-                    false => Failure::Passing(error, wait),
+                    false => Failure::Temporary(error, wait),
                 })
             }
-            408 | 500.. => Err(Failure::Passing(HubError::Status { url, status }, None)),
+            408 | 500.. => Err(Failure::Temporary(HubError::Status { url, status }, None)),
             _ => Err(Failure::Final(HubError::Status { url, status })),
         }
     }
@@ -180,16 +180,16 @@ pub(crate) fn header<'h>(headers: &'h HeaderMap, name: &str) -> Option<&'h str> 
     headers.get(name).and_then(|value| value.to_str().ok())
 }
 
-fn gather(announced: &mut Announced, headers: &HeaderMap) {
+fn gather(metadata: &mut FileMetadata, headers: &HeaderMap) {
     if let Some(bytes) = header(headers, "x-linked-size").and_then(|v| v.parse().ok()) {
-        announced.bytes.get_or_insert(bytes);
+        metadata.bytes.get_or_insert(bytes);
     }
     let hash = header(headers, "x-linked-etag").and_then(hash_of_etag);
     if let Some(hash) = hash {
-        announced.sha256.get_or_insert(hash);
+        metadata.sha256.get_or_insert(hash);
     }
     if let Some(revision) = header(headers, "x-repo-commit").filter(|r| is_hex(r, 40)) {
-        announced.revision.get_or_insert(revision.to_ascii_lowercase());
+        metadata.revision.get_or_insert(revision.to_ascii_lowercase());
     }
 }
 
@@ -212,7 +212,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn only_a_whole_hash_is_taken_for_one() {
+    fn only_a_complete_hash_is_accepted() {
         let hash = "364492e38a3a06d221ac75da7f6621ada3f2361cd24fde11ba79091e9f40efcf";
         assert_eq!(hash_of_etag(&format!("\"{hash}\"")).as_deref(), Some(hash));
         assert_eq!(hash_of_etag(&format!("W/\"{}\"", hash.to_uppercase())).as_deref(), Some(hash));

@@ -1,6 +1,6 @@
-//! SHA-256 of what streams by and of what lies on the disk.
+//! SHA-256 of streams and of files.
 
-use crate::download::{Progress, Watch};
+use crate::download::{Progress, TransferCallbacks};
 use crate::error::HubError;
 use sha2::{Digest as _, Sha256};
 use std::fs::File;
@@ -9,7 +9,17 @@ use std::path::Path;
 
 const PIECE: usize = 1 << 20;
 
-/// A hash under way, and how many bytes went in.
+/// Bytes as lower-case hexadecimal digits.
+pub fn hex(bytes: &[u8]) -> String {
+    bytes.iter().map(|b| format!("{b:02x}")).collect()
+}
+
+/// SHA-256 of `bytes` as lower-case hexadecimal digits.
+pub fn sha256_hex(bytes: &[u8]) -> String {
+    hex(&Sha256::digest(bytes))
+}
+
+/// An incremental hash and the number of bytes hashed.
 #[derive(Clone)]
 pub(crate) struct Digest {
     hash: Sha256,
@@ -30,41 +40,46 @@ impl Digest {
         self.bytes
     }
 
-    /// Small hexadecimal letters.
+    /// Lower-case hexadecimal digits.
     pub fn hex(&self) -> String {
-        self.hash.clone().finalize().iter().map(|b| format!("{b:02x}")).collect()
+        hex(&self.hash.clone().finalize())
     }
 }
 
-/// Hashes what `file` holds and leaves it at its end; a file longer than `most` is emptied.
+/// Hashes the content of `file` and leaves the position at its end. A file longer than `most` is emptied.
 pub(crate) fn hash_prefix(
     file: &mut File,
     path: &Path,
     most: u64,
-    watch: &Watch<'_>,
+    callbacks: &TransferCallbacks<'_>,
 ) -> Result<Digest, HubError> {
     let length = file.metadata().map_err(HubError::io("look at", path))?.len();
     if length > most {
         file.set_len(0).map_err(HubError::io("truncate", path))?;
     }
     file.seek(SeekFrom::Start(0)).map_err(HubError::io("read", path))?;
-    hash_rest(file, path, length, watch)
+    hash_rest(file, path, length, callbacks)
 }
 
 /// Length and SHA-256 of a file.
-pub fn sha256_of(path: &Path, watch: &Watch<'_>) -> Result<(u64, String), HubError> {
+pub fn sha256_of(path: &Path, callbacks: &TransferCallbacks<'_>) -> Result<(u64, String), HubError> {
     let mut file = File::open(path).map_err(HubError::io("read", path))?;
     let total = file.metadata().map_err(HubError::io("look at", path))?.len();
-    let digest = hash_rest(&mut file, path, total, watch)?;
+    let digest = hash_rest(&mut file, path, total, callbacks)?;
     Ok((digest.bytes(), digest.hex()))
 }
 
-fn hash_rest(file: &mut File, path: &Path, total: u64, watch: &Watch<'_>) -> Result<Digest, HubError> {
+fn hash_rest(
+    file: &mut File,
+    path: &Path,
+    total: u64,
+    callbacks: &TransferCallbacks<'_>,
+) -> Result<Digest, HubError> {
     let name = path.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default();
     let mut digest = Digest::new();
     let mut piece = vec![0; PIECE];
     loop {
-        watch.stop()?;
+        callbacks.stop()?;
         let n = match file.read(&mut piece) {
             Ok(0) => return Ok(digest),
             Ok(n) => n,
@@ -72,6 +87,6 @@ fn hash_rest(file: &mut File, path: &Path, total: u64, watch: &Watch<'_>) -> Res
             Err(e) => return Err(HubError::io("read", path)(e)),
         };
         digest.update(&piece[..n]);
-        (watch.progress)(Progress { file: &name, done: digest.bytes(), total });
+        (callbacks.progress)(Progress { file: &name, done: digest.bytes(), total });
     }
 }

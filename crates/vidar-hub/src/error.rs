@@ -1,4 +1,4 @@
-//! Why a checkpoint cannot be found, fetched or trusted: what, where, what was found, what was expected.
+//! Errors of finding, fetching and verifying checkpoints: file or address, found value, expected value.
 
 use crate::catalogue::Licence;
 use std::io;
@@ -10,7 +10,7 @@ use thiserror::Error;
 #[non_exhaustive]
 pub enum HubError {
     /// No checkpoint of that name.
-    #[error("{name:?} is not a known checkpoint; known are {known}")]
+    #[error("{name:?} is not a known checkpoint; known: {known}")]
     UnknownModel {
         /// The name as given.
         name: String,
@@ -26,9 +26,7 @@ pub enum HubError {
         looked: PathBuf,
     },
     /// Non-commercial weights without an acceptance of their licence.
-    #[error(
-        "{name} is licensed under {licence}, which forbids commercial use, and nobody here has accepted that"
-    )]
+    #[error("{name} is licensed under {licence}, which forbids commercial use and has not been accepted yet")]
     LicenceNotAccepted {
         /// Which checkpoint.
         name: String,
@@ -36,7 +34,7 @@ pub enum HubError {
         licence: Licence,
     },
     /// A licence was accepted that is not the one of the checkpoint.
-    #[error("{name} is licensed under {licence}, the licence accepted is {given:?}")]
+    #[error("{name} is licensed under {licence}, the accepted licence is {given:?}")]
     WrongLicence {
         /// Which checkpoint.
         name: String,
@@ -45,8 +43,8 @@ pub enum HubError {
         /// What was accepted.
         given: String,
     },
-    /// The network is switched off.
-    #[error("{what} would have to be fetched, and the network is switched off")]
+    /// Network use is disabled.
+    #[error("{what} must be fetched, but network use is disabled")]
     Offline {
         /// What is missing.
         what: String,
@@ -62,37 +60,37 @@ pub enum HubError {
         expected: &'static str,
     },
     /// 401 or 403.
-    #[error("{url} answered {status}: no access{}", detail_of(detail))]
+    #[error("{url}: status {status}, no access{}", detail_of(detail))]
     NoAccess {
-        /// What was asked for.
+        /// The requested address.
         url: String,
         /// The status.
         status: u16,
-        /// What the hub says about it.
+        /// The hub's explanation.
         detail: String,
-        /// The page of the repository, where access is asked for.
+        /// The page of the repository, where access can be requested.
         page: String,
         /// Whether a token was sent.
         with_token: bool,
     },
     /// 404.
-    #[error("{url} answered 404: there is no such file")]
+    #[error("{url}: status 404, no such file")]
     NotFound {
-        /// What was asked for.
+        /// The requested address.
         url: String,
     },
     /// 429, after all waiting that was allowed.
-    #[error("{url} answered 429: too many requests{}", retry_of(*retry_after_secs))]
+    #[error("{url}: status 429, too many requests{}", retry_of(*retry_after_secs))]
     RateLimited {
-        /// What was asked for.
+        /// The requested address.
         url: String,
-        /// What the server asks to wait, seconds.
+        /// The wait that the server requests, seconds.
         retry_after_secs: Option<u64>,
     },
     /// Any other status that is not a success, after all retries that were allowed.
-    #[error("{url} answered {status}")]
+    #[error("{url}: status {status}")]
     Status {
-        /// What was asked for.
+        /// The requested address.
         url: String,
         /// The status.
         status: u16,
@@ -100,27 +98,27 @@ pub enum HubError {
     /// The connection failed, after all retries.
     #[error("{url}: {reason}")]
     Network {
-        /// What was asked for.
+        /// The requested address.
         url: String,
         /// What went wrong.
         reason: String,
     },
-    /// A redirect leads nowhere, in a circle, or from https to http.
+    /// A redirect is invalid, in a loop, or from https to http.
     #[error("{url}: {reason}")]
     Redirect {
-        /// Where it began.
+        /// The first address.
         url: String,
         /// What is wrong with it.
         reason: String,
     },
-    /// The answer contradicts itself or the request.
+    /// The response contradicts itself or the request.
     #[error("{url}: {what} is {found}, expected {expected}")]
-    BadAnswer {
-        /// What was asked for.
+    BadResponse {
+        /// The requested address.
         url: String,
-        /// Which part of the answer.
+        /// Which part of the response.
         what: &'static str,
-        /// What it says.
+        /// The value found.
         found: String,
         /// What was expected.
         expected: String,
@@ -161,7 +159,7 @@ pub enum HubError {
         /// Which folder.
         path: PathBuf,
     },
-    /// A file beside the weights is not what this program writes.
+    /// A file next to the weights was not written by this program.
     #[error("{path}: {reason}", path = path.display())]
     BadRecord {
         /// Which file.
@@ -169,7 +167,7 @@ pub enum HubError {
         /// What is wrong.
         reason: String,
     },
-    /// A file given is no checkpoint.
+    /// A given file is not a checkpoint.
     #[error("{path} is not a checkpoint: {reason}", path = path.display())]
     NotACheckpoint {
         /// Which file or folder.
@@ -177,14 +175,14 @@ pub enum HubError {
         /// Why not.
         reason: String,
     },
-    /// The file system said no.
+    /// The file system reported an error.
     #[error("cannot {action} {path}: {source}", path = path.display())]
     Io {
-        /// What was tried.
+        /// The action that failed.
         action: &'static str,
-        /// On which file.
+        /// Path of the file.
         path: PathBuf,
-        /// What the system said.
+        /// The system's error.
         source: io::Error,
     },
     /// The caller asked to stop.
@@ -203,10 +201,10 @@ impl HubError {
         let text = match self {
             Self::UnknownModel { .. } => "`vidar model list` describes them".to_owned(),
             Self::NotInstalled { name, .. } => {
-                format!("`vidar model pull {name}` fetches it, `vidar model import FILE` takes a copy you have")
+                format!("`vidar model pull {name}` fetches it; `vidar model import FILE` copies a local file")
             }
             Self::LicenceNotAccepted { licence, .. } => format!(
-                "read {}; if you agree, add --accept-licence {}; it is written down beside the weights",
+                "read {}; if you agree, add --accept-licence {}; it is recorded next to the weights",
                 licence.text_url(),
                 licence.spdx()
             ),
@@ -216,13 +214,13 @@ impl HubError {
                     .to_owned()
             }
             Self::NoAccess { page, with_token: false, .. } => {
-                format!("log in at {page}, accept its terms if it asks, and set HF_TOKEN to a token that may read it")
+                format!("log in at {page}, accept its terms if asked, and set HF_TOKEN to a token with read access")
             }
             Self::NoAccess { page, with_token: true, .. } => {
-                format!("the token in HF_TOKEN may not read it; ask for access at {page}, or make a new token")
+                format!("the token in HF_TOKEN has no read access; request access at {page}, or create a new token")
             }
             Self::NotFound { .. } => "check HF_ENDPOINT and --revision".to_owned(),
-            Self::RateLimited { .. } => "wait, or set HF_TOKEN: the hub allows more to those it knows".to_owned(),
+            Self::RateLimited { .. } => "wait, or set HF_TOKEN: the hub allows more requests with a token".to_owned(),
             Self::Status { .. } | Self::Network { .. } => {
                 "try again: what was fetched is kept; HF_ENDPOINT names a mirror, HTTPS_PROXY a proxy".to_owned()
             }
@@ -232,10 +230,10 @@ impl HubError {
             }
             Self::NoSpace { .. } => "free space, or set VIDAR_MODELS to a folder on another disk".to_owned(),
             Self::NotACheckpoint { .. } => {
-                "a checkpoint is model.safetensors with config.json beside it, as they lie on the hub".to_owned()
+                "a checkpoint is model.safetensors with config.json next to it, as on the hub".to_owned()
             }
             Self::Busy { .. } => "wait for it to finish".to_owned(),
-            Self::BadRecord { .. } => "`vidar model import` or `vidar model pull --again` writes it anew".to_owned(),
+            Self::BadRecord { .. } => "`vidar model import` or `vidar model pull --again` rewrites it".to_owned(),
             _ => return None,
         };
         Some(text)
@@ -247,5 +245,5 @@ fn detail_of(detail: &str) -> String {
 }
 
 fn retry_of(secs: Option<u64>) -> String {
-    secs.map_or_else(String::new, |s| format!("; it asks to wait {s} s"))
+    secs.map_or_else(String::new, |s| format!("; the server requests a wait of {s} s"))
 }

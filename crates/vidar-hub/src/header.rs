@@ -1,4 +1,4 @@
-//! A first look into a `.safetensors` file: is it whole, and how many tensors does it hold.
+//! Reads the header of a `.safetensors` file: whether the file is complete, and its number of tensors.
 //!
 //! Eight bytes of length, that many bytes of JSON, then the data. The last offset must be the end of the file.
 
@@ -12,7 +12,7 @@ use std::path::Path;
 /// Longest header that is read, bytes; official ones have about 200 kB.
 const MOST_HEADER: u64 = 16 << 20;
 
-/// What the header says.
+/// Content of the header.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct Header {
     /// Tensors in the file.
@@ -35,7 +35,7 @@ pub(crate) fn read_header(path: &Path) -> Result<Header, HubError> {
     let size = u64::from_le_bytes(first);
     if size > MOST_HEADER || size.saturating_add(8) > length {
         return Err(bad(format!(
-            "its header would have {size} bytes; it is no safetensors file, or cut off"
+            "its header would have {size} bytes; it is not a safetensors file, or truncated"
         )));
     }
     let mut json = Vec::new();
@@ -50,10 +50,10 @@ fn parse(json: &[u8], data: u64) -> Result<Header, String> {
     let mut end = 0;
     for (name, entry) in &entries {
         let Some([from, to]) = entry.data_offsets else {
-            return Err(format!("tensor {name:?} has no place in the file"));
+            return Err(format!("tensor {name:?} has no offsets"));
         };
         if from > to || to > data {
-            return Err(format!("tensor {name:?} lies at {from}..{to} of {data} bytes; the file is cut off"));
+            return Err(format!("tensor {name:?} is at {from}..{to} of {data} bytes; the file is truncated"));
         }
         end = end.max(to);
     }
@@ -73,16 +73,16 @@ mod tests {
         let json = br#"{"__metadata__":{"a":"b"},"x":{"dtype":"F32","shape":[2],"data_offsets":[0,8]},
             "y":{"dtype":"F32","shape":[1],"data_offsets":[8,12]}}"#;
         assert_eq!(parse(json, 12), Ok(Header { tensors: 2 }));
-        assert!(parse(json, 11).unwrap_err().contains("cut off"));
+        assert!(parse(json, 11).unwrap_err().contains("truncated"));
         assert!(parse(json, 13).unwrap_err().contains("end at byte 12 of 13"));
-        assert!(parse(br#"{"x":{}}"#, 0).unwrap_err().contains("no place"));
+        assert!(parse(br#"{"x":{}}"#, 0).unwrap_err().contains("no offsets"));
         assert!(parse(br#"{"x":{"data_offsets":[8,4]}}"#, 8).is_err());
         assert_eq!(parse(b"{}", 0), Ok(Header { tensors: 0 }));
     }
 
     proptest! {
         #[test]
-        fn no_header_makes_it_panic(json in proptest::collection::vec(any::<u8>(), 0..200), data: u64) {
+        fn no_header_panics(json in proptest::collection::vec(any::<u8>(), 0..200), data: u64) {
             let _ = parse(&json, data);
             let numbers = format!(r#"{{"x":{{"data_offsets":[{data},{}]}}}}"#, json.len());
             let _ = parse(numbers.as_bytes(), data);

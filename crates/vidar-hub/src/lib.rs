@@ -1,13 +1,12 @@
 //! Checkpoints of Depth Anything 3: the list of official ones, and finding, fetching, resuming and verifying them.
 //!
 //! - [`catalogue`]: which checkpoints there are, under which licence, how large, with which SHA-256.
-//! - [`HubSettings`]: where they are kept and fetched from, as the environment says.
+//! - [`HubSettings`]: where they are stored and fetched from, set by environment variables.
 //! - [`Store`]: those on this machine: `find`, `require`, `list`, `verify`, `pull`, `import`.
 //!
-//! Nothing here is trusted that can be checked: a file takes its name only when its length and SHA-256 are the official
-//! ones. Nothing is fetched unless [`Store::pull`] is called, and then from one hub only
+//! Every file is verified: it gets its final name only if its length and SHA-256 are the official ones. Nothing is fetched unless [`Store::pull`] is called, and then from one hub only
 //! (`{endpoint}/{repo}/resolve/{revision}/{file}`, and wherever it redirects to). Weights whose licence forbids commercial
-//! use are neither fetched nor handed out before an [`Acceptance`] lies beside them.
+//! use are neither fetched nor handed out before an [`Acceptance`] is recorded next to them.
 //!
 //! ```
 //! use vidar_hub::{HubSettings, Store, catalogue};
@@ -35,11 +34,12 @@ mod settings;
 mod store;
 
 pub use catalogue::{Ability, Checkpoint, Licence, OfficialFile};
-pub use digest::sha256_of;
-pub use download::{Progress, Watch};
+pub use digest::{hex, sha256_hex, sha256_of};
+pub use download::{Progress, TransferCallbacks};
 pub use error::HubError;
 pub use pull::PullOptions;
 pub use settings::{ENDPOINT, HubSettings};
 pub use store::{
-    Acceptance, IdentifiedBy, Installed, Place, Record, RecordedFile, Store, Verified, official_licence,
+    Acceptance, CheckpointLocation, IdentifiedBy, Installed, Record, RecordedFile, Store, Verified,
+    official_licence,
 };

@@ -4,7 +4,7 @@ use crate::error::HubError;
 use std::fs::{File, OpenOptions, TryLockError};
 use std::path::Path;
 
-/// Held while a checkpoint is written; the system lets it go when the process ends, however it ends.
+/// Held while a checkpoint is written; the system releases it when the process ends.
 pub(crate) struct Lock {
     _file: File,
 }
@@ -18,7 +18,7 @@ impl Lock {
         match file.try_lock() {
             Ok(()) => Ok(Self { _file: file }),
             Err(TryLockError::WouldBlock) => Err(HubError::Busy { path: folder.to_owned() }),
-            // A file system without locks: two writers would be caught by the hash.
+            // A file system without locks: two concurrent writers are detected by the hash.
             Err(TryLockError::Error(_)) => Ok(Self { _file: file }),
         }
     }

@@ -1,15 +1,15 @@
-//! `pull` and `import`: how a checkpoint comes into the store.
+//! `pull` and `import`: adding checkpoints to the store.
 
 use crate::catalogue::{CHECKPOINTS, CONFIG, Checkpoint, WEIGHTS, of_hash, of_size};
 use crate::client::Client;
 use crate::digest::sha256_of;
-use crate::download::{Wanted, Watch, fetch};
+use crate::download::{FileRequest, TransferCallbacks, fetch};
 use crate::error::HubError;
 use crate::header::{Header, read_header};
 use crate::lock::Lock;
 use crate::store::{
-    Acceptance, IdentifiedBy, Installed, Place, RECORD, RecordedFile, Store, make_folder, minimal_config,
-    record_of, write_json,
+    Acceptance, CheckpointLocation, IdentifiedBy, Installed, RECORD, RecordedFile, Store, make_folder,
+    minimal_config, record_of, write_json,
 };
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -19,21 +19,21 @@ use std::path::{Path, PathBuf};
 pub struct PullOptions {
     /// The acceptance of its licence, where the user gave one.
     pub acceptance: Option<Acceptance>,
-    /// Another commit or branch than the one described here; its files are then identified by the hub alone.
+    /// Another commit or branch than the one described here; only the hub then states their hashes.
     pub revision: Option<String>,
-    /// Fetch again what is already there.
+    /// Fetch again, even if it is present.
     pub again: bool,
-    /// Now, RFC 3339.
+    /// The current time, RFC 3339.
     pub now: String,
 }
 
 impl Store {
-    /// Fetches a checkpoint, continuing what an earlier call began. Nothing is fetched when it is already here.
+    /// Fetches a checkpoint, continuing an earlier call. Nothing is fetched if the checkpoint is present.
     pub fn pull(
         &self,
         checkpoint: &'static Checkpoint,
         options: &PullOptions,
-        watch: &Watch<'_>,
+        callbacks: &TransferCallbacks<'_>,
     ) -> Result<Installed, HubError> {
         if let Some(acceptance) = &options.acceptance {
             self.accept(checkpoint, acceptance)?;
@@ -51,7 +51,7 @@ impl Store {
         let folder = self.folder(checkpoint);
         make_folder(&folder)?;
         let _lock = Lock::take(&folder)?;
-        self.pull_files(checkpoint, options, &folder, watch)?;
+        self.pull_files(checkpoint, options, &folder, callbacks)?;
         self.installed(checkpoint)
     }
 
@@ -60,7 +60,7 @@ impl Store {
         checkpoint: &'static Checkpoint,
         options: &PullOptions,
         folder: &Path,
-        watch: &Watch<'_>,
+        callbacks: &TransferCallbacks<'_>,
     ) -> Result<(), HubError> {
         let settings = self.settings();
         let page = checkpoint.page(&settings.endpoint);
@@ -72,14 +72,14 @@ impl Store {
         for official in &checkpoint.files {
             let url = checkpoint.url(&settings.endpoint, revision, official.name);
             let target = folder.join(official.name);
-            let wanted = Wanted {
+            let wanted = FileRequest {
                 url: &url,
                 target: &target,
                 name: official.name,
                 bytes: official.bytes.filter(|_| pinned || official.name == WEIGHTS),
                 sha256: official.sha256.filter(|_| pinned),
             };
-            let fetched = fetch(&client, settings, &wanted, watch)?;
+            let fetched = fetch(&client, settings, &wanted, callbacks)?;
             if official.name == WEIGHTS {
                 check_weights(&target, checkpoint)?;
             }
@@ -98,16 +98,16 @@ impl Store {
 
     /// Copies a checkpoint that the user has: `model.safetensors`, or a folder with it and `config.json`.
     ///
-    /// Which checkpoint it is follows from its hash, else from `name`, else from its length if only one has it.
+    /// The checkpoint is identified by its hash, else by `name`, else by its length if only one has that length.
     pub fn import(
         &self,
         path: &Path,
         name: Option<&'static Checkpoint>,
         options: &PullOptions,
-        watch: &Watch<'_>,
+        callbacks: &TransferCallbacks<'_>,
     ) -> Result<Installed, HubError> {
         let weights = weights_in(path)?;
-        let (bytes, sha256) = sha256_of(&weights, watch)?;
+        let (bytes, sha256) = sha256_of(&weights, callbacks)?;
         let checkpoint = identify(&weights, name, bytes, &sha256)?;
         if let Some(acceptance) = &options.acceptance {
             self.accept(checkpoint, acceptance)?;
@@ -117,12 +117,12 @@ impl Store {
         let folder = self.folder(checkpoint);
         make_folder(&folder)?;
         let _lock = Lock::take(&folder)?;
-        copy(&weights, &folder.join(WEIGHTS), bytes, watch)?;
+        copy(&weights, &folder.join(WEIGHTS), bytes, callbacks)?;
         let identified_by = match checkpoint.weights().sha256 {
             Some(_) => IdentifiedBy::Catalogue,
             None => IdentifiedBy::Nobody,
         };
-        let config = import_config(&weights, &folder, checkpoint, watch)?;
+        let config = import_config(&weights, &folder, checkpoint, callbacks)?;
         let weights_file = RecordedFile { name: WEIGHTS.to_owned(), bytes, sha256, identified_by };
         let source = weights.display().to_string();
         let record = record_of(checkpoint, source, None, &options.now, vec![config, weights_file]);
@@ -132,7 +132,7 @@ impl Store {
 
     fn installed(&self, checkpoint: &'static Checkpoint) -> Result<Installed, HubError> {
         match self.find(checkpoint)? {
-            Some(installed) if installed.place == Place::Store => Ok(installed),
+            Some(installed) if installed.location == CheckpointLocation::Store => Ok(installed),
             _ => Err(HubError::NotInstalled {
                 name: checkpoint.name.to_owned(),
                 looked: self.folder(checkpoint),
@@ -141,7 +141,7 @@ impl Store {
     }
 }
 
-/// A revision is part of an address; only what can be one is let through.
+/// A revision is part of an address; only valid names of revisions are accepted.
 fn checked_revision(revision: &str) -> Result<&str, HubError> {
     let fits = |c: char| c.is_ascii_alphanumeric() || "._-".contains(c);
     if !revision.is_empty() && revision.chars().all(fits) && !revision.starts_with('.') {
@@ -155,7 +155,7 @@ fn weights_in(path: &Path) -> Result<PathBuf, HubError> {
     let weights = if path.is_dir() { path.join(WEIGHTS) } else { path.to_owned() };
     match fs::metadata(&weights) {
         Ok(m) if m.is_file() => Ok(weights),
-        Ok(_) => Err(HubError::NotACheckpoint { path: weights, reason: "it is no file".to_owned() }),
+        Ok(_) => Err(HubError::NotACheckpoint { path: weights, reason: "it is not a file".to_owned() }),
         Err(e) => Err(HubError::io("read", &weights)(e)),
     }
 }
@@ -183,14 +183,14 @@ fn identify(
     if let Some(checkpoint) = by_hash {
         return Ok(checkpoint);
     }
-    // Without a known hash, only checkpoints whose own hash is not known here can be meant.
+    // Without a matching hash, it can only be a checkpoint whose hash is unknown.
     let mut candidates = of_size(bytes).filter(|c| c.weights().sha256.is_none());
     match (candidates.next(), candidates.next()) {
         (Some(only), None) => Ok(only),
         _ => {
             let known = CHECKPOINTS.iter().map(|c| c.name).collect::<Vec<_>>().join(", ");
             let reason = format!(
-                "{bytes} bytes with SHA-256 {sha256} are none of {known}; weights of your own are used in place with \
+                "{bytes} bytes with SHA-256 {sha256} match none of {known}; other weights are used in place with \
                  --model-dir"
             );
             Err(HubError::NotACheckpoint { path: weights.to_owned(), reason })
@@ -198,7 +198,7 @@ fn identify(
     }
 }
 
-/// Looks into the file: a complete safetensors file with as many tensors as the checkpoint has.
+/// Checks that the file is a complete safetensors file with the checkpoint's number of tensors.
 fn check_weights(path: &Path, checkpoint: &Checkpoint) -> Result<(), HubError> {
     let Header { tensors, .. } = read_header(path)?;
     if tensors == checkpoint.tensors {
@@ -208,8 +208,8 @@ fn check_weights(path: &Path, checkpoint: &Checkpoint) -> Result<(), HubError> {
     Err(HubError::NotACheckpoint { path: path.to_owned(), reason })
 }
 
-fn copy(from: &Path, to: &Path, bytes: u64, watch: &Watch<'_>) -> Result<(), HubError> {
-    watch.stop()?;
+fn copy(from: &Path, to: &Path, bytes: u64, callbacks: &TransferCallbacks<'_>) -> Result<(), HubError> {
+    callbacks.stop()?;
     if is_same(from, to) {
         return Ok(());
     }
@@ -220,7 +220,7 @@ fn copy(from: &Path, to: &Path, bytes: u64, watch: &Watch<'_>) -> Result<(), Hub
     let part = to.with_extension("import.part");
     let copied = fs::copy(from, &part).and_then(|_| fs::rename(&part, to));
     copied.map_err(|e| {
-        // Ours and unfinished; the first error is the one to tell.
+        // An incomplete copy; the first error is the one to report.
         let _ = fs::remove_file(&part);
         HubError::io("copy to", to)(e)
     })
@@ -230,21 +230,21 @@ fn is_same(a: &Path, b: &Path) -> bool {
     matches!((fs::canonicalize(a), fs::canonicalize(b)), (Ok(a), Ok(b)) if a == b)
 }
 
-/// The `config.json` beside the weights, if it is the official one; else one that names the architecture.
+/// The `config.json` next to the weights, if it is the official one; else one that names the architecture.
 fn import_config(
     weights: &Path,
     folder: &Path,
     checkpoint: &Checkpoint,
-    watch: &Watch<'_>,
+    callbacks: &TransferCallbacks<'_>,
 ) -> Result<RecordedFile, HubError> {
     let target = folder.join(CONFIG);
     let official = &checkpoint.files[0];
     let beside = weights.with_file_name(CONFIG);
     if beside.is_file() {
-        let (bytes, sha256) = sha256_of(&beside, watch)?;
+        let (bytes, sha256) = sha256_of(&beside, callbacks)?;
         let fits = official.bytes.is_none_or(|b| b == bytes) && official.sha256.is_none_or(|h| h == sha256);
         if fits {
-            copy(&beside, &target, bytes, watch)?;
+            copy(&beside, &target, bytes, callbacks)?;
             let identified_by = match official.sha256 {
                 Some(_) => IdentifiedBy::Catalogue,
                 None => IdentifiedBy::Nobody,
@@ -256,6 +256,6 @@ fn import_config(
         return Err(HubError::WrongHash { what, found: sha256, expected });
     }
     fs::write(&target, minimal_config(checkpoint)).map_err(HubError::io("write", &target))?;
-    let (bytes, sha256) = sha256_of(&target, watch)?;
+    let (bytes, sha256) = sha256_of(&target, callbacks)?;
     Ok(RecordedFile { name: CONFIG.to_owned(), bytes, sha256, identified_by: IdentifiedBy::Nobody })
 }

@@ -1,4 +1,4 @@
-//! Where checkpoints are kept and fetched from.
+//! Where checkpoints are stored and fetched from.
 //!
 //! | Variable | Meaning | Default |
 //! |---|---|---|
@@ -6,8 +6,8 @@
 //! | `HF_ENDPOINT` | the hub, or a mirror of it | `https://huggingface.co` |
 //! | `HF_TOKEN` | token of a user of the hub | none |
 //! | `VIDAR_OFFLINE`, `HF_HUB_OFFLINE` | `1`: never use the network | use it |
-//! | `HF_HUB_CACHE`, `HF_HOME` | cache of other programs, searched but never written | `~/.cache/huggingface/hub` |
-//! | `HTTPS_PROXY`, `NO_PROXY`, … | as everywhere | none |
+//! | `HF_HUB_CACHE`, `HF_HOME` | cache of other programs, read only | `~/.cache/huggingface/hub` |
+//! | `HTTPS_PROXY`, `NO_PROXY`, … | the usual proxy settings | none |
 
 use crate::error::HubError;
 use std::path::PathBuf;
@@ -16,12 +16,12 @@ use std::time::Duration;
 /// The official hub.
 pub const ENDPOINT: &str = "https://huggingface.co";
 
-/// Where checkpoints are kept and how they are fetched.
+/// Where checkpoints are stored and how they are fetched.
 #[derive(Clone, PartialEq, Eq)]
 pub struct HubSettings {
     /// Folder of the checkpoints, one folder for each.
     pub root: PathBuf,
-    /// Cache of the hub's own programs, read only.
+    /// Cache of the hub's official programs, read only.
     pub hub_cache: Option<PathBuf>,
     /// The hub or a mirror, without a slash at the end.
     pub endpoint: String,
@@ -29,21 +29,21 @@ pub struct HubSettings {
     pub token: Option<String>,
     /// Never use the network.
     pub offline: bool,
-    /// Whether proxies of the environment are used.
+    /// Whether proxy variables of the environment are used.
     pub proxy_from_environment: bool,
-    /// Longest silence of a server before the connection is given up.
+    /// Time without data after which a connection is closed.
     pub silence: Duration,
-    /// Tries without progress before a transfer is given up.
+    /// Tries without progress before a transfer fails.
     pub tries: u32,
     /// First wait between two tries; doubled each time.
     pub backoff: Duration,
-    /// Longest wait that a server may ask for.
+    /// Longest wait that a server may request.
     pub longest_wait: Duration,
 }
 
 impl std::fmt::Debug for HubSettings {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        // A token must not end up in a log.
+        // A token must not appear in a log.
         f.debug_struct("HubSettings")
             .field("root", &self.root)
             .field("hub_cache", &self.hub_cache)
@@ -55,7 +55,7 @@ impl std::fmt::Debug for HubSettings {
 }
 
 impl HubSettings {
-    /// Settings with everything at its default and checkpoints kept in `root`.
+    /// Default settings with checkpoints stored in `root`.
     pub fn new(root: PathBuf) -> Self {
         Self {
             root,
@@ -71,7 +71,7 @@ impl HubSettings {
         }
     }
 
-    /// Settings as the environment has them; `variable` looks one up.
+    /// Settings from environment variables; `variable` looks one up.
     pub fn from_environment(variable: impl Fn(&str) -> Option<String>) -> Result<Self, HubError> {
         let set = |name: &str| variable(name).filter(|value| !value.is_empty());
         let mut settings = Self::new(root(&set)?);
@@ -136,8 +136,8 @@ fn token(set: &impl Fn(&str) -> Option<String>) -> Result<Option<String>, HubErr
     if token.chars().all(|c| c.is_ascii_graphic()) {
         return Ok(Some(token).filter(|t| !t.is_empty()));
     }
-    // The token itself is not repeated.
-    let (found, expected) = ("…".to_owned(), "printable letters only");
+    // The message does not contain the token.
+    let (found, expected) = ("…".to_owned(), "printable characters only");
     Err(HubError::BadSetting { name: "HF_TOKEN", found, expected })
 }
 
@@ -160,7 +160,7 @@ mod tests {
     }
 
     #[test]
-    fn the_environment_says_where_and_how() {
+    fn settings_are_read_from_the_environment() {
         let s = settings(&[("HOME", "/h")]).unwrap();
         if cfg!(target_os = "linux") {
             assert_eq!(s.root, PathBuf::from("/h/.local/share/vidar/models"));
@@ -182,7 +182,7 @@ mod tests {
     }
 
     #[test]
-    fn what_cannot_be_meant_is_refused_and_a_token_is_never_shown() {
+    fn invalid_settings_are_refused_and_a_token_is_never_shown() {
         for endpoint in ["huggingface.co", "ftp://x", "https://", "https:///x", "https://a b", "https://u@h"]
         {
             assert!(settings(&[("HOME", "/h"), ("HF_ENDPOINT", endpoint)]).is_err(), "{endpoint}");

@@ -4,16 +4,16 @@
 //! $VIDAR_MODELS/
 //!   da3-small/
 //!     config.json  model.safetensors    as on the hub
-//!     vidar-model.json                  where they came from, lengths, SHA-256
+//!     vidar-model.json                  source, lengths, SHA-256
 //!     acceptance.json                   who accepted a non-commercial licence, when, and which text
 //! ```
 //!
-//! A checkpoint that is not there is looked for in the cache of the hub's own programs
-//! (`models--depth-anything--DA3-SMALL/snapshots/…`), which is read and never written.
+//! If a checkpoint is missing there, the cache of the hub's official programs is searched
+//! (`models--depth-anything--DA3-SMALL/snapshots/…`). That cache is never written.
 
 use crate::catalogue::{CHECKPOINTS, CONFIG, Checkpoint, Licence, OfficialFile, WEIGHTS};
 use crate::digest::sha256_of;
-use crate::download::Watch;
+use crate::download::TransferCallbacks;
 use crate::error::HubError;
 use crate::settings::HubSettings;
 use serde::{Deserialize, Serialize, de::DeserializeOwned};
@@ -27,10 +27,10 @@ pub const RECORD_SCHEMA: &str = "vidar.model/1";
 pub const ACCEPTANCE_SCHEMA: &str = "vidar.acceptance/1";
 pub(crate) const RECORD: &str = "vidar-model.json";
 pub(crate) const ACCEPTANCE: &str = "acceptance.json";
-/// A file of JSON beside weights is never longer than this, bytes.
+/// Largest JSON file next to weights, bytes.
 const MOST_JSON: u64 = 1 << 20;
 
-/// Where a checkpoint came from and what it must be.
+/// Source, lengths and hashes of a checkpoint.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Record {
     /// [`RECORD_SCHEMA`].
@@ -52,17 +52,17 @@ pub struct Record {
 /// One file of a record.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct RecordedFile {
-    /// Name beside the record.
+    /// File name, in the folder of the record.
     pub name: String,
     /// Length.
     pub bytes: u64,
-    /// SHA-256, small hexadecimal letters.
+    /// SHA-256, lower-case hexadecimal digits.
     pub sha256: String,
-    /// Who says that this is the right hash.
+    /// The source of the hash.
     pub identified_by: IdentifiedBy,
 }
 
-/// Who says that a hash is the right one.
+/// The source of an expected hash.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum IdentifiedBy {
@@ -70,11 +70,11 @@ pub enum IdentifiedBy {
     Catalogue,
     /// The hub it was fetched from.
     Hub,
-    /// Nobody: it is the hash of what came.
+    /// None: it is the hash of the received file.
     Nobody,
 }
 
-/// That somebody accepted a licence.
+/// Record that a licence was accepted.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Acceptance {
     /// [`ACCEPTANCE_SCHEMA`].
@@ -83,7 +83,7 @@ pub struct Acceptance {
     pub model: String,
     /// SPDX name of the licence.
     pub licence: String,
-    /// Where its text is.
+    /// Address of its text.
     pub text: String,
     /// Who accepted.
     pub accepted_by: String,
@@ -116,13 +116,13 @@ impl Acceptance {
     }
 }
 
-/// Where the files of a checkpoint lie.
+/// Where the files of a checkpoint are stored.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "kebab-case")]
-pub enum Place {
+pub enum CheckpointLocation {
     /// In the store of this program.
     Store,
-    /// In the cache of the hub's own programs.
+    /// In the cache of the hub's official programs.
     HubCache,
 }
 
@@ -133,11 +133,11 @@ pub struct Installed {
     pub checkpoint: &'static Checkpoint,
     /// The folder of its files.
     pub folder: PathBuf,
-    /// Whose folder that is.
-    pub place: Place,
-    /// Where it came from; only in the store.
+    /// Whether the folder is in the store or in the cache.
+    pub location: CheckpointLocation,
+    /// Its record; only in the store.
     pub record: Option<Record>,
-    /// Who accepted its licence, where that is needed and was done.
+    /// The acceptance of its licence, if one is needed and recorded.
     pub acceptance: Option<Acceptance>,
 }
 
@@ -147,14 +147,14 @@ impl Installed {
         self.folder.join(WEIGHTS)
     }
 
-    /// SHA-256 of the weights as recorded when they came.
+    /// SHA-256 of the weights as recorded when they were added.
     pub fn recorded_sha256(&self) -> Option<&str> {
         let files = &self.record.as_ref()?.files;
         files.iter().find(|f| f.name == WEIGHTS).map(|f| f.sha256.as_str())
     }
 }
 
-/// What became of a file when it was verified.
+/// A verified file.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 pub struct Verified {
     /// Which file.
@@ -163,7 +163,7 @@ pub struct Verified {
     pub bytes: u64,
     /// Its SHA-256.
     pub sha256: String,
-    /// Who says that this is right.
+    /// The source of the expected hash.
     pub identified_by: IdentifiedBy,
 }
 
@@ -189,25 +189,31 @@ impl Store {
         self.settings.root.join(checkpoint.name)
     }
 
-    /// The checkpoint, if all of its files are here; `None` otherwise. Lengths are looked at, hashes are not.
+    /// The checkpoint, if all of its files are present; `None` otherwise. Lengths are checked, hashes are not.
     pub fn find(&self, checkpoint: &'static Checkpoint) -> Result<Option<Installed>, HubError> {
         let folder = self.folder(checkpoint);
         let acceptance = self.acceptance(checkpoint)?;
         if is_complete(&folder, checkpoint) {
             let record = read_record(&folder, checkpoint)?;
-            return Ok(Some(Installed { checkpoint, folder, place: Place::Store, record, acceptance }));
+            return Ok(Some(Installed {
+                checkpoint,
+                folder,
+                location: CheckpointLocation::Store,
+                record,
+                acceptance,
+            }));
         }
         let cached = self.settings.hub_cache.as_ref().and_then(|cache| in_hub_cache(cache, checkpoint));
         Ok(cached.map(|folder| Installed {
             checkpoint,
             folder,
-            place: Place::HubCache,
+            location: CheckpointLocation::HubCache,
             record: None,
             acceptance,
         }))
     }
 
-    /// The checkpoint, ready to be used: here, and its licence accepted where that is needed.
+    /// The checkpoint, ready to be used: present, and its licence accepted if needed.
     pub fn require(&self, checkpoint: &'static Checkpoint) -> Result<Installed, HubError> {
         let Some(installed) = self.find(checkpoint)? else {
             let (name, looked) = (checkpoint.name.to_owned(), self.folder(checkpoint));
@@ -217,7 +223,7 @@ impl Store {
         Ok(installed)
     }
 
-    /// Who accepted the checkpoint's licence, if anybody did.
+    /// The acceptance of the checkpoint's licence, if there is one.
     pub fn acceptance(&self, checkpoint: &Checkpoint) -> Result<Option<Acceptance>, HubError> {
         let path = self.folder(checkpoint).join(ACCEPTANCE);
         let read: Option<Acceptance> = read_json(&path)?;
@@ -231,7 +237,7 @@ impl Store {
         }
     }
 
-    /// An error unless the licence allows every use or somebody accepted it.
+    /// An error unless the licence allows every use or was accepted.
     pub fn require_acceptance(&self, checkpoint: &Checkpoint) -> Result<Option<Acceptance>, HubError> {
         let acceptance = self.acceptance(checkpoint)?;
         if acceptance.is_none() && !checkpoint.licence.allows_commercial_use() {
@@ -241,7 +247,7 @@ impl Store {
         Ok(acceptance)
     }
 
-    /// Writes an acceptance down beside the weights.
+    /// Records an acceptance next to the weights.
     pub fn accept(&self, checkpoint: &Checkpoint, acceptance: &Acceptance) -> Result<(), HubError> {
         if !acceptance.is_of(checkpoint) {
             let (name, licence) = (checkpoint.name.to_owned(), checkpoint.licence);
@@ -252,16 +258,16 @@ impl Store {
         write_json(&folder.join(ACCEPTANCE), acceptance)
     }
 
-    /// Every official checkpoint with what is here of it.
+    /// Every official checkpoint, with its installation if it is present.
     pub fn list(&self) -> Result<Vec<(&'static Checkpoint, Option<Installed>)>, HubError> {
         CHECKPOINTS.iter().map(|c| Ok((c, self.find(c)?))).collect()
     }
 
-    /// Reads every byte of a checkpoint and holds lengths and hashes against catalogue and record.
+    /// Reads every byte of a checkpoint and compares lengths and hashes with catalogue and record.
     pub fn verify(
         &self,
         checkpoint: &'static Checkpoint,
-        watch: &Watch<'_>,
+        callbacks: &TransferCallbacks<'_>,
     ) -> Result<Vec<Verified>, HubError> {
         let Some(installed) = self.find(checkpoint)? else {
             let (name, looked) = (checkpoint.name.to_owned(), self.folder(checkpoint));
@@ -274,10 +280,10 @@ impl Store {
         let mut verified = Vec::new();
         for official in &checkpoint.files {
             let path = installed.folder.join(official.name);
-            let (bytes, sha256) = sha256_of(&path, watch)?;
+            let (bytes, sha256) = sha256_of(&path, callbacks)?;
             let what = || path.display().to_string();
             let record = recorded(official.name);
-            // Another commit, or a config.json that is our own: the record alone says what belongs there.
+            // Another commit, or a generated config.json: only the record has the expected hashes.
             let own = record.is_some_and(|r| r.identified_by != IdentifiedBy::Catalogue);
             let official =
                 if own { OfficialFile { bytes: None, sha256: None, ..*official } } else { *official };
@@ -303,8 +309,8 @@ impl Store {
     }
 }
 
-/// Whether every file is there, the weights with the right length. The `config.json` of weights that came without
-/// one is our own, so its length says nothing.
+/// Whether every file is present, the weights with the right length. The length of `config.json` is not checked, because
+/// weights without one get a generated file.
 fn is_complete(folder: &Path, checkpoint: &Checkpoint) -> bool {
     let length =
         |name: &str| fs::metadata(folder.join(name)).ok().filter(fs::Metadata::is_file).map(|m| m.len());
@@ -312,7 +318,7 @@ fn is_complete(folder: &Path, checkpoint: &Checkpoint) -> bool {
     weights && length(CONFIG).is_some_and(|n| n <= MOST_JSON)
 }
 
-/// The newest complete snapshot that the hub's own programs keep.
+/// The newest complete snapshot in the cache of the hub's official programs.
 fn in_hub_cache(cache: &Path, checkpoint: &Checkpoint) -> Option<PathBuf> {
     let repository = cache.join(format!("models--{}", checkpoint.repo.replace('/', "--")));
     let snapshots = repository.join("snapshots");
@@ -320,11 +326,11 @@ fn in_hub_cache(cache: &Path, checkpoint: &Checkpoint) -> Option<PathBuf> {
     let named = [checkpoint.revision, main.trim()].map(|revision| snapshots.join(revision));
     let mut others: Vec<PathBuf> = fs::read_dir(&snapshots).ok()?.flatten().map(|e| e.path()).collect();
     others.sort();
-    // `snapshots` itself is what an empty name gives; it holds no files of its own.
+    // An empty name gives `snapshots` itself, which contains no files.
     named.into_iter().chain(others).find(|folder| *folder != snapshots && is_complete(folder, checkpoint))
 }
 
-/// The record of a folder, if there is one and it is of that checkpoint.
+/// The record of a folder, if there is one for that checkpoint.
 fn read_record(folder: &Path, checkpoint: &Checkpoint) -> Result<Option<Record>, HubError> {
     let path = folder.join(RECORD);
     let record: Option<Record> = read_json(&path)?;
@@ -353,7 +359,7 @@ fn read_json<T: DeserializeOwned>(path: &Path) -> Result<Option<T>, HubError> {
     serde_json::from_slice(&bytes).map(Some).map_err(|e| bad(e.to_string()))
 }
 
-/// Writes JSON beside `path` and renames, so that nobody ever sees half of it.
+/// Writes JSON to a temporary file and renames it to `path`, so that the file is never incomplete.
 pub(crate) fn write_json(path: &Path, value: &impl Serialize) -> Result<(), HubError> {
     let bad = |e: serde_json::Error| HubError::BadRecord { path: path.to_owned(), reason: e.to_string() };
     let mut bytes = serde_json::to_vec_pretty(value).map_err(bad)?;
@@ -393,9 +399,9 @@ pub(crate) fn minimal_config(checkpoint: &Checkpoint) -> String {
     format!("{{\"model_name\": {:?}}}\n", checkpoint.architecture)
 }
 
-/// What a folder of weights seems to be: the official checkpoint with weights of that length, and its licence.
+/// The licence of the official checkpoint whose weights have the length of those in `folder`.
 ///
-/// Weights trained further have the length, and mostly the licence, of what they were trained from.
+/// Fine-tuned weights have the length, and mostly the licence, of the official ones.
 pub fn official_licence(folder: &Path) -> Option<Licence> {
     let bytes = fs::metadata(folder.join(WEIGHTS)).ok()?.len();
     crate::catalogue::of_size(bytes).map(|c| c.licence).next()

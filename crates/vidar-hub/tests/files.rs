@@ -1,13 +1,12 @@
-//! Checkpoints that are already on the disk: imported, found in the hub's cache, verified, spoilt.
+//! Checkpoints on the disk: imported, found in the hub's cache, verified, corrupted.
 #![allow(clippy::unwrap_used, clippy::panic)] // Helpers of tests may stop at the first surprise, as tests may.
 
-use sha2::{Digest, Sha256};
 use std::fs;
 use std::path::{Path, PathBuf};
 use vidar_hub::catalogue::{CONFIG, WEIGHTS};
 use vidar_hub::{
-    Checkpoint, HubError, HubSettings, IdentifiedBy, Licence, OfficialFile, Place, PullOptions, Store, Watch,
-    catalogue,
+    Checkpoint, CheckpointLocation, HubError, HubSettings, IdentifiedBy, Licence, OfficialFile, PullOptions,
+    Store, TransferCallbacks, catalogue,
 };
 
 fn weights(value: u8) -> Vec<u8> {
@@ -16,7 +15,7 @@ fn weights(value: u8) -> Vec<u8> {
 }
 
 fn checkpoint() -> &'static Checkpoint {
-    let hash: String = Sha256::digest(weights(1)).iter().map(|b| format!("{b:02x}")).collect();
+    let hash: String = vidar_hub::sha256_hex(&weights(1));
     Box::leak(Box::new(Checkpoint {
         name: "tiny",
         repo: "maker/TINY",
@@ -44,8 +43,8 @@ fn bench() -> (tempfile::TempDir, Store) {
     (folder, Store::new(settings))
 }
 
-fn quiet() -> Watch<'static> {
-    Watch { progress: &|_| {}, cancel: &|| false }
+fn quiet() -> TransferCallbacks<'static> {
+    TransferCallbacks { progress: &|_| {}, cancel: &|| false }
 }
 
 fn write(path: PathBuf, bytes: &[u8]) -> PathBuf {
@@ -66,7 +65,7 @@ fn a_file_and_a_folder_are_imported_and_verified() {
     assert_eq!(fs::read(installed.weights()).unwrap(), weights(1));
     let config = fs::read_to_string(installed.folder.join(CONFIG)).unwrap();
     assert!(config.contains("\"model_name\": \"da3-small\""), "{config}");
-    assert_eq!(installed.place, Place::Store);
+    assert_eq!(installed.location, CheckpointLocation::Store);
     let verified = store.verify(checkpoint(), &quiet()).unwrap();
     assert_eq!(
         verified.iter().map(|v| v.identified_by).collect::<Vec<_>>(),
@@ -82,7 +81,7 @@ fn a_file_and_a_folder_are_imported_and_verified() {
 }
 
 #[test]
-fn what_is_not_that_checkpoint_is_not_imported() {
+fn files_of_another_checkpoint_are_not_imported() {
     let (folder, store) = bench();
     let other = write(folder.path().join("other"), &weights(2));
     assert!(matches!(import(&store, &other).unwrap_err(), HubError::WrongHash { .. }));
@@ -96,17 +95,20 @@ fn what_is_not_that_checkpoint_is_not_imported() {
 }
 
 #[test]
-fn the_cache_of_the_hubs_programs_is_used_and_left_alone() {
+fn the_cache_of_the_hubs_programs_is_read_and_not_written() {
     let (folder, store) = bench();
     assert!(matches!(store.require(checkpoint()).unwrap_err(), HubError::NotInstalled { .. }));
     let repository = folder.path().join("cache/models--maker--TINY");
     write(repository.join("snapshots/aaaa").join(WEIGHTS), &weights(1)[..10]);
     write(repository.join("snapshots/aaaa").join(CONFIG), b"{}");
-    assert!(store.find(checkpoint()).unwrap().is_none(), "half a snapshot was taken for a whole one");
+    assert!(store.find(checkpoint()).unwrap().is_none(), "an incomplete snapshot was accepted");
     write(repository.join("snapshots/bbbb").join(WEIGHTS), &weights(1));
     write(repository.join("snapshots/bbbb").join(CONFIG), b"{}");
     let found = store.require(checkpoint()).unwrap();
-    assert_eq!((found.place, found.folder), (Place::HubCache, repository.join("snapshots/bbbb")));
+    assert_eq!(
+        (found.location, found.folder),
+        (CheckpointLocation::HubCache, repository.join("snapshots/bbbb"))
+    );
     write(repository.join("snapshots/cccc").join(WEIGHTS), &weights(1));
     write(repository.join("snapshots/cccc").join(CONFIG), b"{}");
     write(repository.join("refs/main"), b"cccc\n");
@@ -116,21 +118,21 @@ fn the_cache_of_the_hubs_programs_is_used_and_left_alone() {
 }
 
 #[test]
-fn a_checkpoint_that_rots_is_noticed() {
+fn a_corrupted_checkpoint_is_detected() {
     let (folder, store) = bench();
     let installed = import(&store, &write(folder.path().join("w"), &weights(1))).unwrap();
     let mut rotten = weights(1);
     rotten[700] ^= 4;
     fs::write(installed.weights(), rotten).unwrap();
     assert!(matches!(store.verify(checkpoint(), &quiet()).unwrap_err(), HubError::WrongHash { .. }));
-    let stop = Watch { progress: &|_| {}, cancel: &|| true };
+    let stop = TransferCallbacks { progress: &|_| {}, cancel: &|| true };
     assert!(matches!(store.verify(checkpoint(), &stop).unwrap_err(), HubError::Cancelled));
     fs::write(installed.weights(), &weights(1)[..20]).unwrap();
     assert!(matches!(store.verify(checkpoint(), &quiet()).unwrap_err(), HubError::NotInstalled { .. }));
 }
 
 #[test]
-fn a_damaged_index_is_named_and_never_panics() {
+fn a_damaged_record_is_reported_and_never_panics() {
     let (folder, store) = bench();
     let installed = import(&store, &write(folder.path().join("w"), &weights(1))).unwrap();
     let record = installed.folder.join("vidar-model.json");

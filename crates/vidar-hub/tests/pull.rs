@@ -1,23 +1,22 @@
-//! Fetching from a hub that behaves, misbehaves, or lies. Nothing but 127.0.0.1 is contacted.
+//! Fetching from a hub that responds correctly, fails, or sends wrong data. Nothing but 127.0.0.1 is contacted.
 #![allow(clippy::unwrap_used, clippy::panic)] // Helpers of tests may stop at the first surprise, as tests may.
 
 mod server;
 
 use server::{Reply, Request, Server};
-use sha2::{Digest, Sha256};
 use std::cell::Cell;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 use vidar_hub::catalogue::{CONFIG, WEIGHTS};
 use vidar_hub::{
-    Acceptance, Checkpoint, HubError, HubSettings, IdentifiedBy, Licence, OfficialFile, Place, PullOptions,
-    Store, Watch,
+    Acceptance, Checkpoint, CheckpointLocation, HubError, HubSettings, IdentifiedBy, Licence, OfficialFile,
+    PullOptions, Store, TransferCallbacks,
 };
 
 const CONFIG_TEXT: &[u8] = b"{\"model_name\": \"da3-small\"}\n";
 
 fn hex(bytes: &[u8]) -> String {
-    Sha256::digest(bytes).iter().map(|b| format!("{b:02x}")).collect()
+    vidar_hub::sha256_hex(bytes)
 }
 
 /// A whole safetensors file of one tensor and about 200 kB.
@@ -120,15 +119,15 @@ fn options() -> PullOptions {
     PullOptions { now: "2026-01-02T03:04:05Z".to_owned(), ..PullOptions::default() }
 }
 
-fn quiet() -> Watch<'static> {
-    Watch { progress: &|_| {}, cancel: &|| false }
+fn quiet() -> TransferCallbacks<'static> {
+    TransferCallbacks { progress: &|_| {}, cancel: &|| false }
 }
 
 #[test]
 fn a_checkpoint_is_fetched_recorded_verified_and_not_fetched_twice() {
     let bench = Bench::new(Reply::file);
     let told = Cell::new(0);
-    let watch = Watch {
+    let watch = TransferCallbacks {
         progress: &|p| {
             assert!(p.done >= told.get() || p.file == CONFIG);
             told.set(p.done);
@@ -146,7 +145,7 @@ fn a_checkpoint_is_fetched_recorded_verified_and_not_fetched_twice() {
     assert_eq!(record.source, format!("{}/maker/TINY", bench.server.address));
     assert_eq!(record.added, "2026-01-02T03:04:05Z");
     assert_eq!(installed.recorded_sha256(), Some(hex(&weights()).as_str()));
-    assert_eq!(installed.place, Place::Store);
+    assert_eq!(installed.location, CheckpointLocation::Store);
     let paths: Vec<String> = bench.server.requests().iter().map(|r| r.path.clone()).collect();
     let base = "/maker/TINY/resolve/0123456789abcdef0123456789abcdef01234567";
     assert!(paths.iter().all(|p| p.starts_with(base)), "{paths:?}");
@@ -160,7 +159,7 @@ fn a_checkpoint_is_fetched_recorded_verified_and_not_fetched_twice() {
 }
 
 #[test]
-fn a_transfer_that_breaks_goes_on_where_it_broke() {
+fn an_interrupted_transfer_continues_where_it_stopped() {
     let mut cuts = vec![120_000, 50_000].into_iter();
     let bench = Bench::new(move |request, file| {
         let cut_after = if request.method == "GET" { cuts.next() } else { None };
@@ -174,7 +173,7 @@ fn a_transfer_that_breaks_goes_on_where_it_broke() {
 }
 
 #[test]
-fn a_part_of_an_earlier_day_is_continued() {
+fn a_part_of_an_earlier_run_is_continued() {
     let bench = Bench::new(|request, file| Reply { cut_after: Some(60_000), ..Reply::file(request, file) });
     let HubError::Network { reason, .. } = bench.pull(tiny()).unwrap_err() else { panic!() };
     assert!(reason.contains("after"), "{reason}");
@@ -197,7 +196,7 @@ fn a_part_of_an_earlier_day_is_continued() {
 }
 
 #[test]
-fn a_part_that_was_spoilt_is_thrown_away_and_fetched_anew() {
+fn a_corrupted_part_is_discarded_and_fetched_again() {
     let bench = Bench::new(Reply::file);
     std::fs::create_dir_all(bench.folder()).unwrap();
     let part = bench.folder().join(format!("{WEIGHTS}.{}.part", &hex(&weights())[..12]));
@@ -211,7 +210,7 @@ fn a_part_that_was_spoilt_is_thrown_away_and_fetched_anew() {
 }
 
 #[test]
-fn a_server_that_ignores_ranges_is_followed_from_the_start() {
+fn a_server_that_ignores_ranges_is_read_from_the_start() {
     let mut first = true;
     let bench = Bench::new(move |request, file| {
         let whole = Reply { body: file.to_vec(), ..Reply::status(200) };
@@ -226,7 +225,7 @@ fn a_server_that_ignores_ranges_is_followed_from_the_start() {
 }
 
 #[test]
-fn redirects_are_followed_and_tell_the_hash_but_the_token_stays_at_home() {
+fn redirects_are_followed_with_their_hash_but_without_the_token() {
     let storage = Server::start(|request| Reply::file(request, &weights()));
     let away = format!("{}/blob?Signature=a%2Fb", storage.address);
     let hash = hex(&weights());
@@ -259,7 +258,7 @@ fn redirects_are_followed_and_tell_the_hash_but_the_token_stays_at_home() {
 }
 
 #[test]
-fn redirects_in_a_circle_or_to_nowhere_end_with_their_address() {
+fn invalid_redirects_and_redirect_loops_fail_with_their_address() {
     for location in ["/maker/TINY/resolve/round", "ftp://elsewhere/x", "", "http://"] {
         let bench = Bench::plain(move |_| Reply::status(302).with("Location", location));
         let error = bench.pull(tiny()).unwrap_err();
@@ -276,8 +275,8 @@ fn redirects_in_a_circle_or_to_nowhere_end_with_their_address() {
 }
 
 #[test]
-fn refusals_are_told_apart_and_say_what_to_do() {
-    for (status, with_token, expected) in [(401, false, "HF_TOKEN"), (403, true, "may not read it")] {
+fn each_refusal_has_its_error_and_hint() {
+    for (status, with_token, expected) in [(401, false, "HF_TOKEN"), (403, true, "has no read access")] {
         let bench = Bench::plain(move |_| Reply::status(status).with("X-Error-Message", "gated repo"));
         let token = with_token.then(|| "t".to_owned());
         let store = Store::new(HubSettings { token, ..bench.store.settings().clone() });
@@ -286,7 +285,7 @@ fn refusals_are_told_apart_and_say_what_to_do() {
         assert!(error.to_string().contains("gated repo"), "{error}");
         let hint = error.hint().unwrap();
         assert!(hint.contains(expected) && hint.contains("/maker/TINY"), "{hint}");
-        assert_eq!(bench.server.requests().len(), 1, "a refusal is not asked again");
+        assert_eq!(bench.server.requests().len(), 1, "a refusal is not retried");
     }
     let bench = Bench::plain(|_| Reply::status(404));
     assert!(matches!(bench.pull(tiny()).unwrap_err(), HubError::NotFound { .. }));
@@ -297,7 +296,7 @@ fn refusals_are_told_apart_and_say_what_to_do() {
 }
 
 #[test]
-fn a_busy_or_broken_server_is_asked_again_and_given_up_in_the_end() {
+fn requests_to_a_busy_or_broken_server_are_retried_and_finally_fail() {
     let mut left = 2;
     let bench = Bench::new(move |request, file| {
         if left > 0 {
@@ -318,7 +317,7 @@ fn a_busy_or_broken_server_is_asked_again_and_given_up_in_the_end() {
 }
 
 #[test]
-fn the_wait_that_a_server_asks_for_is_kept() {
+fn the_wait_requested_by_a_server_is_respected() {
     let mut first = true;
     let bench = Bench::new(move |request, file| match std::mem::take(&mut first) {
         true => Reply::status(429).with("Retry-After", 1),
@@ -361,11 +360,11 @@ fn a_length_or_hash_that_the_hub_announces_differently_is_refused_before_a_byte_
 
 #[test]
 fn a_body_of_the_wrong_length_is_refused() {
-    // Too long, and says so.
+    // Too long, with a matching Content-Length.
     let bench = Bench::new(|request, file| Reply::file(request, &[file, b"more"].concat()));
     let error = bench.pull(tiny()).unwrap_err();
     assert!(matches!(error, HubError::WrongSize { .. }), "{error}");
-    // Too long, and does not say so.
+    // Too long, without Content-Length.
     let bench = Bench::new(|_, file| Reply {
         body: [file, b"more"].concat(),
         own_length: true,
@@ -373,11 +372,11 @@ fn a_body_of_the_wrong_length_is_refused() {
     });
     let error = bench.pull(tiny()).unwrap_err();
     assert!(matches!(error, HubError::WrongSize { .. }), "{error}");
-    // Too short, and says so.
+    // Too short, with a matching Content-Length.
     let bench = Bench::new(|_, file| Reply { body: file[..9].to_vec(), ..Reply::status(200) });
     let error = bench.pull(tiny()).unwrap_err();
     assert!(matches!(error, HubError::WrongSize { found: 9, .. }), "{error}");
-    // Too short, and does not say so: as good as a broken connection.
+    // Too short, without Content-Length: treated as a broken connection.
     let bench =
         Bench::new(|_, file| Reply { body: file[..9].to_vec(), own_length: true, ..Reply::status(200) });
     let error = bench.pull(tiny()).unwrap_err();
@@ -397,15 +396,17 @@ fn an_endless_file_of_unknown_length_is_cut_off() {
 }
 
 #[test]
-fn a_drip_can_be_stopped_and_silence_is_noticed() {
+fn a_slow_transfer_can_be_stopped_and_a_stalled_one_times_out() {
     let bench = Bench::new(|request, file| Reply {
         drip: Some((1000, Duration::from_millis(20))),
         ..Reply::file(request, file)
     });
     let clock = Instant::now();
     let cancel = || clock.elapsed() > Duration::from_millis(300);
-    let error =
-        bench.store.pull(tiny(), &options(), &Watch { progress: &|_| {}, cancel: &cancel }).unwrap_err();
+    let error = bench
+        .store
+        .pull(tiny(), &options(), &TransferCallbacks { progress: &|_| {}, cancel: &cancel })
+        .unwrap_err();
     assert!(matches!(error, HubError::Cancelled), "{error}");
     assert!(clock.elapsed() < Duration::from_secs(2), "{:?}", clock.elapsed());
     let part = bench.files().into_iter().find(|f| f.ends_with(".part")).unwrap();
@@ -422,9 +423,9 @@ fn a_drip_can_be_stopped_and_silence_is_noticed() {
 }
 
 #[test]
-fn hostile_answers_end_in_an_error() {
-    type Lie = fn(&Request, &[u8]) -> Reply;
-    let lies: [Lie; 8] = [
+fn hostile_responses_end_in_an_error() {
+    type WrongResponse = fn(&Request, &[u8]) -> Reply;
+    let responses: [WrongResponse; 8] = [
         |r, f| Reply { status: 206, ..Reply::file(r, f) }.with("Content-Range", "bytes 5-9/10"),
         |r, f| {
             Reply { status: 206, ..Reply::file(r, f) }.with("Content-Range", "bytes 18446744073709551616-/*")
@@ -438,19 +439,19 @@ fn hostile_answers_end_in_an_error() {
         |r, f| Reply::file(r, f).with("X-Linked-Size", u64::MAX),
         |_, _| Reply::status(999),
     ];
-    for (i, lie) in lies.into_iter().enumerate() {
-        let bench = Bench::new(lie);
-        assert!(bench.pull(tiny()).is_err(), "lie {i} was believed");
-        assert!(!bench.folder().join(WEIGHTS).exists(), "lie {i}");
+    for (i, response) in responses.into_iter().enumerate() {
+        let bench = Bench::new(response);
+        assert!(bench.pull(tiny()).is_err(), "wrong response {i} was accepted");
+        assert!(!bench.folder().join(WEIGHTS).exists(), "wrong response {i}");
     }
-    // Headers that mean nothing are as good as none.
+    // Headers without meaning are ignored.
     let bench =
         Bench::new(|r, f| Reply::file(r, f).with("X-Linked-Size", "-3").with("X-Linked-ETag", "\"x\""));
     bench.pull(tiny()).unwrap();
 }
 
 #[test]
-fn random_bytes_in_place_of_an_answer_never_panic() {
+fn random_bytes_in_place_of_a_response_never_panic() {
     let mut state = 7_u64;
     let mut random = move || {
         state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
@@ -485,7 +486,7 @@ fn random_bytes_in_place_of_an_answer_never_panic() {
 }
 
 #[test]
-fn offline_means_offline() {
+fn offline_makes_no_request() {
     let bench = Bench::new(Reply::file);
     let store = Store::new(HubSettings { offline: true, ..bench.store.settings().clone() });
     let error = store.pull(tiny(), &options(), &quiet()).unwrap_err();
@@ -496,7 +497,7 @@ fn offline_means_offline() {
 }
 
 #[test]
-fn non_commercial_weights_need_an_acceptance_that_is_written_down() {
+fn non_commercial_weights_need_a_recorded_acceptance() {
     let free_of_charge = checkpoint(true, Licence::CcByNc4);
     let bench = Bench::new(Reply::file);
     let error = bench.pull(free_of_charge).unwrap_err();

@@ -1,4 +1,4 @@
-//! What every plot shares: header with title and legend, a frame with grid and ticks, and the map from data to pixels.
+//! Common parts of all plots: header with title and legend, frame with grid and ticks, mapping from data to pixels.
 
 use crate::canvas::{Area, Canvas, Pen, Rgb, theme};
 use crate::size::{PictureSize, TypeScale};
@@ -21,7 +21,7 @@ impl AxisFace {
     }
 }
 
-/// `label [unit]`, or what there is of it.
+/// `label [unit]`; an empty part is omitted.
 pub(crate) fn axis_title(label: &str, unit: &str) -> String {
     match (label.is_empty(), unit.is_empty()) {
         (_, true) => label.to_owned(),
@@ -83,7 +83,7 @@ fn widest(marks: &[(f64, String)], style: &TextStyle) -> f64 {
     marks.iter().map(|(_, l)| style.width_of(l)).fold(0.0, f64::max)
 }
 
-/// Room that labels and titles need around a frame: left, right, top, bottom.
+/// Margins for labels and titles around a frame: left, right, top, bottom.
 pub(crate) struct Margins {
     pub left: f64,
     pub right: f64,
@@ -99,14 +99,14 @@ impl Margins {
         let x_title = if x.title.is_empty() { 0.0 } else { 1.2 * line };
         Self {
             left: y_title + widest(&y.marks, &ink) + 8.0 * unit + 0.6 * line,
-            // Half of the last tick label may hang over.
+            // Half of the last tick label may extend beyond the frame.
             right: (0.5 * widest(&x.marks, &ink)).max(0.8 * line),
             top: 0.6 * line,
             bottom: 5.0 * unit + 1.2 * line + x_title + 0.5 * line,
         }
     }
 
-    /// What remains of `outer`; never smaller than a few pixels.
+    /// The area of `outer` within the margins; at least a few pixels.
     pub(crate) fn inside(&self, outer: &Area) -> Area {
         Area {
             left: outer.left + self.left,
@@ -149,7 +149,7 @@ pub(crate) fn draw_header(
     let gap = 1.4 * line;
     let mut left = side;
     for (i, (label, swatch)) in legend.iter().enumerate() {
-        // A mark needs less room than a piece of line.
+        // A mark needs less space than a piece of line.
         let key = if matches!(swatch, Swatch::Line(_)) { 1.8 * line } else { 0.9 * line };
         let label = style.fitted(label, room - key - 0.4 * line);
         let width = key + 0.4 * line + style.width_of(&label);
@@ -167,14 +167,14 @@ pub(crate) fn draw_header(
     Area { left: 0.0, top, width: canvas.width(), height: (canvas.height() - top).max(8.0) }
 }
 
-fn draw_swatch(canvas: &mut Canvas, swatch: Swatch, (left, middle): (f64, f64), width: f64, unit: f64) {
-    let center = (left + 0.5 * width, middle);
+fn draw_swatch(canvas: &mut Canvas, swatch: Swatch, (left, centre): (f64, f64), width: f64, unit: f64) {
+    let center = (left + 0.5 * width, centre);
     match swatch {
-        Swatch::Line(pen) => canvas.polyline(&[(left, middle), (left + width, middle)], pen),
+        Swatch::Line(pen) => canvas.polyline(&[(left, centre), (left + width, centre)], pen),
         Swatch::Fill(color) => {
             let side = 0.5 * width;
             let area =
-                Area { left: left + 0.5 * side, top: middle - 0.4 * side, width: side, height: 0.8 * side };
+                Area { left: left + 0.5 * side, top: centre - 0.4 * side, width: side, height: 0.8 * side };
             canvas.fill_area(&area, color);
         }
         Swatch::Dot(color) => canvas.disc(center, 3.5 * unit, color),
@@ -183,14 +183,14 @@ fn draw_swatch(canvas: &mut Canvas, swatch: Swatch, (left, middle): (f64, f64), 
     }
 }
 
-/// A ring: where a path begins.
+/// A ring: start of a path.
 pub(crate) fn start_mark(canvas: &mut Canvas, at: (f64, f64), color: Rgb, unit: f64) {
     canvas.disc(at, 7.5 * unit, theme::PAPER);
     canvas.disc(at, 6.5 * unit, color);
     canvas.disc(at, 3.8 * unit, theme::PAPER);
 }
 
-/// A square: where a path ends.
+/// A square: end of a path.
 pub(crate) fn end_mark(canvas: &mut Canvas, (x, y): (f64, f64), color: Rgb, unit: f64) {
     for (half, color) in [(6.8 * unit, theme::PAPER), (5.6 * unit, color)] {
         canvas.polygon(
@@ -200,8 +200,8 @@ pub(crate) fn end_mark(canvas: &mut Canvas, (x, y): (f64, f64), color: Rgb, unit
     }
 }
 
-/// Says in the middle of an area that there is nothing to show.
-pub(crate) fn say_empty(canvas: &mut Canvas, area: &Area, text: &str, scale: TypeScale) {
+/// Writes in the centre of an area that there is no data.
+pub(crate) fn draw_empty_note(canvas: &mut Canvas, area: &Area, text: &str, scale: TypeScale) {
     let style = TextStyle::new(scale.body, theme::QUIET_INK);
     let text = style.fitted(text, area.width);
     let at = (area.left + 0.5 * area.width, area.top + 0.5 * area.height);

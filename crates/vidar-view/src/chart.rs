@@ -1,7 +1,7 @@
 //! Distributions and comparisons: histograms and bars.
 
 use crate::Picture;
-use crate::axes::{AxisFace, Frame, Margins, Swatch, axis_title, draw_header, say_empty};
+use crate::axes::{AxisFace, Frame, Margins, Swatch, axis_title, draw_empty_note, draw_header};
 use crate::canvas::{Area, Canvas, Pen, theme};
 use crate::lines::{AxisSpec, axis_range, intervals_that_fit, rows_that_fit, series_color};
 use crate::size::{PictureSize, TypeScale};
@@ -13,11 +13,11 @@ use crate::ticks::{LARGEST, Ticks, nice_step, padded, range_of, short_number};
 pub struct Histogram {
     /// Title; may be empty.
     pub title: String,
-    /// The quantity. A fixed range leaves values outside it to the first and last bar's sides, counted in a note.
+    /// The quantity. With a fixed range, values outside it are counted in a note.
     pub x: AxisSpec,
     /// The values; those that are not finite are counted in a note.
     pub values: Vec<f64>,
-    /// Values worth marking, with names (`median 0.012 m`).
+    /// Marked values, with names (`median 0.012 m`).
     pub markers: Vec<(f64, String)>,
 }
 
@@ -71,7 +71,7 @@ pub fn plot_histogram(histogram: &Histogram, size: PictureSize) -> Picture {
     let frame = Frame { area, x: x.range, y: y.range };
     frame.draw(&mut canvas, &x, &y, scale);
     if most == 0 {
-        say_empty(&mut canvas, &area, "no data", scale);
+        draw_empty_note(&mut canvas, &area, "no data", scale);
     }
     bins.draw(&mut canvas, &frame);
     draw_markers(&mut canvas, &frame, &histogram.markers, scale);
@@ -149,7 +149,7 @@ impl Bins {
     }
 }
 
-/// Between 12 and 60 bins over `span`, as Freedman and Diaconis have it where that lies between.
+/// Between 12 and 60 bins over `span`, by the rule of Freedman and Diaconis, clamped.
 fn bin_width(sorted: &[f64], span: f64) -> f64 {
     let quantile = |q: f64| sorted.get((q * (sorted.len().saturating_sub(1)) as f64) as usize).copied();
     let spread = quantile(0.75).zip(quantile(0.25)).map_or(0.0, |(a, b)| a - b);
@@ -202,7 +202,7 @@ pub fn plot_bars(plot: &BarPlot, size: PictureSize) -> Picture {
     let data = range_of(plot.groups.iter().flat_map(|g| g.values.iter().copied()));
     let frame = bar_frame(&mut canvas, plot, data, &outer, scale);
     if data.is_none() || plot.categories.is_empty() {
-        say_empty(&mut canvas, &frame.area, "no data", scale);
+        draw_empty_note(&mut canvas, &frame.area, "no data", scale);
         return canvas.into_picture();
     }
     let row = frame.area.height / plot.categories.len() as f64;
@@ -260,7 +260,7 @@ fn bar_frame(
     let fixed = plot.value.range.is_some();
     let (low, mut high) = axis_range(&plot.value.clone().from_zero(), data, 0.02);
     if !fixed {
-        // The longest bar ends where its value still fits behind it.
+        // The longest bar leaves space for its value.
         high = low + (high - low) * area.width / (area.width - room);
         if low < 0.0 && high <= 0.0 {
             high = padded((low, high), 0.05).1;

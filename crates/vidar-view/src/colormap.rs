@@ -1,4 +1,4 @@
-//! Colours for numbers: maps whose lightness changes evenly, so that they survive grey printing and colour blindness.
+//! Colour maps with monotone lightness, readable in grey print and with colour blindness.
 //!
 //! Each map is a path through OKLCH (Ottosson, "A perceptual color space for image processing", 2020): lightness is
 //! linear in the value, hue turns along a few stops, and chroma is as strong as sRGB allows up to a cap.
@@ -58,7 +58,7 @@ fn table(recipe: &Recipe) -> Table {
         let (from, share) = (place.floor() as usize, place.fract());
         let h0 = recipe.hues[from];
         let h1 = recipe.hues[(from + 1).min(recipe.hues.len() - 1)];
-        // Red lies at the seam of the circle, so the shorter way round is taken.
+        // Red is at the wrap-around of the circle, so the shorter way round is taken.
         let turn = (h1 - h0 + 540.0).rem_euclid(360.0) - 180.0;
         strongest(lightness, h0 + share * turn, recipe.chroma_cap)
     })
@@ -73,7 +73,7 @@ fn strongest(lightness: f64, hue_deg: f64, cap: f64) -> [u8; 3] {
     if fits(&at(cap)) {
         low = cap;
     }
-    // Twenty halvings are finer than eight bits can show.
+    // Twenty bisections are finer than eight bits.
     for _ in 0..20 {
         let middle = 0.5 * (low + high);
         if fits(&at(middle)) { low = middle } else { high = middle }

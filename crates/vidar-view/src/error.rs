@@ -1,8 +1,8 @@
-//! What can go wrong when a picture is made.
+//! Errors of drawing pictures.
 
 use thiserror::Error;
 
-/// Why there is no picture.
+/// Errors of drawing a picture.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum ViewError {
@@ -16,19 +16,19 @@ pub enum ViewError {
         /// Largest side.
         max: usize,
     },
-    /// The PNG encoder refused.
-    #[error("the PNG encoder refused a picture of {width}x{height} pixels: {source}")]
+    /// The PNG encoder failed.
+    #[error("the PNG encoder failed on a picture of {width}x{height} pixels: {source}")]
     Png {
         /// Columns.
         width: usize,
         /// Rows.
         height: usize,
-        /// What it said.
+        /// Its error.
         source: png::EncodingError,
     },
-    /// An attribute list of a surface does not fit its vertices, or a triangle names a vertex that is not there.
+    /// An attribute list of a surface does not match its vertices, or a triangle index is out of range.
     #[error(
-        "{surface} is not consistent: {vertices} vertices, {triangles} triangles, but an attribute list has another length or an index lies outside"
+        "{surface} is not consistent: {vertices} vertices, {triangles} triangles, but an attribute list has another length or an index is out of range"
     )]
     InconsistentSurface {
         /// `mesh` or `cloud`.
@@ -38,7 +38,7 @@ pub enum ViewError {
         /// Number of triangles.
         triangles: usize,
     },
-    /// Values to be painted onto a surface are not one per vertex.
+    /// The number of values on a surface is not one per vertex.
     #[error("values on the surface: expected {expected} (one per vertex), found {found}")]
     WrongValueCount {
         /// Number of vertices.
@@ -46,7 +46,7 @@ pub enum ViewError {
         /// Number of values.
         found: usize,
     },
-    /// A camera holds a value that is not finite, or looks nowhere.
+    /// A camera contains a value that is not finite, or has no valid direction.
     #[error("map camera `{name}` is degenerate: {what}")]
     BadCamera {
         /// Name of the viewpoint.

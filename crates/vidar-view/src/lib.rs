@@ -1,16 +1,16 @@
-//! Pictures and the report: what a run looked like, for a person.
+//! Plots, pictures and the HTML report of a run.
 //!
-//! Everything here turns values into pixels or into one HTML file and touches neither disk nor screen: the caller
+//! All functions turn values into pixels or into one HTML file, without any access to disk or screen: the caller
 //! writes the bytes. A picture is an `Image<[u8; 3]>` in sRGB until [`encode_png`].
 //!
 //! - [`plot_trajectories_top_down`]: paths in metres, equal scale on both axes, ground truth where there is one.
 //! - [`plot_lines`], [`plot_histogram`], [`plot_bars`]: errors over time, distributions, timings.
-//! - [`depth_picture`], [`confidence_picture`], [`side_by_side`]: what the geometry stage saw.
+//! - [`depth_picture`], [`confidence_picture`], [`side_by_side`]: output of the geometry stage.
 //! - [`render_map`]: a mesh or a cloud from a [`MapCamera`], by a software rasteriser.
 //! - [`render_html`]: a [`Report`] as one self-contained file.
 //!
-//! Plots and pictures never fail and never panic: values that are not finite are left out, an empty input gives
-//! empty axes that say so. The same input gives the same bytes for any number of threads.
+//! Plots and pictures never fail and never panic: values that are not finite are skipped, an empty input gives
+//! empty axes with a note. The same input gives the same bytes for any number of threads.
 
 mod axes;
 mod canvas;
@@ -36,7 +36,7 @@ pub use map::{MapSurface, Shading, render_map, render_map_with_path};
 pub use picture::{confidence_picture, depth_picture, side_by_side};
 pub use png_bytes::encode_png;
 pub use report::{
-    Figure, FigureWidth, Report, Section, SummaryItem, Table, Verdict, VerdictLevel, render_html,
+    Assessment, AssessmentLevel, Figure, FigureWidth, Report, Section, SummaryItem, Table, render_html,
 };
 pub use size::PictureSize;
 pub use ticks::{Ticks, nice_step};

@@ -1,7 +1,7 @@
 //! The general x-y plot: errors over time, timings, curves of precision and recall.
 
 use crate::Picture;
-use crate::axes::{AxisFace, Frame, Margins, Swatch, axis_title, draw_header, say_empty};
+use crate::axes::{AxisFace, Frame, Margins, Swatch, axis_title, draw_empty_note, draw_header};
 use crate::canvas::{Area, Canvas, Pen, Rgb, clip_segment, theme};
 use crate::size::{PictureSize, TypeScale};
 use crate::text::{Align, TextStyle};
@@ -26,7 +26,7 @@ impl AxisSpec {
         Self { label: label.into(), unit: unit.into(), ..Self::default() }
     }
 
-    /// The same axis showing zero: right for errors, durations, counts.
+    /// The same axis with zero included: for errors, durations, counts.
     pub fn from_zero(self) -> Self {
         Self { includes_zero: true, ..self }
     }
@@ -70,7 +70,7 @@ impl Series {
     }
 }
 
-/// A level worth comparing with: a threshold, a median.
+/// A horizontal reference level: a threshold, a median.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ReferenceLine {
     /// Where, on the y axis.
@@ -88,7 +88,7 @@ pub struct LinePlot {
     pub x: AxisSpec,
     /// Vertical axis.
     pub y: AxisSpec,
-    /// What is shown, in the order of the legend; later ones lie on top.
+    /// The series, in the order of the legend; later ones are drawn on top.
     pub series: Vec<Series>,
     /// Horizontal levels.
     pub references: Vec<ReferenceLine>,
@@ -107,7 +107,7 @@ pub fn plot_lines(plot: &LinePlot, size: PictureSize) -> Picture {
     let frame = Frame { area, x: x.range, y: y.range };
     frame.draw(&mut canvas, &x, &y, scale);
     if points().next().is_none() {
-        say_empty(&mut canvas, &area, "no data", scale);
+        draw_empty_note(&mut canvas, &area, "no data", scale);
     }
     for (i, series) in plot.series.iter().enumerate() {
         draw_series(&mut canvas, &frame, series, series_color(i), scale);
@@ -145,7 +145,7 @@ fn fitted_axes(
 ) -> (AxisFace, AxisFace, Area) {
     let x_range = axis_range(&plot.x, x_data, 0.0);
     let y_range = axis_range(&plot.y, y_data, 0.05);
-    // Labels decide the margins and the margins decide how many labels fit: a first guess, then the real thing.
+    // Margins depend on the labels, and the number of labels on the margins: two passes.
     let faces = |columns: usize, rows: usize| {
         let x_ticks = Ticks::between(x_range.0, x_range.1, columns);
         let y_ticks = Ticks::between(y_range.0, y_range.1, rows);
@@ -180,7 +180,7 @@ pub(crate) fn axis_range(axis: &AxisSpec, data: Option<(f64, f64)>, pad: f64) ->
     }
     let (low, high) = (low.min(0.0), high.max(0.0));
     let (padded_low, padded_high) = padded((low, high), pad);
-    // The side that ends at zero stays there: nothing lies beyond.
+    // An end at zero stays at zero.
     (if low == 0.0 { 0.0 } else { padded_low }, if high == 0.0 && low < 0.0 { 0.0 } else { padded_high })
 }
 
@@ -201,7 +201,7 @@ fn draw_series(canvas: &mut Canvas, frame: &Frame, series: &Series, color: Rgb, 
                     && x <= frame.area.right() + 0.5
                     && y >= frame.area.top - 0.5
                     && y <= frame.area.bottom() + 0.5;
-                // A dot on top of the one before adds nothing, and millions of them take long.
+                // A dot at the same pixel as the one before is skipped, for speed.
                 if inside && !((x - last.0).abs() < 0.25 && (y - last.1).abs() < 0.25) {
                     canvas.disc((x, y), 2.4 * scale.unit, color);
                     last = (x, y);
@@ -236,7 +236,7 @@ pub(crate) fn draw_clipped(canvas: &mut Canvas, area: &Area, points: &[(f64, f64
     canvas.polyline(&run, pen);
 }
 
-/// Fewer points that look the same: of consecutive points within one pixel column the first, lowest, highest and
+/// Reduces points without visible change: of consecutive points within one pixel column the first, lowest, highest and
 /// last are kept, so that no spike is lost.
 pub(crate) fn thinned(points: &[(f64, f64)]) -> Vec<(f64, f64)> {
     let mut kept = Vec::new();

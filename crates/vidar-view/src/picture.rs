@@ -1,4 +1,4 @@
-//! Pictures of depth and confidence, and pictures beside each other.
+//! Pictures of depth and confidence, and pictures side by side.
 
 use crate::Picture;
 use crate::canvas::{Area, Canvas, Pen, theme};
@@ -8,7 +8,7 @@ use crate::text::{Align, TextStyle};
 use crate::ticks::Ticks;
 use vidar_core::Image;
 
-/// Narrower images are enlarged by a whole factor to about this many columns, so that the scale beside them fits.
+/// Narrower images are enlarged by a whole factor to about this many columns, so that the colour scale fits.
 const SMALLEST_WIDTH: usize = 320;
 
 /// A picture of z-depth with a scale in metres: near is bright, far is dark, no depth is dark grey.
@@ -26,7 +26,7 @@ pub fn depth_picture(depth: &Image<f32>, range: Option<(f32, f32)>) -> Picture {
     })
 }
 
-/// A picture of confidence 0…1 with its scale: sure is bright, unsure is dark, not a number is dark grey.
+/// A picture of confidence 0…1 with its scale: high is bright, low is dark, NaN is dark grey.
 pub fn confidence_picture(confidence: &Image<f32>) -> Picture {
     let colours = confidence.map(|&c| ColorMap::Sea.color(c));
     with_color_bar(&colours, "confidence", (0.0, 1.0), |v| ColorMap::Sea.color(v as f32))
@@ -34,7 +34,7 @@ pub fn confidence_picture(confidence: &Image<f32>) -> Picture {
 
 /// 1st and 99th percentile of the valid values, opened where they coincide.
 fn robust_range(image: &Image<f32>, valid: impl Fn(f32) -> bool) -> (f32, f32) {
-    // A million samples place a percentile well enough.
+    // A million samples are enough for a percentile.
     let stride = (image.data().len() / 1_000_000).max(1);
     let mut values: Vec<f32> = image.data().iter().step_by(stride).copied().filter(|&v| valid(v)).collect();
     values.sort_unstable_by(f32::total_cmp);
@@ -51,7 +51,7 @@ fn with_color_bar(
     range: (f64, f64),
     color: impl Fn(f64) -> [u8; 3],
 ) -> Picture {
-    let shown = comfortable(colours);
+    let shown = viewable(colours);
     let (width, height) = (shown.width(), shown.height().max(PictureSize::MIN));
     let scale = TypeScale::for_extent(width.min(height * 4 / 3));
     let (line, unit) = (scale.line(), scale.unit);
@@ -98,8 +98,8 @@ fn draw_color_bar(
     canvas.outline(area, Pen::new(theme::FRAME, unit));
 }
 
-/// The picture enlarged or thinned by whole factors to a size that can be looked at.
-fn comfortable(picture: &Picture) -> Picture {
+/// The picture enlarged or thinned by whole factors to a size suitable for viewing.
+fn viewable(picture: &Picture) -> Picture {
     let (w, h) = (picture.width().max(1), picture.height().max(1));
     if picture.data().is_empty() {
         return Picture::filled(SMALLEST_WIDTH, SMALLEST_WIDTH * 3 / 4, theme::NO_DATA);

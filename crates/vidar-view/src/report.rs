@@ -1,4 +1,4 @@
-//! One run's report as one HTML file that needs nothing else: no network, no script, no font.
+//! The report of one run as one self-contained HTML file: no network, no script, no font.
 
 mod style;
 
@@ -7,25 +7,25 @@ use base64::engine::general_purpose::STANDARD;
 use std::fmt::Write;
 use vidar_core::Warning;
 
-/// How much a result can be trusted.
+/// Level of trust in a result.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum VerdictLevel {
-    /// What was asked for holds.
+pub enum AssessmentLevel {
+    /// The requirements are met.
     Good,
-    /// It holds with reservations, which the text names.
+    /// The requirements are met with reservations, given in the text.
     Caution,
-    /// It does not hold.
+    /// The requirements are not met.
     Bad,
-    /// There was nothing to judge it by.
-    Unjudged,
+    /// There was no reference to evaluate it against.
+    NotEvaluated,
 }
 
-/// The one sentence a reader in a hurry takes away.
+/// One-sentence summary of the quality of a result.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Verdict {
-    /// How much the result can be trusted.
-    pub level: VerdictLevel,
-    /// Why, with numbers.
+pub struct Assessment {
+    /// Level of trust.
+    pub level: AssessmentLevel,
+    /// Reason, with numbers.
     pub text: String,
 }
 
@@ -36,7 +36,7 @@ pub struct SummaryItem {
     pub label: String,
     /// Its value with unit.
     pub value: String,
-    /// What it means, for somebody who sees it for the first time. May be empty.
+    /// Short explanation for new users. May be empty.
     pub explanation: String,
 }
 
@@ -51,13 +51,13 @@ pub struct Table {
     pub rows: Vec<Vec<String>>,
 }
 
-/// How wide a figure is shown.
+/// Width of a figure.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Default)]
 pub enum FigureWidth {
     /// The whole column.
     #[default]
     Full,
-    /// Two beside each other where the window is wide enough; plots of about 720 columns suit it.
+    /// Two side by side if the window is wide enough; plots of about 720 columns suit it.
     Half,
 }
 
@@ -68,9 +68,9 @@ pub struct Figure {
     pub png: Vec<u8>,
     /// What it shows and what to look for.
     pub caption: String,
-    /// The same for somebody who cannot see it.
+    /// Alternative text.
     pub alt: String,
-    /// How wide it is shown.
+    /// Its width.
     pub width: FigureWidth,
 }
 
@@ -87,22 +87,22 @@ pub struct Section {
     pub figures: Vec<Figure>,
 }
 
-/// Everything a report shows, as plain text and numbers already formatted.
+/// Content of a report, as plain text with formatted numbers.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Report {
     /// Title: usually the dataset.
     pub title: String,
     /// What was done, in one line. May be empty.
     pub subtitle: String,
-    /// The judgement, if any.
-    pub verdict: Option<Verdict>,
+    /// The assessment, if any.
+    pub assessment: Option<Assessment>,
     /// The most important numbers.
     pub summary: Vec<SummaryItem>,
     /// The parts, in the order of reading.
     pub sections: Vec<Section>,
-    /// What the user should know.
+    /// Warnings.
     pub warnings: Vec<Warning>,
-    /// How it was made: name and value (command, version, seed).
+    /// Provenance: name and value (command, version, seed).
     pub provenance: Vec<(String, String)>,
 }
 
@@ -158,15 +158,15 @@ fn push_head(html: &mut String, report: &Report) {
     if !report.subtitle.is_empty() {
         put!(html, "<p class=\"subtitle\">{}</p>\n", escaped(&report.subtitle));
     }
-    if let Some(verdict) = &report.verdict {
-        let (class, word) = match verdict.level {
-            VerdictLevel::Good => ("good", "Good"),
-            VerdictLevel::Caution => ("caution", "With reservations"),
-            VerdictLevel::Bad => ("bad", "Not met"),
-            VerdictLevel::Unjudged => ("unjudged", "Not judged"),
+    if let Some(assessment) = &report.assessment {
+        let (class, word) = match assessment.level {
+            AssessmentLevel::Good => ("good", "Good"),
+            AssessmentLevel::Caution => ("caution", "With reservations"),
+            AssessmentLevel::Bad => ("bad", "Not met"),
+            AssessmentLevel::NotEvaluated => ("not-evaluated", "Not evaluated"),
         };
-        let text = escaped(&verdict.text);
-        put!(html, "<p class=\"verdict {class}\"><strong>{word}</strong><span>{text}</span></p>\n");
+        let text = escaped(&assessment.text);
+        put!(html, "<p class=\"assessment {class}\"><strong>{word}</strong><span>{text}</span></p>\n");
     }
     html.push_str("</header>\n");
 }
@@ -210,7 +210,7 @@ fn push_warnings(html: &mut String, warnings: &[Warning]) {
 }
 
 fn push_contents(html: &mut String, sections: &[Section]) {
-    // Two sections are found without help.
+    // Two sections need no table of contents.
     if sections.len() < 3 {
         return;
     }
@@ -254,7 +254,7 @@ fn push_table(html: &mut String, table: &Table) {
     html.push_str("</tr></thead>\n<tbody>\n");
     for row in &table.rows {
         html.push_str("<tr>");
-        // A row is as wide as the head: what is missing stays empty, what is too much is not lost either.
+        // Short rows are filled with empty cells; extra cells are kept.
         for c in 0..row.len().max(table.columns.len()) {
             let cell = row.get(c).map_or_else(String::new, |t| escaped(t));
             if c == 0 {
@@ -268,7 +268,7 @@ fn push_table(html: &mut String, table: &Table) {
     html.push_str("</tbody>\n</table></div>\n");
 }
 
-/// Whether every filled cell of a column starts like a number (or says that there is none).
+/// Whether every filled cell of a column starts like a number or is a dash.
 fn is_numeric(table: &Table, column: usize) -> bool {
     let mut cells = table.rows.iter().filter_map(|r| r.get(column)).filter(|c| !c.is_empty()).peekable();
     let starts_like_number = |cell: &String| {
@@ -297,7 +297,7 @@ fn push_provenance(html: &mut String, provenance: &[(String, String)]) {
     if provenance.is_empty() {
         return;
     }
-    html.push_str("<footer>\n<h2>How this was made</h2>\n<dl>\n");
+    html.push_str("<footer>\n<h2>Provenance</h2>\n<dl>\n");
     for (name, value) in provenance {
         put!(html, "<dt>{}</dt><dd><code>{}</code></dd>\n", escaped(name), escaped(value));
     }

@@ -34,7 +34,7 @@ impl PictureSize {
 
     /// Text heights and stroke unit that suit this size.
     pub(crate) fn type_scale(self) -> TypeScale {
-        // Judged by the side that limits: 16 px text suits 480 rows, and so on upwards.
+        // Set by the limiting side: 16 px text suits 480 rows, and so on upwards.
         TypeScale::for_extent(self.width.min(self.height * 4 / 3))
     }
 }

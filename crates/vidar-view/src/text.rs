@@ -3,7 +3,7 @@
 use crate::canvas::{Canvas, Rgb};
 use noto_sans_mono_bitmap::{FontWeight, RasterHeight, RasterizedChar, get_raster, get_raster_width};
 
-/// Which part of the text lies at the given place, along the text.
+/// Which part of the text is at the given position, along the text.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Align {
     Start,
@@ -11,7 +11,7 @@ pub(crate) enum Align {
     End,
 }
 
-/// How a piece of text looks.
+/// Style of a text.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct TextStyle {
     pub height: RasterHeight,
@@ -53,7 +53,7 @@ impl TextStyle {
     }
 }
 
-/// `text` in characters the font has: typographic signs become their plain forms, anything else a `?`.
+/// `text` in characters the font has: typographic characters become ASCII, any other character a `?`.
 fn printable(text: &str) -> String {
     let mut out = String::with_capacity(text.len());
     for c in text.chars() {
@@ -76,7 +76,7 @@ fn printable(text: &str) -> String {
 }
 
 impl Canvas {
-    /// Horizontal text; `y` is the middle of its line.
+    /// Horizontal text; `y` is the centre of its line.
     pub(crate) fn text(&mut self, (x, y): (f64, f64), text: &str, align: Align, style: &TextStyle) {
         let text = printable(text);
         let start = start_of(x, text.chars().count(), align, style);
@@ -87,7 +87,7 @@ impl Canvas {
         }
     }
 
-    /// Text that reads upwards; `x` is the middle of its line.
+    /// Text that reads upwards; `x` is the centre of its line.
     pub(crate) fn text_upwards(&mut self, (x, y): (f64, f64), text: &str, align: Align, style: &TextStyle) {
         let text = printable(text);
         let start = start_of(-y, text.chars().count(), align, style);
@@ -131,13 +131,13 @@ mod tests {
     }
 
     #[test]
-    fn signs_without_a_glyph_become_readable_ones() {
+    fn characters_without_a_glyph_are_replaced() {
         assert_eq!(printable("\u{2212}1 \u{2026} \u{2265}2 m\u{b2}"), "-1 ... >=2 m\u{b2}");
         assert_eq!(printable("\u{1f600}\n"), "? ");
     }
 
     #[test]
-    fn long_text_is_cut_to_its_room() {
+    fn long_text_is_cut_to_the_width() {
         let s = style();
         let cut = s.fitted("a rather long dataset name", 10.0 * s.width_of("x"));
         assert_eq!(cut.chars().count(), 10);

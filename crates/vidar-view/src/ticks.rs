@@ -15,7 +15,7 @@ pub fn nice_step(span: f64, max_intervals: usize) -> f64 {
     for k in [exponent, exponent + 1.0] {
         for mantissa in [1.0, 2.0, 5.0] {
             let step = scaled(mantissa, k as i32);
-            // A hair of tolerance: 0.3 / 3 must not round up to 0.2.
+            // A small tolerance: 0.3 / 3 must not round up to 0.2.
             if step >= raw * (1.0 - 1e-9) && step > 0.0 {
                 return step;
             }
@@ -91,7 +91,7 @@ pub(crate) fn range_of(values: impl IntoIterator<Item = f64>) -> Option<(f64, f6
     })
 }
 
-/// `range` with `share` of its width added on both sides; a range without width is opened around its value.
+/// `range` with `share` of its width added on both sides; a range without width is widened around its value.
 pub(crate) fn padded((low, high): (f64, f64), share: f64) -> (f64, f64) {
     let span = high - low;
     let scale = low.abs().max(high.abs());
@@ -149,7 +149,7 @@ mod tests {
     }
 
     #[test]
-    fn labels_never_say_minus_zero_and_use_exponents_only_far_out() {
+    fn labels_are_never_minus_zero_and_use_exponents_only_for_extreme_values() {
         assert_eq!(Ticks::between(-1.0, 1.0, 4).labels(), ["-1.0", "-0.5", "0.0", "0.5", "1.0"]);
         assert_eq!(Ticks::between(0.0, 2e7, 2).labels(), ["0", "1e7", "2e7"]);
         assert_eq!(Ticks::between(0.0, 3e-6, 3).labels(), ["0", "1e-6", "2e-6", "3e-6"]);
@@ -165,7 +165,7 @@ mod tests {
     }
 
     #[test]
-    fn short_numbers_keep_three_digits_and_no_idle_zeros() {
+    fn short_numbers_have_three_digits_and_no_trailing_zeros() {
         let texts = [0.012_34, 0.4, 100.0, 98_765.0, 0.0, 1e-7, f64::NAN].map(short_number);
         assert_eq!(texts, ["0.0123", "0.4", "100", "98765", "0", "1.00e-7", "n/a"]);
     }

@@ -1,7 +1,7 @@
 //! Paths seen from above (and from the side), with the same scale on all axes.
 
 use crate::Picture;
-use crate::axes::{AxisFace, Frame, Margins, Swatch, draw_header, end_mark, say_empty, start_mark};
+use crate::axes::{AxisFace, Frame, Margins, Swatch, draw_empty_note, draw_header, end_mark, start_mark};
 use crate::canvas::{Area, Canvas, Pen, Rgb, theme};
 use crate::lines::{draw_clipped, intervals_that_fit, rows_that_fit};
 use crate::map::camera::HorizontalPlane;
@@ -11,13 +11,13 @@ use crate::ticks::{LARGEST, Ticks, nice_step, range_of};
 use nalgebra::Vector3;
 use vidar_core::Trajectory;
 
-/// What a path is; decides how it is drawn.
+/// Role of a path; sets its style.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Default)]
 pub enum TrajectoryRole {
     /// A result: coloured, in front.
     #[default]
     Estimate,
-    /// What it is compared with: dark, broad, behind.
+    /// The reference: dark, wide, behind.
     GroundTruth,
 }
 
@@ -68,8 +68,8 @@ pub fn plot_trajectories_top_down(items: &[PlotTrajectory<'_>], size: PictureSiz
 
 /// Paths from above: metres with equal scale on both axes, start (ring) and end (square) of each path, scale bar.
 ///
-/// Where two poses lie further apart in time than five usual intervals the path was not observed, and the connecting
-/// line is dashed.
+/// Where two poses lie further apart in time than five median intervals, the path was not observed there and the
+/// connecting line is dashed.
 pub fn plot_trajectories(items: &[PlotTrajectory<'_>], plot: &TrajectoryPlot, size: PictureSize) -> Picture {
     let scale = size.type_scale();
     let plane = HorizontalPlane::of_up(&plot.up);
@@ -85,7 +85,7 @@ pub fn plot_trajectories(items: &[PlotTrajectory<'_>], plot: &TrajectoryPlot, si
         draw_paths(&mut canvas, side, &paths, 2, scale);
     }
     if paths.iter().all(|p| p.points.is_empty()) {
-        say_empty(&mut canvas, &panels.top.area, "no poses", scale);
+        draw_empty_note(&mut canvas, &panels.top.area, "no poses", scale);
     } else {
         draw_scale_bar(&mut canvas, &panels.top, scale);
     }
@@ -167,10 +167,10 @@ impl Panels {
     /// Two frames with one number of pixels per metre, as large as they fit, sharing the horizontal axis.
     fn layout(paths: &[Path], plane: &HorizontalPlane, side: bool, outer: &Area, scale: TypeScale) -> Self {
         let spans: [(f64, f64); 3] = std::array::from_fn(|axis| {
-            opened(range_of(paths.iter().flat_map(|p| p.points.iter().map(move |q| q[axis]))))
+            widened(range_of(paths.iter().flat_map(|p| p.points.iter().map(move |q| q[axis]))))
         });
         let titles: [String; 3] = std::array::from_fn(|axis| format!("{} [m]", plane.names[axis]));
-        // Margins from a guess of the labels; the same labels are drawn later with a step that fits.
+        // Margins from estimated labels; the same labels are drawn later with a step that fits.
         let widest = spans.iter().map(|s| s.1 - s.0).fold(0.0, f64::max);
         let guess = nice_step(widest, 8);
         let face = |axis: usize, range: (f64, f64), step: f64| {
@@ -184,13 +184,13 @@ impl Panels {
 
         let width = outer.width - margins.left - margins.right;
         let room = outer.height - margins.top - margins.bottom;
-        // Marks at the ends of a flat path need room above and below.
+        // Marks at the ends of a flat path need space above and below.
         let air = 20.0 * scale.unit;
         let both = room - margins.top - margins.bottom - air;
         let with_side = side && both > 6.0 * scale.line();
         let (height, metres) = if with_side { (both, length(1) + length(2)) } else { (room, length(1)) };
         let per_metre = (width / length(0)).min(height / metres).max(1e-12);
-        // What is left over vertically goes to the view from above; horizontally both are opened.
+        // Remaining height goes to the top view; remaining width widens both views.
         let side_height = if with_side { (length(2) * per_metre).max(3.0 * scale.line()) + air } else { 0.0 };
         let top_height = (if with_side { height + air } else { height } - side_height).max(8.0);
         let (left, width) = (outer.left + margins.left, width.max(8.0));
@@ -217,8 +217,8 @@ impl Panels {
     }
 }
 
-/// A range with some air; a path without extent gets a metre around it.
-fn opened(range: Option<(f64, f64)>) -> (f64, f64) {
+/// A range with a margin; a path without extent gets one metre around it.
+fn widened(range: Option<(f64, f64)>) -> (f64, f64) {
     let Some((low, high)) = range else { return (-1.0, 1.0) };
     let span = high - low;
     if span <= 1e-6 + 1e-9 * low.abs().max(high.abs()) {

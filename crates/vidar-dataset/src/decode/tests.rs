@@ -78,7 +78,7 @@ fn jpeg(color: bool) -> Vec<u8> {
 }
 
 #[test]
-fn jpegs_are_grey_or_colour_and_truncation_is_seen_everywhere() {
+fn jpegs_are_grey_or_colour_and_every_truncation_is_detected() {
     assert!(matches!(decode(&jpeg(false)).unwrap(), FrameImage::Gray8(_)));
     let whole = jpeg(true);
     let colour = decode(&whole).unwrap();
@@ -111,7 +111,7 @@ fn header(width: u32, height: u32) -> Vec<u8> {
 }
 
 #[test]
-fn headers_that_claim_too_much_are_refused_before_anything_is_allocated() {
+fn headers_with_too_large_sizes_are_refused_before_allocation() {
     let error = decode(&header(20_000, 4)).unwrap_err();
     assert!(error.contains("20000x4") || error.contains("limit"), "{error}");
     let error = decode(&header(16_384, 16_384)).unwrap_err();
@@ -119,7 +119,7 @@ fn headers_that_claim_too_much_are_refused_before_anything_is_allocated() {
     let small = ImageLimits { max_decoded_bytes: 7, ..Default::default() };
     let whole = encode(png::ColorType::Grayscale, png::BitDepth::Eight, &[], &[9; 8]);
     assert!(
-        decode_image(&whole, &small).unwrap_err().contains("8 bytes; at most 7"),
+        decode_image(&whole, &small).unwrap_err().contains("8 bytes; the limit is 7"),
         "a limit below the image"
     );
 }

@@ -1,4 +1,4 @@
-//! Lists with a time in every line: files, inertial readings, bare times.
+//! Lists with a time in every line: files, IMU samples, times only.
 
 use super::units::{UnitRule, decide_unit, read_time};
 use crate::dataset::AccelSample;
@@ -67,7 +67,7 @@ fn check_stays_inside(source: &Source<'_>, row: &Row<'_>, name: &str) -> Result<
     if inside && !name.contains('\0') {
         Ok(())
     } else {
-        Err(source.garbage(row.line, quoted(name), "a file name inside the dataset"))
+        Err(source.malformed(row.line, quoted(name), "a file name inside the dataset"))
     }
 }
 
@@ -93,7 +93,7 @@ pub fn time_list(
             (Some(second), None) if is_image_name(second) => (first, Some(second)),
             _ => {
                 let expected = "a time, or the file name of an image and a time";
-                return Err(source.garbage(row.line, quoted(row.text), expected));
+                return Err(source.malformed(row.line, quoted(row.text), expected));
             }
         };
         split.push((row, time, name));
@@ -110,7 +110,7 @@ pub fn time_list(
     Ok((times, notes))
 }
 
-/// Whether a file name ends like an image that can be read.
+/// Whether a file name has the extension of a supported image format.
 pub(crate) fn is_image_name(name: &str) -> bool {
     name.rsplit_once('.')
         .is_some_and(|(_, ext)| ["png", "jpg", "jpeg"].iter().any(|known| ext.eq_ignore_ascii_case(known)))
@@ -118,7 +118,7 @@ pub(crate) fn is_image_name(name: &str) -> bool {
 
 type TimedRow<const N: usize> = (Timestamp, [f64; N]);
 
-/// Rows of a time and `N` numbers. Rows with a number that is not finite are left out and counted.
+/// Rows of a time and `N` numbers. Rows with a number that is not finite are skipped and counted.
 fn timed_numbers<const N: usize>(
     source: &Source<'_>,
     rule: UnitRule,
@@ -137,7 +137,7 @@ fn timed_numbers<const N: usize>(
         let mut numbers = [0.0; N];
         for (i, number) in numbers.iter_mut().enumerate() {
             let field = fields.next().ok_or_else(|| {
-                source.garbage(
+                source.malformed(
                     row.line,
                     format!("{} columns", i + 1),
                     format!("{} columns: {columns}", N + 1),
@@ -154,8 +154,8 @@ fn timed_numbers<const N: usize>(
     if not_finite.0 > 0 {
         notes.push(
             Warning::new(
-                "reading-not-finite",
-                format!("{} readings hold NaN or infinity; left out", not_finite.0),
+                "sample-not-finite",
+                format!("{} samples contain NaN or infinity; skipped", not_finite.0),
             )
             .at(format!("{place}:{}", not_finite.1)),
         );

@@ -12,7 +12,7 @@ fn all_numbers(source: &Source<'_>, limit: usize) -> Result<Vec<(usize, f64)>, D
     for row in source.lines(&mut Vec::new())?.rows {
         for field in row.fields() {
             if out.len() == limit {
-                return Err(source.garbage(row.line, format!("more than {limit} numbers"), "one matrix"));
+                return Err(source.malformed(row.line, format!("more than {limit} numbers"), "one matrix"));
             }
             out.push((row.line, source.number(&row, field, "a matrix")?));
         }
@@ -22,7 +22,7 @@ fn all_numbers(source: &Source<'_>, limit: usize) -> Result<Vec<(usize, f64)>, D
 
 /// Reads `[fx, fy, cx, cy]` from a 3×3 (or 4×4, or 3×4) matrix or from four numbers in that order.
 ///
-/// The matrix must be upper triangular without skew and end in 1, else it is no pinhole.
+/// The matrix must be upper triangular without skew and end in 1, else it is not a pinhole camera.
 pub fn intrinsics_matrix(source: &Source<'_>) -> Result<[f64; 4], DatasetError> {
     let numbers: Vec<f64> = all_numbers(source, 16)?.into_iter().map(|(_, v)| v).collect();
     let at = |row: usize, column: usize, columns: usize| numbers[row * columns + column];
@@ -32,14 +32,14 @@ pub fn intrinsics_matrix(source: &Source<'_>) -> Result<[f64; 4], DatasetError> 
         12 | 16 => 4,
         n => {
             let expected = "9 numbers (a 3x3 matrix) or 4 (fx fy cx cy)";
-            return Err(source.garbage(0, format!("{n} numbers"), expected));
+            return Err(source.malformed(0, format!("{n} numbers"), expected));
         }
     };
     let zeros = [at(0, 1, columns), at(1, 0, columns), at(2, 0, columns), at(2, 1, columns)];
-    // Skew below a hundredth of a pixel cannot be told from rounding.
+    // Skew below a hundredth of a pixel is rounding.
     if zeros.iter().any(|z| !(z.abs() < 0.01)) || !((at(2, 2, columns) - 1.0).abs() < 1e-6) {
         let expected = "rows (fx 0 cx) (0 fy cy) (0 0 1)";
-        return Err(source.garbage(0, "a matrix that is no pinhole camera", expected));
+        return Err(source.malformed(0, "a matrix that is not a pinhole camera", expected));
     }
     Ok([at(0, 0, columns), at(1, 1, columns), at(0, 2, columns), at(1, 2, columns)])
 }
@@ -66,15 +66,15 @@ fn check_last_row(
 ) -> Result<(), DatasetError> {
     let last = [m[(3, 0)], m[(3, 1)], m[(3, 2)], m[(3, 3)] - 1.0];
     if count != 12 && count != 16 {
-        return Err(source.garbage(
+        return Err(source.malformed(
             line,
             format!("{count} numbers"),
             "12 or 16 numbers of a row-major matrix",
         ));
     }
-    // NaN passes: the whole pose is then left out as lost.
+    // NaN passes: the whole pose is then skipped (tracking lost).
     if last.iter().any(|v| v.abs() > 1e-6) {
-        return Err(source.garbage(line, "a last row that is not 0 0 0 1", "a row-major rigid motion"));
+        return Err(source.malformed(line, "a last row that is not 0 0 0 1", "a row-major rigid motion"));
     }
     Ok(())
 }
@@ -94,7 +94,7 @@ pub fn matrix_poses(source: &Source<'_>) -> Result<(Vec<Option<Se3>>, Vec<Warnin
 pub fn single_pose(source: &Source<'_>) -> Result<Option<Se3>, DatasetError> {
     let numbers = all_numbers(source, 16)?;
     if numbers.len() != 16 {
-        return Err(source.garbage(0, format!("{} numbers", numbers.len()), "16 numbers of a 4x4 matrix"));
+        return Err(source.malformed(0, format!("{} numbers", numbers.len()), "16 numbers of a 4x4 matrix"));
     }
     if numbers.iter().any(|(_, v)| !v.is_finite()) {
         return Ok(None);

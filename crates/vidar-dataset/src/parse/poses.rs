@@ -1,8 +1,8 @@
 //! Trajectory files: TUM, EuRoC csv, KITTI.
 //!
-//! Policy for poses that are no pose: a row with NaN, infinity or a zero quaternion is what trackers write while
-//! lost, so it is left out, counted and named; a quaternion whose length is further than 5 % from one, or a matrix
-//! that is no rotation, is a wrong file and an error with its line.
+//! Invalid poses: trackers write a row with NaN, infinity or a zero quaternion while tracking is lost. Such rows are
+//! skipped and counted in a warning. A quaternion whose norm differs from one by more than 5 %, or a matrix that is not
+//! a rotation, means a wrong file: an error with its line.
 
 use super::units::{UnitRule, decide_unit, read_time};
 use crate::error::DatasetError;
@@ -29,17 +29,17 @@ pub struct RawPose {
 pub struct PoseFile {
     /// Its poses in the order of the file.
     pub poses: Vec<RawPose>,
-    /// Rows in the file, including those that were left out.
+    /// Rows in the file, including those that were skipped.
     pub rows: usize,
-    /// Whose poses the header says they are (`# world_from_body, body = camera0`).
+    /// The body of the poses according to the header (`# world_from_body, body = camera0`).
     pub body: Option<BodyFrame>,
     /// Whether it holds positions only (a prism); then rotations are the identity.
     pub positions_only: bool,
-    /// What was found.
+    /// Warnings about the file.
     pub notes: Vec<Warning>,
 }
 
-/// A quaternion in a text file of six digits has a length within 1e-5 of one; 5 % is another thing.
+/// A quaternion in a text file of six digits has a length within 1e-5 of one; 5 % is more than rounding.
 const QUATERNION_TOLERANCE: f64 = 0.05;
 
 /// Reads TUM rows: `seconds tx ty tz qx qy qz qw`.
@@ -67,7 +67,7 @@ fn stamped_poses(
     let positions_only = lines.rows.first().is_some_and(|r| r.fields().count() == 4);
     let wanted = if positions_only { 3 } else { 7 };
     let mut poses = Vec::with_capacity(lines.rows.len());
-    let mut lost = Lost::default();
+    let mut lost = LostPoses::default();
     for (index, row) in lines.rows.iter().enumerate() {
         let mut fields = row.fields();
         let time = read_time(source, row, fields.next().unwrap_or(""), unit)?;
@@ -75,7 +75,7 @@ fn stamped_poses(
         for (i, number) in v.iter_mut().take(wanted).enumerate() {
             let field = fields.next().ok_or_else(|| {
                 let expected = format!("{} columns: {columns}", wanted + 1);
-                source.garbage(row.line, format!("{} columns", i + 1), expected)
+                source.malformed(row.line, format!("{} columns", i + 1), expected)
             })?;
             *number = source.number(row, field, columns)?;
         }
@@ -87,19 +87,19 @@ fn stamped_poses(
             None => lost.count(row.line),
         }
     }
-    lost.tell(&place, &mut notes);
+    lost.warn(&place, &mut notes);
     let body = body_of(&lines);
     Ok(PoseFile { poses, rows: lines.rows.len(), body, positions_only, notes })
 }
 
 /// Rows that hold no pose.
 #[derive(Default)]
-pub(super) struct Lost {
+pub(super) struct LostPoses {
     rows: usize,
     first_line: usize,
 }
 
-impl Lost {
+impl LostPoses {
     pub(super) fn count(&mut self, line: usize) {
         if self.rows == 0 {
             self.first_line = line;
@@ -107,10 +107,10 @@ impl Lost {
         self.rows += 1;
     }
 
-    pub(super) fn tell(&self, place: &str, notes: &mut Vec<Warning>) {
+    pub(super) fn warn(&self, place: &str, notes: &mut Vec<Warning>) {
         if self.rows > 0 {
             let message = format!(
-                "{} poses hold NaN, infinity or a zero quaternion (tracking lost); left out",
+                "{} poses contain NaN, infinity or a zero quaternion (tracking lost); skipped",
                 self.rows
             );
             notes.push(Warning::new("pose-not-finite", message).at(format!("{place}:{}", self.first_line)));
@@ -131,7 +131,7 @@ fn pose_from(
     }
     if !((norm - 1.0).abs() <= QUATERNION_TOLERANCE) {
         let found = format!("a quaternion of length {norm:.4}");
-        return Err(source.garbage(row.line, found, "a unit quaternion (are the columns in order?)"));
+        return Err(source.malformed(row.line, found, "a unit quaternion (are the columns in order?)"));
     }
     Ok(So3::from_quaternion(q[0], q[1], q[2], q[3]).map(|r| Se3::new(r, Vector3::from(t))))
 }
@@ -141,7 +141,7 @@ pub fn kitti_poses(source: &Source<'_>) -> Result<PoseFile, DatasetError> {
     let mut notes = Vec::new();
     let lines = source.lines(&mut notes)?;
     let mut poses = Vec::with_capacity(lines.rows.len());
-    let mut lost = Lost::default();
+    let mut lost = LostPoses::default();
     for (index, row) in lines.rows.iter().enumerate() {
         let m = super::matrices::row_matrix(source, row)?;
         if m.iter().all(|v| v.is_finite()) {
@@ -151,7 +151,7 @@ pub fn kitti_poses(source: &Source<'_>) -> Result<PoseFile, DatasetError> {
             lost.count(row.line);
         }
     }
-    lost.tell(&source.path.display().to_string(), &mut notes);
+    lost.warn(&source.path.display().to_string(), &mut notes);
     let body = body_of(&lines);
     Ok(PoseFile { poses, rows: lines.rows.len(), body, positions_only: false, notes })
 }
@@ -159,11 +159,11 @@ pub fn kitti_poses(source: &Source<'_>) -> Result<PoseFile, DatasetError> {
 /// The rigid motion of a matrix in a file of poses.
 pub(super) fn rigid(source: &Source<'_>, line: usize, m: &Matrix4<f64>) -> Result<Se3, DatasetError> {
     Se3::from_matrix(m).ok_or_else(|| {
-        source.garbage(line, crate::calibration::departure(m), "a rigid motion (orthonormal rotation)")
+        source.malformed(line, crate::calibration::departure(m), "a rigid motion (orthonormal rotation)")
     })
 }
 
-/// Whose poses a header says they are.
+/// The body of the poses according to the header.
 fn body_of(lines: &Lines<'_>) -> Option<BodyFrame> {
     lines.comments.iter().find_map(|comment| {
         let (_, after) = comment.split_once("body =")?;

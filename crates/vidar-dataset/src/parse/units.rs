@@ -1,9 +1,9 @@
-//! In which unit a column of times is written.
+//! Decides the unit of a column of times.
 //!
-//! A format has its unit, but files slip: EuRoC lists in seconds, TUM lists in nanoseconds. A unit is plausible when
-//! the median step lies between 0.1 ms and 10 s and no time is past the year 2100. The unit of the format stands as
-//! long as it is plausible; else the plausible one whose times are years 2000–2100 is taken, else the one whose step
-//! is nearest to 20 ms (in the logarithm), and a warning names the decision.
+//! Each format has a unit, but files may use another: EuRoC lists in seconds, TUM lists in nanoseconds. A unit is plausible when
+//! the median step lies between 0.1 ms and 10 s and no time is past the year 2100. The unit of the format is kept
+//! if it is plausible; else the plausible one whose times are years 2000–2100 is taken, else the one whose step
+//! is nearest to 20 ms (in the logarithm), and a warning reports the decision.
 
 use crate::error::DatasetError;
 use crate::options::TimeUnit;
@@ -13,16 +13,16 @@ use vidar_core::{Timestamp, Warning};
 /// How the unit of a file's times is decided.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum UnitRule {
-    /// The user said so.
+    /// Given by the user.
     Given(TimeUnit),
-    /// The format says so, unless the numbers make it impossible.
+    /// That of the format, unless it is implausible.
     Expected(TimeUnit),
-    /// Nobody said; the numbers decide.
+    /// Not stated; decided by the numbers.
     Guess,
 }
 
 impl UnitRule {
-    /// The user's word where there is one, else the format's.
+    /// The unit given by the user if there is one, else that of the format.
     pub fn given_or(given: Option<TimeUnit>, expected: TimeUnit) -> Self {
         given.map_or(Self::Expected(expected), Self::Given)
     }
@@ -35,13 +35,14 @@ const EPOCH_SECS: std::ops::Range<f64> = 9.4e8..4.1e9;
 /// Steps from 10 kHz to one in ten seconds.
 const STEP_SECS: std::ops::RangeInclusive<f64> = 1e-4..=10.0;
 
-struct Evidence {
+/// Statistics of the numbers in a time column.
+struct TimeColumnStatistics {
     largest: f64,
     median_step: Option<f64>,
     has_fraction: bool,
 }
 
-impl Evidence {
+impl TimeColumnStatistics {
     fn of<'a>(times: impl Iterator<Item = &'a str>) -> Self {
         let mut values = Vec::new();
         let mut has_fraction = false;
@@ -90,25 +91,25 @@ pub(crate) fn decide_unit<'a>(
     place: &str,
     notes: &mut Vec<Warning>,
 ) -> TimeUnit {
-    let evidence = match rule {
+    let statistics = match rule {
         UnitRule::Given(unit) => return unit,
-        _ => Evidence::of(times),
+        _ => TimeColumnStatistics::of(times),
     };
-    let told = |e: &Evidence| match e.median_step {
+    let description = |e: &TimeColumnStatistics| match e.median_step {
         Some(step) => format!("values up to {:e} with a median step of {step:e}", e.largest),
         None => format!("values up to {:e}", e.largest),
     };
     match rule {
         UnitRule::Given(unit) => unit,
-        UnitRule::Expected(unit) if evidence.is_plausible(unit) => unit,
-        UnitRule::Expected(unit) => match evidence.best() {
+        UnitRule::Expected(unit) if statistics.is_plausible(unit) => unit,
+        UnitRule::Expected(unit) => match statistics.best() {
             Some(best) if best != unit => {
                 notes.push(
                     Warning::new(
                         "unit-slip",
                         format!(
                             "times should be in {unit} but {} look like {best}; read as {best}",
-                            told(&evidence)
+                            description(&statistics)
                         ),
                     )
                     .at(place)
@@ -119,11 +120,11 @@ pub(crate) fn decide_unit<'a>(
             _ => unit,
         },
         UnitRule::Guess => {
-            let unit = evidence.best().unwrap_or(TimeUnit::Seconds);
+            let unit = statistics.best().unwrap_or(TimeUnit::Seconds);
             notes.push(
-                Warning::new("time-unit", format!("{}: read as {unit}", told(&evidence)))
+                Warning::new("time-unit", format!("{}: read as {unit}", description(&statistics)))
                     .at(place)
-                    .hint("--time-unit s|ms|us|ns says it for certain"),
+                    .hint("--time-unit s|ms|us|ns sets the unit"),
             );
             unit
         }
@@ -138,5 +139,5 @@ pub(crate) fn read_time(
     unit: TimeUnit,
 ) -> Result<Timestamp, DatasetError> {
     Timestamp::parse_unit(text, unit.digits())
-        .map_err(|_| source.garbage(row.line, quoted(text), format!("a time in {unit}")))
+        .map_err(|_| source.malformed(row.line, quoted(text), format!("a time in {unit}")))
 }

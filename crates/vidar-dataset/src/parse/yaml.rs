@@ -1,7 +1,7 @@
 //! Calibration files: EuRoC `sensor.yaml` and Kalibr's camchain and imu YAML.
 //!
-//! OpenCV's dialect (`%YAML:1.0`, `!!opencv-matrix`) is made plain before the YAML parser sees it. Documents become
-//! a small tree, so that an error names the key and what it holds.
+//! OpenCV's dialect (`%YAML:1.0`, `!!opencv-matrix`) is converted to plain YAML before parsing. Documents are parsed
+//! into a small tree, so that an error names the key and its value.
 
 use crate::calibration::{departure, model_from_parts};
 use crate::error::DatasetError;
@@ -50,7 +50,7 @@ impl<'de> Visitor<'de> for NodeVisitor {
         Ok(Node::Number(v))
     }
     fn visit_str<E>(self, v: &str) -> Result<Node, E> {
-        // YAML 1.2 wants a dot in `2e-3`; calibration tools do not write one.
+        // YAML 1.2 requires a dot in `2e-3`; calibration tools do not write one.
         Ok(v.trim().parse().map_or_else(|_| Node::Text(v.to_string()), Node::Number))
     }
     fn visit_unit<E>(self) -> Result<Node, E> {
@@ -99,7 +99,7 @@ impl Node {
         }
     }
 
-    fn told(&self) -> String {
+    fn description(&self) -> String {
         match self {
             Self::Null => "nothing".into(),
             Self::Number(v) => format!("the number {v}"),
@@ -110,7 +110,7 @@ impl Node {
     }
 }
 
-/// A document and where its keys are, for messages.
+/// A document with the lines of its keys, for messages.
 struct Document<'a> {
     source: Source<'a>,
     text: String,
@@ -121,18 +121,18 @@ impl<'a> Document<'a> {
     fn parse(source: &Source<'a>, notes: &mut Vec<Warning>) -> Result<Self, DatasetError> {
         if source.bytes.len() > MAX_YAML_BYTES {
             let found = format!("{} bytes", source.bytes.len());
-            return Err(source.garbage(0, found, format!("at most {MAX_YAML_BYTES} bytes of YAML")));
+            return Err(source.malformed(0, found, format!("at most {MAX_YAML_BYTES} bytes of YAML")));
         }
         let text = plain_yaml(source.text(notes)?);
         let root: Node = serde_saphyr::from_str(&text).map_err(|e| {
             let line = e.location().map_or(0, |l| l.line() as usize);
             let reason = e.without_snippet().to_string();
             let reason: String = reason.lines().next().unwrap_or_default().chars().take(200).collect();
-            source.garbage(line, reason, "YAML")
+            source.malformed(line, reason, "YAML")
         })?;
         match root {
             Node::Map(_) => Ok(Self { source: *source, text, root }),
-            other => Err(source.garbage(1, other.told(), "YAML keys and values")),
+            other => Err(source.malformed(1, other.description(), "YAML keys and values")),
         }
     }
 
@@ -144,14 +144,14 @@ impl<'a> Document<'a> {
     }
 
     fn wrong(&self, key: &str, found: &str, expected: &str) -> DatasetError {
-        self.source.garbage(self.line_of(key), format!("{key}: {found}"), expected)
+        self.source.malformed(self.line_of(key), format!("{key}: {found}"), expected)
     }
 
     fn number(&self, map: &Node, key: &str) -> Result<Option<f64>, DatasetError> {
         match map.get(key) {
             None => Ok(None),
             Some(Node::Number(v)) if v.is_finite() => Ok(Some(*v)),
-            Some(other) => Err(self.wrong(key, &other.told(), "a finite number")),
+            Some(other) => Err(self.wrong(key, &other.description(), "a finite number")),
         }
     }
 
@@ -159,18 +159,18 @@ impl<'a> Document<'a> {
         match map.get(key) {
             None => Ok(None),
             Some(Node::Text(t)) => Ok(Some(t.trim().to_ascii_lowercase())),
-            Some(other) => Err(self.wrong(key, &other.told(), "a word")),
+            Some(other) => Err(self.wrong(key, &other.description(), "a word")),
         }
     }
 
     fn numbers(&self, node: &Node, key: &str) -> Result<Vec<f64>, DatasetError> {
         let Node::List(list) = node else {
-            return Err(self.wrong(key, &node.told(), "a list of numbers"));
+            return Err(self.wrong(key, &node.description(), "a list of numbers"));
         };
         list.iter()
             .map(|n| match n {
                 Node::Number(v) => Ok(*v),
-                other => Err(self.wrong(key, &other.told(), "a number in the list")),
+                other => Err(self.wrong(key, &other.description(), "a number in the list")),
             })
             .collect()
     }
@@ -212,7 +212,8 @@ impl<'a> Document<'a> {
         if let (Some(one), Some(other)) = (kalibr, open_vins) {
             let apart = (one.inverse() * other).log();
             if !(apart.amax() < 1e-3) {
-                let found = format!("a motion {:.3} from the inverse of T_cam_imu", apart.amax());
+                let found =
+                    format!("a transform that differs by {:.3} from the inverse of T_cam_imu", apart.amax());
                 return Err(self.wrong("T_imu_cam", &found, "the inverse of T_cam_imu, or only one of them"));
             }
         }
@@ -278,7 +279,7 @@ impl<'a> Document<'a> {
     }
 }
 
-/// Makes OpenCV's dialect plain YAML, line for line.
+/// Converts OpenCV's dialect to plain YAML, line by line.
 fn plain_yaml(text: &str) -> String {
     let mut out = String::with_capacity(text.len() + 1);
     for line in text.lines() {
@@ -290,7 +291,7 @@ fn plain_yaml(text: &str) -> String {
     out
 }
 
-/// A camera as a calibration file tells it. Size 0×0 when the file has no resolution.
+/// A camera of a calibration file. Size 0×0 when the file has no resolution.
 #[derive(Clone, Debug, PartialEq)]
 pub struct CameraCalibration {
     /// How it projects.
@@ -301,7 +302,7 @@ pub struct CameraCalibration {
     pub time_offset: Duration,
 }
 
-/// An IMU as a calibration file tells it.
+/// An IMU of a calibration file.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ImuCalibration {
     /// Its noise.
@@ -347,7 +348,7 @@ pub struct KalibrCamera {
     pub number: u32,
     /// The camera.
     pub calibration: CameraCalibration,
-    /// `T_cam_imu`, the inverse of `T_imu_cam` (OpenVINS), or put together from `T_cn_cnm1`: maps IMU coordinates to the camera.
+    /// `T_cam_imu`, the inverse of `T_imu_cam` (OpenVINS), or composed from `T_cn_cnm1`: maps IMU coordinates to the camera.
     pub camera_from_imu: Option<Se3>,
 }
 
@@ -374,7 +375,7 @@ pub fn kalibr_yaml(source: &Source<'_>) -> Result<(KalibrFile, Vec<Warning>), Da
     let mut previous: Option<(u32, Option<Se3>)> = None;
     for (number, key, node) in numbered {
         let Some(calibration) = doc.camera(node, &format!("{key}: "))? else {
-            return Err(doc.wrong(key, &node.told(), "a camera with camera_model and intrinsics"));
+            return Err(doc.wrong(key, &node.description(), "a camera with camera_model and intrinsics"));
         };
         let chained = match (doc.motion(node, "T_cn_cnm1")?, previous) {
             (Some(camera_from_previous), Some((n, Some(previous_from_imu)))) if n + 1 == number => {
@@ -395,7 +396,7 @@ pub fn kalibr_yaml(source: &Source<'_>) -> Result<(KalibrFile, Vec<Warning>), Da
         } else {
             "cam0: …, or imu0: / gyroscope_noise_density and accelerometer_noise_density"
         };
-        return Err(source.garbage(1, format!("the keys {}", keys.join(", ")), expected));
+        return Err(source.malformed(1, format!("the keys {}", keys.join(", ")), expected));
     }
     Ok((file, notes))
 }

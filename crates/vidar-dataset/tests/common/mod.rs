@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use tempfile::TempDir;
 use vidar_dataset::{Dataset, DatasetError, OpenOptions, open};
 
-/// A folder that vanishes with the value.
+/// A folder that is removed when dropped.
 pub struct Folder(TempDir);
 
 impl Folder {
@@ -81,7 +81,7 @@ pub fn frame_ns(i: i64) -> i64 {
 pub const CAM0: &str = "%YAML:1.0\n---\nsensor_type: camera\nT_BS:\n  cols: 4\n  rows: 4\n  data: [0.0, -1.0, 0.0, 0.1,\n         1.0, 0.0, 0.0, 0.2,\n         0.0, 0.0, 1.0, 0.3,\n         0.0, 0.0, 0.0, 1.0]\nrate_hz: 20\nresolution: [16, 12]\ncamera_model: pinhole\nintrinsics: [10.0, 11.0, 7.5, 5.5] #fu, fv, cu, cv\ndistortion_model: radial-tangential\ndistortion_coefficients: [-0.1, 0.01, 0.0, 1e-05]\n";
 pub const IMU0: &str = "%YAML:1.0\nsensor_type: imu\nT_BS:\n  cols: 4\n  rows: 4\n  data: [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]\nrate_hz: 200\ngyroscope_noise_density: 1.6968e-04\ngyroscope_random_walk: 1.9393e-05\naccelerometer_noise_density: 2.0e-3\naccelerometer_random_walk: 3.0e-3\n";
 
-/// Ten frames at 20 Hz, 120 inertial readings at 200 Hz, eleven reference poses, in EuRoC's layout.
+/// Ten frames at 20 Hz, 120 IMU samples at 200 Hz, eleven reference poses, in EuRoC's layout.
 pub fn euroc() -> Folder {
     let f = Folder::new();
     let mut list = String::from("#timestamp [ns],filename\n");

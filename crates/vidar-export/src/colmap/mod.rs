@@ -1,16 +1,16 @@
 //! COLMAP sparse models: `cameras`, `images`, `points3D`, as text or binary.
 //!
 //! - Camera model PINHOLE; equal intrinsics share one camera. Pixels count from the image's corner, so 0.5 is added to
-//!   the principal point on the way out and taken off on the way in.
+//!   the principal point on export and subtracted on import.
 //! - `images` hold `camera_from_world` (quaternion w x y z, translation), metres. `IMAGE_ID` is the frame number + 1,
-//!   because COLMAP's own numbers start at 1. Times have no place in the format.
+//!   because COLMAP's own numbers start at 1. The format has no times.
 //! - `points3D` hold position and colour; without a colour mid grey is written. The error is −1 ("not computed")
-//!   and tracks are empty. Normals and confidence have no place in the format.
+//!   and tracks are empty. The format has no normals and no confidence.
 //! - The world is not re-centred, rotated or rescaled: the model is metric, z up.
 //! - NaN is refused in both directions.
 //!
-//! Read: PINHOLE and SIMPLE_PINHOLE; other models are named and refused, because views here have no distortion.
-//! Observations and tracks are checked for shape and left out.
+//! Read: PINHOLE and SIMPLE_PINHOLE; other models are refused by name, because views have no distortion.
+//! Observations and tracks are checked for shape and skipped.
 
 mod binary;
 mod text;
@@ -32,7 +32,7 @@ const CAMERAS: &str = "COLMAP cameras";
 const IMAGES: &str = "COLMAP images";
 const POINTS: &str = "COLMAP points3D";
 
-/// COLMAP packs two image numbers into one; larger ones break its databases.
+/// COLMAP packs two image ids into one number; larger ids break its databases.
 const MAX_IMAGE_ID: u32 = 2_147_483_646;
 /// Colour of points without one.
 const NO_COLOR: [u8; 3] = [128; 3];
@@ -55,7 +55,7 @@ impl ColmapFormat {
     }
 }
 
-/// A COLMAP model as far as VIDAR understands it.
+/// The supported part of a COLMAP model.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct ColmapModel {
     /// The posed images, in the order of the file; `frame_id` is `IMAGE_ID` − 1.

@@ -1,4 +1,4 @@
-//! COLMAP's text files. Numbers are printed with as many digits as bring back the same bits.
+//! COLMAP's text files. Numbers are printed with enough digits to restore the same bits.
 
 use super::{CAMERAS, IMAGES, POINTS, RawCamera, RawImage, color_of, unsupported_model};
 use crate::error::{ExportError, quoted, write_error};
@@ -54,9 +54,9 @@ pub(super) fn write_points(w: &mut dyn Write, points: &PointCloud) -> Result<(),
 
 pub(super) fn read_cameras(bytes: &[u8]) -> Result<Vec<RawCamera>, ExportError> {
     let mut cameras = Vec::new();
-    let mut announced = Announced::default();
+    let mut stated = StatedCount::default();
     for line in Lines::new(CAMERAS, bytes)? {
-        if announced.is_comment(&line)? {
+        if stated.is_comment(&line)? {
             continue;
         }
         let tokens: Vec<&str> = line.text.split_ascii_whitespace().collect();
@@ -80,16 +80,16 @@ pub(super) fn read_cameras(bytes: &[u8]) -> Result<Vec<RawCamera>, ExportError> 
             principal_point,
         });
     }
-    announced.check(CAMERAS, cameras.len())?;
+    stated.check(CAMERAS, cameras.len())?;
     Ok(cameras)
 }
 
 pub(super) fn read_images(bytes: &[u8]) -> Result<Vec<RawImage>, ExportError> {
     let mut images = Vec::new();
-    let mut announced = Announced::default();
+    let mut stated = StatedCount::default();
     let mut lines = Lines::new(IMAGES, bytes)?;
     while let Some(line) = lines.next() {
-        if announced.is_comment(&line)? {
+        if stated.is_comment(&line)? {
             continue;
         }
         images.push(read_image(&line)?);
@@ -98,7 +98,7 @@ pub(super) fn read_images(bytes: &[u8]) -> Result<Vec<RawImage>, ExportError> {
             check_observations(&observations)?;
         }
     }
-    announced.check(IMAGES, images.len())?;
+    stated.check(IMAGES, images.len())?;
     Ok(images)
 }
 
@@ -133,9 +133,9 @@ fn check_observations(line: &Line<'_>) -> Result<(), ExportError> {
 
 pub(super) fn read_points(bytes: &[u8]) -> Result<PointCloud, ExportError> {
     let mut points = PointCloud::default();
-    let mut announced = Announced::default();
+    let mut stated = StatedCount::default();
     for line in Lines::new(POINTS, bytes)? {
-        if announced.is_comment(&line)? {
+        if stated.is_comment(&line)? {
             continue;
         }
         let mut tokens = line.text.split_ascii_whitespace();
@@ -164,16 +164,16 @@ pub(super) fn read_points(bytes: &[u8]) -> Result<PointCloud, ExportError> {
         points.positions.push(position);
         points.colors.push(color);
     }
-    announced.check(POINTS, points.len())?;
+    stated.check(POINTS, points.len())?;
     Ok(points)
 }
 
-/// The number of records that a comment announces; holding the file to it finds a cut-off end.
+/// The number of records stated in a comment; comparing it with the file detects truncation.
 #[derive(Default)]
-struct Announced(Option<usize>);
+struct StatedCount(Option<usize>);
 
-impl Announced {
-    /// Whether the line is blank or a comment; remembers an announced count.
+impl StatedCount {
+    /// Whether the line is blank or a comment; stores a stated count.
     fn is_comment(&mut self, line: &Line<'_>) -> Result<bool, ExportError> {
         let Some(comment) = line.comment() else { return Ok(line.is_blank()) };
         if let Some(rest) = comment.strip_prefix("Number of ")
@@ -191,7 +191,7 @@ impl Announced {
             Some(expected) if expected != found => Err(ExportError::malformed(
                 format,
                 "whole file",
-                format!("{expected} records, as its comment says"),
+                format!("{expected} records, as stated in its comment"),
                 found.to_string(),
             )),
             _ => Ok(()),

@@ -1,4 +1,4 @@
-//! Accessors: typed windows into the binary chunk, checked before anything is made of them.
+//! Accessors: typed views of the binary chunk, checked before use.
 
 use super::json::{Accessor, Document};
 use super::read::{bad, unsupported};
@@ -8,11 +8,11 @@ use crate::error::{ExportError, quoted};
 /// Largest distance between elements that glTF allows, bytes.
 const MAX_STRIDE: usize = 252;
 
-/// The accessors of a file and how much may still be read through them.
+/// The accessors of a file, with a budget of elements to read.
 pub(super) struct Accessors<'a> {
     document: &'a Document,
     binary: &'a [u8],
-    /// Elements that may still be made; nodes and accessors that repeat data use it up.
+    /// Elements that may still be read; repeated data counts each time.
     budget: usize,
 }
 
@@ -94,7 +94,7 @@ impl<'a> Accessors<'a> {
         Ok(elements.iter().map(read).collect())
     }
 
-    /// Finds an accessor, one of `kinds` (name, components), and holds every number of it against the file.
+    /// Finds an accessor, one of `kinds` (name, components), and checks all its numbers against the file.
     fn elements(
         &mut self,
         index: usize,
@@ -130,7 +130,7 @@ impl<'a> Accessors<'a> {
             bad(&place, &format!("elements within {} bytes", view.len()), found)
         })?;
         self.budget = self.budget.checked_sub(accessor.count).ok_or_else(|| {
-            unsupported(&place, "a scene that repeats its data to more elements than bytes".to_owned())
+            unsupported(&place, "a scene whose repeated data gives more elements than bytes".to_owned())
         })?;
         Ok(Elements { accessor, component_bytes, element_bytes, stride, data })
     }

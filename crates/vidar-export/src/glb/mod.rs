@@ -1,17 +1,17 @@
 //! GLB (binary glTF 2.0): coloured meshes and point clouds for any 3-D viewer.
 //!
-//! - glTF is y-up; VIDAR's world is z-up. The vertices are left as they are, and the one root node `world` carries the
+//! - glTF is y-up; VIDAR's world is z-up. The vertices are not changed; the root node `world` has the
 //!   rotation (x, y, z) ↦ (x, z, −y) as its matrix.
-//! - `POSITION` (metres) and `NORMAL` are `float`; `COLOR_0` is RGBA of normalised 16 bits. glTF wants linear light there
-//!   while VIDAR's colours are sRGB: they are converted, and 16 bits bring every sRGB byte back.
+//! - `POSITION` (metres) and `NORMAL` are `float`; `COLOR_0` is RGBA of normalised 16 bits. glTF requires linear light,
+//!   VIDAR's colours are sRGB: they are converted, and 16 bits restore every sRGB byte.
 //! - Confidence is the application's own attribute `_CONFIDENCE`.
 //! - Indices are `unsigned int`; a mesh without triangles, and a cloud, is drawn as points.
-//! - Coloured surfaces are unlit (`KHR_materials_unlit`), because their colours hold the light of the photographs.
-//! - `asset.extras` tells frame, units and the caller's comments. An empty cloud has a node and no mesh.
+//! - Coloured surfaces are unlit (`KHR_materials_unlit`), because their colours include the lighting of the images.
+//! - `asset.extras` has frame, units and the caller's comments. An empty cloud has a node and no mesh.
 //!
 //! Read: the default scene of a GLB with one binary chunk; node trees with matrices or TRS; primitives of triangles or
 //! points, indexed or not; colours of 8, 16 bits or float; strides. Sparse or compressed data and other
-//! files are named and refused. NaN is refused in both directions.
+//! files are refused by name. NaN is refused in both directions.
 
 mod accessor;
 mod json;

@@ -12,7 +12,7 @@ use vidar_core::{PointCloud, So3, TriangleMesh};
 /// Deepest node tree read; bounds the recursion.
 const MAX_DEPTH: usize = 64;
 
-/// What a GLB holds that VIDAR knows, in VIDAR's world (z up), metres.
+/// The supported content of a GLB, in VIDAR's world (z up), metres.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Glb {
     /// All primitives of the default scene; without triangles it is a cloud.
@@ -29,7 +29,7 @@ impl Glb {
     }
 }
 
-/// Reads a GLB file; see the [module](super) for what is understood.
+/// Reads a GLB file; see the [module](super) for the supported part.
 ///
 /// An attribute is returned when every primitive has it. A file whose nodes repeat its meshes so often that there are
 /// more vertices than bytes is refused, so memory stays within a multiple of `bytes.len()`.
@@ -112,7 +112,7 @@ fn comments(document: &Document) -> Vec<String> {
     list.into_iter().flatten().filter_map(|v| v.as_str().map(str::to_owned)).collect()
 }
 
-/// What has been read so far; an attribute list is dropped at the end unless every vertex has it.
+/// The data read so far; an attribute list is dropped at the end unless every vertex has it.
 #[derive(Default)]
 struct Parts {
     mesh: TriangleMesh,
@@ -250,7 +250,7 @@ impl SceneReader<'_> {
         }
         let base = base as u32;
         self.parts.mesh.triangles.extend(local.chunks_exact(3).map(|t| {
-            // Mirroring turns the inside out; the order of two corners turns it back.
+            // Mirroring inverts the orientation; swapping two corners restores it.
             let (b, c) = if mirrored { (t[2], t[1]) } else { (t[1], t[2]) };
             [base + t[0], base + b, base + c]
         }));

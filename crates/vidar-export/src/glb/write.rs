@@ -91,7 +91,7 @@ struct Section {
     bytes: usize,
 }
 
-/// Where everything lies in the buffer.
+/// Layout of the buffer.
 struct Layout {
     sections: Vec<Section>,
     total: usize,
@@ -206,7 +206,7 @@ fn asset(comments: &[String]) -> Value {
     })
 }
 
-/// The rotation of the root node, column by column as glTF wants it.
+/// The rotation of the root node, column by column as glTF requires.
 fn root_matrix() -> [f64; 16] {
     let mut matrix = nalgebra::Matrix4::identity();
     matrix.fixed_view_mut::<3, 3>(0, 0).copy_from(&y_up_from_z_up());
@@ -218,7 +218,7 @@ fn root_matrix() -> [f64; 16] {
 fn material(unlit: bool) -> Value {
     let surface =
         json!({ "baseColorFactor": [1.0, 1.0, 1.0, 1.0], "metallicFactor": 0.0, "roughnessFactor": 1.0 });
-    // The inside of a room is looked at from outside too.
+    // The inside of a room must be visible from outside, too.
     let mut material = json!({ "pbrMetallicRoughness": surface, "doubleSided": true });
     if unlit {
         material["extensions"] = json!({ "KHR_materials_unlit": {} });

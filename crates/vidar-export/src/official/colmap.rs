@@ -1,8 +1,8 @@
 //! A COLMAP model as the official program exports it.
 //!
 //! One PINHOLE camera, one rig, one frame and one image per view, at the size of the original image: rows of the camera
-//! matrix are scaled by the sizes' ratio. Points are pixels whose confidence reaches a percentile; each is seen by one image,
-//! at its pixel scaled and cut to an integer. The matrix goes out as it is: the network's principal point counts from
+//! matrix are scaled by the sizes' ratio. Points are pixels whose confidence reaches a percentile; each is observed in one image,
+//! at its pixel scaled and truncated to an integer. The matrix is not changed: the network's principal point counts from
 //! the image's corner, as COLMAP's does. `rigs.bin` and `frames.bin` are those of COLMAP 3.12 and later; older versions
 //! ignore them.
 
@@ -19,7 +19,7 @@ const PINHOLE: i32 = 1;
 /// COLMAP's number of the sensor type "camera".
 const CAMERA: i32 = 0;
 
-/// The name and size of the image that a view was made of.
+/// Name and size of the image of a view.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct OriginalImage {
     /// Path relative to COLMAP's image folder.
@@ -39,7 +39,7 @@ struct Observation {
     color: [u8; 3],
 }
 
-/// Writes the model into `dir`; pixels below the `percentile` of confidence become no points.
+/// Writes the model into `dir`; pixels below the `percentile` of confidence are not used as points.
 pub fn write_official_colmap(
     dir: &Path,
     prediction: &Prediction,
@@ -98,7 +98,7 @@ fn views<'a>(
     let view = |(camera, original): (&super::numbers::Camera, &'a OriginalImage)| {
         let (sx, sy) = (original.width as f64 / width as f64, original.height as f64 / height as f64);
         let rotation: Matrix3<f64> = camera.camera_from_world.fixed_view::<3, 3>(0, 0).into_owned();
-        // The network's rotation is one up to 32 bits; the nearest true rotation is what a quaternion can hold.
+        // The network's rotation is orthonormal to 32 bits only; the nearest rotation is stored as quaternion.
         let rotation = Rotation3::from_matrix_eps(&rotation, 1e-12, 100, Rotation3::identity());
         let q = UnitQuaternion::from_rotation_matrix(&rotation);
         let sign = if q.w < 0.0 { -1.0 } else { 1.0 };

@@ -8,8 +8,8 @@
 //! | [`write_official_colmap`] | `cameras.bin`, `images.bin`, `points3D.bin`, `rigs.bin`, `frames.bin` | none |
 //!
 //! These formats keep the official program's conventions, which are not VIDAR's: `extrinsics` are
-//! `camera_from_world`, `intrinsics` scale from the image's corner, and unprojection takes the pixel's number for its
-//! place. [`read_prediction_npz`] takes files of either program.
+//! `camera_from_world`, `intrinsics` scale from the image's corner, and unprojection uses the pixel's index as its
+//! position. [`read_prediction_npz`] takes files of either program.
 
 mod colmap;
 mod npy;
@@ -29,14 +29,14 @@ pub use vis::{depth_colors, spectral, write_depth_vis};
 use crate::error::ExportError;
 use vidar_core::Image;
 
-/// One view of a prediction, in the official program's terms.
+/// One view of a prediction, in the official program's conventions.
 #[derive(Clone, Debug, PartialEq)]
 pub struct PredictedView {
-    /// The image as the network saw it; absent in `mini_npz`.
+    /// The network's input image; absent in `mini_npz`.
     pub image: Option<Image<[u8; 3]>>,
     /// z-depth.
     pub depth: Image<f32>,
-    /// At least 1, higher is surer; single-view networks have none.
+    /// At least 1, higher is more certain; single-view networks have none.
     pub confidence: Option<Image<f32>>,
     /// Rows of `camera_from_world`, 3×4.
     pub extrinsics: Option<[[f32; 4]; 3]>,
@@ -57,7 +57,7 @@ impl Prediction {
         self.views.first().map_or((0, 0), |v| (v.depth.width(), v.depth.height()))
     }
 
-    /// Refuses views of several sizes, and things that only some views have.
+    /// Refuses views of different sizes, and data that only some views have.
     fn check(&self, format: &'static str) -> Result<(), ExportError> {
         let size = self.size();
         let Some(first) = self.views.first() else {
@@ -78,7 +78,8 @@ impl Prediction {
                 return Err(ExportError::unwritable(format, what(), reason));
             }
             if has(view) != has(first) {
-                let reason = "image, confidence, extrinsics and intrinsics are of all views or of none";
+                let reason =
+                    "image, confidence, extrinsics and intrinsics must be present for all views or for none";
                 return Err(ExportError::unwritable(format, what(), reason));
             }
         }
@@ -101,7 +102,7 @@ impl Prediction {
     }
 }
 
-/// Whether a pixel becomes a point: confident enough, and a depth that is one. Without confidences all are.
+/// Whether a pixel is used as a point: sufficient confidence, and a valid depth. Without confidences every depth counts.
 fn is_point(view: &PredictedView, x: usize, y: usize, least: f64) -> bool {
     let depth = view.depth[(x, y)];
     let sure = view.confidence.as_ref().is_none_or(|c| f64::from(c[(x, y)]) >= least);

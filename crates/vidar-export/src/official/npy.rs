@@ -1,4 +1,4 @@
-//! One array of numpy: a magic number, a Python dictionary, the values.
+//! The npy format: a magic number, a Python dictionary, the values.
 
 use crate::error::{ExportError, quoted};
 use std::io::{self, Read, Write};
@@ -11,7 +11,7 @@ const ALIGNMENT: usize = 64;
 const MOST_HEADER: usize = 10_000;
 /// Most axes of an array; numpy's own limit.
 const MOST_AXES: usize = 64;
-/// Room taken at once while reading, bytes; more only as it comes.
+/// Memory allocated at once while reading, bytes.
 const PIECE: usize = 1 << 20;
 
 /// The values of an array, in row-major order.
@@ -191,7 +191,7 @@ fn broken(place: &str, expected: &str, error: &io::Error) -> ExportError {
     ExportError::malformed(FORMAT, place, expected, error.to_string())
 }
 
-/// Takes room only as values come, so that a header cannot ask for memory that the file does not fill.
+/// Allocates memory as values are read, so that a wrong header cannot cause a large allocation.
 fn read_values(r: &mut dyn Read, bytes: u64, place: &str) -> Result<Vec<u8>, ExportError> {
     let mut raw = Vec::with_capacity(PIECE.min(usize::try_from(bytes).unwrap_or(PIECE)));
     r.take(bytes).read_to_end(&mut raw).map_err(|e| broken(place, "values", &e))?;
@@ -224,7 +224,7 @@ struct Kind {
 }
 
 impl Kind {
-    /// What the values take; a kind that is not known counts as bytes and is refused later, by its name.
+    /// Size of the values; an unknown kind counts as bytes and is refused later, by name.
     fn size(&self) -> Option<Size> {
         let (stored, decoded) = match self.descr.trim_start_matches(['<', '|', '=']) {
             "f2" => (2, 4),
@@ -274,7 +274,7 @@ fn f32_from_half(half: u16) -> f32 {
     }
 }
 
-/// Takes `{'descr': '<f4', 'fortran_order': False, 'shape': (2, 3), }` apart.
+/// Parses `{'descr': '<f4', 'fortran_order': False, 'shape': (2, 3), }` apart.
 fn parse_header(header: &str) -> Option<Kind> {
     let inner = header.trim().strip_prefix('{')?.strip_suffix('}')?;
     let after = |key: &str| {
@@ -310,7 +310,7 @@ mod tests {
     }
 
     #[test]
-    fn arrays_of_every_kind_come_back() {
+    fn arrays_of_every_kind_are_restored() {
         for (shape, data) in [
             (vec![2, 3], NpyData::F32(vec![1.0, -0.0, f32::MIN_POSITIVE, f32::INFINITY, 5.5, 6.25])),
             (vec![1], NpyData::F64(vec![0.1])),
@@ -349,7 +349,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_not_whole_or_too_much_is_refused_with_its_place() {
+    fn incomplete_and_too_large_arrays_are_refused_with_their_position() {
         let mut bytes = Vec::new();
         NpyArray::new(vec![3], NpyData::F32(vec![0.0; 3])).unwrap().write(&mut bytes).unwrap();
         let read = |bytes: &[u8], most: u64| NpyArray::read(&mut &bytes[..], "depth.npy", most);
@@ -370,14 +370,14 @@ mod tests {
 
     proptest! {
         #[test]
-        fn no_bytes_make_it_panic(header in "[ -~]{0,80}", tail in proptest::collection::vec(any::<u8>(), 0..40)) {
+        fn no_bytes_panic(header in "[ -~]{0,80}", tail in proptest::collection::vec(any::<u8>(), 0..40)) {
             let length = (header.len() as u16).to_le_bytes();
             let bytes = [&b"\x93NUMPY\x01\x00"[..], &length, header.as_bytes(), &tail].concat();
             let _ = NpyArray::read(&mut bytes.as_slice(), "x", 1 << 16);
         }
 
         #[test]
-        fn no_shape_makes_it_panic(shape in proptest::collection::vec(any::<usize>(), 0..5)) {
+        fn no_shape_panics(shape in proptest::collection::vec(any::<usize>(), 0..5)) {
             let axes: Vec<String> = shape.iter().map(usize::to_string).collect();
             let header = format!("{{'descr': '<f8', 'fortran_order': False, 'shape': ({},)}}", axes.join(","));
             let length = (header.len() as u16).to_le_bytes();

@@ -9,7 +9,7 @@ use zip::{CompressionMethod, ZipArchive, ZipWriter};
 
 const FORMAT: &str = "npz";
 
-/// How much a foreign file may make of itself. Deflate can blow a file up a thousandfold.
+/// Limits on the decompressed size of a file. Deflate can expand a file a thousandfold.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct NpzLimits {
     /// Most bytes of values, all arrays together.
@@ -25,13 +25,13 @@ impl Default for NpzLimits {
     }
 }
 
-/// Whether arrays are squeezed.
+/// Whether arrays are compressed.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Packing {
     /// As `numpy.savez_compressed`.
     #[default]
     Deflated,
-    /// As `numpy.savez`: larger, and as fast as the disk.
+    /// As `numpy.savez`: larger, limited by the disk's speed only.
     Stored,
 }
 

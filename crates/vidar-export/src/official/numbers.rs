@@ -24,7 +24,7 @@ pub(super) fn rounded(value: f32, scale: f32) -> f32 {
     (value * scale).round_ties_even() / scale
 }
 
-/// A camera in the official program's terms.
+/// A camera in the official program's conventions.
 pub(super) struct Camera {
     pub camera_from_world: Matrix4<f64>,
     pub world_from_camera: Matrix4<f64>,

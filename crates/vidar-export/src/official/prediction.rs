@@ -2,13 +2,13 @@
 //!
 //! | Array | Type and shape | `npz` | `mini_npz` |
 //! |---|---|---|---|
-//! | `image` | `uint8` N×H×W×3 | as the network saw it | – |
+//! | `image` | `uint8` N×H×W×3 | the network's input | – |
 //! | `depth` | `float32` N×H×W | 6 decimals | 8 decimals |
 //! | `conf` | `float32` N×H×W | 2 decimals | 2 decimals |
 //! | `extrinsics` | `float32` N×3×4 | `camera_from_world` | same |
 //! | `intrinsics` | `float32` N×3×3 | at the depth's size | same |
 //!
-//! What a network does not predict is left out. Reading takes `exts`, `ixts` and 4×4 extrinsics too, which other
+//! Arrays that a network does not predict are omitted. Reading takes `exts`, `ixts` and 4×4 extrinsics too, which other
 //! programs write.
 
 use super::npy::{NpyArray, NpyData};
@@ -172,7 +172,7 @@ fn images(
     }
 }
 
-/// Matrices of three rows (a fourth one is left out) and `C` columns.
+/// Matrices of three rows (a fourth one is ignored) and `C` columns.
 fn matrices<const C: usize>(
     name: &str,
     array: NpyArray,

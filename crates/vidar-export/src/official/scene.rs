@@ -1,13 +1,13 @@
 //! `scene.glb` of the official program: confident pixels as coloured points, cameras as wire frames.
 //!
 //! - A pixel becomes a point when its confidence reaches `min(max(1.05, P40), P90)` (percentiles over all views) and its
-//!   depth is finite and positive. Its number (u, v) is taken for its place, without half a pixel.
+//!   depth is finite and positive. Its index (u, v) is used as its position, without half a pixel.
 //! - The scene is turned so that the first camera looks along −z with y up, and moved so that the median of the points is
 //!   the origin: `A = T(−median) · diag(1, −1, −1, 1) · camera0_from_world`. `A` is kept in `asset.extras`.
 //! - Colours are the image's bytes as they are, which is how the official program's viewer shows them.
 //! - Each camera is eight segments: four edges from its centre, four around its image, at 0.03 of the scene's diagonal
-//!   (between the 5th and 95th percentile), in a hue of its own.
-//! - More points than wanted are thinned evenly by a fixed seed. The official program draws an unseeded sample.
+//!   (between the 5th and 95th percentile), in a distinct hue.
+//! - Excess points are thinned evenly with a fixed seed. The official program uses an unseeded sample.
 
 use super::numbers::{Camera, percentile_of, transform};
 use super::{Prediction, confidence_percentile, is_point};
@@ -27,17 +27,17 @@ const FLOAT: u32 = 5126;
 const MODE_POINTS: u32 = 0;
 const MODE_LINES: u32 = 1;
 
-/// Confidence is 1 + exp(…): what is not above this says nothing.
+/// Confidence is 1 + exp(…): values below this carry no information.
 const LEAST_CONFIDENCE: f64 = 1.05;
-/// However much is asked for, the best tenth is shown.
+/// The best tenth of the points is always shown.
 const MOST_PERCENTILE: f64 = 90.0;
 /// Length of a camera's edges in diagonals of the scene.
 const CAMERA_SIZE: f64 = 0.03;
 
-/// What goes into the scene.
+/// Options of the scene.
 #[derive(Clone, Debug, PartialEq)]
 pub struct SceneOptions {
-    /// Percentile of confidence below which pixels are left out.
+    /// Percentile of confidence below which pixels are skipped.
     pub confidence_percentile: f64,
     /// Most points.
     pub most_points: usize,
@@ -52,7 +52,7 @@ impl Default for SceneOptions {
     }
 }
 
-/// What a scene came to hold.
+/// Statistics of a scene.
 #[derive(Clone, Debug, PartialEq)]
 pub struct SceneSummary {
     /// The confidence that a point has at least.
@@ -181,7 +181,7 @@ fn diagonal(points: &[Vector3<f64>]) -> f64 {
         at(95.0) - at(5.0)
     };
     let diagonal = Vector3::new(extent(0), extent(1), extent(2)).norm();
-    // Without points, or with one, cameras are still drawn.
+    // Cameras are drawn even without points.
     if diagonal.is_finite() && diagonal > 0.0 { diagonal } else { 1.0 }
 }
 
@@ -340,7 +340,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn thinning_keeps_as_many_as_wanted_evenly_and_always_the_same() {
+    fn thinning_is_uniform_deterministic_and_keeps_the_requested_number() {
         let chosen = thinned(10_000, 1_000);
         assert_eq!(chosen.len(), 1_000);
         assert!(chosen.is_sorted_by(|a, b| a < b));

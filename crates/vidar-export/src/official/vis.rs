@@ -16,7 +16,7 @@ const QUALITY: u8 = 95;
 /// Percentiles of inverse depth that get the ends of the colours.
 const LOW: f64 = 2.0;
 const HIGH: f64 = 98.0;
-/// With fewer depths there is nothing to stretch.
+/// With fewer depths percentiles are not used.
 const LEAST_DEPTHS: usize = 11;
 
 /// ColorBrewer's Spectral in eleven classes (Cynthia Brewer, Apache-2.0).
@@ -36,7 +36,7 @@ const SPECTRAL_11: [[u8; 3]; 11] = [
 
 /// The colour at x in 0…1, in 256 steps; red is 0.
 ///
-/// Step by step as matplotlib makes its table, in the same order of operations: cutting to bytes shows the last bit.
+/// Step by step as matplotlib makes its table, in the same order of operations: truncation to bytes depends on the last bit.
 pub fn spectral(x: f64) -> [u8; 3] {
     let step = if x >= 1.0 { 255.0 } else { (x.max(0.0) * 256.0).floor() };
     let class_at = |class: usize| class as f64 * 0.1 * 255.0;
@@ -64,7 +64,7 @@ pub fn depth_colors(depth: &Image<f32>) -> Image<[u8; 3]> {
         |percent| percentile(&sorted, percent).filter(|_| sorted.len() >= LEAST_DEPTHS).unwrap_or(0.0);
     let (mut low, mut high) = (range(LOW), range(HIGH));
     if low == high {
-        // A wall at one distance is drawn in one colour, the middle one.
+        // A constant depth is drawn in the central colour.
         (low, high) = (low - 1e-6, high + 1e-6);
     }
     inverse.map(|&v| spectral(1.0 - ((f64::from(v) - low) / (high - low)).clamp(0.0, 1.0)))
@@ -80,7 +80,7 @@ pub fn write_depth_vis(w: &mut dyn Write, prediction: &Prediction, index: usize)
     let pixels = side_by_side(view);
     let (width, height) =
         (view.depth.width() * if view.image.is_some() { 2 } else { 1 }, view.depth.height());
-    // JPEG counts in 16 bits, and the encoder says so when a side is longer.
+    // JPEG sizes have 16 bits; the encoder reports longer sides.
     let (Ok(columns), Ok(rows)) = (u32::try_from(width), u32::try_from(height)) else {
         return Err(ExportError::unwritable(
             FORMAT,
@@ -122,7 +122,7 @@ mod tests {
     }
 
     #[test]
-    fn near_is_red_far_is_blue_and_nothing_is_far() {
+    fn near_is_red_far_is_blue_and_no_depth_is_far() {
         let depth = Image::from_fn(20, 10, |x, y| if (x, y) == (3, 3) { f32::NAN } else { 1.0 + x as f32 });
         let colors = depth_colors(&depth);
         assert_eq!(colors[(0, 0)], SPECTRAL_11[0]);

@@ -2,12 +2,12 @@
 //!
 //! Written: `binary_little_endian 1.0`; element `vertex` with `float x y z`, then, where known,
 //! `float nx ny nz`, `uchar red green blue` (sRGB), `float confidence`; for meshes element `face` with
-//! `list uchar int vertex_indices`. The first comments name frame and units; the caller's follow (one line each).
-//! Nothing is moved or scaled: positions are the world's, in metres, z up.
+//! `list uchar int vertex_indices`. The first comments state frame and units; the caller's follow (one line each).
+//! Positions are not moved or scaled: world frame, metres, z up.
 //!
 //! Read: ASCII and binary of both byte orders, any scalar type for any property, unknown elements and properties
 //! skipped, `vertex_index` as well as `vertex_indices`, polygons cut into fans of triangles, colours of 8 or 16
-//! bits or float 0…1, `quality` as well as `confidence`. Counts are held against the bytes that are there before
+//! bits or float 0…1, `quality` as well as `confidence`. Counts are checked against the file size before
 //! anything is allocated.
 //!
 //! NaN: the writer refuses it. The reader refuses a position that is not finite (naming the vertex) and, because

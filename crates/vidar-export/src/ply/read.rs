@@ -6,7 +6,7 @@ use super::scalar::{Body, ScalarType};
 use crate::error::ExportError;
 use vidar_core::{PointCloud, TriangleMesh};
 
-/// What a PLY file holds that VIDAR knows.
+/// The supported content of a PLY file.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Ply {
     /// The vertices.
@@ -25,7 +25,7 @@ impl Ply {
     }
 }
 
-/// Reads a PLY file; see the [module](super) for what is understood.
+/// Reads a PLY file; see the [module](super) for the supported part.
 ///
 /// Errors name the header line or the byte and the element. A file without a `vertex` element is an error; bytes
 /// after the last element are one too. Memory stays within a small multiple of `bytes.len()`.
@@ -57,7 +57,7 @@ pub fn read_ply(bytes: &[u8]) -> Result<Ply, ExportError> {
     Ok(ply)
 }
 
-/// Holds the count of the header against the bytes that are there, so that nothing is reserved on its word.
+/// Checks the count in the header against the file size, before memory is allocated.
 fn check_count(element: &Element, body: &Body<'_>) -> Result<(), ExportError> {
     let least = body.least_bytes(element.count, element.properties.iter().map(Property::least));
     let name = &element.name;
@@ -78,7 +78,7 @@ fn check_count(element: &Element, body: &Body<'_>) -> Result<(), ExportError> {
     Ok(())
 }
 
-/// Where a vertex property goes.
+/// The target of a vertex property.
 #[derive(Clone, Copy)]
 enum Slot {
     Position(usize),
@@ -216,7 +216,7 @@ fn skip(element: &Element, body: &mut Body<'_>) -> Result<(), ExportError> {
     Ok(())
 }
 
-/// Reads one property of one item: a scalar's value is returned, a list's values are handed to `each`.
+/// Reads one property of one item: a scalar's value is returned, a list's values are passed to `each`.
 #[inline]
 fn read_property(
     element: &Element,
@@ -230,7 +230,7 @@ fn read_property(
         PropertyKind::Scalar(kind) => body.next(kind, context),
         PropertyKind::List { count, item } => {
             let length = body.next(count, context)?;
-            // Negative lengths saturate to 0 by the cast, so they are refused by hand.
+            // Negative lengths saturate to 0 by the cast, so they are refused explicitly.
             if length < 0.0 {
                 return Err(body.error(&context(), "a list length of 0 or more", length.to_string()));
             }

@@ -6,13 +6,13 @@ use crate::vertices::{Vertices, check_triangles};
 use std::io::{self, BufWriter, Write};
 use vidar_core::{PointCloud, TriangleMesh};
 
-/// Comments of every file: without them a PLY is numbers without a meaning.
+/// Comments of every file: they define frame and units.
 const FRAME_COMMENTS: [&str; 2] = [
     "frame world: right-handed, z up, gravity along -z",
     "units metres; normals unit; colours sRGB; confidence 0..1",
 ];
 
-/// Writes a point cloud; `comments` (the source, the run) follow those that name frame and units.
+/// Writes a point cloud; `comments` (the source, the run) follow those of frame and units.
 ///
 /// A comment's line breaks become blanks. Errors: a value that is not finite, attribute lists of another length,
 /// the writer's own.

@@ -12,7 +12,7 @@ const FORMAT: &str = "EuRoC trajectory csv";
 /// Writes a trajectory as EuRoC csv, integer nanoseconds, w first; `header_note` becomes comment lines.
 ///
 /// Only time, position and rotation are written (eight columns): velocities and biases are not part of a
-/// [`Trajectory`], and inventing zeros for them would be read as measurements.
+/// [`Trajectory`], and zeros in their place would be read as measurements.
 pub fn write_euroc_csv(w: impl Write, trajectory: &Trajectory, header_note: &str) -> Result<(), ExportError> {
     write_lines(w, trajectory, header_note).map_err(write_error(FORMAT))
 }
@@ -34,7 +34,7 @@ fn write_lines(w: impl Write, trajectory: &Trajectory, header_note: &str) -> io:
 }
 
 /// Reads an EuRoC csv of eight columns, or the seventeen of a ground-truth file (velocity and biases are checked
-/// to be numbers and left out).
+/// to be numbers and ignored).
 ///
 /// The body is the one named by the header of [`write_euroc_csv`], else
 /// [`vidar_core::trajectory::BodyFrame::Other`].

@@ -11,16 +11,16 @@ use vidar_core::{Se3, Timestamp};
 const FORMAT: &str = "KITTI trajectory";
 const TIMES_FORMAT: &str = "KITTI times";
 
-/// What a KITTI file leaves out: whose poses they are, and when each holds.
+/// The part missing in a KITTI file: the body of the poses and their times.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct KittiTimes {
-    /// Whose poses.
+    /// Body of the poses.
     pub body: BodyFrame,
     /// Time of each line of the KITTI file.
     pub times: Vec<Timestamp>,
 }
 
-/// Writes the poses as KITTI text. Write [`write_kitti_times`] beside it, or times and frames are lost.
+/// Writes the poses as KITTI text. Write [`write_kitti_times`] as well, otherwise times and body are lost.
 pub fn write_kitti(w: impl Write, trajectory: &Trajectory) -> Result<(), ExportError> {
     write_matrices(w, trajectory).map_err(write_error(FORMAT))
 }
@@ -40,7 +40,7 @@ fn write_matrices(w: impl Write, trajectory: &Trajectory) -> io::Result<()> {
     w.flush()
 }
 
-/// Writes the file beside a KITTI file (`.times.txt`): body and note as comments, then seconds, one a line.
+/// Writes the file that accompanies a KITTI file (`.times.txt`): body and note as comments, then seconds, one a line.
 pub fn write_kitti_times(
     w: impl Write,
     trajectory: &Trajectory,
@@ -57,7 +57,7 @@ pub fn write_kitti_times(
     write().map_err(write_error(TIMES_FORMAT))
 }
 
-/// Reads the times beside a KITTI file; also KITTI's own `times.txt` (seconds, exponents allowed).
+/// Reads the times of a KITTI file; also KITTI's own `times.txt` (seconds, exponents allowed).
 pub fn read_kitti_times(bytes: &[u8]) -> Result<KittiTimes, ExportError> {
     let mut body = BodyFrame::Other;
     let mut times: Vec<Timestamp> = Vec::new();
@@ -100,7 +100,7 @@ pub fn read_kitti(bytes: &[u8], times: &KittiTimes) -> Result<Trajectory, Export
             matrix[(i / 4, i % 4)] = line.finite("a finite matrix entry", token)?;
         }
         let world_from_body = Se3::from_matrix(&matrix)
-            .ok_or_else(|| line.error("a rotation in the 3x3 part", "a matrix that is none"))?;
+            .ok_or_else(|| line.error("a rotation in the 3x3 part", "another matrix"))?;
         collector.push(&line, *time, world_from_body)?;
         last_line = line.number;
     }

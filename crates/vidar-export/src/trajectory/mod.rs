@@ -1,9 +1,9 @@
 //! Trajectories as other tools read them: TUM, EuRoC csv, KITTI.
 //!
-//! All three tell `world_from_body` in metres; quaternions are unit, with w ≥ 0 when written. Times never pass
+//! All three hold `world_from_body` in metres; quaternions are unit, with w ≥ 0 when written. Times never pass
 //! through floating point. TUM and EuRoC files name the body in a comment (`# world_from_body, body = camera0`);
 //! KITTI has no comments, so its body and times are in a second file. A file without that comment is read as poses
-//! of [`BodyFrame::Other`]: nothing is guessed.
+//! of [`BodyFrame::Other`]: the body is not guessed.
 //!
 //! Digits: TUM and EuRoC numbers have nine decimals, so a position is exact to 0.5 nm and a rotation to about
 //! 1e-9 rad, far below any sensor. KITTI matrices have thirteen significant digits, because rounding a
@@ -24,7 +24,7 @@ use std::io::{self, Write};
 use vidar_core::trajectory::{BodyFrame, StampedPose, Trajectory};
 use vidar_core::{CameraId, Se3, So3, Timestamp};
 
-/// Largest deviation of a quaternion's length from 1 that is still taken for rounding of printed digits.
+/// Largest deviation of a quaternion's length from 1 that is accepted as rounding of printed digits.
 const QUATERNION_LENGTH_TOLERANCE: f64 = 1e-2;
 
 /// Writes the comment that names the frames, and the caller's note, one comment line per line.

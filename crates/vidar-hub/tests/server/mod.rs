@@ -1,4 +1,4 @@
-//! A hub of one thread on 127.0.0.1 whose answers a test writes itself.
+//! A single-threaded hub on 127.0.0.1 whose responses are given by the test.
 
 use std::io::{BufRead, BufReader, Write};
 use std::net::{TcpListener, TcpStream};
@@ -6,7 +6,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
-/// A request as it came.
+/// A received request.
 #[derive(Clone, Debug)]
 pub struct Request {
     pub method: String,
@@ -25,17 +25,17 @@ impl Request {
     }
 }
 
-/// What to answer.
+/// The response to send.
 #[derive(Clone, Debug, Default)]
 pub struct Reply {
     pub status: u16,
     pub headers: Vec<(String, String)>,
     pub body: Vec<u8>,
-    /// Close the connection after so many bytes of the body.
+    /// Close the connection after this many bytes of the body.
     pub cut_after: Option<usize>,
-    /// Wait this long before each piece of so many bytes.
+    /// Wait this long before each piece of this many bytes.
     pub drip: Option<(usize, Duration)>,
-    /// Send no Content-Length of our own making.
+    /// Send no Content-Length header.
     pub own_length: bool,
 }
 
@@ -82,7 +82,7 @@ impl Server {
                 let Some(request) = read_request(&stream) else { continue };
                 seen.lock().unwrap().push(request.clone());
                 let reply = answer(&request);
-                // The client may hang up in the middle; that is its right.
+                // The client may close the connection at any time.
                 let _ = write_reply(stream, &request, &reply);
             }
         });

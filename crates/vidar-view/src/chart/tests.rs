@@ -15,14 +15,14 @@ fn every_value_is_counted_once() {
     assert_eq!(bins.counts.iter().sum::<usize>(), 1000);
     assert_eq!((bins.below, bins.above, bins.not_finite), (0, 0, 0));
     assert!((10..=60).contains(&bins.counts.len()), "{}", bins.counts.len());
-    // Evenly spread values fill inner bins evenly.
+    // Uniform values fill inner bins uniformly.
     let inner = &bins.counts[1..bins.counts.len() - 1];
     let (low, high) = (inner.iter().min().unwrap(), inner.iter().max().unwrap());
     assert!(high - low <= 3, "{inner:?}");
 }
 
 #[test]
-fn values_outside_and_without_a_number_are_told() {
+fn values_outside_the_range_and_not_finite_are_counted() {
     let mut h = histogram(vec![-1.0, 0.1, 0.2, 0.2, 0.99, 1.0, 7.0, f64::NAN, f64::INFINITY]);
     h.x = h.x.between(0.0, 1.0);
     let bins = Bins::of(&h);
@@ -48,7 +48,7 @@ fn a_bar_is_as_long_as_its_value() {
 }
 
 #[test]
-fn odd_input_makes_charts() {
+fn degenerate_input_gives_charts() {
     let sizes = [PictureSize::new(0, 0), PictureSize::new(300, 200), PictureSize::new(1200, 900)];
     let values = [
         vec![],

@@ -44,7 +44,7 @@ fn errors_start_at_zero_and_negative_data_ends_there() {
     assert!(low < -1.0 && high > 1.0);
     let (low, high) = axis_range(&axis, Some((0.0, 0.0)), 0.05);
     assert!(low < high);
-    assert_eq!(axis_range(&axis.between(3.0, 1.0), None, 0.05), (0.0, 1.0), "a reversed range is not taken");
+    assert_eq!(axis_range(&axis.between(3.0, 1.0), None, 0.05), (0.0, 1.0), "a reversed range is ignored");
 }
 
 #[test]
@@ -71,7 +71,7 @@ fn nothing_is_drawn_outside_a_fixed_range() {
 }
 
 #[test]
-fn odd_input_makes_plots() {
+fn degenerate_input_gives_plots() {
     let inputs = [
         vec![],
         vec![[1.0, 1.0]],

@@ -1,4 +1,4 @@
-//! From where a map is looked at.
+//! Viewpoints of map pictures.
 
 use nalgebra::{Matrix3, Vector3};
 use vidar_core::{StampedPose, Trajectory};
@@ -53,10 +53,10 @@ fn axis_name(direction: &Vector3<f64>) -> String {
     format!("{sign}{}", ["x", "y", "z"][axis])
 }
 
-/// Which way is up in a world that may not have z up, judged by the cameras: people hold them level.
+/// Which way is up in a world that may not have z up, estimated from the cameras, which are usually held level.
 ///
 /// Takes the mean of the cameras' upward image axis. Within 35° of z it is z, the project's own convention;
-/// within 20° of another axis it is that axis; otherwise the mean itself. `camera_path` must be told of a camera
+/// within 20° of another axis it is that axis; otherwise the mean itself. `camera_path` must hold poses of a camera
 /// (x right, y down, z forward). Without poses it is z.
 pub fn up_of_world(camera_path: &Trajectory) -> Vector3<f64> {
     let sum: Vector3<f64> =
@@ -87,10 +87,10 @@ pub enum Projection {
     },
 }
 
-/// What happens to surfaces seen from behind.
+/// How surfaces seen from behind are drawn.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum BackFaces {
-    /// They are left out: from outside one looks through walls and ceiling into the room.
+    /// They are not drawn: the inside of a room is visible from outside.
     Cull,
     /// They are drawn darker and greyer.
     Dim,
@@ -101,7 +101,7 @@ pub enum BackFaces {
 pub struct MapCamera {
     /// Name for captions and files (`top`).
     pub name: String,
-    /// Where it stands, metres, world.
+    /// Its position, metres, world.
     pub position: Vector3<f64>,
     /// Unit direction of the picture's columns towards the right, world.
     pub right: Vector3<f64>,
@@ -109,13 +109,13 @@ pub struct MapCamera {
     pub down: Vector3<f64>,
     /// How points become pixels.
     pub projection: Projection,
-    /// What happens to surfaces seen from behind.
+    /// How surfaces seen from behind are drawn.
     pub back_faces: BackFaces,
-    /// Points beyond this distance above `up · p` are left out: opens a ceiling that has no normals.
+    /// Points with `up · p` above this limit are not drawn: opens a ceiling that has no normals.
     pub cut: Option<Cut>,
 }
 
-/// A horizontal cut that takes away what lies above.
+/// A horizontal cut that removes everything above it.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Cut {
     /// Unit direction of up, world.
@@ -133,7 +133,7 @@ pub enum Viewpoint {
     ThreeQuarterFront,
     /// From above and the back left.
     ThreeQuarterBack,
-    /// From the middle of the camera's path, looking where the cameras looked.
+    /// From the centre of the camera's path, in the cameras' viewing direction.
     Inside,
 }
 
@@ -151,7 +151,7 @@ impl Viewpoint {
         }
     }
 
-    /// Name in words, for captions.
+    /// Name for captions.
     pub fn caption(self) -> &'static str {
         match self {
             Self::Top => "From above",
@@ -165,9 +165,9 @@ impl Viewpoint {
 impl MapCamera {
     /// The camera of a fixed viewpoint for a map with these vertices.
     ///
-    /// Frames the middle 99 % of the vertices along each axis, so that a few stray points do not shrink the map.
+    /// Frames the central 99 % of the vertices along each axis, so that a few stray points do not shrink the map.
     /// `camera_path` (poses of a camera) is kept in the picture and places [`Viewpoint::Inside`]; without it that
-    /// view stands in the middle of the map. `aspect` is width / height of the picture. A map without vertices gives a camera that looks at
+    /// view is placed at the centre of the map. `aspect` is width / height of the picture. A map without vertices gives a camera that looks at
     /// the origin.
     pub fn fixed(
         viewpoint: Viewpoint,
@@ -190,12 +190,12 @@ impl MapCamera {
         }
     }
 
-    /// The same camera with everything above `height_m` along `up` taken away.
+    /// The same camera with everything above `height_m` along `up` removed.
     pub fn cut_above(self, up: &Vector3<f64>, height_m: f64) -> Self {
         Self { cut: Some(Cut { up: *up, height_m }), ..self }
     }
 
-    /// Where it looks, unit, world.
+    /// Viewing direction, unit, world.
     pub fn forward(&self) -> Vector3<f64> {
         self.right.cross(&self.down)
     }
@@ -217,7 +217,7 @@ impl MapCamera {
     /// 38° above the horizon at an azimuth counted from the plane's first axis.
     fn around(name: &str, plane: &HorizontalPlane, bounds: &Bounds, aspect: f64, azimuth_deg: f64) -> Self {
         const ELEVATION_DEG: f64 = 38.0;
-        // A long lens: little distortion, yet near things look nearer.
+        // A small angle: weak perspective.
         const VERTICAL_ANGLE_DEG: f64 = 28.0;
         let (sa, ca) = azimuth_deg.to_radians().sin_cos();
         let (se, ce) = ELEVATION_DEG.to_radians().sin_cos();
@@ -237,7 +237,7 @@ impl MapCamera {
         }
     }
 
-    /// At the pose nearest to the mean place of the cameras, upright, looking where it looked.
+    /// At the pose nearest to the mean camera position, upright, in the direction of that pose.
     fn inside(name: &str, plane: &HorizontalPlane, bounds: &Bounds, path: Option<&Trajectory>) -> Self {
         let poses = path.map_or(&[][..], Trajectory::poses);
         let count = poses.len().max(1) as f64;
@@ -277,7 +277,7 @@ struct Bounds {
 
 impl Bounds {
     fn robust(positions: &[[f32; 3]], plane: &HorizontalPlane) -> Self {
-        // A hundred thousand samples place a percentile well enough.
+        // A hundred thousand samples are enough for a percentile.
         let stride = (positions.len() / 100_000).max(1);
         let finite = positions.iter().step_by(stride).filter(|p| p.iter().all(|v| v.is_finite()));
         let points: Vec<[f64; 3]> =
@@ -289,7 +289,7 @@ impl Bounds {
             let Some(last) = values.len().checked_sub(1) else { continue };
             let trim = values.len() / 200;
             let (low, high) = (values[trim], values[last - trim]);
-            // What was trimmed usually continues a little.
+            // The trimmed part usually extends a little further.
             let air = (0.02 * (high - low)).max(1e-3);
             (bounds.low[axis], bounds.high[axis]) =
                 ((low - air).max(values[0] - 1e-3), (high + air).min(values[last] + 1e-3));
@@ -299,9 +299,9 @@ impl Bounds {
         bounds
     }
 
-    /// Widens the box so that a path within reach is seen whole.
+    /// Enlarges the box to contain the path if it is near.
     fn include(&mut self, plane: &HorizontalPlane, poses: &[StampedPose]) {
-        // A path that left the map far behind would make the map small; then it is cut by the picture instead.
+        // A path far from the map would make the map small; it is clipped by the picture instead.
         let reach = self.size().into_iter().fold(0.0, f64::max);
         let near = |p: &[f64; 3]| (0..3).all(|i| p[i] >= self.low[i] - reach && p[i] <= self.high[i] + reach);
         let stride = (poses.len() / 10_000).max(1);
@@ -327,7 +327,7 @@ impl Bounds {
     ) -> (Vector3<f64>, f64) {
         let mut center = self.world(plane, [0.5; 3]);
         let mut distance = 1.0;
-        // Each round centres what the last one saw; three are enough to a pixel.
+        // Each iteration centres the view of the last one; three are accurate to a pixel.
         for _ in 0..3 {
             let relative: Vec<[f64; 3]> = self
                 .inside
@@ -344,7 +344,7 @@ impl Bounds {
                 }
             }
         }
-        // The last shift may have pushed something out by a little.
+        // The last shift may have moved vertices slightly outside.
         let needed = |p: &[f64; 3]| {
             let d = plane.direction(p[0], p[1], p[2]) - center;
             d.dot(&outwards) + (d.dot(&right).abs() / tangents[0]).max(d.dot(&down).abs() / tangents[1])

@@ -1,9 +1,9 @@
-//! Darkens creases and the ground behind edges, which a light at the camera leaves flat.
+//! Darkens creases and surfaces behind edges, which a light at the camera does not show.
 //!
-//! A pixel that lies deeper than the middle of two opposite neighbours sits in a hollow. Nearness is linear over a
-//! plane, so planes stay untouched however steeply they are seen. After the idea of eye-dome lighting (Boucheny 2009).
+//! A pixel that is deeper than the mean of two opposite neighbours is in a hollow. Inverse depth is linear over a
+//! plane, so planes are not changed at any viewing angle. After the idea of eye-dome lighting (Boucheny 2009).
 
-use super::raster::{Drawn, Lens};
+use super::raster::{Lens, Rasterised};
 use crate::Picture;
 use rayon::prelude::*;
 
@@ -14,7 +14,7 @@ const FULL_DEPTH: f32 = 1.5;
 /// Share of light taken from the deepest hollow.
 const STRENGTH: f32 = 0.5;
 
-pub(super) fn darkened(frame: Drawn, lens: &Lens) -> Picture {
+pub(super) fn darkened(frame: Rasterised, lens: &Lens) -> Picture {
     let (width, height) = (frame.width, frame.height);
     let mut colors = frame.colors;
     let nearness = &frame.nearness;
@@ -44,7 +44,7 @@ fn hollow_at(
         let (x, y) = (x as i64 + dx, y as i64 + dy);
         let inside = x >= 0 && y >= 0 && x < width as i64 && y < height as i64;
         let value = if inside { nearness[y as usize * width + x as usize] } else { here };
-        // Nothing behind an outline is no hollow.
+        // Background behind an outline is not a hollow.
         if value == f32::NEG_INFINITY { here } else { value }
     };
     let mut sum = 0.0;

@@ -2,8 +2,8 @@
 //!
 //! Triangles are scan-converted with exact integer edge functions (Pineda, "A parallel algorithm for polygon
 //! rasterization", 1988) and a z-buffer into 3 × 3 samples per pixel; points are discs in space. The light sits at the
-//! camera. What is seen from behind is left out or dimmed as the camera says, so that a closed room can be looked
-//! into from outside. Bands of rows are drawn in parallel, each in the order of the triangles.
+//! camera. Back faces are skipped or dimmed, as set in the camera, so that the inside of a closed room is
+//! visible from outside. Bands of rows are drawn in parallel, each in the order of the triangles.
 
 pub mod camera;
 mod crease;
@@ -22,7 +22,7 @@ use camera::{MapCamera, Projection};
 use raster::Lens;
 use vidar_core::{PointCloud, Trajectory, TriangleMesh};
 
-/// What is drawn.
+/// The surface to draw.
 #[derive(Clone, Copy, Debug)]
 pub enum MapSurface<'a> {
     /// Triangles.
@@ -60,7 +60,7 @@ impl MapSurface<'_> {
             Self::Cloud(cloud) => ("cloud", cloud.is_consistent(), 0),
         };
         let vertices = self.positions().len();
-        // Vertices are named by u32 throughout.
+        // Vertex indices are u32.
         if consistent && vertices <= u32::MAX as usize && triangles <= u32::MAX as usize {
             Ok(())
         } else {
@@ -69,7 +69,7 @@ impl MapSurface<'_> {
     }
 }
 
-/// What the colours mean.
+/// Meaning of the colours.
 #[derive(Clone, Copy, Debug)]
 pub enum Shading<'a> {
     /// The surface's own colours; a light grey where it has none.
@@ -82,7 +82,7 @@ pub enum Shading<'a> {
         values: &'a [f32],
         /// Values at the ends of the scale; beyond them the colour stays that of the end.
         range: (f32, f32),
-        /// What the values are, with the unit (`distance to reference [m]`).
+        /// Name of the values, with the unit (`distance to reference [m]`).
         label: &'a str,
     },
 }
@@ -142,7 +142,7 @@ pub fn render_map_with_path(
     Ok(canvas.into_picture())
 }
 
-/// The path with a pale halo, so that it is seen on dark and on bright ground.
+/// The path with a pale halo, visible on dark and bright background.
 fn draw_path(canvas: &mut Canvas, lens: &Lens, path: &Trajectory, scale: TypeScale) {
     let pixels: Vec<Option<(f64, f64)>> =
         path.poses().iter().map(|p| lens.picture_point(&p.world_from_body.translation)).collect();

@@ -8,10 +8,10 @@ use nalgebra::Vector3;
 use rayon::prelude::*;
 use vidar_core::{PointCloud, TriangleMesh};
 
-/// A surface without colours looks like plaster.
+/// Colour of a surface without colours.
 const PLASTER: [f32; 3] = [214.0, 209.0, 200.0];
 
-/// Every vertex in the camera's frame with its final colour; what is cut away or not finite has NaN for its place.
+/// Every vertex in the camera's frame with its final colour; vertices that are cut away or not finite have a NaN position.
 pub(super) fn painted(surface: &MapSurface<'_>, lens: &Lens, shading: &Shading<'_>) -> Vec<Vertex> {
     let computed;
     let normals = match surface {
@@ -46,7 +46,7 @@ pub(super) fn painted(surface: &MapSurface<'_>, lens: &Lens, shading: &Shading<'
         .collect()
 }
 
-/// Brightness under a light at the camera. Colours that carry a meaning are dimmed least.
+/// Brightness under a light at the camera. Colours that encode values are dimmed least.
 fn light(facing: Option<f64>, shading: &Shading<'_>, is_plain: bool) -> f32 {
     let depth = match shading {
         Shading::Color if is_plain => 0.55,

@@ -41,7 +41,7 @@ impl Vertex {
 }
 
 /// A drawn picture before annotation.
-pub(super) struct Drawn {
+pub(super) struct Rasterised {
     pub width: usize,
     pub height: usize,
     pub colors: Vec<[u8; 3]>,
@@ -70,7 +70,7 @@ impl Lens {
         let forward = camera.forward();
         let rows = [camera.right, camera.down, forward];
         if camera.position.iter().chain(rows.iter().flatten()).any(|v| !v.is_finite()) {
-            return Err(bad("its place or direction is not finite"));
+            return Err(bad("its position or direction is not finite"));
         }
         if rows.iter().any(|r| (r.norm() - 1.0).abs() > 1e-6) {
             return Err(bad("right and down must be unit vectors at a right angle"));
@@ -166,7 +166,7 @@ impl Lens {
 }
 
 /// Draws a mesh. `triangles` must name vertices that exist.
-pub(super) fn draw_mesh(lens: &Lens, vertices: &[Vertex], triangles: &[[u32; 3]]) -> Drawn {
+pub(super) fn draw_mesh(lens: &Lens, vertices: &[Vertex], triangles: &[[u32; 3]]) -> Rasterised {
     let corners = |t: u32| triangles[t as usize].map(|i| &vertices[i as usize]);
     let bins = binned(lens, triangles.len(), |t, rows| {
         let corners = corners(t);
@@ -200,7 +200,7 @@ pub(super) fn draw_mesh(lens: &Lens, vertices: &[Vertex], triangles: &[[u32; 3]]
 }
 
 /// Draws points as discs that face the camera.
-pub(super) fn draw_cloud(lens: &Lens, vertices: &[Vertex], radius_m: f64) -> Drawn {
+pub(super) fn draw_cloud(lens: &Lens, vertices: &[Vertex], radius_m: f64) -> Rasterised {
     // At least half a pixel, so that a far cloud does not fade; at most a twentieth of the picture.
     let (least, most) = (0.5 * SAMPLES as f64, (lens.height * SAMPLES) as f64 / 20.0);
     let disc = |i: u32| {
@@ -257,7 +257,7 @@ fn for_each_clipped(lens: &Lens, corners: [&Vertex; 3], mut use_part: impl FnMut
     }
 }
 
-/// For every band the primitives that may touch it, in their order.
+/// For every band, the primitives that may overlap it, in their order.
 ///
 /// `extent` calls back with the first and last sample row of each visible part of a primitive.
 fn binned(lens: &Lens, count: usize, extent: impl Fn(u32, &mut dyn FnMut(f64, f64)) + Sync) -> Vec<Vec<u32>> {
@@ -278,7 +278,7 @@ fn binned(lens: &Lens, count: usize, extent: impl Fn(u32, &mut dyn FnMut(f64, f6
                 else {
                     continue;
                 };
-                // A row of slack covers the rounding to sub-sample positions.
+                // A margin of one row covers the rounding to sub-sample positions.
                 let first = ((top - 1.0) / rows_per_band).max(0.0) as usize;
                 let last = (((bottom + 1.0) / rows_per_band).max(0.0) as usize).min(bands - 1);
                 for bin in &mut bins[first.min(bands - 1)..=last] {
@@ -291,8 +291,8 @@ fn binned(lens: &Lens, count: usize, extent: impl Fn(u32, &mut dyn FnMut(f64, f6
     (0..bands).map(|b| chunks.iter().flat_map(|c| &c[b]).copied().collect()).collect()
 }
 
-/// Draws every band with its primitives and joins them to a picture.
-fn drawn(lens: &Lens, bins: &[Vec<u32>], draw: impl Fn(&mut Band, u32) + Sync) -> Drawn {
+/// Draws every band with its primitives and joins the bands to a picture.
+fn drawn(lens: &Lens, bins: &[Vec<u32>], draw: impl Fn(&mut Band, u32) + Sync) -> Rasterised {
     let bands: Vec<(Vec<[u8; 3]>, Vec<f32>)> = bins
         .par_iter()
         .enumerate()
@@ -306,7 +306,7 @@ fn drawn(lens: &Lens, bins: &[Vec<u32>], draw: impl Fn(&mut Band, u32) + Sync) -
         })
         .collect();
     let mut frame =
-        Drawn { width: lens.width, height: lens.height, colors: Vec::new(), nearness: Vec::new() };
+        Rasterised { width: lens.width, height: lens.height, colors: Vec::new(), nearness: Vec::new() };
     for (colors, nearness) in bands {
         frame.colors.extend(colors);
         frame.nearness.extend(nearness);
@@ -336,7 +336,7 @@ impl Band {
         }
     }
 
-    /// Sets a sample if it is nearer than what is there; of equals the first stays.
+    /// Sets a sample if it is nearer than what is there; among equals the first is kept.
     fn put(&mut self, column: usize, row: usize, nearness: f32, color: impl FnOnce() -> [f32; 3]) {
         let i = row * self.columns + column;
         if nearness > self.nearness[i] {

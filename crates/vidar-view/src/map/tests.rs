@@ -143,7 +143,7 @@ fn is_like(p: [u8; 3], main: usize) -> bool {
 }
 
 #[test]
-fn from_outside_one_looks_into_a_closed_room() {
+fn the_inside_of_a_closed_room_is_visible_from_outside() {
     let mesh = room();
     for viewpoint in [Viewpoint::Top, Viewpoint::ThreeQuarterFront, Viewpoint::ThreeQuarterBack] {
         let camera = MapCamera::fixed(viewpoint, &mesh.positions, None, &Vector3::z(), 4.0 / 3.0);
@@ -257,7 +257,7 @@ fn errors_are_coloured_by_their_scale() {
 }
 
 #[test]
-fn what_does_not_fit_together_is_an_error_that_says_so() {
+fn inconsistent_surfaces_and_values_are_refused() {
     let mut mesh = room();
     let camera = from_above();
     let size = PictureSize::new(200, 200);
@@ -279,7 +279,7 @@ fn what_does_not_fit_together_is_an_error_that_says_so() {
 }
 
 #[test]
-fn odd_surfaces_make_pictures() {
+fn degenerate_surfaces_give_pictures() {
     let empty = TriangleMesh::default();
     let mut odd = room();
     odd.positions[3] = [f32::NAN; 3];

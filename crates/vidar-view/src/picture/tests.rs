@@ -21,7 +21,7 @@ fn depth_keeps_its_pixels_and_gains_a_scale_at_the_right() {
 }
 
 #[test]
-fn without_a_range_outliers_do_not_decide_the_colours() {
+fn without_a_range_outliers_do_not_set_the_colours() {
     let mut depth = Image::from_fn(400, 300, |x, _| 1.0 + x as f32 / 400.0);
     depth[(3, 3)] = 1e6;
     let picture = depth_picture(&depth, None);
@@ -30,14 +30,14 @@ fn without_a_range_outliers_do_not_decide_the_colours() {
 }
 
 #[test]
-fn confidence_is_dark_where_unsure() {
+fn low_confidence_is_dark() {
     let picture = confidence_picture(&Image::from_fn(320, 240, |x, _| x as f32 / 319.0));
     assert_eq!(picture[(0, 0)], ColorMap::Sea.color(0.0));
     assert_eq!(picture[(319, 0)], ColorMap::Sea.color(1.0));
 }
 
 #[test]
-fn odd_inputs_make_pictures() {
+fn degenerate_inputs_give_pictures() {
     let odd = [
         Image::filled(0, 0, 1.0),
         Image::filled(1, 1, 2.0),
@@ -56,7 +56,7 @@ fn odd_inputs_make_pictures() {
 }
 
 #[test]
-fn pictures_beside_each_other_have_one_height_and_keep_their_pixels() {
+fn pictures_side_by_side_have_one_height_and_keep_their_pixels() {
     let red = Picture::filled(300, 200, [255, 0, 0]);
     let blue = Picture::filled(75, 50, [0, 0, 255]);
     let both = side_by_side(&[("first", &red), ("a second one whose name is long", &blue)]);
@@ -67,7 +67,7 @@ fn pictures_beside_each_other_have_one_height_and_keep_their_pixels() {
 }
 
 #[test]
-fn no_pictures_and_empty_pictures_beside_each_other_are_no_failure() {
+fn no_pictures_and_empty_pictures_side_by_side_are_accepted() {
     let empty = Picture::filled(0, 0, [0; 3]);
     assert!(!side_by_side(&[]).data().is_empty());
     assert!(!side_by_side(&[("nothing", &empty)]).data().is_empty());

@@ -4,13 +4,13 @@ pub(super) const CSS: &str = r#":root {
   color-scheme: light dark;
   --paper: #ffffff; --card: #f5f6f8; --ink: #1f2328; --quiet: #57606a; --line: #d8dee4; --link: #0b5cad;
   --good: #116329; --good-bg: #dafbe1; --caution: #7a4b00; --caution-bg: #fff3c4;
-  --bad: #a40e26; --bad-bg: #ffe5e4; --unjudged: #424a53; --unjudged-bg: #eaeef2;
+  --bad: #a40e26; --bad-bg: #ffe5e4; --not-evaluated: #424a53; --not-evaluated-bg: #eaeef2;
 }
 @media (prefers-color-scheme: dark) {
   :root {
     --paper: #14171a; --card: #1e2328; --ink: #e6e9ec; --quiet: #a2abb5; --line: #363d45; --link: #79b8ff;
     --good: #7ee29a; --good-bg: #12301c; --caution: #f5cf6b; --caution-bg: #362a0b;
-    --bad: #ffa198; --bad-bg: #3d1618; --unjudged: #c4ccd4; --unjudged-bg: #2a3037;
+    --bad: #ffa198; --bad-bg: #3d1618; --not-evaluated: #c4ccd4; --not-evaluated-bg: #2a3037;
   }
 }
 * { box-sizing: border-box; }
@@ -28,13 +28,13 @@ p { margin: .5rem 0; max-width: 48rem; overflow-wrap: anywhere; }
 a { color: var(--link); }
 code { font: .88em/1.5 ui-monospace, "SF Mono", Menlo, Consolas, "DejaVu Sans Mono", monospace; overflow-wrap: anywhere; }
 .subtitle { color: var(--quiet); font-size: 1.05rem; }
-.verdict { display: flex; flex-wrap: wrap; gap: .3rem .9rem; align-items: baseline; max-width: none;
+.assessment { display: flex; flex-wrap: wrap; gap: .3rem .9rem; align-items: baseline; max-width: none;
   margin: 1.1rem 0; padding: .7rem 1rem; border-left: .35rem solid; border-radius: .35rem; }
-.verdict span { color: var(--ink); }
-.verdict.good { color: var(--good); background: var(--good-bg); }
-.verdict.caution { color: var(--caution); background: var(--caution-bg); }
-.verdict.bad { color: var(--bad); background: var(--bad-bg); }
-.verdict.unjudged { color: var(--unjudged); background: var(--unjudged-bg); }
+.assessment span { color: var(--ink); }
+.assessment.good { color: var(--good); background: var(--good-bg); }
+.assessment.caution { color: var(--caution); background: var(--caution-bg); }
+.assessment.bad { color: var(--bad); background: var(--bad-bg); }
+.assessment.not-evaluated { color: var(--not-evaluated); background: var(--not-evaluated-bg); }
 .summary { display: grid; grid-template-columns: repeat(auto-fill, minmax(13.5rem, 1fr)); gap: .8rem; margin: 1.4rem 0 0; }
 .summary > div { background: var(--card); border: 1px solid var(--line); border-radius: .5rem; padding: .8rem 1rem; }
 .summary dt { color: var(--quiet); font-size: .9rem; }
@@ -77,6 +77,6 @@ footer dd { margin: 0; min-width: 0; }
   nav { display: none; }
   figure, table, .summary > div, .warnings { break-inside: avoid; }
   h2 { break-after: avoid; }
-  .verdict { print-color-adjust: exact; -webkit-print-color-adjust: exact; }
+  .assessment { print-color-adjust: exact; -webkit-print-color-adjust: exact; }
 }
 "#;

@@ -5,7 +5,7 @@ fn full_report() -> Report {
     Report {
         title: evil.clone(),
         subtitle: evil.clone(),
-        verdict: Some(Verdict { level: VerdictLevel::Caution, text: evil.clone() }),
+        assessment: Some(Assessment { level: AssessmentLevel::Caution, text: evil.clone() }),
         summary: vec![SummaryItem { label: evil.clone(), value: evil.clone(), explanation: evil.clone() }],
         sections: ["One", "Two", evil.as_str()]
             .map(|heading| Section {
@@ -89,7 +89,7 @@ fn pictures_have_texts_and_tables_have_heads() {
 }
 
 #[test]
-fn columns_of_numbers_are_told_from_columns_of_words() {
+fn numeric_columns_are_detected() {
     let table = Table {
         caption: String::new(),
         columns: vec!["a".to_owned(); 3],

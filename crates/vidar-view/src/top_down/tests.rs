@@ -59,7 +59,7 @@ fn both_panels_have_one_scale_and_hold_all_data() {
 }
 
 #[test]
-fn an_unobserved_stretch_is_not_drawn_as_a_path() {
+fn an_unobserved_interval_is_not_drawn_as_a_path() {
     let mut poses = circle(3.0).poses().to_vec();
     poses.drain(100..300);
     let broken = Trajectory::new(BodyFrame::Imu, poses).unwrap();
@@ -70,7 +70,7 @@ fn an_unobserved_stretch_is_not_drawn_as_a_path() {
 }
 
 #[test]
-fn ground_truth_lies_behind_whatever_the_order() {
+fn ground_truth_is_drawn_behind_in_any_order() {
     let (a, b) = (circle(3.0), circle(3.0));
     let items = [PlotTrajectory::estimate("a", &a), PlotTrajectory::ground_truth("b", &b)];
     let one = plot_trajectories_top_down(&items, PictureSize::new(640, 480));
@@ -80,7 +80,7 @@ fn ground_truth_lies_behind_whatever_the_order() {
 }
 
 #[test]
-fn odd_paths_make_plots() {
+fn degenerate_paths_give_plots() {
     let far: Vec<[f64; 3]> = (0..50).map(|i| [1e12 + f64::from(i), 1e300, -1e300]).collect();
     let many: Vec<[f64; 3]> = (0..30_000).map(|i| [f64::from(i).sin(), f64::from(i).cos(), 0.0]).collect();
     let paths = [
@@ -102,7 +102,7 @@ fn odd_paths_make_plots() {
 }
 
 #[test]
-fn axes_of_worlds_with_another_up_are_named_and_right_handed() {
+fn axes_with_another_up_are_named_and_right_handed() {
     for (up, names) in [
         (Vector3::z(), ["x", "y", "z"]),
         (-Vector3::z(), ["x", "-y", "-z"]),
@@ -126,7 +126,7 @@ fn axes_of_worlds_with_another_up_are_named_and_right_handed() {
 }
 
 #[test]
-fn up_is_read_from_how_cameras_are_held() {
+fn up_is_estimated_from_the_cameras() {
     let held = |world_from_level: So3| {
         // Level camera of a world with z up: x right, y down, z along world y; then nodding a little.
         let level = So3::exp(&Vector3::new(-std::f64::consts::FRAC_PI_2, 0.0, 0.0));
@@ -148,6 +148,6 @@ fn up_is_read_from_how_cameras_are_held() {
 }
 
 #[test]
-fn scale_bars_are_named_in_units_people_use() {
+fn scale_bars_have_common_units() {
     assert_eq!([2000.0, 5.0, 0.5, 0.02, 0.005].map(metres_label), ["2 km", "5 m", "50 cm", "2 cm", "5 mm"]);
 }

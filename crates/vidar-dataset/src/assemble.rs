@@ -1,4 +1,4 @@
-//! Small steps of putting a dataset together: names, files that are there, a guessed camera, the cut.
+//! Small steps of completing a dataset: its name, existing files, a guessed camera, the selected part.
 
 use crate::dataset::{CalibrationSource, DEPTH_TOLERANCE, Dataset, ImageEntry};
 use crate::decode::{self, ImageLimits};
@@ -8,7 +8,7 @@ use crate::options::OpenOptions;
 use std::path::{Path, PathBuf};
 use vidar_core::{CameraModel, Duration, Pinhole, Timestamp, Warning};
 
-/// The last part of the root's path that says something: `mav0` does not, and `seq-01` only with its room.
+/// The last meaningful part of the root's path: not `mav0`, and `seq-01` only together with its parent folder.
 pub(crate) fn name_of(root: &Path) -> String {
     let absolute = root.canonicalize().unwrap_or_else(|_| root.to_path_buf());
     let parts = absolute.components().rev().filter_map(|c| match c {
@@ -18,12 +18,12 @@ pub(crate) fn name_of(root: &Path) -> String {
     let mut parts = parts.filter(|p| p != "mav0");
     let last = parts.next().unwrap_or_else(|| "dataset".into());
     match parts.next() {
-        Some(room) if last.starts_with("seq") => format!("{room}-{last}"),
+        Some(parent) if last.starts_with("seq") => format!("{parent}-{last}"),
         _ => last,
     }
 }
 
-/// Leaves out files that are not there or hold nothing, and names them.
+/// Skips missing and empty files, with a warning.
 pub(crate) fn keep_existing(
     files: &mut Vec<(Timestamp, PathBuf)>,
     what: &str,
@@ -41,23 +41,24 @@ pub(crate) fn keep_existing(
             Err(e) => return Err(io_error(&path)(e)),
         }
     }
-    for (kind, fault, paths) in
-        [("image-missing", "are named but not there", missing), ("image-empty", "are empty (0 bytes)", empty)]
-    {
+    for (kind, fault, paths) in [
+        ("image-missing", "are listed but do not exist", missing),
+        ("image-empty", "are empty (0 bytes)", empty),
+    ] {
         if let Some(first) = paths.first() {
             let name = first.display();
-            let message = format!("{} {what} {fault}; left out, the first is {name}", paths.len());
-            notes.push(Warning::new(kind, message).at(place.display()));
+            let message = format!("{} {what} {fault}; skipped, the first is {name}", paths.len());
+            notes.push(Warning::degraded(kind, message).at(place.display()));
         }
     }
     *files = kept;
     Ok(())
 }
 
-/// The size of the first image whose header can be read; truncated ones are told when they are loaded.
+/// The size of the first image whose header can be read; truncated ones are reported when they are loaded.
 pub(crate) fn first_readable_size(images: &[ImageEntry]) -> Result<(usize, usize), DatasetError> {
     let mut first_error = None;
-    // Ten unreadable images in a row are no accident.
+    // After ten unreadable images in a row the search stops.
     for entry in images.iter().take(10) {
         match decode::read_size(&entry.path, &ImageLimits::default()) {
             Ok(size) => return Ok(size),
@@ -71,7 +72,7 @@ pub(crate) fn first_readable_size(images: &[ImageEntry]) -> Result<(usize, usize
     }))
 }
 
-/// Opening angle across the longer side assumed for a camera about which nothing is known, as of a phone: f = 0.8·w.
+/// Opening angle across the longer side assumed for an uncalibrated camera, as of a phone: f = 0.8·w.
 const GUESSED_FOCAL_RATIO: f64 = 0.8;
 
 pub(crate) fn guessed_model(
@@ -85,14 +86,15 @@ pub(crate) fn guessed_model(
     })?;
     let warning = Warning::new(
         "intrinsics-guessed",
-        format!("no calibration; a pinhole of focal length {focal:.0} px is guessed, so nothing metric can be trusted"),
+        format!(
+            "no calibration; a pinhole with focal length {focal:.0} px is guessed, so results are not metric"
+        ),
     )
     .hint("--calibration FILE, or --camera-model pinhole:fx,fy,cx,cy");
     Ok((CameraModel::Pinhole(pinhole), CalibrationSource::Guessed, warning))
 }
 
-/// Inertial readings and poses kept before and after the cut, so that an initialiser has its still seconds and
-/// interpolation its neighbours.
+/// IMU samples and poses kept before and after the selected part, for a static initialisation and for interpolation.
 const LEAD_IN: Duration = Duration::from_millis(3000);
 
 /// Applies start, end and stride.
