@@ -1,10 +1,10 @@
-//! Arrows go only down, and stage crates do not know each other (ARCHITECTURE.md).
+//! Checks the layers: dependencies point down only, and stage crates do not depend on each other (ARCHITECTURE.md).
 
 use anyhow::Result;
 use cargo_metadata::{DependencyKind, MetadataCommand};
 use std::path::Path;
 
-/// Crate, layer, and which crates of the workspace it may name.
+/// Each crate with the crates of the workspace that it may depend on.
 const LAYERS: &[(&str, &[&str])] = &[
     ("vidar-core", &[]),
     ("vidar-nn", &[]),
@@ -25,7 +25,7 @@ const LAYERS: &[(&str, &[&str])] = &[
     ("xtask", &[]),
 ];
 
-/// Third-party crates that only one place may name, with the reason.
+/// Third-party crates that only the listed crates may use, with the reason.
 const RESERVED: &[(&str, &[&str], &str)] = &[
     ("clap", &["vidar-cli"], "only the program parses flags; libraries take plain values"),
     ("anyhow", &["vidar-cli", "xtask"], "libraries return typed errors"),
@@ -33,11 +33,11 @@ const RESERVED: &[(&str, &[&str], &str)] = &[
     ("tiny-skia", &["vidar-view"], "pictures are drawn in one place"),
     ("kiddo", &["vidar-eval"], "nearest neighbours are searched in one place"),
     ("ureq", &["vidar-hub"], "the network is used in one place, and only when asked for"),
-    ("wgpu", &["vidar-gpu"], "graphics processors are spoken to in one place"),
+    ("wgpu", &["vidar-gpu"], "graphics processors are used in one place"),
     ("zip", &["vidar-export"], "archives are read and written in one place, within bounds"),
 ];
 
-/// Reads the workspace's own dependency graph and names every arrow that must not be.
+/// Reads the workspace's own dependency graph and reports every forbidden dependency.
 pub fn check(root: &Path) -> Result<Vec<String>> {
     let metadata = MetadataCommand::new().manifest_path(root.join("Cargo.toml")).no_deps().exec()?;
     let members: Vec<String> = metadata.packages.iter().map(|p| p.name.to_string()).collect();
@@ -49,7 +49,7 @@ pub fn check(root: &Path) -> Result<Vec<String>> {
             problems.push(format!("{name} has no layer; add it to xtask/src/layers.rs and ARCHITECTURE.md"));
         }
         for dependency in &package.dependencies {
-            // Tests may look sideways; what ships may not.
+            // Development dependencies on the same layer are allowed.
             let ships = dependency.kind != DependencyKind::Development;
             let ours = members.contains(&dependency.name);
             let allowed = match may {
@@ -57,7 +57,7 @@ pub fn check(root: &Path) -> Result<Vec<String>> {
                 Some(may) => may.contains(&dependency.name.as_str()),
             };
             if ours && ships && !allowed {
-                problems.push(format!("{name} -> {}: this arrow goes up or sideways", dependency.name));
+                problems.push(format!("{name} -> {}: this dependency points up or sideways", dependency.name));
             }
             if let Some((_, owners, reason)) = RESERVED.iter().find(|(n, _, _)| *n == dependency.name)
                 && ships

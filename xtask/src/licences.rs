@@ -80,7 +80,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn spdx_expressions_are_met_only_by_what_is_allowed() {
+    fn spdx_expressions_are_satisfied_by_allowed_licences_only() {
         let allowed: Vec<String> =
             ["MIT", "Apache-2.0", "Apache-2.0 WITH LLVM-exception", "Unicode-3.0"].map(Into::into).into();
         for good in [

@@ -1,4 +1,4 @@
-//! House checks, run by CI: `cargo xtask check` runs all, or name one of `layers`, `names`, `size`, `licences`.
+//! Project checks, run by CI: `cargo xtask check` runs all, or name one of `layers`, `names`, `size`, `licences`.
 
 mod layers;
 mod licences;

@@ -3,11 +3,11 @@
 use anyhow::{Context, Result};
 use std::path::{Path, PathBuf};
 
-/// A file above this fails (CODE_STYLE.md); above [`WARN_LINES`] it is named.
+/// A file above this fails (CODE_STYLE.md); above [`WARN_LINES`] it is reported.
 const MAX_LINES: usize = 800;
 const WARN_LINES: usize = 600;
 
-/// Words that hide a transform's direction, and the crates at the border that may say them.
+/// Words that hide a transform's direction, and the crates at the file-format border that may use them.
 const BANNED: &[&str] = &["extrinsic", "c2w", "w2c", "t_cw", "t_wc", "cam_to_world", "world_to_cam"];
 const BORDER: &[&str] = &["vidar-dataset", "vidar-export", "xtask"];
 
@@ -29,7 +29,7 @@ fn sources(root: &Path) -> Result<Vec<PathBuf>> {
     Ok(found)
 }
 
-/// Names every file that has outgrown its room.
+/// Reports every file above the limit.
 pub fn check_size(root: &Path) -> Result<Vec<String>> {
     let mut problems = Vec::new();
     for path in sources(root)? {
@@ -43,7 +43,7 @@ pub fn check_size(root: &Path) -> Result<Vec<String>> {
     Ok(problems)
 }
 
-/// Names every code line that uses a banned word outside the border crates.
+/// Reports every code line that uses a banned word outside the border crates.
 pub fn check_names(root: &Path) -> Result<Vec<String>> {
     let mut problems = Vec::new();
     for path in sources(root)? {
@@ -52,7 +52,7 @@ pub fn check_names(root: &Path) -> Result<Vec<String>> {
             continue;
         }
         for (number, line) in std::fs::read_to_string(&path)?.lines().enumerate() {
-            // Prose may speak of the field's words; code may not.
+            // Comments may use these words; code may not.
             let code = line.split("//").next().unwrap_or_default();
             let code = code.split('"').step_by(2).collect::<String>().to_lowercase();
             let words = code.split(|c: char| !(c.is_alphanumeric() || c == '_'));

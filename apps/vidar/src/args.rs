@@ -5,7 +5,7 @@ use clap::{ArgAction, Args, Parser, Subcommand, ValueEnum, ValueHint};
 use std::path::PathBuf;
 use vidar::da3::Device;
 
-/// One camera and metric poses into a metric dense 3-D map.
+/// Metric dense 3-D maps from one camera and an IMU, or from one camera and metric poses.
 #[derive(Debug, Parser)]
 #[command(name = "vidar", version = version(), max_term_width = 110, propagate_version = true)]
 #[command(
@@ -15,7 +15,7 @@ pub struct Cli {
     /// What to do.
     #[command(subcommand)]
     pub command: Command,
-    /// Flags that every command has.
+    /// Options of every command.
     #[command(flatten)]
     pub common: CommonArgs,
 }
@@ -24,34 +24,34 @@ fn version() -> &'static str {
     concat!(env!("CARGO_PKG_VERSION"), " (stereo, cpu)")
 }
 
-/// Flags that every command has.
+/// Options of every command.
 #[derive(Args, Clone, Debug)]
 pub struct CommonArgs {
-    /// How progress is told, on the error stream.
+    /// How progress is shown, on the error stream.
     #[arg(long, value_enum, default_value_t = ProgressMode::Auto, global = true, help_heading = "Output")]
     pub progress: ProgressMode,
     /// Print the result as one JSON object on the standard output.
     #[arg(long, global = true, help_heading = "Output")]
     pub json: bool,
-    /// Say nothing but errors and the result.
+    /// Print only errors and the result.
     #[arg(short, long, global = true, help_heading = "Output")]
     pub quiet: bool,
     /// Never use the network.
     #[arg(long, global = true, help_heading = "Output")]
     pub offline: bool,
-    /// Threads to use; 0 means all. The result does not depend on it.
+    /// Number of threads; 0 means all. The result does not depend on it.
     #[arg(long, default_value_t = 0, global = true, help_heading = "Output")]
     pub threads: usize,
 }
 
-/// How progress is told.
+/// How progress is shown.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 pub enum ProgressMode {
     /// A bar on a terminal, plain lines otherwise.
     Auto,
     /// A bar.
     Bar,
-    /// A line per stage and now and then.
+    /// One line per stage, and one every few seconds.
     Plain,
     /// One JSON object per event.
     Json,
@@ -62,38 +62,38 @@ pub enum ProgressMode {
 /// What to do.
 #[derive(Debug, Subcommand)]
 pub enum Command {
-    /// Everything: poses, depth, one surface, judgement, files.
+    /// Run the whole pipeline on a recording: poses, depth, fusion into one surface, evaluation, files.
     #[command(after_help = RUN_EXAMPLES)]
     Run(Box<RunArgs>),
-    /// A synthetic room, flown, mapped and judged; nothing is downloaded.
+    /// Render a flight through a synthetic room, map it and evaluate the map; nothing is downloaded.
     #[command(
         after_help = "Examples:\n  vidar demo\n  vidar demo -o my_demo --seed 7\n  vidar demo --scene corridor --set fusion.voxel_size_m=0.03"
     )]
     Demo(DemoArgs),
-    /// What is in a recording, and is it healthy.
+    /// Show the contents of a recording and check its data and calibration.
     #[command(
         after_help = "Examples:\n  vidar inspect my_recording/\n  vidar inspect my_recording/ --trajectory vio.tum\n  vidar inspect my_recording/ --json"
     )]
     Inspect(InspectArgs),
-    /// Judge a trajectory against a trajectory, a cloud against a cloud, or show a run's scores.
+    /// Evaluate a trajectory or a cloud against a reference, or show the scores of a run.
     #[command(
         after_help = "Examples:\n  vidar eval estimate.tum truth.tum\n  vidar eval map.ply scan.ply\n  vidar eval runs/demo/latest/run --fail-below f@0.05=0.5"
     )]
     Eval(EvalArgs),
-    /// Other programs' formats from a finished run.
+    /// Export a finished run to formats of other programs.
     #[command(
         after_help = "Examples:\n  vidar export runs/demo/latest/run --to colmap -o colmap\n  vidar export runs/demo/latest/run --to nerfstudio -o ns\n  vidar export runs/demo/latest/run --to tum"
     )]
     Export(ExportArgs),
-    /// Depth, confidence, cameras and a cloud of plain images, by Depth Anything 3.
+    /// Predict depth, confidence, cameras and a cloud from images, with Depth Anything 3.
     #[command(
         after_help = "Examples:\n  vidar depth photos/\n  vidar depth a.jpg b.jpg --model da3-base --format ply,glb -o out\n  vidar depth frames/ --poses colmap/ --resolution input\n  vidar depth photos/ --dry-run"
     )]
     Depth(Box<DepthArgs>),
-    /// Checkpoints: list, pull, import, verify, check, where.
+    /// Manage checkpoints: list, pull, import, verify, check, where.
     #[command(subcommand)]
     Model(ModelCommand),
-    /// The metric trajectory of a recording from its own camera and IMU.
+    /// Estimate the metric trajectory of a recording from its camera and IMU.
     #[command(
         after_help = "Examples:\n  vidar odometry mav0/ -o result\n  vidar odometry my_recording/ --mono\n  vidar odometry my_recording/ --set odometry.max_landmarks=200 --json"
     )]
@@ -103,23 +103,23 @@ pub enum Command {
         after_help = "Examples:\n  vidar synth room1\n  vidar synth hall1 --scene hall --seed 3 --duration 20\n  vidar synth flight1 --trajectory flight.tum --euroc"
     )]
     Synth(SynthArgs),
-    /// The paper's tables: every sequence of a dataset under every coupling, judged alike.
+    /// Reproduce the paper's tables: run and evaluate every sequence of a dataset with every coupling.
     #[command(
         after_help = "Examples:\n  vidar bench euroc EuRoC/ --sequences V1,V2 --geometry da3-small -o tables\n  vidar bench euroc --synthetic --geometry simulated -o tables\n  vidar bench tum TUM/ --modes pose-free,pose-conditioned"
     )]
     Bench(Box<BenchArgs>),
-    /// What is possible with what is there.
+    /// Check this machine: processor, memory, disk, networks, graphics processors.
     Doctor,
-    /// Settings: show, explain, presets, schema.
+    /// Show and explain settings: show, explain, presets, schema.
     #[command(subcommand)]
     Config(ConfigCommand),
-    /// What an error code means.
+    /// Explain an error code.
     #[command(after_help = "Examples:\n  vidar explain E0202\n  vidar explain all")]
     Explain {
         /// The code, such as E0202, or `all`.
         code: String,
     },
-    /// A completion script for a shell, on the standard output.
+    /// Print a completion script for a shell.
     Completions {
         /// Which shell.
         shell: clap_complete::Shell,
@@ -134,7 +134,7 @@ const RUN_EXAMPLES: &str = "Examples:
 /// How the input is read.
 #[derive(Args, Clone, Debug, Default)]
 pub struct InputArgs {
-    /// Layout, where looking at the path would decide otherwise: euroc, tum-rgbd, 7scenes, posed-folder, images.
+    /// Layout of the recording, instead of detecting it: euroc, tum-rgbd, 7scenes, posed-folder, images.
     #[arg(long, help_heading = "Input")]
     pub format: Option<String>,
     /// Number of the camera (`cam0` is 0).
@@ -143,31 +143,31 @@ pub struct InputArgs {
     /// Calibration: EuRoC sensor.yaml, Kalibr camchain or imu yaml. Repeatable.
     #[arg(long, value_hint = ValueHint::FilePath, help_heading = "Input")]
     pub calibration: Vec<PathBuf>,
-    /// Camera from numbers: pinhole:fx,fy,cx,cy  radtan:…,k1,k2,p1,p2(,k3)  kb4:…,k1,k2,k3,k4  ds:…,xi,alpha  fov:…,w.
+    /// Camera model of the images: pinhole:fx,fy,cx,cy  radtan:…,k1,k2,p1,p2(,k3)  kb4:…,k1,k2,k3,k4  ds:…,xi,alpha  fov:…,w.
     #[arg(long, allow_hyphen_values = true, help_heading = "Input")]
     pub camera_model: Option<String>,
-    /// Metric trajectory of the same recording: the anchor.
+    /// Metric trajectory of the same recording, used instead of VIDAR's own odometry.
     #[arg(long, value_hint = ValueHint::FilePath, help_heading = "Input")]
     pub trajectory: Option<PathBuf>,
-    /// Its format: tum, euroc, kitti.
+    /// Format of --trajectory, instead of detecting it: tum, euroc, kitti.
     #[arg(long, help_heading = "Input")]
     pub trajectory_format: Option<String>,
-    /// Whose poses it holds: imu, or camera0, camera1, ….
+    /// Body whose poses --trajectory holds: imu, or camera0, camera1, ….
     #[arg(long, help_heading = "Input")]
     pub trajectory_body: Option<String>,
-    /// File of image times for image folders.
+    /// File of image times, for image folders.
     #[arg(long, value_hint = ValueHint::FilePath, help_heading = "Input")]
     pub timestamps: Option<PathBuf>,
-    /// Unit of image times: s, ms, us, ns.
+    /// Unit of image times, instead of detecting it: s, ms, us, ns.
     #[arg(long, help_heading = "Input")]
     pub time_unit: Option<String>,
-    /// Depth camera: fx,fy,cx,cy.
+    /// Intrinsics of the depth camera, pixels: fx,fy,cx,cy.
     #[arg(long, allow_hyphen_values = true, help_heading = "Input")]
     pub depth_intrinsics: Option<String>,
     /// Raw depth units per metre (1000: millimetres, 5000: TUM).
     #[arg(long, help_heading = "Input")]
     pub depth_scale: Option<f64>,
-    /// Place of the depth camera in the colour camera: tx,ty,tz metres, optionally ,qx,qy,qz,qw.
+    /// Pose of the depth camera in the colour camera: tx,ty,tz in metres, optionally ,qx,qy,qz,qw.
     #[arg(long, allow_hyphen_values = true, help_heading = "Input")]
     pub color_from_depth: Option<String>,
     /// Start, seconds after the first image.
@@ -176,7 +176,7 @@ pub struct InputArgs {
     /// End, seconds after the first image.
     #[arg(long, help_heading = "Input")]
     pub end: Option<f64>,
-    /// Every n-th image only.
+    /// Use every n-th image only.
     #[arg(long, help_heading = "Input")]
     pub stride: Option<usize>,
 }
@@ -184,13 +184,13 @@ pub struct InputArgs {
 /// How settings are given.
 #[derive(Args, Clone, Debug, Default)]
 pub struct ConfigArgs {
-    /// A preset: `vidar config presets` lists them.
+    /// Preset; `vidar config presets` lists them.
     #[arg(long, help_heading = "Settings")]
     pub preset: Option<String>,
-    /// A TOML file over the preset.
+    /// TOML file of settings; overrides the preset.
     #[arg(long, value_hint = ValueHint::FilePath, help_heading = "Settings")]
     pub config: Option<PathBuf>,
-    /// One setting: section.key=value. Repeatable; beats files.
+    /// One setting: section.key=value. Repeatable; overrides files.
     #[arg(long = "set", value_name = "KEY=VALUE", action = ArgAction::Append, help_heading = "Settings")]
     pub set: Vec<String>,
 }
@@ -201,7 +201,7 @@ pub struct OutputArgs {
     /// Output folder; default `runs/<name>/<time>/` with a `latest` link.
     #[arg(short, long, value_hint = ValueHint::DirPath, help_heading = "Output")]
     pub output: Option<PathBuf>,
-    /// Move an existing output folder aside instead of refusing.
+    /// Rename an existing output folder instead of failing.
     #[arg(long, help_heading = "Output")]
     pub force: bool,
 }
@@ -224,28 +224,28 @@ pub struct RunArgs {
     /// Source of depth: stereo, a network of `vidar model list` such as da3-small, or recorded:DIR.
     #[arg(long, visible_alias = "model", value_name = "NAME", help_heading = "Model")]
     pub geometry: Option<String>,
-    /// How depth and metric poses are coupled: coupled, hybrid, pose-conditioned, ground-truth, pose-free, da3-streaming.
+    /// Coupling of depth and metric poses: coupled, hybrid, pose-conditioned, ground-truth, pose-free, da3-streaming.
     #[arg(long, value_name = "MODE", help_heading = "Model")]
     pub mode: Option<String>,
-    /// A folder with model.safetensors and config.json of one's own.
+    /// Folder with model.safetensors and config.json, for custom weights.
     #[arg(long, value_hint = ValueHint::AnyPath, help_heading = "Model")]
     pub model_dir: Option<PathBuf>,
-    /// Where a network is computed: cpu, gpu, gpu:N or auto; `vidar doctor` lists graphics processors.
+    /// Device that runs the network: cpu, gpu, gpu:N or auto; `vidar doctor` lists graphics processors.
     #[arg(long, value_name = "DEVICE", help_heading = "Model")]
     pub device: Option<Device>,
     /// Acceptance of a licence.
     #[command(flatten)]
     pub licence: LicenceArgs,
-    /// A cloud (PLY, metres, world of ground truth) to judge the map against.
+    /// Reference cloud (PLY, metres, world frame of the ground truth) for the evaluation of the map.
     #[arg(long, value_hint = ValueHint::FilePath, help_heading = "Input")]
     pub reference: Option<PathBuf>,
-    /// Say what would be done, and stop.
+    /// Print the plan and stop.
     #[arg(long)]
     pub dry_run: bool,
-    /// Memory to plan for, such as 4GiB or 800MB; default: what the parts ask for.
+    /// Memory limit for planning, such as 4GiB or 800MB; default: the sum of the parts.
     #[arg(long, value_name = "SIZE", help_heading = "Model")]
     pub memory_budget: Option<String>,
-    /// Go on in the folder of -o where an interrupted run stopped; what is there and still holds is not computed again.
+    /// Continue an interrupted run in the folder of -o; valid results in it are not computed again.
     #[arg(long, requires = "output", conflicts_with = "force", help_heading = "Output")]
     pub resume: bool,
     /// End with status 5 when a score is above its bound: ate, scale, chamfer (e.g. ate=0.1). Repeatable.
@@ -256,22 +256,22 @@ pub struct RunArgs {
     pub fail_below: Vec<String>,
 }
 
-/// What to simulate.
+/// The synthetic world.
 #[derive(Args, Clone, Debug, Default)]
 pub struct WorldArgs {
-    /// Everything random follows from it.
+    /// Seed of all random numbers.
     #[arg(long, help_heading = "World")]
     pub seed: Option<u64>,
     /// room, hall or corridor.
     #[arg(long, help_heading = "World")]
     pub scene: Option<String>,
-    /// sweep, orbit or aggressive.
+    /// sweep, orbit, aggressive, handheld or handheld-lively.
     #[arg(long, help_heading = "World")]
     pub flight: Option<String>,
     /// Length, seconds.
     #[arg(long, help_heading = "World")]
     pub duration: Option<f64>,
-    /// Sit still for this many seconds first; default: in flight from the first frame.
+    /// Stand still for this many seconds first; default: moving from the first frame.
     #[arg(long, help_heading = "World")]
     pub static_start: Option<f64>,
 }
@@ -279,13 +279,13 @@ pub struct WorldArgs {
 /// `vidar demo`.
 #[derive(Args, Clone, Debug)]
 pub struct DemoArgs {
-    /// What to simulate.
+    /// The synthetic world.
     #[command(flatten)]
     pub world: WorldArgs,
-    /// Where depth comes from: da3-nano (in the program), stereo, or another network; `vidar model list` names them.
+    /// Source of depth: da3-nano (built in), stereo, or another network; `vidar model list` names them.
     #[arg(long, visible_alias = "model", value_name = "NAME", help_heading = "Model")]
     pub geometry: Option<String>,
-    /// A folder with model.safetensors and config.json of one's own.
+    /// Folder with model.safetensors and config.json, for custom weights.
     #[arg(long, value_hint = ValueHint::AnyPath, help_heading = "Model")]
     pub model_dir: Option<PathBuf>,
     /// How settings are given.
@@ -313,7 +313,7 @@ pub struct OdometryArgs {
     /// The recording: images and an IMU, in EuRoC or TUM layout.
     #[arg(value_hint = ValueHint::AnyPath)]
     pub path: PathBuf,
-    /// The camera alone, without its IMU: a trajectory up to scale.
+    /// Use the camera only, without the IMU: a trajectory up to scale.
     #[arg(long)]
     pub mono: bool,
     /// Write tracks, residuals and states as tables (odometry/debug_tracks.csv, odometry/debug_states.csv).
@@ -336,7 +336,7 @@ pub struct EvalArgs {
     /// A trajectory, a cloud (.ply), or a run folder.
     #[arg(value_hint = ValueHint::AnyPath)]
     pub estimate: PathBuf,
-    /// What to judge it against; not for a run folder.
+    /// Reference trajectory or cloud; not for a run folder.
     #[arg(value_hint = ValueHint::AnyPath)]
     pub truth: Option<PathBuf>,
     /// How settings are given.
@@ -370,18 +370,42 @@ pub struct SynthArgs {
     /// Folder of the sequence; must not exist.
     #[arg(value_hint = ValueHint::DirPath)]
     pub out: PathBuf,
-    /// What to simulate.
+    /// The synthetic world.
     #[command(flatten)]
     pub world: WorldArgs,
     /// Fly along this trajectory (TUM or EuRoC csv) instead of a built-in flight.
     #[arg(long, value_hint = ValueHint::FilePath)]
     pub trajectory: Option<PathBuf>,
-    /// EuRoC's sizes and rates: 752x480 at 20 Hz, static start, 60 s.
-    #[arg(long)]
+    /// Image size and rates of EuRoC: 752x480 at 20 Hz, static start, 60 s.
+    #[arg(long, conflicts_with_all = ["preset", "world_config"])]
     pub euroc: bool,
-    /// A TOML file with every setting of the world.
+    /// Settings to start from: demo, euroc, phone-slow, phone-fast, realsense, or tumvi (with --trajectory).
+    #[arg(long, value_name = "NAME", conflicts_with = "world_config")]
+    pub preset: Option<String>,
+    /// TOML file with every setting of the world.
     #[arg(long, value_hint = ValueHint::FilePath)]
     pub world_config: Option<PathBuf>,
+    /// Image size, such as 1280x720; a lens given in pixels is scaled with the width.
+    #[arg(long, value_name = "WxH", help_heading = "Recording")]
+    pub size: Option<String>,
+    /// Frames per second.
+    #[arg(long, value_name = "HZ", help_heading = "Recording")]
+    pub frame_rate: Option<f64>,
+    /// IMU samples per second.
+    #[arg(long, value_name = "HZ", help_heading = "Recording")]
+    pub imu_rate: Option<f64>,
+    /// Rolling shutter: milliseconds from the first row to the last.
+    #[arg(long, value_name = "MS", help_heading = "Recording")]
+    pub readout_ms: Option<f64>,
+    /// Milliseconds by which image stamps are late (negative: early).
+    #[arg(long, value_name = "MS", allow_negative_numbers = true, help_heading = "Recording")]
+    pub stamp_delay_ms: Option<f64>,
+    /// Calibration files that are written: given, partial (focal length only) or absent.
+    #[arg(long, value_name = "WHICH", help_heading = "Recording")]
+    pub calibration: Option<String>,
+    /// Share of the surface without texture, 0 to 1.
+    #[arg(long, value_name = "SHARE", help_heading = "Recording")]
+    pub bare_share: Option<f64>,
 }
 
 /// `vidar bench`.
@@ -390,39 +414,39 @@ pub struct BenchArgs {
     /// Which dataset.
     #[arg(value_enum)]
     pub dataset: BenchDataset,
-    /// The folder where the dataset was unpacked. With --synthetic only its ground truth is used, to fly along.
+    /// Folder of the unpacked dataset. With --synthetic only its ground truth is used, as flight path.
     #[arg(value_hint = ValueHint::DirPath)]
     pub root: Option<PathBuf>,
     /// Render the sequences (EuRoC's camera and IMU) instead of reading images.
     #[arg(long, help_heading = "World")]
     pub synthetic: bool,
-    /// A TOML file with every setting of the rendered worlds.
+    /// TOML file with every setting of the rendered worlds.
     #[arg(long, value_hint = ValueHint::FilePath, requires = "synthetic", help_heading = "World")]
     pub world_config: Option<PathBuf>,
-    /// Beginnings of the names of the sequences wanted, separated by commas; default: all.
+    /// Sequences to run, as prefixes of their names separated by commas; default: all.
     #[arg(long, value_delimiter = ',', help_heading = "Input")]
     pub sequences: Vec<String>,
-    /// Couplings to compare, separated by commas; default: those of the paper's tables that the geometry can do, and coupled.
+    /// Couplings to compare, separated by commas; default: those of the paper's tables that the geometry source supports, and coupled.
     #[arg(long, value_delimiter = ',', help_heading = "Model")]
     pub modes: Vec<String>,
     /// Source of depth: as for `vidar run`, or simulated (with --synthetic: a network's errors on true depth).
     #[arg(long, visible_alias = "model", value_name = "NAME", help_heading = "Model")]
     pub geometry: Option<String>,
-    /// A folder with model.safetensors and config.json of one's own.
+    /// Folder with model.safetensors and config.json, for custom weights.
     #[arg(long, value_hint = ValueHint::AnyPath, help_heading = "Model")]
     pub model_dir: Option<PathBuf>,
-    /// Leave out the odometry's own rows of Table I.
+    /// Omit the rows of the odometry in Table I.
     #[arg(long, help_heading = "Output")]
     pub no_trajectories: bool,
     /// How settings are given.
     #[command(flatten)]
     pub config: ConfigArgs,
-    /// Folder of runs and tables; the same folder goes on where it stopped.
+    /// Folder of runs and tables; an existing one is continued.
     #[arg(short, long, value_hint = ValueHint::DirPath, default_value = "bench", help_heading = "Output")]
     pub output: PathBuf,
 }
 
-/// A dataset that `vidar bench` knows.
+/// A dataset that `vidar bench` supports.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 pub enum BenchDataset {
     /// EuRoC MAV: a folder with mav0/ per sequence.
@@ -434,16 +458,16 @@ pub enum BenchDataset {
 /// `vidar config`.
 #[derive(Debug, Subcommand)]
 pub enum ConfigCommand {
-    /// Every setting with its value.
+    /// Print every setting with its value.
     Show {
         /// How settings are given.
         #[command(flatten)]
         config: ConfigArgs,
-        /// Each value with where it came from.
+        /// Add the origin of each value.
         #[arg(long)]
         origin: bool,
     },
-    /// What a setting, or all of a section, means.
+    /// Explain a setting, or all settings of a section.
     #[command(
         after_help = "Examples:\n  vidar config explain fusion.voxel_size_m\n  vidar config explain keyframes"
     )]
@@ -451,8 +475,8 @@ pub enum ConfigCommand {
         /// A key such as `fusion.voxel_size_m`, or a section such as `fusion`.
         key: String,
     },
-    /// Presets and when to use them.
+    /// List presets and when to use them.
     Presets,
-    /// JSON schema of the configuration.
+    /// Print the JSON schema of the configuration.
     Schema,
 }

@@ -1,4 +1,4 @@
-//! From flags to the library's values, each checked where it is used first.
+//! Converts flags to values of the library; each is checked here or at its first use.
 
 use crate::args::{ConfigArgs, InputArgs, OutputArgs, RunArgs, WorldArgs};
 use std::path::Path;
@@ -9,12 +9,12 @@ use vidar::run_folder::Place;
 use vidar::synth::{FlightKind, SceneKind, Start, SynthConfig};
 use vidar::{Error, Layered};
 
-/// A wrong flag with what it should be.
+/// An error about a wrong flag, with a hint.
 pub fn usage(what: impl Into<String>, hint: impl Into<String>) -> Error {
     Error::Usage { what: what.into(), hint: hint.into() }
 }
 
-/// Configuration in its layers.
+/// The configuration with its layers.
 pub fn layered(args: &ConfigArgs, default_preset: Option<&str>) -> Result<Layered, Error> {
     let mut layered = Layered::defaults()?;
     if let Some(name) = args.preset.as_deref().or(default_preset) {
@@ -28,7 +28,7 @@ pub fn layered(args: &ConfigArgs, default_preset: Option<&str>) -> Result<Layere
     Ok(layered)
 }
 
-/// The flags that are settings too.
+/// Applies the input flags that are settings, too.
 pub fn apply_input_flags(layered: &mut Layered, input: &InputArgs) -> Result<(), Error> {
     let flags: [(&str, &'static str, Option<f64>); 2] =
         [("input.start_secs", "--start", input.start), ("input.end_secs", "--end", input.end)];
@@ -67,7 +67,7 @@ pub fn apply_model_flags(layered: &mut Layered, args: &RunArgs) -> Result<(), Er
 /// `4GiB`, `800MB`, `1.5G`, or bytes.
 fn byte_count(text: &str) -> Result<i64, Error> {
     let wrong =
-        || usage(format!("--memory-budget {text:?} is no size"), "write 4GiB, 800MB or a number of bytes");
+        || usage(format!("--memory-budget {text:?} is not a size"), "write 4GiB, 800MB or a number of bytes");
     let split = text.find(|c: char| !(c.is_ascii_digit() || c == '.')).unwrap_or(text.len());
     let number: f64 = text[..split].parse().map_err(|_| wrong())?;
     let unit = match text[split..].trim().to_ascii_lowercase().as_str() {
@@ -180,12 +180,12 @@ pub fn name_of(path: &Path) -> String {
             _ => None,
         })
         .collect();
-    // `…/MH_01/mav0` is called MH_01.
+    // `…/MH_01/mav0` has the name MH_01.
     let meaningful = parts.iter().rev().find(|p| !["mav0", "cam0", "data"].contains(&p.as_str()));
     meaningful.cloned().unwrap_or_else(|| "run".into())
 }
 
-/// The world to simulate.
+/// The synthetic world of the flags.
 pub fn world(args: &WorldArgs, mut world: SynthConfig) -> Result<SynthConfig, Error> {
     if let Some(seed) = args.seed {
         world.seed = seed;
@@ -211,10 +211,12 @@ pub fn world(args: &WorldArgs, mut world: SynthConfig) -> Result<SynthConfig, Er
             "sweep" => FlightKind::Sweep,
             "orbit" => FlightKind::Orbit,
             "aggressive" => FlightKind::Aggressive,
+            "handheld" => FlightKind::Handheld,
+            "handheld-lively" => FlightKind::HandheldLively,
             other => {
                 return Err(usage(
                     format!("--flight {other:?} is unknown"),
-                    "flights: sweep, orbit, aggressive",
+                    "flights: sweep, orbit, aggressive, handheld, handheld-lively",
                 ));
             }
         };

@@ -1,6 +1,6 @@
 //! The `vidar` program as a library, so that its parts can be tested.
 //!
-//! Standard output is data, the error stream is talk. Outcomes map to exit codes here and nowhere else.
+//! Data goes to the standard output, messages to the error stream. Exit codes are set here only.
 
 pub mod args;
 mod build;
@@ -16,7 +16,7 @@ use std::ffi::OsString;
 use std::process::ExitCode;
 use vidar::{CancelToken, Error, ExitStatus};
 
-/// What a command ends with.
+/// Result of a command.
 pub type Outcome = Result<ExitStatus, Error>;
 
 /// Parses, runs, prints, and returns the exit code.
@@ -25,7 +25,7 @@ pub fn main_with(args: impl Iterator<Item = OsString>) -> ExitCode {
     let cli = match Cli::try_parse_from(&typed) {
         Ok(cli) => cli,
         Err(error) => {
-            // Help and version are data and go to the standard output; clap knows which is which.
+            // Help and version go to the standard output; clap selects the stream.
             let _ = error.print();
             return ExitCode::from(if error.use_stderr() { ExitStatus::Usage as u8 } else { 0 });
         }
@@ -49,9 +49,9 @@ pub fn main_with(args: impl Iterator<Item = OsString>) -> ExitCode {
     }
 }
 
-/// Runs `work`; a panic is a bug of ours, named as such, with what to do about it.
+/// Runs `work`; a panic is reported as a bug, with a hint.
 fn without_bug<T>(work: impl FnOnce() -> T) -> Option<T> {
-    // Nothing that the panic may have left half changed is looked at afterwards: the process ends.
+    // The process ends, so state left inconsistent by the panic is not used.
     let result = std::panic::catch_unwind(std::panic::AssertUnwindSafe(work));
     if result.is_err() {
         print::talk("error[E7001]: this is a bug in VIDAR; what was finished is on disk");
@@ -62,7 +62,7 @@ fn without_bug<T>(work: impl FnOnce() -> T) -> Option<T> {
     result.ok()
 }
 
-/// What every command needs to know.
+/// Context of every command.
 pub(crate) struct Context {
     pub cli: args::CommonArgs,
     pub command: Vec<String>,
@@ -106,17 +106,17 @@ fn dispatch(command: Command, context: &Context) -> Outcome {
 /// The first signal asks the run to finish its files; the second ends the process at once.
 fn install_cancel(cancel: &CancelToken) {
     let cancel = cancel.clone();
-    // Without a handler the system's own applies, which ends the process: worse, but not wrong.
+    // Without a handler the system's default applies, which ends the process.
     let _ = ctrlc::set_handler(move || {
         if cancel.is_cancelled() {
             end_now();
         }
         cancel.cancel();
-        print::talk("stopping: finishing files; press Ctrl-C again to end at once");
+        print::talk("stopping: finishing files; press Ctrl-C again to stop immediately");
     });
 }
 
-#[allow(clippy::disallowed_methods, clippy::exit)] // a signal handler has nobody to return to
+#[allow(clippy::disallowed_methods, clippy::exit)] // a signal handler cannot return an error
 fn end_now() {
     std::process::exit(ExitStatus::Interrupted as i32);
 }
@@ -135,13 +135,13 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_panic_is_told_as_a_bug_and_everything_else_passes_through() {
+    fn a_panic_is_reported_as_a_bug_and_other_results_pass_through() {
         assert_eq!(without_bug(|| 7), Some(7));
         assert_eq!(without_bug(|| -> i32 { panic!("on purpose") }), None);
     }
 
     #[test]
-    fn a_command_is_quoted_so_that_a_shell_takes_it_back() {
+    fn a_command_is_quoted_for_the_shell() {
         assert_eq!(quoted("plain/path.tum"), "plain/path.tum");
         assert_eq!(quoted("two words"), "'two words'");
         assert_eq!(quoted("it's"), r"'it'\''s'");

@@ -8,15 +8,15 @@ use vidar::da3::Device;
 /// `vidar model`.
 #[derive(Debug, Subcommand)]
 pub enum ModelCommand {
-    /// Every official checkpoint: licence, size, what it can tell, and whether it is here.
+    /// List the official checkpoints: licence, size, abilities, and whether they are installed.
     #[command(after_help = "Examples:\n  vidar model list\n  vidar model list --json")]
     List,
-    /// Fetch a checkpoint from the hub, going on where an earlier call stopped.
+    /// Fetch a checkpoint from the hub; an interrupted transfer is continued.
     #[command(
         after_help = "Examples:\n  vidar model pull da3-small\n  vidar model pull da3-large-1.1 --accept-licence CC-BY-NC-4.0\n  HF_ENDPOINT=https://mirror.example vidar model pull da3-base"
     )]
     Pull(PullArgs),
-    /// Take a copy of a checkpoint that is on this machine already.
+    /// Copy a checkpoint that is on this machine already.
     #[command(
         after_help = "Examples:\n  vidar model import model.safetensors\n  vidar model import DA3-SMALL/\n  vidar model import giant.safetensors --model da3-giant-1.1 --accept-licence CC-BY-NC-4.0"
     )]
@@ -24,7 +24,7 @@ pub enum ModelCommand {
     /// Read every byte of a checkpoint and compare lengths and SHA-256.
     #[command(after_help = "Examples:\n  vidar model verify\n  vidar model verify da3-small")]
     Verify {
-        /// Which one; without it all that are here.
+        /// Name of the checkpoint; default: all installed ones.
         name: Option<String>,
     },
     /// Compare the network, layer by layer, with reference files.
@@ -32,10 +32,10 @@ pub enum ModelCommand {
         after_help = "Examples:\n  vidar model check goldens/\n  vidar model check small.safetensors --precision bf16\n  vidar model check small.safetensors --model-dir DA3-SMALL/"
     )]
     Check(CheckArgs),
-    /// The folder of a checkpoint, or of all.
+    /// Print the folder of a checkpoint, or of all.
     #[command(after_help = "Examples:\n  vidar model where\n  vidar model where da3-small")]
     Where {
-        /// Which one; without it the folder of all.
+        /// Name of the checkpoint; default: the folder of all.
         name: Option<String>,
     },
 }
@@ -43,10 +43,10 @@ pub enum ModelCommand {
 /// Acceptance of a licence.
 #[derive(Args, Clone, Debug, Default)]
 pub struct LicenceArgs {
-    /// Accept the licence of the weights, named in full (CC-BY-NC-4.0); written down beside them.
+    /// Accept the licence of the weights, named in full (CC-BY-NC-4.0); the acceptance is recorded next to them.
     #[arg(long, value_name = "LICENCE", help_heading = "Model")]
     pub accept_licence: Option<String>,
-    /// Who accepts; default is the user of this system.
+    /// Name of the person who accepts; default: the user of this system.
     #[arg(long, value_name = "NAME", help_heading = "Model")]
     pub accepted_by: Option<String>,
 }
@@ -54,15 +54,15 @@ pub struct LicenceArgs {
 /// `vidar model pull`.
 #[derive(Args, Clone, Debug)]
 pub struct PullArgs {
-    /// Which checkpoint.
+    /// Name of the checkpoint.
     pub name: String,
     /// Acceptance of a licence.
     #[command(flatten)]
     pub licence: LicenceArgs,
-    /// Another commit or branch of its repository; the hub alone then says what is right.
+    /// Another commit or branch of its repository; hashes are then those of the hub.
     #[arg(long)]
     pub revision: Option<String>,
-    /// Fetch again what is already here.
+    /// Fetch again, even if it is installed.
     #[arg(long)]
     pub again: bool,
 }
@@ -73,7 +73,7 @@ pub struct ImportArgs {
     /// `model.safetensors`, or a folder with it and `config.json`.
     #[arg(value_hint = ValueHint::AnyPath)]
     pub path: PathBuf,
-    /// Which checkpoint it is, where its SHA-256 does not tell.
+    /// Name of the checkpoint, if its SHA-256 does not identify it.
     #[arg(long)]
     pub model: Option<String>,
     /// Acceptance of a licence.
@@ -84,19 +84,19 @@ pub struct ImportArgs {
 /// `vidar model check`.
 #[derive(Args, Clone, Debug)]
 pub struct CheckArgs {
-    /// A reference file (.safetensors with a manifest.json beside it), or a folder of them.
+    /// A reference file (.safetensors with a manifest.json next to it), or a folder of them.
     #[arg(value_hint = ValueHint::AnyPath)]
     pub path: PathBuf,
-    /// Check this model instead of weights made by rule.
+    /// Check this model instead of synthetic weights.
     #[arg(long, value_hint = ValueHint::AnyPath)]
     pub model_dir: Option<PathBuf>,
     /// Precision of the backbone.
     #[arg(long, value_enum, default_value_t = PrecisionArg::F32)]
     pub precision: PrecisionArg,
-    /// Where the network is computed: cpu, gpu, gpu:N or auto; `vidar doctor` lists graphics processors.
+    /// Device that runs the network: cpu, gpu, gpu:N or auto; `vidar doctor` lists graphics processors.
     #[arg(long, default_value_t, value_name = "DEVICE")]
     pub device: Device,
-    /// Print every tensor, not only the worst and what departs.
+    /// Print every tensor, not only the worst one and those that differ.
     #[arg(long)]
     pub all: bool,
 }
@@ -104,15 +104,15 @@ pub struct CheckArgs {
 /// Precision of matrix products.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 pub enum PrecisionArg {
-    /// Brain floats of 16 bits where the processor multiplies them, 32 bits elsewhere.
+    /// bf16 if the processor supports it, else 32 bits.
     Auto,
     /// 32 bits.
     F32,
-    /// Three products of 16 bits, close to 32.
+    /// Three bf16 products per 32-bit product; nearly the accuracy of 32 bits.
     F32Split,
-    /// Brain floats of 16 bits.
+    /// bf16.
     Bf16,
-    /// Weights of 16 bits.
+    /// Weights of 16-bit floats.
     F16,
 }
 
@@ -121,46 +121,46 @@ pub enum PrecisionArg {
 pub enum MethodArg {
     /// The longer side; then stretched.
     UpperBoundResize,
-    /// The longer side; then cut.
+    /// The longer side; then cropped.
     UpperBoundCrop,
     /// The shorter side; then stretched.
     LowerBoundResize,
-    /// The shorter side; then cut.
+    /// The shorter side; then cropped.
     LowerBoundCrop,
 }
 
 /// How the reference view is chosen.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 pub enum RefViewArg {
-    /// In the middle of similarity, norm and variance.
+    /// The view with medium similarity, norm and variance.
     SaddleBalanced,
-    /// With the widest range of similarities.
+    /// The view with the widest range of similarities.
     SaddleSimRange,
-    /// The first.
+    /// The first view.
     First,
-    /// The one in the middle.
+    /// The middle view.
     Middle,
 }
 
 /// Size of clouds and depth images.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 pub enum ResolutionArg {
-    /// As the network answers.
+    /// Size of the network's output.
     Processed,
-    /// As the images came.
+    /// Size of the images.
     Input,
 }
 
 /// `vidar depth`.
 #[derive(Args, Clone, Debug)]
 pub struct DepthArgs {
-    /// Images, or folders of images; all are seen together, in this order.
+    /// Images, or folders of images; all are predicted together, in this order.
     #[arg(required = true, value_hint = ValueHint::AnyPath)]
     pub inputs: Vec<PathBuf>,
-    /// The network: `vidar model list` names them (da3-nano needs no download); `…-untrained` has weights made by rule.
+    /// The network: `vidar model list` names them (da3-nano needs no download); `…-untrained` has synthetic weights.
     #[arg(long, default_value = "da3-small", help_heading = "Model")]
     pub model: String,
-    /// A folder with model.safetensors and config.json of one's own.
+    /// Folder with model.safetensors and config.json, for custom weights.
     #[arg(long, conflicts_with = "model", value_hint = ValueHint::AnyPath, help_heading = "Model")]
     pub model_dir: Option<PathBuf>,
     /// Acceptance of a licence.
@@ -169,13 +169,13 @@ pub struct DepthArgs {
     /// Precision of the backbone.
     #[arg(long, value_enum, default_value_t = PrecisionArg::Auto, help_heading = "Model")]
     pub precision: PrecisionArg,
-    /// Where the network is computed: cpu, gpu, gpu:N or auto; `vidar doctor` lists graphics processors.
+    /// Device that runs the network: cpu, gpu, gpu:N or auto; `vidar doctor` lists graphics processors.
     #[arg(long, default_value_t, value_name = "DEVICE", help_heading = "Model")]
     pub device: Device,
-    /// Length of the bounding side of what the network sees, pixels; default: 504, for da3-nano what it was trained for.
+    /// Length of the bounding side of the network input, pixels; default: 504, or 280 for da3-nano.
     #[arg(long, value_name = "PX", help_heading = "Model")]
     pub process_res: Option<usize>,
-    /// Which side that is, and how multiples of 14 are reached.
+    /// Which side is bounded, and how multiples of 14 are reached.
     #[arg(long, value_enum, default_value_t = MethodArg::UpperBoundResize, help_heading = "Model")]
     pub method: MethodArg,
     /// Known cameras of the images: a transforms.json, a folder with a COLMAP model, or a run folder.
@@ -184,7 +184,7 @@ pub struct DepthArgs {
     /// With --poses: keep the network's scale and move the cameras instead.
     #[arg(long, requires = "poses", help_heading = "Model")]
     pub keep_scale: bool,
-    /// Focal length in pixels of the images: metres from da3-metric-large.
+    /// Focal length of the images, pixels; gives metres with da3-metric-large.
     #[arg(long, value_name = "PX", help_heading = "Model")]
     pub focal: Option<f64>,
     /// Cameras from rays instead of the camera decoder: slower, with a principal point.
@@ -193,25 +193,25 @@ pub struct DepthArgs {
     /// How the reference view is chosen.
     #[arg(long, value_enum, default_value_t = RefViewArg::SaddleBalanced, help_heading = "Model")]
     pub ref_view: RefViewArg,
-    /// Stop and round where the official program does, also where VIDAR does better.
+    /// Reproduce the official program exactly, including its rounding and its limits.
     #[arg(long, help_heading = "Model")]
     pub compat: bool,
-    /// What to write, separated by commas: depth_png, ply, depth_vis, mini_npz, npz, glb, colmap.
+    /// Output formats, separated by commas: depth_png, ply, depth_vis, mini_npz, npz, glb, colmap.
     #[arg(long, default_value = "depth_png,ply,depth_vis", help_heading = "Output")]
     pub format: String,
     /// Size of cloud and depth images.
     #[arg(long, value_enum, default_value_t = ResolutionArg::Processed, help_heading = "Output")]
     pub resolution: ResolutionArg,
-    /// Percentile of confidence below which pixels become no points.
+    /// Percentile of confidence below which pixels are not used as points.
     #[arg(long, default_value_t = 40.0, help_heading = "Output")]
     pub conf_percentile: f64,
-    /// Most points of a cloud.
+    /// Largest number of points in a cloud.
     #[arg(long, default_value_t = 1_000_000, help_heading = "Output")]
     pub max_points: usize,
     /// Where results go.
     #[command(flatten)]
     pub output: OutputArgs,
-    /// Say what would be done and what memory it takes, and stop.
+    /// Print the plan with its memory, and stop.
     #[arg(long)]
     pub dry_run: bool,
 }

@@ -1,11 +1,11 @@
-//! The reference pages under `docs/reference/`, made from the definitions so that they cannot drift.
+//! The reference pages under `docs/reference/`, generated from the definitions in the source.
 
 use crate::args::Cli;
 use clap::{Command, CommandFactory};
 use vidar::config::{PRESETS, explain, schema};
 use vidar::{Error, error::CODES};
 
-const MADE: &str = "Made from the definitions in the source; do not edit. \
+const MADE: &str = "Generated from the definitions in the source; do not edit. \
     `UPDATE_DOCS=1 cargo test -p vidar-cli --test program reference` writes it anew.";
 
 /// File name and text of every page.
@@ -33,7 +33,7 @@ fn describe(command: &mut Command, text: &mut String) {
 
 fn config() -> Result<String, Error> {
     let mut text = format!(
-        "# Configuration\n\n{MADE}\n\nLayers, each beating the ones before: defaults, `--preset`, `--config FILE` (TOML), \
+        "# Configuration\n\n{MADE}\n\nLayers, each overriding the ones before: defaults, `--preset`, `--config FILE` (TOML), \
          `VIDAR_SECTION__KEY`, `--set section.key=value`, flags.\n\n## Presets\n\n"
     );
     PRESETS.iter().for_each(|p| text.push_str(&format!("- `{}`: {}\n", p.name, p.about)));

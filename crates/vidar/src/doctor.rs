@@ -1,4 +1,4 @@
-//! `vidar doctor`: what is possible with what is there. It never fails because something optional is absent.
+//! `vidar doctor`: checks of this machine. Missing optional parts are not failures.
 
 use crate::system::{Hardware, hardware};
 use serde::Serialize;
@@ -8,9 +8,9 @@ use vidar_da3::Device;
 /// One finding.
 #[derive(Clone, Debug, Serialize)]
 pub struct Finding {
-    /// What was looked at.
+    /// The subject.
     pub what: &'static str,
-    /// Whether it is as it should be, absent but optional, or in the way.
+    /// Fine, absent but optional, or a problem.
     pub state: State,
     /// What was found.
     pub found: String,
@@ -18,19 +18,19 @@ pub struct Finding {
     pub advice: Option<String>,
 }
 
-/// How a finding bears on a run.
+/// Consequence of a finding for a run.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum State {
-    /// As it should be.
+    /// Fine.
     Ok,
     /// Absent, and nothing needs it.
     Optional,
-    /// In the way of a run.
+    /// Prevents a run.
     Problem,
 }
 
-/// Looks at machine, disk and environment.
+/// Checks machine, disk and environment.
 pub fn examine(folder: &Path) -> Vec<Finding> {
     let machine = hardware();
     vec![
@@ -51,7 +51,7 @@ pub fn examine(folder: &Path) -> Vec<Finding> {
     .collect()
 }
 
-/// What networks can be computed on beside the CPU.
+/// Graphics processors that can run networks.
 fn graphics_processors() -> Vec<Finding> {
     let absent = |found: &str, advice: &str| {
         let (found, advice) = (found.to_owned(), Some(advice.to_owned()));
@@ -59,7 +59,7 @@ fn graphics_processors() -> Vec<Finding> {
     };
     match Device::list() {
         None => absent(
-            "this program was built without graphics processors; everything runs on the CPU",
+            "this program was built without GPU support; everything runs on the CPU",
             "build it with `--features gpu` to run networks on one",
         ),
         Some(all) if all.is_empty() => absent(
@@ -90,7 +90,7 @@ fn cpu(machine: &Hardware) -> Finding {
 fn memory(machine: &Hardware) -> Finding {
     const COMFORTABLE: u64 = 4 << 30;
     match machine.memory_bytes {
-        None => finding("memory", State::Ok, "the system does not tell".into()),
+        None => finding("memory", State::Ok, "not reported by the system".into()),
         Some(bytes) if bytes >= COMFORTABLE => finding("memory", State::Ok, crate::run::bytes(bytes)),
         Some(bytes) => Finding {
             what: "memory",
@@ -104,7 +104,7 @@ fn memory(machine: &Hardware) -> Finding {
 fn writable(folder: &Path) -> Finding {
     let probe = folder.join(format!(".vidar-doctor-{}", std::process::id()));
     let tried = std::fs::write(&probe, b"probe");
-    // Our own probe; if it cannot be removed there is nothing better to do.
+    // If the test file cannot be removed, it is left there.
     let _ = std::fs::remove_file(&probe);
     match tried {
         Ok(()) => finding("output", State::Ok, format!("{} can be written", folder.display())),

@@ -1,12 +1,12 @@
-//! Everything that can stop a run, with a stable code, the place, the next step and the exit status.
+//! Errors that stop a run, each with a stable code, a location, a hint and an exit status.
 
 use std::path::{Path, PathBuf};
 use thiserror::Error;
 
-/// How a run of the program ends; the numbers are part of its interface.
+/// Exit status of the program; the numbers are part of its interface.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum ExitStatus {
-    /// Everything asked for was made.
+    /// Success.
     Done = 0,
     /// The input or the data cannot be used.
     BadInput = 1,
@@ -60,7 +60,7 @@ pub enum Error {
         /// All names.
         known: String,
     },
-    /// A command was given something it cannot work with.
+    /// A command got an invalid argument.
     #[error("{what}")]
     Usage {
         /// What is wrong.
@@ -78,36 +78,36 @@ pub enum Error {
     #[error(transparent)]
     Dataset(#[from] vidar_dataset::DatasetError),
     /// No metric poses.
-    #[error("{name} has no metric trajectory: neither --trajectory nor ground truth")]
-    NoAnchor {
+    #[error("{name} has no metric trajectory: no IMU, no --trajectory and no ground truth")]
+    NoMetricTrajectory {
         /// Dataset name.
         name: String,
     },
-    /// The camera is only guessed, and a guess makes no metric map.
-    #[error("{name} has no calibration: the camera is only guessed from the size of its images")]
+    /// The camera model is only guessed, which gives no metric map.
+    #[error("{name} has no calibration: the camera model is only guessed from the image size")]
     NoCalibration {
         /// Dataset name.
         name: String,
     },
     /// Camera and IMU gave no metric poses.
-    #[error("the odometry of {name} never gave a metric pose: {reason}")]
+    #[error("the odometry of {name} never initialised: {reason}")]
     NoOdometry {
         /// Dataset name.
         name: String,
-        /// What it waited for.
+        /// What was missing.
         reason: String,
     },
-    /// Images and trajectory do not meet in time.
+    /// Images and trajectory do not overlap in time.
     #[error("no image has a pose: images span {images}, the trajectory spans {poses}")]
     NoOverlap {
         /// Time range of the images, s.
         images: String,
         /// Time range of the poses, s.
         poses: String,
-        /// What the ratio of both suggests, if it is that of two units of time.
+        /// The likely cause, if the ratio of both is that of two units of time.
         slip: Option<&'static str>,
     },
-    /// Too few keyframes to see depth.
+    /// Too few keyframes for depth.
     #[error("{found} keyframes with poses, at least {needed} are needed")]
     TooFewKeyframes {
         /// Keyframes found.
@@ -118,16 +118,16 @@ pub enum Error {
     /// The geometry model failed.
     #[error("geometry: {0}")]
     Geometry(#[from] vidar_core::ModelError),
-    /// A checkpoint is missing, refused, or could not be fetched.
+    /// A checkpoint is missing, invalid, or could not be fetched.
     #[error("model: {0}")]
     Hub(#[from] vidar_hub::HubError),
-    /// The network refused its weights or its input.
+    /// The network rejected its weights or its input.
     #[error("network: {0}")]
     Da3(#[from] vidar_da3::Da3Error),
-    /// The stereo model refused its configuration.
+    /// The stereo model rejected its configuration.
     #[error("stereo: {0}")]
     Stereo(#[from] vidar_stereo::StereoError),
-    /// The odometry refused its rig, its configuration or an image.
+    /// The odometry rejected its rig, its configuration or an image.
     #[error("odometry: {0}")]
     Odometry(#[from] vidar_odometry::OdometryError),
     /// A chunk could not be placed.
@@ -156,10 +156,10 @@ pub enum Error {
         /// The reason of the last chunk.
         reason: String,
     },
-    /// Nothing was reconstructed, as is to be expected of weights made by rule.
+    /// Nothing was reconstructed, as expected with synthetic weights.
     #[error(
-        "nothing was reconstructed from {keyframes} keyframes: the weights of {model} are made by rule, so its depth and cameras \
-         are noise, and no chunk of them could be laid on the metric poses"
+        "nothing was reconstructed from {keyframes} keyframes: {model} has synthetic weights, so its depth and cameras are \
+         noise, and no chunk could be aligned to the metric poses"
     )]
     Untrained {
         /// Keyframes tried.
@@ -170,17 +170,17 @@ pub enum Error {
     /// A camera or view cannot be made.
     #[error("camera: {0}")]
     Camera(#[from] vidar_core::CameraError),
-    /// A trajectory cannot be carried into the frame needed.
+    /// A trajectory cannot be converted to the required frame.
     #[error("trajectory: {0}")]
     Trajectory(#[from] vidar_core::TrajectoryError),
-    /// The file system said no.
+    /// The file system reported an error.
     #[error("cannot {action} {path}: {source}", path = path.display())]
     Io {
-        /// What was tried.
+        /// The action that failed.
         action: &'static str,
-        /// On which file.
+        /// Path of the file.
         path: PathBuf,
-        /// What the system said.
+        /// The system's error.
         source: std::io::Error,
     },
     /// A folder is not a run folder of this program.
@@ -227,7 +227,7 @@ impl Error {
             Self::OutputExists { .. } => "E0106",
             Self::Dataset(vidar_dataset::DatasetError::BadOption { .. }) => "E0105",
             Self::Dataset(_) => "E0201",
-            Self::NoAnchor { .. } => "E0202",
+            Self::NoMetricTrajectory { .. } => "E0202",
             Self::NoOverlap { .. } => "E0203",
             Self::TooFewKeyframes { .. } => "E0204",
             Self::Camera(_) => "E0205",
@@ -258,7 +258,7 @@ impl Error {
         }
     }
 
-    /// What the file system said, whichever stage asked it.
+    /// The file system's error, from any stage.
     fn file_system(&self) -> Option<&std::io::Error> {
         use vidar_export::ExportError as Export;
         match self {
@@ -270,7 +270,7 @@ impl Error {
         }
     }
 
-    /// How the program ends because of it.
+    /// The exit status for this error.
     pub fn exit_status(&self) -> ExitStatus {
         match self.code().as_bytes() {
             [b'E', b'0', b'1', ..] => ExitStatus::Usage,
@@ -286,33 +286,33 @@ impl Error {
         let text = match self {
             Self::UnknownKey { nearest: Some(nearest), .. } => {
                 return Some(format!(
-                    "did you mean {nearest:?}? `vidar config explain {nearest}` tells what it does"
+                    "did you mean {nearest:?}? `vidar config explain {nearest}` explains it"
                 ));
             }
             Self::Usage { hint, .. } => return Some(hint.clone()),
             Self::NoOverlap { slip: Some(slip), .. } => {
-                return Some(format!("{slip}; --time-unit s|ms|us|ns tells the unit of image times"));
+                return Some(format!("{slip}; --time-unit s|ms|us|ns sets the unit of image times"));
             }
             Self::UnknownKey { .. } => "`vidar config show` lists every key",
-            Self::BadValue { .. } => "`vidar config explain KEY` gives meaning, unit and range",
+            Self::BadValue { .. } => "`vidar config explain KEY` shows meaning, unit and range",
             Self::ConfigFile { .. } => "the file is TOML; `vidar config show > my.toml` writes a valid one",
             Self::UnknownPreset { .. } => "`vidar config presets` describes them",
-            Self::OutputExists { .. } => "choose another -o, or add --force to move the old folder aside",
-            Self::NoAnchor { .. } => {
+            Self::OutputExists { .. } => "choose another -o, or add --force to rename the old folder",
+            Self::NoMetricTrajectory { .. } => {
                 "give the poses of your own odometry with --trajectory FILE (TUM, EuRoC csv or KITTI, metres)"
             }
             Self::NoOverlap { .. } => {
-                "check the trajectory's clock and unit; --time-unit s|ms|us|ns tells it when the guess is wrong"
+                "check the trajectory's clock and unit; --time-unit s|ms|us|ns sets the unit of image times"
             }
             Self::TooFewKeyframes { .. } => {
                 "lower keyframes.min_translation_m, or give a longer part of the sequence"
             }
             Self::Untrained { .. } => {
                 "`vidar model pull da3-small` fetches trained weights (131 MiB, Apache-2.0) for --geometry da3-small; --geometry \
-                 stereo needs none; --mode pose-conditioned tries the road without meaning"
+                 stereo needs none; --mode pose-conditioned runs the pipeline without meaningful results"
             }
             Self::Empty { .. } => {
-                "look at depth/ in the run folder; try --preset quality, or another depth range"
+                "check the images in depth/ of the run folder; try --preset quality, or another depth range"
             }
             other if other.file_system().is_some_and(is_full) => {
                 "free space, or choose another disk with -o; finished files are kept"
@@ -322,33 +322,33 @@ impl Error {
                 "give --calibration FILE (EuRoC sensor.yaml, Kalibr camchain) or --camera-model pinhole:fx,fy,cx,cy"
             }
             Self::NoOdometry { .. } => {
-                "move sideways at the start; `vidar odometry PATH` tells every image's state in odometry/health.csv"
+                "move sideways at the start; `vidar odometry PATH` writes the state at every image to odometry/health.csv"
             }
             Self::Camera(_) => {
                 "check fx, fy, cx, cy and the distortion in the calibration, or give --camera-model"
             }
             Self::Trajectory(_) => {
-                "--trajectory-body imu|camera0 says whose poses they are; --calibration gives the rig"
+                "--trajectory-body imu|camera0 sets the body whose poses they are; --calibration gives the rig"
             }
             Self::Export(_) => {
-                "the message names the place in the file; write it anew with the program it came from"
+                "the message names the position in the file; write it again with its program"
             }
-            Self::Synth(_) => "`vidar synth --help` lists what can be set, --world-config takes all of it",
+            Self::Synth(_) => "`vidar synth --help` lists the options; --world-config takes all settings",
             Self::Odometry(_) => {
                 "`vidar inspect PATH` prints camera, extrinsics and IMU as they were read; --calibration corrects them"
             }
             Self::Threshold(_) => "`vidar eval RUN` shows every score",
             Self::Eval(_) => "check that both are of the same recording, body and clock",
             Self::NotARecording { .. } => {
-                "docs/guides/recorded-geometry.md tells what is read; --stride, --start, geometry.chunk_keyframes and \
+                "docs/guides/recorded-geometry.md describes the format; --stride, --start, geometry.chunk_keyframes and \
                  geometry.overlap_keyframes must be those of the recording"
             }
-            Self::NotARun { .. } => "a run folder holds manifest.json; `vidar run PATH` makes one",
+            Self::NotARun { .. } => "a run folder contains manifest.json; `vidar run PATH` creates one",
             Self::Dataset(error) => return Some(dataset_hint(error).to_owned()),
             Self::Hub(error) => return error.hint(),
             Self::Da3(error) if let Some(advice) = error.device_advice() => advice,
             Self::Da3(_) => {
-                "`vidar model list` describes the networks; docs/guides/models.md tells what each one needs"
+                "`vidar model list` describes the networks; docs/guides/models.md states what each one needs"
             }
             _ => return None,
         };
@@ -356,7 +356,7 @@ impl Error {
     }
 }
 
-/// The code of what happened to a checkpoint.
+/// The code of a checkpoint error.
 fn hub_code(error: &vidar_hub::HubError) -> &'static str {
     use vidar_hub::HubError as H;
     match error {
@@ -371,33 +371,33 @@ fn hub_code(error: &vidar_hub::HubError) -> &'static str {
     }
 }
 
-/// The next step after a recording was refused.
+/// The hint for an error in a recording.
 fn dataset_hint(error: &vidar_dataset::DatasetError) -> &'static str {
     use vidar_dataset::DatasetError as D;
     match error {
-        D::Io { .. } => "check the path and that it may be read",
+        D::Io { .. } => "check the path and its read permission",
         D::UnknownLayout { .. } => {
-            "--format names the layout; docs/getting-started.md shows what each one looks like"
+            "--format sets the layout; docs/getting-started.md describes each one"
         }
-        D::Garbage { .. } => "repair or remove that line; the file may be cut off or of another format",
-        D::MissingCamera { .. } => "choose one of those with --camera N",
+        D::Malformed { .. } => "repair or remove that line; the file may be truncated or in another format",
+        D::MissingCamera { .. } => "choose an available camera with --camera N",
         D::NoImages { .. } => {
-            "check --start, --end and --stride, and that the images lie where the list says"
+            "check --start, --end and --stride, and that the listed images exist"
         }
-        D::NoPoses { .. } => "--trajectory-format tum|euroc|kitti says what the file is",
+        D::NoPoses { .. } => "--trajectory-format tum|euroc|kitti sets the format",
         D::BadCamera { .. } | D::UnsupportedCamera { .. } => {
             "correct the calibration, or replace it with --camera-model or --calibration FILE"
         }
         D::NotRigid { .. } => "the matrix maps sensor to body coordinates; its rotation must be orthonormal",
-        D::BadImage { .. } => "the image may be cut off; copy the recording again",
-        D::WrongImageSize { .. } => "the calibration is of another resolution; give the one of these images",
+        D::BadImage { .. } => "the image may be truncated; copy the recording again",
+        D::WrongImageSize { .. } => "the calibration is for another resolution; give the one for these images",
         D::TimesMismatch { .. } => "give one time per pose with --timestamps, or the trajectory as TUM",
-        D::BadOption { .. } => "`vidar run --help` shows what each flag takes",
-        _ => "`vidar inspect PATH` shows what was found and what is missing",
+        D::BadOption { .. } => "`vidar run --help` lists the values of each option",
+        _ => "`vidar inspect PATH` shows what was found",
     }
 }
 
-/// Whether the system said that no space is left: a full disk, a quota, or a limit on the size of files.
+/// Whether the system reports that no space is left: a full disk, a quota, or a limit on the size of files.
 pub fn is_full(error: &std::io::Error) -> bool {
     use std::io::ErrorKind::{FileTooLarge, QuotaExceeded, StorageFull};
     matches!(error.kind(), StorageFull | QuotaExceeded | FileTooLarge)
@@ -407,13 +407,13 @@ pub fn is_full(error: &std::io::Error) -> bool {
 pub const CODES: &[(&str, &str)] = &[
     (
         "E0101",
-        "A configuration key does not exist. Keys are refused rather than ignored, because an ignored key is a wrong result that looks right.",
+        "A configuration key does not exist. Keys are refused rather than ignored, because an ignored key would silently give a wrong result.",
     ),
     ("E0102", "A configuration value has the wrong type or lies outside its range."),
     ("E0103", "A configuration file is missing or is not valid TOML."),
     ("E0104", "The preset is not one of those that `vidar config presets` lists."),
-    ("E0105", "The command line asks for something that this command cannot do."),
-    ("E0106", "The output folder exists. VIDAR never overwrites; --force moves the old folder aside."),
+    ("E0105", "The command line has an invalid option, argument or combination of them."),
+    ("E0106", "The output folder exists. VIDAR never overwrites; --force renames the old folder."),
     (
         "E0201",
         "The input path, a file in it, or its calibration cannot be used. The message names file, line, what was found and what was expected.",
@@ -426,57 +426,57 @@ pub const CODES: &[(&str, &str)] = &[
         "E0203",
         "Image times and pose times do not overlap: another clock, another unit, or another recording.",
     ),
-    ("E0204", "Too few frames have a pose and enough motion between them to see depth."),
-    ("E0205", "Camera parameters are not those of a camera, or no undistorted view fits into the image."),
-    ("E0206", "Poses belong to a body whose place on the rig is unknown."),
-    ("E0207", "The folder lacks what a run of VIDAR writes (manifest.json, views.json)."),
+    ("E0204", "Too few frames have a pose, or there is too little motion between them for depth."),
+    ("E0205", "Camera parameters are invalid, or no undistorted view fits into the image."),
+    ("E0206", "Poses belong to a body whose extrinsics are unknown."),
+    ("E0207", "The folder lacks files of a run folder (manifest.json, views.json)."),
     (
         "E0208",
         "The images carry no calibration. A camera guessed from the size of the images bends every surface, so no metric map is made with it.",
     ),
     (
         "E0209",
-        "Camera and IMU gave no metric poses: the odometry never started; the message says what it waited for.",
+        "Camera and IMU gave no metric poses: the odometry never initialised; the message states the reason.",
     ),
-    ("E0210", "A recorded prediction is missing, damaged, or of other images than those at hand."),
+    ("E0210", "A recorded prediction is missing, damaged, or belongs to other images."),
     ("E0301", "The geometry model could not predict depth for any chunk."),
     ("E0302", "Predicted geometry could not be placed in the metric world."),
-    ("E0303", "Fusion refused its configuration or a view, or met its memory bound."),
-    ("E0304", "There is nothing to compare, or what is compared does not match (body, time, empty cloud)."),
+    ("E0303", "Fusion rejected its configuration or a view, or reached its memory limit."),
+    ("E0304", "There is nothing to compare, or the inputs do not match (body, time, empty cloud)."),
     (
         "E0305",
-        "Depth was computed but nothing passed confidence and consistency, or no chunk fits the metric poses. Weights made by rule (`…-untrained`) end so where the network must find the cameras itself: what they say is noise.",
+        "Depth was computed but nothing passed confidence and consistency, or no chunk could be aligned to the metric poses. This is expected with synthetic weights (`…-untrained`), whose depth and cameras are noise.",
     ),
     ("E0306", "A file of an interchange format could not be written or read."),
     ("E0307", "A picture could not be drawn or encoded."),
     ("E0308", "The description of the synthetic world is not usable, or its files could not be written."),
     (
         "E0309",
-        "A network cannot be opened or run: the checkpoint is not the one its config.json describes (each key is named), or the images or cameras do not fit it.",
+        "A network cannot be opened or run: the checkpoint is not the one its config.json describes (each wrong key is listed), or the images or cameras are not suitable for it.",
     ),
     (
         "E0310",
-        "The odometry refused its settings, the camera's place on the IMU, or an image of another size.",
+        "The odometry rejected its settings, the camera-IMU extrinsics, or an image of another size.",
     ),
     (
         "E0311",
-        "The graphics processor that was asked for cannot be used: the program was built without them, there is none of that number, it lacks something, its memory does not suffice, or it failed. --device cpu needs none.",
+        "The requested graphics processor cannot be used: the program was built without GPU support, there is none with that number, it lacks a feature or memory, or it failed. --device cpu needs none.",
     ),
     ("E0401", "A file or folder could not be read or written."),
     ("E0402", "The disk is full. Finished files are kept; unfinished ones are removed."),
     (
         "E0403",
-        "A checkpoint is not on this machine, and could not be fetched: no network, no access, no such file, or a server that does not answer. What was fetched is kept and continued.",
+        "A checkpoint is not on this machine, and could not be fetched: no network, no access, no such file, or a server that does not respond. Partial downloads are kept and continued.",
     ),
     (
         "E0404",
-        "The weights may not be used commercially, and nobody here has accepted that: --accept-licence writes an acceptance down.",
+        "The weights may not be used commercially, and the licence has not been accepted: --accept-licence records an acceptance.",
     ),
-    ("E0405", "A checkpoint or the record beside it is damaged, or is not the official one."),
+    ("E0405", "A checkpoint or its record is damaged, or is not the official one."),
     ("E0501", "A threshold given with --fail-above or --fail-below was missed."),
     (
         "E7001",
-        "A bug in VIDAR: something that cannot happen happened. Please report it; finished files are on disk.",
+        "A bug in VIDAR. Please report it; finished files are on disk.",
     ),
     ("E1301", "Interrupted by Ctrl-C or a signal. Files that were being written are finished or removed."),
 ];
@@ -487,7 +487,7 @@ mod tests {
     use std::io::ErrorKind::{FileTooLarge, NotFound, StorageFull};
 
     #[test]
-    fn a_full_disk_is_the_same_error_whichever_stage_meets_it() {
+    fn a_full_disk_is_the_same_error_in_every_stage() {
         let full = || std::io::Error::from(StorageFull);
         let path = || PathBuf::from("map/mesh.ply");
         let all = [

@@ -1,4 +1,4 @@
-//! `vidar export`: other programs' formats, made after the fact from a run folder.
+//! `vidar export`: formats of other programs, made from a finished run folder.
 
 use crate::error::Error;
 use crate::run::pose_of;
@@ -9,10 +9,10 @@ use std::str::FromStr;
 use vidar_core::{BodyFrame, CameraId, FrameId, PointCloud, StampedPose, Timestamp, Trajectory};
 use vidar_export::{ColmapFormat, ExportView};
 
-/// What to make.
+/// The target format.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum ExportTarget {
-    /// COLMAP model, binary, beside the images.
+    /// COLMAP model, binary, with the images.
     Colmap,
     /// COLMAP model, text.
     ColmapText,
@@ -78,7 +78,7 @@ pub fn read_views(run: &Path) -> Result<Vec<StoredView>, Error> {
 
 /// Makes `target` from the run folder `run` in the folder `out` and returns the files made.
 pub fn export_run(run: &Path, target: ExportTarget, out: &Path) -> Result<Vec<PathBuf>, Error> {
-    // What is no run folder is refused before anything is made in it.
+    // A folder that is not a run folder is refused before any file is written.
     read_views(run)?;
     std::fs::create_dir_all(out).map_err(|e| Error::io("create", out, e))?;
     match target {
@@ -93,7 +93,7 @@ pub fn export_run(run: &Path, target: ExportTarget, out: &Path) -> Result<Vec<Pa
     }
 }
 
-/// The run's own GLB, or one made from its mesh when the run was told not to write it.
+/// The run's GLB, or one made from its mesh if the run did not write it.
 fn glb(run: &Path, out: &Path) -> Result<PathBuf, Error> {
     if run.join("map/mesh.glb").is_file() {
         return copy(run, "map", "mesh.glb", out);

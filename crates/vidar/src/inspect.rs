@@ -1,4 +1,4 @@
-//! `vidar inspect`: what is in a recording, and is it healthy.
+//! `vidar inspect`: contents and health of a recording.
 
 mod calibration;
 
@@ -8,54 +8,54 @@ use std::path::Path;
 use vidar_core::{FrameImage, Timestamp, Trajectory, Warning};
 use vidar_dataset::{Dataset, OpenOptions};
 
-/// A recording in numbers.
+/// Summary of a recording.
 #[derive(Clone, Debug, Serialize)]
 pub struct Inspection {
     /// Its name.
     pub name: String,
     /// Its layout.
     pub kind: String,
-    /// Why it was taken for that layout.
+    /// Why this layout was chosen.
     pub reason: String,
     /// Streams with their rates.
     pub streams: Vec<Stream>,
-    /// The camera in use, in words.
+    /// The camera in use, as text.
     pub camera: Vec<String>,
-    /// The IMU, in words.
+    /// The IMU, as text.
     pub imu: Vec<String>,
-    /// Poses, in words.
+    /// Poses, as text.
     pub poses: Vec<String>,
     /// Brightness and sharpness of sampled images.
     pub images: Option<ImageHealth>,
-    /// What can be done with it.
+    /// What can be done with the recording.
     pub possible: Vec<String>,
-    /// What is not quite right.
+    /// Warnings.
     pub warnings: Vec<Warning>,
 }
 
-/// One stream of readings.
+/// One stream of samples.
 #[derive(Clone, Debug, Serialize)]
 pub struct Stream {
     /// What it is.
     pub what: String,
-    /// Number of readings.
+    /// Number of samples.
     pub count: usize,
-    /// First reading, s.
+    /// Time of the first sample, s.
     pub start_secs: f64,
     /// Length, s.
     pub length_secs: f64,
     /// Median rate, Hz.
     pub rate_hz: f64,
-    /// Longest time between two readings, s.
+    /// Longest time between two samples, s.
     pub longest_gap_secs: f64,
 }
 
 /// Medians over sampled images.
 #[derive(Clone, Debug, Serialize)]
 pub struct ImageHealth {
-    /// Images looked at.
+    /// Number of sampled images.
     pub sampled: usize,
-    /// Those that could not be read.
+    /// Number of sampled images that could not be read.
     pub unreadable: usize,
     /// Median of mean brightness, 0…255.
     pub brightness: f64,
@@ -65,24 +65,24 @@ pub struct ImageHealth {
     pub sharpness: f64,
 }
 
-/// Images looked at; enough for a median, few enough for a first impression.
+/// Number of sampled images: enough for a median, few enough to be fast.
 const SAMPLED_IMAGES: usize = 9;
 
-/// Opens the recording and looks.
+/// Opens the recording and summarises it.
 pub fn inspect(path: &Path, options: &OpenOptions) -> Result<Inspection, Error> {
     let dataset = vidar_dataset::open(path, options)?;
     let images: Vec<Timestamp> = dataset.images.iter().map(|i| i.time).collect();
     let imu: Vec<Timestamp> = dataset.imu.iter().map(|s| s.time).collect();
     let depths: Vec<Timestamp> = dataset.depths.iter().map(|d| d.time).collect();
     let truth: Vec<Timestamp> = times(dataset.ground_truth.as_ref());
-    let anchor: Vec<Timestamp> = times(dataset.anchor.as_ref().map(|a| &a.trajectory));
+    let external: Vec<Timestamp> = times(dataset.external_trajectory.as_ref().map(|a| &a.trajectory));
     let camera = format!("images of camera {}", dataset.camera);
     let streams = [
         (camera.as_str(), images),
         ("IMU", imu),
         ("depth images", depths),
         ("ground truth", truth),
-        ("trajectory", anchor),
+        ("trajectory", external),
     ]
     .into_iter()
     .filter_map(|(what, times)| stream(what, &times))
@@ -92,9 +92,9 @@ pub fn inspect(path: &Path, options: &OpenOptions) -> Result<Inspection, Error> 
         kind: dataset.kind.to_string(),
         reason: dataset.reason.clone(),
         streams,
-        camera: calibration::camera_words(&dataset),
-        imu: imu_words(&dataset),
-        poses: pose_words(&dataset),
+        camera: calibration::describe_camera(&dataset),
+        imu: describe_imu(&dataset),
+        poses: describe_poses(&dataset),
         images: image_health(&dataset),
         possible: possible(&dataset),
         warnings: dataset.warnings.clone(),
@@ -120,9 +120,9 @@ fn stream(what: &str, times: &[Timestamp]) -> Option<Stream> {
     })
 }
 
-fn imu_words(dataset: &Dataset) -> Vec<String> {
+fn describe_imu(dataset: &Dataset) -> Vec<String> {
     if dataset.imu.is_empty() {
-        return vec!["none: scale can come from an external trajectory only".into()];
+        return vec!["none: the scale can only come from an external trajectory".into()];
     }
     let mut words = Vec::new();
     let n = dataset.imu.len() as f64;
@@ -133,19 +133,19 @@ fn imu_words(dataset: &Dataset) -> Vec<String> {
         gyro.to_degrees()
     ));
     match &dataset.rig.imu {
-        Some(noise) => words.extend(calibration::noise_words(noise)),
+        Some(noise) => words.extend(calibration::describe_noise(noise)),
         None => words.push("noise: not in the calibration".into()),
     }
     words
 }
 
-fn pose_words(dataset: &Dataset) -> Vec<String> {
+fn describe_poses(dataset: &Dataset) -> Vec<String> {
     let describe = |what: &str, t: &Trajectory| {
         format!("{what}: {} poses of the {}, path {:.1} m", t.len(), t.body(), t.path_length_m())
     };
     let mut words = Vec::new();
     words.extend(dataset.ground_truth.as_ref().map(|t| describe("ground truth", t)));
-    words.extend(dataset.anchor.as_ref().map(|a| describe("external trajectory", &a.trajectory)));
+    words.extend(dataset.external_trajectory.as_ref().map(|a| describe("external trajectory", &a.trajectory)));
     if words.is_empty() {
         words.push("none".into());
     }
@@ -200,23 +200,23 @@ fn possible(dataset: &Dataset) -> Vec<String> {
     let mut lines = Vec::new();
     if dataset.calibration == vidar_dataset::CalibrationSource::Guessed {
         lines.push(
-            "vidar run: not yet; give --calibration FILE or --camera-model (the camera is a guess)".into(),
+            "vidar run: not possible yet; give --calibration FILE or --camera-model (the camera model is a guess)".into(),
         );
         return lines;
     }
     let has_imu = dataset.rig.imu.is_some() && !dataset.imu.is_empty();
-    match (&dataset.anchor, &dataset.ground_truth) {
+    match (&dataset.external_trajectory, &dataset.ground_truth) {
         (None, _) if has_imu => {
-            lines.push("vidar run: metric map anchored by the odometry of camera and IMU".into());
+            lines.push("vidar run: metric map with poses of VIDAR's odometry (camera and IMU)".into());
         }
-        (Some(_), _) => lines.push("vidar run: metric map anchored by the external trajectory".into()),
+        (Some(_), _) => lines.push("vidar run: metric map with poses of the external trajectory".into()),
         (None, Some(_)) => {
-            lines.push("vidar run: metric map anchored by ground truth (an upper bound)".into())
+            lines.push("vidar run: metric map with poses of the ground truth (an upper bound)".into())
         }
-        (None, None) => lines.push("vidar run: not in metres; give metric poses with --trajectory FILE, or --mode pose-free with a network".into()),
+        (None, None) => lines.push("vidar run: no metric poses; give --trajectory FILE, or use --mode pose-free with a network (not metric)".into()),
     }
     if dataset.reference_cloud.is_some() || dataset.depth_sensor.is_some() {
-        lines.push("the map will be judged against the scan or the depth sensor".into());
+        lines.push("the map will be evaluated against the scan or the depth sensor".into());
     }
     lines
 }
@@ -227,7 +227,7 @@ mod tests {
     use vidar_core::Image;
 
     #[test]
-    fn a_stream_knows_its_rate_and_longest_gap() {
+    fn a_stream_has_its_rate_and_longest_gap() {
         let times: Vec<Timestamp> =
             [0, 50, 100, 150, 400, 450].map(|ms| Timestamp::from_nanos(ms * 1_000_000)).into();
         let stream = stream("x", &times).unwrap();

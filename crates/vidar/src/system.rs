@@ -1,4 +1,4 @@
-//! What machine this is, as far as the system tells without help.
+//! Hardware of this machine, as reported by the system.
 
 use serde::Serialize;
 use std::path::Path;
@@ -8,17 +8,17 @@ use std::path::Path;
 pub struct Hardware {
     /// Operating system and architecture.
     pub platform: String,
-    /// CPU name, where the system tells.
+    /// CPU name, if the system reports it.
     pub cpu: Option<String>,
-    /// Instruction sets that matter to the kernels.
+    /// Instruction sets used by the kernels.
     pub cpu_features: Vec<&'static str>,
     /// Threads that this process may use.
     pub threads: usize,
-    /// Memory, bytes, where the system tells.
+    /// Memory, bytes, if the system reports it.
     pub memory_bytes: Option<u64>,
 }
 
-/// Looks at the machine.
+/// Queries the machine.
 pub fn hardware() -> Hardware {
     Hardware {
         platform: format!("{}-{}", std::env::consts::OS, std::env::consts::ARCH),
@@ -34,9 +34,9 @@ pub fn peak_memory_bytes() -> Option<u64> {
     kib_of("/proc/self/status", "VmHWM")
 }
 
-/// Forgets the peak so far, where the system can (Linux), so that the next one is of what follows.
+/// Resets the peak, if the system supports it (Linux).
 pub fn reset_peak_memory() {
-    // Elsewhere, or without the right, the peak stays that of the whole process: an upper bound.
+    // On other systems, or without permission, the peak stays that of the whole process: an upper bound.
     let _ = std::fs::write("/proc/self/clear_refs", "5");
 }
 

@@ -57,7 +57,7 @@ fn synthetic(args: &BenchArgs) -> Result<Option<SyntheticBench>, Error> {
     Ok(Some(SyntheticBench { world }))
 }
 
-/// The couplings asked for; else those of the paper's tables that the source can do.
+/// The couplings of --modes; else those of the paper's tables that the source supports.
 fn modes(args: &BenchArgs, layered: &Layered) -> Result<Vec<CouplingMode>, Error> {
     if !args.modes.is_empty() {
         return args.modes.iter().map(|m| mode(m)).collect();
@@ -78,6 +78,6 @@ fn modes(args: &BenchArgs, layered: &Layered) -> Result<Vec<CouplingMode>, Error
 fn mode(name: &str) -> Result<CouplingMode, Error> {
     CouplingMode::ALL.into_iter().find(|m| m.name() == name).ok_or_else(|| {
         let known: Vec<&str> = CouplingMode::ALL.iter().map(|m| m.name()).collect();
-        usage(format!("--modes {name:?} is no coupling"), format!("couplings: {}", known.join(", ")))
+        usage(format!("--modes {name:?} is not a coupling"), format!("couplings: {}", known.join(", ")))
     })
 }

@@ -12,7 +12,7 @@ use vidar::export_formats::official::SceneOptions;
 use vidar::models::{self, ModelChoice};
 use vidar::{Error, ExitStatus};
 
-/// Depth, confidence, cameras and a cloud of plain images.
+/// Depth, confidence, cameras and a cloud from images.
 pub fn depth(args: &DepthArgs, context: &Context) -> Outcome {
     let request = request(args, context)?;
     if args.dry_run {
@@ -29,12 +29,12 @@ pub fn depth(args: &DepthArgs, context: &Context) -> Outcome {
         print::json(&value);
     } else {
         print::warnings(&outcome.warnings);
-        tell(&outcome);
+        print_outcome(&outcome);
     }
     Ok(ExitStatus::Done)
 }
 
-fn tell(outcome: &DepthOutcome) {
+fn print_outcome(outcome: &DepthOutcome) {
     let (width, height) = outcome.size;
     let at = |name: &str| outcome.folder.join(name).display().to_string();
     let mut rows = vec![

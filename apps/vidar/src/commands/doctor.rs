@@ -5,7 +5,7 @@ use std::path::Path;
 use vidar::ExitStatus;
 use vidar::doctor::{State, examine};
 
-/// What is possible with what is there.
+/// Checks of this machine.
 pub fn doctor(context: &Context) -> Outcome {
     let findings = examine(Path::new("."));
     let problem = findings.iter().any(|f| f.state == State::Problem);
@@ -23,9 +23,9 @@ pub fn doctor(context: &Context) -> Outcome {
                 print::data(format!("   {:<12} hint: {advice}", ""));
             }
         }
-        let verdict =
-            if problem { "something is in the way, see !! above" } else { "ready: try `vidar demo`" };
-        print::data(verdict);
+        let summary =
+            if problem { "there are problems, marked with !! above" } else { "ready: try `vidar demo`" };
+        print::data(summary);
     }
     Ok(if problem { ExitStatus::ResourceMissing } else { ExitStatus::Done })
 }

@@ -6,7 +6,7 @@ use serde_json::json;
 use vidar::ExitStatus;
 use vidar::evaluate::{Thresholds, evaluate_files, evaluate_run};
 
-/// Judges a trajectory, a cloud, or shows a run's scores.
+/// Evaluates a trajectory or a cloud, or shows the scores of a run.
 pub fn eval(args: &EvalArgs, context: &Context) -> Outcome {
     let thresholds = Thresholds::parse(&args.fail_above, &args.fail_below)?;
     let config = build::layered(&args.config, None)?.build()?;

@@ -6,7 +6,7 @@ use crate::{Context, Outcome, print};
 use vidar::ExitStatus;
 use vidar::export::{ExportTarget, export_run};
 
-/// Other programs' formats from a finished run.
+/// Exports a finished run to formats of other programs.
 pub fn export(args: &ExportArgs, context: &Context) -> Outcome {
     let target: ExportTarget =
         args.to.parse().map_err(|e: String| usage(format!("--to: {e}"), "see `vidar export --help`"))?;

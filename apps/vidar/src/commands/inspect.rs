@@ -4,7 +4,7 @@ use crate::args::InspectArgs;
 use crate::{Context, Outcome, build, print};
 use vidar::ExitStatus;
 
-/// What is in a recording, and is it healthy.
+/// Contents and health of a recording.
 pub fn inspect(args: &InspectArgs, context: &Context) -> Outcome {
     let mut options = build::open_options(&args.input)?;
     options.stride = args.input.stride.unwrap_or(1);

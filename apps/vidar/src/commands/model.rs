@@ -8,7 +8,7 @@ use std::cell::Cell;
 use std::path::{Path, PathBuf};
 use vidar::core::Warning;
 use vidar::da3::{self, Da3Options, check};
-use vidar::hub::{Ability, Checkpoint, Installed, Progress, Watch, catalogue};
+use vidar::hub::{Ability, Checkpoint, Installed, Progress, TransferCallbacks, catalogue};
 use vidar::models::{self, LicenceAccepted, bundled};
 use vidar::run::bytes;
 use vidar::{Error, Event, Events, ExitStatus};
@@ -33,7 +33,7 @@ fn list(context: &Context) -> Outcome {
     } else {
         let (name, size) = (bundled::NAME, bytes(bundled::bytes()));
         let words: Vec<&str> = BUNDLED_ABILITIES.iter().map(|a| a.words()).collect();
-        print::data(format!("{name:<26} {:<5} {size:>9}  {}", "here", bundled::LICENCE));
+        print::data(format!("{name:<26} {:<5} {size:>9}  {}", "installed", bundled::LICENCE));
         print::data(format!("    {}; {} M parameters", words.join(", "), bundled::parameters()? / 1_000_000));
         print::data(format!("    {}", bundled::NOTE));
     }
@@ -46,11 +46,11 @@ fn list(context: &Context) -> Outcome {
                 "bytes": checkpoint.bytes(), "sha256": checkpoint.weights().sha256,
                 "abilities": checkpoint.abilities.iter().map(ability).collect::<Vec<_>>(), "note": checkpoint.note,
                 "installed": installed.as_ref().map(|i| i.folder.display().to_string()),
-                "place": installed.as_ref().map(|i| i.place),
+                "location": installed.as_ref().map(|i| i.location),
             }));
             continue;
         }
-        let here = if installed.is_some() { "here" } else { "-" };
+        let here = if installed.is_some() { "installed" } else { "-" };
         let size = bytes(checkpoint.bytes());
         let terms = if checkpoint.licence.allows_commercial_use() { "" } else { " (no commercial use)" };
         print::data(format!("{:<26} {here:<5} {size:>9}  {}{terms}", checkpoint.name, checkpoint.licence));
@@ -73,17 +73,17 @@ fn bundled_row() -> Result<serde_json::Value, Error> {
     Ok(json!({
         "name": bundled::NAME, "repository": null, "licence": bundled::LICENCE, "commercial_use": true,
         "parameters": bundled::parameters()?, "bytes": bundled::bytes(), "sha256": bundled::sha256(),
-        "abilities": BUNDLED_ABILITIES, "note": bundled::NOTE, "installed": bundled::SOURCE, "place": "program",
+        "abilities": BUNDLED_ABILITIES, "note": bundled::NOTE, "installed": bundled::SOURCE, "location": "program",
     }))
 }
 
-/// Says that nothing is to be done for the network in the program; whether `name` is that one.
+/// If `name` is the built-in network, prints that nothing is to be done and returns true.
 fn is_in_program(name: &str, schema: &str, context: &Context) -> bool {
     let is_it = name == bundled::NAME;
     if is_it && context.cli.json {
         let (name, place, sha256) = (bundled::NAME, "program", bundled::sha256());
         print::json(
-            &json!({ "schema": schema, "name": name, "folder": null, "place": place, "sha256": sha256 }),
+            &json!({ "schema": schema, "name": name, "folder": null, "location": location, "sha256": sha256 }),
         );
     } else if is_it {
         print::data(format!("{name} is {}; sha256 {}", bundled::SOURCE, bundled::sha256()));
@@ -95,7 +95,7 @@ fn ability(ability: &Ability) -> serde_json::Value {
     json!(ability)
 }
 
-/// The acceptance that flags express.
+/// The acceptance given by flags.
 pub fn accepted(args: &LicenceArgs) -> Option<LicenceAccepted> {
     let licence = args.accept_licence.clone()?;
     let of_system = || std::env::var("USER").or_else(|_| std::env::var("USERNAME")).ok();
@@ -103,11 +103,11 @@ pub fn accepted(args: &LicenceArgs) -> Option<LicenceAccepted> {
     Some(LicenceAccepted { licence, by })
 }
 
-/// Tells of bytes as steps of a mebibyte.
-fn watched<T>(
+/// Runs `work` with progress in steps of a mebibyte.
+fn with_progress<T>(
     stage: &'static str,
     context: &Context,
-    work: impl FnOnce(&Watch<'_>) -> Result<T, vidar::hub::HubError>,
+    work: impl FnOnce(&TransferCallbacks<'_>) -> Result<T, vidar::hub::HubError>,
 ) -> Result<T, Error> {
     let events: Events = progress::events(&context.cli);
     let last = Cell::new(u64::MAX);
@@ -118,8 +118,8 @@ fn watched<T>(
         }
     };
     let cancel = || context.cancel.is_cancelled();
-    let watch = Watch { progress: &tell, cancel: &cancel };
-    events.stage(stage, 0, || work(&watch).map_err(Error::from))
+    let callbacks = TransferCallbacks { progress: &tell, cancel: &cancel };
+    events.stage(stage, 0, || work(&callbacks).map_err(Error::from))
 }
 
 fn pull(args: &PullArgs, context: &Context) -> Outcome {
@@ -134,15 +134,16 @@ fn pull(args: &PullArgs, context: &Context) -> Outcome {
         again: args.again,
         ..models::pull_options(acceptance)
     };
-    let installed = watched("pull (MiB)", context, |watch| store.pull(checkpoint, &options, watch))?;
-    told(&installed, context)
+    let installed =
+        with_progress("pull (MiB)", context, |callbacks| store.pull(checkpoint, &options, callbacks))?;
+    print_installed(&installed, context)
 }
 
 fn import(args: &ImportArgs, context: &Context) -> Outcome {
     let store = models::store(true)?;
     let named: Option<&'static Checkpoint> = args.model.as_deref().map(catalogue::find).transpose()?;
     let accepted = accepted(&args.licence);
-    // Which checkpoint it is may follow from the file; its licence is then asked for by name.
+    // The file may identify the checkpoint; its licence is then required.
     let target = match (named, &accepted) {
         (None, Some(_)) => identified(&args.path, context)?,
         (named, _) => named,
@@ -152,24 +153,26 @@ fn import(args: &ImportArgs, context: &Context) -> Outcome {
         None => None,
     };
     let options = models::pull_options(acceptance);
-    let installed =
-        watched("import (MiB)", context, |watch| store.import(&args.path, named, &options, watch))?;
-    told(&installed, context)
+    let installed = with_progress("import (MiB)", context, |callbacks| {
+        store.import(&args.path, named, &options, callbacks)
+    })?;
+    print_installed(&installed, context)
 }
 
 /// The checkpoint that a file is by its hash.
 fn identified(path: &Path, context: &Context) -> Result<Option<&'static Checkpoint>, Error> {
     let weights = if path.is_dir() { path.join(catalogue::WEIGHTS) } else { path.to_owned() };
-    let (_, sha256) = watched("hash (MiB)", context, |watch| vidar::hub::sha256_of(&weights, watch))?;
+    let (_, sha256) =
+        with_progress("hash (MiB)", context, |callbacks| vidar::hub::sha256_of(&weights, callbacks))?;
     Ok(catalogue::of_hash(&sha256))
 }
 
-fn told(installed: &Installed, context: &Context) -> Outcome {
+fn print_installed(installed: &Installed, context: &Context) -> Outcome {
     let c = installed.checkpoint;
     if context.cli.json {
         print::json(&json!({
             "schema": "vidar.model/1", "name": c.name, "folder": installed.folder.display().to_string(),
-            "place": installed.place, "record": installed.record, "acceptance": installed.acceptance,
+            "location": installed.location, "record": installed.record, "acceptance": installed.acceptance,
         }));
     } else {
         print::pairs([
@@ -194,7 +197,7 @@ fn verify(name: Option<&str>, context: &Context) -> Outcome {
     };
     let mut rows = Vec::new();
     for checkpoint in wanted {
-        let files = watched("verify (MiB)", context, |watch| store.verify(checkpoint, watch))?;
+        let files = with_progress("verify (MiB)", context, |callbacks| store.verify(checkpoint, callbacks))?;
         if !context.cli.json {
             for file in &files {
                 let words = format!("{} {} ({:?})", file.name, &file.sha256[..12], file.identified_by);
@@ -206,7 +209,7 @@ fn verify(name: Option<&str>, context: &Context) -> Outcome {
     if context.cli.json {
         print::json(&json!({ "schema": "vidar.verify/1", "models": rows }));
     } else if rows.is_empty() {
-        print::data("no checkpoint is here; `vidar model list` names them");
+        print::data("no checkpoint is installed; `vidar model list` shows all");
     }
     Ok(ExitStatus::Done)
 }
@@ -262,13 +265,13 @@ fn check_files(args: &CheckArgs, context: &Context) -> Outcome {
             match check::check_file(file, args.model_dir.as_deref(), &options) {
                 Ok(report) => {
                     if !context.cli.json {
-                        tell_report(&report, args.all);
+                        print_report(&report, args.all);
                     }
                     reports.push(report);
                 }
-                // One of a folder that cannot be judged must not hide the others.
+                // One invalid file of a folder must not hide the others.
                 Err(error @ da3::Da3Error::BadGolden { .. }) if files.len() > 1 => {
-                    events.warn(&Warning::new("reference-left-out", error.to_string()));
+                    events.warn(&Warning::new("reference-skipped", error.to_string()));
                     left_out += 1;
                 }
                 Err(error) => return Err(error.into()),
@@ -277,17 +280,17 @@ fn check_files(args: &CheckArgs, context: &Context) -> Outcome {
         }
         Ok(())
     })?;
-    let departed = reports.iter().filter(|r| !r.holds()).count();
+    let failed = reports.iter().filter(|r| !r.holds()).count();
     if context.cli.json {
-        print::json(&json!({ "schema": "vidar.check/1", "holds": departed == 0, "reports": reports }));
+        print::json(&json!({ "schema": "vidar.check/1", "holds": failed == 0, "reports": reports }));
     }
-    if departed > 0 {
-        return Err(Error::Threshold(format!("{departed} of {} reference files are not met", reports.len())));
+    if failed > 0 {
+        return Err(Error::Threshold(format!("{failed} of {} reference files differ", reports.len())));
     }
     Ok(if left_out > 0 { ExitStatus::Degraded } else { ExitStatus::Done })
 }
 
-fn tell_report(report: &check::CheckReport, all: bool) {
+fn print_report(report: &check::CheckReport, all: bool) {
     if all || !report.holds() {
         print::data(report.to_string().trim_end());
         return;
@@ -298,7 +301,7 @@ fn tell_report(report: &check::CheckReport, all: bool) {
     let worst = worst.map(|words| format!("{words}, by {}", report.measure));
     let name = report.file.file_stem().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default();
     let (model, rows) = (&report.model, report.rows.len());
-    print::data(format!("{name:<32} {model:<22} {rows:>4} tensors hold  {}", worst.unwrap_or_default()));
+    print::data(format!("{name:<32} {model:<22} {rows:>4} tensors match {}", worst.unwrap_or_default()));
 }
 
 /// A reference file, or those of a folder that its manifest describes.
@@ -320,7 +323,7 @@ fn references(path: &Path) -> Result<Vec<PathBuf>, Error> {
     files.sort();
     match files.is_empty() {
         true => Err(usage(
-            format!("{} describes no reference file that is there", manifest.display()),
+            format!("{} describes no existing reference file", manifest.display()),
             "give a .safetensors file, or a folder with files and manifest.json",
         )),
         false => Ok(files),

@@ -1,15 +1,15 @@
 //! `vidar bench`: tables of rendered sequences, in one command that can be repeated.
 
-use crate::support::{Ran, files_under, shared, vidar};
+use crate::support::{ProgramOutput, files_under, shared, vidar};
 use serde_json::Value;
 use std::path::Path;
 
 /// Small images and short flights; ground truth as poses, because so little is no flight to track.
-fn bench(out: &Path, more: &[&str]) -> Ran {
+fn bench(out: &Path, more: &[&str]) -> ProgramOutput {
     bench_of(&shared().world, out, more)
 }
 
-fn bench_of(world: &Path, out: &Path, more: &[&str]) -> Ran {
+fn bench_of(world: &Path, out: &Path, more: &[&str]) -> ProgramOutput {
     let world = world.to_str().unwrap();
     let settings = shared().settings.to_str().unwrap();
     let mut all = vec!["bench", "euroc", "--synthetic", "--world-config", world, "--config", settings];
@@ -59,7 +59,7 @@ fn a_bench_writes_the_papers_tables_and_is_not_done_twice() {
     let mesh = "runs/room1_1/hybrid/map/mesh.ply";
     let before = stamp(mesh);
     bench(&out, &modes).ends_with(0);
-    assert_eq!(stamp(mesh), before, "what is there is not made again");
+    assert_eq!(stamp(mesh), before, "existing results are not computed again");
     assert_eq!(std::fs::read_to_string(out.join("tables.md")).unwrap(), text);
     assert!(files_under(&out).iter().any(|f| f == "bench.json"));
 
@@ -76,7 +76,7 @@ fn a_bench_writes_the_papers_tables_and_is_not_done_twice() {
 #[test]
 fn a_run_that_fails_is_a_row_with_its_reason() {
     let out = shared().root.join("bench failed");
-    // The odometry cannot start on so little: the coupling that needs it fails, the one that does not stands.
+    // The sequence is too short for the odometry: the coupling that needs it fails, the other one succeeds.
     let more =
         ["--modes", "pose-free,pose-conditioned", "--set", "input.poses=odometry", "--sequences", "room1_1"];
     let ran = bench(&out, &more);
@@ -84,7 +84,7 @@ fn a_run_that_fails_is_a_row_with_its_reason() {
     let failed: Vec<&Value> =
         table["runs"].as_array().unwrap().iter().filter(|r| !r["failure"].is_null()).collect();
     if failed.is_empty() {
-        // It did start.
+        // It did initialise.
         ran.ends_with(0);
         return;
     }
@@ -95,7 +95,7 @@ fn a_run_that_fails_is_a_row_with_its_reason() {
 }
 
 #[test]
-fn what_a_bench_cannot_do_is_said() {
+fn unsupported_benches_are_refused() {
     vidar(&["bench", "euroc"]).ends_with(2).says(&["--synthetic"]);
     vidar(&["bench", "tum", "--synthetic"]).ends_with(2).says(&["EuRoC"]);
     vidar(&["bench", "euroc", "/no/such"]).ends_with(4);

@@ -34,7 +34,7 @@ fn each_layer_beats_the_one_before_and_is_named_as_the_origin() {
 }
 
 #[test]
-fn a_flag_beats_file_and_set_and_the_run_writes_its_origin_down() {
+fn a_flag_overrides_file_and_set_and_its_origin_is_recorded() {
     let folder = tempfile::tempdir().unwrap();
     let out = folder.path().join("r");
     run_on(&shared().sequence, &out, &["-q", "--set", "input.stride=5", "--stride", "2"]).ends_with(0);
@@ -55,7 +55,7 @@ fn what_config_show_prints_is_taken_back_unchanged() {
 }
 
 #[test]
-fn an_unknown_key_is_refused_with_the_nearest_name_wherever_it_stands() {
+fn an_unknown_key_from_any_source_is_refused_with_the_nearest_name() {
     vidar(&["config", "show", "--set", "fusion.voxel_size=0.03"]).ends_with(2).says(&[
         "error[E0101]",
         "fusion.voxel_size\"",

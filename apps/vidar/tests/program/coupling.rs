@@ -1,6 +1,6 @@
 //! Couplings, recorded predictions and interrupted runs: the real program on a simulated network.
 
-use crate::support::{Ran, files_under, manifest, run_command, run_on, shared};
+use crate::support::{ProgramOutput, files_under, manifest, run_command, run_on, shared};
 use serde_json::Value;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
@@ -25,7 +25,7 @@ fn out(name: &str) -> PathBuf {
     shared().root.join("coupling").join(name)
 }
 
-fn with_geometry(source: &str, name: &str, more: &[&str]) -> (Ran, PathBuf) {
+fn with_geometry(source: &str, name: &str, more: &[&str]) -> (ProgramOutput, PathBuf) {
     let out = out(name);
     let mut all = SHORT.to_vec();
     all[2] = source;
@@ -33,11 +33,11 @@ fn with_geometry(source: &str, name: &str, more: &[&str]) -> (Ran, PathBuf) {
     (run_on(&shared().sequence, &out, &all), out)
 }
 
-fn simulated(name: &str, more: &[&str]) -> (Ran, PathBuf) {
+fn simulated(name: &str, more: &[&str]) -> (ProgramOutput, PathBuf) {
     with_geometry("simulated", name, more)
 }
 
-fn recorded(name: &str, folder: &Path, more: &[&str]) -> (Ran, PathBuf) {
+fn recorded(name: &str, folder: &Path, more: &[&str]) -> (ProgramOutput, PathBuf) {
     with_geometry(&format!("recorded:{}", folder.display()), name, more)
 }
 

@@ -1,6 +1,6 @@
 //! Predictions and poses that are wrong: every coupling ends with a map and counts what acted, or says what it cannot do.
 
-use crate::support::{Ran, manifest, run_on, shared};
+use crate::support::{ProgramOutput, manifest, run_on, shared};
 use std::fs::File;
 use std::path::{Path, PathBuf};
 use vidar::export_formats::official::{NpyArray, NpyData, NpzLimits, read_npz, write_npz_arrays};
@@ -12,7 +12,7 @@ fn out(name: &str) -> PathBuf {
     shared().root.join("damage").join(name)
 }
 
-fn run(name: &str, source: &str, more: &[&str]) -> (Ran, PathBuf) {
+fn run(name: &str, source: &str, more: &[&str]) -> (ProgramOutput, PathBuf) {
     let out = out(name);
     let mut all = vec![
         "-q",
@@ -217,12 +217,13 @@ fn poses_that_fly_away_half_way_are_counted_and_do_not_take_the_coupled_map_alon
 }
 
 #[test]
-fn places_are_told_as_asked_for_and_the_manifest_says_how() {
-    let salad = concat!(env!("CARGO_MANIFEST_DIR"), "/../../crates/vidar/tests/data/salad_tiny.safetensors");
+fn the_place_recognition_descriptor_is_selectable_and_recorded_in_the_manifest() {
+    let salad =
+        concat!(env!("CARGO_MANIFEST_DIR"), "/../../crates/vidar-da3/tests/data/salad_tiny.safetensors");
     let checkpoint = format!("coupling.salad_checkpoint={salad}");
     let kept = ["--mode", "hybrid", "--set", "output.keep_chunks=true", "--set"];
     for (name, more, expected, length) in [
-        ("pictures", &[&kept[..], &["coupling.places=pictures"]].concat(), "pictures", None),
+        ("pictures", &[&kept[..], &["coupling.place_recognition=image"]].concat(), "image", None),
         ("salad", &[&kept[..], &[checkpoint.as_str()]].concat(), "salad", Some(5 + 6 * 4)),
     ] {
         let (ran, folder) = run(&format!("places {name}"), "simulated", more);
@@ -232,12 +233,12 @@ fn places_are_told_as_asked_for_and_the_manifest_says_how() {
             read_npz(File::open(folder.join("chunks/000000.npz")).unwrap(), NpzLimits::default()).unwrap();
         assert_eq!(arrays.get("place").map(|a| a.shape[1]), length, "{name}");
     }
-    let (ran, _) = run("places model", "simulated", &["--set", "coupling.places=model"]);
-    ran.ends_with(2).says(&["is no network", "coupling.places"]);
-    let (ran, _) = run("places nothing", "simulated", &["--set", "coupling.places=salad"]);
+    let (ran, _) = run("places model", "simulated", &["--set", "coupling.place_recognition=model"]);
+    ran.ends_with(2).says(&["is no network", "coupling.place_recognition"]);
+    let (ran, _) = run("places nothing", "simulated", &["--set", "coupling.place_recognition=salad"]);
     ran.ends_with(2).says(&["coupling.salad_checkpoint"]);
     let wrong =
         format!("coupling.salad_checkpoint={}", shared().sequence.join("mav0/cam0/sensor.yaml").display());
     let (ran, _) = run("places wrong", "simulated", &["--set", wrong.as_str()]);
-    ran.ends_with(2).says(&["is no checkpoint of SALAD", "salad_to_safetensors.py"]);
+    ran.ends_with(2).says(&["is not a SALAD checkpoint", "salad_to_safetensors.py"]);
 }

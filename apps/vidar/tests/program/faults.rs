@@ -1,8 +1,8 @@
 //! Bad input and bad luck: a clear error or a named degradation, its exit code, nothing lost.
 
 use crate::support::{
-    Ran, VIDAR, copy_of_sequence, files_under, finished, images_of, manifest, run_command, run_on, shared,
-    vidar, vidar_in,
+    ProgramOutput, VIDAR, copy_of_sequence, files_under, finished, images_of, manifest, run_command, run_on,
+    shared, vidar, vidar_in,
 };
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -27,7 +27,7 @@ impl Bench {
         self.folder.path().join("out")
     }
 
-    fn run(&self, more: &[&str]) -> Ran {
+    fn run(&self, more: &[&str]) -> ProgramOutput {
         run_on(&self.sequence, &self.out(), more)
     }
 
@@ -60,7 +60,7 @@ fn broken_images_are_named_left_out_and_the_run_is_degraded() {
     let whole = fs::read(&images[4]).unwrap();
     fs::write(&images[4], &whole[..whole.len() / 2]).unwrap();
     fs::write(&images[8], b"").unwrap();
-    fs::write(&images[12], b"this is no picture").unwrap();
+    fs::write(&images[12], b"this is not an image").unwrap();
     let ran = bench.run(&[]).ends_with(3).says(&[
         "warning: [image-unreadable]",
         "(and 1 more)",
@@ -105,7 +105,7 @@ fn no_readable_image_at_all_is_bad_input() {
 }
 
 #[test]
-fn garbage_in_a_csv_is_named_with_file_and_line() {
+fn a_malformed_csv_is_reported_with_file_and_line() {
     for (file, code) in [("mav0/cam0/data.csv", 4), ("mav0/imu0/data.csv", 9)] {
         let bench = Bench::new();
         bench.edit(file, |text| {
@@ -194,7 +194,7 @@ fn poses_that_are_not_numbers_are_left_out_and_counted() {
 }
 
 #[test]
-fn images_and_poses_that_never_meet_are_told_with_both_ranges_and_a_likely_unit() {
+fn images_and_poses_without_overlap_are_reported_with_both_ranges_and_the_likely_unit() {
     let file = shared().root.join("elsewhere.tum");
     fs::write(&file, "5.0 0 0 0 0 0 0 1\n6.0 1 0 0 0 0 0 1\n7.0 2 0 0 0 0 0 1\n").unwrap();
     let out = shared().root.join("no overlap");
@@ -220,7 +220,7 @@ fn images_alone_are_inspected_but_not_mapped_without_calibration_and_poses() {
     let folder = tempfile::tempdir().unwrap();
     let images = image_folder(folder.path());
     let ran = vidar(&["inspect", text(&images)]).ends_with(0).says(&["intrinsics-guessed"]);
-    assert!(ran.stdout.contains("not yet"), "{}", ran.stdout);
+    assert!(ran.stdout.contains("not possible yet"), "{}", ran.stdout);
     let truth = finished().0.join("trajectory/anchor_camera.tum");
     let out = folder.path().join("out");
     let trajectory = ["--trajectory", text(&truth), "--trajectory-body", "camera0", "-q"];
@@ -250,7 +250,7 @@ fn what_is_no_recording_is_refused_with_what_was_looked_for() {
 }
 
 #[test]
-fn a_cut_that_leaves_nothing_says_what_there_was() {
+fn an_empty_selection_of_images_is_reported_with_the_available_range() {
     let out = shared().root.join("cut");
     let (sequence, cut) = (&shared().sequence, |flags: &[&str]| run_on(&shared().sequence, &out, flags));
     cut(&["--start", "100"]).ends_with(1).says(&["error[E0201]", "no image", "hint:"]);
@@ -262,7 +262,7 @@ fn a_cut_that_leaves_nothing_says_what_there_was() {
 }
 
 #[test]
-fn a_reference_that_cannot_be_used_is_refused_early_or_costs_only_the_judgement() {
+fn an_invalid_reference_is_refused_early_or_prevents_only_the_evaluation() {
     let out = shared().root.join("reference");
     run_on(&shared().sequence, &out, &["--reference", "no.ply"])
         .ends_with(4)
@@ -302,7 +302,7 @@ fn a_full_disk_ends_with_4_keeps_what_is_finished_and_leaves_no_half_file() {
     let out = folder.path().join("out");
     // No file may grow beyond 1600 blocks of 512 or 1024 bytes: images, depth and chunks of four views fit, the mesh does not.
     let script = "trap '' XFSZ; ulimit -f 1600; exec \"$0\" \"$@\"";
-    let ran: Ran = Command::new("sh")
+    let ran: ProgramOutput = Command::new("sh")
         .args(["-c", script, VIDAR, "run"])
         .arg(&shared().sequence)
         .args(["-q", "-o", text(&out), "--set", "fusion.voxel_size_m=0.012", "--set", "output.report=false"])
@@ -331,7 +331,9 @@ fn data_that_a_full_standard_output_swallows_is_an_error() {
     let full = fs::OpenOptions::new().write(true).open("/dev/full").unwrap();
     let child =
         Command::new(VIDAR).args(["config", "show"]).stdout(full).stderr(Stdio::piped()).spawn().unwrap();
-    Ran::from(child.wait_with_output().unwrap()).ends_with(4).says(&["error[E0402]", "standard output"]);
+    ProgramOutput::from(child.wait_with_output().unwrap())
+        .ends_with(4)
+        .says(&["error[E0402]", "standard output"]);
 }
 
 #[test]
@@ -346,7 +348,7 @@ fn readers_that_go_away_are_no_error_and_no_panic() {
         "\"$0\" doctor 2>&-",
         "\"$0\" config show --set a.b=1 2>&- >&-; test $? -eq 2",
     ] {
-        let ran: Ran =
+        let ran: ProgramOutput =
             Command::new("bash").args(["-o", "pipefail", "-c", line, VIDAR]).output().unwrap().into();
         assert!(ran.code == 0, "{line}: {} {}", ran.code, ran.stderr);
         assert!(!ran.stderr.contains("panicked"), "{line}: {}", ran.stderr);
@@ -365,7 +367,7 @@ fn readers_that_go_away_are_no_error_and_no_panic() {
 
 /// Starts a run that takes several seconds, sends `signal` once depth is there, and returns how it ended.
 #[cfg(unix)]
-fn interrupted_by(signal: &str, out: &Path) -> Ran {
+fn interrupted_by(signal: &str, out: &Path) -> ProgramOutput {
     let slow = ["--set", "geometry.chunk_keyframes=2", "--set", "geometry.context_keyframes=4"];
     let child = run_command(&shared().sequence, out, &slow)
         .stdout(Stdio::piped())

@@ -72,7 +72,8 @@ impl ExtraSettings {
 }
 
 use ExtraSettings::{
-    Chunked, Fine, Evaluated, Learned, Moving, Nothing, Odometry, Pictures, Refused, Simulated, Turning, Unposed,
+    Chunked, Evaluated, Fine, Learned, Moving, Nothing, Odometry, Pictures, Refused, Simulated, Turning,
+    Unposed,
 };
 
 /// Ground truth at 10 Hz, 2 cm off on the way: a trajectory that must be interpolated and differs from ground truth.
@@ -189,7 +190,7 @@ fn run(name: &str, arguments: &[String]) -> BTreeMap<String, Vec<u8>> {
 }
 
 #[test]
-fn every_setting_of_the_dense_road_is_in_the_list() {
+fn every_setting_of_the_dense_pipeline_is_in_the_list() {
     let json = vidar(&["config", "show", "--json"]).ends_with(0).json();
     for row in json["settings"].as_array().unwrap() {
         let key = row["key"].as_str().unwrap();

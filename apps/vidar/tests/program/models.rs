@@ -1,6 +1,8 @@
-//! `vidar model`, `vidar depth` and a run on a network: the real program over a small checkpoint made by rule.
+//! `vidar model`, `vidar depth` and a run on a network: the real program with a small checkpoint of synthetic weights.
 
-use crate::support::{Ran, command, files_under, images_of, keys, run_command, shared, vidar, vidar_in};
+use crate::support::{
+    ProgramOutput, command, files_under, images_of, keys, run_command, shared, vidar, vidar_in,
+};
 use serde_json::{Value, json};
 use std::io::{BufRead, BufReader, Write};
 use std::net::TcpListener;
@@ -22,7 +24,7 @@ fn tiny_config() -> String {
     .to_string()
 }
 
-/// A checkpoint as it lies on the hub, with weights made by rule.
+/// A checkpoint with the files of the hub and synthetic weights.
 fn write_checkpoint(folder: &Path) {
     std::fs::create_dir_all(folder).unwrap();
     std::fs::write(folder.join("config.json"), tiny_config()).unwrap();
@@ -67,7 +69,7 @@ fn text(path: &Path) -> &str {
 }
 
 /// `vidar depth` on the small checkpoint.
-fn depth(out: &str, more: &[&str]) -> (Ran, PathBuf) {
+fn depth(out: &str, more: &[&str]) -> (ProgramOutput, PathBuf) {
     let b = bench();
     let out = b.root.join(out);
     let mut args = vec!["depth", text(&b.images), "--model-dir", text(&b.model), "-o", text(&out), "-q"];
@@ -91,7 +93,7 @@ fn matrix(value: &Value) -> Vec<f64> {
 }
 
 #[test]
-fn depth_writes_every_format_and_says_with_what() {
+fn depth_writes_every_format_and_records_how_it_was_made() {
     let (ran, out) = depth("all", &["--format", "npz-mini_npz-glb-depth_vis-colmap-ply-depth_png", "--json"]);
     let json = ran.ends_with(0).json();
     assert_eq!(json["schema"], "vidar.depth-run/1");
@@ -147,7 +149,7 @@ fn depth_writes_every_format_and_says_with_what() {
 }
 
 #[test]
-fn known_cameras_give_their_unit_and_are_answered() {
+fn known_cameras_give_the_unit_of_depth() {
     // Three cameras that stand apart, not on a line.
     let b = bench();
     let frame = |i: usize, t: [f64; 3]| {
@@ -169,7 +171,7 @@ fn known_cameras_give_their_unit_and_are_answered() {
     // One image more than cameras.
     std::fs::write(&poses, json!({ "camera_model": "OPENCV", "frames": &frames[..2] }).to_string()).unwrap();
     let (ran, out) = depth("too few cameras", &more);
-    ran.ends_with(2).says(&["no camera of", "2.png"]);
+    ran.ends_with(2).says(&["no camera for", "2.png"]);
     assert!(!out.exists(), "a refused run left a folder");
 }
 
@@ -208,9 +210,9 @@ fn a_dry_run_of_depth_plans_memory_and_writes_nothing() {
     for word in ["3", "504x322", "da3-giant-untrained", "memory", "weights", "writes"] {
         assert!(ran.stdout.contains(word), "{word:?} is missing in\n{}", ran.stdout);
     }
-    // Weights that are not here are said to be missing, and the plan is made all the same.
+    // Missing weights are reported, and the plan is made anyway.
     let mut command = command_with_store(folder.path());
-    let ran: Ran = command.args(["depth", images, "--dry-run", "--json"]).output().unwrap().into();
+    let ran: ProgramOutput = command.args(["depth", images, "--dry-run", "--json"]).output().unwrap().into();
     let json = ran.ends_with(0).json();
     assert!(json["plan"]["licence"].as_str().unwrap().contains("not on this machine"), "{json}");
     assert!(json["memory"]["weights"].as_u64().unwrap() > 100 << 20);
@@ -232,7 +234,7 @@ fn what_depth_cannot_do_is_refused_with_the_next_step() {
         .says(&["no/such/image.png"]);
     let folder = tempfile::tempdir().unwrap();
     let mut command = command_with_store(folder.path());
-    let ran: Ran = command.args(["depth", text(&b.images)]).output().unwrap().into();
+    let ran: ProgramOutput = command.args(["depth", text(&b.images)]).output().unwrap().into();
     ran.ends_with(4).says(&["error[E0403]", "vidar model pull da3-small"]);
     // A damaged checkpoint is named key by key.
     let broken = b.root.join("broken");
@@ -286,10 +288,11 @@ fn hub() -> String {
 }
 
 #[test]
-fn models_are_listed_with_licence_size_and_what_they_can() {
+fn models_are_listed_with_licence_size_and_abilities() {
     let folder = tempfile::tempdir().unwrap();
-    let run =
-        |args: &[&str]| -> Ran { command_with_store(folder.path()).args(args).output().unwrap().into() };
+    let run = |args: &[&str]| -> ProgramOutput {
+        command_with_store(folder.path()).args(args).output().unwrap().into()
+    };
     let ran = run(&["model", "list"]).ends_with(0);
     for word in [
         "da3-small",
@@ -318,51 +321,51 @@ fn models_are_listed_with_licence_size_and_what_they_can() {
             "abilities",
             "note",
             "installed",
-            "place"
+            "location"
         ]
     );
-    assert_eq!((&models[0]["name"], &models[0]["place"]), (&json!("da3-nano"), &json!("program")));
+    assert_eq!((&models[0]["name"], &models[0]["location"]), (&json!("da3-nano"), &json!("program")));
     assert!(models.iter().all(|m| keys(m, 1) == keys(&models[0], 1)));
     assert!(models[1..].iter().all(|m| m["installed"].is_null()));
     let ran = run(&["model", "where"]).ends_with(0);
     assert_eq!(ran.stdout.trim(), text(&folder.path().join("models")));
     run(&["model", "where", "da3-small"]).ends_with(4).says(&["error[E0403]", "vidar model pull da3-small"]);
     run(&["demo", "--model", "da3-small", "-q"]).ends_with(4).says(&["error[E0403]"]);
-    assert!(!folder.path().join("runs").exists(), "said before anything was rendered");
+    assert!(!folder.path().join("runs").exists(), "reported before anything was rendered");
     run(&["model", "verify"]).ends_with(0);
     run(&["model", "verify", "da3-small"]).ends_with(4);
     for verb in ["where", "verify", "pull"] {
         let ran = run(&["model", verb, "da3-nano"]).ends_with(0);
-        assert!(ran.stdout.contains("part of the program"), "{}", ran.stdout);
-        assert_eq!(run(&["model", verb, "da3-nano", "--json"]).ends_with(0).json()["place"], "program");
+        assert!(ran.stdout.contains("built into the program"), "{}", ran.stdout);
+        assert_eq!(run(&["model", verb, "da3-nano", "--json"]).ends_with(0).json()["location"], "program");
     }
     run(&["model", "pull", "da3-huge"]).ends_with(2).says(&["error[E0105]", "da3-small"]);
 }
 
 #[test]
-fn the_network_in_the_program_needs_nothing_and_says_what_it_is() {
+fn the_built_in_network_needs_no_download_and_warns_of_its_limits() {
     let b = bench();
     let out = b.root.join("nano");
     let args = ["depth", text(&b.images), "--model", "da3-nano", "-o", text(&out), "-q"];
     let mut command = command_with_store(&b.root);
-    let ran: Ran = command.args(args).output().unwrap().into();
+    let ran: ProgramOutput = command.args(args).output().unwrap().into();
     ran.ends_with(0).says(&["small-network", "vidar model pull da3-small"]);
     let manifest = read_json(&out.join("manifest.json"));
     let model = &manifest["model"];
     assert_eq!((&model["name"], &model["licence"]), (&json!("da3-nano"), &json!("MIT OR Apache-2.0")));
     assert_eq!(model["weights_sha256"].as_str().map(str::len), Some(64));
-    assert_eq!(read_json(&out.join("predictions.json"))["width"], 280, "the size that it was trained for");
+    assert_eq!(read_json(&out.join("predictions.json"))["width"], 280, "the training size of da3-nano");
 }
 
 #[test]
-fn pulling_asks_the_mirror_needs_acceptance_and_stays_offline_when_told() {
+fn pulling_uses_the_mirror_needs_acceptance_and_respects_offline() {
     let folder = tempfile::tempdir().unwrap();
     let hub = hub();
-    let run = |args: &[&str]| -> Ran {
+    let run = |args: &[&str]| -> ProgramOutput {
         command_with_store(folder.path()).env("HF_ENDPOINT", &hub).args(args).output().unwrap().into()
     };
     let ran = run(&["model", "pull", "da3-small", "-q"]).ends_with(4);
-    let ran = ran.says(&["error[E0403]", "answered 404", "depth-anything/DA3-SMALL/resolve/"]);
+    let ran = ran.says(&["error[E0403]", "status 404", "depth-anything/DA3-SMALL/resolve/"]);
     assert!(ran.stderr.contains(&hub), "{}", ran.stderr);
     run(&["model", "pull", "da3-large-1.1", "-q"]).ends_with(4).says(&[
         "error[E0404]",
@@ -384,18 +387,19 @@ fn pulling_asks_the_mirror_needs_acceptance_and_stays_offline_when_told() {
         "--accepted-by",
         "A. Person",
     ];
-    run(&accepting).ends_with(4).says(&["error[E0403]", "answered 403", "HF_TOKEN"]);
+    run(&accepting).ends_with(4).says(&["error[E0403]", "status 403", "HF_TOKEN"]);
     let written = read_json(&acceptance);
     assert_eq!((&written["accepted_by"], &written["model"]), (&json!("A. Person"), &json!("da3-large-1.1")));
-    run(&["model", "pull", "da3-base", "--offline", "-q"]).ends_with(4).says(&["network is switched off"]);
+    run(&["model", "pull", "da3-base", "--offline", "-q"]).ends_with(4).says(&["network use is disabled"]);
 }
 
 #[test]
-fn what_is_no_official_checkpoint_is_not_imported() {
+fn other_files_than_official_checkpoints_are_not_imported() {
     let folder = tempfile::tempdir().unwrap();
     let b = bench();
-    let run =
-        |args: &[&str]| -> Ran { command_with_store(folder.path()).args(args).output().unwrap().into() };
+    let run = |args: &[&str]| -> ProgramOutput {
+        command_with_store(folder.path()).args(args).output().unwrap().into()
+    };
     run(&["model", "import", text(&b.model), "-q"]).ends_with(4).says(&["error[E0405]", "--model-dir"]);
     run(&["model", "import", text(&b.model), "--model", "da3-small", "-q"])
         .ends_with(4)
@@ -405,19 +409,19 @@ fn what_is_no_official_checkpoint_is_not_imported() {
 }
 
 #[test]
-fn a_model_is_checked_against_references_and_a_departure_ends_with_5() {
+fn a_model_is_checked_against_references_and_a_difference_ends_with_5() {
     let references = concat!(env!("CARGO_MANIFEST_DIR"), "/../../crates/vidar-da3/tests/data");
     let ran = vidar(&["model", "check", references, "-q"]).ends_with(0);
-    assert!(ran.stdout.lines().count() >= 3 && ran.stdout.contains("tensors hold"), "{}", ran.stdout);
+    assert!(ran.stdout.lines().count() >= 3 && ran.stdout.contains("tensors match"), "{}", ran.stdout);
     let one = format!("{references}/tiny_free_v3.safetensors");
     let json = vidar(&["model", "check", &one, "-q", "--json"]).ends_with(0).json();
     assert_eq!((&json["schema"], &json["holds"]), (&json!("vidar.check/1"), &json!(true)));
-    // The same weights from a file hold too; weights with one tensor changed do not.
+    // The same weights from a file match, too; weights with one changed tensor do not.
     let b = bench();
     vidar(&["model", "check", &one, "--model-dir", text(&b.model), "-q"]).ends_with(0);
-    let spoilt = b.root.join("spoilt");
-    write_checkpoint(&spoilt);
-    let weights = spoilt.join("model.safetensors");
+    let corrupted = b.root.join("corrupted");
+    write_checkpoint(&corrupted);
+    let weights = corrupted.join("model.safetensors");
     let mut bytes = std::fs::read(&weights).unwrap();
     let header = 8 + u64::from_le_bytes(bytes[..8].try_into().unwrap()) as usize;
     let document: Value = serde_json::from_slice(&bytes[8..header]).unwrap();
@@ -425,13 +429,13 @@ fn a_model_is_checked_against_references_and_a_departure_ends_with_5() {
         as usize;
     bytes[header + at..header + at + 4].copy_from_slice(&5.0_f32.to_le_bytes());
     std::fs::write(&weights, bytes).unwrap();
-    let ran = vidar(&["model", "check", &one, "--model-dir", text(&spoilt), "-q"]).ends_with(5);
+    let ran = vidar(&["model", "check", &one, "--model-dir", text(&corrupted), "-q"]).ends_with(5);
     assert!(ran.stdout.contains("first departure: patch_embed"), "{}", ran.stdout);
     vidar(&["model", "check", "/no/such/folder/x.safetensors"]).ends_with(1);
 }
 
 /// `vidar run` on the small checkpoint.
-fn run_on_network(out: &str, more: &[&str]) -> (Ran, PathBuf) {
+fn run_on_network(out: &str, more: &[&str]) -> (ProgramOutput, PathBuf) {
     let b = bench();
     let out = b.root.join(out);
     let small = "model.network.preprocess.process_size_px=56";
@@ -442,7 +446,7 @@ fn run_on_network(out: &str, more: &[&str]) -> (Ran, PathBuf) {
 
 #[test]
 fn a_run_uses_a_network_with_and_without_poses_and_names_it_in_the_manifest() {
-    // With cameras given, predictions are in their world; the geometry of these weights means nothing, the road does.
+    // With cameras given, predictions are in their world; the geometry of these weights is meaningless, the pipeline is tested.
     let (ran, out) = run_on_network("run conditioned", &["--set", "model.network.mode=conditioned"]);
     assert!(matches!(ran.code, 0 | 3), "{}\n{}", ran.stdout, ran.stderr);
     let manifest = read_json(&out.join("manifest.json"));
@@ -452,7 +456,7 @@ fn a_run_uses_a_network_with_and_without_poses_and_names_it_in_the_manifest() {
     assert_eq!((&network["licence"], &network["acceptance"]), (&json!("unknown"), &Value::Null));
     assert!(network["memory"]["working"].as_u64().unwrap() > 0);
     assert!(files_under(&out).iter().any(|f| f.starts_with("depth/") && f.ends_with(".png")));
-    // Without, one similarity takes each chunk onto the anchor, or says why it cannot.
+    // Without, one similarity aligns each chunk to the trajectory, or reports why it cannot.
     let settings = ["--set", "align.max_center_rms_m=100"];
     let (ran, out) = run_on_network("run free", &settings);
     assert!(matches!(ran.code, 0 | 1 | 3), "{}\n{}", ran.stdout, ran.stderr);
@@ -473,11 +477,11 @@ fn a_dry_run_shows_the_network_its_terms_and_its_memory() {
     for word in ["da3-small", "memory of the network", "views at once"] {
         assert!(ran.stdout.contains(word), "{word:?} is missing in\n{}", ran.stdout);
     }
-    assert!(ran.stderr.contains("this geometry means nothing"), "{}", ran.stderr);
+    assert!(ran.stderr.contains("this geometry is meaningless"), "{}", ran.stderr);
     vidar(&["run", sequence, "--geometry", "magic", "--dry-run"]).ends_with(2).says(&["magic", "da3-small"]);
     let folder = tempfile::tempdir().unwrap();
     let mut command = command_with_store(folder.path());
-    let ran: Ran =
+    let ran: ProgramOutput =
         command.args(["run", sequence, "--geometry", "da3-giant-1.1", "--dry-run"]).output().unwrap().into();
     ran.ends_with(4).says(&["error[E0403]"]);
 }
@@ -511,7 +515,7 @@ fn a_device_that_this_program_or_machine_lacks_is_refused_with_the_next_step() {
 }
 
 #[test]
-fn where_a_network_computed_stands_in_plans_and_manifests() {
+fn the_device_of_a_network_is_recorded_in_plans_and_manifests() {
     let (ran, out) = depth("on the cpu", &["--device", "cpu", "--format", "mini_npz"]);
     ran.ends_with(0);
     let options = &read_json(&out.join("manifest.json"))["options"];
@@ -523,12 +527,12 @@ fn where_a_network_computed_stands_in_plans_and_manifests() {
 }
 
 #[test]
-fn a_coupled_run_on_weights_made_by_rule_says_that_they_mean_nothing_and_where_trained_ones_are() {
+fn a_coupled_run_on_synthetic_weights_fails_with_a_hint_to_trained_ones() {
     let out = bench().root.join("coupled untrained");
     let small = "model.network.preprocess.process_size_px=56";
     let network = ["--geometry", "da3-small-untrained", "--mode", "coupled", "--stride", "2", "--set", small];
     let mut command = run_command(&shared().sequence, &out, &[&network[..], &["-q"]].concat());
-    let ran: Ran = command.output().unwrap().into();
-    let words = ["error[E0305]", "da3-small-untrained are made by rule", "vidar model pull da3-small"];
+    let ran: ProgramOutput = command.output().unwrap().into();
+    let words = ["error[E0305]", "da3-small-untrained has synthetic weights", "vidar model pull da3-small"];
     ran.ends_with(1).says(&words);
 }

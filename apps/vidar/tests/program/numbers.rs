@@ -1,6 +1,6 @@
 //! How good the map is on a world whose truth is known, and that the result does not depend on threads.
 
-use crate::support::{Ran, VIDAR, files_under, finished, run_command, run_on, shared, vidar};
+use crate::support::{ProgramOutput, VIDAR, files_under, finished, run_command, run_on, shared, vidar};
 use serde_json::Value;
 use std::path::{Path, PathBuf};
 use vidar::core::{Se3, So3, StampedPose, Trajectory};
@@ -109,7 +109,7 @@ fn the_result_has_the_same_bits_with_one_thread_and_with_four() {
             &out,
             &["-q", "--threads", threads, "--stride", "2", "--set", "eval.mode=auto"],
         );
-        Ran::from(command.output().unwrap()).ends_with(0);
+        ProgramOutput::from(command.output().unwrap()).ends_with(0);
         out
     });
     let names = files_under(&folders[0]);

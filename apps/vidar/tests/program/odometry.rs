@@ -1,6 +1,6 @@
 //! `vidar odometry`: a metric trajectory from camera and IMU alone.
 
-use crate::support::{Ran, command, copy_tree, files_under, manifest, shared, vidar};
+use crate::support::{ProgramOutput, command, copy_tree, files_under, manifest, shared, vidar};
 use serde_json::Value;
 use std::path::{Path, PathBuf};
 use std::sync::OnceLock;
@@ -18,12 +18,12 @@ fn flight() -> &'static Path {
         let made = command()
             .args(["synth".as_ref(), sequence.as_os_str(), "--world-config".as_ref(), world.as_os_str()])
             .output();
-        Ran::from(made.unwrap()).ends_with(0);
+        ProgramOutput::from(made.unwrap()).ends_with(0);
         sequence
     })
 }
 
-fn odometry(sequence: &Path, out: &Path, more: &[&str]) -> Ran {
+fn odometry(sequence: &Path, out: &Path, more: &[&str]) -> ProgramOutput {
     let mut command = command();
     command.arg("odometry").arg(sequence).arg("-o").arg(out).args(["--json", "-q"]).args(more);
     command.output().unwrap().into()
@@ -77,7 +77,7 @@ fn a_rendered_flight_is_tracked_in_metres_and_its_trajectory_anchors_a_map() {
     command.arg("run").arg(flight()).arg("-o").arg(&map).arg("--trajectory").arg(&trajectory);
     command.args(["--trajectory-body", "imu", "-q", "--config"]).arg(&shared().settings);
     command.args(["--set", "geometry.max_width_px=160", "--set", "input.stride=4"]);
-    let ran: Ran = command.output().unwrap().into();
+    let ran: ProgramOutput = command.output().unwrap().into();
     assert!([0, 3].contains(&ran.code), "{}", ran.stderr);
     assert!(map.join("map/mesh.ply").is_file());
 }
@@ -91,7 +91,7 @@ fn without_any_trajectory_the_odometry_anchors_the_map() {
     let mut command = command();
     command.arg("run").arg(&sequence).arg("-o").arg(&out).args(["-q", "--config"]).arg(&shared().settings);
     command.args(["--set", "geometry.max_width_px=160", "--set", "keyframes.max_count=12"]);
-    let ran: Ran = command.output().unwrap().into();
+    let ran: ProgramOutput = command.output().unwrap().into();
     assert!([0, 3].contains(&ran.code), "{}", ran.stderr);
     let manifest = manifest(&out);
     assert_eq!(manifest["poses"]["source"], "odometry");

@@ -1,4 +1,4 @@
-//! A tiny recording, rendered once, and the program as a value.
+//! A tiny recording, rendered once, and functions to run the program.
 
 use serde_json::Value;
 use std::ffi::OsStr;
@@ -14,24 +14,24 @@ pub const VIDAR: &str = env!("CARGO_BIN_EXE_vidar");
 const WORLD: &str = "duration_secs = 2.5\ncamera_rate_hz = 8.0\nwidth = 160\nheight = 104\nblur_samples = 1\n\
     exposure_secs = 0.0\nscan_spacing_m = 0.05\n";
 
-/// Coarse voxels, no pictures, no judgement unless asked for; what is tested is the road, not the finish.
+/// Coarse voxels, no pictures, no evaluation by default: most tests need only the pipeline.
 const SETTINGS: &str =
     "[fusion]\nvoxel_size_m = 0.04\n[eval]\nmode = \"off\"\n[output]\nreport = false\nmesh_glb = false\n";
 
-/// What a call of the program left.
-pub struct Ran {
+/// Exit code and output of a call of the program.
+pub struct ProgramOutput {
     pub code: i32,
     pub stdout: String,
     pub stderr: String,
 }
 
-impl Ran {
+impl ProgramOutput {
     /// The one JSON object on the standard output.
     pub fn json(&self) -> Value {
         serde_json::from_str(&self.stdout).unwrap_or_else(|e| panic!("{e}\n{}\n{}", self.stdout, self.stderr))
     }
 
-    /// Fails with everything said unless the exit code is `code`.
+    /// Fails with all output unless the exit code is `code`.
     #[track_caller]
     pub fn ends_with(self, code: i32) -> Self {
         assert_eq!(self.code, code, "stdout:\n{}\nstderr:\n{}", self.stdout, self.stderr);
@@ -39,7 +39,7 @@ impl Ran {
         self
     }
 
-    /// Fails unless the error stream holds every one of `words`.
+    /// Fails unless the error stream contains all `words`.
     #[track_caller]
     pub fn says(self, words: &[&str]) -> Self {
         for word in words {
@@ -49,7 +49,7 @@ impl Ran {
     }
 }
 
-impl From<Output> for Ran {
+impl From<Output> for ProgramOutput {
     fn from(output: Output) -> Self {
         Self {
             code: output.status.code().unwrap_or(-1),
@@ -59,7 +59,7 @@ impl From<Output> for Ran {
     }
 }
 
-/// The program, free of what the caller's environment would set.
+/// The program, without `VIDAR_*` variables of the caller's environment.
 pub fn command() -> Command {
     let mut command = Command::new(VIDAR);
     for (name, _) in std::env::vars_os().filter(|(n, _)| n.to_string_lossy().starts_with("VIDAR_")) {
@@ -69,16 +69,16 @@ pub fn command() -> Command {
 }
 
 /// Runs the program in `folder`.
-pub fn vidar_in<S: AsRef<OsStr>>(folder: &Path, args: &[S]) -> Ran {
+pub fn vidar_in<S: AsRef<OsStr>>(folder: &Path, args: &[S]) -> ProgramOutput {
     command().current_dir(folder).args(args).output().unwrap().into()
 }
 
 /// Runs the program in the temporary folder of the test process.
-pub fn vidar<S: AsRef<OsStr>>(args: &[S]) -> Ran {
+pub fn vidar<S: AsRef<OsStr>>(args: &[S]) -> ProgramOutput {
     vidar_in(&shared().root, args)
 }
 
-/// What every test may read and none may change.
+/// Files that tests may read but not change.
 pub struct Shared {
     pub root: PathBuf,
     /// The recording in EuRoC layout.
@@ -105,7 +105,7 @@ pub fn shared() -> &'static Shared {
         let made = command()
             .args(["synth".as_ref(), sequence.as_os_str(), "--world-config".as_ref(), world.as_os_str()])
             .output();
-        Ran::from(made.unwrap()).ends_with(0);
+        ProgramOutput::from(made.unwrap()).ends_with(0);
         Shared { root, sequence, settings, world, _folder: folder }
     })
 }
@@ -124,7 +124,7 @@ pub fn finished() -> &'static (PathBuf, Value) {
 }
 
 /// `vidar run SEQUENCE -o OUT --config <short> …`.
-pub fn run_on(sequence: &Path, out: &Path, more: &[&str]) -> Ran {
+pub fn run_on(sequence: &Path, out: &Path, more: &[&str]) -> ProgramOutput {
     run_command(sequence, out, more).output().unwrap().into()
 }
 

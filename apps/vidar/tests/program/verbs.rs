@@ -65,7 +65,7 @@ fn a_wrong_command_line_ends_with_2() {
         &["eval", "a.ply", "b.tum"],
     ] {
         let ran = vidar(args);
-        assert!(ran.stdout.is_empty(), "{args:?} put its complaint on the standard output");
+        assert!(ran.stdout.is_empty(), "{args:?} printed an error on the standard output");
         // A world out of range is bad input to `synth`; everything else is a wrong command line.
         let code = if args.contains(&"nan") { 1 } else { 2 };
         let ran = ran.ends_with(code);
@@ -74,7 +74,7 @@ fn a_wrong_command_line_ends_with_2() {
 }
 
 #[test]
-fn inspect_tells_people_and_scripts_the_same() {
+fn inspect_prints_the_same_as_text_and_json() {
     let sequence = text(&shared().sequence);
     let ran = vidar(&["inspect", sequence]).ends_with(0);
     for word in ["euroc", "20", "8.0 Hz", "200", "ground truth", "-> vidar run"] {
@@ -129,7 +129,7 @@ fn a_run_as_json_has_stable_keys() {
 }
 
 #[test]
-fn the_run_folder_holds_what_its_readme_says_and_the_manifest_knows_it() {
+fn the_run_folder_matches_its_readme_and_its_manifest() {
     let (folder, _) = finished();
     let files = files_under(folder);
     for file in [
@@ -211,7 +211,7 @@ fn progress_as_json_is_one_event_a_line_and_the_log_has_the_same_shape() {
 }
 
 #[test]
-fn quiet_says_nothing_but_the_result_and_it_is_at_most_twelve_lines_with_trust() {
+fn quiet_prints_only_the_result_in_at_most_twelve_lines() {
     let out = shared().root.join("quiet");
     let ran = run_on(&shared().sequence, &out, &["--quiet", "--stride", "2", "--set", "eval.mode=auto"])
         .ends_with(0);
@@ -221,7 +221,7 @@ fn quiet_says_nothing_but_the_result_and_it_is_at_most_twelve_lines_with_trust()
         assert!(ran.stdout.contains(word), "{word:?} is missing in\n{}", ran.stdout);
     }
     let shown = ran.stdout.lines().find_map(|l| l.strip_prefix("look at it")).unwrap().trim();
-    assert!(std::path::Path::new(shown).is_file(), "{shown} is named but not there");
+    assert!(std::path::Path::new(shown).is_file(), "{shown} is printed but does not exist");
 }
 
 #[test]
@@ -297,7 +297,7 @@ fn bounds_missed_end_with_5_and_bounds_kept_with_0() {
 }
 
 #[test]
-fn eval_judges_trajectories_and_surfaces_and_a_thing_equals_itself() {
+fn eval_scores_trajectories_and_surfaces_and_a_file_equals_itself() {
     let run = &finished().0;
     let (tum, ply) = (run.join("trajectory/anchor_camera.tum"), run.join("map/points.ply"));
     let json = vidar(&["eval", text(&tum), text(&tum), "--json"]).ends_with(0).json();
@@ -311,7 +311,7 @@ fn eval_judges_trajectories_and_surfaces_and_a_thing_equals_itself() {
 }
 
 #[test]
-fn every_export_is_made_and_an_unknown_one_names_the_known() {
+fn every_export_is_made_and_an_unknown_one_is_refused_with_the_list() {
     let run = text(&finished().0);
     let folder = tempfile::tempdir().unwrap();
     for format in ["colmap", "colmap-text", "nerfstudio", "tum", "kitti", "euroc", "ply", "glb"] {
@@ -348,7 +348,7 @@ fn synth_never_overwrites_and_the_same_seed_makes_the_same_files() {
 }
 
 #[test]
-fn the_demo_ends_with_what_was_made_how_good_it_is_and_how_to_look_at_it() {
+fn the_demo_prints_its_files_its_scores_and_how_to_view_them() {
     let folder = tempfile::tempdir().unwrap();
     let args = ["demo", "-o", "d", "--duration", "3", "--set", "fusion.voxel_size_m=0.05", "-q"];
     let ran = vidar_in(folder.path(), &args).ends_with(0);
@@ -362,7 +362,7 @@ fn the_demo_ends_with_what_was_made_how_good_it_is_and_how_to_look_at_it() {
 }
 
 #[test]
-fn doctor_finds_nothing_in_the_way_and_says_so_to_scripts() {
+fn doctor_finds_no_problem_and_prints_json() {
     let ran = vidar(&["doctor"]).ends_with(0);
     assert!(ran.stdout.contains("ready"), "{}", ran.stdout);
     let json = vidar(&["doctor", "--json"]).ends_with(0).json();
@@ -371,11 +371,11 @@ fn doctor_finds_nothing_in_the_way_and_says_so_to_scripts() {
 }
 
 #[test]
-fn completions_know_every_verb_and_bash_takes_them() {
+fn completions_contain_every_verb_and_bash_accepts_them() {
     for shell in ["bash", "zsh", "fish"] {
         let script = vidar(&["completions", shell]).ends_with(0).stdout;
         for verb in VERBS {
-            assert!(script.contains(verb[0]), "{shell} does not know {verb:?}");
+            assert!(script.contains(verb[0]), "{shell} lacks {verb:?}");
         }
     }
     let script = vidar(&["completions", "bash"]).stdout;
@@ -398,7 +398,7 @@ fn every_error_code_is_explained_in_either_case() {
 }
 
 #[test]
-fn threads_are_refused_kindly_when_there_cannot_be_so_many() {
+fn an_invalid_number_of_threads_is_refused() {
     let ran = command().args(["config", "show", "--threads", "x"]).output().unwrap();
     assert_eq!(ran.status.code(), Some(2));
 }

@@ -9,7 +9,7 @@ use vidar_view::{Figure, FigureWidth, PictureSize, PlotTrajectory, Report, Secti
 
 const PLOT_SIZE: (usize, usize) = (960, 640);
 
-/// One HTML file with everything in it.
+/// One self-contained HTML file.
 pub(super) fn report(request: &BenchRequest, outcome: &BenchOutcome, cells: &Cells) -> Result<String, Error> {
     let tables = cells
         .grids
@@ -39,7 +39,7 @@ pub(super) fn report(request: &BenchRequest, outcome: &BenchOutcome, cells: &Cel
     Ok(vidar_view::render_html(&report))
 }
 
-/// Paths from above, and where each map departs from the scan.
+/// Paths from above, and the distance of each map to the scan.
 fn sequence_section(
     request: &BenchRequest,
     outcome: &BenchOutcome,
@@ -68,7 +68,7 @@ fn sequence_section(
             let name = if row.with_imu {
                 "odometry, camera and IMU"
             } else {
-                "odometry, camera alone (up to scale)"
+                "odometry, camera only (up to scale)"
             };
             let png = vidar_view::encode_png(&picture)?;
             section.figures.push(Figure {
@@ -82,7 +82,7 @@ fn sequence_section(
     Ok(section)
 }
 
-/// A trajectory file from above; none where it cannot be read.
+/// A trajectory file from above; `None` if it cannot be read.
 fn path_picture(file: &Path) -> Option<vidar_view::Picture> {
     let (trajectory, _): (Trajectory, _) =
         vidar_dataset::read_trajectory(file, &TrajectoryReadOptions::default()).ok()?;

@@ -1,12 +1,12 @@
-//! The paper's tables in one command: every sequence, every coupling, judged alike.
+//! The paper's tables in one command: every sequence with every coupling, evaluated in the same way.
 //!
 //! ```text
-//! sequences ─▶ odometry (camera + IMU, camera alone) ─▶ Table I
-//!          └─▶ run per coupling mode ─▶ judged against scan and truth ─▶ Tables II and III
+//! sequences ─▶ odometry (camera + IMU, camera only) ─▶ Table I
+//!          └─▶ run per coupling mode ─▶ evaluation against scan and truth ─▶ Tables II and III
 //! ```
 //!
-//! A run that fails is a row that says why; it is counted and left out of the means. What is finished is kept: the same
-//! command in the same folder goes on where it stopped.
+//! A failed run is a row with its reason; it is counted and excluded from the means. Finished rows are stored: the same
+//! command in the same folder continues where it stopped.
 
 mod figures;
 mod orderings;
@@ -48,15 +48,15 @@ pub enum BenchKind {
 pub struct BenchRequest {
     /// Which dataset.
     pub kind: BenchKind,
-    /// The folder with its sequences. With `synthetic`, only its ground truth is used: rooms are flown along it.
+    /// The folder with its sequences. With `synthetic`, only its ground truth is used: rendered rooms are flown through along it.
     pub root: Option<PathBuf>,
     /// Render the sequences instead of reading their images.
     pub synthetic: Option<SyntheticBench>,
-    /// Beginnings of the names wanted; empty = all.
+    /// Prefixes of the names of sequences to run; empty = all.
     pub sequences: Vec<String>,
     /// Couplings to compare.
     pub modes: Vec<CouplingMode>,
-    /// Whether the odometry alone is judged, too (Table I).
+    /// Whether the odometry alone is evaluated, too (Table I).
     pub trajectories: bool,
     /// Settings of all runs; `coupling.mode` is set per run.
     pub layered: Layered,
@@ -148,7 +148,7 @@ fn write(request: &BenchRequest, outcome: &BenchOutcome, cells: &Cells) -> Resul
     put("report.html", figures::report(request, outcome, cells)?.as_bytes())
 }
 
-/// The sequences as they lie below the root, or rendered ones.
+/// The sequences below the root, or rendered ones.
 fn sequences_of(
     request: &BenchRequest,
     events: &Events,
@@ -177,7 +177,7 @@ fn sequences_of(
     let mut rendered = Vec::new();
     for (name, flight, world) in flights {
         let path = request.out.join("sequences").join(&name);
-        // The last part that a rendered sequence gets tells that it is whole; another world is rendered anew.
+        // The file written last shows that a rendered sequence is complete; another world is rendered again.
         let is_whole = path.join("mav0").exists();
         let is_same = || Simulation::open(&path).is_ok_and(|s| *s.config() == world);
         if !(is_whole && is_same()) {
@@ -196,19 +196,19 @@ fn scene_of(name: &str) -> SceneKind {
     if name.starts_with("MH") { SceneKind::Hall } else { SceneKind::Room }
 }
 
-/// Every sequence gets a room, noise and simulated network of its own; the same name gets the same ones again.
+/// Every sequence has its own room, noise and simulated network, which depend on its name only.
 fn seed_of(name: &str, base: u64) -> u64 {
     name.bytes().fold(base, |seed, b| seed.wrapping_mul(31).wrapping_add(u64::from(b))) & (u64::MAX >> 1)
 }
 
-/// Ground truth of a EuRoC sequence without looking at its images.
+/// Ground truth of a EuRoC sequence, without reading its images.
 fn truth_of(sequence: &Path) -> Result<Trajectory, Error> {
     let file = sequence.join("mav0/state_groundtruth_estimate0/data.csv");
     Ok(vidar_dataset::read_trajectory(&file, &TrajectoryReadOptions::default())?.0)
 }
 
-/// Flights that need no dataset: three kinds in two rooms each, named after the rooms that they stand for.
-fn built_in(world: &SynthConfig, wanted: &[String]) -> Vec<(String, Option<Trajectory>, SynthConfig)> {
+/// Flights that need no dataset: three kinds in two rooms each, named after their rooms.
+fn built_in(world: &SynthConfig, prefixes: &[String]) -> Vec<(String, Option<Trajectory>, SynthConfig)> {
     let flights = [FlightKind::Sweep, FlightKind::Orbit, FlightKind::Aggressive];
     let all = (1..=2_u64).flat_map(|room| {
         flights.iter().enumerate().map(move |(k, flight)| {
@@ -216,7 +216,7 @@ fn built_in(world: &SynthConfig, wanted: &[String]) -> Vec<(String, Option<Traje
             (format!("room{room}_{}", k + 1), None, SynthConfig { seed, flight: *flight, ..world.clone() })
         })
     });
-    all.filter(|(name, ..)| wanted.is_empty() || wanted.iter().any(|w| name.starts_with(w.as_str())))
+    all.filter(|(name, ..)| prefixes.is_empty() || prefixes.iter().any(|w| name.starts_with(w.as_str())))
         .collect()
 }
 
@@ -224,7 +224,7 @@ fn built_in(world: &SynthConfig, wanted: &[String]) -> Vec<(String, Option<Traje
 fn layered_for(request: &BenchRequest, mode: CouplingMode) -> Result<Layered, Error> {
     let mut layered = request.layered.clone();
     layered.value("coupling.mode", toml::Value::String(mode.to_string()), Origin::Flag("bench"))?;
-    // A run takes ground truth where the odometry has no answer; in a table that would be a wrong row.
+    // A run falls back to ground truth if the odometry fails; in a table that would be a wrong row.
     let is_open = layered.build()?.input.poses == PoseSource::Auto;
     if is_open && request.kind == BenchKind::Euroc && mode != CouplingMode::GroundTruth {
         layered.value("input.poses", toml::Value::String("odometry".into()), Origin::Flag("bench"))?;

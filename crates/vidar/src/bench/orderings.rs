@@ -1,31 +1,31 @@
-//! Which of the paper's orderings a bench shows, said by its own numbers.
+//! Checks which orderings of the paper's results hold in a bench.
 
 use super::BenchRow;
 use super::tables::{Grid, Table, mean};
 use vidar_align::CouplingMode;
 
-/// Scores this close are a tie.
-const TIE: f64 = 0.005;
-/// A borrowed scale that gains more than this (F@0.10) says that the map was not metric. The paper's pose-free column gains 0.256,
+/// Scores this close count as equal.
+const EQUAL_SCORES: f64 = 0.005;
+/// If the scale of ground truth improves F@0.10 by more than this, the map was not metric. The paper's pose-free column gains 0.256,
 /// its pose-conditioned one 0.018.
 const METRIC_GAIN: f64 = 0.05;
 
 impl Table<'_> {
-    /// The claims that the couplings run can tell of; `None` with fewer than two couplings.
+    /// The claims that can be checked with the couplings that were run; `None` with fewer than two couplings.
     pub(super) fn orderings(&self) -> Option<Grid> {
         use CouplingMode::{Coupled, GroundTruth, Hybrid, PoseConditioned, PoseFree};
         let claims = [
             self.gains("pose-free loses the metric scale", PoseFree, true),
             self.gains("pose-conditioned is metric", PoseConditioned, false),
             self.beats("pose-conditioned beats pose-free", PoseConditioned, PoseFree),
-            self.beats("true poses are at least as good as the odometry's", GroundTruth, PoseConditioned),
+            self.beats("true poses are at least as good as those of the odometry", GroundTruth, PoseConditioned),
             self.beats("hybrid beats pose-conditioned", Hybrid, PoseConditioned),
             self.beats("coupled beats pose-conditioned (ours)", Coupled, PoseConditioned),
             self.beats("coupled beats hybrid (ours)", Coupled, Hybrid),
         ];
         let rows: Vec<Vec<String>> = claims.into_iter().flatten().collect();
         (self.request.modes.len() > 1 && !rows.is_empty()).then(|| Grid {
-            caption: "What the paper says, and whether it holds here (F@0.10, a failed run counts as 0)"
+            caption: "Claims of the paper, and whether they hold here (F@0.10, a failed run counts as 0)"
                 .into(),
             columns: ["Claim", "Holds", "On average", "Sequences"].map(String::from).to_vec(),
             rows,
@@ -45,10 +45,10 @@ impl Table<'_> {
             .collect();
         let (a, b): (Vec<f64>, Vec<f64>) = pairs.iter().copied().unzip();
         let (a, b) = (mean(&a)?, mean(&b)?);
-        let wins = pairs.iter().filter(|(a, b)| *a >= b - TIE).count();
-        let holds = if a > b + TIE {
+        let wins = pairs.iter().filter(|(a, b)| *a >= b - EQUAL_SCORES).count();
+        let holds = if a > b + EQUAL_SCORES {
             "yes"
-        } else if a >= b - TIE {
+        } else if a >= b - EQUAL_SCORES {
             "tie"
         } else {
             "no"
@@ -56,7 +56,7 @@ impl Table<'_> {
         Some(cells(claim, holds, format!("{a:.3} and {b:.3}"), wins, pairs.len()))
     }
 
-    /// What a borrowed scale gains.
+    /// Gain of F@0.10 with the scale of ground truth.
     fn gains(&self, claim: &str, mode: CouplingMode, should: bool) -> Option<Vec<String>> {
         let gains: Vec<f64> = self
             .sequences
@@ -65,9 +65,9 @@ impl Table<'_> {
             .filter_map(|r| Some(r.f10_free? - r.f10?))
             .collect();
         let gain = mean(&gains)?;
-        let as_said = gains.iter().filter(|g| (**g > METRIC_GAIN) == should).count();
+        let as_claimed = gains.iter().filter(|g| (**g > METRIC_GAIN) == should).count();
         let holds = if (gain > METRIC_GAIN) == should { "yes" } else { "no" };
-        Some(cells(claim, holds, format!("a borrowed scale gains {gain:.3}"), as_said, gains.len()))
+        Some(cells(claim, holds, format!("the scale of ground truth gains {gain:.3}"), as_claimed, gains.len()))
     }
 }
 
@@ -85,7 +85,7 @@ mod tests {
     }
 
     #[test]
-    fn claims_follow_the_numbers_and_failures_count_as_nothing() {
+    fn claims_follow_the_numbers_and_failures_count_as_zero() {
         use CouplingMode::{Coupled, PoseConditioned, PoseFree};
         let modes = [PoseFree, PoseConditioned, Coupled];
         let names = ["V1_01".to_owned(), "V1_02".to_owned()];
@@ -97,21 +97,21 @@ mod tests {
             row("V1_01", Coupled, Some(0.4), Some(0.4)),
             row("V1_02", Coupled, Some(0.6), Some(0.6)),
         ];
-        let said_of = |modes: &[CouplingMode], rows: &[BenchRow]| {
+        let claims_of = |modes: &[CouplingMode], rows: &[BenchRow]| {
             let request = &request(modes.to_vec());
             Table { request, sequences: &names, rows, odometry: &[] }.orderings()
         };
         let grid = said_of(&modes, &rows).unwrap();
-        let said: Vec<[&str; 4]> =
+        let claims: Vec<[&str; 4]> =
             grid.rows.iter().map(|r| [&r[0], &r[1], &r[2], &r[3]].map(String::as_str)).collect();
         assert_eq!(
-            said[0],
-            ["pose-free loses the metric scale", "yes", "a borrowed scale gains 0.400", "1 of 1"]
+            claims[0],
+            ["pose-free loses the metric scale", "yes", "the scale of ground truth gains 0.400", "1 of 1"]
         );
-        assert_eq!(said[1][1..], ["yes", "a borrowed scale gains 0.010", "2 of 2"]);
-        assert_eq!(said[2][1..], ["yes", "0.550 and 0.050", "2 of 2"]);
-        assert_eq!(said[3][1..], ["no", "0.500 and 0.550", "1 of 2"]);
-        assert_eq!(said.len(), 4, "nothing is claimed of couplings that were not run");
+        assert_eq!(claims[1][1..], ["yes", "the scale of ground truth gains 0.010", "2 of 2"]);
+        assert_eq!(claims[2][1..], ["yes", "0.550 and 0.050", "2 of 2"]);
+        assert_eq!(claims[3][1..], ["no", "0.500 and 0.550", "1 of 2"]);
+        assert_eq!(claims.len(), 4, "no claim about couplings that were not run");
         assert!(said_of(&modes[..1], &rows[..2]).is_none());
     }
 }

@@ -1,4 +1,4 @@
-//! What the paper's tables say, to stand beside ours. Its sequences are real; rendered ones are no reproduction of it.
+//! Values of the paper's tables, printed next to ours. They are of real sequences; rendered ones do not reproduce them.
 
 /// A row of the paper's Table II: F@0.10 and F@0.05 of PF, VIO and GT; absent where the paper leaves it out.
 pub(super) type DenseRow = (&'static str, [Option<f64>; 3], [Option<f64>; 3]);

@@ -1,4 +1,4 @@
-//! One run as one row, kept so that it need not be done twice.
+//! One run as one row, stored so that it is not repeated.
 
 use super::{BenchRequest, Sequence, layered_for, open_options};
 use crate::error::{Error, ExitStatus};
@@ -26,19 +26,19 @@ pub struct BenchRow {
     pub degraded: bool,
     /// Poses that the map was made with.
     pub trajectory: TrajectoryScores,
-    /// F and where the bounded placement was refused, at 0.05 m and 0.10 m.
+    /// F@0.05.
     pub f05: Option<f64>,
     /// F@0.10.
     pub f10: Option<f64>,
-    /// F@0.10 with the scale borrowed from ground truth.
+    /// F@0.10 with the scale of ground truth.
     pub f10_free: Option<f64>,
-    /// Share of a depth sensor's pixels, relative error.
+    /// Mean relative error of depth against a depth sensor.
     pub abs_rel: Option<f64>,
     /// Keyframes with depth.
     pub keyframes: usize,
     /// Wall time, s.
     pub seconds: f64,
-    /// Largest resident memory of the run, bytes, where the system tells.
+    /// Largest resident memory of the run, bytes, if the system reports it.
     pub peak_memory_bytes: Option<u64>,
     /// Rejections, and loops accepted of those evaluated.
     pub placement: serde_json::Value,
@@ -89,7 +89,7 @@ impl From<&TrajectoryReport> for TrajectoryScores {
     }
 }
 
-/// Runs one coupling on one sequence, or reads what an earlier call left.
+/// Runs one coupling on one sequence, or reads the stored row.
 pub(super) fn run_row(
     request: &BenchRequest,
     sequence: &Sequence,
@@ -115,7 +115,7 @@ pub(super) fn run_row(
     let clock = std::time::Instant::now();
     let mut row = BenchRow { sequence: sequence.name.clone(), mode, folder, ..BenchRow::default() };
     match run(&run_request, &Events::none(), cancel) {
-        Err(error) if matters_to_all(&error) => return Err(error),
+        Err(error) if affects_all_runs(&error) => return Err(error),
         Err(error) => row.failure = Some(format!("{} {error}", error.code())),
         Ok(outcome) if outcome.status == ExitStatus::Interrupted => {
             return Err(Error::Interrupted { path: request.out.clone() });
@@ -146,7 +146,7 @@ pub(super) fn run_row(
     Ok(row)
 }
 
-/// Runs the odometry alone on one sequence, or reads what an earlier call left.
+/// Runs the odometry alone on one sequence, or reads the stored row.
 pub(super) fn odometry_row(
     request: &BenchRequest,
     sequence: &Sequence,
@@ -174,7 +174,7 @@ pub(super) fn odometry_row(
     };
     let mut row = OdometryRow { sequence: sequence.name.clone(), with_imu, folder, ..OdometryRow::default() };
     match odometry(&odometry_request, &Events::none(), cancel) {
-        Err(error) if matters_to_all(&error) => return Err(error),
+        Err(error) if affects_all_runs(&error) => return Err(error),
         Err(error) => row.failure = Some(format!("{} {error}", error.code())),
         Ok(outcome) if outcome.status == ExitStatus::Interrupted => {
             return Err(Error::Interrupted { path: request.out.clone() });
@@ -195,43 +195,43 @@ pub(super) fn odometry_row(
     Ok(row)
 }
 
-/// Errors that every other run would meet, too: a wrong setting, a full disk, a missing model, Ctrl-C.
-fn matters_to_all(error: &Error) -> bool {
+/// Errors that would occur in every other run, too: a wrong setting, a full disk, a missing model, Ctrl-C.
+fn affects_all_runs(error: &Error) -> bool {
     matches!(error.exit_status(), ExitStatus::Usage | ExitStatus::ResourceMissing | ExitStatus::Interrupted)
 }
 
-/// What a row was made of.
+/// Hash of the inputs of a row.
 fn key(sequence: &Sequence, settings: &str) -> Result<String, Error> {
     let mut hash = Sha256::new();
-    // A rendered sequence says which world it is of; one that was recorded has no such file.
+    // A rendered sequence has a file with its world; a recorded one has not.
     let world = std::fs::read_to_string(sequence.path.join("synth.toml")).unwrap_or_default();
     for part in [crate::VERSION, &sequence.path.display().to_string(), settings, &world] {
         hash.update(part.as_bytes());
         hash.update([0]);
     }
-    Ok(hash.finalize().iter().map(|b| format!("{b:02x}")).collect())
+    Ok(vidar_hub::hex(&hash.finalize()))
 }
 
 #[derive(Serialize, Deserialize)]
-struct Kept<T> {
+struct StoredRow<T> {
     key: String,
     row: T,
 }
 
-fn kept<T: DeserializeOwned>(place: &Path, key: &str) -> Result<Option<T>, Error> {
+fn stored<T: DeserializeOwned>(place: &Path, key: &str) -> Result<Option<T>, Error> {
     let path = place.join("row.json");
     let bytes = match std::fs::read(&path) {
         Ok(bytes) => bytes,
         Err(e) if e.kind() == std::io::ErrorKind::NotFound => return Ok(None),
         Err(e) => return Err(Error::io("read", &path, e)),
     };
-    // A row of another version is done again.
-    let kept: Option<Kept<T>> = serde_json::from_slice(&bytes).ok();
-    Ok(kept.filter(|k| k.key == key).map(|k| k.row))
+    // A row of another version is computed again.
+    let stored: Option<StoredRow<T>> = serde_json::from_slice(&bytes).ok();
+    Ok(stored.filter(|k| k.key == key).map(|k| k.row))
 }
 
-fn keep<T: Serialize>(place: &Path, key: &str, row: &T) -> Result<(), Error> {
+fn store<T: Serialize>(place: &Path, key: &str, row: &T) -> Result<(), Error> {
     std::fs::create_dir_all(place).map_err(|e| Error::io("create", place, e))?;
-    let kept = Kept { key: key.to_owned(), row };
-    Ok(vidar_export::atomic::write_file_atomically(&place.join("row.json"), &pretty(&kept))?)
+    let stored = StoredRow { key: key.to_owned(), row };
+    Ok(vidar_export::atomic::write_file_atomically(&place.join("row.json"), &pretty(&stored))?)
 }

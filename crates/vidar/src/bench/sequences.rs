@@ -1,4 +1,4 @@
-//! The sequences under a folder as the datasets are downloaded and unpacked.
+//! Finds the sequences of a downloaded and unpacked dataset.
 
 use super::BenchKind;
 use crate::error::Error;
@@ -9,21 +9,21 @@ use std::path::{Path, PathBuf};
 pub struct Sequence {
     /// Short name, as in the paper's tables: `V1_01`, `fr1_xyz`.
     pub name: String,
-    /// Where it lies.
+    /// Its folder.
     pub path: PathBuf,
 }
 
-/// How deep sequences may lie below the root: `machine_hall/MH_01_easy/mav0`.
+/// Largest depth of sequences below the root: `machine_hall/MH_01_easy/mav0`.
 const DEPTH: usize = 3;
 
-/// Every sequence of the kind below `root`, by name. Only those whose name begins with one of `wanted`, unless that is empty.
-pub fn find(root: &Path, kind: BenchKind, wanted: &[String]) -> Result<Vec<Sequence>, Error> {
+/// Every sequence of the kind below `root`, by name. Only those whose name begins with one of `prefixes`, unless that is empty.
+pub fn find(root: &Path, kind: BenchKind, prefixes: &[String]) -> Result<Vec<Sequence>, Error> {
     let mut found = Vec::new();
     walk(root, kind, DEPTH, &mut found)?;
     found.sort_by(|a, b| a.name.cmp(&b.name));
     found.dedup_by(|a, b| a.name == b.name);
     let all = found.len();
-    found.retain(|s| wanted.is_empty() || wanted.iter().any(|w| s.name.starts_with(w.as_str())));
+    found.retain(|s| prefixes.is_empty() || prefixes.iter().any(|w| s.name.starts_with(w.as_str())));
     match (found.is_empty(), kind) {
         (false, _) => Ok(found),
         (true, BenchKind::Euroc) => {
@@ -38,9 +38,9 @@ pub fn find(root: &Path, kind: BenchKind, wanted: &[String]) -> Result<Vec<Seque
 fn nothing(root: &Path, all: usize, expected: &str) -> Error {
     let what = match all {
         0 => format!("no sequence below {}", root.display()),
-        n => format!("none of the {n} sequences below {} was asked for", root.display()),
+        n => format!("none of the {n} sequences below {} matches --sequences", root.display()),
     };
-    Error::Usage { what, hint: format!("expected {expected}; --sequences names some of them") }
+    Error::Usage { what, hint: format!("expected {expected}; --sequences takes prefixes of their names") }
 }
 
 fn walk(folder: &Path, kind: BenchKind, depth: usize, found: &mut Vec<Sequence>) -> Result<(), Error> {
@@ -75,7 +75,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn sequences_are_found_as_they_are_unpacked_and_named_as_in_the_paper() {
+    fn unpacked_sequences_are_found_and_named_as_in_the_paper() {
         let root = tempfile::tempdir().unwrap();
         for path in [
             "vicon_room1/V1_01_easy/mav0/cam0",
@@ -86,9 +86,9 @@ mod tests {
             std::fs::create_dir_all(root.path().join(path)).unwrap();
         }
         std::fs::write(root.path().join("rgbd_dataset_freiburg1_xyz/rgb.txt"), "").unwrap();
-        let names = |kind, wanted: &[&str]| -> Vec<String> {
-            let wanted: Vec<String> = wanted.iter().map(|w| (*w).to_owned()).collect();
-            find(root.path(), kind, &wanted).unwrap().into_iter().map(|s| s.name).collect()
+        let names = |kind, prefixes: &[&str]| -> Vec<String> {
+            let prefixes: Vec<String> = prefixes.iter().map(|w| (*w).to_owned()).collect();
+            find(root.path(), kind, &prefixes).unwrap().into_iter().map(|s| s.name).collect()
         };
         assert_eq!(names(BenchKind::Euroc, &[]), ["MH_05", "V1_01"]);
         assert_eq!(names(BenchKind::Euroc, &["V1"]), ["V1_01"]);

@@ -1,10 +1,10 @@
-//! Tables I, II and III of the paper, ours beside it.
+//! Tables I, II and III, with the paper's values in brackets.
 
 use super::{BenchKind, BenchRequest, BenchRow, OdometryRow, paper};
 use std::fmt::Write as _;
 use vidar_align::CouplingMode;
 
-/// One table as text cells; the report and the Markdown file are made of the same ones.
+/// One table as text cells; used for the report and the Markdown file.
 #[derive(Clone, Debug)]
 pub(super) struct Grid {
     pub caption: String,
@@ -77,7 +77,7 @@ fn notes(request: &BenchRequest) -> Vec<String> {
     ];
     if request.synthetic.is_some() {
         notes.push(
-            "Rendered sequences: easier than real ones and not comparable with the paper's numbers, which stand here for order only.".to_owned(),
+            "Rendered sequences: easier than real ones and not comparable with the paper's numbers, which are given for orientation only.".to_owned(),
         );
     }
     notes
@@ -122,7 +122,7 @@ impl Table<'_> {
         };
         let euroc = self.request.kind == BenchKind::Euroc;
         for (with_imu, name, k) in
-            [(false, "odometry, camera alone", 0), (true, "odometry, camera and IMU", 1)]
+            [(false, "odometry, camera only", 0), (true, "odometry, camera and IMU", 1)]
         {
             let of: Vec<_> = self
                 .odometry
@@ -242,7 +242,7 @@ impl Table<'_> {
                 of.iter().map(|r| r.keyframes).sum::<usize>().to_string(),
                 number(median(&per), 3),
                 peak.map_or_else(|| "–".into(), crate::run::bytes),
-                "none used".to_owned(),
+                "not used".to_owned(),
             ]
         };
         Grid {
@@ -264,7 +264,7 @@ impl Table<'_> {
         let runs =
             self.rows.iter().filter_map(|r| Some((&r.sequence, r.mode.to_string(), r.failure.clone()?)));
         let odometry = self.odometry.iter().filter_map(|r| {
-            let name = if r.with_imu { "odometry" } else { "odometry, camera alone" };
+            let name = if r.with_imu { "odometry" } else { "odometry, camera only" };
             Some((&r.sequence, name.to_owned(), r.failure.clone()?))
         });
         let rows: Vec<_> = runs.chain(odometry).map(|(s, m, why)| vec![s.clone(), m, why]).collect();

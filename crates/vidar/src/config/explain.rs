@@ -1,4 +1,4 @@
-//! What a key means, taken from the doc comments of the configuration structs, so that it cannot drift.
+//! Explanations of keys, generated from the doc comments of the configuration structs.
 
 use super::{Config, Layered};
 use crate::error::Error;
@@ -10,7 +10,7 @@ use serde_json::Value;
 pub struct Explanation {
     /// The key.
     pub key: String,
-    /// What it does, unit, range, when to touch it.
+    /// Meaning, unit, range, and when to change it.
     pub about: String,
     /// The default as TOML.
     pub default: String,
@@ -69,7 +69,7 @@ fn about(schema: &Value, key: &str) -> String {
     own.split_whitespace().collect::<Vec<_>>().join(" ")
 }
 
-/// Follows `$ref` and the one-element `allOf` that carries a reference beside a description.
+/// Follows `$ref` and the one-element `allOf` that holds a reference next to a description.
 fn resolve<'a>(schema: &'a Value, node: &'a Value) -> &'a Value {
     let reference = node["$ref"].as_str().or_else(|| node["allOf"][0]["$ref"].as_str());
     match reference.and_then(|r| r.strip_prefix('#')).and_then(|pointer| schema.pointer(pointer)) {

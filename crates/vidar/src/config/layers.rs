@@ -12,7 +12,7 @@ const SOURCE: &str = "geometry.source";
 const PROCESS_SIZE: &str = "model.network.preprocess.process_size_px";
 const POSE_MODE: &str = "model.network.mode";
 
-/// Where a value came from.
+/// Origin of a value.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Origin {
     /// The program's default.
@@ -25,7 +25,7 @@ pub enum Origin {
     Environment(String),
     /// `--set`.
     Set,
-    /// A flag of its own.
+    /// A dedicated flag.
     Flag(&'static str),
     /// Derived from the data.
     Derived(&'static str),
@@ -45,7 +45,7 @@ impl fmt::Display for Origin {
     }
 }
 
-/// Configuration under construction: the values so far and where each came from.
+/// Configuration under construction: values and their origins.
 #[derive(Clone, Debug)]
 pub struct Layered {
     values: Table,
@@ -62,7 +62,7 @@ impl Layered {
     pub fn defaults() -> Result<Self, Error> {
         let mut values =
             Table::try_from(Config::default()).map_err(|e| Error::BadValue { reason: e.to_string() })?;
-        // The schema knows every key, the table only those that have a value by default.
+        // The schema contains every key, the table only those with a default value.
         let optional: BTreeSet<String> =
             super::explain::keys().into_iter().filter(|key| lookup(&values, key).is_none()).collect();
         optional.iter().for_each(|key| store(&mut values, key, Value::String(ABSENT.into())));
@@ -92,7 +92,7 @@ impl Layered {
         })
     }
 
-    /// Applies `VIDAR_SECTION__KEY=value` variables; those without a double underscore mean other things.
+    /// Applies `VIDAR_SECTION__KEY=value` variables; those without a double underscore are not settings.
     pub fn environment(&mut self, variables: impl Iterator<Item = (String, String)>) -> Result<(), Error> {
         let mut sorted: Vec<_> = variables.collect();
         sorted.sort();
@@ -141,14 +141,14 @@ impl Layered {
         Ok(())
     }
 
-    /// The network in the program gets pictures of the size that it was trained for and is told where the cameras are, unless
-    /// somebody chose otherwise; another network gets what all get.
+    /// The built-in network gets images of its training size and known camera poses, unless set otherwise; all other
+    /// networks get the defaults.
     fn follow_source(&mut self) -> Result<(), Error> {
         let is_bundled = lookup(&self.values, SOURCE).and_then(Value::as_str) == Some(bundled::NAME);
         let size = Value::Integer(bundled::PROCESS_SIZE_PX as i64);
         let wishes = [
-            (PROCESS_SIZE, size, "the size that da3-nano was trained for"),
-            (POSE_MODE, Value::String("conditioned".into()), "cameras that da3-nano finds itself are coarse"),
+            (PROCESS_SIZE, size, "the training size of da3-nano"),
+            (POSE_MODE, Value::String("conditioned".into()), "cameras estimated by da3-nano are coarse"),
         ];
         for (key, wish, why) in wishes {
             let (value, origin) = match (is_bundled, self.origins.get(key)) {
@@ -290,12 +290,12 @@ fn remove(table: &mut Table, key: &str) {
     }
 }
 
-/// Optional values are numbers so far; whole ones are meant as such.
+/// All optional values are numbers; a whole number is kept as integer.
 fn optional_value(value: Value) -> Value {
     if let Value::Integer(i) = value { Value::Float(i as f64) } else { value }
 }
 
-/// Fits `value` to the kind of `current`; the error is (expected, found).
+/// Converts `value` to the type of `current`; the error is (expected, found).
 fn coerce(current: &Value, value: Value) -> Result<Value, (&'static str, String)> {
     match (current, value) {
         (Value::Float(_), Value::Integer(i)) => Ok(Value::Float(i as f64)),
@@ -312,7 +312,7 @@ fn coerce(current: &Value, value: Value) -> Result<Value, (&'static str, String)
 
 fn kind(value: &Value) -> &'static str {
     match value {
-        Value::String(_) => "a text",
+        Value::String(_) => "a string",
         Value::Integer(_) => "a whole number",
         Value::Float(_) => "a number",
         Value::Boolean(_) => "true or false",

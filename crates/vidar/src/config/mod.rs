@@ -1,4 +1,4 @@
-//! Configuration: one plain struct per stage, composed here, in layers whose origins are kept.
+//! Configuration: one plain struct per stage, composed here, in layers; the origin of each value is stored.
 //!
 //! defaults < preset < file < `VIDAR_SECTION__KEY` < `--set section.key=value` < dedicated flags.
 
@@ -15,7 +15,7 @@ use crate::models::geometry::SourceChoice;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-/// Which part of the input is used.
+/// Selection of the input.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct InputConfig {
@@ -30,7 +30,7 @@ pub struct InputConfig {
     /// Where metric poses come from: `auto` (an external trajectory, else the odometry of camera and IMU, else ground truth),
     /// `external`, `odometry`, `ground-truth`.
     pub poses: PoseSource,
-    /// Longest gap (s) between two poses that is bridged by interpolation. Raise it for keyframe-only trajectories.
+    /// Longest gap (s) between two poses that is interpolated. Raise it for keyframe-only trajectories.
     pub max_pose_gap_secs: f64,
 }
 
@@ -61,7 +61,7 @@ impl Default for InputConfig {
     }
 }
 
-/// Which frames carry geometry.
+/// Choice of keyframes.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct KeyframeConfig {
@@ -69,10 +69,10 @@ pub struct KeyframeConfig {
     pub min_translation_m: f64,
     /// … or turned at least this much (degrees).
     pub min_rotation_deg: f64,
-    /// Most keyframes; beyond it the distances are widened evenly. 0 means no limit.
+    /// Most keyframes; above it the distances are scaled up evenly. 0 means no limit.
     pub max_count: usize,
-    /// Where no poses are known beforehand (`coupling.mode` `pose-free` or `da3-streaming` without any), a keyframe every so
-    /// many seconds. Lower it for fast motion.
+    /// Time between keyframes (s) if no poses are known beforehand (`coupling.mode` `pose-free` or `da3-streaming` without a
+    /// trajectory). Lower it for fast motion.
     pub unposed_interval_secs: f64,
 }
 
@@ -82,21 +82,21 @@ impl Default for KeyframeConfig {
     }
 }
 
-/// Which model sees the frames, and how many at once.
+/// The geometry model, and the number of keyframes per prediction.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct GeometryConfig {
     /// The model: `stereo` (needs poses, no weights), a network of `vidar model list` (`da3-small`), or `recorded:DIR`,
-    /// predictions that another program left there.
+    /// predictions of another program in that folder.
     pub source: String,
-    /// Keyframes that are seen together. Larger chunks need more memory and agree better within themselves.
+    /// Keyframes that are predicted together. Larger chunks need more memory and are more consistent.
     pub chunk_keyframes: usize,
-    /// Keyframes that a chunk shares with the one before it: what ties the two together. Networks and recordings only;
+    /// Keyframes that a chunk shares with the one before it, for the overlap constraint between them. Networks and recordings only;
     /// smaller than the chunk.
     pub overlap_keyframes: usize,
-    /// Keyframes on each side that are seen as context only. Stereo only.
+    /// Keyframes on each side that are used as context only. Stereo only.
     pub context_keyframes: usize,
-    /// Widest undistorted image (px) that the model gets; larger images are reduced.
+    /// Largest width of the undistorted images (px); wider images are reduced.
     pub max_width_px: usize,
 }
 
@@ -112,25 +112,25 @@ impl Default for GeometryConfig {
     }
 }
 
-/// How depth and metric poses are coupled.
+/// Coupling of depth and metric poses.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct CouplingConfig {
     /// `coupled` estimates poses and chunks together; `pose-conditioned` and `hybrid` are the paper's; `ground-truth` is
-    /// pose-conditioned on true poses, an upper bound; `pose-free` and `da3-streaming` use no metric poses and give no metres.
+    /// pose-conditioned on true poses, an upper bound; `pose-free` and `da3-streaming` use no metric poses, so their maps are not metric.
     pub mode: vidar_align::CouplingMode,
-    /// Show both ends of a loop to the network together, as DA3-Streaming does: one more prediction per loop. Otherwise what is
-    /// stored of the two chunks is compared.
+    /// Predict both ends of a loop together, as DA3-Streaming does: one more prediction per loop. Otherwise the stored
+    /// predictions of the two chunks are compared.
     pub loop_chunks: bool,
-    /// Hold a network's depth to what stereo is sure of in the same pictures, beside the odometry's landmarks, where
-    /// the two differ by more than stereo is wrong itself (`coupled` only). A tenth of a second of processor time per keyframe.
+    /// Add reliable stereo points of the same images to the odometry's landmarks as depth constraints, where network and
+    /// stereo differ by more than the stereo error (`coupled` only). Takes a tenth of a second of CPU time per keyframe.
     pub stereo_landmarks: bool,
-    /// How places are told again: `salad` (needs `coupling.salad_checkpoint`), `model` (the geometry network's own tokens, at
-    /// no further cost), `pictures` (knows the same view again, not a place from another side), or `auto`, the first of these
-    /// that there is.
-    pub places: PlacesConfig,
-    /// SALAD's published checkpoint, converted by `tools/salad_to_safetensors.py`. One more network of 350 MB to run per
-    /// keyframe; it knows places from other sides.
+    /// Place recognition descriptor: `salad` (needs `coupling.salad_checkpoint`), `model` (tokens of the geometry network, at
+    /// no extra cost), `image` (recognises the same view, not the same place from another side), or `auto`, the first of
+    /// these that is available.
+    pub place_recognition: PlaceRecognitionConfig,
+    /// SALAD's published checkpoint, converted by `tools/salad_to_safetensors.py`. Runs one more network of 350 MB per
+    /// keyframe; it recognises places from other viewpoints.
     pub salad_checkpoint: String,
 }
 
@@ -140,49 +140,49 @@ impl Default for CouplingConfig {
             mode: vidar_align::CouplingMode::default(),
             stereo_landmarks: true,
             loop_chunks: false,
-            places: PlacesConfig::Auto,
+            place_recognition: PlaceRecognitionConfig::Auto,
             salad_checkpoint: String::new(),
         }
     }
 }
 
-/// How places are told again.
+/// Place recognition descriptor.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
-pub enum PlacesConfig {
-    /// The best there is.
+pub enum PlaceRecognitionConfig {
+    /// The best one available.
     #[default]
     Auto,
     /// SALAD's descriptors.
     Salad,
     /// Averaged tokens of the geometry network.
     Model,
-    /// Brightness and gradients of the pictures.
-    Pictures,
+    /// Brightness and gradients of the image.
+    Image,
 }
 
-/// The network, where `geometry.source` names one.
+/// The network, if `geometry.source` names one.
 #[derive(Clone, Debug, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct ModelConfig {
-    /// Folder with `model.safetensors` and `config.json` of one's own, instead of the network that `geometry.source` names.
+    /// Folder with `model.safetensors` and `config.json` of custom weights, instead of the network that `geometry.source` names.
     pub dir: String,
-    /// Precision of the backbone. `auto` is bf16 where the processor multiplies it and f32 elsewhere (the manifest says which);
+    /// Precision of the backbone. `auto` is bf16 if the processor supports it, else f32 (recorded in the manifest);
     /// `f32` is the reference.
     pub precision: vidar_da3::Precision,
-    /// Where the network is computed: `cpu`, `gpu` (the best that does not run its shaders on the CPU), `gpu:N` (as `vidar doctor`
-    /// numbers them), or `auto` (a graphics processor where there is one). All but `cpu` need a program built with `--features gpu`.
+    /// Device that runs the network: `cpu`, `gpu` (the best hardware device), `gpu:N` (number N of `vidar doctor`), or `auto`
+    /// (a graphics processor if there is one). All but `cpu` need a program built with `--features gpu`.
     #[schemars(with = "String")]
     pub device: vidar_da3::Device,
     /// How the network is used.
     pub network: vidar_da3::Da3ModelConfig,
 }
 
-/// What is judged, and against what.
+/// Evaluation of the result.
 #[derive(Clone, Debug, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct EvalConfig {
-    /// Judge the result when there is something to judge it against.
+    /// Evaluate the result if there is a reference.
     pub mode: EvalMode,
     /// Trajectory metrics.
     pub trajectory: vidar_eval::TrajectoryEvalConfig,
@@ -190,11 +190,11 @@ pub struct EvalConfig {
     pub surface: vidar_eval::SurfaceEvalConfig,
 }
 
-/// Whether the result is judged.
+/// Whether the result is evaluated.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum EvalMode {
-    /// When there is a reference.
+    /// If there is a reference.
     #[default]
     Auto,
     /// Never.
@@ -211,14 +211,14 @@ pub struct OutputConfig {
     pub depth_units_per_metre: f64,
     /// Write the undistorted keyframe images; COLMAP and nerfstudio exports need them.
     pub images: bool,
-    /// Write the mesh as GLB beside PLY.
+    /// Write the mesh as GLB in addition to PLY.
     pub mesh_glb: bool,
     /// Draw pictures and the HTML report.
     pub report: bool,
-    /// Keep what the geometry model said of each chunk in `chunks/`, for `--geometry recorded:RUN/chunks`. Otherwise it is
-    /// removed when the run is done.
+    /// Keep the predictions of every chunk in `chunks/`, for `--geometry recorded:RUN/chunks`. Otherwise they are removed at
+    /// the end of the run.
     pub keep_chunks: bool,
-    /// Write `map/so_far.ply` after every chunk, at provisional places, for whoever watches. Costs a fusion more; the final
+    /// Write `map/so_far.ply` after every chunk, with provisional placements, for viewing. Costs one more fusion; the final
     /// map is the same.
     pub live_map: bool,
 }
@@ -237,22 +237,22 @@ impl Default for OutputConfig {
     }
 }
 
-/// What a run may take.
+/// Resource limits.
 #[derive(Clone, Debug, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct LimitsConfig {
-    /// Memory (bytes) that a run plans for; 0 means what its parts ask for. What network and chunk leave of it is the map's: a
-    /// map that does not fit is cut, with a warning. Set it where other programs run beside.
+    /// Memory limit (bytes) for planning; 0 means the sum of the parts. The map gets the part that network and chunk leave: a
+    /// larger map is truncated, with a warning. Set it if other programs need memory.
     pub memory_bytes: u64,
 }
 
-/// All of it.
+/// The whole configuration.
 #[derive(Clone, Debug, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct Config {
-    /// Which part of the input is used.
+    /// Selection of the input.
     pub input: InputConfig,
-    /// Which frames carry geometry.
+    /// Choice of keyframes.
     pub keyframes: KeyframeConfig,
     /// Which model sees them.
     pub geometry: GeometryConfig,
@@ -262,17 +262,17 @@ pub struct Config {
     pub odometry: vidar_odometry::OdometryConfig,
     /// Multi-view stereo.
     pub stereo: vidar_stereo::StereoConfig,
-    /// How depth and metric poses are coupled.
+    /// Coupling of depth and metric poses.
     pub coupling: CouplingConfig,
     /// Placement of chunks.
     pub align: vidar_align::AlignerConfig,
     /// Fusion into one surface.
     pub fusion: vidar_fusion::FusionConfig,
-    /// Judgement.
+    /// Evaluation.
     pub eval: EvalConfig,
     /// What is written.
     pub output: OutputConfig,
-    /// What a run may take.
+    /// Resource limits.
     pub limits: LimitsConfig,
 }
 
@@ -284,8 +284,8 @@ impl Config {
             true => Ok(()),
             false => bad(format!("{key} must be finite and positive, found {value}")),
         };
-        if self.coupling.places == PlacesConfig::Salad && self.coupling.salad_checkpoint.is_empty() {
-            return bad("coupling.places = \"salad\" needs coupling.salad_checkpoint".into());
+        if self.coupling.place_recognition == PlaceRecognitionConfig::Salad && self.coupling.salad_checkpoint.is_empty() {
+            return bad("coupling.place_recognition = \"salad\" needs coupling.salad_checkpoint".into());
         }
         for (key, value) in
             [("input.start_secs", self.input.start_secs), ("input.end_secs", self.input.end_secs)]

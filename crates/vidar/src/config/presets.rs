@@ -25,12 +25,12 @@ pub const PRESETS: &[Preset] = &[
     },
     Preset {
         name: "fast",
-        about: "a first look: half the resolution, coarser voxels",
+        about: "fast preview: half the resolution, coarser voxels",
         toml: include_str!("../../../../presets/fast.toml"),
     },
     Preset {
         name: "quality",
-        about: "patience for a better surface: closer keyframes, larger images",
+        about: "slower, better surface: closer keyframes, larger images",
         toml: include_str!("../../../../presets/quality.toml"),
     },
     Preset {

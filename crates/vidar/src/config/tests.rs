@@ -20,7 +20,7 @@ fn every_preset_changes_something_and_is_valid() {
 }
 
 #[test]
-fn later_layers_win_and_every_value_knows_its_origin() {
+fn later_layers_override_and_every_value_has_its_origin() {
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("mine.toml");
     std::fs::write(&file, "[keyframes]\nmin_translation_m = 0.5\nmin_rotation_deg = 3\n").unwrap();
@@ -50,7 +50,7 @@ fn later_layers_win_and_every_value_knows_its_origin() {
 }
 
 #[test]
-fn what_is_printed_can_be_read_back() {
+fn printed_configuration_can_be_read_back() {
     let mut layered = defaults();
     layered.set("fusion.voxel_size_m=0.07").unwrap();
     let folder = tempfile::tempdir().unwrap();
@@ -90,7 +90,7 @@ fn wrong_kinds_and_ranges_name_the_key() {
 }
 
 #[test]
-fn a_bad_file_is_named() {
+fn an_invalid_file_is_reported() {
     let missing = defaults().file(std::path::Path::new("/nowhere/x.toml")).unwrap_err();
     assert_eq!(missing.code(), "E0103");
     assert!(missing.to_string().contains("/nowhere/x.toml"));
@@ -101,7 +101,7 @@ fn a_bad_file_is_named() {
 }
 
 #[test]
-fn the_network_in_the_program_gets_its_own_size_unless_one_is_asked_for() {
+fn the_built_in_network_gets_its_training_size_unless_another_is_set() {
     let size = |layered: &Layered| layered.build().unwrap().model.network.preprocess.process_size_px;
     let mut layered = defaults();
     layered.set("geometry.source=da3-nano").unwrap();
@@ -116,5 +116,5 @@ fn the_network_in_the_program_gets_its_own_size_unless_one_is_asked_for() {
     assert_eq!(mode(&layered), vidar_da3::PoseMode::Free);
     layered.set("model.network.preprocess.process_size_px=140").unwrap();
     layered.set("geometry.source=da3-nano").unwrap();
-    assert_eq!(size(&layered), 140, "what was asked for stays");
+    assert_eq!(size(&layered), 140, "an explicit value is kept");
 }

@@ -1,13 +1,13 @@
-//! Maps of the network back at the size of the image.
+//! Resamples maps of the network to the size of the image.
 
 use nalgebra::Matrix3;
 use vidar_core::Image;
 use vidar_da3::preprocess::{PreprocessConfig, Step, follow, plan};
 
-/// Neighbouring depths that differ by more than this factor belong to two surfaces: nothing is drawn between them.
+/// Neighbouring depths that differ by more than this factor belong to two surfaces: values are not interpolated between them.
 const EDGE_RATIO: f32 = 1.1;
 
-/// Where pixels of an image went: `processed = scale · image + offset`, both from the edge of the top-left pixel.
+/// Mapping of image pixels to processed pixels: `processed = scale · image + offset`, both from the edge of the top-left pixel.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Mapping {
     scale: (f64, f64),
@@ -50,7 +50,7 @@ impl Mapping {
         matrix
     }
 
-    /// A map at the size of the image: bilinear within a surface, nearest at its edges, NaN where the network saw nothing.
+    /// A map at the size of the image: bilinear within a surface, nearest at its edges, NaN outside the network's input.
     pub fn at_image(&self, map: &Image<f32>, (width, height): (usize, usize)) -> Image<f32> {
         let (w, h) = (map.width(), map.height());
         Image::from_fn(width, height, |x, y| {
@@ -77,7 +77,7 @@ impl Mapping {
     }
 }
 
-/// The nearest value of a map at the size of the image; for confidences, which must not be invented.
+/// The nearest value of a map at the size of the image; for confidences, which must not be interpolated.
 pub(super) fn nearest(map: &Image<f32>, (width, height): (usize, usize)) -> Image<f32> {
     let at =
         |c: usize, to: usize, from: usize| ((c * from + from / 2) / to.max(1)).min(from.saturating_sub(1));
@@ -90,7 +90,7 @@ mod tests {
     use vidar_da3::preprocess::ResizeMethod;
 
     #[test]
-    fn a_plane_comes_back_as_a_plane_and_an_edge_as_an_edge() {
+    fn planes_and_edges_are_preserved() {
         let config = PreprocessConfig { process_size_px: 56, ..PreprocessConfig::default() };
         let mapping = Mapping::new((112, 84), (56, 42), &config).unwrap();
         let plane = Image::from_fn(56, 42, |x, y| 100.0 + x as f32 * 2.0 + y as f32);
@@ -102,7 +102,7 @@ mod tests {
     }
 
     #[test]
-    fn what_was_cut_away_has_no_depth_and_the_camera_stays_the_same() {
+    fn cropped_pixels_have_no_depth_and_the_camera_is_unchanged() {
         let config = PreprocessConfig { process_size_px: 60, method: ResizeMethod::UpperBoundCrop };
         let mapping = Mapping::new((120, 90), (56, 42), &config).unwrap();
         let large = mapping.at_image(&Image::filled(56, 42, 2.0), (120, 90));

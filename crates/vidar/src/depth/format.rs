@@ -1,4 +1,4 @@
-//! What `vidar depth` writes.
+//! Output formats of `vidar depth`.
 
 use crate::error::Error;
 
@@ -63,9 +63,9 @@ pub fn parse_formats(text: &str) -> Result<Vec<DepthFormat>, Error> {
 /// At which size clouds and depth images are written.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Resolution {
-    /// As the network answers.
+    /// Size of the network's output.
     Processed,
-    /// As the images came.
+    /// Size of the images.
     Input,
 }
 

@@ -1,4 +1,4 @@
-//! Images from files and folders, and the cameras that are known of them.
+//! Images from files and folders, and their known cameras.
 
 use crate::error::Error;
 use crate::export::read_views;
@@ -10,7 +10,7 @@ use vidar_core::{Image, LieGroup, Pinhole, Se3};
 use vidar_dataset::decode::{ImageLimits, read_image, read_size};
 use vidar_dataset::{DatasetKind, OpenOptions};
 
-/// An image as it came.
+/// A decoded image.
 pub(super) struct Picture {
     pub path: PathBuf,
     pub image: Image<[u8; 3]>,
@@ -40,7 +40,7 @@ pub(super) fn size_of(path: &Path) -> Result<(usize, usize), Error> {
     Ok(read_size(path, &ImageLimits::default())?)
 }
 
-/// Decodes all images; the first one that cannot be read ends it.
+/// Decodes all images; stops at the first one that cannot be read.
 pub(super) fn read_all(paths: &[PathBuf]) -> Result<Vec<Picture>, Error> {
     let read = |path: &PathBuf| {
         let image = read_image(path, &ImageLimits::default())?.to_rgb8();
@@ -51,14 +51,14 @@ pub(super) fn read_all(paths: &[PathBuf]) -> Result<Vec<Picture>, Error> {
 
 /// Cameras by image name, read from a file or folder.
 pub(super) struct Cameras {
-    /// What it was read as.
+    /// Format of the source.
     pub source: &'static str,
     path: PathBuf,
     views: Vec<(String, Se3, Pinhole)>,
 }
 
-/// Cameras of the images at hand, in the network's terms.
-pub(super) struct Given {
+/// Known cameras of the images, in the network's conventions.
+pub(super) struct KnownCameras {
     pub source: &'static str,
     pub camera_from_world: Vec<Matrix4<f64>>,
     /// In pixels of the images, from the edge of the top-left one.
@@ -92,19 +92,19 @@ impl Cameras {
         match model {
             Some(folder) => Ok(foreign("a COLMAP model", vidar_export::read_colmap(&folder)?.views)),
             None => Err(Error::Usage {
-                what: format!("--poses {}: neither cameras nor a file", path.display()),
+                what: format!("--poses {}: no cameras and no file", path.display()),
                 hint: "give a transforms.json, a folder with a COLMAP model, or a run folder".to_owned(),
             }),
         }
     }
 
-    /// How many cameras it knows.
+    /// Number of cameras.
     pub fn count(&self) -> usize {
         self.views.len()
     }
 
     /// The cameras of these images, at their sizes. Every image needs one.
-    pub fn of_images(&self, images: &[PathBuf], sizes: &[(usize, usize)]) -> Result<Given, Error> {
+    pub fn of_images(&self, images: &[PathBuf], sizes: &[(usize, usize)]) -> Result<KnownCameras, Error> {
         let (mut camera_from_world, mut intrinsics) = (Vec::new(), Vec::new());
         for (image, &(width, height)) in images.iter().zip(sizes) {
             let (_, world_from_camera, pinhole) = self.find(image)?;
@@ -115,7 +115,7 @@ impl Cameras {
             camera_from_world.push(world_from_camera.inverse().matrix());
             intrinsics.push(vidar_da3::pose::to_edge(&pinhole));
         }
-        Ok(Given { source: self.source, camera_from_world, intrinsics })
+        Ok(KnownCameras { source: self.source, camera_from_world, intrinsics })
     }
 
     /// The one camera whose image has the longest common end with this path.
@@ -127,14 +127,14 @@ impl Cameras {
         let best = self.views.iter().map(|v| (common(&v.0), v)).max_by_key(|(n, _)| *n);
         let wrong = |why: &str| Error::Usage {
             what: format!("--poses {}: {why} {}", self.path.display(), image.display()),
-            hint: "every image needs a camera of the same file name; leave out the images without".to_owned(),
+            hint: "every image needs a camera of the same file name; remove the images without one".to_owned(),
         };
         match best {
             Some((n, view)) if n > 0 => {
                 let twins = self.views.iter().filter(|v| common(&v.0) == n).count();
-                if twins > 1 { Err(wrong("several cameras could be of")) } else { Ok(view) }
+                if twins > 1 { Err(wrong("several cameras match")) } else { Ok(view) }
             }
-            _ => Err(wrong("no camera of")),
+            _ => Err(wrong("no camera for")),
         }
     }
 }
@@ -163,7 +163,7 @@ mod tests {
         assert_eq!((given.intrinsics[0][(0, 2)], given.intrinsics[1][(0, 2)]), (50.0, 25.0));
         assert_eq!(given.intrinsics[1][(0, 0)], 50.0);
         let error = |image: &str| known.find(Path::new(image)).unwrap_err().to_string();
-        assert!(error("2.png").contains("no camera of 2.png"));
+        assert!(error("2.png").contains("no camera for 2.png"));
         assert!(error("0.png").contains("several cameras"));
     }
 }

@@ -4,8 +4,8 @@
 //! images ─▶ (cameras of the same images) ─▶ network ─▶ prediction ─▶ files
 //! ```
 //!
-//! All images are seen together. The run folder holds `predictions.json` (what was found, in VIDAR's conventions),
-//! `manifest.json` (with what it was found), and the formats asked for.
+//! All images are predicted together. The run folder holds `predictions.json` (the result, in VIDAR's conventions),
+//! `manifest.json` (how it was made), and the formats asked for.
 
 mod at_input;
 mod format;
@@ -30,7 +30,7 @@ use vidar_da3::{Da3, Da3Error, Da3Options, DevicePlan, Hooks, InferOptions, Inpu
 use vidar_export::official::SceneOptions;
 use vidar_hub::Store;
 
-/// What to look at, with what, and what to write.
+/// Inputs, network and outputs.
 #[derive(Clone, Debug)]
 pub struct DepthRequest {
     /// Images, and folders of images, in order.
@@ -41,9 +41,9 @@ pub struct DepthRequest {
     pub accepted: Option<LicenceAccepted>,
     /// The checkpoints of this machine.
     pub store: Store,
-    /// How the network computes.
+    /// Options of the network.
     pub da3: Da3Options,
-    /// How it infers.
+    /// Options of the inference.
     pub infer: InferOptions,
     /// Known cameras: a `transforms.json`, a COLMAP model, or a run folder.
     pub poses: Option<PathBuf>,
@@ -61,12 +61,12 @@ pub struct DepthRequest {
     pub command: Vec<String>,
 }
 
-/// What a run would do.
+/// The plan of a run.
 #[derive(Clone, Debug)]
 pub struct DepthPlan {
     /// The images in order.
     pub images: Vec<PathBuf>,
-    /// Columns and rows at which the network sees them.
+    /// Columns and rows of the network's input.
     pub processed: (usize, usize),
     /// The model, or why it cannot be used yet.
     pub model: Result<Located, String>,
@@ -76,13 +76,13 @@ pub struct DepthPlan {
     pub device: Option<DevicePlan>,
     /// Where known cameras come from.
     pub cameras: Option<String>,
-    /// What was noticed.
+    /// Warnings.
     pub warnings: Vec<Warning>,
     name: String,
     formats: Vec<DepthFormat>,
 }
 
-/// What a run made.
+/// The result of a run.
 #[derive(Clone, Debug, Serialize)]
 pub struct DepthOutcome {
     /// The folder.
@@ -91,13 +91,13 @@ pub struct DepthOutcome {
     pub views: usize,
     /// Columns and rows of the prediction.
     pub size: (usize, usize),
-    /// What one unit of depth is.
+    /// The unit of depth.
     pub unit: Unit,
-    /// Why that is known, or not.
+    /// The reason for the unit.
     pub unit_reason: String,
     /// Files, relative to the folder.
     pub artifacts: Vec<String>,
-    /// What was noticed.
+    /// Warnings.
     pub warnings: Vec<Warning>,
     /// Wall time of the network, s.
     pub network_secs: f64,
@@ -105,7 +105,7 @@ pub struct DepthOutcome {
     pub seconds: f64,
 }
 
-/// What one unit of depth is.
+/// The unit of depth.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Unit {
@@ -117,7 +117,7 @@ pub enum Unit {
     Arbitrary,
 }
 
-/// Looks at images, cameras and model, and says what a run would do and need.
+/// Plans a run from images, cameras and model: what it does and what it needs.
 pub fn plan(request: &DepthRequest) -> Result<DepthPlan, Error> {
     let images = inputs::list(&request.inputs)?;
     let sizes = images.iter().map(|p| inputs::size_of(p)).collect::<Result<Vec<_>, _>>()?;
@@ -143,7 +143,7 @@ pub fn plan(request: &DepthRequest) -> Result<DepthPlan, Error> {
         config.map(|c| request.da3.device.plan(&c, size, request.infer.use_ray_pose)).transpose()?;
     let device = planned.flatten();
     // What a device computes takes the device's memory.
-    warnings.extend(memory.as_ref().filter(|_| device.is_none()).and_then(models::too_much));
+    warnings.extend(memory.as_ref().filter(|_| device.is_none()).and_then(models::memory_warning));
     Ok(DepthPlan {
         device,
         processed,
@@ -177,10 +177,10 @@ impl DepthPlan {
         let formats: Vec<&str> = self.formats.iter().map(|f| f.name()).collect();
         let mut lines = vec![
             ("images", self.images.len().to_string()),
-            ("network sees", format!("{}x{} px", self.processed.0, self.processed.1)),
+            ("network input", format!("{}x{} px", self.processed.0, self.processed.1)),
             ("model", model),
             ("licence", licence),
-            ("cameras", self.cameras.clone().unwrap_or_else(|| "to be found by the network".to_owned())),
+            ("cameras", self.cameras.clone().unwrap_or_else(|| "estimated by the network".to_owned())),
             ("writes", formats.join(", ")),
         ];
         if let Some(memory) = &self.memory {
@@ -209,7 +209,7 @@ pub fn run(request: &DepthRequest, events: &Events, cancel: &CancelToken) -> Res
     check_formats(&model, request)?;
     let pictures = events.stage("read", plan.images.len(), || inputs::read_all(&plan.images))?;
     let cameras = given_cameras(request, &pictures)?;
-    // A folder is made only when there is something to put into it.
+    // The folder is created only after the network has been opened.
     let network = std::time::Instant::now();
     let mut prediction =
         events.stage("depth", 0, || infer(&model, request, &pictures, cameras.as_ref(), cancel))?;
@@ -254,16 +254,16 @@ fn check_formats(model: &Da3, request: &DepthRequest) -> Result<(), Error> {
         );
     }
     if request.infer.use_ray_pose || request.poses.is_some() {
-        let what = format!("{} sees each image by itself and knows no cameras", request.model.name());
+        let what = format!("{} predicts each image separately and no cameras", request.model.name());
         return usage(
             what,
-            "leave --poses and --use-ray-pose out; --focal gives metric depth with da3-metric-large",
+            "remove --poses and --use-ray-pose; --focal gives metric depth with da3-metric-large",
         );
     }
     Ok(())
 }
 
-fn given_cameras(request: &DepthRequest, pictures: &[Picture]) -> Result<Option<inputs::Given>, Error> {
+fn given_cameras(request: &DepthRequest, pictures: &[Picture]) -> Result<Option<inputs::KnownCameras>, Error> {
     let Some(path) = &request.poses else { return Ok(None) };
     let paths: Vec<PathBuf> = pictures.iter().map(|p| p.path.clone()).collect();
     let sizes: Vec<(usize, usize)> = pictures.iter().map(|p| (p.image.width(), p.image.height())).collect();
@@ -274,7 +274,7 @@ fn infer(
     model: &Da3,
     request: &DepthRequest,
     pictures: &[Picture],
-    cameras: Option<&inputs::Given>,
+    cameras: Option<&inputs::KnownCameras>,
     cancel: &CancelToken,
 ) -> Result<Prediction, Error> {
     let images: Vec<_> = pictures.iter().map(|p| p.image.clone()).collect();
@@ -290,16 +290,16 @@ fn infer(
     })
 }
 
-/// The metric network answers for a focal length of 300 px: metres = depth · focal / 300, in processed pixels.
+/// The metric network assumes a focal length of 300 px: metres = depth · focal / 300, in processed pixels.
 const CANONICAL_FOCAL_PX: f64 = 300.0;
 
-/// What a unit of depth is; a canonical depth whose focal length is known becomes metres.
+/// The unit of depth; a canonical depth whose focal length is known becomes metres.
 fn unit_of(
     model: &Da3,
     prediction: &mut Prediction,
     request: &DepthRequest,
     pictures: &[Picture],
-    cameras: Option<&inputs::Given>,
+    cameras: Option<&inputs::KnownCameras>,
 ) -> (Unit, String) {
     if prediction.is_metric {
         return (Unit::Metre, "the network's metric part".to_owned());
@@ -323,21 +323,21 @@ fn unit_of(
     match (&prediction.alignment, cameras) {
         (Some(alignment), Some(given)) if request.infer.align_to_given => match alignment.evidence {
             vidar_da3::align::ScaleEvidence::Nothing => {
-                (Unit::Arbitrary, "the cameras given stand in one place, which fixes no scale".to_owned())
+                (Unit::Arbitrary, "the given cameras are at one position, which gives no scale".to_owned())
             }
             evidence => (Unit::GivenCameras, format!("{} ({evidence:?})", given.source)),
         },
-        _ => (Unit::Arbitrary, "one unknown factor for all views: no camera was given".to_owned()),
+        _ => (Unit::Arbitrary, "one unknown factor for all views: no cameras given".to_owned()),
     }
 }
 
 fn warnings(plan: &DepthPlan, located: &Located, prediction: &Prediction) -> Vec<Warning> {
     let mut warnings = plan.warnings.clone();
-    warnings.extend(models::untrained(&located.identity));
-    warnings.extend(models::bundled::modest(&located.identity));
+    warnings.extend(models::untrained_warning(&located.identity));
+    warnings.extend(models::bundled::small_network_warning(&located.identity));
     if prediction.was_cropped {
-        let message = "images of several shapes were cut to the smallest";
-        warnings.push(Warning::new("cropped", message).hint("predict them apart from each other"));
+        let message = "images of several shapes were cropped to the smallest";
+        warnings.push(Warning::new("cropped", message).hint("predict images of each shape separately"));
     }
     warnings
 }

@@ -1,4 +1,4 @@
-//! `predictions.json`: what was found. `manifest.json`: with what.
+//! `predictions.json`: the result. `manifest.json`: how it was made.
 
 use super::write::{Writer, depth_name, unit_words};
 use super::{DepthFormat, DepthOutcome, DepthRequest, Resolution};

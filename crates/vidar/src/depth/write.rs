@@ -18,7 +18,7 @@ const STEPS_PER_METRE: f64 = 1000.0;
 /// Largest number of a 16-bit pixel.
 const MOST_STEPS: f64 = 65_535.0;
 
-/// Where a view stands and how it projects, in VIDAR's conventions.
+/// Pose and intrinsics of a view, in VIDAR's conventions.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct ViewCamera {
     pub world_from_camera: Se3,
@@ -52,7 +52,7 @@ impl<'a> Writer<'a> {
         Self { folder, request, pictures, prediction, unit, artifacts, warnings, depth_scale: None, events }
     }
 
-    /// Every format asked for.
+    /// Writes every requested format.
     pub fn formats(&mut self) -> Result<(), Error> {
         let official = self.official();
         for format in &self.request.formats {
@@ -77,7 +77,7 @@ impl<'a> Writer<'a> {
         Ok(())
     }
 
-    /// Writes a whole file and tells of it.
+    /// Writes a file and emits its event.
     pub fn bytes(&mut self, path: &str, bytes: &[u8]) -> Result<(), Error> {
         let bytes = self.folder.write(path, bytes)?;
         self.made(path, bytes);
@@ -101,7 +101,7 @@ impl<'a> Writer<'a> {
         self.artifacts.push(path.to_owned());
     }
 
-    /// The prediction in the official program's terms.
+    /// The prediction in the official program's conventions.
     fn official(&self) -> official::Prediction {
         let p = self.prediction;
         let view = |i: usize| PredictedView {
@@ -145,7 +145,7 @@ impl<'a> Writer<'a> {
         Ok(Mapping::new((image.width(), image.height()), processed, &self.request.infer.preprocess)?)
     }
 
-    /// Depth of view `i` at the size that was asked for.
+    /// Depth of view `i` at the size that was requested.
     fn depth(&self, i: usize) -> Result<Image<f32>, Error> {
         let depth = &self.prediction.depth[i];
         match self.request.resolution {
@@ -161,7 +161,7 @@ impl<'a> Writer<'a> {
         let scale = self.steps_per_unit();
         let mut clipped = 0;
         for i in 0..self.prediction.depth.len() {
-            // The file counts steps per unit; which unit that is, predictions.json says.
+            // The file counts steps per unit; the unit is recorded in predictions.json.
             let depth = MetricDepth::new(self.depth(i)?);
             let mut bytes = Vec::new();
             clipped += vidar_export::write_depth_png(&mut bytes, &depth, scale)?.clipped;
@@ -170,7 +170,7 @@ impl<'a> Writer<'a> {
         self.depth_scale = Some(scale);
         if clipped > 0 {
             let message =
-                format!("{clipped} pixels lie beyond what {scale} steps per unit can tell; they are 0");
+                format!("{clipped} pixels exceed the range of {scale} steps per unit; they are 0");
             self.warnings.push(Warning::new("depth-clipped", message).hint("mini_npz keeps every depth"));
         }
         Ok(())
@@ -207,12 +207,12 @@ impl<'a> Writer<'a> {
         self.export("points.ply", |w| vidar_export::write_ply_cloud(w, &cloud, &comments))
     }
 
-    /// In which frame poses and points are.
+    /// The frame of poses and points.
     pub fn frame_words(&self) -> String {
         match (&self.request.poses, self.request.infer.align_to_given) {
             (Some(path), true) => format!("the world of {}", path.display()),
             _ => format!(
-                "the network's own, about the camera of view {}: x right, y down, z forward",
+                "the network's frame, with the origin at the camera of view {}: x right, y down, z forward",
                 self.prediction.reference_view
             ),
         }
@@ -235,7 +235,7 @@ impl<'a> Writer<'a> {
             }
         };
         let Some(camera) = camera else {
-            let reason = format!("the camera of view {i} is none");
+            let reason = format!("the camera of view {i} is invalid");
             return Err(ExportError::Unwritable { format: "PLY", what: "a cloud".to_owned(), reason }.into());
         };
         for y in 0..size.1 {
@@ -267,7 +267,7 @@ impl<'a> Writer<'a> {
         Ok(())
     }
 
-    /// The official program writes the pictures beside its scene, and the first one as the scene's thumbnail.
+    /// As the official program: depth images next to the scene, and the first one as thumbnail of the scene.
     fn glb(&mut self, official: &official::Prediction) -> Result<(), Error> {
         let scene = self.request.scene.clone();
         self.export("scene.glb", |w| official::write_scene_glb(w, official, &scene).map(|_| ()))?;
@@ -299,11 +299,11 @@ pub(super) fn depth_name(i: usize) -> String {
     format!("depth/{i:04}.png")
 }
 
-/// A unit in words.
+/// The unit as text.
 pub(super) fn unit_words(unit: Unit) -> &'static str {
     match unit {
         Unit::Metre => "metre",
-        Unit::GivenCameras => "that of the cameras given",
+        Unit::GivenCameras => "that of the given cameras",
         Unit::Arbitrary => "unknown (one factor for all views)",
     }
 }

@@ -1,31 +1,31 @@
-//! A calibration as a person would say it, so that a wrong one is seen before it is used.
+//! Describes a calibration in plain terms, so that errors are noticed before it is used.
 
 use nalgebra::{Vector2, Vector3};
 use vidar_core::{CameraModel, ImuNoise, LieGroup, Pinhole, RigCamera, Se3};
 use vidar_dataset::{CalibrationSource, Dataset};
 
-/// The camera in use: how it projects, what it sees, where it sits, its clock, its distance from the others.
-pub(super) fn camera_words(dataset: &Dataset) -> Vec<String> {
+/// The camera in use: model, field of view, extrinsics, clock, distance to the other cameras.
+pub(super) fn describe_camera(dataset: &Dataset) -> Vec<String> {
     let Some(camera) = dataset.rig.camera(dataset.camera) else { return Vec::new() };
-    let mut words = model_words(&camera.model, &dataset.calibration);
+    let mut words = describe_model(&camera.model, &dataset.calibration);
     if dataset.rig.imu.is_some() || camera.body_from_camera != Se3::IDENTITY {
-        words.push(place_words(&camera.body_from_camera));
-        words.push(axes_words(&camera.body_from_camera));
-        words.push(clock_words(camera));
+        words.push(describe_position(&camera.body_from_camera));
+        words.push(describe_axes(&camera.body_from_camera));
+        words.push(describe_clock(camera));
     }
     let others = dataset.rig.cameras.iter().enumerate().filter(|(k, _)| *k != dataset.camera.index());
     for (number, other) in others.filter(|(_, o)| o.body_from_camera != camera.body_from_camera) {
-        words.push(baseline_words(number, &(camera.body_from_camera.inverse() * other.body_from_camera)));
+        words.push(describe_baseline(number, &(camera.body_from_camera.inverse() * other.body_from_camera)));
     }
     words
 }
 
-fn model_words(model: &CameraModel, source: &CalibrationSource) -> Vec<String> {
+fn describe_model(model: &CameraModel, source: &CalibrationSource) -> Vec<String> {
     let k = model.intrinsics();
     let from = match source {
         CalibrationSource::File(path) => format!("from {}", path.display()),
         CalibrationSource::Flags => "from --camera-model".into(),
-        CalibrationSource::Guessed => "a guess".into(),
+        CalibrationSource::Guessed => "guessed".into(),
         other => format!("{other:?}").to_lowercase(),
     };
     let mut words = vec![format!(
@@ -39,9 +39,9 @@ fn model_words(model: &CameraModel, source: &CalibrationSource) -> Vec<String> {
         k.cy
     )];
     if let Some([across, down, corner]) = field_of_view_deg(model) {
-        words.push(format!("sees {across:.0} x {down:.0} degrees, {corner:.0} from corner to corner"));
+        words.push(format!("field of view {across:.0} x {down:.0} degrees, {corner:.0} on the diagonal"));
     }
-    words.extend(corner_words(model, k));
+    words.extend(describe_distortion(model, k));
     words
 }
 
@@ -57,8 +57,8 @@ fn field_of_view_deg(model: &CameraModel) -> Option<[f64; 3]> {
     ])
 }
 
-/// How far the distortion moves the corner that it moves most.
-fn corner_words(model: &CameraModel, k: &Pinhole) -> Option<String> {
+/// Largest shift of a corner by the distortion.
+fn describe_distortion(model: &CameraModel, k: &Pinhole) -> Option<String> {
     if matches!(model, CameraModel::Pinhole(_)) {
         return Some("no distortion".into());
     }
@@ -67,7 +67,7 @@ fn corner_words(model: &CameraModel, k: &Pinhole) -> Option<String> {
     for corner in [(0.0, 0.0), (w, 0.0), (0.0, h), (w, h)].map(|(x, y)| Vector2::new(x, y)) {
         let ray = model.unproject(&corner)?;
         if ray.z <= 1e-3 {
-            return Some("distortion: corners look sideways or back, no pinhole shows them".into());
+            return Some("distortion: corners are at 90 degrees or more, outside any pinhole view".into());
         }
         let straight = Vector2::new(k.fx * ray.x / ray.z + k.cx, k.fy * ray.y / ray.z + k.cy);
         let centre = Vector2::new(k.cx, k.cy);
@@ -82,16 +82,16 @@ fn corner_words(model: &CameraModel, k: &Pinhole) -> Option<String> {
     Some(format!("distortion moves a corner's pixel by {moved:.1} px, {way}"))
 }
 
-/// Where the camera sits on the body.
-fn place_words(body_from_camera: &Se3) -> String {
+/// Position of the camera on the body.
+fn describe_position(body_from_camera: &Se3) -> String {
     let t = body_from_camera.translation;
     let parts: Vec<String> =
         ["x", "y", "z"].iter().zip(t.iter()).map(|(axis, v)| format!("{axis} {:+.1}", v * 100.0)).collect();
-    format!("sits {:.1} cm from the IMU: {} cm in the IMU's axes", t.norm() * 100.0, parts.join(", "))
+    format!("is {:.1} cm from the IMU: {} cm in the IMU's axes", t.norm() * 100.0, parts.join(", "))
 }
 
-/// Which way the camera's three axes point on the body.
-fn axes_words(body_from_camera: &Se3) -> String {
+/// Directions of the camera's axes on the body.
+fn describe_axes(body_from_camera: &Se3) -> String {
     let along = |axis: Vector3<f64>| {
         let (name, off) = nearest_axis(&(body_from_camera.rotation * axis));
         if off < 0.05 { format!("body {name}") } else { format!("body {name} ({off:.1} deg off)") }
@@ -116,15 +116,15 @@ fn nearest_axis(direction: &Vector3<f64>) -> (String, f64) {
     )
 }
 
-fn clock_words(camera: &RigCamera) -> String {
+fn describe_clock(camera: &RigCamera) -> String {
     let millis = camera.time_offset.as_secs_f64() * 1e3;
     match millis {
-        0.0 => "clock: image stamps are taken as IMU time".into(),
-        _ => format!("clock: IMU time is the image's stamp {millis:+.2} ms"),
+        0.0 => "clock: image timestamps are IMU time".into(),
+        _ => format!("clock: IMU time is the image timestamp {millis:+.2} ms"),
     }
 }
 
-fn baseline_words(number: usize, chosen_from_other: &Se3) -> String {
+fn describe_baseline(number: usize, chosen_from_other: &Se3) -> String {
     let t = chosen_from_other.translation;
     let at = t.iamax();
     let side = match (at, t[at] > 0.0) {
@@ -137,27 +137,27 @@ fn baseline_words(number: usize, chosen_from_other: &Se3) -> String {
     };
     let turned = chosen_from_other.rotation.log().norm().to_degrees();
     format!(
-        "camera {number} sits {:.1} cm {side} (baseline), turned by {turned:.1} degrees",
+        "camera {number} is {:.1} cm {side} (baseline), rotated by {turned:.1} degrees",
         t.norm() * 100.0
     )
 }
 
-/// An IMU's noise in units that can be compared with a data sheet or with readings at rest.
-pub(super) fn noise_words(noise: &ImuNoise) -> Vec<String> {
+/// An IMU's noise in units that can be compared with a data sheet or with samples at rest.
+pub(super) fn describe_noise(noise: &ImuNoise) -> Vec<String> {
     let root_rate = noise.rate_hz.max(0.0).sqrt();
     let (gyro, accel) = (noise.gyro_noise_density, noise.accel_noise_density);
     // A random walk of density d has grown to d·√t after t seconds.
     let minute = 60.0_f64.sqrt();
     vec![
         format!(
-            "gyroscope noise {gyro:.2e} rad/s/sqrt(Hz): readings scatter by {:.3} deg/s at {} Hz, angle by {:.2} deg after an hour; bias walks {:.4} deg/s in a minute",
+            "gyroscope noise {gyro:.2e} rad/s/sqrt(Hz): standard deviation of samples {:.3} deg/s at {} Hz, of the angle {:.2} deg after an hour; bias drift {:.4} deg/s in a minute",
             (gyro * root_rate).to_degrees(),
             noise.rate_hz,
             (gyro * 60.0).to_degrees(),
             (noise.gyro_random_walk * minute).to_degrees()
         ),
         format!(
-            "accelerometer noise {accel:.2e} m/s2/sqrt(Hz): readings scatter by {:.3} m/s2, velocity by {:.3} m/s after a minute; bias walks {:.4} m/s2 in a minute",
+            "accelerometer noise {accel:.2e} m/s2/sqrt(Hz): standard deviation of samples {:.3} m/s2, of the velocity {:.3} m/s after a minute; bias drift {:.4} m/s2 in a minute",
             accel * root_rate,
             accel * minute,
             noise.accel_random_walk * minute
@@ -201,30 +201,30 @@ mod tests {
     }
 
     #[test]
-    fn the_euroc_camera_is_told_as_its_makers_would() {
+    fn the_euroc_camera_is_described() {
         let camera = euroc();
-        let words = model_words(&camera.model, &CalibrationSource::Flags).join("\n");
+        let words = describe_model(&camera.model, &CalibrationSource::Flags).join("\n");
         assert!(words.contains("752x480, f 458.7/457.3 px"), "{words}");
         assert!(words.contains("px, inwards (barrel)"), "{words}");
         assert_eq!(
-            place_words(&camera.body_from_camera),
-            "sits 6.9 cm from the IMU: x -2.2, y -6.5, z +1.0 cm in the IMU's axes"
+            describe_position(&camera.body_from_camera),
+            "is 6.9 cm from the IMU: x -2.2, y -6.5, z +1.0 cm in the IMU's axes"
         );
         assert_eq!(
-            axes_words(&camera.body_from_camera),
+            describe_axes(&camera.body_from_camera),
             "looks along body +z (1.5 deg off); its right is body +y (1.7 deg off), its down is body -x (0.9 deg off)"
         );
-        assert_eq!(clock_words(&camera), "clock: image stamps are taken as IMU time");
+        assert_eq!(describe_clock(&camera), "clock: image timestamps are IMU time");
         let late = RigCamera { time_offset: Duration::from_nanos(-7_500_000), ..camera };
-        assert_eq!(clock_words(&late), "clock: IMU time is the image's stamp -7.50 ms");
+        assert_eq!(describe_clock(&late), "clock: IMU time is the image timestamp -7.50 ms");
     }
 
     #[test]
-    fn a_corner_is_moved_by_what_the_model_says() {
+    fn the_shift_of_a_corner_follows_the_model() {
         // One radial term: r becomes r(1 + k1 r²).
         let pinhole = Pinhole::new(100.0, 100.0, 49.5, 37.0, 100, 75).unwrap();
         let model = |k1| CameraModel::RadTan(RadTan::new(pinhole, [k1, 0.0, 0.0, 0.0]).unwrap());
-        let shown = corner_words(&model(-0.1), &pinhole).unwrap();
+        let shown = describe_distortion(&model(-0.1), &pinhole).unwrap();
         // The corner is at r_distorted; its ray at r with r(1 - 0.1 r²) = r_distorted.
         let distorted = (49.5_f64 / 100.0).hypot(37.0 / 100.0);
         let mut r = distorted;
@@ -233,26 +233,26 @@ mod tests {
         }
         let expected = format!("by {:.1} px, inwards", (r - distorted) * 100.0);
         assert!(shown.contains(&expected), "{shown}: {expected}");
-        assert!(corner_words(&model(0.1), &pinhole).unwrap().contains("outwards"));
-        assert_eq!(corner_words(&CameraModel::Pinhole(pinhole), &pinhole).unwrap(), "no distortion");
+        assert!(describe_distortion(&model(0.1), &pinhole).unwrap().contains("outwards"));
+        assert_eq!(describe_distortion(&CameraModel::Pinhole(pinhole), &pinhole).unwrap(), "no distortion");
     }
 
     #[test]
-    fn a_second_camera_is_beside_ahead_or_above() {
+    fn a_second_camera_is_described_by_its_direction() {
         let at = |x, y, z| Se3::new(So3::IDENTITY, Vector3::new(x, y, z));
         let turned = Se3::new(So3::exp(&Vector3::new(0.0, 0.1, 0.0)), Vector3::new(0.11, 0.002, 0.001));
         assert_eq!(
-            baseline_words(1, &turned),
-            "camera 1 sits 11.0 cm to the right (baseline), turned by 5.7 degrees"
+            describe_baseline(1, &turned),
+            "camera 1 is 11.0 cm to the right (baseline), rotated by 5.7 degrees"
         );
-        assert!(baseline_words(1, &at(0.0, -0.2, 0.0)).contains("20.0 cm above"));
-        assert!(baseline_words(1, &at(0.0, 0.0, 0.3)).contains("30.0 cm ahead"));
+        assert!(describe_baseline(1, &at(0.0, -0.2, 0.0)).contains("20.0 cm above"));
+        assert!(describe_baseline(1, &at(0.0, 0.0, 0.3)).contains("30.0 cm ahead"));
     }
 
     #[test]
-    fn noise_is_told_in_units_of_daily_use() {
-        let words = noise_words(&ImuNoise::EUROC);
-        assert!(words[0].contains("0.137 deg/s at 200 Hz, angle by 0.58 deg after an hour"), "{}", words[0]);
-        assert!(words[1].contains("scatter by 0.028 m/s2, velocity by 0.015 m/s"), "{}", words[1]);
+    fn noise_is_described_in_practical_units() {
+        let words = describe_noise(&ImuNoise::EUROC);
+        assert!(words[0].contains("0.137 deg/s at 200 Hz, of the angle 0.58 deg after an hour"), "{}", words[0]);
+        assert!(words[1].contains("samples 0.028 m/s2, of the velocity 0.015 m/s"), "{}", words[1]);
     }
 }

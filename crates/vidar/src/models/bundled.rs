@@ -1,9 +1,9 @@
-//! da3-nano: a small network of our own that is part of the program. How it was made is in `training/`, what it can and
-//! cannot do in `models/da3-nano/README.md`.
+//! da3-nano: VIDAR's own small network, built into the program. `training/` describes how it was trained,
+//! `models/da3-nano/README.md` what it can and cannot do.
 
 use super::ModelIdentity;
 use crate::error::Error;
-use crate::run::sha256_hex;
+use vidar_hub::sha256_hex;
 use std::sync::Arc;
 use std::sync::OnceLock;
 use vidar_core::Warning;
@@ -11,17 +11,17 @@ use vidar_da3::config::json;
 use vidar_da3::{Da3, Da3Config, Da3Options};
 use vidar_nn::Checkpoint;
 
-/// What the user calls it.
+/// Its name on the command line.
 pub const NAME: &str = "da3-nano";
 /// Licence of its weights.
 pub const LICENCE: &str = "MIT OR Apache-2.0";
 /// Longer side of the pictures that it was trained for, px.
 pub const PROCESS_SIZE_PX: usize = 280;
-/// What one should know before choosing it.
+/// Advice on when to choose it.
 pub const NOTE: &str =
-    "in the program; trained on rendered rooms, to try things out: for real recordings take da3-small";
-/// Where weights and description come from, for errors and manifests.
-pub const SOURCE: &str = "part of the program (models/da3-nano)";
+    "built in; trained on rendered rooms, for first tries: for real recordings use da3-small";
+/// Source of weights and description, for errors and manifests.
+pub const SOURCE: &str = "built into the program (models/da3-nano)";
 
 static WEIGHTS: &[u8] = include_bytes!("../../../../models/da3-nano/model.safetensors");
 static DESCRIPTION: &str = include_str!("../../../../models/da3-nano/config.json");
@@ -36,7 +36,7 @@ pub fn bytes() -> u64 {
     WEIGHTS.len() as u64
 }
 
-/// Numbers that the network has.
+/// Number of parameters.
 pub fn parameters() -> Result<u64, Error> {
     let shapes = vidar_da3::weights::inventory::parameters(&config()?);
     Ok(shapes.iter().filter(|p| p.is_read).map(|p| p.shape.iter().product::<usize>() as u64).sum())
@@ -44,17 +44,17 @@ pub fn parameters() -> Result<u64, Error> {
 
 /// SHA-256 of its weights.
 pub fn sha256() -> &'static str {
-    static FOUND: OnceLock<String> = OnceLock::new();
-    FOUND.get_or_init(|| sha256_hex(WEIGHTS))
+    static HASH: OnceLock<String> = OnceLock::new();
+    HASH.get_or_init(|| sha256_hex(WEIGHTS))
 }
 
-/// Opens the network; its weights are read where they are.
+/// Opens the network; its weights are not copied.
 pub fn open(options: &Da3Options) -> Result<Da3, Error> {
     let checkpoint = Checkpoint::from_static(WEIGHTS, SOURCE).map_err(vidar_da3::Da3Error::from)?;
     Ok(Da3::with_weights(config()?, Arc::new(checkpoint), options)?)
 }
 
-/// What manifests say of it.
+/// Its identity in manifests.
 pub fn identity() -> ModelIdentity {
     ModelIdentity {
         name: NAME.to_owned(),
@@ -64,15 +64,15 @@ pub fn identity() -> ModelIdentity {
         weights_bytes: bytes(),
         source: Some(SOURCE.to_owned()),
         acceptance: None,
-        geometry_means_something: true,
+        is_trained: true,
     }
 }
 
-/// What everybody should know who uses it.
-pub(crate) fn modest(identity: &ModelIdentity) -> Option<Warning> {
+/// The warning for its users.
+pub(crate) fn small_network_warning(identity: &ModelIdentity) -> Option<Warning> {
     (identity.name == NAME).then(|| {
-        let message = "da3-nano is small and has seen rendered rooms only";
-        let hint = "for recordings of your own fetch official weights: `vidar model pull da3-small`";
+        let message = "da3-nano is small and was trained on rendered rooms only";
+        let hint = "for your own recordings fetch official weights: `vidar model pull da3-small`";
         Warning::new("small-network", message).hint(hint)
     })
 }
@@ -83,7 +83,7 @@ mod tests {
     use vidar_da3::weights::verify;
 
     #[test]
-    fn it_is_whole_and_small() {
+    fn it_is_complete_and_small() {
         let checkpoint = Checkpoint::from_static(WEIGHTS, SOURCE).unwrap();
         verify(&checkpoint, &config().unwrap()).unwrap();
         assert!(bytes() <= 16 << 20, "{} bytes", bytes());

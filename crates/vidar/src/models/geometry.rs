@@ -14,7 +14,7 @@ use vidar_da3::{Da3Model, Da3ModelConfig, Da3Options, DevicePlan, PoseMode, Prec
 /// The source of geometry that needs no network.
 pub const STEREO: &str = "stereo";
 
-/// What a configuration names as its source of geometry.
+/// The source of geometry of a configuration.
 #[derive(Clone, Debug)]
 pub enum SourceChoice {
     /// Multi-view stereo.
@@ -27,7 +27,7 @@ pub enum SourceChoice {
     Simulated,
 }
 
-/// The source of geometry that tells the truth of a synthetic recording, wrong as a network would be.
+/// The simulated network: true geometry of a synthetic recording with the errors of a network.
 pub const SIMULATED: &str = "simulated";
 
 /// The source of geometry that the configuration names.
@@ -41,19 +41,19 @@ pub fn source(config: &Config) -> Result<SourceChoice, Error> {
     }
 }
 
-/// What a plan knows of the network.
+/// The network in a plan.
 #[derive(Clone, Debug, Serialize)]
 pub struct NetworkPlan {
-    /// What manifests say of it.
+    /// Its identity in manifests.
     #[serde(flatten)]
     pub identity: ModelIdentity,
-    /// Views that it sees at once.
+    /// Views per prediction.
     pub views_at_once: usize,
     /// Memory for those, bytes.
     pub memory: MemoryPlan,
-    /// What it computes with, and where.
+    /// Precision and device.
     pub arithmetic: String,
-    /// The graphics processor and what it must hold; none where the CPU computes.
+    /// The graphics processor and the memory it needs; `None` on the CPU.
     pub device: Option<DevicePlan>,
 }
 
@@ -67,7 +67,7 @@ pub fn chosen(config: &Config) -> Result<Option<ModelChoice>, Error> {
     }
 }
 
-/// Opens the network. The network of computers is never used for it.
+/// Opens the network. Nothing is downloaded.
 pub fn open(choice: &ModelChoice, config: &Config, mode: PoseMode) -> Result<(Da3Model, Located), Error> {
     let located = locate(choice, None, &store(true)?)?;
     // The dense head stays in 32 bits, as in the official program.
@@ -81,7 +81,7 @@ pub fn open(choice: &ModelChoice, config: &Config, mode: PoseMode) -> Result<(Da
     Ok((model, located))
 }
 
-/// What running it on chunks of `views` such views takes, and what there is to warn of.
+/// Memory of running it on chunks of `views` views, and warnings.
 pub fn planned(
     model: &Da3Model,
     located: &Located,
@@ -94,11 +94,11 @@ pub fn planned(
     let memory = planned_memory(model.network().config(), views, size);
     let wants_rays = config.model.network.use_ray_pose;
     let device = model.network().device_plan(views, size.1, size.0, wants_rays);
-    // What a device computes takes the device's memory.
+    // On a device, the device's memory is used.
     let mut warnings: Vec<Warning> = Vec::new();
-    warnings.extend(super::too_much(&memory).filter(|_| device.is_none()));
-    warnings.extend(super::untrained(&identity));
-    warnings.extend(super::bundled::modest(&identity));
+    warnings.extend(super::memory_warning(&memory).filter(|_| device.is_none()));
+    warnings.extend(super::untrained_warning(&identity));
+    warnings.extend(super::bundled::small_network_warning(&identity));
     let arithmetic = model.network().describe_compute();
     Ok((NetworkPlan { identity, views_at_once: views, memory, arithmetic, device }, warnings))
 }

@@ -1,4 +1,4 @@
-//! What a network will need, before it runs, as manifests and plans have it.
+//! Planned memory of a network, for plans and manifests.
 
 use crate::run::bytes;
 use serde::Serialize;
@@ -9,7 +9,7 @@ use vidar_da3::{Da3Config, DevicePlan, memory_estimate};
 pub struct MemoryPlan {
     /// Weights. Those of a file are mapped: the system may drop them again.
     pub weights: u64,
-    /// Everything else that lives at once, the answer included.
+    /// Everything else, including the output.
     pub working: u64,
 }
 
@@ -20,7 +20,7 @@ impl MemoryPlan {
     }
 }
 
-/// What a device must hold, in words.
+/// The memory of a device as text.
 pub fn device_memory(plan: &DevicePlan) -> String {
     let DevicePlan { weights, working, largest, largest_is, .. } = plan;
     format!(

@@ -1,8 +1,8 @@
-//! Which network, where its weights are, and under which terms: the one door to `vidar-hub` and `vidar-da3`.
+//! Choice of the network, its weights and their licence: the only interface to `vidar-hub` and `vidar-da3`.
 //!
-//! A model is named (`da3-small`), or it is in the program (`da3-nano`), or it is a folder of one's own (`--model-dir`), or it is *untrained*
-//! (`da3-small-untrained`): the official architecture with weights made by rule, whose geometry means nothing and which
-//! serves to try the road and to measure time and memory without weights.
+//! A model is an official one (`da3-small`), the built-in one (`da3-nano`), a folder with custom weights (`--model-dir`), or
+//! *untrained* (`da3-small-untrained`): the official architecture with synthetic weights. Its geometry is meaningless; it
+//! serves to test the pipeline and to measure time and memory without downloads.
 
 pub mod bundled;
 pub mod geometry;
@@ -21,11 +21,11 @@ use vidar_core::Warning;
 use vidar_da3::preprocess::PreprocessConfig;
 use vidar_da3::{Da3, Da3Config, Da3Options, Variant};
 use vidar_hub::catalogue::{self, CHECKPOINTS, WEIGHTS};
-use vidar_hub::{Acceptance, Checkpoint, HubError, HubSettings, Installed, PullOptions, Store, Watch};
+use vidar_hub::{Acceptance, Checkpoint, HubError, HubSettings, Installed, PullOptions, Store, TransferCallbacks};
 
-/// How much of a card is looked at.
+/// Length of the part of a model card that is read.
 const CARD_HEAD_BYTES: u64 = 64 << 10;
-/// The end of a name that asks for weights made by rule.
+/// The suffix of names with synthetic weights.
 const UNTRAINED: &str = "-untrained";
 
 /// Which network.
@@ -33,11 +33,11 @@ const UNTRAINED: &str = "-untrained";
 pub enum ModelChoice {
     /// An official checkpoint.
     Official(&'static Checkpoint),
-    /// The network that is part of the program.
+    /// The built-in network.
     Bundled,
     /// A folder with `model.safetensors` and `config.json`, or a safetensors file.
     Folder(PathBuf),
-    /// An official architecture with weights made by rule.
+    /// An official architecture with synthetic weights.
     Untrained(Variant),
 }
 
@@ -57,7 +57,7 @@ impl ModelChoice {
         Ok(Self::Official(catalogue::find(name)?))
     }
 
-    /// What the user calls it.
+    /// Its name on the command line.
     pub fn name(&self) -> String {
         match self {
             Self::Official(checkpoint) => checkpoint.name.to_owned(),
@@ -68,55 +68,55 @@ impl ModelChoice {
     }
 }
 
-/// That the user accepts a licence.
+/// Acceptance of a licence by the user.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct LicenceAccepted {
-    /// The licence as the user named it.
+    /// The licence as given by the user.
     pub licence: String,
     /// Who.
     pub by: String,
 }
 
-/// A model that is here and may be used.
+/// A model that is available and may be used.
 #[derive(Clone, Debug)]
 pub struct Located {
     /// Which one.
     pub choice: ModelChoice,
-    /// Its weights; `None` for those in the program and those made by rule.
+    /// Its weights; `None` for built-in and synthetic ones.
     pub path: Option<PathBuf>,
-    /// What manifests say of it.
+    /// Its identity in manifests.
     pub identity: ModelIdentity,
 }
 
-/// What a manifest says of a model.
+/// Identity of a model in a manifest.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 pub struct ModelIdentity {
     /// Name as the user chose it.
     pub name: String,
-    /// The official checkpoint that its weights are, where they are one's.
+    /// The official checkpoint, if the weights are those of one.
     pub official: Option<&'static str>,
-    /// SPDX licence of the weights; for weights of one's own what the card beside them says, else `unknown`.
+    /// SPDX licence of the weights; for custom weights that of the card next to them, else `unknown`.
     pub licence: String,
-    /// SHA-256 of the weights; none for weights made by rule.
+    /// SHA-256 of the weights; none for synthetic weights.
     pub weights_sha256: Option<String>,
     /// Length of the weights.
     pub weights_bytes: u64,
-    /// Where they came from.
+    /// Their source.
     pub source: Option<String>,
-    /// Who accepted a licence that asks for it.
+    /// Who accepted the licence, if it requires acceptance.
     pub acceptance: Option<Acceptance>,
-    /// Whether its geometry means anything: not for weights made by rule.
-    pub geometry_means_something: bool,
+    /// Whether the weights are trained: not for synthetic ones.
+    pub is_trained: bool,
 }
 
-/// The store that the environment describes; `offline` forbids the network besides.
+/// The store set by the environment; `offline` additionally disables network use.
 pub fn store(offline: bool) -> Result<Store, Error> {
     let mut settings = HubSettings::from_environment(|name| std::env::var(name).ok())?;
     settings.offline |= offline;
     Ok(Store::new(settings))
 }
 
-/// Finds the model's weights and checks that they may be used. The network is never used for it.
+/// Finds the model's weights and checks that they may be used. Nothing is downloaded.
 pub fn locate(
     choice: &ModelChoice,
     accepted: Option<&LicenceAccepted>,
@@ -137,20 +137,20 @@ pub fn locate(
                 licence: "MIT OR Apache-2.0".to_owned(),
                 weights_sha256: None,
                 weights_bytes: 0,
-                source: Some("weights made by rule".to_owned()),
+                source: Some("synthetic weights".to_owned()),
                 acceptance: None,
-                geometry_means_something: false,
+                is_trained: false,
             },
         }),
     }
 }
 
-/// The acceptance that the user gave with this command, as a record.
+/// The record of the acceptance given with this command.
 pub fn acceptance_of(
     checkpoint: &'static Checkpoint,
     accepted: Option<&LicenceAccepted>,
 ) -> Result<Option<Acceptance>, Error> {
-    // Nothing needs to be written down where everything is allowed.
+    // A licence that allows every use needs no record.
     let needed = accepted.filter(|_| !checkpoint.licence.allows_commercial_use());
     let now = crate::run_folder::now_rfc3339();
     Ok(needed.map(|a| Acceptance::new(checkpoint, &a.licence, &a.by, &now)).transpose()?)
@@ -166,7 +166,7 @@ fn official(
     accepted: Option<&LicenceAccepted>,
     store: &Store,
 ) -> Result<Located, Error> {
-    // What is not there is said first: a licence is accepted for something.
+    // A missing checkpoint is reported before a missing acceptance.
     if store.find(checkpoint)?.is_none() {
         store.require(checkpoint)?;
     }
@@ -189,7 +189,7 @@ fn official(
             weights_bytes: length(&installed.weights())?,
             source: source(&installed),
             acceptance: installed.acceptance,
-            geometry_means_something: true,
+            is_trained: true,
         },
     })
 }
@@ -199,7 +199,7 @@ fn source(installed: &Installed) -> Option<String> {
     record.map(|r| r.source.clone()).or_else(|| Some(installed.folder.display().to_string()))
 }
 
-/// Weights of one's own. Those of an official length keep the terms of the official ones.
+/// Custom weights. Those with the length of official ones keep their licence.
 fn folder(path: &Path, accepted: Option<&LicenceAccepted>, store: &Store) -> Result<Located, Error> {
     let weights = if path.is_dir() { path.join(WEIGHTS) } else { path.to_owned() };
     let bytes = length(&weights)?;
@@ -226,12 +226,12 @@ fn folder(path: &Path, accepted: Option<&LicenceAccepted>, store: &Store) -> Res
             weights_bytes: bytes,
             source: Some(path.display().to_string()),
             acceptance,
-            geometry_means_something: true,
+            is_trained: true,
         },
     })
 }
 
-/// What `README.md` beside the weights names as `license:` in its head, as cards on the hub do.
+/// The `license:` in the head of `README.md` next to the weights, as in model cards on the hub.
 fn card_licence(folder: &Path) -> Option<String> {
     let mut head = Vec::new();
     File::open(folder.join("README.md")).ok()?.take(CARD_HEAD_BYTES).read_to_end(&mut head).ok()?;
@@ -248,8 +248,8 @@ fn length(weights: &Path) -> Result<u64, Error> {
 }
 
 fn hash(weights: &Path) -> Result<String, Error> {
-    let watch = Watch { progress: &|_| {}, cancel: &|| false };
-    Ok(vidar_hub::sha256_of(weights, &watch)?.1)
+    let callbacks = TransferCallbacks { progress: &|_| {}, cancel: &|| false };
+    Ok(vidar_hub::sha256_of(weights, &callbacks)?.1)
 }
 
 impl Located {
@@ -267,7 +267,7 @@ impl Located {
     }
 }
 
-/// The architecture, as far as it is known without weights.
+/// The architecture, if it is known without weights.
 pub fn architecture(choice: &ModelChoice) -> Option<Da3Config> {
     match choice {
         ModelChoice::Official(checkpoint) => Variant::from_name(checkpoint.architecture).map(Variant::config),
@@ -277,7 +277,7 @@ pub fn architecture(choice: &ModelChoice) -> Option<Da3Config> {
     }
 }
 
-/// Length of the bounding side at which a network is happiest, px.
+/// Recommended length of the bounding side of the input, px.
 pub fn process_size_px(choice: &ModelChoice) -> usize {
     match choice {
         ModelChoice::Bundled => bundled::PROCESS_SIZE_PX,
@@ -285,24 +285,24 @@ pub fn process_size_px(choice: &ModelChoice) -> usize {
     }
 }
 
-/// A warning when the plan does not fit this machine.
-pub(crate) fn too_much(plan: &MemoryPlan) -> Option<Warning> {
+/// A warning if the plan exceeds the memory of this machine.
+pub(crate) fn memory_warning(plan: &MemoryPlan) -> Option<Warning> {
     let there = crate::system::hardware().memory_bytes?;
     (plan.total() > there).then(|| {
-        let message = format!("{} planned, this machine has {}", bytes(plan.total()), bytes(there));
+        let message = format!("planned memory {}, this machine has {}", bytes(plan.total()), bytes(there));
         Warning::new("memory", message).hint("fewer images at once, a smaller size, or a smaller model")
     })
 }
 
-/// A warning when the weights are made by rule.
-pub(crate) fn untrained(identity: &ModelIdentity) -> Option<Warning> {
-    (!identity.geometry_means_something).then(|| {
-        let message = "the weights are made by rule: this geometry means nothing";
+/// A warning if the weights are synthetic.
+pub(crate) fn untrained_warning(identity: &ModelIdentity) -> Option<Warning> {
+    (!identity.is_trained).then(|| {
+        let message = "the weights are synthetic: this geometry is meaningless";
         Warning::new("untrained", message).hint("`vidar model pull da3-small` fetches trained weights")
     })
 }
 
-/// Names of all networks that can be chosen.
+/// Names of all available networks.
 pub fn names() -> String {
     std::iter::once(bundled::NAME).chain(CHECKPOINTS.iter().map(|c| c.name)).collect::<Vec<_>>().join(", ")
 }
@@ -329,7 +329,7 @@ mod tests {
     }
 
     #[test]
-    fn a_card_tells_the_licence_of_weights_of_ones_own() {
+    fn the_licence_of_custom_weights_is_that_of_their_card() {
         let folder = tempfile::tempdir().unwrap();
         let says = |text: &str| {
             std::fs::write(folder.path().join("README.md"), text).unwrap();
@@ -343,10 +343,10 @@ mod tests {
     }
 
     #[test]
-    fn weights_made_by_rule_say_so() {
+    fn synthetic_weights_are_marked_as_untrained() {
         let store = Store::new(HubSettings::new("/no/such".into()));
         let located = locate(&ModelChoice::named("da3-small-untrained").unwrap(), None, &store).unwrap();
-        assert!(!located.identity.geometry_means_something && located.identity.weights_sha256.is_none());
+        assert!(!located.identity.is_trained && located.identity.weights_sha256.is_none());
         let missing = locate(&ModelChoice::named("da3-small").unwrap(), None, &store).unwrap_err();
         assert_eq!(missing.code(), "E0403");
     }
