@@ -1,9 +1,9 @@
-//! What the odometry refuses. A lost track is an outcome, not an error.
+//! Errors of the odometry. A lost track is an outcome, not an error.
 
 use thiserror::Error;
 use vidar_core::CameraId;
 
-/// Why the odometry refused its rig, its configuration or an event.
+/// An invalid rig, configuration or event.
 #[derive(Clone, Debug, PartialEq, Error)]
 #[non_exhaustive]
 pub enum OdometryError {

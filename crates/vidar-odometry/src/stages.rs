@@ -21,7 +21,7 @@ pub enum Stage {
     Keyframe,
     /// Frames that leave the window.
     Marginalise,
-    /// Covariances, health and what is told.
+    /// Covariances, health, keyframes and revised poses of the output.
     Output,
 }
 
@@ -43,14 +43,14 @@ impl Stage {
     pub fn name(self) -> &'static str {
         match self {
             Self::Pyramid => "pyramid",
-            Self::Initialise => "start",
+            Self::Initialise => "initialise",
             Self::Predict => "predict",
             Self::Match => "match",
             Self::Smooth => "smooth",
             Self::Distances => "distances",
             Self::Keyframe => "keyframe",
             Self::Marginalise => "marginalise",
-            Self::Output => "tell",
+            Self::Output => "output",
         }
     }
 }

@@ -58,7 +58,7 @@ fn fly(seed: u64, secs: f64, tracks: usize, rate_hz: f64) -> Run {
     odometry.start_at(first, disturbed(&first.truth, &mut random), SIGMAS).unwrap();
     let mut run = Run { nees: Vec::new(), relative_nees: Vec::new(), squared_errors: 0.0, frames: 0.0 };
     for (k, frame) in simulation.frames.iter().enumerate().skip(1) {
-        let StepOutput::SlidingWindowOdometry(state) =
+        let StepOutput::Tracking(state) =
             odometry.push(frame.id, frame.time, &frame.observations).unwrap()
         else {
             panic!("it was started");
@@ -106,21 +106,21 @@ fn evaluate(runs: &[Run], worst_ate_m: f64) {
 }
 
 #[test]
-fn pose_covariance_is_honest_over_50_short_flights() {
+fn pose_covariance_is_consistent_over_50_short_flights() {
     let runs: Vec<Run> = (0..50).map(|seed| fly(seed, 4.0, 40, 10.0)).collect();
     evaluate(&runs, 0.06);
 }
 
 #[test]
 #[ignore = "long: 50 flights of 20 s at 20 Hz"]
-fn pose_covariance_is_honest_over_50_long_flights() {
+fn pose_covariance_is_consistent_over_50_long_flights() {
     let runs: Vec<Run> = (0..50).map(|seed| fly(seed, 20.0, 110, 20.0)).collect();
     evaluate(&runs, 0.06);
 }
 
 /// What is wrong with the calibration, and what of it was left.
 struct Calibrated {
-    /// Clock offset that is not told, s, and the error of its estimate over its standard deviation.
+    /// Clock offset that is not given, s, and the error of its estimate over its standard deviation.
     offset_secs: f64,
     offset_error_secs: f64,
     offset_normalised: f64,
@@ -131,7 +131,7 @@ struct Calibrated {
     velocity_error_mps: f64,
 }
 
-/// Flies with a clock offset and a camera turned by `turn_deg` that nobody tells, both estimated.
+/// Flies with a clock offset and a camera turned by `turn_deg` that is not given, both estimated.
 fn calibrate(seed: u64, secs: f64, tracks: usize, offset_secs: f64, turn_deg: f64) -> Calibrated {
     let course = Course { kind: CourseKind::Eight, secs: secs + 2.0, speed: 1.4, phase: 0.37 * seed as f64 };
     let settings =
@@ -151,7 +151,7 @@ fn calibrate(seed: u64, secs: f64, tracks: usize, offset_secs: f64, turn_deg: f6
     odometry.start_at(first, disturbed(&first.truth, &mut random), sigmas).unwrap();
     let mut velocity_error_mps = f64::NAN;
     for frame in &simulation.frames[1..] {
-        let StepOutput::SlidingWindowOdometry(state) =
+        let StepOutput::Tracking(state) =
             odometry.push(frame.id, frame.time, &frame.observations).unwrap()
         else {
             panic!("it was started");
@@ -174,7 +174,7 @@ fn calibrate(seed: u64, secs: f64, tracks: usize, offset_secs: f64, turn_deg: f6
     }
 }
 
-fn judge_clocks(runs: &[Calibrated]) {
+fn evaluate_clocks(runs: &[Calibrated]) {
     let worst = runs.iter().map(|r| r.offset_error_secs.abs()).fold(0.0, f64::max);
     let rms = mean(runs.iter().map(|r| r.offset_normalised.powi(2))).sqrt();
     let velocity = runs.iter().map(|r| r.velocity_error_mps).fold(0.0, f64::max);
@@ -187,11 +187,11 @@ fn judge_clocks(runs: &[Calibrated]) {
         let (error, offset) = (r.offset_error_secs * 1e3, r.offset_secs * 1e3);
         assert!(error.abs() < 1.0, "{error:.3} ms off where {offset:.0} ms were to be found");
     }
-    assert!((0.4..2.0).contains(&rms), "errors are {rms:.2} of what is told");
+    assert!((0.4..2.0).contains(&rms), "errors are {rms:.2} of the stated σ");
     assert!(velocity < 0.3, "{velocity}");
 }
 
-fn judge_turns(runs: &[Calibrated]) {
+fn evaluate_turns(runs: &[Calibrated]) {
     let worst = runs.iter().map(|r| r.turn_error_deg).fold(0.0, f64::max);
     let nees = mean(runs.iter().map(|r| r.turn_nees)) / 3.0;
     let sigma = runs.iter().map(|r| r.turn_sigma_deg).fold(0.0, f64::max);
@@ -208,14 +208,14 @@ fn clocks_that_are_off_by_up_to_20_ms_are_set_within_a_millisecond() {
     let offsets = [-0.02, -0.01, 0.0, 0.003, 0.01, 0.02];
     let runs: Vec<Calibrated> =
         offsets.iter().zip(0..).map(|(offset, seed)| calibrate(seed, 8.0, 70, *offset, 0.0)).collect();
-    judge_clocks(&runs);
+    evaluate_clocks(&runs);
 }
 
 #[test]
 fn cameras_that_are_turned_by_two_degrees_are_set_right_with_their_clocks() {
     let runs: Vec<Calibrated> = (0..4).map(|seed| calibrate(seed, 8.0, 70, 0.005, 2.0)).collect();
-    judge_turns(&runs);
-    judge_clocks(&runs);
+    evaluate_turns(&runs);
+    evaluate_clocks(&runs);
 }
 
 #[test]
@@ -223,10 +223,10 @@ fn cameras_that_are_turned_by_two_degrees_are_set_right_with_their_clocks() {
 fn clocks_and_cameras_are_set_right_over_50_long_flights() {
     let offset = |seed: u64| (seed % 9) as f64 * 0.005 - 0.02;
     let clocks: Vec<Calibrated> = (0..50).map(|seed| calibrate(seed, 20.0, 110, offset(seed), 0.0)).collect();
-    judge_clocks(&clocks);
+    evaluate_clocks(&clocks);
     let both: Vec<Calibrated> = (0..50).map(|seed| calibrate(seed, 20.0, 110, offset(seed), 2.0)).collect();
-    judge_turns(&both);
-    judge_clocks(&both);
+    evaluate_turns(&both);
+    evaluate_clocks(&both);
 }
 
 /// A flight that pauses: its own time slows down to a halt within a second, rests, and goes on.
@@ -297,7 +297,7 @@ fn pause(seed: u64, rest_secs: f64) -> (f64, [f64; 3]) {
         // Known after a moment, as in truth.
         let rests = (5.4..5.0 + rest_secs).contains(&secs);
         let push = if rests { FeatureOdometry::push_resting } else { FeatureOdometry::push };
-        let StepOutput::SlidingWindowOdometry(state) =
+        let StepOutput::Tracking(state) =
             push(&mut odometry, frame.id, frame.time, &frame.observations).unwrap()
         else {
             panic!("it was started");
@@ -324,7 +324,7 @@ fn pause(seed: u64, rest_secs: f64) -> (f64, [f64; 3]) {
     (drift, nees)
 }
 
-fn judge_pauses(count: u64, rest_secs: f64) {
+fn evaluate_pauses(count: u64, rest_secs: f64) {
     let runs: Vec<(f64, [f64; 3])> = (0..count).map(|seed| pause(seed, rest_secs)).collect();
     let drift = runs.iter().map(|r| r.0).fold(0.0, f64::max);
     let [pose, bias, later] = std::array::from_fn(|k| mean(runs.iter().map(|r| r.1[k])));
@@ -340,11 +340,11 @@ fn judge_pauses(count: u64, rest_secs: f64) {
 
 #[test]
 fn a_rest_of_a_minute_drifts_by_less_than_two_centimetres() {
-    judge_pauses(2, 60.0);
+    evaluate_pauses(2, 60.0);
 }
 
 #[test]
 #[ignore = "long: 20 rests of a minute"]
-fn rests_of_a_minute_are_honest_over_20_runs() {
-    judge_pauses(20, 60.0);
+fn rests_of_a_minute_are_consistent_over_20_runs() {
+    evaluate_pauses(20, 60.0);
 }

@@ -91,7 +91,7 @@ fn flown(poses: &[StampedPose], start: Start) -> Flown {
     Flown(FlightPath::from_trajectory(&trajectory, &config).unwrap())
 }
 
-/// A window whose frames lie nearer together than this (root mean square) tells no scale by its extent, m.
+/// A window whose frames lie nearer together than this (root mean square) does not determine the scale by its extent, m.
 const RESTING_M: f64 = 0.05;
 
 /// Error of log(scale): of the window's extent, or where the body hardly moves (and noise would be all of it), the median
@@ -124,7 +124,7 @@ struct Outcome {
     waited_secs: Option<f64>,
     /// Why it was not, at last.
     failure: String,
-    /// Error of log(scale) when it was accepted, and its standard deviation as told.
+    /// Error of log(scale) when it was accepted, and its stated standard deviation.
     at_acceptance: f64,
     sigma: f64,
     /// Errors in the end: log(scale), and the body's velocity, m/s.
@@ -153,7 +153,7 @@ fn start_in_flight(flight: &impl Flight, from_secs: f64, later_secs: f64, seed: 
     for (k, frame) in simulation.frames.iter().enumerate() {
         let secs = k as f64 / settings.camera_rate_hz;
         match odometry.push(frame.id, frame.time, &frame.observations).unwrap() {
-            StepOutput::InFlightSolution { log_scale_sigma, .. } => {
+            StepOutput::Initialised { log_scale_sigma, .. } => {
                 outcome.waited_secs = Some(secs);
                 outcome.at_acceptance = log_scale_error(odometry.smoother().unwrap(), &simulation);
                 outcome.sigma = log_scale_sigma;
@@ -161,7 +161,7 @@ fn start_in_flight(flight: &impl Flight, from_secs: f64, later_secs: f64, seed: 
             StepOutput::Waiting(_) if secs > PATIENCE_SECS => return outcome,
             StepOutput::Waiting(Some(failure)) => outcome.failure = failure.to_string(),
             StepOutput::Waiting(None) => {}
-            StepOutput::SlidingWindowOdometry(state) => {
+            StepOutput::Tracking(state) => {
                 outcome.velocity_mps = velocity_error(&state, &frame.truth)
             }
         }
@@ -175,8 +175,8 @@ fn start_in_flight(flight: &impl Flight, from_secs: f64, later_secs: f64, seed: 
     outcome
 }
 
-/// Starts from the rest that `flight` begins with, and flies on for `later_secs`. At rest nothing tells the scale: it counts
-/// as accepted with the first frame at which it is told to be known as well as a start in flight must know it.
+/// Starts from the rest that `flight` begins with, and flies on for `later_secs`. At rest the scale is not observable: it counts
+/// as accepted with the first frame at which its stated σ is as well as a start in flight must know it.
 fn start_from_rest(flight: &impl Flight, later_secs: f64, seed: u64) -> Outcome {
     let settings = SimulationConfig { seed, ..Default::default() };
     let simulation = Simulation::new(flight, 0.0, REST_SECS + 1.0 + later_secs, &settings);
@@ -194,7 +194,7 @@ fn start_from_rest(flight: &impl Flight, later_secs: f64, seed: u64) -> Outcome 
     odometry.start_at(&simulation.frames[first], rest.state, rest.sigmas).unwrap();
     let limit = InFlightConfig::default().max_log_scale_sigma;
     for (k, frame) in simulation.frames.iter().enumerate().skip(first + 1) {
-        let StepOutput::SlidingWindowOdometry(state) =
+        let StepOutput::Tracking(state) =
             odometry.push(frame.id, frame.time, &frame.observations).unwrap()
         else {
             unreachable!("it was started")
@@ -223,7 +223,7 @@ fn accepted(outcomes: &[Outcome], of: fn(&Outcome) -> f64) -> Vec<f64> {
 }
 
 /// A row of the table, and what did not go well.
-fn tell(name: &str, outcomes: &[Outcome]) {
+fn report(name: &str, outcomes: &[Outcome]) {
     let at = |share| 100.0 * quantile(accepted(outcomes, |o| o.at_acceptance), share);
     let later = |share| 100.0 * quantile(accepted(outcomes, |o| o.later), share);
     let normalised = accepted(outcomes, |o| o.at_acceptance / o.sigma);
@@ -265,7 +265,7 @@ fn starts_on_a_built_in_flight_are_metric() {
     let course = Course { kind: CourseKind::Eight, secs: 40.0, speed: 1.6, phase: 0.2 };
     let outcomes: Vec<Outcome> =
         (0..5).map(|k| start_in_flight(&course, 1.0 + 4.0 * f64::from(k), 2.0, 100 + k as u64)).collect();
-    tell("figure of eight", &outcomes);
+    report("figure of eight", &outcomes);
     let started = outcomes.iter().filter(|o| o.waited_secs.is_some()).count();
     assert!(started >= 4, "{started} of {} started", outcomes.len());
     assert!(outcomes.iter().all(|o| !o.is_lost()));
@@ -283,7 +283,7 @@ fn starts_on_euroc_flights_are_metric() {
         };
         outcomes.push(start_in_flight(&flown(&poses, Start::InFlight), from, 2.0, 7));
     }
-    tell("EuRoC, four starts", &outcomes);
+    report("EuRoC, four starts", &outcomes);
     assert!(outcomes.iter().all(|o| o.waited_secs.is_some() && !o.is_lost()));
     assert!(quantile(accepted(&outcomes, |o| o.at_acceptance), 0.5) < 0.04);
 }
@@ -358,10 +358,10 @@ fn evaluate(what: &str, all: &[Outcome]) {
     for name in FLIGHTS {
         let of_flight: Vec<Outcome> = all.iter().filter(|o| o.name == name).cloned().collect();
         if !of_flight.is_empty() {
-            tell(name, &of_flight);
+            report(name, &of_flight);
         }
     }
-    tell("all", all);
+    report("all", all);
     tell_bad(all);
     assert!(quantile(accepted(all, |o| o.at_acceptance), 0.5) < 0.03);
     assert!(quantile(accepted(all, |o| o.later), 0.5) < 0.01);

@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-/// Where derivatives are taken, which decides what the smoother believes to know of its heading.
+/// Where derivatives are taken, which decides how much spurious information about the heading the smoother gains.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, schemars::JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum Linearisation {
@@ -10,7 +10,7 @@ pub enum Linearisation {
     /// was (observability constraint: Hesch, Kottas, Bowman, Roumeliotis, "Camera-IMU-based localization", IJRR 2014).
     #[default]
     ObservabilityConstrained,
-    /// States in the prior keep the point of their first use (Huang, Mourikis, Roumeliotis, IJRR 2010). Just as honest
+    /// States in the prior keep the point of their first use (Huang, Mourikis, Roumeliotis, IJRR 2010). As consistent
     /// later, but the rough states of the first seconds stay in every derivative.
     FirstEstimates,
     /// Everything at the present states: heading seems better known than it is.
@@ -25,7 +25,7 @@ pub struct SmootherConfig {
     pub max_frames: usize,
     /// Residual (in standard deviations) from which an observation pulls only linearly, 0.5…10.
     pub huber_sigmas: f64,
-    /// Squared whitened residual (2 degrees of freedom) beyond which an observation is told as an outlier, 4…100.
+    /// Squared whitened residual (2 degrees of freedom) beyond which an observation is reported as an outlier, 4…100.
     /// 9.2 is 99 %.
     pub outlier_chi2: f64,
     /// Keyframes whose observations a landmark keeps when its host leaves and it lives on with a newer host, 1…20.
@@ -66,7 +66,7 @@ impl Default for SmootherConfig {
 }
 
 impl SmootherConfig {
-    /// Checks every key against its range; the first that is outside is told with its range.
+    /// Checks every key against its range; the first that is outside is reported with its range.
     ///
     /// # Errors
     /// The key, its range and what was found.

@@ -45,8 +45,8 @@ impl Whitening {
     }
 }
 
-/// How much later than the IMU measurements' first and last instant the two states are, s: the clock offset as it is believed now
-/// minus what was believed when the IMU measurements were cut.
+/// How much later than the IMU measurements' first and last instant the two states are, s: the present estimate of the clock offset
+/// minus its estimate when the IMU measurements were cut.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub(crate) struct Shift {
     pub(crate) begin: f64,

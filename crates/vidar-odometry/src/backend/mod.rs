@@ -36,7 +36,7 @@ use rustc_hash::FxHashMap;
 use vidar_core::{CameraModel, Duration, FrameId, LandmarkId, Se3, Timestamp};
 use window::{Calibration, Frame, GaugePrior, ImuFactor, Landmark, LandmarkObservation};
 
-/// Why the smoother refuses.
+/// Errors of the smoother.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 #[non_exhaustive]
 pub enum SmootherError {
@@ -156,7 +156,7 @@ impl Smoother {
         &self.config
     }
 
-    /// Begins with one frame, whose `state` is believed as well as `sigmas` say. Everything held before is forgotten.
+    /// Begins with one frame, with `sigmas` the standard deviations of its `state`. Everything held before is discarded.
     ///
     /// # Errors
     /// A state that is not finite.
@@ -170,7 +170,7 @@ impl Smoother {
         self.start_about(id, time, state, state, sigmas)
     }
 
-    /// As [`Smoother::start`], with a first guess that is not what is believed: `reference` is, as well as `sigmas` say.
+    /// As [`Smoother::start`], with a first guess that differs from the mean of the gauge prior, `reference`.
     ///
     /// # Errors
     /// A state that is not finite.
@@ -379,7 +379,7 @@ impl Smoother {
         self.frames.iter().find(|f| f.id == id).map(|f| f.time)
     }
 
-    /// The landmark as it is believed now.
+    /// The present estimate of a landmark.
     pub fn landmark(&self, id: LandmarkId) -> Option<LandmarkEstimate> {
         let landmark = &self.landmarks[*self.slots.get(&id)?];
         Some(landmark.estimate(&self.frames, &self.calibration.body_from_camera))

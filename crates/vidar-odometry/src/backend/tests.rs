@@ -204,7 +204,7 @@ fn flown(
     odometry.start_at(first, NavState { bias: Bias::ZERO, ..first.truth }, sigmas).unwrap();
     for frame in &simulation.frames[1..] {
         let out = odometry.push(frame.id, frame.time, &frame.observations).unwrap();
-        assert!(matches!(out, StepOutput::SlidingWindowOdometry(_)));
+        assert!(matches!(out, StepOutput::Tracking(_)));
     }
     (odometry, simulation)
 }

@@ -31,7 +31,7 @@ pub struct Observation {
     pub covariance: Matrix2<f64>,
 }
 
-/// A landmark as believed.
+/// The estimate of a landmark.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct LandmarkEstimate {
     /// Its name.

@@ -2,7 +2,7 @@
 
 use thiserror::Error;
 
-/// Why the front end refused its input.
+/// Errors of the front end.
 #[derive(Clone, Debug, PartialEq, Error)]
 #[non_exhaustive]
 pub enum FrontendError {

@@ -3,8 +3,9 @@
 //! Semi-direct, after Forster et al., "SVO: Semidirect Visual Odometry for Monocular and Multicamera Systems", T-RO 2017:
 //!
 //! 1. [`Pyramid`]: the image at several resolutions.
-//! 2. [`ImageAligner`]: where the camera is, by sparse image alignment against the last keyframe and the last frame,
-//!    starting from what the gyroscope says. It predicts; nothing of it is kept as a measurement.
+//! 2. [`ImageAligner`]: sparse image alignment. The odometry uses it only where no valid IMU measurements predict the pose
+//!    (no IMU, or a saturated one): the landmarks that the last image showed are aligned from that image to the current
+//!    one, starting from a constant-velocity motion. It is a prediction, not a measurement.
 //! 3. [`Warp`], [`Template`], [`align_feature`]: each landmark is measured against its **keyframe's** patch, so that errors do
 //!    not add up from frame to frame, with a covariance per measurement.
 //! 4. [`Detector`]: new features of a keyframe in the cells of an [`OccupancyGrid`] that no landmark holds.

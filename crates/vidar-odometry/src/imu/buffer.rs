@@ -10,15 +10,15 @@ pub enum BufferError {
     /// Time does not advance.
     #[error("IMU sample at {found} s is not after the one before it at {previous} s; it is left out")]
     NotIncreasing {
-        /// Time of the reading.
+        /// Time of the sample.
         found: Timestamp,
-        /// Time of the newest reading held.
+        /// Time of the newest sample held.
         previous: Timestamp,
     },
     /// A component is not a number.
     #[error("IMU sample at {found} s is not finite; it is left out")]
     NotFinite {
-        /// Time of the reading.
+        /// Time of the sample.
         found: Timestamp,
     },
     /// The IMU measurements held do not reach as far back or ahead as asked.
@@ -36,13 +36,13 @@ pub enum BufferError {
 /// A stretch without IMU measurements, longer than the IMU's rate explains.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Gap {
-    /// Last reading before it.
+    /// Last sample before it.
     pub after: Timestamp,
     /// Its length.
     pub length: Duration,
 }
 
-/// A gap is told when two IMU measurements lie further apart than this many nominal periods.
+/// A gap is reported when two IMU measurements lie further apart than this many nominal periods.
 const GAP_PERIODS: f64 = 3.5;
 
 /// IMU measurements in the order of time; the oldest are forgotten by [`ImuBuffer::forget_before`].
@@ -92,7 +92,7 @@ impl ImuBuffer {
         self.samples.is_empty()
     }
 
-    /// Time of the newest reading.
+    /// Time of the newest sample.
     pub fn newest(&self) -> Option<Timestamp> {
         self.samples.back().map(|s| s.time)
     }
@@ -102,7 +102,7 @@ impl ImuBuffer {
         self.samples.iter()
     }
 
-    /// Time that one reading stands for when none is missing.
+    /// Time between samples when none is missing.
     pub fn nominal_period(&self) -> Duration {
         self.nominal_period
     }
@@ -139,7 +139,7 @@ impl ImuBuffer {
         out.extend(self.samples.range(begin..end));
         out.push(last);
         let limit = Duration::from_secs_f64(self.nominal_period.as_secs_f64() * GAP_PERIODS);
-        // Neighbours in the buffer, not in the cut, so that a cut within a gap tells the whole of it.
+        // Neighbours in the buffer, not in the cut, so that a cut within a gap reports the whole gap.
         let begin = begin.saturating_sub(1);
         let end = (end + 1).min(self.samples.len());
         let pairs = self.samples.range(begin..end).zip(self.samples.range(begin..end).skip(1));

@@ -34,7 +34,7 @@ pub struct StepNoise {
     pub period_secs: f64,
 }
 
-/// What the estimator believes of the IMU: densities as inflated for vibration, and the limits of its ranges.
+/// The IMU model of the estimator: densities as inflated for vibration, and the limits of its ranges.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ImuModel {
     /// White noise.
@@ -51,7 +51,7 @@ pub struct ImuModel {
     pub gravity_mps2: f64,
 }
 
-/// Walks below these are not believed of any MEMS IMU.
+/// Random walks below these are not realistic for a MEMS IMU.
 const MIN_GYRO_WALK: f64 = 1e-5;
 const MIN_ACCEL_WALK: f64 = 1e-3;
 
@@ -221,7 +221,7 @@ pub struct Preintegration {
     model: ImuModel,
     samples: Vec<ImuSample>,
     sealed: bool,
-    /// First and last reading, kept however long the stretch is.
+    /// First and last sample, kept however long the stretch is.
     ends: [Rates; 2],
 }
 
@@ -297,7 +297,7 @@ impl Preintegration {
         if self.sealed {
             self.samples.clear();
         } else {
-            // The first reading of `next` is the last of this stretch.
+            // The first sample of `next` is the last of this stretch.
             self.samples.extend_from_slice(next.samples.get(1..).unwrap_or(&[]));
         }
     }
@@ -325,7 +325,7 @@ impl Preintegration {
         &self.model
     }
 
-    /// What the first and the last reading say, the biases that were integrated with taken off.
+    /// Rates of the first and the last sample, less the biases of the integration.
     pub(crate) fn ends(&self) -> [Rates; 2] {
         self.ends.map(|r| Rates { turn: r.turn - self.bias.gyro, force: r.force - self.bias.accel })
     }

@@ -152,7 +152,7 @@ fn covariance_of_motion_is_what_noisy_readings_scatter() {
     }
     for k in 0..9 {
         let ratio = (sum[(k, k)] / exact.delta.covariance[(k, k)]).sqrt();
-        assert!((0.93..1.07).contains(&ratio), "component {k}: scatter {ratio:.3} of what is told");
+        assert!((0.93..1.07).contains(&ratio), "component {k}: scatter {ratio:.3} of the stated σ");
     }
 }
 

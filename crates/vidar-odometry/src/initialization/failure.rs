@@ -1,9 +1,10 @@
 //! Why there is no metric state yet, in words that say what to do.
 
+use crate::backend::SmootherError;
 use std::fmt;
 
-/// What stands in the way.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+/// Reason of an initialisation failure.
+#[derive(Clone, Debug, PartialEq)]
 #[non_exhaustive]
 pub enum InitFailureReason {
     /// Frames with IMU measurements between them.
@@ -40,14 +41,16 @@ pub enum InitFailureReason {
     ImageMotion,
     /// Mean specific force, m/s², which must be near gravity.
     SpecificForce,
-    /// Angle between the camera's orientation as given and as gyroscope and images tell it together, degrees.
+    /// Angle between the camera's orientation as given and as estimated from gyroscope and images, degrees.
     CameraOrientation,
+    /// The backend could not be built or rejected its first frames; the measured value and limit mean nothing.
+    Backend(SmootherError),
 }
 
 /// An failure reason with its measured value and the limit.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq)]
 pub struct InitFailure {
-    /// What stands in the way.
+    /// Reason of an initialisation failure.
     pub reason: InitFailureReason,
     /// What was measured.
     pub measured: f64,
@@ -56,6 +59,11 @@ pub struct InitFailure {
 }
 
 impl InitFailure {
+    /// A failure of the backend, with its own reason.
+    pub(crate) fn backend(error: SmootherError) -> Self {
+        Self::new(InitFailureReason::Backend(error), f64::NAN, f64::NAN)
+    }
+
     pub(crate) fn new(reason: InitFailureReason, measured: f64, limit: f64) -> Self {
         Self { reason, measured, limit }
     }
@@ -74,7 +82,8 @@ impl InitFailure {
 
 impl fmt::Display for InitFailure {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let (name, unit, advice) = match self.reason {
+        let (name, unit, advice) = match &self.reason {
+            InitFailureReason::Backend(error) => return write!(f, "backend: {error}"),
             InitFailureReason::Frames => ("frames with IMU measurements", "", "wait"),
             InitFailureReason::Seconds => ("recorded time", " s", "wait"),
             InitFailureReason::Tracks => ("shared tracks", "", "show more texture, move less abruptly"),

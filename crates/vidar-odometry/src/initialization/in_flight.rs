@@ -37,7 +37,7 @@ pub struct LoggedFrame {
     pub observations: Vec<TrackObservation>,
 }
 
-/// When a start in motion is believed.
+/// Settings and acceptance limits of the initialisation in motion.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct InFlightConfig {
@@ -59,7 +59,7 @@ pub struct InFlightConfig {
     pub accel_bias_sigma: f64,
     /// Standard deviation of the gyroscope's bias before anything is known, rad/s, 0.001…0.5.
     pub gyro_bias_sigma: f64,
-    /// Highest speed that is believed, m/s, 1…100.
+    /// Highest valid speed, m/s, 1…100.
     pub max_speed_mps: f64,
 }
 
@@ -100,11 +100,11 @@ pub enum InitOutcome {
     Failed(InitFailure),
 }
 
-/// Largest biases that are believed, m/s² and rad/s.
+/// Largest valid biases, m/s² and rad/s.
 const MAX_ACCEL_BIAS: f64 = 0.6;
 const MAX_GYRO_BIAS: f64 = 0.3;
 
-/// χ² per degree of freedom beyond which a fit is not believed.
+/// χ² per degree of freedom beyond which a solution is rejected.
 const MAX_CHI2_PER_DOF: f64 = 3.0;
 
 /// Steps of the window's solution.

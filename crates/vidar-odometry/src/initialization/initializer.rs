@@ -32,7 +32,7 @@ const ATTEMPT_EVERY: u32 = 2;
 /// Stillness that a static start needs, s.
 pub(crate) const STILL_SECS: f64 = 0.5;
 
-/// An image of the log, with the rotation first_from_body that the gyroscope tells.
+/// An image of the log, with the rotation first_from_body integrated from the gyroscope.
 #[derive(Debug)]
 struct LoggedRotation {
     frame: FrameId,
@@ -59,8 +59,6 @@ pub(crate) struct Initializer {
 /// A start that was found.
 pub(crate) struct InitialState {
     pub smoother: Smoother,
-    /// Standard deviation of ln(scale), where there is a scale.
-    pub log_scale_sigma: Option<f64>,
     /// Median distance of the landmarks.
     pub median_distance: f64,
     /// Images of the frames that the smoother holds.
@@ -112,7 +110,7 @@ impl Initializer {
         *self.in_flight.gyro_bias()
     }
 
-    /// Follows all tracks into an image and logs what was seen; a metric state if the log tells one.
+    /// Tracks all features into an image and logs their observations; a metric state if the log determines one.
     pub fn follow(
         &mut self,
         host: Rc<HostImage>,
@@ -138,34 +136,33 @@ impl Initializer {
             });
         }
         if !frame.0.is_multiple_of(ATTEMPT_EVERY) {
-            return Err(self.failure);
+            return Err(self.failure.clone());
         }
         let attempt = if self.is_mono { self.attempt_mono() } else { self.attempt_in_flight(chained) };
         if let Err(failure) = &attempt {
-            self.failure = *failure;
+            self.failure = failure.clone();
         }
         attempt
     }
 
     fn attempt_in_flight(&mut self, chained: bool) -> Result<InitialState, InitFailure> {
         if !chained {
-            return Err(self.failure);
+            return Err(self.failure.clone());
         }
         match self.in_flight.attempt(&self.log) {
             Ok(InitOutcome::Solved(started)) => {
-                let (log_scale_sigma, median_distance_m) =
-                    (started.log_scale_sigma, started.median_distance_m);
-                Ok(self.found(started.smoother, Some(log_scale_sigma), median_distance_m))
+                let median_distance_m = started.median_distance_m;
+                Ok(self.initial_state(started.smoother, median_distance_m))
             }
             Ok(InitOutcome::Failed(failure)) => Err(failure),
-            Err(_) => Err(self.failure),
+            Err(error) => Err(InitFailure::backend(error)),
         }
     }
 
     fn attempt_mono(&mut self) -> Result<InitialState, InitFailure> {
         let camera = self.tracker.camera().clone();
         let smoother = super::monocular::start(&self.log, &camera, &self.body_from_camera, &self.config)?;
-        Ok(self.found(smoother, None, 1.0 / INITIAL_INVERSE_DISTANCE))
+        Ok(self.initial_state(smoother, 1.0 / INITIAL_INVERSE_DISTANCE))
     }
 
     /// Measures all tracks in the newest image; how many were found.
@@ -226,9 +223,9 @@ impl Initializer {
         self.rotations.drain(..excess);
     }
 
-    fn found(&self, smoother: Smoother, log_scale_sigma: Option<f64>, median_distance: f64) -> InitialState {
+    fn initial_state(&self, smoother: Smoother, median_distance: f64) -> InitialState {
         let held = |t: &&LoggedRotation| smoother.frames().any(|f| f == t.frame);
         let hosts = self.rotations.iter().filter(held).map(|t| t.host.clone()).collect();
-        InitialState { smoother, log_scale_sigma, median_distance, hosts }
+        InitialState { smoother, median_distance, hosts }
     }
 }

@@ -11,7 +11,7 @@ use nalgebra::{Matrix3, SMatrix, SVector, Vector3};
 pub(crate) struct LinearView {
     /// Time after the first view, s.
     pub(crate) secs: f64,
-    /// Camera's place as far as IMU measurements alone tell: `Δp + R p_bc`.
+    /// Camera's place from IMU measurements alone: `Δp + R p_bc`.
     pub(crate) offset: Vector3<f64>,
     /// Derivative of `Δp` by the accelerometer bias.
     pub(crate) by_accel_bias: Matrix3<f64>,
@@ -199,7 +199,7 @@ fn reweight(
             let to = point - place(&views[*view], motion);
             let distance = to.norm().max(0.05 * typical);
             let residual = (across(ray) * to).norm() / distance;
-            // The linear stage knows the rotation only so well: ten sigmas are still believed in full.
+            // The rotation is only approximate in the linear stage: residuals up to ten sigmas keep their full weight.
             let robust = (10.0 * ray_sigma_rad / residual.max(1e-12)).min(1.0);
             *w = robust / (distance * distance);
         }

@@ -8,7 +8,7 @@
 //! 3. maximum a posteriori of the whole window with the smoother's own factors;
 //! 4. acceptance only if the scale's own standard deviation, the fit, the biases and a second solution agree.
 //!
-//! What stands in the way is told as a named condition with its measured value. The smoother that solved the window goes
+//! An initialisation failure names its reason, with the measured value and the limit. The smoother that solved the window goes
 //! on as the running one, so nothing is linearised at a scale that was not yet known.
 
 mod failure;

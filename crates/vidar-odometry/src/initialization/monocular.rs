@@ -29,9 +29,9 @@ pub(crate) fn start(
     body_from_camera: &Se3,
     config: &OdometryConfig,
 ) -> Result<Smoother, InitFailure> {
-    let refuse = |reason, measured, limit| InitFailure { reason, measured, limit };
+    let fail = |reason, measured, limit| InitFailure { reason, measured, limit };
     let Some((newest, earlier)) = log.split_last() else {
-        return Err(refuse(InitFailureReason::Frames, 0.0, 2.0));
+        return Err(fail(InitFailureReason::Frames, 0.0, 2.0));
     };
     let mut most = 0;
     for reference in earlier {
@@ -41,7 +41,7 @@ pub(crate) fn start(
             return between(reference, newest, &shared, camera, body_from_camera, config);
         }
     }
-    Err(refuse(InitFailureReason::Tracks, most as f64, MIN_SHARED as f64))
+    Err(fail(InitFailureReason::Tracks, most as f64, MIN_SHARED as f64))
 }
 
 fn shared_tracks(a: &LoggedFrame, b: &LoggedFrame) -> Vec<(TrackObservation, TrackObservation)> {
@@ -62,7 +62,7 @@ fn between(
     body_from_camera: &Se3,
     config: &OdometryConfig,
 ) -> Result<Smoother, InitFailure> {
-    let refuse = |reason, measured, limit| InitFailure { reason, measured, limit };
+    let fail = |reason, measured, limit| InitFailure { reason, measured, limit };
     let sigma_rad = RAY_SIGMA_PX / camera.intrinsics().fx;
     let ray = |s: &TrackObservation| camera.unproject(&s.pixel);
     let with_rays: Vec<(TrackObservation, TrackObservation, RayPair)> =
@@ -71,18 +71,18 @@ fn between(
     let mut solver = TwoViewSolver::new(TwoViewConfig::default());
     let found = solver.without_rotation(&pairs, sigma_rad).map_err(|failure| match failure {
         TwoViewFailure::NoParallax { median_rad, .. } => {
-            refuse(InitFailureReason::Parallax, median_rad.to_degrees(), MIN_PARALLAX_DEG)
+            fail(InitFailureReason::Parallax, median_rad.to_degrees(), MIN_PARALLAX_DEG)
         }
         TwoViewFailure::NoConsensus { inliers, needed } => {
-            refuse(InitFailureReason::Tracks, inliers as f64, needed as f64)
+            fail(InitFailureReason::Tracks, inliers as f64, needed as f64)
         }
         TwoViewFailure::TooFewPairs { found, needed } => {
-            refuse(InitFailureReason::Tracks, found as f64, needed as f64)
+            fail(InitFailureReason::Tracks, found as f64, needed as f64)
         }
     })?;
     let parallax_deg = found.median_parallax_rad.to_degrees();
     if parallax_deg < MIN_PARALLAX_DEG {
-        return Err(refuse(InitFailureReason::Parallax, parallax_deg, MIN_PARALLAX_DEG));
+        return Err(fail(InitFailureReason::Parallax, parallax_deg, MIN_PARALLAX_DEG));
     }
     let mut points: Vec<(TrackObservation, TrackObservation, f64)> = Vec::new();
     for ((a, b, pair), inlier) in with_rays.iter().zip(solver.inliers()) {
@@ -92,14 +92,14 @@ fn between(
         }
     }
     if points.len() < MIN_SHARED / 2 {
-        return Err(refuse(InitFailureReason::Tracks, points.len() as f64, 0.5 * MIN_SHARED as f64));
+        return Err(fail(InitFailureReason::Tracks, points.len() as f64, 0.5 * MIN_SHARED as f64));
     }
     let mut inverses: Vec<f64> = points.iter().map(|p| p.2).collect();
     inverses.sort_unstable_by(f64::total_cmp);
     let scale = INITIAL_INVERSE_DISTANCE / inverses[inverses.len() / 2];
     let b_from_a = Se3::new(found.b_from_a.rotation, found.b_from_a.translation / scale);
     build(first, second, &points, scale, &b_from_a, camera, body_from_camera, config)
-        .ok_or_else(|| refuse(InitFailureReason::ImageChi2, f64::INFINITY, 3.0))
+        .ok_or_else(|| fail(InitFailureReason::ImageChi2, f64::INFINITY, 3.0))
 }
 
 #[allow(clippy::too_many_arguments)] // the end of one function, kept apart for its length only

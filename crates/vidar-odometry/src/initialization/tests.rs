@@ -22,10 +22,10 @@ fn until_started(simulation: &Simulation) -> (Vec<InitFailure>, Option<(FrameId,
     for frame in &simulation.frames {
         match odometry.push(frame.id, frame.time, &frame.observations).unwrap() {
             StepOutput::Waiting(failure) => failures.extend(failure),
-            StepOutput::InFlightSolution { log_scale_sigma, .. } => {
+            StepOutput::Initialised { log_scale_sigma, .. } => {
                 return (failures, Some((frame.id, log_scale_sigma, odometry)));
             }
-            StepOutput::SlidingWindowOdometry(_) => unreachable!("it starts before it runs"),
+            StepOutput::Tracking(_) => unreachable!("it starts before it runs"),
         }
     }
     (failures, None)
@@ -175,7 +175,7 @@ fn gravity_is_as_strong_as_it_is_told() {
         let truth = &simulation.frames[simulation.frames.len() - 1].truth;
         (truth.world_from_body.rotation * (state.bias.accel - truth.bias.accel)).z
     };
-    // What is not told of gravity is found in the accelerometer's bias.
+    // What the configured gravity lacks is found in the accelerometer's bias.
     let (told, not_told) = (up_bias(9.78), up_bias(9.82));
     assert!(told.abs() < 0.015, "{told}");
     assert!((not_told - told + 0.04).abs() < 0.01, "{not_told} {told}");
@@ -197,7 +197,7 @@ fn upside_down_is_level_too() {
 }
 
 #[test]
-fn a_log_without_readings_or_tracks_is_refused() {
+fn a_log_without_imu_samples_or_tracks_fails() {
     let course = Course { kind: CourseKind::Eight, secs: 3.0, speed: 1.0, phase: 0.1 };
     let simulation = simulate(&course, &SimulationConfig::default());
     let mut start = InFlightInitializer::new(

@@ -8,7 +8,7 @@ const MAX_LEVER_M: f64 = 2.0;
 /// Clocks of camera and IMU are closer than this, s.
 const MAX_OFFSET_SECS: f64 = 1.0;
 
-/// Refuses what no rig has: a lever of metres, an offset of seconds, a focal length far from the image's size.
+/// Rejects calibrations that no rig has: a lever of metres, an offset of seconds, a focal length far from the image's size.
 pub(crate) fn check(camera: &RigCamera) -> Result<(), OdometryError> {
     let bad = |what, found: f64, expected| Err(OdometryError::BadCalibration { what, found, expected });
     let lever = camera.body_from_camera.translation.norm();

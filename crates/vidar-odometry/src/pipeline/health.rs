@@ -1,4 +1,4 @@
-//! Whether a running state may be believed, and when to give it up.
+//! Health of the tracked state, and when it is declared lost.
 
 use super::output::{DivergenceSign, LossReason};
 use crate::config::OdometryConfig;
@@ -6,17 +6,17 @@ use crate::imu::NavState;
 use crate::tracking::StepReport;
 use vidar_core::{Health, Timestamp};
 
-/// Below these numbers of fitting landmarks a frame has few features, or is as good as blind.
+/// Below these numbers of inlier landmarks a frame has few features, or is blind.
 const FEW_LANDMARKS: usize = 15;
 const BLIND_LANDMARKS: usize = 5;
 
-/// Share of contradicting observations that makes a frame suspicious; frames in a row that make the state so; and frames
-/// after which it is given up.
+/// Share of outlier observations that makes a frame suspicious; suspicious frames in a row after which the state is
+/// suspect; and after which it is declared lost.
 const SUSPICIOUS_SHARE: f64 = 0.5;
 const SUSPICIOUS_FRAMES: u32 = 5;
 const SUSPICIOUS_LIMIT: u32 = 25;
 
-/// Largest biases that are believed, rad/s and m/s².
+/// Largest valid biases, rad/s and m/s².
 const MAX_GYRO_BIAS: f64 = 0.5;
 const MAX_ACCEL_BIAS: f64 = 1.5;
 
@@ -26,33 +26,22 @@ pub(crate) const SETTLED_SCALE_STD: f64 = 0.02;
 /// The longest stretch without IMU measurements that is bridged, s.
 pub(crate) const MAX_IMU_GAP_SECS: f64 = 0.5;
 
-/// Watches a running odometry.
+/// Monitors the health of an odometry that is tracking.
 #[derive(Debug, Default)]
 pub(crate) struct HealthMonitor {
     blind_since: Option<Timestamp>,
     suspicious: u32,
-    /// Best knowledge of the scale so far; what was learned stays in the landmarks' depths.
-    scale_std: Option<f64>,
 }
 
-/// What the watch makes of a frame.
+/// Decision after one image.
 pub(crate) enum HealthDecision {
     Continue(Health),
     Lost(LossReason),
 }
 
 impl HealthMonitor {
-    /// The scale's standard deviation, after the window says `now`.
-    pub fn scale_std(&mut self, now: Option<f64>) -> f64 {
-        let best = match (self.scale_std, now.filter(|s| s.is_finite())) {
-            (Some(best), Some(now)) => Some(best.min(now)),
-            (best, now) => best.or(now),
-        };
-        self.scale_std = best;
-        best.unwrap_or(f64::INFINITY)
-    }
-
-    /// Judges the state after an image at `time`. `is_metric` says that an IMU gives the scale.
+    /// Evaluates the state after an image at `time`. `is_metric`: an IMU observes the scale; `scale_std`: the present
+    /// standard deviation of ln(scale).
     pub fn evaluate(
         &mut self,
         state: &NavState,
@@ -65,7 +54,7 @@ impl HealthMonitor {
         if let Some((sign, found, limit)) = self.divergence(state, step, is_metric, config) {
             return HealthDecision::Lost(LossReason::Diverged { sign, found, limit });
         }
-        // A body at rest needs no landmark: it is known not to move.
+        // A body at rest needs no landmark: its velocity is zero.
         let blind = step.fitting < BLIND_LANDMARKS && !step.is_still && !step.just_started;
         if blind {
             let since = *self.blind_since.get_or_insert(time);

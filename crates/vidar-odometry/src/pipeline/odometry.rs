@@ -53,7 +53,7 @@ pub struct InputCounts {
 #[derive(Debug)]
 enum Phase {
     Initializing(Box<Initializer>),
-    SlidingWindowOdometry(Box<SlidingWindowOdometry>),
+    Tracking(Box<SlidingWindowOdometry>),
 }
 
 /// Visual-inertial odometry of one camera and one IMU.
@@ -181,7 +181,7 @@ impl Odometry {
     pub fn tracks(&self) -> Vec<TrackRecord> {
         match &self.phase {
             Phase::Initializing(_) => Vec::new(),
-            Phase::SlidingWindowOdometry(window) => window.records(),
+            Phase::Tracking(window) => window.records(),
         }
     }
 
@@ -208,7 +208,7 @@ impl Odometry {
     /// Correction of the clock offset that the next frame is stamped with.
     fn estimated_offset(&self) -> Duration {
         match &self.phase {
-            Phase::SlidingWindowOdometry(window) => window.smoother.next_frame_offset(),
+            Phase::Tracking(window) => window.smoother.next_frame_offset(),
             Phase::Initializing(_) => Duration::ZERO,
         }
     }
@@ -216,7 +216,7 @@ impl Odometry {
     /// The calibration as estimated on the way: where the camera is on the body, and what to add to image stamps to get
     /// the IMU's time. `None` before the start.
     pub fn calibration(&mut self) -> Option<CalibrationEstimate> {
-        let Phase::SlidingWindowOdometry(window) = &mut self.phase else { return None };
+        let Phase::Tracking(window) = &mut self.phase else { return None };
         let estimate = window.smoother.calibration();
         let time_offset_secs = self.camera.time_offset.as_secs_f64() + estimate.time_offset_secs;
         Some(CalibrationEstimate { time_offset_secs, ..estimate })
@@ -272,12 +272,12 @@ impl Odometry {
                     _ if resting => self.start_static(frame, &host, time),
                     Ok(found) => self.start_in_flight(found, frame, &host),
                     Err(failure) => {
-                        self.failure = failure;
+                        self.failure = failure.clone();
                         Status::Waiting(failure)
                     }
                 }
             }
-            Phase::SlidingWindowOdometry(window) => {
+            Phase::Tracking(window) => {
                 let frame_id = host.frame;
                 let step = window.step(FrameInput { host, time, preintegration, imu_still }, &mut self.clock);
                 self.check.add(&self.camera.model, &window.tracker.tracks, frame_id, gyro);
@@ -287,10 +287,7 @@ impl Odometry {
                 }
                 match step {
                     Ok(step) => self.report(&step, frame, frame_id),
-                    Err(_) => {
-                        let (sign, found, limit) = (DivergenceSign::NotFinite, f64::NAN, 0.0);
-                        self.lose(LossReason::Diverged { sign, found, limit })
-                    }
+                    Err(error) => self.lose(LossReason::Backend(error)),
                 }
             }
         }
@@ -298,7 +295,7 @@ impl Odometry {
 
     /// A stretch without images or IMU measurements that cannot be bridged.
     fn gap_before(&mut self, time: Timestamp) -> Option<LossReason> {
-        let (Phase::SlidingWindowOdometry(_), Some(last)) = (&self.phase, self.last_frame) else {
+        let (Phase::Tracking(_), Some(last)) = (&self.phase, self.last_frame) else {
             return None;
         };
         let secs = (time - last).as_secs_f64();
@@ -317,11 +314,12 @@ impl Odometry {
 
     /// The state carried forward by the IMU, for an image that tells nothing.
     fn coast(&mut self, preintegration: Option<Preintegration>, time: Timestamp) -> Status {
-        let Phase::SlidingWindowOdometry(window) = &mut self.phase else {
-            return Status::Waiting(self.failure);
+        let Phase::Tracking(window) = &mut self.phase else {
+            return Status::Waiting(self.failure.clone());
         };
-        let Some(state) = window.state() else { return Status::Waiting(self.failure) };
+        let Some(state) = window.state() else { return Status::Waiting(self.failure.clone()) };
         let covariance = window.smoother.covariance_of_newest().unwrap_or_else(unknown_covariance);
+        let scale_std = present_scale_std(&mut window.smoother, self.imu_model.is_some());
         let (state, covariance) = match &preintegration {
             Some(preintegration) => {
                 let carried = propagate(&state, &covariance, preintegration);
@@ -329,12 +327,11 @@ impl Odometry {
             }
             None => (state, covariance),
         };
-        let is_metric = self.imu_model.is_some();
-        let mut tracking = Tracking {
+        let tracking = Tracking {
             segment: self.segment,
             state: public_state(&state, time),
             covariance,
-            scale_std: self.health_monitor.scale_std(None),
+            scale_std,
             health: Health::Degraded,
             tracked: 0,
             tracks: TrackSummary::default(),
@@ -342,9 +339,6 @@ impl Odometry {
             keyframe: None,
             revised: Vec::new(),
         };
-        if !is_metric {
-            tracking.scale_std = f64::INFINITY;
-        }
         Status::Tracking(Box::new(tracking))
     }
 
@@ -353,7 +347,7 @@ impl Odometry {
         let gap = self.imu.interval(from, time, &mut self.interval).ok()?;
         self.counts.imu_gaps += usize::from(gap.is_some());
         let (bias, spare) = match &mut self.phase {
-            Phase::SlidingWindowOdometry(window) => (window.state()?.bias, window.spare_preintegration()),
+            Phase::Tracking(window) => (window.state()?.bias, window.spare_preintegration()),
             Phase::Initializing(initializer) => {
                 (Bias { gyro: initializer.gyro_bias(), accel: Vector3::zeros() }, None)
             }
@@ -386,10 +380,10 @@ impl Odometry {
             Ok(at_rest) => at_rest,
             Err(failure) => return self.wait(failure),
         };
-        let Ok(mut smoother) = self.smoother() else { return self.wait(self.failure) };
+        let Ok(mut smoother) = self.smoother() else { return self.wait(self.failure.clone()) };
         let begun = smoother.start(host.frame, time, at_rest.state, at_rest.sigmas);
         if begun.and_then(|()| smoother.mark_keyframe(host.frame)).is_err() {
-            return self.wait(self.failure);
+            return self.wait(self.failure.clone());
         }
         let mut tracker = Tracker::new(self.camera.model.clone(), &self.frontend, IMAGE_NOISE_GRAY);
         tracker.detect(host, 2 * self.config.max_landmarks, INITIAL_INVERSE_DISTANCE);
@@ -401,7 +395,7 @@ impl Odometry {
             hosts,
             INITIAL_INVERSE_DISTANCE,
         );
-        let Some(mut window) = window else { return self.wait(self.failure) };
+        let Some(mut window) = window else { return self.wait(self.failure.clone()) };
         window.stand(time);
         self.begin(window, frame, host.frame)
     }
@@ -415,10 +409,9 @@ impl Odometry {
             &self.frontend,
         )));
         let Phase::Initializing(before) = std::mem::replace(&mut self.phase, waiting) else {
-            return Status::Waiting(self.failure);
+            return Status::Waiting(self.failure.clone());
         };
         let typical = 1.0 / found.median_distance.clamp(0.1, 100.0);
-        self.health_monitor.scale_std(found.log_scale_sigma);
         let window = SlidingWindowOdometry::new(
             self.config.clone(),
             found.smoother,
@@ -426,18 +419,18 @@ impl Odometry {
             found.hosts,
             typical,
         );
-        let Some(window) = window else { return self.wait(self.failure) };
+        let Some(window) = window else { return self.wait(self.failure.clone()) };
         self.begin(window, frame, host.frame)
     }
 
     fn begin(&mut self, window: SlidingWindowOdometry, frame: &Frame, id: FrameId) -> Status {
-        self.phase = Phase::SlidingWindowOdometry(Box::new(window));
+        self.phase = Phase::Tracking(Box::new(window));
         let step = StepReport { just_started: true, is_keyframe: true, ..StepReport::default() };
         self.report(&step, frame, id)
     }
 
     fn wait(&mut self, failure: InitFailure) -> Status {
-        self.failure = failure;
+        self.failure = failure.clone();
         Status::Waiting(failure)
     }
 
@@ -448,14 +441,13 @@ impl Odometry {
     /// What is known after a step.
     fn report(&mut self, step: &StepReport, frame: &Frame, id: FrameId) -> Status {
         let is_metric = self.imu_model.is_some();
-        let Phase::SlidingWindowOdometry(window) = &mut self.phase else {
-            return Status::Waiting(self.failure);
+        let Phase::Tracking(window) = &mut self.phase else {
+            return Status::Waiting(self.failure.clone());
         };
-        let Some(state) = window.state() else { return Status::Waiting(self.failure) };
+        let Some(state) = window.state() else { return Status::Waiting(self.failure.clone()) };
         let smoother = &mut window.smoother;
         let covariance = smoother.covariance_of_newest().unwrap_or_else(unknown_covariance);
-        let now = if is_metric { smoother.log_scale_sigma() } else { None };
-        let scale_std = self.health_monitor.scale_std(now);
+        let scale_std = present_scale_std(smoother, is_metric);
         let health = match self.health_monitor.evaluate(
             &state,
             step,
@@ -503,7 +495,7 @@ impl Odometry {
 
     /// A clock offset that is well known is not forgotten with the state.
     fn keep_clock_offset(&mut self, reason: &LossReason) {
-        let Phase::SlidingWindowOdometry(window) = &mut self.phase else { return };
+        let Phase::Tracking(window) = &mut self.phase else { return };
         let estimate = window.smoother.calibration();
         let is_known = estimate.time_offset_sigma_secs.is_some_and(|s| s < KNOWN_CLOCK_SECS);
         if is_known && !matches!(reason, LossReason::Diverged { .. }) {
@@ -527,7 +519,13 @@ impl Odometry {
     }
 }
 
-/// Nothing is known.
+/// Standard deviation of ln(scale) of the present window; infinite where it is not observable or not finite.
+fn present_scale_std(smoother: &mut Smoother, is_metric: bool) -> f64 {
+    let sigma = if is_metric { smoother.log_scale_sigma() } else { None };
+    sigma.filter(|s| s.is_finite()).unwrap_or(f64::INFINITY)
+}
+
+/// Covariance of a state that the backend gives none for.
 fn unknown_covariance() -> vidar_core::NavCovariance {
     vidar_core::NavCovariance::from_diagonal_element(f64::INFINITY)
 }

@@ -1,4 +1,4 @@
-//! Whether the gyroscope and the images tell the same rotation: the camera's orientation on the body is the part of a
+//! Whether gyroscope and images agree on the rotation: the camera's orientation on the body is the part of a
 //! calibration that is wrong most often (inverted, or of another convention), and wrong by much.
 //!
 //! Both rates are compared without their means, so a gyroscope bias does not matter. The rotation of the images is the

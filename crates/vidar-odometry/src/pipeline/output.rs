@@ -1,6 +1,7 @@
 //! What the odometry says of every image.
 
 use crate::initialization::InitFailure;
+use crate::backend::SmootherError;
 use std::fmt;
 use vidar_core::{
     FrameId, Health, NavCovariance, NavState, OdometryKeyframe, RevisedPose, SparseLandmark, Timestamp,
@@ -90,7 +91,7 @@ pub struct TrackSummary {
 }
 
 /// Why a state was given up.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq)]
 pub enum LossReason {
     /// Too few landmarks for too long.
     NoFeatures {
@@ -107,6 +108,8 @@ pub enum LossReason {
         /// Length of the gap, s.
         secs: f64,
     },
+    /// The backend rejected the image's frame, observations or marginalisation.
+    Backend(SmootherError),
     /// The state contradicts the sensors or physics.
     Diverged {
         /// What gave it away.
@@ -141,6 +144,7 @@ impl fmt::Display for LossReason {
             Self::NoFeatures { secs } => write!(f, "no landmark was seen for {secs:.2} s"),
             Self::ImuGap { secs } => write!(f, "no IMU measurement for {secs:.2} s"),
             Self::ImageGap { secs } => write!(f, "no image for {secs:.2} s"),
+            Self::Backend(error) => write!(f, "backend: {error}"),
             Self::Diverged { sign, found, limit } => match sign {
                 DivergenceSign::Speed => write!(f, "speed {found:.1} m/s > {limit:.1} m/s"),
                 DivergenceSign::GyroBias => write!(f, "gyroscope bias {found:.2} rad/s > {limit:.2} rad/s"),
@@ -165,6 +169,12 @@ impl fmt::Display for LossReason {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_backend_error_is_reported_with_its_own_reason() {
+        let reason = LossReason::Backend(SmootherError::Full { held: 18 });
+        assert!(reason.to_string().contains("18 frames already"), "{reason}");
+    }
 
     #[test]
     fn a_loss_names_its_reason_with_values() {

@@ -22,7 +22,7 @@ pub struct FeatureOdometryConfig {
     pub smoother: SmootherConfig,
     /// The start.
     pub in_flight: InFlightConfig,
-    /// What is believed of the IMU.
+    /// The IMU model of the smoother.
     pub imu: ImuModel,
     /// Nominal rate of IMU measurements, Hz.
     pub imu_rate_hz: f64,
@@ -38,7 +38,7 @@ pub struct FeatureOdometryConfig {
     pub min_parallax_deg: f64,
     /// Frames between attempts to start.
     pub attempt_every: usize,
-    /// Whether tracks and IMU measurements tell when the body rests, as in the whole odometry; else only
+    /// Whether standstill is detected from tracks and IMU measurements, as in the whole odometry; else only
     /// [`FeatureOdometry::push_resting`] does.
     pub notices_rest: bool,
 }
@@ -68,14 +68,14 @@ pub enum StepOutput {
     /// There is no metric state; why not, when an attempt was made.
     Waiting(Option<InitFailure>),
     /// The start succeeded with this frame.
-    InFlightSolution {
+    Initialised {
         /// State of the frame.
         state: NavState,
         /// Standard deviation of log(scale).
         log_scale_sigma: f64,
     },
     /// The state of the frame.
-    SlidingWindowOdometry(NavState),
+    Tracking(NavState),
 }
 
 /// Standard deviations of a resting body's velocity, m/s, and motion from frame to frame, m and rad; after this long its
@@ -205,7 +205,7 @@ impl FeatureOdometry {
     /// Takes the tracks of the next frame, with its stamp.
     ///
     /// # Errors
-    /// What the smoother refuses; IMU measurements that do not reach to the frame count as missing.
+    /// Errors of the smoother; IMU measurements that do not reach to the frame count as missing.
     pub fn push(
         &mut self,
         id: FrameId,
@@ -226,7 +226,7 @@ impl FeatureOdometry {
             Some(mut smoother) => {
                 let state = self.advance(&mut smoother, id, time, observations, preintegration);
                 self.smoother = Some(smoother);
-                state.map(StepOutput::SlidingWindowOdometry)
+                state.map(StepOutput::Tracking)
             }
             None => self.try_start(id, time, observations, preintegration),
         }
@@ -301,7 +301,7 @@ impl FeatureOdometry {
                 self.trim(&mut smoother)?;
                 let state = smoother.newest().map_or(NavState::REST, |(.., s)| *s);
                 self.smoother = Some(smoother);
-                Ok(StepOutput::InFlightSolution { state, log_scale_sigma: started.log_scale_sigma })
+                Ok(StepOutput::Initialised { state, log_scale_sigma: started.log_scale_sigma })
             }
         }
     }

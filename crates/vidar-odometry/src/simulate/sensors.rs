@@ -81,7 +81,7 @@ pub struct SimulatedFrame {
     pub observations: Vec<TrackObservation>,
 }
 
-/// A flight as sensors tell it.
+/// Sensor data of a flight.
 #[derive(Clone, Debug)]
 pub struct Simulation {
     /// The camera: EuRoC's.

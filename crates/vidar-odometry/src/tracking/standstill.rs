@@ -1,4 +1,4 @@
-//! Whether the camera stands still, told from images and from the IMU.
+//! Standstill detection from images and from the IMU.
 
 use super::track::Track;
 use crate::imu::StepNoise;
@@ -22,7 +22,7 @@ const STILL_ACCEL: f64 = 0.15;
 
 /// Motion of tracks since the body was last seen to move.
 ///
-/// Standing is judged against one place in the past, not from image to image: what creeps slowly gets away from it.
+/// Standstill is evaluated against one image in the past, not from image to image, so that slow motion is detected.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct ImageMotion {
     reference: FxHashMap<LandmarkId, Pixel>,
@@ -109,7 +109,7 @@ impl ImuStatistics {
     pub fn of<'a>(samples: impl Iterator<Item = &'a ImuSample>) -> Self {
         let (mut n, mut gyro, mut accel) = (0.0_f64, Vector3::zeros(), Vector3::zeros());
         let (mut gyro2, mut accel2) = (0.0, 0.0);
-        // Sums about the first reading keep their digits.
+        // Sums relative to the first sample keep their precision.
         let mut origin: Option<&ImuSample> = None;
         for sample in samples {
             let first = *origin.get_or_insert(sample);
@@ -147,7 +147,7 @@ mod tests {
     use super::*;
     use crate::simulate::Random;
 
-    /// Whether 60 tracks with noise of `sigma` pixels are told to be still after a second of `motion` (pixels per second at
+    /// Whether 60 tracks with noise of `sigma` pixels are reported as still after a second of `motion` (pixels per second at
     /// a place, from the middle).
     fn is_still(sigma: f64, motion: impl Fn(Vector2<f64>) -> Vector2<f64>) -> bool {
         let mut random = Random::new(5);

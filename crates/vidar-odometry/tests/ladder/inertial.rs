@@ -27,7 +27,7 @@ fn a_second_without_readings_is_a_loss_with_its_reason_and_a_new_segment() {
 }
 
 #[test]
-fn a_saturated_gyroscope_is_not_believed() {
+fn a_saturated_gyroscope_is_not_used() {
     let mut recording = recording();
     let from = EPOCH + Duration::from_millis(5010);
     for sample in &mut recording.imu {
@@ -48,7 +48,7 @@ fn inverted() -> Recording {
 }
 
 #[test]
-fn an_inverted_extrinsic_is_refused_in_words() {
+fn an_inverted_extrinsic_is_rejected_with_its_reason() {
     let outputs = inverted().run();
     let healthy = outputs.iter().filter(|o| o.health() == Health::Ok).count();
     assert!(healthy < outputs.len() / 20, "{healthy} of {}", outputs.len());

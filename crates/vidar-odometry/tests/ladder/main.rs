@@ -1,7 +1,7 @@
 //! The robustness ladder in a fast form: one small rendered flight, corrupted in every way that recordings are corrupted.
 //!
-//! What is demanded is never accuracy alone but honesty: a state that is told as healthy is right, and what cannot be
-//! right is refused, degraded or lost with a reason. The long forms are run with
+//! Each test demands accuracy and consistency: a state reported as healthy is accurate, and what cannot be accurate is
+//! rejected, degraded or lost with a reason. The long forms are run with
 //! `cargo test --release -p vidar-odometry --test ladder -- --ignored`.
 
 #![allow(clippy::unwrap_used, clippy::panic, clippy::print_stderr)] // helpers of tests are test code, though not marked so
@@ -15,7 +15,7 @@ use recording::{clean_outputs, lost, recording};
 use vidar_core::{ImuSample, SensorEvent};
 
 #[test]
-fn a_clean_flight_is_tracked_to_centimetres_with_an_honest_covariance() {
+fn a_clean_flight_is_tracked_to_centimetres_with_a_consistent_covariance() {
     let recording = recording();
     let outputs = clean_outputs();
     let report = recording.evaluate(outputs);

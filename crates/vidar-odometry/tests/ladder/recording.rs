@@ -135,7 +135,7 @@ impl Recording {
         (outputs, odometry)
     }
 
-    /// Judges the poses that were told as metric, all of one segment.
+    /// Evaluates the poses that were reported as metric, all of one segment.
     pub fn evaluate(&self, outputs: &[OdometryOutput]) -> TrajectoryReport {
         let poses: Vec<StampedPose> = outputs
             .iter()
@@ -179,7 +179,7 @@ pub fn lost(outputs: &[OdometryOutput]) -> Vec<String> {
     outputs.iter().filter_map(reason).collect()
 }
 
-/// Whether every pose told as healthy and metric is within `limit_m` of the truth after the best rigid motion.
+/// Whether every pose reported as healthy and metric is within `limit_m` of the truth after the best rigid motion.
 pub fn within(rung: &str, recording: &Recording, outputs: &[OdometryOutput], limit_m: f64) {
     let (ate, share) = recording.error_and_share(rung, outputs);
     assert!(ate < limit_m, "{rung}: {ate} m of {limit_m} m, {share} of the images");

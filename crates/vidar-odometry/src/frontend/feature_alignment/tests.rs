@@ -113,7 +113,7 @@ fn rendered_features_are_found_to_a_tenth_of_a_pixel() {
 }
 
 #[test]
-fn stated_covariances_are_honest() {
+fn stated_covariances_are_consistent() {
     for (view, sigma) in [(1, 2.0), (2, 2.0), (1, 8.0)] {
         let s = score(scene(), Trial { view, gain: 1.0, sigma, disturbed_px: 0.5, blur_px: 1, smooth: true });
         let mean = s.normalised.iter().sum::<f64>() / s.normalised.len() as f64;

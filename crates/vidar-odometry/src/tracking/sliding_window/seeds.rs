@@ -6,7 +6,7 @@ use crate::tracking::CameraPoses;
 use crate::tracking::{host_covariance, parallax, unknown_distance};
 use vidar_core::{FrameId, LandmarkId, LieGroup};
 
-/// Mean chi-square per measurement (two degrees of freedom) up to which a seed's distance is believed.
+/// Mean chi-square per measurement (two degrees of freedom) up to which a seed's distance is accepted.
 const DISTANCE_GATE: f64 = 9.0;
 
 /// A seed becomes a landmark when its distance is known to this share...
