@@ -339,6 +339,18 @@ pub struct EvalArgs {
     /// Reference trajectory or cloud; not for a run folder.
     #[arg(value_hint = ValueHint::AnyPath)]
     pub truth: Option<PathBuf>,
+    /// Format of both trajectories, instead of detecting it: tum, euroc, kitti.
+    #[arg(long, value_name = "FORMAT", help_heading = "Input")]
+    pub trajectory_format: Option<String>,
+    /// Body whose poses both trajectories hold: imu, or camera0, camera1, ….
+    #[arg(long, value_name = "BODY", help_heading = "Input")]
+    pub trajectory_body: Option<String>,
+    /// File with one time per pose, for KITTI trajectories.
+    #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath, help_heading = "Input")]
+    pub timestamps: Option<PathBuf>,
+    /// Unit of times, instead of detecting it: s, ms, us, ns.
+    #[arg(long, value_name = "UNIT", help_heading = "Input")]
+    pub time_unit: Option<String>,
     /// How settings are given.
     #[command(flatten)]
     pub config: ConfigArgs,

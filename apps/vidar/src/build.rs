@@ -1,10 +1,10 @@
 //! Converts flags to values of the library; each is checked here or at its first use.
 
-use crate::args::{ConfigArgs, InputArgs, OutputArgs, RunArgs, WorldArgs};
+use crate::args::{ConfigArgs, EvalArgs, InputArgs, OutputArgs, RunArgs, WorldArgs};
 use std::path::Path;
 use vidar::config::Origin;
 use vidar::core::{BodyFrame, CameraId, Se3, So3};
-use vidar::dataset::{CameraFlag, OpenOptions};
+use vidar::dataset::{CameraFlag, OpenOptions, TrajectoryReadOptions};
 use vidar::run_folder::Place;
 use vidar::synth::{FlightKind, SceneKind, Start, SynthConfig};
 use vidar::{Error, Layered};
@@ -120,6 +120,19 @@ pub fn open_options(input: &InputArgs) -> Result<OpenOptions, Error> {
     options.depth_intrinsics = input.depth_intrinsics.as_deref().map(four).transpose()?;
     options.color_from_depth = input.color_from_depth.as_deref().map(motion).transpose()?;
     Ok(options)
+}
+
+/// How the trajectories of `vidar eval` are read.
+pub fn trajectory_options(args: &EvalArgs) -> Result<TrajectoryReadOptions, Error> {
+    let time_unit = args.time_unit.as_deref().map(str::parse).transpose()?;
+    let times =
+        args.timestamps.as_deref().map(|file| vidar::dataset::read_times(file, time_unit)).transpose()?;
+    Ok(TrajectoryReadOptions {
+        format: args.trajectory_format.as_deref().map(str::parse).transpose()?,
+        body: args.trajectory_body.as_deref().map(body).transpose()?,
+        time_unit,
+        times,
+    })
 }
 
 fn body(text: &str) -> Result<BodyFrame, Error> {

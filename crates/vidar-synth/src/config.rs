@@ -1,5 +1,6 @@
 //! What to simulate.
 
+use crate::device::DeviceConfig;
 use crate::error::SynthError;
 use serde::{Deserialize, Serialize};
 use vidar_core::ImuNoise;
@@ -43,6 +44,10 @@ pub enum FlightKind {
     Orbit,
     /// Figures of eight with roll, pitch and yaw, about 2 m/s, up to about 2 rad/s.
     Aggressive,
+    /// A hand-held camera, mostly below 0.5 m/s: standing, turning on the spot, walking a few steps, swaying always.
+    Handheld,
+    /// A hand-held camera in lively use: brisk steps up to about 1 m/s, quick turns up to about 2 rad/s.
+    HandheldLively,
 }
 
 /// How the sequence begins.
@@ -111,6 +116,10 @@ pub struct SynthConfig {
     pub clutter: usize,
     /// Width of the Gaussian that smooths a given trajectory's jitter, s, 0…1. 0 passes through every pose.
     pub trajectory_smoothing_secs: f64,
+    /// Share of walls, floor, ceiling and furniture without texture, 0…1.
+    pub bare_share: f64,
+    /// How the sequence is recorded: lens, mount, shutter, clocks, compression, calibration.
+    pub device: DeviceConfig,
 }
 
 impl Default for SynthConfig {
@@ -140,6 +149,8 @@ impl Default for SynthConfig {
             scan_noise_m: 0.0,
             clutter: 45,
             trajectory_smoothing_secs: 0.06,
+            bare_share: 0.0,
+            device: DeviceConfig::default(),
         }
     }
 }
@@ -203,6 +214,8 @@ impl SynthConfig {
         within("scan_noise_m", self.scan_noise_m, 0.0, 0.1, "0 to 0.1 m")?;
         ensure(self.clutter <= 1000, "clutter", "0 to 1000", self.clutter)?;
         within("trajectory_smoothing_secs", self.trajectory_smoothing_secs, 0.0, 1.0, "0 to 1 s")?;
+        within("bare_share", self.bare_share, 0.0, 1.0, "0 to 1")?;
+        self.device.validate()?;
         if let Start::Static { secs } = self.start {
             within("start.static.secs", secs, 0.0, 60.0, "0 to 60 s")?;
         }
@@ -235,8 +248,11 @@ mod tests {
 
     #[test]
     fn presets_are_valid() {
-        for config in [SynthConfig::default(), SynthConfig::demo(), SynthConfig::euroc()] {
+        SynthConfig::default().validate().unwrap();
+        for name in crate::PRESETS {
+            let config = SynthConfig::preset(name).unwrap();
             config.validate().unwrap();
+            config.camera().unwrap();
         }
     }
 
@@ -271,9 +287,11 @@ mod tests {
 
     #[test]
     fn toml_round_trip_keeps_every_key_and_refuses_unknown_ones() {
-        let config = SynthConfig { start: Start::Static { secs: 2.5 }, ..SynthConfig::euroc() };
-        let text = toml::to_string(&config).unwrap();
-        assert_eq!(toml::from_str::<SynthConfig>(&text).unwrap(), config);
+        let still = SynthConfig { start: Start::Static { secs: 2.5 }, ..SynthConfig::euroc() };
+        for config in [still, SynthConfig::phone_slow()] {
+            let text = toml::to_string(&config).unwrap();
+            assert_eq!(toml::from_str::<SynthConfig>(&text).unwrap(), config);
+        }
         assert!(toml::from_str::<SynthConfig>("widht = 3").is_err());
     }
 }

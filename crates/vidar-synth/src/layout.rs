@@ -1,6 +1,7 @@
 //! The texts and clouds of a EuRoC folder (ASL format).
 
 use crate::config::SynthConfig;
+use crate::device::Mount;
 use crate::error::SynthError;
 use crate::flight::FlightPath;
 use crate::imu::ImuRecord;
@@ -21,16 +22,22 @@ pub(crate) fn stamp(k: usize, rate_hz: f64) -> (Timestamp, f64) {
     (Timestamp::from_nanos(EPOCH_NANOS + nanos), nanos as f64 * 1e-9)
 }
 
+/// Stamp nearest to `secs` after the sequence's beginning, and the instant (s) that it names.
+pub(crate) fn stamp_at(secs: f64) -> (Timestamp, f64) {
+    let nanos = (secs * 1e9).round() as i64;
+    (Timestamp::from_nanos(EPOCH_NANOS + nanos), nanos as f64 * 1e-9)
+}
+
 /// Seconds after the sequence's beginning of a stamp; the inverse of [`stamp`].
 pub(crate) fn secs(time: Timestamp) -> f64 {
     (time.nanos().saturating_sub(EPOCH_NANOS)) as f64 * 1e-9
 }
 
 /// `data.csv` of a camera or a depth camera.
-pub(crate) fn image_list(times: &[Timestamp]) -> String {
+pub(crate) fn image_list(times: &[Timestamp], extension: &str) -> String {
     let mut text = String::from("#timestamp [ns],filename\n");
     for t in times {
-        let _ = writeln!(text, "{0},{0}.png", t.nanos());
+        let _ = writeln!(text, "{0},{0}.{extension}", t.nanos());
     }
     text
 }
@@ -50,15 +57,20 @@ pub(crate) fn imu_list(record: &ImuRecord) -> String {
 }
 
 /// `data.csv` of the ground truth: EuRoC's 17 columns.
-pub(crate) fn truth_list(flight: &FlightPath, record: &ImuRecord, rate_hz: f64) -> String {
+pub(crate) fn truth_list(flight: &FlightPath, record: &ImuRecord) -> String {
     let mut text = String::from(
         "#timestamp, p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w [], q_RS_x [], q_RS_y [], q_RS_z [], \
          v_RS_R_x [m s^-1], v_RS_R_y [m s^-1], v_RS_R_z [m s^-1], b_w_RS_S_x [rad s^-1], b_w_RS_S_y [rad s^-1], \
          b_w_RS_S_z [rad s^-1], b_a_RS_S_x [m s^-2], b_a_RS_S_y [m s^-2], b_a_RS_S_z [m s^-2]\n",
     );
-    for (k, (bw, ba)) in record.gyro_bias.iter().zip(&record.accel_bias).enumerate() {
-        let (time, secs) = stamp(k, rate_hz);
-        let state = flight.state(secs);
+    let mut previous = None;
+    for ((sample, bw), ba) in record.samples.iter().zip(&record.gyro_bias).zip(&record.accel_bias) {
+        let time = sample.time;
+        // A repeated row of the IMU is one state.
+        if previous.replace(time) == Some(time) {
+            continue;
+        }
+        let state = flight.state(secs(time));
         let (p, v) = (state.world_from_body.translation, state.velocity_in_world);
         let [x, y, z, w] = state.world_from_body.rotation.quaternion_xyzw();
         let _ =
@@ -90,14 +102,34 @@ fn transform_yaml(matrix: &[f64; 16]) -> String {
 const IDENTITY: [f64; 16] =
     [1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0];
 
+/// k1, k2, p1, p2 of a camera.
+pub(crate) fn distortion(camera: &CameraModel) -> [f64; 4] {
+    match camera {
+        CameraModel::RadTan(m) => m.distortion,
+        _ => [0.0; 4],
+    }
+}
+
+/// `T_BS` of the mount, row by row; EuRoC's as published, digit for digit.
+pub(crate) fn mount_matrix(config: &SynthConfig) -> [f64; 16] {
+    if config.device.mount == Mount::Euroc {
+        return EUROC_BODY_FROM_CAMERA;
+    }
+    let matrix = config.body_from_camera().matrix();
+    std::array::from_fn(|i| matrix[(i / 4, i % 4)])
+}
+
 /// `sensor.yaml` of cam0, or, with `depth_units_per_metre`, of the depth registered to cam0's pixels.
+///
+/// `body_from_camera` is `T_BS`, row by row; without it no place of the sensor is written.
 pub(crate) fn camera_yaml(
     camera: &CameraModel,
-    distortion: [f64; 4],
+    body_from_camera: Option<&[f64; 16]>,
     rate_hz: f64,
     depth_units_per_metre: Option<u32>,
 ) -> String {
     let k = camera.intrinsics();
+    let distortion = distortion(camera);
     let kind = if depth_units_per_metre.is_some() { "depth" } else { "camera" };
     let comment = if depth_units_per_metre.is_some() {
         "exact z-depth along the optical axis of cam0, registered to cam0's (distorted) pixels"
@@ -106,8 +138,10 @@ pub(crate) fn camera_yaml(
     };
     let mut text =
         format!("%YAML:1.0\n# General sensor definitions.\nsensor_type: {kind}\ncomment: {comment}\n\n");
-    text.push_str("# Sensor extrinsics wrt. the body-frame.\n");
-    text.push_str(&transform_yaml(&EUROC_BODY_FROM_CAMERA));
+    if let Some(matrix) = body_from_camera {
+        text.push_str("# Sensor extrinsics wrt. the body-frame.\n");
+        text.push_str(&transform_yaml(matrix));
+    }
     let _ = write!(
         text,
         "\n# Camera specific definitions.\nrate_hz: {rate_hz}\nresolution: [{}, {}]\ncamera_model: pinhole\n\
@@ -127,7 +161,9 @@ pub(crate) fn camera_yaml(
 /// `sensor.yaml` of the IMU.
 pub(crate) fn imu_yaml(config: &SynthConfig) -> String {
     let n = &config.imu_noise;
-    let s = config.imu_noise_scale;
+    // A noise-free IMU still states its data sheet, since estimators divide by it.
+    let scale = if config.imu_noise_scale > 0.0 { config.imu_noise_scale } else { 1.0 };
+    let stated = scale * config.device.stated_noise_factor;
     format!(
         "%YAML:1.0\n# General sensor definitions.\nsensor_type: imu\ncomment: simulated IMU\n\n\
          # Sensor extrinsics wrt. the body-frame.\n{}rate_hz: {}\n\n\
@@ -138,11 +174,10 @@ pub(crate) fn imu_yaml(config: &SynthConfig) -> String {
          accelerometer_random_walk: {:?}    # [ m / s^3 / sqrt(Hz) ].  ( accel bias diffusion )\n",
         transform_yaml(&IDENTITY),
         config.imu_rate_hz,
-        // A noise-free IMU still states its data sheet, since estimators divide by it.
-        n.gyro_noise_density * if s > 0.0 { s } else { 1.0 },
-        n.gyro_random_walk * if s > 0.0 { s } else { 1.0 },
-        n.accel_noise_density * if s > 0.0 { s } else { 1.0 },
-        n.accel_random_walk * if s > 0.0 { s } else { 1.0 },
+        n.gyro_noise_density * stated,
+        n.gyro_random_walk * stated,
+        n.accel_noise_density * stated,
+        n.accel_random_walk * stated,
     )
 }
 

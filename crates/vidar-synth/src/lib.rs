@@ -9,26 +9,33 @@
 
 pub mod clip;
 mod config;
+mod device;
 mod error;
 mod flight;
+mod image_file;
 mod imu;
 mod layout;
 pub mod odometry;
 mod photometry;
-mod png_file;
 pub mod predict;
+mod presets;
 mod random;
 mod render;
 mod rig;
 mod scan;
+mod schedule;
 mod sequence;
 mod simulation;
+mod staging;
+mod truth;
 mod world;
 
 pub use config::{FlightKind, SceneKind, Start, SynthConfig, Variety};
+pub use device::{CalibrationKind, DeviceConfig, ImuTiming, Lens, Mount};
 pub use error::SynthError;
 pub use flight::{FlightPath, FlightState};
 pub use imu::{ImuRecord, simulate_imu};
+pub use presets::PRESETS;
 pub use render::{RenderedView, SynthView, render_views};
 pub use rig::{euroc_body_from_camera, euroc_camera, euroc_rig};
 pub use sequence::{SynthSummary, write_sequence};

@@ -33,6 +33,26 @@ pub(crate) enum Purpose {
     Clip(u32),
     /// Sensor noise of a clip.
     ClipNoise(u32),
+    /// Misalignment and lever arm of the camera.
+    Mount,
+    /// Scale errors of the IMU.
+    ImuScale,
+    /// Timing of the IMU's samples.
+    ImuTiming,
+    /// Repeated rows of the IMU.
+    ImuRepeats,
+    /// Gaps in the IMU's rows.
+    ImuGaps,
+    /// Noise of an accelerometer with a clock of its own.
+    ImuAccel,
+    /// Focal length of a partial calibration.
+    StatedFocal,
+    /// Times, drops and repeats of the frames.
+    Schedule,
+    /// Hand-held path.
+    Handheld,
+    /// Surfaces without texture.
+    BareSurfaces,
     /// Pixels of a frame in a chunk's prediction.
     Prediction(u32, u32),
 }
@@ -55,6 +75,16 @@ pub(crate) fn stream(seed: u64, purpose: Purpose) -> ChaCha8Rng {
         Purpose::ClipRoom => (14, 0),
         Purpose::Clip(k) => (15, u64::from(k)),
         Purpose::ClipNoise(k) => (16, u64::from(k)),
+        Purpose::Mount => (17, 0),
+        Purpose::ImuScale => (18, 0),
+        Purpose::ImuTiming => (19, 0),
+        Purpose::StatedFocal => (20, 0),
+        Purpose::Schedule => (21, 0),
+        Purpose::Handheld => (22, 0),
+        Purpose::BareSurfaces => (23, 0),
+        Purpose::ImuRepeats => (24, 0),
+        Purpose::ImuGaps => (25, 0),
+        Purpose::ImuAccel => (26, 0),
         Purpose::Prediction(_, frame) => (9, u64::from(frame)),
     };
     let seed = match purpose {

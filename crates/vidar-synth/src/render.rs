@@ -9,13 +9,19 @@ use nalgebra::{Matrix3, Vector3};
 use rayon::prelude::*;
 use vidar_core::{CameraModel, FrameImage, Image, MetricDepth, Se3};
 
-/// Pixels along the sides of a tile, whose rays are cast together.
-const TILE: usize = 8;
+/// Columns and rows of a tile, whose rays are cast together from one pose.
+const TILE: [usize; 2] = [8, 8];
+
+/// Tiles of a rolling shutter: rows of a tile share a pose, which is off by half a row's time at most. At 30 ms for
+/// 480 rows, 3 rad/s and a focal length of 490 px that is 0.05 px.
+pub(crate) const ROLLING_TILE: [usize; 2] = [32, 2];
 
 /// The directions (z = 1) into which a camera's pixels look, for each of a set of places within the pixel.
 pub(crate) struct RayTable {
     width: usize,
     height: usize,
+    /// Columns and rows of a tile.
+    tile: [usize; 2],
     samples: Vec<Sample>,
     /// Angle between neighbouring pixels near the axis, rad.
     pixel_angle: f64,
@@ -32,6 +38,11 @@ struct Sample {
 impl RayTable {
     /// A table of `samples` places per pixel; the middle one is the pixel's centre.
     pub(crate) fn new(camera: &CameraModel, samples: usize) -> Self {
+        Self::with_tiles(camera, samples, TILE)
+    }
+
+    /// As [`RayTable::new`], with tiles of `tile` columns and rows.
+    pub(crate) fn with_tiles(camera: &CameraModel, samples: usize, tile: [usize; 2]) -> Self {
         let (width, height) = (camera.width(), camera.height());
         let samples = (0..samples)
             .map(|s| {
@@ -41,20 +52,27 @@ impl RayTable {
                     camera.unproject(&pixel).map_or([f64::NAN; 2], |r| [r.x / r.z, r.y / r.z])
                 };
                 let rays: Vec<[f64; 2]> = (0..width * height).into_par_iter().map(ray).collect();
-                let columns = width.div_ceil(TILE);
-                let mut tiles = vec![TileBounds::EMPTY; columns * height.div_ceil(TILE)];
+                let columns = width.div_ceil(tile[0]);
+                let mut tiles = vec![TileBounds::EMPTY; columns * height.div_ceil(tile[1])];
                 for (i, ray) in rays.iter().enumerate() {
-                    tiles[(i / width / TILE) * columns + (i % width) / TILE].add(*ray);
+                    tiles[(i / width / tile[1]) * columns + (i % width) / tile[0]].add(*ray);
                 }
                 Sample { rays, tiles }
             })
             .collect();
-        Self { width, height, samples, pixel_angle: 1.0 / camera.intrinsics().fx }
+        Self { width, height, tile, samples, pixel_angle: 1.0 / camera.intrinsics().fx }
     }
 
     /// The sample whose place is the pixel's centre.
     pub(crate) fn centre(&self) -> usize {
         self.samples.len() / 2
+    }
+
+    /// Middle row of band `band` of tiles; bands are numbered from the top.
+    pub(crate) fn middle_row(&self, band: usize) -> f64 {
+        let first = band * self.tile[1];
+        let last = (first + self.tile[1]).min(self.height) - 1;
+        0.5 * (first + last) as f64
     }
 }
 
@@ -75,8 +93,12 @@ pub(crate) struct Exposed {
     pub depth: Vec<f32>,
 }
 
-/// Renders the frame whose sample `s` is taken from pose `world_from_camera(s)`.
-pub(crate) fn expose(world: &World, rays: &RayTable, world_from_camera: &[Se3]) -> Exposed {
+/// Renders the frame whose sample `s` of band `b` of rows is taken from pose `world_from_camera(s, b)`.
+pub(crate) fn expose(
+    world: &World,
+    rays: &RayTable,
+    world_from_camera: impl Fn(usize, usize) -> Se3 + Sync,
+) -> Exposed {
     let of_channels = expose_hits(world, rays, world_from_camera, |_, radiance| [radiance]);
     Exposed { radiance: of_channels.radiance.into_flattened(), depth: of_channels.depth }
 }
@@ -93,19 +115,19 @@ pub(crate) struct ExposedChannels<const C: usize> {
 pub(crate) fn expose_hits<const C: usize>(
     world: &World,
     rays: &RayTable,
-    world_from_camera: &[Se3],
+    world_from_camera: impl Fn(usize, usize) -> Se3 + Sync,
     colour: impl Fn(&Hit, f32) -> [f32; C] + Sync,
 ) -> ExposedChannels<C> {
     let n = rays.width * rays.height;
     let mut radiance = vec![[0.0_f32; C]; n];
     let mut depth = vec![f32::NAN; n];
     let share = 1.0 / rays.samples.len() as f32;
-    let band = TILE * rays.width;
+    let band = rays.tile[1] * rays.width;
     let bands = radiance.par_chunks_mut(band).zip(depth.par_chunks_mut(band)).enumerate();
     bands.for_each(|(row, (radiance, depth))| {
         let mut hits = TileHits::default();
-        for (s, world_from_camera) in world_from_camera.iter().enumerate().take(rays.samples.len()) {
-            let eye = Eye::new(world_from_camera);
+        for s in 0..rays.samples.len() {
+            let eye = Eye::new(&world_from_camera(s, row));
             let is_centre = s == rays.centre();
             eye.cast_band(world, rays, s, row, &mut hits, |hits, ray, pixel| {
                 let Some(hit) = world.tile_hit(hits, ray, &eye.origin) else { return };
@@ -127,7 +149,7 @@ pub(crate) fn expose_hits<const C: usize>(
 pub(crate) fn depth_image(world: &World, rays: &RayTable, world_from_camera: &Se3) -> Image<f32> {
     let eye = Eye::new(world_from_camera);
     let mut depth = Image::filled(rays.width, rays.height, f32::NAN);
-    let bands = depth.data_mut().par_chunks_mut(TILE * rays.width).enumerate();
+    let bands = depth.data_mut().par_chunks_mut(rays.tile[1] * rays.width).enumerate();
     bands.for_each(|(row, depth)| {
         eye.cast_band(world, rays, rays.centre(), row, &mut TileHits::default(), |hits, ray, pixel| {
             if let Some(z) = World::tile_depth(hits, ray) {
@@ -163,10 +185,11 @@ impl Eye {
         mut pixel_of: impl FnMut(&TileHits, usize, usize),
     ) {
         let Sample { rays: table, tiles } = &rays.samples[sample];
-        let columns = rays.width.div_ceil(TILE);
-        let rows = TILE * band..(TILE * (band + 1)).min(rays.height);
+        let [across, down] = rays.tile;
+        let columns = rays.width.div_ceil(across);
+        let rows = down * band..(down * (band + 1)).min(rays.height);
         for column in 0..columns {
-            let xs = TILE * column..(TILE * (column + 1)).min(rays.width);
+            let xs = across * column..(across * (column + 1)).min(rays.width);
             let bounds = &tiles[band * columns + column];
             hits.directions.clear();
             for y in rows.clone() {
@@ -243,7 +266,7 @@ pub fn render_views(
 }
 
 fn render_view(world: &World, view: &SynthView, rays: &RayTable) -> RenderedView {
-    let exposed = expose(world, rays, &vec![view.world_from_camera; rays.samples.len()]);
+    let exposed = expose(world, rays, |_, _| view.world_from_camera);
     let (width, height) = (rays.width, rays.height);
     let image = Image::from_fn(width, height, |x, y| (exposed.radiance[y * width + x] * 255.0).round() as u8);
     let depth = Image::from_fn(width, height, |x, y| exposed.depth[y * width + x]);

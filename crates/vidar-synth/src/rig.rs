@@ -1,5 +1,6 @@
 //! The simulated rig: EuRoC's cam0 and IMU (Burri et al., "The EuRoC micro aerial vehicle datasets", IJRR 2016).
 
+use crate::config::SynthConfig;
 use crate::error::SynthError;
 use nalgebra::Matrix4;
 use vidar_core::camera::RadTan;
@@ -38,6 +39,18 @@ pub fn euroc_body_from_camera() -> Se3 {
     Se3::from_matrix(&Matrix4::from_row_slice(&EUROC_BODY_FROM_CAMERA)).unwrap_or(Se3::IDENTITY)
 }
 
+/// Where cam0 sits on the TUM-VI rig's IMU (Schubert et al., "The TUM VI benchmark", IROS 2018), about.
+pub(crate) fn tum_vi_body_from_camera() -> Se3 {
+    #[rustfmt::skip]
+    let matrix = Matrix4::new(
+        -0.999_525_037_869_674_3, 0.029_615_343_885_863_2, -0.008_522_328_211_654_74, 0.047_279_882_249_143_92,
+        0.007_501_918_507_405_204, -0.034_397_360_613_931_44, -0.999_380_079_249_888_3, -0.047_443_232_143_367_08,
+        -0.029_890_130_316_433_09, -0.998_969_345_370_175, 0.034_158_851_273_856_16, -0.068_199_960_506_629_7,
+        0.0, 0.0, 0.0, 1.0,
+    );
+    Se3::from_matrix(&matrix).unwrap_or(Se3::IDENTITY)
+}
+
 /// EuRoC's rig with one camera of `width` × `height`.
 pub fn euroc_rig(width: usize, height: usize) -> Result<Rig, SynthError> {
     let camera = RigCamera {
@@ -47,4 +60,15 @@ pub fn euroc_rig(width: usize, height: usize) -> Result<Rig, SynthError> {
         rate_hz: None,
     };
     Ok(Rig { cameras: vec![camera], imu: Some(ImuNoise::EUROC) })
+}
+
+/// The rig that `config` simulates: one camera with its true calibration.
+pub(crate) fn rig(config: &SynthConfig) -> Result<Rig, SynthError> {
+    let camera = RigCamera {
+        model: config.camera()?,
+        body_from_camera: config.body_from_camera(),
+        time_offset: Duration::ZERO,
+        rate_hz: None,
+    };
+    Ok(Rig { cameras: vec![camera], imu: Some(config.imu_noise) })
 }

@@ -1,16 +1,20 @@
 //! Writes a sequence in EuRoC layout, whole or not at all.
 
 use crate::config::SynthConfig;
+use crate::device::CalibrationKind;
 use crate::error::SynthError;
 use crate::flight::FlightPath;
+use crate::image_file;
 use crate::imu::simulate_imu;
 use crate::layout;
 use crate::photometry::Photometry;
-use crate::png_file;
-use crate::render::{RayTable, expose};
+use crate::render::{ROLLING_TILE, RayTable, expose};
 use crate::rig;
 use crate::scan::{Scan, Witness, scan_observed_surface};
+use crate::schedule::{Shot, shots};
 use crate::simulation::{CONFIG_FILE, FLIGHT_FILE, flight_list};
+use crate::staging::{Staging, make_folder};
+use crate::truth::{TRUTH_FILE, truth_text};
 use crate::world::World;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
@@ -23,7 +27,7 @@ use vidar_core::{BodyFrame, CameraModel, Se3, Timestamp, Trajectory};
 pub struct SynthSummary {
     /// Images of cam0 (and of depth0, if asked for).
     pub frames: usize,
-    /// Readings of imu0, and poses of the ground truth.
+    /// Rows of imu0.
     pub imu_samples: usize,
     /// Points of the reference cloud.
     pub scan_points: usize,
@@ -35,11 +39,11 @@ pub struct SynthSummary {
     pub shapes: usize,
 }
 
-/// Told how many frames of how many are done; `false` stops the work. Called from several threads.
+/// Called with the number of frames done and of all frames, from several threads; `false` stops the work.
 pub type Progress<'a> = dyn Fn(usize, usize) -> bool + Sync + 'a;
 
-/// Writes the sequence that `config` describes to `out/mav0`, the configuration to `out/synth.toml` and a given flight
-/// to `out/flight.csv`; [`crate::Simulation::open`] brings all of it back.
+/// Writes the sequence that `config` describes to `out/mav0`, the configuration to `out/synth.toml`, the device's true
+/// parameters to `out/truth.json` and a given flight to `out/flight.csv`; [`crate::Simulation::open`] brings all of it back.
 ///
 /// `flight` takes the place of the built-in flight; the world is built around it. Everything is first written to a
 /// hidden folder inside `out` and then renamed, so that after an error or a cancellation nothing is left.
@@ -54,8 +58,9 @@ pub fn write_sequence(
 ) -> Result<SynthSummary, SynthError> {
     config.validate()?;
     let path = FlightPath::new(config, flight)?;
+    let shots = shots(config, &path);
     let staging = Staging::new(out)?;
-    if !progress(0, frame_count(config, &path)) {
+    if !progress(0, shots.len()) {
         return Err(SynthError::Cancelled);
     }
     let world = World::build(config, &path)?;
@@ -63,21 +68,24 @@ pub fn write_sequence(
         config,
         path: &path,
         world: &world,
-        camera: rig::euroc_camera(config.width, config.height)?,
+        camera: config.camera()?,
+        shots: &shots,
+        body_from_camera: config.body_from_camera(),
         mav: staging.folder.join("mav0"),
     };
-    let times = writer.times();
     let witnesses = writer.write_frames(progress)?;
-    writer.write_camera_texts(&times)?;
+    writer.write_camera_texts()?;
     let imu_samples = writer.write_inertial()?;
     let scan_points = writer.write_scan(&witnesses)?;
     writer.write_config(&staging.folder, flight)?;
-    if !progress(times.len(), times.len()) {
+    let frames = shots.iter().map(|s| s.stamps.len()).sum();
+    layout::write_text(&staging.folder.join(TRUTH_FILE), &truth_text(config, &writer.camera, &shots)?)?;
+    if !progress(shots.len(), shots.len()) {
         return Err(SynthError::Cancelled);
     }
     staging.publish()?;
     Ok(SynthSummary {
-        frames: times.len(),
+        frames,
         imu_samples,
         scan_points,
         duration_secs: path.duration_secs(),
@@ -86,33 +94,31 @@ pub fn write_sequence(
     })
 }
 
-fn frame_count(config: &SynthConfig, path: &FlightPath) -> usize {
-    ((path.duration_secs() * config.camera_rate_hz - 1e-6).ceil().max(1.0)) as usize
-}
-
 struct Writer<'a> {
     config: &'a SynthConfig,
     path: &'a FlightPath,
     world: &'a World,
+    shots: &'a [Shot],
     camera: CameraModel,
+    body_from_camera: Se3,
     mav: PathBuf,
 }
 
 impl Writer<'_> {
-    fn times(&self) -> Vec<Timestamp> {
-        let n = frame_count(self.config, self.path);
-        (0..n).map(|k| layout::stamp(k, self.config.camera_rate_hz).0).collect()
-    }
-
     /// Renders and writes all images and depths; returns what each frame saw.
     fn write_frames(&self, progress: &Progress<'_>) -> Result<Vec<Witness>, SynthError> {
         make_folder(&self.mav.join("cam0/data"))?;
         if self.config.depth {
             make_folder(&self.mav.join("depth0/data"))?;
         }
-        let rays = RayTable::new(&self.camera, self.config.blur_samples);
+        let samples = self.config.blur_samples;
+        let rays = if self.config.device.readout_secs > 0.0 {
+            RayTable::with_tiles(&self.camera, samples, ROLLING_TILE)
+        } else {
+            RayTable::new(&self.camera, samples)
+        };
         let photometry = Photometry::new(self.config);
-        let total = frame_count(self.config, self.path);
+        let total = self.shots.len();
         let done = AtomicUsize::new(0);
         let cancelled = AtomicBool::new(false);
         let frame = |k: usize| {
@@ -131,35 +137,64 @@ impl Writer<'_> {
 
     fn write_frame(&self, k: usize, rays: &RayTable, photometry: &Photometry) -> Result<Witness, SynthError> {
         let config = self.config;
-        let (time, secs) = layout::stamp(k, config.camera_rate_hz);
-        let poses = self.poses_within_exposure(secs, rays.centre());
-        let exposed = expose(self.world, rays, &poses);
-        let name = format!("{}.png", time.nanos());
-        let (width, height) = (config.width, config.height);
-        let image = photometry.develop(&exposed.radiance, k, secs);
-        png_file::write_gray8(&self.mav.join("cam0/data").join(&name), width, height, &image)?;
-        if config.depth {
+        let Shot { secs, stamps } = &self.shots[k];
+        let exposed = if config.device.readout_secs > 0.0 {
+            expose(self.world, rays, |s, band| {
+                self.world_from_camera(
+                    secs + self.row_delay(rays.middle_row(band)) + self.ray_delay(s, rays.centre()),
+                )
+            })
+        } else {
+            // One pose per ray of a pixel holds for every row.
+            let poses: Vec<Se3> = (0..config.blur_samples)
+                .map(|s| self.world_from_camera(secs + self.ray_delay(s, rays.centre())))
+                .collect();
+            expose(self.world, rays, |s, _| poses[s])
+        };
+        let image = photometry.develop(&exposed.radiance, k, *secs);
+        for stamp in stamps {
+            self.write_pictures(*stamp, &image, &exposed.depth)?;
+        }
+        Ok(Witness::new(&self.world_from_camera(*secs), &exposed.depth, config.width))
+    }
+
+    fn write_pictures(&self, stamp: Timestamp, image: &[u8], depth: &[f32]) -> Result<(), SynthError> {
+        let (width, height) = (self.config.width, self.config.height);
+        let file = self.mav.join("cam0/data").join(format!("{}.{}", stamp.nanos(), self.image_extension()));
+        match self.config.device.jpeg_quality {
+            0 => image_file::write_gray8(&file, width, height, image)?,
+            quality => image_file::write_jpeg(&file, width, height, image, quality)?,
+        }
+        if self.config.depth {
             let units = f64::from(self.depth_units_per_metre());
             let encode = |&z: &f32| {
                 let value = (f64::from(z) * units).round();
                 // NaN and what lies beyond the range are 0: no depth.
                 if value >= 1.0 && value <= f64::from(u16::MAX) { value as u16 } else { 0 }
             };
-            let depth: Vec<u16> = exposed.depth.iter().map(encode).collect();
-            png_file::write_gray16(&self.mav.join("depth0/data").join(&name), width, height, &depth)?;
+            let depth: Vec<u16> = depth.iter().map(encode).collect();
+            let file = self.mav.join("depth0/data").join(format!("{}.png", stamp.nanos()));
+            image_file::write_gray16(&file, width, height, &depth)?;
         }
-        Ok(Witness::new(&poses[rays.centre()], &exposed.depth, width))
+        Ok(())
     }
 
-    /// Poses of the camera over the exposure around `secs`; the one of sample `centre` is exactly at `secs`.
-    fn poses_within_exposure(&self, secs: f64, centre: usize) -> Vec<Se3> {
-        let n = self.config.blur_samples;
-        let body_from_camera = rig::euroc_body_from_camera();
-        let at = |s: usize| {
-            let offset = self.config.exposure_secs * (s as f64 - centre as f64) / n as f64;
-            self.path.world_from_body(secs + offset) * body_from_camera
-        };
-        (0..n).map(at).collect()
+    fn image_extension(&self) -> &'static str {
+        if self.config.device.jpeg_quality > 0 { "jpg" } else { "png" }
+    }
+
+    fn world_from_camera(&self, secs: f64) -> Se3 {
+        self.path.world_from_body(secs) * self.body_from_camera
+    }
+
+    /// When ray `sample` of a pixel is cast, relative to the middle of the exposure, s; that of `centre` is in it.
+    fn ray_delay(&self, sample: usize, centre: usize) -> f64 {
+        self.config.exposure_secs * (sample as f64 - centre as f64) / self.config.blur_samples as f64
+    }
+
+    /// When `row` is exposed, relative to the middle row, s.
+    fn row_delay(&self, row: f64) -> f64 {
+        (row / (self.config.height - 1) as f64 - 0.5) * self.config.device.readout_secs
     }
 
     /// The finest unit in which the longest sight line of the room fits 16 bits.
@@ -169,20 +204,28 @@ impl Writer<'_> {
         [5000, 2000, 1000, 500, 200].into_iter().find(|&u| longest * f64::from(u) < 65_535.0).unwrap_or(100)
     }
 
-    fn write_camera_texts(&self, times: &[Timestamp]) -> Result<(), SynthError> {
+    fn write_camera_texts(&self) -> Result<(), SynthError> {
         let rate = self.config.camera_rate_hz;
-        let distortion = match &self.camera {
-            CameraModel::RadTan(m) => m.distortion,
-            _ => [0.0; 4],
+        let mount = layout::mount_matrix(self.config);
+        let stamps: Vec<Timestamp> = self.shots.iter().flat_map(|s| s.stamps.iter().copied()).collect();
+        let folder = self.mav.join("cam0");
+        layout::write_text(&folder.join("data.csv"), &layout::image_list(&stamps, self.image_extension()))?;
+        let yaml = match self.config.device.calibration {
+            CalibrationKind::Given => Some(layout::camera_yaml(&self.camera, Some(&mount), rate, None)),
+            CalibrationKind::Partial => {
+                Some(layout::camera_yaml(&self.config.partial_camera(&self.camera)?, None, rate, None))
+            }
+            CalibrationKind::Absent => None,
         };
-        let list = layout::image_list(times);
-        let yaml = |units| layout::camera_yaml(&self.camera, distortion, rate, units);
-        layout::write_text(&self.mav.join("cam0/data.csv"), &list)?;
-        layout::write_text(&self.mav.join("cam0/sensor.yaml"), &yaml(None))?;
+        if let Some(yaml) = yaml {
+            layout::write_text(&folder.join("sensor.yaml"), &yaml)?;
+        }
         if self.config.depth {
-            layout::write_text(&self.mav.join("depth0/data.csv"), &list)?;
+            let folder = self.mav.join("depth0");
+            layout::write_text(&folder.join("data.csv"), &layout::image_list(&stamps, "png"))?;
             let units = Some(self.depth_units_per_metre());
-            layout::write_text(&self.mav.join("depth0/sensor.yaml"), &yaml(units))?;
+            let yaml = layout::camera_yaml(&self.camera, Some(&mount), rate, units);
+            layout::write_text(&folder.join("sensor.yaml"), &yaml)?;
         }
         Ok(())
     }
@@ -192,10 +235,12 @@ impl Writer<'_> {
         let imu = self.mav.join("imu0");
         make_folder(&imu)?;
         layout::write_text(&imu.join("data.csv"), &layout::imu_list(&record))?;
-        layout::write_text(&imu.join("sensor.yaml"), &layout::imu_yaml(self.config))?;
+        if self.config.device.calibration == CalibrationKind::Given {
+            layout::write_text(&imu.join("sensor.yaml"), &layout::imu_yaml(self.config))?;
+        }
         let truth = self.mav.join("state_groundtruth_estimate0");
         make_folder(&truth)?;
-        let list = layout::truth_list(self.path, &record, self.config.imu_rate_hz);
+        let list = layout::truth_list(self.path, &record);
         layout::write_text(&truth.join("data.csv"), &list)?;
         let yaml = layout::plain_yaml("visual-inertial", "exact state of the simulated body");
         layout::write_text(&truth.join("sensor.yaml"), &yaml)?;
@@ -221,9 +266,8 @@ impl Writer<'_> {
             "%YAML:1.0\ncomment: simulated micro aerial vehicle\n",
         )?;
         if let Some(flown) = flown {
-            // Told of the body, so that the sequence can be simulated again without knowing whose it was.
-            let flown =
-                flown.in_frame(BodyFrame::Imu, &rig::euroc_rig(self.config.width, self.config.height)?)?;
+            // Poses of the body, so that the sequence can be simulated again whatever frame the trajectory had.
+            let flown = flown.in_frame(BodyFrame::Imu, &rig::rig(self.config)?)?;
             layout::write_text(&folder.join(FLIGHT_FILE), &flight_list(&flown))?;
         }
         let flight = if flown.is_some() { "flown along flight.csv" } else { "built-in flight" };
@@ -233,56 +277,5 @@ impl Writer<'_> {
             toml::to_string(self.config)?
         );
         layout::write_text(&folder.join(CONFIG_FILE), &text)
-    }
-}
-
-fn make_folder(path: &Path) -> Result<(), SynthError> {
-    std::fs::create_dir_all(path).map_err(SynthError::write(path))
-}
-
-/// A hidden folder inside the output; removed when dropped.
-struct Staging {
-    out: PathBuf,
-    folder: PathBuf,
-    /// The topmost folder that had to be made for `out`.
-    made: Option<PathBuf>,
-}
-
-impl Staging {
-    fn new(out: &Path) -> Result<Self, SynthError> {
-        let goal = out.join("mav0");
-        if goal.symlink_metadata().is_ok() {
-            return Err(SynthError::OutputExists { path: goal });
-        }
-        let made = out.ancestors().take_while(|a| !a.as_os_str().is_empty() && !a.exists()).last();
-        let folder = out.join(format!(".synth-partial-{}", std::process::id()));
-        let staging = Self { out: out.to_path_buf(), made: made.map(Path::to_path_buf), folder };
-        make_folder(&staging.folder)?;
-        Ok(staging)
-    }
-
-    /// Moves what was written to its place; `mav0` last, so that where it stands everything stands.
-    fn publish(mut self) -> Result<(), SynthError> {
-        for name in [FLIGHT_FILE, CONFIG_FILE, "mav0"] {
-            let (made, goal) = (self.folder.join(name), self.out.join(name));
-            if name != FLIGHT_FILE || made.exists() {
-                std::fs::rename(made, &goal).map_err(SynthError::write(&goal))?;
-            }
-        }
-        self.made = None;
-        Ok(())
-    }
-}
-
-impl Drop for Staging {
-    fn drop(&mut self) {
-        // Best effort: what cannot be removed cannot be reported from here either.
-        let _ = std::fs::remove_dir_all(&self.folder);
-        // Only folders that are empty again go, so that nobody else's file can.
-        if let Some(made) = &self.made {
-            for folder in self.out.ancestors().take_while(|a| a.starts_with(made)) {
-                let _ = std::fs::remove_dir(folder);
-            }
-        }
     }
 }

@@ -4,7 +4,6 @@ use crate::config::SynthConfig;
 use crate::error::SynthError;
 use crate::flight::FlightPath;
 use crate::layout;
-use crate::rig::euroc_body_from_camera;
 use crate::world::World;
 use std::path::Path;
 use vidar_core::{BodyFrame, Se3, StampedPose, Timestamp, Trajectory};
@@ -64,7 +63,7 @@ impl Simulation {
         &self.world
     }
 
-    /// Stamp of frame `k`.
+    /// Time of frame `k` on the IMU's clock, at an even frame rate.
     pub fn frame_time(&self, k: usize) -> Timestamp {
         layout::stamp(k, self.config.camera_rate_hz).0
     }
@@ -77,9 +76,9 @@ impl Simulation {
         within.then(|| self.path.world_from_body(secs))
     }
 
-    /// Exact pose of cam0 at a stamp of the sequence.
+    /// Exact pose of cam0 at the middle row of the image taken at `time` on the IMU's clock.
     pub fn world_from_camera(&self, time: Timestamp) -> Option<Se3> {
-        Some(self.world_from_body(time)? * euroc_body_from_camera())
+        Some(self.world_from_body(time)? * self.config.body_from_camera())
     }
 }
 

@@ -88,6 +88,7 @@ fn a_sequence_has_every_file_of_the_layout_and_agrees_with_the_world() {
     let all = files(&out);
     for name in [
         "synth.toml",
+        "truth.json",
         "mav0/body.yaml",
         "mav0/cam0/sensor.yaml",
         "mav0/cam0/data.csv",
@@ -102,7 +103,7 @@ fn a_sequence_has_every_file_of_the_layout_and_agrees_with_the_world() {
     ] {
         assert!(all.contains_key(Path::new(name)), "{name} is missing from {:?}", all.keys());
     }
-    assert_eq!(all.len(), 12 + 10);
+    assert_eq!(all.len(), 13 + 10);
     let text = |name: &str| String::from_utf8(all[Path::new(name)].clone()).unwrap();
     assert!(text("mav0/cam0/sensor.yaml").starts_with("%YAML:1.0\n"));
     assert!(text("mav0/depth0/sensor.yaml").contains("units_per_metre: 5000\n"));
@@ -213,8 +214,8 @@ fn a_full_disk_is_an_error_and_not_a_short_file() {
         eprintln!("skipped: no /dev/full here");
         return;
     }
-    assert!(png_file::write_gray8(full, 64, 64, &[7; 4096]).is_err());
-    assert!(png_file::write_gray16(full, 64, 64, &[7; 4096]).is_err());
+    assert!(image_file::write_gray8(full, 64, 64, &[7; 4096]).is_err());
+    assert!(image_file::write_gray16(full, 64, 64, &[7; 4096]).is_err());
     assert!(layout::write_text(full, "text").is_err());
     let point = ScanPoint { position: Vector3::zeros(), gray: 1 };
     assert!(layout::write_ply(full, &[point; 3]).is_err());
@@ -308,7 +309,7 @@ fn long_exposures_blur_and_short_ones_do_not() {
     let shaken: Vec<Se3> = (0..5)
         .map(|s| still.plus(&nalgebra::Vector6::new(0.0, 0.06 * f64::from(s - 2), 0.0, 0.0, 0.0, 0.0)))
         .collect();
-    let (sharp, blurred) = (expose(world, &rays, &[still; 5]), expose(world, &rays, &shaken));
+    let (sharp, blurred) = (expose(world, &rays, |_, _| still), expose(world, &rays, |s, _| shaken[s]));
     let edges = |image: &[f32]| image.windows(2).map(|w| (w[1] - w[0]).abs()).sum::<f32>();
     assert!(edges(&blurred.radiance) < 0.85 * edges(&sharp.radiance));
     assert_eq!(sharp.depth, blurred.depth, "depth is that of the middle of the exposure");

@@ -5,17 +5,20 @@ use crate::build::{self, usage};
 use crate::{Context, Outcome, print, progress};
 use std::path::Path;
 use vidar::dataset::TrajectoryReadOptions;
-use vidar::synth::SynthConfig;
+use vidar::synth::{CalibrationKind, PRESETS, SynthConfig};
 use vidar::{Error, ExitStatus};
 
 /// Renders a synthetic sequence in EuRoC layout.
 pub fn synth(args: &SynthArgs, context: &Context) -> Outcome {
-    let base = match &args.world_config {
-        Some(path) => world_file(path)?,
-        None if args.euroc => SynthConfig::euroc(),
-        None => SynthConfig::demo(),
+    let base = match (&args.world_config, &args.preset) {
+        (Some(path), _) => world_file(path)?,
+        (None, Some(name)) => SynthConfig::preset(name).ok_or_else(|| {
+            usage(format!("--preset {name:?} is unknown"), format!("presets: {}", PRESETS.join(", ")))
+        })?,
+        (None, None) if args.euroc => SynthConfig::euroc(),
+        (None, None) => SynthConfig::demo(),
     };
-    let world = build::world(&args.world, base)?;
+    let world = build::world(&args.world, recording(args, base)?)?;
     if args.out.exists() {
         return Err(usage(
             format!("{} exists", args.out.display()),
@@ -43,6 +46,46 @@ pub fn synth(args: &SynthArgs, context: &Context) -> Outcome {
         print::talk(format!("next: vidar run {}", args.out.display()));
     }
     Ok(ExitStatus::Done)
+}
+
+/// Applies the options of the recording device.
+fn recording(args: &SynthArgs, mut world: SynthConfig) -> Result<SynthConfig, Error> {
+    if let Some(size) = &args.size {
+        let parsed = size.split_once('x').and_then(|(w, h)| Some((w.parse().ok()?, h.parse().ok()?)));
+        let Some((width, height)) = parsed else {
+            return Err(usage(format!("--size {size:?} is no size"), "for example --size 1280x720"));
+        };
+        world = world.resized(width, height);
+    }
+    if let Some(hz) = args.frame_rate {
+        world.camera_rate_hz = hz;
+    }
+    if let Some(hz) = args.imu_rate {
+        world.imu_rate_hz = hz;
+    }
+    if let Some(ms) = args.readout_ms {
+        world.device.readout_secs = ms * 1e-3;
+    }
+    if let Some(ms) = args.stamp_delay_ms {
+        world.device.stamp_delay_secs = ms * 1e-3;
+    }
+    if let Some(share) = args.bare_share {
+        world.bare_share = share;
+    }
+    if let Some(kind) = &args.calibration {
+        world.device.calibration = match kind.as_str() {
+            "given" => CalibrationKind::Given,
+            "partial" => CalibrationKind::Partial,
+            "absent" => CalibrationKind::Absent,
+            other => {
+                return Err(usage(
+                    format!("--calibration {other:?} is unknown"),
+                    "calibrations: given, partial, absent",
+                ));
+            }
+        };
+    }
+    Ok(world)
 }
 
 /// A file with every setting of the world.

@@ -170,7 +170,10 @@ impl ClipRoom {
         let mut noise = Gaussian::new(stream(self.seed, Purpose::ClipNoise(number)));
         let tint = |hit: &Hit, radiance: f32| palette.tint(world, hit).map(|t| radiance * t);
         let exposed: Vec<ExposedChannels<3>> = (0..poses.len())
-            .map(|k| expose_hits(world, &table, &sensor.shutter(&poses, k, samples), tint))
+            .map(|k| {
+                let shutter = sensor.shutter(&poses, k, samples);
+                expose_hits(world, &table, |sample, _| shutter[sample], tint)
+            })
             .collect();
         let gain = sensor.metered(&exposed);
         let views = exposed

@@ -9,7 +9,7 @@ use vidar_core::{Se3, So3};
 /// Height of the body's origin above the floor while it sits, m: on a small stand.
 const REST_HEIGHT_M: f64 = 0.45;
 
-/// A course through a scene whose floor is centred on the origin.
+/// A course through a scene (any flight that is not hand-held) whose floor is centred on the origin.
 pub(super) struct Course {
     kind: FlightKind,
     corridor: bool,
@@ -28,10 +28,10 @@ impl Course {
         let (half, height_m) = match (config.scene, config.flight) {
             (SceneKind::Room, FlightKind::Sweep) => ([1.5, 1.5], 1.6),
             (SceneKind::Room, FlightKind::Orbit) => ([2.3, 2.2], 1.8),
-            (SceneKind::Room, FlightKind::Aggressive) => ([1.7, 1.6], 1.7),
+            (SceneKind::Room, _) => ([1.7, 1.6], 1.7),
             (SceneKind::Hall, FlightKind::Sweep) => ([5.5, 3.5], 2.2),
             (SceneKind::Hall, FlightKind::Orbit) => ([6.0, 4.2], 2.6),
-            (SceneKind::Hall, FlightKind::Aggressive) => ([4.0, 3.0], 2.6),
+            (SceneKind::Hall, _) => ([4.0, 3.0], 2.6),
             (SceneKind::Corridor, FlightKind::Aggressive) => ([8.0, 0.3], 1.5),
             (SceneKind::Corridor, _) => ([11.0, 0.35], 1.5),
         };
@@ -45,7 +45,7 @@ impl Course {
         let speed = match config.flight {
             FlightKind::Sweep => 0.9,
             FlightKind::Orbit => 1.1,
-            FlightKind::Aggressive => 2.0,
+            _ => 2.0,
         };
         let corridor = config.scene == SceneKind::Corridor;
         let mean_radius = if corridor { half[0] } else { 0.5 * (half[0] + half[1]) };
@@ -84,7 +84,7 @@ impl Course {
                 let z = self.height_m + self.height_swing_m * (1.5 * a).sin();
                 (Vector3::new(half_x * a.cos(), half_y * a.sin(), z), a + PI + 0.25 * (0.7 * secs).sin())
             }
-            FlightKind::Aggressive => {
+            _ => {
                 let z = self.height_m + 1.4 * self.height_swing_m * (1.7 * a + 0.3).sin();
                 let position = Vector3::new(half_x * a.sin(), half_y * (2.0 * a).sin(), z);
                 (position, 0.6 * a + 1.1 * (1.1 * secs).sin())
@@ -105,7 +105,7 @@ impl Course {
         let glance = match self.kind {
             FlightKind::Sweep => 0.75 * (0.75 * secs).sin(),
             FlightKind::Orbit => 0.15 * (0.6 * secs).sin(),
-            FlightKind::Aggressive => 0.8 * (1.4 * secs).sin(),
+            _ => 0.8 * (1.4 * secs).sin(),
         };
         (Vector3::new(-half_x * a.cos(), weave, z), turning + glance)
     }

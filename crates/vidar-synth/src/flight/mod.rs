@@ -4,12 +4,14 @@
 //! ([`spline`]); what is written as truth, what the camera sees and what the IMU reads come from that one curve.
 
 mod builtin;
+mod handheld;
 mod recorded;
 mod spline;
 
 pub use spline::FlightState;
 
 use crate::config::{Start, SynthConfig};
+use crate::device::Mount;
 use crate::error::SynthError;
 use crate::world::Extent;
 use nalgebra::Vector3;
@@ -48,13 +50,29 @@ impl FlightPath {
     pub fn built_in(config: &SynthConfig) -> Result<Self, SynthError> {
         config.validate()?;
         let pace = Pace::new(config.start, 0.0);
-        let course = builtin::Course::new(config);
-        let poses: Vec<Se3> = control_times(config.duration_secs)
-            .map(|t| course.world_from_body(pace.source_secs(t), pace.lift(t)))
-            .collect();
+        let poses = Self::built_in_poses(config, &pace);
         // The built-in flights are what the spline makes of them; nothing need be passed through.
         let spline = PoseSpline::new(-margin_secs(), INTERVAL_SECS, &poses);
         Ok(Self { spline, duration_secs: config.duration_secs })
+    }
+
+    /// Control poses of the body on the built-in flight.
+    fn built_in_poses(config: &SynthConfig, pace: &Pace) -> Vec<Se3> {
+        use vidar_core::LieGroup;
+        let times = control_times(config.duration_secs);
+        let camera_from_body = config.body_from_camera().inverse();
+        if let Some(path) = handheld::Handheld::new(config) {
+            let at = |t: f64| path.world_from_camera(pace.source_secs(t), t, pace.lift(t)) * camera_from_body;
+            return times.map(at).collect();
+        }
+        let course = builtin::Course::new(config);
+        let euroc = times.map(|t| course.world_from_body(pace.source_secs(t), pace.lift(t)));
+        if config.device.mount == Mount::Euroc {
+            return euroc.collect();
+        }
+        // Courses are those of EuRoC's body; another mount keeps the camera where it was.
+        let euroc_from_body = crate::rig::euroc_body_from_camera() * camera_from_body;
+        euroc.map(|world_from_euroc| world_from_euroc * euroc_from_body).collect()
     }
 
     /// A flight through a recorded trajectory of the body or of a camera of EuRoC's rig, z up.
@@ -66,7 +84,7 @@ impl FlightPath {
     /// Fewer than 4 poses, less than a second of flight, a gap of more than a second, or a body that the rig lacks.
     pub fn from_trajectory(trajectory: &Trajectory, config: &SynthConfig) -> Result<Self, SynthError> {
         config.validate()?;
-        let source = recorded::Recorded::new(trajectory, config.trajectory_smoothing_secs)?;
+        let source = recorded::Recorded::new(trajectory, config)?;
         let lead_in = if config.start == Start::InFlight { MARGIN_SECS } else { 0.0 };
         let pace = Pace::new(config.start, lead_in);
         let available = pace.sequence_secs(source.duration_secs() - MARGIN_SECS);

@@ -1,5 +1,6 @@
 //! A recorded trajectory as a smooth course.
 
+use crate::config::SynthConfig;
 use crate::error::SynthError;
 use crate::rig;
 use nalgebra::Vector3;
@@ -17,10 +18,10 @@ pub(super) struct Recorded {
 }
 
 impl Recorded {
-    pub(super) fn new(trajectory: &Trajectory, smoothing_secs: f64) -> Result<Self, SynthError> {
+    pub(super) fn new(trajectory: &Trajectory, config: &SynthConfig) -> Result<Self, SynthError> {
         let bad = |reason: String| SynthError::BadTrajectory { reason };
-        // The intrinsics do not matter for moving poses about the rig.
-        let trajectory = trajectory.in_frame(BodyFrame::Imu, &rig::euroc_rig(752, 480)?)?;
+        let smoothing_secs = config.trajectory_smoothing_secs;
+        let trajectory = trajectory.in_frame(BodyFrame::Imu, &rig::rig(config)?)?;
         let Some((begin, end)) = trajectory.time_range() else {
             return Err(bad("it is empty".into()));
         };

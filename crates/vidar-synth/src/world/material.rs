@@ -22,6 +22,8 @@ pub(super) enum Kind {
     Board,
     /// Nearly uniform paint, as real rooms have and stereo dislikes.
     Plain,
+    /// Uniform albedo; only the light on it varies.
+    Uniform,
 }
 
 /// A surface: its kind, its own random numbers, its mean brightness, and the size (m) of what it covers.
@@ -99,6 +101,7 @@ impl Material {
                 let grain = octaves(u, v, 0.09, texel, 0.75, s ^ 29);
                 tone + 0.15 * dirt + 0.07 * grain - 0.20 * specks - 0.10 * crack(u, v, 0.9, texel, s ^ 5)
             }
+            Kind::Uniform => tone,
             Kind::Plain => tone + 0.012 * rough(0.8, 0.5),
             Kind::Brick => brick(u, v, texel, s, tone),
             Kind::Concrete => {

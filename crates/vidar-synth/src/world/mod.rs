@@ -1,5 +1,6 @@
 //! The world: a furnished room as analytic shapes with baked, band-limited textures.
 
+mod bare;
 mod bvh;
 mod furnish;
 mod light;
@@ -19,7 +20,6 @@ pub(crate) use wild::room_size;
 use crate::config::{SceneKind, SynthConfig};
 use crate::error::SynthError;
 use crate::flight::FlightPath;
-use crate::rig::euroc_camera;
 use bvh::Bvh;
 use light::{LightMap, Lighting};
 use material::Surface;
@@ -79,14 +79,15 @@ impl World {
     pub fn build(config: &SynthConfig, flight: &FlightPath) -> Result<Self, SynthError> {
         config.validate()?;
         let room = room_around(config, &flight.extent())?;
-        let furnished = furnish::furnish(config, &room, &flight.positions(0.02));
+        let mut furnished = furnish::furnish(config, &room, &flight.positions(0.02));
+        bare::strip_textures(&mut furnished, &room, config);
         let mut shapes = vec![Shape::Shell { min: room.min, max: room.max }];
         let mut surfaces = furnished.shell;
         for piece in furnished.pieces {
             surfaces.extend(std::iter::repeat_n(piece.surface, piece.shape.face_count()));
             shapes.push(piece.shape);
         }
-        let focal = euroc_camera(config.width, config.height)?.intrinsics().fx;
+        let focal = config.camera()?.intrinsics().fx;
         let lighting = wild::lighting(config);
         Ok(Self::bake(shapes, &surfaces, SHARP_DISTANCE_M / focal, &lighting, config.seed as u32))
     }

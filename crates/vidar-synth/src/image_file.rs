@@ -1,9 +1,25 @@
-//! Grey PNG files.
+//! Grey PNG and JPEG files.
 
 use crate::error::SynthError;
 use std::fs::File;
 use std::io::{BufWriter, Write};
 use std::path::Path;
+
+/// Writes 8-bit grey pixels as a baseline JPEG of `quality` 1…100.
+pub(crate) fn write_jpeg(
+    path: &Path,
+    width: usize,
+    height: usize,
+    pixels: &[u8],
+    quality: u8,
+) -> Result<(), SynthError> {
+    let mut bytes = Vec::new();
+    image::codecs::jpeg::JpegEncoder::new_with_quality(&mut bytes, quality)
+        .encode(pixels, width as u32, height as u32, image::ExtendedColorType::L8)
+        .map_err(std::io::Error::other)
+        .and_then(|()| std::fs::write(path, &bytes))
+        .map_err(SynthError::write(path))
+}
 
 /// Writes 8-bit grey pixels.
 pub(crate) fn write_gray8(path: &Path, width: usize, height: usize, pixels: &[u8]) -> Result<(), SynthError> {

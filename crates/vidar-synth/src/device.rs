@@ -1,0 +1,276 @@
+//! The recording device: lens, place of the camera, shutter, clocks, compression, and which calibration is written.
+//!
+//! The default is EuRoC's sensor: global shutter, one clock, lossless images, calibration given. The other settings
+//! make recordings as phones, depth cameras and action cameras make them.
+
+use crate::config::{SynthConfig, ensure, within};
+use crate::error::SynthError;
+use crate::random::{Gaussian, Purpose, stream};
+use crate::rig;
+use nalgebra::{Matrix3, Vector3};
+use serde::{Deserialize, Serialize};
+use vidar_core::camera::RadTan;
+use vidar_core::{CameraModel, LieGroup, Pinhole, Se3, So3};
+
+/// The camera's projection.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case", deny_unknown_fields)]
+pub enum Lens {
+    /// EuRoC's cam0 (radial-tangential), scaled to the image size.
+    #[default]
+    Euroc,
+    /// A pinhole with radial-tangential distortion; all coefficients 0 is a plain pinhole.
+    Radtan {
+        /// Focal length in both directions, px, 8…20000.
+        focal_px: f64,
+        /// Principal point minus the image's centre, px, −500…500.
+        centre_offset_px: [f64; 2],
+        /// k1, k2, p1, p2 (OpenCV), −1…1.
+        distortion: [f64; 4],
+    },
+}
+
+/// Where and how the camera is mounted on the body (IMU).
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Mount {
+    /// EuRoC's cam0: body x up, z ahead.
+    #[default]
+    Euroc,
+    /// cam0 of the TUM-VI rig: body z up, camera along −y.
+    TumVi,
+    /// A phone held in landscape, axes as Android defines them; misaligned by 1.5° (σ per axis) and with a lever arm
+    /// of about 6 cm, both drawn from the seed.
+    Phone,
+    /// One of the 24 axis permutations with misalignment as `phone` and a lever arm of up to 5 cm per axis, drawn
+    /// from the seed.
+    AnyAxes,
+}
+
+/// How the IMU's samples are timed.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum ImuTiming {
+    /// Evenly spaced.
+    #[default]
+    Regular,
+    /// Intervals vary by 5 % (σ) of the period; stamps are right; one row in 500 is written twice.
+    Jittered,
+    /// Gyroscope and accelerometer sample on their own clocks (rates 0.3 % apart); the file has a row for every sample
+    /// of either, the other sensor linearly interpolated. About two rows per period, some only microseconds apart.
+    Interleaved,
+}
+
+/// Which calibration is written beside the images. The true values are always in `truth.json`.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum CalibrationKind {
+    /// Lens, `T_BS` and IMU noise as simulated. Readout and clock offset are not written.
+    #[default]
+    Given,
+    /// A focal length with 1.5 % error (σ), principal point at the centre, no distortion, no `T_BS`, no IMU noise.
+    Partial,
+    /// No calibration files of camera and IMU.
+    Absent,
+}
+
+/// How the sequence is recorded.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct DeviceConfig {
+    /// The camera's projection.
+    pub lens: Lens,
+    /// Where the camera is mounted.
+    pub mount: Mount,
+    /// Rolling shutter: time from the exposure of the first row to that of the last, s, 0…0.05; 0 is a global shutter.
+    /// Row r of h is exposed at `t + (r/(h−1) − 1/2)·readout_secs`.
+    pub readout_secs: f64,
+    /// Image stamps are late by this, s, −0.15…0.15: stamp = time of the middle row + `stamp_delay_secs`.
+    pub stamp_delay_secs: f64,
+    /// Standard deviation of each frame's time in periods, 0…0.3 (variable frame rate); stamps follow.
+    pub frame_jitter: f64,
+    /// Share of frames that are missing, 0…0.5.
+    pub dropped_frames: f64,
+    /// Share of frames that show the previous image again under a new stamp, 0…0.5.
+    pub repeated_frames: f64,
+    /// JPEG quality, 1…100; 0 writes lossless PNG.
+    pub jpeg_quality: u8,
+    /// How the IMU's samples are timed.
+    pub imu_timing: ImuTiming,
+    /// Gaps in the IMU's rows per minute, 0…60; each lasts 20 to 50 ms.
+    pub imu_gaps_per_min: f64,
+    /// Standard deviation of the gyroscope's and accelerometer's scale errors per axis, 0…0.05.
+    pub imu_scale_sigma: f64,
+    /// Written IMU noise densities are the true ones times this, 0.01…1000.
+    pub stated_noise_factor: f64,
+    /// Which calibration is written.
+    pub calibration: CalibrationKind,
+}
+
+impl Default for DeviceConfig {
+    fn default() -> Self {
+        Self {
+            lens: Lens::Euroc,
+            mount: Mount::Euroc,
+            readout_secs: 0.0,
+            stamp_delay_secs: 0.0,
+            frame_jitter: 0.0,
+            dropped_frames: 0.0,
+            repeated_frames: 0.0,
+            jpeg_quality: 0,
+            imu_timing: ImuTiming::Regular,
+            imu_gaps_per_min: 0.0,
+            imu_scale_sigma: 0.0,
+            stated_noise_factor: 1.0,
+            calibration: CalibrationKind::Given,
+        }
+    }
+}
+
+impl DeviceConfig {
+    pub(crate) fn validate(&self) -> Result<(), SynthError> {
+        if let Lens::Radtan { focal_px, centre_offset_px, distortion } = self.lens {
+            within("device.lens.focal_px", focal_px, 8.0, 20_000.0, "8 to 20000 px")?;
+            for offset in centre_offset_px {
+                within("device.lens.centre_offset_px", offset, -500.0, 500.0, "-500 to 500 px")?;
+            }
+            for k in distortion {
+                within("device.lens.distortion", k, -1.0, 1.0, "-1 to 1")?;
+            }
+        }
+        within("device.readout_secs", self.readout_secs, 0.0, 0.05, "0 to 0.05 s")?;
+        within("device.stamp_delay_secs", self.stamp_delay_secs, -0.15, 0.15, "-0.15 to 0.15 s")?;
+        within("device.frame_jitter", self.frame_jitter, 0.0, 0.3, "0 to 0.3")?;
+        within("device.dropped_frames", self.dropped_frames, 0.0, 0.5, "0 to 0.5")?;
+        within("device.repeated_frames", self.repeated_frames, 0.0, 0.5, "0 to 0.5")?;
+        ensure(self.jpeg_quality <= 100, "device.jpeg_quality", "0 to 100", self.jpeg_quality)?;
+        within("device.imu_gaps_per_min", self.imu_gaps_per_min, 0.0, 60.0, "0 to 60 per minute")?;
+        within("device.imu_scale_sigma", self.imu_scale_sigma, 0.0, 0.05, "0 to 0.05")?;
+        within("device.stated_noise_factor", self.stated_noise_factor, 0.01, 1000.0, "0.01 to 1000")
+    }
+}
+
+impl SynthConfig {
+    /// The camera that renders the images: `device.lens` at the configured size.
+    ///
+    /// # Errors
+    /// A lens that is no valid camera of this size (distortion that folds the image).
+    pub fn camera(&self) -> Result<CameraModel, SynthError> {
+        let Lens::Radtan { focal_px, centre_offset_px, distortion } = self.device.lens else {
+            return rig::euroc_camera(self.width, self.height);
+        };
+        let [dx, dy] = centre_offset_px;
+        let (cx, cy) = (0.5 * (self.width as f64 - 1.0) + dx, 0.5 * (self.height as f64 - 1.0) + dy);
+        let pinhole = Pinhole::new(focal_px, focal_px, cx, cy, self.width, self.height)?;
+        if distortion == [0.0; 4] {
+            return Ok(CameraModel::Pinhole(pinhole));
+        }
+        Ok(CameraModel::RadTan(RadTan::new(pinhole, distortion)?))
+    }
+
+    /// Pose of the camera in the body (IMU) frame: `device.mount`.
+    pub fn body_from_camera(&self) -> Se3 {
+        let mut random = Gaussian::new(stream(self.seed, Purpose::Mount));
+        let misaligned = |axes: Matrix3<f64>, turn: Vector3<f64>, lever_m: Vector3<f64>| {
+            let axes = So3::from_matrix(&axes).unwrap_or(So3::IDENTITY);
+            Se3::new(axes * So3::exp(&(turn * MISALIGNMENT_RAD)), lever_m)
+        };
+        match self.device.mount {
+            Mount::Euroc => rig::euroc_body_from_camera(),
+            Mount::TumVi => rig::tum_vi_body_from_camera(),
+            Mount::Phone => {
+                // Landscape: the body's x is up, y is left, z points at the user; the camera looks along −z.
+                let axes = Matrix3::new(0.0, -1.0, 0.0, -1.0, 0.0, 0.0, 0.0, 0.0, -1.0);
+                let lever_m = Vector3::new(0.02, 0.055, -0.004) + random.vector() * 0.005;
+                misaligned(axes, random.vector(), lever_m)
+            }
+            Mount::AnyAxes => {
+                let axes = axis_permutation((random.uniform() * 24.0) as usize);
+                let lever_m = Vector3::from_fn(|_, _| 0.1 * random.uniform() - 0.05);
+                misaligned(axes, random.vector(), lever_m)
+            }
+        }
+    }
+
+    /// True scale factors of gyroscope and accelerometer per axis: a reading is motion times this, plus bias and noise.
+    pub fn imu_scale(&self) -> [Vector3<f64>; 2] {
+        let mut random = Gaussian::new(stream(self.seed, Purpose::ImuScale));
+        let mut draw = || Vector3::repeat(1.0) + random.vector() * self.device.imu_scale_sigma;
+        [draw(), draw()]
+    }
+
+    /// The camera that a partial calibration states.
+    pub(crate) fn partial_camera(&self, camera: &CameraModel) -> Result<CameraModel, SynthError> {
+        let focal_px = self.stated_focal_px(camera.intrinsics().fx);
+        let [cx, cy] = [self.width, self.height].map(|size| 0.5 * (size as f64 - 1.0));
+        Ok(CameraModel::Pinhole(Pinhole::new(focal_px, focal_px, cx, cy, self.width, self.height)?))
+    }
+
+    /// The focal length that a partial calibration states, px: the true one with an error of 1.5 % (σ), at most 3 %.
+    pub(crate) fn stated_focal_px(&self, true_focal_px: f64) -> f64 {
+        let mut random = Gaussian::new(stream(self.seed, Purpose::StatedFocal));
+        true_focal_px * (1.0 + (0.015 * random.next()).clamp(-0.03, 0.03))
+    }
+}
+
+/// Standard deviation of a consumer device's camera orientation per axis, rad: 1.5°.
+const MISALIGNMENT_RAD: f64 = 0.026;
+
+/// Right-handed axis permutation `index` (0…23); columns are the camera's axes in the body.
+fn axis_permutation(index: usize) -> Matrix3<f64> {
+    let (x, sign_x) = (index % 3, if (index / 3).is_multiple_of(2) { 1.0 } else { -1.0 });
+    let turn = index / 6 % 4;
+    let mut first = Vector3::zeros();
+    first[x] = sign_x;
+    let mut second = Vector3::zeros();
+    second[(x + 1 + turn % 2) % 3] = if turn < 2 { 1.0 } else { -1.0 };
+    Matrix3::from_columns(&[first, second, first.cross(&second)])
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_24_axis_permutations_are_right_handed_and_distinct() {
+        for i in 0..24 {
+            assert!((axis_permutation(i).determinant() - 1.0).abs() < 1e-12, "{i}");
+            for j in 0..i {
+                assert_ne!(axis_permutation(i), axis_permutation(j), "{i} and {j}");
+            }
+        }
+    }
+
+    #[test]
+    fn a_phone_held_in_landscape_sees_upright_images() {
+        let config = SynthConfig {
+            device: DeviceConfig { mount: Mount::Phone, ..Default::default() },
+            ..Default::default()
+        };
+        let mount = config.body_from_camera();
+        // The image's down (camera y) is the body's −x; 5° is more than 3 σ of the misalignment.
+        let down = mount.rotation * Vector3::y();
+        assert!(down.dot(&-Vector3::x()) > 5_f64.to_radians().cos(), "{down:?}");
+        assert!((0.03..0.09).contains(&mount.translation.norm()));
+        let other = SynthConfig { seed: 2, ..config.clone() };
+        assert_ne!(other.body_from_camera(), mount);
+        assert_eq!(config.body_from_camera(), mount);
+    }
+
+    #[test]
+    fn a_lens_of_given_focal_length_projects_with_it() {
+        let lens = Lens::Radtan {
+            focal_px: 487.0,
+            centre_offset_px: [3.0, -2.0],
+            distortion: [0.08, -0.1, 0.0, 0.0],
+        };
+        let device = DeviceConfig { lens, ..Default::default() };
+        let config = SynthConfig { width: 640, height: 480, device, ..Default::default() };
+        let camera = config.camera().unwrap();
+        let k = camera.intrinsics();
+        assert_eq!([k.fx, k.fy, k.cx, k.cy], [487.0, 487.0, 322.5, 237.5]);
+        assert!(matches!(camera, CameraModel::RadTan(_)));
+        let stated = config.stated_focal_px(487.0);
+        assert!((stated / 487.0 - 1.0).abs() <= 0.03 && stated != 487.0);
+    }
+}
