@@ -1,8 +1,8 @@
 #!/usr/bin/env python3
-"""Makes crates/vidar/tests/data/salad_tiny.safetensors: a tiny SALAD with random weights, an input and its descriptor.
+"""Makes crates/vidar-da3/tests/data/salad_tiny.safetensors: a tiny SALAD with random weights, an input and its descriptor.
 
 Needs: pip install torch safetensors numpy
-  python tools/make_salad_golden.py crates/vidar/tests/data/salad_tiny.safetensors
+  python tools/make_salad_golden.py crates/vidar-da3/tests/data/salad_tiny.safetensors
 
 Written from the papers (DINOv2: Oquab et al. 2023; SALAD: Izquierdo and Civera 2024) in plain PyTorch, float64. Keys are those of
 the published checkpoint.

@@ -477,33 +477,3 @@ fn the_machine_chains_the_recorded_run_as_the_official_code_does() {
         }
     }
 }
-
-#[test]
-fn descriptors_of_salad_are_met() {
-    let Some(golden) = Golden::open("salad_small") else { return };
-    let perceptron = |name: &str, second: usize| Perceptron {
-        first: golden.f32(&format!("w.{name}.0.weight")),
-        first_bias: golden.f32(&format!("w.{name}.0.bias")),
-        second: golden.f32(&format!("w.{name}.{second}.weight")),
-        second_bias: golden.f32(&format!("w.{name}.{second}.bias")),
-    };
-    let head = SaladHead {
-        cluster_features: perceptron("cluster_features", 3),
-        score: perceptron("score", 3),
-        token_features: perceptron("token_features", 2),
-        dust_bin: golden.f32("w.dust_bin")[0],
-    };
-    let shape = golden.shape("in.features");
-    let (channels, tokens) = (shape[1], shape[2] * shape[3]);
-    let (features, class) = (golden.f32("in.features"), golden.f32("in.token"));
-    let expected = golden.f32("out.descriptor");
-    let dimension = golden.shape("out.descriptor")[1];
-    for image in 0..shape[0] {
-        let patches = &features[image * channels * tokens..(image + 1) * channels * tokens];
-        let found = head.describe(patches, tokens, &class[image * channels..(image + 1) * channels]).unwrap();
-        assert_eq!(found.len(), dimension);
-        for (a, b) in found.iter().zip(&expected[image * dimension..]) {
-            assert!((a - b).abs() < 1e-6, "{image}: {a} {b}");
-        }
-    }
-}

@@ -65,6 +65,14 @@ pub enum Da3Error {
         /// One line a key: missing, wrong shape, unknown.
         problems: Vec<String>,
     },
+    /// A file that is not SALAD's converted checkpoint.
+    #[error("{} is not a SALAD checkpoint: {reason}", path.display())]
+    NotSalad {
+        /// The file.
+        path: PathBuf,
+        /// What is missing or wrong.
+        reason: String,
+    },
     /// No description, and keys of no official network.
     #[error("{origin}: no config.json, and the keys fit no official network: {reason}")]
     UnknownNetwork {

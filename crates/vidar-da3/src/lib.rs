@@ -35,6 +35,7 @@ pub mod pose;
 pub mod preprocess;
 pub mod ray_pose;
 mod run;
+pub mod salad;
 mod sky;
 mod trace;
 pub mod weights;

@@ -1,83 +1,83 @@
-//! Exhaustive search for places that look alike and are far apart in time.
+//! Exhaustive search for images with similar descriptors that are far apart in time.
 
 use vidar_core::{FrameId, Timestamp};
 
-/// Descriptors of a run, 2 bytes per number, and where on the way they were taken.
+/// Descriptors of a run, 2 bytes per entry, with the time and the travelled distance of each image.
 #[derive(Clone, Debug, Default)]
 pub struct PlaceIndex {
     dimension: usize,
     /// Row-major, in units of each row's `step`.
     values: Vec<i16>,
-    places: Vec<Place>,
-    /// How places look on average; none where descriptors are compared as they are.
-    common: Option<Common>,
+    images: Vec<IndexedImage>,
+    /// Statistics for whitening; none where descriptors are compared as they are.
+    statistics: Option<ChannelStatistics>,
 }
 
-/// How much a row of the index, in units of its step, looks like what is searched for.
-type Likeness<'a> = Box<dyn Fn(&[i16], f32) -> f32 + 'a>;
+/// Similarity of a row of the index, in units of its step, to the query.
+type Similarity<'a> = Box<dyn Fn(&[i16], f32) -> f32 + 'a>;
 
-/// Sums over all places, channel by channel.
+/// Sums over all images, channel by channel.
 #[derive(Clone, Debug, Default)]
-struct Common {
+struct ChannelStatistics {
     sum: Vec<f64>,
     squares: Vec<f64>,
 }
 
-/// Before so many places their average says nothing.
-const FEW_PLACES: usize = 16;
-/// Channels that vary less than this share of the average channel are not blown up further.
-const LEAST_VARIANCE: f64 = 0.01;
+/// Fewer images than this do not give a useful mean.
+const MIN_IMAGES: usize = 16;
+/// Added to each channel's variance, as a share of the mean variance of all channels.
+const VARIANCE_FLOOR: f64 = 0.01;
 
 #[derive(Clone, Copy, Debug)]
-struct Place {
+struct IndexedImage {
     frame_id: FrameId,
     time: Timestamp,
     travel_m: f64,
     step: f32,
 }
 
-/// A place that looks alike.
+/// A similar image.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct PlaceMatch {
-    /// The frame taken there.
+    /// Its frame.
     pub frame_id: FrameId,
     /// Inner product of the descriptors.
     pub similarity: f32,
 }
 
 impl PlaceIndex {
-    /// An index for descriptors that are all alike, as averaged tokens are: similarity is the correlation of what sets two
-    /// places apart from the average of all so far, each channel in units of its spread (a diagonal whitening). Until
-    /// there are some places nothing is found.
+    /// An index for descriptors with a large common part, such as mean tokens. Similarity is the correlation of two
+    /// descriptors after subtracting the mean of all descriptors so far and dividing each channel by its standard deviation
+    /// (diagonal whitening). A search among fewer than 16 images finds nothing.
     pub fn whitened() -> Self {
-        Self { common: Some(Common::default()), ..Self::default() }
+        Self { statistics: Some(ChannelStatistics::default()), ..Self::default() }
     }
 
-    /// Whether the average look is removed before places are compared.
+    /// Whether descriptors are whitened before they are compared.
     pub fn is_whitened(&self) -> bool {
-        self.common.is_some()
+        self.statistics.is_some()
     }
 
-    /// Number of places.
+    /// Number of images.
     pub fn len(&self) -> usize {
-        self.places.len()
+        self.images.len()
     }
 
     /// Whether there is none.
     pub fn is_empty(&self) -> bool {
-        self.places.is_empty()
+        self.images.is_empty()
     }
 
     /// Bytes held.
     pub fn memory_bytes(&self) -> usize {
-        self.values.len() * 2 + self.places.len() * size_of::<Place>()
+        self.values.len() * 2 + self.images.len() * size_of::<IndexedImage>()
     }
 
-    /// Adds a place. A descriptor of another length than the first, or one that is not finite, is not taken: `false`.
+    /// Adds an image; `false` for a descriptor that is not finite or not as long as the first one.
     ///
-    /// `travel_m` is the length of the way so far.
+    /// `travel_m` is the distance travelled so far.
     pub fn add(&mut self, frame_id: FrameId, time: Timestamp, travel_m: f64, descriptor: &[f32]) -> bool {
-        if self.places.is_empty() {
+        if self.images.is_empty() {
             self.dimension = descriptor.len();
         }
         let finite = descriptor.iter().all(|v| v.is_finite());
@@ -87,18 +87,18 @@ impl PlaceIndex {
         // 15 bits of the largest entry: an inner product is off by less than 1e-4.
         let largest = descriptor.iter().fold(0.0_f32, |a, v| a.max(v.abs())).max(f32::MIN_POSITIVE);
         let step = largest / f32::from(i16::MAX);
-        if let Some(common) = &mut self.common {
-            common.add(descriptor);
+        if let Some(statistics) = &mut self.statistics {
+            statistics.add(descriptor);
         }
         self.values.extend(descriptor.iter().map(|v| (v / step).round() as i16));
-        self.places.push(Place { frame_id, time, travel_m, step });
+        self.images.push(IndexedImage { frame_id, time, travel_m, step });
         true
     }
 
-    /// The `top_k` most similar places that lie `min_gap_s` and `min_travel_m` or more before this one, best first.
+    /// The `top_k` most similar images at least `min_gap_s` and `min_travel_m` before this one, best first.
     ///
-    /// Places near in time are left out before the best are chosen: in slow or fast-sampled video they would fill every
-    /// list, and no revisit would ever be seen.
+    /// Images near in time are excluded before the best are chosen: in slow or densely sampled video they would fill every
+    /// list and hide revisits.
     pub fn search(
         &self,
         time: Timestamp,
@@ -111,18 +111,18 @@ impl PlaceIndex {
         if descriptor.len() != self.dimension || self.dimension == 0 {
             return Vec::new();
         }
-        let far = |p: &Place| {
+        let far = |p: &IndexedImage| {
             time.since(p.time).as_secs_f64() >= min_gap_s && travel_m - p.travel_m >= min_travel_m
         };
-        let likeness: Likeness<'_> = match &self.common {
+        let similarity_of: Similarity<'_> = match &self.statistics {
             None => Box::new(|row, step| inner(row, descriptor) * step),
-            Some(_) if self.len() < FEW_PLACES => return Vec::new(),
-            Some(common) => common.correlation(self.len(), descriptor),
+            Some(_) if self.len() < MIN_IMAGES => return Vec::new(),
+            Some(statistics) => statistics.correlation(self.len(), descriptor),
         };
-        let rows = self.places.iter().zip(self.values.chunks_exact(self.dimension));
+        let rows = self.images.iter().zip(self.values.chunks_exact(self.dimension));
         let mut found: Vec<PlaceMatch> = rows
-            .filter(|(p, _)| far(p))
-            .map(|(p, row)| PlaceMatch { frame_id: p.frame_id, similarity: likeness(row, p.step) })
+            .filter(|(image, _)| far(image))
+            .map(|(p, row)| PlaceMatch { frame_id: p.frame_id, similarity: similarity_of(row, p.step) })
             .filter(|m| m.similarity.is_finite())
             .collect();
         let order = |a: &PlaceMatch, b: &PlaceMatch| {
@@ -137,7 +137,7 @@ impl PlaceIndex {
     }
 }
 
-impl Common {
+impl ChannelStatistics {
     fn add(&mut self, descriptor: &[f32]) {
         self.sum.resize(descriptor.len(), 0.0);
         self.squares.resize(descriptor.len(), 0.0);
@@ -147,13 +147,13 @@ impl Common {
         }
     }
 
-    /// Of a descriptor with a row of the index: both less the mean, each channel weighed by the inverse of its variance.
-    fn correlation(&self, places: usize, descriptor: &[f32]) -> Likeness<'static> {
-        let n = places as f64;
+    /// Correlation of a descriptor with a row of the index: both less the mean, each channel weighted by its inverse variance.
+    fn correlation(&self, images: usize, descriptor: &[f32]) -> Similarity<'static> {
+        let n = images as f64;
         let mean: Vec<f64> = self.sum.iter().map(|s| s / n).collect();
         let variance: Vec<f64> =
             self.squares.iter().zip(&mean).map(|(s, m)| (s / n - m * m).max(0.0)).collect();
-        let floor = LEAST_VARIANCE * variance.iter().sum::<f64>() / variance.len().max(1) as f64;
+        let floor = VARIANCE_FLOOR * variance.iter().sum::<f64>() / variance.len().max(1) as f64;
         let weight: Vec<f32> = variance.iter().map(|v| (1.0 / (v + floor).max(1e-30)) as f32).collect();
         let mean: Vec<f32> = mean.into_iter().map(|m| m as f32).collect();
         let own: Vec<f32> = descriptor.iter().zip(&mean).map(|(d, m)| d - m).collect();
@@ -170,7 +170,7 @@ impl Common {
     }
 }
 
-/// Summed in sixteen lanes, so that the compiler may use vector registers; always in the same order.
+/// Inner product in sixteen lanes, which the compiler vectorises; the order of summation is fixed.
 fn inner(a: &[i16], b: &[f32]) -> f32 {
     const LANES: usize = 16;
     let mut lanes = [0.0_f32; LANES];
