@@ -40,6 +40,9 @@ pub struct OdometryConfig {
     pub gravity_mps2: f64,
     /// Whether the offset between the clocks of camera and IMU is estimated on the way.
     pub estimate_time_offset: bool,
+    /// Rolling shutter: time from the first to the last image row, milliseconds, 0…50; 0 is a global shutter. Absent: it is
+    /// estimated from feature tracks and gyroscope as soon as the camera turns.
+    pub readout_ms: Option<f64>,
     /// Whether the camera's place on the body is refined on the way.
     pub estimate_extrinsics: bool,
     /// Fastest speed that is believed, m/s, 0.1…100.
@@ -61,6 +64,7 @@ impl Default for OdometryConfig {
             gravity_mps2: vidar_core::GRAVITY_MPS2,
             estimate_time_offset: true,
             estimate_extrinsics: false,
+            readout_ms: None,
             max_speed_mps: 20.0,
             max_blind_secs: 2.0,
         }
@@ -99,6 +103,7 @@ impl OdometryConfig {
         check("gyro_noise_factor", self.gyro_noise_factor, 1.0, 100.0, "1 to 100")?;
         check("accel_noise_factor", self.accel_noise_factor, 1.0, 100.0, "1 to 100")?;
         check("gravity_mps2", self.gravity_mps2, 9.5, 10.0, "9.5 to 10 m/s²")?;
+        check("readout_ms", self.readout_ms.unwrap_or(0.0), 0.0, 50.0, "0 to 50 ms")?;
         check("max_speed_mps", self.max_speed_mps, 0.1, 100.0, "0.1 to 100 m/s")?;
         check("max_blind_secs", self.max_blind_secs, 0.1, 10.0, "0.1 to 10 s")
     }

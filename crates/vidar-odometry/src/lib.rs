@@ -4,6 +4,7 @@
 //!
 //! - [`frontend`]: image pyramids, feature detection, patch alignment, two-view geometry;
 //! - [`imu`]: the buffer of IMU samples, preintegration, propagation of state and covariance;
+//! - `gyro_alignment`: clock offset, rolling-shutter readout and camera rotation from tracks and gyroscope;
 //! - [`initialization`]: the first metric state, from standstill, in motion, or up to scale without an IMU;
 //! - `tracking`: features followed from image to image, seeds, keyframes and the sliding window of frames;
 //! - [`backend`]: the fixed-lag smoother that estimates the window's states and landmarks;
@@ -13,6 +14,7 @@ pub mod backend;
 mod config;
 mod error;
 pub mod frontend;
+mod gyro_alignment;
 pub mod imu;
 pub mod initialization;
 mod pipeline;

@@ -58,8 +58,7 @@ fn fly(seed: u64, secs: f64, tracks: usize, rate_hz: f64) -> Run {
     odometry.start_at(first, disturbed(&first.truth, &mut random), SIGMAS).unwrap();
     let mut run = Run { nees: Vec::new(), relative_nees: Vec::new(), squared_errors: 0.0, frames: 0.0 };
     for (k, frame) in simulation.frames.iter().enumerate().skip(1) {
-        let StepOutput::Tracking(state) =
-            odometry.push(frame.id, frame.time, &frame.observations).unwrap()
+        let StepOutput::Tracking(state) = odometry.push(frame.id, frame.time, &frame.observations).unwrap()
         else {
             panic!("it was started");
         };
@@ -151,8 +150,7 @@ fn calibrate(seed: u64, secs: f64, tracks: usize, offset_secs: f64, turn_deg: f6
     odometry.start_at(first, disturbed(&first.truth, &mut random), sigmas).unwrap();
     let mut velocity_error_mps = f64::NAN;
     for frame in &simulation.frames[1..] {
-        let StepOutput::Tracking(state) =
-            odometry.push(frame.id, frame.time, &frame.observations).unwrap()
+        let StepOutput::Tracking(state) = odometry.push(frame.id, frame.time, &frame.observations).unwrap()
         else {
             panic!("it was started");
         };

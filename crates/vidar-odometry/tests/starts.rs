@@ -161,9 +161,7 @@ fn start_in_flight(flight: &impl Flight, from_secs: f64, later_secs: f64, seed: 
             StepOutput::Waiting(_) if secs > PATIENCE_SECS => return outcome,
             StepOutput::Waiting(Some(failure)) => outcome.failure = failure.to_string(),
             StepOutput::Waiting(None) => {}
-            StepOutput::Tracking(state) => {
-                outcome.velocity_mps = velocity_error(&state, &frame.truth)
-            }
+            StepOutput::Tracking(state) => outcome.velocity_mps = velocity_error(&state, &frame.truth),
         }
         if outcome.waited_secs.is_some_and(|at| secs >= at + later_secs) {
             break;
@@ -194,8 +192,7 @@ fn start_from_rest(flight: &impl Flight, later_secs: f64, seed: u64) -> Outcome 
     odometry.start_at(&simulation.frames[first], rest.state, rest.sigmas).unwrap();
     let limit = InFlightConfig::default().max_log_scale_sigma;
     for (k, frame) in simulation.frames.iter().enumerate().skip(first + 1) {
-        let StepOutput::Tracking(state) =
-            odometry.push(frame.id, frame.time, &frame.observations).unwrap()
+        let StepOutput::Tracking(state) = odometry.push(frame.id, frame.time, &frame.observations).unwrap()
         else {
             unreachable!("it was started")
         };

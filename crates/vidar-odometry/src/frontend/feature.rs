@@ -19,9 +19,11 @@ pub enum FeatureKind {
 /// A place in a keyframe whose surroundings can be found again.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Feature {
-    /// Where it is, level-0 pixels.
+    /// Where it is in the image, level-0 pixels: the centre of its patch.
     pub pixel: Pixel,
-    /// Unit direction in the keyframe's camera frame.
+    /// Where a global shutter at the image's time would show it, level-0 pixels; the same as `pixel` unless the shutter rolls.
+    pub global_pixel: Pixel,
+    /// Unit direction of `global_pixel` in the keyframe's camera frame.
     pub bearing: Vector3<f64>,
     /// Pyramid level on which it was found.
     pub level: u8,
@@ -33,7 +35,16 @@ impl Feature {
     /// A feature at `pixel`; `None` where the camera has no direction for it.
     pub fn new(camera: &CameraModel, pixel: Pixel, level: u8, kind: FeatureKind) -> Option<Self> {
         let bearing = camera.unproject(&pixel)?;
-        Some(Self { pixel, bearing, level, kind })
+        Some(Self { pixel, global_pixel: pixel, bearing, level, kind })
+    }
+
+    /// The same patch with the rolling shutter's motion removed from its direction; `None` where the camera has no
+    /// direction for `global_pixel`.
+    pub fn with_global_pixel(self, camera: &CameraModel, global_pixel: Pixel) -> Option<Self> {
+        if global_pixel == self.pixel {
+            return Some(self);
+        }
+        Some(Self { global_pixel, bearing: camera.unproject(&global_pixel)?, ..self })
     }
 
     /// Whether it is a piece of an edge.

@@ -4,6 +4,7 @@
 //! [`GyroAlignmentLog`] collects both while the odometry runs and is asked for an [`Alignment`] from time to time.
 //! [`RollingShutter`] applies the readout time to pixels.
 
+mod hand_eye;
 mod path;
 mod shutter;
 mod solver;
@@ -13,10 +14,10 @@ mod tests;
 pub(crate) use shutter::RollingShutter;
 pub(crate) use solver::Alignment;
 
+use nalgebra::Vector3;
 use path::RateSample;
 use solver::{ImageFeatures, Problem};
 use std::collections::VecDeque;
-use nalgebra::Vector3;
 use vidar_core::{CameraModel, ImuSample, LandmarkId, So3, Timestamp, camera::Pixel};
 
 /// Images nearer in time than this add little and cost as much, s.
@@ -46,6 +47,8 @@ pub(crate) struct Guess {
     pub search: bool,
     /// The focal length is a guess, too.
     pub estimates_focal: bool,
+    /// Nothing is known of `body_from_camera`: find it first.
+    pub unknown_rotation: bool,
 }
 
 /// Feature tracks and gyroscope samples of the last seconds.
@@ -80,6 +83,11 @@ impl GyroAlignmentLog {
         }
     }
 
+    /// Forgets the images, for when features are named anew.
+    pub fn forget_images(&mut self) {
+        self.images.clear();
+    }
+
     /// Solves for the alignment if enough came since the last attempt.
     pub fn attempt(&mut self, camera: &CameraModel, guess: &Guess) -> Option<Alignment> {
         let (newest, origin) = (self.gyro.back()?.0, self.images.front()?.0);
@@ -105,6 +113,11 @@ impl GyroAlignmentLog {
         let covered = samples.first().is_some_and(|s| s.secs < -LOOKAHEAD_SECS) || samples.len() > 50;
         if !covered || rate_rms(&samples) < MIN_RATE_RMS {
             return None;
+        }
+        let mut guess = *guess;
+        if guess.unknown_rotation {
+            let start = hand_eye::hand_eye(camera, &images, &samples)?;
+            guess.body_from_camera = start.body_from_camera;
         }
         let mut problem =
             Problem::new(camera, guess.estimates_focal, guess.body_from_camera, &images, &samples);

@@ -118,7 +118,9 @@ impl<'a> Problem<'a> {
         let mut pairs = Vec::new();
         for (k, image) in images.iter().enumerate() {
             for apart in [0.1, 0.25] {
-                let Some(j) = (k + 1..images.len()).find(|j| images[*j].secs - image.secs >= apart) else { continue };
+                let Some(j) = (k + 1..images.len()).find(|j| images[*j].secs - image.secs >= apart) else {
+                    continue;
+                };
                 if images[j].secs - image.secs < apart + 0.15 {
                     let matches = common(image, &images[j]);
                     if matches.len() >= 12 {
@@ -328,7 +330,11 @@ impl<'a> Problem<'a> {
 }
 
 /// Unit rays of all features when the focal length is `focal_ratio` times that of `camera`.
-fn rays_of(camera: &CameraModel, images: &[ImageFeatures], focal_ratio: f64) -> Vec<Vec<Option<Vector3<f64>>>> {
+fn rays_of(
+    camera: &CameraModel,
+    images: &[ImageFeatures],
+    focal_ratio: f64,
+) -> Vec<Vec<Option<Vector3<f64>>>> {
     let centre = Pixel::new(camera.intrinsics().cx, camera.intrinsics().cy);
     let ray = |pixel: &Pixel| camera.unproject(&(centre + (pixel - centre) / focal_ratio));
     images.iter().map(|i| i.features.iter().map(|(_, pixel)| ray(pixel)).collect()).collect()
@@ -339,7 +345,7 @@ fn bias_of(x: &Parameters) -> Vector3<f64> {
 }
 
 /// Indices of features that both images show, both in the order of ids.
-fn common(a: &ImageFeatures, b: &ImageFeatures) -> Vec<[usize; 2]> {
+pub(super) fn common(a: &ImageFeatures, b: &ImageFeatures) -> Vec<[usize; 2]> {
     let (mut i, mut j, mut out) = (0, 0, Vec::new());
     while i < a.features.len() && j < b.features.len() {
         match a.features[i].0.cmp(&b.features[j].0) {

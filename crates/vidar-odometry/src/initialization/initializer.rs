@@ -191,7 +191,7 @@ impl Initializer {
                 last,
                 secs,
             };
-            self.tracker.measure(&host.pyramid, frame, &prediction);
+            self.tracker.measure(host, &prediction);
         }
         self.images_still = self.motion.update(tracks_in(&self.tracker.tracks, frame), time);
         self.rotations.push(LoggedRotation { frame, first_from_body, host: host.clone() });
@@ -207,7 +207,7 @@ impl Initializer {
                 let covariance = host_covariance(track);
                 newest.observations.push(TrackObservation {
                     landmark,
-                    pixel: track.feature.pixel,
+                    pixel: track.feature.global_pixel,
                     covariance,
                 });
             } else if let Some(measured) = &track.measured {

@@ -6,6 +6,7 @@ mod keyframes;
 mod odometry;
 mod orientation_check;
 mod output;
+mod time_calibration;
 
 pub use odometry::{InputCounts, Odometry};
 pub use output::{DivergenceSign, LossReason, OdometryOutput, Status, TrackSummary, Tracking};

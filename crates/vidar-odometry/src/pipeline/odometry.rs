@@ -4,10 +4,12 @@ use super::health::{HealthDecision, HealthMonitor, MAX_IMU_GAP_SECS};
 use super::keyframes::{KeyframeInput, KeyframeRegistry, public_state, seen_landmarks};
 use super::orientation_check::{MAX_TURN_DEG, OrientationCheck};
 use super::output::{DivergenceSign, LossReason, OdometryOutput, Status, TrackSummary, Tracking};
+use super::time_calibration::TimeCalibration;
 use crate::backend::{CalibrationEstimate, Smoother, SmootherError};
 use crate::config::{ImuUse, OdometryConfig};
 use crate::error::OdometryError;
 use crate::frontend::FrontendConfig;
+use crate::gyro_alignment::RollingShutter;
 use crate::imu::{Bias, ImuBuffer, ImuModel, Preintegration, propagate};
 use crate::initialization::{INITIAL_INVERSE_DISTANCE, InitialState, Initializer, STILL_SECS};
 use crate::initialization::{InitFailure, InitFailureReason, StaticInitConfig, initialize_static};
@@ -79,6 +81,7 @@ pub struct Odometry {
     health_monitor: HealthMonitor,
     keyframes: KeyframeRegistry,
     check: OrientationCheck,
+    time_calibration: TimeCalibration,
     images: ImagePool,
     clock: StageClock,
 }
@@ -107,11 +110,14 @@ impl Odometry {
         let config = OdometryConfig { imu, ..config.clone() };
         let phase =
             Phase::Initializing(Box::new(initializer(&config, imu_model.is_none(), &rig_camera, &frontend)));
+        let time_calibration =
+            TimeCalibration::new(config.readout_ms.map(|ms| ms * 1e-3), config.estimate_time_offset);
         Ok(Self {
             config,
             frontend,
             camera_id: camera,
             check: OrientationCheck::new(&rig_camera.body_from_camera.rotation),
+            time_calibration,
             images: ImagePool::default(),
             clock: StageClock::start(),
             camera: rig_camera,
@@ -143,7 +149,10 @@ impl Odometry {
     pub fn push(&mut self, event: SensorEvent) -> Result<Option<OdometryOutput>, OdometryError> {
         match event {
             SensorEvent::Imu(sample) if self.imu_model.is_some() => match self.imu.push(sample) {
-                Ok(()) => self.counts.imu_samples += 1,
+                Ok(()) => {
+                    self.counts.imu_samples += 1;
+                    self.time_calibration.add_gyro(&sample);
+                }
                 Err(_) => self.counts.imu_samples_rejected += 1,
             },
             SensorEvent::Image(frame) if frame.camera == self.camera_id => self.take_image(frame)?,
@@ -223,7 +232,9 @@ impl Odometry {
     }
 
     fn is_ready(&self, frame: &Frame) -> bool {
-        self.imu_model.is_none() || self.imu.newest().is_some_and(|newest| newest >= self.imu_time(frame))
+        let half_readout = Duration::from_secs_f64(0.5 * self.time_calibration.readout_secs);
+        let until = self.imu_time(frame) + half_readout;
+        self.imu_model.is_none() || self.imu.newest().is_some_and(|newest| newest >= until)
     }
 
     /// One image. `None` when nothing can be said of it.
@@ -233,9 +244,10 @@ impl Odometry {
         let id = FrameId(self.next_frame);
         self.next_frame = self.next_frame.wrapping_add(1);
         // The size was checked when the image came.
-        let host = self.images.take(id, &frame.image, self.frontend.pyramid.levels)?;
+        let host = self.images.take(id, &frame.image, self.frontend.pyramid.levels, self.shutter_at(time))?;
         let was_starting = matches!(self.phase, Phase::Initializing(_));
         let status = self.status_after(&frame, host, time);
+        let status = self.recalibrate(&frame, id).unwrap_or(status);
         self.clock.lap(if was_starting { Stage::Initialise } else { Stage::Output });
         self.imu.forget_before(self.last_frame.unwrap_or(time) - Duration::from_millis(1500));
         Some(OdometryOutput { frame_id: frame.id, time: frame.time, status })
@@ -291,6 +303,59 @@ impl Odometry {
                 }
             }
         }
+    }
+
+    /// How the camera moves while an image of this time is read out, as gyroscope and newest state give it.
+    fn shutter_at(&self, time: Timestamp) -> RollingShutter {
+        let readout_secs = self.time_calibration.readout_secs;
+        let half = Duration::from_secs_f64(0.5 * readout_secs);
+        let ends = (self.imu.at(time - half), self.imu.at(time + half));
+        let (true, (Some(first), Some(last))) = (readout_secs > 0.0, ends) else {
+            return RollingShutter::default();
+        };
+        let camera_from_body = self.camera.body_from_camera.rotation.inverse();
+        let (bias, velocity) = match &self.phase {
+            Phase::Tracking(window) => window.state().map_or((Vector3::zeros(), Vector3::zeros()), |s| {
+                let body_velocity = s.world_from_body.rotation.inverse() * s.velocity;
+                let rate = 0.5 * (first.gyro.0 + last.gyro.0) - s.bias.gyro;
+                let at_camera = body_velocity + rate.cross(&self.camera.body_from_camera.translation);
+                (s.bias.gyro, camera_from_body * at_camera)
+            }),
+            Phase::Initializing(initializer) => (initializer.gyro_bias(), Vector3::zeros()),
+        };
+        RollingShutter {
+            readout_secs,
+            rate: camera_from_body * (0.5 * (first.gyro.0 + last.gyro.0) - bias),
+            acceleration: camera_from_body * ((last.gyro.0 - first.gyro.0) / readout_secs),
+            velocity,
+        }
+    }
+
+    /// Checks clock, readout and camera rotation against tracks and gyroscope; starts anew where they were corrected.
+    fn recalibrate(&mut self, frame: &Frame, id: FrameId) -> Option<Status> {
+        self.imu_model?;
+        let tracks = match &self.phase {
+            Phase::Initializing(initializer) => &initializer.tracker.tracks,
+            Phase::Tracking(window) => &window.tracker.tracks,
+        };
+        let shown = tracks.iter().filter(|t| t.last_frame == id).map(|t| (t.id, t.last_pixel));
+        self.time_calibration.add_image(frame.time, shown);
+        let offset = self.camera.time_offset + self.estimated_offset();
+        let correction = self.time_calibration.correction(&self.camera, offset.as_secs_f64())?;
+        self.camera.time_offset = Duration::from_secs_f64(correction.offset_secs);
+        if let Some(rotation) = correction.body_from_camera {
+            self.camera.body_from_camera.rotation = rotation;
+            self.check = OrientationCheck::new(&rotation);
+        }
+        self.last_frame = None;
+        if let Phase::Initializing(_) = &self.phase {
+            self.initialize_anew();
+            return None;
+        }
+        Some(self.lose(LossReason::Recalibrated {
+            time_offset_ms: correction.offset_secs * 1e3,
+            readout_ms: correction.readout_secs * 1e3,
+        }))
     }
 
     /// A stretch without images or IMU measurements that cannot be bridged.
@@ -380,6 +445,7 @@ impl Odometry {
             Ok(at_rest) => at_rest,
             Err(failure) => return self.wait(failure),
         };
+        self.time_calibration.forget_tracks();
         let Ok(mut smoother) = self.smoother() else { return self.wait(self.failure.clone()) };
         let begun = smoother.start(host.frame, time, at_rest.state, at_rest.sigmas);
         if begun.and_then(|()| smoother.mark_keyframe(host.frame)).is_err() {
@@ -498,7 +564,8 @@ impl Odometry {
         let Phase::Tracking(window) = &mut self.phase else { return };
         let estimate = window.smoother.calibration();
         let is_known = estimate.time_offset_sigma_secs.is_some_and(|s| s < KNOWN_CLOCK_SECS);
-        if is_known && !matches!(reason, LossReason::Diverged { .. }) {
+        let keeps = !matches!(reason, LossReason::Diverged { .. } | LossReason::Recalibrated { .. });
+        if is_known && keeps {
             self.camera.time_offset += Duration::from_secs_f64(estimate.time_offset_secs);
         }
     }
@@ -506,16 +573,21 @@ impl Odometry {
     /// Gives the state up and starts anew.
     fn lose(&mut self, reason: LossReason) -> Status {
         self.keep_clock_offset(&reason);
+        self.initialize_anew();
+        self.health_monitor = HealthMonitor::default();
+        self.keyframes.forget_held();
+        self.segment = self.segment.wrapping_add(1);
+        Status::Lost(reason)
+    }
+
+    fn initialize_anew(&mut self) {
+        self.time_calibration.forget_tracks();
         self.phase = Phase::Initializing(Box::new(initializer(
             &self.config,
             self.imu_model.is_none(),
             &self.camera,
             &self.frontend,
         )));
-        self.health_monitor = HealthMonitor::default();
-        self.keyframes.forget_held();
-        self.segment = self.segment.wrapping_add(1);
-        Status::Lost(reason)
     }
 }
 

@@ -1,7 +1,7 @@
 //! What the odometry says of every image.
 
-use crate::initialization::InitFailure;
 use crate::backend::SmootherError;
+use crate::initialization::InitFailure;
 use std::fmt;
 use vidar_core::{
     FrameId, Health, NavCovariance, NavState, OdometryKeyframe, RevisedPose, SparseLandmark, Timestamp,
@@ -108,6 +108,13 @@ pub enum LossReason {
         /// Length of the gap, s.
         secs: f64,
     },
+    /// Tracks and gyroscope contradict the clock offset, readout time or camera rotation in use; they were corrected.
+    Recalibrated {
+        /// Clock offset now in use: what to add to image stamps, ms.
+        time_offset_ms: f64,
+        /// Readout time of the rolling shutter now in use, ms.
+        readout_ms: f64,
+    },
     /// The backend rejected the image's frame, observations or marginalisation.
     Backend(SmootherError),
     /// The state contradicts the sensors or physics.
@@ -144,6 +151,10 @@ impl fmt::Display for LossReason {
             Self::NoFeatures { secs } => write!(f, "no landmark was seen for {secs:.2} s"),
             Self::ImuGap { secs } => write!(f, "no IMU measurement for {secs:.2} s"),
             Self::ImageGap { secs } => write!(f, "no image for {secs:.2} s"),
+            Self::Recalibrated { time_offset_ms, readout_ms } => write!(
+                f,
+                "the camera's clock is {time_offset_ms:+.1} ms off and its rows take {readout_ms:.1} ms: started anew with that"
+            ),
             Self::Backend(error) => write!(f, "backend: {error}"),
             Self::Diverged { sign, found, limit } => match sign {
                 DivergenceSign::Speed => write!(f, "speed {found:.1} m/s > {limit:.1} m/s"),

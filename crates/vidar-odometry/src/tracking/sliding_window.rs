@@ -247,7 +247,7 @@ impl SlidingWindowOdometry {
             last: self.last,
             secs: self.smoother.time(self.last).map_or(0.0, |t| (time - t).as_secs_f64()),
         };
-        self.tracker.measure(&host.pyramid, host.frame, &prediction)
+        self.tracker.measure(host, &prediction)
     }
 
     /// Tells the smoother where the image shows its landmarks.
@@ -307,10 +307,10 @@ fn follow_host(
     let Some(landmark) = smoother.landmark(track.id) else { return false };
     let Some(host) = hosts.iter().find(|h| h.frame == landmark.host) else { return false };
     let Some(pixel) = camera.project(&landmark.bearing) else { return false };
-    let Some(feature) = crate::frontend::Feature::new(camera, pixel, track.feature.level, track.feature.kind)
-    else {
-        return false;
-    };
+    let shown = host.shutter.from_global(camera, &pixel, landmark.inverse_distance);
+    let feature = crate::frontend::Feature::new(camera, shown, track.feature.level, track.feature.kind)
+        .and_then(|f| f.with_global_pixel(camera, pixel));
+    let Some(feature) = feature else { return false };
     track.host = host.clone();
     track.feature = feature;
     track.distance.mean = landmark.inverse_distance;

@@ -4,6 +4,7 @@ use crate::frontend::{
     AlignedFeature, Feature, MatchFailure, MatchingConfig, PixelMeasurement, Pyramid, Template, Warp,
     align_feature,
 };
+use crate::gyro_alignment::RollingShutter;
 use nalgebra::{Matrix2, Matrix2x1, Vector2};
 use std::rc::Rc;
 use vidar_core::camera::Pixel;
@@ -16,6 +17,8 @@ pub(crate) struct HostImage {
     pub frame: FrameId,
     /// Its grey levels.
     pub pyramid: Pyramid,
+    /// How the camera moved while it was read out.
+    pub shutter: RollingShutter,
 }
 
 /// Images whose memory is used again once nobody holds them.
@@ -26,17 +29,24 @@ pub(crate) struct ImagePool {
 
 impl ImagePool {
     /// The pyramid of `image`, called `frame`; `None` for an image of another size than those before.
-    pub fn take(&mut self, frame: FrameId, image: &FrameImage, levels: usize) -> Option<Rc<HostImage>> {
+    pub fn take(
+        &mut self,
+        frame: FrameId,
+        image: &FrameImage,
+        levels: usize,
+        shutter: RollingShutter,
+    ) -> Option<Rc<HostImage>> {
         let free = self.images.iter_mut().find_map(Rc::get_mut);
         match free {
             Some(host) => {
                 host.frame = frame;
+                host.shutter = shutter;
                 host.pyramid.rebuild(image).ok()?;
             }
             None => {
                 let mut pyramid = Pyramid::new(image.width(), image.height(), levels);
                 pyramid.rebuild(image).ok()?;
-                self.images.push(Rc::new(HostImage { frame, pyramid }));
+                self.images.push(Rc::new(HostImage { frame, pyramid, shutter }));
             }
         }
         self.images.iter().find(|h| h.frame == frame).cloned()
@@ -63,8 +73,10 @@ pub(crate) struct Track {
     pub distance: InverseDistance,
     /// Whether the smoother knows it.
     pub is_landmark: bool,
-    /// Last place where it was found, and in which frame.
+    /// Where the image in which it was found last shows it, and where a global shutter would have.
     pub last_pixel: Pixel,
+    pub last_global_pixel: Pixel,
+    /// That image.
     pub last_frame: FrameId,
     /// Where the newest keyframe shows it.
     pub keyframe_pixel: Option<Pixel>,

@@ -2,11 +2,11 @@
 
 use super::track::{HostImage, InverseDistance, Measurer, Track, rotated_pixel, unknown_distance};
 use crate::frontend::{
-    Detection, Detector, Feature, FrontendConfig, MatchFailure, OccupancyGrid, PixelMeasurement, Pyramid,
-    Warp,
+    Detection, Detector, Feature, FrontendConfig, MatchFailure, OccupancyGrid, PixelMeasurement, Warp,
 };
 use nalgebra::Vector2;
 use std::rc::Rc;
+use vidar_core::camera::Pixel;
 use vidar_core::{CameraModel, FrameId, LandmarkId, LieGroup, Se3};
 
 /// Relative deviation of a distance below which the point's place is predicted from it rather than from its motion.
@@ -73,8 +73,10 @@ impl Tracker {
         &self.camera
     }
 
-    /// Measures every track in `current`, the image `frame`; tracks that are lost for good are dropped.
-    pub fn measure(&mut self, current: &Pyramid, frame: FrameId, prediction: &Prediction<'_>) -> TrackCounts {
+    /// Measures every track in `current`; tracks that are lost for good are dropped. Measurements are those of a global
+    /// shutter at the image's time.
+    pub fn measure(&mut self, current: &HostImage, prediction: &Prediction<'_>) -> TrackCounts {
+        let frame = current.frame;
         let mut counts = TrackCounts::default();
         let (camera, measurer) = (&self.camera, &mut self.measurer);
         self.tracks.retain_mut(|track| {
@@ -90,9 +92,10 @@ impl Tracker {
             };
             *tried += 1;
             match found {
-                Ok(measurement) => {
+                Ok((pixel, measurement)) => {
                     *count += 1;
-                    track.last_pixel = measurement.pixel;
+                    track.last_pixel = pixel;
+                    track.last_global_pixel = measurement.pixel;
                     track.last_frame = frame;
                     if !track.is_landmark {
                         track.observations.push((frame, measurement));
@@ -141,10 +144,10 @@ impl Tracker {
             if !self.camera.contains(&detection.pixel, BORDER_PX) {
                 continue;
             }
-            let Some(feature) = Feature::new(&self.camera, detection.pixel, detection.level, detection.kind)
-            else {
-                continue;
-            };
+            let global_pixel = host.shutter.to_global(&self.camera, &detection.pixel, typical_inverse);
+            let feature = Feature::new(&self.camera, detection.pixel, detection.level, detection.kind)
+                .and_then(|f| f.with_global_pixel(&self.camera, global_pixel));
+            let Some(feature) = feature else { continue };
             let track = self.fresh_track(host, feature, unknown_distance(typical_inverse));
             self.tracks.push(track);
         }
@@ -162,9 +165,10 @@ impl Tracker {
             distance,
             is_landmark: false,
             last_pixel: feature.pixel,
+            last_global_pixel: feature.global_pixel,
             last_frame: host.frame,
             drift: Vector2::zeros(),
-            keyframe_pixel: Some(feature.pixel),
+            keyframe_pixel: Some(feature.global_pixel),
             observations: Vec::with_capacity(SEEN_FRAMES),
             found: 1,
             missed: 0,
@@ -177,32 +181,37 @@ fn is_known(distance: &InverseDistance, has_translation: bool) -> bool {
     has_translation && distance.relative_std() < KNOWN_DISTANCE
 }
 
+/// Where the image shows the track, and the measurement as a global shutter would give it.
 fn measure_one(
     camera: &CameraModel,
     measurer: &mut Measurer,
     track: &mut Track,
-    current: &Pyramid,
+    current: &HostImage,
     current_from_host: &Se3,
     prediction: &Prediction<'_>,
-) -> Result<PixelMeasurement, MatchFailure> {
+) -> Result<(Pixel, PixelMeasurement), MatchFailure> {
     let known = is_known(&track.distance, prediction.has_translation);
     let inverse = if prediction.has_translation { track.distance.mean.max(0.0) } else { 0.0 };
     let mut warp =
         Warp::new(camera, &track.feature, inverse, current_from_host).ok_or(MatchFailure::NotVisible)?;
     let turned = (!known && track.last_frame == prediction.last)
-        .then(|| rotated_pixel(camera, &track.last_pixel, &prediction.current_from_last))
+        .then(|| rotated_pixel(camera, &track.last_global_pixel, &prediction.current_from_last))
         .flatten();
     let expected = match turned {
         Some(turned) => turned + track.drift * prediction.secs,
         None => warp.pixel,
     };
+    let expected = current.shutter.from_global(camera, &expected, inverse);
     if !camera.contains(&expected, BORDER_PX) {
         return Err(MatchFailure::OutsideImage);
     }
     warp.pixel = expected;
-    let found = measurer.find(&track.host.pyramid, &track.feature, &warp, &expected, current, !known)?;
+    let found =
+        measurer.find(&track.host.pyramid, &track.feature, &warp, &expected, &current.pyramid, !known)?;
+    let shown = found.measurement.pixel;
+    let pixel = current.shutter.to_global(camera, &shown, inverse);
     if let Some(turned) = turned {
-        track.drift = (found.measurement.pixel - turned) / prediction.secs.max(1e-3);
+        track.drift = (pixel - turned) / prediction.secs.max(1e-3);
     }
-    Ok(found.measurement)
+    Ok((shown, PixelMeasurement { pixel, ..found.measurement }))
 }

@@ -139,7 +139,13 @@ fn waves(dx: f64, dy: f64, gain: f64, offset: f64) -> Pyramid {
 }
 
 fn feature(level: u8, kind: FeatureKind) -> Feature {
-    Feature { pixel: Pixel::new(70.0, 55.0), bearing: Vector3::z(), level, kind }
+    Feature {
+        pixel: Pixel::new(70.0, 55.0),
+        global_pixel: Pixel::new(70.0, 55.0),
+        bearing: Vector3::z(),
+        level,
+        kind,
+    }
 }
 
 #[test]

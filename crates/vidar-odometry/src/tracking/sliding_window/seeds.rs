@@ -68,7 +68,7 @@ impl SlidingWindowOdometry {
         let host = Observation {
             frame: track.host.frame,
             landmark: id,
-            pixel: track.feature.pixel,
+            pixel: track.feature.global_pixel,
             covariance: host_covariance(track),
         };
         self.smoother.add_landmark(&host, track.distance.mean)?;

@@ -1,0 +1,125 @@
+//! Clock offset, rolling-shutter readout and camera rotation as used by the odometry: the given values until feature
+//! tracks and gyroscope contradict them.
+
+use crate::gyro_alignment::{Alignment, Guess, GyroAlignmentLog};
+use vidar_core::{ImuSample, LandmarkId, LieGroup, RigCamera, So3, Timestamp, camera::Pixel};
+
+/// Differences from the values in use below which nothing is corrected, besides three standard deviations: the backend
+/// estimates a clock offset of some milliseconds by itself, and a readout of 4 ms moves a pixel by less than one at 1 rad/s.
+const MIN_OFFSET_SECS: f64 = 0.004;
+const MIN_READOUT_SECS: f64 = 0.004;
+const MIN_ROTATION_RAD: f64 = 2.0 * std::f64::consts::PI / 180.0;
+
+/// Standard deviations from which a solution is used at all, and from which no better one is needed.
+const USABLE_OFFSET_SECS: f64 = 0.004;
+const SETTLED_OFFSET_SECS: f64 = 0.0015;
+const SETTLED_READOUT_SECS: f64 = 0.003;
+
+/// Largest mean squared whitened residual of a solution that explains the tracks.
+const MAX_CHI2_PER_DOF: f64 = 3.0;
+
+/// Attempts after which the values in use stay.
+const MAX_ATTEMPTS: usize = 40;
+
+/// New values, where they differ from those in use.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Correction {
+    /// `t_imu = stamp + offset`, s.
+    pub offset_secs: f64,
+    pub readout_secs: f64,
+    /// Rotation of the camera on the body, where it is far from the given one.
+    pub body_from_camera: Option<So3>,
+}
+
+/// The values in use and what they are checked with.
+#[derive(Debug)]
+pub(crate) struct TimeCalibration {
+    log: GyroAlignmentLog,
+    /// Readout time in use, s.
+    pub readout_secs: f64,
+    estimates_offset: bool,
+    estimates_readout: bool,
+    attempts: usize,
+    is_settled: bool,
+}
+
+impl TimeCalibration {
+    /// `readout_secs`: the readout time where it is known.
+    pub fn new(readout_secs: Option<f64>, estimates_offset: bool) -> Self {
+        Self {
+            log: GyroAlignmentLog::default(),
+            readout_secs: readout_secs.unwrap_or(0.0),
+            estimates_offset,
+            estimates_readout: readout_secs.is_none(),
+            attempts: 0,
+            is_settled: !estimates_offset && readout_secs.is_some(),
+        }
+    }
+
+    pub fn add_gyro(&mut self, sample: &ImuSample) {
+        if !self.is_settled {
+            self.log.add_gyro(sample);
+        }
+    }
+
+    /// Takes the features of an image as it shows them, with its own stamp.
+    pub fn add_image(&mut self, stamp: Timestamp, features: impl Iterator<Item = (LandmarkId, Pixel)>) {
+        if !self.is_settled {
+            self.log.add_image(stamp, features);
+        }
+    }
+
+    /// Forgets the images: tracks get new names.
+    pub fn forget_tracks(&mut self) {
+        self.log.forget_images();
+    }
+
+    /// A correction of `camera`, whose clock offset in use is `offset_secs`, where one is called for.
+    pub fn correction(&mut self, camera: &RigCamera, offset_secs: f64) -> Option<Correction> {
+        if self.is_settled || self.attempts >= MAX_ATTEMPTS {
+            return None;
+        }
+        let guess = Guess {
+            body_from_camera: camera.body_from_camera.rotation,
+            offset_secs,
+            readout_secs: self.readout_secs,
+            search: self.attempts.is_multiple_of(4),
+            estimates_focal: false,
+            unknown_rotation: false,
+        };
+        let found = self.log.attempt(&camera.model, &guess)?;
+        self.attempts += 1;
+        let is_usable = found.offset_sigma < USABLE_OFFSET_SECS && found.chi2_per_dof < MAX_CHI2_PER_DOF;
+        if !is_usable {
+            return None;
+        }
+        let correction = self.compare(&found, camera, offset_secs);
+        if correction.is_none() {
+            self.is_settled =
+                found.offset_sigma < SETTLED_OFFSET_SECS && found.readout_sigma < SETTLED_READOUT_SECS;
+        }
+        if let Some(correction) = &correction {
+            self.readout_secs = correction.readout_secs;
+        }
+        correction
+    }
+
+    fn compare(&self, found: &Alignment, camera: &RigCamera, offset_secs: f64) -> Option<Correction> {
+        let differs = |a: f64, b: f64, sigma: f64, least: f64| (a - b).abs() > (3.0 * sigma).max(least);
+        let readout_secs = match differs(found.readout_secs, 0.0, found.readout_sigma, MIN_READOUT_SECS) {
+            true => found.readout_secs.max(0.0),
+            false => 0.0,
+        };
+        let offset = self.estimates_offset
+            && differs(found.offset_secs, offset_secs, found.offset_sigma, MIN_OFFSET_SECS);
+        let readout = self.estimates_readout
+            && differs(readout_secs, self.readout_secs, found.readout_sigma, MIN_READOUT_SECS);
+        let turn = (camera.body_from_camera.rotation.inverse() * found.body_from_camera).angle_rad();
+        let rotation = turn > (4.0 * found.rotation_sigma).max(MIN_ROTATION_RAD);
+        (offset || readout || rotation).then_some(Correction {
+            offset_secs: if self.estimates_offset { found.offset_secs } else { offset_secs },
+            readout_secs: if self.estimates_readout { readout_secs } else { self.readout_secs },
+            body_from_camera: rotation.then_some(found.body_from_camera),
+        })
+    }
+}
