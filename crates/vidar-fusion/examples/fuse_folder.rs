@@ -11,7 +11,7 @@ use std::time::Instant;
 use vidar_core::{AlignedView, Confidence, FrameId, Image, MetricDepth, Pinhole, Se3, Timestamp};
 use vidar_fusion::{FusionConfig, PointFusion, TsdfVolume};
 
-/// What 7-Scenes writes for "no depth".
+/// The value of missing depth in 7-Scenes.
 const INVALID_MM: [u16; 2] = [0, 65535];
 
 #[allow(clippy::print_stdout)] // printing is this program's whole purpose
@@ -86,7 +86,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     Ok(())
 }
 
-/// Processor time of all threads so far; 0 where `/proc` does not tell.
+/// Processor time of all threads so far; 0 without `/proc`.
 fn cpu_ms() -> f64 {
     let tasks = std::fs::read_dir("/proc/self/task").into_iter().flatten().flatten();
     let stats = tasks.filter_map(|task| std::fs::read_to_string(task.path().join("schedstat")).ok());

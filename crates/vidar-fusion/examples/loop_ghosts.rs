@@ -1,4 +1,4 @@
-//! What a closed loop does to the ghosts of a map: a rendered room, flown round twice, fused in chunks whose poses
+//! Effect of a loop closure on double walls: a rendered room, flown round twice, fused in chunks whose poses
 //! drift, then corrected.
 //!
 //! `loop_ghosts [OUT.png]` prints the double-wall rate of the reference map (true poses), of the drifted map, of the map
@@ -8,7 +8,7 @@
 use nalgebra::Vector3;
 use std::error::Error;
 use vidar_core::{AlignedView, ChunkId, Confidence, FrameId, Pinhole, Se3, So3, TriangleMesh};
-use vidar_fusion::{DoubleWalls, FusionConfig, RevisedView, SubVolumeConfig, SubVolumes, TsdfVolume};
+use vidar_fusion::{DoubleWallDetector, FusionConfig, RevisedView, SubVolumeConfig, SubVolumes, TsdfVolume};
 use vidar_synth::predict::{TruePlace, TrueView, true_views};
 use vidar_synth::{FlightKind, Simulation, SynthConfig};
 
@@ -20,8 +20,8 @@ const VIEWS: usize = 112;
 fn main() -> Result<(), Box<dyn Error>> {
     let views = flight()?;
     let fusion = FusionConfig { voxel_size_m: 0.03, ..FusionConfig::default() };
-    let walls = DoubleWalls::default();
-    let tell = |what: &str, mesh: &TriangleMesh, secs: f64| -> Result<(), Box<dyn Error>> {
+    let walls = DoubleWallDetector::default();
+    let print = |what: &str, mesh: &TriangleMesh, secs: f64| -> Result<(), Box<dyn Error>> {
         let report = walls.of_mesh(mesh)?;
         println!(
             "{{\"map\": \"{what}\", \"double_wall_rate\": {:.4}, \"vertices\": {}, \"cpu_secs\": {secs:.2}}}",
@@ -35,18 +35,18 @@ fn main() -> Result<(), Box<dyn Error>> {
     for view in &views {
         plain.integrate(&aligned(view, &view.world_from_camera)?)?;
     }
-    tell("true poses", &plain.extract_mesh(), cpu_secs() - start)?;
+    print("true poses", &plain.extract_mesh(), cpu_secs() - start)?;
 
     let start = cpu_secs();
-    let mut parts = SubVolumes::new(&SubVolumeConfig { fusion, ..SubVolumeConfig::default() })?;
+    let mut volumes = SubVolumes::new(&SubVolumeConfig { fusion, ..SubVolumeConfig::default() })?;
     for (i, view) in views.iter().enumerate() {
-        parts.integrate(chunk_of(i), &aligned(view, &drifted(i, &view.world_from_camera))?)?;
+        volumes.integrate(chunk_of(i), &aligned(view, &drifted(i, &view.world_from_camera))?)?;
     }
-    let before = parts.extract_mesh()?;
-    tell("drifted", &before, cpu_secs() - start)?;
+    let before = volumes.extract_mesh()?;
+    print("drifted", &before, cpu_secs() - start)?;
 
     let start = cpu_secs();
-    for chunk in parts.chunks().collect::<Vec<_>>() {
+    for chunk in volumes.chunks().collect::<Vec<_>>() {
         let of_chunk = views.iter().enumerate().filter(|(i, _)| chunk_of(*i) == chunk);
         let revised: Vec<RevisedView> = of_chunk
             .map(|(_, v)| RevisedView {
@@ -55,27 +55,27 @@ fn main() -> Result<(), Box<dyn Error>> {
                 depth_factor: 1.0,
             })
             .collect();
-        parts.revise(chunk, &revised)?;
+        volumes.revise(chunk, &revised)?;
     }
-    let moved = parts.extract_mesh()?;
-    tell("sub-volumes moved", &moved, cpu_secs() - start)?;
+    let moved = volumes.extract_mesh()?;
+    print("sub-volumes moved", &moved, cpu_secs() - start)?;
 
     let start = cpu_secs();
-    for (chunk, _) in parts.stale() {
+    for (chunk, _) in volumes.stale() {
         let of_chunk = views.iter().enumerate().filter(|(i, _)| chunk_of(*i) == chunk);
         let again: Result<Vec<AlignedView>, _> =
             of_chunk.map(|(_, v)| aligned(v, &v.world_from_camera)).collect();
-        parts.rebuild(chunk, again?)?;
+        volumes.rebuild(chunk, again?)?;
     }
-    let rebuilt = parts.extract_mesh()?;
-    tell("moved chunks fused again", &rebuilt, cpu_secs() - start)?;
-    let report = parts.report();
+    let rebuilt = volumes.extract_mesh()?;
+    print("moved chunks fused again", &rebuilt, cpu_secs() - start)?;
+    let report = volumes.report();
     let mut bytes = 0;
-    for chunk in parts.chunks().collect::<Vec<_>>() {
-        bytes += parts.set_aside(chunk)?.len();
+    for chunk in volumes.chunks().collect::<Vec<_>>() {
+        bytes += volumes.offload(chunk)?.len();
     }
     println!(
-        "{{\"sub_volumes_mib\": {:.1}, \"set_aside_mib\": {:.1}, \"one_volume_mib\": {:.1}}}",
+        "{{\"sub_volumes_mib\": {:.1}, \"offloaded_mib\": {:.1}, \"one_volume_mib\": {:.1}}}",
         report.memory_bytes as f64 / 1048576.0,
         bytes as f64 / 1048576.0,
         plain.memory_bytes() as f64 / 1048576.0
@@ -90,7 +90,7 @@ fn chunk_of(i: usize) -> ChunkId {
     ChunkId((i / CHUNK) as u32)
 }
 
-/// Where an odometry that drifts by 2.5 cm and 0.5° per chunk believes view `i` to be.
+/// The pose of view `i` by an odometry that drifts by 2.5 cm and 0.5° per chunk.
 fn drifted(i: usize, world_from_camera: &Se3) -> Se3 {
     let chunks = i as f64 / CHUNK as f64;
     let turn = So3::from_axis_angle(&Vector3::z(), 0.5_f64.to_radians() * chunks);

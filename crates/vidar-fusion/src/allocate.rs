@@ -10,7 +10,7 @@ use vidar_core::AlignedView;
 
 /// Neighbouring rays that start a search lie at most this share of a block apart at the median depth…
 const RAY_SPACING: f64 = 1.0 / 5.0;
-/// …and at most this many pixels; rows are staggered, so that thin upright objects are met by the next row.
+/// …and at most this many pixels; rows are staggered, so that thin upright objects are hit by the next row.
 const MAX_STRIDE_PX: usize = 6;
 
 /// The blocks that `view` touches, sorted, each once. At most a few per pixel, however small the voxels.
@@ -28,7 +28,7 @@ pub(crate) fn touched_blocks(
     let found: Vec<Vec<Code>> = rows
         .par_chunks(8 * TILE / rays.stride)
         .map(|rows| {
-            let mut found = Found::default();
+            let mut found = TouchedCodes::default();
             for &y in rows {
                 rays.touch_row(sampled, y, &mut found);
             }
@@ -41,7 +41,7 @@ pub(crate) fn touched_blocks(
     codes.into_iter().map(|code| rays.key(code)).collect()
 }
 
-/// A block as a number: its place from the camera's block, x above y above z, so that codes sort as keys do.
+/// A block as a number: its offset from the camera's block, x above y above z, so that codes sort as keys do.
 type Code = u64;
 
 /// Bits of a coordinate. Depths reach 2¹⁶ blocks (`check_view`), so only rays 85° off the axis could leave these.
@@ -57,7 +57,7 @@ struct Rays {
     stride: usize,
     camera_block: BlockKey,
     start: [f32; 3],
-    /// Where a ray of z-depth 1 m ends: that of pixel (0, 0), and what a column and a row add.
+    /// End of a ray of z-depth 1 m: that of pixel (0, 0), and what a column and a row add.
     corner: Vector3<f64>,
     column: [f32; 3],
     row: Vector3<f64>,
@@ -75,7 +75,7 @@ impl Rays {
         let rotation = view.world_from_camera().rotation.matrix() * per_block;
         let origin = view.world_from_camera().translation * per_block;
         let camera_block = origin.map(f64::floor);
-        // Half a block per step and less than a block across: no block of a smooth surface is jumped over.
+        // Half a block per step and less than a block across: no block of a smooth surface is skipped.
         let steps = (4.0 * truncation * per_block as f32).ceil().max(1.0);
         Self {
             stride,
@@ -90,7 +90,7 @@ impl Rays {
         }
     }
 
-    fn touch_row(&self, sampled: &SampledView, y: usize, found: &mut Found) {
+    fn touch_row(&self, sampled: &SampledView, y: usize, found: &mut TouchedCodes) {
         let stagger = (y / self.stride * 2 + y / self.stride / 3) % self.stride;
         let samples = &sampled.samples[y * sampled.width..][..sampled.width];
         found.depths.clear();
@@ -100,14 +100,14 @@ impl Rays {
         for point in 0..self.points {
             // Point by point, not ray by ray: neighbours in the row mostly lie in the same block.
             let offset = point as f32 * self.spacing;
-            dispatch!(self.place(first, stagger, offset, &found.depths, &mut found.row));
+            dispatch!(self.encode(first, stagger, offset, &found.depths, &mut found.row));
             found.add_row();
         }
     }
 
     /// The block of each ray's point at `offset` behind the beginning of its truncation.
     #[inline(always)]
-    fn place(&self, first: [f32; 3], stagger: usize, offset: f32, depths: &[f32], codes: &mut [Code]) {
+    fn encode(&self, first: [f32; 3], stagger: usize, offset: f32, depths: &[f32], codes: &mut [Code]) {
         for (i, (code, &depth)) in codes.iter_mut().zip(depths).enumerate() {
             let z = (depth - self.truncation).max(0.0) + offset;
             let x = (stagger + i * self.stride) as i32 as f32;
@@ -115,9 +115,9 @@ impl Rays {
                 let at = self.start[axis] + (first[axis] + x * self.column[axis]) * z;
                 (floor(at) + CODE_ORIGIN) as u32 as u64 & CODE_MASK
             });
-            let place = a << (2 * CODE_BITS) | b << CODE_BITS | c;
-            // Samples that are no use have a depth of 0.
-            *code = if depth > 0.0 { place } else { NO_BLOCK };
+            let packed = a << (2 * CODE_BITS) | b << CODE_BITS | c;
+            // Unusable samples have a depth of 0.
+            *code = if depth > 0.0 { packed } else { NO_BLOCK };
         }
     }
 
@@ -129,22 +129,22 @@ impl Rays {
 }
 
 /// Blocks in the order of discovery, few of them twice: neighbouring rays cross the same blocks.
-struct Found {
+struct TouchedCodes {
     codes: Vec<Code>,
-    /// The last code seen of each residue, which drops nearly all repetitions without a hash table.
+    /// The last code of each residue, which drops nearly all repetitions without a hash table.
     recent: [Code; Self::RECENT],
     /// Depths of a row's rays, and the blocks of one point of each.
     depths: Vec<f32>,
     row: Vec<Code>,
 }
 
-impl Default for Found {
+impl Default for TouchedCodes {
     fn default() -> Self {
         Self { codes: Vec::new(), recent: [NO_BLOCK; Self::RECENT], depths: Vec::new(), row: Vec::new() }
     }
 }
 
-impl Found {
+impl TouchedCodes {
     /// 8 × 8 × 8 blocks.
     const RECENT: usize = 512;
 

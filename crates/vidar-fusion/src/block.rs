@@ -10,9 +10,9 @@ use crate::grid::{EDGE, NODES};
 pub(crate) const DISTANCE_ONE: f32 = 4096.0;
 /// Rows of [`EDGE`] nodes in a block.
 pub(crate) const ROWS: usize = EDGE * EDGE;
-/// Views after which the 32-bit sums hand over to their upper parts: (2³¹ − 2²⁶) / (4095 · 4096).
+/// Views after which the upper bits of the 32-bit sums are carried to their upper parts: (2³¹ − 2²⁶) / (4095 · 4096).
 const VIEWS_BEFORE_CARRY: u8 = 120;
-/// Bits of Σ w·d that stay in a row when its upper part is handed over.
+/// Bits of Σ w·d that stay in a row when its upper part is carried.
 const DISTANCE_BITS: u32 = 26;
 /// Bits of Σ confidence that stay in a row.
 const CONFIDENCE_BITS: u32 = 8;
@@ -22,7 +22,7 @@ const CONFIDENCE_SHIFT: u32 = 16;
 /// Eight neighbours along x.
 pub(crate) type Lanes<T> = [T; EDGE];
 
-/// Sums of eight nodes, as every view touches them: three vectors in one and a half cache lines.
+/// Sums of eight nodes, as every view updates them: three vectors in one and a half cache lines.
 #[derive(Clone, Copy, Debug)]
 #[repr(C)]
 pub(crate) struct Row {
@@ -81,7 +81,7 @@ impl Block {
         self.uncarried += 1;
     }
 
-    /// Moves the upper bits of all sums to where there is room. Changes no sum, hence may happen at any time.
+    /// Carries the upper bits of all sums to their upper parts. Changes no sum, so it may be called at any time.
     #[cold]
     fn carry(&mut self) {
         for (at, row) in self.rows.iter_mut().enumerate() {
@@ -105,14 +105,14 @@ impl Block {
         i64::from(low) + (i64::from(self.distance_above[node]) << DISTANCE_BITS)
     }
 
-    /// Views that saw a node within the truncation.
+    /// Views that observed a node within the truncation.
     #[inline(always)]
     pub fn observations(&self, node: usize) -> u32 {
         self.rows[node / EDGE].near[node % EDGE] & 0xffff
     }
 
-    /// Signed distance of a node in truncations, with `free` (weight seen through the whole block) as distance 1;
-    /// `None` when fewer than `min_observations` views saw it near a surface.
+    /// Signed distance of a node in truncations, with `free` (free-space weight of the block) as distance 1;
+    /// `None` when fewer than `min_observations` views observed it near a surface.
     #[inline(always)]
     pub fn distance(&self, node: usize, free: u32, min_observations: u32) -> Option<f32> {
         let weight = self.rows[node / EDGE].weight[node % EDGE];
@@ -121,7 +121,7 @@ impl Block {
         }
         let sum = self.weighted_distance(node) + i64::from(free) * DISTANCE_ONE as i64;
         let value = sum as f32 / ((u64::from(weight) + u64::from(free)) as f32 * DISTANCE_ONE);
-        // A surface through a node would give up to six vertices in one place; a hair in front of it gives one
+        // A surface through a node would give up to six coincident vertices; slightly in front of it gives one
         // vertex per edge, all distinct.
         Some(if sum == 0 { ZERO_NUDGE } else { value })
     }
@@ -133,7 +133,7 @@ impl Block {
         sum as f32 / (self.observations(node).max(1) as f32 * crate::sample::CONFIDENCE_ONE)
     }
 
-    /// Mean colour of a node, if any coloured view saw it.
+    /// Mean colour of a node, if any coloured view observed it.
     pub fn mean_color(&self, node: usize) -> Option<[f32; 3]> {
         let [r, g, b, weight] = self.color.as_ref()?[node / EDGE].map(|lanes| lanes[node % EDGE]);
         (weight > 0).then(|| [r, g, b].map(|c| c as f32 / weight as f32))
@@ -169,8 +169,8 @@ impl Block {
         }
     }
 
-    /// Puts sums, of at most [`crate::grid::MAX_VIEWS`] views, in the place of a node's; colours only where there
-    /// is room for them.
+    /// Replaces a node's sums by others, of at most [`crate::grid::MAX_VIEWS`] views; colours only if the block has
+    /// colours.
     pub fn put(&mut self, node: usize, sums: &NodeSums) {
         let (at, i) = (node / EDGE, node % EDGE);
         let row = &mut self.rows[at];

@@ -1,10 +1,10 @@
-//! Free space: blocks that a view looks through entirely.
+//! Free space: blocks that lie entirely in front of the surface of a view.
 //!
-//! Space carving in the sense of Curless & Levoy (1996, section 4), at the resolution of blocks: a block before
-//! the surface of every pixel it covers, by more than the truncation, collects a vote of the weight
-//! `c · min(1, (1 m / z)²)`; when the surface is read, the votes count as observations of distance +1 for all nodes
-//! of the block. So a floater vanishes once it is outvoted. Votes live beside the blocks, because whether a block
-//! exists yet must not matter to the result. Within the blocks that a view touches, carving is per voxel.
+//! Space carving in the sense of Curless & Levoy (1996, section 4), at the resolution of blocks: a block in front
+//! of the surface of every pixel it covers, by more than the truncation, receives the free-space weight
+//! `c · min(1, (1 m / z)²)`; at extraction, the weight is an observation of distance +1 for all nodes of the block.
+//! A floater is removed once its free-space weight exceeds its own. Free-space weights are stored beside the blocks,
+//! because the result must not depend on whether a block exists yet. Within the blocks that a view touches, carving is per voxel.
 
 use crate::FusionConfig;
 use crate::grid::{BlockKey, CameraFromWorld, EDGE};
@@ -15,29 +15,29 @@ use vidar_core::AlignedView;
 
 /// Blocks that one view may examine; a smaller range is carved where the frustum holds more.
 const MAX_EXAMINED: f64 = (1u32 << 19) as f64;
-/// A block is looked up in tiles so large that it covers about this many along each axis.
+/// The tiles in which a block is looked up are so large that it covers about this many along each axis.
 const TILES_ACROSS: usize = 4;
 
-/// A block seen empty, with its vote in units of [`WEIGHT_ONE`].
-pub(crate) type Vote = (BlockKey, u32);
+/// A free block, with its weight in units of [`WEIGHT_ONE`].
+pub(crate) type FreeBlock = (BlockKey, u32);
 
-/// What a view sees empty. A function of view and configuration alone.
+/// The free space of a view. It depends on the view and the configuration only.
 #[derive(Default)]
 pub(crate) struct FreeSpace {
     /// The blocks, sorted.
-    pub votes: Vec<Vote>,
+    pub blocks: Vec<FreeBlock>,
     /// Whether the range had to be shortened to keep the work bounded.
     pub shortened: bool,
 }
 
-/// Finds the blocks that `view` sees empty.
+/// Finds the blocks that are free in `view`.
 pub(crate) fn free_space(view: &AlignedView, sampled: &SampledView, config: &FusionConfig) -> FreeSpace {
     let block_m = config.voxel_size_m * EDGE as f64;
     let Some(frustum) = frustum_blocks(view, sampled, config, block_m) else { return FreeSpace::default() };
     let Frustum { low, high, range, shortened } = frustum;
     let pyramid = Pyramid::new(sampled);
     let k = view.intrinsics();
-    let judge = Judge {
+    let test = FreeSpaceTest {
         pyramid: &pyramid,
         size: [sampled.width as f32, sampled.height as f32],
         k: [k.fx as f32, k.fy as f32, k.cx as f32, k.cy as f32],
@@ -47,26 +47,26 @@ pub(crate) fn free_space(view: &AlignedView, sampled: &SampledView, config: &Fus
     };
     let camera_from_world = CameraFromWorld::new(view);
     let step = camera_from_world.rotation.column(0) * block_m;
-    let layers: Vec<Vec<Vote>> = (low[2]..=high[2])
+    let layers: Vec<Vec<FreeBlock>> = (low[2]..=high[2])
         .into_par_iter()
         .map(|z| {
-            let mut votes = Vec::new();
+            let mut free = Vec::new();
             for y in low[1]..=high[1] {
                 let first = Vector3::new(low[0], y, z).map(|i| (f64::from(i) + 0.5) * block_m);
                 let first = camera_from_world.apply(&first);
                 for x in low[0]..=high[0] {
                     let centre = first + step * f64::from(x - low[0]);
-                    if let Some(vote) = judge.vote(centre.x as f32, centre.y as f32, centre.z as f32) {
-                        votes.push(([x, y, z], vote));
+                    if let Some(weight) = test.weight(centre.x as f32, centre.y as f32, centre.z as f32) {
+                        free.push(([x, y, z], weight));
                     }
                 }
             }
-            votes
+            free
         })
         .collect();
-    let mut votes: Vec<Vote> = layers.into_iter().flatten().collect();
-    votes.par_sort_unstable();
-    FreeSpace { votes, shortened }
+    let mut blocks: Vec<FreeBlock> = layers.into_iter().flatten().collect();
+    blocks.par_sort_unstable();
+    FreeSpace { blocks, shortened }
 }
 
 /// The box of blocks around a view's frustum, and the z that it reaches.
@@ -86,7 +86,7 @@ fn frustum_blocks(
     if config.carve_range_m == 0.0 {
         return None;
     }
-    // Beyond the view's farthest depth nothing is seen through.
+    // Beyond the view's farthest depth no block is free.
     let farthest = sampled.tiles.iter().map(|t| t.farthest).fold(0.0, f32::max);
     let mut range = config.carve_range_m.min(f64::from(farthest) - config.truncation_m());
     if !(range > 0.0) {
@@ -117,7 +117,7 @@ fn frustum_blocks(
     Some(Frustum { low: key(origin + low), high: key(origin + high), range, shortened })
 }
 
-struct Judge<'a> {
+struct FreeSpaceTest<'a> {
     pyramid: &'a Pyramid,
     size: [f32; 2],
     k: [f32; 4],
@@ -126,17 +126,17 @@ struct Judge<'a> {
     range: f32,
 }
 
-impl Judge<'_> {
-    /// The vote for a block whose centre lies at (x, y, z) in the camera.
+impl FreeSpaceTest<'_> {
+    /// The free-space weight of a block whose centre lies at (x, y, z) in the camera.
     #[inline(always)]
-    fn vote(&self, x: f32, y: f32, z: f32) -> Option<u32> {
+    fn weight(&self, x: f32, y: f32, z: f32) -> Option<u32> {
         let front = z - self.radius;
         if front <= 1e-3 || z > self.range {
             return None;
         }
         let [fx, fy, cx, cy] = self.k;
         let (rx, ry) = (x / z, y / z);
-        // |Δ(X/Z)| ≤ (r + |X/Z| r) / (Z − r) bounds the picture of the block's bounding ball.
+        // |Δ(X/Z)| ≤ (r + |X/Z| r) / (Z − r) bounds the projection of the block's bounding sphere.
         let (hu, hv) =
             (fx * self.radius * (1.0 + rx.abs()) / front, fy * self.radius * (1.0 + ry.abs()) / front);
         let (u, v) = (fx * rx + cx, fy * ry + cy);
@@ -145,7 +145,7 @@ impl Judge<'_> {
             return None;
         }
         let tile = self.pyramid.over([u0 as usize, v0 as usize], [u1 as usize, v1 as usize]);
-        // Holes may hide something: half of the pixels must have a depth that counts.
+        // Pixels without depth may hide a surface: half of the pixels must have a usable depth.
         if tile.nearest <= z + self.radius + self.truncation || 2 * tile.usable < tile.pixels {
             return None;
         }
@@ -155,7 +155,7 @@ impl Judge<'_> {
     }
 }
 
-/// Tiles joined two by two, level by level.
+/// Tiles merged two by two, level by level.
 struct Pyramid {
     levels: Vec<Level>,
 }

@@ -1,12 +1,12 @@
-//! What a user may choose about fusion.
+//! Settings of fusion.
 
 use crate::FusionError;
 use serde::{Deserialize, Serialize};
 
 /// Settings of fusion, shared by the TSDF volume and the point cloud.
 ///
-/// There is no maximal weight on purpose: a running average that forgets depends on the order of the views,
-/// and this crate promises the same bits for every order.
+/// There is no maximum weight: a running average with a maximum depends on the order of the views, and the result of
+/// this crate has the same bits for every order.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct FusionConfig {
@@ -21,12 +21,12 @@ pub struct FusionConfig {
     /// Pixels whose surface is seen at a steeper angle from its normal than this, degrees, 10 to 90, are ignored:
     /// they are the smeared edges of objects.
     pub max_incidence_deg: f64,
-    /// Space seen empty up to this z, metres, 0 to 100, erases surface that other views put there; 0 turns
+    /// Free space observed up to this z, metres, 0 to 100, removes surface that other views put there; 0 turns
     /// carving off. Raise it to clean large rooms.
     pub carve_range_m: f64,
-    /// Views that must have seen a voxel near its surface before it counts, 1 to 1000. 1 keeps everything.
+    /// Views that must have observed a voxel near its surface before it is used, 1 to 1000. 1 keeps everything.
     pub min_observations: u32,
-    /// Connected pieces of the mesh with fewer triangles than this are dropped, 0 to 1000000; 0 keeps all.
+    /// Connected components of the mesh with fewer triangles than this are dropped, 0 to 1000000; 0 keeps all.
     pub min_component_triangles: u32,
     /// Bytes that the volume may hold, at least 1 MiB. When it is full, new space is not mapped, and reported.
     pub memory_budget_bytes: u64,
@@ -89,12 +89,12 @@ impl FusionConfig {
 mod tests {
     use super::*;
 
-    type Spoil = fn(&mut FusionConfig);
+    type Change = fn(&mut FusionConfig);
 
     #[test]
     fn the_default_is_valid_and_every_field_is_checked() {
         assert_eq!(FusionConfig::default().validate(), Ok(()));
-        let spoil: [(&str, Spoil); 9] = [
+        let invalid: [(&str, Change); 9] = [
             ("voxel_size_m", |c| c.voxel_size_m = 0.0),
             ("truncation_voxels", |c| c.truncation_voxels = 1.0),
             ("max_depth_m", |c| c.max_depth_m = f64::INFINITY),
@@ -105,9 +105,9 @@ mod tests {
             ("min_component_triangles", |c| c.min_component_triangles = 2_000_000),
             ("memory_budget_bytes", |c| c.memory_budget_bytes = 0),
         ];
-        for (name, spoil) in spoil {
+        for (name, change) in invalid {
             let mut config = FusionConfig::default();
-            spoil(&mut config);
+            change(&mut config);
             match config.validate() {
                 Err(FusionError::BadConfig { field, .. }) => assert_eq!(field, name),
                 other => panic!("{name}: {other:?}"),

@@ -1,39 +1,27 @@
-//! What was seen, how often and how surely.
+//! Coverage: what was observed, by how many views and with which confidence.
 
 use crate::field::Field;
-use crate::grid::{NODES, node_of};
+use crate::grid::NODES;
 use crate::volume::TsdfVolume;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use vidar_core::TriangleMesh;
 
-/// One voxel of a [`DensityMap`].
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-pub struct DensityCell {
-    /// Lattice index; the voxel's centre lies at `index · voxel_size_m` in the world.
-    pub index: [i32; 3],
-    /// Views that saw the voxel within the truncation of their depth.
-    pub observations: u32,
+/// A voxel within one voxel of the surface.
+struct SurfaceVoxel {
+    /// Views that observed the voxel within the truncation of their depth.
+    observations: u32,
     /// Mean confidence of those views, 0…1.
-    pub mean_confidence: f32,
+    mean_confidence: f32,
 }
 
-/// Observation count and mean confidence of every voxel within one voxel of the surface, sorted by block and node.
-#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
-pub struct DensityMap {
-    /// Edge of a voxel, metres.
-    pub voxel_size_m: f64,
-    /// The voxels.
-    pub cells: Vec<DensityCell>,
-}
-
-/// Coverage in a few numbers.
+/// Coverage of a volume.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct CoverageReport {
     /// Area of the extracted mesh, m².
     pub surface_area_m2: f64,
-    /// Space that was seen, free or near surface, m³: voxels with an observation and blocks seen empty (those only
-    /// within the carving range).
+    /// Observed space, free or near the surface, m³: voxels with an observation and free blocks (the latter only within
+    /// the carving range).
     pub observed_volume_m3: f64,
     /// Smallest and largest corner of the mesh in the world, metres; `None` when it is empty.
     pub bounds_m: Option<[[f32; 3]; 2]>,
@@ -43,47 +31,42 @@ pub struct CoverageReport {
     pub mean_observations: f64,
     /// Mean confidence of surface voxels, 0…1.
     pub mean_confidence: f64,
-    /// Share of surface voxels seen by at least three views, 0…1.
+    /// Share of surface voxels observed by at least three views, 0…1.
     pub share_seen_by_3_or_more: f64,
     /// Views that were fused.
     pub views: u32,
 }
 
 impl TsdfVolume {
-    /// How often and how surely each voxel of the surface was seen.
-    pub fn density_map(&self) -> DensityMap {
+    /// The voxels within one voxel of the surface, sorted by block and node.
+    fn surface_voxels(&self) -> Vec<SurfaceVoxel> {
         let field = Field::new(self);
         let one_voxel = 1.0 / self.config().truncation_voxels as f32;
-        let cells: Vec<Vec<DensityCell>> = (0..field.len())
+        (0..field.len())
             .into_par_iter()
-            .map(|at| {
-                let block = field.blocks[at];
-                (0..NODES)
-                    .filter(|&node| field.value(at, node).abs() <= one_voxel)
-                    .map(|node| DensityCell {
-                        index: node_of(field.keys[at], node),
-                        observations: block.observations(node),
-                        mean_confidence: block.mean_confidence(node),
-                    })
-                    .collect()
+            .flat_map_iter(|at| {
+                let (field, block) = (&field, field.blocks[at]);
+                (0..NODES).filter(move |&node| field.value(at, node).abs() <= one_voxel).map(move |node| {
+                    let mean_confidence = block.mean_confidence(node);
+                    SurfaceVoxel { observations: block.observations(node), mean_confidence }
+                })
             })
-            .collect();
-        DensityMap { voxel_size_m: self.config().voxel_size_m, cells: cells.concat() }
+            .collect()
     }
 
     /// The coverage of this volume, whose extracted mesh is `mesh`.
     pub fn coverage(&self, mesh: &TriangleMesh) -> CoverageReport {
-        let cells = self.density_map().cells;
+        let voxels = self.surface_voxels();
         // Integer and sequential sums: nothing here depends on the number of threads.
-        let observations: u64 = cells.iter().map(|c| u64::from(c.observations)).sum();
-        let confidence: f64 = cells.iter().map(|c| f64::from(c.mean_confidence)).sum();
-        let often = cells.iter().filter(|c| c.observations >= 3).count();
-        let n = cells.len().max(1) as f64;
+        let observations: u64 = voxels.iter().map(|c| u64::from(c.observations)).sum();
+        let confidence: f64 = voxels.iter().map(|c| f64::from(c.mean_confidence)).sum();
+        let often = voxels.iter().filter(|c| c.observations >= 3).count();
+        let n = voxels.len().max(1) as f64;
         CoverageReport {
             surface_area_m2: surface_area_m2(mesh),
             observed_volume_m3: self.observed_nodes() as f64 * self.config().voxel_size_m.powi(3),
             bounds_m: bounds(mesh),
-            surface_voxels: cells.len() as u64,
+            surface_voxels: voxels.len() as u64,
             mean_observations: observations as f64 / n,
             mean_confidence: confidence / n,
             share_seen_by_3_or_more: often as f64 / n,
@@ -91,7 +74,7 @@ impl TsdfVolume {
         }
     }
 
-    /// Nodes with an observation, with all nodes of blocks that were seen empty.
+    /// Nodes with an observation, with all nodes of free blocks.
     fn observed_nodes(&self) -> u64 {
         let within_blocks: usize = (self.keys.par_iter().zip(&self.blocks))
             .filter(|(key, _)| !self.free.contains_key(*key))

@@ -31,9 +31,9 @@ fn edge(base: usize, axis: usize) -> u8 {
 
 /// Corner at which an edge starts, and its axis.
 pub(crate) fn edge_start(edge: u8) -> (usize, usize) {
-    let (axis, place) = (edge as usize / 4, edge as usize % 4);
+    let (axis, position) = (edge as usize / 4, edge as usize % 4);
     let (b, c) = ((axis + 1) % 3, (axis + 2) % 3);
-    ((place & 1) << b | (place >> 1) << c, axis)
+    ((position & 1) << b | (position >> 1) << c, axis)
 }
 
 fn edge_between(one: usize, other: usize) -> u8 {
@@ -111,14 +111,14 @@ fn triangulate(polygon: &[u8]) -> Triangles {
             let neighbours = b - a == 1 || (a == 0 && b == polygon.len() - 1);
             neighbours || !share_face(polygon[a], polygon[b])
         };
-        for middle in from + 1..to {
+        for between in from + 1..to {
             let kept = out.len();
-            if drawable(from, middle)
-                && drawable(middle, to)
-                && cut(polygon, from, middle, out)
-                && cut(polygon, middle, to, out)
+            if drawable(from, between)
+                && drawable(between, to)
+                && cut(polygon, from, between, out)
+                && cut(polygon, between, to, out)
             {
-                out.push([polygon[from], polygon[middle], polygon[to]]);
+                out.push([polygon[from], polygon[between], polygon[to]]);
                 return true;
             }
             out.truncate(kept);

@@ -1,9 +1,9 @@
-//! What can go wrong in fusion.
+//! Errors of fusion.
 
 use thiserror::Error;
 use vidar_core::{ChunkId, FrameId};
 
-/// Why a volume cannot be made, or a view not be fused. A refused view leaves the volume as it was.
+/// Why a volume cannot be created or a view cannot be fused. A rejected view leaves the volume unchanged.
 #[derive(Clone, Debug, PartialEq, Error)]
 #[non_exhaustive]
 pub enum FusionError {
@@ -19,7 +19,7 @@ pub enum FusionError {
         /// The value.
         found: f64,
     },
-    /// The camera stands so far from the origin that single precision cannot carry the map.
+    /// The camera is so far from the origin that single precision does not resolve the voxels.
     #[error(
         "frame {frame}: camera is {distance_m:.0} m from the origin, but voxels of {voxel_size_m} m reach \
          {limit_m:.0} m; move the world's origin or use larger voxels"
@@ -34,7 +34,7 @@ pub enum FusionError {
         /// Distance that this voxel size reaches, metres.
         limit_m: f64,
     },
-    /// Voxels are so much finer than the pixels that no surface would close.
+    /// Voxels are so much finer than the pixels that the surface would have holes.
     #[error(
         "frame {frame}: voxels of {voxel_size_m} m are far finer than the {footprint_m:.4} m between \
          neighbouring pixels at the median depth; use voxels of at least {smallest_m:.4} m"
@@ -50,7 +50,7 @@ pub enum FusionError {
         smallest_m: f64,
     },
     /// The accumulators hold no more views without overflow.
-    #[error("frame {frame}: the volume already holds {limit} views, the most its sums can carry")]
+    #[error("frame {frame}: the volume already holds {limit} views, the limit of its sums")]
     TooManyViews {
         /// Which view.
         frame: FrameId,
@@ -64,7 +64,7 @@ pub enum FusionError {
         frame: FrameId,
         /// The chunk that fused it.
         owner: ChunkId,
-        /// The chunk that was to fuse it now.
+        /// The chunk that should fuse it now.
         chunk: ChunkId,
     },
     /// No view of that chunk was fused.
@@ -78,12 +78,12 @@ pub enum FusionError {
     NotOfChunk {
         /// Which view.
         frame: FrameId,
-        /// The chunk that was told to move it.
+        /// The chunk whose revision names it.
         chunk: ChunkId,
     },
     /// A revised pose or scale is not finite, or the scale not positive.
     #[error(
-        "frame {frame} of chunk {chunk} cannot move there: its pose or its depth factor is not finite and positive"
+        "frame {frame} of chunk {chunk}: its revised pose is not finite, or its depth factor is not finite and positive"
     )]
     BadMove {
         /// Which view.
@@ -91,14 +91,14 @@ pub enum FusionError {
         /// Its chunk.
         chunk: ChunkId,
     },
-    /// A chunk's volume waits elsewhere.
-    #[error("chunk {chunk} was set aside; bring it back first")]
-    SetAside {
+    /// A chunk's volume is not in memory.
+    #[error("chunk {chunk} is offloaded")]
+    Offloaded {
         /// Which chunk.
         chunk: ChunkId,
     },
-    /// Bytes that are not those of a volume that was set aside.
-    #[error("a volume that was set aside is broken at byte {at}: expected {what}")]
+    /// Bytes that are not those of an offloaded volume.
+    #[error("an offloaded volume is corrupt at byte {at}: expected {what}")]
     BadSnapshot {
         /// What was expected.
         what: &'static str,

@@ -4,13 +4,13 @@
 //! its vertices, then every block connects them, looking up those of its neighbours; both in parallel, in the order
 //! of keys. A cube is used when all of its corners are observed, so the mesh ends where observation does.
 
+use crate::components::remove_small_components;
 use crate::cubes::{Triangles, edge_start, triangle_table};
 use crate::field::{Field, Neighbourhood};
 use crate::grid::{EDGE, NODES, node_of};
-use crate::tidy::tidy;
 use crate::volume::TsdfVolume;
 use rayon::prelude::*;
-use vidar_core::{PointCloud, TriangleMesh};
+use vidar_core::TriangleMesh;
 
 /// Vertices keep this share of an edge away from its ends, so that no two of them coincide.
 const END_MARGIN: f32 = 0.002;
@@ -32,20 +32,20 @@ struct Vertex {
 
 impl TsdfVolume {
     /// The zero level of the distance as a mesh: vertices shared by all triangles around them, counter-clockwise
-    /// seen from the observers, with unit normals toward them, colours (when any view had one) and confidences.
+    /// as seen by the cameras, with unit normals toward them, colours (when any view had one) and confidences.
     ///
     /// Closed wherever all eight corners of a cube were observed. The same bits for any order of the views and any
     /// number of threads.
     pub fn extract_mesh(&self) -> TriangleMesh {
         let field = Field::new(self);
         let colored = self.blocks.iter().any(|b| b.color.is_some());
-        let placed: Vec<Option<BlockVertices>> = (0..field.len())
+        let vertices: Vec<Option<BlockVertices>> = (0..field.len())
             .into_par_iter()
             .with_min_len(8)
             .map(|at| place_vertices(&field, at, self.config().voxel_size_m))
             .collect();
         let mut next = 0u32;
-        let first: Vec<u32> = placed
+        let first: Vec<u32> = vertices
             .iter()
             .map(|p| {
                 let first = next;
@@ -57,10 +57,10 @@ impl TsdfVolume {
         let triangles: Vec<Vec<[u32; 3]>> = (0..field.len())
             .into_par_iter()
             .with_min_len(8)
-            .map(|at| connect_vertices(&field, at, &placed, &first, table))
+            .map(|at| connect_vertices(&field, at, &vertices, &first, table))
             .collect();
         let mut mesh = TriangleMesh { triangles: triangles.concat(), ..TriangleMesh::default() };
-        for vertex in placed.iter().flatten().flat_map(|p| &p.vertices) {
+        for vertex in vertices.iter().flatten().flat_map(|p| &p.vertices) {
             mesh.positions.push(vertex.position);
             mesh.normals.push(vertex.normal);
             mesh.confidences.push(vertex.confidence);
@@ -68,13 +68,7 @@ impl TsdfVolume {
                 mesh.colors.push(vertex.color);
             }
         }
-        tidy(mesh, self.config().min_component_triangles as usize)
-    }
-
-    /// The vertices of the mesh as points, with normals, confidences and colours (when any view had one).
-    pub fn extract_cloud(&self) -> PointCloud {
-        let TriangleMesh { positions, normals, colors, confidences, .. } = self.extract_mesh();
-        PointCloud { positions, normals, colors, confidences }
+        remove_small_components(mesh, self.config().min_component_triangles as usize)
     }
 }
 
@@ -84,8 +78,8 @@ fn place_vertices(field: &Field<'_>, at: usize, voxel_m: f64) -> Option<BlockVer
     let mut of_edge = Box::new([NO_VERTEX; NODES * 3]);
     let mut vertices = Vec::new();
     for node in 0..NODES {
-        let place = [node % EDGE, node / EDGE % EDGE, node / (EDGE * EDGE)];
-        let here = Neighbourhood::at(place[0], place[1], place[2]);
+        let node_index = [node % EDGE, node / EDGE % EDGE, node / (EDGE * EDGE)];
+        let here = Neighbourhood::at(node_index[0], node_index[1], node_index[2]);
         for axis in 0..3 {
             let (a, b) = (around.value(here), around.value(here + Neighbourhood::STRIDE[axis]));
             // A NaN is on no side.
@@ -108,10 +102,10 @@ fn vertex(
     t: f32,
     voxel_m: f64,
 ) -> Option<Vertex> {
-    let mut place = [node % EDGE, node / EDGE % EDGE, node / (EDGE * EDGE)];
-    let here = Neighbourhood::at(place[0], place[1], place[2]);
-    place[axis] += 1;
-    let (other_block, other_node) = around.owner(place)?;
+    let mut node_index = [node % EDGE, node / EDGE % EDGE, node / (EDGE * EDGE)];
+    let here = Neighbourhood::at(node_index[0], node_index[1], node_index[2]);
+    node_index[axis] += 1;
+    let (other_block, other_node) = around.owner(node_index)?;
     let ends = [(field.blocks[at], node), (field.blocks[other_block as usize], other_node)];
     let mix = |a: f32, b: f32| a + t * (b - a);
 
@@ -145,21 +139,21 @@ fn vertex(
 fn connect_vertices(
     field: &Field<'_>,
     at: usize,
-    placed: &[Option<BlockVertices>],
+    vertices: &[Option<BlockVertices>],
     first: &[u32],
     table: &[Triangles; 256],
 ) -> Vec<[u32; 3]> {
     let mut triangles = Vec::new();
     let Some(around) = field.neighbourhood(at) else { return triangles };
     for node in 0..NODES {
-        let place = [node % EDGE, node / EDGE % EDGE, node / (EDGE * EDGE)];
-        let Some(case) = cube_case(&around, place) else { continue };
+        let node_index = [node % EDGE, node / EDGE % EDGE, node / (EDGE * EDGE)];
+        let Some(case) = cube_case(&around, node_index) else { continue };
         for triangle in &table[case] {
             let indices = triangle.map(|edge| {
                 let (corner, axis) = edge_start(edge);
-                let start = [0, 1, 2].map(|a| place[a] + (corner >> a & 1));
+                let start = [0, 1, 2].map(|a| node_index[a] + (corner >> a & 1));
                 let (block, node) = around.owner(start)?;
-                let vertex = placed[block as usize].as_ref()?.of_edge[node * 3 + axis];
+                let vertex = vertices[block as usize].as_ref()?.of_edge[node * 3 + axis];
                 (vertex != NO_VERTEX).then(|| first[block as usize] + u32::from(vertex))
             });
             if let [Some(a), Some(b), Some(c)] = indices {
@@ -172,9 +166,9 @@ fn connect_vertices(
     triangles
 }
 
-/// Which corners of the cube at `place` are behind the surface; `None` unless all are observed.
-fn cube_case(around: &Neighbourhood, place: [usize; 3]) -> Option<usize> {
-    let start = Neighbourhood::at(place[0], place[1], place[2]);
+/// Which corners of the cube at `node_index` are behind the surface; `None` unless all are observed.
+fn cube_case(around: &Neighbourhood, node_index: [usize; 3]) -> Option<usize> {
+    let start = Neighbourhood::at(node_index[0], node_index[1], node_index[2]);
     let mut case = 0;
     for corner in 0..8 {
         let [sx, sy, sz] = Neighbourhood::STRIDE;

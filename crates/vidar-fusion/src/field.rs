@@ -1,4 +1,4 @@
-//! The distance field as the surface is read from it: one value per node, blocks in the order of their keys.
+//! The distance field from which the surface is extracted: one value per node, blocks in the order of their keys.
 
 use crate::block::Block;
 use crate::grid::{BlockKey, EDGE, NODES};
@@ -11,13 +11,13 @@ pub(crate) const SPAN: usize = EDGE + 3;
 
 /// Distances of all blocks, in truncations, NaN where not observed.
 pub(crate) struct Field<'a> {
-    /// Keys, ascending, so that nothing depends on the order in which blocks were made.
+    /// Keys, ascending, so that nothing depends on the order in which blocks were created.
     pub keys: Vec<BlockKey>,
     pub blocks: Vec<&'a Block>,
     values: Vec<[f32; NODES]>,
     /// Whether a block has nodes in front of the surface, and behind it.
     signs: Vec<[bool; 2]>,
-    places: FxHashMap<BlockKey, u32>,
+    index_of: FxHashMap<BlockKey, u32>,
 }
 
 impl<'a> Field<'a> {
@@ -41,8 +41,8 @@ impl<'a> Field<'a> {
                 (values, signs)
             })
             .unzip();
-        let places = keys.iter().enumerate().map(|(at, key)| (*key, at as u32)).collect();
-        Self { keys, blocks, values, signs, places }
+        let index_of = keys.iter().enumerate().map(|(at, key)| (*key, at as u32)).collect();
+        Self { keys, blocks, values, signs, index_of }
     }
 
     pub fn len(&self) -> usize {
@@ -59,11 +59,11 @@ impl<'a> Field<'a> {
         let key = self.keys[at];
         let ahead = |i: usize| {
             let offset = [i & 1, i >> 1 & 1, i >> 2 & 1];
-            self.places.get(&[0, 1, 2].map(|a| key[a] + offset[a] as i32))
+            self.index_of.get(&[0, 1, 2].map(|a| key[a] + offset[a] as i32))
         };
         let mut signs = self.signs[at];
-        for place in (1..8).filter_map(ahead) {
-            let other = self.signs[*place as usize];
+        for index in (1..8).filter_map(ahead) {
+            let other = self.signs[*index as usize];
             signs = [signs[0] | other[0], signs[1] | other[1]];
         }
         if signs != [true, true] {
@@ -72,7 +72,7 @@ impl<'a> Field<'a> {
         let mut blocks = [None; 27];
         for (i, block) in blocks.iter_mut().enumerate() {
             let offset = [i % 3, i / 3 % 3, i / 9];
-            *block = self.places.get(&[0, 1, 2].map(|a| key[a] + offset[a] as i32 - 1)).copied();
+            *block = self.index_of.get(&[0, 1, 2].map(|a| key[a] + offset[a] as i32 - 1)).copied();
         }
         Some(self.gather(blocks))
     }
@@ -81,7 +81,7 @@ impl<'a> Field<'a> {
         let mut values = [f32::NAN; SPAN * SPAN * SPAN];
         for z in 0..SPAN {
             for y in 0..SPAN {
-                let ((by, ny), (bz, nz)) = (place(y), place(z));
+                let ((by, ny), (bz, nz)) = (split(y), split(z));
                 let row = &mut values[(z * SPAN + y) * SPAN..][..SPAN];
                 let first = (nz * EDGE + ny) * EDGE;
                 let side = |bx: usize| blocks[bz * 9 + by * 3 + bx].map(|b| &self.values[b as usize]);
@@ -101,7 +101,7 @@ impl<'a> Field<'a> {
 }
 
 /// For a coordinate of the neighbourhood (0 = one before the block): which of three blocks, and its node there.
-fn place(i: usize) -> (usize, usize) {
+fn split(i: usize) -> (usize, usize) {
     let from_previous_block = i + EDGE - 1;
     (from_previous_block / EDGE, from_previous_block % EDGE)
 }
@@ -127,7 +127,7 @@ impl Neighbourhood {
 
     /// The block that owns node (x, y, z), each 0…8, and the node there.
     pub fn owner(&self, node: [usize; 3]) -> Option<(u32, usize)> {
-        let [(bx, x), (by, y), (bz, z)] = node.map(|i| place(i + 1));
+        let [(bx, x), (by, y), (bz, z)] = node.map(|i| split(i + 1));
         let block = self.blocks[bz * 9 + by * 3 + bx]?;
         Some((block, (z * EDGE + y) * EDGE + x))
     }

@@ -1,4 +1,4 @@
-//! The voxel lattice: nodes at `index · voxel`, grouped in cubic blocks of 8³ nodes that are hashed by their place.
+//! The voxel lattice: nodes at `index · voxel`, grouped in cubic blocks of 8³ nodes that are hashed by their position.
 
 use crate::{FusionConfig, FusionError};
 use nalgebra::Vector3;
@@ -10,21 +10,21 @@ pub(crate) const EDGE: usize = 8;
 pub(crate) const NODES: usize = EDGE * EDGE * EDGE;
 /// Most views a volume takes: 16-bit counts and 32-bit colour sums (255 · 255 · 65535 < 2³²) cannot overflow then.
 pub(crate) const MAX_VIEWS: u32 = 65_535;
-/// Reach of the lattice in voxels: single precision still tells eighths of a voxel apart there.
+/// Reach of the lattice in voxels: single precision still resolves eighths of a voxel there.
 const REACH_VOXELS: f64 = (1u32 << 21) as f64;
-/// A voxel may be this many times smaller than the distance of neighbouring pixels; beyond, surfaces fall to dust.
+/// A voxel may be this many times smaller than the distance of neighbouring pixels; beyond that, the surface has holes.
 const MAX_OVERSAMPLING: f64 = 8.0;
 
-/// Place of a block: node indices divided by [`EDGE`].
+/// Position of a block: node indices divided by [`EDGE`].
 pub(crate) type BlockKey = [i32; 3];
 
-/// Place of the node `local` (0…511, x fastest) of block `key` on the lattice.
+/// Position of the node `local` (0…511, x fastest) of block `key` on the lattice.
 pub(crate) fn node_of(key: BlockKey, local: usize) -> [i32; 3] {
     let offset = [local % EDGE, local / EDGE % EDGE, local / (EDGE * EDGE)];
     [0, 1, 2].map(|a| key[a] * EDGE as i32 + offset[a] as i32)
 }
 
-/// Refuses views that the lattice cannot hold: too far out, or with pixels much coarser than the voxels.
+/// Rejects views that the lattice cannot hold: too far out, or with pixels much coarser than the voxels.
 pub(crate) fn check_view(config: &FusionConfig, view: &AlignedView) -> Result<(), FusionError> {
     let limit_m = REACH_VOXELS * config.voxel_size_m;
     let distance_m = view.world_from_camera().translation.norm() + config.max_depth_m * 4.0;
@@ -54,18 +54,18 @@ pub(crate) fn check_view(config: &FusionConfig, view: &AlignedView) -> Result<()
 /// Median of a regular sample of the usable depths; `None` when there are none.
 pub(crate) fn median_depth(view: &AlignedView, max_depth: f32) -> Option<f32> {
     let data = view.depth().image().data();
-    // About a thousand samples place the median well within the factor that its users allow; the stride is
+    // About a thousand samples determine the median well within the tolerance of its uses; the stride is
     // odd so that it does not fall on one column only.
     let stride = (data.len() / 1024).max(1) | 1;
     let mut sample: Vec<f32> = data.iter().step_by(stride).copied().filter(|&z| z <= max_depth).collect();
     if sample.is_empty() {
         sample = data.iter().copied().filter(|&z| z <= max_depth).collect();
     }
-    let middle = sample.len() / 2;
+    let half = sample.len() / 2;
     if sample.is_empty() {
         return None;
     }
-    Some(*sample.select_nth_unstable_by(middle, f32::total_cmp).1)
+    Some(*sample.select_nth_unstable_by(half, f32::total_cmp).1)
 }
 
 /// Bytes that a `hashbrown` table of `entries` entries of `entry_bytes` takes (7/8 load, power-of-two buckets).

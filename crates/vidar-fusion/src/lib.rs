@@ -10,7 +10,7 @@
 //! use vidar_core::{AlignedView, Confidence, FrameId, Image, MetricDepth, Pinhole, Se3, Timestamp};
 //! use vidar_fusion::{FusionConfig, TsdfVolume};
 //! # fn main() -> Result<(), Box<dyn std::error::Error>> {
-//! // A wall one metre before the camera, seen twice.
+//! // A wall one metre in front of the camera, in two views.
 //! let camera = Pinhole::new(80.0, 80.0, 39.5, 29.5, 80, 60)?;
 //! let mut volume = TsdfVolume::new(&FusionConfig::default())?;
 //! for i in 0..2 {
@@ -29,15 +29,17 @@
 //! # }
 //! ```
 //!
-//! The path of a view: [`sample`] weighs its pixels, [`allocate`] finds the blocks it touches, [`update`] adds it to
-//! the sums of each [`block`], [`carve`] votes for what it sees empty. The way out: [`field`] reads distances, [`cubes`] has the
-//! triangles, [`extract`] makes the mesh, [`tidy`] drops crumbs, [`coverage`] counts, [`double_wall`] finds ghosts.
+//! Integration of a view: [`sample`] weighs its pixels, [`allocate`] finds the blocks it touches, [`update`] adds it to
+//! the sums of each [`block`], [`carve`] adds free space. Extraction: [`field`] reads distances, [`cubes`] has the
+//! triangles, [`extract`] makes the mesh, [`components`] removes small components, [`coverage`] measures what was
+//! observed, [`double_wall`] detects double walls.
 //!
-//! A map whose poses still change is fused in [`SubVolumes`], one per chunk, which move with the graph.
+//! A map whose poses still change is fused in [`SubVolumes`]: one volume per chunk, moved when the pose graph changes.
 
 mod allocate;
 mod block;
 mod carve;
+mod components;
 mod config;
 mod coverage;
 mod cubes;
@@ -51,15 +53,14 @@ mod points;
 mod sample;
 mod simd;
 mod sub_volumes;
-mod tidy;
 mod update;
 #[cfg(target_arch = "x86_64")]
 mod update_avx2;
 mod volume;
 
 pub use config::FusionConfig;
-pub use coverage::{CoverageReport, DensityCell, DensityMap, surface_area_m2};
-pub use double_wall::{DoubleWallReport, DoubleWalls};
+pub use coverage::{CoverageReport, surface_area_m2};
+pub use double_wall::{DoubleWallDetector, DoubleWallReport};
 pub use error::FusionError;
 pub use points::PointFusion;
 pub use sub_volumes::{RevisedView, Revision, SubVolumeConfig, SubVolumeReport, SubVolumes};

@@ -1,9 +1,8 @@
-//! The pixels of a view, summed by voxel, on their way into the point cloud.
+//! The pixels of a view, summed by voxel before they are added to the point cloud.
 //!
-//! A voxel of usual size is seen by dozens of neighbouring pixels. So a strip of rows first sums them in a small
-//! table without chains, from which an older voxel is pushed out when another one takes its slot; what is pushed
-//! out, a part of a voxel, is then added to the cloud's hash tables. Sums are integers: how pixels are cut into
-//! parts does not matter.
+//! A voxel of usual size is observed by dozens of neighbouring pixels. A strip of rows therefore sums them in a small
+//! direct-mapped table; when another voxel takes its slot, a voxel's partial sum is evicted and later added to the
+//! cloud's hash tables. Sums are integers, so the result does not depend on how pixels are grouped.
 
 use crate::grid::BlockKey;
 use crate::points::{SHARDS, shard_of};
@@ -17,14 +16,14 @@ use vidar_core::AlignedView;
 pub(crate) const FRACTION_ONE: f32 = 4096.0;
 /// Rows of a strip.
 const STRIP: usize = 32;
-/// Pixels that a part takes: 127 weights (12 bits) of normals (12 bits and sign) fit 32 bits.
+/// Pixels that a partial sum takes: 127 weights (12 bits) of normals (12 bits and sign) fit 32 bits.
 const MAX_PIXELS: u32 = 127;
 /// Slots of a strip's table: a few times the voxels that a row of pixels crosses, and still in the second cache.
 const SLOTS: usize = 1024;
 
 /// Sums over some pixels of one voxel.
 #[derive(Clone, Copy, Debug, Default)]
-pub(crate) struct Part {
+pub(crate) struct PartialSum {
     pub key: BlockKey,
     /// Σ w · (position − centre of the voxel), Σ w · normal, Σ w, 0: one vector.
     pub sums: [i32; 8],
@@ -34,7 +33,7 @@ pub(crate) struct Part {
     pub pixels: u32,
 }
 
-impl Part {
+impl PartialSum {
     pub fn offset(&self) -> [i32; 3] {
         [0, 1, 2].map(|a| self.sums[a])
     }
@@ -48,7 +47,7 @@ impl Part {
     }
 }
 
-/// The parts of a view, by strip and shard. Kept from view to view for its memory.
+/// The partial sums of a view, by strip and shard. Kept from view to view to reuse its memory.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Strips {
     strips: Vec<Strip>,
@@ -56,12 +55,12 @@ pub(crate) struct Strips {
 
 #[derive(Clone, Debug, Default)]
 struct Strip {
-    parts: Vec<Vec<Part>>,
-    slots: Vec<Part>,
+    partial_sums: Vec<Vec<PartialSum>>,
+    slots: Vec<PartialSum>,
     row: Row,
 }
 
-/// Where the pixels of a row lie and face; anything where there is no depth.
+/// Positions and normals of the pixels of a row; unspecified where there is no depth.
 #[derive(Clone, Debug, Default)]
 struct Row {
     /// Depths with a margin of NaN on both sides.
@@ -69,48 +68,48 @@ struct Row {
     pixels: Vec<Pixel>,
 }
 
-/// Place and direction of a pixel.
+/// Position and normal of a pixel.
 #[derive(Clone, Copy, Debug, Default)]
 struct Pixel {
     /// Voxels from that of the camera.
     voxel: [i32; 3],
-    /// Offset from the voxel's centre and unit normal, of [`FRACTION_ONE`], 1, 0: what [`Part::sums`] sums.
+    /// Offset from the voxel's centre and unit normal, of [`FRACTION_ONE`], 1, 0: what [`PartialSum::sums`] sums.
     terms: [i32; 8],
 }
 
 impl Strips {
-    /// Sums the pixels of `view` by voxel, in place of the view before.
+    /// Sums the pixels of `view` by voxel, replacing those of the previous view.
     pub fn fill(&mut self, view: &AlignedView, sampled: &SampledView, voxel_m: f64) {
-        let placer = Placer::new(view, voxel_m);
+        let backprojector = Backprojector::new(view, voxel_m);
         self.strips.resize_with(sampled.height.div_ceil(STRIP), Strip::default);
         let rows = sampled.samples.par_chunks(sampled.width * STRIP);
         self.strips.par_iter_mut().zip(rows).enumerate().for_each(|(at, (strip, samples))| {
             strip.clear();
             for (row, samples) in samples.chunks_exact(sampled.width).enumerate() {
                 let y = at * STRIP + row;
-                dispatch!(placer.place(y, samples, &mut strip.row));
+                dispatch!(backprojector.backproject(y, samples, &mut strip.row));
                 let colors = view.color().map(|c| &c.data()[y * sampled.width..][..sampled.width]);
-                dispatch!(strip.add(samples, colors, placer.camera_voxel));
+                dispatch!(strip.add(samples, colors, backprojector.camera_voxel));
             }
             strip.finish();
         });
     }
 
-    /// The parts of one shard, in the order of strips.
-    pub fn of_shard(&self, shard: usize) -> impl Iterator<Item = &Part> {
-        self.strips.iter().flat_map(move |strip| &strip.parts[shard])
+    /// The partial sums of one shard, in the order of strips.
+    pub fn of_shard(&self, shard: usize) -> impl Iterator<Item = &PartialSum> {
+        self.strips.iter().flat_map(move |strip| &strip.partial_sums[shard])
     }
 }
 
 impl Strip {
     fn clear(&mut self) {
-        self.parts.resize_with(SHARDS, Vec::new);
-        self.parts.iter_mut().for_each(Vec::clear);
+        self.partial_sums.resize_with(SHARDS, Vec::new);
+        self.partial_sums.iter_mut().for_each(Vec::clear);
         self.slots.clear();
-        self.slots.resize(SLOTS, Part::default());
+        self.slots.resize(SLOTS, PartialSum::default());
     }
 
-    /// Adds the row that was placed last.
+    /// Adds the row that was back-projected last.
     #[inline(always)]
     fn add(&mut self, samples: &[Sample], colors: Option<&[[u8; 3]]>, camera_voxel: BlockKey) {
         for (x, (sample, pixel)) in samples.iter().zip(&self.row.pixels).enumerate() {
@@ -122,9 +121,9 @@ impl Strip {
             let slot = &mut self.slots[slot_of(&key)];
             if slot.key != key || slot.pixels == MAX_PIXELS {
                 if slot.pixels > 0 {
-                    self.parts[shard_of(&slot.key)].push(*slot);
+                    self.partial_sums[shard_of(&slot.key)].push(*slot);
                 }
-                *slot = Part { key, ..Part::default() };
+                *slot = PartialSum { key, ..PartialSum::default() };
             }
             for (sum, term) in slot.sums.iter_mut().zip(pixel.terms) {
                 *sum += weight as i32 * term;
@@ -140,15 +139,15 @@ impl Strip {
         }
     }
 
-    /// Pushes out what is left in the slots.
+    /// Evicts the remaining slots.
     fn finish(&mut self) {
         for slot in self.slots.iter().filter(|slot| slot.pixels > 0) {
-            self.parts[shard_of(&slot.key)].push(*slot);
+            self.partial_sums[shard_of(&slot.key)].push(*slot);
         }
     }
 }
 
-/// The slot of a voxel: Knuth's multiplicative hash, whose upper bits are the good ones.
+/// The slot of a voxel: Knuth's multiplicative hash, whose upper bits are the well-mixed ones.
 #[inline(always)]
 fn slot_of(key: &BlockKey) -> usize {
     const FACTORS: [u32; 3] = [0x9e37_79b1, 0x85eb_ca77, 0xc2b2_ae3d];
@@ -157,8 +156,8 @@ fn slot_of(key: &BlockKey) -> usize {
     (hash >> (u32::BITS - SLOTS.ilog2())) as usize % SLOTS
 }
 
-/// Finds the voxels of pixels.
-struct Placer<'a> {
+/// Back-projects pixels into voxels.
+struct Backprojector<'a> {
     depth: &'a [f32],
     width: usize,
     height: usize,
@@ -168,13 +167,13 @@ struct Placer<'a> {
     /// Stands for rows outside the image.
     missing: Vec<f32>,
     camera_voxel: BlockKey,
-    /// Where the camera lies from the centre of its voxel, in voxels, where single precision is plenty.
+    /// Offset of the camera from the centre of its voxel, in voxels, where single precision is plenty.
     start: [f32; 3],
     rotation: [[f32; 3]; 3],
     per_voxel: f32,
 }
 
-impl<'a> Placer<'a> {
+impl<'a> Backprojector<'a> {
     fn new(view: &'a AlignedView, voxel_m: f64) -> Self {
         let k = view.intrinsics();
         let origin = view.world_from_camera().translation / voxel_m;
@@ -196,9 +195,9 @@ impl<'a> Placer<'a> {
         }
     }
 
-    /// Places the pixels of row `y`.
+    /// Back-projects the pixels of row `y`.
     #[inline(always)]
-    fn place(&self, y: usize, samples: &[Sample], row: &mut Row) {
+    fn backproject(&self, y: usize, samples: &[Sample], row: &mut Row) {
         let (n, step) = (self.width, self.step);
         let line = |y: usize| &self.depth[y * n..][..n];
         row.depth.clear();

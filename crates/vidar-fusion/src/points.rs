@@ -1,11 +1,10 @@
 //! Point fusion: one point per voxel, the weighted mean of all pixels that fall into it.
 //!
-//! Cheaper in thought than a TSDF and true to thin things, but without free space and without surface between the
-//! points. Weights are those of the TSDF; all sums are integers, so the cloud is the same for any order of views
-//! and any number of threads, except where the memory budget refused voxels ([`PointFusion::warnings`] says so).
+//! Simpler than a TSDF and preserves thin objects, but has no free space and no surface between the points. Weights are those of the TSDF; all sums are integers, so the cloud is the same for any order of views
+//! and any number of threads, except where the memory budget rejected voxels (see [`PointFusion::warnings`]).
 
 use crate::grid::{BlockKey, MAX_VIEWS, check_view, table_bytes};
-use crate::pixels::{FRACTION_ONE, Part, Strips};
+use crate::pixels::{FRACTION_ONE, PartialSum, Strips};
 use crate::sample::{CONFIDENCE_ONE, SampledView};
 use crate::{FusionConfig, FusionError, IntegrationStats};
 use nalgebra::Vector3;
@@ -14,7 +13,7 @@ use rustc_hash::{FxBuildHasher, FxHashMap};
 use std::hash::BuildHasher;
 use vidar_core::{AlignedView, PointCloud, Warning};
 
-/// Voxels are dealt to this many tables, which are filled in parallel.
+/// Voxels are distributed over this many tables, which are filled in parallel.
 pub(crate) const SHARDS: usize = 16;
 
 /// Sums over the pixels of one voxel. 65535 views of 2³² pixels' weights would be needed to overflow them.
@@ -39,14 +38,14 @@ struct PointSum {
 pub struct PointFusion {
     config: FusionConfig,
     shards: Vec<FxHashMap<BlockKey, PointSum>>,
-    /// Memory of the last view's samples and parts, for the next one.
+    /// Memory of the last view's samples and partial_sums, for the next one.
     scratch: (SampledView, Strips),
     views: u32,
     dropped: u64,
 }
 
 impl PointFusion {
-    /// An empty cloud; refuses a configuration that is out of range.
+    /// An empty cloud; fails for a configuration that is out of range.
     pub fn new(config: &FusionConfig) -> Result<Self, FusionError> {
         config.validate()?;
         Ok(Self {
@@ -91,7 +90,7 @@ impl PointFusion {
         })
     }
 
-    /// One point per voxel seen by at least `min_observations` views, in the order of voxels: weighted mean
+    /// One point per voxel observed by at least `min_observations` views, in the order of voxels: weighted mean
     /// position, unit normal facing the observers, mean confidence, and colour when any view had one.
     pub fn finish(self) -> PointCloud {
         let min_views = self.config.min_observations;
@@ -112,13 +111,13 @@ impl PointFusion {
         cloud
     }
 
-    /// Degradations so far: `fusion-memory-budget` when new points were refused.
+    /// Degradations so far: `fusion-memory-budget` when new points were rejected.
     pub fn warnings(&self) -> Vec<Warning> {
         if self.dropped == 0 {
             return Vec::new();
         }
         let message = format!(
-            "the point cloud reached its budget of {} MiB: {} pixels fell into voxels that were refused, and which \
+            "the point cloud reached its budget of {} MiB: {} pixels fell into voxels that were rejected, and which \
              ones depends on the order of the views",
             self.config.memory_budget_bytes >> 20,
             self.dropped
@@ -134,18 +133,18 @@ impl PointFusion {
 }
 
 impl PointSum {
-    fn add(&mut self, part: &Part, call: u32) {
-        let (offset, normal) = (part.offset(), part.normal());
+    fn add(&mut self, partial: &PartialSum, call: u32) {
+        let (offset, normal) = (partial.offset(), partial.normal());
         for a in 0..3 {
             self.offset[a] += i64::from(offset[a]);
             self.normal[a] += i64::from(normal[a]);
         }
-        for (sum, more) in self.color.iter_mut().zip(part.color) {
+        for (sum, more) in self.color.iter_mut().zip(partial.color) {
             *sum += u64::from(more);
         }
-        self.weight += u64::from(part.weight());
-        self.confidence += u64::from(part.confidence);
-        self.pixels += u64::from(part.pixels);
+        self.weight += u64::from(partial.weight());
+        self.confidence += u64::from(partial.confidence);
+        self.pixels += u64::from(partial.pixels);
         self.views += u32::from(self.last_call != call);
         self.last_call = call;
     }
@@ -157,7 +156,7 @@ impl PointSum {
 
     fn unit_normal(&self) -> [f32; 3] {
         let sum = Vector3::from(self.normal.map(|n| n as f64));
-        // Opposite views of a thin sheet may cancel; then any direction is as good as another.
+        // Opposite normals of a thin sheet may cancel; the direction is then arbitrary.
         let unit = sum.try_normalize(0.5).unwrap_or_else(Vector3::z);
         unit.map(|c| c as f32).into()
     }
@@ -167,23 +166,23 @@ fn shard_bytes(entries: usize) -> u64 {
     table_bytes(entries, size_of::<(BlockKey, PointSum)>())
 }
 
-/// Adds parts to the voxels of one shard; how many voxels changed, and how many pixels the budget refused.
+/// Adds partial_sums to the voxels of one shard; how many voxels changed, and how many pixels the budget rejected.
 fn add_to_shard<'a>(
     shard: &mut FxHashMap<BlockKey, PointSum>,
-    parts: impl Iterator<Item = &'a Part>,
+    partial_sums: impl Iterator<Item = &'a PartialSum>,
     call: u32,
     budget: u64,
 ) -> (u64, u64) {
     let (mut touched, mut dropped) = (0, 0);
-    for part in parts {
-        if let Some(sum) = shard.get_mut(&part.key) {
+    for partial in partial_sums {
+        if let Some(sum) = shard.get_mut(&partial.key) {
             touched += u64::from(sum.last_call != call);
-            sum.add(part, call);
+            sum.add(partial, call);
         } else if shard_bytes(shard.len() + 1) <= budget {
             touched += 1;
-            shard.entry(part.key).or_default().add(part, call);
+            shard.entry(partial.key).or_default().add(partial, call);
         } else {
-            dropped += u64::from(part.pixels);
+            dropped += u64::from(partial.pixels);
         }
     }
     (touched, dropped)

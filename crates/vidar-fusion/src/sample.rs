@@ -1,4 +1,4 @@
-//! From a view to what the volume asks of each pixel: a depth, a weight, a confidence.
+//! Depth, weight and confidence of each pixel of a view.
 //!
 //! The weight of a pixel with confidence c, incidence angle θ between its ray and its surface normal and depth z is
 //!
@@ -19,7 +19,7 @@ pub(crate) const WEIGHT_ONE: f32 = 4095.0;
 pub(crate) const CONFIDENCE_ONE: f32 = 255.0;
 /// Pixels along the edge of a tile.
 pub(crate) const TILE: usize = 8;
-/// Depth steps between neighbouring pixels above this share of the depth are taken for the edge of an object.
+/// Depth steps between neighbouring pixels above this share of the depth are treated as the edge of an object.
 const JUMP_RATIO: f32 = 0.05;
 /// Adding this to a float below 2²² rounds it to the nearest integer, found in the low bits. Unlike `as`, which
 /// must saturate, this becomes one vector addition.
@@ -31,7 +31,7 @@ pub(crate) fn round_to_i32(x: f32) -> i32 {
     ((x + ROUND).to_bits() as i32).wrapping_sub(ROUND.to_bits() as i32)
 }
 
-/// What fusion needs of a pixel. Its layout is what the gathers of `update_avx2` read.
+/// A pixel's input to fusion. Its layout is what the gathers of `update_avx2` read.
 #[derive(Clone, Copy, Debug)]
 #[repr(C)]
 pub(crate) struct Sample {
@@ -85,7 +85,7 @@ impl Tile {
     }
 }
 
-/// All samples of a view, row by row, and their tiles. Kept from view to view, so that its memory is asked for once.
+/// All samples of a view, row by row, and their tiles. Kept from view to view, so that its memory is allocated once.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct SampledView {
     pub width: usize,
@@ -100,10 +100,10 @@ pub(crate) struct SampledView {
 }
 
 impl SampledView {
-    /// Weighs every pixel of `view`, in place of the view before.
+    /// Weighs every pixel of `view`, replacing the samples of the previous view.
     pub fn fill(&mut self, view: &AlignedView, config: &FusionConfig) {
         let (width, height) = (view.intrinsics().width, view.intrinsics().height);
-        let weigher = Weigher::new(view, config);
+        let weigher = PixelWeighting::new(view, config);
         let (tile_columns, tile_rows) = (width.div_ceil(TILE), height.div_ceil(TILE));
         (self.width, self.height, self.tile_columns) = (width, height, tile_columns);
         self.samples.resize(width * height, Sample::NONE);
@@ -119,8 +119,8 @@ impl SampledView {
         self.pixels_used = self.tiles.iter().map(|t| u64::from(t.usable)).sum();
     }
 
-    /// Copies the colours. Blocks look them up in no order that the processor could foresee, and waited for the
-    /// memory at each; read once from front to back here, they are in its cache by then.
+    /// Copies the colours. Blocks access them in an order that is not prefetched; reading them once sequentially brings
+    /// them into the cache.
     fn fill_colors(&mut self, view: &AlignedView) {
         let bytes = view.color().map_or(&[][..], |c| c.data().as_flattened());
         self.colors.resize(if bytes.is_empty() { 0 } else { bytes.len() + 1 }, 0);
@@ -143,7 +143,7 @@ pub(crate) fn gradient_step(width: usize) -> usize {
 
 /// Slope of depth per pixel, from the depths before, at and behind a pixel (NaN = none).
 ///
-/// Central where the surface is smooth, the gentler side at an edge, 0 where nothing is known.
+/// Central where the surface is smooth, the gentler side at an edge, 0 without neighbours.
 #[inline(always)]
 pub(crate) fn slope(before: f32, here: f32, after: f32, per_step: f32) -> f32 {
     let (left, right) = (here - before, after - here);
@@ -165,7 +165,7 @@ pub(crate) fn camera_normal(k: &[f32; 4], du: f32, dv: f32, z: f32, gx: f32, gy:
     [k[0] * gx, k[1] * gy, -(z + du * gx + dv * gy)]
 }
 
-struct Weigher<'a> {
+struct PixelWeighting<'a> {
     width: usize,
     height: usize,
     depth: &'a [f32],
@@ -180,7 +180,7 @@ struct Weigher<'a> {
     min_cos: f32,
 }
 
-impl<'a> Weigher<'a> {
+impl<'a> PixelWeighting<'a> {
     fn new(view: &'a AlignedView, config: &FusionConfig) -> Self {
         let k: &Pinhole = view.intrinsics();
         Self {
@@ -192,7 +192,7 @@ impl<'a> Weigher<'a> {
             k: [k.fx as f32, k.fy as f32, k.cx as f32, k.cy as f32],
             per_focal: [1.0 / k.fx as f32, 1.0 / k.fy as f32],
             step: gradient_step(k.width),
-            // A confidence of 0 says "wrong", whatever the threshold.
+            // A confidence of 0 is unusable, whatever the threshold.
             min_confidence: (config.min_confidence as f32).max(f32::MIN_POSITIVE),
             max_depth: config.max_depth_m as f32,
             min_cos: (config.max_incidence_deg.to_radians().cos() as f32).max(0.0),
@@ -254,7 +254,7 @@ impl<'a> Weigher<'a> {
         let norms = ((n[0] * n[0] + n[1] * n[1] + n[2] * n[2]) * (rx * rx + ry * ry + 1.0)).sqrt();
         let steep = z < self.min_cos * norms;
         let usable = (z <= self.max_depth) & (confidence >= self.min_confidence) & !steep;
-        // cos θ · min(1, 1 / z²) with a single division: they and the root are what this kernel takes its time for.
+        // cos θ · min(1, 1 / z²) with a single division: they and the root dominate the time of this kernel.
         let far = if z > 1.0 { z * z } else { 1.0 };
         let weight = round_to_i32(confidence * z / (norms * far) * WEIGHT_ONE).max(1) as u32;
         let confidence = round_to_i32(confidence * CONFIDENCE_ONE).max(1) as u32;

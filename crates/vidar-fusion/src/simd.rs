@@ -1,4 +1,4 @@
-//! Running a kernel with the vector instructions that the machine has.
+//! Runs a kernel with the vector instructions of the processor.
 
 /// Calls a method `#[inline(always)]` inside a function that may use AVX2, where the processor has it.
 ///

@@ -6,7 +6,7 @@
 //! `d = clamp(s / truncation, −1, 1)`, `Σ w·d`, `Σ w`   (Curless & Levoy 1996, eq. 1–2),
 //!
 //! with w of [`crate::sample`], falling linearly to 0 from one voxel behind the surface to the truncation, where
-//! nothing is known. Nodes within the truncation also count the view and sum its confidence and colour.
+//! nothing was observed. Nodes within the truncation also count the view and sum its confidence and colour.
 //!
 //! A row of eight nodes at a time: in plain Rust here, and with AVX2 in [`crate::update_avx2`], where the gathers
 //! make it about twice as fast. Both do the same operations in the same order and give the same bits (tested).
@@ -15,7 +15,7 @@ use crate::block::{Block, ColorRow, DISTANCE_ONE, Lanes, Row};
 use crate::grid::EDGE;
 use crate::sample::{Sample, round_to_i32};
 
-/// Nodes closer to the camera plane than this, metres, are not looked up.
+/// Nodes closer to the camera plane than this, metres, are not updated.
 pub(crate) const NEAR_M: f32 = 1e-3;
 
 /// One view, ready to be added to blocks.
@@ -66,14 +66,14 @@ impl BlockUpdate<'_> {
         let (pixel, depth_of_node) = self.project_row(start);
         let mut depth: Lanes<f32> = [0.0; EDGE];
         let mut packed: Lanes<u32> = [0; EDGE];
-        let mut seen = 0;
+        let mut any = 0;
         for i in 0..EDGE {
             let sample = self.samples.get(pixel[i] as usize).copied().unwrap_or(Sample::NONE);
             depth[i] = sample.depth;
             packed[i] = sample.weight_and_confidence;
-            seen |= packed[i];
+            any |= packed[i];
         }
-        if seen == 0 {
+        if any == 0 {
             return;
         }
         let per_truncation = 1.0 / self.truncation_m;
@@ -126,7 +126,7 @@ impl BlockUpdate<'_> {
             let per_z = 1.0 / z;
             let (u, v) = (fx * x * per_z + cx, fy * y * per_z + cy);
             let inside = (z > NEAR_M) & (u > -0.5) & (v > -0.5) & (u < right) & (v < bottom);
-            // Wrapping: what lies outside the image is garbage here and not taken.
+            // Wrapping: values outside the image are arbitrary here and not used.
             let index = round_to_i32(v).wrapping_mul(width).wrapping_add(round_to_i32(u));
             pixel[i] = if inside { index as u32 } else { u32::MAX };
             depth[i] = z;

@@ -15,7 +15,7 @@ pub(crate) fn can_add(update: &BlockUpdate<'_>) -> bool {
     fits(pixels) && update.colors.is_none_or(|colors| colors.len() == 3 * pixels + 1)
 }
 
-/// What is the same for all rows, in vectors.
+/// Constants of all rows, in vectors.
 struct Constants {
     pixels: __m256i,
     k: [__m256; 4],
@@ -50,28 +50,28 @@ pub(crate) fn add_rows(update: &BlockUpdate<'_>, block: &mut Block, origin: [f32
     };
     let mut colors = block.color.as_deref_mut();
     for layer in 0..EDGE {
-        // What the rows see first, then what follows from it: a wrong guess at a branch of `add_row` throws away the
-        // work begun behind it, which would be the loads of the next rows. Their sums come closer meanwhile.
-        let mut seen = [Seen::NOTHING; EDGE];
-        for (y, seen) in seen.iter_mut().enumerate() {
+        // All rows are projected before any is updated: a mispredicted branch of `add_row` would otherwise discard the
+        // loads of the next rows. The sums are prefetched meanwhile.
+        let mut projected = [ProjectedRow::NOTHING; EDGE];
+        for (y, projected) in projected.iter_mut().enumerate() {
             let at = layer * EDGE + y;
             prefetch(&block.rows[at]);
             if let Some(colors) = &colors {
                 prefetch(&colors[at]);
             }
-            *seen = look(update, &constants, update.row_start(at, origin));
+            *projected = project(update, &constants, update.row_start(at, origin));
         }
-        for (y, seen) in seen.iter().enumerate() {
+        for (y, projected) in projected.iter().enumerate() {
             let at = layer * EDGE + y;
             let row = &mut block.rows[at];
-            add_row(update, &constants, row, colors.as_mut().map(|c| &mut c[at]), seen);
+            add_row(update, &constants, row, colors.as_mut().map(|c| &mut c[at]), projected);
         }
     }
 }
 
-/// What the eight nodes of a row see.
+/// Pixels of the eight nodes of a row.
 #[derive(Clone, Copy)]
-struct Seen {
+struct ProjectedRow {
     /// Pixel of each node; not in the image where `packed` is 0.
     pixel: __m256i,
     /// Depth of the pixel minus z of the node.
@@ -80,7 +80,7 @@ struct Seen {
     packed: __m256i,
 }
 
-impl Seen {
+impl ProjectedRow {
     const NOTHING: Self = {
         // SAFETY: vectors are numbers for which all bits are valid.
         unsafe { std::mem::zeroed() }
@@ -100,7 +100,7 @@ fn samples_at(samples: &[Sample], pixel: __m128i, inside: __m128i) -> __m256i {
         let base = samples.as_ptr();
         // SAFETY: a pixel is 0 or inside, so less than samples.len(), which is not 0 (`can_add`); a sample has 8 bytes.
         let (one, other) = unsafe { (base.add(one as usize), base.add(other as usize)) };
-        // SAFETY: as above; neither access asks for alignment.
+        // SAFETY: as above; neither access requires alignment.
         unsafe { _mm_loadh_pd(_mm_castsi128_pd(_mm_loadl_epi64(one.cast())), other.cast()) }
     };
     let first = load(_mm_cvtsi128_si64(pixel));
@@ -109,7 +109,7 @@ fn samples_at(samples: &[Sample], pixel: __m128i, inside: __m128i) -> __m256i {
     _mm256_and_si256(four, _mm256_cvtepi32_epi64(inside))
 }
 
-/// Asks for the memory of a row of sums, two lines of the cache, before it is needed.
+/// Prefetches a row of sums, two cache lines.
 #[inline]
 #[target_feature(enable = "avx2")]
 fn prefetch<T>(row: &T) {
@@ -120,7 +120,7 @@ fn prefetch<T>(row: &T) {
 
 #[inline]
 #[target_feature(enable = "avx2")]
-fn look(update: &BlockUpdate<'_>, c: &Constants, start: [f32; 3]) -> Seen {
+fn project(update: &BlockUpdate<'_>, c: &Constants, start: [f32; 3]) -> ProjectedRow {
     let [x, y, z] = [0, 1, 2].map(|a| _mm256_add_ps(_mm256_set1_ps(start[a]), c.ramp[a]));
     let per_z = _mm256_div_ps(_mm256_set1_ps(1.0), z);
     let u = _mm256_add_ps(_mm256_mul_ps(_mm256_mul_ps(c.k[0], x), per_z), c.k[2]);
@@ -151,7 +151,7 @@ fn look(update: &BlockUpdate<'_>, c: &Constants, start: [f32; 3]) -> Seen {
     let packed = _mm256_castps_pd(_mm256_shuffle_ps::<0b11_01_11_01>(first, second));
     let depth = _mm256_castpd_ps(_mm256_permute4x64_pd::<0b11_01_10_00>(depth));
     let packed = _mm256_castpd_si256(_mm256_permute4x64_pd::<0b11_01_10_00>(packed));
-    Seen { pixel, distance: _mm256_sub_ps(depth, z), packed }
+    ProjectedRow { pixel, distance: _mm256_sub_ps(depth, z), packed }
 }
 
 #[inline]
@@ -161,9 +161,9 @@ fn add_row(
     c: &Constants,
     row: &mut Row,
     color: Option<&mut ColorRow>,
-    seen: &Seen,
+    projected: &ProjectedRow,
 ) {
-    let &Seen { pixel, distance, packed } = seen;
+    let &ProjectedRow { pixel, distance, packed } = projected;
     let zero = _mm256_setzero_si256();
     let one = _mm256_set1_ps(1.0);
     let fade = _mm256_mul_ps(_mm256_add_ps(distance, c.truncation), c.per_fade);
@@ -220,7 +220,7 @@ fn add_colors(sums: &mut ColorRow, colors: &[u8], pixel: __m256i, near: __m256i,
 fn accumulate<T>(sums: &mut [T; EDGE], add: __m256i) {
     const { assert!(size_of::<[T; EDGE]>() == size_of::<__m256i>()) };
     let at = std::ptr::from_mut(sums).cast::<__m256i>();
-    // SAFETY: the reference is to as many bytes as a vector, and neither access asks for alignment. T is i32 or u32,
+    // SAFETY: the reference is to as many bytes as a vector, and neither access requires alignment. T is i32 or u32,
     // for which all bits are valid.
     unsafe { _mm256_storeu_si256(at, _mm256_add_epi32(_mm256_loadu_si256(at), add)) };
 }

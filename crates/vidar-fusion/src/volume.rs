@@ -2,7 +2,7 @@
 
 use crate::allocate::touched_blocks;
 use crate::block::Block;
-use crate::carve::{Vote, free_space};
+use crate::carve::{FreeBlock, free_space};
 use crate::grid::{BlockKey, CameraFromWorld, EDGE, MAX_VIEWS, check_view, table_bytes};
 use crate::sample::SampledView;
 use crate::update::BlockUpdate;
@@ -13,7 +13,7 @@ use rustc_hash::FxHashMap;
 use serde::{Deserialize, Serialize};
 use vidar_core::{AlignedView, Warning};
 
-/// What one call of `integrate` did.
+/// Statistics of one call of `integrate`.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct IntegrationStats {
     /// Pixels whose depth was used.
@@ -22,17 +22,17 @@ pub struct IntegrationStats {
     pub blocks_touched: u64,
     /// Blocks (or voxels) that exist now.
     pub blocks_total: u64,
-    /// Blocks (or voxels) that the view needed and the memory budget refused.
+    /// Blocks (or voxels) that the view needed and the memory budget rejected.
     pub dropped_by_budget: u64,
-    /// Blocks that the view saw entirely empty.
+    /// Blocks that are entirely free in the view.
     pub blocks_carved: u64,
 }
 
 /// A truncated signed distance field over hashed blocks of 8³ voxels.
 ///
 /// [`Self::integrate`] adds views to integer sums, so the volume is the same to the bit for any order of views and
-/// any number of threads. The one exception is a volume that ran into its memory budget: which blocks it had to
-/// refuse then depends on which view came first ([`Self::warnings`] says so).
+/// any number of threads. The one exception is a volume that ran into its memory budget: which blocks it
+/// rejected then depends on the order of the views (see [`Self::warnings`]).
 #[derive(Clone, Debug)]
 pub struct TsdfVolume {
     config: FusionConfig,
@@ -40,7 +40,7 @@ pub struct TsdfVolume {
     pub(crate) keys: Vec<BlockKey>,
     // Boxed, so that a growing list moves pointers and not the blocks.
     pub(crate) blocks: Vec<Box<Block>>,
-    /// Weight of the views that saw a whole block empty.
+    /// Free-space weights of blocks.
     pub(crate) free: FxHashMap<BlockKey, u32>,
     colored_blocks: u64,
     /// Memory of the last view's samples, for the next one.
@@ -52,7 +52,7 @@ pub struct TsdfVolume {
 }
 
 impl TsdfVolume {
-    /// An empty volume; refuses a configuration that is out of range.
+    /// An empty volume; fails for a configuration that is out of range.
     pub fn new(config: &FusionConfig) -> Result<Self, FusionError> {
         config.validate()?;
         Ok(Self {
@@ -88,14 +88,14 @@ impl TsdfVolume {
         }
         let mut sampled = std::mem::take(&mut self.scratch);
         sampled.fill(view, &self.config);
-        let wanted = touched_blocks(view, &sampled, &self.config);
+        let needed = touched_blocks(view, &sampled, &self.config);
         let free = free_space(view, &sampled, &self.config);
-        let (touched, dropped_blocks) = self.allocate(&wanted, view.color().is_some());
+        let (touched, dropped_blocks) = self.allocate(&needed, view.color().is_some());
         self.update(view, &sampled, &touched);
-        let dropped_votes = self.vote(&free.votes);
+        let dropped_free = self.add_free(&free.blocks);
         self.views += 1;
         self.shortened_views += u32::from(free.shortened);
-        self.dropped += dropped_blocks + dropped_votes;
+        self.dropped += dropped_blocks + dropped_free;
         self.peak_bytes = self.peak_bytes.max(self.memory_bytes() + sampled.scratch_bytes());
         let pixels_used = sampled.pixels_used;
         self.scratch = sampled;
@@ -103,16 +103,16 @@ impl TsdfVolume {
             pixels_used,
             blocks_touched: touched.len() as u64,
             blocks_total: self.blocks.len() as u64,
-            dropped_by_budget: dropped_blocks + dropped_votes,
-            blocks_carved: free.votes.len() as u64 - dropped_votes,
+            dropped_by_budget: dropped_blocks + dropped_free,
+            blocks_carved: free.blocks.len() as u64 - dropped_free,
         })
     }
 
-    /// Finds or makes the blocks at `wanted` (sorted); their indices, sorted, and how many the budget refused.
-    fn allocate(&mut self, wanted: &[BlockKey], colored: bool) -> (Vec<u32>, u64) {
-        let mut touched = Vec::with_capacity(wanted.len());
+    /// Finds or creates the blocks at `needed` (sorted); their indices, sorted, and how many the budget rejected.
+    fn allocate(&mut self, needed: &[BlockKey], colored: bool) -> (Vec<u32>, u64) {
+        let mut touched = Vec::with_capacity(needed.len());
         let mut dropped = 0;
-        for key in wanted {
+        for key in needed {
             if let Some(&at) = self.index.get(key) {
                 touched.push(at);
                 continue;
@@ -168,10 +168,10 @@ impl TsdfVolume {
         });
     }
 
-    /// Adds the votes for empty blocks; how many the budget refused.
-    fn vote(&mut self, votes: &[Vote]) -> u64 {
+    /// Adds the weights of free blocks; returns how many the budget rejected.
+    fn add_free(&mut self, blocks: &[FreeBlock]) -> u64 {
         let mut dropped = 0;
-        for &(key, weight) in votes {
+        for &(key, weight) in blocks {
             if let Some(sum) = self.free.get_mut(&key) {
                 *sum += weight;
             } else if self.bytes_with(self.blocks.len(), self.free.len() + 1, 0)
@@ -187,19 +187,19 @@ impl TsdfVolume {
 
     /// Adds all sums of `other`, a volume of the same voxels, as if its views had been fused here.
     ///
-    /// How many blocks and votes the budget refused.
+    /// Returns how many blocks and free-space weights the budget rejected.
     pub(crate) fn add(&mut self, other: &Self) -> u64 {
         self.count_views(other);
         let blocks = other.keys.iter().copied().zip(other.blocks.iter().map(|b| &**b));
-        self.add_blocks(blocks) + self.add_votes(&other.votes())
+        self.add_blocks(blocks) + self.add_free_blocks(&other.free_blocks())
     }
 
-    /// Adds sums block by block; how many blocks the budget refused.
+    /// Adds sums block by block; returns how many blocks the budget rejected.
     pub(crate) fn add_blocks<'a>(&mut self, more: impl Iterator<Item = (BlockKey, &'a Block)>) -> u64 {
         let mut dropped = 0;
         for (key, block) in more {
-            let (touched, refused) = self.allocate(&[key], block.color.is_some());
-            dropped += refused;
+            let (touched, rejected) = self.allocate(&[key], block.color.is_some());
+            dropped += rejected;
             for at in touched {
                 self.blocks[at as usize].add(block);
             }
@@ -209,18 +209,18 @@ impl TsdfVolume {
         dropped
     }
 
-    /// Adds votes for empty blocks of another volume; how many the budget refused.
-    pub(crate) fn add_votes(&mut self, votes: &[Vote]) -> u64 {
-        let dropped = self.vote(votes);
+    /// Adds the free blocks of another volume; returns how many the budget rejected.
+    pub(crate) fn add_free_blocks(&mut self, blocks: &[FreeBlock]) -> u64 {
+        let dropped = self.add_free(blocks);
         self.dropped += dropped;
         dropped
     }
 
-    /// The votes for empty blocks, in the order of their keys.
-    pub(crate) fn votes(&self) -> Vec<Vote> {
-        let mut votes: Vec<Vote> = self.free.iter().map(|(key, weight)| (*key, *weight)).collect();
-        votes.sort_unstable();
-        votes
+    /// The free blocks with their weights, in the order of their keys.
+    pub(crate) fn free_blocks(&self) -> Vec<FreeBlock> {
+        let mut blocks: Vec<FreeBlock> = self.free.iter().map(|(key, weight)| (*key, *weight)).collect();
+        blocks.sort_unstable();
+        blocks
     }
 
     /// Counts views whose sums come by [`Self::add_blocks`].
@@ -234,7 +234,7 @@ impl TsdfVolume {
         (self.views, self.shortened_views)
     }
 
-    /// Sets what [`Self::view_counts`] tells.
+    /// Sets the counts of [`Self::view_counts`].
     pub(crate) fn set_view_counts(&mut self, views: u32, shortened: u32) {
         (self.views, self.shortened_views) = (views, shortened);
     }
@@ -244,13 +244,13 @@ impl TsdfVolume {
         self.config.memory_budget_bytes = bytes;
     }
 
-    /// Degradations so far: `fusion-memory-budget` when new space was refused, `fusion-carve-range` when the
+    /// Degradations so far: `fusion-memory-budget` when new blocks were rejected, `fusion-carve-range` when the
     /// carving range was shortened because it holds too many blocks.
     pub fn warnings(&self) -> Vec<Warning> {
         let mut warnings = Vec::new();
         if self.dropped > 0 {
             let message = format!(
-                "the volume reached its budget of {} MiB: {} times a block was needed and refused, so parts are \
+                "the volume reached its budget of {} MiB: {} times a needed block was rejected, so parts are \
                  missing, and which ones depends on the order of the views",
                 self.config.memory_budget_bytes >> 20,
                 self.dropped
@@ -286,7 +286,7 @@ impl TsdfVolume {
         self.peak_bytes
     }
 
-    /// Bytes with `blocks` block entries and `free` votes in the tables, and `more` bytes of block.
+    /// Bytes with `blocks` block entries and `free` free blocks in the tables, and `more` bytes of block.
     fn bytes_with(&self, blocks: usize, free: usize, more: u64) -> u64 {
         let lists = blocks.next_power_of_two() * (size_of::<BlockKey>() + size_of::<usize>());
         let entry = size_of::<(BlockKey, u32)>();

@@ -1,35 +1,35 @@
-//! Which surfaces count as doubled.
+//! Which surfaces count as double walls.
 
 #![allow(clippy::unwrap_used)] // a helper that fails is a test that fails
 
 use vidar_core::{PointCloud, TriangleMesh};
-use vidar_fusion::{DoubleWalls, FusionError};
+use vidar_fusion::{DoubleWallDetector, FusionError};
 
 /// Positions and normals.
-type Part = (Vec<[f32; 3]>, Vec<[f32; 3]>);
+type Patch = (Vec<[f32; 3]>, Vec<[f32; 3]>);
 
 /// Points 1 cm apart on the square of 1 m at height `z` from `from_x` on, facing `up`.
-fn square(z: f32, from_x: f32, up: f32) -> Part {
+fn square(z: f32, from_x: f32, up: f32) -> Patch {
     let points: Vec<[f32; 3]> =
         (0..10_000).map(|i| [from_x + (i % 100) as f32 * 0.01, (i / 100) as f32 * 0.01, z]).collect();
     let normals = vec![[0.0, 0.0, up]; points.len()];
     (points, normals)
 }
 
-fn cloud(parts: &[Part]) -> PointCloud {
+fn cloud(patches: &[Patch]) -> PointCloud {
     PointCloud {
-        positions: parts.iter().flat_map(|p| p.0.clone()).collect(),
-        normals: parts.iter().flat_map(|p| p.1.clone()).collect(),
+        positions: patches.iter().flat_map(|p| p.0.clone()).collect(),
+        normals: patches.iter().flat_map(|p| p.1.clone()).collect(),
         ..PointCloud::default()
     }
 }
 
-fn rate(parts: &[Part]) -> f64 {
-    DoubleWalls::default().of_cloud(&cloud(parts)).unwrap().rate
+fn rate(patches: &[Patch]) -> f64 {
+    DoubleWallDetector::default().of_cloud(&cloud(patches)).unwrap().rate
 }
 
 #[test]
-fn only_a_near_surface_that_faces_the_same_way_is_a_ghost() {
+fn only_a_near_surface_that_faces_the_same_way_is_a_double_wall() {
     assert_eq!(rate(&[square(0.0, 0.0, 1.0)]), 0.0);
     assert_eq!(rate(&[square(0.0, 0.0, 1.0), square(0.1, 0.0, 1.0)]), 1.0);
     assert_eq!(rate(&[square(0.0, 0.0, 1.0), square(0.1, 0.0, -1.0)]), 0.0, "two sides of a board");
@@ -40,7 +40,7 @@ fn only_a_near_surface_that_faces_the_same_way_is_a_ghost() {
 }
 
 #[test]
-fn a_tilt_beyond_the_angle_is_another_thing() {
+fn a_tilt_beyond_the_angle_is_not_a_double_wall() {
     let tilted = |angle: f32| {
         let (points, normals) = square(0.0, 0.0, 1.0);
         let turn = |p: &[f32; 3]| [p[0], p[1], p[2] + 0.1 + (p[1] - 0.5) * angle.tan()];
@@ -53,7 +53,7 @@ fn a_tilt_beyond_the_angle_is_another_thing() {
 
 #[test]
 fn a_mesh_counts_by_area() {
-    // Two triangles of 1 m² that face up, 10 cm apart at one corner only, and a fine ghost over that corner.
+    // Two triangles of 1 m² that face up, 10 cm apart at one corner only, and a small double wall over that corner.
     let mesh = TriangleMesh {
         positions: vec![
             [0.0, 0.0, 0.0],
@@ -67,26 +67,26 @@ fn a_mesh_counts_by_area() {
         triangles: vec![[0, 1, 2], [3, 4, 5]],
         ..TriangleMesh::default()
     };
-    let report = DoubleWalls::default().of_mesh(&mesh).unwrap();
+    let report = DoubleWallDetector::default().of_mesh(&mesh).unwrap();
     // A third of the large triangle hangs on its corner.
     assert!((report.rate - 1.0 / 3.0).abs() < 1e-3, "{report:?}");
     assert_eq!((report.points, report.doubled), (6, 4));
 }
 
 #[test]
-fn what_cannot_be_judged_has_no_rate() {
-    let walls = DoubleWalls::default();
+fn surfaces_without_normals_have_no_rate() {
+    let detector = DoubleWallDetector::default();
     let (positions, normals) = square(0.0, 0.0, 1.0);
-    assert_eq!(walls.of_cloud(&PointCloud::from_positions(positions.clone())).unwrap().rate, 0.0);
-    assert_eq!(walls.of_mesh(&TriangleMesh::default()).unwrap().points, 0);
+    assert_eq!(detector.of_cloud(&PointCloud::from_positions(positions.clone())).unwrap().rate, 0.0);
+    assert_eq!(detector.of_mesh(&TriangleMesh::default()).unwrap().points, 0);
     let mut broken = cloud(&[(positions, normals), square(0.1, 0.0, 1.0)]);
     for i in 0..100 {
         broken.positions[i * 7] = [f32::NAN, f32::INFINITY, 0.0];
         broken.normals[i * 11] = [f32::NAN; 3];
     }
-    assert!(walls.of_cloud(&broken).unwrap().rate > 0.9);
-    let bad = DoubleWalls { farthest_m: 0.01, ..walls };
-    assert!(matches!(bad.of_cloud(&broken), Err(FusionError::BadConfig { field: "farthest_m", .. })));
+    assert!(detector.of_cloud(&broken).unwrap().rate > 0.9);
+    let bad = DoubleWallDetector { max_distance_m: 0.01, ..detector };
+    assert!(matches!(bad.of_cloud(&broken), Err(FusionError::BadConfig { field: "max_distance_m", .. })));
 }
 
 #[test]
@@ -94,7 +94,7 @@ fn the_rate_is_the_same_for_any_number_of_threads() {
     let both = cloud(&[square(0.0, 0.0, 1.0), square(0.1, 0.5, 1.0)]);
     let on = |threads: usize| {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
-        pool.install(|| DoubleWalls::default().of_cloud(&both).unwrap())
+        pool.install(|| DoubleWallDetector::default().of_cloud(&both).unwrap())
     };
     assert_eq!(on(1), on(4));
 }

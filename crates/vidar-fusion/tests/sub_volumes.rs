@@ -1,4 +1,4 @@
-//! Sub-volumes move with their chunks, and ghosts go.
+//! Sub-volumes move with their chunks, and double walls disappear.
 
 #![allow(clippy::unwrap_used)] // a helper that fails is a test that fails
 
@@ -6,7 +6,7 @@ mod common;
 
 use common::{Vec3, ball, border_edges, config, floor, fuse, look_at, point, rms, view, views_around};
 use vidar_core::{AlignedView, ChunkId, FrameId, Image, LieGroup, Se3, Sim3, So3, TriangleMesh};
-use vidar_fusion::{DoubleWalls, FusionConfig, FusionError, RevisedView, SubVolumeConfig, SubVolumes};
+use vidar_fusion::{DoubleWallDetector, FusionConfig, FusionError, RevisedView, SubVolumeConfig, SubVolumes};
 
 fn settings(fusion: FusionConfig) -> SubVolumeConfig {
     SubVolumeConfig { fusion, ..SubVolumeConfig::default() }
@@ -14,16 +14,16 @@ fn settings(fusion: FusionConfig) -> SubVolumeConfig {
 
 /// The views dealt out to chunks in turn.
 fn dealt(config: &SubVolumeConfig, views: &[AlignedView], chunks: u32) -> SubVolumes {
-    let mut parts = SubVolumes::new(config).unwrap();
+    let mut volumes = SubVolumes::new(config).unwrap();
     for (i, view) in views.iter().enumerate() {
-        parts.integrate(ChunkId(i as u32 * chunks / views.len() as u32), view).unwrap();
+        volumes.integrate(ChunkId(i as u32 * chunks / views.len() as u32), view).unwrap();
     }
-    parts
+    volumes
 }
 
-fn add(parts: &mut SubVolumes, chunk: ChunkId, views: &[AlignedView]) {
+fn add(volumes: &mut SubVolumes, chunk: ChunkId, views: &[AlignedView]) {
     for view in views {
-        parts.integrate(chunk, view).unwrap();
+        volumes.integrate(chunk, view).unwrap();
     }
 }
 
@@ -48,53 +48,53 @@ fn colored(view: AlignedView) -> AlignedView {
 }
 
 #[test]
-fn as_long_as_nothing_moves_the_sum_is_plain_fusion_to_the_bit() {
-    // 130 views: more than the rows of sums take without handing over.
+fn without_motion_the_merged_volume_equals_plain_fusion_to_the_bit() {
+    // 130 views: more than the rows of sums take without a carry.
     let views: Vec<AlignedView> = views_around(130, 1.3, ball(0.4)).into_iter().map(colored).collect();
     let fusion = FusionConfig { carve_range_m: 2.0, min_observations: 2, voxel_size_m: 0.04, ..config() };
     let plain = fuse(&fusion, &views);
     for chunks in [1, 4, 130] {
-        let parts = dealt(&settings(fusion.clone()), &views, chunks);
-        assert_eq!(parts.chunks().count(), chunks as usize);
-        let merged = parts.merged().unwrap();
+        let volumes = dealt(&settings(fusion.clone()), &views, chunks);
+        assert_eq!(volumes.chunks().count(), chunks as usize);
+        let merged = volumes.merged().unwrap();
         assert_eq!(merged.views(), plain.views());
         assert!(same_bits(&merged.extract_mesh(), &plain.extract_mesh()), "{chunks} chunks");
     }
 }
 
 #[test]
-fn a_motion_below_the_tolerance_changes_nothing_and_does_not_add_up_unseen() {
+fn a_motion_below_the_tolerance_changes_nothing_and_does_not_accumulate() {
     let views = views_around(12, 1.3, ball(0.4));
-    let mut parts = dealt(&settings(config()), &views, 2);
-    let before = parts.extract_mesh().unwrap();
+    let mut volumes = dealt(&settings(config()), &views, 2);
+    let before = volumes.extract_mesh().unwrap();
     let mut stale = Vec::new();
     for step in 1..=4 {
         let shift = Sim3::from_se3(&Se3::from_translation(Vec3::new(0.008 * f64::from(step), 0.0, 0.0)));
         let moves: Vec<_> = views[..6].iter().map(|v| revised(v, &shift)).collect();
-        let revision = parts.revise(ChunkId(0), &moves).unwrap();
-        assert!((revision.moved_m - 0.008 * f64::from(step)).abs() < 1e-9, "told of where it was fused");
+        let revision = volumes.revise(ChunkId(0), &moves).unwrap();
+        assert!((revision.moved_m - 0.008 * f64::from(step)).abs() < 1e-9, "relative to the fused pose");
         stale.push(revision.stale);
-        let unchanged = same_bits(&before, &parts.extract_mesh().unwrap());
+        let unchanged = same_bits(&before, &volumes.extract_mesh().unwrap());
         assert_eq!(unchanged, !revision.stale, "step {step}");
     }
     // The tolerance is a voxel of 2 cm.
     assert_eq!(stale, [false, false, true, true]);
     let back: Vec<_> = views[..6].iter().map(|v| revised(v, &Sim3::IDENTITY)).collect();
-    assert!(!parts.revise(ChunkId(0), &back).unwrap().stale);
-    assert!(same_bits(&before, &parts.extract_mesh().unwrap()));
+    assert!(!volumes.revise(ChunkId(0), &back).unwrap().stale);
+    assert!(same_bits(&before, &volumes.extract_mesh().unwrap()));
 }
 
 #[test]
-fn a_moved_chunk_lies_where_its_similarity_puts_it() {
+fn a_moved_chunk_lies_at_its_similarity() {
     let views: Vec<AlignedView> = views_around(40, 1.3, ball(0.4)).into_iter().map(colored).collect();
     let turn = So3::exp(&Vec3::new(0.2, -0.3, 0.5));
-    let place = Sim3::new(turn, Vec3::new(0.313, -0.127, 0.055), 1.05).unwrap();
-    let mut parts = dealt(&settings(config()), &views, 1);
-    let moves: Vec<_> = views.iter().map(|v| revised(v, &place)).collect();
-    let revision = parts.revise(ChunkId(0), &moves).unwrap();
+    let motion = Sim3::new(turn, Vec3::new(0.313, -0.127, 0.055), 1.05).unwrap();
+    let mut volumes = dealt(&settings(config()), &views, 1);
+    let moves: Vec<_> = views.iter().map(|v| revised(v, &motion)).collect();
+    let revision = volumes.revise(ChunkId(0), &moves).unwrap();
     assert!(revision.stale && revision.bent_m < 1e-6, "{revision:?}");
-    let mesh = parts.extract_mesh().unwrap();
-    let off = |p: &[f32; 3]| (point(*p) - place.translation).norm() - 0.4 * 1.05;
+    let mesh = volumes.extract_mesh().unwrap();
+    let off = |p: &[f32; 3]| (point(*p) - motion.translation).norm() - 0.4 * 1.05;
     let moved = rms(mesh.positions.iter().map(off));
     let fused = rms(fuse(&config(), &views).extract_mesh().positions.iter().map(|p| point(*p).norm() - 0.4));
     // Resampling costs less than a tenth of a voxel (2 cm) on top of what fusion itself is off.
@@ -102,22 +102,22 @@ fn a_moved_chunk_lies_where_its_similarity_puts_it() {
     assert!(border_edges(&mesh).is_empty(), "the ball stays closed");
     let outward = mesh.positions.iter().zip(&mesh.normals);
     assert!(
-        outward.into_iter().all(|(p, n)| (point(*p) - place.translation).normalize().dot(&point(*n)) > 0.9)
+        outward.into_iter().all(|(p, n)| (point(*p) - motion.translation).normalize().dot(&point(*n)) > 0.9)
     );
     assert!(mesh.confidences.iter().all(|c| *c > 0.95) && mesh.colors.len() == mesh.positions.len());
 }
 
-/// Views of the floor z = 0 from a row of places, 1.2 m up, by a camera that believes to be `drift` higher.
+/// Views of the floor z = 0 from a row of positions, 1.2 m up, by a camera whose pose estimate is `drift` too high.
 fn floor_views(first: u32, count: u32, from_x: f64, drift: f64) -> Vec<AlignedView> {
     (0..count)
         .map(|i| {
             let eye = Vec3::new(from_x + 1.2 * f64::from(i) / f64::from(count), 0.0, 1.2);
             let truth = look_at(eye, eye + Vec3::new(0.2, 0.0, -1.2));
             let seen = view(first + i, truth, 1.0, floor(0.0));
-            let believed = Se3::new(truth.rotation, truth.translation + Vec3::new(0.0, 0.0, drift));
+            let drifted = Se3::new(truth.rotation, truth.translation + Vec3::new(0.0, 0.0, drift));
             common::from_depth(
                 first + i,
-                believed,
+                drifted,
                 seen.depth().image().clone(),
                 seen.confidence().image().clone(),
             )
@@ -138,65 +138,65 @@ fn undrifted(view: &AlignedView, drift: f64) -> RevisedView {
 #[test]
 fn a_loop_correction_removes_the_double_wall() {
     let drift = 0.12;
-    // The second visit sees more often: what few views look through would be carved away.
+    // The second visit has more views: what a few views observe as free would be carved away.
     let (first, second) = (floor_views(0, 8, 0.0, 0.0), floor_views(100, 24, 0.1, drift));
-    let mut parts = SubVolumes::new(&settings(config())).unwrap();
-    add(&mut parts, ChunkId(0), &first);
-    add(&mut parts, ChunkId(7), &second);
-    let walls = DoubleWalls::default();
-    let rate = |parts: &SubVolumes| walls.of_mesh(&parts.extract_mesh().unwrap()).unwrap().rate;
-    let before = rate(&parts);
+    let mut volumes = SubVolumes::new(&settings(config())).unwrap();
+    add(&mut volumes, ChunkId(0), &first);
+    add(&mut volumes, ChunkId(7), &second);
+    let detector = DoubleWallDetector::default();
+    let rate = |volumes: &SubVolumes| detector.of_mesh(&volumes.extract_mesh().unwrap()).unwrap().rate;
+    let before = rate(&volumes);
     assert!(before > 0.45, "the second visit lies above the first: {before}");
 
     let moves: Vec<_> = second.iter().map(|v| undrifted(v, drift)).collect();
-    let revision = parts.revise(ChunkId(7), &moves).unwrap();
+    let revision = volumes.revise(ChunkId(7), &moves).unwrap();
     assert!((revision.moved_m - drift).abs() < 1e-9 && revision.bent_m < 1e-9 && revision.stale);
-    assert_eq!(parts.stale().iter().map(|(id, _)| *id).collect::<Vec<_>>(), [ChunkId(7)]);
-    let moved = rate(&parts);
+    assert_eq!(volumes.stale().iter().map(|(id, _)| *id).collect::<Vec<_>>(), [ChunkId(7)]);
+    let moved = rate(&volumes);
     assert!(moved < 0.01, "moved: {moved}");
-    let height = rms(parts.extract_mesh().unwrap().positions.iter().map(|p| f64::from(p[2])));
+    let height = rms(volumes.extract_mesh().unwrap().positions.iter().map(|p| f64::from(p[2])));
     assert!(height < 0.004, "{height}");
 
-    parts.rebuild(ChunkId(7), floor_views(100, 24, 0.1, 0.0)).unwrap();
-    assert!(parts.stale().is_empty() && rate(&parts) < 0.01);
-    assert_eq!(parts.report().rebuilt, 1);
-    // Fused again where it is, the map is as if it never had been elsewhere.
+    volumes.rebuild(ChunkId(7), floor_views(100, 24, 0.1, 0.0)).unwrap();
+    assert!(volumes.stale().is_empty() && rate(&volumes) < 0.01);
+    assert_eq!(volumes.report().rebuilt, 1);
+    // Fused again where it is, the map is as if it never had been elsewin_memory.
     let all: Vec<AlignedView> = first.into_iter().chain(floor_views(100, 24, 0.1, 0.0)).collect();
-    assert!(same_bits(&parts.extract_mesh().unwrap(), &fuse(&config(), &all).extract_mesh()));
+    assert!(same_bits(&volumes.extract_mesh().unwrap(), &fuse(&config(), &all).extract_mesh()));
 }
 
 #[test]
-fn a_bent_chunk_says_so_and_is_straight_after_it_was_fused_again() {
-    // The chunk's later views believe to be higher and higher: no rigid motion makes that good.
+fn a_non_rigid_motion_is_reported_and_removed_by_fusing_again() {
+    // The pose estimates of the chunk's later views are higher and higher: no similarity corrects that.
     let tilt = |i: usize| 0.03 * i as f64;
     let straight = floor_views(0, 8, 0.0, 0.0);
     let bent: Vec<AlignedView> = (0..8).map(|i| floor_views(0, 8, 0.0, tilt(i)).swap_remove(i)).collect();
-    let mut parts = dealt(&settings(config()), &bent, 1);
+    let mut volumes = dealt(&settings(config()), &bent, 1);
     let moves: Vec<_> = bent.iter().enumerate().map(|(i, v)| undrifted(v, tilt(i))).collect();
-    let revision = parts.revise(ChunkId(0), &moves).unwrap();
+    let revision = volumes.revise(ChunkId(0), &moves).unwrap();
     assert!(revision.moved_m > 0.2 && revision.bent_m > 0.005, "{revision:?}");
-    assert!(revision.bent_m < 0.7 * revision.moved_m, "the similarity takes its part: {revision:?}");
-    parts.rebuild(ChunkId(0), straight.clone()).unwrap();
-    assert!(same_bits(&parts.extract_mesh().unwrap(), &fuse(&config(), &straight).extract_mesh()));
+    assert!(revision.bent_m < 0.7 * revision.moved_m, "the similarity explains a part: {revision:?}");
+    volumes.rebuild(ChunkId(0), straight.clone()).unwrap();
+    assert!(same_bits(&volumes.extract_mesh().unwrap(), &fuse(&config(), &straight).extract_mesh()));
 }
 
 #[test]
-fn views_that_come_after_a_move_lie_where_they_say() {
+fn views_added_after_a_move_lie_at_their_poses() {
     let views = floor_views(0, 8, 0.0, 0.12);
-    let mut parts = SubVolumes::new(&settings(config())).unwrap();
-    add(&mut parts, ChunkId(0), &views[..5]);
+    let mut volumes = SubVolumes::new(&settings(config())).unwrap();
+    add(&mut volumes, ChunkId(0), &views[..5]);
     let moves: Vec<_> = views[..5].iter().map(|v| undrifted(v, 0.12)).collect();
-    parts.revise(ChunkId(0), &moves).unwrap();
-    // These come at the corrected place.
-    add(&mut parts, ChunkId(0), &floor_views(0, 8, 0.0, 0.0)[5..]);
-    let mesh = parts.extract_mesh().unwrap();
+    volumes.revise(ChunkId(0), &moves).unwrap();
+    // These have corrected poses.
+    add(&mut volumes, ChunkId(0), &floor_views(0, 8, 0.0, 0.0)[5..]);
+    let mesh = volumes.extract_mesh().unwrap();
     assert!(rms(mesh.positions.iter().map(|p| f64::from(p[2]))) < 0.004);
-    assert_eq!(parts.merged().unwrap().views(), 8);
+    assert_eq!(volumes.merged().unwrap().views(), 8);
 }
 
 #[test]
-fn a_moved_chunk_carves_where_it_looks_now() {
-    // A floater above the floor, seen by one chunk; the other, once moved, looks through its place.
+fn a_moved_chunk_carves_at_its_present_pose() {
+    // A floater above the floor, observed by one chunk; the other, once moved, observes free space there.
     let fusion = FusionConfig { carve_range_m: 3.0, ..config() };
     let eye = Vec3::new(0.3, 0.0, 1.6);
     let pose = look_at(eye, Vec3::new(0.3, 0.001, 0.0));
@@ -212,68 +212,68 @@ fn a_moved_chunk_carves_where_it_looks_now() {
             view(i, look_at(eye, eye + Vec3::new(0.0, 0.001, -1.9)), 1.0, floor(0.0))
         })
         .collect();
-    let mut parts = SubVolumes::new(&settings(fusion)).unwrap();
-    parts.integrate(ChunkId(0), &floater).unwrap();
-    add(&mut parts, ChunkId(1), &clear);
-    let floats = |parts: &SubVolumes| {
-        parts.extract_mesh().unwrap().positions.iter().filter(|p| p[2] > 0.5 && p[2] < 0.9).count()
+    let mut volumes = SubVolumes::new(&settings(fusion)).unwrap();
+    volumes.integrate(ChunkId(0), &floater).unwrap();
+    add(&mut volumes, ChunkId(1), &clear);
+    let floats = |volumes: &SubVolumes| {
+        volumes.extract_mesh().unwrap().positions.iter().filter(|p| p[2] > 0.5 && p[2] < 0.9).count()
     };
-    assert!(floats(&parts) > 50);
+    assert!(floats(&volumes) > 50);
     // A quarter turn and a shift that is no whole number of blocks.
     let turn = So3::from_axis_angle(&Vec3::z(), 0.7);
     let middle = Vec3::new(0.3, 0.0, 0.0);
     let to = Sim3::new(turn, middle - turn * (middle + far), 1.0).unwrap();
     let moves: Vec<_> = clear.iter().map(|v| revised(v, &to)).collect();
-    assert!(parts.revise(ChunkId(1), &moves).unwrap().stale);
-    assert_eq!(floats(&parts), 0, "what the moved chunk looks through is gone");
+    assert!(volumes.revise(ChunkId(1), &moves).unwrap().stale);
+    assert_eq!(floats(&volumes), 0, "free space of the moved chunk is carved");
 }
 
 #[test]
 fn each_keyframe_is_fused_once_and_only_by_its_owner() {
     let views = views_around(4, 1.3, ball(0.4));
-    let mut parts = SubVolumes::new(&settings(config())).unwrap();
-    parts.integrate(ChunkId(1), &views[0]).unwrap();
-    parts.integrate(ChunkId(1), &views[1]).unwrap();
-    let refused =
+    let mut volumes = SubVolumes::new(&settings(config())).unwrap();
+    volumes.integrate(ChunkId(1), &views[0]).unwrap();
+    volumes.integrate(ChunkId(1), &views[1]).unwrap();
+    let rejected =
         |chunk| FusionError::FusedAlready { frame: FrameId(0), owner: ChunkId(1), chunk: ChunkId(chunk) };
     for chunk in [1, 2] {
-        assert_eq!(parts.integrate(ChunkId(chunk), &views[0]).unwrap_err(), refused(chunk));
+        assert_eq!(volumes.integrate(ChunkId(chunk), &views[0]).unwrap_err(), rejected(chunk));
     }
-    assert_eq!((parts.owner(FrameId(0)), parts.owner(FrameId(3))), (Some(ChunkId(1)), None));
-    parts.integrate(ChunkId(2), &views[2]).unwrap();
+    assert_eq!((volumes.owner(FrameId(0)), volumes.owner(FrameId(3))), (Some(ChunkId(1)), None));
+    volumes.integrate(ChunkId(2), &views[2]).unwrap();
     let stay = |i: usize| revised(&views[i], &Sim3::IDENTITY);
-    assert_eq!(parts.revise(ChunkId(9), &[]).unwrap_err(), FusionError::NoSuchChunk { chunk: ChunkId(9) });
-    let foreign = parts.revise(ChunkId(1), &[stay(2)]).unwrap_err();
+    assert_eq!(volumes.revise(ChunkId(9), &[]).unwrap_err(), FusionError::NoSuchChunk { chunk: ChunkId(9) });
+    let foreign = volumes.revise(ChunkId(1), &[stay(2)]).unwrap_err();
     assert_eq!(foreign, FusionError::NotOfChunk { frame: FrameId(2), chunk: ChunkId(1) });
     for factor in [0.0, -1.0, f64::NAN, f64::INFINITY] {
-        let bad = parts.revise(ChunkId(1), &[RevisedView { depth_factor: factor, ..stay(0) }]).unwrap_err();
+        let bad = volumes.revise(ChunkId(1), &[RevisedView { depth_factor: factor, ..stay(0) }]).unwrap_err();
         assert_eq!(bad, FusionError::BadMove { frame: FrameId(0), chunk: ChunkId(1) });
     }
-    let before = parts.extract_mesh().unwrap();
-    assert_eq!(parts.rebuild(ChunkId(2), vec![views[0].clone()]).unwrap_err(), refused(2));
+    let before = volumes.extract_mesh().unwrap();
+    assert_eq!(volumes.rebuild(ChunkId(2), vec![views[0].clone()]).unwrap_err(), rejected(2));
     let twice = vec![views[2].clone(), views[2].clone()];
-    assert!(matches!(parts.rebuild(ChunkId(2), twice), Err(FusionError::FusedAlready { .. })));
-    assert!(parts.rebuild(ChunkId(9), Vec::new()).is_err());
-    assert!(same_bits(&before, &parts.extract_mesh().unwrap()), "a refused rebuild leaves all as it was");
+    assert!(matches!(volumes.rebuild(ChunkId(2), twice), Err(FusionError::FusedAlready { .. })));
+    assert!(volumes.rebuild(ChunkId(9), Vec::new()).is_err());
+    assert!(same_bits(&before, &volumes.extract_mesh().unwrap()), "a failed rebuild changes nothing");
     // A chunk may be fused again from other views; those it had before are free again.
-    parts.rebuild(ChunkId(2), vec![views[3].clone()]).unwrap();
-    assert_eq!((parts.owner(FrameId(2)), parts.owner(FrameId(3))), (None, Some(ChunkId(2))));
-    assert_eq!(parts.report().views, 3);
+    volumes.rebuild(ChunkId(2), vec![views[3].clone()]).unwrap();
+    assert_eq!((volumes.owner(FrameId(2)), volumes.owner(FrameId(3))), (None, Some(ChunkId(2))));
+    assert_eq!(volumes.report().views, 3);
 }
 
 #[test]
 fn all_chunks_together_hold_to_one_budget() {
     let budget = 3 << 20;
     let fusion = FusionConfig { memory_budget_bytes: budget, voxel_size_m: 0.01, ..config() };
-    let mut parts = SubVolumes::new(&settings(fusion)).unwrap();
+    let mut volumes = SubVolumes::new(&settings(fusion)).unwrap();
     for (i, view) in views_around(30, 1.3, ball(0.4)).iter().enumerate() {
-        parts.integrate(ChunkId(i as u32 / 3), view).unwrap();
-        assert!(parts.memory_bytes() <= budget);
+        volumes.integrate(ChunkId(i as u32 / 3), view).unwrap();
+        assert!(volumes.memory_bytes() <= budget);
     }
-    let report = parts.report();
+    let report = volumes.report();
     assert!(report.dropped_by_budget > 0 && report.peak_memory_bytes <= budget, "{report:?}");
-    assert!(parts.warnings().iter().any(|w| w.kind == "fusion-memory-budget"));
-    assert!(parts.merged().unwrap().memory_bytes() <= budget);
+    assert!(volumes.warnings().iter().any(|w| w.kind == "fusion-memory-budget"));
+    assert!(volumes.merged().unwrap().memory_bytes() <= budget);
     let bad = SubVolumeConfig { move_tolerance_voxels: f64::NAN, ..SubVolumeConfig::default() };
     assert!(matches!(
         SubVolumes::new(&bad),
@@ -288,10 +288,10 @@ fn the_map_is_the_same_for_any_number_of_threads_and_order_of_chunks() {
     let mesh = |threads: usize, order: [u32; 3]| {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
         pool.install(|| {
-            let mut parts = SubVolumes::new(&settings(fusion.clone())).unwrap();
+            let mut volumes = SubVolumes::new(&settings(fusion.clone())).unwrap();
             for chunk in order {
                 for view in &views[8 * chunk as usize..8 * chunk as usize + 8] {
-                    parts.integrate(ChunkId(chunk), view).unwrap();
+                    volumes.integrate(ChunkId(chunk), view).unwrap();
                 }
             }
             for chunk in order {
@@ -301,9 +301,9 @@ fn the_map_is_the_same_for_any_number_of_threads_and_order_of_chunks() {
                     .iter()
                     .map(|v| revised(v, &by))
                     .collect();
-                parts.revise(ChunkId(chunk), &moves).unwrap();
+                volumes.revise(ChunkId(chunk), &moves).unwrap();
             }
-            parts.extract_mesh().unwrap()
+            volumes.extract_mesh().unwrap()
         })
     };
     let one = mesh(1, [0, 1, 2]);
@@ -313,51 +313,46 @@ fn the_map_is_the_same_for_any_number_of_threads_and_order_of_chunks() {
 }
 
 #[test]
-fn chunks_that_wait_elsewhere_move_and_merge_as_if_they_were_here() {
+fn offloaded_chunks_move_and_merge_like_those_in_memory() {
     let views: Vec<AlignedView> = views_around(130, 1.3, ball(0.4)).into_iter().map(colored).collect();
     let fusion = FusionConfig { carve_range_m: 2.0, voxel_size_m: 0.04, ..config() };
-    let mut here = dealt(&settings(fusion.clone()), &views, 5);
-    let mut away = here.clone();
-    let mut shelf = std::collections::BTreeMap::new();
-    let full = away.memory_bytes();
+    let mut in_memory = dealt(&settings(fusion.clone()), &views, 5);
+    let mut offloaded = in_memory.clone();
+    let mut stored = std::collections::BTreeMap::new();
+    let full = offloaded.memory_bytes();
     for chunk in 0..4 {
-        shelf.insert(ChunkId(chunk), away.set_aside(ChunkId(chunk)).unwrap());
+        stored.insert(ChunkId(chunk), offloaded.offload(ChunkId(chunk)).unwrap());
     }
-    let bytes: usize = shelf.values().map(Vec::len).sum();
-    assert!(away.memory_bytes() < full / 3 && (bytes as u64) < full / 2, "{bytes} of {full}");
-    assert_eq!(away.aside().collect::<Vec<_>>(), (0..4).map(ChunkId).collect::<Vec<_>>());
+    let bytes: usize = stored.values().map(Vec::len).sum();
+    assert!(offloaded.memory_bytes() < full / 3 && (bytes as u64) < full / 2, "{bytes} of {full}");
+    assert_eq!(offloaded.offloaded().collect::<Vec<_>>(), (0..4).map(ChunkId).collect::<Vec<_>>());
     let by = Sim3::new(So3::exp(&Vec3::new(0.0, 0.1, 0.2)), Vec3::new(0.1, 0.0, 0.2), 0.98).unwrap();
-    for parts in [&mut here, &mut away] {
+    for volumes in [&mut in_memory, &mut offloaded] {
         let moves: Vec<_> = views[26..52].iter().map(|v| revised(v, &by)).collect();
-        assert!(parts.revise(ChunkId(1), &moves).unwrap().stale);
+        assert!(volumes.revise(ChunkId(1), &moves).unwrap().stale);
     }
-    let wanted = here.extract_mesh().unwrap();
-    let load = |chunk: ChunkId| Ok::<_, FusionError>(shelf[&chunk].clone());
-    assert!(same_bits(&wanted, &away.merged_with(load).unwrap().extract_mesh()));
-    assert_eq!(away.merged().unwrap_err(), FusionError::SetAside { chunk: ChunkId(0) });
-    assert_eq!(away.set_aside(ChunkId(0)).unwrap_err(), FusionError::SetAside { chunk: ChunkId(0) });
+    let expected = in_memory.extract_mesh().unwrap();
+    let load = |chunk: ChunkId| Ok::<_, FusionError>(stored[&chunk].clone());
+    assert!(same_bits(&expected, &offloaded.merged_with(load).unwrap().extract_mesh()));
+    assert_eq!(offloaded.merged().unwrap_err(), FusionError::Offloaded { chunk: ChunkId(0) });
+    assert_eq!(offloaded.offload(ChunkId(0)).unwrap_err(), FusionError::Offloaded { chunk: ChunkId(0) });
     let late = &views_around(131, 1.3, ball(0.4))[130];
-    assert!(matches!(away.integrate(ChunkId(0), late), Err(FusionError::SetAside { .. })));
-    for (chunk, bytes) in &shelf {
-        away.bring_back(*chunk, bytes).unwrap();
-    }
-    assert!(same_bits(&wanted, &away.extract_mesh().unwrap()));
-    assert_eq!(away.memory_bytes(), here.memory_bytes());
-    assert_eq!(away.set_aside(ChunkId(2)).unwrap(), shelf[&ChunkId(2)], "equal volumes, equal bytes");
+    assert!(matches!(offloaded.integrate(ChunkId(0), late), Err(FusionError::Offloaded { .. })));
+    assert_eq!(in_memory.offload(ChunkId(2)).unwrap(), stored[&ChunkId(2)], "equal volumes, equal bytes");
 }
 
 #[test]
-fn broken_bytes_are_refused_and_never_panic() {
+fn corrupt_bytes_are_an_error_and_never_panic() {
     let views = views_around(6, 1.3, ball(0.4));
     let fusion = FusionConfig { carve_range_m: 1.0, voxel_size_m: 0.05, ..config() };
-    let mut parts = dealt(&settings(fusion), &views, 1);
-    let good = parts.set_aside(ChunkId(0)).unwrap();
+    let mut volumes = dealt(&settings(fusion), &views, 1);
+    let good = volumes.offload(ChunkId(0)).unwrap();
     let mut state = 1_u64;
     let mut random = |below: usize| {
         state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
         (state >> 33) as usize % below
     };
-    let mut refused = 0;
+    let mut rejected = 0;
     for round in 0..400 {
         let mut bytes = good.clone();
         if round % 2 == 0 {
@@ -366,17 +361,17 @@ fn broken_bytes_are_refused_and_never_panic() {
             bytes[random(good.len())] ^= 1 << random(8);
         }
         // A flipped bit of a sum may still be a sum; whatever is read can be made a mesh.
-        match parts.merged_with(|_| Ok::<_, FusionError>(bytes.clone())) {
+        match volumes.merged_with(|_| Ok::<_, FusionError>(bytes.clone())) {
             Ok(volume) => drop(volume.extract_mesh()),
-            Err(FusionError::BadSnapshot { .. }) => refused += 1,
+            Err(FusionError::BadSnapshot { .. }) => rejected += 1,
             Err(other) => panic!("{other}"),
         }
     }
-    assert!(refused >= 200, "{refused}");
-    assert!(parts.bring_back(ChunkId(0), b"VSUB2").is_err());
+    assert!(rejected >= 200, "{rejected}");
+    let read = |bytes: &[u8]| volumes.merged_with(|_| Ok::<_, FusionError>(bytes.to_vec()));
+    assert!(read(b"VSUB2").is_err());
     let mut endless = b"VSUB1".to_vec();
     endless.extend([0xFF; 20]);
-    assert!(parts.bring_back(ChunkId(0), &endless).is_err());
-    parts.bring_back(ChunkId(0), &good).unwrap();
-    assert!(parts.extract_mesh().unwrap().positions.len() > 100);
+    assert!(read(&endless).is_err());
+    assert!(read(&good).unwrap().extract_mesh().positions.len() > 100);
 }

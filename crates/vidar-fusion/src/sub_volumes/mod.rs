@@ -1,24 +1,24 @@
-//! One volume per chunk, which moves when the graph moves its chunk (Voxgraph: Reijgwart et al., RA-L 2020).
+//! Sub-volumes: one volume per chunk, moved when the pose graph moves its chunk (Voxgraph: Reijgwart et al., RA-L 2020).
 //!
-//! Views are fused where the graph puts them when they come. When a loop closes, the graph moves the keyframes of
-//! earlier chunks; their sub-volumes are then placed anew, by the similarity that fits the motion of their surfaces
-//! best, and a chunk that moved by more than a voxel is [stale](Revision::stale): it is resampled where it lies now
-//! until its views are fused again ([`SubVolumes::rebuild`]), which is exact also when the chunk bent. Chunks that
-//! moved less stay as they are, to the bit.
+//! Views are fused at the poses that the graph estimates at that time. When a loop closes, the graph moves the keyframes
+//! of earlier chunks; their sub-volumes are then moved by the similarity that best fits the motion of their surfaces. A
+//! chunk that moved by more than a voxel is [stale](Revision::stale): it is resampled at its present pose until its
+//! views are fused again ([`SubVolumes::rebuild`]), which is exact also when the motion is not a similarity. Chunks that
+//! moved less are unchanged, to the bit.
 //!
-//! A chunk that is done can be [set aside](SubVolumes::set_aside) as bytes, for instance in a file, and still moves; so
-//! memory stays flat however long the sequence is.
+//! A finished chunk can be [offloaded](SubVolumes::offload) as bytes, for instance to a file, and can still be moved, so
+//! memory does not grow with the length of the sequence.
 //!
 //! [`SubVolumes::merged`] adds all sub-volumes to one. Sums are integers, so as long as nothing moved the result is
 //! the volume that fusing all views at once would have made, to the bit, and with any motion it does not depend on
 //! the order in which chunks came or on the number of threads.
 
-mod placement;
+mod motion;
 mod resample;
 mod snapshot;
 
 use crate::{FusionConfig, FusionError, IntegrationStats, TsdfVolume};
-use placement::Probe;
+use motion::SurfaceProbe;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use vidar_core::{AlignedView, ChunkId, FrameId, LieGroup, Se3, Sim3, TriangleMesh, Warning};
@@ -30,7 +30,7 @@ pub struct SubVolumeConfig {
     /// Settings of each sub-volume and of the merged one. `memory_budget_bytes` is for all sub-volumes together; the
     /// merged volume may hold as much again while it exists.
     pub fusion: FusionConfig,
-    /// Motion of a chunk's surface, voxels, 0.01 to 100, from which on the chunk is moved and due to be fused again.
+    /// Motion of a chunk's surface, voxels, 0.01 to 100, from which on the chunk is moved and due for fusing again.
     pub move_tolerance_voxels: f64,
 }
 
@@ -57,23 +57,23 @@ impl SubVolumeConfig {
     }
 }
 
-/// Where the graph puts a keyframe now.
+/// A keyframe's present pose in the graph.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct RevisedView {
     /// Which keyframe.
     pub frame_id: FrameId,
     /// Its pose now.
     pub world_from_camera: Se3,
-    /// Its depth now per depth as it was fused (e^dσ of its chunk).
+    /// Its present depth over its depth when fused (e^dσ of its chunk).
     pub depth_factor: f64,
 }
 
-/// What a graph update did to a chunk.
+/// Effect of a graph update on a chunk.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Revision {
-    /// How far the farthest-moving piece of its surface is from where it was fused, m.
+    /// Largest motion of a point of its surface since it was fused, m.
     pub moved_m: f64,
-    /// How far a piece of its surface is at most from where it is placed now, m: what no rigid motion can follow.
+    /// Largest residual of a point of its surface after the fitted similarity, m: the non-rigid sub_volume of the motion.
     pub bent_m: f64,
     /// Whether it moved by more than the tolerance and its views should be fused again.
     pub stale: bool,
@@ -86,7 +86,7 @@ pub struct SubVolumeReport {
     pub chunks: u64,
     /// Views fused.
     pub views: u64,
-    /// Chunks that lie elsewhere than where they were fused.
+    /// Stale chunks.
     pub stale: u64,
     /// Chunks that were fused again so far.
     pub rebuilt: u64,
@@ -94,7 +94,7 @@ pub struct SubVolumeReport {
     pub memory_bytes: u64,
     /// Most bytes held at once.
     pub peak_memory_bytes: u64,
-    /// Times that a block was refused for lack of memory.
+    /// Times that a block was rejected for lack of memory.
     pub dropped_by_budget: u64,
 }
 
@@ -112,17 +112,17 @@ pub struct SubVolumes {
 #[derive(Clone, Debug)]
 struct SubVolume {
     volume: TsdfVolume,
-    /// Where the chunk lies now, told of where it was fused.
+    /// Motion of the chunk since it was fused.
     now_from_fused: Sim3,
-    /// Points of its surface by which its motion is judged.
-    probes: BTreeMap<FrameId, Probe>,
+    /// Points of its surface from which its motion is estimated.
+    probes: BTreeMap<FrameId, SurfaceProbe>,
     revision: Revision,
-    /// Whether `volume` is empty here because its bytes are elsewhere.
-    is_aside: bool,
+    /// Whether `volume` is empty because its bytes were offloaded.
+    is_offloaded: bool,
 }
 
 impl SubVolumes {
-    /// No chunks yet; refuses a configuration that is out of range.
+    /// Without chunks; fails for a configuration that is out of range.
     pub fn new(config: &SubVolumeConfig) -> Result<Self, FusionError> {
         config.validate()?;
         Ok(Self {
@@ -152,10 +152,10 @@ impl SubVolumes {
 
     /// Fuses a keyframe into its chunk. Each keyframe is fused once, by the chunk that owns it.
     ///
-    /// A chunk that has been moved takes views where it was fused: they are moved with it.
+    /// Views of a chunk that was moved are transformed to the frame in which it was fused.
     ///
     /// # Errors
-    /// A keyframe that was fused already, and what [`TsdfVolume::integrate`] refuses; nothing changes then.
+    /// A keyframe that was fused already, and the errors of [`TsdfVolume::integrate`]; nothing changes then.
     pub fn integrate(&mut self, chunk: ChunkId, view: &AlignedView) -> Result<IntegrationStats, FusionError> {
         let frame = view.frame_id();
         if let Some(owner) = self.owner(frame) {
@@ -164,15 +164,15 @@ impl SubVolumes {
         let others = self.memory_bytes() - self.chunks.get(&chunk).map_or(0, |c| c.volume.memory_bytes());
         let budget = self.config.fusion.memory_budget_bytes.saturating_sub(others);
         let mut fresh = None;
-        let part = match self.chunks.get_mut(&chunk) {
-            Some(part) => part,
+        let sub_volume = match self.chunks.get_mut(&chunk) {
+            Some(sub_volume) => sub_volume,
             None => fresh.insert(SubVolume::new(&self.config.fusion)?),
         };
-        if part.is_aside {
-            return Err(FusionError::SetAside { chunk });
+        if sub_volume.is_offloaded {
+            return Err(FusionError::Offloaded { chunk });
         }
-        part.volume.set_budget(budget);
-        let stats = part.integrate(view)?;
+        sub_volume.volume.set_budget(budget);
+        let stats = sub_volume.integrate(view)?;
         if let Some(fresh) = fresh {
             self.chunks.insert(chunk, fresh);
         }
@@ -182,16 +182,16 @@ impl SubVolumes {
         Ok(stats)
     }
 
-    /// Places a chunk where the graph puts its keyframes now; keyframes that are not named move with the others.
+    /// Moves a chunk to the present poses of its keyframes; keyframes that are not named move with the others.
     ///
     /// # Errors
     /// A chunk without views, a keyframe that is not the chunk's, a pose that is not finite; nothing changes then.
     pub fn revise(&mut self, chunk: ChunkId, revised: &[RevisedView]) -> Result<Revision, FusionError> {
-        let part = self.chunks.get_mut(&chunk).ok_or(FusionError::NoSuchChunk { chunk })?;
+        let sub_volume = self.chunks.get_mut(&chunk).ok_or(FusionError::NoSuchChunk { chunk })?;
         let mut pairs = Vec::with_capacity(revised.len());
         for view in revised {
             let frame = view.frame_id;
-            let probe = part.probes.get(&frame).ok_or(FusionError::NotOfChunk { frame, chunk })?;
+            let probe = sub_volume.probes.get(&frame).ok_or(FusionError::NotOfChunk { frame, chunk })?;
             let factor = view.depth_factor;
             if !(view.world_from_camera.is_finite() && factor.is_finite() && factor > 0.0) {
                 return Err(FusionError::BadMove { frame, chunk });
@@ -200,24 +200,28 @@ impl SubVolumes {
         }
         let voxel_m = self.config.fusion.voxel_size_m;
         let tolerance_m = self.config.move_tolerance_voxels * voxel_m;
-        let (now_from_fused, revision) = placement::fit(&pairs, tolerance_m);
-        part.now_from_fused = now_from_fused;
-        part.revision = revision;
+        let (now_from_fused, revision) = motion::fit(&pairs, tolerance_m);
+        sub_volume.now_from_fused = now_from_fused;
+        sub_volume.revision = revision;
         Ok(revision)
     }
 
-    /// The chunks that lie elsewhere than where they were fused, farthest first.
+    /// The stale chunks, largest motion first.
     pub fn stale(&self) -> Vec<(ChunkId, Revision)> {
-        let mut stale: Vec<_> =
-            self.chunks.iter().map(|(id, part)| (*id, part.revision)).filter(|(_, r)| r.stale).collect();
+        let mut stale: Vec<_> = self
+            .chunks
+            .iter()
+            .map(|(id, sub_volume)| (*id, sub_volume.revision))
+            .filter(|(_, r)| r.stale)
+            .collect();
         stale.sort_by(|a, b| b.1.moved_m.total_cmp(&a.1.moved_m).then(a.0.cmp(&b.0)));
         stale
     }
 
-    /// Fuses a chunk again from its views where they are now, in the place of what it held.
+    /// Fuses a chunk again from its views at their present poses, and replaces its volume.
     ///
     /// # Errors
-    /// A chunk without views, a keyframe that another chunk owns, and what [`TsdfVolume::integrate`] refuses; the
+    /// A chunk without views, a keyframe that another chunk owns, and the errors of [`TsdfVolume::integrate`]; the
     /// chunk is then as it was.
     pub fn rebuild(
         &mut self,
@@ -226,19 +230,19 @@ impl SubVolumes {
     ) -> Result<IntegrationStats, FusionError> {
         let old = self.chunks.get(&chunk).ok_or(FusionError::NoSuchChunk { chunk })?;
         let others = self.memory_bytes() - old.volume.memory_bytes();
-        let mut part = SubVolume::new(&self.config.fusion)?;
-        part.volume.set_budget(self.config.fusion.memory_budget_bytes.saturating_sub(others));
+        let mut sub_volume = SubVolume::new(&self.config.fusion)?;
+        sub_volume.volume.set_budget(self.config.fusion.memory_budget_bytes.saturating_sub(others));
         let mut total = IntegrationStats::default();
         for view in views {
             let frame = view.frame_id();
             if let Some(owner) = self
                 .owner(frame)
                 .filter(|owner| *owner != chunk)
-                .or(part.probes.contains_key(&frame).then_some(chunk))
+                .or(sub_volume.probes.contains_key(&frame).then_some(chunk))
             {
                 return Err(FusionError::FusedAlready { frame, owner, chunk });
             }
-            let stats = part.integrate(&view)?;
+            let stats = sub_volume.integrate(&view)?;
             total.pixels_used += stats.pixels_used;
             total.blocks_touched += stats.blocks_touched;
             total.blocks_total = stats.blocks_total;
@@ -246,90 +250,73 @@ impl SubVolumes {
             total.blocks_carved += stats.blocks_carved;
         }
         // Both exist for a moment.
-        self.peak_bytes = self.peak_bytes.max(self.memory_bytes() + part.volume.memory_bytes());
+        self.peak_bytes = self.peak_bytes.max(self.memory_bytes() + sub_volume.volume.memory_bytes());
         self.dropped += total.dropped_by_budget;
         self.owners.retain(|_, owner| *owner != chunk);
-        self.owners.extend(part.probes.keys().map(|frame| (*frame, chunk)));
-        self.chunks.insert(chunk, part);
+        self.owners.extend(sub_volume.probes.keys().map(|frame| (*frame, chunk)));
+        self.chunks.insert(chunk, sub_volume);
         self.rebuilt += 1;
         Ok(total)
     }
 
-    /// Takes a chunk's sums out of memory: its bytes, to be given back by [`Self::bring_back`] or to
-    /// [`Self::merged_with`]. Its place is still revised meanwhile, and [`Self::rebuild`] does not need them.
+    /// Removes a chunk's volume from memory and returns its bytes, which [`Self::merged_with`] reads. The chunk can still
+    /// be revised, and [`Self::rebuild`] does not need the bytes.
     ///
     /// # Errors
-    /// A chunk without views, or one that was set aside already.
-    pub fn set_aside(&mut self, chunk: ChunkId) -> Result<Vec<u8>, FusionError> {
+    /// A chunk without views, or one that is offloaded already.
+    pub fn offload(&mut self, chunk: ChunkId) -> Result<Vec<u8>, FusionError> {
         let empty = TsdfVolume::new(&self.config.fusion)?;
-        let part = self.chunks.get_mut(&chunk).ok_or(FusionError::NoSuchChunk { chunk })?;
-        if part.is_aside {
-            return Err(FusionError::SetAside { chunk });
+        let sub_volume = self.chunks.get_mut(&chunk).ok_or(FusionError::NoSuchChunk { chunk })?;
+        if sub_volume.is_offloaded {
+            return Err(FusionError::Offloaded { chunk });
         }
-        let bytes = snapshot::write(&part.volume);
-        part.volume = empty;
-        part.is_aside = true;
+        let bytes = snapshot::write(&sub_volume.volume);
+        sub_volume.volume = empty;
+        sub_volume.is_offloaded = true;
         Ok(bytes)
     }
 
-    /// Gives back what [`Self::set_aside`] returned; a chunk that is in memory stays as it is.
-    ///
-    /// # Errors
-    /// A chunk without views, bytes that are none of a volume, or too large for what is left of the budget.
-    pub fn bring_back(&mut self, chunk: ChunkId, bytes: &[u8]) -> Result<(), FusionError> {
-        let budget = self.config.fusion.memory_budget_bytes.saturating_sub(self.memory_bytes());
-        let part = self.chunks.get_mut(&chunk).ok_or(FusionError::NoSuchChunk { chunk })?;
-        if part.is_aside {
-            let budget = budget.max(FusionConfig::MIN_MEMORY_BUDGET_BYTES);
-            let config = FusionConfig { memory_budget_bytes: budget, ..self.config.fusion.clone() };
-            part.volume = snapshot::read(bytes, &config)?;
-            part.is_aside = false;
-        }
-        self.peak_bytes = self.peak_bytes.max(self.memory_bytes());
-        Ok(())
+    /// The offloaded chunks.
+    pub fn offloaded(&self) -> impl Iterator<Item = ChunkId> + '_ {
+        self.chunks.iter().filter(|(_, sub_volume)| sub_volume.is_offloaded).map(|(id, _)| *id)
     }
 
-    /// Chunks whose sums are elsewhere.
-    pub fn aside(&self) -> impl Iterator<Item = ChunkId> + '_ {
-        self.chunks.iter().filter(|(_, part)| part.is_aside).map(|(id, _)| *id)
-    }
-
-    /// All sub-volumes where they lie now, as one volume.
+    /// All sub-volumes at their present poses, as one volume.
     ///
     /// Chunks that did not move are added sum by sum, the others are resampled (trilinear, in space and in all sums).
     ///
     /// # Errors
-    /// More than 65535 views, or a chunk that was set aside: see [`Self::merged_with`].
+    /// More than 65535 views, or an offloaded chunk: see [`Self::merged_with`].
     pub fn merged(&self) -> Result<TsdfVolume, FusionError> {
-        self.merged_with(|chunk| Err(FusionError::SetAside { chunk }))
+        self.merged_with(|chunk| Err(FusionError::Offloaded { chunk }))
     }
 
-    /// As [`Self::merged`]; `load` is asked for the bytes of each chunk that was set aside, one at a time.
+    /// As [`Self::merged`]; `load` returns the bytes of each offloaded chunk, one at a time.
     ///
     /// # Errors
-    /// More than 65535 views, whatever `load` returns, or bytes that are none of a volume.
+    /// More than 65535 views, whatever `load` returns, or bytes that are not a volume.
     pub fn merged_with<E: From<FusionError>>(
         &self,
         mut load: impl FnMut(ChunkId) -> Result<Vec<u8>, E>,
     ) -> Result<TsdfVolume, E> {
         let mut merged = TsdfVolume::new(&self.config.fusion)?;
-        for (chunk, part) in &self.chunks {
+        for (chunk, sub_volume) in &self.chunks {
             let loaded;
-            let volume = if part.is_aside {
+            let volume = if sub_volume.is_offloaded {
                 loaded = snapshot::read(&load(*chunk)?, &self.config.fusion)?;
                 &loaded
             } else {
-                &part.volume
+                &sub_volume.volume
             };
             let limit = crate::grid::MAX_VIEWS;
             if merged.views() + volume.views() > limit {
-                let frame = part.probes.keys().next().copied().unwrap_or_default();
+                let frame = sub_volume.probes.keys().next().copied().unwrap_or_default();
                 return Err(FusionError::TooManyViews { frame, limit }.into());
             }
-            if part.now_from_fused == Sim3::IDENTITY {
+            if sub_volume.now_from_fused == Sim3::IDENTITY {
                 merged.add(volume);
             } else {
-                resample::add_moved(&mut merged, volume, &part.now_from_fused);
+                resample::add_moved(&mut merged, volume, &sub_volume.now_from_fused);
             }
         }
         Ok(merged)
@@ -345,7 +332,7 @@ impl SubVolumes {
 
     /// Bytes held now by all sub-volumes; never above the budget.
     pub fn memory_bytes(&self) -> u64 {
-        self.chunks.values().map(|part| part.volume.memory_bytes()).sum()
+        self.chunks.values().map(|sub_volume| sub_volume.volume.memory_bytes()).sum()
     }
 
     /// Counts and memory.
@@ -353,7 +340,7 @@ impl SubVolumes {
         SubVolumeReport {
             chunks: self.chunks.len() as u64,
             views: self.owners.len() as u64,
-            stale: self.chunks.values().filter(|part| part.revision.stale).count() as u64,
+            stale: self.chunks.values().filter(|sub_volume| sub_volume.revision.stale).count() as u64,
             rebuilt: self.rebuilt,
             memory_bytes: self.memory_bytes(),
             peak_memory_bytes: self.peak_bytes,
@@ -364,7 +351,7 @@ impl SubVolumes {
     /// Degradations so far, as [`TsdfVolume::warnings`] of each chunk, each kind once.
     pub fn warnings(&self) -> Vec<Warning> {
         let mut warnings: Vec<Warning> = Vec::new();
-        for warning in self.chunks.values().flat_map(|part| part.volume.warnings()) {
+        for warning in self.chunks.values().flat_map(|sub_volume| sub_volume.volume.warnings()) {
             if !warnings.iter().any(|w| w.kind == warning.kind) {
                 warnings.push(warning);
             }
@@ -378,18 +365,18 @@ impl SubVolume {
         let volume = TsdfVolume::new(config)?;
         let revision = Revision::default();
         let probes = BTreeMap::new();
-        Ok(Self { volume, now_from_fused: Sim3::IDENTITY, probes, revision, is_aside: false })
+        Ok(Self { volume, now_from_fused: Sim3::IDENTITY, probes, revision, is_offloaded: false })
     }
 
     fn integrate(&mut self, view: &AlignedView) -> Result<IntegrationStats, FusionError> {
         if self.now_from_fused == Sim3::IDENTITY {
             let stats = self.volume.integrate(view)?;
-            self.probes.insert(view.frame_id(), Probe::new(view, self.volume.config()));
+            self.probes.insert(view.frame_id(), SurfaceProbe::new(view, self.volume.config()));
             return Ok(stats);
         }
-        let there = placement::moved(view, &self.now_from_fused.inverse())?;
+        let there = motion::moved(view, &self.now_from_fused.inverse())?;
         let stats = self.volume.integrate(&there)?;
-        self.probes.insert(view.frame_id(), Probe::new(&there, self.volume.config()));
+        self.probes.insert(view.frame_id(), SurfaceProbe::new(&there, self.volume.config()));
         Ok(stats)
     }
 }

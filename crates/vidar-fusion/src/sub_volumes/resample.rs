@@ -1,19 +1,19 @@
-//! A sub-volume read where it was fused and written where it lies now.
+//! Resampling of a moved sub-volume.
 //!
-//! Each node of the lattice takes the trilinear mean of the sums around the place that it came from. Means of sums
-//! weigh distances by their weights, so what was hardly seen hardly counts. The distance itself scales with the
-//! chunk; its truncation does not, hence it is cut at one truncation again.
+//! Each node of the lattice takes the trilinear mean of the sums around the position that it came from. Means of sums
+//! weigh distances by their weights, so nodes of little weight have little influence. The distance itself scales with the
+//! chunk; its truncation does not, hence it is clamped to one truncation again.
 
 use crate::block::{Block, DISTANCE_ONE, NodeSums};
-use crate::carve::Vote;
+use crate::carve::FreeBlock;
 use crate::grid::{BlockKey, EDGE, NODES, node_of};
 use crate::volume::TsdfVolume;
 use nalgebra::Vector3;
 use rayon::prelude::*;
 use vidar_core::{LieGroup, Sim3};
 
-/// Share of the trilinear weight that must fall on nodes that were seen; less would grow the surface at its rim.
-const LEAST_SEEN: f64 = 0.5;
+/// Share of the trilinear weight that must fall on observed nodes; less would extend the surface beyond its border.
+const MIN_OBSERVED_SHARE: f64 = 0.5;
 
 /// Adds `source`, moved by `now_from_fused`, to `merged`.
 pub(super) fn add_moved(merged: &mut TsdfVolume, source: &TsdfVolume, now_from_fused: &Sim3) {
@@ -23,17 +23,17 @@ pub(super) fn add_moved(merged: &mut TsdfVolume, source: &TsdfVolume, now_from_f
     merged.count_views(source);
 
     let targets = covered(source.keys.iter().copied(), now_from_fused, voxel_m);
-    // A part at a time, so that the resampled blocks do not all exist twice.
-    for part in targets.chunks(4096) {
+    // In batches, so that the resampled blocks do not all exist twice.
+    for batch in targets.chunks(4096) {
         let blocks: Vec<Option<Block>> =
-            part.par_iter().with_min_len(8).map(|key| reader.block(*key)).collect();
-        let pairs = part.iter().copied().zip(&blocks);
+            batch.par_iter().with_min_len(8).map(|key| reader.block(*key)).collect();
+        let pairs = batch.iter().copied().zip(&blocks);
         merged.add_blocks(pairs.filter_map(|(key, block)| Some((key, block.as_ref()?))));
     }
     let free = covered(source.free.keys().copied(), now_from_fused, voxel_m);
-    let votes: Vec<Vote> =
-        free.par_iter().with_min_len(64).filter_map(|key| Some((*key, reader.vote(*key)?))).collect();
-    merged.add_votes(&votes);
+    let free: Vec<FreeBlock> =
+        free.par_iter().with_min_len(64).filter_map(|key| Some((*key, reader.free_weight(*key)?))).collect();
+    merged.add_free_blocks(&free);
 }
 
 /// Blocks of the lattice that the moved blocks `keys` reach, sorted, each once.
@@ -58,7 +58,7 @@ fn covered(keys: impl Iterator<Item = BlockKey>, now_from_fused: &Sim3, voxel_m:
                 found.extend((low.x..=high.x).map(|x| [x, y, z]));
             }
         }
-        // Neighbours find the same blocks: now and then the list is made short again.
+        // Neighbouring blocks cover the same blocks: duplicates are removed from time to time.
         if found.len() > 1 << 20 {
             found.sort_unstable();
             found.dedup();
@@ -77,18 +77,18 @@ struct Reader<'a> {
 }
 
 impl Reader<'_> {
-    /// The block at `key`; `None` where nothing was seen.
+    /// The block at `key`; `None` where nothing was observed.
     fn block(&self, key: BlockKey) -> Option<Block> {
         let mut nodes = [NodeSums::default(); NODES];
         let mut cache = Cache::new(self.source);
-        let (mut seen, mut colored) = (false, false);
+        let (mut observed, mut colored) = (false, false);
         for (local, sums) in nodes.iter_mut().enumerate() {
-            let place = Vector3::from(node_of(key, local).map(|i| f64::from(i) * self.voxel_m));
-            *sums = self.sums_at(&(self.fused_from_now.act(&place) / self.voxel_m), &mut cache);
-            seen |= sums.weight > 0;
+            let position = Vector3::from(node_of(key, local).map(|i| f64::from(i) * self.voxel_m));
+            *sums = self.sums_at(&(self.fused_from_now.act(&position) / self.voxel_m), &mut cache);
+            observed |= sums.weight > 0;
             colored |= sums.color[3] > 0;
         }
-        seen.then(|| {
+        observed.then(|| {
             let mut block = Block::new();
             if colored {
                 block.add_color();
@@ -100,12 +100,12 @@ impl Reader<'_> {
         })
     }
 
-    /// The trilinear mean of the sums around `place` (in voxels, where the chunk was fused).
-    fn sums_at(&self, place: &Vector3<f64>, cache: &mut Cache<'_>) -> NodeSums {
-        let base = place.map(f64::floor);
-        let share = place - base;
+    /// The trilinear mean of the sums around `position` (in voxels, in the frame in which the chunk was fused).
+    fn sums_at(&self, position: &Vector3<f64>, cache: &mut Cache<'_>) -> NodeSums {
+        let base = position.map(f64::floor);
+        let share = position - base;
         let base: [i32; 3] = base.map(|v| v as i32).into();
-        let mut seen = 0.0;
+        let mut observed = 0.0;
         let mut near = 0.0;
         let (mut distance, mut weight, mut views, mut confidence) = (0.0, 0.0, 0.0, 0.0);
         let mut color = [0.0; 4];
@@ -118,7 +118,7 @@ impl Reader<'_> {
             }
             let node = [0, 1, 2].map(|a| base[a] + offset[a] as i32);
             let Some(sums) = cache.sums(node).filter(|s| s.weight > 0) else { continue };
-            seen += c;
+            observed += c;
             distance += c * sums.weighted_distance as f64;
             weight += c * f64::from(sums.weight);
             if sums.observations > 0 {
@@ -131,12 +131,12 @@ impl Reader<'_> {
             }
         }
         let whole = weight.round() as u32;
-        if seen < LEAST_SEEN || whole == 0 {
+        if observed < MIN_OBSERVED_SHARE || whole == 0 {
             return NodeSums::default();
         }
         // Distances in metres grow with the chunk, a truncation stays what it is.
         let mean = (distance * self.scale / weight).clamp(-f64::from(DISTANCE_ONE), f64::from(DISTANCE_ONE));
-        // How often it was seen does not fade towards the rim.
+        // The number of observations does not decrease towards the border.
         let count = |sum: f64| if near > 0.0 { (sum / near).round() as u32 } else { 0 };
         NodeSums {
             weighted_distance: (mean * f64::from(whole)).round() as i64,
@@ -147,18 +147,18 @@ impl Reader<'_> {
         }
     }
 
-    /// The vote for a block as empty: the smallest of the votes around the place that it came from.
-    fn vote(&self, key: BlockKey) -> Option<u32> {
+    /// The free-space weight of a block: the smallest of the weights around the position that it came from.
+    fn free_weight(&self, key: BlockKey) -> Option<u32> {
         let edge_m = EDGE as f64 * self.voxel_m;
-        let vote = |corner: usize| {
+        let weight = |corner: usize| {
             let offset = [corner & 1, corner >> 1 & 1, corner >> 2 & 1].map(|o| o as f64);
-            let place = Vector3::from([0, 1, 2].map(|a| (f64::from(key[a]) + offset[a]) * edge_m));
-            // Corners lie on borders: a hair inside, so that a block that did not move is only itself.
-            let middle = Vector3::from(key.map(|i| (f64::from(i) + 0.5) * edge_m));
-            let place = self.fused_from_now.act(&(place + (middle - place) * 0.05)) / edge_m;
-            self.source.free.get(&<BlockKey>::from(place.map(|v| v.floor() as i32))).copied()
+            let position = Vector3::from([0, 1, 2].map(|a| (f64::from(key[a]) + offset[a]) * edge_m));
+            // Corners lie on borders: slightly inside, so that a block that did not move is only itself.
+            let centre = Vector3::from(key.map(|i| (f64::from(i) + 0.5) * edge_m));
+            let position = self.fused_from_now.act(&(position + (centre - position) * 0.05)) / edge_m;
+            self.source.free.get(&<BlockKey>::from(position.map(|v| v.floor() as i32))).copied()
         };
-        (0..8).map(vote).try_fold(u32::MAX, |least, vote| Some(least.min(vote?)))
+        (0..8).map(weight).try_fold(u32::MAX, |least, weight| Some(least.min(weight?)))
     }
 }
 

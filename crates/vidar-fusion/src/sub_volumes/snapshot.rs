@@ -1,7 +1,7 @@
-//! A volume as bytes, every sum exact, so that chunks that are done can wait on disk.
+//! Lossless serialisation of a volume, for offloading finished chunks to disk.
 //!
-//! `VSUB1`, then as LEB128 numbers: views, shortened views, blocks, votes. Per block its key, whether it has colour, a
-//! bit per node that was seen, and the sums of those nodes; per vote its key and weight. Signed numbers are zigzag.
+//! `VSUB1`, then as LEB128 numbers: views, shortened views, blocks, free blocks. Per block its key, whether it has colour, a
+//! bit per node that was observed, and the sums of those nodes; per free block its key and weight. Signed numbers are zigzag.
 //! About a quarter of what the volume takes in memory.
 
 use crate::block::{Block, NodeSums};
@@ -16,9 +16,9 @@ pub(super) fn write(volume: &TsdfVolume) -> Vec<u8> {
     let mut out = MAGIC.to_vec();
     let mut order: Vec<usize> = (0..volume.keys.len()).collect();
     order.sort_unstable_by_key(|&at| volume.keys[at]);
-    let votes = volume.votes();
+    let free_blocks = volume.free_blocks();
     let (views, shortened) = volume.view_counts();
-    for number in [u64::from(views), u64::from(shortened), order.len() as u64, votes.len() as u64] {
+    for number in [u64::from(views), u64::from(shortened), order.len() as u64, free_blocks.len() as u64] {
         put(&mut out, number);
     }
     for at in order {
@@ -27,11 +27,11 @@ pub(super) fn write(volume: &TsdfVolume) -> Vec<u8> {
         let colored = block.color.is_some();
         out.push(u8::from(colored));
         let sums: Vec<NodeSums> = (0..NODES).map(|node| block.sums(node)).collect();
-        let seen = |s: &NodeSums| *s != NodeSums::default();
+        let observed = |s: &NodeSums| *s != NodeSums::default();
         for eight in sums.chunks(8) {
-            out.push(eight.iter().enumerate().fold(0, |bits, (i, s)| bits | u8::from(seen(s)) << i));
+            out.push(eight.iter().enumerate().fold(0, |bits, (i, s)| bits | u8::from(observed(s)) << i));
         }
-        for s in sums.iter().filter(|s| seen(s)) {
+        for s in sums.iter().filter(|s| observed(s)) {
             put(&mut out, zigzag(s.weighted_distance));
             for number in [s.weight, s.observations, s.confidence] {
                 put(&mut out, u64::from(number));
@@ -41,14 +41,14 @@ pub(super) fn write(volume: &TsdfVolume) -> Vec<u8> {
             }
         }
     }
-    for (key, weight) in votes {
+    for (key, weight) in free_blocks {
         put_key(&mut out, key);
         put(&mut out, u64::from(weight));
     }
     out
 }
 
-/// The volume back. What does not fit the budget of `config` is an error, as is anything that [`write`] does not write.
+/// Reads the volume back. Fails for bytes that [`write`] does not write, and beyond the budget of `config`.
 pub(super) fn read(bytes: &[u8], config: &FusionConfig) -> Result<TsdfVolume, FusionError> {
     let mut input = Input { bytes, at: 0 };
     if input.take(MAGIC.len())? != MAGIC {
@@ -59,7 +59,7 @@ pub(super) fn read(bytes: &[u8], config: &FusionConfig) -> Result<TsdfVolume, Fu
     if views > MAX_VIEWS || shortened > views {
         return Err(input.bad("the number of views"));
     }
-    let (blocks, votes) = (input.number()?, input.number()?);
+    let (blocks, free_blocks) = (input.number()?, input.number()?);
     let mut last: Option<BlockKey> = None;
     for _ in 0..blocks {
         let key = input.key()?;
@@ -72,11 +72,11 @@ pub(super) fn read(bytes: &[u8], config: &FusionConfig) -> Result<TsdfVolume, Fu
         if colored {
             block.add_color();
         }
-        let seen: Vec<u8> = input.take(NODES / 8)?.to_vec();
-        for node in (0..NODES).filter(|node| seen[node / 8] >> (node % 8) & 1 == 1) {
+        let observed: Vec<u8> = input.take(NODES / 8)?.to_vec();
+        for node in (0..NODES).filter(|node| observed[node / 8] >> (node % 8) & 1 == 1) {
             let weighted_distance = unzigzag(input.number()?);
             let (weight, observations, confidence) = (input.small()?, input.small()?, input.small()?);
-            // What no sum of that many views can be.
+            // Bounds on the sums of that many views.
             let fits = weighted_distance.unsigned_abs() <= u64::from(weight) * 4096
                 && u64::from(weight) <= u64::from(views) * 4095
                 && observations <= views
@@ -99,12 +99,12 @@ pub(super) fn read(bytes: &[u8], config: &FusionConfig) -> Result<TsdfVolume, Fu
             return Err(input.bad("a size within the memory budget"));
         }
     }
-    for _ in 0..votes {
-        let vote = (input.key()?, input.small()?);
-        if vote.1 > views * 4095 {
-            return Err(input.bad("a vote"));
+    for _ in 0..free_blocks {
+        let free_block = (input.key()?, input.small()?);
+        if free_block.1 > views * 4095 {
+            return Err(input.bad("a free block"));
         }
-        if volume.add_votes(&[vote]) > 0 {
+        if volume.add_free_blocks(&[free_block]) > 0 {
             return Err(input.bad("a size within the memory budget"));
         }
     }
@@ -158,7 +158,7 @@ impl<'a> Input<'a> {
             *k = i32::try_from(unzigzag(self.number()?))
                 .ok()
                 .filter(|k| k.unsigned_abs() <= 1 << 20)
-                .ok_or_else(|| self.bad("a block's place"))?;
+                .ok_or_else(|| self.bad("a block's position"))?;
         }
         Ok(key)
     }

@@ -19,7 +19,7 @@ pub fn camera() -> Pinhole {
     Pinhole::new(160.0, 160.0, 99.5, 74.5, WIDTH, HEIGHT).unwrap()
 }
 
-/// Keeps everything, so that a test sees what one view does.
+/// Keeps everything, so that the effect of one view is visible.
 pub fn config() -> FusionConfig {
     FusionConfig {
         voxel_size_m: 0.02,
@@ -127,7 +127,7 @@ pub fn point(p: [f32; 3]) -> Vec3 {
 
 pub fn rms(values: impl Iterator<Item = f64>) -> f64 {
     let (sum, n) = values.fold((0.0, 0), |(sum, n), v| (sum + v * v, n + 1));
-    assert!(n > 0, "nothing to judge");
+    assert!(n > 0, "no values");
     (sum / f64::from(n)).sqrt()
 }
 
@@ -149,13 +149,13 @@ pub fn border_edges(mesh: &TriangleMesh) -> Vec<[u32; 2]> {
     edges.keys().copied().filter(|[a, b]| !edges.contains_key(&[*b, *a])).collect()
 }
 
-/// Asserts that no two vertices share a place and that every vertex is used.
+/// Asserts that no two vertices coincide and that every vertex is used.
 pub fn assert_vertices_are_distinct_and_used(mesh: &TriangleMesh) {
     assert!(mesh.is_consistent());
-    let mut places: Vec<[u32; 3]> = mesh.positions.iter().map(|p| p.map(f32::to_bits)).collect();
-    places.sort_unstable();
-    places.dedup();
-    assert_eq!(places.len(), mesh.positions.len(), "two vertices in one place");
+    let mut positions: Vec<[u32; 3]> = mesh.positions.iter().map(|p| p.map(f32::to_bits)).collect();
+    positions.sort_unstable();
+    positions.dedup();
+    assert_eq!(positions.len(), mesh.positions.len(), "two vertices coincide");
     let mut used: Vec<u32> = mesh.triangles.iter().flatten().copied().collect();
     used.sort_unstable();
     used.dedup();

@@ -1,4 +1,4 @@
-//! Where a chunk lies after its keyframes moved.
+//! Motion of a chunk, from the motion of its keyframes.
 
 use super::{RevisedView, Revision};
 use crate::grid::median_depth;
@@ -8,16 +8,16 @@ use vidar_core::{AlignedView, LieGroup, Se3, Sim3, umeyama_sim3};
 
 /// A few points of a keyframe's surface.
 #[derive(Clone, Debug)]
-pub(super) struct Probe {
+pub(super) struct SurfaceProbe {
     world_from_camera: Se3,
-    /// In the camera, m: the middle and the corners of the view at its median depth.
+    /// In the camera, m: the centre and the corners of the view at its median depth.
     points: [Vector3<f64>; 5],
 }
 
-impl Probe {
+impl SurfaceProbe {
     pub(super) fn new(view: &AlignedView, config: &FusionConfig) -> Self {
         let k = view.intrinsics();
-        // A view without depth adds no surface; how far it moves is then told of one metre.
+        // A view without depth adds no surface; its motion is measured at one metre.
         let z = median_depth(view, config.max_depth_m as f32).map_or(1.0, f64::from);
         let (right, bottom) = (k.width as f64 - 1.0, k.height as f64 - 1.0);
         let pixels = [[0.5 * right, 0.5 * bottom], [0.0, 0.0], [right, 0.0], [0.0, bottom], [right, bottom]];
@@ -25,8 +25,8 @@ impl Probe {
     }
 }
 
-/// The similarity that follows the motion of the surface best, unless it moved no more than `tolerance_m`.
-pub(super) fn fit(pairs: &[(&Probe, &RevisedView)], tolerance_m: f64) -> (Sim3, Revision) {
+/// The similarity that best fits the motion of the surface, or the identity if it moved no more than `tolerance_m`.
+pub(super) fn fit(pairs: &[(&SurfaceProbe, &RevisedView)], tolerance_m: f64) -> (Sim3, Revision) {
     let (mut fused, mut now) = (Vec::new(), Vec::new());
     for (probe, view) in pairs {
         for point in &probe.points {
@@ -34,23 +34,23 @@ pub(super) fn fit(pairs: &[(&Probe, &RevisedView)], tolerance_m: f64) -> (Sim3, 
             now.push(view.world_from_camera.act(&(point * view.depth_factor)));
         }
     }
-    let farthest = |place: &Sim3| -> f64 {
-        fused.iter().zip(&now).map(|(a, b)| (place.act(a) - b).norm()).fold(0.0, f64::max)
+    let largest = |motion: &Sim3| -> f64 {
+        fused.iter().zip(&now).map(|(a, b)| (motion.act(a) - b).norm()).fold(0.0, f64::max)
     };
-    let moved_m = farthest(&Sim3::IDENTITY);
+    let moved_m = largest(&Sim3::IDENTITY);
     if moved_m <= tolerance_m {
         return (Sim3::IDENTITY, Revision { moved_m, bent_m: moved_m, stale: false });
     }
-    // A view's five points are no line and no place, so the similarity exists; should rounding say otherwise, the
-    // first view leads.
-    let place = umeyama_sim3(&fused, &now).unwrap_or_else(|_| {
-        let lead = |(probe, view): &(&Probe, &RevisedView)| {
+    // A view's five points are neither collinear nor coincident, so the similarity exists; should rounding prevent
+    // it, the motion of the first view is used.
+    let motion = umeyama_sim3(&fused, &now).unwrap_or_else(|_| {
+        let of_first = |(probe, view): &(&SurfaceProbe, &RevisedView)| {
             let scaled = Sim3 { scale: view.depth_factor, ..Sim3::from_se3(&view.world_from_camera) };
             scaled * Sim3::from_se3(&probe.world_from_camera.inverse())
         };
-        pairs.first().map_or(Sim3::IDENTITY, lead)
+        pairs.first().map_or(Sim3::IDENTITY, of_first)
     });
-    (place, Revision { moved_m, bent_m: farthest(&place), stale: true })
+    (motion, Revision { moved_m, bent_m: largest(&motion), stale: true })
 }
 
 /// A view moved by a similarity: pose, and depth by the scale.
