@@ -1,5 +1,5 @@
-//! One call's way from views to depth. Every step is a function of the call's input, and nothing outlives the call:
-//! corrected poses depend on all views of a chunk, so an estimate of another chunk would hardly ever be the same.
+//! The processing of one call, from views to depth. Nothing is cached between calls: corrected poses depend on all
+//! views of a chunk, so an estimate of another chunk could hardly ever be reused.
 
 use crate::config::StereoConfig;
 use crate::error::StereoError;
@@ -12,34 +12,34 @@ use vidar_core::{Pinhole, Se3};
 
 /// Neighbours whose own depths are compared with a reference's.
 const CHECKED_NEIGHBOURS: usize = 4;
-/// As many of them have to be there even if nobody asked for their depth.
+/// Fewest of them, also where their depth is not requested.
 const MIN_CHECKED: usize = 2;
 
-/// Depth of one view before the checks, with all that the checks of others need.
+/// Depth of one view before the checks, with the inputs of the consistency checks.
 #[derive(Debug)]
 pub(crate) struct ViewDepth {
     /// The corrected pose.
     pub world_from_camera: Se3,
     /// Intrinsics at the working size.
     pub intrinsics: Pinhole,
-    /// What the view alone says.
+    /// The estimate of the view alone.
     pub estimate: Estimate,
     /// The views that it was matched with, best first: indices into the chunk.
     pub neighbours: Vec<usize>,
 }
 
-/// Asked before each piece of work; `true` ends the call.
+/// Polled before each unit of work; `true` ends the call.
 pub(crate) type Cancel<'a> = &'a (dyn Fn() -> bool + Sync);
 
 /// A call in progress.
 pub(crate) struct Chunk<'a> {
     /// The views; at their corrected poses once [`Chunk::work`] is done.
     pub views: Vec<Prepared>,
-    /// Largest parallax that a view without depth was found to have, degrees.
+    /// Largest parallax of each view without depth, degrees.
     pub parallax_deg: Vec<f64>,
     /// Depths of the references and of the views that these are checked against.
     pub depths: BTreeMap<usize, ViewDepth>,
-    /// The views whose depth is asked for.
+    /// The views whose depth is requested.
     references: &'a BTreeSet<usize>,
     config: &'a StereoConfig,
     cancel: Cancel<'a>,
@@ -59,10 +59,11 @@ impl<'a> Chunk<'a> {
     /// Depth of the references and of the views that they are checked against.
     pub fn work(&mut self) -> Result<(), StereoError> {
         let probes = self.probe()?;
-        if self.config.pose_spread_deg > 0.0 && self.config.pose_spread_m > 0.0 {
-            let placed = register(&self.views, &probes, self.config);
-            for (view, placed) in self.views.iter_mut().zip(placed) {
-                (view.world_from_camera, view.misfit) = (placed.world_from_camera, placed.misfit);
+        if self.config.pose_std_deg > 0.0 && self.config.pose_std_m > 0.0 {
+            let corrected = register(&self.views, &probes, self.config);
+            for (view, corrected) in self.views.iter_mut().zip(corrected) {
+                (view.world_from_camera, view.correction) =
+                    (corrected.world_from_camera, corrected.correction);
             }
         }
         self.estimate(self.references, &probes)?;
@@ -70,16 +71,16 @@ impl<'a> Chunk<'a> {
         self.estimate(&checks, &probes)
     }
 
-    /// The views that a view with depth is checked against: those whose depth is asked for anyway come first.
+    /// The views that a view with depth is checked against: those whose depth is requested anyway come first.
     pub fn checked(&self, view: usize) -> Vec<usize> {
         let Some(depth) = self.depths.get(&view) else { return Vec::new() };
-        let (asked, context): (Vec<usize>, Vec<usize>) =
+        let (requested, context): (Vec<usize>, Vec<usize>) =
             depth.neighbours.iter().partition(|n| self.references.contains(n));
-        let extra = MIN_CHECKED.saturating_sub(asked.len());
-        asked.into_iter().take(CHECKED_NEIGHBOURS).chain(context.into_iter().take(extra)).collect()
+        let extra = MIN_CHECKED.saturating_sub(requested.len());
+        requested.into_iter().take(CHECKED_NEIGHBOURS).chain(context.into_iter().take(extra)).collect()
     }
 
-    /// A rough look at every view; nothing for those without parallax.
+    /// A coarse estimate of every view; `None` for those without parallax.
     fn probe(&mut self) -> Result<Vec<Option<Probe>>, StereoError> {
         let of_view = |i| self.unless_cancelled(|| probe(&self.views, i, self.config));
         let found = (0..self.views.len()).into_par_iter().map(of_view).collect::<Result<Vec<_>, _>>()?;
@@ -89,9 +90,9 @@ impl<'a> Chunk<'a> {
         Ok(found.into_iter().map(Result::ok).collect())
     }
 
-    /// Estimates those of `wanted` that have no depth yet, views in parallel.
-    fn estimate(&mut self, wanted: &BTreeSet<usize>, probes: &[Option<Probe>]) -> Result<(), StereoError> {
-        let missing: Vec<(usize, &Probe)> = wanted
+    /// Estimates those of `needed` that have no depth yet, views in parallel.
+    fn estimate(&mut self, needed: &BTreeSet<usize>, probes: &[Option<Probe>]) -> Result<(), StereoError> {
+        let missing: Vec<(usize, &Probe)> = needed
             .iter()
             .filter(|i| !self.depths.contains_key(i))
             .filter_map(|&i| Some((i, probes[i].as_ref()?)))

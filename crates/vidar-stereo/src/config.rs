@@ -1,4 +1,4 @@
-//! What can be tuned from outside. Everything else is a named constant with its reason beside the code.
+//! Settings of stereo. Everything else is a named constant with its reason beside the code.
 
 use crate::error::StereoError;
 use serde::{Deserialize, Serialize};
@@ -10,11 +10,11 @@ pub struct StereoConfig {
     /// Largest width of the images that are matched, and so of the depth, pixels, 64…4096. Larger images are
     /// area-averaged down; smaller ones are used as they are. Raise for finer depth; time grows with its square.
     pub max_width_px: usize,
-    /// Views that each view is matched against, 1…8. More survive occlusion better and cost time in proportion.
+    /// Views that each view is matched against, 1…8. More neighbours are more robust to occlusion; time is proportional.
     pub neighbours: usize,
     /// Smallest parallax that makes a neighbour useful, degrees at the typical depth of the scene, 0.05…20.
     pub min_parallax_deg: f64,
-    /// Parallax at which a neighbour is as good as it gets, degrees, above `min_parallax_deg`, at most 30.
+    /// Parallax at which a neighbour scores best, degrees, above `min_parallax_deg`, at most 30.
     /// Lower it for cluttered scenes (less occlusion), raise it for open ones (finer depth).
     pub best_parallax_deg: f64,
     /// Nearest depth that is searched, metres, positive.
@@ -27,14 +27,14 @@ pub struct StereoConfig {
     pub step_penalty: u16,
     /// Penalty of a depth edge between adjacent pixels of equal brightness, `step_penalty`…1000.
     pub jump_penalty: u16,
-    /// Rounds of slanted-plane refinement after the sweep, 0…8. Zero is quicker and leaves staircases.
+    /// Rounds of slanted-plane refinement after the sweep, 0…8. Zero is faster and leaves steps of one plane.
     pub refine_rounds: usize,
-    /// Spread of the given poses, one standard deviation of each one's rotation, degrees, 0…5. Poses are corrected
-    /// within it by what the images say; 0 here or in `pose_spread_m` takes them as they are.
-    pub pose_spread_deg: f64,
-    /// Spread of the given camera centres, metres, 0…1.
-    pub pose_spread_m: f64,
-    /// Noise of the images, grey levels of 255, 0.1…50. Texture weaker than this is not trusted.
+    /// Standard deviation of each given pose's rotation, degrees, 0…5. Poses are corrected by the images with this prior;
+    /// 0 here or in `pose_std_m` takes them as given.
+    pub pose_std_deg: f64,
+    /// Standard deviation of the given camera centres, metres, 0…1.
+    pub pose_std_m: f64,
+    /// Noise of the images, grey levels of 255, 0.1…50. Weaker texture is not matched.
     pub noise_gray: f64,
     /// Largest relative difference between the depths of two views that agree, 0.001…0.2.
     pub agreement_ratio: f64,
@@ -55,8 +55,8 @@ impl Default for StereoConfig {
             step_penalty: 12,
             jump_penalty: 80,
             refine_rounds: 1,
-            pose_spread_deg: 0.1,
-            pose_spread_m: 0.01,
+            pose_std_deg: 0.1,
+            pose_std_m: 0.01,
             noise_gray: 1.0,
             agreement_ratio: 0.02,
             min_confidence: 0.3,
@@ -65,7 +65,7 @@ impl Default for StereoConfig {
 }
 
 impl StereoConfig {
-    /// Refuses values outside the ranges that the fields state, naming the key.
+    /// Checks every field against the range in its description.
     pub fn validate(&self) -> Result<(), StereoError> {
         let check = |key: &'static str, found: f64, low: f64, high: f64| {
             if found >= low && found <= high {
@@ -83,8 +83,8 @@ impl StereoConfig {
         check("step_penalty", f64::from(self.step_penalty), 1.0, 200.0)?;
         check("jump_penalty", f64::from(self.jump_penalty), f64::from(self.step_penalty), 1000.0)?;
         check("refine_rounds", self.refine_rounds as f64, 0.0, 8.0)?;
-        check("pose_spread_deg", self.pose_spread_deg, 0.0, 5.0)?;
-        check("pose_spread_m", self.pose_spread_m, 0.0, 1.0)?;
+        check("pose_std_deg", self.pose_std_deg, 0.0, 5.0)?;
+        check("pose_std_m", self.pose_std_m, 0.0, 1.0)?;
         check("noise_gray", self.noise_gray, 0.1, 50.0)?;
         check("agreement_ratio", self.agreement_ratio, 0.001, 0.2)?;
         check("min_confidence", self.min_confidence, 0.0, 1.0)

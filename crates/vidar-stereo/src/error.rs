@@ -1,9 +1,9 @@
-//! What can go wrong, each with what was found and what is needed.
+//! Errors of stereo, each with what was found and what is expected.
 
 use thiserror::Error;
 use vidar_core::{ChunkId, FrameId, ModelError};
 
-/// Why stereo could not work.
+/// Why stereo failed.
 #[derive(Clone, Debug, PartialEq, Error)]
 #[non_exhaustive]
 pub enum StereoError {
@@ -19,7 +19,7 @@ pub enum StereoError {
         /// Largest value allowed.
         high: f64,
     },
-    /// One view has no other to be matched with.
+    /// Fewer views than matching needs.
     #[error("chunk {chunk}: {found} views, stereo needs at least {needed}")]
     TooFewViews {
         /// Which chunk.
@@ -32,7 +32,7 @@ pub enum StereoError {
     /// A requested reference is not among the views.
     #[error("reference {index} is not one of the {views} views")]
     NoSuchReference {
-        /// The index asked for.
+        /// The requested index.
         index: usize,
         /// Number of views.
         views: usize,
@@ -50,7 +50,7 @@ pub enum StereoError {
         frame: FrameId,
     },
     /// The intrinsics are singular or not finite.
-    #[error("frame {frame}: intrinsics fx {fx}, fy {fy}, cx {cx}, cy {cy} are not those of a camera")]
+    #[error("frame {frame}: intrinsics fx {fx}, fy {fy}, cx {cx}, cy {cy} are not valid")]
     BadIntrinsics {
         /// Which frame.
         frame: FrameId,
@@ -91,7 +91,7 @@ pub enum StereoError {
         /// Fewest rows and columns.
         needed: usize,
     },
-    /// No reference has a neighbour that sees the same from a different place (the camera only turned, or stood).
+    /// No reference has a neighbour with overlap and a baseline (the camera only rotated, or did not move).
     #[error(
         "chunk {chunk}: no view has parallax: at most {found_deg:.3} deg was found, {needed_deg:.3} deg is needed"
     )]
@@ -103,10 +103,10 @@ pub enum StereoError {
         /// Parallax needed, degrees.
         needed_deg: f64,
     },
-    /// The caller asked to stop.
+    /// The caller cancelled.
     #[error("cancelled")]
     Cancelled,
-    /// A result could not be put together; a defect of this crate rather than of the input.
+    /// A result could not be assembled: a defect of this crate, not of the input.
     #[error("internal: {what}")]
     Internal {
         /// What failed.

@@ -8,7 +8,7 @@ use crate::prepare::{Level, Prepared};
 use crate::refine::refine;
 use crate::select::{Selection, select};
 use crate::sgm::{Penalties, aggregate};
-use crate::sweep::{Planes, Source, UNSEEN, WORST, sweep};
+use crate::sweep::{INVISIBLE, Planes, Source, WORST, sweep};
 use crate::warp::{Warp, neighbour_from_reference};
 
 /// Pyramid level of the sweep; the refinement works on level 0.
@@ -18,10 +18,10 @@ pub(crate) const PROBE_LEVEL: usize = 2;
 /// Planes of the probe.
 const PROBE_PLANES: usize = 64;
 
-/// What one reference alone says.
+/// The estimate from one reference alone.
 #[derive(Clone, Debug)]
 pub(crate) struct Estimate {
-    /// Inverse depth at the working size, 1/m; NaN where nothing was found.
+    /// Inverse depth at the working size, 1/m; NaN where there is none.
     pub rho: Vec<f32>,
     /// Matching cost at the winner, 0 (perfect) to 1 (none).
     pub cost: Vec<f32>,
@@ -31,12 +31,12 @@ pub(crate) struct Estimate {
     pub texture: Vec<f32>,
     /// Growth of the cost away from the winner, per squared pixel of shift of the best neighbour.
     pub curvature: Vec<f32>,
-    /// Inverse-depth step that shifts the best neighbour by one working pixel, 1/m.
+    /// Inverse-depth step that shifts the pixel in the best neighbour by one working pixel, 1/m.
     pub rho_per_px: f32,
 }
 
 /// Depth of `views[reference]` and the views it was matched with; `Err` holds the largest parallax in degrees, if
-/// there is none worth matching.
+/// there is too little for matching.
 pub(crate) fn estimate(
     views: &[Prepared],
     reference: usize,
@@ -61,7 +61,7 @@ fn matched(
 ) -> Estimate {
     let coarse = &views[reference].levels[SWEEP_LEVEL];
     let coarse_sources = sources(views, reference, neighbours, SWEEP_LEVEL);
-    let planes = spread_planes(coarse, &coarse_sources, near_m.max(config.min_depth_m), config);
+    let planes = place_planes(coarse, &coarse_sources, near_m.max(config.min_depth_m), config);
     let costs = sweep(coarse, &coarse_sources, &planes, config.noise_gray as f32);
     let penalties = Penalties { step: config.step_penalty as i16, jump: config.jump_penalty as i16 };
     let sums = aggregate(coarse, &costs, planes.count, penalties);
@@ -89,7 +89,7 @@ pub(crate) fn sources<'a>(
         .collect()
 }
 
-/// Shift of a neighbour's pixel per unit of inverse depth, px·m: the largest over `sources`, at the image's middle.
+/// Shift of a neighbour's pixel per unit of inverse depth, px·m: the largest over `sources`, at the image centre.
 pub(crate) fn shift_per_rho(level: &Level, sources: &[Source<'_>]) -> f32 {
     let (x, y) = (level.width as f32 * 0.5, level.height as f32 * 0.5);
     let shift = |source: &Source<'_>| {
@@ -103,8 +103,8 @@ pub(crate) fn shift_per_rho(level: &Level, sources: &[Source<'_>]) -> f32 {
     sources.iter().map(shift).fold(0.0, f32::max)
 }
 
-/// Planes a pixel apart for the widest neighbour, from infinity's side to `near_m`.
-fn spread_planes(level: &Level, sources: &[Source<'_>], near_m: f64, config: &StereoConfig) -> Planes {
+/// Planes one pixel apart in the neighbour of the widest baseline, from infinity's side to `near_m`.
+fn place_planes(level: &Level, sources: &[Source<'_>], near_m: f64, config: &StereoConfig) -> Planes {
     let (first, last) = (1.0 / config.max_depth_m, 1.0 / near_m.min(config.max_depth_m / 1.1));
     let pixels = f64::from(shift_per_rho(level, sources)) * (last - first);
     let count = (pixels.ceil() as usize + 1).clamp(16, config.max_planes);
@@ -118,17 +118,17 @@ pub(crate) struct SceneDepth {
     pub near: f64,
 }
 
-/// What a rough look at a quarter of the size finds.
+/// A coarse estimate at a quarter of the size.
 #[derive(Clone, Debug)]
 pub(crate) struct Probe {
     pub depth: SceneDepth,
-    /// Inverse depth at a quarter of the working size, 1/m; NaN where the look is not sure.
+    /// Inverse depth at a quarter of the working size, 1/m; NaN where the estimate is ambiguous.
     pub rho: Vec<f32>,
 }
 
-/// A rough look at a quarter of the size. `Err` holds the largest parallax in degrees, if none is worth matching.
+/// Estimates depth coarsely at a quarter of the size. `Err` holds the largest parallax in degrees, if there is too little.
 pub(crate) fn probe(views: &[Prepared], reference: usize, config: &StereoConfig) -> Result<Probe, f64> {
-    // Depth is unknown here: average the worth of a neighbour over the searched range, evenly in log depth.
+    // Depth is unknown here: average the score of a neighbour over the searched range, evenly in log depth.
     let ratio = config.max_depth_m / config.min_depth_m;
     let depths_m: Vec<f64> =
         (0..5).map(|i| config.min_depth_m * ratio.powf((i as f64 + 0.5) / 5.0)).collect();
@@ -144,17 +144,17 @@ pub(crate) fn probe(views: &[Prepared], reference: usize, config: &StereoConfig)
     let penalties = Penalties { step: config.step_penalty as i16, jump: config.jump_penalty as i16 };
     let sums = aggregate(level, &costs, planes.count, penalties);
     let winners = Winners::pick(level, &costs, &sums, &planes);
-    let sure = |i: usize| winners.cost[i] < 0.4 && winners.margin[i] > 0.05 && winners.rho[i] > 0.0;
+    let is_distinct = |i: usize| winners.cost[i] < 0.4 && winners.margin[i] > 0.05 && winners.rho[i] > 0.0;
     let rho: Vec<f32> =
-        (0..winners.rho.len()).map(|i| if sure(i) { winners.rho[i] } else { f32::NAN }).collect();
+        (0..winners.rho.len()).map(|i| if is_distinct(i) { winners.rho[i] } else { f32::NAN }).collect();
     let mut depths_m: Vec<f32> = rho.iter().filter(|rho| !rho.is_nan()).map(|rho| 1.0 / rho).collect();
     if depths_m.len() < rho.len() / 50 {
-        let middle = (config.min_depth_m * config.max_depth_m).sqrt();
-        return Ok(Probe { depth: SceneDepth { median: middle, near: config.min_depth_m }, rho });
+        let centre = (config.min_depth_m * config.max_depth_m).sqrt();
+        return Ok(Probe { depth: SceneDepth { median: centre, near: config.min_depth_m }, rho });
     }
     depths_m.sort_unstable_by(f32::total_cmp);
     let at = |share: f64| f64::from(depths_m[((depths_m.len() - 1) as f64 * share) as usize]);
-    // Small near things may have been missed at this size, so the near end keeps a margin.
+    // Small near objects may have been missed at this size, so the near end keeps a margin.
     Ok(Probe { depth: SceneDepth { median: at(0.5), near: 0.6 * at(0.02) }, rho })
 }
 
@@ -166,7 +166,7 @@ pub(crate) struct Winners {
 }
 
 impl Winners {
-    /// Picks the least sum, fits a parabola through its neighbours, and finds the least sum more than two planes off.
+    /// Picks the least sum, fits a parabola through its neighbours, and finds the least sum more than two planes away.
     pub fn pick(level: &Level, costs: &[u8], sums: &[i16], planes: &Planes) -> Self {
         let n = level.width * level.height;
         let mut winners = Self { rho: vec![f32::NAN; n], cost: vec![1.0; n], margin: vec![0.0; n] };
@@ -174,7 +174,7 @@ impl Winners {
             let sums = &sums[pixel * planes.count..][..planes.count];
             let costs = &costs[pixel * planes.count..][..planes.count];
             let Some((best, &least)) = sums.iter().enumerate().min_by_key(|(_, s)| **s) else { continue };
-            if costs[best] == UNSEEN {
+            if costs[best] == INVISIBLE {
                 continue;
             }
             let outside = |k: usize| k.abs_diff(best) > 2;

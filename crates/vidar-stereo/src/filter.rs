@@ -1,22 +1,22 @@
-//! Removal of speckles: small islands of depth that nothing around them continues.
+//! Removal of speckles: small connected regions of depth.
 
-/// Islands of fewer pixels are removed; a real thing this small is rarely matched right either.
-const SMALLEST_ISLAND: usize = 24;
-/// Relative inverse-depth difference of adjacent pixels of one island.
+/// Regions of fewer pixels are removed; real objects of this size are rarely matched correctly.
+const MIN_REGION_PX: usize = 24;
+/// Relative inverse-depth difference of adjacent pixels of one region.
 const STEP_RATIO: f32 = 0.04;
 
-/// Sets `rho` to NaN on islands of fewer than [`SMALLEST_ISLAND`] pixels.
+/// Sets `rho` to NaN on regions of fewer than [`MIN_REGION_PX`] pixels.
 pub(crate) fn remove_speckles(rho: &mut [f32], width: usize) {
     let height = rho.len() / width.max(1);
-    let mut seen = vec![false; rho.len()];
+    let mut visited = vec![false; rho.len()];
     let mut island = Vec::new();
     for start in 0..rho.len() {
-        if seen[start] || rho[start].is_nan() {
+        if visited[start] || rho[start].is_nan() {
             continue;
         }
         island.clear();
         island.push(start);
-        seen[start] = true;
+        visited[start] = true;
         let mut next = 0;
         while next < island.len() {
             let i = island[next];
@@ -30,13 +30,13 @@ pub(crate) fn remove_speckles(rho: &mut [f32], width: usize) {
             ];
             for j in around.into_iter().flatten() {
                 // A NaN fails the comparison.
-                if !seen[j] && (rho[j] - rho[i]).abs() < STEP_RATIO * rho[i] {
-                    seen[j] = true;
+                if !visited[j] && (rho[j] - rho[i]).abs() < STEP_RATIO * rho[i] {
+                    visited[j] = true;
                     island.push(j);
                 }
             }
         }
-        if island.len() < SMALLEST_ISLAND {
+        if island.len() < MIN_REGION_PX {
             for &i in &island {
                 rho[i] = f32::NAN;
             }

@@ -1,7 +1,7 @@
 //! The model: views in, depth in the frame of the given poses out.
 
 use crate::chunk::{Cancel, Chunk, ViewDepth};
-use crate::confidence::{Evidence, evidence};
+use crate::confidence::{PixelFeatures, pixel_features};
 use crate::config::StereoConfig;
 use crate::consistency::{Support, support};
 use crate::error::StereoError;
@@ -19,7 +19,7 @@ use vidar_core::{
 /// Fewest views of a chunk.
 const MIN_VIEWS: usize = 2;
 
-/// Multi-view stereo as a [`GeometryModel`]: name `stereo`, needs poses, depth in metres of the prior's world.
+/// Multi-view stereo as a [`GeometryModel`]: name `stereo`, needs poses, depth in metres, in the world frame of the prior poses.
 #[derive(Debug)]
 pub struct StereoModel {
     config: StereoConfig,
@@ -37,7 +37,7 @@ pub struct OmittedView {
     pub needed_parallax_deg: f64,
 }
 
-/// Depths of the references, and what became of the rest.
+/// Depths of the references, and the omitted references.
 #[derive(Clone, Debug)]
 pub struct StereoOutput {
     /// One entry per reference with parallax, in the order of the views. The depth has the working size
@@ -47,13 +47,13 @@ pub struct StereoOutput {
     pub omitted: Vec<OmittedView>,
 }
 
-/// What the confidence of a view's pixels was judged by.
+/// The features from which the confidence of a view's pixels was computed.
 #[derive(Clone, Debug)]
-pub struct ViewEvidence {
+pub struct ViewFeatures {
     /// Which frame.
     pub frame_id: FrameId,
     /// One entry per pixel, row by row, also where the view got no depth.
-    pub pixels: Vec<Evidence>,
+    pub pixels: Vec<PixelFeatures>,
 }
 
 impl StereoModel {
@@ -78,7 +78,7 @@ impl StereoModel {
     /// Depth of the views at the indices `references` only, from all of `views`.
     ///
     /// Neighbours are chosen anywhere in `views`, so a streaming driver passes a window around the references.
-    /// `cancel` is asked before each piece of work. If no reference has parallax, that is an error.
+    /// `cancel` is polled before each unit of work. Fails if no reference has parallax.
     pub fn predict_with(
         &self,
         views: &ChunkViews,
@@ -88,13 +88,13 @@ impl StereoModel {
         Ok(self.with_parallax(views, references, cancel, false)?.0)
     }
 
-    /// As [`Self::predict_with`], and what each pixel's confidence was judged by: one entry per view of the prediction.
-    pub fn predict_with_evidence(
+    /// As [`Self::predict_with`], with the features of the confidence: one entry per view of the prediction.
+    pub fn predict_with_features(
         &self,
         views: &ChunkViews,
         references: &[usize],
         cancel: &(dyn Fn() -> bool + Sync),
-    ) -> Result<(StereoOutput, Vec<ViewEvidence>), StereoError> {
+    ) -> Result<(StereoOutput, Vec<ViewFeatures>), StereoError> {
         self.with_parallax(views, references, cancel, true)
     }
 
@@ -104,25 +104,25 @@ impl StereoModel {
         views: &ChunkViews,
         references: &[usize],
         cancel: Cancel<'_>,
-        keep_evidence: bool,
-    ) -> Result<(StereoOutput, Vec<ViewEvidence>), StereoError> {
-        let (output, evidence) = self.depths_of(views, references, cancel, keep_evidence)?;
+        keep_features: bool,
+    ) -> Result<(StereoOutput, Vec<ViewFeatures>), StereoError> {
+        let (output, features) = self.depths_of(views, references, cancel, keep_features)?;
         if output.prediction.views.is_empty() && !output.omitted.is_empty() {
             let found_deg = output.omitted.iter().map(|o| o.found_parallax_deg).fold(0.0, f64::max);
             let needed_deg = self.config.min_parallax_deg;
             return Err(StereoError::NoParallax { chunk: views.id, found_deg, needed_deg });
         }
-        Ok((output, evidence))
+        Ok((output, features))
     }
 
-    /// The whole of it; references without parallax are omitted, even if that leaves none.
+    /// Predicts the references; those without parallax are omitted, even if that leaves none.
     fn depths_of(
         &self,
         views: &ChunkViews,
         references: &[usize],
         cancel: Cancel<'_>,
-        keep_evidence: bool,
-    ) -> Result<(StereoOutput, Vec<ViewEvidence>), StereoError> {
+        keep_features: bool,
+    ) -> Result<(StereoOutput, Vec<ViewFeatures>), StereoError> {
         let found = views.views.len();
         if found < MIN_VIEWS {
             return Err(StereoError::TooFewViews { chunk: views.id, found, needed: MIN_VIEWS });
@@ -132,15 +132,15 @@ impl StereoModel {
         }
         let references: BTreeSet<usize> = references.iter().copied().collect();
         let prepared: Vec<_> = views.views.par_iter().map(|v| prepare(v, &self.config)).collect();
-        // Collected one by one, so that the first bad view is the one named.
+        // Collected one by one, so that the error is that of the first bad view.
         let prepared = prepared.into_iter().collect::<Result<Vec<_>, _>>()?;
         let mut chunk = Chunk::new(prepared, &references, &self.config, cancel);
         chunk.work()?;
         let results: Vec<_> = references
             .par_iter()
-            .filter_map(|&r| checked_geometry(&chunk, r, &self.config, keep_evidence))
+            .filter_map(|&r| checked_geometry(&chunk, r, &self.config, keep_features))
             .collect();
-        let (geometries, evidence) = results.into_iter().collect::<Result<Vec<_>, _>>()?.into_iter().unzip();
+        let (geometries, features) = results.into_iter().collect::<Result<Vec<_>, _>>()?.into_iter().unzip();
         let omitted = references
             .iter()
             .filter(|r| !chunk.depths.contains_key(r))
@@ -152,21 +152,21 @@ impl StereoModel {
             .collect();
         let prediction =
             GeometryPrediction { chunk_id: views.id, frame: ChunkFrame::PriorWorld, views: geometries };
-        Ok((StereoOutput { prediction, omitted }, evidence))
+        Ok((StereoOutput { prediction, omitted }, features))
     }
 }
 
-/// A view's depth after the checks against its neighbours' own; nothing without parallax.
+/// A view's depth after the checks against its neighbours' own; `None` without parallax.
 fn checked_geometry(
     chunk: &Chunk<'_>,
     reference: usize,
     config: &StereoConfig,
-    keep_evidence: bool,
-) -> Option<Result<(ViewGeometry, ViewEvidence), StereoError>> {
+    keep_features: bool,
+) -> Option<Result<(ViewGeometry, ViewFeatures), StereoError>> {
     let own = chunk.depths.get(&reference)?;
     let others: Vec<_> = chunk.checked(reference).iter().filter_map(|i| chunk.depths.get(i)).collect();
     let supports = support(own, &others, config);
-    Some(geometry(&chunk.views[reference], own, &supports, config, keep_evidence))
+    Some(geometry(&chunk.views[reference], own, &supports, config, keep_features))
 }
 
 fn geometry(
@@ -174,12 +174,12 @@ fn geometry(
     own: &ViewDepth,
     supports: &[Support],
     config: &StereoConfig,
-    keep_evidence: bool,
-) -> Result<(ViewGeometry, ViewEvidence), StereoError> {
+    keep_features: bool,
+) -> Result<(ViewGeometry, ViewFeatures), StereoError> {
     let level = &view.levels[0];
     let mut rho = vec![f32::NAN; supports.len()];
     let mut confident = vec![0.0f32; supports.len()];
-    let of = |i: usize| evidence(&own.estimate, i, &supports[i], &view.misfit, config);
+    let of = |i: usize| pixel_features(&own.estimate, i, &supports[i], &view.correction, config);
     for (i, support) in supports.iter().enumerate() {
         let p = of(i).confidence();
         if support.rho > 0.0 && f64::from(p) >= config.min_confidence && support.agreeing > 0 {
@@ -202,8 +202,8 @@ fn geometry(
         depth: RelativeDepth::new(image(depth)?),
         confidence: Confidence::new(image(confident)?),
     };
-    let pixels = if keep_evidence { (0..supports.len()).map(of).collect() } else { Vec::new() };
-    Ok((geometry, ViewEvidence { frame_id: view.frame_id, pixels }))
+    let pixels = if keep_features { (0..supports.len()).map(of).collect() } else { Vec::new() };
+    Ok((geometry, ViewFeatures { frame_id: view.frame_id, pixels }))
 }
 
 impl GeometryModel for StereoModel {
@@ -216,15 +216,15 @@ impl GeometryModel for StereoModel {
         Ok(self.predict_with(views, &references, &|| false)?.prediction)
     }
 
-    /// Views without parallax are left out, even if that leaves none; the context is estimated as far as the checks
-    /// of the wanted views need it.
+    /// Views without parallax are omitted, even if that leaves none; context views are estimated only as far as the
+    /// consistency checks of the requested views need them.
     fn predict_views(
         &mut self,
         views: &ChunkViews,
-        wanted: Range<usize>,
+        requested: Range<usize>,
         cancel: &(dyn Fn() -> bool + Sync),
     ) -> Result<GeometryPrediction, ModelError> {
-        let references: Vec<usize> = wanted.filter(|&i| i < views.views.len()).collect();
+        let references: Vec<usize> = requested.filter(|&i| i < views.views.len()).collect();
         Ok(self.depths_of(views, &references, cancel, false)?.0.prediction)
     }
 }

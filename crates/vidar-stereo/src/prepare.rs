@@ -1,11 +1,11 @@
-//! Views as the matcher wants them: grey, at the working size, with two coarser levels and intrinsics that fit.
+//! Preparation of views for matching: grey, at the working size, with two coarser levels and their intrinsics.
 
 use crate::config::StereoConfig;
 use crate::error::StereoError;
-use crate::register::Misfit;
+use crate::register::PoseCorrection;
 use vidar_core::{ChunkView, FrameId, Image, Pinhole, Se3};
 
-/// Fewest rows and columns of a working image: the coarsest level still holds a few windows then.
+/// Fewest rows and columns of a working image: the coarsest level then still contains a few windows.
 pub(crate) const MIN_SIZE_PX: usize = 32;
 
 /// One level of the image pyramid.
@@ -23,8 +23,8 @@ pub(crate) struct Level {
 pub(crate) struct Prepared {
     pub frame_id: FrameId,
     pub world_from_camera: Se3,
-    /// How well its pose suits the images; nothing is known where poses are taken as given.
-    pub misfit: Misfit,
+    /// Size and residual of its pose correction; zero where poses are taken as given.
+    pub correction: PoseCorrection,
     /// Working size, half of it, a quarter of it.
     pub levels: [Level; 3],
 }
@@ -66,7 +66,7 @@ pub(crate) fn prepare(view: &ChunkView, config: &StereoConfig) -> Result<Prepare
     Ok(Prepared {
         frame_id: frame,
         world_from_camera,
-        misfit: Misfit::default(),
+        correction: PoseCorrection::default(),
         levels: [working, half, quarter],
     })
 }
@@ -89,7 +89,7 @@ fn halved(level: &Level) -> Level {
     Level { width, height, gray, intrinsics }
 }
 
-/// Exact area average: every source pixel counts by its overlap with the target pixel.
+/// Exact area average: every source pixel is weighted by its overlap with the target pixel.
 fn area_average(image: &Image<f32>, width: usize, height: usize) -> Vec<f32> {
     let columns = overlaps(image.width(), width);
     let rows = overlaps(image.height(), height);

@@ -1,9 +1,9 @@
 //! From the coarse winners to slanted planes at the working size.
 //!
 //! Every pixel holds a plane `ρ(x+dx, y+dy) = ρ + gx·dx + gy·dy` in inverse depth, which is exactly a plane in space.
-//! In each round a pixel tries the planes of pixels around it and small changes of its own, and keeps the one whose
+//! In each round a pixel tests the planes of pixels around it and small changes of its own, and keeps the one whose
 //! windows correlate best in the better half of the neighbours (the idea of PatchMatch stereo, Bleyer 2011). All
-//! pixels read the previous round, so the order does not matter. A weak pull towards the semi-global solution decides
+//! pixels read the previous round, so the order does not matter. A weak prior at the semi-global solution decides
 //! where the texture does not.
 
 use crate::config::StereoConfig;
@@ -25,18 +25,18 @@ struct Plane {
     curvature: f32,
 }
 
-/// Pull towards the coarse solution per plane of difference, in units of a full mismatch.
+/// Penalty of a deviation from the coarse solution, per plane of difference, in units of a full mismatch.
 const PRIOR_WEIGHT: f32 = 0.05;
 /// Differences from the coarse solution beyond this many planes cost no more.
 const PRIOR_LIMIT_PLANES: f32 = 2.0;
-/// Brightness difference at which a pixel of the window counts 1/e, grey levels.
+/// Brightness difference at which a pixel's weight in the window is halved, grey levels.
 const BILATERAL_GRAY: f32 = 25.0;
 /// Window of the refinement: every other pixel of 7 × 7.
 const REACH: i32 = 3;
 const SAMPLES: usize = 25;
-/// Neighbours that the refinement looks at: the best few say most, and each costs the same time.
+/// Neighbours used by the refinement: the best few contribute most, and each costs the same time.
 const MOST_SOURCES: usize = 3;
-/// From where planes are tried, in turns: near ones, then further ones.
+/// Offsets of the pixels whose planes are tested, by round: near ones, then further ones.
 const FROM: [[(i32, i32); 4]; 2] = [[(-1, 0), (1, 0), (0, -1), (0, 1)], [(-4, 1), (4, -1), (1, 4), (-1, -4)]];
 
 /// Refines `winners` (at `coarse`'s size) on `fine`.
@@ -54,7 +54,7 @@ pub(crate) fn refine(
     let step = planes.step;
     let mut state: Vec<Plane> = prior.clone();
     for round in 0..config.refine_rounds.max(1) {
-        // With no round at all the planes are only scored.
+        // Without rounds the planes are only scored.
         let search = config.refine_rounds > 0;
         let delta = 0.4 * step * 0.5f32.powi(round as i32);
         let before = state;
@@ -78,7 +78,7 @@ pub(crate) fn refine(
                         }
                         let q = before[qy as usize * w + qx as usize];
                         let rho = q.rho - q.gx * dx as f32 - q.gy * dy as f32;
-                        // Hardly another plane: not worth the time.
+                        // Nearly the same plane: skipped.
                         if rho > 0.0 && (rho - own.rho).abs() > 0.5 * delta {
                             let candidate = patches.scored(Plane { rho, ..q }, center, step, &patch);
                             if candidate.score < best.score {
@@ -191,7 +191,7 @@ impl Patches<'_> {
                 let (px, py) = ((x + dx).clamp(0, w - 1), (y + dy).clamp(0, h - 1));
                 let gray = at(px, py);
                 let difference = (gray - center).abs() / BILATERAL_GRAY;
-                // A rational fall-off: as good as the exponential one, and quick.
+                // A rational fall-off: as good as an exponential one, and faster.
                 let weight = 1.0 / (1.0 + difference * difference);
                 (patch.dx[i], patch.dy[i]) = ((px - x) as f32, (py - y) as f32);
                 (patch.gray[i], patch.weight[i]) = (gray, weight);
@@ -211,8 +211,8 @@ impl Patches<'_> {
 
     fn scored(&self, plane: Plane, center: f32, step: f32, patch: &Patch) -> Plane {
         let cost = self.cost(&plane, patch);
-        let pull = ((plane.rho - center).abs() / step).min(PRIOR_LIMIT_PLANES);
-        Plane { score: cost + PRIOR_WEIGHT * pull, cost, ..plane }
+        let deviation = ((plane.rho - center).abs() / step).min(PRIOR_LIMIT_PLANES);
+        Plane { score: cost + PRIOR_WEIGHT * deviation, cost, ..plane }
     }
 
     /// The best of a plane and the two `delta` nearer and further, with the vertex of the parabola through them.
@@ -234,7 +234,7 @@ impl Patches<'_> {
         Plane { rho: plane.rho + offset * delta, curvature: bend, ..plane }
     }
 
-    /// Mean of `1 − ncc` over the better half of the neighbours; 1 where none sees the window.
+    /// Mean of `1 − ncc` over the better half of the neighbours; 1 where the window is visible in none.
     fn cost(&self, plane: &Plane, patch: &Patch) -> f32 {
         let mut costs = [f32::INFINITY; MOST_SOURCES];
         let n = self.sources.len().min(MOST_SOURCES);

@@ -1,11 +1,11 @@
 //! Small corrections of the given poses, so that the images agree with them to a fraction of a pixel.
 //!
-//! Poses from odometry, from a depth camera's tracker or from a clock that is some milliseconds off put a pixel some
-//! pixels aside of where it is, and stereo then finds a wrong depth or none. Here corners of every view, placed at the
-//! depth that a quick look found, are searched around where the poses say, and a small bundle adjustment (Triggs 2000)
-//! moves the poses: unknown are a correction per view and an inverse depth per corner, the given poses enter as
-//! measurements with the spreads of the settings, wrong matches are weighed down (Cauchy). Inverse depths are
-//! eliminated (a scalar each), and what is left is a dense system of six unknowns a view.
+//! Errors of odometry, of a depth camera's tracker or of a clock displace projections by several pixels, and stereo then
+//! finds a wrong depth or none. Corners of every view, at the depth of the probe, are therefore matched around their
+//! projections in other views, and a small bundle adjustment (Triggs 2000) corrects the poses: unknown are a correction
+//! per view and an inverse depth per corner, the given poses are priors with the standard deviations of the settings,
+//! and outliers are down-weighted (Cauchy). Inverse depths are eliminated (a scalar each), which leaves a dense system of
+//! six unknowns per view.
 
 mod solve;
 
@@ -22,7 +22,7 @@ use vidar_core::Se3;
 const CELL_PX: usize = 20;
 /// Radius of a corner's template.
 const TEMPLATE: isize = 4;
-/// Radius of the search around the predicted place, working pixels.
+/// Radius of the search around the predicted position, working pixels.
 const SEARCH: isize = 6;
 /// Views that a corner is searched in.
 const SEARCHED_VIEWS: usize = 5;
@@ -31,73 +31,75 @@ const MIN_CORRELATION: f32 = 0.85;
 /// Least standard deviation of a template in multiples of the noise: weaker ones match anything.
 const MIN_TEXTURE: f32 = 4.0;
 
-/// A corner of one view and where it was found in others.
+/// A corner of one view and its observations in others.
 #[derive(Clone, Debug)]
 pub(crate) struct Track {
-    /// The view it was taken from.
-    pub anchor: usize,
+    /// Its host view.
+    pub host: usize,
     /// Its ray there, z = 1.
     pub ray: Vector3<f64>,
     /// Inverse depth there, 1/m.
     pub rho: f64,
-    /// Views and pixels where it was found.
-    pub found: Vec<(usize, Vector2<f64>)>,
+    /// Views and pixels of its observations.
+    pub observations: Vec<(usize, Vector2<f64>)>,
 }
 
 /// A corrected pose.
-pub(crate) struct Placed {
+pub(crate) struct CorrectedPose {
     pub world_from_camera: Se3,
-    /// How well the poses suited the images before, and how well they do now.
-    pub misfit: Misfit,
+    /// Size and residual of the correction.
+    pub correction: PoseCorrection,
 }
 
-/// How the poses of a view and the images around it suit each other, medians in working pixels.
+/// Size and residual of a view's pose correction, medians in working pixels.
 #[derive(Clone, Copy, Debug, Default)]
-pub(crate) struct Misfit {
-    /// Shift of what the view shares with others by the correction.
+pub(crate) struct PoseCorrection {
+    /// Shift of the view's matches by the correction.
     pub shift_px: f32,
-    /// What is left between matches and corrected poses.
+    /// Residual of the matches with the corrected poses.
     pub residual_px: f32,
 }
 
-/// The views' poses, corrected; the given ones where there is nothing to correct them by.
-pub(crate) fn register(views: &[Prepared], probes: &[Option<Probe>], config: &StereoConfig) -> Vec<Placed> {
+/// The views' poses, corrected; the given ones where there are too few matches.
+pub(crate) fn register(
+    views: &[Prepared],
+    probes: &[Option<Probe>],
+    config: &StereoConfig,
+) -> Vec<CorrectedPose> {
     let mut tracks: Vec<Track> = (0..views.len())
         .into_par_iter()
         .flat_map_iter(|i| tracks_of(views, i, probes[i].as_ref(), config))
         .collect();
     let cameras: Vec<_> = views.iter().map(|v| v.levels[0].intrinsics).collect();
     let given: Vec<Se3> = views.iter().map(|v| v.world_from_camera).collect();
-    let spread = solve::Spread {
-        rotation_rad: config.pose_spread_deg.to_radians(),
-        translation_m: config.pose_spread_m,
-    };
-    let poses = solve::adjusted(&given, &cameras, &mut tracks, &spread);
-    let misfits = solve::misfits(&given, &poses, &cameras, &tracks);
+    let prior =
+        solve::PosePrior { rotation_rad: config.pose_std_deg.to_radians(), translation_m: config.pose_std_m };
+    let poses = solve::adjusted(&given, &cameras, &mut tracks, &prior);
+    let corrections = solve::corrections(&given, &poses, &cameras, &tracks);
     poses
         .into_iter()
-        .zip(misfits)
-        .map(|(world_from_camera, misfit)| Placed { world_from_camera, misfit })
+        .zip(corrections)
+        .map(|(world_from_camera, correction)| CorrectedPose { world_from_camera, correction })
         .collect()
 }
 
-/// Corners of a view with known depth, each searched in the views that see it best.
-fn tracks_of(views: &[Prepared], anchor: usize, probe: Option<&Probe>, config: &StereoConfig) -> Vec<Track> {
+/// Corners of a view with known depth, each matched in its best neighbours.
+fn tracks_of(views: &[Prepared], host: usize, probe: Option<&Probe>, config: &StereoConfig) -> Vec<Track> {
     let Some(probe) = probe else { return Vec::new() };
     let searched = select(
         views,
-        anchor,
+        host,
         &[probe.depth.median],
         &StereoConfig { neighbours: SEARCHED_VIEWS, ..config.clone() },
     )
     .neighbours;
-    let own = &views[anchor].levels[0];
-    let coarse = &views[anchor].levels[PROBE_LEVEL];
+    let own = &views[host].levels[0];
+    let coarse = &views[host].levels[PROBE_LEVEL];
     let warps: Vec<Warp> = searched
         .iter()
         .map(|&n| {
             let motion =
-                neighbour_from_reference(&views[n].world_from_camera, &views[anchor].world_from_camera);
+                neighbour_from_reference(&views[n].world_from_camera, &views[host].world_from_camera);
             Warp::new(&own.intrinsics, &views[n].levels[0].intrinsics, &motion)
         })
         .collect();
@@ -110,16 +112,16 @@ fn tracks_of(views: &[Prepared], anchor: usize, probe: Option<&Probe>, config: &
         if !(rho > 0.0) || template.deviation < MIN_TEXTURE * config.noise_gray as f32 {
             continue;
         }
-        let mut found = Vec::new();
+        let mut observations = Vec::new();
         for (warp, &n) in warps.iter().zip(&searched) {
             let Some((u, v, _)) = warp.project(x as f32, y as f32, rho) else { continue };
             if let Some(pixel) = template.search(&views[n].levels[0], u, v) {
-                found.push((n, pixel));
+                observations.push((n, pixel));
             }
         }
-        if found.len() >= 2 {
+        if observations.len() >= 2 {
             let ray = own.intrinsics.ray(x as f64, y as f64);
-            tracks.push(Track { anchor, ray, rho: f64::from(rho), found });
+            tracks.push(Track { host, ray, rho: f64::from(rho), observations });
         }
     }
     tracks
@@ -164,7 +166,7 @@ fn corners(level: &Level) -> Vec<(usize, usize)> {
 const SIDE: usize = 2 * TEMPLATE as usize + 1;
 const AREA: usize = SIDE * SIDE;
 
-/// A window of grey levels, its mean taken off.
+/// A window of grey levels, with zero mean.
 struct Template {
     gray: [f32; AREA],
     deviation: f32,
@@ -192,8 +194,8 @@ impl Template {
         sum / (AREA as f32 * self.deviation * other.deviation).max(1e-6)
     }
 
-    /// Where it correlates best within the search radius, to a fraction of a pixel; `None` if nowhere well enough, or
-    /// only at the edge of the search.
+    /// Position of the best correlation within the search radius, to a fraction of a pixel; `None` if the correlation is
+    /// too low, or highest at the border of the search.
     fn search(&self, level: &Level, u: f32, v: f32) -> Option<Vector2<f64>> {
         let (u, v) = (u.round() as isize, v.round() as isize);
         let at = |dx: isize, dy: isize| -> f32 {

@@ -1,7 +1,7 @@
-//! Which views a reference is matched against.
+//! Selection of the neighbours that a reference is matched with.
 //!
-//! A good neighbour sees the same surface (overlap), from far enough aside to tell depths apart and near enough to
-//! look alike (parallax), and adds something to the neighbours chosen before it (another side). The weight of the
+//! A good neighbour observes the same surface (overlap), with a baseline wide enough to resolve depth and narrow enough
+//! for similar appearance (parallax), and in another direction than the neighbours chosen before it. The weight of the
 //! parallax angle is the piecewise Gaussian used by multi-view stereo since Goesele 2007 and MVSNet.
 
 use crate::config::StereoConfig;
@@ -9,12 +9,12 @@ use crate::prepare::Prepared;
 use nalgebra::Vector3;
 use vidar_core::LieGroup;
 
-/// Share of the reference that a neighbour has to see.
+/// Least share of the reference that is visible in a neighbour.
 const MIN_OVERLAP: f64 = 0.25;
 /// Fall-off of the weight above the best parallax, as a multiple of the best parallax.
 const WIDE_SIGMA: f64 = 1.5;
 
-/// What a candidate is worth at one scene depth.
+/// Score of a candidate at one scene depth.
 struct Candidate {
     index: usize,
     score: f64,
@@ -58,11 +58,11 @@ pub(crate) fn select(
     Selection { neighbours: choose(candidates, config.neighbours), best_parallax_deg }
 }
 
-/// Greedy choice; a candidate near one already chosen is worth less.
+/// Greedy choice; a candidate near one already chosen scores less.
 fn choose(mut candidates: Vec<Candidate>, count: usize) -> Vec<usize> {
     let mut chosen = Vec::with_capacity(count);
     while chosen.len() < count {
-        // Ties go to the earlier view, so that the choice is one of the input alone.
+        // Ties go to the earlier view, so that the choice depends on the input only.
         let Some(best) = (0..candidates.len())
             .reduce(|a, b| if candidates[b].score > candidates[a].score { b } else { a })
         else {
@@ -71,7 +71,7 @@ fn choose(mut candidates: Vec<Candidate>, count: usize) -> Vec<usize> {
         let taken = candidates.remove(best);
         for other in &mut candidates {
             let apart = (other.offset - taken.offset).norm() / taken.offset.norm().max(f64::MIN_POSITIVE);
-            // Half a baseline apart counts nearly in full, the same place a fifth.
+            // Half a baseline apart scores nearly in full, the same position a fifth.
             other.score *= 1.0 - 0.8 * (-(apart / 0.3).powi(2)).exp();
         }
         chosen.push(taken.index);
@@ -85,13 +85,13 @@ fn angle_weight(angle_deg: f64, config: &StereoConfig) -> f64 {
     (-0.5 * ((angle_deg - best) / sigma).powi(2)).exp()
 }
 
-/// Share of a grid of reference pixels at depth `z_m` that `other` sees, and their mean parallax, degrees.
+/// Share of a grid of reference pixels at depth `z_m` that is visible in `other`, and their mean parallax, degrees.
 pub(crate) fn overlap_and_parallax(reference: &Prepared, other: &Prepared, z_m: f64) -> (f64, f64) {
     const GRID: usize = 6;
     let (k, k_other) = (&reference.levels[0].intrinsics, &other.levels[0].intrinsics);
     let other_from_reference = other.world_from_camera.inverse() * reference.world_from_camera;
     let center = other_from_reference.translation;
-    let (mut seen, mut angle) = (0usize, 0.0);
+    let (mut visible, mut angle) = (0usize, 0.0);
     for i in 0..GRID {
         for j in 0..GRID {
             let x = (i as f64 + 0.5) / GRID as f64 * k.width as f64 - 0.5;
@@ -103,11 +103,11 @@ pub(crate) fn overlap_and_parallax(reference: &Prepared, other: &Prepared, z_m: 
                 && pixel.x <= (k_other.width - 1) as f64
                 && pixel.y <= (k_other.height - 1) as f64;
             if inside {
-                seen += 1;
+                visible += 1;
                 // Between the rays from the two centres to the point.
                 angle += point.angle(&(point - center)).to_degrees();
             }
         }
     }
-    (seen as f64 / (GRID * GRID) as f64, if seen > 0 { angle / seen as f64 } else { 0.0 })
+    (visible as f64 / (GRID * GRID) as f64, if visible > 0 { angle / visible as f64 } else { 0.0 })
 }

@@ -5,7 +5,7 @@
 //! All numbers are integers, so the sum does not depend on the order of directions or threads.
 
 use crate::prepare::Level;
-use crate::sweep::UNSEEN;
+use crate::sweep::INVISIBLE;
 
 /// Penalties of the smoothness term.
 #[derive(Clone, Copy, Debug)]
@@ -18,7 +18,7 @@ pub(crate) struct Penalties {
 
 /// Brightness step at which P2 has fallen to half, grey levels.
 const HALVING_STEP_GRAY: f32 = 12.0;
-/// Neutral cost of a plane that no neighbour sees: as bad as no correlation.
+/// Neutral cost of a plane that is visible in no neighbour: that of no correlation.
 const NEUTRAL: i16 = 254;
 
 /// Sums of the path costs by row, column, plane; `costs` as from the sweep. Needs `2·costs.len()` `i16`.
@@ -51,7 +51,7 @@ fn half_pass(image: &Level, costs: &[u8], planes: usize, penalties: Penalties, f
             let x = if flipped { w - 1 - step_x } else { step_x };
             let pixel = y * w + x;
             for (c, &raw) in cost.iter_mut().zip(&costs[pixel * planes..][..planes]) {
-                *c = if raw == UNSEEN { NEUTRAL } else { i16::from(raw) };
+                *c = if raw == INVISIBLE { NEUTRAL } else { i16::from(raw) };
             }
             let sum = &mut sums[pixel * planes..][..planes];
             let jump = |qx: usize, qy: usize| {

@@ -1,17 +1,17 @@
-//! Plane sweep (Collins 1996; Gallup 2007): for every pixel and inverse depth, how well the neighbours agree.
+//! Plane sweep (Collins 1996; Gallup 2007): matching costs of every pixel and inverse depth.
 //!
 //! The measure is zero-mean normalised cross-correlation over a small square window, which does not change with
 //! gain and offset of the exposure. With noise variance σ² added to both variances,
 //! `ncc = cov / √((var_r + σ²)(var_n + σ²))` goes to zero where there is no texture, so that noise matches nothing.
-//! Costs are `254·clamp(1 − ncc, 0, 1)` in `u8`, and 255 where a neighbour does not see the window. Over the
-//! neighbours the better half is averaged: what is hidden in some of them is mostly seen in the others.
+//! Costs are `254·clamp(1 − ncc, 0, 1)` in `u8`, and 255 where the window is not visible in a neighbour. The
+//! better half of the neighbours is averaged: a surface that is occluded in some of them is mostly visible in others.
 
 use crate::prepare::Level;
 use crate::warp::{Warp, sample};
 use rayon::prelude::*;
 
-/// Cost of a window that a neighbour does not see.
-pub(crate) const UNSEEN: u8 = 255;
+/// Cost of a window that is not visible in a neighbour.
+pub(crate) const INVISIBLE: u8 = 255;
 /// Cost of no correlation at all.
 pub(crate) const WORST: f32 = 254.0;
 /// Rows that one task computes; small enough for the strip's costs to stay in the cache.
@@ -19,7 +19,7 @@ const STRIP_ROWS: usize = 8;
 /// Window radius, pixels.
 pub(crate) const RADIUS: usize = 2;
 
-/// A neighbour's image and where to look in it.
+/// A neighbour's image and the warp into it.
 #[derive(Clone, Copy)]
 pub(crate) struct Source<'a> {
     pub level: &'a Level,
@@ -44,7 +44,7 @@ impl Planes {
 /// Costs by row, column, plane (plane fastest): `height·width·planes.count` bytes.
 pub(crate) fn sweep(reference: &Level, sources: &[Source<'_>], planes: &Planes, noise_gray: f32) -> Vec<u8> {
     let row_len = reference.width * planes.count;
-    let mut volume = vec![UNSEEN; reference.height * row_len];
+    let mut volume = vec![INVISIBLE; reference.height * row_len];
     volume.par_chunks_mut(STRIP_ROWS * row_len).enumerate().for_each(|(strip, costs)| {
         Strip::new(reference, strip * STRIP_ROWS, costs.len() / row_len, noise_gray)
             .sweep(sources, planes, costs);
@@ -116,8 +116,8 @@ impl<'a> Strip<'a> {
         let padded = (w + 2 * RADIUS) * (self.rows + 2 * RADIUS);
         let mut warped = vec![0.0f32; padded];
         let mut scratch = Scratch::new(w + 2 * RADIUS);
-        let mut per_source = vec![vec![UNSEEN; w * self.rows]; sources.len()];
-        let mut merged = vec![UNSEEN; w * self.rows];
+        let mut per_source = vec![vec![INVISIBLE; w * self.rows]; sources.len()];
+        let mut merged = vec![INVISIBLE; w * self.rows];
         for plane in 0..planes.count {
             let rho = planes.rho(plane as f32);
             for (source, out) in sources.iter().zip(&mut per_source) {
@@ -131,7 +131,7 @@ impl<'a> Strip<'a> {
         }
     }
 
-    /// The neighbour's image as the reference would see it if all were at inverse depth `rho`; NaN = unseen.
+    /// The neighbour's image warped to the reference by the plane at inverse depth `rho`; NaN = not visible.
     fn warp(&self, source: &Source<'_>, rho: f32, warped: &mut [f32]) {
         let (w, h) = (self.reference.width, self.reference.height);
         let (a, b) = (&source.warp.a, &source.warp.b);
@@ -187,8 +187,8 @@ impl<'a> Strip<'a> {
                 let variance = (q * INVERSE_AREA - mean * mean).max(0.0) + self.noise_variance;
                 let covariance = c * INVERSE_AREA - mean * mean_r[x];
                 let cost = WORST * (1.0 - covariance * inverse_r[x] / variance.sqrt());
-                // `max`/`min` would swallow the NaN that marks an unseen pixel.
-                out[x] = if s.is_nan() { UNSEEN } else { cost.clamp(0.0, WORST) as u8 };
+                // `max`/`min` would swallow the NaN that marks an invisible pixel.
+                out[x] = if s.is_nan() { INVISIBLE } else { cost.clamp(0.0, WORST) as u8 };
             }
         }
     }
@@ -218,7 +218,7 @@ fn repeat_borders(row: &mut [f32]) {
 }
 
 /// Sorts the neighbours' costs at each pixel (a compare-exchange network over whole rows, so that it vectorises) and
-/// averages the better half of all neighbours; an unseen cost in that half repeats the best seen one.
+/// averages the better half of all neighbours; an invisible one in that half repeats the best visible one.
 pub(crate) fn merge_better_half(per_source: &mut [Vec<u8>], merged: &mut [u8]) {
     let n = per_source.len();
     for pass in 0..n {
@@ -235,7 +235,7 @@ pub(crate) fn merge_better_half(per_source: &mut [Vec<u8>], merged: &mut [u8]) {
         let mut sum = 0u32;
         for costs in &per_source[..half] {
             let cost = costs[pixel];
-            sum += u32::from(if cost == UNSEEN { best } else { cost });
+            sum += u32::from(if cost == INVISIBLE { best } else { cost });
         }
         *out = (sum / half as u32) as u8;
     }

@@ -1,4 +1,4 @@
-//! Where a pixel of the reference appears in a neighbour, as a function of its inverse depth.
+//! Projection of a reference pixel into a neighbour, as a function of its inverse depth.
 //!
 //! With `p = (x, y, 1)` and inverse depth `ρ = 1/z`, the point `z K_r⁻¹ p` projects to
 //! `p_n ~ K_n (R K_r⁻¹ p + ρ t) = A p + ρ b`, where `R, t` are `neighbour_from_reference`.

@@ -10,9 +10,9 @@ use vidar_core::{
 };
 use vidar_stereo::{StereoConfig, StereoModel};
 
-/// Frames of each recording, and which of them are judged.
+/// Frames of each recording, and which of them are evaluated.
 const FRAMES: usize = 9;
-const WANTED: std::ops::Range<usize> = 3..6;
+const EVALUATED: std::ops::Range<usize> = 3..6;
 
 fn shared() -> PathBuf {
     std::env::var_os("VIDAR_SHARED")
@@ -48,16 +48,16 @@ fn view(i: usize, path: &Path, world_from_camera: Se3, k: impl Fn(usize, usize) 
     }
 }
 
-/// Completeness, and the share of what is there that is within 10 % of the sensor.
-fn judged(views: Vec<ChunkView>, sensor: &[(Image<f32>, Pinhole, Se3)]) -> (f64, f64) {
+/// Completeness, and the share of the depths that is within 10 % of the sensor.
+fn evaluate(views: Vec<ChunkView>, sensor: &[(Image<f32>, Pinhole, Se3)]) -> (f64, f64) {
     let chunk = ChunkViews { id: ChunkId(0), views };
     let mut model = StereoModel::new(StereoConfig::default()).expect("defaults are valid");
-    let found = model.predict_views(&chunk, WANTED, &|| false).expect("has parallax").views;
-    assert_eq!(found.len(), WANTED.len());
-    let (mut seen, mut there, mut near) = (0usize, 0usize, 0usize);
+    let found = model.predict_views(&chunk, EVALUATED, &|| false).expect("has parallax").views;
+    assert_eq!(found.len(), EVALUATED.len());
+    let (mut with_truth, mut there, mut near) = (0usize, 0usize, 0usize);
     for view in found {
         let (truth, k, color_from_depth) = &sensor[view.frame_id.0 as usize];
-        // Every third sensor pixel, carried into the colour camera.
+        // Every third sensor pixel, projected into the colour camera.
         for (x, y) in (0..k.height).step_by(3).flat_map(|y| (0..k.width).step_by(3).map(move |x| (x, y))) {
             let z = truth[(x, y)];
             let p = *color_from_depth * (k.ray(x as f64, y as f64) * f64::from(z));
@@ -67,13 +67,13 @@ fn judged(views: Vec<ChunkView>, sensor: &[(Image<f32>, Pinhole, Se3)]) -> (f64,
             if !inside || u as usize >= view.intrinsics.width || v as usize >= view.intrinsics.height {
                 continue;
             }
-            seen += 1;
+            with_truth += 1;
             let z = f64::from(view.depth.image()[(u as usize, v as usize)]);
             there += usize::from(z.is_finite());
             near += usize::from((z - p.z).abs() < 0.1 * p.z);
         }
     }
-    (there as f64 / seen.max(1) as f64, near as f64 / there.max(1) as f64)
+    (there as f64 / with_truth.max(1) as f64, near as f64 / there.max(1) as f64)
 }
 
 fn sorted(folder: &Path, end: &str) -> Vec<PathBuf> {
@@ -85,7 +85,7 @@ fn sorted(folder: &Path, end: &str) -> Vec<PathBuf> {
 }
 
 #[test]
-fn a_room_seen_by_a_headset_has_depth_that_is_mostly_right() {
+fn depth_of_a_room_seen_by_a_headset_is_mostly_correct() {
     let folder = shared().join("data/hololens_commonroom");
     if !folder.is_dir() {
         eprintln!("skipped: no real frames at {}", folder.display());
@@ -103,12 +103,12 @@ fn a_room_seen_by_a_headset_has_depth_that_is_mostly_right() {
         views.push(view);
         sensor.push((truth, k, Se3::IDENTITY));
     }
-    let (complete, near) = judged(views, &sensor);
+    let (complete, near) = evaluate(views, &sensor);
     assert!(complete > 0.2 && near > 0.8, "completeness {complete:.3}, within 10 % {near:.3}");
 }
 
 #[test]
-fn a_kitchen_with_poses_of_another_clock_has_depth_that_is_mostly_right() {
+fn depth_of_a_kitchen_with_poses_of_another_clock_is_mostly_correct() {
     let folder = shared().join("data/7scenes_redkitchen/seq-01");
     if !folder.is_dir() {
         eprintln!("skipped: no real frames at {}", folder.display());
@@ -125,6 +125,6 @@ fn a_kitchen_with_poses_of_another_clock_has_depth_that_is_mostly_right() {
         let k = Pinhole::new(585.0, 585.0, 320.0, 240.0, 640, 480).expect("a camera");
         sensor.push((depth(Path::new(&format!("{name}.depth.png"))), k, color_from_depth));
     }
-    let (complete, near) = judged(views, &sensor);
+    let (complete, near) = evaluate(views, &sensor);
     assert!(complete > 0.25 && near > 0.7, "completeness {complete:.3}, within 10 % {near:.3}");
 }

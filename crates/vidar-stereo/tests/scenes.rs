@@ -21,7 +21,7 @@ fn middle(chunk: &ChunkViews) -> ViewGeometry {
 }
 
 /// Completeness and AbsRel against the truth.
-fn judged(scene: &Scene, view: &ViewGeometry) -> (f64, f64) {
+fn evaluate(scene: &Scene, view: &ViewGeometry) -> (f64, f64) {
     let truth = depth(scene, &poses()[MIDDLE]);
     let errors: Vec<f64> = (view.depth.image().data().iter().zip(truth.data()))
         .filter(|(z, _)| z.is_finite())
@@ -44,38 +44,38 @@ fn plain(_: usize) -> (f64, f64) {
 }
 
 #[test]
-fn textured_walls_straight_and_slanted_are_dense_and_right() {
+fn textured_walls_straight_and_slanted_are_dense_and_accurate() {
     for (name, scene) in [("straight", WALL), ("slanted", slanted())] {
-        let (complete, absrel) = judged(&scene, &middle(&views(&scene, &poses(), plain, 0.0)));
+        let (complete, absrel) = evaluate(&scene, &middle(&views(&scene, &poses(), plain, 0.0)));
         assert!(complete > 0.8 && absrel < 0.02, "{name}: completeness {complete:.3}, AbsRel {absrel:.4}");
     }
 }
 
 #[test]
 fn a_board_in_front_keeps_its_edges() {
-    let (complete, absrel) = judged(&boxed(), &middle(&views(&boxed(), &poses(), plain, 0.0)));
+    let (complete, absrel) = evaluate(&boxed(), &middle(&views(&boxed(), &poses(), plain, 0.0)));
     assert!(complete > 0.7 && absrel < 0.02, "completeness {complete:.3}, AbsRel {absrel:.4}");
 }
 
 #[test]
-fn exposure_of_each_view_hardly_matters() {
-    let same = judged(&slanted(), &middle(&views(&slanted(), &poses(), plain, 0.0)));
+fn exposure_of_each_view_has_little_effect() {
+    let same = evaluate(&slanted(), &middle(&views(&slanted(), &poses(), plain, 0.0)));
     let varied = |i: usize| if i.is_multiple_of(2) { (0.6, 20.0) } else { (1.0, 0.0) };
-    let other = judged(&slanted(), &middle(&views(&slanted(), &poses(), varied, 0.0)));
+    let other = evaluate(&slanted(), &middle(&views(&slanted(), &poses(), varied, 0.0)));
     assert!((same.1 - other.1).abs() < 0.01 && other.0 > 0.8, "{same:?} {other:?}");
 }
 
 #[test]
-fn noise_of_five_gray_levels_is_survived() {
-    let (complete, absrel) = judged(&slanted(), &middle(&views(&slanted(), &poses(), plain, 5.0)));
+fn noise_of_five_gray_levels_is_tolerated() {
+    let (complete, absrel) = evaluate(&slanted(), &middle(&views(&slanted(), &poses(), plain, 5.0)));
     assert!(complete > 0.7 && absrel < 0.02, "completeness {complete:.3}, AbsRel {absrel:.4}");
 }
 
 #[test]
-fn a_bare_noisy_wall_yields_next_to_nothing() {
+fn a_bare_noisy_wall_has_hardly_any_depth() {
     let bare = Scene { textured: false, ..WALL };
     let view = middle(&views(&bare, &poses(), plain, 2.0));
-    let (complete, absrel) = judged(&bare, &view);
+    let (complete, absrel) = evaluate(&bare, &view);
     let trust =
         view.confidence.image().data().iter().sum::<f32>() / view.confidence.image().data().len() as f32;
     assert!(
@@ -85,7 +85,7 @@ fn a_bare_noisy_wall_yields_next_to_nothing() {
 }
 
 #[test]
-fn turning_on_the_spot_is_an_error_that_says_so() {
+fn pure_rotation_is_an_error_of_missing_parallax() {
     let turns: Vec<Se3> = (0..4)
         .map(|i| Se3::new(So3::exp(&Vector3::new(0.0, 0.05 * i as f64, 0.0)), Vector3::zeros()))
         .collect();
@@ -97,7 +97,7 @@ fn turning_on_the_spot_is_an_error_that_says_so() {
 }
 
 #[test]
-fn a_view_far_away_is_omitted_and_the_others_go_on() {
+fn a_view_far_away_is_omitted_and_the_others_are_estimated() {
     let mut places = poses();
     places.push(Se3::from_translation(Vector3::new(500.0, 0.0, 0.0)));
     let chunk = views(&WALL, &places, plain, 0.0);
@@ -107,7 +107,7 @@ fn a_view_far_away_is_omitted_and_the_others_go_on() {
 }
 
 #[test]
-fn bad_views_are_named() {
+fn errors_name_the_bad_view() {
     let good = views(&WALL, &poses()[..3], plain, 0.0);
     let mut one = good.clone();
     one.views.truncate(1);
@@ -149,9 +149,9 @@ fn the_bits_do_not_depend_on_threads_nor_on_the_order_of_views() {
 }
 
 #[test]
-fn confidence_is_the_share_that_is_right() {
+fn confidence_is_the_share_of_correct_pixels() {
     let mut bins = [(0usize, 0usize, 0.0f64); 5];
-    // None of these was looked at when the weights were chosen.
+    // None of these was used when the weights were fitted.
     let small_board = Scene { board: Some((0.3, 1.5)), ..WALL };
     let steep = Scene { normal: Vector3::new(-0.7, 0.3, 1.0).normalize(), distance: 2.2, ..WALL };
     let far = Scene { distance: 4.5, ..WALL };
@@ -170,7 +170,10 @@ fn confidence_is_the_share_that_is_right() {
         }
     }
     for (count, right, sum) in bins.iter().filter(|b| b.0 >= 500) {
-        let (said, held) = (sum / *count as f64, *right as f64 / *count as f64);
-        assert!((said - held).abs() < 0.15, "said {said:.3}, held {held:.3} of {count}: {bins:?}");
+        let (predicted, observed) = (sum / *count as f64, *right as f64 / *count as f64);
+        assert!(
+            (predicted - observed).abs() < 0.15,
+            "predicted {predicted:.3}, observed {observed:.3} of {count}: {bins:?}"
+        );
     }
 }

@@ -1,4 +1,4 @@
-//! Chunks of a stream: only what is wanted, nothing twice, and poses that the images correct.
+//! Chunks of a stream: requested views only, and poses corrected by the images.
 
 #![allow(clippy::expect_used, reason = "helpers of tests may stop at the first surprise, as tests may")]
 
@@ -50,28 +50,32 @@ fn ids(views: &[ViewGeometry]) -> Vec<u32> {
     views.iter().map(|v| v.frame_id.0).collect()
 }
 
-/// Predicts, and counts how often it was asked whether to stop: once before each piece of work.
-fn counted(model: &mut StereoModel, chunk: &ChunkViews, wanted: Range<usize>) -> (Vec<ViewGeometry>, usize) {
-    let asked = AtomicUsize::new(0);
+/// Predicts, and counts the polls of `cancel`: one before each unit of work.
+fn counted(
+    model: &mut StereoModel,
+    chunk: &ChunkViews,
+    requested: Range<usize>,
+) -> (Vec<ViewGeometry>, usize) {
+    let polls = AtomicUsize::new(0);
     let cancel = || {
-        asked.fetch_add(1, Ordering::Relaxed);
+        polls.fetch_add(1, Ordering::Relaxed);
         false
     };
-    let prediction = model.predict_views(chunk, wanted, &cancel).expect("has parallax");
-    (prediction.views, asked.into_inner())
+    let prediction = model.predict_views(chunk, requested, &cancel).expect("has parallax");
+    (prediction.views, polls.into_inner())
 }
 
 #[test]
-fn only_wanted_views_come_back_and_the_others_are_worked_out_only_as_far_as_they_serve() {
+fn only_requested_views_are_returned_and_few_context_views_are_estimated() {
     let all = views(&boxed(), &flight(8), |_| (1.0, 0.0), 2.0);
     let (found, work) = counted(&mut model(), &all, 3..5);
     assert_eq!(ids(&found), [3, 4]);
-    // Eight probes, the two wanted, and one or two more for each to be checked against.
+    // Eight probes, the two requested, and one or two more for each to be checked against.
     assert!((8 + 3..=8 + 6).contains(&work), "{work}");
 }
 
 #[test]
-fn a_chunk_is_predicted_alike_whatever_was_predicted_before() {
+fn a_prediction_does_not_depend_on_earlier_calls() {
     let all = views(&boxed(), &flight(12), |_| (1.0, 0.0), 2.0);
     let mut streaming = model();
     counted(&mut streaming, &part(&all, 0..8), 0..5);
@@ -86,8 +90,8 @@ fn a_chunk_is_predicted_alike_whatever_was_predicted_before() {
 }
 
 #[test]
-fn views_that_nobody_asked_for_change_nothing_but_through_the_matching() {
-    // The same call twice, and the whole chunk in between: a model keeps nothing.
+fn a_model_keeps_no_state_between_calls() {
+    // The same call twice, and the whole chunk in between: the model keeps no state.
     let all = views(&boxed(), &flight(6), |_| (1.0, 0.0), 2.0);
     let mut used = model();
     let first = used.predict_views(&all, 2..3, &|| false).expect("has parallax");
@@ -97,18 +101,18 @@ fn views_that_nobody_asked_for_change_nothing_but_through_the_matching() {
 }
 
 #[test]
-fn wanted_views_without_parallax_are_left_out_and_cancelling_is_heard() {
+fn requested_views_without_parallax_are_omitted_and_cancelling_works() {
     let turns: Vec<Se3> = (0..4)
         .map(|i| Se3::new(So3::exp(&Vector3::new(0.0, 0.05 * i as f64, 0.0)), Vector3::zeros()))
         .collect();
     let chunk = views(&WALL, &turns, |_| (1.0, 0.0), 0.0);
-    let prediction = model().predict_views(&chunk, 1..3, &|| false).expect("nothing is no error here");
+    let prediction = model().predict_views(&chunk, 1..3, &|| false).expect("no depth is not an error here");
     assert!(prediction.views.is_empty());
     let chunk = views(&WALL, &flight(4), |_| (1.0, 0.0), 0.0);
     assert!(matches!(model().predict_views(&chunk, 1..3, &|| true), Err(ModelError::Cancelled)));
-    // Heard as well in the middle of the work.
-    let asked = AtomicUsize::new(0);
-    let late = || asked.fetch_add(1, Ordering::Relaxed) > 5;
+    // Also in the middle of the work.
+    let polls = AtomicUsize::new(0);
+    let late = || polls.fetch_add(1, Ordering::Relaxed) > 5;
     assert!(matches!(model().predict_views(&chunk, 0..4, &late), Err(ModelError::Cancelled)));
 }
 
@@ -121,7 +125,7 @@ fn right(scene: &Scene, truth_pose: &Se3, view: &ViewGeometry) -> f64 {
 }
 
 #[test]
-fn poses_that_jitter_are_straightened_by_the_images() {
+fn noisy_poses_are_corrected_by_the_images() {
     let true_poses = flight(9);
     let mut chunk = views(&boxed(), &true_poses, |_| (1.0, 0.0), 2.0);
     for (i, view) in chunk.views.iter_mut().enumerate() {
@@ -134,7 +138,7 @@ fn poses_that_jitter_are_straightened_by_the_images() {
         view.world_from_camera = Some(true_poses[i] * jitter);
         view.time = Timestamp::from_nanos(i as i64 * 50_000_000);
     }
-    let taken_as_given = StereoConfig { pose_spread_deg: 0.0, ..StereoConfig::default() };
+    let taken_as_given = StereoConfig { pose_std_deg: 0.0, ..StereoConfig::default() };
     let score = |config: StereoConfig| {
         let mut model = StereoModel::new(config).expect("valid");
         let found = model.predict_views(&chunk, 4..5, &|| false).expect("has parallax");

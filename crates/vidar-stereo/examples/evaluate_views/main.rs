@@ -1,15 +1,15 @@
-//! Judges stereo view by view on recordings with sensor depth: how much is there, how right it is, and whether
-//! confidence is the share that is right.
+//! Evaluates stereo view by view on recordings with sensor depth: completeness, accuracy, and calibration of the
+//! confidence.
 //!
 //! ```sh
-//! cargo run --release -p vidar-stereo --example judge_views -- RECORDING [FLAG VALUE]...
+//! cargo run --release -p vidar-stereo --example evaluate_views -- RECORDING [FLAG VALUE]...
 //! ```
 //!
-//! Of the recording: `--camera-model`, `--depth-intrinsics`, `--color-from-depth` as `vidar run` takes them.
+//! Of the recording: `--camera-model`, `--depth-intrinsics`, `--color-from-depth` as for `vidar run`.
 //! Which keyframes: `--min-translation-m`, `--min-rotation-deg`, `--first N`, `--last N` (of the keyframes).
-//! Settings of stereo: `--set key=value`. What is worked into the input, so that it is no longer right: `--jitter-deg`,
-//! `--jitter-m` (noise of each pose), `--lag-ms` (poses late by so much), `--focal-ratio`, `--center-px`, `--seed N`.
-//! `--csv FILE` writes a sample of the evidence with the error, for `fit_confidence`.
+//! Settings of stereo: `--set key=value`. Errors added to the input: `--jitter-deg`, `--jitter-m` (noise of each pose),
+//! `--lag-ms` (delay of the poses), `--focal-ratio`, `--center-px`, `--seed N`.
+//! `--csv FILE` writes a sample of the features with the error, for `fit_confidence`.
 
 #![allow(clippy::print_stdout, reason = "its output is what the example is for")]
 
@@ -34,26 +34,26 @@ fn main() -> Result<(), Box<dyn Error>> {
     let model = StereoModel::new(config)?;
     let mut score = Score::default();
     let count = recording.keyframes.len();
-    let wanted = request.first.min(count)..request.last.min(count);
+    let evaluated = request.first.min(count)..request.last.min(count);
     let views = recording.views(&request)?;
     let (mut omitted, before) = (0, processor_secs());
-    for (number, start) in wanted.clone().step_by(CHUNK).enumerate() {
-        let core = start..(start + CHUNK).min(wanted.end);
-        let seen = start.saturating_sub(CONTEXT)..(core.end + CONTEXT).min(count);
-        let chunk = ChunkViews { id: ChunkId(number as u32), views: views[seen.clone()].to_vec() };
-        let references: Vec<usize> = core.map(|i| i - seen.start).collect();
-        let (output, evidence) = model.predict_with_evidence(&chunk, &references, &|| false)?;
+    for (number, start) in evaluated.clone().step_by(CHUNK).enumerate() {
+        let core = start..(start + CHUNK).min(evaluated.end);
+        let window = start.saturating_sub(CONTEXT)..(core.end + CONTEXT).min(count);
+        let chunk = ChunkViews { id: ChunkId(number as u32), views: views[window.clone()].to_vec() };
+        let references: Vec<usize> = core.map(|i| i - window.start).collect();
+        let (output, features) = model.predict_with_features(&chunk, &references, &|| false)?;
         omitted += output.omitted.len();
-        for (view, evidence) in output.prediction.views.iter().zip(&evidence) {
+        for (view, features) in output.prediction.views.iter().zip(&features) {
             let truth = recording.sensor_depth(view)?;
-            score.add(view, evidence, &truth);
+            score.add(view, features, &truth);
         }
     }
     let secs = processor_secs() - before;
-    println!("{}: {} keyframes, {omitted} without parallax", request.name(), wanted.len());
+    println!("{}: {} keyframes, {omitted} without parallax", request.name(), evaluated.len());
     println!(
         "  processor time {:.0} ms a view, with reading the truth",
-        1e3 * secs / wanted.len().max(1) as f64
+        1e3 * secs / evaluated.len().max(1) as f64
     );
     score.print();
     if let Some(path) = &request.csv {
@@ -62,7 +62,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     Ok(())
 }
 
-/// Processor time of this process so far, all threads, seconds; zero where the system does not tell.
+/// Processor time of this process so far, all threads, seconds; zero where the system does not report it.
 fn processor_secs() -> f64 {
     let stat = std::fs::read_to_string("/proc/self/stat").unwrap_or_default();
     // After the name in parentheses; user and system time are the 14th and 15th field, in hundredths of a second.

@@ -1,4 +1,4 @@
-//! Recordings as the judge wants them: keyframes, undistorted views, sensor depth in a view's pixels.
+//! Reading of recordings: keyframes, undistorted views, sensor depth in a view's pixels.
 
 use nalgebra::Vector3;
 use std::error::Error;
@@ -10,7 +10,7 @@ use vidar_dataset::{CameraFlag, Dataset, ImageEntry, OpenOptions};
 /// Widest undistorted view, as the program's default is.
 const WIDEST_PX: usize = 640;
 
-/// What was asked for.
+/// The command line.
 pub struct Request {
     path: PathBuf,
     options: OpenOptions,
@@ -30,7 +30,7 @@ pub struct Request {
 
 impl Request {
     pub fn parse(args: &[String]) -> Result<Self, Box<dyn Error>> {
-        let (path, flags) = args.split_first().ok_or("usage: judge_views RECORDING [FLAG VALUE]...")?;
+        let (path, flags) = args.split_first().ok_or("usage: evaluate_views RECORDING [FLAG VALUE]...")?;
         let mut request = Self {
             path: path.into(),
             options: OpenOptions::default(),
@@ -87,7 +87,7 @@ impl Request {
 pub struct Keyframe {
     image: ImageEntry,
     world_from_camera: Se3,
-    /// Some time later or earlier, where poses are asked to be late.
+    /// The pose at the delayed time.
     lagging: Se3,
 }
 
@@ -126,7 +126,7 @@ impl Recording {
         Ok(Self { dataset, keyframes, remap })
     }
 
-    /// Every keyframe as the model sees it, with the errors that were asked for.
+    /// Every keyframe as input of the model, with the requested errors.
     pub fn views(&self, request: &Request) -> Result<Vec<ChunkView>, Box<dyn Error>> {
         let mut draw = Draw(request.seed);
         let target = self.remap.target();
@@ -156,35 +156,19 @@ impl Recording {
             .collect()
     }
 
-    /// The sensor's depth at a view's pixels: every depth pixel is carried over, the nearest one wins; NaN elsewhere.
+    /// The sensor's depth registered to a view; NaN without depth.
     pub fn sensor_depth(&self, view: &ViewGeometry) -> Result<Image<f32>, Box<dyn Error>> {
         let sensor = self.dataset.depth_sensor.as_ref().ok_or("no depth camera")?;
         let keyframe =
             self.keyframes.iter().find(|k| k.image.frame_id == view.frame_id).ok_or("no such frame")?;
-        // The true camera, also where the model was told another one.
+        // The true camera, also where the model is given another one.
         let k = self.remap.target().resized(view.intrinsics.width, view.intrinsics.height)?;
-        let mut out = Image::filled(k.width, k.height, f32::NAN);
-        let Some(entry) = self.dataset.depth_for(keyframe.image.time) else { return Ok(out) };
+        let Some(entry) = self.dataset.depth_for(keyframe.image.time) else {
+            return Ok(Image::filled(k.width, k.height, f32::NAN));
+        };
         let depth = self.dataset.load_depth(entry)?;
-        let (image, kd) = (depth.image(), &sensor.intrinsics);
-        for y in 0..image.height() {
-            for x in 0..image.width() {
-                let z = f64::from(image[(x, y)]);
-                if z.is_nan() {
-                    continue;
-                }
-                let p = sensor.color_from_depth * (kd.ray(x as f64, y as f64) * z);
-                let Some(pixel) = k.project(&p) else { continue };
-                let (u, v) = (pixel.x.round(), pixel.y.round());
-                if u >= 0.0 && v >= 0.0 && u < k.width as f64 && v < k.height as f64 {
-                    let cell = &mut out[(u as usize, v as usize)];
-                    if cell.is_nan() || p.z < f64::from(*cell) {
-                        *cell = p.z as f32;
-                    }
-                }
-            }
-        }
-        Ok(out)
+        let registered = vidar_eval::register_depth(&depth, &sensor.intrinsics, &sensor.color_from_depth, &k);
+        Ok(registered.image().clone())
     }
 }
 

@@ -1,14 +1,14 @@
-//! What the judge counts.
+//! Scores of depth and of confidence.
 
 use std::fmt::Write;
 use vidar_core::{Image, ViewGeometry};
-use vidar_stereo::{Evidence, TOLERANCE_RATIO, ViewEvidence};
+use vidar_stereo::{PixelFeatures, TOLERANCE_RATIO, ViewFeatures};
 
 /// Relative step of the sensor's depth that makes an edge.
 const EDGE_RATIO: f32 = 0.05;
-/// Pixels beside an edge where a sensor of another place and time is not to be trusted.
+/// Pixels beside an edge where a sensor at another position and time is not accurate.
 const EDGE_PX: usize = 3;
-/// One pixel of so many goes into the sample.
+/// One of this many pixels is sampled.
 const SAMPLED: usize = 61;
 const BINS: usize = 10;
 
@@ -16,8 +16,8 @@ const BINS: usize = 10;
 #[derive(Clone, Copy, Default)]
 struct Bin {
     count: usize,
-    right: usize,
-    said: f64,
+    correct: usize,
+    predicted: f64,
 }
 
 /// A pixel of the sample.
@@ -30,7 +30,7 @@ struct Row {
     error: f32,
     at_edge: bool,
     kept: bool,
-    evidence: Evidence,
+    features: PixelFeatures,
 }
 
 #[derive(Default)]
@@ -41,22 +41,22 @@ pub struct Score {
     within_m: [usize; 2],
     bins: [Bin; BINS],
     bins_off_edges: [Bin; BINS],
-    misfits: Vec<(f32, f32, f32)>,
+    corrections: Vec<(f32, f32, f32)>,
     sample: Vec<Row>,
     views: usize,
 }
 
 impl Score {
-    pub fn add(&mut self, view: &ViewGeometry, evidence: &ViewEvidence, truth: &Image<f32>) {
+    pub fn add(&mut self, view: &ViewGeometry, features: &ViewFeatures, truth: &Image<f32>) {
         let (w, depth, confidence) =
             (truth.width(), view.depth.image().data(), view.confidence.image().data());
         let edges = edges(truth);
         let mut own = Vec::new();
         for (i, &t) in truth.data().iter().enumerate().filter(|(_, t)| t.is_finite()) {
             self.truths += 1;
-            let (z, evidence) = (depth[i], evidence.pixels[i]);
-            if (i % w * 31 + i / w * 17) % SAMPLED == 0 && evidence.agreeing > 0 {
-                let error = (1.0 / evidence.rho - t) / t;
+            let (z, features) = (depth[i], features.pixels[i]);
+            if (i % w * 31 + i / w * 17) % SAMPLED == 0 && features.agreeing > 0 {
+                let error = (1.0 / features.rho - t) / t;
                 self.sample.push(Row {
                     view: self.views,
                     x: i % w,
@@ -65,7 +65,7 @@ impl Score {
                     error,
                     at_edge: edges[i],
                     kept: z.is_finite(),
-                    evidence,
+                    features,
                 });
             }
             if z.is_nan() {
@@ -79,16 +79,16 @@ impl Score {
             let bin = ((confidence[i] * BINS as f32) as usize).min(BINS - 1);
             let count = |bins: &mut [Bin; BINS]| {
                 bins[bin].count += 1;
-                bins[bin].right += usize::from(error.abs() < TOLERANCE_RATIO);
-                bins[bin].said += f64::from(confidence[i]);
+                bins[bin].correct += usize::from(error.abs() < TOLERANCE_RATIO);
+                bins[bin].predicted += f64::from(confidence[i]);
             };
             count(&mut self.bins);
             if !edges[i] {
                 count(&mut self.bins_off_edges);
             }
         }
-        if let Some(e) = evidence.pixels.first() {
-            self.misfits.push((e.shift_px, e.residual_px, quantile(&mut own, 0.5)));
+        if let Some(e) = features.pixels.first() {
+            self.corrections.push((e.shift_px, e.residual_px, quantile(&mut own, 0.5)));
         }
         self.errors.extend(own);
         self.views += 1;
@@ -109,7 +109,7 @@ impl Score {
             self.within_m[1] as f64 / n,
         );
         let list = |of: fn(&(f32, f32, f32)) -> f32| {
-            let mut values: Vec<f32> = self.misfits.iter().map(of).collect();
+            let mut values: Vec<f32> = self.corrections.iter().map(of).collect();
             [0.1, 0.5, 0.9].map(|share| quantile(&mut values, share))
         };
         println!(
@@ -120,22 +120,22 @@ impl Score {
         );
         for (name, bins) in [("all pixels", &self.bins), ("off depth edges", &self.bins_off_edges)] {
             let total: usize = bins.iter().map(|b| b.count).sum();
-            let said: f64 = bins.iter().map(|b| b.said).sum();
-            let right: usize = bins.iter().map(|b| b.right).sum();
-            let gap: f64 = bins.iter().map(|b| (b.said - b.right as f64).abs()).sum();
+            let predicted: f64 = bins.iter().map(|b| b.predicted).sum();
+            let correct: usize = bins.iter().map(|b| b.correct).sum();
+            let gap: f64 = bins.iter().map(|b| (b.predicted - b.correct as f64).abs()).sum();
             let n = total.max(1) as f64;
             print!(
-                "  {name}: calibration error {:.3}, said {:.3}, held {:.3};",
+                "  {name}: calibration error {:.3}, predicted {:.3}, observed {:.3};",
                 gap / n,
-                said / n,
-                right as f64 / n
+                predicted / n,
+                correct as f64 / n
             );
             for bin in bins.iter().filter(|b| b.count > 0) {
                 let count = bin.count as f64;
                 print!(
                     "  {:.2}→{:.2} ({:.0} %)",
-                    bin.said / count,
-                    bin.right as f64 / count,
+                    bin.predicted / count,
+                    bin.correct as f64 / count,
                     100.0 * count / n
                 );
             }
@@ -143,14 +143,14 @@ impl Score {
         }
     }
 
-    /// The sample: where, the sensor's depth, the relative error, whether at an edge, whether kept, the evidence.
+    /// The sample: where, the sensor's depth, the relative error, whether at an edge, whether kept, the features.
     pub fn csv(&self) -> String {
         let mut out = String::from(
-            "view,x,y,truth_m,error,edge,kept,rho,agreeing,asked,spread,cost,margin,curvature,texture,\
+            "view,x,y,truth_m,error,edge,kept,rho,agreeing,compared,rms_difference,cost,margin,curvature,texture,\
              resolution_px,shift_px,residual_px,confidence\n",
         );
         for row in &self.sample {
-            let Row { view, x, y, truth_m, error, at_edge, kept, evidence: e } = row;
+            let Row { view, x, y, truth_m, error, at_edge, kept, features: e } = row;
             let _ = writeln!(
                 out,
                 "{view},{x},{y},{truth_m},{error},{},{},{},{},{},{},{},{},{},{},{},{},{},{}",
@@ -158,8 +158,8 @@ impl Score {
                 u8::from(*kept),
                 e.rho,
                 e.agreeing,
-                e.asked,
-                e.spread,
+                e.compared,
+                e.rms_difference,
                 e.cost,
                 e.margin,
                 e.curvature,
