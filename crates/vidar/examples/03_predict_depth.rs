@@ -2,7 +2,7 @@
 #![allow(clippy::print_stdout)] // an example prints
 
 use vidar_core::remap::{RemapTable, undistorted_view};
-use vidar_core::{ChunkId, ChunkView, ChunkViews, Duration, GeometryModel};
+use vidar_core::{BodyFrame, ChunkId, ChunkView, ChunkViews, Duration, GeometryModel};
 use vidar_dataset::{Dataset, OpenOptions};
 use vidar_stereo::{StereoConfig, StereoModel};
 use vidar_synth::predict::{TruePlace, true_views};
@@ -44,7 +44,7 @@ fn read_views(dataset: &Dataset, count: usize) -> Result<ChunkViews, Failure> {
     let camera = &dataset.rig.camera(dataset.camera).ok_or("the rig lacks the camera")?.model;
     let remap = RemapTable::new(camera, &undistorted_view(camera, camera.width(), camera.height())?);
     let truth = dataset.ground_truth.as_ref().ok_or("the sequence has no ground truth")?;
-    let trajectory = truth.in_camera_frame(dataset.camera, &dataset.rig)?;
+    let trajectory = truth.in_frame(BodyFrame::Camera(dataset.camera), &dataset.rig)?;
     let view = |entry: &vidar_dataset::ImageEntry| -> Result<ChunkView, Failure> {
         Ok(ChunkView {
             frame_id: entry.frame_id,

@@ -27,7 +27,10 @@ pub fn main() -> Result<(), Failure> {
         squares += (view.world_from_camera.translation - truth.translation).norm_squared();
     }
     let rmse_m = (squares / placement.views.len() as f64).sqrt();
-    println!("{} views placed, camera centres within {rmse_m:.3} m of the truth (RMS)", placement.views.len());
+    println!(
+        "{} views placed, camera centres within {rmse_m:.3} m of the truth (RMS)",
+        placement.views.len()
+    );
     assert!(placement.is_metric && placement.views.len() == FRAMES && rmse_m < 0.05);
     Ok(())
 }
@@ -35,8 +38,7 @@ pub fn main() -> Result<(), Failure> {
 /// Chunks of 12 frames, of which neighbours share 4; every fourth frame has a metric pose.
 fn align(simulation: &Arc<Simulation>) -> Result<Placement, Failure> {
     let errors = PredictionErrors::default();
-    let mut network =
-        SyntheticModel::new(Arc::clone(simulation), errors, Conditioning::PoseFree, 112, 1)?;
+    let mut network = SyntheticModel::new(Arc::clone(simulation), errors, Conditioning::PoseFree, 112, 1)?;
     let mut aligner = Aligner::new(CouplingMode::Coupled, &AlignerConfig::default())?;
     for (id, range) in (0..).zip(chunk_ranges(FRAMES, 12, 4)?) {
         let prediction = network.predict(&views(simulation, ChunkId(id), range.clone())?)?;

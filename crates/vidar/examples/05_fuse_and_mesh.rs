@@ -1,7 +1,7 @@
 //! Metric depth and poses fused into a surface: a TSDF volume, its mesh as a PLY file, and its F-score.
 #![allow(clippy::print_stdout)] // an example prints
 
-use vidar_core::{AlignedView, Confidence, Duration, PointCloud, Se3};
+use vidar_core::{AlignedView, BodyFrame, Confidence, Duration, PointCloud, Se3};
 use vidar_dataset::OpenOptions;
 use vidar_eval::{SurfaceEvalConfig, evaluate_surface};
 use vidar_fusion::{FusionConfig, TsdfVolume};
@@ -17,7 +17,7 @@ pub fn main() -> Result<(), Failure> {
     let dataset = vidar_dataset::open(folder.path(), &OpenOptions::default())?;
     let sensor = dataset.depth_sensor.as_ref().ok_or("the sequence has no depth")?;
     let truth = dataset.ground_truth.as_ref().ok_or("the sequence has no ground truth")?;
-    let trajectory = truth.in_camera_frame(dataset.camera, &dataset.rig)?;
+    let trajectory = truth.in_frame(BodyFrame::Camera(dataset.camera), &dataset.rig)?;
 
     let mut volume = TsdfVolume::new(&FusionConfig { voxel_size_m: 0.04, ..FusionConfig::default() })?;
     for image in &dataset.images {
