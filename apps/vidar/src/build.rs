@@ -5,7 +5,7 @@ use std::path::Path;
 use vidar::config::Origin;
 use vidar::core::{BodyFrame, CameraId, Se3, So3};
 use vidar::dataset::{CameraFlag, OpenOptions, TrajectoryReadOptions};
-use vidar::run_folder::Place;
+use vidar::run_folder::OutputLocation;
 use vidar::synth::{FlightKind, SceneKind, Start, SynthConfig};
 use vidar::{Error, Layered};
 
@@ -176,10 +176,10 @@ fn motion(text: &str) -> Result<Se3, Error> {
 }
 
 /// Where results go.
-pub fn place(output: &OutputArgs, name: &str) -> Place {
+pub fn place(output: &OutputArgs, name: &str) -> OutputLocation {
     match &output.output {
-        Some(path) => Place::Exact { path: path.clone(), force: output.force },
-        None => Place::Dated { base: ".".into(), name: name.to_owned() },
+        Some(path) => OutputLocation::Exact { path: path.clone(), force: output.force },
+        None => OutputLocation::Dated { base: ".".into(), name: name.to_owned() },
     }
 }
 

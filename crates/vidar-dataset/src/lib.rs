@@ -29,7 +29,7 @@ pub use dataset::{
 pub use error::DatasetError;
 pub use options::{DatasetKind, OpenOptions, TimeUnit, TrajectoryFormat, TrajectoryReadOptions};
 
-pub use trajectory_file::{read_trajectory, trajectory_from};
+pub use trajectory_file::{read_times, read_trajectory, trajectory_from};
 
 use std::path::Path;
 

@@ -31,6 +31,14 @@ pub fn trajectory_from(
     Ok((read.trajectory, read.notes))
 }
 
+/// Reads a file of times, one per line, such as the times of the poses of a KITTI trajectory.
+pub fn read_times(path: &Path, unit: Option<TimeUnit>) -> Result<Vec<Timestamp>, DatasetError> {
+    let bytes = read_text_file(path)?;
+    let rule = unit.map_or(UnitRule::Guess, UnitRule::Given);
+    let (times, _) = parse::time_list(&Source { path, bytes: &bytes }, rule)?;
+    Ok(times.into_iter().map(|t| t.time).collect())
+}
+
 /// The warning when neither the user nor the file states whose poses they are.
 pub(crate) fn assumed_body(body: BodyFrame, path: &Path) -> Warning {
     let whose = match body {

@@ -127,12 +127,14 @@ impl<'a> Client<'a> {
         }
         request.call().map_err(|e| {
             let reason = e.to_string();
-            let error = HubError::Network { url, reason };
             match e {
                 ureq::Error::BadUri(_) | ureq::Error::Tls(_) | ureq::Error::InvalidProxyUrl => {
-                    Failure::Final(error)
+                    Failure::Final(HubError::Network { url, reason })
                 }
-                _ => Failure::Temporary(error, None),
+                e if is_connection_failure(&e) => {
+                    Failure::Temporary(HubError::NoConnection { url, reason }, None)
+                }
+                _ => Failure::Temporary(HubError::Network { url, reason }, None),
             }
         })
     }
@@ -172,6 +174,27 @@ impl<'a> Client<'a> {
             408 | 500.. => Err(Failure::Temporary(HubError::Status { url, status }, None)),
             _ => Err(Failure::Final(HubError::Status { url, status })),
         }
+    }
+}
+
+/// Whether no connection was established: no network, an unknown host, or no server at the address.
+fn is_connection_failure(error: &ureq::Error) -> bool {
+    use std::io::ErrorKind as K;
+    match error {
+        ureq::Error::HostNotFound | ureq::Error::ConnectionFailed => true,
+        // A failed name lookup has no error kind of its own, so errors of an established connection are excluded.
+        ureq::Error::Io(e) => !matches!(
+            e.kind(),
+            K::ConnectionReset
+                | K::ConnectionAborted
+                | K::BrokenPipe
+                | K::UnexpectedEof
+                | K::TimedOut
+                | K::WouldBlock
+                | K::Interrupted
+                | K::InvalidData
+        ),
+        _ => false,
     }
 }
 

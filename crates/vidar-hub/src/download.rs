@@ -76,8 +76,8 @@ pub(crate) fn fetch(
     callbacks: &TransferCallbacks<'_>,
 ) -> Result<FetchedFile, HubError> {
     let metadata = retried(settings, callbacks, || request_metadata(client, request).map_err(|f| (f, 0)))?;
-    let expected = Expected::of(request, &metadata)?;
-    let part = Part::of(request, &expected);
+    let expected = ExpectedFile::of(request, &metadata)?;
+    let part = PartialFile::of(request, &expected);
     let digest = retried(settings, callbacks, || attempt(client, request, &expected, &part, callbacks))?;
     part.into_place(request.target)?;
     Ok(FetchedFile {
@@ -130,17 +130,19 @@ fn request_metadata(client: &Client<'_>, request: &FileRequest<'_>) -> Result<Fi
         // A plain mirror may not support HEAD; what is missing is checked when the file streams.
         Err(Failure::Final(HubError::Status { status: 405, .. }))
         | Err(Failure::Temporary(HubError::Status { status: 501, .. }, _)) => Ok(FileMetadata::default()),
+        // Without any connection, waiting for a retry only delays the message. During a transfer it is retried.
+        Err(Failure::Temporary(error @ HubError::NoConnection { .. }, _)) => Err(Failure::Final(error)),
         Err(failure) => Err(failure),
     }
 }
 
 /// Expected length and hash of the file, from catalogue and hub.
-struct Expected {
+struct ExpectedFile {
     bytes: Option<u64>,
     sha256: Option<String>,
 }
 
-impl Expected {
+impl ExpectedFile {
     fn of(request: &FileRequest<'_>, metadata: &FileMetadata) -> Result<Self, HubError> {
         let what = || request.url.to_owned();
         if let (Some(expected), Some(found)) = (request.bytes, metadata.bytes)
@@ -170,14 +172,14 @@ impl Expected {
 }
 
 /// The incomplete file.
-struct Part {
+struct PartialFile {
     path: PathBuf,
     /// Whether its existing bytes may be used.
     continues: bool,
 }
 
-impl Part {
-    fn of(request: &FileRequest<'_>, expected: &Expected) -> Self {
+impl PartialFile {
+    fn of(request: &FileRequest<'_>, expected: &ExpectedFile) -> Self {
         let key = expected.sha256.as_deref().map_or("new", |h| &h[..12]);
         let path = request.target.with_file_name(format!("{}.{key}.part", request.name));
         Self { path, continues: expected.sha256.is_some() }
@@ -202,8 +204,8 @@ impl Part {
 fn attempt(
     client: &Client<'_>,
     request: &FileRequest<'_>,
-    expected: &Expected,
-    part: &Part,
+    expected: &ExpectedFile,
+    part: &PartialFile,
     callbacks: &TransferCallbacks<'_>,
 ) -> Result<Digest, (Failure, u64)> {
     let last = |error: HubError| (Failure::Final(error), 0);
@@ -231,7 +233,7 @@ fn attempt(
     }
 }
 
-fn check_space(target: &Path, expected: &Expected, there: u64) -> Result<(), HubError> {
+fn check_space(target: &Path, expected: &ExpectedFile, there: u64) -> Result<(), HubError> {
     let Some(bytes) = expected.bytes else { return Ok(()) };
     let folder = target.parent().unwrap_or(Path::new("."));
     match crate::disk::free_bytes(folder) {
@@ -246,10 +248,10 @@ fn check_space(target: &Path, expected: &Expected, there: u64) -> Result<(), Hub
 fn stream(
     response: Response,
     request: &FileRequest<'_>,
-    expected: &Expected,
+    expected: &ExpectedFile,
     file: &mut File,
     digest: &mut Digest,
-    part: &Part,
+    part: &PartialFile,
     callbacks: &TransferCallbacks<'_>,
 ) -> Result<(), Failure> {
     let start = where_it_begins(&response, request, digest.bytes())?;
@@ -319,7 +321,7 @@ fn where_it_begins(response: &Response, request: &FileRequest<'_>, asked: u64) -
 fn check_length(
     response: &Response,
     request: &FileRequest<'_>,
-    expected: &Expected,
+    expected: &ExpectedFile,
     start: u64,
 ) -> Result<(), Failure> {
     let length: Option<u64> = header(&response.headers, "content-length").and_then(|v| v.trim().parse().ok());

@@ -95,6 +95,14 @@ pub enum HubError {
         /// The status.
         status: u16,
     },
+    /// No connection could be established.
+    #[error("no connection to {url}: {reason}")]
+    NoConnection {
+        /// The requested address.
+        url: String,
+        /// What went wrong.
+        reason: String,
+    },
     /// The connection failed, after all retries.
     #[error("{url}: {reason}")]
     Network {
@@ -221,6 +229,11 @@ impl HubError {
             }
             Self::NotFound { .. } => "check HF_ENDPOINT and --revision".to_owned(),
             Self::RateLimited { .. } => "wait, or set HF_TOKEN: the hub allows more requests with a token".to_owned(),
+            Self::NoConnection { .. } => {
+                "check the network connection; HF_ENDPOINT names a mirror, HTTPS_PROXY a proxy; `vidar model import FILE` copies \
+                 a local file"
+                    .to_owned()
+            }
             Self::Status { .. } | Self::Network { .. } => {
                 "try again: what was fetched is kept; HF_ENDPOINT names a mirror, HTTPS_PROXY a proxy".to_owned()
             }

@@ -40,6 +40,6 @@ pub use error::HubError;
 pub use pull::PullOptions;
 pub use settings::{ENDPOINT, HubSettings};
 pub use store::{
-    Acceptance, CheckpointLocation, IdentifiedBy, Installed, Record, RecordedFile, Store, Verified,
-    official_licence,
+    Acceptance, CheckpointLocation, IdentifiedBy, InstalledCheckpoint, Record, RecordedFile, Store,
+    VerifiedFile, official_licence,
 };

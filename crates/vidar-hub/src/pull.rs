@@ -8,8 +8,8 @@ use crate::error::HubError;
 use crate::header::{Header, read_header};
 use crate::lock::Lock;
 use crate::store::{
-    Acceptance, CheckpointLocation, IdentifiedBy, Installed, RECORD, RecordedFile, Store, make_folder,
-    minimal_config, record_of, write_json,
+    Acceptance, CheckpointLocation, IdentifiedBy, InstalledCheckpoint, RECORD, RecordedFile, Store,
+    make_folder, minimal_config, record_of, write_json,
 };
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -34,7 +34,7 @@ impl Store {
         checkpoint: &'static Checkpoint,
         options: &PullOptions,
         callbacks: &TransferCallbacks<'_>,
-    ) -> Result<Installed, HubError> {
+    ) -> Result<InstalledCheckpoint, HubError> {
         if let Some(acceptance) = &options.acceptance {
             self.accept(checkpoint, acceptance)?;
         }
@@ -105,7 +105,7 @@ impl Store {
         name: Option<&'static Checkpoint>,
         options: &PullOptions,
         callbacks: &TransferCallbacks<'_>,
-    ) -> Result<Installed, HubError> {
+    ) -> Result<InstalledCheckpoint, HubError> {
         let weights = weights_in(path)?;
         let (bytes, sha256) = sha256_of(&weights, callbacks)?;
         let checkpoint = identify(&weights, name, bytes, &sha256)?;
@@ -130,7 +130,7 @@ impl Store {
         self.installed(checkpoint)
     }
 
-    fn installed(&self, checkpoint: &'static Checkpoint) -> Result<Installed, HubError> {
+    fn installed(&self, checkpoint: &'static Checkpoint) -> Result<InstalledCheckpoint, HubError> {
         match self.find(checkpoint)? {
             Some(installed) if installed.location == CheckpointLocation::Store => Ok(installed),
             _ => Err(HubError::NotInstalled {

@@ -128,7 +128,7 @@ pub enum CheckpointLocation {
 
 /// A checkpoint that is on this machine.
 #[derive(Clone, Debug)]
-pub struct Installed {
+pub struct InstalledCheckpoint {
     /// Which one.
     pub checkpoint: &'static Checkpoint,
     /// The folder of its files.
@@ -141,7 +141,7 @@ pub struct Installed {
     pub acceptance: Option<Acceptance>,
 }
 
-impl Installed {
+impl InstalledCheckpoint {
     /// The file of weights.
     pub fn weights(&self) -> PathBuf {
         self.folder.join(WEIGHTS)
@@ -156,7 +156,7 @@ impl Installed {
 
 /// A verified file.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
-pub struct Verified {
+pub struct VerifiedFile {
     /// Which file.
     pub name: String,
     /// Its length.
@@ -190,12 +190,12 @@ impl Store {
     }
 
     /// The checkpoint, if all of its files are present; `None` otherwise. Lengths are checked, hashes are not.
-    pub fn find(&self, checkpoint: &'static Checkpoint) -> Result<Option<Installed>, HubError> {
+    pub fn find(&self, checkpoint: &'static Checkpoint) -> Result<Option<InstalledCheckpoint>, HubError> {
         let folder = self.folder(checkpoint);
         let acceptance = self.acceptance(checkpoint)?;
         if is_complete(&folder, checkpoint) {
             let record = read_record(&folder, checkpoint)?;
-            return Ok(Some(Installed {
+            return Ok(Some(InstalledCheckpoint {
                 checkpoint,
                 folder,
                 location: CheckpointLocation::Store,
@@ -204,7 +204,7 @@ impl Store {
             }));
         }
         let cached = self.settings.hub_cache.as_ref().and_then(|cache| in_hub_cache(cache, checkpoint));
-        Ok(cached.map(|folder| Installed {
+        Ok(cached.map(|folder| InstalledCheckpoint {
             checkpoint,
             folder,
             location: CheckpointLocation::HubCache,
@@ -214,7 +214,7 @@ impl Store {
     }
 
     /// The checkpoint, ready to be used: present, and its licence accepted if needed.
-    pub fn require(&self, checkpoint: &'static Checkpoint) -> Result<Installed, HubError> {
+    pub fn require(&self, checkpoint: &'static Checkpoint) -> Result<InstalledCheckpoint, HubError> {
         let Some(installed) = self.find(checkpoint)? else {
             let (name, looked) = (checkpoint.name.to_owned(), self.folder(checkpoint));
             return Err(HubError::NotInstalled { name, looked });
@@ -259,7 +259,7 @@ impl Store {
     }
 
     /// Every official checkpoint, with its installation if it is present.
-    pub fn list(&self) -> Result<Vec<(&'static Checkpoint, Option<Installed>)>, HubError> {
+    pub fn list(&self) -> Result<Vec<(&'static Checkpoint, Option<InstalledCheckpoint>)>, HubError> {
         CHECKPOINTS.iter().map(|c| Ok((c, self.find(c)?))).collect()
     }
 
@@ -268,7 +268,7 @@ impl Store {
         &self,
         checkpoint: &'static Checkpoint,
         callbacks: &TransferCallbacks<'_>,
-    ) -> Result<Vec<Verified>, HubError> {
+    ) -> Result<Vec<VerifiedFile>, HubError> {
         let Some(installed) = self.find(checkpoint)? else {
             let (name, looked) = (checkpoint.name.to_owned(), self.folder(checkpoint));
             return Err(HubError::NotInstalled { name, looked });
@@ -303,7 +303,7 @@ impl Store {
                 (None, Some(record)) => record.identified_by,
                 (None, None) => IdentifiedBy::Nobody,
             };
-            verified.push(Verified { name: official.name.to_owned(), bytes, sha256, identified_by });
+            verified.push(VerifiedFile { name: official.name.to_owned(), bytes, sha256, identified_by });
         }
         Ok(verified)
     }

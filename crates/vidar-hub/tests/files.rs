@@ -53,7 +53,7 @@ fn write(path: PathBuf, bytes: &[u8]) -> PathBuf {
     path
 }
 
-fn import(store: &Store, path: &Path) -> Result<vidar_hub::Installed, HubError> {
+fn import(store: &Store, path: &Path) -> Result<vidar_hub::InstalledCheckpoint, HubError> {
     store.import(path, Some(checkpoint()), &PullOptions::default(), &quiet())
 }
 

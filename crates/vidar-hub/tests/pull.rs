@@ -77,7 +77,7 @@ impl Bench {
         Self { folder, store, server }
     }
 
-    fn pull(&self, checkpoint: &'static Checkpoint) -> Result<vidar_hub::Installed, HubError> {
+    fn pull(&self, checkpoint: &'static Checkpoint) -> Result<vidar_hub::InstalledCheckpoint, HubError> {
         self.store.pull(checkpoint, &options(), &quiet())
     }
 
@@ -126,17 +126,17 @@ fn quiet() -> TransferCallbacks<'static> {
 #[test]
 fn a_checkpoint_is_fetched_recorded_verified_and_not_fetched_twice() {
     let bench = Bench::new(Reply::file);
-    let told = Cell::new(0);
+    let last = Cell::new(0);
     let watch = TransferCallbacks {
         progress: &|p| {
-            assert!(p.done >= told.get() || p.file == CONFIG);
-            told.set(p.done);
+            assert!(p.done >= last.get() || p.file == CONFIG);
+            last.set(p.done);
             assert!(p.file == CONFIG || p.total == weights().len() as u64);
         },
         cancel: &|| false,
     };
     let installed = bench.store.pull(tiny(), &options(), &watch).unwrap();
-    assert_eq!(told.get(), weights().len() as u64);
+    assert_eq!(last.get(), weights().len() as u64);
     assert_eq!(std::fs::read(installed.weights()).unwrap(), weights());
     assert_eq!(std::fs::read(installed.folder.join(CONFIG)).unwrap(), CONFIG_TEXT);
     assert_eq!(bench.files(), [".lock", CONFIG, WEIGHTS, "vidar-model.json"]);
@@ -200,8 +200,8 @@ fn a_corrupted_part_is_discarded_and_fetched_again() {
     let bench = Bench::new(Reply::file);
     std::fs::create_dir_all(bench.folder()).unwrap();
     let part = bench.folder().join(format!("{WEIGHTS}.{}.part", &hex(&weights())[..12]));
-    for spoilt in [vec![0; 1000], vec![0; weights().len()], vec![0; weights().len() + 5]] {
-        std::fs::write(&part, spoilt).unwrap();
+    for corrupted in [vec![0; 1000], vec![0; weights().len()], vec![0; weights().len() + 5]] {
+        std::fs::write(&part, corrupted).unwrap();
         let again = PullOptions { again: true, ..options() };
         let installed = bench.store.pull(tiny(), &again, &quiet()).unwrap();
         assert_eq!(std::fs::read(installed.weights()).unwrap(), weights());
@@ -314,6 +314,22 @@ fn requests_to_a_busy_or_broken_server_are_retried_and_finally_fail() {
     assert!(matches!(error, HubError::RateLimited { retry_after_secs: Some(3600), .. }), "{error}");
     assert_eq!(bench.server.requests().len(), 1, "an hour is not waited for");
     assert!(error.hint().unwrap().contains("HF_TOKEN"));
+}
+
+#[test]
+fn a_missing_connection_is_reported_without_retries() {
+    // A port that was free a moment ago: nothing answers there.
+    let address = std::net::TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap();
+    for endpoint in [format!("http://{address}"), "http://no-such-host.invalid".to_owned()] {
+        let folder = tempfile::tempdir().unwrap();
+        let settings =
+            HubSettings { tries: 5, backoff: Duration::from_secs(20), ..settings(folder.path(), &endpoint) };
+        let clock = Instant::now();
+        let error = Store::new(settings).pull(tiny(), &options(), &quiet()).unwrap_err();
+        assert!(matches!(error, HubError::NoConnection { .. }), "{error}");
+        assert!(error.to_string().contains("no connection to") && error.hint().is_some(), "{error}");
+        assert!(clock.elapsed() < Duration::from_secs(15), "{:?}", clock.elapsed());
+    }
 }
 
 #[test]

@@ -1,5 +1,6 @@
 //! `vidar doctor`: checks of this machine. Missing optional parts are not failures.
 
+use crate::models::{self, bundled};
 use crate::system::{Hardware, hardware};
 use serde::Serialize;
 use std::path::Path;
@@ -43,12 +44,47 @@ pub fn examine(folder: &Path) -> Vec<Finding> {
             State::Ok,
             "stereo: built in, needs metric poses, no weights (MIT OR Apache-2.0)".into(),
         ),
-        finding("weights", State::Optional, "none are read by this version (see WEIGHTS.md)".into()),
+        finding(
+            "network",
+            State::Ok,
+            format!(
+                "{}: built in, {} MiB, trained on rendered rooms ({})",
+                bundled::NAME,
+                bundled::bytes() >> 20,
+                bundled::LICENCE
+            ),
+        ),
+        checkpoints(),
     ]
     .into_iter()
     .chain(graphics_processors())
     .chain([environment()])
     .collect()
+}
+
+/// Official checkpoints on this machine.
+fn checkpoints() -> Finding {
+    // Only the disk is searched.
+    let listed = models::store(true).and_then(|store| Ok(store.list()?));
+    let (state, found, advice) = match listed {
+        Ok(listed) => {
+            let names: Vec<&str> =
+                listed.iter().filter(|(_, installed)| installed.is_some()).map(|(c, _)| c.name).collect();
+            match names.is_empty() {
+                false => (State::Ok, names.join(", "), None),
+                true => {
+                    let advice = "for real recordings: `vidar model pull da3-small` (131 MiB, Apache-2.0)";
+                    (
+                        State::Optional,
+                        "no official checkpoint is installed".to_owned(),
+                        Some(advice.to_owned()),
+                    )
+                }
+            }
+        }
+        Err(error) => (State::Problem, error.to_string(), error.hint()),
+    };
+    Finding { what: "checkpoints", state, found, advice }
 }
 
 /// Graphics processors that can run networks.
@@ -131,9 +167,11 @@ mod tests {
     #[test]
     fn a_healthy_folder_has_no_problem_and_a_missing_one_has() {
         let folder = tempfile::tempdir().unwrap();
-        assert!(examine(folder.path()).iter().all(|f| f.state != State::Problem));
+        let findings = examine(folder.path());
+        assert!(findings.iter().all(|f| f.state != State::Problem));
         let missing = examine(&folder.path().join("not/there"));
         assert_eq!(missing.iter().filter(|f| f.state == State::Problem).count(), 1);
-        assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 0, "the probe is removed");
+        assert!(findings.iter().any(|f| f.state == State::Ok && f.found.contains("da3-nano: built in")));
+        assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 0, "the test file is removed");
     }
 }

@@ -121,6 +121,9 @@ pub enum Error {
     /// A checkpoint is missing, invalid, or could not be fetched.
     #[error("model: {0}")]
     Hub(#[from] vidar_hub::HubError),
+    /// The weights of the chosen network are not installed.
+    #[error("model: {0}")]
+    WeightsMissing(vidar_hub::HubError),
     /// The network rejected its weights or its input.
     #[error("network: {0}")]
     Da3(#[from] vidar_da3::Da3Error),
@@ -237,7 +240,7 @@ impl Error {
             Self::NoOdometry { .. } => "E0209",
             Self::NotARecording { .. } => "E0210",
             Self::Geometry(_) | Self::Stereo(_) => "E0301",
-            Self::Hub(error) => hub_code(error),
+            Self::Hub(error) | Self::WeightsMissing(error) => hub_code(error),
             Self::Da3(vidar_da3::Da3Error::Cancelled) => "E1301",
             Self::Da3(error) if error.device_advice().is_some() => "E0311",
             Self::Da3(_) => "E0309",
@@ -330,9 +333,7 @@ impl Error {
             Self::Trajectory(_) => {
                 "--trajectory-body imu|camera0 sets the body whose poses they are; --calibration gives the rig"
             }
-            Self::Export(_) => {
-                "the message names the position in the file; write it again with its program"
-            }
+            Self::Export(_) => "the message names the position in the file; write it again with its program",
             Self::Synth(_) => "`vidar synth --help` lists the options; --world-config takes all settings",
             Self::Odometry(_) => {
                 "`vidar inspect PATH` prints camera, extrinsics and IMU as they were read; --calibration corrects them"
@@ -346,6 +347,12 @@ impl Error {
             Self::NotARun { .. } => "a run folder contains manifest.json; `vidar run PATH` creates one",
             Self::Dataset(error) => return Some(dataset_hint(error).to_owned()),
             Self::Hub(error) => return error.hint(),
+            // Every command that opens a network has --model.
+            Self::WeightsMissing(error) => {
+                return error
+                    .hint()
+                    .map(|hint| format!("{hint}; --model da3-nano is built in and needs no download"));
+            }
             Self::Da3(error) if let Some(advice) = error.device_advice() => advice,
             Self::Da3(_) => {
                 "`vidar model list` describes the networks; docs/guides/models.md states what each one needs"
@@ -376,21 +383,19 @@ fn dataset_hint(error: &vidar_dataset::DatasetError) -> &'static str {
     use vidar_dataset::DatasetError as D;
     match error {
         D::Io { .. } => "check the path and its read permission",
-        D::UnknownLayout { .. } => {
-            "--format sets the layout; docs/getting-started.md describes each one"
-        }
+        D::UnknownLayout { .. } => "--format sets the layout; docs/getting-started.md describes each one",
         D::Malformed { .. } => "repair or remove that line; the file may be truncated or in another format",
         D::MissingCamera { .. } => "choose an available camera with --camera N",
-        D::NoImages { .. } => {
-            "check --start, --end and --stride, and that the listed images exist"
-        }
+        D::NoImages { .. } => "check --start, --end and --stride, and that the listed images exist",
         D::NoPoses { .. } => "--trajectory-format tum|euroc|kitti sets the format",
         D::BadCamera { .. } | D::UnsupportedCamera { .. } => {
             "correct the calibration, or replace it with --camera-model or --calibration FILE"
         }
         D::NotRigid { .. } => "the matrix maps sensor to body coordinates; its rotation must be orthonormal",
         D::BadImage { .. } => "the image may be truncated; copy the recording again",
-        D::WrongImageSize { .. } => "the calibration is for another resolution; give the one for these images",
+        D::WrongImageSize { .. } => {
+            "the calibration is for another resolution; give the one for these images"
+        }
         D::TimesMismatch { .. } => "give one time per pose with --timestamps, or the trajectory as TUM",
         D::BadOption { .. } => "`vidar run --help` lists the values of each option",
         _ => "`vidar inspect PATH` shows what was found",
@@ -454,10 +459,7 @@ pub const CODES: &[(&str, &str)] = &[
         "E0309",
         "A network cannot be opened or run: the checkpoint is not the one its config.json describes (each wrong key is listed), or the images or cameras are not suitable for it.",
     ),
-    (
-        "E0310",
-        "The odometry rejected its settings, the camera-IMU extrinsics, or an image of another size.",
-    ),
+    ("E0310", "The odometry rejected its settings, the camera-IMU extrinsics, or an image of another size."),
     (
         "E0311",
         "The requested graphics processor cannot be used: the program was built without GPU support, there is none with that number, it lacks a feature or memory, or it failed. --device cpu needs none.",
@@ -474,10 +476,7 @@ pub const CODES: &[(&str, &str)] = &[
     ),
     ("E0405", "A checkpoint or its record is damaged, or is not the official one."),
     ("E0501", "A threshold given with --fail-above or --fail-below was missed."),
-    (
-        "E7001",
-        "A bug in VIDAR. Please report it; finished files are on disk.",
-    ),
+    ("E7001", "A bug in VIDAR. Please report it; finished files are on disk."),
     ("E1301", "Interrupted by Ctrl-C or a signal. Files that were being written are finished or removed."),
 ];
 

@@ -145,7 +145,8 @@ fn describe_poses(dataset: &Dataset) -> Vec<String> {
     };
     let mut words = Vec::new();
     words.extend(dataset.ground_truth.as_ref().map(|t| describe("ground truth", t)));
-    words.extend(dataset.external_trajectory.as_ref().map(|a| describe("external trajectory", &a.trajectory)));
+    words
+        .extend(dataset.external_trajectory.as_ref().map(|a| describe("external trajectory", &a.trajectory)));
     if words.is_empty() {
         words.push("none".into());
     }

@@ -11,7 +11,7 @@ pub fn eval(args: &EvalArgs, context: &Context) -> Outcome {
     let thresholds = Thresholds::parse(&args.fail_above, &args.fail_below)?;
     let config = build::layered(&args.config, None)?.build()?;
     let evaluation = match &args.truth {
-        Some(truth) => evaluate_files(&args.estimate, truth, &config)?,
+        Some(truth) => evaluate_files(&args.estimate, truth, &config, &build::trajectory_options(args)?)?,
         None => evaluate_run(&args.estimate)?,
     };
     if context.cli.json {

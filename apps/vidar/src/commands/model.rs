@@ -8,7 +8,7 @@ use std::cell::Cell;
 use std::path::{Path, PathBuf};
 use vidar::core::Warning;
 use vidar::da3::{self, Da3Options, check};
-use vidar::hub::{Ability, Checkpoint, Installed, Progress, TransferCallbacks, catalogue};
+use vidar::hub::{Ability, Checkpoint, InstalledCheckpoint, Progress, TransferCallbacks, catalogue};
 use vidar::models::{self, LicenceAccepted, bundled};
 use vidar::run::bytes;
 use vidar::{Error, Event, Events, ExitStatus};
@@ -167,7 +167,7 @@ fn identified(path: &Path, context: &Context) -> Result<Option<&'static Checkpoi
     Ok(catalogue::of_hash(&sha256))
 }
 
-fn print_installed(installed: &Installed, context: &Context) -> Outcome {
+fn print_installed(installed: &InstalledCheckpoint, context: &Context) -> Outcome {
     let c = installed.checkpoint;
     if context.cli.json {
         print::json(&json!({
@@ -280,7 +280,7 @@ fn check_files(args: &CheckArgs, context: &Context) -> Outcome {
         }
         Ok(())
     })?;
-    let failed = reports.iter().filter(|r| !r.holds()).count();
+    let failed = reports.iter().filter(|r| !r.passed()).count();
     if context.cli.json {
         print::json(&json!({ "schema": "vidar.check/1", "holds": failed == 0, "reports": reports }));
     }
@@ -291,7 +291,7 @@ fn check_files(args: &CheckArgs, context: &Context) -> Outcome {
 }
 
 fn print_report(report: &check::CheckReport, all: bool) {
-    if all || !report.holds() {
+    if all || !report.passed() {
         print::data(report.to_string().trim_end());
         return;
     }

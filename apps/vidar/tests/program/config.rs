@@ -70,6 +70,9 @@ fn an_unknown_key_from_any_source_is_refused_with_the_nearest_name() {
         "keyframes.min_translation_m",
     ]);
     vidar(&["config", "explain", "fusion.voxl_size_m"]).ends_with(2).says(&["fusion.voxel_size_m"]);
+    let ran = vidar(&["config", "explain", "nonsense"]).ends_with(2);
+    let ran = ran.says(&["error[E0101]", "\"nonsense\"", "vidar config show"]);
+    assert!(!ran.stderr.contains("did you mean"), "{}", ran.stderr);
     let ran = command().args(["config", "show"]).env("VIDAR_FUSION__VOXEL", "1").output().unwrap();
     assert_eq!(ran.status.code(), Some(2));
 }

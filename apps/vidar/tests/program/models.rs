@@ -235,7 +235,7 @@ fn what_depth_cannot_do_is_refused_with_the_next_step() {
     let folder = tempfile::tempdir().unwrap();
     let mut command = command_with_store(folder.path());
     let ran: ProgramOutput = command.args(["depth", text(&b.images)]).output().unwrap().into();
-    ran.ends_with(4).says(&["error[E0403]", "vidar model pull da3-small"]);
+    ran.ends_with(4).says(&["error[E0403]", "vidar model pull da3-small", "--model da3-nano"]);
     // A damaged checkpoint is named key by key.
     let broken = b.root.join("broken");
     write_checkpoint(&broken);
@@ -430,7 +430,7 @@ fn a_model_is_checked_against_references_and_a_difference_ends_with_5() {
     bytes[header + at..header + at + 4].copy_from_slice(&5.0_f32.to_le_bytes());
     std::fs::write(&weights, bytes).unwrap();
     let ran = vidar(&["model", "check", &one, "--model-dir", text(&corrupted), "-q"]).ends_with(5);
-    assert!(ran.stdout.contains("first departure: patch_embed"), "{}", ran.stdout);
+    assert!(ran.stdout.contains("first failure: patch_embed"), "{}", ran.stdout);
     vidar(&["model", "check", "/no/such/folder/x.safetensors"]).ends_with(1);
 }
 
@@ -464,7 +464,7 @@ fn a_run_uses_a_network_with_and_without_poses_and_names_it_in_the_manifest() {
     let aligned: Vec<Value> = log
         .lines()
         .map(|l| serde_json::from_str(l).unwrap())
-        .filter(|e: &Value| e["event"] == "chunk-aligned")
+        .filter(|e: &Value| e["event"] == "chunk-placed")
         .collect();
     assert!(!aligned.is_empty(), "{log}");
     assert!(aligned.iter().all(|e| e["status"] != "prior-world"), "{aligned:?}");

@@ -114,14 +114,17 @@ fn a_run_as_json_has_stable_keys() {
             "double_walls",
             "metric_poses",
             "coupling",
-            "places",
+            "place_recognition",
             "is_metric",
             "placement",
-            "judgement",
+            "evaluation",
             "seconds"
         ]
     );
-    assert_eq!(keys(&json["result"]["judgement"], 1), ["trajectory", "anchor", "surface", "depth"]);
+    assert_eq!(
+        keys(&json["result"]["evaluation"], 1),
+        ["trajectory", "metric_trajectory", "surface", "depth"]
+    );
     let scores: Vec<&str> = json["scores"].as_object().unwrap().keys().map(String::as_str).collect();
     for name in ["abs-rel", "chamfer", "delta-f", "f@0.05", "f@0.10"] {
         assert!(scores.contains(&name), "{name} in {scores:?}");
@@ -142,7 +145,7 @@ fn the_run_folder_matches_its_readme_and_its_manifest() {
         "map/coverage.json",
         "map/mesh.ply",
         "map/points.ply",
-        "trajectory/anchor_camera.tum",
+        "trajectory/metric_camera.tum",
         "trajectory/keyframes_camera.euroc.csv",
         "views.json",
     ] {
@@ -192,9 +195,18 @@ fn progress_as_json_is_one_event_a_line_and_the_log_has_the_same_shape() {
             "stage-started" => &["schema", "event", "stage", "total"],
             "progress" => &["schema", "event", "stage", "done", "total"],
             "stage-finished" => &["schema", "event", "stage", "seconds"],
-            "chunk-aligned" => &["schema", "event", "chunk", "scale", "center_rms_m", "status"],
+            "world" => &["schema", "event", "poses", "segment"],
+            "state" => &["schema", "event", "frame", "time_ns", "segment", "position_m"],
+            "revised-states" => &["schema", "event", "keyframes"],
+            "keyframe" => &["schema", "event", "frame", "time_ns"],
+            "chunk-predicted" => &["schema", "event", "chunk", "keyframes", "with_depth", "is_reused"],
+            "chunk-placed" => &["schema", "event", "chunk", "scale", "center_rms_m", "status"],
+            "loop-measured" => &["schema", "event", "later", "earlier", "inlier_ratio", "rejection"],
+            "placements-revised" => &["schema", "event", "chunks", "keyframes", "is_final"],
+            "surface-changed" => &["schema", "event", "triangles", "is_final"],
+            "step-finished" => &["schema", "event", "step", "seconds"],
             "artifact-written" => &["schema", "event", "path", "bytes"],
-            "warning" => &["schema", "event", "kind", "message", "place", "hint"],
+            "warning" => &["schema", "event", "severity", "kind", "message", "place", "hint"],
             "finished" => &["schema", "event", "exit", "seconds"],
             other => panic!("unknown event {other}"),
         }
@@ -205,7 +217,7 @@ fn progress_as_json_is_one_event_a_line_and_the_log_has_the_same_shape() {
         assert_eq!(keys(event, 1), expected(event["event"].as_str().unwrap()));
     }
     assert_eq!(events.last().unwrap()["event"], "finished");
-    for kind in ["stage-started", "progress", "stage-finished", "chunk-aligned", "artifact-written"] {
+    for kind in ["stage-started", "progress", "stage-finished", "state", "keyframe", "chunk-placed", "surface-changed", "artifact-written"] {
         assert!(events.iter().any(|e| e["event"] == kind), "no {kind}");
     }
 }
@@ -299,7 +311,7 @@ fn bounds_missed_end_with_5_and_bounds_kept_with_0() {
 #[test]
 fn eval_scores_trajectories_and_surfaces_and_a_file_equals_itself() {
     let run = &finished().0;
-    let (tum, ply) = (run.join("trajectory/anchor_camera.tum"), run.join("map/points.ply"));
+    let (tum, ply) = (run.join("trajectory/metric_camera.tum"), run.join("map/points.ply"));
     let json = vidar(&["eval", text(&tum), text(&tum), "--json"]).ends_with(0).json();
     assert_eq!(json["kind"], "trajectory");
     assert!(json["scores"]["ate"].as_f64().unwrap() < 1e-9);
@@ -308,6 +320,42 @@ fn eval_scores_trajectories_and_surfaces_and_a_file_equals_itself() {
     assert_eq!(json["kind"], "surface");
     assert_eq!(json["scores"]["f@0.05"], 1.0);
     assert!(vidar(&["eval", text(&tum), text(&tum)]).ends_with(0).stdout.contains("ATE SE(3)"));
+}
+
+#[test]
+fn options_named_in_hints_of_eval_exist() {
+    let help = vidar(&["eval", "--help"]).ends_with(0).stdout;
+    let file = |name: &str, rows: String| {
+        let path = shared().root.join(name);
+        std::fs::write(&path, rows).unwrap();
+        path
+    };
+    let tum = |scale: f64| -> String {
+        (0..20)
+            .map(|i| format!("{} {i} {} 0 0 0 0 1\n", 1.6e9 * scale + f64::from(i) * scale, i * i))
+            .collect()
+    };
+    let (plain, millis) = (file("plain.tum", tum(1.0)), file("millis.tum", tum(1e3)));
+    let kitti =
+        file("poses.kitti", (0..20).map(|i| format!("1 0 0 {i} 0 1 0 {} 0 0 1 0\n", i * i)).collect());
+    let times = file("times.txt", (0..20).map(|i| format!("{}\n", 1_600_000_000 + i)).collect());
+    let empty = file("empty.tum", String::new());
+    for (estimate, code) in [(&plain, 0), (&millis, 0), (&kitti, 1), (&empty, 1)] {
+        let ran = vidar(&["eval", text(estimate), text(&plain)]).ends_with(code);
+        let named: Vec<&str> = ran
+            .stderr
+            .split(|c: char| !(c.is_ascii_alphanumeric() || c == '-'))
+            .filter(|word| word.starts_with("--"))
+            .collect();
+        assert!(!named.is_empty(), "{}", ran.stderr);
+        assert!(named.iter().all(|option| help.contains(option)), "{named:?} in\n{}", ran.stderr);
+    }
+    // The named options remove the cause.
+    let body = ["--trajectory-body", "imu"];
+    let ran = vidar(&[&["eval", text(&plain), text(&plain)], &body[..]].concat()).ends_with(0);
+    assert!(!ran.stderr.contains("trajectory-body"), "{}", ran.stderr);
+    let ran = vidar(&["eval", text(&kitti), text(&kitti), "--timestamps", text(&times), "--json"]);
+    assert_eq!(ran.ends_with(0).json()["report"]["matched"], 20);
 }
 
 #[test]
@@ -364,7 +412,7 @@ fn the_demo_prints_its_files_its_scores_and_how_to_view_them() {
 #[test]
 fn doctor_finds_no_problem_and_prints_json() {
     let ran = vidar(&["doctor"]).ends_with(0);
-    assert!(ran.stdout.contains("ready"), "{}", ran.stdout);
+    assert!(ran.stdout.contains("ready") && ran.stdout.contains("da3-nano: built in"), "{}", ran.stdout);
     let json = vidar(&["doctor", "--json"]).ends_with(0).json();
     assert_eq!(keys(&json, 1), ["schema", "findings"]);
     assert_eq!(keys(&json["findings"][0], 1), ["what", "state", "found", "advice"]);

@@ -27,7 +27,7 @@ pub fn write_ply_mesh(w: impl Write, mesh: &TriangleMesh, comments: &[String]) -
     let vertices = Vertices::of_mesh(mesh);
     vertices.check(FORMAT)?;
     check_triangles(FORMAT, &mesh.triangles, mesh.positions.len())?;
-    // The face list holds `int`, the type every reader knows.
+    // The face list holds `int`, the type every reader supports.
     if mesh.positions.len() > i32::MAX as usize {
         let reason = "its indices are signed 32-bit";
         return Err(ExportError::unwritable(FORMAT, format!("{} vertices", mesh.positions.len()), reason));

@@ -65,11 +65,8 @@ fn sequence_section(
     for row in odometry {
         let file = request.out.join(&row.folder).join("trajectory/odometry_body.tum");
         if let Some(picture) = path_picture(&file) {
-            let name = if row.with_imu {
-                "odometry, camera and IMU"
-            } else {
-                "odometry, camera only (up to scale)"
-            };
+            let name =
+                if row.with_imu { "odometry, camera and IMU" } else { "odometry, camera only (up to scale)" };
             let png = vidar_view::encode_png(&picture)?;
             section.figures.push(Figure {
                 png,

@@ -18,7 +18,11 @@ impl Table<'_> {
             self.gains("pose-free loses the metric scale", PoseFree, true),
             self.gains("pose-conditioned is metric", PoseConditioned, false),
             self.beats("pose-conditioned beats pose-free", PoseConditioned, PoseFree),
-            self.beats("true poses are at least as good as those of the odometry", GroundTruth, PoseConditioned),
+            self.beats(
+                "true poses are at least as good as those of the odometry",
+                GroundTruth,
+                PoseConditioned,
+            ),
             self.beats("hybrid beats pose-conditioned", Hybrid, PoseConditioned),
             self.beats("coupled beats pose-conditioned (ours)", Coupled, PoseConditioned),
             self.beats("coupled beats hybrid (ours)", Coupled, Hybrid),
@@ -67,7 +71,13 @@ impl Table<'_> {
         let gain = mean(&gains)?;
         let as_claimed = gains.iter().filter(|g| (**g > METRIC_GAIN) == should).count();
         let holds = if (gain > METRIC_GAIN) == should { "yes" } else { "no" };
-        Some(cells(claim, holds, format!("the scale of ground truth gains {gain:.3}"), as_claimed, gains.len()))
+        Some(cells(
+            claim,
+            holds,
+            format!("the scale of ground truth gains {gain:.3}"),
+            as_claimed,
+            gains.len(),
+        ))
     }
 }
 

@@ -5,7 +5,7 @@ use crate::error::{Error, ExitStatus};
 use crate::events::{CancelToken, Events};
 use crate::odometry::{OdometryRequest, odometry};
 use crate::run::{RunRequest, run};
-use crate::run_folder::{Place, pretty};
+use crate::run_folder::{OutputLocation, pretty};
 use crate::{config::Origin, system};
 use serde::{Deserialize, Serialize, de::DeserializeOwned};
 use sha2::{Digest, Sha256};
@@ -100,7 +100,7 @@ pub(super) fn run_row(
     let layered = layered_for(request, mode)?;
     let key = key(sequence, &layered.to_toml(false))?;
     let place = request.out.join(&folder);
-    if let Some(row) = kept(&place, &key)? {
+    if let Some(row) = stored(&place, &key)? {
         return Ok(row);
     }
     system::reset_peak_memory();
@@ -109,7 +109,7 @@ pub(super) fn run_row(
         open: open_options(),
         layered,
         reference: None,
-        place: Place::Resumed { path: place.clone() },
+        place: OutputLocation::Resumed { path: place.clone() },
         command: request.command.clone(),
     };
     let clock = std::time::Instant::now();
@@ -121,28 +121,28 @@ pub(super) fn run_row(
             return Err(Error::Interrupted { path: request.out.clone() });
         }
         Ok(outcome) => {
-            let judgement = &outcome.judgement;
+            let evaluation = &outcome.evaluation;
             let f = |scores: &[Scores], at: f64| {
                 scores.iter().find(|s| (s.threshold_m - at).abs() < 1e-9).map(|s| s.f)
             };
             row.degraded = outcome.status == ExitStatus::Degraded;
-            row.trajectory = match crate::run::anchored_by_truth(&outcome.plan) && !mode.chains() {
+            row.trajectory = match outcome.map.uses_ground_truth() && !mode.chains() {
                 true => TrajectoryScores { log_scale: Some(0.0), ..TrajectoryScores::default() },
-                false => judgement.trajectory.as_ref().map_or_else(Default::default, Into::into),
+                false => evaluation.trajectory.as_ref().map_or_else(Default::default, Into::into),
             };
-            if let Some(surface) = &judgement.surface {
+            if let Some(surface) = &evaluation.surface {
                 (row.f05, row.f10) = (f(&surface.native, 0.05), f(&surface.native, 0.10));
                 row.f10_free = f(&surface.free, 0.10);
             }
             row.abs_rel =
-                judgement.depth.as_ref().and_then(|d| d.summary.pixel_weighted.metric).map(|m| m.abs_rel);
+                evaluation.depth.as_ref().and_then(|d| d.summary.pixel_weighted.metric).map(|m| m.abs_rel);
             row.keyframes = outcome.map.views.len();
             row.placement = outcome.result_json()["placement"].clone();
         }
     }
     row.seconds = clock.elapsed().as_secs_f64();
     row.peak_memory_bytes = system::peak_memory_bytes();
-    keep(&place, &key, &row)?;
+    store(&place, &key, &row)?;
     Ok(row)
 }
 
@@ -161,14 +161,14 @@ pub(super) fn odometry_row(
     }
     let key = key(sequence, &format!("{name}\n{}", layered.to_toml(false)))?;
     let place = request.out.join(&folder);
-    if let Some(row) = kept(&place, &key)? {
+    if let Some(row) = stored(&place, &key)? {
         return Ok(row);
     }
     let odometry_request = OdometryRequest {
         path: sequence.path.clone(),
         open: open_options(),
         layered,
-        place: Place::Resumed { path: place.clone() },
+        place: OutputLocation::Resumed { path: place.clone() },
         command: request.command.clone(),
         debug_dump: false,
     };
@@ -191,7 +191,7 @@ pub(super) fn odometry_row(
             }
         }
     }
-    keep(&place, &key, &row)?;
+    store(&place, &key, &row)?;
     Ok(row)
 }
 

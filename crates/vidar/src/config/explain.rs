@@ -33,11 +33,32 @@ pub fn explain(key: &str) -> Result<Vec<Explanation>, Error> {
         .map(|(k, default, _)| Explanation { about: about(&schema, &k), key: k, default })
         .collect();
     if found.is_empty() {
-        // `value` refuses an unknown key and names the nearest one.
-        let mut layered = defaults;
-        layered.value(key, toml::Value::Integer(0), super::Origin::Flag("vidar config explain"))?;
+        return Err(Error::UnknownKey {
+            key: key.to_owned(),
+            nearest: nearest(&defaults, key),
+            origin: "the argument of `vidar config explain`".to_owned(),
+        });
     }
     Ok(found)
+}
+
+/// The key or section that `key` is probably a misspelling of.
+fn nearest(defaults: &Layered, key: &str) -> Option<String> {
+    /// Jaro-Winkler similarity of a misspelling: lower values also accept unrelated words.
+    const MISSPELLING: f64 = 0.85;
+    let keys = defaults.entries().into_iter().map(|(k, _, _)| k);
+    let sections =
+        schema()["properties"].as_object().into_iter().flat_map(|o| o.keys().cloned()).collect::<Vec<_>>();
+    // A key without its section counts as close to the full one.
+    let score = |candidate: &str| {
+        let tail = candidate.rsplit('.').next().unwrap_or(candidate);
+        strsim::jaro_winkler(key, candidate).max(strsim::jaro_winkler(key, tail))
+    };
+    keys.chain(sections)
+        .map(|k| (score(&k), k))
+        .filter(|(s, _)| *s > MISSPELLING)
+        .max_by(|a, b| a.0.total_cmp(&b.0))
+        .map(|(_, k)| k)
 }
 
 /// Every key of the configuration, in sections, sorted.
@@ -94,6 +115,16 @@ mod tests {
     #[test]
     fn a_section_explains_all_its_keys_and_an_unknown_key_is_refused() {
         assert!(explain("keyframes").unwrap().len() >= 3);
-        assert!(matches!(explain("keyframes.min_translation"), Err(Error::UnknownKey { .. })));
+        let suggested = |key: &str| match explain(key) {
+            Err(Error::UnknownKey { nearest, .. }) => nearest,
+            other => panic!("{key}: {other:?}"),
+        };
+        assert_eq!(suggested("keyframes.min_translation").as_deref(), Some("keyframes.min_translation_m"));
+        assert_eq!(suggested("keyframe").as_deref(), Some("keyframes"));
+        assert_eq!(suggested("voxl_size_m").as_deref(), Some("fusion.voxel_size_m"));
+        assert_eq!(suggested("nonsense"), None);
+        let error = explain("nonsense").unwrap_err();
+        assert!(error.to_string().contains("\"nonsense\""), "{error}");
+        assert!(error.hint().is_some_and(|h| h.contains("vidar config show")), "{:?}", error.hint());
     }
 }

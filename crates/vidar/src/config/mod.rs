@@ -9,6 +9,7 @@ mod presets;
 pub use explain::{Explanation, explain, schema};
 pub use layers::{Layered, Origin};
 pub use presets::{PRESETS, Preset};
+pub use vidar_align::keyframe_selection::KeyframeConfig;
 
 use crate::error::Error;
 use crate::models::geometry::SourceChoice;
@@ -58,27 +59,6 @@ impl Default for InputConfig {
             poses: PoseSource::Auto,
             max_pose_gap_secs: 0.5,
         }
-    }
-}
-
-/// Choice of keyframes.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
-#[serde(default, deny_unknown_fields)]
-pub struct KeyframeConfig {
-    /// A frame becomes a keyframe when the camera moved at least this far (m) since the last one.
-    pub min_translation_m: f64,
-    /// … or turned at least this much (degrees).
-    pub min_rotation_deg: f64,
-    /// Most keyframes; above it the distances are scaled up evenly. 0 means no limit.
-    pub max_count: usize,
-    /// Time between keyframes (s) if no poses are known beforehand (`coupling.mode` `pose-free` or `da3-streaming` without a
-    /// trajectory). Lower it for fast motion.
-    pub unposed_interval_secs: f64,
-}
-
-impl Default for KeyframeConfig {
-    fn default() -> Self {
-        Self { min_translation_m: 0.05, min_rotation_deg: 8.0, max_count: 0, unposed_interval_secs: 0.2 }
     }
 }
 
@@ -284,7 +264,9 @@ impl Config {
             true => Ok(()),
             false => bad(format!("{key} must be finite and positive, found {value}")),
         };
-        if self.coupling.place_recognition == PlaceRecognitionConfig::Salad && self.coupling.salad_checkpoint.is_empty() {
+        if self.coupling.place_recognition == PlaceRecognitionConfig::Salad
+            && self.coupling.salad_checkpoint.is_empty()
+        {
             return bad("coupling.place_recognition = \"salad\" needs coupling.salad_checkpoint".into());
         }
         for (key, value) in

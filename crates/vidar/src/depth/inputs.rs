@@ -127,7 +127,8 @@ impl Cameras {
         let best = self.views.iter().map(|v| (common(&v.0), v)).max_by_key(|(n, _)| *n);
         let wrong = |why: &str| Error::Usage {
             what: format!("--poses {}: {why} {}", self.path.display(), image.display()),
-            hint: "every image needs a camera of the same file name; remove the images without one".to_owned(),
+            hint: "every image needs a camera of the same file name; remove the images without one"
+                .to_owned(),
         };
         match best {
             Some((n, view)) if n > 0 => {

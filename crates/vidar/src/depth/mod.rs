@@ -17,9 +17,9 @@ pub use format::{DepthFormat, Resolution, parse_formats};
 
 use crate::error::Error;
 use crate::events::{CancelToken, Events};
-use crate::models::{self, LicenceAccepted, Located, MemoryPlan, ModelChoice, planned_memory};
+use crate::models::{self, LicenceAccepted, LocatedModel, MemoryPlan, ModelChoice, planned_memory};
 use crate::run::bytes;
-use crate::run_folder::{Place, RunFolder};
+use crate::run_folder::{OutputLocation, RunFolder};
 use at_input::Mapping;
 use inputs::{Cameras, Picture};
 use serde::Serialize;
@@ -56,7 +56,7 @@ pub struct DepthRequest {
     /// What becomes a point.
     pub scene: SceneOptions,
     /// Where results go.
-    pub place: Place,
+    pub place: OutputLocation,
     /// The command as typed.
     pub command: Vec<String>,
 }
@@ -69,7 +69,7 @@ pub struct DepthPlan {
     /// Columns and rows of the network's input.
     pub processed: (usize, usize),
     /// The model, or why it cannot be used yet.
-    pub model: Result<Located, String>,
+    pub model: Result<LocatedModel, String>,
     /// Memory, where the architecture is known.
     pub memory: Option<MemoryPlan>,
     /// The graphics processor and what it must hold; none where the CPU computes, or nothing is known of the network.
@@ -129,7 +129,7 @@ pub fn plan(request: &DepthRequest) -> Result<DepthPlan, Error> {
     let mut warnings = Vec::new();
     let model = match models::locate(&request.model, request.accepted.as_ref(), &request.store) {
         Ok(located) => Ok(located),
-        Err(error @ Error::Hub(vidar_hub::HubError::NotInstalled { .. })) => Err(error.to_string()),
+        Err(error @ Error::WeightsMissing(_)) => Err(error.to_string()),
         Err(error) => return Err(error),
     };
     let config = match (&model, models::architecture(&request.model)) {
@@ -263,7 +263,10 @@ fn check_formats(model: &Da3, request: &DepthRequest) -> Result<(), Error> {
     Ok(())
 }
 
-fn given_cameras(request: &DepthRequest, pictures: &[Picture]) -> Result<Option<inputs::KnownCameras>, Error> {
+fn given_cameras(
+    request: &DepthRequest,
+    pictures: &[Picture],
+) -> Result<Option<inputs::KnownCameras>, Error> {
     let Some(path) = &request.poses else { return Ok(None) };
     let paths: Vec<PathBuf> = pictures.iter().map(|p| p.path.clone()).collect();
     let sizes: Vec<(usize, usize)> = pictures.iter().map(|p| (p.image.width(), p.image.height())).collect();
@@ -321,8 +324,8 @@ fn unit_of(
         return (Unit::Metre, format!("focal length {focal} px"));
     }
     match (&prediction.alignment, cameras) {
-        (Some(alignment), Some(given)) if request.infer.align_to_given => match alignment.evidence {
-            vidar_da3::align::ScaleEvidence::Nothing => {
+        (Some(alignment), Some(given)) if request.infer.align_to_given => match alignment.scale_source {
+            vidar_da3::align::ScaleSource::Unobservable => {
                 (Unit::Arbitrary, "the given cameras are at one position, which gives no scale".to_owned())
             }
             evidence => (Unit::GivenCameras, format!("{} ({evidence:?})", given.source)),
@@ -331,7 +334,7 @@ fn unit_of(
     }
 }
 
-fn warnings(plan: &DepthPlan, located: &Located, prediction: &Prediction) -> Vec<Warning> {
+fn warnings(plan: &DepthPlan, located: &LocatedModel, prediction: &Prediction) -> Vec<Warning> {
     let mut warnings = plan.warnings.clone();
     warnings.extend(models::untrained_warning(&located.identity));
     warnings.extend(models::bundled::small_network_warning(&located.identity));

@@ -3,7 +3,7 @@
 use super::write::{Writer, depth_name, unit_words};
 use super::{DepthFormat, DepthOutcome, DepthRequest, Resolution};
 use crate::error::Error;
-use crate::models::Located;
+use crate::models::LocatedModel;
 use crate::run_folder::{RunFolder, now_rfc3339, pretty};
 use serde_json::{Value, json};
 use vidar_da3::Da3;
@@ -16,7 +16,7 @@ const MANIFEST_SCHEMA: &str = "vidar.depth-run/1";
 /// Writes `predictions.json`, in VIDAR's conventions.
 pub(super) fn predictions(
     writer: &mut Writer<'_>,
-    located: &Located,
+    located: &LocatedModel,
     outcome: &DepthOutcome,
 ) -> Result<(), Error> {
     let prediction = writer.prediction;
@@ -38,7 +38,7 @@ pub(super) fn predictions(
         })
     };
     let alignment = prediction.alignment.as_ref().map(
-        |a| json!({ "predicted_units_per_given": a.scale, "evidence": a.evidence, "inliers": a.inliers }),
+        |a| json!({ "predicted_units_per_given": a.scale, "scale_source": a.scale_source, "inliers": a.inliers }),
     );
     let document = json!({
         "schema": PREDICTIONS_SCHEMA,
@@ -71,7 +71,7 @@ pub(super) fn predictions(
 pub(super) fn manifest(
     folder: &RunFolder,
     request: &DepthRequest,
-    located: &Located,
+    located: &LocatedModel,
     network: &Da3,
     outcome: &DepthOutcome,
 ) -> Result<(), Error> {

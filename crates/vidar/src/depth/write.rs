@@ -169,8 +169,7 @@ impl<'a> Writer<'a> {
         }
         self.depth_scale = Some(scale);
         if clipped > 0 {
-            let message =
-                format!("{clipped} pixels exceed the range of {scale} steps per unit; they are 0");
+            let message = format!("{clipped} pixels exceed the range of {scale} steps per unit; they are 0");
             self.warnings.push(Warning::new("depth-clipped", message).hint("mini_npz keeps every depth"));
         }
         Ok(())

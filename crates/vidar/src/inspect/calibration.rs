@@ -26,7 +26,8 @@ fn describe_model(model: &CameraModel, source: &CalibrationSource) -> Vec<String
         CalibrationSource::File(path) => format!("from {}", path.display()),
         CalibrationSource::Flags => "from --camera-model".into(),
         CalibrationSource::Guessed => "guessed".into(),
-        other => format!("{other:?}").to_lowercase(),
+        CalibrationSource::DatasetDefault => "the dataset's published calibration".into(),
+        _ => "unknown source".into(),
     };
     let mut words = vec![format!(
         "{} {}x{}, f {:.1}/{:.1} px, centre {:.1}/{:.1} px; {from}",
@@ -136,10 +137,7 @@ fn describe_baseline(number: usize, chosen_from_other: &Se3) -> String {
         (_, false) => "behind",
     };
     let turned = chosen_from_other.rotation.log().norm().to_degrees();
-    format!(
-        "camera {number} is {:.1} cm {side} (baseline), rotated by {turned:.1} degrees",
-        t.norm() * 100.0
-    )
+    format!("camera {number} is {:.1} cm {side} (baseline), rotated by {turned:.1} degrees", t.norm() * 100.0)
 }
 
 /// An IMU's noise in units that can be compared with a data sheet or with samples at rest.
@@ -252,7 +250,11 @@ mod tests {
     #[test]
     fn noise_is_described_in_practical_units() {
         let words = describe_noise(&ImuNoise::EUROC);
-        assert!(words[0].contains("0.137 deg/s at 200 Hz, of the angle 0.58 deg after an hour"), "{}", words[0]);
+        assert!(
+            words[0].contains("0.137 deg/s at 200 Hz, of the angle 0.58 deg after an hour"),
+            "{}",
+            words[0]
+        );
         assert!(words[1].contains("samples 0.028 m/s2, of the velocity 0.015 m/s"), "{}", words[1]);
     }
 }

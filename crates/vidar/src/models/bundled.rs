@@ -3,12 +3,12 @@
 
 use super::ModelIdentity;
 use crate::error::Error;
-use vidar_hub::sha256_hex;
 use std::sync::Arc;
 use std::sync::OnceLock;
 use vidar_core::Warning;
 use vidar_da3::config::json;
 use vidar_da3::{Da3, Da3Config, Da3Options};
+use vidar_hub::sha256_hex;
 use vidar_nn::Checkpoint;
 
 /// Its name on the command line.

@@ -1,6 +1,6 @@
 //! A network as the geometry model of a run.
 
-use super::{Located, MemoryPlan, ModelChoice, ModelIdentity, locate, planned_memory, store};
+use super::{LocatedModel, MemoryPlan, ModelChoice, ModelIdentity, locate, planned_memory, store};
 use crate::chunks::RECORDED;
 use crate::config::{Config, ModelConfig};
 use crate::error::Error;
@@ -68,7 +68,7 @@ pub fn chosen(config: &Config) -> Result<Option<ModelChoice>, Error> {
 }
 
 /// Opens the network. Nothing is downloaded.
-pub fn open(choice: &ModelChoice, config: &Config, mode: PoseMode) -> Result<(Da3Model, Located), Error> {
+pub fn open(choice: &ModelChoice, config: &Config, mode: PoseMode) -> Result<(Da3Model, LocatedModel), Error> {
     let located = locate(choice, None, &store(true)?)?;
     // The dense head stays in 32 bits, as in the official program.
     let head_precision = Some(Precision::F32);
@@ -84,7 +84,7 @@ pub fn open(choice: &ModelChoice, config: &Config, mode: PoseMode) -> Result<(Da
 /// Memory of running it on chunks of `views` views, and warnings.
 pub fn planned(
     model: &Da3Model,
-    located: &Located,
+    located: &LocatedModel,
     config: &Config,
     view: &Pinhole,
     views: usize,

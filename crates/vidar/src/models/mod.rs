@@ -21,7 +21,9 @@ use vidar_core::Warning;
 use vidar_da3::preprocess::PreprocessConfig;
 use vidar_da3::{Da3, Da3Config, Da3Options, Variant};
 use vidar_hub::catalogue::{self, CHECKPOINTS, WEIGHTS};
-use vidar_hub::{Acceptance, Checkpoint, HubError, HubSettings, Installed, PullOptions, Store, TransferCallbacks};
+use vidar_hub::{
+    Acceptance, Checkpoint, HubError, HubSettings, InstalledCheckpoint, PullOptions, Store, TransferCallbacks,
+};
 
 /// Length of the part of a model card that is read.
 const CARD_HEAD_BYTES: u64 = 64 << 10;
@@ -79,7 +81,7 @@ pub struct LicenceAccepted {
 
 /// A model that is available and may be used.
 #[derive(Clone, Debug)]
-pub struct Located {
+pub struct LocatedModel {
     /// Which one.
     pub choice: ModelChoice,
     /// Its weights; `None` for built-in and synthetic ones.
@@ -121,14 +123,14 @@ pub fn locate(
     choice: &ModelChoice,
     accepted: Option<&LicenceAccepted>,
     store: &Store,
-) -> Result<Located, Error> {
+) -> Result<LocatedModel, Error> {
     match choice {
         ModelChoice::Official(checkpoint) => official(checkpoint, accepted, store),
         ModelChoice::Bundled => {
-            Ok(Located { choice: choice.clone(), path: None, identity: bundled::identity() })
+            Ok(LocatedModel { choice: choice.clone(), path: None, identity: bundled::identity() })
         }
         ModelChoice::Folder(path) => folder(path, accepted, store),
-        ModelChoice::Untrained(_) => Ok(Located {
+        ModelChoice::Untrained(_) => Ok(LocatedModel {
             choice: choice.clone(),
             path: None,
             identity: ModelIdentity {
@@ -165,10 +167,10 @@ fn official(
     checkpoint: &'static Checkpoint,
     accepted: Option<&LicenceAccepted>,
     store: &Store,
-) -> Result<Located, Error> {
+) -> Result<LocatedModel, Error> {
     // A missing checkpoint is reported before a missing acceptance.
     if store.find(checkpoint)?.is_none() {
-        store.require(checkpoint)?;
+        store.require(checkpoint).map_err(Error::WeightsMissing)?;
     }
     if let Some(acceptance) = acceptance_of(checkpoint, accepted)? {
         store.accept(checkpoint, &acceptance)?;
@@ -178,7 +180,7 @@ fn official(
         Some(recorded) => recorded.to_owned(),
         None => hash(&installed.weights())?,
     };
-    Ok(Located {
+    Ok(LocatedModel {
         choice: ModelChoice::Official(checkpoint),
         path: Some(installed.folder.clone()),
         identity: ModelIdentity {
@@ -194,13 +196,13 @@ fn official(
     })
 }
 
-fn source(installed: &Installed) -> Option<String> {
+fn source(installed: &InstalledCheckpoint) -> Option<String> {
     let record = installed.record.as_ref();
     record.map(|r| r.source.clone()).or_else(|| Some(installed.folder.display().to_string()))
 }
 
 /// Custom weights. Those with the length of official ones keep their licence.
-fn folder(path: &Path, accepted: Option<&LicenceAccepted>, store: &Store) -> Result<Located, Error> {
+fn folder(path: &Path, accepted: Option<&LicenceAccepted>, store: &Store) -> Result<LocatedModel, Error> {
     let weights = if path.is_dir() { path.join(WEIGHTS) } else { path.to_owned() };
     let bytes = length(&weights)?;
     let sha256 = hash(&weights)?;
@@ -212,7 +214,7 @@ fn folder(path: &Path, accepted: Option<&LicenceAccepted>, store: &Store) -> Res
         }
         acceptance = store.require_acceptance(checkpoint)?;
     }
-    Ok(Located {
+    Ok(LocatedModel {
         choice: ModelChoice::Folder(path.to_owned()),
         path: Some(path.to_owned()),
         identity: ModelIdentity {
@@ -252,11 +254,11 @@ fn hash(weights: &Path) -> Result<String, Error> {
     Ok(vidar_hub::sha256_of(weights, &callbacks)?.1)
 }
 
-impl Located {
+impl LocatedModel {
     /// Opens the network. Weights are mapped, not copied.
     pub fn open(&self, options: &Da3Options) -> Result<Da3, Error> {
         match (&self.choice, &self.path) {
-            (ModelChoice::Untrained(variant), _) => Ok(Da3::deterministic(*variant, options)?),
+            (ModelChoice::Untrained(variant), _) => Ok(Da3::synthetic(*variant, options)?),
             (ModelChoice::Bundled, _) => bundled::open(options),
             (_, Some(path)) => Ok(Da3::open(path, options)?),
             (_, None) => {
