@@ -35,8 +35,8 @@ fn plain() -> Events {
     Events::none().with(move |event| match event {
         Event::StageStarted { stage, total: 0 } => print::talk(format!("{stage} …")),
         Event::StageStarted { stage, total } => print::talk(format!("{stage}: {total} …")),
-        Event::StageFinished { stage, seconds } => {
-            print::talk(format!("{stage} done in {}", print::seconds(*seconds)));
+        Event::StageFinished { stage: name, seconds } | Event::StepFinished { step: name, seconds } => {
+            print::talk(format!("{name} done in {}", print::seconds(*seconds)));
         }
         Event::Progress { stage, done, total } => {
             let Ok(mut last) = last.lock() else { return };
@@ -73,8 +73,8 @@ fn bar() -> Events {
             bar.set_length(*total as u64);
             bar.set_position(*done as u64);
         }
-        Event::StageFinished { stage, seconds } => {
-            bar.println(format!("{stage:>10} done in {}", print::seconds(*seconds)));
+        Event::StageFinished { stage: name, seconds } | Event::StepFinished { step: name, seconds } => {
+            bar.println(format!("{name:>10} done in {}", print::seconds(*seconds)));
         }
         Event::Finished { .. } => bar.finish_and_clear(),
         _ => {}

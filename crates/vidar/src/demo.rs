@@ -1,11 +1,11 @@
-//! `vidar demo`: a synthetic room, flown, mapped and judged; nothing is downloaded.
+//! `vidar demo`: a synthetic room, flown, mapped and evaluated; nothing is downloaded.
 
 use crate::config::Layered;
 use crate::error::Error;
 use crate::events::{CancelToken, Event, Events};
 use crate::models::{self, geometry};
 use crate::run::{RunOutcome, RunRequest, run};
-use crate::run_folder::Place;
+use crate::run_folder::OutputLocation;
 use std::path::{Path, PathBuf};
 use vidar_core::Trajectory;
 use vidar_dataset::OpenOptions;
@@ -19,7 +19,7 @@ pub struct DemoRequest {
     /// The configuration of the run.
     pub layered: Layered,
     /// Where sequence and run go.
-    pub place: Place,
+    pub place: OutputLocation,
     /// The command as typed.
     pub command: Vec<String>,
 }
@@ -38,7 +38,7 @@ pub fn demo(request: &DemoRequest, events: &Events, cancel: &CancelToken) -> Res
         open: OpenOptions::default(),
         layered: request.layered.clone(),
         reference: None,
-        place: Place::Exact { path: root.join("run"), force: false },
+        place: OutputLocation::Exact { path: root.join("run"), force: false },
         command: request.command.clone(),
     };
     run(&run_request, events, cancel)

@@ -2,7 +2,7 @@
 
 use crate::config::Config;
 use crate::error::Error;
-use crate::run::Judgement;
+use crate::run::Evaluation;
 use serde_json::Value;
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -13,16 +13,16 @@ use vidar_eval::{SampleDensity, SurfaceReport, TrajectoryReport};
 /// Scores by name: `ate`, `ate-sim3`, `scale`, `chamfer`, `f@0.05`, ….
 pub type Scores = BTreeMap<String, f64>;
 
-/// Every score of a judgement.
-pub fn scores(judgement: &Judgement) -> Scores {
+/// Every score of an evaluation.
+pub fn scores(evaluation: &Evaluation) -> Scores {
     let mut scores = Scores::new();
-    if let Some(report) = &judgement.trajectory {
+    if let Some(report) = &evaluation.trajectory {
         add_trajectory(&mut scores, report);
     }
-    if let Some(report) = &judgement.surface {
+    if let Some(report) = &evaluation.surface {
         add_surface(&mut scores, report);
     }
-    if let Some(depth) = judgement.depth.as_ref().and_then(|d| d.summary.pixel_weighted.metric) {
+    if let Some(depth) = evaluation.depth.as_ref().and_then(|d| d.summary.pixel_weighted.metric) {
         scores.insert("abs-rel".into(), depth.abs_rel);
     }
     scores
@@ -45,9 +45,9 @@ fn add_surface(scores: &mut Scores, report: &SurfaceReport) {
     scores.insert("delta-f".into(), report.delta_f);
 }
 
-/// What was found about two files or a run.
+/// Result of an evaluation of two files or of a run.
 #[derive(Clone, Debug)]
-pub struct Evaluation {
+pub struct EvalOutcome {
     /// `trajectory`, `surface` or `run`.
     pub kind: &'static str,
     /// Scores by name.
@@ -56,15 +56,22 @@ pub struct Evaluation {
     pub lines: Vec<(String, String)>,
     /// The whole report.
     pub report: Value,
-    /// What the reader should know.
+    /// Warnings.
     pub warnings: Vec<Warning>,
 }
 
-/// Judges one file against another: trajectories, or clouds and meshes (.ply).
-pub fn evaluate_files(estimate: &Path, truth: &Path, config: &Config) -> Result<Evaluation, Error> {
+/// Compares one file with another: trajectories, or clouds and meshes (.ply).
+///
+/// `reading` applies to both trajectories.
+pub fn evaluate_files(
+    estimate: &Path,
+    truth: &Path,
+    config: &Config,
+    reading: &TrajectoryReadOptions,
+) -> Result<EvalOutcome, Error> {
     match (is_ply(estimate), is_ply(truth)) {
         (true, true) => surface(estimate, truth, config),
-        (false, false) => trajectory(estimate, truth, config),
+        (false, false) => trajectory(estimate, truth, config, reading),
         _ => Err(Error::Usage {
             what: format!("{} and {} are not of one kind", estimate.display(), truth.display()),
             hint: "compare a trajectory with a trajectory, or a .ply with a .ply".into(),
@@ -76,9 +83,14 @@ fn is_ply(path: &Path) -> bool {
     path.extension().is_some_and(|e| e.eq_ignore_ascii_case("ply"))
 }
 
-fn trajectory(estimate: &Path, truth: &Path, config: &Config) -> Result<Evaluation, Error> {
+fn trajectory(
+    estimate: &Path,
+    truth: &Path,
+    config: &Config,
+    reading: &TrajectoryReadOptions,
+) -> Result<EvalOutcome, Error> {
     let read = |path: &Path| -> Result<(Trajectory, Vec<Warning>), Error> {
-        Ok(vidar_dataset::read_trajectory(path, &TrajectoryReadOptions::default())?)
+        Ok(vidar_dataset::read_trajectory(path, reading)?)
     };
     let ((estimate, mut warnings), (truth, more)) = (read(estimate)?, read(truth)?);
     warnings.extend(more);
@@ -86,7 +98,7 @@ fn trajectory(estimate: &Path, truth: &Path, config: &Config) -> Result<Evaluati
     warnings.extend(report.warnings.iter().cloned());
     let mut scores = Scores::new();
     add_trajectory(&mut scores, &report);
-    Ok(Evaluation {
+    Ok(EvalOutcome {
         kind: "trajectory",
         scores,
         lines: trajectory_lines(&report),
@@ -137,7 +149,7 @@ pub fn trajectory_lines(report: &TrajectoryReport) -> Vec<(String, String)> {
     lines
 }
 
-fn surface(estimate: &Path, truth: &Path, config: &Config) -> Result<Evaluation, Error> {
+fn surface(estimate: &Path, truth: &Path, config: &Config) -> Result<EvalOutcome, Error> {
     let report = vidar_eval::evaluate_surface(
         &read_surface(estimate, config)?,
         &read_surface(truth, config)?,
@@ -147,7 +159,13 @@ fn surface(estimate: &Path, truth: &Path, config: &Config) -> Result<Evaluation,
     let mut scores = Scores::new();
     add_surface(&mut scores, &report);
     let warnings = report.warnings.clone();
-    Ok(Evaluation { kind: "surface", scores, lines: surface_lines(&report), report: json(&report), warnings })
+    Ok(EvalOutcome {
+        kind: "surface",
+        scores,
+        lines: surface_lines(&report),
+        report: json(&report),
+        warnings,
+    })
 }
 
 /// A cloud as it is; a mesh as evenly spread points.
@@ -195,8 +213,8 @@ pub fn surface_lines(report: &SurfaceReport) -> Vec<(String, String)> {
     lines
 }
 
-/// The scores that a finished run wrote down.
-pub fn evaluate_run(run: &Path) -> Result<Evaluation, Error> {
+/// The scores in the folder of a finished run.
+pub fn evaluate_run(run: &Path) -> Result<EvalOutcome, Error> {
     let not_a_run = |reason: String| Error::NotARun { path: run.to_owned(), reason };
     let path = run.join("eval/metrics.json");
     let bytes = std::fs::read(&path).map_err(|e| not_a_run(format!("eval/metrics.json: {e}")))?;
@@ -207,9 +225,9 @@ pub fn evaluate_run(run: &Path) -> Result<Evaluation, Error> {
     let mut lines: Vec<(String, String)> =
         scores.iter().map(|(k, v)| (k.clone(), format!("{v:.4}"))).collect();
     if lines.is_empty() {
-        lines.push(("scores".into(), "none: there was nothing to judge the run against".into()));
+        lines.push(("scores".into(), "none: there was no reference to compare the run with".into()));
     }
-    Ok(Evaluation { kind: "run", scores, lines, report, warnings: Vec::new() })
+    Ok(EvalOutcome { kind: "run", scores, lines, report, warnings: Vec::new() })
 }
 
 fn json(value: &impl serde::Serialize) -> Value {

@@ -1,20 +1,18 @@
-//! From a path to images with metric poses.
+//! From a path to a recording, its poses and its images.
 
-use crate::config::{Config, PoseSource};
+use crate::config::{Config, PoseSource as PoseChoice};
+use crate::engine::{FrameStamp, GivenPoses, ImageSource, OdometryPoses, PoseSource};
 use crate::error::Error;
-use crate::events::{CancelToken, Events};
-use crate::keyframes::PosedFrame;
-use crate::odometry::Tracked;
 use serde::Serialize;
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
-use vidar_core::{BodyFrame, CameraId, Duration, Se3, Trajectory, Warning};
-use vidar_dataset::{Dataset, ImageEntry, OpenOptions};
+use vidar_align::CouplingMode;
+use vidar_core::{BodyFrame, CameraId, Duration, Frame, FrameImage, SensorEvent, Trajectory, Warning};
+use vidar_dataset::{Dataset, DatasetError, ImageEntry, OpenOptions};
 
-/// Where the metric poses of a run came from.
+/// Where the metric poses of a run come from.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 #[serde(tag = "source", rename_all = "kebab-case")]
-pub enum AnchorSource {
+pub enum TrajectorySource {
     /// A trajectory that the user gave.
     External {
         /// Which file.
@@ -26,7 +24,7 @@ pub enum AnchorSource {
     Odometry,
 }
 
-impl std::fmt::Display for AnchorSource {
+impl std::fmt::Display for TrajectorySource {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         match self {
             Self::External { file } => write!(f, "external trajectory {file}"),
@@ -36,21 +34,173 @@ impl std::fmt::Display for AnchorSource {
     }
 }
 
-/// The metric trajectory that everything is placed by, told of the camera in use.
+/// A metric trajectory of the camera in use.
 #[derive(Clone, Debug)]
-pub struct MetricAnchor {
+pub struct MetricTrajectory {
     /// Where it came from.
-    pub source: AnchorSource,
-    /// Poses of the camera in use.
+    pub source: TrajectorySource,
+    /// Poses of the camera in use, m.
     pub camera_trajectory: Trajectory,
-    /// What there is to say of it.
-    pub warnings: Vec<Warning>,
-    /// All that the odometry said, where the poses are its.
-    pub tracked: Option<Arc<Tracked>>,
 }
 
-/// Opens the recording with all of its images between start and end: odometry wants every one, whatever
-/// `input.stride` leaves for depth.
+/// Where a run takes its poses from, decided before anything is tracked.
+#[derive(Clone, Debug)]
+pub enum PosePlan {
+    /// Nowhere: the coupling needs none.
+    None,
+    /// A given trajectory.
+    Given(MetricTrajectory),
+    /// Odometry; where it gives none, the fallback.
+    Odometry {
+        /// Ground truth, where `input.poses` is `auto` and there is any.
+        fallback: Option<MetricTrajectory>,
+    },
+}
+
+impl PosePlan {
+    /// What the configuration asks for, of what the recording has.
+    ///
+    /// # Errors
+    /// [`Error::NoMetricTrajectory`] where the coupling needs poses and there are none; a calibration that is only guessed.
+    pub fn new(dataset: &Dataset, config: &Config) -> Result<Self, Error> {
+        let mode = config.coupling.mode;
+        let choice = match mode {
+            CouplingMode::GroundTruth => PoseChoice::GroundTruth,
+            _ => config.input.poses,
+        };
+        let external = dataset
+            .external_trajectory
+            .as_ref()
+            .map(|t| (&t.trajectory, TrajectorySource::External { file: t.source.display().to_string() }));
+        let truth = dataset.ground_truth.as_ref().map(|t| (t, TrajectorySource::GroundTruth));
+        let in_use = |(trajectory, source): (&Trajectory, TrajectorySource)| {
+            Ok::<_, Error>(MetricTrajectory { source, camera_trajectory: in_camera(trajectory, dataset)? })
+        };
+        let has_imu = dataset.rig.imu.is_some() && !dataset.imu.is_empty();
+        let given = match choice {
+            PoseChoice::Odometry => return Ok(Self::Odometry { fallback: None }),
+            PoseChoice::Auto if external.is_none() && has_imu => {
+                return Ok(Self::Odometry { fallback: truth.map(in_use).transpose()? });
+            }
+            PoseChoice::External => external,
+            PoseChoice::GroundTruth => truth,
+            PoseChoice::Auto => external.or(truth),
+        };
+        match given {
+            Some(given) => in_use(given).map(Self::Given),
+            None if mode.uses_pose_priors() => Err(Error::NoMetricTrajectory { name: dataset.name.clone() }),
+            None => Ok(Self::None),
+        }
+    }
+
+    /// Where poses come from, as far as it is known before tracking.
+    pub fn source(&self) -> Option<TrajectorySource> {
+        match self {
+            Self::None => None,
+            Self::Given(trajectory) => Some(trajectory.source.clone()),
+            Self::Odometry { .. } => Some(TrajectorySource::Odometry),
+        }
+    }
+
+    /// The given trajectory as a source of poses.
+    pub fn given(&self, dataset: &Dataset, config: &Config) -> Option<GivenPoses> {
+        match self {
+            Self::Given(trajectory) => Some(given_poses(trajectory, dataset, config)),
+            Self::None | Self::Odometry { .. } => None,
+        }
+    }
+
+    /// Sources of poses for the engine: the one that is planned, and its fallback.
+    ///
+    /// # Errors
+    /// Settings or calibration that the odometry refuses.
+    #[allow(clippy::type_complexity)] // two sources of one kind, named by their place in `EngineSetup`
+    pub fn open(
+        &self,
+        dataset: &Dataset,
+        config: &Config,
+    ) -> Result<(Option<Box<dyn PoseSource>>, Option<Box<dyn PoseSource>>), Error> {
+        let boxed = |poses: GivenPoses| Box::new(poses) as Box<dyn PoseSource>;
+        Ok(match self {
+            Self::None => (None, None),
+            Self::Given(trajectory) => (Some(boxed(given_poses(trajectory, dataset, config))), None),
+            Self::Odometry { fallback } => {
+                let odometry = OdometryPoses::new(&dataset.rig, dataset.camera, &config.odometry)?;
+                let fallback = fallback.as_ref().map(|t| boxed(given_poses(t, dataset, config)));
+                (Some(Box::new(odometry)), fallback)
+            }
+        })
+    }
+}
+
+fn given_poses(trajectory: &MetricTrajectory, dataset: &Dataset, config: &Config) -> GivenPoses {
+    // Poses are in the IMU's clock: t_imu = t_camera + offset.
+    let offset = dataset.rig.camera(dataset.camera).map_or(Duration::ZERO, |c| c.time_offset);
+    GivenPoses::new(trajectory.clone(), offset, Duration::from_secs_f64(config.input.max_pose_gap_secs))
+}
+
+/// A recording as the engine takes it: IMU samples and images in the order of time, each image decoded when its turn comes.
+/// An image that cannot be read comes as its time alone, with a warning.
+pub enum Measurement {
+    /// A measurement, whole.
+    Event(SensorEvent),
+    /// An image whose pixels are not needed.
+    Stamp(FrameStamp),
+    /// An image whose pixels cannot be read.
+    Unreadable(FrameStamp, DatasetError),
+}
+
+/// The measurements of a recording; without `sensors` only the times of its images.
+pub fn measurements(dataset: &Dataset, sensors: bool) -> impl Iterator<Item = Measurement> + '_ {
+    let mut imu = if sensors { dataset.imu.as_slice() } else { &[] }.iter().peekable();
+    let mut images = dataset.images.iter().peekable();
+    std::iter::from_fn(move || {
+        let image_time = images.peek().map(|i| i.time);
+        // At equal times the IMU comes first.
+        if let Some(sample) = imu.next_if(|s| image_time.is_none_or(|t| s.time <= t)) {
+            return Some(Measurement::Event(SensorEvent::Imu(*sample)));
+        }
+        let entry = images.next()?;
+        let stamp = stamp_of(entry);
+        if !sensors {
+            return Some(Measurement::Stamp(stamp));
+        }
+        Some(match dataset.load_image(entry) {
+            Ok(image) => {
+                let FrameStamp { frame_id: id, time, camera } = stamp;
+                Measurement::Event(SensorEvent::Image(Frame { id, time, camera, image }))
+            }
+            Err(error) => Measurement::Unreadable(stamp, error),
+        })
+    })
+}
+
+/// An image of the recording without its pixels.
+pub fn stamp_of(entry: &ImageEntry) -> FrameStamp {
+    FrameStamp { frame_id: entry.frame_id, time: entry.time, camera: entry.camera }
+}
+
+/// Reads a recording's images again when the engine needs their pixels.
+pub struct ImageFiles<'a>(pub &'a Dataset);
+
+impl ImageSource for ImageFiles<'_> {
+    fn image(&self, stamp: &FrameStamp) -> Result<FrameImage, Warning> {
+        let missing = || {
+            let message = format!("the recording has no image {}", stamp.frame_id);
+            Warning::degraded("image-unreadable", message)
+        };
+        let place = self.0.images.binary_search_by_key(&stamp.time, |i| i.time);
+        let is_it = |entry: &&ImageEntry| entry.frame_id == stamp.frame_id;
+        let entry = place.ok().and_then(|i| self.0.images.get(i)).filter(is_it);
+        let entry = entry.or_else(|| self.0.images.iter().find(is_it)).ok_or_else(missing)?;
+        self.0
+            .load_image(entry)
+            .map_err(|e| Warning::degraded("image-unreadable", e.to_string()).at(entry.path.display()))
+    }
+}
+
+/// Opens the recording with all of its images between start and end: the odometry uses every one,
+/// whatever `input.stride` leaves for depth.
 pub fn open_every_image(path: &Path, options: &OpenOptions, config: &Config) -> Result<Dataset, Error> {
     let mut config = config.clone();
     config.input.stride = 1;
@@ -72,65 +222,7 @@ pub fn open_dataset(path: &Path, options: &OpenOptions, config: &Config) -> Resu
     Ok(vidar_dataset::open(path, &options)?)
 }
 
-/// The metric trajectory that the configuration asks for.
-pub fn metric_anchor(
-    dataset: &Dataset,
-    config: &Config,
-    events: &Events,
-    cancel: &CancelToken,
-) -> Result<MetricAnchor, Error> {
-    let external =
-        dataset.anchor.as_ref().map(|a| (&a.trajectory, AnchorSource::External { file: shown(&a.source) }));
-    let truth = dataset.ground_truth.as_ref().map(|t| (t, AnchorSource::GroundTruth));
-    let given = |chosen: Option<(&Trajectory, AnchorSource)>| {
-        let (trajectory, source) = chosen.ok_or_else(|| Error::NoAnchor { name: dataset.name.clone() })?;
-        let camera_trajectory = in_camera(trajectory, dataset)?;
-        Ok(MetricAnchor { source, camera_trajectory, warnings: Vec::new(), tracked: None })
-    };
-    let has_imu = dataset.rig.imu.is_some() && !dataset.imu.is_empty();
-    match config.input.poses {
-        PoseSource::External => given(external),
-        PoseSource::GroundTruth => given(truth),
-        PoseSource::Odometry => odometry_anchor(dataset, config, events, cancel),
-        PoseSource::Auto if external.is_some() => given(external),
-        PoseSource::Auto if has_imu => match odometry_anchor(dataset, config, events, cancel) {
-            Err(Error::NoOdometry { reason, .. }) if truth.is_some() => {
-                let mut anchor = given(truth)?;
-                let message =
-                    format!("the odometry never gave a metric pose ({reason}): ground truth is used");
-                let hint = "scores are an upper bound; --set input.poses=odometry refuses to do without";
-                anchor.warnings.push(Warning::new("odometry-not-used", message).hint(hint));
-                Ok(anchor)
-            }
-            other => other,
-        },
-        PoseSource::Auto => given(truth),
-    }
-}
-
-/// The longest span that the odometry tracked in metres.
-fn odometry_anchor(
-    dataset: &Dataset,
-    config: &Config,
-    events: &Events,
-    cancel: &CancelToken,
-) -> Result<MetricAnchor, Error> {
-    require_calibration(dataset)?;
-    let total = dataset.images.len();
-    let tracked = events
-        .stage("odometry", total, || crate::odometry::track(dataset, config, events, cancel))
-        .map(Arc::new)?;
-    let trajectory = tracked.longest_segment().filter(|_| tracked.is_metric);
-    let trajectory = trajectory.ok_or_else(|| Error::NoOdometry {
-        name: dataset.name.clone(),
-        reason: tracked.why_not_started().unwrap_or_else(|| "it is told to leave the IMU out".into()),
-    })?;
-    let camera_trajectory = in_camera(&trajectory, dataset)?;
-    let warnings = tracked.warnings();
-    Ok(MetricAnchor { source: AnchorSource::Odometry, camera_trajectory, warnings, tracked: Some(tracked) })
-}
-
-/// Ground truth told of the camera in use, if there is any that can be.
+/// Ground truth of the camera in use, where its place on the rig is known.
 pub fn truth_in_camera(dataset: &Dataset) -> Option<Trajectory> {
     dataset.ground_truth.as_ref().and_then(|t| in_camera(t, dataset).ok())
 }
@@ -139,45 +231,19 @@ fn in_camera(trajectory: &Trajectory, dataset: &Dataset) -> Result<Trajectory, E
     Ok(trajectory.in_frame(BodyFrame::Camera(dataset.camera), &dataset.rig)?)
 }
 
-/// Every image that has a pose. Images outside the trajectory are counted in a warning; none at all is an error.
-pub fn posed_frames(
-    dataset: &Dataset,
+/// Refuses a given trajectory that no image was taken within.
+pub fn require_overlap(
     images: &[ImageEntry],
-    anchor: &MetricAnchor,
-    config: &Config,
-) -> Result<(Vec<PosedFrame>, Vec<Warning>), Error> {
-    let pose_of = poses_at(dataset, anchor, config);
-    let posed =
-        |image: &ImageEntry| Some(PosedFrame { image: image.clone(), world_from_camera: pose_of(image)? });
-    let frames: Vec<PosedFrame> = images.iter().filter_map(posed).collect();
-    if frames.is_empty() {
-        let poses = anchor.camera_trajectory.time_range();
-        let slip = images.first().zip(poses).and_then(|(image, (pose, _))| unit_slip(image.time, pose));
-        let images = range(images.first().map(|i| i.time).zip(images.last().map(|i| i.time)));
-        return Err(Error::NoOverlap { images, poses: range(poses), slip });
+    poses: &GivenPoses,
+    trajectory: &Trajectory,
+) -> Result<(), Error> {
+    if images.is_empty() || images.iter().any(|i| poses.pose_at(i.time).is_some()) {
+        return Ok(());
     }
-    let missing = images.len() - frames.len();
-    let mut warnings = Vec::new();
-    if missing > 0 {
-        let message = format!("{missing} of {} images have no pose and are left out", images.len());
-        warnings.push(
-            Warning::new("images-without-pose", message)
-                .hint("they lie outside the trajectory, or in a gap longer than input.max_pose_gap_secs"),
-        );
-    }
-    Ok((frames, warnings))
-}
-
-/// The anchor's pose of the camera when an image was taken.
-pub fn poses_at<'a>(
-    dataset: &Dataset,
-    anchor: &'a MetricAnchor,
-    config: &Config,
-) -> impl Fn(&ImageEntry) -> Option<Se3> + 'a {
-    let max_gap = Duration::from_secs_f64(config.input.max_pose_gap_secs);
-    let offset = dataset.rig.camera(dataset.camera).map_or(Duration::ZERO, |c| c.time_offset);
-    // Poses are in the IMU's clock: t_imu = t_camera + offset.
-    move |image| anchor.camera_trajectory.interpolate(image.time + offset, max_gap)
+    let times = trajectory.time_range();
+    let slip = images.first().zip(times).and_then(|(image, (pose, _))| unit_slip(image.time, pose));
+    let images = range(images.first().map(|i| i.time).zip(images.last().map(|i| i.time)));
+    Err(Error::NoOverlap { images, poses: range(times), slip })
 }
 
 /// Two clocks that differ by a factor of about 10³, 10⁶ or 10⁹ are one clock in two units.
@@ -204,10 +270,6 @@ pub fn require_calibration(dataset: &Dataset) -> Result<(), Error> {
 
 fn range(times: Option<(vidar_core::Timestamp, vidar_core::Timestamp)>) -> String {
     times.map_or_else(|| "nothing".to_owned(), |(first, last)| format!("{first} to {last} s"))
-}
-
-fn shown(path: &Path) -> String {
-    path.display().to_string()
 }
 
 /// A path made absolute for the manifest, as far as the system can.

@@ -1,13 +1,12 @@
-//! The corridor: configuration, events, the run folder, and the stages wired together.
-//!
-//! Data flows through the rooms in one direction:
+//! The pipeline: configuration, the mapping engine, events, the run folder, and all stages connected.
 //!
 //! ```text
 //! vidar-dataset ─▶ metric poses ─▶ vidar-stereo ─▶ vidar-align ─▶ vidar-fusion ─▶ vidar-eval · vidar-export · vidar-view
-//!  Dataset          Keyframe        GeometryPrediction  AlignedView    TsdfVolume       scores · files · pictures
+//!  Dataset          MapKeyframe     GeometryPrediction  AlignedView    Surface          scores · files · figures
 //! ```
 //!
-//! [`run::run`] is that figure as code; the program in `apps/vidar` only parses, calls it and prints.
+//! [`engine::Engine`] is the method as a push machine: sensor measurements in, map events out. [`run::run`] is a run of it:
+//! recording → engine → evaluate → export. The program in `apps/vidar` only parses, calls it and prints.
 
 pub mod bench;
 pub mod chunks;
@@ -15,13 +14,13 @@ pub mod config;
 pub mod demo;
 pub mod depth;
 pub mod doctor;
+pub mod engine;
 pub mod error;
 pub mod evaluate;
 pub mod events;
 pub mod export;
 pub mod input;
 pub mod inspect;
-pub mod keyframes;
 pub mod models;
 pub mod odometry;
 pub mod run;

@@ -7,12 +7,12 @@ mod report;
 use crate::config::{Config, Layered};
 use crate::error::{Error, ExitStatus};
 use crate::events::{CancelToken, Event, Events};
-use crate::input;
-use crate::run_folder::{MANIFEST_SCHEMA, Manifest, Place, RunFolder};
+use crate::input::{self, Measurement};
+use crate::run_folder::{MANIFEST_SCHEMA, Manifest, OutputLocation, RunFolder};
 use serde_json::{Value, json};
 use std::path::PathBuf;
 use std::time::Instant;
-use vidar_core::{BodyFrame, OdometryKeyframe, RevisedPose, SensorEvent, StampedPose, Trajectory, Warning};
+use vidar_core::{BodyFrame, OdometryKeyframe, RevisedPose, StampedPose, Trajectory, Warning};
 use vidar_dataset::{Dataset, OpenOptions};
 use vidar_eval::TrajectoryReport;
 use vidar_odometry::{ImuUse, InputCounts, Odometry, OdometryOutput, Status};
@@ -27,7 +27,7 @@ pub struct OdometryRequest {
     /// The configuration with its origins.
     pub layered: Layered,
     /// Where results go.
-    pub place: Place,
+    pub place: OutputLocation,
     /// The command as typed, for the manifest.
     pub command: Vec<String>,
     /// Whether tracks, residuals and states are written out as tables.
@@ -37,7 +37,7 @@ pub struct OdometryRequest {
 /// One image as the odometry left it.
 #[derive(Clone, Debug)]
 pub struct TrackedFrame {
-    /// What was said of it; landmarks, keyframe and revisions are kept elsewhere.
+    /// The output for it; landmarks, keyframe and revisions are kept elsewhere.
     pub output: OdometryOutput,
     /// Wall time that it took, s, decoding left out.
     pub seconds: f64,
@@ -54,7 +54,7 @@ pub struct LostSpan {
     pub reason: String,
 }
 
-/// Everything that the odometry said of a recording.
+/// All outputs of the odometry on a recording.
 #[derive(Clone, Debug, Default)]
 pub struct Tracked {
     /// Every image, in order.
@@ -65,7 +65,7 @@ pub struct Tracked {
     pub lost: Vec<LostSpan>,
     /// What was taken and left out.
     pub counts: InputCounts,
-    /// What was said of images that could not be read; they are left out.
+    /// Errors of images that could not be read; they are skipped.
     pub unreadable: Vec<String>,
     /// Whether lengths are metres.
     pub is_metric: bool,
@@ -106,7 +106,7 @@ pub fn odometry(
     let total = dataset.images.len();
     let mut dump = if request.debug_dump { Some(dump::Dump::create(&folder)?) } else { None };
     let tracked =
-        events.stage("odometry", total, || track_into(&dataset, &config, events, cancel, dump.as_mut()))?;
+        events.stage("odometry", total, || track(&dataset, &config, events, cancel, dump.as_mut()))?;
     let dumped = dump.is_some();
     dump.map_or(Ok(()), dump::Dump::finish)?;
 
@@ -115,7 +115,7 @@ pub fn odometry(
     warnings.iter().for_each(|w| events.warn(w));
     let trajectory = tracked.longest_segment();
     let report = match (&trajectory, &dataset.ground_truth) {
-        (Some(trajectory), Some(truth)) => judge(trajectory, truth, &dataset, &config)?,
+        (Some(trajectory), Some(truth)) => evaluate(trajectory, truth, &dataset, &config)?,
         _ => None,
     };
     let status = match (cancel.is_cancelled(), trajectory.is_none() || !tracked.lost.is_empty()) {
@@ -144,17 +144,8 @@ pub fn odometry(
     Ok(outcome)
 }
 
-/// Feeds a dataset to the odometry.
-pub(crate) fn track(
-    dataset: &Dataset,
-    config: &Config,
-    events: &Events,
-    cancel: &CancelToken,
-) -> Result<Tracked, Error> {
-    track_into(dataset, config, events, cancel, None)
-}
-
-fn track_into(
+/// Feeds a recording to the odometry.
+fn track(
     dataset: &Dataset,
     config: &Config,
     events: &Events,
@@ -167,21 +158,19 @@ fn track_into(
     let mut tracked = Tracked { is_metric, ..Tracked::default() };
     let total = dataset.images.len();
     let mut spent = 0.0;
-    for event in dataset.events() {
+    for measurement in input::measurements(dataset, true) {
         if cancel.is_cancelled() {
             break;
         }
-        let event = match event {
-            Ok(event) => event,
+        let event = match measurement {
+            Measurement::Event(event) => event,
             // A broken image is a gap in the stream, not the end of the flight.
-            Err(error) => {
+            Measurement::Unreadable(_, error) => {
                 tracked.unreadable.push(error.to_string());
                 continue;
             }
+            Measurement::Stamp(_) => continue,
         };
-        if matches!(event, SensorEvent::GroundTruth { .. } | SensorEvent::Depth { .. }) {
-            continue;
-        }
         let clock = Instant::now();
         let output = odometry.push(event)?;
         spent += clock.elapsed().as_secs_f64();
@@ -266,14 +255,14 @@ impl Tracked {
         for span in &self.lost {
             let at = vidar_core::Timestamp::from_nanos(span.from_ns);
             warnings
-                .push(Warning::new("track-lost", format!("at {at} s: {}", span.reason)).hint(
-                    "poses after it are a segment of their own; odometry/health.csv tells every image",
+                .push(Warning::degraded("track-lost", format!("at {at} s: {}", span.reason)).hint(
+                    "poses after it are a segment of their own; odometry/health.csv lists every image",
                 ));
         }
         if !self.frames.iter().any(|f| f.output.tracking().is_some()) {
             let why = self.why_not_started().unwrap_or_else(|| "no images".into());
             let text = format!("the odometry never started: {why}");
-            warnings.push(Warning::new("odometry-never-started", text));
+            warnings.push(Warning::degraded("odometry-never-started", text));
         }
         if !self.is_metric {
             let text =
@@ -284,7 +273,7 @@ impl Tracked {
     }
 }
 
-fn judge(
+fn evaluate(
     trajectory: &Trajectory,
     truth: &Trajectory,
     dataset: &Dataset,

@@ -1,4 +1,4 @@
-//! The run folder: a thing one can mail to a colleague.
+//! The run folder: everything about one run, in files that stand alone.
 //!
 //! Written atomically, appended as computed; nothing is deleted that this run did not write.
 
@@ -24,7 +24,7 @@ pub struct RunFolder {
 
 /// Where a new run folder goes.
 #[derive(Clone, Debug)]
-pub enum Place {
+pub enum OutputLocation {
     /// Exactly here.
     Exact {
         /// The folder.
@@ -46,7 +46,7 @@ pub enum Place {
     },
 }
 
-impl Place {
+impl OutputLocation {
     /// Makes an empty folder there and returns its path.
     pub fn reserve(&self) -> Result<PathBuf, Error> {
         match self {
@@ -70,7 +70,7 @@ impl Place {
     }
 }
 
-/// What is written down about a run.
+/// Record of a run.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
 pub struct Manifest {
     /// [`MANIFEST_SCHEMA`].
@@ -126,13 +126,15 @@ pub struct StoredView {
 
 impl RunFolder {
     /// Makes the folder, refusing one that is in use.
-    pub fn create(place: &Place) -> Result<Self, Error> {
+    pub fn create(place: &OutputLocation) -> Result<Self, Error> {
         let root = place.reserve()?;
         let path = root.join("log.jsonl");
         let mut options = File::options();
         let log = match place {
-            Place::Resumed { .. } => options.create(true).append(true),
-            Place::Exact { .. } | Place::Dated { .. } => options.create(true).write(true).truncate(true),
+            OutputLocation::Resumed { .. } => options.create(true).append(true),
+            OutputLocation::Exact { .. } | OutputLocation::Dated { .. } => {
+                options.create(true).write(true).truncate(true)
+            }
         };
         let log = log.open(&path).map_err(|e| Error::io("create", &path, e))?;
         Ok(Self { root, log: Mutex::new(Some(log)) })
@@ -269,7 +271,7 @@ mod tests {
     fn an_occupied_folder_is_refused_and_force_moves_it_aside() {
         let base = tempfile::tempdir().unwrap();
         let path = base.path().join("out ä");
-        let place = |force| Place::Exact { path: path.clone(), force };
+        let place = |force| OutputLocation::Exact { path: path.clone(), force };
         RunFolder::create(&place(false)).unwrap().write("a/b.txt", b"one").unwrap();
         assert!(matches!(RunFolder::create(&place(false)), Err(Error::OutputExists { .. })));
         RunFolder::create(&place(true)).unwrap();
@@ -281,7 +283,7 @@ mod tests {
     #[test]
     fn dated_folders_never_collide_and_latest_names_the_newest() {
         let base = tempfile::tempdir().unwrap();
-        let place = Place::Dated { base: base.path().to_owned(), name: "../my room".into() };
+        let place = OutputLocation::Dated { base: base.path().to_owned(), name: "../my room".into() };
         let first = RunFolder::create(&place).unwrap();
         let second = RunFolder::create(&place).unwrap();
         assert_ne!(first.path(), second.path());
@@ -296,7 +298,8 @@ mod tests {
     #[test]
     fn events_are_lines_with_a_schema() {
         let base = tempfile::tempdir().unwrap();
-        let folder = RunFolder::create(&Place::Exact { path: base.path().join("r"), force: false }).unwrap();
+        let folder =
+            RunFolder::create(&OutputLocation::Exact { path: base.path().join("r"), force: false }).unwrap();
         folder.log(&Event::StageStarted { stage: "stereo", total: 3 });
         let warning = vidar_core::Warning::new("time-gap", "0.5 s without images").at("cam0");
         folder.log(&Event::Warning { warning });

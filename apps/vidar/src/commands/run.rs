@@ -5,7 +5,7 @@ use crate::{Context, Outcome, build, print, progress};
 use serde_json::json;
 use vidar::demo::DemoRequest;
 use vidar::evaluate::Thresholds;
-use vidar::run_folder::Place;
+use vidar::run_folder::OutputLocation;
 use vidar::synth::SynthConfig;
 use vidar::{Error, ExitStatus, RunOutcome, RunRequest};
 
@@ -22,7 +22,7 @@ pub fn run(args: &RunArgs, context: &Context) -> Outcome {
         layered,
         reference: args.reference.clone(),
         place: match (&args.output.output, args.resume) {
-            (Some(path), true) => Place::Resumed { path: path.clone() },
+            (Some(path), true) => OutputLocation::Resumed { path: path.clone() },
             _ => build::place(&args.output, &build::name_of(&args.path)),
         },
         command: context.command.clone(),
@@ -34,7 +34,7 @@ pub fn run(args: &RunArgs, context: &Context) -> Outcome {
     conclude(&outcome, &thresholds, context)
 }
 
-/// Writes an acceptance given with this command down, before the model is opened.
+/// Records an acceptance of a licence given with this command, before the model is opened.
 fn accept_licence(layered: &vidar::Layered, args: &RunArgs) -> Result<(), Error> {
     let (Some(accepted), Some(choice)) =
         (super::model::accepted(&args.licence), vidar::models::geometry::chosen(&layered.build()?)?)
@@ -57,7 +57,7 @@ fn dry_run(request: &RunRequest, context: &Context) -> Outcome {
     Ok(ExitStatus::Done)
 }
 
-/// A synthetic room, flown, mapped and judged.
+/// A synthetic room, flown, mapped and evaluated.
 pub fn demo(args: &DemoArgs, context: &Context) -> Outcome {
     let mut layered = build::layered(&args.config, Some("demo"))?;
     build::apply_source_flags(&mut layered, args.geometry.as_deref(), args.model_dir.as_deref())?;
@@ -71,9 +71,9 @@ pub fn demo(args: &DemoArgs, context: &Context) -> Outcome {
     conclude(&outcome, &Thresholds::default(), context)
 }
 
-/// Says what was made, how far to trust it, and what next; then applies thresholds.
+/// Prints the result with its warnings and scores; then applies thresholds.
 fn conclude(outcome: &RunOutcome, thresholds: &Thresholds, context: &Context) -> Outcome {
-    let scores = vidar::evaluate::scores(&outcome.judgement);
+    let scores = vidar::evaluate::scores(&outcome.evaluation);
     if context.cli.json {
         print::json(&json!({
             "schema": "vidar.run/1",

@@ -81,7 +81,7 @@ fn every_coupling_makes_a_map_and_says_what_it_is() {
         assert!(!run.join("chunks").exists(), "{mode}: what is done with is removed");
         errors.push((
             mode,
-            result["judgement"]["depth"]["pixel_weighted"]["metric"]["abs_rel"].as_f64().unwrap(),
+            result["evaluation"]["depth"]["pixel_weighted"]["metric"]["abs_rel"].as_f64().unwrap(),
         ));
     }
     // The truth is at hand: metric couplings tell metres, the others cannot.
@@ -100,7 +100,7 @@ fn what_stereo_is_sure_of_straightens_a_small_networks_depth_and_leaves_a_good_o
         out
     };
     let error = |run: &Path| {
-        let depth = &manifest(run)["result"]["judgement"]["depth"]["pixel_weighted"];
+        let depth = &manifest(run)["result"]["evaluation"]["depth"]["pixel_weighted"];
         depth["metric"]["abs_rel"].as_f64().unwrap()
     };
     // Poses are true and come without landmarks.
@@ -199,11 +199,11 @@ fn the_folder_of_da3_streaming_is_read() {
     assert!([0, 3].contains(&ran.code), "{}", ran.stderr);
     let folder = out("official streaming");
     streaming_folder(&first.join("chunks"), &folder);
-    let judged = ["--mode", "hybrid", "--set", "geometry.chunk_keyframes=60", "--set", "eval.mode=auto"];
-    let (ran, run) = recorded("from streaming", &folder, &judged);
+    let evaluated = ["--mode", "hybrid", "--set", "geometry.chunk_keyframes=60", "--set", "eval.mode=auto"];
+    let (ran, run) = recorded("from streaming", &folder, &evaluated);
     assert!([0, 3].contains(&ran.code), "{}", ran.stderr);
     let result = &manifest(&run)["result"];
-    let abs_rel = result["judgement"]["depth"]["pixel_weighted"]["metric"]["abs_rel"].as_f64().unwrap();
+    let abs_rel = result["evaluation"]["depth"]["pixel_weighted"]["metric"]["abs_rel"].as_f64().unwrap();
     assert!(abs_rel < 0.1, "{result}");
 }
 
@@ -276,7 +276,7 @@ fn the_map_grows_while_chunks_come_and_ends_as_it_would_have() {
     let grown: Vec<u64> = log
         .lines()
         .filter_map(|l| serde_json::from_str::<Value>(l).ok())
-        .filter(|e| e["event"] == "map-grew")
+        .filter(|e| e["event"] == "surface-changed" && e["is_final"] == false)
         .map(|e| e["triangles"].as_u64().unwrap())
         .collect();
     assert!(grown.len() >= 3 && grown[0] > 1000 && grown.last() > grown.first(), "{grown:?}");
@@ -285,7 +285,7 @@ fn the_map_grows_while_chunks_come_and_ends_as_it_would_have() {
 }
 
 #[test]
-fn a_revisit_is_found_judged_and_told() {
+fn a_revisit_is_found_measured_and_reported() {
     // More than one lap round a room: the last keyframes see what the first ones saw.
     let sequence = shared().root.join("round and round");
     let world = shared().root.join("back.toml");
@@ -321,7 +321,7 @@ fn poses_are_not_needed_where_no_metres_are_asked_for() {
     assert!([0, 3].contains(&ran.code), "{}", ran.stderr);
     let manifest = manifest(&run);
     assert!(manifest["poses"].is_null() && manifest["result"]["is_metric"] == false, "{manifest}");
-    assert!(!run.join("trajectory/anchor_camera.tum").exists());
+    assert!(!run.join("trajectory/metric_camera.tum").exists());
     assert!(run.join("trajectory/keyframes_camera.tum").exists());
     let (ran, _) = simulated("unposed hybrid", &["--mode", "hybrid", "--set", "input.poses=external"]);
     ran.ends_with(1).says(&["E0202"]);

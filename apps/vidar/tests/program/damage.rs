@@ -135,7 +135,7 @@ fn an_inconsistent_chunk_is_left_out_where_anything_contradicts_it() {
             }
         }
     });
-    // `pose-conditioned` divides by one scale and has no neighbour to ask: it sees centres far from their anchors.
+    // `pose-conditioned` divides by one scale and has no neighbour to ask: it sees centres far from their pose priors.
     let acted = ["inconsistent-chunk", "no-overlap", "scale-out-of-range", "rank-deficient"];
     survives("inconsistent", &source, &acted, &["pose-free", "hybrid", "coupled"]);
 }
@@ -160,7 +160,8 @@ fn a_unit_that_jumps_by_a_third_changes_no_metric_map() {
                 run(&format!("{name} {mode}"), &source, &["--mode", mode, "--set", "eval.mode=auto"]);
             assert!([0, 3].contains(&ran.code), "{name}, {mode}: {}", ran.stderr);
             let result = &manifest(&folder)["result"];
-            let error = result["judgement"]["depth"]["pixel_weighted"]["metric"]["abs_rel"].as_f64().unwrap();
+            let error =
+                result["evaluation"]["depth"]["pixel_weighted"]["metric"]["abs_rel"].as_f64().unwrap();
             assert!(error < 0.12, "{name}, {mode}: {error}");
         }
     }
@@ -228,7 +229,7 @@ fn the_place_recognition_descriptor_is_selectable_and_recorded_in_the_manifest()
     ] {
         let (ran, folder) = run(&format!("places {name}"), "simulated", more);
         assert!([0, 3].contains(&ran.code), "{name}: {}", ran.stderr);
-        assert_eq!(manifest(&folder)["result"]["places"], expected);
+        assert_eq!(manifest(&folder)["result"]["place_recognition"], expected);
         let arrays =
             read_npz(File::open(folder.join("chunks/000000.npz")).unwrap(), NpzLimits::default()).unwrap();
         assert_eq!(arrays.get("place").map(|a| a.shape[1]), length, "{name}");

@@ -96,6 +96,19 @@ const ONE_PIXEL_PNG: &[u8] = &[
 ];
 
 #[test]
+fn ground_truth_in_place_of_odometry_that_failed_degrades_the_run() {
+    // Two and a half seconds at 8 Hz of 160x104 pixels are too little for the odometry to initialise.
+    let out = shared().root.join("fallback");
+    let flags = ["-q", "--stride", "2", "--set", "input.poses=auto"];
+    run_on(&shared().sequence, &out, &flags).ends_with(3).says(&["[odometry-not-used]", "upper bound"]);
+    let manifest = manifest(&out);
+    assert_eq!((&manifest["exit"], &manifest["poses"]["source"]), (&3.into(), &"ground-truth".into()));
+    let out = shared().root.join("no fallback");
+    let flags = ["-q", "--stride", "2", "--set", "input.poses=odometry"];
+    run_on(&shared().sequence, &out, &flags).ends_with(1).says(&["error[E0209]", "hint:"]);
+}
+
+#[test]
 fn no_readable_image_at_all_is_bad_input() {
     let bench = Bench::new();
     for image in images_of(&bench.sequence) {
@@ -167,7 +180,7 @@ fn singular_intrinsics_are_refused_with_their_place() {
 
 #[test]
 fn poses_that_are_not_numbers_are_left_out_and_counted() {
-    let truth = fs::read_to_string(finished().0.join("trajectory/anchor_camera.tum")).unwrap();
+    let truth = fs::read_to_string(finished().0.join("trajectory/metric_camera.tum")).unwrap();
     let mut number = 0;
     let spoilt: Vec<String> = truth
         .lines()
@@ -221,7 +234,7 @@ fn images_alone_are_inspected_but_not_mapped_without_calibration_and_poses() {
     let images = image_folder(folder.path());
     let ran = vidar(&["inspect", text(&images)]).ends_with(0).says(&["intrinsics-guessed"]);
     assert!(ran.stdout.contains("not possible yet"), "{}", ran.stdout);
-    let truth = finished().0.join("trajectory/anchor_camera.tum");
+    let truth = finished().0.join("trajectory/metric_camera.tum");
     let out = folder.path().join("out");
     let trajectory = ["--trajectory", text(&truth), "--trajectory-body", "camera0", "-q"];
     run_on(&images, &out, &trajectory).ends_with(1).says(&[
@@ -274,7 +287,7 @@ fn an_invalid_reference_is_refused_early_or_prevents_only_the_evaluation() {
     let file = bench.folder.path().join("nan.ply");
     fs::write(&file, nan).unwrap();
     let flags = ["--stride", "2", "--set", "eval.mode=auto", "--reference", text(&file)];
-    let ran = bench.run(&flags).ends_with(3).says(&["[not-judged]"]);
+    let ran = bench.run(&flags).ends_with(3).says(&["[not-evaluated]"]);
     assert!(ran.stderr.contains("nan") || ran.stderr.contains("NaN"), "{}", ran.stderr);
     assert!(bench.out().join("map/mesh.ply").is_file(), "the map must survive a bad reference");
     vidar(&["eval", text(&file), text(&finished().0.join("map/points.ply"))]).ends_with(1).says(&["error["]);

@@ -11,7 +11,7 @@ fn score(json: &Value, name: &str) -> f64 {
 
 /// The camera's true poses at every image, as a trajectory of its own.
 fn truth() -> Trajectory {
-    let path = finished().0.join("trajectory/anchor_camera.tum");
+    let path = finished().0.join("trajectory/metric_camera.tum");
     vidar::dataset::read_trajectory(&path, &Default::default()).unwrap().0
 }
 
@@ -61,7 +61,7 @@ fn the_map_of_the_tiny_room_lies_on_the_scan() {
     // 160 px wide images put neighbouring rays 4 cm apart at 3 m: precision at 0.10 m must be high, recall is
     // bounded by what 2.5 s of flight see. Without any of stereo, placement or fusion F would be below 0.2.
     assert!(score(json, "f@0.10") > 0.6, "{}", json["scores"]);
-    let surface = &json["result"]["judgement"]["surface"];
+    let surface = &json["result"]["evaluation"]["surface"];
     let at_10 = surface["native"].as_array().unwrap().last().unwrap();
     assert!(at_10["precision"].as_f64().unwrap() > 0.8, "{at_10}");
     // The depth images are exact, so the error is stereo's own.
@@ -95,7 +95,7 @@ fn a_trajectory_of_wrong_scale_is_found_out_by_the_native_score_and_forgiven_by_
     let (native, truth) = (score(&json, "f@0.10"), score(with_truth, "f@0.10"));
     assert!(native < truth - 0.15, "native F {native} against {truth}");
     assert!(score(&json, "delta-f") > 0.15, "the free scale must win it back: {}", json["scores"]);
-    let free = json["result"]["judgement"]["surface"]["scale_free"].as_f64().unwrap();
+    let free = json["result"]["evaluation"]["surface"]["scale_free"].as_f64().unwrap();
     assert!((free * 1.3 - 1.0).abs() < 0.05, "free scale {free}, expected about {}", 1.0 / 1.3);
 }
 
@@ -132,7 +132,7 @@ fn the_exported_truth_equals_the_truth_of_the_recording() {
     let body = vidar::dataset::read_trajectory(&truth_csv, &Default::default()).unwrap().0;
     assert!(
         body.len() >= 20 && truth().len() == body.len(),
-        "poses of the anchor are those of the recording"
+        "poses of the trajectory are those of the recording"
     );
     assert!(Path::new(VIDAR).is_file());
     // A camera is a hand's breadth from its body: both fly the same way.

@@ -131,7 +131,11 @@ pub fn run_on(sequence: &Path, out: &Path, more: &[&str]) -> ProgramOutput {
 /// The same, not yet started.
 pub fn run_command(sequence: &Path, out: &Path, more: &[&str]) -> Command {
     let mut command = command();
-    command.arg("run").arg(sequence).arg("-o").arg(out).arg("--config").arg(&shared().settings).args(more);
+    command.arg("run").arg(sequence).arg("-o").arg(out).arg("--config").arg(&shared().settings);
+    if more.iter().any(|m| m.starts_with("--trajectory")) {
+        command.args(["--set", "input.poses=external"]);
+    }
+    command.args(more);
     command
 }
 

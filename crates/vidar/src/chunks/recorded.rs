@@ -8,7 +8,8 @@
 //!
 //! "The N-th image" counts those that `input.start_secs`, `end_secs` and `stride` leave.
 
-use super::store::{StoredChunk, load, read_sidecar, read_views};
+use super::store::{StoredChunk, is_loop, load, read_sidecar, read_views};
+use crate::engine::PredictionId;
 use crate::error::Error;
 use nalgebra::Matrix4;
 use std::collections::BTreeMap;
@@ -61,7 +62,7 @@ impl Recording {
             names.iter().filter(|n| n.extension().is_some_and(|e| e == extension)).cloned().collect()
         };
         let described: Vec<PathBuf> =
-            of("json").into_iter().filter(|j| j.with_extension("npz").exists()).collect();
+            of("json").into_iter().filter(|j| j.with_extension("npz").exists() && !is_loop(j)).collect();
         if !described.is_empty() {
             recording.chunks =
                 described.into_iter().map(|json| described_chunk(json, images)).collect::<Result<_, _>>()?;
@@ -108,9 +109,8 @@ impl Recording {
             Files::Plain(npz) => read_views(npz, ids, number, ChunkFrame::ModelNative, 1.0),
             Files::Described { npz, json } => {
                 let sidecar =
-                    read_sidecar(json)?.ok_or_else(|| self.bad(format!("chunk {chunk} went away")))?;
-                let mut stored = load(npz, &sidecar)?;
-                stored.prediction.chunk_id = number;
+                    read_sidecar(json)?.ok_or_else(|| self.bad(format!("chunk {chunk} was removed")))?;
+                let mut stored = load(npz, PredictionId::Chunk(number), &sidecar)?;
                 for (view, id) in stored.prediction.views.iter_mut().zip(ids) {
                     view.frame_id = *id;
                 }
@@ -214,7 +214,7 @@ fn natural(path: &Path) -> (String, Vec<u64>, String) {
 
 fn described_chunk(json: PathBuf, images: &[ImageEntry]) -> Result<RecordedChunk, Error> {
     let bad = |reason: String| Error::NotARecording { path: json.clone(), reason };
-    let sidecar = read_sidecar(&json)?.ok_or_else(|| bad("it went away".into()))?;
+    let sidecar = read_sidecar(&json)?.ok_or_else(|| bad("it was removed".into()))?;
     let place = |time: &i64| {
         let at = images.binary_search_by_key(&Timestamp::from_nanos(*time), |i| i.time).ok();
         at.ok_or_else(|| bad(format!("no image of the input was taken at {time} ns")))

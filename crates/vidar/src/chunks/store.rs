@@ -1,5 +1,6 @@
 //! One chunk's prediction as a file, and back.
 
+use crate::engine::PredictionId;
 use crate::error::Error;
 use crate::run_folder::pretty;
 use nalgebra::{Matrix3, Matrix4};
@@ -19,20 +20,29 @@ use vidar_export::official::{NpyArray, NpyData, NpzLimits, Packing, read_npz, wr
 /// Schema of a chunk's `json`.
 pub(super) const CHUNK_SCHEMA: &str = "vidar.chunk/1";
 const FORMAT: &str = "chunk npz";
+/// What the names of loops' files begin with.
+const LOOP: &str = "loop-";
 
 /// A chunk as it lies on disk.
 #[derive(Clone, Debug)]
 pub struct StoredChunk {
-    /// What the model said; no views where it had nothing to say.
+    /// The model's prediction; no views where it failed.
     pub prediction: GeometryPrediction,
     /// When each view was taken.
     pub times: Vec<Timestamp>,
-    /// Each view's picture at the depth's size; empty where there are none.
+    /// Each view's image at the depth's size; empty where there are none.
     pub colors: Vec<Image<[u8; 3]>>,
-    /// Each view's look, by which its place is told again; empty where pictures serve.
-    pub looks: Vec<Vec<f32>>,
+    /// Each view's descriptor for place recognition; empty where images serve.
+    pub descriptors: Vec<Vec<f32>>,
     /// Why there is no prediction.
     pub failure: Option<String>,
+}
+
+impl StoredChunk {
+    /// A prediction alone.
+    pub fn of(prediction: GeometryPrediction) -> Self {
+        Self { prediction, times: Vec::new(), colors: Vec::new(), descriptors: Vec::new(), failure: None }
+    }
 }
 
 /// `000003.json`.
@@ -40,7 +50,11 @@ pub struct StoredChunk {
 #[serde(deny_unknown_fields)]
 pub(super) struct Sidecar {
     pub schema: String,
+    /// The chunk; of a loop the later one.
     pub id: u32,
+    /// The earlier chunk, where it is the prediction of a loop.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub earlier: Option<u32>,
     pub frame: ChunkFrame,
     pub frames: Vec<u32>,
     pub times_ns: Vec<i64>,
@@ -69,9 +83,8 @@ impl ChunkStore {
     }
 
     /// Writes a chunk, whole or not at all.
-    pub fn write(&self, chunk: &StoredChunk, key: &str) -> Result<u64, Error> {
+    pub fn write(&self, id: PredictionId, chunk: &StoredChunk, key: &str) -> Result<u64, Error> {
         std::fs::create_dir_all(&self.folder).map_err(|e| Error::io("create", &self.folder, e))?;
-        let id = chunk.prediction.chunk_id;
         let mut bytes = 0;
         if !chunk.prediction.views.is_empty() {
             let packed = pack(chunk)?;
@@ -80,7 +93,13 @@ impl ChunkStore {
         }
         let sidecar = Sidecar {
             schema: CHUNK_SCHEMA.to_owned(),
-            id: id.0,
+            id: match id {
+                PredictionId::Chunk(chunk) | PredictionId::Loop { later: chunk, .. } => chunk.0,
+            },
+            earlier: match id {
+                PredictionId::Loop { earlier, .. } => Some(earlier.0),
+                PredictionId::Chunk(_) => None,
+            },
             frame: chunk.prediction.frame,
             frames: chunk.prediction.views.iter().map(|v| v.frame_id.0).collect(),
             times_ns: chunk.times.iter().map(|t| t.nanos()).collect(),
@@ -94,23 +113,24 @@ impl ChunkStore {
     /// The chunk with that number, if it is there and was made of what `key` stands for.
     ///
     /// A file that a power cut left half written is as good as none: the chunk is predicted again.
-    pub fn find(&self, id: ChunkId, key: &str) -> Option<StoredChunk> {
+    pub fn find(&self, id: PredictionId, key: &str) -> Option<StoredChunk> {
         let sidecar = self.sidecar(id).ok()?.filter(|s| s.key == key)?;
-        self.load(&sidecar).ok()
+        load(&self.path(id, "npz"), id, &sidecar).ok()
     }
 
     /// The chunk with that number.
-    pub fn read(&self, id: ChunkId) -> Result<StoredChunk, Error> {
+    pub fn read(&self, id: PredictionId) -> Result<StoredChunk, Error> {
         let missing = || Error::io("read", &self.path(id, "json"), std::io::ErrorKind::NotFound.into());
-        self.load(&self.sidecar(id)?.ok_or_else(missing)?)
+        load(&self.path(id, "npz"), id, &self.sidecar(id)?.ok_or_else(missing)?)
     }
 
     /// Removes every chunk, and the folder where nothing else lies in it.
     pub fn remove_all(&self) {
         let Ok(entries) = std::fs::read_dir(&self.folder) else { return };
         let ours = |p: &PathBuf| {
-            let number = p.file_stem().and_then(|s| s.to_str()).is_some_and(|s| s.parse::<u32>().is_ok());
-            number && p.extension().is_some_and(|e| e == "npz" || e == "json")
+            let is_number = |s: &str| s.parse::<u32>().is_ok() || s.starts_with(LOOP);
+            p.file_stem().and_then(|s| s.to_str()).is_some_and(is_number)
+                && p.extension().is_some_and(|e| e == "npz" || e == "json")
         };
         // What cannot be removed is only left behind.
         for path in entries.filter_map(|e| Some(e.ok()?.path())).filter(ours) {
@@ -119,17 +139,23 @@ impl ChunkStore {
         let _ = std::fs::remove_dir(&self.folder);
     }
 
-    fn path(&self, id: ChunkId, extension: &str) -> PathBuf {
-        self.folder.join(format!("{:06}.{extension}", id.0))
+    fn path(&self, id: PredictionId, extension: &str) -> PathBuf {
+        self.folder.join(match id {
+            PredictionId::Chunk(chunk) => format!("{:06}.{extension}", chunk.0),
+            PredictionId::Loop { later, earlier } => {
+                format!("{LOOP}{:06}-{:06}.{extension}", later.0, earlier.0)
+            }
+        })
     }
 
-    fn sidecar(&self, id: ChunkId) -> Result<Option<Sidecar>, Error> {
+    fn sidecar(&self, id: PredictionId) -> Result<Option<Sidecar>, Error> {
         read_sidecar(&self.path(id, "json"))
     }
+}
 
-    fn load(&self, sidecar: &Sidecar) -> Result<StoredChunk, Error> {
-        load(&self.path(ChunkId(sidecar.id), "npz"), sidecar)
-    }
+/// Whether a file is of the prediction of a loop.
+pub(super) fn is_loop(path: &Path) -> bool {
+    path.file_name().and_then(|n| n.to_str()).is_some_and(|n| n.starts_with(LOOP))
 }
 
 /// A sidecar; `None` where there is no such file.
@@ -151,21 +177,20 @@ pub(super) fn read_sidecar(path: &Path) -> Result<Option<Sidecar>, Error> {
 }
 
 /// The chunk that a sidecar describes.
-pub(super) fn load(npz: &Path, sidecar: &Sidecar) -> Result<StoredChunk, Error> {
+pub(super) fn load(npz: &Path, id: PredictionId, sidecar: &Sidecar) -> Result<StoredChunk, Error> {
     let ids: Vec<FrameId> = sidecar.frames.iter().copied().map(FrameId).collect();
     let mut chunk = match ids.is_empty() {
-        true => empty(sidecar),
-        false => read_views(npz, &ids, ChunkId(sidecar.id), sidecar.frame, 1.0)?,
+        true => empty(id, sidecar),
+        false => read_views(npz, &ids, id.model_number(), sidecar.frame, 1.0)?,
     };
     chunk.times = sidecar.times_ns.iter().copied().map(Timestamp::from_nanos).collect();
     chunk.failure = sidecar.failure.clone();
     Ok(chunk)
 }
 
-fn empty(sidecar: &Sidecar) -> StoredChunk {
-    let prediction =
-        GeometryPrediction { chunk_id: ChunkId(sidecar.id), frame: sidecar.frame, views: Vec::new() };
-    StoredChunk { prediction, times: Vec::new(), colors: Vec::new(), looks: Vec::new(), failure: None }
+fn empty(id: PredictionId, sidecar: &Sidecar) -> StoredChunk {
+    let chunk_id = id.model_number();
+    StoredChunk::of(GeometryPrediction { chunk_id, frame: sidecar.frame, views: Vec::new() })
 }
 
 fn pack(chunk: &StoredChunk) -> Result<Vec<u8>, Error> {
@@ -197,10 +222,10 @@ fn pack(chunk: &StoredChunk) -> Result<Vec<u8>, Error> {
         image = NpyArray::new(vec![n, height, width, 3], NpyData::U8(bytes))?;
         arrays.push(("image", &image));
     }
-    let looks;
-    if let Some(first) = chunk.looks.first().filter(|_| chunk.looks.len() == n) {
-        looks = NpyArray::new(vec![n, first.len()], NpyData::F32(chunk.looks.concat()))?;
-        arrays.push(("place", &looks));
+    let descriptors;
+    if let Some(first) = chunk.descriptors.first().filter(|_| chunk.descriptors.len() == n) {
+        descriptors = NpyArray::new(vec![n, first.len()], NpyData::F32(chunk.descriptors.concat()))?;
+        arrays.push(("place", &descriptors));
     }
     let mut packed = std::io::Cursor::new(Vec::new());
     write_npz_arrays_with(&mut packed, &arrays, Packing::Stored)?;
@@ -286,7 +311,7 @@ pub(super) fn read_views(
             .collect(),
         _ => Vec::new(),
     };
-    let looks = match take(&["place"]) {
+    let descriptors = match take(&["place"]) {
         Some(array) if array.shape.first() == Some(&n) && array.shape.len() == 2 => {
             let length = array.shape[1].max(1);
             array.into_f32().map_or_else(Vec::new, |v| v.chunks(length).map(<[f32]>::to_vec).collect())
@@ -294,7 +319,7 @@ pub(super) fn read_views(
         _ => Vec::new(),
     };
     let prediction = GeometryPrediction { chunk_id, frame, views };
-    Ok(StoredChunk { prediction, times: vec![Timestamp::default(); n], colors, looks, failure: None })
+    Ok(StoredChunk { prediction, times: vec![Timestamp::default(); n], colors, descriptors, failure: None })
 }
 
 /// `n` matrices of three rows and `columns` columns; a fourth row is left out.

@@ -55,7 +55,7 @@ fn put_trajectory(
     put(&format!("{stem}.euroc.csv"), &bytes)
 }
 
-/// Poses of the newest segment's keyframes, told of their camera.
+/// Poses of the newest segment's keyframes, as poses of the camera.
 fn keyframe_trajectory(keyframes: &[OdometryKeyframe]) -> Option<Trajectory> {
     let segment = keyframes.last()?.segment;
     let poses = keyframes

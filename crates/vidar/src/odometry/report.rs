@@ -6,8 +6,8 @@ use crate::run_folder::RunFolder;
 use vidar_core::{StampedPose, Trajectory};
 use vidar_odometry::Tracking;
 use vidar_view::{
-    AxisSpec, Figure, FigureWidth, LinePlot, PictureSize, PlotTrajectory, Report, Section, Series,
-    SummaryItem, TrajectoryPlot, Verdict, VerdictLevel,
+    Assessment, AssessmentLevel, AxisSpec, Figure, FigureWidth, LinePlot, PictureSize, PlotTrajectory,
+    Report, Section, Series, SummaryItem, TrajectoryPlot,
 };
 
 /// Columns and rows of the pictures.
@@ -54,7 +54,7 @@ pub(super) fn write(
     let report = Report {
         title: format!("VIDAR odometry: {title}"),
         subtitle: unit(outcome).into(),
-        verdict: Some(verdict(outcome)),
+        assessment: Some(assessment(outcome)),
         summary: summary.collect(),
         sections: vec![path, time],
         warnings: outcome.warnings.clone(),
@@ -69,26 +69,29 @@ fn unit(outcome: &OdometryOutcome) -> &'static str {
     if outcome.tracked.is_metric { "lengths in metres" } else { "up to scale: lengths are not metres" }
 }
 
-fn verdict(outcome: &OdometryOutcome) -> Verdict {
+fn assessment(outcome: &OdometryOutcome) -> Assessment {
     let tracked = &outcome.tracked;
     let (level, text) = match (outcome.status, &outcome.report) {
         (ExitStatus::Interrupted, _) => {
-            (VerdictLevel::Bad, "interrupted: only a part was tracked".to_owned())
+            (AssessmentLevel::Bad, "interrupted: only a part was tracked".to_owned())
         }
         _ if outcome.trajectory.is_none() => {
             let why = tracked.why_not_started().unwrap_or_else(|| "no images".into());
-            (VerdictLevel::Bad, format!("never started: {why}"))
+            (AssessmentLevel::Bad, format!("never started: {why}"))
         }
-        (ExitStatus::Degraded, _) => {
-            (VerdictLevel::Caution, format!("lost {} times; segments cannot be compared", tracked.lost.len()))
-        }
+        (ExitStatus::Degraded, _) => (
+            AssessmentLevel::Caution,
+            format!("lost {} times; segments cannot be compared", tracked.lost.len()),
+        ),
         (_, Some(report)) => {
             let ate = report.ate_se3_m.map_or("-".into(), |e| format!("{:.4} m", e.rmse));
-            (VerdictLevel::Good, format!("tracked throughout; ATE SE(3) {ate} against ground truth"))
+            (AssessmentLevel::Good, format!("tracked throughout; ATE SE(3) {ate} against ground truth"))
         }
-        (_, None) => (VerdictLevel::Unjudged, "tracked throughout; no ground truth to judge it by".into()),
+        (_, None) => {
+            (AssessmentLevel::NotEvaluated, "tracked throughout; no ground truth to compare it with".into())
+        }
     };
-    Verdict { level, text }
+    Assessment { level, text }
 }
 
 fn path_picture(
@@ -142,7 +145,7 @@ fn plots(outcome: &OdometryOutcome) -> Vec<(&'static str, LinePlot, &'static str
     let tracks = vec![
         line("landmarks that fit", &|t| t.tracked as f64),
         line("landmarks looked for", &|t| t.tracks.landmarks_tried as f64),
-        line("young tracks", &|t| t.tracks.young_found as f64),
+        line("seeds", &|t| t.tracks.seeds_found as f64),
         line("contradicting", &|t| t.tracks.contradicting as f64),
     ];
     let millis = frames.iter().map(|f| [secs(f.output.time.nanos()), 1e3 * f.seconds]).collect();

@@ -1,40 +1,38 @@
-//! One run: real frames in, a metric dense map out, judged.
+//! One run: recording → engine → evaluate → export.
 
-mod dense;
-mod judge;
-mod live;
-mod looks;
-mod observation;
+mod evaluate;
+mod map;
 mod outputs;
 mod pictures;
-mod placed;
+mod place_recognition;
 mod plan;
+mod readers;
 mod record;
 mod reference;
 mod source;
-mod sparse;
-mod surface;
+mod store;
 mod views;
 
-pub use judge::{DepthScore, Judgement};
+pub use evaluate::{DepthScore, Evaluation};
+pub use map::MetricMap;
 pub use outputs::pose_of;
-pub use plan::{Plan, bytes};
+pub use plan::{ExpectedWork, Plan, bytes};
 
 use crate::config::{Config, Layered};
+use crate::engine::{Engine, EngineSetup, FrameStamp, MapEvent};
 use crate::error::{Error, ExitStatus};
 use crate::events::{CancelToken, Event, Events};
-use crate::input::{self, AnchorSource};
-use crate::run_folder::{Place, RunFolder, StoredView};
-use looks::Looks;
-use record::Recorder;
-pub(crate) use record::sha256_hex;
+use crate::input::{self, ImageFiles, Measurement};
+use crate::run_folder::{OutputLocation, RunFolder};
+use place_recognition::PlaceRecognition;
+use readers::{FINISH, MAP, Readers};
+use record::{Recorder, RunDescription};
 use source::Source;
 use std::path::PathBuf;
 use std::sync::Arc;
-use vidar_align::Placement;
-use vidar_core::{BodyFrame, PointCloud, StampedPose, Trajectory, TriangleMesh, Warning};
-use vidar_dataset::{Dataset, OpenOptions};
-use vidar_fusion::{CoverageReport, DoubleWallReport};
+use store::RunStore;
+use vidar_core::{Duration, RigCamera, Se3, Warning};
+use vidar_dataset::{Dataset, DatasetError, OpenOptions};
 
 /// What to run on, how, and where to.
 #[derive(Clone, Debug)]
@@ -45,15 +43,15 @@ pub struct RunRequest {
     pub open: OpenOptions,
     /// The configuration with its origins.
     pub layered: Layered,
-    /// A reference cloud (PLY, metres, in the world of ground truth) to judge against.
+    /// A reference cloud (PLY, metres, in the world of ground truth) to compare the map with.
     pub reference: Option<PathBuf>,
     /// Where results go.
-    pub place: Place,
+    pub place: OutputLocation,
     /// The command as typed, for the manifest.
     pub command: Vec<String>,
 }
 
-/// What a run made.
+/// Result of a run.
 #[derive(Debug)]
 pub struct RunOutcome {
     /// The run folder.
@@ -64,8 +62,8 @@ pub struct RunOutcome {
     pub plan: Plan,
     /// The map.
     pub map: MetricMap,
-    /// How good it is, where that can be known.
-    pub judgement: Judgement,
+    /// Scores of the map, where there is something to compare it with.
+    pub evaluation: Evaluation,
     /// Every warning, in order.
     pub warnings: Vec<Warning>,
     /// Wall time, s.
@@ -78,45 +76,32 @@ impl RunOutcome {
         outputs::result_json(self)
     }
 
-    /// What was made, how far to trust it, how long it took, what next: at most twelve lines.
+    /// What was made, its scores and time, and the report: at most twelve lines.
     pub fn summary_lines(&self) -> Vec<(&'static str, String)> {
         pictures::summary_lines(self)
     }
+
+    /// Whether the map is in metres.
+    pub fn is_metric(&self) -> bool {
+        self.map.trajectory.is_some() && self.plan.mode.uses_pose_priors()
+    }
 }
 
-/// The fused world.
-#[derive(Debug, Default)]
-pub struct MetricMap {
-    /// Surface with triangles.
-    pub mesh: TriangleMesh,
-    /// Surface as points.
-    pub cloud: PointCloud,
-    /// Area, volume and how often it was seen.
-    pub coverage: CoverageReport,
-    /// Where chunks and keyframes stand, and how far to trust it.
-    pub placement: Option<Placement>,
-    /// Keyframes that got depth.
-    pub views: Vec<StoredView>,
-    /// Largest memory of the volume, bytes.
-    pub volume_bytes: u64,
-    /// How much of the surface is there twice.
-    pub double_walls: Option<DoubleWallReport>,
-    /// Depth against the depth sensor, where there is one.
-    pub depth_scores: judge::DepthScorer,
-    /// What the volume had to say.
-    pub warnings: Vec<Warning>,
-}
-
-/// Looks at the input and says what a run would do, without doing it.
+/// What a run would do, without doing it.
+///
+/// # Errors
+/// The input, the configuration or the model cannot be used.
 pub fn plan(request: &RunRequest) -> Result<Plan, Error> {
     let config = request.layered.build()?;
     let dataset = input::open_every_image(&request.path, &request.open, &config)?;
-    let (events, cancel) = (Events::none(), CancelToken::new());
-    Ok(Plan::make(&dataset, &config, request.reference.as_deref(), &events, &cancel)?.0)
+    Ok(Plan::make(&dataset, &config, request.reference.as_deref())?.0)
 }
 
-/// Runs all of it. On Ctrl-C what is finished is fused, written and judged, and the status says so. A run that fails
-/// after its folder was made leaves a manifest there that says why.
+/// Runs all of it. On Ctrl-C what is predicted is fused, written and evaluated, and the status is `Interrupted`. A run that
+/// fails after its folder was made leaves a manifest there with the reason.
+///
+/// # Errors
+/// The input cannot be used, nothing could be mapped, or a result could not be written.
 pub fn run(request: &RunRequest, events: &Events, cancel: &CancelToken) -> Result<RunOutcome, Error> {
     let clock = std::time::Instant::now();
     let recorder = Recorder::default();
@@ -124,14 +109,16 @@ pub fn run(request: &RunRequest, events: &Events, cancel: &CancelToken) -> Resul
     let config = request.layered.build()?;
     let dataset =
         events.stage("read", 0, || input::open_every_image(&request.path, &request.open, &config))?;
-    let (plan, sight) = Plan::make(&dataset, &config, request.reference.as_deref(), &events, cancel)?;
+    let (plan, source, places) =
+        events.stage("plan", 0, || Plan::make(&dataset, &config, request.reference.as_deref()))?;
     let folder = Arc::new(RunFolder::create(&request.place)?);
     recorder.keep_log_in(folder.clone());
     dataset.warnings.iter().chain(&plan.warnings).for_each(|w| events.warn(w));
-    let about = record::About::new(request, &dataset, &plan)?;
+    let description = RunDescription::new(request, &dataset, &plan)?;
 
-    let made = carry_out(request, &config, &dataset, (plan, sight), &folder, &events, cancel, &recorder);
-    let made = made.map(|outcome| RunOutcome {
+    let context =
+        Context { request, config: &config, dataset: &dataset, folder: &folder, events: &events, cancel };
+    let made = context.carry_out(plan, source, &places, &recorder).map(|outcome| RunOutcome {
         seconds: clock.elapsed().as_secs_f64(),
         warnings: recorder.warnings(),
         ..outcome
@@ -140,63 +127,143 @@ pub fn run(request: &RunRequest, events: &Events, cancel: &CancelToken) -> Resul
         Ok(outcome) => (outcome.status, outputs::result_json(outcome)),
         Err(error) => (error.exit_status(), record::failure_json(error)),
     };
-    let noted = folder.write_manifest(&recorder.manifest(about, result, exit));
+    let written = folder.write_manifest(&recorder.manifest(description, result, exit));
     let outcome = made?;
-    noted?;
+    written?;
     events.emit(&Event::Finished { exit: exit as i32, seconds: outcome.seconds });
     Ok(outcome)
 }
 
-/// Dense map, judgement, files, report.
-#[allow(clippy::too_many_arguments)] // one call, in the order in which `run` made them
-fn carry_out(
-    request: &RunRequest,
-    config: &Config,
-    dataset: &Dataset,
-    (plan, sight): (Plan, (Source, Looks)),
-    folder: &RunFolder,
-    events: &Events,
-    cancel: &CancelToken,
-    recorder: &Recorder,
-) -> Result<RunOutcome, Error> {
-    folder.write("config.resolved.toml", request.layered.to_toml(true).as_bytes())?;
-    let map = dense::build(dataset, &plan, sight, config, folder, events, cancel)?;
-    let judgement = events.stage("judge", 0, || judge::judge(dataset, &plan, &map, config, events))?;
-    let status = match (cancel.is_cancelled(), recorder.is_degraded() || map.mesh.triangles.is_empty()) {
-        (true, _) => ExitStatus::Interrupted,
-        (false, true) => ExitStatus::Degraded,
-        (false, false) => ExitStatus::Done,
-    };
-    let outcome = RunOutcome {
-        folder: folder.path().to_owned(),
-        status,
-        plan,
-        map,
-        judgement,
-        warnings: recorder.warnings(),
-        seconds: 0.0,
-    };
-    events.stage("write", 0, || outputs::write(&outcome, config, request, folder, events))?;
-    if config.output.report {
-        events.stage("report", 0, || pictures::draw(&outcome, dataset, request, folder, events))?;
+/// What the stages of a run share.
+struct Context<'a> {
+    request: &'a RunRequest,
+    config: &'a Config,
+    dataset: &'a Dataset,
+    folder: &'a RunFolder,
+    events: &'a Events,
+    cancel: &'a CancelToken,
+}
+
+impl Context<'_> {
+    /// Recording → engine → evaluate → export.
+    fn carry_out(
+        &self,
+        plan: Plan,
+        mut source: Source,
+        places: &PlaceRecognition,
+        recorder: &Recorder,
+    ) -> Result<RunOutcome, Error> {
+        let Self { request, config, dataset, folder, events, cancel } = *self;
+        folder.write("config.resolved.toml", request.layered.to_toml(true).as_bytes())?;
+        let map = self.build_map(&plan, &mut source, places)?;
+        let evaluation =
+            events.stage("evaluate", 0, || evaluate::evaluate(dataset, &plan, &map, config, events))?;
+        let is_degraded = recorder.is_degraded() || map.surface.mesh.triangles.is_empty();
+        let status = match (cancel.is_cancelled(), is_degraded) {
+            (true, _) => ExitStatus::Interrupted,
+            (false, true) => ExitStatus::Degraded,
+            (false, false) => ExitStatus::Done,
+        };
+        let (root, warnings) = (folder.path().to_owned(), recorder.warnings());
+        let outcome = RunOutcome { folder: root, status, plan, map, evaluation, warnings, seconds: 0.0 };
+        events.stage("write", 0, || outputs::write(&outcome, config, request, folder, events))?;
+        if config.output.report {
+            events.stage("report", 0, || pictures::draw(&outcome, dataset, request, folder, events))?;
+        }
+        Ok(outcome)
     }
-    Ok(outcome)
+
+    /// The recording through the engine; its events become log, progress, files and map.
+    fn build_map(
+        &self,
+        plan: &Plan,
+        source: &mut Source,
+        places: &PlaceRecognition,
+    ) -> Result<MetricMap, Error> {
+        let Self { config, dataset, folder, events, cancel, .. } = *self;
+        let store = RunStore::new(folder.path(), dataset, plan, config)?;
+        let images = ImageFiles(dataset);
+        let (poses, fallback) = plan.poses.open(dataset, config)?;
+        let cancelled = || cancel.is_cancelled();
+        let mut engine = Engine::new(EngineSetup {
+            name: dataset.name.clone(),
+            config,
+            camera_id: plan.camera_id,
+            camera: camera_on_rig(dataset, plan),
+            view: plan.view,
+            poses,
+            fallback,
+            prescribed: plan.prescribed.clone(),
+            geometry: source,
+            places,
+            images: &images,
+            store: &store,
+            volume_budget_bytes: plan.volume_budget_bytes,
+            cancelled: &cancelled,
+        })?;
+        let mut readers = Readers::new(dataset, plan, config, folder, events);
+        events.stage(MAP, dataset.images.len(), || {
+            self.push_recording(&mut engine, &mut |event| readers.read(event))
+        })?;
+        readers.finishing();
+        events
+            .stage(FINISH, 0, || engine.finish(&mut |event| readers.read(event)))
+            .map_err(|error| of_synthetic_weights(error, plan))?;
+        let map = readers.finish(plan);
+        store.clean(config.output.keep_chunks || cancel.is_cancelled());
+        Ok(map)
+    }
+
+    /// Every measurement of the recording, until Ctrl-C.
+    fn push_recording(
+        &self,
+        engine: &mut Engine<'_>,
+        sink: &mut dyn FnMut(MapEvent) -> Result<(), Error>,
+    ) -> Result<(), Error> {
+        let (total, mut done) = (self.dataset.images.len(), 0);
+        for measurement in input::measurements(self.dataset, engine.needs_sensors()) {
+            if self.cancel.is_cancelled() {
+                break;
+            }
+            let is_image = !matches!(&measurement, Measurement::Event(vidar_core::SensorEvent::Imu(_)));
+            match measurement {
+                Measurement::Event(event) => engine.push(event, sink)?,
+                Measurement::Stamp(stamp) => engine.push_stamp(stamp, sink)?,
+                Measurement::Unreadable(stamp, error) => {
+                    sink(MapEvent::Warning(unreadable(self.dataset, stamp, &error)))?;
+                    engine.push_stamp(stamp, sink)?;
+                }
+            }
+            if is_image {
+                done += 1;
+                self.events.emit(&Event::Progress { stage: MAP, done, total });
+            }
+        }
+        Ok(())
+    }
 }
 
-/// Whether the metric poses are ground truth.
-pub(crate) fn anchored_by_truth(plan: &Plan) -> bool {
-    plan.anchor.as_ref().is_some_and(|a| a.source == AnchorSource::GroundTruth)
+/// An image that the odometry has to do without. It is tracked across; if it becomes a keyframe, that is a degradation.
+fn unreadable(dataset: &Dataset, stamp: FrameStamp, error: &DatasetError) -> Warning {
+    let entry = dataset.images.iter().find(|i| i.frame_id == stamp.frame_id);
+    let warning = Warning::new("odometry-image-unreadable", error.to_string());
+    entry.map_or(warning.clone(), |entry| warning.at(entry.path.display()))
 }
 
-/// The keyframes' poses in the map as a trajectory of the camera.
-pub(crate) fn keyframe_trajectory(plan: &Plan, map: &MetricMap) -> Option<Trajectory> {
-    let placement = map.placement.as_ref()?;
-    let time = |frame| plan.keyframes.iter().find(|k| k.image.frame_id == frame).map(|k| k.image.time);
-    let poses = placement
-        .keyframes
-        .iter()
-        .filter_map(|k| Some(StampedPose { time: time(k.frame_id)?, world_from_body: k.world_from_camera }))
-        .collect();
-    let camera = plan.keyframes.first()?.image.camera;
-    Trajectory::new(BodyFrame::Camera(camera), poses).ok()
+fn camera_on_rig(dataset: &Dataset, plan: &Plan) -> RigCamera {
+    dataset.rig.camera(plan.camera_id).cloned().unwrap_or_else(|| RigCamera {
+        model: plan.camera.clone(),
+        body_from_camera: Se3::IDENTITY,
+        time_offset: Duration::ZERO,
+        rate_hz: None,
+    })
+}
+
+/// Nothing was placed because the network's weights are synthetic: the error names them.
+fn of_synthetic_weights(error: Error, plan: &Plan) -> Error {
+    let identity = plan.network.as_ref().map(|n| &n.identity).filter(|i| !i.is_trained);
+    match (error, identity) {
+        (Error::Empty { keyframes, .. }, Some(i)) => Error::Untrained { keyframes, model: i.name.clone() },
+        (error, _) => error,
+    }
 }

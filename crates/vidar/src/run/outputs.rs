@@ -1,6 +1,6 @@
 //! Files of the run folder: trajectories, map, depth sidecar, scores, README.
 
-use super::{Judgement, Plan, RunOutcome, RunRequest, anchored_by_truth, keyframe_trajectory};
+use super::{MetricMap, RunOutcome, RunRequest};
 use crate::config::Config;
 use crate::error::Error;
 use crate::events::{Event, Events};
@@ -20,12 +20,12 @@ pub fn write(
     events: &Events,
 ) -> Result<(), Error> {
     let writer = Writer { folder, events };
-    let plan = &outcome.plan;
-    if let Some(anchor) = &plan.anchor {
-        writer.trajectory("trajectory/anchor_camera", &anchor.camera_trajectory, plan)?;
+    let (plan, map) = (&outcome.plan, &outcome.map);
+    if let Some(trajectory) = &map.trajectory {
+        writer.trajectory("trajectory/metric_camera", &trajectory.camera_trajectory, map)?;
     }
-    if let Some(keyframes) = keyframe_trajectory(plan, &outcome.map) {
-        writer.trajectory("trajectory/keyframes_camera", &keyframes, plan)?;
+    if let Some(keyframes) = map.keyframe_trajectory() {
+        writer.trajectory("trajectory/keyframes_camera", &keyframes, map)?;
     }
     writer.bytes("views.json", &pretty(&json!({ "schema": VIEWS_SCHEMA, "views": outcome.map.views })))?;
     if config.output.depth_png && !outcome.map.views.is_empty() {
@@ -33,19 +33,21 @@ pub fn write(
     }
     let comments = vec![
         "VIDAR metric map".to_owned(),
-        format!("frame: world, right-handed; unit: {}", if plan.is_metric() { "metre" } else { "arbitrary" }),
-        format!("metric poses: {}", plan.poses()),
+        format!(
+            "frame: world, right-handed; unit: {}",
+            if outcome.is_metric() { "metre" } else { "arbitrary" }
+        ),
+        format!("metric poses: {}", map.poses()),
         format!("coupling: {}", plan.mode),
         format!("geometry: {}", plan.model.name),
     ];
-    let map = &outcome.map;
-    writer.export("map/mesh.ply", |w| vidar_export::write_ply_mesh(w, &map.mesh, &comments))?;
-    writer.export("map/points.ply", |w| vidar_export::write_ply_cloud(w, &map.cloud, &comments))?;
-    if config.output.mesh_glb && !map.mesh.triangles.is_empty() {
-        writer.export("map/mesh.glb", |w| vidar_export::write_glb_mesh(w, &map.mesh, &comments))?;
+    writer.export("map/mesh.ply", |w| vidar_export::write_ply_mesh(w, &map.surface.mesh, &comments))?;
+    writer.export("map/points.ply", |w| vidar_export::write_ply_cloud(w, &map.surface.cloud, &comments))?;
+    if config.output.mesh_glb && !map.surface.mesh.triangles.is_empty() {
+        writer.export("map/mesh.glb", |w| vidar_export::write_glb_mesh(w, &map.surface.mesh, &comments))?;
     }
-    writer.bytes("map/coverage.json", &pretty(&map.coverage))?;
-    writer.bytes("eval/metrics.json", &pretty(&metrics(&outcome.judgement, plan)))?;
+    writer.bytes("map/coverage.json", &pretty(&map.surface.coverage))?;
+    writer.bytes("eval/metrics.json", &pretty(&metrics(outcome)))?;
     writer.bytes("README.txt", readme(outcome, request).as_bytes())
 }
 
@@ -74,8 +76,8 @@ impl Writer<'_> {
         Ok(())
     }
 
-    fn trajectory(&self, stem: &str, trajectory: &Trajectory, plan: &Plan) -> Result<(), Error> {
-        let note = format!("metric poses: {}", plan.poses());
+    fn trajectory(&self, stem: &str, trajectory: &Trajectory, map: &MetricMap) -> Result<(), Error> {
+        let note = format!("metric poses: {}", map.poses());
         self.export(&format!("{stem}.tum"), |w| vidar_export::write_tum(w, trajectory, &note))?;
         self.export(&format!("{stem}.euroc.csv"), |w| vidar_export::write_euroc_csv(w, trajectory, &note))
     }
@@ -106,42 +108,37 @@ pub fn pose_of(view: &StoredView) -> Option<Se3> {
     Se3::from_matrix(&matrix)
 }
 
-fn metrics(judgement: &Judgement, plan: &Plan) -> Value {
+fn metrics(outcome: &RunOutcome) -> Value {
     json!({
         "schema": "vidar.metrics/1",
-        "metric_poses": source_json(plan),
-        "coupling": plan.mode,
-        "poses_are_ground_truth": anchored_by_truth(plan),
-        "reference": plan.reference.to_string(),
-        "scores": crate::evaluate::scores(judgement),
-        "judgement": judgement,
+        "metric_poses": outcome.map.poses_json(),
+        "coupling": outcome.plan.mode,
+        "poses_are_ground_truth": outcome.map.uses_ground_truth(),
+        "reference": outcome.plan.reference.to_string(),
+        "scores": crate::evaluate::scores(&outcome.evaluation),
+        "evaluation": outcome.evaluation,
     })
 }
 
 /// Counts and scores for the manifest and `--json`.
 pub fn result_json(outcome: &RunOutcome) -> Value {
-    let judgement = &outcome.judgement;
+    let map = &outcome.map;
     json!({
-        "keyframes": outcome.plan.keyframes.len(),
-        "keyframes_with_depth": outcome.map.views.len(),
-        "mesh_triangles": outcome.map.mesh.triangles.len(),
-        "points": outcome.map.cloud.len(),
-        "coverage": outcome.map.coverage,
-        "volume_bytes": outcome.map.volume_bytes,
-        "double_walls": outcome.map.double_walls,
-        "metric_poses": source_json(&outcome.plan),
+        "keyframes": map.keyframes.len(),
+        "keyframes_with_depth": map.views.len(),
+        "mesh_triangles": map.surface.mesh.triangles.len(),
+        "points": map.surface.cloud.len(),
+        "coverage": map.surface.coverage,
+        "volume_bytes": map.surface.volume_bytes,
+        "double_walls": map.surface.double_walls,
+        "metric_poses": map.poses_json(),
         "coupling": outcome.plan.mode,
-        "places": outcome.plan.places,
-        "is_metric": outcome.plan.is_metric(),
-        "placement": outcome.map.placement.as_ref().map(placement_json),
-        "judgement": judgement,
+        "place_recognition": outcome.plan.place_recognition,
+        "is_metric": outcome.is_metric(),
+        "placement": map.placement.as_deref().map(placement_json),
+        "evaluation": outcome.evaluation,
         "seconds": outcome.seconds,
     })
-}
-
-/// Where metric poses came from; null where there are none.
-pub fn source_json(plan: &Plan) -> Value {
-    json!(plan.anchor.as_ref().map(|a| &a.source))
 }
 
 /// The alignment: chunk status and scale, loops, rejections, graph, drift.
@@ -183,13 +180,13 @@ fn readme(outcome: &RunOutcome, request: &RunRequest) -> String {
          \x20 camera: x right, y down, z forward; pixel (0, 0) is the centre of the top-left pixel.\n\
          \x20 a_from_b maps coordinates in b to coordinates in a.\n\n\
          Files\n\
-         \x20 report.html                    everything below in pictures and numbers\n\
+         \x20 report.html                    everything below in figures and numbers\n\
          \x20 map/mesh.ply, mesh.glb         surface (GLB is y-up by a root node; PLY is in the world frame)\n\
          \x20 map/points.ply                 points with normals, colour, confidence\n\
-         \x20 trajectory/*.tum, *.csv        world_from_camera of the anchor and of the keyframes\n\
+         \x20 trajectory/*.tum, *.csv        world_from_camera of all images and of the keyframes\n\
          \x20 depth/*.png, depth.json        z-depth, 16 bit, 0 = none; scale and cameras in depth.json\n\
          \x20 images/*.png, views.json       undistorted keyframes with intrinsics and world_from_camera\n\
-         \x20 eval/metrics.json              scores and what they were judged against\n\
+         \x20 eval/metrics.json              scores and what the result was compared with\n\
          \x20 config.resolved.toml           every setting with its origin\n\
          \x20 manifest.json, log.jsonl       versions, hashes, timings, events\n\n\
          To do it again\n  {command}\n",

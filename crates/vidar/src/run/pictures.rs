@@ -1,6 +1,6 @@
-//! Pictures of a run and its one-file report.
+//! Figures of a run and its one-file report.
 
-use super::{RunOutcome, RunRequest, anchored_by_truth, keyframe_trajectory};
+use super::{RunOutcome, RunRequest};
 use crate::error::{Error, ExitStatus};
 use crate::evaluate::{surface_lines, trajectory_lines};
 use crate::events::{Event, Events};
@@ -9,11 +9,13 @@ use crate::run_folder::{RunFolder, StoredView};
 use vidar_core::Trajectory;
 use vidar_dataset::Dataset;
 use vidar_view::{
-    AxisSpec, Figure, FigureWidth, Histogram, MapCamera, MapSurface, Picture, PictureSize, PlotTrajectory,
-    Report, Section, Shading, SummaryItem, Table, TrajectoryPlot, Assessment, AssessmentLevel, Viewpoint,
+    Assessment, AssessmentLevel, AxisSpec, Figure, FigureWidth, Histogram, MapCamera, MapSurface, Picture,
+    PictureSize, PlotTrajectory, Report, Section, Shading, SummaryItem, Table, TrajectoryPlot, Viewpoint,
 };
 
 const MAP_SIZE: (usize, usize) = (960, 640);
+/// Name of the trajectory by which chunks were placed.
+const METRIC: &str = "metric trajectory";
 const PLOT_SIZE: (usize, usize) = (960, 640);
 /// Keyframes shown with image and depth, spread over the run.
 const SHOWN_VIEWS: usize = 6;
@@ -27,22 +29,22 @@ pub fn draw(
     events: &Events,
 ) -> Result<(), Error> {
     let mut album = Album { folder, events };
-    let path = keyframe_trajectory(&outcome.plan, &outcome.map);
-    let anchor = outcome.plan.anchor.as_ref().map(|a| &a.camera_trajectory);
-    let up = path.as_ref().or(anchor).map_or_else(nalgebra::Vector3::z, vidar_view::up_of_world);
+    let path = outcome.map.keyframe_trajectory();
+    let metric = outcome.map.trajectory.as_ref().map(|t| &t.camera_trajectory);
+    let up = path.as_ref().or(metric).map_or_else(nalgebra::Vector3::z, vidar_view::up_of_world);
     let report = Report {
         title: format!("VIDAR: {}", dataset.name),
         subtitle: format!(
             "{}; metric poses: {}; coupling: {}",
             outcome.plan.input,
-            outcome.plan.poses(),
+            outcome.map.poses(),
             outcome.plan.mode
         ),
         assessment: Some(assessment(outcome)),
         summary: summary(outcome),
         sections: vec![
             map_section(outcome, path.as_ref(), &up, &mut album)?,
-            judgement_section(outcome, path.as_ref(), &up, &mut album)?,
+            evaluation_section(outcome, path.as_ref(), &up, &mut album)?,
             trajectory_section(outcome, dataset, &up, &mut album)?,
             depth_section(outcome, folder, &mut album)?,
             plan_section(outcome),
@@ -83,13 +85,13 @@ impl Album<'_> {
 }
 
 fn assessment(outcome: &RunOutcome) -> Assessment {
-    let upper = if anchored_by_truth(&outcome.plan) {
+    let upper = if outcome.map.uses_ground_truth() {
         "; poses are ground truth, so this is an upper bound"
     } else {
         ""
     };
     let (level, text) =
-        match (outcome.status, outcome.judgement.surface.as_ref().and_then(|s| s.native.last())) {
+        match (outcome.status, outcome.evaluation.surface.as_ref().and_then(|s| s.native.last())) {
             (ExitStatus::Interrupted, _) => {
                 (AssessmentLevel::Bad, "interrupted: only a part was mapped".to_owned())
             }
@@ -100,7 +102,10 @@ fn assessment(outcome: &RunOutcome) -> Assessment {
                 if s.f >= 0.5 { AssessmentLevel::Good } else { AssessmentLevel::Caution },
                 format!("F {:.3} at {:.2} m against the reference{upper}", s.f, s.threshold_m),
             ),
-            (_, None) => (AssessmentLevel::NotEvaluated, "there is no reference to judge the surface by".to_owned()),
+            (_, None) => (
+                AssessmentLevel::NotEvaluated,
+                "there is no reference to compare the surface with".to_owned(),
+            ),
         };
     Assessment { level, text }
 }
@@ -114,22 +119,22 @@ pub fn summary_lines(outcome: &RunOutcome) -> Vec<(&'static str, String)> {
             "map",
             format!(
                 "{folder}/map/mesh.ply ({} triangles), points.ply ({} points)",
-                map.mesh.triangles.len(),
-                map.cloud.len()
+                map.surface.mesh.triangles.len(),
+                map.surface.cloud.len()
             ),
         ),
-        ("keyframes", format!("{} of {} with depth", map.views.len(), outcome.plan.keyframes.len())),
+        ("keyframes", format!("{} of {} with depth", map.views.len(), outcome.map.keyframes.len())),
         (
             "surface",
             format!(
                 "{:.1} m2, seen by {:.1} views on average",
-                map.coverage.surface_area_m2, map.coverage.mean_observations
+                map.surface.coverage.surface_area_m2, map.surface.coverage.mean_observations
             ),
         ),
-        ("metric poses", outcome.plan.poses()),
+        ("metric poses", outcome.map.poses()),
         ("coupling", coupling_line(outcome)),
     ];
-    match &outcome.judgement.trajectory {
+    match &outcome.evaluation.trajectory {
         Some(t) => {
             let number = |v: Option<f64>| v.map_or_else(|| "not determined".into(), |v| format!("{v:.4}"));
             let ate = number(t.ate_se3_m.as_ref().map(|s| s.rmse));
@@ -138,15 +143,15 @@ pub fn summary_lines(outcome: &RunOutcome) -> Vec<(&'static str, String)> {
                 format!("ATE {ate} m, |ln s| {} ({} matched)", number(t.scale_error), t.matched),
             ));
         }
-        None if anchored_by_truth(&outcome.plan) => lines.push(("scale", "metric by ground truth".into())),
-        None if !outcome.plan.is_metric() => {
+        None if outcome.map.uses_ground_truth() => lines.push(("scale", "metric by ground truth".into())),
+        None if !outcome.is_metric() => {
             lines.push(("scale", "arbitrary: this coupling uses no metric poses".into()));
         }
         None => {
             lines.push(("scale", "as metric as the trajectory given; no ground truth to check it".into()))
         }
     }
-    match &outcome.judgement.surface {
+    match &outcome.evaluation.surface {
         Some(surface) => {
             let f: Vec<String> = surface
                 .native
@@ -157,11 +162,11 @@ pub fn summary_lines(outcome: &RunOutcome) -> Vec<(&'static str, String)> {
                 .collect();
             lines.push(("how good", f.join("  ")));
         }
-        None => lines.push(("how good", "not judged: no reference".into())),
+        None => lines.push(("how good", "not evaluated: no reference".into())),
     }
-    if let Some(metric) = outcome.judgement.depth.as_ref().and_then(|d| d.summary.pixel_weighted.metric) {
+    if let Some(metric) = outcome.evaluation.depth.as_ref().and_then(|d| d.summary.pixel_weighted.metric) {
         let complete =
-            outcome.judgement.depth.as_ref().map_or(0.0, |d| d.summary.pixel_weighted.completeness);
+            outcome.evaluation.depth.as_ref().map_or(0.0, |d| d.summary.pixel_weighted.completeness);
         lines.push((
             "depth",
             format!(
@@ -193,7 +198,7 @@ fn coupling_line(outcome: &RunOutcome) -> String {
     }
     let accepted = placement.loops.iter().filter(|l| l.rejection.is_none()).count();
     if !placement.loops.is_empty() {
-        text += &format!(", {accepted} of {} loops believed", placement.loops.len());
+        text += &format!(", {accepted} of {} loops accepted", placement.loops.len());
     }
     let rejections: Vec<String> = placement
         .rejections
@@ -213,7 +218,7 @@ fn summary(outcome: &RunOutcome) -> Vec<SummaryItem> {
         explanation: why.into(),
     };
     let mut items = Vec::new();
-    if let Some(surface) = &outcome.judgement.surface {
+    if let Some(surface) = &outcome.evaluation.surface {
         for s in &surface.native {
             items.push(item(
                 &format!("F@{:.2} m", s.threshold_m),
@@ -222,7 +227,7 @@ fn summary(outcome: &RunOutcome) -> Vec<SummaryItem> {
             ));
         }
     }
-    if let Some(t) = &outcome.judgement.trajectory {
+    if let Some(t) = &outcome.evaluation.trajectory {
         if let Some(ate) = &t.ate_se3_m {
             items.push(item(
                 "ATE SE(3)",
@@ -234,7 +239,7 @@ fn summary(outcome: &RunOutcome) -> Vec<SummaryItem> {
             items.push(item("|ln s|", format!("{scale:.4}"), "scale error: 0.01 is one percent"));
         }
     }
-    if let Some(m) = outcome.judgement.depth.as_ref().and_then(|d| d.summary.pixel_weighted.metric) {
+    if let Some(m) = outcome.evaluation.depth.as_ref().and_then(|d| d.summary.pixel_weighted.metric) {
         items.push(item(
             "depth AbsRel",
             format!("{:.4}", m.abs_rel),
@@ -243,12 +248,12 @@ fn summary(outcome: &RunOutcome) -> Vec<SummaryItem> {
     }
     items.push(item(
         "keyframes",
-        format!("{}/{}", outcome.map.views.len(), outcome.plan.keyframes.len()),
+        format!("{}/{}", outcome.map.views.len(), outcome.map.keyframes.len()),
         "with depth, of all chosen",
     ));
     items.push(item(
         "surface",
-        format!("{:.1} m²", outcome.map.coverage.surface_area_m2),
+        format!("{:.1} m²", outcome.map.surface.coverage.surface_area_m2),
         "area of the mesh",
     ));
     items
@@ -264,7 +269,7 @@ fn map_section(
     up: &nalgebra::Vector3<f64>,
     album: &mut Album<'_>,
 ) -> Result<Section, Error> {
-    let mesh = &outcome.map.mesh;
+    let mesh = &outcome.map.surface.mesh;
     let mut section = Section { heading: "Map".into(), ..Section::default() };
     if mesh.triangles.is_empty() {
         section.paragraphs.push("The map has no triangle.".into());
@@ -278,44 +283,48 @@ fn map_section(
         let name = format!("map-{}", viewpoint.name());
         section.figures.push(album.figure(&name, &picture, viewpoint.caption(), FigureWidth::Half)?);
     }
-    let c = &outcome.map.coverage;
+    let c = &outcome.map.surface.coverage;
     section.tables.push(Table {
         caption: "Coverage".into(),
         columns: vec!["What".into(), "Value".into()],
         rows: vec![
             vec!["triangles".into(), mesh.triangles.len().to_string()],
-            vec!["points".into(), outcome.map.cloud.len().to_string()],
+            vec!["points".into(), outcome.map.surface.cloud.len().to_string()],
             vec!["area".into(), format!("{:.2} m²", c.surface_area_m2)],
             vec!["observed volume".into(), format!("{:.2} m³", c.observed_volume_m3)],
             vec!["views per surface voxel".into(), format!("{:.1}", c.mean_observations)],
             vec!["seen by three views or more".into(), format!("{:.1} %", c.share_seen_by_3_or_more * 100.0)],
             vec![
                 "there twice (ghosts; real layers count too)".into(),
-                outcome.map.double_walls.map_or_else(|| "–".into(), |d| format!("{:.1} %", d.rate * 100.0)),
+                outcome
+                    .map
+                    .surface
+                    .double_walls
+                    .map_or_else(|| "–".into(), |d| format!("{:.1} %", d.rate * 100.0)),
             ],
         ],
     });
     Ok(section)
 }
 
-fn judgement_section(
+fn evaluation_section(
     outcome: &RunOutcome,
     path: Option<&Trajectory>,
     up: &nalgebra::Vector3<f64>,
     album: &mut Album<'_>,
 ) -> Result<Section, Error> {
-    let mut section = Section { heading: "Judgement".into(), ..Section::default() };
-    section.paragraphs.push(format!("Judged against {}.", outcome.plan.reference));
-    if anchored_by_truth(&outcome.plan) {
+    let mut section = Section { heading: "Evaluation".into(), ..Section::default() };
+    section.paragraphs.push(format!("Compared with {}.", outcome.plan.reference));
+    if outcome.map.uses_ground_truth() {
         section.paragraphs.push("Poses are ground truth: dense scores are an upper bound, and trajectory scores are left out because they would compare ground truth with itself.".into());
     }
-    if let Some(surface) = &outcome.judgement.surface {
+    if let Some(surface) = &outcome.evaluation.surface {
         section.tables.push(table(
             "Surface, native-scale bounded placement (paper, section IV-B)",
             surface_lines(surface),
         ));
     }
-    if let Some(depth) = &outcome.judgement.depth {
+    if let Some(depth) = &outcome.evaluation.depth {
         let p = &depth.summary.pixel_weighted;
         let mut rows = vec![vec!["completeness".into(), format!("{:.1} %", p.completeness * 100.0)]];
         if let Some(m) = &p.metric {
@@ -330,7 +339,7 @@ fn judgement_section(
             rows,
         });
     }
-    if let Some((cloud, errors)) = &outcome.judgement.error_cloud {
+    if let Some((cloud, errors)) = &outcome.evaluation.error_cloud {
         let camera = MapCamera::fixed(
             Viewpoint::Top,
             &cloud.positions,
@@ -373,24 +382,25 @@ fn trajectory_section(
 ) -> Result<Section, Error> {
     let mut section = Section { heading: "Trajectory".into(), ..Section::default() };
     let truth = truth_in_camera(dataset);
-    let (judgement, plan) = (&outcome.judgement, &outcome.plan);
-    let moved = plan.mode.chains().then(|| keyframe_trajectory(plan, &outcome.map)).flatten();
-    let anchor = plan.anchor.as_ref().map(|a| a.camera_trajectory.clone());
-    let (map, anchor) = match moved {
+    let evaluation = &outcome.evaluation;
+    let moved = outcome.plan.mode.chains().then(|| outcome.map.keyframe_trajectory()).flatten();
+    let metric = outcome.map.trajectory.as_ref().map(|t| t.camera_trajectory.clone());
+    let (map, metric) = match moved {
         Some(map) => {
-            (Some((map, "map", &judgement.trajectory)), anchor.map(|a| (a, "anchor", &judgement.anchor)))
+            let metric = metric.map(|t| (t, METRIC, &evaluation.metric_trajectory));
+            (Some((map, "map", &evaluation.trajectory)), metric)
         }
-        None => (anchor.map(|a| (a, "anchor", &judgement.trajectory)), None),
+        None => (metric.map(|t| (t, METRIC, &evaluation.trajectory)), None),
     };
     let mut placed = Vec::new();
-    for (trajectory, name, report) in [map, anchor].into_iter().flatten() {
+    for (trajectory, name, report) in [map, metric].into_iter().flatten() {
         let truth_from = report.as_ref().and_then(|t| {
             section
                 .tables
                 .push(table(&format!("Poses of the {name} against ground truth"), trajectory_lines(t)));
             t.truth_from_estimate_se3?.to_se3()
         });
-        let is_truth = name == "anchor" && anchored_by_truth(plan);
+        let is_truth = name == METRIC && outcome.map.uses_ground_truth();
         let shown = truth_from.and_then(|t| aligned(&trajectory, t)).unwrap_or(trajectory);
         placed.push((shown, name, is_truth));
     }
@@ -401,7 +411,7 @@ fn trajectory_section(
     let labels: Vec<String> = placed.iter().map(|(_, name, _)| format!("{name}, rigidly aligned")).collect();
     for ((trajectory, _, is_truth), label) in placed.iter().zip(&labels) {
         shown.push(match is_truth {
-            true => PlotTrajectory::ground_truth("ground truth (the anchor)", trajectory),
+            true => PlotTrajectory::ground_truth("ground truth (the metric trajectory)", trajectory),
             false => PlotTrajectory::estimate(label, trajectory),
         });
     }

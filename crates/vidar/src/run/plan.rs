@@ -1,30 +1,32 @@
-//! What a run would do, before it does anything.
+//! What a run would do: all that is known before anything is tracked or predicted.
 
-use super::looks::Looks;
-use super::source::{Opened, Source};
-use crate::config::{Config, PoseSource};
+use super::place_recognition::PlaceRecognition;
+use super::source::{OpenedSource, Source};
+use crate::config::Config;
+use crate::engine::{ChunkRule, GeometrySource, PosedFrame, Selection, chunk_rule};
 use crate::error::Error;
-use crate::events::{CancelToken, Events};
-use crate::input::{self, MetricAnchor};
-use crate::keyframes::{Keyframe, select_by_time, select_keyframes};
+use crate::input::{self, PosePlan};
 use crate::models::device_memory;
 use crate::models::geometry::NetworkPlan;
-use std::collections::BTreeSet;
-use std::ops::Range;
 use std::path::Path;
 use vidar_align::CouplingMode;
-use vidar_align::streaming::chunk_ranges;
 use vidar_core::remap::undistorted_view;
-use vidar_core::{CameraModel, ModelInfo, Pinhole, Se3, Warning};
+use vidar_core::{CameraId, CameraModel, FrameId, ModelInfo, Pinhole, Warning};
 use vidar_dataset::{Dataset, ImageEntry};
 
-/// A chunk: the keyframes whose depth is wanted, inside those that are seen.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct ChunkPlan {
-    /// Indices of the keyframes whose depth is computed.
-    pub core: Range<usize>,
-    /// Indices of the keyframes that are seen.
-    pub seen: Range<usize>,
+/// Keyframes and chunks, where they are known before tracking.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct ExpectedWork {
+    /// Images with a pose.
+    pub posed: usize,
+    /// Keyframes.
+    pub keyframes: usize,
+    /// Chunks.
+    pub chunks: usize,
+    /// Keyframes that the model sees, over all chunks.
+    pub seen: usize,
+    /// Most keyframes that the model sees at once.
+    pub largest: usize,
 }
 
 /// The plan of a run.
@@ -36,16 +38,16 @@ pub struct Plan {
     pub input: String,
     /// How depth is coupled to the metric poses.
     pub mode: CouplingMode,
-    /// The metric trajectory; none where the mode needs none and there is none.
-    pub anchor: Option<MetricAnchor>,
-    /// Images in the input.
+    /// Where metric poses come from.
+    pub poses: PosePlan,
+    /// Images that may become keyframes.
     pub images: usize,
-    /// Images with a pose.
-    pub posed: usize,
-    /// The frames that carry geometry.
-    pub keyframes: Vec<Keyframe>,
-    /// The chunks in order.
-    pub chunks: Vec<ChunkPlan>,
+    /// Keyframes and chunks; none where the odometry decides them.
+    pub expected: Option<ExpectedWork>,
+    /// Frames of each chunk, where a recording prescribes them.
+    pub prescribed: Option<Vec<Vec<FrameId>>>,
+    /// Which camera is in use.
+    pub camera_id: CameraId,
     /// The camera as it is.
     pub camera: CameraModel,
     /// The undistorted view that the model gets.
@@ -54,9 +56,9 @@ pub struct Plan {
     pub model: ModelInfo,
     /// The network it is, where it is one.
     pub network: Option<NetworkPlan>,
-    /// How places are told again: `salad`, `model` or `pictures`.
-    pub places: &'static str,
-    /// What the result will be judged against.
+    /// Descriptors of place recognition: `salad`, `model` or `image`.
+    pub place_recognition: &'static str,
+    /// What the result will be compared with.
     pub reference: ReferenceSource,
     /// Units of the depth PNG per metre.
     pub depth_units_per_metre: f64,
@@ -64,11 +66,11 @@ pub struct Plan {
     pub volume_budget_bytes: u64,
     /// Disk that the run folder will take at most, bytes.
     pub disk_bytes: u64,
-    /// What was noticed.
+    /// Warnings about the input and the settings.
     pub warnings: Vec<Warning>,
 }
 
-/// What the surface is judged against.
+/// What the surface is compared with.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum ReferenceSource {
     /// A point cloud file.
@@ -80,38 +82,40 @@ pub enum ReferenceSource {
 }
 
 impl Plan {
-    /// Looks at poses, camera and configuration, and opens the source of geometry and what tells places.
+    /// Checks poses, camera and configuration, and opens the geometry model and place recognition. Nothing is tracked,
+    /// predicted or written.
     pub fn make(
         dataset: &Dataset,
         config: &Config,
         reference: Option<&Path>,
-        events: &Events,
-        cancel: &CancelToken,
-    ) -> Result<(Self, (Source, Looks)), Error> {
+    ) -> Result<(Self, Source, PlaceRecognition), Error> {
         if let Some(path) = reference {
-            // Better said now than after an hour of depth.
+            // Better refused now than after an hour of depth.
             std::fs::File::open(path).map_err(|e| Error::io("read", path, e))?;
         }
         input::require_calibration(dataset)?;
         let images = input::strided(dataset, config);
-        let Opened { mut source, chunks: recorded } = Source::open(dataset, &images, config)?;
-        // Better a wrong checkpoint now than after the odometry.
-        let looks = Looks::open(config, &mut source)?;
-        let anchor = anchor(dataset, config, events, cancel)?;
-        let mut warnings = anchor.as_ref().map_or_else(Vec::new, |a| a.warnings.clone());
-        let chosen = choose(dataset, &images, anchor.as_ref(), recorded, &source, config, &mut warnings)?;
-        let (needed, found) = (source.info().min_views, chosen.keyframes.len());
-        if found < needed.max(1) {
+        let OpenedSource { mut source, chunks } = Source::open(dataset, &images, config)?;
+        let frames_of = |chunk: Vec<usize>| chunk.into_iter().map(|i| images[i].frame_id).collect();
+        let prescribed: Option<Vec<Vec<FrameId>>> = chunks.map(|c| c.into_iter().map(frames_of).collect());
+        let place_recognition = PlaceRecognition::open(config, &mut source)?;
+        let poses = PosePlan::new(dataset, config)?;
+        let rule = chunk_rule(config, source.overlaps(), prescribed.clone());
+        let expected = expected_work(dataset, &images, &poses, &rule, config)?;
+        let needed = source.info().min_views.max(1);
+        let found = expected.map_or(images.len(), |e| e.keyframes);
+        if found < needed {
             return Err(Error::TooFewKeyframes { found, needed });
         }
+        let mut warnings = Vec::new();
         let camera = camera_model(dataset)?;
         let view = model_view(&camera, config)?;
         let coverage = vidar_core::remap::RemapTable::new(&camera, &view).coverage();
         if coverage < 0.95 {
-            let seen = format!("the undistorted view sees {:.0} % of its pixels", coverage * 100.0);
+            let seen = format!("the undistorted view shows {:.0} % of its pixels", coverage * 100.0);
             warnings.push(Warning::new("view-coverage", seen).hint("check the calibration's distortion"));
         }
-        let views_at_once = chosen.chunks.iter().map(|c| c.seen.len()).max().unwrap_or(0);
+        let views_at_once = expected.map_or(rule.largest().min(images.len()), |e| e.largest);
         let network = source.planned(config, &view, views_at_once, &mut warnings)?;
         let volume_budget_bytes = map_budget(config, views_at_once, &view, network.as_ref())?;
         let plan = Self {
@@ -119,50 +123,58 @@ impl Plan {
             input: format!("{}: {} ({})", dataset.name, dataset.kind, dataset.reason),
             mode: config.coupling.mode,
             images: images.len(),
-            posed: chosen.posed,
-            disk_bytes: disk_bytes(chosen.keyframes.len(), &chosen.chunks, &view, config),
-            keyframes: chosen.keyframes,
-            chunks: chosen.chunks,
+            disk_bytes: disk_bytes(expected, images.len(), &rule, &view, config),
+            expected,
+            prescribed,
+            camera_id: dataset.camera,
             camera,
             view,
             model: source.info().clone(),
-            places: looks.word(),
+            place_recognition: place_recognition.name(),
             network,
             reference: reference_source(dataset, config, reference),
             depth_units_per_metre: config.output.depth_units_per_metre,
             volume_budget_bytes,
-            anchor,
+            poses,
             warnings,
         };
-        Ok((plan, (source, looks)))
+        Ok((plan, source, place_recognition))
     }
 
     /// Where metric poses come from, in words.
-    pub fn poses(&self) -> String {
-        self.anchor
-            .as_ref()
-            .map_or_else(|| "none: lengths are not metres".to_owned(), |a| a.source.to_string())
-    }
-
-    /// Whether the map comes out in metres.
-    pub fn is_metric(&self) -> bool {
-        self.anchor.is_some() && self.mode.uses_pose_priors()
+    pub fn pose_source(&self) -> String {
+        match (&self.poses, self.poses.source()) {
+            (PosePlan::Odometry { fallback: Some(fallback) }, Some(source)) => {
+                format!("{source}; if it fails, {}", fallback.source)
+            }
+            (_, Some(source)) => source.to_string(),
+            (_, None) => "none: lengths are not metres".to_owned(),
+        }
     }
 
     /// The plan in lines of label and text, for `--dry-run` and the report.
     pub fn lines(&self) -> Vec<(&'static str, String)> {
         let k = &self.view;
+        let (images, keyframes) = match &self.expected {
+            Some(e) => {
+                let images = format!("{} ({} with a pose)", self.images, e.posed);
+                (images, format!("{} in {} chunks", e.keyframes, e.chunks))
+            }
+            None => {
+                (self.images.to_string(), "known when the odometry has tracked; cut into chunks".to_owned())
+            }
+        };
         let mut lines = vec![
             ("input", self.input.clone()),
-            ("metric poses", self.poses()),
+            ("metric poses", self.pose_source()),
             ("coupling", self.mode.to_string()),
-            ("images", format!("{} ({} with a pose)", self.images, self.posed)),
-            ("keyframes", format!("{} in {} chunks", self.keyframes.len(), self.chunks.len())),
+            ("images", images),
+            ("keyframes", keyframes),
             ("camera", format!("{} {}x{}", self.camera.name(), self.camera.width(), self.camera.height())),
             ("model view", format!("{}x{} px, f {:.1}/{:.1} px, undistorted", k.width, k.height, k.fx, k.fy)),
             ("geometry", format!("{} ({})", self.model.name, self.model.licence)),
-            ("places told by", self.places.to_owned()),
-            ("judged against", self.reference.to_string()),
+            ("place recognition", self.place_recognition.to_owned()),
+            ("compared with", self.reference.to_string()),
             ("memory of the map", format!("at most {}", bytes(self.volume_budget_bytes))),
             ("disk", format!("at most {}", bytes(self.disk_bytes))),
         ];
@@ -188,122 +200,43 @@ impl Plan {
     }
 }
 
-/// Metric poses, where there are any; a mode that needs none goes without.
-fn anchor(
-    dataset: &Dataset,
-    config: &Config,
-    events: &Events,
-    cancel: &CancelToken,
-) -> Result<Option<MetricAnchor>, Error> {
-    let mode = config.coupling.mode;
-    let mut config = config.clone();
-    if mode == CouplingMode::GroundTruth {
-        config.input.poses = PoseSource::GroundTruth;
-    }
-    match input::metric_anchor(dataset, &config, events, cancel) {
-        Err(Error::NoAnchor { .. } | Error::NoOdometry { .. }) if !mode.uses_pose_priors() => Ok(None),
-        other => other.map(Some),
-    }
-}
-
-/// Which images carry geometry, and how they are cut.
-struct Chosen {
-    keyframes: Vec<Keyframe>,
-    posed: usize,
-    chunks: Vec<ChunkPlan>,
-}
-
-fn choose(
+/// Keyframes and chunks, where no odometry has to track for them.
+fn expected_work(
     dataset: &Dataset,
     images: &[ImageEntry],
-    anchor: Option<&MetricAnchor>,
-    recorded: Option<Vec<Vec<usize>>>,
-    source: &Source,
+    poses: &PosePlan,
+    rule: &ChunkRule,
     config: &Config,
-    warnings: &mut Vec<Warning>,
-) -> Result<Chosen, Error> {
-    let posed = match anchor {
-        None => None,
-        Some(anchor) => {
-            let (frames, noticed) = input::posed_frames(dataset, images, anchor, config)?;
-            warnings.extend(noticed);
-            Some(frames)
+) -> Result<Option<ExpectedWork>, Error> {
+    // Given poses come without keyframes of the odometry, so none is preferred.
+    let mut selection = Selection::new(&config.keyframes, false);
+    let stamps = images.iter().map(input::stamp_of);
+    let (posed, keyframes) = match poses {
+        PosePlan::Odometry { .. } => return Ok(None),
+        PosePlan::None => {
+            let stamps: Vec<_> = stamps.collect();
+            (0, selection.among_unposed(&stamps, rule, true))
+        }
+        PosePlan::Given(trajectory) => {
+            let Some(given) = poses.given(dataset, config) else { return Ok(None) };
+            input::require_overlap(images, &given, &trajectory.camera_trajectory)?;
+            let posed = |stamp: crate::engine::FrameStamp| {
+                let world_from_camera = given.pose_at(stamp.time)?;
+                Some(PosedFrame { stamp, world_from_camera, odometry: None })
+            };
+            let posed: Vec<PosedFrame> = stamps.filter_map(posed).collect();
+            (posed.len(), selection.among_posed(&posed, rule, true))
         }
     };
-    let count = posed.as_ref().map_or(0, Vec::len);
-    if let Some(chunks) = recorded {
-        let pose_of = anchor.map(|a| input::poses_at(dataset, a, config));
-        let (keyframes, chunks) = recorded_keyframes(images, &chunks, pose_of)?;
-        return Ok(Chosen { keyframes, posed: count, chunks });
-    }
-    let keyframes: Vec<Keyframe> = match posed {
-        Some(frames) => {
-            // The odometry's keyframes come with landmarks, which tell a chunk's scale.
-            let tracked = anchor.and_then(|a| a.tracked.as_ref()).filter(|_| knows_landmarks(config, source));
-            let known: BTreeSet<_> = tracked.iter().flat_map(|t| &t.keyframes).map(|k| k.frame_id).collect();
-            let chosen = select_keyframes(&frames, &config.keyframes, &|id| known.contains(&id));
-            chosen.into_iter().map(Keyframe::from).collect()
-        }
-        None => select_by_time(images, &config.keyframes),
-    };
-    let geometry = &config.geometry;
-    let chunks = match source.overlaps() {
-        true => overlapping(keyframes.len(), geometry.chunk_keyframes, geometry.overlap_keyframes)?,
-        false => chunks(keyframes.len(), geometry.chunk_keyframes, geometry.context_keyframes),
-    };
-    Ok(Chosen { keyframes, posed: count, chunks })
-}
-
-/// Whether landmarks of the odometry matter: where chunks have a scale of their own that is to be found.
-fn knows_landmarks(config: &Config, source: &Source) -> bool {
-    config.coupling.mode == CouplingMode::Coupled && source.overlaps()
-}
-
-/// The images that a recording is of, and its chunks as spans of them.
-fn recorded_keyframes(
-    images: &[ImageEntry],
-    recorded: &[Vec<usize>],
-    pose_of: Option<impl Fn(&ImageEntry) -> Option<Se3>>,
-) -> Result<(Vec<Keyframe>, Vec<ChunkPlan>), Error> {
-    let mut used: Vec<usize> = recorded.iter().flatten().copied().collect();
-    used.sort_unstable();
-    used.dedup();
-    let keyframe = |&i: &usize| Keyframe {
-        image: images[i].clone(),
-        world_from_camera: pose_of.as_ref().and_then(|f| f(&images[i])),
-    };
-    let keyframes = used.iter().map(keyframe).collect();
-    let span = |images: &Vec<usize>| {
-        let first = images.first().and_then(|i| used.binary_search(i).ok())?;
-        let range = first..first + images.len();
-        (used.get(range.clone())? == images.as_slice()).then_some(range)
-    };
-    let spans: Option<Vec<Range<usize>>> = recorded.iter().map(span).collect();
-    let spans = spans.ok_or_else(|| Error::BadValue {
-        reason: "the recorded chunks are not spans of consecutive frames".into(),
-    })?;
-    Ok((keyframes, owned(spans)))
-}
-
-/// Chunks of `size` keyframes that share `overlap` with their neighbour.
-fn overlapping(keyframes: usize, size: usize, overlap: usize) -> Result<Vec<ChunkPlan>, Error> {
-    let ranges =
-        chunk_ranges(keyframes, size, overlap).map_err(|e| Error::BadValue { reason: e.to_string() })?;
-    Ok(owned(ranges.into_iter().map(|r| r.frames).collect()))
-}
-
-/// Each keyframe belongs to one chunk; what two share is halved between them, because geometry is worst at a chunk's ends.
-fn owned(spans: Vec<Range<usize>>) -> Vec<ChunkPlan> {
-    let middle = |a: &Range<usize>, b: &Range<usize>| {
-        let shared = a.end.saturating_sub(b.start);
-        b.start + shared / 2
-    };
-    let core = |k: usize| {
-        let start = if k == 0 { spans[0].start } else { middle(&spans[k - 1], &spans[k]) };
-        let end = spans.get(k + 1).map_or(spans[k].end, |next| middle(&spans[k], next));
-        start..end.max(start)
-    };
-    (0..spans.len()).map(|k| ChunkPlan { core: core(k), seen: spans[k].clone() }).collect()
+    let frames: Vec<FrameId> = keyframes.iter().map(|k| k.stamp.frame_id).collect();
+    let chunks = rule.chunks(&frames)?;
+    Ok(Some(ExpectedWork {
+        posed,
+        keyframes: keyframes.len(),
+        chunks: chunks.len(),
+        seen: chunks.iter().map(|c| c.seen.len()).sum(),
+        largest: chunks.iter().map(|c| c.seen.len()).max().unwrap_or(0),
+    }))
 }
 
 impl std::fmt::Display for ReferenceSource {
@@ -341,19 +274,6 @@ fn model_view(camera: &CameraModel, config: &Config) -> Result<Pinhole, Error> {
     Ok(undistorted_view(camera, target, scaled)?)
 }
 
-fn chunks(keyframes: usize, size: usize, context: usize) -> Vec<ChunkPlan> {
-    (0..keyframes)
-        .step_by(size)
-        .map(|start| {
-            let end = (start + size).min(keyframes);
-            ChunkPlan {
-                core: start..end,
-                seen: start.saturating_sub(context)..(end + context).min(keyframes),
-            }
-        })
-        .collect()
-}
-
 fn reference_source(dataset: &Dataset, config: &Config, given: Option<&Path>) -> ReferenceSource {
     let has_depth =
         dataset.depth_sensor.is_some() && !dataset.depths.is_empty() && dataset.ground_truth.is_some();
@@ -380,7 +300,7 @@ fn map_budget(
     let chunk = (views * view.width * view.height) as u64 * CHUNK_BYTES_PER_PIXEL;
     let network = network.map_or(0, |n| n.memory.total());
     let taken = PROGRAM_BYTES + chunk + network;
-    // The surface is extracted, judged and written beside the volume: about as much again, and half.
+    // The surface is extracted, evaluated and written beside the volume: about as much again, and half.
     let left = config.limits.memory_bytes.saturating_sub(taken) * 2 / 5;
     if left < LEAST_MAP_BYTES {
         return Err(Error::BadValue {
@@ -405,38 +325,31 @@ const CHUNK_BYTES_PER_PIXEL: u64 = 48;
 /// A map smaller than this is not worth a run.
 const LEAST_MAP_BYTES: u64 = 16 << 20;
 
-/// Upper bound: raw 16-bit depth and 24-bit colour per keyframe, every chunk's prediction (depth and confidence of
-/// 32 bits, colour), and the volume's share for map files.
-fn disk_bytes(keyframes: usize, chunks: &[ChunkPlan], view: &Pinhole, config: &Config) -> u64 {
+/// Upper bound: raw 16-bit depth and 24-bit colour per keyframe, every chunk's prediction (depth and confidence of 32 bits,
+/// colour), and the volume's share for map files. Where the keyframes are not known, every image may become one.
+fn disk_bytes(
+    expected: Option<ExpectedWork>,
+    images: usize,
+    rule: &ChunkRule,
+    view: &Pinhole,
+    config: &Config,
+) -> u64 {
+    let keyframes = expected.map_or(images, |e| e.keyframes);
+    let predicted = expected.map_or_else(
+        || {
+            let frames: Vec<FrameId> = (0..u32::try_from(images).unwrap_or(u32::MAX)).map(FrameId).collect();
+            rule.chunks(&frames).map_or(images, |c| c.iter().map(|c| c.seen.len()).sum())
+        },
+        |e| e.seen,
+    );
     let pixels = (view.width * view.height) as u64;
     let per_pixel = 2 * u64::from(config.output.depth_png) + 3 * u64::from(config.output.images);
-    let predicted: usize = chunks.iter().map(|c| c.seen.len()).sum();
     pixels * (per_pixel * keyframes as u64 + 11 * predicted as u64) + (256 << 20)
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn chunks_cover_every_keyframe_once_and_see_their_neighbours() {
-        let plan = chunks(37, 16, 4);
-        assert_eq!(plan.iter().map(|c| c.core.len()).sum::<usize>(), 37);
-        assert_eq!(plan[0], ChunkPlan { core: 0..16, seen: 0..20 });
-        assert_eq!(plan[1], ChunkPlan { core: 16..32, seen: 12..36 });
-        assert_eq!(plan[2], ChunkPlan { core: 32..37, seen: 28..37 });
-        assert!(chunks(0, 16, 4).is_empty());
-    }
-
-    #[test]
-    fn overlapping_chunks_own_every_keyframe_once() {
-        let plan = overlapping(37, 16, 4).unwrap();
-        assert_eq!(plan[0], ChunkPlan { core: 0..14, seen: 0..16 });
-        assert_eq!(plan[1], ChunkPlan { core: 14..26, seen: 12..28 });
-        assert_eq!(plan[2], ChunkPlan { core: 26..37, seen: 24..37 });
-        assert!(overlapping(10, 4, 4).is_err());
-        assert_eq!(overlapping(3, 16, 4).unwrap(), [ChunkPlan { core: 0..3, seen: 0..3 }]);
-    }
 
     #[test]
     fn sizes_are_readable() {

@@ -1,4 +1,4 @@
-//! What a run remembers of itself: warnings, timings, files, and the manifest made of them.
+//! Warnings, timings and files of a run as a reader of its events, and the manifest made of them.
 
 use super::{Plan, RunRequest};
 use crate::error::{Error, ExitStatus};
@@ -6,10 +6,10 @@ use crate::events::{Event, Events};
 use crate::run_folder::{MANIFEST_SCHEMA, Manifest, RunFolder};
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex};
-use vidar_core::Warning;
+use vidar_core::{Severity, Warning};
 use vidar_dataset::Dataset;
 
-/// Remembers what the events said, for the manifest and for `log.jsonl`.
+/// Records events for the manifest and for `log.jsonl`.
 #[derive(Clone, Default)]
 pub(super) struct Recorder(Arc<Mutex<Recorded>>);
 
@@ -22,24 +22,12 @@ struct Recorded {
     warnings: Vec<Warning>,
     seconds: Vec<(&'static str, f64)>,
     artifacts: Vec<String>,
+    /// Where the poses of the world that is mapped come from.
+    poses: Option<serde_json::Value>,
 }
 
-/// Kinds of warnings that mean that part of the result is missing.
-const DEGRADING: &[&str] = &[
-    "image-unreadable",
-    "image-empty",
-    "image-missing",
-    "chunk-failed",
-    "chunk-not-placed",
-    "fusion-memory-budget",
-    "no-parallax",
-    "depth-unreadable",
-    "not-judged",
-    "track-lost",
-];
-
 impl Recorder {
-    /// The same events, remembered.
+    /// The same events, recorded.
     pub fn listen(&self, events: Events) -> Events {
         let recorded = self.0.clone();
         events.with(move |event| {
@@ -50,8 +38,12 @@ impl Recorder {
             }
             match event {
                 Event::Warning { warning } => recorded.warnings.push(warning.clone()),
-                Event::StageFinished { stage, seconds } => recorded.seconds.push((stage, *seconds)),
+                Event::StageFinished { stage: name, seconds }
+                | Event::StepFinished { step: name, seconds } => {
+                    recorded.seconds.push((name, *seconds));
+                }
                 Event::ArtifactWritten { path, .. } => recorded.artifacts.push(path.clone()),
+                Event::World { poses, .. } => recorded.poses = Some(serde_json::json!(poses)),
                 _ => {}
             }
         })
@@ -76,13 +68,18 @@ impl Recorder {
         self.read(|r| r.warnings.clone())
     }
 
-    /// Whether a warning said that part of the result is missing.
+    /// Whether a part of the result is missing or weaker than asked for.
     pub fn is_degraded(&self) -> bool {
-        self.read(|r| r.warnings.iter().any(|w| DEGRADING.contains(&w.kind.as_str())))
+        self.read(|r| r.warnings.iter().any(|w| w.severity == Severity::Degraded))
     }
 
     /// The manifest of a run that ended with `exit`.
-    pub fn manifest(&self, about: About, result: serde_json::Value, exit: ExitStatus) -> Manifest {
+    pub fn manifest(
+        &self,
+        description: RunDescription,
+        result: serde_json::Value,
+        exit: ExitStatus,
+    ) -> Manifest {
         let mut counts = BTreeMap::<String, u64>::new();
         self.read(|r| r.warnings.iter().for_each(|w| *counts.entry(w.kind.clone()).or_default() += 1));
         Manifest {
@@ -92,15 +89,16 @@ impl Recorder {
             warnings: serde_json::json!(counts),
             artifacts: self.read(|r| r.artifacts.clone()),
             exit: exit as i32,
-            ..about.0
+            poses: self.read(|r| r.poses.clone()).unwrap_or_else(|| description.0.poses.clone()),
+            ..description.0
         }
     }
 }
 
-/// What is known of a run before it did anything.
-pub(super) struct About(Manifest);
+/// What is known of a run before it starts.
+pub(super) struct RunDescription(Manifest);
 
-impl About {
+impl RunDescription {
     /// Input, configuration, model and machine.
     pub fn new(request: &RunRequest, dataset: &Dataset, plan: &Plan) -> Result<Self, Error> {
         Ok(Self(Manifest {
@@ -113,10 +111,10 @@ impl About {
                 "images": dataset.images.len(), "imu_samples": dataset.imu.len(),
                 "depth_images": dataset.depths.len(),
             }),
-            dataset_sha256: sha256_hex(&dataset.fingerprint()?),
-            config_sha256: sha256_hex(request.layered.to_toml(false).as_bytes()),
+            dataset_sha256: vidar_hub::sha256_hex(&dataset.fingerprint()?),
+            config_sha256: vidar_hub::sha256_hex(request.layered.to_toml(false).as_bytes()),
             model: plan.model_json(),
-            poses: super::outputs::source_json(plan),
+            poses: serde_json::json!(plan.poses.source()),
             hardware: serde_json::json!(crate::system::hardware()),
             ..Manifest::default()
         }))
@@ -126,9 +124,4 @@ impl About {
 /// The result of a run that failed.
 pub(super) fn failure_json(error: &Error) -> serde_json::Value {
     serde_json::json!({ "error": { "code": error.code(), "message": error.to_string(), "hint": error.hint() } })
-}
-
-pub(crate) fn sha256_hex(bytes: &[u8]) -> String {
-    use sha2::{Digest, Sha256};
-    Sha256::digest(bytes).iter().map(|b| format!("{b:02x}")).collect()
 }

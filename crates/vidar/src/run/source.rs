@@ -2,14 +2,13 @@
 
 use crate::chunks::{RecordedModel, Recording};
 use crate::config::Config;
+use crate::engine::{GeometrySource, Prediction};
 use crate::error::Error;
-use crate::models::Located;
+use crate::models::LocatedModel;
 use crate::models::geometry::{self, NetworkPlan, SourceChoice};
 use std::sync::Arc;
 use vidar_align::CouplingMode;
-use vidar_core::{
-    ChunkViews, GeometryModel, GeometryPrediction, Image, ModelError, ModelInfo, Pinhole, Warning,
-};
+use vidar_core::{ChunkViews, GeometryModel, ModelError, ModelInfo, Pinhole, Warning};
 use vidar_da3::{Da3Model, PoseMode};
 use vidar_dataset::{Dataset, ImageEntry};
 use vidar_stereo::StereoModel;
@@ -24,15 +23,15 @@ pub enum Source {
     /// Multi-view stereo: needs poses, answers in their world.
     Stereo(StereoModel),
     /// A network.
-    Network(Box<(Da3Model, Located)>),
+    Network(Box<(Da3Model, LocatedModel)>),
     /// Predictions made elsewhere.
     Recorded(RecordedModel),
     /// A simulated network that knows a synthetic recording's world.
     Simulated(SyntheticModel),
 }
 
-/// What a source asks of the plan.
-pub struct Opened {
+/// A source, with the chunks that it prescribes.
+pub struct OpenedSource {
     /// The source.
     pub source: Source,
     /// Images per chunk, where the recording prescribes them.
@@ -41,7 +40,7 @@ pub struct Opened {
 
 impl Source {
     /// Opens what the configuration names. `images` are those that a recording may be of.
-    pub fn open(dataset: &Dataset, images: &[ImageEntry], config: &Config) -> Result<Opened, Error> {
+    pub fn open(dataset: &Dataset, images: &[ImageEntry], config: &Config) -> Result<OpenedSource, Error> {
         let mode = config.coupling.mode;
         let mut chunks = None;
         let source = match geometry::source(config)? {
@@ -72,17 +71,7 @@ impl Source {
             }
             SourceChoice::Simulated => Self::Simulated(simulated(dataset, config)?),
         };
-        Ok(Opened { source, chunks })
-    }
-
-    /// Whether chunks are tied by keyframes that both hold; stereo's are tied by the poses that it is given.
-    pub fn overlaps(&self) -> bool {
-        !matches!(self, Self::Stereo(_))
-    }
-
-    /// Whether it answers to any set of views, also to both ends of a loop together.
-    pub fn sees_any_views(&self) -> bool {
-        matches!(self, Self::Network(_) | Self::Simulated(_))
+        Ok(OpenedSource { source, chunks })
     }
 
     fn model(&mut self) -> &mut dyn GeometryModel {
@@ -92,26 +81,6 @@ impl Source {
             Self::Recorded(model) => model,
             Self::Simulated(model) => model,
         }
-    }
-
-    /// What it is.
-    pub fn info(&self) -> &ModelInfo {
-        match self {
-            Self::Stereo(model) => model.info(),
-            Self::Network(network) => network.0.info(),
-            Self::Recorded(model) => model.info(),
-            Self::Simulated(model) => model.info(),
-        }
-    }
-
-    /// Depth of the views `wanted`.
-    pub fn predict(
-        &mut self,
-        views: &ChunkViews,
-        wanted: std::ops::Range<usize>,
-        cancel: &(dyn Fn() -> bool + Sync),
-    ) -> Result<GeometryPrediction, ModelError> {
-        self.model().predict_views(views, wanted, cancel)
     }
 
     /// Channels of the tokens that a network can tell places by.
@@ -126,22 +95,6 @@ impl Source {
     pub fn keep_place_tokens(&mut self) {
         if let Self::Network(network) = self {
             network.0.keep_place_tokens();
-        }
-    }
-
-    /// Tokens of the last prediction's views; empty where none are kept.
-    pub fn take_place_tokens(&mut self) -> Vec<Vec<f32>> {
-        match self {
-            Self::Network(network) => network.0.take_place_tokens(),
-            Self::Stereo(_) | Self::Recorded(_) | Self::Simulated(_) => Vec::new(),
-        }
-    }
-
-    /// Pictures at the depth's size that came with the last prediction, one per view; empty where none did.
-    pub fn take_colors(&mut self) -> Vec<Image<[u8; 3]>> {
-        match self {
-            Self::Recorded(model) => model.take_colors(),
-            Self::Stereo(_) | Self::Network(_) | Self::Simulated(_) => Vec::new(),
         }
     }
 
@@ -161,6 +114,41 @@ impl Source {
     }
 }
 
+impl GeometrySource for Source {
+    fn info(&self) -> &ModelInfo {
+        match self {
+            Self::Stereo(model) => model.info(),
+            Self::Network(network) => network.0.info(),
+            Self::Recorded(model) => model.info(),
+            Self::Simulated(model) => model.info(),
+        }
+    }
+
+    fn overlaps(&self) -> bool {
+        !matches!(self, Self::Stereo(_))
+    }
+
+    fn predicts_any_views(&self) -> bool {
+        matches!(self, Self::Network(_) | Self::Simulated(_))
+    }
+
+    fn predict(
+        &mut self,
+        views: &ChunkViews,
+        wanted: std::ops::Range<usize>,
+        cancelled: &(dyn Fn() -> bool + Sync),
+    ) -> Result<Prediction, ModelError> {
+        let geometry = self.model().predict_views(views, wanted, cancelled)?;
+        let (mut colors, mut tokens) = (Vec::new(), Vec::new());
+        match self {
+            Self::Network(network) => tokens = network.0.take_place_tokens(),
+            Self::Recorded(model) => colors = model.take_colors(),
+            Self::Stereo(_) | Self::Simulated(_) => {}
+        }
+        Ok(Prediction { geometry, colors, tokens })
+    }
+}
+
 /// The simulated network of a recording that `vidar synth` made.
 fn simulated(dataset: &Dataset, config: &Config) -> Result<SyntheticModel, Error> {
     // `mav0/` lies inside the folder that was written.
@@ -175,7 +163,7 @@ fn simulated(dataset: &Dataset, config: &Config) -> Result<SyntheticModel, Error
     Ok(SyntheticModel::new(simulation, errors, conditioning, SIMULATED_SIDE_PX, seed)?)
 }
 
-/// Whether the network is told where the cameras are.
+/// How the network is used: with given camera poses or without.
 fn pose_mode(config: &Config) -> PoseMode {
     match config.coupling.mode {
         CouplingMode::PoseConditioned | CouplingMode::GroundTruth => PoseMode::Conditioned,

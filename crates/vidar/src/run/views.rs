@@ -1,71 +1,64 @@
-//! Keyframes as the model sees them: read, undistorted, with their prior pose.
+//! Files of the keyframes that were fused: depth and undistorted image.
 
-use crate::events::Events;
-use crate::keyframes::Keyframe;
+use crate::config::Config;
+use crate::error::Error;
+use crate::events::{Event, Events};
+use crate::run_folder::{RunFolder, StoredView};
 use rayon::prelude::*;
-use std::ops::Range;
-use vidar_core::remap::RemapTable;
-use vidar_core::{ChunkView, Warning};
-use vidar_dataset::Dataset;
+use vidar_core::AlignedView;
 
-/// A window of undistorted keyframes that moves forward through the sequence; each image is read once.
-pub struct ViewWindow<'a> {
-    dataset: &'a Dataset,
-    keyframes: &'a [Keyframe],
-    remap: &'a RemapTable,
-    /// Keyframe index with its view, ascending. Unreadable images are missing.
-    views: Vec<(usize, ChunkView)>,
-    next: usize,
+/// Writes depth and image of every view as it is finished, so that a crash later loses nothing.
+pub(super) fn write_views(
+    views: &[AlignedView],
+    config: &Config,
+    folder: &RunFolder,
+    events: &Events,
+) -> Result<Vec<StoredView>, Error> {
+    folder.file("depth/.")?;
+    folder.file("images/.")?;
+    let stored: Result<Vec<_>, Error> =
+        views.par_iter().map(|view| write_view(view, config, folder)).collect();
+    let stored = stored?;
+    for (_, artifacts) in &stored {
+        for (path, bytes) in artifacts {
+            events.emit(&Event::ArtifactWritten { path: path.clone(), bytes: *bytes });
+        }
+    }
+    Ok(stored.into_iter().map(|(view, _)| view).collect())
 }
 
-impl<'a> ViewWindow<'a> {
-    /// An empty window before the first keyframe.
-    pub fn new(dataset: &'a Dataset, keyframes: &'a [Keyframe], remap: &'a RemapTable) -> Self {
-        Self { dataset, keyframes, remap, views: Vec::new(), next: 0 }
-    }
+type Artifacts = Vec<(String, u64)>;
 
-    /// Moves the window to the keyframes `seen`, reading what is new. Unreadable images are warned of and left out.
-    pub fn advance(&mut self, seen: &Range<usize>, events: &Events) {
-        self.views.retain(|(index, _)| seen.contains(index));
-        let fresh: Vec<usize> = (self.next.max(seen.start)..seen.end).collect();
-        let loaded: Vec<_> = fresh.par_iter().map(|&index| (index, self.load(index))).collect();
-        for (index, result) in loaded {
-            match result {
-                Ok(view) => self.views.push((index, view)),
-                Err(warning) => events.warn(&warning),
-            }
-        }
-        self.next = self.next.max(seen.end);
+fn write_view(
+    view: &AlignedView,
+    config: &Config,
+    folder: &RunFolder,
+) -> Result<(StoredView, Artifacts), Error> {
+    let mut artifacts = Artifacts::new();
+    let name = format!("{:06}.png", view.frame_id().0);
+    let mut depth = None;
+    if config.output.depth_png {
+        let path = format!("depth/{name}");
+        let mut bytes = Vec::new();
+        vidar_export::write_depth_png(&mut bytes, view.depth(), config.output.depth_units_per_metre)?;
+        artifacts.push((path.clone(), folder.write(&path, &bytes)?));
+        depth = Some(path);
     }
-
-    /// Hands the views out and, beside them, which of them lie in `core`.
-    pub fn take(&mut self, core: &Range<usize>) -> (Vec<ChunkView>, Range<usize>, Vec<usize>) {
-        let (indices, views): (Vec<usize>, Vec<ChunkView>) =
-            std::mem::take(&mut self.views).into_iter().unzip();
-        let start = indices.partition_point(|&i| i < core.start);
-        let end = indices.partition_point(|&i| i < core.end);
-        (views, start..end, indices)
+    let mut image = None;
+    if let (true, Some(color)) = (config.output.images, view.color()) {
+        let path = format!("images/{name}");
+        artifacts.push((path.clone(), folder.write(&path, &vidar_view::encode_png(color)?)?));
+        image = Some(path);
     }
-
-    /// Takes the views back.
-    pub fn put_back(&mut self, views: Vec<ChunkView>, indices: Vec<usize>) {
-        self.views = indices.into_iter().zip(views).collect();
-    }
-
-    /// Reads one keyframe, wherever it lies.
-    pub fn load(&self, index: usize) -> Result<ChunkView, Warning> {
-        let keyframe = &self.keyframes[index];
-        let place = || keyframe.image.path.display().to_string();
-        let image = self
-            .dataset
-            .load_image(&keyframe.image)
-            .map_err(|e| Warning::new("image-unreadable", e.to_string()).at(place()))?;
-        Ok(ChunkView {
-            frame_id: keyframe.image.frame_id,
-            time: keyframe.image.time,
-            image: self.remap.apply(&image),
-            intrinsics: *self.remap.target(),
-            world_from_camera: keyframe.world_from_camera,
-        })
-    }
+    let m = view.world_from_camera().matrix();
+    let rows = std::array::from_fn(|r| std::array::from_fn(|c| m[(r, c)]));
+    let stored = StoredView {
+        frame: view.frame_id().0,
+        time_ns: view.time().nanos(),
+        image,
+        depth,
+        intrinsics: *view.intrinsics(),
+        world_from_camera: rows,
+    };
+    Ok((stored, artifacts))
 }

@@ -1,16 +1,13 @@
-//! Landmarks by stereo: the points of a chunk's pictures that matching between known places is surest of.
+//! Landmarks by stereo: the points of a chunk's images whose depth multi-view stereo measures with the highest confidence.
 //!
-//! The odometry follows few points, and a trajectory that was given comes with none. A network's depth, off by a factor that
-//! varies slowly over each picture, can be held to these as well, as long as it is off by more than stereo is.
+//! The odometry tracks few points, and a given trajectory comes with none. A network's depth, off by a factor that varies
+//! slowly over each image, can be fitted to these points as well, as long as its error is larger than stereo's.
 
-use super::observation::in_depth_image;
-use super::plan::Plan;
-use super::source::Source;
 use crate::config::Config;
 use crate::error::Error;
 use std::collections::BTreeMap;
-use vidar_align::CouplingMode;
 use vidar_align::landmark_scale::{LandmarkConfig, depth_ratios};
+use vidar_align::landmark_transfer::pixel_at_size;
 use vidar_core::camera::Pixel;
 use vidar_core::model::ChunkFrame;
 use vidar_core::{
@@ -18,15 +15,15 @@ use vidar_core::{
 };
 use vidar_stereo::{StereoConfig, StereoError, StereoModel, TOLERANCE_RATIO};
 
-/// The picture is cut into so many blocks across and down; each gives one landmark at most.
+/// Blocks across and down that the image is cut into; each gives one landmark at most.
 const BLOCKS: (usize, usize) = (20, 14);
-/// A few hundred points need no fine picture, and no refinement: 320 px with it cost three times as much for a hundredth more.
+/// A few hundred points need no fine image, and no refinement: 320 px with it cost three times as much for a hundredth more.
 const MAX_WIDTH_PX: usize = 240;
 /// The least probability that the depth is right to within [`TOLERANCE_RATIO`].
 const MIN_CONFIDENCE: f32 = 0.75;
 
-/// A network that differs from stereo by less, in the middle, may be the better of the two: stereo's errors are those of whole
-/// regions, which held-out landmarks cannot tell. 1.5 times what stereo calls right.
+/// A network whose median difference from stereo is smaller may be the better of the two: stereo's errors are those of whole
+/// regions, which held-out landmarks cannot show. 1.5 times stereo's tolerance.
 const CONTRADICTS: f64 = 1.5 * TOLERANCE_RATIO as f64;
 
 /// What stereo's errors have in common from point to point and chunk to chunk (calibration, poses, exposure), of ln(depth):
@@ -34,55 +31,54 @@ const CONTRADICTS: f64 = 1.5 * TOLERANCE_RATIO as f64;
 pub const SHARED_STD: f64 = 0.5 * TOLERANCE_RATIO as f64;
 
 /// Finds landmarks by stereo.
-pub struct Sparse {
+pub struct StereoLandmarks {
     stereo: StereoModel,
     config: LandmarkConfig,
 }
 
-impl Sparse {
-    /// `None` where nothing is held to landmarks, or these are not wanted.
-    pub fn wanted(plan: &Plan, source: &Source, config: &Config) -> Result<Option<Self>, Error> {
-        let holds = plan.mode == CouplingMode::Coupled && plan.anchor.is_some() && source.overlaps();
-        if !(holds && config.coupling.stereo_landmarks) {
-            return Ok(None);
-        }
+impl StereoLandmarks {
+    /// Stereo at a reduced size.
+    pub fn new(config: &Config) -> Result<Self, Error> {
         let max_width_px = config.stereo.max_width_px.min(MAX_WIDTH_PX);
         let quick = StereoConfig { max_width_px, refine_rounds: 0, ..config.stereo.clone() };
-        Ok(Some(Self { stereo: StereoModel::new(quick)?, config: config.align.landmarks.clone() }))
+        Ok(Self { stereo: StereoModel::new(quick)?, config: config.align.landmarks.clone() })
     }
 
-    /// Landmarks of those of a prediction's `views` that have a pose, at the pixels of its depth. None at all where the camera
-    /// hardly moved, or where stereo and the prediction agree.
-    pub fn of(
+    /// Landmarks of those of a prediction's `views` that have a pose, at the pixels of its depth, numbered from
+    /// `first_number`. Empty where the camera hardly moved, or where stereo and the prediction agree.
+    pub fn find(
         &self,
         prediction: &GeometryPrediction,
         views: &[ChunkView],
-        cancel: &(dyn Fn() -> bool + Sync),
+        first_number: u32,
+        cancelled: &(dyn Fn() -> bool + Sync),
     ) -> Result<BTreeMap<FrameId, Vec<SparseLandmark>>, StereoError> {
         let views: Vec<ChunkView> = views.iter().filter(|v| v.world_from_camera.is_some()).cloned().collect();
         let references: Vec<usize> = (0..views.len()).collect();
         let views = ChunkViews { id: prediction.chunk_id, views };
-        let by_stereo = match self.stereo.predict_with(&views, &references, cancel) {
+        let by_stereo = match self.stereo.predict_with(&views, &references, cancelled) {
             Ok(output) => output.prediction.views,
             Err(
                 StereoError::NoParallax { .. } | StereoError::TooFewViews { .. } | StereoError::Cancelled,
             ) => return Ok(BTreeMap::new()),
             Err(error) => return Err(error),
         };
-        let seen = |view: &ViewGeometry| {
+        let mut numbers = first_number..;
+        let landmarks_of = |view: &ViewGeometry| {
             let stereo = by_stereo.iter().find(|s| s.frame_id == view.frame_id)?;
             let moved = |l: SparseLandmark| {
-                let pixel = in_depth_image(&l.pixel, &stereo.intrinsics, &view.intrinsics)?;
+                let pixel = pixel_at_size(&l.pixel, &stereo.intrinsics, &view.intrinsics)?;
                 Some(SparseLandmark { pixel, ..l })
             };
-            Some((view.frame_id, surest(stereo).into_iter().filter_map(moved).collect()))
+            let points = most_confident(stereo, &mut numbers);
+            Some((view.frame_id, points.into_iter().filter_map(moved).collect()))
         };
-        let landmarks: BTreeMap<_, _> = prediction.views.iter().filter_map(seen).collect();
-        Ok(if self.contradict(prediction, &landmarks) { landmarks } else { BTreeMap::new() })
+        let landmarks: BTreeMap<_, _> = prediction.views.iter().filter_map(landmarks_of).collect();
+        Ok(if self.contradicts(prediction, &landmarks) { landmarks } else { BTreeMap::new() })
     }
 
-    /// Whether a chunk's depth is farther from its landmarks than stereo can be wrong.
-    fn contradict(
+    /// Whether a chunk's depth differs from its landmarks by more than stereo's error.
+    fn contradicts(
         &self,
         prediction: &GeometryPrediction,
         landmarks: &BTreeMap<FrameId, Vec<SparseLandmark>>,
@@ -92,42 +88,41 @@ impl Sparse {
         };
         let logs: Vec<f64> = prediction.views.iter().flat_map(of).map(|r| r.log_ratio).collect();
         // The unit of a chunk in a frame of its own is free.
-        let unit = if prediction.frame == ChunkFrame::ModelNative { middle(&logs) } else { Some(0.0) };
-        let off = |unit: f64| middle(&logs.iter().map(|l| (l - unit).abs()).collect::<Vec<_>>());
+        let unit = if prediction.frame == ChunkFrame::ModelNative { median(&logs) } else { Some(0.0) };
+        let off = |unit: f64| median(&logs.iter().map(|l| (l - unit).abs()).collect::<Vec<_>>());
         unit.and_then(off).is_some_and(|off| off > CONTRADICTS)
     }
 }
 
-fn middle(values: &[f64]) -> Option<f64> {
+fn median(values: &[f64]) -> Option<f64> {
     let mut sorted = values.to_vec();
     sorted.sort_by(f64::total_cmp);
     sorted.get(sorted.len() / 2).copied()
 }
 
-/// The surest pixel of each block.
-fn surest(view: &ViewGeometry) -> Vec<SparseLandmark> {
+/// The pixel of each block whose depth is most confident. No point is followed from view to view: each has its own number.
+fn most_confident(view: &ViewGeometry, numbers: &mut impl Iterator<Item = u32>) -> Vec<SparseLandmark> {
     let (depth, confidence) = (view.depth.image(), view.confidence.image());
     let (width, height) = (depth.width(), depth.height());
     let within =
         |block: usize, blocks: usize, size: usize| block * size / blocks..(block + 1) * size / blocks;
     let pick = |block: usize| {
         let columns = within(block % BLOCKS.0, BLOCKS.0, width);
-        let places = within(block / BLOCKS.0, BLOCKS.1, height)
+        let candidates = within(block / BLOCKS.0, BLOCKS.1, height)
             .flat_map(|y| columns.clone().map(move |x| (x, y)))
             .filter(|&at| depth[at].is_finite() && confidence[at] >= MIN_CONFIDENCE);
-        let (x, y) = places.reduce(|a, b| if confidence[b] > confidence[a] { b } else { a })?;
+        candidates.reduce(|a, b| if confidence[b] > confidence[a] { b } else { a })
+    };
+    let landmark = |((x, y), number): ((usize, usize), u32)| {
         let inverse_depth = 1.0 / f64::from(depth[(x, y)]);
-        // No point is followed from frame to frame: each view's own are told apart by its frame, and from the odometry's by
-        // the top bit.
-        let number = (view.frame_id.0).wrapping_mul((BLOCKS.0 * BLOCKS.1) as u32).wrapping_add(block as u32);
-        Some(SparseLandmark {
-            id: LandmarkId(number | 1 << 31),
+        SparseLandmark {
+            id: LandmarkId(number),
             pixel: Pixel::new(x as f64, y as f64),
             inverse_depth,
             inverse_depth_std: f64::from(TOLERANCE_RATIO) * inverse_depth,
-        })
+        }
     };
-    (0..BLOCKS.0 * BLOCKS.1).filter_map(pick).collect()
+    (0..BLOCKS.0 * BLOCKS.1).filter_map(pick).zip(numbers).map(landmark).collect()
 }
 
 #[cfg(test)]
@@ -145,9 +140,9 @@ mod tests {
         }
     }
 
-    /// A wall 2 m away of which stereo is sure on the left half alone, more so at one pixel of each block.
+    /// A wall 2 m away that stereo measures on the left half alone, with more confidence at one pixel of each block.
     #[test]
-    fn every_block_that_stereo_is_sure_of_gives_one_landmark_where_it_is_surest() {
+    fn every_block_that_stereo_measures_gives_one_landmark_where_confidence_is_highest() {
         let (width, height) = (200, 140);
         let mut depth = Image::filled(width, height, 2.0_f32);
         depth.data_mut()[0] = f32::NAN;
@@ -157,15 +152,15 @@ mod tests {
             (true, true) => 0.9,
         };
         let view = view(width, height, depth, Image::from_fn(width, height, sure));
-        let found = surest(&view);
-        assert_eq!(found.len(), 10 * 14);
-        for landmark in &found {
+        let landmarks = most_confident(&view, &mut (0..));
+        assert_eq!(landmarks.len(), 10 * 14);
+        for landmark in &landmarks {
             assert_eq!((landmark.pixel.x as usize % 10, landmark.pixel.y as usize % 10), (7, 4));
             assert!((landmark.inverse_depth - 0.5).abs() < 1e-12);
             assert!((landmark.inverse_depth_std - 0.015).abs() < 1e-9);
         }
-        let ids: std::collections::BTreeSet<_> = found.iter().map(|l| l.id).collect();
-        assert_eq!(ids.len(), found.len());
+        let ids: std::collections::BTreeSet<_> = landmarks.iter().map(|l| l.id).collect();
+        assert_eq!(ids.len(), landmarks.len());
     }
 
     /// A wall that a network sees 10 % too far contradicts landmarks in metres, not those of a chunk whose unit is free; one
@@ -176,11 +171,11 @@ mod tests {
         let seen =
             |z: f32| view(width, height, Image::filled(width, height, z), Image::filled(width, height, 1.0));
         let stereo = StereoModel::new(StereoConfig::default()).unwrap();
-        let sparse = Sparse { stereo, config: LandmarkConfig::default() };
-        let landmarks = BTreeMap::from([(FrameId(3), surest(&seen(2.0)))]);
+        let stereo_landmarks = StereoLandmarks { stereo, config: LandmarkConfig::default() };
+        let landmarks = BTreeMap::from([(FrameId(3), most_confident(&seen(2.0), &mut (0..)))]);
         let is_contradicted = |z: f32, frame: ChunkFrame| {
             let prediction = GeometryPrediction { chunk_id: ChunkId(0), frame, views: vec![seen(z)] };
-            sparse.contradict(&prediction, &landmarks)
+            stereo_landmarks.contradicts(&prediction, &landmarks)
         };
         assert!(is_contradicted(2.2, ChunkFrame::PriorWorld));
         assert!(!is_contradicted(2.04, ChunkFrame::PriorWorld));
@@ -193,6 +188,6 @@ mod tests {
         );
         let bent =
             GeometryPrediction { chunk_id: ChunkId(0), frame: ChunkFrame::ModelNative, views: vec![bent] };
-        assert!(sparse.contradict(&bent, &landmarks));
+        assert!(stereo_landmarks.contradicts(&bent, &landmarks));
     }
 }

@@ -1,12 +1,12 @@
-//! How good the result is, where that can be known.
+//! Scores of the result, where there is something to compare it with.
 
+use super::map::MetricMap;
 use super::plan::Plan;
-use super::{MetricMap, anchored_by_truth, keyframe_trajectory, reference};
+use super::reference;
 use crate::config::Config;
 use crate::error::Error;
 use crate::events::Events;
 use crate::input::truth_in_camera;
-use rayon::prelude::*;
 use serde::Serialize;
 use vidar_core::{AlignedView, PointCloud, Se3, Trajectory, TriangleMesh, Warning};
 use vidar_dataset::Dataset;
@@ -15,18 +15,18 @@ use vidar_eval::{
     SurfaceReport, TrajectoryReport,
 };
 
-/// Scores, each with what it was judged against.
+/// Scores of a run.
 #[derive(Clone, Debug, Default, Serialize)]
-pub struct Judgement {
+pub struct Evaluation {
     /// The map's camera poses against ground truth; absent when they are ground truth.
     pub trajectory: Option<TrajectoryReport>,
-    /// Poses of the anchor against ground truth, where the map's are not the anchor's.
-    pub anchor: Option<TrajectoryReport>,
+    /// The metric trajectory against ground truth, where the map's poses are others.
+    pub metric_trajectory: Option<TrajectoryReport>,
     /// Surface against the reference.
     pub surface: Option<SurfaceReport>,
     /// Depth of keyframes against the depth sensor.
     pub depth: Option<DepthScore>,
-    /// Points of the estimate with their distance (m) to the reference; for pictures.
+    /// Points of the estimate with their distance (m) to the reference; for figures.
     #[serde(skip)]
     pub error_cloud: Option<(PointCloud, Vec<f32>)>,
 }
@@ -39,17 +39,18 @@ pub struct DepthScore {
     pub summary: DepthSummary,
 }
 
-/// Judges trajectory, surface and depth. What cannot be judged is left out; a failed judgement is a warning.
-pub fn judge(
+/// Evaluates trajectory, surface and depth. What has no reference is left out; an evaluation that failed is a degradation.
+pub fn evaluate(
     dataset: &Dataset,
     plan: &Plan,
     map: &MetricMap,
     config: &Config,
     events: &Events,
-) -> Result<Judgement, Error> {
-    let mut judgement = Judgement::default();
-    let warn =
-        |what: &str, reason: String| events.warn(&Warning::new("not-judged", format!("{what}: {reason}")));
+) -> Result<Evaluation, Error> {
+    let mut evaluation = Evaluation::default();
+    let warn = |what: &str, reason: String| {
+        events.warn(&Warning::degraded("not-evaluated", format!("{what}: {reason}")))
+    };
     let mut start = PlacementStart::from(Se3::IDENTITY);
     if let Some(truth) = truth_in_camera(dataset) {
         let against_truth = |what: &str, estimate: &Trajectory| match vidar_eval::evaluate_trajectory(
@@ -66,45 +67,45 @@ pub fn judge(
                 None
             }
         };
-        let anchor = plan.anchor.as_ref().filter(|_| !anchored_by_truth(plan));
-        let anchor = anchor.and_then(|a| against_truth("trajectory", &a.camera_trajectory));
-        let moved = plan.mode.chains().then(|| keyframe_trajectory(plan, map)).flatten();
+        let metric = map.trajectory.as_ref().filter(|_| !map.uses_ground_truth());
+        let metric = metric.and_then(|t| against_truth("trajectory", &t.camera_trajectory));
+        let moved = plan.mode.chains().then(|| map.keyframe_trajectory()).flatten();
         match moved {
             Some(trajectory) => {
-                judgement.trajectory = against_truth("map's poses", &trajectory);
-                judgement.anchor = anchor;
+                evaluation.trajectory = against_truth("poses of the map", &trajectory);
+                evaluation.metric_trajectory = metric;
             }
-            None => judgement.trajectory = anchor,
+            None => evaluation.trajectory = metric,
         }
-        if let Some(report) = &judgement.trajectory {
+        if let Some(report) = &evaluation.trajectory {
             start = placement_start(report);
         }
     }
-    // By now the map is made; a reference that cannot be read must not cost it.
+    // The map is finished: a reference that cannot be read must not cost it.
     let reference = reference::cloud(&plan.reference, dataset, config, events).unwrap_or_else(|e| {
         warn("surface", format!("{}: {e}", plan.reference));
         None
     });
     if let Some(reference) = reference {
         let surface = SurfaceEvalConfig { keep_point_errors: true, ..config.eval.surface.clone() };
-        let judged = sampled(&map.mesh, config).map_err(Error::from).and_then(|estimate| {
+        let report = sampled(&map.surface.mesh, config).map_err(Error::from).and_then(|estimate| {
             let report = vidar_eval::evaluate_surface_from(&estimate, &reference, &start, &surface)?;
             Ok((estimate, report))
         });
-        match judged {
+        match report {
             Ok((estimate, mut report)) => {
-                judgement.error_cloud =
+                evaluation.error_cloud =
                     report.point_errors.take().map(|errors| (estimate, errors.estimate_m));
-                judgement.surface = Some(report);
+                evaluation.surface = Some(report);
             }
             Err(e) => warn("surface", e.to_string()),
         }
     }
-    judgement.depth = map.depth_scores.score();
-    Ok(judgement)
+    evaluation.depth = map.depth_scores.score();
+    Ok(evaluation)
 }
 
-/// Where the estimate lies in the world of ground truth, as its trajectory tells.
+/// Pose of the estimate in the world of ground truth, by its trajectory.
 fn placement_start(report: &TrajectoryReport) -> PlacementStart {
     PlacementStart {
         truth_from_estimate: report.truth_from_estimate_se3.and_then(|t| t.to_se3()).unwrap_or(Se3::IDENTITY),
@@ -112,35 +113,27 @@ fn placement_start(report: &TrajectoryReport) -> PlacementStart {
     }
 }
 
-/// The mesh as evenly spread points: what is judged must not depend on how finely a format splits triangles.
+/// The mesh as evenly spread points: scores must not depend on how finely a format splits triangles.
 pub fn sampled(mesh: &TriangleMesh, config: &Config) -> Result<PointCloud, EvalError> {
     vidar_eval::sample_mesh(mesh, SampleDensity::SpacingM(config.fusion.voxel_size_m / 2.0))
 }
 
-/// Compares depth with the sensor's, view by view as the views are made.
+/// Compares depth with the depth sensor's, view by view as views are fused.
 #[derive(Debug, Default)]
 pub struct DepthScorer(DepthAccumulator);
 
 impl DepthScorer {
-    /// Takes in the views for whose time there is a depth image.
-    pub fn add(&mut self, dataset: &Dataset, views: &[AlignedView]) {
-        let compared: Vec<_> = views
-            .par_iter()
-            .map(|view| match reference::sensor_depth_in_view(dataset, view.time(), view.intrinsics()) {
-                Some(Ok(truth)) => Some((view.depth(), truth)),
-                // An unreadable depth image is named when the reference is fused.
-                Some(Err(_)) | None => None,
-            })
-            .collect();
-        for (predicted, truth) in compared.into_iter().flatten() {
-            // Both have the view's size, so this cannot fail; were it to, the frame would only be missing here.
-            let _ = self.0.push(predicted, &truth);
-        }
+    /// Adds the views for whose time there is a depth image.
+    pub fn add(&mut self, dataset: &Dataset, views: &[AlignedView]) -> Result<(), Error> {
+        let truth = |view: &AlignedView| {
+            // An unreadable depth image is reported when the reference is fused.
+            reference::sensor_depth_in_view(dataset, view.time(), view.intrinsics())?.ok()
+        };
+        Ok(self.0.push_views(views, truth)?)
     }
 
     /// The scores, if anything could be compared.
     pub fn score(&self) -> Option<DepthScore> {
-        let summary = self.0.summary();
-        (summary.frames_judged > 0).then_some(DepthScore { summary })
+        self.0.summary().map(|summary| DepthScore { summary })
     }
 }

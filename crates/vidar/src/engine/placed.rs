@@ -1,12 +1,26 @@
-//! A predicted view in metres and in the world.
+//! Predicted views in metres and in the world.
 
+use crate::chunks::StoredChunk;
 use crate::error::Error;
-use vidar_align::AlignError;
 use vidar_align::aligner::ViewPlacement;
+use vidar_align::{AlignError, Placement};
 use vidar_core::{AlignedView, Image, RelativeDepth, Timestamp, ViewGeometry};
 
+/// The views that a chunk owns, in metres and in the world.
+pub fn placed_views(placement: &Placement, stored: StoredChunk) -> Result<Vec<AlignedView>, Error> {
+    let id = stored.prediction.chunk_id;
+    let mut colors = stored.colors.into_iter();
+    let mut views = Vec::new();
+    for (view, time) in stored.prediction.views.into_iter().zip(stored.times) {
+        let color = colors.next();
+        let Some(place) = placement.view(view.frame_id).filter(|p| p.owner == id) else { continue };
+        views.push(placed_view(view, time, place, color)?);
+    }
+    Ok(views)
+}
+
 /// The view where the alignment puts it, its depth in metres and corrected where landmarks support it.
-pub(super) fn placed_view(
+fn placed_view(
     view: ViewGeometry,
     time: Timestamp,
     place: &ViewPlacement,

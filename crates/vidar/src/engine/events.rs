@@ -1,0 +1,141 @@
+//! What the engine reports: progress and results in one typed stream.
+
+use crate::input::TrajectorySource;
+use std::sync::Arc;
+use vidar_align::Placement;
+use vidar_align::aligner::{ChunkReport, LoopReport};
+use vidar_core::{
+    AlignedView, CameraId, ChunkId, FrameId, OdometryKeyframe, PointCloud, RevisedPose, Se3, Timestamp,
+    TriangleMesh, Warning,
+};
+use vidar_fusion::{CoverageReport, DoubleWallReport};
+
+/// An image without its pixels.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct FrameStamp {
+    /// Its number in the sequence.
+    pub frame_id: FrameId,
+    /// When it was taken, in the cameras' clock.
+    pub time: Timestamp,
+    /// Which camera took it.
+    pub camera: CameraId,
+}
+
+/// Pose of the camera at one image.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct FrameState {
+    /// Which image.
+    pub frame_id: FrameId,
+    /// When it was taken.
+    pub time: Timestamp,
+    /// Segment of the track: poses of different segments have no common world frame.
+    pub segment: u32,
+    /// Pose of the camera, m.
+    pub world_from_camera: Se3,
+}
+
+/// A frame that carries geometry.
+#[derive(Clone, Debug)]
+pub struct MapKeyframe {
+    /// The image.
+    pub stamp: FrameStamp,
+    /// Pose of its camera as tracked, m; none where poses are found by the geometry model alone.
+    pub world_from_camera: Option<Se3>,
+    /// The odometry's keyframe of the same image, with its landmarks and covariance.
+    pub odometry: Option<Arc<OdometryKeyframe>>,
+}
+
+/// The step of the method that the engine works on.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Step {
+    /// Metric poses of images.
+    Track,
+    /// Depth of a chunk's keyframes.
+    Predict,
+    /// Placement of chunks in the world.
+    Align,
+    /// Placed depth into one surface.
+    Fuse,
+}
+
+impl Step {
+    /// The step as it is named in manifests.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Track => "track",
+            Self::Predict => "predict",
+            Self::Align => "align",
+            Self::Fuse => "fuse",
+        }
+    }
+}
+
+/// The fused surface.
+#[derive(Clone, Debug, Default)]
+pub struct Surface {
+    /// Surface with triangles.
+    pub mesh: TriangleMesh,
+    /// Surface as points.
+    pub cloud: PointCloud,
+    /// Area, volume and number of observations.
+    pub coverage: CoverageReport,
+    /// Share of the surface that exists twice.
+    pub double_walls: Option<DoubleWallReport>,
+    /// Largest memory of the volume, bytes.
+    pub volume_bytes: u64,
+}
+
+/// One event of the engine's stream. Frames, units: `world_from_camera` in metres (in units of the first chunk in couplings
+/// without metric poses).
+#[derive(Clone, Debug)]
+pub enum MapEvent {
+    /// The engine turned to this step.
+    Step(Step),
+    /// A new world: keyframes, chunks, placements and surface reported before are void. Raised when mapping begins, and when a
+    /// later segment of the track has become longer than the one that was mapped.
+    World {
+        /// Where the metric poses come from; none without metric poses.
+        source: Option<TrajectorySource>,
+        /// The segment that is mapped.
+        segment: u32,
+    },
+    /// The pose of an image.
+    State(FrameState),
+    /// Poses of odometry keyframes, estimated again.
+    RevisedStates(Vec<RevisedPose>),
+    /// A frame was selected as a keyframe.
+    Keyframe(MapKeyframe),
+    /// Depth of a chunk's keyframes was predicted.
+    ChunkPredicted {
+        /// Which chunk.
+        chunk: ChunkId,
+        /// Keyframes whose depth was wanted.
+        keyframes: usize,
+        /// Keyframes that got depth.
+        with_depth: usize,
+        /// Whether an earlier run had predicted it.
+        is_reused: bool,
+    },
+    /// A chunk was aligned.
+    ChunkPlaced(ChunkReport),
+    /// A revisit was measured.
+    LoopMeasured(LoopReport),
+    /// All chunks and keyframes, estimated again.
+    PlacementsRevised {
+        /// Where they are now.
+        placement: Arc<Placement>,
+        /// Whether nothing will move any more.
+        is_final: bool,
+    },
+    /// Keyframes at their final poses, in metres, as they are fused.
+    ViewsFused(Vec<AlignedView>),
+    /// The surface at the present placements.
+    SurfaceChanged {
+        /// The surface. Only the final one has points and coverage.
+        surface: Arc<Surface>,
+        /// Whether it is the map.
+        is_final: bool,
+    },
+    /// Something the user should know.
+    Warning(Warning),
+}

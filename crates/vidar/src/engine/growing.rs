@@ -1,0 +1,106 @@
+//! The surface while the map grows: it follows the graph.
+//!
+//! Each chunk is a volume of its own, placed where the aligner has it now; when a loop moves chunks, their volumes move with
+//! them. Volumes of older chunks are kept outside, so that memory stays flat. The final map is fused from the predictions
+//! at their final poses, each keyframe once.
+
+use super::events::{MapEvent, Surface};
+use super::setup::PredictionStore;
+use crate::config::Config;
+use crate::error::Error;
+use std::collections::BTreeMap;
+use std::sync::Arc;
+use vidar_align::Placement;
+use vidar_core::{AlignedView, ChunkId, FrameId, Se3, Warning};
+use vidar_fusion::{RevisedView, SubVolumeConfig, SubVolumes};
+
+/// Chunks whose volumes are kept in memory.
+const IN_MEMORY: usize = 2;
+
+/// A growing surface.
+pub struct GrowingSurface {
+    config: SubVolumeConfig,
+    volumes: SubVolumes,
+    /// Depth scale that each keyframe was fused with.
+    fused: BTreeMap<FrameId, f64>,
+    /// Chunks in memory, oldest first.
+    in_memory: Vec<ChunkId>,
+}
+
+impl GrowingSurface {
+    /// A surface without chunks.
+    pub fn new(config: &Config) -> Result<Self, Error> {
+        let config = SubVolumeConfig { fusion: config.fusion.clone(), ..SubVolumeConfig::default() };
+        let volumes = SubVolumes::new(&config)?;
+        Ok(Self { config, volumes, fused: BTreeMap::new(), in_memory: Vec::new() })
+    }
+
+    /// Removes every chunk.
+    pub fn reset(&mut self) -> Result<(), Error> {
+        self.volumes = SubVolumes::new(&self.config)?;
+        self.fused.clear();
+        self.in_memory.clear();
+        Ok(())
+    }
+
+    /// Adds a chunk's views and moves the others to where they are now; the surface at these placements.
+    pub fn grow(
+        &mut self,
+        chunk: ChunkId,
+        views: &[AlignedView],
+        placement: &Placement,
+        store: &dyn PredictionStore,
+    ) -> Result<Vec<MapEvent>, Error> {
+        let mut events = Vec::new();
+        for view in views {
+            if self.fused.contains_key(&view.frame_id()) {
+                continue;
+            }
+            match self.volumes.integrate(chunk, view) {
+                Ok(_) => {
+                    let scale = placement.view(view.frame_id()).map_or(1.0, |p| p.metres_per_unit);
+                    self.fused.insert(view.frame_id(), scale);
+                }
+                // The final map reports its own losses; this surface is provisional.
+                Err(error) => {
+                    events.push(MapEvent::Warning(Warning::new("growing-surface", error.to_string())))
+                }
+            }
+        }
+        self.follow(placement)?;
+        self.in_memory.push(chunk);
+        while self.in_memory.len() > IN_MEMORY {
+            let oldest = self.in_memory.remove(0);
+            if self.volumes.chunks().any(|c| c == oldest) {
+                store.keep_volume(oldest, &self.volumes.offload(oldest)?)?;
+            }
+        }
+        let merged = self.volumes.merged_with(|chunk| store.read_volume(chunk))?;
+        let surface = Surface { mesh: merged.extract_mesh(), ..Surface::default() };
+        events.push(MapEvent::SurfaceChanged { surface: Arc::new(surface), is_final: false });
+        Ok(events)
+    }
+
+    /// Moves every chunk with its keyframes.
+    fn follow(&mut self, placement: &Placement) -> Result<(), Error> {
+        let chunks: Vec<ChunkId> = self.volumes.chunks().collect();
+        for chunk in chunks {
+            let moved: Vec<RevisedView> = self
+                .fused
+                .iter()
+                .filter(|(frame, _)| self.volumes.owner(**frame) == Some(chunk))
+                .filter_map(|(frame, scale)| {
+                    let now = placement.view(*frame)?;
+                    let (frame_id, world_from_camera): (FrameId, Se3) = (*frame, now.world_from_camera);
+                    // A frame whose depth comes from another chunk by now still constrains where this one is.
+                    let depth_factor = if now.owner == chunk { now.metres_per_unit / scale } else { 1.0 };
+                    Some(RevisedView { frame_id, world_from_camera, depth_factor })
+                })
+                .collect();
+            if !moved.is_empty() {
+                self.volumes.revise(chunk, &moved)?;
+            }
+        }
+        Ok(())
+    }
+}

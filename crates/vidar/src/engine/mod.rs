@@ -1,0 +1,480 @@
+//! Sensor measurements in, a metric dense map out: the method as one push machine.
+//!
+//! ```text
+//! push(SensorEvent) ─▶ track ─▶ select keyframes ─▶ predict ─▶ align ─┐
+//! finish()          ─────────── the rest of it ───────────────────────┴▶ fuse
+//! ```
+//!
+//! It is the paper's figure of the pipeline (section III-A). Images are tracked to metric poses by visual-inertial odometry
+//! (or looked up in a given trajectory); frames that moved become keyframes; a chunk of keyframes is predicted by the
+//! geometry model as soon as later keyframes no longer change it, and is aligned in the metric world. When the recording
+//! ends, all chunks are placed by one graph and their depth is fused. The engine owns no thread, file or clock; what it needs
+//! from outside it gets as traits ([`EngineSetup`]), and all that it finds out it reports as [`MapEvent`]s. Same input,
+//! same bits. Memory is bounded by one window of keyframes, the aligner's samples and the fusion's budget.
+
+mod cut;
+mod events;
+mod fuse;
+mod growing;
+mod observe;
+mod placed;
+mod predict;
+mod select;
+mod setup;
+mod stereo_landmarks;
+mod track;
+mod views;
+
+pub use cut::ChunkRule;
+pub use events::{FrameStamp, FrameState, MapEvent, MapKeyframe, Step, Surface};
+pub use select::Selection;
+pub use setup::{
+    EngineSetup, GeometrySource, ImageSource, PlaceDescriber, PredictedFrame, Prediction, PredictionId,
+    PredictionStore,
+};
+pub use track::{GivenPoses, OdometryPoses, PoseReport, PoseSource, PosedFrame};
+
+use crate::chunks::StoredChunk;
+use crate::config::Config;
+use crate::error::Error;
+use crate::input::TrajectorySource;
+use fuse::SurfaceFusion;
+use growing::GrowingSurface;
+use observe::Observer;
+use placed::placed_views;
+use predict::Predictor;
+use std::sync::Arc;
+use stereo_landmarks::StereoLandmarks;
+use track::Track;
+use vidar_align::chunking::ChunkSpan;
+use vidar_align::{Aligner, CouplingMode, Placement};
+use vidar_core::{CameraId, ChunkId, Duration, FrameId, SensorEvent, Warning};
+use vidar_fusion::FusionConfig;
+
+/// Where the engine's events go. An error of a reader ends the run.
+pub type Sink<'s> = dyn FnMut(MapEvent) -> Result<(), Error> + 's;
+
+/// The machine.
+pub struct Engine<'a> {
+    name: String,
+    config: &'a Config,
+    camera: CameraId,
+    cancelled: &'a (dyn Fn() -> bool + Sync),
+    poses: Option<Box<dyn PoseSource + 'a>>,
+    fallback: Option<Box<dyn PoseSource + 'a>>,
+    track: Track,
+    /// Images so far, and those of them that may become keyframes.
+    images: usize,
+    candidates: Vec<FrameStamp>,
+    rule: ChunkRule,
+    observer: Observer,
+    predictor: Predictor<'a>,
+    world: Option<World>,
+    growing: Option<GrowingSurface>,
+    volume_budget_bytes: u64,
+    step: Option<Step>,
+}
+
+/// What is mapped of one segment of the track.
+struct World {
+    /// None where there are no metric poses.
+    segment: Option<u32>,
+    /// Keyframes of the odometry that were taken so far.
+    odometry_taken: usize,
+    selection: Selection,
+    keyframes: Vec<MapKeyframe>,
+    frames: Vec<FrameId>,
+    chunks: usize,
+    aligner: Aligner,
+    failures: Vec<String>,
+}
+
+impl<'a> Engine<'a> {
+    /// An engine that has seen nothing.
+    ///
+    /// # Errors
+    /// Settings that a stage refuses.
+    pub fn new(setup: EngineSetup<'a>) -> Result<Self, Error> {
+        let config = setup.config;
+        let overlaps = setup.geometry.overlaps();
+        let rule = chunk_rule(config, overlaps, setup.prescribed);
+        let mut predictor = Predictor::new(
+            setup.geometry,
+            setup.places,
+            (setup.images, setup.store),
+            (&setup.camera, &setup.view),
+            setup.cancelled,
+        );
+        let is_fitted = config.coupling.mode == CouplingMode::Coupled && setup.poses.is_some() && overlaps;
+        if is_fitted && config.coupling.stereo_landmarks {
+            predictor.stereo_landmarks = Some(StereoLandmarks::new(config)?);
+        }
+        Ok(Self {
+            name: setup.name,
+            config,
+            camera: setup.camera_id,
+            cancelled: setup.cancelled,
+            poses: setup.poses,
+            fallback: setup.fallback,
+            track: Track::new(Duration::from_secs_f64(config.input.max_pose_gap_secs)),
+            images: 0,
+            candidates: Vec::new(),
+            rule,
+            observer: Observer::new(&setup.camera, setup.view, overlaps),
+            predictor,
+            world: None,
+            growing: config.output.live_map.then(|| GrowingSurface::new(config)).transpose()?,
+            volume_budget_bytes: setup.volume_budget_bytes,
+            step: None,
+        })
+    }
+
+    /// Whether every measurement must be pushed whole. Otherwise poses are given, and [`Engine::push_stamp`] suffices.
+    pub fn needs_sensors(&self) -> bool {
+        self.poses.as_ref().is_some_and(|p| p.needs_sensors())
+    }
+
+    /// Takes a measurement. Measurements come in the order of time; at equal times the IMU comes first.
+    ///
+    /// # Errors
+    /// What a stage cannot go on with, and what a reader of the events returns.
+    pub fn push(&mut self, event: SensorEvent, sink: &mut Sink<'_>) -> Result<(), Error> {
+        if let SensorEvent::Image(frame) = &event {
+            if frame.camera != self.camera {
+                return Ok(());
+            }
+            self.add_image(FrameStamp { frame_id: frame.id, time: frame.time, camera: frame.camera });
+        }
+        self.enter(Step::Track, sink)?;
+        let reports = self.poses.as_mut().map_or_else(|| Ok(Vec::new()), |p| p.push(event))?;
+        self.advance(reports, false, sink)
+    }
+
+    /// Takes an image without its pixels: poses are given, or the image cannot be read.
+    ///
+    /// # Errors
+    /// As [`Engine::push`].
+    pub fn push_stamp(&mut self, stamp: FrameStamp, sink: &mut Sink<'_>) -> Result<(), Error> {
+        self.add_image(stamp);
+        let reports = self.poses.as_mut().map_or_else(Vec::new, |p| p.push_stamp(&stamp));
+        self.advance(reports, false, sink)
+    }
+
+    /// Maps what is left, places everything once more, and fuses it.
+    ///
+    /// # Errors
+    /// There is no pose, no keyframe or no placed chunk; and as [`Engine::push`].
+    pub fn finish(mut self, sink: &mut Sink<'_>) -> Result<(), Error> {
+        let rest = self.poses.as_mut().map_or_else(Vec::new, |p| p.finish());
+        self.add_reports(rest, sink)?;
+        self.track.finish();
+        self.settle_poses(sink)?;
+        self.advance(Vec::new(), true, sink)?;
+        let placement = self.place(sink)?;
+        self.fuse(&placement, sink)
+    }
+
+    /// The method: track → select keyframes → predict → align.
+    fn advance(
+        &mut self,
+        reports: Vec<PoseReport>,
+        is_complete: bool,
+        sink: &mut Sink<'_>,
+    ) -> Result<(), Error> {
+        self.add_reports(reports, sink)?;
+        if !self.select_keyframes(is_complete, sink)? && !is_complete {
+            return Ok(());
+        }
+        while let Some((id, chunk)) = self.next_chunk(is_complete)? {
+            let Some(prediction) = self.predict(id, &chunk, sink)? else { break };
+            self.align(id, &chunk, prediction, sink)?;
+        }
+        Ok(())
+    }
+
+    fn add_image(&mut self, stamp: FrameStamp) {
+        if self.images % self.config.input.stride.max(1) == 0 {
+            self.candidates.push(stamp);
+            self.track.add_candidate(stamp);
+        }
+        self.images += 1;
+    }
+
+    /// Track: poses of images.
+    fn add_reports(&mut self, reports: Vec<PoseReport>, sink: &mut Sink<'_>) -> Result<(), Error> {
+        for report in reports {
+            if let PoseReport::Posed { revised, .. } = &report {
+                revised.iter().for_each(|r| self.observer.revise(r));
+                if !revised.is_empty() {
+                    sink(MapEvent::RevisedStates(revised.clone()))?;
+                }
+            }
+            if let Some(state) = self.track.add(report) {
+                sink(MapEvent::State(state))?;
+            }
+        }
+        Ok(())
+    }
+
+    /// When the recording has ended without a track, the fallback's poses are used, or none where the coupling needs none.
+    fn settle_poses(&mut self, sink: &mut Sink<'_>) -> Result<(), Error> {
+        let Some(poses) = &self.poses else { return Ok(()) };
+        for warning in poses.warnings() {
+            sink(MapEvent::Warning(warning))?;
+        }
+        if self.track.longest().is_some() || (self.cancelled)() {
+            return Ok(());
+        }
+        let reason = poses.why_no_pose();
+        let is_needed = self.config.coupling.mode.uses_pose_priors();
+        match self.fallback.take() {
+            Some(mut fallback) => {
+                let message =
+                    format!("the odometry gave no metric pose ({reason}): {} is used", fallback.source());
+                let hint = "scores are an upper bound; --set input.poses=odometry fails instead";
+                sink(MapEvent::Warning(Warning::degraded("odometry-not-used", message).hint(hint)))?;
+                self.track = Track::new(Duration::from_secs_f64(self.config.input.max_pose_gap_secs));
+                let candidates = self.candidates.clone();
+                for stamp in &candidates {
+                    self.track.add_candidate(*stamp);
+                    let reports = fallback.push_stamp(stamp);
+                    self.add_reports(reports, sink)?;
+                }
+                self.track.finish();
+                self.poses = Some(fallback);
+                Ok(())
+            }
+            None if is_needed => Err(Error::NoOdometry { name: self.name.clone(), reason }),
+            None => {
+                let message =
+                    format!("the odometry gave no metric pose ({reason}): keyframes are selected by time");
+                sink(MapEvent::Warning(Warning::degraded("odometry-not-used", message)))?;
+                self.poses = None;
+                Ok(())
+            }
+        }
+    }
+
+    /// Select keyframes: those of the longest segment that moved far enough. Whether there are new ones.
+    fn select_keyframes(&mut self, is_complete: bool, sink: &mut Sink<'_>) -> Result<bool, Error> {
+        let segment = match &self.poses {
+            Some(_) => match self.track.longest() {
+                Some(longest) => Some(longest.id),
+                None => return Ok(false),
+            },
+            None => None,
+        };
+        if self.world.as_ref().is_none_or(|w| w.segment != segment) {
+            self.begin_world(segment, sink)?;
+        }
+        let Some(world) = &mut self.world else { return Ok(false) };
+        let selected = match self.track.longest().filter(|_| segment.is_some()) {
+            Some(track) => {
+                for keyframe in &track.odometry[world.odometry_taken..] {
+                    self.observer.add(keyframe.clone());
+                }
+                world.odometry_taken = track.odometry.len();
+                world.selection.among_posed(&track.frames, &self.rule, is_complete)
+            }
+            None => world.selection.among_unposed(&self.candidates, &self.rule, is_complete),
+        };
+        let is_any = !selected.is_empty();
+        for keyframe in selected {
+            world.frames.push(keyframe.stamp.frame_id);
+            world.keyframes.push(keyframe.clone());
+            sink(MapEvent::Keyframe(keyframe))?;
+        }
+        Ok(is_any)
+    }
+
+    /// A map without keyframes of this segment.
+    fn begin_world(&mut self, segment: Option<u32>, sink: &mut Sink<'_>) -> Result<(), Error> {
+        let mode = self.config.coupling.mode;
+        let mut aligner = Aligner::new(mode, &self.config.align)?;
+        if self.predictor.places.is_whitened() {
+            aligner = aligner.with_whitened_descriptors();
+        }
+        // Landmarks matter where chunks have a scale of their own that is to be estimated.
+        let prefers_odometry = mode == CouplingMode::Coupled && self.predictor.geometry.overlaps();
+        self.world = Some(World {
+            segment,
+            odometry_taken: 0,
+            selection: Selection::new(&self.config.keyframes, prefers_odometry),
+            keyframes: Vec::new(),
+            frames: Vec::new(),
+            chunks: 0,
+            aligner,
+            failures: Vec::new(),
+        });
+        self.observer.reset();
+        self.predictor.reset();
+        if let Some(growing) = &mut self.growing {
+            growing.reset()?;
+        }
+        let source: Option<TrajectorySource> = self.poses.as_ref().map(|p| p.source());
+        sink(MapEvent::World { source, segment: segment.unwrap_or(0) })
+    }
+
+    /// The next chunk that later keyframes cannot change.
+    fn next_chunk(&self, is_complete: bool) -> Result<Option<(ChunkId, ChunkSpan)>, Error> {
+        let Some(world) = self.world.as_ref().filter(|_| !(self.cancelled)()) else { return Ok(None) };
+        let chunk = match is_complete {
+            true => self.rule.chunks(&world.frames)?.into_iter().nth(world.chunks),
+            false => self.rule.decided(world.chunks, &world.frames)?.into_iter().next(),
+        };
+        let is_ready = |c: &ChunkSpan| is_complete || self.observer.is_decided(&world.keyframes, c.seen.end);
+        Ok(chunk.filter(is_ready).map(|c| (number(world.chunks), c)))
+    }
+
+    /// Predict: depth of a chunk; `None` when cancelled.
+    fn predict(
+        &mut self,
+        id: ChunkId,
+        chunk: &ChunkSpan,
+        sink: &mut Sink<'_>,
+    ) -> Result<Option<StoredChunk>, Error> {
+        self.enter(Step::Predict, sink)?;
+        let Some(world) = &self.world else { return Ok(None) };
+        let mut events = Vec::new();
+        let prediction = self.predictor.predict(id, chunk, &world.keyframes, &mut events)?;
+        events.into_iter().try_for_each(&mut *sink)?;
+        Ok(prediction)
+    }
+
+    /// Align: the chunk in the metric world, and the loops that it closes.
+    fn align(
+        &mut self,
+        id: ChunkId,
+        chunk: &ChunkSpan,
+        stored: StoredChunk,
+        sink: &mut Sink<'_>,
+    ) -> Result<(), Error> {
+        self.enter(Step::Align, sink)?;
+        let Some(world) = &mut self.world else { return Ok(()) };
+        world.chunks += 1;
+        let mut events = Vec::new();
+        match &stored.failure {
+            Some(reason) => world.failures.push(reason.clone()),
+            None => {
+                let descriptors = self.predictor.places.descriptors(&stored);
+                let keyframes = &world.keyframes;
+                let first = self.observer.first_free_landmark(&keyframes[chunk.seen.clone()]);
+                let prediction = stored.prediction;
+                let by_stereo = self.predictor.landmarks(chunk, keyframes, &prediction, first, &mut events);
+                let observation =
+                    self.observer.observe(keyframes, chunk, prediction, &descriptors, &by_stereo);
+                let report = world.aligner.push(observation)?;
+                if !report.status.is_usable() {
+                    let mut message = format!("not placed: {}", report.status.description());
+                    if report.center_rms_m.is_finite() {
+                        message += &format!(" (RMS distance of camera centres {:.3} m)", report.center_rms_m);
+                    }
+                    world.failures.push(message.clone());
+                    let warning = Warning::degraded("chunk-not-placed", message).at(PredictionId::Chunk(id));
+                    events.push(MapEvent::Warning(warning));
+                }
+                events.push(MapEvent::ChunkPlaced(report));
+            }
+        }
+        let predicts_loops = self.predictor.geometry.predicts_any_views() && self.config.coupling.loop_chunks;
+        for candidate in world.aligner.loop_candidates() {
+            let together = match predicts_loops {
+                true => self.predictor.predict_loop(&candidate, &world.keyframes, &mut events)?,
+                false => None,
+            };
+            events.push(MapEvent::LoopMeasured(world.aligner.push_loop(&candidate, together.as_ref())?));
+        }
+        if let Some(growing) = &mut self.growing {
+            let placement = Arc::new(world.aligner.placement_so_far());
+            let stored = self.predictor.store.read(PredictionId::Chunk(id))?;
+            let grown =
+                growing.grow(id, &placed_views(&placement, stored)?, &placement, self.predictor.store)?;
+            events.push(MapEvent::PlacementsRevised { placement, is_final: false });
+            events.extend(grown);
+        }
+        events.into_iter().try_for_each(&mut *sink)
+    }
+
+    /// Every chunk and keyframe, placed by all that was measured.
+    fn place(&mut self, sink: &mut Sink<'_>) -> Result<Arc<Placement>, Error> {
+        let is_cancelled = (self.cancelled)();
+        let without_pose = self.track.without_pose;
+        if without_pose > 0 && self.poses.is_some() {
+            let message =
+                format!("{without_pose} of {} images have no pose and are skipped", self.candidates.len());
+            let hint = "they lie outside the trajectory, or in a gap longer than input.max_pose_gap_secs";
+            sink(MapEvent::Warning(Warning::new("images-without-pose", message).hint(hint)))?;
+        }
+        let needed = self.predictor.geometry.info().min_views.max(1);
+        let found = self.world.as_ref().map_or(0, |w| w.keyframes.len());
+        if found < needed && !is_cancelled {
+            return Err(Error::TooFewKeyframes { found, needed });
+        }
+        if self.world.is_none() {
+            self.begin_world(None, sink)?;
+        }
+        let world = self.world.take().ok_or(Error::TooFewKeyframes { found, needed })?;
+        self.enter(Step::Align, sink)?;
+        let placement = Arc::new(world.aligner.finish());
+        if placement.views.is_empty() && !is_cancelled {
+            let reason = world.failures.last().cloned();
+            let reason = reason.unwrap_or_else(|| "no keyframe image could be read".into());
+            return Err(Error::Empty { keyframes: found, reason });
+        }
+        sink(MapEvent::PlacementsRevised { placement: placement.clone(), is_final: true })?;
+        Ok(placement)
+    }
+
+    /// Fuse: every placed chunk's own keyframes into one surface.
+    fn fuse(&mut self, placement: &Placement, sink: &mut Sink<'_>) -> Result<(), Error> {
+        self.enter(Step::Fuse, sink)?;
+        let fusion =
+            FusionConfig { memory_budget_bytes: self.volume_budget_bytes, ..self.config.fusion.clone() };
+        let mut surface = SurfaceFusion::new(&fusion)?;
+        // Asked to stop while predicting, what was predicted is fused; asked to stop now, fusing stops.
+        let was_cancelled = (self.cancelled)();
+        for chunk in &placement.chunks {
+            if (self.cancelled)() && !was_cancelled {
+                break;
+            }
+            if !placement.views.iter().any(|v| v.owner == chunk.chunk_id) {
+                continue;
+            }
+            let stored = self.predictor.store.read(PredictionId::Chunk(chunk.chunk_id))?;
+            let views = placed_views(placement, stored)?;
+            surface.fuse(&views).into_iter().try_for_each(&mut *sink)?;
+            sink(MapEvent::ViewsFused(views))?;
+        }
+        let (surface, warnings) = surface.finish();
+        for warning in warnings {
+            sink(MapEvent::Warning(warning))?;
+        }
+        sink(MapEvent::SurfaceChanged { surface: Arc::new(surface), is_final: true })
+    }
+
+    fn enter(&mut self, step: Step, sink: &mut Sink<'_>) -> Result<(), Error> {
+        match self.step.replace(step) == Some(step) {
+            true => Ok(()),
+            false => sink(MapEvent::Step(step)),
+        }
+    }
+}
+
+/// How keyframes are cut into chunks: as a recording prescribes, overlapping for models that find poses, with context for
+/// stereo.
+pub fn chunk_rule(config: &Config, overlaps: bool, prescribed: Option<Vec<Vec<FrameId>>>) -> ChunkRule {
+    let geometry = &config.geometry;
+    let size = geometry.chunk_keyframes;
+    match (prescribed, overlaps) {
+        (Some(chunks), _) => ChunkRule::Prescribed(chunks),
+        (None, true) => ChunkRule::Overlapping { size, overlap: geometry.overlap_keyframes },
+        (None, false) => ChunkRule::WithContext { size, context: geometry.context_keyframes },
+    }
+}
+
+fn number(chunk: usize) -> ChunkId {
+    ChunkId(u32::try_from(chunk).unwrap_or(u32::MAX))
+}
+
+#[cfg(test)]
+mod tests;

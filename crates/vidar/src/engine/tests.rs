@@ -1,0 +1,332 @@
+//! The engine on a wall: a geometry model that is right, and sources that fail.
+
+use super::*;
+use crate::chunks::StoredChunk;
+use crate::input::MetricTrajectory;
+use nalgebra::Vector3;
+use std::cell::RefCell;
+use std::collections::BTreeMap;
+use vidar_core::model::ChunkFrame;
+use vidar_core::{
+    BodyFrame, CameraModel, ChunkViews, Confidence, FrameImage, GeometryPrediction, Image, ModelError,
+    ModelInfo, Pinhole, RelativeDepth, RigCamera, Se3, Severity, StampedPose, Timestamp, Trajectory,
+    ViewGeometry,
+};
+
+const FRAMES: u32 = 40;
+
+fn pinhole() -> Pinhole {
+    Pinhole::new(40.0, 40.0, 31.5, 23.5, 64, 48).unwrap()
+}
+
+fn stamp(i: u32) -> FrameStamp {
+    let time = Timestamp::from_nanos(i64::from(i) * 100_000_000);
+    FrameStamp { frame_id: FrameId(i), time, camera: CameraId(0) }
+}
+
+fn pose(i: u32) -> Se3 {
+    Se3::from_translation(Vector3::new(f64::from(i) * 0.06, 0.0, 0.0))
+}
+
+/// A wall 2 m in front of the camera; predictions of the chunks in `failing` fail.
+struct Wall {
+    info: ModelInfo,
+    failing: Vec<u32>,
+}
+
+impl Wall {
+    fn new(failing: &[u32]) -> Self {
+        let info = ModelInfo {
+            name: "wall".into(),
+            licence: "none".into(),
+            weights_sha256: None,
+            needs_poses: true,
+            min_views: 2,
+        };
+        Self { info, failing: failing.to_vec() }
+    }
+}
+
+impl GeometrySource for Wall {
+    fn info(&self) -> &ModelInfo {
+        &self.info
+    }
+
+    fn overlaps(&self) -> bool {
+        false
+    }
+
+    fn predicts_any_views(&self) -> bool {
+        false
+    }
+
+    fn predict(
+        &mut self,
+        views: &ChunkViews,
+        wanted: std::ops::Range<usize>,
+        _: &(dyn Fn() -> bool + Sync),
+    ) -> Result<Prediction, ModelError> {
+        if self.failing.contains(&views.id.0) {
+            return Err(ModelError::Other("out of order".into()));
+        }
+        let view = |v: &vidar_core::ChunkView| ViewGeometry {
+            frame_id: v.frame_id,
+            chunk_from_camera: v.world_from_camera.unwrap(),
+            intrinsics: pinhole(),
+            depth: RelativeDepth::new(Image::filled(64, 48, 2.0)),
+            confidence: Confidence::full(64, 48),
+        };
+        let views = GeometryPrediction {
+            chunk_id: views.id,
+            frame: ChunkFrame::PriorWorld,
+            views: views.views[wanted].iter().map(view).collect(),
+        };
+        Ok(Prediction { geometry: views, colors: Vec::new(), tokens: Vec::new() })
+    }
+}
+
+struct NoPlaces;
+
+impl PlaceDescriber for NoPlaces {
+    fn is_whitened(&self) -> bool {
+        false
+    }
+
+    fn describe(&self, _: &mut StoredChunk, _: &[Vec<f32>]) -> Result<(), Error> {
+        Ok(())
+    }
+
+    fn descriptors(&self, _: &StoredChunk) -> Vec<Vec<f32>> {
+        Vec::new()
+    }
+}
+
+struct GrayImages;
+
+impl ImageSource for GrayImages {
+    fn image(&self, _: &FrameStamp) -> Result<FrameImage, Warning> {
+        Ok(FrameImage::Gray8(Image::filled(64, 48, 128)))
+    }
+}
+
+#[derive(Default)]
+struct MemoryStore(RefCell<BTreeMap<PredictionId, StoredChunk>>);
+
+impl PredictionStore for MemoryStore {
+    fn find(&self, _: PredictionId, _: &[PredictedFrame]) -> Option<StoredChunk> {
+        None
+    }
+
+    fn keep(
+        &self,
+        id: PredictionId,
+        _: &[PredictedFrame],
+        chunk: &StoredChunk,
+    ) -> Result<StoredChunk, Error> {
+        self.0.borrow_mut().insert(id, chunk.clone());
+        Ok(chunk.clone())
+    }
+
+    fn read(&self, id: PredictionId) -> Result<StoredChunk, Error> {
+        let missing = || Error::BadValue { reason: format!("no {id}") };
+        self.0.borrow().get(&id).cloned().ok_or_else(missing)
+    }
+
+    fn keep_volume(&self, _: ChunkId, _: &[u8]) -> Result<(), Error> {
+        Ok(())
+    }
+
+    fn read_volume(&self, chunk: ChunkId) -> Result<Vec<u8>, Error> {
+        Err(Error::BadValue { reason: format!("no volume {chunk}") })
+    }
+}
+
+/// Poses by a function of the frame's number: segment and pose.
+struct Scripted(fn(u32) -> Option<u32>);
+
+impl PoseSource for Scripted {
+    fn source(&self) -> TrajectorySource {
+        TrajectorySource::Odometry
+    }
+
+    fn needs_sensors(&self) -> bool {
+        false
+    }
+
+    fn push(&mut self, _: SensorEvent) -> Result<Vec<PoseReport>, Error> {
+        Ok(Vec::new())
+    }
+
+    fn push_stamp(&mut self, stamp: &FrameStamp) -> Vec<PoseReport> {
+        let FrameStamp { frame_id, time, .. } = *stamp;
+        vec![match (self.0)(frame_id.0) {
+            Some(segment) => PoseReport::Posed {
+                state: FrameState { frame_id, time, segment, world_from_camera: pose(frame_id.0) },
+                keyframe: None,
+                revised: Vec::new(),
+            },
+            None => PoseReport::NotPosed { time },
+        }]
+    }
+
+    fn finish(&mut self) -> Vec<PoseReport> {
+        Vec::new()
+    }
+
+    fn warnings(&self) -> Vec<Warning> {
+        Vec::new()
+    }
+
+    fn why_no_pose(&self) -> String {
+        "no parallax".into()
+    }
+}
+
+fn truth() -> GivenPoses {
+    let poses = (0..FRAMES).map(|i| StampedPose { time: stamp(i).time, world_from_body: pose(i) }).collect();
+    let camera_trajectory = Trajectory::new(BodyFrame::Camera(CameraId(0)), poses).unwrap();
+    let trajectory = MetricTrajectory { source: TrajectorySource::GroundTruth, camera_trajectory };
+    GivenPoses::new(trajectory, Duration::ZERO, Duration::from_millis(500))
+}
+
+/// Events of a run, and how many of them came before the recording ended.
+fn run(
+    poses: Box<dyn PoseSource>,
+    fallback: Option<Box<dyn PoseSource>>,
+    geometry: &mut Wall,
+) -> (Result<(), Error>, Vec<MapEvent>, usize) {
+    let mut config = Config::default();
+    config.geometry.chunk_keyframes = 6;
+    config.geometry.context_keyframes = 2;
+    config.fusion.voxel_size_m = 0.1;
+    let (store, model) = (MemoryStore::default(), CameraModel::Pinhole(pinhole()));
+    let camera =
+        RigCamera { model, body_from_camera: Se3::IDENTITY, time_offset: Duration::ZERO, rate_hz: None };
+    let mut engine = Engine::new(EngineSetup {
+        name: "wall".into(),
+        config: &config,
+        camera_id: CameraId(0),
+        camera,
+        view: pinhole(),
+        poses: Some(poses),
+        fallback,
+        prescribed: None,
+        geometry,
+        places: &NoPlaces,
+        images: &GrayImages,
+        store: &store,
+        volume_budget_bytes: 1 << 28,
+        cancelled: &|| false,
+    })
+    .unwrap();
+    let mut events = Vec::new();
+    for i in 0..FRAMES {
+        engine
+            .push_stamp(stamp(i), &mut |e| {
+                events.push(e);
+                Ok(())
+            })
+            .unwrap();
+    }
+    let during = events.len();
+    let ended = engine.finish(&mut |e| {
+        events.push(e);
+        Ok(())
+    });
+    (ended, events, during)
+}
+
+fn placed(events: &[MapEvent]) -> Vec<u32> {
+    let chunk = |e: &MapEvent| match e {
+        MapEvent::ChunkPlaced(report) => Some(report.chunk_id.0),
+        _ => None,
+    };
+    events.iter().filter_map(chunk).collect()
+}
+
+fn degradations(events: &[MapEvent]) -> Vec<String> {
+    let kind = |e: &MapEvent| match e {
+        MapEvent::Warning(w) if w.severity == Severity::Degraded => Some(w.kind.clone()),
+        _ => None,
+    };
+    events.iter().filter_map(kind).collect()
+}
+
+fn surface(events: &[MapEvent]) -> &Surface {
+    match events.last() {
+        Some(MapEvent::SurfaceChanged { surface, is_final: true }) => surface,
+        other => panic!("the last event is {other:?}"),
+    }
+}
+
+#[test]
+fn chunks_are_placed_while_the_recording_goes_on_and_the_surface_is_the_wall() {
+    let (ended, events, during) = run(Box::new(truth()), None, &mut Wall::new(&[]));
+    ended.unwrap();
+    assert_eq!(placed(&events), (0..7).collect::<Vec<_>>());
+    // The last chunk is short, and the one before it waits for its context.
+    assert_eq!(placed(&events[..during]).len(), 6);
+    let keyframes = events.iter().filter(|e| matches!(e, MapEvent::Keyframe(_))).count();
+    let states = events.iter().filter(|e| matches!(e, MapEvent::State(_))).count();
+    assert_eq!((keyframes, states), (FRAMES as usize, FRAMES as usize));
+    assert!(degradations(&events).is_empty());
+    let surface = surface(&events);
+    assert!(surface.mesh.triangles.len() > 500, "{}", surface.mesh.triangles.len());
+    assert!(surface.mesh.positions.iter().all(|p| (p[2] - 2.0).abs() < 0.05));
+}
+
+#[test]
+fn a_later_segment_that_grows_longer_takes_the_map_over() {
+    let two = |i: u32| match i {
+        0..12 => Some(0),
+        12 => None,
+        _ => Some(1),
+    };
+    let (ended, events, _) = run(Box::new(Scripted(two)), None, &mut Wall::new(&[]));
+    ended.unwrap();
+    let worlds: Vec<usize> =
+        (0..events.len()).filter(|i| matches!(events[*i], MapEvent::World { .. })).collect();
+    assert_eq!(worlds.len(), 2);
+    assert!(!placed(&events[..worlds[1]]).is_empty(), "the first segment was mapped as it came");
+    let frames = |e: &MapEvent| match e {
+        MapEvent::Keyframe(k) => Some(k.stamp.frame_id.0),
+        _ => None,
+    };
+    let last: Vec<u32> = events[worlds[1]..].iter().filter_map(frames).collect();
+    assert_eq!(last, (13..FRAMES).collect::<Vec<_>>());
+    let fused: Vec<u32> = events
+        .iter()
+        .flat_map(|e| match e {
+            MapEvent::ViewsFused(views) => views.iter().map(|v| v.frame_id().0).collect(),
+            _ => Vec::new(),
+        })
+        .collect();
+    assert_eq!(fused, last);
+}
+
+#[test]
+fn a_chunk_that_could_not_be_predicted_degrades_the_map_and_the_others_are_fused() {
+    let (ended, events, _) = run(Box::new(truth()), None, &mut Wall::new(&[1]));
+    ended.unwrap();
+    assert_eq!(degradations(&events), ["chunk-failed"]);
+    assert_eq!(placed(&events), [0, 2, 3, 4, 5, 6]);
+    assert!(surface(&events).mesh.triangles.len() > 300);
+}
+
+#[test]
+fn ground_truth_in_place_of_failed_odometry_is_a_degradation_and_without_it_an_error() {
+    let nothing = || Box::new(Scripted(|_| None));
+    let (ended, events, during) = run(nothing(), Some(Box::new(truth())), &mut Wall::new(&[]));
+    ended.unwrap();
+    assert_eq!(degradations(&events), ["odometry-not-used"]);
+    assert!(placed(&events[..during]).is_empty());
+    assert_eq!(placed(&events).len(), 7);
+    let source = events.iter().find_map(|e| match e {
+        MapEvent::World { source, .. } => source.clone(),
+        _ => None,
+    });
+    assert_eq!(source, Some(TrajectorySource::GroundTruth));
+    let (ended, _, _) = run(nothing(), None, &mut Wall::new(&[]));
+    let error = ended.unwrap_err().to_string();
+    assert!(error.contains("no parallax"), "{error}");
+}

@@ -1,0 +1,384 @@
+//! Track: every image gets a metric pose, by visual-inertial odometry or from a given trajectory.
+
+use super::events::{FrameStamp, FrameState};
+use crate::error::Error;
+use crate::input::{MetricTrajectory, TrajectorySource};
+use std::collections::{BTreeMap, VecDeque};
+use std::sync::Arc;
+use vidar_core::{
+    CameraId, Duration, LieGroup, OdometryKeyframe, RevisedPose, Rig, Se3, SensorEvent, Timestamp, Warning,
+};
+use vidar_odometry::{ImuUse, Odometry, OdometryConfig, OdometryOutput, Status};
+
+/// What a pose source reports of one image. Images are reported in the order of time; one may be left out.
+#[derive(Clone, Debug)]
+pub enum PoseReport {
+    /// The image has a pose.
+    Posed {
+        /// The pose.
+        state: FrameState,
+        /// The keyframe that the image became in the odometry, if it did.
+        keyframe: Option<Box<OdometryKeyframe>>,
+        /// Earlier keyframes whose poses were estimated again.
+        revised: Vec<RevisedPose>,
+    },
+    /// The image has none.
+    NotPosed {
+        /// When it was taken.
+        time: Timestamp,
+    },
+}
+
+/// Where the poses of images come from.
+pub trait PoseSource {
+    /// What it is.
+    fn source(&self) -> TrajectorySource;
+    /// Whether it works on pixels and IMU samples, so that every event must be pushed whole.
+    fn needs_sensors(&self) -> bool;
+    /// Takes a sensor measurement; reports the images whose poses it decides.
+    ///
+    /// # Errors
+    /// The measurement does not fit the calibration.
+    fn push(&mut self, event: SensorEvent) -> Result<Vec<PoseReport>, Error>;
+    /// Takes an image of which only the time is known.
+    fn push_stamp(&mut self, stamp: &FrameStamp) -> Vec<PoseReport>;
+    /// Reports the images that still waited.
+    fn finish(&mut self) -> Vec<PoseReport>;
+    /// What there is to report at the end.
+    fn warnings(&self) -> Vec<Warning>;
+    /// Why there are no metric poses.
+    fn why_no_pose(&self) -> String;
+}
+
+/// Poses of a trajectory that was given: external, or ground truth.
+pub struct GivenPoses {
+    trajectory: MetricTrajectory,
+    /// The trajectory's clock is the IMU's: `t_imu = t_camera + offset`.
+    camera_to_imu: Duration,
+    max_gap: Duration,
+}
+
+impl GivenPoses {
+    /// Poses of `trajectory`, interpolated across gaps of at most `max_gap`.
+    pub fn new(trajectory: MetricTrajectory, camera_to_imu: Duration, max_gap: Duration) -> Self {
+        Self { trajectory, camera_to_imu, max_gap }
+    }
+
+    /// The camera's pose when an image was taken.
+    pub fn pose_at(&self, time: Timestamp) -> Option<Se3> {
+        self.trajectory.camera_trajectory.interpolate(time + self.camera_to_imu, self.max_gap)
+    }
+}
+
+impl PoseSource for GivenPoses {
+    fn source(&self) -> TrajectorySource {
+        self.trajectory.source.clone()
+    }
+
+    fn needs_sensors(&self) -> bool {
+        false
+    }
+
+    fn push(&mut self, event: SensorEvent) -> Result<Vec<PoseReport>, Error> {
+        Ok(match event {
+            SensorEvent::Image(frame) => {
+                let stamp = FrameStamp { frame_id: frame.id, time: frame.time, camera: frame.camera };
+                self.push_stamp(&stamp)
+            }
+            _ => Vec::new(),
+        })
+    }
+
+    fn push_stamp(&mut self, stamp: &FrameStamp) -> Vec<PoseReport> {
+        let FrameStamp { frame_id, time, .. } = *stamp;
+        vec![match self.pose_at(time) {
+            Some(world_from_camera) => PoseReport::Posed {
+                state: FrameState { frame_id, time, segment: 0, world_from_camera },
+                keyframe: None,
+                revised: Vec::new(),
+            },
+            None => PoseReport::NotPosed { time },
+        }]
+    }
+
+    fn finish(&mut self) -> Vec<PoseReport> {
+        Vec::new()
+    }
+
+    fn warnings(&self) -> Vec<Warning> {
+        Vec::new()
+    }
+
+    fn why_no_pose(&self) -> String {
+        "no image was taken within the given trajectory".into()
+    }
+}
+
+/// Poses of the recording's own camera and IMU.
+pub struct OdometryPoses {
+    odometry: Odometry,
+    body_from_camera: Se3,
+    is_metric: bool,
+    has_state: bool,
+    /// Times and reasons of losses.
+    lost: Vec<(Timestamp, String)>,
+    waiting_for: Option<String>,
+}
+
+impl OdometryPoses {
+    /// Odometry of one camera of the rig.
+    ///
+    /// # Errors
+    /// Settings or calibration that the odometry refuses.
+    pub fn new(rig: &Rig, camera: CameraId, config: &OdometryConfig) -> Result<Self, Error> {
+        let odometry = Odometry::new(rig, camera, config)?;
+        let body_from_camera = rig.camera(camera).map_or(Se3::IDENTITY, |c| c.body_from_camera);
+        let is_metric = config.imu != ImuUse::Off && rig.imu.is_some();
+        Ok(Self {
+            odometry,
+            body_from_camera,
+            is_metric,
+            has_state: false,
+            lost: Vec::new(),
+            waiting_for: None,
+        })
+    }
+
+    fn report(&mut self, output: OdometryOutput) -> PoseReport {
+        let (frame_id, time) = (output.frame_id, output.time);
+        match output.status {
+            Status::Tracking(tracking) if self.is_metric => {
+                self.has_state = true;
+                let world_from_camera = tracking.state.world_from_body * self.body_from_camera;
+                let state = FrameState { frame_id, time, segment: tracking.segment, world_from_camera };
+                PoseReport::Posed { state, keyframe: tracking.keyframe, revised: tracking.revised }
+            }
+            Status::Tracking(_) => PoseReport::NotPosed { time },
+            Status::Lost(reason) => {
+                self.lost.push((time, reason.to_string()));
+                PoseReport::NotPosed { time }
+            }
+            Status::Waiting(reason) => {
+                self.waiting_for = Some(reason.to_string());
+                PoseReport::NotPosed { time }
+            }
+        }
+    }
+}
+
+impl PoseSource for OdometryPoses {
+    fn source(&self) -> TrajectorySource {
+        TrajectorySource::Odometry
+    }
+
+    fn needs_sensors(&self) -> bool {
+        true
+    }
+
+    fn push(&mut self, event: SensorEvent) -> Result<Vec<PoseReport>, Error> {
+        let output = self.odometry.push(event)?;
+        Ok(output.map(|o| self.report(o)).into_iter().collect())
+    }
+
+    fn push_stamp(&mut self, _: &FrameStamp) -> Vec<PoseReport> {
+        Vec::new()
+    }
+
+    fn finish(&mut self) -> Vec<PoseReport> {
+        self.odometry.finish().into_iter().map(|o| self.report(o)).collect()
+    }
+
+    fn warnings(&self) -> Vec<Warning> {
+        let hint = "only the longest segment is mapped; `vidar odometry` writes every image's state";
+        let lost = |(time, reason): &(Timestamp, String)| {
+            Warning::degraded("track-lost", format!("at {time} s: {reason}")).hint(hint)
+        };
+        self.lost.iter().map(lost).collect()
+    }
+
+    fn why_no_pose(&self) -> String {
+        match (&self.waiting_for, self.is_metric) {
+            (_, false) => {
+                "odometry.imu is \"off\", or the recording has no IMU: lengths are not metres".into()
+            }
+            _ if self.has_state => "it lost track after one image".into(),
+            (Some(reason), _) => reason.clone(),
+            (None, _) => "it got no image".into(),
+        }
+    }
+}
+
+/// A frame with its metric pose.
+#[derive(Clone, Debug)]
+pub struct PosedFrame {
+    /// The image.
+    pub stamp: FrameStamp,
+    /// Pose of its camera, m.
+    pub world_from_camera: Se3,
+    /// The odometry's keyframe of the image, if it is one.
+    pub odometry: Option<Arc<OdometryKeyframe>>,
+}
+
+/// A span of images whose poses share one world.
+#[derive(Debug)]
+pub struct Segment {
+    /// Its number.
+    pub id: u32,
+    /// Images with a pose of their own.
+    pub images: usize,
+    /// Candidates for keyframes, in the order of time.
+    pub frames: Vec<PosedFrame>,
+    /// Every keyframe of the odometry, in the order of time.
+    pub odometry: Vec<Arc<OdometryKeyframe>>,
+    last: Option<(Timestamp, Se3)>,
+}
+
+/// The poses of all images so far, by segment.
+#[derive(Debug, Default)]
+pub struct Track {
+    /// Candidates whose pose is not decided yet.
+    waiting: VecDeque<FrameStamp>,
+    segments: BTreeMap<u32, Segment>,
+    max_gap: Duration,
+    /// Candidates without a pose.
+    pub without_pose: usize,
+}
+
+impl Track {
+    /// No image yet. An image that the odometry could not use gets a pose between two others at most `max_gap` apart.
+    pub fn new(max_gap: Duration) -> Self {
+        Self { max_gap, ..Self::default() }
+    }
+
+    /// An image that may become a keyframe.
+    pub fn add_candidate(&mut self, stamp: FrameStamp) {
+        self.waiting.push_back(stamp);
+    }
+
+    /// Takes a report; candidates up to its time get their poses.
+    pub fn add(&mut self, report: PoseReport) -> Option<FrameState> {
+        match report {
+            PoseReport::NotPosed { time } => {
+                while self.waiting.front().is_some_and(|w| w.time <= time) {
+                    self.waiting.pop_front();
+                    self.without_pose += 1;
+                }
+                None
+            }
+            PoseReport::Posed { state, keyframe, .. } => {
+                self.add_pose(state, keyframe.map(|k| Arc::new(*k)));
+                Some(state)
+            }
+        }
+    }
+
+    fn add_pose(&mut self, state: FrameState, keyframe: Option<Arc<OdometryKeyframe>>) {
+        let FrameState { frame_id, time, segment, world_from_camera } = state;
+        let segment = self.segments.entry(segment).or_insert_with(|| Segment {
+            id: segment,
+            images: 0,
+            frames: Vec::new(),
+            odometry: Vec::new(),
+            last: None,
+        });
+        segment.images += 1;
+        segment.odometry.extend(keyframe.clone());
+        while let Some(stamp) = self.waiting.front().copied().filter(|w| w.time <= time) {
+            self.waiting.pop_front();
+            let is_this = stamp.frame_id == frame_id;
+            let pose = match is_this {
+                true => Some(world_from_camera),
+                false => between(segment.last, (time, world_from_camera), stamp.time, self.max_gap),
+            };
+            match pose {
+                Some(world_from_camera) => segment.frames.push(PosedFrame {
+                    stamp,
+                    world_from_camera,
+                    odometry: keyframe.clone().filter(|_| is_this),
+                }),
+                None => self.without_pose += 1,
+            }
+        }
+        segment.last = Some((time, world_from_camera));
+    }
+
+    /// No further report will come.
+    pub fn finish(&mut self) {
+        self.without_pose += self.waiting.len();
+        self.waiting.clear();
+    }
+
+    /// The segment with the most images, the first of equally long ones; none below two images.
+    pub fn longest(&self) -> Option<&Segment> {
+        let longest = self.segments.values().max_by_key(|s| (s.images, std::cmp::Reverse(s.id)));
+        longest.filter(|s| s.images >= 2)
+    }
+}
+
+/// The pose between two others, if they are close enough in time.
+fn between(
+    before: Option<(Timestamp, Se3)>,
+    after: (Timestamp, Se3),
+    time: Timestamp,
+    max_gap: Duration,
+) -> Option<Se3> {
+    let (start, from) = before?;
+    let span = after.0 - start;
+    if span > max_gap || span <= Duration::ZERO || time < start {
+        return None;
+    }
+    Some(from.interpolate(&after.1, (time - start).nanos() as f64 / span.nanos() as f64))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use nalgebra::Vector3;
+    use vidar_core::FrameId;
+
+    fn stamp(i: u32) -> FrameStamp {
+        let time = Timestamp::from_nanos(i64::from(i) * 100_000_000);
+        FrameStamp { frame_id: FrameId(i), time, camera: CameraId(0) }
+    }
+
+    fn posed(i: u32, segment: u32) -> PoseReport {
+        let FrameStamp { frame_id, time, .. } = stamp(i);
+        let world_from_camera = Se3::from_translation(Vector3::new(f64::from(i), 0.0, 0.0));
+        let state = FrameState { frame_id, time, segment, world_from_camera };
+        PoseReport::Posed { state, keyframe: None, revised: Vec::new() }
+    }
+
+    #[test]
+    fn the_longest_segment_is_the_track_and_the_first_of_two_equal_ones() {
+        let mut track = Track::new(Duration::from_millis(500));
+        (0..10).for_each(|i| track.add_candidate(stamp(i)));
+        assert!(track.longest().is_none());
+        for i in 0..4 {
+            track.add(posed(i, 0));
+        }
+        track.add(PoseReport::NotPosed { time: stamp(4).time });
+        for i in 5..9 {
+            track.add(posed(i, 1));
+        }
+        assert_eq!(track.longest().unwrap().id, 0);
+        track.add(posed(9, 1));
+        let longest = track.longest().unwrap();
+        let ids: Vec<u32> = longest.frames.iter().map(|f| f.stamp.frame_id.0).collect();
+        assert_eq!((longest.id, ids, track.without_pose), (1, vec![5, 6, 7, 8, 9], 1));
+    }
+
+    #[test]
+    fn an_image_that_the_source_left_out_gets_the_pose_between_its_neighbours_unless_the_gap_is_long() {
+        let mut track = Track::new(Duration::from_millis(250));
+        (0..8).for_each(|i| track.add_candidate(stamp(i)));
+        for i in [0, 1, 3, 7] {
+            track.add(posed(i, 0));
+        }
+        track.finish();
+        let x: Vec<f64> =
+            track.longest().unwrap().frames.iter().map(|f| f.world_from_camera.translation.x).collect();
+        assert_eq!(x.len(), 5);
+        assert!((x[2] - 2.0).abs() < 1e-9 && x[4] == 7.0, "{x:?}");
+        assert_eq!(track.without_pose, 3);
+    }
+}

@@ -1,0 +1,70 @@
+//! Keyframes as the model sees them: read, undistorted, with their prior pose.
+
+use super::events::{MapEvent, MapKeyframe};
+use super::setup::ImageSource;
+use rayon::prelude::*;
+use std::ops::Range;
+use vidar_core::remap::RemapTable;
+use vidar_core::{CameraModel, ChunkView, Pinhole, Warning};
+
+/// A window of undistorted keyframes that moves forward through the sequence; each image is read once.
+pub struct ViewWindow<'a> {
+    images: &'a dyn ImageSource,
+    remap: RemapTable,
+    /// Keyframe index with its view, ascending. Unreadable images are missing.
+    views: Vec<(usize, ChunkView)>,
+    next: usize,
+}
+
+impl<'a> ViewWindow<'a> {
+    /// An empty window before the first keyframe.
+    pub fn new(images: &'a dyn ImageSource, camera: &CameraModel, view: &Pinhole) -> Self {
+        Self { images, remap: RemapTable::new(camera, view), views: Vec::new(), next: 0 }
+    }
+
+    /// Moves back before the first keyframe.
+    pub fn reset(&mut self) {
+        self.views.clear();
+        self.next = 0;
+    }
+
+    /// Moves the window to the keyframes `seen`, reading what is new. Unreadable images are reported and left out.
+    pub fn advance(&mut self, keyframes: &[MapKeyframe], seen: &Range<usize>, report: &mut Vec<MapEvent>) {
+        self.views.retain(|(index, _)| seen.contains(index));
+        let fresh: Vec<usize> = (self.next.max(seen.start)..seen.end).collect();
+        let loaded: Vec<_> = fresh.par_iter().map(|&index| (index, self.load(&keyframes[index]))).collect();
+        for (index, result) in loaded {
+            match result {
+                Ok(view) => self.views.push((index, view)),
+                Err(warning) => report.push(MapEvent::Warning(warning)),
+            }
+        }
+        self.next = self.next.max(seen.end);
+    }
+
+    /// Hands the views out, with the span of those that lie in `wanted`, and their indices for [`ViewWindow::put_back`].
+    pub fn take(&mut self, wanted: &Range<usize>) -> (Vec<ChunkView>, Range<usize>, Vec<usize>) {
+        let (indices, views): (Vec<usize>, Vec<ChunkView>) =
+            std::mem::take(&mut self.views).into_iter().unzip();
+        let start = indices.partition_point(|&i| i < wanted.start);
+        let end = indices.partition_point(|&i| i < wanted.end);
+        (views, start..end, indices)
+    }
+
+    /// Takes the views back.
+    pub fn put_back(&mut self, views: Vec<ChunkView>, indices: Vec<usize>) {
+        self.views = indices.into_iter().zip(views).collect();
+    }
+
+    /// Reads one keyframe.
+    pub fn load(&self, keyframe: &MapKeyframe) -> Result<ChunkView, Warning> {
+        let image = self.images.image(&keyframe.stamp)?;
+        Ok(ChunkView {
+            frame_id: keyframe.stamp.frame_id,
+            time: keyframe.stamp.time,
+            image: self.remap.apply(&image),
+            intrinsics: *self.remap.target(),
+            world_from_camera: keyframe.world_from_camera,
+        })
+    }
+}

@@ -1,0 +1,124 @@
+//! The map of a run, collected from the engine's events.
+
+use super::evaluate::DepthScorer;
+use crate::engine::{FrameState, MapEvent, MapKeyframe, Surface};
+use crate::error::Error;
+use crate::input::{MetricTrajectory, PosePlan, TrajectorySource};
+use crate::run_folder::StoredView;
+use std::collections::BTreeMap;
+use std::sync::Arc;
+use vidar_align::Placement;
+use vidar_core::{BodyFrame, CameraId, StampedPose, Trajectory};
+use vidar_dataset::Dataset;
+
+/// The fused world.
+#[derive(Debug, Default)]
+pub struct MetricMap {
+    /// The metric trajectory by which chunks were placed; none where there are no metric poses.
+    pub trajectory: Option<MetricTrajectory>,
+    /// The frames that carry geometry.
+    pub keyframes: Vec<MapKeyframe>,
+    /// Poses of chunks and keyframes, with their uncertainty.
+    pub placement: Option<Arc<Placement>>,
+    /// The surface.
+    pub surface: Arc<Surface>,
+    /// Keyframes that got depth.
+    pub views: Vec<StoredView>,
+    /// Depth against the depth sensor, where there is one.
+    pub depth_scores: DepthScorer,
+}
+
+impl MetricMap {
+    /// Where metric poses came from, in words.
+    pub fn poses(&self) -> String {
+        let source = self.trajectory.as_ref().map(|t| t.source.to_string());
+        source.unwrap_or_else(|| "none: lengths are not metres".to_owned())
+    }
+
+    /// Where metric poses came from; null where there are none.
+    pub fn poses_json(&self) -> serde_json::Value {
+        serde_json::json!(self.trajectory.as_ref().map(|t| &t.source))
+    }
+
+    /// Whether the metric poses are ground truth.
+    pub fn uses_ground_truth(&self) -> bool {
+        self.trajectory.as_ref().is_some_and(|t| t.source == TrajectorySource::GroundTruth)
+    }
+
+    /// The keyframes' poses in the map as a trajectory of the camera.
+    pub fn keyframe_trajectory(&self) -> Option<Trajectory> {
+        let stamps: BTreeMap<_, _> = self.keyframes.iter().map(|k| (k.stamp.frame_id, k.stamp)).collect();
+        let pose = |k: &vidar_align::aligner::KeyframePlacement| {
+            let stamp = stamps.get(&k.frame_id)?;
+            Some(StampedPose { time: stamp.time, world_from_body: k.world_from_camera })
+        };
+        let poses = self.placement.as_ref()?.keyframes.iter().filter_map(pose).collect();
+        Trajectory::new(BodyFrame::Camera(self.keyframes.first()?.stamp.camera), poses).ok()
+    }
+}
+
+/// Collects the map from the events of the engine.
+pub(super) struct MapCollector<'a> {
+    dataset: &'a Dataset,
+    poses: &'a PosePlan,
+    map: MetricMap,
+    /// Tracked poses of each segment, and the segment that is mapped.
+    states: BTreeMap<u32, Vec<FrameState>>,
+    segment: u32,
+    source: Option<TrajectorySource>,
+}
+
+impl<'a> MapCollector<'a> {
+    /// Nothing yet.
+    pub(super) fn new(dataset: &'a Dataset, poses: &'a PosePlan) -> Self {
+        Self { dataset, poses, map: MetricMap::default(), states: BTreeMap::new(), segment: 0, source: None }
+    }
+
+    /// The map so far.
+    pub(super) fn map(&self) -> &MetricMap {
+        &self.map
+    }
+
+    /// Takes an event.
+    pub(super) fn read(&mut self, event: &MapEvent) -> Result<(), Error> {
+        match event {
+            MapEvent::State(state) => self.states.entry(state.segment).or_default().push(*state),
+            MapEvent::World { source, segment } => {
+                self.map = MetricMap::default();
+                (self.source, self.segment) = (source.clone(), *segment);
+            }
+            MapEvent::Keyframe(keyframe) => self.map.keyframes.push(keyframe.clone()),
+            MapEvent::PlacementsRevised { placement, is_final: true } => {
+                self.map.placement = Some(placement.clone());
+            }
+            MapEvent::SurfaceChanged { surface, is_final: true } => self.map.surface = surface.clone(),
+            MapEvent::ViewsFused(views) => self.map.depth_scores.add(self.dataset, views)?,
+            _ => {}
+        }
+        Ok(())
+    }
+
+    /// Adds views that were written.
+    pub(super) fn add_stored(&mut self, views: Vec<StoredView>) {
+        self.map.views.extend(views);
+    }
+
+    /// The map, with its trajectory: the given one, or the states of the segment that was mapped.
+    pub(super) fn finish(mut self, camera: CameraId) -> MetricMap {
+        self.map.trajectory = match (&self.source, self.poses) {
+            (None, _) => None,
+            (Some(TrajectorySource::Odometry), _) => self.tracked(camera),
+            (Some(_), PosePlan::Given(given)) => Some(given.clone()),
+            (Some(_), PosePlan::Odometry { fallback }) => fallback.clone(),
+            (Some(_), PosePlan::None) => None,
+        };
+        self.map
+    }
+
+    fn tracked(&self, camera: CameraId) -> Option<MetricTrajectory> {
+        let pose = |s: &FrameState| StampedPose { time: s.time, world_from_body: s.world_from_camera };
+        let poses = self.states.get(&self.segment)?.iter().map(pose).collect();
+        let camera_trajectory = Trajectory::new(BodyFrame::Camera(camera), poses).ok()?;
+        Some(MetricTrajectory { source: TrajectorySource::Odometry, camera_trajectory })
+    }
+}

@@ -1,0 +1,125 @@
+//! Readers of the engine's events: log and progress, times of the steps, the map, the growing surface, and files of views.
+
+use super::map::{MapCollector, MetricMap};
+use super::plan::Plan;
+use super::views::write_views;
+use crate::config::Config;
+use crate::engine::{MapEvent, Step};
+use crate::error::Error;
+use crate::events::{Event, Events};
+use crate::run_folder::RunFolder;
+use std::time::{Duration, Instant};
+use vidar_dataset::Dataset;
+
+/// File of the growing surface.
+const SO_FAR: &str = "map/so_far.ply";
+/// The stages of `vidar run` in which the engine works.
+pub(super) const MAP: &str = "map";
+pub(super) const FINISH: &str = "finish";
+
+/// All of them.
+pub(super) struct Readers<'a> {
+    events: &'a Events,
+    config: &'a Config,
+    folder: &'a RunFolder,
+    collector: MapCollector<'a>,
+    times: StepTimes,
+    /// Keyframes predicted and fused, once the recording has ended.
+    finishing: Option<(usize, usize)>,
+    predicted: usize,
+}
+
+impl<'a> Readers<'a> {
+    pub(super) fn new(
+        dataset: &'a Dataset,
+        plan: &'a Plan,
+        config: &'a Config,
+        folder: &'a RunFolder,
+        events: &'a Events,
+    ) -> Self {
+        let collector = MapCollector::new(dataset, &plan.poses);
+        let times = StepTimes::default();
+        Self { events, config, folder, collector, times, finishing: None, predicted: 0 }
+    }
+
+    /// The recording has ended: progress is that of predicting and fusing what is left.
+    pub(super) fn finishing(&mut self) {
+        self.finishing = Some((self.predicted, 0));
+    }
+
+    /// Takes an event.
+    pub(super) fn read(&mut self, event: MapEvent) -> Result<(), Error> {
+        if let Some(shown) = Event::of(&event) {
+            self.events.emit(&shown);
+        }
+        self.times.read(&event);
+        self.collector.read(&event)?;
+        match &event {
+            MapEvent::World { .. } => self.predicted = 0,
+            MapEvent::ChunkPredicted { with_depth, .. } => self.predicted += with_depth,
+            MapEvent::SurfaceChanged { surface, is_final: false } => {
+                let target = self.folder.file(SO_FAR)?;
+                let comments = vec!["VIDAR map so far: provisional poses".to_owned()];
+                vidar_export::atomic::write_atomically(&target, |w| {
+                    vidar_export::write_ply_mesh(w, &surface.mesh, &comments)
+                })?;
+            }
+            MapEvent::ViewsFused(views) => {
+                let stored = write_views(views, self.config, self.folder, self.events)?;
+                if let Some((_, fused)) = &mut self.finishing {
+                    *fused += stored.len();
+                }
+                self.collector.add_stored(stored);
+            }
+            _ => {}
+        }
+        if let (Some((_, fused)), MapEvent::ChunkPredicted { .. } | MapEvent::ViewsFused(_)) =
+            (self.finishing, &event)
+        {
+            // Each keyframe is predicted once and fused once; overlaps are predicted twice.
+            let keyframes = self.collector.map().keyframes.len();
+            let done = self.predicted.min(keyframes) + fused.min(keyframes);
+            self.events.emit(&Event::Progress { stage: FINISH, done, total: 2 * keyframes });
+        }
+        Ok(())
+    }
+
+    /// The map; times of the steps are reported.
+    pub(super) fn finish(self, plan: &Plan) -> MetricMap {
+        for (step, time) in self.times.finish() {
+            self.events.emit(&Event::StepFinished { step: step.name(), seconds: time.as_secs_f64() });
+        }
+        // What cannot be removed is only left behind.
+        let _ = std::fs::remove_file(self.folder.path().join(SO_FAR));
+        self.collector.finish(plan.camera_id)
+    }
+}
+
+/// How long the engine worked on each step.
+#[derive(Default)]
+struct StepTimes {
+    current: Option<(Step, Instant)>,
+    total: Vec<(Step, Duration)>,
+}
+
+impl StepTimes {
+    fn read(&mut self, event: &MapEvent) {
+        if let MapEvent::Step(step) = event {
+            self.stop();
+            self.current = Some((*step, Instant::now()));
+        }
+    }
+
+    fn stop(&mut self) {
+        let Some((step, since)) = self.current.take() else { return };
+        match self.total.iter_mut().find(|(s, _)| *s == step) {
+            Some((_, total)) => *total += since.elapsed(),
+            None => self.total.push((step, since.elapsed())),
+        }
+    }
+
+    fn finish(mut self) -> Vec<(Step, Duration)> {
+        self.stop();
+        self.total
+    }
+}

@@ -1,0 +1,94 @@
+//! Predictions of a run in its folder.
+
+use crate::chunks::{ChunkStore, StoredChunk};
+use crate::config::Config;
+use crate::engine::{PredictedFrame, PredictionId, PredictionStore};
+use crate::error::Error;
+use crate::run::plan::Plan;
+use serde_json::json;
+use sha2::{Digest, Sha256};
+use std::path::{Path, PathBuf};
+use vidar_core::ChunkId;
+use vidar_dataset::Dataset;
+
+/// `chunks/` and `volumes/` of a run folder.
+pub(super) struct RunStore {
+    chunks: ChunkStore,
+    volumes: PathBuf,
+    /// What all predictions of the run depend on, besides their own frames.
+    identity: Vec<u8>,
+}
+
+impl RunStore {
+    /// The store of a plan in the run folder `root`.
+    pub(super) fn new(root: &Path, dataset: &Dataset, plan: &Plan, config: &Config) -> Result<Self, Error> {
+        let part = json!({
+            "version": crate::VERSION,
+            "model": plan.model_json(),
+            "mode": plan.mode,
+            "view": plan.view,
+            "camera": format!("{:?}", plan.camera),
+            "stereo": config.stereo,
+            "network": config.model,
+            "place_recognition": plan.place_recognition,
+        });
+        let mut identity = dataset.fingerprint()?;
+        identity.extend(part.to_string().into_bytes());
+        Ok(Self { chunks: ChunkStore::new(root.join("chunks")), volumes: root.join("volumes"), identity })
+    }
+
+    /// Removes volumes, and predictions unless they are to be kept.
+    pub(super) fn clean(&self, keeps_predictions: bool) {
+        // What cannot be removed is only left behind.
+        let _ = std::fs::remove_dir_all(&self.volumes);
+        if !keeps_predictions {
+            self.chunks.remove_all();
+        }
+    }
+
+    /// SHA-256 of all that a prediction depends on.
+    fn key(&self, frames: &[PredictedFrame]) -> String {
+        let mut hash = Sha256::new_with_prefix(&self.identity);
+        for (time, world_from_camera) in frames {
+            hash.update(time.nanos().to_le_bytes());
+            if let Some(pose) = world_from_camera {
+                pose.matrix().iter().for_each(|v| hash.update(v.to_le_bytes()));
+            }
+        }
+        vidar_hub::hex(&hash.finalize())
+    }
+
+    fn volume(&self, chunk: ChunkId) -> PathBuf {
+        self.volumes.join(format!("{:06}.volume", chunk.0))
+    }
+}
+
+impl PredictionStore for RunStore {
+    fn find(&self, id: PredictionId, frames: &[PredictedFrame]) -> Option<StoredChunk> {
+        self.chunks.find(id, &self.key(frames))
+    }
+
+    fn keep(
+        &self,
+        id: PredictionId,
+        frames: &[PredictedFrame],
+        chunk: &StoredChunk,
+    ) -> Result<StoredChunk, Error> {
+        self.chunks.write(id, chunk, &self.key(frames))?;
+        self.chunks.read(id)
+    }
+
+    fn read(&self, id: PredictionId) -> Result<StoredChunk, Error> {
+        self.chunks.read(id)
+    }
+
+    fn keep_volume(&self, chunk: ChunkId, bytes: &[u8]) -> Result<(), Error> {
+        std::fs::create_dir_all(&self.volumes).map_err(|e| Error::io("create", &self.volumes, e))?;
+        Ok(vidar_export::atomic::write_file_atomically(&self.volume(chunk), bytes)?)
+    }
+
+    fn read_volume(&self, chunk: ChunkId) -> Result<Vec<u8>, Error> {
+        let path = self.volume(chunk);
+        std::fs::read(&path).map_err(|e| Error::io("read", &path, e))
+    }
+}
