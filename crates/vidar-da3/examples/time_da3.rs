@@ -5,7 +5,7 @@
 
 use std::io::{BufRead, Write};
 use std::time::Instant;
-use vidar_da3::weights::deterministic::image_u8;
+use vidar_da3::weights::synthetic::image_u8;
 use vidar_da3::{Da3, Da3Options, Hooks, InferOptions, Pixels, Variant, preprocess::normalise};
 
 type Fallible<T> = Result<T, Box<dyn std::error::Error>>;
@@ -83,7 +83,7 @@ fn device_peak(model: &Da3) -> Option<u64> {
 
 fn main() -> Fallible<()> {
     let arguments = arguments()?;
-    let model = Da3::deterministic(arguments.variant, &arguments.options)?;
+    let model = Da3::synthetic(arguments.variant, &arguments.options)?;
     let (views, rows, columns) = (arguments.views, arguments.rows, arguments.columns);
     let pictures = (0..views).map(|seed| normalise(&image_u8(seed as u64 + 1, columns, rows)));
     let data: Vec<f32> = pictures.flatten().collect();

@@ -1,10 +1,10 @@
-//! In what numbers a model computes.
+//! Number formats of a model.
 //!
-//! bf16 keeps eight bits, so every rounded factor is off by up to 0.4 %. What that does to depth depends on *where* it
-//! happens: errors of the patch embedding and of the first blocks grow through all later ones, and errors of the dense
-//! head fall on the answer directly, while those of the later blocks are averaged away. So a bf16 backbone has its patch
-//! embedding and its first third of blocks (of forty: half, attention too) in `f32`, and `f32` heads (as the official
-//! code's, whose `autocast` leaves the head out). The residual stream, norms, softmax and all sums are `f32` in every
+//! bf16 keeps eight bits, so every rounded factor is off by up to 0.4 %. The effect on depth depends on the layer: errors of
+//! the patch embedding and of the first blocks grow through all later ones, errors of the dense head reach the output
+//! directly, and errors of the later blocks average out. A bf16 backbone therefore keeps its patch embedding and its first
+//! third of blocks (of forty: half, attention included) in `f32`, and its heads too (the official code also excludes the head
+//! from `autocast`). The residual stream, norms, softmax and all sums are `f32` in every
 //! precision. Depth is then within two hundredths of its standard deviation at every pixel of every reference,
 //! where bf16 throughout (as the official code has its backbone) reaches four to eight; a third of the local
 //! blocks' products cost twice the time of the others.
@@ -19,7 +19,7 @@ use vidar_nn::{Compute, Isa, NnError};
 #[serde(rename_all = "kebab-case")]
 pub enum Precision {
     /// `bf16` where the processor multiplies it, `f32` elsewhere: the fastest that keeps depth within two hundredths of
-    /// its standard deviation. [`Arithmetic`] tells which of the two it is.
+    /// its standard deviation. [`Arithmetic`] reports which of the two is used.
     #[default]
     Auto,
     /// Everything in `f32`: the reference.
@@ -48,7 +48,7 @@ impl Precision {
         }
     }
 
-    /// What a set of kernels computes it in.
+    /// The format in which a kernel set computes it.
     fn on(self, isa: Isa) -> vidar_nn::Precision {
         match self {
             Self::Auto | Self::Bf16 if isa.multiplies_bf16() => vidar_nn::Precision::Bf16,
@@ -76,7 +76,7 @@ impl FromStr for Precision {
     }
 }
 
-/// What an open model computes with: the precision asked for, resolved for this machine. Its words name it in manifests
+/// Kernels and precisions of an open model: the requested precision, resolved for this machine. Its text stands in manifests
 /// and reports: `bf16 (patch embedding, leading blocks and heads f32) on avx512`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 pub struct Arithmetic {
@@ -95,7 +95,7 @@ pub struct Arithmetic {
 }
 
 impl Arithmetic {
-    /// Resolves what was asked for.
+    /// Resolves the requested precisions for a kernel set.
     pub(crate) fn resolve(
         precision: Precision,
         head: Option<Precision>,
@@ -107,7 +107,7 @@ impl Arithmetic {
         Self { isa, backbone, head: head.unwrap_or(own).on(isa), exact_blocks, on_device: false }
     }
 
-    /// As [`Arithmetic::resolve`], for a graphics processor: it has all formats.
+    /// As [`Arithmetic::resolve`], for a graphics processor, which has all formats.
     pub(crate) fn on_device(
         precision: Precision,
         head: Option<Precision>,
@@ -124,14 +124,13 @@ impl Arithmetic {
         Self { isa, backbone: stored(precision), head, exact_blocks, on_device: true }
     }
 
-    /// Whether all of it has `f32`'s accuracy.
+    /// Whether everything has the accuracy of `f32`.
     pub(crate) fn is_exact(&self) -> bool {
         is_exact(self.backbone) && is_exact(self.head)
     }
 
-    /// Whether the largest error of depth is bounded, not only its mean square: all but the middle and the end of the
-    /// backbone is exact.
-    pub(crate) fn is_guarded(&self) -> bool {
+    /// Whether the largest error of depth is bounded, not only its mean square: heads and leading blocks are exact.
+    pub(crate) fn bounds_largest_error(&self) -> bool {
         let is_rounded_late = self.backbone == vidar_nn::Precision::Bf16 && self.exact_blocks.is_none();
         is_exact(self.head) && (is_exact(self.backbone) || is_rounded_late)
     }
@@ -168,12 +167,12 @@ impl fmt::Display for Arithmetic {
     }
 }
 
-/// Most blocks that are rounded one after the other: their errors add up. With 27 of 40 rounded, depth was off by up to 0.022
+/// Most consecutive blocks in bf16: their errors add up. With 27 of 40 rounded, depth was off by up to 0.022
 /// of its deviation on GIANT's references and 0.019 on NESTED's; with 20, by 0.017 and 0.020 with attention in bf16 everywhere,
 /// by 0.007 and 0.005 with the exact blocks' attention exact too.
 const MOST_ROUNDED: usize = 20;
 
-/// Whether a backbone has so many blocks that rounded attention of the exact ones leaves a trace in depth.
+/// Whether a backbone is so deep that bf16 attention in its exact blocks would affect depth.
 pub(crate) fn is_deep(depth: usize) -> bool {
     depth / 3 < depth.saturating_sub(MOST_ROUNDED)
 }
@@ -221,7 +220,7 @@ mod tests {
     }
 
     #[test]
-    fn the_first_third_is_exact_or_all_but_twenty_unless_said_otherwise() {
+    fn the_first_third_is_exact_or_all_but_twenty_by_default() {
         assert_eq!([12, 24, 40].map(is_deep), [false, false, true]);
         assert_eq!([12, 24, 40, 2].map(|depth| exact_blocks(None, depth)), [4, 8, 20, 0]);
         assert_eq!((exact_blocks(Some(0), 12), exact_blocks(Some(99), 12)), (0, 12));

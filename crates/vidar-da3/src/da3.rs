@@ -1,13 +1,12 @@
-//! A model that is open: [`Da3`].
+//! An open model: [`Da3`].
 
 use crate::arithmetic::{Arithmetic, Precision};
 use crate::config::{Da3Config, Variant, json};
-use crate::device::{self, Device, DevicePlan, Opened};
+use crate::device::{self, Device, OpenDevice};
 use crate::error::Da3Error;
-use crate::infer::Hooks;
-use crate::model::{DeviceLoader, Model};
-use crate::run::Run;
-use crate::weights::{DeterministicWeights, Residency, detect, verify};
+use crate::model::{DeviceLoader, DevicePlan, Model};
+use crate::run::{Hooks, Run};
+use crate::weights::{Residency, SyntheticWeights, detect, verify};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use vidar_nn::{Checkpoint, Compute, Isa, WeightSource};
@@ -25,11 +24,11 @@ pub struct Da3Options {
     pub exact_blocks: Option<usize>,
     /// Where backbone and dense head are computed.
     pub device: Device,
-    /// Bytes of a device's memory that may be held at a time; `None` is whatever it gives.
+    /// Most bytes of device memory held at a time; `None` is no limit.
     pub max_device_bytes: Option<u64>,
-    /// A set of kernels to insist on; `None` is the best of this machine.
+    /// The kernel set; `None` is the fastest of this machine.
     pub isa: Option<Isa>,
-    /// Whether weights made by rule are kept. Files are mapped and cost nothing either way.
+    /// Whether synthetic weights stay in memory. Files are mapped and cost nothing either way.
     pub residency: Residency,
 }
 
@@ -40,8 +39,8 @@ pub struct Da3 {
     backbone: Compute,
     head: Compute,
     arithmetic: Arithmetic,
-    opened: Option<Opened>,
-    source: WeightsOrigin,
+    opened: Option<OpenDevice>,
+    origin: WeightsOrigin,
 }
 
 /// Where the weights of an open model come from.
@@ -54,18 +53,18 @@ pub enum WeightsOrigin {
         /// Its size.
         bytes: u64,
     },
-    /// Made by rule: the geometry means nothing.
-    Deterministic,
-    /// Given by the caller.
-    Given,
+    /// Generated: the predicted geometry is meaningless.
+    Synthetic,
+    /// Supplied by the caller.
+    External,
 }
 
 const WEIGHTS_FILE: &str = "model.safetensors";
 const CONFIG_FILE: &str = "config.json";
 
 impl Da3 {
-    /// Opens a folder with `model.safetensors` and `config.json` as they lie on the hub, or a safetensors file (with a
-    /// `config.json` beside it, if there is one). Without a description the network is told by its keys.
+    /// Opens a folder with `model.safetensors` and `config.json` as published on the hub, or a safetensors file (with a
+    /// `config.json` beside it, if there is one). Without a `config.json` the network is recognised by its keys.
     pub fn open(path: &Path, options: &Da3Options) -> Result<Self, Da3Error> {
         let (weights, description) = locate(path)?;
         let described = match description {
@@ -84,24 +83,24 @@ impl Da3 {
         Self::load(config, &source, options, origin)
     }
 
-    /// A model whose weights come from elsewhere.
+    /// A model with weights from any source.
     pub fn with_weights(
         config: Da3Config,
         source: Arc<dyn WeightSource>,
         options: &Da3Options,
     ) -> Result<Self, Da3Error> {
-        Self::load(config, &source, options, WeightsOrigin::Given)
+        Self::load(config, &source, options, WeightsOrigin::External)
     }
 
-    /// An official variant with weights made by rule, for tests and timings: its geometry means nothing.
-    pub fn deterministic(variant: Variant, options: &Da3Options) -> Result<Self, Da3Error> {
-        Self::deterministic_of(variant.config(), options)
+    /// An official variant with synthetic weights, for tests and timings: its geometry is meaningless.
+    pub fn synthetic(variant: Variant, options: &Da3Options) -> Result<Self, Da3Error> {
+        Self::synthetic_of(variant.config(), options)
     }
 
-    /// As [`Da3::deterministic`], for any description.
-    pub fn deterministic_of(config: Da3Config, options: &Da3Options) -> Result<Self, Da3Error> {
-        let source: Arc<dyn WeightSource> = Arc::new(DeterministicWeights);
-        Self::load(config, &source, options, WeightsOrigin::Deterministic)
+    /// As [`Da3::synthetic`], for any network.
+    pub fn synthetic_of(config: Da3Config, options: &Da3Options) -> Result<Self, Da3Error> {
+        let source: Arc<dyn WeightSource> = Arc::new(SyntheticWeights);
+        Self::load(config, &source, options, WeightsOrigin::Synthetic)
     }
 
     fn load(
@@ -128,31 +127,31 @@ impl Da3 {
             backbone,
             head: backbone.at(arithmetic.head),
             arithmetic,
-            source: origin,
+            origin,
         })
     }
 
-    /// What the model is.
+    /// The networks of the model.
     pub fn config(&self) -> &Da3Config {
         &self.config
     }
 
-    /// Where its weights come from.
+    /// The origin of its weights.
     pub fn origin(&self) -> &WeightsOrigin {
-        &self.source
+        &self.origin
     }
 
-    /// What it computes with: the options resolved for this machine.
+    /// Kernels and precisions: the options resolved for this machine.
     pub fn arithmetic(&self) -> Arithmetic {
         self.arithmetic
     }
 
     /// The name of the device that backbone and head are computed on; `None` is the CPU.
     pub fn device_name(&self) -> Option<String> {
-        self.opened.as_ref().map(Opened::name)
+        self.opened.as_ref().map(OpenDevice::name)
     }
 
-    /// What `views` views at `height` × `width` processed pixels take on the device; `None` is the CPU
+    /// Device memory for `views` views at `height` × `width` processed pixels; `None` is the CPU
     /// ([`Da3::memory_estimate`]).
     pub fn device_plan(
         &self,
@@ -165,7 +164,7 @@ impl Da3 {
         self.opened.as_ref().map(|device| device.plan(&self.config, size, wants_rays))
     }
 
-    /// What it computes with and where, in words.
+    /// Kernels, precisions and device as text.
     pub fn describe_compute(&self) -> String {
         match self.device_name() {
             Some(name) => format!("{} ({name})", self.arithmetic),
@@ -176,7 +175,7 @@ impl Da3 {
     /// The device that backbone and head are computed on, if it is not the CPU.
     #[cfg(feature = "gpu")]
     pub fn gpu(&self) -> Option<&vidar_gpu::Gpu> {
-        self.opened.as_ref().map(Opened::gpu)
+        self.opened.as_ref().map(OpenDevice::gpu)
     }
 
     /// Kernels and precision of the backbone.
@@ -184,7 +183,7 @@ impl Da3 {
         self.backbone
     }
 
-    /// Whether it takes several views at once and answers cameras.
+    /// Whether it takes several views at once and predicts cameras.
     pub fn is_any_view(&self) -> bool {
         self.config.main().is_any_view()
     }

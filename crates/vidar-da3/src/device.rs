@@ -1,14 +1,14 @@
-//! Where a model computes.
+//! Selection of the device that a model runs on.
 
 use crate::arithmetic::Arithmetic;
 use crate::config::Da3Config;
 use crate::error::Da3Error;
-use crate::model::DeviceLoader;
+use crate::model::{DeviceLoader, DevicePlan};
 use serde::{Deserialize, Serialize};
 use std::fmt;
 use std::str::FromStr;
 
-/// Where backbone and dense head are computed. Camera parts, preprocessing and alignment are on the CPU in any case.
+/// The device of backbone and dense head. Camera encoder and decoder, preprocessing and alignment always run on the CPU.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default, Serialize, Deserialize)]
 #[serde(try_from = "String", into = "String")]
 pub enum Device {
@@ -17,10 +17,10 @@ pub enum Device {
     Cpu,
     /// A graphics processor; needs the feature `gpu`.
     Gpu {
-        /// Its place in the list of devices; `None` is the best that does not run its shaders on the CPU.
+        /// Its index in the list of devices; `None` is the best that does not emulate shaders on the CPU.
         adapter: Option<usize>,
     },
-    /// A graphics processor where one opens, the CPU otherwise.
+    /// A graphics processor if one can be opened, the CPU otherwise.
     Auto,
 }
 
@@ -35,11 +35,11 @@ impl fmt::Display for Device {
     }
 }
 
-/// A word that names no device.
+/// A name of no device.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("unknown device {found:?}; expected cpu, gpu, gpu:N (N counted from 0) or auto")]
 pub struct UnknownDevice {
-    /// The word.
+    /// The name found.
     pub found: String,
 }
 
@@ -72,24 +72,9 @@ impl From<Device> for String {
     }
 }
 
-/// A device and what a run takes there, before it starts. All in bytes.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
-pub struct DevicePlan {
-    /// The device in words.
-    pub device: String,
-    /// All weights, in `f32`; the backbone's take half of it in bf16 or f16.
-    pub weights: u64,
-    /// Largest sum of buffers during a run, weights aside.
-    pub working: u64,
-    /// The largest single buffer, weights aside: devices bound these, some at 128 MiB.
-    pub largest: u64,
-    /// What the largest buffer is for.
-    pub largest_is: &'static str,
-}
-
 impl Device {
-    /// The device of this machine that is meant, unless it is the CPU, and what `views` views at `height` × `width`
-    /// pixels take there. Nothing is opened.
+    /// The memory that `views` views at `height` × `width` pixels need on the selected device; `None` for the CPU. The device
+    /// is not opened.
     ///
     /// # Errors
     /// [`Da3Error::NoDeviceSupport`], or [`Da3Error::Gpu`](crate::Da3Error) when there is no such device.
@@ -110,8 +95,8 @@ impl Device {
         Ok(adapter.map(|adapter| crate::gpu::device_plan(&adapter, config, size, wants_rays)))
     }
 
-    /// The device of this machine that is meant, unless it is the CPU, and what `views` views at `height` × `width`
-    /// pixels take there. Nothing is opened.
+    /// The memory that `views` views at `height` × `width` pixels need on the selected device; `None` for the CPU. The device
+    /// is not opened.
     ///
     /// # Errors
     /// [`Da3Error::NoDeviceSupport`].
@@ -125,8 +110,8 @@ impl Device {
         open(self, None).map(|_| None)
     }
 
-    /// Every graphics processor of this machine by its word and its name, the best first; `None` when this program was
-    /// built without them.
+    /// All graphics processors of this machine with their descriptions, the best first; `None` in builds without the feature
+    /// `gpu`.
     #[must_use]
     pub fn list() -> Option<Vec<(Self, String)>> {
         #[cfg(feature = "gpu")]
@@ -141,48 +126,48 @@ impl Device {
     }
 }
 
-/// A device that was opened.
+/// An open device.
 #[cfg(feature = "gpu")]
-pub(crate) struct Opened(vidar_gpu::Gpu);
+pub(crate) struct OpenDevice(vidar_gpu::Gpu);
 
-/// Nothing can be opened without the feature `gpu`.
+/// Without the feature `gpu` there is no device to open.
 #[cfg(not(feature = "gpu"))]
-pub(crate) enum Opened {}
+pub(crate) enum OpenDevice {}
 
-/// Opens the device asked for, unless it is the CPU. At most `max_bytes` of its memory are held at a time.
+/// Opens the selected device; `None` for the CPU. At most `max_bytes` of its memory are held at a time.
 #[cfg(feature = "gpu")]
-pub(crate) fn open(device: Device, max_bytes: Option<u64>) -> Result<Option<Opened>, Da3Error> {
+pub(crate) fn open(device: Device, max_bytes: Option<u64>) -> Result<Option<OpenDevice>, Da3Error> {
     let open = |adapter| vidar_gpu::Gpu::open(&vidar_gpu::GpuOptions { adapter, memory_limit: max_bytes });
     match device {
         Device::Cpu => Ok(None),
-        Device::Gpu { adapter } => Ok(Some(Opened(open(adapter)?))),
-        Device::Auto => Ok(open(None).ok().map(Opened)),
+        Device::Gpu { adapter } => Ok(Some(OpenDevice(open(adapter)?))),
+        Device::Auto => Ok(open(None).ok().map(OpenDevice)),
     }
 }
 
-/// Opens the device asked for, unless it is the CPU.
+/// Opens the selected device; `None` for the CPU.
 #[cfg(not(feature = "gpu"))]
-pub(crate) fn open(device: Device, _max_bytes: Option<u64>) -> Result<Option<Opened>, Da3Error> {
+pub(crate) fn open(device: Device, _max_bytes: Option<u64>) -> Result<Option<OpenDevice>, Da3Error> {
     match device {
         Device::Cpu | Device::Auto => Ok(None),
         Device::Gpu { .. } => Err(Da3Error::NoDeviceSupport { device }),
     }
 }
 
-impl Opened {
-    /// What puts networks on it.
+impl OpenDevice {
+    /// Loads networks to it.
     #[cfg(feature = "gpu")]
     pub fn loader(&self, arithmetic: Arithmetic) -> impl DeviceLoader + use<> {
         crate::gpu::Context::new(&self.0, arithmetic)
     }
 
-    /// What puts networks on it.
+    /// Loads networks to it.
     #[cfg(not(feature = "gpu"))]
     pub fn loader(&self, _arithmetic: Arithmetic) -> NoLoader {
         match *self {}
     }
 
-    /// What a run takes on it.
+    /// Memory of a run on it.
     pub fn plan(&self, config: &Da3Config, size: (usize, usize, usize), wants_rays: bool) -> DevicePlan {
         #[cfg(feature = "gpu")]
         return crate::gpu::device_plan(self.0.adapter(), config, size, wants_rays);
@@ -208,7 +193,7 @@ impl Opened {
     }
 }
 
-/// What puts networks on no device.
+/// The loader of builds without devices.
 #[cfg(not(feature = "gpu"))]
 pub(crate) enum NoLoader {}
 
@@ -229,7 +214,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn words_name_devices_and_back() {
+    fn names_of_devices_round_trip() {
         let all =
             [Device::Cpu, Device::Gpu { adapter: None }, Device::Gpu { adapter: Some(3) }, Device::Auto];
         for device in all {

@@ -1,13 +1,14 @@
 //! Depth Anything 3 as a [`GeometryModel`]: chunks of views in, depth and poses per view out.
 
-use crate::align::ScaleEvidence;
+use crate::align::ScaleSource;
 use crate::config::HeadKind;
 use crate::da3::Da3;
 use crate::error::Da3Error;
-use crate::infer::{Hooks, InferOptions, Inputs, Prediction};
+use crate::infer::{InferOptions, Inputs, Prediction};
 use crate::model::backbone::ReferenceStrategy;
 use crate::pose::{from_edge, parts, rigid_inverse, to_edge};
 use crate::preprocess::PreprocessConfig;
+use crate::run::Hooks;
 use nalgebra::{Matrix3, Matrix4};
 use serde::{Deserialize, Serialize};
 use std::ops::Range;
@@ -205,7 +206,8 @@ struct Placed {
 /// Depth is in metres where a baseline was seen. One place alone shows no scale: the answer is then in the network's
 /// own frame and unit, and says so.
 fn in_prior_world(mut prediction: Prediction) -> Result<Placed, Da3Error> {
-    let is_scaled = prediction.alignment.as_ref().is_some_and(|a| a.evidence != ScaleEvidence::Nothing);
+    let is_scaled =
+        prediction.alignment.as_ref().is_some_and(|a| a.scale_source != ScaleSource::Unobservable);
     if is_scaled || prediction.is_metric {
         return Ok(Placed { frame: ChunkFrame::PriorWorld, prediction });
     }

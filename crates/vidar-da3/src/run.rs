@@ -1,9 +1,24 @@
-//! What accompanies a run through the network: kernels, the wish to stop, somebody who looks on.
+//! The context of a run through the network: kernels and precision, cancellation, tracing.
 
 use crate::arithmetic::{exact, exact_blocks};
 use crate::error::Da3Error;
 use crate::trace::{Layout, Trace, Traced};
 use vidar_nn::Compute;
+
+/// Cancellation and observation of a run.
+#[derive(Clone, Copy)]
+pub struct Hooks<'a> {
+    /// Called between blocks and views; `true` ends the run with [`Da3Error::Cancelled`].
+    pub cancel: &'a (dyn Fn() -> bool + Sync),
+    /// Receives intermediate results.
+    pub trace: Option<&'a dyn Trace>,
+}
+
+impl Default for Hooks<'_> {
+    fn default() -> Self {
+        Self { cancel: &|| false, trace: None }
+    }
+}
 
 /// Passed by reference to every part.
 #[derive(Clone, Copy)]
@@ -14,9 +29,9 @@ pub(crate) struct Run<'a> {
     pub exact_blocks: Option<usize>,
     /// Kernels and precision of the dense head.
     pub head: Compute,
-    /// Asked between blocks and views; `true` ends the run.
+    /// Called between blocks and views; `true` ends the run.
     pub cancel: &'a (dyn Fn() -> bool + Sync),
-    /// Who looks on.
+    /// Receives intermediate results.
     pub trace: Option<&'a dyn Trace>,
 }
 
@@ -31,23 +46,23 @@ impl Run<'_> {
         if self.exact_blocks == Some(0) { self.backbone } else { exact(self.backbone) }
     }
 
-    /// Stops the run when the caller wants it to.
-    pub fn checkpoint(&self) -> Result<(), Da3Error> {
+    /// Fails when the caller has cancelled the run.
+    pub fn check_cancelled(&self) -> Result<(), Da3Error> {
         if (self.cancel)() { Err(Da3Error::Cancelled) } else { Ok(()) }
     }
 
-    /// Shows a result to whoever looks on.
+    /// Passes a result to the trace, if there is one.
     pub fn show(&self, name: &str, view: usize, shape: &[usize], data: &[f32]) {
         self.show_as(Layout::Rows, name, view, shape, data);
     }
 
-    /// Shows a map `[rows, columns, channels]`.
+    /// As [`Run::show`], for a map `[rows, columns, channels]`.
     pub fn show_map(&self, name: &str, view: usize, shape: [usize; 3], data: &[f32]) {
         self.show_as(Layout::Map, name, view, &shape, data);
     }
 
-    /// Whether anybody wants a result of that name.
-    pub fn is_watched(&self, name: &str) -> bool {
+    /// Whether the trace wants a result of that name.
+    pub fn is_traced(&self, name: &str) -> bool {
         self.trace.is_some_and(|trace| trace.wants(name))
     }
 

@@ -1,14 +1,14 @@
-//! Looking into a run: intermediate results under the names that the reference files use.
+//! Tracing a run: intermediate results under the names that the reference files use.
 //!
 //! `patch_embed`, `tokens_in`, `blockII`, `featK`, `camtokK`, `pose_enc`, `cam_enc_tokens`, `head.…`: see
-//! [`crate::check`]. Results come view by view; blocks are in the order of computation (the reference view first).
+//! [`crate::check`]. Results arrive view by view; views of blocks are in the order of computation (the reference view first).
 
-/// How the numbers of a traced tensor lie.
+/// Memory layout of a traced tensor.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Layout {
-    /// As the shape says.
+    /// Row-major in the order of the shape.
     Rows,
-    /// `[rows, columns, channels]`; reference files have the channels first.
+    /// `[rows, columns, channels]`; reference files store the channels first.
     Map,
 }
 
@@ -21,16 +21,16 @@ pub struct Traced<'a> {
     pub view: usize,
     /// Shape of this view's part.
     pub shape: &'a [usize],
-    /// How the numbers lie.
+    /// Its memory layout.
     pub layout: Layout,
-    /// The numbers.
+    /// The values.
     pub data: &'a [f32],
 }
 
-/// Somebody who wants to see intermediate results.
+/// Receiver of intermediate results.
 pub trait Trace: Sync {
-    /// Whether a result of that name is of interest; others are not put together at all.
+    /// Whether a result of that name is wanted; others are not assembled.
     fn wants(&self, name: &str) -> bool;
-    /// Takes one view's part.
+    /// Receives one view's part.
     fn record(&self, tensor: Traced<'_>);
 }

@@ -13,7 +13,7 @@ use vidar_core::{
 };
 use vidar_da3::config::json;
 use vidar_da3::preprocess::PreprocessConfig;
-use vidar_da3::weights::deterministic::image_u8;
+use vidar_da3::weights::synthetic::image_u8;
 use vidar_da3::{Da3, Da3Model, Da3ModelConfig, Da3Options, PoseMode};
 
 fn chunk(n: u32, has_poses: bool) -> ChunkViews {
@@ -114,7 +114,7 @@ fn poses_from_rays_have_a_principal_point_of_their_own() {
 #[test]
 fn a_network_of_single_views_needs_to_be_metric_and_posed() {
     let config = json::parse(&tiny_json("tiny_metric_v2.safetensors"), "tiny").unwrap();
-    let network = Arc::new(Da3::deterministic_of(config, &Da3Options::default()).unwrap());
+    let network = Arc::new(Da3::synthetic_of(config, &Da3Options::default()).unwrap());
     for mode in [PoseMode::Free, PoseMode::Conditioned] {
         let refused =
             Da3Model::new(Arc::clone(&network), Da3ModelConfig { mode, ..Da3ModelConfig::default() }, None);

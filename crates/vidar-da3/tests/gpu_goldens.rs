@@ -8,7 +8,7 @@ mod common;
 
 use common::{own, shared};
 use std::path::Path;
-use vidar_da3::check::{CheckReport, Verdict, check_file};
+use vidar_da3::check::{CheckReport, CheckResult, check_file};
 use vidar_da3::gpu::adapters;
 use vidar_da3::{Da3Options, Device, Precision, Residency};
 
@@ -30,10 +30,15 @@ fn any_device(precision: Precision) -> Option<Da3Options> {
 
 fn check(file: &Path, options: &Da3Options) -> CheckReport {
     let report = check_file(file, None, options).unwrap();
-    let judged = report.rows.iter().filter(|row| row.verdict != Verdict::Noted).count();
+    let evaluated = report.rows.iter().filter(|row| row.result != CheckResult::NotEvaluated).count();
     let worst = report.worst().unwrap();
     let name = file.file_name().unwrap().to_string_lossy();
-    eprintln!("{name} · {}: {judged} rows, worst {:.1e} ({})", report.compute, worst.ratio(), worst.tensor);
+    eprintln!(
+        "{name} · {}: {evaluated} rows, worst {:.1e} ({})",
+        report.compute,
+        worst.ratio(),
+        worst.tensor
+    );
     report
 }
 
@@ -42,7 +47,7 @@ fn every_layer_of_the_tiny_networks_holds_on_a_device() {
     let Some(options) = any_device(Precision::F32) else { return };
     for file in FILES {
         let report = check(&own(file), &options);
-        assert!(report.holds(), "{report}");
+        assert!(report.passed(), "{report}");
         assert!(report.compute.contains("gpu"), "{}", report.compute);
     }
 }
@@ -66,8 +71,8 @@ fn packed_weights_keep_depth_within_two_hundredths_of_its_deviation() {
         let Some(options) = any_device(precision) else { return };
         for file in &FILES[..2] {
             let report = check(&own(file), &options);
-            assert!(report.holds(), "{report}");
-            assert!(report.rows.iter().any(|row| row.verdict == Verdict::Noted));
+            assert!(report.passed(), "{report}");
+            assert!(report.rows.iter().any(|row| row.result == CheckResult::NotEvaluated));
         }
     }
 }
@@ -90,7 +95,7 @@ fn official(files: &[&str], precision: Precision) {
     let options = Da3Options { residency: Residency::OnDemand, ..options };
     for file in files {
         let report = check(&folder.join(format!("{file}.safetensors")), &options);
-        assert!(report.holds(), "{report}");
+        assert!(report.passed(), "{report}");
     }
 }
 

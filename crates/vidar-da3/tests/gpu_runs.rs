@@ -13,7 +13,7 @@ use vidar_core::Image;
 use vidar_da3::config::json;
 use vidar_da3::gpu::{GpuError, MemoryPlan, adapters, memory_plan};
 use vidar_da3::preprocess::PreprocessConfig;
-use vidar_da3::weights::DeterministicWeights;
+use vidar_da3::weights::SyntheticWeights;
 use vidar_da3::weights::inventory::parameters;
 use vidar_da3::{Da3, Da3Error, Da3Options, Device, Hooks, InferOptions, Inputs, Precision};
 use vidar_nn::{CheckpointError, Weight, WeightSource};
@@ -52,11 +52,11 @@ struct Remembering(Mutex<BTreeSet<String>>);
 impl WeightSource for Remembering {
     fn weight(&self, name: &str, shape: &[usize]) -> Result<Weight, CheckpointError> {
         self.0.lock().unwrap().insert(name.to_owned());
-        DeterministicWeights.weight(name, shape)
+        SyntheticWeights.weight(name, shape)
     }
 
     fn has(&self, name: &str) -> bool {
-        DeterministicWeights.has(name)
+        SyntheticWeights.has(name)
     }
 }
 
@@ -77,7 +77,7 @@ fn the_device_reads_the_keys_that_the_network_has() {
 #[test]
 fn a_run_holds_no_more_device_memory_than_planned_and_gives_it_back() {
     let Some(options) = any_device() else { return };
-    let model = Da3::deterministic_of(tiny_config(), &options).unwrap();
+    let model = Da3::synthetic_of(tiny_config(), &options).unwrap();
     let gpu = model.gpu().unwrap();
     let weights = gpu.held_bytes();
     for (views, wants_rays) in [(1, false), (5, false), (3, true)] {
@@ -96,7 +96,7 @@ fn a_run_holds_no_more_device_memory_than_planned_and_gives_it_back() {
 #[test]
 fn a_run_that_may_not_hold_its_memory_is_refused_before_it_starts() {
     let Some(options) = any_device() else { return };
-    let model = Da3::deterministic_of(tiny_config(), &options).unwrap();
+    let model = Da3::synthetic_of(tiny_config(), &options).unwrap();
     let weights = model.gpu().unwrap().held_bytes();
     let (one, twelve) = (plan(&model, 1, false), plan(&model, 12, false));
     drop(model);
@@ -104,7 +104,7 @@ fn a_run_that_may_not_hold_its_memory_is_refused_before_it_starts() {
         max_device_bytes: Some(weights + u64::midpoint(one.working, twelve.working)),
         ..options
     };
-    let model = Da3::deterministic_of(tiny_config(), &tight).unwrap();
+    let model = Da3::synthetic_of(tiny_config(), &tight).unwrap();
     let said = model.infer(&Inputs::images(&pictures(12)), &small()).err().unwrap();
     assert!(matches!(said, Da3Error::Gpu(GpuError::OverBudget { .. })), "{said}");
     // Fewer views still run.
@@ -114,7 +114,7 @@ fn a_run_that_may_not_hold_its_memory_is_refused_before_it_starts() {
 #[test]
 fn a_run_on_a_device_stops_when_asked_to() {
     let Some(options) = any_device() else { return };
-    let model = Da3::deterministic_of(tiny_config(), &options).unwrap();
+    let model = Da3::synthetic_of(tiny_config(), &options).unwrap();
     let asked = AtomicUsize::new(0);
     let cancel = || asked.fetch_add(1, Ordering::Relaxed) >= 6;
     let hooks = Hooks { cancel: &cancel, trace: None };
@@ -128,7 +128,7 @@ fn a_run_on_a_device_stops_when_asked_to() {
 #[test]
 fn two_models_on_one_device_answer_as_each_alone() {
     let Some(options) = any_device() else { return };
-    let model = Da3::deterministic_of(tiny_config(), &options).unwrap();
+    let model = Da3::synthetic_of(tiny_config(), &options).unwrap();
     let run = |views: usize| {
         let answer = model.infer(&Inputs::images(&pictures(views)), &small()).unwrap();
         answer.depth.iter().flat_map(|d| d.data().to_vec()).map(f32::to_bits).collect::<Vec<_>>()
@@ -145,9 +145,9 @@ fn two_models_on_one_device_answer_as_each_alone() {
 fn a_device_that_is_not_there_is_said_with_what_to_do() {
     let number = adapters().len();
     let options = Da3Options { device: Device::Gpu { adapter: Some(number) }, ..Da3Options::default() };
-    let said = Da3::deterministic_of(tiny_config(), &options).err().unwrap().to_string();
+    let said = Da3::synthetic_of(tiny_config(), &options).err().unwrap().to_string();
     assert!(said.contains("Vulkan") && said.contains(&format!("number {number}")), "{said}");
     let auto = Da3Options { device: Device::Auto, ..Da3Options::default() };
-    let model = Da3::deterministic_of(tiny_config(), &auto).unwrap();
+    let model = Da3::synthetic_of(tiny_config(), &auto).unwrap();
     eprintln!("auto computes on {}", model.describe_compute());
 }

@@ -8,9 +8,9 @@ use common::{own, tiny, tiny_json};
 use nalgebra::{Matrix3, Matrix4};
 use std::sync::atomic::{AtomicUsize, Ordering};
 use vidar_core::Image;
-use vidar_da3::align::ScaleEvidence;
+use vidar_da3::align::ScaleSource;
 use vidar_da3::preprocess::{PreprocessConfig, ResizeMethod};
-use vidar_da3::weights::deterministic::image_u8;
+use vidar_da3::weights::synthetic::image_u8;
 use vidar_da3::{
     Da3, Da3Error, Da3Options, Hooks, InferOptions, Inputs, Prediction, ReferenceStrategy, config::json,
 };
@@ -61,7 +61,7 @@ fn the_same_bits_come_out_for_any_number_of_threads() {
 #[test]
 fn two_models_run_at_once_without_minding_each_other() {
     let other = json::parse(&tiny_json("tiny_metric_v2.safetensors"), "tiny").unwrap();
-    let (first, second) = (tiny(), Da3::deterministic_of(other, &Da3Options::default()).unwrap());
+    let (first, second) = (tiny(), Da3::synthetic_of(other, &Da3Options::default()).unwrap());
     let images = pictures(3);
     let run = |model: &Da3| bits(&model.infer(&Inputs::images(&images), &options()).unwrap());
     let alone = (run(&first), run(&second));
@@ -114,14 +114,14 @@ fn wanted_views_are_those_of_the_whole() {
 #[test]
 fn where_the_official_code_raises_the_scale_that_is_seen_is_named() {
     let model = tiny();
-    for (views, evidence) in
-        [(1, ScaleEvidence::Nothing), (2, ScaleEvidence::LengthAlongLine), (5, ScaleEvidence::Similarity)]
+    for (views, scale_source) in
+        [(1, ScaleSource::Unobservable), (2, ScaleSource::LengthAlongLine), (5, ScaleSource::Similarity)]
     {
         let (images, (poses, k)) = (pictures(views as u64), cameras(views));
         let inputs = Inputs::posed(&images, &poses, &k);
         let found = model.infer(&inputs, &options()).unwrap();
         let alignment = found.alignment.unwrap();
-        assert_eq!(alignment.evidence, evidence, "{views} views");
+        assert_eq!(alignment.scale_source, scale_source, "{views} views");
         assert_eq!(found.camera_from_world.unwrap(), poses);
         let compat = InferOptions { compat: true, ..options() };
         let raised = matches!(model.infer(&inputs, &compat), Err(Da3Error::DegenerateCameras { .. }));
@@ -185,7 +185,7 @@ fn features_come_in_the_order_of_the_views() {
 #[test]
 fn networks_of_single_views_answer_sky_and_refuse_cameras() {
     let config = json::parse(&tiny_json("tiny_metric_v2.safetensors"), "tiny").unwrap();
-    let model = Da3::deterministic_of(config, &Da3Options::default()).unwrap();
+    let model = Da3::synthetic_of(config, &Da3Options::default()).unwrap();
     let (images, (poses, k)) = (pictures(2), cameras(2));
     let found = model.infer(&Inputs::images(&images), &options()).unwrap();
     assert!(found.sky.is_some() && found.confidence.is_none() && found.camera_from_world.is_none());
@@ -197,7 +197,7 @@ fn networks_of_single_views_answer_sky_and_refuse_cameras() {
 #[test]
 fn a_nested_model_answers_in_metres() {
     let config = json::parse(&tiny_json("tiny_nested_v2.safetensors"), "tiny").unwrap();
-    let model = Da3::deterministic_of(config, &Da3Options::default()).unwrap();
+    let model = Da3::synthetic_of(config, &Da3Options::default()).unwrap();
     let images = [image_u8(1, 56, 42), image_u8(5, 56, 42)];
     let found = model.infer(&Inputs::images(&images), &options()).unwrap();
     assert!(found.is_metric && found.scale_factor.unwrap() > 0.0 && found.sky.is_none());

@@ -9,7 +9,7 @@ use nalgebra::{Matrix3, Matrix4};
 use vidar_core::Image;
 use vidar_da3::config::json;
 use vidar_da3::preprocess::PreprocessConfig;
-use vidar_da3::weights::deterministic::image_u8;
+use vidar_da3::weights::synthetic::image_u8;
 use vidar_da3::{Da3, Da3Options, InferOptions, Inputs, Isa, Precision};
 
 /// One test only: kernels of others in this process would be seen too.
@@ -28,11 +28,11 @@ fn a_forced_kernel_set_is_the_only_one_that_runs() {
         for precision in [Precision::Auto, Precision::F32] {
             let options = Da3Options { isa: Some(isa), precision, ..Da3Options::default() };
             Isa::take_used();
-            let model = Da3::deterministic_of(tiny_config(), &options).unwrap();
+            let model = Da3::synthetic_of(tiny_config(), &options).unwrap();
             assert_eq!(model.arithmetic().isa, isa);
             model.infer(&Inputs::images(&images), &all).unwrap();
             model.infer(&Inputs::posed(&images, &poses, &k), &plain).unwrap();
-            let model = Da3::deterministic_of(nested.clone(), &options).unwrap();
+            let model = Da3::synthetic_of(nested.clone(), &options).unwrap();
             model.infer(&Inputs::images(&images), &plain).unwrap();
             assert_eq!(Isa::take_used(), [isa], "{}", model.arithmetic());
         }

@@ -7,7 +7,7 @@ mod common;
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::sync::atomic::{AtomicUsize, Ordering};
 use vidar_da3::preprocess::PreprocessConfig;
-use vidar_da3::weights::deterministic::image_u8;
+use vidar_da3::weights::synthetic::image_u8;
 use vidar_da3::{Da3, Da3Options, InferOptions, Inputs, Variant};
 
 /// Counts bytes in use and their maximum.
@@ -44,7 +44,7 @@ fn peak<T>(work: impl FnOnce() -> T) -> (T, usize) {
 /// One test only: others in this process would be counted too.
 #[test]
 fn the_plan_is_near_the_truth_and_a_thousand_calls_leave_nothing_behind() {
-    let model = Da3::deterministic(Variant::Small, &Da3Options::default()).unwrap();
+    let model = Da3::synthetic(Variant::Small, &Da3Options::default()).unwrap();
     for (views, size) in [(1, 252), (6, 140)] {
         let images: Vec<_> = (0..views).map(|i| image_u8(i as u64, 160, 120)).collect();
         let options = InferOptions {

@@ -11,8 +11,8 @@ use vidar_core::Image;
 use vidar_da3::align::{align_cameras, samples};
 use vidar_da3::preprocess::{self, PreprocessConfig, ResizeMethod, normalise};
 use vidar_da3::ray_pose::{RayMap, camera_from_rays, split};
-use vidar_da3::weights::deterministic::{fnv1a64, image_u8, tensor};
 use vidar_da3::weights::inventory::{is_ignored, parameters};
+use vidar_da3::weights::synthetic::{fnv1a64, image_u8, tensor};
 use vidar_da3::{Variant, pose};
 use vidar_nn::Checkpoint;
 
@@ -132,8 +132,9 @@ fn preprocessing_is_opencvs() {
             matches!(s, preprocess::Step::Resize { interpolation: preprocess::Interpolation::Cubic, .. })
         });
         if is_cubic {
+            // The official result depends on the processor (see `preprocess::cubic`): at most two bytes in 100 000 differ.
             assert!(
-                worst <= 1 && differing * 10_000 <= found.len(),
+                worst <= 1 && differing * 50_000 <= found.len(),
                 "{name}: {differing} of {}, {worst}",
                 found.len()
             );

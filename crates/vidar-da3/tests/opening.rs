@@ -7,7 +7,7 @@ mod common;
 use common::{tensors, tiny_config, tiny_folder, tiny_json, write_safetensors};
 use std::collections::BTreeMap;
 use std::path::Path;
-use vidar_da3::weights::{deterministic, inventory};
+use vidar_da3::weights::{inventory, synthetic};
 use vidar_da3::{Da3, Da3Error, Da3Options, Variant, WeightsOrigin};
 
 type Tensors = BTreeMap<String, (Vec<usize>, Vec<f32>)>;
@@ -107,7 +107,7 @@ fn without_a_description_the_keys_tell_the_network() {
     // A class token as wide as the small network's: taken for it, and every other key is then wrong.
     let mut all = tensors(&tiny_config());
     let name = "model.backbone.pretrained.cls_token";
-    all.insert(name.into(), (vec![1, 1, 384], deterministic::tensor(name, &[1, 1, 384])));
+    all.insert(name.into(), (vec![1, 1, 384], synthetic::tensor(name, &[1, 1, 384])));
     write_safetensors(&folder.path().join("model.safetensors"), &all);
     assert!(refusal(folder.path()).contains("is not a checkpoint of da3-small"));
 }

@@ -5,7 +5,7 @@
 mod common;
 
 use common::own;
-use vidar_da3::check::{CheckReport, Measure, Verdict, check_file};
+use vidar_da3::check::{CheckReport, CheckResult, Measure, check_file};
 use vidar_da3::{Da3Options, Isa, Precision, Residency};
 
 const FILES: [&str; 4] = [
@@ -29,7 +29,7 @@ fn every_layer_of_the_tiny_networks_holds_with_every_set_of_kernels() {
         for precision in [Precision::F32, Precision::F32Split] {
             for file in FILES {
                 let report = check(file, &Da3Options { isa: Some(isa), precision, ..Da3Options::default() });
-                assert!(report.holds(), "{report}");
+                assert!(report.passed(), "{report}");
                 let most = report.worst().unwrap().ratio();
                 eprintln!("{file} {isa} {precision}: {} rows, worst {most:.1e}", report.rows.len());
             }
@@ -52,7 +52,7 @@ fn intermediate_results_are_among_what_is_compared() {
     ] {
         assert!(names.contains(&name), "{name} is not in {names:?}");
     }
-    assert!(report.to_string().contains("rows hold"));
+    assert!(report.to_string().contains("rows pass"));
 }
 
 #[test]
@@ -60,7 +60,7 @@ fn by_default_every_pixel_of_depth_is_within_two_hundredths_of_its_deviation() {
     for precision in [Precision::Auto, Precision::Bf16] {
         for file in FILES {
             let report = check(file, &Da3Options { precision, ..Da3Options::default() });
-            assert!(report.holds(), "{report}");
+            assert!(report.passed(), "{report}");
             assert_eq!(report.measure, Measure::Largest);
             let depth = report.rows.iter().find(|row| row.tensor == "out.depth").unwrap();
             assert!(depth.p999_difference <= depth.max_difference, "{report}");
@@ -70,7 +70,7 @@ fn by_default_every_pixel_of_depth_is_within_two_hundredths_of_its_deviation() {
 }
 
 #[test]
-fn bf16_throughout_is_judged_by_its_mean_square() {
+fn bf16_throughout_is_evaluated_by_its_mean_square() {
     let options = Da3Options {
         precision: Precision::Bf16,
         head_precision: Some(Precision::Bf16),
@@ -80,16 +80,16 @@ fn bf16_throughout_is_judged_by_its_mean_square() {
     // The tiny networks of one view have too little width to average rounding over.
     for file in &FILES[..2] {
         let report = check(file, &options);
-        assert!(report.holds() && report.to_string().contains("judged by the"), "{report}");
+        assert!(report.passed() && report.to_string().contains("evaluated by the"), "{report}");
         if Isa::detect().multiplies_bf16() {
             assert_eq!(report.measure, Measure::RootMeanSquare);
-            assert!(report.rows.iter().any(|row| row.verdict == Verdict::Noted));
+            assert!(report.rows.iter().any(|row| row.result == CheckResult::NotEvaluated));
         }
     }
 }
 
 #[test]
-fn parts_built_on_demand_answer_the_same() {
+fn parts_built_on_demand_give_the_same_results() {
     let kept = check(FILES[0], &Da3Options::default());
     let on_demand = check(FILES[0], &Da3Options { residency: Residency::OnDemand, ..Da3Options::default() });
     let differences = |r: &CheckReport| r.rows.iter().map(|row| row.max_difference).collect::<Vec<_>>();
@@ -97,12 +97,12 @@ fn parts_built_on_demand_answer_the_same() {
 }
 
 #[test]
-fn another_networks_weights_depart_at_the_first_layer() {
+fn weights_of_another_network_fail_at_the_first_changed_layer() {
     let folder = tempfile::tempdir().unwrap();
     let mut tensors = common::tensors(&common::tiny_config());
     tensors.get_mut("model.backbone.pretrained.blocks.2.mlp.fc2.bias").unwrap().1[5] += 0.5;
     common::write_safetensors(&folder.path().join("model.safetensors"), &tensors);
     std::fs::write(folder.path().join("config.json"), common::tiny_json(FILES[0])).unwrap();
     let report = check_file(&own(FILES[0]), Some(folder.path()), &exact()).unwrap();
-    assert_eq!(report.first_departure().unwrap().tensor, "block02");
+    assert_eq!(report.first_failure().unwrap().tensor, "block02");
 }

@@ -2,8 +2,8 @@
 //!
 //! The given camera centres g are mapped onto the predicted ones p by the similarity `p ≈ s R g + t` (Umeyama 1991);
 //! from ten views on by RANSAC with fixed samples ([`pcg64`]). Depth is then divided by s. Where the centres do not
-//! fix a similarity (one view, two views, a straight line) the official code stops; here the answer says what can be
-//! observed: with a baseline its length ratio, without one nothing.
+//! determine a similarity (one view, two views, a straight line) the official code raises an error. Here the scale is the
+//! ratio of lengths where there is a baseline; without one it is unobservable and [`ScaleSource`] reports that.
 
 pub mod pcg64;
 
@@ -13,31 +13,32 @@ use nalgebra::{Matrix3, Matrix4, Vector3};
 use pcg64::Pcg64;
 use serde::{Deserialize, Serialize};
 
-/// From this many views on samples are drawn.
+/// Fewer views than this are fitted without RANSAC.
 const RANSAC_MIN_VIEWS: usize = 10;
 const RANSAC_ROUNDS: usize = 10;
 const RANSAC_SEED: u32 = 42;
-/// Singular values of the covariance that the official code counts as there: absolute, in the scene's units squared.
+/// Singular values of the covariance above this count towards the official code's rank: absolute, in the scene's units squared.
 const OFFICIAL_RANK_TOLERANCE: f64 = f64::EPSILON;
-/// Share of the first singular value below which the second one is rounding: a straight line.
+/// A second singular value below this share of the first is rounding: the centres lie on a line.
 const LINE_TOLERANCE: f64 = 1e-9;
 
-/// Spread over distance from the origin below which positions are one place seen through rounding.
-const PLACE_TOLERANCE: f64 = 1e-12;
+/// Positions coincide up to rounding when their largest distance from the mean is below this share of their distance from
+/// the origin.
+const COINCIDENT_TOLERANCE: f64 = 1e-12;
 
-/// What fixed the scale between given and predicted cameras.
+/// What the scale between given and predicted cameras was estimated from.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
-pub enum ScaleEvidence {
+pub enum ScaleSource {
     /// A similarity of all camera centres.
     Similarity,
     /// A similarity of the centres that agree, found by RANSAC.
     SimilarityOfInliers,
-    /// The centres lie on a line (or there are two): the ratio of lengths along it; orientation comes from the
-    /// cameras' own.
+    /// The centres lie on a line (or there are two): the ratio of lengths along it. The rotation is fitted to the
+    /// orientations of the cameras.
     LengthAlongLine,
-    /// One place only, given or predicted: nothing. The scale is 1, that is, the network's own units.
-    Nothing,
+    /// All given or all predicted centres coincide. The scale is 1, so depth stays in the network's own units.
+    Unobservable,
 }
 
 /// How given cameras map onto predicted ones: `p = scale · rotation · g + translation`.
@@ -49,9 +50,9 @@ pub struct CameraAlignment {
     pub rotation: Matrix3<f64>,
     /// In predicted units.
     pub translation: Vector3<f64>,
-    /// What the scale rests on.
-    pub evidence: ScaleEvidence,
-    /// Views that agree with it.
+    /// What the scale was estimated from.
+    pub scale_source: ScaleSource,
+    /// Number of views that agree with it.
     pub inliers: usize,
 }
 
@@ -67,8 +68,8 @@ impl CameraAlignment {
     }
 }
 
-/// Aligns given cameras with predicted ones (both `camera_from_world`). With `is_strict` a case in which the official
-/// code raises is an error here too.
+/// Aligns given cameras with predicted ones (both `camera_from_world`). With `is_strict` every case in which the official
+/// code raises an error is an error here too ([`Da3Error::DegenerateCameras`]).
 pub fn align_cameras(
     predicted: &[Matrix4<f64>],
     given: &[Matrix4<f64>],
@@ -89,16 +90,16 @@ pub fn align_cameras(
         return Ok(align_line(predicted, given, &full));
     }
     if given.len() < RANSAC_MIN_VIEWS {
-        return Ok(full.alignment(ScaleEvidence::Similarity, given.len()));
+        return Ok(full.alignment(ScaleSource::Similarity, given.len()));
     }
     Ok(ransac(&source, &target, &full))
 }
 
 fn describe(fit: &Fit) -> String {
-    if fit.is_place { "in one place".into() } else { "on a line".into() }
+    if fit.is_coincident { "at one point".into() } else { "on a line".into() }
 }
 
-/// An Umeyama fit with what is needed to judge it.
+/// An Umeyama fit with its degeneracies.
 struct Fit {
     rotation: Matrix3<f64>,
     translation: Vector3<f64>,
@@ -106,16 +107,16 @@ struct Fit {
     values: [f64; 3],
     source_variance: f64,
     official_rank: usize,
-    /// No rotation follows: fewer than three positions, or a line, or one place.
+    /// The rotation is undetermined: fewer than three positions, all on a line, or all at one point.
     is_line: bool,
-    /// Not even a length follows.
-    is_place: bool,
+    /// The scale is undetermined too: all at one point.
+    is_coincident: bool,
 }
 
 impl Fit {
-    fn alignment(&self, evidence: ScaleEvidence, inliers: usize) -> CameraAlignment {
+    fn alignment(&self, scale_source: ScaleSource, inliers: usize) -> CameraAlignment {
         let (rotation, translation) = (self.rotation, self.translation);
-        CameraAlignment { scale: self.scale, rotation, translation, evidence, inliers }
+        CameraAlignment { scale: self.scale, rotation, translation, scale_source, inliers }
     }
 }
 
@@ -130,8 +131,8 @@ fn fit(source: &[Vector3<f64>], target: &[Vector3<f64>]) -> Fit {
         covariance += (p - target_mean) * (g - source_mean).transpose() / n;
         source_variance += (g - source_mean).norm_squared() / n;
     }
-    let is_place = is_one_place(source, &source_mean) || is_one_place(target, &target_mean);
-    // A matrix that is not finite has no decomposition: the fit is refused as one place.
+    let is_coincident = are_coincident(source, &source_mean) || are_coincident(target, &target_mean);
+    // A matrix that is not finite has no decomposition; the fit is treated as coincident positions.
     let decomposed = covariance.iter().all(|v| v.is_finite()).then(|| covariance.svd(true, true));
     let (mut values, mut rotation, mut trace) = ([0.0; 3], Matrix3::identity(), 0.0);
     if let Some(svd) = decomposed
@@ -151,18 +152,18 @@ fn fit(source: &[Vector3<f64>], target: &[Vector3<f64>]) -> Fit {
         values,
         source_variance,
         official_rank: values.iter().filter(|v| **v > OFFICIAL_RANK_TOLERANCE).count(),
-        is_line: is_place || source.len() < 3 || !(values[1] > LINE_TOLERANCE * values[0]),
-        is_place,
+        is_line: is_coincident || source.len() < 3 || !(values[1] > LINE_TOLERANCE * values[0]),
+        is_coincident,
     }
 }
 
-fn is_one_place(points: &[Vector3<f64>], mean: &Vector3<f64>) -> bool {
+fn are_coincident(points: &[Vector3<f64>], mean: &Vector3<f64>) -> bool {
     let spread = points.iter().map(|p| (p - mean).norm()).fold(0.0, f64::max);
     let size = points.iter().map(|p| p.norm()).fold(0.0, f64::max);
-    !(spread > PLACE_TOLERANCE * size)
+    !(spread > COINCIDENT_TOLERANCE * size)
 }
 
-/// The scale along the only direction there is; the rotation that fits the cameras' own orientations best.
+/// The scale from lengths along the line; the rotation that fits the orientations of the cameras best.
 fn align_line(predicted: &[Matrix4<f64>], given: &[Matrix4<f64>], full: &Fit) -> CameraAlignment {
     let mut sum = Matrix3::zeros();
     for (p, g) in predicted.iter().zip(given) {
@@ -172,15 +173,15 @@ fn align_line(predicted: &[Matrix4<f64>], given: &[Matrix4<f64>], full: &Fit) ->
     }
     let rotation = nearest_rotation(&sum);
     let along = full.values[0] / full.source_variance;
-    let is_seen = !full.is_place && along.is_finite() && along > 0.0;
-    let scale = if is_seen { along } else { 1.0 };
+    let is_observable = !full.is_coincident && along.is_finite() && along > 0.0;
+    let scale = if is_observable { along } else { 1.0 };
     let mean =
         |cameras: &[Matrix4<f64>]| cameras.iter().map(centre).sum::<Vector3<f64>>() / cameras.len() as f64;
     CameraAlignment {
         scale,
         translation: mean(predicted) - rotation * mean(given) * scale,
         rotation,
-        evidence: if is_seen { ScaleEvidence::LengthAlongLine } else { ScaleEvidence::Nothing },
+        scale_source: if is_observable { ScaleSource::LengthAlongLine } else { ScaleSource::Unobservable },
         inliers: given.len(),
     }
 }
@@ -199,13 +200,13 @@ fn nearest_rotation(matrix: &Matrix3<f64>) -> Matrix3<f64> {
     }
 }
 
-/// Ten fits to half of the views each; the one with most inliers, then least mean error, refitted to its inliers.
+/// Ten fits to half of the views each; the one with most inliers, then the smallest mean error, is refitted to its inliers.
 ///
 /// The threshold is the median over views of the distance to the *nearest* predicted centre after a fit to all.
 fn ransac(source: &[Vector3<f64>], target: &[Vector3<f64>], full: &Fit) -> CameraAlignment {
-    let everything = full.alignment(ScaleEvidence::Similarity, source.len());
+    let all_views = full.alignment(ScaleSource::Similarity, source.len());
     let nearest = |g: &Vector3<f64>| {
-        let moved = everything.apply(g);
+        let moved = all_views.apply(g);
         target.iter().map(|p| (p - moved).norm()).fold(f64::INFINITY, f64::min)
     };
     let threshold = median(source.iter().map(nearest).collect());
@@ -217,7 +218,7 @@ fn ransac(source: &[Vector3<f64>], target: &[Vector3<f64>], full: &Fit) -> Camer
         if candidate.official_rank < 2 {
             continue;
         }
-        let candidate = candidate.alignment(ScaleEvidence::SimilarityOfInliers, 0);
+        let candidate = candidate.alignment(ScaleSource::SimilarityOfInliers, 0);
         let error = |i: usize| (candidate.apply(&source[i]) - target[i]).norm();
         let inliers: Vec<usize> = (0..source.len()).filter(|&i| error(i) <= threshold).collect();
         let count = inliers.len();
@@ -229,7 +230,7 @@ fn ransac(source: &[Vector3<f64>], target: &[Vector3<f64>], full: &Fit) -> Camer
         }
     }
     let Some((count, _, candidate, inliers)) = best else {
-        return everything;
+        return all_views;
     };
     if count < 3 {
         return CameraAlignment { inliers: count, ..candidate };
@@ -239,7 +240,7 @@ fn ransac(source: &[Vector3<f64>], target: &[Vector3<f64>], full: &Fit) -> Camer
     if refit.official_rank < 2 {
         return CameraAlignment { inliers: count, ..candidate };
     }
-    refit.alignment(ScaleEvidence::SimilarityOfInliers, count)
+    refit.alignment(ScaleSource::SimilarityOfInliers, count)
 }
 
 /// The samples of RANSAC for a number of views: the same as the official code draws.
@@ -249,7 +250,7 @@ pub fn samples(views: usize) -> Vec<Vec<usize>> {
     (0..RANSAC_ROUNDS).map(|_| generator.choose(views, size)).collect()
 }
 
-/// Middle value, mean of the two middle ones for an even number.
+/// The median; the mean of the two central values for an even number.
 pub(crate) fn median(mut values: Vec<f64>) -> f64 {
     values.sort_by(f64::total_cmp);
     let n = values.len();

@@ -27,7 +27,7 @@ fn a_bent_path_gives_the_similarity_back() {
     let (predicted, given) = pair(&bend(5));
     for is_strict in [false, true] {
         let found = align_cameras(&predicted, &given, is_strict).unwrap();
-        assert!((found.scale - 0.5).abs() < 1e-12 && found.evidence == ScaleEvidence::Similarity);
+        assert!((found.scale - 0.5).abs() < 1e-12 && found.scale_source == ScaleSource::Similarity);
         for (p, g) in predicted.iter().zip(&given) {
             assert!((found.to_predicted(g) - p).norm() < 1e-12);
         }
@@ -40,7 +40,7 @@ fn a_line_and_two_views_give_the_length_and_keep_the_cameras_orientation() {
     for positions in [&line[..], &line[..2]] {
         let (predicted, given) = pair(positions);
         let found = align_cameras(&predicted, &given, false).unwrap();
-        assert_eq!(found.evidence, ScaleEvidence::LengthAlongLine);
+        assert_eq!(found.scale_source, ScaleSource::LengthAlongLine);
         assert!((found.scale - 0.5).abs() < 1e-9, "{}", found.scale);
         for (p, g) in predicted.iter().zip(&given) {
             assert!((found.to_predicted(g) - p).norm() < 1e-9);
@@ -52,11 +52,11 @@ fn a_line_and_two_views_give_the_length_and_keep_the_cameras_orientation() {
 }
 
 #[test]
-fn one_place_shows_no_scale_and_says_so() {
+fn coincident_positions_are_reported_as_unobservable_scale() {
     for positions in [vec![Vector3::new(1.0, 2.0, 3.0)], vec![Vector3::new(1.0, 2.0, 3.0); 4]] {
         let (predicted, given) = pair(&positions);
         let found = align_cameras(&predicted, &given, false).unwrap();
-        assert_eq!((found.evidence, found.scale), (ScaleEvidence::Nothing, 1.0));
+        assert_eq!((found.scale_source, found.scale), (ScaleSource::Unobservable, 1.0));
         assert!(found.translation.iter().all(|v| v.is_finite()));
         assert!(align_cameras(&predicted, &given, true).is_err());
     }
@@ -67,14 +67,14 @@ fn from_ten_views_on_an_outlier_is_left_out() {
     let (mut predicted, given) = pair(&bend(16));
     predicted[11] = camera(Vector3::new(40.0, -30.0, 9.0), 1.0);
     let found = align_cameras(&predicted, &given, false).unwrap();
-    assert_eq!(found.evidence, ScaleEvidence::SimilarityOfInliers);
+    assert_eq!(found.scale_source, ScaleSource::SimilarityOfInliers);
     assert!(found.inliers < 16 && (found.scale - 0.5).abs() < 1e-6, "{found:?}");
 }
 
 #[test]
-fn predictions_that_are_not_finite_do_not_end_the_program() {
+fn predictions_that_are_not_finite_give_no_scale() {
     let (mut predicted, given) = pair(&bend(4));
     predicted[2][(0, 3)] = f64::NAN;
     let found = align_cameras(&predicted, &given, false).unwrap();
-    assert_eq!(found.evidence, ScaleEvidence::Nothing);
+    assert_eq!(found.scale_source, ScaleSource::Unobservable);
 }

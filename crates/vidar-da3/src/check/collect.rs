@@ -1,15 +1,15 @@
-//! Gathers the intermediate results of a run that a reference file has, views stacked and channels first.
+//! Collects the intermediate results of a run that a reference file contains, views stacked and channels first.
 
 use super::golden::Golden;
 use crate::trace::{Layout, Trace, Traced};
 use std::collections::BTreeMap;
 use std::sync::{Mutex, PoisonError};
 
-/// What a run showed.
+/// Collected intermediate results.
 pub(super) struct Collector {
     wanted: Vec<String>,
     views: usize,
-    seen: Mutex<BTreeMap<String, Stack>>,
+    stacks: Mutex<BTreeMap<String, Stack>>,
 }
 
 /// One result of all views.
@@ -17,20 +17,20 @@ pub(super) struct Collector {
 pub(super) struct Stack {
     /// Shape of one view's part, channels first.
     pub shape: Vec<usize>,
-    /// By view; empty for those not seen.
+    /// By view; empty where nothing was recorded.
     pub views: Vec<Vec<f32>>,
-    /// When it was first seen.
+    /// Its position in the order of computation.
     pub order: usize,
 }
 
 impl Collector {
     pub fn new(golden: &Golden) -> Self {
         let wanted = golden.names().map(|name| without_thinning(name).0.to_owned()).collect();
-        Self { wanted, views: golden.views, seen: Mutex::new(BTreeMap::new()) }
+        Self { wanted, views: golden.views, stacks: Mutex::new(BTreeMap::new()) }
     }
 
     pub fn take(&self, name: &str) -> Option<Stack> {
-        self.seen.lock().unwrap_or_else(PoisonError::into_inner).get(name).cloned()
+        self.stacks.lock().unwrap_or_else(PoisonError::into_inner).get(name).cloned()
     }
 }
 
@@ -46,10 +46,10 @@ impl Trace for Collector {
             }
             _ => (tensor.shape.to_vec(), tensor.data.to_vec()),
         };
-        let mut seen = self.seen.lock().unwrap_or_else(PoisonError::into_inner);
-        let order = seen.len();
+        let mut stacks = self.stacks.lock().unwrap_or_else(PoisonError::into_inner);
+        let order = stacks.len();
         let new = || Stack { shape, views: vec![Vec::new(); self.views], order };
-        let stack = seen.entry(tensor.name.to_owned()).or_insert_with(new);
+        let stack = stacks.entry(tensor.name.to_owned()).or_insert_with(new);
         if let Some(view) = stack.views.get_mut(tensor.view) {
             *view = data;
         }
@@ -60,10 +60,10 @@ fn channels_first(data: &[f32], channels: usize) -> Vec<f32> {
     (0..channels).flat_map(|c| data.iter().skip(c).step_by(channels.max(1)).copied()).collect()
 }
 
-/// How a reference keeps a tensor.
+/// How a tensor is subsampled in a reference.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Thinning {
-    /// All of it.
+    /// Not at all.
     None,
     /// Every N-th row and column of pixels.
     Pixels(usize),

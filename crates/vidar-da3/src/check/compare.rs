@@ -1,19 +1,20 @@
-//! Comparing what a run yields with a reference.
+//! Comparison of a run with a reference.
 
 use super::collect::{Collector, Thinning, without_thinning};
 use super::golden::Golden;
-use super::report::{CheckReport, Measure, Row, Tolerances, Verdict};
+use super::report::{CheckReport, CheckResult, Measure, Row, Tolerances};
 use super::three_rows;
 use crate::da3::Da3;
 use crate::error::Da3Error;
 use crate::infer::NetOutput;
 use crate::model::backbone::ReferenceStrategy;
 
-/// Sky this near to the threshold may fall on either side; in rounded arithmetic, twice what depth is allowed.
+/// Distance from the sky threshold within which a pixel may fall on either side; in rounded arithmetic, twice the tolerance
+/// of depth.
 const SKY_MARGIN: f64 = 1e-4;
 const SKY_THRESHOLD: f64 = 0.3;
 
-/// A comparison under way.
+/// A comparison in progress.
 pub(super) struct Comparison<'a> {
     golden: &'a Golden,
     tolerances: Tolerances,
@@ -25,7 +26,7 @@ impl<'a> Comparison<'a> {
         Self { golden, tolerances, rows: Vec::new() }
     }
 
-    /// Compares the numbers of one tensor, `[views…]`, if the reference has it.
+    /// Compares one tensor, `[views…]`, if the reference has it.
     pub fn tensor(&mut self, name: &str, found: &[f64]) -> Result<(), Da3Error> {
         if self.golden.names().any(|n| n == name) {
             let (_, expected) = self.golden.tensor(name)?;
@@ -38,7 +39,7 @@ impl<'a> Comparison<'a> {
     pub fn bytes(&mut self, name: &str, found: &[u8]) -> Result<(), Da3Error> {
         if self.golden.names().any(|n| n == name) {
             let expected = self.golden.bytes(name)?;
-            let verdict = if expected == found { Verdict::Holds } else { Verdict::Departs };
+            let result = if expected == found { CheckResult::Passed } else { CheckResult::Failed };
             let differing = expected.iter().zip(found).filter(|(a, b)| a != b).count();
             let worst = expected.iter().zip(found).map(|(a, b)| a.abs_diff(*b)).max().unwrap_or(0);
             let note = format!("{differing} bytes of {} differ", expected.len());
@@ -50,20 +51,20 @@ impl<'a> Comparison<'a> {
                 deviation: 1.0,
                 tolerance: 0.0,
                 measure: Measure::Largest,
-                verdict,
+                result,
                 note,
             });
         }
         Ok(())
     }
 
-    /// The reference view must be the same, except where two views tie.
+    /// The reference view must be the same, except where two views have equal scores.
     pub fn reference(&mut self, expected: usize, found: usize, strategy: ReferenceStrategy) {
         let is_tie = strategy == ReferenceStrategy::SaddleSimRange;
-        let verdict = match expected == found {
-            true => Verdict::Holds,
-            false if is_tie => Verdict::Noted,
-            false => Verdict::Departs,
+        let result = match expected == found {
+            true => CheckResult::Passed,
+            false if is_tie => CheckResult::NotEvaluated,
+            false => CheckResult::Failed,
         };
         let note = format!("view {found}, expected {expected}");
         self.rows.push(Row {
@@ -74,12 +75,12 @@ impl<'a> Comparison<'a> {
             deviation: 1.0,
             tolerance: 0.0,
             measure: Measure::Largest,
-            verdict,
+            result,
             note,
         });
     }
 
-    /// Compares everything the collector saw, in the order of computation.
+    /// Compares all collected intermediate results, in the order of computation.
     pub fn traced(&mut self, collector: &Collector) -> Result<(), Da3Error> {
         let mut found = Vec::new();
         for name in self.golden.names() {
@@ -97,7 +98,7 @@ impl<'a> Comparison<'a> {
         Ok(())
     }
 
-    /// Compares the network's answer.
+    /// Compares the network's output.
     pub fn output(&mut self, output: &NetOutput) -> Result<(), Da3Error> {
         let (rows, columns) = (self.golden.rows, self.golden.columns);
         let map = vec![rows, columns];
@@ -129,7 +130,7 @@ impl<'a> Comparison<'a> {
             self.tensor("out.intrinsics", &rows)?;
         }
         if let Some(scale) = output.scale_factor {
-            // A single number has no deviation: it is compared with its own size.
+            // A single number has no deviation: it is compared relative to its magnitude.
             let name = "out.scale_factor_f64";
             if self.golden.names().any(|n| n == name) {
                 let expected = self.golden.tensor(name)?.1[0];
@@ -139,11 +140,11 @@ impl<'a> Comparison<'a> {
         Ok(())
     }
 
-    /// Compares a number relative to its size.
+    /// Compares a number relative to its magnitude.
     pub fn number(&mut self, name: &str, expected: f64, found: f64) {
         let (difference, tolerance) = ((expected - found).abs(), self.tolerances.of_output(name, None));
         let size = expected.abs().max(f64::MIN_POSITIVE);
-        let verdict = self.judge(difference / size, tolerance);
+        let result = self.evaluate(difference / size, tolerance);
         self.rows.push(Row {
             tensor: name.into(),
             max_difference: difference,
@@ -152,7 +153,7 @@ impl<'a> Comparison<'a> {
             deviation: size,
             tolerance: tolerance.unwrap_or(f64::INFINITY),
             measure: self.tolerances.measure,
-            verdict,
+            result,
             note: "relative".into(),
         });
     }
@@ -175,12 +176,12 @@ impl<'a> Comparison<'a> {
         let rounding = self.golden.entry.f32_vs_f64.get(base.trim_start_matches("out."));
         let tolerance = self.tolerances.of_output(base, rounding.map(|r| r.max_abs_over_std));
         let deviation = deviation(expected);
-        let is_doubtful = self.doubtful_pixels(base, expected.len());
+        let is_near_threshold = self.pixels_near_threshold(base, expected.len());
         let (mut worst, mut squares) = (0.0f64, 0.0f64);
         let mut left_out = 0;
         let mut all = Vec::with_capacity(expected.len());
         for (i, (e, f)) in expected.iter().zip(found).enumerate() {
-            if is_doubtful.get(i).copied().unwrap_or(false) {
+            if is_near_threshold.get(i).copied().unwrap_or(false) {
                 left_out += 1;
                 continue;
             }
@@ -199,7 +200,7 @@ impl<'a> Comparison<'a> {
         } else if left_out > 0 {
             note = format!("{left_out} pixels at the sky threshold left out");
         }
-        // A tensor that is constant is compared with its size, and one of zeros with one.
+        // A constant tensor is compared relative to its magnitude, a zero tensor absolutely.
         let size = expected.iter().fold(0.0f64, |m, v| m.max(v.abs()));
         let deviation = if deviation > 1e-12 * size {
             deviation
@@ -209,11 +210,12 @@ impl<'a> Comparison<'a> {
             1.0
         };
         let measure = self.tolerances.measure;
-        let judged = match measure {
+        let evaluated = match measure {
             Measure::Largest => worst,
             Measure::RootMeanSquare => rms_difference,
         };
-        let verdict = if has_all { self.judge(judged / deviation, tolerance) } else { Verdict::Departs };
+        let result =
+            if has_all { self.evaluate(evaluated / deviation, tolerance) } else { CheckResult::Failed };
         self.rows.push(Row {
             tensor: name.into(),
             max_difference: worst,
@@ -222,21 +224,21 @@ impl<'a> Comparison<'a> {
             measure,
             deviation,
             tolerance: tolerance.unwrap_or(f64::INFINITY),
-            verdict,
+            result,
             note,
         });
     }
 
-    fn judge(&self, ratio: f64, tolerance: Option<f64>) -> Verdict {
+    fn evaluate(&self, ratio: f64, tolerance: Option<f64>) -> CheckResult {
         match tolerance {
-            Some(tolerance) if ratio <= tolerance => Verdict::Holds,
-            Some(_) => Verdict::Departs,
-            None => Verdict::Noted,
+            Some(tolerance) if ratio <= tolerance => CheckResult::Passed,
+            Some(_) => CheckResult::Failed,
+            None => CheckResult::NotEvaluated,
         }
     }
 
-    /// Pixels whose sky is so near the threshold that rounding decides.
-    fn doubtful_pixels(&self, base: &str, length: usize) -> Vec<bool> {
+    /// Pixels whose sky value is so close to the threshold that rounding decides.
+    fn pixels_near_threshold(&self, base: &str, length: usize) -> Vec<bool> {
         let sky_name = match base {
             "out.depth" | "out.depth_conf" => ["metric.sky", "out.sky"],
             _ => return Vec::new(),
@@ -262,7 +264,7 @@ impl<'a> Comparison<'a> {
     }
 }
 
-/// What one number in a thousand exceeds; the largest of fewer than a thousand.
+/// The 99.9 % quantile; the largest of fewer than a thousand values.
 fn high_quantile(values: &mut [f64]) -> f64 {
     let Some(last) = values.len().checked_sub(1) else { return 0.0 };
     let at = last - values.len() / 1000;
@@ -275,7 +277,7 @@ fn deviation(values: &[f64]) -> f64 {
     (values.iter().map(|v| (v - mean).powi(2)).sum::<f64>() / n).sqrt()
 }
 
-/// Keeps of one view's tensor what a thinned reference keeps.
+/// Thins one view's tensor as the reference is thinned.
 fn thin(values: &[f32], shape: &[usize], thinning: Thinning) -> Vec<f64> {
     let keep = |values: &[f32]| values.iter().map(|v| f64::from(*v)).collect::<Vec<_>>();
     match (thinning, shape) {

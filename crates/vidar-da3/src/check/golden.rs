@@ -4,7 +4,7 @@ use crate::config::{Da3Config, Variant, json};
 use crate::error::Da3Error;
 use crate::model::backbone::ReferenceStrategy;
 use crate::preprocess::normalise;
-use crate::weights::deterministic::image_u8;
+use crate::weights::synthetic::image_u8;
 use serde::Deserialize;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};

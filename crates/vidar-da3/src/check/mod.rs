@@ -1,9 +1,9 @@
 //! Checking a model against reference files.
 //!
 //! A reference is a safetensors file of named tensors, described by an entry of the `manifest.json` beside it: which
-//! network (`model`, or a whole `config`), `views`, `H`, `W`, what the input is, and `kwargs`. Weights are made by rule
-//! ([`crate::weights::deterministic`]) unless a checkpoint is given. Every tensor of the file that a run yields is compared in the order of
-//! computation, so that the first failing row names the first layer that departs.
+//! network (`model`, or a whole `config`), `views`, `H`, `W`, what the input is, and `kwargs`. Weights are synthetic
+//! ([`crate::weights::synthetic`]) unless a checkpoint is given. Every tensor of the file that a run computes is compared in
+//! the order of computation, so that the first failing row names the first layer that differs.
 //!
 //! Names: `input` `[S,3,H,W]`; `patch_embed`, `tokens_in`, `blockII`, `featK`, `camtokK`, `pose_enc`, `cam_enc_pose9`,
 //! `cam_enc_tokens`; `head.*` with channels first; `out.*`; for nested models `any.*`, `metric.*`; for inference with
@@ -17,19 +17,20 @@ mod posed;
 mod report;
 
 pub use golden::Golden;
-pub use report::{CheckReport, Measure, Row, Tolerances, Verdict};
+pub use report::{CheckReport, CheckResult, Measure, Row, Tolerances};
 
 use crate::da3::{Da3, Da3Options};
 use crate::error::Da3Error;
-use crate::infer::{Hooks, InferOptions, NetCameras, NetOutput};
+use crate::infer::{InferOptions, NetOutput};
 use crate::model::backbone::{Pixels, ReferenceStrategy};
-use crate::pose;
+use crate::pose::{self, NetCameras};
+use crate::run::Hooks;
 use collect::Collector;
 use compare::Comparison;
 use golden::Kind;
 use std::path::Path;
 
-/// Checks one reference file; `weights` is a model to open instead of weights made by rule.
+/// Checks one reference file; `weights` is a model to open instead of synthetic weights.
 pub fn check_file(
     file: &Path,
     weights: Option<&Path>,
@@ -38,7 +39,7 @@ pub fn check_file(
     let golden = Golden::open(file)?;
     let model = match weights {
         Some(path) => Da3::open(path, options)?,
-        None => Da3::deterministic_of(golden.config()?, options)?,
+        None => Da3::synthetic_of(golden.config()?, options)?,
     };
     check(&golden, &model, &Hooks::default())
 }
@@ -72,7 +73,7 @@ pub fn check(golden: &Golden, model: &Da3, hooks: &Hooks<'_>) -> Result<CheckRep
         let found = output.reference;
         comparison.reference(expected, found, golden.strategy);
         if expected != found {
-            // Two views tie, and rounding decides: go on with the reference's choice.
+            // Two views have equal scores and rounding decides: go on with the choice of the reference.
             options.reference = ReferenceStrategy::View(expected);
             (output, collector) = forward(&options)?;
         }
@@ -85,7 +86,7 @@ pub fn check(golden: &Golden, model: &Da3, hooks: &Hooks<'_>) -> Result<CheckRep
     Ok(comparison.report(model))
 }
 
-/// Rows of a rigid transform as reference files hold it: 3 × 4.
+/// The first three rows of a rigid transform, as reference files store it.
 fn three_rows(matrix: &nalgebra::Matrix4<f64>) -> Vec<f64> {
     let (rotation, translation) = pose::parts(matrix);
     (0..3).flat_map(|r| [rotation[(r, 0)], rotation[(r, 1)], rotation[(r, 2)], translation[r]]).collect()

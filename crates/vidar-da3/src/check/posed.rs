@@ -5,14 +5,15 @@ use super::golden::Golden;
 use super::three_rows;
 use crate::da3::Da3;
 use crate::error::Da3Error;
-use crate::infer::{Hooks, InferOptions, Inputs, Prediction};
+use crate::infer::{InferOptions, Inputs, Prediction};
 use crate::pose::{Cameras, normalise_world};
 use crate::preprocess::{self, PreprocessConfig};
-use crate::weights::deterministic::image_u8;
+use crate::run::Hooks;
+use crate::weights::synthetic::image_u8;
 use nalgebra::{Matrix3, Matrix4};
 use vidar_core::Image;
 
-/// Cameras as the network is told them, compared on the way with what the reference fed.
+/// The cameras that the network takes; the intermediate values are compared with those of the reference.
 pub(super) fn net_cameras(golden: &Golden, comparison: &mut Comparison<'_>) -> Result<Cameras, Da3Error> {
     let moved = normalise_world(&given(golden)?.camera_from_world);
     let rows: Vec<f64> =
@@ -23,7 +24,7 @@ pub(super) fn net_cameras(golden: &Golden, comparison: &mut Comparison<'_>) -> R
     Ok(Cameras { camera_from_world: moved, intrinsics })
 }
 
-/// Runs inference as a user would, aligned and not, and compares.
+/// Runs the public interface with and without alignment, and compares.
 pub(super) fn check_interface(
     golden: &Golden,
     model: &Da3,

@@ -1,4 +1,4 @@
-//! What a check says.
+//! Results of a check.
 
 use crate::config::Variant;
 use crate::da3::Da3;
@@ -15,7 +15,7 @@ pub struct CheckReport {
     pub model: String,
     /// Kernels and precision ([`crate::Arithmetic`]).
     pub compute: String,
-    /// Which difference rows are judged by.
+    /// The difference that rows are evaluated by.
     pub measure: Measure,
     /// One row a tensor, in the order of computation.
     pub rows: Vec<Row>,
@@ -34,23 +34,23 @@ pub struct Row {
     pub rms_difference: f64,
     /// Standard deviation of the reference (its size, for a constant one).
     pub deviation: f64,
-    /// Allowed difference over deviation, of the `measure`; infinite where nothing is promised.
+    /// Largest allowed difference over deviation, of the `measure`; infinite where there is no tolerance.
     pub tolerance: f64,
-    /// Which difference is judged.
+    /// The difference that is evaluated.
     pub measure: Measure,
-    /// Whether it holds.
-    pub verdict: Verdict,
-    /// What else there is to say.
+    /// Whether it passed.
+    pub result: CheckResult,
+    /// Remarks.
     pub note: String,
 }
 
-/// Which difference a tolerance is about.
+/// The difference that a tolerance bounds.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Measure {
     /// The largest one.
     Largest,
-    /// The root of the mean square: what is promised where rounding is not guarded ([`crate::Arithmetic`]). (The official
+    /// The root mean square: bounded where the largest error is not ([`crate::Arithmetic`]). (The official
     /// code in bf16 is off by up to 0.054 of the deviation of depth at single pixels, 0.009 in the mean square, on the
     /// same references.)
     RootMeanSquare,
@@ -68,17 +68,17 @@ impl fmt::Display for Measure {
 /// Outcome of a row.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "kebab-case")]
-pub enum Verdict {
+pub enum CheckResult {
     /// Within tolerance.
-    Holds,
+    Passed,
     /// Outside.
-    Departs,
-    /// Nothing is promised of it in this precision.
-    Noted,
+    Failed,
+    /// This precision has no tolerance for it.
+    NotEvaluated,
 }
 
 impl Row {
-    /// The judged difference over deviation.
+    /// The evaluated difference over deviation.
     pub fn ratio(&self) -> f64 {
         match self.measure {
             Measure::Largest => self.max_difference / self.deviation,
@@ -88,38 +88,38 @@ impl Row {
 }
 
 impl CheckReport {
-    /// Whether no row departs.
-    pub fn holds(&self) -> bool {
-        self.rows.iter().all(|row| row.verdict != Verdict::Departs)
+    /// Whether no row failed.
+    pub fn passed(&self) -> bool {
+        self.rows.iter().all(|row| row.result != CheckResult::Failed)
     }
 
-    /// The first tensor, in the order of computation, that departs.
-    pub fn first_departure(&self) -> Option<&Row> {
-        self.rows.iter().find(|row| row.verdict == Verdict::Departs)
+    /// The first tensor, in the order of computation, that failed.
+    pub fn first_failure(&self) -> Option<&Row> {
+        self.rows.iter().find(|row| row.result == CheckResult::Failed)
     }
 
-    /// The row with the largest ratio among those that are judged.
+    /// The row with the largest ratio among those that are evaluated.
     pub fn worst(&self) -> Option<&Row> {
-        let judged = self.rows.iter().filter(|row| row.verdict != Verdict::Noted);
-        judged.max_by(|a, b| a.ratio().total_cmp(&b.ratio()))
+        let evaluated = self.rows.iter().filter(|row| row.result != CheckResult::NotEvaluated);
+        evaluated.max_by(|a, b| a.ratio().total_cmp(&b.ratio()))
     }
 }
 
 impl fmt::Display for CheckReport {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         writeln!(f, "{} · {} · {}", self.file.display(), self.model, self.compute)?;
-        writeln!(f, "judged by {} over the standard deviation", self.measure)?;
+        writeln!(f, "evaluated by {} over the standard deviation", self.measure)?;
         let width = self.rows.iter().map(|row| row.tensor.len()).max().unwrap_or(0).max(6);
         writeln!(
             f,
-            "{:width$}  {:>9}  {:>9}  {:>9}  {:>9}  {:>9}  verdict",
+            "{:width$}  {:>9}  {:>9}  {:>9}  {:>9}  {:>9}  result",
             "tensor", "max|d|", "/std", "99.9%/std", "rms/std", "allowed"
         )?;
         for row in &self.rows {
-            let verdict = match row.verdict {
-                Verdict::Holds => "holds",
-                Verdict::Departs => "DEPARTS",
-                Verdict::Noted => "noted",
+            let result = match row.result {
+                CheckResult::Passed => "passed",
+                CheckResult::Failed => "FAILED",
+                CheckResult::NotEvaluated => "not evaluated",
             };
             let allowed = if row.tolerance.is_finite() {
                 format!("{:9.1e}", row.tolerance)
@@ -131,27 +131,27 @@ impl fmt::Display for CheckReport {
                 [worst, row.p999_difference, row.rms_difference].map(|difference| difference / row.deviation);
             write!(
                 f,
-                "{name:width$}  {worst:9.2e}  {largest:9.2e}  {high:9.2e}  {rms:9.2e}  {allowed}  {verdict}"
+                "{name:width$}  {worst:9.2e}  {largest:9.2e}  {high:9.2e}  {rms:9.2e}  {allowed}  {result}"
             )?;
             if row.note.is_empty() { writeln!(f)? } else { writeln!(f, " ({})", row.note)? }
         }
-        match self.first_departure() {
-            Some(row) => writeln!(f, "first departure: {}", row.tensor),
-            None => writeln!(f, "all {} rows hold", self.rows.len()),
+        match self.first_failure() {
+            Some(row) => writeln!(f, "first failure: {}", row.tensor),
+            None => writeln!(f, "all {} rows pass", self.rows.len()),
         }
     }
 }
 
-/// What is promised of a model's outputs, as difference over standard deviation.
+/// Tolerances of a model's outputs, as difference over standard deviation.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Tolerances {
-    /// Of which difference.
+    /// The difference that they bound.
     pub measure: Measure,
     /// Depth.
     pub depth: f64,
-    /// Everything else; `None` promises nothing.
+    /// Everything else; `None` is not evaluated.
     pub others: Option<f64>,
-    /// Outputs that the manifest calls ill-conditioned.
+    /// Outputs that the manifest marks as ill-conditioned.
     pub ill_conditioned: f64,
 }
 
@@ -159,7 +159,7 @@ pub struct Tolerances {
 const ILL_CONDITIONED: f64 = 1e-4;
 
 impl Tolerances {
-    /// Those of a model's precision and size.
+    /// The tolerances for a model's precision and size.
     pub fn of(model: &Da3) -> Self {
         let is_giant = matches!(model.config().variant, Some(Variant::Giant | Variant::NestedGiantLarge));
         let arithmetic = model.arithmetic();
@@ -172,11 +172,12 @@ impl Tolerances {
                 ill_conditioned: 1e-3,
             };
         }
-        let measure = if arithmetic.is_guarded() { Measure::Largest } else { Measure::RootMeanSquare };
+        let measure =
+            if arithmetic.bounds_largest_error() { Measure::Largest } else { Measure::RootMeanSquare };
         Self { measure, depth: 2e-2, others: None, ill_conditioned: 2e-2 }
     }
 
-    /// Allowed for a tensor, given how far the official code itself rounds it.
+    /// The tolerance of a tensor, given the rounding error of the official code itself.
     pub(super) fn of_output(&self, name: &str, rounding: Option<f64>) -> Option<f64> {
         let is_depth = matches!(name, "out.depth" | "any.depth");
         let own = if is_depth { Some(self.depth) } else { self.others };

@@ -154,7 +154,7 @@ impl Backbone {
             )?,
         };
         for i in 0..self.config.depth {
-            run.checkpoint()?;
+            run.check_cancelled()?;
             if self.config.alternate_from == Some(i + 1) {
                 self.put_reference_first(recorder, &walk, &mut state, cameras)?;
             }
@@ -162,7 +162,7 @@ impl Backbone {
                 self.place_camera_tokens(recorder, &walk, &state, cameras)?;
             }
             self.block(recorder, &walk, i, &state)?;
-            self.hand_over(recorder, &walk, i, &state, features)?;
+            self.emit(recorder, &walk, i, &state, features)?;
             recorder.submit()?;
         }
         features.camera_tokens = recorder.read(&features.camera, 0, features.camera.len())?;
@@ -183,7 +183,7 @@ impl Backbone {
         let picture = self.gpu.buffer("pixels", length)?;
         let unfolded = self.gpu.buffer("patches", length)?;
         for view in 0..pixels.views {
-            run.checkpoint()?;
+            run.check_cancelled()?;
             let first = view * (1 + patches) * dim;
             picture.write(&self.gpu, 0, &pixels.data[view * length..(view + 1) * length]);
             patchify(recorder, (&picture, 0), [pixels.rows, pixels.columns, PATCH], &unfolded)?;
@@ -226,7 +226,7 @@ impl Backbone {
         }
         if !is_global {
             for (first, views) in groups() {
-                walk.run.checkpoint()?;
+                walk.run.check_cancelled()?;
                 let part = (first * tokens, views * tokens);
                 block.project(recorder, &state.x, part, 0, scratch)?;
                 block.prepare(recorder, part.1, rotation.map(|r| &r.0), scratch)?;
@@ -237,7 +237,7 @@ impl Backbone {
             return Ok(());
         }
         for (first, views) in groups() {
-            walk.run.checkpoint()?;
+            walk.run.check_cancelled()?;
             let part = (first * tokens, views * tokens);
             block.project(recorder, &state.x, part, part.0, scratch)?;
             recorder.submit()?;
@@ -245,7 +245,7 @@ impl Backbone {
         let all = walk.views * tokens;
         block.prepare(recorder, all, rotation.map(|r| &r.1), scratch)?;
         for (first, views) in groups() {
-            walk.run.checkpoint()?;
+            walk.run.check_cancelled()?;
             let part = (first * tokens, views * tokens);
             block.attend_and_finish(recorder, &state.x, part, (part, (0, all), 1), scratch)?;
             recorder.submit()?;
@@ -254,7 +254,7 @@ impl Backbone {
     }
 
     /// Shows the tokens after a block and hands over what is wanted of them.
-    fn hand_over(
+    fn emit(
         &self,
         recorder: &mut Recorder,
         walk: &Walk<'_>,

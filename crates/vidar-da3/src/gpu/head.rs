@@ -228,7 +228,7 @@ impl Head {
             let shape = self.stages.lateral(run, recorder, (view, k), (stage, size), room)?;
             laterals.push((out, shape));
         }
-        run.checkpoint()?;
+        run.check_cancelled()?;
         let room = (&scratch.x, &scratch.inner, &scratch.fused);
         let shape = self.fusion.run(run, recorder, view, &laterals, room)?;
         let shape = convolve(
@@ -257,7 +257,7 @@ impl Head {
         let confidence = depth.split_off(full.pixels());
         let rays = match self.rays.as_ref().filter(|_| wants_rays) {
             Some(branch) => {
-                run.checkpoint()?;
+                run.check_cancelled()?;
                 Some(branch.get()?.run(run, recorder, view, &laterals, (grids, scratch))?)
             }
             None => None,
@@ -298,7 +298,7 @@ impl Pair {
         let pixels = shape.pixels();
         convolve(recorder, (map, shape), &self.first, &scratch.last, false, End::Store)?;
         let name = format!("head.{}.logits", self.name);
-        if run.is_watched(&name) {
+        if run.is_traced(&name) {
             let plain = vec![Activation::None; self.activations.len()];
             point(recorder, (&scratch.last, pixels), &self.last, &plain, (&scratch.answer, at))?;
             let planes = recorder.read(&scratch.answer, at, pixels * plain.len())?;
@@ -346,7 +346,7 @@ impl RayBranch {
         let mut shape = self.fusion.run(run, recorder, view, laterals, room)?;
         let (mut from, mut to) = (&scratch.fused, &scratch.narrow);
         for conv in &self.convs {
-            run.checkpoint()?;
+            run.check_cancelled()?;
             shape = convolve(recorder, (from, shape), conv, to, false, End::Store)?;
             std::mem::swap(&mut from, &mut to);
         }

@@ -25,7 +25,7 @@ use crate::arithmetic::{Arithmetic, exact_blocks};
 use crate::config::{HeadKind, NetConfig};
 use crate::error::Da3Error;
 use crate::model::backbone::{CameraTokens, Pixels};
-use crate::model::{Dense, DeviceLoader, DeviceNet};
+use crate::model::{DenseOutput, DeviceLoader, DeviceNet};
 use crate::run::Run;
 use crate::weights::{Residency, Scope};
 use backbone::Backbone;
@@ -100,7 +100,7 @@ impl DeviceNet for Network {
         tokens: CameraTokens<'_>,
         layers: &[usize],
         (wanted, wants_rays): (Range<usize>, bool),
-    ) -> Result<Dense, Da3Error> {
+    ) -> Result<DenseOutput, Da3Error> {
         let wants_rays = wants_rays && self.net.head.kind == HeadKind::DualDpt;
         let size = (pixels.views, pixels.rows, pixels.columns);
         plan::Size::new(&self.net, size, wanted.len(), wants_rays).working().fits(&self.gpu)?;
@@ -113,7 +113,7 @@ impl DeviceNet for Network {
         let mut scratch = head::Scratch::new(&self.gpu, &self.net, pixels, wants_rays)?;
         let mut views = Vec::with_capacity(wanted.len());
         for (view, stages) in stages.into_iter().enumerate().filter(|(view, _)| wanted.contains(view)) {
-            run.checkpoint()?;
+            run.check_cancelled()?;
             let picture = (view, pixels.rows, pixels.columns);
             views.push(self.head.run(
                 run,
@@ -124,7 +124,7 @@ impl DeviceNet for Network {
                 &mut scratch,
             )?);
         }
-        Ok(Dense { views, camera_tokens, layers, reference })
+        Ok(DenseOutput { views, camera_tokens, layers, reference })
     }
 }
 
@@ -136,7 +136,7 @@ fn show(
     shape: &[usize],
     (buffer, at): (&vidar_gpu::Buffer, usize),
 ) -> Result<(), Da3Error> {
-    if run.is_watched(name) {
+    if run.is_traced(name) {
         let values = recorder.read(buffer, at, shape.iter().product())?;
         run.show(name, view, shape, &values);
     }
@@ -151,7 +151,7 @@ fn show_map(
     shape: vidar_gpu::ops::MapShape,
     buffer: &vidar_gpu::Buffer,
 ) -> Result<(), Da3Error> {
-    if run.is_watched(name) {
+    if run.is_traced(name) {
         let values = recorder.read(buffer, 0, shape.len())?;
         run.show_map(name, view, [shape.rows, shape.columns, shape.channels], &values);
     }

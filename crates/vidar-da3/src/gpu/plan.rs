@@ -4,7 +4,7 @@ use super::backbone::{FFN_ROWS, group_views};
 use super::block::inner_width;
 use super::head::ScratchSizes;
 use crate::config::{Da3Config, NetConfig, Networks, PATCH};
-use crate::device::DevicePlan;
+use crate::model::DevicePlan;
 use crate::weights::inventory::parameters;
 use vidar_gpu::{Adapter, Gpu, GpuError};
 

@@ -164,7 +164,7 @@ impl Fusion {
         let mut shape = *shape;
         recorder.copy((coarsest, 0), (x, 0), shape.len());
         for level in (0..4).rev() {
-            run.checkpoint()?;
+            run.check_cancelled()?;
             let block = &self.blocks[level];
             if let Some(unit) = &block.lateral {
                 let (lateral, _) = &laterals[level];

@@ -1,13 +1,13 @@
 //! The network on normalised pixels: what is between preprocessing and alignment.
 
-use super::{Hooks, InferOptions, NetCameras};
+use super::InferOptions;
 use crate::da3::Da3;
 use crate::error::Da3Error;
 use crate::model::backbone::Pixels;
-use crate::model::{AnyView, Model, Nested, Request, SingleAnswer, scale_to_metres};
-use crate::pose::{self, Cameras};
+use crate::model::{AnyView, Model, Nested, Request, SingleViewOutput, scale_to_metres};
+use crate::pose::{self, Cameras, NetCameras};
 use crate::ray_pose::{RayMap, camera_from_rays, sample_table};
-use crate::run::Run;
+use crate::run::{Hooks, Run};
 use nalgebra::{Matrix3, Matrix4};
 use std::collections::BTreeMap;
 use std::ops::Range;
@@ -106,7 +106,7 @@ impl Da3 {
     }
 }
 
-fn show_ends(run: &Run<'_>, pixels: &Pixels<'_>, output: &NetOutput, answer: &SingleAnswer) {
+fn show_ends(run: &Run<'_>, pixels: &Pixels<'_>, output: &NetOutput, answer: &SingleViewOutput) {
     let shape = [pixels.rows, pixels.columns];
     let confidence = output.confidence.as_deref().unwrap_or_default();
     let ends: [(&str, &[f32]); 4] = [
@@ -145,7 +145,7 @@ fn any_view(
     if options.use_ray_pose {
         let mut found = Cameras::default();
         for map in views.iter().filter_map(|v| v.rays.as_ref()) {
-            run.checkpoint()?;
+            run.check_cancelled()?;
             let camera = camera_from_rays(map, &sample_table(map.rows * map.columns))?;
             found.intrinsics.push(camera.intrinsics(width, height));
             found.camera_from_world.push(camera.camera_from_world);

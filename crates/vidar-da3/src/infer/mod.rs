@@ -15,9 +15,9 @@ use crate::align::align_cameras;
 use crate::da3::Da3;
 use crate::error::Da3Error;
 use crate::model::backbone::{Pixels, ReferenceStrategy};
-use crate::pose;
+use crate::pose::{self, NetCameras};
 use crate::preprocess::{self, Batch, PreprocessConfig, denormalise, normalise_into};
-use crate::trace::Trace;
+use crate::run::Hooks;
 use nalgebra::{Matrix3, Matrix4};
 use std::ops::Range;
 use vidar_core::Image;
@@ -87,31 +87,6 @@ impl Default for InferOptions {
             compat: false,
         }
     }
-}
-
-/// Who may stop a run, and who looks on.
-#[derive(Clone, Copy)]
-pub struct Hooks<'a> {
-    /// Asked between blocks and views; `true` ends the run with [`Da3Error::Cancelled`].
-    pub cancel: &'a (dyn Fn() -> bool + Sync),
-    /// Gets intermediate results.
-    pub trace: Option<&'a dyn Trace>,
-}
-
-impl Default for Hooks<'_> {
-    fn default() -> Self {
-        Self { cancel: &|| false, trace: None }
-    }
-}
-
-/// Cameras as the network is told them: the first is the world, distances are normalised, intrinsics are those of the
-/// pixels.
-#[derive(Clone, Copy, Debug)]
-pub struct NetCameras<'a> {
-    /// Poses, see [`pose::normalise_world`].
-    pub camera_from_world: &'a [Matrix4<f64>],
-    /// Intrinsics of the network's pixels.
-    pub intrinsics: &'a [Matrix3<f64>],
 }
 
 /// Most views of one run: the tokens of more do not fit any machine.

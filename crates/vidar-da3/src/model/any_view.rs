@@ -3,12 +3,11 @@
 use super::backbone::{Backbone, CameraTokens, Feature, FeatureSink, Pixels, ReferenceStrategy};
 use super::cam_dec::CameraDecoder;
 use super::cam_enc::CameraEncoder;
+use super::device::{DenseOutput, DeviceLoader, DeviceNet};
 use super::head::{DenseView, DualDpt, Embeddings, Map};
-use super::{Dense, DeviceLoader, DeviceNet};
 use crate::config::NetConfig;
 use crate::error::Da3Error;
-use crate::infer::NetCameras;
-use crate::pose;
+use crate::pose::{self, NetCameras};
 use crate::run::Run;
 use crate::weights::{Residency, Scope, Slot};
 use std::collections::BTreeMap;
@@ -94,7 +93,7 @@ impl AnyView {
             None => CameraTokens::Trained(request.strategy),
         };
         let wanted = (request.wanted.clone(), request.wants_rays);
-        let Dense { views, camera_tokens, layers, reference } = match &self.parts {
+        let DenseOutput { views, camera_tokens, layers, reference } = match &self.parts {
             Parts::Here(host) => host.run(run, pixels, tokens, request.layers, wanted)?,
             Parts::OnDevice(device) => device.run(run, pixels, tokens, request.layers, wanted)?,
         };
@@ -133,17 +132,17 @@ impl Host {
         tokens: CameraTokens<'_>,
         layers: &[usize],
         (wanted, wants_rays): (Range<usize>, bool),
-    ) -> Result<Dense, Da3Error> {
+    ) -> Result<DenseOutput, Da3Error> {
         let mut features = Features::new(self, pixels, wanted.clone());
         let reference = self.backbone.run(run, pixels, tokens, layers, &mut features)?;
         let Features { embeddings, stages, camera_tokens, layers, .. } = features;
         let size = (pixels.rows, pixels.columns);
         let mut views = Vec::with_capacity(wanted.len());
         for (view, stages) in stages.into_iter().enumerate().filter(|(view, _)| wanted.contains(view)) {
-            run.checkpoint()?;
+            run.check_cancelled()?;
             views.push(self.head.run(run, view, stages, size, (&embeddings, wants_rays))?);
         }
-        Ok(Dense { views, camera_tokens, layers, reference })
+        Ok(DenseOutput { views, camera_tokens, layers, reference })
     }
 }
 

@@ -1,8 +1,8 @@
 //! A network of single views: backbone and DPT head with sky (the metric and the monocular one).
 
 use super::backbone::{Backbone, CameraTokens, Feature, FeatureSink, Pixels, ReferenceStrategy};
+use super::device::{DenseOutput, DeviceLoader, DeviceNet};
 use super::head::{DenseView, Dpt, Map};
-use super::{Dense, DeviceLoader, DeviceNet};
 use crate::config::NetConfig;
 use crate::error::Da3Error;
 use crate::run::Run;
@@ -30,7 +30,7 @@ struct Host {
 }
 
 /// What the network says; all views one after the other.
-pub(crate) struct SingleAnswer {
+pub(crate) struct SingleViewOutput {
     /// `[views, H, W]`, sky filled.
     pub depth: Vec<f32>,
     /// `[views, H, W]`.
@@ -62,7 +62,7 @@ impl SingleView {
         run: &Run<'_>,
         pixels: &Pixels<'_>,
         layers: &[usize],
-    ) -> Result<SingleAnswer, Da3Error> {
+    ) -> Result<SingleViewOutput, Da3Error> {
         let tokens = CameraTokens::Trained(ReferenceStrategy::First);
         let dense = match &self.parts {
             Parts::Here(host) => host.run(run, pixels, tokens, layers)?,
@@ -77,7 +77,7 @@ impl SingleView {
             sky.extend(answer.confidence);
         }
         sky::fill(&mut depth, &sky);
-        Ok(SingleAnswer { depth, sky, layers: dense.layers })
+        Ok(SingleViewOutput { depth, sky, layers: dense.layers })
     }
 }
 
@@ -89,7 +89,7 @@ impl Host {
         pixels: &Pixels<'_>,
         tokens: CameraTokens<'_>,
         layers: &[usize],
-    ) -> Result<Dense, Da3Error> {
+    ) -> Result<DenseOutput, Da3Error> {
         let mut features = Features {
             net: self,
             size: pixels.patches(),
@@ -99,11 +99,11 @@ impl Host {
         let reference = self.backbone.run(run, pixels, tokens, layers, &mut features)?;
         let mut views = Vec::with_capacity(pixels.views);
         for (view, stages) in features.stages.into_iter().enumerate() {
-            run.checkpoint()?;
+            run.check_cancelled()?;
             let (depth, sky) = self.head.run(run, view, stages, (pixels.rows, pixels.columns))?;
             views.push(DenseView { depth, confidence: sky, rays: None });
         }
-        Ok(Dense { views, camera_tokens: Vec::new(), layers: features.layers, reference })
+        Ok(DenseOutput { views, camera_tokens: Vec::new(), layers: features.layers, reference })
     }
 }
 

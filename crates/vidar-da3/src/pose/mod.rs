@@ -25,6 +25,16 @@ pub struct Cameras {
     pub intrinsics: Vec<Matrix3<f64>>,
 }
 
+/// Cameras as the network takes them: the first camera is the world frame, distances are normalised, intrinsics are those
+/// of the network's pixels.
+#[derive(Clone, Copy, Debug)]
+pub struct NetCameras<'a> {
+    /// Poses, see [`normalise_world`].
+    pub camera_from_world: &'a [Matrix4<f64>],
+    /// Intrinsics of the network's pixels.
+    pub intrinsics: &'a [Matrix3<f64>],
+}
+
 /// The inverse of a rigid transform, `[Rᵀ | −Rᵀt]`, without assuming that R is exactly a rotation.
 pub fn rigid_inverse(a_from_b: &Matrix4<f64>) -> Matrix4<f64> {
     let (rotation, translation) = parts(a_from_b);

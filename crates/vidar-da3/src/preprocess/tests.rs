@@ -69,7 +69,7 @@ fn intrinsics_follow_with_their_origin_at_the_edge() {
 
 #[test]
 fn resizing_is_the_same_with_any_number_of_threads() {
-    let picture = crate::weights::deterministic::image_u8(4, 333, 251);
+    let picture = crate::weights::synthetic::image_u8(4, 333, 251);
     let run = |threads| {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
         pool.install(|| (area::resize(&picture, 100, 77), cubic::resize(&picture, 400, 300)))

@@ -18,7 +18,7 @@ pub struct Parameter {
 
 /// Every tensor of a model, in the order of the module tree.
 pub fn parameters(config: &Da3Config) -> Vec<Parameter> {
-    let mut list = List { found: Vec::new(), is_read: true };
+    let mut list = List { parameters: Vec::new(), is_read: true };
     match &config.networks {
         Networks::Single(net) => list.network(net, SINGLE),
         Networks::Nested { any_view, metric } => {
@@ -26,22 +26,22 @@ pub fn parameters(config: &Da3Config) -> Vec<Parameter> {
             list.network(metric, NESTED_METRIC);
         }
     }
-    list.found
+    list.parameters
 }
 
-/// Where the keys of a single network begin.
+/// Prefix of the keys of a single network.
 pub const SINGLE: &str = "model";
-/// Where the keys of a nested model's any-view network begin.
+/// Prefix of the keys of a nested model's any-view network.
 pub const NESTED_ANY_VIEW: &str = "model.da3";
-/// Where the keys of a nested model's metric network begin.
+/// Prefix of the keys of a nested model's metric network.
 pub const NESTED_METRIC: &str = "model.da3_metric";
 
-/// Parts of official files that inference of geometry does not use at all (the Gaussian head).
+/// Whether a key belongs to a part that inference of geometry does not use (the Gaussian head).
 pub fn is_ignored(name: &str) -> bool {
     name.split('.').any(|part| part == "gs_head" || part == "gs_adapter")
 }
 
-/// Another name under which some converters store a tensor of the list, if `name` is one: the shared norm.
+/// The stored name of a tensor that some converters write under an alias (the shared norm); `None` when `name` is no alias.
 pub fn stored_name(name: &str) -> Option<String> {
     let (head, rest) = name.split_once("scratch.output_conv2_aux.")?;
     let (level, leaf) = rest.split_once('.')?;
@@ -50,16 +50,16 @@ pub fn stored_name(name: &str) -> Option<String> {
 }
 
 struct List {
-    found: Vec<Parameter>,
+    parameters: Vec<Parameter>,
     is_read: bool,
 }
 
 impl List {
     fn tensor(&mut self, name: String, shape: &[usize]) {
-        self.found.push(Parameter { name, shape: shape.to_vec(), is_read: self.is_read });
+        self.parameters.push(Parameter { name, shape: shape.to_vec(), is_read: self.is_read });
     }
 
-    fn unread(&mut self, is_read: bool, add: impl FnOnce(&mut Self)) {
+    fn optional(&mut self, is_read: bool, add: impl FnOnce(&mut Self)) {
         let before = self.is_read;
         self.is_read = before && is_read;
         add(self);
@@ -194,7 +194,7 @@ impl List {
     /// Only level 3 of the ray branch is read; its norm is the one stored under level 0.
     fn rays(&mut self, scratch: &str, features: usize) {
         for level in 0..4 {
-            self.unread(level == 3, |list| {
+            self.optional(level == 3, |list| {
                 for i in 0..5 {
                     let (inputs, outputs) =
                         if i % 2 == 0 { (features, features / 2) } else { (features / 2, features) };

@@ -1,28 +1,28 @@
-//! Where weights come from: the hub's files checked key by key, or weights made by rule.
+//! Sources of weights: the hub's files, checked key by key, and synthetic weights.
 
-pub mod deterministic;
+mod identify;
 pub mod inventory;
-mod opened;
 mod scope;
 mod slot;
+pub mod synthetic;
 
-pub use opened::{detect, verify};
+pub use identify::{detect, verify};
 pub(crate) use scope::{ConvShape, Scope};
 pub use slot::Residency;
 pub(crate) use slot::Slot;
 
 use vidar_nn::{CheckpointError, Weight, WeightSource};
 
-/// Weights made by rule ([`deterministic`]), one tensor at a time when it is asked for.
+/// Synthetic weights ([`synthetic`]), generated one tensor at a time when requested.
 #[derive(Clone, Copy, Debug, Default)]
-pub struct DeterministicWeights;
+pub struct SyntheticWeights;
 
-impl WeightSource for DeterministicWeights {
+impl WeightSource for SyntheticWeights {
     fn weight(&self, name: &str, shape: &[usize]) -> Result<Weight, CheckpointError> {
-        Ok(Weight::owned(name, shape, deterministic::tensor(name, shape)))
+        Ok(Weight::owned(name, shape, synthetic::tensor(name, shape)))
     }
 
-    /// Every key the network may ask for exists, under its stored name only.
+    /// Every key that a network requests exists, under its stored name only.
     fn has(&self, name: &str) -> bool {
         inventory::stored_name(name).is_none()
     }

@@ -1,4 +1,4 @@
-//! A place in the key tree from which layers are built: `scope.at("attn").linear("qkv", …)`.
+//! A prefix of checkpoint keys from which layers are built: `scope.at("attn").linear("qkv", …)`.
 
 use crate::error::Da3Error;
 use std::sync::Arc;
@@ -16,7 +16,7 @@ impl Scope {
         Self { source, path: root.into() }
     }
 
-    /// The scope of a part of this one.
+    /// The scope `self.part`.
     pub fn at(&self, part: &str) -> Self {
         Self { source: Arc::clone(&self.source), path: format!("{}.{part}", self.path) }
     }
@@ -52,14 +52,19 @@ impl Scope {
         Ok(Conv2d::new(weight, Some(bias), stride, padding)?)
     }
 
-    /// A 3×3 convolution with a border of one and no bias.
+    /// A 3×3 convolution with padding 1 and no bias.
     pub fn conv3_unbiased(&self, part: &str, inputs: usize, outputs: usize) -> Result<Conv2d, Da3Error> {
         let weight = self.at(part).weight("weight", &[outputs, inputs, 3, 3])?;
         Ok(Conv2d::new(weight, None, 1, 1)?)
     }
 
-    /// A transposed convolution whose stride is its side, as many channels out as in.
-    pub fn spread(&self, part: &str, channels: usize, side: usize) -> Result<ConvTranspose2d, Da3Error> {
+    /// A transposed convolution with stride equal to its kernel size and as many output as input channels.
+    pub fn conv_transpose(
+        &self,
+        part: &str,
+        channels: usize,
+        side: usize,
+    ) -> Result<ConvTranspose2d, Da3Error> {
         let layer = self.at(part);
         let weight = layer.weight("weight", &[channels, channels, side, side])?;
         Ok(ConvTranspose2d::new(weight, Some(layer.weight("bias", &[channels])?))?)
@@ -82,7 +87,7 @@ impl ConvShape {
         Self { inputs, outputs, side: 1, stride: 1, padding: 0 }
     }
 
-    /// 3×3 with a border of one.
+    /// 3×3 with padding 1.
     pub fn three(inputs: usize, outputs: usize) -> Self {
         Self { inputs, outputs, side: 3, stride: 1, padding: 1 }
     }

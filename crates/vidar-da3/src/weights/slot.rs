@@ -1,16 +1,15 @@
-//! A part of the network that is built once, or anew each time it runs.
+//! A part of the network that is built once, or each time it runs.
 
 use crate::error::Da3Error;
 use std::sync::Arc;
 
-/// Whether the parts of a network stay between runs.
+/// Whether the parts of a network stay in memory between runs.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Residency {
-    /// Built when the model is opened. Views into a mapped file cost nothing; weights made by rule stay in memory.
+    /// Built when the model is opened. Views into a mapped file cost nothing; synthetic weights stay in memory.
     #[default]
     Kept,
-    /// Built when it is its turn and dropped afterwards: a network whose weights are made by rule then needs the memory
-    /// of one block.
+    /// Built when it runs and dropped afterwards: a network with synthetic weights then needs the memory of one block.
     OnDemand,
 }
 

@@ -6,8 +6,8 @@
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use vidar_da3::config::json;
-use vidar_da3::weights::deterministic::tensor;
 use vidar_da3::weights::inventory::{Parameter, parameters};
+use vidar_da3::weights::synthetic::tensor;
 use vidar_da3::{Da3, Da3Config, Da3Options};
 
 /// A file of the reference material outside the repository; says so when it is not there.
@@ -39,7 +39,7 @@ pub fn tiny_config() -> Da3Config {
 }
 
 pub fn tiny() -> Da3 {
-    Da3::deterministic_of(tiny_config(), &Da3Options::default()).unwrap()
+    Da3::synthetic_of(tiny_config(), &Da3Options::default()).unwrap()
 }
 
 /// All tensors of a network, made by rule.

@@ -157,14 +157,14 @@ impl Backbone {
         let length = (1 + rows * columns) * self.config.dim;
         let mut x = vec![0.0; pixels.views * length];
         for (view, tokens) in x.chunks_exact_mut(length).enumerate() {
-            run.checkpoint()?;
+            run.check_cancelled()?;
             self.embed.apply(run, view, pixels.view(view), (pixels.rows, pixels.columns), tokens);
         }
         let rope = RopeTables { tables: rope_tables(&self.config, rows, columns) };
         let mut order = Order((0..pixels.views).collect());
         let mut scratch = BlockScratch::default();
         for i in 0..self.config.depth {
-            run.checkpoint()?;
+            run.check_cancelled()?;
             if self.config.alternate_from == Some(i + 1) {
                 order = self.put_reference_first(&mut x, length, cameras);
             }
@@ -195,10 +195,10 @@ impl Backbone {
     ) -> Result<(), Da3Error> {
         let views = (GROUP_TOKENS / (step.length / self.config.dim)).max(1);
         for (group, x) in x.chunks_mut(views * step.length).enumerate() {
-            step.run.checkpoint()?;
+            step.run.check_cancelled()?;
             block.run(&step.compute, x, x.len() / step.length, rope, scratch);
             for (i, x) in x.chunks_exact(step.length).enumerate() {
-                self.hand_over(step, group * views + i, x, x)?;
+                self.emit(step, group * views + i, x, x)?;
             }
         }
         Ok(())
@@ -217,26 +217,26 @@ impl Backbone {
         resize(&mut queries, x.len());
         let mut sequence = block.key_values(&compute, x.len() / self.config.dim);
         for (x, queries) in x.chunks(step.length).zip(queries.chunks_mut(step.length)) {
-            step.run.checkpoint()?;
+            step.run.check_cancelled()?;
             block.push(&compute, x, rope, (&mut sequence, queries), scratch);
         }
         let mut before = Vec::new();
         let mut views = x.chunks_exact_mut(step.length).zip(queries.chunks_exact(step.length)).enumerate();
         views.try_for_each(|(i, (x, queries))| {
-            step.run.checkpoint()?;
+            step.run.check_cancelled()?;
             before.clear();
             if self.config.out_layers.contains(&step.layer) {
                 before.extend_from_slice(x);
             }
             block.run_in_sequence(&compute, x, rope, (&sequence, queries), scratch);
-            self.hand_over(step, i, &before, x)
+            self.emit(step, i, &before, x)
         })?;
         scratch.queries = queries;
         Ok(())
     }
 
     /// Shows a view's tokens after a block and hands over what is wanted of them.
-    fn hand_over(
+    fn emit(
         &self,
         step: &mut Step<'_, '_>,
         position: usize,

@@ -54,14 +54,14 @@ impl Dpt {
         size: (usize, usize),
     ) -> Result<(Vec<f32>, Vec<f32>), Da3Error> {
         let laterals = self.stages.laterals(run, view, stages);
-        run.checkpoint()?;
+        run.check_cancelled()?;
         let fused = self.fusion.run(run, view, &laterals)?;
         drop(laterals);
         let narrow = fused.convolved(&run.head, &self.output_conv1, ConvInput::None, Epilogue::None);
         drop(fused);
         run.show_map("head.output_conv1", view, narrow.shape(), &narrow.data);
         show_input(run, view, &narrow, size, None);
-        run.checkpoint()?;
+        run.check_cancelled()?;
         let pairs = [&self.output_conv2, &self.sky_output_conv2];
         let mut logits = run_pairs(run, &narrow, size, None, &pairs);
         let (depth, sky) = (logits.swap_remove(0), logits.swap_remove(0));

@@ -126,13 +126,13 @@ impl DualDpt {
         (embeddings, wants_rays): (&Embeddings, bool),
     ) -> Result<DenseView, Da3Error> {
         let laterals = self.stages.laterals(run, view, stages);
-        run.checkpoint()?;
+        run.check_cancelled()?;
         let fused = self.fusion.run(run, view, &laterals)?;
         let narrow = fused.convolved(&run.head, &self.output_conv1, ConvInput::None, Epilogue::None);
         drop(fused);
         run.show_map("head.output_conv1", view, narrow.shape(), &narrow.data);
         show_input(run, view, &narrow, (rows, columns), Some(&embeddings.full));
-        run.checkpoint()?;
+        run.check_cancelled()?;
         let pairs = [&self.output_conv2];
         let logits = run_pairs(run, &narrow, (rows, columns), Some(&embeddings.full), &pairs).swap_remove(0);
         drop(narrow);
@@ -143,7 +143,7 @@ impl DualDpt {
         activation::exp(&run.head, &mut confidence);
         confidence.iter_mut().for_each(|c| *c += 1.0);
         let rays = if wants_rays {
-            run.checkpoint()?;
+            run.check_cancelled()?;
             Some(self.rays.get()?.run(run, view, &laterals, &embeddings.rays)?)
         } else {
             None
@@ -182,7 +182,7 @@ impl RayBranch {
         let c = &run.head;
         let mut x = self.fusion.run(run, view, laterals)?;
         for conv in &self.convs {
-            run.checkpoint()?;
+            run.check_cancelled()?;
             x = x.convolved(c, conv, ConvInput::None, Epilogue::None);
         }
         run.show_map("head.output_conv1_aux.3", view, x.shape(), &x.data);

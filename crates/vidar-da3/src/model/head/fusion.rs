@@ -72,7 +72,7 @@ impl Fusion {
         let c = &run.head;
         let mut x = laterals[3].clone();
         for level in (0..4).rev() {
-            run.checkpoint()?;
+            run.check_cancelled()?;
             let block = &self.blocks[level];
             if let Some(unit) = &block.lateral {
                 x.data.iter_mut().zip(&laterals[level].data).for_each(|(x, l)| *x += l);

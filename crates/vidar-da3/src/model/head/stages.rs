@@ -1,7 +1,8 @@
 //! From the four features to four maps of F channels: `projects.K`, `resize_layers.K`, `scratch.layer{K+1}_rn`.
 //!
-//! Feature k, `[patches, C]`, is projected to `out_channels[k]`; stage 0 is spread fourfold, stage 1 twofold, stage 2
-//! stays, stage 3 is halved (rounding up); a 3×3 convolution without bias brings each to F channels. Sizes: 4ph × 4pw,
+//! Feature k, `[patches, C]`, is projected to `out_channels[k]`; stage 0 is upsampled by four and stage 1 by
+//! two with transposed convolutions, stage 2 keeps its size, stage 3 is halved (rounding up); a 3×3 convolution without bias
+//! brings each to F channels. Sizes: 4ph × 4pw,
 //! 2ph × 2pw, ph × pw, ⌈ph/2⌉ × ⌈pw/2⌉.
 
 use super::map::Map;
@@ -31,8 +32,8 @@ impl Stages {
         let halve = ConvShape { stride: 2, ..ConvShape::three(channels[3], channels[3]) };
         Ok(Self {
             projects: projects.collect::<Result<_, _>>()?,
-            spread_4: scope.spread("resize_layers.0", channels[0], 4)?,
-            spread_2: scope.spread("resize_layers.1", channels[1], 2)?,
+            spread_4: scope.conv_transpose("resize_layers.0", channels[0], 4)?,
+            spread_2: scope.conv_transpose("resize_layers.1", channels[1], 2)?,
             halve: scope.conv("resize_layers.3", halve)?,
             layer_rn: layer_rn.collect::<Result<_, _>>()?,
         })

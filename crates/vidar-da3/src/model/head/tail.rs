@@ -83,7 +83,7 @@ pub(crate) fn show_input(
     embedding: Option<&GridEmbedding>,
 ) {
     let name = "head.output_conv2.in";
-    if run.is_watched(name) {
+    if run.is_traced(name) {
         let mut full = map.resized(&run.head, rows, columns);
         if let Some(embedding) = embedding {
             full.embed(embedding);

@@ -6,12 +6,12 @@ use crate::error::Da3Error;
 use std::collections::BTreeSet;
 use vidar_nn::Checkpoint;
 
-/// Problems listed in an error; the rest is counted.
+/// Most problems listed in an error; the others are counted.
 const MAX_LISTED: usize = 20;
 
-/// Checks every key of a checkpoint: missing ones, wrong shapes, keys of some other network.
+/// Checks every key of a checkpoint: missing keys, wrong shapes, keys of another network.
 ///
-/// Keys that inference never reads may be absent; the Gaussian head may be there.
+/// Keys that inference never reads may be absent; those of the Gaussian head may be present.
 pub fn verify(checkpoint: &Checkpoint, config: &Da3Config) -> Result<(), Da3Error> {
     let expected = parameters(config);
     let known: BTreeSet<&str> = expected.iter().map(|p| p.name.as_str()).collect();
@@ -52,10 +52,10 @@ fn problem(checkpoint: &Checkpoint, parameter: &Parameter) -> Option<String> {
     }
 }
 
-/// The official network whose keys a checkpoint has, when no `config.json` says which it is.
+/// The official network whose keys a checkpoint has, for checkpoints without `config.json`.
 ///
-/// Nested by its prefix, any-view by its camera token, the size by the width of the class token. The metric and the
-/// monocular network cannot be told apart; metric is assumed.
+/// Nested models are recognised by their prefix, any-view networks by their camera token, the size by the width of the
+/// class token. The metric and the monocular network have the same keys and shapes; metric is assumed.
 pub fn detect(checkpoint: &Checkpoint) -> Result<Variant, Da3Error> {
     if checkpoint.names().any(|name| name.starts_with("model.da3.")) {
         return Ok(Variant::NestedGiantLarge);

@@ -1,4 +1,4 @@
-//! Weights and images made by rule, the same bits in every language: what parity tests run on.
+//! Synthetic weights and images: deterministic, with the same bits in every language, for parity tests.
 //!
 //! A value is `fl(u·scale) + offset` with `u` in [−1, 1) from SplitMix64 over FNV-1a of the tensor's full key plus the
 //! element's index; scale and offset follow from the key and the shape, so that activations stay of order one. Only
@@ -39,7 +39,7 @@ pub fn tensor(name: &str, shape: &[usize]) -> Vec<f32> {
     (0..length).map(value).collect()
 }
 
-/// What is added and what `u` is multiplied by, from key and shape; the first rule that matches counts.
+/// Offset and scale of `u` from key and shape; the first matching rule applies.
 fn offset_and_scale(name: &str, shape: &[usize]) -> (f32, f32) {
     let leaf = name.rsplit('.').next().unwrap_or(name);
     let matrix = |fan_in: usize, gain: f64| ((3.0 / fan_in as f64).sqrt() * gain) as f32;
