@@ -91,6 +91,10 @@ impl NearestIndex {
     /// `max_distance_m` (strictly).
     pub fn nearest(&self, query: &[f32; 3], max_distance_m: Option<f32>) -> Option<Neighbour> {
         let tree = self.tree.as_ref().filter(|_| usable(query))?;
+        // A query this far from all points needs no search.
+        if max_distance_m.is_some_and(|limit| self.squared_distance_to_bounds(query) > limit * limit) {
+            return None;
+        }
         let found = tree.query(query).nearest_one::<SquaredEuclidean<f32>>().execute();
         let limit = max_distance_m.unwrap_or(f32::INFINITY);
         if !(found.distance < limit * limit) {
@@ -101,6 +105,12 @@ impl NearestIndex {
         let squared: f64 =
             position.iter().zip(query).map(|(a, b)| (f64::from(*a) - f64::from(*b)).powi(2)).sum();
         Some(Neighbour { index, position, distance_m: squared.sqrt() })
+    }
+
+    /// Squared distance from `query` to the bounding box of the points, m²; 0 inside.
+    fn squared_distance_to_bounds(&self, query: &[f32; 3]) -> f32 {
+        let (min, max) = self.bounds;
+        (0..3).map(|k| (min[k] - query[k]).max(query[k] - max[k]).max(0.0).powi(2)).sum()
     }
 
     /// The nearest point of each query, in their order; `None` as in [`nearest`](Self::nearest).

@@ -85,18 +85,15 @@ pub fn evaluate_surface_from(
     let mut free = FreePlacement::same_as_native(&native, &native_score.scores);
     for candidate in free_candidates(&estimated, &truth.index, start, config, &native)? {
         // A candidate that moves all points outside the crop is skipped.
-        let Ok(score) = score(&estimated, &truth, &candidate.truth_from_estimate, config) else { continue };
-        if score.f_at(config.delta_f_threshold()) > free.f_at(config.delta_f_threshold()) {
-            free = FreePlacement::new(&candidate, score.scores);
+        let scores = candidate_scores(&estimated, &truth, &candidate.truth_from_estimate, config);
+        let Ok(scores) = scores else { continue };
+        if report::f_at(&scores, config.delta_f_threshold()) > free.f_at(config.delta_f_threshold()) {
+            free = FreePlacement::new(&candidate, scores);
         }
     }
     if let Some(warning) = native.rejection_warning(config) {
         warnings.push(warning);
     }
-    let errors = config
-        .keep_point_errors
-        .then(|| point_errors(estimate, reference, &truth, &native_score, &native.truth_from_estimate))
-        .transpose()?;
     let threshold = config.delta_f_threshold();
     Ok(SurfaceReport {
         delta_f: free.f_at(threshold) - native_score.f_at(threshold),
@@ -115,7 +112,12 @@ pub fn evaluate_surface_from(
         reference_points_evaluated: truth.points.len(),
         placement: native.report(),
         free_placement: free,
-        point_errors: errors,
+        point_errors: point_errors(
+            (estimate, reference),
+            &truth,
+            (native_score.distances, &native_score.index),
+            (&native.truth_from_estimate, config.voxel_size_m.is_some()),
+        ),
         warnings,
     })
 }
@@ -140,6 +142,8 @@ struct PlacementScore {
     estimate_points: usize,
     cropped: usize,
     index: NearestIndex,
+    /// Distances of the evaluated points, when errors per point are requested.
+    distances: Option<PointErrors>,
 }
 
 impl PlacementScore {
@@ -160,22 +164,49 @@ fn score(
     let to_reference = nearest_distances(&points, &truth.index, None);
     let to_estimate = nearest_distances(&truth.points, &index, None);
     let scores = config.thresholds_m.iter().map(|&t| Scores::new(t, &to_reference, &to_estimate)).collect();
+    let distances = config
+        .keep_point_errors
+        .then(|| PointErrors { estimate_m: to_reference.clone(), reference_m: to_estimate.clone() });
     let chamfer = Chamfer::new(to_reference, to_estimate);
-    Ok(PlacementScore { scores, chamfer, estimate_points: points.len(), cropped, index })
+    Ok(PlacementScore { scores, chamfer, estimate_points: points.len(), cropped, index, distances })
+}
+
+/// The scores of a placement without its distances: only those below the largest threshold are searched for.
+fn candidate_scores(
+    estimated: &[[f32; 3]],
+    truth: &Reference,
+    truth_from_estimate: &Sim3,
+    config: &SurfaceEvalConfig,
+) -> Result<Vec<Scores>, EvalError> {
+    let placed = transformed(estimated, truth_from_estimate);
+    let (points, _) = evaluated_points(placed, &truth.index, config)?;
+    let index = NearestIndex::build(&points)?;
+    // The margin covers the rounding of squared distances in f32.
+    let limit = Some((config.delta_f_threshold() * 1.001) as f32);
+    let to_reference = nearest_distances(&points, &truth.index, limit);
+    let to_estimate = nearest_distances(&truth.points, &index, limit);
+    Ok(config.thresholds_m.iter().map(|&t| Scores::new(t, &to_reference, &to_estimate)).collect())
 }
 
 /// Errors of all given points, in their order, for colouring.
 fn point_errors(
-    estimate: &PointCloud,
-    reference: &PointCloud,
+    (estimate, reference): (&PointCloud, &PointCloud),
     truth: &Reference,
-    score: &PlacementScore,
-    truth_from_estimate: &Sim3,
-) -> Result<PointErrors, EvalError> {
-    let placed = transformed(&estimate.positions, truth_from_estimate);
-    Ok(PointErrors {
-        estimate_m: nearest_distances(&placed, &truth.index, None),
-        reference_m: nearest_distances(&reference.positions, &score.index, None),
+    (evaluated, index): (Option<PointErrors>, &NearestIndex),
+    (truth_from_estimate, thinned): (&Sim3, bool),
+) -> Option<PointErrors> {
+    let PointErrors { estimate_m, reference_m } = evaluated?;
+    // With voxels the evaluated points are means; as many as given are the given ones.
+    let same_estimate = !thinned && estimate_m.len() == estimate.len();
+    let same_reference = !thinned && reference_m.len() == reference.len();
+    let of_estimate = || {
+        let placed = transformed(&estimate.positions, truth_from_estimate);
+        nearest_distances(&placed, &truth.index, None)
+    };
+    let of_reference = || nearest_distances(&reference.positions, index, None);
+    Some(PointErrors {
+        estimate_m: if same_estimate { estimate_m } else { of_estimate() },
+        reference_m: if same_reference { reference_m } else { of_reference() },
     })
 }
 
