@@ -1,4 +1,4 @@
-//! Times a network with weights made by rule: `time_da3 da3-small --views 4 --size 378x504 --precision bf16 --runs 3`.
+//! Times a network with synthetic weights: `time_da3 da3-small --views 4 --size 378x504 --precision bf16 --runs 3`.
 //!
 //! One line of JSON a run: wall and CPU seconds, and the process's largest memory so far. `bench/da3_vs_torch.py` drives it
 //! in turn with the official code: with `--serve` it answers one run a line of standard input.
