@@ -3,7 +3,7 @@
 //! ```text
 //! cargo run --release -p vidar-odometry --example evaluate -- [--mono] [--start S] [--secs S] [--verbose]
 //!     [--repeat N] [--stages] [--image-noise GRAY] [--imu-noise FACTOR] [--halve]
-//!     [--trajectory FILE] [--frames FILE] [--set KEY=VALUE]... SEQUENCE...
+//!     [--live] [--trajectory FILE] [--frames FILE] [--set KEY=VALUE]... SEQUENCE...
 //! ```
 //!
 //! A sequence is any folder with images, IMU measurements and ground truth that `vidar-dataset` reads. Figures: ATE after the best
@@ -13,6 +13,9 @@
 //!
 //! Time is wall time. On a machine that others use too, `--repeat 5` runs a sequence five times (the results are the same
 //! bits) and takes the least of every image's five times. `--stages` splits the median and the 95 % quantile by stage.
+//!
+//! The camera's clock offset, readout and rotation are found in a first pass over the beginning; `--live` leaves it out,
+//! as for a stream, which cannot be read twice.
 //!
 //! `--image-noise`, `--imu-noise` corrupt what is read: noise of so many grey levels; so much more inertial noise that
 //! its whole is FACTOR times the data sheet's (the bias stays). `--halve` averages 2 × 2 pixels.
@@ -47,6 +50,7 @@ struct Options {
     image_noise: f64,
     imu_noise: f64,
     halve: bool,
+    live: bool,
 }
 
 fn options() -> Result<Options, Failure> {
@@ -61,6 +65,7 @@ fn options() -> Result<Options, Failure> {
             "--image-noise" => found.image_noise = value()?.parse()?,
             "--imu-noise" => found.imu_noise = value()?.parse()?,
             "--halve" => found.halve = true,
+            "--live" => found.live = true,
             "--verbose" => found.verbose = true,
             "--start" => found.start_secs = value()?.parse()?,
             "--secs" => found.secs = Some(value()?.parse()?),
@@ -272,7 +277,17 @@ fn run(dataset: &Dataset, options: &Options) -> Result<Run, Failure> {
         }
     }
     let mut corruptor = Corruptor::new(options, rig.imu);
-    let mut odometry = Odometry::new(&rig, dataset.camera, &config)?;
+    let mut odometry = match options.live || options.mono {
+        true => Odometry::new(&rig, dataset.camera, &config)?,
+        false => {
+            let events = dataset.events().filter_map(Result::ok);
+            let timing = Odometry::find_timing(&rig, dataset.camera, &config, events)?;
+            if options.verbose {
+                println!("  {timing:?}");
+            }
+            Odometry::with_timing(&rig, dataset.camera, &config, &timing)?
+        }
+    };
     let mut run = Run { outputs: Vec::new(), times: Vec::new(), poses: Vec::new() };
     for event in dataset.events() {
         let mut event = event?;

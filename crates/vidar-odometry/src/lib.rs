@@ -26,7 +26,8 @@ mod tracking;
 pub use config::{ImuUse, OdometryConfig};
 pub use error::OdometryError;
 pub use pipeline::{
-    DivergenceSign, InputCounts, LossReason, Odometry, OdometryOutput, Status, TrackSummary, Tracking,
+    CameraTiming, DivergenceSign, InputCounts, LossReason, Odometry, OdometryOutput, Status, TrackSummary,
+    Tracking,
 };
 pub use stages::{Stage, StageTimes};
 pub use tracking::TrackRecord;

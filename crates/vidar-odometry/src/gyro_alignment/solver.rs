@@ -32,8 +32,9 @@ const PIXEL_SIGMA: f64 = 0.7;
 /// Whitened residual from which a match loses weight (Cauchy).
 const CAUCHY: f64 = 2.0;
 
-/// Each ray takes part in up to four pairs, so residuals are correlated: covariances are multiplied by this.
-const SHARED_RAYS: f64 = 4.0;
+/// Each ray takes part in up to four pairs, and tracking errors last over many images, so residuals are correlated:
+/// covariances are multiplied by this.
+const SHARED_RAYS: f64 = 9.0;
 
 /// The rotation of the camera is biased when parallax is small: on slow motion its error was up to ten times its formal
 /// standard deviation (this module's tests), so that is multiplied by this.

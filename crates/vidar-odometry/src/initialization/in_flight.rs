@@ -53,6 +53,11 @@ pub struct InFlightConfig {
     pub min_parallax_deg: f64,
     /// Most standard deviation of log(scale), 0.005…0.5. 0.03 lets half of the starts be within 2 %.
     pub max_log_scale_sigma: f64,
+    /// A stretch of the log from which on the scale may be provisional, s, 0.5…10: the state starts with whatever scale is
+    /// known then, and its standard deviation is reported.
+    pub provisional_secs: f64,
+    /// Most standard deviation of log(scale) of a provisional start, 0.005…0.5.
+    pub provisional_log_scale_sigma: f64,
     /// Most change of scale between two successive solutions, relative, 0.01…1.
     pub max_scale_change: f64,
     /// Standard deviation of the accelerometer's bias before anything is known, m/s², 0.01…2.
@@ -72,6 +77,8 @@ impl Default for InFlightConfig {
             min_tracks: 25,
             min_parallax_deg: 1.0,
             max_log_scale_sigma: 0.03,
+            provisional_secs: 1.8,
+            provisional_log_scale_sigma: 0.15,
             max_scale_change: 0.1,
             accel_bias_sigma: 0.15,
             gyro_bias_sigma: 0.1,
@@ -129,6 +136,8 @@ const GOOD_INERTIAL_FIT: f64 = 0.4;
 
 /// Share of observations that may be left out as wrong.
 const MOST_LEFT_OUT: f64 = 0.2;
+/// The same for a provisional start, whose scale gives less evidence that the solution is right.
+const MOST_LEFT_OUT_PROVISIONAL: f64 = 0.1;
 
 /// How well a solved window fits.
 #[derive(Clone, Copy, Debug)]
@@ -276,7 +285,7 @@ impl InFlightInitializer {
             return Ok(Err(InitFailure::new(InitFailureReason::Frames, 0.0, 1.0)));
         };
         self.learn_gyro_bias(&mut smoother);
-        Ok(self.evaluate(smoother, &fit))
+        Ok(self.evaluate(smoother, &fit, span))
     }
 
     /// Chooses frames over the end of the log and joins their IMU measurements.
@@ -539,7 +548,12 @@ impl InFlightInitializer {
     }
 
     /// Step 4.
-    fn evaluate(&mut self, mut smoother: Smoother, fit: &Fit) -> Result<InFlightSolution, InitFailure> {
+    fn evaluate(
+        &mut self,
+        mut smoother: Smoother,
+        fit: &Fit,
+        span_secs: f64,
+    ) -> Result<InFlightSolution, InitFailure> {
         let places: Vec<(FrameId, Vector3<f64>)> = smoother
             .frames()
             .filter_map(|id| Some((id, smoother.state(id)?.world_from_body.translation)))
@@ -550,9 +564,16 @@ impl InFlightInitializer {
             smoother.frames().filter_map(|id| Some(smoother.state(id)?.velocity.norm())).fold(0.0, f64::max);
         let bias = smoother.newest().map_or(Bias::ZERO, |(.., s)| s.bias);
         let median_distance_m = median(smoother.landmarks().map(|l| 1.0 / l.inverse_distance)).unwrap_or(0.0);
+        // A well-known scale is taken as soon as it is there; a provisional one only from a long stretch that fits well.
+        let (max_sigma, max_left_out) = match span_secs >= self.config.provisional_secs {
+            true if sigma > self.config.max_log_scale_sigma => {
+                (self.config.provisional_log_scale_sigma, MOST_LEFT_OUT_PROVISIONAL)
+            }
+            _ => (self.config.max_log_scale_sigma, MOST_LEFT_OUT),
+        };
         let at_most = [
-            (InitFailureReason::ScaleUncertainty, sigma, self.config.max_log_scale_sigma),
-            (InitFailureReason::OutlierShare, fit.left_out, MOST_LEFT_OUT),
+            (InitFailureReason::ScaleUncertainty, sigma, max_sigma),
+            (InitFailureReason::OutlierShare, fit.left_out, max_left_out),
             (InitFailureReason::ImageChi2, fit.image, MAX_CHI2_PER_DOF),
             (InitFailureReason::ImuChi2, fit.inertial, GOOD_INERTIAL_FIT),
             (InitFailureReason::Speed, fastest, self.config.max_speed_mps),
@@ -566,12 +587,9 @@ impl InFlightInitializer {
             return Err(InitFailure::new(reason, measured, limit));
         }
         let change = previous.and_then(|p| scale_change(&p, &places)).unwrap_or(f64::INFINITY);
-        if !(change <= self.config.max_scale_change) {
-            return Err(InitFailure::new(
-                InitFailureReason::ScaleAgreement,
-                change,
-                self.config.max_scale_change,
-            ));
+        let max_change = self.config.max_scale_change.max(sigma);
+        if !(change <= max_change) {
+            return Err(InitFailure::new(InitFailureReason::ScaleAgreement, change, max_change));
         }
         self.last = None;
         Ok(InFlightSolution { smoother, log_scale_sigma: sigma, median_distance_m })

@@ -14,8 +14,9 @@ use nalgebra::Vector3;
 use std::rc::Rc;
 use vidar_core::{FrameId, LieGroup, Se3, So3, Timestamp};
 
-/// Frames that are logged at most.
-const LOG_FRAMES: usize = 60;
+/// The stretch of frames that is logged, s, and most frames of it (their images stay in memory).
+const LOG_SECS: f64 = 3.0;
+const LOG_FRAMES: usize = 100;
 
 /// Inverse distance to assume of everything, 1/m.
 pub(crate) const INITIAL_INVERSE_DISTANCE: f64 = 0.4;
@@ -26,8 +27,8 @@ const REFILL_SHARE: f64 = 0.7;
 /// Fewest corners of a first image.
 const MIN_FEATURES: usize = 40;
 
-/// An attempt to start in flight is made at every such frame.
-const ATTEMPT_EVERY: u32 = 2;
+/// Time between attempts to start, s: every second frame at 20 Hz.
+const ATTEMPT_SECS: f64 = 0.09;
 
 /// Stillness that a static start needs, s.
 pub(crate) const STILL_SECS: f64 = 0.5;
@@ -52,6 +53,7 @@ pub(crate) struct Initializer {
     in_flight: InFlightInitializer,
     motion: ImageMotion,
     pub images_still: bool,
+    last_attempt: Option<Timestamp>,
     /// What stood in the way at the last attempt.
     failure: InitFailure,
 }
@@ -101,6 +103,7 @@ impl Initializer {
             in_flight,
             motion: ImageMotion::default(),
             images_still: false,
+            last_attempt: None,
             failure: InitFailure { reason: InitFailureReason::Frames, measured: 0.0, limit: 5.0 },
         }
     }
@@ -135,9 +138,10 @@ impl Initializer {
                 limit: MIN_FEATURES as f64,
             });
         }
-        if !frame.0.is_multiple_of(ATTEMPT_EVERY) {
+        if self.last_attempt.is_some_and(|last| (time - last).as_secs_f64() < ATTEMPT_SECS) {
             return Err(self.failure.clone());
         }
+        self.last_attempt = Some(time);
         let attempt = if self.is_mono { self.attempt_mono() } else { self.attempt_in_flight(chained) };
         if let Err(failure) = &attempt {
             self.failure = failure.clone();
@@ -218,7 +222,9 @@ impl Initializer {
     }
 
     fn forget(&mut self) {
-        let excess = self.log.len().saturating_sub(LOG_FRAMES);
+        let Some(newest) = self.log.last().map(|f| f.time) else { return };
+        let old = self.log.iter().take_while(|f| (newest - f.time).as_secs_f64() > LOG_SECS).count();
+        let excess = old.max(self.log.len().saturating_sub(LOG_FRAMES));
         self.log.drain(..excess);
         self.rotations.drain(..excess);
     }

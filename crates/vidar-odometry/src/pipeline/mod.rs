@@ -10,3 +10,4 @@ mod time_calibration;
 
 pub use odometry::{InputCounts, Odometry};
 pub use output::{DivergenceSign, LossReason, OdometryOutput, Status, TrackSummary, Tracking};
+pub use time_calibration::CameraTiming;

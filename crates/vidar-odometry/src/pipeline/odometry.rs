@@ -4,7 +4,7 @@ use super::health::{HealthDecision, HealthMonitor, MAX_IMU_GAP_SECS};
 use super::keyframes::{KeyframeInput, KeyframeRegistry, public_state, seen_landmarks};
 use super::orientation_check::{MAX_TURN_DEG, OrientationCheck};
 use super::output::{DivergenceSign, LossReason, OdometryOutput, Status, TrackSummary, Tracking};
-use super::time_calibration::TimeCalibration;
+use super::time_calibration::{CameraTiming, TimeCalibration};
 use crate::backend::{CalibrationEstimate, Smoother, SmootherError};
 use crate::config::{ImuUse, OdometryConfig};
 use crate::error::OdometryError;
@@ -31,6 +31,9 @@ const MAX_PENDING: usize = 40;
 
 /// A clock offset known this well outlives a loss, s.
 const KNOWN_CLOCK_SECS: f64 = 1e-3;
+
+/// Stretch of a recording from which the camera's timing is found, s: a hand turns often enough within it.
+const TIMING_SECS: f64 = 30.0;
 
 /// Noise of images that the front end reckons with, grey levels.
 const IMAGE_NOISE_GRAY: f64 = 3.0;
@@ -231,6 +234,55 @@ impl Odometry {
         Some(CalibrationEstimate { time_offset_secs, ..estimate })
     }
 
+    /// Clock, readout and rotation of the camera as used now. Run over the first half minute of a recording, they can be given to
+    /// an odometry that starts at its beginning: [`Odometry::with_timing`].
+    pub fn timing(&self) -> CameraTiming {
+        let offset = self.camera.time_offset + self.estimated_offset();
+        self.time_calibration.timing(&self.camera, offset.as_secs_f64())
+    }
+
+    /// Finds clock, readout and rotation of a camera from the beginning of a recording: events are taken until the values
+    /// are settled, for half a minute at most.
+    ///
+    /// # Errors
+    /// As [`Odometry::new`] and [`Odometry::push`].
+    pub fn find_timing(
+        rig: &Rig,
+        camera: CameraId,
+        config: &OdometryConfig,
+        events: impl IntoIterator<Item = SensorEvent>,
+    ) -> Result<CameraTiming, OdometryError> {
+        let mut odometry = Self::new(rig, camera, config)?;
+        let mut first = None;
+        for event in events {
+            odometry.push(event)?;
+            let Some(newest) = odometry.last_image else { continue };
+            let seen_secs = (newest - *first.get_or_insert(newest)).as_secs_f64();
+            if odometry.time_calibration.is_settled() || seen_secs > TIMING_SECS {
+                break;
+            }
+        }
+        Ok(odometry.timing())
+    }
+
+    /// An odometry that begins with what another one found of the camera's clock, readout and rotation.
+    ///
+    /// # Errors
+    /// As [`Odometry::new`].
+    pub fn with_timing(
+        rig: &Rig,
+        camera: CameraId,
+        config: &OdometryConfig,
+        timing: &CameraTiming,
+    ) -> Result<Self, OdometryError> {
+        let mut rig = rig.clone();
+        let found = rig.cameras.get_mut(camera.index()).ok_or(OdometryError::NoSuchCamera(camera))?;
+        found.time_offset = Duration::from_secs_f64(timing.time_offset_secs);
+        found.body_from_camera = timing.body_from_camera;
+        let config = OdometryConfig { readout_ms: Some(timing.readout_secs * 1e3), ..config.clone() };
+        Self::new(&rig, camera, &config)
+    }
+
     fn is_ready(&self, frame: &Frame) -> bool {
         let half_readout = Duration::from_secs_f64(0.5 * self.time_calibration.readout_secs);
         let until = self.imu_time(frame) + half_readout;
@@ -341,7 +393,11 @@ impl Odometry {
         let shown = tracks.iter().filter(|t| t.last_frame == id).map(|t| (t.id, t.last_pixel));
         self.time_calibration.add_image(frame.time, shown);
         let offset = self.camera.time_offset + self.estimated_offset();
-        let correction = self.time_calibration.correction(&self.camera, offset.as_secs_f64())?;
+        let correction = self.time_calibration.correction(
+            &self.camera,
+            offset.as_secs_f64(),
+            matches!(self.phase, Phase::Tracking(_)),
+        )?;
         self.camera.time_offset = Duration::from_secs_f64(correction.offset_secs);
         if let Some(rotation) = correction.body_from_camera {
             self.camera.body_from_camera.rotation = rotation;

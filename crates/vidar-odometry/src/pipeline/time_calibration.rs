@@ -2,13 +2,16 @@
 //! tracks and gyroscope contradict them.
 
 use crate::gyro_alignment::{Alignment, Guess, GyroAlignmentLog};
-use vidar_core::{ImuSample, LandmarkId, LieGroup, RigCamera, So3, Timestamp, camera::Pixel};
+use vidar_core::{ImuSample, LandmarkId, LieGroup, RigCamera, Se3, So3, Timestamp, camera::Pixel};
 
 /// Differences from the values in use below which nothing is corrected, besides three standard deviations: the backend
 /// estimates a clock offset of some milliseconds by itself, and a readout of 4 ms moves a pixel by less than one at 1 rad/s.
 const MIN_OFFSET_SECS: f64 = 0.004;
 const MIN_READOUT_SECS: f64 = 0.004;
 const MIN_ROTATION_RAD: f64 = 2.0 * std::f64::consts::PI / 180.0;
+
+/// A running state is given up only for differences this many times larger.
+const TRACKING_FACTOR: f64 = 2.5;
 
 /// Standard deviations from which a solution is used at all, and from which no better one is needed.
 const USABLE_OFFSET_SECS: f64 = 0.004;
@@ -31,6 +34,21 @@ pub(crate) struct Correction {
     pub body_from_camera: Option<So3>,
 }
 
+/// Clock, readout and rotation of a camera as the odometry uses them.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct CameraTiming {
+    /// What to add to image stamps to get the IMU's time of the centre row, s.
+    pub time_offset_secs: f64,
+    /// Time from the first to the last row, s; 0 is a global shutter.
+    pub readout_secs: f64,
+    /// Pose of the camera on the body; its rotation is corrected where tracks and gyroscope contradict the given one.
+    pub body_from_camera: Se3,
+    /// Standard deviations of offset and readout, s; `None` as long as nothing was estimated.
+    pub sigmas_secs: Option<(f64, f64)>,
+    /// Whether another look at the recording would bring little.
+    pub is_settled: bool,
+}
+
 /// The values in use and what they are checked with.
 #[derive(Debug)]
 pub(crate) struct TimeCalibration {
@@ -39,6 +57,10 @@ pub(crate) struct TimeCalibration {
     pub readout_secs: f64,
     estimates_offset: bool,
     estimates_readout: bool,
+    /// Standard deviations of offset and readout in use, s; zero for given values.
+    used_sigmas: (f64, f64),
+    /// Standard deviations of the newest solution, s.
+    estimated: Option<(f64, f64)>,
     attempts: usize,
     is_settled: bool,
 }
@@ -51,6 +73,8 @@ impl TimeCalibration {
             readout_secs: readout_secs.unwrap_or(0.0),
             estimates_offset,
             estimates_readout: readout_secs.is_none(),
+            used_sigmas: (0.0, 0.0),
+            estimated: None,
             attempts: 0,
             is_settled: !estimates_offset && readout_secs.is_some(),
         }
@@ -69,14 +93,36 @@ impl TimeCalibration {
         }
     }
 
+    /// What is in use for `camera`, whose clock offset is `offset_secs`.
+    pub fn timing(&self, camera: &RigCamera, offset_secs: f64) -> CameraTiming {
+        CameraTiming {
+            time_offset_secs: offset_secs,
+            readout_secs: self.readout_secs,
+            body_from_camera: camera.body_from_camera,
+            sigmas_secs: self.estimated,
+            is_settled: self.is_settled(),
+        }
+    }
+
+    /// Whether another solution would bring little.
+    pub fn is_settled(&self) -> bool {
+        self.is_settled || self.attempts >= MAX_ATTEMPTS
+    }
+
     /// Forgets the images: tracks get new names.
     pub fn forget_tracks(&mut self) {
         self.log.forget_images();
     }
 
-    /// A correction of `camera`, whose clock offset in use is `offset_secs`, where one is called for.
-    pub fn correction(&mut self, camera: &RigCamera, offset_secs: f64) -> Option<Correction> {
-        if self.is_settled || self.attempts >= MAX_ATTEMPTS {
+    /// A correction of `camera`, whose clock offset in use is `offset_secs`, where one is called for. `is_tracking`: there is
+    /// a state that it would end.
+    pub fn correction(
+        &mut self,
+        camera: &RigCamera,
+        offset_secs: f64,
+        is_tracking: bool,
+    ) -> Option<Correction> {
+        if self.is_settled() {
             return None;
         }
         let guess = Guess {
@@ -93,27 +139,52 @@ impl TimeCalibration {
         if !is_usable {
             return None;
         }
-        let correction = self.compare(&found, camera, offset_secs);
+        self.estimated = Some((found.offset_sigma, found.readout_sigma));
+        let correction = self.compare(&found, camera, offset_secs, is_tracking);
         if correction.is_none() {
             self.is_settled =
                 found.offset_sigma < SETTLED_OFFSET_SECS && found.readout_sigma < SETTLED_READOUT_SECS;
         }
         if let Some(correction) = &correction {
             self.readout_secs = correction.readout_secs;
+            self.used_sigmas = (found.offset_sigma, found.readout_sigma);
         }
         correction
     }
 
-    fn compare(&self, found: &Alignment, camera: &RigCamera, offset_secs: f64) -> Option<Correction> {
-        let differs = |a: f64, b: f64, sigma: f64, least: f64| (a - b).abs() > (3.0 * sigma).max(least);
-        let readout_secs = match differs(found.readout_secs, 0.0, found.readout_sigma, MIN_READOUT_SECS) {
+    fn compare(
+        &self,
+        found: &Alignment,
+        camera: &RigCamera,
+        offset_secs: f64,
+        is_tracking: bool,
+    ) -> Option<Correction> {
+        // A running state is worth more than some milliseconds, which its backend estimates by itself.
+        let least = if is_tracking { TRACKING_FACTOR } else { 1.0 };
+        let differs = |a: f64, b: f64, sigma: f64, used_sigma: f64, floor: f64| {
+            (a - b).abs() > (3.0 * sigma.hypot(used_sigma)).max(floor)
+        };
+        let readout_secs = match differs(found.readout_secs, 0.0, found.readout_sigma, 0.0, MIN_READOUT_SECS)
+        {
             true => found.readout_secs.max(0.0),
             false => 0.0,
         };
         let offset = self.estimates_offset
-            && differs(found.offset_secs, offset_secs, found.offset_sigma, MIN_OFFSET_SECS);
+            && differs(
+                found.offset_secs,
+                offset_secs,
+                found.offset_sigma,
+                self.used_sigmas.0,
+                least * MIN_OFFSET_SECS,
+            );
         let readout = self.estimates_readout
-            && differs(readout_secs, self.readout_secs, found.readout_sigma, MIN_READOUT_SECS);
+            && differs(
+                readout_secs,
+                self.readout_secs,
+                found.readout_sigma,
+                self.used_sigmas.1,
+                least * MIN_READOUT_SECS,
+            );
         let turn = (camera.body_from_camera.rotation.inverse() * found.body_from_camera).angle_rad();
         let rotation = turn > (4.0 * found.rotation_sigma).max(MIN_ROTATION_RAD);
         (offset || readout || rotation).then_some(Correction {
