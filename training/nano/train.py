@@ -45,7 +45,7 @@ MOST_CLIPS = 8  # that a process takes scenes from in one step
 @dataclass
 class Stage:
     """Part of the recipe: until which step, which sizes (`stream_views --sizes`), how many views a step, and how often
-    a scene has how many of them, which share of the rooms are homes (`stream_views --lived-in`), how strongly
+    a scene has how many of them, which share of the rooms are homes (`stream_views --home-share`), how strongly
     correspondence and depth are taught, and which share of the scenes look different (`augment.varied`)."""
 
     until_step: int
@@ -55,7 +55,7 @@ class Stage:
     lr_from: float = 1.0
     lr_to: float = 1.0
     scene_views: str = "1:4,2:30,3:10,4:26,6:6,8:24,16:20"
-    lived_in: float = 0.0
+    home_share: float = 0.0
     match: float = 1.0
     depth: float = 1.0
     augmented: float = 0.0
@@ -300,7 +300,7 @@ class Trainer:
             first_room = self.room + self.rank * ROOMS_APART
             arguments = ["--sizes", stage.sizes, "--views", str(stage.views_per_clip)]
             arguments += ["--clips", str(self.recipe.clips_per_room), "--first-room", str(first_room)]
-            arguments += ["--lived-in", str(stage.lived_in)]
+            arguments += ["--home-share", str(stage.home_share)]
             renderer = Renderer(self.stream, arguments)
             pool = Pool(iter(renderer), 800 if stage.views_per_clip <= 8 else 400, self.recipe.clip_uses, self.rng)
             print(f"step {self.step}: {stage}, rooms from {first_room}", flush=True)

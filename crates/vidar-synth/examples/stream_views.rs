@@ -2,11 +2,11 @@
 //!
 //! ```text
 //! stream_views [--split train|val|test] [--first-room R] [--rooms N] [--clips C] [--views V]
-//!              [--sizes 112x70:3,98x84:1] [--samples S] [--lived-in SHARE]
+//!              [--sizes 112x70:3,98x84:1] [--samples S] [--home-share SHARE]
 //! ```
 //!
 //! Rooms `R`, `R + 1`, … of the split (`--rooms 0`: without end) give `C` clips each of `V` views; a clip's size is
-//! drawn by weight. `--lived-in` makes that share of the rooms homes, looked over from near by. The stream is the
+//! drawn by weight. `--home-share` makes that share of the rooms homes, looked over from near by. The stream is the
 //! same for the same arguments. All numbers are little-endian:
 //!
 //! | bytes | what |
@@ -35,7 +35,7 @@ struct Arguments {
     views: usize,
     samples: usize,
     sizes: Vec<([usize; 2], u64)>,
-    lived_in: f64,
+    home_share: f64,
 }
 
 fn main() -> Result<(), Box<dyn Error>> {
@@ -54,7 +54,7 @@ fn stream(arguments: &Arguments, out: &mut impl Write) -> Result<(), Box<dyn Err
     let last =
         if arguments.rooms == 0 { u32::MAX } else { arguments.first_room.saturating_add(arguments.rooms) };
     for index in arguments.first_room..last {
-        let room = ClipRoom::lived_in(arguments.split, index, widest, arguments.lived_in)?;
+        let room = ClipRoom::with_homes(arguments.split, index, widest, arguments.home_share)?;
         for number in 0..arguments.clips {
             let [width, height] = size_of(&arguments.sizes, room.seed(), number);
             let settings = ClipSettings { views: arguments.views, width, height, samples: arguments.samples };
@@ -118,7 +118,7 @@ fn arguments() -> Result<Arguments, Box<dyn Error>> {
         views: 8,
         samples: 3,
         sizes: vec![([112, 70], 1)],
-        lived_in: 0.0,
+        home_share: 0.0,
     };
     let mut rest = std::env::args().skip(1);
     while let Some(key) = rest.next() {
@@ -136,7 +136,7 @@ fn arguments() -> Result<Arguments, Box<dyn Error>> {
             "--rooms" => found.rooms = value.parse()?,
             "--clips" => found.clips = value.parse()?,
             "--views" => found.views = value.parse()?,
-            "--lived-in" => found.lived_in = value.parse()?,
+            "--home-share" => found.home_share = value.parse()?,
             "--samples" => found.samples = value.parse()?,
             "--sizes" => found.sizes = value.split(',').map(size).collect::<Result<_, _>>()?,
             other => return Err(format!("unknown argument {other}; see the program's head").into()),

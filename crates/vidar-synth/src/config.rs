@@ -22,15 +22,15 @@ pub enum SceneKind {
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Variety {
-    /// Size, light and taste of the place are always the same; furniture, textures and pictures differ.
+    /// Size, light and style of the place are always the same; furniture, textures and pictures differ.
     #[default]
-    Usual,
+    Standard,
     /// Size, light, materials and kinds of furniture differ as well, windows and lamps may shine, walls may be bare:
     /// places to train networks on. Built-in flights shrink and grow with the place.
-    Wild,
-    /// Wild places of a home's size, with kitchens, set tables, desks and beds full of small things. Whatever
-    /// [`SceneKind`] asks for, rooms are as rooms of a home are.
-    Lived,
+    Randomized,
+    /// Randomized places of a home's size, with kitchens, set tables, desks and beds full of small objects. Whatever
+    /// [`SceneKind`] is chosen, rooms have the size of a home's.
+    Home,
 }
 
 /// Built-in flights; a trajectory file takes their place when one is given.
@@ -46,7 +46,7 @@ pub enum FlightKind {
     Aggressive,
     /// A hand-held camera, mostly below 0.5 m/s: standing, turning on the spot, walking a few steps, swaying always.
     Handheld,
-    /// A hand-held camera in lively use: brisk steps up to about 1 m/s, quick turns up to about 2 rad/s.
+    /// A hand-held camera in lively use: brisk steps (up to 2 m/s for moments) and quick turns (up to 3 rad/s).
     HandheldLively,
 }
 
@@ -127,7 +127,7 @@ impl Default for SynthConfig {
         Self {
             seed: 1,
             scene: SceneKind::Room,
-            variety: Variety::Usual,
+            variety: Variety::Standard,
             flight: FlightKind::Sweep,
             start: Start::InFlight,
             duration_secs: 10.0,
@@ -258,8 +258,8 @@ mod tests {
 
     #[test]
     fn each_bad_key_is_named() {
-        type Spoil = fn(&mut SynthConfig);
-        let cases: [(&str, Spoil); 14] = [
+        type Corrupt = fn(&mut SynthConfig);
+        let cases: [(&str, Corrupt); 14] = [
             ("seed", |c| c.seed = u64::MAX),
             ("duration_secs", |c| c.duration_secs = 0.0),
             ("camera_rate_hz", |c| c.camera_rate_hz = f64::NAN),
@@ -275,9 +275,9 @@ mod tests {
             ("clutter", |c| c.clutter = 1_000_000),
             ("start.static.secs", |c| c.start = Start::Static { secs: -1.0 }),
         ];
-        for (name, spoil) in cases {
+        for (name, corrupt) in cases {
             let mut config = SynthConfig::default();
-            spoil(&mut config);
+            corrupt(&mut config);
             match config.validate() {
                 Err(SynthError::BadConfig { key, .. }) => assert_eq!(key, name),
                 other => panic!("{name}: {other:?}"),

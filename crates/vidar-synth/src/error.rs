@@ -24,7 +24,7 @@ pub enum SynthError {
         /// What is wrong with it, with numbers.
         reason: String,
     },
-    /// The given trajectory cannot be told of the IMU.
+    /// The given trajectory cannot be converted to the body (IMU) frame.
     #[error("the trajectory cannot be moved to the body frame: {0}")]
     Frame(#[from] TrajectoryError),
     /// The camera of this size cannot be made.
@@ -41,7 +41,7 @@ pub enum SynthError {
     Write {
         /// Which file or folder.
         path: PathBuf,
-        /// What the system said.
+        /// The system's message.
         source: std::io::Error,
     },
     /// A file of a written sequence cannot be read.
@@ -49,7 +49,7 @@ pub enum SynthError {
     Read {
         /// Which file.
         path: PathBuf,
-        /// What the system said.
+        /// The system's message.
         source: std::io::Error,
     },
     /// A file is not one that a sequence was written with.

@@ -1,7 +1,7 @@
 //! Synthetic worlds in EuRoC layout: exact flight, camera, IMU, depth and scan; deterministic by seed.
 //!
 //! One smooth curve ([`FlightPath`]) is the truth from which everything follows: images and depth by ray casting a
-//! furnished [`World`], inertial readings from the curve's derivatives, a reference cloud of the surface that the
+//! furnished [`World`], IMU samples from the curve's derivatives, a reference cloud of the surface that the
 //! camera saw. [`write_sequence`] writes all of it as a EuRoC folder; [`render_views`] keeps it in memory.
 //!
 //! Every random number is drawn from a stream that belongs to its purpose and frame, so that the same [`SynthConfig`]

@@ -8,9 +8,9 @@ use rand_chacha::ChaCha8Rng;
 pub(crate) enum Purpose {
     Furniture,
     Imu,
-    /// Size of a wild place.
+    /// Size of a randomized place.
     Size,
-    /// Light of a wild place.
+    /// Light of a randomized place.
     Light,
     Exposure,
     /// Sensor noise of one frame.

@@ -174,7 +174,7 @@ impl Eye {
         Self { origin: world_from_camera.translation, rotation, axes }
     }
 
-    /// Casts sample `sample` of a row of tiles and tells of each ray and its pixel (counted from the band's first).
+    /// Casts sample `sample` of a row of tiles and reports each ray and its pixel (counted from the band's first).
     fn cast_band(
         &self,
         world: &World,

@@ -28,8 +28,8 @@ const BAND: usize = 32;
 /// Points seen flatter than this (cosine to the normal) do not count as seen.
 const MIN_COSINE: f64 = 0.03;
 
-/// A frame as a witness of what it saw.
-pub(crate) struct Witness {
+/// A frame with what decides whether it observed a point: its pose and coarse depth.
+pub(crate) struct ObservingFrame {
     camera_from_world: Se3,
     position: Vector3<f64>,
     columns: usize,
@@ -37,7 +37,7 @@ pub(crate) struct Witness {
     farthest: Vec<f32>,
 }
 
-impl Witness {
+impl ObservingFrame {
     pub(crate) fn new(world_from_camera: &Se3, depth: &[f32], width: usize) -> Self {
         let height = depth.len() / width.max(1);
         let (columns, rows) = (width.div_ceil(BLOCK), height.div_ceil(BLOCK));
@@ -72,11 +72,11 @@ impl Witness {
     }
 }
 
-/// Points about `spacing_m` apart on every surface that a witness saw, `noise_m` off along the normal.
+/// Points about `spacing_m` apart on every surface that any of the frames `observing` saw, `noise_m` off along the normal.
 pub(crate) fn scan_observed_surface(
     world: &World,
     camera: &CameraModel,
-    witnesses: &[Witness],
+    observing: &[ObservingFrame],
     scan: &Scan,
 ) -> Result<Vec<ScanPoint>, SynthError> {
     let mut bands = Vec::new();
@@ -99,7 +99,7 @@ pub(crate) fn scan_observed_surface(
     let bands: Vec<Vec<ScanPoint>> = bands
         .into_par_iter()
         .enumerate()
-        .map(|(index, band)| scan_band(world, camera, witnesses, scan, band, index))
+        .map(|(index, band)| scan_band(world, camera, observing, scan, band, index))
         .collect();
     Ok(bands.concat())
 }
@@ -115,7 +115,7 @@ pub(crate) struct Scan {
 fn scan_band(
     world: &World,
     camera: &CameraModel,
-    witnesses: &[Witness],
+    observing: &[ObservingFrame],
     scan: &Scan,
     (shape, face, first_row): (usize, usize, usize),
     index: usize,
@@ -126,7 +126,7 @@ fn scan_band(
     let number = world.face_number(shape, face);
     let columns = (width / scan.spacing_m).ceil() as usize;
     let mut points = Vec::new();
-    // Neighbouring points are mostly seen by the same frame: ask the last witness first.
+    // Neighbouring points are mostly seen by the same frame: try the frame of the last point first.
     let mut last = 0;
     for row in first_row..first_row + BAND {
         for column in 0..columns {
@@ -140,11 +140,11 @@ fn scan_band(
             let Some((position, normal)) = solid.at(face, uv) else {
                 continue;
             };
-            let n = witnesses.len();
-            let witness = (0..n)
+            let n = observing.len();
+            let frame_view = (0..n)
                 .map(|k| (last + k) % n)
-                .find(|&k| witnesses[k].sees(world, camera, &position, &normal));
-            if let Some(k) = witness {
+                .find(|&k| observing[k].sees(world, camera, &position, &normal));
+            if let Some(k) = frame_view {
                 last = k;
                 let gray = (world.face_radiance(number, uv, scan.spacing_m) * 255.0).round() as u8;
                 points.push(ScanPoint { position: position + normal * noise, gray });

@@ -10,7 +10,7 @@ use crate::layout;
 use crate::photometry::Photometry;
 use crate::render::{ROLLING_TILE, RayTable, expose};
 use crate::rig;
-use crate::scan::{Scan, Witness, scan_observed_surface};
+use crate::scan::{ObservingFrame, Scan, scan_observed_surface};
 use crate::schedule::{Shot, shots};
 use crate::simulation::{CONFIG_FILE, FLIGHT_FILE, flight_list};
 use crate::staging::{Staging, make_folder};
@@ -73,10 +73,10 @@ pub fn write_sequence(
         body_from_camera: config.body_from_camera(),
         mav: staging.folder.join("mav0"),
     };
-    let witnesses = writer.write_frames(progress)?;
+    let observing = writer.write_frames(progress)?;
     writer.write_camera_texts()?;
     let imu_samples = writer.write_inertial()?;
-    let scan_points = writer.write_scan(&witnesses)?;
+    let scan_points = writer.write_scan(&observing)?;
     writer.write_config(&staging.folder, flight)?;
     let frames = shots.iter().map(|s| s.stamps.len()).sum();
     layout::write_text(&staging.folder.join(TRUTH_FILE), &truth_text(config, &writer.camera, &shots)?)?;
@@ -106,7 +106,7 @@ struct Writer<'a> {
 
 impl Writer<'_> {
     /// Renders and writes all images and depths; returns what each frame saw.
-    fn write_frames(&self, progress: &Progress<'_>) -> Result<Vec<Witness>, SynthError> {
+    fn write_frames(&self, progress: &Progress<'_>) -> Result<Vec<ObservingFrame>, SynthError> {
         make_folder(&self.mav.join("cam0/data"))?;
         if self.config.depth {
             make_folder(&self.mav.join("depth0/data"))?;
@@ -125,17 +125,22 @@ impl Writer<'_> {
             if cancelled.load(Ordering::Relaxed) {
                 return Err(SynthError::Cancelled);
             }
-            let witness = self.write_frame(k, &rays, &photometry)?;
+            let frame_view = self.write_frame(k, &rays, &photometry)?;
             if !progress(done.fetch_add(1, Ordering::Relaxed) + 1, total) {
                 cancelled.store(true, Ordering::Relaxed);
                 return Err(SynthError::Cancelled);
             }
-            Ok(witness)
+            Ok(frame_view)
         };
         (0..total).into_par_iter().with_max_len(1).map(frame).collect()
     }
 
-    fn write_frame(&self, k: usize, rays: &RayTable, photometry: &Photometry) -> Result<Witness, SynthError> {
+    fn write_frame(
+        &self,
+        k: usize,
+        rays: &RayTable,
+        photometry: &Photometry,
+    ) -> Result<ObservingFrame, SynthError> {
         let config = self.config;
         let Shot { secs, stamps } = &self.shots[k];
         let exposed = if config.device.readout_secs > 0.0 {
@@ -155,7 +160,7 @@ impl Writer<'_> {
         for stamp in stamps {
             self.write_pictures(*stamp, &image, &exposed.depth)?;
         }
-        Ok(Witness::new(&self.world_from_camera(*secs), &exposed.depth, config.width))
+        Ok(ObservingFrame::new(&self.world_from_camera(*secs), &exposed.depth, config.width))
     }
 
     fn write_pictures(&self, stamp: Timestamp, image: &[u8], depth: &[f32]) -> Result<(), SynthError> {
@@ -247,10 +252,10 @@ impl Writer<'_> {
         Ok(record.samples.len())
     }
 
-    fn write_scan(&self, witnesses: &[Witness]) -> Result<usize, SynthError> {
+    fn write_scan(&self, observing: &[ObservingFrame]) -> Result<usize, SynthError> {
         let config = self.config;
         let scan = Scan { seed: config.seed, spacing_m: config.scan_spacing_m, noise_m: config.scan_noise_m };
-        let points = scan_observed_surface(self.world, &self.camera, witnesses, &scan)?;
+        let points = scan_observed_surface(self.world, &self.camera, observing, &scan)?;
         let folder = self.mav.join("pointcloud0");
         make_folder(&folder)?;
         layout::write_ply(&folder.join("data.ply"), &points)?;

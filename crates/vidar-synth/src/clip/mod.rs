@@ -81,7 +81,7 @@ pub struct Clip {
 pub struct ClipRoom {
     seed: u64,
     simulation: Simulation,
-    /// Whether people live there: looked over from near by, in richer colours.
+    /// Whether the room is a home: seen at close range, in richer colours.
     is_home: bool,
 }
 
@@ -94,15 +94,15 @@ impl ClipRoom {
     /// # Errors
     /// A width that no camera has.
     pub fn new(split: Split, index: u32, width: usize) -> Result<Self, SynthError> {
-        Self::lived_in(split, index, width, 0.0)
+        Self::with_homes(split, index, width, 0.0)
     }
 
-    /// As [`ClipRoom::new`], but `share` (0…1) of the rooms are [`Variety::Lived`], of which clips are taken as by
-    /// somebody who looks things over: from near by, often from above. The other rooms are the same as without them.
+    /// As [`ClipRoom::new`], but `share` (0…1) of the rooms are [`Variety::Home`], of which clips are taken as by
+    /// a person who inspects objects: at close range, often from above. The other rooms are the same as without them.
     ///
     /// # Errors
     /// A width that no camera has, a share outside 0…1.
-    pub fn lived_in(split: Split, index: u32, width: usize, share: f64) -> Result<Self, SynthError> {
+    pub fn with_homes(split: Split, index: u32, width: usize, share: f64) -> Result<Self, SynthError> {
         crate::config::ensure((0.0..=1.0).contains(&share), "share", "0 to 1", share)?;
         let seed = split.seed(index);
         let mut rng = stream(seed, Purpose::ClipRoom);
@@ -113,7 +113,7 @@ impl ClipRoom {
                 6..8 => SceneKind::Hall,
                 _ => SceneKind::Corridor,
             },
-            variety: if rng.random::<f64>() < 0.8 { Variety::Wild } else { Variety::Usual },
+            variety: if rng.random::<f64>() < 0.8 { Variety::Randomized } else { Variety::Standard },
             flight: match rng.random_range(0..3) {
                 0 => FlightKind::Sweep,
                 1 => FlightKind::Orbit,
@@ -130,7 +130,7 @@ impl ClipRoom {
         if is_home {
             // No flight leads through a home: what it has may stand anywhere.
             config =
-                SynthConfig { variety: Variety::Lived, scene: SceneKind::Room, duration_secs: 0.1, ..config };
+                SynthConfig { variety: Variety::Home, scene: SceneKind::Room, duration_secs: 0.1, ..config };
         }
         Ok(Self { seed, simulation: Simulation::new(&config, None)?, is_home })
     }
@@ -154,7 +154,7 @@ impl ClipRoom {
         let mut rng = stream(self.seed, Purpose::Clip(number));
         let camera = camera(width, height, &mut rng)?;
         let world = self.simulation.world();
-        let path = if self.is_home { paths::at_home } else { paths::path };
+        let path = if self.is_home { paths::home_path } else { paths::path };
         let nearest = if self.is_home { [0.15, 0.45] } else { [0.25, 0.7] };
         let mut poses = path(&self.simulation, views, &mut rng);
         for _ in 0..TRIES {

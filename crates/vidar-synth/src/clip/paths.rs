@@ -1,7 +1,7 @@
 //! Where the views of a clip are taken from.
 //!
-//! Flights keep the pace of the built-in courses; hand-held paths walk and turn by small uneven steps, or walk round
-//! something and look at it; in homes they look over its things from near by. Steps between neighbouring views
+//! Flights keep the speed of the built-in courses; hand-held paths walk and turn by small uneven steps, or walk round
+//! something and look at it; in homes they inspect objects at close range. Steps between neighbouring views
 //! are 5 to 70 cm and up to about 20°.
 
 use crate::rig::euroc_body_from_camera;
@@ -28,8 +28,8 @@ pub(super) fn path(simulation: &Simulation, views: usize, rng: &mut ChaCha8Rng) 
     }
 }
 
-/// Poses of `views` views in a place where people live: mostly looking over its things from near by.
-pub(super) fn at_home(simulation: &Simulation, views: usize, rng: &mut ChaCha8Rng) -> Vec<Se3> {
+/// Poses of `views` views in a home: mostly inspecting objects at close range.
+pub(super) fn home_path(simulation: &Simulation, views: usize, rng: &mut ChaCha8Rng) -> Vec<Se3> {
     let world = simulation.world();
     match rng.random_range(0..20) {
         0..12 => inspection(world, views, rng),
@@ -123,8 +123,8 @@ fn walk(world: &World, views: usize, rng: &mut ChaCha8Rng) -> Vec<Se3> {
         .collect()
 }
 
-/// Where a hand-held camera looks.
-struct Gaze {
+/// The point at which a hand-held camera is directed.
+struct ViewTarget {
     target: Vector3<f64>,
     /// By how much the target moves from view to view, m.
     wander: Vector3<f64>,
@@ -133,7 +133,7 @@ struct Gaze {
     unrest: f64,
 }
 
-impl Gaze {
+impl ViewTarget {
     /// Poses from `place` on, a free step of about `length` apart, beginning along `heading`.
     fn while_stepping(
         mut self,
@@ -171,8 +171,8 @@ fn walk_round(world: &World, views: usize, rng: &mut ChaCha8Rng) -> Vec<Se3> {
     let heading = yaw + 0.5 * PI * if rng.random::<bool>() { 1.0 } else { -1.0 } + 0.4 * normal(rng);
     let lean = 0.07 * normal(rng);
     let unrest = uniform(rng, 0.01, 0.06);
-    let gaze = Gaze { target, wander: Vector3::zeros(), lean, unrest };
-    gaze.while_stepping(world, place, heading, length, views, rng)
+    let view_target = ViewTarget { target, wander: Vector3::zeros(), lean, unrest };
+    view_target.while_stepping(world, place, heading, length, views, rng)
 }
 
 /// Looks over something from 0.5 to 2.3 m, mostly from above, while stepping aside and letting the eye wander.
@@ -185,18 +185,18 @@ fn inspection(world: &World, views: usize, rng: &mut ChaCha8Rng) -> Vec<Se3> {
     let heading = to.y.atan2(to.x) + side + 0.6 * normal(rng);
     let wander = Vector3::new(normal(rng), normal(rng), 0.3 * normal(rng)) * (0.04 * reach);
     let (lean, unrest) = (0.08 * normal(rng), uniform(rng, 0.01, 0.05));
-    let gaze = Gaze { target, wander, lean, unrest };
-    gaze.while_stepping(world, place, heading, length, views, rng)
+    let view_target = ViewTarget { target, wander, lean, unrest };
+    view_target.while_stepping(world, place, heading, length, views, rng)
 }
 
-/// A free place and a thing that is seen from there.
+/// A free place and an object that is seen from there.
 fn vantage(world: &World, rng: &mut ChaCha8Rng) -> Option<(Vector3<f64>, Vector3<f64>)> {
     // The first shape is the room itself.
-    let (room, things) = (world.extent(), &world.shapes()[1..]);
+    let (room, objects) = (world.extent(), &world.shapes()[1..]);
     for _ in 0..8 * TRIES {
-        let thing = things.get(rng.random_range(0..things.len().max(1)))?.extent();
-        let middle = thing.center();
-        let target = Vector3::new(middle.x, middle.y, thing.max.z.min(room.max.z - 0.8));
+        let object = objects.get(rng.random_range(0..objects.len().max(1)))?.extent();
+        let middle = object.center();
+        let target = Vector3::new(middle.x, middle.y, object.max.z.min(room.max.z - 0.8));
         let (azimuth, elevation) = (uniform(rng, -PI, PI), uniform(rng, 0.05, 0.95));
         let away = uniform(rng, 0.5, 2.3);
         let (sin, cos) = elevation.sin_cos();

@@ -77,10 +77,10 @@ fn settings_outside_their_domain_are_refused() {
 
 #[test]
 fn homes_take_only_their_share_and_change_no_other_room() {
-    assert!(ClipRoom::lived_in(Split::Train, 0, 56, 1.5).is_err());
+    assert!(ClipRoom::with_homes(Split::Train, 0, 56, 1.5).is_err());
     let mut homes = 0;
     for index in 0..6 {
-        let mixed = ClipRoom::lived_in(Split::Train, index, 56, 0.5).unwrap();
+        let mixed = ClipRoom::with_homes(Split::Train, index, 56, 0.5).unwrap();
         if mixed.is_home {
             homes += 1;
             continue;
@@ -96,7 +96,7 @@ fn homes_take_only_their_share_and_change_no_other_room() {
 fn homes_are_small_full_and_seen_from_near_by_and_above() {
     let (mut depths, mut tilts) = (Vec::new(), Vec::new());
     for index in 0..5 {
-        let room = ClipRoom::lived_in(Split::Train, index, 56, 1.0).unwrap();
+        let room = ClipRoom::with_homes(Split::Train, index, 56, 1.0).unwrap();
         let extent = room.simulation.world().extent();
         let size = extent.max - extent.min;
         assert!(size.x < 7.0 && size.y < 7.0 && size.z < 3.1, "{size:?}");

@@ -35,9 +35,9 @@ impl Course {
             (SceneKind::Corridor, FlightKind::Aggressive) => ([8.0, 0.3], 1.5),
             (SceneKind::Corridor, _) => ([11.0, 0.35], 1.5),
         };
-        // A wild place is smaller or larger than usual, and the flight with it.
+        // A randomized place is smaller or larger than a standard one, and the flight with it.
         let grown = crate::world::room_size(config).component_div(&crate::world::room_size(&SynthConfig {
-            variety: Variety::Usual,
+            variety: Variety::Standard,
             ..config.clone()
         }));
         let half = [half[0] * grown.x, half[1] * grown.y];

@@ -24,7 +24,7 @@ const INTERVAL_SECS: f64 = 0.05;
 /// How far the curve goes on before the first and after the last instant, s: room for an exposure.
 const MARGIN_SECS: f64 = 0.2;
 
-/// Time in which a body at rest reaches the flight's own pace, s.
+/// Time in which a body at rest reaches the flight's own speed, s.
 const RAMP_SECS: f64 = 2.0;
 
 /// Motion of the body over time, with exact derivatives. Time is in seconds after the sequence's beginning.
@@ -49,24 +49,26 @@ impl FlightPath {
     /// The built-in flight `config.flight` through `config.scene`.
     pub fn built_in(config: &SynthConfig) -> Result<Self, SynthError> {
         config.validate()?;
-        let pace = Pace::new(config.start, 0.0);
-        let poses = Self::built_in_poses(config, &pace);
+        let time_map = TimeMap::new(config.start, 0.0);
+        let poses = Self::built_in_poses(config, &time_map);
         // The built-in flights are what the spline makes of them; nothing need be passed through.
         let spline = PoseSpline::new(-margin_secs(), INTERVAL_SECS, &poses);
         Ok(Self { spline, duration_secs: config.duration_secs })
     }
 
     /// Control poses of the body on the built-in flight.
-    fn built_in_poses(config: &SynthConfig, pace: &Pace) -> Vec<Se3> {
+    fn built_in_poses(config: &SynthConfig, time_map: &TimeMap) -> Vec<Se3> {
         use vidar_core::LieGroup;
         let times = control_times(config.duration_secs);
         let camera_from_body = config.body_from_camera().inverse();
         if let Some(path) = handheld::Handheld::new(config) {
-            let at = |t: f64| path.world_from_camera(pace.source_secs(t), t, pace.lift(t)) * camera_from_body;
+            let at = |t: f64| {
+                path.world_from_camera(time_map.source_secs(t), t, time_map.lift(t)) * camera_from_body
+            };
             return times.map(at).collect();
         }
         let course = builtin::Course::new(config);
-        let euroc = times.map(|t| course.world_from_body(pace.source_secs(t), pace.lift(t)));
+        let euroc = times.map(|t| course.world_from_body(time_map.source_secs(t), time_map.lift(t)));
         if config.device.mount == Mount::Euroc {
             return euroc.collect();
         }
@@ -86,11 +88,11 @@ impl FlightPath {
         config.validate()?;
         let source = recorded::Recorded::new(trajectory, config)?;
         let lead_in = if config.start == Start::InFlight { MARGIN_SECS } else { 0.0 };
-        let pace = Pace::new(config.start, lead_in);
-        let available = pace.sequence_secs(source.duration_secs() - MARGIN_SECS);
+        let time_map = TimeMap::new(config.start, lead_in);
+        let available = time_map.sequence_secs(source.duration_secs() - MARGIN_SECS);
         let duration_secs = config.duration_secs.min(available);
         let poses: Vec<Se3> =
-            control_times(duration_secs).map(|t| source.world_from_body(pace.source_secs(t))).collect();
+            control_times(duration_secs).map(|t| source.world_from_body(time_map.source_secs(t))).collect();
         let resting = match config.start {
             Start::Static { secs } => ((secs + margin_secs()) / INTERVAL_SECS) as usize + ORDER,
             Start::InFlight => 0,
@@ -152,13 +154,13 @@ fn control_times(duration_secs: f64) -> impl Iterator<Item = f64> {
 }
 
 /// How time in the sequence becomes time on the source's course.
-struct Pace {
+struct TimeMap {
     start: Start,
     /// Time on the course at the sequence's beginning, s.
     lead_in_secs: f64,
 }
 
-impl Pace {
+impl TimeMap {
     fn new(start: Start, lead_in_secs: f64) -> Self {
         Self { start, lead_in_secs }
     }

@@ -251,7 +251,7 @@ fn along_a_real_flight_the_simulated_imu_reads_what_the_real_one_read() {
         accel += (path.specific_force(secs) - force).norm_squared();
         n += 1;
     }
-    assert!(n > 1500, "{n} readings");
+    assert!(n > 1500, "{n} IMU samples");
     let (gyro, accel) = ((gyro / f64::from(n)).sqrt(), (accel / f64::from(n)).sqrt());
     // What remains is vibration and the smoothing; a wrong frame or gravity sign would give 0.3 rad/s and 20 m/s².
     assert!(gyro < 0.06 && accel < 0.6, "rms differences {gyro} rad/s, {accel} m/s²");

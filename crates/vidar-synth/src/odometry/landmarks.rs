@@ -19,7 +19,7 @@ const SMOOTH: f32 = 0.05;
 struct Point {
     id: LandmarkId,
     in_world: Vector3<f64>,
-    /// ln(told depth/true depth), the same in each keyframe.
+    /// ln(reported depth/true depth), the same in each keyframe.
     log_error: f64,
 }
 
@@ -36,19 +36,19 @@ impl<'a> Landmarks<'a> {
         Self { errors, random: Gaussian::new(stream(seed, Purpose::Landmarks)), alive: Vec::new(), next: 0 }
     }
 
-    /// What the keyframe `view` tells of its landmarks, on a track whose lengths are `scale` true ones.
+    /// Landmarks that the keyframe `view` reports, on a track whose lengths are `scale` true ones.
     pub(super) fn seen(&mut self, view: &TrueView, scale: f64) -> Vec<SparseLandmark> {
         self.alive.retain(|p| project(view, &p.in_world).is_some());
         self.refill(view);
         let of_keyframe = self.errors.landmark_frame_sigma * self.random.next();
         let sigma = self.errors.landmark_sigma.hypot(self.errors.landmark_frame_sigma).max(1e-3);
-        let tell = |point: &Point| {
+        let observe = |point: &Point| {
             let (pixel, z) = project(view, &point.in_world)?;
             let inverse_depth = 1.0 / (z * scale * (point.log_error + of_keyframe).exp());
             let inverse_depth_std = sigma * inverse_depth;
             Some(SparseLandmark { id: point.id, pixel, inverse_depth, inverse_depth_std })
         };
-        self.alive.iter().filter_map(tell).collect()
+        self.alive.iter().filter_map(observe).collect()
     }
 
     fn refill(&mut self, view: &TrueView) {

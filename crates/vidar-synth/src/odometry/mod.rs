@@ -1,4 +1,4 @@
-//! Keyframes as a visual-inertial odometry would have told them, without running one.
+//! Keyframes as a visual-inertial odometry would report them, without running one.
 //!
 //! The body's steps from keyframe to keyframe are off by white noise, by a scale that walks slowly, and by a yaw that
 //! walks (gravity holds roll and pitch); errors add up along the way. Landmarks are points of the true surface, seen
@@ -88,7 +88,7 @@ impl OdometryErrors {
 /// Smallest standard deviations that are stated: an odometry that claims to know exactly breaks whoever believes it.
 const STATED_FLOOR: f64 = 1e-6;
 
-/// What an odometry of `errors` tells of the keyframes `views`, in the order of time, of a camera at
+/// The keyframes `views` as an odometry with `errors` reports them, in the order of time, of a camera at
 /// `body_from_camera`.
 ///
 /// The first keyframe is at its true pose. Deterministic by `seed`.
@@ -118,9 +118,9 @@ pub fn simulate_odometry(
             log_scale += errors.factor * errors.scale_walk * random.next();
             let error = StepError::draw(&step, &world_from_body.rotation, errors, &mut random);
             let rotation = step.rotation * So3::exp(&error.turn);
-            let told = Se3::new(rotation, step.translation * log_scale.exp() + error.slip);
-            world_from_body = world_from_body * told;
-            let transport = told.inverse().adjoint();
+            let reported = Se3::new(rotation, step.translation * log_scale.exp() + error.slip);
+            world_from_body = world_from_body * reported;
+            let transport = reported.inverse().adjoint();
             covariance = transport * covariance * transport.transpose() + error.covariance;
             previous = Some((KeyframeId(k as u32 - 1), error.covariance));
         }
@@ -192,7 +192,7 @@ impl StepError {
     }
 }
 
-/// A pose covariance of the body's own axes with the place told in the world's.
+/// A pose covariance of the body's own axes with the position in the world's axes.
 fn in_world_axes(covariance: &PoseCovariance, world_from_body: &So3) -> PoseCovariance {
     let mut turn = PoseCovariance::identity();
     turn.fixed_view_mut::<3, 3>(3, 3).copy_from(&world_from_body.matrix());

@@ -70,12 +70,12 @@ fn steps_are_as_uncertain_as_stated_and_three_times_worse_at_factor_three() {
         for seed in 0..30 {
             let all = keyframes(&errors, seed);
             for (pair, truth) in all.windows(2).zip(views().windows(2)) {
-                let told = pair[0].state.world_from_body.inverse() * pair[1].state.world_from_body;
+                let reported = pair[0].state.world_from_body.inverse() * pair[1].state.world_from_body;
                 let camera_from_body = euroc_body_from_camera().inverse();
                 let body = |v: &TrueView| v.world_from_camera * camera_from_body;
                 let true_step = body(&truth[0]).inverse() * body(&truth[1]);
                 // previous_from_this · exp(δ)
-                let delta = (true_step.inverse() * told).log();
+                let delta = (true_step.inverse() * reported).log();
                 let covariance = pair[1].previous.unwrap().1;
                 sum += (delta.transpose() * covariance.try_inverse().unwrap() * delta)[0];
                 count += 6;
@@ -91,7 +91,7 @@ fn steps_are_as_uncertain_as_stated_and_three_times_worse_at_factor_three() {
 }
 
 #[test]
-fn pose_covariance_tells_how_far_the_end_is_off() {
+fn pose_covariance_predicts_the_error_at_the_end() {
     // Without the scale, which is common to all steps and not part of the chain.
     let errors =
         OdometryErrors { landmarks: 0, scale_sigma: 0.0, scale_walk: 0.0, ..OdometryErrors::default() };
@@ -129,7 +129,7 @@ fn gravity_holds_roll_and_pitch_and_yaw_drifts() {
 }
 
 #[test]
-fn the_same_seed_tells_the_same_and_another_seed_another_story() {
+fn the_same_seed_gives_the_same_keyframes_and_another_seed_others() {
     let errors = OdometryErrors::default();
     assert_eq!(keyframes(&errors, 4), keyframes(&errors, 4));
     assert_ne!(keyframes(&errors, 4), keyframes(&errors, 5));

@@ -48,7 +48,7 @@ pub struct PredictionErrors {
     pub sky_beyond_m: f64,
     /// Relative depth error at which the confidence is one half, 0.001…1.
     pub confidence_tolerance: f64,
-    /// How badly the confidence knows the error: standard deviation of ln(perceived error/true error), smooth over the
+    /// How badly the confidence predicts the error: standard deviation of ln(perceived error/true error), smooth over the
     /// image, 0…3.
     pub confidence_noise: f64,
     /// Pose-conditioned predictions: standard deviation of ln(scale) about the scale of the poses given, 0…1.

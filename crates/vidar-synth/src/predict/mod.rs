@@ -2,7 +2,7 @@
 //!
 //! True depth is rendered and then spoiled as Depth Anything 3 spoils it ([`PredictionErrors`]): each chunk has a frame
 //! and scale of its own, its cameras drift from view to view and its depth scale with them, depth bends smoothly within
-//! a view, bleeds over edges and is noisy, and confidence knows of it only in part. Given prior poses
+//! a view, bleeds over edges and is noisy, and confidence reflects it only in part. Given prior poses
 //! (pose-conditioned), frame and scale are those of the poses up to a small error of scale, and drift is smaller.
 //!
 //! A frame that two chunks see is predicted twice, with errors that agree only as far as they belong to the image

@@ -13,14 +13,14 @@ const PATCH: usize = 14;
 /// Whether a simulated network heeds prior poses.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Conditioning {
-    /// Prior poses are not looked at.
+    /// Prior poses are ignored.
     PoseFree,
     /// Prior poses are injected; each view must have one.
     PosesInjected,
 }
 
-/// A network that sees a [`Simulation`]: it knows the truth by the views' stamps and tells it with
-/// [`PredictionErrors`]. It never looks at the images.
+/// A network that sees a [`Simulation`]: it takes the truth at the views' stamps and adds
+/// [`PredictionErrors`]. It ignores the images.
 pub struct SyntheticModel {
     info: ModelInfo,
     simulation: Arc<Simulation>,

@@ -6,7 +6,7 @@ use nalgebra::{Vector3, Vector6};
 use rand::Rng;
 use vidar_core::{LieGroup, Se3, Sim3, So3, umeyama_se3, umeyama_sim3};
 
-/// Injected poses whose centres lie closer together than this (RMS, m) do not tell the network a scale.
+/// Injected poses whose centres lie closer together than this (RMS, m) give the network no scale.
 const MIN_SPREAD_M: f64 = 0.1;
 
 /// What a chunk's prediction is off by, apart from its pixels.

@@ -190,14 +190,14 @@ fn edges_bleed_and_planes_do_not() {
     for x in (5..35).chain(45..75) {
         assert!((depth[(x, 20)] / z(x) - 1.0).abs() < 1e-5, "column {x}");
     }
-    // Pixels at the edge float between both sides, and confidence knows that something is there.
+    // Pixels at the edge float between both sides, and confidence is low there.
     assert!(depth[(39, 20)] < 3.2 && depth[(39, 20)] > 2.2, "{}", depth[(39, 20)]);
     assert!(depth[(40, 20)] > 2.1);
     assert!(confidence[(39, 20)] < 0.3 && confidence[(20, 20)] > 0.95);
 }
 
 #[test]
-fn confidence_knows_the_error_in_part() {
+fn confidence_reflects_the_error_in_part() {
     let views = views();
     let errors = PredictionErrors { deformation_sigma: 0.0, bleeding_px: 1.0, ..PredictionErrors::default() };
     let prediction = predict_chunk(ChunkId(0), &views, None, &errors, 3).unwrap();
@@ -226,7 +226,7 @@ fn confidence_knows_the_error_in_part() {
 }
 
 #[test]
-fn conditioned_predictions_stand_where_they_were_told_up_to_scale() {
+fn conditioned_predictions_keep_the_prior_poses_up_to_scale() {
     let views = views();
     // The poses given are 5 % too long.
     let prior: Vec<Se3> = views
@@ -315,17 +315,17 @@ fn standing_still_and_single_views_have_predictions() {
 
 #[test]
 fn each_bad_key_is_named() {
-    type Spoil = fn(&mut PredictionErrors);
-    let cases: [(&str, Spoil); 5] = [
+    type Corrupt = fn(&mut PredictionErrors);
+    let cases: [(&str, Corrupt); 5] = [
         ("errors.gauge_scale_sigma", |e| e.gauge_scale_sigma = f64::NAN),
         ("errors.deformation_order", |e| e.deformation_order = 0),
         ("errors.hole_share", |e| e.hole_share = 1.0),
         ("errors.confidence_tolerance", |e| e.confidence_tolerance = 0.0),
         ("errors.failed_share", |e| e.failed_share = -0.1),
     ];
-    for (name, spoil) in cases {
+    for (name, corrupt) in cases {
         let mut errors = PredictionErrors::default();
-        spoil(&mut errors);
+        corrupt(&mut errors);
         let refused = predict_chunk(ChunkId(0), &[], None, &errors, 0).unwrap_err();
         assert!(refused.to_string().contains(name), "{refused}");
     }

@@ -1,6 +1,6 @@
 //! Surfaces without texture, as painted walls and plain furniture have them.
 
-use super::furnish::Furnished;
+use super::furniture::RoomContents;
 use super::material::{Decal, Kind, Material};
 use super::shape::Extent;
 use crate::config::SynthConfig;
@@ -11,7 +11,7 @@ use rand::seq::SliceRandom;
 /// Makes `config.bare_share` of the shell's area and of the furniture uniform.
 ///
 /// Faces of the shell are drawn in random order until the area is reached; the last one is bare on one side only.
-pub(super) fn strip_textures(furnished: &mut Furnished, room: &Extent, config: &SynthConfig) {
+pub(super) fn strip_textures(furnished: &mut RoomContents, room: &Extent, config: &SynthConfig) {
     if config.bare_share <= 0.0 {
         return;
     }

@@ -57,7 +57,7 @@ impl Bvh {
         self.split(extents, middle, until);
     }
 
-    /// Tells of every shape of the leaves that a pyramid may meet.
+    /// Calls back with every shape of the leaves that a pyramid may meet.
     pub(super) fn within(&self, pyramid: &Pyramid, mut found: impl FnMut(usize)) {
         // As deep as in `nearest`.
         let mut waiting = [0_u32; 40];

@@ -2,20 +2,20 @@
 
 mod bare;
 mod bvh;
-mod furnish;
+mod furniture;
+mod home;
 mod light;
-mod lived;
 mod material;
 mod noise;
+mod randomized;
 mod shape;
 mod texture;
 mod tile;
-mod wild;
 
+pub(crate) use randomized::room_size;
 pub use shape::Extent;
 pub(crate) use shape::Shape;
 pub(crate) use tile::{TileBounds, TileHits};
-pub(crate) use wild::room_size;
 
 use crate::config::{SceneKind, SynthConfig};
 use crate::error::SynthError;
@@ -79,7 +79,7 @@ impl World {
     pub fn build(config: &SynthConfig, flight: &FlightPath) -> Result<Self, SynthError> {
         config.validate()?;
         let room = room_around(config, &flight.extent())?;
-        let mut furnished = furnish::furnish(config, &room, &flight.positions(0.02));
+        let mut furnished = furniture::furnish(config, &room, &flight.positions(0.02));
         bare::strip_textures(&mut furnished, &room, config);
         let mut shapes = vec![Shape::Shell { min: room.min, max: room.max }];
         let mut surfaces = furnished.shell;
@@ -88,7 +88,7 @@ impl World {
             shapes.push(piece.shape);
         }
         let focal = config.camera()?.intrinsics().fx;
-        let lighting = wild::lighting(config);
+        let lighting = randomized::lighting(config);
         Ok(Self::bake(shapes, &surfaces, SHARP_DISTANCE_M / focal, &lighting, config.seed as u32))
     }
 

@@ -1,4 +1,4 @@
-//! Wild places and homes differ from seed to seed in everything, and nothing stands in the flight's way.
+//! Randomized places and homes differ from seed to seed in everything, and nothing stands in the flight's way.
 
 #![allow(clippy::unwrap_used, clippy::panic)] // a helper that fails is a test that fails
 
@@ -9,7 +9,7 @@ use vidar_synth::{
 };
 
 fn wild(seed: u64, scene: SceneKind, flight: FlightKind) -> Simulation {
-    varied(seed, Variety::Wild, scene, flight)
+    varied(seed, Variety::Randomized, scene, flight)
 }
 
 fn varied(seed: u64, variety: Variety, scene: SceneKind, flight: FlightKind) -> Simulation {
@@ -41,7 +41,7 @@ fn flights_are_free_in_every_wild_place_and_home() {
     let scenes = [SceneKind::Room, SceneKind::Hall, SceneKind::Corridor];
     let flights = [FlightKind::Sweep, FlightKind::Orbit, FlightKind::Aggressive];
     for seed in 0..9 {
-        for variety in [Variety::Wild, Variety::Lived] {
+        for variety in [Variety::Randomized, Variety::Home] {
             let simulation = varied(seed, variety, scenes[seed as usize % 3], flights[seed as usize / 3]);
             for position in simulation.path().positions(0.05) {
                 let clearance = simulation.world().clearance_m(&position);

@@ -1,9 +1,9 @@
-//! Places that people live in: kitchens, set tables, desks, beds, wardrobes, and the small things that stand on them.
+//! Places that people live in: kitchens, set tables, desks, beds, wardrobes, and the small objects that stand on them.
 //!
-//! A camera in the hand looks down on such things from near, where the usual places and the wild ones have little. The
+//! A camera in the hand looks down on such objects from near, where the standard and the randomized places have little. The
 //! furniture's own frame has x along the wall or the longer side, y into the room and z up.
 
-use super::furnish::{Piece, WallPlace, between, material, on_floor, pick, plain};
+use super::furniture::{Piece, WallPlace, between, material, on_floor, pick, plain};
 use super::material::{Kind, Material};
 use super::shape::{Extent, Shape};
 use nalgebra::{Rotation3, Vector3};
@@ -14,7 +14,7 @@ use std::f64::consts::PI;
 /// What bodies of cupboards and fronts are made of.
 const FRONTS: [Kind; 6] = [Kind::Plain, Kind::Plain, Kind::Door, Kind::Door, Kind::Planks, Kind::Metal];
 
-/// What people put their things on.
+/// Furniture on which small objects stand.
 const TOPS: [Kind; 6] = [Kind::Planks, Kind::Plain, Kind::Plain, Kind::Concrete, Kind::Tiles, Kind::Plaster];
 
 /// A random group of furniture.
@@ -86,12 +86,12 @@ impl Build {
         }
     }
 
-    /// Up to `count` things that stand in the rectangle of half sides `half` about `middle`, apart from each other.
-    fn things(&mut self, middle: [f64; 3], half: [f64; 2], count: usize, rng: &mut ChaCha8Rng) {
+    /// Up to `count` objects that stand in the rectangle of half sides `half` about `middle`, apart from each other.
+    fn small_objects(&mut self, middle: [f64; 3], half: [f64; 2], count: usize, rng: &mut ChaCha8Rng) {
         let mut taken: Vec<[f64; 3]> = Vec::new();
         for _ in 0..3 * count {
-            let thing = Thing::random(rng);
-            let reach = thing.reach();
+            let object = SmallObject::random(rng);
+            let reach = object.reach();
             if taken.len() == count || reach > half[0].min(half[1]) {
                 continue;
             }
@@ -100,7 +100,7 @@ impl Build {
                 continue;
             }
             taken.push([x, y, reach]);
-            thing.stand(self, [x, y, middle[2]], rng);
+            object.stand(self, [x, y, middle[2]], rng);
         }
     }
 }
@@ -114,7 +114,7 @@ fn any(kinds: &[Kind], rng: &mut ChaCha8Rng) -> Material {
 
 /// Something small.
 #[derive(Clone, Copy)]
-enum Thing {
+enum SmallObject {
     Plate { radius: f64 },
     Cup { radius: f64 },
     Bowl { radius: f64 },
@@ -127,7 +127,7 @@ enum Thing {
     Picture { width: f64 },
 }
 
-impl Thing {
+impl SmallObject {
     fn random(rng: &mut ChaCha8Rng) -> Self {
         match rng.random_range(0..12) {
             0 => Self::Plate { radius: between(rng, 0.08, 0.15) },
@@ -289,7 +289,7 @@ fn kitchen(room: &Extent, rng: &mut ChaCha8Rng) -> Vec<Piece> {
         build.block([x, 0.15, top + 0.25], [0.022, 0.2, 0.022], 0.0, material(Kind::Metal, 0.6, rng));
     }
     let half = [0.5 * long, 0.5 * depth - 0.03];
-    build.things([middle, 0.5 * depth, top + 0.006], half, crowd(long * depth, rng), rng);
+    build.small_objects([middle, 0.5 * depth, top + 0.006], half, crowd(long * depth, rng), rng);
     build.pieces
 }
 
@@ -304,7 +304,7 @@ fn chair(build: &mut Build, [x, y]: [f64; 2], turn: f64, of: [Material; 2]) {
     }
 }
 
-/// A table, square or round, with chairs about it and things on it.
+/// A table, square or round, with chairs about it and objects on it.
 fn set_table(room: &Extent, rng: &mut ChaCha8Rng) -> Vec<Piece> {
     let (length, width, tall) = (between(rng, 0.8, 2.0), between(rng, 0.65, 1.0), between(rng, 0.68, 0.78));
     let mut build = Build::free(room, 0.5 * width + 0.2, rng);
@@ -320,7 +320,7 @@ fn set_table(room: &Extent, rng: &mut ChaCha8Rng) -> Vec<Piece> {
     }
     let inner = if is_round { 0.68 } else { 0.97 };
     let half = [0.5 * inner * length, 0.5 * inner * width];
-    build.things([0.0, 0.0, tall], half, crowd(length * width, rng), rng);
+    build.small_objects([0.0, 0.0, tall], half, crowd(length * width, rng), rng);
     let seat = [any(&[Kind::Fabric, Kind::Planks, Kind::Plain], rng), legs];
     for side in [-1.0, 1.0] {
         for k in 0..rng.random_range(0..=2) {
@@ -359,12 +359,12 @@ fn desk(room: &Extent, rng: &mut ChaCha8Rng) -> Vec<Piece> {
     let half = [0.25 * length - 0.12, 0.28 * width];
     for side in [-1.0, 1.0] {
         let count = crowd(0.5 * length * width, rng);
-        build.things([side * (0.25 * length + 0.1), 0.68 * width, tall], half, count, rng);
+        build.small_objects([side * (0.25 * length + 0.1), 0.68 * width, tall], half, count, rng);
     }
     if rng.random::<f64>() < 0.4 {
         let (shelf, z) = (any(&TOPS, rng), tall + between(rng, 0.5, 0.8));
         build.block([0.0, 0.12, z], [length, 0.24, 0.025], 0.0, shelf);
-        build.things([0.0, 0.12, z + 0.025], [0.5 * length, 0.11], crowd(0.5 * length, rng), rng);
+        build.small_objects([0.0, 0.12, z + 0.025], [0.5 * length, 0.11], crowd(0.5 * length, rng), rng);
     }
     if rng.random::<f64>() < 0.7 {
         let seat = [any(&[Kind::Fabric, Kind::Plain], rng), legs];
@@ -383,7 +383,7 @@ fn island(room: &Extent, rng: &mut ChaCha8Rng) -> Vec<Piece> {
     let top = [long + 2.0 * over, depth + 2.0 * over, 0.035];
     build.block([0.0, 0.5 * depth, tall], top, 0.0, any(&TOPS, rng));
     let half = [0.5 * long, 0.5 * depth];
-    build.things([0.0, 0.5 * depth, tall + 0.035], half, crowd(long * depth, rng), rng);
+    build.small_objects([0.0, 0.5 * depth, tall + 0.035], half, crowd(long * depth, rng), rng);
     let (seat, leg) = (any(&[Kind::Fabric, Kind::Planks], rng), any(&[Kind::Metal], rng));
     for k in 0..rng.random_range(0..=3) {
         let place = [0.5 * (f64::from(k) - 1.0), -0.3 - over, 0.0];
@@ -393,7 +393,7 @@ fn island(room: &Extent, rng: &mut ChaCha8Rng) -> Vec<Piece> {
     build.pieces
 }
 
-/// A low cupboard with things, perhaps a large screen, on it.
+/// A low cupboard with objects, perhaps a large screen, on it.
 fn sideboard(room: &Extent, rng: &mut ChaCha8Rng) -> Vec<Piece> {
     let (long, depth, tall) = (between(rng, 0.8, 2.2), between(rng, 0.32, 0.5), between(rng, 0.4, 1.1));
     let mut build = Build::at_wall(room, long, rng);
@@ -406,7 +406,7 @@ fn sideboard(room: &Extent, rng: &mut ChaCha8Rng) -> Vec<Piece> {
         build.block([0.0, 0.1, tall + 0.06], [wide, 0.04, 0.56 * wide], 0.0, screen);
         build.block([0.0, 0.1, tall + 0.02], [0.3 * wide, 0.12, 0.05], 0.0, screen);
     } else {
-        build.things([0.0, 0.5 * depth, tall + 0.02], half, crowd(1.5 * long * depth, rng), rng);
+        build.small_objects([0.0, 0.5 * depth, tall + 0.02], half, crowd(1.5 * long * depth, rng), rng);
     }
     build.pieces
 }
@@ -446,6 +446,6 @@ fn low_table(room: &Extent, rng: &mut ChaCha8Rng) -> Vec<Piece> {
     build.block([0.0, 0.0, tall - 0.03], [length, width, 0.03], 0.0, any(&TOPS, rng));
     let legs = any(&[Kind::Metal, Kind::Planks], rng);
     build.legs([0.0; 2], [length, width], tall - 0.03, legs);
-    build.things([0.0, 0.0, tall], [0.5 * length, 0.5 * width], crowd(length * width, rng), rng);
+    build.small_objects([0.0, 0.0, tall], [0.5 * length, 0.5 * width], crowd(length * width, rng), rng);
     build.pieces
 }

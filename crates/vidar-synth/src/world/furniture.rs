@@ -2,7 +2,7 @@
 
 use super::material::{Decal, Kind, Material, Surface};
 use super::shape::{Extent, Shape};
-use super::{lived, wild};
+use super::{home, randomized};
 use crate::config::{SceneKind, SynthConfig, Variety};
 use crate::random::{Purpose, stream};
 use nalgebra::{Rotation3, Vector3};
@@ -24,34 +24,35 @@ pub(super) struct Piece {
 }
 
 /// The room's six faces and everything in it.
-pub(super) struct Furnished {
+pub(super) struct RoomContents {
     pub shell: Vec<Surface>,
     pub pieces: Vec<Piece>,
 }
 
 /// Furnishes `room` for `config`, keeping clear of the flight's `positions`.
-pub(super) fn furnish(config: &SynthConfig, room: &Extent, positions: &[Vector3<f64>]) -> Furnished {
+pub(super) fn furnish(config: &SynthConfig, room: &Extent, positions: &[Vector3<f64>]) -> RoomContents {
     let mut rng = stream(config.seed, Purpose::Furniture);
-    let wild = config.variety != Variety::Usual;
-    let shell = if wild { wild::shell(room, &mut rng) } else { shell_surfaces(config.scene, room, &mut rng) };
+    let wild = config.variety != Variety::Standard;
+    let shell =
+        if wild { randomized::shell(room, &mut rng) } else { shell_surfaces(config.scene, room, &mut rng) };
     let mut space = Space { room: *room, positions, taken: Vec::new() };
     let mut pieces = Vec::new();
     for _ in 0..group_count(config, room) {
-        // Wild places hold what any usual place holds, and more.
+        // Randomized places hold what any standard place holds, and more.
         let scene =
             if wild { [SceneKind::Room, SceneKind::Hall][rng.random_range(0..2)] } else { config.scene };
         let own = wild && rng.random::<f64>() < 0.35;
-        let at_home = config.variety == Variety::Lived && rng.random::<f64>() < 0.6;
+        let from_home = config.variety == Variety::Home && rng.random::<f64>() < 0.6;
         let kind = Group::random(scene, &mut rng);
         for _ in 0..ATTEMPTS {
-            let mut group = match (at_home, own) {
-                (true, _) => lived::furniture(room, &mut rng),
-                (false, true) => wild::furniture(room, &mut rng),
+            let mut group = match (from_home, own) {
+                (true, _) => home::furniture(room, &mut rng),
+                (false, true) => randomized::furniture(room, &mut rng),
                 (false, false) => kind.build(room, &mut rng),
             };
             // What belongs together in a home keeps its materials.
-            if wild && !at_home {
-                wild::restyle(&mut group, &mut rng);
+            if wild && !from_home {
+                randomized::restyle(&mut group, &mut rng);
             }
             if space.take(&group) {
                 pieces.extend(group);
@@ -59,7 +60,7 @@ pub(super) fn furnish(config: &SynthConfig, room: &Extent, positions: &[Vector3<
             }
         }
     }
-    Furnished { shell, pieces }
+    RoomContents { shell, pieces }
 }
 
 /// `clutter` groups per 64 m² of floor, up to four times as many in large places.

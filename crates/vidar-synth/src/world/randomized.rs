@@ -1,10 +1,10 @@
 //! Worlds that differ in everything that a seed can change: size, light, materials, furniture.
 //!
-//! A network that is to work in places it never saw must be trained on many that have little in common. Where the usual
-//! places keep their size and taste, [`crate::Variety::Wild`] draws them anew for each seed, and adds furniture that
-//! the usual places lack: stairs, sofas, lamps, plants, rugs, windows that shine.
+//! A network that is to work in places it never saw must be trained on many that have little in common. Where the standard
+//! places keep their size and style, [`crate::Variety::Randomized`] draws them anew for each seed, and adds furniture that
+//! the standard places lack: stairs, sofas, lamps, plants, rugs, windows that shine.
 
-use super::furnish::{Piece, WallPlace, between, material, on_floor, pick, piece, plain};
+use super::furniture::{Piece, WallPlace, between, material, on_floor, pick, piece, plain};
 use super::light::Lighting;
 use super::material::{Decal, Kind, Material, Surface};
 use super::shape::{Extent, Shape};
@@ -22,11 +22,11 @@ pub(crate) fn room_size(config: &SynthConfig) -> Vector3<f64> {
         SceneKind::Hall => Vector3::new(20.0, 15.0, 7.0),
         SceneKind::Corridor => Vector3::new(30.0, 3.0, 3.0),
     };
-    if config.variety == Variety::Lived {
+    if config.variety == Variety::Home {
         let mut rng = stream(config.seed, Purpose::Size);
         return [(2.6, 6.8), (2.6, 6.0), (2.3, 3.0)].map(|(low, high)| between(&mut rng, low, high)).into();
     }
-    if config.variety == Variety::Usual {
+    if config.variety == Variety::Standard {
         return usual;
     }
     let mut rng = stream(config.seed, Purpose::Size);
@@ -40,7 +40,7 @@ pub(crate) fn room_size(config: &SynthConfig) -> Vector3<f64> {
 
 /// Light of the place that `config` asks for.
 pub(super) fn lighting(config: &SynthConfig) -> Lighting {
-    if config.variety == Variety::Usual {
+    if config.variety == Variety::Standard {
         return Lighting::USUAL;
     }
     let mut rng = stream(config.seed, Purpose::Light);
@@ -142,7 +142,7 @@ fn ceiling_lights(size: [f64; 2], rng: &mut ChaCha8Rng) -> Vec<Decal> {
         .collect()
 }
 
-/// Furniture that only wild places have.
+/// Furniture that only randomized places have.
 pub(super) fn furniture(room: &Extent, rng: &mut ChaCha8Rng) -> Vec<Piece> {
     match rng.random_range(0..7) {
         0 => stairs(room, rng),
@@ -155,7 +155,7 @@ pub(super) fn furniture(room: &Extent, rng: &mut ChaCha8Rng) -> Vec<Piece> {
     }
 }
 
-/// A new taste for pieces that the usual places have: another material and brightness on each, now and then.
+/// A new style for pieces that the standard places have: another material and brightness on each, now and then.
 pub(super) fn restyle(pieces: &mut [Piece], rng: &mut ChaCha8Rng) {
     let kinds = [
         Kind::Plain,
@@ -279,7 +279,7 @@ fn partition(room: &Extent, rng: &mut ChaCha8Rng) -> Vec<Piece> {
     vec![piece(Shape::block(foot, size, yaw), kind, tone, rng)]
 }
 
-/// Small things of all shapes, close together.
+/// Small objects of all shapes, close together.
 fn heap(room: &Extent, rng: &mut ChaCha8Rng) -> Vec<Piece> {
     let middle = on_floor(room, 0.8, rng);
     let kinds =
