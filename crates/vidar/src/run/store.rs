@@ -39,8 +39,13 @@ impl RunStore {
 
     /// Removes volumes, and predictions unless they are to be kept.
     pub(super) fn clean(&self, keeps_predictions: bool) {
-        // What cannot be removed is only left behind.
-        let _ = std::fs::remove_dir_all(&self.volumes);
+        // What cannot be removed is only left behind, and files of others stay.
+        let entries = std::fs::read_dir(&self.volumes).into_iter().flatten();
+        let volumes = entries.filter_map(|e| Some(e.ok()?.path()));
+        for path in volumes.filter(|p| p.extension().is_some_and(|e| e == "volume")) {
+            let _ = std::fs::remove_file(path);
+        }
+        let _ = std::fs::remove_dir(&self.volumes);
         if !keeps_predictions {
             self.chunks.remove_all();
         }
