@@ -81,7 +81,7 @@ fn bundled_row() -> Result<serde_json::Value, Error> {
 fn is_in_program(name: &str, schema: &str, context: &Context) -> bool {
     let is_it = name == bundled::NAME;
     if is_it && context.cli.json {
-        let (name, place, sha256) = (bundled::NAME, "program", bundled::sha256());
+        let (name, location, sha256) = (bundled::NAME, "program", bundled::sha256());
         print::json(
             &json!({ "schema": schema, "name": name, "folder": null, "location": location, "sha256": sha256 }),
         );

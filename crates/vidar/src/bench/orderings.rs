@@ -111,7 +111,7 @@ mod tests {
             let request = &request(modes.to_vec());
             Table { request, sequences: &names, rows, odometry: &[] }.orderings()
         };
-        let grid = said_of(&modes, &rows).unwrap();
+        let grid = claims_of(&modes, &rows).unwrap();
         let claims: Vec<[&str; 4]> =
             grid.rows.iter().map(|r| [&r[0], &r[1], &r[2], &r[3]].map(String::as_str)).collect();
         assert_eq!(
@@ -122,6 +122,6 @@ mod tests {
         assert_eq!(claims[2][1..], ["yes", "0.550 and 0.050", "2 of 2"]);
         assert_eq!(claims[3][1..], ["no", "0.500 and 0.550", "1 of 2"]);
         assert_eq!(claims.len(), 4, "no claim about couplings that were not run");
-        assert!(said_of(&modes[..1], &rows[..2]).is_none());
+        assert!(claims_of(&modes[..1], &rows[..2]).is_none());
     }
 }
