@@ -4,14 +4,15 @@
 //! view is off by a factor that varies slowly across the image, which no similarity of a chunk can repair.
 //!
 //! Minimised is `Σ ρ((rⱼ − β − φ(uⱼ)·g)/sⱼ) + β²/(0.02 l)² + |g|²/(0.03 l)² + |∇g|²/(0.02 l)²` with Cauchy's loss, in closed
-//! form per reweighting (25 unknowns). How loose the prior is, l of 1, 4 or 16, and whether the grid is kept at all, held-out
-//! landmarks decide: fitted to one half of them, the looser or richer correction must lower the error of the other half. Good
-//! networks are off by a few per cent and stay with l = 1; small ones are off by tens, and their landmarks say so.
+//! form per reweighting (25 unknowns). The prior's scale l (1, 4 or 16), and whether the grid is kept at all, are chosen on
+//! held-out landmarks: fitted to one half of them, the wider prior or the grid must lower the error of the other half. Good
+//! networks are off by a few per cent and keep l = 1; small ones are off by tens of per cent and need l = 4 or 16.
 
-use crate::landmark_scale::DepthRatio;
+use crate::landmark_scale::{DepthRatio, RatioSource};
 use nalgebra::{SMatrix, SVector};
 use serde::{Deserialize, Serialize};
 use vidar_core::Image;
+use vidar_solve::statistics::{STD_PER_MAD, median_upper};
 
 /// Columns of the grid.
 pub const FIELD_COLUMNS: usize = 6;
@@ -62,16 +63,16 @@ fn weights(x: f64, y: f64, width: usize, height: usize) -> [(usize, f64); 4] {
     ]
 }
 
-/// What fitting came to.
+/// A fitted field.
 #[derive(Clone, Debug, PartialEq)]
 pub struct FieldFit {
     /// The correction.
     pub field: DepthField,
     /// Whether the grid improved held-out landmarks and was kept.
     pub keeps_grid: bool,
-    /// How much wider than a good network's the prior had to be: 1, 4 or 16.
+    /// Factor on the prior's standard deviations: 1, 4 or 16.
     pub prior_scale: f64,
-    /// Middle error of held-out landmarks: uncorrected, with the offset, with the grid.
+    /// Median error of held-out landmarks: uncorrected, with the offset, with the grid.
     pub held_out: [f64; 3],
 }
 
@@ -79,15 +80,15 @@ const UNKNOWNS: usize = 1 + NODES;
 type Matrix = SMatrix<f64, UNKNOWNS, UNKNOWNS>;
 type Vector = SVector<f64, UNKNOWNS>;
 
-/// Prior spread of the offset, of the grid's nodes and of neighbouring nodes' difference, ln, of a good network.
+/// Prior σ of the offset, of the grid's nodes and of the difference of neighbouring nodes, ln, for a good network.
 const OFFSET_STD: f64 = 0.02;
 const NODE_STD: f64 = 0.03;
 const SLOPE_STD: f64 = 0.02;
 const CAUCHY: f64 = 2.0;
 const ROUNDS: usize = 5;
-/// The grid must lower the held-out error by this share to be kept, and a looser prior too.
+/// The grid must lower the held-out error by this share to be kept, and so must a wider prior.
 const IMPROVEMENT: f64 = 0.03;
-/// How much wider than usual the prior may be.
+/// Factors on the prior's standard deviations that are tried.
 const PRIOR_SCALES: [f64; 3] = [1.0, 4.0, 16.0];
 
 /// Fits a view's field to landmarks. `log_scale` is the chunk's; ratios are this view's. `None` below `min_landmarks`
@@ -103,16 +104,12 @@ pub fn fit_depth_field(
     }
     let rows: Vec<Row> = ratios
         .iter()
-        .map(|r| {
-            // Which half: by the landmark, so that no landmark is on both sides.
-            let half = (r.landmark.0.wrapping_mul(0x9e37_79b9) >> 31) as usize;
-            Row { half, ..Row::new(&Evidence::of_landmark(r, log_scale), size) }
-        })
+        .map(|r| Row { half: half(r.source), ..Row::new(&FieldConstraint::of_landmark(r, log_scale), size) })
         .collect();
     let best =
-        PRIOR_SCALES.map(|prior_scale| held_out(&rows, prior_scale)).into_iter().reduce(|best, looser| {
-            let is_better = looser.error() < (1.0 - IMPROVEMENT) * best.error();
-            if is_better { looser } else { best }
+        PRIOR_SCALES.map(|prior_scale| held_out(&rows, prior_scale)).into_iter().reduce(|best, wider| {
+            let is_better = wider.error() < (1.0 - IMPROVEMENT) * best.error();
+            if is_better { wider } else { best }
         })?;
     let all: Vec<&Row> = rows.iter().collect();
     let found = solve(&all, if best.keeps_grid { UNKNOWNS } else { 1 }, best.prior_scale);
@@ -120,15 +117,25 @@ pub fn fit_depth_field(
     Some(FieldFit { field: field_of(&found), keeps_grid, prior_scale, held_out: best.errors })
 }
 
+/// Which half of the landmarks: by a hash of the landmark, so that no landmark is in both halves. Points are hashed to the
+/// other half than the landmark of the same number.
+fn half(source: RatioSource) -> usize {
+    let top_bit = |number: u32| (number.wrapping_mul(0x9e37_79b9) >> 31) as usize;
+    match source {
+        RatioSource::Landmark(id) => top_bit(id.0),
+        RatioSource::Point(number) => 1 - top_bit(number),
+    }
+}
+
 fn field_of(x: &Vector) -> DepthField {
     DepthField { offset: x[0], grid: std::array::from_fn(|m| x[m + 1]) }
 }
 
-/// Something that tells the correction at one pixel.
+/// A measured correction at one pixel.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct Evidence {
+pub(crate) struct FieldConstraint {
     pub pixel: [f64; 2],
-    /// ln of the factor that it asks for.
+    /// ln of the measured factor.
     pub log_factor: f64,
     /// Standard deviation of it.
     pub std: f64,
@@ -136,35 +143,39 @@ pub(crate) struct Evidence {
     pub share: f64,
 }
 
-impl Evidence {
-    /// What a landmark asks of a depth that already has the chunk's scale.
+impl FieldConstraint {
+    /// The correction at a landmark of a depth that already has the chunk's scale.
     pub fn of_landmark(ratio: &DepthRatio, log_scale: f64) -> Self {
         Self { pixel: ratio.pixel, log_factor: ratio.log_ratio - log_scale, std: ratio.std, share: 1.0 }
     }
 }
 
-/// The field of evidence of all kinds, with a prior of this prior_scale.
-pub(crate) fn field_from(evidence: &[Evidence], prior_scale: f64, size: (usize, usize)) -> DepthField {
-    let rows: Vec<Row> = evidence.iter().map(|e| Row::new(e, size)).collect();
+/// The field from constraints of all kinds.
+pub(crate) fn field_from(
+    constraints: &[FieldConstraint],
+    prior_scale: f64,
+    size: (usize, usize),
+) -> DepthField {
+    let rows: Vec<Row> = constraints.iter().map(|c| Row::new(c, size)).collect();
     field_of(&solve(&rows.iter().collect::<Vec<_>>(), UNKNOWNS, prior_scale))
 }
 
-/// What a prior of some prior_scale is worth.
+/// Held-out errors of one prior scale.
 struct HeldOut {
     prior_scale: f64,
-    /// Middle error: uncorrected, with the offset, with the grid.
+    /// Median error: uncorrected, with the offset, with the grid.
     errors: [f64; 3],
     keeps_grid: bool,
 }
 
 impl HeldOut {
-    /// Middle error of what would be kept.
+    /// Median error of the correction that would be kept.
     fn error(&self) -> f64 {
         self.errors[if self.keeps_grid { 2 } else { 1 }]
     }
 }
 
-/// Fits each half of the landmarks and asks the other.
+/// Fits each half of the landmarks and measures the error of the other.
 fn held_out(rows: &[Row], prior_scale: f64) -> HeldOut {
     let mut errors: [Vec<f64>; 3] = Default::default();
     let mut improves_both = true;
@@ -173,12 +184,12 @@ fn held_out(rows: &[Row], prior_scale: f64) -> HeldOut {
         let (offset, grid) = (solve(&fitted, 1, prior_scale), solve(&fitted, UNKNOWNS, prior_scale));
         let by = |x: &Vector| held.iter().map(|r| r.error(x).abs()).collect::<Vec<f64>>();
         let (with_offset, with_grid) = (by(&offset), by(&grid));
-        improves_both &= middle(with_grid.clone()) < middle(with_offset.clone());
+        improves_both &= median(with_grid.clone()) < median(with_offset.clone());
         errors[0].extend(by(&Vector::zeros()));
         errors[1].extend(with_offset);
         errors[2].extend(with_grid);
     }
-    let errors = errors.map(middle);
+    let errors = errors.map(median);
     let keeps_grid = improves_both && errors[2] < (1.0 - IMPROVEMENT) * errors[1];
     HeldOut { prior_scale, errors, keeps_grid }
 }
@@ -193,9 +204,9 @@ struct Row {
 }
 
 impl Row {
-    fn new(evidence: &Evidence, size: (usize, usize)) -> Self {
-        let nodes = weights(evidence.pixel[0], evidence.pixel[1], size.0, size.1);
-        Self { residual: evidence.log_factor, std: evidence.std, share: evidence.share, nodes, half: 0 }
+    fn new(c: &FieldConstraint, size: (usize, usize)) -> Self {
+        let nodes = weights(c.pixel[0], c.pixel[1], size.0, size.1);
+        Self { residual: c.log_factor, std: c.std, share: c.share, nodes, half: 0 }
     }
 
     fn error(&self, x: &Vector) -> f64 {
@@ -208,8 +219,9 @@ fn solve(rows: &[&Row], unknowns: usize, prior_scale: f64) -> Vector {
     let mut x = Vector::zeros();
     for _ in 0..ROUNDS {
         let (mut information, mut right) = prior(prior_scale);
-        // What most landmarks are off by is no outlier, only more noise than was told.
-        let wider = (1.4826 * middle(rows.iter().map(|r| (r.error(&x) / r.std).abs()).collect())).max(1.0);
+        // An error that most landmarks have is no outlier, only more noise than their σ states.
+        let wider =
+            (STD_PER_MAD * median(rows.iter().map(|r| (r.error(&x) / r.std).abs()).collect())).max(1.0);
         for row in rows {
             let std = wider * row.std;
             let e = row.error(&x) / std;
@@ -242,11 +254,11 @@ fn solve(rows: &[&Row], unknowns: usize, prior_scale: f64) -> Vector {
 }
 
 fn prior(prior_scale: f64) -> (Matrix, Vector) {
-    let told = |std: f64| (prior_scale * std).powi(-2);
-    let mut information = Matrix::identity() * told(NODE_STD);
-    information[(0, 0)] = told(OFFSET_STD);
-    let slope = told(SLOPE_STD);
-    let mut tie = |a: usize, b: usize| {
+    let information_of = |std: f64| (prior_scale * std).powi(-2);
+    let mut information = Matrix::identity() * information_of(NODE_STD);
+    information[(0, 0)] = information_of(OFFSET_STD);
+    let slope = information_of(SLOPE_STD);
+    let mut add_slope = |a: usize, b: usize| {
         information[(a, a)] += slope;
         information[(b, b)] += slope;
         information[(a, b)] -= slope;
@@ -256,19 +268,18 @@ fn prior(prior_scale: f64) -> (Matrix, Vector) {
         for column in 0..FIELD_COLUMNS {
             let node = 1 + row * FIELD_COLUMNS + column;
             if column + 1 < FIELD_COLUMNS {
-                tie(node, node + 1);
+                add_slope(node, node + 1);
             }
             if row + 1 < FIELD_ROWS {
-                tie(node, node + FIELD_COLUMNS);
+                add_slope(node, node + FIELD_COLUMNS);
             }
         }
     }
     (information, Vector::zeros())
 }
 
-fn middle(mut values: Vec<f64>) -> f64 {
-    let at = values.len() / 2;
-    if values.is_empty() { 0.0 } else { *values.select_nth_unstable_by(at, f64::total_cmp).1 }
+fn median(mut values: Vec<f64>) -> f64 {
+    median_upper(&mut values).unwrap_or(0.0)
 }
 
 #[cfg(test)]
@@ -290,7 +301,7 @@ mod tests {
                 let gross = if k % 9 == 0 { 0.5 } else { 0.0 };
                 DepthRatio {
                     frame_id: FrameId(0),
-                    landmark: LandmarkId(k),
+                    source: RatioSource::Landmark(LandmarkId(k)),
                     pixel: [x, y],
                     log_ratio: 0.3 + field(x, y) + error + gross,
                     std: noise.max(0.01),
@@ -313,7 +324,7 @@ mod tests {
     }
 
     #[test]
-    fn a_small_network_gets_a_looser_prior_and_a_good_one_does_not() {
+    fn a_small_network_gets_a_wider_prior_and_a_good_one_does_not() {
         let bent = |x: f64, y: f64| 0.25 * (5.0 * x / 503.0).sin() - 0.3 * (y / 321.0 - 0.5) - 0.2;
         let fit = fit_depth_field(&ratios(80, 4, 0.06, bent), 0.3, SIZE, 15).unwrap();
         assert!(fit.keeps_grid && fit.prior_scale > 1.0, "{fit:?}");

@@ -34,7 +34,7 @@ pub struct KeyframeSelector {
 }
 
 impl KeyframeSelector {
-    /// A selector that has seen no frame.
+    /// A selector without frames.
     pub fn new(config: &KeyframeConfig) -> Self {
         Self::widened(config, 1.0)
     }

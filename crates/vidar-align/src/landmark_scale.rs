@@ -1,14 +1,16 @@
 //! The scale of a chunk from landmarks whose metric depth is known.
 //!
-//! Odometry knows some points' depth in metres; the model predicts the depth at the same pixels in its own unit. The
-//! chunk's scale is the weighted median of `log d − log D` over all of them, which neither travel nor its shape can make
-//! degenerate: in simulation 0.8 to 0.9 % whatever the camera did, where centres need 0.7 m of travel to match it. Its
-//! variance is `1.57 σ²/n + s²/f`: σ from the median absolute deviation, n counted per landmark and not per observation
+//! Odometry gives the depth of some points in metres; the model predicts the depth at the same pixels in its own unit. The
+//! chunk's scale is the weighted median of `log d − log D` over all of them, which no camera motion makes degenerate: in
+//! simulation its error is 0.8 to 0.9 % for any motion, where camera centres need 0.7 m of travel to match it. Its variance
+//! is `1.57 σ²/n + s²/f`: σ from the median absolute deviation, n counted per landmark and not per observation
 //! (a landmark's error is the same in all views), f views of jitter s each (1.57 = π/2, the price of a median).
 
 use serde::{Deserialize, Serialize};
 use std::collections::{BTreeMap, BTreeSet};
+use vidar_core::camera::Pixel;
 use vidar_core::{FrameId, Image, LandmarkId, SparseLandmark, ViewGeometry};
+use vidar_solve::statistics::{STD_PER_MAD, weighted_median};
 
 /// How landmarks are compared with predicted depth.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
@@ -18,7 +20,7 @@ pub struct LandmarkConfig {
     pub model_noise: f64,
     /// Error that all pixels of one view share, as a share of depth (0 to 0.2).
     pub view_jitter: f64,
-    /// Landmarks whose inverse depth is less certain than this share of it say nothing (0.01 to 1).
+    /// Landmarks whose σ of inverse depth exceeds this share of it are not used (0.01 to 1).
     pub max_relative_std: f64,
     /// Fewest landmarks that correct a view's depth; 0 never corrects, else 15 or more.
     pub min_for_field: usize,
@@ -30,7 +32,7 @@ impl Default for LandmarkConfig {
     }
 }
 
-/// ln(metres per chunk unit) with its evidence.
+/// ln(metres per chunk unit) with its uncertainty.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct LogScale {
     /// The estimate.
@@ -45,14 +47,36 @@ pub struct LogScale {
     pub shared_std: f64,
 }
 
-/// A landmark against the depth predicted at its pixel.
+/// A point of known metric depth that no track connects to other frames: the surest pixels of multi-view stereo, for example.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct DepthPoint {
+    /// Its number, different for all points of a run.
+    pub number: u32,
+    /// Its position in the depth image.
+    pub pixel: Pixel,
+    /// Inverse of its z-depth, 1/m.
+    pub inverse_depth: f64,
+    /// Standard deviation of `inverse_depth`.
+    pub inverse_depth_std: f64,
+}
+
+/// What a depth ratio was measured at.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub enum RatioSource {
+    /// A landmark of the odometry, which several views may observe.
+    Landmark(LandmarkId),
+    /// A [`DepthPoint`], by its number.
+    Point(u32),
+}
+
+/// Metric depth of a landmark or point against the depth predicted at its pixel.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct DepthRatio {
     /// In which view.
     pub frame_id: FrameId,
-    /// Which landmark.
-    pub landmark: LandmarkId,
-    /// Where.
+    /// At which landmark or point.
+    pub source: RatioSource,
+    /// Its pixel in the depth image.
     pub pixel: [f64; 2],
     /// log d − log D.
     pub log_ratio: f64,
@@ -60,7 +84,7 @@ pub struct DepthRatio {
     pub std: f64,
 }
 
-/// Fewest observations and landmarks that say anything.
+/// Fewest observations and landmarks that determine a scale.
 const MIN_OBSERVATIONS: usize = 8;
 const MIN_LANDMARKS: usize = 5;
 /// Relative range of the 3 × 3 neighbours above which a landmark lies on a depth edge.
@@ -72,23 +96,43 @@ pub fn depth_ratios(
     landmarks: &[SparseLandmark],
     config: &LandmarkConfig,
 ) -> Vec<DepthRatio> {
-    let depth = view.depth.image();
     let ratio = |l: &SparseLandmark| {
-        let relative = l.inverse_depth_std / l.inverse_depth;
-        let usable = l.inverse_depth.is_finite() && l.inverse_depth > 0.0 && relative >= 0.0;
-        if !usable || relative > config.max_relative_std {
-            return None;
-        }
-        let predicted = smooth_depth(depth, l.pixel.x, l.pixel.y)?;
-        Some(DepthRatio {
-            frame_id: view.frame_id,
-            landmark: l.id,
-            pixel: [l.pixel.x, l.pixel.y],
-            log_ratio: -l.inverse_depth.ln() - f64::from(predicted).ln(),
-            std: relative.hypot(config.model_noise),
-        })
+        let source = RatioSource::Landmark(l.id);
+        depth_ratio(view, source, l.pixel, (l.inverse_depth, l.inverse_depth_std), config)
     };
-    landmarks.iter().filter_map(ratio).filter(|r| r.log_ratio.is_finite()).collect()
+    landmarks.iter().filter_map(ratio).collect()
+}
+
+/// The same for points without tracks.
+pub fn point_ratios(view: &ViewGeometry, points: &[DepthPoint], config: &LandmarkConfig) -> Vec<DepthRatio> {
+    let ratio = |p: &DepthPoint| {
+        let source = RatioSource::Point(p.number);
+        depth_ratio(view, source, p.pixel, (p.inverse_depth, p.inverse_depth_std), config)
+    };
+    points.iter().filter_map(ratio).collect()
+}
+
+fn depth_ratio(
+    view: &ViewGeometry,
+    source: RatioSource,
+    pixel: Pixel,
+    (inverse_depth, inverse_depth_std): (f64, f64),
+    config: &LandmarkConfig,
+) -> Option<DepthRatio> {
+    let relative = inverse_depth_std / inverse_depth;
+    let usable = inverse_depth.is_finite() && inverse_depth > 0.0 && relative >= 0.0;
+    if !usable || relative > config.max_relative_std {
+        return None;
+    }
+    let predicted = smooth_depth(view.depth.image(), pixel.x, pixel.y)?;
+    let ratio = DepthRatio {
+        frame_id: view.frame_id,
+        source,
+        pixel: [pixel.x, pixel.y],
+        log_ratio: -inverse_depth.ln() - f64::from(predicted).ln(),
+        std: relative.hypot(config.model_noise),
+    };
+    ratio.log_ratio.is_finite().then_some(ratio)
 }
 
 /// Depth at the nearest pixel, unless an edge runs through its neighbourhood.
@@ -114,41 +158,27 @@ pub(crate) fn smooth_depth(depth: &Image<f32>, x: f64, y: f64) -> Option<f32> {
 
 /// The chunk's scale; `None` with too few landmarks.
 pub fn landmark_scale(ratios: &[DepthRatio], config: &LandmarkConfig) -> Option<LogScale> {
-    let mut seen: BTreeMap<LandmarkId, f64> = BTreeMap::new();
-    ratios.iter().for_each(|r| *seen.entry(r.landmark).or_insert(0.0) += 1.0);
+    let mut seen: BTreeMap<RatioSource, f64> = BTreeMap::new();
+    ratios.iter().for_each(|r| *seen.entry(r.source).or_insert(0.0) += 1.0);
     if ratios.len() < MIN_OBSERVATIONS || seen.len() < MIN_LANDMARKS {
         return None;
     }
-    // A landmark seen in many views is one landmark.
-    let weight = |r: &DepthRatio| 1.0 / (r.std * r.std * seen[&r.landmark]);
+    // A landmark observed in many views is one landmark.
+    let weight = |r: &DepthRatio| 1.0 / (r.std * r.std * seen[&r.source]);
     let weighted: Vec<(f64, f64)> = ratios.iter().map(|r| (r.log_ratio, weight(r))).collect();
     let log_scale = weighted_median(weighted.clone())?;
     let off = weighted.iter().map(|(l, w)| ((l - log_scale).abs(), *w)).collect();
-    let sigma = 1.4826 * weighted_median(off)?;
-    let mut per_landmark: BTreeMap<LandmarkId, f64> = BTreeMap::new();
-    ratios.iter().for_each(|r| *per_landmark.entry(r.landmark).or_insert(0.0) += weight(r));
+    let sigma = STD_PER_MAD * weighted_median(off)?;
+    let mut per_landmark: BTreeMap<RatioSource, f64> = BTreeMap::new();
+    ratios.iter().for_each(|r| *per_landmark.entry(r.source).or_insert(0.0) += weight(r));
     let (sum, squares) = per_landmark.values().fold((0.0, 0.0), |(s, q), w| (s + w, q + w * w));
     let effective = sum * sum / squares;
     let views = ratios.iter().map(|r| r.frame_id).collect::<BTreeSet<_>>().len() as f64;
     let variance = std::f64::consts::FRAC_PI_2 * sigma * sigma / effective
         + config.view_jitter * config.view_jitter / views;
-    // Perfect agreement of a handful proves nothing beyond what the depths resolve.
+    // Perfect agreement of a few is no evidence below the resolution of the depths.
     let std = variance.sqrt().max(1e-3);
     Some(LogScale { log_scale, std, effective, observations: ratios.len(), shared_std: 0.0 })
-}
-
-/// The value below which half of the weight lies.
-fn weighted_median(mut values: Vec<(f64, f64)>) -> Option<f64> {
-    values.sort_by(|a, b| a.0.total_cmp(&b.0));
-    let half = 0.5 * values.iter().map(|v| v.1).sum::<f64>();
-    let mut sum = 0.0;
-    values
-        .iter()
-        .find(|v| {
-            sum += v.1;
-            sum >= half
-        })
-        .map(|v| v.0)
 }
 
 #[cfg(test)]
@@ -175,7 +205,7 @@ mod tests {
                 let gross = if k % 8 == 0 { 0.6 * normal(&mut rng) } else { 0.0 };
                 DepthRatio {
                     frame_id: FrameId(k % 12),
-                    landmark: LandmarkId(k % 60),
+                    source: RatioSource::Landmark(LandmarkId(k % 60)),
                     pixel: [0.0, 0.0],
                     log_ratio: truth
                         + own[(k % 60) as usize]
@@ -189,7 +219,7 @@ mod tests {
     }
 
     #[test]
-    fn the_scale_is_told_to_about_a_percent_and_its_uncertainty_is_honest() {
+    fn the_scale_is_measured_to_about_a_percent_and_its_uncertainty_is_consistent() {
         let config = LandmarkConfig::default();
         let trials = 400;
         let (mut squares, mut chi2) = (0.0, 0.0);
@@ -206,11 +236,11 @@ mod tests {
     }
 
     #[test]
-    fn one_landmark_seen_often_is_one_landmark() {
+    fn one_landmark_observed_often_counts_as_one_landmark() {
         let mut many = ratios(3, 0.0);
         let once = landmark_scale(&many, &LandmarkConfig::default()).unwrap();
         for _ in 0..200 {
-            many.push(DepthRatio { landmark: LandmarkId(5), log_ratio: 3.0, ..many[5] });
+            many.push(DepthRatio { source: RatioSource::Landmark(LandmarkId(5)), log_ratio: 3.0, ..many[5] });
         }
         let often = landmark_scale(&many, &LandmarkConfig::default()).unwrap();
         assert!((often.log_scale - once.log_scale).abs() < 0.02);
@@ -251,5 +281,30 @@ mod tests {
         let kept = depth_ratios(&view, &all, &LandmarkConfig::default());
         assert_eq!(kept.len(), 1);
         assert!((kept[0].log_ratio - 2.0_f64.ln()).abs() < 1e-12);
+    }
+
+    #[test]
+    fn points_and_landmarks_of_the_same_number_are_different_and_both_determine_the_scale() {
+        let view = ViewGeometry {
+            frame_id: FrameId(1),
+            chunk_from_camera: Se3::IDENTITY,
+            intrinsics: Pinhole::new(30.0, 30.0, 19.5, 14.5, 40, 30).unwrap(),
+            depth: RelativeDepth::new(Image::filled(40, 30, 2.0)),
+            confidence: Confidence::full(40, 30),
+        };
+        let config = LandmarkConfig::default();
+        let pixel = |k: u32| Pixel::new(f64::from(3 * k + 2), 7.0);
+        let (inverse_depth, inverse_depth_std) = (0.25, 0.005);
+        let landmarks: Vec<SparseLandmark> = (0..10)
+            .map(|k| SparseLandmark { id: LandmarkId(k), pixel: pixel(k), inverse_depth, inverse_depth_std })
+            .collect();
+        let points: Vec<DepthPoint> = (0..10)
+            .map(|number| DepthPoint { number, pixel: pixel(number), inverse_depth, inverse_depth_std })
+            .collect();
+        let mut all = depth_ratios(&view, &landmarks, &config);
+        all.extend(point_ratios(&view, &points, &config));
+        let found = landmark_scale(&all, &config).unwrap();
+        assert!((found.log_scale - 2.0_f64.ln()).abs() < 1e-12 && found.observations == 20);
+        assert!((found.effective - 20.0).abs() < 1e-9, "{found:?}");
     }
 }

@@ -1,4 +1,4 @@
-//! The machine in every mode, on a room of which everything is known.
+//! The aligner in every coupling, on a simulated room.
 
 #![allow(clippy::unwrap_used)] // helpers of tests are test code, though not marked so
 
@@ -9,16 +9,19 @@ use vidar_align::aligner::RejectionReason;
 use vidar_align::streaming::chunk_ranges;
 use vidar_align::{Aligner, AlignerConfig, ChunkStatus, CouplingMode, Placement};
 use vidar_core::model::ChunkFrame;
-use vidar_core::{GeometryPrediction, Image, LieGroup, RelativeDepth, Se3, umeyama_sim3};
+use vidar_core::{
+    ChunkView, FrameId, FrameImage, GeometryPrediction, Image, LieGroup, RelativeDepth, Se3, Timestamp,
+    umeyama_sim3,
+};
 
 fn run(mode: CouplingMode, truth: &[Se3], odometry: Option<&[Se3]>, model: Model, seed: u64) -> Placement {
     let mut noise = Noise::new(seed);
-    let mut machine = Aligner::new(mode, &AlignerConfig::default()).unwrap();
+    let mut aligner = Aligner::new(mode, &AlignerConfig::default()).unwrap();
     for (k, range) in chunk_ranges(truth.len(), 12, 4).unwrap().into_iter().enumerate() {
         let prediction = predict(truth, range.frames, k as u32, model, &mut noise);
-        machine.push(observe(prediction, odometry, none)).unwrap();
+        aligner.push(observe(prediction, odometry, none)).unwrap();
     }
-    machine.finish()
+    aligner.finish()
 }
 
 #[test]
@@ -46,7 +49,7 @@ fn an_exact_model_gives_the_exact_world_in_every_metric_mode() {
 }
 
 #[test]
-fn without_anchors_the_world_is_right_up_to_one_similarity() {
+fn without_pose_priors_the_world_is_right_up_to_one_similarity() {
     let truth = laps(40, 1.0);
     for mode in [CouplingMode::Da3Streaming, CouplingMode::PoseFree, CouplingMode::Coupled] {
         let placement = run(mode, &truth, None, EXACT, 2);
@@ -67,7 +70,7 @@ fn without_anchors_the_world_is_right_up_to_one_similarity() {
 }
 
 #[test]
-fn anchors_change_nothing_where_the_mode_does_not_use_them() {
+fn pose_priors_change_nothing_where_the_mode_does_not_use_them() {
     let truth = laps(30, 1.0);
     let with = run(CouplingMode::PoseFree, &truth, Some(&truth), REAL, 3);
     let without = run(CouplingMode::PoseFree, &truth, None, REAL, 3);
@@ -101,11 +104,11 @@ fn lean(prediction: &mut GeometryPrediction) {
 }
 
 #[test]
-fn landmarks_straighten_a_leaning_depth_and_tell_the_scale() {
+fn landmarks_straighten_a_leaning_depth_and_determine_the_scale() {
     let truth = laps(24, 0.6);
     let mut noise = Noise::new(11);
     let mut points = Noise::new(12);
-    let mut machine = Aligner::new(CouplingMode::Coupled, &AlignerConfig::default()).unwrap();
+    let mut aligner = Aligner::new(CouplingMode::Coupled, &AlignerConfig::default()).unwrap();
     let mut predictions = Vec::new();
     for (k, range) in chunk_ranges(24, 12, 4).unwrap().into_iter().enumerate() {
         let mut prediction = predict(&truth, range.frames.clone(), k as u32, EXACT, &mut noise);
@@ -114,9 +117,9 @@ fn landmarks_straighten_a_leaning_depth_and_tell_the_scale() {
         let seen: Vec<_> =
             range.frames.map(|i| (i, landmarks(&truth[i], i, 80, 0.02, 0.05, &mut points))).collect();
         let of = |i: usize| seen.iter().find(|s| s.0 == i).map_or(Vec::new(), |s| s.1.clone());
-        machine.push(observe(prediction, Some(&truth), of)).unwrap();
+        aligner.push(observe(prediction, Some(&truth), of)).unwrap();
     }
-    let placement = machine.finish();
+    let placement = aligner.finish();
     assert!(placement.views.iter().all(|v| v.field.is_some()));
     let kept = placement.views.len()
         - placement.rejections.of(RejectionReason::DepthFieldRejected).min(placement.views.len());
@@ -165,7 +168,7 @@ fn rough_run(step: usize) -> (f64, Placement) {
 fn rough_run_sharing(step: usize, shared_std: f64) -> (f64, Placement) {
     let truth = laps(36, 0.7);
     let (mut noise, mut points) = (Noise::new(21), Noise::new(22));
-    let mut machine = Aligner::new(CouplingMode::Coupled, &AlignerConfig::default()).unwrap();
+    let mut aligner = Aligner::new(CouplingMode::Coupled, &AlignerConfig::default()).unwrap();
     let mut predictions = Vec::new();
     for (k, range) in chunk_ranges(36, 12, 4).unwrap().into_iter().enumerate() {
         let prediction = rough(&truth, range.frames.clone(), k as u32, &mut noise);
@@ -180,9 +183,9 @@ fn rough_run_sharing(step: usize, shared_std: f64) -> (f64, Placement) {
         let of = |i: usize| seen.iter().find(|s| s.0 == i).map_or(Vec::new(), |s| s.1.clone());
         let mut observation = observe(prediction, Some(&truth), of);
         observation.frames.iter_mut().for_each(|f| f.shared_landmark_std = shared_std);
-        machine.push(observation).unwrap();
+        aligner.push(observation).unwrap();
     }
-    let placement = machine.finish();
+    let placement = aligner.finish();
     let mut off: Vec<f64> = Vec::new();
     for prediction in predictions {
         for view in placement.aligned_views(prediction, &[]).unwrap() {
@@ -196,7 +199,7 @@ fn rough_run_sharing(step: usize, shared_std: f64) -> (f64, Placement) {
 }
 
 #[test]
-fn a_rough_depth_in_the_anchors_world_is_brought_to_landmarks_and_its_poses_stay() {
+fn a_rough_depth_in_the_world_of_its_priors_is_scaled_to_landmarks_and_its_poses_stay() {
     let (error, placement) = rough_run(1);
     assert_eq!(placement.rejections.of(RejectionReason::DepthRescaled), placement.chunks.len());
     assert_eq!(
@@ -215,7 +218,7 @@ fn a_rough_depth_in_the_anchors_world_is_brought_to_landmarks_and_its_poses_stay
 fn with_given_poses(mode: CouplingMode, factor: f32) -> Placement {
     let truth = laps(36, 0.7);
     let mut noise = Noise::new(31);
-    let mut machine = Aligner::new(mode, &AlignerConfig::default()).unwrap();
+    let mut aligner = Aligner::new(mode, &AlignerConfig::default()).unwrap();
     for (k, range) in chunk_ranges(36, 12, 4).unwrap().into_iter().enumerate() {
         let model = Model { has_gauge: false, ..EXACT };
         let mut prediction = predict(&truth, range.frames, k as u32, model, &mut noise);
@@ -224,13 +227,13 @@ fn with_given_poses(mode: CouplingMode, factor: f32) -> Placement {
         for view in &mut prediction.views {
             view.depth = RelativeDepth::new(view.depth.image().map(|z| z * seen));
         }
-        machine.push(observe(prediction, Some(&truth), none)).unwrap();
+        aligner.push(observe(prediction, Some(&truth), none)).unwrap();
     }
-    machine.finish()
+    aligner.finish()
 }
 
 #[test]
-fn chunks_in_the_anchors_world_keep_their_scale_whatever_their_overlap_says() {
+fn chunks_in_the_world_of_their_priors_keep_their_scale_whatever_the_scale_of_their_overlap() {
     let placement = with_given_poses(CouplingMode::PoseConditioned, 0.67);
     assert!(placement.rejections.of(RejectionReason::ScaleOutOfRange) >= 2, "{:?}", placement.rejections);
     for chunk in &placement.chunks {
@@ -251,7 +254,7 @@ fn given_poses_do_not_make_a_depth_metric_that_its_neighbours_contradict() {
 }
 
 #[test]
-fn no_number_of_landmarks_makes_a_scale_surer_than_what_they_share() {
+fn no_number_of_landmarks_lowers_sigma_below_their_shared_error() {
     let (alone, shared) = (rough_run(1).1, rough_run_sharing(1, 0.02).1);
     for (alone, shared) in alone.chunks.iter().zip(&shared.chunks) {
         assert!(alone.log_scale_std < 0.01, "{}", alone.log_scale_std);
@@ -269,22 +272,22 @@ fn views_without_landmarks_are_corrected_by_their_neighbours() {
 }
 
 #[test]
-fn what_is_kept_grows_by_a_few_kilobytes_per_view_and_no_more() {
+fn memory_grows_by_a_few_kilobytes_per_view_and_no_more() {
     let truth = laps(200, 3.0);
     let mut noise = Noise::new(13);
-    let mut machine = Aligner::new(CouplingMode::Coupled, &AlignerConfig::default()).unwrap();
+    let mut aligner = Aligner::new(CouplingMode::Coupled, &AlignerConfig::default()).unwrap();
     let mut sizes = Vec::new();
     for (k, range) in chunk_ranges(200, 12, 4).unwrap().into_iter().enumerate() {
         let prediction = predict(&truth, range.frames, k as u32, REAL, &mut noise);
-        machine.push(observe(prediction, Some(&truth), none)).unwrap();
-        sizes.push(machine.memory_bytes());
+        aligner.push(observe(prediction, Some(&truth), none)).unwrap();
+        sizes.push(aligner.memory_bytes());
     }
     let growth = (sizes[sizes.len() - 1] - sizes[1]) as f64 / ((sizes.len() - 2) * 12) as f64;
     assert!(growth < 6000.0, "{growth} bytes per view");
 }
 
 #[test]
-fn settings_out_of_range_are_named_and_modes_have_their_words() {
+fn settings_out_of_range_are_named_and_modes_have_their_names() {
     let mut config = AlignerConfig::default();
     config.validate().unwrap();
     config.loops.top_k = 0;
@@ -309,26 +312,26 @@ fn a_metric_scale_that_jumps_between_neighbours_is_clamped_and_counted() {
         odometry.push(odometry[i] * step);
     }
     let mut noise = Noise::new(21);
-    let mut machine = Aligner::new(CouplingMode::PoseConditioned, &AlignerConfig::default()).unwrap();
+    let mut aligner = Aligner::new(CouplingMode::PoseConditioned, &AlignerConfig::default()).unwrap();
     let mut gauges = Vec::new();
     for (k, range) in chunk_ranges(60, 12, 4).unwrap().into_iter().enumerate() {
         gauges.push(Noise(noise.0.clone()).gauge());
         let prediction = predict(&truth, range.frames, k as u32, EXACT, &mut noise);
-        machine.push(observe(prediction, Some(&odometry), none)).unwrap();
+        aligner.push(observe(prediction, Some(&odometry), none)).unwrap();
     }
-    let placement = machine.finish();
+    let placement = aligner.finish();
     assert!(placement.rejections.of(RejectionReason::ScaleOutOfRange) >= 1, "{:?}", placement.rejections);
     let jump = placement.chunks[2].world_from_chunk.scale / gauges[2].scale;
     assert!((jump - 1.0).abs() < 0.2, "{jump}");
 }
 
 #[test]
-fn a_chunk_predicted_in_the_anchors_world_keeps_its_metres_though_its_cameras_sit_beside_the_anchors() {
-    // As where the trajectory is of another sensor of the rig: every camera 3 cm beside its anchor, on a short way.
+fn a_chunk_in_the_world_of_its_priors_keeps_its_metres_though_its_cameras_are_beside_them() {
+    // As where the trajectory is of another sensor of the rig: every camera 3 cm beside its pose prior, on a short path.
     let truth = laps(120, 0.5);
     let beside = Se3::new(vidar_core::So3::IDENTITY, nalgebra::Vector3::new(-0.025, 0.012, 0.01));
-    let anchors: Vec<Se3> = truth.iter().map(|t| *t * beside).collect();
-    let mut machine = Aligner::new(CouplingMode::Coupled, &AlignerConfig::default()).unwrap();
+    let priors: Vec<Se3> = truth.iter().map(|t| *t * beside).collect();
+    let mut aligner = Aligner::new(CouplingMode::Coupled, &AlignerConfig::default()).unwrap();
     for (k, start) in [0, 12, 24].into_iter().enumerate() {
         let mut noise = Noise::new(3);
         let mut prediction = predict(&truth, start..start + 12, k as u32, EXACT, &mut noise);
@@ -338,12 +341,49 @@ fn a_chunk_predicted_in_the_anchors_world_keeps_its_metres_though_its_cameras_si
             view.chunk_from_camera = pose;
             view.depth = RelativeDepth::new(depth(&pose));
         }
-        machine.push(observe(prediction, Some(&anchors), none)).unwrap();
+        aligner.push(observe(prediction, Some(&priors), none)).unwrap();
     }
-    let placement = machine.finish();
+    let placement = aligner.finish();
     assert_eq!(placement.views.len(), 36);
     for chunk in &placement.chunks {
         assert!((chunk.world_from_chunk.scale.ln()).abs() < 2e-3, "{:?}", chunk.world_from_chunk);
         assert!(chunk.log_scale_std < 0.006, "{}", chunk.log_scale_std);
     }
+}
+
+#[test]
+fn a_chunk_in_the_world_of_its_priors_is_checked_against_them_and_not_moved() {
+    let truth = laps(12, 0.2);
+    let far: Vec<Se3> =
+        truth.iter().map(|t| Se3::from_translation(nalgebra::Vector3::x() * 2.0) * *t).collect();
+    for (priors, expected) in [(&truth, ChunkStatus::PriorWorld), (&far, ChunkStatus::Inconsistent)] {
+        let model = Model { has_gauge: false, ..EXACT };
+        let mut prediction = predict(&truth, 0..12, 0, model, &mut Noise::new(1));
+        prediction.frame = ChunkFrame::PriorWorld;
+        let mut aligner = Aligner::new(CouplingMode::PoseConditioned, &AlignerConfig::default()).unwrap();
+        let report = aligner.push(observe(prediction, Some(priors), none)).unwrap();
+        assert_eq!(report.status, expected);
+        assert_eq!(report.world_from_chunk, Some(vidar_core::Sim3::IDENTITY));
+    }
+}
+
+#[test]
+fn metric_views_have_the_colours_and_times_of_their_images() {
+    let truth = laps(12, 0.2);
+    let mut aligner = Aligner::new(CouplingMode::PoseConditioned, &AlignerConfig::default()).unwrap();
+    let prediction = predict(&truth, 0..12, 0, EXACT, &mut Noise::new(1));
+    aligner.push(observe(prediction.clone(), Some(&truth), none)).unwrap();
+    let image = |i: u32| ChunkView {
+        frame_id: FrameId(i),
+        time: Timestamp::from_nanos(i64::from(i)),
+        image: FrameImage::Gray8(Image::filled(2 * WIDTH, 2 * HEIGHT, 9)),
+        intrinsics: camera(),
+        world_from_camera: None,
+    };
+    let images: Vec<ChunkView> = (0..12).map(image).collect();
+    let views = aligner.finish().aligned_views(prediction, &images).unwrap();
+    assert_eq!(views.len(), 12);
+    assert_eq!(views[5].color().unwrap()[(1, 1)], [9, 9, 9]);
+    assert_eq!(views[5].time(), Timestamp::from_nanos(5));
+    assert!((views[5].world_from_camera().translation - truth[5].translation).norm() < 1e-6);
 }

@@ -1,4 +1,4 @@
-//! What goes wrong is counted and does not spread.
+//! Bad input is counted, left out, and does not change the rest.
 
 #![allow(clippy::unwrap_used)] // helpers of tests are test code, though not marked so
 
@@ -11,26 +11,26 @@ use vidar_align::streaming::chunk_ranges;
 use vidar_align::{Aligner, AlignerConfig, ChunkObservation, ChunkStatus, CouplingMode, Placement};
 use vidar_core::{ChunkId, GeometryPrediction, Image, LieGroup, RelativeDepth, Se3, Sim3, So3};
 
-fn machine(mode: CouplingMode) -> Aligner {
+fn new_aligner(mode: CouplingMode) -> Aligner {
     Aligner::new(mode, &AlignerConfig::default()).unwrap()
 }
 
-/// Pushes all chunks of a flight, each changed by `spoil`.
+/// Pushes all chunks of a flight, each changed by `corrupt`.
 fn run(
     mode: CouplingMode,
     truth: &[Se3],
     odometry: &[Se3],
     overlap: usize,
-    mut spoil: impl FnMut(usize, &mut GeometryPrediction, &mut Noise),
+    mut corrupt: impl FnMut(usize, &mut GeometryPrediction, &mut Noise),
 ) -> Placement {
     let mut noise = Noise::new(5);
-    let mut machine = machine(mode);
+    let mut aligner = new_aligner(mode);
     for (k, range) in chunk_ranges(truth.len(), 12, overlap).unwrap().into_iter().enumerate() {
         let mut prediction = predict(truth, range.frames, k as u32, REAL, &mut noise);
-        spoil(k, &mut prediction, &mut noise);
-        machine.push(observe(prediction, Some(odometry), none)).unwrap();
+        corrupt(k, &mut prediction, &mut noise);
+        aligner.push(observe(prediction, Some(odometry), none)).unwrap();
     }
-    machine.finish()
+    aligner.finish()
 }
 
 fn all_finite(placement: &Placement) -> bool {
@@ -43,7 +43,7 @@ fn set_depth(prediction: &mut GeometryPrediction, view: usize, mut f: impl FnMut
 }
 
 #[test]
-fn numbers_that_are_none_leave_the_rest_as_it_was() {
+fn views_that_are_not_finite_are_left_out_and_counted() {
     let truth = laps(40, 1.0);
     for mode in CouplingMode::ALL {
         let placement = run(mode, &truth, &truth, 4, |k, p, _| {
@@ -71,7 +71,7 @@ fn numbers_that_are_none_leave_the_rest_as_it_was() {
     }
 }
 
-fn garbage(prediction: &mut GeometryPrediction, noise: &mut Noise) {
+fn make_inconsistent(prediction: &mut GeometryPrediction, noise: &mut Noise) {
     for view in 0..prediction.views.len() {
         set_depth(prediction, view, |_, _| (noise.normal().exp() * 2.0) as f32);
         prediction.views[view].chunk_from_camera = Se3::new(So3::exp(&noise.vector(1.5)), noise.vector(2.0));
@@ -79,12 +79,12 @@ fn garbage(prediction: &mut GeometryPrediction, noise: &mut Noise) {
 }
 
 #[test]
-fn a_garbage_chunk_is_left_out_and_the_others_stand() {
+fn an_inconsistent_chunk_is_left_out_and_the_others_are_placed() {
     let truth = laps(60, 1.0);
     for mode in [CouplingMode::Coupled, CouplingMode::Hybrid, CouplingMode::PoseConditioned] {
         let placement = run(mode, &truth, &truth, 4, |k, p, noise| {
             if k == 3 {
-                garbage(p, noise);
+                make_inconsistent(p, noise);
             }
         });
         assert!(!placement.chunks[3].status.is_usable(), "{mode}: {:?}", placement.chunks[3]);
@@ -97,10 +97,10 @@ fn a_garbage_chunk_is_left_out_and_the_others_stand() {
             assert!(placement.keyframes.iter().any(|k| k.frame_id.0 == 30));
         }
     }
-    // Without anchors what follows the gap has no place, and says so.
+    // Without pose priors the chunks after the gap have no place, and are reported so.
     let placement = run(CouplingMode::PoseFree, &truth, &truth, 4, |k, p, noise| {
         if k == 3 {
-            garbage(p, noise);
+            make_inconsistent(p, noise);
         }
     });
     assert_eq!(placement.chunks[3].status, ChunkStatus::Rejected);
@@ -109,7 +109,7 @@ fn a_garbage_chunk_is_left_out_and_the_others_stand() {
 }
 
 #[test]
-fn chunks_that_share_nothing_are_placed_by_their_anchors_or_not_at_all() {
+fn chunks_that_share_nothing_are_placed_by_their_priors_or_not_at_all() {
     let truth = laps(48, 1.0);
     let coupled = run(CouplingMode::Coupled, &truth, &truth, 0, |_, _, _| {});
     assert_eq!(coupled.rejections.of(RejectionReason::NoOverlap), 3);
@@ -127,19 +127,19 @@ fn nothing_one_frame_and_one_chunk_are_answered() {
     let truth = laps(8, 0.2);
     let mut noise = Noise::new(1);
     for mode in CouplingMode::ALL {
-        let nothing = machine(mode).finish();
+        let nothing = new_aligner(mode).finish();
         assert!(nothing.views.is_empty() && nothing.chunks.is_empty());
-        let mut one = machine(mode);
+        let mut one = new_aligner(mode);
         let report =
             one.push(observe(predict(&truth, 0..1, 0, REAL, &mut noise), Some(&truth), none)).unwrap();
         assert_eq!(report.chunk_id, ChunkId(0));
         assert!(all_finite(&one.finish()), "{mode}");
-        let mut chunk = machine(mode);
+        let mut chunk = new_aligner(mode);
         chunk.push(observe(predict(&truth, 0..8, 0, REAL, &mut noise), Some(&truth), none)).unwrap();
         assert!(chunk.push(observe(predict(&truth, 0..8, 0, REAL, &mut noise), None, none)).is_err());
         let placement = chunk.finish();
         assert!(all_finite(&placement) && placement.views.len() == 8, "{mode}");
-        let mut empty = machine(mode);
+        let mut empty = new_aligner(mode);
         let mut prediction = predict(&truth, 0..3, 0, REAL, &mut noise);
         prediction.views.clear();
         let report = empty.push(ChunkObservation { prediction, frames: Vec::new() }).unwrap();
@@ -157,12 +157,12 @@ fn a_straight_line_is_identity_in_the_papers_modes_and_a_map_in_the_coupled_one(
         (0..36).map(|i| look(Vector3::new(-2.0 + 0.1 * f64::from(i), 1.0, 1.2), 0.3, 0.05)).collect();
     let run = |mode| {
         let mut noise = Noise::new(2);
-        let mut machine = machine(mode);
+        let mut aligner = new_aligner(mode);
         for (k, range) in chunk_ranges(36, 12, 4).unwrap().into_iter().enumerate() {
             let prediction = predict(&truth, range.frames, k as u32, EXACT, &mut noise);
-            machine.push(observe(prediction, Some(&truth), none)).unwrap();
+            aligner.push(observe(prediction, Some(&truth), none)).unwrap();
         }
-        machine.finish()
+        aligner.finish()
     };
     let conditioned = run(CouplingMode::PoseConditioned);
     assert!(conditioned.rejections.of(RejectionReason::RankDeficient) >= 1 && conditioned.views.is_empty());
@@ -174,7 +174,7 @@ fn a_straight_line_is_identity_in_the_papers_modes_and_a_map_in_the_coupled_one(
 }
 
 #[test]
-fn standing_still_says_nothing_of_scale_unless_landmarks_do() {
+fn standing_still_leaves_the_scale_unobservable_without_landmarks() {
     let mut noise = Noise::new(3);
     let truth: Vec<Se3> = (0..36)
         .map(|_| {
@@ -184,7 +184,7 @@ fn standing_still_says_nothing_of_scale_unless_landmarks_do() {
         .collect();
     let run = |with_landmarks: bool| {
         let (mut noise, mut points) = (Noise::new(4), Noise::new(5));
-        let mut machine = machine(CouplingMode::Coupled);
+        let mut aligner = new_aligner(CouplingMode::Coupled);
         let mut gauges = Vec::new();
         for (k, range) in chunk_ranges(36, 12, 4).unwrap().into_iter().enumerate() {
             let mut peek = Noise(noise.0.clone());
@@ -196,9 +196,9 @@ fn standing_still_says_nothing_of_scale_unless_landmarks_do() {
                 seen.clear();
             }
             let of = |i: usize| seen.iter().find(|s| s.0 == i).map_or(Vec::new(), |s| s.1.clone());
-            machine.push(observe(prediction, Some(&truth), of)).unwrap();
+            aligner.push(observe(prediction, Some(&truth), of)).unwrap();
         }
-        (machine.finish(), gauges)
+        (aligner.finish(), gauges)
     };
     let (blind, _) = run(false);
     assert!(all_finite(&blind) && blind.rejections.of(RejectionReason::ScaleUnobservable) >= 1);
@@ -214,7 +214,7 @@ fn standing_still_says_nothing_of_scale_unless_landmarks_do() {
 #[test]
 fn a_chunk_whose_unit_jumps_by_a_third_is_no_other_map() {
     let truth = laps(60, 1.0);
-    let spoil = |k: usize, p: &mut GeometryPrediction| {
+    let corrupt = |k: usize, p: &mut GeometryPrediction| {
         let factor = [1.0, 1.3, 0.7, 1.3, 1.0, 0.7, 1.3, 1.0][k % 8];
         for v in 0..p.views.len() {
             p.views[v].chunk_from_camera.translation *= factor;
@@ -224,7 +224,7 @@ fn a_chunk_whose_unit_jumps_by_a_third_is_no_other_map() {
     };
     for mode in [CouplingMode::Coupled, CouplingMode::PoseConditioned, CouplingMode::Hybrid] {
         let plain = run(mode, &truth, &truth, 4, |_, _, _| {});
-        let jumping = run(mode, &truth, &truth, 4, |k, p, _| spoil(k, p));
+        let jumping = run(mode, &truth, &truth, 4, |k, p, _| corrupt(k, p));
         let difference = plain
             .views
             .iter()

@@ -1,4 +1,4 @@
-//! The whole machine in the regimes that part the paper's couplings: good and drifting odometry, false loops.
+//! The aligner where the paper's couplings differ: good and drifting odometry, false loops.
 //!
 //! Three laps of a room; revisits are found by descriptors, answered by loop chunks of the model, some of which put the
 //! two sides together falsely. No number here forecasts real data; what is claimed is the order.
@@ -15,7 +15,7 @@ use vidar_core::{GeometryPrediction, LieGroup, Se3, Sim3, So3, umeyama_se3};
 
 const FRAMES: usize = 120;
 
-/// A descriptor that knows a place and a heading: random Fourier features of both.
+/// A descriptor of a place and a heading: random Fourier features of both.
 fn descriptor(pose: &Se3) -> Vec<f32> {
     let mut noise = Noise::new(77);
     let forward = pose.rotation.act(&nalgebra::Vector3::z());
@@ -50,25 +50,25 @@ fn run(mode: CouplingMode, seed: u64, drift: f64, false_share: f64) -> Outcome {
     let mut config = AlignerConfig::default();
     config.graph.odometry_per_metre *= drift;
     config.graph.odometry_rotation_deg *= drift;
-    let mut machine = Aligner::new(mode, &config).unwrap();
+    let mut aligner = Aligner::new(mode, &config).unwrap();
     for (k, range) in chunk_ranges(FRAMES, 16, 5).unwrap().into_iter().enumerate() {
         let prediction = predict(&truth, range.frames, k as u32, REAL, &mut noise);
         let mut observation = observe(prediction, Some(&odometry), none);
         for frame in &mut observation.frames {
             frame.descriptor = Some(descriptor(&truth[frame.frame_id.index()]));
         }
-        machine.push(observation).unwrap();
-        for candidate in machine.loop_candidates() {
+        aligner.push(observation).unwrap();
+        for candidate in aligner.loop_candidates() {
             let both: Vec<usize> =
                 candidate.later_window.iter().chain(&candidate.earlier_window).map(|f| f.index()).collect();
             let mut answer = predict_frames(&truth, &both, 9999, REAL, &mut luck);
             if luck.uniform() < false_share {
                 mislead(&mut answer, &candidate.later_window, &mut luck);
             }
-            machine.push_loop(&candidate, Some(&answer)).unwrap();
+            aligner.push_loop(&candidate, Some(&answer)).unwrap();
         }
     }
-    let placement = machine.finish();
+    let placement = aligner.finish();
     let (placed, exact): (Vec<_>, Vec<_>) = placement
         .views
         .iter()
@@ -100,7 +100,7 @@ fn the_coupled_world_is_at_least_as_good_as_the_better_of_the_papers_two_in_ever
 }
 
 #[test]
-fn false_loops_are_refused_and_true_ones_kept() {
+fn false_loops_are_rejected_and_true_ones_kept() {
     let clean = run(CouplingMode::Coupled, 1, 1.0, 0.0);
     let loops = &clean.placement.loops;
     let kept = loops.iter().filter(|l| l.rejection.is_none()).count();
@@ -111,10 +111,10 @@ fn false_loops_are_refused_and_true_ones_kept() {
 }
 
 #[test]
-fn a_loop_can_be_measured_without_asking_the_model_again() {
+fn a_loop_can_be_measured_without_another_prediction() {
     let truth = laps(96, 2.0);
     let mut noise = Noise::new(6);
-    let mut machine = Aligner::new(CouplingMode::PoseFree, &AlignerConfig::default()).unwrap();
+    let mut aligner = Aligner::new(CouplingMode::PoseFree, &AlignerConfig::default()).unwrap();
     let mut gauges = Vec::new();
     for (k, range) in chunk_ranges(96, 16, 5).unwrap().into_iter().enumerate() {
         gauges.push(Noise(noise.0.clone()).gauge());
@@ -123,13 +123,13 @@ fn a_loop_can_be_measured_without_asking_the_model_again() {
         for frame in &mut observation.frames {
             frame.descriptor = Some(descriptor(&truth[frame.frame_id.index()]));
         }
-        machine.push(observation).unwrap();
+        aligner.push(observation).unwrap();
     }
-    let candidates = machine.loop_candidates();
+    let candidates = aligner.loop_candidates();
     assert!(!candidates.is_empty());
     let mut accepted = 0;
     for candidate in &candidates {
-        let report = machine.push_loop(candidate, None).unwrap();
+        let report = aligner.push_loop(candidate, None).unwrap();
         if report.rejection.is_some() {
             continue;
         }
@@ -140,7 +140,7 @@ fn a_loop_can_be_measured_without_asking_the_model_again() {
         assert!(off[6].abs() < 0.03 && off.fixed_rows::<3>(0).norm() < 0.03, "{off:?} {report:?}");
     }
     assert!(accepted * 2 >= candidates.len(), "{accepted} of {}", candidates.len());
-    assert!(machine.loop_candidates().len() < candidates.len());
+    assert!(aligner.loop_candidates().len() < candidates.len());
 }
 
 #[test]
@@ -152,7 +152,7 @@ fn old_frames_within_a_chunk_close_the_loop_without_a_loop_chunk() {
         let mut config = AlignerConfig::default();
         config.graph.odometry_per_metre *= 4.0;
         config.graph.odometry_rotation_deg *= 4.0;
-        let mut machine = Aligner::new(CouplingMode::Coupled, &config).unwrap();
+        let mut aligner = Aligner::new(CouplingMode::Coupled, &config).unwrap();
         for (k, range) in chunk_ranges(64, 12, 4).unwrap().into_iter().enumerate() {
             let mut frames: Vec<usize> = range.frames.clone().collect();
             if takes_old_frames && range.frames.start >= 36 {
@@ -161,9 +161,9 @@ fn old_frames_within_a_chunk_close_the_loop_without_a_loop_chunk() {
                 frames.splice(0..0, old..old + 4);
             }
             let prediction = predict_frames(&truth, &frames, k as u32, REAL, &mut noise);
-            machine.push(observe(prediction, Some(&odometry), none)).unwrap();
+            aligner.push(observe(prediction, Some(&odometry), none)).unwrap();
         }
-        let placement = machine.finish();
+        let placement = aligner.finish();
         assert_eq!(placement.views.len(), 64);
         let owners: Vec<u32> = placement.views.iter().map(|v| v.owner.0).collect();
         assert!(

@@ -1,10 +1,11 @@
-//! Chunks chained by their overlaps, closed by loops: the reference's world.
+//! Chunks chained by their overlaps, closed by loops in a Sim(3) pose graph.
 
-use super::memory::Chunk;
+use super::chunk::Chunk;
+use super::report::GraphFailure;
 use crate::streaming::{LoopConstraint, PoseGraphConfig, optimise_chain};
 use vidar_core::{LieGroup, Sim3};
 
-/// Where a chunk stands in its chain.
+/// Where a chunk is in its chain.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Link {
     /// The chain, by the index of its first chunk: chunks of different chains share nothing.
@@ -13,46 +14,59 @@ pub(super) struct Link {
     pub root_from_chunk: Sim3,
 }
 
+/// All chains.
+pub(super) struct Chains {
+    /// Per chunk; `None` for chunks that are not usable.
+    pub links: Vec<Option<Link>>,
+    /// Chains whose graph has no solution: their loops stay open.
+    pub failures: Vec<GraphFailure>,
+}
+
 /// Chains usable chunks. `loops` are (later, earlier, `earlier_from_later`) of accepted loops.
-pub(super) fn chain(chunks: &[Chunk], loops: &[(usize, usize, Sim3)]) -> Vec<Option<Link>> {
+pub(super) fn chain(chunks: &[Chunk], loops: &[(usize, usize, Sim3)]) -> Chains {
     let mut links: Vec<Option<Link>> = Vec::with_capacity(chunks.len());
     for (index, chunk) in chunks.iter().enumerate() {
-        let before = chunk.tie.as_ref().and_then(|t| links[t.to].map(|l| (l, t)));
+        let before = chunk.overlap.as_ref().and_then(|o| links[o.earlier].map(|l| (l, o)));
         links.push(chunk.is_usable().then(|| match before {
-            Some((link, tie)) => {
-                Link { root: link.root, root_from_chunk: link.root_from_chunk * tie.fit.target_from_source }
-            }
+            Some((link, overlap)) => Link {
+                root: link.root,
+                root_from_chunk: link.root_from_chunk * overlap.fit.target_from_source,
+            },
             None => Link { root: index, root_from_chunk: Sim3::IDENTITY },
         }));
     }
     let mut roots: Vec<usize> = links.iter().flatten().map(|l| l.root).collect();
     roots.dedup();
-    for root in roots {
-        close(&mut links, root, loops);
-    }
-    links
+    let failures = roots
+        .into_iter()
+        .filter_map(|root| close(&mut links, root, loops).err().map(|reason| (root, reason)))
+        .map(|(root, reason)| GraphFailure { first_chunk: chunks[root].id, reason })
+        .collect();
+    Chains { links, failures }
 }
 
-/// Spreads the loops of one chain over its links; a chain whose graph has no answer stays open.
-fn close(links: &mut [Option<Link>], root: usize, loops: &[(usize, usize, Sim3)]) {
+/// Distributes the loops of one chain over its links. On an error the links stay as they are.
+fn close(links: &mut [Option<Link>], root: usize, loops: &[(usize, usize, Sim3)]) -> Result<(), String> {
     let members: Vec<usize> =
         (0..links.len()).filter(|&i| links[i].is_some_and(|l| l.root == root)).collect();
-    let place = |chunk: usize| members.binary_search(&chunk).ok();
+    let index = |chunk: usize| members.binary_search(&chunk).ok();
     let constraints: Vec<LoopConstraint> = loops
         .iter()
         .filter_map(|(later, earlier, b_from_a)| {
-            Some(LoopConstraint { a: place(*later)?, b: place(*earlier)?, b_from_a: *b_from_a })
+            Some(LoopConstraint { a: index(*later)?, b: index(*earlier)?, b_from_a: *b_from_a })
         })
         .collect();
     if constraints.is_empty() {
-        return;
+        return Ok(());
     }
     let gauges: Vec<Sim3> = members.iter().filter_map(|&m| links[m].map(|l| l.root_from_chunk)).collect();
     let steps: Vec<Sim3> = gauges.windows(2).map(|g| g[0].inverse() * g[1]).collect();
-    let Ok(closed) = optimise_chain(&steps, &constraints, &PoseGraphConfig::default()) else { return };
-    let mut sum = Sim3::IDENTITY;
+    let closed =
+        optimise_chain(&steps, &constraints, &PoseGraphConfig::default()).map_err(|e| e.to_string())?;
+    let mut root_from_chunk = Sim3::IDENTITY;
     for (member, step) in members.iter().skip(1).zip(&closed.previous_from_next) {
-        sum = sum * *step;
-        links[*member] = Some(Link { root, root_from_chunk: sum });
+        root_from_chunk = root_from_chunk * *step;
+        links[*member] = Some(Link { root, root_from_chunk });
     }
+    Ok(())
 }

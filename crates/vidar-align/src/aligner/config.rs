@@ -1,4 +1,4 @@
-//! What a user may choose of the machine.
+//! Configuration of the aligner.
 
 use crate::AlignError;
 use crate::coupled::CoupledConfig;
@@ -7,78 +7,18 @@ use crate::overlap::OverlapConfig;
 use crate::streaming::{AlignMethod, Compat};
 use serde::{Deserialize, Serialize};
 
-/// How prediction and odometry are coupled.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, schemars::JsonSchema)]
-#[serde(rename_all = "kebab-case")]
-pub enum CouplingMode {
-    /// The reference: chunks chained by their overlaps, loops, Sim(3) graph. Not metric.
-    #[serde(rename = "da3-streaming")]
-    Da3Streaming,
-    /// The same chain without the reference's quirks: the paper's PF column. Not metric.
-    PoseFree,
-    /// The paper's VIO column: poses are the odometry's, each chunk's depth is divided by its Umeyama scale.
-    PoseConditioned,
-    /// The same with true poses: the upper bound of the paper's tables.
-    GroundTruth,
-    /// The paper's decoupled hybrid: the pose-free chain, then one similarity onto the odometry's camera centres.
-    Hybrid,
-    /// Keyframes and chunk gauges estimated together from odometry, gravity, overlaps, landmarks and loops.
-    #[default]
-    Coupled,
-}
-
-impl CouplingMode {
-    /// The word as it stands in files and on the command line.
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::Da3Streaming => "da3-streaming",
-            Self::PoseFree => "pose-free",
-            Self::PoseConditioned => "pose-conditioned",
-            Self::GroundTruth => "ground-truth",
-            Self::Hybrid => "hybrid",
-            Self::Coupled => "coupled",
-        }
-    }
-
-    /// All of them, in the order of the paper's tables.
-    pub const ALL: [Self; 6] = [
-        Self::Da3Streaming,
-        Self::PoseFree,
-        Self::PoseConditioned,
-        Self::GroundTruth,
-        Self::Hybrid,
-        Self::Coupled,
-    ];
-
-    /// Whether chunks are tied to each other by overlaps (else each is tied to its anchors alone).
-    pub fn chains(self) -> bool {
-        !matches!(self, Self::PoseConditioned | Self::GroundTruth)
-    }
-
-    /// Whether metric anchors take part at all.
-    pub fn uses_pose_priors(self) -> bool {
-        !matches!(self, Self::Da3Streaming | Self::PoseFree)
-    }
-}
-
-impl std::fmt::Display for CouplingMode {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.write_str(self.name())
-    }
-}
-
-/// What decides how chunks become one world.
+/// Configuration of the alignment.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct AlignerConfig {
-    /// Largest RMS distance (m) between placed and anchored camera centres at which a chunk is still trusted.
+    /// Largest RMS distance (m) of placed camera centres from their pose priors at which a chunk is still accepted.
     /// Raise it for fast vehicles with a coarse trajectory; lower it indoors.
     pub max_center_rms_m: f64,
     /// Whether `da3-streaming` follows the reference where it errs, number for number, on all pixels (`off`, `reference`).
     pub compat: Compat,
     /// What the reference chain estimates between neighbours: `sim3`, `se3` (metric models) or `scale-se3`.
     pub chain: AlignMethod,
-    /// Scale ratios between metric neighbours outside this range count as failures (the paper's guard: 0.85 to 1.20).
+    /// Scale ratios between metric neighbours outside this range are taken as 1 (the paper: 0.85 to 1.20).
     pub scale_range: [f64; 2],
     /// Overlaps of neighbouring chunks.
     pub overlap: OverlapConfig,
@@ -105,13 +45,13 @@ impl Default for AlignerConfig {
     }
 }
 
-/// How revisits are sought and believed.
+/// How loops are found and accepted.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct LoopsConfig {
     /// Smallest inner product of two places' descriptors (0 to 1). The paper's τ_loop.
     pub min_similarity: f32,
-    /// The same where places are told by the geometry model's tokens, less what all places have in common (−1 to 1).
+    /// The same for descriptors of the geometry model's tokens, after whitening (−1 to 1).
     pub min_token_similarity: f32,
     /// Nearest places asked for per keyframe, after those near in time were left out (1 to 20).
     pub top_k: usize,
@@ -121,12 +61,11 @@ pub struct LoopsConfig {
     pub min_travel_m: f64,
     /// Keyframes on each side of a loop's two ends that a loop chunk or a direct comparison takes (1 to 60).
     pub window: usize,
-    /// Share of pairs that must agree within 5 % of depth, seen from both sides (0 to 1).
+    /// Share of pairs that must agree within 5 % of depth, from both sides (0 to 1).
     pub min_inlier_ratio: f64,
-    /// Largest χ² of a loop against what odometry and overlaps predict, 7 degrees of freedom (24.3: one true loop in a
-    /// thousand is lost).
+    /// Largest χ² of a loop against odometry and overlaps, 7 degrees of freedom (24.3: one true loop in a thousand is lost).
     pub max_chi2: f64,
-    /// Most loops kept per chunk (1 or more).
+    /// Most loops measured per chunk (1 or more).
     pub max_per_chunk: usize,
 }
 
@@ -146,28 +85,28 @@ impl Default for LoopsConfig {
     }
 }
 
-/// How much each kind of evidence counts in the coupled graph, before it is judged.
+/// Standard deviations of the coupled graph's factors.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct GraphWeights {
-    /// Error of a camera centre within its chunk, as a share of the chunk's middle depth (0.003: good models indoors).
+    /// σ of a camera centre within its chunk, as a share of the chunk's median depth (0.003: good models indoors).
     pub attachment_depth_ratio: f64,
-    /// Error of a camera's rotation within its chunk, degrees.
+    /// σ of a camera's rotation within its chunk, degrees.
     pub attachment_rotation_deg: f64,
-    /// Odometry without a covariance of its own: error per metre of step.
+    /// Odometry without a covariance of its own: σ per metre of step.
     pub odometry_per_metre: f64,
-    /// Odometry without a covariance of its own: smallest error of a step, m.
+    /// Odometry without a covariance of its own: least σ of a step, m.
     pub odometry_floor_m: f64,
-    /// Odometry without a covariance of its own: error of rotation, degrees per square root of a second.
+    /// Odometry without a covariance of its own: σ of rotation, degrees per square root of a second.
     pub odometry_rotation_deg: f64,
-    /// Error of the direction of gravity, degrees.
+    /// σ of the direction of gravity, degrees.
     pub gravity_deg: f64,
-    /// Change of a chunk's metric scale against its neighbour's beyond what the overlap says, standard deviation of ln.
+    /// σ of the random walk of ln(scale) from chunk to chunk beyond the scale step of their overlap.
     pub scale_walk: f64,
-    /// Standard deviation of ln(scale) above which motion and landmarks count as not telling a chunk's scale.
+    /// σ of ln(scale) above which a chunk's scale counts as not observable from motion and landmarks.
     pub max_log_scale_std: f64,
-    /// Mean χ² per degree of freedom of the odometry above which coupled poses are not believed and information flows one
-    /// way only, from odometry to chunks.
+    /// Mean χ² per degree of freedom of the odometry above which coupled poses are rejected and information flows one way
+    /// only, from odometry to chunks.
     pub max_odometry_chi2: f64,
     /// Most iterations of each descent.
     pub max_iterations: usize,

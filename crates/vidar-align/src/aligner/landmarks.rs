@@ -1,27 +1,30 @@
-//! What a chunk's landmarks say of its depth, before anything else is made of it.
+//! Scale and depth corrections of one chunk from its landmarks, before overlaps and loops are measured.
 //!
-//! The unit of a chunk that the model placed itself is free: landmarks measure it ([`Landmarks::scale`]), and each view is
-//! corrected about it. A chunk in the anchors' own world has metres for a unit, as far as its poses go; a network that was
-//! given the poses may still see everything too near or too far. Where landmarks say so beyond doubt, its depth alone is
-//! brought to them, and its poses stay.
+//! A chunk in a frame of its own has a free unit: landmarks measure it ([`DepthCorrection::scale`]), and each view is
+//! corrected relative to it. A chunk in the world of its pose priors has metres for a unit as far as its poses go; a network
+//! that was given the poses may still predict all depth too near or too far. Where landmarks contradict the depth beyond
+//! three standard deviations, the depth is scaled to them and the poses stay.
 
-use super::agreement::{Refined, agree};
 use super::observation::FrameObservation;
 use super::report::RejectionReason;
-use crate::depth_field::{DepthField, Evidence, fit_depth_field};
-use crate::landmark_scale::{DepthRatio, LandmarkConfig, LogScale, depth_ratios, landmark_scale};
+use super::view_consistency::{ViewCorrection, enforce_consistency};
+use crate::depth_field::{DepthField, FieldConstraint, fit_depth_field};
+use crate::landmark_scale::{
+    DepthRatio, LandmarkConfig, LogScale, depth_ratios, landmark_scale, point_ratios,
+};
 use std::collections::BTreeMap;
 use vidar_core::model::ChunkFrame;
 use vidar_core::{FrameId, GeometryPrediction, RelativeDepth, ViewGeometry};
+use vidar_solve::statistics::median_upper;
 
-/// How far the depth of a chunk in the anchors' world is off a metre when nothing is wrong, standard deviation of ln.
+/// σ of ln(metres per unit) of a correct chunk in the world of its pose priors.
 const METRIC_DEPTH_STD: f64 = 0.02;
-/// From so many standard deviations on it is not believed against its landmarks.
+/// Landmarks contradict a depth from this many standard deviations on.
 const CONTRADICTS: f64 = 3.0;
 
 /// Scale and fields of one chunk.
 #[derive(Debug, Default)]
-pub(super) struct Landmarks {
+pub(super) struct DepthCorrection {
     /// ln(metres per unit) of the chunk after correction.
     pub scale: Option<LogScale>,
     /// Corrections of views' depths.
@@ -29,23 +32,25 @@ pub(super) struct Landmarks {
     pub rejections: Vec<RejectionReason>,
 }
 
-impl Landmarks {
-    pub fn learn(
+impl DepthCorrection {
+    pub fn from_landmarks(
         prediction: &GeometryPrediction,
         frames: &[FrameObservation],
         config: &LandmarkConfig,
     ) -> Self {
-        let seen = |view: &ViewGeometry| {
-            let frame = frames.iter().find(|f| f.frame_id == view.frame_id);
-            frame.map_or(Vec::new(), |f| depth_ratios(view, &f.landmarks, config))
+        let ratios_of = |view: &ViewGeometry| {
+            let Some(frame) = frames.iter().find(|f| f.frame_id == view.frame_id) else { return Vec::new() };
+            let mut ratios = depth_ratios(view, &frame.landmarks, config);
+            ratios.extend(point_ratios(view, &frame.points, config));
+            ratios
         };
         let per_view: Vec<(&ViewGeometry, Vec<DepthRatio>)> =
-            prediction.views.iter().map(|v| (v, seen(v))).collect();
+            prediction.views.iter().map(|v| (v, ratios_of(v))).collect();
         let all: Vec<DepthRatio> = per_view.iter().flat_map(|(_, r)| r.iter().copied()).collect();
         let Some(scale) = landmark_scale(&all, config) else { return Self::default() };
         let shared_std = shared_std(&all, frames);
-        let doubt = CONTRADICTS * METRIC_DEPTH_STD.hypot(scale.std);
-        let is_off = prediction.frame == ChunkFrame::PriorWorld && scale.log_scale.abs() > doubt;
+        let limit = CONTRADICTS * METRIC_DEPTH_STD.hypot(scale.std);
+        let is_off = prediction.frame == ChunkFrame::PriorWorld && scale.log_scale.abs() > limit;
         let shift = if is_off { scale.log_scale } else { 0.0 };
         let mut found = Self {
             scale: Some(LogScale { log_scale: scale.log_scale - shift, shared_std, ..scale }),
@@ -55,26 +60,25 @@ impl Landmarks {
             found.rejections.push(RejectionReason::DepthRescaled);
         }
         let mut refined = Vec::new();
-        let mut prior_scale = Vec::new();
+        let mut prior_scales = Vec::new();
         for (view, ratios) in &per_view {
             let size = (view.intrinsics.width, view.intrinsics.height);
             let fit = fit_depth_field(ratios, scale.log_scale, size, config.min_for_field);
             if fit.as_ref().is_some_and(|f| !f.keeps_grid) {
                 found.rejections.push(RejectionReason::DepthFieldRejected);
             }
-            prior_scale.extend(fit.as_ref().map(|f| f.prior_scale));
-            refined.push(Refined {
+            prior_scales.extend(fit.as_ref().map(|f| f.prior_scale));
+            refined.push(ViewCorrection {
                 view,
-                // In metres where the chunk's poses are, else in its own unit: what landmarks ask for is counted from there.
+                // In metres where the chunk's poses are, else in its own unit: corrections are relative to it.
                 shift,
-                landmarks: ratios.iter().map(|r| Evidence::of_landmark(r, scale.log_scale)).collect(),
+                landmarks: ratios.iter().map(|r| FieldConstraint::of_landmark(r, scale.log_scale)).collect(),
                 field: fit.map(|f| f.field),
             });
         }
         // Neighbours correct each other where most views need more than a good network does.
-        prior_scale.sort_by(f64::total_cmp);
-        if let Some(prior_scale) = prior_scale.get(prior_scale.len() / 2).filter(|l| **l > 1.0) {
-            agree(&mut refined, *prior_scale);
+        if let Some(prior_scale) = median_upper(&mut prior_scales).filter(|s| *s > 1.0) {
+            enforce_consistency(&mut refined, prior_scale);
         }
         for view in refined {
             if let Some(mut field) = view.field.or(is_off.then(DepthField::default)) {
@@ -85,7 +89,7 @@ impl Landmarks {
         found
     }
 
-    /// The prediction with its depths corrected: what overlaps and loops are measured on.
+    /// The prediction with its depths corrected: overlaps and loops are measured on it.
     pub fn corrected(&self, mut prediction: GeometryPrediction) -> GeometryPrediction {
         for view in &mut prediction.views {
             if let Some(field) = self.fields.get(&view.frame_id) {
@@ -96,7 +100,7 @@ impl Landmarks {
     }
 }
 
-/// What the landmarks used have in common, on average over them.
+/// σ of the error that the landmarks used share, on average over them.
 fn shared_std(ratios: &[DepthRatio], frames: &[FrameObservation]) -> f64 {
     let of = |r: &DepthRatio| {
         frames.iter().find(|f| f.frame_id == r.frame_id).map_or(0.0, |f| f.shared_landmark_std)

@@ -1,22 +1,23 @@
-//! What a run tells the machine of a chunk.
+//! Input of the aligner: chunks with what is known of their frames.
 
 use crate::covariance::covariance_in_camera;
+pub use crate::landmark_scale::DepthPoint;
 use nalgebra::UnitVector3;
 use vidar_core::{
     FrameId, GeometryPrediction, LieGroup, OdometryKeyframe, PoseCovariance, Se3, SparseLandmark, Timestamp,
 };
 
-/// A chunk's prediction with what is known of its frames from elsewhere.
+/// A chunk's prediction with pose priors, landmarks and descriptors of its frames.
 #[derive(Clone, Debug)]
 pub struct ChunkObservation {
-    /// What the model said. Views that were seen in an earlier chunk, too, tie the two; they are told by their frame.
+    /// The model's prediction. Frames that an earlier chunk holds, too, constrain the two chunks to each other.
     pub prediction: GeometryPrediction,
-    /// What else is known, one entry per frame; frames without geometry may have one (odometry goes on), frames
-    /// without an entry are placed through their chunk.
+    /// One entry per frame. Frames without geometry may have one (odometry continues); frames without an entry are placed
+    /// through their chunk.
     pub frames: Vec<FrameObservation>,
 }
 
-/// What is known of a frame besides its predicted geometry.
+/// What is known of a frame apart from its predicted geometry.
 #[derive(Clone, Debug)]
 pub struct FrameObservation {
     /// Which frame.
@@ -27,9 +28,11 @@ pub struct FrameObservation {
     pub pose_prior: Option<PosePrior>,
     /// Points of known metric depth. `pixel` is at the depth image's size, distortion removed.
     pub landmarks: Vec<SparseLandmark>,
-    /// Standard deviation of an error of ln(depth) that the landmarks of all frames share; 0 where each has its own alone.
+    /// Points of known metric depth that no track connects to other frames.
+    pub points: Vec<DepthPoint>,
+    /// σ of an error of ln(depth) that the landmarks and points of all frames share; 0 where errors are independent.
     pub shared_landmark_std: f64,
-    /// Unit-length descriptor of the place, if revisits are sought. The same length for all frames of a run.
+    /// Unit-length place recognition descriptor, if loops are to be found. The same length for all frames of a run.
     pub descriptor: Option<Vec<f32>>,
 }
 
@@ -41,12 +44,13 @@ impl FrameObservation {
             time,
             pose_prior: None,
             landmarks: Vec::new(),
+            points: Vec::new(),
             shared_landmark_std: 0.0,
             descriptor: None,
         }
     }
 
-    /// The same with a metric pose.
+    /// The same with a pose prior.
     pub fn with_pose_prior(mut self, pose_prior: PosePrior) -> Self {
         self.pose_prior = Some(pose_prior);
         self
@@ -56,21 +60,21 @@ impl FrameObservation {
 /// A metric pose from odometry, a given trajectory or ground truth.
 #[derive(Clone, Debug, PartialEq)]
 pub struct PosePrior {
-    /// The camera's pose, m. All anchors of a run share one world, z up, unless `segment` differs.
+    /// The camera's pose, m. All pose priors of a run share one world, z up, unless `segment` differs.
     pub world_from_camera: Se3,
-    /// Covariance of δ in `previous_from_this · exp(δ)`, rotation then translation in this camera's axes, the previous one
-    /// being the anchored frame before; none: typical odometry.
+    /// Covariance of δ in `previous_from_this · exp(δ)`, rotation then translation in this camera's axes, where the previous
+    /// frame is the one before with a pose prior; none: typical odometry.
     pub relative_covariance: Option<PoseCovariance>,
     /// The world's up in the camera, from an inertial sensor.
     pub up_in_camera: Option<UnitVector3<f64>>,
-    /// Anchors of different segments share no world: nothing ties the two.
+    /// Pose priors of different segments share no world.
     pub segment: u32,
-    /// Whether the source itself says that this is metric and backed by images. Others place nothing.
+    /// Whether the source reports the pose as metric and supported by images. Others are not used.
     pub is_trusted: bool,
 }
 
 impl PosePrior {
-    /// A pose of which nothing else is known (a trajectory file, ground truth).
+    /// A trusted pose without covariance or gravity (a trajectory file, ground truth).
     pub fn new(world_from_camera: Se3) -> Self {
         Self {
             world_from_camera,
@@ -81,7 +85,8 @@ impl PosePrior {
         }
     }
 
-    /// What an odometry keyframe says of its camera. `body_from_camera` turns covariances, which are in the body's axes.
+    /// The pose, relative covariance and gravity of an odometry keyframe. `body_from_camera` carries covariances, which are in
+    /// the body's axes, to the camera.
     pub fn from_odometry(keyframe: &OdometryKeyframe, body_from_camera: &Se3) -> Self {
         let world_from_camera = keyframe.world_from_camera;
         let up_in_world = UnitVector3::try_new(-keyframe.gravity_in_world, 1e-9);

@@ -1,6 +1,6 @@
-//! What the machine says: of a chunk when it comes, of a loop when it is judged, of the world when asked.
+//! Reports: of a chunk when it is pushed, of a loop when it is measured, of the whole alignment.
 
-use super::CouplingMode;
+use super::coupling::CouplingMode;
 use crate::coupled::InformationFlow;
 use crate::depth_field::DepthField;
 use serde::{Deserialize, Serialize};
@@ -47,63 +47,66 @@ impl ChunkStatus {
     }
 }
 
-/// Something went wrong and was kept from spreading.
+/// Why a measurement, a chunk or an estimate was rejected, replaced or down-weighted.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum RejectionReason {
     /// A metric scale ratio left its range and was taken as 1 (the paper's clamp).
     ScaleOutOfRange,
-    /// Camera centres fix no similarity (a line, a place): identity in the paper's modes, rotation from rotations in `coupled`.
+    /// Camera centres determine no similarity (collinear, or coincident): identity in the paper's modes, rotation from
+    /// rotations in `coupled`.
     RankDeficient,
-    /// A view's pose or all of its depth is not a number; the view was left out.
+    /// A view's pose or all of its depth is not finite; the view was left out.
     ViewNotFinite,
-    /// A chunk has no usable view, or contradicts its neighbour and its anchors; it was left out.
+    /// A chunk has no usable view, or contradicts its neighbour and its pose priors; it was left out.
     InconsistentChunk,
-    /// A chunk shares no usable frame with those before.
+    /// A chunk has no frame in common with the chunk before on which both agree.
     NoOverlap,
-    /// Neither motion nor landmarks tell a chunk's scale; overlap and a random-walk prior hold it.
+    /// Neither motion nor landmarks determine a chunk's scale; overlap and a random-walk prior hold it.
     ScaleUnobservable,
-    /// Odometry contradicts chunks that agree with each other; it was loosened there.
+    /// Odometry contradicts chunks that agree with each other; it was down-weighted there.
     OdometryDownweighted,
-    /// Coupled poses would have bent the odometry beyond belief; information flowed one way only.
+    /// The coupled poses exceeded [`max_odometry_chi2`](super::GraphWeights::max_odometry_chi2); information flowed one way only.
     OneWay,
-    /// A loop was refused.
+    /// A loop was rejected.
     LoopRejected,
     /// A fitted depth field did not improve held-out landmarks; only the view's own scale was kept.
     DepthFieldRejected,
-    /// Landmarks contradict the depth of a chunk whose poses were given; the depth was brought to them.
+    /// Landmarks contradict the depth of a chunk whose poses were given; the depth was scaled to them.
     DepthRescaled,
-    /// The graph had no answer; chunks stay where anchors and overlaps put them.
+    /// A covariance is not positive definite; the constraint was left out of the graph.
+    SingularCovariance,
+    /// A graph has no solution ([`Placement::graph_failures`]); chunks stay at their initial places.
     GraphFailed,
 }
 
-/// How often each guard acted.
+/// How often each reason applied.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(transparent)]
 pub struct RejectionCounts(BTreeMap<RejectionReason, usize>);
 
 impl RejectionCounts {
-    /// How often one acted.
-    pub fn of(&self, guard: RejectionReason) -> usize {
-        self.0.get(&guard).copied().unwrap_or(0)
+    /// How often one applied.
+    pub fn of(&self, reason: RejectionReason) -> usize {
+        self.0.get(&reason).copied().unwrap_or(0)
     }
 
-    /// Those that acted, in order.
+    /// The reasons that applied, in order.
     pub fn iter(&self) -> impl Iterator<Item = (RejectionReason, usize)> + '_ {
         self.0.iter().map(|(g, n)| (*g, *n))
     }
 
-    /// Whether none acted.
+    /// Whether none applied.
     pub fn is_empty(&self) -> bool {
         self.0.is_empty()
     }
 
-    pub(crate) fn add(&mut self, guard: RejectionReason) {
-        *self.0.entry(guard).or_insert(0) += 1;
+    pub(crate) fn add(&mut self, reason: RejectionReason) {
+        *self.0.entry(reason).or_insert(0) += 1;
     }
 
-    pub(crate) fn extend(&mut self, rejections: &[RejectionReason]) {
-        rejections.iter().for_each(|g| self.add(*g));
+    pub(crate) fn extend(&mut self, reasons: &[RejectionReason]) {
+        reasons.iter().for_each(|g| self.add(*g));
     }
 }
 
@@ -120,34 +123,34 @@ pub struct OverlapReport {
     pub pairs: usize,
     /// Share of them within 5 % of depth.
     pub inlier_ratio: f64,
-    /// Middle residual, share of depth.
+    /// Median residual, share of depth.
     pub median_residual: f64,
     /// Standard deviation of the logarithm of the scale between them.
     pub log_scale_std: f64,
 }
 
-/// What is known of a chunk as soon as it is there.
+/// A chunk as it was pushed.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ChunkReport {
     /// Which chunk.
     pub chunk_id: ChunkId,
     /// How it stands.
     pub status: ChunkStatus,
-    /// Where it would be placed now; later chunks and loops may move it. `None` when nothing places it.
+    /// Its initial place; later chunks and loops may move it. `None` when nothing determines it.
     pub world_from_chunk: Option<Sim3>,
-    /// Views whose camera has a metric anchor.
+    /// Views whose camera has a pose prior.
     pub matched: usize,
-    /// RMS distance of placed and anchored camera centres, m; NaN without anchors.
+    /// RMS distance of placed camera centres from their pose priors, m; NaN without any.
     pub center_rms_m: f64,
     /// Agreement with the chunk before.
     pub overlap: Option<OverlapReport>,
-    /// Standard deviation of ln(metres per unit) from this chunk's own motion and landmarks; infinite when neither tells.
+    /// σ of ln(metres per unit) from this chunk's own motion and landmarks; infinite when neither determines it.
     pub log_scale_std: f64,
-    /// Guards that acted.
+    /// Reasons that applied.
     pub rejections: Vec<RejectionReason>,
 }
 
-/// A chunk's place.
+/// A chunk in the world.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ChunkPlacement {
     /// Which chunk.
@@ -156,11 +159,11 @@ pub struct ChunkPlacement {
     pub status: ChunkStatus,
     /// Maps chunk coordinates and units to the world and metres (to the first chunk's in modes that are not metric).
     pub world_from_chunk: Sim3,
-    /// Standard deviation of ln(scale): how far to trust it. Infinite where nothing metric tells.
+    /// σ of ln(scale); infinite where nothing metric determines it.
     pub log_scale_std: f64,
 }
 
-/// A view's place.
+/// A view in the world.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ViewPlacement {
     /// Which frame.
@@ -185,7 +188,7 @@ pub struct KeyframePlacement {
     pub world_from_camera: Se3,
 }
 
-/// What became of a supposed revisit.
+/// A measured loop.
 #[derive(Clone, Debug, PartialEq)]
 pub struct LoopReport {
     /// The later chunk.
@@ -198,26 +201,38 @@ pub struct LoopReport {
     pub earlier_from_later: Option<Sim3>,
     /// Smallest share of agreeing pairs on either side.
     pub inlier_ratio: f64,
-    /// χ² against the prediction, 7 degrees of freedom; NaN where none could be made.
-    pub chi2: f64,
-    /// Why it was refused; `None` = accepted.
+    /// χ² against the pose priors, 7 degrees of freedom; `None` where there are none to compare with, NaN where the covariance
+    /// is singular.
+    pub chi2: Option<f64>,
+    /// Why it was rejected; `None` = accepted.
     pub rejection: Option<LoopRejection>,
 }
 
-/// Why a loop is not believed.
+/// Why a loop was rejected.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum LoopRejection {
-    /// No geometry could be compared.
+    /// The two sides have too few points in common.
     NoGeometry,
+    /// The points of one side determine no similarity.
+    Degenerate,
     /// Too few points agree on one side.
     FewInliers,
-    /// It contradicts odometry and overlaps beyond their covariance.
+    /// χ² against odometry and overlaps exceeds [`max_chi2`](super::LoopsConfig::max_chi2), or is not a number.
     Chi2TooLarge,
     /// It contradicts the other loops.
     Inconsistent,
-    /// The graph let it go.
+    /// The robust kernel left it no weight in the graph.
     GraphOutlier,
+}
+
+/// A pose graph without a solution: its chunks stay at their initial places.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct GraphFailure {
+    /// The first chunk of the graph.
+    pub first_chunk: ChunkId,
+    /// The solver's error.
+    pub reason: String,
 }
 
 /// How the coupled graph ended.
@@ -237,23 +252,23 @@ pub struct GraphReport {
     pub odometry_chi2: f64,
 }
 
-/// How far chain and anchors part: what a metric map would lose without the other.
+/// Distance between the placed chunks and the pose priors.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct DriftReport {
-    /// RMS distance of placed camera centres from their anchors, m.
+    /// RMS distance of placed camera centres from their pose priors, m.
     pub center_rms_m: f64,
     /// Largest such distance, m.
     pub center_max_m: f64,
     /// Standard deviation over chunks of the scale step between neighbours against their overlap, ln.
     pub scale_step_std: f64,
-    /// Anchored camera centres compared.
+    /// Camera centres compared.
     pub matched: usize,
 }
 
-/// One world.
+/// The result of the alignment: chunks, views and keyframes in one world.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Placement {
-    /// How it was made.
+    /// How it was estimated.
     pub mode: CouplingMode,
     /// Whether lengths are metres.
     pub is_metric: bool,
@@ -261,25 +276,27 @@ pub struct Placement {
     pub chunks: Vec<ChunkPlacement>,
     /// Every view that a usable chunk holds, once, by frame.
     pub views: Vec<ViewPlacement>,
-    /// Every frame whose pose is known, by frame: views and anchored frames without geometry.
+    /// Every frame whose pose is estimated, by frame: views, and frames with a pose prior but no geometry.
     pub keyframes: Vec<KeyframePlacement>,
-    /// Loops judged.
+    /// Loops measured.
     pub loops: Vec<LoopReport>,
-    /// Guards that acted.
+    /// How often something was rejected, by reason.
     pub rejections: RejectionCounts,
     /// The graph, in mode `coupled`.
     pub graph: Option<GraphReport>,
-    /// Chain against anchors.
+    /// Graphs that have no solution, with the reason.
+    pub graph_failures: Vec<GraphFailure>,
+    /// Placed chunks against pose priors.
     pub drift: DriftReport,
 }
 
 impl Placement {
-    /// Where a chunk stands.
+    /// A chunk's place.
     pub fn chunk(&self, id: ChunkId) -> Option<&ChunkPlacement> {
         self.chunks.iter().find(|c| c.chunk_id == id)
     }
 
-    /// Where a view stands.
+    /// A view's place.
     pub fn view(&self, frame: FrameId) -> Option<&ViewPlacement> {
         self.views.binary_search_by_key(&frame, |v| v.frame_id).ok().map(|i| &self.views[i])
     }

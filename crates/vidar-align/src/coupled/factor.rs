@@ -1,10 +1,10 @@
 //! What is known, as residuals with Jacobians.
 
-use super::Kernel;
 use nalgebra::{DMatrix, Matrix3, Matrix6, SMatrix, SVector, UnitVector3, Vector3};
 use vidar_core::{LieGroup, Se3, Sim3, So3};
+use vidar_solve::Kernel;
 
-/// One piece of evidence. Standard deviations must be finite and positive.
+/// One measurement. Standard deviations must be finite and positive.
 #[derive(Clone, Debug)]
 pub enum Factor {
     /// Odometry between keyframes: `r = W Log(Z⁻¹ Tᵢ⁻¹ Tⱼ)`.
@@ -18,7 +18,7 @@ pub enum Factor {
         /// W, with `Wᵀ W` the information matrix; tangent order.
         whitening: Box<Matrix6<f64>>,
     },
-    /// Gravity, which the odometry's inertial sensor knows: `r = (Rᵢᵀ e_z − g) / σ`.
+    /// Direction of gravity from the odometry's accelerometer: `r = (Rᵢᵀ e_z − g) / σ`.
     Gravity {
         /// Which keyframe.
         i: usize,
@@ -82,8 +82,8 @@ pub struct Attachment {
     pub position_std_m: f64,
     /// Poses of a model may be grossly wrong.
     pub kernel: Kernel,
-    /// Whether the keyframe is moved by it. In a pose-conditioned chunk the model mostly repeats what it was given, which
-    /// says where the chunk is and nothing new of the keyframe.
+    /// Whether the keyframe is moved by it. In a pose-conditioned chunk the model mostly repeats the poses that it was
+    /// given: they determine the chunk's place and are no new measurement of the keyframe.
     pub moves_keyframe: bool,
 }
 
@@ -140,7 +140,7 @@ pub(super) struct Linearised {
 }
 
 impl Factor {
-    /// The loss it is seen through.
+    /// Its robust kernel.
     pub fn kernel(&self) -> Kernel {
         match self {
             Self::Attachment(a) => a.kernel,

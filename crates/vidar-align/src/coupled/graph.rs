@@ -1,12 +1,11 @@
 //! The solver: Levenberg-Marquardt over keyframes and chunks, robust, graduated for loops, with a way back.
 
-use super::Kernel;
 use super::factor::{Factor, Variable};
 use nalgebra::{DMatrix, SVector, Vector6};
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 use vidar_core::{LieGroup, Se3, Sim3};
-use vidar_solve::{NormalEquations, SolveError};
+use vidar_solve::{Kernel, NormalEquations, SolveError};
 
 /// What is estimated.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -17,7 +16,7 @@ pub struct CoupledState {
     pub chunks: Vec<Sim3>,
 }
 
-/// When the solver stops and when it distrusts itself.
+/// When the solver stops and when its result is rejected.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct CoupledConfig {
     /// Most iterations of each descent.
@@ -26,7 +25,7 @@ pub struct CoupledConfig {
     pub tolerance: f64,
     /// Shoulders of bounded kernels during the graduated descent, as multiples of their own, last 1.
     pub graduation: [f64; 3],
-    /// Mean χ² per degree of freedom of the odometry above which the coupled poses are not believed.
+    /// Mean χ² per degree of freedom of the odometry above which the coupled poses are rejected.
     pub max_odometry_chi2: f64,
 }
 
@@ -46,7 +45,7 @@ pub enum InformationFlow {
     OneWay,
 }
 
-/// The estimate and what it says of itself.
+/// The estimate with its statistics.
 #[derive(Clone, Debug)]
 pub struct Solution {
     /// The estimate.
@@ -93,7 +92,7 @@ pub enum GraphError {
 /// Estimates keyframes and chunks from all factors, starting at `start`.
 ///
 /// # Errors
-/// [`GraphError`]; a factor that is merely wrong is let go by its kernel and is no error.
+/// [`GraphError`]; a factor that is an outlier is down-weighted by its kernel and is no error.
 pub fn solve(
     start: &CoupledState,
     factors: &[Factor],

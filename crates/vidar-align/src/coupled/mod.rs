@@ -16,11 +16,10 @@
 
 mod factor;
 mod graph;
-mod kernel;
 
 pub use factor::{Attachment, Factor, RelativeChunk};
 pub use graph::{CoupledConfig, CoupledState, GraphError, InformationFlow, Solution, solve};
-pub use kernel::Kernel;
+pub use vidar_solve::Kernel;
 
 /// By how much the standard deviations of n measurements that share one error are widened so that they count as one:
 /// √n.

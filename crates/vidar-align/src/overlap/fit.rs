@@ -4,20 +4,22 @@ use crate::streaming::{AlignMethod, StreamingError, weighted_similarity};
 use nalgebra::{SMatrix, Vector3};
 use serde::{Deserialize, Serialize};
 use vidar_core::{LieGroup, Sim3};
+use vidar_solve::Kernel;
+use vidar_solve::statistics::{STD_PER_MAD, median_upper};
 
-/// How an overlap is sampled and when its fit is believed.
+/// How an overlap is sampled and when its fit is accepted.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct OverlapConfig {
-    /// Depths remembered per view (100 to 20 000). More cost memory and time and change nothing: errors of a prediction
-    /// are shared by neighbouring pixels.
+    /// Depths kept per view (100 to 20 000). More cost memory and time without effect: neighbouring pixels share the errors
+    /// of a prediction.
     pub samples_per_view: usize,
     /// Most point pairs of one fit (1000 to 1 000 000); views are thinned evenly to stay below.
     pub max_pairs: usize,
-    /// Fewest point pairs that may tie two chunks (3 or more).
+    /// Fewest point pairs of an overlap constraint (3 or more).
     pub min_pairs: usize,
-    /// Share of pairs that must agree within 5 % of depth for neighbouring chunks to be tied (0 to 1). Lower it for models
-    /// whose views disagree a lot; below it a chunk counts as garbage.
+    /// Share of pairs that must agree within 5 % of depth for an overlap constraint (0 to 1). Lower it for models whose views
+    /// disagree a lot; below it a chunk that shares frames with its neighbour is rejected.
     pub min_inlier_ratio: f64,
 }
 
@@ -27,7 +29,7 @@ impl Default for OverlapConfig {
     }
 }
 
-/// Points of one thing in two chunks.
+/// The same points in two chunks.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct PointPairs {
     /// In the source chunk, its units.
@@ -38,7 +40,7 @@ pub struct PointPairs {
     pub source_depth: Vec<f64>,
     /// z-depth of each target point in its camera: what a residual is measured by.
     pub target_depth: Vec<f64>,
-    /// Weight of each pair before any is doubted.
+    /// Weight of each pair before robust weighting.
     pub weight: Vec<f64>,
     /// How many of them count as independent; 0 = all.
     pub independent: usize,
@@ -65,7 +67,7 @@ impl PointPairs {
     }
 }
 
-/// A similarity between two chunks and how far to trust it.
+/// A similarity between two chunks with its covariance.
 #[derive(Clone, Debug, PartialEq)]
 pub struct OverlapFit {
     /// Maps the source chunk to the target chunk.
@@ -74,9 +76,9 @@ pub struct OverlapFit {
     pub covariance: SMatrix<f64, 7, 7>,
     /// Pairs that took part.
     pub pairs: usize,
-    /// Share of them that agree within 5 % of depth, seen from either chunk.
+    /// Share of them that agree within 5 % of depth in both chunks.
     pub inlier_ratio: f64,
-    /// Middle residual as a share of depth.
+    /// Median residual as a share of depth.
     pub median_residual: f64,
     /// Reweightings.
     pub iterations: usize,
@@ -99,9 +101,9 @@ const STEPS: usize = 20;
 const SETTLED: f64 = 1e-6;
 /// Median of the length of a three-dimensional Gaussian of unit variance per axis.
 const MEDIAN_OF_LENGTH: f64 = 1.538;
-/// By how much stated standard deviations exceed what independent pixels would say: errors of a model are not white.
+/// Factor on the standard deviations from independent pixels: errors of a model are not white.
 const WIDENING: f64 = 3.0;
-/// Smallest residual taken for real, share of depth: what f32 depth resolves.
+/// Least residual, share of depth: the resolution of f32 depth.
 const RESIDUAL_FLOOR: f64 = 1e-6;
 
 /// Fits `target ≈ S · source`.
@@ -122,16 +124,13 @@ pub fn fit_overlap(pairs: &PointPairs, config: &OverlapConfig) -> Result<Overlap
     let mut bounded_from = COARSE_STEPS;
     for step in 0..STEPS {
         measure(pairs, &fit, &mut residuals);
-        let width = 2.5 * 1.4826 * median(&residuals, &mut scratch).max(RESIDUAL_FLOOR) / 1.5;
         let coarse = step < bounded_from;
-        let weight = |r: f64| {
-            if coarse {
-                if r <= HUBER_WIDTH { 1.0 } else { HUBER_WIDTH / r }
-            } else {
-                (width * width / (width * width + r * r)).powi(2)
-            }
+        let kernel = if coarse {
+            Kernel::Huber { k: HUBER_WIDTH }
+        } else {
+            bounded_kernel(median(&residuals, &mut scratch))
         };
-        let weights = base.iter().zip(&residuals).map(|(w, r)| w * weight(*r)).collect();
+        let weights = base.iter().zip(&residuals).map(|(w, r)| w * kernel.weight_of_length(*r)).collect();
         let next = solve(&normalised(weights))?;
         iterations = step + 1;
         let change = (fit.inverse() * next).log();
@@ -146,24 +145,29 @@ pub fn fit_overlap(pairs: &PointPairs, config: &OverlapConfig) -> Result<Overlap
             break;
         }
     }
-    Ok(OverlapFit { iterations, ..judge(pairs, fit) })
+    Ok(OverlapFit { iterations, ..evaluate_fit(pairs, fit) })
+}
+
+/// Geman-McClure's kernel at the width of the residuals themselves.
+fn bounded_kernel(median_residual: f64) -> Kernel {
+    Kernel::GemanMcClure { k: 2.5 * STD_PER_MAD * median_residual.max(RESIDUAL_FLOOR) / 1.5 }
 }
 
 /// The inverse of `Σ wᵢ Jᵢᵀ Jᵢ / (ρ σ²)`, ρ = pairs per independent one, widened.
 fn covariance(pairs: &PointPairs, fit: &Sim3, residuals: &[f64], median: f64) -> SMatrix<f64, 7, 7> {
     let sigma = median.max(RESIDUAL_FLOOR) / MEDIAN_OF_LENGTH;
-    let width = 2.5 * 1.4826 * median.max(RESIDUAL_FLOOR) / 1.5;
+    let kernel = bounded_kernel(median);
     let mut information = SMatrix::<f64, 7, 7>::zeros();
     let largest = pairs.weight.iter().fold(0.0, |a: f64, w| a.max(*w)).max(f64::MIN_POSITIVE);
     for i in 0..pairs.len() {
-        let doubt = (width * width / (width * width + residuals[i] * residuals[i])).powi(2);
+        let weight = kernel.weight_of_length(residuals[i]) * pairs.weight[i] / largest;
         let j = fit.d_act_d_perturbation(&pairs.source[i]) / pairs.target_depth[i];
-        information += j.transpose() * j * (doubt * pairs.weight[i] / largest);
+        information += j.transpose() * j * weight;
     }
     let independent = if pairs.independent == 0 { pairs.len() } else { pairs.independent.min(pairs.len()) };
     let sharing = pairs.len() as f64 / independent as f64;
     let variance = sigma * sigma * sharing * WIDENING * WIDENING;
-    // A direction that nothing fixes (all points in one place) stays open instead of failing.
+    // A direction that is not observable (all points in one place) stays free instead of failing.
     let open = information.diagonal().max().max(1e-12) * 1e-12;
     let regular = information + SMatrix::<f64, 7, 7>::identity() * open;
     regular.try_inverse().map_or_else(SMatrix::identity, |inverse| inverse * variance)
@@ -176,7 +180,7 @@ fn measure(pairs: &PointPairs, fit: &Sim3, residuals: &mut [f64]) {
     }
 }
 
-/// Weights that sum to their number, so that the closed form's "all weight is gone" means what it says.
+/// Weights that sum to their number, so that the closed form's threshold on the sum of weights is one on the pairs.
 fn normalised(mut weights: Vec<f64>) -> Vec<f64> {
     let sum: f64 = weights.iter().sum();
     if sum > 0.0 && sum.is_finite() {
@@ -189,12 +193,11 @@ fn normalised(mut weights: Vec<f64>) -> Vec<f64> {
 fn median(values: &[f64], scratch: &mut Vec<f64>) -> f64 {
     scratch.clear();
     scratch.extend_from_slice(values);
-    let middle = scratch.len() / 2;
-    if scratch.is_empty() { 0.0 } else { *scratch.select_nth_unstable_by(middle, f64::total_cmp).1 }
+    median_upper(scratch).unwrap_or(0.0)
 }
 
-/// A similarity found by other means, judged by the same pairs.
-pub(crate) fn judge(pairs: &PointPairs, target_from_source: Sim3) -> OverlapFit {
+/// Residuals, inlier ratio and covariance of a similarity found by other means.
+pub(crate) fn evaluate_fit(pairs: &PointPairs, target_from_source: Sim3) -> OverlapFit {
     let mut residuals = vec![0.0; pairs.len()];
     measure(pairs, &target_from_source, &mut residuals);
     let median_residual = median(&residuals, &mut Vec::new());
@@ -208,7 +211,7 @@ pub(crate) fn judge(pairs: &PointPairs, target_from_source: Sim3) -> OverlapFit 
     }
 }
 
-/// Share of pairs within 5 % of depth, seen from either side: `|x − S⁻¹ y| / z_x` is the same error seen from the source.
+/// Share of pairs within 5 % of depth on both sides: `|x − S⁻¹ y| / z_x` is the same error in units of the source.
 fn inlier_ratio(pairs: &PointPairs, fit: &Sim3, residuals: &[f64]) -> f64 {
     let agrees = |i: usize| {
         let back = residuals[i] * pairs.target_depth[i] / (fit.scale * pairs.source_depth[i]);

@@ -1,6 +1,7 @@
 //! Sampled views of the same frames into point pairs.
 
 use super::{PointPairs, SampledView};
+use vidar_solve::statistics::median_upper;
 
 /// Share of the smaller median that a confidence must exceed (the reference's 0.1).
 const CONFIDENCE_SHARE: f32 = 0.1;
@@ -46,6 +47,5 @@ pub(crate) fn pair_mapped(
 }
 
 fn median(mut values: Vec<f32>) -> f32 {
-    let middle = values.len() / 2;
-    if values.is_empty() { 0.0 } else { *values.select_nth_unstable_by(middle, f32::total_cmp).1 }
+    median_upper(&mut values).unwrap_or(0.0)
 }

@@ -3,6 +3,7 @@
 use super::PointPairs;
 use nalgebra::Vector3;
 use vidar_core::{FrameId, LieGroup, Pinhole, Se3, ViewGeometry};
+use vidar_solve::statistics::median_upper;
 
 /// Pixels of a view, one per cell of a grid, jittered by a hash of the frame: two chunks that hold the same frame at the
 /// same size sample the same pixels, so that their samples are pairs.
@@ -76,11 +77,10 @@ impl SampledView {
         self.depth.iter().filter(|z| z.is_finite()).count() as f64 / self.len().max(1) as f64
     }
 
-    /// The middle depth in chunk units; `None` when no sample has one.
+    /// The median depth in chunk units; `None` when no sample has one.
     pub fn median_depth(&self) -> Option<f64> {
         let mut valid: Vec<f32> = self.depth.iter().copied().filter(|z| z.is_finite()).collect();
-        let middle = valid.len() / 2;
-        (!valid.is_empty()).then(|| f64::from(*valid.select_nth_unstable_by(middle, f32::total_cmp).1))
+        median_upper(&mut valid).map(f64::from)
     }
 
     /// Confidences of the usable samples.
@@ -95,7 +95,7 @@ impl SampledView {
 
     /// Adds the pairs "this view in `self`'s chunk (target) and in `source`'s chunk", every `stride`-th cell.
     ///
-    /// Views of another frame or size have no pairs. `is_trusted` says which confidences take part, `weigh` makes
+    /// Views of another frame or size have no pairs. `is_trusted` selects the confidences that take part, `weigh` makes
     /// a weight of the two confidences.
     pub(crate) fn pair_with(
         &self,

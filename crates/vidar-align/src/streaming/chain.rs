@@ -13,7 +13,7 @@ pub fn accumulate(previous_from_next: &[Sim3]) -> Vec<Sim3> {
         .collect()
 }
 
-/// What a loop chunk says of the chunks it ties, `b_from_a = b_from_loop ∘ a_from_loop⁻¹`.
+/// The transform between the two chunks of a loop, by a loop chunk that shares frames with both: `b_from_a = b_from_loop ∘ a_from_loop⁻¹`.
 pub fn loop_constraint(a_from_loop: &Sim3, b_from_loop: &Sim3) -> Sim3 {
     *b_from_loop * vidar_core::LieGroup::inverse(a_from_loop)
 }

@@ -7,7 +7,7 @@
 //! ```
 //!
 //! Everything is computed in f64 from f32 depth. What the reference does by accident and what changes results is
-//! kept behind [`Compat`], off by default; each such place says what it is.
+//! kept behind [`Compat`], off by default; each such place is documented.
 
 mod chain;
 mod chunks;
@@ -23,7 +23,7 @@ pub use chain::{accumulate, loop_constraint};
 pub use chunks::{ChunkRange, chunk_ranges};
 pub use closed_form::{AlignMethod, weighted_similarity};
 pub use depth_scale::{DepthScale, ScaleMethod, depth_scale};
-pub use irls::{IrlsConfig, IrlsOutcome, IrlsStep, fit_irls, huber_loss, huber_weight};
+pub use irls::{IrlsConfig, IrlsOutcome, IrlsStep, fit_irls};
 pub use loops::{FramePair, LoopDetection, LoopWindow, detect_loops, loop_windows};
 pub use overlap::{OverlapFit, PointMap, align_overlap};
 pub use pose_graph::{LmStep, LoopConstraint, PoseGraphConfig, PoseGraphOutcome, optimise_chain};

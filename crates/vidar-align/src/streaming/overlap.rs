@@ -92,18 +92,9 @@ pub fn align_overlap(
     })
 }
 
-/// The middle value, the mean of the two middle ones for an even count; 0 for none. NaN counts as smallest.
+/// The median, the mean of the two central values for an even count; 0 for none. NaN counts as smallest.
 pub(super) fn median(values: &[f32]) -> f32 {
-    let mut sorted: Vec<f32> =
+    let mut values: Vec<f32> =
         values.iter().map(|v| if v.is_nan() { f32::NEG_INFINITY } else { *v }).collect();
-    if sorted.is_empty() {
-        return 0.0;
-    }
-    let middle = sorted.len() / 2;
-    let (below, upper, _) = sorted.select_nth_unstable_by(middle, f32::total_cmp);
-    if values.len() % 2 == 1 {
-        return *upper;
-    }
-    let lower = below.iter().copied().fold(f32::NEG_INFINITY, f32::max);
-    0.5 * (lower + *upper)
+    vidar_solve::statistics::median(&mut values).unwrap_or(0.0)
 }

@@ -95,7 +95,14 @@ pub fn optimise_chain(
     let mut steps: Vec<LmStep> = Vec::new();
     for iteration in 0..config.max_iterations {
         let cost_before = linearise(&edges, &logs, &mut equations);
-        let Ok(step) = equations.solve(|diagonal| diagonal * (1.0 + lambda)) else { break };
+        let step = match equations.solve(|diagonal| diagonal * (1.0 + lambda)) {
+            Ok(step) => step,
+            // The reference keeps what it has; without a single step there is no solution to keep.
+            Err(error) if steps.is_empty() => {
+                return Err(StreamingError::Unsolvable { reason: error.to_string() });
+            }
+            Err(_) => break,
+        };
         let tried: Vec<Tangent> =
             logs.iter().zip(step.chunks_exact(7)).map(|(g, d)| g + Tangent::from_column_slice(d)).collect();
         let cost_after = cost(&edges, &tried);

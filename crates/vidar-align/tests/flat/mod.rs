@@ -1,4 +1,4 @@
-//! A furnished room of which everything is known: cameras fly through it, a model predicts chunks in gauges of its own.
+//! A simulated furnished room: cameras fly through it, a model predicts chunks in gauges of its own.
 
 #![allow(clippy::unwrap_used, dead_code)] // helpers of tests are test code, though not marked so; not every test uses all
 
@@ -124,7 +124,7 @@ pub const EXACT: Model = Model { has_gauge: true, turn_deg: 0.0, step: 0.0, stre
 /// What coupling.md calls DA3-like, per keyframe.
 pub const REAL: Model = Model { has_gauge: true, turn_deg: 0.12, step: 0.012, stretch: 0.0015, depth: 0.01 };
 
-/// What the model says of frames `range` of a flight.
+/// The model's prediction of frames `range` of a flight.
 pub fn predict(
     truth: &[Se3],
     range: Range<usize>,
@@ -135,7 +135,7 @@ pub fn predict(
     predict_frames(truth, &range.collect::<Vec<_>>(), id, model, noise)
 }
 
-/// What the model says of some frames of a flight, in the order given.
+/// The model's prediction of some frames of a flight, in the order given.
 pub fn predict_frames(
     truth: &[Se3],
     frames: &[usize],
@@ -223,7 +223,7 @@ pub fn landmarks(
         .collect()
 }
 
-/// A chunk with anchors, gravity, time (2 Hz) and, where `seen` says so, landmarks.
+/// A chunk with pose priors, gravity, time (2 Hz) and, where given, landmarks.
 pub fn observe(
     prediction: GeometryPrediction,
     odometry: Option<&[Se3]>,
@@ -238,10 +238,10 @@ pub fn observe(
             frame.landmarks = landmarks(i);
             match odometry {
                 Some(poses) => {
-                    let mut anchor = PosePrior::new(poses[i]);
+                    let mut prior = PosePrior::new(poses[i]);
                     let up = poses[i].rotation.inverse().act(&Vector3::z());
-                    anchor.up_in_camera = Some(UnitVector3::new_normalize(up));
-                    frame.with_pose_prior(anchor)
+                    prior.up_in_camera = Some(UnitVector3::new_normalize(up));
+                    frame.with_pose_prior(prior)
                 }
                 None => frame,
             }

@@ -153,7 +153,7 @@ fn placement_json(placement: &Placement) -> Value {
     let revisit = |l: &LoopReport| {
         json!({
             "later": l.later, "earlier": l.earlier, "similarity": l.similarity, "inlier_ratio": finite(l.inlier_ratio),
-            "chi2": finite(l.chi2), "rejection": l.rejection,
+            "chi2": l.chi2.and_then(finite), "rejection": l.rejection,
         })
     };
     json!({
@@ -163,6 +163,9 @@ fn placement_json(placement: &Placement) -> Value {
         "graph": placement.graph.as_ref().map(|g| json!({
             "flow": g.flow, "iterations": g.iterations, "cost": g.cost, "odometry_chi2": finite(g.odometry_chi2),
         })),
+        "graph_failures": placement.graph_failures.iter().map(|f| json!({
+            "first_chunk": f.first_chunk, "reason": f.reason,
+        })).collect::<Vec<_>>(),
         "drift": {
             "center_rms_m": finite(placement.drift.center_rms_m), "center_max_m": finite(placement.drift.center_max_m),
             "scale_step_std": finite(placement.drift.scale_step_std), "matched": placement.drift.matched,

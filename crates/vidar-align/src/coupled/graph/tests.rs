@@ -23,7 +23,7 @@ fn odometry(poses: &[Se3]) -> Vec<Factor> {
     (0..poses.len() - 1).map(link).collect()
 }
 
-fn anchor(pose: &Se3) -> Factor {
+fn gauge_prior(pose: &Se3) -> Factor {
     Factor::GaugePrior { i: 0, world_from_camera: *pose, position_std_m: 1e-3, heading_std_rad: 1e-3 }
 }
 
@@ -51,8 +51,8 @@ fn gauge() -> Sim3 {
 fn a_chunk_finds_its_gauge_and_keyframes_stay_when_all_agree() {
     let truth = circle(12);
     let mut factors = odometry(&truth);
-    factors.push(anchor(&truth[0]));
-    // Without gravity the whole would be free to tilt about the anchor.
+    factors.push(gauge_prior(&truth[0]));
+    // Without gravity the whole would be free to tilt about the first keyframe.
     factors.extend(truth.iter().enumerate().map(|(i, pose)| Factor::Gravity {
         i,
         up_in_camera: UnitVector3::new_normalize(pose.rotation.inverse().act(&Vector3::z())),
@@ -75,7 +75,7 @@ fn a_false_loop_is_let_go_and_a_true_one_is_kept() {
     let truth = circle(24);
     let gauges = [gauge(), gauge() * Sim3::exp(&SVector::<f64, 7>::repeat(0.1))];
     let mut factors = odometry(&truth);
-    factors.push(anchor(&truth[0]));
+    factors.push(gauge_prior(&truth[0]));
     factors.extend(attach(&truth[..12], 0, &gauges[0]));
     factors.extend(attach(&truth[12..], 1, &gauges[1]).into_iter().map(|f| match f {
         Factor::Attachment(a) => Factor::Attachment(Attachment { i: a.i + 12, ..a }),
@@ -112,7 +112,7 @@ fn a_model_that_contradicts_the_odometry_does_not_bend_it() {
         })
         .collect();
     let mut factors = odometry(&truth);
-    factors.push(anchor(&truth[0]));
+    factors.push(gauge_prior(&truth[0]));
     factors.extend(attach(&bent, 0, &Sim3::IDENTITY).into_iter().map(|f| match f {
         Factor::Attachment(a) => Factor::Attachment(Attachment {
             rotation_std_rad: 1e-3,
@@ -139,6 +139,6 @@ fn factors_that_point_nowhere_or_are_not_finite_are_named() {
     let error = solve(&start, &[lost], &CoupledConfig::default()).unwrap_err();
     assert_eq!(error.to_string(), "factor 0 touches chunk 4, there are 1");
     let broken = Factor::Scale { k: 0, log_scale: f64::NAN, std: 1.0, kernel: Kernel::Quadratic };
-    let error = solve(&start, &[anchor(&truth[0]), broken], &CoupledConfig::default()).unwrap_err();
+    let error = solve(&start, &[gauge_prior(&truth[0]), broken], &CoupledConfig::default()).unwrap_err();
     assert_eq!(error, GraphError::NotFinite { factor: 1 });
 }

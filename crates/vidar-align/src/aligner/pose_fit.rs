@@ -1,4 +1,4 @@
-//! A chunk onto its anchors alone.
+//! One chunk onto its pose priors.
 
 use super::report::RejectionReason;
 use nalgebra::{Matrix3, Vector3};
@@ -6,39 +6,39 @@ use rand::seq::index::sample;
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::SeedableRng;
 use vidar_core::{LieGroup, Se3, Sim3, So3, umeyama_sim3};
+use vidar_solve::statistics::median_upper;
 
-/// A camera both as its chunk and as its anchor have it.
+/// A camera in its chunk and in the world of its pose prior.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Pair {
+pub(super) struct CameraPair {
     pub chunk_from_camera: Se3,
     pub world_from_camera: Se3,
 }
 
-/// Views from which on the model's own API seeks a consensus.
-const CONSENSUS_FROM: usize = 10;
+/// From this many views on the model's own API uses RANSAC.
+const RANSAC_FROM: usize = 10;
 const TRIALS: usize = 10;
 
-/// The paper's `UmeyamaScale`, robust as the model's own API has it: the similarity from metric centres to predicted ones,
-/// for 10 views and more by consensus over ten halves. Its inverse is returned, `world_from_chunk`.
+/// The paper's `UmeyamaScale`, robust as in the model's own API: the similarity from metric centres to predicted ones; from
+/// 10 views on by RANSAC over ten random halves. Its inverse is returned, `world_from_chunk`.
 ///
 /// # Errors
 /// [`RejectionReason::RankDeficient`].
-pub(super) fn robust_umeyama(pairs: &[Pair], seed: u64) -> Result<Sim3, RejectionReason> {
+pub(super) fn robust_umeyama(pairs: &[CameraPair], seed: u64) -> Result<Sim3, RejectionReason> {
     let metric: Vec<Vector3<f64>> = pairs.iter().map(|p| p.world_from_camera.translation).collect();
     let predicted: Vec<Vector3<f64>> = pairs.iter().map(|p| p.chunk_from_camera.translation).collect();
     let all = umeyama_sim3(&metric, &predicted).map_err(|_| RejectionReason::RankDeficient)?;
-    if pairs.len() < CONSENSUS_FROM {
+    if pairs.len() < RANSAC_FROM {
         return Ok(all.inverse());
     }
-    // The width: the middle distance from a moved centre to the nearest predicted one, whichever that is.
+    // The threshold: the median distance from a moved centre to the nearest predicted one, whichever that is.
     let mut nearest: Vec<f64> = metric
         .iter()
         .map(|m| predicted.iter().map(|p| (all.act(m) - p).norm()).fold(f64::INFINITY, f64::min))
         .collect();
-    let middle = nearest.len() / 2;
-    let width = *nearest.select_nth_unstable_by(middle, f64::total_cmp).1;
+    let threshold = median_upper(&mut nearest).unwrap_or(0.0);
     let inliers = |s: &Sim3| -> Vec<usize> {
-        (0..pairs.len()).filter(|&i| (s.act(&metric[i]) - predicted[i]).norm() <= width).collect()
+        (0..pairs.len()).filter(|&i| (s.act(&metric[i]) - predicted[i]).norm() <= threshold).collect()
     };
     let fit = |of: &[usize]| {
         let (m, p): (Vec<_>, Vec<_>) = of.iter().map(|&i| (metric[i], predicted[i])).unzip();
@@ -58,40 +58,39 @@ pub(super) fn robust_umeyama(pairs: &[Pair], seed: u64) -> Result<Sim3, Rejectio
     Ok(fit(&best).unwrap_or(all).inverse())
 }
 
-/// A chunk's place from rotations and centres together: never degenerate while there is one anchor.
+/// A chunk's place from rotations and centres together: determined by a single pose prior up to its scale.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct PoseFit {
-    /// The place; its scale is `scale_hint` where the centres do not tell one.
+    /// The place; its scale is `scale_hint` where the centres do not determine one.
     pub world_from_chunk: Sim3,
-    /// Standard deviation of ln(scale) as the centres tell it; infinite when they do not.
+    /// σ of ln(scale) from the centres; infinite when they do not determine one.
     pub log_scale_std: f64,
     /// RMS distance of centres, m.
     pub center_rms_m: f64,
     /// RMS angle between rotations, rad.
     pub rotation_rms_rad: f64,
-    /// RMS distance of the anchored centres from their mean, m.
+    /// RMS distance of the prior centres from their mean, m.
     pub radius_m: f64,
 }
 
-/// `R = proj_SO(3)(Σ R_world R_chunkᵀ)`, gross ones left out; scale and translation by linear least squares about it.
+/// `R = proj_SO(3)(Σ R_world R_chunkᵀ)`, outliers left out; scale and translation by linear least squares about it.
 ///
-/// `floor_m` is the error of a centre that is assumed at least, `scale_hint` the metres per unit used when the centres do
-/// not tell. `None` without pairs.
-pub(super) fn fit_about_rotations(pairs: &[Pair], scale_hint: f64, floor_m: f64) -> Option<PoseFit> {
-    let pairs: Vec<&Pair> =
+/// `floor_m` is the least error of a centre, `scale_hint` the metres per unit where the centres do not determine the scale. `None` without pairs.
+pub(super) fn fit_about_rotations(pairs: &[CameraPair], scale_hint: f64, floor_m: f64) -> Option<PoseFit> {
+    let pairs: Vec<&CameraPair> =
         pairs.iter().filter(|p| p.chunk_from_camera.is_finite() && p.world_from_camera.is_finite()).collect();
-    let turn = |p: &Pair| p.world_from_camera.rotation * p.chunk_from_camera.rotation.inverse();
+    let turn = |p: &CameraPair| p.world_from_camera.rotation * p.chunk_from_camera.rotation.inverse();
     let mut rotation = mean_rotation(pairs.iter().map(|p| turn(p)))?;
-    let apart = |r: &So3, p: &Pair| (r.inverse() * turn(p)).angle_rad();
+    let apart = |r: &So3, p: &CameraPair| (r.inverse() * turn(p)).angle_rad();
     for _ in 0..3 {
         let mut angles: Vec<f64> = pairs.iter().map(|p| apart(&rotation, p)).collect();
-        let middle = angles.len() / 2;
-        let limit = 3.0 * angles.select_nth_unstable_by(middle, f64::total_cmp).1.max(0.01);
+        let limit = 3.0 * median_upper(&mut angles)?.max(0.01);
         let kept = pairs.iter().filter(|p| apart(&rotation, p) <= limit);
         rotation = mean_rotation(kept.map(|p| turn(p))).unwrap_or(rotation);
     }
     let n = pairs.len() as f64;
-    let mean = |of: &dyn Fn(&Pair) -> Vector3<f64>| pairs.iter().map(|p| of(p)).sum::<Vector3<f64>>() / n;
+    let mean =
+        |of: &dyn Fn(&CameraPair) -> Vector3<f64>| pairs.iter().map(|p| of(p)).sum::<Vector3<f64>>() / n;
     let (chunk_mean, world_mean) =
         (mean(&|p| p.chunk_from_camera.translation), mean(&|p| p.world_from_camera.translation));
     let (mut along, mut chunk_spread, mut world_spread) = (0.0, 0.0, 0.0);
@@ -103,7 +102,7 @@ pub(super) fn fit_about_rotations(pairs: &[Pair], scale_hint: f64, floor_m: f64)
         world_spread += y.norm_squared();
     }
     let measured = along / chunk_spread;
-    let told = pairs.len() >= 2 && measured.is_finite() && measured > 0.0 && world_spread > 0.0;
+    let is_observable = pairs.len() >= 2 && measured.is_finite() && measured > 0.0 && world_spread > 0.0;
     let radius_m = (world_spread / n).sqrt();
     let place = |scale: f64| {
         let turned = Sim3 { rotation, translation: Vector3::zeros(), scale };
@@ -118,10 +117,10 @@ pub(super) fn fit_about_rotations(pairs: &[Pair], scale_hint: f64, floor_m: f64)
             .sum();
         (sum / n).sqrt()
     };
-    let fitted = place(if told { measured } else { scale_hint });
+    let fitted = place(if is_observable { measured } else { scale_hint });
     let center_rms_m = rms(&fitted);
-    // Errors within a chunk are correlated: n centres tell no more than one pair of them a radius apart.
-    let log_scale_std = if told { center_rms_m.max(floor_m) / radius_m } else { f64::INFINITY };
+    // Errors within a chunk are correlated: n centres have the information of one pair a radius apart.
+    let log_scale_std = if is_observable { center_rms_m.max(floor_m) / radius_m } else { f64::INFINITY };
     let angles: f64 = pairs.iter().map(|p| apart(&rotation, p).powi(2)).sum();
     let world_from_chunk = if log_scale_std < 1.0 { fitted } else { place(scale_hint) };
     Some(PoseFit {
@@ -134,7 +133,7 @@ pub(super) fn fit_about_rotations(pairs: &[Pair], scale_hint: f64, floor_m: f64)
 }
 
 /// The rotation nearest to the sum of rotations; `None` for none, or when they cancel.
-pub(super) fn mean_rotation(rotations: impl Iterator<Item = So3>) -> Option<So3> {
+fn mean_rotation(rotations: impl Iterator<Item = So3>) -> Option<So3> {
     let mut count = 0usize;
     let sum = rotations.fold(Matrix3::zeros(), |m, r| {
         count += 1;
@@ -149,8 +148,8 @@ pub(super) fn mean_rotation(rotations: impl Iterator<Item = So3>) -> Option<So3>
     So3::from_matrix(&(u * sign * v))
 }
 
-/// RMS distance of placed and anchored centres, m; NaN without pairs.
-pub(super) fn center_rms(world_from_chunk: &Sim3, pairs: &[Pair]) -> f64 {
+/// RMS distance of placed centres from their pose priors, m; NaN without pairs.
+pub(super) fn center_rms(world_from_chunk: &Sim3, pairs: &[CameraPair]) -> f64 {
     let sum: f64 = pairs
         .iter()
         .map(|p| {
@@ -159,4 +158,13 @@ pub(super) fn center_rms(world_from_chunk: &Sim3, pairs: &[Pair]) -> f64 {
         })
         .sum();
     (sum / pairs.len() as f64).sqrt()
+}
+
+/// The same place with another scale, the mean of the cameras kept.
+pub(super) fn rescaled_about_centers(world_from_chunk: &Sim3, scale: f64, pairs: &[CameraPair]) -> Sim3 {
+    let n = pairs.len().max(1) as f64;
+    let mean = pairs.iter().map(|p| p.chunk_from_camera.translation).sum::<Vector3<f64>>() / n;
+    let kept = world_from_chunk.act(&mean);
+    let moved = Sim3 { scale, ..*world_from_chunk };
+    Sim3 { translation: world_from_chunk.translation + kept - moved.act(&mean), ..moved }
 }

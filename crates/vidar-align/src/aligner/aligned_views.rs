@@ -1,4 +1,4 @@
-//! A chunk's depth as metric views, where a placement says they are.
+//! Metric views of a chunk, by a placement.
 
 use super::Placement;
 use crate::AlignError;

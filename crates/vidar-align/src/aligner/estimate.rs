@@ -1,0 +1,139 @@
+//! What a coupling estimates, and the placement that is reported of it.
+
+use super::chunk::Chunk;
+use super::coupling::CouplingMode;
+use super::history::{History, LoopMeasurement, NEIGHBOURS, reports};
+use super::report::{
+    ChunkPlacement, ChunkStatus, DriftReport, GraphFailure, GraphReport, KeyframePlacement, LoopReport,
+    Placement, RejectionCounts, RejectionReason, ViewPlacement,
+};
+use std::collections::BTreeMap;
+use vidar_core::{FrameId, LieGroup, Se3, Sim3};
+
+/// Gauges of chunks and, where something other than their chunk determines them, poses of keyframes.
+pub(super) struct Estimate {
+    /// `world_from_chunk` per chunk; `None` leaves the chunk out.
+    pub chunks: Vec<Option<Sim3>>,
+    /// Keyframes whose pose does not follow from their chunk's.
+    pub keyframes: BTreeMap<FrameId, Se3>,
+    /// σ of ln(scale) per chunk.
+    pub log_scale_std: Vec<f64>,
+    pub is_metric: bool,
+    pub rejections: Vec<RejectionReason>,
+    pub graph: Option<GraphReport>,
+    /// Graphs without a solution.
+    pub failures: Vec<GraphFailure>,
+    pub loops: Vec<LoopReport>,
+}
+
+impl Estimate {
+    pub fn new(
+        history: &History,
+        chunks: Vec<Option<Sim3>>,
+        loops: Vec<LoopMeasurement>,
+        is_metric: bool,
+    ) -> Self {
+        Self {
+            chunks,
+            keyframes: BTreeMap::new(),
+            log_scale_std: history.chunks.iter().map(|c| c.log_scale_std).collect(),
+            is_metric,
+            rejections: Vec::new(),
+            graph: None,
+            failures: Vec::new(),
+            loops: reports(loops),
+        }
+    }
+}
+
+/// The placement of an estimate.
+pub(super) fn placement(mode: CouplingMode, history: &History, estimate: Estimate) -> Placement {
+    let mut rejections = RejectionCounts::default();
+    history.chunks.iter().for_each(|c| rejections.extend(&c.rejections));
+    rejections.extend(&estimate.rejections);
+    estimate.failures.iter().for_each(|_| rejections.add(RejectionReason::GraphFailed));
+    estimate
+        .loops
+        .iter()
+        .filter(|l| l.rejection.is_some())
+        .for_each(|_| rejections.add(RejectionReason::LoopRejected));
+    let chunks = history.chunks.iter().zip(&estimate.chunks).zip(&estimate.log_scale_std);
+    let chunks = chunks.map(|((c, place), std)| ChunkPlacement {
+        chunk_id: c.id,
+        status: if place.is_none() && c.is_usable() { ChunkStatus::Unplaced } else { c.status },
+        world_from_chunk: place.unwrap_or(Sim3::IDENTITY),
+        log_scale_std: if estimate.is_metric { *std } else { f64::INFINITY },
+    });
+    let mut views: BTreeMap<FrameId, ViewPlacement> = BTreeMap::new();
+    let mut owners: BTreeMap<FrameId, usize> = BTreeMap::new();
+    for (k, (chunk, place)) in history.chunks.iter().zip(&estimate.chunks).enumerate() {
+        let Some(place) = place else { continue };
+        // The later of two neighbours owns a shared frame: its views extend to later frames. A frame that comes back in a
+        // distant chunk keeps its owner, and so does the surface that was fused of it.
+        for view in &chunk.views {
+            let owner = owners.entry(view.frame_id).or_insert(k);
+            if k - *owner >= NEIGHBOURS {
+                continue;
+            }
+            *owner = k;
+            let chained = place.transform_pose(&view.chunk_from_camera);
+            let placed = ViewPlacement {
+                frame_id: view.frame_id,
+                owner: chunk.id,
+                world_from_camera: estimate.keyframes.get(&view.frame_id).copied().unwrap_or(chained),
+                metres_per_unit: place.scale,
+                field: view.field.clone(),
+            };
+            views.insert(view.frame_id, placed);
+        }
+    }
+    let mut keyframes: BTreeMap<FrameId, Se3> = estimate.keyframes.clone();
+    views.values().for_each(|v| {
+        keyframes.entry(v.frame_id).or_insert(v.world_from_camera);
+    });
+    Placement {
+        mode,
+        is_metric: estimate.is_metric,
+        chunks: chunks.collect(),
+        drift: drift(history, &estimate),
+        views: views.into_values().collect(),
+        keyframes: keyframes
+            .into_iter()
+            .map(|(frame_id, world_from_camera)| KeyframePlacement { frame_id, world_from_camera })
+            .collect(),
+        loops: estimate.loops,
+        rejections,
+        graph: estimate.graph,
+        graph_failures: estimate.failures,
+    }
+}
+
+/// Placed cameras against their pose priors, and scale steps against overlaps.
+fn drift(history: &History, estimate: &Estimate) -> DriftReport {
+    let mut report = DriftReport::default();
+    let (mut squares, mut steps) = (0.0, Vec::new());
+    for (k, (chunk, place)) in history.chunks.iter().zip(&estimate.chunks).enumerate() {
+        let Some(place) = place else { continue };
+        for pair in chunk.pairs(&history.frames) {
+            let placed = place.act(&pair.chunk_from_camera.translation);
+            let apart = (placed - pair.world_from_camera.translation).norm();
+            squares += apart * apart;
+            report.center_max_m = report.center_max_m.max(apart);
+            report.matched += 1;
+        }
+        if let Some(step) = scale_step(chunk, estimate, k) {
+            steps.push(step);
+        }
+    }
+    report.center_rms_m = (squares / report.matched.max(1) as f64).sqrt();
+    let n = steps.len().max(1) as f64;
+    report.scale_step_std = (steps.iter().map(|s| s * s).sum::<f64>() / n).sqrt();
+    report
+}
+
+/// ln of the scale step from the chunk before over that of their overlap.
+fn scale_step(chunk: &Chunk, estimate: &Estimate, k: usize) -> Option<f64> {
+    let overlap = chunk.overlap.as_ref()?;
+    let (before, now) = (estimate.chunks[overlap.earlier]?, estimate.chunks[k]?);
+    Some((now.scale / (before.scale * overlap.fit.target_from_source.scale)).ln())
+}
