@@ -1,4 +1,5 @@
 //! Ordinary recordings: rolling shutter, clocks, compression, IMU timing, calibration files, bare walls, hand-held paths.
+#![allow(clippy::unwrap_used, clippy::panic)] // a test may panic
 
 use std::path::Path;
 use vidar_core::{FrameImage, Image, LieGroup, Timestamp};
