@@ -289,6 +289,7 @@ mod tests {
         let pyramid = Pyramid::of(&image, 2);
         let feature = Feature {
             pixel: Pixel::new(30.0, 31.0),
+            global_pixel: Pixel::new(30.0, 31.0),
             bearing: Vector3::z(),
             level: 0,
             kind: FeatureKind::Corner,

@@ -4,7 +4,6 @@
 //! [`GyroAlignmentLog`] collects both while the odometry runs and is asked for an [`Alignment`] from time to time.
 //! [`RollingShutter`] applies the readout time to pixels.
 
-mod hand_eye;
 mod path;
 mod shutter;
 mod solver;
@@ -45,10 +44,6 @@ pub(crate) struct Guess {
     pub readout_secs: f64,
     /// Try all clock offsets rather than those near `offset_secs`.
     pub search: bool,
-    /// The focal length is a guess, too.
-    pub estimates_focal: bool,
-    /// Nothing is known of `body_from_camera`: find it first.
-    pub unknown_rotation: bool,
 }
 
 /// Feature tracks and gyroscope samples of the last seconds.
@@ -114,13 +109,7 @@ impl GyroAlignmentLog {
         if !covered || rate_rms(&samples) < MIN_RATE_RMS {
             return None;
         }
-        let mut guess = *guess;
-        if guess.unknown_rotation {
-            let start = hand_eye::hand_eye(camera, &images, &samples)?;
-            guess.body_from_camera = start.body_from_camera;
-        }
-        let mut problem =
-            Problem::new(camera, guess.estimates_focal, guess.body_from_camera, &images, &samples);
+        let mut problem = Problem::new(camera, guess.body_from_camera, &images, &samples);
         if problem.pair_count() < MIN_PAIRS {
             return None;
         }

@@ -30,7 +30,7 @@ impl RollingShutter {
     }
 
     /// The pixel as a global shutter at the centre row's time would show it. `inverse_distance` of the point, 1/m.
-    pub fn to_global(&self, camera: &CameraModel, pixel: &Pixel, inverse_distance: f64) -> Pixel {
+    pub fn remove_motion(&self, camera: &CameraModel, pixel: &Pixel, inverse_distance: f64) -> Pixel {
         if self.readout_secs == 0.0 {
             return *pixel;
         }
@@ -41,15 +41,15 @@ impl RollingShutter {
     }
 
     /// Where the rolling shutter shows what a global shutter would show at `pixel`: the inverse of
-    /// [`RollingShutter::to_global`], by fixed-point iteration (each round shrinks the error by the image motion within
+    /// [`RollingShutter::remove_motion`], by fixed-point iteration (each round shrinks the error by the image motion within
     /// the readout over the image height, about a tenth for a lively hand).
-    pub fn from_global(&self, camera: &CameraModel, pixel: &Pixel, inverse_distance: f64) -> Pixel {
+    pub fn add_motion(&self, camera: &CameraModel, pixel: &Pixel, inverse_distance: f64) -> Pixel {
         if self.readout_secs == 0.0 {
             return *pixel;
         }
         let mut rolled = *pixel;
         for _ in 0..5 {
-            rolled += pixel - self.to_global(camera, &rolled, inverse_distance);
+            rolled += pixel - self.remove_motion(camera, &rolled, inverse_distance);
         }
         rolled
     }
@@ -83,8 +83,8 @@ mod tests {
     fn a_pixel_survives_the_way_to_the_global_shutter_and_back() {
         let (camera, shutter) = (camera(), lively());
         for pixel in [Vector2::new(30.0, 20.0), Vector2::new(600.0, 460.0), Vector2::new(320.0, 240.0)] {
-            let global = shutter.to_global(&camera, &pixel, 0.5);
-            let back = shutter.from_global(&camera, &global, 0.5);
+            let global = shutter.remove_motion(&camera, &pixel, 0.5);
+            let back = shutter.add_motion(&camera, &global, 0.5);
             assert!((back - pixel).norm() < 2e-3, "{pixel} came back as {back}");
         }
     }
@@ -102,7 +102,7 @@ mod tests {
             pixel = camera.project(&(turn.inverse() * (point - shutter.velocity * secs))).unwrap();
             secs = (pixel.y / 479.0 - 0.5) * shutter.readout_secs;
         }
-        let global = shutter.to_global(&camera, &pixel, 1.0 / point.norm());
+        let global = shutter.remove_motion(&camera, &pixel, 1.0 / point.norm());
         let expected = camera.project(&point).unwrap();
         assert!((global - expected).norm() < 0.05, "{global} instead of {expected}");
         assert!((pixel - expected).norm() > 5.0, "the motion must matter");
@@ -112,7 +112,7 @@ mod tests {
     fn a_global_shutter_changes_nothing() {
         let (camera, shutter) = (camera(), RollingShutter { readout_secs: 0.0, ..lively() });
         let pixel = Vector2::new(12.25, 400.5);
-        assert_eq!(shutter.to_global(&camera, &pixel, 1.0), pixel);
-        assert_eq!(shutter.from_global(&camera, &pixel, 1.0), pixel);
+        assert_eq!(shutter.remove_motion(&camera, &pixel, 1.0), pixel);
+        assert_eq!(shutter.add_motion(&camera, &pixel, 1.0), pixel);
     }
 }

@@ -13,14 +13,12 @@ use super::path::{OrientationPath, RateSample};
 use nalgebra::{Matrix2, Matrix3, SMatrix, SVector, Vector2, Vector3};
 use vidar_core::{CameraModel, LandmarkId, LieGroup, So3, camera::Pixel};
 
-/// Parameters: clock offset (s), readout (s), rotation of the camera (rad, right perturbation), gyroscope bias (rad/s),
-/// logarithm of the focal length over the given one.
-const DIM: usize = 9;
+/// Parameters: clock offset (s), readout (s), rotation of the camera (rad, right perturbation), gyroscope bias (rad/s).
+const DIM: usize = 8;
 const OFFSET: usize = 0;
 const READOUT: usize = 1;
 const ROTATION: usize = 2;
 const BIAS: usize = 5;
-const FOCAL: usize = 8;
 
 /// Orientations are interpolated linearly between so many row times per image: at 5 rad/s and 33 ms the chord of a
 /// segment is off by less than 2e-5 rad.
@@ -41,10 +39,10 @@ const SHARED_RAYS: f64 = 9.0;
 const ROTATION_INFLATION: f64 = 6.0;
 
 /// Standard deviations of the prior about the given values, in the order of the parameters.
-const PRIOR: [f64; DIM] = [0.1, 0.02, 0.1, 0.1, 0.1, 0.05, 0.05, 0.05, 0.2];
+const PRIOR: [f64; DIM] = [0.1, 0.02, 0.1, 0.1, 0.1, 0.05, 0.05, 0.05];
 
 /// Steps of the numeric derivatives.
-const STEPS: [f64; DIM] = [1e-4, 1e-4, 1e-5, 1e-5, 1e-5, 1e-4, 1e-4, 1e-4, 1e-4];
+const STEPS: [f64; DIM] = [1e-4, 1e-4, 1e-5, 1e-5, 1e-5, 1e-4, 1e-4, 1e-4];
 
 /// The clock offset is searched on a grid of ±[`SEARCH_SECS`] in steps of [`SEARCH_STEP_SECS`]; the optimum's basin is as
 /// wide as the fastest change of rate allows, some 30 ms for a lively hand.
@@ -68,16 +66,10 @@ pub(crate) struct Alignment {
     pub readout_secs: f64,
     /// Rotation body_from_camera.
     pub body_from_camera: So3,
-    /// Gyroscope bias, rad/s.
-    pub gyro_bias: Vector3<f64>,
-    /// Focal length over the given one; 1 where it is not estimated.
-    pub focal_ratio: f64,
     /// Standard deviations: offset (s), readout (s), rotation (rad, the largest of three axes).
     pub offset_sigma: f64,
     pub readout_sigma: f64,
     pub rotation_sigma: f64,
-    /// Standard deviation of ln(`focal_ratio`).
-    pub focal_sigma: f64,
     /// Mean squared whitened residual.
     pub chi2_per_dof: f64,
 }
@@ -95,27 +87,27 @@ pub(crate) struct Problem<'a> {
     camera: &'a CameraModel,
     samples: &'a [RateSample],
     images: &'a [ImageFeatures],
-    /// Unit rays for the given focal length.
-    rays: Vec<Vec<Option<Vector3<f64>>>>,
+    rays: Rays,
     pairs: Vec<Pair>,
     given: So3,
-    estimates_focal: bool,
     ray_sigma: f64,
 }
+
+/// Per image and feature, the ray in camera or common axes; `None` where the camera has none for the pixel.
+type Rays = Vec<Vec<Option<Vector3<f64>>>>;
 
 type Parameters = SVector<f64, DIM>;
 
 impl<'a> Problem<'a> {
-    /// `images` and `samples` in the order of time; pairs are images about 0.1 and 0.25 s apart. `estimates_focal`: the
-    /// focal length of `camera` is a guess.
+    /// `images` and `samples` in the order of time; pairs are images about 0.1 and 0.25 s apart.
     pub fn new(
         camera: &'a CameraModel,
-        estimates_focal: bool,
         body_from_camera: So3,
         images: &'a [ImageFeatures],
         samples: &'a [RateSample],
     ) -> Self {
-        let rays = rays_of(camera, images, 1.0);
+        let ray = |(_, pixel): &(LandmarkId, Pixel)| camera.unproject(pixel);
+        let rays = images.iter().map(|i| i.features.iter().map(ray).collect()).collect();
         let mut pairs = Vec::new();
         for (k, image) in images.iter().enumerate() {
             for apart in [0.1, 0.25] {
@@ -131,7 +123,7 @@ impl<'a> Problem<'a> {
             }
         }
         let ray_sigma = PIXEL_SIGMA / camera.intrinsics().fx;
-        Self { camera, samples, images, rays, pairs, given: body_from_camera, estimates_focal, ray_sigma }
+        Self { camera, samples, images, rays, pairs, given: body_from_camera, ray_sigma }
     }
 
     /// Number of pairs of images.
@@ -151,7 +143,7 @@ impl<'a> Problem<'a> {
             for k in 0..=steps {
                 let mut trial = prior;
                 trial[OFFSET] = -SEARCH_SECS + f64::from(k) * SEARCH_STEP_SECS;
-                let only_bias = |p: usize| (BIAS..FOCAL).contains(&p);
+                let only_bias = |p: usize| p >= BIAS;
                 self.iterate(&mut trial, &prior, only_bias, 2)?;
                 let (_, _, cost) = self.linearise(&trial, only_bias);
                 if cost < best {
@@ -159,14 +151,9 @@ impl<'a> Problem<'a> {
                 }
             }
         }
-        self.iterate(&mut x, &prior, |p| p == OFFSET || (BIAS..FOCAL).contains(&p), 6)?;
-        let focal = self.estimates_focal;
-        let is_free = move |p: usize| focal || p != FOCAL;
-        self.iterate(&mut x, &prior, |p| p != FOCAL, 10)?;
-        if focal {
-            self.iterate(&mut x, &prior, is_free, 10)?;
-        }
-        let (mut h, _, _) = self.linearise(&x, is_free);
+        self.iterate(&mut x, &prior, |p| p == OFFSET || p >= BIAS, 6)?;
+        self.iterate(&mut x, &prior, |_| true, 10)?;
+        let (mut h, _, _) = self.linearise(&x, |_| true);
         let chi2 = self.chi2_per_dof(&x);
         for p in 0..DIM {
             h[(p, p)] += 1.0 / (PRIOR[p] * PRIOR[p]);
@@ -177,9 +164,6 @@ impl<'a> Problem<'a> {
             offset_secs: x[OFFSET],
             readout_secs: x[READOUT],
             body_from_camera: self.rotation(&x),
-            gyro_bias: bias_of(&x),
-            focal_ratio: x[FOCAL].exp(),
-            focal_sigma: sigma(FOCAL),
             offset_sigma: sigma(OFFSET),
             readout_sigma: sigma(READOUT),
             rotation_sigma: ROTATION_INFLATION * (ROTATION..ROTATION + 3).map(sigma).fold(0.0, f64::max),
@@ -218,7 +202,6 @@ impl<'a> Problem<'a> {
             *x += step;
             x[OFFSET] = x[OFFSET].clamp(-1.2 * SEARCH_SECS, 1.2 * SEARCH_SECS);
             x[READOUT] = x[READOUT].clamp(-0.01, 0.06);
-            x[FOCAL] = x[FOCAL].clamp(-0.7, 0.7);
             if step[OFFSET].abs() < 1e-5 && step[READOUT].abs() < 1e-4 && step.norm() < 1e-3 {
                 break;
             }
@@ -227,12 +210,10 @@ impl<'a> Problem<'a> {
     }
 
     /// All rays in common axes for the parameters `x`.
-    fn turned(&self, x: &Parameters) -> Vec<Vec<Option<Vector3<f64>>>> {
+    fn turned(&self, x: &Parameters) -> Rays {
         let path = OrientationPath::new(self.samples, &bias_of(x));
         let body_from_camera = self.rotation(x);
         let last_row = self.camera.height() as f64 - 1.0;
-        let other = (x[FOCAL] != 0.0).then(|| rays_of(self.camera, self.images, x[FOCAL].exp()));
-        let rays = other.as_ref().unwrap_or(&self.rays);
         let turn_image = |(image, rays): (&ImageFeatures, &Vec<Option<Vector3<f64>>>)| {
             let row_turns: Vec<Matrix3<f64>> = (0..=ROW_SEGMENTS)
                 .map(|k| {
@@ -248,7 +229,7 @@ impl<'a> Problem<'a> {
             };
             image.features.iter().zip(rays).map(turn).collect()
         };
-        self.images.iter().zip(rays).map(turn_image).collect()
+        self.images.iter().zip(&self.rays).map(turn_image).collect()
     }
 
     /// Normal equations `H δ = g` without prior, and the robust cost; directions of translation are updated.
@@ -258,7 +239,7 @@ impl<'a> Problem<'a> {
         is_free: impl Fn(usize) -> bool,
     ) -> (SMatrix<f64, DIM, DIM>, Parameters, f64) {
         let at = self.turned(x);
-        let moved: Vec<Option<Vec<Vec<Option<Vector3<f64>>>>>> = (0..DIM)
+        let moved: Vec<Option<Rays>> = (0..DIM)
             .map(|p| {
                 is_free(p).then(|| {
                     let mut there = *x;
@@ -330,23 +311,12 @@ impl<'a> Problem<'a> {
     }
 }
 
-/// Unit rays of all features when the focal length is `focal_ratio` times that of `camera`.
-fn rays_of(
-    camera: &CameraModel,
-    images: &[ImageFeatures],
-    focal_ratio: f64,
-) -> Vec<Vec<Option<Vector3<f64>>>> {
-    let centre = Pixel::new(camera.intrinsics().cx, camera.intrinsics().cy);
-    let ray = |pixel: &Pixel| camera.unproject(&(centre + (pixel - centre) / focal_ratio));
-    images.iter().map(|i| i.features.iter().map(|(_, pixel)| ray(pixel)).collect()).collect()
-}
-
 fn bias_of(x: &Parameters) -> Vector3<f64> {
     Vector3::new(x[BIAS], x[BIAS + 1], x[BIAS + 2])
 }
 
 /// Indices of features that both images show, both in the order of ids.
-pub(super) fn common(a: &ImageFeatures, b: &ImageFeatures) -> Vec<[usize; 2]> {
+fn common(a: &ImageFeatures, b: &ImageFeatures) -> Vec<[usize; 2]> {
     let (mut i, mut j, mut out) = (0, 0, Vec::new());
     while i < a.features.len() && j < b.features.len() {
         match a.features[i].0.cmp(&b.features[j].0) {

@@ -386,12 +386,7 @@ impl Odometry {
     /// Checks clock, readout and camera rotation against tracks and gyroscope; starts anew where they were corrected.
     fn recalibrate(&mut self, frame: &Frame, id: FrameId) -> Option<Status> {
         self.imu_model?;
-        let tracks = match &self.phase {
-            Phase::Initializing(initializer) => &initializer.tracker.tracks,
-            Phase::Tracking(window) => &window.tracker.tracks,
-        };
-        let shown = tracks.iter().filter(|t| t.last_frame == id).map(|t| (t.id, t.last_pixel));
-        self.time_calibration.add_image(frame.time, shown);
+        self.log_features_of(id, frame.time);
         let offset = self.camera.time_offset + self.estimated_offset();
         let correction = self.time_calibration.correction(
             &self.camera,
@@ -412,6 +407,16 @@ impl Odometry {
             time_offset_ms: correction.offset_secs * 1e3,
             readout_ms: correction.readout_secs * 1e3,
         }))
+    }
+
+    /// Hands the features of image `id` to the time calibration.
+    fn log_features_of(&mut self, id: FrameId, stamp: Timestamp) {
+        let tracks = match &self.phase {
+            Phase::Initializing(initializer) => &initializer.tracker.tracks,
+            Phase::Tracking(window) => &window.tracker.tracks,
+        };
+        let shown = tracks.iter().filter(|t| t.last_frame == id).map(|t| (t.id, t.last_pixel));
+        self.time_calibration.add_image(stamp, shown);
     }
 
     /// A stretch without images or IMU measurements that cannot be bridged.

@@ -130,8 +130,6 @@ impl TimeCalibration {
             offset_secs,
             readout_secs: self.readout_secs,
             search: self.attempts.is_multiple_of(4),
-            estimates_focal: false,
-            unknown_rotation: false,
         };
         let found = self.log.attempt(&camera.model, &guess)?;
         self.attempts += 1;

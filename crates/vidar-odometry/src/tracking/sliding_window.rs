@@ -307,7 +307,7 @@ fn follow_host(
     let Some(landmark) = smoother.landmark(track.id) else { return false };
     let Some(host) = hosts.iter().find(|h| h.frame == landmark.host) else { return false };
     let Some(pixel) = camera.project(&landmark.bearing) else { return false };
-    let shown = host.shutter.from_global(camera, &pixel, landmark.inverse_distance);
+    let shown = host.shutter.add_motion(camera, &pixel, landmark.inverse_distance);
     let feature = crate::frontend::Feature::new(camera, shown, track.feature.level, track.feature.kind)
         .and_then(|f| f.with_global_pixel(camera, pixel));
     let Some(feature) = feature else { return false };

@@ -144,7 +144,7 @@ impl Tracker {
             if !self.camera.contains(&detection.pixel, BORDER_PX) {
                 continue;
             }
-            let global_pixel = host.shutter.to_global(&self.camera, &detection.pixel, typical_inverse);
+            let global_pixel = host.shutter.remove_motion(&self.camera, &detection.pixel, typical_inverse);
             let feature = Feature::new(&self.camera, detection.pixel, detection.level, detection.kind)
                 .and_then(|f| f.with_global_pixel(&self.camera, global_pixel));
             let Some(feature) = feature else { continue };
@@ -201,7 +201,7 @@ fn measure_one(
         Some(turned) => turned + track.drift * prediction.secs,
         None => warp.pixel,
     };
-    let expected = current.shutter.from_global(camera, &expected, inverse);
+    let expected = current.shutter.add_motion(camera, &expected, inverse);
     if !camera.contains(&expected, BORDER_PX) {
         return Err(MatchFailure::OutsideImage);
     }
@@ -209,7 +209,7 @@ fn measure_one(
     let found =
         measurer.find(&track.host.pyramid, &track.feature, &warp, &expected, &current.pyramid, !known)?;
     let shown = found.measurement.pixel;
-    let pixel = current.shutter.to_global(camera, &shown, inverse);
+    let pixel = current.shutter.remove_motion(camera, &shown, inverse);
     if let Some(turned) = turned {
         track.drift = (pixel - turned) / prediction.secs.max(1e-3);
     }

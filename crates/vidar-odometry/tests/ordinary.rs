@@ -1,0 +1,88 @@
+//! An ordinary recording, rendered: a phone in a lively hand, a rolling shutter, stamps 35 ms early, JPEG, a consumer IMU
+//! and walls without texture. The calibration of lens and IMU is given; clock and readout are not.
+
+#![allow(clippy::unwrap_used, clippy::print_stderr)] // helpers of tests are test code, though not marked so
+
+use std::sync::OnceLock;
+use tempfile::TempDir;
+use vidar_core::{BodyFrame, SensorEvent, StampedPose, Trajectory};
+use vidar_dataset::{Dataset, OpenOptions};
+use vidar_eval::{TrajectoryEvalConfig, evaluate_trajectory};
+use vidar_odometry::{Odometry, OdometryConfig, OdometryOutput, Status};
+use vidar_synth::{Lens, SynthConfig, write_sequence};
+
+const READOUT_SECS: f64 = 0.022;
+const STAMP_DELAY_SECS: f64 = -0.035;
+
+/// The recording on disk, and what was read of it. Half a phone's resolution, so that rendering stays short.
+fn recording() -> &'static (TempDir, Dataset) {
+    static ONCE: OnceLock<(TempDir, Dataset)> = OnceLock::new();
+    ONCE.get_or_init(|| {
+        let mut config = SynthConfig::phone_fast();
+        (config.seed, config.duration_secs, config.camera_rate_hz) = (91, 10.0, 20.0);
+        (config.width, config.height, config.blur_samples) = (320, 240, 1);
+        config.device.lens = Lens::Radtan {
+            focal_px: 260.0,
+            centre_offset_px: [-1.2, 2.5],
+            distortion: [0.05, -0.08, -0.0004, 0.0006],
+        };
+        (config.device.readout_secs, config.device.stamp_delay_secs) = (READOUT_SECS, STAMP_DELAY_SECS);
+        (config.depth, config.scan_spacing_m) = (false, 0.5);
+        let folder = tempfile::tempdir().unwrap();
+        write_sequence(folder.path(), &config, None, &|_, _| true).unwrap();
+        let dataset = vidar_dataset::open(folder.path(), &OpenOptions::default()).unwrap();
+        (folder, dataset)
+    })
+}
+
+fn events(dataset: &Dataset) -> impl Iterator<Item = SensorEvent> + '_ {
+    dataset.events().map(Result::unwrap)
+}
+
+fn run(dataset: &Dataset, mut odometry: Odometry) -> Vec<OdometryOutput> {
+    let mut outputs: Vec<OdometryOutput> =
+        events(dataset).filter_map(|e| odometry.push(e).unwrap()).collect();
+    outputs.extend(odometry.finish());
+    outputs
+}
+
+#[test]
+fn clock_and_readout_are_found_and_the_trajectory_is_metric() {
+    let (_, dataset) = recording();
+    let config = OdometryConfig::default();
+    let timing = Odometry::find_timing(&dataset.rig, dataset.camera, &config, events(dataset)).unwrap();
+    let offset_ms = 1e3 * (timing.time_offset_secs + STAMP_DELAY_SECS);
+    let readout_ms = 1e3 * (timing.readout_secs - READOUT_SECS);
+    assert!(offset_ms.abs() < 3.0, "clock off by {offset_ms} ms: {timing:?}");
+    assert!(readout_ms.abs() < 4.0, "readout off by {readout_ms} ms: {timing:?}");
+
+    let odometry = Odometry::with_timing(&dataset.rig, dataset.camera, &config, &timing).unwrap();
+    let outputs = run(dataset, odometry);
+    let states = || outputs.iter().filter_map(|o| Some((o.time, o.tracking()?)));
+    let first = states().next().map(|(time, _)| (time - outputs[0].time).as_secs_f64()).unwrap();
+    assert!(first < 4.0, "first state after {first} s");
+    let expected = outputs.iter().filter(|o| (o.time - outputs[0].time).as_secs_f64() >= first).count();
+    let share = states().count() as f64 / expected as f64;
+    assert!(share > 0.98, "a state for {share} of the images after the first");
+    let poses = states().map(|(time, t)| StampedPose { time, world_from_body: t.state.world_from_body });
+    let estimate = Trajectory::new(BodyFrame::Imu, poses.collect()).unwrap();
+    let truth = dataset.ground_truth.as_ref().unwrap();
+    let report = evaluate_trajectory(&estimate, truth, &TrajectoryEvalConfig::default()).unwrap();
+    let (ate, scale) = (report.ate_se3_m.unwrap().rmse, report.scale_error.unwrap());
+    let path = estimate.path_length_m();
+    assert!(ate < 0.02 * path, "ATE {ate} m over {path} m");
+    let (_, last) = states().next_back().unwrap();
+    assert!(scale < (3.0 * last.scale_std).max(0.03), "|ln s| {scale} at a stated {}", last.scale_std);
+}
+
+#[test]
+fn a_live_odometry_corrects_clock_and_readout_on_the_way() {
+    let (_, dataset) = recording();
+    let config = OdometryConfig::default();
+    let odometry = Odometry::new(&dataset.rig, dataset.camera, &config).unwrap();
+    let outputs = run(dataset, odometry);
+    let last = outputs.last().unwrap();
+    assert!(matches!(last.status, Status::Tracking(_)), "{:?}", last.status);
+    let with_state = outputs.iter().filter(|o| o.tracking().is_some()).count();
+    assert!(2 * with_state > outputs.len(), "{with_state} of {}", outputs.len());
+}
