@@ -15,8 +15,8 @@ const WORLD: &str = "duration_secs = 2.5\ncamera_rate_hz = 8.0\nwidth = 160\nhei
     exposure_secs = 0.0\nscan_spacing_m = 0.05\n";
 
 /// Coarse voxels, no pictures, no evaluation by default: most tests need only the pipeline.
-const SETTINGS: &str =
-    "[fusion]\nvoxel_size_m = 0.04\n[eval]\nmode = \"off\"\n[output]\nreport = false\nmesh_glb = false\n";
+/// The recording is too short for the odometry to initialise, so ground truth is asked for.
+const SETTINGS: &str = "[input]\nposes = \"ground-truth\"\n[fusion]\nvoxel_size_m = 0.04\n[eval]\nmode = \"off\"\n[output]\nreport = false\nmesh_glb = false\n";
 
 /// Exit code and output of a call of the program.
 pub struct ProgramOutput {
