@@ -303,6 +303,9 @@ fn run(dataset: &Dataset, options: &Options) -> Result<Run, Failure> {
     for output in odometry.finish() {
         keep(&mut run, output, options.mono);
     }
+    // Ground truth is in the IMU's clock.
+    let offset = Duration::from_secs_f64(odometry.timing().time_offset_secs);
+    run.poses.iter_mut().for_each(|p| p.time = p.time + offset);
     Ok(run)
 }
 

@@ -6,7 +6,9 @@ use crate::error::Error;
 use serde::Serialize;
 use std::path::{Path, PathBuf};
 use vidar_align::CouplingMode;
-use vidar_core::{BodyFrame, CameraId, Duration, Frame, FrameImage, SensorEvent, Trajectory, Warning};
+use vidar_core::{
+    BodyFrame, CameraId, Duration, Frame, FrameImage, SensorEvent, StampedPose, Trajectory, Warning,
+};
 use vidar_dataset::{Dataset, DatasetError, ImageEntry, OpenOptions};
 
 /// Where the metric poses of a run come from.
@@ -108,6 +110,11 @@ impl PosePlan {
             Self::Given(trajectory) => Some(given_poses(trajectory, dataset, config)),
             Self::None | Self::Odometry { .. } => None,
         }
+    }
+
+    /// Whether they come from the recording's own camera and IMU.
+    pub fn is_odometry(&self) -> bool {
+        matches!(self, Self::Odometry { .. })
     }
 
     /// Sources of poses for the engine: the one that is planned, and its fallback.
@@ -222,9 +229,17 @@ pub fn open_dataset(path: &Path, options: &OpenOptions, config: &Config) -> Resu
     Ok(vidar_dataset::open(path, &options)?)
 }
 
-/// Ground truth of the camera in use, where its place on the rig is known.
+/// Ground truth of the camera in use at the images' stamps, where its place on the rig is known.
 pub fn truth_in_camera(dataset: &Dataset) -> Option<Trajectory> {
-    dataset.ground_truth.as_ref().and_then(|t| in_camera(t, dataset).ok())
+    let truth = dataset.ground_truth.as_ref().and_then(|t| in_camera(t, dataset).ok())?;
+    in_image_clock(&truth, dataset)
+}
+
+/// A trajectory in the IMU's clock, as ground truth is, with the stamps that images of these times have.
+pub fn in_image_clock(trajectory: &Trajectory, dataset: &Dataset) -> Option<Trajectory> {
+    let offset = dataset.rig.camera(dataset.camera).map_or(Duration::ZERO, |c| c.time_offset);
+    let stamped = |p: &StampedPose| StampedPose { time: p.time - offset, ..*p };
+    Trajectory::new(trajectory.body(), trajectory.poses().iter().map(stamped).collect()).ok()
 }
 
 fn in_camera(trajectory: &Trajectory, dataset: &Dataset) -> Result<Trajectory, Error> {

@@ -4,6 +4,7 @@ mod dump;
 mod files;
 mod report;
 
+use crate::camera_timing;
 use crate::config::{Config, Layered};
 use crate::error::{Error, ExitStatus};
 use crate::events::{CancelToken, Event, Events};
@@ -98,19 +99,24 @@ pub fn odometry(
 ) -> Result<OdometryOutcome, Error> {
     let clock = Instant::now();
     let started = crate::run_folder::now_rfc3339();
-    let config = request.layered.build()?;
-    let dataset = events.stage("read", 0, || input::open_dataset(&request.path, &request.open, &config))?;
+    let mut config = request.layered.build()?;
+    let mut dataset =
+        events.stage("read", 0, || input::open_dataset(&request.path, &request.open, &config))?;
     input::require_calibration(&dataset)?;
     let folder = RunFolder::create(&request.place)?;
     folder.write("config.resolved.toml", request.layered.to_toml(true).as_bytes())?;
     let total = dataset.images.len();
     let mut dump = if request.debug_dump { Some(dump::Dump::create(&folder)?) } else { None };
+    let timing = events.stage(camera_timing::STAGE, 0, || {
+        camera_timing::settle(&mut dataset, &mut config, events, cancel)
+    })?;
     let tracked =
         events.stage("odometry", total, || track(&dataset, &config, events, cancel, dump.as_mut()))?;
     let dumped = dump.is_some();
     dump.map_or(Ok(()), dump::Dump::finish)?;
 
     let mut warnings = dataset.warnings.clone();
+    warnings.extend(timing);
     warnings.extend(tracked.warnings());
     warnings.iter().for_each(|w| events.warn(w));
     let trajectory = tracked.longest_segment();
@@ -279,7 +285,8 @@ fn evaluate(
     dataset: &Dataset,
     config: &Config,
 ) -> Result<Option<TrajectoryReport>, Error> {
-    let Ok(truth) = truth.in_frame(BodyFrame::Imu, &dataset.rig) else { return Ok(None) };
+    let truth = truth.in_frame(BodyFrame::Imu, &dataset.rig).ok();
+    let Some(truth) = truth.and_then(|t| input::in_image_clock(&t, dataset)) else { return Ok(None) };
     match vidar_eval::evaluate_trajectory(trajectory, &truth, &config.eval.trajectory) {
         Ok(report) => Ok(Some(report)),
         Err(vidar_eval::EvalError::NoMatches { .. }) => Ok(None),

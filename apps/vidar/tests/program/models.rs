@@ -10,7 +10,7 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::sync::OnceLock;
 use vidar::da3::config::json::parse;
-use vidar::da3::weights::{deterministic, inventory};
+use vidar::da3::weights::{inventory, synthetic};
 use vidar::export_formats::official::{NpzLimits, read_prediction_npz};
 
 /// A network of the family that is small enough for tests.
@@ -31,7 +31,7 @@ fn write_checkpoint(folder: &Path) {
     let config = parse(&tiny_config(), "config.json").unwrap();
     let (mut header, mut data) = (serde_json::Map::new(), Vec::<u8>::new());
     for parameter in inventory::parameters(&config) {
-        let values = deterministic::tensor(&parameter.name, &parameter.shape);
+        let values = synthetic::tensor(&parameter.name, &parameter.shape);
         let from = data.len();
         data.extend(values.iter().flat_map(|v| v.to_le_bytes()));
         let entry = json!({ "dtype": "F32", "shape": parameter.shape, "data_offsets": [from, data.len()] });

@@ -45,6 +45,8 @@ pub struct CameraTiming {
     pub body_from_camera: Se3,
     /// Standard deviations of offset and readout, s; `None` as long as nothing was estimated.
     pub sigmas_secs: Option<(f64, f64)>,
+    /// Whether any of them differs from the given one.
+    pub is_corrected: bool,
     /// Whether another look at the recording would bring little.
     pub is_settled: bool,
 }
@@ -100,6 +102,7 @@ impl TimeCalibration {
             readout_secs: self.readout_secs,
             body_from_camera: camera.body_from_camera,
             sigmas_secs: self.estimated,
+            is_corrected: self.used_sigmas.0 > 0.0,
             is_settled: self.is_settled(),
         }
     }

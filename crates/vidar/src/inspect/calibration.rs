@@ -27,7 +27,6 @@ fn describe_model(model: &CameraModel, source: &CalibrationSource) -> Vec<String
         CalibrationSource::Flags => "from --camera-model".into(),
         CalibrationSource::Guessed => "guessed".into(),
         CalibrationSource::DatasetDefault => "the dataset's published calibration".into(),
-        _ => "unknown source".into(),
     };
     let mut words = vec![format!(
         "{} {}x{}, f {:.1}/{:.1} px, centre {:.1}/{:.1} px; {from}",

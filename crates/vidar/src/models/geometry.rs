@@ -68,7 +68,11 @@ pub fn chosen(config: &Config) -> Result<Option<ModelChoice>, Error> {
 }
 
 /// Opens the network. Nothing is downloaded.
-pub fn open(choice: &ModelChoice, config: &Config, mode: PoseMode) -> Result<(Da3Model, LocatedModel), Error> {
+pub fn open(
+    choice: &ModelChoice,
+    config: &Config,
+    mode: PoseMode,
+) -> Result<(Da3Model, LocatedModel), Error> {
     let located = locate(choice, None, &store(true)?)?;
     // The dense head stays in 32 bits, as in the official program.
     let head_precision = Some(Precision::F32);

@@ -18,6 +18,7 @@ pub use map::MetricMap;
 pub use outputs::pose_of;
 pub use plan::{ExpectedWork, Plan, bytes};
 
+use crate::camera_timing;
 use crate::config::{Config, Layered};
 use crate::engine::{Engine, EngineSetup, FrameStamp, MapEvent};
 use crate::error::{Error, ExitStatus};
@@ -106,14 +107,20 @@ pub fn run(request: &RunRequest, events: &Events, cancel: &CancelToken) -> Resul
     let clock = std::time::Instant::now();
     let recorder = Recorder::default();
     let events = recorder.listen(events.clone());
-    let config = request.layered.build()?;
-    let dataset =
+    let mut config = request.layered.build()?;
+    let mut dataset =
         events.stage("read", 0, || input::open_every_image(&request.path, &request.open, &config))?;
     let (plan, source, places) =
         events.stage("plan", 0, || Plan::make(&dataset, &config, request.reference.as_deref()))?;
     let folder = Arc::new(RunFolder::create(&request.place)?);
     recorder.keep_log_in(folder.clone());
     dataset.warnings.iter().chain(&plan.warnings).for_each(|w| events.warn(w));
+    if plan.poses.is_odometry() {
+        let timing = events.stage(camera_timing::STAGE, 0, || {
+            camera_timing::settle(&mut dataset, &mut config, &events, cancel)
+        })?;
+        timing.iter().for_each(|w| events.warn(w));
+    }
     let description = RunDescription::new(request, &dataset, &plan)?;
 
     let context =
