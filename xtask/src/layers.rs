@@ -57,7 +57,8 @@ pub fn check(root: &Path) -> Result<Vec<String>> {
                 Some(may) => may.contains(&dependency.name.as_str()),
             };
             if ours && ships && !allowed {
-                problems.push(format!("{name} -> {}: this dependency points up or sideways", dependency.name));
+                problems
+                    .push(format!("{name} -> {}: this dependency points up or sideways", dependency.name));
             }
             if let Some((_, owners, reason)) = RESERVED.iter().find(|(n, _, _)| *n == dependency.name)
                 && ships

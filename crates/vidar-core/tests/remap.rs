@@ -1,5 +1,7 @@
 //! Undistortion and resizing, compared with scenes rendered directly through the ideal camera.
 
+#![allow(clippy::unwrap_used)] // helpers of tests are test code, though not marked so
+
 use nalgebra::{Vector2, Vector3};
 use vidar_core::camera::{DoubleSphere, Equidistant, Fov, ParametricCamera, RadTan};
 use vidar_core::remap::{RemapTable, undistorted_view};

@@ -154,7 +154,10 @@ impl Odometry {
             SensorEvent::Imu(sample) if self.imu_model.is_some() => match self.imu.push(sample) {
                 Ok(()) => {
                     self.counts.imu_samples += 1;
-                    self.time_calibration.add_gyro(&sample);
+                    match self.imu_model.is_some_and(|m| sample.gyro.0.amax() >= m.gyro_limit) {
+                        true => self.time_calibration.forget(),
+                        false => self.time_calibration.add_gyro(&sample),
+                    }
                 }
                 Err(_) => self.counts.imu_samples_rejected += 1,
             },

@@ -117,6 +117,11 @@ impl TimeCalibration {
         self.log.forget_images();
     }
 
+    /// Forgets all measurements: a saturated gyroscope integrates to a wrong rotation.
+    pub fn forget(&mut self) {
+        self.log = GyroAlignmentLog::default();
+    }
+
     /// A correction of `camera`, whose clock offset in use is `offset_secs`, where one is called for. `is_tracking`: there is
     /// a state that it would end.
     pub fn correction(
@@ -187,7 +192,7 @@ impl TimeCalibration {
                 least * MIN_READOUT_SECS,
             );
         let turn = (camera.body_from_camera.rotation.inverse() * found.body_from_camera).angle_rad();
-        let rotation = turn > (4.0 * found.rotation_sigma).max(MIN_ROTATION_RAD);
+        let rotation = turn > (4.0 * found.rotation_sigma).max(least * MIN_ROTATION_RAD);
         (offset || readout || rotation).then_some(Correction {
             offset_secs: if self.estimates_offset { found.offset_secs } else { offset_secs },
             readout_secs: if self.estimates_readout { readout_secs } else { self.readout_secs },

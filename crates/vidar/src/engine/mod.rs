@@ -193,7 +193,7 @@ impl<'a> Engine<'a> {
     }
 
     fn add_image(&mut self, stamp: FrameStamp) {
-        if self.images % self.config.input.stride.max(1) == 0 {
+        if self.images.is_multiple_of(self.config.input.stride.max(1)) {
             self.candidates.push(stamp);
             self.track.add_candidate(stamp);
         }
