@@ -1,7 +1,7 @@
 //! SALAD: place recognition descriptors of images (Izquierdo and Civera, *Optimal Transport Aggregation for Visual Place
 //! Recognition*, 2024).
 //!
-//! A DINOv2 ViT-B/14 encodes the image at 336 × 336 pixels ([`ImageEncoder`](crate::ImageEncoder)); an aggregation head turns
+//! A DINOv2 ViT-B/14 encodes the image at 336 × 336 pixels ([`ImageEncoder`]); an aggregation head turns
 //! its tokens into one unit-length descriptor. Backbone and head were trained together and lie in one checkpoint, so all of
 //! SALAD is in this crate, beside the other networks on that backbone. `vidar-align` only searches among descriptors and
 //! needs no network.
