@@ -324,7 +324,7 @@ fn a_glb_with_wrong_or_repeated_data_is_refused() {
     // A hundred nodes of one mesh: more vertices than the file has bytes.
     let many = vec![r#"{"mesh":0}"#; 100].join(",");
     let roots: Vec<String> = (0..100).map(|i| i.to_string()).collect();
-    refused(glb(&format!("[{many}]"), &format!("[{}]", roots.join(",")), 100, 1200), &["repeats"]);
+    refused(glb(&format!("[{many}]"), &format!("[{}]", roots.join(",")), 100, 1200), &["repeated"]);
     // A chain of nodes deeper than any tool makes.
     let chain: Vec<String> = (1..=100).map(|i| format!(r#"{{"children":[{i}]}}"#)).collect();
     refused(glb(&format!("[{},{{}}]", chain.join(",")), "[0]", 1, 1200), &["levels"]);

@@ -38,7 +38,8 @@ impl ExtraSettings {
     fn arguments(self) -> Vec<String> {
         let settings: &[&str] = match self {
             Self::Nothing => &[],
-            Self::Evaluated | Self::Odometry => &["eval.mode=auto"],
+            Self::Evaluated => &["eval.mode=auto"],
+            Self::Odometry => &["eval.mode=auto", "input.poses=external"],
             Self::Refused => &[
                 "eval.mode=auto",
                 "eval.surface.scale_bounds.min=0.9999999",
