@@ -199,9 +199,9 @@ fn simulate(seed: u64, vio: f64, false_loops: usize) -> World {
     World { truth, odometry, relative, step_m, vio, chunks, overlaps, loops, landmark_log, seen }
 }
 
-/// Poses and the metres per depth unit of every view, judged with a rigid fit only: metric ATE, and the share of seen
+/// Poses and the metres per depth unit of every view, compared after a rigid fit only: metric ATE, and the share of seen
 /// points within 5 cm.
-fn judge(world: &World, poses: &[Se3], metres_per_unit: impl Fn(usize) -> f64) -> (f64, f64) {
+fn errors_of(world: &World, poses: &[Se3], metres_per_unit: impl Fn(usize) -> f64) -> (f64, f64) {
     let centers = |p: &[Se3]| p.iter().map(|p| p.translation).collect::<Vec<_>>();
     let fit = rigid_fit(&centers(poses), &centers(&world.truth));
     let squares: f64 = poses
@@ -235,7 +235,7 @@ fn pose_conditioned(world: &World) -> (f64, f64) {
             umeyama_sim3(&centers(&c.poses), &centers(&world.odometry[c.range.frames.clone()])).unwrap().scale
         })
         .collect();
-    judge(world, &world.odometry, |frame| scales[owner(world, frame)])
+    errors_of(world, &world.odometry, |frame| scales[owner(world, frame)])
 }
 
 /// The paper's hybrid: the reference's own graph, then one similarity onto the odometry's centres.
@@ -254,7 +254,7 @@ fn hybrid(world: &World) -> (f64, f64) {
     let centers = |p: &[Se3]| p.iter().map(|p| p.translation).collect::<Vec<_>>();
     let onto = umeyama_sim3(&centers(&place(&gauges)), &centers(&world.odometry)).unwrap();
     gauges.iter_mut().for_each(|g| *g = onto * *g);
-    judge(world, &place(&gauges), |frame| gauges[owner(world, frame)].scale)
+    errors_of(world, &place(&gauges), |frame| gauges[owner(world, frame)].scale)
 }
 
 fn coupled(world: &World) -> (f64, f64) {
@@ -324,7 +324,7 @@ fn coupled(world: &World) -> (f64, f64) {
     assert_eq!(solved.flow, InformationFlow::Coupled, "{}", solved.odometry_chi2);
     let gauges = &solved.state.chunks;
     assert!(gauges.iter().all(Sim3::is_finite));
-    judge(world, &solved.state.keyframes, |frame| gauges[owner(world, frame)].scale)
+    errors_of(world, &solved.state.keyframes, |frame| gauges[owner(world, frame)].scale)
 }
 
 fn median(mut values: Vec<f64>) -> f64 {

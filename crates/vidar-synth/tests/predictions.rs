@@ -167,7 +167,7 @@ fn a_chain_of_chunks_is_one_reconstruction_up_to_scale_and_drifts() {
             .collect();
         chain_chunks(&chunks).unwrap()
     };
-    let misfit = |views: &[vidar_core::ViewGeometry]| {
+    let residual = |views: &[vidar_core::ViewGeometry]| {
         let (a, b): (Vec<_>, Vec<_>) = views
             .iter()
             .zip(&truth)
@@ -184,8 +184,8 @@ fn a_chain_of_chunks_is_one_reconstruction_up_to_scale_and_drifts() {
     };
     let clean = chained(&gauges);
     assert_eq!(clean.iter().map(|v| v.frame_id.0).collect::<Vec<_>>(), (0..20).collect::<Vec<_>>());
-    assert!(misfit(&clean) < 1e-5, "{}", misfit(&clean));
-    let real = misfit(&chained(&PredictionErrors::default()));
+    assert!(residual(&clean) < 1e-5, "{}", residual(&clean));
+    let real = residual(&chained(&PredictionErrors::default()));
     assert!((0.002..0.2).contains(&real), "{real} m");
     let apart = [
         predict_chunk(ChunkId(0), &truth[..4], None, &gauges, 5).unwrap(),

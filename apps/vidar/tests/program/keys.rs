@@ -98,7 +98,7 @@ fn sparse_truth() -> String {
     .clone()
 }
 
-/// Every setting of the dense road, another value for it, and what must be set besides.
+/// Every setting of the dense pipeline, another value for it, and the additional settings that it needs.
 const SETTINGS: &[(&str, &str, ExtraSettings)] = &[
     ("align.max_center_rms_m", "1e-12", Simulated),
     ("coupling.mode", "hybrid", Simulated),

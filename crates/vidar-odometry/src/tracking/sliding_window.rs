@@ -178,7 +178,7 @@ impl SlidingWindowOdometry {
         .collect()
     }
 
-    /// One image: the road from its pixels to a smoothed state.
+    /// One image: from its pixels to an estimated state.
     pub fn step(&mut self, input: FrameInput, clock: &mut StageClock) -> Result<StepReport, SmootherError> {
         let frame = input.host.frame;
         let last_state = self.state().unwrap_or(NavState::REST);
