@@ -7,7 +7,7 @@ use crate::config::Config;
 use crate::error::Error;
 use crate::events::{CancelToken, Event, Events};
 use crate::input::{self, Measurement};
-use vidar_core::{Duration, LieGroup, SensorEvent, Warning};
+use vidar_core::{LieGroup, SensorEvent, Warning};
 use vidar_dataset::Dataset;
 use vidar_odometry::{CameraTiming, ImuUse, Odometry};
 
@@ -46,11 +46,9 @@ pub(crate) fn settle(
     if !timing.is_corrected {
         return Ok(None);
     }
-    config.odometry.readout_ms = Some(1e3 * timing.readout_secs);
     let Some(camera) = dataset.rig.cameras.get_mut(dataset.camera.index()) else { return Ok(None) };
     let turn = camera.body_from_camera.rotation.inverse() * timing.body_from_camera.rotation;
-    camera.time_offset = Duration::from_secs_f64(timing.time_offset_secs);
-    camera.body_from_camera = timing.body_from_camera;
+    timing.apply(camera, &mut config.odometry);
     Ok(Some(corrected(&timing, turn.angle_rad().to_degrees())))
 }
 

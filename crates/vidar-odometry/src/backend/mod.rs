@@ -26,6 +26,7 @@ pub use covariance::CalibrationEstimate;
 pub use inertial::GaugePriorSigmas;
 pub use marginalise::MarginalisationReport;
 pub use optimise::{OptimiseReport, Outlier};
+pub(crate) use visual::tangent_basis;
 pub use window::{LandmarkEstimate, Observation};
 
 use crate::imu::{ImuModel, NavState, Preintegration};

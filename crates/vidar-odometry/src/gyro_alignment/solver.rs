@@ -10,6 +10,7 @@
 //! rolling shutter video rectification", 2012, and Kelly, Sukhatme, "A general framework for temporal calibration", 2014.
 
 use super::path::{OrientationPath, RateSample};
+use crate::backend::tangent_basis;
 use nalgebra::{Matrix2, Matrix3, SMatrix, SVector, Vector2, Vector3};
 use vidar_core::{CameraModel, LandmarkId, LieGroup, So3, camera::Pixel};
 
@@ -257,7 +258,7 @@ impl<'a> Problem<'a> {
             };
             pair.direction = direction(pair.matches.iter().filter_map(|m| normals(&at, m)), ray_sigma);
             let t = pair.direction;
-            let tangents = tangents(&t);
+            let tangents = tangent_basis(&t);
             let mut h_pair = SMatrix::<f64, DIM, DIM>::zeros();
             let mut g_pair = Parameters::zeros();
             let mut cross = SMatrix::<f64, DIM, 2>::zeros();
@@ -274,7 +275,7 @@ impl<'a> Problem<'a> {
                         j[p] = (there - n).dot(&t) / (STEPS[p] * sigma);
                     }
                 }
-                let jt = Vector2::new(n.dot(&tangents[0]), n.dot(&tangents[1])) / sigma;
+                let jt = tangents.tr_mul(&n) / sigma;
                 h_pair += j * j.transpose() * weight;
                 g_pair -= j * (r * weight);
                 cross += j * jt.transpose() * weight;
@@ -356,10 +357,4 @@ fn direction(
         t = Some(eigen.eigenvectors.column(eigen.eigenvalues.imin()).into_owned());
     }
     t.unwrap_or_else(Vector3::z)
-}
-
-fn tangents(t: &Vector3<f64>) -> [Vector3<f64>; 2] {
-    let axis = if t.z.abs() < 0.9 { Vector3::z() } else { Vector3::x() };
-    let first = t.cross(&axis).normalize();
-    [first, t.cross(&first)]
 }

@@ -280,9 +280,8 @@ impl Odometry {
     ) -> Result<Self, OdometryError> {
         let mut rig = rig.clone();
         let found = rig.cameras.get_mut(camera.index()).ok_or(OdometryError::NoSuchCamera(camera))?;
-        found.time_offset = Duration::from_secs_f64(timing.time_offset_secs);
-        found.body_from_camera = timing.body_from_camera;
-        let config = OdometryConfig { readout_ms: Some(timing.readout_secs * 1e3), ..config.clone() };
+        let mut config = config.clone();
+        timing.apply(found, &mut config);
         Self::new(&rig, camera, &config)
     }
 

@@ -1,8 +1,9 @@
 //! Clock offset, rolling-shutter readout and camera rotation as used by the odometry: the given values until feature
 //! tracks and gyroscope contradict them.
 
+use crate::config::OdometryConfig;
 use crate::gyro_alignment::{Alignment, Guess, GyroAlignmentLog};
-use vidar_core::{ImuSample, LandmarkId, LieGroup, RigCamera, Se3, So3, Timestamp, camera::Pixel};
+use vidar_core::{Duration, ImuSample, LandmarkId, LieGroup, RigCamera, Se3, So3, Timestamp, camera::Pixel};
 
 /// Differences from the values in use below which nothing is corrected, besides three standard deviations: the backend
 /// estimates a clock offset of some milliseconds by itself, and a readout of 4 ms moves a pixel by less than one at 1 rad/s.
@@ -51,6 +52,15 @@ pub struct CameraTiming {
     pub is_settled: bool,
 }
 
+impl CameraTiming {
+    /// Puts the values into the camera's calibration and the odometry's settings.
+    pub fn apply(&self, camera: &mut RigCamera, config: &mut OdometryConfig) {
+        camera.time_offset = Duration::from_secs_f64(self.time_offset_secs);
+        camera.body_from_camera = self.body_from_camera;
+        config.readout_ms = Some(1e3 * self.readout_secs);
+    }
+}
+
 /// The values in use and what they are checked with.
 #[derive(Debug)]
 pub(crate) struct TimeCalibration {
@@ -83,14 +93,14 @@ impl TimeCalibration {
     }
 
     pub fn add_gyro(&mut self, sample: &ImuSample) {
-        if !self.is_settled {
+        if !self.is_settled() {
             self.log.add_gyro(sample);
         }
     }
 
     /// Takes the features of an image as it shows them, with its own stamp.
     pub fn add_image(&mut self, stamp: Timestamp, features: impl Iterator<Item = (LandmarkId, Pixel)>) {
-        if !self.is_settled {
+        if !self.is_settled() {
             self.log.add_image(stamp, features);
         }
     }
