@@ -3,7 +3,7 @@
 //! ```text
 //! cargo run --release -p vidar-odometry --example evaluate -- [--mono] [--start S] [--secs S] [--verbose]
 //!     [--repeat N] [--stages] [--image-noise GRAY] [--imu-noise FACTOR] [--halve]
-//!     [--live] [--trajectory FILE] [--frames FILE] [--set KEY=VALUE]... SEQUENCE...
+//!     [--live] [--adjust] [--trajectory FILE] [--frames FILE] [--set KEY=VALUE]... SEQUENCE...
 //! ```
 //!
 //! A sequence is any folder with images, IMU measurements and ground truth that `vidar-dataset` reads. Figures: ATE after the best
@@ -17,6 +17,8 @@
 //! The camera's clock offset, readout and rotation are found in a first pass over the beginning; `--live` leaves it out,
 //! as for a stream, which cannot be read twice.
 //!
+//! `--adjust` evaluates the trajectory of the bundle adjustment after the recording's end in a second row.
+//!
 //! `--image-noise`, `--imu-noise` corrupt what is read: noise of so many grey levels; so much more inertial noise that
 //! its whole is FACTOR times the data sheet's (the bias stays). `--halve` averages 2 × 2 pixels.
 
@@ -25,11 +27,12 @@
 use std::path::{Path, PathBuf};
 use vidar_core::camera::RadTan;
 use vidar_core::{
-    BodyFrame, CameraModel, Duration, FrameImage, Health, Image, ImuNoise, SensorEvent, StampedPose,
-    Trajectory,
+    BodyFrame, CameraModel, Duration, FrameImage, Health, Image, ImuNoise, NavState, SensorEvent,
+    StampedPose, Timestamp, Trajectory,
 };
 use vidar_dataset::{Dataset, OpenOptions};
 use vidar_eval::{TrajectoryEvalConfig, evaluate_trajectory};
+use vidar_odometry::bundle_adjustment::{Adjusted, CalibrationSigmas};
 use vidar_odometry::simulate::Random;
 use vidar_odometry::{ImuUse, Odometry, OdometryConfig, OdometryOutput, Stage, StageTimes, Status};
 
@@ -51,6 +54,7 @@ struct Options {
     imu_noise: f64,
     halve: bool,
     live: bool,
+    adjust: bool,
 }
 
 fn options() -> Result<Options, Failure> {
@@ -66,6 +70,7 @@ fn options() -> Result<Options, Failure> {
             "--imu-noise" => found.imu_noise = value()?.parse()?,
             "--halve" => found.halve = true,
             "--live" => found.live = true,
+            "--adjust" => found.adjust = true,
             "--verbose" => found.verbose = true,
             "--start" => found.start_secs = value()?.parse()?,
             "--secs" => found.secs = Some(value()?.parse()?),
@@ -112,6 +117,7 @@ struct Run {
     outputs: Vec<OdometryOutput>,
     times: Vec<StageTimes>,
     poses: Vec<StampedPose>,
+    adjusted: Option<Adjusted>,
 }
 
 fn evaluate(path: &Path, options: &Options) -> Result<(), Failure> {
@@ -144,18 +150,50 @@ fn evaluate(path: &Path, options: &Options) -> Result<(), Failure> {
         println!("{name:<14} no trajectory: {} poses", run.poses.len());
         return Ok(());
     }
-    let first_secs = (run.poses[0].time - first_image).as_secs_f64();
-    let done = 100.0 * run.poses.len() as f64 / dataset.images.len() as f64;
-    let estimate = Trajectory::new(BodyFrame::Imu, run.poses)?;
-    if let Some(file) = &options.trajectory {
-        std::fs::write(file, tum(&estimate))?;
-    }
     let truth = dataset.ground_truth.as_ref().ok_or("no ground truth")?;
+    let images: (Timestamp, usize) = (first_image, dataset.images.len());
+    let live = row(&name, run.poses, images, &run.times, truth)?;
+    if let Some(file) = &options.trajectory {
+        std::fs::write(file, tum(&live))?;
+    }
+    if let Some(adjusted) = run.adjusted {
+        let offset = Duration::from_secs_f64(adjusted.calibration.time_offset_secs);
+        let pose = |state: &NavState| StampedPose {
+            time: state.time + offset,
+            world_from_body: state.world_from_body,
+        };
+        row(
+            "  adjusted",
+            adjusted.images.iter().map(|(_, state)| pose(state)).collect(),
+            images,
+            &[],
+            truth,
+        )?;
+    }
+    if options.stages {
+        println!("{}", stages(&run.times));
+    }
+    Ok(())
+}
+
+/// Prints the figures of one trajectory.
+fn row(
+    name: &str,
+    poses: Vec<StampedPose>,
+    (first_image, images): (Timestamp, usize),
+    times: &[StageTimes],
+    truth: &Trajectory,
+) -> Result<Trajectory, Failure> {
+    let first_secs = (poses[0].time - first_image).as_secs_f64();
+    let done = 100.0 * poses.len() as f64 / images as f64;
+    let estimate = Trajectory::new(BodyFrame::Imu, poses)?;
     let report = evaluate_trajectory(&estimate, truth, &TrajectoryEvalConfig::default())?;
-    let mut millis: Vec<f64> = run.times.iter().map(|t| 1e3 * t.total().as_secs_f64()).collect();
+    let mut millis: Vec<f64> = times.iter().map(|t| 1e3 * t.total().as_secs_f64()).collect();
     let mean = millis.iter().sum::<f64>() / millis.len().max(1) as f64;
     millis.sort_by(f64::total_cmp);
-    let percentile = |share: f64| millis[((millis.len() - 1) as f64 * share) as usize];
+    let percentile = |share: f64| {
+        millis.get((millis.len().max(1) - 1) * (100.0 * share) as usize / 100).copied().unwrap_or(f64::NAN)
+    };
     let or_nan = |v: Option<f64>| v.unwrap_or(f64::NAN);
     println!(
         "{name:<14} {:>7.4} {:>7.4} {:>7.4} {:>7.2} {:>8.4} {done:>6.1} {first_secs:>6.2} {mean:>7.2} {:>6.2} {:>6.2} {:>6.0} {:>6.1}",
@@ -169,10 +207,7 @@ fn evaluate(path: &Path, options: &Options) -> Result<(), Failure> {
         peak_megabytes(),
         report.matched_truth_path_m,
     );
-    if options.stages {
-        println!("{}", stages(&run.times));
-    }
-    Ok(())
+    Ok(estimate)
 }
 
 /// Median, 95 % quantile and mean of every stage, ms, over the images that passed it; and over the running odometry.
@@ -288,7 +323,10 @@ fn run(dataset: &Dataset, options: &Options) -> Result<Run, Failure> {
             Odometry::with_timing(&rig, dataset.camera, &config, &timing)?
         }
     };
-    let mut run = Run { outputs: Vec::new(), times: Vec::new(), poses: Vec::new() };
+    let mut run = Run { outputs: Vec::new(), times: Vec::new(), poses: Vec::new(), adjusted: None };
+    if options.adjust {
+        odometry.keep_log();
+    }
     for event in dataset.events() {
         let mut event = event?;
         if matches!(event, SensorEvent::GroundTruth { .. } | SensorEvent::Depth { .. }) {
@@ -302,6 +340,20 @@ fn run(dataset: &Dataset, options: &Options) -> Result<Run, Failure> {
     }
     for output in odometry.finish() {
         keep(&mut run, output, options.mono);
+    }
+    if options.adjust {
+        let clock = std::time::Instant::now();
+        let adjusted = odometry.adjust(&CalibrationSigmas::default())?;
+        if options.verbose {
+            println!(
+                "  {:.1} s, σ(ln s) {:.4}, {:?}",
+                clock.elapsed().as_secs_f64(),
+                adjusted.scale_std,
+                adjusted.report
+            );
+            println!("  {:?}", adjusted.calibration);
+        }
+        run.adjusted = Some(adjusted);
     }
     // Ground truth is in the IMU's clock.
     let offset = Duration::from_secs_f64(odometry.timing().time_offset_secs);

@@ -8,9 +8,11 @@
 //! - [`initialization`]: the first metric state, from standstill, in motion, or up to scale without an IMU;
 //! - `tracking`: features followed from image to image, seeds, keyframes and the sliding window of frames;
 //! - [`backend`]: the fixed-lag smoother that estimates the window's states and landmarks;
+//! - [`bundle_adjustment`]: after a recording's end, all states, landmarks and the calibration in one adjustment;
 //! - `pipeline`: [`Odometry`], the push machine that connects them and monitors their health.
 
 pub mod backend;
+pub mod bundle_adjustment;
 mod config;
 mod error;
 pub mod frontend;

@@ -23,10 +23,14 @@ mod window;
 
 pub use config::{Linearisation, SmootherConfig};
 pub use covariance::CalibrationEstimate;
+pub(crate) use dense::dot;
 pub use inertial::GaugePriorSigmas;
+pub(crate) use inertial::{
+    Shift, Whitening, gauge_prior_at, jacobians as inertial_jacobians, residual as inertial_residual,
+};
 pub use marginalise::MarginalisationReport;
 pub use optimise::{OptimiseReport, Outlier};
-pub(crate) use visual::tangent_basis;
+pub(crate) use visual::{bearing_plus, tangent_basis, whitening};
 pub use window::{LandmarkEstimate, Observation};
 
 use crate::imu::{ImuModel, NavState, Preintegration};
@@ -334,7 +338,7 @@ impl Smoother {
         if !finite(&seen.pixel) {
             return Err(bad("pixel", format!("({}, {})", seen.pixel.x, seen.pixel.y)));
         }
-        let whitening = visual::whitening(&seen.covariance).ok_or_else(|| {
+        let whitening = whitening(&seen.covariance).ok_or_else(|| {
             let c: &Matrix2<f64> = &seen.covariance;
             bad("covariance", format!("[{} {}; {} {}]", c[(0, 0)], c[(0, 1)], c[(1, 0)], c[(1, 1)]))
         })?;

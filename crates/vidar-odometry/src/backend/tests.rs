@@ -153,7 +153,7 @@ fn reprojection_agrees_with_numeric_derivatives() {
         let by_target = |d: &SVector<f64, 6>| pixel(&h, &pose_plus(&target, d), &place, &bearing, rho);
         check_jacobian("target", &j.by_target, by_target, &zero, 1e-6).unwrap();
         let by_landmark = |d: &Vector3<f64>| {
-            pixel(&h, &t, &place, &visual::bearing_plus(&bearing, &Vector2::new(d.x, d.y)), rho + d.z)
+            pixel(&h, &t, &place, &bearing_plus(&bearing, &Vector2::new(d.x, d.y)), rho + d.z)
         };
         check_jacobian("landmark", &j.by_landmark, by_landmark, &Vector3::zeros(), 1e-6).unwrap();
         let by_place = visual::by_body_from_camera(&camera, &at_h, &at_t, &bearing, rho).unwrap();

@@ -8,6 +8,7 @@ mod orientation_check;
 mod output;
 mod time_calibration;
 
+pub(crate) use keyframes::public_state;
 pub use odometry::{InputCounts, Odometry};
 pub use output::{DivergenceSign, LossReason, OdometryOutput, Status, TrackSummary, Tracking};
 pub use time_calibration::CameraTiming;

@@ -6,6 +6,7 @@ use super::orientation_check::{MAX_TURN_DEG, OrientationCheck};
 use super::output::{DivergenceSign, LossReason, OdometryOutput, Status, TrackSummary, Tracking};
 use super::time_calibration::{CameraTiming, TimeCalibration};
 use crate::backend::{CalibrationEstimate, Smoother, SmootherError};
+use crate::bundle_adjustment::{self, Adjusted, AdjustmentError, CalibrationSigmas, LoggedState, TrackLog};
 use crate::config::{ImuUse, OdometryConfig};
 use crate::error::OdometryError;
 use crate::frontend::FrontendConfig;
@@ -14,10 +15,10 @@ use crate::imu::{Bias, ImuBuffer, ImuModel, Preintegration, propagate};
 use crate::initialization::{INITIAL_INVERSE_DISTANCE, InitialState, Initializer, STILL_SECS};
 use crate::initialization::{InitFailure, InitFailureReason, StaticInitConfig, initialize_static};
 use crate::stages::{Stage, StageClock, StageTimes};
-use crate::tracking::HostImage;
 use crate::tracking::ImuStatistics;
 use crate::tracking::Tracker;
 use crate::tracking::{FrameInput, SlidingWindowOdometry, StepReport};
+use crate::tracking::{HostImage, host_covariance, noisy_covariance};
 use crate::tracking::{ImagePool, TrackRecord};
 use nalgebra::Vector3;
 use std::collections::VecDeque;
@@ -87,6 +88,8 @@ pub struct Odometry {
     time_calibration: TimeCalibration,
     images: ImagePool,
     clock: StageClock,
+    /// What is kept for the adjustment, where one is wanted.
+    log: Option<TrackLog>,
 }
 
 impl Odometry {
@@ -123,6 +126,7 @@ impl Odometry {
             time_calibration,
             images: ImagePool::default(),
             clock: StageClock::start(),
+            log: None,
             camera: rig_camera,
             imu_model,
             imu: ImuBuffer::new(noise.map_or(200.0, |n| n.rate_hz)),
@@ -154,6 +158,9 @@ impl Odometry {
             SensorEvent::Imu(sample) if self.imu_model.is_some() => match self.imu.push(sample) {
                 Ok(()) => {
                     self.counts.imu_samples += 1;
+                    if let Some(log) = &mut self.log {
+                        log.add_imu(&sample);
+                    }
                     match self.imu_model.is_some_and(|m| sample.gyro.0.amax() >= m.gyro_limit) {
                         true => self.time_calibration.forget(),
                         false => self.time_calibration.add_gyro(&sample),
@@ -301,6 +308,7 @@ impl Odometry {
         let host = self.images.take(id, &frame.image, self.frontend.pyramid.levels, self.shutter_at(time))?;
         let was_starting = matches!(self.phase, Phase::Initializing(_));
         let status = self.status_after(&frame, host, time);
+        self.log_image(&frame, id, &status);
         let status = self.recalibrate(&frame, id).unwrap_or(status);
         self.clock.lap(if was_starting { Stage::Initialise } else { Stage::Output });
         self.imu.forget_before(self.last_frame.unwrap_or(time) - Duration::from_millis(1500));
@@ -421,6 +429,51 @@ impl Odometry {
         self.time_calibration.add_image(stamp, shown);
     }
 
+    /// Logs what image `id` shows, where a log is kept and the image is due or a keyframe.
+    fn log_image(&mut self, frame: &Frame, id: FrameId, status: &Status) {
+        let Some(log) = &mut self.log else { return };
+        log.add_stamp(frame.id, frame.time);
+        let is_keyframe = matches!(status, Status::Tracking(tracking) if tracking.keyframe.is_some());
+        if !is_keyframe && !log.is_due(frame.time) {
+            return;
+        }
+        let (tracks, state) = match &self.phase {
+            Phase::Initializing(initializer) => (&initializer.tracker.tracks, None),
+            Phase::Tracking(window) => (&window.tracker.tracks, window.state()),
+        };
+        let noise_px = self.config.pixel_noise_px;
+        let shown = tracks.iter().filter_map(|t| match &t.measured {
+            _ if t.host.frame == id => Some((t.id, &t.feature.pixel, host_covariance(t))),
+            Some(measured) if t.last_frame == id => {
+                Some((t.id, &t.last_pixel, noisy_covariance(measured, noise_px)))
+            }
+            _ => None,
+        });
+        let state = state.map(|state| LoggedState { segment: self.segment, state });
+        log.add_image(id, frame.time, state, shown);
+        if let Phase::Tracking(window) = &self.phase {
+            log.follow(&window.smoother);
+        }
+    }
+
+    /// Keeps tracks and IMU measurements from here on, for [`Odometry::adjust`]: about 2 MB per minute of recording.
+    pub fn keep_log(&mut self) {
+        self.log = Some(TrackLog::new(1.0 / self.imu.nominal_period().as_secs_f64()));
+    }
+
+    /// One adjustment of all states that the log holds; see [`bundle_adjustment`].
+    ///
+    /// # Errors
+    /// No log was kept or there is no IMU; otherwise as [`bundle_adjustment::adjust`].
+    pub fn adjust(&self, sigmas: &CalibrationSigmas) -> Result<Adjusted, AdjustmentError> {
+        let (Some(log), Some(model)) = (&self.log, &self.imu_model) else {
+            return Err(AdjustmentError::TooShort { images: 0 });
+        };
+        let mut camera = self.camera.clone();
+        camera.time_offset += self.estimated_offset();
+        bundle_adjustment::adjust(log, &camera, self.time_calibration.readout_secs, model, sigmas)
+    }
+
     /// A stretch without images or IMU measurements that cannot be bridged.
     fn gap_before(&mut self, time: Timestamp) -> Option<LossReason> {
         let (Phase::Tracking(_), Some(last)) = (&self.phase, self.last_frame) else {
@@ -509,6 +562,7 @@ impl Odometry {
             Err(failure) => return self.wait(failure),
         };
         self.time_calibration.forget_tracks();
+        self.log.iter_mut().for_each(TrackLog::next_generation);
         let Ok(mut smoother) = self.smoother() else { return self.wait(self.failure.clone()) };
         let begun = smoother.start(host.frame, time, at_rest.state, at_rest.sigmas);
         if begun.and_then(|()| smoother.mark_keyframe(host.frame)).is_err() {
@@ -645,6 +699,7 @@ impl Odometry {
 
     fn initialize_anew(&mut self) {
         self.time_calibration.forget_tracks();
+        self.log.iter_mut().for_each(TrackLog::next_generation);
         self.phase = Phase::Initializing(Box::new(initializer(
             &self.config,
             self.imu_model.is_none(),

@@ -1,0 +1,154 @@
+//! Symmetric matrices stored by rows from their first non-zero entry (envelope, skyline), and their Cholesky factor.
+//!
+//! States that see the same landmarks are neighbours in time, so that the reduced system of a recording is a band with a few
+//! full rows for the calibration: factorising it costs the square of the band's width per row, and the factor fills nothing
+//! outside the envelope (George and Liu 1981, chapter 4).
+
+use crate::backend::dot;
+
+/// Lower triangle of a symmetric matrix, or its Cholesky factor.
+#[derive(Clone, Debug)]
+pub(super) struct Envelope {
+    /// First stored column of every row.
+    first: Vec<usize>,
+    /// Where every row begins in `values`; one more than there are rows.
+    begin: Vec<usize>,
+    values: Vec<f64>,
+}
+
+impl Envelope {
+    /// A matrix of zeros whose row `i` is stored from column `first[i] ≤ i` on.
+    pub(super) fn new(first: Vec<usize>) -> Self {
+        let mut begin = Vec::with_capacity(first.len() + 1);
+        let mut length = 0;
+        for (row, column) in first.iter().enumerate() {
+            begin.push(length);
+            length += row + 1 - column;
+        }
+        begin.push(length);
+        Self { first, begin, values: vec![0.0; length] }
+    }
+
+    /// Rows.
+    pub(super) fn dim(&self) -> usize {
+        self.first.len()
+    }
+
+    /// Sets every entry to zero.
+    pub(super) fn clear(&mut self) {
+        self.values.fill(0.0);
+    }
+
+    /// Adds to an entry of the lower triangle that the envelope holds.
+    pub(super) fn add(&mut self, row: usize, column: usize, value: f64) {
+        debug_assert!(
+            column <= row && column >= self.first[row],
+            "({row}, {column}) is outside the envelope"
+        );
+        self.values[self.begin[row] + column - self.first[row]] += value;
+    }
+
+    /// Entry of the diagonal.
+    pub(super) fn diagonal(&self, row: usize) -> f64 {
+        self.values[self.begin[row + 1] - 1]
+    }
+
+    fn row(&self, row: usize) -> &[f64] {
+        &self.values[self.begin[row]..self.begin[row + 1]]
+    }
+
+    /// Factorises `self + diag(extra)` into `factor`, which has the same envelope; whether it is positive definite.
+    pub(super) fn factorise(&self, extra: &[f64], factor: &mut Self) -> bool {
+        factor.values.copy_from_slice(&self.values);
+        for i in 0..self.dim() {
+            let (first, begin) = (self.first[i], self.begin[i]);
+            let (above, rest) = factor.values.split_at_mut(begin);
+            let row = &mut rest[..i + 1 - first];
+            for j in first..i {
+                let first_j = self.first[j];
+                let from = first.max(first_j);
+                let other = &above[self.begin[j]..self.begin[j + 1]];
+                let known = dot(&row[from - first..j - first], &other[from - first_j..j - first_j]);
+                row[j - first] = (row[j - first] - known) / other[j - first_j];
+            }
+            let (left, last) = row.split_at_mut(i - first);
+            let pivot = last[0] + extra[i] - dot(left, left);
+            if !(pivot > 0.0 && pivot.is_finite()) {
+                return false;
+            }
+            last[0] = pivot.sqrt();
+        }
+        true
+    }
+
+    /// `L⁻¹ b` in place, for a factor.
+    pub(super) fn forward(&self, b: &mut [f64]) {
+        for i in 0..self.dim() {
+            let row = self.row(i);
+            let (left, diagonal) = row.split_at(row.len() - 1);
+            b[i] = (b[i] - dot(left, &b[self.first[i]..i])) / diagonal[0];
+        }
+    }
+
+    /// `L⁻ᵀ b` in place, for a factor.
+    pub(super) fn backward(&self, b: &mut [f64]) {
+        for i in (0..self.dim()).rev() {
+            let row = self.row(i);
+            let (left, diagonal) = row.split_at(row.len() - 1);
+            let value = b[i] / diagonal[0];
+            b[i] = value;
+            for (target, l) in b[self.first[i]..i].iter_mut().zip(left) {
+                *target -= l * value;
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use nalgebra::{DMatrix, DVector};
+
+    /// A positive definite matrix with this envelope.
+    fn example(first: &[usize]) -> (Envelope, DMatrix<f64>) {
+        let n = first.len();
+        let mut envelope = Envelope::new(first.to_vec());
+        let mut dense = DMatrix::zeros(n, n);
+        for i in 0..n {
+            for j in first[i]..=i {
+                let value = if i == j { 10.0 + i as f64 } else { ((3 * i + 7 * j) as f64).sin() };
+                envelope.add(i, j, value);
+                dense[(i, j)] = value;
+                dense[(j, i)] = value;
+            }
+        }
+        (envelope, dense)
+    }
+
+    #[test]
+    fn a_band_with_a_full_last_row_is_solved_as_a_dense_matrix_is() {
+        let (envelope, mut dense) = example(&[0, 0, 1, 1, 3, 4, 2, 0]);
+        let extra: Vec<f64> = (0..8).map(|i| 0.1 * f64::from(i)).collect();
+        for (i, e) in extra.iter().enumerate() {
+            dense[(i, i)] += e;
+        }
+        let mut factor = envelope.clone();
+        assert!(envelope.factorise(&extra, &mut factor));
+        let b = DVector::from_fn(8, |i, _| (i as f64).cos());
+        let mut x = b.as_slice().to_vec();
+        factor.forward(&mut x);
+        factor.backward(&mut x);
+        let expected = dense.lu().solve(&b).unwrap();
+        for (found, wanted) in x.iter().zip(expected.iter()) {
+            assert!((found - wanted).abs() < 1e-12, "{found} instead of {wanted}");
+        }
+    }
+
+    #[test]
+    fn an_indefinite_matrix_is_refused() {
+        let (mut envelope, _) = example(&[0, 0, 0]);
+        envelope.add(2, 2, -30.0);
+        let mut factor = envelope.clone();
+        assert!(!envelope.factorise(&[0.0; 3], &mut factor));
+    }
+}

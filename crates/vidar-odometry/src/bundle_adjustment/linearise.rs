@@ -1,0 +1,281 @@
+//! Cost and normal equations: inertial factors, reprojections with the landmarks eliminated, priors.
+
+use super::envelope::Envelope;
+use super::observation::{self, Linearised, STATE_DIM};
+use super::problem::{FRAME_DIM, ObservedLandmark, Problem};
+use crate::backend::{
+    GaugePriorSigmas, Shift, Whitening, gauge_prior_at, inertial_jacobians, inertial_residual,
+};
+use crate::imu::{Matrix15, Vector15};
+use nalgebra::{Matrix3, SMatrix, Vector2, Vector3};
+use vidar_solve::Kernel;
+
+/// Loss of whitened reprojection errors: quadratic to 2 standard deviations, then without influence in the end. Tracks of the
+/// front end have 2 to 5 % gross errors, which Huber's loss lets bend the path.
+pub(super) const KERNEL: Kernel = Kernel::Cauchy { k: 2.0 };
+
+/// Squared whitened error of an observation that does not project at all.
+const BEHIND: f64 = 100.0;
+
+/// What the adjustment's total is made of.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub(super) struct Cost {
+    pub(super) visual: f64,
+    pub(super) inertial: f64,
+    pub(super) priors: f64,
+}
+
+impl Cost {
+    pub(super) fn total(&self) -> f64 {
+        self.visual + self.inertial + self.priors
+    }
+}
+
+/// A landmark's block of the normal equations, kept to find its step from the states'.
+#[derive(Clone, Debug, Default)]
+pub(super) struct LandmarkBlock {
+    /// Inverse of the damped 3 × 3 block; `None` leaves the landmark where it is.
+    inverse: Option<Matrix3<f64>>,
+    gradient: Vector3<f64>,
+    /// `Jᵀ J` between the unknowns of each observation's state and the landmark.
+    by_state: Vec<(usize, SMatrix<f64, STATE_DIM, 3>)>,
+    by_calibration: Vec<Vector3<f64>>,
+}
+
+/// The reduced normal equations `H x = −g` of states and calibration.
+#[derive(Clone, Debug)]
+pub(super) struct System {
+    pub(super) h: Envelope,
+    pub(super) factor: Envelope,
+    pub(super) gradient: Vec<f64>,
+    pub(super) landmarks: Vec<LandmarkBlock>,
+}
+
+impl System {
+    pub(super) fn new(problem: &Problem) -> Self {
+        let h = problem.envelope();
+        Self { factor: h.clone(), h, gradient: vec![0.0; problem.dim()], landmarks: Vec::new() }
+    }
+}
+
+/// Squared whitened error of an observation.
+pub(super) fn squared_error(problem: &Problem, seen: &ObservedLandmark, at: usize) -> f64 {
+    let measured = &seen.observations[at];
+    let body = &problem.frames[measured.frame].body;
+    match observation::project(body, &seen.landmark, &problem.calibration, &measured.pixel) {
+        Some(pixel) => (measured.whitening * (pixel - measured.pixel)).norm_squared(),
+        None => BEHIND,
+    }
+}
+
+/// The cost at the present values.
+pub(super) fn cost(problem: &Problem) -> Cost {
+    let mut cost = Cost::default();
+    for seen in &problem.landmarks {
+        for at in 0..seen.observations.len() {
+            cost.visual += KERNEL.loss(squared_error(problem, seen, at));
+        }
+    }
+    for k in 1..problem.frames.len() {
+        cost.inertial += 0.5 * inertial_error(problem, k).map_or(0.0, |r| r.norm_squared());
+    }
+    let state = &problem.frames[0].body.state;
+    let (gauge, _) = gauge_prior_at(&problem.gauge, &GaugePriorSigmas::GAUGE, state, state);
+    cost.priors += 0.5 * gauge.norm_squared();
+    for (value, sigma) in problem.calibration.minus(&problem.prior.mean).iter().zip(&problem.prior.sigmas) {
+        if *sigma > 0.0 {
+            cost.priors += 0.5 * (value / sigma).powi(2);
+        }
+    }
+    cost
+}
+
+/// Whitened inertial residual between a state and the one before.
+pub(super) fn inertial_error(problem: &Problem, k: usize) -> Option<Vector15> {
+    let preintegration = problem.frames[k].preintegration.as_ref()?;
+    let (i, j) = (&problem.frames[k - 1].body.state, &problem.frames[k].body.state);
+    Some(Whitening::of(preintegration).apply(&inertial_residual(preintegration, i, j, Shift::default())))
+}
+
+/// Fills the reduced system at the present values. `damping` is added, relatively, to the landmarks' diagonal.
+pub(super) fn linearise(problem: &Problem, damping: f64, system: &mut System) {
+    system.h.clear();
+    system.gradient.fill(0.0);
+    add_priors(problem, system);
+    for k in 1..problem.frames.len() {
+        add_inertial(problem, k, system);
+    }
+    let mut blocks = std::mem::take(&mut system.landmarks);
+    blocks.resize_with(problem.landmarks.len(), LandmarkBlock::default);
+    for (seen, block) in problem.landmarks.iter().zip(&mut blocks) {
+        add_landmark(problem, seen, damping, block, system);
+    }
+    system.landmarks = blocks;
+}
+
+fn add_priors(problem: &Problem, system: &mut System) {
+    let state = &problem.frames[0].body.state;
+    let (residual, jacobian) = gauge_prior_at(&problem.gauge, &GaugePriorSigmas::GAUGE, state, state);
+    add_block(system, 0, 0, &(jacobian.transpose() * jacobian));
+    add_gradient(system, 0, &(jacobian.transpose() * residual));
+    let offset = problem.calibration_offset();
+    let moved = problem.calibration.minus(&problem.prior.mean);
+    for (k, index) in problem.active.iter().enumerate() {
+        let weight = problem.prior.sigmas[*index].powi(-2);
+        system.h.add(offset + k, offset + k, weight);
+        system.gradient[offset + k] += weight * moved[*index];
+    }
+}
+
+fn add_inertial(problem: &Problem, k: usize, system: &mut System) {
+    let Some(preintegration) = problem.frames[k].preintegration.as_ref() else { return };
+    let (i, j) = (&problem.frames[k - 1].body.state, &problem.frames[k].body.state);
+    let whitening = Whitening::of(preintegration);
+    let residual = whitening.apply(&inertial_residual(preintegration, i, j, Shift::default()));
+    let (by_i, by_j) = inertial_jacobians(preintegration, i, j, Shift::default());
+    let (by_i, by_j) = (whitening.apply(&by_i), whitening.apply(&by_j));
+    let (at_i, at_j) = (FRAME_DIM * (k - 1), FRAME_DIM * k);
+    add_block(system, at_i, at_i, &(by_i.transpose() * by_i));
+    add_block(system, at_j, at_j, &(by_j.transpose() * by_j));
+    let across = by_j.transpose() * by_i;
+    for row in 0..FRAME_DIM {
+        for column in 0..FRAME_DIM {
+            system.h.add(at_j + row, at_i + column, across[(row, column)]);
+        }
+    }
+    add_gradient(system, at_i, &(by_i.transpose() * residual));
+    add_gradient(system, at_j, &(by_j.transpose() * residual));
+}
+
+/// Adds a symmetric block of the diagonal.
+fn add_block(system: &mut System, at_row: usize, at_column: usize, block: &Matrix15) {
+    for row in 0..FRAME_DIM {
+        for column in 0..=row {
+            system.h.add(at_row + row, at_column + column, block[(row, column)]);
+        }
+    }
+}
+
+fn add_gradient(system: &mut System, at: usize, gradient: &Vector15) {
+    for (sum, value) in system.gradient[at..at + FRAME_DIM].iter_mut().zip(gradient.iter()) {
+        *sum += value;
+    }
+}
+
+/// Adds a landmark's observations, with the landmark eliminated (Schur complement).
+fn add_landmark(
+    problem: &Problem,
+    seen: &ObservedLandmark,
+    damping: f64,
+    block: &mut LandmarkBlock,
+    system: &mut System,
+) {
+    let calibrations = problem.active.len();
+    let offset = problem.calibration_offset();
+    block.by_state.clear();
+    block.by_calibration.clear();
+    block.by_calibration.resize(calibrations, Vector3::zeros());
+    block.gradient = Vector3::zeros();
+    let mut own = Matrix3::zeros();
+    for measured in &seen.observations {
+        let body = &problem.frames[measured.frame].body;
+        let Some(at) = observation::linearise(body, &seen.landmark, &problem.calibration, &measured.pixel)
+        else {
+            continue;
+        };
+        let residual: Vector2<f64> = measured.whitening * (at.pixel - measured.pixel);
+        let root_weight = KERNEL.weight(residual.norm_squared()).sqrt();
+        let whitening = measured.whitening * root_weight;
+        let residual = residual * root_weight;
+        let Linearised { by_state, by_landmark, by_calibration, .. } = at;
+        let (by_state, by_landmark) = (whitening * by_state, whitening * by_landmark);
+        own += by_landmark.transpose() * by_landmark;
+        block.gradient += by_landmark.transpose() * residual;
+        block.by_state.push((measured.frame, by_state.transpose() * by_landmark));
+        let from = FRAME_DIM * measured.frame;
+        let square = by_state.transpose() * by_state;
+        let gradient = by_state.transpose() * residual;
+        for row in 0..STATE_DIM {
+            system.gradient[from + row] += gradient[row];
+            for column in 0..=row {
+                system.h.add(from + row, from + column, square[(row, column)]);
+            }
+        }
+        for (k, index) in problem.active.iter().enumerate() {
+            let by_one = whitening * by_calibration[*index];
+            block.by_calibration[k] += by_landmark.transpose() * by_one;
+            system.gradient[offset + k] += by_one.dot(&residual);
+            let with_state = by_state.transpose() * by_one;
+            for row in 0..STATE_DIM {
+                system.h.add(offset + k, from + row, with_state[row]);
+            }
+            for (other, other_index) in problem.active[..=k].iter().enumerate() {
+                system.h.add(
+                    offset + k,
+                    offset + other,
+                    by_one.dot(&(whitening * by_calibration[*other_index])),
+                );
+            }
+        }
+    }
+    for k in 0..3 {
+        // The floor keeps a landmark whose distance nothing tells where it is.
+        own[(k, k)] += damping * own[(k, k)] + 1e-9;
+    }
+    block.inverse = own.try_inverse();
+    let Some(inverse) = block.inverse else { return };
+    eliminate(problem, block, &inverse, system);
+}
+
+fn eliminate(problem: &Problem, block: &LandmarkBlock, inverse: &Matrix3<f64>, system: &mut System) {
+    let offset = problem.calibration_offset();
+    let own_step = inverse * block.gradient;
+    for (at, (frame, by_state)) in block.by_state.iter().enumerate() {
+        let from = FRAME_DIM * frame;
+        let weighted = by_state * inverse;
+        let gradient = by_state * own_step;
+        for row in 0..STATE_DIM {
+            system.gradient[from + row] -= gradient[row];
+        }
+        for (other_frame, other) in &block.by_state[..=at] {
+            let product = weighted * other.transpose();
+            let other_from = FRAME_DIM * other_frame;
+            let is_diagonal = other_frame == frame;
+            for row in 0..STATE_DIM {
+                let columns = if is_diagonal { row + 1 } else { STATE_DIM };
+                for column in 0..columns {
+                    system.h.add(from + row, other_from + column, -product[(row, column)]);
+                }
+            }
+        }
+        for (k, by_calibration) in block.by_calibration.iter().enumerate() {
+            let product = weighted * by_calibration;
+            for row in 0..STATE_DIM {
+                system.h.add(offset + k, from + row, -product[row]);
+            }
+        }
+    }
+    for (k, by_calibration) in block.by_calibration.iter().enumerate() {
+        system.gradient[offset + k] -= by_calibration.dot(&own_step);
+        let weighted = inverse * by_calibration;
+        for (other, by_other) in block.by_calibration[..=k].iter().enumerate() {
+            system.h.add(offset + k, offset + other, -weighted.dot(by_other));
+        }
+    }
+}
+
+impl LandmarkBlock {
+    /// The landmark's step that belongs to a step of states and calibration.
+    pub(super) fn step(&self, step: &[f64], calibration_offset: usize) -> Option<Vector3<f64>> {
+        let mut gradient = self.gradient;
+        for (frame, by_state) in &self.by_state {
+            let from = FRAME_DIM * frame;
+            let moved = SMatrix::<f64, STATE_DIM, 1>::from_column_slice(&step[from..from + STATE_DIM]);
+            gradient += by_state.transpose() * moved;
+        }
+        for (by_calibration, moved) in self.by_calibration.iter().zip(&step[calibration_offset..]) {
+            gradient += by_calibration * *moved;
+        }
+        Some(-(self.inverse? * gradient))
+    }
+}

@@ -1,0 +1,133 @@
+//! What the odometry saw, kept for the adjustment after the recording's end.
+
+use crate::backend::Smoother;
+use crate::imu::NavState;
+use nalgebra::{Matrix2, Vector2};
+use vidar_core::{Duration, FrameId, ImuSample, LandmarkId, Timestamp, camera::Pixel};
+
+/// Images are logged this far apart, and keyframes in any case: preintegration over it is good to a tenth of a millimetre,
+/// and a hand turns by less than 20° in it.
+const LOG_PERIOD: Duration = Duration::from_millis(200);
+
+/// Logged images whose states are brought up to date with the window: more than any window holds.
+const NEWEST_IMAGES: usize = 48;
+
+/// A feature track. Numbers begin anew with every start of the tracker, which the generation counts.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord)]
+pub(crate) struct TrackKey {
+    pub(crate) generation: u32,
+    pub(crate) track: LandmarkId,
+}
+
+/// Where an image shows a track, as read out (the rolling shutter's motion is in it). 32 bytes: an hour at five images per
+/// second with 150 tracks each is 90 MB.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct LoggedObservation {
+    pub(crate) key: TrackKey,
+    pixel: [f32; 2],
+    /// xx, xy, yy.
+    covariance: [f32; 3],
+}
+
+impl LoggedObservation {
+    pub(crate) fn new(key: TrackKey, pixel: &Pixel, covariance: &Matrix2<f64>) -> Self {
+        let c = covariance;
+        Self {
+            key,
+            pixel: [pixel.x as f32, pixel.y as f32],
+            covariance: [c[(0, 0)] as f32, c[(0, 1)] as f32, c[(1, 1)] as f32],
+        }
+    }
+
+    pub(crate) fn pixel(&self) -> Pixel {
+        Vector2::new(self.pixel[0].into(), self.pixel[1].into())
+    }
+
+    pub(crate) fn covariance(&self) -> Matrix2<f64> {
+        let [xx, xy, yy] = self.covariance.map(f64::from);
+        Matrix2::new(xx, xy, xy, yy)
+    }
+}
+
+/// The odometry's state at an image.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct LoggedState {
+    /// States of different segments are in different worlds.
+    pub(crate) segment: u32,
+    pub(crate) state: NavState,
+}
+
+/// An image with all that it showed.
+#[derive(Clone, Debug)]
+pub(crate) struct LoggedImage {
+    /// The odometry's own number.
+    frame: FrameId,
+    /// Its stamp, in the clock of the images.
+    pub(crate) stamp: Timestamp,
+    pub(crate) observations: Vec<LoggedObservation>,
+    pub(crate) state: Option<LoggedState>,
+}
+
+/// Feature tracks, IMU measurements and states of a recording.
+#[derive(Clone, Debug, Default)]
+pub struct TrackLog {
+    pub(crate) images: Vec<LoggedImage>,
+    /// Number and stamp of every image.
+    pub(crate) stamps: Vec<(FrameId, Timestamp)>,
+    pub(crate) imu: Vec<ImuSample>,
+    /// The IMU's rate, Hz.
+    pub(crate) imu_rate_hz: f64,
+    generation: u32,
+}
+
+impl TrackLog {
+    pub(crate) fn new(imu_rate_hz: f64) -> Self {
+        Self { imu_rate_hz, ..Self::default() }
+    }
+
+    /// The tracker starts anew.
+    pub(crate) fn next_generation(&mut self) {
+        self.generation = self.generation.wrapping_add(1);
+    }
+
+    pub(crate) fn add_imu(&mut self, sample: &ImuSample) {
+        self.imu.push(*sample);
+    }
+
+    /// An image that the caller calls `caller_frame`.
+    pub(crate) fn add_stamp(&mut self, caller_frame: FrameId, stamp: Timestamp) {
+        self.stamps.push((caller_frame, stamp));
+    }
+
+    /// Whether an image taken at `stamp` is due to be logged.
+    pub(crate) fn is_due(&self, stamp: Timestamp) -> bool {
+        self.images.last().is_none_or(|last| stamp - last.stamp >= LOG_PERIOD)
+    }
+
+    /// Logs an image.
+    pub(crate) fn add_image<'a>(
+        &mut self,
+        frame: FrameId,
+        stamp: Timestamp,
+        state: Option<LoggedState>,
+        shown: impl Iterator<Item = (LandmarkId, &'a Pixel, Matrix2<f64>)>,
+    ) {
+        let generation = self.generation;
+        let observations = shown
+            .map(|(track, pixel, covariance)| {
+                LoggedObservation::new(TrackKey { generation, track }, pixel, &covariance)
+            })
+            .collect();
+        self.images.push(LoggedImage { frame, stamp, observations, state });
+    }
+
+    /// Brings the states of images that the window still holds up to date.
+    pub(crate) fn follow(&mut self, smoother: &Smoother) {
+        let newest = self.images.len().saturating_sub(NEWEST_IMAGES);
+        for image in &mut self.images[newest..] {
+            if let (Some(logged), Some(state)) = (&mut image.state, smoother.state(image.frame)) {
+                logged.state = *state;
+            }
+        }
+    }
+}

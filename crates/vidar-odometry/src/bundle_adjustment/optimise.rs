@@ -1,0 +1,139 @@
+//! Levenberg-Marquardt over the whole recording, with gross errors left out round by round.
+
+use super::linearise::{Cost, System, cost, inertial_error, linearise, squared_error};
+use super::problem::{FRAME_DIM, Problem};
+use crate::imu::Vector15;
+use nalgebra::Vector3;
+
+/// Rounds of minimising and leaving out what does not fit.
+const ROUNDS: usize = 3;
+
+/// Iterations of a round at most. The cost of healthy recordings settles within ten.
+const ITERATIONS: usize = 15;
+
+/// A round ends when an iteration lowers the cost by less than this share.
+const SETTLED_SHARE: f64 = 1e-4;
+
+/// First damping, and the largest at which a descent is still looked for.
+const FIRST_DAMPING: f64 = 1e-4;
+const MAX_DAMPING: f64 = 1e4;
+
+/// Squared whitened error, 2 degrees of freedom, beyond which an observation is left out: 99.9 %, and in the first round
+/// more, where states are still to settle.
+const OUTLIER_CHI2: [f64; ROUNDS] = [100.0, 25.0, 13.8];
+
+/// Fewest observations of a landmark.
+const MIN_OBSERVATIONS: usize = 3;
+
+/// What the optimisation did.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub(super) struct OptimiseReport {
+    pub(super) before: Cost,
+    pub(super) after: Cost,
+    pub(super) iterations: usize,
+    pub(super) observations: usize,
+    pub(super) rejected: usize,
+}
+
+/// Minimises the cost. Returns the system at the solution, without damping, or `None` where it is not positive definite.
+pub(super) fn optimise(problem: &mut Problem) -> (OptimiseReport, Option<System>) {
+    let mut report = OptimiseReport { before: cost(problem), ..OptimiseReport::default() };
+    for limit in OUTLIER_CHI2 {
+        report.iterations += minimise(problem);
+        report.rejected += reject(problem, limit);
+    }
+    report.iterations += minimise(problem);
+    report.after = cost(problem);
+    report.observations = problem.landmarks.iter().map(|l| l.observations.len()).sum();
+    let mut system = System::new(problem);
+    linearise(problem, 0.0, &mut system);
+    let is_definite = system.h.factorise(&vec![0.0; problem.dim()], &mut system.factor);
+    (report, is_definite.then_some(system))
+}
+
+fn minimise(problem: &mut Problem) -> usize {
+    let mut system = System::new(problem);
+    let mut damping = FIRST_DAMPING;
+    let mut best = cost(problem).total();
+    for iteration in 0..ITERATIONS {
+        follow_biases(problem);
+        let mut lowered = None;
+        while damping <= MAX_DAMPING {
+            linearise(problem, damping, &mut system);
+            let extra: Vec<f64> =
+                (0..problem.dim()).map(|k| damping * system.h.diagonal(k).max(1e-12)).collect();
+            if system.h.factorise(&extra, &mut system.factor) {
+                let mut step: Vec<f64> = system.gradient.iter().map(|g| -g).collect();
+                system.factor.forward(&mut step);
+                system.factor.backward(&mut step);
+                let tried = moved(problem, &system, &step);
+                let found = tried.as_ref().map_or(f64::INFINITY, |p| cost(p).total());
+                if let Some(tried) = tried.filter(|_| found < best) {
+                    *problem = tried;
+                    lowered = Some(best - found);
+                    best = found;
+                    damping = (damping * 0.2).max(1e-9);
+                    break;
+                }
+            }
+            damping *= 8.0;
+        }
+        if lowered.is_none_or(|by| by < SETTLED_SHARE * best) {
+            return iteration + 1;
+        }
+    }
+    ITERATIONS
+}
+
+/// Integrates again where the biases have moved.
+fn follow_biases(problem: &mut Problem) {
+    for k in 1..problem.frames.len() {
+        let bias = problem.frames[k - 1].body.state.bias;
+        if let Some(preintegration) = &mut problem.frames[k].preintegration {
+            preintegration.follow(&bias);
+        }
+    }
+}
+
+fn moved(problem: &Problem, system: &System, step: &[f64]) -> Option<Problem> {
+    if step.iter().any(|v| !v.is_finite()) {
+        return None;
+    }
+    let offset = problem.calibration_offset();
+    let mut out = problem.clone();
+    for (k, frame) in out.frames.iter_mut().enumerate() {
+        let delta = Vector15::from_column_slice(&step[FRAME_DIM * k..FRAME_DIM * (k + 1)]);
+        frame.body.state = frame.body.state.plus(&delta);
+    }
+    for (seen, block) in out.landmarks.iter_mut().zip(&system.landmarks) {
+        let step: Vector3<f64> = block.step(step, offset).unwrap_or_default();
+        seen.landmark = seen.landmark.plus(&step);
+    }
+    out.calibration = problem.calibration_plus(&step[offset..])?;
+    Some(out)
+}
+
+/// Leaves out observations that do not fit, and landmarks of which too little is left; how many observations.
+fn reject(problem: &mut Problem, limit: f64) -> usize {
+    let keep: Vec<Vec<bool>> = problem
+        .landmarks
+        .iter()
+        .map(|seen| {
+            (0..seen.observations.len()).map(|at| squared_error(problem, seen, at) <= limit).collect()
+        })
+        .collect();
+    let before: usize = problem.landmarks.iter().map(|l| l.observations.len()).sum();
+    for (seen, keep) in problem.landmarks.iter_mut().zip(&keep) {
+        let mut kept = keep.iter();
+        seen.observations.retain(|_| kept.next().copied().unwrap_or(false));
+    }
+    problem.landmarks.retain(|seen| seen.observations.len() >= MIN_OBSERVATIONS);
+    before - problem.landmarks.iter().map(|l| l.observations.len()).sum::<usize>()
+}
+
+/// Mean squared whitened inertial residual per degree of freedom: 1 is expected of an IMU as its noise is stated.
+pub(super) fn inertial_chi2_per_dof(problem: &Problem) -> f64 {
+    let errors: Vec<f64> =
+        (1..problem.frames.len()).filter_map(|k| Some(inertial_error(problem, k)?.norm_squared())).collect();
+    errors.iter().sum::<f64>() / (FRAME_DIM * errors.len().max(1)) as f64
+}

@@ -1,0 +1,108 @@
+//! The unknowns of the adjustment and what was measured of them.
+
+use super::envelope::Envelope;
+use super::observation::{Calibration, Landmark, MovingBody, STATE_DIM};
+use crate::imu::{ImuBuffer, ImuModel, NavState, Preintegration};
+use nalgebra::{Matrix2, Vector3};
+use vidar_core::{Timestamp, camera::Pixel};
+
+/// Unknowns of a state: rotation, position, velocity, biases of gyroscope and accelerometer.
+pub(super) const FRAME_DIM: usize = 15;
+
+/// A state of the chain.
+#[derive(Clone, Debug)]
+pub(super) struct FrameState {
+    /// Instant of the state, in the IMU's clock.
+    pub(super) time: Timestamp,
+    pub(super) body: MovingBody,
+    /// Inertial factor from the state before; none at the beginning of a chain.
+    pub(super) preintegration: Option<Preintegration>,
+}
+
+/// An observation of a landmark.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Observation {
+    pub(super) frame: usize,
+    /// Where the image shows it, as read out.
+    pub(super) pixel: Pixel,
+    /// `W` with `WᵀW = Σ⁻¹`.
+    pub(super) whitening: Matrix2<f64>,
+}
+
+/// A landmark with all its observations, oldest first.
+#[derive(Clone, Debug)]
+pub(super) struct ObservedLandmark {
+    pub(super) landmark: Landmark,
+    pub(super) observations: Vec<Observation>,
+}
+
+/// Standard deviations of what is known of the calibration before; zero: it is not estimated.
+#[derive(Clone, Debug, PartialEq)]
+pub(super) struct CalibrationPrior {
+    pub(super) mean: Calibration,
+    /// In the order of [`super::observation::Linearised::by_calibration`].
+    pub(super) sigmas: Vec<f64>,
+}
+
+/// States, landmarks and calibration, with all measurements.
+#[derive(Clone, Debug)]
+pub(super) struct Problem {
+    pub(super) frames: Vec<FrameState>,
+    pub(super) landmarks: Vec<ObservedLandmark>,
+    pub(super) calibration: Calibration,
+    pub(super) prior: CalibrationPrior,
+    /// Indices of the calibration's unknowns that are estimated.
+    pub(super) active: Vec<usize>,
+    /// Where the first state is held: position and heading are free otherwise.
+    pub(super) gauge: NavState,
+}
+
+impl Problem {
+    /// Unknowns of the reduced system: states, then calibration.
+    pub(super) fn dim(&self) -> usize {
+        FRAME_DIM * self.frames.len() + self.active.len()
+    }
+
+    /// Where the calibration's unknowns begin.
+    pub(super) fn calibration_offset(&self) -> usize {
+        FRAME_DIM * self.frames.len()
+    }
+
+    /// The envelope of the reduced system: a state is tied to the one before and to all that share a landmark with it.
+    pub(super) fn envelope(&self) -> Envelope {
+        let mut oldest: Vec<usize> = (0..self.frames.len()).map(|k| k.saturating_sub(1)).collect();
+        for seen in &self.landmarks {
+            let Some(first) = seen.observations.first().map(|o| o.frame) else { continue };
+            for observation in &seen.observations {
+                oldest[observation.frame] = oldest[observation.frame].min(first);
+            }
+        }
+        let states = oldest.iter().flat_map(|first| [FRAME_DIM * first; FRAME_DIM]);
+        Envelope::new(states.chain(vec![0; self.active.len()]).collect())
+    }
+
+    /// The calibration moved by a step of its active unknowns; `None` where the camera would not be valid.
+    pub(super) fn calibration_plus(&self, step: &[f64]) -> Option<Calibration> {
+        let mut delta = vec![0.0; self.calibration.dim()];
+        for (index, value) in self.active.iter().zip(step) {
+            delta[*index] = *value;
+        }
+        self.calibration.plus(&delta)
+    }
+}
+
+impl FrameState {
+    /// A state at `time` with the sensors' readings around it; `None` where the IMU does not cover it.
+    pub(super) fn new(time: Timestamp, state: NavState, imu: &ImuBuffer, model: &ImuModel) -> Option<Self> {
+        let around = vidar_core::Duration::from_millis(10);
+        let now = imu.at(time)?;
+        let (before, after) = (imu.at(time - around).unwrap_or(now), imu.at(time + around).unwrap_or(now));
+        let secs = (after.time - before.time).as_secs_f64();
+        let gyro_change = if secs > 0.0 { (after.gyro.0 - before.gyro.0) / secs } else { Vector3::zeros() };
+        let body =
+            MovingBody { state, gyro: now.gyro.0, gyro_change, force: now.accel.0, gravity: model.gravity() };
+        Some(Self { time, body, preintegration: None })
+    }
+}
+
+const _: () = assert!(STATE_DIM < FRAME_DIM);

@@ -1,0 +1,195 @@
+//! What the adjustment found: calibration, scale, and a state for every image.
+
+use super::Solution;
+use super::initial::preintegrate;
+use super::linearise::System;
+use super::log::TrackLog;
+use super::optimise::inertial_chi2_per_dof;
+use super::problem::{FRAME_DIM, Problem};
+use crate::backend::dot;
+use crate::imu::{ImuBuffer, ImuModel, NavState};
+use crate::pipeline::public_state;
+use nalgebra::Vector3;
+use vidar_core::{CameraModel, Duration, FrameId, LieGroup, Se3, So3, Timestamp};
+
+/// Longest time before the first or after the last adjusted state that is carried by the IMU, s.
+const MAX_EDGE_SECS: f64 = 0.5;
+
+/// The camera's calibration as estimated, with standard deviations; zero where it was held.
+#[derive(Clone, Debug, PartialEq)]
+pub struct AdjustedCalibration {
+    /// Intrinsics.
+    pub camera: CameraModel,
+    /// Pose of the camera on the body.
+    pub body_from_camera: Se3,
+    /// `t_imu = stamp + offset`, s.
+    pub time_offset_secs: f64,
+    /// From the first to the last row, s.
+    pub readout_secs: f64,
+    /// Standard deviations: clock offset and readout (s), rotation (rad), position (m), intrinsics (their own units).
+    pub sigmas: Vec<f64>,
+}
+
+/// An image that took part in the adjustment.
+#[derive(Clone, Debug, PartialEq)]
+pub struct AdjustedKeyframe {
+    /// Its stamp, in the clock of the images.
+    pub stamp: Timestamp,
+    /// Its state.
+    pub state: vidar_core::NavState,
+}
+
+/// How the adjustment went.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct AdjustmentReport {
+    /// States adjusted.
+    pub states: usize,
+    /// Landmarks at the end.
+    pub landmarks: usize,
+    /// Observations at the end, and those that were left out.
+    pub observations: usize,
+    /// Observations that did not fit.
+    pub rejected: usize,
+    /// Iterations of all rounds.
+    pub iterations: usize,
+    /// Cost before and after.
+    pub cost: (f64, f64),
+    /// Mean squared whitened residual of the inertial factors.
+    pub inertial_chi2_per_dof: f64,
+}
+
+/// An adjusted recording. The world is levelled, z up, its origin where the first state was.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Adjusted {
+    /// A state for every image between the first and the last adjusted one, in the order of time.
+    pub images: Vec<(FrameId, vidar_core::NavState)>,
+    /// The images that took part.
+    pub keyframes: Vec<AdjustedKeyframe>,
+    /// The calibration.
+    pub calibration: AdjustedCalibration,
+    /// Standard deviation of ln(scale) over the whole path, as the measurements and their stated noise give it.
+    pub scale_std: f64,
+    /// How it went.
+    pub report: AdjustmentReport,
+}
+
+pub(super) fn collect(log: &TrackLog, imu: &ImuBuffer, model: &ImuModel, solution: &Solution) -> Adjusted {
+    let Solution { problem, guess, clock_offset, report, system } = solution;
+    let stamps: Vec<Timestamp> = guess.images.iter().map(|k| log.images[*k].stamp).collect();
+    let clock = Duration::from_secs_f64(problem.calibration.clock_secs);
+    // States at the images' true instants.
+    let states: Vec<(Timestamp, NavState)> = problem
+        .frames
+        .iter()
+        .map(|f| (f.time + clock, f.body.state_after(problem.calibration.clock_secs)))
+        .collect();
+    let offset = *clock_offset + clock;
+    let images = log
+        .stamps
+        .iter()
+        .filter_map(|(frame, stamp)| {
+            let state = state_at(&states, *stamp + offset, imu, model)?;
+            Some((*frame, public_state(&state, *stamp)))
+        })
+        .collect();
+    let keyframes = stamps
+        .iter()
+        .zip(&states)
+        .map(|(stamp, (_, state))| AdjustedKeyframe { stamp: *stamp, state: public_state(state, *stamp) })
+        .collect();
+    Adjusted {
+        images,
+        keyframes,
+        calibration: AdjustedCalibration {
+            camera: problem.calibration.camera.clone(),
+            body_from_camera: problem.calibration.body_from_camera,
+            time_offset_secs: offset.as_secs_f64(),
+            readout_secs: problem.calibration.readout_secs,
+            sigmas: calibration_sigmas(problem, system),
+        },
+        scale_std: log_scale_sigma(problem, system),
+        report: AdjustmentReport {
+            states: problem.frames.len(),
+            landmarks: problem.landmarks.len(),
+            observations: report.observations,
+            rejected: report.rejected,
+            iterations: report.iterations,
+            cost: (report.before.total(), report.after.total()),
+            inertial_chi2_per_dof: inertial_chi2_per_dof(problem),
+        },
+    }
+}
+
+/// The state at an instant: carried by the IMU from the adjusted state before it, and corrected by what the IMU misses the
+/// next one by, in proportion to the time.
+fn state_at(
+    states: &[(Timestamp, NavState)],
+    time: Timestamp,
+    imu: &ImuBuffer,
+    model: &ImuModel,
+) -> Option<NavState> {
+    let after = states.partition_point(|(t, _)| *t < time);
+    if let Some((_, state)) = states.get(after).filter(|(t, _)| *t == time) {
+        return Some(*state);
+    }
+    let mut interval = Vec::new();
+    let mut carry = |from: &(Timestamp, NavState), until: Timestamp| {
+        Some(preintegrate(imu, model, &from.1, from.0, until, &mut interval)?.predict(&from.1))
+    };
+    let is_near = |other: Timestamp| (time - other).as_secs_f64().abs() <= MAX_EDGE_SECS;
+    match (after.checked_sub(1).map(|k| &states[k]), states.get(after)) {
+        (Some(before), Some(next)) => {
+            let carried = carry(before, time)?;
+            let missed = carry(before, next.0)?;
+            let share = (time - before.0).nanos() as f64 / (next.0 - before.0).nanos() as f64;
+            let error = next.1.minus(&missed);
+            // Rotation, position, velocity; the biases are those of the state before.
+            let mut step = error * share;
+            step.fixed_rows_mut::<6>(9).fill(0.0);
+            Some(carried.plus(&step))
+        }
+        (Some(last), None) if is_near(last.0) => carry(last, time),
+        (None, Some(first)) if is_near(first.0) => {
+            let secs = (time - first.0).as_secs_f64();
+            let sample = imu.at(time)?;
+            let turn = So3::exp(&((sample.gyro.0 - first.1.bias.gyro) * secs));
+            let pose = &first.1.world_from_body;
+            let place = pose.translation + first.1.velocity * secs;
+            Some(NavState { world_from_body: Se3::new(pose.rotation * turn, place), ..first.1 })
+        }
+        _ => None,
+    }
+}
+
+/// Standard deviation of a linear function of the unknowns.
+fn sigma_of(mut slope: Vec<f64>, system: &System) -> f64 {
+    system.factor.forward(&mut slope);
+    dot(&slope, &slope).sqrt()
+}
+
+fn calibration_sigmas(problem: &Problem, system: &System) -> Vec<f64> {
+    let mut sigmas = vec![0.0; problem.calibration.dim()];
+    for (k, index) in problem.active.iter().enumerate() {
+        let mut unit = vec![0.0; problem.dim()];
+        unit[problem.calibration_offset() + k] = 1.0;
+        sigmas[*index] = sigma_of(unit, system);
+    }
+    sigmas
+}
+
+/// With positions `p_k` about their mean `m`, `d ln s / d p_k = (p_k − m) / Σ |p − m|²`.
+fn log_scale_sigma(problem: &Problem, system: &System) -> f64 {
+    let places: Vec<Vector3<f64>> =
+        problem.frames.iter().map(|f| f.body.state.world_from_body.translation).collect();
+    let mean = places.iter().sum::<Vector3<f64>>() / places.len() as f64;
+    let spread: f64 = places.iter().map(|p| (p - mean).norm_squared()).sum();
+    if !(spread > 0.0) {
+        return f64::INFINITY;
+    }
+    let mut slope = vec![0.0; problem.dim()];
+    for (k, place) in places.iter().enumerate() {
+        let at = FRAME_DIM * k + 3;
+        slope[at..at + 3].copy_from_slice(((place - mean) / spread).as_slice());
+    }
+    sigma_of(slope, system)
+}
