@@ -1,18 +1,15 @@
 //! First guess of all states and landmarks from the odometry's log.
 
-use super::log::{LoggedImage, TrackKey, TrackLog};
+use super::log::{TrackKey, TrackLog};
 use super::observation::{self, Calibration, Landmark, MIN_INVERSE_DISTANCE};
+use super::problem::CalibrationPrior;
 use super::problem::{FrameState, Observation, ObservedLandmark, Problem};
-use super::{AdjustmentError, CalibrationPrior};
+use super::{AdjustmentError, Recording};
 use crate::backend::whitening;
 use crate::imu::{ImuBuffer, ImuModel, NavState, Preintegration};
 use nalgebra::Vector3;
 use std::collections::BTreeMap;
 use vidar_core::{Duration, ImuSample, LieGroup, Se3, So3, Timestamp};
-
-/// Longest stretch without a state that the IMU alone carries, s: at 0.03 m/s² of error 0.4 m, which the tracks that run
-/// through it then correct.
-const MAX_BRIDGE_SECS: f64 = 5.0;
 
 /// Nearest landmark, 1/m.
 const MAX_INVERSE_DISTANCE: f64 = 20.0;
@@ -22,16 +19,16 @@ const MIN_PARALLAX_RAD: f64 = 2e-3;
 const TYPICAL_INVERSE_DISTANCE: f64 = 0.3;
 
 /// Fewest images that see a landmark.
-const MIN_OBSERVATIONS: usize = 3;
+pub(super) const MIN_OBSERVATIONS: usize = 3;
 
 /// States to start from, of consecutive logged images.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Default)]
 pub(super) struct Guess {
     /// Which images of the log.
     pub(super) images: Vec<usize>,
     /// Instants of the states, in the IMU's clock.
-    times: Vec<Timestamp>,
-    states: Vec<NavState>,
+    pub(super) times: Vec<Timestamp>,
+    pub(super) states: Vec<NavState>,
 }
 
 impl Guess {
@@ -47,15 +44,15 @@ impl Guess {
     }
 }
 
-/// The problem that begins with `guess`.
+/// The problem that begins with `guess`, whose state number `held` fixes position and heading of the world.
 pub(super) fn build(
-    log: &TrackLog,
-    imu: &ImuBuffer,
-    model: &ImuModel,
+    recording: &Recording<'_>,
     calibration: &Calibration,
     prior: CalibrationPrior,
     guess: &Guess,
+    held: usize,
 ) -> Result<Problem, AdjustmentError> {
+    let Recording { log, imu, model } = *recording;
     let at = |(time, state): (&Timestamp, &NavState)| FrameState::new(*time, *state, imu, model);
     let frames: Option<Vec<FrameState>> = guess.times.iter().zip(&guess.states).map(at).collect();
     let mut frames = frames
@@ -68,88 +65,81 @@ pub(super) fn build(
         frames[k].preintegration = preintegrate(imu, model, &state, from, until, &mut interval);
     }
     let landmarks = triangulate(log, &guess.images, &frames, calibration);
-    let gauge = frames[0].body.state;
+    let gauge = (held, frames[held].body.state);
     let active = (0..calibration.dim()).filter(|k| prior.sigmas[*k] > 0.0).collect();
     Ok(Problem { frames, landmarks, calibration: calibration.clone(), prior, active, gauge })
 }
 
-/// Indices of the longest run of images whose states are known or within reach of one that is.
-fn longest_chain(log: &TrackLog, imu: &ImuBuffer, clock_offset: Duration) -> Vec<usize> {
-    let covered = |image: &LoggedImage| imu.at(image.stamp + clock_offset).is_some();
-    let known: Vec<Timestamp> = log.images.iter().filter(|i| i.state.is_some()).map(|i| i.stamp).collect();
-    let near = |time: Timestamp| {
-        let after = known.partition_point(|k| *k < time);
-        let before = after.checked_sub(1).and_then(|k| known.get(k));
-        let secs = |other: &Timestamp| (*other - time).as_secs_f64().abs();
-        known.get(after).into_iter().chain(before).any(|k| secs(k) <= MAX_BRIDGE_SECS)
-    };
-    let mut chains: Vec<Vec<usize>> = vec![Vec::new()];
-    for (index, image) in log.images.iter().enumerate() {
-        let gap = chains.last().and_then(|c| c.last()).map(|last| image.stamp - log.images[*last].stamp);
-        if !covered(image) || !near(image.stamp) || gap.is_some_and(|g| g.as_secs_f64() > MAX_BRIDGE_SECS) {
-            chains.push(Vec::new());
-        }
-        if covered(image)
-            && near(image.stamp)
-            && let Some(chain) = chains.last_mut()
-        {
-            chain.push(index);
-        }
-    }
-    let states = |c: &Vec<usize>| c.iter().filter(|k| log.images[**k].state.is_some()).count();
-    // Of equally long ones the first.
-    chains.into_iter().rev().max_by_key(states).unwrap_or_default()
-}
-
-/// States of the longest chain in one world: the odometry's where it has them, carried by the IMU where it has none. The world is that of
-/// the first segment; later ones are turned about the vertical and moved to where the IMU arrives.
-pub(super) fn chained_states(
+/// The odometry's states of the segment that has the most: the images from its first to its last one, those without a state
+/// carried by the IMU.
+pub(super) fn longest_segment(
     log: &TrackLog,
     imu: &ImuBuffer,
     model: &ImuModel,
     clock_offset: Duration,
 ) -> Guess {
-    let chain = longest_chain(log, imu, clock_offset);
-    let time = |index: &usize| log.images[*index].stamp + clock_offset;
-    let mut interval = Vec::new();
-    let mut states: Vec<Option<NavState>> = Vec::with_capacity(chain.len());
-    let mut placed: Option<(u32, Se3)> = None;
-    for (k, index) in chain.iter().enumerate() {
-        let arrived = (k > 0).then(|| states[k - 1]).flatten().and_then(|before: NavState| {
-            let (from, until) = (time(&chain[k - 1]), time(index));
-            Some(preintegrate(imu, model, &before, from, until, &mut interval)?.predict(&before))
-        });
-        let Some(logged) = &log.images[*index].state else {
-            states.push(arrived);
-            continue;
-        };
-        let here = match (placed, arrived) {
-            (Some((segment, here)), _) if segment == logged.segment => here,
-            (_, None) => Se3::IDENTITY,
-            (_, Some(arrived)) => onto(&logged.state.world_from_body, &arrived.world_from_body),
-        };
-        placed = Some((logged.segment, here));
-        states.push(Some(NavState {
-            world_from_body: here * logged.state.world_from_body,
-            velocity: here.rotation * logged.state.velocity,
-            bias: logged.state.bias,
-        }));
+    let mut counts: BTreeMap<u32, usize> = BTreeMap::new();
+    for state in log.images.iter().filter_map(|i| i.state.as_ref()) {
+        *counts.entry(state.segment).or_default() += 1;
     }
-    // What lies before the first state is carried backwards.
-    for k in (0..chain.len().saturating_sub(1)).rev() {
-        if states[k].is_none()
-            && let Some(after) = states[k + 1]
-        {
-            let (from, until) = (time(&chain[k]), time(&chain[k + 1]));
-            states[k] =
-                preintegrate(imu, model, &after, from, until, &mut interval).map(|p| before(&after, &p));
+    // Of equally long ones the first.
+    let longest = counts.iter().rev().max_by_key(|(_, count)| **count).map(|(segment, _)| *segment);
+    let mut guess = Guess::default();
+    if let Some(segment) = longest {
+        let first = log.images.iter().position(|i| i.is_of(segment)).unwrap_or(0);
+        guess.take_segment(log, imu, model, clock_offset, first, Se3::IDENTITY);
+    }
+    guess
+}
+
+impl Guess {
+    /// Appends the states of a segment, moved by `placed`, from its first image on; the images in between that have none are
+    /// carried by the IMU.
+    pub(super) fn take_segment(
+        &mut self,
+        log: &TrackLog,
+        imu: &ImuBuffer,
+        model: &ImuModel,
+        clock_offset: Duration,
+        first: usize,
+        placed: Se3,
+    ) {
+        let Some(segment) = log.images[first].state.map(|s| s.segment) else { return };
+        let last = log.images.iter().rposition(|i| i.is_of(segment)).unwrap_or(first);
+        for image in first..=last {
+            let time = log.images[image].stamp + clock_offset;
+            let state = match &log.images[image].state {
+                Some(logged) => Some(NavState {
+                    world_from_body: placed * logged.state.world_from_body,
+                    velocity: placed.rotation * logged.state.velocity,
+                    bias: logged.state.bias,
+                }),
+                None => self.carried_to(time, imu, model),
+            };
+            let Some(state) = state else { return };
+            self.images.push(image);
+            self.times.push(time);
+            self.states.push(state);
         }
     }
-    // Where the IMU has a gap, the chain ends.
-    let first = states.iter().position(Option::is_some).unwrap_or(0);
-    let states: Vec<NavState> = states[first..].iter().map_while(|s| *s).collect();
-    let images = chain[first..first + states.len()].to_vec();
-    Guess { times: images.iter().map(time).collect(), images, states }
+
+    /// The newest state carried to `time`; `None` where the IMU does not cover it.
+    pub(super) fn carried_to(&self, time: Timestamp, imu: &ImuBuffer, model: &ImuModel) -> Option<NavState> {
+        let (from, state) = (self.times.last()?, self.states.last()?);
+        Some(preintegrate(imu, model, state, *from, time, &mut Vec::new())?.predict(state))
+    }
+
+    /// The oldest state carried back to `time`.
+    pub(super) fn carried_back_to(
+        &self,
+        time: Timestamp,
+        imu: &ImuBuffer,
+        model: &ImuModel,
+    ) -> Option<NavState> {
+        let (until, state) = (self.times.first()?, self.states.first()?);
+        let preintegration = preintegrate(imu, model, state, time, *until, &mut Vec::new())?;
+        Some(before(state, &preintegration))
+    }
 }
 
 pub(super) fn preintegrate(
@@ -165,7 +155,7 @@ pub(super) fn preintegrate(
 }
 
 /// The turn about the vertical and the shift that bring a pose of one levelled world to where it is in another.
-fn onto(pose: &Se3, target: &Se3) -> Se3 {
+pub(super) fn onto(pose: &Se3, target: &Se3) -> Se3 {
     let turn = target.rotation * pose.rotation.inverse();
     let forward = turn.act(&Vector3::x());
     let yaw = So3::exp(&(Vector3::z() * forward.y.atan2(forward.x)));
@@ -173,7 +163,7 @@ fn onto(pose: &Se3, target: &Se3) -> Se3 {
 }
 
 /// The state at the beginning of a stretch that ends in `after`.
-fn before(after: &NavState, preintegration: &Preintegration) -> NavState {
+pub(super) fn before(after: &NavState, preintegration: &Preintegration) -> NavState {
     let (turn, position, velocity) = preintegration.corrected(&after.bias);
     let t = preintegration.secs();
     let gravity = preintegration.model().gravity();

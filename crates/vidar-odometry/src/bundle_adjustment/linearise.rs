@@ -79,8 +79,7 @@ pub(super) fn cost(problem: &Problem) -> Cost {
     for k in 1..problem.frames.len() {
         cost.inertial += 0.5 * inertial_error(problem, k).map_or(0.0, |r| r.norm_squared());
     }
-    let state = &problem.frames[0].body.state;
-    let (gauge, _) = gauge_prior_at(&problem.gauge, &GaugePriorSigmas::GAUGE, state, state);
+    let (gauge, _) = gauge_error(problem);
     cost.priors += 0.5 * gauge.norm_squared();
     for (value, sigma) in problem.calibration.minus(&problem.prior.mean).iter().zip(&problem.prior.sigmas) {
         if *sigma > 0.0 {
@@ -113,11 +112,18 @@ pub(super) fn linearise(problem: &Problem, damping: f64, system: &mut System) {
     system.landmarks = blocks;
 }
 
+/// Whitened difference of the held state from where it is held, and its derivative.
+fn gauge_error(problem: &Problem) -> (Vector15, Matrix15) {
+    let (held, reference) = &problem.gauge;
+    let state = &problem.frames[*held].body.state;
+    gauge_prior_at(reference, &GaugePriorSigmas::GAUGE, state, state)
+}
+
 fn add_priors(problem: &Problem, system: &mut System) {
-    let state = &problem.frames[0].body.state;
-    let (residual, jacobian) = gauge_prior_at(&problem.gauge, &GaugePriorSigmas::GAUGE, state, state);
-    add_block(system, 0, 0, &(jacobian.transpose() * jacobian));
-    add_gradient(system, 0, &(jacobian.transpose() * residual));
+    let (residual, jacobian) = gauge_error(problem);
+    let at = FRAME_DIM * problem.gauge.0;
+    add_block(system, at, at, &(jacobian.transpose() * jacobian));
+    add_gradient(system, at, &(jacobian.transpose() * residual));
     let offset = problem.calibration_offset();
     let moved = problem.calibration.minus(&problem.prior.mean);
     for (k, index) in problem.active.iter().enumerate() {

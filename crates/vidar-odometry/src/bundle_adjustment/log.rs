@@ -68,6 +68,13 @@ pub(crate) struct LoggedImage {
     pub(crate) state: Option<LoggedState>,
 }
 
+impl LoggedImage {
+    /// Whether it has a state of this segment.
+    pub(crate) fn is_of(&self, segment: u32) -> bool {
+        self.state.is_some_and(|s| s.segment == segment)
+    }
+}
+
 /// Feature tracks, IMU measurements and states of a recording.
 #[derive(Clone, Debug, Default)]
 pub struct TrackLog {

@@ -6,10 +6,11 @@
 //! (clock, readout, place on the body, intrinsics) are estimated together; scale and gravity are part of it, because states are
 //! metric and z is up. Segments that the odometry had to leave apart are joined by the IMU where the gap is short.
 //!
-//! [`adjust`] is the way through: first guess → optimise → the clock's correction put into the stamps, again → covariance →
-//! a state for every image.
+//! [`adjust`] is the way through: the odometry's longest segment → outward over images without a state, and over other segments
+//! → all together → covariance → a state for every image.
 
 mod envelope;
+mod grow;
 mod initial;
 mod linearise;
 mod log;
@@ -30,8 +31,8 @@ use optimise::OptimiseReport;
 use problem::{CalibrationPrior, Problem};
 use vidar_core::{Duration, RigCamera};
 
-/// The first guess and the optimisation are done this often: the second time with the stamps corrected.
-const PASSES: usize = 2;
+/// Adjustments of all states at most: another one follows where the clock was corrected.
+const PASSES: usize = 3;
 
 /// Corrections of the clock below this are left in the row times, s.
 const SETTLED_CLOCK_SECS: f64 = 2e-4;
@@ -39,7 +40,8 @@ const SETTLED_CLOCK_SECS: f64 = 2e-4;
 /// The solution with what belongs to it.
 struct Solution {
     problem: Problem,
-    guess: Guess,
+    /// Which images of the log the states belong to.
+    images: Vec<usize>,
     /// What the states' instants are their images' stamps plus.
     clock_offset: Duration,
     report: OptimiseReport,
@@ -136,33 +138,71 @@ pub fn adjust(
         // What is out of order was left out by the odometry, too.
         let _ = imu.push(*sample);
     }
-    let mut calibration = Calibration {
+    let calibration = Calibration {
         camera: camera.model.clone(),
         body_from_camera: camera.body_from_camera,
         clock_secs: 0.0,
         readout_secs,
     };
-    let mut prior = CalibrationPrior { sigmas: sigmas.of(&calibration), mean: calibration.clone() };
-    let mut clock_offset = camera.time_offset;
-    let mut guess = initial::chained_states(log, &imu, model, clock_offset);
-    for pass in 1.. {
-        let mut problem = initial::build(log, &imu, model, &calibration, prior.clone(), &guess)?;
+    let prior = CalibrationPrior { sigmas: sigmas.of(&calibration), mean: calibration.clone() };
+    let recording = Recording { log, imu: &imu, model };
+    let segment = initial::longest_segment(log, &imu, model, camera.time_offset);
+    let mut work = Work { calibration, prior, clock_offset: camera.time_offset, guess: segment };
+    // The longest segment first: it gives the calibration with which the rest is found.
+    work.pass(&recording)?;
+    work.guess = grow::outward(&recording, &work);
+    for _ in 1..PASSES {
+        if work.pass(&recording)?.0 {
+            break;
+        }
+    }
+    let clock_offset = work.clock_offset;
+    let (_, problem, report) = work.pass(&recording)?;
+    let system = optimise::solution(&problem).ok_or(AdjustmentError::Undetermined)?;
+    let images = work.guess.images;
+    Ok(result::collect(&recording, &Solution { problem, images, clock_offset, report, system }))
+}
+
+/// What was recorded.
+struct Recording<'a> {
+    log: &'a TrackLog,
+    imu: &'a ImuBuffer,
+    model: &'a ImuModel,
+}
+
+/// What is known so far.
+struct Work {
+    calibration: Calibration,
+    prior: CalibrationPrior,
+    /// What the states' instants are their images' stamps plus.
+    clock_offset: Duration,
+    guess: Guess,
+}
+
+impl Work {
+    /// Adjusts all states of the guess; whether the clock was right.
+    fn pass(
+        &mut self,
+        recording: &Recording<'_>,
+    ) -> Result<(bool, Problem, OptimiseReport), AdjustmentError> {
+        let mut problem = initial::build(recording, &self.calibration, self.prior.clone(), &self.guess, 0)?;
         if problem.landmarks.len() < MIN_LANDMARKS {
             return Err(AdjustmentError::FewLandmarks { landmarks: problem.landmarks.len() });
         }
-        let (report, system) = optimise::optimise(&mut problem);
+        let report = optimise::optimise(&mut problem);
         let clock_secs = problem.calibration.clock_secs;
-        if pass == PASSES || clock_secs.abs() <= SETTLED_CLOCK_SECS {
-            let system = system.ok_or(AdjustmentError::Undetermined)?;
-            let solution = Solution { problem, guess, clock_offset, report, system };
-            return Ok(result::collect(log, &imu, model, &solution));
+        let is_settled = clock_secs.abs() <= SETTLED_CLOCK_SECS;
+        if is_settled {
+            self.guess.states = problem.frames.iter().map(|f| f.body.state).collect();
+            self.calibration = problem.calibration.clone();
+        } else {
+            self.clock_offset += Duration::from_secs_f64(clock_secs);
+            self.guess = self.guess.at_corrected_clock(&problem);
+            self.calibration = Calibration { clock_secs: 0.0, ..problem.calibration.clone() };
+            self.prior.mean.clock_secs -= clock_secs;
         }
-        clock_offset += Duration::from_secs_f64(clock_secs);
-        guess = guess.at_corrected_clock(&problem);
-        calibration = Calibration { clock_secs: 0.0, ..problem.calibration };
-        prior.mean.clock_secs -= clock_secs;
+        Ok((is_settled, problem, report))
     }
-    Err(AdjustmentError::Undetermined)
 }
 
 /// Fewest landmarks of a recording.

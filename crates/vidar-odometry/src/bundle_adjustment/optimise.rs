@@ -35,8 +35,15 @@ pub(super) struct OptimiseReport {
     pub(super) rejected: usize,
 }
 
-/// Minimises the cost. Returns the system at the solution, without damping, or `None` where it is not positive definite.
-pub(super) fn optimise(problem: &mut Problem) -> (OptimiseReport, Option<System>) {
+/// Brings new states near the solution: two rounds, gross errors left out in between.
+pub(super) fn settle(problem: &mut Problem) {
+    minimise(problem);
+    reject(problem, OUTLIER_CHI2[0]);
+    minimise(problem);
+}
+
+/// Minimises the cost, and leaves out what does not fit.
+pub(super) fn optimise(problem: &mut Problem) -> OptimiseReport {
     let mut report = OptimiseReport { before: cost(problem), ..OptimiseReport::default() };
     for limit in OUTLIER_CHI2 {
         report.iterations += minimise(problem);
@@ -45,10 +52,14 @@ pub(super) fn optimise(problem: &mut Problem) -> (OptimiseReport, Option<System>
     report.iterations += minimise(problem);
     report.after = cost(problem);
     report.observations = problem.landmarks.iter().map(|l| l.observations.len()).sum();
+    report
+}
+
+/// The system at the solution, without damping, factorised; `None` where it is not positive definite.
+pub(super) fn solution(problem: &Problem) -> Option<System> {
     let mut system = System::new(problem);
     linearise(problem, 0.0, &mut system);
-    let is_definite = system.h.factorise(&vec![0.0; problem.dim()], &mut system.factor);
-    (report, is_definite.then_some(system))
+    system.h.factorise(&vec![0.0; problem.dim()], &mut system.factor).then_some(system)
 }
 
 fn minimise(problem: &mut Problem) -> usize {

@@ -53,8 +53,8 @@ pub(super) struct Problem {
     pub(super) prior: CalibrationPrior,
     /// Indices of the calibration's unknowns that are estimated.
     pub(super) active: Vec<usize>,
-    /// Where the first state is held: position and heading are free otherwise.
-    pub(super) gauge: NavState,
+    /// The state that is held, and where: position and heading of the world are free otherwise.
+    pub(super) gauge: (usize, NavState),
 }
 
 impl Problem {

@@ -1,11 +1,10 @@
 //! What the adjustment found: calibration, scale, and a state for every image.
 
-use super::Solution;
 use super::initial::preintegrate;
 use super::linearise::System;
-use super::log::TrackLog;
 use super::optimise::inertial_chi2_per_dof;
 use super::problem::{FRAME_DIM, Problem};
+use super::{Recording, Solution};
 use crate::backend::dot;
 use crate::imu::{ImuBuffer, ImuModel, NavState};
 use crate::pipeline::public_state;
@@ -73,9 +72,10 @@ pub struct Adjusted {
     pub report: AdjustmentReport,
 }
 
-pub(super) fn collect(log: &TrackLog, imu: &ImuBuffer, model: &ImuModel, solution: &Solution) -> Adjusted {
-    let Solution { problem, guess, clock_offset, report, system } = solution;
-    let stamps: Vec<Timestamp> = guess.images.iter().map(|k| log.images[*k].stamp).collect();
+pub(super) fn collect(recording: &Recording<'_>, solution: &Solution) -> Adjusted {
+    let Recording { log, imu, model } = *recording;
+    let Solution { problem, images, clock_offset, report, system } = solution;
+    let stamps: Vec<Timestamp> = images.iter().map(|k| log.images[*k].stamp).collect();
     let clock = Duration::from_secs_f64(problem.calibration.clock_secs);
     // States at the images' true instants.
     let states: Vec<(Timestamp, NavState)> = problem
