@@ -22,6 +22,11 @@ pub fn data(line: impl AsRef<str>) {
     }
 }
 
+/// A line of data with names in it, which may hold line breaks.
+pub fn line(text: impl AsRef<str>) {
+    data(printable(text.as_ref()));
+}
+
 /// An error if data was lost on its way to the standard output, say to a full disk.
 pub fn all_delivered() -> Result<(), Error> {
     match LOST.get() {

@@ -21,8 +21,8 @@ mod source;
 mod trajectory_file;
 mod tum_rgbd;
 
-pub use checks::{gain_error_at_rest, specific_force_at_rest};
 pub use camera_flag::{CameraFlag, with_size};
+pub use checks::{gain_error_at_rest, specific_force_at_rest};
 pub use dataset::{
     AccelSample, CalibrationSource, DEPTH_TOLERANCE, Dataset, DepthEntry, DepthSensor, ExternalTrajectory,
     ImageEntry,

@@ -454,7 +454,10 @@ fn a_transfer_that_trickles_and_one_that_takes_too_long_are_given_up() {
     };
     let clock = Instant::now();
     let error = Store::new(settings).pull(tiny(), &options(), &quiet()).unwrap_err();
-    assert!(matches!(error, HubError::Network { .. }) && error.to_string().contains("bytes per second"), "{error}");
+    assert!(
+        matches!(error, HubError::Network { .. }) && error.to_string().contains("bytes per second"),
+        "{error}"
+    );
     assert!(clock.elapsed() < Duration::from_secs(4), "{:?}", clock.elapsed());
 
     let bench = Bench::new(trickle);

@@ -184,12 +184,12 @@ fn read_surface(path: &Path, config: &Config) -> Result<PointCloud, Error> {
 
 /// The surface report in words: the rigid fit first, then what another scale would give.
 pub fn surface_lines(report: &SurfaceReport) -> Vec<(String, String)> {
-    let text = |s: &vidar_eval::Scores| {
-        format!("{:.3} (precision {:.3}, recall {:.3})", s.f, s.precision, s.recall)
-    };
-    let rigid = report.rigid.iter().map(|s| {
-        (format!("F@{:.2} m", s.threshold_m), format!("{}, rigid fit: scale as it is", text(s)))
-    });
+    let text =
+        |s: &vidar_eval::Scores| format!("{:.3} (precision {:.3}, recall {:.3})", s.f, s.precision, s.recall);
+    let rigid = report
+        .rigid
+        .iter()
+        .map(|s| (format!("F@{:.2} m", s.threshold_m), format!("{}, rigid fit: scale as it is", text(s))));
     let refined = report.native.iter().map(|s| {
         let label = format!("F@{:.2} m refined", s.threshold_m);
         (label, format!("{}, {}", text(s), refinement(report)))

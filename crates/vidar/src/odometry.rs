@@ -9,8 +9,8 @@ use crate::config::{Config, Layered};
 use crate::error::{Error, ExitStatus};
 use crate::events::{CancelToken, Event, Events};
 use crate::input::{self, Measurement};
-use crate::run_folder::{MANIFEST_SCHEMA, Manifest, OutputLocation, RunFolder};
 use crate::quality::TrackQuality;
+use crate::run_folder::{MANIFEST_SCHEMA, Manifest, OutputLocation, RunFolder};
 use crate::verdict::{Findings, Level, ScaleSource, StatedScale, Verdict};
 use serde_json::{Value, json};
 use std::collections::BTreeSet;
@@ -298,7 +298,8 @@ impl Tracked {
         if !self.frames.iter().any(|f| f.output.tracking().is_some()) {
             let why = self.why_not_started().unwrap_or_else(|| "no images".into());
             let text = format!("the odometry never started: {why}");
-            let hint = "`vidar inspect` shows calibration and units in plain words; docs/failures.md lists causes";
+            let hint =
+                "`vidar inspect` shows calibration and units in plain words; docs/failures.md lists causes";
             warnings.push(Warning::degraded("odometry-never-started", text).hint(hint));
         }
         if !self.with_imu {

@@ -75,6 +75,9 @@ impl TrackQuality {
         let of_kind = self.refusals.iter().filter(|(name, _)| CONTRADICTIONS.contains(name) == contradicts);
         let (count, most) = of_kind.map(|(_, refusal)| refusal).max_by_key(|(count, _)| *count)?;
         Some(match contradicts {
+            false if most.starts_with("std(log scale)") => format!(
+                "{most}. If the camera does speed up and slow down, signs or axes of the accelerometer are wrong"
+            ),
             false => most.clone(),
             true => format!(
                 "images and IMU contradict each other in {} of {} attempts ({most}; {count}x). {LIKELY_CAUSES}",
@@ -117,8 +120,11 @@ impl TrackQuality {
         if tracked == 0 {
             return format!("0 of {} images", self.images);
         }
-        let mut text =
-            format!("{tracked} of {} images, health OK in {:.0} % of them", self.images, 100.0 * self.healthy());
+        let mut text = format!(
+            "{tracked} of {} images, health OK in {:.0} % of them",
+            self.images,
+            100.0 * self.healthy()
+        );
         if self.losses > 0 {
             text += &format!(", lost {}x", self.losses);
         }

@@ -161,7 +161,9 @@ impl RunFolder {
         let path = root.join("log.jsonl");
         let mut options = File::options();
         let log = match place {
-            OutputLocation::Resumed { .. } | OutputLocation::Replaced { .. } => options.create(true).append(true),
+            OutputLocation::Resumed { .. } | OutputLocation::Replaced { .. } => {
+                options.create(true).append(true)
+            }
             OutputLocation::Exact { .. } | OutputLocation::Dated { .. } => {
                 options.create(true).write(true).truncate(true)
             }

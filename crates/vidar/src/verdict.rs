@@ -118,7 +118,10 @@ impl Findings {
         });
         let stated = scale.sigma.filter(|sigma| error > 3.0 * sigma && error > 1e-3);
         if let Some(sigma) = stated {
-            self.add(Level::Caution, format!("|ln s| {error:.4} is more than three times the stated σ {sigma:.4}"));
+            self.add(
+                Level::Caution,
+                format!("|ln s| {error:.4} is more than three times the stated σ {sigma:.4}"),
+            );
         }
     }
 }
@@ -201,11 +204,9 @@ impl StatedScale {
             source,
         };
         match source {
-            ScaleSource::None => Self {
-                is_metric: false,
-                words: "arbitrary: nothing metric takes part".into(),
-                ..empty
-            },
+            ScaleSource::None => {
+                Self { is_metric: false, words: "arbitrary: nothing metric takes part".into(), ..empty }
+            }
             ScaleSource::Given => Self {
                 words: match chunks {
                     Some(c) => format!(
@@ -222,11 +223,9 @@ impl StatedScale {
                 words: format!("metric by ground truth{of_chunks}"),
                 ..empty
             },
-            ScaleSource::Odometry { stated, .. } if !stated.is_finite() => Self {
-                is_metric: false,
-                words: "unknown: the odometry does not observe it".into(),
-                ..empty
-            },
+            ScaleSource::Odometry { stated, .. } if !stated.is_finite() => {
+                Self { is_metric: false, words: "unknown: the odometry does not observe it".into(), ..empty }
+            }
             ScaleSource::Odometry { stated, unseen } => {
                 let sigma = (stated.powi(2) + unseen.powi(2) + known.powi(2)).sqrt();
                 Self {
@@ -270,7 +269,11 @@ mod tests {
         let odometry = |stated| ScaleSource::Odometry { stated, unseen: 0.01 };
         let all = StatedScale::new(odometry(0.02), Some(0.02));
         assert!((all.sigma.unwrap() - 0.03).abs() < 1e-12 && all.is_metric);
-        assert!(all.words.contains("known to 3.0 %") && all.words.contains("odometry 2.0 %"), "{}", all.words);
+        assert!(
+            all.words.contains("known to 3.0 %") && all.words.contains("odometry 2.0 %"),
+            "{}",
+            all.words
+        );
         let loose = StatedScale::new(odometry(0.108), Some(0.005));
         assert!(!loose.is_metric && loose.warning().unwrap().message.contains("0.11"));
         let given = StatedScale::new(ScaleSource::Given, Some(0.005));

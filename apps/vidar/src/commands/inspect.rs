@@ -21,7 +21,7 @@ pub fn inspect(args: &InspectArgs, context: &Context) -> Outcome {
         print::json(&value);
         return Ok(ExitStatus::Done);
     }
-    print::data(format!("{}: {} ({})", found.name, found.kind, found.reason));
+    print::line(format!("{}: {} ({})", found.name, found.kind, found.reason));
     for s in &found.streams {
         let times = match s.rate_hz {
             Some(hz) => format!(
@@ -34,7 +34,7 @@ pub fn inspect(args: &InspectArgs, context: &Context) -> Outcome {
         print::data(format!("  {:<20} {:>6}   {times}", s.what, s.count));
     }
     for (label, words) in [("camera", &found.camera), ("imu", &found.imu), ("poses", &found.poses)] {
-        words.iter().for_each(|line| print::data(format!("  {label:<8} {line}")));
+        words.iter().for_each(|line| print::line(format!("  {label:<8} {line}")));
     }
     if let Some(i) = &found.images {
         print::data(format!(

@@ -24,7 +24,15 @@ fn control_characters_in_names_reach_neither_terminal_nor_files() {
     let out = shared().root.join("evil run");
     let mut run = command();
     run.arg("run").arg(&sequence).arg("-o").arg(&out).arg("--config").arg(&shared().settings);
-    run.args(["--stride", "2", "--set", "input.poses=external", "--set", "output.report=true", "--trajectory"]);
+    run.args([
+        "--stride",
+        "2",
+        "--set",
+        "input.poses=external",
+        "--set",
+        "output.report=true",
+        "--trajectory",
+    ]);
     let ran: crate::support::ProgramOutput = run.arg(&trajectory).output().unwrap().into();
     assert!([0, 3].contains(&ran.code), "{}", ran.stderr);
     let inspected = vidar(&["inspect", text(&sequence)]);
@@ -38,7 +46,9 @@ fn control_characters_in_names_reach_neither_terminal_nor_files() {
     for name in files_under(&out).iter().filter(|n| !n.ends_with(".png") && !n.ends_with(".glb")) {
         let bytes = std::fs::read(out.join(name)).unwrap();
         // Binary parts of PLY are no text.
-        let text = String::from_utf8_lossy(&bytes[..bytes.len().min(if name.ends_with(".ply") { 600 } else { usize::MAX })]);
+        let text = String::from_utf8_lossy(
+            &bytes[..bytes.len().min(if name.ends_with(".ply") { 600 } else { usize::MAX })],
+        );
         let text = text.split("end_header").next().unwrap();
         assert!(!text.contains(is_obeyed), "{name} holds control characters");
     }
@@ -62,7 +72,12 @@ fn files_without_an_end_are_refused_at_once_and_in_little_memory() {
         let mut limited = std::process::Command::new("sh");
         limited.arg("-c").arg("ulimit -v 1500000; exec \"$0\" \"$@\"").arg(crate::support::VIDAR).args(&args);
         let ran: crate::support::ProgramOutput = limited.current_dir(&shared().root).output().unwrap().into();
-        assert!([0, 1, 2].contains(&ran.code) && !ran.stderr.contains("panicked"), "{args:?}: {} {}", ran.code, ran.stderr);
+        assert!(
+            [0, 1, 2].contains(&ran.code) && !ran.stderr.contains("panicked"),
+            "{args:?}: {} {}",
+            ran.code,
+            ran.stderr
+        );
         assert!(ran.code != 0 || args.contains(&"--timestamps"), "{args:?}: {}", ran.stdout);
         assert!(clock.elapsed() < Duration::from_secs(20), "{args:?} took {:?}", clock.elapsed());
     }
@@ -102,5 +117,9 @@ fn weights_that_are_not_the_official_ones_are_refused_by_their_hash() {
     let ran: crate::support::ProgramOutput = pull.output().unwrap().into();
     assert!(ran.code != 0 && ran.stderr.contains("error[E0"), "{} {}", ran.code, ran.stderr);
     assert!(ran.stderr.contains(&"0".repeat(12)) || ran.stderr.contains("hash"), "{}", ran.stderr);
-    assert!(!files_under(models.path()).iter().any(|f| f.ends_with("model.safetensors")), "{:?}", files_under(models.path()));
+    assert!(
+        !files_under(models.path()).iter().any(|f| f.ends_with("model.safetensors")),
+        "{:?}",
+        files_under(models.path())
+    );
 }

@@ -7,6 +7,7 @@ mod config;
 mod coupling;
 mod damage;
 mod docs;
+mod fault_list;
 mod faults;
 mod hostile;
 mod keys;

@@ -28,16 +28,25 @@ fn plan(folder: &Path, more: &[&str]) -> crate::support::ProgramOutput {
 #[test]
 fn photos_without_times_are_all_used_and_their_rate_is_not_invented() {
     let folder = photos("eight photos");
-    let ran = plan(&folder, &[]).ends_with(0).says(&["[times-synthesised]", "[every-image-used]", "8 images"]);
+    let ran =
+        plan(&folder, &[]).ends_with(0).says(&["[times-synthesised]", "[every-image-used]", "8 images"]);
     assert!(ran.stdout.contains("8 in 1 chunks"), "{}", ran.stdout);
     let inspected = vidar(&["inspect", text(&folder)]).ends_with(0);
-    assert!(inspected.stdout.contains("without times") && !inspected.stdout.contains("30.0 Hz"), "{}", inspected.stdout);
+    assert!(
+        inspected.stdout.contains("without times") && !inspected.stdout.contains("30.0 Hz"),
+        "{}",
+        inspected.stdout
+    );
     // With times the interval between keyframes counts again.
     let times: String = (0..8).map(|k| format!("{:.3}\n", 1.6e9 + 0.05 * f64::from(k))).collect();
     let list = shared().root.join("eight times.txt");
     std::fs::write(&list, times).unwrap();
     let ran = plan(&folder, &["--timestamps", text(&list)]).ends_with(0);
-    assert!(!ran.stderr.contains("every-image-used") && ran.stdout.contains("2 in 1 chunks"), "{}", ran.stdout);
+    assert!(
+        !ran.stderr.contains("every-image-used") && ran.stdout.contains("2 in 1 chunks"),
+        "{}",
+        ran.stdout
+    );
 }
 
 #[test]
@@ -84,7 +93,8 @@ fn a_csv_whose_quaternion_order_is_not_stated_is_refused_and_one_that_states_it_
     let plain = file("plain.csv", rows(xyzw));
     let blanks = file("blanks.tum", rows(xyzw).replace(',', " "));
     let tum = file("tum.csv", format!("#timestamp,tx,ty,tz,qx,qy,qz,qw\n{}", rows(xyzw)));
-    let euroc = file("wxyz.csv", format!("#timestamp,px,py,pz,qw,qx,qy,qz\n{}", rows([half, 0.0, 0.0, half])));
+    let euroc =
+        file("wxyz.csv", format!("#timestamp,px,py,pz,qw,qx,qy,qz\n{}", rows([half, 0.0, 0.0, half])));
     vidar(&["eval", text(&plain), text(&blanks)])
         .ends_with(1)
         .says(&["order of the quaternion", "--trajectory-format tum"]);
@@ -94,6 +104,7 @@ fn a_csv_whose_quaternion_order_is_not_stated_is_refused_and_one_that_states_it_
         assert!(turned < 1e-6, "{}: turned by {turned} degrees", path.display());
     }
     let flag = ["--trajectory-format", "tum"];
-    let json = vidar(&[&["eval", text(&plain), text(&plain), "--json"], &flag[..]].concat()).ends_with(0).json();
+    let json =
+        vidar(&[&["eval", text(&plain), text(&plain), "--json"], &flag[..]].concat()).ends_with(0).json();
     assert_eq!(json["scores"]["ate"].as_f64().map(|v| v < 1e-9), Some(true));
 }

@@ -54,7 +54,9 @@ fn what_an_attempt_does_not_make_again_goes_and_files_of_others_stay() {
     }
     let mut log = std::fs::read_to_string(out.join("log.jsonl")).unwrap();
     for name in ["pictures/depth-000099.png", "depth/000099.png"] {
-        log += &format!("{{\"schema\":\"vidar.event/1\",\"event\":\"artifact-written\",\"path\":\"{name}\",\"bytes\":4}}\n");
+        log += &format!(
+            "{{\"schema\":\"vidar.event/1\",\"event\":\"artifact-written\",\"path\":\"{name}\",\"bytes\":4}}\n"
+        );
     }
     std::fs::write(out.join("log.jsonl"), log).unwrap();
     resumed(&shared().sequence, &out, &[]).ends_with(0);
@@ -71,7 +73,8 @@ fn what_an_attempt_does_not_make_again_goes_and_files_of_others_stay() {
 fn a_manifest_lists_every_file_of_a_run_and_is_there_from_the_start() {
     let (out, _) = finished();
     let manifest = manifest(out);
-    let listed: Vec<&str> = manifest["artifacts"].as_array().unwrap().iter().map(|a| a.as_str().unwrap()).collect();
+    let listed: Vec<&str> =
+        manifest["artifacts"].as_array().unwrap().iter().map(|a| a.as_str().unwrap()).collect();
     assert_eq!(listed, files_under(out));
     assert_eq!(manifest["exit"], 0);
 }

@@ -207,8 +207,7 @@ struct FirstRow {
 impl FirstRow {
     fn of(source: &Source<'_>) -> Option<Self> {
         // Only the head is looked at; a cut last line does not matter.
-        let head =
-            Source { path: source.path, bytes: source.bytes.get(..64 << 10).unwrap_or(source.bytes) };
+        let head = Source { path: source.path, bytes: source.bytes.get(..64 << 10).unwrap_or(source.bytes) };
         let head = match head.bytes.iter().rposition(|&b| b == b'\n') {
             Some(end) => Source { path: head.path, bytes: head.bytes.get(..end)? },
             None => head,
@@ -216,10 +215,11 @@ impl FirstRow {
         let lines = head.lines(&mut Vec::new()).ok()?;
         let first = lines.rows.first()?;
         let header = lines.comments.join(" ").to_ascii_lowercase();
-        let w_is_last = match (header.find("qw").or(header.find("q_w")), header.find("qx").or(header.find("q_x"))) {
-            (Some(w), Some(x)) => Some(w > x),
-            _ => None,
-        };
+        let w_is_last =
+            match (header.find("qw").or(header.find("q_w")), header.find("qx").or(header.find("q_x"))) {
+                (Some(w), Some(x)) => Some(w > x),
+                _ => None,
+            };
         let is_nanoseconds = first.fields().next()?.parse::<f64>().is_ok_and(|t| t >= 1e17);
         let is_csv = first.text.contains([',', ';']);
         Some(Self { columns: first.fields().count(), is_csv, is_nanoseconds, w_is_last })

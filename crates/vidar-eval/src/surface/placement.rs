@@ -54,11 +54,10 @@ pub(super) fn rigid_placement(
 ) -> Placement {
     let rigid = Sim3::from_se3(&start.truth_from_estimate);
     let points = subset(estimated, config.icp.max_points);
-    refined_rigidly(&points, reference, &rigid, config)
-        .map_or(Placement { start: "rigid", truth_from_estimate: rigid }, |truth_from_estimate| Placement {
-            start: "rigid",
-            truth_from_estimate,
-        })
+    refined_rigidly(&points, reference, &rigid, config).map_or(
+        Placement { start: "rigid", truth_from_estimate: rigid },
+        |truth_from_estimate| Placement { start: "rigid", truth_from_estimate },
+    )
 }
 
 /// The result of an ICP without scale, unless it fails or fits worse than its start.
@@ -229,7 +228,7 @@ impl Refinement {
         ((scale - 1.0).abs() > TOLERATED_SCALE_CHANGE).then(|| {
             let message = format!(
                 "the reference fits best with lengths times {scale:.3}: the bounded placement (scale refined) hides an error of \
-                 scale of {:.1} %",
+                 scale, of poses or of depth of {:.1} %",
                 (1.0 / scale - 1.0).abs() * 100.0
             );
             Warning::new("scale-refined", message).hint("judge by the rigid F, which keeps the scale as it is")

@@ -91,7 +91,14 @@ mod tests {
     use super::*;
 
     fn row(sequence: &str, mode: CouplingMode, f10: Option<f64>, free: Option<f64>) -> BenchRow {
-        BenchRow { sequence: sequence.into(), mode, f10, f10_rigid: f10, f10_free: free, ..BenchRow::default() }
+        BenchRow {
+            sequence: sequence.into(),
+            mode,
+            f10,
+            f10_rigid: f10,
+            f10_free: free,
+            ..BenchRow::default()
+        }
     }
 
     #[test]

@@ -34,7 +34,9 @@ impl Cells {
         };
         let rendered = if request.synthetic.is_some() { ", rendered" } else { "" };
         let mut grids = vec![table.trajectories()];
-        for (threshold_m, fit) in [(0.10, Fit::Rigid), (0.05, Fit::Rigid), (0.10, Fit::Bounded), (0.05, Fit::Bounded)] {
+        for (threshold_m, fit) in
+            [(0.10, Fit::Rigid), (0.05, Fit::Rigid), (0.10, Fit::Bounded), (0.05, Fit::Bounded)]
+        {
             grids.push(table.dense(threshold_m, fit));
         }
         if request.kind == BenchKind::Euroc {

@@ -251,8 +251,7 @@ pub(super) fn read_views(
 ) -> Result<StoredChunk, Error> {
     let file = File::open(path).map_err(|e| Error::io("read", path, e))?;
     // An archive of zeros unpacks to a thousand times its size: what the views may hold is known beforehand.
-    let limits =
-        NpzLimits { bytes: VIEW_BYTES * (ids.len() as u64 + 1), ..NpzLimits::default() };
+    let limits = NpzLimits { bytes: VIEW_BYTES * (ids.len() as u64 + 1), ..NpzLimits::default() };
     let mut arrays = read_npz(BufReader::new(file), limits).map_err(|e| at(path, e))?;
     let mut take = |names: &[&str]| names.iter().find_map(|name| arrays.remove(*name));
     let bad = |reason: String| Error::NotARecording { path: path.to_owned(), reason };

@@ -201,9 +201,7 @@ impl PoseSource for OdometryPoses {
 
     fn why_no_pose(&self) -> String {
         match self.is_metric {
-            false => {
-                "odometry.imu is \"off\", or the recording has no IMU: lengths are not metres".into()
-            }
+            false => "odometry.imu is \"off\", or the recording has no IMU: lengths are not metres".into(),
             _ if self.has_state => "it lost track after one image".into(),
             _ => self.quality.why_not_started().unwrap_or_else(|| "it got no image".into()),
         }

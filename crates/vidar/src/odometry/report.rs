@@ -6,8 +6,8 @@ use crate::run_folder::RunFolder;
 use vidar_core::{StampedPose, Trajectory};
 use vidar_odometry::Tracking;
 use vidar_view::{
-    AxisSpec, Figure, FigureWidth, LinePlot, PictureSize, PlotTrajectory,
-    Report, Section, Series, SummaryItem, TrajectoryPlot,
+    AxisSpec, Figure, FigureWidth, LinePlot, PictureSize, PlotTrajectory, Report, Section, Series,
+    SummaryItem, TrajectoryPlot,
 };
 
 /// Columns and rows of the pictures.

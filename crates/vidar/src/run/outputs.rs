@@ -9,7 +9,7 @@ use crate::run_folder::{MANIFEST_SCHEMA, RunFolder, StoredView, VIEWS_SCHEMA, pr
 use serde_json::{Value, json};
 use vidar_align::Placement;
 use vidar_align::aligner::{ChunkPlacement, LoopReport};
-use vidar_core::{printable, FrameId, Se3, Timestamp, Trajectory};
+use vidar_core::{FrameId, Se3, Timestamp, Trajectory, printable};
 use vidar_export::{DepthFrame, DepthSidecar, ExportError};
 
 /// Writes everything but pictures and manifest.

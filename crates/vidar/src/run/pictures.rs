@@ -10,8 +10,8 @@ use crate::run_folder::{RunFolder, StoredView};
 use vidar_core::Trajectory;
 use vidar_dataset::Dataset;
 use vidar_view::{
-    AxisSpec, Figure, FigureWidth, Histogram, MapCamera, MapSurface, Picture,
-    PictureSize, PlotTrajectory, Report, Section, Shading, SummaryItem, Table, TrajectoryPlot, Viewpoint,
+    AxisSpec, Figure, FigureWidth, Histogram, MapCamera, MapSurface, Picture, PictureSize, PlotTrajectory,
+    Report, Section, Shading, SummaryItem, Table, TrajectoryPlot, Viewpoint,
 };
 
 const MAP_SIZE: (usize, usize) = (960, 640);

@@ -34,7 +34,8 @@ pub(super) fn lines(outcome: &RunOutcome) -> Vec<(&'static str, String)> {
         ("scale", outcome.scale.words.clone()),
     ];
     if let Some(t) = &outcome.evaluation.trajectory {
-        let ate = t.ate_se3_m.as_ref().map_or_else(|| "not determined".into(), |s| format!("{:.4} m", s.rmse));
+        let ate =
+            t.ate_se3_m.as_ref().map_or_else(|| "not determined".into(), |s| format!("{:.4} m", s.rmse));
         let scale = t.scale_error.map_or_else(|| "not determined".into(), |v| format!("{v:.4}"));
         let held = match map.uses_ground_truth() && outcome.plan.mode.uses_pose_priors() {
             true => "; the map was placed by ground truth: an upper bound",

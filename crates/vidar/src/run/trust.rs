@@ -64,9 +64,8 @@ pub(super) fn verdict(
     status: ExitStatus,
 ) -> Verdict {
     let mut findings = Findings::default();
-    findings.when(status == ExitStatus::Interrupted, Level::Bad, || {
-        "interrupted: only a part was mapped".into()
-    });
+    findings
+        .when(status == ExitStatus::Interrupted, Level::Bad, || "interrupted: only a part was mapped".into());
     findings.when(map.surface.mesh.triangles.is_empty(), Level::Bad, || "the map is empty".into());
     for warning in warnings.iter().filter(|w| w.severity == Severity::Degraded) {
         let level = match warning.kind.as_str() {

@@ -28,7 +28,9 @@ impl Earlier {
             return Ok(None);
         }
         let not_a_run = |reason: String| Error::NotARun { path: root.to_owned(), reason };
-        let text = |name: &str| read_text_up_to(&root.join(name), MAX_JSON_BYTES).map_err(|e| not_a_run(format!("{name}: {e}")));
+        let text = |name: &str| {
+            read_text_up_to(&root.join(name), MAX_JSON_BYTES).map_err(|e| not_a_run(format!("{name}: {e}")))
+        };
         let manifest: Manifest = serde_json::from_str(&text("manifest.json")?)
             .map_err(|e| not_a_run(format!("manifest.json: {e}")))?;
         let config = settings(&text("config.resolved.toml").unwrap_or_default());
@@ -54,7 +56,11 @@ impl Earlier {
             let config = settings(config);
             let old: Vec<&str> = self.config.difference(&config).take(3).map(String::as_str).collect();
             let new: Vec<&str> = config.difference(&self.config).take(3).map(String::as_str).collect();
-            return Some(format!("its settings are others: {} before, {} now", old.join(", "), new.join(", ")));
+            return Some(format!(
+                "its settings are others: {} before, {} now",
+                old.join(", "),
+                new.join(", ")
+            ));
         }
         None
     }
@@ -124,7 +130,8 @@ mod tests {
             ..Manifest::default()
         };
         std::fs::write(root.join("manifest.json"), super::super::pretty(&manifest)).unwrap();
-        let line = r#"{"schema":"vidar.event/1","event":"artifact-written","path":"pictures/kept.png","bytes":1}"#;
+        let line =
+            r#"{"schema":"vidar.event/1","event":"artifact-written","path":"pictures/kept.png","bytes":1}"#;
         std::fs::write(root.join("log.jsonl"), line).unwrap();
         let earlier = Earlier::read(&root).unwrap().unwrap();
         earlier.remove_all_but(&root, &["pictures/kept.png".to_owned()].into());
