@@ -251,7 +251,7 @@ pub struct RunArgs {
     /// End with status 5 when a score is above its bound: ate, scale, chamfer (e.g. ate=0.1). Repeatable.
     #[arg(long, value_name = "NAME=VALUE")]
     pub fail_above: Vec<String>,
-    /// End with status 5 when a score is below its bound: f@0.05, f@0.10, … (e.g. f@0.05=0.5). Repeatable.
+    /// End with status 5 when a score is below its bound: f@0.05, f@0.10, … of the rigid fit (e.g. f@0.05=0.5). Repeatable.
     #[arg(long, value_name = "NAME=VALUE")]
     pub fail_below: Vec<String>,
 }
@@ -357,7 +357,7 @@ pub struct EvalArgs {
     /// End with status 5 when a score is above its bound: ate, scale, chamfer. Repeatable.
     #[arg(long, value_name = "NAME=VALUE")]
     pub fail_above: Vec<String>,
-    /// End with status 5 when a score is below its bound: f@0.05, f@0.10, …. Repeatable.
+    /// End with status 5 when a score is below its bound: f@0.05, f@0.10, … of the rigid fit. Repeatable.
     #[arg(long, value_name = "NAME=VALUE")]
     pub fail_below: Vec<String>,
 }

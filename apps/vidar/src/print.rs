@@ -4,7 +4,7 @@ use std::io::{ErrorKind, Write};
 use std::sync::OnceLock;
 use std::sync::atomic::{AtomicBool, Ordering};
 use vidar::Error;
-use vidar::core::Warning;
+use vidar::core::{Warning, printable, printable_json, printable_lines};
 
 /// Why data did not reach the standard output, once that happened. A reader that went away is no reason.
 static LOST: OnceLock<std::io::Error> = OnceLock::new();
@@ -13,13 +13,18 @@ static JSON_PRINTED: AtomicBool = AtomicBool::new(false);
 
 /// A line of data on the standard output.
 pub fn data(line: impl AsRef<str>) {
-    match writeln!(std::io::stdout().lock(), "{}", line.as_ref()) {
+    match writeln!(std::io::stdout().lock(), "{}", printable_lines(line.as_ref())) {
         Err(error) if error.kind() != ErrorKind::BrokenPipe => {
             // Only the first reason is told.
             let _ = LOST.set(error);
         }
         _ => {}
     }
+}
+
+/// A line of data with names in it, which may hold line breaks.
+pub fn line(text: impl AsRef<str>) {
+    data(printable(text.as_ref()));
 }
 
 /// An error if data was lost on its way to the standard output, say to a full disk.
@@ -32,13 +37,13 @@ pub fn all_delivered() -> Result<(), Error> {
 
 /// A line of talk on the error stream.
 pub fn talk(line: impl AsRef<str>) {
-    let _ = writeln!(std::io::stderr().lock(), "{}", line.as_ref());
+    let _ = writeln!(std::io::stderr().lock(), "{}", printable_lines(line.as_ref()));
 }
 
 /// JSON on the standard output.
 pub fn json(value: &serde_json::Value) {
     JSON_PRINTED.store(true, Ordering::Relaxed);
-    data(serde_json::to_string_pretty(value).unwrap_or_default());
+    data(printable_json(&serde_json::to_string_pretty(value).unwrap_or_default()));
 }
 
 /// An error: what, where, why, next step, code.
@@ -51,17 +56,17 @@ pub fn error(error: &Error, as_json: bool) {
             "exit": error.exit_status() as i32,
         }));
     }
-    talk(format!("error[{}]: {error}", error.code()));
+    talk(format!("error[{}]: {}", error.code(), printable(&error.to_string())));
     let mut source = std::error::Error::source(error);
     while let Some(cause) = source {
         // Transparent wrappers repeat their cause.
         if !error.to_string().contains(&cause.to_string()) {
-            talk(format!("  because: {cause}"));
+            talk(format!("  because: {}", printable(&cause.to_string())));
         }
         source = cause.source();
     }
     if let Some(hint) = hint {
-        talk(format!("  hint: {hint}"));
+        talk(format!("  hint: {}", printable(&hint)));
     }
 }
 
@@ -86,7 +91,7 @@ pub fn warnings(warnings: &[Warning]) {
 /// Label and value in two columns.
 pub fn pairs<'a>(rows: impl IntoIterator<Item = (&'a str, String)>) {
     for (label, value) in rows {
-        data(format!("{label:<20} {value}"));
+        data(format!("{label:<20} {}", printable(&value)));
     }
 }
 

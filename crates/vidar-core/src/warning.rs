@@ -1,5 +1,6 @@
 //! "Did, but": what a stage returns beside its result when the input was not quite right.
 
+use crate::printable::printable;
 use serde::{Deserialize, Serialize};
 use std::fmt;
 
@@ -37,7 +38,7 @@ impl Warning {
         Self {
             severity: Severity::Info,
             kind: kind.into(),
-            message: message.into(),
+            message: printable(&message.into()).into_owned(),
             place: String::new(),
             hint: None,
         }
@@ -50,13 +51,13 @@ impl Warning {
 
     /// The same warning with its place.
     pub fn at(mut self, place: impl fmt::Display) -> Self {
-        self.place = place.to_string();
+        self.place = printable(&place.to_string()).into_owned();
         self
     }
 
     /// The same warning with the next step.
     pub fn hint(mut self, hint: impl Into<String>) -> Self {
-        self.hint = Some(hint.into());
+        self.hint = Some(printable(&hint.into()).into_owned());
         self
     }
 }

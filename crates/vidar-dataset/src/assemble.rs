@@ -5,6 +5,7 @@ use crate::decode::{self, ImageLimits};
 use crate::draft::image_range;
 use crate::error::{DatasetError, io_error};
 use crate::options::OpenOptions;
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use vidar_core::{CameraModel, Duration, Pinhole, Timestamp, Warning};
 
@@ -55,21 +56,63 @@ pub(crate) fn keep_existing(
     Ok(())
 }
 
-/// The size of the first image whose header can be read; truncated ones are reported when they are loaded.
-pub(crate) fn first_readable_size(images: &[ImageEntry]) -> Result<(usize, usize), DatasetError> {
+/// The size that most images have; those of another are left out, with a warning. Images whose header cannot be read stay:
+/// they are reported when they are loaded.
+pub(crate) fn keep_one_size(
+    images: &mut Vec<ImageEntry>,
+    place: &Path,
+    notes: &mut Vec<Warning>,
+) -> Result<(usize, usize), DatasetError> {
+    let limits = ImageLimits::default();
     let mut first_error = None;
-    // After ten unreadable images in a row the search stops.
-    for entry in images.iter().take(10) {
-        match decode::read_size(&entry.path, &ImageLimits::default()) {
-            Ok(size) => return Ok(size),
-            Err(e) => first_error = first_error.or(Some(e)),
+    let mut sizes = Vec::with_capacity(images.len());
+    for (number, entry) in images.iter().enumerate() {
+        match decode::read_size(&entry.path, &limits) {
+            Ok(size) => sizes.push(Some(size)),
+            Err(e) => {
+                sizes.push(None);
+                first_error = first_error.or(Some(e));
+            }
+        }
+        // After ten unreadable images in a row at the beginning the search stops.
+        if number >= 9 && sizes.iter().all(Option::is_none) {
+            break;
         }
     }
-    Err(first_error.unwrap_or_else(|| DatasetError::NoImages {
-        path: PathBuf::new(),
-        found: "an empty list".into(),
-        expected: "to read".into(),
-    }))
+    sizes.resize(images.len(), None);
+    let mut counts = BTreeMap::<(usize, usize), (usize, usize)>::new();
+    for (number, size) in sizes.iter().enumerate() {
+        if let Some(size) = size {
+            counts.entry(*size).or_insert((0, number)).0 += 1;
+        }
+    }
+    // Of equally frequent sizes that of the earliest image.
+    let most = counts.iter().max_by_key(|(_, (count, first))| (*count, std::cmp::Reverse(*first)));
+    let Some((&kept, &(count, _))) = most else {
+        return Err(first_error.unwrap_or_else(|| DatasetError::NoImages {
+            path: PathBuf::new(),
+            found: "an empty list".into(),
+            expected: "to read".into(),
+        }));
+    };
+    let is_other = |size: &Option<(usize, usize)>| size.is_some_and(|s| s != kept);
+    if let Some(first) = sizes.iter().position(is_other) {
+        let others = sizes.iter().filter(|s| is_other(s)).count();
+        let (width, height) = sizes[first].unwrap_or_default();
+        let message = format!(
+            "{count} images are {}x{}, {others} are not and are left out; the first is {width}x{height}",
+            kept.0, kept.1
+        );
+        let path = &images[first].path;
+        notes.push(
+            Warning::degraded("image-size", message)
+                .at(path.display())
+                .hint(format!("images of one recording have one size; {} lists them", place.display())),
+        );
+        let mut sizes = sizes.iter();
+        images.retain(|_| sizes.next().is_none_or(|s| !is_other(s)));
+    }
+    Ok(kept)
 }
 
 /// Opening angle across the longer side assumed for an uncalibrated camera, as of a phone: f = 0.8·w.

@@ -1,5 +1,6 @@
 //! Checks of timestamps and IMU samples. Each fault becomes a warning.
 
+use nalgebra::Vector3;
 use std::path::Path;
 use vidar_core::{Duration, ImuSample, Timestamp, Trajectory, Warning};
 
@@ -101,6 +102,74 @@ fn mean(samples: &[(Timestamp, f64)]) -> f64 {
     samples.iter().map(|s| s.1).sum::<f64>() / samples.len() as f64
 }
 
+/// Standard gravity, m/s²; anywhere on Earth it is within 0.3 % of it.
+const GRAVITY_MPS2: f64 = 9.80665;
+/// Specific force at rest further off than this share is a wrong gain or a large bias. Gravity's own variation is 0.3 %.
+const GAIN_TOLERANCE: f64 = 0.01;
+/// At rest: largest standard deviation of each axis of the accelerometer over a second, and largest mean rate of turn, which
+/// leaves room for the bias of a consumer gyroscope and none for a hand that sways.
+const REST_DEVIATION_MPS2: f64 = 0.3;
+const REST_TURN_RADPS: f64 = 0.1;
+const REST_TURN_DEVIATION_RADPS: f64 = 0.02;
+
+/// Median of |accel| over the seconds in which the IMU rests, m/s²; none where it never does.
+///
+/// The mean of each axis is taken before the norm, so that noise does not make it longer. `imu` must be in order of time.
+pub fn specific_force_at_rest(imu: &[ImuSample]) -> Option<f64> {
+    let mut norms = Vec::new();
+    let mut from = 0;
+    while from < imu.len() {
+        let end = imu[from].time + Duration::from_millis(1000);
+        let until = from + imu[from..].partition_point(|s| s.time < end);
+        let window = &imu[from..until];
+        if until < imu.len() && window.len() >= 10 {
+            let (accel, accel_std) = mean_and_deviation(window.iter().map(|s| s.accel.0));
+            let (gyro, gyro_std) = mean_and_deviation(window.iter().map(|s| s.gyro.0));
+            if accel_std < REST_DEVIATION_MPS2
+                && gyro_std < REST_TURN_DEVIATION_RADPS
+                && gyro.norm() < REST_TURN_RADPS
+            {
+                norms.push(accel.norm());
+            }
+        }
+        from = until.max(from + 1);
+    }
+    norms.sort_unstable_by(f64::total_cmp);
+    norms.get(norms.len() / 2).copied()
+}
+
+/// Mean, and the largest standard deviation of an axis.
+fn mean_and_deviation(values: impl Iterator<Item = Vector3<f64>> + Clone) -> (Vector3<f64>, f64) {
+    let n = values.clone().count().max(1) as f64;
+    let mean = values.clone().sum::<Vector3<f64>>() / n;
+    let variance = values.map(|v| (v - mean).component_mul(&(v - mean))).sum::<Vector3<f64>>() / n;
+    (mean, variance.max().max(0.0).sqrt())
+}
+
+/// Share by which the accelerometer's length of gravity is off at rest; none where the IMU never rests.
+pub fn gain_error_at_rest(imu: &[ImuSample]) -> Option<f64> {
+    specific_force_at_rest(imu).map(|norm| norm / GRAVITY_MPS2 - 1.0)
+}
+
+/// Checks the accelerometer's gain at rest.
+fn check_gain(imu: &[ImuSample], place: &Path, notes: &mut Vec<Warning>) {
+    let Some(error) = gain_error_at_rest(imu).filter(|e| e.abs() > GAIN_TOLERANCE) else { return };
+    let norm = GRAVITY_MPS2 * (1.0 + error);
+    if !GRAVITY_RANGE_MPS2.contains(&norm) {
+        // `gravity-norm` says it.
+        return;
+    }
+    let message = format!(
+        "at rest the accelerometer measures {norm:.3} m/s², {:+.1} % of gravity: its gain is wrong or its bias is large",
+        100.0 * error
+    );
+    notes.push(
+        Warning::new("accelerometer-gain", message)
+            .at(place.display())
+            .hint("a wrong gain makes all lengths wrong by as much; calibrate the IMU, or scale its samples"),
+    );
+}
+
 /// Checks the norm of gravity.
 pub(crate) fn check_gravity(norms: &[(Timestamp, f64)], place: &Path, notes: &mut Vec<Warning>) {
     let Some((norm, still)) = resting_norm(norms) else { return };
@@ -124,6 +193,7 @@ pub(crate) fn check_imu(imu: &[ImuSample], place: &Path, notes: &mut Vec<Warning
     find_gaps(imu.iter().map(|s| s.time), IMU_GAP_FLOOR, "imu-gap", "the IMU samples", place, notes);
     let norms: Vec<_> = imu.iter().map(|s| (s.time, s.accel.0.norm())).collect();
     check_gravity(&norms, place, notes);
+    check_gain(imu, place, notes);
     let fastest = imu.iter().map(|s| s.gyro.0.amax()).fold(0.0, f64::max);
     if fastest > GYRO_FULL_SCALE_RADPS {
         let message =

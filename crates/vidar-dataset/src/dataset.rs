@@ -117,6 +117,8 @@ pub struct Dataset {
     pub warnings: Vec<Warning>,
     /// Every text file that was read (lists, calibration, poses).
     pub text_files: Vec<PathBuf>,
+    /// Whether image times are invented, because there are none: intervals and rates then mean nothing.
+    pub times_are_invented: bool,
 }
 
 /// An image and the depth image nearest in time count as one moment when no further apart than this: the

@@ -1,6 +1,6 @@
 //! Completes the output of a reader to a consistent dataset: calibration, order, sizes, cuts, external trajectory.
 
-use crate::assemble::{cut, first_readable_size, guessed_model, keep_existing, name_of};
+use crate::assemble::{cut, guessed_model, keep_existing, keep_one_size, name_of};
 use crate::camera_flag::with_size;
 use crate::checks::{self, IMAGE_GAP_FLOOR};
 use crate::dataset::{CalibrationSource, Dataset, DepthEntry, DepthSensor, ExternalTrajectory, ImageEntry};
@@ -77,6 +77,8 @@ pub(crate) struct Draft {
     pub reference_cloud: Option<PathBuf>,
     pub warnings: Vec<Warning>,
     pub text_files: Vec<PathBuf>,
+    /// Image times are made from frame numbers.
+    pub times_are_invented: bool,
 }
 
 impl Draft {
@@ -98,6 +100,7 @@ impl Draft {
             reference_cloud: None,
             warnings: Vec::new(),
             text_files: Vec::new(),
+            times_are_invented: false,
         }
     }
 
@@ -113,8 +116,9 @@ impl Draft {
         for path in &options.calibration {
             self.apply_calibration(path)?;
         }
-        let images = self.complete_images()?;
-        self.complete_model(options, &images)?;
+        let mut images = self.complete_images()?;
+        self.complete_model(options, &mut images)?;
+        self.report_unread_calibrations();
         let chosen = CameraId(self.chosen as u32);
         let mut dataset = Dataset {
             name: name_of(&self.root),
@@ -134,6 +138,7 @@ impl Draft {
             reference_cloud: self.reference_cloud.take(),
             warnings: std::mem::take(&mut self.warnings),
             text_files: std::mem::take(&mut self.text_files),
+            times_are_invented: self.times_are_invented,
         };
         let root = self.root.clone();
         let notes = &mut dataset.warnings;
@@ -182,10 +187,32 @@ impl Draft {
             .collect())
     }
 
+    /// Names the files next to the images that look like a calibration and are not read.
+    fn report_unread_calibrations(&mut self) {
+        for name in crate::folder::names_in(&self.root).unwrap_or_default() {
+            let path = self.root.join(&name);
+            if self.text_files.contains(&path) || !looks_like_calibration(&name) || !path.is_file() {
+                continue;
+            }
+            self.warnings.push(
+                Warning::new("calibration-ignored", format!("{name} looks like a calibration and is not read"))
+                    .at(path.display())
+                    .hint(
+                        "--calibration FILE reads EuRoC's and Kalibr's yaml; --camera-model pinhole:fx,fy,cx,cy gives \
+                         the values",
+                    ),
+            );
+        }
+    }
+
     /// The chosen camera's model at the size of its images.
-    fn complete_model(&mut self, options: &OpenOptions, images: &[ImageEntry]) -> Result<(), DatasetError> {
+    fn complete_model(
+        &mut self,
+        options: &OpenOptions,
+        images: &mut Vec<ImageEntry>,
+    ) -> Result<(), DatasetError> {
+        let size = keep_one_size(images, &self.image_list, &mut self.warnings)?;
         let Some(first) = images.first() else { return Ok(()) };
-        let size = first_readable_size(images)?;
         let camera = &mut self.cameras[self.chosen];
         if let Some(model) = &options.camera_model {
             (camera.model, camera.source) = (Some(model.clone()), CalibrationSource::Flags);
@@ -408,6 +435,14 @@ impl Draft {
         dataset.text_files.push(path.clone());
         Ok(())
     }
+}
+
+/// Names under which programs write calibrations.
+fn looks_like_calibration(name: &str) -> bool {
+    let lower = name.to_ascii_lowercase();
+    let words = ["calib", "intrinsic", "camchain", "camera", "extrinsic"];
+    let endings = [".txt", ".yaml", ".yml", ".json", ".xml", ".ini"];
+    words.iter().any(|w| lower.contains(w)) && endings.iter().any(|e| lower.ends_with(e))
 }
 
 /// Without an IMU there is no IMU frame: poses that a format calls the IMU's are then the chosen camera's.

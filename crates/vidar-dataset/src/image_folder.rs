@@ -111,6 +111,7 @@ fn images_by_name(
         return times.into_iter().zip(names).map(|(t, n)| (t, folder.join(n))).collect();
     }
     draft.warnings.push(synthetic_warning(folder));
+    draft.times_are_invented = true;
     numbers_of(names).into_iter().zip(names).map(|(i, n)| (synthetic_time(i), folder.join(n))).collect()
 }
 

@@ -22,6 +22,7 @@ mod trajectory_file;
 mod tum_rgbd;
 
 pub use camera_flag::{CameraFlag, with_size};
+pub use checks::{gain_error_at_rest, specific_force_at_rest};
 pub use dataset::{
     AccelSample, CalibrationSource, DEPTH_TOLERANCE, Dataset, DepthEntry, DepthSensor, ExternalTrajectory,
     ImageEntry,

@@ -27,6 +27,7 @@ pub(crate) fn open(path: &Path, reason: String, options: &OpenOptions) -> Result
         Some(list) => image_folder::images_by_list(&mut draft, &folder, &names, &list, options)?,
         None => {
             draft.warnings.push(synthetic_warning(&folder));
+            draft.times_are_invented = true;
             let times = numbers_of(&names).into_iter().map(synthetic_time);
             times.zip(&names).map(|(time, name)| (time, folder.join(name))).collect()
         }

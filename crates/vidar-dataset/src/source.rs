@@ -15,17 +15,23 @@ pub(crate) fn read_text_file(path: &Path) -> Result<Vec<u8>, DatasetError> {
     read_file_up_to(path, MAX_TEXT_BYTES)
 }
 
-/// Reads a file of at most `limit` bytes.
+/// Reads a file of at most `limit` bytes; of a device or a pipe, which state no length, [`MAX_STREAM_BYTES`].
 pub(crate) fn read_file_up_to(path: &Path, limit: u64) -> Result<Vec<u8>, DatasetError> {
     let file = std::fs::File::open(path).map_err(io_error(path))?;
-    let found = file.metadata().map_err(io_error(path))?.len();
-    if found > limit {
-        return Err(DatasetError::TooLarge { path: path.to_path_buf(), found, limit });
+    let metadata = file.metadata().map_err(io_error(path))?;
+    let limit = if metadata.is_file() { limit } else { limit.min(MAX_STREAM_BYTES) };
+    let too_large = |found| DatasetError::TooLarge { path: path.to_path_buf(), found, limit };
+    if metadata.len() > limit {
+        return Err(too_large(metadata.len()));
     }
-    let mut bytes = Vec::with_capacity(found as usize);
-    file.take(limit).read_to_end(&mut bytes).map_err(io_error(path))?;
-    Ok(bytes)
+    let mut bytes = Vec::with_capacity(metadata.len() as usize);
+    file.take(limit + 1).read_to_end(&mut bytes).map_err(io_error(path))?;
+    let found = bytes.len() as u64;
+    if found > limit { Err(too_large(found)) } else { Ok(bytes) }
 }
+
+/// Largest input that is read from what is no file, bytes.
+const MAX_STREAM_BYTES: u64 = 64 << 20;
 
 /// Most rows of a file: ten hours at 1 kHz. It keeps a file of line feeds from growing into a list of rows.
 const MAX_ROWS: usize = 36_000_000;

@@ -90,6 +90,12 @@ fn not_a_trajectory(source: &Source<'_>) -> DatasetError {
     if source.bytes.is_empty() {
         return DatasetError::NoPoses { path: source.path.to_path_buf(), found: "an empty file".into() };
     }
+    if parse::is_ambiguous_csv(source) {
+        let found = "8 columns with commas and no header: the order of the quaternion is not known";
+        let expected =
+            "--trajectory-format tum (x y z w) or euroc (w x y z), or a header that names qx and qw";
+        return source.malformed(1, found, expected);
+    }
     let expected = "rows of TUM (8 columns), EuRoC csv (4, 8, 11 or 17) or KITTI (12)";
     source.malformed(1, "no known trajectory format", expected)
 }

@@ -25,10 +25,10 @@ fn main() -> Result<(), Box<dyn Error>> {
     let before = std::time::Instant::now();
     let report = evaluate_surface_from(&estimate, &reference, &start, &config)?;
     println!(
-        "{count} points, {offset_m} m off: {:.1} s, peak {} MiB; native F {:.4}, free F {:.4}, chamfer {:.4} m, {}",
+        "{count} points, {offset_m} m off: {:.1} s, peak {} MiB; rigid F {:.4}, free F {:.4}, chamfer {:.4} m, {}",
         before.elapsed().as_secs_f64(),
         peak_kib() / 1024,
-        report.native[0].f,
+        report.rigid[0].f,
         report.free[0].f,
         report.chamfer.chamfer_m,
         report.placement.reason,

@@ -3,12 +3,14 @@
 //! With `R` the estimate after placement, `G` the reference and a threshold τ,
 //! `P = |{x ∈ R : min_y |x − y| < τ}| / |R|`, `R = |{y ∈ G : min_x |x − y| < τ}| / |G|`, `F = 2PR / (P + R)`.
 //!
-//! **Native placement.** The estimate is moved into the reference's world frame by the SE(3) fit of its trajectory to
-//! ground truth. One similarity refinement by ICP follows; it is accepted only when its scale is within bounds. It
-//! corrects a small uniform error of depth, but not an unknown scale.
+//! **Rigid placement.** The estimate is moved into the reference's world frame by the SE(3) fit of its trajectory to
+//! ground truth, refined by an ICP without scale. The scale is the estimate's own: a map that claims to be metric is judged
+//! by this one, and so are the mean distances and the errors of points.
+//! **Native placement**, the paper's. From the same SE(3) fit one similarity refinement by ICP follows; it is accepted only
+//! when its scale is within bounds. It forgives an error of scale within those bounds; above 2 % that is a warning.
 //! **Free placement.** The refinement's scale is not bounded; it also starts from the trajectories' Sim(3) fit where
-//! there is one. The native placement is one of the free ones and the one with the highest F counts, so
-//! `ΔF = F_free − F_native` is never negative: the gain in F if the true scale were known.
+//! there is one. The rigid and the native placement are among the free ones and the one with the highest F counts, so
+//! `ΔF = F_free − F_native` and `F_free − F_rigid` are never negative: the gain in F if the true scale were known.
 //!
 //! **Evaluated points.** The reference should contain the observed surface only: recall counts every point of it, and
 //! a scan of rooms that no camera observed makes recall meaningless. Cropping the reference to the estimate is not
@@ -30,7 +32,7 @@ pub use report::{Chamfer, FreePlacement, PlacementReport, PointErrors, Scores, S
 use crate::error::EvalError;
 use crate::nearest::{NearestIndex, nearest_distances};
 use cloud::{evaluated_points, finite_positions, thinned, transformed};
-use placement::{free_candidates, native_placement};
+use placement::{Placement, free_candidates, native_placement, rigid_placement};
 use vidar_core::{PointCloud, Se3, Sim3, Warning};
 
 /// Initial placement of the estimate in the reference's world frame, from the trajectories.
@@ -60,7 +62,7 @@ pub fn evaluate_surface(
     evaluate_surface_from(estimate, reference, &PlacementStart::from(*truth_from_estimate), config)
 }
 
-/// Evaluates `estimate` against `reference` under the native-scale bounded placement and under the free one.
+/// Evaluates `estimate` against `reference` under the rigid, the native-scale bounded and the free placement.
 ///
 /// Points with a coordinate that is not finite are dropped and counted. Fails when nothing is left of a cloud.
 pub fn evaluate_surface_from(
@@ -80,43 +82,50 @@ pub fn evaluate_surface_from(
     let mut warnings = dropped_warnings(estimate, reference, estimated.len(), reference_points.len());
 
     let truth = Reference::new(thinned(&reference_points, config.voxel_size_m)?)?;
+    let threshold = config.delta_f_threshold();
+    let rigid = rigid_placement(&estimated, &truth.index, start, config);
+    let rigid_score = score(&estimated, &truth, &rigid.truth_from_estimate, config)?;
     let native = native_placement(&estimated, &truth.index, start, config)?;
-    let native_score = score(&estimated, &truth, &native.truth_from_estimate, config)?;
-    let mut free = FreePlacement::same_as_native(&native, &native_score.scores);
-    for candidate in free_candidates(&estimated, &truth.index, start, config, &native)? {
+    let native_scores = candidate_scores(&estimated, &truth, &native.truth_from_estimate, config)?;
+    let mut free = FreePlacement::new(&rigid, rigid_score.scores.clone());
+    let bounded = Placement { start: "native", truth_from_estimate: native.truth_from_estimate };
+    for candidate in
+        std::iter::once(bounded).chain(free_candidates(&estimated, &truth.index, start, config, &native)?)
+    {
         // A candidate that moves all points outside the crop is skipped.
         let scores = candidate_scores(&estimated, &truth, &candidate.truth_from_estimate, config);
         let Ok(scores) = scores else { continue };
-        if report::f_at(&scores, config.delta_f_threshold()) > free.f_at(config.delta_f_threshold()) {
+        if report::f_at(&scores, threshold) > free.f_at(threshold) {
             free = FreePlacement::new(&candidate, scores);
         }
     }
-    if let Some(warning) = native.rejection_warning(config) {
-        warnings.push(warning);
-    }
-    let threshold = config.delta_f_threshold();
+    warnings.extend(native.rejection_warning(config));
+    warnings.extend(native.scale_warning());
     Ok(SurfaceReport {
-        delta_f: free.f_at(threshold) - native_score.f_at(threshold),
+        delta_f_rigid: free.f_at(threshold) - report::f_at(&rigid_score.scores, threshold),
+        delta_f: free.f_at(threshold) - report::f_at(&native_scores, threshold),
         delta_f_threshold_m: threshold,
-        native: native_score.scores,
+        rigid: rigid_score.scores,
+        native: native_scores,
         free: free.scores.clone(),
         scale_native: native.truth_from_estimate.scale,
         scale_free: free.truth_from_estimate.scale,
-        chamfer: native_score.chamfer,
+        chamfer: rigid_score.chamfer,
+        rigid_placement: rigid.truth_from_estimate.into(),
         estimate_points: estimate.len(),
         reference_points: reference.len(),
         estimate_points_not_finite: estimate.len() - estimated.len(),
         reference_points_not_finite: reference.len() - reference_points.len(),
-        estimate_points_cropped: native_score.cropped,
-        estimate_points_evaluated: native_score.estimate_points,
+        estimate_points_cropped: rigid_score.cropped,
+        estimate_points_evaluated: rigid_score.estimate_points,
         reference_points_evaluated: truth.points.len(),
         placement: native.report(),
         free_placement: free,
         point_errors: point_errors(
             (estimate, reference),
             &truth,
-            (native_score.distances, &native_score.index),
-            (&native.truth_from_estimate, config.voxel_size_m.is_some()),
+            (rigid_score.distances, &rigid_score.index),
+            (&rigid.truth_from_estimate, config.voxel_size_m.is_some()),
         ),
         warnings,
     })
@@ -144,12 +153,6 @@ struct PlacementScore {
     index: NearestIndex,
     /// Distances of the evaluated points, when errors per point are requested.
     distances: Option<PointErrors>,
-}
-
-impl PlacementScore {
-    fn f_at(&self, threshold_m: f64) -> f64 {
-        report::f_at(&self.scores, threshold_m)
-    }
 }
 
 fn score(

@@ -15,7 +15,7 @@ use crate::settings::HubSettings;
 use std::fs::{File, OpenOptions};
 use std::io::{Read, Seek, SeekFrom, Write};
 use std::path::{Path, PathBuf};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 /// Bytes between two progress reports and checks for cancellation.
 const PIECE: usize = 64 << 10;
@@ -75,10 +75,15 @@ pub(crate) fn fetch(
     request: &FileRequest<'_>,
     callbacks: &TransferCallbacks<'_>,
 ) -> Result<FetchedFile, HubError> {
-    let metadata = retried(settings, callbacks, || request_metadata(client, request).map_err(|f| (f, 0)))?;
+    let deadline = Deadline::new(settings, request.url);
+    let metadata =
+        retried(settings, &deadline, callbacks, || request_metadata(client, request).map_err(|f| (f, 0)))?;
     let expected = ExpectedFile::of(request, &metadata)?;
     let part = PartialFile::of(request, &expected);
-    let digest = retried(settings, callbacks, || attempt(client, request, &expected, &part, callbacks))?;
+    let digest = retried(settings, &deadline, callbacks, || {
+        let limits = Limits { deadline: &deadline, rate: RateLimit::new(settings) };
+        attempt(client, request, &expected, &part, limits, callbacks)
+    })?;
     part.into_place(request.target)?;
     Ok(FetchedFile {
         bytes: digest.bytes(),
@@ -88,15 +93,73 @@ pub(crate) fn fetch(
     })
 }
 
+/// When a file must be complete.
+struct Deadline {
+    since: Instant,
+    longest: Duration,
+    url: String,
+}
+
+impl Deadline {
+    fn new(settings: &HubSettings, url: &str) -> Self {
+        Self { since: Instant::now(), longest: settings.longest_transfer, url: url.to_owned() }
+    }
+
+    fn check(&self) -> Result<(), HubError> {
+        match self.since.elapsed() > self.longest {
+            true => Err(HubError::TooSlow { url: self.url.clone(), secs: self.longest.as_secs() }),
+            false => Ok(()),
+        }
+    }
+}
+
+/// The rate below which a connection is closed.
+struct RateLimit {
+    least: u64,
+    window: Duration,
+    since: Instant,
+    bytes: u64,
+}
+
+impl RateLimit {
+    fn new(settings: &HubSettings) -> Self {
+        let (least, window) = (settings.min_bytes_per_sec, settings.rate_window);
+        Self { least, window, since: Instant::now(), bytes: 0 }
+    }
+
+    /// Takes a piece; an error in words where the window that ends with it was too slow.
+    fn add(&mut self, bytes: usize) -> Result<(), String> {
+        self.bytes += bytes as u64;
+        let secs = self.since.elapsed().as_secs_f64();
+        if secs < self.window.as_secs_f64() {
+            return Ok(());
+        }
+        let rate = self.bytes as f64 / secs;
+        (self.since, self.bytes) = (Instant::now(), 0);
+        match rate < self.least as f64 {
+            true => Err(format!("{rate:.0} bytes per second are less than {}", self.least)),
+            false => Ok(()),
+        }
+    }
+}
+
+/// What ends an attempt besides its own errors.
+struct Limits<'a> {
+    deadline: &'a Deadline,
+    rate: RateLimit,
+}
+
 /// Retries with increasing waits. A failure carries the number of bytes that its attempt added.
 fn retried<T>(
     settings: &HubSettings,
+    deadline: &Deadline,
     callbacks: &TransferCallbacks<'_>,
     mut attempt: impl FnMut() -> Result<T, (Failure, u64)>,
 ) -> Result<T, HubError> {
     let mut tried = 0;
     loop {
         callbacks.stop()?;
+        deadline.check()?;
         match attempt() {
             Ok(value) => return Ok(value),
             Err((Failure::Final(error), _)) => return Err(error),
@@ -206,6 +269,7 @@ fn attempt(
     request: &FileRequest<'_>,
     expected: &ExpectedFile,
     part: &PartialFile,
+    limits: Limits<'_>,
     callbacks: &TransferCallbacks<'_>,
 ) -> Result<Digest, (Failure, u64)> {
     let last = |error: HubError| (Failure::Final(error), 0);
@@ -215,7 +279,8 @@ fn attempt(
     if expected.bytes.is_none_or(|bytes| digest.bytes() < bytes) || before == 0 {
         check_space(request.target, expected, before).map_err(last)?;
         let response = client.ask(Method::Get(before), request.url).map_err(|f| (f, 0))?;
-        stream(response, request, expected, &mut file, &mut digest, part, callbacks).map_err(|failure| {
+        let into = Sink { file: &mut file, digest: &mut digest, part };
+        stream(response, request, expected, into, limits, callbacks).map_err(|failure| {
             let gained = digest.bytes().saturating_sub(before);
             (failure, gained)
         })?;
@@ -244,16 +309,23 @@ fn check_space(target: &Path, expected: &ExpectedFile, there: u64) -> Result<(),
     }
 }
 
+/// Where a response goes.
+struct Sink<'a> {
+    file: &'a mut File,
+    digest: &'a mut Digest,
+    part: &'a PartialFile,
+}
+
 /// Appends the response to the existing bytes, or replaces them if the server starts from the beginning.
 fn stream(
     response: Response,
     request: &FileRequest<'_>,
     expected: &ExpectedFile,
-    file: &mut File,
-    digest: &mut Digest,
-    part: &PartialFile,
+    into: Sink<'_>,
+    mut limits: Limits<'_>,
     callbacks: &TransferCallbacks<'_>,
 ) -> Result<(), Failure> {
+    let Sink { file, digest, part } = into;
     let start = where_it_begins(&response, request, digest.bytes())?;
     if start != digest.bytes() {
         let restart = file.set_len(0).and_then(|()| file.seek(SeekFrom::Start(0)));
@@ -279,6 +351,8 @@ fn stream(
             Err(e) if e.kind() == std::io::ErrorKind::Interrupted => continue,
             Err(e) => return Err(broken(format!("broke off after {} bytes: {e}", digest.bytes()))),
         };
+        limits.deadline.check().map_err(Failure::Final)?;
+        limits.rate.add(n).map_err(broken)?;
         let found = digest.bytes() + n as u64;
         if found > expected.most() {
             part.discard();

@@ -111,6 +111,14 @@ pub enum HubError {
         /// What went wrong.
         reason: String,
     },
+    /// A file took longer than a transfer may take.
+    #[error("{url}: not complete after {secs} s")]
+    TooSlow {
+        /// The requested address.
+        url: String,
+        /// The limit, s.
+        secs: u64,
+    },
     /// A redirect is invalid, in a loop, or from https to http.
     #[error("{url}: {reason}")]
     Redirect {
@@ -234,7 +242,7 @@ impl HubError {
                  a local file"
                     .to_owned()
             }
-            Self::Status { .. } | Self::Network { .. } => {
+            Self::Status { .. } | Self::Network { .. } | Self::TooSlow { .. } => {
                 "try again: what was fetched is kept; HF_ENDPOINT names a mirror, HTTPS_PROXY a proxy".to_owned()
             }
             Self::WrongSize { .. } | Self::WrongHash { .. } => {

@@ -33,6 +33,13 @@ pub struct HubSettings {
     pub proxy_from_environment: bool,
     /// Time without data after which a connection is closed.
     pub silence: Duration,
+    /// Slowest transfer that goes on, bytes per second on average over [`Self::rate_window`]. A server that sends a byte now and
+    /// then is not silent, and would never end.
+    pub min_bytes_per_sec: u64,
+    /// Time over which the rate is taken.
+    pub rate_window: Duration,
+    /// Longest time for one file, tries and waits included.
+    pub longest_transfer: Duration,
     /// Tries without progress before a transfer fails.
     pub tries: u32,
     /// First wait between two tries; doubled each time.
@@ -65,6 +72,9 @@ impl HubSettings {
             offline: false,
             proxy_from_environment: true,
             silence: Duration::from_secs(30),
+            min_bytes_per_sec: 1 << 10,
+            rate_window: Duration::from_secs(60),
+            longest_transfer: Duration::from_secs(24 * 3600),
             tries: 5,
             backoff: Duration::from_secs(1),
             longest_wait: Duration::from_secs(120),

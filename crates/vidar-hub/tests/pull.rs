@@ -439,6 +439,37 @@ fn a_slow_transfer_can_be_stopped_and_a_stalled_one_times_out() {
 }
 
 #[test]
+fn a_transfer_that_trickles_and_one_that_takes_too_long_are_given_up() {
+    // Never silent: a byte every two milliseconds would take minutes.
+    let trickle = |request: &Request, file: &[u8]| Reply {
+        drip: Some((1, Duration::from_millis(2))),
+        ..Reply::file(request, file)
+    };
+    let bench = Bench::new(trickle);
+    let settings = HubSettings {
+        min_bytes_per_sec: 50_000,
+        rate_window: Duration::from_millis(200),
+        tries: 2,
+        ..bench.store.settings().clone()
+    };
+    let clock = Instant::now();
+    let error = Store::new(settings).pull(tiny(), &options(), &quiet()).unwrap_err();
+    assert!(
+        matches!(error, HubError::Network { .. }) && error.to_string().contains("bytes per second"),
+        "{error}"
+    );
+    assert!(clock.elapsed() < Duration::from_secs(4), "{:?}", clock.elapsed());
+
+    let bench = Bench::new(trickle);
+    let settings =
+        HubSettings { longest_transfer: Duration::from_millis(300), ..bench.store.settings().clone() };
+    let clock = Instant::now();
+    let error = Store::new(settings).pull(tiny(), &options(), &quiet()).unwrap_err();
+    assert!(matches!(error, HubError::TooSlow { .. }), "{error}");
+    assert!(clock.elapsed() < Duration::from_secs(4), "{:?}", clock.elapsed());
+}
+
+#[test]
 fn hostile_responses_end_in_an_error() {
     type WrongResponse = fn(&Request, &[u8]) -> Reply;
     let responses: [WrongResponse; 8] = [

@@ -124,6 +124,7 @@ pub fn render_html(report: &Report) -> String {
 
 /// Text for HTML content and for attributes in double quotes.
 fn escaped(text: &str) -> String {
+    let text = vidar_core::printable_lines(text);
     let mut out = String::with_capacity(text.len());
     for c in text.chars() {
         match c {

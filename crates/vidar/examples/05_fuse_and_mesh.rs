@@ -45,7 +45,7 @@ pub fn main() -> Result<(), Failure> {
     let scan = vidar_export::read_ply(&std::fs::read(scan)?)?.cloud;
     let cloud = PointCloud::from_positions(mesh.positions.clone());
     let report = evaluate_surface(&cloud, &scan, &Se3::IDENTITY, &SurfaceEvalConfig::default())?;
-    let score = report.native.first().ok_or("no threshold")?;
+    let score = report.rigid.first().ok_or("no threshold")?;
     println!("{} triangles in {size_kib} KiB, F@{} {:.3}", mesh.triangles.len(), score.threshold_m, score.f);
     assert!(score.f > 0.8);
     Ok(())

@@ -74,6 +74,14 @@ pub enum Error {
         /// Which folder.
         path: PathBuf,
     },
+    /// A folder to resume in holds another run.
+    #[error("cannot resume in {path}: {difference}", path = path.display())]
+    OtherRun {
+        /// Which folder.
+        path: PathBuf,
+        /// What differs.
+        difference: String,
+    },
     /// The input cannot be read.
     #[error(transparent)]
     Dataset(#[from] vidar_dataset::DatasetError),
@@ -228,6 +236,7 @@ impl Error {
             Self::UnknownPreset { .. } => "E0104",
             Self::Usage { .. } => "E0105",
             Self::OutputExists { .. } => "E0106",
+            Self::OtherRun { .. } => "E0107",
             Self::Dataset(vidar_dataset::DatasetError::BadOption { .. }) => "E0105",
             Self::Dataset(_) => "E0201",
             Self::NoMetricTrajectory { .. } => "E0202",
@@ -301,6 +310,10 @@ impl Error {
             Self::ConfigFile { .. } => "the file is TOML; `vidar config show > my.toml` writes a valid one",
             Self::UnknownPreset { .. } => "`vidar config presets` describes them",
             Self::OutputExists { .. } => "choose another -o, or add --force to rename the old folder",
+            Self::OtherRun { .. } => {
+                "resume with the command in its manifest.json, choose another -o, or use --force instead of --resume to rename \
+                 the old folder"
+            }
             Self::NoMetricTrajectory { .. } => {
                 "give the poses of your own odometry with --trajectory FILE (TUM, EuRoC csv or KITTI, metres)"
             }
@@ -419,6 +432,7 @@ pub const CODES: &[(&str, &str)] = &[
     ("E0104", "The preset is not one of those that `vidar config presets` lists."),
     ("E0105", "The command line has an invalid option, argument or combination of them."),
     ("E0106", "The output folder exists. VIDAR never overwrites; --force renames the old folder."),
+    ("E0107", "The folder given with --resume holds another run: its recording or its settings differ."),
     (
         "E0201",
         "The input path, a file in it, or its calibration cannot be used. The message names file, line, what was found and what was expected.",

@@ -10,7 +10,8 @@ use vidar_core::{PointCloud, Se3, Trajectory, Warning};
 use vidar_dataset::TrajectoryReadOptions;
 use vidar_eval::{SampleDensity, SurfaceReport, TrajectoryReport};
 
-/// Scores by name: `ate`, `ate-sim3`, `scale`, `chamfer`, `f@0.05`, ….
+/// Scores by name: `ate`, `ate-sim3`, `scale`, `chamfer`, `f@0.05`, …. Scores of the surface are those of the rigid fit;
+/// `f@0.05-refined` is the paper's, with a scale refined within bounds.
 pub type Scores = BTreeMap<String, f64>;
 
 /// Every score of an evaluation.
@@ -38,11 +39,12 @@ fn add_trajectory(scores: &mut Scores, report: &TrajectoryReport) {
 }
 
 fn add_surface(scores: &mut Scores, report: &SurfaceReport) {
-    scores.extend(report.native.iter().map(|s| (format!("f@{:.2}", s.threshold_m), s.f)));
-    scores.extend(report.native.iter().map(|s| (format!("p@{:.2}", s.threshold_m), s.precision)));
-    scores.extend(report.native.iter().map(|s| (format!("r@{:.2}", s.threshold_m), s.recall)));
+    scores.extend(report.rigid.iter().map(|s| (format!("f@{:.2}", s.threshold_m), s.f)));
+    scores.extend(report.rigid.iter().map(|s| (format!("p@{:.2}", s.threshold_m), s.precision)));
+    scores.extend(report.rigid.iter().map(|s| (format!("r@{:.2}", s.threshold_m), s.recall)));
+    scores.extend(report.native.iter().map(|s| (format!("f@{:.2}-refined", s.threshold_m), s.f)));
     scores.insert("chamfer".into(), report.chamfer.chamfer_m);
-    scores.insert("delta-f".into(), report.delta_f);
+    scores.insert("delta-f".into(), report.delta_f_rigid);
 }
 
 /// Result of an evaluation of two files or of a run.
@@ -170,7 +172,8 @@ fn surface(estimate: &Path, truth: &Path, config: &Config) -> Result<EvalOutcome
 
 /// A cloud as it is; a mesh as evenly spread points.
 fn read_surface(path: &Path, config: &Config) -> Result<PointCloud, Error> {
-    let bytes = std::fs::read(path).map_err(|e| Error::io("read", path, e))?;
+    let bytes = crate::system::read_up_to(path, crate::system::MAX_CLOUD_BYTES)
+        .map_err(|e| Error::io("read", path, e))?;
     let ply = vidar_export::read_ply(&bytes)?;
     if ply.triangles.is_empty() {
         return Ok(ply.cloud);
@@ -179,23 +182,25 @@ fn read_surface(path: &Path, config: &Config) -> Result<PointCloud, Error> {
     Ok(vidar_eval::sample_mesh(&ply.into_mesh(), density)?)
 }
 
-/// The surface report in words.
+/// The surface report in words: the rigid fit first, then what another scale would give.
 pub fn surface_lines(report: &SurfaceReport) -> Vec<(String, String)> {
-    let mut lines: Vec<(String, String)> = report
-        .native
+    let text =
+        |s: &vidar_eval::Scores| format!("{:.3} (precision {:.3}, recall {:.3})", s.f, s.precision, s.recall);
+    let rigid = report
+        .rigid
         .iter()
-        .map(|s| {
-            let text = format!("{:.3} (precision {:.3}, recall {:.3})", s.f, s.precision, s.recall);
-            (format!("F@{:.2} m", s.threshold_m), text)
-        })
-        .collect();
-    lines
-        .push(("placement".into(), format!("scale {:.4}, {}", report.scale_native, report.placement.reason)));
+        .map(|s| (format!("F@{:.2} m", s.threshold_m), format!("{}, rigid fit: scale as it is", text(s))));
+    let refined = report.native.iter().map(|s| {
+        let label = format!("F@{:.2} m refined", s.threshold_m);
+        (label, format!("{}, {}", text(s), refinement(report)))
+    });
+    let mut lines: Vec<(String, String)> = rigid.chain(refined).collect();
+    lines.push(("refinement".into(), report.placement.reason.clone()));
     lines.push((
         "free scale".into(),
         format!(
-            "dF {:+.3} at {:.2} m with scale {:.4}",
-            report.delta_f, report.delta_f_threshold_m, report.scale_free
+            "dF {:+.3} at {:.2} m with scale {:.4}, against the rigid fit",
+            report.delta_f_rigid, report.delta_f_threshold_m, report.scale_free
         ),
     ));
     let c = &report.chamfer;
@@ -213,11 +218,20 @@ pub fn surface_lines(report: &SurfaceReport) -> Vec<(String, String)> {
     lines
 }
 
+/// What the paper's bounded placement did with the scale.
+pub fn refinement(report: &SurfaceReport) -> String {
+    match report.placement.accepted {
+        true => format!("scale refined to {:.4}", report.scale_native),
+        false => "refinement rejected".to_owned(),
+    }
+}
+
 /// The scores in the folder of a finished run.
 pub fn evaluate_run(run: &Path) -> Result<EvalOutcome, Error> {
     let not_a_run = |reason: String| Error::NotARun { path: run.to_owned(), reason };
     let path = run.join("eval/metrics.json");
-    let bytes = std::fs::read(&path).map_err(|e| not_a_run(format!("eval/metrics.json: {e}")))?;
+    let bytes = crate::system::read_up_to(&path, crate::system::MAX_JSON_BYTES)
+        .map_err(|e| not_a_run(format!("eval/metrics.json: {e}")))?;
     let report: Value =
         serde_json::from_slice(&bytes).map_err(|e| not_a_run(format!("eval/metrics.json: {e}")))?;
     let scores: Scores = serde_json::from_value(report["scores"].clone())

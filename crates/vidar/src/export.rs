@@ -64,7 +64,8 @@ struct StoredViews {
 pub fn read_views(run: &Path) -> Result<Vec<StoredView>, Error> {
     let path = run.join("views.json");
     let not_a_run = |reason: String| Error::NotARun { path: run.to_owned(), reason };
-    let bytes = std::fs::read(&path).map_err(|e| not_a_run(format!("views.json: {e}")))?;
+    let bytes = crate::system::read_up_to(&path, crate::system::MAX_JSON_BYTES)
+        .map_err(|e| not_a_run(format!("views.json: {e}")))?;
     let stored: StoredViews =
         serde_json::from_slice(&bytes).map_err(|e| not_a_run(format!("views.json: {e}")))?;
     if stored.schema != VIEWS_SCHEMA {
@@ -99,7 +100,8 @@ fn glb(run: &Path, out: &Path) -> Result<PathBuf, Error> {
         return copy(run, "map", "mesh.glb", out);
     }
     let path = run.join("map/mesh.ply");
-    let bytes = std::fs::read(&path).map_err(|e| Error::io("read", &path, e))?;
+    let bytes = crate::system::read_up_to(&path, crate::system::MAX_CLOUD_BYTES)
+        .map_err(|e| Error::io("read", &path, e))?;
     let mesh = vidar_export::read_ply(&bytes)?.into_mesh();
     let target = out.join("mesh.glb");
     let comments = ["VIDAR metric map".to_owned()];
@@ -178,7 +180,8 @@ fn export_views(run: &Path) -> Result<Vec<ExportView>, Error> {
 
 fn points(run: &Path) -> Result<PointCloud, Error> {
     let path = run.join("map/points.ply");
-    let bytes = std::fs::read(&path).map_err(|e| Error::io("read", &path, e))?;
+    let bytes = crate::system::read_up_to(&path, crate::system::MAX_CLOUD_BYTES)
+        .map_err(|e| Error::io("read", &path, e))?;
     Ok(vidar_export::read_ply(&bytes)?.cloud)
 }
 

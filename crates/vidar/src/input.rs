@@ -214,6 +214,21 @@ pub fn open_every_image(path: &Path, options: &OpenOptions, config: &Config) -> 
     open_dataset(path, options, &config)
 }
 
+/// Where image times are invented, an interval of time between keyframes means nothing: every image is one.
+pub fn use_every_untimed_image(dataset: &Dataset, config: &mut Config) -> Option<Warning> {
+    if !dataset.times_are_invented {
+        return None;
+    }
+    // Shorter than any interval of invented times.
+    config.keyframes.unposed_interval_secs = 1e-6;
+    let message = format!(
+        "the {} images have no times: where no poses select keyframes, every image is one",
+        dataset.images.len()
+    );
+    let hint = "--stride N takes every N-th of a video; --timestamps FILE gives the times";
+    Some(Warning::new("every-image-used", message).hint(hint))
+}
+
 /// The images that `input.stride` leaves.
 pub fn strided(dataset: &Dataset, config: &Config) -> Vec<ImageEntry> {
     dataset.images.iter().step_by(config.input.stride.max(1)).cloned().collect()
@@ -227,6 +242,13 @@ pub fn open_dataset(path: &Path, options: &OpenOptions, config: &Config) -> Resu
     options.start = Some(Duration::from_secs_f64(config.input.start_secs)).filter(|d| *d > Duration::ZERO);
     options.end = Some(Duration::from_secs_f64(config.input.end_secs)).filter(|d| *d > Duration::ZERO);
     Ok(vidar_dataset::open(path, &options)?)
+}
+
+/// σ(ln s) of what no estimate of the scale sees: as configured, and at least what the accelerometer is off at rest.
+pub fn unseen_scale_std(dataset: &Dataset, config: &Config) -> f64 {
+    let at_rest = vidar_dataset::gain_error_at_rest(&dataset.imu).map_or(0.0, f64::abs);
+    // Gravity itself differs by 0.3 % on Earth, which says nothing of the gain.
+    if at_rest > 0.01 { config.input.imu_scale_std.max(at_rest) } else { config.input.imu_scale_std }
 }
 
 /// Ground truth of the camera in use at the images' stamps, where its place on the rig is known.

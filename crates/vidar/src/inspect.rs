@@ -44,8 +44,8 @@ pub struct Stream {
     pub start_secs: f64,
     /// Length, s.
     pub length_secs: f64,
-    /// Median rate, Hz.
-    pub rate_hz: f64,
+    /// Median rate, Hz; null where times are invented.
+    pub rate_hz: Option<f64>,
     /// Longest time between two samples, s.
     pub longest_gap_secs: f64,
 }
@@ -86,6 +86,8 @@ pub fn inspect(path: &Path, options: &OpenOptions) -> Result<Inspection, Error> 
     ]
     .into_iter()
     .filter_map(|(what, times)| stream(what, &times))
+    // Poses of images have the images' times.
+    .map(|s| Stream { rate_hz: s.rate_hz.filter(|_| !dataset.times_are_invented), ..s })
     .collect();
     Ok(Inspection {
         name: dataset.name.clone(),
@@ -115,7 +117,7 @@ fn stream(what: &str, times: &[Timestamp]) -> Option<Stream> {
         count: times.len(),
         start_secs: first.as_secs_f64(),
         length_secs: (last - first).as_secs_f64(),
-        rate_hz: if median > 0 { 1e9 / median as f64 } else { 0.0 },
+        rate_hz: Some(if median > 0 { 1e9 / median as f64 } else { 0.0 }),
         longest_gap_secs: gaps.last().copied().unwrap_or(0) as f64 * 1e-9,
     })
 }
@@ -232,7 +234,7 @@ mod tests {
         let times: Vec<Timestamp> =
             [0, 50, 100, 150, 400, 450].map(|ms| Timestamp::from_nanos(ms * 1_000_000)).into();
         let stream = stream("x", &times).unwrap();
-        assert!((stream.rate_hz - 20.0).abs() < 1e-9);
+        assert!((stream.rate_hz.unwrap() - 20.0).abs() < 1e-9);
         assert!((stream.longest_gap_secs - 0.25).abs() < 1e-9);
         assert!((stream.length_secs - 0.45).abs() < 1e-9);
     }

@@ -24,9 +24,11 @@ pub mod input;
 pub mod inspect;
 pub mod models;
 pub mod odometry;
+pub mod quality;
 pub mod run;
 pub mod run_folder;
 pub mod system;
+pub mod verdict;
 
 pub use config::{Config, Layered};
 pub use error::{Error, ExitStatus};

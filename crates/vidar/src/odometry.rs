@@ -9,11 +9,14 @@ use crate::config::{Config, Layered};
 use crate::error::{Error, ExitStatus};
 use crate::events::{CancelToken, Event, Events};
 use crate::input::{self, Measurement};
+use crate::quality::TrackQuality;
 use crate::run_folder::{MANIFEST_SCHEMA, Manifest, OutputLocation, RunFolder};
+use crate::verdict::{Findings, Level, ScaleSource, StatedScale, Verdict};
 use serde_json::{Value, json};
+use std::collections::BTreeSet;
 use std::path::PathBuf;
 use std::time::Instant;
-use vidar_core::{BodyFrame, OdometryKeyframe, RevisedPose, StampedPose, Trajectory, Warning};
+use vidar_core::{BodyFrame, OdometryKeyframe, RevisedPose, Severity, StampedPose, Trajectory, Warning};
 use vidar_dataset::{Dataset, OpenOptions};
 use vidar_eval::TrajectoryReport;
 use vidar_odometry::{ImuUse, InputCounts, Odometry, OdometryOutput, Status};
@@ -68,8 +71,10 @@ pub struct Tracked {
     pub counts: InputCounts,
     /// Errors of images that could not be read; they are skipped.
     pub unreadable: Vec<String>,
-    /// Whether lengths are metres.
-    pub is_metric: bool,
+    /// Whether camera and IMU were used together; else the trajectory is known up to scale.
+    pub with_imu: bool,
+    /// Health, coverage and scale over the whole recording.
+    pub quality: TrackQuality,
 }
 
 /// What a run of the odometry made.
@@ -87,6 +92,10 @@ pub struct OdometryOutcome {
     pub report: Option<TrajectoryReport>,
     /// Every warning, in order.
     pub warnings: Vec<Warning>,
+    /// What is said of the scale.
+    pub scale: StatedScale,
+    /// How far it may be trusted.
+    pub verdict: Verdict,
     /// Wall time, s.
     pub seconds: f64,
 }
@@ -103,7 +112,10 @@ pub fn odometry(
     let mut dataset =
         events.stage("read", 0, || input::open_dataset(&request.path, &request.open, &config))?;
     input::require_calibration(&dataset)?;
+    let started_manifest = start_manifest(request, &dataset, started)?;
+    let earlier = request.place.earlier(&started_manifest, &request.layered.to_toml(false))?;
     let folder = RunFolder::create(&request.place)?;
+    folder.write_manifest(&started_manifest)?;
     folder.write("config.resolved.toml", request.layered.to_toml(true).as_bytes())?;
     let total = dataset.images.len();
     let mut dump = if request.debug_dump { Some(dump::Dump::create(&folder)?) } else { None };
@@ -115,16 +127,20 @@ pub fn odometry(
     let dumped = dump.is_some();
     dump.map_or(Ok(()), dump::Dump::finish)?;
 
+    let trajectory = tracked.longest_segment();
+    let scale = tracked.stated_scale(input::unseen_scale_std(&dataset, &config));
     let mut warnings = dataset.warnings.clone();
     warnings.extend(timing);
     warnings.extend(tracked.warnings());
+    warnings.extend(trajectory.as_ref().and_then(|_| scale.warning()));
     warnings.iter().for_each(|w| events.warn(w));
-    let trajectory = tracked.longest_segment();
     let report = match (&trajectory, &dataset.ground_truth) {
         (Some(trajectory), Some(truth)) => evaluate(trajectory, truth, &dataset, &config)?,
         _ => None,
     };
-    let status = match (cancel.is_cancelled(), trajectory.is_none() || !tracked.lost.is_empty()) {
+    let is_degraded = warnings.iter().any(|w| w.severity == Severity::Degraded);
+    let verdict = verdict(&tracked, &scale, report.as_ref(), cancel.is_cancelled());
+    let status = match (cancel.is_cancelled(), is_degraded) {
         (true, _) => ExitStatus::Interrupted,
         (false, true) => ExitStatus::Degraded,
         (false, false) => ExitStatus::Done,
@@ -136,6 +152,8 @@ pub fn odometry(
         trajectory,
         report,
         warnings,
+        scale,
+        verdict,
         seconds: clock.elapsed().as_secs_f64(),
     };
     let mut artifacts = events.stage("write", 0, || files::write(&outcome, &folder, events))?;
@@ -145,7 +163,12 @@ pub fn odometry(
     let truth = dataset.ground_truth.as_ref().and_then(|t| t.in_frame(BodyFrame::Imu, &dataset.rig).ok());
     let made = report::write(&outcome, truth.as_ref(), &dataset.name, &request.command, &folder)?;
     artifacts.extend(made);
-    folder.write_manifest(&manifest(request, &dataset, &outcome, started, artifacts)?)?;
+    artifacts.extend(["log.jsonl", "manifest.json"].map(String::from));
+    let artifacts: BTreeSet<String> = artifacts.into_iter().collect();
+    if let Some(earlier) = earlier {
+        earlier.remove_all_but(folder.path(), &artifacts);
+    }
+    folder.write_manifest(&manifest(started_manifest, &outcome, artifacts))?;
     events.emit(&Event::Finished { exit: status as i32, seconds: outcome.seconds });
     Ok(outcome)
 }
@@ -160,8 +183,8 @@ fn track(
 ) -> Result<Tracked, Error> {
     let settings = &config.odometry;
     let mut odometry = Odometry::new(&dataset.rig, dataset.camera, settings)?;
-    let is_metric = settings.imu != ImuUse::Off && dataset.rig.imu.is_some();
-    let mut tracked = Tracked { is_metric, ..Tracked::default() };
+    let with_imu = settings.imu != ImuUse::Off && dataset.rig.imu.is_some();
+    let mut tracked = Tracked { with_imu, ..Tracked::default() };
     let total = dataset.images.len();
     let mut spent = 0.0;
     for measurement in input::measurements(dataset, true) {
@@ -199,6 +222,7 @@ fn track(
 impl Tracked {
     fn keep(&mut self, mut output: OdometryOutput, seconds: f64) {
         let time_ns = output.time.nanos();
+        self.quality.add(&output);
         match &mut output.status {
             Status::Tracking(tracking) => {
                 if let Some(open) = self.lost.last_mut().filter(|l| l.until_ns.is_none()) {
@@ -244,12 +268,18 @@ impl Tracked {
         Some((state.output.time - first).as_secs_f64())
     }
 
-    /// What it waited for at the end, if it never had a state.
+    /// What is said of the scale; `unseen`: σ(ln s) of what no estimate sees.
+    pub fn stated_scale(&self, unseen: f64) -> StatedScale {
+        let source = match self.with_imu {
+            true => ScaleSource::Odometry { stated: self.quality.scale_std(), unseen },
+            false => ScaleSource::None,
+        };
+        StatedScale::new(source, None)
+    }
+
+    /// Why it never had a state.
     pub(crate) fn why_not_started(&self) -> Option<String> {
-        self.frames.iter().rev().find_map(|f| match &f.output.status {
-            Status::Waiting(refusal) => Some(refusal.to_string()),
-            _ => None,
-        })
+        self.quality.why_not_started()
     }
 
     pub(crate) fn warnings(&self) -> Vec<Warning> {
@@ -268,15 +298,41 @@ impl Tracked {
         if !self.frames.iter().any(|f| f.output.tracking().is_some()) {
             let why = self.why_not_started().unwrap_or_else(|| "no images".into());
             let text = format!("the odometry never started: {why}");
-            warnings.push(Warning::degraded("odometry-never-started", text));
+            let hint =
+                "`vidar inspect` shows calibration and units in plain words; docs/failures.md lists causes";
+            warnings.push(Warning::degraded("odometry-never-started", text).hint(hint));
         }
-        if !self.is_metric {
+        if !self.with_imu {
             let text =
                 "one camera without an IMU: the trajectory is known up to scale, lengths are not metres";
             warnings.push(Warning::new("scale-unknown", text));
         }
         warnings
     }
+}
+
+/// How far the trajectory may be trusted.
+fn verdict(
+    tracked: &Tracked,
+    scale: &StatedScale,
+    report: Option<&TrajectoryReport>,
+    is_interrupted: bool,
+) -> Verdict {
+    let mut findings = Findings::default();
+    findings.when(is_interrupted, Level::Bad, || "interrupted: only a part was tracked".into());
+    if tracked.quality.longest().is_none() {
+        let why = tracked.why_not_started().unwrap_or_else(|| "no images".into());
+        findings.add(Level::Bad, format!("never started: {why}"));
+        return findings.verdict(None);
+    }
+    findings.track(&tracked.quality);
+    findings.scale(scale);
+    let compared = report.and_then(|report| {
+        findings.trajectory(report, scale);
+        let ate = report.ate_se3_m.as_ref()?;
+        Some(format!("ATE SE(3) {:.4} m against ground truth", ate.rmse))
+    });
+    findings.verdict(compared)
 }
 
 fn evaluate(
@@ -304,7 +360,10 @@ impl OdometryOutcome {
             *health.entry(files::word(&frame.output)).or_default() += 1;
         }
         json!({
-            "is_metric": tracked.is_metric,
+            "verdict": self.verdict,
+            "is_metric": self.scale.is_metric,
+            "scale": self.scale,
+            "quality": tracked.quality.json(),
             "images": tracked.frames.len(),
             "images_with_state": with_state,
             "first_state_secs": tracked.first_state_secs(),
@@ -324,10 +383,11 @@ impl OdometryOutcome {
     /// What was made and how far to trust it.
     pub fn summary_lines(&self) -> Vec<(&'static str, String)> {
         let tracked = &self.tracked;
-        let with_state = tracked.frames.iter().filter(|f| f.output.tracking().is_some()).count();
-        let unit = if tracked.is_metric { "m" } else { "units (up to scale)" };
+        let unit = if self.scale.is_metric { "m" } else { "units (lengths are not metres)" };
         let mut lines = vec![
-            ("images", format!("{with_state} of {} with a state", tracked.frames.len())),
+            ("verdict", self.verdict.line()),
+            ("tracked", tracked.quality.words()),
+            ("scale", self.scale.words.clone()),
             ("keyframes", tracked.keyframes.len().to_string()),
         ];
         if let Some(trajectory) = &self.trajectory {
@@ -351,15 +411,8 @@ impl OdometryOutcome {
     }
 }
 
-fn manifest(
-    request: &OdometryRequest,
-    dataset: &Dataset,
-    outcome: &OdometryOutcome,
-    started: String,
-    artifacts: Vec<String>,
-) -> Result<Manifest, Error> {
-    let mut counts = std::collections::BTreeMap::<String, u64>::new();
-    outcome.warnings.iter().for_each(|w| *counts.entry(w.kind.clone()).or_default() += 1);
+/// What is known before tracking.
+fn start_manifest(request: &OdometryRequest, dataset: &Dataset, started: String) -> Result<Manifest, Error> {
     Ok(Manifest {
         schema: MANIFEST_SCHEMA.into(),
         version: crate::VERSION.into(),
@@ -369,13 +422,23 @@ fn manifest(
             "name": dataset.name, "kind": dataset.kind.to_string(), "path": request.path.display().to_string(),
             "images": dataset.images.len(), "imu_samples": dataset.imu.len(),
         }),
+        dataset_sha256: vidar_hub::sha256_hex(&dataset.fingerprint()?),
+        config_sha256: vidar_hub::sha256_hex(request.layered.to_toml(false).as_bytes()),
         poses: json!({ "source": "odometry" }),
         hardware: json!(crate::system::hardware()),
+        ..Manifest::default()
+    })
+}
+
+fn manifest(start: Manifest, outcome: &OdometryOutcome, artifacts: BTreeSet<String>) -> Manifest {
+    let mut counts = std::collections::BTreeMap::<String, u64>::new();
+    outcome.warnings.iter().for_each(|w| *counts.entry(w.kind.clone()).or_default() += 1);
+    Manifest {
         peak_memory_bytes: crate::system::peak_memory_bytes(),
         result: outcome.result_json(),
         warnings: json!(counts),
-        artifacts,
-        exit: outcome.status as i32,
-        ..Manifest::default()
-    })
+        artifacts: artifacts.into_iter().collect(),
+        exit: Some(outcome.status as i32),
+        ..start
+    }
 }

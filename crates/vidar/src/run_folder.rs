@@ -2,9 +2,14 @@
 //!
 //! Written atomically, appended as computed; nothing is deleted that this run did not write.
 
+mod earlier;
+
+pub use earlier::Earlier;
+
 use crate::error::Error;
 use crate::events::{EVENT_SCHEMA, Event};
 use serde::{Deserialize, Serialize};
+use std::collections::BTreeSet;
 use std::fs::File;
 use std::io::Write;
 use std::path::{Path, PathBuf};
@@ -32,8 +37,13 @@ pub enum OutputLocation {
         /// Move an existing folder aside instead of refusing.
         force: bool,
     },
-    /// In a folder that an earlier run left, or a new one; files are replaced one by one, whole.
+    /// In a folder that an earlier attempt at the same run left, or a new one; files are replaced one by one, whole.
     Resumed {
+        /// The folder.
+        path: PathBuf,
+    },
+    /// As `Resumed`; where the folder holds another run, that run's own files go first.
+    Replaced {
         /// The folder.
         path: PathBuf,
     },
@@ -47,6 +57,26 @@ pub enum OutputLocation {
 }
 
 impl OutputLocation {
+    /// What an earlier attempt left there, if the run may go on from it.
+    ///
+    /// # Errors
+    /// [`Error::OtherRun`] where `Resumed` names a folder of another recording or configuration; [`Error::NotARun`] where its
+    /// files are of no run.
+    pub fn earlier(&self, manifest: &Manifest, config: &str) -> Result<Option<Earlier>, Error> {
+        let (Self::Resumed { path } | Self::Replaced { path }) = self else { return Ok(None) };
+        let Some(earlier) = Earlier::read(path)? else { return Ok(None) };
+        match (earlier.difference(manifest, config), self) {
+            (None, _) => Ok(Some(earlier)),
+            (Some(difference), Self::Resumed { .. }) => {
+                Err(Error::OtherRun { path: path.clone(), difference })
+            }
+            (Some(_), _) => {
+                earlier.remove_all_but(path, &BTreeSet::new());
+                Ok(None)
+            }
+        }
+    }
+
     /// Makes an empty folder there and returns its path.
     pub fn reserve(&self) -> Result<PathBuf, Error> {
         match self {
@@ -55,7 +85,7 @@ impl OutputLocation {
                 create_dir(path)?;
                 Ok(path.clone())
             }
-            Self::Resumed { path } => {
+            Self::Resumed { path } | Self::Replaced { path } => {
                 create_dir(path)?;
                 Ok(path.clone())
             }
@@ -101,10 +131,10 @@ pub struct Manifest {
     pub result: serde_json::Value,
     /// Warnings, each kind with its count.
     pub warnings: serde_json::Value,
-    /// Files made, relative to the run folder.
+    /// Every file of the run, relative to the run folder, sorted. Files in the folder that are not listed are not of the run.
     pub artifacts: Vec<String>,
-    /// Exit status as a number.
-    pub exit: i32,
+    /// Exit status as a number; null while the run goes on, and of a run that was killed.
+    pub exit: Option<i32>,
 }
 
 /// One keyframe as the run folder keeps it.
@@ -131,7 +161,9 @@ impl RunFolder {
         let path = root.join("log.jsonl");
         let mut options = File::options();
         let log = match place {
-            OutputLocation::Resumed { .. } => options.create(true).append(true),
+            OutputLocation::Resumed { .. } | OutputLocation::Replaced { .. } => {
+                options.create(true).append(true)
+            }
             OutputLocation::Exact { .. } | OutputLocation::Dated { .. } => {
                 options.create(true).write(true).truncate(true)
             }
@@ -165,7 +197,8 @@ impl RunFolder {
     pub fn log(&self, event: &Event) {
         let Ok(mut guard) = self.log.lock() else { return };
         if let Some(file) = guard.as_mut() {
-            let written = serde_json::to_string(&event_line(event)).map(|line| writeln!(file, "{line}"));
+            let written = serde_json::to_string(&event_line(event))
+                .map(|line| writeln!(file, "{}", vidar_core::printable_json(&line)));
             if !matches!(written, Ok(Ok(()))) {
                 *guard = None;
             }
@@ -191,7 +224,8 @@ pub fn event_line(event: &Event) -> serde_json::Value {
 
 /// Indented JSON with a final newline.
 pub fn pretty(value: &impl Serialize) -> Vec<u8> {
-    let mut bytes = serde_json::to_vec_pretty(value).unwrap_or_default();
+    let text = serde_json::to_string_pretty(value).unwrap_or_default();
+    let mut bytes = vidar_core::printable_json(&text).into_owned().into_bytes();
     bytes.push(b'\n');
     bytes
 }

@@ -1,6 +1,7 @@
 //! Hardware of this machine, as reported by the system.
 
 use serde::Serialize;
+use std::io::Read;
 use std::path::Path;
 
 /// Machine and limits.
@@ -80,3 +81,39 @@ mod tests {
         assert!(hardware.threads >= 1);
     }
 }
+
+/// Reads a file of at most `limit` bytes: what is larger, or has no end, is refused and never held in memory.
+///
+/// # Errors
+/// The file cannot be read; `InvalidData` beyond the limit.
+pub fn read_up_to(path: &Path, limit: u64) -> std::io::Result<Vec<u8>> {
+    let too_large = || {
+        let message = format!("larger than {}", crate::run::bytes(limit));
+        std::io::Error::new(std::io::ErrorKind::InvalidData, message)
+    };
+    let file = std::fs::File::open(path)?;
+    let stated = file.metadata()?.len();
+    if stated > limit {
+        return Err(too_large());
+    }
+    let mut bytes = Vec::with_capacity(usize::try_from(stated).unwrap_or(0));
+    // A device states no length.
+    file.take(limit + 1).read_to_end(&mut bytes)?;
+    if bytes.len() as u64 > limit { Err(too_large()) } else { Ok(bytes) }
+}
+
+/// As [`read_up_to`], as text.
+///
+/// # Errors
+/// As [`read_up_to`], and bytes that are not UTF-8.
+pub fn read_text_up_to(path: &Path, limit: u64) -> std::io::Result<String> {
+    let bytes = read_up_to(path, limit)?;
+    String::from_utf8(bytes).map_err(|e| std::io::Error::new(std::io::ErrorKind::InvalidData, e.to_string()))
+}
+
+/// Largest configuration or description that is read, bytes.
+pub const MAX_CONFIG_BYTES: u64 = 4 << 20;
+/// Largest JSON file of a run that is read back, bytes.
+pub const MAX_JSON_BYTES: u64 = 256 << 20;
+/// Largest cloud, mesh or picture that is read, bytes.
+pub const MAX_CLOUD_BYTES: u64 = 4 << 30;

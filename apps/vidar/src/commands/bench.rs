@@ -40,7 +40,8 @@ pub fn bench(args: &BenchArgs, context: &Context) -> Outcome {
         }));
     } else {
         print::data(&outcome.markdown);
-        print::talk(format!("tables, runs and figures: {}", outcome.folder.join("report.html").display()));
+        let report = outcome.folder.join("report.html").display().to_string();
+        print::talk(format!("tables, runs and figures: {}", vidar::core::printable(&report)));
     }
     Ok(outcome.status)
 }

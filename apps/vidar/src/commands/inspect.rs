@@ -21,19 +21,20 @@ pub fn inspect(args: &InspectArgs, context: &Context) -> Outcome {
         print::json(&value);
         return Ok(ExitStatus::Done);
     }
-    print::data(format!("{}: {} ({})", found.name, found.kind, found.reason));
+    print::line(format!("{}: {} ({})", found.name, found.kind, found.reason));
     for s in &found.streams {
-        print::data(format!(
-            "  {:<20} {:>6}   {:.1} Hz over {}, longest gap {:.3} s",
-            s.what,
-            s.count,
-            s.rate_hz,
-            print::seconds(s.length_secs),
-            s.longest_gap_secs
-        ));
+        let times = match s.rate_hz {
+            Some(hz) => format!(
+                "{hz:.1} Hz over {}, longest gap {:.3} s",
+                print::seconds(s.length_secs),
+                s.longest_gap_secs
+            ),
+            None => "without times".to_owned(),
+        };
+        print::data(format!("  {:<20} {:>6}   {times}", s.what, s.count));
     }
     for (label, words) in [("camera", &found.camera), ("imu", &found.imu), ("poses", &found.poses)] {
-        words.iter().for_each(|line| print::data(format!("  {label:<8} {line}")));
+        words.iter().for_each(|line| print::line(format!("  {label:<8} {line}")));
     }
     if let Some(i) = &found.images {
         print::data(format!(

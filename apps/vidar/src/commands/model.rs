@@ -310,7 +310,8 @@ fn references(path: &Path) -> Result<Vec<PathBuf>, Error> {
         return Ok(vec![path.to_owned()]);
     }
     let manifest = path.join("manifest.json");
-    let text = std::fs::read_to_string(&manifest).map_err(|e| Error::io("read", &manifest, e))?;
+    let text = vidar::system::read_text_up_to(&manifest, vidar::system::MAX_JSON_BYTES)
+        .map_err(|e| Error::io("read", &manifest, e))?;
     let document: serde_json::Value = serde_json::from_str(&text)
         .map_err(|e| usage(format!("{}: {e}", manifest.display()), "it describes each reference file"))?;
     let described = document["files"].as_object().into_iter().flatten();

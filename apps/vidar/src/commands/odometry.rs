@@ -21,6 +21,7 @@ pub fn odometry(args: &OdometryArgs, context: &Context) -> Outcome {
         debug_dump: args.debug_dump,
     };
     let outcome = vidar::odometry::odometry(&request, &progress::events(&context.cli), &context.cancel)?;
+    print::warnings(&outcome.warnings);
     if context.cli.json {
         let mut value = serde_json::json!({
             "schema": "vidar.odometry/1", "folder": outcome.folder.display().to_string(),

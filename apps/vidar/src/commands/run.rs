@@ -74,6 +74,7 @@ pub fn demo(args: &DemoArgs, context: &Context) -> Outcome {
 /// Prints the result with its warnings and scores; then applies thresholds.
 fn conclude(outcome: &RunOutcome, thresholds: &Thresholds, context: &Context) -> Outcome {
     let scores = vidar::evaluate::scores(&outcome.evaluation);
+    print::warnings(&outcome.warnings);
     if context.cli.json {
         print::json(&json!({
             "schema": "vidar.run/1",
@@ -83,7 +84,6 @@ fn conclude(outcome: &RunOutcome, thresholds: &Thresholds, context: &Context) ->
             "scores": scores,
         }));
     } else {
-        print::warnings(&outcome.warnings);
         print::pairs(outcome.summary_lines());
     }
     if outcome.status == ExitStatus::Interrupted {

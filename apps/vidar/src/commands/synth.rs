@@ -91,6 +91,7 @@ fn recording(args: &SynthArgs, mut world: SynthConfig) -> Result<SynthConfig, Er
 /// A file with every setting of the world.
 pub fn world_file(path: &Path) -> Result<SynthConfig, Error> {
     let fail = |reason: String| Error::ConfigFile { path: path.to_owned(), reason };
-    let text = std::fs::read_to_string(path).map_err(|e| fail(e.to_string()))?;
+    let text = vidar::system::read_text_up_to(path, vidar::system::MAX_CONFIG_BYTES)
+        .map_err(|e| fail(e.to_string()))?;
     toml::from_str(&text).map_err(|e| fail(e.to_string()))
 }

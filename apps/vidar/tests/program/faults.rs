@@ -84,7 +84,7 @@ fn an_image_of_another_size_is_left_out_and_named() {
     let images = images_of(&bench.sequence);
     // A depth picture of the finished run's own size would fit; one pixel is the smallest valid PNG here.
     fs::write(&images[6], ONE_PIXEL_PNG).unwrap();
-    bench.run(&[]).ends_with(3).says(&["[image-unreadable]", "1x1", "160x104"]);
+    bench.run(&[]).ends_with(3).says(&["[image-size]", "1x1", "160x104"]);
 }
 
 /// A valid PNG of one grey pixel.

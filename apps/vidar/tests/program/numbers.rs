@@ -62,7 +62,7 @@ fn the_map_of_the_tiny_room_lies_on_the_scan() {
     // bounded by what 2.5 s of flight see. Without any of stereo, placement or fusion F would be below 0.2.
     assert!(score(json, "f@0.10") > 0.6, "{}", json["scores"]);
     let surface = &json["result"]["evaluation"]["surface"];
-    let at_10 = surface["native"].as_array().unwrap().last().unwrap();
+    let at_10 = surface["rigid"].as_array().unwrap().last().unwrap();
     assert!(at_10["precision"].as_f64().unwrap() > 0.8, "{at_10}");
     // The depth images are exact, so the error is stereo's own.
     assert!(score(json, "abs-rel") < 0.1, "{}", json["scores"]);
@@ -85,13 +85,13 @@ fn poses_from_another_world_are_placed_by_their_trajectory() {
 }
 
 #[test]
-fn a_trajectory_of_wrong_scale_is_found_out_by_the_native_score_and_forgiven_by_the_free_one() {
+fn a_trajectory_of_wrong_scale_is_found_out_by_the_rigid_score_and_forgiven_by_the_free_one() {
     let (_, with_truth) = finished();
     let json = run_with(&told_otherwise("vio scaled.tum", 1.3, 0.0), "scaled");
     // The exact answer: ln 1.3.
     assert!((score(&json, "scale") - 1.3_f64.ln()).abs() < 1e-3, "{}", json["scores"]);
     assert!(score(&json, "ate-sim3") < 1e-3 && score(&json, "ate") > 0.02, "{}", json["scores"]);
-    // The bounded placement may undo 15 % at most, so a map that is 30 % too large must lose.
+    // The rigid fit undoes no scale, so a map that is 30 % too large must lose.
     let (native, truth) = (score(&json, "f@0.10"), score(with_truth, "f@0.10"));
     assert!(native < truth - 0.15, "native F {native} against {truth}");
     assert!(score(&json, "delta-f") > 0.15, "the free scale must win it back: {}", json["scores"]);

@@ -116,6 +116,9 @@ fn a_run_as_json_has_stable_keys() {
             "coupling",
             "place_recognition",
             "is_metric",
+            "verdict",
+            "scale",
+            "odometry",
             "placement",
             "evaluation",
             "seconds"

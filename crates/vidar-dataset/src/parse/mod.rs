@@ -11,6 +11,7 @@ pub use crate::source::Source;
 pub(crate) use lists::is_image_name;
 pub use lists::{ListedFile, ListedTime, accelerometer_list, file_list, imu_csv, time_list};
 pub use matrices::{intrinsics_matrix, matrix_poses, single_pose};
+pub(crate) use poses::is_ambiguous_csv;
 pub use poses::{PoseFile, RawPose, euroc_poses, guess_trajectory_format, kitti_poses, tum_poses};
 pub use units::UnitRule;
 pub use yaml::{

@@ -177,30 +177,56 @@ fn body_of(lines: &Lines<'_>) -> Option<BodyFrame> {
 }
 
 /// The format of a trajectory file, by its first row: 12 or 16 columns are KITTI; a comma or a nanosecond stamp is
-/// EuRoC csv, unless the header puts `qw` last; the rest is TUM.
+/// EuRoC csv, unless the header puts `qw` last; the rest is TUM. Rows of 8 columns with commas, no header and no nanosecond
+/// stamp may be either, with other orders of the quaternion: `None`.
 pub fn guess_trajectory_format(source: &Source<'_>) -> Option<TrajectoryFormat> {
-    // Only the head is looked at; a cut last line does not matter.
-    let head = Source { path: source.path, bytes: source.bytes.get(..64 << 10).unwrap_or(source.bytes) };
-    let head = match head.bytes.iter().rposition(|&b| b == b'\n') {
-        Some(end) => Source { path: head.path, bytes: head.bytes.get(..end)? },
-        None => head,
-    };
-    let lines = head.lines(&mut Vec::new()).ok()?;
-    let first = lines.rows.first()?;
-    let columns = first.fields().count();
-    if columns == 12 || columns == 16 {
-        return Some(TrajectoryFormat::Kitti);
-    }
-    let header = lines.comments.join(" ").to_ascii_lowercase();
-    let w_is_last = match (header.find("qw"), header.find("qx")) {
-        (Some(w), Some(x)) => Some(w > x),
-        _ => None,
-    };
-    let is_nanoseconds = first.fields().next()?.parse::<f64>().is_ok_and(|t| t >= 1e17);
-    let is_csv = first.text.contains(',');
-    match w_is_last {
+    let first = FirstRow::of(source)?;
+    match first.w_is_last {
+        _ if first.columns == 12 || first.columns == 16 => Some(TrajectoryFormat::Kitti),
+        _ if first.is_ambiguous() => None,
         Some(true) => Some(TrajectoryFormat::Tum),
-        _ if is_nanoseconds || is_csv => Some(TrajectoryFormat::EurocCsv),
-        _ => (columns >= 8).then_some(TrajectoryFormat::Tum),
+        _ if first.is_nanoseconds || first.is_csv => Some(TrajectoryFormat::EurocCsv),
+        _ => (first.columns >= 8).then_some(TrajectoryFormat::Tum),
+    }
+}
+
+/// Whether the file is a csv whose order of the quaternion nothing tells.
+pub(crate) fn is_ambiguous_csv(source: &Source<'_>) -> bool {
+    FirstRow::of(source).is_some_and(|first| first.is_ambiguous())
+}
+
+/// What the first row and the header tell of a format.
+struct FirstRow {
+    columns: usize,
+    is_csv: bool,
+    is_nanoseconds: bool,
+    /// Order of the quaternion in the header, if it names it.
+    w_is_last: Option<bool>,
+}
+
+impl FirstRow {
+    fn of(source: &Source<'_>) -> Option<Self> {
+        // Only the head is looked at; a cut last line does not matter.
+        let head = Source { path: source.path, bytes: source.bytes.get(..64 << 10).unwrap_or(source.bytes) };
+        let head = match head.bytes.iter().rposition(|&b| b == b'\n') {
+            Some(end) => Source { path: head.path, bytes: head.bytes.get(..end)? },
+            None => head,
+        };
+        let lines = head.lines(&mut Vec::new()).ok()?;
+        let first = lines.rows.first()?;
+        let header = lines.comments.join(" ").to_ascii_lowercase();
+        let w_is_last =
+            match (header.find("qw").or(header.find("q_w")), header.find("qx").or(header.find("q_x"))) {
+                (Some(w), Some(x)) => Some(w > x),
+                _ => None,
+            };
+        let is_nanoseconds = first.fields().next()?.parse::<f64>().is_ok_and(|t| t >= 1e17);
+        let is_csv = first.text.contains([',', ';']);
+        Some(Self { columns: first.fields().count(), is_csv, is_nanoseconds, w_is_last })
+    }
+
+    /// EuRoC's files of 11 and 17 columns are told by their columns, those of 4 have no quaternion.
+    fn is_ambiguous(&self) -> bool {
+        self.is_csv && !self.is_nanoseconds && self.columns == 8 && self.w_is_last.is_none()
     }
 }

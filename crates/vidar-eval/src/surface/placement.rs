@@ -9,6 +9,10 @@ use crate::nearest::NearestIndex;
 use nalgebra::Vector3;
 use vidar_core::{Se3, Sim3, UmeyamaError, Warning, umeyama_se3, umeyama_sim3};
 
+/// Change of scale from which the bounded placement is told to hide an error. Trimmed ICP of a true cloud with noise of
+/// stereo's size moves the scale by less than 1 %.
+const TOLERATED_SCALE_CHANGE: f64 = 0.02;
+
 /// A placement and the start of its refinement.
 pub(super) struct Placement {
     pub start: &'static str,
@@ -41,6 +45,32 @@ enum Motion {
     Similarity,
 }
 
+/// The SE(3) fit, refined by an ICP without scale where that does not make it worse: the scale is the estimate's own.
+pub(super) fn rigid_placement(
+    estimated: &[[f32; 3]],
+    reference: &NearestIndex,
+    start: &PlacementStart,
+    config: &SurfaceEvalConfig,
+) -> Placement {
+    let rigid = Sim3::from_se3(&start.truth_from_estimate);
+    let points = subset(estimated, config.icp.max_points);
+    refined_rigidly(&points, reference, &rigid, config).map_or(
+        Placement { start: "rigid", truth_from_estimate: rigid },
+        |truth_from_estimate| Placement { start: "rigid", truth_from_estimate },
+    )
+}
+
+/// The result of an ICP without scale, unless it fails or fits worse than its start.
+fn refined_rigidly(
+    points: &[[f32; 3]],
+    reference: &NearestIndex,
+    start: &Sim3,
+    config: &SurfaceEvalConfig,
+) -> Option<Sim3> {
+    let refined = icp(points, reference, start, Motion::Rigid, &config.icp).ok();
+    refined.filter(|r| r.rms_after_m <= r.rms_before_m).map(|r| r.truth_from_estimate)
+}
+
 /// The SE(3) fit, refined by one similarity ICP when its scale is within bounds (the paper's eq. in section IV-B).
 pub(super) fn native_placement(
     estimated: &[[f32; 3]],
@@ -70,10 +100,7 @@ pub(super) fn native_placement(
     };
     let kept = match config.on_rejection {
         OnRejection::KeepRigidFit => rigid,
-        OnRejection::RefineRigid => icp(&points, reference, &rigid, Motion::Rigid, &config.icp)
-            .ok()
-            .filter(|r| r.rms_after_m <= r.rms_before_m)
-            .map_or(rigid, |r| r.truth_from_estimate),
+        OnRejection::RefineRigid => refined_rigidly(&points, reference, &rigid, config).unwrap_or(rigid),
     };
     Ok(Refinement { truth_from_estimate: kept, accepted: false, reason: rejection, refined: refined.ok() })
 }
@@ -192,6 +219,19 @@ impl Refinement {
         (!self.accepted).then(|| {
             Warning::new("refinement-rejected", format!("{}; {kept}", self.reason))
                 .hint("compare scale_free and delta_f: a large difference means that the scale is not metric")
+        })
+    }
+
+    /// A refinement that changed the scale by more than [`TOLERATED_SCALE_CHANGE`] says that the map's own is wrong.
+    pub(super) fn scale_warning(&self) -> Option<Warning> {
+        let scale = self.truth_from_estimate.scale;
+        ((scale - 1.0).abs() > TOLERATED_SCALE_CHANGE).then(|| {
+            let message = format!(
+                "the reference fits best with lengths times {scale:.3}: the bounded placement (scale refined) hides an error of \
+                 scale, of poses or of depth of {:.1} %",
+                (1.0 / scale - 1.0).abs() * 100.0
+            );
+            Warning::new("scale-refined", message).hint("judge by the rigid F, which keeps the scale as it is")
         })
     }
 }

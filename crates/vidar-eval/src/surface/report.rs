@@ -1,6 +1,6 @@
 //! Results of surface evaluation.
 
-use super::placement::{Placement, Refinement};
+use super::placement::Placement;
 use crate::transform::TransformRecord;
 use serde::{Deserialize, Serialize};
 use vidar_core::{Sim3, Warning};
@@ -18,7 +18,7 @@ pub struct Scores {
     pub f: f64,
 }
 
-/// Distances from cloud to cloud, metres, over the evaluated points under the native placement.
+/// Distances from cloud to cloud, metres, over the evaluated points under the rigid placement.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Chamfer {
     /// Mean of `accuracy_mean_m` and `completeness_mean_m`.
@@ -57,7 +57,7 @@ pub struct PlacementReport {
 /// The free placement with the highest F.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct FreePlacement {
-    /// Its origin: `native`; `rigid-start`, the rejected refinement; `similarity-start`, the Sim(3) fit
+    /// Its origin: `rigid`; `native`; `rigid-start`, the rejected refinement; `similarity-start`, the Sim(3) fit
     /// of the trajectories; `similarity-start-refined`, an ICP from there.
     pub start: String,
     /// The placement.
@@ -67,7 +67,7 @@ pub struct FreePlacement {
     pub(super) scores: Vec<Scores>,
 }
 
-/// Distance of every given point to the other cloud under the native placement, metres, in the given order; NaN for
+/// Distance of every given point to the other cloud under the rigid placement, metres, in the given order; NaN for
 /// points that are not finite. With voxels, the other cloud is the thinned one.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct PointErrors {
@@ -80,11 +80,15 @@ pub struct PointErrors {
 /// Agreement of a surface with its reference, and the basis of the comparison.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct SurfaceReport {
-    /// Scores under the native-scale bounded placement, one per threshold.
+    /// Scores under the rigid placement, one per threshold: the scale is the estimate's own.
+    pub rigid: Vec<Scores>,
+    /// Scores under the paper's native-scale bounded placement, which may change the scale within bounds.
     pub native: Vec<Scores>,
     /// Scores under the free placement.
     pub free: Vec<Scores>,
-    /// F_free − F_native at `delta_f_threshold_m`.
+    /// F_free − F_rigid at `delta_f_threshold_m`: what the true scale would gain.
+    pub delta_f_rigid: f64,
+    /// F_free − F_native at `delta_f_threshold_m`, the paper's ΔF.
     pub delta_f: f64,
     /// The largest threshold, metres.
     pub delta_f_threshold_m: f64,
@@ -92,8 +96,10 @@ pub struct SurfaceReport {
     pub scale_native: f64,
     /// Scale of the free placement.
     pub scale_free: f64,
-    /// Mean distances under the native placement.
+    /// Mean distances under the rigid placement.
     pub chamfer: Chamfer,
+    /// The rigid placement; its scale is 1.
+    pub rigid_placement: TransformRecord,
     /// Points given.
     pub estimate_points: usize,
     /// Points given.
@@ -171,11 +177,6 @@ impl FreePlacement {
     pub(super) fn new(candidate: &Placement, scores: Vec<Scores>) -> Self {
         let start = candidate.start.to_owned();
         Self { start, truth_from_estimate: candidate.truth_from_estimate, scores }
-    }
-
-    pub(super) fn same_as_native(native: &Refinement, scores: &[Scores]) -> Self {
-        let start = "native".to_owned();
-        Self { start, truth_from_estimate: native.truth_from_estimate, scores: scores.to_vec() }
     }
 
     pub(super) fn f_at(&self, threshold_m: f64) -> f64 {

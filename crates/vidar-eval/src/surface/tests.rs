@@ -82,12 +82,17 @@ fn scores_of_seven_points_are_those_computed_by_hand() {
 }
 
 #[test]
-fn inflation_of_a_tenth_is_refined_away() {
+fn inflation_of_a_tenth_is_seen_by_the_rigid_fit_and_refined_away_by_the_bounded_one() {
     let (estimate, start) = estimate_of_scale(1.10);
     let report = evaluate_surface(&estimate, &cloud(room(0.05, 0.5)), &start, &config()).unwrap();
     assert!(report.placement.accepted, "{:?}", report.placement);
     assert!((report.scale_native - 1.10).abs() < 0.01, "{:?}", report.placement);
     assert!(report.native[0].f > 0.97, "{:?}", report.native);
+    assert!(report.rigid[0].f < 0.6, "{:?}", report.rigid);
+    assert!(report.delta_f_rigid > 0.1, "{}", report.delta_f_rigid);
+    assert!((report.rigid_placement.scale - 1.0).abs() < 1e-12);
+    assert!(report.chamfer.chamfer_m > 0.03, "{:?}", report.chamfer);
+    assert!(report.warnings.iter().any(|w| w.kind == "scale-refined"), "{:?}", report.warnings);
     assert!(report.delta_f.abs() < 1e-12 && report.scale_free == report.scale_native);
     assert!(report.placement.rms_after_m < report.placement.rms_before_m);
 }
@@ -140,6 +145,8 @@ fn unusable_points_are_dropped_counted_and_told() {
     let config = SurfaceEvalConfig { keep_point_errors: true, ..config() };
     let report = evaluate_surface(&estimate, &cloud(reference), &start, &config).unwrap();
     assert_eq!((report.estimate_points_not_finite, report.reference_points_not_finite), (2, 1));
+    // A true scale is not told to be wrong.
+    assert!(clean.rigid[0].f > 0.97 && clean.warnings.is_empty(), "{:?} {:?}", clean.rigid, clean.warnings);
     assert_eq!(report.native, clean.native);
     assert_eq!(report.warnings.iter().filter(|w| w.kind == "points-not-finite").count(), 2);
     let errors = report.point_errors.unwrap();
@@ -226,7 +233,7 @@ fn the_report_has_stable_keys() {
         |value: &serde_json::Value| value.as_object().unwrap().keys().cloned().collect::<Vec<_>>().join(" ");
     assert_eq!(
         keys(&value),
-        "native free delta_f delta_f_threshold_m scale_native scale_free chamfer estimate_points reference_points \
+        "rigid native free delta_f_rigid delta_f delta_f_threshold_m scale_native scale_free chamfer rigid_placement estimate_points reference_points \
          estimate_points_not_finite reference_points_not_finite estimate_points_cropped estimate_points_evaluated \
          reference_points_evaluated placement free_placement warnings"
     );

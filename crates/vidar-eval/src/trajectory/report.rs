@@ -104,7 +104,8 @@ pub(super) fn coverage(
     used.dedup();
     let times: Vec<_> = matched.iter().map(|m| m.truth.time).collect();
     let steps = || times.windows(2).map(|w| w[1] - w[0]);
-    let covered: f64 = steps().filter(|&s| s <= gap).map(Duration::as_secs_f64).sum();
+    // The sum of nothing is -0.0, which would be shown.
+    let covered = steps().filter(|&s| s <= gap).map(Duration::as_secs_f64).fold(0.0, |a, b| a + b);
     let (mut total, mut longest) = (Duration::ZERO, steps().max().unwrap_or(Duration::ZERO));
     if let (Some((start, end)), Some(&first), Some(&last)) = (truth.time_range(), times.first(), times.last())
     {

@@ -172,7 +172,7 @@ fn sequences_of(
                 Ok((s.name, Some(flight), SynthConfig { scene, seed, ..synthetic.world.clone() }))
             })
             .collect::<Result<_, Error>>()?,
-        None => built_in(&synthetic.world, &request.sequences),
+        None => built_in(&synthetic.world, &request.sequences)?,
     };
     let mut rendered = Vec::new();
     for (name, flight, world) in flights {
@@ -208,16 +208,24 @@ fn truth_of(sequence: &Path) -> Result<Trajectory, Error> {
 }
 
 /// Flights that need no dataset: three kinds in two rooms each, named after their rooms.
-fn built_in(world: &SynthConfig, prefixes: &[String]) -> Vec<(String, Option<Trajectory>, SynthConfig)> {
+fn built_in(
+    world: &SynthConfig,
+    prefixes: &[String],
+) -> Result<Vec<(String, Option<Trajectory>, SynthConfig)>, Error> {
     let flights = [FlightKind::Sweep, FlightKind::Orbit, FlightKind::Aggressive];
-    let all = (1..=2_u64).flat_map(|room| {
-        flights.iter().enumerate().map(move |(k, flight)| {
-            let seed = world.seed.wrapping_mul(100).wrapping_add(room * 10 + k as u64);
-            (format!("room{room}_{}", k + 1), None, SynthConfig { seed, flight: *flight, ..world.clone() })
+    let all: Vec<_> = (1..=2_u64)
+        .flat_map(|room| {
+            flights.iter().enumerate().map(move |(k, flight)| {
+                let seed = world.seed.wrapping_mul(100).wrapping_add(room * 10 + k as u64);
+                let world = SynthConfig { seed, flight: *flight, ..world.clone() };
+                (format!("room{room}_{}", k + 1), None, world)
+            })
         })
-    });
-    all.filter(|(name, ..)| prefixes.is_empty() || prefixes.iter().any(|w| name.starts_with(w.as_str())))
-        .collect()
+        .collect();
+    let names: Vec<String> = all.iter().map(|(name, ..)| name.clone()).collect();
+    sequences::require_matches(&names, prefixes)?;
+    let is_wanted = |name: &str| prefixes.is_empty() || prefixes.iter().any(|w| name.starts_with(w.as_str()));
+    Ok(all.into_iter().filter(|(name, ..)| is_wanted(name)).collect())
 }
 
 /// The settings of one run.

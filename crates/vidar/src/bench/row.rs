@@ -26,9 +26,13 @@ pub struct BenchRow {
     pub degraded: bool,
     /// Poses that the map was made with.
     pub trajectory: TrajectoryScores,
-    /// F@0.05.
+    /// F@0.05 of the rigid fit: scale as it is.
+    pub f05_rigid: Option<f64>,
+    /// F@0.10 of the rigid fit.
+    pub f10_rigid: Option<f64>,
+    /// F@0.05 of the paper's bounded placement.
     pub f05: Option<f64>,
-    /// F@0.10.
+    /// F@0.10 of the same.
     pub f10: Option<f64>,
     /// F@0.10 with the scale of ground truth.
     pub f10_free: Option<f64>,
@@ -109,7 +113,7 @@ pub(super) fn run_row(
         open: open_options(),
         layered,
         reference: None,
-        place: OutputLocation::Resumed { path: place.clone() },
+        place: OutputLocation::Replaced { path: place.clone() },
         command: request.command.clone(),
     };
     let clock = std::time::Instant::now();
@@ -132,6 +136,7 @@ pub(super) fn run_row(
             };
             if let Some(surface) = &evaluation.surface {
                 (row.f05, row.f10) = (f(&surface.native, 0.05), f(&surface.native, 0.10));
+                (row.f05_rigid, row.f10_rigid) = (f(&surface.rigid, 0.05), f(&surface.rigid, 0.10));
                 row.f10_free = f(&surface.free, 0.10);
             }
             row.abs_rel =
@@ -168,7 +173,7 @@ pub(super) fn odometry_row(
         path: sequence.path.clone(),
         open: open_options(),
         layered,
-        place: OutputLocation::Resumed { path: place.clone() },
+        place: OutputLocation::Replaced { path: place.clone() },
         command: request.command.clone(),
         debug_dump: false,
     };
@@ -205,12 +210,15 @@ fn key(sequence: &Sequence, settings: &str) -> Result<String, Error> {
     let mut hash = Sha256::new();
     // A rendered sequence has a file with its world; a recorded one has not.
     let world = std::fs::read_to_string(sequence.path.join("synth.toml")).unwrap_or_default();
-    for part in [crate::VERSION, &sequence.path.display().to_string(), settings, &world] {
+    for part in [crate::VERSION, ROW_SCHEMA, &sequence.path.display().to_string(), settings, &world] {
         hash.update(part.as_bytes());
         hash.update([0]);
     }
     Ok(vidar_hub::hex(&hash.finalize()))
 }
+
+/// Changes when a row says more, so that rows from before are computed again.
+const ROW_SCHEMA: &str = "vidar.bench-row/2";
 
 #[derive(Serialize, Deserialize)]
 struct StoredRow<T> {

@@ -22,25 +22,30 @@ pub fn find(root: &Path, kind: BenchKind, prefixes: &[String]) -> Result<Vec<Seq
     walk(root, kind, DEPTH, &mut found)?;
     found.sort_by(|a, b| a.name.cmp(&b.name));
     found.dedup_by(|a, b| a.name == b.name);
-    let all = found.len();
-    found.retain(|s| prefixes.is_empty() || prefixes.iter().any(|w| s.name.starts_with(w.as_str())));
-    match (found.is_empty(), kind) {
-        (false, _) => Ok(found),
-        (true, BenchKind::Euroc) => {
-            Err(nothing(root, all, "a folder with mav0/ per sequence, as EuRoC's archives unpack"))
-        }
-        (true, BenchKind::Tum) => {
-            Err(nothing(root, all, "rgbd_dataset_*/ with rgb.txt, as TUM's archives unpack"))
-        }
+    if found.is_empty() {
+        let expected = match kind {
+            BenchKind::Euroc => "a folder with mav0/ per sequence, as EuRoC's archives unpack",
+            BenchKind::Tum => "rgbd_dataset_*/ with rgb.txt, as TUM's archives unpack",
+        };
+        let what = format!("no sequence below {}", root.display());
+        return Err(Error::Usage { what, hint: format!("expected {expected}") });
     }
+    let names: Vec<String> = found.iter().map(|s| s.name.clone()).collect();
+    require_matches(&names, prefixes)?;
+    found.retain(|s| prefixes.is_empty() || prefixes.iter().any(|w| s.name.starts_with(w.as_str())));
+    Ok(found)
 }
 
-fn nothing(root: &Path, all: usize, expected: &str) -> Error {
-    let what = match all {
-        0 => format!("no sequence below {}", root.display()),
-        n => format!("none of the {n} sequences below {} matches --sequences", root.display()),
-    };
-    Error::Usage { what, hint: format!("expected {expected}; --sequences takes prefixes of their names") }
+/// Refuses a prefix that no sequence has: a table without it would look complete.
+pub(super) fn require_matches(names: &[String], prefixes: &[String]) -> Result<(), Error> {
+    let missed = |prefix: &&String| !names.iter().any(|name| name.starts_with(prefix.as_str()));
+    match prefixes.iter().find(missed) {
+        None => Ok(()),
+        Some(prefix) => Err(Error::Usage {
+            what: format!("none of the {} sequences matches --sequences {prefix:?}", names.len()),
+            hint: format!("--sequences takes prefixes of their names: {}", names.join(", ")),
+        }),
+    }
 }
 
 fn walk(folder: &Path, kind: BenchKind, depth: usize, found: &mut Vec<Sequence>) -> Result<(), Error> {

@@ -245,7 +245,8 @@ fn frames(folder: &Path, images: usize) -> Result<BTreeMap<usize, PathBuf>, Erro
 
 /// A line of 16 numbers per image: `world_from_camera`, row by row.
 fn streaming_poses(path: &Path) -> Result<Vec<Se3>, Error> {
-    let text = std::fs::read_to_string(path).map_err(|e| Error::io("read", path, e))?;
+    let text = crate::system::read_text_up_to(path, crate::system::MAX_JSON_BYTES)
+        .map_err(|e| Error::io("read", path, e))?;
     let pose = |(number, line): (usize, &str)| {
         let values: Option<Vec<f64>> = line.split_whitespace().map(|v| v.parse().ok()).collect();
         let pose =

@@ -20,6 +20,8 @@ use vidar_export::official::{NpyArray, NpyData, NpzLimits, Packing, read_npz, wr
 /// Schema of a chunk's `json`.
 pub(super) const CHUNK_SCHEMA: &str = "vidar.chunk/1";
 const FORMAT: &str = "chunk npz";
+/// Most bytes that one view of a prediction may hold: 2048 x 2048 pixels of 16 bytes each.
+const VIEW_BYTES: u64 = 64 << 20;
 /// What the names of loops' files begin with.
 const LOOP: &str = "loop-";
 
@@ -160,7 +162,7 @@ pub(super) fn is_loop(path: &Path) -> bool {
 
 /// A sidecar; `None` where there is no such file.
 pub(super) fn read_sidecar(path: &Path) -> Result<Option<Sidecar>, Error> {
-    let bytes = match std::fs::read(path) {
+    let bytes = match crate::system::read_up_to(path, crate::system::MAX_JSON_BYTES) {
         Ok(bytes) => bytes,
         Err(e) if e.kind() == std::io::ErrorKind::NotFound => return Ok(None),
         Err(e) => return Err(Error::io("read", path, e)),
@@ -248,7 +250,9 @@ pub(super) fn read_views(
     least_confidence: f32,
 ) -> Result<StoredChunk, Error> {
     let file = File::open(path).map_err(|e| Error::io("read", path, e))?;
-    let mut arrays = read_npz(BufReader::new(file), NpzLimits::default()).map_err(|e| at(path, e))?;
+    // An archive of zeros unpacks to a thousand times its size: what the views may hold is known beforehand.
+    let limits = NpzLimits { bytes: VIEW_BYTES * (ids.len() as u64 + 1), ..NpzLimits::default() };
+    let mut arrays = read_npz(BufReader::new(file), limits).map_err(|e| at(path, e))?;
     let mut take = |names: &[&str]| names.iter().find_map(|name| arrays.remove(*name));
     let bad = |reason: String| Error::NotARecording { path: path.to_owned(), reason };
     let depth = take(&["depth"]).ok_or_else(|| bad("it has no array \"depth\"".into()))?;

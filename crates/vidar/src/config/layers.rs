@@ -85,7 +85,8 @@ impl Layered {
     /// Applies a TOML file.
     pub fn file(&mut self, path: &Path) -> Result<(), Error> {
         let fail = |reason: String| Error::ConfigFile { path: path.to_owned(), reason };
-        let text = std::fs::read_to_string(path).map_err(|e| fail(e.to_string()))?;
+        let text = crate::system::read_text_up_to(path, crate::system::MAX_CONFIG_BYTES)
+            .map_err(|e| fail(e.to_string()))?;
         self.table(&text, &Origin::File(path.to_owned())).map_err(|error| match error {
             Error::BadValue { reason } => fail(reason),
             other => other,

@@ -33,6 +33,10 @@ pub struct InputConfig {
     pub poses: PoseSource,
     /// Longest gap (s) between two poses that is interpolated. Raise it for keyframe-only trajectories.
     pub max_pose_gap_secs: f64,
+    /// Standard deviation of ln(scale) for what no estimate sees: the gain of the accelerometer and the lever arm of the camera.
+    /// Part of the stated scale wherever the odometry is its source. 0.01: a consumer IMU (data sheets say 1 % typically) and a
+    /// lever arm known to 1 or 2 cm; 0.003: a factory-calibrated IMU on a calibrated rig; 0: exact, as in simulation.
+    pub imu_scale_std: f64,
 }
 
 /// Where metric poses come from.
@@ -58,6 +62,7 @@ impl Default for InputConfig {
             stride: 1,
             poses: PoseSource::Auto,
             max_pose_gap_secs: 0.5,
+            imu_scale_std: 0.01,
         }
     }
 }
@@ -275,6 +280,9 @@ impl Config {
             if !(value.is_finite() && value >= 0.0) {
                 return bad(format!("{key} must be finite and not negative, found {value}"));
             }
+        }
+        if !(0.0..=1.0).contains(&self.input.imu_scale_std) {
+            return bad(format!("input.imu_scale_std must be 0 to 1, found {}", self.input.imu_scale_std));
         }
         for (key, value) in
             [("input.stride", self.input.stride), ("geometry.chunk_keyframes", self.geometry.chunk_keyframes)]

@@ -74,7 +74,8 @@ impl Cameras {
             views: views.into_iter().map(|v| (v.image_name, v.world_from_camera, v.intrinsics)).collect(),
         };
         if path.is_file() {
-            let bytes = std::fs::read(path).map_err(|e| Error::io("read", path, e))?;
+            let bytes = crate::system::read_up_to(path, crate::system::MAX_CLOUD_BYTES)
+                .map_err(|e| Error::io("read", path, e))?;
             let read = vidar_export::read_transforms_json(&bytes)?;
             return Ok(foreign("transforms.json", read.views));
         }

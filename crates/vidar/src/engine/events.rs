@@ -1,6 +1,7 @@
 //! What the engine reports: progress and results in one typed stream.
 
 use crate::input::TrajectorySource;
+use crate::quality::TrackQuality;
 use std::sync::Arc;
 use vidar_align::Placement;
 use vidar_align::aligner::{ChunkReport, LoopReport};
@@ -136,6 +137,8 @@ pub enum MapEvent {
         /// Whether it is the map.
         is_final: bool,
     },
+    /// What the odometry says of the whole recording, once it has seen all of it.
+    Tracked(Box<TrackQuality>),
     /// Something the user should know.
     Warning(Warning),
 }

@@ -222,6 +222,9 @@ impl<'a> Engine<'a> {
         for warning in poses.warnings() {
             sink(MapEvent::Warning(warning))?;
         }
+        if let Some(quality) = poses.quality() {
+            sink(MapEvent::Tracked(Box::new(quality.clone())))?;
+        }
         if self.track.longest().is_some() || (self.cancelled)() {
             return Ok(());
         }

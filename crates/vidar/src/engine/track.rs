@@ -3,6 +3,7 @@
 use super::events::{FrameStamp, FrameState};
 use crate::error::Error;
 use crate::input::{MetricTrajectory, TrajectorySource};
+use crate::quality::TrackQuality;
 use std::collections::{BTreeMap, VecDeque};
 use std::sync::Arc;
 use vidar_core::{
@@ -48,6 +49,10 @@ pub trait PoseSource {
     fn warnings(&self) -> Vec<Warning>;
     /// Why there are no metric poses.
     fn why_no_pose(&self) -> String;
+    /// What it says of its poses, where it estimates them.
+    fn quality(&self) -> Option<&TrackQuality> {
+        None
+    }
 }
 
 /// Poses of a trajectory that was given: external, or ground truth.
@@ -122,7 +127,7 @@ pub struct OdometryPoses {
     has_state: bool,
     /// Times and reasons of losses.
     lost: Vec<(Timestamp, String)>,
-    waiting_for: Option<String>,
+    quality: TrackQuality,
 }
 
 impl OdometryPoses {
@@ -140,12 +145,13 @@ impl OdometryPoses {
             is_metric,
             has_state: false,
             lost: Vec::new(),
-            waiting_for: None,
+            quality: TrackQuality::default(),
         })
     }
 
     fn report(&mut self, output: OdometryOutput) -> PoseReport {
         let (frame_id, time) = (output.frame_id, output.time);
+        self.quality.add(&output);
         match output.status {
             Status::Tracking(tracking) if self.is_metric => {
                 self.has_state = true;
@@ -158,10 +164,7 @@ impl OdometryPoses {
                 self.lost.push((time, reason.to_string()));
                 PoseReport::NotPosed { time }
             }
-            Status::Waiting(reason) => {
-                self.waiting_for = Some(reason.to_string());
-                PoseReport::NotPosed { time }
-            }
+            Status::Waiting(_) => PoseReport::NotPosed { time },
         }
     }
 }
@@ -197,14 +200,15 @@ impl PoseSource for OdometryPoses {
     }
 
     fn why_no_pose(&self) -> String {
-        match (&self.waiting_for, self.is_metric) {
-            (_, false) => {
-                "odometry.imu is \"off\", or the recording has no IMU: lengths are not metres".into()
-            }
+        match self.is_metric {
+            false => "odometry.imu is \"off\", or the recording has no IMU: lengths are not metres".into(),
             _ if self.has_state => "it lost track after one image".into(),
-            (Some(reason), _) => reason.clone(),
-            (None, _) => "it got no image".into(),
+            _ => self.quality.why_not_started().unwrap_or_else(|| "it got no image".into()),
         }
+    }
+
+    fn quality(&self) -> Option<&TrackQuality> {
+        Some(&self.quality)
     }
 }
 

@@ -26,7 +26,7 @@ pub(super) fn write(
         Ok(())
     };
     let tracked = &outcome.tracked;
-    let unit = if tracked.is_metric { "metres" } else { "up to scale, lengths are not metres" };
+    let unit = if outcome.scale.is_metric { "metres" } else { "lengths are not metres" };
     let note = format!("vidar odometry, {unit}");
     if let Some(trajectory) = &outcome.trajectory {
         put_trajectory(&mut put, "trajectory/odometry_body", trajectory, &note)?;
@@ -34,7 +34,7 @@ pub(super) fn write(
     if let Some(keyframes) = keyframe_trajectory(&tracked.keyframes) {
         put_trajectory(&mut put, "trajectory/odometry_keyframes_camera", &keyframes, &note)?;
     }
-    put("odometry/keyframes.json", &pretty(&keyframes_json(tracked)))?;
+    put("odometry/keyframes.json", &pretty(&keyframes_json(outcome)))?;
     put("odometry/landmarks.csv", landmarks_csv(&tracked.keyframes).as_bytes())?;
     put("odometry/health.csv", health_csv(tracked).as_bytes())?;
     put("odometry/report.json", &pretty(&outcome.result_json()))?;
@@ -66,7 +66,8 @@ fn keyframe_trajectory(keyframes: &[OdometryKeyframe]) -> Option<Trajectory> {
     Trajectory::new(vidar_core::BodyFrame::Camera(vidar_core::CameraId(0)), poses).ok()
 }
 
-fn keyframes_json(tracked: &Tracked) -> Value {
+fn keyframes_json(outcome: &OdometryOutcome) -> Value {
+    let tracked = &outcome.tracked;
     let one = |k: &OdometryKeyframe| {
         let previous = k
             .previous
@@ -83,7 +84,7 @@ fn keyframes_json(tracked: &Tracked) -> Value {
         })
     };
     let all: Vec<Value> = tracked.keyframes.iter().map(one).collect();
-    json!({ "schema": KEYFRAMES_SCHEMA, "is_metric": tracked.is_metric, "keyframes": all })
+    json!({ "schema": KEYFRAMES_SCHEMA, "is_metric": outcome.scale.is_metric, "keyframes": all })
 }
 
 /// Rows of a symmetric matrix of `n` columns.

@@ -1,13 +1,13 @@
 //! `report.html` of `vidar odometry`: the path, and over time tracks, time per image, biases and standard deviations.
 
 use super::OdometryOutcome;
-use crate::error::{Error, ExitStatus};
+use crate::error::Error;
 use crate::run_folder::RunFolder;
 use vidar_core::{StampedPose, Trajectory};
 use vidar_odometry::Tracking;
 use vidar_view::{
-    Assessment, AssessmentLevel, AxisSpec, Figure, FigureWidth, LinePlot, PictureSize, PlotTrajectory,
-    Report, Section, Series, SummaryItem, TrajectoryPlot,
+    AxisSpec, Figure, FigureWidth, LinePlot, PictureSize, PlotTrajectory, Report, Section, Series,
+    SummaryItem, TrajectoryPlot,
 };
 
 /// Columns and rows of the pictures.
@@ -54,7 +54,7 @@ pub(super) fn write(
     let report = Report {
         title: format!("VIDAR odometry: {title}"),
         subtitle: unit(outcome).into(),
-        assessment: Some(assessment(outcome)),
+        assessment: Some(outcome.verdict.assessment()),
         summary: summary.collect(),
         sections: vec![path, time],
         warnings: outcome.warnings.clone(),
@@ -66,32 +66,7 @@ pub(super) fn write(
 }
 
 fn unit(outcome: &OdometryOutcome) -> &'static str {
-    if outcome.tracked.is_metric { "lengths in metres" } else { "up to scale: lengths are not metres" }
-}
-
-fn assessment(outcome: &OdometryOutcome) -> Assessment {
-    let tracked = &outcome.tracked;
-    let (level, text) = match (outcome.status, &outcome.report) {
-        (ExitStatus::Interrupted, _) => {
-            (AssessmentLevel::Bad, "interrupted: only a part was tracked".to_owned())
-        }
-        _ if outcome.trajectory.is_none() => {
-            let why = tracked.why_not_started().unwrap_or_else(|| "no images".into());
-            (AssessmentLevel::Bad, format!("never started: {why}"))
-        }
-        (ExitStatus::Degraded, _) => (
-            AssessmentLevel::Caution,
-            format!("lost {} times; segments cannot be compared", tracked.lost.len()),
-        ),
-        (_, Some(report)) => {
-            let ate = report.ate_se3_m.map_or("-".into(), |e| format!("{:.4} m", e.rmse));
-            (AssessmentLevel::Good, format!("tracked throughout; ATE SE(3) {ate} against ground truth"))
-        }
-        (_, None) => {
-            (AssessmentLevel::NotEvaluated, "tracked throughout; no ground truth to compare it with".into())
-        }
-    };
-    Assessment { level, text }
+    if outcome.scale.is_metric { "lengths in metres" } else { "lengths are not metres" }
 }
 
 fn path_picture(
@@ -101,7 +76,7 @@ fn path_picture(
 ) -> vidar_view::Picture {
     let plot = TrajectoryPlot { up: nalgebra::Vector3::z(), ..TrajectoryPlot::default() };
     let size = PictureSize::new(PATH_SIZE.0, PATH_SIZE.1);
-    let record = outcome.report.as_ref().and_then(|r| match outcome.tracked.is_metric {
+    let record = outcome.report.as_ref().and_then(|r| match outcome.scale.is_metric {
         true => r.truth_from_estimate_se3,
         false => r.truth_from_estimate_sim3,
     });
@@ -160,7 +135,7 @@ fn plots(outcome: &OdometryOutcome) -> Vec<(&'static str, LinePlot, &'static str
             "Wall time per image, decoding left out",
         ),
     ];
-    if outcome.tracked.is_metric {
+    if outcome.tracked.with_imu {
         all.extend([
             ("odometry_gyro_bias", plot(AxisSpec::new("gyroscope bias", "rad/s"), gyro), "Gyroscope bias"),
             (

@@ -94,6 +94,7 @@ pub fn evaluate(
         });
         match report {
             Ok((estimate, mut report)) => {
+                report.warnings.iter().for_each(|w| events.warn(w));
                 evaluation.error_cloud =
                     report.point_errors.take().map(|errors| (estimate, errors.estimate_m));
                 evaluation.surface = Some(report);

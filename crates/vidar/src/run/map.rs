@@ -4,11 +4,12 @@ use super::evaluate::DepthScorer;
 use crate::engine::{FrameState, MapEvent, MapKeyframe, Surface};
 use crate::error::Error;
 use crate::input::{MetricTrajectory, PosePlan, TrajectorySource};
+use crate::quality::TrackQuality;
 use crate::run_folder::StoredView;
 use std::collections::BTreeMap;
 use std::sync::Arc;
 use vidar_align::Placement;
-use vidar_core::{BodyFrame, CameraId, StampedPose, Trajectory};
+use vidar_core::{AlignedView, BodyFrame, CameraId, StampedPose, Trajectory};
 use vidar_dataset::Dataset;
 
 /// The fused world.
@@ -26,6 +27,10 @@ pub struct MetricMap {
     pub views: Vec<StoredView>,
     /// Depth against the depth sensor, where there is one.
     pub depth_scores: DepthScorer,
+    /// What the odometry said of the recording, where it ran; also when its poses were not used.
+    pub quality: Option<TrackQuality>,
+    /// Area that each fused view would see if all of its pixels had depth, m².
+    pub view_areas_m2: Vec<f64>,
 }
 
 impl MetricMap {
@@ -43,6 +48,15 @@ impl MetricMap {
     /// Whether the metric poses are ground truth.
     pub fn uses_ground_truth(&self) -> bool {
         self.trajectory.as_ref().is_some_and(|t| t.source == TrajectorySource::GroundTruth)
+    }
+
+    /// What the surface is of the area that the median view sees; small where views contradict each other, so that hardly
+    /// anything was fused.
+    pub fn share_of_a_view(&self) -> Option<f64> {
+        let mut areas = self.view_areas_m2.clone();
+        areas.sort_unstable_by(f64::total_cmp);
+        let median = areas.get(areas.len() / 2).filter(|a| **a > 0.0)?;
+        Some(self.surface.coverage.surface_area_m2 / median)
     }
 
     /// The keyframes' poses in the map as a trajectory of the camera.
@@ -84,7 +98,7 @@ impl<'a> MapCollector<'a> {
         match event {
             MapEvent::State(state) => self.states.entry(state.segment).or_default().push(*state),
             MapEvent::World { source, segment } => {
-                self.map = MetricMap::default();
+                self.map = MetricMap { quality: self.map.quality.take(), ..MetricMap::default() };
                 (self.source, self.segment) = (source.clone(), *segment);
             }
             MapEvent::Keyframe(keyframe) => self.map.keyframes.push(keyframe.clone()),
@@ -92,7 +106,11 @@ impl<'a> MapCollector<'a> {
                 self.map.placement = Some(placement.clone());
             }
             MapEvent::SurfaceChanged { surface, is_final: true } => self.map.surface = surface.clone(),
-            MapEvent::ViewsFused(views) => self.map.depth_scores.add(self.dataset, views)?,
+            MapEvent::ViewsFused(views) => {
+                self.map.view_areas_m2.extend(views.iter().filter_map(area_in_view));
+                self.map.depth_scores.add(self.dataset, views)?;
+            }
+            MapEvent::Tracked(quality) => self.map.quality = Some((**quality).clone()),
             _ => {}
         }
         Ok(())
@@ -121,4 +139,14 @@ impl<'a> MapCollector<'a> {
         let camera_trajectory = Trajectory::new(BodyFrame::Camera(camera), poses).ok()?;
         Some(MetricTrajectory { source: TrajectorySource::Odometry, camera_trajectory })
     }
+}
+
+/// Area of a view's pixels at their depths, facing the camera, m²; pixels without depth count as the mean of the others.
+fn area_in_view(view: &AlignedView) -> Option<f64> {
+    let k = view.intrinsics();
+    let pixels = view.depth().image().data();
+    let valid = || pixels.iter().filter(|z| z.is_finite()).map(|z| f64::from(*z));
+    let count = valid().count();
+    let area: f64 = valid().map(|z| z * z).sum::<f64>() / (k.fx * k.fy);
+    (count > 0).then(|| area * pixels.len() as f64 / count as f64)
 }

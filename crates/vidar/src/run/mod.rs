@@ -11,6 +11,8 @@ mod record;
 mod reference;
 mod source;
 mod store;
+mod summary;
+mod trust;
 mod views;
 
 pub use evaluate::{DepthScore, Evaluation};
@@ -25,6 +27,7 @@ use crate::error::{Error, ExitStatus};
 use crate::events::{CancelToken, Event, Events};
 use crate::input::{self, ImageFiles, Measurement};
 use crate::run_folder::{OutputLocation, RunFolder};
+use crate::verdict::{StatedScale, Verdict};
 use place_recognition::PlaceRecognition;
 use readers::{FINISH, MAP, Readers};
 use record::{Recorder, RunDescription};
@@ -65,6 +68,10 @@ pub struct RunOutcome {
     pub map: MetricMap,
     /// Scores of the map, where there is something to compare it with.
     pub evaluation: Evaluation,
+    /// What is said of the scale.
+    pub scale: StatedScale,
+    /// How far the map may be trusted.
+    pub verdict: Verdict,
     /// Every warning, in order.
     pub warnings: Vec<Warning>,
     /// Wall time, s.
@@ -79,12 +86,12 @@ impl RunOutcome {
 
     /// What was made, its scores and time, and the report: at most twelve lines.
     pub fn summary_lines(&self) -> Vec<(&'static str, String)> {
-        pictures::summary_lines(self)
+        summary::lines(self)
     }
 
     /// Whether the map is in metres.
     pub fn is_metric(&self) -> bool {
-        self.map.trajectory.is_some() && self.plan.mode.uses_pose_priors()
+        self.scale.is_metric
     }
 }
 
@@ -93,9 +100,12 @@ impl RunOutcome {
 /// # Errors
 /// The input, the configuration or the model cannot be used.
 pub fn plan(request: &RunRequest) -> Result<Plan, Error> {
-    let config = request.layered.build()?;
+    let mut config = request.layered.build()?;
     let dataset = input::open_every_image(&request.path, &request.open, &config)?;
-    Ok(Plan::make(&dataset, &config, request.reference.as_deref())?.0)
+    let untimed = input::use_every_untimed_image(&dataset, &mut config);
+    let (mut plan, ..) = Plan::make(&dataset, &config, request.reference.as_deref())?;
+    plan.warnings.splice(0..0, dataset.warnings.iter().cloned().chain(untimed));
+    Ok(plan)
 }
 
 /// Runs all of it. On Ctrl-C what is predicted is fused, written and evaluated, and the status is `Interrupted`. A run that
@@ -110,9 +120,14 @@ pub fn run(request: &RunRequest, events: &Events, cancel: &CancelToken) -> Resul
     let mut config = request.layered.build()?;
     let mut dataset =
         events.stage("read", 0, || input::open_every_image(&request.path, &request.open, &config))?;
+    dataset.warnings.extend(input::use_every_untimed_image(&dataset, &mut config));
     let (plan, source, places) =
         events.stage("plan", 0, || Plan::make(&dataset, &config, request.reference.as_deref()))?;
+    let description = RunDescription::new(request, &dataset, &plan)?;
+    let earlier = request.place.earlier(&description.0, &request.layered.to_toml(false))?;
     let folder = Arc::new(RunFolder::create(&request.place)?);
+    folder.write_manifest(&description.0)?;
+    folder.write("config.resolved.toml", request.layered.to_toml(true).as_bytes())?;
     recorder.keep_log_in(folder.clone());
     dataset.warnings.iter().chain(&plan.warnings).for_each(|w| events.warn(w));
     if plan.poses.is_odometry() {
@@ -121,7 +136,6 @@ pub fn run(request: &RunRequest, events: &Events, cancel: &CancelToken) -> Resul
         })?;
         timing.iter().for_each(|w| events.warn(w));
     }
-    let description = RunDescription::new(request, &dataset, &plan)?;
 
     let context =
         Context { request, config: &config, dataset: &dataset, folder: &folder, events: &events, cancel };
@@ -134,6 +148,9 @@ pub fn run(request: &RunRequest, events: &Events, cancel: &CancelToken) -> Resul
         Ok(outcome) => (outcome.status, outputs::result_json(outcome)),
         Err(error) => (error.exit_status(), record::failure_json(error)),
     };
+    if let (Some(earlier), Ok(_)) = (&earlier, &made) {
+        earlier.remove_all_but(folder.path(), &recorder.files());
+    }
     let written = folder.write_manifest(&recorder.manifest(description, result, exit));
     let outcome = made?;
     written?;
@@ -161,10 +178,11 @@ impl Context<'_> {
         recorder: &Recorder,
     ) -> Result<RunOutcome, Error> {
         let Self { request, config, dataset, folder, events, cancel } = *self;
-        folder.write("config.resolved.toml", request.layered.to_toml(true).as_bytes())?;
         let map = self.build_map(&plan, &mut source, places)?;
         let evaluation =
             events.stage("evaluate", 0, || evaluate::evaluate(dataset, &plan, &map, config, events))?;
+        let scale = trust::stated_scale(&map, plan.mode, input::unseen_scale_std(dataset, config));
+        trust::warnings(&map, &evaluation, &scale).iter().for_each(|w| events.warn(w));
         let is_degraded = recorder.is_degraded() || map.surface.mesh.triangles.is_empty();
         let status = match (cancel.is_cancelled(), is_degraded) {
             (true, _) => ExitStatus::Interrupted,
@@ -172,7 +190,18 @@ impl Context<'_> {
             (false, false) => ExitStatus::Done,
         };
         let (root, warnings) = (folder.path().to_owned(), recorder.warnings());
-        let outcome = RunOutcome { folder: root, status, plan, map, evaluation, warnings, seconds: 0.0 };
+        let verdict = trust::verdict(&map, &evaluation, &scale, &warnings, status);
+        let outcome = RunOutcome {
+            folder: root,
+            status,
+            plan,
+            map,
+            evaluation,
+            scale,
+            verdict,
+            warnings,
+            seconds: 0.0,
+        };
         events.stage("write", 0, || outputs::write(&outcome, config, request, folder, events))?;
         if config.output.report {
             events.stage("report", 0, || pictures::draw(&outcome, dataset, request, folder, events))?;

@@ -4,11 +4,12 @@ use super::{MetricMap, RunOutcome, RunRequest};
 use crate::config::Config;
 use crate::error::Error;
 use crate::events::{Event, Events};
+use crate::quality::TrackQuality;
 use crate::run_folder::{MANIFEST_SCHEMA, RunFolder, StoredView, VIEWS_SCHEMA, pretty};
 use serde_json::{Value, json};
 use vidar_align::Placement;
 use vidar_align::aligner::{ChunkPlacement, LoopReport};
-use vidar_core::{FrameId, Se3, Timestamp, Trajectory};
+use vidar_core::{FrameId, Se3, Timestamp, Trajectory, printable};
 use vidar_export::{DepthFrame, DepthSidecar, ExportError};
 
 /// Writes everything but pictures and manifest.
@@ -31,7 +32,7 @@ pub fn write(
     if config.output.depth_png && !outcome.map.views.is_empty() {
         writer.export("depth/depth.json", |w| sidecar(outcome, config).write(w))?;
     }
-    let comments = vec![
+    let comments = [
         "VIDAR metric map".to_owned(),
         format!(
             "frame: world, right-handed; unit: {}",
@@ -40,7 +41,9 @@ pub fn write(
         format!("metric poses: {}", map.poses()),
         format!("coupling: {}", plan.mode),
         format!("geometry: {}", plan.model.name),
-    ];
+    ]
+    .map(|line| printable(&line).into_owned())
+    .to_vec();
     writer.export("map/mesh.ply", |w| vidar_export::write_ply_mesh(w, &map.surface.mesh, &comments))?;
     writer.export("map/points.ply", |w| vidar_export::write_ply_cloud(w, &map.surface.cloud, &comments))?;
     if config.output.mesh_glb && !map.surface.mesh.triangles.is_empty() {
@@ -77,7 +80,7 @@ impl Writer<'_> {
     }
 
     fn trajectory(&self, stem: &str, trajectory: &Trajectory, map: &MetricMap) -> Result<(), Error> {
-        let note = format!("metric poses: {}", map.poses());
+        let note = printable(&format!("metric poses: {}", map.poses())).into_owned();
         self.export(&format!("{stem}.tum"), |w| vidar_export::write_tum(w, trajectory, &note))?;
         self.export(&format!("{stem}.euroc.csv"), |w| vidar_export::write_euroc_csv(w, trajectory, &note))
     }
@@ -115,6 +118,8 @@ fn metrics(outcome: &RunOutcome) -> Value {
         "coupling": outcome.plan.mode,
         "poses_are_ground_truth": outcome.map.uses_ground_truth(),
         "reference": outcome.plan.reference.to_string(),
+        "verdict": outcome.verdict,
+        "scale": outcome.scale,
         "scores": crate::evaluate::scores(&outcome.evaluation),
         "evaluation": outcome.evaluation,
     })
@@ -135,6 +140,9 @@ pub fn result_json(outcome: &RunOutcome) -> Value {
         "coupling": outcome.plan.mode,
         "place_recognition": outcome.plan.place_recognition,
         "is_metric": outcome.is_metric(),
+        "verdict": outcome.verdict,
+        "scale": outcome.scale,
+        "odometry": map.quality.as_ref().map(TrackQuality::json),
         "placement": map.placement.as_deref().map(placement_json),
         "evaluation": outcome.evaluation,
         "seconds": outcome.seconds,
@@ -175,11 +183,12 @@ fn placement_json(placement: &Placement) -> Value {
 }
 
 fn readme(outcome: &RunOutcome, request: &RunRequest) -> String {
-    let plan: String = outcome.plan.lines().iter().map(|(k, v)| format!("  {k:<18} {v}\n")).collect();
+    let plan: String =
+        outcome.plan.lines().iter().map(|(k, v)| format!("  {k:<18} {}\n", printable(v))).collect();
     format!(
-        "A run of VIDAR {version} ({MANIFEST_SCHEMA})\n\n{plan}\n\
+        "A run of VIDAR {version} ({MANIFEST_SCHEMA})\n\n  {verdict}\n  scale: {scale}\n\n{plan}\n\
          Frames and units\n\
-         \x20 world: right-handed; metres. With an inertial or ground-truth trajectory z points up.\n\
+         \x20 world: right-handed; {unit}. With an inertial or ground-truth trajectory z points up.\n\
          \x20 camera: x right, y down, z forward; pixel (0, 0) is the centre of the top-left pixel.\n\
          \x20 a_from_b maps coordinates in b to coordinates in a.\n\n\
          Files\n\
@@ -194,6 +203,9 @@ fn readme(outcome: &RunOutcome, request: &RunRequest) -> String {
          \x20 manifest.json, log.jsonl       versions, hashes, timings, events\n\n\
          To do it again\n  {command}\n",
         version = crate::VERSION,
-        command = request.command.join(" "),
+        verdict = outcome.verdict.line(),
+        scale = outcome.scale.words,
+        unit = if outcome.is_metric() { "metres" } else { "lengths are not metres" },
+        command = printable(&request.command.join(" ")),
     )
 }

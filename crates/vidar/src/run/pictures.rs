@@ -1,16 +1,17 @@
 //! Figures of a run and its one-file report.
 
+use super::summary::area;
 use super::{RunOutcome, RunRequest};
-use crate::error::{Error, ExitStatus};
-use crate::evaluate::{surface_lines, trajectory_lines};
+use crate::error::Error;
+use crate::evaluate::{refinement, surface_lines, trajectory_lines};
 use crate::events::{Event, Events};
 use crate::input::truth_in_camera;
 use crate::run_folder::{RunFolder, StoredView};
 use vidar_core::Trajectory;
 use vidar_dataset::Dataset;
 use vidar_view::{
-    Assessment, AssessmentLevel, AxisSpec, Figure, FigureWidth, Histogram, MapCamera, MapSurface, Picture,
-    PictureSize, PlotTrajectory, Report, Section, Shading, SummaryItem, Table, TrajectoryPlot, Viewpoint,
+    AxisSpec, Figure, FigureWidth, Histogram, MapCamera, MapSurface, Picture, PictureSize, PlotTrajectory,
+    Report, Section, Shading, SummaryItem, Table, TrajectoryPlot, Viewpoint,
 };
 
 const MAP_SIZE: (usize, usize) = (960, 640);
@@ -40,7 +41,7 @@ pub fn draw(
             outcome.map.poses(),
             outcome.plan.mode
         ),
-        assessment: Some(assessment(outcome)),
+        assessment: Some(outcome.verdict.assessment()),
         summary: summary(outcome),
         sections: vec![
             map_section(outcome, path.as_ref(), &up, &mut album)?,
@@ -84,133 +85,6 @@ impl Album<'_> {
     }
 }
 
-fn assessment(outcome: &RunOutcome) -> Assessment {
-    let upper = if outcome.map.uses_ground_truth() {
-        "; poses are ground truth, so this is an upper bound"
-    } else {
-        ""
-    };
-    let (level, text) =
-        match (outcome.status, outcome.evaluation.surface.as_ref().and_then(|s| s.native.last())) {
-            (ExitStatus::Interrupted, _) => {
-                (AssessmentLevel::Bad, "interrupted: only a part was mapped".to_owned())
-            }
-            (ExitStatus::Degraded, _) => {
-                (AssessmentLevel::Caution, "finished, but part of the input is missing (see warnings)".into())
-            }
-            (_, Some(s)) => (
-                if s.f >= 0.5 { AssessmentLevel::Good } else { AssessmentLevel::Caution },
-                format!("F {:.3} at {:.2} m against the reference{upper}", s.f, s.threshold_m),
-            ),
-            (_, None) => (
-                AssessmentLevel::NotEvaluated,
-                "there is no reference to compare the surface with".to_owned(),
-            ),
-        };
-    Assessment { level, text }
-}
-
-/// What was made, how far to trust it, how long it took, what next.
-pub fn summary_lines(outcome: &RunOutcome) -> Vec<(&'static str, String)> {
-    let map = &outcome.map;
-    let folder = outcome.folder.display();
-    let mut lines = vec![
-        (
-            "map",
-            format!(
-                "{folder}/map/mesh.ply ({} triangles), points.ply ({} points)",
-                map.surface.mesh.triangles.len(),
-                map.surface.cloud.len()
-            ),
-        ),
-        ("keyframes", format!("{} of {} with depth", map.views.len(), outcome.map.keyframes.len())),
-        (
-            "surface",
-            format!(
-                "{:.1} m2, seen by {:.1} views on average",
-                map.surface.coverage.surface_area_m2, map.surface.coverage.mean_observations
-            ),
-        ),
-        ("metric poses", outcome.map.poses()),
-        ("coupling", coupling_line(outcome)),
-    ];
-    match &outcome.evaluation.trajectory {
-        Some(t) => {
-            let number = |v: Option<f64>| v.map_or_else(|| "not determined".into(), |v| format!("{v:.4}"));
-            let ate = number(t.ate_se3_m.as_ref().map(|s| s.rmse));
-            lines.push((
-                "trajectory",
-                format!("ATE {ate} m, |ln s| {} ({} matched)", number(t.scale_error), t.matched),
-            ));
-        }
-        None if outcome.map.uses_ground_truth() => lines.push(("scale", "metric by ground truth".into())),
-        None if !outcome.is_metric() => {
-            lines.push(("scale", "arbitrary: this coupling uses no metric poses".into()));
-        }
-        None => {
-            lines.push(("scale", "as metric as the trajectory given; no ground truth to check it".into()))
-        }
-    }
-    match &outcome.evaluation.surface {
-        Some(surface) => {
-            let f: Vec<String> = surface
-                .native
-                .iter()
-                .map(|s| {
-                    format!("F@{:.2} {:.3} (P {:.3}, R {:.3})", s.threshold_m, s.f, s.precision, s.recall)
-                })
-                .collect();
-            lines.push(("how good", f.join("  ")));
-        }
-        None => lines.push(("how good", "not evaluated: no reference".into())),
-    }
-    if let Some(metric) = outcome.evaluation.depth.as_ref().and_then(|d| d.summary.pixel_weighted.metric) {
-        let complete =
-            outcome.evaluation.depth.as_ref().map_or(0.0, |d| d.summary.pixel_weighted.completeness);
-        lines.push((
-            "depth",
-            format!(
-                "AbsRel {:.4}, delta<1.25 {:.3}, on {:.0} % of the sensor's pixels",
-                metric.abs_rel,
-                metric.delta_1,
-                complete * 100.0
-            ),
-        ));
-    }
-    let memory = crate::system::peak_memory_bytes()
-        .map_or_else(String::new, |b| format!(", peak memory {}", super::bytes(b)));
-    lines.push(("took", format!("{:.1} s{memory}", outcome.seconds)));
-    let report = outcome.folder.join("report.html");
-    let shown = if report.exists() { report } else { outcome.folder.join("map/mesh.ply") };
-    lines.push(("look at it", shown.display().to_string()));
-    lines
-}
-
-/// How chunks were coupled, how well their scales are known, and which rejection reasons applied.
-fn coupling_line(outcome: &RunOutcome) -> String {
-    let mut text = outcome.plan.mode.to_string();
-    let Some(placement) = &outcome.map.placement else { return text };
-    let mut stds: Vec<f64> =
-        placement.chunks.iter().map(|c| c.log_scale_std).filter(|s| s.is_finite()).collect();
-    stds.sort_unstable_by(f64::total_cmp);
-    if let Some(median) = stds.get(stds.len() / 2) {
-        text += &format!(", scale of a chunk known to {:.1} %", median * 100.0);
-    }
-    let accepted = placement.loops.iter().filter(|l| l.rejection.is_none()).count();
-    if !placement.loops.is_empty() {
-        text += &format!(", {accepted} of {} loops accepted", placement.loops.len());
-    }
-    let rejections: Vec<String> = placement
-        .rejections
-        .iter()
-        .map(|(reason, n)| format!("{} {n}x", serde_json::json!(reason).as_str().unwrap_or_default()))
-        .collect();
-    if !rejections.is_empty() {
-        text += &format!("; rejections: {}", rejections.join(", "));
-    }
-    text
-}
-
 fn summary(outcome: &RunOutcome) -> Vec<SummaryItem> {
     let item = |label: &str, value: String, why: &str| SummaryItem {
         label: label.into(),
@@ -219,14 +93,22 @@ fn summary(outcome: &RunOutcome) -> Vec<SummaryItem> {
     };
     let mut items = Vec::new();
     if let Some(surface) = &outcome.evaluation.surface {
-        for s in &surface.native {
+        for s in &surface.rigid {
             items.push(item(
                 &format!("F@{:.2} m", s.threshold_m),
                 format!("{:.3}", s.f),
-                "harmonic mean of precision and recall at this distance",
+                "harmonic mean of precision and recall at this distance, rigid fit: scale as it is",
+            ));
+        }
+        if let Some(s) = surface.native.last() {
+            items.push(item(
+                &format!("F@{:.2} m refined", s.threshold_m),
+                format!("{:.3}", s.f),
+                &format!("the paper's bounded placement: {}", refinement(surface)),
             ));
         }
     }
+    items.push(item("scale", scale_item(outcome), &outcome.scale.words));
     if let Some(t) = &outcome.evaluation.trajectory {
         if let Some(ate) = &t.ate_se3_m {
             items.push(item(
@@ -253,10 +135,19 @@ fn summary(outcome: &RunOutcome) -> Vec<SummaryItem> {
     ));
     items.push(item(
         "surface",
-        format!("{:.1} m²", outcome.map.surface.coverage.surface_area_m2),
+        area(outcome.map.surface.coverage.surface_area_m2, outcome.is_metric(), 1),
         "area of the mesh",
     ));
     items
+}
+
+fn scale_item(outcome: &RunOutcome) -> String {
+    let known = outcome.scale.sigma.map(|sigma| format!("σ {:.1} %", 100.0 * sigma));
+    known.unwrap_or_else(|| "σ not known".into())
+}
+
+fn volume(value: f64, is_metric: bool) -> String {
+    format!("{value:.2} {}", if is_metric { "m³" } else { "cubic units (not metres)" })
 }
 
 fn size(of: (usize, usize)) -> PictureSize {
@@ -290,8 +181,8 @@ fn map_section(
         rows: vec![
             vec!["triangles".into(), mesh.triangles.len().to_string()],
             vec!["points".into(), outcome.map.surface.cloud.len().to_string()],
-            vec!["area".into(), format!("{:.2} m²", c.surface_area_m2)],
-            vec!["observed volume".into(), format!("{:.2} m³", c.observed_volume_m3)],
+            vec!["area".into(), area(c.surface_area_m2, outcome.is_metric(), 2)],
+            vec!["observed volume".into(), volume(c.observed_volume_m3, outcome.is_metric())],
             vec!["views per surface voxel".into(), format!("{:.1}", c.mean_observations)],
             vec!["seen by three views or more".into(), format!("{:.1} %", c.share_seen_by_3_or_more * 100.0)],
             vec![
@@ -320,7 +211,7 @@ fn evaluation_section(
     }
     if let Some(surface) = &outcome.evaluation.surface {
         section.tables.push(table(
-            "Surface, native-scale bounded placement (paper, section IV-B)",
+            "Surface: rigid fit, and with the scale refined (the paper's bounded placement, section IV-B)",
             surface_lines(surface),
         ));
     }
@@ -381,6 +272,10 @@ fn trajectory_section(
     album: &mut Album<'_>,
 ) -> Result<Section, Error> {
     let mut section = Section { heading: "Trajectory".into(), ..Section::default() };
+    section.paragraphs.push(format!("Scale: {}.", outcome.scale.words));
+    if let Some(quality) = &outcome.map.quality {
+        section.paragraphs.push(format!("Odometry: {}.", quality.words()));
+    }
     let truth = truth_in_camera(dataset);
     let evaluation = &outcome.evaluation;
     let moved = outcome.plan.mode.chains().then(|| outcome.map.keyframe_trajectory()).flatten();

@@ -4,7 +4,7 @@ use super::{Plan, RunRequest};
 use crate::error::{Error, ExitStatus};
 use crate::events::{Event, Events};
 use crate::run_folder::{MANIFEST_SCHEMA, Manifest, RunFolder};
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::sync::{Arc, Mutex};
 use vidar_core::{Severity, Warning};
 use vidar_dataset::Dataset;
@@ -73,6 +73,12 @@ impl Recorder {
         self.read(|r| r.warnings.iter().any(|w| w.severity == Severity::Degraded))
     }
 
+    /// Every file of the run so far, with those that are no results.
+    pub fn files(&self) -> BTreeSet<String> {
+        let own = ["config.resolved.toml", "log.jsonl", "manifest.json"].map(String::from);
+        self.read(|r| r.artifacts.iter().cloned().chain(own).collect())
+    }
+
     /// The manifest of a run that ended with `exit`.
     pub fn manifest(
         &self,
@@ -87,8 +93,8 @@ impl Recorder {
             peak_memory_bytes: crate::system::peak_memory_bytes(),
             result,
             warnings: serde_json::json!(counts),
-            artifacts: self.read(|r| r.artifacts.clone()),
-            exit: exit as i32,
+            artifacts: self.files().into_iter().collect(),
+            exit: Some(exit as i32),
             poses: self.read(|r| r.poses.clone()).unwrap_or_else(|| description.0.poses.clone()),
             ..description.0
         }
@@ -96,7 +102,7 @@ impl Recorder {
 }
 
 /// What is known of a run before it starts.
-pub(super) struct RunDescription(Manifest);
+pub(super) struct RunDescription(pub Manifest);
 
 impl RunDescription {
     /// Input, configuration, model and machine.

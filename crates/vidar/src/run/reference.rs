@@ -24,7 +24,8 @@ pub fn cloud(
     match source {
         ReferenceSource::None => Ok(None),
         ReferenceSource::Cloud(path) => {
-            let bytes = std::fs::read(path).map_err(|e| Error::io("read", path, e))?;
+            let bytes = crate::system::read_up_to(path, crate::system::MAX_CLOUD_BYTES)
+                .map_err(|e| Error::io("read", path, e))?;
             Ok(Some(vidar_export::read_ply(&bytes)?.cloud))
         }
         ReferenceSource::DepthSensor => fused_sensor_depth(dataset, config, events).map(Some),

@@ -1,0 +1,224 @@
+//! What the odometry said of a whole recording, in figures: how much of it has a state, how the states are, how well the scale
+//! is known. One collector for `vidar odometry` and `vidar run`.
+
+use nalgebra::Vector3;
+use serde_json::{Value, json};
+use std::collections::BTreeMap;
+use vidar_core::{Health, Timestamp};
+use vidar_odometry::initialization::InitFailureReason;
+use vidar_odometry::{LossReason, OdometryOutput, Status, Tracking};
+
+/// Statements of the odometry, summed up image by image.
+#[derive(Clone, Debug, Default)]
+pub struct TrackQuality {
+    /// Images that the odometry answered.
+    pub images: usize,
+    /// Those with a state, in any segment.
+    pub with_state: usize,
+    /// Times that a state was given up.
+    pub losses: usize,
+    times: Option<(Timestamp, Timestamp)>,
+    /// Refusals to start, each kind with its count and its last text.
+    refusals: BTreeMap<&'static str, (usize, String)>,
+    /// How many of them found that images and IMU contradict each other.
+    contradictions: usize,
+    waits: usize,
+    segments: BTreeMap<u32, SegmentQuality>,
+}
+
+/// States of one segment.
+#[derive(Clone, Debug)]
+pub struct SegmentQuality {
+    /// Images with a state.
+    pub images: usize,
+    /// How many of them have which health.
+    pub health: BTreeMap<&'static str, usize>,
+    first: Timestamp,
+    last: Timestamp,
+    last_position: Vector3<f64>,
+    last_scale_std: f64,
+    /// ∫ σ(ln s) over the path, and the path's length, m.
+    weighted: (f64, f64),
+}
+
+impl TrackQuality {
+    /// Takes the answer to one image.
+    pub fn add(&mut self, output: &OdometryOutput) {
+        self.images += 1;
+        let (first, _) = self.times.unwrap_or((output.time, output.time));
+        self.times = Some((first, output.time));
+        match &output.status {
+            Status::Tracking(tracking) => {
+                self.with_state += 1;
+                let add = |s: &mut SegmentQuality| s.add(output.time, tracking);
+                let new = || SegmentQuality::new(output.time, tracking);
+                self.segments.entry(tracking.segment).and_modify(add).or_insert_with(new);
+            }
+            Status::Lost(reason) => {
+                self.losses += 1;
+                self.contradictions += usize::from(matches!(reason, LossReason::Diverged { .. }));
+            }
+            Status::Waiting(failure) => {
+                self.waits += 1;
+                let kind = kind_of(&failure.reason);
+                self.contradictions += usize::from(kind.is_contradiction);
+                let refusal = self.refusals.entry(kind.name).or_default();
+                *refusal = (refusal.0 + 1, failure.to_string());
+            }
+        }
+    }
+
+    /// Why the odometry never started: the refusal that was found most often, of the kind that was found more often. The last one
+    /// alone may be an accident of where the recording ends.
+    pub fn why_not_started(&self) -> Option<String> {
+        let contradicts = 2 * self.contradictions > self.waits;
+        let of_kind = self.refusals.iter().filter(|(name, _)| CONTRADICTIONS.contains(name) == contradicts);
+        let (count, most) = of_kind.map(|(_, refusal)| refusal).max_by_key(|(count, _)| *count)?;
+        Some(match contradicts {
+            false if most.starts_with("std(log scale)") => format!(
+                "{most}. If the camera does speed up and slow down, signs or axes of the accelerometer are wrong"
+            ),
+            false => most.clone(),
+            true => format!(
+                "images and IMU contradict each other in {} of {} attempts ({most}; {count}x). {LIKELY_CAUSES}",
+                self.contradictions, self.waits
+            ),
+        })
+    }
+
+    /// Whether most of what the odometry found is contradiction of the sensors, so that its states are doubtful as well.
+    pub fn contradicts(&self) -> bool {
+        self.contradictions > 0 && 2 * self.contradictions > self.waits + self.losses
+    }
+
+    /// The segment with the most images, the first of equally long ones: the one that is mapped.
+    pub fn longest(&self) -> Option<&SegmentQuality> {
+        let longest = self.segments.iter().max_by_key(|(id, s)| (s.images, std::cmp::Reverse(**id)));
+        longest.map(|(_, s)| s).filter(|s| s.images >= 2)
+    }
+
+    /// σ(ln s) of the longest segment, without what no estimate sees; infinite where it is not observed.
+    pub fn scale_std(&self) -> f64 {
+        self.longest().map_or(f64::INFINITY, SegmentQuality::scale_std)
+    }
+
+    /// Share of the recording's time within the longest segment, 0…1.
+    pub fn covered(&self) -> f64 {
+        let (Some((first, last)), Some(segment)) = (self.times, self.longest()) else { return 0.0 };
+        let total = (last - first).as_secs_f64();
+        if total > 0.0 { (segment.last - segment.first).as_secs_f64() / total } else { 0.0 }
+    }
+
+    /// Share of the longest segment's images whose health is OK, 0…1.
+    pub fn healthy(&self) -> f64 {
+        self.longest().map_or(0.0, |s| s.count(Health::Ok) as f64 / s.images.max(1) as f64)
+    }
+
+    /// In words: "193 of 220 images, health OK in 97 % of them".
+    pub fn words(&self) -> String {
+        let tracked = self.longest().map_or(0, |s| s.images);
+        if tracked == 0 {
+            return format!("0 of {} images", self.images);
+        }
+        let mut text = format!(
+            "{tracked} of {} images, health OK in {:.0} % of them",
+            self.images,
+            100.0 * self.healthy()
+        );
+        if self.losses > 0 {
+            text += &format!(", lost {}x", self.losses);
+        }
+        text
+    }
+
+    /// For manifests.
+    pub fn json(&self) -> Value {
+        json!({
+            "images": self.images, "with_state": self.with_state, "losses": self.losses,
+            "mapped_images": self.longest().map_or(0, |s| s.images),
+            "covered_time_ratio": self.covered(), "healthy_ratio": self.healthy(),
+            "health": self.longest().map(|s| &s.health),
+            "scale_std": Some(self.scale_std()).filter(|s| s.is_finite()),
+        })
+    }
+}
+
+/// What ends most attempts where calibration, clock or units are wrong, in the order in which they are usually found.
+const LIKELY_CAUSES: &str = "Most likely the calibration is not this recording's: the camera's rotation and position on the IMU \
+    (T_BS), the clock offset, the focal length or the distortion, or axes, signs and units of the IMU";
+
+/// Refusals that say that images and IMU contradict each other. The others say that something is missing yet.
+const CONTRADICTIONS: [&str; 8] = [
+    "outliers",
+    "image residual",
+    "inertial residual",
+    "speed",
+    "accelerometer bias",
+    "gyroscope bias",
+    "specific force",
+    "camera orientation",
+];
+
+struct RefusalKind {
+    name: &'static str,
+    is_contradiction: bool,
+}
+
+fn kind_of(reason: &InitFailureReason) -> RefusalKind {
+    use InitFailureReason as R;
+    let name = match reason {
+        R::OutlierShare => "outliers",
+        R::ImageChi2 => "image residual",
+        R::ImuChi2 => "inertial residual",
+        R::Speed => "speed",
+        R::AccelBias => "accelerometer bias",
+        R::GyroBias => "gyroscope bias",
+        R::SpecificForce => "specific force",
+        R::CameraOrientation => "camera orientation",
+        R::Frames | R::Seconds => "too short",
+        R::Tracks => "tracks",
+        R::Parallax => "parallax",
+        R::ScaleUncertainty | R::ScaleAgreement => "scale",
+        R::SceneDistance => "distance",
+        R::GyroStd | R::AccelStd | R::ImageMotion => "neither at rest nor moving",
+        _ => "other",
+    };
+    RefusalKind { name, is_contradiction: CONTRADICTIONS.contains(&name) }
+}
+
+impl SegmentQuality {
+    fn new(time: Timestamp, tracking: &Tracking) -> Self {
+        Self {
+            images: 1,
+            health: [(tracking.health.as_str(), 1)].into(),
+            first: time,
+            last: time,
+            last_position: tracking.state.world_from_body.translation,
+            last_scale_std: tracking.scale_std,
+            weighted: (0.0, 0.0),
+        }
+    }
+
+    fn add(&mut self, time: Timestamp, tracking: &Tracking) {
+        self.images += 1;
+        *self.health.entry(tracking.health.as_str()).or_default() += 1;
+        let position = tracking.state.world_from_body.translation;
+        let step = (position - self.last_position).norm();
+        self.weighted.0 += step * tracking.scale_std;
+        self.weighted.1 += step;
+        (self.last, self.last_position, self.last_scale_std) = (time, position, tracking.scale_std);
+    }
+
+    fn count(&self, health: Health) -> usize {
+        self.health.get(health.as_str()).copied().unwrap_or(0)
+    }
+
+    /// σ of ln(scale) of the whole path: errors of its pieces go one way, so their σ add up with the pieces' lengths. At least
+    /// that of the newest state.
+    pub fn scale_std(&self) -> f64 {
+        match self.weighted.1 > 0.0 {
+            true => (self.weighted.0 / self.weighted.1).max(self.last_scale_std),
+            false => self.last_scale_std,
+        }
+    }
+}
