@@ -152,7 +152,7 @@ impl Event {
     pub fn of(event: &MapEvent) -> Option<Self> {
         let finite = |v: f64| Some(v).filter(|v| v.is_finite());
         Some(match event {
-            MapEvent::Step(_) | MapEvent::ViewsFused(_) => return None,
+            MapEvent::Step(_) | MapEvent::ChunkObserved { .. } | MapEvent::ViewsFused(_) => return None,
             MapEvent::World { source, segment } => Self::World { poses: source.clone(), segment: *segment },
             MapEvent::State(state) => Self::State {
                 frame: state.frame_id,

@@ -12,5 +12,6 @@ mod keys;
 mod models;
 mod numbers;
 mod odometry;
+mod quality;
 mod support;
 mod verbs;
