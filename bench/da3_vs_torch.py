@@ -14,7 +14,7 @@ official code computes its ray branch and discards it when it is not requested; 
 the same. What a worker writes to standard error is shown when it ends early.
 
 Engines: torch-f32, torch-bf16 (autocast, which leaves the head in f32), torch-f32-avx2 (oneDNN, MKL and ATen held to AVX2);
-ours-default (precision `auto`), ours-f32, ours-f32-split, ours-bf16-head32 (the whole backbone in bf16 and the head in f32,
+ours-default (precision `auto`), ours-f32, ours-bf16-head32 (the whole backbone in bf16 and the head in f32,
 like the official code), ours-bf16 (everything in bf16), ours-f32-avx2.
 """
 import argparse
@@ -31,7 +31,6 @@ AVX2 = {"ATEN_CPU_CAPABILITY": "avx2", "ONEDNN_MAX_CPU_ISA": "AVX2", "MKL_ENABLE
 OURS = {
     "ours-default": [],
     "ours-f32": ["--precision", "f32"],
-    "ours-f32-split": ["--precision", "f32-split"],
     "ours-bf16": ["--precision", "bf16", "--head-precision", "bf16", "--exact-blocks", "0"],
     "ours-bf16-head32": ["--precision", "bf16", "--head-precision", "f32", "--exact-blocks", "0"],
     "ours-f32-avx2": ["--precision", "f32", "--isa", "avx2"],

@@ -13,7 +13,7 @@ const LAYERS: &[(&str, &[&str])] = &[
     ("vidar-solve", &["vidar-core"]),
     ("vidar-dataset", &["vidar-core"]),
     ("vidar-odometry", &["vidar-core", "vidar-solve"]),
-    ("vidar-da3", &["vidar-core", "vidar-nn", "vidar-gpu"]),
+    ("vidar-da3", &["vidar-core", "vidar-nn", "vidar-gpu", "vidar-solve"]),
     ("vidar-stereo", &["vidar-core"]),
     ("vidar-align", &["vidar-core", "vidar-solve"]),
     ("vidar-fusion", &["vidar-core"]),

@@ -450,6 +450,13 @@ pub struct BenchArgs {
     /// Omit the rows of the odometry in Table I.
     #[arg(long, help_heading = "Output")]
     pub no_trajectories: bool,
+    /// Instead of the paper's tables, each coupling with and without landmarks, stereo points and loops on the same
+    /// keyframes and predictions; takes no --modes.
+    #[arg(long, requires = "synthetic", conflicts_with = "modes", help_heading = "Model")]
+    pub ablation: bool,
+    /// Seeds of rooms, noise and simulated networks over which --ablation takes median and spread.
+    #[arg(long, default_value_t = 3, value_parser = clap::value_parser!(u64).range(1..=100), help_heading = "World")]
+    pub seeds: u64,
     /// How settings are given.
     #[command(flatten)]
     pub config: ConfigArgs,

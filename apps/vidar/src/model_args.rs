@@ -108,8 +108,6 @@ pub enum PrecisionArg {
     Auto,
     /// 32 bits.
     F32,
-    /// Three bf16 products per 32-bit product; nearly the accuracy of 32 bits.
-    F32Split,
     /// bf16.
     Bf16,
     /// Weights of 16-bit floats.

@@ -50,7 +50,7 @@ pub struct LogScale {
 /// A point of known metric depth that no track connects to other frames: the surest pixels of multi-view stereo, for example.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct DepthPoint {
-    /// Its number, different for all points of a run.
+    /// Its number, different for all points of a chunk.
     pub number: u32,
     /// Its position in the depth image.
     pub pixel: Pixel,

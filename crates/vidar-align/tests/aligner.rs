@@ -5,13 +5,13 @@
 mod flat;
 
 use flat::*;
-use vidar_align::aligner::RejectionReason;
+use vidar_align::aligner::{DepthPoint, RejectionReason};
 use vidar_align::streaming::chunk_ranges;
 use vidar_align::{Aligner, AlignerConfig, ChunkStatus, CouplingMode, Placement};
 use vidar_core::model::ChunkFrame;
 use vidar_core::{
-    ChunkView, FrameId, FrameImage, GeometryPrediction, Image, LieGroup, RelativeDepth, Se3, Timestamp,
-    umeyama_sim3,
+    ChunkView, FrameId, FrameImage, GeometryPrediction, Image, LieGroup, RelativeDepth, Se3, SparseLandmark,
+    Timestamp, umeyama_sim3,
 };
 
 fn run(mode: CouplingMode, truth: &[Se3], odometry: Option<&[Se3]>, model: Model, seed: u64) -> Placement {
@@ -164,7 +164,13 @@ fn rough_run(step: usize) -> (f64, Placement) {
     rough_run_sharing(step, 0.0)
 }
 
-/// The same with landmarks that have an error in common.
+/// A landmark as a point without a track.
+fn untracked(landmark: SparseLandmark) -> DepthPoint {
+    let SparseLandmark { id, pixel, inverse_depth, inverse_depth_std } = landmark;
+    DepthPoint { number: id.0, pixel, inverse_depth, inverse_depth_std }
+}
+
+/// The same with points that have an error in common, where it is above 0.
 fn rough_run_sharing(step: usize, shared_std: f64) -> (f64, Placement) {
     let truth = laps(36, 0.7);
     let (mut noise, mut points) = (Noise::new(21), Noise::new(22));
@@ -182,7 +188,12 @@ fn rough_run_sharing(step: usize, shared_std: f64) -> (f64, Placement) {
             .collect();
         let of = |i: usize| seen.iter().find(|s| s.0 == i).map_or(Vec::new(), |s| s.1.clone());
         let mut observation = observe(prediction, Some(&truth), of);
-        observation.frames.iter_mut().for_each(|f| f.shared_landmark_std = shared_std);
+        if shared_std > 0.0 {
+            for frame in &mut observation.frames {
+                frame.points = frame.landmarks.drain(..).map(untracked).collect();
+                frame.shared_point_std = shared_std;
+            }
+        }
         aligner.push(observation).unwrap();
     }
     let placement = aligner.finish();

@@ -24,8 +24,6 @@ pub enum Precision {
     Auto,
     /// Everything in `f32`: the reference.
     F32,
-    /// `f32`-like accuracy by the fastest way the processor has.
-    F32Split,
     /// Backbone in bf16 but for its leading blocks, heads in `f32`. A processor that does not multiply bf16 computes it in
     /// `f32`, which is then as fast.
     Bf16,
@@ -35,14 +33,13 @@ pub enum Precision {
 
 impl Precision {
     /// All of them.
-    pub const ALL: [Self; 5] = [Self::Auto, Self::F32, Self::F32Split, Self::Bf16, Self::F16];
+    pub const ALL: [Self; 4] = [Self::Auto, Self::F32, Self::Bf16, Self::F16];
 
     /// The word used in configuration and on the command line.
     pub const fn name(self) -> &'static str {
         match self {
             Self::Auto => "auto",
             Self::F32 => "f32",
-            Self::F32Split => "f32-split",
             Self::Bf16 => "bf16",
             Self::F16 => "f16",
         }
@@ -53,7 +50,6 @@ impl Precision {
         match self {
             Self::Auto | Self::Bf16 if isa.multiplies_bf16() => vidar_nn::Precision::Bf16,
             Self::Auto | Self::Bf16 | Self::F32 => vidar_nn::Precision::F32,
-            Self::F32Split => vidar_nn::Precision::F32Split,
             Self::F16 => vidar_nn::Precision::F16,
         }
     }
@@ -71,7 +67,7 @@ impl FromStr for Precision {
         Self::ALL.into_iter().find(|p| p.name() == word).ok_or_else(|| NnError::UnknownName {
             what: "precision",
             found: word.to_owned(),
-            expected: "auto, f32, f32-split, bf16, f16",
+            expected: "auto, f32, bf16, f16",
         })
     }
 }
@@ -117,7 +113,6 @@ impl Arithmetic {
         let stored = |precision| match precision {
             Precision::Auto | Precision::Bf16 => vidar_nn::Precision::Bf16,
             Precision::F32 => vidar_nn::Precision::F32,
-            Precision::F32Split => vidar_nn::Precision::F32Split,
             Precision::F16 => vidar_nn::Precision::F16,
         };
         let head = head.map_or(vidar_nn::Precision::F32, stored);
@@ -137,7 +132,7 @@ impl Arithmetic {
 }
 
 fn is_exact(precision: vidar_nn::Precision) -> bool {
-    matches!(precision, vidar_nn::Precision::F32 | vidar_nn::Precision::F32Split)
+    precision == vidar_nn::Precision::F32
 }
 
 impl fmt::Display for Arithmetic {

@@ -164,6 +164,12 @@ impl Da3 {
         self.opened.as_ref().map(|device| device.plan(&self.config, size, wants_rays))
     }
 
+    /// The most bytes of device memory held at a time since the network was opened, as counted by its buffers; `None` is the
+    /// CPU.
+    pub fn device_peak_bytes(&self) -> Option<u64> {
+        self.opened.as_ref().map(OpenDevice::peak_bytes)
+    }
+
     /// Kernels, precisions and device as text.
     pub fn describe_compute(&self) -> String {
         match self.device_name() {

@@ -186,6 +186,14 @@ impl OpenDevice {
         match *self {}
     }
 
+    /// The most bytes held in its buffers at a time so far.
+    pub fn peak_bytes(&self) -> u64 {
+        #[cfg(feature = "gpu")]
+        return self.0.peak_bytes();
+        #[cfg(not(feature = "gpu"))]
+        match *self {}
+    }
+
     /// The open device.
     #[cfg(feature = "gpu")]
     pub fn gpu(&self) -> &vidar_gpu::Gpu {

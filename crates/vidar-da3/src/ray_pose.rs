@@ -6,11 +6,11 @@
 //! diagonal holds the inverse focal lengths, its last row the principal point. The camera's place is the weighted mean
 //! of the ray origins. Samples come from a fixed seed; the official code's are unseeded.
 
-use crate::align::pcg64::Pcg64;
 use crate::error::Da3Error;
 use crate::pose::{compose, rigid_inverse};
 use nalgebra::{Matrix3, Matrix4, SMatrix, SVector, Vector3};
 use rayon::prelude::*;
+use vidar_solve::pcg64::Pcg64;
 
 /// Rays of one view on a grid of `rows` × `columns`.
 #[derive(Clone, Debug, PartialEq)]

@@ -1,6 +1,6 @@
 //! Sky: filled with the far end of the depth that is not sky (DA3, metric and monocular networks).
 
-use crate::align::pcg64::Pcg64;
+use vidar_solve::pcg64::Pcg64;
 
 /// Below this the sky head says "not sky".
 pub const SKY_THRESHOLD: f32 = 0.3;

@@ -8,13 +8,14 @@ use common::shared;
 use nalgebra::{Matrix3, Matrix4};
 use std::collections::BTreeMap;
 use vidar_core::Image;
-use vidar_da3::align::{align_cameras, samples};
+use vidar_da3::align::align_cameras;
 use vidar_da3::preprocess::{self, PreprocessConfig, ResizeMethod, normalise};
 use vidar_da3::ray_pose::{RayMap, camera_from_rays, split};
 use vidar_da3::weights::inventory::{is_ignored, parameters};
 use vidar_da3::weights::synthetic::{fnv1a64, image_u8, tensor};
 use vidar_da3::{Variant, pose};
 use vidar_nn::Checkpoint;
+use vidar_solve::ransac_samples;
 
 struct File(Checkpoint);
 
@@ -216,7 +217,7 @@ fn alignment_and_its_samples_are_the_official_ones() {
     let text = std::fs::read_to_string(shared("golden/da3/ransac_samples_seed42.json").unwrap()).unwrap();
     let tables: BTreeMap<usize, Vec<Vec<usize>>> = serde_json::from_str(&text).unwrap();
     assert!(tables.len() > 100);
-    tables.iter().for_each(|(views, table)| assert_eq!(&samples(*views), table, "{views} views"));
+    tables.iter().for_each(|(views, table)| assert_eq!(&ransac_samples(*views), table, "{views} views"));
 }
 
 #[test]

@@ -26,13 +26,12 @@ fn check(file: &str, options: &Da3Options) -> CheckReport {
 #[test]
 fn every_layer_of_the_tiny_networks_holds_with_every_set_of_kernels() {
     for isa in Isa::available() {
-        for precision in [Precision::F32, Precision::F32Split] {
-            for file in FILES {
-                let report = check(file, &Da3Options { isa: Some(isa), precision, ..Da3Options::default() });
-                assert!(report.passed(), "{report}");
-                let most = report.worst().unwrap().ratio();
-                eprintln!("{file} {isa} {precision}: {} rows, worst {most:.1e}", report.rows.len());
-            }
+        for file in FILES {
+            let options = Da3Options { isa: Some(isa), precision: Precision::F32, ..Da3Options::default() };
+            let report = check(file, &options);
+            assert!(report.passed(), "{report}");
+            let most = report.worst().unwrap().ratio();
+            eprintln!("{file} {isa}: {} rows, worst {most:.1e}", report.rows.len());
         }
     }
 }

@@ -5,12 +5,16 @@
 //! cloud's hash tables. Sums are integers, so the result does not depend on how pixels are grouped.
 
 use crate::grid::BlockKey;
-use crate::points::{SHARDS, shard_of};
 use crate::sample::{Sample, SampledView, camera_normal, gradient_step, round_to_i32, slope};
 use crate::simd::dispatch;
 use nalgebra::{Matrix3, Vector3};
 use rayon::prelude::*;
+use rustc_hash::FxBuildHasher;
+use std::hash::BuildHasher;
 use vidar_core::AlignedView;
+
+/// Voxels are distributed over this many tables, which are filled in parallel.
+pub(crate) const SHARDS: usize = 16;
 
 /// The integer that stands for one voxel edge in sums of positions, and for 1 in sums of normals.
 pub(crate) const FRACTION_ONE: f32 = 4096.0;
@@ -234,4 +238,10 @@ impl<'a> Backprojector<'a> {
             pixels[x].terms[6] = 1;
         }
     }
+}
+
+/// The shard that a voxel belongs to.
+fn shard_of(key: &BlockKey) -> usize {
+    // The upper half, because the tables use the lower bits.
+    (FxBuildHasher.hash_one(key) >> 32) as usize % SHARDS
 }

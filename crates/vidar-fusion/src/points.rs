@@ -4,7 +4,7 @@
 //! and any number of threads, except where the memory budget rejected voxels (see [`PointFusion::warnings`]).
 
 use crate::grid::{BlockKey, MAX_VIEWS, check_view, table_bytes};
-use crate::pixels::{FRACTION_ONE, PartialSum, Strips};
+use crate::pixels::{FRACTION_ONE, PartialSum, SHARDS, Strips};
 use crate::sample::{CONFIDENCE_ONE, SampledView};
 use crate::{FusionConfig, FusionError, IntegrationStats};
 use nalgebra::Vector3;
@@ -12,9 +12,6 @@ use rayon::prelude::*;
 use rustc_hash::{FxBuildHasher, FxHashMap};
 use std::hash::BuildHasher;
 use vidar_core::{AlignedView, PointCloud, Warning};
-
-/// Voxels are distributed over this many tables, which are filled in parallel.
-pub(crate) const SHARDS: usize = 16;
 
 /// Sums over the pixels of one voxel. 65535 views of 2³² pixels' weights would be needed to overflow them.
 #[derive(Clone, Debug, Default)]
@@ -186,10 +183,4 @@ fn add_to_shard<'a>(
         }
     }
     (touched, dropped)
-}
-
-/// The shard that a voxel belongs to.
-pub(crate) fn shard_of(key: &BlockKey) -> usize {
-    // The upper half, because the tables use the lower bits.
-    (FxBuildHasher.hash_one(key) >> 32) as usize % SHARDS
 }

@@ -80,12 +80,6 @@ fn linears(c: &Compute, table: &mut Table) {
         let name = format!("linear {rows}x{inner}x{width}");
         table.row(&name, 2 * rows * inner * width, || layer.apply(c, &x, rows, &mut out, end));
     }
-    let norm = LayerNorm::new(weight(&[384]), weight(&[384]), 1e-6).expect("shapes fit");
-    let layer = Linear::new(weight(&[1152, 384]), None).expect("shapes fit");
-    let (x, mut out) = (numbers(973 * 384), vec![0.0; 973 * 1152]);
-    table.row("linear 973x384x1152 normed", 2 * 973 * 384 * 1152, || {
-        layer.apply_normed(c, &norm, &x, 973, &mut out, Epilogue::None);
-    });
 }
 
 fn attentions(c: &Compute, table: &mut Table) {

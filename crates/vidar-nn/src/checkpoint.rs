@@ -13,7 +13,7 @@ use std::sync::Arc;
 use crate::kernels::map::Mapping;
 use crate::weight::Weight;
 
-mod header;
+pub(crate) mod header;
 
 pub use header::Dtype;
 use header::Entry;

@@ -14,10 +14,6 @@ pub enum Precision {
     /// Factors in `f32`.
     #[default]
     F32,
-    /// The accuracy of `f32` by the fastest way that a kernel set has. Splitting each factor into two bf16 numbers takes
-    /// three products, which pays off only where bf16 runs at more than three times the rate of `f32`. AVX-512-BF16 does
-    /// not (1.7 times on Zen 5, `examples/rates.rs`), so every kernel set computes this precision in `f32`.
-    F32Split,
     /// Factors rounded to bf16 where the processor multiplies bf16; elsewhere `f32`, which is then as fast.
     Bf16,
     /// Weights rounded to f16, activations and arithmetic in `f32`.
@@ -26,13 +22,12 @@ pub enum Precision {
 
 impl Precision {
     /// All precisions, most exact first.
-    pub const ALL: [Self; 4] = [Self::F32, Self::F32Split, Self::F16, Self::Bf16];
+    pub const ALL: [Self; 3] = [Self::F32, Self::F16, Self::Bf16];
 
     /// The word used in configuration and on the command line.
     pub const fn name(self) -> &'static str {
         match self {
             Self::F32 => "f32",
-            Self::F32Split => "f32-split",
             Self::Bf16 => "bf16",
             Self::F16 => "f16",
         }
@@ -51,7 +46,7 @@ impl FromStr for Precision {
         Self::ALL.into_iter().find(|p| p.name() == word).ok_or_else(|| NnError::UnknownName {
             what: "precision",
             found: word.to_owned(),
-            expected: "f32, f32-split, f16, bf16",
+            expected: "f32, f16, bf16",
         })
     }
 }

@@ -88,7 +88,7 @@ impl Conv2d {
         let end = epilogue.checked(self.outputs, out.len());
         let source =
             if self.kernel == [1, 1] && self.stride == 1 && self.padding == 0 && input == ConvInput::None {
-                Source::Flat { x: x.data, rows: h * w, inner: self.inputs, norm: None }
+                Source::Flat { x: x.data, rows: h * w, inner: self.inputs }
             } else {
                 let fill = match input {
                     ConvInput::None => Fill::Copy(x.data),
@@ -239,7 +239,7 @@ impl ConvTranspose2d {
         for (ky, kernel_row) in ordered.chunks_exact(width * self.inputs).enumerate() {
             let line = w * width;
             let product = Product {
-                source: Source::Flat { x: x.data, rows: h * w, inner: self.inputs, norm: None },
+                source: Source::Flat { x: x.data, rows: h * w, inner: self.inputs },
                 columns: &DenseColumns { values: kernel_row, inner: self.inputs },
                 width,
                 bias: bias.as_deref(),

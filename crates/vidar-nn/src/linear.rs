@@ -5,7 +5,6 @@ use crate::error::NnError;
 use crate::kernels::gemm::{End, OutLayout, Product};
 use crate::kernels::pack::Columns;
 use crate::kernels::source::Source;
-use crate::norm::LayerNorm;
 use crate::weight::Weight;
 
 /// What is done with a layer's sums before they are stored.
@@ -87,25 +86,7 @@ impl Linear {
     pub fn apply(&self, c: &Compute, x: &[f32], rows: usize, out: &mut [f32], epilogue: Epilogue<'_>) {
         assert_eq!(out.len(), rows * self.outputs, "output of a linear layer");
         let end = epilogue.checked(self.outputs, out.len());
-        self.product(self.flat(x, rows, None), rows, self.outputs, end).run(c, out);
-    }
-
-    /// As [`Linear::apply`] of the layer norm of `x`, which is never stored.
-    ///
-    /// # Panics
-    /// When a slice has another length, or the norm another width.
-    pub fn apply_normed(
-        &self,
-        c: &Compute,
-        norm: &LayerNorm,
-        x: &[f32],
-        rows: usize,
-        out: &mut [f32],
-        epilogue: Epilogue<'_>,
-    ) {
-        assert_eq!(out.len(), rows * self.outputs, "output of a linear layer");
-        let end = epilogue.checked(self.outputs, out.len());
-        self.product(self.flat(x, rows, Some(norm)), rows, self.outputs, end).run(c, out);
+        self.product(self.flat(x, rows), rows, self.outputs, end).run(c, out);
     }
 
     /// The gated unit of SwiGLU: the first half of the layer's outputs gates the second, `out = silu(gate) * value`;
@@ -114,37 +95,14 @@ impl Linear {
     /// # Panics
     /// When a slice has another length, or the number of outputs is odd.
     pub fn apply_swiglu(&self, c: &Compute, x: &[f32], rows: usize, out: &mut [f32]) {
-        self.gated(c, None, x, rows, out);
-    }
-
-    /// As [`Linear::apply_swiglu`] of the layer norm of `x`, which is never stored.
-    ///
-    /// # Panics
-    /// When a slice has another length, the norm another width, or the number of outputs is odd.
-    pub fn apply_swiglu_normed(
-        &self,
-        c: &Compute,
-        norm: &LayerNorm,
-        x: &[f32],
-        rows: usize,
-        out: &mut [f32],
-    ) {
-        self.gated(c, Some(norm), x, rows, out);
-    }
-
-    fn gated(&self, c: &Compute, norm: Option<&LayerNorm>, x: &[f32], rows: usize, out: &mut [f32]) {
         assert_eq!(self.outputs % 2, 0, "a gated unit has an even number of outputs");
         assert_eq!(out.len(), rows * self.outputs / 2, "output of a gated unit");
-        self.product(self.flat(x, rows, norm), rows, self.outputs / 2, End::SwiGlu).run(c, out);
+        self.product(self.flat(x, rows), rows, self.outputs / 2, End::SwiGlu).run(c, out);
     }
 
-    fn flat<'a>(&self, x: &'a [f32], rows: usize, norm: Option<&'a LayerNorm>) -> Source<'a> {
+    fn flat<'a>(&self, x: &'a [f32], rows: usize) -> Source<'a> {
         assert_eq!(x.len(), rows * self.inputs, "input of a linear layer");
-        let norm = norm.map(|norm| {
-            assert_eq!(norm.features(), self.inputs, "norm before a linear layer");
-            norm.view()
-        });
-        Source::Flat { x, rows, inner: self.inputs, norm }
+        Source::Flat { x, rows, inner: self.inputs }
     }
 
     fn product<'a>(&'a self, source: Source<'a>, rows: usize, width: usize, end: End<'a>) -> Product<'a> {

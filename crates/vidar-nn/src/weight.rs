@@ -3,7 +3,7 @@
 use std::ops::Range;
 use std::sync::Arc;
 
-use crate::checkpoint::Dtype;
+use crate::checkpoint::header::Dtype;
 use crate::kernels::map::Mapping;
 
 /// A weight tensor, row-major. Cloning is cheap: the storage is shared.

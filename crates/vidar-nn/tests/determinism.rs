@@ -76,7 +76,9 @@ impl Net {
     fn run(&self, c: &Compute) -> Vec<f32> {
         let tokens = ROWS * COLS;
         let mut qkv = vec![0.0; tokens * 3 * D];
-        self.qkv.apply_normed(c, &self.norm, &self.x, tokens, &mut qkv, Epilogue::None);
+        let mut normed = vec![0.0; self.x.len()];
+        self.norm.apply(c, &self.x, &mut normed);
+        self.qkv.apply(c, &normed, tokens, &mut qkv, Epilogue::None);
         let norms = Some((&self.head_norm, &self.head_norm));
         let spec = AttentionSpec { heads: 2, head_dim: 24, qk_norm: norms, rope: Some(&self.rope) };
         let mut x = vec![0.0; tokens * D];

@@ -15,7 +15,7 @@
 use crate::config::StereoConfig;
 use crate::consistency::Support;
 use crate::estimate::Estimate;
-use crate::register::PoseCorrection;
+use crate::prepare::PoseCorrection;
 
 /// Relative depth error below which a depth counts as correct.
 pub const TOLERANCE_RATIO: f32 = 0.03;

@@ -2,8 +2,16 @@
 
 use crate::config::StereoConfig;
 use crate::error::StereoError;
-use crate::register::PoseCorrection;
 use vidar_core::{ChunkView, FrameId, Image, Pinhole, Se3};
+
+/// Size and residual of a view's pose correction, medians in working pixels.
+#[derive(Clone, Copy, Debug, Default)]
+pub(crate) struct PoseCorrection {
+    /// Shift of the view's matches by the correction.
+    pub shift_px: f32,
+    /// Residual of the matches with the corrected poses.
+    pub residual_px: f32,
+}
 
 /// Fewest rows and columns of a working image: the coarsest level then still contains a few windows.
 pub(crate) const MIN_SIZE_PX: usize = 32;

@@ -11,7 +11,7 @@ mod solve;
 
 use crate::config::StereoConfig;
 use crate::estimate::{PROBE_LEVEL, Probe};
-use crate::prepare::{Level, Prepared};
+use crate::prepare::{Level, PoseCorrection, Prepared};
 use crate::select::select;
 use crate::warp::{Warp, neighbour_from_reference};
 use nalgebra::{Vector2, Vector3};
@@ -49,15 +49,6 @@ pub(crate) struct CorrectedPose {
     pub world_from_camera: Se3,
     /// Size and residual of the correction.
     pub correction: PoseCorrection,
-}
-
-/// Size and residual of a view's pose correction, medians in working pixels.
-#[derive(Clone, Copy, Debug, Default)]
-pub(crate) struct PoseCorrection {
-    /// Shift of the view's matches by the correction.
-    pub shift_px: f32,
-    /// Residual of the matches with the corrected poses.
-    pub residual_px: f32,
 }
 
 /// The views' poses, corrected; the given ones where there are too few matches.

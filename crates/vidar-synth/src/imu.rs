@@ -6,8 +6,8 @@
 use crate::config::SynthConfig;
 use crate::device::ImuTiming;
 use crate::flight::FlightPath;
-use crate::layout::{secs, stamp, stamp_at};
 use crate::random::{Gaussian, Purpose, stream};
+use crate::stamps::{secs, stamp, stamp_at};
 use nalgebra::Vector3;
 use vidar_core::{AngularRate, ImuSample, SpecificForce, Timestamp};
 

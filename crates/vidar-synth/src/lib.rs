@@ -27,6 +27,7 @@ mod schedule;
 mod sequence;
 mod simulation;
 mod staging;
+mod stamps;
 mod truth;
 mod world;
 

@@ -2,8 +2,8 @@
 
 use crate::config::SynthConfig;
 use crate::flight::FlightPath;
-use crate::layout;
 use crate::random::{Gaussian, Purpose, stream};
+use crate::stamps;
 use vidar_core::{Duration, Timestamp};
 
 /// An image that is taken.
@@ -23,14 +23,14 @@ pub(crate) fn shots(config: &SynthConfig, path: &FlightPath) -> Vec<Shot> {
     let mut random = Gaussian::new(stream(config.seed, Purpose::Schedule));
     let mut shots: Vec<Shot> = Vec::with_capacity(count);
     for k in 0..count {
-        let (mut time, mut secs) = layout::stamp(k, config.camera_rate_hz);
+        let (mut time, mut secs) = stamps::stamp(k, config.camera_rate_hz);
         // Each frame draws three numbers, so that one setting does not change what another does.
         let (jitter, drop, repeat) = (random.next(), random.uniform(), random.uniform());
         if device.frame_jitter > 0.0 {
             // Within 0.4 of a period, so that the order stays.
             let periods = (device.frame_jitter * jitter).clamp(-0.4, 0.4);
             let moved = (secs + periods / config.camera_rate_hz).clamp(0.0, path.duration_secs());
-            (time, secs) = layout::stamp_at(moved);
+            (time, secs) = stamps::stamp_at(moved);
         }
         if k > 0 && drop < device.dropped_frames {
             continue;
@@ -62,7 +62,7 @@ mod tests {
         for (a, b) in exact.iter().zip(&late) {
             assert_eq!(a.secs, b.secs);
             assert_eq!((b.stamps[0] - a.stamps[0]).nanos(), 25_000_000);
-            assert_eq!(layout::secs(a.stamps[0]), a.secs);
+            assert_eq!(stamps::secs(a.stamps[0]), a.secs);
         }
     }
 

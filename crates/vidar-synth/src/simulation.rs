@@ -3,7 +3,7 @@
 use crate::config::SynthConfig;
 use crate::error::SynthError;
 use crate::flight::FlightPath;
-use crate::layout;
+use crate::stamps;
 use crate::world::World;
 use std::path::Path;
 use vidar_core::{BodyFrame, Se3, StampedPose, Timestamp, Trajectory};
@@ -65,12 +65,12 @@ impl Simulation {
 
     /// Time of frame `k` on the IMU's clock, at an even frame rate.
     pub fn frame_time(&self, k: usize) -> Timestamp {
-        layout::stamp(k, self.config.camera_rate_hz).0
+        stamps::stamp(k, self.config.camera_rate_hz).0
     }
 
     /// Exact pose of the body (IMU) at a stamp of the sequence; `None` before the first and after the last instant.
     pub fn world_from_body(&self, time: Timestamp) -> Option<Se3> {
-        let secs = layout::secs(time);
+        let secs = stamps::secs(time);
         // A frame's stamp may round past the end by half a nanosecond.
         let within = (-1e-6..=self.path.duration_secs() + 1e-6).contains(&secs);
         within.then(|| self.path.world_from_body(secs))

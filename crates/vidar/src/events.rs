@@ -152,7 +152,10 @@ impl Event {
     pub fn of(event: &MapEvent) -> Option<Self> {
         let finite = |v: f64| Some(v).filter(|v| v.is_finite());
         Some(match event {
-            MapEvent::Step(_) | MapEvent::ViewsFused(_) | MapEvent::Tracked(_) => return None,
+            MapEvent::Step(_)
+            | MapEvent::ChunkObserved { .. }
+            | MapEvent::ViewsFused(_)
+            | MapEvent::Tracked(_) => return None,
             MapEvent::World { source, segment } => Self::World { poses: source.clone(), segment: *segment },
             MapEvent::State(state) => Self::State {
                 frame: state.frame_id,

@@ -32,6 +32,9 @@ pub fn bench(args: &BenchArgs, context: &Context) -> Outcome {
         out: args.output.clone(),
         command: context.command.clone(),
     };
+    if args.ablation {
+        return ablation(&request, args.seeds, context);
+    }
     let outcome = vidar::bench::bench(&request, &progress::events(&context.cli), &context.cancel)?;
     if context.cli.json {
         print::json(&json!({
@@ -42,6 +45,22 @@ pub fn bench(args: &BenchArgs, context: &Context) -> Outcome {
         print::data(&outcome.markdown);
         let report = outcome.folder.join("report.html").display().to_string();
         print::talk(format!("tables, runs and figures: {}", vidar::core::printable(&report)));
+    }
+    Ok(outcome.status)
+}
+
+/// What each measurement brings to each coupling.
+fn ablation(request: &BenchRequest, seeds: u64, context: &Context) -> Outcome {
+    let events = progress::events(&context.cli);
+    let outcome = vidar::bench::ablation::ablation(request, seeds, &events, &context.cancel)?;
+    if context.cli.json {
+        print::json(&json!({
+            "schema": vidar::bench::ablation::ABLATION_SCHEMA, "folder": outcome.folder, "rows": outcome.rows,
+            "exit": outcome.status as i32,
+        }));
+    } else {
+        print::data(&outcome.markdown);
+        print::talk(format!("every case: {}", outcome.folder.join("ablation.json").display()));
     }
     Ok(outcome.status)
 }

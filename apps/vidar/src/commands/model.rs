@@ -245,7 +245,6 @@ pub fn precision(arg: PrecisionArg) -> da3::Precision {
     match arg {
         PrecisionArg::Auto => da3::Precision::Auto,
         PrecisionArg::F32 => da3::Precision::F32,
-        PrecisionArg::F32Split => da3::Precision::F32Split,
         PrecisionArg::Bf16 => da3::Precision::Bf16,
         PrecisionArg::F16 => da3::Precision::F16,
     }

@@ -94,7 +94,7 @@ fn every_coupling_makes_a_map_and_says_what_it_is() {
 #[test]
 fn what_stereo_is_sure_of_straightens_a_small_networks_depth_and_leaves_a_good_ones() {
     let run = |name: &str, source: &str, landmarks: &str| {
-        let landmarks = format!("coupling.stereo_landmarks={landmarks}");
+        let landmarks = format!("coupling.landmarks={landmarks}");
         let (ran, out) = with_geometry(source, name, &["--set", &landmarks, "--set", "eval.mode=auto"]);
         assert!([0, 3].contains(&ran.code), "{}", ran.stderr);
         out
@@ -104,10 +104,10 @@ fn what_stereo_is_sure_of_straightens_a_small_networks_depth_and_leaves_a_good_o
         depth["metric"]["abs_rel"].as_f64().unwrap()
     };
     // Poses are true and come without landmarks.
-    let held = error(&run("small held", "da3-nano", "true"));
-    let free = error(&run("small free", "da3-nano", "false"));
+    let held = error(&run("small held", "da3-nano", "both"));
+    let free = error(&run("small free", "da3-nano", "odometry"));
     assert!(held < 0.8 * free, "{held} {free}");
-    let (held, free) = (run("good held", "simulated", "true"), run("good free", "simulated", "false"));
+    let (held, free) = (run("good held", "simulated", "both"), run("good free", "simulated", "odometry"));
     assert!(mesh(&held) == mesh(&free), "{} {}", error(&held), error(&free));
 }
 
@@ -295,9 +295,11 @@ fn a_revisit_is_found_measured_and_reported() {
     let (sequence_arg, world_arg) = (sequence.to_str().unwrap(), world.to_str().unwrap());
     crate::support::vidar(&["synth", sequence_arg, "--world-config", world_arg, "-q"]).ends_with(0);
     let mut found = Vec::new();
-    for more in
-        [&["--set", "coupling.loop_chunks=true"][..], &[], &["--set", "align.loops.min_similarity=1.0"]]
-    {
+    for more in [
+        &["--set", "coupling.loop_chunks=true"][..],
+        &["--set", "coupling.loops=false"],
+        &["--set", "align.loops.min_similarity=1.0"],
+    ] {
         let out = out(&format!("loops {}", found.len()));
         let settings = [&SHORT[..], more, &["--set", "align.loops.min_similarity=0.7"]].concat();
         let settings = if more.len() == 2 && more[1].contains("similarity") {
@@ -312,6 +314,7 @@ fn a_revisit_is_found_measured_and_reported() {
         found.push((loops.len(), accepted));
     }
     assert!(found[0].1 > 0, "a loop chunk ties the two visits: {found:?}");
+    assert_eq!(found[1], (0, 0), "none was looked for: {found:?}");
     assert_eq!(found[2], (0, 0), "nothing looks exactly alike: {found:?}");
 }
 

@@ -102,7 +102,7 @@ fn sparse_truth() -> String {
 const SETTINGS: &[(&str, &str, ExtraSettings)] = &[
     ("align.max_center_rms_m", "1e-12", Simulated),
     ("coupling.mode", "hybrid", Simulated),
-    ("coupling.stereo_landmarks", "false", Learned),
+    ("coupling.landmarks", "none", Learned),
     ("eval.mode", "auto", Nothing),
     ("eval.surface.crop_margin_m", "0.1", Evaluated),
     ("eval.surface.on_rejection", "refine_rigid", Refused),
@@ -152,6 +152,7 @@ const SETTINGS: &[(&str, &str, ExtraSettings)] = &[
 const ELSEWHERE: &[(&str, &str)] = &[
     ("input.camera", "there is one camera here; faults.rs asks for another"),
     ("output.live_map", "it leaves nothing; coupling.rs watches it grow"),
+    ("coupling.loops", "they need a revisit; coupling.rs has one"),
     ("coupling.loop_chunks", "it needs a revisit; coupling.rs has one"),
     ("coupling.place_recognition", "damage.rs has a run of each"),
     ("coupling.salad_checkpoint", "damage.rs has a small one"),

@@ -16,6 +16,7 @@ mod numbers;
 mod odometry;
 mod photos;
 mod resume;
+mod quality;
 mod support;
 mod trust;
 mod verbs;

@@ -9,7 +9,8 @@ use std::sync::OnceLock;
 const WORLD: &str = "duration_secs = 6.0\ncamera_rate_hz = 20.0\nwidth = 376\nheight = 240\nblur_samples = 1\n\
     exposure_secs = 0.0\nscan_spacing_m = 0.1\n";
 
-fn flight() -> &'static Path {
+/// The rendered flight, without which nothing is tracked.
+pub fn flight() -> &'static Path {
     static FLIGHT: OnceLock<PathBuf> = OnceLock::new();
     FLIGHT.get_or_init(|| {
         let world = shared().root.join("flight.toml");

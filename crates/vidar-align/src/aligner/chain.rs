@@ -2,8 +2,11 @@
 
 use super::chunk::Chunk;
 use super::report::GraphFailure;
+use crate::landmark_scale::LogScale;
 use crate::streaming::{LoopConstraint, PoseGraphConfig, optimise_chain};
+use std::f64::consts::FRAC_PI_2;
 use vidar_core::{LieGroup, Sim3};
+use vidar_solve::statistics::weighted_median;
 
 /// Where a chunk is in its chain.
 #[derive(Clone, Copy, Debug)]
@@ -43,6 +46,27 @@ pub(super) fn chain(chunks: &[Chunk], loops: &[(usize, usize, Sim3)]) -> Chains 
         .map(|(root, reason)| GraphFailure { first_chunk: chunks[root].id, reason })
         .collect();
     Chains { links, failures }
+}
+
+/// ln(metres per unit) of the chain's first chunk, from the landmarks of all its chunks; `None` without landmarks.
+pub(super) fn landmark_scale(chunks: &[Chunk], links: &[Option<Link>], root: usize) -> Option<LogScale> {
+    let members = chunks.iter().zip(links).filter_map(|(c, l)| Some((c, l.filter(|l| l.root == root)?)));
+    let of_root = |(c, link): (&Chunk, Link)| {
+        let z = c.landmark_scale?;
+        Some(LogScale { log_scale: z.log_scale - link.root_from_chunk.scale.ln(), ..z })
+    };
+    let found: Vec<LogScale> = members.filter_map(of_root).collect();
+    let weighted: Vec<(f64, f64)> = found.iter().map(|z| (z.log_scale, z.std.powi(-2))).collect();
+    let log_scale = weighted_median(weighted)?;
+    let sum = |of: fn(&LogScale) -> f64| found.iter().map(of).sum::<f64>();
+    Some(LogScale {
+        log_scale,
+        // The price of a median of normal errors.
+        std: (FRAC_PI_2 / sum(|z| z.std.powi(-2))).sqrt(),
+        effective: sum(|z| z.effective),
+        observations: found.iter().map(|z| z.observations).sum(),
+        shared_std: sum(|z| z.shared_std) / found.len() as f64,
+    })
 }
 
 /// Distributes the loops of one chain over its links. On an error the links stay as they are.

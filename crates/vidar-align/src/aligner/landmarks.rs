@@ -10,7 +10,7 @@ use super::report::RejectionReason;
 use super::view_consistency::{ViewCorrection, enforce_consistency};
 use crate::depth_field::{DepthField, FieldConstraint, fit_depth_field};
 use crate::landmark_scale::{
-    DepthRatio, LandmarkConfig, LogScale, depth_ratios, landmark_scale, point_ratios,
+    DepthRatio, LandmarkConfig, LogScale, RatioSource, depth_ratios, landmark_scale, point_ratios,
 };
 use std::collections::BTreeMap;
 use vidar_core::model::ChunkFrame;
@@ -100,10 +100,13 @@ impl DepthCorrection {
     }
 }
 
-/// σ of the error that the landmarks used share, on average over them.
+/// σ of the error that the landmarks used share, on average over them: those that the odometry tracks share none.
 fn shared_std(ratios: &[DepthRatio], frames: &[FrameObservation]) -> f64 {
-    let of = |r: &DepthRatio| {
-        frames.iter().find(|f| f.frame_id == r.frame_id).map_or(0.0, |f| f.shared_landmark_std)
+    let of = |r: &DepthRatio| match r.source {
+        RatioSource::Landmark(_) => 0.0,
+        RatioSource::Point(_) => {
+            frames.iter().find(|f| f.frame_id == r.frame_id).map_or(0.0, |f| f.shared_point_std)
+        }
     };
     ratios.iter().map(of).sum::<f64>() / ratios.len().max(1) as f64
 }

@@ -30,8 +30,8 @@ pub struct FrameObservation {
     pub landmarks: Vec<SparseLandmark>,
     /// Points of known metric depth that no track connects to other frames.
     pub points: Vec<DepthPoint>,
-    /// σ of an error of ln(depth) that the landmarks and points of all frames share; 0 where errors are independent.
-    pub shared_landmark_std: f64,
+    /// σ of an error of ln(depth) that the points of all frames share; 0 where their errors are independent.
+    pub shared_point_std: f64,
     /// Unit-length place recognition descriptor, if loops are to be found. The same length for all frames of a run.
     pub descriptor: Option<Vec<f32>>,
 }
@@ -45,7 +45,7 @@ impl FrameObservation {
             pose_prior: None,
             landmarks: Vec::new(),
             points: Vec::new(),
-            shared_landmark_std: 0.0,
+            shared_point_std: 0.0,
             descriptor: None,
         }
     }

@@ -1,12 +1,11 @@
 //! One chunk onto its pose priors.
 
 use super::report::RejectionReason;
-use nalgebra::{Matrix3, Vector3};
-use rand::seq::index::sample;
-use rand_chacha::ChaCha8Rng;
-use rand_chacha::rand_core::SeedableRng;
-use vidar_core::{LieGroup, Se3, Sim3, So3, umeyama_sim3};
+use crate::landmark_scale::LogScale;
+use nalgebra::Vector3;
+use vidar_core::{LieGroup, Se3, Sim3, So3};
 use vidar_solve::statistics::median_upper;
+use vidar_solve::{mean_rotation, robust_similarity};
 
 /// A camera in its chunk and in the world of its pose prior.
 #[derive(Clone, Copy, Debug)]
@@ -15,47 +14,15 @@ pub(super) struct CameraPair {
     pub world_from_camera: Se3,
 }
 
-/// From this many views on the model's own API uses RANSAC.
-const RANSAC_FROM: usize = 10;
-const TRIALS: usize = 10;
-
-/// The paper's `UmeyamaScale`, robust as in the model's own API: the similarity from metric centres to predicted ones; from
-/// 10 views on by RANSAC over ten random halves. Its inverse is returned, `world_from_chunk`.
+/// The paper's `UmeyamaScale`: the inverse of the robust similarity from metric centres to predicted ones.
 ///
 /// # Errors
 /// [`RejectionReason::RankDeficient`].
-pub(super) fn robust_umeyama(pairs: &[CameraPair], seed: u64) -> Result<Sim3, RejectionReason> {
+pub(super) fn world_from_chunk(pairs: &[CameraPair]) -> Result<Sim3, RejectionReason> {
     let metric: Vec<Vector3<f64>> = pairs.iter().map(|p| p.world_from_camera.translation).collect();
     let predicted: Vec<Vector3<f64>> = pairs.iter().map(|p| p.chunk_from_camera.translation).collect();
-    let all = umeyama_sim3(&metric, &predicted).map_err(|_| RejectionReason::RankDeficient)?;
-    if pairs.len() < RANSAC_FROM {
-        return Ok(all.inverse());
-    }
-    // The threshold: the median distance from a moved centre to the nearest predicted one, whichever that is.
-    let mut nearest: Vec<f64> = metric
-        .iter()
-        .map(|m| predicted.iter().map(|p| (all.act(m) - p).norm()).fold(f64::INFINITY, f64::min))
-        .collect();
-    let threshold = median_upper(&mut nearest).unwrap_or(0.0);
-    let inliers = |s: &Sim3| -> Vec<usize> {
-        (0..pairs.len()).filter(|&i| (s.act(&metric[i]) - predicted[i]).norm() <= threshold).collect()
-    };
-    let fit = |of: &[usize]| {
-        let (m, p): (Vec<_>, Vec<_>) = of.iter().map(|&i| (metric[i], predicted[i])).unzip();
-        umeyama_sim3(&m, &p).ok()
-    };
-    let mut rng = ChaCha8Rng::seed_from_u64(42 ^ seed.rotate_left(32));
-    let mut best: Vec<usize> = Vec::new();
-    for _ in 0..TRIALS {
-        let mut drawn = sample(&mut rng, pairs.len(), pairs.len().div_ceil(2)).into_vec();
-        drawn.sort_unstable();
-        let Some(tried) = fit(&drawn) else { continue };
-        let agree = inliers(&tried);
-        if agree.len() > best.len() {
-            best = agree;
-        }
-    }
-    Ok(fit(&best).unwrap_or(all).inverse())
+    let fit = robust_similarity(&metric, &predicted).map_err(|_| RejectionReason::RankDeficient)?;
+    Ok(fit.target_from_source.inverse())
 }
 
 /// A chunk's place from rotations and centres together: determined by a single pose prior up to its scale.
@@ -132,20 +99,24 @@ pub(super) fn fit_about_rotations(pairs: &[CameraPair], scale_hint: f64, floor_m
     })
 }
 
-/// The rotation nearest to the sum of rotations; `None` for none, or when they cancel.
-fn mean_rotation(rotations: impl Iterator<Item = So3>) -> Option<So3> {
-    let mut count = 0usize;
-    let sum = rotations.fold(Matrix3::zeros(), |m, r| {
-        count += 1;
-        m + r.matrix()
-    });
-    if count == 0 || !sum.iter().all(|v| v.is_finite()) {
-        return None;
+/// The same place with the scale from centres and landmarks together, by inverse variance.
+pub(super) fn with_landmark_scale(
+    fit: PoseFit,
+    landmarks: Option<LogScale>,
+    pairs: &[CameraPair],
+) -> PoseFit {
+    let Some(landmarks) = landmarks else { return fit };
+    let information = [fit.log_scale_std.powi(-2), landmarks.std.powi(-2)];
+    let sum = information[0] + information[1];
+    let log = (information[0] * fit.world_from_chunk.scale.ln() + information[1] * landmarks.log_scale) / sum;
+    let world_from_chunk = rescaled_about_centers(&fit.world_from_chunk, log.exp(), pairs);
+    let center_rms_m = center_rms(&world_from_chunk, pairs);
+    PoseFit {
+        world_from_chunk,
+        center_rms_m,
+        log_scale_std: sum.powf(-0.5).hypot(landmarks.shared_std),
+        ..fit
     }
-    let svd = sum.svd(true, true);
-    let (u, v) = (svd.u?, svd.v_t?);
-    let sign = Matrix3::from_diagonal(&Vector3::new(1.0, 1.0, (u * v).determinant().signum()));
-    So3::from_matrix(&(u * sign * v))
 }
 
 /// RMS distance of placed centres from their pose priors, m; NaN without pairs.

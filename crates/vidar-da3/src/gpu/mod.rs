@@ -62,7 +62,7 @@ impl Context {
 
 fn storage(precision: vidar_nn::Precision) -> Storage {
     match precision {
-        vidar_nn::Precision::F32 | vidar_nn::Precision::F32Split => Storage::F32,
+        vidar_nn::Precision::F32 => Storage::F32,
         vidar_nn::Precision::Bf16 => Storage::Bf16,
         vidar_nn::Precision::F16 => Storage::F16,
     }

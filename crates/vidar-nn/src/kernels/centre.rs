@@ -7,7 +7,6 @@
 //!
 //! The centre is a mean over some rows at fixed places: it depends on the input only.
 
-use super::norm::norm_row;
 use super::resample::add;
 use super::shared::SharedMut;
 use super::simd::Simd;
@@ -80,13 +79,7 @@ impl Kernel for Centre<'_> {
         out.fill(0.0);
         let mut line = vec![0.0; width];
         match source {
-            Source::Flat { x, norm, .. } => mean(s, x, out, |row, out| match norm {
-                Some(norm) => {
-                    norm_row(s, *norm, row, &mut line);
-                    add(s, out, &line);
-                }
-                None => add(s, out, row),
-            }),
+            Source::Flat { x, .. } => mean(s, x, out, |row, out| add(s, out, row)),
             Source::Bands(bands) => match bands.fill {
                 Fill::Copy(x) => mean(s, x, out, |pixel, out| add(s, out, pixel)),
                 Fill::Relu(x) => mean(s, x, out, |pixel, out| {

@@ -15,11 +15,11 @@ use std::ops::Range;
 use rayon::prelude::*;
 
 use super::centre::{Bias, centre_of};
-use super::pack::{Columns, Inner, Pack};
+use super::pack::{Columns, Pack};
 use super::scratch::{self, Role};
 use super::shared::SharedMut;
 use super::simd::Simd;
-use super::source::{Geometry, Source};
+use super::source::{Geometry, Inner, Source};
 use super::tile::{MAX_ROWS, Multiply, Sums, steps_of, tile_start};
 use super::{Factors, ProductKernel, dispatch_product, math, winograd};
 use crate::compute::{Compute, Precision};

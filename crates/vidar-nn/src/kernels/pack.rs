@@ -7,6 +7,7 @@ use super::gemm::{Shape, ShapeOf};
 use super::scratch::{self, Role};
 use super::shared::SharedMut;
 use super::simd::Simd;
+use super::source::Inner;
 use super::tile::{Multiply, steps_of};
 use super::{Factors, ProductKernel, dispatch_product};
 use crate::compute::Isa;
@@ -15,20 +16,6 @@ use crate::compute::Isa;
 pub(crate) trait Columns: Sync {
     /// Writes column `column` of B (its whole inner dimension, tap after tap) to `out`.
     fn read(&self, column: usize, out: &mut [f32]);
-}
-
-/// The inner dimension: `taps` runs of `group` consecutive numbers.
-#[derive(Debug, Clone, Copy)]
-pub(crate) struct Inner {
-    pub(crate) taps: usize,
-    pub(crate) group: usize,
-}
-
-impl Inner {
-    /// Words of a column: every tap starts with a new one.
-    pub(crate) fn words<M: Multiply>(self) -> usize {
-        self.taps * steps_of::<M>(self.group)
-    }
 }
 
 /// Packs the given columns, a panel's width of them at a time (the last panel is filled up with zeros).

@@ -2,10 +2,22 @@
 
 use std::ops::Range;
 
-use super::norm::{NormRef, norm_row};
-use super::pack::Inner;
 use super::scratch::{self, Scratch};
-use super::tile::Multiply;
+use super::tile::{Multiply, steps_of};
+
+/// The inner dimension: `taps` runs of `group` consecutive numbers.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Inner {
+    pub(crate) taps: usize,
+    pub(crate) group: usize,
+}
+
+impl Inner {
+    /// Words of a column: every tap starts with a new one.
+    pub(crate) fn words<M: Multiply>(self) -> usize {
+        self.taps * steps_of::<M>(self.group)
+    }
+}
 
 /// How rows of A lie in a prepared buffer. Row m starts at `at(m)`, relative to row 0's start.
 pub(crate) struct Geometry {
@@ -28,8 +40,8 @@ impl Geometry {
 /// Where the rows of A come from.
 #[derive(Clone, Copy)]
 pub(crate) enum Source<'a> {
-    /// Rows of a dense matrix, normalised first where a norm is given.
-    Flat { x: &'a [f32], rows: usize, inner: usize, norm: Option<NormRef<'a>> },
+    /// Rows of a dense matrix.
+    Flat { x: &'a [f32], rows: usize, inner: usize },
     /// Pixels of a convolution's output.
     Bands(Bands<'a>),
 }
@@ -108,8 +120,8 @@ impl<'a> Source<'a> {
     pub(crate) fn geometry<M: Multiply>(&self) -> Geometry {
         let inner = self.inner();
         match self {
-            Self::Flat { x, rows, inner: width, norm } => {
-                let row_stride = if norm.is_none() && m_takes_directly::<M>(x, *width) {
+            Self::Flat { x, rows, inner: width } => {
+                let row_stride = if m_takes_directly::<M>(x, *width) {
                     *width
                 } else {
                     // Pairs stay aligned, and rows do not fall into the same cache sets.
@@ -156,31 +168,20 @@ impl<'a> Source<'a> {
     ) -> &'s [M::Number] {
         let rows = self.rows(chunk);
         match self {
-            Self::Flat { x, inner, norm, .. } => {
+            Self::Flat { x, inner, .. } => {
                 let x = &x[rows.start * inner..rows.end * inner];
-                if norm.is_none()
-                    && m_takes_directly::<M>(x, *inner)
+                if m_takes_directly::<M>(x, *inner)
                     && let Some(direct) = M::direct(x)
                 {
                     return direct;
                 }
                 let stride = geometry.row_stride;
                 let numbers = rows.len() * stride + SLACK;
-                let temporary = inner.next_multiple_of(16);
-                let (line, words) = scratch.words(temporary + numbers).split_at_mut(temporary);
-                let line = &mut scratch::as_floats_mut(line)[..*inner];
-                let to = &mut M::numbers(words)[..numbers];
+                let to = &mut M::numbers(scratch.words(numbers))[..numbers];
                 if *inner > 0 {
                     for (x, to) in x.chunks_exact(*inner).zip(to.chunks_exact_mut(stride)) {
                         let (to, rest) = to.split_at_mut(*inner);
                         rest.fill(M::Number::default());
-                        let x = match norm {
-                            Some(norm) => {
-                                norm_row(m.simd(), *norm, x, line);
-                                &*line
-                            }
-                            None => x,
-                        };
                         round(m, x, centre, to);
                     }
                 }

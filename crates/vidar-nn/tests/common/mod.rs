@@ -55,7 +55,6 @@ pub fn error_in_std(a: &[f32], b: &[f64]) -> f64 {
 pub fn bound(precision: Precision) -> f64 {
     match precision {
         Precision::F32 => 3e-6,
-        Precision::F32Split => 3e-5,
         Precision::F16 => 3e-3,
         Precision::Bf16 => 2e-2,
     }

@@ -1,6 +1,7 @@
 //! The bundle adjustment: robust least squares over poses and inverse depths.
 
-use super::{PoseCorrection, Track};
+use super::Track;
+use crate::prepare::PoseCorrection;
 use nalgebra::{DMatrix, DVector, Matrix2x3, Matrix3, Matrix6, SMatrix, Vector2, Vector3};
 use vidar_core::{LieGroup, Pinhole, Se3, So3};
 

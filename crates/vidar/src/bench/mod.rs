@@ -8,6 +8,7 @@
 //! A failed run is a row with its reason; it is counted and excluded from the means. Finished rows are stored: the same
 //! command in the same folder continues where it stopped.
 
+pub mod ablation;
 mod figures;
 mod orderings;
 mod paper;

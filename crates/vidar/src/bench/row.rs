@@ -3,8 +3,9 @@
 use super::{BenchRequest, Sequence, layered_for, open_options};
 use crate::error::{Error, ExitStatus};
 use crate::events::{CancelToken, Events};
+use crate::input::{open_dataset, truth_in_camera};
 use crate::odometry::{OdometryRequest, odometry};
-use crate::run::{RunRequest, run};
+use crate::run::{RunOutcome, RunRequest, run};
 use crate::run_folder::{OutputLocation, pretty};
 use crate::{config::Origin, system};
 use serde::{Deserialize, Serialize, de::DeserializeOwned};
@@ -24,7 +25,7 @@ pub struct BenchRow {
     pub failure: Option<String>,
     /// Whether part of the input is missing in the result.
     pub degraded: bool,
-    /// Poses that the map was made with.
+    /// The keyframes as placed in the map.
     pub trajectory: TrajectoryScores,
     /// F@0.05 of the rigid fit: scale as it is.
     pub f05_rigid: Option<f64>,
@@ -44,6 +45,9 @@ pub struct BenchRow {
     pub seconds: f64,
     /// Largest resident memory of the run, bytes, if the system reports it.
     pub peak_memory_bytes: Option<u64>,
+    /// The most memory of a graphics processor held at a time, bytes; `None` where none was used.
+    #[serde(default)]
+    pub device_peak_bytes: Option<u64>,
     /// Rejections, and loops accepted of those evaluated.
     pub placement: serde_json::Value,
     /// The run folder, relative to the bench's.
@@ -130,10 +134,8 @@ pub(super) fn run_row(
                 scores.iter().find(|s| (s.threshold_m - at).abs() < 1e-9).map(|s| s.f)
             };
             row.degraded = outcome.status == ExitStatus::Degraded;
-            row.trajectory = match outcome.map.uses_ground_truth() && !mode.chains() {
-                true => TrajectoryScores { log_scale: Some(0.0), ..TrajectoryScores::default() },
-                false => evaluation.trajectory.as_ref().map_or_else(Default::default, Into::into),
-            };
+            row.trajectory = keyframes_against_truth(&run_request, &outcome)?;
+            row.device_peak_bytes = outcome.device_peak_bytes;
             if let Some(surface) = &evaluation.surface {
                 (row.f05, row.f10) = (f(&surface.native, 0.05), f(&surface.native, 0.10));
                 (row.f05_rigid, row.f10_rigid) = (f(&surface.rigid, 0.05), f(&surface.rigid, 0.10));
@@ -149,6 +151,17 @@ pub(super) fn run_row(
     row.peak_memory_bytes = system::peak_memory_bytes();
     store(&place, &key, &row)?;
     Ok(row)
+}
+
+/// The map's keyframes against ground truth, for every coupling alike: where poses are given, they are measured, too.
+fn keyframes_against_truth(request: &RunRequest, outcome: &RunOutcome) -> Result<TrajectoryScores, Error> {
+    let config = request.layered.build()?;
+    let dataset = open_dataset(&request.path, &request.open, &config)?;
+    let (Some(estimate), Some(truth)) = (outcome.map.keyframe_trajectory(), truth_in_camera(&dataset)) else {
+        return Ok(TrajectoryScores::default());
+    };
+    let report = vidar_eval::evaluate_trajectory(&estimate, &truth, &config.eval.trajectory);
+    Ok(report.as_ref().map_or_else(|_| TrajectoryScores::default(), Into::into))
 }
 
 /// Runs the odometry alone on one sequence, or reads the stored row.
@@ -201,12 +214,12 @@ pub(super) fn odometry_row(
 }
 
 /// Errors that would occur in every other run, too: a wrong setting, a full disk, a missing model, Ctrl-C.
-fn affects_all_runs(error: &Error) -> bool {
+pub(super) fn affects_all_runs(error: &Error) -> bool {
     matches!(error.exit_status(), ExitStatus::Usage | ExitStatus::ResourceMissing | ExitStatus::Interrupted)
 }
 
 /// Hash of the inputs of a row.
-fn key(sequence: &Sequence, settings: &str) -> Result<String, Error> {
+pub(super) fn key(sequence: &Sequence, settings: &str) -> Result<String, Error> {
     let mut hash = Sha256::new();
     // A rendered sequence has a file with its world; a recorded one has not.
     let world = std::fs::read_to_string(sequence.path.join("synth.toml")).unwrap_or_default();
@@ -226,7 +239,7 @@ struct StoredRow<T> {
     row: T,
 }
 
-fn stored<T: DeserializeOwned>(place: &Path, key: &str) -> Result<Option<T>, Error> {
+pub(super) fn stored<T: DeserializeOwned>(place: &Path, key: &str) -> Result<Option<T>, Error> {
     let path = place.join("row.json");
     let bytes = match std::fs::read(&path) {
         Ok(bytes) => bytes,
@@ -238,7 +251,7 @@ fn stored<T: DeserializeOwned>(place: &Path, key: &str) -> Result<Option<T>, Err
     Ok(stored.filter(|k| k.key == key).map(|k| k.row))
 }
 
-fn store<T: Serialize>(place: &Path, key: &str, row: &T) -> Result<(), Error> {
+pub(super) fn store<T: Serialize>(place: &Path, key: &str, row: &T) -> Result<(), Error> {
     std::fs::create_dir_all(place).map_err(|e| Error::io("create", place, e))?;
     let stored = StoredRow { key: key.to_owned(), row };
     Ok(vidar_export::atomic::write_file_atomically(&place.join("row.json"), &pretty(&stored))?)

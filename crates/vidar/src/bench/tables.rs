@@ -167,7 +167,7 @@ impl Table<'_> {
             add(format!("map, {mode}"), of, p.map(|p| (p.1, p.2, p.3)));
         }
         Grid {
-            caption: "Table I: trajectories, Sim(3)-aligned RMSE".into(),
+            caption: "Table I: trajectories, Sim(3)-aligned RMSE (odometry: every image with a pose; map: its keyframes)".into(),
             columns: ["Method", "Valid", "Mean, m", "Median, m"].map(String::from).to_vec(),
             rows,
         }
@@ -251,7 +251,7 @@ impl Table<'_> {
         });
         let rows = std::iter::once(rigid).chain(rows);
         Grid {
-            caption: "Table III: how metric the result is".into(),
+            caption: "Table III: how metric the result is (keyframes as placed in the map against ground truth; F of the map of the same keyframes)".into(),
             columns: std::iter::once("Metric".to_owned())
                 .chain(self.modes().map(|m| m.to_string()))
                 .collect(),
@@ -269,12 +269,13 @@ impl Table<'_> {
                 .collect();
             let per: Vec<f64> = of.iter().map(|r| r.seconds / r.keyframes as f64).collect();
             let peak = of.iter().filter_map(|r| r.peak_memory_bytes).max();
+            let device = of.iter().filter_map(|r| r.device_peak_bytes).max();
             vec![
                 mode.to_string(),
                 of.iter().map(|r| r.keyframes).sum::<usize>().to_string(),
                 number(median(&per), 3),
                 peak.map_or_else(|| "–".into(), crate::run::bytes),
-                "not used".to_owned(),
+                device.map_or_else(|| "none used".into(), crate::run::bytes),
             ]
         };
         Grid {
@@ -284,7 +285,7 @@ impl Table<'_> {
                 "Keyframes",
                 "Seconds per keyframe, median",
                 "CPU memory, peak",
-                "GPU memory",
+                "GPU memory, peak",
             ]
             .map(String::from)
             .to_vec(),
@@ -334,13 +335,7 @@ pub(super) fn mean(values: &[f64]) -> Option<f64> {
 }
 
 fn median(values: &[f64]) -> Option<f64> {
-    let mut sorted = values.to_vec();
-    sorted.sort_unstable_by(f64::total_cmp);
-    let n = sorted.len();
-    match n {
-        0 => None,
-        _ => Some(0.5 * (sorted[(n - 1) / 2] + sorted[n / 2])),
-    }
+    vidar_solve::statistics::median(&mut values.to_vec())
 }
 
 /// Standard deviation over sequences (of the sample).

@@ -107,9 +107,12 @@ pub struct CouplingConfig {
     /// Predict both ends of a loop together, as DA3-Streaming does: one more prediction per loop. Otherwise the stored
     /// predictions of the two chunks are compared.
     pub loop_chunks: bool,
-    /// Add reliable stereo points of the same images to the odometry's landmarks as depth constraints, where network and
-    /// stereo differ by more than the stereo error (`coupled` only). Takes a tenth of a second of CPU time per keyframe.
-    pub stereo_landmarks: bool,
+    /// Landmarks that give chunks their scale and correct their depth: `odometry`, `stereo` (reliable stereo points of the
+    /// same images, where network and stereo differ by more than the stereo error; a tenth of a second of CPU time per
+    /// keyframe), `both`, `none`, or `auto`: both in `coupled`, none in the paper's couplings.
+    pub landmarks: LandmarkSources,
+    /// Look for loops and close them. Couplings that place each chunk by its poses alone have none.
+    pub loops: bool,
     /// Place recognition descriptor: `salad` (needs `coupling.salad_checkpoint`), `model` (tokens of the geometry network, at
     /// no extra cost), `image` (recognises the same view, not the same place from another side), or `auto`, the first of
     /// these that is available.
@@ -123,12 +126,42 @@ impl Default for CouplingConfig {
     fn default() -> Self {
         Self {
             mode: vidar_align::CouplingMode::default(),
-            stereo_landmarks: true,
+            landmarks: LandmarkSources::Auto,
+            loops: true,
             loop_chunks: false,
             place_recognition: PlaceRecognitionConfig::Auto,
             salad_checkpoint: String::new(),
         }
     }
+}
+
+impl CouplingConfig {
+    /// Whether a source of landmarks takes part.
+    pub fn uses_landmarks(&self, source: LandmarkSources) -> bool {
+        let chosen = match (self.landmarks, self.mode) {
+            (LandmarkSources::Auto, vidar_align::CouplingMode::Coupled) => LandmarkSources::Both,
+            (LandmarkSources::Auto, _) => LandmarkSources::None,
+            (chosen, _) => chosen,
+        };
+        chosen == source || chosen == LandmarkSources::Both
+    }
+}
+
+/// Where landmarks come from.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "kebab-case")]
+pub enum LandmarkSources {
+    /// Both in `coupled`, none in the paper's couplings.
+    #[default]
+    Auto,
+    /// No landmarks.
+    None,
+    /// Points that the odometry tracks.
+    Odometry,
+    /// The surest points of multi-view stereo.
+    Stereo,
+    /// Odometry and stereo.
+    Both,
 }
 
 /// Place recognition descriptor.

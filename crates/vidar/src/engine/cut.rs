@@ -1,6 +1,5 @@
 //! Which keyframes form a chunk, decided as soon as later keyframes can no longer change it.
 
-use super::select::prescribed_frames;
 use crate::error::Error;
 use vidar_align::chunking::{ChunkSpan, chunks_with_context, divide_overlaps, overlapping_chunks};
 use vidar_core::FrameId;
@@ -107,6 +106,14 @@ impl ChunkRule {
             Self::Overlapping { .. } | Self::WithContext { .. } => None,
         }
     }
+}
+
+/// Frames of the chunks that a recording prescribes, each once, ascending.
+fn prescribed_frames(chunks: &[Vec<FrameId>]) -> Vec<FrameId> {
+    let mut frames: Vec<FrameId> = chunks.iter().flatten().copied().collect();
+    frames.sort_unstable();
+    frames.dedup();
+    frames
 }
 
 #[cfg(test)]

@@ -4,7 +4,7 @@ use crate::input::TrajectorySource;
 use crate::quality::TrackQuality;
 use std::sync::Arc;
 use vidar_align::Placement;
-use vidar_align::aligner::{ChunkReport, LoopReport};
+use vidar_align::aligner::{ChunkReport, FrameObservation, LoopReport};
 use vidar_core::{
     AlignedView, CameraId, ChunkId, FrameId, OdometryKeyframe, PointCloud, RevisedPose, Se3, Timestamp,
     TriangleMesh, Warning,
@@ -116,6 +116,13 @@ pub enum MapEvent {
         with_depth: usize,
         /// Whether an earlier run had predicted it.
         is_reused: bool,
+    },
+    /// What is known of a chunk's frames besides its prediction: the aligner's input.
+    ChunkObserved {
+        /// Which chunk.
+        chunk: ChunkId,
+        /// Pose priors, landmarks and descriptors.
+        frames: Vec<FrameObservation>,
     },
     /// A chunk was aligned.
     ChunkPlaced(ChunkReport),

@@ -17,7 +17,7 @@ mod events;
 mod fuse;
 mod growing;
 mod observe;
-mod placed;
+pub(crate) mod placed;
 mod predict;
 mod select;
 mod setup;
@@ -35,19 +35,19 @@ pub use setup::{
 pub use track::{GivenPoses, OdometryPoses, PoseReport, PoseSource, PosedFrame};
 
 use crate::chunks::StoredChunk;
-use crate::config::Config;
+use crate::config::{Config, LandmarkSources};
 use crate::error::Error;
 use crate::input::TrajectorySource;
 use fuse::SurfaceFusion;
 use growing::GrowingSurface;
-use observe::Observer;
+use observe::{LandmarkUse, Observer};
 use placed::placed_views;
 use predict::Predictor;
 use std::sync::Arc;
 use stereo_landmarks::StereoLandmarks;
 use track::Track;
 use vidar_align::chunking::ChunkSpan;
-use vidar_align::{Aligner, CouplingMode, Placement};
+use vidar_align::{Aligner, Placement};
 use vidar_core::{CameraId, ChunkId, Duration, FrameId, SensorEvent, Warning};
 use vidar_fusion::FusionConfig;
 
@@ -105,8 +105,9 @@ impl<'a> Engine<'a> {
             (&setup.camera, &setup.view),
             setup.cancelled,
         );
-        let is_fitted = config.coupling.mode == CouplingMode::Coupled && setup.poses.is_some() && overlaps;
-        if is_fitted && config.coupling.stereo_landmarks {
+        // Chunks without overlaps are stereo's: their unit is that of the poses already.
+        let is_fitted = setup.poses.is_some() && overlaps;
+        if is_fitted && config.coupling.uses_landmarks(LandmarkSources::Stereo) {
             predictor.stereo_landmarks = Some(StereoLandmarks::new(config)?);
         }
         Ok(Self {
@@ -120,7 +121,7 @@ impl<'a> Engine<'a> {
             images: 0,
             candidates: Vec::new(),
             rule,
-            observer: Observer::new(&setup.camera, setup.view, overlaps),
+            observer: Observer::new(&setup.camera, setup.view, LandmarkUse::new(&config.coupling, overlaps)),
             predictor,
             world: None,
             growing: config.output.live_map.then(|| GrowingSurface::new(config)).transpose()?,
@@ -297,8 +298,8 @@ impl<'a> Engine<'a> {
         if self.predictor.places.is_whitened() {
             aligner = aligner.with_whitened_descriptors();
         }
-        // Landmarks matter where chunks have a scale of their own that is to be estimated.
-        let prefers_odometry = mode == CouplingMode::Coupled && self.predictor.geometry.overlaps();
+        // Landmarks matter where chunks have a scale of their own. All couplings get the same keyframes, used or not.
+        let prefers_odometry = self.predictor.geometry.overlaps();
         self.world = Some(World {
             segment,
             odometry_taken: 0,
@@ -361,11 +362,11 @@ impl<'a> Engine<'a> {
             None => {
                 let descriptors = self.predictor.places.descriptors(&stored);
                 let keyframes = &world.keyframes;
-                let first = self.observer.first_free_landmark(&keyframes[chunk.seen.clone()]);
                 let prediction = stored.prediction;
-                let by_stereo = self.predictor.landmarks(chunk, keyframes, &prediction, first, &mut events);
+                let by_stereo = self.predictor.landmarks(chunk, keyframes, &prediction, &mut events);
                 let observation =
                     self.observer.observe(keyframes, chunk, prediction, &descriptors, &by_stereo);
+                events.push(MapEvent::ChunkObserved { chunk: id, frames: observation.frames.clone() });
                 let report = world.aligner.push(observation)?;
                 if !report.status.is_usable() {
                     let mut message = format!("not placed: {}", report.status.description());
@@ -380,7 +381,11 @@ impl<'a> Engine<'a> {
             }
         }
         let predicts_loops = self.predictor.geometry.predicts_any_views() && self.config.coupling.loop_chunks;
-        for candidate in world.aligner.loop_candidates() {
+        let candidates = match self.config.coupling.loops {
+            true => world.aligner.loop_candidates(),
+            false => Vec::new(),
+        };
+        for candidate in candidates {
             let together = match predicts_loops {
                 true => self.predictor.predict_loop(&candidate, &world.keyframes, &mut events)?,
                 false => None,

@@ -3,8 +3,10 @@
 
 use super::events::MapKeyframe;
 use super::stereo_landmarks;
+use crate::config::{CouplingConfig, LandmarkSources};
 use std::collections::BTreeMap;
 use std::sync::Arc;
+use vidar_align::aligner::DepthPoint;
 use vidar_align::chunking::ChunkSpan;
 use vidar_align::covariance::{chained_covariance, covariance_in_camera};
 use vidar_align::landmark_transfer::{LandmarkSource, LandmarkTransfer};
@@ -17,26 +19,47 @@ use vidar_core::{
 /// Landmarks are transferred from keyframes at most this many frames away.
 pub const MAX_STEPS: usize = 10;
 
+/// What becomes of the odometry's landmarks.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum LandmarkUse {
+    /// They are not used.
+    None,
+    /// Keyframes of the odometry have them.
+    AtKeyframes,
+    /// Frames between two of the odometry's keyframes get those that both observe, too. A network's depth is corrected in
+    /// every view; stereo is better than landmarks transferred between keyframes.
+    Transferred,
+}
+
+impl LandmarkUse {
+    /// As configured; `overlaps` tells whether chunks have a scale of their own.
+    pub fn new(config: &CouplingConfig, overlaps: bool) -> Self {
+        match (config.uses_landmarks(LandmarkSources::Odometry), overlaps) {
+            (false, _) => Self::None,
+            (true, false) => Self::AtKeyframes,
+            (true, true) => Self::Transferred,
+        }
+    }
+}
+
 /// Observes the frames of chunks.
 pub struct Observer {
     camera: CameraModel,
     view: Pinhole,
     body_from_camera: Se3,
-    /// Whether frames between two of the odometry's keyframes get the landmarks that both observe. A network's depth is
-    /// corrected in every view; stereo is better than landmarks transferred between keyframes.
-    transfers_landmarks: bool,
+    landmarks: LandmarkUse,
     /// The odometry's keyframes: the chain of covariances runs through those that were not selected, too.
     odometry: BTreeMap<KeyframeId, Arc<OdometryKeyframe>>,
 }
 
 impl Observer {
     /// Landmarks are projected from the camera to the undistorted `view`.
-    pub fn new(camera: &RigCamera, view: Pinhole, transfers_landmarks: bool) -> Self {
+    pub fn new(camera: &RigCamera, view: Pinhole, landmarks: LandmarkUse) -> Self {
         Self {
             camera: camera.model.clone(),
             view,
             body_from_camera: camera.body_from_camera,
-            transfers_landmarks,
+            landmarks,
             odometry: BTreeMap::new(),
         }
     }
@@ -61,16 +84,10 @@ impl Observer {
     /// Whether the landmarks of the frames before `end` no longer depend on keyframes that are still to come.
     pub fn is_decided(&self, keyframes: &[MapKeyframe], end: usize) -> bool {
         let mut later = keyframes[end.min(keyframes.len())..].iter().take(MAX_STEPS);
-        !self.transfers_landmarks
+        self.landmarks != LandmarkUse::Transferred
             || self.odometry.is_empty()
             || keyframes.len() >= end + MAX_STEPS
             || later.any(|k| k.odometry.is_some())
-    }
-
-    /// The first number that no landmark of the odometry has in a chunk.
-    pub fn first_free_landmark(&self, keyframes: &[MapKeyframe]) -> u32 {
-        let ids = keyframes.iter().filter_map(|k| k.odometry.as_ref()).flat_map(|k| &k.landmarks);
-        ids.map(|l| l.id.0.saturating_add(1)).max().unwrap_or(0)
     }
 
     /// A chunk's prediction with all that is known of its frames besides.
@@ -80,16 +97,13 @@ impl Observer {
         chunk: &ChunkSpan,
         prediction: GeometryPrediction,
         descriptors: &[Vec<f32>],
-        by_stereo: &BTreeMap<FrameId, Vec<SparseLandmark>>,
+        by_stereo: &BTreeMap<FrameId, Vec<DepthPoint>>,
     ) -> ChunkObservation {
         let observe = |k: usize| {
             let view = prediction.views.iter().position(|v| v.frame_id == keyframes[k].stamp.frame_id);
             let mut frame = self.frame(keyframes, k, view.map(|v| prediction.views[v].intrinsics));
-            if let Some(by_stereo) = by_stereo.get(&frame.frame_id).filter(|l| !l.is_empty()) {
-                frame.landmarks.extend(by_stereo);
-                let share = by_stereo.len() as f64 / frame.landmarks.len() as f64;
-                frame.shared_landmark_std = share * stereo_landmarks::SHARED_STD;
-            }
+            frame.points = by_stereo.get(&frame.frame_id).cloned().unwrap_or_default();
+            frame.shared_point_std = stereo_landmarks::SHARED_STD;
             frame.descriptor = view.and_then(|v| descriptors.get(v)).filter(|d| !d.is_empty()).cloned();
             frame
         };
@@ -106,7 +120,7 @@ impl Observer {
         let mut frame = FrameObservation::new(keyframe.stamp.frame_id, keyframe.stamp.time);
         let Some(pose) = keyframe.world_from_camera else { return frame };
         let Some(odometry) = &keyframe.odometry else {
-            if let (true, Some(depth)) = (self.transfers_landmarks, depth) {
+            if let (LandmarkUse::Transferred, Some(depth)) = (self.landmarks, depth) {
                 frame.landmarks = self.transferred(keyframes, k, &pose, &self.transfer(&depth));
             }
             return frame.with_pose_prior(PosePrior::new(pose));
@@ -120,7 +134,7 @@ impl Observer {
                 chained_covariance(odometry, before.id, |id| self.odometry.get(&id).map(Arc::as_ref))
             })
             .map(|covariance| covariance_in_camera(&covariance, &self.body_from_camera));
-        if let Some(depth) = depth {
+        if let Some(depth) = depth.filter(|_| self.landmarks != LandmarkUse::None) {
             frame.landmarks = self.transfer(&depth).undistorted(&odometry.landmarks);
         }
         frame.with_pose_prior(prior)

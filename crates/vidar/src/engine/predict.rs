@@ -11,13 +11,12 @@ use crate::error::Error;
 use rayon::prelude::*;
 use std::collections::BTreeMap;
 use std::ops::Range;
-use vidar_align::aligner::LoopCandidate;
+use vidar_align::aligner::{DepthPoint, LoopCandidate};
 use vidar_align::chunking::ChunkSpan;
 use vidar_align::color_at_size;
 use vidar_core::model::ChunkFrame;
 use vidar_core::{
-    ChunkId, ChunkView, ChunkViews, FrameId, GeometryPrediction, ModelError, RigCamera, SparseLandmark,
-    ViewGeometry, Warning,
+    ChunkId, ChunkView, ChunkViews, FrameId, GeometryPrediction, ModelError, RigCamera, ViewGeometry, Warning,
 };
 
 /// The geometry model with all that it works on.
@@ -126,13 +125,12 @@ impl<'a> Predictor<'a> {
         span: &ChunkSpan,
         keyframes: &[MapKeyframe],
         prediction: &GeometryPrediction,
-        first_number: u32,
         events: &mut Vec<MapEvent>,
-    ) -> BTreeMap<FrameId, Vec<SparseLandmark>> {
+    ) -> BTreeMap<FrameId, Vec<DepthPoint>> {
         let Some(stereo) = &self.stereo_landmarks else { return BTreeMap::new() };
         self.window.advance(keyframes, &span.seen, events);
         let (views, _, indices) = self.window.take(&span.seen);
-        let landmarks = stereo.find(prediction, &views, first_number, self.cancelled);
+        let landmarks = stereo.find(prediction, &views, self.cancelled);
         self.window.put_back(views, indices);
         landmarks.unwrap_or_else(|error| {
             let place = PredictionId::Chunk(prediction.chunk_id);

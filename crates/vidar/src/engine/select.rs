@@ -88,14 +88,6 @@ impl Selection {
     }
 }
 
-/// Frames of the chunks that a recording prescribes, each once, ascending.
-pub fn prescribed_frames(chunks: &[Vec<FrameId>]) -> Vec<FrameId> {
-    let mut frames: Vec<FrameId> = chunks.iter().flatten().copied().collect();
-    frames.sort_unstable();
-    frames.dedup();
-    frames
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;

@@ -1,4 +1,4 @@
-//! Landmarks by stereo: the points of a chunk's images whose depth multi-view stereo measures with the highest confidence.
+//! Stereo landmarks: the points of a chunk's images whose depth multi-view stereo measures with the highest confidence.
 //!
 //! The odometry tracks few points, and a given trajectory comes with none. A network's depth, off by a factor that varies
 //! slowly over each image, can be fitted to these points as well, as long as its error is larger than stereo's.
@@ -6,13 +6,12 @@
 use crate::config::Config;
 use crate::error::Error;
 use std::collections::BTreeMap;
-use vidar_align::landmark_scale::{LandmarkConfig, depth_ratios};
+use vidar_align::landmark_scale::{DepthPoint, LandmarkConfig, point_ratios};
 use vidar_align::landmark_transfer::pixel_at_size;
 use vidar_core::camera::Pixel;
 use vidar_core::model::ChunkFrame;
-use vidar_core::{
-    ChunkView, ChunkViews, FrameId, GeometryPrediction, LandmarkId, SparseLandmark, ViewGeometry,
-};
+use vidar_core::{ChunkView, ChunkViews, FrameId, GeometryPrediction, ViewGeometry};
+use vidar_solve::statistics::median_upper;
 use vidar_stereo::{StereoConfig, StereoError, StereoModel, TOLERANCE_RATIO};
 
 /// Blocks across and down that the image is cut into; each gives one landmark at most.
@@ -44,15 +43,13 @@ impl StereoLandmarks {
         Ok(Self { stereo: StereoModel::new(quick)?, config: config.align.landmarks.clone() })
     }
 
-    /// Landmarks of those of a prediction's `views` that have a pose, at the pixels of its depth, numbered from
-    /// `first_number`. Empty where the camera hardly moved, or where stereo and the prediction agree.
+    /// Landmarks of those of a prediction's `views` that have a pose, at the pixels of its depth. Empty where the camera hardly moved, or where stereo and the prediction agree.
     pub fn find(
         &self,
         prediction: &GeometryPrediction,
         views: &[ChunkView],
-        first_number: u32,
         cancelled: &(dyn Fn() -> bool + Sync),
-    ) -> Result<BTreeMap<FrameId, Vec<SparseLandmark>>, StereoError> {
+    ) -> Result<BTreeMap<FrameId, Vec<DepthPoint>>, StereoError> {
         let views: Vec<ChunkView> = views.iter().filter(|v| v.world_from_camera.is_some()).cloned().collect();
         let references: Vec<usize> = (0..views.len()).collect();
         let views = ChunkViews { id: prediction.chunk_id, views };
@@ -63,12 +60,12 @@ impl StereoLandmarks {
             ) => return Ok(BTreeMap::new()),
             Err(error) => return Err(error),
         };
-        let mut numbers = first_number..;
+        let mut numbers = 0..;
         let landmarks_of = |view: &ViewGeometry| {
             let stereo = by_stereo.iter().find(|s| s.frame_id == view.frame_id)?;
-            let moved = |l: SparseLandmark| {
+            let moved = |l: DepthPoint| {
                 let pixel = pixel_at_size(&l.pixel, &stereo.intrinsics, &view.intrinsics)?;
-                Some(SparseLandmark { pixel, ..l })
+                Some(DepthPoint { pixel, ..l })
             };
             let points = most_confident(stereo, &mut numbers);
             Some((view.frame_id, points.into_iter().filter_map(moved).collect()))
@@ -81,27 +78,22 @@ impl StereoLandmarks {
     fn contradicts(
         &self,
         prediction: &GeometryPrediction,
-        landmarks: &BTreeMap<FrameId, Vec<SparseLandmark>>,
+        landmarks: &BTreeMap<FrameId, Vec<DepthPoint>>,
     ) -> bool {
         let of = |v: &ViewGeometry| {
-            landmarks.get(&v.frame_id).map_or(Vec::new(), |l| depth_ratios(v, l, &self.config))
+            landmarks.get(&v.frame_id).map_or(Vec::new(), |l| point_ratios(v, l, &self.config))
         };
         let logs: Vec<f64> = prediction.views.iter().flat_map(of).map(|r| r.log_ratio).collect();
         // The unit of a chunk in a frame of its own is free.
-        let unit = if prediction.frame == ChunkFrame::ModelNative { median(&logs) } else { Some(0.0) };
-        let off = |unit: f64| median(&logs.iter().map(|l| (l - unit).abs()).collect::<Vec<_>>());
+        let is_free = prediction.frame == ChunkFrame::ModelNative;
+        let unit = if is_free { median_upper(&mut logs.clone()) } else { Some(0.0) };
+        let off = |unit: f64| median_upper(&mut logs.iter().map(|l| (l - unit).abs()).collect::<Vec<_>>());
         unit.and_then(off).is_some_and(|off| off > CONTRADICTS)
     }
 }
 
-fn median(values: &[f64]) -> Option<f64> {
-    let mut sorted = values.to_vec();
-    sorted.sort_by(f64::total_cmp);
-    sorted.get(sorted.len() / 2).copied()
-}
-
 /// The pixel of each block whose depth is most confident. No point is followed from view to view: each has its own number.
-fn most_confident(view: &ViewGeometry, numbers: &mut impl Iterator<Item = u32>) -> Vec<SparseLandmark> {
+fn most_confident(view: &ViewGeometry, numbers: &mut impl Iterator<Item = u32>) -> Vec<DepthPoint> {
     let (depth, confidence) = (view.depth.image(), view.confidence.image());
     let (width, height) = (depth.width(), depth.height());
     let within =
@@ -115,8 +107,8 @@ fn most_confident(view: &ViewGeometry, numbers: &mut impl Iterator<Item = u32>) 
     };
     let landmark = |((x, y), number): ((usize, usize), u32)| {
         let inverse_depth = 1.0 / f64::from(depth[(x, y)]);
-        SparseLandmark {
-            id: LandmarkId(number),
+        DepthPoint {
+            number,
             pixel: Pixel::new(x as f64, y as f64),
             inverse_depth,
             inverse_depth_std: f64::from(TOLERANCE_RATIO) * inverse_depth,
@@ -159,8 +151,8 @@ mod tests {
             assert!((landmark.inverse_depth - 0.5).abs() < 1e-12);
             assert!((landmark.inverse_depth_std - 0.015).abs() < 1e-9);
         }
-        let ids: std::collections::BTreeSet<_> = landmarks.iter().map(|l| l.id).collect();
-        assert_eq!(ids.len(), landmarks.len());
+        let numbers: std::collections::BTreeSet<_> = landmarks.iter().map(|l| l.number).collect();
+        assert_eq!(numbers.len(), landmarks.len());
     }
 
     /// A wall that a network sees 10 % too far contradicts landmarks in metres, not those of a chunk whose unit is free; one

@@ -8,7 +8,7 @@ mod place_recognition;
 mod plan;
 mod readers;
 mod record;
-mod reference;
+pub(crate) mod reference;
 mod source;
 mod store;
 mod summary;
@@ -16,6 +16,7 @@ mod trust;
 mod views;
 
 pub use evaluate::{DepthScore, Evaluation};
+pub(crate) use evaluate::{placement_start, sampled};
 pub use map::MetricMap;
 pub use outputs::pose_of;
 pub use plan::{ExpectedWork, Plan, bytes};
@@ -74,6 +75,8 @@ pub struct RunOutcome {
     pub verdict: Verdict,
     /// Every warning, in order.
     pub warnings: Vec<Warning>,
+    /// The most memory of a graphics processor held at a time, bytes; `None` where none was used.
+    pub device_peak_bytes: Option<u64>,
     /// Wall time, s.
     pub seconds: f64,
 }
@@ -200,6 +203,7 @@ impl Context<'_> {
             scale,
             verdict,
             warnings,
+            device_peak_bytes: source.device_peak_bytes(),
             seconds: 0.0,
         };
         events.stage("write", 0, || outputs::write(&outcome, config, request, folder, events))?;
@@ -286,7 +290,7 @@ fn unreadable(dataset: &Dataset, stamp: FrameStamp, error: &DatasetError) -> War
     entry.map_or(warning.clone(), |entry| warning.at(entry.path.display()))
 }
 
-fn camera_on_rig(dataset: &Dataset, plan: &Plan) -> RigCamera {
+pub(crate) fn camera_on_rig(dataset: &Dataset, plan: &Plan) -> RigCamera {
     dataset.rig.camera(plan.camera_id).cloned().unwrap_or_else(|| RigCamera {
         model: plan.camera.clone(),
         body_from_camera: Se3::IDENTITY,

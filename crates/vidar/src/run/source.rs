@@ -98,6 +98,14 @@ impl Source {
         }
     }
 
+    /// The most memory of a graphics processor that it held at a time so far, bytes; `None` where it works on none.
+    pub fn device_peak_bytes(&self) -> Option<u64> {
+        match self {
+            Self::Network(network) => network.0.network().device_peak_bytes(),
+            Self::Stereo(_) | Self::Recorded(_) | Self::Simulated(_) => None,
+        }
+    }
+
     /// What running it on chunks of `views` such views takes; warnings join `warnings`.
     pub fn planned(
         &self,

@@ -6,25 +6,21 @@
 //! from their neighbour. Odometry that contradicts chunks which agree with each other is down-weighted there.
 
 use super::super::chunk::{Chunk, OverlapConstraint};
-use super::super::config::{AlignerConfig, GraphWeights};
+use super::super::config::GraphWeights;
 use super::super::estimate::Estimate;
 use super::super::history::{History, LoopMeasurement, reject, reports};
-use super::super::landmarks::DepthCorrection;
-use super::super::observation::FrameObservation;
-use super::super::overlaps;
-use super::super::pose_fit::{CameraPair, PoseFit, center_rms, rescaled_about_centers};
+use super::super::pose_fit::{CameraPair, PoseFit, with_landmark_scale};
 use super::super::report::{ChunkStatus, GraphFailure, GraphReport, LoopRejection, RejectionReason};
 use super::pose_free::first_chain;
-use super::{Coupling, SharedFrames, initialise_by_overlap};
+use super::{Coupling, initialise_by_overlap};
 use crate::coupled::{
     Attachment, CoupledConfig, CoupledState, Factor, InformationFlow, RelativeChunk, Solution, inflation,
     solve,
 };
-use crate::overlap::OverlapFit;
 use nalgebra::Matrix6;
 use std::collections::BTreeMap;
 use vidar_core::model::ChunkFrame;
-use vidar_core::{FrameId, GeometryPrediction, LieGroup, PoseCovariance, Se3, Sim3};
+use vidar_core::{FrameId, LieGroup, PoseCovariance, Se3, Sim3};
 use vidar_solve::Kernel;
 
 /// Rotations of a chunk this far (rad, RMS) from those of its pose priors contradict them.
@@ -58,20 +54,6 @@ struct Index {
 pub(in crate::aligner) struct Coupled;
 
 impl Coupling for Coupled {
-    fn correct_depth(
-        &self,
-        prediction: &GeometryPrediction,
-        frames: &[FrameObservation],
-        config: &AlignerConfig,
-    ) -> DepthCorrection {
-        DepthCorrection::from_landmarks(prediction, frames, &config.landmarks)
-    }
-
-    fn fit_overlap(&self, shared: &SharedFrames<'_>, config: &AlignerConfig) -> Option<OverlapFit> {
-        let fit = overlaps::fit_robust(shared.sampled, config).ok();
-        fit.filter(|fit| fit.inlier_ratio >= config.overlap.min_inlier_ratio)
-    }
-
     /// A chunk that contradicts both its pose priors and its neighbour is rejected.
     fn initialise(&self, history: &History, chunk: &mut Chunk, pairs: &[CameraPair]) {
         let by_overlap = history.initial_by_overlap(chunk);
@@ -83,7 +65,7 @@ impl Coupling for Coupled {
             initialise_by_overlap(history, chunk);
             return;
         };
-        let fit = with_landmark_scale(fit, chunk, pairs);
+        let fit = with_landmark_scale(fit, chunk.landmark_scale, pairs);
         chunk.log_scale_std = fit.log_scale_std;
         let contradicts = contradicts(&fit, pairs.len(), history.config.max_center_rms_m);
         (chunk.status, chunk.initial) = match (contradicts, by_overlap) {
@@ -150,22 +132,6 @@ impl Coupling for Coupled {
         estimate.log_scale_std = built.scale_stds(history);
         estimate.loops = reports(loops);
         estimate
-    }
-}
-
-/// The same place with the scale from centres and landmarks together, by inverse variance.
-fn with_landmark_scale(fit: PoseFit, chunk: &Chunk, pairs: &[CameraPair]) -> PoseFit {
-    let Some(landmarks) = chunk.landmark_scale else { return fit };
-    let information = [fit.log_scale_std.powi(-2), landmarks.std.powi(-2)];
-    let sum = information[0] + information[1];
-    let log = (information[0] * fit.world_from_chunk.scale.ln() + information[1] * landmarks.log_scale) / sum;
-    let world_from_chunk = rescaled_about_centers(&fit.world_from_chunk, log.exp(), pairs);
-    let center_rms_m = center_rms(&world_from_chunk, pairs);
-    PoseFit {
-        world_from_chunk,
-        center_rms_m,
-        log_scale_std: sum.powf(-0.5).hypot(landmarks.shared_std),
-        ..fit
     }
 }
 

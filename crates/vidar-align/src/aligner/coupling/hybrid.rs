@@ -1,13 +1,15 @@
 //! Decoupled hybrid (the paper's section III-D): the pose-free chain, then one similarity per chain onto the pose priors.
-//! `S_vio = Umeyama({c_i^pred}, {c_i^VIO})`, `M ← S_vio(M)`.
+//! `S_vio = Umeyama({c_i^pred}, {c_i^VIO})`, `M ← S_vio(M)`. Where the chain has landmarks, the similarity's scale is that of
+//! centres and landmarks together.
 
-use super::super::chain::{Chains, chain};
+use super::super::chain::{Chains, chain, landmark_scale};
 use super::super::chunk::Chunk;
 use super::super::estimate::Estimate;
 use super::super::history::History;
 use super::super::pose_fit::CameraPair;
 use super::super::report::RejectionReason;
 use super::{Coupling, initialise_by_overlap};
+use crate::landmark_scale::LogScale;
 use nalgebra::Vector3;
 use std::collections::BTreeMap;
 use vidar_core::{FrameId, LieGroup, Sim3, umeyama_sim3};
@@ -57,6 +59,11 @@ impl Coupling for Hybrid {
                 }
             };
             let std = log_scale_std_of(&world_from_root, &chained, &metric);
+            let by_landmarks = landmark_scale(&history.chunks, &links, *root);
+            let (world_from_root, std) = match by_landmarks {
+                Some(landmarks) => with_landmarks(&world_from_root, std, &landmarks, &chained),
+                None => (world_from_root, std),
+            };
             members().for_each(|(k, link)| {
                 chunks[k] = Some(world_from_root * link.root_from_chunk);
                 log_scale_std[k] = std;
@@ -65,6 +72,23 @@ impl Coupling for Hybrid {
         let estimate = Estimate::new(history, chunks, loops, is_metric);
         Estimate { rejections, log_scale_std, failures, ..estimate }
     }
+}
+
+/// The similarity with the scale from centres and landmarks by inverse variance, about the mean of the centres; and σ of its
+/// ln(scale).
+fn with_landmarks(
+    world_from_root: &Sim3,
+    std: f64,
+    landmarks: &LogScale,
+    chained: &[Vector3<f64>],
+) -> (Sim3, f64) {
+    let information = [if std.is_finite() { std.powi(-2) } else { 0.0 }, landmarks.std.powi(-2)];
+    let sum = information[0] + information[1];
+    let log = (information[0] * world_from_root.scale.ln() + information[1] * landmarks.log_scale) / sum;
+    let mean = chained.iter().sum::<Vector3<f64>>() / chained.len().max(1) as f64;
+    let scaled = Sim3 { scale: log.exp(), ..*world_from_root };
+    let translation = world_from_root.translation + world_from_root.act(&mean) - scaled.act(&mean);
+    (Sim3 { translation, ..scaled }, sum.powf(-0.5).hypot(landmarks.shared_std))
 }
 
 /// σ of ln(scale) of a similarity over correlated centres: their residual over their radius.

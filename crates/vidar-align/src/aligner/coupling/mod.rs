@@ -21,7 +21,8 @@ use crate::streaming::Compat;
 use serde::{Deserialize, Serialize};
 use vidar_core::{GeometryPrediction, Sim3, ViewGeometry};
 
-/// How prediction and odometry are coupled.
+/// How prediction and odometry are coupled. All but `da3-streaming` measure overlaps and use landmarks and loops in the same
+/// way, as far as these are given.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, schemars::JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum CouplingMode {
@@ -105,14 +106,14 @@ pub(super) struct SharedFrames<'a> {
 
 /// What differs between couplings. Defaults are those of a chain of chunks.
 pub(super) trait Coupling: std::fmt::Debug + Sync {
-    /// Scale and depth corrections from the landmarks of a chunk.
+    /// Scale and depth corrections from the landmarks of a chunk, where its frames have any.
     fn correct_depth(
         &self,
-        _prediction: &GeometryPrediction,
-        _frames: &[FrameObservation],
-        _config: &AlignerConfig,
+        prediction: &GeometryPrediction,
+        frames: &[FrameObservation],
+        config: &AlignerConfig,
     ) -> DepthCorrection {
-        DepthCorrection::default()
+        DepthCorrection::from_landmarks(prediction, frames, &config.landmarks)
     }
 
     /// Whether the full views of the last usable chunk are kept for [`Coupling::fit_overlap`].
@@ -122,8 +123,8 @@ pub(super) trait Coupling: std::fmt::Debug + Sync {
 
     /// The similarity between two chunks from the frames that both hold; `None` where they do not agree.
     fn fit_overlap(&self, shared: &SharedFrames<'_>, config: &AlignerConfig) -> Option<OverlapFit> {
-        overlaps::fit_reference(shared.sampled, config)
-            .filter(|fit| fit.inlier_ratio >= config.overlap.min_inlier_ratio)
+        let fit = overlaps::fit_robust(shared.sampled, config).ok();
+        fit.filter(|fit| fit.inlier_ratio >= config.overlap.min_inlier_ratio)
     }
 
     /// Constraints to older chunks that hold some of a new chunk's frames: loops closed within an ordinary chunk.

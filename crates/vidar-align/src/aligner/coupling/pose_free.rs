@@ -1,11 +1,13 @@
-//! Pose-free: chunks chained by overlaps, closed by loops. Not metric (the paper's PF column).
+//! Pose-free: chunks chained by overlaps, closed by loops. Not metric (the paper's PF column), but where landmarks give the
+//! chain its unit.
 
-use super::super::chain::{Chains, chain};
+use super::super::chain::{Chains, Link, chain, landmark_scale};
 use super::super::chunk::Chunk;
 use super::super::estimate::Estimate;
 use super::super::history::{History, LoopMeasurement};
 use super::super::pose_fit::CameraPair;
 use super::{Coupling, initialise_by_overlap};
+use vidar_core::Sim3;
 
 /// The coupling.
 #[derive(Debug)]
@@ -25,11 +27,13 @@ impl Coupling for PoseFree {
     }
 }
 
-/// The first chain; chunks of other chains share nothing with it and are left out.
+/// The first chain, in metres where it has landmarks; chunks of other chains share nothing with it and are left out.
 pub(super) fn first_chain(history: &History, loops: Vec<LoopMeasurement>) -> Estimate {
     let Chains { links, failures } = chain(&history.chunks, &history.loop_edges(&loops));
     let root = links.iter().flatten().map(|l| l.root).next();
-    let chunks =
-        links.iter().map(|l| l.filter(|l| Some(l.root) == root).map(|l| l.root_from_chunk)).collect();
+    let unit = root.and_then(|root| landmark_scale(&history.chunks, &links, root));
+    let world_from_root = Sim3 { scale: unit.map_or(1.0, |z| z.log_scale.exp()), ..Sim3::IDENTITY };
+    let place = |l: Link| world_from_root * l.root_from_chunk;
+    let chunks = links.iter().map(|l| l.filter(|l| Some(l.root) == root).map(place)).collect();
     Estimate { failures, ..Estimate::new(history, chunks, loops, false) }
 }

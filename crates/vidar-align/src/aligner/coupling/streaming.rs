@@ -7,7 +7,9 @@ use super::super::chunk::{Chunk, OverlapConstraint};
 use super::super::config::AlignerConfig;
 use super::super::estimate::Estimate;
 use super::super::history::{History, LoopMeasurement};
-use super::super::overlaps::odds;
+use super::super::landmarks::DepthCorrection;
+use super::super::observation::FrameObservation;
+use super::super::overlaps::{self, odds};
 use super::super::pose_fit::CameraPair;
 use super::super::report::LoopRejection;
 use super::pose_free::{PoseFree, first_chain};
@@ -16,7 +18,7 @@ use crate::overlap::{OverlapFit, PATCH_PIXELS, PointPairs, evaluate_fit};
 use crate::streaming::{
     AlignMethod, Compat, IrlsConfig, PointMap, ScaleMethod, align_overlap, depth_scale, unproject,
 };
-use vidar_core::ViewGeometry;
+use vidar_core::{GeometryPrediction, ViewGeometry};
 
 /// What the reference meant.
 #[derive(Debug)]
@@ -27,6 +29,20 @@ pub(in crate::aligner) struct Streaming;
 pub(in crate::aligner) struct StreamingReference;
 
 impl Coupling for Streaming {
+    fn correct_depth(
+        &self,
+        _: &GeometryPrediction,
+        _: &[FrameObservation],
+        _: &AlignerConfig,
+    ) -> DepthCorrection {
+        DepthCorrection::default()
+    }
+
+    fn fit_overlap(&self, shared: &SharedFrames<'_>, config: &AlignerConfig) -> Option<OverlapFit> {
+        overlaps::fit_reference(shared.sampled, config)
+            .filter(|fit| fit.inlier_ratio >= config.overlap.min_inlier_ratio)
+    }
+
     fn revisits(&self, _: &History, _: &Chunk) -> Vec<OverlapConstraint> {
         Vec::new()
     }
@@ -45,6 +61,15 @@ impl Coupling for Streaming {
 }
 
 impl Coupling for StreamingReference {
+    fn correct_depth(
+        &self,
+        _: &GeometryPrediction,
+        _: &[FrameObservation],
+        _: &AlignerConfig,
+    ) -> DepthCorrection {
+        DepthCorrection::default()
+    }
+
     fn keeps_full_views(&self) -> bool {
         true
     }
