@@ -11,6 +11,7 @@
 //! - `pipeline`: [`Odometry`], the push machine that connects them and monitors their health.
 
 pub mod backend;
+pub mod calibration;
 mod config;
 mod error;
 pub mod frontend;

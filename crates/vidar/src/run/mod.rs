@@ -18,6 +18,7 @@ pub use map::MetricMap;
 pub use outputs::pose_of;
 pub use plan::{ExpectedWork, Plan, bytes};
 
+use crate::calibrate;
 use crate::camera_timing;
 use crate::config::{Config, Layered};
 use crate::engine::{Engine, EngineSetup, FrameStamp, MapEvent};
@@ -93,8 +94,10 @@ impl RunOutcome {
 /// # Errors
 /// The input, the configuration or the model cannot be used.
 pub fn plan(request: &RunRequest) -> Result<Plan, Error> {
-    let config = request.layered.build()?;
-    let dataset = input::open_every_image(&request.path, &request.open, &config)?;
+    let mut config = request.layered.build()?;
+    let mut dataset = input::open_every_image(&request.path, &request.open, &config)?;
+    let (events, cancel) = (Events::none(), CancelToken::default());
+    calibrate::complete(&mut dataset, &mut config.odometry.readout_ms, &events, &cancel)?;
     Ok(Plan::make(&dataset, &config, request.reference.as_deref())?.0)
 }
 
@@ -110,6 +113,7 @@ pub fn run(request: &RunRequest, events: &Events, cancel: &CancelToken) -> Resul
     let mut config = request.layered.build()?;
     let mut dataset =
         events.stage("read", 0, || input::open_every_image(&request.path, &request.open, &config))?;
+    calibrate::complete(&mut dataset, &mut config.odometry.readout_ms, &events, cancel)?;
     let (plan, source, places) =
         events.stage("plan", 0, || Plan::make(&dataset, &config, request.reference.as_deref()))?;
     let folder = Arc::new(RunFolder::create(&request.place)?);
