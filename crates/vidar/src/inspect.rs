@@ -201,7 +201,8 @@ fn possible(dataset: &Dataset) -> Vec<String> {
     let mut lines = Vec::new();
     if dataset.calibration == vidar_dataset::CalibrationSource::Guessed && !dataset.imu.is_empty() {
         lines.push(
-            "vidar run, vidar odometry: calibrate from images and gyroscope first, as vidar calibrate does".into(),
+            "vidar run, vidar odometry: calibrate from images and gyroscope first, as vidar calibrate does"
+                .into(),
         );
         return lines;
     }

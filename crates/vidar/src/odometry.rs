@@ -103,7 +103,7 @@ pub fn odometry(
     let mut config = request.layered.build()?;
     let mut dataset =
         events.stage("read", 0, || input::open_dataset(&request.path, &request.open, &config))?;
-    calibrate::complete(&mut dataset, &mut config.odometry.readout_ms, events, cancel)?;
+    calibrate::complete(&mut dataset, &mut config.odometry, events, cancel)?;
     input::require_calibration(&dataset)?;
     let folder = RunFolder::create(&request.place)?;
     folder.write("config.resolved.toml", request.layered.to_toml(true).as_bytes())?;

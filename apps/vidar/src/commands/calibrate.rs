@@ -12,11 +12,11 @@ pub fn calibrate(args: &CalibrateArgs, context: &Context) -> Outcome {
     open.start = args.input.start.map(vidar::core::Duration::from_secs_f64);
     open.end = args.input.end.map(vidar::core::Duration::from_secs_f64);
     let request = CalibrateRequest { path: args.path.clone(), open, output: args.output.clone() };
-    let outcome =
-        vidar::calibrate::calibrate(&request, &progress::events(&context.cli), &context.cancel)?;
+    let outcome = vidar::calibrate::calibrate(&request, &progress::events(&context.cli), &context.cancel)?;
     if context.cli.json {
         let mut value = serde_json::json!({ "schema": "vidar.calibrate/1" });
-        if let (Some(object), serde_json::Value::Object(fields)) = (value.as_object_mut(), outcome.to_json()) {
+        if let (Some(object), serde_json::Value::Object(fields)) = (value.as_object_mut(), outcome.to_json())
+        {
             object.extend(fields);
         }
         print::json(&value);

@@ -43,7 +43,8 @@ fn check(found: &Value, truth: f64, bound: f64) {
 fn a_phone_is_calibrated_by_its_recording_and_the_file_is_read_again() {
     let file = shared().root.join("found calibration.yaml");
     let sequence = phone().to_str().unwrap();
-    let found = vidar(&["calibrate", sequence, "-o", file.to_str().unwrap(), "--json", "-q"]).ends_with(0).json();
+    let found =
+        vidar(&["calibrate", sequence, "-o", file.to_str().unwrap(), "--json", "-q"]).ends_with(0).json();
     assert_eq!(found["schema"], "vidar.calibrate/1");
     check(&found["focal_px"], 330.0, 0.02 * 330.0);
     check(&found["time_offset_secs"], -0.04, 0.003);
@@ -84,8 +85,11 @@ fn a_wrong_calibration_is_contradicted() {
 #[test]
 fn odometry_calibrates_by_itself_and_says_so() {
     let out = shared().root.join("odometry without calibration");
-    let ran = vidar(&["odometry", phone().to_str().unwrap(), "-o", out.to_str().unwrap(), "--json"])
-        .says(&["calibrated-from-recording", "focal length", "lever arm"]);
+    let ran = vidar(&["odometry", phone().to_str().unwrap(), "-o", out.to_str().unwrap(), "--json"]).says(&[
+        "calibrated-from-recording",
+        "focal length",
+        "lever arm",
+    ]);
     assert!(ran.code == 0 || ran.code == 3, "{}", ran.stderr);
     let json = ran.json();
     assert!(number(&json["images_with_state"]) > 0.5 * number(&json["images"]), "{json}");

@@ -21,9 +21,9 @@ mod window;
 
 use crate::gyro_alignment::{ImageFeatures, RateSample};
 use nalgebra::Vector3;
+pub use noise::{SensorNoise, sensor_noise};
 use parameters::{BIAS, CENTRE, FOCAL, K1, K2, OFFSET, Parameters, READOUT, ROTATION, prior_sigmas};
 use solve::Problem;
-pub use noise::{SensorNoise, sensor_noise};
 pub use tracker::FeatureTracker;
 use vidar_core::{ImuSample, LandmarkId, So3, Timestamp, camera::Pixel};
 
@@ -39,9 +39,29 @@ const MAX_SAMPLES: usize = 200_000;
 /// Readout that the estimate starts from, s: between a global shutter and a phone's.
 const START_READOUT_SECS: f64 = 0.015;
 
+/// Least root mean square of the angular rate, rad/s, that the liveliest stretch must have: below, the gyroscope's noise is
+/// fitted to that of the pixels, and whatever fits best looks certain (a camera at rest gave a clock to 4 ms).
+const MIN_TURNING: f64 = 0.03;
+
 /// Standard deviations from the residuals are multiplied by this: found on simulated recordings
 /// (`tests/calibration.rs`), where the share of errors beyond 3 σ has to be below 2 %.
 const SIGMA_FACTOR: f64 = 1.5;
+
+/// The readout's standard deviation is at least this share of it: positions between images are parabolas, which underrate a
+/// hand's fastest translation (errors of 0.6 ms at readouts of 30 ms, `tests/calibration.rs`).
+const READOUT_SHARE: f64 = 0.01;
+
+/// What the model leaves out bounds what can be known, however long a recording is. Rotation, rad: axes of consumer gyroscopes
+/// are askew by tenths of a degree (0.4° between this and the published calibration of EuRoC's MH_01). Focal length, relative:
+/// pixels are square to some tenths of a per cent. Principal point, image widths: tangential distortion moves it (6 px of 752
+/// on MH_01).
+const ROTATION_FLOOR: f64 = 0.0026;
+const FOCAL_FLOOR: f64 = 0.0015;
+const CENTRE_FLOOR: f64 = 0.004;
+
+/// Few stretches tell little of errors that each of them shares: standard deviations are multiplied by 1 + this over their
+/// number (simulated recordings of 3 to 20 s).
+const FEW_STRETCHES: f64 = 3.0;
 
 /// A number of the calibration.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -164,14 +184,13 @@ impl CalibrationLog {
         if windows.is_empty() || samples.len() < 50 {
             return Err(CalibrationFailure::TooLittleData);
         }
+        if windows.iter().map(|w| w.turning(&samples)).fold(0.0, f64::max) < MIN_TURNING {
+            return Err(CalibrationFailure::TooLittleRotation);
+        }
         let starts = hand_eye::starts(size, &images, &samples, START_READOUT_SECS);
         let Some(first) = starts.first() else { return Err(CalibrationFailure::TooLittleRotation) };
-        let prior = Parameters {
-            focal: 0.75 * size.0,
-            offset_secs: 0.0,
-            bias: Vector3::zeros(),
-            ..first.parameters
-        };
+        let prior =
+            Parameters { focal: 0.75 * size.0, offset_secs: 0.0, bias: Vector3::zeros(), ..first.parameters };
         // From below: rates between samples are interpolated. From above: vibration is no white noise.
         let gyro_noise = sensor_noise(&self.samples).map_or(5e-4, |n| n.gyro).clamp(2e-4, 5e-3);
         let problem = Problem { samples: &samples, width: size.0, prior, gyro_noise };
@@ -180,7 +199,17 @@ impl CalibrationLog {
         let [formal, spread] = problem.covariances(&solution).ok_or(CalibrationFailure::Unexplained)?;
         let x = &solution.parameters;
         let priors = prior_sigmas(size.0);
-        let sigma = |p: usize| SIGMA_FACTOR * formal[(p, p)].max(spread[(p, p)]).sqrt();
+        let factor = SIGMA_FACTOR * (1.0 + FEW_STRETCHES / windows.len() as f64);
+        let sigma = |p: usize| {
+            let floor = match p {
+                FOCAL => FOCAL_FLOOR,
+                READOUT => READOUT_SHARE * x.readout_secs,
+                _ if (CENTRE..CENTRE + 2).contains(&p) => CENTRE_FLOOR * size.0,
+                _ if (ROTATION..ROTATION + 3).contains(&p) => ROTATION_FLOOR,
+                _ => 0.0,
+            };
+            floor.hypot(factor * formal[(p, p)].max(spread[(p, p)]).sqrt())
+        };
         // Half of what is believed of any camera: more than that is the prior's, not the recording's.
         let estimate = |p: usize, value: f64| Estimate {
             value,

@@ -59,5 +59,8 @@ pub fn sensor_noise(samples: &[ImuSample]) -> Option<SensorNoise> {
         let quiet = *variances.get((QUIET * variances.len() as f64) as usize)?;
         (variances.len() >= MIN_STRETCHES).then(|| (quiet * block_secs).sqrt())
     };
-    Some(SensorNoise { gyro: density(|s| s.gyro.0)?, accel: density(|s| s.accel.0)?, rate_hz })
+    let accel = density(|s| s.accel.0)?;
+    // Rounding of sums is no noise.
+    let accel = if accel > 1e-9 { accel } else { 0.0 };
+    Some(SensorNoise { gyro: density(|s| s.gyro.0)?, accel, rate_hz })
 }

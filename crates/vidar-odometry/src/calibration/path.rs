@@ -74,7 +74,8 @@ impl GyroPath {
             rotation: (self.orientations[k] * So3::exp(&(rate * step))).matrix(),
             rate,
             bias_integral: self.bias_integrals[k] + start * step,
-            scale_integral: self.scale_integrals[k] + start * Matrix3::from_diagonal(&self.measured[k]) * step,
+            scale_integral: self.scale_integrals[k]
+                + start * Matrix3::from_diagonal(&self.measured[k]) * step,
         }
     }
 }

@@ -182,7 +182,13 @@ fn residual_scale(windows: &[Window], parameters: &Parameters, path: &GyroPath) 
 
 /// Every third stretch and every second point: enough to choose among starts.
 fn thinned(windows: &[Window]) -> Vec<Window> {
-    let every = if windows.len() >= 9 { 3 } else if windows.len() >= 4 { 2 } else { 1 };
+    let every = if windows.len() >= 9 {
+        3
+    } else if windows.len() >= 4 {
+        2
+    } else {
+        1
+    };
     let mut few: Vec<Window> = windows.iter().step_by(every).cloned().collect();
     for window in &mut few {
         window.points = window.points.iter().step_by(2).cloned().collect();

@@ -50,13 +50,22 @@ pub(super) fn stretches(size: (f64, f64), images: &[ImageFeatures], samples: &[R
     all.into_iter().map(|(.., window)| window).collect()
 }
 
+/// Length of the means of which the angular rate is judged, s: noise averages out, motion hardly.
+const MEAN_SECS: f64 = 0.1;
+
 /// Root mean square of the angular rate about its mean, rad/s.
 fn turning(samples: &[RateSample], from: f64, to: f64) -> f64 {
-    let inside: Vec<Vector3<f64>> =
-        samples.iter().filter(|s| s.secs >= from && s.secs <= to).map(|s| s.rate).collect();
-    let n = inside.len().max(1) as f64;
-    let mean = inside.iter().sum::<Vector3<f64>>() / n;
-    (inside.iter().map(|r| (r - mean).norm_squared()).sum::<f64>() / n).sqrt()
+    let mut means: Vec<(i64, Vector3<f64>, f64)> = Vec::new();
+    for sample in samples.iter().filter(|s| s.secs >= from && s.secs <= to) {
+        let block = ((sample.secs - from) / MEAN_SECS) as i64;
+        match means.last_mut() {
+            Some((last, sum, count)) if *last == block => (*sum, *count) = (*sum + sample.rate, *count + 1.0),
+            _ => means.push((block, sample.rate, 1.0)),
+        }
+    }
+    let n = means.len().max(1) as f64;
+    let mean = means.iter().map(|(_, sum, count)| sum / *count).sum::<Vector3<f64>>() / n;
+    (means.iter().map(|(_, sum, count)| (sum / *count - mean).norm_squared()).sum::<f64>() / n).sqrt()
 }
 
 fn stretch(size: (f64, f64), images: &[ImageFeatures]) -> Option<Window> {
@@ -98,6 +107,12 @@ fn stretch(size: (f64, f64), images: &[ImageFeatures]) -> Option<Window> {
 }
 
 impl Window {
+    /// Root mean square of the angular rate about its mean, rad/s.
+    pub fn turning(&self, samples: &[RateSample]) -> f64 {
+        let time = |node: Option<&Node>| node.map_or(0.0, |n| n.secs);
+        turning(samples, time(self.nodes.first()), time(self.nodes.last()))
+    }
+
     /// Forgets positions and distances, and takes directions from the pixels next to the reference image.
     pub fn restart(&mut self, parameters: &Parameters, path: &GyroPath) {
         for node in &mut self.nodes {

@@ -167,7 +167,9 @@ impl Template {
         if !fits(image, centre, HALF + 1) {
             return None;
         }
-        let read = |x: i32, y: i32| sample(image, (centre.x + f64::from(x)) as f32, (centre.y + f64::from(y)) as f32);
+        let read = |x: i32, y: i32| {
+            sample(image, (centre.x + f64::from(x)) as f32, (centre.y + f64::from(y)) as f32)
+        };
         const WIDE: usize = SIDE + 2;
         let mut wide = [0.0_f32; WIDE * WIDE];
         for (k, value) in wide.iter_mut().enumerate() {
@@ -222,7 +224,8 @@ impl Template {
         let (x0, y0) = (place.x - f64::from(HALF), place.y - f64::from(HALF));
         let (left, top) = (x0 as usize, y0 as usize);
         let (fx, fy) = ((x0 - left as f64) as f32, (y0 - top as f64) as f32);
-        let (mut sum, mut square, mut with_grey, mut bx, mut by) = (0.0_f32, 0.0_f32, 0.0_f32, 0.0_f32, 0.0_f32);
+        let (mut sum, mut square, mut with_grey, mut bx, mut by) =
+            (0.0_f32, 0.0_f32, 0.0_f32, 0.0_f32, 0.0_f32);
         for y in 0..SIDE {
             let upper = &image.row(top + y)[left..=left + SIDE];
             let lower = &image.row(top + y + 1)[left..=left + SIDE];

@@ -6,8 +6,8 @@
 //! the integrated gyroscope are estimated as a random walk of small rotations. Positions between images are interpolated by
 //! a parabola through the three nearest. Points and then images are eliminated by Schur complements.
 
-use super::parameters::{DIM, FOCAL, LENS, OFFSET, Parameters, READOUT, ROTATION, SCALE, Tangent};
 use super::parameters::{BIAS, Projection};
+use super::parameters::{DIM, FOCAL, LENS, OFFSET, Parameters, READOUT, ROTATION, SCALE, Tangent};
 use super::path::{GyroPath, PathPoint};
 use nalgebra::{DMatrix, DVector, Matrix2x3, Matrix3, SMatrix, Vector2, Vector3};
 use vidar_core::camera::Pixel;
@@ -79,7 +79,6 @@ pub(super) struct Window {
 pub(super) struct Reduced {
     pub hessian: SMatrix<f64, DIM, DIM>,
     pub gradient: Tangent,
-    pub cost: f64,
     back: BackSubstitution,
 }
 
@@ -126,9 +125,9 @@ impl Window {
         for point in &self.points {
             for seen in &point.observations {
                 let at = self.see(point, seen, parameters, path, &reference);
-                let e2 = parameters.project(&at.in_camera).map_or(INVALID * INVALID, |p| {
-                    ((seen.pixel - p.pixel) / noise.pixel).norm_squared()
-                });
+                let e2 = parameters
+                    .project(&at.in_camera)
+                    .map_or(INVALID * INVALID, |p| ((seen.pixel - p.pixel) / noise.pixel).norm_squared());
                 cost += KERNEL.loss(e2);
             }
         }
@@ -158,7 +157,8 @@ impl Window {
         let late = seen.row * parameters.readout_secs;
         let at = path.at(node.secs + parameters.offset_secs + late);
         let body_from_camera = parameters.body_from_camera.matrix();
-        let reference_from_body = So3::exp(&node.drift).matrix() * reference.rotation.transpose() * at.rotation;
+        let reference_from_body =
+            So3::exp(&node.drift).matrix() * reference.rotation.transpose() * at.rotation;
         let turn = (reference_from_body * body_from_camera).transpose();
         let near = self.interpolation(seen.node, late);
         let position = near.iter().map(|(k, w, _)| self.nodes[*k].position * *w).sum();
@@ -219,7 +219,6 @@ impl Window {
         let mut h = DMatrix::<f64>::zeros(all, all);
         let mut g = DVector::<f64>::zeros(all);
         let reference = path.at(self.nodes[self.reference].secs + parameters.offset_secs);
-        let mut cost = self.prior_cost(noise);
         self.add_priors(&mut h, &mut g, noise);
         let mut blocks = Vec::with_capacity(self.points.len());
         for point in &self.points {
@@ -230,14 +229,9 @@ impl Window {
             let mut coupling = DMatrix::<f64>::zeros(all, 3);
             for seen in &point.observations {
                 let at = self.see(point, seen, parameters, path, &reference);
-                let Some(projection) = parameters.project(&at.in_camera) else {
-                    cost += KERNEL.loss(INVALID * INVALID);
-                    continue;
-                };
+                let Some(projection) = parameters.project(&at.in_camera) else { continue };
                 let linear = self.linearise(point, seen, &at, &projection, &reference, &tangents, noise);
-                let e2 = linear.residual.norm_squared();
-                cost += KERNEL.loss(e2);
-                let w = KERNEL.weight(e2);
+                let w = KERNEL.weight(linear.residual.norm_squared());
                 let weighted = linear.jacobian * w;
                 for (a, &column) in linear.columns.iter().enumerate() {
                     g[column] += weighted.column(a).dot(&linear.residual);
@@ -271,11 +265,12 @@ impl Window {
         for a in 0..DIM {
             gradient[a] = g[own + a] - coupling.column(a).dot(&solved);
             for b in 0..DIM {
-                hessian[(a, b)] = h[(own + a.max(b), own + a.min(b))] - coupling.column(a).dot(&by_parameters.column(b));
+                hessian[(a, b)] =
+                    h[(own + a.max(b), own + a.min(b))] - coupling.column(a).dot(&by_parameters.column(b));
             }
         }
         let back = BackSubstitution { by_parameters, nodes: solved, points: blocks };
-        Some(Reduced { hessian, gradient, cost, back })
+        Some(Reduced { hessian, gradient, back })
     }
 
     fn add_priors(&self, h: &mut DMatrix<f64>, g: &mut DVector<f64>, noise: &Noise) {
@@ -347,12 +342,8 @@ impl Window {
             velocity += self.nodes[*node].position * *slope;
         }
         let first = 12;
-        jacobian
-            .fixed_columns_mut::<LENS>(first + FOCAL)
-            .copy_from(&(projection.d_lens * by_sigma));
-        jacobian
-            .column_mut(first + OFFSET)
-            .copy_from(&(d_turn * (rate - reference.rate)));
+        jacobian.fixed_columns_mut::<LENS>(first + FOCAL).copy_from(&(projection.d_lens * by_sigma));
+        jacobian.column_mut(first + OFFSET).copy_from(&(d_turn * (rate - reference.rate)));
         jacobian
             .column_mut(first + READOUT)
             .copy_from(&((d_turn * rate - d_ray * velocity * point.inverse_distance) * seen.row));

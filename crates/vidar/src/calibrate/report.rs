@@ -128,8 +128,10 @@ impl CalibrateOutcome {
             None => format!("the data says {seen:.2e} {unit}"),
         };
         let given = self.stated_noise;
-        let mut lines =
-            vec![("gyroscope noise", words(given.map(|n| n.gyro_noise_density), seen.gyro, "rad/s/sqrt(Hz)"))];
+        let mut lines = vec![(
+            "gyroscope noise",
+            words(given.map(|n| n.gyro_noise_density), seen.gyro, "rad/s/sqrt(Hz)"),
+        )];
         if seen.accel > 0.0 {
             let given = given.map(|n| n.accel_noise_density);
             lines.push(("accelerometer noise", words(given, seen.accel, "m/s2/sqrt(Hz)")));
@@ -173,9 +175,8 @@ impl CalibrateOutcome {
     /// Everything as JSON.
     pub fn to_json(&self) -> Value {
         let c = &self.calibration;
-        let number = |e: &Estimate| {
-            json!({ "value": e.value, "sigma": e.sigma, "observable": e.is_observable })
-        };
+        let number =
+            |e: &Estimate| json!({ "value": e.value, "sigma": e.sigma, "observable": e.is_observable });
         let matrix = c.body_from_camera.matrix();
         let rows: Vec<Vec<f64>> = (0..3).map(|r| matrix.row(r).iter().copied().collect()).collect();
         let checks: Vec<Value> = self

@@ -50,7 +50,9 @@ impl CalibrateOutcome {
         line(format!("  # {}", told("readout", &c.readout_secs, 1e3, "ms", 2)));
         line(format!("  readout_secs: {:.6}", 1e-3 * used_readout_ms(c)));
         line("imu0:".into());
-        line("  # Noise as the data show it; bias walks as consumer sensors have them, not observable.".into());
+        line(
+            "  # Noise as the data show it; bias walks as consumer sensors have them, not observable.".into(),
+        );
         line(format!("  gyroscope_noise_density: {:.3e}", noise.gyro_noise_density));
         line(format!("  gyroscope_random_walk: {:.3e}", noise.gyro_random_walk));
         line(format!("  accelerometer_noise_density: {:.3e}", noise.accel_noise_density));
@@ -66,6 +68,8 @@ pub(super) fn told(what: &str, estimate: &Estimate, scale: f64, unit: &str, digi
     let space = if unit.is_empty() { "" } else { " " };
     match estimate.is_observable {
         true => format!("{what}: {value:.digits$} ± {sigma:.digits$}{space}{unit}"),
-        false => format!("{what}: not observable in this recording ({value:.digits$}{space}{unit} is assumed)"),
+        false => {
+            format!("{what}: not observable in this recording ({value:.digits$}{space}{unit} is assumed)")
+        }
     }
 }

@@ -97,7 +97,7 @@ pub fn plan(request: &RunRequest) -> Result<Plan, Error> {
     let mut config = request.layered.build()?;
     let mut dataset = input::open_every_image(&request.path, &request.open, &config)?;
     let (events, cancel) = (Events::none(), CancelToken::default());
-    calibrate::complete(&mut dataset, &mut config.odometry.readout_ms, &events, &cancel)?;
+    calibrate::complete(&mut dataset, &mut config.odometry, &events, &cancel)?;
     Ok(Plan::make(&dataset, &config, request.reference.as_deref())?.0)
 }
 
@@ -113,7 +113,7 @@ pub fn run(request: &RunRequest, events: &Events, cancel: &CancelToken) -> Resul
     let mut config = request.layered.build()?;
     let mut dataset =
         events.stage("read", 0, || input::open_every_image(&request.path, &request.open, &config))?;
-    calibrate::complete(&mut dataset, &mut config.odometry.readout_ms, &events, cancel)?;
+    calibrate::complete(&mut dataset, &mut config.odometry, &events, cancel)?;
     let (plan, source, places) =
         events.stage("plan", 0, || Plan::make(&dataset, &config, request.reference.as_deref()))?;
     let folder = Arc::new(RunFolder::create(&request.place)?);
