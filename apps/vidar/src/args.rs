@@ -75,6 +75,11 @@ pub enum Command {
         after_help = "Examples:\n  vidar inspect my_recording/\n  vidar inspect my_recording/ --trajectory vio.tum\n  vidar inspect my_recording/ --json"
     )]
     Inspect(InspectArgs),
+    /// Calibrate camera, clock and mount from an ordinary recording with a gyroscope, or check a given calibration.
+    #[command(
+        after_help = "Examples:\n  vidar calibrate my_recording/\n  vidar calibrate my_recording/ -o calibration.yaml\n  vidar run my_recording/ --calibration calibration.yaml"
+    )]
+    Calibrate(CalibrateArgs),
     /// Evaluate a trajectory or a cloud against a reference, or show the scores of a run.
     #[command(
         after_help = "Examples:\n  vidar eval estimate.tum truth.tum\n  vidar eval map.ply scan.ply\n  vidar eval runs/demo/latest/run --fail-below f@0.05=0.5"
@@ -302,6 +307,20 @@ pub struct InspectArgs {
     /// The recording.
     #[arg(value_hint = ValueHint::AnyPath)]
     pub path: PathBuf,
+    /// How the input is read.
+    #[command(flatten)]
+    pub input: InputArgs,
+}
+
+/// `vidar calibrate`.
+#[derive(Args, Clone, Debug)]
+pub struct CalibrateArgs {
+    /// The recording: images and an IMU.
+    #[arg(value_hint = ValueHint::AnyPath)]
+    pub path: PathBuf,
+    /// File for the calibration (Kalibr's YAML, camera and IMU in one), as --calibration takes it.
+    #[arg(short, long, value_hint = ValueHint::FilePath, help_heading = "Output")]
+    pub output: Option<PathBuf>,
     /// How the input is read.
     #[command(flatten)]
     pub input: InputArgs,

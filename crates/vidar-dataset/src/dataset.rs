@@ -76,6 +76,8 @@ pub enum CalibrationSource {
     Flags,
     /// What is published for this kind of dataset; a warning says so.
     DatasetDefault,
+    /// The recording itself: estimated from its images and its gyroscope.
+    Recording,
     /// A guess from the size of the images; a warning says so. It must not be used for metric results.
     Guessed,
 }
@@ -97,6 +99,8 @@ pub struct Dataset {
     pub camera: CameraId,
     /// Where that camera's model comes from.
     pub calibration: CalibrationSource,
+    /// Rolling shutter: time from the first to the last row, where the calibration states it.
+    pub readout: Option<Duration>,
     /// Images, strictly increasing in time.
     pub images: Vec<ImageEntry>,
     /// IMU samples, strictly increasing in time.

@@ -27,6 +27,7 @@ pub(crate) struct DraftCamera {
     pub source: CalibrationSource,
     pub body_from_camera: Se3,
     pub time_offset: Duration,
+    pub readout: Option<Duration>,
     pub rate_hz: Option<f64>,
 }
 
@@ -38,6 +39,7 @@ impl DraftCamera {
             source: CalibrationSource::Guessed,
             body_from_camera: Se3::IDENTITY,
             time_offset: Duration::ZERO,
+            readout: None,
             rate_hz: None,
         }
     }
@@ -128,6 +130,7 @@ impl Draft {
             calibration: self.cameras[self.chosen].source.clone(),
             rig: self.rig(),
             camera: chosen,
+            readout: self.cameras[self.chosen].readout,
             images,
             imu: std::mem::take(&mut self.imu),
             accelerometer: std::mem::take(&mut self.accelerometer),
@@ -326,6 +329,7 @@ impl Draft {
         }
         camera.model = Some(calibration.model);
         camera.time_offset = calibration.time_offset;
+        camera.readout = calibration.readout;
         camera.rate_hz = calibration.rate_hz.or(camera.rate_hz);
         camera.body_from_camera = body_from_camera.unwrap_or(camera.body_from_camera);
         camera.source = CalibrationSource::File(path.to_path_buf());

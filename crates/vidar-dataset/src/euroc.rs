@@ -191,6 +191,7 @@ fn read_camera(
         if let Some(calibration) = sensor.camera {
             camera.model = Some(calibration.model);
             camera.time_offset = calibration.time_offset;
+            camera.readout = calibration.readout;
             camera.rate_hz = calibration.rate_hz;
             camera.source = CalibrationSource::File(path);
         }

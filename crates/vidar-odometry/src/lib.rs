@@ -13,6 +13,7 @@
 
 pub mod backend;
 pub mod bundle_adjustment;
+pub mod calibration;
 mod config;
 mod error;
 pub mod frontend;

@@ -24,6 +24,8 @@ pub(crate) fn settle(
     events: &Events,
     cancel: &CancelToken,
 ) -> Result<Option<Warning>, Error> {
+    let stated = dataset.readout.map(|r| 1e3 * r.as_secs_f64());
+    config.odometry.readout_ms = config.odometry.readout_ms.or(stated);
     let settings = &config.odometry;
     let is_known = settings.readout_ms.is_some() && !settings.estimate_time_offset;
     if is_known || settings.imu == ImuUse::Off || dataset.rig.imu.is_none() {

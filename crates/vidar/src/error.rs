@@ -97,6 +97,14 @@ pub enum Error {
         /// Dataset name.
         name: String,
     },
+    /// The recording does not show its calibration.
+    #[error("{name} has no calibration, and the recording does not show it: {reason}")]
+    NotCalibrated {
+        /// Dataset name.
+        name: String,
+        /// What is missing.
+        reason: String,
+    },
     /// Camera and IMU gave no metric poses.
     #[error("the odometry of {name} never initialised: {reason}")]
     NoOdometry {
@@ -245,7 +253,7 @@ impl Error {
             Self::Camera(_) => "E0205",
             Self::Trajectory(_) => "E0206",
             Self::NotARun { .. } => "E0207",
-            Self::NoCalibration { .. } => "E0208",
+            Self::NoCalibration { .. } | Self::NotCalibrated { .. } => "E0208",
             Self::NoOdometry { .. } => "E0209",
             Self::NotARecording { .. } => "E0210",
             Self::Geometry(_) | Self::Stereo(_) => "E0301",
@@ -334,6 +342,9 @@ impl Error {
                 "free space, or choose another disk with -o; finished files are kept"
             }
             other if other.file_system().is_some() => "check that the path exists and may be written",
+            Self::NotCalibrated { .. } => {
+                "turn the camera about all axes for some seconds while it sees texture, or give --calibration FILE"
+            }
             Self::NoCalibration { .. } => {
                 "give --calibration FILE (EuRoC sensor.yaml, Kalibr camchain) or --camera-model pinhole:fx,fy,cx,cy"
             }
@@ -451,7 +462,7 @@ pub const CODES: &[(&str, &str)] = &[
     ("E0207", "The folder lacks files of a run folder (manifest.json, views.json)."),
     (
         "E0208",
-        "The images carry no calibration. A camera guessed from the size of the images bends every surface, so no metric map is made with it.",
+        "The images carry no calibration, and the recording does not show it: that takes a gyroscope and some seconds of turning. A camera guessed from the size of the images bends every surface, so no metric map is made with it.",
     ),
     (
         "E0209",

@@ -201,6 +201,13 @@ fn measure(image: &FrameImage) -> [f64; 3] {
 
 fn possible(dataset: &Dataset) -> Vec<String> {
     let mut lines = Vec::new();
+    if dataset.calibration == vidar_dataset::CalibrationSource::Guessed && !dataset.imu.is_empty() {
+        lines.push(
+            "vidar run, vidar odometry: calibrate from images and gyroscope first, as vidar calibrate does"
+                .into(),
+        );
+        return lines;
+    }
     if dataset.calibration == vidar_dataset::CalibrationSource::Guessed {
         lines.push(
             "vidar run: not possible yet; give --calibration FILE or --camera-model (the camera model is a guess)".into(),

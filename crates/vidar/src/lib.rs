@@ -9,6 +9,7 @@
 //! recording → engine → evaluate → export. The program in `apps/vidar` only parses, calls it and prints.
 
 pub mod bench;
+pub mod calibrate;
 mod camera_timing;
 pub mod chunks;
 pub mod config;

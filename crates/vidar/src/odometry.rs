@@ -4,6 +4,7 @@ mod dump;
 mod files;
 mod report;
 
+use crate::calibrate;
 use crate::camera_timing;
 use crate::config::{Config, Layered};
 use crate::error::{Error, ExitStatus};
@@ -111,6 +112,7 @@ pub fn odometry(
     let mut config = request.layered.build()?;
     let mut dataset =
         events.stage("read", 0, || input::open_dataset(&request.path, &request.open, &config))?;
+    calibrate::complete(&mut dataset, &mut config.odometry, events, cancel)?;
     input::require_calibration(&dataset)?;
     let started_manifest = start_manifest(request, &dataset, started)?;
     let earlier = request.place.earlier(&started_manifest, &request.layered.to_toml(false))?;

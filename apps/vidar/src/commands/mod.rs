@@ -1,6 +1,7 @@
 //! One file per verb.
 
 pub mod bench;
+pub mod calibrate;
 pub mod config;
 pub mod depth;
 pub mod doctor;

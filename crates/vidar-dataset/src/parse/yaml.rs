@@ -13,6 +13,8 @@ use vidar_core::{CameraModel, Duration, ImuNoise, LieGroup, Se3, Warning};
 
 /// A calibration file has a few kilobytes; a megabyte is something else.
 pub const MAX_YAML_BYTES: usize = 1 << 20;
+/// Longest readout of a rolling shutter that is believed, s.
+const MAX_READOUT_SECS: f64 = 0.1;
 
 /// A YAML value.
 #[derive(Clone, Debug, PartialEq)]
@@ -275,7 +277,14 @@ impl<'a> Document<'a> {
         )?;
         let shift = self.number(map, "timeshift_cam_imu")?;
         let shift = shift.map_or(Duration::ZERO, Duration::from_secs_f64);
-        Ok(Some(CameraCalibration { model, rate_hz: self.number(map, "rate_hz")?, time_offset: shift }))
+        let readout = match self.number(map, "readout_secs")? {
+            Some(secs) if !(0.0..=MAX_READOUT_SECS).contains(&secs) => {
+                return Err(self.wrong("readout_secs", &secs.to_string(), "0 to 0.1 s"));
+            }
+            secs => secs.map(Duration::from_secs_f64),
+        };
+        let rate_hz = self.number(map, "rate_hz")?;
+        Ok(Some(CameraCalibration { model, rate_hz, time_offset: shift, readout }))
     }
 }
 
@@ -300,6 +309,8 @@ pub struct CameraCalibration {
     pub rate_hz: Option<f64>,
     /// `t_imu = t_camera + time_offset`.
     pub time_offset: Duration,
+    /// Rolling shutter: time from the first to the last row (`readout_secs`, an addition to Kalibr's keys).
+    pub readout: Option<Duration>,
 }
 
 /// An IMU of a calibration file.

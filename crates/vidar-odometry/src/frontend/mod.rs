@@ -41,6 +41,7 @@ pub use feature_alignment::{AlignedFeature, MatchFailure, align_feature};
 pub use image_alignment::{
     AlignmentPoint, AlignmentReference, ImageAligner, ImageAlignment, MAX_REFERENCES, MotionPrediction,
 };
+pub(crate) use patch::sample;
 pub use pyramid::{Pyramid, from_level, level_scale, to_level};
 pub use template::{Template, Warp};
 pub use two_view::{RayPair, Triangulated, TwoView, TwoViewFailure, TwoViewSolver, triangulate};

@@ -10,12 +10,12 @@ mod solver;
 #[cfg(test)]
 mod tests;
 
+pub(crate) use path::RateSample;
 pub(crate) use shutter::RollingShutter;
-pub(crate) use solver::Alignment;
+pub(crate) use solver::{Alignment, ImageFeatures, common};
 
 use nalgebra::Vector3;
-use path::RateSample;
-use solver::{ImageFeatures, Problem};
+use solver::Problem;
 use std::collections::VecDeque;
 use vidar_core::{CameraModel, ImuSample, LandmarkId, So3, Timestamp, camera::Pixel};
 

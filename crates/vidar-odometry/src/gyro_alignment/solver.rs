@@ -317,7 +317,7 @@ fn bias_of(x: &Parameters) -> Vector3<f64> {
 }
 
 /// Indices of features that both images show, both in the order of ids.
-fn common(a: &ImageFeatures, b: &ImageFeatures) -> Vec<[usize; 2]> {
+pub(crate) fn common(a: &ImageFeatures, b: &ImageFeatures) -> Vec<[usize; 2]> {
     let (mut i, mut j, mut out) = (0, 0, Vec::new());
     while i < a.features.len() && j < b.features.len() {
         match a.features[i].0.cmp(&b.features[j].0) {

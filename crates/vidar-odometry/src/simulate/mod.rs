@@ -6,10 +6,12 @@
 
 mod course;
 mod driver;
+mod handheld;
 mod random;
 mod sensors;
 
 pub use course::{Course, CourseKind, Flight, Motion};
 pub use driver::{FeatureOdometry, FeatureOdometryConfig, StepOutput};
+pub use handheld::{Handheld, HandheldRecording};
 pub use random::Random;
 pub use sensors::{SimulatedFrame, Simulation, SimulationConfig};

@@ -25,6 +25,7 @@ fn describe_model(model: &CameraModel, source: &CalibrationSource) -> Vec<String
     let from = match source {
         CalibrationSource::File(path) => format!("from {}", path.display()),
         CalibrationSource::Flags => "from --camera-model".into(),
+        CalibrationSource::Recording => "found from the recording itself".into(),
         CalibrationSource::Guessed => "guessed".into(),
         CalibrationSource::DatasetDefault => "the dataset's published calibration".into(),
     };

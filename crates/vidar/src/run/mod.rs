@@ -21,6 +21,7 @@ pub use map::MetricMap;
 pub use outputs::pose_of;
 pub use plan::{ExpectedWork, Plan, bytes};
 
+use crate::calibrate;
 use crate::camera_timing;
 use crate::config::{Config, Layered};
 use crate::engine::{Engine, EngineSetup, FrameStamp, MapEvent};
@@ -104,8 +105,10 @@ impl RunOutcome {
 /// The input, the configuration or the model cannot be used.
 pub fn plan(request: &RunRequest) -> Result<Plan, Error> {
     let mut config = request.layered.build()?;
-    let dataset = input::open_every_image(&request.path, &request.open, &config)?;
+    let mut dataset = input::open_every_image(&request.path, &request.open, &config)?;
     let untimed = input::use_every_untimed_image(&dataset, &mut config);
+    let (events, cancel) = (Events::none(), CancelToken::default());
+    calibrate::complete(&mut dataset, &mut config.odometry, &events, &cancel)?;
     let (mut plan, ..) = Plan::make(&dataset, &config, request.reference.as_deref())?;
     plan.warnings.splice(0..0, dataset.warnings.iter().cloned().chain(untimed));
     Ok(plan)
@@ -124,6 +127,7 @@ pub fn run(request: &RunRequest, events: &Events, cancel: &CancelToken) -> Resul
     let mut dataset =
         events.stage("read", 0, || input::open_every_image(&request.path, &request.open, &config))?;
     dataset.warnings.extend(input::use_every_untimed_image(&dataset, &mut config));
+    calibrate::complete(&mut dataset, &mut config.odometry, &events, cancel)?;
     let (plan, source, places) =
         events.stage("plan", 0, || Plan::make(&dataset, &config, request.reference.as_deref()))?;
     let description = RunDescription::new(request, &dataset, &plan)?;

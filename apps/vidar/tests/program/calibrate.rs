@@ -1,0 +1,111 @@
+//! `vidar calibrate`, and what other verbs do without a calibration.
+
+use crate::support::{ProgramOutput, command, shared, vidar};
+use serde_json::Value;
+use std::path::{Path, PathBuf};
+use std::sync::OnceLock;
+
+/// A phone in lively use whose calibration is withheld: rolling shutter of 24 ms, stamps 40 ms late.
+const WORLD: &str = "duration_secs = 12.0\ncamera_rate_hz = 15.0\nwidth = 400\nheight = 300\nblur_samples = 1\n\
+    exposure_secs = 0.0\nscan_spacing_m = 0.2\nflight = \"handheld-lively\"\ndepth = false\nseed = 8\n\
+    [imu_noise]\ngyro_noise_density = 5e-4\ngyro_random_walk = 2e-5\naccel_noise_density = 5e-3\n\
+    accel_random_walk = 1e-3\nrate_hz = 200.0\n\
+    [device]\nmount = \"any-axes\"\nreadout_secs = 0.024\nstamp_delay_secs = 0.04\ncalibration = \"absent\"\n\
+    [device.lens.radtan]\nfocal_px = 330.0\ncentre_offset_px = [2.0, -3.0]\ndistortion = [-0.08, 0.03, 0.0, 0.0]\n";
+
+fn phone() -> &'static Path {
+    static PHONE: OnceLock<PathBuf> = OnceLock::new();
+    PHONE.get_or_init(|| {
+        let world = shared().root.join("phone.toml");
+        std::fs::write(&world, WORLD).unwrap();
+        let sequence = shared().root.join("phone without calibration");
+        let made = command()
+            .args(["synth".as_ref(), sequence.as_os_str(), "--world-config".as_ref(), world.as_os_str()])
+            .output();
+        ProgramOutput::from(made.unwrap()).ends_with(0);
+        sequence
+    })
+}
+
+fn number(v: &Value) -> f64 {
+    v.as_f64().unwrap_or_else(|| panic!("{v} is no number"))
+}
+
+/// Value and standard deviation against the truth.
+fn check(found: &Value, truth: f64, bound: f64) {
+    let (value, sigma) = (number(&found["value"]), number(&found["sigma"]));
+    assert_eq!(found["observable"], true, "{found}");
+    assert!((value - truth).abs() < bound, "{value} instead of {truth}");
+    assert!((value - truth).abs() < 3.5 * sigma, "{value} ± {sigma} instead of {truth}");
+}
+
+#[test]
+fn a_phone_is_calibrated_by_its_recording_and_the_file_is_read_again() {
+    let file = shared().root.join("found calibration.yaml");
+    let sequence = phone().to_str().unwrap();
+    let found =
+        vidar(&["calibrate", sequence, "-o", file.to_str().unwrap(), "--json", "-q"]).ends_with(0).json();
+    assert_eq!(found["schema"], "vidar.calibrate/1");
+    check(&found["focal_px"], 330.0, 0.02 * 330.0);
+    check(&found["time_offset_secs"], -0.04, 0.003);
+    check(&found["readout_secs"], 0.024, 0.004);
+    let truth: Value = serde_json::from_slice(&std::fs::read(phone().join("truth.json")).unwrap()).unwrap();
+    let given = &truth["camera"]["body_from_camera"];
+    // Angle between the rotations, from the trace of one times the other's transpose.
+    let trace: f64 = (0..9)
+        .map(|k| number(&given[4 * (k / 3) + k % 3]) * number(&found["body_from_camera"][k / 3][k % 3]))
+        .sum();
+    let angle = (0.5 * (trace - 1.0)).clamp(-1.0, 1.0).acos().to_degrees();
+    assert!(angle < 1.0, "rotation off by {angle} degrees: {found}");
+    assert!((number(&found["gyro_noise"]) / 5e-4 - 1.0).abs() < 0.3, "{found}");
+    assert!((number(&found["accel_noise"]) / 5e-3 - 1.0).abs() < 0.3, "{found}");
+
+    let text = std::fs::read_to_string(&file).unwrap();
+    assert!(text.contains("sigma") && text.contains("±") && text.contains("not observable"), "{text}");
+    // Given back, it is checked against what the recording shows and agrees with it.
+    let again = vidar(&["calibrate", sequence, "--calibration", file.to_str().unwrap(), "--json", "-q"])
+        .ends_with(0)
+        .json();
+    let checks = again["checks"].as_array().unwrap();
+    assert_eq!(checks.len(), 3, "{again}");
+    assert!(checks.iter().all(|c| c["contradicts"] == false), "{again}");
+    let shown = vidar(&["calibrate", sequence, "--calibration", file.to_str().unwrap()]).ends_with(0);
+    for words in ["focal length", "time offset", "rotation", "not observable", "the file says", "agrees"] {
+        assert!(shown.stdout.contains(words), "{words} is missing in {}", shown.stdout);
+    }
+}
+
+#[test]
+fn a_wrong_calibration_is_contradicted() {
+    let camera = "radtan:290,290,199.5,149.5,0,0,0,0";
+    let ran = vidar(&["calibrate", phone().to_str().unwrap(), "--camera-model", camera, "-q"]).ends_with(3);
+    assert!(ran.stdout.contains("contradicts"), "{}", ran.stdout);
+}
+
+#[test]
+fn odometry_calibrates_by_itself_and_says_so() {
+    let out = shared().root.join("odometry without calibration");
+    let ran = vidar(&["odometry", phone().to_str().unwrap(), "-o", out.to_str().unwrap(), "--json"]).says(&[
+        "calibrated-from-recording",
+        "focal length",
+        "lever arm",
+    ]);
+    assert!(ran.code == 0 || ran.code == 3, "{}", ran.stderr);
+    let json = ran.json();
+    assert!(number(&json["images_with_state"]) > 0.5 * number(&json["images"]), "{json}");
+}
+
+#[test]
+fn a_recording_that_shows_no_calibration_is_refused() {
+    let folder = tempfile::tempdir().unwrap();
+    let world = folder.path().join("still.toml");
+    let still = WORLD.replace("duration_secs = 12.0", "duration_secs = 1.0");
+    std::fs::write(&world, still).unwrap();
+    let sequence = folder.path().join("short");
+    let (sequence, world) = (sequence.to_str().unwrap(), world.to_str().unwrap());
+    vidar(&["synth", sequence, "--world-config", world, "-q"]).ends_with(0);
+    vidar(&["calibrate", sequence]).ends_with(1).says(&["error[E0208]", "hint:"]);
+    let out = folder.path().join("out");
+    vidar(&["odometry", sequence, "-o", out.to_str().unwrap()]).ends_with(1).says(&["error[E0208]"]);
+    assert!(!out.exists(), "a refused run left a folder");
+}

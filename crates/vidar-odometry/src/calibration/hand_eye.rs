@@ -1,0 +1,161 @@
+//! A start from nothing: clock offset and rotation of the camera on the body by comparing rotations.
+//!
+//! The rotation of each pair of images is fitted without translation for a trial focal length. For each clock offset on a
+//! grid the gyroscope's rates are compared with those of the images without their means (so the bias does not matter), and
+//! the rotation that maps one set to the other is found in closed form (Kabsch 1976; Tsai, Lenz 1989 for hand-eye
+//! calibration). Translation disturbs the images' rotations: this is a start to some degrees and some ten milliseconds, and
+//! tells the axis permutation.
+
+use super::parameters::Parameters;
+use super::path::GyroPath;
+use crate::gyro_alignment::{ImageFeatures, RateSample, common};
+use nalgebra::{Matrix3, Vector2, Vector3};
+use vidar_core::{LieGroup, So3};
+
+/// Matches that a pair of images needs.
+const MIN_MATCHES: usize = 12;
+/// Pairs that a solution needs.
+const MIN_PAIRS: usize = 15;
+/// Clock offsets that are tried: ± this, in such steps, s.
+const SEARCH_SECS: f64 = 0.2;
+const STEP_SECS: f64 = 0.01;
+/// Trial focal lengths in image widths: fields of view from 90° to 39°.
+const FOCALS: [f64; 6] = [0.5, 0.62, 0.75, 0.9, 1.1, 1.4];
+
+/// A start for the refinement.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Start {
+    pub parameters: Parameters,
+    /// Share of the images' rotation that it leaves unexplained.
+    pub unexplained: f64,
+}
+
+/// Starts in the order of what they leave unexplained: the best clock offset of every trial focal length, and of the best
+/// focal length the second best offset. Empty where the body turned too little.
+pub(super) fn starts(
+    size: (f64, f64),
+    images: &[ImageFeatures],
+    samples: &[RateSample],
+    readout_secs: f64,
+) -> Vec<Start> {
+    let path = GyroPath::new(samples, &Vector3::zeros(), &Vector3::zeros());
+    let mut found: Vec<Start> = Vec::new();
+    for widths in FOCALS {
+        let parameters = Parameters {
+            focal: widths * size.0,
+            k1: 0.0,
+            k2: 0.0,
+            centre: Vector2::new(0.5 * (size.0 - 1.0), 0.5 * (size.1 - 1.0)),
+            offset_secs: 0.0,
+            readout_secs,
+            body_from_camera: So3::IDENTITY,
+            bias: Vector3::zeros(),
+            scale: Vector3::zeros(),
+        };
+        let seen = image_rates(&parameters, images);
+        if seen.len() < MIN_PAIRS {
+            return Vec::new();
+        }
+        let steps = (2.0 * SEARCH_SECS / STEP_SECS).round() as i32;
+        let mut offsets: Vec<Start> = (0..=steps)
+            .filter_map(|k| {
+                let offset_secs = -SEARCH_SECS + f64::from(k) * STEP_SECS;
+                let rates: Vec<(Vector3<f64>, Vector3<f64>)> = seen
+                    .iter()
+                    .map(|(from, to, seen)| {
+                        let turn = path.at(from + offset_secs).rotation.transpose()
+                            * path.at(to + offset_secs).rotation;
+                        let turn = So3::from_matrix(&turn).unwrap_or(So3::IDENTITY);
+                        (turn.log() / (to - from), *seen)
+                    })
+                    .collect();
+                let (unexplained, body_from_camera, bias) = best_rotation(&rates)?;
+                let parameters = Parameters { offset_secs, body_from_camera, bias, ..parameters };
+                Some(Start { parameters, unexplained })
+            })
+            .collect();
+        offsets.sort_by(|a, b| a.unexplained.total_cmp(&b.unexplained));
+        let Some(best) = offsets.first().copied() else { continue };
+        found.push(best);
+        let apart = |s: &&Start| (s.parameters.offset_secs - best.parameters.offset_secs).abs() > 0.04;
+        found.extend(offsets.iter().find(apart));
+    }
+    found.sort_by(|a, b| a.unexplained.total_cmp(&b.unexplained));
+    found
+}
+
+/// Per pair of neighbouring images: both stamps, and the rate of the camera in its own axes.
+fn image_rates(camera: &Parameters, images: &[ImageFeatures]) -> Vec<(f64, f64, Vector3<f64>)> {
+    let rate = |pair: &[ImageFeatures]| {
+        let [before, now] = pair else { return None };
+        let secs = now.secs - before.secs;
+        let matches: Vec<(Vector3<f64>, Vector3<f64>)> = common(before, now)
+            .iter()
+            .map(|[a, b]| (camera.direction(&before.features[*a].1), camera.direction(&now.features[*b].1)))
+            .collect();
+        if matches.len() < MIN_MATCHES || secs > 0.3 {
+            return None;
+        }
+        Some((before.secs, now.secs, rotation_between(&matches)? / secs))
+    };
+    images.windows(2).filter_map(rate).collect()
+}
+
+/// Rotation that maps the second rates of the pairs onto the first, means removed, the share of the second that it
+/// leaves unexplained, and the difference of the means. `None` where the rates span less than a plane.
+fn best_rotation(rates: &[(Vector3<f64>, Vector3<f64>)]) -> Option<(f64, So3, Vector3<f64>)> {
+    let n = rates.len() as f64;
+    let (a, b) = rates.iter().fold((Vector3::zeros(), Vector3::zeros()), |(a, b), r| (a + r.0, b + r.1));
+    let (mean_a, mean_b) = (a / n, b / n);
+    let mut rotation = Matrix3::<f64>::identity();
+    let mut weight_scale2 = f64::INFINITY;
+    let mut unexplained = 1.0;
+    // Pairs that the first rotation leaves far off (translation, wrong matches) lose weight.
+    for _ in 0..4 {
+        let (mut cross, mut left, mut energy, mut weights) = (Matrix3::zeros(), 0.0, 0.0, 0.0);
+        for (felt, seen) in rates {
+            let (felt, seen) = (felt - mean_a, seen - mean_b);
+            let r2 = (felt - rotation * seen).norm_squared();
+            let weight = if weight_scale2.is_finite() { 1.0 / (1.0 + r2 / weight_scale2) } else { 1.0 };
+            cross += felt * seen.transpose() * weight;
+            energy += 0.5 * (seen.norm_squared() + felt.norm_squared()) * weight;
+            left += weight * r2;
+            weights += weight;
+        }
+        let svd = cross.svd(true, true);
+        let (u, v_t) = (svd.u?, svd.v_t?);
+        if !(svd.singular_values[1] > 0.02 * svd.singular_values[0] && weights > 0.0) {
+            return None;
+        }
+        let sign = (u * v_t).determinant().signum();
+        rotation = u * Matrix3::from_diagonal(&Vector3::new(1.0, 1.0, sign)) * v_t;
+        unexplained = 1.0 - (rotation * cross.transpose()).trace() / energy;
+        weight_scale2 = if weight_scale2.is_finite() { (left / weights).max(1e-6) } else { energy / weights };
+    }
+    Some((unexplained, So3::from_matrix(&rotation)?, mean_a - rotation * mean_b))
+}
+
+/// Rotation vector `before_from_now` that explains most of the motion of unit rays (before, now): Gauss-Newton with
+/// Cauchy weights.
+fn rotation_between(pairs: &[(Vector3<f64>, Vector3<f64>)]) -> Option<Vector3<f64>> {
+    let mut rotation = So3::IDENTITY;
+    let mut scale2 = f64::INFINITY;
+    for _ in 0..5 {
+        let (mut h, mut g, mut sum, mut weights) = (Matrix3::<f64>::zeros(), Vector3::zeros(), 0.0, 0.0);
+        for (before, now) in pairs {
+            let turned = rotation * *now;
+            // before ≈ turned + δ × turned.
+            let residual = before - turned;
+            let r2 = residual.norm_squared();
+            let weight = if scale2.is_finite() { 1.0 / (1.0 + r2 / scale2) } else { 1.0 };
+            h += (Matrix3::identity() - turned * turned.transpose()) * weight;
+            g += turned.cross(&residual) * weight;
+            sum += weight * r2;
+            weights += weight;
+        }
+        rotation = So3::exp(&(h.try_inverse()? * g)) * rotation;
+        scale2 = (sum / weights).max(1e-8);
+    }
+    let turn = rotation.log();
+    turn.iter().all(|x| x.is_finite()).then_some(turn)
+}

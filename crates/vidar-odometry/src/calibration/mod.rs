@@ -1,0 +1,236 @@
+//! Calibration of a camera on an IMU from an ordinary recording, with nothing known but the images' size.
+//!
+//! 1. [`FeatureTracker`] follows corners from image to image without a camera model.
+//! 2. The rotations of image pairs, compared with the gyroscope's, give a start: clock offset and axis permutation.
+//! 3. All stretches of some 1.5 s are adjusted jointly over focal length, distortion, principal point, clock, readout,
+//!    rotation and gyroscope errors; camera positions and points are eliminated.
+//! 4. Standard deviations come from the residuals.
+//!
+//! The lever arm and the accelerometer take no part: rotations alone do not show them.
+
+mod hand_eye;
+mod noise;
+mod parameters;
+mod path;
+mod solve;
+mod stretches;
+#[cfg(test)]
+mod tests;
+mod tracker;
+mod window;
+
+use crate::gyro_alignment::{ImageFeatures, RateSample};
+use nalgebra::Vector3;
+pub use noise::{SensorNoise, sensor_noise};
+use parameters::{BIAS, CENTRE, FOCAL, K1, K2, OFFSET, Parameters, READOUT, ROTATION, prior_sigmas};
+use solve::Problem;
+pub use tracker::FeatureTracker;
+use vidar_core::{ImuSample, LandmarkId, So3, Timestamp, camera::Pixel};
+
+/// Images nearer in time than this add little and cost as much, s.
+const IMAGE_SPACING_SECS: f64 = 0.09;
+/// Images and samples beyond this time after the first image are not kept, s.
+const MAX_SPAN_SECS: f64 = 60.0;
+/// Gyroscope samples this far before the first and behind the last image are kept: the largest clock offset.
+const MARGIN_SECS: f64 = 0.5;
+/// Gyroscope samples that are kept at most, against recordings with absurd rates.
+const MAX_SAMPLES: usize = 200_000;
+
+/// Readout that the estimate starts from, s: between a global shutter and a phone's.
+const START_READOUT_SECS: f64 = 0.015;
+
+/// Least root mean square of the angular rate, rad/s, that the liveliest stretch must have: below, the gyroscope's noise is
+/// fitted to that of the pixels, and whatever fits best looks certain (a camera at rest gave a clock to 4 ms).
+const MIN_TURNING: f64 = 0.03;
+
+/// Standard deviations from the residuals are multiplied by this: found on simulated recordings
+/// (`tests/calibration.rs`), where the share of errors beyond 3 σ has to be below 2 %.
+const SIGMA_FACTOR: f64 = 1.5;
+
+/// The readout's standard deviation is at least this share of it: positions between images are parabolas, which underrate a
+/// hand's fastest translation (errors of 0.6 ms at readouts of 30 ms, `tests/calibration.rs`).
+const READOUT_SHARE: f64 = 0.01;
+
+/// What the model leaves out bounds what can be known, however long a recording is. Rotation, rad: axes of consumer gyroscopes
+/// are askew by tenths of a degree (0.4° between this and the published calibration of EuRoC's MH_01). Focal length, relative:
+/// pixels are square to some tenths of a per cent. Principal point, image widths: tangential distortion moves it (6 px of 752
+/// on MH_01).
+const ROTATION_FLOOR: f64 = 0.0026;
+const FOCAL_FLOOR: f64 = 0.0015;
+const CENTRE_FLOOR: f64 = 0.004;
+
+/// Few stretches tell little of errors that each of them shares: standard deviations are multiplied by 1 + this over their
+/// number (simulated recordings of 3 to 20 s).
+const FEW_STRETCHES: f64 = 3.0;
+
+/// A number of the calibration.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Estimate {
+    /// The value.
+    pub value: f64,
+    /// Standard deviation, same unit.
+    pub sigma: f64,
+    /// Whether the recording shows it: its standard deviation is well below what is believed of any camera.
+    pub is_observable: bool,
+}
+
+/// Calibration of one camera on an IMU. Pixels, seconds, radians.
+#[derive(Clone, Debug)]
+pub struct Calibration {
+    /// Focal length of both axes, pixels.
+    pub focal_px: Estimate,
+    /// Principal point, pixels.
+    pub centre_px: [Estimate; 2],
+    /// Radial distortion of the radial-tangential model.
+    pub radial: [Estimate; 2],
+    /// `t_imu = stamp + offset` for the centre row, s.
+    pub time_offset_secs: Estimate,
+    /// Time from the first to the last row, s.
+    pub readout_secs: Estimate,
+    /// Rotation body_from_camera, and its standard deviations about the camera's axes, rad.
+    pub body_from_camera: So3,
+    /// Standard deviation about each axis of the camera, rad.
+    pub rotation_sigmas: [f64; 3],
+    /// Whether the rotation is observable about every axis.
+    pub rotation_is_observable: bool,
+    /// Gyroscope bias, rad/s.
+    pub gyro_bias: [Estimate; 3],
+    /// Standard deviation of a pixel measurement, pixels.
+    pub pixel_sigma: f64,
+    /// Images and stretches that were used.
+    pub images: usize,
+    /// Stretches of about 1.5 s that were adjusted.
+    pub stretches: usize,
+}
+
+/// Feature tracks and gyroscope samples of a recording.
+#[derive(Debug, Default)]
+pub struct CalibrationLog {
+    images: Vec<(Timestamp, Vec<(LandmarkId, Pixel)>)>,
+    samples: Vec<ImuSample>,
+}
+
+/// Why there is no calibration.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[non_exhaustive]
+pub enum CalibrationFailure {
+    /// Too few images with common features, or too few gyroscope samples beside them.
+    TooLittleData,
+    /// The body turned too little, or about one axis only.
+    TooLittleRotation,
+    /// No camera explains the tracks by the gyroscope's rotations.
+    Unexplained,
+}
+
+impl CalibrationLog {
+    /// Takes a gyroscope sample; samples come in the order of time.
+    pub fn add_gyro(&mut self, sample: &ImuSample) {
+        let is_later = self.samples.last().is_none_or(|last| sample.time > last.time);
+        let is_finite = sample.gyro.0.iter().all(|r| r.is_finite());
+        if is_later && is_finite && self.samples.len() < MAX_SAMPLES && !self.is_full() {
+            self.samples.push(*sample);
+        }
+    }
+
+    /// Takes the features of an image with its own stamp; images come in the order of time.
+    pub fn add_image(&mut self, stamp: Timestamp, features: impl Iterator<Item = (LandmarkId, Pixel)>) {
+        let is_near = |(last, _): &(Timestamp, _)| (stamp - *last).as_secs_f64() < IMAGE_SPACING_SECS;
+        if self.images.last().is_some_and(is_near) || self.is_full() {
+            return;
+        }
+        let mut features: Vec<(LandmarkId, Pixel)> =
+            features.filter(|(_, p)| p.x.is_finite() && p.y.is_finite()).collect();
+        features.sort_unstable_by_key(|f| f.0);
+        features.dedup_by_key(|f| f.0);
+        self.images.push((stamp, features));
+    }
+
+    /// Whether more of the recording would not be used.
+    pub fn is_full(&self) -> bool {
+        match (self.images.first(), self.samples.last()) {
+            (Some((first, _)), Some(last)) => {
+                (last.time - *first).as_secs_f64() > MAX_SPAN_SECS + MARGIN_SECS
+            }
+            _ => false,
+        }
+    }
+
+    /// Estimates the calibration of a camera with images of `width` × `height`.
+    ///
+    /// # Errors
+    /// Says why the recording does not show it; never an error of the program.
+    pub fn calibrate(&self, width: usize, height: usize) -> Result<Calibration, CalibrationFailure> {
+        let Some(origin) = self.images.first().map(|(t, _)| *t) else {
+            return Err(CalibrationFailure::TooLittleData);
+        };
+        let secs = |t: Timestamp| (t - origin).as_secs_f64();
+        let samples: Vec<RateSample> = self
+            .samples
+            .iter()
+            .map(|s| RateSample { secs: secs(s.time), rate: s.gyro.0 })
+            .filter(|s| s.secs > -MARGIN_SECS)
+            .collect();
+        let (Some(begin), Some(end)) = (samples.first(), samples.last()) else {
+            return Err(CalibrationFailure::TooLittleData);
+        };
+        let images: Vec<ImageFeatures> = self
+            .images
+            .iter()
+            .map(|(t, features)| ImageFeatures { secs: secs(*t), features: features.clone() })
+            .filter(|i| i.secs > begin.secs - 0.05 && i.secs < end.secs + 0.05)
+            .collect();
+        let size = (width as f64, height as f64);
+        let windows = stretches::stretches(size, &images, &samples);
+        if windows.is_empty() || samples.len() < 50 {
+            return Err(CalibrationFailure::TooLittleData);
+        }
+        if windows.iter().map(|w| w.turning(&samples)).fold(0.0, f64::max) < MIN_TURNING {
+            return Err(CalibrationFailure::TooLittleRotation);
+        }
+        let starts = hand_eye::starts(size, &images, &samples, START_READOUT_SECS);
+        let Some(first) = starts.first() else { return Err(CalibrationFailure::TooLittleRotation) };
+        let prior =
+            Parameters { focal: 0.75 * size.0, offset_secs: 0.0, bias: Vector3::zeros(), ..first.parameters };
+        // From below: rates between samples are interpolated. From above: vibration is no white noise.
+        let gyro_noise = sensor_noise(&self.samples).map_or(5e-4, |n| n.gyro).clamp(2e-4, 5e-3);
+        let problem = Problem { samples: &samples, width: size.0, prior, gyro_noise };
+        let starts: Vec<Parameters> = starts.iter().map(|s| s.parameters).collect();
+        let solution = problem.solve(&starts, &windows).ok_or(CalibrationFailure::Unexplained)?;
+        let [formal, spread] = problem.covariances(&solution).ok_or(CalibrationFailure::Unexplained)?;
+        let x = &solution.parameters;
+        let priors = prior_sigmas(size.0);
+        let factor = SIGMA_FACTOR * (1.0 + FEW_STRETCHES / windows.len() as f64);
+        let sigma = |p: usize| {
+            let floor = match p {
+                FOCAL => FOCAL_FLOOR,
+                READOUT => READOUT_SHARE * x.readout_secs,
+                _ if (CENTRE..CENTRE + 2).contains(&p) => CENTRE_FLOOR * size.0,
+                _ if (ROTATION..ROTATION + 3).contains(&p) => ROTATION_FLOOR,
+                _ => 0.0,
+            };
+            floor.hypot(factor * formal[(p, p)].max(spread[(p, p)]).sqrt())
+        };
+        // Half of what is believed of any camera: more than that is the prior's, not the recording's.
+        let estimate = |p: usize, value: f64| Estimate {
+            value,
+            sigma: sigma(p),
+            is_observable: formal[(p, p)].sqrt() < 0.5 * priors[p],
+        };
+        let focal = estimate(FOCAL, x.focal);
+        let rotation_sigmas = [0, 1, 2].map(|a| sigma(ROTATION + a));
+        Ok(Calibration {
+            focal_px: Estimate { sigma: focal.sigma * x.focal, is_observable: focal.sigma < 0.1, ..focal },
+            centre_px: [estimate(CENTRE, x.centre.x), estimate(CENTRE + 1, x.centre.y)],
+            radial: [estimate(K1, x.k1), estimate(K2, x.k2)],
+            time_offset_secs: estimate(OFFSET, x.offset_secs),
+            readout_secs: estimate(READOUT, x.readout_secs),
+            body_from_camera: x.body_from_camera,
+            rotation_sigmas,
+            rotation_is_observable: rotation_sigmas.iter().all(|s| *s < 0.1),
+            gyro_bias: [0, 1, 2].map(|a| estimate(BIAS + a, x.bias[a])),
+            pixel_sigma: solution.noise.pixel,
+            images: images.len(),
+            stretches: windows.len(),
+        })
+    }
+}

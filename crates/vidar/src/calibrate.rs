@@ -1,0 +1,240 @@
+//! Calibration of a recording from the recording itself: `vidar calibrate`, and what `odometry` and `run` do where there is
+//! no calibration.
+
+mod report;
+mod yaml;
+
+use crate::error::Error;
+use crate::events::{CancelToken, Event, Events};
+use crate::input::{self, Measurement};
+use std::path::{Path, PathBuf};
+use vidar_core::{CameraModel, Duration, ImuNoise, Pinhole, Se3, SensorEvent, Warning, camera::RadTan};
+use vidar_dataset::{CalibrationSource, Dataset, OpenOptions};
+use vidar_odometry::OdometryConfig;
+use vidar_odometry::calibration::{
+    Calibration, CalibrationFailure, CalibrationLog, FeatureTracker, SensorNoise, sensor_noise,
+};
+
+/// The stage's name in events.
+pub(crate) const STAGE: &str = "calibrate";
+
+/// Standard deviation of a lever arm that nothing is known of, m: a phone's camera is as far from its IMU.
+pub const UNKNOWN_LEVER_M: f64 = 0.05;
+
+/// Bias walks, which half a minute does not show: those of consumer sensors.
+const GYRO_RANDOM_WALK: f64 = 2e-5;
+const ACCEL_RANDOM_WALK: f64 = 1e-3;
+/// What is taken where the accelerometer's noise cannot be seen, m/s²/√Hz.
+const UNSEEN_ACCEL_NOISE: f64 = 5e-3;
+/// Bounds of what is believed of the data: no sensor in a hand is better, none that works is worse.
+const GYRO_NOISE: (f64, f64) = (1e-4, 1e-2);
+const ACCEL_NOISE: (f64, f64) = (1e-3, 0.1);
+
+/// Clock offsets that are known better than this are kept by the odometry, s: a rendered slow phone, found within 0.1 ms,
+/// was lost when the odometry corrected it by 10 ms from a few seconds.
+const SETTLED_OFFSET_SECS: f64 = 0.0015;
+/// Warnings of reading that complain of values which nobody gave.
+const OF_A_GUESS: [&str; 4] = ["intrinsics-guessed", "imu-noise", "extrinsics-identity", "imu-rate"];
+
+/// What to calibrate.
+#[derive(Clone, Debug)]
+pub struct CalibrateRequest {
+    /// The recording.
+    pub path: PathBuf,
+    /// How to read it.
+    pub open: OpenOptions,
+    /// Where the calibration is written, if anywhere.
+    pub output: Option<PathBuf>,
+}
+
+/// What was found, beside what the recording states.
+#[derive(Clone, Debug)]
+pub struct CalibrateOutcome {
+    /// Name of the recording.
+    pub name: String,
+    /// Camera, clock and mount.
+    pub calibration: Calibration,
+    /// Noise of the sensors as the data show it.
+    pub noise: Option<SensorNoise>,
+    /// What the recording's own files state; `None` where the camera is only guessed from the images' size.
+    pub stated: Option<Stated>,
+    /// Noise that the recording's files state.
+    pub stated_noise: Option<ImuNoise>,
+    /// Columns and rows.
+    pub size: (usize, usize),
+    /// The file that was written.
+    pub file: Option<PathBuf>,
+    /// Warnings of reading.
+    pub warnings: Vec<Warning>,
+}
+
+/// A given calibration.
+#[derive(Clone, Debug)]
+pub struct Stated {
+    /// How the camera projects.
+    pub model: CameraModel,
+    /// Its pose on the body.
+    pub body_from_camera: Se3,
+    /// `t_imu = t_camera + time_offset`.
+    pub time_offset: Duration,
+}
+
+/// Calibrates a recording and writes what was found.
+///
+/// # Errors
+/// The recording cannot be read, it does not show its calibration, or the file cannot be written.
+pub fn calibrate(
+    request: &CalibrateRequest,
+    events: &Events,
+    cancel: &CancelToken,
+) -> Result<CalibrateOutcome, Error> {
+    let dataset = events.stage("read", 0, || vidar_dataset::open(&request.path, &request.open))?;
+    let calibration = events.stage(STAGE, 0, || look(&dataset, events, cancel))?;
+    let camera = dataset.rig.camera(dataset.camera);
+    let is_stated = dataset.calibration != CalibrationSource::Guessed;
+    let stated = camera.filter(|_| is_stated).map(|c| Stated {
+        model: c.model.clone(),
+        body_from_camera: c.body_from_camera,
+        time_offset: c.time_offset,
+    });
+    let is_assumed = dataset.warnings.iter().any(|w| w.kind == "imu-noise");
+    let mut outcome = CalibrateOutcome {
+        name: dataset.name.clone(),
+        size: size_of(&dataset),
+        noise: sensor_noise(&dataset.imu),
+        calibration,
+        stated,
+        stated_noise: dataset.rig.imu.filter(|_| !is_assumed),
+        file: None,
+        warnings: dataset.warnings.clone(),
+    };
+    if outcome.stated.is_none() {
+        outcome.warnings.retain(|w| !OF_A_GUESS.contains(&w.kind.as_str()));
+    }
+    if let Some(path) = &request.output {
+        write(path, &outcome.to_yaml())?;
+        outcome.file = Some(path.clone());
+    }
+    Ok(outcome)
+}
+
+fn write(path: &Path, text: &str) -> Result<(), Error> {
+    if let Some(folder) = path.parent().filter(|f| !f.as_os_str().is_empty()) {
+        std::fs::create_dir_all(folder).map_err(|e| Error::io("create", folder, e))?;
+    }
+    std::fs::write(path, text).map_err(|e| Error::io("write", path, e))
+}
+
+/// Where `dataset` has a gyroscope but no calibration: finds it, puts it into the rig, and says so. The settings of the
+/// odometry follow from what is known then.
+///
+/// # Errors
+/// The recording does not show its calibration.
+pub(crate) fn complete(
+    dataset: &mut Dataset,
+    settings: &mut OdometryConfig,
+    events: &Events,
+    cancel: &CancelToken,
+) -> Result<(), Error> {
+    if dataset.calibration != CalibrationSource::Guessed || dataset.imu.is_empty() {
+        return Ok(());
+    }
+    let found = events.stage(STAGE, 0, || look(dataset, events, cancel))?;
+    let size = size_of(dataset);
+    let noise = believed_noise(sensor_noise(&dataset.imu));
+    let model = model_of(&found, size)?;
+    let Some(camera) = dataset.rig.cameras.get_mut(dataset.camera.index()) else { return Ok(()) };
+    camera.model = model;
+    camera.body_from_camera = Se3::new(found.body_from_camera, nalgebra::Vector3::zeros());
+    camera.time_offset = Duration::from_secs_f64(found.time_offset_secs.value);
+    if found.readout_secs.is_observable {
+        settings.readout_ms = settings.readout_ms.or(Some(used_readout_ms(&found)));
+        // Half a minute shows the clock better than the odometry's last seconds do.
+        settings.estimate_time_offset &= found.time_offset_secs.sigma > SETTLED_OFFSET_SECS;
+    }
+    // The lever arm is not known at all (rendered lively phone: 0.036 m of error with it estimated, 0.063 m without).
+    settings.estimate_extrinsics = true;
+    dataset.rig.imu = Some(noise);
+    dataset.calibration = CalibrationSource::Recording;
+    // What these said is no longer so.
+    dataset.warnings.retain(|w| !OF_A_GUESS.contains(&w.kind.as_str()));
+    dataset.warnings.push(
+        Warning::new("calibrated-from-recording", report::sentence(&found))
+            .hint("`vidar calibrate` writes it to a file; --calibration FILE gives a better one"),
+    );
+    Ok(())
+}
+
+/// Follows features through the recording and estimates.
+fn look(dataset: &Dataset, events: &Events, cancel: &CancelToken) -> Result<Calibration, Error> {
+    let refuse = |reason: &str| Error::NotCalibrated { name: dataset.name.clone(), reason: reason.into() };
+    if dataset.imu.is_empty() {
+        return Err(refuse("it has no gyroscope"));
+    }
+    let (width, height) = size_of(dataset);
+    let mut tracker = FeatureTracker::new(width, height);
+    let mut log = CalibrationLog::default();
+    let mut done = 0;
+    for measurement in input::measurements(dataset, true) {
+        if cancel.is_cancelled() || log.is_full() {
+            break;
+        }
+        match measurement {
+            Measurement::Event(SensorEvent::Imu(sample)) => log.add_gyro(&sample),
+            Measurement::Event(SensorEvent::Image(frame)) => {
+                let features = tracker.push(frame.time, &frame.image).map_err(|e| refuse(&e.to_string()))?;
+                if let Some(features) = features {
+                    log.add_image(frame.time, features.into_iter());
+                }
+                done += 1;
+                events.emit(&Event::Progress { stage: STAGE, done, total: 0 });
+            }
+            // The pass that maps reports what cannot be read.
+            Measurement::Event(_) | Measurement::Stamp(_) | Measurement::Unreadable(..) => {}
+        }
+    }
+    log.calibrate(width, height).map_err(|failure| refuse(reason(failure)))
+}
+
+fn reason(failure: CalibrationFailure) -> &'static str {
+    match failure {
+        CalibrationFailure::TooLittleData => {
+            "fewer than two seconds of images with common features and gyroscope samples"
+        }
+        CalibrationFailure::TooLittleRotation => "the camera turns too little, or about one axis only",
+        _ => "no camera explains the images by the gyroscope's rotations",
+    }
+}
+
+fn size_of(dataset: &Dataset) -> (usize, usize) {
+    dataset.rig.camera(dataset.camera).map_or((0, 0), |c| (c.model.width(), c.model.height()))
+}
+
+/// The camera that was found.
+pub(crate) fn model_of(found: &Calibration, (width, height): (usize, usize)) -> Result<CameraModel, Error> {
+    let f = found.focal_px.value;
+    let [cx, cy] = found.centre_px.map(|c| c.value);
+    let [k1, k2] = found.radial.map(|k| k.value);
+    let pinhole = Pinhole::new(f, f, cx, cy, width, height)?;
+    Ok(CameraModel::RadTan(RadTan::new(pinhole, [k1, k2, 0.0, 0.0])?))
+}
+
+/// A readout that is not there within three standard deviations and below 4 ms is a global shutter's.
+fn used_readout_ms(found: &Calibration) -> f64 {
+    let readout = found.readout_secs;
+    let is_global = readout.value < (3.0 * readout.sigma).min(0.004);
+    if is_global { 0.0 } else { 1e3 * readout.value.clamp(0.0, 0.05) }
+}
+
+/// Noise for the odometry: what the data show, within what sensors have.
+fn believed_noise(seen: Option<SensorNoise>) -> ImuNoise {
+    let (gyro, accel) = seen.map_or((GYRO_NOISE.0, 0.0), |n| (n.gyro, n.accel));
+    let accel = if accel > 0.0 { accel } else { UNSEEN_ACCEL_NOISE };
+    ImuNoise {
+        gyro_noise_density: gyro.clamp(GYRO_NOISE.0, GYRO_NOISE.1),
+        gyro_random_walk: GYRO_RANDOM_WALK,
+        accel_noise_density: accel.clamp(ACCEL_NOISE.0, ACCEL_NOISE.1),
+        accel_random_walk: ACCEL_RANDOM_WALK,
+        rate_hz: seen.map_or(200.0, |n| n.rate_hz),
+    }
+}
