@@ -45,6 +45,9 @@ pub struct OdometryConfig {
     pub readout_ms: Option<f64>,
     /// Whether the camera's place on the body is refined on the way.
     pub estimate_extrinsics: bool,
+    /// Whether all states of a recording on disk are adjusted together after its end: better poses, and poses for the images
+    /// before the start.
+    pub adjust: bool,
     /// Fastest speed that is believed, m/s, 0.1…100.
     pub max_speed_mps: f64,
     /// After this long without landmarks or IMU measurements the state is given up, s, 0.1…10.
@@ -65,6 +68,7 @@ impl Default for OdometryConfig {
             estimate_time_offset: true,
             estimate_extrinsics: false,
             readout_ms: None,
+            adjust: true,
             max_speed_mps: 20.0,
             max_blind_secs: 2.0,
         }

@@ -1,5 +1,6 @@
 //! The metric trajectory of a recording from its own camera and IMU: `vidar odometry`.
 
+pub(crate) mod adjusted;
 mod dump;
 mod files;
 mod report;
@@ -20,6 +21,7 @@ use std::time::Instant;
 use vidar_core::{BodyFrame, OdometryKeyframe, RevisedPose, Severity, StampedPose, Trajectory, Warning};
 use vidar_dataset::{Dataset, OpenOptions};
 use vidar_eval::TrajectoryReport;
+use vidar_odometry::bundle_adjustment::{Adjusted, CalibrationSigmas};
 use vidar_odometry::{ImuUse, InputCounts, Odometry, OdometryOutput, Status};
 
 /// What to run the odometry on, how, and where to.
@@ -76,6 +78,10 @@ pub struct Tracked {
     pub with_imu: bool,
     /// Health, coverage and scale over the whole recording.
     pub quality: TrackQuality,
+    /// All states adjusted together after the end, where that was asked for and camera and IMU agree in it.
+    pub adjusted: Option<Adjusted>,
+    /// Why there are none.
+    pub not_adjusted: Option<String>,
 }
 
 /// What a run of the odometry made.
@@ -87,10 +93,14 @@ pub struct OdometryOutcome {
     pub status: ExitStatus,
     /// What was tracked.
     pub tracked: Tracked,
-    /// The longest segment's poses of the body.
+    /// The longest segment's poses of the body as they were estimated live.
     pub trajectory: Option<Trajectory>,
-    /// Against ground truth, where there is any.
+    /// Poses of the body at every image after the adjustment.
+    pub final_trajectory: Option<Trajectory>,
+    /// The live trajectory against ground truth, where there is any.
     pub report: Option<TrajectoryReport>,
+    /// The final one against it.
+    pub final_report: Option<TrajectoryReport>,
     /// Every warning, in order.
     pub warnings: Vec<Warning>,
     /// What is said of the scale.
@@ -112,6 +122,7 @@ pub fn odometry(
     let mut config = request.layered.build()?;
     let mut dataset =
         events.stage("read", 0, || input::open_dataset(&request.path, &request.open, &config))?;
+    let sigmas = adjusted::adjustable(&dataset, &config);
     calibrate::complete(&mut dataset, &mut config.odometry, events, cancel)?;
     input::require_calibration(&dataset)?;
     let started_manifest = start_manifest(request, &dataset, started)?;
@@ -119,13 +130,11 @@ pub fn odometry(
     let folder = RunFolder::create(&request.place)?;
     folder.write_manifest(&started_manifest)?;
     folder.write("config.resolved.toml", request.layered.to_toml(true).as_bytes())?;
-    let total = dataset.images.len();
     let mut dump = if request.debug_dump { Some(dump::Dump::create(&folder)?) } else { None };
     let timing = events.stage(camera_timing::STAGE, 0, || {
         camera_timing::settle(&mut dataset, &mut config, events, cancel)
     })?;
-    let tracked =
-        events.stage("odometry", total, || track(&dataset, &config, events, cancel, dump.as_mut()))?;
+    let tracked = track(&dataset, &config, sigmas.as_ref(), events, cancel, dump.as_mut())?;
     let dumped = dump.is_some();
     dump.map_or(Ok(()), dump::Dump::finish)?;
 
@@ -136,12 +145,13 @@ pub fn odometry(
     warnings.extend(tracked.warnings());
     warnings.extend(trajectory.as_ref().and_then(|_| scale.warning()));
     warnings.iter().for_each(|w| events.warn(w));
-    let report = match (&trajectory, &dataset.ground_truth) {
-        (Some(trajectory), Some(truth)) => evaluate(trajectory, truth, &dataset, &config)?,
-        _ => None,
-    };
+    let final_trajectory = tracked.adjusted.as_ref().and_then(adjusted::trajectory);
+    let report = against_truth(trajectory.as_ref(), &dataset, &config)?;
+    tracked.adjusted.iter().for_each(|adjusted| adjusted::apply(adjusted, &mut dataset));
+    let final_report = against_truth(final_trajectory.as_ref(), &dataset, &config)?;
     let is_degraded = warnings.iter().any(|w| w.severity == Severity::Degraded);
-    let verdict = verdict(&tracked, &scale, report.as_ref(), cancel.is_cancelled());
+    let judged = final_report.as_ref().or(report.as_ref());
+    let verdict = verdict(&tracked, &scale, judged, cancel.is_cancelled());
     let status = match (cancel.is_cancelled(), is_degraded) {
         (true, _) => ExitStatus::Interrupted,
         (false, true) => ExitStatus::Degraded,
@@ -152,7 +162,9 @@ pub fn odometry(
         status,
         tracked,
         trajectory,
+        final_trajectory,
         report,
+        final_report,
         warnings,
         scale,
         verdict,
@@ -175,17 +187,46 @@ pub fn odometry(
     Ok(outcome)
 }
 
-/// Feeds a recording to the odometry.
-fn track(
+/// Feeds a recording to the odometry, and adjusts all states after its end where `adjustable` says what may change.
+pub(crate) fn track(
     dataset: &Dataset,
     config: &Config,
+    adjustable: Option<&CalibrationSigmas>,
+    events: &Events,
+    cancel: &CancelToken,
+    dump: Option<&mut dump::Dump>,
+) -> Result<Tracked, Error> {
+    let total = dataset.images.len();
+    let keeps_log = adjustable.is_some();
+    let (mut tracked, odometry) =
+        events.stage("odometry", total, || push_all(dataset, config, keeps_log, events, cancel, dump))?;
+    if let Some(sigmas) = adjustable.filter(|_| tracked.with_imu && !cancel.is_cancelled()) {
+        match events.stage("adjustment", 0, || odometry.adjust(sigmas)) {
+            Ok(adjusted) if adjusted.is_consistent() => {
+                tracked.quality.adjust(&adjusted);
+                tracked.adjusted = Some(adjusted);
+            }
+            Ok(_) => tracked.not_adjusted = Some("camera and IMU contradict each other".into()),
+            Err(reason) => tracked.not_adjusted = Some(reason.to_string()),
+        }
+    }
+    Ok(tracked)
+}
+
+fn push_all(
+    dataset: &Dataset,
+    config: &Config,
+    keeps_log: bool,
     events: &Events,
     cancel: &CancelToken,
     mut dump: Option<&mut dump::Dump>,
-) -> Result<Tracked, Error> {
+) -> Result<(Tracked, Odometry), Error> {
     let settings = &config.odometry;
     let mut odometry = Odometry::new(&dataset.rig, dataset.camera, settings)?;
     let with_imu = settings.imu != ImuUse::Off && dataset.rig.imu.is_some();
+    if keeps_log && with_imu {
+        odometry.keep_log();
+    }
     let mut tracked = Tracked { with_imu, ..Tracked::default() };
     let total = dataset.images.len();
     let mut spent = 0.0;
@@ -218,7 +259,7 @@ fn track(
         tracked.keep(output, 0.0);
     }
     tracked.counts = odometry.counts();
-    Ok(tracked)
+    Ok((tracked, odometry))
 }
 
 impl Tracked {
@@ -304,6 +345,9 @@ impl Tracked {
                 "`vidar inspect` shows calibration and units in plain words; docs/failures.md lists causes";
             warnings.push(Warning::degraded("odometry-never-started", text).hint(hint));
         }
+        if let (Some(reason), true) = (&self.not_adjusted, self.quality.longest().is_some()) {
+            warnings.push(Warning::new("not-adjusted", format!("the live states are final: {reason}")));
+        }
         if !self.with_imu {
             let text =
                 "one camera without an IMU: the trajectory is known up to scale, lengths are not metres";
@@ -337,12 +381,13 @@ fn verdict(
     findings.verdict(compared)
 }
 
-fn evaluate(
-    trajectory: &Trajectory,
-    truth: &Trajectory,
+/// Scores against ground truth, where there are both.
+fn against_truth(
+    trajectory: Option<&Trajectory>,
     dataset: &Dataset,
     config: &Config,
 ) -> Result<Option<TrajectoryReport>, Error> {
+    let (Some(trajectory), Some(truth)) = (trajectory, &dataset.ground_truth) else { return Ok(None) };
     let truth = truth.in_frame(BodyFrame::Imu, &dataset.rig).ok();
     let Some(truth) = truth.and_then(|t| input::in_image_clock(&t, dataset)) else { return Ok(None) };
     match vidar_eval::evaluate_trajectory(trajectory, &truth, &config.eval.trajectory) {
@@ -379,6 +424,13 @@ impl OdometryOutcome {
             "imu_gaps": tracked.counts.imu_gaps,
             "milliseconds_per_image": files::milliseconds(tracked),
             "trajectory": self.report,
+            "final": tracked.adjusted.as_ref().map(|adjusted| json!({
+                "images": adjusted.images.len(),
+                "scale_std": adjusted.scale_std,
+                "adjustment": adjusted.report,
+                "calibration": adjusted::calibration_json(adjusted),
+                "trajectory": self.final_report,
+            })),
         })
     }
 
@@ -398,12 +450,18 @@ impl OdometryOutcome {
         if let Some(secs) = tracked.first_state_secs() {
             lines.push(("first state", format!("{secs:.2} s after the first image")));
         }
-        let ate = |e: Option<vidar_eval::ErrorStats>| e.map_or("-".into(), |e| format!("{:.4} m", e.rmse));
-        if let Some(report) = &self.report {
-            lines.push(("ATE SE(3)", ate(report.ate_se3_m)));
-            lines.push(("ATE Sim(3)", ate(report.ate_sim3_m)));
-            lines.push(("|ln s|", report.scale_error.map_or("-".into(), |s| format!("{s:.4}"))));
-        }
+        let metres = |e: Option<vidar_eval::ErrorStats>| e.map_or("-".into(), |e| format!("{:.4} m", e.rmse));
+        let mut both =
+            |label, of: &dyn Fn(&TrajectoryReport) -> String| match (&self.final_report, &self.report) {
+                (Some(adjusted), Some(live)) => {
+                    lines.push((label, format!("{} (live {})", of(adjusted), of(live))));
+                }
+                (Some(only), None) | (None, Some(only)) => lines.push((label, of(only))),
+                (None, None) => {}
+            };
+        both("ATE SE(3)", &|r| metres(r.ate_se3_m));
+        both("ATE Sim(3)", &|r| metres(r.ate_sim3_m));
+        both("|ln s|", &|r| r.scale_error.map_or("-".into(), |s| format!("{s:.4}")));
         for span in &tracked.lost {
             let at = vidar_core::Timestamp::from_nanos(span.from_ns);
             lines.push(("lost", format!("at {at} s: {}", span.reason)));

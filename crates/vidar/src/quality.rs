@@ -5,6 +5,7 @@ use nalgebra::Vector3;
 use serde_json::{Value, json};
 use std::collections::BTreeMap;
 use vidar_core::{Health, Timestamp};
+use vidar_odometry::bundle_adjustment::Adjusted;
 use vidar_odometry::initialization::InitFailureReason;
 use vidar_odometry::{LossReason, OdometryOutput, Status, Tracking};
 
@@ -24,6 +25,16 @@ pub struct TrackQuality {
     contradictions: usize,
     waits: usize,
     segments: BTreeMap<u32, SegmentQuality>,
+    adjusted: Option<AdjustedQuality>,
+}
+
+/// What the adjustment after the recording's end made of the states.
+#[derive(Clone, Copy, Debug)]
+struct AdjustedQuality {
+    images: usize,
+    first: Timestamp,
+    last: Timestamp,
+    scale_std: f64,
 }
 
 /// States of one segment.
@@ -68,6 +79,22 @@ impl TrackQuality {
         }
     }
 
+    /// The adjusted states replace those of the longest segment.
+    pub fn adjust(&mut self, adjusted: &Adjusted) {
+        let (Some(first), Some(last)) = (adjusted.images.first(), adjusted.images.last()) else { return };
+        self.adjusted = Some(AdjustedQuality {
+            images: adjusted.images.len(),
+            first: first.1.time,
+            last: last.1.time,
+            scale_std: adjusted.scale_std,
+        });
+    }
+
+    /// Images with a state in the one world that is mapped.
+    pub fn mapped_images(&self) -> usize {
+        self.adjusted.map_or_else(|| self.longest().map_or(0, |s| s.images), |a| a.images)
+    }
+
     /// Why the odometry never started: the refusal that was found most often, of the kind that was found more often. The last one
     /// alone may be an accident of where the recording ends.
     pub fn why_not_started(&self) -> Option<String> {
@@ -99,14 +126,20 @@ impl TrackQuality {
 
     /// σ(ln s) of the longest segment, without what no estimate sees; infinite where it is not observed.
     pub fn scale_std(&self) -> f64 {
-        self.longest().map_or(f64::INFINITY, SegmentQuality::scale_std)
+        let live = || self.longest().map_or(f64::INFINITY, SegmentQuality::scale_std);
+        self.adjusted.map_or_else(live, |a| a.scale_std)
     }
 
     /// Share of the recording's time within the longest segment, 0…1.
     pub fn covered(&self) -> f64 {
-        let (Some((first, last)), Some(segment)) = (self.times, self.longest()) else { return 0.0 };
+        let segment = self.longest().map(|s| (s.first, s.last));
+        let (Some((first, last)), Some((from, until))) =
+            (self.times, self.adjusted.map(|a| (a.first, a.last)).or(segment))
+        else {
+            return 0.0;
+        };
         let total = (last - first).as_secs_f64();
-        if total > 0.0 { (segment.last - segment.first).as_secs_f64() / total } else { 0.0 }
+        if total > 0.0 { (until - from).as_secs_f64() / total } else { 0.0 }
     }
 
     /// Share of the longest segment's images whose health is OK, 0…1.
@@ -116,7 +149,7 @@ impl TrackQuality {
 
     /// In words: "193 of 220 images, health OK in 97 % of them".
     pub fn words(&self) -> String {
-        let tracked = self.longest().map_or(0, |s| s.images);
+        let tracked = self.mapped_images();
         if tracked == 0 {
             return format!("0 of {} images", self.images);
         }
@@ -135,7 +168,7 @@ impl TrackQuality {
     pub fn json(&self) -> Value {
         json!({
             "images": self.images, "with_state": self.with_state, "losses": self.losses,
-            "mapped_images": self.longest().map_or(0, |s| s.images),
+            "mapped_images": self.mapped_images(), "is_adjusted": self.adjusted.is_some(),
             "covered_time_ratio": self.covered(), "healthy_ratio": self.healthy(),
             "health": self.longest().map(|s| &s.health),
             "scale_std": Some(self.scale_std()).filter(|s| s.is_finite()),

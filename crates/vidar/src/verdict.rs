@@ -77,7 +77,7 @@ impl Findings {
 
     /// What the odometry says of itself.
     pub fn track(&mut self, quality: &TrackQuality) {
-        let segment = quality.longest().map_or(0, |s| s.images);
+        let segment = quality.mapped_images();
         self.when(quality.covered() < GOOD_COVERAGE, Level::Caution, || {
             format!(
                 "{segment} of {} images have a state in one world, {:.0} % of the time",

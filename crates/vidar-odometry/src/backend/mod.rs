@@ -23,6 +23,7 @@ mod window;
 
 pub use config::{Linearisation, SmootherConfig};
 pub use covariance::CalibrationEstimate;
+pub(crate) use covariance::d_relative_d_poses;
 pub(crate) use dense::dot;
 pub use inertial::GaugePriorSigmas;
 pub(crate) use inertial::{

@@ -176,7 +176,7 @@ fn relative_pose_agrees_with_numeric_derivatives() {
         let b = pose_plus(&b, &d.fixed_rows::<6>(6).into_owned());
         (a.inverse() * b).minus(&here)
     };
-    let j = covariance::d_relative_d_poses(&a.world_from_body, &b.world_from_body);
+    let j = d_relative_d_poses(&a.world_from_body, &b.world_from_body);
     check_jacobian("relative pose", &j, f, &SVector::zeros(), 1e-6).unwrap();
 }
 

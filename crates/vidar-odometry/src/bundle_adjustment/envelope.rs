@@ -90,6 +90,16 @@ impl Envelope {
         }
     }
 
+    /// As [`Envelope::forward`] for `b` that is zero before `from`, worked out up to `until` and for the rows from `border` on.
+    pub(super) fn forward_within(&self, b: &mut [f64], from: usize, until: usize, border: usize) {
+        for i in (from..until.min(border)).chain(border..self.dim()) {
+            let row = self.row(i);
+            let (left, diagonal) = row.split_at(row.len() - 1);
+            let first = self.first[i].max(from);
+            b[i] = (b[i] - dot(&left[first - self.first[i]..], &b[first..i])) / diagonal[0];
+        }
+    }
+
     /// `L⁻ᵀ b` in place, for a factor.
     pub(super) fn backward(&self, b: &mut [f64]) {
         for i in (0..self.dim()).rev() {
@@ -142,6 +152,19 @@ mod tests {
         for (found, wanted) in x.iter().zip(expected.iter()) {
             assert!((found - wanted).abs() < 1e-12, "{found} instead of {wanted}");
         }
+    }
+
+    #[test]
+    fn a_part_of_the_forward_substitution_is_that_of_the_whole() {
+        let (envelope, _) = example(&[0, 0, 1, 1, 3, 4, 2, 0]);
+        let mut factor = envelope.clone();
+        assert!(envelope.factorise(&[0.0; 8], &mut factor));
+        let mut whole = vec![0.0; 8];
+        whole[3] = 1.0;
+        let mut part = whole.clone();
+        factor.forward(&mut whole);
+        factor.forward_within(&mut part, 3, 7, 7);
+        assert_eq!(whole, part);
     }
 
     #[test]

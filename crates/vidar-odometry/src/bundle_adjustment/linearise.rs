@@ -271,6 +271,11 @@ fn eliminate(problem: &Problem, block: &LandmarkBlock, inverse: &Matrix3<f64>, s
 }
 
 impl LandmarkBlock {
+    /// Standard deviation of the inverse distance with the states held, 1/m.
+    pub(super) fn inverse_distance_sigma(&self) -> f64 {
+        self.inverse.map_or(f64::INFINITY, |inverse| inverse[(2, 2)].sqrt())
+    }
+
     /// The landmark's step that belongs to a step of states and calibration.
     pub(super) fn step(&self, step: &[f64], calibration_offset: usize) -> Option<Vector3<f64>> {
         let mut gradient = self.gradient;

@@ -60,8 +60,9 @@ pub(crate) struct LoggedState {
 /// An image with all that it showed.
 #[derive(Clone, Debug)]
 pub(crate) struct LoggedImage {
-    /// The odometry's own number.
+    /// The odometry's own number, and the caller's.
     frame: FrameId,
+    pub(crate) caller_frame: FrameId,
     /// Its stamp, in the clock of the images.
     pub(crate) stamp: Timestamp,
     pub(crate) observations: Vec<LoggedObservation>,
@@ -111,11 +112,11 @@ impl TrackLog {
         self.images.last().is_none_or(|last| stamp - last.stamp >= LOG_PERIOD)
     }
 
-    /// Logs an image.
+    /// Logs an image, with the caller's number and its stamp.
     pub(crate) fn add_image<'a>(
         &mut self,
         frame: FrameId,
-        stamp: Timestamp,
+        (caller_frame, stamp): (FrameId, Timestamp),
         state: Option<LoggedState>,
         shown: impl Iterator<Item = (LandmarkId, &'a Pixel, Matrix2<f64>)>,
     ) {
@@ -125,7 +126,7 @@ impl TrackLog {
                 LoggedObservation::new(TrackKey { generation, track }, pixel, &covariance)
             })
             .collect();
-        self.images.push(LoggedImage { frame, stamp, observations, state });
+        self.images.push(LoggedImage { frame, caller_frame, stamp, observations, state });
     }
 
     /// Brings the states of images that the window still holds up to date.

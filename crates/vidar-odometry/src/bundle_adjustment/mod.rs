@@ -12,6 +12,7 @@
 mod envelope;
 mod grow;
 mod initial;
+mod keyframes;
 mod linearise;
 mod log;
 mod observation;
@@ -21,7 +22,7 @@ mod result;
 
 pub(crate) use log::LoggedState;
 pub use log::TrackLog;
-pub use result::{Adjusted, AdjustedCalibration, AdjustedKeyframe, AdjustmentReport};
+pub use result::{Adjusted, AdjustedCalibration, AdjustmentReport};
 
 use crate::imu::{ImuBuffer, ImuModel};
 use initial::Guess;

@@ -166,7 +166,7 @@ pub(super) fn project(
 }
 
 /// Direction from a camera at `place` to the landmark, world axes, scaled by the inverse distance from its origin.
-fn from_camera(landmark: &Landmark, place: &Vector3<f64>) -> Vector3<f64> {
+pub(super) fn from_camera(landmark: &Landmark, place: &Vector3<f64>) -> Vector3<f64> {
     landmark.direction + (landmark.origin - place) * landmark.inverse_distance
 }
 

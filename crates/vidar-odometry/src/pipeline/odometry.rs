@@ -452,7 +452,7 @@ impl Odometry {
         // Where the IMU alone carried the state it is no better than what the adjustment carries itself.
         let is_seen = matches!(status, Status::Tracking(tracking) if tracking.health != Health::Degraded);
         let state = state.filter(|_| is_seen).map(|state| LoggedState { segment: self.segment, state });
-        log.add_image(id, frame.time, state, shown);
+        log.add_image(id, (frame.id, frame.time), state, shown);
         if let Phase::Tracking(window) = &self.phase {
             log.follow(&window.smoother);
         }

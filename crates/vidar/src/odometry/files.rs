@@ -31,6 +31,14 @@ pub(super) fn write(
     if let Some(trajectory) = &outcome.trajectory {
         put_trajectory(&mut put, "trajectory/odometry_body", trajectory, &note)?;
     }
+    if let Some(trajectory) = &outcome.final_trajectory {
+        put_trajectory(
+            &mut put,
+            "trajectory/final_body",
+            trajectory,
+            &format!("{note}, adjusted after the end"),
+        )?;
+    }
     if let Some(keyframes) = keyframe_trajectory(&tracked.keyframes) {
         put_trajectory(&mut put, "trajectory/odometry_keyframes_camera", &keyframes, &note)?;
     }

@@ -24,10 +24,14 @@ pub use plan::{ExpectedWork, Plan, bytes};
 use crate::calibrate;
 use crate::camera_timing;
 use crate::config::{Config, Layered};
-use crate::engine::{Engine, EngineSetup, FrameStamp, MapEvent};
+use crate::engine::{Engine, EngineSetup, FrameStamp, MapEvent, PoseSource};
 use crate::error::{Error, ExitStatus};
 use crate::events::{CancelToken, Event, Events};
 use crate::input::{self, ImageFiles, Measurement};
+use crate::odometry::{
+    self,
+    adjusted::{self, AdjustedPoses},
+};
 use crate::run_folder::{OutputLocation, RunFolder};
 use crate::verdict::{StatedScale, Verdict};
 use place_recognition::PlaceRecognition;
@@ -127,6 +131,7 @@ pub fn run(request: &RunRequest, events: &Events, cancel: &CancelToken) -> Resul
     let mut dataset =
         events.stage("read", 0, || input::open_every_image(&request.path, &request.open, &config))?;
     dataset.warnings.extend(input::use_every_untimed_image(&dataset, &mut config));
+    let sigmas = adjusted::adjustable(&dataset, &config);
     calibrate::complete(&mut dataset, &mut config.odometry, &events, cancel)?;
     let (plan, source, places) =
         events.stage("plan", 0, || Plan::make(&dataset, &config, request.reference.as_deref()))?;
@@ -143,10 +148,18 @@ pub fn run(request: &RunRequest, events: &Events, cancel: &CancelToken) -> Resul
         })?;
         timing.iter().for_each(|w| events.warn(w));
     }
+    let poses = match &sigmas {
+        Some(sigmas) if plan.poses.is_odometry() => {
+            let tracked = odometry::track(&dataset, &config, Some(sigmas), &events, cancel, None)?;
+            tracked.adjusted.iter().for_each(|adjusted| adjusted::apply(adjusted, &mut dataset));
+            AdjustedPoses::new(&tracked)
+        }
+        _ => None,
+    };
 
     let context =
         Context { request, config: &config, dataset: &dataset, folder: &folder, events: &events, cancel };
-    let made = context.carry_out(plan, source, &places, &recorder).map(|outcome| RunOutcome {
+    let made = context.carry_out(plan, source, poses, &places, &recorder).map(|outcome| RunOutcome {
         seconds: clock.elapsed().as_secs_f64(),
         warnings: recorder.warnings(),
         ..outcome
@@ -181,11 +194,12 @@ impl Context<'_> {
         &self,
         plan: Plan,
         mut source: Source,
+        adjusted: Option<AdjustedPoses>,
         places: &PlaceRecognition,
         recorder: &Recorder,
     ) -> Result<RunOutcome, Error> {
         let Self { request, config, dataset, folder, events, cancel } = *self;
-        let map = self.build_map(&plan, &mut source, places)?;
+        let map = self.build_map(&plan, &mut source, adjusted, places)?;
         let evaluation =
             events.stage("evaluate", 0, || evaluate::evaluate(dataset, &plan, &map, config, events))?;
         let scale = trust::stated_scale(&map, plan.mode, input::unseen_scale_std(dataset, config));
@@ -222,12 +236,14 @@ impl Context<'_> {
         &self,
         plan: &Plan,
         source: &mut Source,
+        adjusted: Option<AdjustedPoses>,
         places: &PlaceRecognition,
     ) -> Result<MetricMap, Error> {
         let Self { config, dataset, folder, events, cancel, .. } = *self;
         let store = RunStore::new(folder.path(), dataset, plan, config)?;
         let images = ImageFiles(dataset);
-        let (poses, fallback) = plan.poses.open(dataset, config)?;
+        let (live, fallback) = plan.poses.open(dataset, config)?;
+        let poses = adjusted.map(|p| Box::new(p) as Box<dyn PoseSource>).or(live);
         let cancelled = || cancel.is_cancelled();
         let mut engine = Engine::new(EngineSetup {
             name: dataset.name.clone(),

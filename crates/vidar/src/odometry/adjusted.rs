@@ -1,0 +1,137 @@
+//! The adjustment of a recording after its end, as `vidar odometry` and `vidar run` use it: what may change, and the adjusted
+//! states as poses for the engine.
+
+use super::Tracked;
+use crate::config::Config;
+use crate::engine::{FrameStamp, FrameState, PoseReport, PoseSource};
+use crate::error::Error;
+use crate::input::TrajectorySource;
+use crate::quality::TrackQuality;
+use serde_json::{Value, json};
+use std::collections::BTreeMap;
+use vidar_core::{
+    BodyFrame, Duration, FrameId, OdometryKeyframe, Se3, SensorEvent, StampedPose, Trajectory, Warning,
+};
+use vidar_dataset::{CalibrationSource, Dataset};
+use vidar_odometry::bundle_adjustment::{Adjusted, AdjustedCalibration, CalibrationSigmas};
+
+/// Standard deviations of a calibration that was found from the recording's own tracks and gyroscope.
+const FOUND_FOCAL: f64 = 0.02;
+const FOUND_DISTORTION: f64 = 0.02;
+const FOUND_ROTATION_RAD: f64 = 0.02;
+
+/// What the adjustment may change of the camera; `None` where nothing is to be adjusted. `dataset` and `config` are as the user
+/// gave them: what was given is held.
+pub(crate) fn adjustable(dataset: &Dataset, config: &Config) -> Option<CalibrationSigmas> {
+    let settings = &config.odometry;
+    let by_default = CalibrationSigmas::default();
+    let clock = if settings.estimate_time_offset { by_default.time_offset_secs } else { 0.0 };
+    let readout = if settings.readout_ms.is_none() { by_default.readout_secs } else { 0.0 };
+    let given = CalibrationSigmas { time_offset_secs: clock, readout_secs: readout, ..by_default };
+    settings.adjust.then_some(match dataset.calibration {
+        CalibrationSource::Guessed => CalibrationSigmas {
+            rotation_rad: FOUND_ROTATION_RAD,
+            position_m: crate::calibrate::UNKNOWN_LEVER_M,
+            focal: FOUND_FOCAL,
+            distortion: FOUND_DISTORTION,
+            ..given
+        },
+        _ => given,
+    })
+}
+
+/// Puts the adjusted calibration into the recording's rig.
+pub(crate) fn apply(adjusted: &Adjusted, dataset: &mut Dataset) {
+    let Some(camera) = dataset.rig.cameras.get_mut(dataset.camera.index()) else { return };
+    camera.model = adjusted.calibration.camera.clone();
+    camera.body_from_camera = adjusted.calibration.body_from_camera;
+    camera.time_offset = Duration::from_secs_f64(adjusted.calibration.time_offset_secs);
+}
+
+/// The calibration as adjusted, with standard deviations; zero where it was held.
+pub(super) fn calibration_json(adjusted: &Adjusted) -> Value {
+    let AdjustedCalibration { camera, body_from_camera, time_offset_secs, readout_secs, sigmas } =
+        &adjusted.calibration;
+    json!({
+        "model": camera.name(),
+        "intrinsics": camera.parameters(), "intrinsics_std": &sigmas[8..],
+        "time_offset_ms": 1e3 * time_offset_secs, "time_offset_std_ms": 1e3 * sigmas[0],
+        "readout_ms": 1e3 * readout_secs, "readout_std_ms": 1e3 * sigmas[1],
+        "body_from_camera_xyzw": body_from_camera.rotation.quaternion_xyzw(), "rotation_std_rad": &sigmas[2..5],
+        "body_from_camera_m": body_from_camera.translation.as_slice(), "position_std_m": &sigmas[5..8],
+    })
+}
+
+/// Poses of the body at every adjusted image.
+pub(super) fn trajectory(adjusted: &Adjusted) -> Option<Trajectory> {
+    let poses = adjusted
+        .images
+        .iter()
+        .map(|(_, state)| StampedPose { time: state.time, world_from_body: state.world_from_body });
+    Trajectory::new(BodyFrame::Imu, poses.collect()).ok()
+}
+
+/// Adjusted states as the engine's poses.
+pub(crate) struct AdjustedPoses {
+    poses: BTreeMap<FrameId, Se3>,
+    keyframes: BTreeMap<FrameId, OdometryKeyframe>,
+    warnings: Vec<Warning>,
+    quality: TrackQuality,
+}
+
+impl AdjustedPoses {
+    /// The adjusted states of what was tracked; `None` where there are none.
+    pub(crate) fn new(tracked: &Tracked) -> Option<Self> {
+        let adjusted = tracked.adjusted.as_ref()?;
+        let place = adjusted.calibration.body_from_camera;
+        Some(Self {
+            poses: adjusted.images.iter().map(|(id, state)| (*id, state.world_from_body * place)).collect(),
+            keyframes: adjusted.keyframes.iter().map(|k| (k.frame_id, k.clone())).collect(),
+            warnings: tracked.warnings(),
+            quality: tracked.quality.clone(),
+        })
+    }
+}
+
+impl PoseSource for AdjustedPoses {
+    fn source(&self) -> TrajectorySource {
+        TrajectorySource::Odometry
+    }
+
+    fn needs_sensors(&self) -> bool {
+        false
+    }
+
+    fn push(&mut self, event: SensorEvent) -> Result<Vec<PoseReport>, Error> {
+        let SensorEvent::Image(frame) = event else { return Ok(Vec::new()) };
+        Ok(self.push_stamp(&FrameStamp { frame_id: frame.id, time: frame.time, camera: frame.camera }))
+    }
+
+    fn push_stamp(&mut self, stamp: &FrameStamp) -> Vec<PoseReport> {
+        let FrameStamp { frame_id, time, .. } = *stamp;
+        vec![match self.poses.get(&frame_id) {
+            Some(world_from_camera) => PoseReport::Posed {
+                state: FrameState { frame_id, time, segment: 0, world_from_camera: *world_from_camera },
+                keyframe: self.keyframes.remove(&frame_id).map(Box::new),
+                revised: Vec::new(),
+            },
+            None => PoseReport::NotPosed { time },
+        }]
+    }
+
+    fn finish(&mut self) -> Vec<PoseReport> {
+        Vec::new()
+    }
+
+    fn warnings(&self) -> Vec<Warning> {
+        self.warnings.clone()
+    }
+
+    fn why_no_pose(&self) -> String {
+        self.quality.why_not_started().unwrap_or_else(|| "it got no image".into())
+    }
+
+    fn quality(&self) -> Option<&TrackQuality> {
+        Some(&self.quality)
+    }
+}
