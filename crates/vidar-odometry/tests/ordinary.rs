@@ -5,9 +5,10 @@
 
 use std::sync::OnceLock;
 use tempfile::TempDir;
-use vidar_core::{BodyFrame, SensorEvent, StampedPose, Trajectory};
+use vidar_core::{BodyFrame, Duration, NavState, SensorEvent, StampedPose, Trajectory};
 use vidar_dataset::{Dataset, OpenOptions};
 use vidar_eval::{TrajectoryEvalConfig, evaluate_trajectory};
+use vidar_odometry::bundle_adjustment::CalibrationSigmas;
 use vidar_odometry::{Odometry, OdometryConfig, OdometryOutput, Status};
 use vidar_synth::{Lens, SynthConfig, write_sequence};
 
@@ -76,13 +77,46 @@ fn clock_and_readout_are_found_and_the_trajectory_is_metric() {
 }
 
 #[test]
-fn a_live_odometry_corrects_clock_and_readout_on_the_way() {
+fn a_live_odometry_corrects_clock_and_readout_on_the_way_and_the_adjustment_afterwards_reaches_every_image() {
     let (_, dataset) = recording();
     let config = OdometryConfig::default();
-    let odometry = Odometry::new(&dataset.rig, dataset.camera, &config).unwrap();
-    let outputs = run(dataset, odometry);
+    let mut odometry = Odometry::new(&dataset.rig, dataset.camera, &config).unwrap();
+    odometry.keep_log();
+    let mut outputs: Vec<OdometryOutput> =
+        events(dataset).filter_map(|e| odometry.push(e).unwrap()).collect();
+    outputs.extend(odometry.finish());
     let last = outputs.last().unwrap();
     assert!(matches!(last.status, Status::Tracking(_)), "{:?}", last.status);
     let with_state = outputs.iter().filter(|o| o.tracking().is_some()).count();
     assert!(2 * with_state > outputs.len(), "{with_state} of {}", outputs.len());
+
+    let adjusted = odometry.adjust(&CalibrationSigmas::default()).unwrap();
+    assert!(adjusted.is_consistent(), "{:?}", adjusted.report);
+    assert!(adjusted.images.len() + 2 >= outputs.len(), "{} of {}", adjusted.images.len(), outputs.len());
+    let calibration = &adjusted.calibration;
+    let offset_ms = 1e3 * (calibration.time_offset_secs + STAMP_DELAY_SECS);
+    let readout_ms = 1e3 * (calibration.readout_secs - READOUT_SECS);
+    assert!(offset_ms.abs() < 1.0, "clock off by {offset_ms} ms, stated {}", 1e3 * calibration.sigmas[0]);
+    assert!(readout_ms.abs() < 1.5, "readout off by {readout_ms} ms, stated {}", 1e3 * calibration.sigmas[1]);
+    // Ground truth is in the IMU's clock.
+    let offset = Duration::from_secs_f64(calibration.time_offset_secs);
+    let pose =
+        |s: &NavState| StampedPose { time: s.time + offset, world_from_body: s.world_from_body };
+    let poses = adjusted.images.iter().map(|(_, state)| pose(state)).collect();
+    let estimate = Trajectory::new(BodyFrame::Imu, poses).unwrap();
+    let truth = dataset.ground_truth.as_ref().unwrap();
+    let report = evaluate_trajectory(&estimate, truth, &TrajectoryEvalConfig::default()).unwrap();
+    let (ate, scale) = (report.ate_se3_m.unwrap().rmse, report.scale_error.unwrap());
+    let path = estimate.path_length_m();
+    eprintln!("ATE {ate:.4} m over {path:.2} m, |ln s| {scale:.4} at σ {:.4}", adjusted.scale_std);
+    assert!(ate < 0.005 * path, "ATE {ate} m over {path} m");
+    assert!(scale < (3.0 * adjusted.scale_std).max(0.01), "|ln s| {scale} at σ {}", adjusted.scale_std);
+    assert!(adjusted.keyframes.iter().all(|k| k.landmarks.len() < 400));
+    let covariances = adjusted.keyframes.iter().filter_map(|k| k.previous.map(|(_, c)| c));
+    assert!(covariances.clone().count() + 1 == adjusted.keyframes.len());
+    for covariance in covariances {
+        assert!(covariance.symmetric_eigenvalues().min() > 0.0, "{covariance}");
+    }
+    let again = odometry.adjust(&CalibrationSigmas::default()).unwrap();
+    assert!(again == adjusted, "the same log gave another adjustment");
 }
