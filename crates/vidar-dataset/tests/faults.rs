@@ -128,11 +128,14 @@ fn truncated_images_fail_when_they_are_loaded() {
 }
 
 #[test]
-fn an_image_of_another_size_is_refused() {
+fn an_image_of_another_size_is_left_out_and_told_and_one_that_changes_later_is_refused() {
     let f = euroc();
+    let whole = f.open().unwrap();
     f.write(&format!("mav0/cam0/data/{}.png", frame_ns(5)), gray_png(12, 16, 0));
+    fails(whole.load_image(&whole.images[5]), &["12x16", "16x12"]);
     let d = f.open().unwrap();
-    fails(d.load_image(&d.images[5]), &["12x16", "16x12"]);
+    assert_eq!(d.images.len() + 1, whole.images.len());
+    assert!(warning(&d, "image-size").message.contains("the first is 12x16"), "{:?}", d.warnings);
     f.edit("mav0/cam0/sensor.yaml", |s| s.replace("[16, 12]", "[640, 480]"));
     fails(f.open(), &["image is 16x12", "camera is 640x480"]);
 }

@@ -124,7 +124,10 @@ fn bounds_decide_what_is_refused_and_rigid_refinement_can_follow() {
     let refine = SurfaceEvalConfig { on_rejection: OnRejection::RefineRigid, ..narrow };
     let refined = evaluate_surface(&estimate, &reference, &off, &refine).unwrap();
     assert_eq!(refined.scale_native, 1.0);
-    assert!(refined.chamfer.accuracy_mean_m < kept.chamfer.accuracy_mean_m);
+    // The closest pairs decide the refinement, not F, which a wrong scale may even lower.
+    assert_ne!(refined.placement.truth_from_estimate, kept.placement.truth_from_estimate);
+    // The rigid placement is refined either way.
+    assert_eq!(refined.rigid, kept.rigid);
     // The rejected refinement is still a candidate of the free placement.
     assert!(
         kept.delta_f > 0.3 && (kept.scale_free - 1.1).abs() < 0.01,
