@@ -97,7 +97,9 @@ pub fn calibrate(
         body_from_camera: c.body_from_camera,
         time_offset: c.time_offset,
     });
-    let is_assumed = dataset.warnings.iter().any(|w| w.kind == "imu-noise");
+    // The reader of EuRoC's layout takes EuRoC's own where no file gives any, and says so.
+    let is_assumed = dataset.rig.imu == Some(ImuNoise::EUROC)
+        && dataset.warnings.iter().any(|w| w.kind == "imu-noise");
     let mut outcome = CalibrateOutcome {
         name: dataset.name.clone(),
         size: size_of(&dataset),

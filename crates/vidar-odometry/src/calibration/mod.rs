@@ -61,7 +61,7 @@ const CENTRE_FLOOR: f64 = 0.004;
 
 /// Few stretches tell little of errors that each of them shares: standard deviations are multiplied by 1 + this over their
 /// number (simulated recordings of 3 to 20 s).
-const FEW_STRETCHES: f64 = 3.0;
+const FEW_STRETCHES: f64 = 1.0;
 
 /// A number of the calibration.
 #[derive(Clone, Copy, Debug, PartialEq)]
