@@ -34,6 +34,7 @@ pub fn odometry(args: &OdometryArgs, context: &Context) -> Outcome {
         print::json(&value);
     } else {
         print::pairs(outcome.summary_lines());
+        print::warnings(&outcome.warnings);
     }
     Ok(outcome.status)
 }
