@@ -13,8 +13,8 @@ mod source;
 mod store;
 mod views;
 
+pub(crate) use evaluate::sampled;
 pub use evaluate::{DepthScore, Evaluation};
-pub(crate) use evaluate::{placement_start, sampled};
 pub use map::MetricMap;
 pub use outputs::pose_of;
 pub use plan::{ExpectedWork, Plan, bytes};
