@@ -1,5 +1,6 @@
-//! Project checks, run by CI: `cargo xtask check` runs all, or name one of `layers`, `names`, `size`, `licences`.
+//! Project checks, run by CI: `cargo xtask check` runs all, or name one of `layers`, `circles`, `names`, `size`, `licences`.
 
+mod circles;
 mod layers;
 mod licences;
 mod text;
@@ -11,8 +12,9 @@ fn main() -> Result<()> {
     let which = std::env::args().nth(1).unwrap_or_else(|| "check".into());
     let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("..");
     type Check = fn(&Path) -> Result<Vec<String>>;
-    let all: [(&str, Check); 4] = [
+    let all: [(&str, Check); 5] = [
         ("layers", layers::check),
+        ("circles", circles::check),
         ("names", text::check_names),
         ("size", text::check_size),
         ("licences", licences::check),
@@ -20,7 +22,7 @@ fn main() -> Result<()> {
     let wanted = which.strip_prefix("check-").unwrap_or(&which);
     let chosen: Vec<_> = all.iter().filter(|(name, _)| wanted == "check" || wanted == *name).collect();
     if chosen.is_empty() {
-        bail!("unknown check {which:?}; known: check, layers, names, size, licences");
+        bail!("unknown check {which:?}; known: check, layers, circles, names, size, licences");
     }
     let mut failures = 0;
     for (name, check) in chosen {

@@ -23,7 +23,7 @@ use vidar_core::{
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash, Serialize, Deserialize, schemars::JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum PoseMode {
-    /// Pictures alone: the network finds poses and intrinsics in a frame and unit of its own.
+    /// Images alone: the network finds poses and intrinsics in a frame and unit of its own.
     #[default]
     Free,
     /// Prior poses and intrinsics are given to the network, and depth comes out in their frame and metres.
@@ -92,7 +92,7 @@ impl Da3Model {
     }
 
     /// From now on keeps the tokens by which a place can be told again ([`Da3Model::take_place_tokens`]): those of the last
-    /// block before views look at each other, so that a picture's do not depend on what it was seen with.
+    /// block before attention across views, so that an image's do not depend on what it was seen with.
     pub fn keep_place_tokens(&mut self) {
         let backbone = &self.network.config().main().backbone;
         self.place_layer = Some(backbone.alternate_from.unwrap_or(backbone.depth).saturating_sub(1));

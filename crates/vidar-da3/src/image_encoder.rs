@@ -1,4 +1,4 @@
-//! The vision transformer alone, as DINOv2 publishes it (Oquab et al. 2023): a picture in, a class token and patch tokens out.
+//! The vision transformer alone, as DINOv2 publishes it (Oquab et al. 2023): an image in, a class token and patch tokens out.
 //!
 //! Depth Anything's backbone is DINOv2's with views that look at each other; without that it is DINOv2's own, key for
 //! key. Place recognition by SALAD stands on a DINOv2 ViT-B/14.
@@ -16,7 +16,7 @@ const NORM_EPS: f32 = 1e-6;
 /// Channels per attention head in every published DINOv2.
 const HEAD: usize = 64;
 
-/// Tokens of a picture after the final norm.
+/// Tokens of an image after the final norm.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ImageTokens {
     /// The class token, `[channels]`.
@@ -88,7 +88,7 @@ impl ImageEncoder {
         self.dim
     }
 
-    /// Encodes normalised pixels `[3, rows, columns]` of one picture; both sides are multiples of 14.
+    /// Encodes normalised pixels `[3, rows, columns]` of one image; both sides are multiples of 14.
     ///
     /// # Errors
     /// [`Da3Error::BadInput`] for other sizes.

@@ -8,14 +8,14 @@
 //! use vidar_da3::{Da3, Da3Options, InferOptions, Inputs};
 //! # fn main() -> Result<(), vidar_da3::Da3Error> {
 //! let model = Da3::open("DA3-SMALL".as_ref(), &Da3Options::default())?;
-//! let pictures: Vec<Image<[u8; 3]>> = vec![Image::filled(640, 480, [90, 90, 90]); 2];
-//! let prediction = model.infer(&Inputs::images(&pictures), &InferOptions::default())?;
+//! let images: Vec<Image<[u8; 3]>> = vec![Image::filled(640, 480, [90, 90, 90]); 2];
+//! let prediction = model.infer(&Inputs::images(&images), &InferOptions::default())?;
 //! let depth = &prediction.depth[0]; // 504 × 378
 //! # let _ = depth; Ok(()) }
 //! ```
 //!
 //! The conventions inside are the network's: poses `camera_from_world`, intrinsics with their origin at the *edge* of
-//! the top-left pixel ([`pose::to_edge`], [`pose::from_edge`]). [`Da3Model`] speaks `VIDAR`'s.
+//! the top-left pixel ([`pose::to_edge`], [`pose::from_edge`]). [`Da3Model`] uses `VIDAR`'s.
 
 pub mod align;
 mod arithmetic;

@@ -12,7 +12,7 @@ pub struct MemoryEstimate {
     pub weights: u64,
     /// Largest sum of buffers during a run, the answer included.
     pub working: u64,
-    /// The answer: depth and confidence, rays and pictures aside.
+    /// The output: depth and confidence, rays and images aside.
     pub answer: u64,
 }
 
@@ -36,7 +36,7 @@ pub fn memory_estimate(
         pixels: (height * width) as u64,
     };
     let answer = 2 * size.views * size.pixels * FLOAT;
-    // Pictures as bytes and as normalised numbers.
+    // Images as bytes and as normalised numbers.
     let input = size.views * size.pixels * (3 + 3 * FLOAT);
     let network = match &config.networks {
         Networks::Single(net) => network(net, &size, wants_rays),

@@ -3,7 +3,7 @@
 //! The head writes, for each cell of a grid, the direction d and origin of its ray in the world and a confidence w.
 //! With cell positions x on an image of size 2 × 2 about the origin, `d ~ H x`, so H is fitted by weighted RANSAC over
 //! direct linear transforms and split as `H = R L` with R orthonormal (`world_from_camera`) and L lower triangular: its
-//! diagonal holds the inverse focal lengths, its last row the principal point. The camera's place is the weighted mean
+//! diagonal holds the inverse focal lengths, its last row the principal point. The camera centre is the weighted mean
 //! of the ray origins. Samples come from a fixed seed; the official code's are unseeded.
 
 use crate::error::Da3Error;
@@ -30,14 +30,14 @@ pub struct RayMap {
 pub struct RayCamera {
     /// Its pose.
     pub camera_from_world: Matrix4<f64>,
-    /// Focal lengths x and y in halves of the picture's sides.
+    /// Focal lengths x and y in halves of the image's sides.
     pub focal: [f64; 2],
-    /// Principal point on a picture of 2 × 2 with its origin at the top-left edge.
+    /// Principal point on an image of 2 × 2 with its origin at the top-left edge.
     pub principal_point: [f64; 2],
 }
 
 impl RayCamera {
-    /// Intrinsics of a picture of `width` × `height`, origin at the edge of the top-left pixel.
+    /// Intrinsics of an image of `width` × `height`, origin at the edge of the top-left pixel.
     pub fn intrinsics(&self, width: usize, height: usize) -> Matrix3<f64> {
         let (half_width, half_height) = (width as f64 / 2.0, height as f64 / 2.0);
         let [fx, fy] = self.focal;
@@ -81,7 +81,7 @@ pub fn sample_table(cells: usize) -> Vec<[usize; SAMPLE]> {
         .collect()
 }
 
-/// One cell: its place on the picture, where its ray meets the plane z = 1, its weight.
+/// One cell: its position in the image, where its ray meets the plane z = 1, its weight.
 #[derive(Clone, Copy)]
 struct Point {
     x: f64,

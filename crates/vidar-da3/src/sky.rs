@@ -13,7 +13,7 @@ pub const MAX_SAMPLES: usize = 100_000;
 const SEED: u32 = 42;
 
 /// Sets the depth of sky pixels to the 0.99 quantile of the others, over all views together. At most 100,000 pixels
-/// are looked at; the official code draws them anew each time, here the seed is fixed.
+/// are used; the official code draws them anew each time, here the seed is fixed.
 pub fn fill(depth: &mut [f32], sky: &[f32]) {
     let open: Vec<f32> = depth.iter().zip(sky).filter(|(_, s)| is_open(**s)).map(|(d, _)| *d).collect();
     if open.len() <= MIN_PIXELS || depth.len() - open.len() <= MIN_PIXELS {

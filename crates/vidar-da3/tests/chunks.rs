@@ -46,7 +46,7 @@ fn pictures_alone_give_geometry_in_the_models_own_frame() {
     for view in &found.views {
         let k = &view.intrinsics;
         assert_eq!((k.width, k.height, view.depth.image().width()), (56, 42, 56));
-        // The decoder's principal point is the middle of the picture: in VIDAR's convention half a pixel less.
+        // The decoder's principal point is the middle of the image: in VIDAR's convention half a pixel less.
         assert_eq!((k.cx, k.cy), (27.5, 20.5));
         assert!(view.confidence.image().data().iter().all(|c| (0.0..1.0).contains(c)));
         assert!(view.depth.image().data().iter().all(|d| *d > 0.0));

@@ -33,7 +33,7 @@ fn pictures(views: usize) -> Vec<Image<[u8; 3]>> {
         .collect()
 }
 
-/// Small pictures' size on the network's side: rows and columns.
+/// Small images' size on the network's side: rows and columns.
 const SIZE: (usize, usize) = (56, 84);
 
 fn small() -> InferOptions {

@@ -9,8 +9,7 @@ use crate::sample::{CONFIDENCE_ONE, SampledView};
 use crate::{FusionConfig, FusionError, IntegrationStats};
 use nalgebra::Vector3;
 use rayon::prelude::*;
-use rustc_hash::{FxBuildHasher, FxHashMap};
-use std::hash::BuildHasher;
+use rustc_hash::FxHashMap;
 use vidar_core::{AlignedView, PointCloud, Warning};
 
 /// Sums over the pixels of one voxel. 65535 views of 2³² pixels' weights would be needed to overflow them.

@@ -108,7 +108,7 @@ impl Buffer {
         self.len == 0
     }
 
-    /// Writes numbers from place `at` on, before anything that is recorded but not yet sent off.
+    /// Writes numbers from place `at` on, before anything that is recorded but not yet submitted.
     ///
     /// # Panics
     /// When they do not fit.

@@ -252,7 +252,7 @@ impl Gpu {
         self.shared.failure.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Waits until everything sent off is done.
+    /// Waits until all submitted work is done.
     ///
     /// # Errors
     /// As [`Gpu::check`].

@@ -1,4 +1,4 @@
-//! Operations recorded and sent off together.
+//! Operations recorded and submitted together.
 
 use crate::buffer::Buffer;
 use crate::device::{Gpu, IMMEDIATES};

@@ -35,7 +35,7 @@ pub struct Conv2d {
 }
 
 impl Conv2d {
-    /// Puts a layer together; the border is `padding` zeros on each side.
+    /// Constructs a layer; the border is `padding` zeros on each side.
     ///
     /// # Errors
     /// [`NnError::WeightShape`] and, for a stride of zero or an empty kernel, [`NnError::Setting`].
@@ -153,7 +153,7 @@ impl Columns for Conv2d {
     }
 }
 
-/// An NHWC map of one picture: `[rows, cols, channels]`, row-major.
+/// An NHWC map of one image: `[rows, cols, channels]`, row-major.
 #[derive(Debug, Clone, Copy)]
 pub struct MapRef<'a> {
     /// The numbers.
@@ -183,7 +183,7 @@ pub struct ConvTranspose2d {
 }
 
 impl ConvTranspose2d {
-    /// Puts a layer together.
+    /// Constructs a layer.
     ///
     /// # Errors
     /// [`NnError::WeightShape`] when the kernel is not square or the shapes do not fit.

@@ -5,8 +5,8 @@
 //! operation with kernels asks for one, so that a forced kernel set is used throughout. They run on the rayon pool they are
 //! called in and give the same bits for any number of threads.
 //!
-//! Slice lengths are the caller's own doing and asserted; everything that comes from a file is checked when it is read
-//! ([`Checkpoint`]) or when a layer is put together (`new`), and answered with an error.
+//! Slice lengths are the responsibility of the caller and are asserted; everything that comes from a file is checked when it is read
+//! ([`Checkpoint`]) or when a layer is constructed (`new`), and reported as an error.
 
 pub mod activation;
 mod attention;

@@ -57,7 +57,7 @@ pub struct Linear {
 }
 
 impl Linear {
-    /// Puts a layer together; the weight stays where it is.
+    /// Constructs a layer; the weight is not copied.
     ///
     /// # Errors
     /// [`NnError::WeightShape`] when the shapes do not fit.

@@ -23,7 +23,7 @@ pub struct LayerNorm {
 const TASK_ROWS: usize = 32;
 
 impl LayerNorm {
-    /// Puts a layer together from `[features]` vectors. DA3 uses eps 1e-6 in its blocks and 1e-5 elsewhere.
+    /// Constructs a layer from `[features]` vectors. DA3 uses eps 1e-6 in its blocks and 1e-5 elsewhere.
     ///
     /// # Errors
     /// [`NnError::WeightShape`] when the shapes do not fit.
@@ -77,7 +77,7 @@ impl LayerNorm {
         });
     }
 
-    /// Normalises each row of `x` (`[rows, features]`) where it stands.
+    /// Normalises each row of `x` (`[rows, features]`) in place.
     ///
     /// # Panics
     /// When the length is no whole number of rows.
@@ -98,7 +98,7 @@ impl LayerNorm {
     }
 }
 
-/// Some rows; without `x` they are normalised where they stand.
+/// Some rows; without `x` they are normalised in place.
 struct Rows<'a> {
     norm: NormRef<'a>,
     x: Option<&'a [f32]>,

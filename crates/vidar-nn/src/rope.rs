@@ -46,7 +46,7 @@ impl RopeTable {
         &self.sin
     }
 
-    /// Turns one head of token `token` where it stands.
+    /// Turns one head of token `token` in place.
     #[inline(always)] // into code that is compiled for a kernel set
     pub fn rotate(&self, token: usize, head: &mut [f32]) {
         debug_assert_eq!(head.len(), self.head_dim);

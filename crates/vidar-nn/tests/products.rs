@@ -177,7 +177,7 @@ fn empty_inputs_give_empty_or_bias_only_outputs() {
     assert_eq!(wide(&[1.0]), [1.0]);
 }
 
-/// Numbers whose rows share a part that is ten times as large as what tells them apart.
+/// Numbers whose rows share a part that is ten times as large as what distinguishes them.
 fn with_common_part(numbers: &mut Numbers, rows: usize, width: usize) -> Vec<f32> {
     let common: Vec<f32> = numbers.vec(width).iter().map(|x| 10.0 * x).collect();
     (0..rows * width).map(|i| common[i % width] + numbers.next()).collect()

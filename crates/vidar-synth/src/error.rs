@@ -2,7 +2,7 @@
 
 use std::path::{Path, PathBuf};
 use thiserror::Error;
-use vidar_core::{CameraError, ChunkId, TrajectoryError};
+use vidar_core::{CameraError, TrajectoryError};
 
 /// Why a synthetic sequence cannot be made.
 #[derive(Debug, Error)]
@@ -58,16 +58,6 @@ pub enum SynthError {
         /// Which file.
         path: PathBuf,
         /// What is wrong with it.
-        reason: String,
-    },
-    /// Two neighbouring chunks do not share enough to be joined.
-    #[error("chunks {earlier} and {later} cannot be joined: {reason}")]
-    Unchained {
-        /// The earlier chunk.
-        earlier: ChunkId,
-        /// The later chunk.
-        later: ChunkId,
-        /// Why not.
         reason: String,
     },
     /// The configuration cannot be written as TOML.

@@ -15,7 +15,6 @@ mod flight;
 mod image_file;
 mod imu;
 mod layout;
-pub mod odometry;
 mod photometry;
 pub mod predict;
 mod presets;

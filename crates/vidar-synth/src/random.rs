@@ -23,10 +23,6 @@ pub(crate) enum Purpose {
     ChunkField(u32),
     /// Deformation that belongs to a frame.
     FrameField(u32),
-    /// Steps of a simulated odometry.
-    Odometry,
-    /// Points that a simulated odometry sees.
-    Landmarks,
     /// Kind of place and flight of a room for clips.
     ClipRoom,
     /// Camera and path of a clip.
@@ -70,8 +66,6 @@ pub(crate) fn stream(seed: u64, purpose: Purpose) -> ChaCha8Rng {
         Purpose::Chunk(k) => (6, u64::from(k)),
         Purpose::ChunkField(k) => (7, u64::from(k)),
         Purpose::FrameField(k) => (8, u64::from(k)),
-        Purpose::Odometry => (10, 0),
-        Purpose::Landmarks => (11, 0),
         Purpose::ClipRoom => (14, 0),
         Purpose::Clip(k) => (15, u64::from(k)),
         Purpose::ClipNoise(k) => (16, u64::from(k)),

@@ -7,12 +7,9 @@ use std::sync::Arc;
 use vidar_core::model::ChunkFrame;
 use vidar_core::{
     BodyFrame, ChunkId, ChunkView, ChunkViews, FrameId, FrameImage, GeometryModel, Image, LieGroup,
-    ModelError, Pinhole, Se3, StampedPose, Timestamp, Trajectory, umeyama_sim3,
+    ModelError, Pinhole, Se3, StampedPose, Timestamp, Trajectory,
 };
-use vidar_synth::predict::{
-    Conditioning, PredictionErrors, SyntheticModel, TruePlace, chain_chunks, chunk_ranges, predict_chunk,
-    true_views,
-};
+use vidar_synth::predict::{Conditioning, PredictionErrors, SyntheticModel};
 use vidar_synth::{Simulation, SynthConfig, SynthError, write_sequence};
 
 fn tiny() -> SynthConfig {
@@ -134,63 +131,4 @@ fn a_simulated_network_predicts_what_it_is_shown() {
     assert!(matches!(posed.predict(&late).unwrap_err(), ModelError::BadView { frame: FrameId(4), .. }));
     let none = posed.predict(&ChunkViews { id: ChunkId(0), views: Vec::new() }).unwrap_err();
     assert!(matches!(none, ModelError::TooFewViews { .. }));
-}
-
-#[test]
-fn chunks_are_cut_by_the_references_rule() {
-    let cut = |n, size, overlap| chunk_ranges(n, size, overlap).unwrap();
-    assert_eq!(cut(10, 30, 10), vec![0..10; 1]);
-    assert_eq!(cut(30, 30, 10), vec![0..30; 1]);
-    assert_eq!(cut(31, 30, 10), [0..30, 20..31]);
-    assert_eq!(cut(50, 30, 10), [0..30, 20..50]);
-    assert_eq!(cut(7, 3, 0), [0..3, 3..6, 6..7]);
-    assert!(cut(0, 3, 0).is_empty());
-    assert!(chunk_ranges(9, 3, 3).is_err() && chunk_ranges(9, 0, 0).is_err());
-}
-
-#[test]
-fn a_chain_of_chunks_is_one_reconstruction_up_to_scale_and_drifts() {
-    let simulation = Simulation::new(&tiny(), None).unwrap();
-    let place = |k: usize| {
-        let time = simulation.frame_time(k);
-        let world_from_camera = simulation.world_from_camera(time).unwrap();
-        TruePlace { frame_id: FrameId(k as u32), time, world_from_camera }
-    };
-    let intrinsics = Pinhole::new(45.0, 45.0, 41.5, 27.5, 84, 56).unwrap();
-    let truth = true_views(simulation.world(), &(0..20).map(place).collect::<Vec<_>>(), &intrinsics);
-    let chained = |errors: &PredictionErrors| {
-        let chunks: Vec<_> = chunk_ranges(20, 8, 4)
-            .unwrap()
-            .into_iter()
-            .enumerate()
-            .map(|(k, range)| predict_chunk(ChunkId(k as u32), &truth[range], None, errors, 5).unwrap())
-            .collect();
-        chain_chunks(&chunks).unwrap()
-    };
-    let residual = |views: &[vidar_core::ViewGeometry]| {
-        let (a, b): (Vec<_>, Vec<_>) = views
-            .iter()
-            .zip(&truth)
-            .map(|(v, t)| (v.chunk_from_camera.translation, t.world_from_camera.translation))
-            .unzip();
-        let fit = umeyama_sim3(&a, &b).unwrap();
-        (a.iter().zip(&b).map(|(a, b)| (fit.act(a) - b).norm_squared()).sum::<f64>() / 20.0).sqrt()
-    };
-    let gauges = PredictionErrors {
-        gauge_scale_sigma: 0.3,
-        gauge_rotation_deg: 50.0,
-        gauge_shift_m: 2.0,
-        ..PredictionErrors::NONE
-    };
-    let clean = chained(&gauges);
-    assert_eq!(clean.iter().map(|v| v.frame_id.0).collect::<Vec<_>>(), (0..20).collect::<Vec<_>>());
-    assert!(residual(&clean) < 1e-5, "{}", residual(&clean));
-    let real = residual(&chained(&PredictionErrors::default()));
-    assert!((0.002..0.2).contains(&real), "{real} m");
-    let apart = [
-        predict_chunk(ChunkId(0), &truth[..4], None, &gauges, 5).unwrap(),
-        predict_chunk(ChunkId(1), &truth[4..8], None, &gauges, 5).unwrap(),
-    ];
-    let refused = chain_chunks(&apart).unwrap_err();
-    assert!(refused.to_string().starts_with("chunks 0 and 1 cannot be joined"), "{refused}");
 }

@@ -2,11 +2,12 @@
 #![allow(clippy::print_stdout)] // an example prints
 
 use std::sync::Arc;
+use vidar_align::streaming::chunk_ranges;
 use vidar_align::{
     Aligner, AlignerConfig, ChunkObservation, CouplingMode, FrameObservation, Placement, PosePrior,
 };
 use vidar_core::{ChunkId, ChunkView, ChunkViews, FrameId, FrameImage, GeometryModel, Image, Pinhole};
-use vidar_synth::predict::{Conditioning, PredictionErrors, SyntheticModel, chunk_ranges};
+use vidar_synth::predict::{Conditioning, PredictionErrors, SyntheticModel};
 use vidar_synth::{Simulation, SynthConfig};
 
 type Failure = Box<dyn std::error::Error>;
@@ -41,6 +42,7 @@ fn align(simulation: &Arc<Simulation>) -> Result<Placement, Failure> {
     let mut network = SyntheticModel::new(Arc::clone(simulation), errors, Conditioning::PoseFree, 112, 1)?;
     let mut aligner = Aligner::new(CouplingMode::Coupled, &AlignerConfig::default())?;
     for (id, range) in (0..).zip(chunk_ranges(FRAMES, 12, 4)?) {
+        let range = range.frames;
         let prediction = network.predict(&views(simulation, ChunkId(id), range.clone())?)?;
         let frames = range.map(|k| {
             let time = simulation.frame_time(k);

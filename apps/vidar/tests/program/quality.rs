@@ -1,6 +1,8 @@
 //! How good the product is, bounded: a rendered flight through images and IMU, odometry, the coupled graph and fusion to a
-//! mesh, by stereo and by the bundled network. The bounds leave a third to a half of room around what was measured when they
-//! were set (`cargo test -p vidar-cli --test program quality -- --nocapture` prints it): they catch a loss, not a tremor.
+//! mesh, by stereo and by the bundled network.
+//!
+//! The bounds are provisional: they were set before the first measurement, and the tests are ignored until
+//! `cargo test -p vidar-cli --test program quality -- --ignored --nocapture` has printed what holds.
 
 use crate::odometry::flight;
 use crate::support::{ProgramOutput, command, shared};
@@ -75,6 +77,7 @@ fn holds(geometry: &str, bounds: &Bounds) {
 }
 
 #[test]
+#[ignore = "bounds not measured yet; cargo test -p vidar-cli --test program quality -- --ignored --nocapture"]
 fn the_map_of_a_flight_by_stereo_is_within_its_bounds() {
     holds(
         "stereo",
@@ -90,6 +93,7 @@ fn the_map_of_a_flight_by_stereo_is_within_its_bounds() {
 }
 
 #[test]
+#[ignore = "bounds not measured yet; cargo test -p vidar-cli --test program quality -- --ignored --nocapture"]
 fn the_map_of_a_flight_by_the_bundled_network_is_within_its_bounds() {
     holds(
         "da3-nano",

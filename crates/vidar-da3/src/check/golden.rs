@@ -62,7 +62,7 @@ pub(super) struct Entry {
     input: String,
     #[serde(default)]
     kwargs: Arguments,
-    /// Rows and columns of the pictures before preprocessing.
+    /// Rows and columns of the images before preprocessing.
     #[serde(default)]
     pub source_hw: Option<[usize; 2]>,
     #[serde(default)]
@@ -180,7 +180,7 @@ impl Golden {
         Ok(seeds.iter().flat_map(|s| normalise(&image_u8(*s, self.columns, self.rows))).collect())
     }
 
-    /// The seeds of the pictures, `… for seed in [1, 2]`, one a view.
+    /// The seeds of the images, `… for seed in [1, 2]`, one a view.
     pub(super) fn seeds(&self) -> Option<Vec<u64>> {
         let (_, list) = self.entry.input.split_once("for seed in [")?;
         let (list, _) = list.split_once(']')?;

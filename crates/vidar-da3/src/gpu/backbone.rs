@@ -1,7 +1,7 @@
 //! The vision transformer on the device; see the CPU's for what it computes.
 //!
 //! Tokens of all views lie in one buffer. A local block takes a few views at a time; a global one writes queries, keys and
-//! values of all views, then answers a few views at a time.
+//! values of all views, then outputs for a few views at a time.
 
 use super::block::{Block, Scratch, inner_width};
 use super::head::Grids;
@@ -117,7 +117,7 @@ impl Backbone {
         })
     }
 
-    /// Runs all blocks; features go to `features` as they come. Answers the reference view.
+    /// Runs all blocks; features go to `features` as they come. Returns the reference view.
     pub fn run(
         &self,
         run: &Run<'_>,

@@ -46,7 +46,7 @@ struct RayBranch {
     pair: Pair,
 }
 
-/// The position embeddings of one picture size; a DPT head has none.
+/// The position embeddings of one image size; a DPT head has none.
 pub(super) struct Grids {
     stages: Vec<Grid>,
     full: Option<Grid>,
@@ -192,7 +192,7 @@ impl Head {
         &self.stages
     }
 
-    /// Embeddings for pictures of `rows` × `columns` pixels.
+    /// Embeddings for images of `rows` × `columns` pixels.
     pub fn grids(&self, gpu: &Gpu, rows: usize, columns: usize) -> Result<Grids, Da3Error> {
         if self.config.kind == HeadKind::DptSky {
             return Ok(Grids { stages: Vec::new(), full: None, rays: None });

@@ -1,6 +1,6 @@
 //! The networks on a graphics processor (feature `gpu`): backbone and dense head as operations of `vidar-gpu`.
 //!
-//! Same keys, same sizes, same answers as on the CPU; camera encoder and decoder, poses from rays, preprocessing and
+//! Same keys, same sizes, same results as on the CPU; camera encoder and decoder, poses from rays, preprocessing and
 //! alignment stay on the CPU and are shared with it. Weights go to the device once, the backbone's in the precision asked
 //! for, the head's in `f32` as the official code has it; activations and sums are `f32`.
 //!
@@ -9,7 +9,7 @@
 //! ```
 //!
 //! What a run needs is worked out before it starts ([`MemoryPlan`]) and held against what the device binds and what is
-//! allowed. A run is sent off in small parts, so that it can be stopped and no part holds the device for long.
+//! allowed. A run is submitted in small parts, so that it can be stopped and no part blocks the device for long.
 
 mod backbone;
 mod block;
@@ -35,7 +35,7 @@ use vidar_gpu::{Gpu, Recorder, Storage};
 
 pub use vidar_gpu::{Adapter, AdapterKind, GpuError, adapters};
 
-/// An open device and how networks lie on it.
+/// An open device and how networks are stored on it.
 pub(crate) struct Context {
     gpu: Gpu,
     backbone: Storage,
@@ -53,7 +53,7 @@ impl Context {
         &self.gpu
     }
 
-    /// How block `i` of `depth` lies on the device; the patch embedding is as the first block.
+    /// How block `i` of `depth` is stored on the device; the patch embedding is as the first block.
     fn of_block(&self, i: usize, depth: usize) -> Storage {
         let is_exact = self.backbone == Storage::Bf16 && i < exact_blocks(self.exact_blocks, depth);
         if is_exact { Storage::F32 } else { self.backbone }

@@ -1,7 +1,7 @@
-//! Inference: pictures in, a [`Prediction`] out, as the official public interface answers it.
+//! Inference: images in, a [`Prediction`] out, as the official public interface returns it.
 //!
 //! ```text
-//! pictures ─▶ preprocess ─▶ normalise ─┐
+//! images ─▶ preprocess ─▶ normalise ─┐
 //! cameras ──▶ first camera = world ────┴▶ network ─▶ (nested: metres) ─▶ align with the given cameras ─▶ prediction
 //! ```
 
@@ -25,22 +25,22 @@ use vidar_core::Image;
 /// What the network sees.
 #[derive(Clone, Copy, Debug)]
 pub struct Inputs<'a> {
-    /// The pictures.
+    /// The images.
     pub images: &'a [Image<[u8; 3]>],
-    /// Known camera poses in a metric world, one a picture. They need `intrinsics`.
+    /// Known camera poses in a metric world, one per image. They need `intrinsics`.
     pub camera_from_world: Option<&'a [Matrix4<f64>]>,
-    /// Known intrinsics in pixels of the pictures, origin at the *edge* of the top-left pixel
+    /// Known intrinsics in pixels of the images, origin at the *edge* of the top-left pixel
     /// ([`pose::to_edge`]). Without poses they are not used.
     pub intrinsics: Option<&'a [Matrix3<f64>]>,
 }
 
 impl<'a> Inputs<'a> {
-    /// Pictures alone.
+    /// Images alone.
     pub fn images(images: &'a [Image<[u8; 3]>]) -> Self {
         Self { images, camera_from_world: None, intrinsics: None }
     }
 
-    /// Pictures with known cameras.
+    /// Images with known cameras.
     pub fn posed(
         images: &'a [Image<[u8; 3]>],
         camera_from_world: &'a [Matrix4<f64>],
@@ -70,7 +70,7 @@ pub struct InferOptions {
     /// nested ones work out all.
     pub wanted: Option<Range<usize>>,
     /// Behave as the official code does where this library does better: stop at one or two given views and at given
-    /// cameras on a line, answer pictures that lose a level, leave feature maps in the order of computation.
+    /// cameras on a line, return images that lose a grey level, leave feature maps in the order of computation.
     pub compat: bool,
 }
 

@@ -1,4 +1,4 @@
-//! What inference answers.
+//! The result of inference.
 
 use super::NetOutput;
 use crate::align::CameraAlignment;
@@ -18,7 +18,7 @@ const IS_SKY: f32 = 0.5;
 /// Depth, and what the network says besides, of every wanted view, at the processed size.
 #[derive(Clone, Debug)]
 pub struct Prediction {
-    /// The processed pictures of all views.
+    /// The processed images of all views.
     pub images: Vec<Image<[u8; 3]>>,
     /// Which views the maps below are of.
     pub wanted: Range<usize>,
@@ -32,7 +32,7 @@ pub struct Prediction {
     pub camera_from_world: Option<Vec<Matrix4<f64>>>,
     /// Intrinsics of all views in processed pixels, origin at the edge of the top-left pixel.
     pub intrinsics: Option<Vec<Matrix3<f64>>>,
-    /// Whether the network itself answers in metres (nested models).
+    /// Whether the network itself predicts metres (nested models).
     pub is_metric: bool,
     /// Metres per unit that a nested model multiplied by.
     pub scale_factor: Option<f64>,
@@ -44,7 +44,7 @@ pub struct Prediction {
     pub features: BTreeMap<usize, FeatureMaps>,
     /// The view in whose camera frame predicted poses are.
     pub reference_view: usize,
-    /// Whether pictures of different sizes were cut to the smallest.
+    /// Whether images of different sizes were cut to the smallest.
     pub was_cropped: bool,
 }
 

@@ -51,7 +51,7 @@ pub(crate) struct Request<'a> {
 pub(crate) struct Answer {
     /// Of the wanted views.
     pub views: Vec<DenseView>,
-    /// Pose codes of the camera decoder, if there is one.
+    /// Pose encodings of the camera decoder, if there is one.
     pub codes: Option<Vec<[f64; 9]>>,
     /// By layer and view: normalised patch tokens.
     pub layers: BTreeMap<usize, Vec<Vec<f32>>>,

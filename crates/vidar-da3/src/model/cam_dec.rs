@@ -1,6 +1,6 @@
-//! The camera decoder, `cam_dec` (DA3, camera head): camera tokens become pose codes.
+//! The camera decoder, `cam_dec` (DA3, camera head): camera tokens become pose encodings.
 //!
-//! Two ReLU layers `backbone.{0,2}`, then position `fc_t`, quaternion `fc_qvec` (xyzw, of any length) and angles of view
+//! Two ReLU layers `backbone.{0,2}`, then position `fc_t`, quaternion `fc_qvec` (xyzw, of any length) and fields of view
 //! `fc_fov.0` (ReLU). Shapes: tokens `[views, 2D]`, codes `[views, 9]`.
 
 use crate::error::Da3Error;
@@ -28,7 +28,7 @@ impl CameraDecoder {
         })
     }
 
-    /// Pose codes of the views' camera tokens. Always in `f32`, as the official code does it.
+    /// Pose encodings of the views' camera tokens. Always in `f32`, as the official code does it.
     pub fn run(&self, run: &Run<'_>, tokens: &[f32]) -> Vec<[f64; 9]> {
         let compute = run.backbone.at(Precision::F32);
         let width = self.backbone_0.in_features();

@@ -1,6 +1,6 @@
 //! The camera encoder, `cam_enc` (DA3, pose conditioning): given cameras become tokens.
 //!
-//! `pose_branch.{fc1,fc2}` lift a pose code of nine numbers to D channels; `token_norm`, the blocks `trunk.I` over the
+//! `pose_branch.{fc1,fc2}` lift a pose encoding of nine numbers to D channels; `token_norm`, the blocks `trunk.I` over the
 //! sequence of views (no rotation, no query-key norm), `trunk_norm`. Shapes: codes `[views, 9]`, tokens `[views, D]`.
 
 use super::backbone::{Block, BlockScratch, BlockShape};
@@ -36,7 +36,7 @@ impl CameraEncoder {
         })
     }
 
-    /// Tokens of the views' pose codes. Always in `f32`, as the official code does it.
+    /// Tokens of the views' pose encodings. Always in `f32`, as the official code does it.
     pub fn run(&self, run: &Run<'_>, codes: &[[f64; 9]]) -> Vec<f32> {
         let compute = run.backbone.at(Precision::F32);
         let input: Vec<f32> = codes.iter().flatten().map(|v| *v as f32).collect();

@@ -17,7 +17,7 @@ const MIN_SUM: f64 = 1e-12;
 const FAR_QUANTILE: f64 = 0.99;
 const MAX_SKY_DEPTH: f64 = 200.0;
 
-/// Both networks' answers, all views one after the other.
+/// Both networks' outputs, all views one after the other.
 pub(crate) struct Nested<'a> {
     /// Any-view depth, `[views, H, W]`.
     pub depth: &'a mut [f32],
@@ -38,7 +38,7 @@ pub fn metres_per_canonical(intrinsics: &Matrix3<f64>) -> f64 {
     f64::midpoint(intrinsics[(0, 0)], intrinsics[(1, 1)]) / CANONICAL_FOCAL
 }
 
-/// Scales depth and poses to metres in place; answers the scale.
+/// Scales depth and poses to metres in place; returns the scale.
 pub(crate) fn scale_to_metres(nested: Nested<'_>) -> Result<f64, Da3Error> {
     let Nested { depth, confidence, camera_from_world, intrinsics, canonical, sky } = nested;
     let area = depth.len() / intrinsics.len().max(1);

@@ -1,7 +1,7 @@
 //! Camera positions and views as the network writes and reads them (DA3, camera encoder and decoder).
 //!
-//! A pose code has nine numbers: position of the camera in the world, its orientation `world_from_camera` as a
-//! quaternion xyzw, and the angles of view down and across in radians. Intrinsics have their origin at the *edge* of
+//! A pose encoding has nine numbers: position of the camera in the world, its orientation `world_from_camera` as a
+//! quaternion xyzw, and the fields of view down and across in radians. Intrinsics have their origin at the *edge* of
 //! the top-left pixel; [`to_edge`] and [`from_edge`] cross to `VIDAR`'s convention, whose origin is that pixel's centre.
 
 mod quaternion;
@@ -11,7 +11,7 @@ pub use quaternion::{matrix_from_quaternion, quaternion_from_matrix};
 use nalgebra::{Matrix3, Matrix4, Vector3};
 use vidar_core::Pinhole;
 
-/// Tangents of half an angle of view are not taken smaller than this.
+/// Tangents of half a field of view are not taken smaller than this.
 const MIN_TAN: f64 = 1e-6;
 /// Median distance of the cameras below which positions are not scaled up any further.
 const MIN_MEDIAN_DISTANCE: f64 = 0.1;
@@ -54,7 +54,7 @@ pub fn compose(rotation: &Matrix3<f64>, translation: &Vector3<f64>) -> Matrix4<f
     matrix
 }
 
-/// The camera's place in the world.
+/// The camera centre in the world.
 pub fn centre(camera_from_world: &Matrix4<f64>) -> Vector3<f64> {
     parts(&rigid_inverse(camera_from_world)).1
 }
@@ -78,7 +78,7 @@ pub fn normalise_world(camera_from_world: &[Matrix4<f64>]) -> Vec<Matrix4<f64>> 
     moved
 }
 
-/// The pose code of a camera for a picture of `width` × `height`; principal point and skew do not take part.
+/// The pose encoding of a camera for an image of `width` × `height`; principal point and skew do not take part.
 pub fn encode(
     camera_from_world: &Matrix4<f64>,
     intrinsics: &Matrix3<f64>,
@@ -92,7 +92,7 @@ pub fn encode(
     [position.x, position.y, position.z, qx, qy, qz, qw, down, across]
 }
 
-/// `camera_from_world` and intrinsics of a pose code; the principal point is the middle of the picture.
+/// `camera_from_world` and intrinsics of a pose encoding; the principal point is the middle of the image.
 pub fn decode(code: &[f64; 9], width: usize, height: usize) -> (Matrix4<f64>, Matrix3<f64>) {
     let [x, y, z, qx, qy, qz, qw, down, across] = *code;
     let world_from_camera = compose(&matrix_from_quaternion([qx, qy, qz, qw]), &Vector3::new(x, y, z));

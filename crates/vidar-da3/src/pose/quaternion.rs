@@ -1,4 +1,4 @@
-//! Quaternions xyzw and matrices, as the pose codes use them.
+//! Quaternions xyzw and matrices, as the pose encodings use them.
 
 use nalgebra::Matrix3;
 

@@ -2,7 +2,7 @@
 //!
 //! Weights and sums are `f64` and the result rounds half to even. There is no single official result to match: on x86 OpenCV
 //! calls Intel's closed primitives (IPP), whose `f32` sums differ with the instruction set, so that a value within 3e-5 of a
-//! tie may round either way. On a picture of 320 × 240 enlarged to 504 × 378 (571 536 bytes), OpenCV 4.11 with AVX2 differs
+//! tie may round either way. On an image of 320 × 240 enlarged to 504 × 378 (571 536 bytes), OpenCV 4.11 with AVX2 differs
 //! from the recording of the official code in 4 bytes, with SSE4.2 in 4 others, and this file in 5, each by one grey level.
 //! OpenCV without IPP (`OPENCV_IPP=disabled`, ARM) uses 11-bit weights and differs from the recording in 24 915 bytes.
 

@@ -1,9 +1,9 @@
-//! From pictures to the network's input, as the official `InputProcessor` does it.
+//! From images to the network's input, as the official `InputProcessor` does it.
 //!
-//! A picture is scaled so that its longer (or shorter) side has the wanted length, then resized or cut to multiples of
+//! An image is scaled so that its longer (or shorter) side has the wanted length, then resized or cut to multiples of
 //! the patch; both steps give bytes. Sizes round half to even at the first step and ties up at the second. Shrinking
 //! is OpenCV's `INTER_AREA` bit by bit ([`area`]), enlarging its `INTER_CUBIC` ([`cubic`]). Intrinsics follow with the
-//! origin at the *edge* of the top-left pixel: scaling has no half-pixel term. Files' EXIF orientation is not looked at.
+//! origin at the *edge* of the top-left pixel: scaling has no half-pixel term. Files' EXIF orientation is ignored.
 
 pub mod area;
 pub mod cubic;
@@ -33,7 +33,7 @@ pub enum ResizeMethod {
     LowerBoundCrop,
 }
 
-/// How pictures are brought to the network's size.
+/// How images are brought to the network's size.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, schemars::JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct PreprocessConfig {
@@ -72,7 +72,7 @@ pub enum Interpolation {
     Cubic,
 }
 
-/// One step from a picture to the network's size.
+/// One step from an image to the network's size.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Step {
     /// Resize to a width and height.
@@ -97,7 +97,7 @@ pub enum Step {
     },
 }
 
-/// The steps for a picture of `width` × `height`, none to two of them.
+/// The steps for an image of `width` × `height`, none to two of them.
 pub fn plan(width: usize, height: usize, config: &PreprocessConfig) -> Result<Vec<Step>, Da3Error> {
     config.validate()?;
     if width == 0 || height == 0 {
@@ -146,7 +146,7 @@ fn nearest_multiple(length: usize) -> usize {
     up.max(PATCH)
 }
 
-/// Width and height at which a picture of the given size reaches the network (before the batch is made equal).
+/// Width and height at which an image of the given size reaches the network (before the batch is made equal).
 pub fn processed_size(
     width: usize,
     height: usize,
@@ -159,30 +159,30 @@ pub fn processed_size(
     })
 }
 
-/// Pictures of equal size, ready to be normalised.
+/// Images of equal size, ready to be normalised.
 #[derive(Clone, Debug)]
 pub struct Batch {
-    /// The processed pictures.
+    /// The processed images.
     pub images: Vec<Image<[u8; 3]>>,
     /// Their intrinsics, origin at the edge of the top-left pixel, if any were given.
     pub intrinsics: Option<Vec<Matrix3<f64>>>,
-    /// Whether the pictures ended in different sizes and were cut to the smallest of them.
+    /// Whether the images ended in different sizes and were cut to the smallest of them.
     pub was_cropped: bool,
 }
 
 impl Batch {
-    /// Columns of every picture.
+    /// Columns of every image.
     pub fn width(&self) -> usize {
         self.images.first().map_or(0, Image::width)
     }
 
-    /// Rows of every picture.
+    /// Rows of every image.
     pub fn height(&self) -> usize {
         self.images.first().map_or(0, Image::height)
     }
 }
 
-/// Processes the pictures of a batch, with intrinsics at the size of the pictures given.
+/// Processes the images of a batch, with intrinsics at the size of the images given.
 pub fn process(
     images: &[&Image<[u8; 3]>],
     intrinsics: Option<&[Matrix3<f64>]>,
@@ -220,7 +220,7 @@ fn in_view(view: usize, error: &Da3Error) -> Da3Error {
     Da3Error::BadView { view, reason: error.to_string() }
 }
 
-/// A picture and its intrinsics.
+/// An image and its intrinsics.
 type Processed = (Image<[u8; 3]>, Option<Matrix3<f64>>);
 
 fn process_one(
@@ -238,7 +238,7 @@ fn process_one(
     Ok((current.unwrap_or_else(|| image.clone()), matrix))
 }
 
-/// Does one step to a picture.
+/// Does one step to an image.
 pub fn apply(image: &Image<[u8; 3]>, step: Step) -> Image<[u8; 3]> {
     match step {
         Step::Resize { width, height, interpolation: Interpolation::Area } => {
@@ -255,7 +255,7 @@ pub fn apply(image: &Image<[u8; 3]>, step: Step) -> Image<[u8; 3]> {
     }
 }
 
-/// What a step does to intrinsics (origin at the edge of the top-left pixel) of a picture of `(width, height)`.
+/// What a step does to intrinsics (origin at the edge of the top-left pixel) of an image of `(width, height)`.
 pub fn follow(intrinsics: &Matrix3<f64>, (width, height): (usize, usize), step: Step) -> Matrix3<f64> {
     let mut k = *intrinsics;
     match step {

@@ -17,7 +17,7 @@ fn table() -> [[f32; 256]; 3] {
     std::array::from_fn(|c| std::array::from_fn(|v| (v as f32 / 255.0 - MEAN[c]) / STD[c]))
 }
 
-/// A picture as `[3, rows, columns]`.
+/// An image as `[3, rows, columns]`.
 pub fn normalise(image: &Image<[u8; 3]>) -> Vec<f32> {
     let mut planes = vec![0.0; 3 * image.width() * image.height()];
     normalise_into(image, &mut planes);
@@ -37,7 +37,7 @@ pub fn normalise_into(image: &Image<[u8; 3]>, planes: &mut [f32]) {
 
 /// The official way back to bytes: `trunc((x·std + mean)·255)`, which loses one level in about a quarter of the bytes.
 ///
-/// `VIDAR`'s own prediction carries the processed picture itself; this is for comparison with official outputs.
+/// `VIDAR`'s own prediction carries the processed image itself; this is for comparison with official outputs.
 pub fn denormalise(planes: &[f32], width: usize, height: usize) -> Image<[u8; 3]> {
     let area = width * height;
     Image::from_fn(width, height, |x, y| {

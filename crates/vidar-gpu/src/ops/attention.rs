@@ -165,7 +165,7 @@ pub struct AttendSpec {
     pub keys: (usize, usize),
     /// Token of the output that the first query's answer becomes.
     pub out: usize,
-    /// Sequences; from one to the next, queries, keys and answers move on by their numbers.
+    /// Sequences; from one to the next, queries, keys and outputs move on by their numbers.
     pub sequences: usize,
 }
 
@@ -207,7 +207,7 @@ fn attend_kernel(head_dim: usize) -> Kernel {
     Kernel::new(format!("attend {head_dim}"), 1, move || attend_source(head_dim / 4))
 }
 
-/// Keys whose scores are made before the maximum is looked at.
+/// Keys whose scores are made before the maximum is updated.
 const TOGETHER: usize = 8;
 
 fn attend_source(d: usize) -> String {

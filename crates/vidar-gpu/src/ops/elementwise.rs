@@ -48,7 +48,7 @@ pub fn copy_rows(
     recorder.dispatch(&copy_kernel(), &[x.buffer], out.buffer, &words, groups(rows * width, 256))
 }
 
-/// Writes the patches of a picture of three planes, `[3, rows, columns]` from `in_at` on, as rows
+/// Writes the patches of an image of three planes, `[3, rows, columns]` from `in_at` on, as rows
 /// `[rows/side · columns/side, 3 · side²]`.
 ///
 /// # Errors

@@ -70,7 +70,7 @@ pub fn resample(
     Ok(to)
 }
 
-/// Adds an embedding to a map where it stands.
+/// Adds an embedding to a map in place.
 ///
 /// # Errors
 /// When the device refuses the kernel.

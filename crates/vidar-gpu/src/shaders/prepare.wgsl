@@ -1,4 +1,4 @@
-// Norm and rotation of queries and keys where they stand: one invocation a head of a token.
+// Norm and rotation of queries and keys in place: one invocation a head of a token.
 struct Params {
   items: u32,     // tokens · 2 · heads
   heads: u32,

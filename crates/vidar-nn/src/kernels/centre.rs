@@ -1,6 +1,6 @@
 //! Products of bf16 factors around a centre.
 //!
-//! Rounding to bf16 is relative, so what all rows of A have in common costs the precision of what tells them apart, and that
+//! Rounding to bf16 is relative, so what all rows of A have in common costs the precision of what distinguishes them, and that
 //! is what a network's answer depends on: tokens and pixels share most of their size. For any row c
 //! `A B = (A - 1 c) B + 1 (c B)`: with c near the mean row, only differences are rounded, on either side of the product;
 //! `c B` is one row in `f32`, added to the bias while B is packed. Zeros around a map become `-c`.

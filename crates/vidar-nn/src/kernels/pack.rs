@@ -8,7 +8,7 @@ use super::scratch::{self, Role};
 use super::shared::SharedMut;
 use super::simd::Simd;
 use super::source::Inner;
-use super::tile::{Multiply, steps_of};
+use super::tile::Multiply;
 use super::{Factors, ProductKernel, dispatch_product};
 use crate::compute::Isa;
 

@@ -9,14 +9,12 @@
 //! (`deformation_frame_share`). Everything follows from the seed, the chunk's number and the frame's number; the same
 //! numbers give the same bits for any number of threads.
 
-mod chain;
 mod errors;
 mod field;
 mod model;
 mod motion;
 mod pixels;
 
-pub use chain::{chain_chunks, chunk_ranges};
 pub use errors::PredictionErrors;
 pub use model::{Conditioning, SyntheticModel};
 

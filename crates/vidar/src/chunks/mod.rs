@@ -4,8 +4,10 @@
 //! says which frames it is of, in which frame its poses are, and what it was made of. The second is written last: a chunk
 //! exists when it does.
 
+mod memory;
 mod recorded;
 mod store;
 
+pub use memory::MemoryStore;
 pub use recorded::{RECORDED, RecordedChunk, RecordedModel, Recording};
 pub use store::{ChunkStore, StoredChunk};

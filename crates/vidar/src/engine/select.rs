@@ -4,7 +4,7 @@ use super::cut::ChunkRule;
 use super::events::{FrameStamp, MapKeyframe};
 use super::track::PosedFrame;
 use vidar_align::keyframe_selection::{KeyframeConfig, KeyframeSelector, select_by_motion, select_by_time};
-use vidar_core::{FrameId, Se3, Timestamp};
+use vidar_core::{Se3, Timestamp};
 
 /// Selects keyframes of one world.
 #[derive(Debug)]
@@ -92,7 +92,7 @@ impl Selection {
 mod tests {
     use super::*;
     use nalgebra::Vector3;
-    use vidar_core::CameraId;
+    use vidar_core::{CameraId, FrameId};
 
     fn posed(i: u32) -> PosedFrame {
         let stamp = FrameStamp {

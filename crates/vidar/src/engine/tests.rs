@@ -1,7 +1,7 @@
 //! The engine on a wall: a geometry model that is right, and sources that fail.
 
 use super::*;
-use crate::chunks::StoredChunk;
+use crate::chunks::{MemoryStore, StoredChunk};
 use crate::input::MetricTrajectory;
 use nalgebra::Vector3;
 use std::cell::RefCell;
@@ -106,38 +106,6 @@ struct GrayImages;
 impl ImageSource for GrayImages {
     fn image(&self, _: &FrameStamp) -> Result<FrameImage, Warning> {
         Ok(FrameImage::Gray8(Image::filled(64, 48, 128)))
-    }
-}
-
-#[derive(Default)]
-struct MemoryStore(RefCell<BTreeMap<PredictionId, StoredChunk>>);
-
-impl PredictionStore for MemoryStore {
-    fn find(&self, _: PredictionId, _: &[PredictedFrame]) -> Option<StoredChunk> {
-        None
-    }
-
-    fn keep(
-        &self,
-        id: PredictionId,
-        _: &[PredictedFrame],
-        chunk: &StoredChunk,
-    ) -> Result<StoredChunk, Error> {
-        self.0.borrow_mut().insert(id, chunk.clone());
-        Ok(chunk.clone())
-    }
-
-    fn read(&self, id: PredictionId) -> Result<StoredChunk, Error> {
-        let missing = || Error::BadValue { reason: format!("no {id}") };
-        self.0.borrow().get(&id).cloned().ok_or_else(missing)
-    }
-
-    fn keep_volume(&self, _: ChunkId, _: &[u8]) -> Result<(), Error> {
-        Ok(())
-    }
-
-    fn read_volume(&self, chunk: ChunkId) -> Result<Vec<u8>, Error> {
-        Err(Error::BadValue { reason: format!("no volume {chunk}") })
     }
 }
 

@@ -107,7 +107,7 @@ pub fn evaluate(
 }
 
 /// Pose of the estimate in the world of ground truth, by its trajectory.
-pub(crate) fn placement_start(report: &TrajectoryReport) -> PlacementStart {
+fn placement_start(report: &TrajectoryReport) -> PlacementStart {
     PlacementStart {
         truth_from_estimate: report.truth_from_estimate_se3.and_then(|t| t.to_se3()).unwrap_or(Se3::IDENTITY),
         truth_from_estimate_sim3: report.truth_from_estimate_sim3.and_then(|t| t.to_sim3()),

@@ -15,8 +15,8 @@ mod summary;
 mod trust;
 mod views;
 
+pub(crate) use evaluate::sampled;
 pub use evaluate::{DepthScore, Evaluation};
-pub(crate) use evaluate::{placement_start, sampled};
 pub use map::MetricMap;
 pub use outputs::pose_of;
 pub use plan::{ExpectedWork, Plan, bytes};

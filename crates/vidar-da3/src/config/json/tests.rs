@@ -1,7 +1,7 @@
 use super::*;
 use proptest::prelude::*;
 
-/// As it lies on the hub, with the program's own sections.
+/// As published, with the program's own sections.
 const SMALL: &str = r#"{"model_name": "da3-small", "config": {
   "__object__": {"path": "depth_anything_3.model.da3", "name": "DepthAnything3Net", "args": "as_params"},
   "net": {"__object__": {"path": "x", "name": "DinoV2", "args": "as_params"}, "name": "vits",

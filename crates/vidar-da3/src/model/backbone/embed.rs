@@ -1,7 +1,7 @@
 //! From pixels to tokens: `patch_embed.proj`, `cls_token`, `pos_embed`.
 //!
 //! Patches of 14 × 14 pixels are projected to D channels; the class token comes first; the position embedding, trained
-//! on a grid of 37 × 37, is resampled to the picture's patches by a bicubic (a = −0.75) whose scale factors are
+//! on a grid of 37 × 37, is resampled to the image's patches by a bicubic (a = −0.75) whose scale factors are
 //! `(patches + 0.1)/37`: the tenth enters the mapping of coordinates, not only the size. Shapes: pixels `[3, H, W]`,
 //! tokens `[1 + H/14·W/14, D]`.
 
@@ -15,7 +15,7 @@ use vidar_nn::{Conv2d, ConvInput, Epilogue, MapRef, Weight, resize_bicubic_scale
 /// What is added to the number of patches before the scale of the position grid is taken.
 const OFFSET: f64 = 0.1;
 
-/// Embeds pictures as tokens.
+/// Embeds images as tokens.
 pub(crate) struct Embed {
     proj: Conv2d,
     cls_token: Vec<f32>,

@@ -39,12 +39,12 @@ const ROPE_BASE: f32 = 100.0;
 /// Tokens that go through a local block at once.
 pub(crate) const GROUP_TOKENS: usize = 4096;
 
-/// Normalised pictures: `[views, 3, rows, columns]`, sides multiples of the patch.
+/// Normalised images: `[views, 3, rows, columns]`, sides multiples of the patch.
 #[derive(Clone, Copy, Debug)]
 pub struct Pixels<'a> {
     /// The numbers.
     pub data: &'a [f32],
-    /// Pictures.
+    /// Images.
     pub views: usize,
     /// Rows of each.
     pub rows: usize,
@@ -144,7 +144,7 @@ impl Backbone {
     }
 
     /// Runs all blocks; features go to `sink` as they come. `extra` are layers whose tokens are wanted besides.
-    /// Answers the reference view.
+    /// Returns the reference view.
     pub fn run(
         &self,
         run: &Run<'_>,

@@ -1,4 +1,4 @@
-//! The reference view, in whose camera frame an any-view network answers (DA3, reference view selection).
+//! The reference view, in whose camera frame an any-view network predicts (DA3, reference view selection).
 //!
 //! With three views or more and no poses given, it is chosen from the class tokens before the alternation begins. For
 //! token c of each view: its mean cosine with the others, its norm, and the variance of its normalised channels, each

@@ -30,14 +30,14 @@ pub(crate) struct DualDpt {
     output_conv2: Pair,
     rays: Slot<RayBranch>,
     config: HeadConfig,
-    /// Embeddings of the picture size seen last.
+    /// Embeddings of the image size seen last.
     embeddings: Mutex<Option<OfSize>>,
 }
 
-/// Rows and columns of pictures, and the embeddings at that size.
+/// Rows and columns of images, and the embeddings at that size.
 type OfSize = ((usize, usize), Arc<Embeddings>);
 
-/// The position embeddings of one picture size.
+/// The position embeddings of one image size.
 pub(crate) struct Embeddings {
     stages: Vec<GridEmbedding>,
     full: GridEmbedding,
@@ -82,7 +82,7 @@ impl DualDpt {
         })
     }
 
-    /// Embeddings for pictures of `rows` × `columns` pixels.
+    /// Embeddings for images of `rows` × `columns` pixels.
     pub fn embeddings(&self, rows: usize, columns: usize) -> Arc<Embeddings> {
         let mut kept = self.embeddings.lock().unwrap_or_else(PoisonError::into_inner);
         if let Some((size, embeddings)) = kept.as_ref()

@@ -1,4 +1,4 @@
-//! The dense heads, `head`: from features to maps at the picture's size. They run view by view.
+//! The dense heads, `head`: from features to maps at the image's size. They run view by view.
 
 mod dpt;
 mod dual_dpt;

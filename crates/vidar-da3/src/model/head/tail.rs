@@ -1,6 +1,6 @@
 //! The last layers of the dense heads: `scratch.output_conv1` and pairs like `scratch.output_conv2.{0,2}`.
 //!
-//! Enlargement to the picture's size, position embedding, 3×3 convolution, ReLU and 1×1 run in one pass over bands of
+//! Enlargement to the image's size, position embedding, 3×3 convolution, ReLU and 1×1 run in one pass over bands of
 //! rows: no map of that size is stored but the outputs.
 
 use super::map::Map;

@@ -1,6 +1,6 @@
 //! The position embedding that the DualDPT head adds to its maps.
 //!
-//! A cell's place (u, v) lies on a picture whose half diagonal is 1: `u = ±(a/d)(w−1)/w` at the first and last column
+//! A cell's position (u, v) lies on an image whose half diagonal is 1: `u = ±(a/d)(w−1)/w` at the first and last column
 //! with aspect a = W/H and `d = √(a²+1)`, `v` likewise with `1/d`. Each coordinate becomes sines and cosines of
 //! frequencies `100^(−j/Q)`, Q a quarter of the channels: `[sin u, cos u, sin v, cos v]`, times 0.1.
 
@@ -9,7 +9,7 @@ use vidar_nn::GridEmbedding;
 const BASE: f64 = 100.0;
 const RATIO: f64 = 0.1;
 
-/// The embedding of maps of `rows` × `columns` × `channels` of a picture with aspect `width / height`, as its two
+/// The embedding of maps of `rows` × `columns` × `channels` of an image with aspect `width / height`, as its two
 /// separable halves.
 pub(crate) fn embedding(rows: usize, columns: usize, channels: usize, aspect: f64) -> GridEmbedding {
     let diagonal = (aspect * aspect + 1.0).sqrt();

@@ -1,15 +1,12 @@
 //! The front half, once: track, select keyframes, predict, and gather what is known of the frames.
 
-use crate::chunks::StoredChunk;
+use crate::chunks::{MemoryStore, StoredChunk};
 use crate::config::Config;
-use crate::engine::{
-    Engine, EngineSetup, MapEvent, PlaceDescriber, PredictedFrame, PredictionId, PredictionStore,
-};
+use crate::engine::{Engine, EngineSetup, MapEvent, PlaceDescriber, PredictionId, PredictionStore};
 use crate::error::Error;
 use crate::events::CancelToken;
 use crate::input::{self, ImageFiles, Measurement};
 use crate::run::{Plan, camera_on_rig};
-use std::cell::RefCell;
 use std::collections::BTreeMap;
 use vidar_align::FrameObservation;
 use vidar_core::{ChunkId, FrameId, Timestamp};
@@ -31,7 +28,7 @@ pub struct Observed {
 pub fn observe(dataset: &Dataset, config: &Config, cancel: &CancelToken) -> Result<Observed, Error> {
     let (plan, mut source, places) = Plan::make(dataset, config, None)?;
     let (poses, fallback) = plan.poses.open(dataset, config)?;
-    let store = InMemory::default();
+    let store = MemoryStore::default();
     let images = ImageFiles(dataset);
     let cancelled = || cancel.is_cancelled();
     let mut engine = Engine::new(EngineSetup {
@@ -81,37 +78,4 @@ pub fn observe(dataset: &Dataset, config: &Config, cancel: &CancelToken) -> Resu
     };
     let chunks = observed.into_iter().map(chunk).collect::<Result<_, Error>>()?;
     Ok(Observed { is_whitened: places.is_whitened(), plan, keyframes, chunks })
-}
-
-/// Predictions of one run, in memory.
-#[derive(Default)]
-struct InMemory(RefCell<BTreeMap<PredictionId, StoredChunk>>);
-
-impl PredictionStore for InMemory {
-    fn find(&self, _: PredictionId, _: &[PredictedFrame]) -> Option<StoredChunk> {
-        None
-    }
-
-    fn keep(
-        &self,
-        id: PredictionId,
-        _: &[PredictedFrame],
-        chunk: &StoredChunk,
-    ) -> Result<StoredChunk, Error> {
-        self.0.borrow_mut().insert(id, chunk.clone());
-        Ok(chunk.clone())
-    }
-
-    fn read(&self, id: PredictionId) -> Result<StoredChunk, Error> {
-        let missing = || Error::BadValue { reason: format!("{id} was not predicted") };
-        self.0.borrow().get(&id).cloned().ok_or_else(missing)
-    }
-
-    fn keep_volume(&self, chunk: ChunkId, _: &[u8]) -> Result<(), Error> {
-        Err(Error::BadValue { reason: format!("an ablation keeps no volume of chunk {chunk}") })
-    }
-
-    fn read_volume(&self, chunk: ChunkId) -> Result<Vec<u8>, Error> {
-        Err(Error::BadValue { reason: format!("an ablation keeps no volume of chunk {chunk}") })
-    }
 }
