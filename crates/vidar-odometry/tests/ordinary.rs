@@ -100,8 +100,7 @@ fn a_live_odometry_corrects_clock_and_readout_on_the_way_and_the_adjustment_afte
     assert!(readout_ms.abs() < 1.5, "readout off by {readout_ms} ms, stated {}", 1e3 * calibration.sigmas[1]);
     // Ground truth is in the IMU's clock.
     let offset = Duration::from_secs_f64(calibration.time_offset_secs);
-    let pose =
-        |s: &NavState| StampedPose { time: s.time + offset, world_from_body: s.world_from_body };
+    let pose = |s: &NavState| StampedPose { time: s.time + offset, world_from_body: s.world_from_body };
     let poses = adjusted.images.iter().map(|(_, state)| pose(state)).collect();
     let estimate = Trajectory::new(BodyFrame::Imu, poses).unwrap();
     let truth = dataset.ground_truth.as_ref().unwrap();

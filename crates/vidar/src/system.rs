@@ -70,18 +70,6 @@ fn kib_of(file: &str, key: &str) -> Option<u64> {
     value.split_whitespace().next()?.parse::<u64>().ok()?.checked_mul(1024)
 }
 
-#[cfg(test)]
-mod tests {
-    #[test]
-    #[cfg(target_os = "linux")]
-    fn memory_and_peak_are_plausible() {
-        let hardware = super::hardware();
-        assert!(hardware.memory_bytes.unwrap() > 100 << 20);
-        assert!(super::peak_memory_bytes().unwrap() > 1 << 20);
-        assert!(hardware.threads >= 1);
-    }
-}
-
 /// Reads a file of at most `limit` bytes: what is larger, or has no end, is refused and never held in memory.
 ///
 /// # Errors
@@ -117,3 +105,15 @@ pub const MAX_CONFIG_BYTES: u64 = 4 << 20;
 pub const MAX_JSON_BYTES: u64 = 256 << 20;
 /// Largest cloud, mesh or picture that is read, bytes.
 pub const MAX_CLOUD_BYTES: u64 = 4 << 30;
+
+#[cfg(test)]
+mod tests {
+    #[test]
+    #[cfg(target_os = "linux")]
+    fn memory_and_peak_are_plausible() {
+        let hardware = super::hardware();
+        assert!(hardware.memory_bytes.unwrap() > 100 << 20);
+        assert!(super::peak_memory_bytes().unwrap() > 1 << 20);
+        assert!(hardware.threads >= 1);
+    }
+}

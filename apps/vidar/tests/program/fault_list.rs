@@ -236,7 +236,7 @@ fn judge_all(cases: &[&[Case]]) {
             scope.spawn(|| {
                 while let Some(case) = all.get(next.fetch_add(1, Ordering::Relaxed)) {
                     match judge(*case) {
-                        Ok(text) => println!("{text}"),
+                        Ok(text) => eprintln!("{text}"),
                         Err(text) => wrong.lock().unwrap().push(text),
                     }
                 }

@@ -64,7 +64,7 @@ fn holds(geometry: &str, bounds: &Bounds) {
         score(1, "f"),
         score(1, "recall"),
     );
-    println!("{measured}");
+    eprintln!("{measured}");
     for name in ["metric_trajectory", "trajectory"] {
         let (ate, scale) = poses(name);
         assert!(ate < bounds.most_ate_m && scale < bounds.most_scale_error, "{name}: {measured}");

@@ -4,8 +4,6 @@ use super::*;
 use crate::chunks::{MemoryStore, StoredChunk};
 use crate::input::MetricTrajectory;
 use nalgebra::Vector3;
-use std::cell::RefCell;
-use std::collections::BTreeMap;
 use vidar_core::model::ChunkFrame;
 use vidar_core::{
     BodyFrame, CameraModel, ChunkViews, Confidence, FrameImage, GeometryPrediction, Image, ModelError,
