@@ -142,9 +142,14 @@ impl TrackQuality {
         if total > 0.0 { (until - from).as_secs_f64() / total } else { 0.0 }
     }
 
-    /// Share of the longest segment's images whose health is OK, 0…1.
+    /// Share of the longest segment's images whose health is OK, 0…1. Where states were adjusted afterwards, a scale that had still to
+    /// converge is none of their faults.
     pub fn healthy(&self) -> f64 {
-        self.longest().map_or(0.0, |s| s.count(Health::Ok) as f64 / s.images.max(1) as f64)
+        let converging = |s: &SegmentQuality| match self.adjusted {
+            Some(_) => s.count(Health::ScaleConverging),
+            None => 0,
+        };
+        self.longest().map_or(0.0, |s| (s.count(Health::Ok) + converging(s)) as f64 / s.images.max(1) as f64)
     }
 
     /// In words: "193 of 220 images, health OK in 97 % of them".

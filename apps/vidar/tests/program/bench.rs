@@ -6,14 +6,14 @@ use std::path::Path;
 
 /// Small images and short flights; ground truth as poses, because so little is no flight to track.
 fn bench(out: &Path, more: &[&str]) -> ProgramOutput {
-    bench_of(&shared().world, out, more)
+    bench_of(&shared().world, "room1_1,room2_3", out, more)
 }
 
-fn bench_of(world: &Path, out: &Path, more: &[&str]) -> ProgramOutput {
+fn bench_of(world: &Path, sequences: &str, out: &Path, more: &[&str]) -> ProgramOutput {
     let world = world.to_str().unwrap();
     let settings = shared().settings.to_str().unwrap();
     let mut all = vec!["bench", "euroc", "--synthetic", "--world-config", world, "--config", settings];
-    all.extend(["--geometry", "simulated", "--sequences", "room1_1,room2_3", "--no-trajectories"]);
+    all.extend(["--geometry", "simulated", "--sequences", sequences, "--no-trajectories"]);
     all.extend([
         "--set",
         "input.poses=ground-truth",
@@ -68,7 +68,7 @@ fn a_bench_writes_the_papers_tables_and_is_not_done_twice() {
     let text = std::fs::read_to_string(&shared().world).unwrap();
     std::fs::write(&world, format!("image_noise_sigma = 3.0\n{text}")).unwrap();
     let before = stamp("sequences/room1_1/synth.toml");
-    bench_of(&world, &out, &["--modes", "hybrid"]).ends_with(0);
+    bench_of(&world, "room1_1,room2_3", &out, &["--modes", "hybrid"]).ends_with(0);
     assert!(stamp("sequences/room1_1/synth.toml") > before);
     assert!(stamp("runs/room1_1/hybrid/map/mesh.ply") > before);
 }
@@ -77,9 +77,8 @@ fn a_bench_writes_the_papers_tables_and_is_not_done_twice() {
 fn a_run_that_fails_is_a_row_with_its_reason() {
     let out = shared().root.join("bench failed");
     // The sequence is too short for the odometry: the coupling that needs it fails, the other one succeeds.
-    let more =
-        ["--modes", "pose-free,pose-conditioned", "--set", "input.poses=odometry", "--sequences", "room1_1"];
-    let ran = bench(&out, &more);
+    let more = ["--modes", "pose-free,pose-conditioned", "--set", "input.poses=odometry"];
+    let ran = bench_of(&shared().world, "room1_1", &out, &more);
     let table: Value = serde_json::from_slice(&std::fs::read(out.join("bench.json")).unwrap()).unwrap();
     let failed: Vec<&Value> =
         table["runs"].as_array().unwrap().iter().filter(|r| !r["failure"].is_null()).collect();
@@ -103,10 +102,11 @@ fn unsupported_benches_are_refused() {
 #[test]
 fn an_ablation_gives_every_coupling_the_same_keyframes_and_is_not_done_twice() {
     let out = shared().root.join("ablation");
-    let more = ["--ablation", "--seeds", "1", "--sequences", "room1_1", "--json"];
+    let more = ["--ablation", "--seeds", "1", "--json"];
     let more = [&more[..], &["--set", "geometry.chunk_keyframes=5", "--set", "geometry.overlap_keyframes=2"]]
         .concat();
-    let json = bench(&out, &more).ends_with(0).json();
+    let bench = |more: &[&str]| bench_of(&shared().world, "room1_1", &out, more);
+    let json = bench(&more).ends_with(0).json();
     let rows = json["rows"].as_array().unwrap();
     // Five couplings with five sets of measurements, but no loops for chunks that are placed by poses alone.
     assert_eq!(rows.len(), 24, "{rows:?}");
@@ -122,6 +122,6 @@ fn an_ablation_gives_every_coupling_the_same_keyframes_and_is_not_done_twice() {
     {
         assert!(text.contains(word), "{word} is missing in\n{text}");
     }
-    assert_eq!(bench(&out, &more).ends_with(0).json()["rows"], json["rows"]);
+    assert_eq!(bench(&more).ends_with(0).json()["rows"], json["rows"]);
     vidar(&["bench", "euroc", "x", "--ablation"]).ends_with(2).says(&["--synthetic"]);
 }

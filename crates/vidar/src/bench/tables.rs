@@ -397,6 +397,8 @@ pub(super) mod tests {
             BenchRow {
                 f10: None,
                 f05: None,
+                f10_rigid: None,
+                f05_rigid: None,
                 f10_free: None,
                 trajectory: TrajectoryScores::default(),
                 ..failed
