@@ -18,6 +18,10 @@ const MAX_INVERSE_DISTANCE: f64 = 20.0;
 const MIN_PARALLAX_RAD: f64 = 2e-3;
 const TYPICAL_INVERSE_DISTANCE: f64 = 0.3;
 
+/// Tracks that are longer become several landmarks, so that the reduced system stays a band also where a body at rest sees the
+/// same things for minutes: 10 s at five images per second.
+const MAX_OBSERVATIONS: usize = 50;
+
 /// Fewest images that see a landmark.
 pub(super) const MIN_OBSERVATIONS: usize = 3;
 
@@ -195,12 +199,12 @@ fn triangulate(
             }
         }
     }
-    tracks.retain(|_, seen| seen.len() >= MIN_OBSERVATIONS);
-    let landmark = |observations: Vec<Observation>| {
-        let landmark = first_guess(&observations, frames, calibration)?;
-        Some(ObservedLandmark { landmark, observations })
+    let landmark = |observations: &[Observation]| {
+        let landmark = first_guess(observations, frames, calibration)?;
+        Some(ObservedLandmark { landmark, observations: observations.to_vec() })
     };
-    tracks.into_values().filter_map(landmark).collect()
+    let parts = tracks.values().flat_map(|seen| seen.chunks(MAX_OBSERVATIONS));
+    parts.filter(|part| part.len() >= MIN_OBSERVATIONS).filter_map(landmark).collect()
 }
 
 /// Direction of the first observation; the inverse distance that fits the other rays best: linear least squares of

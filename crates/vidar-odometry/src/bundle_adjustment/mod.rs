@@ -65,6 +65,14 @@ pub enum AdjustmentError {
         /// How many.
         landmarks: usize,
     },
+    /// More states than one adjustment takes.
+    #[error("{images} logged images are more than one adjustment takes ({limit})")]
+    TooLong {
+        /// How many.
+        images: usize,
+        /// Most.
+        limit: usize,
+    },
     /// The solution is not determined.
     #[error("the adjustment's solution is not determined by the measurements")]
     Undetermined,
@@ -134,6 +142,9 @@ pub fn adjust(
     model: &ImuModel,
     sigmas: &CalibrationSigmas,
 ) -> Result<Adjusted, AdjustmentError> {
+    if log.images.len() > MAX_IMAGES {
+        return Err(AdjustmentError::TooLong { images: log.images.len(), limit: MAX_IMAGES });
+    }
     let mut imu = ImuBuffer::new(log.imu_rate_hz);
     for sample in &log.imu {
         // What is out of order was left out by the odometry, too.
@@ -205,6 +216,9 @@ impl Work {
         Ok((is_settled, problem, report))
     }
 }
+
+/// Most logged images: about 15 minutes. System and factor take some 0.1 MB per image (landmarks of 5 s).
+const MAX_IMAGES: usize = 5000;
 
 /// Fewest landmarks of a recording.
 const MIN_LANDMARKS: usize = 30;
