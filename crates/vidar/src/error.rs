@@ -343,7 +343,8 @@ impl Error {
             }
             other if other.file_system().is_some() => "check that the path exists and may be written",
             Self::NotCalibrated { .. } => {
-                "turn the camera about all axes for some seconds while it sees texture, or give --calibration FILE"
+                "turn the camera about all axes for some seconds while it sees texture, or give --calibration FILE (EuRoC \
+                 sensor.yaml, Kalibr camchain)"
             }
             Self::NoCalibration { .. } => {
                 "give --calibration FILE (EuRoC sensor.yaml, Kalibr camchain) or --camera-model pinhole:fx,fy,cx,cy"
