@@ -34,7 +34,7 @@ const ACCEL_NOISE: (f64, f64) = (1e-3, 0.1);
 /// was lost when the odometry corrected it by 10 ms from a few seconds.
 const SETTLED_OFFSET_SECS: f64 = 0.0015;
 /// Largest relative σ of the focal length and σ of the clock offset of a calibration that is used without being asked for. Eleven
-/// rendered recordings of 20 s had 0.3 to 0.9 % and 0.2 to 1 ms.
+/// rendered recordings of 20 s had 0.3 to 0.5 % and 0.1 to 0.7 ms.
 const MAX_FOCAL_SIGMA: f64 = 0.04;
 const MAX_CLOCK_SIGMA_MS: f64 = 10.0;
 

@@ -275,10 +275,11 @@ mod tests {
         let (body, landmark, calibration, measured) = example();
         let at = linearise(&body, &landmark, &calibration, &measured).unwrap();
         assert!((at.pixel - Pixel::new(410.0, 120.0)).norm() < 1e-9, "{}", at.pixel);
+        // Within a row's time the rates turn by a milliradian at most, which the derivative by the instant leaves out.
         let check = |name: &str, plus: Option<Pixel>, minus: Option<Pixel>, h: f64, found: Vector2<f64>| {
             let wanted = (plus.unwrap() - minus.unwrap()) / (2.0 * h);
-            let scale = wanted.norm().max(1.0);
-            assert!((wanted - found).norm() < 2e-5 * scale, "{name}: {found} instead of {wanted}");
+            let error = (wanted - found).norm() / wanted.norm().max(1.0);
+            assert!(error < 2e-4, "{name}: {found} instead of {wanted}, {error:.1e} off");
         };
         let h = 1e-6;
         for k in 0..STATE_DIM {
