@@ -96,9 +96,13 @@ fn recording(name: &str, secs: f64, path: impl Fn(f64) -> ([f64; 3], f64)) -> Pa
 }
 
 fn odometry(sequence: &Path, name: &str) -> ProgramOutput {
+    odometry_with(sequence, name, &[])
+}
+
+fn odometry_with(sequence: &Path, name: &str, more: &[&str]) -> ProgramOutput {
     let out = shared().root.join(format!("odometry of {name}"));
     let mut command = command();
-    command.arg("odometry").arg(sequence).arg("-o").arg(out).args(["--json", "--progress", "off"]);
+    command.arg("odometry").arg(sequence).arg("-o").arg(out).args(["--json", "--progress", "off"]).args(more);
     command.output().unwrap().into()
 }
 
@@ -134,9 +138,14 @@ fn flight() -> &'static Path {
 
 #[test]
 fn half_a_recording_is_not_tracked_throughout() {
-    let json = odometry(flight(), "flight").ends_with(0).json();
+    // What is adjusted after the end reaches back before the start.
+    let json = odometry(flight(), "whole flight").ends_with(0).json();
+    assert!(number(&json["quality"]["covered_time_ratio"]) > 0.95, "{}", json["quality"]);
+    let live = ["--set", "odometry.adjust=false"];
+    let json = odometry_with(flight(), "flight", &live).ends_with(0).json();
     let quality = &json["quality"];
     assert!(number(&quality["covered_time_ratio"]) < 0.8, "this flight starts late: {quality}");
+    assert_eq!(quality["is_adjusted"], false);
     assert_eq!(json["verdict"]["level"], "caution", "{}", json["verdict"]);
     let why = reasons(&json["verdict"]);
     assert!(why.contains("images have a state") && !why.contains("throughout"), "{why}");
