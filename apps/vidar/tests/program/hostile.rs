@@ -1,8 +1,6 @@
 //! Input that means harm: names that terminals obey, files without an end, archives of zeros, hubs with other weights.
 
-use crate::support::{command, copy_tree, files_under, shared, vidar};
-use std::io::{BufRead, BufReader, Write};
-use std::net::TcpListener;
+use crate::support::{command, copy_tree, files_under, http_server, shared, vidar};
 use std::path::Path;
 use std::process::Stdio;
 use std::time::{Duration, Instant};
@@ -86,29 +84,14 @@ fn files_without_an_end_are_refused_at_once_and_in_little_memory() {
 #[test]
 fn weights_that_are_not_the_official_ones_are_refused_by_their_hash() {
     // A hub that announces another file of the right length under the official name.
-    let listener = TcpListener::bind("127.0.0.1:0").unwrap();
-    let address = format!("http://{}", listener.local_addr().unwrap());
-    std::thread::spawn(move || {
-        for stream in listener.incoming().flatten() {
-            let mut first = String::new();
-            let mut lines = BufReader::new(&stream);
-            let _ = lines.read_line(&mut first);
-            let mut line = String::new();
-            while lines.read_line(&mut line).is_ok_and(|n| n > 2) {
-                line.clear();
-            }
-            let etag = "0".repeat(64);
-            let body = if first.contains("config.json") { "{}" } else { "" };
-            let mut stream = &stream;
-            let _ = write!(
-                stream,
-                "HTTP/1.1 200 OK\r\nConnection: close\r\nX-Linked-ETag: \"{etag}\"\r\nContent-Length: {}\r\n\r\n",
-                body.len()
-            );
-            if first.starts_with("GET") {
-                let _ = stream.write_all(body.as_bytes());
-            }
-        }
+    let address = http_server(|first| {
+        let etag = "0".repeat(64);
+        let body = if first.contains("config.json") { "{}" } else { "" };
+        let head = format!(
+            "HTTP/1.1 200 OK\r\nConnection: close\r\nX-Linked-ETag: \"{etag}\"\r\nContent-Length: {}\r\n\r\n",
+            body.len()
+        );
+        if first.starts_with("GET") { head + body } else { head }
     });
     let models = tempfile::tempdir().unwrap();
     let mut pull = command();

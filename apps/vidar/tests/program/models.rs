@@ -1,11 +1,9 @@
 //! `vidar model`, `vidar depth` and a run on a network: the real program with a small checkpoint of synthetic weights.
 
 use crate::support::{
-    ProgramOutput, command, files_under, images_of, keys, run_command, shared, vidar, vidar_in,
+    ProgramOutput, command, files_under, http_server, images_of, keys, run_command, shared, vidar, vidar_in,
 };
 use serde_json::{Value, json};
-use std::io::{BufRead, BufReader, Write};
-use std::net::TcpListener;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::sync::OnceLock;
@@ -268,23 +266,10 @@ fn command_with_store(root: &Path) -> Command {
 
 /// A hub that has only small files: `config.json` of DA3-SMALL's name, and nothing else.
 fn hub() -> String {
-    let listener = TcpListener::bind("127.0.0.1:0").unwrap();
-    let address = format!("http://{}", listener.local_addr().unwrap());
-    std::thread::spawn(move || {
-        for stream in listener.incoming().flatten() {
-            let mut first = String::new();
-            let mut lines = BufReader::new(&stream);
-            let _ = lines.read_line(&mut first);
-            let mut line = String::new();
-            while lines.read_line(&mut line).is_ok_and(|n| n > 2) {
-                line.clear();
-            }
-            let status = if first.contains("GATED") || first.contains("LARGE") { 403 } else { 404 };
-            let mut stream = &stream;
-            let _ = write!(stream, "HTTP/1.1 {status} X\r\nContent-Length: 0\r\nConnection: close\r\n\r\n");
-        }
-    });
-    address
+    http_server(|first| {
+        let status = if first.contains("GATED") || first.contains("LARGE") { 403 } else { 404 };
+        format!("HTTP/1.1 {status} X\r\nContent-Length: 0\r\nConnection: close\r\n\r\n")
+    })
 }
 
 #[test]

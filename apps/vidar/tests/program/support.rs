@@ -2,6 +2,8 @@
 
 use serde_json::Value;
 use std::ffi::OsStr;
+use std::io::{BufRead, BufReader, Write};
+use std::net::TcpListener;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 use std::sync::OnceLock;
@@ -197,4 +199,23 @@ pub fn keys(value: &Value, depth: usize) -> Vec<String> {
 /// The manifest of a run.
 pub fn manifest(run: &Path) -> Value {
     serde_json::from_slice(&std::fs::read(run.join("manifest.json")).unwrap()).unwrap()
+}
+
+/// A server on this machine that answers every request by `answer` of its first line, and its address.
+pub fn http_server(answer: fn(&str) -> String) -> String {
+    let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+    let address = format!("http://{}", listener.local_addr().unwrap());
+    std::thread::spawn(move || {
+        for stream in listener.incoming().flatten() {
+            let mut first = String::new();
+            let mut lines = BufReader::new(&stream);
+            let _ = lines.read_line(&mut first);
+            let mut line = String::new();
+            while lines.read_line(&mut line).is_ok_and(|n| n > 2) {
+                line.clear();
+            }
+            let _ = (&stream).write_all(answer(&first).as_bytes());
+        }
+    });
+    address
 }

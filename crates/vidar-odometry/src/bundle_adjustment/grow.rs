@@ -66,7 +66,7 @@ impl Grown<'_> {
                 self.guess.take_segment(log, imu, model, self.work.clock_offset, image, placed);
                 break;
             }
-            self.push(image, time, arrived);
+            self.guess.push(image, time, arrived);
         }
         let added = self.guess.images.len() - known;
         if added == 0 {
@@ -112,12 +112,6 @@ impl Grown<'_> {
         (secs >= MIN_SEGMENT_SECS).then_some(logged.state)
     }
 
-    fn push(&mut self, image: usize, time: Timestamp, state: NavState) {
-        self.guess.images.push(image);
-        self.guess.times.push(time);
-        self.guess.states.push(state);
-    }
-
     /// One past the last state at most `secs` later than number `from`.
     fn until(&self, from: usize, secs: f64) -> usize {
         let limit = self.guess.times[from] + Duration::from_secs_f64(secs);
@@ -153,13 +147,5 @@ impl Grown<'_> {
     fn judge(&mut self, seen_share: f64, secs: f64) -> Option<()> {
         self.blind_secs = if seen_share >= 0.3 { 0.0 } else { self.blind_secs + secs };
         (self.blind_secs <= MAX_BLIND_SECS).then_some(())
-    }
-}
-
-impl Guess {
-    fn push_front(&mut self, image: usize, time: Timestamp, state: NavState) {
-        self.images.insert(0, image);
-        self.times.insert(0, time);
-        self.states.insert(0, state);
     }
 }

@@ -121,10 +121,22 @@ impl Guess {
                 None => self.carried_to(time, imu, model),
             };
             let Some(state) = state else { return };
-            self.images.push(image);
-            self.times.push(time);
-            self.states.push(state);
+            self.push(image, time, state);
         }
+    }
+
+    /// Adds a state at the end.
+    pub(super) fn push(&mut self, image: usize, time: Timestamp, state: NavState) {
+        self.images.push(image);
+        self.times.push(time);
+        self.states.push(state);
+    }
+
+    /// Adds a state at the beginning.
+    pub(super) fn push_front(&mut self, image: usize, time: Timestamp, state: NavState) {
+        self.images.insert(0, image);
+        self.times.insert(0, time);
+        self.states.insert(0, state);
     }
 
     /// The newest state carried to `time`; `None` where the IMU does not cover it.

@@ -188,7 +188,6 @@ impl Template {
             let mean = values.iter().sum::<f32>() / (SIDE * SIDE) as f32;
             values.iter_mut().for_each(|v| *v -= mean);
         }
-        let dot = |a: &[f32], b: &[f32]| f64::from(a.iter().zip(b).map(|(a, b)| a * b).sum::<f32>());
         let h = Matrix2::new(dot(&gx, &gx), dot(&gx, &gy), dot(&gx, &gy), dot(&gy, &gy));
         let energy = dot(&grey, &grey);
         let weak = 0.5 * (h.trace() - ((h.m11 - h.m22).powi(2) + 4.0 * h.m12 * h.m12).sqrt());

@@ -1,0 +1,55 @@
+//! What is kept for the adjustment after the recording's end, and the adjustment.
+
+use super::{Odometry, Phase, Status};
+use crate::bundle_adjustment::{self, Adjusted, AdjustmentError, CalibrationSigmas, LoggedState, TrackLog};
+use crate::tracking::{host_covariance, noisy_covariance};
+use vidar_core::{Frame, FrameId, Health};
+
+impl Odometry {
+    /// Logs what image `id` shows, where a log is kept and the image is due or a keyframe.
+    pub(super) fn log_image(&mut self, frame: &Frame, id: FrameId, status: &Status) {
+        let Some(log) = &mut self.log else { return };
+        log.add_stamp(frame.id, frame.time);
+        let is_keyframe = matches!(status, Status::Tracking(tracking) if tracking.keyframe.is_some());
+        if !is_keyframe && !log.is_due(frame.time) {
+            return;
+        }
+        let (tracks, state) = match &self.phase {
+            Phase::Initializing(initializer) => (&initializer.tracker.tracks, None),
+            Phase::Tracking(window) => (&window.tracker.tracks, window.state()),
+        };
+        let noise_px = self.config.pixel_noise_px;
+        let shown = tracks.iter().filter_map(|t| match &t.measured {
+            _ if t.host.frame == id => Some((t.id, &t.feature.pixel, host_covariance(t))),
+            Some(measured) if t.last_frame == id => {
+                Some((t.id, &t.last_pixel, noisy_covariance(measured, noise_px)))
+            }
+            _ => None,
+        });
+        // Where the IMU alone carried the state it is no better than what the adjustment carries itself.
+        let is_seen = matches!(status, Status::Tracking(tracking) if tracking.health != Health::Degraded);
+        let state = state.filter(|_| is_seen).map(|state| LoggedState { segment: self.segment, state });
+        log.add_image(id, (frame.id, frame.time), state, shown);
+        if let Phase::Tracking(window) = &self.phase {
+            log.follow(&window.smoother);
+        }
+    }
+
+    /// Keeps tracks and IMU measurements from here on, for [`Odometry::adjust`]: about 2 MB per minute of recording.
+    pub fn keep_log(&mut self) {
+        self.log = Some(TrackLog::new(1.0 / self.imu.nominal_period().as_secs_f64()));
+    }
+
+    /// One adjustment of all states that the log holds; see [`bundle_adjustment`].
+    ///
+    /// # Errors
+    /// No log was kept or there is no IMU; otherwise as [`bundle_adjustment::adjust`].
+    pub fn adjust(&self, sigmas: &CalibrationSigmas) -> Result<Adjusted, AdjustmentError> {
+        let (Some(log), Some(model)) = (&self.log, &self.imu_model) else {
+            return Err(AdjustmentError::TooShort { images: 0 });
+        };
+        let mut camera = self.camera.clone();
+        camera.time_offset += self.estimated_offset();
+        bundle_adjustment::adjust(log, &camera, self.time_calibration.readout_secs, model, sigmas)
+    }
+}
