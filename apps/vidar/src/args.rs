@@ -390,6 +390,12 @@ pub struct ExportArgs {
     /// colmap, colmap-text, nerfstudio, tum, kitti, euroc, ply or glb.
     #[arg(long)]
     pub to: String,
+    /// COLMAP: with every point the keyframes that see it (projections, at most 200 000 points).
+    #[arg(long)]
+    pub tracks: bool,
+    /// COLMAP and nerfstudio: images at the recording's size, undistorted again from its files.
+    #[arg(long)]
+    pub input_size: bool,
     /// Output folder; default `RUN/export/<format>`.
     #[arg(short, long, value_hint = ValueHint::DirPath)]
     pub output: Option<PathBuf>,

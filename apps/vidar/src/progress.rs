@@ -45,6 +45,13 @@ fn plain() -> Events {
                 print::talk(format!("{stage}: {done} of {total}"));
             }
         }
+        Event::ChunkProgress { percent } => {
+            let Ok(mut last) = last.lock() else { return };
+            if last.elapsed() >= HEARTBEAT {
+                *last = Instant::now();
+                print::talk(format!("chunk: {percent} % predicted"));
+            }
+        }
         _ => {}
     })
 }
@@ -68,6 +75,8 @@ fn bar() -> Events {
             bar.set_message(*stage);
             bar.enable_steady_tick(Duration::from_millis(200));
         }
+        Event::ChunkProgress { percent } => bar.set_message(format!("chunk {percent:>3} %")),
+        Event::ChunkPredicted { .. } => bar.set_message("map"),
         Event::Progress { done, total, .. } => {
             bar.set_style(style(true));
             bar.set_length(*total as u64);

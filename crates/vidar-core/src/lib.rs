@@ -78,7 +78,7 @@ pub use id::{CameraId, ChunkId, FrameId, KeyframeId, LandmarkId};
 pub use image::{FrameImage, Image, ImageError};
 pub use lie::{LieGroup, Se3, Sim3, So3};
 pub use model::{
-    ChunkView, ChunkViews, GeometryModel, GeometryPrediction, ModelError, ModelInfo, ViewGeometry,
+    ChunkView, ChunkViews, GeometryModel, GeometryPrediction, ModelError, ModelInfo, ViewGeometry, Watch,
 };
 pub use odometry::{
     Health, NavCovariance, NavState, OdometryKeyframe, PoseCovariance, RevisedPose, SparseLandmark,

@@ -121,6 +121,9 @@ pub enum ModelError {
     Other(String),
 }
 
+/// Called between pieces of long work with the share of it that is done, 0…1, roughly; `true` ends the work.
+pub type Watch<'a> = &'a (dyn Fn(f64) -> bool + Sync);
+
 /// A model that predicts dense geometry from views.
 pub trait GeometryModel: Send {
     /// Which model this is.
@@ -131,15 +134,15 @@ pub trait GeometryModel: Send {
 
     /// Predicts the views `requested` (indices into `views.views`) of a chunk.
     ///
-    /// The other views are context. `cancel` is polled; `true` ends the work with [`ModelError::Cancelled`]. The
-    /// default implementation predicts all views and keeps the requested ones.
+    /// The other views are context. When `watch` answers `true` the work ends with [`ModelError::Cancelled`]. The default
+    /// implementation predicts all views and keeps the requested ones.
     fn predict_views(
         &mut self,
         views: &ChunkViews,
         requested: Range<usize>,
-        cancel: &(dyn Fn() -> bool + Sync),
+        watch: Watch<'_>,
     ) -> Result<GeometryPrediction, ModelError> {
-        if cancel() {
+        if watch(0.0) {
             return Err(ModelError::Cancelled);
         }
         let mut prediction = self.predict(views)?;

@@ -18,7 +18,7 @@ pub type NavCovariance = SMatrix<f64, 15, 15>;
 pub type PoseCovariance = SMatrix<f64, 6, 6>;
 
 /// Navigation state: pose, velocity and IMU biases.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct NavState {
     /// Time of the state, in the clock of the images.
     pub time: Timestamp,
@@ -99,7 +99,7 @@ impl fmt::Display for Health {
 }
 
 /// A landmark as observed in one keyframe.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct SparseLandmark {
     /// The landmark; the same in every keyframe that observes it.
     pub id: LandmarkId,
@@ -112,7 +112,7 @@ pub struct SparseLandmark {
 }
 
 /// A keyframe of the odometry, input of dense reconstruction.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct OdometryKeyframe {
     /// Its number, counted from the first of the sequence.
     pub id: KeyframeId,

@@ -7,7 +7,7 @@ use crate::time::Duration;
 use serde::{Deserialize, Serialize};
 
 /// One camera of the rig.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct RigCamera {
     /// How it projects.
     pub model: CameraModel,
@@ -47,7 +47,7 @@ impl ImuNoise {
 }
 
 /// Cameras and IMU on one rigid body; the body frame is the IMU frame.
-#[derive(Clone, Debug, Default, PartialEq)]
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Rig {
     /// Cameras, indexed by [`CameraId`].
     pub cameras: Vec<RigCamera>,

@@ -199,7 +199,8 @@ impl Da3 {
             backbone: self.backbone,
             exact_blocks: self.arithmetic.exact_blocks,
             head: self.head,
-            cancel: hooks.cancel,
+            watch: hooks.watch,
+            share: (0.0, 1.0),
             trace: hooks.trace,
         }
     }

@@ -13,6 +13,7 @@ use nalgebra::{Matrix3, Matrix4};
 use serde::{Deserialize, Serialize};
 use std::ops::Range;
 use std::sync::Arc;
+use vidar_core::Watch;
 use vidar_core::model::ChunkFrame;
 use vidar_core::{
     ChunkViews, Confidence, FrameId, GeometryModel, GeometryPrediction, Image, LieGroup, ModelError,
@@ -117,7 +118,7 @@ impl Da3Model {
         &mut self,
         chunk: &ChunkViews,
         wanted: Range<usize>,
-        cancel: &(dyn Fn() -> bool + Sync),
+        watch: Watch<'_>,
     ) -> Result<GeometryPrediction, ModelError> {
         let wanted = wanted.start.min(chunk.views.len())..wanted.end.min(chunk.views.len());
         if chunk.views.is_empty() {
@@ -143,7 +144,7 @@ impl Da3Model {
         };
         let told = priors.as_deref().filter(|_| self.network.is_any_view());
         let inputs = Inputs { images: &images, camera_from_world: told, intrinsics: Some(&intrinsics) };
-        let hooks = Hooks { cancel, trace: None };
+        let hooks = Hooks { watch, trace: None };
         let mut prediction =
             self.network.infer_with(&inputs, &options, &hooks).map_err(|e| model_error(e, chunk))?;
         drop(images);
@@ -166,16 +167,16 @@ impl GeometryModel for Da3Model {
     }
 
     fn predict(&mut self, views: &ChunkViews) -> Result<GeometryPrediction, ModelError> {
-        self.predict_some(views, 0..views.views.len(), &|| false)
+        self.predict_some(views, 0..views.views.len(), &|_| false)
     }
 
     fn predict_views(
         &mut self,
         views: &ChunkViews,
         wanted: Range<usize>,
-        cancel: &(dyn Fn() -> bool + Sync),
+        watch: Watch<'_>,
     ) -> Result<GeometryPrediction, ModelError> {
-        self.predict_some(views, wanted, cancel)
+        self.predict_some(views, wanted, watch)
     }
 }
 

@@ -98,7 +98,8 @@ impl ImageEncoder {
             backbone: self.compute,
             exact_blocks: None,
             head: self.compute,
-            cancel: &|| false,
+            watch: &|_| false,
+            share: (0.0, 1.0),
             trace: None,
         };
         let patches = (rows / PATCH) * (columns / PATCH);

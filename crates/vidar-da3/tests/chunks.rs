@@ -85,11 +85,11 @@ fn wanted_views_are_those_of_the_whole_and_a_run_can_be_stopped() {
     let mut model = model(PoseMode::Conditioned);
     let chunk = chunk(4, true);
     let whole = model.predict(&chunk).unwrap();
-    let part = model.predict_views(&chunk, 1..3, &|| false).unwrap();
+    let part = model.predict_views(&chunk, 1..3, &|_| false).unwrap();
     assert_eq!(part.views.iter().map(|v| v.frame_id.0).collect::<Vec<_>>(), [101, 102]);
     assert_eq!(part.views[0].depth, whole.views[1].depth);
-    assert!(matches!(model.predict_views(&chunk, 0..4, &|| true), Err(ModelError::Cancelled)));
-    assert!(model.predict_views(&chunk, 4..4, &|| false).unwrap().views.is_empty());
+    assert!(matches!(model.predict_views(&chunk, 0..4, &|_| true), Err(ModelError::Cancelled)));
+    assert!(model.predict_views(&chunk, 4..4, &|_| false).unwrap().views.is_empty());
     let none = ChunkViews { id: ChunkId(1), views: Vec::new() };
     assert!(matches!(model.predict(&none), Err(ModelError::TooFewViews { .. })));
 }

@@ -116,8 +116,8 @@ fn a_run_on_a_device_stops_when_asked_to() {
     let Some(options) = any_device() else { return };
     let model = Da3::synthetic_of(tiny_config(), &options).unwrap();
     let asked = AtomicUsize::new(0);
-    let cancel = || asked.fetch_add(1, Ordering::Relaxed) >= 6;
-    let hooks = Hooks { cancel: &cancel, trace: None };
+    let cancel = |_| asked.fetch_add(1, Ordering::Relaxed) >= 6;
+    let hooks = Hooks { watch: &cancel, trace: None };
     let said = model.infer_with(&Inputs::images(&pictures(3)), &small(), &hooks);
     assert!(matches!(said, Err(Da3Error::Cancelled)));
     assert!(asked.load(Ordering::Relaxed) < 10);

@@ -77,18 +77,18 @@ fn two_models_run_at_once_without_minding_each_other() {
 fn a_run_stops_wherever_it_is_told_to() {
     let (model, images) = (tiny(), pictures(3));
     let asked = AtomicUsize::new(0);
-    let count = || {
+    let count = |_| {
         asked.fetch_add(1, Ordering::Relaxed);
         false
     };
-    let hooks = Hooks { cancel: &count, trace: None };
+    let hooks = Hooks { watch: &count, trace: None };
     model.infer_with(&Inputs::images(&images), &options(), &hooks).unwrap();
     let total = asked.load(Ordering::Relaxed);
     assert!(total > 20, "asked {total} times");
     for stop in 0..total {
         let asked = AtomicUsize::new(0);
-        let cancel = || asked.fetch_add(1, Ordering::Relaxed) == stop;
-        let hooks = Hooks { cancel: &cancel, trace: None };
+        let cancel = |_| asked.fetch_add(1, Ordering::Relaxed) == stop;
+        let hooks = Hooks { watch: &cancel, trace: None };
         let said = model.infer_with(&Inputs::images(&images), &options(), &hooks);
         assert!(matches!(said, Err(Da3Error::Cancelled)), "at question {stop}");
         assert_eq!(asked.load(Ordering::Relaxed), stop + 1, "nothing is asked after the answer");

@@ -2,6 +2,7 @@
 //! `fov:…,omega`.
 
 use crate::error::DatasetError;
+use std::fmt;
 use std::str::FromStr;
 use vidar_core::camera::{DoubleSphere, Equidistant, Fov, RadTan};
 use vidar_core::{CameraError, CameraModel, Pinhole};
@@ -30,6 +31,21 @@ impl FromStr for CameraFlag {
         let model = from_parameters(name.trim(), &numbers)
             .ok_or_else(|| bad(format!("{name:?} with {} numbers", numbers.len())))?;
         model.map(Self).map_err(|e| bad(e.to_string()))
+    }
+}
+
+impl fmt::Display for CameraFlag {
+    /// As it is read, with enough digits to restore the same bits.
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let name = match &self.0 {
+            CameraModel::Pinhole(_) => "pinhole",
+            CameraModel::RadTan(_) => "radtan",
+            CameraModel::Equidistant(_) => "kb4",
+            CameraModel::DoubleSphere(_) => "ds",
+            CameraModel::Fov(_) => "fov",
+        };
+        let numbers: Vec<String> = self.0.parameters().iter().map(f64::to_string).collect();
+        write!(f, "{name}:{}", numbers.join(","))
     }
 }
 
@@ -89,6 +105,7 @@ mod tests {
             let flag: CameraFlag = text.parse().unwrap();
             assert_eq!(flag.0.name(), name);
             assert_eq!(flag.0.width(), 0);
+            assert_eq!(flag.to_string().parse::<CameraFlag>().unwrap(), flag);
             let sized = with_size(&flag.0, 640, 480).unwrap();
             assert_eq!((sized.width(), sized.height()), (640, 480));
             assert_eq!(sized.intrinsics().fx, flag.0.intrinsics().fx);

@@ -4,7 +4,7 @@ use crate::decode::{self, ImageLimits};
 use crate::error::{DatasetError, io_error};
 use crate::events::Events;
 use crate::options::DatasetKind;
-use crate::source::read_text_file;
+use std::io::Write;
 use std::path::{Path, PathBuf};
 use vidar_core::remap::RemapTable;
 use vidar_core::{
@@ -68,7 +68,7 @@ pub struct ExternalTrajectory {
 }
 
 /// Where the chosen camera's model comes from.
-#[derive(Clone, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
 pub enum CalibrationSource {
     /// A calibration file.
     File(PathBuf),
@@ -173,22 +173,26 @@ impl Dataset {
         Events::new(self)
     }
 
-    /// The bytes to hash for a fingerprint of the dataset: name and size of every image and depth image, and every byte of
-    /// every text file that was read. Two datasets with equal fingerprints give the same data.
-    pub fn fingerprint(&self) -> Result<Vec<u8>, DatasetError> {
-        let mut out = format!("vidar-dataset 1 {} camera {}\n", self.kind, self.camera).into_bytes();
+    /// Writes the bytes to hash for a fingerprint of the dataset: name and size of every image and depth image, and every byte
+    /// of every text file that was read. Two datasets with equal fingerprints give the same data.
+    pub fn write_fingerprint(&self, out: &mut dyn Write) -> Result<(), DatasetError> {
+        let say = |out: &mut dyn Write, text: String, path: &Path| {
+            out.write_all(text.as_bytes()).map_err(io_error(path))
+        };
+        say(out, format!("vidar-dataset 1 {} camera {}\n", self.kind, self.camera), &self.root)?;
         let images = self.images.iter().map(|e| (e.time, &e.path));
         let depths = self.depths.iter().map(|e| (e.time, &e.path));
         for (time, path) in images.chain(depths) {
             let size = std::fs::metadata(path).map_err(io_error(path))?.len();
-            out.extend_from_slice(format!("{} {size} {time}\n", self.relative(path)).as_bytes());
+            say(out, format!("{} {size} {time}\n", self.relative(path)), path)?;
         }
         for path in &self.text_files {
-            let text = read_text_file(path)?;
-            out.extend_from_slice(format!("{} {}\n", self.relative(path), text.len()).as_bytes());
-            out.extend_from_slice(&text);
+            let mut file = std::fs::File::open(path).map_err(io_error(path))?;
+            let size = file.metadata().map_err(io_error(path))?.len();
+            say(out, format!("{} {size}\n", self.relative(path)), path)?;
+            std::io::copy(&mut file, out).map_err(io_error(path))?;
         }
-        Ok(out)
+        Ok(())
     }
 
     /// The path as printed: relative to the root if it lies inside.

@@ -113,9 +113,9 @@ fn read_imu(draft: &mut Draft, options: &OpenOptions) -> Result<Se3, DatasetErro
     if !list.is_file() {
         return Ok(Se3::IDENTITY);
     }
-    let bytes = draft.read(&list)?;
     let rule = UnitRule::given_or(options.time_unit, TimeUnit::Nanoseconds);
-    let (imu, notes) = parse::imu_csv(&Source { path: &list, bytes: &bytes }, rule)?;
+    let (imu, notes) = parse::imu_file(&list, rule)?;
+    draft.text_files.push(list);
     draft.warnings.extend(notes);
     draft.imu = imu;
     let sensor = read_sensor(draft, &folder)?.map(|(s, _)| s);

@@ -5,8 +5,12 @@ use std::io::Read;
 use std::path::Path;
 use vidar_core::Warning;
 
-/// Largest text file that is read.
-pub const MAX_TEXT_BYTES: u64 = 2 << 30;
+/// Largest text file that is read as a whole: fifty minutes of 17 columns at 200 Hz.
+pub const MAX_TEXT_BYTES: u64 = 192 << 20;
+/// Largest text file that is read block by block: what [`MAX_ROWS`] lines of 17 columns take.
+const MAX_BLOCKS_BYTES: u64 = 1 << 30;
+/// Bytes of a block.
+const BLOCK_BYTES: usize = 4 << 20;
 /// Longest line that is read; the longest line of a known format (17 columns) has under 500 bytes.
 pub const MAX_LINE_BYTES: usize = 16 << 10;
 
@@ -33,8 +37,40 @@ pub(crate) fn read_file_up_to(path: &Path, limit: u64) -> Result<Vec<u8>, Datase
 /// Largest input that is read from what is no file, bytes.
 const MAX_STREAM_BYTES: u64 = 64 << 20;
 
-/// Most rows of a file: ten hours at 1 kHz. It keeps a file of line feeds from growing into a list of rows.
-const MAX_ROWS: usize = 36_000_000;
+/// Reads a text file block by block, each of whole lines, so that a long recording of an IMU is never in memory as text. `f` gets
+/// the number of lines before the block.
+pub(crate) fn for_each_block(
+    path: &Path,
+    mut f: impl FnMut(&Source<'_>, usize) -> Result<(), DatasetError>,
+) -> Result<(), DatasetError> {
+    let mut file = std::fs::File::open(path).map_err(io_error(path))?;
+    let found = file.metadata().map_err(io_error(path))?.len();
+    if found > MAX_BLOCKS_BYTES {
+        let limit = MAX_BLOCKS_BYTES;
+        return Err(DatasetError::TooLarge { path: path.to_path_buf(), found, limit });
+    }
+    let (mut block, mut lines_before) = (Vec::with_capacity(BLOCK_BYTES + MAX_LINE_BYTES), 0);
+    loop {
+        let kept = block.len();
+        let limit = BLOCK_BYTES as u64;
+        (&mut file).take(limit).read_to_end(&mut block).map_err(io_error(path))?;
+        let is_end = block.len() == kept;
+        // A line longer than is allowed ends the reading in `Source::lines`.
+        let whole = match block.iter().rposition(|&b| b == b'\n') {
+            Some(last) if !is_end && block.len() - last <= MAX_LINE_BYTES => last + 1,
+            _ => block.len(),
+        };
+        f(&Source { path, bytes: &block[..whole] }, lines_before)?;
+        if is_end {
+            return Ok(());
+        }
+        lines_before += block[..whole].iter().filter(|&&b| b == b'\n').count();
+        block.drain(..whole);
+    }
+}
+
+/// Most rows of a file: 50 minutes at 1 kHz, four hours at 200 Hz. As IMU samples they take 170 MB.
+pub const MAX_ROWS: usize = 3_000_000;
 
 /// The bytes of a text file and its path for messages.
 #[derive(Clone, Copy, Debug)]
@@ -111,10 +147,19 @@ impl<'a> Source<'a> {
 
     /// Splits the file into lines; skips empty ones and a first line of column names.
     pub(crate) fn lines(&self, notes: &mut Vec<Warning>) -> Result<Lines<'a>, DatasetError> {
+        self.lines_after(0, notes)
+    }
+
+    /// The same of a block with `lines_before` lines before it.
+    pub(crate) fn lines_after(
+        &self,
+        lines_before: usize,
+        notes: &mut Vec<Warning>,
+    ) -> Result<Lines<'a>, DatasetError> {
         let mut out = Lines { rows: Vec::new(), comments: Vec::new() };
         let mut crlf = false;
         for (index, raw) in self.without_bom(notes)?.split(|&b| b == b'\n').enumerate() {
-            let line = index + 1;
+            let line = lines_before + index + 1;
             if raw.len() > MAX_LINE_BYTES {
                 let found = format!("a line of {} bytes", raw.len());
                 return Err(self.malformed(line, found, format!("at most {MAX_LINE_BYTES} bytes a line")));
@@ -127,11 +172,11 @@ impl<'a> Source<'a> {
                 if out.comments.len() < MAX_COMMENTS {
                     out.comments.push(comment.trim());
                 }
-            } else if out.rows.is_empty() && is_column_names(text) {
+            } else if lines_before == 0 && out.rows.is_empty() && is_column_names(text) {
                 out.comments.push(text);
             } else if !text.is_empty() {
                 if out.rows.len() == MAX_ROWS {
-                    return Err(self.malformed(line, format!("more than {MAX_ROWS} rows"), "a shorter file"));
+                    return Err(self.too_many_rows(line, MAX_ROWS));
                 }
                 out.rows.push(Row { line, text });
             }
@@ -142,6 +187,10 @@ impl<'a> Source<'a> {
             );
         }
         Ok(out)
+    }
+
+    pub(crate) fn too_many_rows(&self, line: usize, limit: usize) -> DatasetError {
+        self.malformed(line, format!("more than {limit} rows"), "a shorter file: split the recording")
     }
 
     /// A finite or non-finite number.

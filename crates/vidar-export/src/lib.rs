@@ -44,7 +44,7 @@ pub mod transforms;
 mod vertices;
 pub mod view;
 
-pub use colmap::{ColmapFormat, ColmapModel, read_colmap, read_colmap_bytes, write_colmap};
+pub use colmap::{ColmapFormat, ColmapModel, Observation, read_colmap, read_colmap_bytes, write_colmap};
 pub use depth::{DepthFrame, DepthPngStats, DepthSidecar, read_depth_png, write_depth_png};
 pub use error::ExportError;
 pub use glb::{Glb, read_glb, write_glb_cloud, write_glb_mesh};

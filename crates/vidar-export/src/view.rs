@@ -39,7 +39,12 @@ const HALF_PIXEL: f64 = 0.5;
 
 /// A principal point in COLMAP's and nerfstudio's pixel convention.
 pub(crate) fn corner_origin_principal_point(intrinsics: &Pinhole) -> (f64, f64) {
-    (intrinsics.cx + HALF_PIXEL, intrinsics.cy + HALF_PIXEL)
+    (corner_origin(intrinsics.cx), corner_origin(intrinsics.cy))
+}
+
+/// A pixel coordinate in that convention.
+pub(crate) fn corner_origin(coordinate: f64) -> f64 {
+    coordinate + HALF_PIXEL
 }
 
 /// Intrinsics from a file that counts pixels from the corner of the image.

@@ -143,14 +143,14 @@ fn an_empty_cloud_is_a_valid_file_in_every_format() {
     assert!(!String::from_utf8_lossy(&glb).contains("BIN\0"));
     assert!(read_glb(&glb).unwrap().into_cloud().is_empty());
     let dir = tempfile::tempdir().unwrap();
-    write_colmap(dir.path(), ColmapFormat::Binary, &[], &empty).unwrap();
+    write_colmap(dir.path(), ColmapFormat::Binary, &[], &empty, &[]).unwrap();
     assert_eq!(read_colmap(dir.path()).unwrap(), ColmapModel::default());
 }
 
 #[test]
 fn colmap_text_is_unchanged() {
     let dir = tempfile::tempdir().unwrap();
-    write_colmap(dir.path(), ColmapFormat::Text, &small_views(), &cloud_of(&small_mesh())).unwrap();
+    write_colmap(dir.path(), ColmapFormat::Text, &small_views(), &cloud_of(&small_mesh()), &[]).unwrap();
     let read = |name: &str| std::fs::read_to_string(dir.path().join(name)).unwrap();
     assert_eq!(
         read("cameras.txt"),
@@ -183,7 +183,7 @@ fn colmap_binary_is_unchanged() {
     let views = &small_views()[..1];
     let cloud =
         PointCloud { positions: vec![[1.0, 0.0, 0.5]], colors: vec![[1, 2, 3]], ..PointCloud::default() };
-    write_colmap(dir.path(), ColmapFormat::Binary, views, &cloud).unwrap();
+    write_colmap(dir.path(), ColmapFormat::Binary, views, &cloud, &[]).unwrap();
     let read = |name: &str| std::fs::read(dir.path().join(name)).unwrap();
     let reals = |values: &[f64]| values.iter().flat_map(|v| v.to_le_bytes()).collect::<Vec<u8>>();
     let number = |value: u64| value.to_le_bytes().to_vec();

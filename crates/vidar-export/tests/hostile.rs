@@ -60,7 +60,7 @@ struct Sample {
 
 fn colmap_file(format: ColmapFormat, name: &str) -> Vec<u8> {
     let dir = tempfile::tempdir().unwrap();
-    write_colmap(dir.path(), format, &small_views(), &cloud_of(&small_mesh())).unwrap();
+    write_colmap(dir.path(), format, &small_views(), &cloud_of(&small_mesh()), &[]).unwrap();
     fs::read(dir.path().join(name)).unwrap()
 }
 
@@ -384,7 +384,7 @@ fn values_that_a_format_cannot_hold_are_refused_before_a_byte_is_written() {
     let refuse = |change: fn(&mut Vec<ExportView>), words: &str| {
         let mut views = small_views();
         change(&mut views);
-        let text_model = write_colmap(dir.path(), ColmapFormat::Text, &views, &PointCloud::default());
+        let text_model = write_colmap(dir.path(), ColmapFormat::Text, &views, &PointCloud::default(), &[]);
         let error = text_model.unwrap_err().to_string();
         assert!(error.contains(words), "{error}");
         assert_eq!(fs::read_dir(dir.path()).unwrap().count(), 0);
@@ -435,7 +435,7 @@ fn a_model_at_an_invalid_path_is_reported_with_the_path() {
     let file = dir.path().join("eine Datei ä");
     fs::File::create(&file).unwrap().write_all(b"x").unwrap();
     let below: &Path = &file.join("sparse");
-    let write = write_colmap(below, ColmapFormat::Binary, &small_views(), &PointCloud::default());
+    let write = write_colmap(below, ColmapFormat::Binary, &small_views(), &PointCloud::default(), &[]);
     for error in [write.unwrap_err(), read_colmap(below).unwrap_err()] {
         assert!(matches!(error, ExportError::File { .. }), "{error}");
         assert!(error.to_string().contains(&below.display().to_string()), "{error}");

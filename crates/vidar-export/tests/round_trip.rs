@@ -73,7 +73,13 @@ proptest! {
         let points = PointCloud { normals: vec![], confidences: vec![], ..cloud_of(&m) };
         for format in [ColmapFormat::Text, ColmapFormat::Binary] {
             let folder = dir.path().join(format!("Räume {format:?}"));
-            write_colmap(&folder, format, &views, &points).unwrap();
+            let seen = |(view, point): (usize, usize)| Observation {
+                point: point as u32,
+                view: view as u32,
+                pixel: [point as f64 + 0.25, view as f64],
+            };
+            let pairs = (0..views.len()).flat_map(|v| (v..points.len()).map(move |p| (v, p)));
+            write_colmap(&folder, format, &views, &points, &pairs.map(seen).collect::<Vec<_>>()).unwrap();
             let model = read_colmap(&folder).unwrap();
             prop_assert_eq!(&model.points.positions, &points.positions);
             if points.colors.is_empty() {
@@ -165,7 +171,7 @@ fn point_and_pixel(view: &ExportView) -> (Vector3<f64>, [f64; 2]) {
 fn colmaps_own_projection_lands_half_a_pixel_further() {
     let dir = tempfile::tempdir().unwrap();
     let views = small_views();
-    write_colmap(dir.path(), ColmapFormat::Text, &views, &PointCloud::default()).unwrap();
+    write_colmap(dir.path(), ColmapFormat::Text, &views, &PointCloud::default(), &[]).unwrap();
     let cameras = std::fs::read_to_string(dir.path().join("cameras.txt")).unwrap();
     let images = std::fs::read_to_string(dir.path().join("images.txt")).unwrap();
     let k: Vec<f64> =

@@ -19,5 +19,5 @@ fn one_reference_and_its_checks(bencher: divan::Bencher<'_, '_>) {
     let chunk = views(&WALL, &poses(), |_| (1.0, 0.0), 2.0);
     bencher
         .with_inputs(|| StereoModel::new(StereoConfig::default()).expect("valid"))
-        .bench_local_values(|model| model.predict_with(&chunk, &[2], &|| false).expect("has parallax"));
+        .bench_local_values(|model| model.predict_with(&chunk, &[2], &|_| false).expect("has parallax"));
 }

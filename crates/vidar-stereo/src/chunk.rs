@@ -8,7 +8,8 @@ use crate::prepare::Prepared;
 use crate::register::register;
 use rayon::prelude::*;
 use std::collections::{BTreeMap, BTreeSet};
-use vidar_core::{Pinhole, Se3};
+use std::sync::atomic::{AtomicUsize, Ordering};
+use vidar_core::{Pinhole, Se3, Watch};
 
 /// Neighbours whose own depths are compared with a reference's.
 const CHECKED_NEIGHBOURS: usize = 4;
@@ -28,9 +29,6 @@ pub(crate) struct ViewDepth {
     pub neighbours: Vec<usize>,
 }
 
-/// Polled before each unit of work; `true` ends the call.
-pub(crate) type Cancel<'a> = &'a (dyn Fn() -> bool + Sync);
-
 /// A call in progress.
 pub(crate) struct Chunk<'a> {
     /// The views; at their corrected poses once [`Chunk::work`] is done.
@@ -42,7 +40,9 @@ pub(crate) struct Chunk<'a> {
     /// The views whose depth is requested.
     references: &'a BTreeSet<usize>,
     config: &'a StereoConfig,
-    cancel: Cancel<'a>,
+    watch: Watch<'a>,
+    /// Units of work so far.
+    done: AtomicUsize,
 }
 
 impl<'a> Chunk<'a> {
@@ -50,10 +50,18 @@ impl<'a> Chunk<'a> {
         views: Vec<Prepared>,
         references: &'a BTreeSet<usize>,
         config: &'a StereoConfig,
-        cancel: Cancel<'a>,
+        watch: Watch<'a>,
     ) -> Self {
         let parallax_deg = vec![0.0; views.len()];
-        Self { views, parallax_deg, depths: BTreeMap::new(), references, config, cancel }
+        Self {
+            views,
+            parallax_deg,
+            depths: BTreeMap::new(),
+            references,
+            config,
+            watch,
+            done: AtomicUsize::new(0),
+        }
     }
 
     /// Depth of the references and of the views that they are checked against.
@@ -117,6 +125,9 @@ impl<'a> Chunk<'a> {
     }
 
     fn unless_cancelled<T>(&self, work: impl FnOnce() -> T) -> Result<T, StereoError> {
-        if (self.cancel)() { Err(StereoError::Cancelled) } else { Ok(work()) }
+        // Every view is probed, every reference estimated; the few estimates for checks come on top.
+        let units = self.views.len() + self.references.len();
+        let done = self.done.fetch_add(1, Ordering::Relaxed).min(units);
+        if (self.watch)(done as f64 / units as f64) { Err(StereoError::Cancelled) } else { Ok(work()) }
     }
 }

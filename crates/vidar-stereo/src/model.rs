@@ -1,6 +1,6 @@
 //! The model: views in, depth in the frame of the given poses out.
 
-use crate::chunk::{Cancel, Chunk, ViewDepth};
+use crate::chunk::{Chunk, ViewDepth};
 use crate::confidence::{PixelFeatures, pixel_features};
 use crate::config::StereoConfig;
 use crate::consistency::{Support, support};
@@ -13,7 +13,7 @@ use std::ops::Range;
 use vidar_core::model::ChunkFrame;
 use vidar_core::{
     ChunkViews, Confidence, FrameId, GeometryModel, GeometryPrediction, Image, ModelError, ModelInfo,
-    RelativeDepth, ViewGeometry,
+    RelativeDepth, ViewGeometry, Watch,
 };
 
 /// Fewest views of a chunk.
@@ -78,14 +78,14 @@ impl StereoModel {
     /// Depth of the views at the indices `references` only, from all of `views`.
     ///
     /// Neighbours are chosen anywhere in `views`, so a streaming driver passes a window around the references.
-    /// `cancel` is polled before each unit of work. Fails if no reference has parallax.
+    /// `watch` is called before each unit of work; `true` ends it. Fails if no reference has parallax.
     pub fn predict_with(
         &self,
         views: &ChunkViews,
         references: &[usize],
-        cancel: &(dyn Fn() -> bool + Sync),
+        watch: Watch<'_>,
     ) -> Result<StereoOutput, StereoError> {
-        Ok(self.with_parallax(views, references, cancel, false)?.0)
+        Ok(self.with_parallax(views, references, watch, false)?.0)
     }
 
     /// As [`Self::predict_with`], with the features of the confidence: one entry per view of the prediction.
@@ -93,9 +93,9 @@ impl StereoModel {
         &self,
         views: &ChunkViews,
         references: &[usize],
-        cancel: &(dyn Fn() -> bool + Sync),
+        watch: Watch<'_>,
     ) -> Result<(StereoOutput, Vec<ViewFeatures>), StereoError> {
-        self.with_parallax(views, references, cancel, true)
+        self.with_parallax(views, references, watch, true)
     }
 
     /// As [`Self::depths_of`]; an error if no reference has parallax.
@@ -103,10 +103,10 @@ impl StereoModel {
         &self,
         views: &ChunkViews,
         references: &[usize],
-        cancel: Cancel<'_>,
+        watch: Watch<'_>,
         keep_features: bool,
     ) -> Result<(StereoOutput, Vec<ViewFeatures>), StereoError> {
-        let (output, features) = self.depths_of(views, references, cancel, keep_features)?;
+        let (output, features) = self.depths_of(views, references, watch, keep_features)?;
         if output.prediction.views.is_empty() && !output.omitted.is_empty() {
             let found_deg = output.omitted.iter().map(|o| o.found_parallax_deg).fold(0.0, f64::max);
             let needed_deg = self.config.min_parallax_deg;
@@ -120,7 +120,7 @@ impl StereoModel {
         &self,
         views: &ChunkViews,
         references: &[usize],
-        cancel: Cancel<'_>,
+        watch: Watch<'_>,
         keep_features: bool,
     ) -> Result<(StereoOutput, Vec<ViewFeatures>), StereoError> {
         let found = views.views.len();
@@ -134,7 +134,7 @@ impl StereoModel {
         let prepared: Vec<_> = views.views.par_iter().map(|v| prepare(v, &self.config)).collect();
         // Collected one by one, so that the error is that of the first bad view.
         let prepared = prepared.into_iter().collect::<Result<Vec<_>, _>>()?;
-        let mut chunk = Chunk::new(prepared, &references, &self.config, cancel);
+        let mut chunk = Chunk::new(prepared, &references, &self.config, watch);
         chunk.work()?;
         let results: Vec<_> = references
             .par_iter()
@@ -213,7 +213,7 @@ impl GeometryModel for StereoModel {
 
     fn predict(&mut self, views: &ChunkViews) -> Result<GeometryPrediction, ModelError> {
         let references: Vec<usize> = (0..views.views.len()).collect();
-        Ok(self.predict_with(views, &references, &|| false)?.prediction)
+        Ok(self.predict_with(views, &references, &|_| false)?.prediction)
     }
 
     /// Views without parallax are omitted, even if that leaves none; context views are estimated only as far as the
@@ -222,9 +222,9 @@ impl GeometryModel for StereoModel {
         &mut self,
         views: &ChunkViews,
         requested: Range<usize>,
-        cancel: &(dyn Fn() -> bool + Sync),
+        watch: Watch<'_>,
     ) -> Result<GeometryPrediction, ModelError> {
         let references: Vec<usize> = requested.filter(|&i| i < views.views.len()).collect();
-        Ok(self.depths_of(views, &references, cancel, false)?.0.prediction)
+        Ok(self.depths_of(views, &references, watch, false)?.0.prediction)
     }
 }

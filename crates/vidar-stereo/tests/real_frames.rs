@@ -52,7 +52,7 @@ fn view(i: usize, path: &Path, world_from_camera: Se3, k: impl Fn(usize, usize) 
 fn evaluate(views: Vec<ChunkView>, sensor: &[(Image<f32>, Pinhole, Se3)]) -> (f64, f64) {
     let chunk = ChunkViews { id: ChunkId(0), views };
     let mut model = StereoModel::new(StereoConfig::default()).expect("defaults are valid");
-    let found = model.predict_views(&chunk, EVALUATED, &|| false).expect("has parallax").views;
+    let found = model.predict_views(&chunk, EVALUATED, &|_| false).expect("has parallax").views;
     assert_eq!(found.len(), EVALUATED.len());
     let (mut with_truth, mut there, mut near) = (0usize, 0usize, 0usize);
     for view in found {

@@ -16,7 +16,7 @@ fn model() -> StereoModel {
 }
 
 fn middle(chunk: &ChunkViews) -> ViewGeometry {
-    let mut output = model().predict_with(chunk, &[MIDDLE], &|| false).expect("has parallax");
+    let mut output = model().predict_with(chunk, &[MIDDLE], &|_| false).expect("has parallax");
     output.prediction.views.remove(0)
 }
 
@@ -89,7 +89,7 @@ fn pure_rotation_is_an_error_of_missing_parallax() {
     let turns: Vec<Se3> = (0..4)
         .map(|i| Se3::new(So3::exp(&Vector3::new(0.0, 0.05 * i as f64, 0.0)), Vector3::zeros()))
         .collect();
-    let result = model().predict_with(&views(&WALL, &turns, plain, 0.0), &[0, 1], &|| false);
+    let result = model().predict_with(&views(&WALL, &turns, plain, 0.0), &[0, 1], &|_| false);
     assert!(
         matches!(result, Err(StereoError::NoParallax { found_deg, needed_deg, .. }) if found_deg < needed_deg),
         "{result:?}"
@@ -101,7 +101,7 @@ fn a_view_far_away_is_omitted_and_the_others_are_estimated() {
     let mut places = poses();
     places.push(Se3::from_translation(Vector3::new(500.0, 0.0, 0.0)));
     let chunk = views(&WALL, &places, plain, 0.0);
-    let output = model().predict_with(&chunk, &[MIDDLE, 5], &|| false).expect("one has parallax");
+    let output = model().predict_with(&chunk, &[MIDDLE, 5], &|_| false).expect("one has parallax");
     assert_eq!(output.prediction.views.len(), 1);
     assert_eq!(output.omitted.iter().map(|o| o.frame_id).collect::<Vec<_>>(), [FrameId(5)]);
 }
@@ -120,9 +120,9 @@ fn errors_name_the_bad_view() {
     assert!(matches!(model().predict(&lost), Err(ModelError::BadView { frame: FrameId(1), .. })));
     let mut odd = good.clone();
     odd.views[2].intrinsics.width = 100;
-    let result = model().predict_with(&odd, &[0], &|| false);
+    let result = model().predict_with(&odd, &[0], &|_| false);
     assert!(matches!(result, Err(StereoError::SizeMismatch { frame: FrameId(2), .. })));
-    let result = model().predict_with(&good, &[0], &|| true);
+    let result = model().predict_with(&good, &[0], &|_| true);
     assert!(matches!(result, Err(StereoError::Cancelled)));
     let result = StereoModel::new(StereoConfig { max_planes: 1, ..StereoConfig::default() });
     assert!(matches!(result, Err(StereoError::BadConfig { key: "max_planes", .. })));

@@ -57,7 +57,7 @@ fn counted(
     requested: Range<usize>,
 ) -> (Vec<ViewGeometry>, usize) {
     let polls = AtomicUsize::new(0);
-    let cancel = || {
+    let cancel = |_| {
         polls.fetch_add(1, Ordering::Relaxed);
         false
     };
@@ -94,9 +94,9 @@ fn a_model_keeps_no_state_between_calls() {
     // The same call twice, and the whole chunk in between: the model keeps no state.
     let all = views(&boxed(), &flight(6), |_| (1.0, 0.0), 2.0);
     let mut used = model();
-    let first = used.predict_views(&all, 2..3, &|| false).expect("has parallax");
+    let first = used.predict_views(&all, 2..3, &|_| false).expect("has parallax");
     used.predict(&all).expect("has parallax");
-    let again = used.predict_views(&all, 2..3, &|| false).expect("has parallax");
+    let again = used.predict_views(&all, 2..3, &|_| false).expect("has parallax");
     assert!(bits(&first.views) == bits(&again.views));
 }
 
@@ -106,13 +106,13 @@ fn requested_views_without_parallax_are_omitted_and_cancelling_works() {
         .map(|i| Se3::new(So3::exp(&Vector3::new(0.0, 0.05 * i as f64, 0.0)), Vector3::zeros()))
         .collect();
     let chunk = views(&WALL, &turns, |_| (1.0, 0.0), 0.0);
-    let prediction = model().predict_views(&chunk, 1..3, &|| false).expect("no depth is not an error here");
+    let prediction = model().predict_views(&chunk, 1..3, &|_| false).expect("no depth is not an error here");
     assert!(prediction.views.is_empty());
     let chunk = views(&WALL, &flight(4), |_| (1.0, 0.0), 0.0);
-    assert!(matches!(model().predict_views(&chunk, 1..3, &|| true), Err(ModelError::Cancelled)));
+    assert!(matches!(model().predict_views(&chunk, 1..3, &|_| true), Err(ModelError::Cancelled)));
     // Also in the middle of the work.
     let polls = AtomicUsize::new(0);
-    let late = || polls.fetch_add(1, Ordering::Relaxed) > 5;
+    let late = |_| polls.fetch_add(1, Ordering::Relaxed) > 5;
     assert!(matches!(model().predict_views(&chunk, 0..4, &late), Err(ModelError::Cancelled)));
 }
 
@@ -141,7 +141,7 @@ fn noisy_poses_are_corrected_by_the_images() {
     let taken_as_given = StereoConfig { pose_std_deg: 0.0, ..StereoConfig::default() };
     let score = |config: StereoConfig| {
         let mut model = StereoModel::new(config).expect("valid");
-        let found = model.predict_views(&chunk, 4..5, &|| false).expect("has parallax");
+        let found = model.predict_views(&chunk, 4..5, &|_| false).expect("has parallax");
         assert_eq!(found.views[0].frame_id, FrameId(4));
         right(&boxed(), &true_poses[4], &found.views[0])
     };

@@ -124,7 +124,7 @@ fn a_simulated_network_predicts_what_it_is_shown() {
     assert_eq!(posed.predict(&chunk(&simulation, true)).unwrap().frame, ChunkFrame::PriorWorld);
     let lost = posed.predict(&chunk(&simulation, false)).unwrap_err();
     assert!(matches!(lost, ModelError::MissingPose { frame: FrameId(0) }), "{lost}");
-    let wanted = posed.predict_views(&chunk(&simulation, true), 3..5, &|| false).unwrap();
+    let wanted = posed.predict_views(&chunk(&simulation, true), 3..5, &|_| false).unwrap();
     assert_eq!(wanted.views.iter().map(|v| v.frame_id.0).collect::<Vec<_>>(), [3, 4]);
     let mut late = chunk(&simulation, true);
     late.views[4].time = simulation.frame_time(10_000);

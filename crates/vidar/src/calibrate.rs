@@ -176,6 +176,17 @@ pub(crate) fn complete(
     Ok(())
 }
 
+/// What calibrating `dataset` gives, or why it gives nothing, as a sentence.
+pub(crate) fn found_in_words(dataset: &Dataset, events: &Events, cancel: &CancelToken) -> String {
+    match events.stage(STAGE, 0, || look(dataset, events, cancel)) {
+        Ok(found) => match too_uncertain(&found) {
+            Some(reason) => format!("{}; too uncertain to be used unasked: {reason}", report::values(&found)),
+            None => report::values(&found),
+        },
+        Err(error) => error.to_string(),
+    }
+}
+
 /// Follows features through the recording and estimates.
 fn look(dataset: &Dataset, events: &Events, cancel: &CancelToken) -> Result<Calibration, Error> {
     let refuse = |reason: &str| Error::NotCalibrated { name: dataset.name.clone(), reason: reason.into() };
@@ -230,7 +241,6 @@ pub(crate) fn model_of(found: &Calibration, (width, height): (usize, usize)) -> 
     Ok(CameraModel::RadTan(RadTan::new(pinhole, [k1, k2, 0.0, 0.0])?))
 }
 
-/// A readout that is not there within three standard deviations and below 4 ms is a global shutter's.
 /// Why a calibration that was found is too uncertain to be used without being asked for: rotation and focal length not known
 /// well enough for tracks and gyroscope to agree within a few pixels, or the clock not within a tenth of a second's motion.
 fn too_uncertain(found: &Calibration) -> Option<String> {
@@ -247,6 +257,7 @@ fn too_uncertain(found: &Calibration) -> Option<String> {
     }
 }
 
+/// A readout that is not there within three standard deviations and below 4 ms is a global shutter's.
 fn used_readout_ms(found: &Calibration) -> f64 {
     let readout = found.readout_secs;
     let is_global = readout.value < (3.0 * readout.sigma).min(0.004);

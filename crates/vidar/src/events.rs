@@ -32,6 +32,11 @@ pub enum Event {
         /// Steps expected.
         total: usize,
     },
+    /// A part of the chunk at hand is predicted.
+    ChunkProgress {
+        /// Roughly, 0…100.
+        percent: usize,
+    },
     /// A stage ended.
     StageFinished {
         /// Stage name.

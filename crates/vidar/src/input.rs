@@ -4,6 +4,7 @@ use crate::config::{Config, PoseSource as PoseChoice};
 use crate::engine::{FrameStamp, GivenPoses, ImageSource, OdometryPoses, PoseSource};
 use crate::error::Error;
 use serde::Serialize;
+use sha2::{Digest, Sha256};
 use std::path::{Path, PathBuf};
 use vidar_align::CouplingMode;
 use vidar_core::{
@@ -144,6 +145,13 @@ fn given_poses(trajectory: &MetricTrajectory, dataset: &Dataset, config: &Config
     // Poses are in the IMU's clock: t_imu = t_camera + offset.
     let offset = dataset.rig.camera(dataset.camera).map_or(Duration::ZERO, |c| c.time_offset);
     GivenPoses::new(trajectory.clone(), offset, Duration::from_secs_f64(config.input.max_pose_gap_secs))
+}
+
+/// SHA-256 of what a recording consists of.
+pub(crate) fn fingerprint(dataset: &Dataset) -> Result<String, Error> {
+    let mut hash = Sha256::new();
+    dataset.write_fingerprint(&mut hash)?;
+    Ok(vidar_hub::hex(&hash.finalize()))
 }
 
 /// A recording as the engine takes it: IMU samples and images in the order of time, each image decoded when its turn comes.

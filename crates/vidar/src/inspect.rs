@@ -1,12 +1,18 @@
 //! `vidar inspect`: contents and health of a recording.
 
 mod calibration;
+mod motion;
 
+pub use motion::Motion;
+
+use crate::calibrate;
 use crate::error::Error;
+use crate::events::{CancelToken, Events};
 use serde::Serialize;
 use std::path::Path;
-use vidar_core::{FrameImage, Timestamp, Trajectory, Warning};
-use vidar_dataset::{Dataset, OpenOptions};
+use vidar_core::{Duration, FrameImage, Timestamp, Trajectory, Warning};
+use vidar_dataset::{CalibrationSource, Dataset, OpenOptions};
+use vidar_odometry::calibration::sensor_noise;
 
 /// Summary of a recording.
 #[derive(Clone, Debug, Serialize)]
@@ -27,6 +33,14 @@ pub struct Inspection {
     pub poses: Vec<String>,
     /// Brightness and sharpness of sampled images.
     pub images: Option<ImageHealth>,
+    /// How the camera moved, where there is an IMU.
+    pub motion: Option<Motion>,
+    /// What the recording does not state.
+    pub missing: Vec<String>,
+    /// What of it was found from images and IMU, with standard deviations; or why it was not.
+    pub found: Vec<String>,
+    /// What to film differently next time.
+    pub advice: Vec<String>,
     /// What can be done with the recording.
     pub possible: Vec<String>,
     /// Warnings.
@@ -68,8 +82,17 @@ pub struct ImageHealth {
 /// Number of sampled images: enough for a median, few enough to be fast.
 const SAMPLED_IMAGES: usize = 9;
 
-/// Opens the recording and summarises it.
-pub fn inspect(path: &Path, options: &OpenOptions) -> Result<Inspection, Error> {
+/// Opens the recording and summarises it. Where it has an IMU and no calibration, half a minute of it is calibrated, as
+/// `vidar odometry` would do.
+///
+/// # Errors
+/// The recording cannot be read.
+pub fn inspect(
+    path: &Path,
+    options: &OpenOptions,
+    events: &Events,
+    cancel: &CancelToken,
+) -> Result<Inspection, Error> {
     let dataset = vidar_dataset::open(path, options)?;
     let images: Vec<Timestamp> = dataset.images.iter().map(|i| i.time).collect();
     let imu: Vec<Timestamp> = dataset.imu.iter().map(|s| s.time).collect();
@@ -89,7 +112,15 @@ pub fn inspect(path: &Path, options: &OpenOptions) -> Result<Inspection, Error> 
     // Poses of images have the images' times.
     .map(|s| Stream { rate_hz: s.rate_hz.filter(|_| !dataset.times_are_invented), ..s })
     .collect();
+    let motion = Motion::of(&dataset.imu);
+    let images = image_health(&dataset);
+    let advice = motion.iter().flat_map(Motion::advice);
+    let advice = advice.chain(images.iter().flat_map(motion::advice_of_images)).collect();
     Ok(Inspection {
+        missing: missing(&dataset),
+        found: found(&dataset, events, cancel),
+        motion,
+        advice,
         name: dataset.name.clone(),
         kind: dataset.kind.to_string(),
         reason: dataset.reason.clone(),
@@ -97,10 +128,45 @@ pub fn inspect(path: &Path, options: &OpenOptions) -> Result<Inspection, Error> 
         camera: calibration::describe_camera(&dataset),
         imu: describe_imu(&dataset),
         poses: describe_poses(&dataset),
-        images: image_health(&dataset),
+        images,
         possible: possible(&dataset),
         warnings: dataset.warnings.clone(),
     })
+}
+
+/// What a metric map needs and the recording does not state.
+fn missing(dataset: &Dataset) -> Vec<String> {
+    let is_guessed = dataset.calibration == CalibrationSource::Guessed;
+    let has_imu = !dataset.imu.is_empty();
+    let warned = |kind: &str| dataset.warnings.iter().any(|w| w.kind == kind);
+    let timing = dataset.rig.camera(dataset.camera).is_some_and(|c| c.time_offset == Duration::ZERO);
+    let all = [
+        (!has_imu, "IMU samples: lengths need a trajectory from elsewhere"),
+        (is_guessed, "intrinsics of the camera"),
+        (has_imu && (is_guessed || warned("extrinsics-identity")), "pose of the camera on the IMU"),
+        (has_imu && timing, "clock offset between camera and IMU (taken as zero to begin with)"),
+        (
+            dataset.readout.is_none(),
+            "readout time of the rolling shutter (a global one is assumed to begin with)",
+        ),
+        (has_imu && (dataset.rig.imu.is_none() || warned("imu-noise")), "noise of the IMU"),
+    ];
+    all.into_iter().filter(|(is_missing, _)| *is_missing).map(|(_, what)| what.to_owned()).collect()
+}
+
+/// What the recording's own data give of it.
+fn found(dataset: &Dataset, events: &Events, cancel: &CancelToken) -> Vec<String> {
+    let mut words = Vec::new();
+    if dataset.calibration == CalibrationSource::Guessed && !dataset.imu.is_empty() {
+        words.push(calibrate::found_in_words(dataset, events, cancel));
+    }
+    if let Some(noise) = sensor_noise(&dataset.imu) {
+        words.push(format!(
+            "noise of the IMU at most {:.1e} rad/s/√Hz and {:.1e} m/s²/√Hz, as its samples show it",
+            noise.gyro, noise.accel
+        ));
+    }
+    words
 }
 
 fn times(trajectory: Option<&Trajectory>) -> Vec<Timestamp> {
@@ -130,6 +196,7 @@ fn describe_imu(dataset: &Dataset) -> Vec<String> {
     let n = dataset.imu.len() as f64;
     let accel: f64 = dataset.imu.iter().map(|s| s.accel.0.norm()).sum::<f64>() / n;
     let gyro: f64 = dataset.imu.iter().map(|s| s.gyro.0.norm()).sum::<f64>() / n;
+    words.extend(Motion::of(&dataset.imu).map(|m| m.words()));
     words.push(format!(
         "mean |specific force| {accel:.2} m/s2 (at rest: 9.8), mean |rate| {:.1} deg/s",
         gyro.to_degrees()
@@ -201,14 +268,14 @@ fn measure(image: &FrameImage) -> [f64; 3] {
 
 fn possible(dataset: &Dataset) -> Vec<String> {
     let mut lines = Vec::new();
-    if dataset.calibration == vidar_dataset::CalibrationSource::Guessed && !dataset.imu.is_empty() {
+    if dataset.calibration == CalibrationSource::Guessed && !dataset.imu.is_empty() {
         lines.push(
             "vidar run, vidar odometry: calibrate from images and gyroscope first, as vidar calibrate does"
                 .into(),
         );
         return lines;
     }
-    if dataset.calibration == vidar_dataset::CalibrationSource::Guessed {
+    if dataset.calibration == CalibrationSource::Guessed {
         lines.push(
             "vidar run: not possible yet; give --calibration FILE or --camera-model (the camera model is a guess)".into(),
         );

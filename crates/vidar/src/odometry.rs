@@ -3,7 +3,10 @@
 pub(crate) mod adjusted;
 mod dump;
 mod files;
+mod poses;
 mod report;
+
+pub(crate) use poses::TrackedPoses;
 
 use crate::calibrate;
 use crate::camera_timing;
@@ -23,6 +26,9 @@ use vidar_dataset::{Dataset, OpenOptions};
 use vidar_eval::TrajectoryReport;
 use vidar_odometry::bundle_adjustment::{Adjusted, CalibrationSigmas};
 use vidar_odometry::{ImuUse, InputCounts, Odometry, OdometryOutput, Status};
+
+/// Kind of the warning that there is no state at all.
+const NEVER_STARTED: &str = "odometry-never-started";
 
 /// What to run the odometry on, how, and where to.
 #[derive(Clone, Debug)]
@@ -343,7 +349,7 @@ impl Tracked {
             let text = format!("the odometry never started: {why}");
             let hint =
                 "`vidar inspect` shows calibration and units in plain words; docs/failures.md lists causes";
-            warnings.push(Warning::degraded("odometry-never-started", text).hint(hint));
+            warnings.push(Warning::degraded(NEVER_STARTED, text).hint(hint));
         }
         if let (Some(reason), true) = (&self.not_adjusted, self.quality.longest().is_some()) {
             warnings.push(Warning::new("not-adjusted", format!("the live states are final: {reason}")));
@@ -482,7 +488,7 @@ fn start_manifest(request: &OdometryRequest, dataset: &Dataset, started: String)
             "name": dataset.name, "kind": dataset.kind.to_string(), "path": request.path.display().to_string(),
             "images": dataset.images.len(), "imu_samples": dataset.imu.len(),
         }),
-        dataset_sha256: vidar_hub::sha256_hex(&dataset.fingerprint()?),
+        dataset_sha256: input::fingerprint(dataset)?,
         config_sha256: vidar_hub::sha256_hex(request.layered.to_toml(false).as_bytes()),
         poses: json!({ "source": "odometry" }),
         hardware: json!(crate::system::hardware()),

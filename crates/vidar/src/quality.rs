@@ -2,6 +2,7 @@
 //! is known. One collector for `vidar odometry` and `vidar run`.
 
 use nalgebra::Vector3;
+use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 use std::collections::BTreeMap;
 use vidar_core::{Health, Timestamp};
@@ -10,7 +11,7 @@ use vidar_odometry::initialization::InitFailureReason;
 use vidar_odometry::{LossReason, OdometryOutput, Status, Tracking};
 
 /// Statements of the odometry, summed up image by image.
-#[derive(Clone, Debug, Default)]
+#[derive(Clone, Debug, Default, Serialize, Deserialize)]
 pub struct TrackQuality {
     /// Images that the odometry answered.
     pub images: usize,
@@ -20,7 +21,7 @@ pub struct TrackQuality {
     pub losses: usize,
     times: Option<(Timestamp, Timestamp)>,
     /// Refusals to start, each kind with its count and its last text.
-    refusals: BTreeMap<&'static str, (usize, String)>,
+    refusals: BTreeMap<String, (usize, String)>,
     /// How many of them found that images and IMU contradict each other.
     contradictions: usize,
     waits: usize,
@@ -29,7 +30,7 @@ pub struct TrackQuality {
 }
 
 /// What the adjustment after the recording's end made of the states.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Copy, Debug, Serialize, Deserialize)]
 struct AdjustedQuality {
     images: usize,
     first: Timestamp,
@@ -38,12 +39,12 @@ struct AdjustedQuality {
 }
 
 /// States of one segment.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct SegmentQuality {
     /// Images with a state.
     pub images: usize,
     /// How many of them have which health.
-    pub health: BTreeMap<&'static str, usize>,
+    pub health: BTreeMap<String, usize>,
     first: Timestamp,
     last: Timestamp,
     last_position: Vector3<f64>,
@@ -73,7 +74,7 @@ impl TrackQuality {
                 self.waits += 1;
                 let kind = kind_of(&failure.reason);
                 self.contradictions += usize::from(kind.is_contradiction);
-                let refusal = self.refusals.entry(kind.name).or_default();
+                let refusal = self.refusals.entry(kind.name.into()).or_default();
                 *refusal = (refusal.0 + 1, failure.to_string());
             }
         }
@@ -99,7 +100,8 @@ impl TrackQuality {
     /// alone may be an accident of where the recording ends.
     pub fn why_not_started(&self) -> Option<String> {
         let contradicts = 2 * self.contradictions > self.waits;
-        let of_kind = self.refusals.iter().filter(|(name, _)| CONTRADICTIONS.contains(name) == contradicts);
+        let of_kind =
+            self.refusals.iter().filter(|(name, _)| CONTRADICTIONS.contains(&name.as_str()) == contradicts);
         let (count, most) = of_kind.map(|(_, refusal)| refusal).max_by_key(|(count, _)| *count)?;
         Some(match contradicts {
             false if most.starts_with("std(log scale)") => format!(
@@ -228,7 +230,7 @@ impl SegmentQuality {
     fn new(time: Timestamp, tracking: &Tracking) -> Self {
         Self {
             images: 1,
-            health: [(tracking.health.as_str(), 1)].into(),
+            health: [(tracking.health.as_str().into(), 1)].into(),
             first: time,
             last: time,
             last_position: tracking.state.world_from_body.translation,
@@ -239,7 +241,7 @@ impl SegmentQuality {
 
     fn add(&mut self, time: Timestamp, tracking: &Tracking) {
         self.images += 1;
-        *self.health.entry(tracking.health.as_str()).or_default() += 1;
+        *self.health.entry(tracking.health.as_str().into()).or_default() += 1;
         let position = tracking.state.world_from_body.translation;
         let step = (position - self.last_position).norm();
         self.weighted.0 += step * tracking.scale_std;

@@ -77,6 +77,14 @@ impl OutputLocation {
         }
     }
 
+    /// The folder of an earlier attempt that the run may go on from.
+    pub fn resumed(&self) -> Option<&Path> {
+        match self {
+            Self::Resumed { path } | Self::Replaced { path } => Some(path),
+            Self::Exact { .. } | Self::Dated { .. } => None,
+        }
+    }
+
     /// Makes an empty folder there and returns its path.
     pub fn reserve(&self) -> Result<PathBuf, Error> {
         match self {
@@ -137,6 +145,17 @@ pub struct Manifest {
     pub exit: Option<i32>,
 }
 
+/// The camera as a run used it.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+pub struct StoredCamera {
+    /// As the flag `--camera-model` takes it.
+    pub model: String,
+    /// Columns of its images.
+    pub width: usize,
+    /// Rows.
+    pub height: usize,
+}
+
 /// One keyframe as the run folder keeps it.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct StoredView {
@@ -144,6 +163,9 @@ pub struct StoredView {
     pub frame: u32,
     /// Time, ns.
     pub time_ns: i64,
+    /// The image as it was read, where it is a file.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub source: Option<PathBuf>,
     /// Undistorted image, relative to the run folder, if written.
     pub image: Option<String>,
     /// Depth PNG, relative to the run folder, if written.

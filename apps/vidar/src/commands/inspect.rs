@@ -1,7 +1,7 @@
 //! `vidar inspect`.
 
 use crate::args::InspectArgs;
-use crate::{Context, Outcome, build, print};
+use crate::{Context, Outcome, build, print, progress};
 use vidar::ExitStatus;
 
 /// Contents and health of a recording.
@@ -10,7 +10,8 @@ pub fn inspect(args: &InspectArgs, context: &Context) -> Outcome {
     options.stride = args.input.stride.unwrap_or(1);
     options.start = args.input.start.map(vidar::core::Duration::from_secs_f64);
     options.end = args.input.end.map(vidar::core::Duration::from_secs_f64);
-    let found = vidar::inspect::inspect(&args.path, &options)?;
+    let found =
+        vidar::inspect::inspect(&args.path, &options, &progress::events(&context.cli), &context.cancel)?;
     if context.cli.json {
         let mut value = serde_json::json!({ "schema": "vidar.inspect/1" });
         if let (Some(object), Ok(serde_json::Value::Object(fields))) =
@@ -45,6 +46,10 @@ pub fn inspect(args: &InspectArgs, context: &Context) -> Outcome {
             i.unreadable,
             i.sampled
         ));
+    }
+    for (label, words) in [("missing", &found.missing), ("found", &found.found), ("next time", &found.advice)]
+    {
+        words.iter().for_each(|line| print::line(format!("  {label:<9} {line}")));
     }
     found.possible.iter().for_each(|line| print::data(format!("  -> {line}")));
     print::warnings(&found.warnings);

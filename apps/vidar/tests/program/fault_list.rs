@@ -64,18 +64,37 @@ const REST: &[Case] = &[
     (Fault::Turned(30.0), CONTRADICTION),
     (Fault::Turned(90.0), CONTRADICTION),
     (Fault::Lever(0.05), &[]),
+    (Fault::Lever(0.30), &[]),
     (Fault::Gains(-1.0, 1.0), CONTRADICTION),
     (Fault::Gains(-1.0, -1.0), CONTRADICTION),
     (Fault::Swapped, CONTRADICTION),
     (Fault::Gains(1.0, 0.98), &[]),
     (Fault::Gains(1.0, 1.02), &[]),
+    (Fault::Gains(1.0, 0.95), &[]),
+    (Fault::Gains(1.0, 1.05), &[]),
+    (Fault::Gains(1.0, 0.90), &[]),
+    (Fault::Gains(1.0, 1.10), &[]),
+    (Fault::Gains(0.98, 1.0), &[]),
+    (Fault::Gains(1.02, 1.0), &[]),
+    (Fault::Gains(0.95, 1.0), &[]),
+    (Fault::Gains(1.05, 1.0), &[]),
+    (Fault::Gains(0.90, 1.0), CONTRADICTION),
+    (Fault::Gains(1.10, 1.0), CONTRADICTION),
     (Fault::Clock(-20), &["camera-timing"]),
     (Fault::Clock(20), &["camera-timing"]),
+    (Fault::Clock(-50), &["camera-timing"]),
+    (Fault::Clock(50), &["camera-timing"]),
+    (Fault::Clock(-200), CONTRADICTION),
+    (Fault::Clock(200), CONTRADICTION),
     (Fault::Clock(-100), CONTRADICTION),
     (Fault::Clock(100), CONTRADICTION),
     (Fault::Clock(-500), CONTRADICTION),
     (Fault::Focal(0.98), &[]),
     (Fault::Focal(1.02), &[]),
+    (Fault::Focal(0.95), CONTRADICTION),
+    (Fault::Focal(1.05), CONTRADICTION),
+    (Fault::Focal(0.90), CONTRADICTION),
+    (Fault::Focal(1.10), CONTRADICTION),
     (Fault::NoDistortion, CONTRADICTION),
 ];
 
@@ -83,7 +102,8 @@ fn text(path: &Path) -> &str {
     path.to_str().unwrap()
 }
 
-fn flight() -> &'static Path {
+/// The flight without a fault.
+pub fn flight() -> &'static Path {
     static FLIGHT: OnceLock<PathBuf> = OnceLock::new();
     FLIGHT.get_or_init(|| {
         let world = shared().root.join("flight with faults.toml");

@@ -106,3 +106,44 @@ fn weights_that_are_not_the_official_ones_are_refused_by_their_hash() {
         files_under(models.path())
     );
 }
+
+/// Lists of ten million rows: of the IMU, of images, of ground truth.
+#[cfg(target_os = "linux")]
+#[test]
+fn ten_million_rows_take_less_than_300_megabytes() {
+    use std::io::Write;
+    const ROWS: i64 = 10_000_000;
+    const MOST_BYTES: u64 = 300_000_000;
+    let sequence = shared().root.join("ten million rows");
+    copy_tree(&shared().sequence, &sequence);
+    const LISTS: [(&str, &str, &str); 3] = [
+        ("imu0", ",0.1,0.2,0.3,0.1,0.2,9.8", "split the recording"),
+        ("cam0", "", "more than 1000000 rows"),
+        ("state_groundtruth_estimate0", ",0,0,0,1,0,0,0,0,0,0,0,0,0,0,0,0", "the limit for such a file"),
+    ];
+    for (list, columns, said) in LISTS {
+        let path = sequence.join("mav0").join(list).join("data.csv");
+        let usual = std::fs::read(&path).unwrap();
+        let mut file = std::io::BufWriter::new(std::fs::File::create(&path).unwrap());
+        for i in 0..ROWS {
+            writeln!(file, "{}{columns}", 5_000_000 * i).unwrap();
+        }
+        drop(file);
+        let mut inspect = command();
+        inspect.arg("inspect").arg(&sequence).stdout(Stdio::piped()).stderr(Stdio::piped());
+        let mut child = inspect.spawn().unwrap();
+        // The most that was resident, as long as the process can be asked.
+        let (mut peak, status) = (0, format!("/proc/{}/status", child.id()));
+        while child.try_wait().unwrap().is_none() {
+            let text = std::fs::read_to_string(&status).unwrap_or_default();
+            let line = text.lines().find_map(|l| l.strip_prefix("VmHWM:"));
+            let kib = line.and_then(|l| l.trim().trim_end_matches(" kB").parse::<u64>().ok());
+            peak = peak.max(kib.unwrap_or(0) * 1024);
+            std::thread::sleep(Duration::from_millis(5));
+        }
+        let ran: crate::support::ProgramOutput = child.wait_with_output().unwrap().into();
+        ran.ends_with(1).says(&["data.csv", said]);
+        assert!((1_000_000..MOST_BYTES).contains(&peak), "{list}: {} MB", peak / 1_000_000);
+        std::fs::write(&path, usual).unwrap();
+    }
+}

@@ -1,8 +1,10 @@
 //! Nothing is lost: a folder is only resumed by the same run, what an earlier attempt left is removed, and the manifest lists what
 //! belongs to a run.
 
-use crate::support::{copy_of_sequence, files_under, finished, manifest, run_on, shared};
+use crate::fault_list::flight;
+use crate::support::{copy_of_sequence, files_under, finished, manifest, run_command, run_on, shared};
 use std::path::Path;
+use std::time::{Duration, Instant};
 
 const SHORT: &[&str] = &["-q", "--stride", "2"];
 
@@ -77,4 +79,47 @@ fn a_manifest_lists_every_file_of_a_run_and_is_there_from_the_start() {
         manifest["artifacts"].as_array().unwrap().iter().map(|a| a.as_str().unwrap()).collect();
     assert_eq!(listed, files_under(out));
     assert_eq!(manifest["exit"], 0);
+}
+
+#[test]
+fn a_run_that_is_killed_before_its_first_chunk_does_not_track_again() {
+    const OWN_POSES: &[&str] = &["-q", "--stride", "2", "--set", "input.poses=odometry"];
+    let (whole, out) = (shared().root.join("tracked once"), shared().root.join("killed after tracking"));
+    let ran = run_on(flight(), &whole, OWN_POSES);
+    assert!([0, 3].contains(&ran.code), "{}", ran.stderr);
+    let mut child = run_command(flight(), &out, OWN_POSES).spawn().unwrap();
+    let (tracked, clock) = (out.join("odometry/tracked.cbor"), Instant::now());
+    while !tracked.exists()
+        && child.try_wait().unwrap().is_none()
+        && clock.elapsed() < Duration::from_secs(120)
+    {
+        std::thread::sleep(Duration::from_millis(1));
+    }
+    // SIGKILL: nothing can be tidied up.
+    child.kill().unwrap();
+    child.wait().unwrap();
+    assert!(
+        tracked.exists() && !out.join("chunks/000000.json").exists(),
+        "killed between tracking and mapping"
+    );
+    let before = std::fs::read_to_string(out.join("log.jsonl")).unwrap().len();
+    let ran = run_on(flight(), &out, &[OWN_POSES, &["--resume"]].concat());
+    assert!([0, 3].contains(&ran.code), "{}", ran.stderr);
+    let log = std::fs::read_to_string(out.join("log.jsonl")).unwrap()[before..].to_owned();
+    assert!(log.contains("odometry-resumed") && !log.contains("\"stage\":\"odometry\""), "{log}");
+    let mesh = |run: &Path| std::fs::read(run.join("map/mesh.ply")).unwrap();
+    assert!(mesh(&whole) == mesh(&out), "the same bits");
+    assert_eq!(manifest(&whole)["result"]["scale"], manifest(&out)["result"]["scale"]);
+    assert!(!tracked.exists(), "the map is made");
+}
+
+#[test]
+fn a_manifest_lists_chunks_that_are_kept() {
+    let out = shared().root.join("kept chunks");
+    run_on(&shared().sequence, &out, &[SHORT, &["--set", "output.keep_chunks=true"]].concat()).ends_with(0);
+    let manifest = manifest(&out);
+    let listed: Vec<&str> =
+        manifest["artifacts"].as_array().unwrap().iter().map(|a| a.as_str().unwrap()).collect();
+    assert!(listed.contains(&"chunks/000000.npz"), "{listed:?}");
+    assert_eq!(listed, files_under(&out));
 }

@@ -397,6 +397,34 @@ fn every_export_is_made_and_an_unknown_one_is_refused_with_the_list() {
 }
 
 #[test]
+fn colmap_gets_tracks_and_images_of_the_input_s_size_on_request() {
+    let run = text(&finished().0);
+    let folder = tempfile::tempdir().unwrap();
+    let out = folder.path().join("large");
+    let more = ["--tracks", "--input-size", "-o", text(&out)];
+    vidar(&[&["export", run, "--to", "colmap-text"], &more[..]].concat()).ends_with(0);
+    let points = std::fs::read_to_string(out.join("sparse/0/points3D.txt")).unwrap();
+    let columns = |l: &str| l.split_whitespace().count();
+    let (all, seen) = points.lines().filter(|l| !l.starts_with('#')).fold((0, 0), |(all, seen), line| {
+        // Eight columns and two for every image: seen twice or more.
+        (all + 1, seen + usize::from(columns(line) >= 8 + 4))
+    });
+    assert!(all > 1000 && seen * 10 > all * 8, "{seen} of {all} points are seen twice");
+    let images = std::fs::read_to_string(out.join("sparse/0/images.txt")).unwrap();
+    let observations = images.lines().filter(|l| !l.starts_with('#')).skip(1).step_by(2).map(columns);
+    let in_tracks: usize = points.lines().filter(|l| !l.starts_with('#')).map(|l| (columns(l) - 8) / 2).sum();
+    assert_eq!(observations.sum::<usize>(), 3 * in_tracks, "tracks and observations agree");
+    let cameras = std::fs::read_to_string(out.join("sparse/0/cameras.txt")).unwrap();
+    assert!(cameras.contains("PINHOLE 160 "), "{cameras}");
+    for image in std::fs::read_dir(out.join("images")).unwrap().flatten() {
+        let png = std::fs::read(image.path()).unwrap();
+        assert_eq!(png[16..20], 160_u32.to_be_bytes(), "its width");
+    }
+    vidar(&["export", run, "--to", "tum", "--tracks"]).ends_with(2).says(&["--tracks", "colmap"]);
+    vidar(&["export", run, "--to", "ply", "--input-size"]).ends_with(2).says(&["--input-size", "nerfstudio"]);
+}
+
+#[test]
 fn synth_never_overwrites_and_the_same_seed_makes_the_same_files() {
     let shared = shared();
     let again = shared.root.join("again");

@@ -17,7 +17,7 @@ struct Lengths {
 }
 
 /// Double-sphere wide-angle camera.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
 pub struct DoubleSphere {
     /// Focal lengths, principal point, size.
     pub pinhole: Pinhole,

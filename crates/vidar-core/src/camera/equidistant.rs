@@ -23,7 +23,7 @@ struct Direction {
 }
 
 /// Equidistant fisheye with four terms.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
 pub struct Equidistant {
     /// Focal lengths, principal point, size.
     pub pinhole: Pinhole,

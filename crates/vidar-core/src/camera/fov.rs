@@ -18,7 +18,7 @@ struct Radius {
 }
 
 /// Field-of-view camera.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
 pub struct Fov {
     /// Focal lengths, principal point, size.
     pub pinhole: Pinhole,

@@ -74,7 +74,7 @@ fn finite(pixel: Pixel) -> Option<Pixel> {
 }
 
 /// Any supported camera model.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
 pub enum CameraModel {
     /// No distortion.
     Pinhole(Pinhole),

@@ -11,7 +11,7 @@ use super::{CameraError, InvalidExample, ParametricCamera, Pinhole, Pixel, finit
 use nalgebra::{Matrix2, Matrix2x3, SMatrix, Vector2, Vector3};
 
 /// Pinhole with radial-tangential distortion.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
 pub struct RadTan {
     /// Focal lengths, principal point, size.
     pub pinhole: Pinhole,

@@ -4,7 +4,7 @@ use super::{LieGroup, So3, hat, impl_group_ops, so3_left_jacobian, trig_quotient
 use nalgebra::{Matrix3, Matrix4, Matrix6, SMatrix, Vector3, Vector6};
 
 /// A rigid motion `a_from_b`.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
 pub struct Se3 {
     /// Rotation part.
     pub rotation: So3,

@@ -4,7 +4,7 @@ use super::{LieGroup, impl_group_ops};
 use nalgebra::{Matrix3, Quaternion, UnitQuaternion, Vector3};
 
 /// A rotation: maps vectors of one frame into another.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
 pub struct So3(UnitQuaternion<f64>);
 
 /// Below this angle (rad) Taylor series replace quotients that lose digits.

@@ -154,7 +154,7 @@ impl Backbone {
             )?,
         };
         for i in 0..self.config.depth {
-            run.check_cancelled()?;
+            run.part(i, self.config.depth).check_cancelled()?;
             if self.config.alternate_from == Some(i + 1) {
                 self.put_reference_first(recorder, &walk, &mut state, cameras)?;
             }

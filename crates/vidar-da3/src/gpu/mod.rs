@@ -26,7 +26,7 @@ use crate::config::{HeadKind, NetConfig};
 use crate::error::Da3Error;
 use crate::model::backbone::{CameraTokens, Pixels};
 use crate::model::{DenseOutput, DeviceLoader, DeviceNet};
-use crate::run::Run;
+use crate::run::{BACKBONE_SHARE, Run};
 use crate::weights::{Residency, Scope};
 use backbone::Backbone;
 use head::Head;
@@ -107,12 +107,20 @@ impl DeviceNet for Network {
         let mut recorder = Recorder::new(&self.gpu);
         let grids = self.head.grids(&self.gpu, pixels.rows, pixels.columns)?;
         let mut features = backbone::Features::new(self, pixels, wanted.clone(), &grids)?;
-        let reference = self.backbone.run(run, &mut recorder, pixels, tokens, layers, &mut features)?;
+        let reference = self.backbone.run(
+            &run.between(0.0, BACKBONE_SHARE),
+            &mut recorder,
+            pixels,
+            tokens,
+            layers,
+            &mut features,
+        )?;
         // Gives the feature buffers back before the head takes its own.
         let (stages, camera_tokens, layers) = features.into_parts();
         let mut scratch = head::Scratch::new(&self.gpu, &self.net, pixels, wants_rays)?;
         let mut views = Vec::with_capacity(wanted.len());
         for (view, stages) in stages.into_iter().enumerate().filter(|(view, _)| wanted.contains(view)) {
+            let run = &run.between(BACKBONE_SHARE, 1.0).part(views.len(), wanted.len());
             run.check_cancelled()?;
             let picture = (view, pixels.rows, pixels.columns);
             views.push(self.head.run(

@@ -8,7 +8,7 @@ use super::head::{DenseView, DualDpt, Embeddings, Map};
 use crate::config::NetConfig;
 use crate::error::Da3Error;
 use crate::pose::{self, NetCameras};
-use crate::run::Run;
+use crate::run::{BACKBONE_SHARE, Run};
 use crate::weights::{Residency, Scope, Slot};
 use std::collections::BTreeMap;
 use std::ops::Range;
@@ -134,11 +134,13 @@ impl Host {
         (wanted, wants_rays): (Range<usize>, bool),
     ) -> Result<DenseOutput, Da3Error> {
         let mut features = Features::new(self, pixels, wanted.clone());
-        let reference = self.backbone.run(run, pixels, tokens, layers, &mut features)?;
+        let reference =
+            self.backbone.run(&run.between(0.0, BACKBONE_SHARE), pixels, tokens, layers, &mut features)?;
         let Features { embeddings, stages, camera_tokens, layers, .. } = features;
         let size = (pixels.rows, pixels.columns);
         let mut views = Vec::with_capacity(wanted.len());
         for (view, stages) in stages.into_iter().enumerate().filter(|(view, _)| wanted.contains(view)) {
+            let run = &run.between(BACKBONE_SHARE, 1.0).part(views.len(), wanted.len());
             run.check_cancelled()?;
             views.push(self.head.run(run, view, stages, size, (&embeddings, wants_rays))?);
         }

@@ -5,7 +5,7 @@ use super::device::{DenseOutput, DeviceLoader, DeviceNet};
 use super::head::{DenseView, Dpt, Map};
 use crate::config::NetConfig;
 use crate::error::Da3Error;
-use crate::run::Run;
+use crate::run::{BACKBONE_SHARE, Run};
 use crate::sky;
 use crate::weights::{Residency, Scope};
 use std::collections::BTreeMap;
@@ -96,9 +96,11 @@ impl Host {
             stages: (0..pixels.views).map(|_| Vec::with_capacity(4)).collect(),
             layers: BTreeMap::new(),
         };
-        let reference = self.backbone.run(run, pixels, tokens, layers, &mut features)?;
+        let reference =
+            self.backbone.run(&run.between(0.0, BACKBONE_SHARE), pixels, tokens, layers, &mut features)?;
         let mut views = Vec::with_capacity(pixels.views);
         for (view, stages) in features.stages.into_iter().enumerate() {
+            let run = &run.between(BACKBONE_SHARE, 1.0).part(view, pixels.views);
             run.check_cancelled()?;
             let (depth, sky) = self.head.run(run, view, stages, (pixels.rows, pixels.columns))?;
             views.push(DenseView { depth, confidence: sky, rays: None });

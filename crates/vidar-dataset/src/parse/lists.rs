@@ -3,9 +3,14 @@
 use super::units::{UnitRule, decide_unit, read_time};
 use crate::dataset::AccelSample;
 use crate::error::DatasetError;
-use crate::source::{Row, Source, quoted};
+use crate::options::TimeUnit;
+use crate::source::{Lines, MAX_ROWS, Row, Source, for_each_block, quoted};
 use nalgebra::Vector3;
+use std::path::Path;
 use vidar_core::{AngularRate, ImuSample, SpecificForce, Timestamp, Warning};
+
+/// Most images of a list: nine hours at 30 Hz.
+const MAX_IMAGES: usize = 1_000_000;
 
 /// A file named in a list.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -37,7 +42,7 @@ pub fn file_list(
     rule: UnitRule,
 ) -> Result<(Vec<ListedFile>, Vec<Warning>), DatasetError> {
     let mut notes = Vec::new();
-    let lines = source.lines(&mut notes)?;
+    let lines = images_at_most(source, source.lines(&mut notes)?)?;
     let place = source.path.display().to_string();
     let split: Vec<(Row<'_>, &str, &str)> = lines
         .rows
@@ -58,12 +63,17 @@ pub fn file_list(
     Ok((files, notes))
 }
 
+fn images_at_most<'a>(source: &Source<'_>, lines: Lines<'a>) -> Result<Lines<'a>, DatasetError> {
+    match lines.rows.get(MAX_IMAGES) {
+        Some(row) => Err(source.too_many_rows(row.line, MAX_IMAGES)),
+        None => Ok(lines),
+    }
+}
+
 /// A list may only name files under its own folder.
 fn check_stays_inside(source: &Source<'_>, row: &Row<'_>, name: &str) -> Result<(), DatasetError> {
     use std::path::Component;
-    let inside = std::path::Path::new(name)
-        .components()
-        .all(|c| matches!(c, Component::Normal(_) | Component::CurDir));
+    let inside = Path::new(name).components().all(|c| matches!(c, Component::Normal(_) | Component::CurDir));
     if inside && !name.contains('\0') {
         Ok(())
     } else {
@@ -82,7 +92,7 @@ pub fn time_list(
     rule: UnitRule,
 ) -> Result<(Vec<ListedTime>, Vec<Warning>), DatasetError> {
     let mut notes = Vec::new();
-    let lines = source.lines(&mut notes)?;
+    let lines = images_at_most(source, source.lines(&mut notes)?)?;
     let mut split: Vec<(Row<'_>, &str, Option<&str>)> = Vec::with_capacity(lines.rows.len());
     for row in lines.rows {
         let mut fields = row.fields();
@@ -118,63 +128,96 @@ pub(crate) fn is_image_name(name: &str) -> bool {
 
 type TimedRow<const N: usize> = (Timestamp, [f64; N]);
 
-/// Rows of a time and `N` numbers. Rows with a number that is not finite are skipped and counted.
-fn timed_numbers<const N: usize>(
-    source: &Source<'_>,
+/// Rows of a time and `N` numbers, taken block by block. Rows with a number that is not finite are skipped and counted.
+struct TimedNumbers<const N: usize> {
     rule: UnitRule,
-    columns: &str,
-) -> Result<(Vec<TimedRow<N>>, Vec<Warning>), DatasetError> {
-    let mut notes = Vec::new();
-    let lines = source.lines(&mut notes)?;
-    let place = source.path.display().to_string();
-    let unit =
-        decide_unit(rule, lines.rows.iter().map(|r| r.fields().next().unwrap_or("")), &place, &mut notes);
-    let mut out = Vec::with_capacity(lines.rows.len());
-    let mut not_finite = (0usize, 0usize);
-    for row in &lines.rows {
+    columns: &'static str,
+    unit: Option<TimeUnit>,
+    rows: Vec<TimedRow<N>>,
+    notes: Vec<Warning>,
+    /// How many rows are not finite, and the line of the first.
+    not_finite: Option<(usize, usize)>,
+}
+
+impl<const N: usize> TimedNumbers<N> {
+    fn new(rule: UnitRule, columns: &'static str) -> Self {
+        Self { rule, columns, unit: None, rows: Vec::new(), notes: Vec::new(), not_finite: None }
+    }
+
+    /// Takes a block with `lines_before` lines before it. The first one decides the unit of time.
+    fn add(&mut self, source: &Source<'_>, lines_before: usize) -> Result<(), DatasetError> {
+        let mut notes = Vec::new();
+        let lines = source.lines_after(lines_before, &mut notes)?;
+        // Every block of a file with CRLF says so.
+        notes.retain(|note| !self.notes.contains(note));
+        self.notes.extend(notes);
+        let unit = *self.unit.get_or_insert_with(|| {
+            let times = lines.rows.iter().map(|r| r.fields().next().unwrap_or(""));
+            decide_unit(self.rule, times, &source.path.display().to_string(), &mut self.notes)
+        });
+        for row in &lines.rows {
+            if self.rows.len() == MAX_ROWS {
+                return Err(source.too_many_rows(row.line, MAX_ROWS));
+            }
+            let (time, numbers) = self.row(source, row, unit)?;
+            if numbers.iter().all(|v| v.is_finite()) {
+                self.rows.push((time, numbers));
+            } else {
+                self.not_finite.get_or_insert((0, row.line)).0 += 1;
+            }
+        }
+        Ok(())
+    }
+
+    fn row(&self, source: &Source<'_>, row: &Row<'_>, unit: TimeUnit) -> Result<TimedRow<N>, DatasetError> {
         let mut fields = row.fields();
         let time = read_time(source, row, fields.next().unwrap_or(""), unit)?;
         let mut numbers = [0.0; N];
         for (i, number) in numbers.iter_mut().enumerate() {
             let field = fields.next().ok_or_else(|| {
-                source.malformed(
-                    row.line,
-                    format!("{} columns", i + 1),
-                    format!("{} columns: {columns}", N + 1),
-                )
+                let expected = format!("{} columns: {}", N + 1, self.columns);
+                source.malformed(row.line, format!("{} columns", i + 1), expected)
             })?;
-            *number = source.number(row, field, columns)?;
+            *number = source.number(row, field, self.columns)?;
         }
-        if numbers.iter().all(|v| v.is_finite()) {
-            out.push((time, numbers));
-        } else {
-            not_finite = (not_finite.0 + 1, if not_finite.0 == 0 { row.line } else { not_finite.1 });
+        Ok((time, numbers))
+    }
+
+    fn finish(mut self, path: &Path) -> (Vec<TimedRow<N>>, Vec<Warning>) {
+        if let Some((count, line)) = self.not_finite {
+            let message = format!("{count} samples contain NaN or infinity; skipped");
+            let place = format!("{}:{line}", path.display());
+            self.notes.push(Warning::new("sample-not-finite", message).at(place));
         }
+        (self.rows, self.notes)
     }
-    if not_finite.0 > 0 {
-        notes.push(
-            Warning::new(
-                "sample-not-finite",
-                format!("{} samples contain NaN or infinity; skipped", not_finite.0),
-            )
-            .at(format!("{place}:{}", not_finite.1)),
-        );
-    }
-    Ok((out, notes))
+}
+
+fn imu_numbers(rule: UnitRule) -> TimedNumbers<6> {
+    TimedNumbers::new(rule, "time, gyro x y z, accel x y z")
+}
+
+fn imu_samples((rows, notes): (Vec<TimedRow<6>>, Vec<Warning>)) -> (Vec<ImuSample>, Vec<Warning>) {
+    let sample = |(time, [gx, gy, gz, ax, ay, az]): TimedRow<6>| ImuSample {
+        time,
+        gyro: AngularRate(Vector3::new(gx, gy, gz)),
+        accel: SpecificForce(Vector3::new(ax, ay, az)),
+    };
+    (rows.into_iter().map(sample).collect(), notes)
 }
 
 /// Reads EuRoC's `imu0/data.csv`: time, gyroscope (rad/s), accelerometer (m/s²).
 pub fn imu_csv(source: &Source<'_>, rule: UnitRule) -> Result<(Vec<ImuSample>, Vec<Warning>), DatasetError> {
-    let (rows, notes) = timed_numbers::<6>(source, rule, "time, gyro x y z, accel x y z")?;
-    let samples = rows
-        .into_iter()
-        .map(|(time, [gx, gy, gz, ax, ay, az])| ImuSample {
-            time,
-            gyro: AngularRate(Vector3::new(gx, gy, gz)),
-            accel: SpecificForce(Vector3::new(ax, ay, az)),
-        })
-        .collect();
-    Ok((samples, notes))
+    let mut numbers = imu_numbers(rule);
+    numbers.add(source, 0)?;
+    Ok(imu_samples(numbers.finish(source.path)))
+}
+
+/// The same of a file, which is never in memory as a whole.
+pub(crate) fn imu_file(path: &Path, rule: UnitRule) -> Result<(Vec<ImuSample>, Vec<Warning>), DatasetError> {
+    let mut numbers = imu_numbers(rule);
+    for_each_block(path, |block, lines_before| numbers.add(block, lines_before))?;
+    Ok(imu_samples(numbers.finish(path)))
 }
 
 /// Reads TUM's `accelerometer.txt`: time, accelerometer (m/s²).
@@ -182,10 +225,52 @@ pub fn accelerometer_list(
     source: &Source<'_>,
     rule: UnitRule,
 ) -> Result<(Vec<AccelSample>, Vec<Warning>), DatasetError> {
-    let (rows, notes) = timed_numbers::<3>(source, rule, "time ax ay az")?;
+    let mut numbers = TimedNumbers::<3>::new(rule, "time ax ay az");
+    numbers.add(source, 0)?;
+    let (rows, notes) = numbers.finish(source.path);
     let samples = rows
         .into_iter()
         .map(|(time, [x, y, z])| AccelSample { time, accel: SpecificForce(Vector3::new(x, y, z)) })
         .collect();
     Ok((samples, notes))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_file_in_blocks_is_the_same_as_the_whole() {
+        // Some 7 MB: two block boundaries, each inside a line.
+        let row = |i: usize| {
+            let x = if i == 80_000 { f64::NAN } else { (i as f64 * 0.37).sin() };
+            format!(
+                "{},{x},-0.25,{i},0.1,9.80665,-0.000123456789\r\n",
+                1_400_000_000_000_000_000 + 5_000_000 * i
+            )
+        };
+        let text: String =
+            std::iter::once("#timestamp [ns],w_x,...\n".into()).chain((0..100_000).map(row)).collect();
+        assert!(text.len() > 6 << 20);
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("data.csv");
+        std::fs::write(&path, &text).unwrap();
+        let rule = UnitRule::Expected(TimeUnit::Nanoseconds);
+        let whole = imu_csv(&Source { path: &path, bytes: text.as_bytes() }, rule).unwrap();
+        assert_eq!(whole.0.len(), 99_999);
+        assert_eq!(
+            whole.1.iter().map(|w| w.kind.as_str()).collect::<Vec<_>>(),
+            ["crlf", "sample-not-finite"]
+        );
+        assert!(imu_file(&path, rule).unwrap() == whole);
+
+        // An error names the line of the file, not of the block.
+        std::fs::write(&path, text.replacen(",99000,", ",x,", 1)).unwrap();
+        let error = imu_file(&path, rule).unwrap_err().to_string();
+        assert!(error.contains("data.csv:99002"), "{error}");
+        // One line without end.
+        std::fs::write(&path, vec![b'1'; 9 << 20]).unwrap();
+        let error = imu_file(&path, rule).unwrap_err().to_string();
+        assert!(error.contains("bytes a line"), "{error}");
+    }
 }

@@ -8,6 +8,7 @@ pub(crate) mod units;
 pub(crate) mod yaml;
 
 pub use crate::source::Source;
+pub(crate) use lists::imu_file;
 pub(crate) use lists::is_image_name;
 pub use lists::{ListedFile, ListedTime, accelerometer_list, file_list, imu_csv, time_list};
 pub use matrices::{intrinsics_matrix, matrix_poses, single_pose};

@@ -1,6 +1,6 @@
 //! COLMAP's binary files: little-endian, counts of 64 bits.
 
-use super::{CAMERAS, IMAGES, POINTS, RawCamera, RawImage, color_of, unsupported_model};
+use super::{CAMERAS, IMAGES, POINTS, RawCamera, RawImage, TrackEntries, color_of, unsupported_model};
 use crate::bytes::Cursor;
 use crate::error::{ExportError, quoted, write_error};
 use std::io::{self, Write};
@@ -55,14 +55,22 @@ pub(super) fn write_images(w: &mut dyn Write, images: &[RawImage]) -> Result<(),
             w.write_all(&image.camera_id.to_le_bytes())?;
             w.write_all(image.name.as_bytes())?;
             w.write_all(&[0])?;
-            w.write_all(&0_u64.to_le_bytes())?;
+            w.write_all(&(image.observations.len() as u64).to_le_bytes())?;
+            for (pixel, point) in &image.observations {
+                write_reals(w, pixel)?;
+                w.write_all(&point.to_le_bytes())?;
+            }
         }
         Ok(())
     };
     write().map_err(write_error(IMAGES))
 }
 
-pub(super) fn write_points(w: &mut dyn Write, points: &PointCloud) -> Result<(), ExportError> {
+pub(super) fn write_points(
+    w: &mut dyn Write,
+    points: &PointCloud,
+    tracks: &[TrackEntries],
+) -> Result<(), ExportError> {
     let mut write = || -> io::Result<()> {
         w.write_all(&(points.len() as u64).to_le_bytes())?;
         for (i, position) in points.positions.iter().enumerate() {
@@ -70,7 +78,12 @@ pub(super) fn write_points(w: &mut dyn Write, points: &PointCloud) -> Result<(),
             write_reals(w, &position.map(f64::from))?;
             w.write_all(&color_of(points, i))?;
             write_reals(w, &[-1.0])?;
-            w.write_all(&0_u64.to_le_bytes())?;
+            let track = tracks.get(i).map_or(&[][..], Vec::as_slice);
+            w.write_all(&(track.len() as u64).to_le_bytes())?;
+            for (image, index) in track {
+                w.write_all(&image.to_le_bytes())?;
+                w.write_all(&index.to_le_bytes())?;
+            }
         }
         Ok(())
     };
@@ -133,7 +146,14 @@ pub(super) fn read_images(bytes: &[u8]) -> Result<Vec<RawImage>, ExportError> {
         }
         let observations = cursor.count(OBSERVATION, &what)?;
         cursor.take(observations * OBSERVATION, &what)?;
-        images.push(RawImage { id, rotation_wxyz, translation, camera_id, name: name.to_owned() });
+        images.push(RawImage {
+            id,
+            rotation_wxyz,
+            translation,
+            camera_id,
+            name: name.to_owned(),
+            observations: Vec::new(),
+        });
     }
     cursor.end()?;
     Ok(images)

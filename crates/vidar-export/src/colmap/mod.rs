@@ -4,8 +4,8 @@
 //!   the principal point on export and subtracted on import.
 //! - `images` hold `camera_from_world` (quaternion w x y z, translation), metres. `IMAGE_ID` is the frame number + 1,
 //!   because COLMAP's own numbers start at 1. The format has no times.
-//! - `points3D` hold position and colour; without a colour mid grey is written. The error is −1 ("not computed")
-//!   and tracks are empty. The format has no normals and no confidence.
+//! - `points3D` hold position and colour; without a colour mid grey is written. The error is −1 ("not computed"). Tracks are
+//!   empty unless [`Observation`]s are given. The format has no normals and no confidence.
 //! - The world is not re-centred, rotated or rescaled: the model is metric, z up.
 //! - NaN is refused in both directions.
 //!
@@ -19,7 +19,8 @@ use crate::atomic::write_atomically;
 use crate::error::ExportError;
 use crate::vertices::Vertices;
 use crate::view::{
-    ExportView, ImportedView, check_views, corner_origin_principal_point, pinhole_from_corner_origin,
+    ExportView, ImportedView, check_views, corner_origin, corner_origin_principal_point,
+    pinhole_from_corner_origin,
 };
 use nalgebra::Vector3;
 use std::collections::BTreeMap;
@@ -64,6 +65,17 @@ pub struct ColmapModel {
     pub points: PointCloud,
 }
 
+/// One point seen in one image.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Observation {
+    /// The point, an index into the cloud.
+    pub point: u32,
+    /// The image, an index into the views.
+    pub view: u32,
+    /// Where it is seen; the centre of the top-left pixel is (0, 0).
+    pub pixel: [f64; 2],
+}
+
 /// A line of `cameras`; principal point in COLMAP's pixels.
 #[derive(Clone, Debug, PartialEq)]
 struct RawCamera {
@@ -84,31 +96,42 @@ struct RawImage {
     translation: [f64; 3],
     camera_id: u32,
     name: String,
+    /// Pixels in COLMAP's convention, each with the id of its point.
+    observations: Vec<([f64; 2], u64)>,
 }
 
-/// Writes a model into `dir` (made if missing), each file atomically.
+/// Track of a point: images by id, with the place in the image's list of observations.
+type TrackEntries = Vec<(u32, u32)>;
+
+/// Writes a model into `dir` (made if missing), each file atomically. Without `observations` tracks are empty.
 ///
 /// A text model cannot hold image names with blanks; a binary one can.
+///
+/// # Errors
+/// Views or points that the format cannot hold, an observation of a point or view that is not there, and files that cannot be
+/// written.
 pub fn write_colmap(
     dir: &Path,
     format: ColmapFormat,
     views: &[ExportView],
     points: &PointCloud,
+    observations: &[Observation],
 ) -> Result<(), ExportError> {
-    let (cameras, images) = raw_model(format, views)?;
+    let (cameras, mut images) = raw_model(format, views)?;
     Vertices::of_cloud(points).check(POINTS)?;
+    let tracks = tracks(&mut images, points.len(), observations)?;
     fs::create_dir_all(dir).map_err(|source| file_error("create", dir, source))?;
     let path = |name: &str| dir.join(format!("{name}.{}", format.extension()));
     match format {
         ColmapFormat::Text => {
             write_atomically(&path("cameras"), |w| text::write_cameras(w, &cameras))?;
             write_atomically(&path("images"), |w| text::write_images(w, &images))?;
-            write_atomically(&path("points3D"), |w| text::write_points(w, points))
+            write_atomically(&path("points3D"), |w| text::write_points(w, points, &tracks))
         }
         ColmapFormat::Binary => {
             write_atomically(&path("cameras"), |w| binary::write_cameras(w, &cameras))?;
             write_atomically(&path("images"), |w| binary::write_images(w, &images))?;
-            write_atomically(&path("points3D"), |w| binary::write_points(w, points))
+            write_atomically(&path("points3D"), |w| binary::write_points(w, points, &tracks))
         }
     }
 }
@@ -180,9 +203,35 @@ fn raw_model(
             translation: camera_from_world.translation.into(),
             camera_id,
             name: view.image_name.clone(),
+            observations: Vec::new(),
         });
     }
     Ok((cameras, images))
+}
+
+/// Gives every image its observations; the track of every point.
+fn tracks(
+    images: &mut [RawImage],
+    points: usize,
+    observations: &[Observation],
+) -> Result<Vec<TrackEntries>, ExportError> {
+    let mut tracks = vec![TrackEntries::new(); points];
+    for observation in observations {
+        let Observation { point, view, pixel } = *observation;
+        let (Some(track), Some(image)) = (tracks.get_mut(point as usize), images.get_mut(view as usize))
+        else {
+            let what = format!("point {point} in view {view}");
+            return Err(ExportError::unwritable(FORMAT, what, "there is no such point or view"));
+        };
+        if !pixel.iter().all(|c| c.is_finite()) {
+            let what = format!("point {point} in view {view}");
+            return Err(ExportError::unwritable(FORMAT, what, "its pixel is not finite"));
+        }
+        // Fewer observations in an image than points in the cloud, which are numbered by 32 bits.
+        track.push((image.id, image.observations.len() as u32));
+        image.observations.push((pixel.map(corner_origin), u64::from(point) + 1));
+    }
+    Ok(tracks)
 }
 
 fn views(cameras: Vec<RawCamera>, images: Vec<RawImage>) -> Result<Vec<ImportedView>, ExportError> {

@@ -1,6 +1,6 @@
 //! COLMAP's text files. Numbers are printed with enough digits to restore the same bits.
 
-use super::{CAMERAS, IMAGES, POINTS, RawCamera, RawImage, color_of, unsupported_model};
+use super::{CAMERAS, IMAGES, POINTS, RawCamera, RawImage, TrackEntries, color_of, unsupported_model};
 use crate::error::{ExportError, quoted, write_error};
 use crate::text::{Line, Lines};
 use std::io::{self, Write};
@@ -30,22 +30,34 @@ pub(super) fn write_images(w: &mut dyn Write, images: &[RawImage]) -> Result<(),
             let [qw, qx, qy, qz] = image.rotation_wxyz;
             let [tx, ty, tz] = image.translation;
             let (id, camera, name) = (image.id, image.camera_id, &image.name);
-            // The second line, of observations, is empty.
-            writeln!(w, "{id} {qw} {qx} {qy} {qz} {tx} {ty} {tz} {camera} {name}\n")?;
+            writeln!(w, "{id} {qw} {qx} {qy} {qz} {tx} {ty} {tz} {camera} {name}")?;
+            for (i, ([x, y], point)) in image.observations.iter().enumerate() {
+                let separator = if i == 0 { "" } else { " " };
+                write!(w, "{separator}{x} {y} {point}")?;
+            }
+            writeln!(w)?;
         }
         Ok(())
     };
     write().map_err(write_error(IMAGES))
 }
 
-pub(super) fn write_points(w: &mut dyn Write, points: &PointCloud) -> Result<(), ExportError> {
+pub(super) fn write_points(
+    w: &mut dyn Write,
+    points: &PointCloud,
+    tracks: &[TrackEntries],
+) -> Result<(), ExportError> {
     let mut write = || -> io::Result<()> {
         writeln!(w, "# 3D point list with one line of data per point:")?;
         writeln!(w, "#   POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)")?;
         writeln!(w, "# Number of points: {}", points.len())?;
         for (i, [x, y, z]) in points.positions.iter().enumerate() {
             let [r, g, b] = color_of(points, i);
-            writeln!(w, "{} {x} {y} {z} {r} {g} {b} -1", i + 1)?;
+            write!(w, "{} {x} {y} {z} {r} {g} {b} -1", i + 1)?;
+            for (image, index) in tracks.get(i).into_iter().flatten() {
+                write!(w, " {image} {index}")?;
+            }
+            writeln!(w)?;
         }
         Ok(())
     };
@@ -115,6 +127,7 @@ fn read_image(line: &Line<'_>) -> Result<RawImage, ExportError> {
         translation: [real(tx)?, real(ty)?, real(tz)?],
         camera_id: line.number("a camera id", camera_id)?,
         name: name.to_owned(),
+        observations: Vec::new(),
     })
 }
 

@@ -42,7 +42,7 @@ fn main() -> Result<(), Box<dyn Error>> {
         let window = start.saturating_sub(CONTEXT)..(core.end + CONTEXT).min(count);
         let chunk = ChunkViews { id: ChunkId(number as u32), views: views[window.clone()].to_vec() };
         let references: Vec<usize> = core.map(|i| i - window.start).collect();
-        let (output, features) = model.predict_with_features(&chunk, &references, &|| false)?;
+        let (output, features) = model.predict_with_features(&chunk, &references, &|_| false)?;
         omitted += output.omitted.len();
         for (view, features) in output.prediction.views.iter().zip(&features) {
             let truth = recording.sensor_depth(view)?;

@@ -12,13 +12,18 @@ const CONTRADICTION_SIGMAS: f64 = 3.0;
 
 /// One sentence for a warning.
 pub(super) fn sentence(found: &Calibration) -> String {
+    format!("no calibration; found from the recording: {}", values(found))
+}
+
+/// The values with their standard deviations.
+pub(super) fn values(found: &Calibration) -> String {
     let sigma = found.rotation_sigmas.iter().fold(0.0, |a: f64, s| a.max(*s)).to_degrees();
     let rotation = match found.rotation_is_observable {
         true => format!("rotation against the IMU within {sigma:.1}° (σ)"),
         false => "rotation against the IMU not observable in this recording".to_owned(),
     };
     format!(
-        "no calibration; found from the recording: {}, {}, {}, {rotation}, lever arm 0 ± {UNKNOWN_LEVER_M} m",
+        "{}, {}, {}, {rotation}, lever arm 0 ± {UNKNOWN_LEVER_M} m",
         told("focal length", &found.focal_px, 1.0, "px", 1),
         told("time offset", &found.time_offset_secs, 1e3, "ms", 1),
         told("readout", &found.readout_secs, 1e3, "ms", 1),

@@ -128,17 +128,22 @@ impl ChunkStore {
 
     /// Removes every chunk, and the folder where nothing else lies in it.
     pub fn remove_all(&self) {
-        let Ok(entries) = std::fs::read_dir(&self.folder) else { return };
+        // What cannot be removed is only left behind.
+        for path in self.files() {
+            let _ = std::fs::remove_file(path);
+        }
+        let _ = std::fs::remove_dir(&self.folder);
+    }
+
+    /// The files of every chunk, in no order.
+    pub fn files(&self) -> Vec<PathBuf> {
         let ours = |p: &PathBuf| {
             let is_number = |s: &str| s.parse::<u32>().is_ok() || s.starts_with(LOOP);
             p.file_stem().and_then(|s| s.to_str()).is_some_and(is_number)
                 && p.extension().is_some_and(|e| e == "npz" || e == "json")
         };
-        // What cannot be removed is only left behind.
-        for path in entries.filter_map(|e| Some(e.ok()?.path())).filter(ours) {
-            let _ = std::fs::remove_file(path);
-        }
-        let _ = std::fs::remove_dir(&self.folder);
+        let entries = std::fs::read_dir(&self.folder).into_iter().flatten();
+        entries.filter_map(|e| Some(e.ok()?.path())).filter(ours).collect()
     }
 
     fn path(&self, id: PredictionId, extension: &str) -> PathBuf {

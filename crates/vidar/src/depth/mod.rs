@@ -285,8 +285,8 @@ fn infer(
         Some(given) => Inputs::posed(&images, &given.camera_from_world, &given.intrinsics),
         None => Inputs::images(&images),
     };
-    let is_cancelled = || cancel.is_cancelled();
-    let hooks = Hooks { cancel: &is_cancelled, trace: None };
+    let watch = |_| cancel.is_cancelled();
+    let hooks = Hooks { watch: &watch, trace: None };
     model.infer_with(&inputs, &request.infer, &hooks).map_err(|error| match error {
         Da3Error::Cancelled => Error::Interrupted { path: PathBuf::from(".") },
         other => other.into(),

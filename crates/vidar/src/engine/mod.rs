@@ -103,7 +103,7 @@ impl<'a> Engine<'a> {
             setup.places,
             (setup.images, setup.store),
             (&setup.camera, &setup.view),
-            setup.cancelled,
+            (setup.cancelled, setup.predicting),
         );
         // Chunks without overlaps are stereo's: their unit is that of the poses already.
         let is_fitted = setup.poses.is_some() && overlaps;

@@ -29,6 +29,8 @@ pub struct Predictor<'a> {
     pub store: &'a dyn PredictionStore,
     /// Asked now and then; `true` stops.
     pub cancelled: &'a (dyn Fn() -> bool + Sync),
+    /// Told which share of a prediction is done.
+    pub predicting: &'a (dyn Fn(f64) + Sync),
     /// Landmarks by stereo, where chunks are fitted to them.
     pub stereo_landmarks: Option<StereoLandmarks>,
     window: ViewWindow<'a>,
@@ -41,10 +43,19 @@ impl<'a> Predictor<'a> {
         places: &'a dyn PlaceDescriber,
         (images, store): (&'a dyn ImageSource, &'a dyn PredictionStore),
         (camera, view): (&RigCamera, &vidar_core::Pinhole),
-        cancelled: &'a (dyn Fn() -> bool + Sync),
+        (cancelled, predicting): (&'a (dyn Fn() -> bool + Sync), &'a (dyn Fn(f64) + Sync)),
     ) -> Self {
         let window = ViewWindow::new(images, &camera.model, view);
-        Self { geometry, places, store, cancelled, stereo_landmarks: None, window }
+        Self { geometry, places, store, cancelled, predicting, stereo_landmarks: None, window }
+    }
+
+    /// What a model at work calls.
+    fn watch(&self) -> impl Fn(f64) -> bool + Sync + use<'a> {
+        let (cancelled, predicting) = (self.cancelled, self.predicting);
+        move |share| {
+            predicting(share);
+            cancelled()
+        }
     }
 
     /// Goes back before the first chunk.
@@ -96,7 +107,8 @@ impl<'a> Predictor<'a> {
         let (views, wanted, indices) = self.window.take(&wanted);
         let expected = wanted.len();
         let views = ChunkViews { id: id.model_number(), views };
-        let predicted = match self.geometry.predict(&views, wanted, self.cancelled) {
+        let watch = self.watch();
+        let predicted = match self.geometry.predict(&views, wanted, &watch) {
             Err(ModelError::Cancelled) => None,
             Err(error) => Some(failed(id, error.to_string())),
             Ok(prediction) if prediction.geometry.views.is_empty() => {
@@ -130,7 +142,7 @@ impl<'a> Predictor<'a> {
         let Some(stereo) = &self.stereo_landmarks else { return BTreeMap::new() };
         self.window.advance(keyframes, &span.seen, events);
         let (views, _, indices) = self.window.take(&span.seen);
-        let landmarks = stereo.find(prediction, &views, self.cancelled);
+        let landmarks = stereo.find(prediction, &views, &|_| (self.cancelled)());
         self.window.put_back(views, indices);
         landmarks.unwrap_or_else(|error| {
             let place = PredictionId::Chunk(prediction.chunk_id);
@@ -167,7 +179,8 @@ impl<'a> Predictor<'a> {
                 return Ok(None);
             }
         };
-        let geometry = match self.geometry.predict(&views, 0..seen.len(), self.cancelled) {
+        let watch = self.watch();
+        let geometry = match self.geometry.predict(&views, 0..seen.len(), &watch) {
             Ok(prediction) => prediction.geometry,
             Err(ModelError::Cancelled) => return Ok(None),
             Err(error) => {

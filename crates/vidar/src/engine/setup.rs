@@ -8,7 +8,7 @@ use crate::error::Error;
 use std::ops::Range;
 use vidar_core::{
     CameraId, ChunkId, ChunkViews, FrameId, FrameImage, GeometryPrediction, Image, ModelError, ModelInfo,
-    Pinhole, RigCamera, Se3, Timestamp, Warning,
+    Pinhole, RigCamera, Se3, Timestamp, Warning, Watch,
 };
 
 /// Values and sources of an [`super::Engine`].
@@ -41,6 +41,8 @@ pub struct EngineSetup<'a> {
     pub volume_budget_bytes: u64,
     /// Asked now and then; `true` stops predictions, and what was placed is fused.
     pub cancelled: &'a (dyn Fn() -> bool + Sync),
+    /// Told now and then which share of the prediction at hand is done, 0…1.
+    pub predicting: &'a (dyn Fn(f64) + Sync),
 }
 
 /// Pixels of images that were pushed before, as they are needed. A file is read again, a live source keeps what it can.
@@ -74,12 +76,12 @@ pub trait GeometrySource {
     /// Depth of the views `wanted` (indices into `views.views`).
     ///
     /// # Errors
-    /// What the model reports; [`ModelError::Cancelled`] when `cancelled` returned `true`.
+    /// What the model reports; [`ModelError::Cancelled`] when `watch` answered `true`.
     fn predict(
         &mut self,
         views: &ChunkViews,
         wanted: Range<usize>,
-        cancelled: &(dyn Fn() -> bool + Sync),
+        watch: Watch<'_>,
     ) -> Result<Prediction, ModelError>;
 }
 

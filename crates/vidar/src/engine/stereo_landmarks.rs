@@ -8,6 +8,7 @@ use crate::error::Error;
 use std::collections::BTreeMap;
 use vidar_align::landmark_scale::{DepthPoint, LandmarkConfig, point_ratios};
 use vidar_align::landmark_transfer::pixel_at_size;
+use vidar_core::Watch;
 use vidar_core::camera::Pixel;
 use vidar_core::model::ChunkFrame;
 use vidar_core::{ChunkView, ChunkViews, FrameId, GeometryPrediction, ViewGeometry};
@@ -48,12 +49,12 @@ impl StereoLandmarks {
         &self,
         prediction: &GeometryPrediction,
         views: &[ChunkView],
-        cancelled: &(dyn Fn() -> bool + Sync),
+        watch: Watch<'_>,
     ) -> Result<BTreeMap<FrameId, Vec<DepthPoint>>, StereoError> {
         let views: Vec<ChunkView> = views.iter().filter(|v| v.world_from_camera.is_some()).cloned().collect();
         let references: Vec<usize> = (0..views.len()).collect();
         let views = ChunkViews { id: prediction.chunk_id, views };
-        let by_stereo = match self.stereo.predict_with(&views, &references, cancelled) {
+        let by_stereo = match self.stereo.predict_with(&views, &references, watch) {
             Ok(output) => output.prediction.views,
             Err(
                 StereoError::NoParallax { .. } | StereoError::TooFewViews { .. } | StereoError::Cancelled,

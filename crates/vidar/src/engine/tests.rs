@@ -62,7 +62,7 @@ impl GeometrySource for Wall {
         &mut self,
         views: &ChunkViews,
         wanted: std::ops::Range<usize>,
-        _: &(dyn Fn() -> bool + Sync),
+        _: vidar_core::Watch<'_>,
     ) -> Result<Prediction, ModelError> {
         if self.failing.contains(&views.id.0) {
             return Err(ModelError::Other("out of order".into()));
@@ -183,6 +183,7 @@ fn run(
         store: &store,
         volume_budget_bytes: 1 << 28,
         cancelled: &|| false,
+        predicting: &|_| {},
     })
     .unwrap();
     let mut events = Vec::new();

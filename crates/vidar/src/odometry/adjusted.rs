@@ -1,17 +1,8 @@
-//! The adjustment of a recording after its end, as `vidar odometry` and `vidar run` use it: what may change, and the adjusted
-//! states as poses for the engine.
+//! The adjustment of a recording after its end, as `vidar odometry` and `vidar run` use it: what may change, and what it found.
 
-use super::Tracked;
 use crate::config::Config;
-use crate::engine::{FrameStamp, FrameState, PoseReport, PoseSource};
-use crate::error::Error;
-use crate::input::TrajectorySource;
-use crate::quality::TrackQuality;
 use serde_json::{Value, json};
-use std::collections::BTreeMap;
-use vidar_core::{
-    BodyFrame, Duration, FrameId, OdometryKeyframe, Se3, SensorEvent, StampedPose, Trajectory, Warning,
-};
+use vidar_core::{BodyFrame, Duration, StampedPose, Trajectory};
 use vidar_dataset::{CalibrationSource, Dataset};
 use vidar_odometry::bundle_adjustment::{Adjusted, AdjustedCalibration, CalibrationSigmas};
 
@@ -69,69 +60,4 @@ pub(super) fn trajectory(adjusted: &Adjusted) -> Option<Trajectory> {
         .iter()
         .map(|(_, state)| StampedPose { time: state.time, world_from_body: state.world_from_body });
     Trajectory::new(BodyFrame::Imu, poses.collect()).ok()
-}
-
-/// Adjusted states as the engine's poses.
-pub(crate) struct AdjustedPoses {
-    poses: BTreeMap<FrameId, Se3>,
-    keyframes: BTreeMap<FrameId, OdometryKeyframe>,
-    warnings: Vec<Warning>,
-    quality: TrackQuality,
-}
-
-impl AdjustedPoses {
-    /// The adjusted states of what was tracked; `None` where there are none.
-    pub(crate) fn new(tracked: &Tracked) -> Option<Self> {
-        let adjusted = tracked.adjusted.as_ref()?;
-        let place = adjusted.calibration.body_from_camera;
-        Some(Self {
-            poses: adjusted.images.iter().map(|(id, state)| (*id, state.world_from_body * place)).collect(),
-            keyframes: adjusted.keyframes.iter().map(|k| (k.frame_id, k.clone())).collect(),
-            warnings: tracked.warnings(),
-            quality: tracked.quality.clone(),
-        })
-    }
-}
-
-impl PoseSource for AdjustedPoses {
-    fn source(&self) -> TrajectorySource {
-        TrajectorySource::Odometry
-    }
-
-    fn needs_sensors(&self) -> bool {
-        false
-    }
-
-    fn push(&mut self, event: SensorEvent) -> Result<Vec<PoseReport>, Error> {
-        let SensorEvent::Image(frame) = event else { return Ok(Vec::new()) };
-        Ok(self.push_stamp(&FrameStamp { frame_id: frame.id, time: frame.time, camera: frame.camera }))
-    }
-
-    fn push_stamp(&mut self, stamp: &FrameStamp) -> Vec<PoseReport> {
-        let FrameStamp { frame_id, time, .. } = *stamp;
-        vec![match self.poses.get(&frame_id) {
-            Some(world_from_camera) => PoseReport::Posed {
-                state: FrameState { frame_id, time, segment: 0, world_from_camera: *world_from_camera },
-                keyframe: self.keyframes.remove(&frame_id).map(Box::new),
-                revised: Vec::new(),
-            },
-            None => PoseReport::NotPosed { time },
-        }]
-    }
-
-    fn finish(&mut self) -> Vec<PoseReport> {
-        Vec::new()
-    }
-
-    fn warnings(&self) -> Vec<Warning> {
-        self.warnings.clone()
-    }
-
-    fn why_no_pose(&self) -> String {
-        self.quality.why_not_started().unwrap_or_else(|| "it got no image".into())
-    }
-
-    fn quality(&self) -> Option<&TrackQuality> {
-        Some(&self.quality)
-    }
 }

@@ -12,6 +12,7 @@ pub(crate) mod reference;
 mod source;
 mod store;
 mod summary;
+mod tracking;
 mod trust;
 mod views;
 
@@ -22,16 +23,12 @@ pub use outputs::pose_of;
 pub use plan::{ExpectedWork, Plan, bytes};
 
 use crate::calibrate;
-use crate::camera_timing;
 use crate::config::{Config, Layered};
 use crate::engine::{Engine, EngineSetup, FrameStamp, MapEvent, PoseSource};
 use crate::error::{Error, ExitStatus};
 use crate::events::{CancelToken, Event, Events};
 use crate::input::{self, ImageFiles, Measurement};
-use crate::odometry::{
-    self,
-    adjusted::{self, AdjustedPoses},
-};
+use crate::odometry::TrackedPoses;
 use crate::run_folder::{OutputLocation, RunFolder};
 use crate::verdict::{StatedScale, Verdict};
 use place_recognition::PlaceRecognition;
@@ -41,6 +38,7 @@ use source::Source;
 use std::path::PathBuf;
 use std::sync::Arc;
 use store::RunStore;
+use tracking::Tracking;
 use vidar_core::{Duration, RigCamera, Se3, Warning};
 use vidar_dataset::{Dataset, DatasetError, OpenOptions};
 
@@ -131,8 +129,8 @@ pub fn run(request: &RunRequest, events: &Events, cancel: &CancelToken) -> Resul
     let mut dataset =
         events.stage("read", 0, || input::open_every_image(&request.path, &request.open, &config))?;
     dataset.warnings.extend(input::use_every_untimed_image(&dataset, &mut config));
-    let sigmas = adjusted::adjustable(&dataset, &config);
-    calibrate::complete(&mut dataset, &mut config.odometry, &events, cancel)?;
+    let mut tracking = Tracking::new(&dataset, &config, &request.place)?;
+    tracking.calibrate(&mut dataset, &mut config, &events, cancel)?;
     let (plan, source, places) =
         events.stage("plan", 0, || Plan::make(&dataset, &config, request.reference.as_deref()))?;
     let description = RunDescription::new(request, &dataset, &plan)?;
@@ -142,19 +140,9 @@ pub fn run(request: &RunRequest, events: &Events, cancel: &CancelToken) -> Resul
     folder.write("config.resolved.toml", request.layered.to_toml(true).as_bytes())?;
     recorder.keep_log_in(folder.clone());
     dataset.warnings.iter().chain(&plan.warnings).for_each(|w| events.warn(w));
-    if plan.poses.is_odometry() {
-        let timing = events.stage(camera_timing::STAGE, 0, || {
-            camera_timing::settle(&mut dataset, &mut config, &events, cancel)
-        })?;
-        timing.iter().for_each(|w| events.warn(w));
-    }
-    let poses = match &sigmas {
-        Some(sigmas) if plan.poses.is_odometry() => {
-            let tracked = odometry::track(&dataset, &config, Some(sigmas), &events, cancel, None)?;
-            tracked.adjusted.iter().for_each(|adjusted| adjusted::apply(adjusted, &mut dataset));
-            AdjustedPoses::new(&tracked)
-        }
-        _ => None,
+    let poses = match plan.poses.is_odometry() {
+        true => tracking.track(&mut dataset, &mut config, &folder, &events, cancel)?,
+        false => None,
     };
 
     let context =
@@ -194,12 +182,12 @@ impl Context<'_> {
         &self,
         plan: Plan,
         mut source: Source,
-        adjusted: Option<AdjustedPoses>,
+        tracked: Option<TrackedPoses>,
         places: &PlaceRecognition,
         recorder: &Recorder,
     ) -> Result<RunOutcome, Error> {
         let Self { request, config, dataset, folder, events, cancel } = *self;
-        let map = self.build_map(&plan, &mut source, adjusted, places)?;
+        let map = self.build_map(&plan, &mut source, tracked, places)?;
         let evaluation =
             events.stage("evaluate", 0, || evaluate::evaluate(dataset, &plan, &map, config, events))?;
         let scale = trust::stated_scale(&map, plan.mode, input::unseen_scale_std(dataset, config));
@@ -224,7 +212,7 @@ impl Context<'_> {
             device_peak_bytes: source.device_peak_bytes(),
             seconds: 0.0,
         };
-        events.stage("write", 0, || outputs::write(&outcome, config, request, folder, events))?;
+        events.stage("write", 0, || outputs::write(&outcome, dataset, config, request, folder, events))?;
         if config.output.report {
             events.stage("report", 0, || pictures::draw(&outcome, dataset, request, folder, events))?;
         }
@@ -236,15 +224,16 @@ impl Context<'_> {
         &self,
         plan: &Plan,
         source: &mut Source,
-        adjusted: Option<AdjustedPoses>,
+        tracked: Option<TrackedPoses>,
         places: &PlaceRecognition,
     ) -> Result<MetricMap, Error> {
         let Self { config, dataset, folder, events, cancel, .. } = *self;
         let store = RunStore::new(folder.path(), dataset, plan, config)?;
         let images = ImageFiles(dataset);
         let (live, fallback) = plan.poses.open(dataset, config)?;
-        let poses = adjusted.map(|p| Box::new(p) as Box<dyn PoseSource>).or(live);
+        let poses = tracked.map(|p| Box::new(p) as Box<dyn PoseSource>).or(live);
         let cancelled = || cancel.is_cancelled();
+        let predicting = readers::chunk_progress(events);
         let mut engine = Engine::new(EngineSetup {
             name: dataset.name.clone(),
             config,
@@ -260,6 +249,7 @@ impl Context<'_> {
             store: &store,
             volume_budget_bytes: plan.volume_budget_bytes,
             cancelled: &cancelled,
+            predicting: &predicting,
         })?;
         let mut readers = Readers::new(dataset, plan, config, folder, events);
         events.stage(MAP, dataset.images.len(), || {
@@ -270,6 +260,9 @@ impl Context<'_> {
             .stage(FINISH, 0, || engine.finish(&mut |event| readers.read(event)))
             .map_err(|error| of_synthetic_weights(error, plan))?;
         let map = readers.finish(plan);
+        if !cancel.is_cancelled() {
+            tracking::forget(folder);
+        }
         store.clean(config.output.keep_chunks || cancel.is_cancelled());
         Ok(map)
     }

@@ -5,16 +5,18 @@ use crate::config::Config;
 use crate::error::Error;
 use crate::events::{Event, Events};
 use crate::quality::TrackQuality;
-use crate::run_folder::{MANIFEST_SCHEMA, RunFolder, StoredView, VIEWS_SCHEMA, pretty};
+use crate::run_folder::{MANIFEST_SCHEMA, RunFolder, StoredCamera, StoredView, VIEWS_SCHEMA, pretty};
 use serde_json::{Value, json};
 use vidar_align::Placement;
 use vidar_align::aligner::{ChunkPlacement, LoopReport};
 use vidar_core::{FrameId, Se3, Timestamp, Trajectory, printable};
+use vidar_dataset::{CameraFlag, Dataset};
 use vidar_export::{DepthFrame, DepthSidecar, ExportError};
 
 /// Writes everything but pictures and manifest.
 pub fn write(
     outcome: &RunOutcome,
+    dataset: &Dataset,
     config: &Config,
     request: &RunRequest,
     folder: &RunFolder,
@@ -28,7 +30,7 @@ pub fn write(
     if let Some(keyframes) = map.keyframe_trajectory() {
         writer.trajectory("trajectory/keyframes_camera", &keyframes, map)?;
     }
-    writer.bytes("views.json", &pretty(&json!({ "schema": VIEWS_SCHEMA, "views": outcome.map.views })))?;
+    writer.bytes("views.json", &pretty(&views_json(outcome, dataset)))?;
     if config.output.depth_png && !outcome.map.views.is_empty() {
         writer.export("depth/depth.json", |w| sidecar(outcome, config).write(w))?;
     }
@@ -84,6 +86,24 @@ impl Writer<'_> {
         self.export(&format!("{stem}.tum"), |w| vidar_export::write_tum(w, trajectory, &note))?;
         self.export(&format!("{stem}.euroc.csv"), |w| vidar_export::write_euroc_csv(w, trajectory, &note))
     }
+}
+
+/// Keyframes, the files that they were read from, and the camera as it was used.
+fn views_json(outcome: &RunOutcome, dataset: &Dataset) -> Value {
+    let source = |view: &StoredView| {
+        let entry = dataset.images.iter().find(|i| i.frame_id.0 == view.frame)?;
+        std::path::absolute(&entry.path).ok()
+    };
+    let views: Vec<StoredView> =
+        outcome.map.views.iter().map(|v| StoredView { source: source(v), ..v.clone() }).collect();
+    let camera = dataset.rig.camera(dataset.camera).map_or(&outcome.plan.camera, |c| &c.model);
+    json!({
+        "schema": VIEWS_SCHEMA,
+        "camera": StoredCamera {
+            model: CameraFlag(camera.clone()).to_string(), width: camera.width(), height: camera.height(),
+        },
+        "views": views,
+    })
 }
 
 fn sidecar(outcome: &RunOutcome, config: &Config) -> DepthSidecar {

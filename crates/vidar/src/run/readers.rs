@@ -8,6 +8,7 @@ use crate::engine::{MapEvent, Step};
 use crate::error::Error;
 use crate::events::{Event, Events};
 use crate::run_folder::RunFolder;
+use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::{Duration, Instant};
 use vidar_dataset::Dataset;
 
@@ -92,6 +93,18 @@ impl<'a> Readers<'a> {
         // What cannot be removed is only left behind.
         let _ = std::fs::remove_file(self.folder.path().join(SO_FAR));
         self.collector.finish(plan.camera_id)
+    }
+}
+
+/// Tells how much of a chunk is predicted, in steps.
+pub(super) fn chunk_progress(events: &Events) -> impl Fn(f64) + Sync {
+    const STEP_PERCENT: usize = 5;
+    let told = AtomicUsize::new(0);
+    move |share| {
+        let percent = (100.0 * share) as usize / STEP_PERCENT * STEP_PERCENT;
+        if told.swap(percent, Ordering::Relaxed) != percent {
+            events.emit(&Event::ChunkProgress { percent });
+        }
     }
 }
 

@@ -1,6 +1,8 @@
 //! Warnings, timings and files of a run as a reader of its events, and the manifest made of them.
 
+use super::store::CHUNKS;
 use super::{Plan, RunRequest};
+use crate::chunks::ChunkStore;
 use crate::error::{Error, ExitStatus};
 use crate::events::{Event, Events};
 use crate::run_folder::{MANIFEST_SCHEMA, Manifest, RunFolder};
@@ -73,10 +75,17 @@ impl Recorder {
         self.read(|r| r.warnings.iter().any(|w| w.severity == Severity::Degraded))
     }
 
-    /// Every file of the run so far, with those that are no results.
+    /// Every file of the run so far, with those that are no results: its records, and what a later attempt can go on from.
     pub fn files(&self) -> BTreeSet<String> {
         let own = ["config.resolved.toml", "log.jsonl", "manifest.json"].map(String::from);
-        self.read(|r| r.artifacts.iter().cloned().chain(own).collect())
+        self.read(|r| {
+            let root = r.folder.as_ref().map(|f| f.path().to_owned()).unwrap_or_default();
+            let tracked = root.join(super::tracking::FILE);
+            let left = ChunkStore::new(root.join(CHUNKS)).files().into_iter().chain([tracked]);
+            let left = left.filter(|p| p.is_file());
+            let left = left.filter_map(|p| Some(p.strip_prefix(&root).ok()?.to_str()?.replace('\\', "/")));
+            r.artifacts.iter().cloned().chain(own).chain(left).collect()
+        })
     }
 
     /// The manifest of a run that ended with `exit`.
@@ -117,7 +126,7 @@ impl RunDescription {
                 "images": dataset.images.len(), "imu_samples": dataset.imu.len(),
                 "depth_images": dataset.depths.len(),
             }),
-            dataset_sha256: vidar_hub::sha256_hex(&dataset.fingerprint()?),
+            dataset_sha256: crate::input::fingerprint(dataset)?,
             config_sha256: vidar_hub::sha256_hex(request.layered.to_toml(false).as_bytes()),
             model: plan.model_json(),
             poses: serde_json::json!(plan.poses.source()),

@@ -144,9 +144,9 @@ impl GeometrySource for Source {
         &mut self,
         views: &ChunkViews,
         wanted: std::ops::Range<usize>,
-        cancelled: &(dyn Fn() -> bool + Sync),
+        watch: vidar_core::Watch<'_>,
     ) -> Result<Prediction, ModelError> {
-        let geometry = self.model().predict_views(views, wanted, cancelled)?;
+        let geometry = self.model().predict_views(views, wanted, watch)?;
         let (mut colors, mut tokens) = (Vec::new(), Vec::new());
         match self {
             Self::Network(network) => tokens = network.0.take_place_tokens(),

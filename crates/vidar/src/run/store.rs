@@ -11,6 +11,9 @@ use std::path::{Path, PathBuf};
 use vidar_core::ChunkId;
 use vidar_dataset::Dataset;
 
+/// Where predictions lie in the run folder.
+pub(super) const CHUNKS: &str = "chunks";
+
 /// `chunks/` and `volumes/` of a run folder.
 pub(super) struct RunStore {
     chunks: ChunkStore,
@@ -32,9 +35,9 @@ impl RunStore {
             "network": config.model,
             "place_recognition": plan.place_recognition,
         });
-        let mut identity = dataset.fingerprint()?;
+        let mut identity = crate::input::fingerprint(dataset)?.into_bytes();
         identity.extend(part.to_string().into_bytes());
-        Ok(Self { chunks: ChunkStore::new(root.join("chunks")), volumes: root.join("volumes"), identity })
+        Ok(Self { chunks: ChunkStore::new(root.join(CHUNKS)), volumes: root.join("volumes"), identity })
     }
 
     /// Removes volumes, and predictions unless they are to be kept.

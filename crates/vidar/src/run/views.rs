@@ -55,6 +55,7 @@ fn write_view(
     let stored = StoredView {
         frame: view.frame_id().0,
         time_ns: view.time().nanos(),
+        source: None,
         image,
         depth,
         intrinsics: *view.intrinsics(),

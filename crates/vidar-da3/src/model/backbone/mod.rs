@@ -164,6 +164,7 @@ impl Backbone {
         let mut order = Order((0..pixels.views).collect());
         let mut scratch = BlockScratch::default();
         for i in 0..self.config.depth {
+            let run = &run.part(i, self.config.depth);
             run.check_cancelled()?;
             if self.config.alternate_from == Some(i + 1) {
                 order = self.put_reference_first(&mut x, length, cameras);
@@ -194,8 +195,9 @@ impl Backbone {
         scratch: &mut BlockScratch,
     ) -> Result<(), Da3Error> {
         let views = (GROUP_TOKENS / (step.length / self.config.dim)).max(1);
+        let (run, groups) = (step.run, x.len().div_ceil(views * step.length));
         for (group, x) in x.chunks_mut(views * step.length).enumerate() {
-            step.run.check_cancelled()?;
+            run.part(group, groups).check_cancelled()?;
             block.run(&step.compute, x, x.len() / step.length, rope, scratch);
             for (i, x) in x.chunks_exact(step.length).enumerate() {
                 self.emit(step, group * views + i, x, x)?;
@@ -216,14 +218,15 @@ impl Backbone {
         let mut queries = std::mem::take(&mut scratch.queries);
         resize(&mut queries, x.len());
         let mut sequence = block.key_values(&compute, x.len() / self.config.dim);
-        for (x, queries) in x.chunks(step.length).zip(queries.chunks_mut(step.length)) {
-            step.run.check_cancelled()?;
+        let (run, parts) = (step.run, 2 * (x.len() / step.length));
+        for (i, (x, queries)) in x.chunks(step.length).zip(queries.chunks_mut(step.length)).enumerate() {
+            run.part(i, parts).check_cancelled()?;
             block.push(&compute, x, rope, (&mut sequence, queries), scratch);
         }
         let mut before = Vec::new();
         let mut views = x.chunks_exact_mut(step.length).zip(queries.chunks_exact(step.length)).enumerate();
         views.try_for_each(|(i, (x, queries))| {
-            step.run.check_cancelled()?;
+            run.part(parts / 2 + i, parts).check_cancelled()?;
             before.clear();
             if self.config.out_layers.contains(&step.layer) {
                 before.extend_from_slice(x);

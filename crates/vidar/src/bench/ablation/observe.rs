@@ -46,6 +46,7 @@ pub fn observe(dataset: &Dataset, config: &Config, cancel: &CancelToken) -> Resu
         store: &store,
         volume_budget_bytes: plan.volume_budget_bytes,
         cancelled: &cancelled,
+        predicting: &|_| {},
     })?;
     let mut keyframes = BTreeMap::new();
     let mut observed: Vec<(ChunkId, Vec<FrameObservation>)> = Vec::new();

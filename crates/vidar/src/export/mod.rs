@@ -1,8 +1,11 @@
 //! `vidar export`: formats of other programs, made from a finished run folder.
 
+mod at_input;
+mod tracks;
+
 use crate::error::Error;
 use crate::run::pose_of;
-use crate::run_folder::{StoredView, VIEWS_SCHEMA};
+use crate::run_folder::{StoredCamera, StoredView, VIEWS_SCHEMA};
 use serde::Deserialize;
 use std::path::{Path, PathBuf};
 use std::str::FromStr;
@@ -54,14 +57,46 @@ impl FromStr for ExportTarget {
     }
 }
 
+/// What an export holds beside what it must.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct ExportOptions {
+    /// COLMAP: every point with the images that see it.
+    pub tracks: bool,
+    /// COLMAP and nerfstudio: images at the size of the recording's, undistorted again from its files.
+    pub input_size: bool,
+}
+
+impl ExportTarget {
+    fn check(self, options: ExportOptions) -> Result<(), Error> {
+        let is_colmap = matches!(self, Self::Colmap | Self::ColmapText);
+        let has_images = is_colmap || self == Self::Nerfstudio;
+        let refused = match options {
+            ExportOptions { tracks: true, .. } if !is_colmap => {
+                "--tracks: only colmap and colmap-text have tracks"
+            }
+            ExportOptions { input_size: true, .. } if !has_images => {
+                "--input-size: only colmap, colmap-text and nerfstudio hold images"
+            }
+            _ => return Ok(()),
+        };
+        Err(Error::Usage { what: refused.to_owned(), hint: "leave it out".to_owned() })
+    }
+}
+
 #[derive(Deserialize)]
 struct StoredViews {
     schema: String,
+    #[serde(default)]
+    camera: Option<StoredCamera>,
     views: Vec<StoredView>,
 }
 
 /// Reads the keyframes of a run folder.
 pub fn read_views(run: &Path) -> Result<Vec<StoredView>, Error> {
+    read_stored(run).map(|stored| stored.views)
+}
+
+fn read_stored(run: &Path) -> Result<StoredViews, Error> {
     let path = run.join("views.json");
     let not_a_run = |reason: String| Error::NotARun { path: run.to_owned(), reason };
     let bytes = crate::system::read_up_to(&path, crate::system::MAX_JSON_BYTES)
@@ -74,18 +109,27 @@ pub fn read_views(run: &Path) -> Result<Vec<StoredView>, Error> {
             stored.schema
         )));
     }
-    Ok(stored.views)
+    Ok(stored)
 }
 
 /// Makes `target` from the run folder `run` in the folder `out` and returns the files made.
-pub fn export_run(run: &Path, target: ExportTarget, out: &Path) -> Result<Vec<PathBuf>, Error> {
+///
+/// # Errors
+/// The folder is none of a run, lacks what the target needs, or cannot be written; options that the target does not have.
+pub fn export_run(
+    run: &Path,
+    target: ExportTarget,
+    options: ExportOptions,
+    out: &Path,
+) -> Result<Vec<PathBuf>, Error> {
+    target.check(options)?;
     // A folder that is not a run folder is refused before any file is written.
     read_views(run)?;
     std::fs::create_dir_all(out).map_err(|e| Error::io("create", out, e))?;
     match target {
-        ExportTarget::Colmap => colmap(run, out, ColmapFormat::Binary),
-        ExportTarget::ColmapText => colmap(run, out, ColmapFormat::Text),
-        ExportTarget::Nerfstudio => nerfstudio(run, out),
+        ExportTarget::Colmap => colmap(run, out, ColmapFormat::Binary, options),
+        ExportTarget::ColmapText => colmap(run, out, ColmapFormat::Text, options),
+        ExportTarget::Nerfstudio => nerfstudio(run, out, options),
         ExportTarget::Tum | ExportTarget::Kitti | ExportTarget::Euroc => trajectory(run, target, out),
         ExportTarget::Ply => {
             ["mesh.ply", "points.ply"].iter().map(|name| copy(run, "map", name, out)).collect()
@@ -109,27 +153,36 @@ fn glb(run: &Path, out: &Path) -> Result<PathBuf, Error> {
     Ok(target)
 }
 
-fn colmap(run: &Path, out: &Path, format: ColmapFormat) -> Result<Vec<PathBuf>, Error> {
-    let views = export_views(run)?;
+fn colmap(
+    run: &Path,
+    out: &Path,
+    format: ColmapFormat,
+    options: ExportOptions,
+) -> Result<Vec<PathBuf>, Error> {
+    let mut views = export_views(run)?;
+    let images = images(run, &mut views, options, out)?;
+    let mut cloud = points(run)?;
+    let mut observations = Vec::new();
+    if options.tracks {
+        cloud = tracks::thinned(cloud);
+        observations = tracks::observations(run, &cloud, &views)?;
+    }
     let sparse = out.join("sparse").join("0");
     std::fs::create_dir_all(&sparse).map_err(|e| Error::io("create", &sparse, e))?;
-    vidar_export::write_colmap(&sparse, format, &views, &points(run)?)?;
-    let mut made = vec![sparse];
-    made.extend(copy_images(run, out)?);
-    Ok(made)
+    vidar_export::write_colmap(&sparse, format, &views, &cloud, &observations)?;
+    Ok(vec![sparse, images])
 }
 
-fn nerfstudio(run: &Path, out: &Path) -> Result<Vec<PathBuf>, Error> {
+fn nerfstudio(run: &Path, out: &Path, options: ExportOptions) -> Result<Vec<PathBuf>, Error> {
     let mut views = export_views(run)?;
+    let images = images(run, &mut views, options, out)?;
     views.iter_mut().for_each(|v| v.image_name = format!("images/{}", v.image_name));
     let json = out.join("transforms.json");
     let points = copy(run, "map", "points.ply", out)?;
     vidar_export::atomic::write_atomically(&json, |w| {
         vidar_export::write_transforms_json(w, &views, Some("points.ply"))
     })?;
-    let mut made = vec![json, points];
-    made.extend(copy_images(run, out)?);
-    Ok(made)
+    Ok(vec![json, points, images])
 }
 
 fn trajectory(run: &Path, target: ExportTarget, out: &Path) -> Result<Vec<PathBuf>, Error> {
@@ -192,13 +245,19 @@ fn copy(run: &Path, folder: &str, name: &str, out: &Path) -> Result<PathBuf, Err
     Ok(to)
 }
 
-fn copy_images(run: &Path, out: &Path) -> Result<Vec<PathBuf>, Error> {
+/// The folder of the views' images: those of the run, or new ones, whose size the views then have.
+fn images(
+    run: &Path,
+    views: &mut [ExportView],
+    options: ExportOptions,
+    out: &Path,
+) -> Result<PathBuf, Error> {
     let images = out.join("images");
     std::fs::create_dir_all(&images).map_err(|e| Error::io("create", &images, e))?;
-    for view in read_views(run)? {
-        if let Some(name) = view.image.as_deref().and_then(|p| p.rsplit('/').next()) {
-            copy(run, "images", name, &images)?;
-        }
+    if options.input_size {
+        at_input::undistort(run, &read_stored(run)?, views, &images)?;
+    } else {
+        views.iter().try_for_each(|view| copy(run, "images", &view.image_name, &images).map(|_| ()))?;
     }
-    Ok(vec![images])
+    Ok(images)
 }
