@@ -9,6 +9,9 @@ use vidar_core::{Duration, FrameId, ImuSample, LandmarkId, Timestamp, camera::Pi
 /// and a hand turns by less than 20° in it.
 const LOG_PERIOD: Duration = Duration::from_millis(200);
 
+/// Stamps of images that are logged at a period vary by this.
+const STAMP_JITTER: Duration = Duration::from_millis(50);
+
 /// Logged images whose states are brought up to date with the window: more than any window holds.
 const NEWEST_IMAGES: usize = 48;
 
@@ -127,6 +130,18 @@ impl TrackLog {
             })
             .collect();
         self.images.push(LoggedImage { frame, caller_frame, stamp, observations, state });
+    }
+
+    /// The log with images at least `period` apart.
+    pub(crate) fn every(&self, period: Duration) -> Self {
+        let mut images: Vec<LoggedImage> = Vec::new();
+        for image in &self.images {
+            let is_due = |last: &LoggedImage| image.stamp - last.stamp >= period - STAMP_JITTER;
+            if images.last().is_none_or(is_due) {
+                images.push(image.clone());
+            }
+        }
+        Self { images, stamps: self.stamps.clone(), imu: self.imu.clone(), ..*self }
     }
 
     /// Brings the states of images that the window still holds up to date.

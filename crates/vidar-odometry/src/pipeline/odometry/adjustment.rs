@@ -1,8 +1,12 @@
 //! What is kept for the adjustment after the recording's end, and the adjustment.
 
 use super::{Odometry, Phase, Status};
-use crate::bundle_adjustment::{self, Adjusted, AdjustmentError, CalibrationSigmas, LoggedState, TrackLog};
+use crate::bundle_adjustment::{
+    self, Adjusted, AdjustmentError, AdjustmentInput, CalibrationSigmas, LoggedState, Progress, TrackLog,
+};
+use crate::imu::StepNoise;
 use crate::tracking::{host_covariance, noisy_covariance};
+use std::ops::ControlFlow;
 use vidar_core::{Frame, FrameId, Health};
 
 impl Odometry {
@@ -45,11 +49,37 @@ impl Odometry {
     /// # Errors
     /// No log was kept or there is no IMU; otherwise as [`bundle_adjustment::adjust`].
     pub fn adjust(&self, sigmas: &CalibrationSigmas) -> Result<Adjusted, AdjustmentError> {
+        self.adjust_with(sigmas, &mut |_| ControlFlow::Continue(()))
+    }
+
+    /// As [`Odometry::adjust`]. `tell` hears how far it is, and is asked before every iteration whether to go on.
+    ///
+    /// # Errors
+    /// As [`Odometry::adjust`], and [`AdjustmentError::Cancelled`] where `tell` broke it off.
+    pub fn adjust_with(
+        &self,
+        sigmas: &CalibrationSigmas,
+        tell: &mut dyn FnMut(Progress) -> ControlFlow<()>,
+    ) -> Result<Adjusted, AdjustmentError> {
         let (Some(log), Some(model)) = (&self.log, &self.imu_model) else {
             return Err(AdjustmentError::TooShort { images: 0 });
         };
         let mut camera = self.camera.clone();
         camera.time_offset += self.estimated_offset();
-        bundle_adjustment::adjust(log, &camera, self.time_calibration.readout_secs, model, sigmas)
+        let data_sheet = StepNoise {
+            gyro_density: model.noise.gyro_density / self.config.gyro_noise_factor,
+            accel_density: model.noise.accel_density / self.config.accel_noise_factor,
+            ..model.noise
+        };
+        let input = AdjustmentInput {
+            log,
+            camera: &camera,
+            readout_secs: self.time_calibration.readout_secs,
+            given_body_from_camera: self.given_body_from_camera,
+            model: *model,
+            data_sheet,
+            sigmas,
+        };
+        bundle_adjustment::adjust(&input, tell)
     }
 }
