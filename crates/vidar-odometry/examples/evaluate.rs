@@ -3,7 +3,7 @@
 //! ```text
 //! cargo run --release -p vidar-odometry --example evaluate -- [--mono] [--start S] [--secs S] [--verbose]
 //!     [--repeat N] [--stages] [--image-noise GRAY] [--imu-noise FACTOR] [--halve]
-//!     [--live] [--adjust] [--sigma KEY=VALUE]... [--lever-error M] [--turn-error DEG] [--trajectory FILE] [--frames FILE] [--set KEY=VALUE]... SEQUENCE...
+//!     [--live] [--adjust] [--variant KEY=VALUE,...]... [--lever-error M] [--turn-error DEG] [--trajectory FILE] [--frames FILE] [--set KEY=VALUE]... SEQUENCE...
 //! ```
 //!
 //! A sequence is any folder with images, IMU measurements and ground truth that `vidar-dataset` reads. Figures: ATE after the best
@@ -18,8 +18,8 @@
 //! as for a stream, which cannot be read twice.
 //!
 //! `--adjust` evaluates the trajectory of the bundle adjustment after the recording's end in a second row, with σ(ln s) and the
-//! processor seconds it took. `--sigma KEY=VALUE` changes what the adjustment may change (`CalibrationSigmas`); `--lever-error M` and
-//! `--turn-error DEG` make the camera's place on the body wrong before the odometry sees it.
+//! processor seconds it took. `--variant KEY=VALUE,KEY=VALUE` adjusts once more with other limits of what may change (`CalibrationSigmas`;
+//! `loops=0` leaves loops out, for all that follow); `--lever-error M` and `--turn-error DEG` make the camera's place on the body wrong before the odometry sees it.
 //!
 //! `--image-noise`, `--imu-noise` corrupt what is read: noise of so many grey levels; so much more inertial noise that
 //! its whole is FACTOR times the data sheet's (the bias stays). `--halve` averages 2 × 2 pixels.
@@ -58,7 +58,8 @@ struct Options {
     halve: bool,
     live: bool,
     adjust: bool,
-    sigmas: Vec<(String, f64)>,
+    /// What the adjustments after the first change.
+    variants: Vec<String>,
     lever_error_m: f64,
     turn_error_deg: f64,
 }
@@ -85,11 +86,7 @@ fn options() -> Result<Options, Failure> {
                 let (key, number) = text.split_once('=').ok_or("--set needs KEY=VALUE")?;
                 found.settings.push((key.to_owned(), number.parse()?));
             }
-            "--sigma" => {
-                let text = value()?;
-                let (key, number) = text.split_once('=').ok_or("--sigma needs KEY=VALUE")?;
-                found.sigmas.push((key.to_owned(), number.parse()?));
-            }
+            "--variant" => found.variants.push(value()?),
             "--lever-error" => found.lever_error_m = value()?.parse()?,
             "--turn-error" => found.turn_error_deg = value()?.parse()?,
             "--frames" => found.frames = Some(value()?.into()),
@@ -130,8 +127,8 @@ struct Run {
     outputs: Vec<OdometryOutput>,
     times: Vec<StageTimes>,
     poses: Vec<StampedPose>,
-    adjusted: Option<Adjusted>,
-    adjust_secs: f64,
+    /// The adjustments: what was changed, and the seconds each took.
+    adjusted: Vec<(String, Adjusted, f64)>,
 }
 
 fn evaluate(path: &Path, options: &Options) -> Result<(), Failure> {
@@ -170,14 +167,14 @@ fn evaluate(path: &Path, options: &Options) -> Result<(), Failure> {
     if let Some(file) = &options.trajectory {
         std::fs::write(file, tum(&live))?;
     }
-    if let Some(adjusted) = run.adjusted {
+    for (variant, adjusted, secs) in &run.adjusted {
         let offset = Duration::from_secs_f64(adjusted.calibration.time_offset_secs);
         let pose = |state: &NavState| StampedPose {
             time: state.time + offset,
             world_from_body: state.world_from_body,
         };
         row(
-            "  adjusted",
+            &format!("  adjusted {variant}"),
             adjusted.images.iter().map(|(_, state)| pose(state)).collect(),
             images,
             &[],
@@ -186,9 +183,9 @@ fn evaluate(path: &Path, options: &Options) -> Result<(), Failure> {
         let place = dataset.rig.camera(dataset.camera).map(|c| c.body_from_camera).unwrap_or(Se3::IDENTITY);
         let found = &adjusted.calibration.body_from_camera;
         println!(
-            "  = σ(ln s) {:.4}, {:.1} s, chi2 {:.3}, place off by {:.4} m {:.3} deg, σ {:.4} m, noise {:.1e} {:.1e}, clock {:.2} ms, {:?}",
+            "  = σ(ln s) {:.4}, {:.1} s, chi2 {:.3}, place off by {:.4} m {:.3} deg, σ {:.4} m, noise {:.1e} {:.1e}, clock {:.2} ms, loops {} {}, {:?}",
             adjusted.scale_std,
-            run.adjust_secs,
+            secs,
             adjusted.report.inertial_chi2_per_dof,
             (found.translation - place.translation).norm(),
             (place.rotation.inverse() * found.rotation).angle_rad().to_degrees(),
@@ -196,6 +193,8 @@ fn evaluate(path: &Path, options: &Options) -> Result<(), Failure> {
             adjusted.imu.gyro_noise_density,
             adjusted.imu.accel_noise_density,
             1e3 * adjusted.calibration.time_offset_secs,
+            adjusted.report.loops,
+            adjusted.report.loop_matches,
             adjusted.findings,
         );
     }
@@ -359,8 +358,7 @@ fn run(dataset: &Dataset, options: &Options) -> Result<Run, Failure> {
             Odometry::with_timing(&rig, dataset.camera, &config, &timing)?
         }
     };
-    let mut run =
-        Run { outputs: Vec::new(), times: Vec::new(), poses: Vec::new(), adjusted: None, adjust_secs: 0.0 };
+    let mut run = Run { outputs: Vec::new(), times: Vec::new(), poses: Vec::new(), adjusted: Vec::new() };
     if options.adjust {
         odometry.keep_log();
     }
@@ -379,13 +377,16 @@ fn run(dataset: &Dataset, options: &Options) -> Result<Run, Failure> {
         keep(&mut run, output, options.mono);
     }
     if options.adjust {
-        let begun = processor_secs();
-        let adjusted = odometry.adjust(&sigmas(options)?)?;
-        run.adjust_secs = processor_secs() - begun;
-        if options.verbose {
-            println!("  {:?}\n  {:?}\n  {:?}", adjusted.report, adjusted.calibration, adjusted.imu);
+        for variant in std::iter::once("").chain(options.variants.iter().map(String::as_str)) {
+            let sigmas = sigmas(variant, &mut odometry)?;
+            let begun = processor_secs();
+            let adjusted = odometry.adjust(&sigmas)?;
+            let secs = processor_secs() - begun;
+            if options.verbose {
+                println!("  {:?}\n  {:?}\n  {:?}", adjusted.report, adjusted.calibration, adjusted.imu);
+            }
+            run.adjusted.push((variant.to_owned(), adjusted, secs));
         }
-        run.adjusted = Some(adjusted);
     }
     // Ground truth is in the IMU's clock.
     let offset = Duration::from_secs_f64(odometry.timing().time_offset_secs);
@@ -394,10 +395,15 @@ fn run(dataset: &Dataset, options: &Options) -> Result<Run, Failure> {
 }
 
 /// What the adjustment may change.
-fn sigmas(options: &Options) -> Result<CalibrationSigmas, Failure> {
+fn sigmas(variant: &str, odometry: &mut Odometry) -> Result<CalibrationSigmas, Failure> {
     let mut sigmas = CalibrationSigmas::default();
-    for (key, number) in &options.sigmas {
-        let value = match key.as_str() {
+    for one in variant.split(',').filter(|one| !one.is_empty()) {
+        let (key, number) = one.split_once('=').ok_or("--variant needs KEY=VALUE")?;
+        let value = match key {
+            "loops" => {
+                odometry.forget_log_images();
+                continue;
+            }
             "time_offset_secs" => &mut sigmas.time_offset_secs,
             "readout_secs" => &mut sigmas.readout_secs,
             "rotation_rad" => &mut sigmas.rotation_rad,
@@ -407,9 +413,9 @@ fn sigmas(options: &Options) -> Result<CalibrationSigmas, Failure> {
             "distortion" => &mut sigmas.distortion,
             "gyro_gain" => &mut sigmas.gyro_gain,
             "accel_gain" => &mut sigmas.accel_gain,
-            other => return Err(format!("unknown sigma {other}").into()),
+            other => return Err(format!("unknown key {other} of a variant").into()),
         };
-        *value = *number;
+        *value = number.parse()?;
     }
     Ok(sigmas)
 }

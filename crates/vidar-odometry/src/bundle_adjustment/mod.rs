@@ -17,6 +17,7 @@ mod initial;
 mod keyframes;
 mod linearise;
 mod log;
+mod loops;
 mod noise;
 mod observation;
 mod optimise;
@@ -38,6 +39,7 @@ use envelope::Envelope;
 use inertial::ImuGain;
 use initial::Guess;
 use linearise::System;
+use loops::Closed;
 use observation::{Calibration, POSITION, ROTATION};
 use optimise::OptimiseReport;
 use problem::{CalibrationPrior, Problem};
@@ -61,6 +63,8 @@ struct Solution {
     report: OptimiseReport,
     /// Mean squared inertial residual, whitened with the noise as given.
     inertial_chi2_per_dof: f64,
+    /// Places that were tied.
+    closed: Closed,
     /// The IMU's model with noise as the residuals show it.
     model: ImuModel,
     system: System,
@@ -152,8 +156,10 @@ pub fn adjust(
         }
         passed = work.pass(&recording, &mut watch)?;
     }
+    watch.stage(AdjustmentStage::Loops, work.guess.images.len());
+    let closed = loops::close(&mut passed.problem, &mut passed.report, log, &passed.images, &mut watch)?;
     watch.stage(AdjustmentStage::Weighted, work.guess.images.len());
-    let solution = weigh(input, passed, &mut watch)?;
+    let solution = Solution { closed, ..weigh(input, passed, &mut watch)? };
     let corrected = imu.multiplied(&solution.problem.calibration.gain);
     let recording = Recording { imu: &corrected, model: &solution.model, ..recording };
     Ok(result::collect(input, &recording, &solution))
@@ -170,13 +176,28 @@ fn weigh(
     let inertial_chi2_per_dof = optimise::inertial_chi2_per_dof(&problem);
     for _ in 0..WEIGHINGS {
         let covariance = noise::covariance(&problem).ok_or(AdjustmentError::Undetermined)?;
-        model = noise::reweighed(&model, &noise::components(&problem, &covariance), &input.data_sheet);
+        let found = noise::reweighed(&model, &noise::components(&problem, &covariance), &input.data_sheet);
+        let change = noise::largest_change(&model, &found);
+        model = found;
+        if change < SETTLED_NOISE {
+            break;
+        }
         problem.frames.iter_mut().filter_map(|f| f.inertial.as_mut()).for_each(|i| i.reweigh(&model));
         optimise::finish(&mut problem, &mut report, watch)?;
     }
     let system = optimise::solution(&problem).ok_or(AdjustmentError::Undetermined)?;
     let covariance = system.factor.inverse(problem.calibration_offset());
-    Ok(Solution { problem, model, images, clock_offset, report, inertial_chi2_per_dof, system, covariance })
+    Ok(Solution {
+        problem,
+        model,
+        images,
+        clock_offset,
+        report,
+        inertial_chi2_per_dof,
+        closed: Closed::default(),
+        system,
+        covariance,
+    })
 }
 
 /// What was recorded.
@@ -248,9 +269,12 @@ impl Work {
     }
 }
 
-/// Adjustments with noise as the residuals show it. Where vision is weak, most of the inertial residuals go into the unknowns, and
-/// the first estimate of the noise goes part of the way only.
-const WEIGHINGS: usize = 3;
+/// Most adjustments with noise as the residuals show it. Where vision is weak, most of the inertial residuals go into the unknowns,
+/// and an estimate of the noise goes part of the way only.
+const WEIGHINGS: usize = 8;
+
+/// Relative change of the densities from which they are settled: standard deviations of the result follow them.
+const SETTLED_NOISE: f64 = 0.05;
 
 /// Standard deviations of a place that was given and is not believed any more.
 const WIDE_ROTATION_RAD: f64 = 0.1;

@@ -72,6 +72,13 @@ pub(super) fn reweighed(model: &ImuModel, found: &Components, data_sheet: &StepN
     ImuModel { noise, ..*model }
 }
 
+/// By how much the densities of two models differ, relatively.
+pub(super) fn largest_change(before: &ImuModel, after: &ImuModel) -> f64 {
+    let change = |a: f64, b: f64| (b / a - 1.0).abs();
+    change(before.noise.gyro_density, after.noise.gyro_density)
+        .max(change(before.noise.accel_density, after.noise.accel_density))
+}
+
 /// The covariance within the envelope at the present values; `None` where the solution is not determined.
 pub(super) fn covariance(problem: &Problem) -> Option<Envelope> {
     let mut system = System::new(problem);

@@ -13,6 +13,8 @@ pub enum AdjustmentStage {
     Outward,
     /// All states together.
     Together,
+    /// The same with what comes into view again.
+    Loops,
     /// All states together, with noise as the residuals show it.
     Weighted,
 }

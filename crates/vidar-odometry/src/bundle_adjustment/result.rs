@@ -60,6 +60,10 @@ pub struct AdjustmentReport {
     pub rejected: usize,
     /// Iterations of all rounds.
     pub iterations: usize,
+    /// Pairs of places, seen at different times, that were tied to each other, and landmarks seen again in them.
+    pub loops: usize,
+    /// See `loops`.
+    pub loop_matches: usize,
     /// Cost before and after.
     pub cost: (f64, f64),
     /// Mean squared residual of the inertial factors, whitened with the noise as given.
@@ -153,6 +157,8 @@ pub(super) fn collect(
             observations: report.observations,
             rejected: report.rejected,
             iterations: report.iterations,
+            loops: solution.closed.pairs,
+            loop_matches: solution.closed.matches,
             cost: (report.before.total(), report.after.total()),
             inertial_chi2_per_dof: solution.inertial_chi2_per_dof,
         },

@@ -34,14 +34,23 @@ impl Odometry {
         let is_seen = matches!(status, Status::Tracking(tracking) if tracking.health != Health::Degraded);
         let state = state.filter(|_| is_seen).map(|state| LoggedState { segment: self.segment, state });
         log.add_image(id, (frame.id, frame.time), state, shown);
+        if let Some(host) = self.last_host.as_ref().filter(|host| host.frame == id) {
+            log.add_place(frame.time, host);
+        }
         if let Phase::Tracking(window) = &self.phase {
             log.follow(&window.smoother);
         }
     }
 
-    /// Keeps tracks and IMU measurements from here on, for [`Odometry::adjust`]: about 2 MB per minute of recording.
+    /// Keeps tracks and IMU measurements from here on, for [`Odometry::adjust`]: about 2 MB per minute of recording, and at most
+    /// 32 MB of grey levels.
     pub fn keep_log(&mut self) {
         self.log = Some(TrackLog::new(1.0 / self.imu.nominal_period().as_secs_f64()));
+    }
+
+    /// Drops the grey levels that were kept: the adjustment then ties nothing that comes into view again.
+    pub fn forget_log_images(&mut self) {
+        self.log.iter_mut().for_each(TrackLog::forget_places);
     }
 
     /// One adjustment of all states that the log holds; see [`bundle_adjustment`].
