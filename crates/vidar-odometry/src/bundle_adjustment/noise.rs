@@ -5,6 +5,7 @@
 //! assumed variance is to be multiplied by.
 
 use super::envelope::Envelope;
+use super::inertial::GAIN_DIM;
 use super::linearise::{self, System, inertial_jacobians};
 use super::problem::{FRAME_DIM, Problem};
 use crate::imu::{ImuModel, StepNoise};
@@ -16,6 +17,9 @@ const MIN_REDUNDANCY: f64 = 20.0;
 /// A density is raised to this many times what it was taken for, at most: beyond it camera and IMU contradict each other, which
 /// the consistency check tells.
 const MAX_FACTOR: f64 = 3.0;
+
+/// Unknowns of an inertial factor: two states and the gains.
+const UNKNOWNS: usize = 2 * FRAME_DIM + GAIN_DIM;
 
 /// Squared residuals and redundancy of a group of measurements.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -41,13 +45,23 @@ pub(super) struct Components {
 /// The components at the solution whose covariance (within the envelope) is `covariance`.
 pub(super) fn components(problem: &Problem, covariance: &Envelope) -> Components {
     let mut found = Components::default();
+    // Where the gains are among the unknowns; held ones are not.
+    let first = problem.calibration.dim() - GAIN_DIM;
+    let gains: [Option<usize>; GAIN_DIM] = std::array::from_fn(|k| {
+        let at = problem.active.iter().position(|index| *index == first + k)?;
+        Some(problem.calibration_offset() + at)
+    });
     for k in 1..problem.frames.len() {
         let Some(at) = inertial_jacobians(problem, k) else { continue };
-        let mut j = SMatrix::<f64, 15, 30>::zeros();
+        let mut j = SMatrix::<f64, 15, UNKNOWNS>::zeros();
         j.fixed_view_mut::<15, 15>(0, 0).copy_from(&at.by_i);
         j.fixed_view_mut::<15, 15>(0, 15).copy_from(&at.by_j);
+        j.fixed_view_mut::<15, GAIN_DIM>(0, 30).copy_from(&at.by_gain);
         let from = FRAME_DIM * (k - 1);
-        let joint = SMatrix::<f64, 30, 30>::from_fn(|a, b| covariance.entry(from + a, from + b));
+        let unknown = |a: usize| if a < 30 { Some(from + a) } else { gains[a - 30] };
+        let joint = SMatrix::<f64, UNKNOWNS, UNKNOWNS>::from_fn(|a, b| {
+            unknown(a).zip(unknown(b)).map_or(0.0, |(a, b)| covariance.entry(a, b))
+        });
         let taken = (j * joint).component_mul(&j).column_sum();
         for row in 0..9 {
             let group = if row < 3 { &mut found.gyro } else { &mut found.accel };
