@@ -3,7 +3,7 @@
 //! ```text
 //! cargo run --release -p vidar-odometry --example evaluate -- [--mono] [--start S] [--secs S] [--verbose]
 //!     [--repeat N] [--stages] [--image-noise GRAY] [--imu-noise FACTOR] [--halve]
-//!     [--live] [--adjust] [--trajectory FILE] [--frames FILE] [--set KEY=VALUE]... SEQUENCE...
+//!     [--live] [--adjust] [--variant KEY=VALUE,...]... [--lever-error M] [--turn-error DEG] [--trajectory FILE] [--frames FILE] [--set KEY=VALUE]... SEQUENCE...
 //! ```
 //!
 //! A sequence is any folder with images, IMU measurements and ground truth that `vidar-dataset` reads. Figures: ATE after the best
@@ -17,18 +17,21 @@
 //! The camera's clock offset, readout and rotation are found in a first pass over the beginning; `--live` leaves it out,
 //! as for a stream, which cannot be read twice.
 //!
-//! `--adjust` evaluates the trajectory of the bundle adjustment after the recording's end in a second row.
+//! `--adjust` evaluates the trajectory of the bundle adjustment after the recording's end in a second row, with σ(ln s) and the
+//! processor seconds it took. `--variant KEY=VALUE,KEY=VALUE` adjusts once more with other limits of what may change (`CalibrationSigmas`;
+//! `loops=0` leaves loops out, for all that follow); `--lever-error M` and `--turn-error DEG` make the camera's place on the body wrong before the odometry sees it.
 //!
 //! `--image-noise`, `--imu-noise` corrupt what is read: noise of so many grey levels; so much more inertial noise that
 //! its whole is FACTOR times the data sheet's (the bias stays). `--halve` averages 2 × 2 pixels.
 
 #![allow(clippy::print_stdout, clippy::print_stderr)] // a program
 
+use nalgebra::Vector3;
 use std::path::{Path, PathBuf};
 use vidar_core::camera::RadTan;
 use vidar_core::{
-    BodyFrame, CameraModel, Duration, FrameImage, Health, Image, ImuNoise, NavState, SensorEvent,
-    StampedPose, Timestamp, Trajectory,
+    BodyFrame, CameraModel, Duration, FrameImage, Health, Image, ImuNoise, LieGroup, NavState, Se3,
+    SensorEvent, So3, StampedPose, Timestamp, Trajectory,
 };
 use vidar_dataset::{Dataset, OpenOptions};
 use vidar_eval::{TrajectoryEvalConfig, evaluate_trajectory};
@@ -55,6 +58,10 @@ struct Options {
     halve: bool,
     live: bool,
     adjust: bool,
+    /// What the adjustments after the first change.
+    variants: Vec<String>,
+    lever_error_m: f64,
+    turn_error_deg: f64,
 }
 
 fn options() -> Result<Options, Failure> {
@@ -79,6 +86,9 @@ fn options() -> Result<Options, Failure> {
                 let (key, number) = text.split_once('=').ok_or("--set needs KEY=VALUE")?;
                 found.settings.push((key.to_owned(), number.parse()?));
             }
+            "--variant" => found.variants.push(value()?),
+            "--lever-error" => found.lever_error_m = value()?.parse()?,
+            "--turn-error" => found.turn_error_deg = value()?.parse()?,
             "--frames" => found.frames = Some(value()?.into()),
             "--trajectory" => found.trajectory = Some(value()?.into()),
             other if other.starts_with("--") => return Err(format!("unknown flag {other}").into()),
@@ -117,7 +127,8 @@ struct Run {
     outputs: Vec<OdometryOutput>,
     times: Vec<StageTimes>,
     poses: Vec<StampedPose>,
-    adjusted: Option<Adjusted>,
+    /// The adjustments: what was changed, and the seconds each took.
+    adjusted: Vec<(String, Adjusted, f64)>,
 }
 
 fn evaluate(path: &Path, options: &Options) -> Result<(), Failure> {
@@ -156,19 +167,36 @@ fn evaluate(path: &Path, options: &Options) -> Result<(), Failure> {
     if let Some(file) = &options.trajectory {
         std::fs::write(file, tum(&live))?;
     }
-    if let Some(adjusted) = run.adjusted {
+    for (variant, adjusted, secs) in &run.adjusted {
         let offset = Duration::from_secs_f64(adjusted.calibration.time_offset_secs);
         let pose = |state: &NavState| StampedPose {
             time: state.time + offset,
             world_from_body: state.world_from_body,
         };
         row(
-            "  adjusted",
+            &format!("  adjusted {variant}"),
             adjusted.images.iter().map(|(_, state)| pose(state)).collect(),
             images,
             &[],
             truth,
         )?;
+        let place = dataset.rig.camera(dataset.camera).map(|c| c.body_from_camera).unwrap_or(Se3::IDENTITY);
+        let found = &adjusted.calibration.body_from_camera;
+        println!(
+            "  = σ(ln s) {:.4}, {:.1} s, chi2 {:.3}, place off by {:.4} m {:.3} deg, σ {:.4} m, noise {:.1e} {:.1e}, clock {:.2} ms, loops {} {}, {:?}",
+            adjusted.scale_std,
+            secs,
+            adjusted.report.inertial_chi2_per_dof,
+            (found.translation - place.translation).norm(),
+            (place.rotation.inverse() * found.rotation).angle_rad().to_degrees(),
+            adjusted.calibration.sigmas[5..8].iter().map(|s| s * s).sum::<f64>().sqrt(),
+            adjusted.imu.gyro_noise_density,
+            adjusted.imu.accel_noise_density,
+            1e3 * adjusted.calibration.time_offset_secs,
+            adjusted.report.loops,
+            adjusted.report.loop_matches,
+            adjusted.findings,
+        );
     }
     if options.stages {
         println!("{}", stages(&run.times));
@@ -311,6 +339,13 @@ fn run(dataset: &Dataset, options: &Options) -> Result<Run, Failure> {
             camera.model = halved_camera(&camera.model)?;
         }
     }
+    for camera in &mut rig.cameras {
+        let diagonal = Vector3::repeat(1.0).normalize();
+        let turn = So3::exp(&(diagonal * options.turn_error_deg.to_radians()));
+        let place = &camera.body_from_camera;
+        camera.body_from_camera =
+            Se3::new(place.rotation * turn, place.translation + diagonal * options.lever_error_m);
+    }
     let mut corruptor = Corruptor::new(options, rig.imu);
     let mut odometry = match options.live || options.mono {
         true => Odometry::new(&rig, dataset.camera, &config)?,
@@ -323,7 +358,7 @@ fn run(dataset: &Dataset, options: &Options) -> Result<Run, Failure> {
             Odometry::with_timing(&rig, dataset.camera, &config, &timing)?
         }
     };
-    let mut run = Run { outputs: Vec::new(), times: Vec::new(), poses: Vec::new(), adjusted: None };
+    let mut run = Run { outputs: Vec::new(), times: Vec::new(), poses: Vec::new(), adjusted: Vec::new() };
     if options.adjust {
         odometry.keep_log();
     }
@@ -342,23 +377,47 @@ fn run(dataset: &Dataset, options: &Options) -> Result<Run, Failure> {
         keep(&mut run, output, options.mono);
     }
     if options.adjust {
-        let clock = std::time::Instant::now();
-        let adjusted = odometry.adjust(&CalibrationSigmas::default())?;
-        if options.verbose {
-            println!(
-                "  {:.1} s, σ(ln s) {:.4}, {:?}",
-                clock.elapsed().as_secs_f64(),
-                adjusted.scale_std,
-                adjusted.report
-            );
-            println!("  {:?}", adjusted.calibration);
+        for variant in std::iter::once("").chain(options.variants.iter().map(String::as_str)) {
+            let sigmas = sigmas(variant, &mut odometry)?;
+            let begun = processor_secs();
+            let adjusted = odometry.adjust(&sigmas)?;
+            let secs = processor_secs() - begun;
+            if options.verbose {
+                println!("  {:?}\n  {:?}\n  {:?}", adjusted.report, adjusted.calibration, adjusted.imu);
+            }
+            run.adjusted.push((variant.to_owned(), adjusted, secs));
         }
-        run.adjusted = Some(adjusted);
     }
     // Ground truth is in the IMU's clock.
     let offset = Duration::from_secs_f64(odometry.timing().time_offset_secs);
     run.poses.iter_mut().for_each(|p| p.time = p.time + offset);
     Ok(run)
+}
+
+/// What the adjustment may change.
+fn sigmas(variant: &str, odometry: &mut Odometry) -> Result<CalibrationSigmas, Failure> {
+    let mut sigmas = CalibrationSigmas::default();
+    for one in variant.split(',').filter(|one| !one.is_empty()) {
+        let (key, number) = one.split_once('=').ok_or("--variant needs KEY=VALUE")?;
+        let value = match key {
+            "loops" => {
+                odometry.forget_log_images();
+                continue;
+            }
+            "time_offset_secs" => &mut sigmas.time_offset_secs,
+            "readout_secs" => &mut sigmas.readout_secs,
+            "rotation_rad" => &mut sigmas.rotation_rad,
+            "position_m" => &mut sigmas.position_m,
+            "focal" => &mut sigmas.focal,
+            "principal_point_px" => &mut sigmas.principal_point_px,
+            "distortion" => &mut sigmas.distortion,
+            "gyro_gain" => &mut sigmas.gyro_gain,
+            "accel_gain" => &mut sigmas.accel_gain,
+            other => return Err(format!("unknown key {other} of a variant").into()),
+        };
+        *value = number.parse()?;
+    }
+    Ok(sigmas)
 }
 
 /// Changes one number of the configuration.
@@ -431,6 +490,13 @@ fn tum(trajectory: &Trajectory) -> String {
         let _ = writeln!(text, "{} {} {} {} {} {} {} {}", pose.time, t.x, t.y, t.z, q[0], q[1], q[2], q[3]);
     }
     text
+}
+
+/// Processor time of this process' first thread so far, s; NaN where the system does not tell.
+fn processor_secs() -> f64 {
+    let told = std::fs::read_to_string("/proc/thread-self/schedstat").unwrap_or_default();
+    let nanos = told.split_whitespace().next().and_then(|n| n.parse::<f64>().ok());
+    nanos.map_or(f64::NAN, |n| 1e-9 * n)
 }
 
 /// Peak resident memory of this process; NaN where the system does not tell.

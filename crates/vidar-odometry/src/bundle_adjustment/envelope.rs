@@ -90,14 +90,88 @@ impl Envelope {
         }
     }
 
-    /// As [`Envelope::forward`] for `b` that is zero before `from`, worked out up to `until` and for the rows from `border` on.
-    pub(super) fn forward_within(&self, b: &mut [f64], from: usize, until: usize, border: usize) {
-        for i in (from..until.min(border)).chain(border..self.dim()) {
-            let row = self.row(i);
-            let (left, diagonal) = row.split_at(row.len() - 1);
-            let first = self.first[i].max(from);
-            b[i] = (b[i] - dot(&left[first - self.first[i]..], &b[first..i])) / diagonal[0];
+    /// The entries of the inverse within the envelope, for a factor (Takahashi, Fagan, Chin 1973): no others are needed to find
+    /// them. `border` is the number of the first of the last rows that begin at column 0.
+    pub(super) fn inverse(&self, border: usize) -> Self {
+        let n = self.dim();
+        let mut z = Self {
+            first: self.first.clone(),
+            begin: self.begin.clone(),
+            values: vec![0.0; self.values.len()],
+        };
+        // Last row of the band that is tied to each column.
+        let mut last: Vec<usize> = (0..n).collect();
+        for row in 0..border {
+            for column in self.first[row]..row {
+                last[column] = row;
+            }
         }
+        let (mut band, mut found) = (Vec::new(), Vec::new());
+        let mut edge = vec![0.0; n - border];
+        let mut edge_found = edge.clone();
+        for j in (0..n).rev() {
+            let end = if j < border { last[j] + 1 } else { j + 1 };
+            let from = border.max(j + 1);
+            band.clear();
+            band.extend((j + 1..end).map(|k| if self.first[k] <= j { self.at(k, j) } else { 0.0 }));
+            found.clear();
+            found.resize(band.len(), 0.0);
+            for k in from..n {
+                edge[k - border] = self.at(k, j);
+                edge_found[k - border] = 0.0;
+            }
+            for (at, k) in (j + 1..end).enumerate().filter(|(_, k)| self.first[*k] <= j) {
+                let row = z.range(k, j + 1, k + 1);
+                found[at] += dot(row, &band[..=at]);
+                for (sum, value) in found[..at].iter_mut().zip(row) {
+                    *sum += value * band[at];
+                }
+            }
+            for k in from..n {
+                let row = z.range(k, j + 1, j + 1 + band.len());
+                let value = edge[k - border];
+                edge_found[k - border] += dot(row, &band);
+                for (sum, entry) in found.iter_mut().zip(row) {
+                    *sum += entry * value;
+                }
+                let row = z.range(k, from, k + 1);
+                edge_found[k - border] += dot(row, &edge[from - border..=k - border]);
+                for (sum, entry) in edge_found[from - border..k - border].iter_mut().zip(row) {
+                    *sum += entry * value;
+                }
+            }
+            let diagonal = self.diagonal(j);
+            let mut own = 1.0 / (diagonal * diagonal);
+            for (at, k) in (j + 1..end).enumerate().filter(|(_, k)| self.first[*k] <= j) {
+                let value = -found[at] / diagonal;
+                z.set(k, j, value);
+                own -= band[at] * value / diagonal;
+            }
+            for k in from..n {
+                let value = -edge_found[k - border] / diagonal;
+                z.set(k, j, value);
+                own -= edge[k - border] * value / diagonal;
+            }
+            z.set(j, j, own);
+        }
+        z
+    }
+
+    /// Entry of a symmetric matrix that the envelope holds.
+    pub(super) fn entry(&self, a: usize, b: usize) -> f64 {
+        self.at(a.max(b), a.min(b))
+    }
+
+    fn at(&self, row: usize, column: usize) -> f64 {
+        self.values[self.begin[row] + column - self.first[row]]
+    }
+
+    fn range(&self, row: usize, from: usize, until: usize) -> &[f64] {
+        &self.values[self.begin[row] + from - self.first[row]..self.begin[row] + until - self.first[row]]
+    }
+
+    fn set(&mut self, row: usize, column: usize, value: f64) {
+        self.values[self.begin[row] + column - self.first[row]] = value;
     }
 
     /// `L⁻ᵀ b` in place, for a factor.
@@ -155,16 +229,19 @@ mod tests {
     }
 
     #[test]
-    fn a_part_of_the_forward_substitution_is_that_of_the_whole() {
-        let (envelope, _) = example(&[0, 0, 1, 1, 3, 4, 2, 0]);
+    fn the_inverse_within_the_envelope_is_that_of_the_dense_matrix() {
+        // The last two rows are the border; row 5 is tied to less than row 4 is.
+        let (envelope, dense) = example(&[0, 0, 1, 1, 2, 4, 4, 0, 0]);
         let mut factor = envelope.clone();
-        assert!(envelope.factorise(&[0.0; 8], &mut factor));
-        let mut whole = vec![0.0; 8];
-        whole[3] = 1.0;
-        let mut part = whole.clone();
-        factor.forward(&mut whole);
-        factor.forward_within(&mut part, 3, 7, 7);
-        assert_eq!(whole, part);
+        assert!(envelope.factorise(&[0.0; 9], &mut factor));
+        let inverse = factor.inverse(7);
+        let expected = dense.try_inverse().unwrap();
+        for i in 0..9 {
+            for j in envelope.first[i]..=i {
+                let (found, wanted) = (inverse.entry(j, i), expected[(i, j)]);
+                assert!((found - wanted).abs() < 1e-12, "({i}, {j}): {found} instead of {wanted}");
+            }
+        }
     }
 
     #[test]

@@ -6,7 +6,8 @@
 
 use super::initial::{self, Guess, MIN_OBSERVATIONS};
 use super::problem::CalibrationPrior;
-use super::{Recording, Work, optimise};
+use super::progress::Watch;
+use super::{AdjustmentError, Recording, Work, optimise};
 use crate::imu::NavState;
 use vidar_core::{Duration, Timestamp};
 
@@ -29,12 +30,16 @@ const MIN_SEEN: usize = 8;
 const MIN_SEGMENT_SECS: f64 = 3.0;
 
 /// The states of `work`, and those of all images that can be reached from them.
-pub(super) fn outward(recording: &Recording<'_>, work: &Work) -> Guess {
+pub(super) fn outward(
+    recording: &Recording<'_>,
+    work: &Work,
+    watch: &mut Watch<'_>,
+) -> Result<Guess, AdjustmentError> {
     let mut grown = Grown { recording, work, guess: work.guess.clone(), blind_secs: 0.0 };
-    while grown.forward().is_some() {}
+    while grown.forward(watch)? {}
     grown.blind_secs = 0.0;
-    while grown.backward().is_some() {}
-    grown.guess
+    while grown.backward(watch)? {}
+    Ok(grown.guess)
 }
 
 struct Grown<'a> {
@@ -50,13 +55,16 @@ impl Grown<'_> {
         self.recording.log.images[image].stamp + self.work.clock_offset
     }
 
-    /// A second more at the end; `None` where nothing more can be reached.
-    fn forward(&mut self) -> Option<()> {
+    /// A second more at the end; whether anything more could be reached.
+    fn forward(&mut self, watch: &mut Watch<'_>) -> Result<bool, AdjustmentError> {
         let Recording { log, imu, model } = *self.recording;
-        let (known, end) = (self.guess.images.len(), *self.guess.times.last()?);
-        let first = *self.guess.images.last()? + 1;
+        let known = self.guess.images.len();
+        let (Some(last), Some(&end)) = (self.guess.images.last(), self.guess.times.last()) else {
+            return Ok(false);
+        };
+        let first = last + 1;
         for image in first..log.images.len() {
-            let (time, newest) = (self.time(image), *self.guess.times.last()?);
+            let (time, newest) = (self.time(image), self.guess.times.last().copied().unwrap_or(end));
             if (time - newest).as_secs_f64() > MAX_GAP_SECS || (time - end).as_secs_f64() > STEP_SECS {
                 break;
             }
@@ -70,21 +78,24 @@ impl Grown<'_> {
         }
         let added = self.guess.images.len() - known;
         if added == 0 {
-            return None;
+            return Ok(false);
         }
         let support = (0..known).rev().find(|k| (end - self.guess.times[*k]).as_secs_f64() > SUPPORT_SECS);
         let from = support.unwrap_or(0);
         let until = self.until(known, STEP_SECS);
-        let seen = self.settle(from, until, from, known..until);
-        self.judge(seen, (self.guess.times[until - 1] - end).as_secs_f64())
+        let seen = self.settle(from, until, from, known..until, watch)?;
+        Ok(self.judge(seen, (self.guess.times[until - 1] - end).as_secs_f64()))
     }
 
     /// A second more at the beginning.
-    fn backward(&mut self) -> Option<()> {
+    fn backward(&mut self, watch: &mut Watch<'_>) -> Result<bool, AdjustmentError> {
         let Recording { imu, model, .. } = *self.recording;
-        let (known, begin) = (self.guess.images.len(), *self.guess.times.first()?);
-        for image in (0..*self.guess.images.first()?).rev() {
-            let (time, oldest) = (self.time(image), *self.guess.times.first()?);
+        let known = self.guess.images.len();
+        let (Some(&first), Some(&begin)) = (self.guess.images.first(), self.guess.times.first()) else {
+            return Ok(false);
+        };
+        for image in (0..first).rev() {
+            let (time, oldest) = (self.time(image), self.guess.times[0]);
             if (oldest - time).as_secs_f64() > MAX_GAP_SECS || (begin - time).as_secs_f64() > STEP_SECS {
                 break;
             }
@@ -93,11 +104,11 @@ impl Grown<'_> {
         }
         let added = self.guess.images.len() - known;
         if added == 0 {
-            return None;
+            return Ok(false);
         }
         let until = self.until(added, SUPPORT_SECS).min(known + added);
-        let seen = self.settle(0, until, until - 1, 0..added);
-        self.judge(seen, (begin - self.guess.times[0]).as_secs_f64())
+        let seen = self.settle(0, until, until - 1, 0..added, watch)?;
+        Ok(self.judge(seen, (begin - self.guess.times[0]).as_secs_f64()))
     }
 
     /// State of the first image of a segment that is long enough to be taken over.
@@ -120,7 +131,15 @@ impl Grown<'_> {
 
     /// Corrects the states `from..until` by their tracks, with the calibration as it is; the share of the images `new` that show
     /// enough.
-    fn settle(&mut self, from: usize, until: usize, held: usize, new: std::ops::Range<usize>) -> f64 {
+    fn settle(
+        &mut self,
+        from: usize,
+        until: usize,
+        held: usize,
+        new: std::ops::Range<usize>,
+        watch: &mut Watch<'_>,
+    ) -> Result<f64, AdjustmentError> {
+        watch.progress.states = self.guess.images.len();
         let part = Guess {
             images: self.guess.images[from..until].to_vec(),
             times: self.guess.times[from..until].to_vec(),
@@ -129,9 +148,9 @@ impl Grown<'_> {
         let calibration = &self.work.calibration;
         let prior = CalibrationPrior { sigmas: vec![0.0; calibration.dim()], mean: calibration.clone() };
         let Ok(mut problem) = initial::build(self.recording, calibration, prior, &part, held - from) else {
-            return 0.0;
+            return Ok(0.0);
         };
-        optimise::settle(&mut problem);
+        optimise::settle(&mut problem, watch)?;
         let mut seen = vec![0_usize; until - from];
         for observation in problem.landmarks.iter().flat_map(|l| &l.observations) {
             seen[observation.frame] += 1;
@@ -140,12 +159,12 @@ impl Grown<'_> {
             *state = frame.body.state;
         }
         let enough = new.clone().filter(|k| seen[*k - from] >= MIN_SEEN).count();
-        enough as f64 / new.len().max(MIN_OBSERVATIONS) as f64
+        Ok(enough as f64 / new.len().max(MIN_OBSERVATIONS) as f64)
     }
 
     /// Goes on unless too long a stretch showed too little.
-    fn judge(&mut self, seen_share: f64, secs: f64) -> Option<()> {
+    fn judge(&mut self, seen_share: f64, secs: f64) -> bool {
         self.blind_secs = if seen_share >= 0.3 { 0.0 } else { self.blind_secs + secs };
-        (self.blind_secs <= MAX_BLIND_SECS).then_some(())
+        self.blind_secs <= MAX_BLIND_SECS
     }
 }

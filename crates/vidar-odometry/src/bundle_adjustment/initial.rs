@@ -1,5 +1,6 @@
 //! First guess of all states and landmarks from the odometry's log.
 
+use super::inertial::InertialFactor;
 use super::log::{TrackKey, TrackLog};
 use super::observation::{self, Calibration, Landmark, MIN_INVERSE_DISTANCE};
 use super::problem::CalibrationPrior;
@@ -20,7 +21,7 @@ const TYPICAL_INVERSE_DISTANCE: f64 = 0.3;
 
 /// Tracks that are longer become several landmarks, so that the reduced system stays a band also where a body at rest sees the
 /// same things for minutes: 10 s at five images per second.
-const MAX_OBSERVATIONS: usize = 50;
+pub(super) const MAX_OBSERVATIONS: usize = 50;
 
 /// Fewest images that see a landmark.
 pub(super) const MIN_OBSERVATIONS: usize = 3;
@@ -36,15 +37,19 @@ pub(super) struct Guess {
 }
 
 impl Guess {
-    /// The solution's states at the instants that its correction of the clock gives the images.
-    pub(super) fn at_corrected_clock(&self, solution: &Problem) -> Self {
+    /// The solution's states at the instants that its correction of the clock gives the images. Those that the IMU no longer
+    /// covers, at either end, are left out.
+    pub(super) fn at_corrected_clock(&self, solution: &Problem, imu: &ImuBuffer) -> Self {
         let secs = solution.calibration.clock_secs;
         let correction = Duration::from_secs_f64(secs);
-        Self {
-            images: self.images.clone(),
-            times: self.times.iter().map(|t| *t + correction).collect(),
-            states: solution.frames.iter().map(|f| f.body.state_after(secs)).collect(),
+        let mut corrected = Self::default();
+        for (k, frame) in solution.frames.iter().enumerate() {
+            let time = self.times[k] + correction;
+            if imu.at(time).is_some() {
+                corrected.push(self.images[k], time, frame.body.state_after(secs));
+            }
         }
+        corrected
     }
 }
 
@@ -57,7 +62,8 @@ pub(super) fn build(
     held: usize,
 ) -> Result<Problem, AdjustmentError> {
     let Recording { log, imu, model } = *recording;
-    let at = |(time, state): (&Timestamp, &NavState)| FrameState::new(*time, *state, imu, model);
+    let gain = &calibration.gain;
+    let at = |(time, state): (&Timestamp, &NavState)| FrameState::new(*time, *state, imu, model, gain);
     let frames: Option<Vec<FrameState>> = guess.times.iter().zip(&guess.states).map(at).collect();
     let mut frames = frames
         .filter(|f| f.len() >= MIN_OBSERVATIONS)
@@ -66,7 +72,8 @@ pub(super) fn build(
     for k in 1..frames.len() {
         let (from, until) = (frames[k - 1].time, frames[k].time);
         let state = frames[k - 1].body.state;
-        frames[k].preintegration = preintegrate(imu, model, &state, from, until, &mut interval);
+        let is_covered = imu.interval(from, until, &mut interval).is_ok();
+        frames[k].inertial = is_covered.then(|| InertialFactor::new(model, &state.bias, gain, &interval));
     }
     let landmarks = triangulate(log, &guess.images, &frames, calibration);
     let gauge = (held, frames[held].body.state);

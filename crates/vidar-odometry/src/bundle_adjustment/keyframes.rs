@@ -10,10 +10,6 @@ use vidar_core::{
     Health, KeyframeId, LandmarkId, LieGroup, OdometryKeyframe, PoseCovariance, SparseLandmark,
 };
 
-/// States after a keyframe whose share in its covariance is worked out: 20 s at five per second. What comes later says next to
-/// nothing of the motion between two neighbours.
-const HORIZON: usize = 100;
-
 /// σ(ln s) above which a keyframe's health says that the scale is not settled.
 const SETTLED_SCALE_STD: f64 = 0.02;
 
@@ -75,21 +71,10 @@ fn seen_landmarks(solution: &Solution) -> Vec<Vec<SparseLandmark>> {
 
 /// Covariance of `a_from_b · exp(δ)` between the bodies of two neighbouring states.
 fn relative_covariance(solution: &Solution, a: usize, b: usize) -> Matrix6<f64> {
-    let Solution { problem, system, .. } = solution;
-    let (from, border) = (FRAME_DIM * a, problem.calibration_offset());
-    let until = (FRAME_DIM * (b + HORIZON)).min(border);
-    let mut columns = Vec::with_capacity(12);
-    for k in 0..12 {
-        let mut unit = vec![0.0; problem.dim()];
-        unit[FRAME_DIM * if k < 6 { a } else { b } + k % 6] = 1.0;
-        system.factor.forward_within(&mut unit, from, until, border);
-        columns.push(unit);
-    }
-    let joint = SMatrix::<f64, 12, 12>::from_fn(|row, column| {
-        let (x, y) = (&columns[row], &columns[column]);
-        crate::backend::dot(&x[from..until], &y[from..until])
-            + crate::backend::dot(&x[border..], &y[border..])
-    });
+    let Solution { problem, covariance, .. } = solution;
+    let unknown = |k: usize| FRAME_DIM * if k < 6 { a } else { b } + k % 6;
+    let joint =
+        SMatrix::<f64, 12, 12>::from_fn(|row, column| covariance.entry(unknown(row), unknown(column)));
     let pose = |k: usize| problem.frames[k].body.state.world_from_body;
     let j = d_relative_d_poses(&pose(a), &pose(b));
     j * joint * j.transpose()

@@ -1,11 +1,10 @@
 //! Cost and normal equations: inertial factors, reprojections with the landmarks eliminated, priors.
 
 use super::envelope::Envelope;
+use super::inertial::{GAIN_DIM, InertialJacobians};
 use super::observation::{self, Linearised, STATE_DIM};
 use super::problem::{FRAME_DIM, ObservedLandmark, Problem};
-use crate::backend::{
-    GaugePriorSigmas, Shift, Whitening, gauge_prior_at, inertial_jacobians, inertial_residual,
-};
+use crate::backend::{GaugePriorSigmas, gauge_prior_at};
 use crate::imu::{Matrix15, Vector15};
 use nalgebra::{Matrix3, SMatrix, Vector2, Vector3};
 use vidar_solve::Kernel;
@@ -91,9 +90,16 @@ pub(super) fn cost(problem: &Problem) -> Cost {
 
 /// Whitened inertial residual between a state and the one before.
 pub(super) fn inertial_error(problem: &Problem, k: usize) -> Option<Vector15> {
-    let preintegration = problem.frames[k].preintegration.as_ref()?;
+    let factor = problem.frames[k].inertial.as_ref()?;
     let (i, j) = (&problem.frames[k - 1].body.state, &problem.frames[k].body.state);
-    Some(Whitening::of(preintegration).apply(&inertial_residual(preintegration, i, j, Shift::default())))
+    Some(factor.error(i, j, &problem.calibration.gain))
+}
+
+/// The same with its derivatives.
+pub(super) fn inertial_jacobians(problem: &Problem, k: usize) -> Option<InertialJacobians> {
+    let factor = problem.frames[k].inertial.as_ref()?;
+    let (i, j) = (&problem.frames[k - 1].body.state, &problem.frames[k].body.state);
+    Some(factor.linearise(i, j, &problem.calibration.gain))
 }
 
 /// Fills the reduced system at the present values. `damping` is added, relatively, to the landmarks' diagonal.
@@ -134,12 +140,9 @@ fn add_priors(problem: &Problem, system: &mut System) {
 }
 
 fn add_inertial(problem: &Problem, k: usize, system: &mut System) {
-    let Some(preintegration) = problem.frames[k].preintegration.as_ref() else { return };
-    let (i, j) = (&problem.frames[k - 1].body.state, &problem.frames[k].body.state);
-    let whitening = Whitening::of(preintegration);
-    let residual = whitening.apply(&inertial_residual(preintegration, i, j, Shift::default()));
-    let (by_i, by_j) = inertial_jacobians(preintegration, i, j, Shift::default());
-    let (by_i, by_j) = (whitening.apply(&by_i), whitening.apply(&by_j));
+    let Some(InertialJacobians { residual, by_i, by_j, by_gain }) = inertial_jacobians(problem, k) else {
+        return;
+    };
     let (at_i, at_j) = (FRAME_DIM * (k - 1), FRAME_DIM * k);
     add_block(system, at_i, at_i, &(by_i.transpose() * by_i));
     add_block(system, at_j, at_j, &(by_j.transpose() * by_j));
@@ -151,6 +154,21 @@ fn add_inertial(problem: &Problem, k: usize, system: &mut System) {
     }
     add_gradient(system, at_i, &(by_i.transpose() * residual));
     add_gradient(system, at_j, &(by_j.transpose() * residual));
+    let (camera, gains) = (problem.active_camera(), problem.calibration.dim() - GAIN_DIM);
+    for (row, index) in problem.active.iter().enumerate().skip(camera) {
+        let by_one = by_gain.column(index - gains);
+        let at = problem.calibration_offset() + row;
+        system.gradient[at] += by_one.dot(&residual);
+        let (with_i, with_j) = (by_i.transpose() * by_one, by_j.transpose() * by_one);
+        for column in 0..FRAME_DIM {
+            system.h.add(at, at_i + column, with_i[column]);
+            system.h.add(at, at_j + column, with_j[column]);
+        }
+        for (other, other_index) in problem.active.iter().enumerate().take(row + 1).skip(camera) {
+            let product = by_one.dot(&by_gain.column(other_index - gains));
+            system.h.add(at, problem.calibration_offset() + other, product);
+        }
+    }
 }
 
 /// Adds a symmetric block of the diagonal.
@@ -176,7 +194,7 @@ fn add_landmark(
     block: &mut LandmarkBlock,
     system: &mut System,
 ) {
-    let calibrations = problem.active.len();
+    let calibrations = problem.active_camera();
     let offset = problem.calibration_offset();
     block.by_state.clear();
     block.by_calibration.clear();
@@ -207,7 +225,7 @@ fn add_landmark(
                 system.h.add(from + row, from + column, square[(row, column)]);
             }
         }
-        for (k, index) in problem.active.iter().enumerate() {
+        for (k, index) in problem.active[..calibrations].iter().enumerate() {
             let by_one = whitening * by_calibration[*index];
             block.by_calibration[k] += by_landmark.transpose() * by_one;
             system.gradient[offset + k] += by_one.dot(&residual);

@@ -2,12 +2,23 @@
 
 use crate::backend::Smoother;
 use crate::imu::NavState;
+use crate::tracking::HostImage;
 use nalgebra::{Matrix2, Vector2};
+use std::rc::Rc;
 use vidar_core::{Duration, FrameId, ImuSample, LandmarkId, Timestamp, camera::Pixel};
 
 /// Images are logged this far apart, and keyframes in any case: preintegration over it is good to a tenth of a millimetre,
 /// and a hand turns by less than 20° in it.
 const LOG_PERIOD: Duration = Duration::from_millis(200);
+
+/// Images whose grey levels are kept are this far apart at first, and twice as far each time that their memory is full.
+const FIRST_PLACE_PERIOD: Duration = Duration::from_millis(1000);
+
+/// Memory of the grey levels that are kept, bytes: 80 images of 640 × 480 with their pyramids.
+const MAX_PLACE_BYTES: usize = 32 << 20;
+
+/// Stamps of images that are logged at a period vary by this.
+const STAMP_JITTER: Duration = Duration::from_millis(50);
 
 /// Logged images whose states are brought up to date with the window: more than any window holds.
 const NEWEST_IMAGES: usize = 48;
@@ -86,11 +97,44 @@ pub struct TrackLog {
     /// The IMU's rate, Hz.
     pub(crate) imu_rate_hz: f64,
     generation: u32,
+    /// Images with their grey levels, to find what comes into view again.
+    places: Vec<(Timestamp, Rc<HostImage>)>,
+    place_period: Duration,
 }
 
 impl TrackLog {
     pub(crate) fn new(imu_rate_hz: f64) -> Self {
-        Self { imu_rate_hz, ..Self::default() }
+        Self { imu_rate_hz, place_period: FIRST_PLACE_PERIOD, ..Self::default() }
+    }
+
+    /// Keeps the grey levels of an image taken at `stamp`, where they are due. It must be logged, too.
+    pub(crate) fn add_place(&mut self, stamp: Timestamp, image: &Rc<HostImage>) {
+        if self.places.last().is_some_and(|(last, _)| stamp - *last < self.place_period) {
+            return;
+        }
+        // Coarser levels add a third.
+        let bytes = |image: &HostImage| image.pyramid.width() * image.pyramid.height() * 4 / 3;
+        self.places.push((stamp, image.clone()));
+        if self.places.len() * bytes(image) > MAX_PLACE_BYTES {
+            let mut number = 0_usize;
+            self.places.retain(|_| {
+                number += 1;
+                number % 2 == 1
+            });
+            self.place_period = self.place_period + self.place_period;
+        }
+    }
+
+    /// Drops all grey levels.
+    pub(crate) fn forget_places(&mut self) {
+        self.places.clear();
+    }
+
+    /// Grey levels of a logged image, where they were kept.
+    pub(crate) fn place_of(&self, image: usize) -> Option<&HostImage> {
+        let stamp = self.images[image].stamp;
+        let at = self.places.binary_search_by_key(&stamp, |(stamp, _)| *stamp).ok()?;
+        Some(&self.places[at].1)
     }
 
     /// The tracker starts anew.
@@ -127,6 +171,18 @@ impl TrackLog {
             })
             .collect();
         self.images.push(LoggedImage { frame, caller_frame, stamp, observations, state });
+    }
+
+    /// The log with images at least `period` apart.
+    pub(crate) fn every(&self, period: Duration) -> Self {
+        let mut images: Vec<LoggedImage> = Vec::new();
+        for image in &self.images {
+            let is_due = |last: &LoggedImage| image.stamp - last.stamp >= period - STAMP_JITTER;
+            if images.last().is_none_or(is_due) {
+                images.push(image.clone());
+            }
+        }
+        Self { images, ..self.clone() }
     }
 
     /// Brings the states of images that the window still holds up to date.

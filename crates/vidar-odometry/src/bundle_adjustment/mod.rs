@@ -10,27 +10,42 @@
 //! → all together → covariance → a state for every image.
 
 mod envelope;
+mod findings;
 mod grow;
+mod inertial;
 mod initial;
 mod keyframes;
 mod linearise;
 mod log;
+mod loops;
+mod noise;
 mod observation;
 mod optimise;
 mod problem;
+mod progress;
 mod result;
+mod sigmas;
+mod thin;
 
+pub use findings::AdjustmentFinding;
 pub(crate) use log::LoggedState;
 pub use log::TrackLog;
-pub use result::{Adjusted, AdjustedCalibration, AdjustmentReport};
+pub use progress::{AdjustmentStage, Progress};
+pub use result::{Adjusted, AdjustedCalibration, AdjustedImu, AdjustmentReport};
+pub use sigmas::CalibrationSigmas;
 
-use crate::imu::{ImuBuffer, ImuModel};
+use crate::imu::{ImuBuffer, ImuModel, StepNoise};
+use envelope::Envelope;
+use inertial::ImuGain;
 use initial::Guess;
 use linearise::System;
-use observation::{Calibration, TIMING_AND_PLACE};
+use loops::Closed;
+use observation::{Calibration, POSITION, ROTATION};
 use optimise::OptimiseReport;
 use problem::{CalibrationPrior, Problem};
-use vidar_core::{Duration, RigCamera};
+use progress::Watch;
+use std::ops::ControlFlow;
+use vidar_core::{Duration, RigCamera, Se3};
 
 /// Adjustments of all states at most: another one follows where the clock was corrected.
 const PASSES: usize = 3;
@@ -46,7 +61,15 @@ struct Solution {
     /// What the states' instants are their images' stamps plus.
     clock_offset: Duration,
     report: OptimiseReport,
+    /// Mean squared inertial residual, whitened with the noise as given.
+    inertial_chi2_per_dof: f64,
+    /// Places that were tied.
+    closed: Closed,
+    /// The IMU's model with noise as the residuals show it.
+    model: ImuModel,
     system: System,
+    /// Covariance within the system's envelope.
+    covariance: Envelope,
 }
 
 /// Why a recording cannot be adjusted.
@@ -65,117 +88,120 @@ pub enum AdjustmentError {
         /// How many.
         landmarks: usize,
     },
-    /// More states than one adjustment takes.
-    #[error("{images} logged images are more than one adjustment takes ({limit})")]
-    TooLong {
-        /// How many.
-        images: usize,
-        /// Most.
-        limit: usize,
-    },
     /// The solution is not determined.
     #[error("the adjustment's solution is not determined by the measurements")]
     Undetermined,
+    /// The caller broke it off.
+    #[error("the adjustment was cancelled")]
+    Cancelled,
 }
 
-/// What may change of the camera: standard deviations of the given values, zero where they are held.
-#[derive(Clone, Debug, PartialEq)]
-pub struct CalibrationSigmas {
-    /// Clock offset, s.
-    pub time_offset_secs: f64,
-    /// Readout, s.
+/// What was recorded, and what is known of the sensors.
+#[derive(Clone, Copy, Debug)]
+pub struct AdjustmentInput<'a> {
+    /// Tracks, IMU measurements and states.
+    pub log: &'a TrackLog,
+    /// The calibration that the odometry used last.
+    pub camera: &'a RigCamera,
+    /// The readout that the odometry used last, s.
     pub readout_secs: f64,
-    /// Rotation of the camera on the body, rad per axis.
-    pub rotation_rad: f64,
-    /// Position of the camera on the body, m per axis.
-    pub position_m: f64,
-    /// Focal lengths, relative.
-    pub focal: f64,
-    /// Principal point, px.
-    pub principal_point_px: f64,
-    /// Distortion parameters, in their own units.
-    pub distortion: f64,
+    /// Place of the camera on the body as it was given, which the result is compared with.
+    pub given_body_from_camera: Se3,
+    /// The IMU's model to begin with.
+    pub model: ImuModel,
+    /// Densities below which the noise is not taken for less.
+    pub data_sheet: StepNoise,
+    /// What may change.
+    pub sigmas: &'a CalibrationSigmas,
 }
 
-impl Default for CalibrationSigmas {
-    /// A calibrated camera whose clock and readout are not known: what alignment with the gyroscope leaves open of them after
-    /// a few seconds (rendered phones: 7 ms and 24 ms at worst), and half a degree of its rotation.
-    fn default() -> Self {
-        Self {
-            time_offset_secs: 1e-2,
-            readout_secs: 2e-2,
-            rotation_rad: 5e-3,
-            position_m: 0.0,
-            focal: 0.0,
-            principal_point_px: 0.0,
-            distortion: 0.0,
-        }
-    }
-}
-
-impl CalibrationSigmas {
-    fn of(&self, calibration: &Calibration) -> Vec<f64> {
-        let mut sigmas = vec![self.time_offset_secs, self.readout_secs];
-        sigmas.extend([self.rotation_rad; 3]);
-        sigmas.extend([self.position_m; 3]);
-        let parameters = calibration.camera.parameters();
-        for (index, value) in parameters.iter().enumerate() {
-            sigmas.push(match index {
-                0 | 1 => self.focal * value,
-                2 | 3 => self.principal_point_px,
-                _ => self.distortion,
-            });
-        }
-        debug_assert_eq!(sigmas.len(), TIMING_AND_PLACE + parameters.len());
-        sigmas
-    }
-}
-
-/// Adjusts all states of `log`. `camera` and `readout_secs` are the calibration that the odometry used last.
+/// Adjusts all states of a log. `tell` is asked before every iteration whether to go on.
 ///
 /// # Errors
-/// Too little was logged, or it determines no solution.
+/// Too little was logged, it determines no solution, or `tell` broke it off.
 pub fn adjust(
-    log: &TrackLog,
-    camera: &RigCamera,
-    readout_secs: f64,
-    model: &ImuModel,
-    sigmas: &CalibrationSigmas,
+    input: &AdjustmentInput<'_>,
+    tell: &mut dyn FnMut(Progress) -> ControlFlow<()>,
 ) -> Result<Adjusted, AdjustmentError> {
-    if log.images.len() > MAX_IMAGES {
-        return Err(AdjustmentError::TooLong { images: log.images.len(), limit: MAX_IMAGES });
-    }
+    let thinned = thin::bounded(input.log);
+    let log: &TrackLog = &thinned;
+    let mut watch = Watch::new(log.images.len(), tell);
     let mut imu = ImuBuffer::new(log.imu_rate_hz);
     for sample in &log.imu {
         // What is out of order was left out by the odometry, too.
         let _ = imu.push(*sample);
     }
     let calibration = Calibration {
-        camera: camera.model.clone(),
-        body_from_camera: camera.body_from_camera,
+        camera: input.camera.model.clone(),
+        body_from_camera: input.camera.body_from_camera,
         clock_secs: 0.0,
-        readout_secs,
+        readout_secs: input.readout_secs,
+        gain: ImuGain::default(),
     };
-    let prior = CalibrationPrior { sigmas: sigmas.of(&calibration), mean: calibration.clone() };
-    let recording = Recording { log, imu: &imu, model };
-    let segment = initial::longest_segment(log, &imu, model, camera.time_offset);
-    let mut work = Work { calibration, prior, clock_offset: camera.time_offset, guess: segment };
+    let prior = CalibrationPrior { sigmas: input.sigmas.of(&calibration), mean: calibration.clone() };
+    let recording = Recording { log, imu: &imu, model: &input.model };
+    let clock_offset = input.camera.time_offset;
+    let guess = initial::longest_segment(log, &imu, &input.model, clock_offset);
+    let mut work = Work { calibration, prior, clock_offset, guess };
     // The longest segment first: it gives the calibration with which the rest is found.
-    work.pass(&recording)?;
-    work.guess = grow::outward(&recording, &work);
+    work.pass(&recording, &mut watch)?;
+    watch.stage(AdjustmentStage::Outward, work.guess.images.len());
+    work.guess = grow::outward(&recording, &work, &mut watch)?;
+    watch.stage(AdjustmentStage::Together, work.guess.images.len());
+    let mut passed = work.pass(&recording, &mut watch)?;
     for _ in 1..PASSES {
-        if work.pass(&recording)?.0 {
+        let contradicted = work.doubt_given(&passed.problem)?;
+        if passed.is_settled && !contradicted {
             break;
         }
+        passed = work.pass(&recording, &mut watch)?;
     }
-    let clock_offset = work.clock_offset;
-    let (_, problem, report) = work.pass(&recording)?;
+    watch.stage(AdjustmentStage::Loops, work.guess.images.len());
+    let closed = loops::close(&mut passed.problem, &mut passed.report, log, &passed.images, &mut watch)?;
+    watch.stage(AdjustmentStage::Weighted, work.guess.images.len());
+    let solution = Solution { closed, ..weigh(input, passed, &mut watch)? };
+    let corrected = imu.multiplied(&solution.problem.calibration.gain);
+    let recording = Recording { imu: &corrected, model: &solution.model, ..recording };
+    Ok(result::collect(input, &recording, &solution))
+}
+
+/// Adjusts once more with the IMU's noise as the residuals show it.
+fn weigh(
+    input: &AdjustmentInput<'_>,
+    passed: Passed,
+    watch: &mut Watch<'_>,
+) -> Result<Solution, AdjustmentError> {
+    let Passed { mut problem, images, mut report, clock_offset, .. } = passed;
+    let mut model = input.model;
+    let inertial_chi2_per_dof = optimise::inertial_chi2_per_dof(&problem);
+    for _ in 0..WEIGHINGS {
+        let covariance = noise::covariance(&problem).ok_or(AdjustmentError::Undetermined)?;
+        let found = noise::reweighed(&model, &noise::components(&problem, &covariance), &input.data_sheet);
+        let change = noise::largest_change(&model, &found);
+        model = found;
+        if change < SETTLED_NOISE {
+            break;
+        }
+        problem.frames.iter_mut().filter_map(|f| f.inertial.as_mut()).for_each(|i| i.reweigh(&model));
+        optimise::finish(&mut problem, &mut report, watch)?;
+    }
     let system = optimise::solution(&problem).ok_or(AdjustmentError::Undetermined)?;
-    let images = work.guess.images;
-    Ok(result::collect(&recording, &Solution { problem, images, clock_offset, report, system }))
+    let covariance = system.factor.inverse(problem.calibration_offset());
+    Ok(Solution {
+        problem,
+        model,
+        images,
+        clock_offset,
+        report,
+        inertial_chi2_per_dof,
+        closed: Closed::default(),
+        system,
+        covariance,
+    })
 }
 
 /// What was recorded.
+#[derive(Clone, Copy)]
 struct Recording<'a> {
     log: &'a TrackLog,
     imu: &'a ImuBuffer,
@@ -191,17 +217,27 @@ struct Work {
     guess: Guess,
 }
 
+/// An adjustment of all states.
+struct Passed {
+    problem: Problem,
+    /// Which images of the log the states belong to.
+    images: Vec<usize>,
+    report: OptimiseReport,
+    /// What the states' instants are their images' stamps plus.
+    clock_offset: Duration,
+    /// Whether the clock was right.
+    is_settled: bool,
+}
+
 impl Work {
-    /// Adjusts all states of the guess; whether the clock was right.
-    fn pass(
-        &mut self,
-        recording: &Recording<'_>,
-    ) -> Result<(bool, Problem, OptimiseReport), AdjustmentError> {
+    /// Adjusts all states of the guess.
+    fn pass(&mut self, recording: &Recording<'_>, watch: &mut Watch<'_>) -> Result<Passed, AdjustmentError> {
+        let (clock_offset, images) = (self.clock_offset, self.guess.images.clone());
         let mut problem = initial::build(recording, &self.calibration, self.prior.clone(), &self.guess, 0)?;
         if problem.landmarks.len() < MIN_LANDMARKS {
             return Err(AdjustmentError::FewLandmarks { landmarks: problem.landmarks.len() });
         }
-        let report = optimise::optimise(&mut problem);
+        let report = optimise::optimise(&mut problem, watch)?;
         let clock_secs = problem.calibration.clock_secs;
         let is_settled = clock_secs.abs() <= SETTLED_CLOCK_SECS;
         if is_settled {
@@ -209,16 +245,40 @@ impl Work {
             self.calibration = problem.calibration.clone();
         } else {
             self.clock_offset += Duration::from_secs_f64(clock_secs);
-            self.guess = self.guess.at_corrected_clock(&problem);
+            self.guess = self.guess.at_corrected_clock(&problem, recording.imu);
             self.calibration = Calibration { clock_secs: 0.0, ..problem.calibration.clone() };
             self.prior.mean.clock_secs -= clock_secs;
         }
-        Ok((is_settled, problem, report))
+        Ok(Passed { problem, images, report, clock_offset, is_settled })
+    }
+
+    /// Where the recording contradicts the place of the camera that was given, its prior is widened, so that it no longer pulls;
+    /// whether it was.
+    fn doubt_given(&mut self, problem: &Problem) -> Result<bool, AdjustmentError> {
+        let covariance = noise::covariance(problem).ok_or(AdjustmentError::Undetermined)?;
+        let departures = findings::departures(problem, &covariance);
+        let mut widened = false;
+        for (at, widest) in [(ROTATION, WIDE_ROTATION_RAD), (POSITION, WIDE_POSITION_M)] {
+            let sigmas = &mut self.prior.sigmas[at..at + 3];
+            if sigmas[0] > 0.0 && sigmas[0] < widest && departures.contradicts(at) {
+                sigmas.fill(widest);
+                widened = true;
+            }
+        }
+        Ok(widened)
     }
 }
 
-/// Most logged images: about 15 minutes. System and factor take some 0.1 MB per image (landmarks of 5 s).
-const MAX_IMAGES: usize = 5000;
+/// Most adjustments with noise as the residuals show it. Where vision is weak, most of the inertial residuals go into the unknowns,
+/// and an estimate of the noise goes part of the way only.
+const WEIGHINGS: usize = 8;
+
+/// Relative change of the densities from which they are settled: standard deviations of the result follow them.
+const SETTLED_NOISE: f64 = 0.05;
+
+/// Standard deviations of a place that was given and is not believed any more.
+const WIDE_ROTATION_RAD: f64 = 0.1;
+const WIDE_POSITION_M: f64 = 0.3;
 
 /// Fewest landmarks of a recording.
 const MIN_LANDMARKS: usize = 30;

@@ -6,6 +6,7 @@
 //! clock offset and `t_r` the readout time. Between them the body turns by the gyroscope's rates and moves with the state's
 //! velocity and the accelerometer's force (Patron-Perez, Lovegrove, Sibley 2015 do the same with splines).
 
+use super::inertial::{GAIN_DIM, ImuGain};
 use crate::backend::tangent_basis;
 use crate::imu::{NavState, hat};
 use nalgebra::{Matrix2x3, Matrix3, SMatrix, Vector2, Vector3};
@@ -17,7 +18,11 @@ pub(super) const STATE_DIM: usize = 9;
 /// Unknowns of the calibration besides the intrinsics: clock offset, readout, rotation and position of the camera.
 pub(super) const TIMING_AND_PLACE: usize = 8;
 
-/// What is estimated of the camera.
+/// Where rotation and position of the camera begin in them.
+pub(super) const ROTATION: usize = 2;
+pub(super) const POSITION: usize = 5;
+
+/// What is estimated of the sensors.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct Calibration {
     pub(super) camera: CameraModel,
@@ -26,6 +31,8 @@ pub(super) struct Calibration {
     pub(super) clock_secs: f64,
     /// From the first to the last row, s.
     pub(super) readout_secs: f64,
+    /// Gains of gyroscope and accelerometer.
+    pub(super) gain: ImuGain,
 }
 
 /// A landmark.
@@ -111,7 +118,7 @@ impl Calibration {
 
     /// Unknowns.
     pub(super) fn dim(&self) -> usize {
-        TIMING_AND_PLACE + self.camera.parameters().len()
+        TIMING_AND_PLACE + self.camera.parameters().len() + GAIN_DIM
     }
 
     /// The calibration moved by a step of all its unknowns; `None` where the camera would not be valid.
@@ -125,6 +132,7 @@ impl Calibration {
             body_from_camera: Se3::new(place.rotation * So3::exp(&three(2)), place.translation + three(5)),
             clock_secs: self.clock_secs + step[0],
             readout_secs: self.readout_secs + step[1],
+            gain: self.gain.plus(&step[step.len() - GAIN_DIM..]),
         })
     }
 
@@ -135,6 +143,7 @@ impl Calibration {
         let mut step = vec![self.clock_secs - other.clock_secs, self.readout_secs - other.readout_secs];
         step.extend(turn.log().iter().chain(place.iter()));
         step.extend(self.camera.parameters().iter().zip(other.camera.parameters()).map(|(a, b)| a - b));
+        step.extend(self.gain.values().iter().zip(other.gain.values()).map(|(a, b)| a - b));
         step
     }
 }
@@ -145,7 +154,8 @@ pub(super) struct Linearised {
     pub(super) pixel: Pixel,
     pub(super) by_state: SMatrix<f64, 2, STATE_DIM>,
     pub(super) by_landmark: Matrix2x3<f64>,
-    /// Clock, readout, rotation, position, intrinsics.
+    /// Clock, readout, rotation, position, intrinsics. The gains have no part in it: within a row's time they turn by less than
+    /// 0.1 mrad.
     pub(super) by_calibration: Vec<Vector2<f64>>,
 }
 
@@ -249,6 +259,7 @@ mod tests {
             ),
             clock_secs: 0.003,
             readout_secs: 0.025,
+            gain: ImuGain::default(),
         };
         let measured = Pixel::new(400.0, 100.0);
         let camera = camera_pose(&body, &calibration, &measured);
@@ -304,7 +315,7 @@ mod tests {
             let minus = project(&body, &landmark.plus(&-step), &calibration, &measured);
             check("landmark", plus, minus, h, at.by_landmark.column(k).into_owned());
         }
-        for k in 0..calibration.dim() {
+        for k in 0..calibration.dim() - GAIN_DIM {
             let plus = project(&body, &landmark, &perturbed(&calibration, k, h), &measured);
             let minus = project(&body, &landmark, &perturbed(&calibration, k, -h), &measured);
             check(&format!("calibration {k}"), plus, minus, h, at.by_calibration[k]);

@@ -1,8 +1,11 @@
 //! Levenberg-Marquardt over the whole recording, with gross errors left out round by round.
 
+use super::AdjustmentError;
 use super::linearise::{Cost, System, cost, inertial_error, linearise, squared_error};
+use super::observation::{Calibration, Landmark};
 use super::problem::{FRAME_DIM, Problem};
-use crate::imu::Vector15;
+use super::progress::Watch;
+use crate::imu::{NavState, Vector15};
 use nalgebra::Vector3;
 
 /// Rounds of minimising and leaving out what does not fit.
@@ -36,23 +39,37 @@ pub(super) struct OptimiseReport {
 }
 
 /// Brings new states near the solution: two rounds, gross errors left out in between.
-pub(super) fn settle(problem: &mut Problem) {
-    minimise(problem);
+pub(super) fn settle(problem: &mut Problem, watch: &mut Watch<'_>) -> Result<(), AdjustmentError> {
+    minimise(problem, watch)?;
     reject(problem, OUTLIER_CHI2[0]);
-    minimise(problem);
+    minimise(problem, watch)?;
+    Ok(())
 }
 
 /// Minimises the cost, and leaves out what does not fit.
-pub(super) fn optimise(problem: &mut Problem) -> OptimiseReport {
+pub(super) fn optimise(
+    problem: &mut Problem,
+    watch: &mut Watch<'_>,
+) -> Result<OptimiseReport, AdjustmentError> {
     let mut report = OptimiseReport { before: cost(problem), ..OptimiseReport::default() };
     for limit in OUTLIER_CHI2 {
-        report.iterations += minimise(problem);
+        report.iterations += minimise(problem, watch)?;
         report.rejected += reject(problem, limit);
     }
-    report.iterations += minimise(problem);
+    finish(problem, &mut report, watch)?;
+    Ok(report)
+}
+
+/// Minimises again, after the measurements' weights were changed; nothing more is left out.
+pub(super) fn finish(
+    problem: &mut Problem,
+    report: &mut OptimiseReport,
+    watch: &mut Watch<'_>,
+) -> Result<(), AdjustmentError> {
+    report.iterations += minimise(problem, watch)?;
     report.after = cost(problem);
     report.observations = problem.landmarks.iter().map(|l| l.observations.len()).sum();
-    report
+    Ok(())
 }
 
 /// The system at the solution, without damping, factorised; `None` where it is not positive definite.
@@ -62,12 +79,15 @@ pub(super) fn solution(problem: &Problem) -> Option<System> {
     system.h.factorise(&vec![0.0; problem.dim()], &mut system.factor).then_some(system)
 }
 
-fn minimise(problem: &mut Problem) -> usize {
+fn minimise(problem: &mut Problem, watch: &mut Watch<'_>) -> Result<usize, AdjustmentError> {
     let mut system = System::new(problem);
     let mut damping = FIRST_DAMPING;
-    let mut best = cost(problem).total();
+    let mut before = Values::default();
     for iteration in 0..ITERATIONS {
-        follow_biases(problem);
+        watch.iteration()?;
+        follow(problem);
+        let best = cost(problem).total();
+        before.keep(problem);
         let mut lowered = None;
         while damping <= MAX_DAMPING {
             linearise(problem, damping, &mut system);
@@ -77,51 +97,78 @@ fn minimise(problem: &mut Problem) -> usize {
                 let mut step: Vec<f64> = system.gradient.iter().map(|g| -g).collect();
                 system.factor.forward(&mut step);
                 system.factor.backward(&mut step);
-                let tried = moved(problem, &system, &step);
-                let found = tried.as_ref().map_or(f64::INFINITY, |p| cost(p).total());
-                if let Some(tried) = tried.filter(|_| found < best) {
-                    *problem = tried;
+                let found =
+                    if advance(problem, &system, &step) { cost(problem).total() } else { f64::INFINITY };
+                if found < best {
                     lowered = Some(best - found);
-                    best = found;
                     damping = (damping * 0.2).max(1e-9);
                     break;
                 }
+                before.restore(problem);
             }
             damping *= 8.0;
         }
         if lowered.is_none_or(|by| by < SETTLED_SHARE * best) {
-            return iteration + 1;
+            return Ok(iteration + 1);
         }
     }
-    ITERATIONS
+    Ok(ITERATIONS)
 }
 
-/// Integrates again where the biases have moved.
-fn follow_biases(problem: &mut Problem) {
+/// Integrates again where biases or gains have moved.
+fn follow(problem: &mut Problem) {
+    let gain = problem.calibration.gain;
     for k in 1..problem.frames.len() {
         let bias = problem.frames[k - 1].body.state.bias;
-        if let Some(preintegration) = &mut problem.frames[k].preintegration {
-            preintegration.follow(&bias);
+        if let Some(inertial) = &mut problem.frames[k].inertial {
+            inertial.follow(&bias, &gain);
         }
     }
 }
 
-fn moved(problem: &Problem, system: &System, step: &[f64]) -> Option<Problem> {
-    if step.iter().any(|v| !v.is_finite()) {
-        return None;
+/// The unknowns' values, to go back to.
+#[derive(Default)]
+struct Values {
+    states: Vec<NavState>,
+    landmarks: Vec<Landmark>,
+    calibration: Option<Calibration>,
+}
+
+impl Values {
+    fn keep(&mut self, problem: &Problem) {
+        self.states.clear();
+        self.states.extend(problem.frames.iter().map(|f| f.body.state));
+        self.landmarks.clear();
+        self.landmarks.extend(problem.landmarks.iter().map(|l| l.landmark));
+        self.calibration = Some(problem.calibration.clone());
     }
+
+    fn restore(&self, problem: &mut Problem) {
+        problem.frames.iter_mut().zip(&self.states).for_each(|(f, state)| f.body.state = *state);
+        problem.landmarks.iter_mut().zip(&self.landmarks).for_each(|(l, landmark)| l.landmark = *landmark);
+        if let Some(calibration) = &self.calibration {
+            problem.calibration.clone_from(calibration);
+        }
+    }
+}
+
+/// Moves all unknowns by a step; whether that gave finite values and a valid camera.
+fn advance(problem: &mut Problem, system: &System, step: &[f64]) -> bool {
     let offset = problem.calibration_offset();
-    let mut out = problem.clone();
-    for (k, frame) in out.frames.iter_mut().enumerate() {
+    let Some(calibration) = problem.calibration_plus(&step[offset..]) else { return false };
+    if step.iter().any(|v| !v.is_finite()) {
+        return false;
+    }
+    problem.calibration = calibration;
+    for (k, frame) in problem.frames.iter_mut().enumerate() {
         let delta = Vector15::from_column_slice(&step[FRAME_DIM * k..FRAME_DIM * (k + 1)]);
         frame.body.state = frame.body.state.plus(&delta);
     }
-    for (seen, block) in out.landmarks.iter_mut().zip(&system.landmarks) {
+    for (seen, block) in problem.landmarks.iter_mut().zip(&system.landmarks) {
         let step: Vector3<f64> = block.step(step, offset).unwrap_or_default();
         seen.landmark = seen.landmark.plus(&step);
     }
-    out.calibration = problem.calibration_plus(&step[offset..])?;
-    Some(out)
+    true
 }
 
 /// Leaves out observations that do not fit, and landmarks of which too little is left; how many observations.

@@ -1,8 +1,9 @@
 //! The unknowns of the adjustment and what was measured of them.
 
 use super::envelope::Envelope;
+use super::inertial::{GAIN_DIM, ImuGain, InertialFactor};
 use super::observation::{Calibration, Landmark, MovingBody, STATE_DIM};
-use crate::imu::{ImuBuffer, ImuModel, NavState, Preintegration};
+use crate::imu::{ImuBuffer, ImuModel, NavState};
 use nalgebra::{Matrix2, Vector3};
 use vidar_core::{Timestamp, camera::Pixel};
 
@@ -16,7 +17,7 @@ pub(super) struct FrameState {
     pub(super) time: Timestamp,
     pub(super) body: MovingBody,
     /// Inertial factor from the state before; none at the beginning of a chain.
-    pub(super) preintegration: Option<Preintegration>,
+    pub(super) inertial: Option<InertialFactor>,
 }
 
 /// An observation of a landmark.
@@ -68,6 +69,12 @@ impl Problem {
         FRAME_DIM * self.frames.len()
     }
 
+    /// How many of the active unknowns are the camera's; the others are the IMU's gains.
+    pub(super) fn active_camera(&self) -> usize {
+        let gains = self.calibration.dim() - GAIN_DIM;
+        self.active.partition_point(|index| *index < gains)
+    }
+
     /// The envelope of the reduced system: a state is tied to the one before and to all that share a landmark with it.
     pub(super) fn envelope(&self) -> Envelope {
         let mut oldest: Vec<usize> = (0..self.frames.len()).map(|k| k.saturating_sub(1)).collect();
@@ -93,15 +100,22 @@ impl Problem {
 
 impl FrameState {
     /// A state at `time` with the sensors' readings around it; `None` where the IMU does not cover it.
-    pub(super) fn new(time: Timestamp, state: NavState, imu: &ImuBuffer, model: &ImuModel) -> Option<Self> {
+    pub(super) fn new(
+        time: Timestamp,
+        state: NavState,
+        imu: &ImuBuffer,
+        model: &ImuModel,
+        gain: &ImuGain,
+    ) -> Option<Self> {
         let around = vidar_core::Duration::from_millis(10);
-        let now = imu.at(time)?;
-        let (before, after) = (imu.at(time - around).unwrap_or(now), imu.at(time + around).unwrap_or(now));
+        let at = |time: Timestamp| Some(gain.applied(&imu.at(time)?));
+        let now = at(time)?;
+        let (before, after) = (at(time - around).unwrap_or(now), at(time + around).unwrap_or(now));
         let secs = (after.time - before.time).as_secs_f64();
         let gyro_change = if secs > 0.0 { (after.gyro.0 - before.gyro.0) / secs } else { Vector3::zeros() };
         let body =
             MovingBody { state, gyro: now.gyro.0, gyro_change, force: now.accel.0, gravity: model.gravity() };
-        Some(Self { time, body, preintegration: None })
+        Some(Self { time, body, inertial: None })
     }
 }
 

@@ -1,10 +1,11 @@
 //! What the adjustment found: calibration, scale, and a state for every image.
 
+use super::envelope::Envelope;
+use super::inertial::GAIN_DIM;
 use super::initial::preintegrate;
 use super::linearise::System;
-use super::optimise::inertial_chi2_per_dof;
 use super::problem::{FRAME_DIM, Problem};
-use super::{Recording, Solution, keyframes};
+use super::{AdjustmentFinding, AdjustmentInput, Recording, Solution, findings, keyframes};
 use crate::backend::dot;
 use crate::imu::{ImuBuffer, ImuModel, NavState};
 use crate::pipeline::public_state;
@@ -29,6 +30,23 @@ pub struct AdjustedCalibration {
     pub sigmas: Vec<f64>,
 }
 
+/// The IMU as estimated.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct AdjustedImu {
+    /// What readings of the gyroscope are to be multiplied by, per axis of the body.
+    pub gyro_gain: Vector3<f64>,
+    /// What readings of the accelerometer are to be multiplied by.
+    pub accel_gain: Vector3<f64>,
+    /// Standard deviations of both, relative; zero where they were held.
+    pub gyro_gain_sigma: Vector3<f64>,
+    /// See `gyro_gain_sigma`.
+    pub accel_gain_sigma: Vector3<f64>,
+    /// White noise as the residuals show it, rad/s/√Hz, at least the data sheet's.
+    pub gyro_noise_density: f64,
+    /// White noise of the accelerometer, m/s²/√Hz.
+    pub accel_noise_density: f64,
+}
+
 /// How the adjustment went.
 #[derive(Clone, Copy, Debug, Default, PartialEq, serde::Serialize)]
 pub struct AdjustmentReport {
@@ -42,9 +60,13 @@ pub struct AdjustmentReport {
     pub rejected: usize,
     /// Iterations of all rounds.
     pub iterations: usize,
+    /// Pairs of places, seen at different times, that were tied to each other, and landmarks seen again in them.
+    pub loops: usize,
+    /// See `loops`.
+    pub loop_matches: usize,
     /// Cost before and after.
     pub cost: (f64, f64),
-    /// Mean squared whitened residual of the inertial factors.
+    /// Mean squared residual of the inertial factors, whitened with the noise as given.
     pub inertial_chi2_per_dof: f64,
 }
 
@@ -58,6 +80,10 @@ pub struct Adjusted {
     pub keyframes: Vec<OdometryKeyframe>,
     /// The calibration.
     pub calibration: AdjustedCalibration,
+    /// The IMU.
+    pub imu: AdjustedImu,
+    /// What was given and the recording contradicts.
+    pub findings: Vec<AdjustmentFinding>,
     /// Standard deviation of ln(scale) over the whole path, as the measurements and their stated noise give it.
     pub scale_std: f64,
     /// How it went.
@@ -78,9 +104,14 @@ impl Adjusted {
     }
 }
 
-pub(super) fn collect(recording: &Recording<'_>, solution: &Solution) -> Adjusted {
+/// `recording` has IMU measurements with the gains applied; the stamps are those of `input`.
+pub(super) fn collect(
+    input: &AdjustmentInput<'_>,
+    recording: &Recording<'_>,
+    solution: &Solution,
+) -> Adjusted {
     let Recording { log, imu, model } = *recording;
-    let Solution { problem, clock_offset, report, system, .. } = solution;
+    let Solution { problem, clock_offset, report, system, covariance, .. } = solution;
     let clock = Duration::from_secs_f64(problem.calibration.clock_secs);
     // States at the images' true instants.
     let states: Vec<(Timestamp, NavState)> = problem
@@ -98,6 +129,8 @@ pub(super) fn collect(recording: &Recording<'_>, solution: &Solution) -> Adjuste
         })
         .collect();
     let scale_std = log_scale_sigma(problem, system);
+    let sigmas = calibration_sigmas(problem, covariance);
+    let gains = problem.calibration.dim() - GAIN_DIM;
     Adjusted {
         images: every_image,
         keyframes: keyframes::of(recording, solution, scale_std),
@@ -106,8 +139,17 @@ pub(super) fn collect(recording: &Recording<'_>, solution: &Solution) -> Adjuste
             body_from_camera: problem.calibration.body_from_camera,
             time_offset_secs: offset.as_secs_f64(),
             readout_secs: problem.calibration.readout_secs,
-            sigmas: calibration_sigmas(problem, system),
+            sigmas: sigmas[..gains].to_vec(),
         },
+        imu: AdjustedImu {
+            gyro_gain: problem.calibration.gain.gyro.add_scalar(1.0),
+            accel_gain: problem.calibration.gain.accel.add_scalar(1.0),
+            gyro_gain_sigma: Vector3::from_column_slice(&sigmas[gains..gains + 3]),
+            accel_gain_sigma: Vector3::from_column_slice(&sigmas[gains + 3..]),
+            gyro_noise_density: model.noise.gyro_density,
+            accel_noise_density: model.noise.accel_density,
+        },
+        findings: findings::of(problem, covariance, &input.given_body_from_camera),
         scale_std,
         report: AdjustmentReport {
             states: problem.frames.len(),
@@ -115,8 +157,10 @@ pub(super) fn collect(recording: &Recording<'_>, solution: &Solution) -> Adjuste
             observations: report.observations,
             rejected: report.rejected,
             iterations: report.iterations,
+            loops: solution.closed.pairs,
+            loop_matches: solution.closed.matches,
             cost: (report.before.total(), report.after.total()),
-            inertial_chi2_per_dof: inertial_chi2_per_dof(problem),
+            inertial_chi2_per_dof: solution.inertial_chi2_per_dof,
         },
     }
 }
@@ -168,12 +212,11 @@ fn sigma_of(mut slope: Vec<f64>, system: &System) -> f64 {
     dot(&slope, &slope).sqrt()
 }
 
-fn calibration_sigmas(problem: &Problem, system: &System) -> Vec<f64> {
+fn calibration_sigmas(problem: &Problem, covariance: &Envelope) -> Vec<f64> {
     let mut sigmas = vec![0.0; problem.calibration.dim()];
     for (k, index) in problem.active.iter().enumerate() {
-        let mut unit = vec![0.0; problem.dim()];
-        unit[problem.calibration_offset() + k] = 1.0;
-        sigmas[*index] = sigma_of(unit, system);
+        let row = problem.calibration_offset() + k;
+        sigmas[*index] = covariance.entry(row, row).max(0.0).sqrt();
     }
     sigmas
 }

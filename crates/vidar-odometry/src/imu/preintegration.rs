@@ -159,16 +159,8 @@ impl Delta {
 
     /// This motion followed by `next`; both linearised at the same biases.
     pub(crate) fn then(&self, next: &Self) -> Self {
+        let (f, g) = self.by_parts(next);
         let turn = self.rotation.matrix();
-        let mut f = Matrix9::identity();
-        f.fixed_view_mut::<3, 3>(0, 0).copy_from(&next.rotation.matrix().transpose());
-        f.fixed_view_mut::<3, 3>(3, 0).copy_from(&(-(turn * hat(&next.position))));
-        f.fixed_view_mut::<3, 3>(3, 6).copy_from(&(Matrix3::identity() * next.secs));
-        f.fixed_view_mut::<3, 3>(6, 0).copy_from(&(-(turn * hat(&next.velocity))));
-        let mut g = Matrix9::zeros();
-        g.fixed_view_mut::<3, 3>(0, 0).copy_from(&Matrix3::identity());
-        g.fixed_view_mut::<3, 3>(3, 3).copy_from(&turn);
-        g.fixed_view_mut::<3, 3>(6, 6).copy_from(&turn);
         let covariance = f * self.covariance * f.transpose() + g * next.covariance * g.transpose();
         Self {
             secs: self.secs + next.secs,
@@ -179,6 +171,21 @@ impl Delta {
             by_accel_bias: f * self.by_accel_bias + g * next.by_accel_bias,
             covariance: (covariance + covariance.transpose()) * 0.5,
         }
+    }
+
+    /// Derivatives of [`Delta::then`] by this motion and by `next`.
+    fn by_parts(&self, next: &Self) -> (Matrix9, Matrix9) {
+        let turn = self.rotation.matrix();
+        let mut f = Matrix9::identity();
+        f.fixed_view_mut::<3, 3>(0, 0).copy_from(&next.rotation.matrix().transpose());
+        f.fixed_view_mut::<3, 3>(3, 0).copy_from(&(-(turn * hat(&next.position))));
+        f.fixed_view_mut::<3, 3>(3, 6).copy_from(&(Matrix3::identity() * next.secs));
+        f.fixed_view_mut::<3, 3>(6, 0).copy_from(&(-(turn * hat(&next.velocity))));
+        let mut g = Matrix9::zeros();
+        g.fixed_view_mut::<3, 3>(0, 0).copy_from(&Matrix3::identity());
+        g.fixed_view_mut::<3, 3>(3, 3).copy_from(&turn);
+        g.fixed_view_mut::<3, 3>(6, 6).copy_from(&turn);
+        (f, g)
     }
 }
 
@@ -343,6 +350,26 @@ impl Preintegration {
     /// Covariance of rotation (first side of the end), position and velocity, white noise only.
     pub fn covariance(&self) -> &SMatrix<f64, 9, 9> {
         &self.delta.covariance
+    }
+
+    /// Derivative of rotation, position and velocity by the sensors' gains (gyroscope, accelerometer, per axis): over a step a
+    /// gain acts as a bias of minus the reading. Zero after very long stretches, whose readings are not kept.
+    pub(crate) fn by_gain(&self) -> SMatrix<f64, 9, 6> {
+        let steps = self.samples.windows(2).filter(|pair| pair[1].time > pair[0].time);
+        let none = (Delta::none(), SMatrix::<f64, 9, 6>::zeros());
+        let (_, by_gain) = steps.fold(none, |(sum, by_gain), pair| {
+            let step = Delta::step(&pair[0], &pair[1], &self.bias, &self.model);
+            let rate = (pair[0].gyro.0 + pair[1].gyro.0) * -0.5;
+            let force = (pair[0].accel.0 + pair[1].accel.0) * -0.5;
+            let mut of_step = SMatrix::<f64, 9, 6>::zeros();
+            for k in 0..3 {
+                of_step.set_column(k, &(step.by_gyro_bias.column(k) * rate[k]));
+                of_step.set_column(3 + k, &(step.by_accel_bias.column(k) * force[k]));
+            }
+            let (f, g) = sum.by_parts(&step);
+            (sum.then(&step), f * by_gain + g * of_step)
+        });
+        by_gain
     }
 
     /// Rotation, position and velocity for `bias`, to first order.

@@ -24,7 +24,8 @@ use nalgebra::Vector3;
 use std::collections::VecDeque;
 use std::rc::Rc;
 use vidar_core::{
-    CameraId, Duration, Frame, FrameId, Health, ImuSample, LieGroup, Rig, RigCamera, SensorEvent, Timestamp,
+    CameraId, Duration, Frame, FrameId, Health, ImuSample, LieGroup, Rig, RigCamera, Se3, SensorEvent,
+    Timestamp,
 };
 
 /// Images that may wait for IMU measurements of their time.
@@ -71,6 +72,8 @@ pub struct Odometry {
     frontend: FrontendConfig,
     camera_id: CameraId,
     camera: RigCamera,
+    /// As the caller's calibration has it.
+    given_body_from_camera: Se3,
     imu_model: Option<ImuModel>,
     imu: ImuBuffer,
     pending: VecDeque<Frame>,
@@ -129,6 +132,7 @@ impl Odometry {
             images: ImagePool::default(),
             clock: StageClock::start(),
             log: None,
+            given_body_from_camera: rig_camera.body_from_camera,
             camera: rig_camera,
             imu_model,
             imu: ImuBuffer::new(noise.map_or(200.0, |n| n.rate_hz)),
@@ -289,9 +293,10 @@ impl Odometry {
     ) -> Result<Self, OdometryError> {
         let mut rig = rig.clone();
         let found = rig.cameras.get_mut(camera.index()).ok_or(OdometryError::NoSuchCamera(camera))?;
+        let given_body_from_camera = found.body_from_camera;
         let mut config = config.clone();
         timing.apply(found, &mut config);
-        Self::new(&rig, camera, &config)
+        Ok(Self { given_body_from_camera, ..Self::new(&rig, camera, &config)? })
     }
 
     fn is_ready(&self, frame: &Frame) -> bool {

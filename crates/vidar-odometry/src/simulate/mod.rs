@@ -7,11 +7,13 @@
 mod course;
 mod driver;
 mod handheld;
+mod logged;
 mod random;
 mod sensors;
 
 pub use course::{Course, CourseKind, Flight, Motion};
 pub use driver::{FeatureOdometry, FeatureOdometryConfig, StepOutput};
 pub use handheld::{Handheld, HandheldRecording};
+pub use logged::{AdjustSettings, Logged};
 pub use random::Random;
 pub use sensors::{SimulatedFrame, Simulation, SimulationConfig};

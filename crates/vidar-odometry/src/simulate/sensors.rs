@@ -44,6 +44,10 @@ pub struct SimulationConfig {
     pub time_offset_secs: f64,
     /// Strength of gravity, m/s².
     pub gravity_mps2: f64,
+    /// Readings of the gyroscope are the true rates times this, per axis, before bias and noise.
+    pub gyro_scale: [f64; 3],
+    /// The same of the accelerometer.
+    pub accel_scale: [f64; 3],
 }
 
 impl Default for SimulationConfig {
@@ -64,6 +68,8 @@ impl Default for SimulationConfig {
             points: 2500,
             time_offset_secs: 0.0,
             gravity_mps2: GRAVITY_MPS2,
+            gyro_scale: [1.0; 3],
+            accel_scale: [1.0; 3],
         }
     }
 }
@@ -168,6 +174,7 @@ fn simulate_imu(
         gyro: random.normal3() * (scale * config.gyro_bias_sigma),
         accel: random.normal3() * (scale * config.accel_bias_sigma),
     };
+    let [gyro_scale, accel_scale] = [config.gyro_scale, config.accel_scale].map(Vector3::from);
     let (mut imu_samples, mut biases) = (Vec::with_capacity(count), Vec::with_capacity(count));
     for k in 0..count {
         let at = k as f64 / config.imu_rate_hz;
@@ -178,8 +185,8 @@ fn simulate_imu(
         let accel_noise = random.normal3() * (scale * noise.accel_noise_density * root_rate);
         imu_samples.push(ImuSample {
             time: stamp(at),
-            gyro: AngularRate(motion.angular_rate + bias.gyro + gyro_noise),
-            accel: SpecificForce(force + bias.accel + accel_noise),
+            gyro: AngularRate(motion.angular_rate.component_mul(&gyro_scale) + bias.gyro + gyro_noise),
+            accel: SpecificForce(force.component_mul(&accel_scale) + bias.accel + accel_noise),
         });
         biases.push(bias);
         bias.gyro += random.normal3() * (scale * noise.gyro_random_walk / root_rate);

@@ -16,6 +16,7 @@ pub(crate) use sliding_window::{FrameInput, SlidingWindowOdometry, StepReport};
 pub(crate) use standstill::{ImageMotion, ImuStatistics, tracks_in};
 pub use track::TrackRecord;
 pub(crate) use track::{
-    HostImage, ImagePool, Track, host_covariance, noisy_covariance, parallax, rotated_pixel, unknown_distance,
+    HostImage, ImagePool, Measurer, Track, host_covariance, noisy_covariance, parallax, rotated_pixel,
+    unknown_distance,
 };
 pub(crate) use tracker::{CameraPoses, Prediction, Tracker};

@@ -1,8 +1,12 @@
 //! What is kept for the adjustment after the recording's end, and the adjustment.
 
 use super::{Odometry, Phase, Status};
-use crate::bundle_adjustment::{self, Adjusted, AdjustmentError, CalibrationSigmas, LoggedState, TrackLog};
+use crate::bundle_adjustment::{
+    self, Adjusted, AdjustmentError, AdjustmentInput, CalibrationSigmas, LoggedState, Progress, TrackLog,
+};
+use crate::imu::StepNoise;
 use crate::tracking::{host_covariance, noisy_covariance};
+use std::ops::ControlFlow;
 use vidar_core::{Frame, FrameId, Health};
 
 impl Odometry {
@@ -30,14 +34,23 @@ impl Odometry {
         let is_seen = matches!(status, Status::Tracking(tracking) if tracking.health != Health::Degraded);
         let state = state.filter(|_| is_seen).map(|state| LoggedState { segment: self.segment, state });
         log.add_image(id, (frame.id, frame.time), state, shown);
+        if let Some(host) = self.last_host.as_ref().filter(|host| host.frame == id) {
+            log.add_place(frame.time, host);
+        }
         if let Phase::Tracking(window) = &self.phase {
             log.follow(&window.smoother);
         }
     }
 
-    /// Keeps tracks and IMU measurements from here on, for [`Odometry::adjust`]: about 2 MB per minute of recording.
+    /// Keeps tracks and IMU measurements from here on, for [`Odometry::adjust`]: about 2 MB per minute of recording, and at most
+    /// 32 MB of grey levels.
     pub fn keep_log(&mut self) {
         self.log = Some(TrackLog::new(1.0 / self.imu.nominal_period().as_secs_f64()));
+    }
+
+    /// Drops the grey levels that were kept: the adjustment then ties nothing that comes into view again.
+    pub fn forget_log_images(&mut self) {
+        self.log.iter_mut().for_each(TrackLog::forget_places);
     }
 
     /// One adjustment of all states that the log holds; see [`bundle_adjustment`].
@@ -45,11 +58,37 @@ impl Odometry {
     /// # Errors
     /// No log was kept or there is no IMU; otherwise as [`bundle_adjustment::adjust`].
     pub fn adjust(&self, sigmas: &CalibrationSigmas) -> Result<Adjusted, AdjustmentError> {
+        self.adjust_with(sigmas, &mut |_| ControlFlow::Continue(()))
+    }
+
+    /// As [`Odometry::adjust`]. `tell` hears how far it is, and is asked before every iteration whether to go on.
+    ///
+    /// # Errors
+    /// As [`Odometry::adjust`], and [`AdjustmentError::Cancelled`] where `tell` broke it off.
+    pub fn adjust_with(
+        &self,
+        sigmas: &CalibrationSigmas,
+        tell: &mut dyn FnMut(Progress) -> ControlFlow<()>,
+    ) -> Result<Adjusted, AdjustmentError> {
         let (Some(log), Some(model)) = (&self.log, &self.imu_model) else {
             return Err(AdjustmentError::TooShort { images: 0 });
         };
         let mut camera = self.camera.clone();
         camera.time_offset += self.estimated_offset();
-        bundle_adjustment::adjust(log, &camera, self.time_calibration.readout_secs, model, sigmas)
+        let data_sheet = StepNoise {
+            gyro_density: model.noise.gyro_density / self.config.gyro_noise_factor,
+            accel_density: model.noise.accel_density / self.config.accel_noise_factor,
+            ..model.noise
+        };
+        let input = AdjustmentInput {
+            log,
+            camera: &camera,
+            readout_secs: self.time_calibration.readout_secs,
+            given_body_from_camera: self.given_body_from_camera,
+            model: *model,
+            data_sheet,
+            sigmas,
+        };
+        bundle_adjustment::adjust(&input, tell)
     }
 }

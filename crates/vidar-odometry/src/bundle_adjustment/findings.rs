@@ -1,0 +1,113 @@
+//! What was given of the camera's place and the recording contradicts.
+
+use super::envelope::Envelope;
+use super::observation::{POSITION, ROTATION};
+use super::problem::Problem;
+use nalgebra::{Matrix3, Vector3};
+use vidar_core::{LieGroup, Se3};
+
+/// Departures below these are none that a user should mend, m and rad: a calibration with a target is good to millimetres and
+/// tenths of a degree, and the recording's own errors (lens, gains) move the place by as much.
+const MIN_POSITION_M: f64 = 0.03;
+const MIN_ROTATION_RAD: f64 = 0.02;
+
+/// A calibration that the recording contradicts.
+#[derive(Clone, Copy, Debug, PartialEq)]
+#[non_exhaustive]
+pub enum AdjustmentFinding {
+    /// The camera is elsewhere on the body than was given.
+    CameraPosition {
+        /// As given, body axes, m.
+        given_m: Vector3<f64>,
+        /// As the recording shows it, m.
+        found_m: Vector3<f64>,
+        /// Standard deviation per axis, m.
+        sigma_m: Vector3<f64>,
+    },
+    /// The camera is turned against what was given.
+    CameraRotation {
+        /// By how much, as a rotation vector in the camera's axes, rad.
+        turned_rad: Vector3<f64>,
+        /// Standard deviation per axis, rad.
+        sigma_rad: Vector3<f64>,
+    },
+}
+
+/// How far rotation and position are from what the prior takes them for, and how well the recording alone knows them.
+pub(super) struct Departures {
+    rotation: Departure,
+    position: Departure,
+}
+
+struct Departure {
+    by: Vector3<f64>,
+    /// Squared, in standard deviations, over three degrees of freedom.
+    chi2: f64,
+    least: f64,
+}
+
+impl Departures {
+    pub(super) fn contradicts(&self, at: usize) -> bool {
+        let one = if at == ROTATION { &self.rotation } else { &self.position };
+        one.chi2 > CHI2_3_SIGMAS && one.by.norm() > one.least
+    }
+}
+
+/// The probability of 3 standard deviations (0.27 %) over three degrees of freedom.
+const CHI2_3_SIGMAS: f64 = 14.2;
+
+/// The departures from the prior. What the recording alone says follows from taking the prior off the solution.
+pub(super) fn departures(problem: &Problem, covariance: &Envelope) -> Departures {
+    let moved = problem.calibration.minus(&problem.prior.mean);
+    let departure = |at: usize, least: f64| {
+        let by = Vector3::from_column_slice(&moved[at..at + 3]);
+        let none = Departure { by: Vector3::zeros(), chi2: 0.0, least };
+        let (Some(joint), sigma) = (block(problem, covariance, at), problem.prior.sigmas[at]) else {
+            return none;
+        };
+        // Of a prior that was widened the given value is tested all the same; it was the mean.
+        let Some(information) = joint.try_inverse() else { return none };
+        let own = information - Matrix3::identity() * sigma.powi(-2);
+        // With Λ = Λ_own + Λ_prior and Λ δ = Λ_own δ_own, where δ counts from the prior's mean.
+        let Some(own_covariance) = own.try_inverse() else { return none };
+        let alone = own_covariance * (information * by);
+        Departure { by: alone, chi2: alone.dot(&(own * alone)), least }
+    };
+    Departures {
+        rotation: departure(ROTATION, MIN_ROTATION_RAD),
+        position: departure(POSITION, MIN_POSITION_M),
+    }
+}
+
+/// Covariance of three unknowns of the calibration; `None` where they are held.
+fn block(problem: &Problem, covariance: &Envelope, at: usize) -> Option<Matrix3<f64>> {
+    let border = problem.calibration_offset();
+    let row = |k: usize| Some(border + problem.active.iter().position(|index| *index == at + k)?);
+    let rows = [row(0)?, row(1)?, row(2)?];
+    Some(Matrix3::from_fn(|a, b| covariance.entry(rows[a], rows[b])))
+}
+
+/// What the solution says of a camera's place that was given.
+pub(super) fn of(problem: &Problem, covariance: &Envelope, given: &Se3) -> Vec<AdjustmentFinding> {
+    let found = &problem.calibration.body_from_camera;
+    let mut findings = Vec::new();
+    let contradicts = |by: &Vector3<f64>, joint: &Matrix3<f64>, least: f64| {
+        let chi2 = joint.try_inverse().map_or(0.0, |inverse| by.dot(&(inverse * by)));
+        chi2 > CHI2_3_SIGMAS && by.norm() > least
+    };
+    let sigmas = |joint: &Matrix3<f64>| joint.diagonal().map(f64::sqrt);
+    if let Some(joint) = block(problem, covariance, POSITION) {
+        let by = found.translation - given.translation;
+        if contradicts(&by, &joint, MIN_POSITION_M) {
+            let (given_m, found_m) = (given.translation, found.translation);
+            findings.push(AdjustmentFinding::CameraPosition { given_m, found_m, sigma_m: sigmas(&joint) });
+        }
+    }
+    if let Some(joint) = block(problem, covariance, ROTATION) {
+        let turned_rad = (given.rotation.inverse() * found.rotation).log();
+        if contradicts(&turned_rad, &joint, MIN_ROTATION_RAD) {
+            findings.push(AdjustmentFinding::CameraRotation { turned_rad, sigma_rad: sigmas(&joint) });
+        }
+    }
+    findings
+}
