@@ -19,14 +19,17 @@ use crate::run_folder::{MANIFEST_SCHEMA, Manifest, OutputLocation, RunFolder};
 use crate::verdict::{Findings, Level, ScaleSource, StatedScale, Verdict};
 use serde_json::{Value, json};
 use std::collections::BTreeSet;
+use std::ops::ControlFlow;
 use std::path::PathBuf;
 use std::time::Instant;
 use vidar_core::{BodyFrame, OdometryKeyframe, RevisedPose, Severity, StampedPose, Trajectory, Warning};
 use vidar_dataset::{Dataset, OpenOptions};
 use vidar_eval::TrajectoryReport;
-use vidar_odometry::bundle_adjustment::{Adjusted, CalibrationSigmas};
+use vidar_odometry::bundle_adjustment::{Adjusted, CalibrationSigmas, Progress};
 use vidar_odometry::{ImuUse, InputCounts, Odometry, OdometryOutput, Status};
 
+/// The stage of the adjustment, in events.
+const ADJUSTMENT: &str = "adjustment";
 /// Kind of the warning that there is no state at all.
 const NEVER_STARTED: &str = "odometry-never-started";
 
@@ -207,7 +210,11 @@ pub(crate) fn track(
     let (mut tracked, odometry) =
         events.stage("odometry", total, || push_all(dataset, config, keeps_log, events, cancel, dump))?;
     if let Some(sigmas) = adjustable.filter(|_| tracked.with_imu && !cancel.is_cancelled()) {
-        match events.stage("adjustment", 0, || odometry.adjust(sigmas)) {
+        let mut tell = |progress: Progress| {
+            events.emit(&Event::Progress { stage: ADJUSTMENT, done: progress.states, total: progress.of });
+            if cancel.is_cancelled() { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
+        };
+        match events.stage(ADJUSTMENT, 0, || odometry.adjust_with(sigmas, &mut tell)) {
             Ok(adjusted) if adjusted.is_consistent() => {
                 tracked.quality.adjust(&adjusted);
                 tracked.adjusted = Some(adjusted);
@@ -354,6 +361,7 @@ impl Tracked {
         if let (Some(reason), true) = (&self.not_adjusted, self.quality.longest().is_some()) {
             warnings.push(Warning::new("not-adjusted", format!("the live states are final: {reason}")));
         }
+        warnings.extend(self.adjusted.iter().flat_map(adjusted::warnings));
         if !self.with_imu {
             let text =
                 "one camera without an IMU: the trajectory is known up to scale, lengths are not metres";
@@ -435,6 +443,7 @@ impl OdometryOutcome {
                 "scale_std": adjusted.scale_std,
                 "adjustment": adjusted.report,
                 "calibration": adjusted::calibration_json(adjusted),
+                "imu": adjusted::imu_json(adjusted),
                 "trajectory": self.final_report,
             })),
         })

@@ -1,10 +1,13 @@
 //! The adjustment of a recording after its end, as `vidar odometry` and `vidar run` use it: what may change, and what it found.
 
 use crate::config::Config;
+use nalgebra::Vector3;
 use serde_json::{Value, json};
-use vidar_core::{BodyFrame, Duration, StampedPose, Trajectory};
+use vidar_core::{BodyFrame, Duration, StampedPose, Trajectory, Warning};
 use vidar_dataset::{CalibrationSource, Dataset};
-use vidar_odometry::bundle_adjustment::{Adjusted, AdjustedCalibration, CalibrationSigmas};
+use vidar_odometry::bundle_adjustment::{
+    Adjusted, AdjustedCalibration, AdjustedImu, AdjustmentFinding, CalibrationSigmas,
+};
 
 /// Standard deviations of a calibration that was found from the recording's own tracks and gyroscope.
 const FOUND_FOCAL: f64 = 0.02;
@@ -51,6 +54,46 @@ pub(super) fn calibration_json(adjusted: &Adjusted) -> Value {
         "body_from_camera_xyzw": body_from_camera.rotation.quaternion_xyzw(), "rotation_std_rad": &sigmas[2..5],
         "body_from_camera_m": body_from_camera.translation.as_slice(), "position_std_m": &sigmas[5..8],
     })
+}
+
+/// The IMU as adjusted.
+pub(super) fn imu_json(adjusted: &Adjusted) -> Value {
+    let AdjustedImu { gyro_gain, accel_gain, gyro_gain_sigma, accel_gain_sigma, .. } = &adjusted.imu;
+    json!({
+        "gyro_gain": gyro_gain.as_slice(), "gyro_gain_std": gyro_gain_sigma.as_slice(),
+        "accel_gain": accel_gain.as_slice(), "accel_gain_std": accel_gain_sigma.as_slice(),
+        "gyro_noise_density": adjusted.imu.gyro_noise_density,
+        "accel_noise_density": adjusted.imu.accel_noise_density,
+    })
+}
+
+/// What was given and the recording contradicts: the values that were found are used.
+pub(super) fn warnings(adjusted: &Adjusted) -> Vec<Warning> {
+    let told = |finding: &AdjustmentFinding| {
+        let text = match finding {
+            AdjustmentFinding::CameraPosition { given_m, found_m, sigma_m } => format!(
+                "the camera's position on the IMU is given as {} cm, the recording shows {} (σ {}) cm: {:.0} cm apart",
+                in_cm(given_m),
+                in_cm(found_m),
+                in_cm(sigma_m),
+                100.0 * (found_m - given_m).norm()
+            ),
+            AdjustmentFinding::CameraRotation { turned_rad, sigma_rad } => format!(
+                "the camera's orientation on the IMU is off by {:.1}° (σ {:.1}°)",
+                turned_rad.norm().to_degrees(),
+                sigma_rad.max().to_degrees()
+            ),
+            other => format!("the recording contradicts its calibration: {other:?}"),
+        };
+        Warning::new("calibration-contradicted", format!("{text}; what was found is used"))
+            .hint("`vidar calibrate` and a ruler show which is right; correct T_BS in the calibration")
+    };
+    adjusted.findings.iter().map(told).collect()
+}
+
+fn in_cm(v: &Vector3<f64>) -> String {
+    let v = v * 100.0;
+    format!("{:+.1} {:+.1} {:+.1}", v.x, v.y, v.z)
 }
 
 /// Poses of the body at every adjusted image.
