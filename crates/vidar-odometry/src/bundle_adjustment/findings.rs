@@ -11,6 +11,10 @@ use vidar_core::{LieGroup, Se3};
 const MIN_POSITION_M: f64 = 0.03;
 const MIN_ROTATION_RAD: f64 = 0.02;
 
+/// From here on the prior of a given position is widened, m: what a hand with a ruler misses a camera by. Real MH_01 shows 12 mm at a
+/// stated 4 mm although it was calibrated with a target, so that less is no reason.
+const DOUBTED_POSITION_M: f64 = 0.02;
+
 /// A calibration that the recording contradicts.
 #[derive(Clone, Copy, Debug, PartialEq)]
 #[non_exhaustive]
@@ -75,7 +79,7 @@ pub(super) fn departures(problem: &Problem, covariance: &Envelope) -> Departures
     };
     Departures {
         rotation: departure(ROTATION, MIN_ROTATION_RAD),
-        position: departure(POSITION, MIN_POSITION_M),
+        position: departure(POSITION, DOUBTED_POSITION_M),
     }
 }
 

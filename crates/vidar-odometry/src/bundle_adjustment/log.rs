@@ -116,10 +116,10 @@ impl TrackLog {
         let bytes = |image: &HostImage| image.pyramid.width() * image.pyramid.height() * 4 / 3;
         self.places.push((stamp, image.clone()));
         if self.places.len() * bytes(image) > MAX_PLACE_BYTES {
-            let mut number = 0_usize;
+            let mut keeps = false;
             self.places.retain(|_| {
-                number += 1;
-                number % 2 == 1
+                keeps = !keeps;
+                keeps
             });
             self.place_period = self.place_period + self.place_period;
         }

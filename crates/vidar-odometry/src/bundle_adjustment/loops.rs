@@ -22,6 +22,9 @@ use vidar_core::{LieGroup, Se3, camera::Pixel};
 /// Times that are closer are tied by tracks and IMU well enough, s.
 const MIN_GAP_SECS: f64 = 5.0;
 
+/// Places that a place is matched with: those that should show most of what it shows. More say the same again, and each costs as much.
+const MAX_PARTNERS: usize = 2;
+
 /// Fewest matches between two places, and the least share of the attempts.
 const MIN_MATCHES: usize = 12;
 const MIN_SHARE: f64 = 0.4;
@@ -146,19 +149,37 @@ fn matches(
     }
     let mut found = Found { pairs: 0, all: Vec::new() };
     for (from, host) in places {
-        for (to, image) in places {
-            let secs = (solution.frames[*to].time - solution.frames[*from].time).as_secs_f64().abs();
-            if secs < MIN_GAP_SECS {
-                continue;
-            }
-            let pair = Pair { solution, from: *from, to: *to, host, image };
-            let verified = pair.verified(&shown[*from], measurer);
-            // A landmark is tied to an image once.
+        let far = |to: usize| {
+            let secs = (solution.frames[to].time - solution.frames[*from].time).as_secs_f64();
+            secs >= MIN_GAP_SECS
+        };
+        let mut partners: Vec<(Pair<'_>, Vec<Predicted>)> = places
+            .iter()
+            .filter(|(to, _)| far(*to))
+            .map(|(to, image)| Pair { solution, from: *from, to: *to, host, image })
+            .map(|pair| {
+                let predicted = pair.all_predicted(&shown[*from]);
+                (pair, predicted)
+            })
+            .filter(|(_, predicted)| predicted.len() >= MIN_MATCHES)
+            .collect();
+        partners.sort_by_key(|(_, predicted)| std::cmp::Reverse(predicted.len()));
+        for (pair, predicted) in partners.iter().take(MAX_PARTNERS) {
+            let verified = pair.verified(predicted, measurer);
             found.pairs += usize::from(!verified.is_empty());
             found.all.extend(verified);
         }
     }
     found
+}
+
+/// A landmark that another place should show.
+struct Predicted {
+    landmark: usize,
+    /// Where the first place shows it, and where the other should.
+    pixel: Pixel,
+    expected: Pixel,
+    warp: Warp,
 }
 
 /// Two places.
@@ -171,24 +192,23 @@ struct Pair<'a> {
 }
 
 impl Pair<'_> {
-    fn verified(&self, shown: &[(usize, Pixel)], measurer: &mut Measurer) -> Vec<Match> {
-        let predicted: Vec<(usize, Pixel, Pixel, Warp)> = shown
-            .iter()
-            .filter_map(|(k, pixel)| {
-                let (expected, warp) = self.predicted(&self.solution.landmarks[*k].landmark, pixel)?;
-                Some((*k, *pixel, expected, warp))
-            })
-            .collect();
-        if predicted.len() < MIN_MATCHES {
-            return Vec::new();
-        }
+    fn all_predicted(&self, shown: &[(usize, Pixel)]) -> Vec<Predicted> {
+        let one = |(landmark, pixel): &(usize, Pixel)| {
+            let (expected, warp) = self.predicted(&self.solution.landmarks[*landmark].landmark, pixel)?;
+            Some(Predicted { landmark: *landmark, pixel: *pixel, expected, warp })
+        };
+        shown.iter().filter_map(one).collect()
+    }
+
+    /// The predicted landmarks that were found, where they agree with one shift of the image; none otherwise.
+    fn verified(&self, predicted: &[Predicted], measurer: &mut Measurer) -> Vec<Match> {
+        let camera = &self.solution.calibration.camera;
         let mut aligned = Vec::with_capacity(predicted.len());
-        for (k, pixel, expected, warp) in &predicted {
-            let camera = &self.solution.calibration.camera;
+        for Predicted { landmark, pixel, expected, warp } in predicted {
             let Some(feature) = Feature::new(camera, *pixel, LEVEL, FeatureKind::Corner) else { continue };
             let (host, image) = (&self.host.pyramid, &self.image.pyramid);
             if let Ok(found) = measurer.find(host, &feature, warp, expected, image, true) {
-                aligned.push((*k, *expected, found.measurement));
+                aligned.push((*landmark, *expected, found.measurement));
             }
         }
         let shifts: Vec<(Vector2<f64>, Vector2<f64>)> =
@@ -273,12 +293,12 @@ mod tests {
         let shift = |k: usize| {
             let at = place(k);
             let drift = Vector2::new(1.5 + 0.004 * at.x - 0.003 * at.y, -0.7 + 0.005 * at.y);
-            if k % 5 == 0 { drift + Vector2::new(4.0, -3.0) } else { drift }
+            if k.is_multiple_of(5) { drift + Vector2::new(4.0, -3.0) } else { drift }
         };
         let shifts: Vec<_> = (0..40).map(|k| (place(k), shift(k))).collect();
         let fits = smooth(&shifts);
         for (k, fit) in fits.iter().enumerate() {
-            assert_eq!(*fit, k % 5 != 0, "match {k}");
+            assert_eq!(*fit, !k.is_multiple_of(5), "match {k}");
         }
     }
 }

@@ -156,48 +156,50 @@ pub fn adjust(
         }
         passed = work.pass(&recording, &mut watch)?;
     }
+    watch.stage(AdjustmentStage::Weighted, work.guess.images.len());
+    let inertial_chi2_per_dof = optimise::inertial_chi2_per_dof(&passed.problem);
+    let model = weigh(input, &mut passed, &mut watch)?;
     watch.stage(AdjustmentStage::Loops, work.guess.images.len());
     let closed = loops::close(&mut passed.problem, &mut passed.report, log, &passed.images, &mut watch)?;
-    watch.stage(AdjustmentStage::Weighted, work.guess.images.len());
-    let solution = Solution { closed, ..weigh(input, passed, &mut watch)? };
+    let Passed { problem, images, report, clock_offset, .. } = passed;
+    let system = optimise::solution(&problem).ok_or(AdjustmentError::Undetermined)?;
+    let covariance = system.factor.inverse(problem.calibration_offset());
+    let solution = Solution {
+        problem,
+        images,
+        clock_offset,
+        report,
+        inertial_chi2_per_dof,
+        closed,
+        model,
+        system,
+        covariance,
+    };
     let corrected = imu.multiplied(&solution.problem.calibration.gain);
     let recording = Recording { imu: &corrected, model: &solution.model, ..recording };
     Ok(result::collect(input, &recording, &solution))
 }
 
-/// Adjusts once more with the IMU's noise as the residuals show it.
+/// Adjusts again with the IMU's noise as the residuals show it, until that is settled; the model with it.
 fn weigh(
     input: &AdjustmentInput<'_>,
-    passed: Passed,
+    passed: &mut Passed,
     watch: &mut Watch<'_>,
-) -> Result<Solution, AdjustmentError> {
-    let Passed { mut problem, images, mut report, clock_offset, .. } = passed;
+) -> Result<ImuModel, AdjustmentError> {
+    let Passed { problem, report, .. } = passed;
     let mut model = input.model;
-    let inertial_chi2_per_dof = optimise::inertial_chi2_per_dof(&problem);
     for _ in 0..WEIGHINGS {
-        let covariance = noise::covariance(&problem).ok_or(AdjustmentError::Undetermined)?;
-        let found = noise::reweighed(&model, &noise::components(&problem, &covariance), &input.data_sheet);
+        let covariance = noise::covariance(problem).ok_or(AdjustmentError::Undetermined)?;
+        let found = noise::reweighed(&model, &noise::components(problem, &covariance), &input.data_sheet);
         let change = noise::largest_change(&model, &found);
         model = found;
         if change < SETTLED_NOISE {
             break;
         }
         problem.frames.iter_mut().filter_map(|f| f.inertial.as_mut()).for_each(|i| i.reweigh(&model));
-        optimise::finish(&mut problem, &mut report, watch)?;
+        optimise::finish(problem, report, watch)?;
     }
-    let system = optimise::solution(&problem).ok_or(AdjustmentError::Undetermined)?;
-    let covariance = system.factor.inverse(problem.calibration_offset());
-    Ok(Solution {
-        problem,
-        model,
-        images,
-        clock_offset,
-        report,
-        inertial_chi2_per_dof,
-        closed: Closed::default(),
-        system,
-        covariance,
-    })
+    Ok(model)
 }
 
 /// What was recorded.

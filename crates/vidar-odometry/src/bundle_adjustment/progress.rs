@@ -13,10 +13,10 @@ pub enum AdjustmentStage {
     Outward,
     /// All states together.
     Together,
-    /// The same with what comes into view again.
-    Loops,
     /// All states together, with noise as the residuals show it.
     Weighted,
+    /// The same with what comes into view again.
+    Loops,
 }
 
 /// How far an adjustment is. It is told before every iteration, which takes well under a second per minute of recording.

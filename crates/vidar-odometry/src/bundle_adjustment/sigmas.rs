@@ -27,15 +27,15 @@ pub struct CalibrationSigmas {
 
 impl Default for CalibrationSigmas {
     /// A calibrated camera whose clock and readout are not known: what alignment with the gyroscope leaves open of them after
-    /// a few seconds (rendered phones: 7 ms and 24 ms at worst), half a degree of its rotation and two centimetres of its place
-    /// (a target gives millimetres, a ruler centimetres; what is worse is told as a finding, and its prior widened). Gains as data
-    /// sheets of consumer parts state them.
+    /// a few seconds (rendered phones: 7 ms and 24 ms at worst), half a degree of its rotation and the 5 mm that a calibration with a
+    /// target leaves of its place (what is worse is told as a finding, and its prior widened). Gains as data sheets of consumer
+    /// parts state them.
     fn default() -> Self {
         Self {
             time_offset_secs: 1e-2,
             readout_secs: 2e-2,
             rotation_rad: 5e-3,
-            position_m: 0.02,
+            position_m: 0.005,
             focal: 0.0,
             principal_point_px: 0.0,
             distortion: 0.0,
