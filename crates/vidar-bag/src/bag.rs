@@ -5,7 +5,7 @@ use crate::db3::{self, Db3};
 use crate::error::BagError;
 use crate::file::BagFile;
 use crate::index::{Encoding, FileIndex, MessageRef, NO_CHUNK, Topic};
-use crate::message::{self, Message};
+use crate::message::{self, Header, Message};
 use crate::{mcap, metadata, ros1, sqlite};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -84,6 +84,9 @@ struct Cache {
 
 /// Decompressed chunks that are kept, bytes; the newest stays even when it is larger.
 const CACHE_BYTES: usize = 32 << 20;
+
+/// Bytes that hold stamp and frame of any message; names of frames are far shorter.
+const HEADER_BYTES: u64 = 1 << 10;
 
 /// Most files of one recording.
 const MAX_FILES: usize = 10_000;
@@ -199,18 +202,42 @@ impl Bag {
         message::decode(message_type, encoding, &bytes).map_err(|reason| self.bad_message(message, reason))
     }
 
+    /// Stamp and frame of one message. Of an image in a chunk without compression only the head is read.
+    pub fn header(&self, message: &MessageRef) -> Result<Header, BagError> {
+        let Some(topic) = self.topic_of(message) else { return Ok(Header::default()) };
+        if matches!(topic.encoding, Encoding::Ros1 | Encoding::Cdr) && !self.messages_are_compressed {
+            let head = self.first_bytes(message, HEADER_BYTES)?;
+            return message::header(topic.encoding, &topic.message_type, &head)
+                .map_err(|reason| self.bad_message(message, reason));
+        }
+        let header = match self.read(message)? {
+            Message::Image(m) => m.header,
+            Message::CompressedImage(m) | Message::CompressedVideo(m) => m.header,
+            Message::Imu(m) => m.header,
+            Message::CameraInfo(m) => m.header,
+            Message::Transforms(m) => m.into_iter().next().map(|t| t.parent).unwrap_or_default(),
+            Message::Poses(m) => m.into_iter().next().map(|p| p.header).unwrap_or_default(),
+        };
+        Ok(header)
+    }
+
     /// The serialised bytes of one message.
     pub fn bytes(&self, message: &MessageRef) -> Result<Vec<u8>, BagError> {
+        self.first_bytes(message, u64::MAX)
+    }
+
+    /// The first bytes of one message; `most` of them or more.
+    fn first_bytes(&self, message: &MessageRef, most: u64) -> Result<Vec<u8>, BagError> {
         let lost = || self.bad_message(message, "no message is where the index says".into());
         let part = self.parts.get(usize::from(message.file)).ok_or_else(lost)?;
         let found = if message.chunk == NO_CHUNK {
             match &part.container {
-                Container::Ros1(file) => ros1::message_at(file, message.offset),
-                Container::Mcap(file) => mcap::message_at(file, message.offset),
+                Container::Ros1(file) => ros1::message_at(file, message.offset, most),
+                Container::Mcap(file) => mcap::message_at(file, message.offset, most),
                 Container::Sqlite(db3) => db3.message(message.offset),
             }
         } else {
-            self.in_chunk(part, message).map_err(|e| match e {
+            self.in_chunk(part, message, most).map_err(|e| match e {
                 BagError::Malformed { found, .. } => self.bad_message(message, found),
                 other => other,
             })
@@ -222,7 +249,7 @@ impl Bag {
         Ok(bytes)
     }
 
-    fn in_chunk(&self, part: &Part, message: &MessageRef) -> Result<Option<Vec<u8>>, BagError> {
+    fn in_chunk(&self, part: &Part, message: &MessageRef, most: u64) -> Result<Option<Vec<u8>>, BagError> {
         let Some(&chunk) = part.chunks.get(message.chunk as usize) else { return Ok(None) };
         if chunk.compression == Compression::None {
             if message.offset >= chunk.stored {
@@ -230,8 +257,8 @@ impl Bag {
             }
             let offset = chunk.offset + message.offset;
             return match &part.container {
-                Container::Ros1(file) => ros1::message_at(file, offset),
-                Container::Mcap(file) => mcap::message_at(file, offset),
+                Container::Ros1(file) => ros1::message_at(file, offset, most),
+                Container::Mcap(file) => mcap::message_at(file, offset, most),
                 Container::Sqlite(_) => Ok(None),
             };
         }
@@ -251,8 +278,8 @@ impl Bag {
             }
         };
         Ok(match &part.container {
-            Container::Ros1(_) => ros1::message_in(&bytes, message.offset).map(<[u8]>::to_vec),
-            Container::Mcap(_) => mcap::message_in(&bytes, message.offset).map(<[u8]>::to_vec),
+            Container::Ros1(_) => ros1::message_in(&bytes, message.offset).map(|b| cut(b, most)),
+            Container::Mcap(_) => mcap::message_in(&bytes, message.offset).map(|b| cut(b, most)),
             Container::Sqlite(_) => None,
         })
     }
@@ -290,6 +317,12 @@ impl Bag {
             reason,
         }
     }
+}
+
+/// The first `most` bytes.
+fn cut(bytes: &[u8], most: u64) -> Vec<u8> {
+    let length = bytes.len().min(usize::try_from(most).unwrap_or(usize::MAX));
+    bytes[..length].to_vec()
 }
 
 fn open_file(path: &Path) -> Result<(BagFormat, Container, FileIndex), BagError> {

@@ -77,16 +77,25 @@ impl BagFile {
 /// Bytes read ahead while walking: some hundred small records, and far less than a chunk that is skipped.
 const WINDOW_BYTES: u64 = 64 << 10;
 
+/// Bytes read with the head of one message: an IMU sample of ROS has 320 and comes in one system call.
+pub(crate) const MESSAGE_AHEAD_BYTES: u64 = 1 << 10;
+
 /// Reads small pieces at growing offsets without one system call for each.
 pub(crate) struct Window<'a> {
     file: &'a BagFile,
+    ahead: u64,
     start: u64,
     bytes: Vec<u8>,
 }
 
 impl<'a> Window<'a> {
     pub(crate) fn new(file: &'a BagFile) -> Self {
-        Self { file, start: 0, bytes: Vec::new() }
+        Self::reading_ahead(file, WINDOW_BYTES)
+    }
+
+    /// For few reads near each other, such as one message.
+    pub(crate) fn reading_ahead(file: &'a BagFile, ahead: u64) -> Self {
+        Self { file, ahead, start: 0, bytes: Vec::new() }
     }
 
     /// The bytes from `offset`, or `None` where the file ends before.
@@ -95,7 +104,7 @@ impl<'a> Window<'a> {
             return Ok(None);
         };
         if offset < self.start || end > self.start + self.bytes.len() as u64 {
-            let wanted = length.max(WINDOW_BYTES).min(self.file.length - offset);
+            let wanted = length.max(self.ahead).min(self.file.length - offset);
             self.bytes = self.file.read(offset, wanted)?;
             self.start = offset;
         }

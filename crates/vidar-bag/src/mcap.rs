@@ -6,7 +6,7 @@
 use crate::bytes::Bytes;
 use crate::compression::{Compression, MAX_DECOMPRESSED_BYTES};
 use crate::error::BagError;
-use crate::file::{BagFile, Window};
+use crate::file::{BagFile, MESSAGE_AHEAD_BYTES, Window};
 use crate::index::{Chunk, Encoding, FileIndex, FileTopic, NO_CHUNK, cut_off, plain_type};
 use std::collections::BTreeMap;
 use vidar_core::Warning;
@@ -277,12 +277,14 @@ pub(crate) fn message_in(chunk: &[u8], offset: u64) -> Option<&[u8]> {
     if op == MESSAGE { body.get(MESSAGE_HEAD_BYTES as usize..) } else { None }
 }
 
-/// The bytes of the message whose record begins at `offset` of the file, where the chunk is not compressed.
-pub(crate) fn message_at(file: &BagFile, offset: u64) -> Result<Option<Vec<u8>>, BagError> {
-    let mut window = Window::new(file);
+/// The bytes of the message whose record begins at `offset` of the file, where the chunk is not compressed; at
+/// most the first `most` of them.
+pub(crate) fn message_at(file: &BagFile, offset: u64, most: u64) -> Result<Option<Vec<u8>>, BagError> {
+    let mut window = Window::reading_ahead(file, MESSAGE_AHEAD_BYTES);
     match head_at(&mut window, offset)? {
         Some((MESSAGE, length)) if length >= MESSAGE_HEAD_BYTES => {
-            file.read(offset + HEAD_BYTES + MESSAGE_HEAD_BYTES, length - MESSAGE_HEAD_BYTES).map(Some)
+            let (at, bytes) = (offset + HEAD_BYTES + MESSAGE_HEAD_BYTES, length - MESSAGE_HEAD_BYTES);
+            Ok(window.get(at, bytes.min(most))?.map(<[u8]>::to_vec))
         }
         _ => Ok(None),
     }

@@ -7,7 +7,7 @@
 use crate::bytes::Bytes;
 use crate::compression::{Compression, MAX_DECOMPRESSED_BYTES};
 use crate::error::BagError;
-use crate::file::{BagFile, Window};
+use crate::file::{BagFile, MESSAGE_AHEAD_BYTES, Window};
 use crate::index::{Chunk, Encoding, FileIndex, FileTopic, NO_CHUNK, cut_off, plain_type};
 use vidar_core::Warning;
 
@@ -313,12 +313,13 @@ pub(crate) fn message_in(chunk: &[u8], offset: u64) -> Option<&[u8]> {
     (fields.op == Some(OP_MESSAGE)).then_some(data)
 }
 
-/// The bytes of the message whose record begins at `offset` of the file, where the chunk is not compressed.
-pub(crate) fn message_at(file: &BagFile, offset: u64) -> Result<Option<Vec<u8>>, BagError> {
-    let mut window = Window::new(file);
+/// The bytes of the message whose record begins at `offset` of the file, where the chunk is not compressed; at
+/// most the first `most` of them.
+pub(crate) fn message_at(file: &BagFile, offset: u64, most: u64) -> Result<Option<Vec<u8>>, BagError> {
+    let mut window = Window::reading_ahead(file, MESSAGE_AHEAD_BYTES);
     let Some(head) = Head::read(&mut window, file, offset)? else { return Ok(None) };
     if head.fields.op != Some(OP_MESSAGE) {
         return Ok(None);
     }
-    file.read(head.data_at, u64::from(head.data_length)).map(Some)
+    Ok(window.get(head.data_at, u64::from(head.data_length).min(most))?.map(<[u8]>::to_vec))
 }

@@ -17,6 +17,9 @@ const LEAF_TABLE: u8 = 0x0d;
 /// Deepest tree: with two children a page, the largest file (2³² pages) has 32 levels.
 const MAX_DEPTH: usize = 32;
 
+/// Bytes read with the page of one row; the overflow pages of an image mostly follow each other.
+const ROW_AHEAD_BYTES: u64 = 16 << 10;
+
 /// An open database.
 #[derive(Debug)]
 pub(crate) struct Database {
@@ -178,7 +181,7 @@ impl Database {
 
     /// A whole row; `None` where its pages are missing.
     pub(crate) fn row(&self, place: RowPlace) -> Result<Option<Row>, BagError> {
-        let mut window = Window::new(&self.file);
+        let mut window = Window::reading_ahead(&self.file, ROW_AHEAD_BYTES);
         let Some(page) = self.page(&mut window, place.page)? else { return Ok(None) };
         let Some(cut) = TreePage::parse(&page, place.page)
             .filter(|t| t.rightmost.is_none())

@@ -185,6 +185,13 @@ pub fn decode(message_type: &str, encoding: Encoding, bytes: &[u8]) -> Result<Me
     }
 }
 
+/// Stamp and frame at the beginning of a message of ROS; the error is the reason as text.
+pub(crate) fn header(encoding: Encoding, message_type: &str, head: &[u8]) -> Result<Header, String> {
+    let mut wire = if encoding == Encoding::Ros1 { ros::Wire::ros1(head) } else { ros::Wire::cdr(head)? };
+    // Foxglove's messages begin with time and frame as ROS 2's header does, also in ROS 1.
+    if message_type.starts_with("foxglove") { wire.time_and_frame() } else { wire.header() }
+}
+
 /// A time of seconds and nanoseconds; what does not fit is as good as no stamp.
 fn stamp(secs: i64, nanos: i64) -> Timestamp {
     let total = secs.checked_mul(1_000_000_000).and_then(|s| s.checked_add(nanos)).unwrap_or(0);

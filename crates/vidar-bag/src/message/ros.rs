@@ -124,10 +124,14 @@ impl<'a> Wire<'a> {
         Ok(stamp(secs, i64::from(nanos)))
     }
 
-    fn header(&mut self) -> Read<Header> {
+    pub(super) fn header(&mut self) -> Read<Header> {
         if self.packing == Packing::Ros1 {
             self.u32("its sequence number")?;
         }
+        self.time_and_frame()
+    }
+
+    pub(super) fn time_and_frame(&mut self) -> Read<Header> {
         Ok(Header { stamp: self.time()?, frame: self.text("its frame_id")? })
     }
 
@@ -206,7 +210,7 @@ pub(super) fn decode(mut wire: Wire<'_>, message_type: &str) -> Read<Message> {
             Message::Poses(w.list(SMALLEST_POSE_BYTES, "poses", stamped_pose)?)
         }
         "foxglove_msgs/RawImage" => {
-            let (header, width, height) = (foxglove_header(w)?, w.u32("its width")?, w.u32("its height")?);
+            let (header, width, height) = (w.time_and_frame()?, w.u32("its width")?, w.u32("its height")?);
             let (encoding, row_bytes) = (w.text("its encoding")?, w.u32("its step")?);
             let data = w.byte_list("its data")?;
             Message::Image(RawImage {
@@ -220,7 +224,7 @@ pub(super) fn decode(mut wire: Wire<'_>, message_type: &str) -> Read<Message> {
             })
         }
         "foxglove_msgs/CompressedImage" | "foxglove_msgs/CompressedVideo" => {
-            let (header, data) = (foxglove_header(w)?, w.byte_list("its data")?);
+            let (header, data) = (w.time_and_frame()?, w.byte_list("its data")?);
             let image = CompressedImage { header, data, format: w.text("its format")? };
             if message_type.ends_with("Video") {
                 Message::CompressedVideo(image)
@@ -230,10 +234,6 @@ pub(super) fn decode(mut wire: Wire<'_>, message_type: &str) -> Read<Message> {
         }
         _ => return Err("messages of this type are not read".into()),
     })
-}
-
-fn foxglove_header(w: &mut Wire<'_>) -> Read<Header> {
-    Ok(Header { stamp: w.time()?, frame: w.text("its frame_id")? })
 }
 
 fn image(w: &mut Wire<'_>) -> Read<RawImage> {

@@ -52,11 +52,11 @@ fn fused_sensor_depth(dataset: &Dataset, config: &Config, events: &Events) -> Re
                         volume.integrate(&view)?;
                     }
                     Err(e) => events
-                        .warn(&Warning::degraded("depth-unreadable", e.to_string()).at(entry.path.display())),
+                        .warn(&Warning::degraded("depth-unreadable", e.to_string()).at(&entry.location)),
                 }
             }
             Err(e) => {
-                events.warn(&Warning::degraded("depth-unreadable", e.to_string()).at(entry.path.display()))
+                events.warn(&Warning::degraded("depth-unreadable", e.to_string()).at(&entry.location))
             }
         }
     }
