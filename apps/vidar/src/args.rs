@@ -139,7 +139,7 @@ const RUN_EXAMPLES: &str = "Examples:
 /// How the input is read.
 #[derive(Args, Clone, Debug, Default)]
 pub struct InputArgs {
-    /// Layout of the recording, instead of detecting it: euroc, tum-rgbd, 7scenes, posed-folder, bag, images.
+    /// Layout of the recording, instead of detecting it: euroc, tum-rgbd, 7scenes, posed-folder, bag, video, images.
     #[arg(long, help_heading = "Input")]
     pub format: Option<String>,
     /// Number of the camera (`cam0` is 0).

@@ -196,6 +196,7 @@ impl Dataset {
                     format!("{} {size} {time}\n", self.relative(path))
                 }
                 Location::Message { topic, number, .. } => format!("{topic} {number} {time}\n"),
+                Location::Frame { number, .. } => format!("frame {number} {time}\n"),
             };
             out.extend_from_slice(line.as_bytes());
         }

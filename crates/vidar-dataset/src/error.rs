@@ -166,6 +166,9 @@ pub enum DatasetError {
     /// A bag cannot be read.
     #[error(transparent)]
     Bag(#[from] vidar_bag::BagError),
+    /// A video cannot be read.
+    #[error(transparent)]
+    Video(#[from] vidar_video::VideoError),
     /// An option has an invalid value.
     #[error("{option}: found {found}, expected {expected}")]
     BadOption {

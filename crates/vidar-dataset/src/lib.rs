@@ -24,6 +24,7 @@ mod topics;
 mod trajectory_file;
 mod transforms;
 mod tum_rgbd;
+mod video;
 mod wrong_thing;
 
 pub use camera_flag::{CameraFlag, with_size};
@@ -70,6 +71,10 @@ fn open_file(path: &Path, options: &OpenOptions) -> Result<Dataset, DatasetError
         let reason = format!("its first bytes are those of {}", format.name());
         return bag::open(path, reason, options)?.finish(options);
     }
+    if vidar_video::is_video(&head) && !wrong_thing::is_picture(&head) {
+        let draft = video::open(path, "its first bytes are those of mp4 and mov".into(), options)?;
+        return draft.finish(options);
+    }
     Err(wrong_thing::describe(path, &head))
 }
 
@@ -100,6 +105,10 @@ fn try_kind(
         DatasetKind::PosedFolder => posed_folder::detect(path)
             .map_or(Ok(None), |reason| single(posed_folder::open(path, reason, options))),
         DatasetKind::Bag => bag::detect(path).map(|reason| bag::open(path, reason, options)).transpose(),
+        DatasetKind::Video => {
+            let found = video::only_one_in(path);
+            found.map(|(file, reason)| video::open(&file, reason, options)).transpose()
+        }
         DatasetKind::ImageFolder => image_folder::detect(path)
             .map_or(Ok(None), |(folder, reason)| single(image_folder::open(path, &folder, reason, options))),
     }

@@ -7,6 +7,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use vidar_bag::{Bag, BagError, Message, MessageRef, Pixels, Topic};
 use vidar_core::{FrameImage, Image, Timestamp};
+use vidar_video::Video;
 
 /// Where the pixels of an image lie.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -22,6 +23,13 @@ pub enum Location {
         /// The message's number in the topic, from 0, in the order of logging.
         number: u32,
     },
+    /// A frame of a video.
+    Frame {
+        /// The video.
+        video: Arc<Path>,
+        /// The frame's number, from 0, in the order of display.
+        number: u32,
+    },
 }
 
 impl Location {
@@ -30,6 +38,7 @@ impl Location {
         match self {
             Self::File(path) => path,
             Self::Message { bag, .. } => bag,
+            Self::Frame { video, .. } => video,
         }
     }
 
@@ -37,7 +46,7 @@ impl Location {
     pub fn as_file(&self) -> Option<&Path> {
         match self {
             Self::File(path) => Some(path),
-            Self::Message { .. } => None,
+            Self::Message { .. } | Self::Frame { .. } => None,
         }
     }
 
@@ -61,6 +70,7 @@ impl fmt::Display for Location {
         match self {
             Self::File(path) => write!(f, "{}", path.display()),
             Self::Message { bag, topic, number } => write!(f, "{} {topic} message {number}", bag.display()),
+            Self::Frame { video, number } => write!(f, "{} frame {number}", video.display()),
         }
     }
 }
@@ -74,6 +84,7 @@ pub(crate) fn files(list: Vec<(Timestamp, PathBuf)>) -> Vec<(Timestamp, Location
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Media {
     pub bag: Option<Arc<Bag>>,
+    pub video: Option<Arc<Video>>,
 }
 
 /// Depth as it is stored.
@@ -96,6 +107,9 @@ impl StoredDepth {
 impl Media {
     /// Decodes a grey or colour image.
     pub(crate) fn image(&self, location: &Location) -> Result<FrameImage, DatasetError> {
+        if let Location::Frame { number, .. } = location {
+            return Ok(self.video(location)?.frame(*number as usize)?);
+        }
         match self.message(location)? {
             None => decode::read_image(location.path(), &ImageLimits::default()),
             Some(message) => match pixels(&message).map_err(|reason| bad_image(location, reason))? {
@@ -119,6 +133,9 @@ impl Media {
 
     /// Columns and rows.
     pub(crate) fn size(&self, location: &Location) -> Result<(usize, usize), DatasetError> {
+        if let Location::Frame { .. } = location {
+            return Ok(self.video(location)?.size());
+        }
         match self.message(location)? {
             None => decode::read_size(location.path(), &ImageLimits::default()),
             Some(Message::Image(image)) => Ok((image.width as usize, image.height as usize)),
@@ -127,6 +144,10 @@ impl Media {
                 Pixels::Float(image) => Ok((image.width(), image.height())),
             },
         }
+    }
+
+    fn video(&self, location: &Location) -> Result<&Video, DatasetError> {
+        self.video.as_deref().ok_or_else(|| bad_image(location, "the recording is not open".into()))
     }
 
     /// The message at a location; `None` for a file.
@@ -142,7 +163,8 @@ impl Media {
     /// What identifies the recording that images lie in: names and sizes of its files.
     pub(crate) fn fingerprint(&self) -> Result<String, DatasetError> {
         let mut text = String::new();
-        for path in self.bag.iter().flat_map(|b| b.files()) {
+        let files = self.bag.iter().flat_map(|b| b.files()).chain(self.video.iter().map(|v| v.path()));
+        for path in files {
             let size = std::fs::metadata(path).map_err(io_error(path))?.len();
             let name = path.file_name().unwrap_or_default().to_string_lossy();
             text.push_str(&format!("{name} {size}\n"));

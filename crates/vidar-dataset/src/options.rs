@@ -19,14 +19,23 @@ pub enum DatasetKind {
     PosedFolder,
     /// A ROS 1 bag, a ROS 2 bag or an MCAP file.
     Bag,
+    /// An mp4 or mov, with the telemetry of an action camera where there is any.
+    Video,
     /// Images in one folder, with or without a file of times.
     ImageFolder,
 }
 
 impl DatasetKind {
     /// Every kind, in the order in which a path is tried.
-    pub const ALL: [Self; 6] =
-        [Self::EurocAsl, Self::TumRgbd, Self::SevenScenes, Self::PosedFolder, Self::Bag, Self::ImageFolder];
+    pub const ALL: [Self; 7] = [
+        Self::EurocAsl,
+        Self::TumRgbd,
+        Self::SevenScenes,
+        Self::PosedFolder,
+        Self::Bag,
+        Self::Video,
+        Self::ImageFolder,
+    ];
 
     /// The name used on the command line and in files.
     pub fn name(self) -> &'static str {
@@ -36,6 +45,7 @@ impl DatasetKind {
             Self::SevenScenes => "7scenes",
             Self::PosedFolder => "posed-folder",
             Self::Bag => "bag",
+            Self::Video => "video",
             Self::ImageFolder => "images",
         }
     }

@@ -40,7 +40,7 @@ pub(crate) fn describe(path: &Path, head: &[u8]) -> DatasetError {
         [0x89, b'P', b'N', b'G', ..] | [0xff, 0xd8, 0xff, ..] => {
             ("one image", "give the folder that holds all images; `vidar depth IMAGE` estimates depth of one")
         }
-        head if is_brand(head, &[b"heic", b"heix", b"mif1", b"msf1", b"heif", b"avif"]) => (
+        head if is_picture(head) => (
             "an HEIC image, which is not decoded",
             "export as JPEG: on a phone choose \"most compatible\" as the camera's format",
         ),
@@ -77,6 +77,11 @@ pub(crate) fn describe(path: &Path, head: &[u8]) -> DatasetError {
         ),
     };
     wrong(path, found.into(), way)
+}
+
+/// Whether an ISO media file holds pictures instead of a movie.
+pub(crate) fn is_picture(head: &[u8]) -> bool {
+    is_brand(head, &[b"heic", b"heix", b"mif1", b"msf1", b"heif", b"avif"])
 }
 
 /// Whether an ISO media file states one of these brands.

@@ -1,6 +1,6 @@
 //! Tracks of a movie: where each sample lies and when it is shown (ISO/IEC 14496-12, 8.6 and 8.7).
 
-use crate::boxes::{atoms, find, find_in, u16_at, u32_at, u64_at};
+use crate::boxes::{atoms, find, find_in, u32_at, u64_at};
 
 /// One sample: a coded picture, or a payload of telemetry.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -221,9 +221,4 @@ impl<'a> Runs<'a> {
         self.left -= 1;
         Some(self.value)
     }
-}
-
-/// Columns and rows that a visual sample entry states.
-pub(crate) fn entry_size(stsd_entry: &[u8]) -> Option<(u16, u16)> {
-    Some((u16_at(stsd_entry, 24)?, u16_at(stsd_entry, 26)?))
 }
