@@ -217,7 +217,7 @@ pub struct OutputArgs {
 /// `vidar run`.
 #[derive(Args, Clone, Debug)]
 pub struct RunArgs {
-    /// The recording: EuRoC, TUM RGB-D, 7-Scenes, a posed folder, or a folder of images.
+    /// The recording: a bag, a video, or a folder (EuRoC, TUM RGB-D, 7-Scenes, posed folder, images).
     #[arg(value_hint = ValueHint::AnyPath)]
     pub path: PathBuf,
     /// How the input is read.
@@ -332,7 +332,7 @@ pub struct CalibrateArgs {
 /// `vidar odometry`.
 #[derive(Args, Clone, Debug)]
 pub struct OdometryArgs {
-    /// The recording: images and an IMU, in EuRoC or TUM layout.
+    /// The recording: images and an IMU, as a bag, an action camera's video, or a folder.
     #[arg(value_hint = ValueHint::AnyPath)]
     pub path: PathBuf,
     /// Use the camera only, without the IMU: a trajectory up to scale.

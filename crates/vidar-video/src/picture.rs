@@ -39,6 +39,22 @@ impl Picture {
             && self.chroma.iter().all(|c| c.len() >= chroma && !c.is_empty())
     }
 
+    /// Without the columns and rows that only fill the last macroblocks, where the stream forgot to say so: the container then
+    /// states a size that is the decoded one before rounding up to 16.
+    pub(crate) fn without_filling(self, (width, height): (usize, usize)) -> Self {
+        let is_filled = |own: usize, stated: usize| stated > 0 && stated.next_multiple_of(16) == own;
+        let same = (width, height) == (self.width, self.height);
+        if same || !is_filled(self.width, width) || !is_filled(self.height, height) {
+            return self;
+        }
+        let cut = |plane: &[u8], own: usize, columns: usize, rows: usize| -> Vec<u8> {
+            plane.chunks_exact(own).take(rows).flat_map(|row| &row[..columns]).copied().collect()
+        };
+        let [x, y] = self.chroma_shift;
+        let chroma = self.chroma.map(|c| cut(&c, self.width >> x, width >> x, height >> y));
+        Self { luma: cut(&self.luma, self.width, width, height), chroma, width, height, ..self }
+    }
+
     /// Red, green and blue, turned clockwise by quarter turns.
     pub(crate) fn upright(&self, quarter_turns: u8) -> FrameImage {
         let (w, h) = (self.width, self.height);
@@ -121,6 +137,17 @@ mod tests {
         assert_eq!(greys(1), (2, vec![4, 0, 5, 1, 6, 2, 7, 3]));
         assert_eq!(greys(2), (4, vec![7, 6, 5, 4, 3, 2, 1, 0]));
         assert_eq!(greys(3), (2, vec![3, 7, 2, 6, 1, 5, 0, 4]));
+    }
+
+    #[test]
+    fn filling_of_macroblocks_is_cut_only_where_the_container_says_so() {
+        let full = Colours { is_full_range: true, is_bt709: true };
+        let filled = || picture((0..32 * 16).map(|i| (i % 32) as u8).collect(), 32, full);
+        let cut = filled().without_filling((22, 16));
+        assert_eq!((cut.width, cut.height, cut.luma.len(), cut.chroma[0].len()), (22, 16, 22 * 16, 11 * 8));
+        assert!(cut.is_whole() && cut.luma[22..44] == (0..22).collect::<Vec<u8>>());
+        assert_eq!(filled().without_filling((11, 16)).width, 32);
+        assert_eq!(filled().without_filling((0, 0)).width, 32);
     }
 
     #[test]

@@ -1,6 +1,6 @@
 //! Tracks of a movie: where each sample lies and when it is shown (ISO/IEC 14496-12, 8.6 and 8.7).
 
-use crate::boxes::{atoms, find, find_in, u32_at, u64_at};
+use crate::boxes::{atoms, find, find_in, u16_at, u32_at, u64_at};
 
 /// One sample: a coded picture, or a payload of telemetry.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -23,6 +23,8 @@ pub(crate) struct Track {
     pub codec: [u8; 4],
     /// The description of the codec: the boxes of its sample entry.
     pub entry: Vec<u8>,
+    /// Columns and rows that the container states for the pictures.
+    pub size: (usize, usize),
     /// Quarter turns clockwise by which pictures are shown.
     pub quarter_turns: u8,
     /// In the order of decoding.
@@ -59,11 +61,17 @@ pub(crate) fn read(trak: &[u8], movie_scale: u32) -> Result<Track, String> {
         handler,
         codec: entry.kind,
         entry: entry.content.get(VISUAL_ENTRY_BYTES..).unwrap_or_default().to_vec(),
+        size: (side_at(entry.content, 24), side_at(entry.content, 26)),
         quarter_turns: find(trak, b"tkhd").map_or(0, quarter_turns),
         samples,
         shown_from_ns: edits.empty_ns,
         has_complex_edits: edits.is_complex,
     })
+}
+
+/// A side of a visual sample entry; 0 where there is none.
+fn side_at(entry: &[u8], at: usize) -> usize {
+    u16_at(entry, at).map_or(0, usize::from)
 }
 
 /// Ticks per second in `mdhd` and `mvhd`.

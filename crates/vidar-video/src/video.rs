@@ -200,6 +200,7 @@ impl Video {
                 Ok(pictures) => {
                     let came = pictures.iter().any(|(sample, _)| *sample == wanted);
                     for (sample, picture) in pictures {
+                        let picture = picture.without_filling(self.tracks[self.video].size);
                         state.recent.push_back((sample, Arc::new(picture)));
                     }
                     state.keep_few();

@@ -50,7 +50,10 @@ fn check(name: &str) {
         let found = quarters(&video.frame(number).unwrap());
         for (i, value) in found.iter().enumerate() {
             let truth = expected["quarters"][number][i].as_f64().unwrap();
-            assert!((value - truth).abs() < TOLERANCE, "{name} frame {number} value {i}: {value:.2} for {truth:.2}");
+            assert!(
+                (value - truth).abs() < TOLERANCE,
+                "{name} frame {number} value {i}: {value:.2} for {truth:.2}"
+            );
         }
     }
 }
@@ -91,7 +94,10 @@ fn a_clip_that_was_cut_off_says_so() {
     let whole = std::fs::read(fixture("h264.mp4")).unwrap();
     std::fs::write(&path, &whole[..whole.len() - 200]).unwrap();
     let error = Video::open(&path).unwrap_err();
-    assert!(matches!(&error, VideoError::Unsupported { .. }) && error.to_string().contains("moov"), "{error}");
+    assert!(
+        matches!(&error, VideoError::Unsupported { .. }) && error.to_string().contains("moov"),
+        "{error}"
+    );
 }
 
 proptest! {
