@@ -55,6 +55,10 @@ fn take_telemetry(draft: &mut Draft, telemetry: Telemetry) {
     );
     let warning = Warning::new("telemetry", message).at(&place);
     draft.warnings.push(warning.hint("`vidar calibrate` finds camera, rotation and clock"));
+    if telemetry.units != ["rad/s", "m/s\u{b2}"] {
+        let message = format!("the telemetry's units are {:?}; rad/s and m/s² are assumed", telemetry.units);
+        draft.warnings.push(Warning::degraded("telemetry-units", message).at(&place));
+    }
     if !telemetry.axes_are_stated {
         let message =
             "the telemetry does not state its axes; those published for the first cameras (Z, X, Y) are used";

@@ -47,7 +47,8 @@ fn entries(mut bytes: &[u8]) -> impl Iterator<Item = Entry<'_>> {
 
 impl Entry<'_> {
     fn text(&self) -> String {
-        let text = String::from_utf8_lossy(self.data);
+        // Type `c` is Latin-1: "m/s²" has one byte for its square.
+        let text: String = self.data.iter().map(|&b| char::from(b)).collect();
         vidar_core::printable(text.trim_matches(['\0', ' '])).into_owned()
     }
 

@@ -6,7 +6,7 @@ use crate::error::VideoError;
 use crate::gpmf::{self, Telemetry};
 use crate::picture::Picture;
 use crate::track::{self, Sample, Track};
-use std::collections::VecDeque;
+use std::collections::{HashSet, VecDeque};
 use std::fmt;
 use std::fs::File;
 use std::io::{Read, Seek, SeekFrom};
@@ -41,6 +41,9 @@ struct Frame {
 struct State {
     decoder: Option<Decoder>,
     next: usize,
+    /// Samples whose pictures came out since the decoder was started at the sample `start`.
+    start: usize,
+    out: HashSet<usize>,
     recent: VecDeque<(usize, Arc<Picture>)>,
 }
 
@@ -183,11 +186,17 @@ impl Video {
         if let Some((_, picture)) = state.recent.iter().find(|(sample, _)| *sample == wanted) {
             return Ok(Arc::clone(picture));
         }
-        let start = (0..=wanted).rev().find(|&i| samples[i].is_sync).unwrap_or(0);
-        // On from where the decoder is, unless a picture that stands alone lies between.
-        if state.decoder.is_none() || state.next > wanted || state.next < start {
+        // A picture that is shown before the one that stands alone, and stored after it, needs the pictures before both.
+        let stands_before = |i: &usize| samples[*i].is_sync && samples[*i].time_ns <= samples[wanted].time_ns;
+        let start = (0..=wanted).rev().find(stands_before).unwrap_or(0);
+        // On from where the decoder is, unless a picture that stands alone lies between. A picture that it was given and that
+        // has not come out is still held back.
+        let is_ahead = (start..=wanted).contains(&state.next);
+        let is_inside = state.start <= wanted && wanted < state.next && !state.out.contains(&wanted);
+        if state.decoder.is_none() || !is_ahead && !is_inside {
             state.decoder = Some(Decoder::start(&self.codec)?);
-            state.next = start;
+            (state.start, state.next) = (start, start);
+            state.out.clear();
         }
         let mut reason = "the decoder gave no picture for it".to_string();
         let last = samples.len().min(wanted + 1 + MOST_HELD_BACK);
@@ -201,6 +210,7 @@ impl Video {
                     let came = pictures.iter().any(|(sample, _)| *sample == wanted);
                     for (sample, picture) in pictures {
                         let picture = picture.without_filling(self.tracks[self.video].size);
+                        state.out.insert(sample);
                         state.recent.push_back((sample, Arc::new(picture)));
                     }
                     state.keep_few();
