@@ -11,7 +11,9 @@ const LAYERS: &[(&str, &[&str])] = &[
     ("vidar-gpu", &[]),
     ("vidar-hub", &[]),
     ("vidar-solve", &["vidar-core"]),
-    ("vidar-dataset", &["vidar-core"]),
+    ("vidar-bag", &["vidar-core"]),
+    ("vidar-video", &["vidar-core"]),
+    ("vidar-dataset", &["vidar-core", "vidar-bag", "vidar-video"]),
     ("vidar-odometry", &["vidar-core", "vidar-solve"]),
     ("vidar-da3", &["vidar-core", "vidar-nn", "vidar-gpu", "vidar-solve"]),
     ("vidar-stereo", &["vidar-core"]),
@@ -34,6 +36,9 @@ const RESERVED: &[(&str, &[&str], &str)] = &[
     ("kiddo", &["vidar-eval"], "nearest neighbours are searched in one place"),
     ("ureq", &["vidar-hub"], "the network is used in one place, and only when asked for"),
     ("wgpu", &["vidar-gpu"], "graphics processors are used in one place"),
+    ("ruzstd", &["vidar-bag"], "recordings are decompressed in one place, within bounds"),
+    ("lz4_flex", &["vidar-bag"], "recordings are decompressed in one place, within bounds"),
+    ("re_mp4", &["vidar-video"], "videos are read in one place"),
     ("zip", &["vidar-export"], "archives are read and written in one place, within bounds"),
 ];
 

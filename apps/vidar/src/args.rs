@@ -139,7 +139,7 @@ const RUN_EXAMPLES: &str = "Examples:
 /// How the input is read.
 #[derive(Args, Clone, Debug, Default)]
 pub struct InputArgs {
-    /// Layout of the recording, instead of detecting it: euroc, tum-rgbd, 7scenes, posed-folder, images.
+    /// Layout of the recording, instead of detecting it: euroc, tum-rgbd, 7scenes, posed-folder, bag, video, images.
     #[arg(long, help_heading = "Input")]
     pub format: Option<String>,
     /// Number of the camera (`cam0` is 0).
@@ -148,6 +148,9 @@ pub struct InputArgs {
     /// Calibration: EuRoC sensor.yaml, Kalibr camchain or imu yaml. Repeatable.
     #[arg(long, value_hint = ValueHint::FilePath, help_heading = "Input")]
     pub calibration: Vec<PathBuf>,
+    /// Topic of a bag to use: NAME for images, depth or IMU; truth=NAME or trajectory=NAME for poses. Repeatable.
+    #[arg(long = "topic", value_name = "NAME", action = ArgAction::Append, help_heading = "Input")]
+    pub topics: Vec<String>,
     /// Camera model of the images: pinhole:fx,fy,cx,cy  radtan:…,k1,k2,p1,p2(,k3)  kb4:…,k1,k2,k3,k4  ds:…,xi,alpha  fov:…,w.
     #[arg(long, allow_hyphen_values = true, help_heading = "Input")]
     pub camera_model: Option<String>,
@@ -214,7 +217,7 @@ pub struct OutputArgs {
 /// `vidar run`.
 #[derive(Args, Clone, Debug)]
 pub struct RunArgs {
-    /// The recording: EuRoC, TUM RGB-D, 7-Scenes, a posed folder, or a folder of images.
+    /// The recording: a bag, a video, or a folder (EuRoC, TUM RGB-D, 7-Scenes, posed folder, images).
     #[arg(value_hint = ValueHint::AnyPath)]
     pub path: PathBuf,
     /// How the input is read.
@@ -329,7 +332,7 @@ pub struct CalibrateArgs {
 /// `vidar odometry`.
 #[derive(Args, Clone, Debug)]
 pub struct OdometryArgs {
-    /// The recording: images and an IMU, in EuRoC or TUM layout.
+    /// The recording: images and an IMU, as a bag, an action camera's video, or a folder.
     #[arg(value_hint = ValueHint::AnyPath)]
     pub path: PathBuf,
     /// Use the camera only, without the IMU: a trajectory up to scale.

@@ -111,6 +111,7 @@ pub fn open_options(input: &InputArgs) -> Result<OpenOptions, Error> {
         camera: CameraId(input.camera.unwrap_or(0)),
         ..OpenOptions::default()
     };
+    options.topics = input.topics.iter().map(|t| t.parse()).collect::<Result<_, _>>()?;
     options.format = input.format.as_deref().map(str::parse).transpose()?;
     options.trajectory_format = input.trajectory_format.as_deref().map(str::parse).transpose()?;
     options.time_unit = input.time_unit.as_deref().map(str::parse).transpose()?;

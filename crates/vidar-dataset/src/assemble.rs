@@ -1,9 +1,9 @@
 //! Small steps of completing a dataset: its name, existing files, a guessed camera, the selected part.
 
 use crate::dataset::{CalibrationSource, DEPTH_TOLERANCE, Dataset, ImageEntry};
-use crate::decode::{self, ImageLimits};
 use crate::draft::image_range;
 use crate::error::{DatasetError, io_error};
+use crate::location::{Location, Media};
 use crate::options::OpenOptions;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -12,6 +12,8 @@ use vidar_core::{CameraModel, Duration, Pinhole, Timestamp, Warning};
 /// The last meaningful part of the root's path: not `mav0`, and `seq-01` only together with its parent folder.
 pub(crate) fn name_of(root: &Path) -> String {
     let absolute = root.canonicalize().unwrap_or_else(|_| root.to_path_buf());
+    // A recording in one file is called as the file is, without its ending.
+    let absolute = if absolute.is_file() { absolute.with_extension("") } else { absolute };
     let parts = absolute.components().rev().filter_map(|c| match c {
         std::path::Component::Normal(part) => Some(part.to_string_lossy().into_owned()),
         _ => None,
@@ -26,18 +28,23 @@ pub(crate) fn name_of(root: &Path) -> String {
 
 /// Skips missing and empty files, with a warning.
 pub(crate) fn keep_existing(
-    files: &mut Vec<(Timestamp, PathBuf)>,
+    files: &mut Vec<(Timestamp, Location)>,
     what: &str,
     place: &Path,
     notes: &mut Vec<Warning>,
 ) -> Result<(), DatasetError> {
     let (mut missing, mut empty) = (Vec::new(), Vec::new());
     let mut kept = Vec::with_capacity(files.len());
-    for (time, path) in files.drain(..) {
+    for (time, location) in files.drain(..) {
+        // The messages of an open recording exist.
+        let Location::File(path) = location else {
+            kept.push((time, location));
+            continue;
+        };
         match std::fs::metadata(&path) {
             Ok(found) if !found.is_file() => missing.push(path),
             Ok(found) if found.len() == 0 => empty.push(path),
-            Ok(_) => kept.push((time, path)),
+            Ok(_) => kept.push((time, Location::File(path))),
             Err(e) if e.kind() == std::io::ErrorKind::NotFound => missing.push(path),
             Err(e) => return Err(io_error(&path)(e)),
         }
@@ -60,14 +67,19 @@ pub(crate) fn keep_existing(
 /// they are reported when they are loaded.
 pub(crate) fn keep_one_size(
     images: &mut Vec<ImageEntry>,
+    media: &Media,
     place: &Path,
     notes: &mut Vec<Warning>,
 ) -> Result<(usize, usize), DatasetError> {
-    let limits = ImageLimits::default();
+    // One stream of a recording has one size; to look at each image would read the whole recording. An image that
+    // differs is reported when it is loaded.
+    if let Some(entry) = images.first().filter(|e| e.location.as_file().is_none()) {
+        return media.size(&entry.location);
+    }
     let mut first_error = None;
     let mut sizes = Vec::with_capacity(images.len());
     for (number, entry) in images.iter().enumerate() {
-        match decode::read_size(&entry.path, &limits) {
+        match media.size(&entry.location) {
             Ok(size) => sizes.push(Some(size)),
             Err(e) => {
                 sizes.push(None);
@@ -103,10 +115,10 @@ pub(crate) fn keep_one_size(
             "{count} images are {}x{}, {others} are not and are left out; the first is {width}x{height}",
             kept.0, kept.1
         );
-        let path = &images[first].path;
+        let location = &images[first].location;
         notes.push(
             Warning::degraded("image-size", message)
-                .at(path.display())
+                .at(location)
                 .hint(format!("images of one recording have one size; {} lists them", place.display())),
         );
         let mut sizes = sizes.iter();

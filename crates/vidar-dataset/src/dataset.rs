@@ -1,8 +1,8 @@
 //! The dataset that every reader returns.
 
-use crate::decode::{self, ImageLimits};
 use crate::error::{DatasetError, io_error};
 use crate::events::Events;
+use crate::location::{Location, Media, StoredDepth};
 use crate::options::DatasetKind;
 use std::io::Write;
 use std::path::{Path, PathBuf};
@@ -21,8 +21,8 @@ pub struct ImageEntry {
     pub time: Timestamp,
     /// Which camera took it.
     pub camera: CameraId,
-    /// Its file.
-    pub path: PathBuf,
+    /// Where its pixels lie.
+    pub location: Location,
 }
 
 /// One depth image.
@@ -30,8 +30,8 @@ pub struct ImageEntry {
 pub struct DepthEntry {
     /// When it was taken, in the dataset's clock.
     pub time: Timestamp,
-    /// Its file, a 16-bit grey PNG.
-    pub path: PathBuf,
+    /// Where it lies: a 16-bit grey PNG, or a message of 16-bit numbers or of metres.
+    pub location: Location,
 }
 
 /// The depth camera.
@@ -72,6 +72,8 @@ pub struct ExternalTrajectory {
 pub enum CalibrationSource {
     /// A calibration file.
     File(PathBuf),
+    /// A topic of the recording, such as ROS's `CameraInfo`.
+    Topic(String),
     /// The user's flags.
     Flags,
     /// What is published for this kind of dataset; a warning says so.
@@ -123,6 +125,8 @@ pub struct Dataset {
     pub text_files: Vec<PathBuf>,
     /// Whether image times are invented, because there are none: intervals and rates then mean nothing.
     pub times_are_invented: bool,
+    /// The open recording that images lie in.
+    pub(crate) media: Media,
 }
 
 /// An image and the depth image nearest in time count as one moment when no further apart than this: the
@@ -132,10 +136,10 @@ pub const DEPTH_TOLERANCE: Duration = Duration::from_millis(20);
 impl Dataset {
     /// Reads the pixels of an image; its size must be its camera's.
     pub fn load_image(&self, entry: &ImageEntry) -> Result<FrameImage, DatasetError> {
-        let image = decode::read_image(&entry.path, &ImageLimits::default())?;
+        let image = self.media.image(&entry.location)?;
         if let Some(camera) = self.rig.camera(entry.camera) {
             let expected = (camera.model.width(), camera.model.height());
-            check_size(&entry.path, (image.width(), image.height()), expected)?;
+            check_size(&entry.location, (image.width(), image.height()), expected)?;
         }
         Ok(image)
     }
@@ -143,16 +147,21 @@ impl Dataset {
     /// Reads a depth image as z-depth in metres, NaN where there is none, in the depth camera's pixels; distortion
     /// is taken out.
     pub fn load_depth(&self, entry: &DepthEntry) -> Result<MetricDepth, DatasetError> {
-        let raw = decode::read_depth(&entry.path, &ImageLimits::default())?;
+        let raw = self.media.depth(&entry.location)?;
         let Some(sensor) = &self.depth_sensor else {
             return Err(DatasetError::BadImage {
-                path: entry.path.clone(),
+                path: entry.location.place(),
                 reason: "the dataset has no depth camera to interpret it with".into(),
             });
         };
         let expected = (sensor.intrinsics.width, sensor.intrinsics.height);
-        check_size(&entry.path, (raw.width(), raw.height()), expected)?;
-        Ok(MetricDepth::new(sensor.rectified(sensor.to_metres(&raw))))
+        check_size(&entry.location, raw.size(), expected)?;
+        let metres = match raw {
+            StoredDepth::Units(raw) => sensor.to_metres(&raw),
+            // ROS marks what is too near or too far by infinities, other writers by zero.
+            StoredDepth::Metres(raw) => raw.map(|&m| if m.is_finite() && m > 0.0 { m } else { f32::NAN }),
+        };
+        Ok(MetricDepth::new(sensor.rectified(metres)))
     }
 
     /// The depth image of the moment `time`: the nearest within [`DEPTH_TOLERANCE`].
@@ -174,17 +183,37 @@ impl Dataset {
     }
 
     /// Writes the bytes to hash for a fingerprint of the dataset: name and size of every image and depth image, and every byte
-    /// of every text file that was read. Two datasets with equal fingerprints give the same data.
+    /// of every text file that was read; of bags and videos name and size, and every IMU sample. Two datasets with equal
+    /// fingerprints give the same data, but for images of equal size in files of equal size.
     pub fn write_fingerprint(&self, out: &mut dyn Write) -> Result<(), DatasetError> {
         let say = |out: &mut dyn Write, text: String, path: &Path| {
             out.write_all(text.as_bytes()).map_err(io_error(path))
         };
         say(out, format!("vidar-dataset 1 {} camera {}\n", self.kind, self.camera), &self.root)?;
-        let images = self.images.iter().map(|e| (e.time, &e.path));
-        let depths = self.depths.iter().map(|e| (e.time, &e.path));
-        for (time, path) in images.chain(depths) {
-            let size = std::fs::metadata(path).map_err(io_error(path))?.len();
-            say(out, format!("{} {size} {time}\n", self.relative(path)), path)?;
+        let media = self.media.fingerprint()?;
+        if !media.is_empty() {
+            say(out, media, &self.root)?;
+            for s in &self.imu {
+                let [w, a] = [s.gyro.0, s.accel.0];
+                say(
+                    out,
+                    format!("{} {} {} {} {} {} {}\n", s.time, w.x, w.y, w.z, a.x, a.y, a.z),
+                    &self.root,
+                )?;
+            }
+        }
+        let images = self.images.iter().map(|e| (e.time, &e.location));
+        let depths = self.depths.iter().map(|e| (e.time, &e.location));
+        for (time, location) in images.chain(depths) {
+            let line = match location {
+                Location::File(path) => {
+                    let size = std::fs::metadata(path).map_err(io_error(path))?.len();
+                    format!("{} {size} {time}\n", self.relative(path))
+                }
+                Location::Message { topic, number, .. } => format!("{topic} {number} {time}\n"),
+                Location::Frame { number, .. } => format!("frame {number} {time}\n"),
+            };
+            say(out, line, &self.root)?;
         }
         for path in &self.text_files {
             let mut file = std::fs::File::open(path).map_err(io_error(path))?;
@@ -224,12 +253,16 @@ impl DepthSensor {
     }
 }
 
-fn check_size(path: &Path, found: (usize, usize), expected: (usize, usize)) -> Result<(), DatasetError> {
+fn check_size(
+    location: &Location,
+    found: (usize, usize),
+    expected: (usize, usize),
+) -> Result<(), DatasetError> {
     if found == expected {
         return Ok(());
     }
     Err(DatasetError::WrongImageSize {
-        path: path.to_path_buf(),
+        path: location.place(),
         found_width: found.0,
         found_height: found.1,
         expected_width: expected.0,

@@ -4,8 +4,8 @@ use crate::assemble::{cut, guessed_model, keep_existing, keep_one_size, name_of}
 use crate::camera_flag::with_size;
 use crate::checks::{self, IMAGE_GAP_FLOOR};
 use crate::dataset::{CalibrationSource, Dataset, DepthEntry, DepthSensor, ExternalTrajectory, ImageEntry};
-use crate::decode::{self, ImageLimits};
 use crate::error::DatasetError;
+use crate::location::{Location, Media};
 use crate::options::{DatasetKind, OpenOptions};
 use crate::parse::{self, Source};
 use crate::rig_checks;
@@ -69,18 +69,22 @@ pub(crate) struct Draft {
     pub chosen: usize,
     /// The file or folder that lists the images.
     pub image_list: PathBuf,
-    pub images: Vec<(Timestamp, PathBuf)>,
+    pub images: Vec<(Timestamp, Location)>,
     pub imu: Vec<ImuSample>,
     pub imu_noise: Option<ImuNoise>,
     pub accelerometer: Vec<crate::dataset::AccelSample>,
-    pub depths: Vec<(Timestamp, PathBuf)>,
+    pub depths: Vec<(Timestamp, Location)>,
     pub depth: Option<DraftDepth>,
     pub ground_truth: Option<(Trajectory, PathBuf)>,
+    /// A metric trajectory inside the recording that the user names.
+    pub trajectory: Option<(Trajectory, PathBuf)>,
     pub reference_cloud: Option<PathBuf>,
     pub warnings: Vec<Warning>,
     pub text_files: Vec<PathBuf>,
     /// Image times are made from frame numbers.
     pub times_are_invented: bool,
+    /// The open recording that images lie in.
+    pub media: Media,
 }
 
 impl Draft {
@@ -99,10 +103,12 @@ impl Draft {
             depths: Vec::new(),
             depth: None,
             ground_truth: None,
+            trajectory: None,
             reference_cloud: None,
             warnings: Vec::new(),
             text_files: Vec::new(),
             times_are_invented: false,
+            media: Media::default(),
         }
     }
 
@@ -142,6 +148,7 @@ impl Draft {
             warnings: std::mem::take(&mut self.warnings),
             text_files: std::mem::take(&mut self.text_files),
             times_are_invented: self.times_are_invented,
+            media: self.media.clone(),
         };
         let root = self.root.clone();
         let notes = &mut dataset.warnings;
@@ -186,7 +193,7 @@ impl Draft {
         let camera = CameraId(self.chosen as u32);
         let numbered = images.into_iter().enumerate();
         Ok(numbered
-            .map(|(i, (time, path))| ImageEntry { frame_id: FrameId(i as u32), time, camera, path })
+            .map(|(i, (time, location))| ImageEntry { frame_id: FrameId(i as u32), time, camera, location })
             .collect())
     }
 
@@ -214,7 +221,7 @@ impl Draft {
         options: &OpenOptions,
         images: &mut Vec<ImageEntry>,
     ) -> Result<(), DatasetError> {
-        let size = keep_one_size(images, &self.image_list, &mut self.warnings)?;
+        let size = keep_one_size(images, &self.media, &self.image_list, &mut self.warnings)?;
         let Some(first) = images.first() else { return Ok(()) };
         let camera = &mut self.cameras[self.chosen];
         if let Some(model) = &options.camera_model {
@@ -224,7 +231,7 @@ impl Draft {
             Some(model) => model,
             None => {
                 let (model, source, warning) = tum_rgbd::published_model(&self.root, self.kind, size)
-                    .map_or_else(|| guessed_model(size, &first.path), Ok)?;
+                    .map_or_else(|| guessed_model(size, first.location.path()), Ok)?;
                 self.warnings.push(warning);
                 camera.source = source;
                 model
@@ -247,7 +254,7 @@ impl Draft {
         };
         if (model.width(), model.height()) != size {
             return Err(DatasetError::WrongImageSize {
-                path: first.path.clone(),
+                path: first.location.place(),
                 found_width: size.0,
                 found_height: size.1,
                 expected_width: model.width(),
@@ -342,10 +349,10 @@ impl Draft {
         keep_existing(&mut depths, "depth images", &self.root, notes)?;
         checks::put_in_order(&mut depths, |d| d.0, "depth images", &self.root, notes);
         let Some((_, first)) = depths.first() else { return Ok(()) };
-        let (width, height) = decode::read_size(first, &ImageLimits::default())?;
+        let (width, height) = self.media.size(first)?;
         let Some(camera) = dataset.rig.camera(dataset.camera) else { return Ok(()) };
         let bad = |key: &str| {
-            let (path, key) = (first.clone(), key.to_string());
+            let (path, key) = (first.place(), key.to_string());
             move |source| DatasetError::BadCamera { path, key, source }
         };
         let intrinsics = match options.depth_intrinsics.or(depth.intrinsics) {
@@ -408,7 +415,7 @@ impl Draft {
             color_from_depth,
             invalid: depth.invalid,
         });
-        dataset.depths = depths.into_iter().map(|(time, path)| DepthEntry { time, path }).collect();
+        dataset.depths = depths.into_iter().map(|(time, location)| DepthEntry { time, location }).collect();
         Ok(())
     }
 
@@ -417,7 +424,14 @@ impl Draft {
         options: &OpenOptions,
         dataset: &mut Dataset,
     ) -> Result<(), DatasetError> {
-        let Some(path) = &options.trajectory else { return Ok(()) };
+        let Some(path) = &options.trajectory else {
+            if let Some((trajectory, source)) = self.trajectory.take() {
+                let range = image_range(&dataset.images);
+                checks::check_overlap(range, &trajectory, "trajectory", &source, &mut dataset.warnings);
+                dataset.external_trajectory = Some(ExternalTrajectory { trajectory, source });
+            }
+            return Ok(());
+        };
         let bytes = crate::source::read_text_file(path)?;
         let read = crate::TrajectoryReadOptions {
             format: options.trajectory_format,

@@ -143,6 +143,32 @@ pub enum DatasetError {
         /// Times known.
         times: usize,
     },
+    /// A recording holds several topics of one kind, or not the one that was named.
+    #[error("{}: {problem}; its topics:\n{topics}", path.display())]
+    Topics {
+        /// The recording.
+        path: PathBuf,
+        /// What is not clear, or missing.
+        problem: String,
+        /// Every topic with its type and count, a line each.
+        topics: String,
+    },
+    /// The path is something that is known and is not a recording.
+    #[error("{}: {found}; {way}", path.display())]
+    WrongThing {
+        /// What was given.
+        path: PathBuf,
+        /// What it is.
+        found: String,
+        /// The nearest way to a map.
+        way: String,
+    },
+    /// A bag cannot be read.
+    #[error(transparent)]
+    Bag(#[from] vidar_bag::BagError),
+    /// A video cannot be read.
+    #[error(transparent)]
+    Video(#[from] vidar_video::VideoError),
     /// An option has an invalid value.
     #[error("{option}: found {found}, expected {expected}")]
     BadOption {

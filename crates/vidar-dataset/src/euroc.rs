@@ -7,6 +7,7 @@ use crate::dataset::CalibrationSource;
 use crate::draft::{Draft, DraftCamera, DraftDepth};
 use crate::error::{DatasetError, io_error};
 use crate::folder::{images_in, names_in};
+use crate::location;
 use crate::options::{DatasetKind, OpenOptions, TimeUnit, TrajectoryFormat, TrajectoryReadOptions};
 use crate::parse::{self, EurocSensor, Source, UnitRule};
 use crate::trajectory_file::{ReadPoses, read_poses};
@@ -206,7 +207,7 @@ fn read_images(draft: &mut Draft, folder: &Path, options: &OpenOptions) -> Resul
     let list = folder.join("data.csv");
     let data = folder.join("data");
     draft.image_list = list.clone();
-    draft.images = if list.is_file() {
+    let images = if list.is_file() {
         let bytes = draft.read(&list)?;
         let rule = UnitRule::given_or(options.time_unit, TimeUnit::Nanoseconds);
         let (files, notes) = parse::file_list(&Source { path: &list, bytes: &bytes }, rule)?;
@@ -215,6 +216,7 @@ fn read_images(draft: &mut Draft, folder: &Path, options: &OpenOptions) -> Resul
     } else {
         list_by_names(draft, &data)?
     };
+    draft.images = location::files(images);
     Ok(())
 }
 
@@ -285,7 +287,7 @@ fn read_depth(draft: &mut Draft, body_from_imu: &Se3, options: &OpenOptions) -> 
     let (files, notes) = parse::file_list(&Source { path: &list, bytes: &bytes }, rule)?;
     draft.warnings.extend(notes);
     let data = folder.join("data");
-    draft.depths = files.into_iter().map(|f| (f.time, data.join(f.name))).collect();
+    draft.depths = files.into_iter().map(|f| (f.time, data.join(f.name).into())).collect();
     let sensor = read_sensor(draft, &folder)?.map(|(s, _)| s);
     let model = sensor.as_ref().and_then(|s| s.camera.as_ref()).map(|c| c.model.clone());
     let body_from_depth = sensor.as_ref().and_then(|s| s.body_from_sensor);

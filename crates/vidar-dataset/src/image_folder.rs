@@ -6,6 +6,7 @@ use crate::error::DatasetError;
 use crate::folder::{
     MAX_NAME_STEP, first_file, images_in, names_in, numbers_of, stem, synthetic_time, synthetic_warning,
 };
+use crate::location::files;
 use crate::options::{DatasetKind, OpenOptions};
 use crate::parse::units::decide_unit;
 use crate::parse::{self, Source, UnitRule};
@@ -47,10 +48,11 @@ pub(crate) fn open(
             expected: "(.png, .jpg, .jpeg in any case)".into(),
         });
     }
-    draft.images = match find_times(path, options).or_else(|| find_times(folder, options)) {
+    let images = match find_times(path, options).or_else(|| find_times(folder, options)) {
         Some(list) => images_by_list(&mut draft, folder, &names, &list, options)?,
         None => images_by_name(&mut draft, folder, &names, options),
     };
+    draft.images = files(images);
     read_intrinsics(&mut draft, folder)?;
     Ok(draft)
 }

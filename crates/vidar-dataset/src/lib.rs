@@ -1,6 +1,7 @@
 #![doc = include_str!("../README.md")]
 
 mod assemble;
+mod bag;
 mod calibration;
 pub mod camera_flag;
 mod checks;
@@ -12,14 +13,19 @@ mod euroc;
 mod events;
 mod folder;
 mod image_folder;
+mod location;
 mod options;
 pub mod parse;
 mod posed_folder;
 mod rig_checks;
 mod seven_scenes;
 mod source;
+mod topics;
 mod trajectory_file;
+mod transforms;
 mod tum_rgbd;
+mod video;
+mod wrong_thing;
 
 pub use camera_flag::{CameraFlag, with_size};
 pub use checks::{gain_error_at_rest, specific_force_at_rest};
@@ -28,7 +34,10 @@ pub use dataset::{
     ImageEntry,
 };
 pub use error::DatasetError;
-pub use options::{DatasetKind, OpenOptions, TimeUnit, TrajectoryFormat, TrajectoryReadOptions};
+pub use location::Location;
+pub use options::{
+    DatasetKind, OpenOptions, PoseUse, TimeUnit, TopicFlag, TrajectoryFormat, TrajectoryReadOptions,
+};
 
 pub use trajectory_file::{read_times, read_trajectory, trajectory_from};
 
@@ -40,11 +49,7 @@ use std::path::Path;
 pub fn open(path: &Path, options: &OpenOptions) -> Result<Dataset, DatasetError> {
     options.validate()?;
     if !path.is_dir() {
-        let found = match std::fs::metadata(path) {
-            Ok(_) => "a file".to_string(),
-            Err(e) => return Err(error::io_error(path)(e)),
-        };
-        return Err(unknown(path, found));
+        return open_file(path, options);
     }
     let kinds = options.format.map_or(DatasetKind::ALL.to_vec(), |kind| vec![kind]);
     for kind in kinds {
@@ -57,6 +62,20 @@ pub fn open(path: &Path, options: &OpenOptions) -> Result<Dataset, DatasetError>
     let found =
         if names.is_empty() { "an empty folder".into() } else { format!("{} entries: {shown}", names.len()) };
     Err(unknown(path, found))
+}
+
+/// Opens a recording in one file, by its first bytes.
+fn open_file(path: &Path, options: &OpenOptions) -> Result<Dataset, DatasetError> {
+    let head = wrong_thing::head_of(path)?;
+    if let Some(format) = vidar_bag::BagFormat::of_bytes(&head) {
+        let reason = format!("its first bytes are those of {}", format.name());
+        return bag::open(path, reason, options)?.finish(options);
+    }
+    if vidar_video::is_video(&head) && !wrong_thing::is_picture(&head) {
+        let draft = video::open(path, "its first bytes are those of mp4 and mov".into(), options)?;
+        return draft.finish(options);
+    }
+    Err(wrong_thing::describe(path, &head))
 }
 
 /// Reads `path` as one kind; `None` when the path does not have that layout.
@@ -85,6 +104,11 @@ fn try_kind(
             .map_or(Ok(None), |(folder, reason)| single(seven_scenes::open(&folder, reason, options))),
         DatasetKind::PosedFolder => posed_folder::detect(path)
             .map_or(Ok(None), |reason| single(posed_folder::open(path, reason, options))),
+        DatasetKind::Bag => bag::detect(path).map(|reason| bag::open(path, reason, options)).transpose(),
+        DatasetKind::Video => {
+            let found = video::only_one_in(path);
+            found.map(|(file, reason)| video::open(&file, reason, options)).transpose()
+        }
         DatasetKind::ImageFolder => image_folder::detect(path)
             .map_or(Ok(None), |(folder, reason)| single(image_folder::open(path, &folder, reason, options))),
     }
@@ -92,6 +116,7 @@ fn try_kind(
 
 fn unknown(path: &Path, found: String) -> DatasetError {
     let expected = "mav0/cam0/data.csv (EuRoC), rgb.txt (TUM RGB-D), frame-*.color.* (7-Scenes), \
-                    images/ with poses.txt, or a folder of PNG or JPEG images";
+                    images/ with poses.txt, a bag (.bag, .mcap, .db3, metadata.yaml), or a folder of PNG or JPEG \
+                    images";
     DatasetError::UnknownLayout { path: path.to_path_buf(), found, expected: expected.to_string() }
 }

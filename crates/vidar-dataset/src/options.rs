@@ -17,14 +17,25 @@ pub enum DatasetKind {
     SevenScenes,
     /// `images/`, `poses.txt`, `K.txt`, and perhaps `depth/`.
     PosedFolder,
+    /// A ROS 1 bag, a ROS 2 bag or an MCAP file.
+    Bag,
+    /// An mp4 or mov, with the telemetry of an action camera where there is any.
+    Video,
     /// Images in one folder, with or without a file of times.
     ImageFolder,
 }
 
 impl DatasetKind {
     /// Every kind, in the order in which a path is tried.
-    pub const ALL: [Self; 5] =
-        [Self::EurocAsl, Self::TumRgbd, Self::SevenScenes, Self::PosedFolder, Self::ImageFolder];
+    pub const ALL: [Self; 7] = [
+        Self::EurocAsl,
+        Self::TumRgbd,
+        Self::SevenScenes,
+        Self::PosedFolder,
+        Self::Bag,
+        Self::Video,
+        Self::ImageFolder,
+    ];
 
     /// The name used on the command line and in files.
     pub fn name(self) -> &'static str {
@@ -33,6 +44,8 @@ impl DatasetKind {
             Self::TumRgbd => "tum-rgbd",
             Self::SevenScenes => "7scenes",
             Self::PosedFolder => "posed-folder",
+            Self::Bag => "bag",
+            Self::Video => "video",
             Self::ImageFolder => "images",
         }
     }
@@ -180,6 +193,8 @@ pub struct OpenOptions {
     pub trajectory_format: Option<TrajectoryFormat>,
     /// The body whose poses it holds.
     pub trajectory_body: Option<BodyFrame>,
+    /// Topics of a bag to use, where they are not clear by themselves.
+    pub topics: Vec<TopicFlag>,
     /// A file of image times (image folders).
     pub timestamps: Option<PathBuf>,
     /// Unit of the times in image lists and file names; `None` detects it.
@@ -205,6 +220,7 @@ impl Default for OpenOptions {
             trajectory: None,
             trajectory_format: None,
             trajectory_body: None,
+            topics: Vec::new(),
             timestamps: None,
             time_unit: None,
             start: None,
@@ -239,6 +255,41 @@ impl OpenOptions {
             return bad("color from depth", "a value that is not finite".into(), "finite numbers");
         }
         Ok(())
+    }
+}
+
+/// A topic that the user names: `/cam0/image_raw`, or `truth=/vicon/pose` where the type does not say what it is for.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct TopicFlag {
+    /// What its poses are used as; `None` for images, depth and IMU, whose use follows from their type.
+    pub poses: Option<PoseUse>,
+    /// Its name.
+    pub name: String,
+}
+
+/// What the poses of a topic are used as.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum PoseUse {
+    /// Reference poses that results are compared with.
+    GroundTruth,
+    /// The metric trajectory of a map.
+    Trajectory,
+}
+
+impl FromStr for TopicFlag {
+    type Err = DatasetError;
+    fn from_str(text: &str) -> Result<Self, DatasetError> {
+        let (poses, name) = match text.split_once('=') {
+            None => (None, text),
+            Some(("truth", name)) => (Some(PoseUse::GroundTruth), name),
+            Some(("trajectory", name)) => (Some(PoseUse::Trajectory), name),
+            Some(_) => (None, ""),
+        };
+        if name.trim().is_empty() {
+            let expected = "NAME, truth=NAME or trajectory=NAME".to_string();
+            return Err(DatasetError::BadOption { option: "topic", found: format!("{text:?}"), expected });
+        }
+        Ok(Self { poses, name: name.trim().to_string() })
     }
 }
 

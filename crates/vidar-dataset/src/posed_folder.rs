@@ -5,6 +5,7 @@ use crate::draft::{Draft, DraftDepth};
 use crate::error::DatasetError;
 use crate::folder::{images_in, numbers_of, stem, synthetic_time, synthetic_warning};
 use crate::image_folder;
+use crate::location::files;
 use crate::options::{DatasetKind, OpenOptions};
 use crate::parse::{self, Source};
 use crate::seven_scenes::checked_pinhole;
@@ -23,7 +24,7 @@ pub(crate) fn open(path: &Path, reason: String, options: &OpenOptions) -> Result
     let folder = path.join("images");
     let names = images_in(&folder)?;
     draft.image_list = folder.clone();
-    draft.images = match image_folder::find_times(path, options) {
+    let images = match image_folder::find_times(path, options) {
         Some(list) => image_folder::images_by_list(&mut draft, &folder, &names, &list, options)?,
         None => {
             draft.warnings.push(synthetic_warning(&folder));
@@ -32,6 +33,7 @@ pub(crate) fn open(path: &Path, reason: String, options: &OpenOptions) -> Result
             times.zip(&names).map(|(time, name)| (time, folder.join(name))).collect()
         }
     };
+    draft.images = files(images);
     read_intrinsics(&mut draft)?;
     read_poses(&mut draft)?;
     read_depth(&mut draft)?;
@@ -90,9 +92,10 @@ fn read_depth(draft: &mut Draft) -> Result<(), DatasetError> {
     let by_stem: std::collections::HashMap<String, String> =
         images_in(&folder)?.into_iter().map(|n| (stem(&n).to_string(), n)).collect();
     for (time, image) in &draft.images {
+        let image = image.path();
         let name = image.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default();
         if let Some(depth) = by_stem.get(stem(&name)) {
-            draft.depths.push((*time, folder.join(depth)));
+            draft.depths.push((*time, folder.join(depth).into()));
         }
     }
     draft.depth = Some(DraftDepth {

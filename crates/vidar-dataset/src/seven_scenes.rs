@@ -47,10 +47,10 @@ pub(crate) fn open(folder: &Path, reason: String, options: &OpenOptions) -> Resu
         let Some(base) = name.find(".color.").map(|at| &name[..at]) else { continue };
         let Some(number) = frame_number(base) else { continue };
         let time = synthetic_time(number);
-        draft.images.push((time, folder.join(&name)));
+        draft.images.push((time, folder.join(&name).into()));
         let depth = folder.join(format!("{base}.depth.png"));
         if depth.is_file() {
-            draft.depths.push((time, depth));
+            draft.depths.push((time, depth.into()));
         }
         let pose = folder.join(format!("{base}.pose.txt"));
         if pose.is_file() {

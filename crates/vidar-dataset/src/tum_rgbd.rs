@@ -6,6 +6,7 @@
 use crate::dataset::CalibrationSource;
 use crate::draft::{Draft, DraftDepth};
 use crate::error::DatasetError;
+use crate::location::files;
 use crate::options::{DatasetKind, OpenOptions, TimeUnit, TrajectoryFormat, TrajectoryReadOptions};
 use crate::parse::{self, Source, UnitRule};
 use crate::trajectory_file::{ReadPoses, read_poses};
@@ -32,9 +33,9 @@ pub(crate) fn open(path: &Path, reason: String, options: &OpenOptions) -> Result
     let mut draft = Draft::new(DatasetKind::TumRgbd, path, reason);
     let rule = UnitRule::given_or(options.time_unit, TimeUnit::Seconds);
     draft.image_list = path.join("rgb.txt");
-    draft.images = read_list(&mut draft, &path.join("rgb.txt"), rule)?;
+    draft.images = files(read_list(&mut draft, &path.join("rgb.txt"), rule)?);
     if path.join("depth.txt").is_file() {
-        draft.depths = read_list(&mut draft, &path.join("depth.txt"), rule)?;
+        draft.depths = files(read_list(&mut draft, &path.join("depth.txt"), rule)?);
         draft.depth = Some(DraftDepth {
             distorted: None,
             intrinsics: None,

@@ -421,6 +421,10 @@ fn dataset_hint(error: &vidar_dataset::DatasetError) -> &'static str {
         D::WrongImageSize { .. } => {
             "the calibration is for another resolution; give the one for these images"
         }
+        D::Topics { .. } => "--topic NAME names a topic of images, depth or IMU; repeatable",
+        D::WrongThing { .. } | D::Bag(_) | D::Video(_) => {
+            "docs/recordings describes what is read, one page for each source"
+        }
         D::TimesMismatch { .. } => "give one time per pose with --timestamps, or the trajectory as TUM",
         D::BadOption { .. } => "`vidar run --help` lists the values of each option",
         _ => "`vidar inspect PATH` shows what was found",

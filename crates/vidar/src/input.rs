@@ -210,7 +210,7 @@ impl ImageSource for ImageFiles<'_> {
         let entry = entry.or_else(|| self.0.images.iter().find(is_it)).ok_or_else(missing)?;
         self.0
             .load_image(entry)
-            .map_err(|e| Warning::degraded("image-unreadable", e.to_string()).at(entry.path.display()))
+            .map_err(|e| Warning::degraded("image-unreadable", e.to_string()).at(&entry.location))
     }
 }
 

@@ -17,6 +17,7 @@ mod numbers;
 mod odometry;
 mod photos;
 mod quality;
+mod recordings;
 mod resume;
 mod support;
 mod trust;

@@ -23,7 +23,9 @@ pub(super) fn list(inputs: &[PathBuf]) -> Result<Vec<PathBuf>, Error> {
         if input.is_dir() {
             let options = OpenOptions { format: Some(DatasetKind::ImageFolder), ..OpenOptions::default() };
             let folder = vidar_dataset::open(input, &options)?;
-            images.extend(folder.images.into_iter().map(|entry| entry.path));
+            images.extend(
+                folder.images.iter().filter_map(|entry| entry.location.as_file().map(Path::to_owned)),
+            );
         } else {
             images.push(input.clone());
         }

@@ -24,6 +24,7 @@ fn describe_model(model: &CameraModel, source: &CalibrationSource) -> Vec<String
     let k = model.intrinsics();
     let from = match source {
         CalibrationSource::File(path) => format!("from {}", path.display()),
+        CalibrationSource::Topic(name) => format!("from the topic {name}"),
         CalibrationSource::Flags => "from --camera-model".into(),
         CalibrationSource::Recording => "found from the recording itself".into(),
         CalibrationSource::Guessed => "guessed".into(),

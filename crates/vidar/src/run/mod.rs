@@ -300,7 +300,7 @@ impl Context<'_> {
 fn unreadable(dataset: &Dataset, stamp: FrameStamp, error: &DatasetError) -> Warning {
     let entry = dataset.images.iter().find(|i| i.frame_id == stamp.frame_id);
     let warning = Warning::new("odometry-image-unreadable", error.to_string());
-    entry.map_or(warning.clone(), |entry| warning.at(entry.path.display()))
+    entry.map_or(warning.clone(), |entry| warning.at(&entry.location))
 }
 
 pub(crate) fn camera_on_rig(dataset: &Dataset, plan: &Plan) -> RigCamera {

@@ -10,7 +10,7 @@ use serde_json::{Value, json};
 use vidar_align::Placement;
 use vidar_align::aligner::{ChunkPlacement, LoopReport};
 use vidar_core::{FrameId, Se3, Timestamp, Trajectory, printable};
-use vidar_dataset::{CameraFlag, Dataset};
+use vidar_dataset::{CameraFlag, Dataset, Location};
 use vidar_export::{DepthFrame, DepthSidecar, ExportError};
 
 /// Writes everything but pictures and manifest.
@@ -92,7 +92,10 @@ impl Writer<'_> {
 fn views_json(outcome: &RunOutcome, dataset: &Dataset) -> Value {
     let source = |view: &StoredView| {
         let entry = dataset.images.iter().find(|i| i.frame_id.0 == view.frame)?;
-        std::path::absolute(&entry.path).ok()
+        match &entry.location {
+            Location::File(path) => std::path::absolute(path).ok(),
+            Location::Message { .. } | Location::Frame { .. } => None,
+        }
     };
     let views: Vec<StoredView> =
         outcome.map.views.iter().map(|v| StoredView { source: source(v), ..v.clone() }).collect();

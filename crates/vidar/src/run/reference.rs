@@ -51,13 +51,12 @@ fn fused_sensor_depth(dataset: &Dataset, config: &Config, events: &Events) -> Re
                     Ok(view) => {
                         volume.integrate(&view)?;
                     }
-                    Err(e) => events
-                        .warn(&Warning::degraded("depth-unreadable", e.to_string()).at(entry.path.display())),
+                    Err(e) => {
+                        events.warn(&Warning::degraded("depth-unreadable", e.to_string()).at(&entry.location))
+                    }
                 }
             }
-            Err(e) => {
-                events.warn(&Warning::degraded("depth-unreadable", e.to_string()).at(entry.path.display()))
-            }
+            Err(e) => events.warn(&Warning::degraded("depth-unreadable", e.to_string()).at(&entry.location)),
         }
     }
     Ok(super::evaluate::sampled(&volume.extract_mesh(), config)?)

@@ -1,0 +1,74 @@
+//! Bags and videos through the program, and the things that are given by mistake.
+
+use crate::support::{shared, vidar, vidar_in};
+use std::path::{Path, PathBuf};
+
+fn bag(name: &str) -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("../../crates/vidar-bag/tests/fixtures").join(name)
+}
+
+fn clip(name: &str) -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("../../crates/vidar-video/tests/fixtures").join(name)
+}
+
+fn inspect(path: &Path, more: &[&str]) -> crate::support::ProgramOutput {
+    let mut args = vec!["inspect".as_ref(), path.as_os_str()];
+    args.extend(more.iter().map(std::ffi::OsStr::new));
+    vidar(&args)
+}
+
+#[test]
+fn bags_of_every_kind_are_inspected() {
+    for name in ["ros1_lz4.bag", "ros2_mcap", "ros2_sqlite", "mcap_ros1_lz4.mcap"] {
+        let told = inspect(&bag(name), &[]).ends_with(0);
+        assert!(told.stdout.contains("from the topic /cam0/camera_info"), "{name}: {}", told.stdout);
+        let told = told.says(&["poses-unused", "--topic truth=/truth"]);
+        assert!(told.stdout.contains("IMU"), "{}", told.stdout);
+    }
+    let told = inspect(&bag("ros1.bag"), &["--topic", "truth=/truth"]).ends_with(0);
+    assert!(told.stdout.contains("ground truth"), "{}", told.stdout);
+}
+
+#[test]
+fn a_topic_that_is_not_there_lists_those_that_are() {
+    inspect(&bag("ros2_mcap"), &["--topic", "/cam9"]).ends_with(1).says(&[
+        "/cam9",
+        "/cam0/image_raw  sensor_msgs/Image  3",
+        "--topic NAME",
+    ]);
+    inspect(&bag("ros2_mcap"), &["--topic", "of=/truth"]).ends_with(2).says(&["trajectory=NAME"]);
+}
+
+#[test]
+fn a_video_is_a_recording_of_images() {
+    let told = inspect(&clip("h264.mp4"), &[]).ends_with(0);
+    assert!(told.stdout.contains("15") && told.stdout.contains("25.0 Hz"), "{}", told.stdout);
+    // Without IMU there is no odometry; the message says what there is instead.
+    vidar(&["odometry".as_ref(), clip("h264.mp4").as_os_str()]).ends_with(1).says(&["IMU"]);
+}
+
+#[test]
+fn what_is_given_by_mistake_is_named_with_the_nearest_way() {
+    let folder = shared().root.join("mistakes");
+    std::fs::create_dir_all(&folder).unwrap();
+    let whole = std::fs::read(clip("h264.mp4")).unwrap();
+    let cut = &whole[..whole.len() - 300];
+    for (name, bytes, words) in [
+        ("photos.zip", &b"PK\x03\x04rest"[..], ["zip archive", "unpack"]),
+        ("image.heic", b"\0\0\0\x18ftypheic\0\0\0\0", ["HEIC", "JPEG"]),
+        ("clip.mkv", b"\x1a\x45\xdf\xa3rest", ["Matroska", "-c copy"]),
+        ("cut.mp4", cut, ["moov", "cut off"]),
+        ("locked.bag", b"\x13\x37 nothing of a bag", ["not those of one", "encrypted"]),
+        ("empty.mcap", b"", ["empty file", "copy"]),
+    ] {
+        std::fs::write(folder.join(name), bytes).unwrap();
+        vidar_in(&folder, &["inspect", name]).ends_with(1).says(&words);
+    }
+    vidar_in(&folder, &["run", "https://example.org/flight.bag"]).ends_with(1).says(&["URL", "download"]);
+    // A codec that is not decoded, a file of sound, a bag without images.
+    inspect(&clip("other_codec.mp4"), &[]).ends_with(1).says(&["mp4v", "ffmpeg"]);
+    inspect(&clip("sound.mp4"), &[]).ends_with(1).says(&["without a video track"]);
+    std::fs::write(folder.join("cut.bag"), &std::fs::read(bag("ros1.bag")).unwrap()[..5200]).unwrap();
+    let told = vidar_in(&folder, &["inspect", "cut.bag"]);
+    assert!(told.code == 1 && !told.stderr.contains("panicked"), "{}", told.stderr);
+}

@@ -1,0 +1,408 @@
+//! An open recording: one bag, or the split files of one.
+
+use crate::compression::Compression;
+use crate::db3::{self, Db3};
+use crate::error::BagError;
+use crate::file::BagFile;
+use crate::index::{Encoding, FileIndex, MessageRef, NO_CHUNK, Topic};
+use crate::message::{self, Header, Message};
+use crate::{mcap, metadata, ros1, sqlite};
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use std::sync::{Arc, Mutex, PoisonError};
+use vidar_core::{Timestamp, Warning};
+
+/// The containers that are read.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum BagFormat {
+    /// ROS 1 bag 2.0.
+    Ros1,
+    /// MCAP.
+    Mcap,
+    /// SQLite of ROS 2.
+    Sqlite,
+}
+
+impl BagFormat {
+    /// The format by a file's first bytes.
+    pub fn of_bytes(bytes: &[u8]) -> Option<Self> {
+        [(ros1::MAGIC, Self::Ros1), (mcap::MAGIC, Self::Mcap), (sqlite::MAGIC, Self::Sqlite)]
+            .into_iter()
+            .find_map(|(magic, format)| bytes.starts_with(magic).then_some(format))
+    }
+
+    /// Its name for people.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Ros1 => "ROS 1 bag",
+            Self::Mcap => "MCAP",
+            Self::Sqlite => "ROS 2 bag (SQLite)",
+        }
+    }
+}
+
+/// An open recording. Its index is in memory, its messages stay in the files until they are asked for.
+#[derive(Debug)]
+pub struct Bag {
+    path: PathBuf,
+    format: BagFormat,
+    parts: Vec<Part>,
+    topics: Vec<Topic>,
+    warnings: Vec<Warning>,
+    messages_are_compressed: bool,
+    cache: Mutex<Cache>,
+}
+
+/// One file with its chunks.
+#[derive(Debug)]
+struct Part {
+    chunks: Vec<crate::index::Chunk>,
+    container: Container,
+}
+
+#[derive(Debug)]
+enum Container {
+    Ros1(BagFile),
+    Mcap(BagFile),
+    Sqlite(Db3),
+}
+
+impl Container {
+    fn file(&self) -> &BagFile {
+        match self {
+            Self::Ros1(file) | Self::Mcap(file) => file,
+            Self::Sqlite(db3) => db3.file(),
+        }
+    }
+}
+
+/// The chunks decompressed last. Neighbouring messages share a chunk; sensors that are read side by side are a few chunks apart.
+#[derive(Debug, Default)]
+struct Cache {
+    chunks: Vec<(u16, u32, Arc<Vec<u8>>)>,
+}
+
+/// Decompressed chunks that are kept, bytes; the newest stays even when it is larger.
+const CACHE_BYTES: usize = 32 << 20;
+
+/// Bytes that hold stamp and frame of any message; names of frames are far shorter.
+const HEADER_BYTES: u64 = 1 << 10;
+
+/// Most files of one recording.
+const MAX_FILES: usize = 10_000;
+
+impl Bag {
+    /// Opens a bag file, the folder of a ROS 2 bag, or a folder that holds the numbered parts of one recording, and lists its
+    /// messages.
+    pub fn open(path: &Path) -> Result<Self, BagError> {
+        let (files, messages_are_compressed) = if path.is_dir() {
+            match metadata::read(path)? {
+                Some(found) => (found.files, found.messages_are_compressed),
+                None => (parts_in(path)?, false),
+            }
+        } else {
+            (vec![path.to_path_buf()], false)
+        };
+        if files.len() > MAX_FILES {
+            let (path, found) = (path.to_path_buf(), files.len() as u64);
+            return Err(BagError::TooLarge { path, what: "files", found, limit: MAX_FILES as u64 });
+        }
+        let mut bag = Self {
+            path: path.to_path_buf(),
+            format: BagFormat::Mcap,
+            parts: Vec::new(),
+            topics: Vec::new(),
+            warnings: Vec::new(),
+            messages_are_compressed,
+            cache: Mutex::default(),
+        };
+        let mut topics = BTreeMap::<(String, String), Topic>::new();
+        for file in &files {
+            let (format, container, index) = open_file(file)?;
+            bag.format = format;
+            bag.take(index, container, &mut topics);
+        }
+        bag.topics = topics.into_values().collect();
+        for (number, topic) in bag.topics.iter_mut().enumerate() {
+            topic.messages.iter_mut().for_each(|m| m.topic = number as u16);
+            // Stable: messages of one time stay in the order in which they were written.
+            topic.messages.sort_by_key(|m| m.log_time);
+        }
+        if bag.topics.iter().all(|t| t.messages.is_empty()) {
+            let found = format!("{} topics without messages", bag.topics.len());
+            return Err(BagError::Empty { path: path.to_path_buf(), found });
+        }
+        Ok(bag)
+    }
+
+    /// Adds the index of one file.
+    fn take(
+        &mut self,
+        index: FileIndex,
+        container: Container,
+        topics: &mut BTreeMap<(String, String), Topic>,
+    ) {
+        let file = self.parts.len() as u16;
+        for found in index.topics.into_values() {
+            // Connections of several publishers to one topic are one topic.
+            let key = (found.name.clone(), found.message_type.clone());
+            let topic = topics.entry(key).or_insert_with(|| Topic {
+                name: found.name,
+                message_type: found.message_type,
+                encoding: found.encoding,
+                messages: Vec::new(),
+            });
+            topic.messages.extend(found.places.iter().map(|&(time, chunk, offset)| MessageRef {
+                log_time: Timestamp::from_nanos(time),
+                topic: 0,
+                file,
+                chunk,
+                offset,
+            }));
+        }
+        self.warnings.extend(index.warnings);
+        self.parts.push(Part { chunks: index.chunks, container });
+    }
+
+    /// What was opened.
+    pub fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// The container of its files.
+    pub fn format(&self) -> BagFormat {
+        self.format
+    }
+
+    /// Its files.
+    pub fn files(&self) -> impl Iterator<Item = &Path> {
+        self.parts.iter().map(|p| p.container.file().path())
+    }
+
+    /// Its topics by name.
+    pub fn topics(&self) -> &[Topic] {
+        &self.topics
+    }
+
+    /// What was found wrong while listing its messages.
+    pub fn warnings(&self) -> &[Warning] {
+        &self.warnings
+    }
+
+    /// The topic of a message.
+    pub fn topic_of(&self, message: &MessageRef) -> Option<&Topic> {
+        self.topics.get(usize::from(message.topic))
+    }
+
+    /// Reads and decodes one message. Messages may be read in any order and from several threads.
+    pub fn read(&self, message: &MessageRef) -> Result<Message, BagError> {
+        let (message_type, encoding) =
+            self.topic_of(message).map_or(("", Encoding::Other), |t| (t.message_type.as_str(), t.encoding));
+        let bytes = self.bytes(message)?;
+        message::decode(message_type, encoding, &bytes).map_err(|reason| self.bad_message(message, reason))
+    }
+
+    /// Stamp and frame of one message. Of an image in a chunk without compression only the head is read.
+    pub fn header(&self, message: &MessageRef) -> Result<Header, BagError> {
+        let Some(topic) = self.topic_of(message) else { return Ok(Header::default()) };
+        if matches!(topic.encoding, Encoding::Ros1 | Encoding::Cdr) && !self.messages_are_compressed {
+            let head = self.first_bytes(message, HEADER_BYTES)?;
+            return message::header(topic.encoding, &topic.message_type, &head)
+                .map_err(|reason| self.bad_message(message, reason));
+        }
+        let header = match self.read(message)? {
+            Message::Image(m) => m.header,
+            Message::CompressedImage(m) | Message::CompressedVideo(m) => m.header,
+            Message::Imu(m) => m.header,
+            Message::CameraInfo(m) => m.header,
+            Message::Transforms(m) => m.into_iter().next().map(|t| t.parent).unwrap_or_default(),
+            Message::Poses(m) => m.into_iter().next().map(|p| p.header).unwrap_or_default(),
+        };
+        Ok(header)
+    }
+
+    /// The serialised bytes of one message.
+    pub fn bytes(&self, message: &MessageRef) -> Result<Vec<u8>, BagError> {
+        self.first_bytes(message, u64::MAX)
+    }
+
+    /// The first bytes of one message; `most` of them or more.
+    fn first_bytes(&self, message: &MessageRef, most: u64) -> Result<Vec<u8>, BagError> {
+        let lost = || self.bad_message(message, "no message is where the index says".into());
+        let part = self.parts.get(usize::from(message.file)).ok_or_else(lost)?;
+        let found = if message.chunk == NO_CHUNK {
+            match &part.container {
+                Container::Ros1(file) => ros1::message_at(file, message.offset, most),
+                Container::Mcap(file) => mcap::message_at(file, message.offset, most),
+                Container::Sqlite(db3) => db3.message(message.offset),
+            }
+        } else {
+            self.in_chunk(part, message, most).map_err(|e| match e {
+                BagError::Malformed { found, .. } => self.bad_message(message, found),
+                other => other,
+            })
+        };
+        let bytes = found?.ok_or_else(lost)?;
+        if self.messages_are_compressed {
+            return Compression::Zstd.decompress(&bytes, None).map_err(|r| self.bad_message(message, r));
+        }
+        Ok(bytes)
+    }
+
+    fn in_chunk(&self, part: &Part, message: &MessageRef, most: u64) -> Result<Option<Vec<u8>>, BagError> {
+        let Some(&chunk) = part.chunks.get(message.chunk as usize) else { return Ok(None) };
+        if chunk.compression == Compression::None {
+            if message.offset >= chunk.stored {
+                return Ok(None);
+            }
+            let offset = chunk.offset + message.offset;
+            return match &part.container {
+                Container::Ros1(file) => ros1::message_at(file, offset, most),
+                Container::Mcap(file) => mcap::message_at(file, offset, most),
+                Container::Sqlite(_) => Ok(None),
+            };
+        }
+        let bytes = match self.cached(message) {
+            Some(bytes) => bytes,
+            None => {
+                let file = part.container.file();
+                let packed = file.read(chunk.offset, chunk.stored)?;
+                let bytes = chunk.compression.decompress(&packed, Some(chunk.size)).map_err(|reason| {
+                    file.malformed(
+                        chunk.offset,
+                        format!("a chunk that is damaged: {reason}"),
+                        "a whole chunk",
+                    )
+                })?;
+                self.keep(message, Arc::new(bytes))
+            }
+        };
+        Ok(match &part.container {
+            Container::Ros1(_) => ros1::message_in(&bytes, message.offset).map(|b| cut(b, most)),
+            Container::Mcap(_) => mcap::message_in(&bytes, message.offset).map(|b| cut(b, most)),
+            Container::Sqlite(_) => None,
+        })
+    }
+
+    fn cached(&self, message: &MessageRef) -> Option<Arc<Vec<u8>>> {
+        let mut cache = self.cache.lock().unwrap_or_else(PoisonError::into_inner);
+        let is_it =
+            |(file, chunk, _): &(u16, u32, Arc<Vec<u8>>)| (*file, *chunk) == (message.file, message.chunk);
+        let at = cache.chunks.iter().position(is_it)?;
+        let found = cache.chunks.remove(at);
+        let bytes = Arc::clone(&found.2);
+        cache.chunks.push(found);
+        Some(bytes)
+    }
+
+    fn keep(&self, message: &MessageRef, bytes: Arc<Vec<u8>>) -> Arc<Vec<u8>> {
+        let mut cache = self.cache.lock().unwrap_or_else(PoisonError::into_inner);
+        cache.chunks.push((message.file, message.chunk, Arc::clone(&bytes)));
+        let mut held: usize = cache.chunks.iter().map(|c| c.2.len()).sum();
+        while held > CACHE_BYTES && cache.chunks.len() > 1 {
+            held -= cache.chunks.remove(0).2.len();
+        }
+        bytes
+    }
+
+    fn bad_message(&self, message: &MessageRef, reason: String) -> BagError {
+        let topic = self.topic_of(message);
+        let path =
+            self.parts.get(usize::from(message.file)).map_or(&*self.path, |p| p.container.file().path());
+        BagError::BadMessage {
+            path: path.to_path_buf(),
+            topic: topic.map_or_else(String::new, |t| t.name.clone()),
+            time: message.log_time.to_secs_string(),
+            message_type: topic.map_or_else(String::new, |t| t.message_type.clone()),
+            reason,
+        }
+    }
+}
+
+/// The first `most` bytes.
+fn cut(bytes: &[u8], most: u64) -> Vec<u8> {
+    let length = bytes.len().min(usize::try_from(most).unwrap_or(usize::MAX));
+    bytes[..length].to_vec()
+}
+
+fn open_file(path: &Path) -> Result<(BagFormat, Container, FileIndex), BagError> {
+    let file = BagFile::open(path)?;
+    let head = file.read(0, file.length().min(16))?;
+    Ok(match BagFormat::of_bytes(&head) {
+        Some(format @ BagFormat::Ros1) => {
+            let index = ros1::index(&file)?;
+            (format, Container::Ros1(file), index)
+        }
+        Some(format @ BagFormat::Mcap) => {
+            let index = mcap::index(&file)?;
+            (format, Container::Mcap(file), index)
+        }
+        Some(format @ BagFormat::Sqlite) => {
+            let (db3, index) = db3::index(file)?;
+            (format, Container::Sqlite(db3), index)
+        }
+        None => {
+            let found = match head.as_slice() {
+                [] => "an empty file (0 bytes)".to_string(),
+                head if head.starts_with(b"#ROSBAG") => "a ROS bag of a version before 2.0".to_string(),
+                head => format!("a file whose first bytes are {head:02x?}"),
+            };
+            let expected = "a ROS 1 bag 2.0, an MCAP file or an SQLite bag of ROS 2".to_string();
+            return Err(BagError::NotABag { path: path.to_path_buf(), found, expected });
+        }
+    })
+}
+
+/// The bags in a folder, where they are the numbered parts of one recording (`x_0.mcap`, `x_1.mcap`, …) or only one.
+fn parts_in(folder: &Path) -> Result<Vec<PathBuf>, BagError> {
+    let mut parts = bags_in(folder)?;
+    let not_one = |found: String| BagError::NotABag {
+        path: folder.to_path_buf(),
+        found,
+        expected: "one bag, the numbered parts of one (x_0.bag, x_1.bag), or a metadata.yaml; name a file"
+            .into(),
+    };
+    let stem = |path: &PathBuf| -> (String, Option<u64>) {
+        let stem = path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
+        match stem.rsplit_once('_').and_then(|(name, n)| Some((name.to_string(), n.parse().ok()?))) {
+            Some((name, number)) => (name, Some(number)),
+            None => (stem, None),
+        }
+    };
+    parts.sort_by_key(&stem);
+    match parts.as_slice() {
+        [] => Err(not_one("a folder without bags".into())),
+        [_] => Ok(parts),
+        [first, ..] => {
+            let (name, number) = stem(first);
+            if number.is_some()
+                && parts.iter().all(|p| stem(p).0 == name && p.extension() == first.extension())
+            {
+                return Ok(parts);
+            }
+            let names = parts
+                .iter()
+                .take(6)
+                .map(|p| p.file_name().unwrap_or_default().to_string_lossy().into_owned());
+            Err(not_one(format!("{} bags: {}", parts.len(), names.collect::<Vec<_>>().join(", "))))
+        }
+    }
+}
+
+/// Files in a folder that are named as bags.
+pub fn bags_in(folder: &Path) -> Result<Vec<PathBuf>, BagError> {
+    let failed = |source| BagError::Io { path: folder.to_path_buf(), source };
+    let mut found = Vec::new();
+    for entry in std::fs::read_dir(folder).map_err(failed)? {
+        let path = entry.map_err(failed)?.path();
+        let ending = path.extension().map(|e| e.to_string_lossy().to_ascii_lowercase());
+        if matches!(ending.as_deref(), Some("bag" | "mcap" | "db3"))
+            && path.is_file()
+            && found.len() < MAX_FILES
+        {
+            found.push(path);
+        }
+    }
+    found.sort();
+    Ok(found)
+}

@@ -1,0 +1,391 @@
+//! ROS 1 bags, ROS 2 bags and MCAP files: one camera, its calibration, IMU, depth and poses.
+
+use crate::dataset::CalibrationSource;
+use crate::draft::{Draft, DraftCamera, DraftDepth};
+use crate::error::DatasetError;
+use crate::location::locate;
+use crate::options::{DatasetKind, OpenOptions, PoseUse};
+use crate::topics::{self, Choice, problem};
+use crate::transforms::{Frames, rigid};
+use nalgebra::{Matrix3, Vector3};
+use std::cell::Cell;
+use std::path::Path;
+use std::sync::Arc;
+use vidar_bag::{Bag, CameraInfo, Header, Message, MessageRef, Role, Topic, role_of};
+use vidar_core::camera::{Equidistant, RadTan};
+use vidar_core::{
+    AngularRate, BodyFrame, CameraId, CameraModel, ImuNoise, ImuSample, LieGroup, Pinhole, Se3, So3,
+    SpecificForce, StampedPose, Timestamp, Trajectory, Warning,
+};
+
+/// Looks for a bag in a folder.
+pub(crate) fn detect(path: &Path) -> Option<String> {
+    let described = std::fs::read_to_string(path.join("metadata.yaml"));
+    if described.is_ok_and(|text| text.contains("rosbag2_bagfile_information")) {
+        return Some("metadata.yaml of a ROS 2 bag".into());
+    }
+    match vidar_bag::bags_in(path).ok()?.as_slice() {
+        [] => None,
+        [one] => Some(format!("its only bag {}", one.file_name().unwrap_or_default().to_string_lossy())),
+        all => Some(format!("{} bags", all.len())),
+    }
+}
+
+/// Reads the recording's index, calibration, IMU and poses; images stay in it.
+pub(crate) fn open(path: &Path, reason: String, options: &OpenOptions) -> Result<Draft, DatasetError> {
+    let bag = Arc::new(Bag::open(path)?);
+    let choice = topics::choose(&bag, options)?;
+    let mut draft = Draft::new(DatasetKind::Bag, path, format!("{reason}; images of {}", choice.image.name));
+    draft.warnings.extend(bag.warnings().iter().cloned());
+    draft.warnings.extend(choice.warnings.iter().cloned());
+    let unused = topics::unused_poses(&bag, &choice);
+    if !unused.is_empty() && choice.poses.is_empty() {
+        let message = format!("poses of {} are not used", unused.join(", "));
+        let way =
+            format!("--topic truth={0} compares with them, --topic trajectory={0} maps with them", unused[0]);
+        draft.warnings.push(Warning::new("poses-unused", message).at(path.display()).hint(way));
+    }
+    let mut clock = Clock { bag: &bag, without_stamp: Cell::new(0) };
+    let first = choice.image.messages.first();
+    let camera_frame = first.map(|m| bag.header(m)).transpose()?.unwrap_or_default().frame;
+    draft.cameras = vec![DraftCamera::unknown(choice.camera)];
+    draft.images = locate(&bag, choice.image, |m| clock.stamp(m))?;
+    let imu_frame = read_imu(&mut draft, &mut clock, choice.imu)?;
+    let frames = read_frames(&mut draft, &bag);
+    read_calibration(&mut draft, &bag, &choice, &camera_frame)?;
+    if let Some(imu_frame) = &imu_frame {
+        read_extrinsics(&mut draft, &frames, imu_frame, &camera_frame);
+    }
+    if let Some(depth) = choice.depth {
+        read_depth(&mut draft, &bag, depth, &clock, &frames, imu_frame.as_deref().unwrap_or(&camera_frame))?;
+    }
+    for (used, topic) in &choice.poses {
+        let known = Known { frames: &frames, imu: imu_frame.as_deref(), camera: &camera_frame };
+        read_poses(&mut draft, &clock, topic, *used, &known)?;
+    }
+    let without = clock.without_stamp.get();
+    if without > 0 {
+        let message =
+            format!("{without} messages have no stamp; the times at which they were logged are used");
+        draft.warnings.push(Warning::new("stamp-missing", message).at(path.display()));
+    }
+    draft.media.bag = Some(Arc::clone(&bag));
+    Ok(draft)
+}
+
+/// Times of messages: their own stamps, else when they were logged.
+struct Clock<'a> {
+    bag: &'a Bag,
+    without_stamp: Cell<usize>,
+}
+
+impl Clock<'_> {
+    fn stamp(&self, message: &MessageRef) -> Result<Timestamp, vidar_bag::BagError> {
+        Ok(self.or_logged(&self.bag.header(message)?, message))
+    }
+
+    fn or_logged(&self, header: &Header, message: &MessageRef) -> Timestamp {
+        if header.stamp.nanos() != 0 {
+            return header.stamp;
+        }
+        self.without_stamp.set(self.without_stamp.get() + 1);
+        message.log_time
+    }
+}
+
+/// Reads all samples of the IMU; returns the name of its frame.
+fn read_imu(
+    draft: &mut Draft,
+    clock: &mut Clock<'_>,
+    topic: Option<&Topic>,
+) -> Result<Option<String>, DatasetError> {
+    let Some(topic) = topic else { return Ok(None) };
+    let (mut frame, mut unread) = (String::new(), None);
+    for message in &topic.messages {
+        match clock.bag.read(message) {
+            Ok(Message::Imu(sample)) => {
+                let time = clock.or_logged(&sample.header, message);
+                let (gyro, accel) = (sample.angular_velocity, sample.linear_acceleration);
+                let (gyro, accel) = (AngularRate(Vector3::from(gyro)), SpecificForce(Vector3::from(accel)));
+                draft.imu.push(ImuSample { time, gyro, accel });
+                frame = sample.header.frame;
+            }
+            Ok(_) => {}
+            Err(e) => unread = Some((unread.map_or(0, |(n, _)| n) + 1, e)),
+        }
+    }
+    let place = format!("{} {}", draft.root.display(), topic.name);
+    if let Some((count, first)) = unread {
+        let message = format!("{count} IMU samples cannot be read and are left out; the last: {first}");
+        draft.warnings.push(Warning::degraded("imu-unreadable", message).at(&place));
+    }
+    let before = draft.imu.len();
+    draft.imu.retain(|s| s.gyro.0.iter().chain(s.accel.0.iter()).all(|v| v.is_finite()));
+    if draft.imu.len() < before {
+        let message = format!("{} IMU samples are not finite; skipped", before - draft.imu.len());
+        draft.warnings.push(Warning::new("sample-not-finite", message).at(&place));
+    }
+    let message = "a bag states no noise densities of its IMU; those of EuRoC's ADIS16448 are used";
+    draft
+        .warnings
+        .push(Warning::new("imu-noise", message).at(&place).hint("--calibration imu.yaml (Kalibr)"));
+    draft.imu_noise = Some(ImuNoise::EUROC);
+    Ok(Some(frame))
+}
+
+/// All fixed transforms: those of `/tf_static`; those of `/tf`, which may move, only where a fixed one is not known.
+fn read_frames(draft: &mut Draft, bag: &Bag) -> Frames {
+    let mut frames = Frames::default();
+    let is_static = |t: &&Topic| t.name.ends_with("tf_static");
+    let all: Vec<&Topic> = bag
+        .topics()
+        .iter()
+        .filter(|t| role_of(&t.message_type, t.encoding) == Some(Role::Transforms))
+        .filter(|t| t.message_type != "geometry_msgs/TransformStamped")
+        .collect();
+    // Without /tf_static the first messages of /tf state the mounts along with what moves; writers before tf2 did so.
+    let (fixed, moving): (Vec<&Topic>, Vec<&Topic>) = all.into_iter().partition(is_static);
+    const FIRST: usize = 100;
+    let moving = if fixed.is_empty() { moving } else { Vec::new() };
+    let messages = moving.iter().flat_map(|t| t.messages.iter().take(FIRST));
+    for message in messages.chain(fixed.iter().flat_map(|t| &t.messages)) {
+        match bag.read(message) {
+            Ok(Message::Transforms(transforms)) => transforms.iter().for_each(|t| frames.add(t)),
+            Ok(_) => {}
+            Err(e) => draft.warnings.push(Warning::degraded("transform-unreadable", e.to_string())),
+        }
+    }
+    frames
+}
+
+/// Takes the camera's model from the topic of calibrations that belongs to the images.
+fn read_calibration(
+    draft: &mut Draft,
+    bag: &Bag,
+    choice: &Choice<'_>,
+    camera_frame: &str,
+) -> Result<(), DatasetError> {
+    let infos: Vec<&Topic> = bag
+        .topics()
+        .iter()
+        .filter(|t| !t.messages.is_empty() && role_of(&t.message_type, t.encoding) == Some(Role::CameraInfo))
+        .collect();
+    let beside = |t: &&&Topic| is_beside(&choice.image.name, &t.name);
+    let same_frame = |t: &&&Topic| {
+        let header = t.messages.first().and_then(|m| bag.header(m).ok());
+        header.is_some_and(|h| !h.frame.is_empty() && h.frame == camera_frame)
+    };
+    let Some(topic) = infos.iter().find(beside).or_else(|| infos.iter().find(same_frame)) else {
+        return Ok(());
+    };
+    let Some(Message::CameraInfo(info)) = topic.messages.first().map(|m| bag.read(m)).transpose()? else {
+        return Ok(());
+    };
+    if info.k[0] == 0.0 {
+        let message = format!("{} states no calibration (its K is zero); it is not used", topic.name);
+        draft.warnings.push(Warning::new("calibration-empty", message).at(bag.path().display()));
+        return Ok(());
+    }
+    let is_rectified = choice.image.name.contains("rect");
+    let camera = &mut draft.cameras[0];
+    camera.model = Some(model_of(&info, is_rectified, bag, topic)?);
+    camera.source = CalibrationSource::Topic(topic.name.clone());
+    if is_rectified && let Some(rotation) = So3::from_matrix(&Matrix3::from_row_slice(&info.r)) {
+        // The rectified camera is the camera turned by R; completed with the mount by `read_extrinsics`.
+        camera.body_from_camera = Se3::new(rotation.inverse(), Vector3::zeros());
+    }
+    Ok(())
+}
+
+/// Whether a topic of calibrations lies beside a topic of images: the same name but for its last part (two for `/compressed`).
+fn is_beside(image: &str, info: &str) -> bool {
+    let Some((folder, _)) = info.rsplit_once('/') else { return false };
+    let mut parent = image.rsplit_once('/').map(|(p, _)| p);
+    for _ in 0..2 {
+        if parent == Some(folder) {
+            return true;
+        }
+        parent = parent.and_then(|p| p.rsplit_once('/')).map(|(p, _)| p);
+    }
+    false
+}
+
+/// The model that a calibration of ROS states (`image_geometry`; REP 104).
+fn model_of(
+    info: &CameraInfo,
+    is_rectified: bool,
+    bag: &Bag,
+    topic: &Topic,
+) -> Result<CameraModel, DatasetError> {
+    let (path, key) = (bag.path(), topic.name.as_str());
+    let bad = |source| DatasetError::BadCamera { path: path.to_path_buf(), key: key.into(), source };
+    let unsupported = |found: String| DatasetError::UnsupportedCamera {
+        path: path.to_path_buf(),
+        key: key.into(),
+        found,
+        expected: "plumb_bob, rational_polynomial with k4 = k5 = k6 = 0, equidistant",
+    };
+    let (width, height) = (info.width as usize, info.height as usize);
+    let [fx, fy, cx, cy] = match is_rectified {
+        true => [info.p[0], info.p[5], info.p[2], info.p[6]],
+        false => [info.k[0], info.k[4], info.k[2], info.k[5]],
+    };
+    let pinhole = Pinhole::new(fx, fy, cx, cy, width, height).map_err(bad)?;
+    let at = |i: usize| info.distortion.get(i).copied().unwrap_or(0.0);
+    if is_rectified || info.distortion.iter().all(|&d| d == 0.0) {
+        return Ok(CameraModel::Pinhole(pinhole));
+    }
+    match info.distortion_model.to_ascii_lowercase().as_str() {
+        "plumb_bob" | "radtan" | "rational_polynomial" | "" => {
+            if (5..info.distortion.len()).any(|i| at(i) != 0.0) {
+                return Err(unsupported(format!(
+                    "{} with {} coefficients",
+                    info.distortion_model,
+                    info.distortion.len()
+                )));
+            }
+            let coefficients = [at(0), at(1), at(2), at(3)];
+            RadTan::with_k3(pinhole, coefficients, at(4)).map(CameraModel::RadTan).map_err(bad)
+        }
+        "equidistant" | "fisheye" | "kannala_brandt" | "kannala_brandt4" => {
+            let coefficients = [at(0), at(1), at(2), at(3)];
+            Equidistant::new(pinhole, coefficients).map(CameraModel::Equidistant).map_err(bad)
+        }
+        other => Err(unsupported(vidar_core::printable(other).to_string())),
+    }
+}
+
+/// The camera's pose on the IMU, from the fixed transforms.
+fn read_extrinsics(draft: &mut Draft, frames: &Frames, imu: &str, camera: &str) {
+    if let Some(imu_from_camera) = frames.a_from_b(imu, camera).filter(|_| imu != camera) {
+        draft.cameras[0].body_from_camera = imu_from_camera * draft.cameras[0].body_from_camera;
+        return;
+    }
+    let message = if imu == camera {
+        format!(
+            "camera and IMU state the same frame ({camera:?}), so the camera's pose on the IMU is not known"
+        )
+    } else {
+        format!("no fixed transform connects the IMU's frame {imu:?} with the camera's {camera:?}")
+    };
+    draft.warnings.push(
+        Warning::new("extrinsics-missing", message)
+            .at(draft.root.display())
+            .hint("--calibration camchain.yaml (Kalibr) gives them; `vidar calibrate` finds the rotation"),
+    );
+}
+
+fn read_depth(
+    draft: &mut Draft,
+    bag: &Bag,
+    topic: &Topic,
+    clock: &Clock<'_>,
+    frames: &Frames,
+    body_frame: &str,
+) -> Result<(), DatasetError> {
+    draft.depths = locate(bag, topic, |m| clock.stamp(m))?;
+    let frame = topic.messages.first().map(|m| bag.header(m)).transpose()?.unwrap_or_default().frame;
+    let infos =
+        bag.topics().iter().filter(|t| role_of(&t.message_type, t.encoding) == Some(Role::CameraInfo));
+    let mut infos = infos.filter(|t| is_beside(&topic.name, &t.name));
+    let info = match infos.next().and_then(|t| t.messages.first()).map(|m| bag.read(m)).transpose()? {
+        Some(Message::CameraInfo(info)) if info.k[0] != 0.0 => Some(info),
+        _ => None,
+    };
+    let aligned = ["aligned", "registered"].iter().any(|w| topic.name.contains(w));
+    draft.depth = Some(DraftDepth {
+        intrinsics: info.map(|i| [i.k[0], i.k[4], i.k[2], i.k[5]]),
+        distorted: None,
+        units_per_metre: None,
+        // REP 118: 16UC1 is millimetres; 32FC1 is metres and needs no unit.
+        default_units: 1000.0,
+        body_from_depth: frames.a_from_b(body_frame, &frame),
+        invalid: vec![0, u16::MAX],
+        is_registered: aligned,
+    });
+    Ok(())
+}
+
+/// The frames that poses can be related to.
+struct Known<'a> {
+    frames: &'a Frames,
+    imu: Option<&'a str>,
+    camera: &'a str,
+}
+
+/// Reads the poses of a topic as ground truth or as the trajectory of the map.
+fn read_poses(
+    draft: &mut Draft,
+    clock: &Clock<'_>,
+    topic: &Topic,
+    used: PoseUse,
+    known: &Known<'_>,
+) -> Result<(), DatasetError> {
+    let (mut poses, mut invalid, mut child) = (Vec::new(), 0usize, String::new());
+    for message in &topic.messages {
+        let stamped: Vec<(Header, String, vidar_bag::Pose)> = match clock.bag.read(message)? {
+            Message::Poses(found) => found.into_iter().map(|p| (p.header, p.child, p.pose)).collect(),
+            Message::Transforms(found) => found.into_iter().map(|t| (t.parent, t.child, t.pose)).collect(),
+            _ => Vec::new(),
+        };
+        for (header, name, pose) in stamped {
+            match rigid(&pose) {
+                Some(world_from_body) => {
+                    let time = clock.or_logged(&header, message);
+                    poses.push(StampedPose { time, world_from_body });
+                }
+                None => invalid += 1,
+            }
+            child = name;
+        }
+    }
+    let place = draft.root.join(topic.name.trim_start_matches('/'));
+    if invalid > 0 {
+        let message = format!("{invalid} poses are not finite or no rotations; skipped");
+        draft.warnings.push(Warning::new("pose-not-finite", message).at(place.display()));
+    }
+    poses.sort_by_key(|p| p.time);
+    let listed = poses.len();
+    // A path that is published anew with every pose repeats the earlier ones.
+    poses.dedup_by_key(|p| p.time);
+    if listed > poses.len() {
+        let message = format!("{} poses repeat a time; the first of each is used", listed - poses.len());
+        draft.warnings.push(Warning::new("time-duplicate", message).at(place.display()));
+    }
+    let (body, body_from_known) = body_of(draft, known, &child, topic);
+    for pose in &mut poses {
+        pose.world_from_body = pose.world_from_body * body_from_known;
+    }
+    let trajectory = Trajectory::new(body, poses)
+        .map_err(|e| DatasetError::NoPoses { path: place.clone(), found: e.to_string() })?;
+    if trajectory.poses().is_empty() {
+        return Err(problem(clock.bag, format!("{} holds no valid pose", topic.name)));
+    }
+    match used {
+        PoseUse::GroundTruth => draft.ground_truth = Some((trajectory, place)),
+        PoseUse::Trajectory => draft.trajectory = Some((trajectory, place)),
+    }
+    Ok(())
+}
+
+/// The body that poses of frame `child` are used as, and `child_from_body`.
+fn body_of(draft: &mut Draft, known: &Known<'_>, child: &str, topic: &Topic) -> (BodyFrame, Se3) {
+    let camera = BodyFrame::Camera(CameraId(0));
+    let (body, frame) = known.imu.map_or((camera, known.camera), |imu| (BodyFrame::Imu, imu));
+    if !child.is_empty() {
+        if let Some(child_from_body) = known.frames.a_from_b(child, frame) {
+            return (body, child_from_body);
+        }
+        if child == known.camera {
+            return (camera, Se3::IDENTITY);
+        }
+    }
+    let stated = if child.is_empty() { "does not say".into() } else { format!("calls {child:?}") };
+    let message = format!("{} {stated} which body its poses are of; assumed: {body}", topic.name);
+    draft.warnings.push(
+        Warning::new("trajectory-body", message)
+            .at(draft.root.display())
+            .hint("a fixed transform from this body to the IMU in /tf_static settles it"),
+    );
+    (body, Se3::IDENTITY)
+}

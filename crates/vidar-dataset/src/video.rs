@@ -1,0 +1,78 @@
+//! Videos: frames with their times, and an action camera's gyroscope and accelerometer.
+
+use crate::draft::Draft;
+use crate::error::DatasetError;
+use crate::folder::{images_in, names_in};
+use crate::location::Location;
+use crate::options::{DatasetKind, OpenOptions};
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use vidar_core::{ImuNoise, Warning};
+use vidar_video::{Telemetry, Video};
+
+/// The video of a folder that holds one and no images.
+pub(crate) fn only_one_in(folder: &Path) -> Option<(PathBuf, String)> {
+    let is_video = |name: &String| {
+        let lower = name.to_ascii_lowercase();
+        [".mp4", ".mov", ".m4v"].iter().any(|ending| lower.ends_with(ending))
+    };
+    let mut videos: Vec<String> = names_in(folder).ok()?.into_iter().filter(is_video).collect();
+    if videos.len() != 1 || !images_in(folder).ok()?.is_empty() {
+        return None;
+    }
+    let name = videos.remove(0);
+    Some((folder.join(&name), format!("its only video {name}")))
+}
+
+/// Reads the tables of a video and its telemetry; pictures stay in it.
+pub(crate) fn open(path: &Path, reason: String, options: &OpenOptions) -> Result<Draft, DatasetError> {
+    if options.camera.0 != 0 {
+        let found = "camera 0 only".to_string();
+        return Err(DatasetError::MissingCamera { path: path.to_path_buf(), camera: options.camera, found });
+    }
+    let video = Arc::new(Video::open(path)?);
+    let mut draft = Draft::new(DatasetKind::Video, path, format!("{reason}; {}", video.codec_name()));
+    draft.warnings.extend(video.warnings().iter().cloned());
+    let name: Arc<Path> = path.into();
+    let frame = |(number, time)| (time, Location::Frame { video: Arc::clone(&name), number: number as u32 });
+    draft.images = video.times().enumerate().map(frame).collect();
+    if let Some(telemetry) = video.telemetry()? {
+        take_telemetry(&mut draft, telemetry);
+    }
+    draft.media.video = Some(video);
+    Ok(draft)
+}
+
+fn take_telemetry(draft: &mut Draft, telemetry: Telemetry) {
+    if telemetry.imu.is_empty() {
+        return;
+    }
+    let place = draft.root.display().to_string();
+    let Telemetry { device, gyro_rate_hz, accel_rate_hz, .. } = &telemetry;
+    let message = format!(
+        "gyroscope at {gyro_rate_hz:.0} Hz and accelerometer at {accel_rate_hz:.0} Hz of {device:?}; camera and IMU have no \
+         calibration, and their clocks differ by some tens of milliseconds"
+    );
+    let warning = Warning::new("telemetry", message).at(&place);
+    draft.warnings.push(warning.hint("`vidar calibrate` finds camera, rotation and clock"));
+    if telemetry.units != ["rad/s", "m/s\u{b2}"] {
+        let message = format!("the telemetry's units are {:?}; rad/s and m/s² are assumed", telemetry.units);
+        draft.warnings.push(Warning::degraded("telemetry-units", message).at(&place));
+    }
+    if !telemetry.axes_are_stated {
+        let message =
+            "the telemetry does not state its axes; those published for the first cameras (Z, X, Y) are used";
+        draft.warnings.push(Warning::new("telemetry-axes", message).at(&place));
+    }
+    if telemetry.may_be_stabilised {
+        let message = "the camera states how it turned the picture against itself: with electronic stabilisation the \
+                       gyroscope does not describe the motion of the picture";
+        let warning = Warning::degraded("video-stabilised", message).at(&place);
+        draft.warnings.push(warning.hint("switch stabilisation off to record for a map"));
+    }
+    draft.imu = telemetry.imu;
+    draft.imu_noise = Some(ImuNoise::EUROC);
+    let message = "a video states no noise densities of its IMU; those of EuRoC's ADIS16448 are used";
+    let warning = Warning::new("imu-noise", message).at(&place);
+    draft.warnings.push(warning.hint("--calibration imu.yaml (Kalibr)"));
+}

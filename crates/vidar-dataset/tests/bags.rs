@@ -1,0 +1,162 @@
+//! Bags as recordings: topics, calibration, poses, and what is said when they are not clear.
+
+#![allow(clippy::unwrap_used, clippy::panic, reason = "tests may stop at the first surprise")]
+
+use std::path::{Path, PathBuf};
+use vidar_core::{BodyFrame, SensorEvent};
+use vidar_dataset::{CalibrationSource, Dataset, DatasetKind, OpenOptions, open};
+
+/// Made by third-party writers; see `make.py` there.
+fn fixture(name: &str) -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("../vidar-bag/tests/fixtures").join(name)
+}
+
+fn with_topics(topics: &[&str]) -> OpenOptions {
+    OpenOptions { topics: topics.iter().map(|t| t.parse().unwrap()).collect(), ..OpenOptions::default() }
+}
+
+fn open_bag(name: &str, topics: &[&str]) -> Dataset {
+    open(&fixture(name), &with_topics(topics)).unwrap_or_else(|e| panic!("{name}: {e}"))
+}
+
+fn kinds(dataset: &Dataset) -> Vec<&str> {
+    dataset.warnings.iter().map(|w| w.kind.as_ref()).collect()
+}
+
+#[test]
+fn every_container_is_the_same_recording() {
+    let first = open_bag("ros1.bag", &[]);
+    assert_eq!(first.kind, DatasetKind::Bag);
+    assert_eq!(first.name, "ros1");
+    assert_eq!((first.images.len(), first.imu.len()), (3, 8));
+    assert_eq!(first.calibration, CalibrationSource::Topic("/cam0/camera_info".into()));
+    let model = &first.rig.cameras[0].model;
+    assert_eq!((model.name(), model.width(), model.height()), ("radtan", 24, 20));
+    // imu_from_camera of /tf_static.
+    let mount = first.rig.cameras[0].body_from_camera;
+    assert_eq!(mount.translation.as_slice(), [0.1, -0.05, 0.02]);
+    let frames: Vec<_> = first.images.iter().map(|i| first.load_image(i).unwrap()).collect();
+    for name in [
+        "ros1_lz4.bag",
+        "ros1_bz2.bag",
+        "ros2_mcap",
+        "ros2_sqlite",
+        "ros2_sqlite_zstd",
+        "mcap_ros1_lz4.mcap",
+        "mcap_ros2_plain.mcap",
+    ] {
+        let other = open_bag(name, &[]);
+        let times = |d: &Dataset| d.images.iter().map(|i| i.time).collect::<Vec<_>>();
+        assert_eq!((times(&other), &other.imu), (times(&first), &first.imu), "{name}");
+        assert_eq!(other.rig, first.rig, "{name}");
+        for (entry, frame) in other.images.iter().zip(&frames) {
+            assert_eq!(other.load_image(entry).unwrap(), *frame, "{name}");
+        }
+    }
+}
+
+#[test]
+fn events_come_in_the_order_of_time() {
+    let dataset = open_bag("mcap_ros2_zstd.mcap", &["truth=/truth"]);
+    let events: Vec<SensorEvent> = dataset.events().map(|e| e.unwrap()).collect();
+    assert_eq!(events.len(), 3 + 8 + 3);
+    assert!(events.windows(2).all(|w| w[0].time() <= w[1].time()));
+}
+
+#[test]
+fn poses_are_used_as_the_user_says() {
+    let without = open_bag("ros1.bag", &[]);
+    assert!(without.ground_truth.is_none() && without.external_trajectory.is_none());
+    assert!(kinds(&without).contains(&"poses-unused"));
+    let truth = open_bag("ros1.bag", &["truth=/truth"]);
+    let poses = truth.ground_truth.as_ref().unwrap();
+    assert_eq!((poses.poses().len(), poses.body()), (3, BodyFrame::Imu));
+    // A PoseStamped does not name its body.
+    assert!(kinds(&truth).contains(&"trajectory-body"));
+    assert_eq!(poses.poses()[1].world_from_body.translation.as_slice(), [0.5, 1.0, 1.75]);
+    let used = open_bag("ros1.bag", &["trajectory=/truth"]);
+    assert_eq!(used.external_trajectory.unwrap().trajectory, *poses);
+    let error = open(&fixture("ros1.bag"), &with_topics(&["/truth"])).unwrap_err().to_string();
+    assert!(error.contains("truth=/truth") && error.contains("trajectory=/truth"), "{error}");
+}
+
+#[test]
+fn a_topic_that_is_not_there_is_answered_with_the_list() {
+    let error = open(&fixture("ros2_mcap"), &with_topics(&["/cam7/image"])).unwrap_err().to_string();
+    for part in ["/cam7/image", "/cam0/image_raw  sensor_msgs/Image  3", "/imu0  sensor_msgs/Imu  8"] {
+        assert!(error.contains(part), "{part}: {error}");
+    }
+    let error = open(&fixture("ros2_mcap"), &with_topics(&["/tf_static"])).unwrap_err().to_string();
+    assert!(error.contains("of a type that is not read"), "{error}");
+}
+
+#[test]
+fn a_camera_that_is_not_there_is_named() {
+    let options = OpenOptions { camera: vidar_core::CameraId(1), ..OpenOptions::default() };
+    let error = open(&fixture("ros1.bag"), &options).unwrap_err().to_string();
+    assert!(error.contains("no camera") && error.contains("/cam0/image_raw"), "{error}");
+}
+
+#[test]
+fn foxglove_without_imu_is_a_recording_of_images() {
+    let dataset = open_bag("foxglove_protobuf.mcap", &["/cam0/image", "truth=/truth"]);
+    assert_eq!(dataset.images.len(), 3);
+    assert!(dataset.imu.is_empty());
+    assert_eq!(dataset.ground_truth.unwrap().body(), BodyFrame::Camera(vidar_core::CameraId(0)));
+    assert_eq!(dataset.calibration, CalibrationSource::Topic("/cam0/calibration".into()));
+    let with_imu = open_bag("foxglove_json.mcap", &[]);
+    assert_eq!(with_imu.imu.len(), 8);
+}
+
+#[test]
+fn a_folder_of_one_bag_is_the_bag() {
+    let folder = tempfile::tempdir().unwrap();
+    std::fs::copy(fixture("ros1_lz4.bag"), folder.path().join("flight.bag")).unwrap();
+    let dataset = open(folder.path(), &OpenOptions::default()).unwrap();
+    assert_eq!((dataset.kind, dataset.images.len()), (DatasetKind::Bag, 3));
+    assert!(dataset.reason.contains("flight.bag"), "{}", dataset.reason);
+}
+
+#[test]
+fn fingerprints_tell_recordings_apart() {
+    let print = |name: &str| {
+        let mut bytes = Vec::new();
+        open_bag(name, &[]).write_fingerprint(&mut bytes).unwrap();
+        bytes
+    };
+    assert_eq!(print("ros1.bag"), print("ros1.bag"));
+    assert_ne!(print("ros1.bag"), print("ros1_lz4.bag"));
+}
+
+#[test]
+fn a_cut_bag_says_so() {
+    let folder = tempfile::tempdir().unwrap();
+    let whole = std::fs::read(fixture("ros1.bag")).unwrap();
+    let path = folder.path().join("cut.bag");
+    std::fs::write(&path, &whole[..whole.len() * 2 / 3]).unwrap();
+    let dataset = open(&path, &OpenOptions::default()).unwrap();
+    assert!(kinds(&dataset).contains(&"bag-cut-off"), "{:?}", kinds(&dataset));
+}
+
+#[test]
+fn what_is_no_recording_is_named_with_the_nearest_way() {
+    let folder = tempfile::tempdir().unwrap();
+    for (name, bytes, says, way) in [
+        ("a.zip", &b"PK\x03\x04rest"[..], "a zip archive", "unpack"),
+        ("a.bag.gz", b"\x1f\x8brest", "compressed", "gunzip"),
+        ("a.heic", b"\0\0\0\x18ftypheic\0\0", "HEIC", "JPEG"),
+        ("a.mkv", b"\x1a\x45\xdf\xa3rest", "Matroska", "ffmpeg"),
+        ("a.jpg", b"\xff\xd8\xff\xe0", "one image", "vidar depth"),
+        ("a.bag", b"\x9a\x11\x34garbage", "named as a bag", "encrypted"),
+        ("a.bin", b"", "empty", "copy"),
+        ("data.csv", b"#timestamp\n", "a text file", "folder"),
+    ] {
+        let path = folder.path().join(name);
+        std::fs::write(&path, bytes).unwrap();
+        let error = open(&path, &OpenOptions::default()).unwrap_err().to_string();
+        assert!(error.contains(says) && error.contains(way), "{name}: {error}");
+    }
+    let error =
+        open(Path::new("https://example.org/a.bag"), &OpenOptions::default()).unwrap_err().to_string();
+    assert!(error.contains("URL") && error.contains("download"), "{error}");
+}
