@@ -129,7 +129,8 @@ fn read_imu(
     draft
         .warnings
         .push(Warning::new("imu-noise", message).at(&place).hint("--calibration imu.yaml (Kalibr)"));
-    draft.imu_noise = Some(ImuNoise::EUROC);
+    let rate_hz = topic.rate_hz().unwrap_or(ImuNoise::EUROC.rate_hz);
+    draft.imu_noise = Some(ImuNoise { rate_hz, ..ImuNoise::EUROC });
     Ok(Some(frame))
 }
 

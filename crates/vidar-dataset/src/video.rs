@@ -70,8 +70,8 @@ fn take_telemetry(draft: &mut Draft, telemetry: Telemetry) {
         let warning = Warning::degraded("video-stabilised", message).at(&place);
         draft.warnings.push(warning.hint("switch stabilisation off to record for a map"));
     }
+    draft.imu_noise = Some(ImuNoise { rate_hz: telemetry.gyro_rate_hz, ..ImuNoise::EUROC });
     draft.imu = telemetry.imu;
-    draft.imu_noise = Some(ImuNoise::EUROC);
     let message = "a video states no noise densities of its IMU; those of EuRoC's ADIS16448 are used";
     let warning = Warning::new("imu-noise", message).at(&place);
     draft.warnings.push(warning.hint("--calibration imu.yaml (Kalibr)"));

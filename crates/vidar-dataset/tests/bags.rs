@@ -31,7 +31,7 @@ fn every_container_is_the_same_recording() {
     assert_eq!((first.images.len(), first.imu.len()), (3, 8));
     assert_eq!(first.calibration, CalibrationSource::Topic("/cam0/camera_info".into()));
     let model = &first.rig.cameras[0].model;
-    assert_eq!((model.name(), model.width(), model.height()), ("radtan", 24, 20));
+    assert_eq!((model.name(), model.width(), model.height()), ("pinhole-radtan", 24, 20));
     // imu_from_camera of /tf_static.
     let mount = first.rig.cameras[0].body_from_camera;
     assert_eq!(mount.translation.as_slice(), [0.1, -0.05, 0.02]);

@@ -116,12 +116,12 @@ fn missing_and_empty_images_are_left_out_and_counted() {
 fn truncated_images_fail_when_they_are_loaded() {
     let f = euroc();
     let d = f.open().unwrap();
-    let whole = std::fs::read(&d.images[5].path).unwrap();
+    let whole = std::fs::read(d.images[5].location.path()).unwrap();
     for keep in [0, 4, 8, 30, whole.len() / 2, whole.len() - 20] {
-        std::fs::write(&d.images[5].path, &whole[..keep]).unwrap();
+        std::fs::write(d.images[5].location.path(), &whole[..keep]).unwrap();
         fails(d.load_image(&d.images[5]), &[&format!("{}.png", frame_ns(5)), "cannot decode"]);
     }
-    std::fs::write(&d.images[5].path, "<html>not found</html>").unwrap();
+    std::fs::write(d.images[5].location.path(), "<html>not found</html>").unwrap();
     fails(d.load_image(&d.images[5]), &["neither PNG nor JPEG"]);
     let broken = d.events().filter(Result::is_err).count();
     assert_eq!(broken, 1, "the stream goes on after one bad image");

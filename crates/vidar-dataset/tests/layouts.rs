@@ -174,7 +174,8 @@ fn an_image_folder_is_read_in_natural_order_whatever_the_case() {
         f.write(name, gray_png(4, 4, 7));
     }
     let d = f.open().unwrap();
-    let names: Vec<_> = d.images.iter().map(|i| i.path.file_name().unwrap().to_str().unwrap()).collect();
+    let names: Vec<_> =
+        d.images.iter().map(|i| i.location.path().file_name().unwrap().to_str().unwrap()).collect();
     assert_eq!(names, ["IMG1.Png", "img2.JPG.png", "img9.png", "img10.PNG"]);
     assert_eq!(d.calibration, CalibrationSource::Guessed);
     warning(&d, "intrinsics-guessed");
@@ -207,7 +208,7 @@ fn files_of_times_are_read_in_every_form() {
         let options = OpenOptions { timestamps: Some(f.join(name)), ..Default::default() };
         let d = vidar_dataset::open(&f.join("pictures"), &options).unwrap();
         assert_eq!((d.images.len(), d.images[0].time.nanos()), (3, first), "{text}");
-        assert!(d.images[0].path.ends_with("a1.png"));
+        assert!(d.images[0].location.path().ends_with("a1.png"));
         warning(&d, "time-unit");
     }
 }

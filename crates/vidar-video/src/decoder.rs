@@ -105,7 +105,7 @@ enum Machine {
         colours: Colours,
     },
     #[cfg(feature = "h265")]
-    H265(crate::h265::H265),
+    H265(Box<crate::h265::H265>),
 }
 
 impl Machine {
@@ -126,7 +126,7 @@ impl Machine {
                 Ok(Self::H264 { decoder, length_size: config.length_size, colours })
             }
             #[cfg(feature = "h265")]
-            Codec::H265(hvcc) => crate::h265::H265::new(hvcc).map(Self::H265),
+            Codec::H265(hvcc) => crate::h265::H265::new(hvcc).map(Box::new).map(Self::H265),
         }
     }
 

@@ -58,60 +58,65 @@ impl Picture {
     /// Red, green and blue, turned clockwise by quarter turns.
     pub(crate) fn upright(&self, quarter_turns: u8) -> FrameImage {
         let (w, h) = (self.width, self.height);
-        let rows = Rows::new(self);
-        FrameImage::Rgb8(match quarter_turns % 4 {
-            0 => Image::from_fn(w, h, |x, y| rows.rgb(x, y)),
-            1 => Image::from_fn(h, w, |x, y| rows.rgb(y, h - 1 - x)),
-            2 => Image::from_fn(w, h, |x, y| rows.rgb(w - 1 - x, h - 1 - y)),
-            _ => Image::from_fn(h, w, |x, y| rows.rgb(w - 1 - y, x)),
-        })
+        let steps = Steps::new(self.colours);
+        let chroma_width = (w >> self.chroma_shift[0]).max(1);
+        let chroma_rows = (h >> self.chroma_shift[1]).max(1);
+        let mut pixels = vec![[0; 3]; w * h];
+        for (y, (out, luma)) in pixels.chunks_exact_mut(w).zip(self.luma.chunks_exact(w)).enumerate() {
+            let at = (y >> self.chroma_shift[1]).min(chroma_rows - 1) * chroma_width;
+            let [cb, cr] = [0, 1].map(|c| &self.chroma[c][at..at + chroma_width]);
+            for (x, (pixel, &luma)) in out.iter_mut().zip(luma).enumerate() {
+                let u = (x >> self.chroma_shift[0]).min(chroma_width - 1);
+                *pixel = steps.rgb(luma, cb[u], cr[u]);
+            }
+        }
+        let at = |x: usize, y: usize| pixels[y * w + x];
+        let made = match quarter_turns % 4 {
+            1 => Ok(Image::from_fn(h, w, |x, y| at(y, h - 1 - x))),
+            2 => Ok(Image::from_fn(w, h, |x, y| at(w - 1 - x, h - 1 - y))),
+            3 => Ok(Image::from_fn(h, w, |x, y| at(w - 1 - y, x))),
+            _ => Image::from_vec(w, h, pixels),
+        };
+        // `w * h` pixels were made above.
+        FrameImage::Rgb8(made.unwrap_or_else(|_| Image::filled(w, h, [0; 3])))
     }
 }
 
 /// The conversion in whole numbers, 16 bits after the point, so that every machine gives the same bits.
-struct Rows<'a> {
-    picture: &'a Picture,
-    chroma_width: usize,
-    chroma_height: usize,
+struct Steps {
     black: i32,
     luma: i32,
-    /// Red of Cr, green of Cb, green of Cr, blue of Cb.
-    chroma: [i32; 4],
+    red_of_cr: i32,
+    green_of_cb: i32,
+    green_of_cr: i32,
+    blue_of_cb: i32,
 }
 
-impl<'a> Rows<'a> {
-    fn new(picture: &'a Picture) -> Self {
+impl Steps {
+    fn new(colours: Colours) -> Self {
         // ITU-R BT.601 and BT.709: Kr and Kb; ranges of 219 and 224 steps.
-        let (kr, kb) = if picture.colours.is_bt709 { (0.2126, 0.0722) } else { (0.299, 0.114) };
+        let (kr, kb) = if colours.is_bt709 { (0.2126, 0.0722) } else { (0.299, 0.114) };
         let kg = 1.0 - kr - kb;
         let (black, luma, chroma) =
-            if picture.colours.is_full_range { (0, 1.0, 1.0) } else { (16, 255.0 / 219.0, 255.0 / 224.0) };
+            if colours.is_full_range { (0, 1.0, 1.0) } else { (16, 255.0 / 219.0, 255.0 / 224.0) };
         let fixed = |v: f64| (v * 65536.0).round() as i32;
         Self {
-            picture,
-            chroma_width: (picture.width >> picture.chroma_shift[0]).max(1),
-            chroma_height: (picture.height >> picture.chroma_shift[1]).max(1),
             black,
             luma: fixed(luma),
-            chroma: [
-                fixed(2.0 * (1.0 - kr) * chroma),
-                fixed(2.0 * (1.0 - kb) * kb / kg * chroma),
-                fixed(2.0 * (1.0 - kr) * kr / kg * chroma),
-                fixed(2.0 * (1.0 - kb) * chroma),
-            ],
+            red_of_cr: fixed(2.0 * (1.0 - kr) * chroma),
+            green_of_cb: fixed(2.0 * (1.0 - kb) * kb / kg * chroma),
+            green_of_cr: fixed(2.0 * (1.0 - kr) * kr / kg * chroma),
+            blue_of_cb: fixed(2.0 * (1.0 - kb) * chroma),
         }
     }
 
-    fn rgb(&self, x: usize, y: usize) -> [u8; 3] {
-        let p = self.picture;
-        let u = (x >> p.chroma_shift[0]).min(self.chroma_width - 1);
-        let v = (y >> p.chroma_shift[1]).min(self.chroma_height - 1);
-        let at = v * self.chroma_width + u;
-        let (cb, cr) = (i32::from(p.chroma[0][at]) - 128, i32::from(p.chroma[1][at]) - 128);
-        let luma = (i32::from(p.luma[y * p.width + x]) - self.black) * self.luma + 32768;
-        let [red, green_b, green_r, blue] = self.chroma;
-        [luma + red * cr, luma - green_b * cb - green_r * cr, luma + blue * cb]
-            .map(|c| (c >> 16).clamp(0, 255) as u8)
+    #[inline]
+    fn rgb(&self, luma: u8, cb: u8, cr: u8) -> [u8; 3] {
+        let (cb, cr) = (i32::from(cb) - 128, i32::from(cr) - 128);
+        let luma = (i32::from(luma) - self.black) * self.luma + 32768;
+        let byte = |c: i32| (c >> 16).clamp(0, 255) as u8;
+        let green = luma - self.green_of_cb * cb - self.green_of_cr * cr;
+        [byte(luma + self.red_of_cr * cr), byte(green), byte(luma + self.blue_of_cb * cb)]
     }
 }
 

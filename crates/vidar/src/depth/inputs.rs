@@ -6,9 +6,10 @@ use crate::run::pose_of;
 use nalgebra::{Matrix3, Matrix4};
 use rayon::prelude::*;
 use std::path::{Path, PathBuf};
-use vidar_core::{Image, LieGroup, Pinhole, Se3};
+use std::sync::Arc;
+use vidar_core::{Duration, Image, LieGroup, Pinhole, Se3};
 use vidar_dataset::decode::{ImageLimits, read_image, read_size};
-use vidar_dataset::{DatasetKind, OpenOptions};
+use vidar_dataset::{Dataset, DatasetKind, OpenOptions};
 
 /// A decoded image.
 pub(super) struct Picture {
@@ -16,39 +17,89 @@ pub(super) struct Picture {
     pub image: Image<[u8; 3]>,
 }
 
-/// The images of files and folders, in the order given; within a folder in natural order.
-pub(super) fn list(inputs: &[PathBuf]) -> Result<Vec<PathBuf>, Error> {
+/// One image to predict depth of: a file, or an image inside a recording.
+#[derive(Clone, Debug)]
+pub(super) struct Source {
+    /// Its file; of an image inside a recording a name that states both.
+    pub path: PathBuf,
+    recording: Option<(Arc<Dataset>, usize)>,
+}
+
+/// Most images that are taken of a video or bag. All images are predicted together, and the cost grows with the square of their
+/// number; the couplings' chunks are of this order.
+const MOST_OF_A_RECORDING: usize = 16;
+/// Least time between two images of a video or bag: without motion between them a second one adds nothing.
+const BETWEEN_IMAGES: Duration = Duration::from_millis(500);
+
+/// The images of files, folders and recordings, in the order given; within a folder in natural order.
+pub(super) fn list(inputs: &[PathBuf]) -> Result<Vec<Source>, Error> {
     let mut images = Vec::new();
+    let of_file = |path: PathBuf| Source { path, recording: None };
     for input in inputs {
         if input.is_dir() {
             let options = OpenOptions { format: Some(DatasetKind::ImageFolder), ..OpenOptions::default() };
             let folder = vidar_dataset::open(input, &options)?;
-            images.extend(
-                folder.images.iter().filter_map(|entry| entry.location.as_file().map(Path::to_owned)),
-            );
+            let files = folder.images.iter().filter_map(|entry| entry.location.as_file());
+            images.extend(files.map(|path| of_file(path.to_owned())));
+        } else if is_recording(input) {
+            images.extend(of_recording(input)?);
         } else {
-            images.push(input.clone());
+            images.push(of_file(input.clone()));
         }
     }
     if images.is_empty() {
-        let (what, hint) = ("no image was given".to_owned(), "name images or folders of images".to_owned());
+        let what = "no image was given".to_owned();
+        let hint = "name images, folders of images, a video or a bag".to_owned();
         return Err(Error::Usage { what, hint });
     }
     Ok(images)
 }
 
-/// Columns and rows of an image file.
-pub(super) fn size_of(path: &Path) -> Result<(usize, usize), Error> {
-    Ok(read_size(path, &ImageLimits::default())?)
+fn is_recording(path: &Path) -> bool {
+    let ending = path.extension().map(|e| e.to_string_lossy().to_ascii_lowercase()).unwrap_or_default();
+    ["mp4", "mov", "m4v", "bag", "mcap", "db3"].contains(&ending.as_str())
+}
+
+/// Images of a recording, spread evenly over it.
+fn of_recording(path: &Path) -> Result<Vec<Source>, Error> {
+    let dataset = Arc::new(vidar_dataset::open(path, &OpenOptions::default())?);
+    let length = match dataset.images.as_slice() {
+        [first, .., last] => last.time - first.time,
+        _ => Duration::ZERO,
+    };
+    let fitting = usize::try_from(length.nanos() / BETWEEN_IMAGES.nanos()).unwrap_or(0) + 1;
+    let (count, listed) = (fitting.min(MOST_OF_A_RECORDING), dataset.images.len());
+    let at = |i: usize| if count > 1 { i * (listed - 1) / (count - 1) } else { 0 };
+    let name = |number: usize| path.with_extension("").join(format!("{number:06}"));
+    let source =
+        |number: usize| Source { path: name(number), recording: Some((Arc::clone(&dataset), number)) };
+    Ok((0..count.min(listed)).map(at).map(source).collect())
+}
+
+impl Source {
+    /// Columns and rows.
+    pub fn size(&self) -> Result<(usize, usize), Error> {
+        match &self.recording {
+            None => Ok(read_size(&self.path, &ImageLimits::default())?),
+            // All images of a recording have its camera's size.
+            Some((dataset, _)) => {
+                Ok(dataset.rig.camera(dataset.camera).map_or((0, 0), |c| (c.model.width(), c.model.height())))
+            }
+        }
+    }
+
+    fn read(&self) -> Result<Picture, Error> {
+        let image = match &self.recording {
+            None => read_image(&self.path, &ImageLimits::default())?,
+            Some((dataset, number)) => dataset.load_image(&dataset.images[*number])?,
+        };
+        Ok(Picture { path: self.path.clone(), image: image.to_rgb8() })
+    }
 }
 
 /// Decodes all images; stops at the first one that cannot be read.
-pub(super) fn read_all(paths: &[PathBuf]) -> Result<Vec<Picture>, Error> {
-    let read = |path: &PathBuf| {
-        let image = read_image(path, &ImageLimits::default())?.to_rgb8();
-        Ok(Picture { path: path.clone(), image })
-    };
-    paths.par_iter().map(read).collect()
+pub(super) fn read_all(sources: &[Source]) -> Result<Vec<Picture>, Error> {
+    sources.par_iter().map(Source::read).collect()
 }
 
 /// Cameras by image name, read from a file or folder.

@@ -33,7 +33,7 @@ use vidar_hub::Store;
 /// Inputs, network and outputs.
 #[derive(Clone, Debug)]
 pub struct DepthRequest {
-    /// Images, and folders of images, in order.
+    /// Images, folders of images, videos and bags, in order.
     pub inputs: Vec<PathBuf>,
     /// The network.
     pub model: ModelChoice,
@@ -66,6 +66,8 @@ pub struct DepthRequest {
 pub struct DepthPlan {
     /// The images in order.
     pub images: Vec<PathBuf>,
+    /// The same, with the recordings that they lie in.
+    sources: Vec<inputs::Source>,
     /// Columns and rows of the network's input.
     pub processed: (usize, usize),
     /// The model, or why it cannot be used yet.
@@ -119,8 +121,9 @@ pub enum Unit {
 
 /// Plans a run from images, cameras and model: what it does and what it needs.
 pub fn plan(request: &DepthRequest) -> Result<DepthPlan, Error> {
-    let images = inputs::list(&request.inputs)?;
-    let sizes = images.iter().map(|p| inputs::size_of(p)).collect::<Result<Vec<_>, _>>()?;
+    let sources = inputs::list(&request.inputs)?;
+    let images: Vec<PathBuf> = sources.iter().map(|s| s.path.clone()).collect();
+    let sizes = sources.iter().map(inputs::Source::size).collect::<Result<Vec<_>, _>>()?;
     let processed = joint_size(&sizes, request)?;
     let cameras = request.poses.as_ref().map(|path| Cameras::read(path)).transpose()?;
     if let Some(cameras) = &cameras {
@@ -152,6 +155,7 @@ pub fn plan(request: &DepthRequest) -> Result<DepthPlan, Error> {
         warnings,
         model,
         images,
+        sources,
         name: request.model.name(),
         formats: request.formats.clone(),
     })
@@ -207,7 +211,7 @@ pub fn run(request: &DepthRequest, events: &Events, cancel: &CancelToken) -> Res
     let located = models::locate(&request.model, request.accepted.as_ref(), &request.store)?;
     let model = events.stage("open model", 0, || located.open(&request.da3))?;
     check_formats(&model, request)?;
-    let pictures = events.stage("read", plan.images.len(), || inputs::read_all(&plan.images))?;
+    let pictures = events.stage("read", plan.images.len(), || inputs::read_all(&plan.sources))?;
     let cameras = given_cameras(request, &pictures)?;
     // The folder is created only after the network has been opened.
     let network = std::time::Instant::now();
