@@ -6,7 +6,10 @@
 #![allow(clippy::unwrap_used, clippy::panic, clippy::print_stdout)] // helpers of tests are test code, though not marked so
 
 use std::ops::ControlFlow;
-use vidar_core::{ImuNoise, LieGroup, OdometryKeyframe, Se3, So3};
+use vidar_core::{
+    BodyFrame, ImuNoise, LieGroup, NavState, OdometryKeyframe, Se3, So3, StampedPose, Trajectory,
+};
+use vidar_eval::{TrajectoryEvalConfig, evaluate_trajectory};
 use vidar_odometry::bundle_adjustment::{Adjusted, AdjustmentError, AdjustmentFinding, CalibrationSigmas};
 use vidar_odometry::simulate::{
     AdjustSettings, Course, CourseKind, Logged, Random, Simulation, SimulationConfig,
@@ -94,6 +97,44 @@ fn an_adjustment_can_be_broken_off_at_any_iteration() {
         assert_eq!(result, Err(AdjustmentError::Cancelled));
         assert_eq!(told, limit + 1);
     }
+}
+
+/// ATE of all images after the best rigid motion, m.
+fn ate_m(flight: &Logged, adjusted: &Adjusted) -> f64 {
+    let trajectory = |poses: Vec<StampedPose>| Trajectory::new(BodyFrame::Imu, poses).unwrap();
+    let stamped = |s: &NavState| StampedPose { time: s.time, world_from_body: s.world_from_body };
+    let estimate = trajectory(adjusted.images.iter().map(|(_, state)| stamped(state)).collect());
+    let truth = flight
+        .truth
+        .iter()
+        .map(|(_, time, state)| StampedPose { time: *time, world_from_body: state.world_from_body });
+    let report =
+        evaluate_trajectory(&estimate, &trajectory(truth.collect()), &TrajectoryEvalConfig::default());
+    report.unwrap().ate_se3_m.unwrap().rmse
+}
+
+#[test]
+fn images_further_apart_as_of_long_recordings_give_nearly_the_same_poses() {
+    let course = Course { kind: CourseKind::Eight, secs: 16.0, speed: 1.0, phase: 0.4 };
+    let config = SimulationConfig {
+        tracks: 80,
+        camera_rate_hz: 10.0,
+        noise: CONSUMER,
+        loss_share: 0.01,
+        ..SimulationConfig::default()
+    };
+    let simulation = Simulation::new(&course, 0.0, 15.0, &config);
+    let [fifth, two_fifths, four_fifths] = [2, 4, 8].map(|every| {
+        let flight = Logged::new(&simulation, every, 1, &settings());
+        let adjusted = adjust(&flight, &settings());
+        // Every image has a state, also those between the adjusted ones.
+        assert!(adjusted.images.len() + 10 > flight.truth.len(), "{} images", adjusted.images.len());
+        ate_m(&flight, &adjusted)
+    });
+    println!("ATE {fifth:.4} {two_fifths:.4} {four_fifths:.4} m");
+    assert!(fifth < 0.02, "ATE {fifth} m with an image every 0.2 s");
+    assert!(two_fifths < 0.03, "ATE {two_fifths} m with an image every 0.4 s");
+    assert!(four_fifths < 0.04, "ATE {four_fifths} m with an image every 0.8 s");
 }
 
 /// Squared errors over a set of flights, and squared errors over their stated variance.

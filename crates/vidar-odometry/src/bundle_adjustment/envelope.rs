@@ -2,7 +2,7 @@
 //!
 //! States that see the same landmarks are neighbours in time, so that the reduced system of a recording is a band with a few
 //! full rows for the calibration: factorising it costs the square of the band's width per row, and the factor fills nothing
-//! outside the envelope (George and Liu 1981, chapter 4).
+//! outside the envelope (George and Liu 1981, chapter 4). A loop makes the rows of the states that it ties long, and no others.
 
 use crate::backend::dot;
 

@@ -3,6 +3,7 @@
 use super::envelope::Envelope;
 use super::observation::{POSITION, ROTATION};
 use super::problem::Problem;
+use super::sigmas::CalibrationSigmas;
 use nalgebra::{Matrix3, Vector3};
 use vidar_core::{LieGroup, Se3};
 
@@ -10,6 +11,9 @@ use vidar_core::{LieGroup, Se3};
 /// tenths of a degree, and the recording's own errors (lens, gains) move the place by as much.
 const MIN_POSITION_M: f64 = 0.03;
 const MIN_ROTATION_RAD: f64 = 0.02;
+
+/// And departures below this many of the standard deviations that the given value was stated with.
+const MIN_STATED_SIGMAS: f64 = 3.0;
 
 /// From here on the prior of a given position is widened, m: what a hand with a ruler misses a camera by. Real MH_01 shows 12 mm at a
 /// stated 4 mm although it was calibrated with a target, so that less is no reason.
@@ -69,7 +73,6 @@ pub(super) fn departures(problem: &Problem, covariance: &Envelope) -> Departures
         let (Some(joint), sigma) = (block(problem, covariance, at), problem.prior.sigmas[at]) else {
             return none;
         };
-        // Of a prior that was widened the given value is tested all the same; it was the mean.
         let Some(information) = joint.try_inverse() else { return none };
         let own = information - Matrix3::identity() * sigma.powi(-2);
         // With Λ = Λ_own + Λ_prior and Λ δ = Λ_own δ_own, where δ counts from the prior's mean.
@@ -91,26 +94,33 @@ fn block(problem: &Problem, covariance: &Envelope, at: usize) -> Option<Matrix3<
     Some(Matrix3::from_fn(|a, b| covariance.entry(rows[a], rows[b])))
 }
 
-/// What the solution says of a camera's place that was given.
-pub(super) fn of(problem: &Problem, covariance: &Envelope, given: &Se3) -> Vec<AdjustmentFinding> {
+/// What the solution says of a camera's place that was given as well as `sigmas` state: a guess is contradicted by more than a
+/// calibration is.
+pub(super) fn of(
+    problem: &Problem,
+    covariance: &Envelope,
+    given: &Se3,
+    sigmas: &CalibrationSigmas,
+) -> Vec<AdjustmentFinding> {
     let found = &problem.calibration.body_from_camera;
     let mut findings = Vec::new();
     let contradicts = |by: &Vector3<f64>, joint: &Matrix3<f64>, least: f64| {
         let chi2 = joint.try_inverse().map_or(0.0, |inverse| by.dot(&(inverse * by)));
         chi2 > CHI2_3_SIGMAS && by.norm() > least
     };
-    let sigmas = |joint: &Matrix3<f64>| joint.diagonal().map(f64::sqrt);
+    let roots = |joint: &Matrix3<f64>| joint.diagonal().map(f64::sqrt);
+    let least = |floor: f64, stated: f64| floor.max(MIN_STATED_SIGMAS * stated);
     if let Some(joint) = block(problem, covariance, POSITION) {
         let by = found.translation - given.translation;
-        if contradicts(&by, &joint, MIN_POSITION_M) {
+        if contradicts(&by, &joint, least(MIN_POSITION_M, sigmas.position_m)) {
             let (given_m, found_m) = (given.translation, found.translation);
-            findings.push(AdjustmentFinding::CameraPosition { given_m, found_m, sigma_m: sigmas(&joint) });
+            findings.push(AdjustmentFinding::CameraPosition { given_m, found_m, sigma_m: roots(&joint) });
         }
     }
     if let Some(joint) = block(problem, covariance, ROTATION) {
         let turned_rad = (given.rotation.inverse() * found.rotation).log();
-        if contradicts(&turned_rad, &joint, MIN_ROTATION_RAD) {
-            findings.push(AdjustmentFinding::CameraRotation { turned_rad, sigma_rad: sigmas(&joint) });
+        if contradicts(&turned_rad, &joint, least(MIN_ROTATION_RAD, sigmas.rotation_rad)) {
+            findings.push(AdjustmentFinding::CameraRotation { turned_rad, sigma_rad: roots(&joint) });
         }
     }
     findings

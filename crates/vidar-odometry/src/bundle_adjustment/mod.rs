@@ -4,10 +4,11 @@
 //! one adjustment over all logged images with every IMU measurement between them gives better states, and states for
 //! the images before the start: poses, velocities, biases, landmarks and, where asked for, the camera's calibration
 //! (clock, readout, place on the body, intrinsics) are estimated together; scale and gravity are part of it, because states are
-//! metric and z is up. Segments that the odometry had to leave apart are joined by the IMU where the gap is short.
+//! metric and z is up. Segments that the odometry had to leave apart are joined by the IMU where the gap is short. The sensors' gains
+//! and their noise are estimated, too, and what comes into view again ties its times together.
 //!
 //! [`adjust`] is the way through: the odometry's longest segment → outward over images without a state, and over other segments
-//! → all together → covariance → a state for every image.
+//! → all together → again with the noise that the residuals show → again with loops → covariance → a state for every image.
 
 mod envelope;
 mod findings;

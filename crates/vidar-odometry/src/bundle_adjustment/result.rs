@@ -149,7 +149,7 @@ pub(super) fn collect(
             gyro_noise_density: model.noise.gyro_density,
             accel_noise_density: model.noise.accel_density,
         },
-        findings: findings::of(problem, covariance, &input.given_body_from_camera),
+        findings: findings::of(problem, covariance, &input.given_body_from_camera, input.sigmas),
         scale_std,
         report: AdjustmentReport {
             states: problem.frames.len(),
