@@ -85,10 +85,7 @@ pub(crate) fn unused_poses<'a>(bag: &'a Bag, choice: &Choice<'_>) -> Vec<&'a str
 }
 
 /// The only one, or the one that the user names; else all of them.
-fn choose_one<'a>(
-    all: Vec<&'a Topic>,
-    named: impl Fn(&Topic) -> bool,
-) -> Result<Option<&'a Topic>, Vec<&'a Topic>> {
+fn choose_one(all: Vec<&Topic>, named: impl Fn(&Topic) -> bool) -> Result<Option<&Topic>, Vec<&Topic>> {
     match (all.iter().find(|t| named(t)), all.as_slice()) {
         (Some(named), _) => Ok(Some(named)),
         (None, []) => Ok(None),

@@ -1,6 +1,11 @@
 //! A real action camera's clip: H.264 with telemetry (see the data's README; not part of the repository).
 
-#![allow(clippy::unwrap_used, clippy::panic, clippy::print_stderr, reason = "tests may stop at the first surprise")]
+#![allow(
+    clippy::unwrap_used,
+    clippy::panic,
+    clippy::print_stderr,
+    reason = "tests may stop at the first surprise"
+)]
 
 use std::path::{Path, PathBuf};
 use vidar_core::FrameImage;
