@@ -1,6 +1,6 @@
 //! Decoders on a thread of their own: a panic or a hang inside one becomes an error of one frame.
 
-use crate::picture::{Colours, Picture};
+use crate::picture::{Colours, Picture, check_size, colours_of, round_to_eight};
 use rust_h264::nal::{parse_avcc, parse_avcc_config, parse_sps_info};
 use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender, sync_channel};
 use std::time::Duration;
@@ -38,9 +38,6 @@ const PICTURE_LIMIT: Duration = Duration::from_secs(20);
 
 /// Name of the thread, by which a program can tell its panics from others.
 pub const DECODER_THREAD: &str = "vidar video decoder";
-
-/// Largest picture, pixels: 8K.
-const MAX_PIXELS: u64 = 8192 * 4352;
 
 impl Decoder {
     /// Starts a decoder for a codec.
@@ -163,24 +160,6 @@ impl Machine {
     }
 }
 
-/// Refuses pictures that would take more memory than any camera's.
-pub(crate) fn check_size(width: u64, height: u64) -> Result<(), String> {
-    if width.saturating_mul(height) > MAX_PIXELS {
-        return Err(format!("pictures of {width}x{height} pixels; at most {MAX_PIXELS} pixels are decoded"));
-    }
-    Ok(())
-}
-
-/// Colours by the stream's own words (ITU-T H.273: matrix 1 is BT.709, 5 and 6 BT.601); without them by size, as players do.
-pub(crate) fn colours_of(is_full_range: bool, matrix: u8, height: usize) -> Colours {
-    let is_bt709 = match matrix {
-        1 => true,
-        5 | 6 => false,
-        _ => height >= 720,
-    };
-    Colours { is_full_range, is_bt709 }
-}
-
 fn h264_picture(frame: rust_h264::decoder::Frame, colours: Colours) -> Picture {
     let is_wide = frame.bytes_per_sample() == 2;
     let plane = |bytes: Vec<u8>| if is_wide { eight_bits(bytes) } else { bytes };
@@ -201,13 +180,4 @@ fn h264_picture(frame: rust_h264::decoder::Frame, colours: Colours) -> Picture {
 /// Ten bits, little-endian, rounded to eight.
 fn eight_bits(bytes: Vec<u8>) -> Vec<u8> {
     bytes.as_chunks::<2>().0.iter().map(|b| round_to_eight(u16::from_le_bytes(*b), 10)).collect()
-}
-
-/// A sample of `depth` bits as eight.
-pub(crate) fn round_to_eight(value: u16, depth: u8) -> u8 {
-    let drop = u32::from(depth.saturating_sub(8));
-    if drop == 0 {
-        return value.min(255) as u8;
-    }
-    ((u32::from(value) + (1 << (drop - 1))) >> drop).min(255) as u8
 }
