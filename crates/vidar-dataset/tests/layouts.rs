@@ -302,7 +302,7 @@ fn names_of_options_are_read_back() {
         assert_eq!(format.to_string().parse::<TrajectoryFormat>().unwrap(), format);
     }
     let error = "eurok".parse::<DatasetKind>().unwrap_err().to_string();
-    assert!(error.contains("euroc, tum-rgbd, 7scenes, posed-folder, images"), "{error}");
+    assert!(error.contains("euroc, tum-rgbd, 7scenes, posed-folder, bag, video, images"), "{error}");
 }
 
 #[test]

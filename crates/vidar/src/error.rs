@@ -97,6 +97,14 @@ pub enum Error {
         /// Dataset name.
         name: String,
     },
+    /// Images alone: neither a calibration nor what would show it.
+    #[error(
+        "{name} has neither a calibration nor an IMU that would show it: images alone give depth without scale"
+    )]
+    ImagesAlone {
+        /// Dataset name.
+        name: String,
+    },
     /// The recording does not show its calibration.
     #[error("{name} has no calibration, and the recording does not show it: {reason}")]
     NotCalibrated {
@@ -253,7 +261,7 @@ impl Error {
             Self::Camera(_) => "E0205",
             Self::Trajectory(_) => "E0206",
             Self::NotARun { .. } => "E0207",
-            Self::NoCalibration { .. } | Self::NotCalibrated { .. } => "E0208",
+            Self::NoCalibration { .. } | Self::ImagesAlone { .. } | Self::NotCalibrated { .. } => "E0208",
             Self::NoOdometry { .. } => "E0209",
             Self::NotARecording { .. } => "E0210",
             Self::Geometry(_) | Self::Stereo(_) => "E0301",
@@ -348,6 +356,10 @@ impl Error {
             }
             Self::NoCalibration { .. } => {
                 "give --calibration FILE (EuRoC sensor.yaml, Kalibr camchain) or --camera-model pinhole:fx,fy,cx,cy"
+            }
+            Self::ImagesAlone { .. } => {
+                "`vidar depth PATH` estimates depth; a metric map needs --camera-model pinhole:fx,fy,cx,cy (or --calibration \
+                 FILE) and the poses of another odometry with --trajectory FILE"
             }
             Self::NoOdometry { .. } => {
                 "move sideways at the start; `vidar odometry PATH` writes the state at every image to odometry/health.csv"

@@ -308,6 +308,11 @@ fn unit_slip(image: vidar_core::Timestamp, pose: vidar_core::Timestamp) -> Optio
 /// Refuses a camera that is only guessed: it would bend every surface and still look metric.
 pub fn require_calibration(dataset: &Dataset) -> Result<(), Error> {
     match dataset.calibration {
+        vidar_dataset::CalibrationSource::Guessed
+            if dataset.imu.is_empty() && dataset.external_trajectory.is_none() =>
+        {
+            Err(Error::ImagesAlone { name: dataset.name.clone() })
+        }
         vidar_dataset::CalibrationSource::Guessed => Err(Error::NoCalibration { name: dataset.name.clone() }),
         _ => Ok(()),
     }
