@@ -38,7 +38,7 @@ impl Compression {
         match self {
             Self::None => out.extend_from_slice(packed),
             Self::Lz4 => read_all(lz4_flex::frame::FrameDecoder::new(packed), limit, &mut out)?,
-            Self::Bzip2 => read_all(bzip2_rs::DecoderReader::new(packed), limit, &mut out)?,
+            Self::Bzip2 => read_all(bzip2::read::BzDecoder::new(packed), limit, &mut out)?,
             Self::Zstd => {
                 let decoder = ruzstd::decoding::StreamingDecoder::new(packed).map_err(|e| e.to_string())?;
                 read_all(decoder, limit, &mut out)?;

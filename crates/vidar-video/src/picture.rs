@@ -150,36 +150,6 @@ impl Steps {
     }
 }
 
-/// Largest picture, pixels: 8K.
-const MAX_PIXELS: u64 = 8192 * 4352;
-
-/// Refuses pictures that would take more memory than any camera's.
-pub(crate) fn check_size(width: u64, height: u64) -> Result<(), String> {
-    if width.saturating_mul(height) > MAX_PIXELS {
-        return Err(format!("pictures of {width}x{height} pixels; at most {MAX_PIXELS} pixels are decoded"));
-    }
-    Ok(())
-}
-
-/// Colours by the stream's own words (ITU-T H.273: matrix 1 is BT.709, 5 and 6 BT.601); without them by size, as players do.
-pub(crate) fn colours_of(is_full_range: bool, matrix: u8, height: usize) -> Colours {
-    let is_bt709 = match matrix {
-        1 => true,
-        5 | 6 => false,
-        _ => height >= 720,
-    };
-    Colours { is_full_range, is_bt709 }
-}
-
-/// A sample of `depth` bits as eight.
-pub(crate) fn round_to_eight(value: u16, depth: u8) -> u8 {
-    let drop = u32::from(depth.saturating_sub(8));
-    if drop == 0 {
-        return value.min(255) as u8;
-    }
-    ((u32::from(value) + (1 << (drop - 1))) >> drop).min(255) as u8
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;

@@ -31,7 +31,7 @@ fn quarters(image: &FrameImage) -> Vec<f64> {
     sums.iter().map(|s| s / (w * h) as f64 * 4.0).collect()
 }
 
-/// A mean over a quarter may differ by the roundings of two conversions to RGB; largest difference seen: 0.7.
+/// A mean over a quarter may differ by the roundings of two conversions to RGB.
 const TOLERANCE: f64 = 0.75;
 
 fn check(name: &str) {

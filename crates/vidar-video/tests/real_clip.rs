@@ -37,7 +37,7 @@ fn frames_times_and_telemetry_are_those_of_the_clip() {
     // 30000/1001 Hz.
     assert!(times.windows(2).all(|w| (w[1] - w[0] - 33_366_667).abs() <= 1_000));
     let telemetry = video.telemetry().unwrap().unwrap();
-    // Hand-counted with the camera maker's numbers: gyroscope about 400 Hz, gravity in the accelerometer.
+    // Counts as ffprobe gives them, and the camera maker's numbers: gyroscope about 400 Hz, gravity in the accelerometer.
     assert!((telemetry.gyro_rate_hz - 400.0).abs() < 5.0, "{}", telemetry.gyro_rate_hz);
     let mean = telemetry.imu.iter().map(|s| s.accel.0.norm()).sum::<f64>() / telemetry.imu.len() as f64;
     assert!((mean - 9.81).abs() < 0.3, "mean specific force {mean}");
