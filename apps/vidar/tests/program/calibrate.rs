@@ -110,3 +110,22 @@ fn a_recording_that_shows_no_calibration_is_refused() {
     vidar(&["odometry", sequence, "-o", out.to_str().unwrap()]).ends_with(1).says(&["error[E0208]"]);
     assert!(!out.exists(), "a refused run left a folder");
 }
+
+#[test]
+fn inspect_says_what_is_missing_and_what_the_recording_shows_of_it() {
+    let ran = vidar(&["inspect", phone().to_str().unwrap(), "-q"]).ends_with(0);
+    for words in [
+        "missing",
+        "intrinsics of the camera",
+        "readout time",
+        "found",
+        "focal length",
+        "noise of the IMU",
+        "turns ",
+    ] {
+        assert!(ran.stdout.contains(words), "{words} is missing in\n{}", ran.stdout);
+    }
+    let calibrated = vidar(&["inspect", shared().sequence.to_str().unwrap(), "--json"]).ends_with(0).json();
+    let missing = calibrated["missing"].as_array().unwrap();
+    assert!(!missing.iter().any(|m| m.as_str().unwrap().contains("intrinsics")), "{calibrated}");
+}

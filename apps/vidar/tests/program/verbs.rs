@@ -85,8 +85,8 @@ fn inspect_prints_the_same_as_text_and_json() {
     assert_eq!(
         keys(&json, 1),
         [
-            "schema", "name", "kind", "reason", "streams", "camera", "imu", "poses", "images", "possible",
-            "warnings"
+            "schema", "name", "kind", "reason", "streams", "camera", "imu", "poses", "images", "motion",
+            "missing", "found", "advice", "possible", "warnings"
         ]
     );
     assert_eq!(
@@ -197,6 +197,7 @@ fn progress_as_json_is_one_event_a_line_and_the_log_has_the_same_shape() {
         match kind {
             "stage-started" => &["schema", "event", "stage", "total"],
             "progress" => &["schema", "event", "stage", "done", "total"],
+            "chunk-progress" => &["schema", "event", "percent"],
             "stage-finished" => &["schema", "event", "stage", "seconds"],
             "world" => &["schema", "event", "poses", "segment"],
             "state" => &["schema", "event", "frame", "time_ns", "segment", "position_m"],
@@ -223,6 +224,7 @@ fn progress_as_json_is_one_event_a_line_and_the_log_has_the_same_shape() {
     for kind in [
         "stage-started",
         "progress",
+        "chunk-progress",
         "stage-finished",
         "state",
         "keyframe",
