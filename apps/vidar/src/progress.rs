@@ -42,7 +42,10 @@ fn plain() -> Events {
             let Ok(mut last) = last.lock() else { return };
             if last.elapsed() >= HEARTBEAT {
                 *last = Instant::now();
-                print::talk(format!("{stage}: {done} of {total}"));
+                match total {
+                    0 => print::talk(format!("{stage}: {done}")),
+                    _ => print::talk(format!("{stage}: {done} of {total}")),
+                }
             }
         }
         Event::ChunkProgress { percent } => {

@@ -176,14 +176,18 @@ pub(crate) fn complete(
     Ok(())
 }
 
-/// What calibrating `dataset` gives, or why it gives nothing, as a sentence.
-pub(crate) fn found_in_words(dataset: &Dataset, events: &Events, cancel: &CancelToken) -> String {
-    match events.stage(STAGE, 0, || look(dataset, events, cancel)) {
-        Ok(found) => match too_uncertain(&found) {
-            Some(reason) => format!("{}; too uncertain to be used unasked: {reason}", report::values(&found)),
-            None => report::values(&found),
-        },
-        Err(error) => error.to_string(),
+/// What calibrating `dataset` gives, as a sentence; the error is why it gives nothing that would be used unasked.
+pub(crate) fn found_in_words(
+    dataset: &Dataset,
+    events: &Events,
+    cancel: &CancelToken,
+) -> Result<String, String> {
+    let found = events.stage(STAGE, 0, || look(dataset, events, cancel)).map_err(|e| e.to_string())?;
+    match too_uncertain(&found) {
+        Some(reason) => {
+            Err(format!("{}; too uncertain to be used unasked: {reason}", report::values(&found)))
+        }
+        None => Ok(report::values(&found)),
     }
 }
 

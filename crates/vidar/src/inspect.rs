@@ -12,7 +12,7 @@ use serde::Serialize;
 use std::path::Path;
 use vidar_core::{Duration, FrameImage, Timestamp, Trajectory, Warning};
 use vidar_dataset::{CalibrationSource, Dataset, OpenOptions};
-use vidar_odometry::calibration::sensor_noise;
+use vidar_odometry::calibration::{SensorNoise, sensor_noise};
 
 /// Summary of a recording.
 #[derive(Clone, Debug, Serialize)]
@@ -82,6 +82,10 @@ pub struct ImageHealth {
 /// Number of sampled images: enough for a median, few enough to be fast.
 const SAMPLED_IMAGES: usize = 9;
 
+/// What shows a calibration.
+const CALIBRATION_ADVICE: &str = "turn the camera about all of its axes for some seconds, by 20° or more, while it sees texture: \
+    that shows the calibration";
+
 /// Opens the recording and summarises it. Where it has an IMU and no calibration, half a minute of it is calibrated, as
 /// `vidar odometry` would do.
 ///
@@ -114,11 +118,21 @@ pub fn inspect(
     .collect();
     let motion = Motion::of(&dataset.imu);
     let images = image_health(&dataset);
+    let needs_calibration = dataset.calibration == CalibrationSource::Guessed && !dataset.imu.is_empty();
+    let calibration = needs_calibration.then(|| calibrate::found_in_words(&dataset, events, cancel));
+    let is_refused = matches!(calibration, Some(Err(_)));
     let advice = motion.iter().flat_map(Motion::advice);
-    let advice = advice.chain(images.iter().flat_map(motion::advice_of_images)).collect();
+    let advice = advice.chain(images.iter().flat_map(motion::advice_of_images));
+    let advice = advice.chain(is_refused.then(|| CALIBRATION_ADVICE.to_owned())).collect();
+    let noise = sensor_noise(&dataset.imu).map(|noise| {
+        let SensorNoise { gyro, accel, .. } = noise;
+        format!(
+            "noise of the IMU at most {gyro:.1e} rad/s/√Hz and {accel:.1e} m/s²/√Hz, as its samples show it"
+        )
+    });
     Ok(Inspection {
         missing: missing(&dataset),
-        found: found(&dataset, events, cancel),
+        found: calibration.map(|c| c.unwrap_or_else(|refused| refused)).into_iter().chain(noise).collect(),
         motion,
         advice,
         name: dataset.name.clone(),
@@ -129,7 +143,7 @@ pub fn inspect(
         imu: describe_imu(&dataset),
         poses: describe_poses(&dataset),
         images,
-        possible: possible(&dataset),
+        possible: possible(&dataset, is_refused),
         warnings: dataset.warnings.clone(),
     })
 }
@@ -152,21 +166,6 @@ fn missing(dataset: &Dataset) -> Vec<String> {
         (has_imu && (dataset.rig.imu.is_none() || warned("imu-noise")), "noise of the IMU"),
     ];
     all.into_iter().filter(|(is_missing, _)| *is_missing).map(|(_, what)| what.to_owned()).collect()
-}
-
-/// What the recording's own data give of it.
-fn found(dataset: &Dataset, events: &Events, cancel: &CancelToken) -> Vec<String> {
-    let mut words = Vec::new();
-    if dataset.calibration == CalibrationSource::Guessed && !dataset.imu.is_empty() {
-        words.push(calibrate::found_in_words(dataset, events, cancel));
-    }
-    if let Some(noise) = sensor_noise(&dataset.imu) {
-        words.push(format!(
-            "noise of the IMU at most {:.1e} rad/s/√Hz and {:.1e} m/s²/√Hz, as its samples show it",
-            noise.gyro, noise.accel
-        ));
-    }
-    words
 }
 
 fn times(trajectory: Option<&Trajectory>) -> Vec<Timestamp> {
@@ -266,8 +265,15 @@ fn measure(image: &FrameImage) -> [f64; 3] {
     [mean, clipped, squares / count - (sum / count).powi(2)]
 }
 
-fn possible(dataset: &Dataset) -> Vec<String> {
+/// `is_refused`: there is no calibration, and the recording does not show one.
+fn possible(dataset: &Dataset, is_refused: bool) -> Vec<String> {
     let mut lines = Vec::new();
+    if is_refused {
+        lines.push(
+            "vidar run, vidar odometry: not possible yet; give --calibration FILE or --camera-model".into(),
+        );
+        return lines;
+    }
     if dataset.calibration == CalibrationSource::Guessed && !dataset.imu.is_empty() {
         lines.push(
             "vidar run, vidar odometry: calibrate from images and gyroscope first, as vidar calibrate does"

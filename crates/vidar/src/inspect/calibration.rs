@@ -149,7 +149,7 @@ pub(super) fn describe_noise(noise: &ImuNoise) -> Vec<String> {
     let minute = 60.0_f64.sqrt();
     vec![
         format!(
-            "gyroscope noise {gyro:.2e} rad/s/sqrt(Hz): standard deviation of samples {:.3} deg/s at {} Hz, of the angle {:.2} deg after an hour; bias drift {:.4} deg/s in a minute",
+            "gyroscope noise {gyro:.2e} rad/s/sqrt(Hz): standard deviation of samples {:.3} deg/s at {:.0} Hz, of the angle {:.2} deg after an hour; bias drift {:.4} deg/s in a minute",
             (gyro * root_rate).to_degrees(),
             noise.rate_hz,
             (gyro * 60.0).to_degrees(),
