@@ -4,14 +4,12 @@
 //! The short list runs with every test; the whole one by
 //! `cargo test -p vidar-cli --test program -- --ignored the_whole_list_of_faults`.
 
+use crate::odometry::flight;
 use crate::support::{ProgramOutput, command, shared, vidar};
 use serde_json::Value;
 use std::path::{Path, PathBuf};
+use std::sync::Mutex;
 use std::sync::atomic::{AtomicUsize, Ordering};
-use std::sync::{Mutex, OnceLock};
-
-const WORLD: &str = "duration_secs = 6.0\ncamera_rate_hz = 20.0\nwidth = 376\nheight = 240\nblur_samples = 1\n\
-    exposure_secs = 0.0\nscan_spacing_m = 0.2\ndepth = false\n";
 
 /// One fault.
 #[derive(Clone, Copy, Debug)]
@@ -102,22 +100,10 @@ fn text(path: &Path) -> &str {
     path.to_str().unwrap()
 }
 
-/// The flight without a fault.
-pub fn flight() -> &'static Path {
-    static FLIGHT: OnceLock<PathBuf> = OnceLock::new();
-    FLIGHT.get_or_init(|| {
-        let world = shared().root.join("flight with faults.toml");
-        std::fs::write(&world, WORLD).unwrap();
-        let sequence = shared().root.join("flight with faults");
-        vidar(&["synth", text(&sequence), "-q", "--world-config", text(&world)]).ends_with(0);
-        sequence
-    })
-}
-
-/// The flight with a fault; its images are linked.
-fn with_fault(fault: Fault) -> PathBuf {
+/// A flight with a fault; its images are linked.
+fn with_fault(flight: &Path, fault: Fault) -> PathBuf {
     let folder = shared().root.join(format!("fault {fault:?}"));
-    let (from, to) = (flight().join("mav0"), folder.join("mav0"));
+    let (from, to) = (flight.join("mav0"), folder.join("mav0"));
     for part in ["cam0", "imu0", "state_groundtruth_estimate0"] {
         std::fs::create_dir_all(to.join(part)).unwrap();
         for name in ["data.csv", "sensor.yaml"] {
@@ -219,7 +205,7 @@ fn imu_with(fault: Fault, text: &str) -> String {
 
 /// Fails unless the fault is right within σ, told as degraded with a cause, or refused with one.
 fn judge((fault, causes): Case) -> Result<String, String> {
-    let folder = with_fault(fault);
+    let folder = with_fault(flight(), fault);
     let mut odometry = command();
     odometry.arg("odometry").arg(&folder).arg("-o").arg(folder.join("out"));
     odometry.args(["--json", "--progress", "off", "--threads", "1"]);
@@ -275,4 +261,33 @@ fn faults_are_right_within_sigma_told_or_refused_with_their_cause() {
 #[ignore = "two minutes; the command is at the top of this file"]
 fn the_whole_list_of_faults() {
     judge_all(&[SHORT, REST]);
+}
+
+#[test]
+fn after_five_seconds_without_imu_it_starts_again() {
+    let world = shared().root.join("long flight.toml");
+    let text = "duration_secs = 14.0\ncamera_rate_hz = 20.0\nwidth = 376\nheight = 240\nblur_samples = 1\n\
+        exposure_secs = 0.0\nscan_spacing_m = 0.2\ndepth = false\n";
+    std::fs::write(&world, text).unwrap();
+    let sequence = shared().root.join("long flight");
+    vidar(&["synth", self::text(&sequence), "-q", "--world-config", self::text(&world)]).ends_with(0);
+    let folder = with_fault(&sequence, Fault::Gap(4.0, 9.0));
+    let out = folder.join("out");
+    vidar(&["odometry", self::text(&folder), "-o", self::text(&out)]).ends_with(3).says(&["imu-gap"]);
+    let table = std::fs::read_to_string(out.join("odometry/health.csv")).unwrap();
+    let rows: Vec<Vec<&str>> =
+        table.lines().filter(|l| !l.starts_with('#')).map(|l| l.split(',').collect()).collect();
+    let first: i64 = rows[0][0].parse().unwrap();
+    let tracked = |from: f64, until: f64| {
+        let is_within = |row: &&Vec<&str>| {
+            let secs = (row[0].parse::<i64>().unwrap() - first) as f64 * 1e-9;
+            (from..until).contains(&secs)
+        };
+        let is_tracked = |row: &&Vec<&str>| !["waiting", "lost"].contains(&row[2]);
+        let within = || rows.iter().filter(is_within);
+        within().filter(is_tracked).count() as f64 / within().count() as f64
+    };
+    assert!(tracked(2.5, 4.0) > 0.9, "before the gap: {}", tracked(2.5, 4.0));
+    assert!(tracked(4.5, 9.0) < 0.1, "no state is claimed within it: {}", tracked(4.5, 9.0));
+    assert!(tracked(12.0, 14.0) > 0.9, "three seconds after it: {}", tracked(12.0, 14.0));
 }

@@ -1,7 +1,7 @@
 //! Nothing is lost: a folder is only resumed by the same run, what an earlier attempt left is removed, and the manifest lists what
 //! belongs to a run.
 
-use crate::fault_list::flight;
+use crate::odometry::flight;
 use crate::support::{copy_of_sequence, files_under, finished, manifest, run_command, run_on, shared};
 use std::path::Path;
 use std::time::{Duration, Instant};
