@@ -136,14 +136,19 @@ fn ten_million_rows_take_less_than_300_megabytes() {
         let (mut peak, status) = (0, format!("/proc/{}/status", child.id()));
         while child.try_wait().unwrap().is_none() {
             let text = std::fs::read_to_string(&status).unwrap_or_default();
-            let line = text.lines().find_map(|l| l.strip_prefix("VmHWM:"));
+            // Before the program is executed the numbers are those of this process.
+            let is_program = text.starts_with("Name:\tvidar\n");
+            let line = text.lines().find_map(|l| l.strip_prefix("VmHWM:")).filter(|_| is_program);
             let kib = line.and_then(|l| l.trim().trim_end_matches(" kB").parse::<u64>().ok());
             peak = peak.max(kib.unwrap_or(0) * 1024);
             std::thread::sleep(Duration::from_millis(5));
         }
         let ran: crate::support::ProgramOutput = child.wait_with_output().unwrap().into();
         ran.ends_with(1).says(&["data.csv", said]);
-        assert!((1_000_000..MOST_BYTES).contains(&peak), "{list}: {} MB", peak / 1_000_000);
+        assert!(peak < MOST_BYTES, "{list}: {} MB", peak / 1_000_000);
+        // A file that is refused by its size ends the program before it can be asked.
+        let is_read = said == "split the recording";
+        assert!(!is_read || peak > 1_000_000, "{list}: nothing was measured");
         std::fs::write(&path, usual).unwrap();
     }
 }
