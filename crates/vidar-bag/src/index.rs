@@ -93,6 +93,16 @@ pub(crate) struct FileIndex {
     /// By the number that the file gives to a connection or channel.
     pub topics: BTreeMap<u32, FileTopic>,
     pub messages: usize,
+    /// The chunk before this place in the file.
+    pub last: Option<LastChunk>,
+}
+
+/// The chunk that was met last, and whether index records listed its messages.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct LastChunk {
+    pub number: u32,
+    pub is_indexed: bool,
+    pub was_opened: bool,
 }
 
 /// A connection of ROS 1, a channel of MCAP, a row of `topics` of ROS 2.
@@ -140,8 +150,36 @@ impl FileIndex {
         topic.places.push((time, chunk, offset));
         Ok(true)
     }
+
+    /// The last chunk, where no index record follows it: its messages are to be listed from itself.
+    pub(crate) fn take_unindexed(&mut self) -> Option<u32> {
+        self.last.take().filter(|last| !last.is_indexed).map(|last| last.number)
+    }
+
+    /// The last chunk without what was listed of it: it is to be listed from itself, because the file ended before all of its
+    /// index records.
+    pub(crate) fn take_incomplete(&mut self) -> Option<u32> {
+        let last = self.last.take()?;
+        self.forget_chunk(last.number);
+        Some(last.number)
+    }
+
+    /// The records of a chunk; `None`, with a warning, where it is damaged.
+    pub(crate) fn unpack(&mut self, file: &BagFile, number: u32) -> Result<Option<Vec<u8>>, BagError> {
+        let chunk = self.chunks[number as usize];
+        let packed = file.read(chunk.offset, chunk.stored)?;
+        match chunk.compression.decompress(&packed, Some(chunk.size)) {
+            Ok(bytes) => Ok(Some(bytes)),
+            Err(reason) => {
+                let message = format!("a chunk at byte {} is damaged and left out: {reason}", chunk.offset);
+                self.warnings.push(Warning::degraded("bag-chunk", message).at(file.path().display()));
+                Ok(None)
+            }
+        }
+    }
+
     /// Takes back the messages of the chunk that was listed last.
-    pub(crate) fn forget_chunk(&mut self, chunk: u32) {
+    fn forget_chunk(&mut self, chunk: u32) {
         for topic in self.topics.values_mut() {
             let kept = topic.places.iter().rposition(|p| p.1 != chunk).map_or(0, |last| last + 1);
             self.messages -= topic.places.len() - kept;

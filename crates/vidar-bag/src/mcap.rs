@@ -7,7 +7,7 @@ use crate::bytes::Bytes;
 use crate::compression::{Compression, MAX_DECOMPRESSED_BYTES};
 use crate::error::BagError;
 use crate::file::{BagFile, MESSAGE_AHEAD_BYTES, Window};
-use crate::index::{Chunk, Encoding, FileIndex, FileTopic, NO_CHUNK, cut_off, plain_type};
+use crate::index::{Chunk, Encoding, FileIndex, FileTopic, LastChunk, NO_CHUNK, cut_off, plain_type};
 use std::collections::BTreeMap;
 use vidar_core::Warning;
 
@@ -32,8 +32,7 @@ const MAX_DESCRIPTION_BYTES: u64 = 16 << 20;
 
 /// Walks through the file and lists its messages.
 pub(crate) fn index(file: &BagFile) -> Result<FileIndex, BagError> {
-    let mut walk =
-        Walk { file, index: FileIndex::default(), schemas: BTreeMap::new(), last: None, unknown: 0 };
+    let mut walk = Walk { file, index: FileIndex::default(), schemas: BTreeMap::new(), unknown: 0 };
     let mut window = Window::new(file);
     let mut at = MAGIC.len() as u64;
     let mut has_end = false;
@@ -85,15 +84,7 @@ struct Walk<'a> {
     index: FileIndex,
     /// Name of every schema.
     schemas: BTreeMap<u16, String>,
-    last: Option<LastChunk>,
     unknown: usize,
-}
-
-#[derive(Clone, Copy)]
-struct LastChunk {
-    number: u32,
-    is_indexed: bool,
-    was_opened: bool,
 }
 
 impl Walk<'_> {
@@ -204,13 +195,13 @@ impl Walk<'_> {
         }
         let number = self.index.chunks.len() as u32;
         self.index.chunks.push(Chunk { offset: records, stored, size, compression });
-        self.last = Some(LastChunk { number, is_indexed: false, was_opened: false });
+        self.index.last = Some(LastChunk { number, is_indexed: false, was_opened: false });
         Ok(())
     }
 
     /// Messages of one channel in the chunk before.
     fn message_index(&mut self, body: u64, length: u64) -> Result<(), BagError> {
-        let Some(mut last) = self.last else { return Ok(()) };
+        let Some(mut last) = self.index.last else { return Ok(()) };
         let data = self.file.read(body, length)?;
         let mut bytes = Bytes::new(&data);
         let (Some(channel), Some(entries)) = (bytes.u16(), bytes.counted()) else { return Ok(()) };
@@ -219,7 +210,7 @@ impl Walk<'_> {
             last.was_opened = true;
         }
         last.is_indexed = true;
-        self.last = Some(last);
+        self.index.last = Some(last);
         let mut entries = Bytes::new(entries);
         while let (Some(time), Some(offset)) = (entries.u64(), entries.u64()) {
             self.add(channel, time, last.number, offset)?;
@@ -229,31 +220,22 @@ impl Walk<'_> {
 
     /// Lists the messages of a chunk that no index follows from the chunk itself.
     fn finish_chunk(&mut self) -> Result<(), BagError> {
-        match self.last.take() {
-            Some(last) if !last.is_indexed => self.open_chunk(last.number, true),
-            _ => Ok(()),
+        match self.index.take_unindexed() {
+            Some(number) => self.open_chunk(number, true),
+            None => Ok(()),
         }
     }
 
     /// Lists the last chunk again from itself, because the file ended before all of its index records.
     fn list_last_again(&mut self) -> Result<(), BagError> {
-        let Some(last) = self.last.take() else { return Ok(()) };
-        self.index.forget_chunk(last.number);
-        self.open_chunk(last.number, true)
+        match self.index.take_incomplete() {
+            Some(number) => self.open_chunk(number, true),
+            None => Ok(()),
+        }
     }
 
     fn open_chunk(&mut self, number: u32, with_messages: bool) -> Result<(), BagError> {
-        let chunk = self.index.chunks[number as usize];
-        let packed = self.file.read(chunk.offset, chunk.stored)?;
-        let bytes = match chunk.compression.decompress(&packed, Some(chunk.size)) {
-            Ok(bytes) => bytes,
-            Err(reason) => {
-                let message = format!("a chunk at byte {} is damaged and left out: {reason}", chunk.offset);
-                let warning = Warning::degraded("bag-chunk", message).at(self.file.path().display());
-                self.index.warnings.push(warning);
-                return Ok(());
-            }
-        };
+        let Some(bytes) = self.index.unpack(self.file, number)? else { return Ok(()) };
         let mut records = Bytes::new(&bytes);
         while !records.is_at_end() {
             let start = records.position() as u64;

@@ -8,7 +8,7 @@ use crate::bytes::Bytes;
 use crate::compression::{Compression, MAX_DECOMPRESSED_BYTES};
 use crate::error::BagError;
 use crate::file::{BagFile, MESSAGE_AHEAD_BYTES, Window};
-use crate::index::{Chunk, Encoding, FileIndex, FileTopic, NO_CHUNK, cut_off, plain_type};
+use crate::index::{Chunk, Encoding, FileIndex, FileTopic, LastChunk, NO_CHUNK, cut_off, plain_type};
 use vidar_core::Warning;
 
 pub(crate) const MAGIC: &[u8] = b"#ROSBAG V2.0\n";
@@ -24,7 +24,7 @@ const OP_CONNECTION: u8 = 0x07;
 
 /// Walks through the file and lists its messages.
 pub(crate) fn index(file: &BagFile) -> Result<FileIndex, BagError> {
-    let mut walk = Walk { file, index: FileIndex::default(), last: None, unknown: 0, index_at: u64::MAX };
+    let mut walk = Walk { file, index: FileIndex::default(), unknown: 0, index_at: u64::MAX };
     let mut window = Window::new(file);
     let mut at = MAGIC.len() as u64;
     let mut is_whole = true;
@@ -136,19 +136,10 @@ fn time(bytes: &mut Bytes<'_>) -> Option<i64> {
 struct Walk<'a> {
     file: &'a BagFile,
     index: FileIndex,
-    /// The chunk before this place in the file, and whether index records listed its messages.
-    last: Option<LastChunk>,
     /// Messages of connections that are not described.
     unknown: usize,
     /// Where the header says that the index begins; 0 until the writer has closed the file.
     index_at: u64,
-}
-
-#[derive(Clone, Copy)]
-struct LastChunk {
-    number: u32,
-    is_indexed: bool,
-    was_opened: bool,
 }
 
 impl Walk<'_> {
@@ -206,20 +197,22 @@ impl Walk<'_> {
         let number = self.index.chunks.len() as u32;
         let stored = u64::from(head.data_length);
         self.index.chunks.push(Chunk { offset: head.data_at, stored, size, compression });
-        self.last = Some(LastChunk { number, is_indexed: false, was_opened: false });
+        self.index.last = Some(LastChunk { number, is_indexed: false, was_opened: false });
         Ok(())
     }
 
     /// Messages of one connection in the chunk before.
     fn index_record(&mut self, head: &Head) -> Result<(), BagError> {
-        let (Some(connection), Some(mut last)) = (head.fields.connection, self.last) else { return Ok(()) };
+        let (Some(connection), Some(mut last)) = (head.fields.connection, self.index.last) else {
+            return Ok(());
+        };
         if !self.index.topics.contains_key(&connection) && !last.was_opened {
             // A chunk holds the description of every connection that appears in it for the first time.
             self.open_chunk(last.number, false)?;
             last.was_opened = true;
         }
         last.is_indexed = true;
-        self.last = Some(last);
+        self.index.last = Some(last);
         let data = self.file.read(head.data_at, u64::from(head.data_length))?;
         let mut bytes = Bytes::new(&data);
         while let (Some(time), Some(offset)) = (time(&mut bytes), bytes.u32()) {
@@ -232,31 +225,22 @@ impl Walk<'_> {
 
     /// Lists the messages of a chunk without index records from the chunk itself.
     fn finish_chunk(&mut self) -> Result<(), BagError> {
-        match self.last.take() {
-            Some(last) if !last.is_indexed => self.open_chunk(last.number, true),
-            _ => Ok(()),
+        match self.index.take_unindexed() {
+            Some(number) => self.open_chunk(number, true),
+            None => Ok(()),
         }
     }
 
     /// Lists the last chunk again from itself, because the file ended before all of its index records.
     fn list_last_again(&mut self) -> Result<(), BagError> {
-        let Some(last) = self.last.take() else { return Ok(()) };
-        self.index.forget_chunk(last.number);
-        self.open_chunk(last.number, true)
+        match self.index.take_incomplete() {
+            Some(number) => self.open_chunk(number, true),
+            None => Ok(()),
+        }
     }
 
     fn open_chunk(&mut self, number: u32, with_messages: bool) -> Result<(), BagError> {
-        let chunk = self.index.chunks[number as usize];
-        let packed = self.file.read(chunk.offset, chunk.stored)?;
-        let bytes = match chunk.compression.decompress(&packed, Some(chunk.size)) {
-            Ok(bytes) => bytes,
-            Err(reason) => {
-                let message = format!("a chunk at byte {} is damaged and left out: {reason}", chunk.offset);
-                let warning = Warning::degraded("bag-chunk", message).at(self.file.path().display());
-                self.index.warnings.push(warning);
-                return Ok(());
-            }
-        };
+        let Some(bytes) = self.index.unpack(self.file, number)? else { return Ok(()) };
         let mut records = Bytes::new(&bytes);
         while !records.is_at_end() {
             let start = records.position() as u64;

@@ -318,3 +318,13 @@ fn every_pixel_of_the_real_cameras_has_a_ray() {
         }
     }
 }
+
+#[test]
+fn a_resized_view_keeps_its_field_of_view() {
+    let view = Pinhole::new(250.0, 251.0, 160.0, 110.0, 322, 224).unwrap();
+    let large = view.resized(752, 524).unwrap();
+    for (from, to) in [((-0.5, -0.5), (-0.5, -0.5)), ((321.5, 223.5), (751.5, 523.5))] {
+        let (a, b) = (view.ray(from.0, from.1), large.ray(to.0, to.1));
+        assert!((a - b).norm() < 1e-12, "{a} {b}");
+    }
+}

@@ -133,14 +133,14 @@ pub fn inspect(
     Ok(Inspection {
         missing: missing(&dataset),
         found: calibration.map(|c| c.unwrap_or_else(|refused| refused)).into_iter().chain(noise).collect(),
-        motion,
         advice,
         name: dataset.name.clone(),
         kind: dataset.kind.to_string(),
         reason: dataset.reason.clone(),
         streams,
         camera: calibration::describe_camera(&dataset),
-        imu: describe_imu(&dataset),
+        imu: describe_imu(&dataset, motion.as_ref()),
+        motion,
         poses: describe_poses(&dataset),
         images,
         possible: possible(&dataset, is_refused),
@@ -187,7 +187,7 @@ fn stream(what: &str, times: &[Timestamp]) -> Option<Stream> {
     })
 }
 
-fn describe_imu(dataset: &Dataset) -> Vec<String> {
+fn describe_imu(dataset: &Dataset, motion: Option<&Motion>) -> Vec<String> {
     if dataset.imu.is_empty() {
         return vec!["none: the scale can only come from an external trajectory".into()];
     }
@@ -195,7 +195,7 @@ fn describe_imu(dataset: &Dataset) -> Vec<String> {
     let n = dataset.imu.len() as f64;
     let accel: f64 = dataset.imu.iter().map(|s| s.accel.0.norm()).sum::<f64>() / n;
     let gyro: f64 = dataset.imu.iter().map(|s| s.gyro.0.norm()).sum::<f64>() / n;
-    words.extend(Motion::of(&dataset.imu).map(|m| m.words()));
+    words.extend(motion.map(Motion::words));
     words.push(format!(
         "mean |specific force| {accel:.2} m/s2 (at rest: 9.8), mean |rate| {:.1} deg/s",
         gyro.to_degrees()

@@ -25,6 +25,11 @@ pub(super) fn undistort(
     let model: CameraFlag = camera.model.parse()?;
     let model = with_size(&model.0, camera.width, camera.height)?;
     let sources: BTreeMap<u32, _> = stored.views.iter().map(|v| (v.frame, &v.source)).collect();
+    // The same rectangle of rays.
+    let at_width =
+        |view: &Pinhole| view.resized(camera.width, (view.height * camera.width).div_ceil(view.width));
+    let first = views.first().map(|view| at_width(&view.intrinsics)).transpose()?;
+    let shared = first.map(|view| RemapTable::new(&model, &view));
     views.par_iter_mut().try_for_each(|view| {
         let Some(Some(source)) = sources.get(&view.frame_id.0) else {
             return Err(refuse(format!("frame {} has no image file: {needs}", view.frame_id)));
@@ -34,35 +39,14 @@ pub(super) fn undistort(
             let found = format!("{} is {}x{} pixels", source.display(), image.width(), image.height());
             return Err(refuse(format!("{found}, the run's camera has {}x{}", camera.width, camera.height)));
         }
-        view.intrinsics = scaled(&view.intrinsics, camera.width)?;
-        let undistorted = RemapTable::new(&model, &view.intrinsics).apply(&image);
+        // All views have the first one's intrinsics, unless a prediction brought its own.
+        view.intrinsics = at_width(&view.intrinsics)?;
+        let undistorted = match &shared {
+            Some(table) if *table.target() == view.intrinsics => table.apply(&image),
+            _ => RemapTable::new(&model, &view.intrinsics).apply(&image),
+        };
         let path = images.join(&view.image_name);
         let png = vidar_view::encode_png(&undistorted.to_rgb8())?;
         Ok(vidar_export::atomic::write_file_atomically(&path, &png)?)
     })
-}
-
-/// The same rectangle of rays in `width` columns.
-fn scaled(view: &Pinhole, width: usize) -> Result<Pinhole, Error> {
-    let height = (view.height * width).div_ceil(view.width);
-    let (x, y) = (width as f64 / view.width as f64, height as f64 / view.height as f64);
-    // Edges stay where they are: they lie at -0.5.
-    let moved = |c: f64, factor: f64| (c + 0.5) * factor - 0.5;
-    Ok(Pinhole::new(view.fx * x, view.fy * y, moved(view.cx, x), moved(view.cy, y), width, height)?)
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn the_field_of_view_stays() {
-        let view = Pinhole::new(250.0, 251.0, 160.0, 110.0, 322, 224).unwrap();
-        let large = scaled(&view, 752).unwrap();
-        assert_eq!((large.width, large.height), (752, 524));
-        for (from, to) in [((-0.5, -0.5), (-0.5, -0.5)), ((321.5, 223.5), (751.5, 523.5))] {
-            let (a, b) = (view.ray(from.0, from.1), large.ray(to.0, to.1));
-            assert!((a - b).norm() < 1e-12, "{a} {b}");
-        }
-    }
 }

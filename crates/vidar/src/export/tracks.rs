@@ -8,6 +8,7 @@ use crate::error::Error;
 use rayon::prelude::*;
 use std::collections::BTreeMap;
 use std::path::Path;
+use vidar_core::camera::Pixel;
 use vidar_core::{LieGroup, MetricDepth, Pinhole, PointCloud, Se3};
 use vidar_export::Observation;
 
@@ -52,14 +53,12 @@ pub(super) fn observations(
         let depth = vidar_export::read_depth_png(&bytes, units_per_metre)?;
         let seen = seen(cloud, &depth, &own.intrinsics, &pose);
         // The same rays in an image of another size.
-        let (from, to) = (&own.intrinsics, &view.intrinsics);
-        let moved = |[x, y]: [f64; 2]| {
-            [(x - from.cx) / from.fx * to.fx + to.cx, (y - from.cy) / from.fy * to.fy + to.cy]
+        let observation = |(point, pixel): (u32, Pixel)| {
+            let ray = own.intrinsics.ray(pixel.x, pixel.y);
+            let pixel = view.intrinsics.project(&ray)?.into();
+            Some(Observation { point, view: index as u32, pixel })
         };
-        let seen = seen.into_iter();
-        Ok(seen
-            .map(|(point, pixel)| Observation { point, view: index as u32, pixel: moved(pixel) })
-            .collect())
+        Ok(seen.into_iter().filter_map(observation).collect())
     };
     let found: Result<Vec<Vec<Observation>>, Error> = views.par_iter().enumerate().map(of_view).collect();
     Ok(found?.concat())
@@ -71,17 +70,16 @@ fn seen(
     depth: &MetricDepth,
     intrinsics: &Pinhole,
     world_from_camera: &Se3,
-) -> Vec<(u32, [f64; 2])> {
+) -> Vec<(u32, Pixel)> {
     let camera_from_world = world_from_camera.inverse();
     let image = depth.image();
     let pixel_of = |position: &[f32; 3]| {
         let p = camera_from_world * nalgebra::Vector3::from(position.map(f64::from));
-        let (x, y) = (intrinsics.fx * p.x / p.z + intrinsics.cx, intrinsics.fy * p.y / p.z + intrinsics.cy);
-        let is_inside = p.z > 0.0 && x > -0.5 && y > -0.5;
-        let (column, row) = (x.round() as usize, y.round() as usize);
-        let is_inside = is_inside && column < image.width() && row < image.height();
+        let pixel = intrinsics.project(&p).filter(|pixel| pixel.x > -0.5 && pixel.y > -0.5)?;
+        let (column, row) = (pixel.x.round() as usize, pixel.y.round() as usize);
+        let is_inside = column < image.width() && row < image.height();
         let measured = f64::from(is_inside.then(|| image[(column, row)])?);
-        ((measured - p.z).abs() < DEPTH_TOLERANCE * p.z).then_some([x, y])
+        ((measured - p.z).abs() < DEPTH_TOLERANCE * p.z).then_some(pixel)
     };
     let points = cloud.positions.iter().enumerate();
     points.filter_map(|(i, p)| Some((i as u32, pixel_of(p)?))).collect()

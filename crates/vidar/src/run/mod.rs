@@ -129,11 +129,12 @@ pub fn run(request: &RunRequest, events: &Events, cancel: &CancelToken) -> Resul
     let mut dataset =
         events.stage("read", 0, || input::open_every_image(&request.path, &request.open, &config))?;
     dataset.warnings.extend(input::use_every_untimed_image(&dataset, &mut config));
-    let mut tracking = Tracking::new(&dataset, &config, &request.place)?;
+    let fingerprint = input::fingerprint(&dataset)?;
+    let mut tracking = Tracking::new(&dataset, &fingerprint, &config, &request.place);
     tracking.calibrate(&mut dataset, &mut config, &events, cancel)?;
     let (plan, source, places) =
         events.stage("plan", 0, || Plan::make(&dataset, &config, request.reference.as_deref()))?;
-    let description = RunDescription::new(request, &dataset, &plan)?;
+    let description = RunDescription::new(request, &dataset, fingerprint.clone(), &plan);
     let earlier = request.place.earlier(&description.0, &request.layered.to_toml(false))?;
     let folder = Arc::new(RunFolder::create(&request.place)?);
     folder.write_manifest(&description.0)?;
@@ -145,8 +146,15 @@ pub fn run(request: &RunRequest, events: &Events, cancel: &CancelToken) -> Resul
         false => None,
     };
 
-    let context =
-        Context { request, config: &config, dataset: &dataset, folder: &folder, events: &events, cancel };
+    let context = Context {
+        request,
+        config: &config,
+        dataset: &dataset,
+        fingerprint: &fingerprint,
+        folder: &folder,
+        events: &events,
+        cancel,
+    };
     let made = context.carry_out(plan, source, poses, &places, &recorder).map(|outcome| RunOutcome {
         seconds: clock.elapsed().as_secs_f64(),
         warnings: recorder.warnings(),
@@ -171,6 +179,8 @@ struct Context<'a> {
     request: &'a RunRequest,
     config: &'a Config,
     dataset: &'a Dataset,
+    /// SHA-256 of what the recording consists of.
+    fingerprint: &'a str,
     folder: &'a RunFolder,
     events: &'a Events,
     cancel: &'a CancelToken,
@@ -186,7 +196,7 @@ impl Context<'_> {
         places: &PlaceRecognition,
         recorder: &Recorder,
     ) -> Result<RunOutcome, Error> {
-        let Self { request, config, dataset, folder, events, cancel } = *self;
+        let Self { request, config, dataset, folder, events, cancel, .. } = *self;
         let map = self.build_map(&plan, &mut source, tracked, places)?;
         let evaluation =
             events.stage("evaluate", 0, || evaluate::evaluate(dataset, &plan, &map, config, events))?;
@@ -228,7 +238,7 @@ impl Context<'_> {
         places: &PlaceRecognition,
     ) -> Result<MetricMap, Error> {
         let Self { config, dataset, folder, events, cancel, .. } = *self;
-        let store = RunStore::new(folder.path(), dataset, plan, config)?;
+        let store = RunStore::new(folder.path(), self.fingerprint, plan, config);
         let images = ImageFiles(dataset);
         let (live, fallback) = plan.poses.open(dataset, config)?;
         let poses = tracked.map(|p| Box::new(p) as Box<dyn PoseSource>).or(live);

@@ -115,8 +115,8 @@ pub(super) struct RunDescription(pub Manifest);
 
 impl RunDescription {
     /// Input, configuration, model and machine.
-    pub fn new(request: &RunRequest, dataset: &Dataset, plan: &Plan) -> Result<Self, Error> {
-        Ok(Self(Manifest {
+    pub fn new(request: &RunRequest, dataset: &Dataset, fingerprint: String, plan: &Plan) -> Self {
+        Self(Manifest {
             schema: MANIFEST_SCHEMA.into(),
             version: crate::VERSION.into(),
             command: request.command.clone(),
@@ -126,13 +126,13 @@ impl RunDescription {
                 "images": dataset.images.len(), "imu_samples": dataset.imu.len(),
                 "depth_images": dataset.depths.len(),
             }),
-            dataset_sha256: crate::input::fingerprint(dataset)?,
+            dataset_sha256: fingerprint,
             config_sha256: vidar_hub::sha256_hex(request.layered.to_toml(false).as_bytes()),
             model: plan.model_json(),
             poses: serde_json::json!(plan.poses.source()),
             hardware: serde_json::json!(crate::system::hardware()),
             ..Manifest::default()
-        }))
+        })
     }
 }
 

@@ -9,7 +9,6 @@ use serde_json::json;
 use sha2::{Digest, Sha256};
 use std::path::{Path, PathBuf};
 use vidar_core::ChunkId;
-use vidar_dataset::Dataset;
 
 /// Where predictions lie in the run folder.
 pub(super) const CHUNKS: &str = "chunks";
@@ -23,8 +22,8 @@ pub(super) struct RunStore {
 }
 
 impl RunStore {
-    /// The store of a plan in the run folder `root`.
-    pub(super) fn new(root: &Path, dataset: &Dataset, plan: &Plan, config: &Config) -> Result<Self, Error> {
+    /// The store of a plan in the run folder `root`; `fingerprint` is the recording's.
+    pub(super) fn new(root: &Path, fingerprint: &str, plan: &Plan, config: &Config) -> Self {
         let part = json!({
             "version": crate::VERSION,
             "model": plan.model_json(),
@@ -35,9 +34,8 @@ impl RunStore {
             "network": config.model,
             "place_recognition": plan.place_recognition,
         });
-        let mut identity = crate::input::fingerprint(dataset)?.into_bytes();
-        identity.extend(part.to_string().into_bytes());
-        Ok(Self { chunks: ChunkStore::new(root.join(CHUNKS)), volumes: root.join("volumes"), identity })
+        let identity = format!("{fingerprint}{part}").into_bytes();
+        Self { chunks: ChunkStore::new(root.join(CHUNKS)), volumes: root.join("volumes"), identity }
     }
 
     /// Removes volumes, and predictions unless they are to be kept.

@@ -6,7 +6,6 @@ use crate::camera_timing;
 use crate::config::Config;
 use crate::error::Error;
 use crate::events::{CancelToken, Events};
-use crate::input;
 use crate::odometry::{self, TrackedPoses, adjusted};
 use crate::run_folder::{OutputLocation, RunFolder};
 use crate::system::read_up_to;
@@ -71,12 +70,12 @@ pub(super) struct Tracking {
 
 impl Tracking {
     /// `dataset` and `config` as the user gave them; `place` may hold the result of an earlier attempt.
-    pub fn new(dataset: &Dataset, config: &Config, place: &OutputLocation) -> Result<Self, Error> {
+    pub fn new(dataset: &Dataset, fingerprint: &str, config: &Config, place: &OutputLocation) -> Self {
         let settings = serde_json::json!({ "version": crate::VERSION, "odometry": config.odometry });
-        let key = format!("{} {:?} {settings}", input::fingerprint(dataset)?, dataset.rig);
+        let key = format!("{fingerprint} {:?} {settings}", dataset.rig);
         let key = vidar_hub::sha256_hex(key.as_bytes());
         let kept = place.resumed().and_then(|folder| read(&folder.join(FILE), &key));
-        Ok(Self { sigmas: adjusted::adjustable(dataset, config), calibrated: None, kept, key })
+        Self { sigmas: adjusted::adjustable(dataset, config), calibrated: None, kept, key }
     }
 
     /// Calibrates a recording that has no calibration.
