@@ -3,6 +3,8 @@
 use crate::config::{Config, PoseSource as PoseChoice};
 use crate::engine::{FrameStamp, GivenPoses, ImageSource, OdometryPoses, PoseSource};
 use crate::error::Error;
+use crate::quality::TrackQuality;
+use crate::verdict::ScaleSource;
 use serde::Serialize;
 use sha2::{Digest, Sha256};
 use std::path::{Path, PathBuf};
@@ -252,11 +254,35 @@ pub fn open_dataset(path: &Path, options: &OpenOptions, config: &Config) -> Resu
     Ok(vidar_dataset::open(path, &options)?)
 }
 
-/// σ(ln s) of what no estimate of the scale sees: as configured, and at least what the accelerometer is off at rest.
-pub fn unseen_scale_std(dataset: &Dataset, config: &Config) -> f64 {
-    let at_rest = vidar_dataset::gain_error_at_rest(&dataset.imu).map_or(0.0, f64::abs);
-    // Gravity itself differs by 0.3 % on Earth, which says nothing of the gain.
-    if at_rest > 0.01 { config.input.imu_scale_std.max(at_rest) } else { config.input.imu_scale_std }
+/// σ(ln s) of what the estimate of the scale does not see.
+#[derive(Clone, Copy, Debug)]
+pub struct UnseenScale {
+    /// Of the accelerometer's gain and the lever arm.
+    sensors: f64,
+    /// Of a calibration that nothing has checked.
+    calibration: f64,
+}
+
+impl UnseenScale {
+    /// As configured, and at least what the accelerometer is off at rest.
+    pub fn of(dataset: &Dataset, config: &Config) -> Self {
+        let at_rest = vidar_dataset::gain_error_at_rest(&dataset.imu).map_or(0.0, f64::abs);
+        // Gravity itself differs by 0.3 % on Earth, which says nothing of the gain.
+        let at_rest = if at_rest > 0.01 { at_rest } else { 0.0 };
+        Self {
+            sensors: config.input.imu_scale_std.max(at_rest),
+            calibration: config.input.calibration_scale_std,
+        }
+    }
+
+    /// The scale of a trajectory: the adjustment estimates the calibration, too; the live one takes it as given.
+    pub fn source(&self, quality: &TrackQuality) -> ScaleSource {
+        ScaleSource::Odometry {
+            stated: quality.scale_std(),
+            unseen: self.sensors,
+            unchecked: (!quality.is_adjusted()).then_some(self.calibration),
+        }
+    }
 }
 
 /// Ground truth of the camera in use at the images' stamps, where its place on the rig is known.

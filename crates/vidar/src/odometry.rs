@@ -13,7 +13,7 @@ use crate::camera_timing;
 use crate::config::{Config, Layered};
 use crate::error::{Error, ExitStatus};
 use crate::events::{CancelToken, Event, Events};
-use crate::input::{self, Measurement};
+use crate::input::{self, Measurement, UnseenScale};
 use crate::quality::TrackQuality;
 use crate::run_folder::{MANIFEST_SCHEMA, Manifest, OutputLocation, RunFolder};
 use crate::verdict::{Findings, Level, ScaleSource, StatedScale, Verdict};
@@ -148,7 +148,7 @@ pub fn odometry(
     dump.map_or(Ok(()), dump::Dump::finish)?;
 
     let trajectory = tracked.longest_segment();
-    let scale = tracked.stated_scale(input::unseen_scale_std(&dataset, &config));
+    let scale = tracked.stated_scale(UnseenScale::of(&dataset, &config));
     let mut warnings = dataset.warnings.clone();
     warnings.extend(timing);
     warnings.extend(tracked.warnings());
@@ -324,10 +324,10 @@ impl Tracked {
         Some((state.output.time - first).as_secs_f64())
     }
 
-    /// What is said of the scale; `unseen`: σ(ln s) of what no estimate sees.
-    pub fn stated_scale(&self, unseen: f64) -> StatedScale {
+    /// What is said of the scale; `unseen`: σ(ln s) of what its estimate does not see.
+    pub fn stated_scale(&self, unseen: UnseenScale) -> StatedScale {
         let source = match self.with_imu {
-            true => ScaleSource::Odometry { stated: self.quality.scale_std(), unseen },
+            true => unseen.source(&self.quality),
             false => ScaleSource::None,
         };
         StatedScale::new(source, None)

@@ -171,11 +171,16 @@ impl TrackQuality {
         text
     }
 
+    /// Whether it is of the states adjusted after the end.
+    pub fn is_adjusted(&self) -> bool {
+        self.adjusted.is_some()
+    }
+
     /// For manifests.
     pub fn json(&self) -> Value {
         json!({
             "images": self.images, "with_state": self.with_state, "losses": self.losses,
-            "mapped_images": self.mapped_images(), "is_adjusted": self.adjusted.is_some(),
+            "mapped_images": self.mapped_images(), "is_adjusted": self.is_adjusted(),
             "covered_time_ratio": self.covered(), "healthy_ratio": self.healthy(),
             "health": self.longest().map(|s| &s.health),
             "scale_std": Some(self.scale_std()).filter(|s| s.is_finite()),

@@ -163,6 +163,8 @@ pub struct StatedScale {
     pub poses: Option<f64>,
     /// Of what no estimate sees: the accelerometer's gain and the lever arm.
     pub unseen: Option<f64>,
+    /// Of a calibration that nothing has checked: that of a live trajectory.
+    pub unchecked: Option<f64>,
     /// All of it in words.
     pub words: String,
     /// Where it comes from.
@@ -179,6 +181,8 @@ pub enum ScaleSource {
         stated: f64,
         /// See [`StatedScale::unseen`].
         unseen: f64,
+        /// See [`StatedScale::unchecked`]; `None` where the adjustment estimated the calibration.
+        unchecked: Option<f64>,
     },
     /// A trajectory whose scale nobody states.
     Given,
@@ -200,6 +204,7 @@ impl StatedScale {
             chunks,
             poses: None,
             unseen: None,
+            unchecked: None,
             words: String::new(),
             source,
         };
@@ -226,16 +231,20 @@ impl StatedScale {
             ScaleSource::Odometry { stated, .. } if !stated.is_finite() => {
                 Self { is_metric: false, words: "unknown: the odometry does not observe it".into(), ..empty }
             }
-            ScaleSource::Odometry { stated, unseen } => {
-                let sigma = (stated.powi(2) + unseen.powi(2) + known.powi(2)).sqrt();
+            ScaleSource::Odometry { stated, unseen, unchecked } => {
+                let parts = [stated, unseen, unchecked.unwrap_or(0.0), known];
+                let sigma = parts.map(|part| part.powi(2)).iter().sum::<f64>().sqrt();
+                let of_calibration =
+                    unchecked.map_or_else(String::new, |c| format!(", calibration not checked {:.1} %", 100.0 * c));
                 Self {
-                    // The gain of an accelerometer is a matter of its class; what the motion shows decides.
+                    // What sensors and calibration add is a matter of their class; what the motion shows decides.
                     is_metric: stated <= METRIC_SCALE_STD,
                     sigma: Some(sigma),
                     poses: Some(stated),
                     unseen: Some(unseen),
+                    unchecked,
                     words: format!(
-                        "known to {:.1} % (1 σ): odometry {:.1} %, accelerometer gain and lever arm {:.1} %{of_chunks}",
+                        "known to {:.1} % (1 σ): odometry {:.1} %, accelerometer gain and lever arm {:.1} %{of_calibration}{of_chunks}",
                         100.0 * sigma,
                         100.0 * stated,
                         100.0 * unseen
@@ -266,7 +275,7 @@ mod tests {
 
     #[test]
     fn parts_of_a_scale_add_up_and_unknown_ones_are_said() {
-        let odometry = |stated| ScaleSource::Odometry { stated, unseen: 0.01 };
+        let odometry = |stated| ScaleSource::Odometry { stated, unseen: 0.01, unchecked: None };
         let all = StatedScale::new(odometry(0.02), Some(0.02));
         assert!((all.sigma.unwrap() - 0.03).abs() < 1e-12 && all.is_metric);
         assert!(
@@ -274,6 +283,10 @@ mod tests {
             "{}",
             all.words
         );
+        let live = ScaleSource::Odometry { stated: 0.02, unseen: 0.01, unchecked: Some(0.02) };
+        let live = StatedScale::new(live, None);
+        assert!((live.sigma.unwrap() - 0.03).abs() < 1e-12 && live.is_metric, "{live:?}");
+        assert!(live.words.contains("calibration not checked 2.0 %"), "{}", live.words);
         let loose = StatedScale::new(odometry(0.108), Some(0.005));
         assert!(!loose.is_metric && loose.warning().unwrap().message.contains("0.11"));
         let given = StatedScale::new(ScaleSource::Given, Some(0.005));

@@ -157,6 +157,7 @@ const ELSEWHERE: &[(&str, &str)] = &[
     ("coupling.place_recognition", "damage.rs has a run of each"),
     ("coupling.salad_checkpoint", "damage.rs has a small one"),
     ("input.imu_scale_std", "trust.rs compares what is stated with it"),
+    ("input.calibration_scale_std", "trust.rs compares what is stated with it"),
     ("input.poses", "verbs.rs runs with another trajectory"),
     ("eval.trajectory.low_coverage_ratio", "it decides a warning; vidar-eval's tests"),
     ("geometry.source", "one source needs no weights"),

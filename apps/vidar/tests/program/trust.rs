@@ -141,8 +141,13 @@ fn half_a_recording_is_not_tracked_throughout() {
     // What is adjusted after the end reaches back before the start.
     let json = odometry(flight(), "whole flight").ends_with(0).json();
     assert!(number(&json["quality"]["covered_time_ratio"]) > 0.95, "{}", json["quality"]);
+    assert!(json["scale"]["unchecked"].is_null(), "{}", json["scale"]);
     let live = ["--set", "odometry.adjust=false"];
     let json = odometry_with(flight(), "flight", &live).ends_with(0).json();
+    // Nothing has checked the calibration that a live trajectory is of.
+    assert_eq!(json["scale"]["unchecked"], 0.05);
+    assert!(number(&json["scale"]["sigma"]) > 0.05, "{}", json["scale"]);
+    assert!(json["scale"]["words"].as_str().unwrap().contains("calibration not checked 5.0 %"));
     let quality = &json["quality"];
     assert!(number(&quality["covered_time_ratio"]) < 0.8, "this flight starts late: {quality}");
     assert_eq!(quality["is_adjusted"], false);

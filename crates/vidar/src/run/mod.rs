@@ -27,7 +27,7 @@ use crate::config::{Config, Layered};
 use crate::engine::{Engine, EngineSetup, FrameStamp, MapEvent, PoseSource};
 use crate::error::{Error, ExitStatus};
 use crate::events::{CancelToken, Event, Events};
-use crate::input::{self, ImageFiles, Measurement};
+use crate::input::{self, ImageFiles, Measurement, UnseenScale};
 use crate::odometry::TrackedPoses;
 use crate::run_folder::{OutputLocation, RunFolder};
 use crate::verdict::{StatedScale, Verdict};
@@ -200,7 +200,7 @@ impl Context<'_> {
         let map = self.build_map(&plan, &mut source, tracked, places)?;
         let evaluation =
             events.stage("evaluate", 0, || evaluate::evaluate(dataset, &plan, &map, config, events))?;
-        let scale = trust::stated_scale(&map, plan.mode, input::unseen_scale_std(dataset, config));
+        let scale = trust::stated_scale(&map, plan.mode, UnseenScale::of(dataset, config));
         trust::warnings(&map, &evaluation, &scale).iter().for_each(|w| events.warn(w));
         let is_degraded = recorder.is_degraded() || map.surface.mesh.triangles.is_empty();
         let status = match (cancel.is_cancelled(), is_degraded) {

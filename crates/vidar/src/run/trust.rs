@@ -2,7 +2,7 @@
 
 use super::{Evaluation, MetricMap};
 use crate::error::ExitStatus;
-use crate::input::TrajectorySource;
+use crate::input::{TrajectorySource, UnseenScale};
 use crate::verdict::{
     BAD_F, Findings, GOOD_F, LEAST_AREA, LEAST_PRECISION, Level, ScaleSource, StatedScale, Verdict,
 };
@@ -10,7 +10,7 @@ use vidar_align::CouplingMode;
 use vidar_core::{Severity, Warning};
 
 /// What is said of the map's scale: chunks, metric poses, and what no estimate sees.
-pub(super) fn stated_scale(map: &MetricMap, mode: CouplingMode, unseen: f64) -> StatedScale {
+pub(super) fn stated_scale(map: &MetricMap, mode: CouplingMode, unseen: UnseenScale) -> StatedScale {
     let mut chunks: Vec<f64> = map
         .placement
         .iter()
@@ -24,8 +24,7 @@ pub(super) fn stated_scale(map: &MetricMap, mode: CouplingMode, unseen: f64) -> 
         Some(TrajectorySource::External { .. }) => ScaleSource::Given,
         Some(TrajectorySource::GroundTruth) => ScaleSource::GroundTruth,
         Some(TrajectorySource::Odometry) => {
-            let stated = map.quality.as_ref().map_or(f64::INFINITY, |q| q.scale_std());
-            ScaleSource::Odometry { stated, unseen }
+            map.quality.as_ref().map_or(ScaleSource::None, |quality| unseen.source(quality))
         }
     };
     StatedScale::new(source, chunks.get(chunks.len() / 2).copied())
