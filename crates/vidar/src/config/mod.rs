@@ -38,8 +38,8 @@ pub struct InputConfig {
     /// lever arm known to 1 or 2 cm; 0.003: a factory-calibrated IMU on a calibrated rig; 0: exact, as in simulation.
     pub imu_scale_std: f64,
     /// Standard deviation of ln(scale) for a calibration that nothing has checked: part of the stated scale where the trajectory is the
-    /// live one, which takes lever arm, focal length, clock and the gyroscope's gain as given. 0.05: a lever arm off by 30 cm, or a focal
-    /// length or gain by 10 %, makes the scale of a flight wrong by 8 to 16 %. The adjustment (`odometry.adjust`) estimates or contradicts
+    /// live one, which takes lever arm, focal length, clock and the gyroscope's gain as given. 0.07: a lever arm off by 30 cm, or a focal
+    /// length or gain by 10 %, makes the scale of a flight wrong by 8 to 20 %. The adjustment (`odometry.adjust`) estimates or contradicts
     /// them, so nothing is added there; 0.005: a calibration made with a target on this rig.
     pub calibration_scale_std: f64,
 }
@@ -68,7 +68,7 @@ impl Default for InputConfig {
             poses: PoseSource::Auto,
             max_pose_gap_secs: 0.5,
             imu_scale_std: 0.01,
-            calibration_scale_std: 0.05,
+            calibration_scale_std: 0.07,
         }
     }
 }
