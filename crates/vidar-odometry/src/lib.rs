@@ -15,6 +15,7 @@ pub mod backend;
 pub mod bundle_adjustment;
 pub mod calibration;
 mod config;
+mod deferred;
 mod error;
 pub mod frontend;
 mod gyro_alignment;

@@ -1,7 +1,7 @@
 //! What consumer recordings leave unsaid about time and rotation: the camera's clock offset, the rolling shutter's
 //! readout time and the rotation of the camera on the body, from feature tracks and gyroscope samples.
 //!
-//! [`GyroAlignmentLog`] collects both while the odometry runs and is asked for an [`Alignment`] from time to time.
+//! [`GyroAlignmentLog`] collects both while the odometry runs and is asked for the problem from time to time, whose solution is an [`Alignment`].
 //! [`RollingShutter`] applies the readout time to pixels.
 
 mod path;
@@ -23,9 +23,8 @@ use vidar_core::{CameraModel, ImuSample, LandmarkId, So3, Timestamp, camera::Pix
 const IMAGE_SPACING_SECS: f64 = 0.045;
 /// Longest stretch of images that is used, s.
 const SPAN_SECS: f64 = 5.0;
-/// Shortest stretch that is tried, and the time between two attempts, s.
+/// Shortest stretch that is tried, s.
 const MIN_SPAN_SECS: f64 = 1.5;
-const ATTEMPT_SECS: f64 = 0.5;
 /// Gyroscope samples this far beyond an image must be there: the largest offset that is searched, and half a readout.
 const LOOKAHEAD_SECS: f64 = 0.19;
 /// Root mean square of the angular rate about its mean that a solution needs, rad/s: below it, a clock offset of 50 ms
@@ -83,11 +82,16 @@ impl GyroAlignmentLog {
         self.images.clear();
     }
 
-    /// Solves for the alignment if enough came since the last attempt.
-    pub fn attempt(&mut self, camera: &CameraModel, guess: &Guess) -> Option<Alignment> {
+    /// The problem as it is now, if at least `pause_secs` of images came since the last one.
+    pub fn next_problem(
+        &mut self,
+        camera: &CameraModel,
+        guess: &Guess,
+        pause_secs: f64,
+    ) -> Option<AlignmentProblem> {
         let (newest, origin) = (self.gyro.back()?.0, self.images.front()?.0);
         let last_image = self.images.back()?.0;
-        if self.last_attempt.is_some_and(|t| (last_image - t).as_secs_f64() < ATTEMPT_SECS) {
+        if self.last_attempt.is_some_and(|t| (last_image - t).as_secs_f64() < pause_secs) {
             return None;
         }
         let images: Vec<ImageFeatures> = self
@@ -109,7 +113,24 @@ impl GyroAlignmentLog {
         if !covered || rate_rms(&samples) < MIN_RATE_RMS {
             return None;
         }
-        let mut problem = Problem::new(camera, guess.body_from_camera, &images, &samples);
+        Some(AlignmentProblem { camera: camera.clone(), guess: *guess, images, samples })
+    }
+}
+
+/// What an alignment is solved from.
+#[derive(Debug)]
+pub(crate) struct AlignmentProblem {
+    camera: CameraModel,
+    guess: Guess,
+    images: Vec<ImageFeatures>,
+    samples: Vec<RateSample>,
+}
+
+impl AlignmentProblem {
+    /// `None` where too few images share features, or nothing determines the alignment.
+    pub fn solve(&self) -> Option<Alignment> {
+        let guess = &self.guess;
+        let mut problem = Problem::new(&self.camera, guess.body_from_camera, &self.images, &self.samples);
         if problem.pair_count() < MIN_PAIRS {
             return None;
         }

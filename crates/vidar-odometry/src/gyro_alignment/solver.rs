@@ -49,6 +49,8 @@ const STEPS: [f64; DIM] = [1e-4, 1e-4, 1e-5, 1e-5, 1e-5, 1e-4, 1e-4, 1e-4];
 /// wide as the fastest change of rate allows, some 30 ms for a lively hand.
 const SEARCH_SECS: f64 = 0.15;
 const SEARCH_STEP_SECS: f64 = 0.0125;
+/// Pairs of images that the search looks at, evenly over all: it has to find the basin only, and tries 25 offsets.
+const SEARCH_PAIRS: usize = 40;
 
 /// Feature positions in one image. `secs`: the image's stamp, before any clock offset, since the common origin.
 #[derive(Clone, Debug)]
@@ -76,6 +78,7 @@ pub(crate) struct Alignment {
 }
 
 /// Matches of one pair of images: indices of the images and of their features.
+#[derive(Clone)]
 struct Pair {
     images: [usize; 2],
     matches: Vec<[usize; 2]>,
@@ -90,6 +93,8 @@ pub(crate) struct Problem<'a> {
     images: &'a [ImageFeatures],
     rays: Rays,
     pairs: Vec<Pair>,
+    /// Per image, whether a pair shows it.
+    is_shown: Vec<bool>,
     given: So3,
     ray_sigma: f64,
 }
@@ -124,7 +129,16 @@ impl<'a> Problem<'a> {
             }
         }
         let ray_sigma = PIXEL_SIGMA / camera.intrinsics().fx;
-        Self { camera, samples, images, rays, pairs, given: body_from_camera, ray_sigma }
+        let is_shown = shown(&pairs, images.len());
+        Self { camera, samples, images, rays, pairs, is_shown, given: body_from_camera, ray_sigma }
+    }
+
+    /// The same problem with at most `most` of its pairs.
+    fn thinned(&self, most: usize) -> Self {
+        let stride = self.pairs.len().div_ceil(most).max(1);
+        let pairs: Vec<Pair> = self.pairs.iter().step_by(stride).cloned().collect();
+        let is_shown = shown(&pairs, self.images.len());
+        Self { pairs, is_shown, rays: self.rays.clone(), ..*self }
     }
 
     /// Number of pairs of images.
@@ -139,14 +153,15 @@ impl<'a> Problem<'a> {
         (x[OFFSET], x[READOUT]) = start;
         let prior = x;
         if search {
+            let mut coarse = self.thinned(SEARCH_PAIRS);
             let steps = (2.0 * SEARCH_SECS / SEARCH_STEP_SECS).round() as i32;
             let mut best = f64::INFINITY;
             for k in 0..=steps {
                 let mut trial = prior;
                 trial[OFFSET] = -SEARCH_SECS + f64::from(k) * SEARCH_STEP_SECS;
                 let only_bias = |p: usize| p >= BIAS;
-                self.iterate(&mut trial, &prior, only_bias, 2)?;
-                let (_, _, cost) = self.linearise(&trial, only_bias);
+                coarse.iterate(&mut trial, &prior, only_bias, 2)?;
+                let (_, _, cost) = coarse.linearise(&trial, |_| false);
                 if cost < best {
                     (best, x) = (cost, trial);
                 }
@@ -215,22 +230,26 @@ impl<'a> Problem<'a> {
         let path = OrientationPath::new(self.samples, &bias_of(x));
         let body_from_camera = self.rotation(x);
         let last_row = self.camera.height() as f64 - 1.0;
-        let turn_image = |(image, rays): (&ImageFeatures, &Vec<Option<Vector3<f64>>>)| {
-            let row_turns: Vec<Matrix3<f64>> = (0..=ROW_SEGMENTS)
-                .map(|k| {
-                    let row = k as f64 / ROW_SEGMENTS as f64 - 0.5;
-                    (path.at(image.secs + x[OFFSET] + row * x[READOUT]) * body_from_camera).matrix()
-                })
-                .collect();
-            let turn = |((_, pixel), ray): (&(LandmarkId, Pixel), &Option<Vector3<f64>>)| {
-                let at = (pixel.y / last_row).clamp(0.0, 1.0) * ROW_SEGMENTS as f64;
-                let k = (at as usize).min(ROW_SEGMENTS - 1);
-                let part = at - k as f64;
-                ray.map(|r| row_turns[k] * r * (1.0 - part) + row_turns[k + 1] * r * part)
+        let turn_image =
+            |((image, rays), is_shown): ((&ImageFeatures, &Vec<Option<Vector3<f64>>>), &bool)| {
+                if !is_shown {
+                    return Vec::new();
+                }
+                let row_turns: Vec<Matrix3<f64>> = (0..=ROW_SEGMENTS)
+                    .map(|k| {
+                        let row = k as f64 / ROW_SEGMENTS as f64 - 0.5;
+                        (path.at(image.secs + x[OFFSET] + row * x[READOUT]) * body_from_camera).matrix()
+                    })
+                    .collect();
+                let turn = |((_, pixel), ray): (&(LandmarkId, Pixel), &Option<Vector3<f64>>)| {
+                    let at = (pixel.y / last_row).clamp(0.0, 1.0) * ROW_SEGMENTS as f64;
+                    let k = (at as usize).min(ROW_SEGMENTS - 1);
+                    let part = at - k as f64;
+                    ray.map(|r| row_turns[k] * r * (1.0 - part) + row_turns[k + 1] * r * part)
+                };
+                image.features.iter().zip(rays).map(turn).collect()
             };
-            image.features.iter().zip(rays).map(turn).collect()
-        };
-        self.images.iter().zip(&self.rays).map(turn_image).collect()
+        self.images.iter().zip(&self.rays).zip(&self.is_shown).map(turn_image).collect()
     }
 
     /// Normal equations `H δ = g` without prior, and the robust cost; directions of translation are updated.
@@ -310,6 +329,12 @@ impl<'a> Problem<'a> {
         }
         if weights > 0.0 { sum / weights } else { f64::INFINITY }
     }
+}
+
+fn shown(pairs: &[Pair], images: usize) -> Vec<bool> {
+    let mut is_shown = vec![false; images];
+    pairs.iter().flat_map(|p| p.images).for_each(|k| is_shown[k] = true);
+    is_shown
 }
 
 fn bias_of(x: &Parameters) -> Vector3<f64> {

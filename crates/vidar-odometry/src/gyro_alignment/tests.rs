@@ -92,7 +92,7 @@ impl Truth {
 
     fn check(&self, offset_ms: f64, readout_ms: f64, rotation_deg: f64) {
         for seed in 0..4 {
-            let found = self.log(seed).attempt(&camera(), &self.guess()).unwrap();
+            let found = self.log(seed).next_problem(&camera(), &self.guess(), 0.5).unwrap().solve().unwrap();
             let offset = (found.offset_secs - self.offset_secs) * 1e3;
             let readout = (found.readout_secs - self.readout_secs) * 1e3;
             let turn = (self.body_from_camera.inverse() * found.body_from_camera).angle_rad().to_degrees();
@@ -139,5 +139,5 @@ fn a_global_shutter_and_a_true_clock_are_left_as_they_are() {
 #[test]
 fn a_body_at_rest_gives_no_alignment() {
     let rest = Truth { liveliness: 0.01, ..lively() };
-    assert!(rest.log(1).attempt(&camera(), &rest.guess()).is_none());
+    assert!(rest.log(1).next_problem(&camera(), &rest.guess(), 0.5).is_none());
 }

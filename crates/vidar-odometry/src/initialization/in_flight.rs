@@ -207,6 +207,11 @@ impl InFlightInitializer {
         }
     }
 
+    /// Its settings.
+    pub(crate) fn config(&self) -> &InFlightConfig {
+        &self.config
+    }
+
     /// Gyroscope bias as found by the last attempt that came so far, rad/s.
     pub fn gyro_bias(&self) -> &Vector3<f64> {
         &self.gyro_bias

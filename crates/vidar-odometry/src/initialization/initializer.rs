@@ -4,18 +4,20 @@ use super::{
     InFlightConfig, InFlightInitializer, InitFailure, InitFailureReason, InitOutcome, LoggedFrame,
     TrackObservation,
 };
-use crate::backend::Smoother;
+use crate::backend::{Observation, Smoother, SmootherError};
 use crate::config::OdometryConfig;
+use crate::deferred::Deferred;
 use crate::imu::{Bias, Preintegration};
 use crate::tracking::{CameraPoses, Prediction, Tracker};
 use crate::tracking::{HostImage, host_covariance, noisy_covariance};
 use crate::tracking::{ImageMotion, tracks_in};
 use nalgebra::Vector3;
 use std::rc::Rc;
-use vidar_core::{FrameId, LieGroup, Se3, So3, Timestamp};
+use vidar_core::{Duration, FrameId, LieGroup, Se3, So3, Timestamp};
 
-/// The stretch of frames that is logged, s, and most frames of it (their images stay in memory).
-const LOG_SECS: f64 = 3.0;
+/// The stretch of frames that is logged, s, and most frames of it (their images stay in memory): the longest window of an attempt, and
+/// what comes while it is solved.
+const LOG_SECS: f64 = 3.2;
 const LOG_FRAMES: usize = 100;
 
 /// Inverse distance to assume of everything, 1/m.
@@ -27,8 +29,13 @@ const REFILL_SHARE: f64 = 0.7;
 /// Fewest corners of a first image.
 const MIN_FEATURES: usize = 40;
 
-/// Time between attempts to start, s: every second frame at 20 Hz.
+/// Least and longest time between attempts to start, s: every second frame at 20 Hz.
 const ATTEMPT_SECS: f64 = 0.09;
+const LONGEST_PAUSE_SECS: f64 = 0.5;
+/// Pause after an attempt whose images and IMU contradict each other, s.
+const CONTRADICTION_PAUSE_SECS: f64 = 0.3;
+/// Time of the recording until the result of an attempt is taken over, s.
+const SOLVING_SECS: f64 = 0.09;
 
 /// Stillness that a static start needs, s.
 pub(crate) const STILL_SECS: f64 = 0.5;
@@ -53,10 +60,17 @@ pub(crate) struct Initializer {
     in_flight: InFlightInitializer,
     motion: ImageMotion,
     pub images_still: bool,
+    /// An attempt that is being solved.
+    solving: Option<Deferred<Attempt>>,
+    /// When the last attempt began, and how long after that the next one is worth it, s.
     last_attempt: Option<Timestamp>,
+    pause_secs: f64,
     /// What stood in the way at the last attempt.
     failure: InitFailure,
 }
+
+/// What an attempt leaves: who made it, with what was learnt, and its outcome.
+type Attempt = (InFlightInitializer, Result<InitOutcome, SmootherError>);
 
 /// A start that was found.
 pub(crate) struct InitialState {
@@ -103,7 +117,9 @@ impl Initializer {
             in_flight,
             motion: ImageMotion::default(),
             images_still: false,
+            solving: None,
             last_attempt: None,
+            pause_secs: ATTEMPT_SECS,
             failure: InitFailure { reason: InitFailureReason::Frames, measured: 0.0, limit: 5.0 },
         }
     }
@@ -123,7 +139,10 @@ impl Initializer {
         let frame = host.frame;
         let tracked = self.track(&host, time, preintegration.as_ref());
         let preintegration = preintegration.filter(|_| !self.log.is_empty());
-        let chained = preintegration.is_some();
+        if preintegration.is_none() {
+            // What is being solved cannot be carried to this image.
+            self.solving = None;
+        }
         self.log.push(LoggedFrame { frame, time, preintegration, observations: Vec::new() });
         if (tracked as f64) < REFILL_SHARE * self.config.max_landmarks as f64 {
             self.tracker.detect(&host, self.config.max_landmarks - tracked, INITIAL_INVERSE_DISTANCE);
@@ -131,6 +150,7 @@ impl Initializer {
         self.log_observations(frame);
         self.forget();
         if self.tracker.tracks.len() < MIN_FEATURES {
+            self.solving = None;
             let found = self.tracker.tracks.len() as f64;
             return Err(InitFailure {
                 reason: InitFailureReason::Tracks,
@@ -138,29 +158,99 @@ impl Initializer {
                 limit: MIN_FEATURES as f64,
             });
         }
-        if self.last_attempt.is_some_and(|last| (time - last).as_secs_f64() < ATTEMPT_SECS) {
+        if let Some((in_flight, outcome)) =
+            self.solving.take_if(|s| s.is_due(time)).and_then(Deferred::result)
+        {
+            self.in_flight = in_flight;
+            match self.take_over(outcome) {
+                Ok(found) => return Ok(found),
+                Err(failure) => {
+                    self.pause_secs = self.pause_after(&failure);
+                    self.failure = failure;
+                }
+            }
+        }
+        let is_early = |last: Timestamp| (time - last).as_secs_f64() < self.pause_secs;
+        if self.solving.is_some() || self.last_attempt.is_some_and(is_early) {
             return Err(self.failure.clone());
         }
         self.last_attempt = Some(time);
-        let attempt = if self.is_mono { self.attempt_mono() } else { self.attempt_in_flight(chained) };
-        if let Err(failure) = &attempt {
-            self.failure = failure.clone();
+        if self.is_mono {
+            return self.attempt_mono().inspect_err(|failure| self.failure = failure.clone());
         }
-        attempt
+        if self.log.last().is_some_and(|newest| newest.preintegration.is_some()) {
+            self.begin_attempt(time);
+        }
+        Err(self.failure.clone())
     }
 
-    fn attempt_in_flight(&mut self, chained: bool) -> Result<InitialState, InitFailure> {
-        if !chained {
-            return Err(self.failure.clone());
-        }
-        match self.in_flight.attempt(&self.log) {
-            Ok(InitOutcome::Solved(started)) => {
-                let median_distance_m = started.median_distance_m;
-                Ok(self.initial_state(started.smoother, median_distance_m))
+    /// Begins to look for a metric state in what is logged now.
+    fn begin_attempt(&mut self, time: Timestamp) {
+        let (mut in_flight, log) = (self.in_flight.clone(), self.log.clone());
+        let solve = move || {
+            let outcome = in_flight.attempt(&log);
+            (in_flight, outcome)
+        };
+        self.solving = Some(Deferred::begin(time + Duration::from_secs_f64(SOLVING_SECS), solve));
+    }
+
+    /// The start that an attempt found, carried to the newest image.
+    fn take_over(&self, outcome: Result<InitOutcome, SmootherError>) -> Result<InitialState, InitFailure> {
+        match outcome.map_err(InitFailure::backend)? {
+            InitOutcome::Failed(failure) => Err(failure),
+            InitOutcome::Solved(mut started) => {
+                self.carry_on(&mut started.smoother).map_err(InitFailure::backend)?;
+                Ok(self.initial_state(started.smoother, started.median_distance_m))
             }
-            Ok(InitOutcome::Failed(failure)) => Err(failure),
-            Err(error) => Err(InitFailure::backend(error)),
         }
+    }
+
+    /// Adds the newest image to a window that was solved while it came.
+    fn carry_on(&self, smoother: &mut Smoother) -> Result<(), SmootherError> {
+        let (Some((solved, _, state)), Some(newest)) = (smoother.newest(), self.log.last()) else {
+            return Ok(());
+        };
+        let state = *state;
+        let mut joined: Option<Preintegration> = None;
+        for part in self.log.iter().filter(|f| f.frame > solved).filter_map(|f| f.preintegration.as_ref()) {
+            match &mut joined {
+                None => joined = Some(part.clone()),
+                Some(sum) => sum.append(part),
+            }
+        }
+        let Some(mut joined) = joined else { return Ok(()) };
+        joined.reintegrate(state.bias);
+        let predicted = joined.predict(&state);
+        smoother.add_frame(newest.frame, newest.time, predicted, Some(joined))?;
+        smoother.mark_keyframe(newest.frame)?;
+        for TrackObservation { landmark, pixel, covariance } in newest.observations.iter().copied() {
+            if smoother.landmark(landmark).is_some() {
+                let seen = Observation { frame: newest.frame, landmark, pixel, covariance };
+                smoother.add_observation(&seen)?;
+            }
+        }
+        smoother.optimise(self.config.iterations);
+        Ok(())
+    }
+
+    /// Time until another attempt may tell more, s: paced by what the last one lacked.
+    fn pause_after(&self, failure: &InitFailure) -> f64 {
+        let (Some(first), Some(last)) = (self.log.first(), self.log.last()) else { return ATTEMPT_SECS };
+        let span = (last.time - first.time).as_secs_f64();
+        let ratio = failure.measured / failure.limit;
+        let pause = match failure.reason {
+            // σ falls with the square of a window's length, parallax grows with it.
+            InitFailureReason::ScaleUncertainty => span * (ratio.sqrt() - 1.0),
+            InitFailureReason::Parallax => span * (1.0 / ratio - 1.0),
+            InitFailureReason::ScaleAgreement
+            | InitFailureReason::Seconds
+            | InitFailureReason::Frames
+            | InitFailureReason::Tracks => ATTEMPT_SECS,
+            _ => CONTRADICTION_PAUSE_SECS,
+        };
+        // From some length on less is asked for.
+        let until_less = Some(self.in_flight.config().provisional_secs - span).filter(|s| *s > 0.0);
+        pause.min(until_less.unwrap_or(f64::INFINITY)).clamp(ATTEMPT_SECS, LONGEST_PAUSE_SECS)
     }
 
     fn attempt_mono(&mut self) -> Result<InitialState, InitFailure> {

@@ -7,6 +7,7 @@ mod odometry;
 mod orientation_check;
 mod output;
 mod time_calibration;
+mod working_size;
 
 pub(crate) use keyframes::public_state;
 pub use odometry::{InputCounts, Odometry};

@@ -5,6 +5,7 @@ use super::keyframes::{KeyframeInput, KeyframeRegistry, public_state, seen_landm
 use super::orientation_check::{MAX_TURN_DEG, OrientationCheck};
 use super::output::{DivergenceSign, LossReason, OdometryOutput, Status, TrackSummary, Tracking};
 use super::time_calibration::{CameraTiming, TimeCalibration};
+use super::working_size::WorkingSize;
 use crate::backend::{CalibrationEstimate, Smoother, SmootherError};
 use crate::bundle_adjustment::TrackLog;
 use crate::config::{ImuUse, OdometryConfig};
@@ -71,7 +72,9 @@ pub struct Odometry {
     config: OdometryConfig,
     frontend: FrontendConfig,
     camera_id: CameraId,
+    /// Of the images that are worked with.
     camera: RigCamera,
+    working: WorkingSize,
     /// As the caller's calibration has it.
     given_body_from_camera: Se3,
     imu_model: Option<ImuModel>,
@@ -104,13 +107,15 @@ impl Odometry {
     /// A setting outside its range, a camera or IMU that the rig lacks, a calibration that cannot be true.
     pub fn new(rig: &Rig, camera: CameraId, config: &OdometryConfig) -> Result<Self, OdometryError> {
         config.validate()?;
-        let rig_camera = rig.camera(camera).ok_or(OdometryError::NoSuchCamera(camera))?.clone();
+        let mut rig_camera = rig.camera(camera).ok_or(OdometryError::NoSuchCamera(camera))?.clone();
         let noise = match config.imu {
             ImuUse::Off => None,
             ImuUse::Auto => rig.imu,
             ImuUse::Required => Some(rig.imu.ok_or(OdometryError::NoImu)?),
         };
         super::calibration::check(&rig_camera)?;
+        let (working, working_camera) = WorkingSize::of(&rig_camera.model);
+        rig_camera.model = working_camera;
         let imu_model = noise.map(|n| {
             ImuModel::from_data_sheet(&n, config.gyro_noise_factor, config.accel_noise_factor)
                 .with_gravity(config.gravity_mps2)
@@ -134,6 +139,7 @@ impl Odometry {
             log: None,
             given_body_from_camera: rig_camera.body_from_camera,
             camera: rig_camera,
+            working,
             imu_model,
             imu: ImuBuffer::new(noise.map_or(200.0, |n| n.rate_hz)),
             pending: VecDeque::new(),
@@ -209,12 +215,14 @@ impl Odometry {
     pub fn tracks(&self) -> Vec<TrackRecord> {
         match &self.phase {
             Phase::Initializing(_) => Vec::new(),
-            Phase::Tracking(window) => window.records(),
+            Phase::Tracking(window) => {
+                window.records().into_iter().map(|track| self.working.restore_track(track)).collect()
+            }
         }
     }
 
-    fn take_image(&mut self, frame: Frame) -> Result<(), OdometryError> {
-        let (width, height) = (self.camera.model.width(), self.camera.model.height());
+    fn take_image(&mut self, mut frame: Frame) -> Result<(), OdometryError> {
+        let (width, height) = self.working.given();
         let (found_width, found_height) = (frame.image.width(), frame.image.height());
         if (found_width, found_height) != (width, height) {
             return Err(OdometryError::WrongImageSize { width, height, found_width, found_height });
@@ -225,6 +233,7 @@ impl Odometry {
         }
         self.last_image = Some(frame.time);
         self.counts.images += 1;
+        frame.image = self.working.image(frame.image);
         self.pending.push_back(frame);
         Ok(())
     }
@@ -278,6 +287,7 @@ impl Odometry {
                 break;
             }
         }
+        odometry.recalibrate(None);
         Ok(odometry.timing())
     }
 
@@ -316,7 +326,13 @@ impl Odometry {
         let was_starting = matches!(self.phase, Phase::Initializing(_));
         let status = self.status_after(&frame, host, time);
         self.log_image(&frame, id, &status);
-        let status = self.recalibrate(&frame, id).unwrap_or(status);
+        let status = match self.imu_model {
+            Some(_) => {
+                self.log_features_of(id, frame.time);
+                self.recalibrate(Some(frame.time)).unwrap_or(status)
+            }
+            None => status,
+        };
         self.clock.lap(if was_starting { Stage::Initialise } else { Stage::Output });
         self.imu.forget_before(self.last_frame.unwrap_or(time) - Duration::from_millis(1500));
         Some(OdometryOutput { frame_id: frame.id, time: frame.time, status })
@@ -400,15 +416,15 @@ impl Odometry {
         }
     }
 
-    /// Checks clock, readout and camera rotation against tracks and gyroscope; starts anew where they were corrected.
-    fn recalibrate(&mut self, frame: &Frame, id: FrameId) -> Option<Status> {
-        self.imu_model?;
-        self.log_features_of(id, frame.time);
+    /// Checks clock, readout and camera rotation against tracks and gyroscope, with an image stamped `now` or after the last one; starts
+    /// anew where they were corrected.
+    fn recalibrate(&mut self, now: Option<Timestamp>) -> Option<Status> {
         let offset = self.camera.time_offset + self.estimated_offset();
         let correction = self.time_calibration.correction(
             &self.camera,
             offset.as_secs_f64(),
             matches!(self.phase, Phase::Tracking(_)),
+            now,
         )?;
         self.camera.time_offset = Duration::from_secs_f64(correction.offset_secs);
         if let Some(rotation) = correction.body_from_camera {
@@ -605,7 +621,8 @@ impl Odometry {
             HealthDecision::Lost(reason) => return self.lose(reason),
         };
         let world_from_camera = state.world_from_body * *smoother.body_from_camera();
-        let landmarks = seen_landmarks(smoother, &window.tracker.tracks, &world_from_camera);
+        let mut landmarks = seen_landmarks(smoother, &window.tracker.tracks, &world_from_camera);
+        self.working.restore_landmarks(&mut landmarks);
         let mut tracking = Tracking {
             segment: self.segment,
             state: public_state(&state, frame.time),

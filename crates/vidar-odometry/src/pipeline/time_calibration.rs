@@ -2,6 +2,7 @@
 //! tracks and gyroscope contradict them.
 
 use crate::config::OdometryConfig;
+use crate::deferred::Deferred;
 use crate::gyro_alignment::{Alignment, Guess, GyroAlignmentLog};
 use vidar_core::{Duration, ImuSample, LandmarkId, LieGroup, RigCamera, Se3, So3, Timestamp, camera::Pixel};
 
@@ -21,6 +22,13 @@ const SETTLED_READOUT_SECS: f64 = 0.003;
 
 /// Largest mean squared whitened residual of a solution that explains the tracks.
 const MAX_CHI2_PER_DOF: f64 = 3.0;
+
+/// Time of the recording until the solution of an attempt is taken over, s.
+const SOLVING_SECS: f64 = 0.5;
+/// Time between attempts, s: the first ones hurry. Later ones come as often as half of what they look at is new.
+const PAUSE_SECS: f64 = 0.5;
+const LATER_PAUSE_SECS: f64 = 2.0;
+const HURRIED_ATTEMPTS: usize = 8;
 
 /// Attempts after which the values in use stay.
 const MAX_ATTEMPTS: usize = 40;
@@ -75,6 +83,8 @@ pub(crate) struct TimeCalibration {
     estimated: Option<(f64, f64)>,
     attempts: usize,
     is_settled: bool,
+    /// The attempt that is being solved.
+    solving: Option<Deferred<Option<Alignment>>>,
 }
 
 impl TimeCalibration {
@@ -89,6 +99,7 @@ impl TimeCalibration {
             estimated: None,
             attempts: 0,
             is_settled: !estimates_offset && readout_secs.is_some(),
+            solving: None,
         }
     }
 
@@ -130,33 +141,60 @@ impl TimeCalibration {
     /// Forgets all measurements: a saturated gyroscope integrates to a wrong rotation.
     pub fn forget(&mut self) {
         self.log = GyroAlignmentLog::default();
+        self.solving = None;
     }
 
-    /// A correction of `camera`, whose clock offset in use is `offset_secs`, where one is called for. `is_tracking`: there is
-    /// a state that it would end.
+    /// A correction of `camera`, whose clock offset in use is `offset_secs`, where one is called for with an image stamped `now`, or
+    /// after the last one (`None`). `is_tracking`: there is a state that it would end.
     pub fn correction(
         &mut self,
         camera: &RigCamera,
         offset_secs: f64,
         is_tracking: bool,
+        now: Option<Timestamp>,
     ) -> Option<Correction> {
         if self.is_settled() {
             return None;
         }
+        let solving = self.solving.take_if(|s| now.is_none_or(|now| s.is_due(now)));
+        if let Some(found) = solving.and_then(Deferred::result).flatten() {
+            return self.take(&found, camera, offset_secs, is_tracking);
+        }
+        if let (None, Some(now)) = (&self.solving, now) {
+            self.begin(camera, offset_secs, now);
+        }
+        None
+    }
+
+    /// Begins to solve for what the log holds.
+    fn begin(&mut self, camera: &RigCamera, offset_secs: f64, now: Timestamp) {
         let guess = Guess {
             body_from_camera: camera.body_from_camera.rotation,
             offset_secs,
             readout_secs: self.readout_secs,
             search: self.attempts.is_multiple_of(4),
         };
-        let found = self.log.attempt(&camera.model, &guess)?;
+        let pause = if self.attempts < HURRIED_ATTEMPTS { PAUSE_SECS } else { LATER_PAUSE_SECS };
+        if let Some(problem) = self.log.next_problem(&camera.model, &guess, pause) {
+            let due = now + Duration::from_secs_f64(SOLVING_SECS);
+            self.solving = Some(Deferred::begin(due, move || problem.solve()));
+        }
+    }
+
+    fn take(
+        &mut self,
+        found: &Alignment,
+        camera: &RigCamera,
+        offset_secs: f64,
+        is_tracking: bool,
+    ) -> Option<Correction> {
         self.attempts += 1;
         let is_usable = found.offset_sigma < USABLE_OFFSET_SECS && found.chi2_per_dof < MAX_CHI2_PER_DOF;
         if !is_usable {
             return None;
         }
         self.estimated = Some((found.offset_sigma, found.readout_sigma));
-        let correction = self.compare(&found, camera, offset_secs, is_tracking);
+        let correction = self.compare(found, camera, offset_secs, is_tracking);
         if correction.is_none() {
             self.is_settled =
                 found.offset_sigma < SETTLED_OFFSET_SECS && found.readout_sigma < SETTLED_READOUT_SECS;

@@ -87,8 +87,12 @@ impl Odometry {
             given_body_from_camera: self.given_body_from_camera,
             model: *model,
             data_sheet,
-            sigmas,
+            sigmas: &CalibrationSigmas {
+                principal_point_px: sigmas.principal_point_px / self.working.factor(),
+                ..sigmas.clone()
+            },
         };
-        bundle_adjustment::adjust(&input, tell)
+        let adjusted = bundle_adjustment::adjust(&input, tell)?;
+        self.working.restore_adjusted(adjusted).map_err(|_| AdjustmentError::Undetermined)
     }
 }
