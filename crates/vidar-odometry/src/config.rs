@@ -40,6 +40,9 @@ pub struct OdometryConfig {
     pub gravity_mps2: f64,
     /// Whether the offset between the clocks of camera and IMU is estimated on the way.
     pub estimate_time_offset: bool,
+    /// Whether a clock offset of any size, the readout and a wrong camera rotation are looked for with feature tracks and gyroscope while
+    /// images come. A recording on disk is looked through before, and then not again.
+    pub align_timing: bool,
     /// Rolling shutter: time from the first to the last image row, milliseconds, 0…50; 0 is a global shutter. Absent: it is
     /// estimated from feature tracks and gyroscope as soon as the camera turns.
     pub readout_ms: Option<f64>,
@@ -66,6 +69,7 @@ impl Default for OdometryConfig {
             accel_noise_factor: 4.0,
             gravity_mps2: vidar_core::GRAVITY_MPS2,
             estimate_time_offset: true,
+            align_timing: true,
             estimate_extrinsics: false,
             readout_ms: None,
             adjust: true,

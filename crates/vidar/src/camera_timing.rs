@@ -27,7 +27,8 @@ pub(crate) fn settle(
     let stated = dataset.readout.map(|r| 1e3 * r.as_secs_f64());
     config.odometry.readout_ms = config.odometry.readout_ms.or(stated);
     let settings = &config.odometry;
-    let is_known = settings.readout_ms.is_some() && !settings.estimate_time_offset;
+    let is_known =
+        !settings.align_timing || (settings.readout_ms.is_some() && !settings.estimate_time_offset);
     if is_known || settings.imu == ImuUse::Off || dataset.rig.imu.is_none() {
         return Ok(None);
     }
@@ -45,6 +46,8 @@ pub(crate) fn settle(
         }
     });
     let timing = Odometry::find_timing(&dataset.rig, dataset.camera, settings, counted)?;
+    // What half a minute shows is not to be given up for what the first seconds show.
+    config.odometry.align_timing &= timing.sigmas_secs.is_none();
     if !timing.is_corrected {
         return Ok(None);
     }

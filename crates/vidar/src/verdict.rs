@@ -234,8 +234,8 @@ impl StatedScale {
             ScaleSource::Odometry { stated, unseen, unchecked } => {
                 let parts = [stated, unseen, unchecked.unwrap_or(0.0), known];
                 let sigma = parts.map(|part| part.powi(2)).iter().sum::<f64>().sqrt();
-                let of_calibration =
-                    unchecked.map_or_else(String::new, |c| format!(", calibration not checked {:.1} %", 100.0 * c));
+                let of_calibration = unchecked
+                    .map_or_else(String::new, |c| format!(", calibration not checked {:.1} %", 100.0 * c));
                 Self {
                     // What sensors and calibration add is a matter of their class; what the motion shows decides.
                     is_metric: stated <= METRIC_SCALE_STD,

@@ -126,8 +126,7 @@ impl Odometry {
         let config = OdometryConfig { imu, ..config.clone() };
         let phase =
             Phase::Initializing(Box::new(initializer(&config, imu_model.is_none(), &rig_camera, &frontend)));
-        let time_calibration =
-            TimeCalibration::new(config.readout_ms.map(|ms| ms * 1e-3), config.estimate_time_offset);
+        let time_calibration = TimeCalibration::new(&config);
         Ok(Self {
             config,
             frontend,

@@ -88,8 +88,10 @@ pub(crate) struct TimeCalibration {
 }
 
 impl TimeCalibration {
-    /// `readout_secs`: the readout time where it is known.
-    pub fn new(readout_secs: Option<f64>, estimates_offset: bool) -> Self {
+    /// What the settings say is known is not estimated.
+    pub fn new(config: &OdometryConfig) -> Self {
+        let readout_secs = config.readout_ms.map(|ms| ms * 1e-3);
+        let estimates_offset = config.estimate_time_offset;
         Self {
             log: GyroAlignmentLog::default(),
             readout_secs: readout_secs.unwrap_or(0.0),
@@ -98,7 +100,7 @@ impl TimeCalibration {
             used_sigmas: (0.0, 0.0),
             estimated: None,
             attempts: 0,
-            is_settled: !estimates_offset && readout_secs.is_some(),
+            is_settled: !config.align_timing || (!estimates_offset && readout_secs.is_some()),
             solving: None,
         }
     }
