@@ -125,12 +125,8 @@ fn read_imu(
         let message = format!("{} IMU samples are not finite; skipped", before - draft.imu.len());
         draft.warnings.push(Warning::new("sample-not-finite", message).at(&place));
     }
-    let message = "a bag states no noise densities of its IMU; those of EuRoC's ADIS16448 are used";
-    draft
-        .warnings
-        .push(Warning::new("imu-noise", message).at(&place).hint("--calibration imu.yaml (Kalibr)"));
     let rate_hz = topic.rate_hz().unwrap_or(ImuNoise::EUROC.rate_hz);
-    draft.imu_noise = Some(ImuNoise { rate_hz, ..ImuNoise::EUROC });
+    draft.assume_imu_noise("a bag", rate_hz, &place);
     Ok(Some(frame))
 }
 

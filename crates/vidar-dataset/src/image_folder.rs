@@ -102,7 +102,7 @@ pub(crate) fn images_by_list(
 }
 
 /// Times from names that are numbers of seconds, ms, µs or ns, else frame numbers at 30 Hz.
-fn images_by_name(
+pub(crate) fn images_by_name(
     draft: &mut Draft,
     folder: &Path,
     names: &[String],
@@ -152,7 +152,7 @@ fn times_from_stems(
 }
 
 /// A matrix of intrinsics or an EuRoC or Kalibr file next to the images.
-fn read_intrinsics(draft: &mut Draft, folder: &Path) -> Result<(), DatasetError> {
+pub(crate) fn read_intrinsics(draft: &mut Draft, folder: &Path) -> Result<(), DatasetError> {
     let matrices = ["K.txt", "intrinsics.txt", "camera-intrinsics.txt"];
     let root = draft.root.clone();
     if let Some(path) = first_file(&root, &matrices).or_else(|| first_file(folder, &matrices)) {

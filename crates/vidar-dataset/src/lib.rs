@@ -13,13 +13,18 @@ mod euroc;
 mod events;
 mod folder;
 mod image_folder;
+mod imu_log;
+mod inertial;
 mod location;
 mod options;
 pub mod parse;
+mod phone;
 mod posed_folder;
 mod rig_checks;
 mod seven_scenes;
 mod source;
+mod spectacular;
+mod stray_scanner;
 mod topics;
 mod trajectory_file;
 mod transforms;
@@ -109,6 +114,15 @@ fn try_kind(
             let found = video::only_one_in(path);
             found.map(|(file, reason)| video::open(&file, reason, options)).transpose()
         }
+        DatasetKind::StrayScanner => stray_scanner::detect(path)
+            .map_or(Ok(None), |reason| single(stray_scanner::open(path, reason, options))),
+        DatasetKind::SpectacularAi => {
+            spectacular::detect(path).map(|reason| spectacular::open(path, reason, options)).transpose()
+        }
+        DatasetKind::ImuLog => {
+            imu_log::detect(path).map_or(Ok(None), |log| single(imu_log::open(path, log, options)))
+        }
+        DatasetKind::KittiRaw | DatasetKind::KittiOdometry | DatasetKind::Replica | DatasetKind::IclNuim => Ok(None),
         DatasetKind::ImageFolder => image_folder::detect(path)
             .map_or(Ok(None), |(folder, reason)| single(image_folder::open(path, &folder, reason, options))),
     }

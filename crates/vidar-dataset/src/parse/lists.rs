@@ -7,7 +7,7 @@ use crate::options::TimeUnit;
 use crate::source::{Lines, MAX_ROWS, Row, Source, for_each_block, quoted};
 use nalgebra::Vector3;
 use std::path::Path;
-use vidar_core::{AngularRate, ImuSample, SpecificForce, Timestamp, Warning};
+use vidar_core::{AngularRate, ImuSample, Se3, So3, SpecificForce, Timestamp, Warning};
 
 /// Most images of a list: nine hours at 30 Hz.
 const MAX_IMAGES: usize = 1_000_000;
@@ -120,17 +120,75 @@ pub fn time_list(
     Ok((times, notes))
 }
 
+/// Reads the times in the first column of a table, whatever follows: one time a frame.
+pub fn first_column_times(
+    source: &Source<'_>,
+    rule: UnitRule,
+) -> Result<(Vec<Timestamp>, Vec<Warning>), DatasetError> {
+    let mut notes = Vec::new();
+    let lines = images_at_most(source, source.lines(&mut notes)?)?;
+    let first = |row: &Row<'_>| row.text.split([',', ';', ' ', '\t']).next().unwrap_or("").trim().to_string();
+    let columns: Vec<String> = lines.rows.iter().map(first).collect();
+    let place = source.path.display().to_string();
+    let unit = decide_unit(rule, columns.iter().map(String::as_str), &place, &mut notes);
+    let times = lines.rows.iter().zip(&columns).map(|(row, time)| read_time(source, row, time, unit));
+    Ok((times.collect::<Result<_, _>>()?, notes))
+}
+
+/// Medians of the columns `fx[px]` and `fy[px]` of a table of frames (MARS Logger's `movie_metadata.csv`); `None` without them.
+pub fn focal_lengths(source: &Source<'_>) -> Result<Option<[f64; 2]>, DatasetError> {
+    let text = source.text(&mut Vec::new())?;
+    let names: Vec<&str> = text.lines().next().unwrap_or("").split(',').map(str::trim).collect();
+    let column = |name: &str| names.iter().position(|n| n.to_ascii_lowercase().starts_with(name));
+    let (Some(x), Some(y)) = (column("fx"), column("fy")) else { return Ok(None) };
+    let lines = images_at_most(source, source.lines(&mut Vec::new())?)?;
+    let median = |column: usize| {
+        let number = |row: &Row<'_>| row.fields().nth(column)?.parse::<f64>().ok().filter(|v| *v > 0.0);
+        let mut values: Vec<f64> = lines.rows.iter().filter_map(number).collect();
+        values.sort_unstable_by(f64::total_cmp);
+        values.get(values.len() / 2).copied()
+    };
+    Ok(median(x).zip(median(y)).map(|(fx, fy)| [fx, fy]))
+}
+
 /// Whether a file name has the extension of a supported image format.
 pub(crate) fn is_image_name(name: &str) -> bool {
     name.rsplit_once('.')
         .is_some_and(|(_, ext)| ["png", "jpg", "jpeg"].iter().any(|known| ext.eq_ignore_ascii_case(known)))
 }
 
-type TimedRow<const N: usize> = (Timestamp, [f64; N]);
+pub(crate) type TimedRow<const N: usize> = (Timestamp, [f64; N]);
 
-/// Rows of a time and `N` numbers, taken block by block. Rows with a number that is not finite are skipped and counted.
+/// Most columns of a row that are looked at.
+const MAX_COLUMNS: usize = 64;
+
+/// Which columns of a row hold its time and its numbers.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) struct Places<const N: usize> {
+    pub time: usize,
+    /// `None`: the table does not hold this number; it is then NaN.
+    pub numbers: [Option<usize>; N],
+    /// A column that tells whose the row is: rows that are not the gyroscope's hold the second half of the numbers.
+    pub sensor: Option<usize>,
+}
+
+impl<const N: usize> Places<N> {
+    /// The time, then the numbers, and nothing is missing.
+    fn in_order() -> Self {
+        Self { time: 0, numbers: std::array::from_fn(|i| Some(i + 1)), sensor: None }
+    }
+
+    /// Whether rows may hold a part of the numbers: two sensors in one table, row by row.
+    fn is_sparse(&self) -> bool {
+        *self != Self::in_order()
+    }
+}
+
+/// Rows of a time and `N` numbers, taken block by block. Rows with a number that is not finite are skipped and counted; in a
+/// table of two sensors those without any.
 struct TimedNumbers<const N: usize> {
     rule: UnitRule,
+    places: Places<N>,
     columns: &'static str,
     unit: Option<TimeUnit>,
     rows: Vec<TimedRow<N>>,
@@ -141,7 +199,11 @@ struct TimedNumbers<const N: usize> {
 
 impl<const N: usize> TimedNumbers<N> {
     fn new(rule: UnitRule, columns: &'static str) -> Self {
-        Self { rule, columns, unit: None, rows: Vec::new(), notes: Vec::new(), not_finite: None }
+        Self::at(rule, Places::in_order(), columns)
+    }
+
+    fn at(rule: UnitRule, places: Places<N>, columns: &'static str) -> Self {
+        Self { rule, places, columns, unit: None, rows: Vec::new(), notes: Vec::new(), not_finite: None }
     }
 
     /// Takes a block with `lines_before` lines before it. The first one decides the unit of time.
@@ -152,7 +214,7 @@ impl<const N: usize> TimedNumbers<N> {
         notes.retain(|note| !self.notes.contains(note));
         self.notes.extend(notes);
         let unit = *self.unit.get_or_insert_with(|| {
-            let times = lines.rows.iter().map(|r| r.fields().next().unwrap_or(""));
+            let times = lines.rows.iter().map(|r| r.fields().nth(self.places.time).unwrap_or(""));
             decide_unit(self.rule, times, &source.path.display().to_string(), &mut self.notes)
         });
         for row in &lines.rows {
@@ -160,7 +222,8 @@ impl<const N: usize> TimedNumbers<N> {
                 return Err(source.too_many_rows(row.line, MAX_ROWS));
             }
             let (time, numbers) = self.row(source, row, unit)?;
-            if numbers.iter().all(|v| v.is_finite()) {
+            let finite = numbers.iter().filter(|v| v.is_finite()).count();
+            if finite == N || self.places.is_sparse() && finite > 0 {
                 self.rows.push((time, numbers));
             } else {
                 self.not_finite.get_or_insert((0, row.line)).0 += 1;
@@ -170,15 +233,28 @@ impl<const N: usize> TimedNumbers<N> {
     }
 
     fn row(&self, source: &Source<'_>, row: &Row<'_>, unit: TimeUnit) -> Result<TimedRow<N>, DatasetError> {
-        let mut fields = row.fields();
-        let time = read_time(source, row, fields.next().unwrap_or(""), unit)?;
-        let mut numbers = [0.0; N];
-        for (i, number) in numbers.iter_mut().enumerate() {
-            let field = fields.next().ok_or_else(|| {
+        let mut fields = [""; MAX_COLUMNS];
+        let mut count = 0;
+        for (field, found) in fields.iter_mut().zip(row.fields()) {
+            (*field, count) = (found, count + 1);
+        }
+        let time = read_time(source, row, fields.get(self.places.time).copied().unwrap_or(""), unit)?;
+        let mut numbers = [f64::NAN; N];
+        for (number, place) in numbers.iter_mut().zip(self.places.numbers) {
+            let Some(place) = place else { continue };
+            let field = fields.get(place).copied().unwrap_or("");
+            if field.is_empty() && self.places.is_sparse() {
+                continue;
+            }
+            if place >= count {
                 let expected = format!("{} columns: {}", N + 1, self.columns);
-                source.malformed(row.line, format!("{} columns", i + 1), expected)
-            })?;
+                return Err(source.malformed(row.line, format!("{count} columns"), expected));
+            }
             *number = source.number(row, field, self.columns)?;
+        }
+        let sensor = self.places.sensor.map(|place| fields.get(place).copied().unwrap_or(""));
+        if sensor.is_some_and(|name| !is_gyroscope(name)) {
+            numbers.rotate_right(N / 2);
         }
         Ok((time, numbers))
     }
@@ -193,8 +269,55 @@ impl<const N: usize> TimedNumbers<N> {
     }
 }
 
+const IMU_COLUMNS: &str = "time, gyro x y z, accel x y z";
+
 fn imu_numbers(rule: UnitRule) -> TimedNumbers<6> {
-    TimedNumbers::new(rule, "time, gyro x y z, accel x y z")
+    TimedNumbers::new(rule, IMU_COLUMNS)
+}
+
+/// Whether a row's mark names the gyroscope: its name, or 1 in a column "is it the gyroscope?".
+fn is_gyroscope(mark: &str) -> bool {
+    mark.to_ascii_lowercase().contains("gyr") || mark.parse() == Ok(1.0)
+}
+
+/// Reads a table of gyroscope and accelerometer, which may share rows or not; what a row does not hold is NaN.
+pub(crate) fn imu_table(
+    path: &Path,
+    rule: UnitRule,
+    places: Places<6>,
+) -> Result<(Vec<TimedRow<6>>, Vec<Warning>), DatasetError> {
+    let mut numbers = TimedNumbers::at(rule, places, IMU_COLUMNS);
+    for_each_block(path, |block, lines_before| numbers.add(block, lines_before))?;
+    Ok(numbers.finish(path))
+}
+
+/// A row of a table of poses with numbers of frames.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct NumberedPose {
+    /// When.
+    pub time: Timestamp,
+    /// Number of the frame.
+    pub frame: u64,
+    /// The pose as written; `None` where it is no rigid motion.
+    pub world_from_camera: Option<Se3>,
+}
+
+/// Reads `time, frame, x, y, z, qx, qy, qz, qw` rows (Stray Scanner's `odometry.csv`).
+pub fn numbered_poses(
+    source: &Source<'_>,
+    rule: UnitRule,
+) -> Result<(Vec<NumberedPose>, Vec<Warning>), DatasetError> {
+    let mut numbers = TimedNumbers::<8>::new(rule, "time, frame, x y z, qx qy qz qw");
+    numbers.add(source, 0)?;
+    let (rows, notes) = numbers.finish(source.path);
+    let pose = |(time, [frame, x, y, z, qx, qy, qz, qw]): TimedRow<8>| {
+        let norm = (qx * qx + qy * qy + qz * qz + qw * qw).sqrt();
+        let rotation = So3::from_quaternion(qx, qy, qz, qw).filter(|_| (norm - 1.0).abs() < 0.05);
+        let world_from_camera = rotation.map(|r| Se3::new(r, Vector3::new(x, y, z)));
+        // A negative or fractional number becomes that of no frame's file.
+        NumberedPose { time, frame: frame.max(0.0) as u64, world_from_camera }
+    };
+    Ok((rows.into_iter().map(pose).collect(), notes))
 }
 
 fn imu_samples((rows, notes): (Vec<TimedRow<6>>, Vec<Warning>)) -> (Vec<ImuSample>, Vec<Warning>) {

@@ -1,6 +1,8 @@
 //! Parsers of whole files held in memory. Every one takes bytes of unknown origin and returns a value or an error
 //! that names the line; none panics, and none allocates more than a small multiple of the file.
 
+pub(crate) mod columns;
+mod jsonl;
 mod lists;
 mod matrices;
 mod poses;
@@ -8,9 +10,13 @@ pub(crate) mod units;
 pub(crate) mod yaml;
 
 pub use crate::source::Source;
-pub(crate) use lists::imu_file;
-pub(crate) use lists::is_image_name;
-pub use lists::{ListedFile, ListedTime, accelerometer_list, file_list, imu_csv, time_list};
+pub use columns::imu_columns;
+pub use jsonl::{JsonCamera, JsonPose, JsonRecording, json_calibration};
+pub(crate) use lists::{TimedRow, imu_file, imu_table, is_image_name};
+pub use lists::{
+    ListedFile, ListedTime, NumberedPose, accelerometer_list, file_list, first_column_times, focal_lengths, imu_csv,
+    numbered_poses, time_list,
+};
 pub use matrices::{intrinsics_matrix, matrix_poses, single_pose};
 pub(crate) use poses::is_ambiguous_csv;
 pub use poses::{PoseFile, RawPose, euroc_poses, guess_trajectory_format, kitti_poses, tum_poses};

@@ -1,0 +1,227 @@
+//! Loggers of phones: tables of gyroscope and accelerometer beside a video or a folder of frames.
+//!
+//! Known by what the tables hold, not by their names: MARS Logger (`gyro_accel.csv`, `movie.mp4`, `frame_timestamps.txt`,
+//! `movie_metadata.csv`), OpenCamera Sensors (`VIDEO_gyro.csv`, `VIDEO_accel.csv`, `VIDEO_timestamps.csv`, in a folder beside the
+//! video), Sensor Logger, and others whose header names its columns. Frames get the times of the log where there is one, because a
+//! video's own begin at zero.
+
+use crate::dataset::CalibrationSource;
+use crate::draft::Draft;
+use crate::error::DatasetError;
+use crate::folder::{images_in, names_in};
+use crate::image_folder;
+use crate::inertial::{ImuFile, imu_file_at, read_imu};
+use crate::location::files;
+use crate::options::{DatasetKind, OpenOptions};
+use crate::parse::{self, Source, UnitRule};
+use crate::phone;
+use crate::video::{names_of_videos, take_frames};
+use std::path::{Path, PathBuf};
+use vidar_core::{CameraModel, Pinhole, Timestamp, Warning};
+use vidar_video::Video;
+
+/// Most tables of a folder that are looked at, and most folders beside the pictures.
+const MAX_TABLES: usize = 64;
+const MAX_FOLDERS: usize = 16;
+/// Folders in which frames commonly lie.
+const FRAMES: [&str; 6] = ["frames", "images", "rgb", "cam0", "color", "data"];
+
+/// What was found of a logger's recording.
+pub(crate) struct Log {
+    tables: Vec<ImuFile>,
+    /// The folder of the tables.
+    folder: PathBuf,
+    pictures: Pictures,
+    reason: String,
+}
+
+enum Pictures {
+    Video(PathBuf),
+    Folder(PathBuf),
+}
+
+/// Looks for tables of an IMU beside pictures.
+pub(crate) fn detect(path: &Path) -> Option<Log> {
+    let pictures = pictures_in(path)?;
+    let (folder, tables) = imu_tables(path)?;
+    let mut names: Vec<String> = tables
+        .iter()
+        .map(|t| t.path.file_name().unwrap_or_default().to_string_lossy().into_owned())
+        .collect();
+    names.sort();
+    let beside = match &pictures {
+        Pictures::Video(file) => file.file_name().unwrap_or_default().to_string_lossy().into_owned(),
+        Pictures::Folder(folder) => format!("images in {}", folder.display()),
+    };
+    let reason = format!("{} of gyroscope and accelerometer beside {beside}", names.join(" and "));
+    Some(Log { tables, folder, pictures, reason })
+}
+
+fn pictures_in(path: &Path) -> Option<Pictures> {
+    if let [only] = names_of_videos(path).as_slice() {
+        return Some(Pictures::Video(path.join(only)));
+    }
+    let has_images = |folder: &PathBuf| images_in(folder).is_ok_and(|names| !names.is_empty());
+    let folders = std::iter::once(path.to_path_buf()).chain(FRAMES.iter().map(|n| path.join(n)));
+    folders.into_iter().find(has_images).map(Pictures::Folder)
+}
+
+/// The tables of one gyroscope and one accelerometer, in `path` or in the one folder under it that has them.
+fn imu_tables(path: &Path) -> Option<(PathBuf, Vec<ImuFile>)> {
+    if let Some(found) = tables_of(path) {
+        return Some((path.to_path_buf(), found));
+    }
+    let inner = names_in(path).ok()?.into_iter().map(|n| path.join(n)).filter(|p| p.is_dir()).take(MAX_FOLDERS);
+    let mut found = inner.filter_map(|folder| Some((tables_of(&folder)?, folder)));
+    match (found.next(), found.next()) {
+        (Some((tables, folder)), None) => Some((folder, tables)),
+        _ => None,
+    }
+}
+
+/// One table of both sensors, else one of each; `None` where a sensor is missing or it is not clear which table is meant.
+fn tables_of(folder: &Path) -> Option<Vec<ImuFile>> {
+    let is_table = |n: &String| {
+        let lower = n.to_ascii_lowercase();
+        !lower.starts_with('.') && (lower.ends_with(".csv") || lower.ends_with(".txt"))
+    };
+    let names = names_in(folder).ok()?.into_iter().filter(is_table).take(MAX_TABLES);
+    let mut tables: Vec<ImuFile> =
+        names.filter_map(|name| imu_file_at(&folder.join(name)).ok().flatten()).collect();
+    // Raw copies and sensors without calibration or gravity are beside the same sensor's table.
+    let is_side = |t: &ImuFile| {
+        let name = t.path.file_name().unwrap_or_default().to_string_lossy().to_ascii_lowercase();
+        ["uncalibrated", "linear", "raw", "user", "magn"].iter().any(|word| name.contains(word))
+    };
+    if tables.iter().any(|t| !is_side(t)) {
+        tables.retain(|t| !is_side(t));
+    }
+    let both = |t: &ImuFile| t.columns.has_gyroscope() && t.columns.has_accelerometer();
+    if let Some(at) = tables.iter().position(both) {
+        return Some(vec![tables.swap_remove(at)]);
+    }
+    let only = |has: &dyn Fn(&ImuFile) -> bool| {
+        let mut found = tables.iter().filter(|t| has(t));
+        found.next().filter(|_| found.next().is_none()).cloned()
+    };
+    let gyro = only(&|t| t.columns.has_gyroscope())?;
+    let accel = only(&|t| t.columns.has_accelerometer())?;
+    Some(vec![gyro, accel])
+}
+
+/// Reads the recording.
+pub(crate) fn open(path: &Path, log: Log, options: &OpenOptions) -> Result<Draft, DatasetError> {
+    let mut draft = Draft::new(DatasetKind::ImuLog, path, log.reason.clone());
+    let tables: Vec<PathBuf> = log.tables.iter().map(|t| t.path.clone()).collect();
+    let frame_log = options.timestamps.clone().or_else(|| frame_times_file(&log.folder, path, &tables));
+    let mut quarter_turns = 0;
+    match &log.pictures {
+        Pictures::Video(file) => {
+            let video = Video::open(file)?;
+            quarter_turns = video.quarter_turns();
+            match &frame_log {
+                Some(list) => {
+                    let times = frame_times(&mut draft, list, options)?;
+                    take_frames(&mut draft, file, video, Some((&times, list)));
+                }
+                None => {
+                    take_frames(&mut draft, file, video, None);
+                    let message = "no log of frame times: the video's own begin at zero and need not be in the clock of the IMU";
+                    let warning = Warning::degraded("frame-clock", message).at(file.display());
+                    draft.warnings.push(warning.hint("--timestamps FILE gives the time of every frame"));
+                }
+            }
+            draft.image_list = file.clone();
+        }
+        Pictures::Folder(folder) => read_folder(&mut draft, folder, frame_log.as_deref(), options)?,
+    }
+    read_imu(&mut draft, &log.tables, options, "a phone's logger")?;
+    phone::assume_mount(&mut draft, quarter_turns);
+    if let Some(list) = &frame_log {
+        read_focal_length(&mut draft, list, &log.folder)?;
+    }
+    image_folder::read_intrinsics(&mut draft, path)?;
+    Ok(draft)
+}
+
+/// Frames in a folder: times of the log where it has one for each, else those in their names.
+fn read_folder(
+    draft: &mut Draft,
+    folder: &Path,
+    log: Option<&Path>,
+    options: &OpenOptions,
+) -> Result<(), DatasetError> {
+    let names = images_in(folder)?;
+    draft.image_list = folder.to_path_buf();
+    if let Some(list) = log {
+        let times = frame_times(draft, list, options)?;
+        if times.len() == names.len() {
+            let timed = times.into_iter().zip(&names).map(|(t, n)| (t, folder.join(n))).collect();
+            draft.images = files(timed);
+            return Ok(());
+        }
+        let message = format!("{} times for {} images; the names of the images are used", times.len(), names.len());
+        draft.warnings.push(Warning::degraded("frame-times", message).at(list.display()));
+    }
+    let by_name = image_folder::images_by_name(draft, folder, &names, options);
+    draft.images = files(by_name);
+    Ok(())
+}
+
+/// The log of frame times: a text file whose name says so and that is none of the IMU's tables.
+fn frame_times_file(folder: &Path, path: &Path, tables: &[PathBuf]) -> Option<PathBuf> {
+    let is_text = |n: &str| n.ends_with(".csv") || n.ends_with(".txt");
+    for words in [["frame_timestamp", "frametime"], ["timestamp", "times."], ["metadata", "frames."]] {
+        for place in [folder, path] {
+            let named = |n: &String| {
+                let lower = n.to_ascii_lowercase();
+                is_text(&lower) && words.iter().any(|w| lower.contains(w))
+            };
+            let mut found = names_in(place).ok()?.into_iter().filter(named).map(|n| place.join(n));
+            if let Some(file) = found.find(|f| !tables.contains(f)) {
+                return Some(file);
+            }
+        }
+    }
+    None
+}
+
+/// The first column of the log; its unit is that of the header where it has one.
+fn frame_times(draft: &mut Draft, list: &Path, options: &OpenOptions) -> Result<Vec<Timestamp>, DatasetError> {
+    let bytes = draft.read(list)?;
+    let source = Source { path: list, bytes: &bytes };
+    let rule = options.time_unit.map_or(UnitRule::Guess, UnitRule::Given);
+    let (times, notes) = parse::first_column_times(&source, rule)?;
+    draft.warnings.extend(notes);
+    Ok(times)
+}
+
+/// MARS Logger states the focal length of every frame, pixels of the recorded video; their median is used.
+fn read_focal_length(draft: &mut Draft, list: &Path, folder: &Path) -> Result<(), DatasetError> {
+    let metadata = folder.join("movie_metadata.csv");
+    if !metadata.is_file() {
+        return Ok(());
+    }
+    let bytes = if metadata == list { crate::source::read_text_file(&metadata)? } else { draft.read(&metadata)? };
+    let source = Source { path: &metadata, bytes: &bytes };
+    let Some([fx, fy]) = parse::focal_lengths(&source)? else { return Ok(()) };
+    let Some((_, first)) = draft.images.first() else { return Ok(()) };
+    let (width, height) = draft.media.size(first)?;
+    let (cx, cy) = (0.5 * width as f64 - 0.5, 0.5 * height as f64 - 0.5);
+    match Pinhole::new(fx, fy, cx, cy, width, height) {
+        Ok(pinhole) => {
+            let message = format!(
+                "focal length {fx:.1}, {fy:.1} px by the logger, which the phone's driver states; centre and distortion are not known"
+            );
+            let warning = Warning::new("intrinsics-driver", message).at(metadata.display());
+            draft.warnings.push(warning.hint("--calibration FILE, or `vidar calibrate`"));
+            draft.cameras[0].model = Some(CameraModel::Pinhole(pinhole));
+            draft.cameras[0].source = CalibrationSource::File(metadata);
+        }
+        Err(e) => {
+            let message = format!("the logger's focal length is not used: {e}");
+            draft.warnings.push(Warning::new("intrinsics-driver", message).at(metadata.display()));
+        }
+    }
+    Ok(())
+}
