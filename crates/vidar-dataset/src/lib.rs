@@ -15,11 +15,14 @@ mod folder;
 mod image_folder;
 mod imu_log;
 mod inertial;
+mod kitti;
+mod kitti_raw;
 mod location;
 mod options;
 pub mod parse;
 mod phone;
 mod posed_folder;
+mod rendered;
 mod rig_checks;
 mod seven_scenes;
 mod source;
@@ -122,7 +125,16 @@ fn try_kind(
         DatasetKind::ImuLog => {
             imu_log::detect(path).map_or(Ok(None), |log| single(imu_log::open(path, log, options)))
         }
-        DatasetKind::KittiRaw | DatasetKind::KittiOdometry | DatasetKind::Replica | DatasetKind::IclNuim => Ok(None),
+        DatasetKind::KittiRaw => {
+            kitti_raw::detect(path).map(|reason| kitti_raw::open(path, reason, options)).transpose()
+        }
+        DatasetKind::KittiOdometry => {
+            kitti::detect(path).map(|reason| kitti::open(path, reason, options)).transpose()
+        }
+        DatasetKind::Replica => rendered::detect_replica(path)
+            .map_or(Ok(None), |reason| single(rendered::open_replica(path, reason, options))),
+        DatasetKind::IclNuim => rendered::detect_icl(path)
+            .map_or(Ok(None), |reason| single(rendered::open_icl(path, reason, options))),
         DatasetKind::ImageFolder => image_folder::detect(path)
             .map_or(Ok(None), |(folder, reason)| single(image_folder::open(path, &folder, reason, options))),
     }

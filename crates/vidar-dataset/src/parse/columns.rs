@@ -160,7 +160,7 @@ fn places(
 ) -> Places<6> {
     let both = [gyro, accel].map(|axes| axes.map_or([None; 3], |a| a.map(Some)));
     let [[gx, gy, gz], [ax, ay, az]] = both;
-    Places { time, numbers: [gx, gy, gz, ax, ay, az], sensor }
+    Places { time, numbers: [gx, gy, gz, ax, ay, az], sensor, is_sparse: true }
 }
 
 /// The columns of a table without header, by its first rows: the time is the first column that never goes backward, else the last;

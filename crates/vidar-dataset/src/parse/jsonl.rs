@@ -188,14 +188,48 @@ impl Pose {
 
 /// Reads the cameras of a `calibration.json`.
 pub fn json_calibration(source: &Source<'_>) -> Result<Vec<JsonCamera>, DatasetError> {
+    let calibration: Calibration = from_json(source, "an object with a list \"cameras\"")?;
+    Ok(calibration.cameras)
+}
+
+/// The camera of Replica's rendering.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct ReplicaCamera {
+    /// `[fx, fy, cx, cy]`, pixels.
+    pub intrinsics: [f64; 4],
+    /// Raw units of depth per metre.
+    pub units_per_metre: f64,
+}
+
+/// Reads `cam_params.json`: `{"camera": {"w", "h", "fx", "fy", "cx", "cy", "scale"}}`.
+pub fn replica_camera(source: &Source<'_>) -> Result<ReplicaCamera, DatasetError> {
+    #[derive(Deserialize)]
+    struct File {
+        camera: Parameters,
+    }
+    #[derive(Deserialize)]
+    struct Parameters {
+        fx: f64,
+        fy: f64,
+        cx: f64,
+        cy: f64,
+        scale: f64,
+    }
+    let File { camera } = from_json(source, "an object \"camera\" with fx, fy, cx, cy, scale")?;
+    if !(camera.scale.is_finite() && camera.scale > 0.0) {
+        return Err(source.malformed(0, format!("scale: {}", camera.scale), "a positive number"));
+    }
+    let intrinsics = [camera.fx, camera.fy, camera.cx, camera.cy];
+    Ok(ReplicaCamera { intrinsics, units_per_metre: camera.scale })
+}
+
+fn from_json<'a, T: Deserialize<'a>>(source: &Source<'a>, expected: &str) -> Result<T, DatasetError> {
     if source.bytes.len() > MAX_JSON_BYTES {
         let found = format!("{} bytes", source.bytes.len());
         return Err(source.malformed(0, found, format!("at most {MAX_JSON_BYTES} bytes of JSON")));
     }
     let text = source.text(&mut Vec::<Warning>::new())?;
-    let calibration: Calibration = serde_json::from_str(text)
-        .map_err(|e| source.malformed(e.line(), e.to_string(), "an object with a list \"cameras\""))?;
-    Ok(calibration.cameras)
+    serde_json::from_str(text).map_err(|e| source.malformed(e.line(), e.to_string(), expected))
 }
 
 impl JsonCamera {

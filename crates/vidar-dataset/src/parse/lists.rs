@@ -135,6 +135,44 @@ pub fn first_column_times(
     Ok((times.collect::<Result<_, _>>()?, notes))
 }
 
+/// A pair of images of ICL-NUIM's `associations.txt`.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Association {
+    /// Number of the depth image.
+    pub depth_frame: u64,
+    /// Its file, inside the dataset.
+    pub depth: String,
+    /// Number of the colour image.
+    pub color_frame: u64,
+    /// Its file, inside the dataset.
+    pub color: String,
+}
+
+/// Reads `n depth/n.png n rgb/n.png` rows; which is which is told by the folders' names.
+pub fn associations(source: &Source<'_>) -> Result<Vec<Association>, DatasetError> {
+    let lines = images_at_most(source, source.lines(&mut Vec::new())?)?;
+    let mut pairs = Vec::with_capacity(lines.rows.len());
+    for row in &lines.rows {
+        let fields: Vec<&str> = row.fields().take(5).collect();
+        let expected = "number, depth image, number, colour image";
+        let &[first, one, second, other] = fields.as_slice() else {
+            return Err(source.malformed(row.line, quoted(row.text), expected));
+        };
+        let number = |text: &str| {
+            text.parse::<u64>().map_err(|_| source.malformed(row.line, quoted(text), "the number of a frame"))
+        };
+        check_stays_inside(source, row, one)?;
+        check_stays_inside(source, row, other)?;
+        let (one, other) = ((number(first)?, one.to_string()), (number(second)?, other.to_string()));
+        let ((depth_frame, depth), (color_frame, color)) = match other.1.contains("depth") {
+            true => (other, one),
+            false => (one, other),
+        };
+        pairs.push(Association { depth_frame, depth, color_frame, color });
+    }
+    Ok(pairs)
+}
+
 /// Medians of the columns `fx[px]` and `fy[px]` of a table of frames (MARS Logger's `movie_metadata.csv`); `None` without them.
 pub fn focal_lengths(source: &Source<'_>) -> Result<Option<[f64; 2]>, DatasetError> {
     let text = source.text(&mut Vec::new())?;
@@ -170,22 +208,19 @@ pub(crate) struct Places<const N: usize> {
     pub numbers: [Option<usize>; N],
     /// A column that tells whose the row is: rows that are not the gyroscope's hold the second half of the numbers.
     pub sensor: Option<usize>,
+    /// Whether rows may hold one half of the numbers: two sensors in one table, row by row.
+    pub is_sparse: bool,
 }
 
 impl<const N: usize> Places<N> {
     /// The time, then the numbers, and nothing is missing.
     fn in_order() -> Self {
-        Self { time: 0, numbers: std::array::from_fn(|i| Some(i + 1)), sensor: None }
-    }
-
-    /// Whether rows may hold a part of the numbers: two sensors in one table, row by row.
-    fn is_sparse(&self) -> bool {
-        *self != Self::in_order()
+        Self { time: 0, numbers: std::array::from_fn(|i| Some(i + 1)), sensor: None, is_sparse: false }
     }
 }
 
 /// Rows of a time and `N` numbers, taken block by block. Rows with a number that is not finite are skipped and counted; in a
-/// table of two sensors those without any.
+/// table of two sensors those without a whole triple.
 struct TimedNumbers<const N: usize> {
     rule: UnitRule,
     places: Places<N>,
@@ -222,8 +257,9 @@ impl<const N: usize> TimedNumbers<N> {
                 return Err(source.too_many_rows(row.line, MAX_ROWS));
             }
             let (time, numbers) = self.row(source, row, unit)?;
-            let finite = numbers.iter().filter(|v| v.is_finite()).count();
-            if finite == N || self.places.is_sparse() && finite > 0 {
+            let mut halves = numbers.chunks(N.div_ceil(2)).map(|half| half.iter().all(|v| v.is_finite()));
+            let is_kept = if self.places.is_sparse { halves.any(|h| h) } else { halves.all(|h| h) };
+            if is_kept {
                 self.rows.push((time, numbers));
             } else {
                 self.not_finite.get_or_insert((0, row.line)).0 += 1;
@@ -243,7 +279,7 @@ impl<const N: usize> TimedNumbers<N> {
         for (number, place) in numbers.iter_mut().zip(self.places.numbers) {
             let Some(place) = place else { continue };
             let field = fields.get(place).copied().unwrap_or("");
-            if field.is_empty() && self.places.is_sparse() {
+            if field.is_empty() && self.places.is_sparse {
                 continue;
             }
             if place >= count {

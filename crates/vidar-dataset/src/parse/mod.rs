@@ -3,6 +3,7 @@
 
 pub(crate) mod columns;
 mod jsonl;
+pub(crate) mod kitti;
 mod lists;
 mod matrices;
 mod poses;
@@ -11,10 +12,13 @@ pub(crate) mod yaml;
 
 pub use crate::source::Source;
 pub use columns::imu_columns;
-pub use jsonl::{JsonCamera, JsonPose, JsonRecording, json_calibration};
+pub use jsonl::{JsonCamera, JsonPose, JsonRecording, ReplicaCamera, json_calibration, replica_camera};
+pub use kitti::{
+    Oxts, ProjectionMatrix, named_numbers, oxts, projection_matrices, rotation_and_translation, times_of_day,
+};
 pub(crate) use lists::{TimedRow, imu_file, imu_table, is_image_name};
 pub use lists::{
-    ListedFile, ListedTime, NumberedPose, accelerometer_list, file_list, first_column_times, focal_lengths, imu_csv,
+    Association, ListedFile, ListedTime, NumberedPose, accelerometer_list, associations, file_list, first_column_times, focal_lengths, imu_csv,
     numbered_poses, time_list,
 };
 pub use matrices::{intrinsics_matrix, matrix_poses, single_pose};
