@@ -1,4 +1,4 @@
-//! Records and calibrations of phones' recorders, KITTI's text files, associations, and headers of tables.
+//! EXIF, records and calibrations of phones' recorders, KITTI's text files, associations, and headers of tables.
 #![no_main]
 
 use libfuzzer_sys::fuzz_target;
@@ -36,6 +36,7 @@ fuzz_target!(|bytes: &[u8]| {
                 assert!(record.world_from_unit(49.0).is_none_or(|m| m.is_finite()));
             }
         }
+        11 => drop(parse::photo_exif(bytes)),
         _ => drop(parse::imu_columns(&String::from_utf8_lossy(bytes), "gyro.csv")),
     }
 });

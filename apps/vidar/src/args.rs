@@ -139,7 +139,8 @@ const RUN_EXAMPLES: &str = "Examples:
 /// How the input is read.
 #[derive(Args, Clone, Debug, Default)]
 pub struct InputArgs {
-    /// Layout of the recording, instead of detecting it: euroc, tum-rgbd, 7scenes, posed-folder, bag, video, images.
+    /// Layout of the recording, instead of detecting it: euroc, tum-rgbd, 7scenes, kitti-raw, kitti, replica, icl-nuim,
+    /// posed-folder, bag, stray-scanner, spectacular-ai, imu-log, video, images.
     #[arg(long, help_heading = "Input")]
     pub format: Option<String>,
     /// Number of the camera (`cam0` is 0).
@@ -500,6 +501,11 @@ pub enum BenchDataset {
     Euroc,
     /// TUM RGB-D: rgbd_dataset_*/.
     Tum,
+    /// TUM-VI: dataset-*_512_16/ with mav0/.
+    TumVi,
+    /// 7-Scenes: a folder per scene with seq-01/ ….
+    #[value(name = "7scenes")]
+    SevenScenes,
 }
 
 /// `vidar config`.

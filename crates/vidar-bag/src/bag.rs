@@ -49,6 +49,7 @@ pub struct Bag {
     parts: Vec<Part>,
     topics: Vec<Topic>,
     warnings: Vec<Warning>,
+    metadata: BTreeMap<String, BTreeMap<String, String>>,
     messages_are_compressed: bool,
     cache: Mutex<Cache>,
 }
@@ -113,6 +114,7 @@ impl Bag {
             parts: Vec::new(),
             topics: Vec::new(),
             warnings: Vec::new(),
+            metadata: BTreeMap::new(),
             messages_are_compressed,
             cache: Mutex::default(),
         };

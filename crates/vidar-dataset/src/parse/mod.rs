@@ -6,6 +6,7 @@ mod jsonl;
 pub(crate) mod kitti;
 mod lists;
 mod matrices;
+mod photo;
 mod poses;
 pub(crate) mod units;
 pub(crate) mod yaml;
@@ -22,6 +23,7 @@ pub use lists::{
     numbered_poses, time_list,
 };
 pub use matrices::{intrinsics_matrix, matrix_poses, single_pose};
+pub use photo::{PhotoExif, photo_exif};
 pub(crate) use poses::is_ambiguous_csv;
 pub use poses::{PoseFile, RawPose, euroc_poses, guess_trajectory_format, kitti_poses, tum_poses};
 pub use units::UnitRule;
