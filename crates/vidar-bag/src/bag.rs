@@ -163,6 +163,7 @@ impl Bag {
             }));
         }
         self.warnings.extend(index.warnings);
+        self.metadata.extend(index.metadata);
         self.parts.push(Part { chunks: index.chunks, container });
     }
 
@@ -189,6 +190,11 @@ impl Bag {
     /// What was found wrong while listing its messages.
     pub fn warnings(&self) -> &[Warning] {
         &self.warnings
+    }
+
+    /// The texts that its writer left about it under a name (MCAP's metadata).
+    pub fn metadata(&self, name: &str) -> Option<&BTreeMap<String, String>> {
+        self.metadata.get(name)
     }
 
     /// The topic of a message.

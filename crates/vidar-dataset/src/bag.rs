@@ -1,5 +1,6 @@
 //! ROS 1 bags, ROS 2 bags and MCAP files: one camera, its calibration, IMU, depth and poses.
 
+use crate::convert::facts::{self, Facts};
 use crate::dataset::CalibrationSource;
 use crate::draft::{Draft, DraftCamera, DraftDepth};
 use crate::error::DatasetError;
@@ -34,7 +35,14 @@ pub(crate) fn detect(path: &Path) -> Option<String> {
 /// Reads the recording's index, calibration, IMU and poses; images stay in it.
 pub(crate) fn open(path: &Path, reason: String, options: &OpenOptions) -> Result<Draft, DatasetError> {
     let bag = Arc::new(Bag::open(path)?);
-    let choice = topics::choose(&bag, options)?;
+    let mut choice = topics::choose(&bag, options)?;
+    // What VIDAR's own conversions leave beside the messages.
+    let facts = bag.metadata(facts::NAME).map(Facts::from_map).unwrap_or_default();
+    let named = [(&facts.truth_topic, PoseUse::GroundTruth), (&facts.trajectory_topic, PoseUse::Trajectory)];
+    if choice.poses.is_empty() {
+        let topic = |name: &String| bag.topics().iter().find(|t| t.name == *name && !t.messages.is_empty());
+        choice.poses = named.into_iter().filter_map(|(name, used)| Some((used, topic(name.as_ref()?)?))).collect();
+    }
     let mut draft = Draft::new(DatasetKind::Bag, path, format!("{reason}; images of {}", choice.image.name));
     draft.warnings.extend(bag.warnings().iter().cloned());
     draft.warnings.extend(choice.warnings.iter().cloned());
@@ -50,14 +58,18 @@ pub(crate) fn open(path: &Path, reason: String, options: &OpenOptions) -> Result
     let camera_frame = first.map(|m| bag.header(m)).transpose()?.unwrap_or_default().frame;
     draft.cameras = vec![DraftCamera::unknown(choice.camera)];
     draft.images = locate(&bag, choice.image, |m| clock.stamp(m))?;
-    let imu_frame = read_imu(&mut draft, &mut clock, choice.imu)?;
+    let imu_frame = read_imu(&mut draft, &mut clock, choice.imu, facts.imu_noise)?;
     let frames = read_frames(&mut draft, &bag);
     read_calibration(&mut draft, &bag, &choice, &camera_frame)?;
+    use_facts(&mut draft, &facts);
     if let Some(imu_frame) = &imu_frame {
         read_extrinsics(&mut draft, &frames, imu_frame, &camera_frame);
     }
     if let Some(depth) = choice.depth {
         read_depth(&mut draft, &bag, depth, &clock, &frames, imu_frame.as_deref().unwrap_or(&camera_frame))?;
+        if let Some(stated) = draft.depth.as_mut() {
+            stated.units_per_metre = facts.depth_units_per_metre;
+        }
     }
     for (used, topic) in &choice.poses {
         let known = Known { frames: &frames, imu: imu_frame.as_deref(), camera: &camera_frame };
@@ -98,6 +110,7 @@ fn read_imu(
     draft: &mut Draft,
     clock: &mut Clock<'_>,
     topic: Option<&Topic>,
+    noise: Option<ImuNoise>,
 ) -> Result<Option<String>, DatasetError> {
     let Some(topic) = topic else { return Ok(None) };
     let (mut frame, mut unread) = (String::new(), None);
@@ -125,8 +138,11 @@ fn read_imu(
         let message = format!("{} IMU samples are not finite; skipped", before - draft.imu.len());
         draft.warnings.push(Warning::new("sample-not-finite", message).at(&place));
     }
-    let rate_hz = topic.rate_hz().unwrap_or(ImuNoise::EUROC.rate_hz);
-    draft.assume_imu_noise("a bag", rate_hz, &place);
+    draft.imu_noise = noise;
+    if noise.is_none() {
+        let rate_hz = topic.rate_hz().unwrap_or(ImuNoise::EUROC.rate_hz);
+        draft.assume_imu_noise("a bag", rate_hz, &place);
+    }
     Ok(Some(frame))
 }
 
@@ -192,6 +208,18 @@ fn read_calibration(
         camera.body_from_camera = Se3::new(rotation.inverse(), Vector3::zeros());
     }
     Ok(())
+}
+
+/// Completes the camera with what `CameraInfo` has no fields for.
+fn use_facts(draft: &mut Draft, facts: &Facts) {
+    let camera = &mut draft.cameras[0];
+    if let Some(model) = &facts.model {
+        camera.model = Some(model.clone());
+        camera.source = CalibrationSource::Topic(format!("metadata {}", facts::NAME));
+    }
+    camera.time_offset = facts.time_offset.unwrap_or(camera.time_offset);
+    camera.readout = facts.readout;
+    camera.rate_hz = facts.rate_hz;
 }
 
 /// Whether a topic of calibrations lies beside a topic of images: the same name but for its last part (two for `/compressed`).

@@ -5,6 +5,7 @@ mod bag;
 mod calibration;
 pub mod camera_flag;
 mod checks;
+pub mod convert;
 mod dataset;
 pub mod decode;
 mod draft;
