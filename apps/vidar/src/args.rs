@@ -223,7 +223,7 @@ pub struct OutputArgs {
 /// `vidar run`.
 #[derive(Args, Clone, Debug)]
 pub struct RunArgs {
-    /// The recording: a bag, a video, or a folder (EuRoC, TUM RGB-D, 7-Scenes, posed folder, images).
+    /// The recording: a bag, a video, or a folder (EuRoC, TUM RGB-D, 7-Scenes, KITTI, a phone's, posed folder, images, …).
     #[arg(value_hint = ValueHint::AnyPath)]
     pub path: PathBuf,
     /// How the input is read.

@@ -120,7 +120,8 @@ mod tests {
         let gyro: Vec<_> = [0, 10, 15, 20, 30, 300, 500].map(|ms| at(ms, 0.5)).to_vec();
         let accel = [at(10, 1.0), at(20, 2.0), at(40, 4.0), at(500, 9.0)];
         let merged = merge_imu(&gyro, &accel);
-        let found: Vec<(i64, f64)> = merged.iter().map(|s| (s.time.nanos() / 1_000_000, s.accel.0.x)).collect();
+        let found: Vec<(i64, f64)> =
+            merged.iter().map(|s| (s.time.nanos() / 1_000_000, s.accel.0.x)).collect();
         // Nothing before the first and nothing at 300 ms, in a gap of 460 ms; a sample at its very end is one.
         assert_eq!(found, [(10, 1.0), (15, 1.5), (20, 2.0), (30, 3.0), (500, 9.0)]);
         assert!(merge_imu(&gyro, &accel[..1]).is_empty());

@@ -95,7 +95,9 @@ fn use_exif(draft: &mut Draft, folder: &Path) -> Result<(), DatasetError> {
     }
     let mut timed = Vec::with_capacity(draft.images.len());
     for (_, location) in &draft.images {
-        let Some(time) = location.as_file().map(exif_of).transpose()?.and_then(|e| e.time) else { return Ok(()) };
+        let Some(time) = location.as_file().map(exif_of).transpose()?.and_then(|e| e.time) else {
+            return Ok(());
+        };
         timed.push((time, location.clone()));
     }
     // Seconds without fraction give bursts equal times; numbers of frames are better then.
@@ -104,7 +106,9 @@ fn use_exif(draft: &mut Draft, folder: &Path) -> Result<(), DatasetError> {
         draft.times_are_invented = false;
         draft.warnings.retain(|w| w.kind != "times-synthesised");
         let message = "image times are those of EXIF, by the camera's clock and time zone";
-        draft.warnings.push(Warning::new("times-exif", message).at(folder.display()).hint("--timestamps FILE"));
+        draft
+            .warnings
+            .push(Warning::new("times-exif", message).at(folder.display()).hint("--timestamps FILE"));
     }
     Ok(())
 }

@@ -71,7 +71,8 @@ fn imu_tables(path: &Path) -> Option<(PathBuf, Vec<ImuFile>)> {
     if let Some(found) = tables_of(path) {
         return Some((path.to_path_buf(), found));
     }
-    let inner = names_in(path).ok()?.into_iter().map(|n| path.join(n)).filter(|p| p.is_dir()).take(MAX_FOLDERS);
+    let inner =
+        names_in(path).ok()?.into_iter().map(|n| path.join(n)).filter(|p| p.is_dir()).take(MAX_FOLDERS);
     let mut found = inner.filter_map(|folder| Some((tables_of(&folder)?, folder)));
     match (found.next(), found.next()) {
         (Some((tables, folder)), None) => Some((folder, tables)),
@@ -113,33 +114,28 @@ fn tables_of(folder: &Path) -> Option<Vec<ImuFile>> {
 pub(crate) fn open(path: &Path, log: Log, options: &OpenOptions) -> Result<Draft, DatasetError> {
     let mut draft = Draft::new(DatasetKind::ImuLog, path, log.reason.clone());
     let tables: Vec<PathBuf> = log.tables.iter().map(|t| t.path.clone()).collect();
-    let frame_log = options.timestamps.clone().or_else(|| frame_times_file(&log.folder, path, &tables));
+    let logged = logged_times(&mut draft, &log.folder, &tables, options)?;
     let mut quarter_turns = 0;
     match &log.pictures {
         Pictures::Video(file) => {
             let video = Video::open(file)?;
             quarter_turns = video.quarter_turns();
-            match &frame_log {
-                Some(list) => {
-                    let times = frame_times(&mut draft, list, options)?;
-                    take_frames(&mut draft, file, video, Some((&times, list)));
-                }
+            match &logged {
+                Some((times, list)) => take_frames(&mut draft, file, video, Some((times, list))),
                 None => {
                     take_frames(&mut draft, file, video, None);
-                    let message = "no log of frame times: the video's own begin at zero and need not be in the clock of the IMU";
+                    let message = "no log of frame times is known: the video's own begin at zero and need not be in the clock of the IMU";
                     let warning = Warning::degraded("frame-clock", message).at(file.display());
                     draft.warnings.push(warning.hint("--timestamps FILE gives the time of every frame"));
                 }
             }
             draft.image_list = file.clone();
         }
-        Pictures::Folder(folder) => read_folder(&mut draft, folder, frame_log.as_deref(), options)?,
+        Pictures::Folder(folder) => read_folder(&mut draft, folder, logged.as_ref(), options)?,
     }
     read_imu(&mut draft, &log.tables, options, "a phone's logger")?;
     phone::assume_mount(&mut draft, quarter_turns);
-    if let Some(list) = &frame_log {
-        read_focal_length(&mut draft, list, &log.folder)?;
-    }
+    read_focal_length(&mut draft, &log.folder)?;
     image_folder::read_intrinsics(&mut draft, path)?;
     Ok(draft)
 }
@@ -148,19 +144,19 @@ pub(crate) fn open(path: &Path, log: Log, options: &OpenOptions) -> Result<Draft
 fn read_folder(
     draft: &mut Draft,
     folder: &Path,
-    log: Option<&Path>,
+    logged: Option<&(Vec<Timestamp>, PathBuf)>,
     options: &OpenOptions,
 ) -> Result<(), DatasetError> {
     let names = images_in(folder)?;
     draft.image_list = folder.to_path_buf();
-    if let Some(list) = log {
-        let times = frame_times(draft, list, options)?;
+    if let Some((times, list)) = logged {
         if times.len() == names.len() {
-            let timed = times.into_iter().zip(&names).map(|(t, n)| (t, folder.join(n))).collect();
+            let timed = times.iter().copied().zip(&names).map(|(t, n)| (t, folder.join(n))).collect();
             draft.images = files(timed);
             return Ok(());
         }
-        let message = format!("{} times for {} images; the names of the images are used", times.len(), names.len());
+        let message =
+            format!("{} times for {} images; the names of the images are used", times.len(), names.len());
         draft.warnings.push(Warning::degraded("frame-times", message).at(list.display()));
     }
     let by_name = image_folder::images_by_name(draft, folder, &names, options);
@@ -168,10 +164,32 @@ fn read_folder(
     Ok(())
 }
 
+/// The times of the frames and their file: the user's, else the log that lies beside the tables.
+fn logged_times(
+    draft: &mut Draft,
+    folder: &Path,
+    tables: &[PathBuf],
+    options: &OpenOptions,
+) -> Result<Option<(Vec<Timestamp>, PathBuf)>, DatasetError> {
+    if let Some(list) = &options.timestamps {
+        return frame_times(draft, list, options).map(|times| Some((times, list.clone())));
+    }
+    let Some(list) = frame_times_file(folder, &draft.root, tables) else { return Ok(None) };
+    match frame_times(draft, &list, options) {
+        Ok(times) => Ok(Some((times, list))),
+        // A file that only looks like a log of times is none.
+        Err(e) => {
+            let message = format!("it looks like the times of the frames and is not used: {e}");
+            draft.warnings.push(Warning::degraded("frame-times", message).at(list.display()));
+            Ok(None)
+        }
+    }
+}
+
 /// The log of frame times: a text file whose name says so and that is none of the IMU's tables.
 fn frame_times_file(folder: &Path, path: &Path, tables: &[PathBuf]) -> Option<PathBuf> {
     let is_text = |n: &str| n.ends_with(".csv") || n.ends_with(".txt");
-    for words in [["frame_timestamp", "frametime"], ["timestamp", "times."], ["metadata", "frames."]] {
+    for words in [["frame_timestamp", "frametime"], ["timestamp", "times."], ["movie_metadata", "frames."]] {
         for place in [folder, path] {
             let named = |n: &String| {
                 let lower = n.to_ascii_lowercase();
@@ -187,7 +205,11 @@ fn frame_times_file(folder: &Path, path: &Path, tables: &[PathBuf]) -> Option<Pa
 }
 
 /// The first column of the log; its unit is that of the header where it has one.
-fn frame_times(draft: &mut Draft, list: &Path, options: &OpenOptions) -> Result<Vec<Timestamp>, DatasetError> {
+fn frame_times(
+    draft: &mut Draft,
+    list: &Path,
+    options: &OpenOptions,
+) -> Result<Vec<Timestamp>, DatasetError> {
     let bytes = draft.read(list)?;
     let source = Source { path: list, bytes: &bytes };
     let rule = options.time_unit.map_or(UnitRule::Guess, UnitRule::Given);
@@ -197,12 +219,14 @@ fn frame_times(draft: &mut Draft, list: &Path, options: &OpenOptions) -> Result<
 }
 
 /// MARS Logger states the focal length of every frame, pixels of the recorded video; their median is used.
-fn read_focal_length(draft: &mut Draft, list: &Path, folder: &Path) -> Result<(), DatasetError> {
+fn read_focal_length(draft: &mut Draft, folder: &Path) -> Result<(), DatasetError> {
     let metadata = folder.join("movie_metadata.csv");
     if !metadata.is_file() {
         return Ok(());
     }
-    let bytes = if metadata == list { crate::source::read_text_file(&metadata)? } else { draft.read(&metadata)? };
+    // It may be the log of times, too, which is then listed already.
+    draft.text_files.retain(|file| *file != metadata);
+    let bytes = draft.read(&metadata)?;
     let source = Source { path: &metadata, bytes: &bytes };
     let Some([fx, fy]) = parse::focal_lengths(&source)? else { return Ok(()) };
     let Some((_, first)) = draft.images.first() else { return Ok(()) };

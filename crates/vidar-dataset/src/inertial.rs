@@ -9,7 +9,9 @@ use crate::parse::{self, Source, TimedRow, UnitRule};
 use nalgebra::Vector3;
 use std::io::Read;
 use std::path::{Path, PathBuf};
-use vidar_core::{AngularRate, Duration, ImuSample, SpecificForce, TimedVector, Timestamp, Warning, merge_imu};
+use vidar_core::{
+    AngularRate, Duration, ImuSample, SpecificForce, TimedVector, Timestamp, Warning, merge_imu,
+};
 
 /// Standard gravity, m/s².
 const GRAVITY_MPS2: f64 = 9.80665;
@@ -62,7 +64,8 @@ pub(crate) fn read_imu(
         paired &= rows.iter().all(|(_, n)| n.iter().all(|v| v.is_finite()));
         let to_radians = if file.columns.is_in_degrees { std::f64::consts::PI / 180.0 } else { 1.0 };
         let take = |out: &mut Vec<TimedVector>, from: usize, scale: f64| {
-            let vector = |(time, n): &TimedRow<6>| (*time, Vector3::new(n[from], n[from + 1], n[from + 2]) * scale);
+            let vector =
+                |(time, n): &TimedRow<6>| (*time, Vector3::new(n[from], n[from + 1], n[from + 2]) * scale);
             out.extend(rows.iter().map(vector).filter(|(_, v)| v.iter().all(|c| c.is_finite())));
         };
         take(&mut gyro, 0, to_radians);
@@ -161,7 +164,9 @@ pub(crate) fn to_specific_force(
     }
     if !is_g {
         if stated == Some(AccelUnit::Gravities) {
-            let message = format!("the header says g, but the accelerometer's length at rest is {norm:.2}; m/s² is used");
+            let message = format!(
+                "the header says g, but the accelerometer's length at rest is {norm:.2}; m/s² is used"
+            );
             notes.push(Warning::new("accel-unit", message).at(place.display()));
         }
         return true;
@@ -170,8 +175,10 @@ pub(crate) fn to_specific_force(
         Some(AccelUnit::Gravities) => (GRAVITY_MPS2, "their sign is kept"),
         _ => (-GRAVITY_MPS2, "their sign is turned, as Core Motion (iOS) writes them"),
     };
-    let header = if stated == Some(AccelUnit::MetresPerSecondSquared) { "; the header says m/s²" } else { "" };
-    let message = format!("the accelerometer's length at rest is {norm:.3}, so its values are in g; {sign}{header}");
+    let header =
+        if stated == Some(AccelUnit::MetresPerSecondSquared) { "; the header says m/s²" } else { "" };
+    let message =
+        format!("the accelerometer's length at rest is {norm:.3}, so its values are in g; {sign}{header}");
     notes.push(Warning::new("accel-unit", message).at(place.display()));
     accel.iter_mut().for_each(|s| s.1 *= factor);
     true

@@ -72,7 +72,11 @@ pub(crate) fn chosen(draft: &Draft, wanted: u32, file: &Path) -> Result<usize, D
 
 /// A rectified camera from its projection; its body is camera 0's rectified frame.
 pub(crate) fn camera_of(number: u32, p: &ProjectionMatrix, file: &Path) -> Result<DraftCamera, DatasetError> {
-    let bad = |source| DatasetError::BadCamera { path: file.to_path_buf(), key: format!("camera {number}"), source };
+    let bad = |source| DatasetError::BadCamera {
+        path: file.to_path_buf(),
+        key: format!("camera {number}"),
+        source,
+    };
     let pinhole = Pinhole::new(p.fx(), p.fy(), p.cx(), p.cy(), 1, 1).map_err(bad)?;
     let camera_from_first = Se3::from_translation(p.translation());
     Ok(DraftCamera {

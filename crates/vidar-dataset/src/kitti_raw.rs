@@ -99,7 +99,10 @@ fn numbered(
 /// A calibration of the day: in the folder above the recording, or beside its images.
 fn calibration(path: &Path, name: &str) -> Option<PathBuf> {
     let absolute = path.canonicalize().unwrap_or_else(|_| path.to_path_buf());
-    [Some(path.join(name)), absolute.parent().map(|p| p.join(name))].into_iter().flatten().find(|p| p.is_file())
+    [Some(path.join(name)), absolute.parent().map(|p| p.join(name))]
+        .into_iter()
+        .flatten()
+        .find(|p| p.is_file())
 }
 
 fn read_cameras(draft: &mut Draft, wanted: u32, file: &Path) -> Result<(), DatasetError> {
@@ -113,7 +116,8 @@ fn read_cameras(draft: &mut Draft, wanted: u32, file: &Path) -> Result<(), Datas
     };
     let Some((_, first)) = draft.images.first() else { return Ok(()) };
     let size = draft.media.size(first)?;
-    let is_raw = size_of(format!("S_{wanted:02}")) == Some(size) && size_of(format!("S_rect_{wanted:02}")) != Some(size);
+    let is_raw = size_of(format!("S_{wanted:02}")) == Some(size)
+        && size_of(format!("S_rect_{wanted:02}")) != Some(size);
     draft.cameras.clear();
     if is_raw {
         draft.cameras.push(raw_camera(&source, wanted, &find)?);
@@ -128,7 +132,8 @@ fn read_cameras(draft: &mut Draft, wanted: u32, file: &Path) -> Result<(), Datas
     let root = draft.root.clone();
     let mounts = calibration(&root, "calib_velo_to_cam.txt").zip(calibration(&root, "calib_imu_to_velo.txt"));
     let Some((velo_to_cam, imu_to_velo)) = mounts else {
-        let message = "no calib_imu_to_velo.txt and calib_velo_to_cam.txt: the cameras' pose on the IMU is not known";
+        let message =
+            "no calib_imu_to_velo.txt and calib_velo_to_cam.txt: the cameras' pose on the IMU is not known";
         draft.warnings.push(Warning::new("extrinsics-missing", message).at(root.display()));
         return Ok(());
     };
@@ -158,16 +163,25 @@ fn raw_camera<'a>(
 ) -> Result<DraftCamera, DatasetError> {
     let line = |name: &str, count: usize| {
         find(format!("{name}_{number:02}")).filter(|n| n.len() == count).ok_or_else(|| {
-            source.malformed(0, format!("no {name}_{number:02} of {count} numbers"), "KITTI's camera calibration")
+            source.malformed(
+                0,
+                format!("no {name}_{number:02} of {count} numbers"),
+                "KITTI's camera calibration",
+            )
         })
     };
-    let bad = |e| DatasetError::BadCamera { path: source.path.to_path_buf(), key: format!("camera {number}"), source: e };
+    let bad = |e| DatasetError::BadCamera {
+        path: source.path.to_path_buf(),
+        key: format!("camera {number}"),
+        source: e,
+    };
     let (k, d, r, t) = (line("K", 9)?, line("D", 5)?, line("R", 9)?, line("T", 3)?);
     let pinhole = Pinhole::new(k[0], k[4], k[2], k[5], 1, 1).map_err(bad)?;
     let pinhole = Pinhole { width: 0, height: 0, ..pinhole };
     let model = RadTan::with_k3(pinhole, [d[0], d[1], d[2], d[3]], d[4]).map_err(bad)?;
-    let rotation = So3::from_matrix(&Matrix3::from_row_slice(r))
-        .ok_or_else(|| source.malformed(0, format!("R_{number:02} is no rotation"), "an orthonormal 3x3 matrix"))?;
+    let rotation = So3::from_matrix(&Matrix3::from_row_slice(r)).ok_or_else(|| {
+        source.malformed(0, format!("R_{number:02} is no rotation"), "an orthonormal 3x3 matrix")
+    })?;
     let camera_from_first = Se3::new(rotation, Vector3::from_row_slice(t));
     Ok(DraftCamera {
         model: Some(CameraModel::RadTan(model)),

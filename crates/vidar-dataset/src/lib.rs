@@ -2,6 +2,7 @@
 
 mod assemble;
 mod bag;
+mod bag_camera;
 mod calibration;
 pub mod camera_flag;
 mod checks;
@@ -81,10 +82,25 @@ fn open_file(path: &Path, options: &OpenOptions) -> Result<Dataset, DatasetError
         return bag::open(path, reason, options)?.finish(options);
     }
     if vidar_video::is_video(&head) && !wrong_thing::is_picture(&head) {
-        let draft = video::open(path, "its first bytes are those of mp4 and mov".into(), options)?;
+        let mut draft = video::open(path, "its first bytes are those of mp4 and mov".into(), options)?;
+        if path.parent().is_some_and(is_recording_of_phone) {
+            let message = format!(
+                "it is part of a phone's recording, whose sensors are read with the folder {}",
+                path.with_file_name("").display()
+            );
+            draft.warnings.push(vidar_core::Warning::new("folder-beside", message).at(path.display()));
+        }
         return draft.finish(options);
     }
     Err(wrong_thing::describe(path, &head))
+}
+
+/// Whether a folder holds more than the video that was given.
+fn is_recording_of_phone(folder: &Path) -> bool {
+    let folder = if folder.as_os_str().is_empty() { Path::new(".") } else { folder };
+    stray_scanner::detect(folder).is_some()
+        || spectacular::detect(folder).is_some()
+        || imu_log::detect(folder).is_some()
 }
 
 /// Reads `path` as one kind; `None` when the path does not have that layout.
@@ -142,8 +158,9 @@ fn try_kind(
 }
 
 fn unknown(path: &Path, found: String) -> DatasetError {
-    let expected = "mav0/cam0/data.csv (EuRoC), rgb.txt (TUM RGB-D), frame-*.color.* (7-Scenes), \
-                    images/ with poses.txt, a bag (.bag, .mcap, .db3, metadata.yaml), or a folder of PNG or JPEG \
-                    images";
+    let expected = "mav0/cam0/data.csv (EuRoC, TUM-VI), rgb.txt (TUM RGB-D, ETH3D), frame-*.color.* (7-Scenes), \
+                    image_00/data or image_0 with times (KITTI), results/frame* (Replica), associations.txt (ICL-NUIM), \
+                    images/ with poses.txt, a bag (.bag, .mcap, .db3, metadata.yaml), a phone's recording (odometry.csv \
+                    with rgb.mp4, data.jsonl, or a table of an IMU beside a video), or a folder of PNG or JPEG images";
     DatasetError::UnknownLayout { path: path.to_path_buf(), found, expected: expected.to_string() }
 }

@@ -42,7 +42,8 @@ pub(crate) fn check_vertical(draft: &mut Draft, up_in_world: Vector3<f64>) {
         while at + 1 < draft.imu.len() && draft.imu[at].time < pose.time {
             at += 1;
         }
-        let Some(sample) = draft.imu.get(at).filter(|s| (s.time - pose.time).abs().as_secs_f64() < 0.05) else {
+        let Some(sample) = draft.imu.get(at).filter(|s| (s.time - pose.time).abs().as_secs_f64() < 0.05)
+        else {
             continue;
         };
         let in_camera = camera_from_body.rotation.act(&sample.accel.0);
@@ -61,9 +62,12 @@ pub(crate) fn check_vertical(draft: &mut Draft, up_in_world: Vector3<f64>) {
         let message = "the accelerometer points down where the recorder's poses say up; its sign is turned";
         draft.warnings.push(Warning::new("accel-sign", message).at(place));
     } else if cosine < 0.9 {
-        let message = format!("the accelerometer's vertical is {degrees:.0}° off that of the recorder's poses");
+        let message =
+            format!("the accelerometer's vertical is {degrees:.0}° off that of the recorder's poses");
         let warning = Warning::degraded("mount-gravity", message).at(place);
-        draft.warnings.push(warning.hint("the camera may be mounted in another way: `vidar calibrate` finds its rotation"));
+        draft.warnings.push(
+            warning.hint("the camera may be mounted in another way: `vidar calibrate` finds its rotation"),
+        );
     }
 }
 

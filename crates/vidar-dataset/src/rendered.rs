@@ -9,7 +9,9 @@ use crate::parse::{self, Source};
 use crate::seven_scenes::checked_pinhole;
 use crate::trajectory_file::{ReadPoses, read_poses};
 use std::path::{Path, PathBuf};
-use vidar_core::{BodyFrame, CameraId, CameraModel, Pinhole, Se3, StampedPose, Timestamp, Trajectory, Warning};
+use vidar_core::{
+    BodyFrame, CameraId, CameraModel, Pinhole, Se3, StampedPose, Timestamp, Trajectory, Warning,
+};
 
 const CAMERA: BodyFrame = BodyFrame::Camera(CameraId(0));
 
@@ -156,7 +158,10 @@ fn read_icl_truth(draft: &mut Draft, truth: PathBuf) -> Result<(), DatasetError>
     draft.warnings.extend(notes);
     let frame = |time: Timestamp| u64::try_from(time.nanos() / 1_000_000_000).ok();
     let pose = |p: &StampedPose| {
-        Some(StampedPose { time: synthetic_time(frame(p.time)?), world_from_body: mirrored(&p.world_from_body) })
+        Some(StampedPose {
+            time: synthetic_time(frame(p.time)?),
+            world_from_body: mirrored(&p.world_from_body),
+        })
     };
     let poses: Vec<StampedPose> = trajectory.poses().iter().filter_map(pose).collect();
     let trajectory = Trajectory::new(CAMERA, poses)

@@ -19,12 +19,10 @@ use vidar_video::Video;
 /// Looks for the layout at `path`.
 pub(crate) fn detect(path: &Path) -> Option<String> {
     let list = path.join("data.jsonl");
-    // Other programs write JSON lines, too; the first line of these has a time and a known key.
     let head = wrong_thing::head_of(&list).ok()?;
-    let head = String::from_utf8_lossy(&head);
-    let has = |word: &str| head.contains(word);
-    (has("\"time\"") && (has("\"sensor\"") || has("\"frames\"") || has("\"groundTruth\"") || has("\"position\"")))
-        .then(|| "data.jsonl with records of sensors".into())
+    let is_json = head.trim_ascii_start().starts_with(b"{");
+    (is_json && (0..2).any(|camera| pictures_of(path, camera).is_some()))
+        .then(|| "data.jsonl beside its pictures".into())
 }
 
 /// Where the pictures of a camera are: the video `data.*` (`data2.*`), else the folder `frames1` (`frames2`).
@@ -37,7 +35,8 @@ fn pictures_of(path: &Path, camera: u32) -> Option<Pictures> {
     let stem = if camera == 0 { "data".to_string() } else { format!("data{}", camera + 1) };
     let is_video = |name: &&String| {
         let (found, ending) = name.rsplit_once('.').unwrap_or((name, ""));
-        found == stem && ["mp4", "mov", "m4v", "mkv", "avi", "webm"].contains(&ending.to_ascii_lowercase().as_str())
+        found == stem
+            && ["mp4", "mov", "m4v", "mkv", "avi", "webm"].contains(&ending.to_ascii_lowercase().as_str())
     };
     let names = names_in(path).ok()?;
     if let Some(name) = names.iter().find(is_video) {
@@ -63,14 +62,17 @@ pub(crate) fn open(path: &Path, reason: String, options: &OpenOptions) -> Result
     draft.image_list = list.clone();
     if let Some((count, line)) = recording.unread {
         let message = format!("{count} lines are no records; skipped");
-        draft.warnings.push(Warning::degraded("record-unreadable", message).at(format!("{}:{line}", list.display())));
+        draft
+            .warnings
+            .push(Warning::degraded("record-unreadable", message).at(format!("{}:{line}", list.display())));
     }
     draft.cameras = vec![DraftCamera::unknown(number)];
     let quarter_turns = take_pictures(&mut draft, &recording, &pictures, &list)?;
     take_imu(&mut draft, &mut recording, &list);
     take_calibration(&mut draft, &recording, number, quarter_turns)?;
     let place = list.display().to_string();
-    draft.ground_truth = trajectory(&mut draft.warnings, &recording.truth, "groundTruth", &place)?.map(|t| (t, list.clone()));
+    draft.ground_truth =
+        trajectory(&mut draft.warnings, &recording.truth, "groundTruth", &place)?.map(|t| (t, list.clone()));
     if let Some((tracker, poses)) = &recording.tracked
         && let Some(found) = trajectory(&mut draft.warnings, poses, tracker, &place)?
     {
@@ -166,12 +168,13 @@ fn trajectory(
     what: &str,
     place: &str,
 ) -> Result<Option<Trajectory>, DatasetError> {
-    let mut stamped: Vec<StampedPose> = poses
-        .iter()
-        .filter_map(|&(time, pose)| Some(StampedPose { time, world_from_body: pose? }))
-        .collect();
+    let mut stamped: Vec<StampedPose> =
+        poses.iter().filter_map(|&(time, pose)| Some(StampedPose { time, world_from_body: pose? })).collect();
     if stamped.len() < poses.len() {
-        let message = format!("{} poses of {what} are not finite or have no orientation; skipped", poses.len() - stamped.len());
+        let message = format!(
+            "{} poses of {what} are not finite or have no orientation; skipped",
+            poses.len() - stamped.len()
+        );
         notes.push(Warning::new("pose-not-finite", message).at(place));
     }
     if stamped.is_empty() {

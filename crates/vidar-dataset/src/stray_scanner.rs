@@ -1,8 +1,9 @@
-//! Stray Scanner (iPhone and iPad with LiDAR): `rgb.mp4`, `odometry.csv`, `camera_matrix.csv`, `imu.csv`, `depth/`.
+//! Stray Scanner (iPhone and iPad with LiDAR): `rgb.mp4`, `odometry.csv`, `camera_matrix.csv`, `imu.csv`, `depth/`,
+//! `confidence/`.
 //!
 //! After the recorder's documentation and source (strayrobots/scanner, docs/format.md). `odometry.csv` has a row for every frame of the
 //! video: its time in the clock of the IMU, and ARKit's `world_from_camera` in the axes of computer vision; the world's y is up. Depth
-//! is in millimetres, registered to the camera, at a seventh of its size. The documentation says that the accelerometer is in m/s²; the
+//! is in millimetres, registered to the camera, in smaller pixels; where `confidence/` says "low" (0) it is none. The documentation says that the accelerometer is in m/s²; the
 //! recorder writes Core Motion's values, which are in g and of the opposite sign, so gravity decides.
 
 use crate::dataset::CalibrationSource;
@@ -102,7 +103,8 @@ fn take_poses(draft: &mut Draft, rows: &[NumberedPose], list: &Path) -> Result<(
 
 /// Says that the recorder's own poses are used.
 pub(crate) fn recorded_poses(tracker: &str, place: &Path) -> Warning {
-    let message = format!("the recording holds poses of {tracker}; a map uses them instead of VIDAR's own odometry");
+    let message =
+        format!("the recording holds poses of {tracker}; a map uses them instead of VIDAR's own odometry");
     Warning::new("poses-recorded", message).at(place.display()).hint("--set input.poses=odometry tracks anew")
 }
 
@@ -118,10 +120,7 @@ fn read_depth(draft: &mut Draft, rows: &[NumberedPose]) -> Result<(), DatasetErr
             draft.depths.push((*time, folder.join(name).into()));
         }
     }
-    if draft.root.join("confidence").is_dir() {
-        let message = "the confidence of the depth images is not used: values of low confidence count as measured";
-        draft.warnings.push(Warning::new("depth-confidence", message).at(draft.root.display()));
-    }
+    draft.media.depth_confidence = Some(draft.root.join("confidence")).filter(|folder| folder.is_dir());
     draft.depth = Some(DraftDepth {
         distorted: None,
         intrinsics: None,

@@ -56,7 +56,10 @@ pub(crate) fn open(path: &Path, reason: String, options: &OpenOptions) -> Result
         inertial::read_imu(&mut draft, &[table], options, "ETH3D")?;
         let message = "no pose of the camera on the IMU is given; assumed: the same position and axes";
         let warning = Warning::degraded("extrinsics-missing", message).at(imu.display());
-        draft.warnings.push(warning.hint("--calibration camchain.yaml (Kalibr) gives it; `vidar calibrate` finds the rotation"));
+        draft.warnings.push(
+            warning
+                .hint("--calibration camchain.yaml (Kalibr) gives it; `vidar calibrate` finds the rotation"),
+        );
     }
     let list = path.join("accelerometer.txt");
     if list.is_file() {

@@ -1,6 +1,11 @@
 //! A recording that was written in another layout is the same recording.
 
-#![allow(clippy::unwrap_used, clippy::panic, clippy::print_stderr, reason = "tests may stop at the first surprise")]
+#![allow(
+    clippy::unwrap_used,
+    clippy::panic,
+    clippy::print_stderr,
+    reason = "tests may stop at the first surprise"
+)]
 
 mod common;
 
@@ -17,7 +22,10 @@ fn opened(path: &Path) -> Dataset {
 
 fn written(from: &Dataset, to: &Path) -> Dataset {
     let done = convert(from, to, ConvertFormat::of_path(to), &|_, _| true).unwrap_or_else(|e| panic!("{e}"));
-    assert_eq!((done.images, done.imu_samples, done.depths), (from.images.len(), from.imu.len(), from.depths.len()));
+    assert_eq!(
+        (done.images, done.imu_samples, done.depths),
+        (from.images.len(), from.imu.len(), from.depths.len())
+    );
     opened(to)
 }
 
@@ -55,10 +63,17 @@ fn assert_same(a: &Dataset, b: &Dataset) {
 fn rich() -> Folder {
     let f = euroc();
     f.edit("mav0/cam0/sensor.yaml", |s| s + "timeshift_cam_imu: -0.0123456\nreadout_secs: 0.0211\n");
-    f.edit("mav0/imu0/data.csv", |s| s.replacen("0.01,0,-0.01,0.1", "0.010000000000000002,-1e-17,-0.01,0.1", 5));
-    let depth_yaml = CAM0.replace("[16, 12]", "[8, 6]").replace("[10.0, 11.0, 7.5, 5.5]", "[5, 5.5, 3.5, 2.5]");
-    let depth_yaml = depth_yaml.replace("radial-tangential", "none").replace("[-0.1, 0.01, 0.0, 1e-05]", "[]");
-    f.write("mav0/depth0/sensor.yaml", depth_yaml.replace("0.0, 0.1,", "0.0, 0.4,") + "units_per_metre: 500\n");
+    f.edit("mav0/imu0/data.csv", |s| {
+        s.replacen("0.01,0,-0.01,0.1", "0.010000000000000002,-1e-17,-0.01,0.1", 5)
+    });
+    let depth_yaml =
+        CAM0.replace("[16, 12]", "[8, 6]").replace("[10.0, 11.0, 7.5, 5.5]", "[5, 5.5, 3.5, 2.5]");
+    let depth_yaml =
+        depth_yaml.replace("radial-tangential", "none").replace("[-0.1, 0.01, 0.0, 1e-05]", "[]");
+    f.write(
+        "mav0/depth0/sensor.yaml",
+        depth_yaml.replace("0.0, 0.1,", "0.0, 0.4,") + "units_per_metre: 500\n",
+    );
     let mut list = String::from("#timestamp [ns],filename\n");
     for i in 0..10 {
         let t = frame_ns(i);
@@ -83,7 +98,11 @@ fn euroc_to_mcap_to_euroc_is_the_same_recording() {
     let mcap = written(&first, &f.join("out.mcap"));
     assert_eq!(mcap.kind, DatasetKind::Bag);
     assert_same(&first, &mcap);
-    assert!(!kinds(&mcap).contains(&"imu-noise") && !kinds(&mcap).contains(&"extrinsics-missing"), "{:?}", kinds(&mcap));
+    assert!(
+        !kinds(&mcap).contains(&"imu-noise") && !kinds(&mcap).contains(&"extrinsics-missing"),
+        "{:?}",
+        kinds(&mcap)
+    );
     let again = written(&mcap, &f.join("again"));
     assert_eq!(again.kind, DatasetKind::EurocAsl);
     assert_same(&first, &again);
@@ -91,7 +110,10 @@ fn euroc_to_mcap_to_euroc_is_the_same_recording() {
     // EuRoC's own numbers come back: those of the second file are those of the first.
     let imu = |root: &Path| {
         let text = std::fs::read_to_string(root.join("mav0/imu0/data.csv")).unwrap();
-        text.lines().skip(1).map(|l| l.split(',').map(|n| n.parse().unwrap()).collect()).collect::<Vec<Vec<f64>>>()
+        text.lines()
+            .skip(1)
+            .map(|l| l.split(',').map(|n| n.parse().unwrap()).collect())
+            .collect::<Vec<Vec<f64>>>()
     };
     assert_eq!(imu(f.path()), imu(&f.join("again")));
 }
@@ -138,7 +160,8 @@ fn poses_of_the_recording_stay_poses_of_the_recording() {
     let d = f.open_with(&options).unwrap();
     let mcap = written(&d, &f.join("out.mcap"));
     assert_same(&d, &mcap);
-    let (own, read) = (d.external_trajectory.unwrap().trajectory, mcap.external_trajectory.clone().unwrap().trajectory);
+    let (own, read) =
+        (d.external_trajectory.unwrap().trajectory, mcap.external_trajectory.clone().unwrap().trajectory);
     assert_eq!(own, read);
     let folder = written(&mcap, &f.join("folder"));
     assert!(folder.external_trajectory.is_none());

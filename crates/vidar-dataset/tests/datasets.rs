@@ -27,7 +27,11 @@ fn tum_vi_is_calibrated_by_its_camchain() {
     assert_eq!((first.model.name(), first.model.intrinsics().fx), ("pinhole-equidistant", 9.5));
     assert!((first.body_from_camera.inverse().translation - Vector3::new(0.04, -0.07, -0.04)).norm() < 1e-12);
     assert_eq!(d.rig.imu.unwrap().accel_noise_density, 0.0028);
-    assert!(!kinds(&d).contains(&"imu-noise") && !kinds(&d).contains(&"intrinsics-guessed"), "{:?}", kinds(&d));
+    assert!(
+        !kinds(&d).contains(&"imu-noise") && !kinds(&d).contains(&"intrinsics-guessed"),
+        "{:?}",
+        kinds(&d)
+    );
 }
 
 /// A projection matrix with a baseline along x.
@@ -51,7 +55,10 @@ fn kitti_odometry_has_rectified_cameras_and_poses_of_the_first() {
     f.write("poses/07.txt", poses);
     let path = f.join("sequences/07");
     let d = open(&path, &camera(2)).unwrap();
-    assert_eq!((d.kind, d.images.len(), d.images[3].time.nanos()), (DatasetKind::KittiOdometry, 4, 311_208_600));
+    assert_eq!(
+        (d.kind, d.images.len(), d.images[3].time.nanos()),
+        (DatasetKind::KittiOdometry, 4, 311_208_600)
+    );
     assert!(d.images[0].location.path().ends_with("image_2/000000.png"));
     // Camera 2 is 6 cm left of camera 0, which the poses are of.
     let chosen = d.rig.camera(d.camera).unwrap();
@@ -82,7 +89,9 @@ fn kitti_raw(records: usize) -> (Folder, std::path::PathBuf) {
             oxts += &stamp(100_000 * i + 100_000 / records * k);
             // 1e-5° to the north is 1.113 m; yaw 90° looks north.
             let north = 49.0 + 1e-5 * number as f64;
-            let record = format!("{north} 8.4 110 0 0 1.5707963267948966 1 2 3 4 5 0.1 0.2 9.81 7 8 9 0.01 0.02 0.03 1 2 3 0.1 0.2 4 5 6 7 8");
+            let record = format!(
+                "{north} 8.4 110 0 0 1.5707963267948966 1 2 3 4 5 0.1 0.2 9.81 7 8 9 0.01 0.02 0.03 1 2 3 0.1 0.2 4 5 6 7 8"
+            );
             f.write(&format!("{drive}/oxts/data/{number:010}.txt"), record);
         }
     }
@@ -152,7 +161,10 @@ fn replica() -> Folder {
         let _ = writeln!(poses, "1 0 0 {i} 0 1 0 0 0 0 1 0.5 0 0 0 1");
     }
     f.write("room0/traj.txt", poses);
-    f.write("cam_params.json", r#"{"camera": {"w": 12, "h": 8, "fx": 6.0, "fy": 6.0, "cx": 5.5, "cy": 3.5, "scale": 6553.5}}"#);
+    f.write(
+        "cam_params.json",
+        r#"{"camera": {"w": 12, "h": 8, "fx": 6.0, "fy": 6.0, "cx": 5.5, "cy": 3.5, "scale": 6553.5}}"#,
+    );
     f
 }
 
@@ -162,7 +174,10 @@ fn replica_has_exact_depth_and_poses() {
     let d = open(&f.join("room0"), &OpenOptions::default()).unwrap();
     assert_eq!((d.kind, d.images.len(), d.depths.len()), (DatasetKind::Replica, 4, 4));
     assert_eq!(d.load_depth(&d.depths[1]).unwrap().image()[(3, 3)], 2.0);
-    assert_eq!(d.ground_truth.as_ref().unwrap().poses()[3].world_from_body.translation, Vector3::new(3.0, 0.0, 0.5));
+    assert_eq!(
+        d.ground_truth.as_ref().unwrap().poses()[3].world_from_body.translation,
+        Vector3::new(3.0, 0.0, 0.5)
+    );
     assert_eq!(d.rig.cameras[0].model.intrinsics().fx, 6.0);
     assert!(matches!(&d.calibration, CalibrationSource::File(p) if p.ends_with("cam_params.json")));
     f.write("cam_params.json", r#"{"camera": {"fx": 6, "fy": 6, "cx": 5, "cy": 3, "scale": 0}}"#);
@@ -205,10 +220,15 @@ fn eth3d_is_tum_rgbd_with_a_calibration_and_an_imu() {
     std::fs::remove_file(f.join("accelerometer.txt")).unwrap();
     f.write("calibration.txt", "726.21 726.30 359.2 202.5\n");
     let mut imu = String::new();
-    (0..400).for_each(|i| writeln!(imu, "{:.4} 0.1 0.2 0.3 0.0 -9.8 0.4", 1_305_031_101.0 + 0.01 * i as f64).unwrap());
+    (0..400).for_each(|i| {
+        writeln!(imu, "{:.4} 0.1 0.2 0.3 0.0 -9.8 0.4", 1_305_031_101.0 + 0.01 * i as f64).unwrap()
+    });
     f.write("imu.txt", imu);
     let d = f.open().unwrap();
-    assert_eq!((d.kind, d.imu.len(), d.rig.cameras[0].model.intrinsics().fx), (DatasetKind::TumRgbd, 400, 726.21));
+    assert_eq!(
+        (d.kind, d.imu.len(), d.rig.cameras[0].model.intrinsics().fx),
+        (DatasetKind::TumRgbd, 400, 726.21)
+    );
     assert_eq!(d.imu[0].accel.0, Vector3::new(0.0, -9.8, 0.4));
     assert_eq!(d.calibration, CalibrationSource::File(f.join("calibration.txt")));
     warning(&d, "extrinsics-missing");
@@ -216,8 +236,14 @@ fn eth3d_is_tum_rgbd_with_a_calibration_and_an_imu() {
 
 #[test]
 fn hostile_files_of_datasets_end_in_an_error_or_a_warning() {
-    let garbage: [&[u8]; 6] =
-        [b"", b"\xff\xfe\0t", &[b'1'; 40_000], b"P0: nan\nR: 1\nT: 1e999 0 0\n", b"{\"camera\": {}}", b"2011-99-99 1:2:3\n"];
+    let garbage: [&[u8]; 6] = [
+        b"",
+        b"\xff\xfe\0t",
+        &[b'1'; 40_000],
+        b"P0: nan\nR: 1\nT: 1e999 0 0\n",
+        b"{\"camera\": {}}",
+        b"2011-99-99 1:2:3\n",
+    ];
     for content in garbage {
         for name in ["calib_cam_to_cam.txt", "calib_imu_to_velo.txt", "calib_velo_to_cam.txt"] {
             let (f, path) = kitti_raw(1);

@@ -32,9 +32,8 @@ fn parse_all(bytes: &[u8]) {
     let _ = parse::times_of_day(&source);
     let _ = parse::oxts(&source).map(|record| record.world_from_unit(49.0));
     let _ = parse::replica_camera(&source);
-    let _ = parse::json_calibration(&source).map(|cameras| {
-        cameras.iter().map(|c| (c.model(&source), c.camera_from_imu(&source))).count()
-    });
+    let _ = parse::json_calibration(&source)
+        .map(|cameras| cameras.iter().map(|c| (c.model(&source), c.camera_from_imu(&source))).count());
     let _ = parse::JsonRecording::default().add(&source, 0, 0);
     let _ = parse::kitti_poses(&source);
     let _ = parse::matrix_poses(&source);

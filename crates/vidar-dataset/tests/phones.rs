@@ -32,7 +32,8 @@ const UP: f64 = 9.80665;
 /// Stray Scanner as its source writes it: the accelerometer in g, with Core Motion's sign.
 fn stray(sign: f64) -> Folder {
     let f = Folder::new();
-    f.write("rgb.mp4", clip("h264.mp4")).write("camera_matrix.csv", "50.0, 0.0, 31.5\n0.0, 50.0, 23.5\n0.0, 0.0, 1.0");
+    f.write("rgb.mp4", clip("h264.mp4"))
+        .write("camera_matrix.csv", "50.0, 0.0, 31.5\n0.0, 50.0, 23.5\n0.0, 0.0, 1.0");
     let mut odometry = String::from("timestamp, frame, x, y, z, qx, qy, qz, qw\n");
     for i in 0..FRAMES {
         // ARKit's world has y up, the camera's y points down: half a turn about x.
@@ -40,6 +41,8 @@ fn stray(sign: f64) -> Folder {
         let _ = writeln!(odometry, "{secs}, {i:06}, {}, 1.5, 0.0, 1.0, 0.0, 0.0, 0.0", 0.1 * i as f64);
         f.write(&format!("depth/{i:06}.png"), gray16_png(8, 6, &[1500; 48]));
     }
+    let levels: Vec<u8> = (0..48).map(|p| [0, 1, 2][p % 3]).collect();
+    f.write("confidence/000001.png", png(8, 6, ::png::ColorType::Grayscale, ::png::BitDepth::Eight, &levels));
     let mut imu = String::from("timestamp, a_x, a_y, a_z, alpha_x, alpha_y, alpha_z\n");
     for i in 0..SAMPLES {
         let secs = (frame_ms(0) - 50 + 5 * i) as f64 * 1e-3;
@@ -69,9 +72,32 @@ fn stray_scanner_is_a_recording_with_arkits_poses_and_an_imu_in_g() {
     for kind in ["extrinsics-assumed", "poses-recorded", "imu-noise"] {
         warning(&d, kind);
     }
+    // Depth of low confidence is none.
+    assert!(d.load_depth(&d.depths[1]).unwrap().image()[(0, 0)].is_nan());
+    assert_eq!(d.load_depth(&d.depths[1]).unwrap().image()[(1, 0)], 1.5);
     // Depth lies on the colour camera, whose intrinsics are scaled to its size.
     assert_eq!((d.depths.len(), d.load_depth(&d.depths[0]).unwrap().image()[(2, 2)]), (FRAMES, 1.5));
     assert!((d.depth_sensor.as_ref().unwrap().intrinsics.fx - 50.0 * 8.0 / 64.0).abs() < 1e-9);
+}
+
+#[test]
+fn a_video_out_of_a_recording_points_to_its_folder() {
+    let f = stray(-1.0);
+    let d = vidar_dataset::open(&f.join("rgb.mp4"), &OpenOptions::default()).unwrap();
+    assert_eq!(d.kind, DatasetKind::Video);
+    warning(&d, "folder-beside");
+}
+
+#[test]
+fn poses_beside_images_are_no_imu() {
+    let f = Folder::new();
+    let mut poses = String::new();
+    for i in 0..9 {
+        f.write(&format!("{i}.png"), gray_png(16, 12, 9));
+        let _ = writeln!(poses, "{i} 0.0 {i} 9.8 0.0 0.0 0.0 1.0");
+    }
+    f.write("trajectory.txt", poses);
+    assert_eq!(f.open().unwrap().kind, DatasetKind::ImageFolder);
 }
 
 #[test]
@@ -108,7 +134,8 @@ fn spectacular() -> Folder {
     let mut lines = String::new();
     for i in 0..SAMPLES {
         let secs = (frame_ms(0) - 50 + 5 * i) as f64 * 1e-3;
-        let _ = writeln!(lines, r#"{{"sensor":{{"type":"gyroscope","values":[0.1,0.2,{}]}},"time":{secs}}}"#, i);
+        let _ =
+            writeln!(lines, r#"{{"sensor":{{"type":"gyroscope","values":[0.1,0.2,{}]}},"time":{secs}}}"#, i);
         if i % 2 == 0 {
             let later = secs + 0.002;
             let _ = writeln!(
@@ -157,7 +184,8 @@ fn spectacular_ai_is_a_calibrated_recording_with_both_sensors_as_one() {
     assert_eq!(d.external_trajectory.as_ref().unwrap().trajectory.body(), BodyFrame::Imu);
     let second = f.open_with(&OpenOptions { camera: CameraId(1), ..Default::default() }).unwrap();
     assert_eq!(second.rig.cameras[0].model.intrinsics().fx, 52.0);
-    let error = f.open_with(&OpenOptions { camera: CameraId(2), ..Default::default() }).unwrap_err().to_string();
+    let error =
+        f.open_with(&OpenOptions { camera: CameraId(2), ..Default::default() }).unwrap_err().to_string();
     assert!(error.contains("available: camera 0, camera 1"), "{error}");
 }
 
@@ -230,18 +258,24 @@ fn opencamera_sensors_has_tables_without_header_in_a_folder_beside_the_video() {
 #[test]
 fn one_table_may_hold_two_sensors_row_by_row_in_degrees_and_milliseconds() {
     let f = Folder::new();
-    let mut table = String::from("time_ms,gyro_x (deg/s),gyro_y (deg/s),gyro_z (deg/s),acc_x (g),acc_y (g),acc_z (g)\n");
+    let mut table =
+        String::from("time_ms,gyro_x (deg/s),gyro_y (deg/s),gyro_z (deg/s),acc_x (g),acc_y (g),acc_z (g)\n");
     for i in 0..70 {
         let t = frame_ms(0) - 50 + 10 * i;
         // Irregular: two of the gyroscope for one of the accelerometer, and a row without anything.
-        let _ = writeln!(table, "{t},180,0,0,,,\n{},0,90,0,,,\n{},,,,0,1.0,0.02\n{},,,,,,", t + 3, t + 6, t + 7);
+        let _ =
+            writeln!(table, "{t},180,0,0,,,\n{},0,90,0,,,\n{},,,,0,1.0,0.02\n{},,,,,,", t + 3, t + 6, t + 7);
     }
     for i in 0..FRAMES {
         f.write(&format!("frames/{}.png", frame_ms(i) * 1_000_000), gray_png(16, 12, 9));
     }
     f.write("sensors.csv", table);
     let d = opens_as_log(&f);
-    assert!((d.imu[0].gyro.0 - Vector3::new(std::f64::consts::PI, 0.0, 0.0)).norm() < 1e-12, "{:?}", d.imu[0]);
+    assert!(
+        (d.imu[0].gyro.0 - Vector3::new(std::f64::consts::PI, 0.0, 0.0)).norm() < 1e-12,
+        "{:?}",
+        d.imu[0]
+    );
     // The header says g: the sign of the values is kept.
     assert!((d.imu[10].accel.0.y - UP).abs() < 1e-9);
     warning(&d, "gyro-unit");
@@ -257,6 +291,10 @@ fn a_video_without_a_log_of_frame_times_says_so() {
     let d = f.open().unwrap();
     assert_eq!(d.kind, DatasetKind::ImuLog);
     warning(&d, "frame-clock");
+    // What only looks like a log of times is told, and not used.
+    f.write("frame_timestamps.txt", "begin\nend\n");
+    assert!(warning(&f.open().unwrap(), "frame-times").message.contains("not used"));
+    std::fs::remove_file(f.join("frame_timestamps.txt")).unwrap();
     // Two tables of the same sensor: it is not clear which is meant, and a video alone remains.
     f.write("imu.csv", imu.replace("gx,gy,gz", "a,b,c")).write("acc2.csv", imu.replace("gx,gy,gz", "a,b,c"));
     assert_eq!(f.open().unwrap().kind, DatasetKind::Video);
@@ -264,7 +302,8 @@ fn a_video_without_a_log_of_frame_times_says_so() {
 
 #[test]
 fn hostile_folders_of_phones_end_in_an_error_or_a_warning() {
-    let garbage: [&[u8]; 5] = [b"", b"\xff\xfe\0t", &[b'1'; 40_000], b"timestamp,frame\n1,2\n", b"{\"time\":1}\n{"];
+    let garbage: [&[u8]; 5] =
+        [b"", b"\xff\xfe\0t", &[b'1'; 40_000], b"timestamp,frame\n1,2\n", b"{\"time\":1}\n{"];
     for content in garbage {
         for name in ["odometry.csv", "camera_matrix.csv", "imu.csv", "rgb.mp4"] {
             let f = stray(-1.0);

@@ -23,15 +23,16 @@ pub fn convert(
         return Err(Error::Usage { what: format!("{} exists", out.display()), hint });
     }
     let dataset = vidar_dataset::open(path, open)?;
-    events.stage("convert", dataset.images.len(), || {
-        let progress = |done: usize, total: usize| {
-            events.emit(&Event::Progress { stage: "convert", done, total });
-            !cancel.is_cancelled()
-        };
-        match vidar_dataset::convert::convert(&dataset, out, format, &progress) {
-            Err(_) if cancel.is_cancelled() => Err(Error::Interrupted { path: out.to_owned() }),
-            other => Ok(other?),
-        }
-    })
-    .map(|converted| (dataset, converted))
+    events
+        .stage("convert", dataset.images.len(), || {
+            let progress = |done: usize, total: usize| {
+                events.emit(&Event::Progress { stage: "convert", done, total });
+                !cancel.is_cancelled()
+            };
+            match vidar_dataset::convert::convert(&dataset, out, format, &progress) {
+                Err(_) if cancel.is_cancelled() => Err(Error::Interrupted { path: out.to_owned() }),
+                other => Ok(other?),
+            }
+        })
+        .map(|converted| (dataset, converted))
 }

@@ -194,7 +194,10 @@ mod tests {
                     r: [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0],
                     p: [458.654, 0.0, 367.215, 0.0, 0.0, 457.296, 248.375, 0.0, 0.0, 0.0, 1.0, 0.0],
                 })),
-                Message::Transforms(vec![FrameTransform { parent: at.clone(), child: "cam0".into(), pose }; 2]),
+                Message::Transforms(vec![
+                    FrameTransform { parent: at.clone(), child: "cam0".into(), pose };
+                    2
+                ]),
                 Message::Poses(vec![FramePose { header: at.clone(), child: "imu0".into(), pose }]),
             ];
             for message in all {

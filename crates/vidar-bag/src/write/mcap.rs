@@ -194,7 +194,8 @@ impl<W: Write> McapWriter<W> {
             self.put(&record(MESSAGE_INDEX, &Body::default().u16(channel).bytes(&list.0).0))?;
         }
         let index = Body::default().u64(first).u64(last).u64(chunk_at).u64(chunk_length).bytes(&offsets.0);
-        let index = index.u64(self.at - index_at).text("lz4").u64(packed.len() as u64).u64(records.len() as u64);
+        let index =
+            index.u64(self.at - index_at).text("lz4").u64(packed.len() as u64).u64(records.len() as u64);
         self.chunk_indexes.push(record(CHUNK_INDEX, &index.0));
         Ok(())
     }
@@ -274,7 +275,9 @@ mod tests {
         // Some 3.5 MB: two chunks.
         let count = 10_000;
         for i in 0..count {
-            writer.write(channel, Timestamp::from_nanos(1_000_000_007 * i), &encode(&imu(i)).unwrap().1).unwrap();
+            writer
+                .write(channel, Timestamp::from_nanos(1_000_000_007 * i), &encode(&imu(i)).unwrap().1)
+                .unwrap();
         }
         let bytes = writer.finish().unwrap();
         std::fs::write(&path, &bytes).unwrap();

@@ -10,10 +10,16 @@ use image::{ExtendedColorType, ImageEncoder};
 use std::fmt::Write as _;
 use std::io::{BufWriter, Write};
 use std::path::Path;
-use vidar_core::{BodyFrame, CameraModel, FrameImage, LieGroup, RigCamera, Se3, Timestamp, Trajectory, Warning};
+use vidar_core::{
+    BodyFrame, CameraModel, FrameImage, LieGroup, RigCamera, Se3, Timestamp, Trajectory, Warning,
+};
 
 /// Writes the folder.
-pub(super) fn write(dataset: &Dataset, out: &Path, progress: &Progress<'_>) -> Result<Converted, DatasetError> {
+pub(super) fn write(
+    dataset: &Dataset,
+    out: &Path,
+    progress: &Progress<'_>,
+) -> Result<Converted, DatasetError> {
     let root = out.join("mav0");
     let mut done = Converted::default();
     write_images(dataset, &root.join("cam0"), &mut done, progress)?;
@@ -28,7 +34,8 @@ pub(super) fn write(dataset: &Dataset, out: &Path, progress: &Progress<'_>) -> R
         let file = out.join("trajectory.tum");
         write_tum(&own.trajectory, &file)?;
         let message = "the layout has no place for a trajectory of the recording; it is in trajectory.tum";
-        done.warnings.push(Warning::new("convert-trajectory", message).hint("--trajectory OUT/trajectory.tum"));
+        done.warnings
+            .push(Warning::new("convert-trajectory", message).hint("--trajectory OUT/trajectory.tum"));
     }
     if let Some(cloud) = &dataset.reference_cloud {
         let folder = root.join("pointcloud0");
@@ -132,7 +139,11 @@ fn camera_yaml(dataset: &Dataset, camera: &RigCamera, is_known: bool) -> String 
     if is_known {
         text += &model_yaml(&camera.model);
         if camera.time_offset.nanos() != 0 {
-            let _ = writeln!(text, "# t_imu = t_camera + timeshift_cam_imu\ntimeshift_cam_imu: {}", camera.time_offset.as_secs_f64());
+            let _ = writeln!(
+                text,
+                "# t_imu = t_camera + timeshift_cam_imu\ntimeshift_cam_imu: {}",
+                camera.time_offset.as_secs_f64()
+            );
         }
         if let Some(readout) = dataset.readout {
             let _ = writeln!(text, "readout_secs: {}", readout.as_secs_f64());
@@ -151,7 +162,8 @@ fn write_imu(dataset: &Dataset, folder: &Path, done: &mut Converted) -> Result<(
     writeln!(out, "{head}").map_err(io_error(&path))?;
     for s in &dataset.imu {
         let (w, a) = (s.gyro.0, s.accel.0);
-        writeln!(out, "{},{},{},{},{},{},{}", s.time.nanos(), w.x, w.y, w.z, a.x, a.y, a.z).map_err(io_error(&path))?;
+        writeln!(out, "{},{},{},{},{},{},{}", s.time.nanos(), w.x, w.y, w.z, a.x, a.y, a.z)
+            .map_err(io_error(&path))?;
     }
     out.flush().map_err(io_error(&path))?;
     done.imu_samples = dataset.imu.len();
@@ -174,10 +186,13 @@ fn write_imu(dataset: &Dataset, folder: &Path, done: &mut Converted) -> Result<(
 const UNITS_PER_METRE: f64 = 1000.0;
 
 fn write_depth(dataset: &Dataset, folder: &Path, done: &mut Converted) -> Result<(), DatasetError> {
-    let Some(sensor) = dataset.depth_sensor.as_ref().filter(|_| !dataset.depths.is_empty()) else { return Ok(()) };
+    let Some(sensor) = dataset.depth_sensor.as_ref().filter(|_| !dataset.depths.is_empty()) else {
+        return Ok(());
+    };
     let data = folder.join("data");
     std::fs::create_dir_all(&data).map_err(io_error(&data))?;
-    let (mut list, mut units, mut clipped) = (String::from("#timestamp [ns],filename\n"), sensor.units_per_metre, 0usize);
+    let (mut list, mut units, mut clipped) =
+        (String::from("#timestamp [ns],filename\n"), sensor.units_per_metre, 0usize);
     for entry in &dataset.depths {
         let raw = match dataset.media.depth(&entry.location)? {
             StoredDepth::Units(raw) => raw.map(|&v| without_invalid(v, sensor)),
@@ -198,7 +213,9 @@ fn write_depth(dataset: &Dataset, folder: &Path, done: &mut Converted) -> Result
     }
     write_text(&folder.join("data.csv"), &list)?;
     if clipped > 0 {
-        let message = format!("{clipped} depths beyond 65 m do not fit into millimetres of 16 bits and are written as none");
+        let message = format!(
+            "{clipped} depths beyond 65 m do not fit into millimetres of 16 bits and are written as none"
+        );
         done.warnings.push(Warning::degraded("convert-depth", message).at(folder.display()));
     }
     write_text(&folder.join("sensor.yaml"), &depth_yaml(dataset, sensor, units))

@@ -37,7 +37,11 @@ struct Writer<'a> {
 }
 
 /// Writes the file.
-pub(super) fn write(dataset: &Dataset, path: &Path, progress: &Progress<'_>) -> Result<Converted, DatasetError> {
+pub(super) fn write(
+    dataset: &Dataset,
+    path: &Path,
+    progress: &Progress<'_>,
+) -> Result<Converted, DatasetError> {
     let file = File::create(path).map_err(io_error(path))?;
     let library = concat!("vidar ", env!("CARGO_PKG_VERSION"));
     let out = McapWriter::new(BufWriter::new(file), library).map_err(io_error(path))?;
@@ -106,7 +110,9 @@ fn pose_of(motion: &Se3) -> Pose {
 
 impl Writer<'_> {
     fn send(&mut self, topic: &str, time: Timestamp, message: &Message) -> Result<(), DatasetError> {
-        let invalid = |reason: String| std::io::Error::new(std::io::ErrorKind::InvalidData, format!("{topic}: {reason}"));
+        let invalid = |reason: String| {
+            std::io::Error::new(std::io::ErrorKind::InvalidData, format!("{topic}: {reason}"))
+        };
         let (message_type, bytes) = encode(message).map_err(|e| io_error(self.path)(invalid(e)))?;
         let known = self.channels.iter().find(|(name, _)| name == topic).map(|(_, id)| *id);
         let channel = match known {
@@ -142,7 +148,12 @@ impl Writer<'_> {
         self.send("/tf_static", time, &Message::Transforms(transforms))
     }
 
-    fn pose(&mut self, topic: &str, trajectory: Option<&Trajectory>, index: usize) -> Result<usize, DatasetError> {
+    fn pose(
+        &mut self,
+        topic: &str,
+        trajectory: Option<&Trajectory>,
+        index: usize,
+    ) -> Result<usize, DatasetError> {
         let Some(trajectory) = trajectory else { return Ok(0) };
         let pose = &trajectory.poses()[index];
         // Poses of another camera, or of a body that is neither, keep their name and no relation to the rest.
@@ -153,7 +164,8 @@ impl Writer<'_> {
             BodyFrame::Camera(id) => format!("camera{id}"),
             BodyFrame::Other => "tracked_object".to_string(),
         };
-        let message = FramePose { header: header(pose.time, WORLD), child, pose: pose_of(&pose.world_from_body) };
+        let message =
+            FramePose { header: header(pose.time, WORLD), child, pose: pose_of(&pose.world_from_body) };
         self.send(topic, pose.time, &Message::Poses(vec![message]))?;
         Ok(1)
     }
@@ -162,7 +174,8 @@ impl Writer<'_> {
         let image = raw_image(header(entry.time, CAMERA), &self.dataset.load_image(entry)?);
         self.send("/cam0/image_raw", entry.time, &Message::Image(image))?;
         let camera = self.dataset.rig.camera(self.dataset.camera);
-        let model = camera.map(|c| &c.model).filter(|_| self.dataset.calibration != CalibrationSource::Guessed);
+        let model =
+            camera.map(|c| &c.model).filter(|_| self.dataset.calibration != CalibrationSource::Guessed);
         match model.and_then(|m| camera_info(m, header(entry.time, CAMERA))) {
             Some(info) => self.send("/cam0/camera_info", entry.time, &Message::CameraInfo(Box::new(info))),
             None => Ok(()),
@@ -176,7 +189,8 @@ impl Writer<'_> {
         let stored = self.dataset.media.depth(&entry.location)?;
         let image = match stored {
             StoredDepth::Units(raw) if sensor.distorted.is_none() => {
-                let data = raw.data().iter().flat_map(|v| without_invalid(*v, sensor).to_le_bytes()).collect();
+                let data =
+                    raw.data().iter().flat_map(|v| without_invalid(*v, sensor).to_le_bytes()).collect();
                 raw_bytes(at, "16UC1", raw.width(), raw.height(), data)
             }
             _ => {

@@ -88,7 +88,8 @@ pub fn convert(
     progress: &Progress<'_>,
 ) -> Result<Converted, DatasetError> {
     if out.symlink_metadata().is_ok() {
-        let source = std::io::Error::new(std::io::ErrorKind::AlreadyExists, "it exists; nothing is overwritten");
+        let source =
+            std::io::Error::new(std::io::ErrorKind::AlreadyExists, "it exists; nothing is overwritten");
         return Err(io_error(out)(source));
     }
     let mut name = out.file_name().unwrap_or_default().to_os_string();
@@ -117,7 +118,11 @@ fn left_out(dataset: &Dataset, out: &Path) -> Vec<Warning> {
     let note = |kind: &str, message: String| Warning::new(kind, message).at(out.display());
     let mut notes = Vec::new();
     if dataset.rig.cameras.len() > 1 {
-        let message = format!("camera {} of {} is written; --camera chooses", dataset.camera, dataset.rig.cameras.len());
+        let message = format!(
+            "camera {} of {} is written; --camera chooses",
+            dataset.camera,
+            dataset.rig.cameras.len()
+        );
         notes.push(note("convert-camera", message));
     }
     if dataset.calibration == CalibrationSource::Guessed {

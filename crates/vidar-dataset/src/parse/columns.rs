@@ -1,6 +1,6 @@
 //! Which columns of a table are time, gyroscope and accelerometer: by the names in its header, else by its numbers.
 
-use super::lists::Places;
+use super::timed::Places;
 use crate::options::TimeUnit;
 
 /// What a table of inertial measurements states about itself.
@@ -90,11 +90,30 @@ fn fit_as_time(stem: &str) -> u8 {
 
 /// Names of gyroscopes and accelerometers before x, y, z. Alone, `alpha` and `omega` are decided by each other.
 const GYROSCOPES: [&str; 14] = [
-    "g", "w", "gyr", "gyro", "gyroscope", "rotationrate", "rot", "omega", "angularvelocity", "angvel", "wrss",
-    "rotation", "angularrate", "gyrometer",
+    "g",
+    "w",
+    "gyr",
+    "gyro",
+    "gyroscope",
+    "rotationrate",
+    "rot",
+    "omega",
+    "angularvelocity",
+    "angvel",
+    "wrss",
+    "rotation",
+    "angularrate",
+    "gyrometer",
 ];
 const ACCELEROMETERS: [&str; 9] = [
-    "a", "acc", "accel", "accelerometer", "acceleration", "linearacceleration", "arss", "specificforce",
+    "a",
+    "acc",
+    "accel",
+    "accelerometer",
+    "acceleration",
+    "linearacceleration",
+    "arss",
+    "specificforce",
     "totalacceleration",
 ];
 
@@ -102,8 +121,10 @@ const ACCELEROMETERS: [&str; 9] = [
 ///
 /// `file_name` decides whose `x`, `y` and `z` are, where that is all the header says.
 pub fn imu_columns(header: &str, file_name: &str) -> Option<ImuColumns> {
-    let names: Vec<(String, String)> =
-        header.trim_start_matches(['#', ' ']).split([',', ';', '\t']).take(64).map(split_unit).collect();
+    let header = header.trim_start_matches(['#', ' ']);
+    let by_blank = !header.contains([',', ';', '\t']);
+    let is_end = |c: char| if by_blank { c == ' ' } else { [',', ';', '\t'].contains(&c) };
+    let names: Vec<(String, String)> = header.split(is_end).take(64).map(split_unit).collect();
     let best = names.iter().map(|(stem, _)| fit_as_time(stem)).max().filter(|&fit| fit > 0)?;
     let time = names.iter().position(|(stem, _)| fit_as_time(stem) == best)?;
     let axes = |is_named: &dyn Fn(&str) -> bool| -> Option<[usize; 3]> {
@@ -164,14 +185,20 @@ fn places(
 }
 
 /// The columns of a table without header, by its first rows: the time is the first column that never goes backward, else the last;
-/// of two triples the one whose mean has the length of gravity is the accelerometer, else the second, as in EuRoC's lists.
+/// of two triples the one whose mean has the length of gravity is the accelerometer, else the second, as in EuRoC's lists. Rows of
+/// poses look the same, so the file's name must speak of an IMU.
 pub(crate) fn columns_by_numbers(rows: &[Vec<f64>], file_name: &str) -> Option<ImuColumns> {
     let width = rows.first()?.len();
+    let lower = file_name.to_ascii_lowercase();
+    if !["imu", "gyr", "acc", "inertial", "motion"].iter().any(|word| lower.contains(word)) {
+        return None;
+    }
     if rows.len() < 3 || !(4..=64).contains(&width) || rows.iter().any(|r| r.len() != width) {
         return None;
     }
     let is_time = |column: usize| {
-        rows.windows(2).all(|w| w[0][column] <= w[1][column]) && rows[0][column] < rows[rows.len() - 1][column]
+        rows.windows(2).all(|w| w[0][column] <= w[1][column])
+            && rows[0][column] < rows[rows.len() - 1][column]
     };
     let time = [0, width - 1].into_iter().find(|&column| is_time(column))?;
     let free: Vec<usize> = (0..width).filter(|&column| column != time).collect();
@@ -182,7 +209,9 @@ pub(crate) fn columns_by_numbers(rows: &[Vec<f64>], file_name: &str) -> Option<I
         (None, Some(Sensor::Accelerometer)) => (None, Some(first)),
         (None, None) if is_gravity(rows, first) => (None, Some(first)),
         (None, None) => return None,
-        (Some(second), _) if is_gravity(rows, first) && !is_gravity(rows, second) => (Some(second), Some(first)),
+        (Some(second), _) if is_gravity(rows, first) && !is_gravity(rows, second) => {
+            (Some(second), Some(first))
+        }
         (Some(second), _) => (Some(first), Some(second)),
     };
     Some(ImuColumns {
@@ -240,8 +269,10 @@ mod tests {
         let alone = "time,seconds_elapsed,z,y,x";
         assert_eq!(of(alone, "Gyroscope.csv"), ([x, y, z, None, None, None], 0, None));
         assert_eq!(of(alone, "Accelerometer.csv"), ([None, None, None, x, y, z], 0, None));
-        let mixed = imu_columns("Timestamp[nanosec], x, y, z[(a:m/s^2)/(g:rad/s)], isGyro?", "raw.csv").unwrap();
+        let mixed =
+            imu_columns("Timestamp[nanosec], x, y, z[(a:m/s^2)/(g:rad/s)], isGyro?", "raw.csv").unwrap();
         assert_eq!(mixed.places.sensor, Some(4));
+        assert_eq!(of("timestamp wx wy wz ax ay az", "imu.txt"), (six(1, 4), 0, None));
         for no in ["", "time,latitude,longitude", "a_x,a_y,a_z", "time,x,y,z", "frame,file"] {
             assert_eq!(imu_columns(no, "Location.csv"), None, "{no}");
         }
@@ -257,10 +288,12 @@ mod tests {
         let found = columns_by_numbers(&swapped, "imu.csv").unwrap();
         assert_eq!(found.places.numbers, [4, 5, 6, 1, 2, 3].map(Some));
         // OpenCamera Sensors: x, y, z, then the time.
-        let last: Vec<_> = (0..9).map(|i| vec![0.1, -0.1 * (i % 3) as f64, 0.0, 1e12 + i as f64 * 1e7]).collect();
+        let last: Vec<_> =
+            (0..9).map(|i| vec![0.1, -0.1 * (i % 3) as f64, 0.0, 1e12 + i as f64 * 1e7]).collect();
         let found = columns_by_numbers(&last, "VID_1_gyro.csv").unwrap();
         assert_eq!((found.places.time, found.places.numbers[0]), (3, Some(0)));
         assert_eq!(columns_by_numbers(&last, "VID_1.csv"), None, "whose they are is not known");
+        assert_eq!(columns_by_numbers(&euroc, "trajectory.txt"), None, "poses look the same");
         assert_eq!(columns_by_numbers(&euroc[..2], "imu.csv"), None);
         let constant: Vec<_> = (0..9).map(|_| row(1, 0.1, 9.8)).collect();
         assert_eq!(columns_by_numbers(&constant, "imu.csv"), None);

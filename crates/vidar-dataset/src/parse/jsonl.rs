@@ -165,9 +165,7 @@ impl JsonRecording {
             self.truth.push((time, pose.rigid()));
         }
         let found = [record.arkit, record.arcore, record.arengine, record.output];
-        if let Some((name, pose)) =
-            TRACKERS.iter().zip(found).find_map(|(name, pose)| Some((*name, pose?)))
-        {
+        if let Some((name, pose)) = TRACKERS.iter().zip(found).find_map(|(name, pose)| Some((*name, pose?))) {
             let (kept, poses) = self.tracked.get_or_insert_with(|| (name.to_string(), Vec::new()));
             if *kept == name {
                 poses.push((time, pose.rigid()));
@@ -239,7 +237,11 @@ impl JsonCamera {
         let size = side(self.image_width).zip(side(self.image_height));
         let centre = |given: Option<f64>, side: Option<usize>| {
             given.or_else(|| side.map(|s| 0.5 * s as f64 - 0.5)).ok_or_else(|| {
-                source.malformed(0, "no principal point and no image size", "principalPointX and principalPointY")
+                source.malformed(
+                    0,
+                    "no principal point and no image size",
+                    "principalPointX and principalPointY",
+                )
             })
         };
         let cx = centre(self.principal_point_x, size.map(|s| s.0))?;

@@ -60,7 +60,11 @@ pub fn named_numbers(source: &Source<'_>) -> Result<Vec<(String, Vec<f64>)>, Dat
             rest.split_ascii_whitespace().take(MAX_NUMBERS + 1).map(|n| n.parse().ok()).collect();
         if let Some(numbers) = numbers.filter(|n| !n.is_empty()) {
             if numbers.len() > MAX_NUMBERS {
-                return Err(source.malformed(index + 1, format!("more than {MAX_NUMBERS} numbers"), "a matrix"));
+                return Err(source.malformed(
+                    index + 1,
+                    format!("more than {MAX_NUMBERS} numbers"),
+                    "a matrix",
+                ));
             }
             out.push((name.trim().to_string(), numbers));
         }
@@ -98,7 +102,11 @@ pub fn times_of_day(source: &Source<'_>) -> Result<Vec<Timestamp>, DatasetError>
             return Err(source.too_many_rows(row.line, MAX_ROWS));
         }
         let time = date_and_time(row.text).ok_or_else(|| {
-            source.malformed(row.line, quoted(row.text), "a date and a time, such as 2011-09-26 13:02:25.964389445")
+            source.malformed(
+                row.line,
+                quoted(row.text),
+                "a date and a time, such as 2011-09-26 13:02:25.964389445",
+            )
         })?;
         times.push(time);
     }
@@ -146,7 +154,9 @@ pub fn oxts(source: &Source<'_>) -> Result<Oxts, DatasetError> {
     let mut numbers = [f64::NAN; 20];
     let mut fields = row.fields();
     for (index, number) in numbers.iter_mut().enumerate() {
-        let field = fields.next().ok_or_else(|| source.malformed(row.line, format!("{index} numbers"), "30 numbers"))?;
+        let field = fields
+            .next()
+            .ok_or_else(|| source.malformed(row.line, format!("{index} numbers"), "30 numbers"))?;
         *number = source.number(row, field, "a record of oxts")?;
     }
     let three = |from: usize| [numbers[from], numbers[from + 1], numbers[from + 2]];
@@ -161,8 +171,11 @@ impl Oxts {
         let scale = origin_deg.to_radians().cos();
         let [latitude, longitude, altitude] = self.place;
         let north = (std::f64::consts::FRAC_PI_4 + latitude.to_radians() / 2.0).tan().ln();
-        let position =
-            Vector3::new(scale * longitude.to_radians() * EARTH_RADIUS_M, scale * EARTH_RADIUS_M * north, altitude);
+        let position = Vector3::new(
+            scale * longitude.to_radians() * EARTH_RADIUS_M,
+            scale * EARTH_RADIUS_M * north,
+            altitude,
+        );
         let [roll, pitch, yaw] = self.angles;
         if !self.angles.iter().all(|v| v.is_finite()) {
             return None;
@@ -184,9 +197,19 @@ mod tests {
         assert_eq!(secs("1970-01-01 00:00:00"), Some(0));
         assert_eq!(secs("2000-02-29 12:00:00"), Some(951_825_600));
         assert_eq!(secs("2011-09-26 13:02:25.964389445"), Some(1_317_042_145));
-        assert_eq!(date_and_time("2011-09-26 13:02:25.964389445").unwrap().nanos() % 1_000_000_000, 964_389_445);
+        assert_eq!(
+            date_and_time("2011-09-26 13:02:25.964389445").unwrap().nanos() % 1_000_000_000,
+            964_389_445
+        );
         assert_eq!(secs("2024:03:01 00:00:01"), Some(1_709_251_201), "as EXIF writes it");
-        for bad in ["", "2011-09-26", "2011-13-26 1:1:1", "2011-09-26 25:00:00", "99999999999999999999-1-1 1:1:1", "é-é-é 1:1:1"] {
+        for bad in [
+            "",
+            "2011-09-26",
+            "2011-13-26 1:1:1",
+            "2011-09-26 25:00:00",
+            "99999999999999999999-1-1 1:1:1",
+            "é-é-é 1:1:1",
+        ] {
             assert_eq!(date_and_time(bad), None, "{bad}");
         }
     }

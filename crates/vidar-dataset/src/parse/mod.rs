@@ -8,6 +8,7 @@ mod lists;
 mod matrices;
 mod photo;
 mod poses;
+mod timed;
 pub(crate) mod units;
 pub(crate) mod yaml;
 
@@ -17,15 +18,17 @@ pub use jsonl::{JsonCamera, JsonPose, JsonRecording, ReplicaCamera, json_calibra
 pub use kitti::{
     Oxts, ProjectionMatrix, named_numbers, oxts, projection_matrices, rotation_and_translation, times_of_day,
 };
-pub(crate) use lists::{TimedRow, imu_file, imu_table, is_image_name};
+pub(crate) use lists::is_image_name;
 pub use lists::{
-    Association, ListedFile, ListedTime, NumberedPose, accelerometer_list, associations, file_list, first_column_times, focal_lengths, imu_csv,
-    numbered_poses, time_list,
+    Association, ListedFile, ListedTime, associations, file_list, first_column_times, focal_lengths,
+    time_list,
 };
 pub use matrices::{intrinsics_matrix, matrix_poses, single_pose};
 pub use photo::{PhotoExif, photo_exif};
 pub(crate) use poses::is_ambiguous_csv;
 pub use poses::{PoseFile, RawPose, euroc_poses, guess_trajectory_format, kitti_poses, tum_poses};
+pub use timed::{NumberedPose, accelerometer_list, imu_csv, numbered_poses};
+pub(crate) use timed::{TimedRow, imu_file, imu_table};
 pub use units::UnitRule;
 pub use yaml::{
     CameraCalibration, EurocSensor, ImuCalibration, KalibrCamera, KalibrFile, euroc_sensor_yaml, kalibr_yaml,

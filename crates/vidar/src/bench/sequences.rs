@@ -82,7 +82,8 @@ fn walk(folder: &Path, kind: BenchKind, depth: usize, found: &mut Vec<Sequence>)
 fn short(name: &str) -> String {
     let name = name.strip_prefix("rgbd_dataset_").unwrap_or(name).replace("freiburg", "fr");
     let name = name.strip_prefix("dataset-").map_or(name.clone(), str::to_owned);
-    let ending = ["_easy", "_medium", "_difficult", "_512_16", "_1024_16"].iter().find_map(|e| name.strip_suffix(e));
+    let ending =
+        ["_easy", "_medium", "_difficult", "_512_16", "_1024_16"].iter().find_map(|e| name.strip_suffix(e));
     ending.unwrap_or(&name).to_owned()
 }
 
