@@ -22,7 +22,7 @@ fuzz_target!(|bytes: &[u8]| {
         2 => drop(parse::replica_camera(&source)),
         3 => drop(parse::numbered_poses(&source, rule)),
         4 => drop(parse::first_column_times(&source, rule)),
-        5 => drop(parse::focal_lengths(&source)),
+        5 => drop(parse::frame_intrinsics(&source)),
         6 => drop(parse::associations(&source)),
         7 => drop(parse::projection_matrices(&source)),
         8 => {

@@ -135,7 +135,7 @@ pub(crate) fn open(path: &Path, log: Log, options: &OpenOptions) -> Result<Draft
     }
     read_imu(&mut draft, &log.tables, options, "a phone's logger")?;
     phone::assume_mount(&mut draft, quarter_turns);
-    read_focal_length(&mut draft, &log.folder)?;
+    read_intrinsics_of_frames(&mut draft, &log.folder, quarter_turns)?;
     image_folder::read_intrinsics(&mut draft, path)?;
     Ok(draft)
 }
@@ -218,8 +218,16 @@ fn frame_times(
     Ok(times)
 }
 
-/// MARS Logger states the focal length of every frame, pixels of the recorded video; their median is used.
-fn read_focal_length(draft: &mut Draft, folder: &Path) -> Result<(), DatasetError> {
+/// Focal length over the longer side of a phone's picture, from wide to tele.
+const FOCAL_RATIO: std::ops::RangeInclusive<f64> = 0.3..=4.0;
+
+/// MARS Logger states the camera of every frame. On iOS with its centre, for the recorded picture; on Android the focal length only, which
+/// is that of the recorded picture or, where the driver states a calibration, of the sensor's whole array: then it is a guess.
+fn read_intrinsics_of_frames(
+    draft: &mut Draft,
+    folder: &Path,
+    quarter_turns: u8,
+) -> Result<(), DatasetError> {
     let metadata = folder.join("movie_metadata.csv");
     if !metadata.is_file() {
         return Ok(());
@@ -227,25 +235,41 @@ fn read_focal_length(draft: &mut Draft, folder: &Path) -> Result<(), DatasetErro
     // It may be the log of times, too, which is then listed already.
     draft.text_files.retain(|file| *file != metadata);
     let bytes = draft.read(&metadata)?;
-    let source = Source { path: &metadata, bytes: &bytes };
-    let Some([fx, fy]) = parse::focal_lengths(&source)? else { return Ok(()) };
+    let Some(stated) = parse::frame_intrinsics(&Source { path: &metadata, bytes: &bytes })? else {
+        return Ok(());
+    };
     let Some((_, first)) = draft.images.first() else { return Ok(()) };
     let (width, height) = draft.media.size(first)?;
-    let (cx, cy) = (0.5 * width as f64 - 0.5, 0.5 * height as f64 - 0.5);
-    match Pinhole::new(fx, fy, cx, cy, width, height) {
-        Ok(pinhole) => {
-            let message = format!(
-                "focal length {fx:.1}, {fy:.1} px by the logger, which the phone's driver states; centre and distortion are not known"
-            );
-            let warning = Warning::new("intrinsics-driver", message).at(metadata.display());
-            draft.warnings.push(warning.hint("--calibration FILE, or `vidar calibrate`"));
-            draft.cameras[0].model = Some(CameraModel::Pinhole(pinhole));
-            draft.cameras[0].source = CalibrationSource::File(metadata);
-        }
-        Err(e) => {
-            let message = format!("the logger's focal length is not used: {e}");
-            draft.warnings.push(Warning::new("intrinsics-driver", message).at(metadata.display()));
-        }
+    let [fx, fy] = stated.focal;
+    let native = if quarter_turns % 2 == 1 { (height, width) } else { (width, height) };
+    let [cx, cy] = stated.centre.unwrap_or([0.5 * native.0 as f64 - 0.5, 0.5 * native.1 as f64 - 0.5]);
+    let [fx, fy, cx, cy] = phone::turned([fx, fy, cx, cy], quarter_turns, (width, height));
+    let is_plausible = FOCAL_RATIO.contains(&(fx / width.max(height) as f64));
+    let pinhole = Pinhole::new(fx, fy, cx, cy, width, height).ok().filter(|_| is_plausible);
+    let (message, hint) = match (pinhole, stated.centre) {
+        (None, _) => (
+            format!(
+                "the logger's focal length, {fx:.1} px, is not that of a {width}x{height} picture; not used"
+            ),
+            "",
+        ),
+        (Some(_), Some(_)) => (
+            format!("camera by the logger: f {fx:.1}, {fy:.1}, c {cx:.1}, {cy:.1} px, without distortion"),
+            "",
+        ),
+        (Some(_), None) => (
+            format!(
+                "focal length {fx:.1} px by the logger, which may be of the sensor's array and not of the picture: a guess"
+            ),
+            "--calibration FILE, or `vidar calibrate`",
+        ),
+    };
+    let warning = Warning::new("intrinsics-driver", message).at(metadata.display());
+    draft.warnings.push(if hint.is_empty() { warning } else { warning.hint(hint) });
+    if let Some(pinhole) = pinhole {
+        draft.cameras[0].model = Some(CameraModel::Pinhole(pinhole));
+        draft.cameras[0].source =
+            stated.centre.map_or(CalibrationSource::Guessed, |_| CalibrationSource::File(metadata));
     }
     Ok(())
 }

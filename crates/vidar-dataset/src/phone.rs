@@ -16,6 +16,17 @@ pub(crate) fn camera_from_imu(quarter_turns: u8) -> So3 {
     So3::from_axis_angle(&Vector3::z(), turn) * So3::from_matrix(&native).unwrap_or(So3::IDENTITY)
 }
 
+/// `[fx, fy, cx, cy]` of a picture that is turned clockwise by quarter turns to be `upright` columns and rows.
+pub(crate) fn turned([fx, fy, cx, cy]: [f64; 4], quarter_turns: u8, upright: (usize, usize)) -> [f64; 4] {
+    let (right, bottom) = (upright.0 as f64 - 1.0, upright.1 as f64 - 1.0);
+    match quarter_turns % 4 {
+        0 => [fx, fy, cx, cy],
+        1 => [fy, fx, right - cy, cx],
+        2 => [fx, fy, right - cx, bottom - cy],
+        _ => [fy, fx, cy, bottom - cx],
+    }
+}
+
 /// Uses the usual mount for the camera of a phone whose recorder states none.
 pub(crate) fn assume_mount(draft: &mut Draft, quarter_turns: u8) {
     if draft.imu.is_empty() {
@@ -74,6 +85,25 @@ pub(crate) fn check_vertical(draft: &mut Draft, up_in_world: Vector3<f64>) {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn intrinsics_turn_with_the_picture() {
+        // A ray through a pixel of the sensor goes through the same pixel of the upright picture.
+        let [fx, fy, cx, cy] = [500.0, 510.0, 300.0, 200.0];
+        let native = Vector3::new(0.1, -0.2, 1.0);
+        let (x, y) = (cx + fx * native.x, cy + fy * native.y);
+        for (turns, upright) in [(0, (640, 480)), (1, (480, 640)), (2, (640, 480)), (3, (480, 640))] {
+            let (w, h) = (upright.0 as f64 - 1.0, upright.1 as f64 - 1.0);
+            let shown = [(x, y), (w - y, x), (w - x, h - y), (y, h - x)][usize::from(turns)];
+            let ray = (camera_from_imu(turns) * camera_from_imu(0).inverse()).act(&native);
+            let [fx, fy, cx, cy] = turned([fx, fy, cx, cy], turns, upright);
+            let found = (cx + fx * ray.x / ray.z, cy + fy * ray.y / ray.z);
+            assert!(
+                (found.0 - shown.0).abs() + (found.1 - shown.1).abs() < 1e-9,
+                "{turns}: {found:?} {shown:?}"
+            );
+        }
+    }
 
     #[test]
     fn an_upright_portrait_video_sees_gravity_downward() {

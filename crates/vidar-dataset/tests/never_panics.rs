@@ -24,7 +24,7 @@ fn parse_all(bytes: &[u8]) {
         let _ = parse::first_column_times(&source, rule);
     }
     let _ = parse::imu_columns(&String::from_utf8_lossy(bytes), "gyro.csv");
-    let _ = parse::focal_lengths(&source);
+    let _ = parse::frame_intrinsics(&source);
     let _ = parse::associations(&source);
     let _ = parse::named_numbers(&source);
     let _ = parse::projection_matrices(&source);
@@ -32,8 +32,9 @@ fn parse_all(bytes: &[u8]) {
     let _ = parse::times_of_day(&source);
     let _ = parse::oxts(&source).map(|record| record.world_from_unit(49.0));
     let _ = parse::replica_camera(&source);
-    let _ = parse::json_calibration(&source)
-        .map(|cameras| cameras.iter().map(|c| (c.model(&source), c.camera_from_imu(&source))).count());
+    for camera in parse::json_calibration(&source).unwrap_or_default() {
+        let _ = (camera.model(&source), camera.camera_from_imu(&source));
+    }
     let _ = parse::JsonRecording::default().add(&source, 0, 0);
     let _ = parse::kitti_poses(&source);
     let _ = parse::matrix_poses(&source);

@@ -228,11 +228,27 @@ fn mars_logger_is_read_with_its_focal_length() {
     f.write("movie.mp4", clip("rotated.mp4"));
     let d = opens_as_log(&f);
     let camera = d.rig.camera(CameraId(0)).unwrap();
-    assert_eq!((camera.model.intrinsics().fx, camera.model.intrinsics().fy), (55.0, 55.5));
+    // The focal lengths are the sensor's; the picture is turned. Without its centre it is a guess.
+    assert_eq!((camera.model.intrinsics().fx, camera.model.intrinsics().fy), (55.5, 55.0));
+    assert_eq!(d.calibration, CalibrationSource::Guessed);
     // The phone stands on its head, and its video is turned (three quarters clockwise) to be upright: the force is upward in it.
     let in_camera = camera.body_from_camera.inverse().rotation.act(&d.imu[50].accel.0);
     assert!((in_camera - Vector3::new(0.0, -UP, 0.0)).norm() < 1e-9, "{in_camera}");
     assert!(d.events().filter(|e| matches!(e, Ok(SensorEvent::Image(_)))).count() == FRAMES);
+    // iOS states the centre, too: 5 px right of the sensor's, which is up in a picture turned by three quarters.
+    let metadata = std::fs::read_to_string(f.join("movie_metadata.csv")).unwrap();
+    let with_centre =
+        metadata.replace("Frame No.", "cx[px],cy[px],Frame No.").replace(",55.5,", ",55.5,36.5,23.5,");
+    f.write("movie_metadata.csv", with_centre);
+    let d = opens_as_log(&f);
+    assert!(matches!(&d.calibration, CalibrationSource::File(p) if p.ends_with("movie_metadata.csv")));
+    assert_eq!(
+        (d.rig.cameras[0].model.intrinsics().cx, d.rig.cameras[0].model.intrinsics().cy),
+        (23.5, 26.5)
+    );
+    // A focal length of 1 stands for none.
+    f.write("movie_metadata.csv", metadata.replace("55", "1"));
+    assert!(!kinds(&opens_as_log(&f)).contains(&"intrinsics-driver"));
 }
 
 #[test]

@@ -170,20 +170,31 @@ pub fn associations(source: &Source<'_>) -> Result<Vec<Association>, DatasetErro
     Ok(pairs)
 }
 
-/// Medians of the columns `fx[px]` and `fy[px]` of a table of frames (MARS Logger's `movie_metadata.csv`); `None` without them.
-pub fn focal_lengths(source: &Source<'_>) -> Result<Option<[f64; 2]>, DatasetError> {
+/// A camera as a logger states it for every frame, pixels.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct FrameIntrinsics {
+    /// fx and fy.
+    pub focal: [f64; 2],
+    /// cx and cy, where they are stated.
+    pub centre: Option<[f64; 2]>,
+}
+
+/// Medians of the columns `fx[px]`, `fy[px]`, `cx[px]` and `cy[px]` of a table of frames (MARS Logger's `movie_metadata.csv`); `None`
+/// without focal lengths. A value of 1 pixel or less stands for one that the phone does not state.
+pub fn frame_intrinsics(source: &Source<'_>) -> Result<Option<FrameIntrinsics>, DatasetError> {
     let text = source.text(&mut Vec::new())?;
     let names: Vec<&str> = text.lines().next().unwrap_or("").split(',').map(str::trim).collect();
     let column = |name: &str| names.iter().position(|n| n.to_ascii_lowercase().starts_with(name));
-    let (Some(x), Some(y)) = (column("fx"), column("fy")) else { return Ok(None) };
     let lines = images_at_most(source, source.lines(&mut Vec::new())?)?;
-    let median = |column: usize| {
-        let number = |row: &Row<'_>| row.fields().nth(column)?.parse::<f64>().ok().filter(|v| *v > 0.0);
+    let median = |name: &str| {
+        let column = column(name)?;
+        let number = |row: &Row<'_>| row.fields().nth(column)?.parse::<f64>().ok();
         let mut values: Vec<f64> = lines.rows.iter().filter_map(number).collect();
         values.sort_unstable_by(f64::total_cmp);
-        values.get(values.len() / 2).copied()
+        values.get(values.len() / 2).copied().filter(|v| v.is_finite() && *v > 1.0)
     };
-    Ok(median(x).zip(median(y)).map(|(fx, fy)| [fx, fy]))
+    let pair = |x: &str, y: &str| Some([median(x)?, median(y)?]);
+    Ok(pair("fx", "fy").map(|focal| FrameIntrinsics { focal, centre: pair("cx", "cy") }))
 }
 
 /// Whether a file name has the extension of a supported image format.

@@ -20,8 +20,8 @@ pub use kitti::{
 };
 pub(crate) use lists::is_image_name;
 pub use lists::{
-    Association, ListedFile, ListedTime, associations, file_list, first_column_times, focal_lengths,
-    time_list,
+    Association, FrameIntrinsics, ListedFile, ListedTime, associations, file_list, first_column_times,
+    frame_intrinsics, time_list,
 };
 pub use matrices::{intrinsics_matrix, matrix_poses, single_pose};
 pub use photo::{PhotoExif, photo_exif};
