@@ -76,7 +76,8 @@ pub(crate) fn open(path: &Path, reason: String, options: &OpenOptions) -> Result
         read_poses(&mut draft, &clock, topic, *used, &known)?;
     }
     let without = clock.without_stamp.get();
-    if without > 0 {
+    // VIDAR's own conversions stamp every message; zero is a time then.
+    if without > 0 && bag.metadata(facts::NAME).is_none() {
         let message =
             format!("{without} messages have no stamp; the times at which they were logged are used");
         draft.warnings.push(Warning::new("stamp-missing", message).at(path.display()));

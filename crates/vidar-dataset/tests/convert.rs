@@ -142,10 +142,14 @@ fn every_camera_model_and_kind_of_pixel_survives() {
         assert_same(&d, &mcap);
         assert_same(&d, &written(&mcap, &f.join(&format!("folder{number}"))));
     }
-    // Without a calibration none is invented.
+    // Without a calibration none is invented; invented times are told.
     let d = opened(&f.join("rgb"));
-    let bare = written(&d, &f.join("bare.mcap"));
+    let done = convert(&d, &f.join("bare.mcap"), ConvertFormat::Mcap, &|_, _| true).unwrap();
+    let told: Vec<_> = done.warnings.iter().map(|w| w.kind.as_str()).collect();
+    assert_eq!(told, ["convert-calibration", "convert-times"]);
+    let bare = opened(&f.join("bare.mcap"));
     assert_eq!(bare.calibration, CalibrationSource::Guessed);
+    assert!(!kinds(&bare).contains(&"stamp-missing"), "{:?}", kinds(&bare));
 }
 
 #[test]

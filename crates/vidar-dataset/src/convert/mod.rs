@@ -128,6 +128,10 @@ fn left_out(dataset: &Dataset, out: &Path) -> Vec<Warning> {
     if dataset.calibration == CalibrationSource::Guessed {
         notes.push(note("convert-calibration", "the camera's model is a guess and is not written".into()));
     }
+    if dataset.times_are_invented || dataset.warnings.iter().any(|w| w.kind == "times-synthesised") {
+        let message = "image times are invented (30 Hz) and are written as if they were measured".to_string();
+        notes.push(Warning::degraded("convert-times", message).at(out.display()));
+    }
     if !dataset.accelerometer.is_empty() {
         notes.push(note("convert-accelerometer", "an accelerometer without gyroscope is not written".into()));
     }
