@@ -29,12 +29,18 @@ pub struct ImuSample {
 /// A measurement of one three-axis sensor: when, and its value.
 pub type TimedVector = (Timestamp, Vector3<f64>);
 
-/// Longest time between two accelerometer samples that is bridged by interpolation, ns: five samples at 50 Hz.
-const MAX_BRIDGE_NS: i64 = 100_000_000;
+/// Time between two accelerometer samples that is always bridged by interpolation, ns: five samples at 50 Hz …
+const BRIDGE_NS: i64 = 100_000_000;
+/// … and in median steps, for slower sensors.
+const BRIDGE_STEPS: i64 = 3;
 
 /// IMU samples at the gyroscope's times, the accelerometer interpolated between its own. Both lists are in order of time; nothing is
-/// invented before the first, after the last, or in a gap of more than 0.1 s of the accelerometer.
+/// invented before the first, after the last, or in a gap of the accelerometer of more than 0.1 s and three median steps.
 pub fn merge_imu(gyro: &[TimedVector], accel: &[TimedVector]) -> Vec<ImuSample> {
+    let mut steps: Vec<i64> = accel.windows(2).map(|w| (w[1].0 - w[0].0).nanos()).collect();
+    steps.sort_unstable();
+    let median = steps.get(steps.len() / 2).copied().unwrap_or(0);
+    let longest = BRIDGE_NS.max(median.saturating_mul(BRIDGE_STEPS));
     let mut samples = Vec::with_capacity(gyro.len());
     let mut at = 0;
     for &(time, rate) in gyro {
@@ -50,7 +56,7 @@ pub fn merge_imu(gyro: &[TimedVector], accel: &[TimedVector]) -> Vec<ImuSample> 
         let force = match share {
             0.0 => before.1,
             1.0 => after.1,
-            _ if step > MAX_BRIDGE_NS => continue,
+            _ if step > longest => continue,
             _ => before.1 * (1.0 - share) + after.1 * share,
         };
         samples.push(ImuSample { time, gyro: AngularRate(rate), accel: SpecificForce(force) });
