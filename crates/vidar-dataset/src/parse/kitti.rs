@@ -128,10 +128,13 @@ pub(crate) fn date_and_time(text: &str) -> Option<Timestamp> {
         && (0..24).contains(&hours)
         && (0..60).contains(&minutes)
         && (0..61_000_000_000).contains(&secs);
+    if !fits {
+        return None;
+    }
     // Days since 1970 of the Gregorian calendar, whose years are counted from March.
     let (y, m) = if month > 2 { (year, month - 3) } else { (year - 1, month + 9) };
     let days = 365 * y + y / 4 - y / 100 + y / 400 + (153 * m + 2) / 5 + day - 719_469;
-    fits.then(|| Timestamp::from_nanos(((days * 24 + hours) * 60 + minutes) * 60_000_000_000 + secs))
+    Some(Timestamp::from_nanos(((days * 24 + hours) * 60 + minutes) * 60_000_000_000 + secs))
 }
 
 /// A record of KITTI's inertial and satellite navigation.
@@ -208,6 +211,7 @@ mod tests {
             "2011-13-26 1:1:1",
             "2011-09-26 25:00:00",
             "99999999999999999999-1-1 1:1:1",
+            "4000000000000000000-1-1 1:1:1",
             "é-é-é 1:1:1",
         ] {
             assert_eq!(date_and_time(bad), None, "{bad}");
