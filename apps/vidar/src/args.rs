@@ -75,6 +75,11 @@ pub enum Command {
         after_help = "Examples:\n  vidar inspect my_recording/\n  vidar inspect my_recording/ --trajectory vio.tum\n  vidar inspect my_recording/ --json"
     )]
     Inspect(InspectArgs),
+    /// Write any recording as MCAP (ROS 2) or as a folder in EuRoC's layout; times, pixels and numbers stay as they are.
+    #[command(
+        after_help = "Examples:\n  vidar convert my_recording/ out.mcap\n  vidar convert drive.bag mav0_folder/\n  vidar convert scan/ out.mcap --start 10 --end 40 --json"
+    )]
+    Convert(ConvertArgs),
     /// Calibrate camera, clock and mount from an ordinary recording with a gyroscope, or check a given calibration.
     #[command(
         after_help = "Examples:\n  vidar calibrate my_recording/\n  vidar calibrate my_recording/ -o calibration.yaml\n  vidar run my_recording/ --calibration calibration.yaml"
@@ -139,7 +144,8 @@ const RUN_EXAMPLES: &str = "Examples:
 /// How the input is read.
 #[derive(Args, Clone, Debug, Default)]
 pub struct InputArgs {
-    /// Layout of the recording, instead of detecting it: euroc, tum-rgbd, 7scenes, posed-folder, bag, video, images.
+    /// Layout of the recording, instead of detecting it: euroc, tum-rgbd, 7scenes, kitti-raw, kitti, replica, icl-nuim,
+    /// posed-folder, bag, stray-scanner, spectacular-ai, imu-log, video, images.
     #[arg(long, help_heading = "Input")]
     pub format: Option<String>,
     /// Number of the camera (`cam0` is 0).
@@ -217,7 +223,7 @@ pub struct OutputArgs {
 /// `vidar run`.
 #[derive(Args, Clone, Debug)]
 pub struct RunArgs {
-    /// The recording: a bag, a video, or a folder (EuRoC, TUM RGB-D, 7-Scenes, posed folder, images).
+    /// The recording: a bag, a video, or a folder (EuRoC, TUM RGB-D, 7-Scenes, KITTI, a phone's, posed folder, images, …).
     #[arg(value_hint = ValueHint::AnyPath)]
     pub path: PathBuf,
     /// How the input is read.
@@ -310,6 +316,23 @@ pub struct InspectArgs {
     /// The recording.
     #[arg(value_hint = ValueHint::AnyPath)]
     pub path: PathBuf,
+    /// How the input is read.
+    #[command(flatten)]
+    pub input: InputArgs,
+}
+
+/// `vidar convert`.
+#[derive(Args, Clone, Debug)]
+pub struct ConvertArgs {
+    /// The recording: whatever `vidar inspect` opens.
+    #[arg(value_hint = ValueHint::AnyPath)]
+    pub path: PathBuf,
+    /// The new file or folder; it must not exist.
+    #[arg(value_hint = ValueHint::AnyPath)]
+    pub out: PathBuf,
+    /// Layout of the output, instead of that of its name's ending (.mcap, else a folder): mcap, euroc.
+    #[arg(long, help_heading = "Output")]
+    pub to: Option<String>,
     /// How the input is read.
     #[command(flatten)]
     pub input: InputArgs,
@@ -500,6 +523,11 @@ pub enum BenchDataset {
     Euroc,
     /// TUM RGB-D: rgbd_dataset_*/.
     Tum,
+    /// TUM-VI: dataset-*_512_16/ with mav0/.
+    TumVi,
+    /// 7-Scenes: a folder per scene with seq-01/ ….
+    #[value(name = "7scenes")]
+    SevenScenes,
 }
 
 /// `vidar config`.

@@ -84,6 +84,7 @@ fn dispatch(command: Command, context: &Context) -> Outcome {
         Command::Run(args) => commands::run::run(&args, context),
         Command::Demo(args) => commands::run::demo(&args, context),
         Command::Inspect(args) => commands::inspect::inspect(&args, context),
+        Command::Convert(args) => commands::convert::convert(&args, context),
         Command::Calibrate(args) => commands::calibrate::calibrate(&args, context),
         Command::Eval(args) => commands::eval::eval(&args, context),
         Command::Export(args) => commands::export::export(&args, context),

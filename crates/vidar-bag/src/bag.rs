@@ -49,6 +49,7 @@ pub struct Bag {
     parts: Vec<Part>,
     topics: Vec<Topic>,
     warnings: Vec<Warning>,
+    metadata: BTreeMap<String, BTreeMap<String, String>>,
     messages_are_compressed: bool,
     cache: Mutex<Cache>,
 }
@@ -113,6 +114,7 @@ impl Bag {
             parts: Vec::new(),
             topics: Vec::new(),
             warnings: Vec::new(),
+            metadata: BTreeMap::new(),
             messages_are_compressed,
             cache: Mutex::default(),
         };
@@ -161,6 +163,7 @@ impl Bag {
             }));
         }
         self.warnings.extend(index.warnings);
+        self.metadata.extend(index.metadata);
         self.parts.push(Part { chunks: index.chunks, container });
     }
 
@@ -187,6 +190,11 @@ impl Bag {
     /// What was found wrong while listing its messages.
     pub fn warnings(&self) -> &[Warning] {
         &self.warnings
+    }
+
+    /// The texts that its writer left about it under a name (MCAP's metadata).
+    pub fn metadata(&self, name: &str) -> Option<&BTreeMap<String, String>> {
+        self.metadata.get(name)
     }
 
     /// The topic of a message.

@@ -93,6 +93,8 @@ pub(crate) struct FileIndex {
     /// By the number that the file gives to a connection or channel.
     pub topics: BTreeMap<u32, FileTopic>,
     pub messages: usize,
+    /// Named texts about the recording (MCAP).
+    pub metadata: BTreeMap<String, BTreeMap<String, String>>,
     /// The chunk before this place in the file.
     pub last: Option<LastChunk>,
 }

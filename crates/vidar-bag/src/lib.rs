@@ -12,6 +12,7 @@ pub mod message;
 mod metadata;
 mod ros1;
 mod sqlite;
+pub mod write;
 
 pub use bag::{Bag, BagFormat, bags_in};
 pub use error::BagError;

@@ -13,13 +13,14 @@ use vidar_core::Warning;
 
 pub(crate) const MAGIC: &[u8] = b"\x89MCAP0\r\n";
 
-const FOOTER: u8 = 0x02;
-const SCHEMA: u8 = 0x03;
-const CHANNEL: u8 = 0x04;
-const MESSAGE: u8 = 0x05;
-const CHUNK: u8 = 0x06;
-const MESSAGE_INDEX: u8 = 0x07;
-const DATA_END: u8 = 0x0f;
+pub(crate) const FOOTER: u8 = 0x02;
+pub(crate) const SCHEMA: u8 = 0x03;
+pub(crate) const CHANNEL: u8 = 0x04;
+pub(crate) const MESSAGE: u8 = 0x05;
+pub(crate) const CHUNK: u8 = 0x06;
+pub(crate) const MESSAGE_INDEX: u8 = 0x07;
+pub(crate) const METADATA: u8 = 0x0c;
+pub(crate) const DATA_END: u8 = 0x0f;
 
 /// Opcode and length.
 const HEAD_BYTES: u64 = 9;
@@ -29,6 +30,10 @@ const MESSAGE_HEAD_BYTES: u64 = 22;
 const CHUNK_HEAD_BYTES: u64 = 28;
 /// Largest schema or channel; the largest definitions of ROS have under 100 kB.
 const MAX_DESCRIPTION_BYTES: u64 = 16 << 20;
+
+/// Largest record of metadata that is kept, and how many are.
+const MAX_METADATA_BYTES: u64 = 64 << 10;
+const MAX_METADATA: usize = 64;
 
 /// Walks through the file and lists its messages.
 pub(crate) fn index(file: &BagFile) -> Result<FileIndex, BagError> {
@@ -107,6 +112,14 @@ impl Walk<'_> {
                 self.chunk(body, length, window)
             }
             MESSAGE_INDEX => self.message_index(body, length),
+            METADATA if length <= MAX_METADATA_BYTES => {
+                if let Some((name, entries)) = window.get(body, length)?.and_then(metadata_in)
+                    && self.index.metadata.len() < MAX_METADATA
+                {
+                    self.index.metadata.insert(name, entries);
+                }
+                Ok(())
+            }
             _ => Ok(()),
         }
     }
@@ -249,6 +262,18 @@ impl Walk<'_> {
         }
         Ok(())
     }
+}
+
+/// A record of metadata: its name, and texts by key.
+fn metadata_in(body: &[u8]) -> Option<(String, BTreeMap<String, String>)> {
+    let mut bytes = Bytes::new(body);
+    let name = bytes.text()?;
+    let mut map = Bytes::new(bytes.counted()?);
+    let mut entries = BTreeMap::new();
+    while let (Some(key), Some(value)) = (map.text(), map.text()) {
+        entries.insert(key, value);
+    }
+    Some((name, entries))
 }
 
 /// The bytes of the message whose record begins at `offset` of a decompressed chunk.

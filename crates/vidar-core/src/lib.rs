@@ -85,7 +85,7 @@ pub use odometry::{
 };
 pub use printable::{printable, printable_json, printable_lines};
 pub use rig::{ImuNoise, Rig, RigCamera};
-pub use sensor::{AngularRate, Frame, ImuSample, SensorEvent, SpecificForce};
+pub use sensor::{AngularRate, Frame, ImuSample, SensorEvent, SpecificForce, TimedVector, merge_imu};
 pub use surface::{PointCloud, TriangleMesh};
 pub use time::{Duration, TimeError, Timestamp};
 pub use trajectory::{BodyFrame, StampedPose, Trajectory, TrajectoryError};

@@ -26,6 +26,44 @@ pub struct ImuSample {
     pub accel: SpecificForce,
 }
 
+/// A measurement of one three-axis sensor: when, and its value.
+pub type TimedVector = (Timestamp, Vector3<f64>);
+
+/// Time between two accelerometer samples that is always bridged by interpolation, ns: five samples at 50 Hz …
+const BRIDGE_NS: i64 = 100_000_000;
+/// … and in median steps, for slower sensors.
+const BRIDGE_STEPS: i64 = 3;
+
+/// IMU samples at the gyroscope's times, the accelerometer interpolated between its own. Both lists are in order of time; nothing is
+/// invented before the first, after the last, or in a gap of the accelerometer of more than 0.1 s and three median steps.
+pub fn merge_imu(gyro: &[TimedVector], accel: &[TimedVector]) -> Vec<ImuSample> {
+    let mut steps: Vec<i64> = accel.windows(2).map(|w| (w[1].0 - w[0].0).nanos()).collect();
+    steps.sort_unstable();
+    let median = steps.get(steps.len() / 2).copied().unwrap_or(0);
+    let longest = BRIDGE_NS.max(median.saturating_mul(BRIDGE_STEPS));
+    let mut samples = Vec::with_capacity(gyro.len());
+    let mut at = 0;
+    for &(time, rate) in gyro {
+        while at + 1 < accel.len() && accel[at + 1].0 < time {
+            at += 1;
+        }
+        let (Some(&before), Some(&after)) = (accel.get(at), accel.get(at + 1)) else { continue };
+        let step = (after.0 - before.0).nanos();
+        if time < before.0 || time > after.0 || step <= 0 {
+            continue;
+        }
+        let share = (time - before.0).nanos() as f64 / step as f64;
+        let force = match share {
+            0.0 => before.1,
+            1.0 => after.1,
+            _ if step > longest => continue,
+            _ => before.1 * (1.0 - share) + after.1 * share,
+        };
+        samples.push(ImuSample { time, gyro: AngularRate(rate), accel: SpecificForce(force) });
+    }
+    samples
+}
+
 /// One image as captured.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Frame {
@@ -72,5 +110,26 @@ impl SensorEvent {
             Self::Imu(sample) => sample.time,
             Self::Depth { time, .. } | Self::GroundTruth { time, .. } => *time,
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn at(ms: i64, value: f64) -> TimedVector {
+        (Timestamp::from_nanos(ms * 1_000_000), Vector3::repeat(value))
+    }
+
+    #[test]
+    fn the_accelerometer_is_interpolated_and_not_invented() {
+        let gyro: Vec<_> = [0, 10, 15, 20, 30, 300, 500].map(|ms| at(ms, 0.5)).to_vec();
+        let accel = [at(10, 1.0), at(20, 2.0), at(40, 4.0), at(500, 9.0)];
+        let merged = merge_imu(&gyro, &accel);
+        let found: Vec<(i64, f64)> =
+            merged.iter().map(|s| (s.time.nanos() / 1_000_000, s.accel.0.x)).collect();
+        // Nothing before the first and nothing at 300 ms, in a gap of 460 ms; a sample at its very end is one.
+        assert_eq!(found, [(10, 1.0), (15, 1.5), (20, 2.0), (30, 3.0), (500, 9.0)]);
+        assert!(merge_imu(&gyro, &accel[..1]).is_empty());
     }
 }

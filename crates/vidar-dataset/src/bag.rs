@@ -1,21 +1,21 @@
 //! ROS 1 bags, ROS 2 bags and MCAP files: one camera, its calibration, IMU, depth and poses.
 
-use crate::dataset::CalibrationSource;
+use crate::bag_camera::{is_beside, read_calibration, use_facts};
+use crate::convert::facts::{self, Facts};
 use crate::draft::{Draft, DraftCamera, DraftDepth};
 use crate::error::DatasetError;
 use crate::location::locate;
 use crate::options::{DatasetKind, OpenOptions, PoseUse};
-use crate::topics::{self, Choice, problem};
+use crate::topics::{self, problem};
 use crate::transforms::{Frames, rigid};
-use nalgebra::{Matrix3, Vector3};
+use nalgebra::Vector3;
 use std::cell::Cell;
 use std::path::Path;
 use std::sync::Arc;
-use vidar_bag::{Bag, CameraInfo, Header, Message, MessageRef, Role, Topic, role_of};
-use vidar_core::camera::{Equidistant, RadTan};
+use vidar_bag::{Bag, Header, Message, MessageRef, Role, Topic, role_of};
 use vidar_core::{
-    AngularRate, BodyFrame, CameraId, CameraModel, ImuNoise, ImuSample, LieGroup, Pinhole, Se3, So3,
-    SpecificForce, StampedPose, Timestamp, Trajectory, Warning,
+    AngularRate, BodyFrame, CameraId, ImuNoise, ImuSample, Se3, SpecificForce, StampedPose, Timestamp,
+    Trajectory, Warning,
 };
 
 /// Looks for a bag in a folder.
@@ -34,7 +34,15 @@ pub(crate) fn detect(path: &Path) -> Option<String> {
 /// Reads the recording's index, calibration, IMU and poses; images stay in it.
 pub(crate) fn open(path: &Path, reason: String, options: &OpenOptions) -> Result<Draft, DatasetError> {
     let bag = Arc::new(Bag::open(path)?);
-    let choice = topics::choose(&bag, options)?;
+    let mut choice = topics::choose(&bag, options)?;
+    // What VIDAR's own conversions leave beside the messages.
+    let facts = bag.metadata(facts::NAME).map(Facts::from_map).unwrap_or_default();
+    let named = [(&facts.truth_topic, PoseUse::GroundTruth), (&facts.trajectory_topic, PoseUse::Trajectory)];
+    if choice.poses.is_empty() {
+        let topic = |name: &String| bag.topics().iter().find(|t| t.name == *name && !t.messages.is_empty());
+        choice.poses =
+            named.into_iter().filter_map(|(name, used)| Some((used, topic(name.as_ref()?)?))).collect();
+    }
     let mut draft = Draft::new(DatasetKind::Bag, path, format!("{reason}; images of {}", choice.image.name));
     draft.warnings.extend(bag.warnings().iter().cloned());
     draft.warnings.extend(choice.warnings.iter().cloned());
@@ -50,21 +58,26 @@ pub(crate) fn open(path: &Path, reason: String, options: &OpenOptions) -> Result
     let camera_frame = first.map(|m| bag.header(m)).transpose()?.unwrap_or_default().frame;
     draft.cameras = vec![DraftCamera::unknown(choice.camera)];
     draft.images = locate(&bag, choice.image, |m| clock.stamp(m))?;
-    let imu_frame = read_imu(&mut draft, &mut clock, choice.imu)?;
+    let imu_frame = read_imu(&mut draft, &mut clock, choice.imu, facts.imu_noise)?;
     let frames = read_frames(&mut draft, &bag);
     read_calibration(&mut draft, &bag, &choice, &camera_frame)?;
+    use_facts(&mut draft, &facts);
     if let Some(imu_frame) = &imu_frame {
         read_extrinsics(&mut draft, &frames, imu_frame, &camera_frame);
     }
     if let Some(depth) = choice.depth {
         read_depth(&mut draft, &bag, depth, &clock, &frames, imu_frame.as_deref().unwrap_or(&camera_frame))?;
+        if let Some(stated) = draft.depth.as_mut() {
+            stated.units_per_metre = facts.depth_units_per_metre;
+        }
     }
     for (used, topic) in &choice.poses {
         let known = Known { frames: &frames, imu: imu_frame.as_deref(), camera: &camera_frame };
         read_poses(&mut draft, &clock, topic, *used, &known)?;
     }
     let without = clock.without_stamp.get();
-    if without > 0 {
+    // VIDAR's own conversions stamp every message; zero is a time then.
+    if without > 0 && bag.metadata(facts::NAME).is_none() {
         let message =
             format!("{without} messages have no stamp; the times at which they were logged are used");
         draft.warnings.push(Warning::new("stamp-missing", message).at(path.display()));
@@ -98,6 +111,7 @@ fn read_imu(
     draft: &mut Draft,
     clock: &mut Clock<'_>,
     topic: Option<&Topic>,
+    noise: Option<ImuNoise>,
 ) -> Result<Option<String>, DatasetError> {
     let Some(topic) = topic else { return Ok(None) };
     let (mut frame, mut unread) = (String::new(), None);
@@ -125,12 +139,11 @@ fn read_imu(
         let message = format!("{} IMU samples are not finite; skipped", before - draft.imu.len());
         draft.warnings.push(Warning::new("sample-not-finite", message).at(&place));
     }
-    let message = "a bag states no noise densities of its IMU; those of EuRoC's ADIS16448 are used";
-    draft
-        .warnings
-        .push(Warning::new("imu-noise", message).at(&place).hint("--calibration imu.yaml (Kalibr)"));
-    let rate_hz = topic.rate_hz().unwrap_or(ImuNoise::EUROC.rate_hz);
-    draft.imu_noise = Some(ImuNoise { rate_hz, ..ImuNoise::EUROC });
+    draft.imu_noise = noise;
+    if noise.is_none() {
+        let rate_hz = topic.rate_hz().unwrap_or(ImuNoise::EUROC.rate_hz);
+        draft.assume_imu_noise("a bag", rate_hz, &place);
+    }
     Ok(Some(frame))
 }
 
@@ -157,103 +170,6 @@ fn read_frames(draft: &mut Draft, bag: &Bag) -> Frames {
         }
     }
     frames
-}
-
-/// Takes the camera's model from the topic of calibrations that belongs to the images.
-fn read_calibration(
-    draft: &mut Draft,
-    bag: &Bag,
-    choice: &Choice<'_>,
-    camera_frame: &str,
-) -> Result<(), DatasetError> {
-    let infos: Vec<&Topic> = bag
-        .topics()
-        .iter()
-        .filter(|t| !t.messages.is_empty() && role_of(&t.message_type, t.encoding) == Some(Role::CameraInfo))
-        .collect();
-    let beside = |t: &&&Topic| is_beside(&choice.image.name, &t.name);
-    let same_frame = |t: &&&Topic| {
-        let header = t.messages.first().and_then(|m| bag.header(m).ok());
-        header.is_some_and(|h| !h.frame.is_empty() && h.frame == camera_frame)
-    };
-    let Some(topic) = infos.iter().find(beside).or_else(|| infos.iter().find(same_frame)) else {
-        return Ok(());
-    };
-    let Some(Message::CameraInfo(info)) = topic.messages.first().map(|m| bag.read(m)).transpose()? else {
-        return Ok(());
-    };
-    if info.k[0] == 0.0 {
-        let message = format!("{} states no calibration (its K is zero); it is not used", topic.name);
-        draft.warnings.push(Warning::new("calibration-empty", message).at(bag.path().display()));
-        return Ok(());
-    }
-    let is_rectified = choice.image.name.contains("rect");
-    let camera = &mut draft.cameras[0];
-    camera.model = Some(model_of(&info, is_rectified, bag, topic)?);
-    camera.source = CalibrationSource::Topic(topic.name.clone());
-    if is_rectified && let Some(rotation) = So3::from_matrix(&Matrix3::from_row_slice(&info.r)) {
-        // The rectified camera is the camera turned by R; completed with the mount by `read_extrinsics`.
-        camera.body_from_camera = Se3::new(rotation.inverse(), Vector3::zeros());
-    }
-    Ok(())
-}
-
-/// Whether a topic of calibrations lies beside a topic of images: the same name but for its last part (two for `/compressed`).
-fn is_beside(image: &str, info: &str) -> bool {
-    let Some((folder, _)) = info.rsplit_once('/') else { return false };
-    let mut parent = image.rsplit_once('/').map(|(p, _)| p);
-    for _ in 0..2 {
-        if parent == Some(folder) {
-            return true;
-        }
-        parent = parent.and_then(|p| p.rsplit_once('/')).map(|(p, _)| p);
-    }
-    false
-}
-
-/// The model that a calibration of ROS states (`image_geometry`; REP 104).
-fn model_of(
-    info: &CameraInfo,
-    is_rectified: bool,
-    bag: &Bag,
-    topic: &Topic,
-) -> Result<CameraModel, DatasetError> {
-    let (path, key) = (bag.path(), topic.name.as_str());
-    let bad = |source| DatasetError::BadCamera { path: path.to_path_buf(), key: key.into(), source };
-    let unsupported = |found: String| DatasetError::UnsupportedCamera {
-        path: path.to_path_buf(),
-        key: key.into(),
-        found,
-        expected: "plumb_bob, rational_polynomial with k4 = k5 = k6 = 0, equidistant",
-    };
-    let (width, height) = (info.width as usize, info.height as usize);
-    let [fx, fy, cx, cy] = match is_rectified {
-        true => [info.p[0], info.p[5], info.p[2], info.p[6]],
-        false => [info.k[0], info.k[4], info.k[2], info.k[5]],
-    };
-    let pinhole = Pinhole::new(fx, fy, cx, cy, width, height).map_err(bad)?;
-    let at = |i: usize| info.distortion.get(i).copied().unwrap_or(0.0);
-    if is_rectified || info.distortion.iter().all(|&d| d == 0.0) {
-        return Ok(CameraModel::Pinhole(pinhole));
-    }
-    match info.distortion_model.to_ascii_lowercase().as_str() {
-        "plumb_bob" | "radtan" | "rational_polynomial" | "" => {
-            if (5..info.distortion.len()).any(|i| at(i) != 0.0) {
-                return Err(unsupported(format!(
-                    "{} with {} coefficients",
-                    info.distortion_model,
-                    info.distortion.len()
-                )));
-            }
-            let coefficients = [at(0), at(1), at(2), at(3)];
-            RadTan::with_k3(pinhole, coefficients, at(4)).map(CameraModel::RadTan).map_err(bad)
-        }
-        "equidistant" | "fisheye" | "kannala_brandt" | "kannala_brandt4" => {
-            let coefficients = [at(0), at(1), at(2), at(3)];
-            Equidistant::new(pinhole, coefficients).map(CameraModel::Equidistant).map_err(bad)
-        }
-        other => Err(unsupported(vidar_core::printable(other).to_string())),
-    }
 }
 
 /// The camera's pose on the IMU, from the fixed transforms.

@@ -6,6 +6,7 @@
 
 use crate::error::DatasetError;
 use crate::source::read_file_up_to;
+use image::metadata::Orientation;
 use image::{ColorType, DynamicImage, ImageDecoder};
 use std::io::Cursor;
 use std::path::Path;
@@ -32,7 +33,7 @@ impl Default for ImageLimits {
 const DEFLATE_MAX_EXPANSION: u64 = 1032;
 
 /// Reads an image file as grey or colour; alpha is dropped, palettes and 1/2/4-bit grey are expanded, 16-bit
-/// colour is rounded to 8 bits.
+/// colour is rounded to 8 bits. A photograph is turned upright as its EXIF says.
 pub fn read_image(path: &Path, limits: &ImageLimits) -> Result<FrameImage, DatasetError> {
     let bytes = read_file_up_to(path, limits.max_file_bytes)?;
     decode_image(&bytes, limits).map_err(|reason| bad_image(path, reason))
@@ -47,16 +48,27 @@ pub fn read_depth(path: &Path, limits: &ImageLimits) -> Result<Image<u16>, Datas
     }
 }
 
-/// The size in the header of an image file, columns and rows.
+/// The size in the header of an image file, columns and rows, upright.
 pub fn read_size(path: &Path, limits: &ImageLimits) -> Result<(usize, usize), DatasetError> {
     // Headers may follow kilobytes of metadata, so the decoder decides how much it reads.
     let bytes = read_file_up_to(path, limits.max_file_bytes)?;
     open_decoder(&bytes, limits)
-        .map(|d| {
+        .map(|mut d| {
             let (width, height) = d.dimensions();
-            (width as usize, height as usize)
+            let (width, height) = (width as usize, height as usize);
+            if lies_on_its_side(orientation(d.as_mut())) { (height, width) } else { (width, height) }
         })
         .map_err(|reason| bad_image(path, reason))
+}
+
+/// How the picture is to be turned; not at all where its EXIF is damaged.
+fn orientation(decoder: &mut dyn ImageDecoder) -> Orientation {
+    decoder.orientation().unwrap_or(Orientation::NoTransforms)
+}
+
+fn lies_on_its_side(orientation: Orientation) -> bool {
+    use Orientation::{Rotate90, Rotate90FlipH, Rotate270, Rotate270FlipH};
+    matches!(orientation, Rotate90 | Rotate270 | Rotate90FlipH | Rotate270FlipH)
 }
 
 fn bad_image(path: &Path, reason: String) -> DatasetError {
@@ -130,9 +142,9 @@ pub fn decode_image(bytes: &[u8], limits: &ImageLimits) -> Result<FrameImage, St
     if matches!(format_of(bytes)?, Format::Jpeg) && !jpeg_is_complete(bytes) {
         return Err(format!("truncated: {} bytes of JPEG without an end-of-image marker", bytes.len()));
     }
-    let decoder = open_decoder(bytes, limits)?;
-    let color = decoder.color_type();
-    let decoded = DynamicImage::from_decoder(decoder).map_err(|e| {
+    let mut decoder = open_decoder(bytes, limits)?;
+    let (color, turn) = (decoder.color_type(), orientation(decoder.as_mut()));
+    let mut decoded = DynamicImage::from_decoder(decoder).map_err(|e| {
         let text = e.to_string();
         if text.to_lowercase().contains("eof") || text.contains("end of file") || text.contains("end of data")
         {
@@ -141,6 +153,7 @@ pub fn decode_image(bytes: &[u8], limits: &ImageLimits) -> Result<FrameImage, St
             text
         }
     })?;
+    decoded.apply_orientation(turn);
     to_frame_image(color, decoded)
 }
 

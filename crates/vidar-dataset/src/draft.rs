@@ -119,6 +119,15 @@ impl Draft {
         Ok(bytes)
     }
 
+    /// Uses EuRoC's noise densities at the samples' rate for an IMU of which `what` states none.
+    pub(crate) fn assume_imu_noise(&mut self, what: &str, rate_hz: f64, place: &str) {
+        let message =
+            format!("{what} states no noise densities of its IMU; those of EuRoC's ADIS16448 are used");
+        let warning = Warning::new("imu-noise", message).at(place);
+        self.warnings.push(warning.hint("--calibration imu.yaml (Kalibr)"));
+        self.imu_noise = Some(ImuNoise { rate_hz, ..ImuNoise::EUROC });
+    }
+
     /// Completes the dataset. The order of the steps follows their dependencies.
     pub(crate) fn finish(mut self, options: &OpenOptions) -> Result<Dataset, DatasetError> {
         for path in &options.calibration {

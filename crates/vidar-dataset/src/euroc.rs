@@ -90,6 +90,7 @@ pub(crate) fn open(path: &Path, layout: EurocLayout, options: &OpenOptions) -> R
     let mut draft = Draft::new(DatasetKind::EurocAsl, &layout.root, layout.reason.clone());
     let body_from_imu = read_imu(&mut draft, options)?;
     read_cameras(&mut draft, path, &layout, &body_from_imu, options)?;
+    read_tum_vi_calibration(&mut draft)?;
     read_truth(&mut draft, &body_from_imu)?;
     read_depth(&mut draft, &body_from_imu, options)?;
     draft.reference_cloud = Some(layout.root.join("pointcloud0").join("data.ply")).filter(|p| p.is_file());
@@ -240,6 +241,24 @@ fn list_by_names(draft: &mut Draft, data: &Path) -> Result<Vec<(Timestamp, PathB
             Ok((time, data.join(name)))
         })
         .collect()
+}
+
+/// TUM-VI: `dso/camchain.yaml` beside `mav0` (Kalibr's) calibrates the camera where its `sensor.yaml` does not.
+fn read_tum_vi_calibration(draft: &mut Draft) -> Result<(), DatasetError> {
+    let absolute = draft.root.canonicalize().unwrap_or_else(|_| draft.root.clone());
+    let Some(folder) = absolute.parent().map(|p| p.join("dso")) else { return Ok(()) };
+    let is_known = draft.cameras.get(draft.chosen).is_none_or(|c| c.model.is_some());
+    let chain = folder.join("camchain.yaml");
+    if !is_known && chain.is_file() {
+        draft.apply_calibration(&chain)?;
+    }
+    let imu = folder.join("imu_config.yaml");
+    let states_noise = draft.warnings.iter().all(|w| w.kind != "imu-noise");
+    if !states_noise && imu.is_file() {
+        draft.apply_calibration(&imu)?;
+        draft.warnings.retain(|w| w.kind != "imu-noise");
+    }
+    Ok(())
 }
 
 /// Reference poses, best first: estimated states, mocap, laser tracker.

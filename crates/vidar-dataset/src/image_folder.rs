@@ -2,16 +2,17 @@
 
 use crate::dataset::CalibrationSource;
 use crate::draft::Draft;
-use crate::error::DatasetError;
+use crate::error::{DatasetError, io_error};
 use crate::folder::{
     MAX_NAME_STEP, first_file, images_in, names_in, numbers_of, stem, synthetic_time, synthetic_warning,
 };
 use crate::location::files;
 use crate::options::{DatasetKind, OpenOptions};
 use crate::parse::units::decide_unit;
-use crate::parse::{self, Source, UnitRule};
+use crate::parse::{self, PhotoExif, Source, UnitRule};
 use crate::seven_scenes::checked_pinhole;
 use std::collections::HashMap;
+use std::io::Read;
 use std::path::{Path, PathBuf};
 use vidar_core::{CameraModel, Timestamp, Warning};
 
@@ -54,7 +55,62 @@ pub(crate) fn open(
     };
     draft.images = files(images);
     read_intrinsics(&mut draft, folder)?;
+    use_exif(&mut draft, folder)?;
     Ok(draft)
+}
+
+/// EXIF lies in the first segments of a file, of which none has more than 64 kB.
+const EXIF_BYTES: u64 = 256 << 10;
+
+fn exif_of(path: &Path) -> Result<PhotoExif, DatasetError> {
+    let mut head = Vec::new();
+    let file = std::fs::File::open(path).map_err(io_error(path))?;
+    file.take(EXIF_BYTES).read_to_end(&mut head).map_err(io_error(path))?;
+    Ok(parse::photo_exif(&head))
+}
+
+/// Photographs state the focal length and when they were taken; used where nothing else does.
+fn use_exif(draft: &mut Draft, folder: &Path) -> Result<(), DatasetError> {
+    let Some(first) = draft.images.first().and_then(|(_, l)| l.as_file()).map(Path::to_path_buf) else {
+        return Ok(());
+    };
+    let stated = exif_of(&first)?;
+    if draft.cameras[0].model.is_none()
+        && stated.focal_35mm.is_some()
+        && let Ok(size) = draft.media.size(&first.clone().into())
+        && let Some(focal) = stated.focal_px(size)
+    {
+        let centre = [0.5 * size.0 as f64 - 0.5, 0.5 * size.1 as f64 - 0.5];
+        let pinhole = checked_pinhole([focal, focal, centre[0], centre[1]], &first)?;
+        let message = format!(
+            "focal length {focal:.0} px by EXIF ({:.0} mm of 35 mm film), true within some percent: still a guess for metric results",
+            stated.focal_35mm.unwrap_or_default()
+        );
+        let warning = Warning::new("intrinsics-guessed", message).at(first.display());
+        draft.warnings.push(warning.hint("--calibration FILE, or --camera-model pinhole:fx,fy,cx,cy"));
+        draft.cameras[0].model = Some(CameraModel::Pinhole(pinhole));
+    }
+    if !draft.times_are_invented || stated.time.is_none() {
+        return Ok(());
+    }
+    let mut timed = Vec::with_capacity(draft.images.len());
+    for (_, location) in &draft.images {
+        let Some(time) = location.as_file().map(exif_of).transpose()?.and_then(|e| e.time) else {
+            return Ok(());
+        };
+        timed.push((time, location.clone()));
+    }
+    // Seconds without fraction give bursts equal times; numbers of frames are better then.
+    if timed.windows(2).all(|w| w[0].0 < w[1].0) {
+        draft.images = timed;
+        draft.times_are_invented = false;
+        draft.warnings.retain(|w| w.kind != "times-synthesised");
+        let message = "image times are those of EXIF, by the camera's clock and time zone";
+        draft
+            .warnings
+            .push(Warning::new("times-exif", message).at(folder.display()).hint("--timestamps FILE"));
+    }
+    Ok(())
 }
 
 /// The user's file of times, or a file with a usual name in the folder.
@@ -102,7 +158,7 @@ pub(crate) fn images_by_list(
 }
 
 /// Times from names that are numbers of seconds, ms, µs or ns, else frame numbers at 30 Hz.
-fn images_by_name(
+pub(crate) fn images_by_name(
     draft: &mut Draft,
     folder: &Path,
     names: &[String],
@@ -152,7 +208,7 @@ fn times_from_stems(
 }
 
 /// A matrix of intrinsics or an EuRoC or Kalibr file next to the images.
-fn read_intrinsics(draft: &mut Draft, folder: &Path) -> Result<(), DatasetError> {
+pub(crate) fn read_intrinsics(draft: &mut Draft, folder: &Path) -> Result<(), DatasetError> {
     let matrices = ["K.txt", "intrinsics.txt", "camera-intrinsics.txt"];
     let root = draft.root.clone();
     if let Some(path) = first_file(&root, &matrices).or_else(|| first_file(folder, &matrices)) {

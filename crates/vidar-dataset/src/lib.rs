@@ -2,9 +2,11 @@
 
 mod assemble;
 mod bag;
+mod bag_camera;
 mod calibration;
 pub mod camera_flag;
 mod checks;
+pub mod convert;
 mod dataset;
 pub mod decode;
 mod draft;
@@ -13,13 +15,21 @@ mod euroc;
 mod events;
 mod folder;
 mod image_folder;
+mod imu_log;
+mod inertial;
+mod kitti;
+mod kitti_raw;
 mod location;
 mod options;
 pub mod parse;
+mod phone;
 mod posed_folder;
+mod rendered;
 mod rig_checks;
 mod seven_scenes;
 mod source;
+mod spectacular;
+mod stray_scanner;
 mod topics;
 mod trajectory_file;
 mod transforms;
@@ -72,10 +82,25 @@ fn open_file(path: &Path, options: &OpenOptions) -> Result<Dataset, DatasetError
         return bag::open(path, reason, options)?.finish(options);
     }
     if vidar_video::is_video(&head) && !wrong_thing::is_picture(&head) {
-        let draft = video::open(path, "its first bytes are those of mp4 and mov".into(), options)?;
+        let mut draft = video::open(path, "its first bytes are those of mp4 and mov".into(), options)?;
+        if path.parent().is_some_and(is_recording_of_phone) {
+            let message = format!(
+                "it is part of a phone's recording, whose sensors are read with the folder {}",
+                path.with_file_name("").display()
+            );
+            draft.warnings.push(vidar_core::Warning::new("folder-beside", message).at(path.display()));
+        }
         return draft.finish(options);
     }
     Err(wrong_thing::describe(path, &head))
+}
+
+/// Whether a folder holds more than the video that was given.
+fn is_recording_of_phone(folder: &Path) -> bool {
+    let folder = if folder.as_os_str().is_empty() { Path::new(".") } else { folder };
+    stray_scanner::detect(folder).is_some()
+        || spectacular::detect(folder).is_some()
+        || imu_log::detect(folder).is_some()
 }
 
 /// Reads `path` as one kind; `None` when the path does not have that layout.
@@ -109,14 +134,33 @@ fn try_kind(
             let found = video::only_one_in(path);
             found.map(|(file, reason)| video::open(&file, reason, options)).transpose()
         }
+        DatasetKind::StrayScanner => stray_scanner::detect(path)
+            .map_or(Ok(None), |reason| single(stray_scanner::open(path, reason, options))),
+        DatasetKind::SpectacularAi => {
+            spectacular::detect(path).map(|reason| spectacular::open(path, reason, options)).transpose()
+        }
+        DatasetKind::ImuLog => {
+            imu_log::detect(path).map_or(Ok(None), |log| single(imu_log::open(path, log, options)))
+        }
+        DatasetKind::KittiRaw => {
+            kitti_raw::detect(path).map(|reason| kitti_raw::open(path, reason, options)).transpose()
+        }
+        DatasetKind::KittiOdometry => {
+            kitti::detect(path).map(|reason| kitti::open(path, reason, options)).transpose()
+        }
+        DatasetKind::Replica => rendered::detect_replica(path)
+            .map_or(Ok(None), |reason| single(rendered::open_replica(path, reason, options))),
+        DatasetKind::IclNuim => rendered::detect_icl(path)
+            .map_or(Ok(None), |reason| single(rendered::open_icl(path, reason, options))),
         DatasetKind::ImageFolder => image_folder::detect(path)
             .map_or(Ok(None), |(folder, reason)| single(image_folder::open(path, &folder, reason, options))),
     }
 }
 
 fn unknown(path: &Path, found: String) -> DatasetError {
-    let expected = "mav0/cam0/data.csv (EuRoC), rgb.txt (TUM RGB-D), frame-*.color.* (7-Scenes), \
-                    images/ with poses.txt, a bag (.bag, .mcap, .db3, metadata.yaml), or a folder of PNG or JPEG \
-                    images";
+    let expected = "mav0/cam0/data.csv (EuRoC, TUM-VI), rgb.txt (TUM RGB-D, ETH3D), frame-*.color.* (7-Scenes), \
+                    image_00/data or image_0 with times (KITTI), results/frame* (Replica), associations.txt (ICL-NUIM), \
+                    images/ with poses.txt, a bag (.bag, .mcap, .db3, metadata.yaml), a phone's recording (odometry.csv \
+                    with rgb.mp4, data.jsonl, or a table of an IMU beside a video), or a folder of PNG or JPEG images";
     DatasetError::UnknownLayout { path: path.to_path_buf(), found, expected: expected.to_string() }
 }

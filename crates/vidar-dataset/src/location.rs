@@ -85,7 +85,12 @@ pub(crate) fn files(list: Vec<(Timestamp, PathBuf)>) -> Vec<(Timestamp, Location
 pub(crate) struct Media {
     pub bag: Option<Arc<Bag>>,
     pub video: Option<Arc<Video>>,
+    /// A folder of confidences, named as the depth images are.
+    pub depth_confidence: Option<PathBuf>,
 }
+
+/// Depth of a lower confidence is none: 0 is low, 1 medium, 2 high (ARKit's `ARConfidenceLevel`).
+const MIN_CONFIDENCE: u8 = 1;
 
 /// Depth as it is stored.
 pub(crate) enum StoredDepth {
@@ -122,13 +127,38 @@ impl Media {
     /// Decodes a depth image.
     pub(crate) fn depth(&self, location: &Location) -> Result<StoredDepth, DatasetError> {
         let Some(message) = self.message(location)? else {
-            return decode::read_depth(location.path(), &ImageLimits::default()).map(StoredDepth::Units);
+            let raw = decode::read_depth(location.path(), &ImageLimits::default())?;
+            return self.confident(location.path(), raw).map(StoredDepth::Units);
         };
         match pixels(&message).map_err(|reason| bad_image(location, reason))? {
             Pixels::Float(metres) => Ok(StoredDepth::Metres(metres)),
             Pixels::Image(FrameImage::Gray16(raw)) => Ok(StoredDepth::Units(raw)),
             Pixels::Image(_) => Err(bad_image(location, "8-bit pixels; depth is 16UC1 or 32FC1".into())),
         }
+    }
+
+    /// Depth with 0 where its confidence is low; as it is where there is no confidence.
+    fn confident(&self, depth: &Path, raw: Image<u16>) -> Result<Image<u16>, DatasetError> {
+        let beside = |folder: &PathBuf| Some(folder.join(depth.file_name()?));
+        let Some(path) = self.depth_confidence.as_ref().and_then(beside).filter(|p| p.is_file()) else {
+            return Ok(raw);
+        };
+        let reason = match decode::read_image(&path, &ImageLimits::default())? {
+            FrameImage::Gray8(levels) if (levels.width(), levels.height()) == (raw.width(), raw.height()) => {
+                let kept = |(depth, level): (&u16, &u8)| if *level < MIN_CONFIDENCE { 0 } else { *depth };
+                let pixels = raw.data().iter().zip(levels.data()).map(kept).collect();
+                return Image::from_vec(raw.width(), raw.height(), pixels)
+                    .map_err(|e| DatasetError::BadImage { path: path.clone(), reason: e.to_string() });
+            }
+            other => format!(
+                "{}x{} levels of confidence, depth is {}x{}",
+                other.width(),
+                other.height(),
+                raw.width(),
+                raw.height()
+            ),
+        };
+        Err(DatasetError::BadImage { path, reason })
     }
 
     /// Columns and rows.

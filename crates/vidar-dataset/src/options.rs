@@ -21,18 +21,39 @@ pub enum DatasetKind {
     Bag,
     /// An mp4 or mov, with the telemetry of an action camera where there is any.
     Video,
+    /// Stray Scanner on iOS (`rgb.mp4`, `odometry.csv`, `camera_matrix.csv`, …).
+    StrayScanner,
+    /// Spectacular AI (`data.jsonl`, `data.mp4`, `calibration.json`).
+    SpectacularAi,
+    /// A table of gyroscope and accelerometer beside a video or a folder of frames, as loggers of phones write it.
+    ImuLog,
+    /// KITTI raw (`image_00/data`, `oxts/`, `calib_cam_to_cam.txt`).
+    KittiRaw,
+    /// KITTI odometry (`image_0`, `times.txt`, `calib.txt`).
+    KittiOdometry,
+    /// Replica as NICE-SLAM renders it (`results/frame000000.jpg`, `traj.txt`, `cam_params.json`).
+    Replica,
+    /// ICL-NUIM (`rgb/`, `depth/`, `associations.txt`, `*.gt.freiburg`).
+    IclNuim,
     /// Images in one folder, with or without a file of times.
     ImageFolder,
 }
 
 impl DatasetKind {
     /// Every kind, in the order in which a path is tried.
-    pub const ALL: [Self; 7] = [
+    pub const ALL: [Self; 14] = [
         Self::EurocAsl,
         Self::TumRgbd,
         Self::SevenScenes,
+        Self::KittiRaw,
+        Self::KittiOdometry,
+        Self::Replica,
+        Self::IclNuim,
         Self::PosedFolder,
         Self::Bag,
+        Self::StrayScanner,
+        Self::SpectacularAi,
+        Self::ImuLog,
         Self::Video,
         Self::ImageFolder,
     ];
@@ -46,6 +67,13 @@ impl DatasetKind {
             Self::PosedFolder => "posed-folder",
             Self::Bag => "bag",
             Self::Video => "video",
+            Self::StrayScanner => "stray-scanner",
+            Self::SpectacularAi => "spectacular-ai",
+            Self::ImuLog => "imu-log",
+            Self::KittiRaw => "kitti-raw",
+            Self::KittiOdometry => "kitti",
+            Self::Replica => "replica",
+            Self::IclNuim => "icl-nuim",
             Self::ImageFolder => "images",
         }
     }

@@ -207,10 +207,12 @@ fn is_column_names(text: &str) -> bool {
     let first_is_word = fields.next().is_some_and(|f| f.starts_with(|c: char| c.is_ascii_alphabetic()));
     let known = ["time", "stamp", "nsec", "sec", "p_x", "tx"];
     let lower = text.to_ascii_lowercase();
-    first_is_word
-        && known.iter().any(|k| lower.contains(k))
-        && !lower.contains(".png")
-        && !lower.contains(".jp")
+    let names_images = lower.contains(".png") || lower.contains(".jp");
+    // A row of words is names of columns whatever they are; "nan" is a number.
+    let is_word = |f: &str| f.starts_with(|c: char| c.is_ascii_alphabetic()) && f.parse::<f64>().is_err();
+    let words = text.split([',', '\t', ';']).map(str::trim);
+    let all_words = words.clone().count() >= 4 && words.clone().all(is_word);
+    first_is_word && !names_images && (all_words || known.iter().any(|k| lower.contains(k)))
 }
 
 /// A field as shown in a message: cut and with control characters escaped.

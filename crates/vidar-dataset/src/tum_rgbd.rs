@@ -1,14 +1,16 @@
-//! TUM RGB-D: `rgb.txt`, `depth.txt`, `groundtruth.txt`, `accelerometer.txt`.
+//! TUM RGB-D: `rgb.txt`, `depth.txt`, `groundtruth.txt`, `accelerometer.txt`; ETH3D SLAM, the same with `calibration.txt` and `imu.txt`.
 //!
-//! Depth is registered to the colour camera, in units of 1/5000 m; poses are the colour camera's. The files hold no
+//! Depth is registered to the colour camera, in units of 1/5000 m; poses are the colour camera's. TUM's files hold no
 //! calibration: the calibration that the dataset's authors publish for each of the three cameras is used, with a warning.
 
 use crate::dataset::CalibrationSource;
 use crate::draft::{Draft, DraftDepth};
 use crate::error::DatasetError;
+use crate::inertial;
 use crate::location::files;
 use crate::options::{DatasetKind, OpenOptions, TimeUnit, TrajectoryFormat, TrajectoryReadOptions};
 use crate::parse::{self, Source, UnitRule};
+use crate::seven_scenes::checked_pinhole;
 use crate::trajectory_file::{ReadPoses, read_poses};
 use std::path::{Path, PathBuf};
 use vidar_core::camera::RadTan;
@@ -46,6 +48,19 @@ pub(crate) fn open(path: &Path, reason: String, options: &OpenOptions) -> Result
             is_registered: true,
         });
     }
+    read_calibration(&mut draft)?;
+    let imu = path.join("imu.txt");
+    if imu.is_file()
+        && let Some(table) = inertial::imu_file_at(&imu)?
+    {
+        inertial::read_imu(&mut draft, &[table], options, "ETH3D")?;
+        let message = "no pose of the camera on the IMU is given; assumed: the same position and axes";
+        let warning = Warning::degraded("extrinsics-missing", message).at(imu.display());
+        draft.warnings.push(
+            warning
+                .hint("--calibration camchain.yaml (Kalibr) gives it; `vidar calibrate` finds the rotation"),
+        );
+    }
     let list = path.join("accelerometer.txt");
     if list.is_file() {
         let bytes = draft.read(&list)?;
@@ -69,6 +84,19 @@ pub(crate) fn open(path: &Path, reason: String, options: &OpenOptions) -> Result
         draft.ground_truth = Some((trajectory, truth));
     }
     Ok(draft)
+}
+
+/// ETH3D's `calibration.txt`: `fx fy cx cy` of images without distortion.
+fn read_calibration(draft: &mut Draft) -> Result<(), DatasetError> {
+    let file = draft.root.join("calibration.txt");
+    if !file.is_file() {
+        return Ok(());
+    }
+    let bytes = draft.read(&file)?;
+    let intrinsics = parse::intrinsics_matrix(&Source { path: &file, bytes: &bytes })?;
+    draft.cameras[0].model = Some(CameraModel::Pinhole(checked_pinhole(intrinsics, &file)?));
+    draft.cameras[0].source = CalibrationSource::File(file);
+    Ok(())
 }
 
 fn read_list(

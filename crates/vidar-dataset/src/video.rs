@@ -7,21 +7,26 @@ use crate::location::Location;
 use crate::options::{DatasetKind, OpenOptions};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use vidar_core::{ImuNoise, Warning};
+use vidar_core::{Timestamp, Warning};
 use vidar_video::{Telemetry, Video};
 
 /// The video of a folder that holds one and no images.
 pub(crate) fn only_one_in(folder: &Path) -> Option<(PathBuf, String)> {
-    let is_video = |name: &String| {
-        let lower = name.to_ascii_lowercase();
-        [".mp4", ".mov", ".m4v"].iter().any(|ending| lower.ends_with(ending))
-    };
-    let mut videos: Vec<String> = names_in(folder).ok()?.into_iter().filter(is_video).collect();
+    let mut videos = names_of_videos(folder);
     if videos.len() != 1 || !images_in(folder).ok()?.is_empty() {
         return None;
     }
     let name = videos.remove(0);
     Some((folder.join(&name), format!("its only video {name}")))
+}
+
+/// Names of videos in a folder, hidden files left out.
+pub(crate) fn names_of_videos(folder: &Path) -> Vec<String> {
+    let is_video = |name: &String| {
+        let lower = name.to_ascii_lowercase();
+        !name.starts_with('.') && [".mp4", ".mov", ".m4v"].iter().any(|ending| lower.ends_with(ending))
+    };
+    names_in(folder).unwrap_or_default().into_iter().filter(is_video).collect()
 }
 
 /// Reads the tables of a video and its telemetry; pictures stay in it.
@@ -30,17 +35,41 @@ pub(crate) fn open(path: &Path, reason: String, options: &OpenOptions) -> Result
         let found = "camera 0 only".to_string();
         return Err(DatasetError::MissingCamera { path: path.to_path_buf(), camera: options.camera, found });
     }
-    let video = Arc::new(Video::open(path)?);
+    let video = Video::open(path)?;
     let mut draft = Draft::new(DatasetKind::Video, path, format!("{reason}; {}", video.codec_name()));
-    draft.warnings.extend(video.warnings().iter().cloned());
-    let name: Arc<Path> = path.into();
-    let frame = |(number, time)| (time, Location::Frame { video: Arc::clone(&name), number: number as u32 });
-    draft.images = video.times().enumerate().map(frame).collect();
     if let Some(telemetry) = video.telemetry()? {
         take_telemetry(&mut draft, telemetry);
     }
-    draft.media.video = Some(video);
+    take_frames(&mut draft, path, video, None);
     Ok(draft)
+}
+
+/// The frames of a video as the images of a recording: at the times of a log, in order, else at the video's own.
+pub(crate) fn take_frames(
+    draft: &mut Draft,
+    path: &Path,
+    video: Video,
+    logged: Option<(&[Timestamp], &Path)>,
+) {
+    draft.warnings.extend(video.warnings().iter().cloned());
+    let name: Arc<Path> = path.into();
+    let frame = |(number, time)| (time, Location::Frame { video: Arc::clone(&name), number: number as u32 });
+    draft.images = match logged {
+        Some((times, log)) => {
+            if times.len() != video.frame_count() {
+                let message = format!(
+                    "{} times for the {} frames of {}; they are matched in order, and the rest is left out",
+                    times.len(),
+                    video.frame_count(),
+                    path.file_name().unwrap_or_default().to_string_lossy()
+                );
+                draft.warnings.push(Warning::degraded("frame-times", message).at(log.display()));
+            }
+            times.iter().copied().take(video.frame_count()).enumerate().map(frame).collect()
+        }
+        None => video.times().enumerate().map(frame).collect(),
+    };
+    draft.media.video = Some(Arc::new(video));
 }
 
 fn take_telemetry(draft: &mut Draft, telemetry: Telemetry) {
@@ -70,9 +99,6 @@ fn take_telemetry(draft: &mut Draft, telemetry: Telemetry) {
         let warning = Warning::degraded("video-stabilised", message).at(&place);
         draft.warnings.push(warning.hint("switch stabilisation off to record for a map"));
     }
-    draft.imu_noise = Some(ImuNoise { rate_hz: telemetry.gyro_rate_hz, ..ImuNoise::EUROC });
+    draft.assume_imu_noise("a video", telemetry.gyro_rate_hz, &place);
     draft.imu = telemetry.imu;
-    let message = "a video states no noise densities of its IMU; those of EuRoC's ADIS16448 are used";
-    let warning = Warning::new("imu-noise", message).at(&place);
-    draft.warnings.push(warning.hint("--calibration imu.yaml (Kalibr)"));
 }

@@ -302,7 +302,9 @@ fn names_of_options_are_read_back() {
         assert_eq!(format.to_string().parse::<TrajectoryFormat>().unwrap(), format);
     }
     let error = "eurok".parse::<DatasetKind>().unwrap_err().to_string();
-    assert!(error.contains("euroc, tum-rgbd, 7scenes, posed-folder, bag, video, images"), "{error}");
+    let expected = "euroc, tum-rgbd, 7scenes, kitti-raw, kitti, replica, icl-nuim, posed-folder, bag, stray-scanner, \
+                    spectacular-ai, imu-log, video, images";
+    assert!(error.contains(expected), "{error}");
 }
 
 #[test]

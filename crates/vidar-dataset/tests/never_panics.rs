@@ -19,6 +19,23 @@ fn parse_all(bytes: &[u8]) {
         let _ = parse::tum_poses(&source, rule);
         let _ = parse::euroc_poses(&source, rule);
     }
+    for rule in [UnitRule::Guess, UnitRule::Expected(TimeUnit::Seconds)] {
+        let _ = parse::numbered_poses(&source, rule);
+        let _ = parse::first_column_times(&source, rule);
+    }
+    let _ = parse::imu_columns(&String::from_utf8_lossy(bytes), "gyro.csv");
+    let _ = parse::frame_intrinsics(&source);
+    let _ = parse::associations(&source);
+    let _ = parse::named_numbers(&source);
+    let _ = parse::projection_matrices(&source);
+    let _ = parse::rotation_and_translation(&source);
+    let _ = parse::times_of_day(&source);
+    let _ = parse::oxts(&source).map(|record| record.world_from_unit(49.0));
+    let _ = parse::replica_camera(&source);
+    for camera in parse::json_calibration(&source).unwrap_or_default() {
+        let _ = (camera.model(&source), camera.camera_from_imu(&source));
+    }
+    let _ = parse::JsonRecording::default().add(&source, 0, 0);
     let _ = parse::kitti_poses(&source);
     let _ = parse::matrix_poses(&source);
     let _ = parse::single_pose(&source);
@@ -45,6 +62,12 @@ fn pieces() -> impl Strategy<Value = String> {
         Just("cam0:\n ".to_string()),
         Just("intrinsics: ".to_string()),
         Just("&a *a".to_string()),
+        Just("R: 1 0 0 0 1 0 0 0 1\nT: 0 0 0\n".to_string()),
+        Just("2011-09-26 13:02:25.5".to_string()),
+        Just("{\"time\":1,\"frames\":[{".to_string()),
+        Just("\"cameraInd\":0,\"time\":".to_string()),
+        Just("}]}".to_string()),
+        Just("gyro_x,gyro_y,gyro_z,time".to_string()),
         any::<f64>().prop_map(|v| v.to_string()),
         any::<i64>().prop_map(|v| v.to_string()),
         "[ -~é]{0,6}",

@@ -156,3 +156,26 @@ fn every_published_estimate_is_a_trajectory() {
     }
     assert!(read > 40, "{read}");
 }
+
+#[test]
+fn real_euroc_survives_two_conversions() {
+    use vidar_dataset::convert::{ConvertFormat, convert};
+    let Some(path) = shared("euroc_MH_01_real_11s") else { return };
+    let options = OpenOptions { end: Some(vidar_core::Duration::from_millis(2000)), ..Default::default() };
+    let first = open(&path, &options).unwrap();
+    let folder = tempfile::tempdir().unwrap();
+    let (bag, again) = (folder.path().join("a.mcap"), folder.path().join("b"));
+    convert(&first, &bag, ConvertFormat::Mcap, &|_, _| true).unwrap();
+    let middle = open(&bag, &OpenOptions::default()).unwrap();
+    convert(&middle, &again, ConvertFormat::Euroc, &|_, _| true).unwrap();
+    let last = open(&again, &OpenOptions::default()).unwrap();
+    assert!(first.images.len() >= 40 && first.imu.len() > 900, "{} {}", first.images.len(), first.imu.len());
+    assert!(first.imu == last.imu && first.rig.imu == last.rig.imu);
+    assert_eq!(first.rig.camera(first.camera).unwrap().model, last.rig.camera(last.camera).unwrap().model);
+    assert_eq!(first.images.len(), last.images.len());
+    for (a, b) in first.images.iter().zip(&last.images) {
+        assert_eq!(a.time, b.time);
+        assert!(first.load_image(a).unwrap() == last.load_image(b).unwrap());
+    }
+    assert_eq!(first.ground_truth.unwrap().len(), last.ground_truth.unwrap().len());
+}

@@ -4,7 +4,7 @@
 //! (`SCAL`) and axes (`ORIN`) before its values (`GYRO`, `ACCL`).
 
 use nalgebra::Vector3;
-use vidar_core::{AngularRate, ImuSample, SpecificForce, Timestamp};
+use vidar_core::{ImuSample, TimedVector, Timestamp, merge_imu};
 
 /// What an action camera recorded beside the pictures.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -122,7 +122,7 @@ pub(crate) fn read(payloads: &[(i64, i64, Vec<u8>)]) -> Telemetry {
     let (gyro_times, accel_times) = (gyro.times(), accel.times());
     telemetry.gyro_rate_hz = rate_hz(&gyro_times);
     telemetry.accel_rate_hz = rate_hz(&accel_times);
-    telemetry.imu = merge(&gyro, &gyro_times, &accel, &accel_times);
+    telemetry.imu = merge_imu(&timed(&gyro, &gyro_times), &timed(&accel, &accel_times));
     telemetry
 }
 
@@ -207,27 +207,9 @@ fn axes_of(text: &str) -> Option<[(usize, f64); 3]> {
     seen.iter().all(|s| *s).then_some(axes)
 }
 
-/// Samples at the gyroscope's times, the accelerometer interpolated; nothing is invented outside of its times.
-fn merge(gyro: &Stream, gyro_times: &[f64], accel: &Stream, accel_times: &[f64]) -> Vec<ImuSample> {
-    let mut samples = Vec::with_capacity(gyro_times.len());
-    let mut at = 0;
-    for (&time, rate) in gyro_times.iter().zip(&gyro.values) {
-        while at + 1 < accel_times.len() && accel_times[at + 1] < time {
-            at += 1;
-        }
-        let (Some(&before), Some(&after)) = (accel_times.get(at), accel_times.get(at + 1)) else { continue };
-        if time < before || time > after {
-            continue;
-        }
-        let share = (time - before) / (after - before);
-        let force = accel.values[at] * (1.0 - share) + accel.values[at + 1] * share;
-        samples.push(ImuSample {
-            time: Timestamp::from_nanos(time.round() as i64),
-            gyro: AngularRate(*rate),
-            accel: SpecificForce(force),
-        });
-    }
-    samples
+/// The values of a stream with their times, in whole nanoseconds.
+fn timed(stream: &Stream, times: &[f64]) -> Vec<TimedVector> {
+    times.iter().map(|t| Timestamp::from_nanos(t.round() as i64)).zip(stream.values.iter().copied()).collect()
 }
 
 #[cfg(test)]

@@ -147,6 +147,11 @@ impl Video {
         self.size
     }
 
+    /// Quarter turns clockwise by which frames are turned to be upright, 0 to 3.
+    pub fn quarter_turns(&self) -> u8 {
+        self.tracks[self.video].quarter_turns
+    }
+
     /// `H.264` or `H.265`.
     pub fn codec_name(&self) -> &'static str {
         match self.codec {

@@ -13,6 +13,7 @@ pub mod calibrate;
 mod camera_timing;
 pub mod chunks;
 pub mod config;
+pub mod convert;
 pub mod demo;
 pub mod depth;
 pub mod doctor;

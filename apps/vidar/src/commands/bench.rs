@@ -17,8 +17,10 @@ pub fn bench(args: &BenchArgs, context: &Context) -> Outcome {
     let kind = match args.dataset {
         BenchDataset::Euroc => BenchKind::Euroc,
         BenchDataset::Tum => BenchKind::Tum,
+        BenchDataset::TumVi => BenchKind::TumVi,
+        BenchDataset::SevenScenes => BenchKind::SevenScenes,
     };
-    if args.synthetic && kind == BenchKind::Tum {
+    if args.synthetic && kind != BenchKind::Euroc {
         return Err(usage("--synthetic renders EuRoC's camera and IMU", "`vidar bench euroc --synthetic`"));
     }
     let request = BenchRequest {

@@ -3,6 +3,7 @@
 pub mod bench;
 pub mod calibrate;
 pub mod config;
+pub mod convert;
 pub mod depth;
 pub mod doctor;
 pub mod eval;

@@ -70,7 +70,7 @@ fn help_examples() -> Vec<String> {
 fn every_command_in_readme_and_documents_parses() {
     let root = repository();
     let mut documents = vec![root.join("README.md")];
-    for folder in ["docs", "docs/guides", "docs/benchmark"] {
+    for folder in ["docs", "docs/guides", "docs/benchmark", "docs/recordings"] {
         let files = std::fs::read_dir(root.join(folder)).unwrap().map(|e| e.unwrap().path());
         documents.extend(files.filter(|p| p.extension().is_some_and(|e| e == "md")));
     }
@@ -104,7 +104,8 @@ fn every_example_in_help_parses_and_every_verb_that_takes_something_has_examples
     for example in &examples {
         parses(&words(example)).unwrap_or_else(|e| panic!("`vidar {example}`: {e}"));
     }
-    for verb in ["run", "demo", "inspect", "eval", "export", "synth", "config explain", "explain"] {
+    for verb in ["run", "demo", "inspect", "convert", "eval", "export", "synth", "config explain", "explain"]
+    {
         assert!(examples.iter().any(|e| e.starts_with(verb)), "{verb} has no example");
     }
 }

@@ -5,6 +5,7 @@
 mod bench;
 mod calibrate;
 mod config;
+mod convert;
 mod coupling;
 mod damage;
 mod docs;

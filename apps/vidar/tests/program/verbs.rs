@@ -7,6 +7,7 @@ const VERBS: &[&[&str]] = &[
     &["run"],
     &["demo"],
     &["inspect"],
+    &["convert"],
     &["eval"],
     &["export"],
     &["depth"],

@@ -1,13 +1,10 @@
-//! Lists with a time in every line: files, IMU samples, times only.
+//! Lists with a time in every line: files, and times only.
 
 use super::units::{UnitRule, decide_unit, read_time};
-use crate::dataset::AccelSample;
 use crate::error::DatasetError;
-use crate::options::TimeUnit;
-use crate::source::{Lines, MAX_ROWS, Row, Source, for_each_block, quoted};
-use nalgebra::Vector3;
+use crate::source::{Lines, Row, Source, quoted};
 use std::path::Path;
-use vidar_core::{AngularRate, ImuSample, SpecificForce, Timestamp, Warning};
+use vidar_core::{Timestamp, Warning};
 
 /// Most images of a list: nine hours at 30 Hz.
 const MAX_IMAGES: usize = 1_000_000;
@@ -120,157 +117,88 @@ pub fn time_list(
     Ok((times, notes))
 }
 
+/// Reads the times in the first column of a table, whatever follows: one time a frame.
+pub fn first_column_times(
+    source: &Source<'_>,
+    rule: UnitRule,
+) -> Result<(Vec<Timestamp>, Vec<Warning>), DatasetError> {
+    let mut notes = Vec::new();
+    let lines = images_at_most(source, source.lines(&mut notes)?)?;
+    let first = |row: &Row<'_>| row.text.split([',', ';', ' ', '\t']).next().unwrap_or("").trim().to_string();
+    let columns: Vec<String> = lines.rows.iter().map(first).collect();
+    let place = source.path.display().to_string();
+    let unit = decide_unit(rule, columns.iter().map(String::as_str), &place, &mut notes);
+    let times = lines.rows.iter().zip(&columns).map(|(row, time)| read_time(source, row, time, unit));
+    Ok((times.collect::<Result<_, _>>()?, notes))
+}
+
+/// A pair of images of ICL-NUIM's `associations.txt`.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Association {
+    /// Number of the depth image.
+    pub depth_frame: u64,
+    /// Its file, inside the dataset.
+    pub depth: String,
+    /// Number of the colour image.
+    pub color_frame: u64,
+    /// Its file, inside the dataset.
+    pub color: String,
+}
+
+/// Reads `n depth/n.png n rgb/n.png` rows; which is which is told by the folders' names.
+pub fn associations(source: &Source<'_>) -> Result<Vec<Association>, DatasetError> {
+    let lines = images_at_most(source, source.lines(&mut Vec::new())?)?;
+    let mut pairs = Vec::with_capacity(lines.rows.len());
+    for row in &lines.rows {
+        let fields: Vec<&str> = row.fields().take(5).collect();
+        let expected = "number, depth image, number, colour image";
+        let &[first, one, second, other] = fields.as_slice() else {
+            return Err(source.malformed(row.line, quoted(row.text), expected));
+        };
+        let number = |text: &str| {
+            text.parse::<u64>().map_err(|_| source.malformed(row.line, quoted(text), "the number of a frame"))
+        };
+        check_stays_inside(source, row, one)?;
+        check_stays_inside(source, row, other)?;
+        let (one, other) = ((number(first)?, one.to_string()), (number(second)?, other.to_string()));
+        let ((depth_frame, depth), (color_frame, color)) = match other.1.contains("depth") {
+            true => (other, one),
+            false => (one, other),
+        };
+        pairs.push(Association { depth_frame, depth, color_frame, color });
+    }
+    Ok(pairs)
+}
+
+/// A camera as a logger states it for every frame, pixels.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct FrameIntrinsics {
+    /// fx and fy.
+    pub focal: [f64; 2],
+    /// cx and cy, where they are stated.
+    pub centre: Option<[f64; 2]>,
+}
+
+/// Medians of the columns `fx[px]`, `fy[px]`, `cx[px]` and `cy[px]` of a table of frames (MARS Logger's `movie_metadata.csv`); `None`
+/// without focal lengths. A value of 1 pixel or less stands for one that the phone does not state.
+pub fn frame_intrinsics(source: &Source<'_>) -> Result<Option<FrameIntrinsics>, DatasetError> {
+    let text = source.text(&mut Vec::new())?;
+    let names: Vec<&str> = text.lines().next().unwrap_or("").split(',').map(str::trim).collect();
+    let column = |name: &str| names.iter().position(|n| n.to_ascii_lowercase().starts_with(name));
+    let lines = images_at_most(source, source.lines(&mut Vec::new())?)?;
+    let median = |name: &str| {
+        let column = column(name)?;
+        let number = |row: &Row<'_>| row.fields().nth(column)?.parse::<f64>().ok();
+        let mut values: Vec<f64> = lines.rows.iter().filter_map(number).collect();
+        values.sort_unstable_by(f64::total_cmp);
+        values.get(values.len() / 2).copied().filter(|v| v.is_finite() && *v > 1.0)
+    };
+    let pair = |x: &str, y: &str| Some([median(x)?, median(y)?]);
+    Ok(pair("fx", "fy").map(|focal| FrameIntrinsics { focal, centre: pair("cx", "cy") }))
+}
+
 /// Whether a file name has the extension of a supported image format.
 pub(crate) fn is_image_name(name: &str) -> bool {
     name.rsplit_once('.')
         .is_some_and(|(_, ext)| ["png", "jpg", "jpeg"].iter().any(|known| ext.eq_ignore_ascii_case(known)))
-}
-
-type TimedRow<const N: usize> = (Timestamp, [f64; N]);
-
-/// Rows of a time and `N` numbers, taken block by block. Rows with a number that is not finite are skipped and counted.
-struct TimedNumbers<const N: usize> {
-    rule: UnitRule,
-    columns: &'static str,
-    unit: Option<TimeUnit>,
-    rows: Vec<TimedRow<N>>,
-    notes: Vec<Warning>,
-    /// How many rows are not finite, and the line of the first.
-    not_finite: Option<(usize, usize)>,
-}
-
-impl<const N: usize> TimedNumbers<N> {
-    fn new(rule: UnitRule, columns: &'static str) -> Self {
-        Self { rule, columns, unit: None, rows: Vec::new(), notes: Vec::new(), not_finite: None }
-    }
-
-    /// Takes a block with `lines_before` lines before it. The first one decides the unit of time.
-    fn add(&mut self, source: &Source<'_>, lines_before: usize) -> Result<(), DatasetError> {
-        let mut notes = Vec::new();
-        let lines = source.lines_after(lines_before, &mut notes)?;
-        // Every block of a file with CRLF says so.
-        notes.retain(|note| !self.notes.contains(note));
-        self.notes.extend(notes);
-        let unit = *self.unit.get_or_insert_with(|| {
-            let times = lines.rows.iter().map(|r| r.fields().next().unwrap_or(""));
-            decide_unit(self.rule, times, &source.path.display().to_string(), &mut self.notes)
-        });
-        for row in &lines.rows {
-            if self.rows.len() == MAX_ROWS {
-                return Err(source.too_many_rows(row.line, MAX_ROWS));
-            }
-            let (time, numbers) = self.row(source, row, unit)?;
-            if numbers.iter().all(|v| v.is_finite()) {
-                self.rows.push((time, numbers));
-            } else {
-                self.not_finite.get_or_insert((0, row.line)).0 += 1;
-            }
-        }
-        Ok(())
-    }
-
-    fn row(&self, source: &Source<'_>, row: &Row<'_>, unit: TimeUnit) -> Result<TimedRow<N>, DatasetError> {
-        let mut fields = row.fields();
-        let time = read_time(source, row, fields.next().unwrap_or(""), unit)?;
-        let mut numbers = [0.0; N];
-        for (i, number) in numbers.iter_mut().enumerate() {
-            let field = fields.next().ok_or_else(|| {
-                let expected = format!("{} columns: {}", N + 1, self.columns);
-                source.malformed(row.line, format!("{} columns", i + 1), expected)
-            })?;
-            *number = source.number(row, field, self.columns)?;
-        }
-        Ok((time, numbers))
-    }
-
-    fn finish(mut self, path: &Path) -> (Vec<TimedRow<N>>, Vec<Warning>) {
-        if let Some((count, line)) = self.not_finite {
-            let message = format!("{count} samples contain NaN or infinity; skipped");
-            let place = format!("{}:{line}", path.display());
-            self.notes.push(Warning::new("sample-not-finite", message).at(place));
-        }
-        (self.rows, self.notes)
-    }
-}
-
-fn imu_numbers(rule: UnitRule) -> TimedNumbers<6> {
-    TimedNumbers::new(rule, "time, gyro x y z, accel x y z")
-}
-
-fn imu_samples((rows, notes): (Vec<TimedRow<6>>, Vec<Warning>)) -> (Vec<ImuSample>, Vec<Warning>) {
-    let sample = |(time, [gx, gy, gz, ax, ay, az]): TimedRow<6>| ImuSample {
-        time,
-        gyro: AngularRate(Vector3::new(gx, gy, gz)),
-        accel: SpecificForce(Vector3::new(ax, ay, az)),
-    };
-    (rows.into_iter().map(sample).collect(), notes)
-}
-
-/// Reads EuRoC's `imu0/data.csv`: time, gyroscope (rad/s), accelerometer (m/s²).
-pub fn imu_csv(source: &Source<'_>, rule: UnitRule) -> Result<(Vec<ImuSample>, Vec<Warning>), DatasetError> {
-    let mut numbers = imu_numbers(rule);
-    numbers.add(source, 0)?;
-    Ok(imu_samples(numbers.finish(source.path)))
-}
-
-/// The same of a file, which is never in memory as a whole.
-pub(crate) fn imu_file(path: &Path, rule: UnitRule) -> Result<(Vec<ImuSample>, Vec<Warning>), DatasetError> {
-    let mut numbers = imu_numbers(rule);
-    for_each_block(path, |block, lines_before| numbers.add(block, lines_before))?;
-    Ok(imu_samples(numbers.finish(path)))
-}
-
-/// Reads TUM's `accelerometer.txt`: time, accelerometer (m/s²).
-pub fn accelerometer_list(
-    source: &Source<'_>,
-    rule: UnitRule,
-) -> Result<(Vec<AccelSample>, Vec<Warning>), DatasetError> {
-    let mut numbers = TimedNumbers::<3>::new(rule, "time ax ay az");
-    numbers.add(source, 0)?;
-    let (rows, notes) = numbers.finish(source.path);
-    let samples = rows
-        .into_iter()
-        .map(|(time, [x, y, z])| AccelSample { time, accel: SpecificForce(Vector3::new(x, y, z)) })
-        .collect();
-    Ok((samples, notes))
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn a_file_in_blocks_is_the_same_as_the_whole() {
-        // Some 7 MB: two block boundaries, each inside a line.
-        let row = |i: usize| {
-            let x = if i == 80_000 { f64::NAN } else { (i as f64 * 0.37).sin() };
-            format!(
-                "{},{x},-0.25,{i},0.1,9.80665,-0.000123456789\r\n",
-                1_400_000_000_000_000_000 + 5_000_000 * i
-            )
-        };
-        let text: String =
-            std::iter::once("#timestamp [ns],w_x,...\n".into()).chain((0..100_000).map(row)).collect();
-        assert!(text.len() > 6 << 20);
-        let folder = tempfile::tempdir().unwrap();
-        let path = folder.path().join("data.csv");
-        std::fs::write(&path, &text).unwrap();
-        let rule = UnitRule::Expected(TimeUnit::Nanoseconds);
-        let whole = imu_csv(&Source { path: &path, bytes: text.as_bytes() }, rule).unwrap();
-        assert_eq!(whole.0.len(), 99_999);
-        assert_eq!(
-            whole.1.iter().map(|w| w.kind.as_str()).collect::<Vec<_>>(),
-            ["crlf", "sample-not-finite"]
-        );
-        assert!(imu_file(&path, rule).unwrap() == whole);
-
-        // An error names the line of the file, not of the block.
-        std::fs::write(&path, text.replacen(",99000,", ",x,", 1)).unwrap();
-        let error = imu_file(&path, rule).unwrap_err().to_string();
-        assert!(error.contains("data.csv:99002"), "{error}");
-        // One line without end.
-        std::fs::write(&path, vec![b'1'; 9 << 20]).unwrap();
-        let error = imu_file(&path, rule).unwrap_err().to_string();
-        assert!(error.contains("bytes a line"), "{error}");
-    }
 }

@@ -42,6 +42,18 @@ pub enum BenchKind {
     Euroc,
     /// TUM RGB-D.
     Tum,
+    /// TUM-VI.
+    TumVi,
+    /// 7-Scenes.
+    #[serde(rename = "7scenes")]
+    SevenScenes,
+}
+
+impl BenchKind {
+    /// Whether its recordings have an IMU that odometry can use.
+    fn has_imu(self) -> bool {
+        matches!(self, Self::Euroc | Self::TumVi)
+    }
 }
 
 /// What to run.
@@ -98,7 +110,7 @@ pub fn bench(request: &BenchRequest, events: &Events, cancel: &CancelToken) -> R
     let total = sequences.len() * request.modes.len();
     events.stage("bench", total, || -> Result<(), Error> {
         for sequence in &sequences {
-            if request.trajectories && request.kind == BenchKind::Euroc {
+            if request.trajectories && request.kind.has_imu() {
                 for with_imu in [true, false] {
                     interrupted(request, cancel)?;
                     odometry.push(row::odometry_row(request, sequence, with_imu, cancel)?);

@@ -26,6 +26,8 @@ pub fn find(root: &Path, kind: BenchKind, prefixes: &[String]) -> Result<Vec<Seq
         let expected = match kind {
             BenchKind::Euroc => "a folder with mav0/ per sequence, as EuRoC's archives unpack",
             BenchKind::Tum => "rgbd_dataset_*/ with rgb.txt, as TUM's archives unpack",
+            BenchKind::TumVi => "dataset-*_512_16/ with mav0/, as TUM-VI's archives unpack",
+            BenchKind::SevenScenes => "a folder per scene with seq-01/ …, as 7-Scenes' archives unpack",
         };
         let what = format!("no sequence below {}", root.display());
         return Err(Error::Usage { what, hint: format!("expected {expected}") });
@@ -50,11 +52,19 @@ pub(super) fn require_matches(names: &[String], prefixes: &[String]) -> Result<(
 
 fn walk(folder: &Path, kind: BenchKind, depth: usize, found: &mut Vec<Sequence>) -> Result<(), Error> {
     let is_sequence = match kind {
-        BenchKind::Euroc => folder.join("mav0").is_dir(),
+        BenchKind::Euroc | BenchKind::TumVi => folder.join("mav0").is_dir(),
         BenchKind::Tum => folder.join("rgb.txt").is_file(),
+        BenchKind::SevenScenes => folder.join("frame-000000.pose.txt").is_file(),
     };
     if is_sequence {
-        let name = folder.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default();
+        let name_of = |f: &Path| f.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default();
+        let mut name = name_of(folder);
+        // Every scene has its own seq-01.
+        if kind == BenchKind::SevenScenes
+            && let Some(scene) = folder.parent()
+        {
+            name = format!("{}-{name}", name_of(scene));
+        }
         found.push(Sequence { name: short(&name), path: folder.to_owned() });
         return Ok(());
     }
@@ -68,10 +78,12 @@ fn walk(folder: &Path, kind: BenchKind, depth: usize, found: &mut Vec<Sequence>)
     folders.iter().try_for_each(|f| walk(f, kind, depth - 1, found))
 }
 
-/// `V1_01_easy` is `V1_01`, `rgbd_dataset_freiburg1_xyz` is `fr1_xyz`.
+/// `V1_01_easy` is `V1_01`, `rgbd_dataset_freiburg1_xyz` is `fr1_xyz`, `dataset-room1_512_16` is `room1`.
 fn short(name: &str) -> String {
     let name = name.strip_prefix("rgbd_dataset_").unwrap_or(name).replace("freiburg", "fr");
-    let ending = ["_easy", "_medium", "_difficult"].iter().find_map(|e| name.strip_suffix(e));
+    let name = name.strip_prefix("dataset-").map_or(name.clone(), str::to_owned);
+    let ending =
+        ["_easy", "_medium", "_difficult", "_512_16", "_1024_16"].iter().find_map(|e| name.strip_suffix(e));
     ending.unwrap_or(&name).to_owned()
 }
 
@@ -87,10 +99,16 @@ mod tests {
             "MH_05_difficult/mav0",
             "rgbd_dataset_freiburg1_xyz",
             "notes",
+            "scenes/chess/seq-01",
+            "scenes/heads/seq-01",
         ] {
             std::fs::create_dir_all(root.path().join(path)).unwrap();
         }
         std::fs::write(root.path().join("rgbd_dataset_freiburg1_xyz/rgb.txt"), "").unwrap();
+        for scene in ["chess", "heads"] {
+            let frame = root.path().join("scenes").join(scene).join("seq-01/frame-000000.pose.txt");
+            std::fs::write(frame, "").unwrap();
+        }
         let names = |kind, prefixes: &[&str]| -> Vec<String> {
             let prefixes: Vec<String> = prefixes.iter().map(|w| (*w).to_owned()).collect();
             find(root.path(), kind, &prefixes).unwrap().into_iter().map(|s| s.name).collect()
@@ -98,6 +116,10 @@ mod tests {
         assert_eq!(names(BenchKind::Euroc, &[]), ["MH_05", "V1_01"]);
         assert_eq!(names(BenchKind::Euroc, &["V1"]), ["V1_01"]);
         assert_eq!(names(BenchKind::Tum, &[]), ["fr1_xyz"]);
+        assert_eq!(names(BenchKind::SevenScenes, &[]), ["chess-seq-01", "heads-seq-01"]);
+        let vi = tempfile::tempdir().unwrap();
+        std::fs::create_dir_all(vi.path().join("dataset-room1_512_16/mav0")).unwrap();
+        assert_eq!(find(vi.path(), BenchKind::TumVi, &[]).unwrap()[0].name, "room1");
         let error = find(root.path(), BenchKind::Euroc, &["V9".into()]).unwrap_err();
         assert!(error.to_string().contains("none of the 2 sequences"), "{error}");
     }

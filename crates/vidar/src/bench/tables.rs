@@ -31,6 +31,8 @@ impl Cells {
         let name = match request.kind {
             BenchKind::Euroc => "EuRoC MAV",
             BenchKind::Tum => "TUM RGB-D",
+            BenchKind::TumVi => "TUM-VI",
+            BenchKind::SevenScenes => "7-Scenes",
         };
         let rendered = if request.synthetic.is_some() { ", rendered" } else { "" };
         let mut grids = vec![table.trajectories()];
@@ -161,7 +163,9 @@ impl Table<'_> {
                 .collect();
             let p = match (euroc, mode) {
                 (true, CouplingMode::Da3Streaming) => Some(paper::EUROC_TRAJECTORY[2]),
-                (false, CouplingMode::PoseFree) => Some(paper::TUM_TRAJECTORY[1]),
+                (false, CouplingMode::PoseFree) if self.request.kind == BenchKind::Tum => {
+                    Some(paper::TUM_TRAJECTORY[1])
+                }
                 _ => None,
             };
             add(format!("map, {mode}"), of, p.map(|p| (p.1, p.2, p.3)));
