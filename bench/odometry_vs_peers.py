@@ -15,7 +15,8 @@ calibration it gets what a careful user would guess: f = 0.75 image widths, no d
 quarter turns, no lever arm, the noise of the synthetic IMU. Its time offset begins at 0 ms (`openvins`) or at the truth (`openvins-clock`).
 
 Errors are those of the position of the IMU when the image was truly taken (the middle row; truth.json), after the best rigid motion; ln s is that of
-the best similarity. `--clock own` takes each program's own estimate of that time instead. Processor time is user time of the
+the best similarity. Images: the share that has a pose in the trajectory (VIDAR live: its longest segment), and the share of those since the first
+state that have any. `--clock own` takes each program's own estimate of that time instead. Processor time is user time of the
 whole process, decoding and (VIDAR) calibration, adjustment and report included.
 """
 import argparse
@@ -198,14 +199,22 @@ def decimal_ns(text):
     return int(whole) * 10**9 + int((part + "0" * 9)[:9])
 
 
-def live_sigma(health, positions):
+def health(path):
+    """The segment and σ(ln s) of every image; None where there is no state."""
+    rows = []
+    for line in path.read_text().splitlines():
+        fields = line.split(",")
+        if not line.startswith("#"):
+            rows.append((fields[3], float(fields[5]) if fields[5] else float("inf")) if fields[3] else None)
+    return rows
+
+
+def live_sigma(states, positions):
     """σ(ln s) of the longest segment as VIDAR states it while it runs, without what no estimate sees: that of the path's pieces weighted by
     their lengths, at least that of the newest state."""
     by_segment = {}
-    for line in health.read_text().splitlines():
-        fields = line.split(",")
-        if not line.startswith("#") and fields[3]:
-            by_segment.setdefault(fields[3], []).append(float(fields[5]) if fields[5] else float("inf"))
+    for segment, sigma in filter(None, states):
+        by_segment.setdefault(segment, []).append(sigma)
     sigmas = np.array(max(by_segment.values(), key=len, default=[]))
     if len(sigmas) != len(positions):
         return None
@@ -244,8 +253,13 @@ def evaluate_vidar(recording, out, clock):
             if clock == "own" and kind == "vidar final":
                 offset = 1e-3 * final["calibration"]["time_offset_ms"]
             row |= evaluate(recording, image_ns, found[1][:, :3], image_ns + round(1e9 * offset))
-            sigma = final.get("scale_std") if kind == "vidar final" else live_sigma(
-                folder / "odometry" / "health.csv", found[1][:, :3])
+            sigma = final.get("scale_std")
+            if kind == "vidar live":
+                states = health(folder / "odometry" / "health.csv")
+                sigma = live_sigma(states, found[1][:, :3])
+                # The trajectory is the longest segment; a loss before or after it counts against what came after the first state.
+                first = next(i for i, state in enumerate(states) if state)
+                row["after_start"] = sum(map(bool, states)) / (len(states) - first)
             row |= {"sigma": sigma and float(np.hypot(sigma, unseen)), "sigma_alone": sigma,
                     "own_ate_m": ((report or {}).get("ate_se3_m") or {}).get("rmse"), "ms_tracking": told["milliseconds_per_image"]}
         rows[kind] = row
@@ -275,43 +289,83 @@ def number(row, key, digits, factor=1.0):
 
 
 def errors(row):
+    """ATE and its share of the path, or why there is none."""
+    if not row:
+        return "not run"
+    if not row.get("poses"):
+        return "no pose"
     if "ate_m" not in row:
-        return "no pose" if not row.get("poses") else "not finite"
-    text = f"{number(row, 'ate_m', 4)} ({number(row, 'ate_percent', 2)} %)"
-    return text if row["is_bounded"] else f"unbounded: {row['ate_m']:.3g}"
+        return "not finite"
+    if row["is_bounded"]:
+        return f"{row['ate_m']:.4f} ({row['ate_percent']:.2f})"
+    return f"{row['ate_m']:.3g} (**{row['ate_percent']:.0f}**)"
 
 
-def tell(results, kinds):
-    print("| Recording | Program | ATE m (% of path) | ln s (σ) | Images % (after the start) | First pose, s | ms an image |")
-    print("|---|---|--:|--:|--:|--:|--:|")
+def scale(row):
+    if not row.get("is_bounded"):
+        return "–"
+    sigma = f" ({row['sigma_alone']:.4f})" if row.get("sigma_alone") is not None else ""
+    return f"{row['ln_s']:+.4f}{sigma}"
+
+
+def tell(recordings, results, kinds):
+    """A row per recording."""
+    columns = []
+    for kind in kinds:
+        columns += [f"{kind}: ATE m (%)"] + ["ln s (σ)"] * kind.startswith("vidar") + ["images %"] * (kind != "vidar final")
+    print("| Recording | Size | Readout, delay ms | Path m | " + " | ".join(columns) + " | ms an image |")
+    print("|---|---|---|--:|" + "--:|" * len(columns) + "--:|")
     for name, rows in results.items():
+        recording = recordings[name]
+        width, height = recording.camera["resolution"]
+        device = recording.device
+        clock = f"{1e3 * device['readout_secs']:.0f}, {1e3 * device['stamp_delay_secs']:+.0f}" if device else "0, 0"
+        # Of the program that gives most of it.
+        path = number({"path_m": max((row.get("path_m", 0.0) for row in rows.values()), default=0.0)}, "path_m", 1)
+        cells = []
         for kind in kinds:
-            if kind not in rows:
-                continue
-            row = rows[kind]
-            sigma = f" ({row['sigma']:.4f})" if row.get("sigma") is not None else ""
-            print(f"| {name} | {kind} | {errors(row)} | {number(row, 'ln_s', 4)}{sigma} | {number(row, 'completion', 1, 100)} "
-                  f"({number(row, 'after_start', 1, 100)}) | {number(row, 'first_secs', 2)} | {number(row, 'ms_per_image', 0)} |")
+            row = rows.get(kind, {})
+            cells += [errors(row)] + [scale(row)] * kind.startswith("vidar")
+            cells += [number(row, "completion", 0, 100)] * (kind != "vidar final")
+        # Live and final poses come from one process.
+        times = ", ".join(number(rows[k], "ms_per_image", 0) for k in kinds if k in rows and k != "vidar live")
+        print(f"| {name} | {width:.0f}×{height:.0f} | {clock} | {path} | {' | '.join(cells)} | {times} |")
 
 
 def summary(results, kinds):
-    print("\n| Program | Recordings | With poses | Bounded | Median ATE m | Median % of path | Median \\|ln s\\| | Median images % | Median after the start % "
-          "| After the start ≥ 98 % | \\|ln s\\| ≤ 2σ | Median \\|ln s\\| where σ ≤ .03 | Median first pose, s | Median ms an image |")
-    print("|---|" + "--:|" * 13)
-    for kind in kinds:
-        rows = [r[kind] for r in results.values() if kind in r]
+    """Medians, in which a recording without a pose counts as the worst; then what the goals of the project ask."""
+    of = {kind: [r[kind] for r in results.values() if kind in r] for kind in kinds}
+    print("\n| Program | Recordings | With poses | Bounded | ATE m | % of path | \\|ln s\\| | Images % | Of those after the start % | First pose, s | ms an image |")
+    print("|---|" + "--:|" * 10)
+    for kind, rows in of.items():
         if not rows:
             continue
-        # A recording without a pose, or with one that left all bounds, counts as the worst.
-        middle = lambda key, digits, factor=1.0: f"{factor * statistics.median(abs(r.get(key, np.inf)) for r in rows):.{digits}f}"
-        share = lambda key: statistics.median(r.get(key, 0.0) for r in rows)
-        stated = [r for r in rows if r.get("sigma") is not None and "ln_s" in r]
-        held = sum(abs(r["ln_s"]) <= 2 * r["sigma"] for r in stated)
-        sure = [abs(r["ln_s"]) for r in stated if r["sigma"] <= 0.03]
-        print(f"| {kind} | {len(rows)} | {sum(bool(r.get('poses')) for r in rows)} | {sum(r.get('is_bounded', False) for r in rows)} "
-              f"| {middle('ate_m', 4)} | {middle('ate_percent', 2)} | {middle('ln_s', 4)} | {100 * share('completion'):.1f} | {100 * share('after_start'):.1f} "
-              f"| {sum(r.get('after_start', 0) >= 0.98 for r in rows)} | {f'{held} of {len(stated)}' if stated else '–'} "
-              f"| {f'{statistics.median(sure):.4f} ({len(sure)})' if sure else '–'} | {middle('first_secs', 2)} | {middle('ms_per_image', 0)} |")
+        middle = lambda key, digits: f"{statistics.median(abs(r.get(key, np.inf)) for r in rows):.{digits}f}"
+        share = lambda key: f"{100 * statistics.median(r.get(key, 0.0) for r in rows):.1f}"
+        counts = (len(rows), sum(bool(r.get("poses")) for r in rows), sum(r.get("is_bounded", False) for r in rows))
+        cells = [*map(str, counts), middle("ate_m", 4), middle("ate_percent", 2), middle("ln_s", 4), share("completion"),
+                 share("after_start"), middle("first_secs", 2), middle("ms_per_image", 0)]
+        print(f"| {kind} | {' | '.join(cells)} |")
+    print("\n| Goal | " + " | ".join(k for k in kinds if k.startswith("vidar")) + " |")
+    print("|---|" + "--:|" * sum(k.startswith("vidar") for k in kinds))
+    goals = {}
+    for kind, rows in of.items():
+        if not kind.startswith("vidar"):
+            continue
+        def put(goal, text):
+            goals.setdefault(goal, []).append(text)
+        complete = [r["after_start"] for r in rows if "after_start" in r]
+        put("images with a pose after the start: ≥ 98 %, recordings", f"{sum(c >= 0.98 for c in complete)} of {len(rows)}")
+        put("the same, least of those that started", f"{100 * min(complete, default=0.0):.1f} %")
+        put("ATE, median % of the path", f"{statistics.median(r.get('ate_percent', np.inf) for r in rows):.2f}")
+        for key, words in (("sigma_alone", "σ of the estimate"), ("sigma", "σ as stated, with what no estimate sees")):
+            stated = [(abs(r["ln_s"]), r[key]) for r in rows if r.get(key) is not None and "ln_s" in r]
+            for factor in (2, 3):
+                put(f"\\|ln s\\| within {factor} σ, {words}", f"{sum(e <= factor * s for e, s in stated)} of {len(stated)}")
+            sure = [e for e, s in stated if s <= 0.03]
+            put(f"\\|ln s\\|, median where {words.split(',')[0]} ≤ .03", f"{statistics.median(sure):.4f} ({len(sure)})" if sure else "–")
+    for goal, cells in goals.items():
+        print(f"| {goal} | {' | '.join(cells)} |")
 
 
 def main():
@@ -325,7 +379,7 @@ def main():
     parser.add_argument("--clock", choices=["true", "own"], default="true")
     parser.add_argument("--table", action="store_true", help="run nothing")
     args = parser.parse_args()
-    results, given, absent = {}, {}, {}
+    recordings, results, given, absent = {}, {}, {}, {}
     kinds = ["vidar final", "vidar live", *args.variants]
     for folder in args.recordings:
         recording = Recording(folder)
@@ -340,13 +394,13 @@ def main():
         for variant in args.variants:
             rows |= evaluate_openvins(recording, out, variant, args.clock)
         print(recording.name, *(f"{kind}: {errors(row)};" for kind, row in rows.items()), file=sys.stderr, flush=True)
-        results[recording.name] = rows
+        recordings[recording.name], results[recording.name] = recording, rows
         (given if recording.is_given else absent)[recording.name] = rows
     (args.out / f"results-{args.clock}-clock.json").write_text(json.dumps(results, indent=1))
     for title, part in (("Calibration given", given), ("No calibration", absent)):
         if part:
             print(f"\n{title}\n")
-            tell(part, kinds)
+            tell(recordings, part, kinds)
             summary(part, kinds)
 
 
