@@ -230,26 +230,26 @@ impl<'a> Problem<'a> {
         let path = OrientationPath::new(self.samples, &bias_of(x));
         let body_from_camera = self.rotation(x);
         let last_row = self.camera.height() as f64 - 1.0;
-        let turn_image =
-            |((image, rays), is_shown): ((&ImageFeatures, &Vec<Option<Vector3<f64>>>), &bool)| {
-                if !is_shown {
-                    return Vec::new();
-                }
-                let row_turns: Vec<Matrix3<f64>> = (0..=ROW_SEGMENTS)
-                    .map(|k| {
-                        let row = k as f64 / ROW_SEGMENTS as f64 - 0.5;
-                        (path.at(image.secs + x[OFFSET] + row * x[READOUT]) * body_from_camera).matrix()
-                    })
-                    .collect();
-                let turn = |((_, pixel), ray): (&(LandmarkId, Pixel), &Option<Vector3<f64>>)| {
-                    let at = (pixel.y / last_row).clamp(0.0, 1.0) * ROW_SEGMENTS as f64;
-                    let k = (at as usize).min(ROW_SEGMENTS - 1);
-                    let part = at - k as f64;
-                    ray.map(|r| row_turns[k] * r * (1.0 - part) + row_turns[k + 1] * r * part)
-                };
-                image.features.iter().zip(rays).map(turn).collect()
+        let turn_image = |k: usize| {
+            let (image, rays) = (&self.images[k], &self.rays[k]);
+            if !self.is_shown[k] {
+                return Vec::new();
+            }
+            let row_turns: Vec<Matrix3<f64>> = (0..=ROW_SEGMENTS)
+                .map(|k| {
+                    let row = k as f64 / ROW_SEGMENTS as f64 - 0.5;
+                    (path.at(image.secs + x[OFFSET] + row * x[READOUT]) * body_from_camera).matrix()
+                })
+                .collect();
+            let turn = |((_, pixel), ray): (&(LandmarkId, Pixel), &Option<Vector3<f64>>)| {
+                let at = (pixel.y / last_row).clamp(0.0, 1.0) * ROW_SEGMENTS as f64;
+                let k = (at as usize).min(ROW_SEGMENTS - 1);
+                let part = at - k as f64;
+                ray.map(|r| row_turns[k] * r * (1.0 - part) + row_turns[k + 1] * r * part)
             };
-        self.images.iter().zip(&self.rays).zip(&self.is_shown).map(turn_image).collect()
+            image.features.iter().zip(rays).map(turn).collect()
+        };
+        (0..self.images.len()).map(turn_image).collect()
     }
 
     /// Normal equations `H δ = g` without prior, and the robust cost; directions of translation are updated.
