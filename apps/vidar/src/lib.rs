@@ -33,6 +33,7 @@ pub fn main_with(args: impl Iterator<Item = OsString>) -> ExitCode {
     let command = typed.iter().map(|a| quoted(&a.to_string_lossy())).collect();
     let context = Context { cli: cli.common, command, cancel: CancelToken::new() };
     install_cancel(&context.cancel);
+    silence_decoders();
     let work = || match context.thread_pool() {
         Ok(pool) => pool.install(|| dispatch(cli.command, &context)),
         Err(error) => Err(error),
@@ -47,6 +48,16 @@ pub fn main_with(args: impl Iterator<Item = OsString>) -> ExitCode {
             ExitCode::from(error.exit_status() as u8)
         }
     }
+}
+
+/// A panic in the decoder of a video is an error of one image, and is said as that error; what Rust prints of it would look like a bug.
+fn silence_decoders() {
+    let before = std::panic::take_hook();
+    std::panic::set_hook(Box::new(move |panic| {
+        if std::thread::current().name() != Some(vidar::dataset::DECODER_THREAD) {
+            before(panic);
+        }
+    }));
 }
 
 /// Runs `work`; a panic is reported as a bug, with a hint.
@@ -135,6 +146,28 @@ fn quoted(argument: &str) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn only_the_panics_of_decoders_are_silent() {
+        use std::sync::atomic::{AtomicUsize, Ordering};
+        static PRINTED: AtomicUsize = AtomicUsize::new(0);
+        let panics_on = |name: &str| {
+            let thread = std::thread::Builder::new().name(name.to_owned());
+            assert!(thread.spawn(|| panic!("as a test")).unwrap().join().is_err());
+        };
+        let other = "not a decoder";
+        std::panic::set_hook(Box::new(move |_| {
+            let thread = std::thread::current();
+            let is_ours = [Some(other), Some(vidar::dataset::DECODER_THREAD)].contains(&thread.name());
+            PRINTED.fetch_add(usize::from(is_ours), Ordering::SeqCst);
+        }));
+        silence_decoders();
+        panics_on(vidar::dataset::DECODER_THREAD);
+        assert_eq!(PRINTED.load(Ordering::SeqCst), 0);
+        panics_on(other);
+        assert_eq!(PRINTED.load(Ordering::SeqCst), 1);
+        let _ = std::panic::take_hook();
+    }
 
     #[test]
     fn a_panic_is_reported_as_a_bug_and_other_results_pass_through() {

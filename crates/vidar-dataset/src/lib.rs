@@ -50,6 +50,7 @@ pub use options::{
 };
 
 pub use trajectory_file::{read_times, read_trajectory, trajectory_from};
+pub use vidar_video::DECODER_THREAD;
 
 use std::path::Path;
 

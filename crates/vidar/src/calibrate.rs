@@ -6,6 +6,7 @@ mod yaml;
 
 use crate::error::Error;
 use crate::events::{CancelToken, Event, Events};
+use crate::imu_noise::believed_noise;
 use crate::input::{self, Measurement};
 use std::path::{Path, PathBuf};
 use vidar_core::{CameraModel, Duration, ImuNoise, Pinhole, Se3, SensorEvent, Warning, camera::RadTan};
@@ -21,15 +22,6 @@ pub(crate) const STAGE: &str = "calibrate";
 /// Standard deviation of a lever arm that nothing is known of, m: a phone's camera is as far from its IMU.
 pub const UNKNOWN_LEVER_M: f64 = 0.05;
 
-/// Bias walks, which half a minute does not show: those of consumer sensors.
-const GYRO_RANDOM_WALK: f64 = 2e-5;
-const ACCEL_RANDOM_WALK: f64 = 1e-3;
-/// What is taken where the accelerometer's noise cannot be seen, m/s²/√Hz.
-const UNSEEN_ACCEL_NOISE: f64 = 5e-3;
-/// Bounds of what is believed of the data: no sensor in a hand is better, none that works is worse.
-const GYRO_NOISE: (f64, f64) = (1e-4, 1e-2);
-const ACCEL_NOISE: (f64, f64) = (1e-3, 0.1);
-
 /// Clock offsets that are known better than this are kept by the odometry, s: a rendered slow phone, found within 0.1 ms,
 /// was lost when the odometry corrected it by 10 ms from a few seconds.
 const SETTLED_OFFSET_SECS: f64 = 0.0015;
@@ -39,7 +31,8 @@ const MAX_FOCAL_SIGMA: f64 = 0.04;
 const MAX_CLOCK_SIGMA_MS: f64 = 10.0;
 
 /// Warnings of reading that complain of values which nobody gave.
-const OF_A_GUESS: [&str; 4] = ["intrinsics-guessed", "imu-noise", "extrinsics-identity", "imu-rate"];
+const OF_A_GUESS: [&str; 5] =
+    ["intrinsics-guessed", "imu-noise", "imu-noise-from-samples", "extrinsics-identity", "imu-rate"];
 
 /// What to calibrate.
 #[derive(Clone, Debug)]
@@ -266,17 +259,4 @@ fn used_readout_ms(found: &Calibration) -> f64 {
     let readout = found.readout_secs;
     let is_global = readout.value < (3.0 * readout.sigma).min(0.004);
     if is_global { 0.0 } else { 1e3 * readout.value.clamp(0.0, 0.05) }
-}
-
-/// Noise for the odometry: what the data show, within what sensors have.
-fn believed_noise(seen: Option<SensorNoise>) -> ImuNoise {
-    let (gyro, accel) = seen.map_or((GYRO_NOISE.0, 0.0), |n| (n.gyro, n.accel));
-    let accel = if accel > 0.0 { accel } else { UNSEEN_ACCEL_NOISE };
-    ImuNoise {
-        gyro_noise_density: gyro.clamp(GYRO_NOISE.0, GYRO_NOISE.1),
-        gyro_random_walk: GYRO_RANDOM_WALK,
-        accel_noise_density: accel.clamp(ACCEL_NOISE.0, ACCEL_NOISE.1),
-        accel_random_walk: ACCEL_RANDOM_WALK,
-        rate_hz: seen.map_or(200.0, |n| n.rate_hz),
-    }
 }

@@ -3,6 +3,7 @@
 use crate::config::{Config, PoseSource as PoseChoice};
 use crate::engine::{FrameStamp, GivenPoses, ImageSource, OdometryPoses, PoseSource};
 use crate::error::Error;
+use crate::imu_noise;
 use crate::quality::TrackQuality;
 use crate::verdict::ScaleSource;
 use serde::Serialize;
@@ -251,7 +252,9 @@ pub fn open_dataset(path: &Path, options: &OpenOptions, config: &Config) -> Resu
     options.stride = config.input.stride;
     options.start = Some(Duration::from_secs_f64(config.input.start_secs)).filter(|d| *d > Duration::ZERO);
     options.end = Some(Duration::from_secs_f64(config.input.end_secs)).filter(|d| *d > Duration::ZERO);
-    Ok(vidar_dataset::open(path, &options)?)
+    let mut dataset = vidar_dataset::open(path, &options)?;
+    imu_noise::settle(&mut dataset);
+    Ok(dataset)
 }
 
 /// σ(ln s) of what the estimate of the scale does not see.

@@ -8,6 +8,7 @@ pub use motion::Motion;
 use crate::calibrate;
 use crate::error::Error;
 use crate::events::{CancelToken, Events};
+use crate::imu_noise;
 use serde::Serialize;
 use std::path::Path;
 use vidar_core::{Duration, FrameImage, Timestamp, Trajectory, Warning};
@@ -97,7 +98,9 @@ pub fn inspect(
     events: &Events,
     cancel: &CancelToken,
 ) -> Result<Inspection, Error> {
-    let dataset = vidar_dataset::open(path, options)?;
+    let mut dataset = vidar_dataset::open(path, options)?;
+    imu_noise::settle(&mut dataset);
+    let dataset = dataset;
     let images: Vec<Timestamp> = dataset.images.iter().map(|i| i.time).collect();
     let imu: Vec<Timestamp> = dataset.imu.iter().map(|s| s.time).collect();
     let depths: Vec<Timestamp> = dataset.depths.iter().map(|d| d.time).collect();
@@ -163,7 +166,7 @@ fn missing(dataset: &Dataset) -> Vec<String> {
             dataset.readout.is_none(),
             "readout time of the rolling shutter (a global one is assumed to begin with)",
         ),
-        (has_imu && (dataset.rig.imu.is_none() || warned("imu-noise")), "noise of the IMU"),
+        (has_imu && (dataset.rig.imu.is_none() || imu_noise::is_guessed(dataset)), "noise of the IMU"),
     ];
     all.into_iter().filter(|(is_missing, _)| *is_missing).map(|(_, what)| what.to_owned()).collect()
 }

@@ -22,6 +22,7 @@ pub mod error;
 pub mod evaluate;
 pub mod events;
 pub mod export;
+mod imu_noise;
 pub mod input;
 pub mod inspect;
 pub mod models;

@@ -147,3 +147,27 @@ fn real_frames_are_tracked_to_a_centimetre() {
     assert!(json["trajectory"]["scale_error"].as_f64().unwrap() < 0.02, "{json}");
     assert!(json["first_state_secs"].as_f64().unwrap() < 1.5, "{json}");
 }
+
+#[test]
+fn noise_that_a_file_inflates_is_named_and_bounded() {
+    let inflated = shared().root.join("inflated noise");
+    copy_tree(flight(), &inflated);
+    let file = inflated.join("mav0/imu0/sensor.yaml");
+    let text = std::fs::read_to_string(&file).unwrap();
+    let lines = text.lines().map(|line| match line.split_once("_noise_density:") {
+        Some((sensor, _)) if sensor == "gyroscope" => "gyroscope_noise_density: 0.05".to_owned(),
+        Some((sensor, _)) => format!("{sensor}_noise_density: 0.5"),
+        None => line.to_owned(),
+    });
+    std::fs::write(&file, lines.collect::<Vec<_>>().join("\n")).unwrap();
+    let sequence = inflated.to_str().unwrap();
+    vidar(&["inspect", sequence]).says(&["imu-noise-contradicted", "gyroscope 5.0e-2 is taken as"]);
+    let out = shared().root.join("inflated noise tracked");
+    let run = odometry(&inflated, &out, &[]).ends_with(0);
+    let log = std::fs::read_to_string(out.join("log.jsonl")).unwrap();
+    assert!(log.contains("imu-noise-contradicted"), "{log}");
+    let trajectory = &run.json()["final"]["trajectory"];
+    assert!(trajectory["scale_error"].as_f64().unwrap() < 0.03, "{trajectory}");
+    let honest = vidar(&["inspect", flight().to_str().unwrap()]).ends_with(0);
+    assert!(!honest.stderr.contains("imu-noise"), "{}", honest.stderr);
+}

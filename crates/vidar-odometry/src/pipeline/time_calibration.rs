@@ -250,3 +250,22 @@ impl TimeCalibration {
         })
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_is_known_or_was_looked_for_is_not_looked_for_again() {
+        let looks = |config: &OdometryConfig| !TimeCalibration::new(config).is_settled();
+        let unknown = OdometryConfig::default();
+        assert!(looks(&unknown));
+        assert!(
+            looks(&OdometryConfig { readout_ms: Some(0.0), ..unknown.clone() }),
+            "the clock is not known"
+        );
+        let known = OdometryConfig { readout_ms: Some(0.0), estimate_time_offset: false, ..unknown.clone() };
+        assert!(!looks(&known));
+        assert!(!looks(&OdometryConfig { align_timing: false, ..unknown }));
+    }
+}

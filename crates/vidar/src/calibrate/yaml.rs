@@ -1,6 +1,7 @@
 //! The calibration as a file of Kalibr's kind, camera and IMU in one, that `--calibration` reads.
 
-use super::{CalibrateOutcome, UNKNOWN_LEVER_M, believed_noise, used_readout_ms};
+use super::{CalibrateOutcome, UNKNOWN_LEVER_M, used_readout_ms};
+use crate::imu_noise::believed_noise;
 use std::fmt::Write;
 use vidar_core::LieGroup;
 use vidar_odometry::calibration::Estimate;
