@@ -6,7 +6,7 @@ use crate::draft::{Draft, DraftCamera, DraftDepth};
 use crate::error::DatasetError;
 use crate::location::locate;
 use crate::options::{DatasetKind, OpenOptions, PoseUse};
-use crate::topics::{self, problem};
+use crate::topics::{self, ImuTopics, problem};
 use crate::transforms::{Frames, rigid};
 use nalgebra::Vector3;
 use std::cell::Cell;
@@ -14,8 +14,8 @@ use std::path::Path;
 use std::sync::Arc;
 use vidar_bag::{Bag, Header, Message, MessageRef, Role, Topic, role_of};
 use vidar_core::{
-    AngularRate, BodyFrame, CameraId, ImuNoise, ImuSample, Se3, SpecificForce, StampedPose, Timestamp,
-    Trajectory, Warning,
+    AngularRate, BodyFrame, CameraId, ImuNoise, ImuSample, Se3, SpecificForce, StampedPose, TimedVector,
+    Timestamp, Trajectory, Warning,
 };
 
 /// Looks for a bag in a folder.
@@ -110,18 +110,52 @@ impl Clock<'_> {
 fn read_imu(
     draft: &mut Draft,
     clock: &mut Clock<'_>,
-    topic: Option<&Topic>,
+    topics: ImuTopics<'_>,
     noise: Option<ImuNoise>,
 ) -> Result<Option<String>, DatasetError> {
-    let Some(topic) = topic else { return Ok(None) };
-    let (mut frame, mut unread) = (String::new(), None);
+    let (topic, frame) = match topics {
+        ImuTopics::None => return Ok(None),
+        ImuTopics::One(topic) => {
+            let (samples, frame) = read_samples(draft, clock, topic);
+            draft.imu = samples;
+            (topic, frame)
+        }
+        ImuTopics::Apart { gyro, accel } => {
+            let (rates, frame) = read_samples(draft, clock, gyro);
+            let (forces, _) = read_samples(draft, clock, accel);
+            draft.imu = vidar_core::merge_imu(
+                &in_order(rates.iter().map(|s| (s.time, s.gyro.0))),
+                &in_order(forces.iter().map(|s| (s.time, s.accel.0))),
+            );
+            (gyro, frame)
+        }
+    };
+    draft.imu_noise = noise;
+    if noise.is_none() {
+        let rate_hz = topic.rate_hz().unwrap_or(ImuNoise::EUROC.rate_hz);
+        let place = format!("{} {}", draft.root.display(), topic.name);
+        draft.assume_imu_noise("a bag", rate_hz, &place);
+    }
+    Ok(Some(frame))
+}
+
+/// In order of time: messages lie in the order in which they were logged.
+fn in_order(samples: impl Iterator<Item = TimedVector>) -> Vec<TimedVector> {
+    let mut samples: Vec<TimedVector> = samples.collect();
+    samples.sort_by_key(|(time, _)| *time);
+    samples
+}
+
+/// Finite samples of a topic and the name of their frame.
+fn read_samples(draft: &mut Draft, clock: &mut Clock<'_>, topic: &Topic) -> (Vec<ImuSample>, String) {
+    let (mut samples, mut frame, mut unread) = (Vec::new(), String::new(), None);
     for message in &topic.messages {
         match clock.bag.read(message) {
             Ok(Message::Imu(sample)) => {
                 let time = clock.or_logged(&sample.header, message);
                 let (gyro, accel) = (sample.angular_velocity, sample.linear_acceleration);
                 let (gyro, accel) = (AngularRate(Vector3::from(gyro)), SpecificForce(Vector3::from(accel)));
-                draft.imu.push(ImuSample { time, gyro, accel });
+                samples.push(ImuSample { time, gyro, accel });
                 frame = sample.header.frame;
             }
             Ok(_) => {}
@@ -133,18 +167,13 @@ fn read_imu(
         let message = format!("{count} IMU samples cannot be read and are left out; the last: {first}");
         draft.warnings.push(Warning::degraded("imu-unreadable", message).at(&place));
     }
-    let before = draft.imu.len();
-    draft.imu.retain(|s| s.gyro.0.iter().chain(s.accel.0.iter()).all(|v| v.is_finite()));
-    if draft.imu.len() < before {
-        let message = format!("{} IMU samples are not finite; skipped", before - draft.imu.len());
+    let before = samples.len();
+    samples.retain(|s| s.gyro.0.iter().chain(s.accel.0.iter()).all(|v| v.is_finite()));
+    if samples.len() < before {
+        let message = format!("{} IMU samples are not finite; skipped", before - samples.len());
         draft.warnings.push(Warning::new("sample-not-finite", message).at(&place));
     }
-    draft.imu_noise = noise;
-    if noise.is_none() {
-        let rate_hz = topic.rate_hz().unwrap_or(ImuNoise::EUROC.rate_hz);
-        draft.assume_imu_noise("a bag", rate_hz, &place);
-    }
-    Ok(Some(frame))
+    (samples, frame)
 }
 
 /// All fixed transforms: those of `/tf_static`; those of `/tf`, which may move, only where a fixed one is not known.

@@ -12,9 +12,21 @@ pub(crate) struct Choice<'a> {
     /// Number of the camera.
     pub camera: u32,
     pub depth: Option<&'a Topic>,
-    pub imu: Option<&'a Topic>,
+    pub imu: ImuTopics<'a>,
     pub poses: Vec<(PoseUse, &'a Topic)>,
     pub warnings: Vec<Warning>,
+}
+
+/// Where IMU samples come from.
+#[derive(Clone, Copy, Debug)]
+pub(crate) enum ImuTopics<'a> {
+    None,
+    One(&'a Topic),
+    /// Gyroscope and accelerometer apart, each with zeros for the other, as RealSense cameras publish them.
+    Apart {
+        gyro: &'a Topic,
+        accel: &'a Topic,
+    },
 }
 
 /// Chooses the topics: those that the user names, else the only one of a kind.
@@ -35,10 +47,8 @@ pub(crate) fn choose<'a>(bag: &'a Bag, options: &OpenOptions) -> Result<Choice<'
         Some(at) => (images[at], options.camera.0),
         None => choose_image(bag, &images, options, !of(Role::Video).is_empty())?,
     };
-    let imu = match choose_one(of(Role::Imu), named) {
-        Ok(imu) => imu,
-        Err(several) => return Err(problem(bag, format!("{} IMUs; name one with --topic", several.len()))),
-    };
+    let imu = choose_imu(bag, of(Role::Imu), named)
+        .map_err(|several| problem(bag, format!("{several} IMUs; name one with --topic")))?;
     let depth = choose_one(without_twins(depth), named).unwrap_or_else(|several| {
         let names: Vec<_> = several.iter().map(|t| t.name.as_str()).collect();
         let message = format!("several topics of depth ({}); none is used", names.join(", "));
@@ -92,6 +102,44 @@ fn choose_one(all: Vec<&Topic>, named: impl Fn(&Topic) -> bool) -> Result<Option
         (None, [one]) => Ok(Some(one)),
         (None, _) => Err(all),
     }
+}
+
+/// The IMU: those that the user names, else all of them. The only one; of several the only one that measures both; else the only
+/// gyroscope with the only accelerometer. The error is how many there are.
+fn choose_imu<'a>(
+    bag: &Bag,
+    all: Vec<&'a Topic>,
+    named: impl Fn(&Topic) -> bool,
+) -> Result<ImuTopics<'a>, usize> {
+    let wanted: Vec<&Topic> = all.iter().copied().filter(|t| named(t)).collect();
+    let topics = if wanted.is_empty() { all } else { wanted };
+    match topics.as_slice() {
+        [] => return Ok(ImuTopics::None),
+        [one] => return Ok(ImuTopics::One(one)),
+        _ => {}
+    }
+    let measured: Vec<(&Topic, [bool; 2])> = topics.iter().map(|t| (*t, measures(bag, t))).collect();
+    let only = |what: [bool; 2]| -> Vec<&'a Topic> {
+        measured.iter().filter(|(_, m)| *m == what).map(|(t, _)| *t).collect()
+    };
+    match (only([true, true]).as_slice(), only([true, false]).as_slice(), only([false, true]).as_slice()) {
+        ([both], _, _) => Ok(ImuTopics::One(both)),
+        ([], [gyro], [accel]) => Ok(ImuTopics::Apart { gyro, accel }),
+        _ => Err(topics.len()),
+    }
+}
+
+/// Whether the first messages hold rates, and whether they hold specific forces: what a driver does not measure it leaves zero.
+fn measures(bag: &Bag, topic: &Topic) -> [bool; 2] {
+    const FIRST: usize = 20;
+    let read = topic.messages.iter().take(FIRST).filter_map(|m| bag.read(m).ok());
+    read.fold([false, false], |[gyro, accel], message| match message {
+        Message::Imu(sample) => {
+            let is_measured = |v: [f64; 3]| v.iter().any(|x| *x != 0.0);
+            [gyro || is_measured(sample.angular_velocity), accel || is_measured(sample.linear_acceleration)]
+        }
+        _ => [gyro, accel],
+    })
 }
 
 fn choose_image<'a>(

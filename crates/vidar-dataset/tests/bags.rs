@@ -160,3 +160,67 @@ fn what_is_no_recording_is_named_with_the_nearest_way() {
         open(Path::new("https://example.org/a.bag"), &OpenOptions::default()).unwrap_err().to_string();
     assert!(error.contains("URL") && error.contains("download"), "{error}");
 }
+
+/// A bag with an image and IMU topics `(name, has gyroscope, has accelerometer, period in ns)`, as a RealSense camera's driver writes them.
+fn bag_with_imus(imus: &[(&str, bool, bool, i64)]) -> tempfile::TempDir {
+    use vidar_bag::write::{McapWriter, encode};
+    use vidar_bag::{Header, ImuMessage, Message, RawImage};
+    use vidar_core::Timestamp;
+    let folder = tempfile::tempdir().unwrap();
+    let mut writer = McapWriter::new(Vec::new(), "test").unwrap();
+    let mut put = |topic: &str, nanos: i64, message: &Message| {
+        let (name, bytes) = encode(message).unwrap();
+        let channel = writer.channel(topic, name).unwrap();
+        writer.write(channel, Timestamp::from_nanos(nanos), &bytes).unwrap();
+    };
+    let header = |nanos: i64| Header { stamp: Timestamp::from_nanos(nanos), frame: "imu".into() };
+    for (topic, gyro, accel, period) in imus {
+        for k in 1..=40 {
+            let nanos = k * period;
+            let t = nanos as f64 * 1e-9;
+            let message = Message::Imu(ImuMessage {
+                header: header(nanos),
+                angular_velocity: if *gyro { [0.1, t, 0.0] } else { [0.0; 3] },
+                linear_acceleration: if *accel { [t, 0.0, 9.8] } else { [0.0; 3] },
+            });
+            put(topic, nanos, &message);
+        }
+    }
+    let data: Vec<u8> = (0..24 * 20).map(|k| (k % 251) as u8).collect();
+    let (width, height, row_bytes) = (24, 20, 24);
+    for nanos in [100_000_000, 150_000_000] {
+        let encoding = "mono8".to_owned();
+        let header = header(nanos);
+        let image =
+            RawImage { header, width, height, encoding, row_bytes, is_big_endian: false, data: data.clone() };
+        put("/camera/color/image_raw", nanos, &Message::Image(image));
+    }
+    let bytes = writer.finish().unwrap();
+    std::fs::write(folder.path().join("realsense.mcap"), bytes).unwrap();
+    folder
+}
+
+#[test]
+fn gyroscope_and_accelerometer_on_topics_of_their_own_are_one_imu() {
+    let (gyro, accel) = ("/camera/gyro/sample", "/camera/accel/sample");
+    let apart = [(gyro, true, false, 5_000_000), (accel, false, true, 16_000_000)];
+    let folder = bag_with_imus(&apart);
+    let path = folder.path().join("realsense.mcap");
+    let dataset = open(&path, &OpenOptions::default()).unwrap();
+    // Samples of the gyroscope between the first and the last of the accelerometer: 20 to 200 ms.
+    assert_eq!(dataset.imu.len(), 37);
+    for sample in &dataset.imu {
+        let t = sample.time.as_secs_f64();
+        assert!((sample.gyro.0.y - t).abs() < 1e-12 && (sample.accel.0.x - t).abs() < 1e-9, "{sample:?}");
+    }
+    // A topic with both is preferred; two of them must be told apart by the user.
+    let both = [apart[0], apart[1], ("/camera/imu", true, true, 5_000_000)];
+    let folder = bag_with_imus(&both);
+    let dataset = open(&folder.path().join("realsense.mcap"), &OpenOptions::default()).unwrap();
+    assert_eq!(dataset.imu.len(), 40);
+    let folder = bag_with_imus(&[both[2], ("/imu", true, true, 4_000_000), apart[0]]);
+    let path = folder.path().join("realsense.mcap");
+    let error = open(&path, &OpenOptions::default()).unwrap_err().to_string();
+    assert!(error.contains("3 IMUs"), "{error}");
+    assert_eq!(open(&path, &with_topics(&["/imu"])).unwrap().imu.len(), 40);
+}

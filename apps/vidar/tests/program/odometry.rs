@@ -155,7 +155,7 @@ fn noise_that_a_file_inflates_is_named_and_bounded() {
     let file = inflated.join("mav0/imu0/sensor.yaml");
     let text = std::fs::read_to_string(&file).unwrap();
     let lines = text.lines().map(|line| match line.split_once("_noise_density:") {
-        Some((sensor, _)) if sensor == "gyroscope" => "gyroscope_noise_density: 0.05".to_owned(),
+        Some(("gyroscope", _)) => "gyroscope_noise_density: 0.05".to_owned(),
         Some((sensor, _)) => format!("{sensor}_noise_density: 0.5"),
         None => line.to_owned(),
     });
