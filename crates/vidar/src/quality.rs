@@ -71,7 +71,10 @@ impl TrackQuality {
                 self.contradictions += usize::from(matches!(reason, LossReason::Diverged { .. }));
             }
             Status::Waiting(failure) => {
-                self.waits += 1;
+                // Too little recorded for an attempt says nothing of the sensors.
+                let is_attempt =
+                    !matches!(failure.reason, InitFailureReason::Frames | InitFailureReason::Seconds);
+                self.waits += usize::from(is_attempt);
                 let kind = kind_of(&failure.reason);
                 self.contradictions += usize::from(kind.is_contradiction);
                 let refusal = self.refusals.entry(kind.name.into()).or_default();
