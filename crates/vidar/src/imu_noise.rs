@@ -44,9 +44,16 @@ pub(crate) fn believed_noise(seen: Option<SensorNoise>) -> ImuNoise {
     }
 }
 
-/// Replaces noise that nobody stated, and noise that the samples contradict; warnings say so.
-pub(crate) fn settle(dataset: &mut Dataset) {
-    let (Some(stated), Some(seen)) = (dataset.rig.imu, sensor_noise(&dataset.imu)) else { return };
+/// Replaces noise that nobody stated, and noise that the samples contradict; warnings say so. Returns what the samples show.
+pub(crate) fn settle(dataset: &mut Dataset) -> Option<SensorNoise> {
+    let seen = sensor_noise(&dataset.imu)?;
+    if let Some(stated) = dataset.rig.imu {
+        replace(dataset, &stated, seen);
+    }
+    Some(seen)
+}
+
+fn replace(dataset: &mut Dataset, stated: &ImuNoise, seen: SensorNoise) {
     let shown = believed_noise(Some(seen));
     if is_guessed(dataset) {
         // What it said is used is not.
@@ -57,7 +64,7 @@ pub(crate) fn settle(dataset: &mut Dataset) {
         dataset.warnings.push(warning.hint("a calibration of the IMU: --calibration imu.yaml (Kalibr)"));
         return;
     }
-    let (settled, contradicted) = bounded(&stated, &shown);
+    let (settled, contradicted) = bounded(stated, &shown);
     if contradicted.is_empty() {
         return;
     }

@@ -13,7 +13,7 @@ use serde::Serialize;
 use std::path::Path;
 use vidar_core::{Duration, FrameImage, Timestamp, Trajectory, Warning};
 use vidar_dataset::{CalibrationSource, Dataset, OpenOptions};
-use vidar_odometry::calibration::{SensorNoise, sensor_noise};
+use vidar_odometry::calibration::SensorNoise;
 
 /// Summary of a recording.
 #[derive(Clone, Debug, Serialize)]
@@ -99,8 +99,7 @@ pub fn inspect(
     cancel: &CancelToken,
 ) -> Result<Inspection, Error> {
     let mut dataset = vidar_dataset::open(path, options)?;
-    imu_noise::settle(&mut dataset);
-    let dataset = dataset;
+    let noise = imu_noise::settle(&mut dataset);
     let images: Vec<Timestamp> = dataset.images.iter().map(|i| i.time).collect();
     let imu: Vec<Timestamp> = dataset.imu.iter().map(|s| s.time).collect();
     let depths: Vec<Timestamp> = dataset.depths.iter().map(|d| d.time).collect();
@@ -127,7 +126,7 @@ pub fn inspect(
     let advice = motion.iter().flat_map(Motion::advice);
     let advice = advice.chain(images.iter().flat_map(motion::advice_of_images));
     let advice = advice.chain(is_refused.then(|| CALIBRATION_ADVICE.to_owned())).collect();
-    let noise = sensor_noise(&dataset.imu).map(|noise| {
+    let noise = noise.map(|noise| {
         let SensorNoise { gyro, accel, .. } = noise;
         format!(
             "noise of the IMU at most {gyro:.1e} rad/s/√Hz and {accel:.1e} m/s²/√Hz, as its samples show it"

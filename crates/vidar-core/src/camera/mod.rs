@@ -157,26 +157,25 @@ impl CameraModel {
         width: usize,
         height: usize,
     ) -> Result<Self, CameraError> {
-        let build_error = |expected| CameraError::WrongParameterCount {
-            model: self.name(),
-            expected,
-            found: parameters.len(),
-        };
         fn build<const N: usize, M: ParametricCamera<N>>(
+            of: &CameraModel,
             parameters: &[f64],
             (width, height): (usize, usize),
-            error: impl Fn(usize) -> CameraError,
         ) -> Result<M, CameraError> {
-            let parameters = parameters.try_into().map_err(|_| error(N))?;
+            let parameters = parameters.try_into().map_err(|_| CameraError::WrongParameterCount {
+                model: of.name(),
+                expected: N,
+                found: parameters.len(),
+            })?;
             M::from_parameters(parameters, width, height)
         }
         let size = (width, height);
         match self {
-            Self::Pinhole(_) => build(parameters, size, build_error).map(Self::Pinhole),
-            Self::RadTan(_) => build(parameters, size, build_error).map(Self::RadTan),
-            Self::Equidistant(_) => build(parameters, size, build_error).map(Self::Equidistant),
-            Self::DoubleSphere(_) => build(parameters, size, build_error).map(Self::DoubleSphere),
-            Self::Fov(_) => build(parameters, size, build_error).map(Self::Fov),
+            Self::Pinhole(_) => build(self, parameters, size).map(Self::Pinhole),
+            Self::RadTan(_) => build(self, parameters, size).map(Self::RadTan),
+            Self::Equidistant(_) => build(self, parameters, size).map(Self::Equidistant),
+            Self::DoubleSphere(_) => build(self, parameters, size).map(Self::DoubleSphere),
+            Self::Fov(_) => build(self, parameters, size).map(Self::Fov),
         }
     }
 

@@ -58,10 +58,7 @@ pub struct FeatureTracker {
 impl FeatureTracker {
     /// For images of `width` × `height`.
     pub fn new(width: usize, height: usize) -> Self {
-        let mut base = 0;
-        while (width >> base) > MAX_WIDTH {
-            base += 1;
-        }
+        let base = Pyramid::level_for(width, height, MAX_WIDTH);
         let cell_px = (width.max(height) / CELLS_ACROSS).clamp(8, 256);
         // One level is searched: the detector names the finest, and large images are followed on a coarser one.
         let config = DetectorConfig { cell_px, levels: base + 1, ..DetectorConfig::default() };

@@ -63,6 +63,12 @@ impl Pyramid {
         Ok(())
     }
 
+    /// Level of images of `width` × `height` that is at most `max_width` wide, or the coarsest that is built.
+    pub(crate) fn level_for(width: usize, height: usize, max_width: usize) -> usize {
+        let is_built = |level: usize| (width >> level).min(height >> level) >= MIN_SIDE_PX;
+        (0..).find(|&level| width >> level <= max_width || !is_built(level + 1)).unwrap_or(0)
+    }
+
     /// Number of levels.
     pub fn level_count(&self) -> usize {
         self.levels.len()

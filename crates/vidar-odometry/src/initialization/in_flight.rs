@@ -2,40 +2,15 @@
 
 use super::failure::{InitFailure, InitFailureReason};
 use super::gyro_bias::{RayPair, gyro_bias};
-use super::linear::{self, LinearSolution, LinearView, Rays};
+use super::linear::{self, LinearSolution};
+use super::log::LoggedFrame;
 use super::static_start::leveled;
-use crate::backend::{
-    GaugePriorSigmas, Observation, OptimiseReport, Smoother, SmootherConfig, SmootherError,
-};
-use crate::imu::{Bias, NavState, Preintegration};
-use nalgebra::{Matrix2, Matrix3, Vector2, Vector3};
-use rustc_hash::FxHashMap;
+use super::views::{self, Track, View};
+use crate::backend::{GaugePriorSigmas, OptimiseReport, Smoother, SmootherConfig, SmootherError};
+use crate::imu::{Bias, NavState};
+use nalgebra::Vector3;
 use serde::{Deserialize, Serialize};
-use vidar_core::{CameraModel, FrameId, LandmarkId, LieGroup, Se3, So3, Timestamp};
-
-/// What a frame saw of a track.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct TrackObservation {
-    /// The track.
-    pub landmark: LandmarkId,
-    /// Where, pixels.
-    pub pixel: Vector2<f64>,
-    /// Covariance of `pixel`, px².
-    pub covariance: Matrix2<f64>,
-}
-
-/// A frame before there is a state: what it saw, and the IMU measurements since the frame before in the log.
-#[derive(Clone, Debug)]
-pub struct LoggedFrame {
-    /// Its number.
-    pub frame: FrameId,
-    /// When it was taken, in the clock of the IMU.
-    pub time: Timestamp,
-    /// IMU measurements since the frame before; what the first frame holds is not used.
-    pub preintegration: Option<Preintegration>,
-    /// What it saw.
-    pub observations: Vec<TrackObservation>,
-}
+use vidar_core::{CameraModel, FrameId, LandmarkId, LieGroup, Se3, So3};
 
 /// Settings and acceptance limits of the initialisation in motion.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
@@ -175,19 +150,6 @@ pub struct InFlightInitializer {
     last: Option<Vec<(FrameId, Vector3<f64>)>>,
 }
 
-/// A chosen frame, with IMU measurements from the chosen one before.
-struct View<'a> {
-    logged: &'a LoggedFrame,
-    preintegration: Option<Preintegration>,
-}
-
-/// A track over the chosen frames.
-struct Track {
-    landmark: LandmarkId,
-    /// View, what it saw, unit ray in its camera.
-    observations: Vec<(usize, TrackObservation, Vector3<f64>)>,
-}
-
 impl InFlightInitializer {
     /// Nothing is known yet but the calibration.
     pub fn new(
@@ -235,7 +197,8 @@ impl InFlightInitializer {
     }
 
     fn solve(&mut self, log: &[LoggedFrame]) -> Result<Result<InFlightSolution, InitFailure>, SmootherError> {
-        let mut views = self.choose(log);
+        let most = self.config.keyframes.min(self.smoother_config.max_frames - 1).max(3);
+        let mut views = views::choose(log, self.config.window_secs, most);
         let span = match (views.first(), views.last()) {
             (Some(first), Some(last)) => (last.logged.time - first.logged.time).as_secs_f64(),
             _ => 0.0,
@@ -246,7 +209,7 @@ impl InFlightInitializer {
         if views.len() < 5 {
             return Ok(Err(InitFailure::new(InitFailureReason::Frames, views.len() as f64, 5.0)));
         }
-        let tracks = self.gather(&views);
+        let tracks = views::gather(&views, &self.camera);
         if tracks.len() < self.config.min_tracks {
             let wanted = self.config.min_tracks as f64;
             return Ok(Err(InitFailure::new(InitFailureReason::Tracks, tracks.len() as f64, wanted)));
@@ -256,8 +219,8 @@ impl InFlightInitializer {
         }
         let bias = Bias { gyro: self.gyro_bias, accel: Vector3::zeros() };
         views.iter_mut().filter_map(|v| v.preintegration.as_mut()).for_each(|r| r.reintegrate(bias));
-        let turns = self.turns(&views, &bias);
-        let parallax = self.median_parallax_deg(&tracks, &turns);
+        let turns = views::rotations(&views, &bias);
+        let parallax = views::median_parallax_deg(&tracks, &turns, &self.body_from_camera.rotation);
         if !(parallax >= self.config.min_parallax_deg) {
             self.last = None;
             return Ok(Err(InitFailure::new(
@@ -293,63 +256,6 @@ impl InFlightInitializer {
         Ok(self.evaluate(smoother, &fit, span))
     }
 
-    /// Chooses frames over the end of the log and joins their IMU measurements.
-    fn choose<'a>(&self, log: &'a [LoggedFrame]) -> Vec<View<'a>> {
-        let Some(newest) = log.last() else { return Vec::new() };
-        // A frame without IMU measurements cannot be tied to what came before it.
-        let chained = log.iter().rposition(|f| f.preintegration.is_none()).unwrap_or(0);
-        let within =
-            |f: &&LoggedFrame| (newest.time - f.time).as_secs_f64() <= self.config.window_secs + 1e-6;
-        let log = &log[chained..];
-        let log = &log[log.len() - log.iter().rev().take_while(within).count()..];
-        let most = self.config.keyframes.min(self.smoother_config.max_frames - 1).max(3);
-        // Frames on a grid that only ever doubles, so that successive attempts choose the same ones; and the newest.
-        let mut stride = 1;
-        while log.len().saturating_sub(1) / stride + 2 > most {
-            stride *= 2;
-        }
-        let mut chosen: Vec<usize> =
-            (0..log.len()).filter(|&k| log[k].frame.index().is_multiple_of(stride)).collect();
-        if chosen.last() != Some(&(log.len() - 1)) {
-            chosen.push(log.len() - 1);
-        }
-        let mut views = Vec::with_capacity(chosen.len());
-        let mut from = 0;
-        for (k, &at) in chosen.iter().enumerate() {
-            let mut preintegration: Option<Preintegration> = None;
-            if k > 0 {
-                for part in log[from + 1..=at].iter().filter_map(|f| f.preintegration.as_ref()) {
-                    match &mut preintegration {
-                        None => preintegration = Some(part.clone()),
-                        Some(sum) => sum.append(part),
-                    }
-                }
-            }
-            views.push(View { logged: &log[at], preintegration });
-            from = at;
-        }
-        views
-    }
-
-    /// Tracks that at least three chosen frames share, in the order of their names.
-    fn gather(&self, views: &[View<'_>]) -> Vec<Track> {
-        let mut at: FxHashMap<LandmarkId, usize> = FxHashMap::default();
-        let mut tracks: Vec<Track> = Vec::new();
-        for (k, view) in views.iter().enumerate() {
-            for observations in &view.logged.observations {
-                let Some(ray) = self.camera.unproject(&observations.pixel) else { continue };
-                let slot = *at.entry(observations.landmark).or_insert_with(|| {
-                    tracks.push(Track { landmark: observations.landmark, observations: Vec::new() });
-                    tracks.len() - 1
-                });
-                tracks[slot].observations.push((k, *observations, ray));
-            }
-        }
-        tracks.retain(|t| t.observations.len() >= 3);
-        tracks.sort_unstable_by_key(|t| t.landmark);
-        tracks
-    }
-
     /// Step 1: gyroscope bias from pairs of neighbouring and next-but-one views.
     fn find_gyro_bias(&mut self, views: &[View<'_>], tracks: &[Track]) {
         let camera_turn = self.body_from_camera.rotation;
@@ -377,80 +283,12 @@ impl InFlightInitializer {
         }
     }
 
-    /// Rotations first_from_body of all views.
-    fn turns(&self, views: &[View<'_>], bias: &Bias) -> Vec<So3> {
-        let mut turn = So3::IDENTITY;
-        let step = |v: &View<'_>| v.preintegration.as_ref().map_or(So3::IDENTITY, |r| r.rotation(bias));
-        let next = |v: &View<'_>| {
-            turn = turn * step(v);
-            turn
-        };
-        views.iter().map(next).collect()
-    }
-
-    /// Median over tracks of the widest angle between rays that rotation leaves.
-    fn median_parallax_deg(&self, tracks: &[Track], turns: &[So3]) -> f64 {
-        let camera = self.body_from_camera.rotation;
-        let mut widest: Vec<f64> = tracks
-            .iter()
-            .map(|t| {
-                let ray = |s: &(usize, TrackObservation, Vector3<f64>)| turns[s.0] * (camera * s.2);
-                let first = ray(&t.observations[0]);
-                t.observations
-                    .iter()
-                    .map(|s| first.cross(&ray(s)).norm().atan2(first.dot(&ray(s))))
-                    .fold(0.0, f64::max)
-            })
-            .collect();
-        widest.sort_unstable_by(f64::total_cmp);
-        widest.get(widest.len() / 2).map_or(0.0, |a| a.to_degrees())
-    }
-
     /// Step 2: velocity, gravity, bias and points, linear.
     fn linear_start(&self, views: &[View<'_>], tracks: &[Track], turns: &[So3]) -> Option<LinearSolution> {
         let gravity_mps2 = views.iter().find_map(|v| v.preintegration.as_ref())?.model().gravity_mps2;
-        let (mut secs, mut position, mut velocity) = (0.0, Vector3::zeros(), Vector3::zeros());
-        let (mut position_by, mut velocity_by) = (Matrix3::zeros(), Matrix3::zeros());
-        let mut before = So3::IDENTITY;
-        let mut linear_views = Vec::with_capacity(views.len());
-        for (view, turn) in views.iter().zip(turns) {
-            if let Some(r) = &view.preintegration {
-                let (_, dp, dv) = r.corrected(r.bias());
-                let t = r.secs();
-                let m = before.matrix();
-                position += velocity * t + before * dp;
-                position_by += velocity_by * t + m * r.delta.by_accel_bias.fixed_view::<3, 3>(3, 0);
-                velocity += before * dv;
-                velocity_by += m * r.delta.by_accel_bias.fixed_view::<3, 3>(6, 0);
-                secs += t;
-            }
-            before = *turn;
-            let offset = position + *turn * self.body_from_camera.translation;
-            linear_views.push(LinearView { secs, offset, by_accel_bias: position_by });
-        }
-        let camera = self.body_from_camera.rotation;
-        let rays: Vec<Rays> = tracks
-            .iter()
-            .map(|t| t.observations.iter().map(|(k, _, ray)| (*k, turns[*k] * (camera * *ray))).collect())
-            .collect();
-        linear::solve(
-            &linear_views,
-            &rays,
-            LINEAR_INFLATION * self.ray_sigma_rad(tracks),
-            self.config.accel_bias_sigma,
-            gravity_mps2,
-        )
-    }
-
-    fn ray_sigma_rad(&self, tracks: &[Track]) -> f64 {
-        let mean = |of: &mut dyn Iterator<Item = f64>| {
-            let (sum, n) = of.fold((0.0, 0.0), |(s, n), v| (s + v, n + 1.0));
-            if n > 0.0 { sum / n } else { 1.0 }
-        };
-        let variances =
-            tracks.iter().flat_map(|t| &t.observations).map(|(_, s, _)| 0.5 * s.covariance.trace());
-        let focal = 0.5 * (self.camera.intrinsics().fx + self.camera.intrinsics().fy);
-        (mean(&mut variances.into_iter()).sqrt() / focal).max(1e-5)
+        let (linear_views, rays) = views::linear_input(views, tracks, turns, &self.body_from_camera);
+        let sigma_rad = LINEAR_INFLATION * views::ray_sigma_rad(tracks, &self.camera);
+        linear::solve(&linear_views, &rays, sigma_rad, self.config.accel_bias_sigma, gravity_mps2)
     }
 
     /// Step 3: the window as a smoother.
@@ -492,20 +330,15 @@ impl InFlightInitializer {
         }
         let fallback = median(first.points.iter().flatten().map(|p| p.norm())).unwrap_or(4.0);
         for (track, point) in tracks.iter().zip(&first.points) {
-            let (host, observations, _) = track.observations[0];
-            let observation = |view: usize, observations: &TrackObservation| Observation {
-                frame: views[view].logged.frame,
-                landmark: track.landmark,
-                pixel: observations.pixel,
-                covariance: observations.covariance,
-            };
+            let (host, first_seen, _) = track.observations[0];
             let at = smoother.state(views[host].logged.frame).map_or(Se3::IDENTITY, |s| s.world_from_body);
             let distance = point.map_or(fallback, |p| {
                 (world_from_first * p - at.act(&self.body_from_camera.translation)).norm()
             });
-            smoother.add_landmark(&observation(host, &observations), 1.0 / distance.clamp(0.1, 1e3))?;
-            for (view, observations, _) in &track.observations[1..] {
-                smoother.add_observation(&observation(*view, observations))?;
+            let first_seen = first_seen.by(views[host].logged.frame);
+            smoother.add_landmark(&first_seen, 1.0 / distance.clamp(0.1, 1e3))?;
+            for (view, seen, _) in &track.observations[1..] {
+                smoother.add_observation(&seen.by(views[*view].logged.frame))?;
             }
         }
         Ok(smoother)

@@ -1,10 +1,11 @@
 //! The odometry before it has a metric state: tracks are followed with the gyroscope's help and logged.
 
+use super::log::joined;
 use super::{
     InFlightConfig, InFlightInitializer, InitFailure, InitFailureReason, InitOutcome, LoggedFrame,
     TrackObservation,
 };
-use crate::backend::{Observation, Smoother, SmootherError};
+use crate::backend::{Smoother, SmootherError};
 use crate::config::OdometryConfig;
 use crate::deferred::Deferred;
 use crate::imu::{Bias, Preintegration};
@@ -211,22 +212,15 @@ impl Initializer {
             return Ok(());
         };
         let state = *state;
-        let mut joined: Option<Preintegration> = None;
-        for part in self.log.iter().filter(|f| f.frame > solved).filter_map(|f| f.preintegration.as_ref()) {
-            match &mut joined {
-                None => joined = Some(part.clone()),
-                Some(sum) => sum.append(part),
-            }
-        }
-        let Some(mut joined) = joined else { return Ok(()) };
+        let since = self.log.iter().filter(|f| f.frame > solved);
+        let Some(mut joined) = joined(since) else { return Ok(()) };
         joined.reintegrate(state.bias);
         let predicted = joined.predict(&state);
         smoother.add_frame(newest.frame, newest.time, predicted, Some(joined))?;
         smoother.mark_keyframe(newest.frame)?;
-        for TrackObservation { landmark, pixel, covariance } in newest.observations.iter().copied() {
-            if smoother.landmark(landmark).is_some() {
-                let seen = Observation { frame: newest.frame, landmark, pixel, covariance };
-                smoother.add_observation(&seen)?;
+        for seen in &newest.observations {
+            if smoother.landmark(seen.landmark).is_some() {
+                smoother.add_observation(&seen.by(newest.frame))?;
             }
         }
         smoother.optimise(self.config.iterations);

@@ -16,14 +16,15 @@ mod gyro_bias;
 mod in_flight;
 mod initializer;
 mod linear;
+mod log;
 mod monocular;
 mod static_start;
+mod views;
 
 pub use failure::{InitFailure, InitFailureReason};
-pub use in_flight::{
-    InFlightConfig, InFlightInitializer, InFlightSolution, InitOutcome, LoggedFrame, TrackObservation,
-};
+pub use in_flight::{InFlightConfig, InFlightInitializer, InFlightSolution, InitOutcome};
 pub(crate) use initializer::{INITIAL_INVERSE_DISTANCE, InitialState, Initializer, STILL_SECS};
+pub use log::{LoggedFrame, TrackObservation};
 pub use static_start::{StaticInitConfig, StaticState, initialize_static};
 
 #[cfg(test)]

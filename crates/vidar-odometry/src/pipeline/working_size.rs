@@ -28,7 +28,7 @@ impl WorkingSize {
     /// For images of `given`, with the camera of the images that are worked with.
     pub fn of(given: &CameraModel) -> (Self, CameraModel) {
         let (width, height) = (given.width(), given.height());
-        let wanted = (0..).find(|k| width >> k <= MAX_WIDTH).unwrap_or(0);
+        let wanted = Pyramid::level_for(width, height, MAX_WIDTH);
         let halved = scaled(given, 1.0 / f64::from(1_u32 << wanted), width >> wanted, height >> wanted);
         // A camera that has no half, of one row say, is worked with as it is.
         let (halvings, working) = halved.map_or_else(|_| (0, given.clone()), |camera| (wanted, camera));
@@ -53,7 +53,7 @@ impl WorkingSize {
         let buffers =
             self.buffers.get_or_insert_with(|| Pyramid::new(self.width, self.height, self.halvings + 1));
         match buffers.rebuild(&given) {
-            Ok(()) => FrameImage::Gray8(buffers.level(buffers.level_count() - 1).clone()),
+            Ok(()) => FrameImage::Gray8(buffers.level(self.halvings).clone()),
             // Its size was checked when it came.
             Err(_) => given,
         }
@@ -118,6 +118,15 @@ mod tests {
         let seen = size.pixel(working.project(&point).unwrap());
         assert!((seen - given.project(&point).unwrap()).norm() < 1e-9, "{seen}");
         assert_eq!(scaled(&working, 2.0, 1281, 721).unwrap(), given);
+    }
+
+    #[test]
+    fn an_image_too_flat_for_more_halvings_fits_the_camera_that_it_is_given_to() {
+        let flat = CameraModel::Pinhole(Pinhole::new(900.0, 900.0, 2000.0, 25.0, 4000, 50).unwrap());
+        let (mut size, working) = WorkingSize::of(&flat);
+        let image = size.image(FrameImage::Gray8(Image::filled(4000, 50, 7)));
+        assert_eq!((working.width(), working.height(), size.factor()), (2000, 25, 2.0));
+        assert_eq!((image.width(), image.height()), (2000, 25));
     }
 
     #[test]
