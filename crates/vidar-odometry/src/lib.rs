@@ -9,6 +9,7 @@
 //! - `tracking`: features followed from image to image, seeds, keyframes and the sliding window of frames;
 //! - [`backend`]: the fixed-lag smoother that estimates the window's states and landmarks;
 //! - [`bundle_adjustment`]: after a recording's end, all states, landmarks and the calibration in one adjustment;
+//! - `relocalization`: keyframes that show the same place found again after a loss;
 //! - `pipeline`: [`Odometry`], the push machine that connects them and monitors their health.
 
 pub mod backend;
@@ -22,6 +23,7 @@ mod gyro_alignment;
 pub mod imu;
 pub mod initialization;
 mod pipeline;
+mod relocalization;
 #[cfg(any(test, feature = "simulation"))]
 pub mod simulate;
 mod stages;
@@ -30,8 +32,8 @@ mod tracking;
 pub use config::{ImuUse, OdometryConfig};
 pub use error::OdometryError;
 pub use pipeline::{
-    CameraTiming, DivergenceSign, InputCounts, LossReason, Odometry, OdometryOutput, Status, TrackSummary,
-    Tracking,
+    CameraTiming, DivergenceSign, InputCounts, Joined, LossReason, Odometry, OdometryOutput, Status,
+    TrackSummary, Tracking,
 };
 pub use stages::{Stage, StageTimes};
 pub use tracking::TrackRecord;

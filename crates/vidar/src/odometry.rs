@@ -26,7 +26,7 @@ use vidar_core::{BodyFrame, OdometryKeyframe, RevisedPose, Severity, StampedPose
 use vidar_dataset::{Dataset, OpenOptions};
 use vidar_eval::TrajectoryReport;
 use vidar_odometry::bundle_adjustment::{Adjusted, CalibrationSigmas, Progress};
-use vidar_odometry::{ImuUse, InputCounts, Odometry, OdometryOutput, Status};
+use vidar_odometry::{ImuUse, InputCounts, Joined, Odometry, OdometryOutput, Status};
 
 /// The stage of the adjustment, in events.
 const ADJUSTMENT: &str = "adjustment";
@@ -68,6 +68,8 @@ pub struct LostSpan {
     pub until_ns: Option<i64>,
     /// Why the state was given up.
     pub reason: String,
+    /// Image at which the place was found again, ns: the states after the span are in the world of those before it. `None` where it was not.
+    pub found_again_ns: Option<i64>,
 }
 
 /// All outputs of the odometry on a recording.
@@ -284,17 +286,32 @@ impl Tracked {
                 if let Some(open) = self.lost.last_mut().filter(|l| l.until_ns.is_none()) {
                     open.until_ns = Some(time_ns);
                 }
+                tracking.joined.iter().for_each(|joined| self.join(joined, time_ns));
                 self.keyframes.extend(tracking.keyframe.take().map(|k| *k));
                 let revised = std::mem::take(&mut tracking.revised);
                 revised.iter().for_each(|r| self.revise(r));
                 tracking.landmarks.clear();
             }
             Status::Lost(reason) => {
-                self.lost.push(LostSpan { from_ns: time_ns, until_ns: None, reason: reason.to_string() });
+                let reason = reason.to_string();
+                self.lost.push(LostSpan { from_ns: time_ns, until_ns: None, reason, found_again_ns: None });
             }
             Status::Waiting(_) => {}
         }
         self.frames.push(TrackedFrame { output, seconds });
+    }
+
+    /// States of a segment that turns out to be of the same world as another one go there.
+    fn join(&mut self, joined: &Joined, time_ns: i64) {
+        for frame in &mut self.frames {
+            if let Status::Tracking(tracking) = &mut frame.output.status {
+                joined.apply(&mut tracking.segment, &mut tracking.state);
+            }
+        }
+        self.keyframes.iter_mut().for_each(|k| joined.apply_to_keyframe(k));
+        if let Some(lost) = self.lost.last_mut() {
+            lost.found_again_ns = Some(time_ns);
+        }
     }
 
     fn revise(&mut self, revised: &RevisedPose) {
@@ -346,10 +363,15 @@ impl Tracked {
         }
         for span in &self.lost {
             let at = vidar_core::Timestamp::from_nanos(span.from_ns);
-            warnings
-                .push(Warning::degraded("track-lost", format!("at {at} s: {}", span.reason)).hint(
-                    "poses after it are a segment of their own; odometry/health.csv lists every image",
-                ));
+            let hint = match span.found_again_ns.map(vidar_core::Timestamp::from_nanos) {
+                Some(again) => format!(
+                    "the place was found again at {again} s: one world; odometry/health.csv lists every image"
+                ),
+                None => {
+                    "poses after it are a segment of their own; odometry/health.csv lists every image".into()
+                }
+            };
+            warnings.push(Warning::degraded("track-lost", format!("at {at} s: {}", span.reason)).hint(hint));
         }
         if !self.frames.iter().any(|f| f.output.tracking().is_some()) {
             let why = self.why_not_started().unwrap_or_else(|| "no images".into());

@@ -5,10 +5,11 @@ use nalgebra::Vector3;
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 use std::collections::BTreeMap;
-use vidar_core::{Health, Timestamp};
+use std::collections::btree_map::Entry;
+use vidar_core::{Health, LieGroup, Timestamp};
 use vidar_odometry::bundle_adjustment::Adjusted;
 use vidar_odometry::initialization::InitFailureReason;
-use vidar_odometry::{LossReason, OdometryOutput, Status, Tracking};
+use vidar_odometry::{Joined, LossReason, OdometryOutput, Status, Tracking};
 
 /// Statements of the odometry, summed up image by image.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
@@ -62,6 +63,7 @@ impl TrackQuality {
         match &output.status {
             Status::Tracking(tracking) => {
                 self.with_state += 1;
+                tracking.joined.iter().for_each(|joined| self.join(joined));
                 let add = |s: &mut SegmentQuality| s.add(output.time, tracking);
                 let new = || SegmentQuality::new(output.time, tracking);
                 self.segments.entry(tracking.segment).and_modify(add).or_insert_with(new);
@@ -80,6 +82,16 @@ impl TrackQuality {
                 let refusal = self.refusals.entry(kind.name.into()).or_default();
                 *refusal = (refusal.0 + 1, failure.to_string());
             }
+        }
+    }
+
+    /// One segment becomes part of another.
+    fn join(&mut self, joined: &Joined) {
+        let Some(mut segment) = self.segments.remove(&joined.segment) else { return };
+        segment.last_position = joined.into_from_segment.act(&segment.last_position);
+        match self.segments.entry(joined.into) {
+            Entry::Occupied(mut into) => into.get_mut().append(segment),
+            Entry::Vacant(into) => drop(into.insert(segment)),
         }
     }
 
@@ -255,6 +267,19 @@ impl SegmentQuality {
         self.weighted.0 += step * tracking.scale_std;
         self.weighted.1 += step;
         (self.last, self.last_position, self.last_scale_std) = (time, position, tracking.scale_std);
+    }
+
+    /// Takes in the states of another segment of the same world.
+    fn append(&mut self, other: Self) {
+        self.images += other.images;
+        other.health.into_iter().for_each(|(word, count)| *self.health.entry(word).or_default() += count);
+        self.weighted.0 += other.weighted.0;
+        self.weighted.1 += other.weighted.1;
+        self.first = self.first.min(other.first);
+        if other.last > self.last {
+            (self.last, self.last_position, self.last_scale_std) =
+                (other.last, other.last_position, other.last_scale_std);
+        }
     }
 
     fn count(&self, health: Health) -> usize {

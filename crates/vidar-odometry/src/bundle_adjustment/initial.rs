@@ -120,11 +120,7 @@ impl Guess {
         for image in first..=last {
             let time = log.images[image].stamp + clock_offset;
             let state = match &log.images[image].state {
-                Some(logged) => Some(NavState {
-                    world_from_body: placed * logged.state.world_from_body,
-                    velocity: placed.rotation * logged.state.velocity,
-                    bias: logged.state.bias,
-                }),
+                Some(logged) => Some(logged.state.moved(&placed)),
                 None => self.carried_to(time, imu, model),
             };
             let Some(state) = state else { return };

@@ -5,7 +5,7 @@ use crate::imu::NavState;
 use crate::tracking::HostImage;
 use nalgebra::{Matrix2, Vector2};
 use std::rc::Rc;
-use vidar_core::{Duration, FrameId, ImuSample, LandmarkId, Timestamp, camera::Pixel};
+use vidar_core::{Duration, FrameId, ImuSample, LandmarkId, Se3, Timestamp, camera::Pixel};
 
 /// Images are logged this far apart, and keyframes in any case: preintegration over it is good to a tenth of a millimetre,
 /// and a hand turns by less than 20° in it.
@@ -185,12 +185,34 @@ impl TrackLog {
         Self { images, ..self.clone() }
     }
 
-    /// Brings the states of images that the window still holds up to date.
-    pub(crate) fn follow(&mut self, smoother: &Smoother) {
+    /// Number of starts of the tracker so far.
+    pub(crate) fn generation(&self) -> u32 {
+        self.generation
+    }
+
+    /// Moves the states of a segment into the world of another one.
+    pub(crate) fn join(&mut self, segment: u32, into: u32, into_from_segment: &Se3) {
+        let states = self.images.iter_mut().filter_map(|i| i.state.as_mut());
+        for logged in states.filter(|s| s.segment == segment) {
+            logged.segment = into;
+            logged.state = logged.state.moved(into_from_segment);
+        }
+    }
+
+    /// Adds to image `frame`, if it was logged, that it shows an earlier track.
+    pub(crate) fn tie(&mut self, frame: FrameId, key: TrackKey, pixel: &Pixel, covariance: &Matrix2<f64>) {
+        let Some(image) = self.images.iter_mut().rev().find(|i| i.frame == frame) else { return };
+        if image.observations.iter().all(|o| o.key != key) {
+            image.observations.push(LoggedObservation::new(key, pixel, covariance));
+        }
+    }
+
+    /// Brings the states of images that the window still holds up to date; `in_world` takes them to the world of their segment.
+    pub(crate) fn follow(&mut self, smoother: &Smoother, in_world: impl Fn(NavState) -> NavState) {
         let newest = self.images.len().saturating_sub(NEWEST_IMAGES);
         for image in &mut self.images[newest..] {
             if let (Some(logged), Some(state)) = (&mut image.state, smoother.state(image.frame)) {
-                logged.state = *state;
+                logged.state = in_world(*state);
             }
         }
     }

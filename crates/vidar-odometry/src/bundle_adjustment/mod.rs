@@ -29,8 +29,8 @@ mod sigmas;
 mod thin;
 
 pub use findings::AdjustmentFinding;
-pub(crate) use log::LoggedState;
 pub use log::TrackLog;
+pub(crate) use log::{LoggedState, TrackKey};
 pub use progress::{AdjustmentStage, Progress};
 pub use result::{Adjusted, AdjustedCalibration, AdjustedImu, AdjustmentReport};
 pub use sigmas::CalibrationSigmas;

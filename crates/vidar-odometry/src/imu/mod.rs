@@ -39,6 +39,15 @@ impl NavState {
     pub const REST: Self =
         Self { world_from_body: Se3::IDENTITY, velocity: Vector3::new(0.0, 0.0, 0.0), bias: Bias::ZERO };
 
+    /// The state in a world that differs by a turn about the vertical and a shift.
+    pub fn moved(&self, to_from_own: &Se3) -> Self {
+        Self {
+            world_from_body: *to_from_own * self.world_from_body,
+            velocity: to_from_own.rotation.act(&self.velocity),
+            bias: self.bias,
+        }
+    }
+
     /// The state moved by an error-state vector.
     pub fn plus(&self, delta: &Vector15) -> Self {
         let part = |at: usize| Vector3::new(delta[at], delta[at + 1], delta[at + 2]);

@@ -11,5 +11,5 @@ mod working_size;
 
 pub(crate) use keyframes::public_state;
 pub use odometry::{InputCounts, Odometry};
-pub use output::{DivergenceSign, LossReason, OdometryOutput, Status, TrackSummary, Tracking};
+pub use output::{DivergenceSign, Joined, LossReason, OdometryOutput, Status, TrackSummary, Tracking};
 pub use time_calibration::CameraTiming;

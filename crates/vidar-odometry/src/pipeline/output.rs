@@ -4,7 +4,8 @@ use crate::backend::SmootherError;
 use crate::initialization::InitFailure;
 use std::fmt;
 use vidar_core::{
-    FrameId, Health, NavCovariance, NavState, OdometryKeyframe, RevisedPose, SparseLandmark, Timestamp,
+    FrameId, Health, LieGroup, NavCovariance, NavState, OdometryKeyframe, PoseCovariance, RevisedPose, Se3,
+    SparseLandmark, Timestamp,
 };
 
 /// What is known after one image.
@@ -71,6 +72,88 @@ pub struct Tracking {
     pub keyframe: Option<Box<OdometryKeyframe>>,
     /// Keyframes whose poses changed since the last output.
     pub revised: Vec<RevisedPose>,
+    /// Two segments of which this image shows that they are of one world.
+    pub joined: Option<Joined>,
+}
+
+/// Two segments whose worlds became one, because a place was found again.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Joined {
+    /// The segment that ends here: all its poses, also those before, belong to the other one with the transform.
+    pub segment: u32,
+    /// The segment that it is part of from here on.
+    pub into: u32,
+    /// From the world of the one to that of the other: a turn about the vertical and a shift.
+    pub into_from_segment: Se3,
+    /// Landmarks that both show.
+    pub matches: usize,
+}
+
+impl Joined {
+    /// A state in the world of the segment that it is part of now; one of another segment stays.
+    pub fn apply(&self, segment: &mut u32, state: &mut NavState) {
+        if *segment == self.segment {
+            *segment = self.into;
+            *state = moved(state, &self.into_from_segment);
+        }
+    }
+
+    /// The same for a keyframe.
+    pub fn apply_to_keyframe(&self, keyframe: &mut OdometryKeyframe) {
+        if keyframe.segment == self.segment {
+            move_keyframe(keyframe, &self.into_from_segment);
+        }
+        self.apply(&mut keyframe.segment, &mut keyframe.state);
+    }
+}
+
+impl Tracking {
+    /// Tells that two segments are one, the own one perhaps.
+    pub(crate) fn join(&mut self, joined: &Joined) {
+        if self.segment == joined.segment {
+            self.move_by(&joined.into_from_segment);
+            self.segment = joined.into;
+            self.keyframe.iter_mut().for_each(|k| k.segment = joined.into);
+        }
+        self.joined = Some(*joined);
+    }
+
+    /// Expresses all poses in a world that differs by a turn about the vertical and a shift.
+    pub(crate) fn move_by(&mut self, to_from_own: &Se3) {
+        self.state = moved(&self.state, to_from_own);
+        let mut turn = NavCovariance::identity();
+        for at in [POSITION, VELOCITY] {
+            turn.fixed_view_mut::<3, 3>(at, at).copy_from(&to_from_own.rotation.matrix());
+        }
+        self.covariance = turn * self.covariance * turn.transpose();
+        for keyframe in self.keyframe.iter_mut() {
+            keyframe.state = moved(&keyframe.state, to_from_own);
+            move_keyframe(keyframe, to_from_own);
+        }
+        for revised in &mut self.revised {
+            revised.world_from_camera = *to_from_own * revised.world_from_camera;
+        }
+    }
+}
+
+/// Entries of a state's covariance from which on they are of its position and of its velocity.
+const POSITION: usize = 3;
+const VELOCITY: usize = 6;
+
+fn moved(state: &NavState, to_from_own: &Se3) -> NavState {
+    NavState {
+        world_from_body: *to_from_own * state.world_from_body,
+        velocity_in_world: to_from_own.rotation.act(&state.velocity_in_world),
+        ..*state
+    }
+}
+
+/// Pose and covariance of a keyframe; its state is moved by itself.
+fn move_keyframe(keyframe: &mut OdometryKeyframe, to_from_own: &Se3) {
+    keyframe.world_from_camera = *to_from_own * keyframe.world_from_camera;
+    let mut turn = PoseCovariance::identity();
+    turn.fixed_view_mut::<3, 3>(POSITION, POSITION).copy_from(&to_from_own.rotation.matrix());
+    keyframe.pose_covariance = turn * keyframe.pose_covariance * turn.transpose();
 }
 
 /// Tracks of one image, counted.

@@ -130,6 +130,7 @@ impl PoseSource for Scripted {
                 state: FrameState { frame_id, time, segment, world_from_camera: pose(frame_id.0) },
                 keyframe: None,
                 revised: Vec::new(),
+                joined: None,
             },
             None => PoseReport::NotPosed { time },
         }]

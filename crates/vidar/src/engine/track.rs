@@ -9,7 +9,7 @@ use std::sync::Arc;
 use vidar_core::{
     CameraId, Duration, LieGroup, OdometryKeyframe, RevisedPose, Rig, Se3, SensorEvent, Timestamp, Warning,
 };
-use vidar_odometry::{ImuUse, Odometry, OdometryConfig, OdometryOutput, Status};
+use vidar_odometry::{ImuUse, Joined, Odometry, OdometryConfig, OdometryOutput, Status, Tracking};
 
 /// What a pose source reports of one image. Images are reported in the order of time; one may be left out.
 #[derive(Clone, Debug)]
@@ -22,6 +22,8 @@ pub enum PoseReport {
         keyframe: Option<Box<OdometryKeyframe>>,
         /// Earlier keyframes whose poses were estimated again.
         revised: Vec<RevisedPose>,
+        /// Two segments that this image shows to be of one world.
+        joined: Option<Joined>,
     },
     /// The image has none.
     NotPosed {
@@ -101,6 +103,7 @@ impl PoseSource for GivenPoses {
                 state: FrameState { frame_id, time, segment: 0, world_from_camera },
                 keyframe: None,
                 revised: Vec::new(),
+                joined: None,
             },
             None => PoseReport::NotPosed { time },
         }]
@@ -157,7 +160,8 @@ impl OdometryPoses {
                 self.has_state = true;
                 let world_from_camera = tracking.state.world_from_body * self.body_from_camera;
                 let state = FrameState { frame_id, time, segment: tracking.segment, world_from_camera };
-                PoseReport::Posed { state, keyframe: tracking.keyframe, revised: tracking.revised }
+                let Tracking { keyframe, revised, joined, .. } = *tracking;
+                PoseReport::Posed { state, keyframe, revised, joined }
             }
             Status::Tracking(_) => PoseReport::NotPosed { time },
             Status::Lost(reason) => {
@@ -269,11 +273,35 @@ impl Track {
                 }
                 None
             }
-            PoseReport::Posed { state, keyframe, .. } => {
+            PoseReport::Posed { state, keyframe, joined, .. } => {
+                joined.iter().for_each(|joined| self.join(joined));
                 self.add_pose(state, keyframe.map(|k| Arc::new(*k)));
                 Some(state)
             }
         }
+    }
+
+    /// One segment becomes part of another.
+    fn join(&mut self, joined: &Joined) {
+        let Some(mut segment) = self.segments.remove(&joined.segment) else { return };
+        let moved = |pose: &mut Se3| *pose = joined.into_from_segment * *pose;
+        for frame in &mut segment.frames {
+            moved(&mut frame.world_from_camera);
+            frame.odometry.iter_mut().for_each(|k| joined.apply_to_keyframe(Arc::make_mut(k)));
+        }
+        segment.odometry.iter_mut().for_each(|k| joined.apply_to_keyframe(Arc::make_mut(k)));
+        segment.last.iter_mut().for_each(|(_, pose)| moved(pose));
+        segment.id = joined.into;
+        let Some(into) = self.segments.get_mut(&joined.into) else {
+            self.segments.insert(joined.into, segment);
+            return;
+        };
+        into.images += segment.images;
+        into.frames.extend(segment.frames);
+        into.frames.sort_by_key(|f| f.stamp.time);
+        into.odometry.extend(segment.odometry);
+        into.odometry.sort_by_key(|k| k.state.time);
+        into.last = [into.last, segment.last].into_iter().flatten().max_by_key(|(time, _)| *time);
     }
 
     fn add_pose(&mut self, state: FrameState, keyframe: Option<Arc<OdometryKeyframe>>) {
@@ -349,7 +377,7 @@ mod tests {
         let FrameStamp { frame_id, time, .. } = stamp(i);
         let world_from_camera = Se3::from_translation(Vector3::new(f64::from(i), 0.0, 0.0));
         let state = FrameState { frame_id, time, segment, world_from_camera };
-        PoseReport::Posed { state, keyframe: None, revised: Vec::new() }
+        PoseReport::Posed { state, keyframe: None, revised: Vec::new(), joined: None }
     }
 
     #[test]

@@ -88,6 +88,7 @@ impl PoseSource for TrackedPoses {
                 },
                 keyframe: self.keyframes.remove(&frame_id).map(Box::new),
                 revised: Vec::new(),
+                joined: None,
             },
             None => PoseReport::NotPosed { time },
         }]

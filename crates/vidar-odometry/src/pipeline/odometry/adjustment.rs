@@ -4,7 +4,7 @@ use super::{Odometry, Phase, Status};
 use crate::bundle_adjustment::{
     self, Adjusted, AdjustmentError, AdjustmentInput, CalibrationSigmas, LoggedState, Progress, TrackLog,
 };
-use crate::imu::StepNoise;
+use crate::imu::{NavState, StepNoise};
 use crate::tracking::{host_covariance, noisy_covariance};
 use std::ops::ControlFlow;
 use vidar_core::{Frame, FrameId, Health};
@@ -32,13 +32,17 @@ impl Odometry {
         });
         // Where the IMU alone carried the state it is no better than what the adjustment carries itself.
         let is_seen = matches!(status, Status::Tracking(tracking) if tracking.health != Health::Degraded);
-        let state = state.filter(|_| is_seen).map(|state| LoggedState { segment: self.segment, state });
+        let placed = self.placed;
+        let in_world = |state: NavState| placed.map_or(state, |placed| state.moved(&placed));
+        let logged = |state| LoggedState { segment: self.segment, state: in_world(state) };
+        let state = state.filter(|_| is_seen).map(logged);
+        let Some(log) = &mut self.log else { return };
         log.add_image(id, (frame.id, frame.time), state, shown);
         if let Some(host) = self.last_host.as_ref().filter(|host| host.frame == id) {
             log.add_place(frame.time, host);
         }
         if let Phase::Tracking(window) = &self.phase {
-            log.follow(&window.smoother);
+            log.follow(&window.smoother, in_world);
         }
     }
 

@@ -1,0 +1,121 @@
+//! From images without a state to the first one, and back.
+
+use super::{IMAGE_NOISE_GRAY, Odometry, Phase, Status};
+use crate::backend::{Smoother, SmootherError};
+use crate::bundle_adjustment::TrackLog;
+use crate::config::OdometryConfig;
+use crate::frontend::FrontendConfig;
+use crate::initialization::{INITIAL_INVERSE_DISTANCE, InitialState, Initializer, STILL_SECS};
+use crate::initialization::{InitFailure, StaticInitConfig, initialize_static};
+use crate::tracking::{HostImage, ImuStatistics, SlidingWindowOdometry, StepReport, Tracker};
+use std::rc::Rc;
+use vidar_core::{Duration, Frame, FrameId, ImuSample, RigCamera, Timestamp};
+
+impl Odometry {
+    /// Whether the IMU measurements of the last half second are those of a body at rest.
+    pub(super) fn imu_is_still(&self, time: Timestamp) -> bool {
+        let from = time - Duration::from_secs_f64(STILL_SECS);
+        let (Some(model), Some(first)) = (&self.imu_model, self.imu.iter().next()) else { return false };
+        let recent = self.imu.iter().filter(|s| s.time >= from && s.time <= time);
+        first.time <= from && ImuStatistics::of(recent).is_still(&model.noise)
+    }
+
+    /// Starts from a body at rest: level and gyroscope bias are known, the velocity is zero, and the scale follows as
+    /// soon as the body moves.
+    pub(super) fn start_static(&mut self, frame: &Frame, host: &Rc<HostImage>, time: Timestamp) -> Status {
+        let samples: Vec<ImuSample> = self.imu.iter().filter(|s| s.time <= time).copied().collect();
+        // An IMU sample early, so that the span is not shorter than asked for by less than one period.
+        let from = time - Duration::from_secs_f64(STILL_SECS + 0.02);
+        let begin = samples.partition_point(|s| s.time < from);
+        let rest_config =
+            StaticInitConfig { gravity_mps2: self.config.gravity_mps2, ..StaticInitConfig::default() };
+        let at_rest = match initialize_static(&samples[begin..], None, &rest_config) {
+            Ok(at_rest) => at_rest,
+            Err(failure) => return self.wait(failure),
+        };
+        self.time_calibration.forget_tracks();
+        self.log.iter_mut().for_each(TrackLog::next_generation);
+        let Ok(mut smoother) = self.smoother() else { return self.wait(self.failure.clone()) };
+        let begun = smoother.start(host.frame, time, at_rest.state, at_rest.sigmas);
+        if begun.and_then(|()| smoother.mark_keyframe(host.frame)).is_err() {
+            return self.wait(self.failure.clone());
+        }
+        let mut tracker = Tracker::new(self.camera.model.clone(), &self.frontend, IMAGE_NOISE_GRAY);
+        tracker.detect(host, 2 * self.config.max_landmarks, INITIAL_INVERSE_DISTANCE);
+        let hosts = vec![host.clone()];
+        let window = SlidingWindowOdometry::new(
+            self.config.clone(),
+            smoother,
+            tracker,
+            hosts,
+            INITIAL_INVERSE_DISTANCE,
+        );
+        let Some(mut window) = window else { return self.wait(self.failure.clone()) };
+        window.stand(time);
+        self.begin(window, frame, host.frame)
+    }
+
+    /// Goes on with the smoother that solved the start.
+    pub(super) fn start_in_flight(
+        &mut self,
+        found: InitialState,
+        frame: &Frame,
+        host: &Rc<HostImage>,
+    ) -> Status {
+        let waiting = Phase::Initializing(Box::new(initializer(
+            &self.config,
+            self.imu_model.is_none(),
+            &self.camera,
+            &self.frontend,
+        )));
+        let Phase::Initializing(before) = std::mem::replace(&mut self.phase, waiting) else {
+            return Status::Waiting(self.failure.clone());
+        };
+        let typical = 1.0 / found.median_distance.clamp(0.1, 100.0);
+        let window = SlidingWindowOdometry::new(
+            self.config.clone(),
+            found.smoother,
+            before.tracker,
+            found.hosts,
+            typical,
+        );
+        let Some(window) = window else { return self.wait(self.failure.clone()) };
+        self.begin(window, frame, host.frame)
+    }
+
+    fn begin(&mut self, window: SlidingWindowOdometry, frame: &Frame, id: FrameId) -> Status {
+        self.phase = Phase::Tracking(Box::new(window));
+        let step = StepReport { just_started: true, is_keyframe: true, ..StepReport::default() };
+        self.report(&step, frame, id)
+    }
+
+    pub(super) fn initialize_anew(&mut self) {
+        self.time_calibration.forget_tracks();
+        self.log.iter_mut().for_each(TrackLog::next_generation);
+        self.phase = Phase::Initializing(Box::new(initializer(
+            &self.config,
+            self.imu_model.is_none(),
+            &self.camera,
+            &self.frontend,
+        )));
+    }
+
+    pub(super) fn wait(&mut self, failure: InitFailure) -> Status {
+        self.failure = failure.clone();
+        Status::Waiting(failure)
+    }
+
+    fn smoother(&self) -> Result<Smoother, SmootherError> {
+        Smoother::new(self.config.smoother(), self.camera.model.clone(), self.camera.body_from_camera)
+    }
+}
+
+pub(super) fn initializer(
+    config: &OdometryConfig,
+    is_mono: bool,
+    camera: &RigCamera,
+    frontend: &FrontendConfig,
+) -> Initializer {
+    let tracker = Tracker::new(camera.model.clone(), frontend, IMAGE_NOISE_GRAY);
+    Initializer::new(config.clone(), is_mono, camera.body_from_camera, tracker)
+}
