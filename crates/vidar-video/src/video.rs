@@ -1,12 +1,12 @@
 //! An open video: its frames by number, decoded when they are asked for.
 
 use crate::boxes::{self, find};
-use crate::decoder::{Codec, Decoder};
+use crate::codec::{Codec, Parameters};
 use crate::error::VideoError;
 use crate::gpmf::{self, Telemetry};
-use crate::picture::Picture;
+use crate::lane::AccessUnits;
+use crate::pictures::{Pictures, Unit};
 use crate::track::{self, Sample, Track};
-use std::collections::{HashSet, VecDeque};
 use std::fmt;
 use std::fs::File;
 use std::io::{Read, Seek, SeekFrom};
@@ -25,8 +25,36 @@ pub struct Video {
     /// Frames in the order of display.
     frames: Vec<Frame>,
     warnings: Vec<Warning>,
+    file: Arc<UnitsOfFile>,
+    pictures: Pictures,
+}
+
+/// Coded pictures where the container's tables say.
+struct UnitsOfFile {
     file: Mutex<File>,
-    state: Mutex<State>,
+    samples: Vec<Sample>,
+}
+
+impl AccessUnits for UnitsOfFile {
+    fn read(&self, number: usize) -> Result<Vec<u8>, String> {
+        let sample = self.samples.get(number).ok_or("the video ends before it")?;
+        self.bytes(sample)
+    }
+}
+
+impl UnitsOfFile {
+    fn bytes(&self, sample: &Sample) -> Result<Vec<u8>, String> {
+        if sample.size > MAX_SAMPLE_BYTES {
+            return Err(format!(
+                "a part of {} bytes; at most {MAX_SAMPLE_BYTES} bytes are read",
+                sample.size
+            ));
+        }
+        let mut file = self.file.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut bytes = vec![0; sample.size as usize];
+        let read = file.seek(SeekFrom::Start(sample.offset)).and_then(|_| file.read_exact(&mut bytes));
+        read.map(|()| bytes).map_err(|e| e.to_string())
+    }
 }
 
 #[derive(Clone, Copy)]
@@ -36,26 +64,10 @@ struct Frame {
     sample: usize,
 }
 
-/// The decoder, the sample that it takes next, and the pictures that came out last.
-#[derive(Default)]
-struct State {
-    decoder: Option<Decoder>,
-    next: usize,
-    /// Samples whose pictures came out since the decoder was started at the sample `start`.
-    start: usize,
-    out: HashSet<usize>,
-    recent: VecDeque<(usize, Arc<Picture>)>,
-}
-
-/// Decoded pictures that are kept, bytes: twenty of 1080p. The newest stays even when it is larger.
-const RECENT_BYTES: usize = 64 << 20;
 /// Largest table of a movie (`moov`); one of ten hours has about 30 MB.
 const MAX_MOOV_BYTES: u64 = 512 << 20;
 /// Largest coded picture, bytes; one of 8K at the highest rate has about 4 MB.
 const MAX_SAMPLE_BYTES: u32 = 64 << 20;
-/// Pictures that a decoder may hold back to bring them in order: 16 in both standards.
-const MOST_HELD_BACK: usize = 17;
-
 impl fmt::Debug for Video {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.debug_struct("Video")
@@ -110,17 +122,15 @@ impl Video {
                 "a video of which no picture lies in the file (its end is missing)".into(),
             ));
         }
-        let mut open = Self {
-            path: path.to_path_buf(),
-            tracks,
-            video,
-            codec,
-            size: (0, 0),
-            frames,
-            warnings,
-            file: Mutex::new(file),
-            state: Mutex::default(),
-        };
+        let units = tracks[video].samples.iter();
+        let units = units.map(|s| Unit { time_ns: s.time_ns, is_sync: s.is_sync }).collect();
+        let file =
+            UnitsOfFile { file: Mutex::new(file), samples: std::mem::take(&mut tracks[video].samples) };
+        let file = Arc::new(file);
+        let source: Arc<dyn AccessUnits> = Arc::clone(&file) as _;
+        let pictures = Pictures::new(codec.clone(), units, source, tracks[video].size);
+        let path = path.to_path_buf();
+        let mut open = Self { path, tracks, video, codec, size: (0, 0), frames, warnings, file, pictures };
         // The decoder's own size counts; the container's may be that of the display.
         let first = open.frame(0)?;
         open.size = (first.width(), first.height());
@@ -154,11 +164,7 @@ impl Video {
 
     /// `H.264` or `H.265`.
     pub fn codec_name(&self) -> &'static str {
-        match self.codec {
-            Codec::H264(_) => "H.264",
-            #[cfg(feature = "h265")]
-            Codec::H265(_) => "H.265",
-        }
+        self.codec.name()
     }
 
     /// What was found unusual while opening.
@@ -171,7 +177,12 @@ impl Video {
         let Some(track) = self.tracks.iter().find(|t| t.codec == *b"gpmd") else { return Ok(None) };
         let mut payloads = Vec::new();
         for sample in &track.samples {
-            payloads.push((sample.time_ns, sample.duration_ns, self.read(sample)?));
+            let bytes = self.file.bytes(sample).map_err(|found| VideoError::Malformed {
+                path: self.path.clone(),
+                found: format!("telemetry: {found}"),
+                expected: "telemetry inside of the file".into(),
+            })?;
+            payloads.push((sample.time_ns, sample.duration_ns, bytes));
         }
         Ok(Some(gpmf::read(&payloads)))
     }
@@ -181,91 +192,18 @@ impl Video {
         let Some(&Frame { sample, .. }) = self.frames.get(number) else {
             return Err(self.bad_frame(number, format!("the video has {} frames", self.frames.len())));
         };
-        let picture = self.picture(sample).map_err(|reason| self.bad_frame(number, reason))?;
+        let picture = self.pictures.picture(sample).map_err(|reason| self.bad_frame(number, reason))?;
         Ok(picture.upright(self.tracks[self.video].quarter_turns))
     }
 
-    fn picture(&self, wanted: usize) -> Result<Arc<Picture>, String> {
-        let samples = &self.tracks[self.video].samples;
-        let mut state = self.state.lock().unwrap_or_else(PoisonError::into_inner);
-        if let Some((_, picture)) = state.recent.iter().find(|(sample, _)| *sample == wanted) {
-            return Ok(Arc::clone(picture));
-        }
-        // A picture that is shown before the one that stands alone, and stored after it, needs the pictures before both.
-        let stands_before = |i: &usize| samples[*i].is_sync && samples[*i].time_ns <= samples[wanted].time_ns;
-        let start = (0..=wanted).rev().find(stands_before).unwrap_or(0);
-        // On from where the decoder is, unless a picture that stands alone lies between. A picture that it was given and that
-        // has not come out is still held back.
-        let is_ahead = (start..=wanted).contains(&state.next);
-        let is_inside = state.start <= wanted && wanted < state.next && !state.out.contains(&wanted);
-        if state.decoder.is_none() || !is_ahead && !is_inside {
-            state.decoder = Some(Decoder::start(&self.codec)?);
-            (state.start, state.next) = (start, start);
-            state.out.clear();
-        }
-        let mut reason = "the decoder gave no picture for it".to_string();
-        let last = samples.len().min(wanted + 1 + MOST_HELD_BACK);
-        while state.next < last {
-            let at = state.next;
-            state.next += 1;
-            let bytes = self.read(&samples[at]).map_err(|e| e.to_string())?;
-            let Some(decoder) = &state.decoder else { break };
-            match decoder.decode(at, bytes, at + 1 == samples.len()) {
-                Ok(pictures) => {
-                    let came = pictures.iter().any(|(sample, _)| *sample == wanted);
-                    for (sample, picture) in pictures {
-                        let picture = picture.without_filling(self.tracks[self.video].size);
-                        state.out.insert(sample);
-                        state.recent.push_back((sample, Arc::new(picture)));
-                    }
-                    state.keep_few();
-                    if came && let Some((_, picture)) = state.recent.iter().rfind(|(s, _)| *s == wanted) {
-                        return Ok(Arc::clone(picture));
-                    }
-                }
-                Err(failure) => {
-                    if failure.is_fatal {
-                        state.decoder = None;
-                        return Err(failure.reason);
-                    }
-                    if at == wanted {
-                        reason = failure.reason;
-                    }
-                }
-            }
-            // Only H.265's decoder holds pictures back.
-            if at >= wanted && matches!(self.codec, Codec::H264(_)) {
-                break;
-            }
-        }
-        Err(reason)
-    }
-
-    fn read(&self, sample: &Sample) -> Result<Vec<u8>, VideoError> {
-        let failed = |source| VideoError::Io { path: self.path.clone(), source };
-        if sample.size > MAX_SAMPLE_BYTES {
-            let found = format!("a coded picture of {} bytes", sample.size);
-            let expected = format!("at most {MAX_SAMPLE_BYTES} bytes");
-            return Err(VideoError::Malformed { path: self.path.clone(), found, expected });
-        }
-        let mut file = self.file.lock().unwrap_or_else(PoisonError::into_inner);
-        file.seek(SeekFrom::Start(sample.offset)).map_err(failed)?;
-        let mut bytes = vec![0; sample.size as usize];
-        file.read_exact(&mut bytes).map_err(failed)?;
-        Ok(bytes)
+    /// Says which frames will be asked for: what these do not need is not decoded. Others stay readable.
+    pub fn expect(&self, frames: impl IntoIterator<Item = usize>) {
+        let units = frames.into_iter().filter_map(|number| Some(self.frames.get(number)?.sample));
+        self.pictures.expect(units);
     }
 
     fn bad_frame(&self, number: usize, reason: String) -> VideoError {
         VideoError::BadFrame { path: self.path.clone(), number, reason }
-    }
-}
-
-impl State {
-    fn keep_few(&mut self) {
-        let mut held: usize = self.recent.iter().map(|(_, p)| p.bytes()).sum();
-        while held > RECENT_BYTES && self.recent.len() > 1 {
-            held -= self.recent.pop_front().map_or(0, |(_, p)| p.bytes());
-        }
     }
 }
 
@@ -309,9 +247,9 @@ fn codec_of(track: &Track, path: &Path) -> Result<Codec, VideoError> {
     };
     let way = "convert it: ffmpeg -i IN -c:v libx264 -crf 16 OUT.mp4";
     match &track.codec {
-        b"avc1" | b"avc3" => described(b"avcC").map(Codec::H264),
+        b"avc1" | b"avc3" => described(b"avcC").map(|b| Codec::H264(Parameters::Described(b))),
         #[cfg(feature = "h265")]
-        b"hvc1" | b"hev1" => described(b"hvcC").map(Codec::H265),
+        b"hvc1" | b"hev1" => described(b"hvcC").map(|b| Codec::H265(Parameters::Described(b))),
         #[cfg(not(feature = "h265"))]
         b"hvc1" | b"hev1" => {
             let found = "the video is H.265, and this build lacks the feature h265";

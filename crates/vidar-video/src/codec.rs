@@ -1,0 +1,162 @@
+//! Access units through the decoders of H.264 and H.265.
+
+use crate::picture::{Colours, Picture, check_size, colours_of, round_to_eight};
+use rust_h264::nal::{NalUnit, NalUnitType, parse_annex_b, parse_avcc, parse_avcc_config, parse_sps_info};
+
+/// The codec of a sequence, with the parameter sets that it begins with.
+#[derive(Clone, Debug)]
+pub(crate) enum Codec {
+    H264(Parameters),
+    #[cfg(feature = "h265")]
+    H265(Parameters),
+}
+
+/// Where parameter sets are kept, which decides how the parts of a unit are told apart.
+#[derive(Clone, Debug)]
+pub(crate) enum Parameters {
+    /// In the container, as the box `avcC` or `hvcC`; parts of a unit have their length before them.
+    Described(Vec<u8>),
+    /// In the sequence itself, which is a byte stream (Annex B of both standards): the first ones of it.
+    InStream(Vec<u8>),
+}
+
+impl Codec {
+    pub(crate) fn name(&self) -> &'static str {
+        match self {
+            Self::H264(_) => "H.264",
+            #[cfg(feature = "h265")]
+            Self::H265(_) => "H.265",
+        }
+    }
+
+    /// Pictures that a decoder may hold back to bring them in order: 16 by the standard, of which only H.265's makes use.
+    pub(crate) fn most_held_back(&self) -> usize {
+        match self {
+            Self::H264(_) => 0,
+            #[cfg(feature = "h265")]
+            Self::H265(_) => 17,
+        }
+    }
+
+    /// A decoder at the beginning of a sequence.
+    pub(crate) fn decoder(&self) -> Result<Box<dyn UnitDecoder>, String> {
+        match self {
+            Self::H264(parameters) => H264::new(parameters).map(|d| Box::new(d) as Box<dyn UnitDecoder>),
+            #[cfg(feature = "h265")]
+            Self::H265(parameters) => {
+                crate::h265::H265::new(parameters).map(|d| Box::new(d) as Box<dyn UnitDecoder>)
+            }
+        }
+    }
+}
+
+/// What decodes access units in their order.
+pub(crate) trait UnitDecoder {
+    /// Whether nothing else is predicted from a unit, so that it need not be decoded unless its picture is wanted.
+    fn is_disposable(&self, bytes: &[u8]) -> bool;
+
+    /// Decodes the next unit; gives the pictures that come out, with the numbers of their units. The error is why this unit gave none.
+    fn decode(&mut self, unit: usize, bytes: &[u8], is_last: bool) -> Result<Vec<(usize, Picture)>, String>;
+}
+
+struct H264 {
+    decoder: Box<rust_h264::decoder::Decoder>,
+    /// Bytes of a length before each part of a unit; `None` in a byte stream.
+    length_size: Option<usize>,
+    colours: Colours,
+}
+
+impl H264 {
+    fn new(parameters: &Parameters) -> Result<Self, String> {
+        let decoder = Box::new(rust_h264::decoder::Decoder::new());
+        let colours = Colours { is_full_range: false, is_bt709: false };
+        let (length_size, parts) = match parameters {
+            Parameters::Described(avcc) => {
+                let config = parse_avcc_config(avcc).map_err(str::to_string)?;
+                let sets = config.sps_nals.into_iter().chain(config.pps_nals);
+                (Some(config.length_size), sets.collect())
+            }
+            Parameters::InStream(bytes) => (None, parse_annex_b(bytes)),
+        };
+        let mut made = Self { decoder, length_size, colours };
+        for nal in &parts {
+            made.take_size(nal).map_err(|e| format!("sequence parameters: {e}"))?;
+            made.decoder.decode_nal(nal).map_err(|e| format!("parameter sets: {e}"))?;
+        }
+        Ok(made)
+    }
+
+    /// Refuses a size before anything of it is allocated.
+    fn take_size(&mut self, nal: &NalUnit<'_>) -> Result<(), String> {
+        if nal.nal_unit_type == NalUnitType::Sps {
+            let info = parse_sps_info(nal).map_err(|e| e.to_string())?;
+            check_size(u64::from(info.coded_width), u64::from(info.coded_height))?;
+            self.colours = colours_of(info.full_range, info.matrix, info.height as usize);
+        }
+        Ok(())
+    }
+
+    fn parts<'a>(&self, bytes: &'a [u8]) -> Vec<NalUnit<'a>> {
+        match self.length_size {
+            Some(size) => parse_avcc(bytes, size),
+            None => parse_annex_b(bytes),
+        }
+    }
+}
+
+impl UnitDecoder for H264 {
+    fn is_disposable(&self, bytes: &[u8]) -> bool {
+        // Only the head of each part counts, but the parts have to be found. Parameter sets and slices of reference pictures state
+        // another `nal_ref_idc` (ITU-T H.264, 7.4.1).
+        let parts = self.parts(bytes);
+        parts.iter().any(|n| n.nal_unit_type == NalUnitType::Slice)
+            && parts.iter().all(|n| n.nal_ref_idc == 0)
+    }
+
+    fn decode(&mut self, unit: usize, bytes: &[u8], _: bool) -> Result<Vec<(usize, Picture)>, String> {
+        let mut first_error = None;
+        for nal in self.parts(bytes) {
+            match self.take_size(&nal) {
+                Ok(()) => {}
+                Err(reason) => return Err(reason),
+            }
+            if let Err(e) = self.decoder.decode_nal(&nal) {
+                first_error.get_or_insert(e.to_string());
+            }
+        }
+        // A unit is one picture, so nothing of it is still to come.
+        match (self.decoder.flush(), first_error) {
+            (Some(frame), _) => {
+                let picture = h264_picture(frame, self.colours);
+                if !picture.is_whole() {
+                    return Err("the decoder gave planes that do not fit its size".into());
+                }
+                Ok(vec![(unit, picture)])
+            }
+            (None, Some(reason)) => Err(reason),
+            (None, None) => Err("it holds no picture".into()),
+        }
+    }
+}
+
+fn h264_picture(frame: rust_h264::decoder::Frame, colours: Colours) -> Picture {
+    let is_wide = frame.bytes_per_sample() == 2;
+    let plane = |bytes: Vec<u8>| if is_wide { eight_bits(bytes) } else { bytes };
+    let chroma_rows = match frame.chroma_format {
+        rust_h264::decoder::ChromaFormat::Yuv420 => 1,
+        rust_h264::decoder::ChromaFormat::Yuv422 => 0,
+    };
+    Picture {
+        width: frame.width as usize,
+        height: frame.height as usize,
+        luma: plane(frame.y),
+        chroma: [plane(frame.u), plane(frame.v)],
+        chroma_shift: [1, chroma_rows],
+        colours,
+    }
+}
+
+/// Ten bits, little-endian, rounded to eight.
+fn eight_bits(bytes: Vec<u8>) -> Vec<u8> {
+    bytes.as_chunks::<2>().0.iter().map(|b| round_to_eight(u16::from_le_bytes(*b), 10)).collect()
+}
