@@ -3,6 +3,7 @@
 mod assemble;
 mod bag;
 mod bag_camera;
+mod bag_video;
 mod calibration;
 pub mod camera_flag;
 mod checks;

@@ -42,10 +42,12 @@ pub(crate) fn choose<'a>(bag: &'a Bag, options: &OpenOptions) -> Result<Choice<'
     let named = |topic: &Topic| options.topics.iter().any(|f| f.name == topic.name);
     let of = |role: Role| -> Vec<&Topic> { bag.topics().iter().filter(|t| role_is(t, role)).collect() };
     let (depth, images): (Vec<_>, Vec<_>) = of(Role::Image).into_iter().partition(|t| is_depth(bag, t));
+    let videos = of(Role::Video);
     let mut warnings = Vec::new();
-    let (image, camera) = match images.iter().position(|t| named(t)) {
-        Some(at) => (images[at], options.camera.0),
-        None => choose_image(bag, &images, options, !of(Role::Video).is_empty())?,
+    let (image, camera) = match images.iter().chain(&videos).find(|t| named(t)) {
+        Some(topic) => (*topic, options.camera.0),
+        // Compressed video beside images is a copy of them.
+        None => choose_image(bag, if images.is_empty() { &videos } else { &images }, options)?,
     };
     let imu = choose_imu(bag, of(Role::Imu), named)
         .map_err(|several| problem(bag, format!("{several} IMUs; name one with --topic")))?;
@@ -85,7 +87,7 @@ fn has_poses(topic: &Topic) -> bool {
 }
 
 fn is_used(topic: &Topic) -> bool {
-    has_poses(topic) || [Role::Image, Role::Imu].iter().any(|role| role_is(topic, *role))
+    has_poses(topic) || [Role::Image, Role::Video, Role::Imu].iter().any(|role| role_is(topic, *role))
 }
 
 /// Topics of poses that nothing names, for a notice.
@@ -146,16 +148,10 @@ fn choose_image<'a>(
     bag: &Bag,
     images: &[&'a Topic],
     options: &OpenOptions,
-    has_video: bool,
 ) -> Result<(&'a Topic, u32), DatasetError> {
     let mut cameras = without_twins(images.to_vec());
     if cameras.is_empty() {
-        let what = if has_video {
-            "no topic of images, only compressed video, which is not read from a bag"
-        } else {
-            "no topic of images"
-        };
-        return Err(problem(bag, what.into()));
+        return Err(problem(bag, "no topic of images or compressed video".into()));
     }
     // Topics that differ in a number or in left and right only are the cameras of one rig.
     let is_rig = cameras.windows(2).all(|w| without_number(&w[0].name) == without_number(&w[1].name));
