@@ -157,6 +157,10 @@ pub struct InputArgs {
     /// Topic of a bag to use: NAME for images, depth or IMU; truth=NAME or trajectory=NAME for poses. Repeatable.
     #[arg(long = "topic", value_name = "NAME", action = ArgAction::Append, help_heading = "Input")]
     pub topics: Vec<String>,
+    /// Who decodes videos: built-in, or ffmpeg, the program of that name on this machine (5.1 or newer), for codecs and containers that
+    /// the built-in decoders refuse.
+    #[arg(long, help_heading = "Input")]
+    pub decoder: Option<String>,
     /// Camera model of the images: pinhole:fx,fy,cx,cy  radtan:…,k1,k2,p1,p2(,k3)  kb4:…,k1,k2,k3,k4  ds:…,xi,alpha  fov:…,w.
     #[arg(long, allow_hyphen_values = true, help_heading = "Input")]
     pub camera_model: Option<String>,

@@ -3,10 +3,12 @@
 mod boxes;
 mod codec;
 mod error;
+mod ffmpeg;
 mod gpmf;
 #[cfg(feature = "h265")]
 mod h265;
 mod lane;
+mod movie;
 mod picture;
 mod pictures;
 mod stream;
@@ -14,6 +16,7 @@ mod track;
 mod video;
 
 pub use error::VideoError;
+pub use ffmpeg::VideoDecoder;
 pub use gpmf::Telemetry;
 pub use lane::{AccessUnits, DECODER_THREAD};
 pub use stream::{StreamCodec, StreamUnit, VideoStream};
