@@ -317,7 +317,7 @@ pub struct DemoArgs {
 /// `vidar inspect`.
 #[derive(Args, Clone, Debug)]
 pub struct InspectArgs {
-    /// The recording.
+    /// The recording; `-` is a bag or video on standard input.
     #[arg(value_hint = ValueHint::AnyPath)]
     pub path: PathBuf,
     /// How the input is read.
@@ -328,7 +328,7 @@ pub struct InspectArgs {
 /// `vidar convert`.
 #[derive(Args, Clone, Debug)]
 pub struct ConvertArgs {
-    /// The recording: whatever `vidar inspect` opens.
+    /// The recording: whatever `vidar inspect` opens; `-` is a bag or video on standard input.
     #[arg(value_hint = ValueHint::AnyPath)]
     pub path: PathBuf,
     /// The new file or folder; it must not exist.
@@ -345,7 +345,7 @@ pub struct ConvertArgs {
 /// `vidar calibrate`.
 #[derive(Args, Clone, Debug)]
 pub struct CalibrateArgs {
-    /// The recording: images and an IMU.
+    /// The recording: images and an IMU; `-` is a bag or video on standard input.
     #[arg(value_hint = ValueHint::AnyPath)]
     pub path: PathBuf,
     /// File for the calibration (Kalibr's YAML, camera and IMU in one), as --calibration takes it.
@@ -359,7 +359,7 @@ pub struct CalibrateArgs {
 /// `vidar odometry`.
 #[derive(Args, Clone, Debug)]
 pub struct OdometryArgs {
-    /// The recording: images and an IMU, as a bag, an action camera's video, or a folder.
+    /// The recording: images and an IMU, as a bag, an action camera's video, or a folder; `-` is a bag or video on standard input.
     #[arg(value_hint = ValueHint::AnyPath)]
     pub path: PathBuf,
     /// Use the camera only, without the IMU: a trajectory up to scale.

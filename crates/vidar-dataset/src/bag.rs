@@ -44,7 +44,11 @@ pub(crate) fn open(path: &Path, reason: String, options: &OpenOptions) -> Result
         choice.poses =
             named.into_iter().filter_map(|(name, used)| Some((used, topic(name.as_ref()?)?))).collect();
     }
-    let mut draft = Draft::new(DatasetKind::Bag, path, format!("{reason}; images of {}", choice.image.name));
+    let mut reason = format!("{reason}; images of {}", choice.image.name);
+    for (number, name) in &choice.others {
+        reason.push_str(&format!(", not those of {name} (--camera {number})"));
+    }
+    let mut draft = Draft::new(DatasetKind::Bag, path, reason);
     draft.warnings.extend(bag.warnings().iter().cloned());
     draft.warnings.extend(choice.warnings.iter().cloned());
     let unused = topics::unused_poses(&bag, &choice);

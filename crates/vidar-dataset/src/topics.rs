@@ -11,6 +11,8 @@ pub(crate) struct Choice<'a> {
     pub image: &'a Topic,
     /// Number of the camera.
     pub camera: u32,
+    /// Numbers and topics of the rig's other cameras.
+    pub others: Vec<(usize, &'a str)>,
     pub depth: Option<&'a Topic>,
     pub imu: ImuTopics<'a>,
     pub poses: Vec<(PoseUse, &'a Topic)>,
@@ -44,8 +46,8 @@ pub(crate) fn choose<'a>(bag: &'a Bag, options: &OpenOptions) -> Result<Choice<'
     let (depth, images): (Vec<_>, Vec<_>) = of(Role::Image).into_iter().partition(|t| is_depth(bag, t));
     let videos = of(Role::Video);
     let mut warnings = Vec::new();
-    let (image, camera) = match images.iter().chain(&videos).find(|t| named(t)) {
-        Some(topic) => (*topic, options.camera.0),
+    let (image, camera, others) = match images.iter().chain(&videos).find(|t| named(t)) {
+        Some(topic) => (*topic, options.camera.0, Vec::new()),
         // Compressed video beside images is a copy of them.
         None => choose_image(bag, if images.is_empty() { &videos } else { &images }, options)?,
     };
@@ -73,7 +75,7 @@ pub(crate) fn choose<'a>(bag: &'a Bag, options: &OpenOptions) -> Result<Choice<'
             (None, None) => {}
         }
     }
-    Ok(Choice { image, camera, depth, imu, poses, warnings })
+    Ok(Choice { image, camera, others, depth, imu, poses, warnings })
 }
 
 fn role_is(topic: &Topic, role: Role) -> bool {
@@ -144,11 +146,14 @@ fn measures(bag: &Bag, topic: &Topic) -> [bool; 2] {
     })
 }
 
+/// The topic of images, the camera's number, and the rig's other cameras.
+type Chosen<'a> = (&'a Topic, u32, Vec<(usize, &'a str)>);
+
 fn choose_image<'a>(
     bag: &Bag,
     images: &[&'a Topic],
     options: &OpenOptions,
-) -> Result<(&'a Topic, u32), DatasetError> {
+) -> Result<Chosen<'a>, DatasetError> {
     let mut cameras = without_twins(images.to_vec());
     if cameras.is_empty() {
         return Err(problem(bag, "no topic of images or compressed video".into()));
@@ -161,7 +166,10 @@ fn choose_image<'a>(
     cameras.sort_by_key(|t| (t.name.len(), t.name.clone()));
     let wanted = options.camera;
     match cameras.get(wanted.index()) {
-        Some(camera) => Ok((camera, wanted.0)),
+        Some(camera) => {
+            let others = cameras.iter().enumerate().filter(|(number, _)| *number != wanted.index());
+            Ok((camera, wanted.0, others.map(|(number, t)| (number, t.name.as_str())).collect()))
+        }
         None => Err(DatasetError::MissingCamera {
             path: bag.path().to_path_buf(),
             camera: wanted,

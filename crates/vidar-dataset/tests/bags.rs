@@ -285,3 +285,41 @@ fn compressed_video_that_cannot_be_decoded_says_why() {
     let error = open(&fixture("foxglove_protobuf.mcap"), &options).unwrap_err().to_string();
     assert!(error.contains("no picture that stands alone"), "{error}");
 }
+
+#[test]
+fn the_other_camera_of_a_stereo_bag_is_named_and_can_be_chosen() {
+    use vidar_bag::{Header, Message, RawImage, write::McapWriter};
+    let mut writer = McapWriter::new(Vec::new(), "test").unwrap();
+    let time = |n: u32| vidar_core::Timestamp::from_nanos(1_000_000_000 + i64::from(n) * 50_000_000);
+    for (topic, value) in [("/stereo/left/image_raw", 50u8), ("/stereo/right/image_raw", 200)] {
+        let channel = writer.channel(topic, "sensor_msgs/Image").unwrap();
+        for number in 0..5 {
+            let image = RawImage {
+                header: Header { stamp: time(number), frame: "cam".into() },
+                width: 8,
+                height: 6,
+                encoding: "mono8".into(),
+                row_bytes: 8,
+                is_big_endian: false,
+                data: vec![value; 48],
+            };
+            let (_, bytes) = vidar_bag::write::encode(&Message::Image(image)).unwrap();
+            writer.write(channel, time(number), &bytes).unwrap();
+        }
+    }
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("stereo.mcap");
+    std::fs::write(&path, writer.finish().unwrap()).unwrap();
+    let of_camera = |number: u32| {
+        let options = OpenOptions { camera: vidar_core::CameraId(number), ..OpenOptions::default() };
+        let dataset = open(&path, &options).unwrap();
+        match dataset.load_image(&dataset.images[0]).unwrap() {
+            vidar_core::FrameImage::Gray8(image) => (dataset.reason, image[(0, 0)]),
+            other => panic!("{other:?}"),
+        }
+    };
+    let (reason, value) = of_camera(0);
+    assert!(reason.contains("not those of /stereo/right/image_raw (--camera 1)") && value == 50, "{reason}");
+    let (reason, value) = of_camera(1);
+    assert!(reason.contains("images of /stereo/right/image_raw") && value == 200, "{reason}");
+}

@@ -160,3 +160,50 @@ fn h264_picture(frame: rust_h264::decoder::Frame, colours: Colours) -> Picture {
 fn eight_bits(bytes: Vec<u8>) -> Vec<u8> {
     bytes.as_chunks::<2>().0.iter().map(|b| round_to_eight(u16::from_le_bytes(*b), 10)).collect()
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Bits of a parameter set (ITU-T H.264, 7.3.2.1 and 9.1).
+    #[derive(Default)]
+    struct Bits(Vec<bool>);
+
+    impl Bits {
+        fn fixed(&mut self, value: u32, count: u32) -> &mut Self {
+            self.0.extend((0..count).rev().map(|i| value >> i & 1 == 1));
+            self
+        }
+
+        fn golomb(&mut self, value: u32) -> &mut Self {
+            let length = (value + 1).ilog2();
+            self.fixed(0, length).fixed(value + 1, length + 1)
+        }
+
+        fn bytes(&self) -> Vec<u8> {
+            let byte = |bits: &[bool]| (0..8).fold(0, |b, i| b << 1 | u8::from(bits.get(i) == Some(&true)));
+            self.0.chunks(8).map(byte).collect()
+        }
+    }
+
+    /// A byte stream of one sequence parameter set for pictures of these macroblocks.
+    fn sequence(columns: u32, rows: u32) -> Vec<u8> {
+        let mut bits = Bits::default();
+        // Baseline, level 5.1, picture order of type 2, one reference, frames only.
+        bits.fixed(66, 8).fixed(0, 8).fixed(51, 8).golomb(0).golomb(0).golomb(2).golomb(1).fixed(0, 1);
+        bits.golomb(columns - 1).golomb(rows - 1).fixed(1, 1).fixed(1, 1).fixed(0, 1).fixed(0, 1).fixed(1, 1);
+        [vec![0, 0, 0, 1, 0x67], bits.bytes()].concat()
+    }
+
+    #[test]
+    fn a_size_beyond_any_camera_is_refused_before_a_picture_is_made() {
+        let open = |stream| Codec::H264(Parameters::InStream(stream)).decoder().map(|_| ());
+        assert_eq!(open(sequence(120, 68)), Ok(()));
+        let refused = open(sequence(2000, 2000)).unwrap_err();
+        assert!(refused.contains("32000x32000"), "{refused}");
+        // Also in the middle of a sequence.
+        let mut decoder = Codec::H264(Parameters::InStream(sequence(4, 4))).decoder().unwrap();
+        let refused = decoder.decode(0, &sequence(2000, 2000), false).map(|_| ()).unwrap_err();
+        assert!(refused.contains("32000x32000"), "{refused}");
+    }
+}
