@@ -81,7 +81,7 @@ impl UnitDecoder for H265 {
         // Beside slices there may be delimiters, messages and filling.
         let is_beside = |nal: &&[u8]| nal.first().is_some_and(|b| matches!(b >> 1 & 0x3f, 35 | 38..=40));
         let parts = self.parts(bytes);
-        parts.iter().any(|n| is_free(n)) && parts.iter().all(|n| is_free(n) || is_beside(n))
+        parts.iter().any(is_free) && parts.iter().all(|n| is_free(n) || is_beside(n))
     }
 
     fn decode(&mut self, unit: usize, bytes: &[u8], is_last: bool) -> Result<Vec<(usize, Picture)>, String> {
@@ -145,5 +145,33 @@ fn picture(frame: &Frame) -> Result<Picture, String> {
         Ok(picture)
     } else {
         Err("the decoder gave planes that do not fit its size".into())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use crate::{AccessUnits, StreamCodec, StreamUnit, VideoStream};
+    use std::sync::Arc;
+    use vidar_core::Timestamp;
+
+    struct Units(Vec<Vec<u8>>);
+
+    impl AccessUnits for Units {
+        fn read(&self, number: usize) -> Result<Vec<u8>, String> {
+            self.0.get(number).cloned().ok_or_else(|| "no such unit".into())
+        }
+    }
+
+    /// Found by fuzzing: the vector instructions of `rusty_h265-accel` 0.6.2 (`fir_h_sse2_tail`) read up to eight bytes past the end of a
+    /// plane. Without its feature `simd` both crates forbid unsafe code.
+    #[test]
+    fn the_decoder_is_built_without_unsafe_code_and_survives_what_was_found() {
+        assert!(matches!(rusty_h265::accel::isa(), rusty_h265::accel::Isa::Scalar));
+        let stream = include_bytes!("../tests/fixtures/end_of_plane.h265");
+        let units = vec![stream.to_vec()];
+        let sets = StreamCodec::H265.parameter_sets(stream);
+        let listed = [StreamUnit { time: Timestamp::from_nanos(0), stands_alone: true }];
+        let opened = VideoStream::open(StreamCodec::H265, &listed, sets, Arc::new(Units(units)));
+        assert!(opened.is_ok_and(|stream| stream.size() == (96, 64)));
     }
 }

@@ -123,12 +123,12 @@ impl Pictures {
         }
         let is_behind = state.current.as_ref().is_some_and(|lane| wanted < lane.next);
         if !is_behind || state.current.as_ref().is_some_and(|lane| self.gives(lane, wanted)) {
-            return self.from_current(&mut state, wanted);
+            return self.take_in_order(&mut state, wanted);
         }
-        self.from_aside(&mut state, wanted)
+        self.take_aside(&mut state, wanted)
     }
 
-    fn from_current(&self, state: &mut State, wanted: usize) -> Result<Arc<Picture>, String> {
+    fn take_in_order(&self, state: &mut State, wanted: usize) -> Result<Arc<Picture>, String> {
         state.looking_back = 0;
         state.in_order += 1;
         if !state.current.as_ref().is_some_and(|lane| self.gives(lane, wanted)) {
@@ -142,7 +142,7 @@ impl Pictures {
         taken.map_err(|e| e.reason)
     }
 
-    fn from_aside(&self, state: &mut State, wanted: usize) -> Result<Arc<Picture>, String> {
+    fn take_aside(&self, state: &mut State, wanted: usize) -> Result<Arc<Picture>, String> {
         state.looking_back += 1;
         let lane = match state.aside.take() {
             Some(lane) if self.gives(&lane, wanted) => Ok(lane),

@@ -26,7 +26,7 @@ pub struct Video {
 }
 
 enum Decoder {
-    BuiltIn { codec: &'static str, pictures: Pictures },
+    BuiltIn { codec: &'static str, pictures: Box<Pictures> },
     Program(Ffmpeg),
 }
 
@@ -52,7 +52,7 @@ impl Video {
         let (name, units) = (codec.name(), std::mem::take(&mut movie.units));
         let pictures = Pictures::new(codec, units, Arc::clone(&movie.file) as _, movie.track().size);
         let frames = std::mem::take(&mut movie.frames);
-        Self::of(path, Some(movie), frames, Decoder::BuiltIn { codec: name, pictures })
+        Self::of(path, Some(movie), frames, Decoder::BuiltIn { codec: name, pictures: Box::new(pictures) })
     }
 
     /// Opens a video for a decoder. With the user's `ffmpeg` it may be of any codec and container that this program reads; the tables
