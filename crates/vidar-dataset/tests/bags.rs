@@ -292,7 +292,7 @@ fn the_other_camera_of_a_stereo_bag_is_named_and_can_be_chosen() {
     let mut writer = McapWriter::new(Vec::new(), "test").unwrap();
     let time = |n: u32| vidar_core::Timestamp::from_nanos(1_000_000_000 + i64::from(n) * 50_000_000);
     for (topic, value) in [("/stereo/left/image_raw", 50u8), ("/stereo/right/image_raw", 200)] {
-        let channel = writer.channel(topic, "sensor_msgs/Image").unwrap();
+        let channel = writer.channel(topic, "sensor_msgs/msg/Image").unwrap();
         for number in 0..5 {
             let image = RawImage {
                 header: Header { stamp: time(number), frame: "cam".into() },
