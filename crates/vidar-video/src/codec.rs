@@ -1,6 +1,7 @@
 //! Access units through the decoders of H.264 and H.265.
 
 use crate::picture::{Colours, Picture, check_size, colours_of, round_to_eight};
+use crate::unit::{Parameters, UnitDecoder};
 use rust_h264::nal::{NalUnit, NalUnitType, parse_annex_b, parse_avcc, parse_avcc_config, parse_sps_info};
 
 /// The codec of a sequence, with the parameter sets that it begins with.
@@ -9,15 +10,6 @@ pub(crate) enum Codec {
     H264(Parameters),
     #[cfg(feature = "h265")]
     H265(Parameters),
-}
-
-/// Where parameter sets are kept, which decides how the parts of a unit are told apart.
-#[derive(Clone, Debug)]
-pub(crate) enum Parameters {
-    /// In the container, as the box `avcC` or `hvcC`; parts of a unit have their length before them.
-    Described(Vec<u8>),
-    /// In the sequence itself, which is a byte stream (Annex B of both standards): the first ones of it.
-    InStream(Vec<u8>),
 }
 
 impl Codec {
@@ -48,15 +40,6 @@ impl Codec {
             }
         }
     }
-}
-
-/// What decodes access units in their order.
-pub(crate) trait UnitDecoder {
-    /// Whether nothing else is predicted from a unit, so that it need not be decoded unless its picture is wanted.
-    fn is_disposable(&self, bytes: &[u8]) -> bool;
-
-    /// Decodes the next unit; gives the pictures that come out, with the numbers of their units. The error is why this unit gave none.
-    fn decode(&mut self, unit: usize, bytes: &[u8], is_last: bool) -> Result<Vec<(usize, Picture)>, String>;
 }
 
 struct H264 {

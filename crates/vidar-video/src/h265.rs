@@ -1,8 +1,8 @@
 //! H.265 through `rusty_h265`: parameter sets of `hvcC` (ISO/IEC 14496-15, 8.3.3), pictures in the order of output.
 
 use crate::boxes::u16_at;
-use crate::codec::{Parameters, UnitDecoder};
 use crate::picture::{Picture, check_size, colours_of, round_to_eight};
+use crate::unit::{Parameters, UnitDecoder};
 use rusty_h265::{Error, Frame};
 
 pub(crate) struct H265 {

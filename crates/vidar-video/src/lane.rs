@@ -1,7 +1,7 @@
 //! A decoder on a thread of its own, ahead of who takes its pictures: a panic or a hang inside becomes an error of one picture.
 
-use crate::codec::UnitDecoder;
 use crate::picture::Picture;
+use crate::unit::UnitDecoder;
 use std::collections::HashSet;
 use std::ops::Range;
 use std::sync::Arc;

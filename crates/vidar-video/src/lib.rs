@@ -13,6 +13,7 @@ mod picture;
 mod pictures;
 mod stream;
 mod track;
+mod unit;
 mod video;
 
 pub use error::VideoError;

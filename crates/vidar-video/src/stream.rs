@@ -1,9 +1,10 @@
 //! Video without a container: one access unit after the other, each a byte stream that starts with its parameter sets where it stands
 //! alone (Annex B of ITU-T H.264 and H.265), as robots send it.
 
-use crate::codec::{Codec, Parameters};
+use crate::codec::Codec;
 use crate::lane::AccessUnits;
 use crate::pictures::{Pictures, Unit};
+use crate::unit::Parameters;
 use std::fmt;
 use std::sync::Arc;
 use vidar_core::{FrameImage, Timestamp};

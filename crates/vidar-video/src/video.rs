@@ -1,13 +1,14 @@
 //! An open video: its frames by number, decoded when they are asked for.
 
 use crate::boxes::find;
-use crate::codec::{Codec, Parameters};
+use crate::codec::Codec;
 use crate::error::VideoError;
 use crate::ffmpeg::{self, Ffmpeg, VideoDecoder};
 use crate::gpmf::{self, Telemetry};
 use crate::movie::{Frame, Movie, unsupported};
 use crate::pictures::Pictures;
 use crate::track::Track;
+use crate::unit::Parameters;
 use std::fmt;
 use std::io::Read;
 use std::path::{Path, PathBuf};

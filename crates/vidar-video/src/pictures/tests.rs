@@ -1,6 +1,6 @@
 use super::*;
-use crate::codec::UnitDecoder;
 use crate::picture::Colours;
+use crate::unit::UnitDecoder;
 use std::time::Duration;
 
 fn unit(time_ns: i64, is_sync: bool) -> Unit {
