@@ -157,6 +157,10 @@ pub struct InputArgs {
     /// Topic of a bag to use: NAME for images, depth or IMU; truth=NAME or trajectory=NAME for poses. Repeatable.
     #[arg(long = "topic", value_name = "NAME", action = ArgAction::Append, help_heading = "Input")]
     pub topics: Vec<String>,
+    /// Who decodes videos: built-in, or ffmpeg, the program of that name on this machine (5.1 or newer), for codecs and containers that
+    /// the built-in decoders refuse.
+    #[arg(long, help_heading = "Input")]
+    pub decoder: Option<String>,
     /// Camera model of the images: pinhole:fx,fy,cx,cy  radtan:…,k1,k2,p1,p2(,k3)  kb4:…,k1,k2,k3,k4  ds:…,xi,alpha  fov:…,w.
     #[arg(long, allow_hyphen_values = true, help_heading = "Input")]
     pub camera_model: Option<String>,
@@ -313,7 +317,7 @@ pub struct DemoArgs {
 /// `vidar inspect`.
 #[derive(Args, Clone, Debug)]
 pub struct InspectArgs {
-    /// The recording.
+    /// The recording; `-` is a bag or video on standard input.
     #[arg(value_hint = ValueHint::AnyPath)]
     pub path: PathBuf,
     /// How the input is read.
@@ -324,7 +328,7 @@ pub struct InspectArgs {
 /// `vidar convert`.
 #[derive(Args, Clone, Debug)]
 pub struct ConvertArgs {
-    /// The recording: whatever `vidar inspect` opens.
+    /// The recording: whatever `vidar inspect` opens; `-` is a bag or video on standard input.
     #[arg(value_hint = ValueHint::AnyPath)]
     pub path: PathBuf,
     /// The new file or folder; it must not exist.
@@ -341,7 +345,7 @@ pub struct ConvertArgs {
 /// `vidar calibrate`.
 #[derive(Args, Clone, Debug)]
 pub struct CalibrateArgs {
-    /// The recording: images and an IMU.
+    /// The recording: images and an IMU; `-` is a bag or video on standard input.
     #[arg(value_hint = ValueHint::AnyPath)]
     pub path: PathBuf,
     /// File for the calibration (Kalibr's YAML, camera and IMU in one), as --calibration takes it.
@@ -355,7 +359,7 @@ pub struct CalibrateArgs {
 /// `vidar odometry`.
 #[derive(Args, Clone, Debug)]
 pub struct OdometryArgs {
-    /// The recording: images and an IMU, as a bag, an action camera's video, or a folder.
+    /// The recording: images and an IMU, as a bag, an action camera's video, or a folder; `-` is a bag or video on standard input.
     #[arg(value_hint = ValueHint::AnyPath)]
     pub path: PathBuf,
     /// Use the camera only, without the IMU: a trajectory up to scale.

@@ -4,7 +4,7 @@ use crate::args::{ConfigArgs, EvalArgs, InputArgs, OutputArgs, RunArgs, WorldArg
 use std::path::Path;
 use vidar::config::Origin;
 use vidar::core::{BodyFrame, CameraId, Se3, So3};
-use vidar::dataset::{CameraFlag, OpenOptions, TrajectoryReadOptions};
+use vidar::dataset::{CameraFlag, OpenOptions, TrajectoryReadOptions, VideoDecoder};
 use vidar::run_folder::OutputLocation;
 use vidar::synth::{FlightKind, SceneKind, Start, SynthConfig};
 use vidar::{Error, Layered};
@@ -113,6 +113,7 @@ pub fn open_options(input: &InputArgs) -> Result<OpenOptions, Error> {
     };
     options.topics = input.topics.iter().map(|t| t.parse()).collect::<Result<_, _>>()?;
     options.format = input.format.as_deref().map(str::parse).transpose()?;
+    options.decoder = input.decoder.as_deref().map(decoder).transpose()?.unwrap_or_default();
     options.trajectory_format = input.trajectory_format.as_deref().map(str::parse).transpose()?;
     options.time_unit = input.time_unit.as_deref().map(str::parse).transpose()?;
     options.camera_model =
@@ -134,6 +135,14 @@ pub fn trajectory_options(args: &EvalArgs) -> Result<TrajectoryReadOptions, Erro
         time_unit,
         times,
     })
+}
+
+fn decoder(text: &str) -> Result<VideoDecoder, Error> {
+    match text {
+        "built-in" => Ok(VideoDecoder::BuiltIn),
+        "ffmpeg" => Ok(VideoDecoder::Ffmpeg),
+        _ => Err(usage(format!("--decoder {text:?} is not a decoder"), "write built-in or ffmpeg")),
+    }
 }
 
 fn body(text: &str) -> Result<BodyFrame, Error> {

@@ -9,6 +9,7 @@ pub mod model_args;
 mod print;
 mod progress;
 pub mod reference;
+mod spool;
 
 use args::{Cli, Command, ConfigCommand};
 use clap::Parser;

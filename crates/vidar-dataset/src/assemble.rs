@@ -167,6 +167,7 @@ pub(crate) fn cut(dataset: &mut Dataset, options: &OpenOptions) -> Result<(), Da
             expected: format!("between {} and {}", from - first, to - first),
         });
     }
+    dataset.media.expect(dataset.images.iter().map(|i| &i.location));
     if options.start.is_some() || options.end.is_some() {
         let wide = from - LEAD_IN..=to + LEAD_IN;
         dataset.imu.retain(|s| wide.contains(&s.time));

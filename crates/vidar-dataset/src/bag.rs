@@ -1,6 +1,7 @@
 //! ROS 1 bags, ROS 2 bags and MCAP files: one camera, its calibration, IMU, depth and poses.
 
 use crate::bag_camera::{is_beside, read_calibration, use_facts};
+use crate::bag_video;
 use crate::convert::facts::{self, Facts};
 use crate::draft::{Draft, DraftCamera, DraftDepth};
 use crate::error::DatasetError;
@@ -43,7 +44,11 @@ pub(crate) fn open(path: &Path, reason: String, options: &OpenOptions) -> Result
         choice.poses =
             named.into_iter().filter_map(|(name, used)| Some((used, topic(name.as_ref()?)?))).collect();
     }
-    let mut draft = Draft::new(DatasetKind::Bag, path, format!("{reason}; images of {}", choice.image.name));
+    let mut reason = format!("{reason}; images of {}", choice.image.name);
+    for (number, name) in &choice.others {
+        reason.push_str(&format!(", not those of {name} (--camera {number})"));
+    }
+    let mut draft = Draft::new(DatasetKind::Bag, path, reason);
     draft.warnings.extend(bag.warnings().iter().cloned());
     draft.warnings.extend(choice.warnings.iter().cloned());
     let unused = topics::unused_poses(&bag, &choice);
@@ -54,10 +59,8 @@ pub(crate) fn open(path: &Path, reason: String, options: &OpenOptions) -> Result
         draft.warnings.push(Warning::new("poses-unused", message).at(path.display()).hint(way));
     }
     let mut clock = Clock { bag: &bag, without_stamp: Cell::new(0) };
-    let first = choice.image.messages.first();
-    let camera_frame = first.map(|m| bag.header(m)).transpose()?.unwrap_or_default().frame;
     draft.cameras = vec![DraftCamera::unknown(choice.camera)];
-    draft.images = locate(&bag, choice.image, |m| clock.stamp(m))?;
+    let camera_frame = read_images(&mut draft, &bag, &clock, choice.image)?;
     let imu_frame = read_imu(&mut draft, &mut clock, choice.imu, facts.imu_noise)?;
     let frames = read_frames(&mut draft, &bag);
     read_calibration(&mut draft, &bag, &choice, &camera_frame)?;
@@ -84,6 +87,28 @@ pub(crate) fn open(path: &Path, reason: String, options: &OpenOptions) -> Result
     }
     draft.media.bag = Some(Arc::clone(&bag));
     Ok(draft)
+}
+
+/// Lists the images of a topic, which stay in the bag; returns the name of their frame.
+fn read_images(
+    draft: &mut Draft,
+    bag: &Arc<Bag>,
+    clock: &Clock<'_>,
+    topic: &Topic,
+) -> Result<String, DatasetError> {
+    if role_of(&topic.message_type, topic.encoding) != Some(Role::Video) {
+        draft.images = locate(bag, topic, |m| clock.stamp(m))?;
+        let first = topic.messages.first().map(|m| bag.header(m)).transpose()?;
+        return Ok(first.unwrap_or_default().frame);
+    }
+    let video = bag_video::open(bag, topic, |header, message| clock.or_logged(header, message))?;
+    draft.reason = format!("{} as {}", draft.reason, video.stream.codec_name());
+    draft.warnings.extend(video.warnings);
+    let mut times = video.times.iter();
+    draft.images = locate(bag, topic, |m| Ok(times.next().copied().unwrap_or(m.log_time)))?;
+    draft.images.drain(..video.first);
+    draft.media.stream = Some((video.topic, Arc::new(video.stream)));
+    Ok(video.frame)
 }
 
 /// Times of messages: their own stamps, else when they were logged.

@@ -118,7 +118,7 @@ pub(crate) fn open(path: &Path, log: Log, options: &OpenOptions) -> Result<Draft
     let mut quarter_turns = 0;
     match &log.pictures {
         Pictures::Video(file) => {
-            let video = Video::open(file)?;
+            let video = Video::open_with(file, options.decoder)?;
             quarter_turns = video.quarter_turns();
             match &logged {
                 Some((times, list)) => take_frames(&mut draft, file, video, Some((times, list))),

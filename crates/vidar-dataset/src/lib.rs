@@ -3,6 +3,7 @@
 mod assemble;
 mod bag;
 mod bag_camera;
+mod bag_video;
 mod calibration;
 pub mod camera_flag;
 mod checks;
@@ -50,7 +51,7 @@ pub use options::{
 };
 
 pub use trajectory_file::{read_times, read_trajectory, trajectory_from};
-pub use vidar_video::DECODER_THREAD;
+pub use vidar_video::{DECODER_THREAD, VideoDecoder};
 
 use std::path::Path;
 
@@ -82,8 +83,11 @@ fn open_file(path: &Path, options: &OpenOptions) -> Result<Dataset, DatasetError
         let reason = format!("its first bytes are those of {}", format.name());
         return bag::open(path, reason, options)?.finish(options);
     }
-    if vidar_video::is_video(&head) && !wrong_thing::is_picture(&head) {
-        let mut draft = video::open(path, "its first bytes are those of mp4 and mov".into(), options)?;
+    let is_movie = vidar_video::is_video(&head) && !wrong_thing::is_picture(&head);
+    let is_for_program = options.decoder == VideoDecoder::Ffmpeg && wrong_thing::may_be_video(&head);
+    if is_movie || is_for_program {
+        let first_bytes = if is_movie { "mp4 and mov" } else { "a video of another kind" };
+        let mut draft = video::open(path, format!("its first bytes are those of {first_bytes}"), options)?;
         if path.parent().is_some_and(is_recording_of_phone) {
             let message = format!(
                 "it is part of a phone's recording, whose sensors are read with the folder {}",

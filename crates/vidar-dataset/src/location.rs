@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use vidar_bag::{Bag, BagError, Message, MessageRef, Pixels, Topic};
 use vidar_core::{FrameImage, Image, Timestamp};
-use vidar_video::Video;
+use vidar_video::{Video, VideoStream};
 
 /// Where the pixels of an image lie.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -85,6 +85,8 @@ pub(crate) fn files(list: Vec<(Timestamp, PathBuf)>) -> Vec<(Timestamp, Location
 pub(crate) struct Media {
     pub bag: Option<Arc<Bag>>,
     pub video: Option<Arc<Video>>,
+    /// A topic of the bag that is compressed video: a picture of it needs the messages before.
+    pub stream: Option<(Arc<str>, Arc<VideoStream>)>,
     /// A folder of confidences, named as the depth images are.
     pub depth_confidence: Option<PathBuf>,
 }
@@ -114,6 +116,9 @@ impl Media {
     pub(crate) fn image(&self, location: &Location) -> Result<FrameImage, DatasetError> {
         if let Location::Frame { number, .. } = location {
             return Ok(self.video(location)?.frame(*number as usize)?);
+        }
+        if let Some((stream, number)) = self.stream(location) {
+            return stream.frame(number).map_err(|reason| bad_image(location, reason));
         }
         match self.message(location)? {
             None => decode::read_image(location.path(), &ImageLimits::default()),
@@ -166,6 +171,9 @@ impl Media {
         if let Location::Frame { .. } = location {
             return Ok(self.video(location)?.size());
         }
+        if let Some((stream, _)) = self.stream(location) {
+            return Ok(stream.size());
+        }
         match self.message(location)? {
             None => decode::read_size(location.path(), &ImageLimits::default()),
             Some(Message::Image(image)) => Ok((image.width as usize, image.height as usize)),
@@ -178,6 +186,28 @@ impl Media {
 
     fn video(&self, location: &Location) -> Result<&Video, DatasetError> {
         self.video.as_deref().ok_or_else(|| bad_image(location, "the recording is not open".into()))
+    }
+
+    /// The stream of compressed video that a location is a picture of, and the picture's number.
+    fn stream(&self, location: &Location) -> Option<(&VideoStream, usize)> {
+        let (Location::Message { topic, number, .. }, Some((name, stream))) = (location, &self.stream) else {
+            return None;
+        };
+        (name == topic).then_some((stream, *number as usize))
+    }
+
+    /// Says which pictures will be asked for, so that a video decodes no more than these need.
+    pub(crate) fn expect<'a>(&self, locations: impl Iterator<Item = &'a Location> + Clone) {
+        if let Some(video) = &self.video {
+            let number = |location: &Location| match location {
+                Location::Frame { number, .. } => Some(*number as usize),
+                _ => None,
+            };
+            video.expect(locations.clone().filter_map(number));
+        }
+        if let Some((_, stream)) = &self.stream {
+            stream.expect(locations.filter_map(|location| Some(self.stream(location)?.1)));
+        }
     }
 
     /// The message at a location; `None` for a file.
@@ -231,10 +261,10 @@ pub(crate) fn pixels(message: &Message) -> Result<Pixels, String> {
 pub(crate) fn locate(
     bag: &Bag,
     topic: &Topic,
-    stamp: impl Fn(&MessageRef) -> Result<Timestamp, BagError>,
+    mut stamp: impl FnMut(&MessageRef) -> Result<Timestamp, BagError>,
 ) -> Result<Vec<(Timestamp, Location)>, DatasetError> {
     let (path, name): (Arc<Path>, Arc<str>) = (bag.path().into(), topic.name.as_str().into());
-    let at = |number: usize, message: &MessageRef| {
+    let mut at = |number: usize, message: &MessageRef| {
         let location =
             Location::Message { bag: Arc::clone(&path), topic: Arc::clone(&name), number: number as u32 };
         Ok((stamp(message)?, location))

@@ -5,6 +5,7 @@ use std::fmt;
 use std::path::PathBuf;
 use std::str::FromStr;
 use vidar_core::{BodyFrame, CameraId, CameraModel, Duration, Se3, Timestamp};
+use vidar_video::VideoDecoder;
 
 /// Layouts of datasets.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
@@ -223,6 +224,8 @@ pub struct OpenOptions {
     pub trajectory_body: Option<BodyFrame>,
     /// Topics of a bag to use, where they are not clear by themselves.
     pub topics: Vec<TopicFlag>,
+    /// Who decodes videos.
+    pub decoder: VideoDecoder,
     /// A file of image times (image folders).
     pub timestamps: Option<PathBuf>,
     /// Unit of the times in image lists and file names; `None` detects it.
@@ -249,6 +252,7 @@ impl Default for OpenOptions {
             trajectory_format: None,
             trajectory_body: None,
             topics: Vec::new(),
+            decoder: VideoDecoder::default(),
             timestamps: None,
             time_unit: None,
             start: None,

@@ -14,7 +14,7 @@ use crate::video::take_frames;
 use crate::wrong_thing;
 use std::path::{Path, PathBuf};
 use vidar_core::{BodyFrame, LieGroup, StampedPose, Timestamp, Trajectory, Warning, merge_imu};
-use vidar_video::Video;
+use vidar_video::{Video, VideoDecoder};
 
 /// Looks for the layout at `path`.
 pub(crate) fn detect(path: &Path) -> Option<String> {
@@ -67,7 +67,7 @@ pub(crate) fn open(path: &Path, reason: String, options: &OpenOptions) -> Result
             .push(Warning::degraded("record-unreadable", message).at(format!("{}:{line}", list.display())));
     }
     draft.cameras = vec![DraftCamera::unknown(number)];
-    let quarter_turns = take_pictures(&mut draft, &recording, &pictures, &list)?;
+    let quarter_turns = take_pictures(&mut draft, &recording, &pictures, &list, options)?;
     take_imu(&mut draft, &mut recording, &list);
     take_calibration(&mut draft, &recording, number, quarter_turns)?;
     let place = list.display().to_string();
@@ -88,14 +88,15 @@ fn take_pictures(
     recording: &JsonRecording,
     pictures: &Pictures,
     list: &Path,
+    options: &OpenOptions,
 ) -> Result<u8, DatasetError> {
     match pictures {
         Pictures::Video(file) => {
             let head = wrong_thing::head_of(file)?;
-            if !vidar_video::is_video(&head) {
+            if !vidar_video::is_video(&head) && options.decoder == VideoDecoder::BuiltIn {
                 return Err(wrong_thing::describe(file, &head));
             }
-            let video = Video::open(file)?;
+            let video = Video::open_with(file, options.decoder)?;
             let turns = video.quarter_turns();
             let times: Vec<Timestamp> = recording.frames.iter().map(|f| f.0).collect();
             take_frames(draft, file, video, Some((&times, list)));

@@ -44,7 +44,7 @@ pub(crate) fn open(path: &Path, reason: String, options: &OpenOptions) -> Result
     draft.image_list = list.clone();
     let times: Vec<Timestamp> = rows.iter().map(|r| r.time).collect();
     let file = first_file(path, &VIDEOS).unwrap_or_else(|| path.join(VIDEOS[0]));
-    let video = Video::open(&file)?;
+    let video = Video::open_with(&file, options.decoder)?;
     let quarter_turns = video.quarter_turns();
     take_frames(&mut draft, &file, video, Some((&times, &list)));
     read_intrinsics(&mut draft, quarter_turns)?;

@@ -11,6 +11,8 @@ pub(crate) struct Choice<'a> {
     pub image: &'a Topic,
     /// Number of the camera.
     pub camera: u32,
+    /// Numbers and topics of the rig's other cameras.
+    pub others: Vec<(usize, &'a str)>,
     pub depth: Option<&'a Topic>,
     pub imu: ImuTopics<'a>,
     pub poses: Vec<(PoseUse, &'a Topic)>,
@@ -42,10 +44,12 @@ pub(crate) fn choose<'a>(bag: &'a Bag, options: &OpenOptions) -> Result<Choice<'
     let named = |topic: &Topic| options.topics.iter().any(|f| f.name == topic.name);
     let of = |role: Role| -> Vec<&Topic> { bag.topics().iter().filter(|t| role_is(t, role)).collect() };
     let (depth, images): (Vec<_>, Vec<_>) = of(Role::Image).into_iter().partition(|t| is_depth(bag, t));
+    let videos = of(Role::Video);
     let mut warnings = Vec::new();
-    let (image, camera) = match images.iter().position(|t| named(t)) {
-        Some(at) => (images[at], options.camera.0),
-        None => choose_image(bag, &images, options, !of(Role::Video).is_empty())?,
+    let (image, camera, others) = match images.iter().chain(&videos).find(|t| named(t)) {
+        Some(topic) => (*topic, options.camera.0, Vec::new()),
+        // Compressed video beside images is a copy of them.
+        None => choose_image(bag, if images.is_empty() { &videos } else { &images }, options)?,
     };
     let imu = choose_imu(bag, of(Role::Imu), named)
         .map_err(|several| problem(bag, format!("{several} IMUs; name one with --topic")))?;
@@ -71,7 +75,7 @@ pub(crate) fn choose<'a>(bag: &'a Bag, options: &OpenOptions) -> Result<Choice<'
             (None, None) => {}
         }
     }
-    Ok(Choice { image, camera, depth, imu, poses, warnings })
+    Ok(Choice { image, camera, others, depth, imu, poses, warnings })
 }
 
 fn role_is(topic: &Topic, role: Role) -> bool {
@@ -85,7 +89,7 @@ fn has_poses(topic: &Topic) -> bool {
 }
 
 fn is_used(topic: &Topic) -> bool {
-    has_poses(topic) || [Role::Image, Role::Imu].iter().any(|role| role_is(topic, *role))
+    has_poses(topic) || [Role::Image, Role::Video, Role::Imu].iter().any(|role| role_is(topic, *role))
 }
 
 /// Topics of poses that nothing names, for a notice.
@@ -142,20 +146,17 @@ fn measures(bag: &Bag, topic: &Topic) -> [bool; 2] {
     })
 }
 
+/// The topic of images, the camera's number, and the rig's other cameras.
+type Chosen<'a> = (&'a Topic, u32, Vec<(usize, &'a str)>);
+
 fn choose_image<'a>(
     bag: &Bag,
     images: &[&'a Topic],
     options: &OpenOptions,
-    has_video: bool,
-) -> Result<(&'a Topic, u32), DatasetError> {
+) -> Result<Chosen<'a>, DatasetError> {
     let mut cameras = without_twins(images.to_vec());
     if cameras.is_empty() {
-        let what = if has_video {
-            "no topic of images, only compressed video, which is not read from a bag"
-        } else {
-            "no topic of images"
-        };
-        return Err(problem(bag, what.into()));
+        return Err(problem(bag, "no topic of images or compressed video".into()));
     }
     // Topics that differ in a number or in left and right only are the cameras of one rig.
     let is_rig = cameras.windows(2).all(|w| without_number(&w[0].name) == without_number(&w[1].name));
@@ -165,7 +166,10 @@ fn choose_image<'a>(
     cameras.sort_by_key(|t| (t.name.len(), t.name.clone()));
     let wanted = options.camera;
     match cameras.get(wanted.index()) {
-        Some(camera) => Ok((camera, wanted.0)),
+        Some(camera) => {
+            let others = cameras.iter().enumerate().filter(|(number, _)| *number != wanted.index());
+            Ok((camera, wanted.0, others.map(|(number, t)| (number, t.name.as_str())).collect()))
+        }
         None => Err(DatasetError::MissingCamera {
             path: bag.path().to_path_buf(),
             camera: wanted,

@@ -35,7 +35,7 @@ pub(crate) fn open(path: &Path, reason: String, options: &OpenOptions) -> Result
         let found = "camera 0 only".to_string();
         return Err(DatasetError::MissingCamera { path: path.to_path_buf(), camera: options.camera, found });
     }
-    let video = Video::open(path)?;
+    let video = Video::open_with(path, options.decoder)?;
     let mut draft = Draft::new(DatasetKind::Video, path, format!("{reason}; {}", video.codec_name()));
     if let Some(telemetry) = video.telemetry()? {
         take_telemetry(&mut draft, telemetry);

@@ -44,12 +44,14 @@ pub(crate) fn describe(path: &Path, head: &[u8]) -> DatasetError {
             "an HEIC image, which is not decoded",
             "export as JPEG: on a phone choose \"most compatible\" as the camera's format",
         ),
-        [0x1a, 0x45, 0xdf, 0xa3, ..] => {
-            ("a Matroska or WebM video", "repack it without loss: ffmpeg -i IN -c copy OUT.mp4")
-        }
-        [b'R', b'I', b'F', b'F', ..] => {
-            ("an AVI video or a sound", "convert it: ffmpeg -i IN -c:v libx264 -crf 16 OUT.mp4")
-        }
+        [0x1a, 0x45, 0xdf, 0xa3, ..] => (
+            "a Matroska or WebM video",
+            "repack it without loss: ffmpeg -i IN -c copy OUT.mp4 (or --decoder ffmpeg)",
+        ),
+        [b'R', b'I', b'F', b'F', ..] => (
+            "an AVI video or a sound",
+            "convert it: ffmpeg -i IN -c:v libx264 -crf 16 OUT.mp4 (or --decoder ffmpeg)",
+        ),
         head if head.starts_with(b"#ROSBAG") => {
             ("a ROS bag of a version before 2.0", "`rosbag migrate` of an old ROS converts it")
         }
@@ -77,6 +79,13 @@ pub(crate) fn describe(path: &Path, head: &[u8]) -> DatasetError {
         ),
     };
     wrong(path, found.into(), way)
+}
+
+/// Whether a file may be a video that the user's own program reads: Matroska and WebM, AVI, MPEG's streams, and containers that begin
+/// like nothing known.
+pub(crate) fn may_be_video(head: &[u8]) -> bool {
+    let is_text = !head.is_empty() && head.iter().all(|b| b.is_ascii_graphic() || b.is_ascii_whitespace());
+    !head.is_empty() && !is_text && !is_picture(head) && !head.starts_with(b"PK")
 }
 
 /// Whether an ISO media file holds pictures instead of a movie.

@@ -224,3 +224,102 @@ fn gyroscope_and_accelerometer_on_topics_of_their_own_are_one_imu() {
     assert!(error.contains("3 IMUs"), "{error}");
     assert_eq!(open(&path, &with_topics(&["/imu"])).unwrap().imu.len(), 40);
 }
+
+/// Made by ffmpeg and third-party writers; see `make_compressed_video.py` there.
+fn video_fixture(name: &str) -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/fixtures").join(name)
+}
+
+fn greens(dataset: &Dataset, number: usize) -> Vec<u8> {
+    match dataset.load_image(&dataset.images[number]).unwrap() {
+        vidar_core::FrameImage::Rgb8(image) => image.data().iter().map(|p| p[1]).collect(),
+        other => panic!("{other:?}"),
+    }
+}
+
+#[test]
+fn compressed_video_is_decoded_as_the_same_video_in_a_file() {
+    let bag = open(&video_fixture("compressed_video.mcap"), &OpenOptions::default()).unwrap();
+    let file = open(&video_fixture("compressed_video.mp4"), &OpenOptions::default()).unwrap();
+    assert_eq!((bag.images.len(), file.images.len()), (30, 30));
+    assert!(bag.reason.contains("/camera/video as H.264"), "{}", bag.reason);
+    // Stamps of the messages, 20 Hz.
+    assert!(bag.images.windows(2).all(|w| (w[1].time - w[0].time).nanos() == 50_000_000));
+    assert_eq!(bag.images[0].time.nanos(), 1_700_000_000_000_000_000);
+    let in_order: Vec<_> = (0..30).map(|n| greens(&bag, n)).collect();
+    for number in (0..30).chain([29, 3, 17, 12, 11, 0]) {
+        assert_eq!(greens(&bag, number), in_order[number], "picture {number}");
+        assert_eq!(greens(&file, number), in_order[number], "picture {number}");
+    }
+    assert_ne!(in_order[3], in_order[17]);
+    // A part of it alone, thinned.
+    let secs = |s: f64| Some(vidar_core::Duration::from_secs_f64(s));
+    let options = OpenOptions { start: secs(0.7), end: secs(1.2), stride: 3, ..OpenOptions::default() };
+    let part = open(&video_fixture("compressed_video.mcap"), &options).unwrap();
+    let numbers: Vec<usize> = part.images.iter().map(|i| i.frame_id.0 as usize).collect();
+    assert_eq!(numbers, [14, 17, 20, 23]);
+    for (at, number) in numbers.into_iter().enumerate() {
+        assert_eq!(greens(&part, at), in_order[number], "picture {number}");
+    }
+}
+
+#[test]
+fn compressed_video_of_h265_in_json_shows_the_same_scene() {
+    let h264 = open(&video_fixture("compressed_video.mcap"), &OpenOptions::default()).unwrap();
+    let h265 = open(&video_fixture("compressed_video_json.mcap"), &OpenOptions::default()).unwrap();
+    assert_eq!(h265.images.len(), 30);
+    // In another order than that of the messages, too.
+    for number in [0, 13, 29, 5, 6, 7] {
+        let (a, b) = (greens(&h264, number), greens(&h265, number));
+        let difference: u64 = a.iter().zip(&b).map(|(a, b)| u64::from(a.abs_diff(*b))).sum();
+        let mean = difference as f64 / a.len() as f64;
+        // Two lossy codings of the same pictures; of neighbouring pictures the difference is several times larger.
+        assert!(mean < 5.0, "picture {number}: {mean}");
+    }
+}
+
+#[test]
+fn compressed_video_that_cannot_be_decoded_says_why() {
+    // The only message of this topic is a start code.
+    let options = with_topics(&["/video"]);
+    let error = open(&fixture("foxglove_protobuf.mcap"), &options).unwrap_err().to_string();
+    assert!(error.contains("no picture that stands alone"), "{error}");
+}
+
+#[test]
+fn the_other_camera_of_a_stereo_bag_is_named_and_can_be_chosen() {
+    use vidar_bag::{Header, Message, RawImage, write::McapWriter};
+    let mut writer = McapWriter::new(Vec::new(), "test").unwrap();
+    let time = |n: u32| vidar_core::Timestamp::from_nanos(1_000_000_000 + i64::from(n) * 50_000_000);
+    for (topic, value) in [("/stereo/left/image_raw", 50u8), ("/stereo/right/image_raw", 200)] {
+        let channel = writer.channel(topic, "sensor_msgs/msg/Image").unwrap();
+        for number in 0..5 {
+            let image = RawImage {
+                header: Header { stamp: time(number), frame: "cam".into() },
+                width: 8,
+                height: 6,
+                encoding: "mono8".into(),
+                row_bytes: 8,
+                is_big_endian: false,
+                data: vec![value; 48],
+            };
+            let (_, bytes) = vidar_bag::write::encode(&Message::Image(image)).unwrap();
+            writer.write(channel, time(number), &bytes).unwrap();
+        }
+    }
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("stereo.mcap");
+    std::fs::write(&path, writer.finish().unwrap()).unwrap();
+    let of_camera = |number: u32| {
+        let options = OpenOptions { camera: vidar_core::CameraId(number), ..OpenOptions::default() };
+        let dataset = open(&path, &options).unwrap();
+        match dataset.load_image(&dataset.images[0]).unwrap() {
+            vidar_core::FrameImage::Gray8(image) => (dataset.reason, image[(0, 0)]),
+            other => panic!("{other:?}"),
+        }
+    };
+    let (reason, value) = of_camera(0);
+    assert!(reason.contains("not those of /stereo/right/image_raw (--camera 1)") && value == 50, "{reason}");
+    let (reason, value) = of_camera(1);
+    assert!(reason.contains("images of /stereo/right/image_raw") && value == 200, "{reason}");
+}

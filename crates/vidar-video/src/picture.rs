@@ -95,10 +95,7 @@ impl Picture {
         for (y, (out, luma)) in pixels.chunks_exact_mut(w).zip(self.luma.chunks_exact(w)).enumerate() {
             let at = (y >> self.chroma_shift[1]).min(chroma_rows - 1) * chroma_width;
             let [cb, cr] = [0, 1].map(|c| &self.chroma[c][at..at + chroma_width]);
-            for (x, (pixel, &luma)) in out.iter_mut().zip(luma).enumerate() {
-                let u = (x >> self.chroma_shift[0]).min(chroma_width - 1);
-                *pixel = steps.rgb(luma, cb[u], cr[u]);
-            }
+            steps.row(out, luma, cb, cr, self.chroma_shift[0]);
         }
         let at = |x: usize, y: usize| pixels[y * w + x];
         let made = match quarter_turns % 4 {
@@ -140,13 +137,33 @@ impl Steps {
         }
     }
 
+    /// A row of pixels; a sample of chroma is for `1 << shift` columns, the last also for an odd one.
+    fn row(&self, out: &mut [[u8; 3]], luma: &[u8], cb: &[u8], cr: &[u8], shift: u32) {
+        let whole = cb.len() << shift;
+        let pairs = out.chunks_mut(1 << shift).zip(luma.chunks(1 << shift)).zip(cb.iter().zip(cr));
+        for ((out, luma), (&cb, &cr)) in pairs {
+            let shares = self.shares(cb, cr);
+            out.iter_mut().zip(luma).for_each(|(pixel, &luma)| *pixel = self.rgb(luma, shares));
+        }
+        if let (Some(&cb), Some(&cr), Some(out), Some(luma)) =
+            (cb.last(), cr.last(), out.get_mut(whole..), luma.get(whole..))
+        {
+            let shares = self.shares(cb, cr);
+            out.iter_mut().zip(luma).for_each(|(pixel, &luma)| *pixel = self.rgb(luma, shares));
+        }
+    }
+
+    /// What chroma adds to red, green and blue.
     #[inline]
-    fn rgb(&self, luma: u8, cb: u8, cr: u8) -> [u8; 3] {
+    fn shares(&self, cb: u8, cr: u8) -> [i32; 3] {
         let (cb, cr) = (i32::from(cb) - 128, i32::from(cr) - 128);
+        [self.red_of_cr * cr, -self.green_of_cb * cb - self.green_of_cr * cr, self.blue_of_cb * cb]
+    }
+
+    #[inline]
+    fn rgb(&self, luma: u8, shares: [i32; 3]) -> [u8; 3] {
         let luma = (i32::from(luma) - self.black) * self.luma + 32768;
-        let byte = |c: i32| (c >> 16).clamp(0, 255) as u8;
-        let green = luma - self.green_of_cb * cb - self.green_of_cr * cr;
-        [byte(luma + self.red_of_cr * cr), byte(green), byte(luma + self.blue_of_cb * cb)]
+        shares.map(|share| ((luma + share) >> 16).clamp(0, 255) as u8)
     }
 }
 

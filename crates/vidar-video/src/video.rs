@@ -1,60 +1,35 @@
 //! An open video: its frames by number, decoded when they are asked for.
 
-use crate::boxes::{self, find};
-use crate::decoder::{Codec, Decoder};
+use crate::boxes::find;
+use crate::codec::Codec;
 use crate::error::VideoError;
+use crate::ffmpeg::{self, Ffmpeg, VideoDecoder};
 use crate::gpmf::{self, Telemetry};
-use crate::picture::Picture;
-use crate::track::{self, Sample, Track};
-use std::collections::{HashSet, VecDeque};
+use crate::movie::{Frame, Movie, unsupported};
+use crate::pictures::Pictures;
+use crate::track::Track;
+use crate::unit::Parameters;
 use std::fmt;
-use std::fs::File;
-use std::io::{Read, Seek, SeekFrom};
+use std::io::Read;
 use std::path::{Path, PathBuf};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::Arc;
 use vidar_core::{FrameImage, Timestamp, Warning};
 
 /// An open mp4 or mov. Its tables are in memory, its pictures stay in the file until they are asked for.
 pub struct Video {
     path: PathBuf,
-    tracks: Vec<Track>,
-    /// Index of the video track.
-    video: usize,
-    codec: Codec,
+    /// The tables; `None` of a container that only the user's program reads.
+    movie: Option<Movie>,
     size: (usize, usize),
     /// Frames in the order of display.
     frames: Vec<Frame>,
-    warnings: Vec<Warning>,
-    file: Mutex<File>,
-    state: Mutex<State>,
+    decoder: Decoder,
 }
 
-#[derive(Clone, Copy)]
-struct Frame {
-    time: Timestamp,
-    /// Index into the track's samples, which are in the order of decoding.
-    sample: usize,
+enum Decoder {
+    BuiltIn { codec: &'static str, pictures: Box<Pictures> },
+    Program(Ffmpeg),
 }
-
-/// The decoder, the sample that it takes next, and the pictures that came out last.
-#[derive(Default)]
-struct State {
-    decoder: Option<Decoder>,
-    next: usize,
-    /// Samples whose pictures came out since the decoder was started at the sample `start`.
-    start: usize,
-    out: HashSet<usize>,
-    recent: VecDeque<(usize, Arc<Picture>)>,
-}
-
-/// Decoded pictures that are kept, bytes: twenty of 1080p. The newest stays even when it is larger.
-const RECENT_BYTES: usize = 64 << 20;
-/// Largest table of a movie (`moov`); one of ten hours has about 30 MB.
-const MAX_MOOV_BYTES: u64 = 512 << 20;
-/// Largest coded picture, bytes; one of 8K at the highest rate has about 4 MB.
-const MAX_SAMPLE_BYTES: u32 = 64 << 20;
-/// Pictures that a decoder may hold back to bring them in order: 16 in both standards.
-const MOST_HELD_BACK: usize = 17;
 
 impl fmt::Debug for Video {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
@@ -71,56 +46,42 @@ pub fn is_video(head: &[u8]) -> bool {
 }
 
 impl Video {
-    /// Opens a video and reads its tables.
+    /// Opens an mp4 or mov for the built-in decoders and reads its tables.
     pub fn open(path: &Path) -> Result<Self, VideoError> {
+        let mut movie = Movie::open(path)?;
+        let codec = codec_of(movie.track(), path)?;
+        let (name, units) = (codec.name(), std::mem::take(&mut movie.units));
+        let pictures = Pictures::new(codec, units, Arc::clone(&movie.file) as _, movie.track().size);
+        let frames = std::mem::take(&mut movie.frames);
+        Self::of(path, Some(movie), frames, Decoder::BuiltIn { codec: name, pictures: Box::new(pictures) })
+    }
+
+    /// Opens a video for a decoder. With the user's `ffmpeg` it may be of any codec and container that this program reads; the tables
+    /// of mp4 and mov are read here in any case, for times, rotation and telemetry.
+    pub fn open_with(path: &Path, decoder: VideoDecoder) -> Result<Self, VideoError> {
+        if decoder == VideoDecoder::BuiltIn {
+            return Self::open(path);
+        }
         let failed = |source| VideoError::Io { path: path.to_path_buf(), source };
-        let mut file = File::open(path).map_err(failed)?;
-        let length = file.metadata().map_err(failed)?.len();
-        let moov = read_moov(&mut file, length, path)?;
-        let malformed = |found: String| VideoError::Malformed {
-            path: path.to_path_buf(),
-            found,
-            expected: "a movie with a video track".into(),
+        let mut head = [0; 8];
+        let read = std::fs::File::open(path).and_then(|mut f| f.read(&mut head)).map_err(failed)?;
+        // A movie in fragments has no tables, which the program does without.
+        let mut movie = if is_video(&head[..read]) { Movie::open(path).ok() } else { None };
+        let frames = match &mut movie {
+            Some(movie) => std::mem::take(&mut movie.frames),
+            None => ffmpeg::times(path)?.into_iter().map(|time| Frame { time, sample: 0 }).collect(),
         };
-        let scale = find(&moov, b"mvhd").and_then(track::time_scale).unwrap_or(1000);
-        let (mut tracks, mut problem) = (Vec::new(), None);
-        for trak in boxes::atoms(&moov).filter(|a| a.kind == *b"trak") {
-            match track::read(trak.content, scale) {
-                Ok(track) => tracks.push(track),
-                Err(reason) => problem = Some(reason),
-            }
-        }
-        let is_it = |t: &Track| t.handler == *b"vide" && t.codec != *b"jpeg";
-        let Some(video) = tracks.iter().position(is_it) else {
-            return Err(malformed(problem.unwrap_or_else(|| "a movie without a video track".into())));
-        };
-        if tracks[video].samples.is_empty() {
-            let is_fragmented = find(&moov, b"mvex").is_some();
-            let (found, way) = match is_fragmented {
-                true => ("a fragmented mp4", "repack it without loss: ffmpeg -i IN -c copy OUT.mp4"),
-                false => ("a video track without pictures", "the recorder stopped before its first picture"),
-            };
-            return Err(unsupported(path, found.into(), way));
-        }
-        let codec = codec_of(&tracks[video], path)?;
-        let mut warnings = Vec::new();
-        let frames = shown_frames(&mut tracks[video], length, path, &mut warnings);
-        if frames.is_empty() {
-            return Err(malformed(
-                "a video of which no picture lies in the file (its end is missing)".into(),
-            ));
-        }
-        let mut open = Self {
-            path: path.to_path_buf(),
-            tracks,
-            video,
-            codec,
-            size: (0, 0),
-            frames,
-            warnings,
-            file: Mutex::new(file),
-            state: Mutex::default(),
-        };
+        let times = frames.iter().map(|f| f.time).collect();
+        Self::of(path, movie, frames, Decoder::Program(Ffmpeg::new(path, times)))
+    }
+
+    fn of(
+        path: &Path,
+        movie: Option<Movie>,
+        frames: Vec<Frame>,
+        decoder: Decoder,
+    ) -> Result<Self, VideoError> {
+        let mut open = Self { path: path.to_path_buf(), movie, size: (0, 0), frames, decoder };
         // The decoder's own size counts; the container's may be that of the display.
         let first = open.frame(0)?;
         open.size = (first.width(), first.height());
@@ -149,154 +110,63 @@ impl Video {
 
     /// Quarter turns clockwise by which frames are turned to be upright, 0 to 3.
     pub fn quarter_turns(&self) -> u8 {
-        self.tracks[self.video].quarter_turns
+        self.movie.as_ref().map_or(0, |movie| movie.track().quarter_turns)
     }
 
-    /// `H.264` or `H.265`.
+    /// `H.264`, `H.265`, or by which program it is decoded.
     pub fn codec_name(&self) -> &'static str {
-        match self.codec {
-            Codec::H264(_) => "H.264",
-            #[cfg(feature = "h265")]
-            Codec::H265(_) => "H.265",
+        match self.decoder {
+            Decoder::BuiltIn { codec, .. } => codec,
+            Decoder::Program(_) => "decoded by ffmpeg",
         }
     }
 
     /// What was found unusual while opening.
     pub fn warnings(&self) -> &[Warning] {
-        &self.warnings
+        self.movie.as_ref().map_or(&[], |movie| &movie.warnings)
     }
 
     /// The telemetry of an action camera, where there is any.
     pub fn telemetry(&self) -> Result<Option<Telemetry>, VideoError> {
-        let Some(track) = self.tracks.iter().find(|t| t.codec == *b"gpmd") else { return Ok(None) };
+        let Some(movie) = &self.movie else { return Ok(None) };
+        let Some(track) = movie.tracks.iter().find(|t| t.codec == *b"gpmd") else { return Ok(None) };
         let mut payloads = Vec::new();
         for sample in &track.samples {
-            payloads.push((sample.time_ns, sample.duration_ns, self.read(sample)?));
+            let bytes = movie.file.bytes(sample).map_err(|found| VideoError::Malformed {
+                path: self.path.clone(),
+                found: format!("telemetry: {found}"),
+                expected: "telemetry inside of the file".into(),
+            })?;
+            payloads.push((sample.time_ns, sample.duration_ns, bytes));
         }
         Ok(Some(gpmf::read(&payloads)))
     }
 
-    /// Decodes a frame. Frames in order are decoded once; another order costs decoding from the last picture that stands alone.
+    /// Decodes a frame. Frames in order are decoded once, ahead and beside who asks; another order costs decoding from the last
+    /// picture that stands alone.
     pub fn frame(&self, number: usize) -> Result<FrameImage, VideoError> {
         let Some(&Frame { sample, .. }) = self.frames.get(number) else {
             return Err(self.bad_frame(number, format!("the video has {} frames", self.frames.len())));
         };
-        let picture = self.picture(sample).map_err(|reason| self.bad_frame(number, reason))?;
-        Ok(picture.upright(self.tracks[self.video].quarter_turns))
+        let decoded = match &self.decoder {
+            Decoder::BuiltIn { pictures, .. } => {
+                pictures.picture(sample).map(|picture| picture.upright(self.quarter_turns()))
+            }
+            Decoder::Program(program) => program.frame(number),
+        };
+        decoded.map_err(|reason| self.bad_frame(number, reason))
     }
 
-    fn picture(&self, wanted: usize) -> Result<Arc<Picture>, String> {
-        let samples = &self.tracks[self.video].samples;
-        let mut state = self.state.lock().unwrap_or_else(PoisonError::into_inner);
-        if let Some((_, picture)) = state.recent.iter().find(|(sample, _)| *sample == wanted) {
-            return Ok(Arc::clone(picture));
+    /// Says which frames will be asked for: what these do not need is not decoded. Others stay readable.
+    pub fn expect(&self, frames: impl IntoIterator<Item = usize>) {
+        if let Decoder::BuiltIn { pictures, .. } = &self.decoder {
+            pictures.expect(frames.into_iter().filter_map(|number| Some(self.frames.get(number)?.sample)));
         }
-        // A picture that is shown before the one that stands alone, and stored after it, needs the pictures before both.
-        let stands_before = |i: &usize| samples[*i].is_sync && samples[*i].time_ns <= samples[wanted].time_ns;
-        let start = (0..=wanted).rev().find(stands_before).unwrap_or(0);
-        // On from where the decoder is, unless a picture that stands alone lies between. A picture that it was given and that
-        // has not come out is still held back.
-        let is_ahead = (start..=wanted).contains(&state.next);
-        let is_inside = state.start <= wanted && wanted < state.next && !state.out.contains(&wanted);
-        if state.decoder.is_none() || !is_ahead && !is_inside {
-            state.decoder = Some(Decoder::start(&self.codec)?);
-            (state.start, state.next) = (start, start);
-            state.out.clear();
-        }
-        let mut reason = "the decoder gave no picture for it".to_string();
-        let last = samples.len().min(wanted + 1 + MOST_HELD_BACK);
-        while state.next < last {
-            let at = state.next;
-            state.next += 1;
-            let bytes = self.read(&samples[at]).map_err(|e| e.to_string())?;
-            let Some(decoder) = &state.decoder else { break };
-            match decoder.decode(at, bytes, at + 1 == samples.len()) {
-                Ok(pictures) => {
-                    let came = pictures.iter().any(|(sample, _)| *sample == wanted);
-                    for (sample, picture) in pictures {
-                        let picture = picture.without_filling(self.tracks[self.video].size);
-                        state.out.insert(sample);
-                        state.recent.push_back((sample, Arc::new(picture)));
-                    }
-                    state.keep_few();
-                    if came && let Some((_, picture)) = state.recent.iter().rfind(|(s, _)| *s == wanted) {
-                        return Ok(Arc::clone(picture));
-                    }
-                }
-                Err(failure) => {
-                    if failure.is_fatal {
-                        state.decoder = None;
-                        return Err(failure.reason);
-                    }
-                    if at == wanted {
-                        reason = failure.reason;
-                    }
-                }
-            }
-            // Only H.265's decoder holds pictures back.
-            if at >= wanted && matches!(self.codec, Codec::H264(_)) {
-                break;
-            }
-        }
-        Err(reason)
-    }
-
-    fn read(&self, sample: &Sample) -> Result<Vec<u8>, VideoError> {
-        let failed = |source| VideoError::Io { path: self.path.clone(), source };
-        if sample.size > MAX_SAMPLE_BYTES {
-            let found = format!("a coded picture of {} bytes", sample.size);
-            let expected = format!("at most {MAX_SAMPLE_BYTES} bytes");
-            return Err(VideoError::Malformed { path: self.path.clone(), found, expected });
-        }
-        let mut file = self.file.lock().unwrap_or_else(PoisonError::into_inner);
-        file.seek(SeekFrom::Start(sample.offset)).map_err(failed)?;
-        let mut bytes = vec![0; sample.size as usize];
-        file.read_exact(&mut bytes).map_err(failed)?;
-        Ok(bytes)
     }
 
     fn bad_frame(&self, number: usize, reason: String) -> VideoError {
         VideoError::BadFrame { path: self.path.clone(), number, reason }
     }
-}
-
-impl State {
-    fn keep_few(&mut self) {
-        let mut held: usize = self.recent.iter().map(|(_, p)| p.bytes()).sum();
-        while held > RECENT_BYTES && self.recent.len() > 1 {
-            held -= self.recent.pop_front().map_or(0, |(_, p)| p.bytes());
-        }
-    }
-}
-
-/// The content of the box `moov`.
-fn read_moov(file: &mut File, length: u64, path: &Path) -> Result<Vec<u8>, VideoError> {
-    let failed = |source| VideoError::Io { path: path.to_path_buf(), source };
-    let mut at = 0;
-    while at < length {
-        let mut head = [0; 16];
-        let held = (length - at).min(16) as usize;
-        file.seek(SeekFrom::Start(at)).map_err(failed)?;
-        file.read_exact(&mut head[..held]).map_err(failed)?;
-        let Some((kind, head_bytes, box_bytes)) = boxes::head(&head[..held]) else { break };
-        let box_bytes = if box_bytes == 0 { length - at } else { box_bytes };
-        let Some(end) = at.checked_add(box_bytes).filter(|&e| e <= length) else { break };
-        if kind == *b"moov" {
-            if box_bytes > MAX_MOOV_BYTES {
-                let found = format!("a table of {box_bytes} bytes");
-                let expected = format!("at most {MAX_MOOV_BYTES} bytes");
-                return Err(VideoError::Malformed { path: path.to_path_buf(), found, expected });
-            }
-            file.seek(SeekFrom::Start(at + head_bytes as u64)).map_err(failed)?;
-            let mut moov = vec![0; box_bytes as usize - head_bytes];
-            file.read_exact(&mut moov).map_err(failed)?;
-            return Ok(moov);
-        }
-        at = end;
-    }
-    let found = "a video without its table (moov), which the camera writes last: the recording was cut off";
-    let way = "a program such as untrunc rebuilds the table with another video of the same camera";
-    Err(unsupported(path, found.into(), way))
 }
 
 fn codec_of(track: &Track, path: &Path) -> Result<Codec, VideoError> {
@@ -307,11 +177,11 @@ fn codec_of(track: &Track, path: &Path) -> Result<Codec, VideoError> {
             expected: "the description of its codec".into(),
         })
     };
-    let way = "convert it: ffmpeg -i IN -c:v libx264 -crf 16 OUT.mp4";
+    let way = "convert it: ffmpeg -i IN -c:v libx264 -crf 16 OUT.mp4, or let that program decode it: --decoder ffmpeg";
     match &track.codec {
-        b"avc1" | b"avc3" => described(b"avcC").map(Codec::H264),
+        b"avc1" | b"avc3" => described(b"avcC").map(|b| Codec::H264(Parameters::Described(b))),
         #[cfg(feature = "h265")]
-        b"hvc1" | b"hev1" => described(b"hvcC").map(Codec::H265),
+        b"hvc1" | b"hev1" => described(b"hvcC").map(|b| Codec::H265(Parameters::Described(b))),
         #[cfg(not(feature = "h265"))]
         b"hvc1" | b"hev1" => {
             let found = "the video is H.265, and this build lacks the feature h265";
@@ -328,29 +198,4 @@ fn codec_of(track: &Track, path: &Path) -> Result<Codec, VideoError> {
             Err(unsupported(path, format!("the video's codec is {name:?}; H.264 and H.265 are decoded"), way))
         }
     }
-}
-
-/// The frames that are shown, in the order of display. Pictures outside of the file are left out, with a warning.
-fn shown_frames(track: &mut Track, length: u64, path: &Path, warnings: &mut Vec<Warning>) -> Vec<Frame> {
-    let inside = |s: &Sample| s.offset.checked_add(u64::from(s.size)).is_some_and(|end| end <= length);
-    let whole = track.samples.iter().take_while(|s| inside(s)).count();
-    if whole < track.samples.len() {
-        let message = format!("the file is cut off: {} of {} pictures are in it", whole, track.samples.len());
-        warnings.push(Warning::degraded("video-cut-off", message).at(path.display()));
-        track.samples.truncate(whole);
-    }
-    if track.has_complex_edits {
-        let message =
-            "the edit list has several parts or another speed; the video is read as it was recorded";
-        warnings.push(Warning::new("video-edits", message).at(path.display()));
-    }
-    let shown = track.samples.iter().enumerate().filter(|(_, s)| s.time_ns >= track.shown_from_ns);
-    let mut frames: Vec<Frame> =
-        shown.map(|(sample, s)| Frame { time: Timestamp::from_nanos(s.time_ns), sample }).collect();
-    frames.sort_by_key(|f| f.time);
-    frames
-}
-
-fn unsupported(path: &Path, found: String, way: &str) -> VideoError {
-    VideoError::Unsupported { path: path.to_path_buf(), found, way: way.to_string() }
 }

@@ -1,7 +1,7 @@
 //! `vidar calibrate`.
 
 use crate::args::CalibrateArgs;
-use crate::{Context, Outcome, build, print, progress};
+use crate::{Context, Outcome, build, print, progress, spool};
 use vidar::ExitStatus;
 use vidar::calibrate::CalibrateRequest;
 
@@ -11,7 +11,8 @@ pub fn calibrate(args: &CalibrateArgs, context: &Context) -> Outcome {
     open.stride = args.input.stride.unwrap_or(1);
     open.start = args.input.start.map(vidar::core::Duration::from_secs_f64);
     open.end = args.input.end.map(vidar::core::Duration::from_secs_f64);
-    let request = CalibrateRequest { path: args.path.clone(), open, output: args.output.clone() };
+    let recording = spool::recording(&args.path)?;
+    let request = CalibrateRequest { path: recording.path.clone(), open, output: args.output.clone() };
     let outcome = vidar::calibrate::calibrate(&request, &progress::events(&context.cli), &context.cancel)?;
     if context.cli.json {
         let mut value = serde_json::json!({ "schema": "vidar.calibrate/1" });

@@ -1,7 +1,7 @@
 //! `vidar convert`.
 
 use crate::args::ConvertArgs;
-use crate::{Context, Outcome, build, print, progress};
+use crate::{Context, Outcome, build, print, progress, spool};
 use serde_json::json;
 use vidar::ExitStatus;
 use vidar::dataset::convert::ConvertFormat;
@@ -17,8 +17,9 @@ pub fn convert(args: &ConvertArgs, context: &Context) -> Outcome {
         None => ConvertFormat::of_path(&args.out),
     };
     let events = progress::events(&context.cli);
+    let recording = spool::recording(&args.path)?;
     let (dataset, done) =
-        vidar::convert::convert(&args.path, &options, &args.out, format, &events, &context.cancel)?;
+        vidar::convert::convert(&recording.path, &options, &args.out, format, &events, &context.cancel)?;
     if context.cli.json {
         print::json(&json!({
             "schema": "vidar.convert/1", "out": args.out, "format": format.name(), "kind": dataset.kind.name(),

@@ -1,7 +1,7 @@
 //! `vidar inspect`.
 
 use crate::args::InspectArgs;
-use crate::{Context, Outcome, build, print, progress};
+use crate::{Context, Outcome, build, print, progress, spool};
 use vidar::ExitStatus;
 
 /// Contents and health of a recording.
@@ -10,8 +10,9 @@ pub fn inspect(args: &InspectArgs, context: &Context) -> Outcome {
     options.stride = args.input.stride.unwrap_or(1);
     options.start = args.input.start.map(vidar::core::Duration::from_secs_f64);
     options.end = args.input.end.map(vidar::core::Duration::from_secs_f64);
+    let recording = spool::recording(&args.path)?;
     let found =
-        vidar::inspect::inspect(&args.path, &options, &progress::events(&context.cli), &context.cancel)?;
+        vidar::inspect::inspect(&recording.path, &options, &progress::events(&context.cli), &context.cancel)?;
     if context.cli.json {
         let mut value = serde_json::json!({ "schema": "vidar.inspect/1" });
         if let (Some(object), Ok(serde_json::Value::Object(fields))) =

@@ -1,7 +1,7 @@
 //! `vidar odometry`.
 
 use crate::args::OdometryArgs;
-use crate::{Context, Outcome, build, print, progress};
+use crate::{Context, Outcome, build, print, progress, spool};
 use vidar::config::Origin;
 use vidar::odometry::OdometryRequest;
 
@@ -12,11 +12,12 @@ pub fn odometry(args: &OdometryArgs, context: &Context) -> Outcome {
     if args.mono {
         layered.value("odometry.imu", toml::Value::String("off".into()), Origin::Flag("--mono"))?;
     }
+    let recording = spool::recording(&args.path)?;
     let request = OdometryRequest {
-        path: args.path.clone(),
+        path: recording.path.clone(),
         open: build::open_options(&args.input)?,
         layered,
-        place: build::place(&args.output, &build::name_of(&args.path)),
+        place: build::place(&args.output, &build::name_of(&recording.path)),
         command: context.command.clone(),
         debug_dump: args.debug_dump,
     };

@@ -1,7 +1,7 @@
 //! `vidar run` and `vidar demo`.
 
 use crate::args::{DemoArgs, RunArgs};
-use crate::{Context, Outcome, build, print, progress};
+use crate::{Context, Outcome, build, print, progress, spool};
 use serde_json::json;
 use vidar::demo::DemoRequest;
 use vidar::evaluate::Thresholds;
@@ -11,6 +11,7 @@ use vidar::{Error, ExitStatus, RunOutcome, RunRequest};
 
 /// Everything, from recording to report.
 pub fn run(args: &RunArgs, context: &Context) -> Outcome {
+    spool::refuse(&args.path)?;
     let mut layered = build::layered(&args.config, None)?;
     build::apply_input_flags(&mut layered, &args.input)?;
     build::apply_model_flags(&mut layered, args)?;

@@ -75,3 +75,73 @@ fn what_is_given_by_mistake_is_named_with_the_nearest_way() {
     let told = vidar_in(&folder, &["inspect", "cut.bag"]);
     assert!(told.code == 1 && !told.stderr.contains("panicked"), "{}", told.stderr);
 }
+
+fn from_input(bytes: &[u8], args: &[&str]) -> crate::support::ProgramOutput {
+    use std::io::Write;
+    use std::process::Stdio;
+    let mut command = crate::support::command();
+    command.args(args).stdin(Stdio::piped()).stdout(Stdio::piped()).stderr(Stdio::piped());
+    let mut child = command.spawn().unwrap();
+    let mut input = child.stdin.take().unwrap();
+    // A program that refuses before it reads closes the pipe.
+    let _ = input.write_all(bytes);
+    drop(input);
+    child.wait_with_output().unwrap().into()
+}
+
+#[test]
+fn a_bag_on_standard_input_is_read_and_one_that_ends_early_says_so() {
+    for name in ["ros1_lz4.bag", "mcap_ros1_lz4.mcap"] {
+        let whole = std::fs::read(bag(name)).unwrap();
+        let told = from_input(&whole, &["inspect", "-"]).ends_with(0);
+        assert!(told.stdout.contains("from the topic /cam0/camera_info"), "{name}: {}", told.stdout);
+        from_input(&whole[..whole.len() * 2 / 3], &["inspect", "-"]).ends_with(0).says(&["bag-cut-off"]);
+    }
+    from_input(b"hello", &["inspect", "-"]).ends_with(1).says(&["kind that is not known"]);
+    from_input(b"", &["odometry", "-"]).ends_with(1).says(&["empty file"]);
+    from_input(b"", &["run", "-"]).ends_with(2).says(&["vidar convert -"]);
+}
+
+#[test]
+fn compressed_video_of_a_bag_is_a_recording_of_images() {
+    let video = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../crates/vidar-dataset/tests/fixtures");
+    for (name, codec) in [("compressed_video.mcap", "H.264"), ("compressed_video_json.mcap", "H.265")] {
+        let told = inspect(&video.join(name), &[]).ends_with(0);
+        let words = ["30", "20.0 Hz", codec, "0 of "];
+        assert!(words.iter().all(|w| told.stdout.contains(w)), "{name}: {}", told.stdout);
+    }
+}
+
+/// A program called ffmpeg is on this machine; says so where it is not.
+#[allow(clippy::print_stderr, reason = "a test that is skipped says so")]
+fn has_ffmpeg() -> bool {
+    let found =
+        std::process::Command::new("ffmpeg").arg("-version").output().is_ok_and(|o| o.status.success());
+    if !found {
+        eprintln!("skipped: this machine has no ffmpeg");
+    }
+    found
+}
+
+#[test]
+fn the_users_own_ffmpeg_decodes_what_the_program_refuses() {
+    let clip = clip("other_codec.mp4");
+    inspect(&clip, &[]).ends_with(1).says(&["mp4v", "--decoder ffmpeg"]);
+    inspect(&clip, &["--decoder", "vlc"]).ends_with(2).says(&["built-in or ffmpeg"]);
+    // Without the program on the path.
+    let folder = tempfile::tempdir().unwrap();
+    let mut command = crate::support::command();
+    command.env("PATH", folder.path()).arg("inspect").arg(&clip).args(["--decoder", "ffmpeg"]);
+    crate::support::ProgramOutput::from(command.output().unwrap())
+        .ends_with(1)
+        .says(&["not on this machine"]);
+    if has_ffmpeg() {
+        let told = inspect(&clip, &["--decoder", "ffmpeg"]).ends_with(0);
+        assert!(
+            told.stdout.contains("decoded by ffmpeg") && told.stdout.contains("0 of "),
+            "{}",
+            told.stdout
+        );
+        inspect(&self::clip("fragmented.mp4"), &["--decoder", "ffmpeg"]).ends_with(0);
+    }
+}
