@@ -224,3 +224,44 @@ impl GeometryModel for StereoModel {
         Ok(self.depths_of(views, &references, watch, false)?.0.prediction)
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use vidar_core::{ChunkId, ChunkView, FrameImage, Pinhole, Se3, Timestamp};
+
+    /// A wall at 2 m with random texture, by cameras that move to the side by whole pixels.
+    fn wall() -> ChunkViews {
+        let k = Pinhole::new(100.0, 100.0, 63.5, 47.5, 128, 96).expect("valid");
+        let texture = |x: usize, y: usize| ((x / 3 * 7919 + y / 3 * 104_729 + x * y / 7) % 239) as u8;
+        let view = |i: usize| ChunkView {
+            frame_id: FrameId(i as u32),
+            time: Timestamp::from_nanos(i as i64),
+            image: FrameImage::Gray8(Image::from_fn(128, 96, |x, y| texture(x + 5 * i, y))),
+            intrinsics: k,
+            world_from_camera: Some(Se3::from_translation([0.1 * i as f64, 0.0, 0.0].into())),
+        };
+        ChunkViews { id: ChunkId(0), views: (0..4).map(view).collect() }
+    }
+
+    #[test]
+    fn the_bits_do_not_depend_on_the_instructions() {
+        let chunk = wall();
+        let run = || -> Vec<u32> {
+            let model = StereoModel::new(StereoConfig::default()).expect("valid");
+            let output = model.predict_with(&chunk, &[1, 2], &|_| false).expect("has parallax");
+            let values = output.prediction.views.into_iter().flat_map(|view| {
+                let depth = view.depth.image().data().to_vec();
+                depth.into_iter().chain(view.confidence.image().data().to_vec())
+            });
+            values.map(f32::to_bits).collect()
+        };
+        let results = crate::simd::tests::with_each(run);
+        let near = |bits: &&u32| (f32::from_bits(**bits) - 2.0).abs() < 0.06;
+        let right = results[0].1.iter().filter(near).count();
+        assert!(right > 128 * 96, "{right} of two views' pixels");
+        for (instructions, found) in &results[1..] {
+            assert!(*found == results[0].1, "{instructions:?}");
+        }
+    }
+}

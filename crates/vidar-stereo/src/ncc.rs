@@ -259,3 +259,72 @@ fn merge<const N: usize>(per_source: [&Vec<f32>; N], merged: &mut [f32]) {
         merged[x] = sum * (1.0 / half as f32);
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use vidar_core::Pinhole;
+
+    fn level(width: usize, height: usize, seed: usize) -> Level {
+        let gray =
+            (0..width * height).map(|i| ((i * 7919 + seed * 104_729) % 1021) as i16 * 4 - 2048).collect();
+        let intrinsics = Pinhole::new(20.0, 20.0, 10.0, 8.0, width, height).expect("valid");
+        Level { width, height, gray, intrinsics }
+    }
+
+    /// Moves by whole pixels: two to the right per unit of inverse depth.
+    fn shift() -> Warp {
+        Warp { a: [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]], b: [2.0, 0.0, 0.0] }
+    }
+
+    fn costs_of(reference: &Level, other: &Level, rho: f32) -> Vec<f32> {
+        let windows = Reference::new(reference, 1.0);
+        let source = Source { level: other, warp: shift() };
+        let flat = vec![rho; reference.width];
+        let mut strip = Strip::new(&windows, 0, reference.height, 1);
+        let mut costs = vec![0.0; reference.width * reference.height];
+        strip.costs(&[source], Surface { rho: &flat, stride: 0 }, 0.0, &mut costs);
+        costs
+    }
+
+    #[test]
+    fn costs_are_those_of_the_definition_at_every_row_of_the_running_sums() {
+        let (w, h) = (24, 19);
+        let (reference, other) = (level(w, h, 1), level(w, h, 2));
+        let found = costs_of(&reference, &other, 1.0);
+        let gray = |level: &Level, x: usize, y: usize| f64::from((level.gray[y * w + x] + 2) >> 2);
+        for (x, y) in (2..w - 2).flat_map(|x| (2..h - 2).map(move |y| (x, y))) {
+            if x + 4 >= w {
+                assert_eq!(found[y * w + x], HIDDEN, "{x} {y}");
+                continue;
+            }
+            let window: Vec<(f64, f64)> = (y - 2..=y + 2)
+                .flat_map(|v| (x - 2..=x + 2).map(move |u| (u, v)))
+                .map(|(u, v)| (gray(&reference, u, v), gray(&other, (u + 2).min(w - 1), v)))
+                .collect();
+            let mean = |of: fn(&(f64, f64)) -> f64| window.iter().map(of).sum::<f64>() / 25.0;
+            let (a, b) = (mean(|p| p.0), mean(|p| p.1));
+            let (var_a, var_b) = (mean(|p| p.0 * p.0) - a * a, mean(|p| p.1 * p.1) - b * b);
+            let covariance = mean(|p| p.0 * p.1) - a * b;
+            let expected = 1.0 - covariance / ((var_a + 16.0) * (var_b + 16.0)).sqrt();
+            // The last column of the window may lie between pixels at the border.
+            if x + 5 < w {
+                let expected = expected.clamp(0.0, 1.0);
+                assert!((f64::from(found[y * w + x]) - expected).abs() < 1e-4, "{x} {y}: {expected}");
+            }
+        }
+    }
+
+    #[test]
+    fn the_better_half_is_averaged_and_hidden_sources_repeat_the_best() {
+        let of = |costs: &[f32]| {
+            let per_source: Vec<Vec<f32>> = costs.iter().map(|&c| vec![c]).collect();
+            let mut merged = [9.0];
+            merge_better_half(&per_source, &mut merged);
+            merged[0]
+        };
+        assert!((of(&[0.5, 0.1, 0.9, 0.3, 0.2]) - 0.2).abs() < 1e-6);
+        assert!((of(&[HIDDEN, 0.4, HIDDEN, HIDDEN]) - 0.4).abs() < 1e-6);
+        assert!(of(&[HIDDEN, HIDDEN, HIDDEN]) > 1.0);
+    }
+}

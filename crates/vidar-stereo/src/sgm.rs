@@ -16,6 +16,14 @@ pub(crate) struct Penalties {
     pub jump: i16,
 }
 
+impl Penalties {
+    /// A share of both, at least one.
+    pub fn scaled(self, share: f32) -> Self {
+        let scaled = |penalty: i16| ((f32::from(penalty) * share) as i16).max(1);
+        Self { step: scaled(self.step), jump: scaled(self.jump) }
+    }
+}
+
 /// Brightness step at which P2 has fallen to half, grey levels.
 const HALVING_STEP_GRAY: f32 = 12.0;
 /// Cost of a label that is visible in no neighbour: that of no correlation.

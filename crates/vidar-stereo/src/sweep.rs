@@ -11,7 +11,7 @@ pub(crate) const INVISIBLE: u8 = 255;
 /// Cost of no correlation at all.
 pub(crate) const WORST: f32 = 254.0;
 /// Rows of one task: each strip also warps the radius above and below it, and its costs stay in the cache.
-const STRIP_ROWS: usize = 24;
+pub(crate) const STRIP_ROWS: usize = 24;
 /// Labels of a pixel are padded to a multiple of this, for the vectors of semi-global matching.
 pub(crate) const LANES: usize = 16;
 
@@ -61,34 +61,4 @@ pub(crate) fn sweep(
         }
     });
     Volume { count: labels.count, stride, costs }
-}
-
-/// How well a surface matches, without moving it.
-pub(crate) struct Scores {
-    /// Matching cost, 0 (perfect) to 1 (none, or not visible).
-    pub cost: Vec<f32>,
-    /// Second derivative of the cost by inverse depth, m².
-    pub bend: Vec<f32>,
-}
-
-/// Scores of a surface from its costs there and `step` to both sides.
-pub(crate) fn score(reference: &Reference, sources: &[Source<'_>], rho: &[f32], step: f32) -> Scores {
-    let width = reference.width;
-    let (mut cost, mut bend) = (vec![1.0; rho.len()], vec![0.0; rho.len()]);
-    let surface = Surface { rho, stride: width };
-    let strips = cost.par_chunks_mut(STRIP_ROWS * width).zip(bend.par_chunks_mut(STRIP_ROWS * width));
-    strips.enumerate().for_each(|(i, (cost, bend))| {
-        let mut strip = Strip::new(reference, i * STRIP_ROWS, cost.len() / width, sources.len());
-        let mut sides = [vec![HIDDEN; cost.len()], vec![HIDDEN; cost.len()]];
-        let [further, nearer] = &mut sides;
-        strip.costs(sources, surface, 0.0, cost);
-        strip.costs(sources, surface, -step, further);
-        strip.costs(sources, surface, step, nearer);
-        for ((c, b), (f, n)) in cost.iter_mut().zip(bend).zip(further.iter().zip(nearer.iter())) {
-            let visible = *c <= 1.0 && *f <= 1.0 && *n <= 1.0;
-            *b = if visible { (f - 2.0 * *c + n) / (step * step) } else { 0.0 };
-            *c = c.min(1.0);
-        }
-    });
-    Scores { cost, bend }
 }
