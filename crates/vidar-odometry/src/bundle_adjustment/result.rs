@@ -73,6 +73,8 @@ pub struct AdjustmentReport {
 /// An adjusted recording. The world is levelled, z up, its origin where the first state was.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Adjusted {
+    /// The segment of the odometry in whose world the states are.
+    pub segment: u32,
     /// A state for every image between the first and the last adjusted one, in the order of time.
     pub images: Vec<(FrameId, vidar_core::NavState)>,
     /// The images that took part, as keyframes of one segment with the landmarks that they observe. Covariances of poses are
@@ -132,6 +134,7 @@ pub(super) fn collect(
     let sigmas = calibration_sigmas(problem, covariance);
     let gains = problem.calibration.dim() - GAIN_DIM;
     Adjusted {
+        segment: solution.segment,
         images: every_image,
         keyframes: keyframes::of(recording, solution, scale_std),
         calibration: AdjustedCalibration {

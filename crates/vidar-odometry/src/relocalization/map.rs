@@ -15,7 +15,8 @@ const MIN_POINTS: usize = 20;
 /// A landmark as a keyframe shows it.
 #[derive(Clone, Debug)]
 pub(crate) struct MapPoint {
-    pub key: TrackKey,
+    /// Its track; `None` where it is of another recording.
+    pub key: Option<TrackKey>,
     /// Its place in the frame of the camera, m.
     pub in_camera: Vector3<f64>,
     pub descriptor: Descriptor,
@@ -24,7 +25,8 @@ pub(crate) struct MapPoint {
 /// A keyframe with the landmarks that it shows.
 #[derive(Clone, Debug)]
 pub(crate) struct MapKeyframe {
-    pub frame: FrameId,
+    /// The smoother's and the caller's number of its image; `None` where it is of another recording.
+    pub own: Option<(FrameId, FrameId)>,
     pub time: Timestamp,
     /// Its world: poses of different segments cannot be compared.
     pub segment: u32,
@@ -66,7 +68,9 @@ impl KeyframeMap {
 
     /// A later estimate of a keyframe's pose.
     pub fn revise(&mut self, frame: FrameId, world_from_camera: Se3) {
-        if let Some(keyframe) = self.keyframes.iter_mut().rev().find(|k| k.frame == frame) {
+        if let Some(keyframe) =
+            self.keyframes.iter_mut().rev().find(|k| k.own.is_some_and(|(own, _)| own == frame))
+        {
             Arc::make_mut(keyframe).world_from_camera = world_from_camera;
         }
     }
@@ -80,13 +84,13 @@ impl KeyframeMap {
         }
     }
 
-    /// Forgets the keyframes that were taken after an instant.
+    /// Forgets the keyframes of this recording that were taken after an instant.
     pub fn forget_after(&mut self, time: Timestamp) {
-        self.keyframes.retain(|k| k.time <= time);
+        self.keyframes.retain(|k| k.own.is_none() || k.time <= time);
     }
 
-    /// Forgets all.
-    pub fn clear(&mut self) {
-        self.keyframes.clear();
+    /// Forgets those of this recording.
+    pub fn forget_own(&mut self) {
+        self.keyframes.retain(|k| k.own.is_none());
     }
 }

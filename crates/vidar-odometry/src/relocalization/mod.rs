@@ -9,6 +9,7 @@ mod descriptor;
 mod leveled_pose;
 mod map;
 mod matching;
+mod saved;
 
 use crate::bundle_adjustment::TrackKey;
 use nalgebra::{Matrix2, Vector3};
@@ -17,6 +18,7 @@ use vidar_core::{LieGroup, Se3};
 
 pub(crate) use descriptor::{Descriptor, downward};
 pub(crate) use map::{KeyframeMap, MapKeyframe, MapPoint};
+pub use saved::SavedMap;
 
 use leveled_pose::{Correspondence, LeveledPose};
 use std::sync::Arc;
@@ -84,6 +86,9 @@ pub(crate) struct Relocalized {
     position: Vector3<f64>,
     /// Median distance of what agrees, m.
     median_distance: f64,
+    /// Features of the query that agree.
+    pub inliers: usize,
+    /// Those that show landmarks of this recording.
     pub matches: Vec<Match>,
 }
 
@@ -127,14 +132,15 @@ pub(crate) fn relocalize(query: &Query, map: &[Arc<MapKeyframe>]) -> Option<Relo
     }
     let matched = |k: &usize| {
         let seen = &query.sightings[best.pairs[*k].sighting];
-        Match { key: best.pairs[*k].key, pixel: seen.pixel, covariance: seen.covariance }
+        Some(Match { key: best.pairs[*k].key?, pixel: seen.pixel, covariance: seen.covariance })
     };
     Some(Relocalized {
         segment: best.segment,
         map_from_own: Se3::new(map_from_leveled, position - map_from_leveled.act(&query.position)),
         position: query.position,
         median_distance: vidar_solve::statistics::median(&mut distances)?,
-        matches: inliers.iter().map(matched).collect(),
+        inliers: inliers.len(),
+        matches: inliers.iter().filter_map(matched).collect(),
     })
 }
 

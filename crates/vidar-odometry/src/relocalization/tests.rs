@@ -26,7 +26,7 @@ fn scene(flipped: u32, scale: f64) -> Scene {
             2.0 * uniform(&mut random) + 1.0,
         );
         let words = [0; 4].map(|_: u64| random.next_u64());
-        let key = TrackKey { generation: 0, track: LandmarkId(k) };
+        let key = Some(TrackKey { generation: 0, track: LandmarkId(k) });
         points.push(MapPoint {
             key,
             in_camera: in_map - keyframe_at,
@@ -47,7 +47,7 @@ fn scene(flipped: u32, scale: f64) -> Scene {
         });
     }
     let keyframe = MapKeyframe {
-        frame: FrameId(3),
+        own: Some((FrameId(3), FrameId(3))),
         time: Timestamp::from_nanos(0),
         segment: 0,
         world_from_camera: Se3::from_translation(keyframe_at),
@@ -91,7 +91,8 @@ fn a_map_forgets_what_came_late_and_moves_segments_into_one_world() {
     let keyframe = |frame: u32, segment: u32| {
         let points = scene(0, 1.0).map[0].points.clone();
         let time = Timestamp::from_nanos(i64::from(frame));
-        MapKeyframe { frame: FrameId(frame), time, segment, world_from_camera: Se3::IDENTITY, points }
+        let own = Some((FrameId(frame), FrameId(frame)));
+        MapKeyframe { own, time, segment, world_from_camera: Se3::IDENTITY, points }
     };
     let mut map = KeyframeMap::default();
     (0..4).for_each(|k| map.add(keyframe(k, k / 2)));
@@ -107,4 +108,20 @@ fn a_map_forgets_what_came_late_and_moves_segments_into_one_world() {
     assert_eq!(map.keyframes()[0].world_from_camera.translation.x, 1.0);
     map.forget_after(Timestamp::from_nanos(1));
     assert_eq!(map.keyframes().len(), 2);
+}
+
+#[test]
+fn a_saved_map_is_the_same_place() {
+    let Scene { map, query, map_from_own } = scene(30, 1.0);
+    let pose = map[0].world_from_camera;
+    let saved = SavedMap::new([(map[0].as_ref(), pose)].into_iter());
+    assert_eq!((saved.len(), saved.is_empty(), saved.fault()), (1, false, None));
+    let read = saved.as_segment(0);
+    let found = relocalize(&query, read.keyframes()).unwrap();
+    assert!((found.map_from_own.inverse() * map_from_own).log().norm() < 1e-5);
+    assert!(
+        found.inliers == 60 && found.matches.is_empty(),
+        "landmarks of another recording have no tracks here"
+    );
+    assert!(SavedMap::default().fault().unwrap().contains("version 0"));
 }

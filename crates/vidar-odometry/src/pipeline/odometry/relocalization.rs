@@ -2,14 +2,15 @@
 
 use super::{Odometry, Phase, Status};
 use crate::backend::LandmarkEstimate;
-use crate::bundle_adjustment::TrackKey;
+use crate::bundle_adjustment::{Adjusted, TrackKey};
 use crate::deferred::Deferred;
 use crate::pipeline::output::{Joined, LossReason};
 use crate::relocalization::{
-    Descriptor, KeyframeMap, MapKeyframe, MapPoint, QUERY_LEVELS, Query, Relocalized, Sighting, downward,
-    relocalize,
+    Descriptor, KeyframeMap, MapKeyframe, MapPoint, QUERY_LEVELS, Query, Relocalized, SavedMap, Sighting,
+    downward, relocalize,
 };
 use nalgebra::{Matrix2, Vector3};
+use std::collections::BTreeMap;
 use vidar_core::{Duration, FrameId, LieGroup, Se3, Timestamp};
 
 /// Least time between searches, s, and time of the recording until the result of one is taken over: comparing with 400 keyframes takes some
@@ -25,6 +26,9 @@ const MAX_DISTANCE_STD: f64 = 0.15;
 
 /// Standard deviation of a corner that is found again by its descriptor, px.
 const MATCH_SIGMA_PX: f64 = 2.0;
+
+/// The segment of a map of another recording.
+const MAP_SEGMENT: u32 = 0;
 
 /// What was estimated so long before a divergence is right, s.
 const DIVERGING_SECS: f64 = 5.0;
@@ -52,7 +56,7 @@ impl Relocalizer {
         self.candidate = None;
         match reason {
             // All that was estimated with the wrong clock or rotation is wrong.
-            LossReason::Recalibrated { .. } => self.map.clear(),
+            LossReason::Recalibrated { .. } => self.map.forget_own(),
             LossReason::Diverged { .. } => {
                 self.map.forget_after(time - Duration::from_secs_f64(DIVERGING_SECS))
             }
@@ -64,7 +68,13 @@ impl Relocalizer {
 impl Odometry {
     /// Keeps image `id` where it is a keyframe, looks for it among the keyframes of other segments, and joins their worlds where it was
     /// found twice.
-    pub(super) fn relocalize(&mut self, status: &mut Status, id: FrameId, time: Timestamp) {
+    pub(super) fn relocalize(
+        &mut self,
+        status: &mut Status,
+        id: FrameId,
+        caller_id: FrameId,
+        time: Timestamp,
+    ) {
         let Status::Tracking(tracking) = status else { return };
         if let Some(joined) = self.joined(time) {
             tracking.join(&joined);
@@ -72,7 +82,7 @@ impl Odometry {
         if tracking.keyframe.is_none() || !tracking.scale_std.is_finite() {
             return;
         }
-        self.keep_keyframe(id, time);
+        self.keep_keyframe(id, caller_id, time);
         let is_early = |last: Timestamp| (time - last).as_secs_f64() < PAUSE_SECS;
         let is_due = self.relocalizer.search.is_none()
             && !self.relocalizer.last_search.is_some_and(is_early)
@@ -105,7 +115,7 @@ impl Odometry {
             self.segment = into;
             self.placed = Some(found.map_from_own);
         }
-        let matches = first.matches.len() + found.matches.len();
+        let matches = first.inliers + found.inliers;
         if let Some(log) = &mut self.log {
             log.join(segment, into, &into_from_segment);
             for (id, result) in [(first_id, first), (id, found)] {
@@ -115,13 +125,48 @@ impl Odometry {
         Some(Joined { segment, into, into_from_segment, matches })
     }
 
+    /// An odometry that looks for itself in the map of another recording of the place. Found there, its poses are in the world of the map, which
+    /// is segment 0.
+    #[must_use]
+    pub fn with_map(mut self, map: &SavedMap) -> Self {
+        self.relocalizer.map = map.as_segment(MAP_SEGMENT);
+        (self.segment, self.next_segment) = (MAP_SEGMENT + 1, MAP_SEGMENT + 2);
+        self
+    }
+
+    /// The keyframes of one world, for [`Odometry::with_map`] of another recording: those that were adjusted, or of the segment with the most;
+    /// and those of the map that this one was found in.
+    pub fn saved_map(&self, adjusted: Option<&Adjusted>) -> SavedMap {
+        let keyframes = self.relocalizer.map.keyframes();
+        let Some(adjusted) = adjusted else {
+            let count =
+                |segment: u32| keyframes.iter().filter(|k| k.segment == segment && k.own.is_some()).count();
+            let of_own = keyframes.iter().filter(|k| k.own.is_some()).map(|k| k.segment);
+            let Some(most) = of_own.max_by_key(|s| (count(*s), std::cmp::Reverse(*s))) else {
+                return SavedMap::new(std::iter::empty());
+            };
+            let of_most = keyframes.iter().filter(|k| k.segment == most);
+            return SavedMap::new(of_most.map(|k| (k.as_ref(), k.world_from_camera)));
+        };
+        let body_from_camera = adjusted.calibration.body_from_camera;
+        let poses: BTreeMap<FrameId, Se3> = adjusted
+            .images
+            .iter()
+            .map(|(id, state)| (*id, state.world_from_body * body_from_camera))
+            .collect();
+        SavedMap::new(keyframes.iter().filter_map(|k| match k.own {
+            Some((_, caller_id)) => Some((k.as_ref(), *poses.get(&caller_id)?)),
+            None => (k.segment == adjusted.segment).then_some((k.as_ref(), k.world_from_camera)),
+        }))
+    }
+
     /// From the smoother's world to that of the segment.
     pub(super) fn world_from_smoother(&self) -> Se3 {
         self.placed.unwrap_or(Se3::IDENTITY)
     }
 
     /// Adds the newest image to the map.
-    fn keep_keyframe(&mut self, id: FrameId, time: Timestamp) {
+    fn keep_keyframe(&mut self, id: FrameId, caller_id: FrameId, time: Timestamp) {
         let (Phase::Tracking(window), Some(host)) = (&self.phase, &self.last_host) else { return };
         let (smoother, camera) = (&window.smoother, &self.camera.model);
         let Some(state) = smoother.state(id).filter(|_| host.frame == id) else { return };
@@ -137,13 +182,14 @@ impl Odometry {
             }
             let down = downward(camera, &camera.unproject(&t.last_global_pixel)?, &gravity);
             let descriptor = Descriptor::at(&host.pyramid, &t.last_pixel, t.feature.level.into(), &down)?;
-            let key = TrackKey { generation, track: t.id };
+            let key = Some(TrackKey { generation, track: t.id });
             Some(MapPoint { key, in_camera: camera_from_own.act(&landmark.in_world), descriptor })
         });
         let points = points.collect();
         let world_from_camera = self.world_from_smoother() * own_from_camera;
         let segment = self.segment;
-        self.relocalizer.map.add(MapKeyframe { frame: id, time, segment, world_from_camera, points });
+        let own = Some((id, caller_id));
+        self.relocalizer.map.add(MapKeyframe { own, time, segment, world_from_camera, points });
     }
 
     /// The newest image, to be looked for.
