@@ -66,12 +66,8 @@ impl Descriptor {
         self.0.iter().zip(&other.0).map(|(a, b)| (a ^ b).count_ones()).sum()
     }
 
-    /// As bytes, for a file.
-    pub fn words(&self) -> [u64; WORDS] {
-        self.0
-    }
-
-    /// From a file.
+    /// Of comparisons that are given.
+    #[cfg(test)]
     pub fn from_words(words: [u64; WORDS]) -> Self {
         Self(words)
     }
