@@ -254,6 +254,9 @@ pub struct RunArgs {
     /// Acceptance of a licence.
     #[command(flatten)]
     pub licence: LicenceArgs,
+    /// Folder of an earlier `vidar odometry` or `vidar run` of the same place: the map is in the world of that recording.
+    #[arg(long, value_name = "FOLDER", value_hint = ValueHint::AnyPath, help_heading = "Input")]
+    pub map: Option<String>,
     /// Reference cloud (PLY, metres, world frame of the ground truth) for the evaluation of the map.
     #[arg(long, value_hint = ValueHint::FilePath, help_heading = "Input")]
     pub reference: Option<PathBuf>,
@@ -362,6 +365,9 @@ pub struct OdometryArgs {
     /// The recording: images and an IMU, as a bag, an action camera's video, or a folder; `-` is a bag or video on standard input.
     #[arg(value_hint = ValueHint::AnyPath)]
     pub path: PathBuf,
+    /// Folder of an earlier `vidar odometry` or `vidar run` of the same place: poses are in the world of that recording.
+    #[arg(long, value_name = "FOLDER", value_hint = ValueHint::AnyPath, help_heading = "Input")]
+    pub map: Option<String>,
     /// Use the camera only, without the IMU: a trajectory up to scale.
     #[arg(long)]
     pub mono: bool,

@@ -49,6 +49,14 @@ pub fn apply_input_flags(layered: &mut Layered, input: &InputArgs) -> Result<(),
     Ok(())
 }
 
+/// `--map`.
+pub fn apply_map_flag(layered: &mut Layered, map: Option<&str>) -> Result<(), Error> {
+    match map {
+        Some(map) => layered.value("input.map", toml::Value::String(map.to_owned()), Origin::Flag("--map")),
+        None => Ok(()),
+    }
+}
+
 /// The flags of `vidar run` that choose a model.
 pub fn apply_model_flags(layered: &mut Layered, args: &RunArgs) -> Result<(), Error> {
     if let Some(mode) = &args.mode {

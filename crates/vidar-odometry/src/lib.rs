@@ -35,5 +35,6 @@ pub use pipeline::{
     CameraTiming, DivergenceSign, InputCounts, Joined, LossReason, Odometry, OdometryOutput, Status,
     TrackSummary, Tracking,
 };
+pub use relocalization::SavedMap;
 pub use stages::{Stage, StageTimes};
 pub use tracking::TrackRecord;

@@ -226,6 +226,14 @@ pub enum Error {
         /// What is wrong with it.
         reason: String,
     },
+    /// The map of an earlier recording cannot be used.
+    #[error("cannot use the map {path}: {reason}", path = path.display())]
+    NotAMap {
+        /// Which file.
+        path: PathBuf,
+        /// What is wrong with it.
+        reason: String,
+    },
     /// A threshold was missed.
     #[error("{0}")]
     Threshold(String),
@@ -264,6 +272,7 @@ impl Error {
             Self::NoCalibration { .. } | Self::ImagesAlone { .. } | Self::NotCalibrated { .. } => "E0208",
             Self::NoOdometry { .. } => "E0209",
             Self::NotARecording { .. } => "E0210",
+            Self::NotAMap { .. } => "E0211",
             Self::Geometry(_) | Self::Stereo(_) => "E0301",
             Self::Hub(error) | Self::WeightsMissing(error) => hub_code(error),
             Self::Da3(vidar_da3::Da3Error::Cancelled) => "E1301",
@@ -381,6 +390,9 @@ impl Error {
                 "docs/guides/recorded-geometry.md describes the format; --stride, --start, geometry.chunk_keyframes and \
                  geometry.overlap_keyframes must be those of the recording"
             }
+            Self::NotAMap { .. } => {
+                "--map takes the folder that `vidar odometry` or `vidar run` left, of this version; it holds odometry/map.cbor"
+            }
             Self::NotARun { .. } => "a run folder contains manifest.json; `vidar run PATH` creates one",
             Self::Dataset(error) => return Some(dataset_hint(error).to_owned()),
             Self::Hub(error) => return error.hint(),
@@ -486,6 +498,10 @@ pub const CODES: &[(&str, &str)] = &[
         "Camera and IMU gave no metric poses: the odometry never initialised; the message states the reason.",
     ),
     ("E0210", "A recorded prediction is missing, damaged, or belongs to other images."),
+    (
+        "E0211",
+        "The map of an earlier recording (--map) cannot be read, is damaged, or is of another version.",
+    ),
     ("E0301", "The geometry model could not predict depth for any chunk."),
     ("E0302", "Predicted geometry could not be placed in the metric world."),
     ("E0303", "Fusion rejected its configuration or a view, or reached its memory limit."),

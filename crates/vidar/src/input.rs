@@ -4,6 +4,7 @@ use crate::config::{Config, PoseSource as PoseChoice};
 use crate::engine::{FrameStamp, GivenPoses, ImageSource, OdometryPoses, PoseSource};
 use crate::error::Error;
 use crate::imu_noise;
+use crate::odometry::EarlierMap;
 use crate::quality::TrackQuality;
 use crate::verdict::ScaleSource;
 use serde::Serialize;
@@ -136,7 +137,9 @@ impl PosePlan {
             Self::None => (None, None),
             Self::Given(trajectory) => (Some(boxed(given_poses(trajectory, dataset, config))), None),
             Self::Odometry { fallback } => {
-                let odometry = OdometryPoses::new(&dataset.rig, dataset.camera, &config.odometry)?;
+                let earlier = EarlierMap::of(config)?;
+                let map = earlier.as_ref().map(|earlier| &earlier.map);
+                let odometry = OdometryPoses::new(&dataset.rig, dataset.camera, &config.odometry, map)?;
                 let fallback = fallback.as_ref().map(|t| boxed(given_poses(t, dataset, config)));
                 (Some(Box::new(odometry)), fallback)
             }

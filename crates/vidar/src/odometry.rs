@@ -3,10 +3,16 @@
 pub(crate) mod adjusted;
 mod dump;
 mod files;
+pub(crate) mod map;
 mod poses;
 mod report;
+mod summary;
+mod tracked;
 
+pub(crate) use map::EarlierMap;
+pub use map::MapUse;
 pub(crate) use poses::TrackedPoses;
+pub use tracked::{ApartSpan, LostSpan, Tracked, TrackedFrame};
 
 use crate::calibrate;
 use crate::camera_timing;
@@ -14,19 +20,18 @@ use crate::config::{Config, Layered};
 use crate::error::{Error, ExitStatus};
 use crate::events::{CancelToken, Event, Events};
 use crate::input::{self, Measurement, UnseenScale};
-use crate::quality::TrackQuality;
 use crate::run_folder::{MANIFEST_SCHEMA, Manifest, OutputLocation, RunFolder};
-use crate::verdict::{Findings, Level, ScaleSource, StatedScale, Verdict};
-use serde_json::{Value, json};
+use crate::verdict::{Findings, Level, StatedScale, Verdict};
+use serde_json::json;
 use std::collections::BTreeSet;
 use std::ops::ControlFlow;
 use std::path::PathBuf;
 use std::time::Instant;
-use vidar_core::{BodyFrame, OdometryKeyframe, RevisedPose, Severity, StampedPose, Trajectory, Warning};
+use vidar_core::{BodyFrame, Severity, Trajectory, Warning};
 use vidar_dataset::{Dataset, OpenOptions};
 use vidar_eval::TrajectoryReport;
-use vidar_odometry::bundle_adjustment::{Adjusted, CalibrationSigmas, Progress};
-use vidar_odometry::{ImuUse, InputCounts, Joined, Odometry, OdometryOutput, Status};
+use vidar_odometry::bundle_adjustment::{CalibrationSigmas, Progress};
+use vidar_odometry::{ImuUse, Odometry};
 
 /// The stage of the adjustment, in events.
 const ADJUSTMENT: &str = "adjustment";
@@ -48,51 +53,6 @@ pub struct OdometryRequest {
     pub command: Vec<String>,
     /// Whether tracks, residuals and states are written out as tables.
     pub debug_dump: bool,
-}
-
-/// One image as the odometry left it.
-#[derive(Clone, Debug)]
-pub struct TrackedFrame {
-    /// The output for it; landmarks, keyframe and revisions are kept elsewhere.
-    pub output: OdometryOutput,
-    /// Wall time that it took, s, decoding left out.
-    pub seconds: f64,
-}
-
-/// A span of images without a state, after there had been one.
-#[derive(Clone, Debug, PartialEq, serde::Serialize)]
-pub struct LostSpan {
-    /// First image of the span, ns.
-    pub from_ns: i64,
-    /// First image with a state again, ns; `None` when there was none.
-    pub until_ns: Option<i64>,
-    /// Why the state was given up.
-    pub reason: String,
-    /// Image at which the place was found again, ns: the states after the span are in the world of those before it. `None` where it was not.
-    pub found_again_ns: Option<i64>,
-}
-
-/// All outputs of the odometry on a recording.
-#[derive(Clone, Debug, Default)]
-pub struct Tracked {
-    /// Every image, in order.
-    pub frames: Vec<TrackedFrame>,
-    /// Keyframes with their last poses.
-    pub keyframes: Vec<OdometryKeyframe>,
-    /// Spans without a state.
-    pub lost: Vec<LostSpan>,
-    /// What was taken and left out.
-    pub counts: InputCounts,
-    /// Errors of images that could not be read; they are skipped.
-    pub unreadable: Vec<String>,
-    /// Whether camera and IMU were used together; else the trajectory is known up to scale.
-    pub with_imu: bool,
-    /// Health, coverage and scale over the whole recording.
-    pub quality: TrackQuality,
-    /// All states adjusted together after the end, where that was asked for and camera and IMU agree in it.
-    pub adjusted: Option<Adjusted>,
-    /// Why there are none.
-    pub not_adjusted: Option<String>,
 }
 
 /// What a run of the odometry made.
@@ -131,6 +91,7 @@ pub fn odometry(
     let clock = Instant::now();
     let started = crate::run_folder::now_rfc3339();
     let mut config = request.layered.build()?;
+    let earlier_map = EarlierMap::of(&config)?;
     let mut dataset =
         events.stage("read", 0, || input::open_dataset(&request.path, &request.open, &config))?;
     let sigmas = adjusted::adjustable(&dataset, &config);
@@ -145,7 +106,8 @@ pub fn odometry(
     let timing = events.stage(camera_timing::STAGE, 0, || {
         camera_timing::settle(&mut dataset, &mut config, events, cancel)
     })?;
-    let tracked = track(&dataset, &config, sigmas.as_ref(), events, cancel, dump.as_mut())?;
+    let recording = Recording { dataset: &dataset, config: &config, map: earlier_map.as_ref() };
+    let tracked = track(&recording, sigmas.as_ref(), events, cancel, dump.as_mut())?;
     let dumped = dump.is_some();
     dump.map_or(Ok(()), dump::Dump::finish)?;
 
@@ -198,26 +160,37 @@ pub fn odometry(
     Ok(outcome)
 }
 
+/// What is tracked.
+pub(crate) struct Recording<'a> {
+    pub dataset: &'a Dataset,
+    pub config: &'a Config,
+    /// The map to look in.
+    pub map: Option<&'a EarlierMap>,
+}
+
 /// Feeds a recording to the odometry, and adjusts all states after its end where `adjustable` says what may change.
 pub(crate) fn track(
-    dataset: &Dataset,
-    config: &Config,
+    recording: &Recording<'_>,
     adjustable: Option<&CalibrationSigmas>,
     events: &Events,
     cancel: &CancelToken,
     dump: Option<&mut dump::Dump>,
 ) -> Result<Tracked, Error> {
-    let total = dataset.images.len();
+    let total = recording.dataset.images.len();
     let keeps_log = adjustable.is_some();
     let (mut tracked, odometry) =
-        events.stage("odometry", total, || push_all(dataset, config, keeps_log, events, cancel, dump))?;
+        events.stage("odometry", total, || push_all(recording, keeps_log, events, cancel, dump))?;
     if let Some(sigmas) = adjustable.filter(|_| tracked.with_imu && !cancel.is_cancelled()) {
         let mut tell = |progress: Progress| {
             events.emit(&Event::Progress { stage: ADJUSTMENT, done: progress.states, total: progress.of });
             if cancel.is_cancelled() { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
         };
         match events.stage(ADJUSTMENT, 0, || odometry.adjust_with(sigmas, &mut tell)) {
-            Ok(adjusted) if adjusted.is_consistent() => {
+            Ok(mut adjusted) if adjusted.is_consistent() => {
+                if let Some(joined) = odometry.place_in_map(&adjusted) {
+                    adjusted.join(&joined);
+                    tracked.map.iter_mut().for_each(|map| map.matches = Some(joined.matches));
+                }
                 tracked.quality.adjust(&adjusted);
                 tracked.adjusted = Some(adjusted);
             }
@@ -225,24 +198,29 @@ pub(crate) fn track(
             Err(reason) => tracked.not_adjusted = Some(reason.to_string()),
         }
     }
+    tracked.saved_map = odometry.saved_map(tracked.adjusted.as_ref());
     Ok(tracked)
 }
 
 fn push_all(
-    dataset: &Dataset,
-    config: &Config,
+    recording: &Recording<'_>,
     keeps_log: bool,
     events: &Events,
     cancel: &CancelToken,
     mut dump: Option<&mut dump::Dump>,
 ) -> Result<(Tracked, Odometry), Error> {
+    let Recording { dataset, config, map } = *recording;
     let settings = &config.odometry;
     let mut odometry = Odometry::new(&dataset.rig, dataset.camera, settings)?;
+    if let Some(earlier) = map {
+        odometry = odometry.with_map(&earlier.map);
+    }
     let with_imu = settings.imu != ImuUse::Off && dataset.rig.imu.is_some();
     if keeps_log && with_imu {
         odometry.keep_log();
     }
-    let mut tracked = Tracked { with_imu, ..Tracked::default() };
+    let map = map.map(|m| MapUse { file: m.path.clone(), found_live_ns: None, matches: None });
+    let mut tracked = Tracked { with_imu, map, ..Tracked::default() };
     let total = dataset.images.len();
     let mut spent = 0.0;
     for measurement in input::measurements(dataset, true) {
@@ -275,122 +253,6 @@ fn push_all(
     }
     tracked.counts = odometry.counts();
     Ok((tracked, odometry))
-}
-
-impl Tracked {
-    fn keep(&mut self, mut output: OdometryOutput, seconds: f64) {
-        let time_ns = output.time.nanos();
-        self.quality.add(&output);
-        match &mut output.status {
-            Status::Tracking(tracking) => {
-                if let Some(open) = self.lost.last_mut().filter(|l| l.until_ns.is_none()) {
-                    open.until_ns = Some(time_ns);
-                }
-                tracking.joined.iter().for_each(|joined| self.join(joined, time_ns));
-                self.keyframes.extend(tracking.keyframe.take().map(|k| *k));
-                let revised = std::mem::take(&mut tracking.revised);
-                revised.iter().for_each(|r| self.revise(r));
-                tracking.landmarks.clear();
-            }
-            Status::Lost(reason) => {
-                let reason = reason.to_string();
-                self.lost.push(LostSpan { from_ns: time_ns, until_ns: None, reason, found_again_ns: None });
-            }
-            Status::Waiting(_) => {}
-        }
-        self.frames.push(TrackedFrame { output, seconds });
-    }
-
-    /// States of a segment that turns out to be of the same world as another one go there.
-    fn join(&mut self, joined: &Joined, time_ns: i64) {
-        for frame in &mut self.frames {
-            if let Status::Tracking(tracking) = &mut frame.output.status {
-                joined.apply(&mut tracking.segment, &mut tracking.state);
-            }
-        }
-        self.keyframes.iter_mut().for_each(|k| joined.apply_to_keyframe(k));
-        if let Some(lost) = self.lost.last_mut() {
-            lost.found_again_ns = Some(time_ns);
-        }
-    }
-
-    fn revise(&mut self, revised: &RevisedPose) {
-        if let Some(keyframe) = self.keyframes.iter_mut().rev().find(|k| k.id == revised.id) {
-            keyframe.world_from_camera = revised.world_from_camera;
-        }
-    }
-
-    /// Poses of the body in the segment with the most images; `None` when there are fewer than two.
-    pub fn longest_segment(&self) -> Option<Trajectory> {
-        let with_state = || self.frames.iter().filter_map(|f| Some((f.output.time, f.output.tracking()?)));
-        let mut counts = std::collections::BTreeMap::<u32, usize>::new();
-        with_state().for_each(|(_, t)| *counts.entry(t.segment).or_default() += 1);
-        // Of equally long segments the first.
-        let (segment, _) = counts.iter().max_by_key(|(segment, n)| (**n, std::cmp::Reverse(**segment)))?;
-        let poses: Vec<StampedPose> = with_state()
-            .filter(|(_, t)| t.segment == *segment)
-            .map(|(time, t)| StampedPose { time, world_from_body: t.state.world_from_body })
-            .collect();
-        (poses.len() >= 2).then(|| Trajectory::new(BodyFrame::Imu, poses).ok()).flatten()
-    }
-
-    /// Seconds from the first image to the first state.
-    pub fn first_state_secs(&self) -> Option<f64> {
-        let first = self.frames.first()?.output.time;
-        let state = self.frames.iter().find(|f| f.output.tracking().is_some())?;
-        Some((state.output.time - first).as_secs_f64())
-    }
-
-    /// What is said of the scale; `unseen`: σ(ln s) of what its estimate does not see.
-    pub fn stated_scale(&self, unseen: UnseenScale) -> StatedScale {
-        let source = match self.with_imu {
-            true => unseen.source(&self.quality),
-            false => ScaleSource::None,
-        };
-        StatedScale::new(source, None)
-    }
-
-    /// Why it never had a state.
-    pub(crate) fn why_not_started(&self) -> Option<String> {
-        self.quality.why_not_started()
-    }
-
-    pub(crate) fn warnings(&self) -> Vec<Warning> {
-        let mut warnings = Vec::new();
-        if let Some(first) = self.unreadable.first() {
-            let text = format!("{} images left out; the first: {first}", self.unreadable.len());
-            warnings.push(Warning::new("odometry-image-unreadable", text));
-        }
-        for span in &self.lost {
-            let at = vidar_core::Timestamp::from_nanos(span.from_ns);
-            let hint = match span.found_again_ns.map(vidar_core::Timestamp::from_nanos) {
-                Some(again) => format!(
-                    "the place was found again at {again} s: one world; odometry/health.csv lists every image"
-                ),
-                None => {
-                    "poses after it are a segment of their own; odometry/health.csv lists every image".into()
-                }
-            };
-            warnings.push(Warning::degraded("track-lost", format!("at {at} s: {}", span.reason)).hint(hint));
-        }
-        if !self.frames.iter().any(|f| f.output.tracking().is_some()) {
-            let why = self.why_not_started().unwrap_or_else(|| "no images".into());
-            let text = format!("the odometry never started: {why}");
-            let hint =
-                "`vidar inspect` shows calibration and units in plain words; docs/failures.md lists causes";
-            warnings.push(Warning::degraded(NEVER_STARTED, text).hint(hint));
-        }
-        if let (Some(reason), true) = (&self.not_adjusted, self.quality.longest().is_some()) {
-            warnings.push(Warning::new("not-adjusted", format!("the live states are final: {reason}")));
-        }
-        warnings.extend(self.adjusted.iter().flat_map(adjusted::warnings));
-        if !self.with_imu {
-            let text =
-                "one camera without an IMU: the trajectory is known up to scale, lengths are not metres";
-            warnings.push(Warning::new("scale-unknown", text));
-        }
-        warnings
-    }
 }
 
 /// How far the trajectory may be trusted.
@@ -430,81 +292,6 @@ fn against_truth(
         Ok(report) => Ok(Some(report)),
         Err(vidar_eval::EvalError::NoMatches { .. }) => Ok(None),
         Err(other) => Err(other.into()),
-    }
-}
-
-impl OdometryOutcome {
-    /// Counts and scores as JSON.
-    pub fn result_json(&self) -> Value {
-        let tracked = &self.tracked;
-        let with_state = tracked.frames.iter().filter(|f| f.output.tracking().is_some()).count();
-        let mut health = std::collections::BTreeMap::<&str, usize>::new();
-        for frame in &tracked.frames {
-            *health.entry(files::word(&frame.output)).or_default() += 1;
-        }
-        json!({
-            "verdict": self.verdict,
-            "is_metric": self.scale.is_metric,
-            "scale": self.scale,
-            "quality": tracked.quality.json(),
-            "images": tracked.frames.len(),
-            "images_with_state": with_state,
-            "first_state_secs": tracked.first_state_secs(),
-            "keyframes": tracked.keyframes.len(),
-            "path_m": self.trajectory.as_ref().map(Trajectory::path_length_m),
-            "health": health,
-            "lost": tracked.lost,
-            "images_out_of_order": tracked.counts.images_out_of_order,
-            "images_repeated": tracked.counts.images_repeated,
-            "imu_samples_rejected": tracked.counts.imu_samples_rejected,
-            "imu_gaps": tracked.counts.imu_gaps,
-            "milliseconds_per_image": files::milliseconds(tracked),
-            "trajectory": self.report,
-            "final": tracked.adjusted.as_ref().map(|adjusted| json!({
-                "images": adjusted.images.len(),
-                "scale_std": adjusted.scale_std,
-                "adjustment": adjusted.report,
-                "calibration": adjusted::calibration_json(adjusted),
-                "imu": adjusted::imu_json(adjusted),
-                "trajectory": self.final_report,
-            })),
-        })
-    }
-
-    /// What was made and how far to trust it.
-    pub fn summary_lines(&self) -> Vec<(&'static str, String)> {
-        let tracked = &self.tracked;
-        let unit = if self.scale.is_metric { "m" } else { "units (lengths are not metres)" };
-        let mut lines = vec![
-            ("verdict", self.verdict.line()),
-            ("tracked", tracked.quality.words()),
-            ("scale", self.scale.words.clone()),
-            ("keyframes", tracked.keyframes.len().to_string()),
-        ];
-        if let Some(trajectory) = &self.trajectory {
-            lines.push(("path", format!("{:.2} {unit}", trajectory.path_length_m())));
-        }
-        if let Some(secs) = tracked.first_state_secs() {
-            lines.push(("first state", format!("{secs:.2} s after the first image")));
-        }
-        let metres = |e: Option<vidar_eval::ErrorStats>| e.map_or("-".into(), |e| format!("{:.4} m", e.rmse));
-        let mut both =
-            |label, of: &dyn Fn(&TrajectoryReport) -> String| match (&self.final_report, &self.report) {
-                (Some(adjusted), Some(live)) => {
-                    lines.push((label, format!("{} (live {})", of(adjusted), of(live))));
-                }
-                (Some(only), None) | (None, Some(only)) => lines.push((label, of(only))),
-                (None, None) => {}
-            };
-        both("ATE SE(3)", &|r| metres(r.ate_se3_m));
-        both("ATE Sim(3)", &|r| metres(r.ate_sim3_m));
-        both("|ln s|", &|r| r.scale_error.map_or("-".into(), |s| format!("{s:.4}")));
-        for span in &tracked.lost {
-            let at = vidar_core::Timestamp::from_nanos(span.from_ns);
-            lines.push(("lost", format!("at {at} s: {}", span.reason)));
-        }
-        lines.push(("folder", self.folder.display().to_string()));
-        lines
     }
 }
 

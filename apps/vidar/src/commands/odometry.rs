@@ -9,6 +9,7 @@ use vidar::odometry::OdometryRequest;
 pub fn odometry(args: &OdometryArgs, context: &Context) -> Outcome {
     let mut layered = build::layered(&args.config, None)?;
     build::apply_input_flags(&mut layered, &args.input)?;
+    build::apply_map_flag(&mut layered, args.map.as_deref())?;
     if args.mono {
         layered.value("odometry.imu", toml::Value::String("off".into()), Origin::Flag("--mono"))?;
     }
@@ -35,7 +36,6 @@ pub fn odometry(args: &OdometryArgs, context: &Context) -> Outcome {
         print::json(&value);
     } else {
         print::pairs(outcome.summary_lines());
-        print::warnings(&outcome.warnings);
     }
     Ok(outcome.status)
 }

@@ -13,6 +13,7 @@ mod fault_list;
 mod faults;
 mod hostile;
 mod keys;
+mod map;
 mod models;
 mod numbers;
 mod odometry;

@@ -88,7 +88,7 @@ pub(super) fn longest_segment(
     imu: &ImuBuffer,
     model: &ImuModel,
     clock_offset: Duration,
-) -> Guess {
+) -> (u32, Guess) {
     let mut counts: BTreeMap<u32, usize> = BTreeMap::new();
     for state in log.images.iter().filter_map(|i| i.state.as_ref()) {
         *counts.entry(state.segment).or_default() += 1;
@@ -100,7 +100,7 @@ pub(super) fn longest_segment(
         let first = log.images.iter().position(|i| i.is_of(segment)).unwrap_or(0);
         guess.take_segment(log, imu, model, clock_offset, first, Se3::IDENTITY);
     }
-    guess
+    (longest.unwrap_or(0), guess)
 }
 
 impl Guess {

@@ -30,7 +30,7 @@ pub(super) fn of(recording: &Recording<'_>, solution: &Solution, scale_std: f64)
         keyframes.push(OdometryKeyframe {
             id: KeyframeId(k as u32),
             frame_id: logged.caller_frame,
-            segment: 0,
+            segment: solution.segment,
             state: public_state(&state, logged.stamp),
             world_from_camera: state.world_from_body * problem.calibration.body_from_camera,
             pose_covariance,

@@ -190,13 +190,21 @@ impl TrackLog {
         self.generation
     }
 
-    /// Moves the states of a segment into the world of another one.
-    pub(crate) fn join(&mut self, segment: u32, into: u32, into_from_segment: &Se3) {
+    /// Moves the states of a segment, whose world is `scale` times too small, into that of another one.
+    pub(crate) fn join(&mut self, segment: u32, into: u32, into_from_segment: &Se3, scale: f64) {
         let states = self.images.iter_mut().filter_map(|i| i.state.as_mut());
         for logged in states.filter(|s| s.segment == segment) {
             logged.segment = into;
+            logged.state.world_from_body.translation *= scale;
+            logged.state.velocity *= scale;
             logged.state = logged.state.moved(into_from_segment);
         }
+    }
+
+    /// Where image `frame` shows a track, if it was logged.
+    pub(crate) fn pixel_of(&self, frame: FrameId, key: TrackKey) -> Option<Pixel> {
+        let image = self.images.iter().rev().find(|i| i.frame == frame)?;
+        image.observations.iter().find(|o| o.key == key).map(LoggedObservation::pixel)
     }
 
     /// Adds to image `frame`, if it was logged, that it shows an earlier track.

@@ -56,6 +56,8 @@ const SETTLED_CLOCK_SECS: f64 = 2e-4;
 
 /// The solution with what belongs to it.
 struct Solution {
+    /// The segment in whose world the states are.
+    segment: u32,
     problem: Problem,
     /// Which images of the log the states belong to.
     images: Vec<usize>,
@@ -142,7 +144,7 @@ pub fn adjust(
     let prior = CalibrationPrior { sigmas: input.sigmas.of(&calibration), mean: calibration.clone() };
     let recording = Recording { log, imu: &imu, model: &input.model };
     let clock_offset = input.camera.time_offset;
-    let guess = initial::longest_segment(log, &imu, &input.model, clock_offset);
+    let (segment, guess) = initial::longest_segment(log, &imu, &input.model, clock_offset);
     let mut work = Work { calibration, prior, clock_offset, guess };
     // The longest segment first: it gives the calibration with which the rest is found.
     work.pass(&recording, &mut watch)?;
@@ -166,6 +168,7 @@ pub fn adjust(
     let system = optimise::solution(&problem).ok_or(AdjustmentError::Undetermined)?;
     let covariance = system.factor.inverse(problem.calibration_offset());
     let solution = Solution {
+        segment,
         problem,
         images,
         clock_offset,

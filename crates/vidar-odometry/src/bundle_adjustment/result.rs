@@ -8,7 +8,7 @@ use super::problem::{FRAME_DIM, Problem};
 use super::{AdjustmentFinding, AdjustmentInput, Recording, Solution, findings, keyframes};
 use crate::backend::dot;
 use crate::imu::{ImuBuffer, ImuModel, NavState};
-use crate::pipeline::public_state;
+use crate::pipeline::{Joined, public_state};
 use nalgebra::Vector3;
 use vidar_core::{CameraModel, Duration, FrameId, LieGroup, OdometryKeyframe, Se3, So3, Timestamp};
 
@@ -73,6 +73,8 @@ pub struct AdjustmentReport {
 /// An adjusted recording. The world is levelled, z up, its origin where the first state was.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Adjusted {
+    /// The segment of the odometry in whose world the states are.
+    pub segment: u32,
     /// A state for every image between the first and the last adjusted one, in the order of time.
     pub images: Vec<(FrameId, vidar_core::NavState)>,
     /// The images that took part, as keyframes of one segment with the landmarks that they observe. Covariances of poses are
@@ -96,6 +98,17 @@ const MAX_INERTIAL_CHI2: f64 = 3.0;
 const MAX_REJECTED_SHARE: f64 = 0.2;
 
 impl Adjusted {
+    /// Takes all poses to the world of another segment.
+    pub fn join(&mut self, joined: &Joined) {
+        for (_, state) in &mut self.images {
+            joined.apply(&mut self.segment.clone(), state);
+        }
+        self.keyframes.iter_mut().for_each(|k| joined.apply_to_keyframe(k));
+        if self.segment == joined.segment {
+            self.segment = joined.into;
+        }
+    }
+
     /// Whether camera and IMU agree in the solution.
     pub fn is_consistent(&self) -> bool {
         let AdjustmentReport { observations, rejected, inertial_chi2_per_dof, .. } = self.report;
@@ -132,6 +145,7 @@ pub(super) fn collect(
     let sigmas = calibration_sigmas(problem, covariance);
     let gains = problem.calibration.dim() - GAIN_DIM;
     Adjusted {
+        segment: solution.segment,
         images: every_image,
         keyframes: keyframes::of(recording, solution, scale_std),
         calibration: AdjustedCalibration {

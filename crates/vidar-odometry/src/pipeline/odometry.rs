@@ -24,8 +24,10 @@ use vidar_core::{
 };
 
 mod adjustment;
+mod joined_segments;
 mod relocalization;
 mod report;
+mod saved_map;
 mod start;
 mod timing;
 
@@ -257,7 +259,7 @@ impl Odometry {
         let host = self.images.take(id, &frame.image, self.frontend.pyramid.levels, self.shutter_at(time))?;
         let was_starting = matches!(self.phase, Phase::Initializing(_));
         let mut status = self.status_after(&frame, host, time);
-        self.relocalize(&mut status, id, time);
+        self.relocalize(&mut status, id, frame.id, time);
         self.log_image(&frame, id, &status);
         let status = match self.imu_model {
             Some(_) => {

@@ -66,8 +66,12 @@ impl Descriptor {
         self.0.iter().zip(&other.0).map(|(a, b)| (a ^ b).count_ones()).sum()
     }
 
+    /// The comparisons, as bits.
+    pub fn words(&self) -> [u64; WORDS] {
+        self.0
+    }
+
     /// Of comparisons that are given.
-    #[cfg(test)]
     pub fn from_words(words: [u64; WORDS]) -> Self {
         Self(words)
     }

@@ -15,16 +15,20 @@ const MIN_POINTS: usize = 20;
 /// A landmark as a keyframe shows it.
 #[derive(Clone, Debug)]
 pub(crate) struct MapPoint {
-    pub key: TrackKey,
+    /// Its track; `None` where it is of another recording.
+    pub key: Option<TrackKey>,
     /// Its place in the frame of the camera, m.
     pub in_camera: Vector3<f64>,
     pub descriptor: Descriptor,
+    /// At several octaves, to be looked for; none where it is of another recording.
+    pub at_octaves: Vec<Descriptor>,
 }
 
 /// A keyframe with the landmarks that it shows.
 #[derive(Clone, Debug)]
 pub(crate) struct MapKeyframe {
-    pub frame: FrameId,
+    /// The smoother's and the caller's number of its image; `None` where it is of another recording.
+    pub own: Option<(FrameId, FrameId)>,
     pub time: Timestamp,
     /// Its world: poses of different segments cannot be compared.
     pub segment: u32,
@@ -59,6 +63,22 @@ impl KeyframeMap {
         &self.keyframes
     }
 
+    /// Those of this recording, without those of another one.
+    pub fn own(&self) -> Self {
+        Self { keyframes: self.keyframes.iter().filter(|k| k.own.is_some()).cloned().collect() }
+    }
+
+    /// The segments, in the order of their first keyframes.
+    pub fn segments(&self) -> Vec<u32> {
+        let mut all: Vec<u32> = Vec::new();
+        for keyframe in &self.keyframes {
+            if !all.contains(&keyframe.segment) {
+                all.push(keyframe.segment);
+            }
+        }
+        all
+    }
+
     /// Whether there are keyframes of other segments.
     pub fn has_other_than(&self, segment: u32) -> bool {
         self.keyframes.iter().any(|k| k.segment != segment)
@@ -66,27 +86,31 @@ impl KeyframeMap {
 
     /// A later estimate of a keyframe's pose.
     pub fn revise(&mut self, frame: FrameId, world_from_camera: Se3) {
-        if let Some(keyframe) = self.keyframes.iter_mut().rev().find(|k| k.frame == frame) {
+        if let Some(keyframe) =
+            self.keyframes.iter_mut().rev().find(|k| k.own.is_some_and(|(own, _)| own == frame))
+        {
             Arc::make_mut(keyframe).world_from_camera = world_from_camera;
         }
     }
 
-    /// Moves the keyframes of a segment into the world of another one.
-    pub fn join(&mut self, segment: u32, into: u32, into_from_segment: &Se3) {
+    /// Moves the keyframes of a segment, whose world is `scale` times too small, into that of another one.
+    pub fn join(&mut self, segment: u32, into: u32, into_from_segment: &Se3, scale: f64) {
         for keyframe in self.keyframes.iter_mut().filter(|k| k.segment == segment) {
             let keyframe = Arc::make_mut(keyframe);
             keyframe.segment = into;
+            keyframe.world_from_camera.translation *= scale;
             keyframe.world_from_camera = *into_from_segment * keyframe.world_from_camera;
+            keyframe.points.iter_mut().for_each(|p| p.in_camera *= scale);
         }
     }
 
-    /// Forgets the keyframes that were taken after an instant.
+    /// Forgets the keyframes of this recording that were taken after an instant.
     pub fn forget_after(&mut self, time: Timestamp) {
-        self.keyframes.retain(|k| k.time <= time);
+        self.keyframes.retain(|k| k.own.is_none() || k.time <= time);
     }
 
-    /// Forgets all.
-    pub fn clear(&mut self) {
-        self.keyframes.clear();
+    /// Forgets those of this recording.
+    pub fn forget_own(&mut self) {
+        self.keyframes.retain(|k| k.own.is_none());
     }
 }

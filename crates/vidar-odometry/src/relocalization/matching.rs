@@ -23,7 +23,7 @@ const MAX_COMPARED: usize = 400;
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Pair {
     pub sighting: usize,
-    pub key: TrackKey,
+    pub key: Option<TrackKey>,
     /// In the world of the segment, m.
     pub point: Vector3<f64>,
 }

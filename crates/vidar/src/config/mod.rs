@@ -42,6 +42,9 @@ pub struct InputConfig {
     /// length or gain by 10 %, makes the scale of a flight wrong by 8 to 20 %. The adjustment (`odometry.adjust`) estimates or contradicts
     /// them, so nothing is added there; 0.005: a calibration made with a target on this rig.
     pub calibration_scale_std: f64,
+    /// Folder of an earlier `vidar odometry` or `vidar run` of the same place, or its `odometry/map.cbor`: the odometry looks for the place in
+    /// it, and its poses are then in the world of that recording. Empty: none.
+    pub map: String,
 }
 
 /// Where metric poses come from.
@@ -69,6 +72,7 @@ impl Default for InputConfig {
             max_pose_gap_secs: 0.5,
             imu_scale_std: 0.01,
             calibration_scale_std: 0.07,
+            map: String::new(),
         }
     }
 }

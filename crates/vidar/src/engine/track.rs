@@ -9,7 +9,7 @@ use std::sync::Arc;
 use vidar_core::{
     CameraId, Duration, LieGroup, OdometryKeyframe, RevisedPose, Rig, Se3, SensorEvent, Timestamp, Warning,
 };
-use vidar_odometry::{ImuUse, Joined, Odometry, OdometryConfig, OdometryOutput, Status, Tracking};
+use vidar_odometry::{ImuUse, Joined, Odometry, OdometryConfig, OdometryOutput, SavedMap, Status, Tracking};
 
 /// What a pose source reports of one image. Images are reported in the order of time; one may be left out.
 #[derive(Clone, Debug)]
@@ -134,12 +134,20 @@ pub struct OdometryPoses {
 }
 
 impl OdometryPoses {
-    /// Odometry of one camera of the rig.
+    /// Odometry of one camera of the rig, which looks for itself in `map`.
     ///
     /// # Errors
     /// Settings or calibration that the odometry refuses.
-    pub fn new(rig: &Rig, camera: CameraId, config: &OdometryConfig) -> Result<Self, Error> {
-        let odometry = Odometry::new(rig, camera, config)?;
+    pub fn new(
+        rig: &Rig,
+        camera: CameraId,
+        config: &OdometryConfig,
+        map: Option<&SavedMap>,
+    ) -> Result<Self, Error> {
+        let mut odometry = Odometry::new(rig, camera, config)?;
+        if let Some(map) = map {
+            odometry = odometry.with_map(map);
+        }
         let body_from_camera = rig.camera(camera).map_or(Se3::IDENTITY, |c| c.body_from_camera);
         let is_metric = config.imu != ImuUse::Off && rig.imu.is_some();
         Ok(Self {

@@ -1,6 +1,6 @@
 //! Files of `vidar odometry`.
 
-use super::{OdometryOutcome, Tracked};
+use super::{OdometryOutcome, Tracked, map};
 use crate::error::Error;
 use crate::events::{Event, Events};
 use crate::run_folder::{RunFolder, pretty};
@@ -46,6 +46,10 @@ pub(super) fn write(
     put("odometry/landmarks.csv", landmarks_csv(&tracked.keyframes).as_bytes())?;
     put("odometry/health.csv", health_csv(tracked).as_bytes())?;
     put("odometry/report.json", &pretty(&outcome.result_json()))?;
+    if let Some((name, bytes)) = map::write(folder, &tracked.saved_map)? {
+        events.emit(&Event::ArtifactWritten { path: name.to_owned(), bytes });
+        made.push(name.to_owned());
+    }
     Ok(made)
 }
 

@@ -39,7 +39,8 @@ impl TrackedPoses {
         };
         if let Some(adjusted) = &tracked.adjusted {
             let place = adjusted.calibration.body_from_camera;
-            let posed = |(id, state): &(FrameId, NavState)| (*id, (0, state.world_from_body * place));
+            let posed =
+                |(id, state): &(FrameId, NavState)| (*id, (adjusted.segment, state.world_from_body * place));
             return Self {
                 poses: adjusted.images.iter().map(posed).collect(),
                 keyframes: by_frame(&adjusted.keyframes),

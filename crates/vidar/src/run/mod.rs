@@ -130,7 +130,7 @@ pub fn run(request: &RunRequest, events: &Events, cancel: &CancelToken) -> Resul
         events.stage("read", 0, || input::open_every_image(&request.path, &request.open, &config))?;
     dataset.warnings.extend(input::use_every_untimed_image(&dataset, &mut config));
     let fingerprint = input::fingerprint(&dataset)?;
-    let mut tracking = Tracking::new(&dataset, &fingerprint, &config, &request.place);
+    let mut tracking = Tracking::new(&dataset, &fingerprint, &config, &request.place)?;
     tracking.calibrate(&mut dataset, &mut config, &events, cancel)?;
     let (plan, source, places) =
         events.stage("plan", 0, || Plan::make(&dataset, &config, request.reference.as_deref()))?;

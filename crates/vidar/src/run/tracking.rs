@@ -5,8 +5,8 @@ use crate::calibrate;
 use crate::camera_timing;
 use crate::config::Config;
 use crate::error::Error;
-use crate::events::{CancelToken, Events};
-use crate::odometry::{self, TrackedPoses, adjusted};
+use crate::events::{CancelToken, Event, Events};
+use crate::odometry::{self, EarlierMap, Recording, TrackedPoses, adjusted, map};
 use crate::run_folder::{OutputLocation, RunFolder};
 use crate::system::read_up_to;
 use serde::{Deserialize, Serialize};
@@ -66,16 +66,28 @@ pub(super) struct Tracking {
     sigmas: Option<CalibrationSigmas>,
     calibrated: Option<Calibrated>,
     kept: Option<Kept>,
+    map: Option<EarlierMap>,
 }
 
 impl Tracking {
     /// `dataset` and `config` as the user gave them; `place` may hold the result of an earlier attempt.
-    pub fn new(dataset: &Dataset, fingerprint: &str, config: &Config, place: &OutputLocation) -> Self {
-        let settings = serde_json::json!({ "version": crate::VERSION, "odometry": config.odometry });
+    ///
+    /// # Errors
+    /// The map of an earlier recording cannot be read.
+    pub fn new(
+        dataset: &Dataset,
+        fingerprint: &str,
+        config: &Config,
+        place: &OutputLocation,
+    ) -> Result<Self, Error> {
+        let map = EarlierMap::of(config)?;
+        let map_sha256 = map.as_ref().map(|m| &m.sha256);
+        let settings =
+            serde_json::json!({ "version": crate::VERSION, "odometry": config.odometry, "map": map_sha256 });
         let key = format!("{fingerprint} {:?} {settings}", dataset.rig);
         let key = vidar_hub::sha256_hex(key.as_bytes());
         let kept = place.resumed().and_then(|folder| read(&folder.join(FILE), &key));
-        Self { sigmas: adjusted::adjustable(dataset, config), calibrated: None, kept, key }
+        Ok(Self { sigmas: adjusted::adjustable(dataset, config), calibrated: None, kept, key, map })
     }
 
     /// Calibrates a recording that has no calibration.
@@ -108,13 +120,20 @@ impl Tracking {
             kept.timing.iter().for_each(|w| events.warn(w));
             let text = "poses of an earlier attempt at this run are used";
             events.warn(&Warning::new("odometry-resumed", text).at(FILE));
+            if let Ok(file) = std::fs::metadata(folder.path().join(map::FILE)) {
+                events.emit(&Event::ArtifactWritten { path: map::FILE.into(), bytes: file.len() });
+            }
             return Ok(Some(kept.poses));
         }
         let timing = events
             .stage(camera_timing::STAGE, 0, || camera_timing::settle(dataset, config, events, cancel))?;
         timing.iter().for_each(|w| events.warn(w));
         let Some(sigmas) = &self.sigmas else { return Ok(None) };
-        let tracked = odometry::track(dataset, config, Some(sigmas), events, cancel, None)?;
+        let recording = Recording { dataset, config, map: self.map.as_ref() };
+        let tracked = odometry::track(&recording, Some(sigmas), events, cancel, None)?;
+        if let Some((name, bytes)) = map::write(folder, &tracked.saved_map)? {
+            events.emit(&Event::ArtifactWritten { path: name.into(), bytes });
+        }
         let poses = TrackedPoses::new(&tracked, &dataset.rig, dataset.camera);
         tracked.adjusted.iter().for_each(|adjusted| adjusted::apply(adjusted, dataset));
         if let (Some(calibrated), false) = (self.calibrated, cancel.is_cancelled()) {

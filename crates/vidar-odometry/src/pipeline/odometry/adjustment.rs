@@ -84,8 +84,9 @@ impl Odometry {
             accel_density: model.noise.accel_density / self.config.accel_noise_factor,
             ..model.noise
         };
+        let log = self.joined_log(log);
         let input = AdjustmentInput {
-            log,
+            log: &log,
             camera: &camera,
             readout_secs: self.time_calibration.readout_secs,
             given_body_from_camera: self.given_body_from_camera,

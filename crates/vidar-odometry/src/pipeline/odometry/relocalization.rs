@@ -23,8 +23,11 @@ const MAX_SCALE_STD: f64 = 0.1;
 /// Landmarks are kept whose distance is known this well, relatively.
 const MAX_DISTANCE_STD: f64 = 0.15;
 
+/// Largest difference of ln(distance) between own landmarks and the map: both are metric.
+pub(super) const MAX_SCALE_DIFFERENCE: f64 = 0.2;
+
 /// Standard deviation of a corner that is found again by its descriptor, px.
-const MATCH_SIGMA_PX: f64 = 2.0;
+pub(super) const MATCH_SIGMA_PX: f64 = 2.0;
 
 /// What was estimated so long before a divergence is right, s.
 const DIVERGING_SECS: f64 = 5.0;
@@ -32,7 +35,7 @@ const DIVERGING_SECS: f64 = 5.0;
 /// Keyframes, and the search among them.
 #[derive(Debug, Default)]
 pub(super) struct Relocalizer {
-    map: KeyframeMap,
+    pub map: KeyframeMap,
     /// The image that is looked for.
     search: Option<(FrameId, Deferred<Option<Relocalized>>)>,
     /// A result that waits for a second one.
@@ -52,7 +55,7 @@ impl Relocalizer {
         self.candidate = None;
         match reason {
             // All that was estimated with the wrong clock or rotation is wrong.
-            LossReason::Recalibrated { .. } => self.map.clear(),
+            LossReason::Recalibrated { .. } => self.map.forget_own(),
             LossReason::Diverged { .. } => {
                 self.map.forget_after(time - Duration::from_secs_f64(DIVERGING_SECS))
             }
@@ -64,7 +67,13 @@ impl Relocalizer {
 impl Odometry {
     /// Keeps image `id` where it is a keyframe, looks for it among the keyframes of other segments, and joins their worlds where it was
     /// found twice.
-    pub(super) fn relocalize(&mut self, status: &mut Status, id: FrameId, time: Timestamp) {
+    pub(super) fn relocalize(
+        &mut self,
+        status: &mut Status,
+        id: FrameId,
+        caller_id: FrameId,
+        time: Timestamp,
+    ) {
         let Status::Tracking(tracking) = status else { return };
         if let Some(joined) = self.joined(time) {
             tracking.join(&joined);
@@ -72,7 +81,7 @@ impl Odometry {
         if tracking.keyframe.is_none() || !tracking.scale_std.is_finite() {
             return;
         }
-        self.keep_keyframe(id, time);
+        self.keep_keyframe(id, caller_id, time);
         let is_early = |last: Timestamp| (time - last).as_secs_f64() < PAUSE_SECS;
         let is_due = self.relocalizer.search.is_none()
             && !self.relocalizer.last_search.is_some_and(is_early)
@@ -92,7 +101,7 @@ impl Odometry {
         let (id, search) = self.relocalizer.search.take_if(|(_, search)| search.is_due(time))?;
         let found = search.result().flatten()?;
         let earlier = self.relocalizer.candidate.replace((id, found.clone()));
-        let (first_id, first) = earlier.filter(|(_, earlier)| earlier.agrees_with(&found))?;
+        let (first_id, first) = earlier.filter(|(_, earlier)| earlier.agrees_with(&found, 1.0))?;
         self.relocalizer.candidate = None;
         let own = self.segment;
         let into_own = self.world_from_smoother();
@@ -100,14 +109,14 @@ impl Odometry {
             true => (own, found.segment, found.map_from_own * into_own.inverse()),
             false => (found.segment, own, into_own * found.map_from_own.inverse()),
         };
-        self.relocalizer.map.join(segment, into, &into_from_segment);
+        self.relocalizer.map.join(segment, into, &into_from_segment, 1.0);
         if segment == own {
             self.segment = into;
             self.placed = Some(found.map_from_own);
         }
-        let matches = first.matches.len() + found.matches.len();
+        let matches = first.inliers + found.inliers;
         if let Some(log) = &mut self.log {
-            log.join(segment, into, &into_from_segment);
+            log.join(segment, into, &into_from_segment, 1.0);
             for (id, result) in [(first_id, first), (id, found)] {
                 result.matches.iter().for_each(|m| log.tie(id, m.key, &m.pixel, &m.covariance));
             }
@@ -121,7 +130,7 @@ impl Odometry {
     }
 
     /// Adds the newest image to the map.
-    fn keep_keyframe(&mut self, id: FrameId, time: Timestamp) {
+    fn keep_keyframe(&mut self, id: FrameId, caller_id: FrameId, time: Timestamp) {
         let (Phase::Tracking(window), Some(host)) = (&self.phase, &self.last_host) else { return };
         let (smoother, camera) = (&window.smoother, &self.camera.model);
         let Some(state) = smoother.state(id).filter(|_| host.frame == id) else { return };
@@ -136,14 +145,17 @@ impl Odometry {
                 return None;
             }
             let down = downward(camera, &camera.unproject(&t.last_global_pixel)?, &gravity);
-            let descriptor = Descriptor::at(&host.pyramid, &t.last_pixel, t.feature.level.into(), &down)?;
-            let key = TrackKey { generation, track: t.id };
-            Some(MapPoint { key, in_camera: camera_from_own.act(&landmark.in_world), descriptor })
+            let at = |level| Descriptor::at(&host.pyramid, &t.last_pixel, level, &down);
+            let descriptor = at(t.feature.level.into())?;
+            let key = Some(TrackKey { generation, track: t.id });
+            let at_octaves = (0..QUERY_LEVELS).filter_map(at).collect();
+            Some(MapPoint { key, in_camera: camera_from_own.act(&landmark.in_world), descriptor, at_octaves })
         });
         let points = points.collect();
         let world_from_camera = self.world_from_smoother() * own_from_camera;
         let segment = self.segment;
-        self.relocalizer.map.add(MapKeyframe { frame: id, time, segment, world_from_camera, points });
+        let own = Some((id, caller_id));
+        self.relocalizer.map.add(MapKeyframe { own, time, segment, world_from_camera, points });
     }
 
     /// The newest image, to be looked for.
@@ -177,6 +189,7 @@ impl Odometry {
             position: own_from_camera.translation,
             sightings: sightings.filter(|s| !s.descriptors.is_empty()).collect(),
             ray_sigma_rad: MATCH_SIGMA_PX / camera.intrinsics().fx,
+            max_scale_difference: MAX_SCALE_DIFFERENCE,
         })
     }
 }
