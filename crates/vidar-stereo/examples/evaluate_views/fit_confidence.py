@@ -6,7 +6,7 @@
 Each set has a part (fit or test), a weight and a file; the weight counts for the whole set. Maximum likelihood of
 p = bound(pose_error) * logistic(features), see confidence.rs. Needs numpy and scipy.
 
-The weights in confidence.rs come from these sets: half of the HoloLens room (--last 20, weight 6), and, with weight 1
+The weights in confidence.rs come from these sets: half of the HoloLens room (--last 20, weight 0.25), and, with weight 1
 each, worlds of `vidar synth` (5 s, 376 x 240 unless stated):
   roomA seed 11; roomB seed 12, orbit, exposure_drift 0.3, image_noise_sigma 4, clutter 70; corrA seed 13, corridor,
   orbit; roomC seed 14, 4 s, 564 x 360, image_noise_sigma 2.5, exposure_secs 0.008, exposure_drift 0.2
