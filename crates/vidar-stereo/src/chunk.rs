@@ -12,9 +12,9 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use vidar_core::{Pinhole, Se3, Watch};
 
 /// Neighbours whose own depths are compared with a reference's.
-const CHECKED_NEIGHBOURS: usize = 4;
+const CHECKED_NEIGHBOURS: usize = 5;
 /// Fewest of them, also where their depth is not requested.
-const MIN_CHECKED: usize = 2;
+const MIN_CHECKED: usize = 3;
 
 /// Depth of one view before the checks, with the inputs of the consistency checks.
 #[derive(Debug)]

@@ -2,8 +2,8 @@
 //!
 //! ```text
 //! views ─▶ grey, working size ─▶ probe the scene's depth ─▶ choose neighbours ─▶ a quarter of the size: plane sweep,
-//!          semi-global matching ─▶ half the size: sweep along the surface, semi-global matching ─▶ the full size: edges,
-//!          scores ─▶ consistency checks ─▶ confidence ─▶ depth
+//!          semi-global matching ─▶ half the size: edges, sweep along the surface, semi-global matching ─▶ the full size:
+//!          edges, scores ─▶ consistency checks ─▶ confidence ─▶ depth
 //! ```
 //!
 //! - **Neighbours** (`select`): by overlap and parallax at the depth that the probe at a quarter of the size estimates;
@@ -13,8 +13,8 @@
 //!   inverse depth over the whole range, the middle one a few offsets along the surface found, continued by its slopes
 //!   (`surface`).
 //! - **Semi-global matching** (`sgm`; Hirschmüller 2008): eight paths in integers, over planes or over offsets.
-//! - **Full size** (`fine`): pixels beside edges try the surfaces around them (the idea of Bleyer 2011); a parabola through
-//!   the costs gives the last fraction of a step.
+//! - **Edges** (`edges`): pixels beside edges try the surfaces around them (the idea of Bleyer 2011), at half the size and
+//!   at the full one; there a parabola through the costs gives the last fraction of a step (`fine`).
 //! - **Checks between views** (`consistency`; Schönberger 2016): forward-backward reprojection through the neighbours'
 //!   own depths; agreeing views are averaged.
 //! - **Confidence** (`confidence`): the probability of an error below [`TOLERANCE_RATIO`].
@@ -35,6 +35,7 @@ mod chunk;
 mod confidence;
 mod config;
 mod consistency;
+mod edges;
 mod elementary;
 mod error;
 mod estimate;

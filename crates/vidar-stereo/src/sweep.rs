@@ -11,7 +11,7 @@ pub(crate) const INVISIBLE: u8 = 255;
 /// Cost of no correlation at all.
 pub(crate) const WORST: f32 = 254.0;
 /// Rows of one task: each strip also warps the radius above and below it, and its costs stay in the cache.
-pub(crate) const STRIP_ROWS: usize = 24;
+const STRIP_ROWS: usize = 24;
 /// Labels of a pixel are padded to a multiple of this, for the vectors of semi-global matching.
 pub(crate) const LANES: usize = 16;
 
@@ -61,4 +61,20 @@ pub(crate) fn sweep(
         }
     });
     Volume { count: labels.count, stride, costs }
+}
+
+/// The costs of the surface `rho + shift` at every pixel.
+pub(crate) fn costs_of_surface(
+    reference: &Reference,
+    sources: &[Source<'_>],
+    rho: &[f32],
+    shift: f32,
+) -> Vec<f32> {
+    let width = reference.width;
+    let mut costs = vec![HIDDEN; rho.len()];
+    costs.par_chunks_mut(STRIP_ROWS * width).enumerate().for_each(|(i, costs)| {
+        let mut strip = Strip::new(reference, i * STRIP_ROWS, costs.len() / width, sources.len());
+        strip.costs(sources, Surface { rho, stride: width }, shift, costs);
+    });
+    costs
 }
