@@ -7,9 +7,10 @@
 //! large as the correction.
 //!
 //! The weights of both were fitted together by maximum likelihood, on pixels that a neighbour confirms and that lie off
-//! the edges of the sensor's depth: half of the HoloLens room (weight 0.25), and rendered rooms and a corridor, unchanged
-//! and with pose noise, time offset and miscalibration (weight 1 each). Calibration on other recordings, with the
-//! commands: docs/benchmark/maps.md. Not modelled: an error of calibration that the poses absorb completely, such as a
+//! the edges of the sensor's depth: half of the HoloLens room, and rendered rooms and a corridor, unchanged and with pose
+//! noise, time offset and miscalibration. Each of the eleven sets has the same weight, and the features are those of the
+//! code as it is (`examples/evaluate_views/fit_confidence.sh` makes them and fits). Calibration on other recordings:
+//! docs/benchmark/maps.md. Not modelled: an error of calibration that the poses absorb completely, such as a
 //! focal length that is off by one percent.
 
 use crate::config::StereoConfig;
