@@ -11,10 +11,12 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::sync::atomic::{AtomicUsize, Ordering};
 use vidar_core::{Pinhole, Se3, Watch};
 
-/// Neighbours whose own depths are compared with a reference's.
-const CHECKED_NEIGHBOURS: usize = 4;
-/// Fewest of them, also where their depth is not requested.
-const MIN_CHECKED: usize = 2;
+/// Neighbours whose own depths are compared with a reference's. At 4 and 5 completeness is .651 and .673 on HoloLens keyframes
+/// 0 to 15, AbsRel .0203 and .0219.
+const CHECKED_NEIGHBOURS: usize = 5;
+/// Fewest of them, also where their depth is not requested: what no checked view sees is lost. At 2 and 3 completeness is .919
+/// and .959 on eight keyframes of rendered room A, .822 and .832 in the corridor.
+const MIN_CHECKED: usize = 3;
 
 /// Depth of one view before the checks, with the inputs of the consistency checks.
 #[derive(Debug)]

@@ -27,8 +27,6 @@ pub struct StereoConfig {
     pub step_penalty: u16,
     /// Penalty of a depth edge between adjacent pixels of equal brightness, `step_penalty`…1000.
     pub jump_penalty: u16,
-    /// Rounds of slanted-plane refinement after the sweep, 0…8. Zero is faster and leaves steps of one plane.
-    pub refine_rounds: usize,
     /// Standard deviation of each given pose's rotation, degrees, 0…5. Poses are corrected by the images with this prior;
     /// 0 here or in `pose_std_m` takes them as given.
     pub pose_std_deg: f64,
@@ -54,7 +52,6 @@ impl Default for StereoConfig {
             max_planes: 128,
             step_penalty: 12,
             jump_penalty: 80,
-            refine_rounds: 1,
             pose_std_deg: 0.1,
             pose_std_m: 0.01,
             noise_gray: 1.0,
@@ -82,7 +79,6 @@ impl StereoConfig {
         check("max_planes", self.max_planes as f64, 16.0, 256.0)?;
         check("step_penalty", f64::from(self.step_penalty), 1.0, 200.0)?;
         check("jump_penalty", f64::from(self.jump_penalty), f64::from(self.step_penalty), 1000.0)?;
-        check("refine_rounds", self.refine_rounds as f64, 0.0, 8.0)?;
         check("pose_std_deg", self.pose_std_deg, 0.0, 5.0)?;
         check("pose_std_m", self.pose_std_m, 0.0, 1.0)?;
         check("noise_gray", self.noise_gray, 0.1, 50.0)?;

@@ -1,22 +1,47 @@
 //! Depth of one reference view from its neighbours, before views are compared with each other.
 //!
-//! Probe at a quarter of the size for the scene's depth → choose neighbours for that depth → sweep → semi-global
-//! matching → winner with sub-plane fit → slanted-plane refinement.
+//! Probe for the scene's depth → choose neighbours for that depth → sweep of the whole range and semi-global matching at a
+//! quarter of the size → edges, sweep along the surface found and semi-global matching over the offsets at half the size
+//! → edges and matching cost at the full size (`fine`). Each size continues the surface of the one before along its slopes.
 
 use crate::config::StereoConfig;
+use crate::edges::with_sharp_edges;
+use crate::fine::settle;
+use crate::ncc::{Reference, Source, Surface, UNITS};
 use crate::prepare::{Level, Prepared};
-use crate::refine::refine;
 use crate::select::{Selection, select};
-use crate::sgm::{Penalties, aggregate};
-use crate::sweep::{INVISIBLE, Planes, Source, WORST, sweep};
+use crate::sgm::{Penalties, Winners, aggregate};
+use crate::surface::{Grid, doubled};
+use crate::sweep::{Labels, sweep};
 use crate::warp::{Warp, neighbour_from_reference};
+use tracing::trace_span;
 
-/// Pyramid level of the sweep; the refinement works on level 0.
-const SWEEP_LEVEL: usize = 1;
-/// Pyramid level of the probe for the scene's depth.
-pub(crate) const PROBE_LEVEL: usize = 2;
+/// Pyramid level of the sweep over the whole range, and of the probe for the scene's depth.
+const COARSE: usize = 2;
+/// Pyramid level of the sweep along the surface.
+const MIDDLE: usize = 1;
+/// Pyramid level of the probe.
+pub(crate) const PROBE_LEVEL: usize = COARSE;
 /// Planes of the probe.
 const PROBE_PLANES: usize = 64;
+/// Shift of the best neighbour's pixel from one plane of the coarse sweep to the next, pixels of that size. More planes find
+/// no more (HoloLens keyframes 0 to 15: completeness .606, .621, .631 and .624 at 0.67, 1, 1.5 and 2 px, AbsRel .0266, .0237,
+/// .0236, .0229); offsets from the surface resolve the rest.
+const PLANE_PX: f64 = 1.5;
+/// Offsets from the surface, and how many of them a plane of the coarse sweep is apart from the next: the surface is
+/// searched 1.6 planes to both sides.
+const OFFSETS: usize = 17;
+const OFFSETS_PER_PLANE: f32 = 5.0;
+/// Share of the penalties between planes that holds between offsets, which differ by less. At 0.7 and 0.5 AbsRel is .0219 and
+/// .0216 on HoloLens keyframes 0 to 15, .0083 and .0082 on rendered room A, .0176 and .0171 on the corridor; completeness is
+/// .678 and .667, .962 and .963, .837 and .838.
+const OFFSET_PENALTY: f32 = 0.5;
+/// How far away the surfaces are that are tried at edges before the offsets, pixels of the middle size. On the same sets
+/// completeness is .676 and .678, .961 and .962, .834 and .837 without and with, AbsRel .0222 and .0219, .0084 and .0083,
+/// .0178 and .0176.
+const REACH_PX: isize = 3;
+/// Neighbours that the full size is scored against: the best few decide, and each costs the same time.
+const SCORED_NEIGHBOURS: usize = 3;
 
 /// The estimate from one reference alone.
 #[derive(Clone, Debug)]
@@ -51,7 +76,7 @@ pub(crate) fn estimate(
     Ok((estimate, selection.neighbours))
 }
 
-/// Sweep, semi-global matching and refinement against `neighbours`.
+/// The surface from the coarse size to the full one, with its scores.
 fn matched(
     views: &[Prepared],
     reference: usize,
@@ -59,15 +84,94 @@ fn matched(
     near_m: f64,
     config: &StereoConfig,
 ) -> Estimate {
-    let coarse = &views[reference].levels[SWEEP_LEVEL];
-    let coarse_sources = sources(views, reference, neighbours, SWEEP_LEVEL);
-    let planes = place_planes(coarse, &coarse_sources, near_m.max(config.min_depth_m), config);
-    let costs = sweep(coarse, &coarse_sources, &planes, config.noise_gray as f32);
+    let [fine, middle, coarse] = &views[reference].levels;
+    let sources = |level: usize| sources(views, reference, neighbours, level);
     let penalties = Penalties { step: config.step_penalty as i16, jump: config.jump_penalty as i16 };
-    let sums = aggregate(coarse, &costs, planes.count, penalties);
-    let winners = Winners::pick(coarse, &costs, &sums, &planes);
-    let fine_sources = sources(views, reference, neighbours, 0);
-    refine(&views[reference].levels[0], coarse, &winners, &fine_sources, &planes, config)
+    let noise_gray = config.noise_gray as f32;
+
+    let coarse_sources = sources(COARSE);
+    let planes = place_planes(coarse, &coarse_sources, near_m.max(config.min_depth_m), config);
+    let winners = trace_span!("quarter size")
+        .in_scope(|| best_planes(coarse, &coarse_sources, &planes, penalties, noise_gray));
+
+    let surface = continued(&winners.rho, coarse, middle, planes.step);
+    let step = planes.step / OFFSETS_PER_PLANE;
+    let offsets = Labels { first: -step * (OFFSETS / 2) as f32, step, count: OFFSETS };
+    let moved = trace_span!("half size").in_scope(|| {
+        let (windows, sources) = (Reference::new(middle, noise_gray), sources(MIDDLE));
+        let surface = trace_span!("edges")
+            .in_scope(|| with_sharp_edges(&windows, &sources, surface, planes.step, REACH_PX));
+        best_offsets(middle, &windows, &sources, &surface, &offsets, penalties.scaled(OFFSET_PENALTY))
+    });
+
+    let rho = continued(&moved, middle, fine, 0.5 * planes.step);
+    let span = trace_span!("full size").entered();
+    let windows = Reference::new(fine, noise_gray);
+    let fine_sources = sources(0);
+    let best_sources = &fine_sources[..fine_sources.len().min(SCORED_NEIGHBOURS)];
+    let settled = settle(&windows, best_sources, rho, planes.step);
+    drop(span);
+    let rho_per_px = 1.0 / shift_per_rho(fine, &fine_sources).max(f32::MIN_POSITIVE);
+    let coarse_pixel = |i: usize| {
+        let (x, y) = (i % fine.width / 4, i / fine.width / 4);
+        y.min(coarse.height - 1) * coarse.width + x.min(coarse.width - 1)
+    };
+    Estimate {
+        margin: (0..settled.rho.len()).map(|i| winners.margin[coarse_pixel(i)]).collect(),
+        texture: windows.inverse_deviation.iter().map(|d| 1.0 / (UNITS * d)).collect(),
+        curvature: settled.bend.iter().map(|b| b * rho_per_px * rho_per_px).collect(),
+        cost: settled.cost,
+        rho: settled.rho,
+        rho_per_px,
+    }
+}
+
+/// The sweep of `planes` with semi-global matching.
+fn best_planes(
+    level: &Level,
+    sources: &[Source<'_>],
+    planes: &Labels,
+    penalties: Penalties,
+    noise_gray: f32,
+) -> Winners {
+    let infinity = vec![0.0; level.width];
+    let surface = Surface { rho: &infinity, stride: 0 };
+    best_labels(level, &Reference::new(level, noise_gray), sources, surface, planes, penalties)
+}
+
+/// `surface` moved by the best of `offsets` at each pixel.
+fn best_offsets(
+    level: &Level,
+    windows: &Reference,
+    sources: &[Source<'_>],
+    surface: &[f32],
+    offsets: &Labels,
+    penalties: Penalties,
+) -> Vec<f32> {
+    let over = Surface { rho: surface, stride: level.width };
+    let winners = best_labels(level, windows, sources, over, offsets, penalties);
+    // Where no neighbour sees any offset the surface stays as it is; the scores say that nothing matches.
+    surface.iter().zip(&winners.rho).map(|(s, o)| if o.is_nan() { *s } else { s + o }).collect()
+}
+
+fn best_labels(
+    level: &Level,
+    windows: &Reference,
+    sources: &[Source<'_>],
+    surface: Surface<'_>,
+    labels: &Labels,
+    penalties: Penalties,
+) -> Winners {
+    let volume = trace_span!("sweep").in_scope(|| sweep(windows, sources, surface, labels));
+    let sums = trace_span!("semi-global matching").in_scope(|| aggregate(level, &volume, penalties));
+    trace_span!("winners").in_scope(|| Winners::pick(&volume, &sums, labels))
+}
+
+/// The surface of `from` at the size of `to`.
+fn continued(rho: &[f32], from: &Level, to: &Level, step: f32) -> Vec<f32> {
+    let _span = trace_span!("continuation").entered();
+    let coarse = Grid { width: from.width, height: from.height, values: rho };
+    doubled(coarse, to.width, to.height, step)
 }
 
 /// The neighbours' images at one level, with the warps into them.
@@ -103,12 +207,12 @@ pub(crate) fn shift_per_rho(level: &Level, sources: &[Source<'_>]) -> f32 {
     sources.iter().map(shift).fold(0.0, f32::max)
 }
 
-/// Planes one pixel apart in the neighbour of the widest baseline, from infinity's side to `near_m`.
-fn place_planes(level: &Level, sources: &[Source<'_>], near_m: f64, config: &StereoConfig) -> Planes {
+/// Planes [`PLANE_PX`] apart in the neighbour of the widest baseline, from infinity's side to `near_m`.
+fn place_planes(level: &Level, sources: &[Source<'_>], near_m: f64, config: &StereoConfig) -> Labels {
     let (first, last) = (1.0 / config.max_depth_m, 1.0 / near_m.min(config.max_depth_m / 1.1));
-    let pixels = f64::from(shift_per_rho(level, sources)) * (last - first);
+    let pixels = f64::from(shift_per_rho(level, sources)) * (last - first) / PLANE_PX;
     let count = (pixels.ceil() as usize + 1).clamp(16, config.max_planes);
-    Planes { first: first as f32, step: ((last - first) / (count - 1) as f64) as f32, count }
+    Labels { first: first as f32, step: ((last - first) / (count - 1) as f64) as f32, count }
 }
 
 /// Typical and nearest depth of a scene, metres.
@@ -136,14 +240,13 @@ pub(crate) fn probe(views: &[Prepared], reference: usize, config: &StereoConfig)
     if neighbours.is_empty() {
         return Err(best_parallax_deg);
     }
+    let _span = trace_span!("probe").entered();
     let level = &views[reference].levels[PROBE_LEVEL];
     let sources = sources(views, reference, &neighbours, PROBE_LEVEL);
     let (first, last) = (1.0 / config.max_depth_m as f32, 1.0 / config.min_depth_m as f32);
-    let planes = Planes { first, step: (last - first) / (PROBE_PLANES - 1) as f32, count: PROBE_PLANES };
-    let costs = sweep(level, &sources, &planes, config.noise_gray as f32);
+    let planes = Labels { first, step: (last - first) / (PROBE_PLANES - 1) as f32, count: PROBE_PLANES };
     let penalties = Penalties { step: config.step_penalty as i16, jump: config.jump_penalty as i16 };
-    let sums = aggregate(level, &costs, planes.count, penalties);
-    let winners = Winners::pick(level, &costs, &sums, &planes);
+    let winners = best_planes(level, &sources, &planes, penalties, config.noise_gray as f32);
     let is_distinct = |i: usize| winners.cost[i] < 0.4 && winners.margin[i] > 0.05 && winners.rho[i] > 0.0;
     let rho: Vec<f32> =
         (0..winners.rho.len()).map(|i| if is_distinct(i) { winners.rho[i] } else { f32::NAN }).collect();
@@ -156,43 +259,4 @@ pub(crate) fn probe(views: &[Prepared], reference: usize, config: &StereoConfig)
     let at = |share: f64| f64::from(depths_m[((depths_m.len() - 1) as f64 * share) as usize]);
     // Small near objects may have been missed at this size, so the near end keeps a margin.
     Ok(Probe { depth: SceneDepth { median: at(0.5), near: 0.6 * at(0.02) }, rho })
-}
-
-/// The best plane of every pixel.
-pub(crate) struct Winners {
-    pub rho: Vec<f32>,
-    pub cost: Vec<f32>,
-    pub margin: Vec<f32>,
-}
-
-impl Winners {
-    /// Picks the least sum, fits a parabola through its neighbours, and finds the least sum more than two planes away.
-    pub fn pick(level: &Level, costs: &[u8], sums: &[i16], planes: &Planes) -> Self {
-        let n = level.width * level.height;
-        let mut winners = Self { rho: vec![f32::NAN; n], cost: vec![1.0; n], margin: vec![0.0; n] };
-        for pixel in 0..n {
-            let sums = &sums[pixel * planes.count..][..planes.count];
-            let costs = &costs[pixel * planes.count..][..planes.count];
-            let Some((best, &least)) = sums.iter().enumerate().min_by_key(|(_, s)| **s) else { continue };
-            if costs[best] == INVISIBLE {
-                continue;
-            }
-            let outside = |k: usize| k.abs_diff(best) > 2;
-            let next = (0..planes.count).filter(|&k| outside(k)).map(|k| sums[k]).min().unwrap_or(least);
-            winners.rho[pixel] = planes.rho(best as f32 + parabola_offset(sums, best));
-            winners.cost[pixel] = f32::from(costs[best]) / WORST;
-            winners.margin[pixel] = f32::from(next - least) / (8.0 * WORST);
-        }
-        winners
-    }
-}
-
-/// Offset in −0.5…0.5 of the least of the parabola through the sums around `best`.
-fn parabola_offset(sums: &[i16], best: usize) -> f32 {
-    if best == 0 || best + 1 >= sums.len() {
-        return 0.0;
-    }
-    let (a, b, c) = (f32::from(sums[best - 1]), f32::from(sums[best]), f32::from(sums[best + 1]));
-    let curvature = a - 2.0 * b + c;
-    if curvature > 0.0 { (0.5 * (a - c) / curvature).clamp(-0.5, 0.5) } else { 0.0 }
 }

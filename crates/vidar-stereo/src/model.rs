@@ -1,7 +1,7 @@
 //! The model: views in, depth in the frame of the given poses out.
 
 use crate::chunk::{Chunk, ViewDepth};
-use crate::confidence::{PixelFeatures, pixel_features};
+use crate::confidence::{PixelFeatures, confident, pixel_features};
 use crate::config::StereoConfig;
 use crate::consistency::{Support, support};
 use crate::error::StereoError;
@@ -10,6 +10,7 @@ use crate::prepare::{Prepared, prepare};
 use rayon::prelude::*;
 use std::collections::BTreeSet;
 use std::ops::Range;
+use tracing::trace_span;
 use vidar_core::model::ChunkFrame;
 use vidar_core::{
     ChunkViews, Confidence, FrameId, GeometryModel, GeometryPrediction, Image, ModelError, ModelInfo,
@@ -131,7 +132,8 @@ impl StereoModel {
             return Err(StereoError::NoSuchReference { index, views: found });
         }
         let references: BTreeSet<usize> = references.iter().copied().collect();
-        let prepared: Vec<_> = views.views.par_iter().map(|v| prepare(v, &self.config)).collect();
+        let one = |view| trace_span!("preparation").in_scope(|| prepare(view, &self.config));
+        let prepared: Vec<_> = views.views.par_iter().map(one).collect();
         // Collected one by one, so that the error is that of the first bad view.
         let prepared = prepared.into_iter().collect::<Result<Vec<_>, _>>()?;
         let mut chunk = Chunk::new(prepared, &references, &self.config, watch);
@@ -165,29 +167,22 @@ fn checked_geometry(
 ) -> Option<Result<(ViewGeometry, ViewFeatures), StereoError>> {
     let own = chunk.depths.get(&reference)?;
     let others: Vec<_> = chunk.checked(reference).iter().filter_map(|i| chunk.depths.get(i)).collect();
-    let supports = support(own, &others, config);
-    Some(geometry(&chunk.views[reference], own, &supports, config, keep_features))
+    let support = trace_span!("consistency").in_scope(|| support(own, &others, config));
+    Some(geometry(&chunk.views[reference], own, &support, config, keep_features))
 }
 
 fn geometry(
     view: &Prepared,
     own: &ViewDepth,
-    supports: &[Support],
+    support: &Support,
     config: &StereoConfig,
     keep_features: bool,
 ) -> Result<(ViewGeometry, ViewFeatures), StereoError> {
     let level = &view.levels[0];
-    let mut rho = vec![f32::NAN; supports.len()];
-    let mut confident = vec![0.0f32; supports.len()];
-    let of = |i: usize| pixel_features(&own.estimate, i, &supports[i], &view.correction, config);
-    for (i, support) in supports.iter().enumerate() {
-        let p = of(i).confidence();
-        if support.rho > 0.0 && f64::from(p) >= config.min_confidence && support.agreeing > 0 {
-            (rho[i], confident[i]) = (support.rho, p);
-        }
-    }
-    remove_speckles(&mut rho, level.width);
-    for (c, _) in confident.iter_mut().zip(&rho).filter(|(_, rho)| rho.is_nan()) {
+    let (mut rho, mut confidence) = trace_span!("confidence")
+        .in_scope(|| confident(&own.estimate, support, &view.correction, config.min_confidence as f32));
+    trace_span!("speckles").in_scope(|| remove_speckles(&mut rho, level.width));
+    for (c, _) in confidence.iter_mut().zip(&rho).filter(|(_, rho)| rho.is_nan()) {
         *c = 0.0;
     }
     let depth: Vec<f32> = rho.iter().map(|rho| 1.0 / rho).collect();
@@ -200,9 +195,10 @@ fn geometry(
         chunk_from_camera: view.world_from_camera,
         intrinsics: level.intrinsics,
         depth: RelativeDepth::new(image(depth)?),
-        confidence: Confidence::new(image(confident)?),
+        confidence: Confidence::new(image(confidence)?),
     };
-    let pixels = if keep_features { (0..supports.len()).map(of).collect() } else { Vec::new() };
+    let of = |i: usize| pixel_features(&own.estimate, i, support, &view.correction, config);
+    let pixels = if keep_features { (0..support.rho.len()).map(of).collect() } else { Vec::new() };
     Ok((geometry, ViewFeatures { frame_id: view.frame_id, pixels }))
 }
 
@@ -226,5 +222,46 @@ impl GeometryModel for StereoModel {
     ) -> Result<GeometryPrediction, ModelError> {
         let references: Vec<usize> = requested.filter(|&i| i < views.views.len()).collect();
         Ok(self.depths_of(views, &references, watch, false)?.0.prediction)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use vidar_core::{ChunkId, ChunkView, FrameImage, Pinhole, Se3, Timestamp};
+
+    /// A wall at 2 m with random texture, by cameras that move to the side by whole pixels.
+    fn wall() -> ChunkViews {
+        let k = Pinhole::new(100.0, 100.0, 63.5, 47.5, 128, 96).expect("valid");
+        let texture = |x: usize, y: usize| ((x / 3 * 7919 + y / 3 * 104_729 + x * y / 7) % 239) as u8;
+        let view = |i: usize| ChunkView {
+            frame_id: FrameId(i as u32),
+            time: Timestamp::from_nanos(i as i64),
+            image: FrameImage::Gray8(Image::from_fn(128, 96, |x, y| texture(x + 5 * i, y))),
+            intrinsics: k,
+            world_from_camera: Some(Se3::from_translation([0.1 * i as f64, 0.0, 0.0].into())),
+        };
+        ChunkViews { id: ChunkId(0), views: (0..4).map(view).collect() }
+    }
+
+    #[test]
+    fn the_bits_do_not_depend_on_the_instructions() {
+        let chunk = wall();
+        let run = || -> Vec<u32> {
+            let model = StereoModel::new(StereoConfig::default()).expect("valid");
+            let output = model.predict_with(&chunk, &[1, 2], &|_| false).expect("has parallax");
+            let values = output.prediction.views.into_iter().flat_map(|view| {
+                let depth = view.depth.image().data().to_vec();
+                depth.into_iter().chain(view.confidence.image().data().to_vec())
+            });
+            values.map(f32::to_bits).collect()
+        };
+        let results = crate::simd::tests::with_each(run);
+        let near = |bits: &&u32| (f32::from_bits(**bits) - 2.0).abs() < 0.06;
+        let right = results[0].1.iter().filter(near).count();
+        assert!(right > 128 * 96, "{right} of two views' pixels");
+        for (instructions, found) in &results[1..] {
+            assert!(*found == results[0].1, "{instructions:?}");
+        }
     }
 }

@@ -16,13 +16,18 @@ pub(crate) struct PoseCorrection {
 /// Fewest rows and columns of a working image: the coarsest level then still contains a few windows.
 pub(crate) const MIN_SIZE_PX: usize = 32;
 
+/// Image units per grey level: an area average has that much detail below a grey level.
+pub(crate) const GRAY_STEPS: i32 = 16;
+/// The middle of the range, image units.
+const MIDDLE: i32 = 128 * GRAY_STEPS;
+
 /// One level of the image pyramid.
 #[derive(Clone, Debug)]
 pub(crate) struct Level {
     pub width: usize,
     pub height: usize,
-    /// Row-major grey levels, 0…255.
-    pub gray: Vec<f32>,
+    /// Row-major grey levels in [`GRAY_STEPS`]ths, less the middle one: −2048…2032.
+    pub gray: Vec<i16>,
     pub intrinsics: Pinhole,
 }
 
@@ -62,9 +67,9 @@ pub(crate) fn prepare(view: &ChunkView, config: &StereoConfig) -> Result<Prepare
         let w = config.max_width_px;
         let h = ((height as f64 * w as f64 / width as f64).round() as usize).max(1);
         let intrinsics = k.resized(w, h).map_err(|_| bad_intrinsics())?;
-        Level { width: w, height: h, gray: area_average(&gray, w, h), intrinsics }
+        Level { width: w, height: h, gray: in_units(&area_average(&gray, w, h)), intrinsics }
     } else {
-        Level { width, height, gray: gray.into_vec(), intrinsics: k }
+        Level { width, height, gray: in_units(gray.data()), intrinsics: k }
     };
     if working.width < MIN_SIZE_PX || working.height < MIN_SIZE_PX {
         return Err(too_small(working.width, working.height));
@@ -79,6 +84,11 @@ pub(crate) fn prepare(view: &ChunkView, config: &StereoConfig) -> Result<Prepare
     })
 }
 
+/// Grey levels in image units.
+fn in_units(gray: &[f32]) -> Vec<i16> {
+    gray.iter().map(|g| (g * GRAY_STEPS as f32 + 0.5) as i16 - MIDDLE as i16).collect()
+}
+
 /// Mean over blocks of 2 × 2; an odd last row or column is left out.
 fn halved(level: &Level) -> Level {
     let (width, height) = (level.width / 2, level.height / 2);
@@ -86,9 +96,9 @@ fn halved(level: &Level) -> Level {
     for y in 0..height {
         let top = &level.gray[2 * y * level.width..][..level.width];
         let bottom = &level.gray[(2 * y + 1) * level.width..][..level.width];
-        gray.extend(
-            (0..width).map(|x| 0.25 * (top[2 * x] + top[2 * x + 1] + bottom[2 * x] + bottom[2 * x + 1])),
-        );
+        let pairs = top.as_chunks::<2>().0.iter().zip(bottom.as_chunks::<2>().0);
+        let mean = |(t, b): (&[i16; 2], &[i16; 2])| (t[0] + t[1] + b[0] + b[1] + 2) >> 2;
+        gray.extend(pairs.map(mean));
     }
     let k = &level.intrinsics;
     let half = |c: f64| (c + 0.5) * 0.5 - 0.5;
@@ -163,12 +173,12 @@ mod tests {
     #[test]
     fn halving_keeps_the_directions_of_pixels() {
         let intrinsics = Pinhole::new(100.0, 110.0, 31.0, 20.5, 65, 43).expect("valid");
-        let gray = (0..65 * 43).map(|i| (i % 65) as f32).collect();
+        let gray = (0..65 * 43).map(|i| (i % 65) as i16 * 4).collect();
         let level = Level { width: 65, height: 43, gray, intrinsics };
         let half = halved(&level);
         assert_eq!((half.width, half.height), (32, 21));
         let fine = (level.intrinsics.ray(10.0, 6.0) + level.intrinsics.ray(11.0, 7.0)) * 0.5;
         assert!((half.intrinsics.ray(5.0, 3.0) - fine).norm() < 1e-12);
-        assert_eq!(half.gray[5], 10.5);
+        assert_eq!(half.gray[5], 42);
     }
 }

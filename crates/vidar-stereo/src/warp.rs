@@ -5,6 +5,8 @@
 //! For fixed ρ this is the plane-induced homography of Collins 1996; on a plane in space ρ is affine in (x, y),
 //! so slanted planes are homographies as well.
 
+use crate::ncc::{HIDDEN, RADIUS};
+use crate::prepare::Level;
 use nalgebra::{Matrix3, Vector3};
 use vidar_core::{LieGroup, Pinhole, Se3};
 
@@ -65,19 +67,109 @@ pub(crate) fn neighbour_from_reference(neighbour: &Se3, reference: &Se3) -> Se3 
     neighbour.inverse() * *reference
 }
 
-/// Bilinear sample of a row-major image; NaN outside the centres of its border pixels.
-#[inline(always)]
-pub(crate) fn sample(gray: &[f32], width: usize, height: usize, u: f32, v: f32) -> f32 {
-    // A NaN position fails the comparisons and so counts as outside.
-    if !(u >= 0.0 && v >= 0.0 && u < (width - 1) as f32 && v < (height - 1) as f32) {
-        return f32::NAN;
+/// Positions are rounded to this part of a pixel.
+const POSITION_STEPS: f32 = 64.0;
+
+/// Bilinear samples of a neighbour along one row of the reference.
+///
+/// Three passes: positions and weights, fetches of the four pixels around each, and their blend. The first and the last
+/// are plain arithmetic over the row, which vectorises; only the fetches are done one by one.
+pub(crate) struct RowSamples {
+    /// Index of the upper left of the four pixels.
+    index: Vec<u32>,
+    /// Its weights in 64ths: across in the lower half, down in the upper.
+    weights: Vec<u32>,
+    /// The upper two pixels, and the lower two: the left one in the lower half.
+    upper: Vec<u32>,
+    lower: Vec<u32>,
+}
+
+impl RowSamples {
+    pub fn new(width: usize) -> Self {
+        let blank = || vec![0; width];
+        Self { index: blank(), weights: blank(), upper: blank(), lower: blank() }
     }
-    let (x, y) = (u as i32 as usize, v as i32 as usize);
-    let (ax, ay) = (u - x as f32, v - y as f32);
-    let p = &gray[y * width + x..][..width + 2];
-    let top = p[0] + ax * (p[1] - p[0]);
-    let bottom = p[width] + ax * (p[width + 1] - p[width]);
-    top + ay * (bottom - top)
+
+    /// Where row `y` at the inverse depths `rho + shift` lies in `level`. `hidden` becomes 0 where a window around the
+    /// position is inside the image and [`HIDDEN`](crate::ncc::HIDDEN) elsewhere, also where `rho` is NaN.
+    #[inline(always)]
+    pub fn locate(
+        &mut self,
+        warp: &Warp,
+        level: &Level,
+        y: usize,
+        rho: &[f32],
+        shift: f32,
+        hidden: &mut [f32],
+    ) {
+        let (a, b) = (&warp.a, &warp.b);
+        let y = y as f32;
+        let base = [0, 1, 2].map(|r| a[r][1] * y + a[r][2] + shift * b[r]);
+        let margin = RADIUS as f32;
+        let (last_u, last_v) = ((level.width - 1) as f32, (level.height - 1) as f32);
+        // The greatest position whose four pixels are all inside.
+        let (most_u, most_v) = (last_u - 1.0 / POSITION_STEPS, last_v - 1.0 / POSITION_STEPS);
+        let (inner_u, inner_v) = (last_u - margin, last_v - margin);
+        let width = level.width as u32;
+        let n = rho.len();
+        let (index, weights, hidden) = (&mut self.index[..n], &mut self.weights[..n], &mut hidden[..n]);
+        for x in 0..n {
+            // By way of i32, which vectorises.
+            let fx = x as i32 as f32;
+            let depth_ratio = base[2] + a[2][0] * fx + rho[x] * b[2];
+            let inverse = 1.0 / depth_ratio;
+            let u = (base[0] + a[0][0] * fx + rho[x] * b[0]) * inverse;
+            let v = (base[1] + a[1][0] * fx + rho[x] * b[1]) * inverse;
+            let inside = (u >= margin)
+                & (v >= margin)
+                & (u <= inner_u)
+                & (v <= inner_v)
+                & (depth_ratio > MIN_DEPTH_RATIO);
+            hidden[x] = if inside { 0.0 } else { HIDDEN };
+            let (u, v) = (in_steps(u, most_u), in_steps(v, most_v));
+            index[x] = (v >> 6).wrapping_mul(width).wrapping_add(u >> 6);
+            weights[x] = (u & 63) | (v & 63) << 16;
+        }
+    }
+
+    /// Reads the four pixels around each position.
+    #[inline(always)]
+    pub fn fetch(&mut self, level: &Level) {
+        let n = self.index.len();
+        let (upper, lower) = (&mut self.upper[..n], &mut self.lower[..n]);
+        let pair = |left: i16, right: i16| u32::from(left as u16) | u32::from(right as u16) << 16;
+        for x in 0..n {
+            let around = &level.gray[self.index[x] as usize..][..level.width + 2];
+            upper[x] = pair(around[0], around[1]);
+            lower[x] = pair(around[level.width], around[level.width + 1]);
+        }
+    }
+
+    /// The samples, rounded to [matched units](crate::ncc::UNITS).
+    #[inline(always)]
+    pub fn blend(&self, out: &mut [f32]) {
+        let n = out.len();
+        let (weights, upper, lower) = (&self.weights[..n], &self.upper[..n], &self.lower[..n]);
+        for x in 0..n {
+            let (across, down) = ((weights[x] & 0xffff) as i32, (weights[x] >> 16) as i32);
+            let mixed = |pair: u32| {
+                let (left, right) = ((pair << 16) as i32 >> 16, pair as i32 >> 16);
+                left * 64 + (right - left) * across
+            };
+            let (top, bottom) = (mixed(upper[x]), mixed(lower[x]));
+            // 64 · 64 weights, and four image units in a matched one.
+            out[x] = ((top * 64 + (bottom - top) * down + (1 << 13)) >> 14) as f32;
+        }
+    }
+}
+
+/// A position from 0 to `most` in 64ths of a pixel; 0 for NaN.
+#[inline(always)]
+fn in_steps(position: f32, most: f32) -> u32 {
+    let position = if position > 0.0 { position } else { 0.0 };
+    let position = if position < most { position } else { most };
+    // Adding 2²³ leaves the rounded value in the mantissa.
+    (position * POSITION_STEPS + 8_388_608.0).to_bits().wrapping_sub(0x4b00_0000)
 }
 
 #[cfg(test)]
@@ -110,11 +202,30 @@ mod tests {
     }
 
     #[test]
-    fn sampling_is_bilinear_inside_and_nan_outside() {
-        let gray: Vec<f32> = (0..12).map(|i| (i % 4) as f32 + 10.0 * (i / 4) as f32).collect();
-        assert!((sample(&gray, 4, 3, 1.25, 0.5) - 6.25).abs() < 1e-6);
-        for (u, v) in [(-0.01, 1.0), (1.0, -0.01), (3.0, 1.0), (1.0, 2.0), (f32::NAN, 1.0)] {
-            assert!(sample(&gray, 4, 3, u, v).is_nan(), "{u} {v}");
+    fn sampling_is_bilinear_inside_and_hidden_outside() {
+        let (width, height) = (16, 12);
+        // Grey levels x + 10 y, in image units.
+        let gray = (0..width * height).map(|i| ((i % width + 10 * (i / width)) * 16) as i16 - 2048).collect();
+        let intrinsics = Pinhole::new(10.0, 10.0, 7.5, 5.5, width, height).expect("valid");
+        let level = Level { width, height, gray, intrinsics };
+        // Moves by (1.25, 0.5) per unit of inverse depth.
+        let a = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]];
+        let warp = Warp { a, b: [1.25, 0.5, 0.0] };
+        let mut samples = RowSamples::new(width);
+        let (mut hidden, mut out) = (vec![0.0; width], vec![0.0; width]);
+        let mut rho = vec![1.0; width];
+        rho[5] = f32::NAN;
+        samples.locate(&warp, &level, 3, &rho, 0.0, &mut hidden);
+        samples.fetch(&level);
+        samples.blend(&mut out);
+        for x in 0..width {
+            let u = x as f32 + 1.25;
+            let seen = (2.0..=13.0).contains(&u) && x != 5;
+            assert_eq!(hidden[x] == 0.0, seen, "{x}");
+            if seen {
+                let expected = 4.0 * (u + 35.0 - 128.0);
+                assert!((out[x] - expected).abs() <= 0.5, "{x}: {} {expected}", out[x]);
+            }
         }
     }
 }

@@ -1,18 +1,12 @@
 #!/usr/bin/env python3
 """Fits the weights of vidar-stereo's confidence to samples that `evaluate_views --csv` wrote.
 
-    fit_confidence.py fit:1:roomA.csv fit:6:holoA.csv test:1:kitchen.csv ...
+    fit_confidence.py fit:1:roomA.csv fit:1:hololensA.csv test:1:redkitchen.csv ...
 
 Each set has a part (fit or test), a weight and a file; the weight counts for the whole set. Maximum likelihood of
 p = bound(pose_error) * logistic(features), see confidence.rs. Needs numpy and scipy.
 
-The weights in confidence.rs come from these sets: half of the HoloLens room (--last 20, weight 6), and, with weight 1
-each, worlds of `vidar synth` (5 s, 376 x 240 unless stated):
-  roomA seed 11; roomB seed 12, orbit, exposure_drift 0.3, image_noise_sigma 4, clutter 70; corrA seed 13, corridor,
-  orbit; roomC seed 14, 4 s, 564 x 360, image_noise_sigma 2.5, exposure_secs 0.008, exposure_drift 0.2
-as they are (--last 8) and perturbed (--first 8 --last 16; seed, jitter-deg, jitter-m, lag-ms, focal-ratio, center-px):
-  roomA 1 0.2 0.006 0 1 0; roomB 2 0.1 0.012 0 1.008 0; roomC 3 0.05 0.004 15 1 0; roomC 4 0.3 0.015 10 0.99 -4;
-  roomB 5 0 0 0 1 7; roomA 6 0.1 0.008 -20 1.01 3
+fit_confidence.sh makes the samples of the weights in confidence.rs and calls this.
 """
 import sys
 import numpy as np

@@ -16,6 +16,7 @@ pub struct Request {
     options: OpenOptions,
     pub settings: Vec<String>,
     pub csv: Option<PathBuf>,
+    pub stages: bool,
     pub first: usize,
     pub last: usize,
     min_translation_m: f64,
@@ -36,6 +37,7 @@ impl Request {
             options: OpenOptions::default(),
             settings: Vec::new(),
             csv: None,
+            stages: false,
             first: 0,
             last: usize::MAX,
             min_translation_m: 0.08,
@@ -62,6 +64,7 @@ impl Request {
                 }
                 "--set" => request.settings.push(value.clone()),
                 "--csv" => request.csv = Some(value.into()),
+                "--stages" => request.stages = value == "yes",
                 "--first" => request.first = value.parse()?,
                 "--last" => request.last = value.parse()?,
                 "--min-translation-m" => request.min_translation_m = value.parse()?,

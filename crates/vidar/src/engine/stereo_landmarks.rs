@@ -17,7 +17,7 @@ use vidar_stereo::{StereoConfig, StereoError, StereoModel, TOLERANCE_RATIO};
 
 /// Blocks across and down that the image is cut into; each gives one landmark at most.
 const BLOCKS: (usize, usize) = (20, 14);
-/// A few hundred points need no fine image, and no refinement: 320 px with it cost three times as much for a hundredth more.
+/// A few hundred points need no fine image.
 const MAX_WIDTH_PX: usize = 240;
 /// The least probability that the depth is right to within [`TOLERANCE_RATIO`].
 const MIN_CONFIDENCE: f32 = 0.75;
@@ -40,7 +40,7 @@ impl StereoLandmarks {
     /// Stereo at a reduced size.
     pub fn new(config: &Config) -> Result<Self, Error> {
         let max_width_px = config.stereo.max_width_px.min(MAX_WIDTH_PX);
-        let quick = StereoConfig { max_width_px, refine_rounds: 0, ..config.stereo.clone() };
+        let quick = StereoConfig { max_width_px, ..config.stereo.clone() };
         Ok(Self { stereo: StereoModel::new(quick)?, config: config.align.landmarks.clone() })
     }
 

@@ -1,0 +1,212 @@
+//! Corners of a view, and their search in another.
+
+use crate::prepare::{GRAY_STEPS, Level};
+use nalgebra::Vector2;
+
+/// One corner per square of this size, working pixels.
+const CELL_PX: usize = 20;
+/// Radius of a corner's template.
+const TEMPLATE: usize = 4;
+const SIDE: usize = 2 * TEMPLATE + 1;
+const AREA: usize = SIDE * SIDE;
+/// Radius of the search around the predicted position, working pixels.
+const SEARCH: usize = 6;
+/// Shifts in one direction.
+const SHIFTS: usize = 2 * SEARCH + 1;
+/// Shifts across, padded for vectors.
+const LANES: usize = 16;
+/// Rows and (padded) columns that the shifted templates cover.
+const ROWS: usize = SHIFTS + SIDE - 1;
+const COLUMNS: usize = LANES + SIDE - 1;
+/// Least normalised correlation of a match.
+const MIN_CORRELATION: f32 = 0.85;
+
+/// The best corner of each square by the smaller eigenvalue of the structure tensor (Shi and Tomasi 1994).
+pub(super) fn corners(level: &Level) -> Vec<(usize, usize)> {
+    let (w, h) = (level.width, level.height);
+    let margin = TEMPLATE + 1;
+    let mut out = Vec::new();
+    let mut tensor = Tensor::new(w);
+    for top in (margin..h.saturating_sub(margin)).step_by(CELL_PX) {
+        let cells = (margin..w.saturating_sub(margin)).step_by(CELL_PX);
+        let mut best = vec![(0.0f32, None); cells.clone().count()];
+        // Every other pixel: a corner is wider than that, and the match is found to a fraction of a pixel anyway.
+        for y in (top..(top + CELL_PX).min(h - margin)).step_by(2) {
+            crate::simd::dispatch!(tensor.row(level, y));
+            for (best, left) in best.iter_mut().zip(cells.clone()) {
+                for x in (left..(left + CELL_PX).min(w - margin)).step_by(2) {
+                    if tensor.strength[x] > best.0 {
+                        *best = (tensor.strength[x], Some((x, y)));
+                    }
+                }
+            }
+        }
+        out.extend(best.into_iter().filter_map(|b| b.1));
+    }
+    out
+}
+
+/// Strength of the corners in one row.
+struct Tensor {
+    /// Column sums of gx², gx·gy, gy² over the window's rows.
+    columns: [Vec<f32>; 3],
+    strength: Vec<f32>,
+}
+
+impl Tensor {
+    /// Radius of the window.
+    const REACH: usize = 2;
+
+    fn new(width: usize) -> Self {
+        Self { columns: std::array::from_fn(|_| vec![0.0; width]), strength: vec![0.0; width] }
+    }
+
+    /// Row `y`, at least one pixel more than the window from the border.
+    #[inline(always)]
+    fn row(&mut self, level: &Level, y: usize) {
+        let w = level.width;
+        let [xx, xy, yy] = &mut self.columns;
+        let (xx, xy, yy) = (&mut xx[..w], &mut xy[..w], &mut yy[..w]);
+        for column in [&mut *xx, &mut *xy, &mut *yy] {
+            column.fill(0.0);
+        }
+        for row in y - Self::REACH..=y + Self::REACH {
+            let own = &level.gray[row * w..][..w];
+            let (above, below) = (&level.gray[(row - 1) * w..][..w], &level.gray[(row + 1) * w..][..w]);
+            for x in 1..w - 1 {
+                let gx = (i32::from(own[x + 1]) - i32::from(own[x - 1])) as f32;
+                let gy = (i32::from(below[x]) - i32::from(above[x])) as f32;
+                xx[x] += gx * gx;
+                xy[x] += gx * gy;
+                yy[x] += gy * gy;
+            }
+        }
+        let strength = &mut self.strength[..w];
+        for x in Self::REACH..w - Self::REACH {
+            let (mut a, mut b, mut c) = (0.0, 0.0, 0.0);
+            for i in x - Self::REACH..=x + Self::REACH {
+                a += xx[i];
+                b += xy[i];
+                c += yy[i];
+            }
+            strength[x] = 0.5 * (a + c - ((a - c) * (a - c) + 4.0 * b * b).sqrt());
+        }
+    }
+}
+
+/// A window of grey levels, with zero mean.
+pub(super) struct Template {
+    gray: [[f32; SIDE]; SIDE],
+    /// Sum of squares.
+    square: f32,
+}
+
+impl Template {
+    pub fn cut(level: &Level, x: usize, y: usize) -> Option<Self> {
+        if x < TEMPLATE || y < TEMPLATE || x + TEMPLATE >= level.width || y + TEMPLATE >= level.height {
+            return None;
+        }
+        let mut gray = [[0.0; SIDE]; SIDE];
+        for (j, target) in gray.iter_mut().enumerate() {
+            let row = &level.gray[(y - TEMPLATE + j) * level.width + x - TEMPLATE..][..SIDE];
+            *target = std::array::from_fn(|i| f32::from(row[i]));
+        }
+        let mean = gray.iter().flatten().sum::<f32>() / AREA as f32;
+        gray.iter_mut().flatten().for_each(|g| *g -= mean);
+        let square = gray.iter().flatten().map(|g| g * g).sum::<f32>();
+        Some(Self { gray, square })
+    }
+
+    /// Standard deviation, grey levels.
+    pub fn deviation(&self) -> f32 {
+        (self.square / AREA as f32).sqrt() / GRAY_STEPS as f32
+    }
+
+    /// Position of the best correlation within the search radius, to a fraction of a pixel; `None` if the correlation is
+    /// too low, or highest at the border of the search.
+    pub fn search(&self, level: &Level, u: f32, v: f32) -> Option<Vector2<f64>> {
+        if !(u.abs() < 1e6 && v.abs() < 1e6) {
+            return None;
+        }
+        let (u, v) = (u.round() as i64, v.round() as i64);
+        let (w, h) = (level.width as i64, level.height as i64);
+        let (left, top) = (u - (SEARCH + TEMPLATE) as i64, v - (SEARCH + TEMPLATE) as i64);
+        if left + COLUMNS as i64 <= 0 || top + ROWS as i64 <= 0 || left >= w || top >= h {
+            return None;
+        }
+        let mut around = [[0.0f32; COLUMNS]; ROWS];
+        let (first, last) = (left.max(0), (left + COLUMNS as i64).min(w));
+        for (j, target) in around.iter_mut().enumerate() {
+            let y = top + j as i64;
+            if (0..h).contains(&y) {
+                let row = &level.gray[(y * w + first) as usize..][..(last - first) as usize];
+                let target = &mut target[(first - left) as usize..];
+                target.iter_mut().zip(row).for_each(|(t, &g)| *t = f32::from(g));
+            }
+        }
+        let mut correlations = [[0.0f32; LANES]; SHIFTS];
+        crate::simd::dispatch!(self.correlate(&around, &mut correlations));
+        // A template that reaches beyond the image matches nothing.
+        let fits = |begin: i64, shift: usize, size: i64| {
+            let first = begin + shift as i64;
+            first >= 0 && first + SIDE as i64 <= size
+        };
+        for (j, row) in correlations.iter_mut().enumerate() {
+            for (i, c) in row.iter_mut().enumerate() {
+                *c = if fits(left, i, w) && fits(top, j, h) { *c } else { -1.0 };
+            }
+        }
+        let mut best = (MIN_CORRELATION, None);
+        for (j, row) in correlations.iter().enumerate() {
+            for (i, &c) in row[..SHIFTS].iter().enumerate() {
+                if c > best.0 {
+                    best = (c, Some((i, j)));
+                }
+            }
+        }
+        let (i, j) = best.1?;
+        if i == 0 || j == 0 || i + 1 == SHIFTS || j + 1 == SHIFTS {
+            return None;
+        }
+        let vertex = |a: f32, b: f32| {
+            let curvature = a - 2.0 * best.0 + b;
+            if curvature < -1e-6 { (0.5 * (a - b) / curvature).clamp(-0.5, 0.5) } else { 0.0 }
+        };
+        let x =
+            (left + (TEMPLATE + i) as i64) as f32 + vertex(correlations[j][i - 1], correlations[j][i + 1]);
+        let y = (top + (TEMPLATE + j) as i64) as f32 + vertex(correlations[j - 1][i], correlations[j + 1][i]);
+        Some(Vector2::new(f64::from(x), f64::from(y)))
+    }
+
+    /// The correlation at every shift, all shifts of a row at once.
+    #[inline(always)]
+    fn correlate(&self, around: &[[f32; COLUMNS]; ROWS], correlations: &mut [[f32; LANES]; SHIFTS]) {
+        for (dy, out) in correlations.iter_mut().enumerate() {
+            let mut cross = [0.0f32; LANES];
+            let (mut sums, mut squares) = ([0.0f32; COLUMNS], [0.0f32; COLUMNS]);
+            for (row, template) in around[dy..dy + SIDE].iter().zip(&self.gray) {
+                for (i, &t) in template.iter().enumerate() {
+                    for l in 0..LANES {
+                        cross[l] += t * row[i + l];
+                    }
+                }
+                for c in 0..COLUMNS {
+                    sums[c] += row[c];
+                    squares[c] += row[c] * row[c];
+                }
+            }
+            let (mut sum, mut square) = ([0.0f32; LANES], [0.0f32; LANES]);
+            for i in 0..SIDE {
+                for l in 0..LANES {
+                    sum[l] += sums[i + l];
+                    square[l] += squares[i + l];
+                }
+            }
+            for l in 0..LANES {
+                let variance = (square[l] - sum[l] * sum[l] / AREA as f32).max(0.0);
+                // The template has zero mean, so the window's mean drops out.
+                out[l] = cross[l] / (self.square * variance).max(1.0).sqrt();
+            }
+        }
+    }
+}
