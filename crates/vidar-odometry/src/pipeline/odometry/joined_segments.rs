@@ -3,7 +3,9 @@
 use super::Odometry;
 use super::relocalization::MATCH_SIGMA_PX;
 use crate::bundle_adjustment::TrackLog;
-use crate::relocalization::{MapKeyframe, MapPoint, Query, Relocalized, Sighting, consensus, relocalize};
+use crate::relocalization::{
+    Descriptor, MapKeyframe, MapPoint, Query, Relocalized, Sighting, consensus, relocalize,
+};
 use nalgebra::Matrix2;
 use std::borrow::Cow;
 use std::sync::Arc;
@@ -28,14 +30,12 @@ impl Odometry {
             let (earlier, later) = keyframes.split_at(begin);
             let own: Vec<&Arc<MapKeyframe>> = later.iter().filter(|k| k.segment == segment).collect();
             let stride = own.len().div_ceil(MAX_QUERIES).max(1);
+            let search =
+                KeyframeSearch { segment, ray_sigma_rad, max_scale_difference: MAX_SCALE_DIFFERENCE };
             let look = |keyframe: &&Arc<MapKeyframe>| {
                 let (frame, _) = keyframe.own?;
                 let pixel = |p: &MapPoint| log.pixel_of(frame, p.key?);
-                let found = relocalize(
-                    &query(keyframe, segment, ray_sigma_rad, MAX_SCALE_DIFFERENCE, pixel),
-                    earlier,
-                )?;
-                Some((frame, found))
+                Some((frame, search.find(keyframe, pixel, earlier)?))
             };
             let (frames, found): (Vec<FrameId>, Vec<Relocalized>) =
                 own.iter().step_by(stride).filter_map(look).unzip();
@@ -51,29 +51,51 @@ impl Odometry {
     }
 }
 
-/// A keyframe of `segment` as something to look for; `pixel` says where it shows a point.
-pub(super) fn query(
-    keyframe: &MapKeyframe,
-    segment: u32,
-    ray_sigma_rad: f64,
-    max_scale_difference: f64,
-    pixel: impl Fn(&MapPoint) -> Option<Pixel>,
-) -> Query {
-    let world_from_camera = &keyframe.world_from_camera;
-    let sighting = |point: &MapPoint| {
-        Some(Sighting {
-            ray: world_from_camera.rotation.act(&point.in_camera.normalize()),
-            distance: Some(point.in_camera.norm()),
-            descriptors: point.at_octaves.clone(),
-            pixel: pixel(point)?,
-            covariance: Matrix2::identity() * MATCH_SIGMA_PX.powi(2),
-        })
-    };
-    Query {
-        segment,
-        position: world_from_camera.translation,
-        sightings: keyframe.points.iter().filter_map(sighting).collect(),
-        ray_sigma_rad,
-        max_scale_difference,
+/// How the keyframes of a segment are looked for.
+pub(super) struct KeyframeSearch {
+    pub segment: u32,
+    /// Standard deviation of a ray, rad.
+    pub ray_sigma_rad: f64,
+    /// Largest difference of ln(scale) to the map.
+    pub max_scale_difference: f64,
+}
+
+impl KeyframeSearch {
+    /// Where a map shows a keyframe; `pixel` says where the keyframe shows a point. Points are described at the octave of their features first, since
+    /// fewer descriptors are mistaken less often, and then at several: the place may be seen from half or twice the distance.
+    pub fn find(
+        &self,
+        keyframe: &MapKeyframe,
+        pixel: impl Fn(&MapPoint) -> Option<Pixel>,
+        map: &[Arc<MapKeyframe>],
+    ) -> Option<Relocalized> {
+        let as_found = |p: &MapPoint| vec![p.descriptor];
+        relocalize(&self.query(keyframe, as_found, &pixel), map)
+            .or_else(|| relocalize(&self.query(keyframe, |p| p.at_octaves.clone(), &pixel), map))
+    }
+
+    fn query(
+        &self,
+        keyframe: &MapKeyframe,
+        descriptors: impl Fn(&MapPoint) -> Vec<Descriptor>,
+        pixel: &impl Fn(&MapPoint) -> Option<Pixel>,
+    ) -> Query {
+        let world_from_camera = &keyframe.world_from_camera;
+        let sighting = |point: &MapPoint| {
+            Some(Sighting {
+                ray: world_from_camera.rotation.act(&point.in_camera.normalize()),
+                distance: Some(point.in_camera.norm()),
+                descriptors: descriptors(point),
+                pixel: pixel(point)?,
+                covariance: Matrix2::identity() * MATCH_SIGMA_PX.powi(2),
+            })
+        };
+        Query {
+            segment: self.segment,
+            position: world_from_camera.translation,
+            sightings: keyframe.points.iter().filter_map(sighting).collect(),
+            ray_sigma_rad: self.ray_sigma_rad,
+            max_scale_difference: self.max_scale_difference,
+        }
     }
 }

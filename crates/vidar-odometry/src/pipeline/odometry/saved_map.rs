@@ -1,11 +1,11 @@
 //! The map of another recording of the same place: looking for oneself in it, and leaving one.
 
 use super::Odometry;
-use super::joined_segments::query;
+use super::joined_segments::KeyframeSearch;
 use super::relocalization::{MATCH_SIGMA_PX, MAX_SCALE_DIFFERENCE};
 use crate::bundle_adjustment::Adjusted;
 use crate::pipeline::output::Joined;
-use crate::relocalization::{MapKeyframe, MapPoint, Place, SavedMap, consensus, relocalize};
+use crate::relocalization::{MapKeyframe, MapPoint, Place, SavedMap, consensus};
 use nalgebra::Vector3;
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -40,13 +40,14 @@ impl Odometry {
         }
         let own = adjusted_keyframes(keyframes, adjusted);
         let ray_sigma_rad = MATCH_SIGMA_PX / self.camera.model.intrinsics().fx;
+        // Nowhere yet: found live, it is of the map's segment.
+        let search =
+            KeyframeSearch { segment: u32::MAX, ray_sigma_rad, max_scale_difference: MAX_SCALE_DIFFERENCE };
         let stride = own.len().div_ceil(MAX_QUERIES).max(1);
         // What is found becomes no observation: the map is not adjusted.
         let nowhere = |_: &MapPoint| Some(Pixel::zeros());
         let found: Vec<_> = (own.iter().step_by(stride))
-            .filter_map(|keyframe| {
-                relocalize(&query(keyframe, u32::MAX, ray_sigma_rad, MAX_SCALE_DIFFERENCE, nowhere), &map)
-            })
+            .filter_map(|keyframe| search.find(keyframe, nowhere, &map))
             .collect();
         let Place { map_from_own, inliers, .. } = consensus(&found, false)?;
         Some(Joined {
