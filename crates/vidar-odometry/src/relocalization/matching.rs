@@ -1,7 +1,7 @@
 //! Which keyframes of the map show what a query shows.
 
 use super::map::{MapKeyframe, MapPoint};
-use super::{Query, Sighting};
+use super::{Query, QueryFeature};
 use crate::bundle_adjustment::TrackKey;
 use nalgebra::Vector3;
 use std::sync::Arc;
@@ -22,7 +22,7 @@ const MAX_COMPARED: usize = 400;
 /// A feature of the query and a landmark of the map.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Pair {
-    pub sighting: usize,
+    pub feature: usize,
     pub key: Option<TrackKey>,
     /// In the world of the segment, m.
     pub point: Vector3<f64>,
@@ -34,7 +34,7 @@ pub(super) struct Best {
     pub segment: u32,
     pub pairs: Vec<Pair>,
     /// Features of the query that were matched.
-    pub sightings: usize,
+    pub features: usize,
 }
 
 /// The keyframes of other segments that share most with the query.
@@ -43,7 +43,7 @@ pub(super) fn best_keyframes(query: &Query, map: &[Arc<MapKeyframe>]) -> Option<
         map.iter().map(Arc::as_ref).filter(|k| k.segment != query.segment).collect();
     let stride = others.len().div_ceil(MAX_COMPARED).max(1);
     let mut matched: Vec<(&MapKeyframe, Vec<(usize, usize)>)> = (others.iter().step_by(stride))
-        .map(|keyframe| (*keyframe, mutual(&query.sightings, &keyframe.points)))
+        .map(|keyframe| (*keyframe, mutual(&query.features, &keyframe.points)))
         .filter(|(_, pairs)| pairs.len() >= MIN_MATCHES)
         .collect();
     // The sort is stable: of equal ones the earlier.
@@ -51,26 +51,26 @@ pub(super) fn best_keyframes(query: &Query, map: &[Arc<MapKeyframe>]) -> Option<
     let segment = matched.first()?.0.segment;
     let mut pairs = Vec::new();
     for (keyframe, found) in matched.iter().filter(|(k, _)| k.segment == segment).take(KEYFRAMES) {
-        pairs.extend(found.iter().map(|(sighting, point)| {
+        pairs.extend(found.iter().map(|(feature, point)| {
             let MapPoint { key, in_camera, .. } = &keyframe.points[*point];
             let point = keyframe.world_from_camera.act(in_camera);
-            Pair { sighting: *sighting, key: *key, point }
+            Pair { feature: *feature, key: *key, point }
         }));
     }
-    let mut sightings: Vec<usize> = pairs.iter().map(|p| p.sighting).collect();
-    sightings.sort_unstable();
-    sightings.dedup();
-    Some(Best { segment, pairs, sightings: sightings.len() })
+    let mut features: Vec<usize> = pairs.iter().map(|p| p.feature).collect();
+    features.sort_unstable();
+    features.dedup();
+    Some(Best { segment, pairs, features: features.len() })
 }
 
 /// Features and points that are each other's best, and clearly so.
-fn mutual(sightings: &[Sighting], points: &[MapPoint]) -> Vec<(usize, usize)> {
+fn mutual(features: &[QueryFeature], points: &[MapPoint]) -> Vec<(usize, usize)> {
     let mut best_of_point: Vec<(u32, usize)> = vec![(u32::MAX, usize::MAX); points.len()];
-    let mut best_of_sighting: Vec<Option<usize>> = vec![None; sightings.len()];
-    for (s, sighting) in sightings.iter().enumerate() {
+    let mut best_of_feature: Vec<Option<usize>> = vec![None; features.len()];
+    for (s, feature) in features.iter().enumerate() {
         let (mut first, mut second, mut at) = (u32::MAX, u32::MAX, 0);
         for (p, point) in points.iter().enumerate() {
-            let Some(distance) = sighting.descriptors.iter().map(|d| d.distance(&point.descriptor)).min()
+            let Some(distance) = feature.descriptors.iter().map(|d| d.distance(&point.descriptor)).min()
             else {
                 break;
             };
@@ -84,9 +84,9 @@ fn mutual(sightings: &[Sighting], points: &[MapPoint]) -> Vec<(usize, usize)> {
             }
         }
         let is_clear = f64::from(first) < MAX_SHARE_OF_SECOND * f64::from(second);
-        best_of_sighting[s] = (first <= MAX_DISTANCE && is_clear).then_some(at);
+        best_of_feature[s] = (first <= MAX_DISTANCE && is_clear).then_some(at);
     }
     let is_mutual = |(s, p): &(usize, usize)| best_of_point[*p].1 == *s;
-    let chosen = best_of_sighting.iter().enumerate().filter_map(|(s, p)| Some((s, (*p)?)));
+    let chosen = best_of_feature.iter().enumerate().filter_map(|(s, p)| Some((s, (*p)?)));
     chosen.filter(is_mutual).collect()
 }

@@ -40,7 +40,7 @@ const SAME_HEADING_RAD: f64 = 0.035;
 
 /// A feature of an image that is looked for in the map.
 #[derive(Clone, Debug)]
-pub(crate) struct Sighting {
+pub(crate) struct QueryFeature {
     /// Unit ray in the own, levelled world.
     pub ray: Vector3<f64>,
     /// Own estimate of its distance, m, where there is one.
@@ -59,7 +59,7 @@ pub(crate) struct Query {
     pub segment: u32,
     /// Place of its camera in the own, levelled world, m.
     pub position: Vector3<f64>,
-    pub sightings: Vec<Sighting>,
+    pub features: Vec<QueryFeature>,
     /// Standard deviation of a ray, rad: corners are found again to a few pixels.
     pub ray_sigma_rad: f64,
     /// Largest difference of ln(distance) between own landmarks and the map.
@@ -115,15 +115,15 @@ impl Relocalized {
 pub(crate) fn relocalize(query: &Query, map: &[Arc<MapKeyframe>]) -> Option<Relocalized> {
     let best = matching::best_keyframes(query, map)?;
     let pairs: Vec<Correspondence> = (best.pairs.iter())
-        .map(|p| Correspondence { ray: query.sightings[p.sighting].ray, point: p.point })
+        .map(|p| Correspondence { ray: query.features[p.feature].ray, point: p.point })
         .collect();
     let found = leveled_pose::estimate(&pairs, query.ray_sigma_rad)?;
     // A landmark of several keyframes counts once.
     let mut inliers: Vec<usize> = found.inliers.clone();
-    inliers.sort_by_key(|k| best.pairs[*k].sighting);
-    inliers.dedup_by_key(|k| best.pairs[*k].sighting);
+    inliers.sort_by_key(|k| best.pairs[*k].feature);
+    inliers.dedup_by_key(|k| best.pairs[*k].feature);
     let is_sure = inliers.len() >= MIN_INLIERS
-        && inliers.len() as f64 >= MIN_INLIER_SHARE * best.sightings as f64
+        && inliers.len() as f64 >= MIN_INLIER_SHARE * best.features as f64
         && spread_rad(inliers.iter().map(|k| pairs[*k].ray)) >= MIN_SPREAD_RAD;
     if !is_sure {
         return None;
@@ -131,7 +131,7 @@ pub(crate) fn relocalize(query: &Query, map: &[Arc<MapKeyframe>]) -> Option<Relo
     let LeveledPose { map_from_leveled, position } = found.pose;
     let mut distances: Vec<f64> = inliers.iter().map(|k| (pairs[*k].point - position).norm()).collect();
     let ratios = inliers.iter().filter_map(|k| {
-        let own = query.sightings[best.pairs[*k].sighting].distance?;
+        let own = query.features[best.pairs[*k].feature].distance?;
         Some(((pairs[*k].point - position).norm() / own).ln())
     });
     let mut ratios: Vec<f64> = ratios.collect();
@@ -140,7 +140,7 @@ pub(crate) fn relocalize(query: &Query, map: &[Arc<MapKeyframe>]) -> Option<Relo
         return None;
     }
     let matched = |k: &usize| {
-        let seen = &query.sightings[best.pairs[*k].sighting];
+        let seen = &query.features[best.pairs[*k].feature];
         Some(Match { key: best.pairs[*k].key?, pixel: seen.pixel, covariance: seen.covariance })
     };
     Some(Relocalized {

@@ -18,7 +18,7 @@ fn scene(flipped: u32, scale: f64) -> Scene {
     let mut random = Pcg64::seed(11);
     let map_from_own = Se3::new(So3::exp(&(Vector3::z() * -0.8)), Vector3::new(3.0, 1.0, 0.2));
     let (keyframe_at, query_at) = (Vector3::new(0.2, 0.1, 1.2), Vector3::new(-1.1, -2.4, 1.0));
-    let (mut points, mut sightings) = (Vec::new(), Vec::new());
+    let (mut points, mut features) = (Vec::new(), Vec::new());
     for k in 0..60 {
         let in_map = Vector3::new(
             2.0 + uniform(&mut random),
@@ -39,7 +39,7 @@ fn scene(flipped: u32, scale: f64) -> Scene {
             seen_words[bit / 64] ^= 1 << (bit % 64);
         }
         let from_query = map_from_own.inverse().act(&in_map) - query_at;
-        sightings.push(Sighting {
+        features.push(QueryFeature {
             ray: from_query.normalize(),
             distance: Some(scale * from_query.norm()),
             descriptors: vec![Descriptor::from_words(seen_words)],
@@ -55,7 +55,7 @@ fn scene(flipped: u32, scale: f64) -> Scene {
         points,
     };
     let query =
-        Query { segment: 1, position: query_at, sightings, ray_sigma_rad: 2e-3, max_scale_difference: 0.2 };
+        Query { segment: 1, position: query_at, features, ray_sigma_rad: 2e-3, max_scale_difference: 0.2 };
     Scene { map: vec![Arc::new(keyframe)], query, map_from_own }
 }
 

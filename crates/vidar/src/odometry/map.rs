@@ -93,7 +93,8 @@ impl MapUse {
             Some(time) => format!("recognised live at {time} s"),
             None => "recognised after the end only, the live poses are in a world of their own".into(),
         };
-        let shown = self.matches.map_or(String::new(), |n| format!("; {n} sightings of its landmarks agree"));
+        let shown =
+            self.matches.map_or(String::new(), |n| format!("; {n} observations of its landmarks agree"));
         Warning::new("map-found", format!("the poses are in the world of {file}: {live}{shown}"))
     }
 }

@@ -4,7 +4,7 @@ use super::Odometry;
 use super::relocalization::MATCH_SIGMA_PX;
 use crate::bundle_adjustment::TrackLog;
 use crate::relocalization::{
-    Descriptor, MapKeyframe, MapPoint, Query, Relocalized, Sighting, consensus, relocalize,
+    Descriptor, MapKeyframe, MapPoint, Query, QueryFeature, Relocalized, consensus, relocalize,
 };
 use nalgebra::Matrix2;
 use std::borrow::Cow;
@@ -81,8 +81,8 @@ impl KeyframeSearch {
         pixel: &impl Fn(&MapPoint) -> Option<Pixel>,
     ) -> Query {
         let world_from_camera = &keyframe.world_from_camera;
-        let sighting = |point: &MapPoint| {
-            Some(Sighting {
+        let feature = |point: &MapPoint| {
+            Some(QueryFeature {
                 ray: world_from_camera.rotation.act(&point.in_camera.normalize()),
                 distance: Some(point.in_camera.norm()),
                 descriptors: descriptors(point),
@@ -93,7 +93,7 @@ impl KeyframeSearch {
         Query {
             segment: self.segment,
             position: world_from_camera.translation,
-            sightings: keyframe.points.iter().filter_map(sighting).collect(),
+            features: keyframe.points.iter().filter_map(feature).collect(),
             ray_sigma_rad: self.ray_sigma_rad,
             max_scale_difference: self.max_scale_difference,
         }

@@ -6,7 +6,7 @@ use crate::bundle_adjustment::TrackKey;
 use crate::deferred::Deferred;
 use crate::pipeline::output::{Joined, LossReason};
 use crate::relocalization::{
-    Descriptor, KeyframeMap, MapKeyframe, MapPoint, QUERY_LEVELS, Query, Relocalized, Sighting, downward,
+    Descriptor, KeyframeMap, MapKeyframe, MapPoint, QUERY_LEVELS, Query, QueryFeature, Relocalized, downward,
     relocalize,
 };
 use nalgebra::{Matrix2, Vector3};
@@ -171,12 +171,12 @@ impl Odometry {
             None => None,
         });
         let covariance = Matrix2::identity() * MATCH_SIGMA_PX.powi(2);
-        let sightings = shown.filter_map(|(track, pixel, global_pixel)| {
+        let features = shown.filter_map(|(track, pixel, global_pixel)| {
             let ray = camera.unproject(&global_pixel)?;
             let down = downward(camera, &ray, &gravity);
             let at = |level| Descriptor::at(&host.pyramid, &pixel, level, &down);
             let distance = |l: LandmarkEstimate| (l.in_world - own_from_camera.translation).norm();
-            Some(Sighting {
+            Some(QueryFeature {
                 ray: own_from_camera.rotation.act(&ray),
                 distance: smoother.landmark(track.id).map(distance),
                 descriptors: (0..QUERY_LEVELS).filter_map(at).collect(),
@@ -187,7 +187,7 @@ impl Odometry {
         Some(Query {
             segment: self.segment,
             position: own_from_camera.translation,
-            sightings: sightings.filter(|s| !s.descriptors.is_empty()).collect(),
+            features: features.filter(|s| !s.descriptors.is_empty()).collect(),
             ray_sigma_rad: MATCH_SIGMA_PX / camera.intrinsics().fx,
             max_scale_difference: MAX_SCALE_DIFFERENCE,
         })
