@@ -487,6 +487,12 @@ fn add_landmark(
     let at_host = system.offset(Part::Pose(host));
     let mut square = own.jacobians.by_landmark.transpose() * own.jacobians.by_landmark;
     let mut gradient = own.jacobians.by_landmark.transpose() * own.residual;
+    if let Some(prior) = landmark.prior {
+        let (r, slope) = prior.residual(landmark.rho);
+        square[(2, 2)] += slope * slope;
+        gradient.z += slope * r;
+        cost += 0.5 * r * r;
+    }
     let mut host_square = SMatrix::<f64, 6, 6>::zeros();
     let mut host_gradient = SVector::<f64, 6>::zeros();
     let mut by_calibration = SMatrix::<f64, CALIBRATION_DIM, 3>::zeros();

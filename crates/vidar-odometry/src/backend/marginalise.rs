@@ -263,7 +263,7 @@ impl Smoother {
                 rows += 2;
                 calibration |= self.config.calibrates_camera();
             }
-            rows += 2;
+            rows += 3;
         }
         if motion != gone {
             bench.insert(Part::Motion(gone));
@@ -432,7 +432,7 @@ impl Smoother {
             .extend(landmark.observations[..count].iter().filter(|s| self.frames[s.frame].keyframe).copied());
         // The landmark's own three columns, then those of the stack.
         let mut one = std::mem::take(&mut bench.one);
-        one.reset(2 * observations.len() + 2, 3 + bench.stack.cols());
+        one.reset(2 * observations.len() + 3, 3 + bench.stack.cols());
         let rhs = 3 + bench.rhs();
         let calibration = bench.column(Part::Calibration).map(|c| c + 3);
         let calibration_step = self.calibration_step();
@@ -480,6 +480,12 @@ impl Smoother {
                 write(&weighted, Some(target));
                 used += 1;
             }
+        }
+        if let Some(prior) = landmark.prior {
+            let (residual, slope) = prior.residual(landmark.rho);
+            let row = one.add_rows(1);
+            one.add(row, 2, slope);
+            one.add(row, rhs, residual);
         }
         if used > 0 {
             let begin = one.triangularise(0, 0, 3);
@@ -544,6 +550,8 @@ impl Smoother {
             let length = q.norm();
             landmark.observations.drain(..=count);
             landmark.host = host;
+            // It went into the prior of the window, with the observations that left.
+            landmark.prior = None;
             landmark.bearing = q / length;
             landmark.rho = (landmark.rho / length).clamp(MIN_INVERSE_DISTANCE, MAX_INVERSE_DISTANCE);
             marginalisation.rehosted.push(landmark.id);

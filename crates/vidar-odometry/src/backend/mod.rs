@@ -293,6 +293,17 @@ impl Smoother {
         Ok(())
     }
 
+    /// Assumes that the inverse distance of a landmark, seen by its host alone until now, is `mean` up to `sigma` (1/m, at least 0).
+    ///
+    /// A landmark of which nothing else is known this way says that a body whose images show no parallax does not move far
+    /// (undelayed initialisation: Civera, Davison, Montiel, "Inverse depth parametrization for monocular SLAM", 2008).
+    pub(crate) fn assume_distance(&mut self, landmark: LandmarkId, mean: f64, sigma: f64) {
+        if let Some(&slot) = self.slots.get(&landmark) {
+            self.system.factorised = false;
+            self.landmarks[slot].prior = (sigma > 0.0).then_some(window::DistancePrior { mean, sigma });
+        }
+    }
+
     /// Adds what a frame sees of a landmark.
     ///
     /// # Errors

@@ -311,6 +311,9 @@ fn the_prior_is_the_dense_marginal() {
             smoother.remove_observation(*f, *l);
         }
     }
+    for l in hosted.iter().step_by(2) {
+        smoother.assume_distance(*l, 0.3, 0.05);
+    }
     let mut marginalisation = MarginalisationReport::default();
     let (h, g) = dense(smoother);
     let k = smoother.len();

@@ -173,6 +173,20 @@ pub(crate) struct LandmarkObservation {
     pub(crate) chi2: f64,
 }
 
+/// What is assumed of an inverse distance (1/m) before any parallax tells it.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) struct DistancePrior {
+    pub(crate) mean: f64,
+    pub(crate) sigma: f64,
+}
+
+impl DistancePrior {
+    /// Whitened residual at `rho`, and its derivative.
+    pub(crate) fn residual(&self, rho: f64) -> (f64, f64) {
+        ((rho - self.mean) / self.sigma, 1.0 / self.sigma)
+    }
+}
+
 #[derive(Clone, Debug)]
 pub(crate) struct Landmark {
     pub(crate) id: LandmarkId,
@@ -181,6 +195,7 @@ pub(crate) struct Landmark {
     pub(crate) bearing: Vector3<f64>,
     pub(crate) rho: f64,
     pub(crate) rho_sigma: f64,
+    pub(crate) prior: Option<DistancePrior>,
     /// Observations in other frames, in the order of frames.
     pub(crate) observations: Vec<LandmarkObservation>,
 }
@@ -206,6 +221,7 @@ impl Landmark {
             bearing: Vector3::z(),
             rho: 1.0,
             rho_sigma: f64::INFINITY,
+            prior: None,
             observations: Vec::new(),
         }
     }
@@ -223,6 +239,7 @@ impl Landmark {
         self.bearing = bearing;
         self.rho = rho;
         self.rho_sigma = f64::INFINITY;
+        self.prior = None;
         self.observations.clear();
     }
 

@@ -201,6 +201,9 @@ impl SlidingWindowOdometry {
             }
         }
         self.observe(frame);
+        if !step.is_still {
+            self.assume_distances()?;
+        }
         clock.lap(Stage::Match);
         self.smoother.optimise_into(self.config.iterations, &mut self.report);
         step.chi2_per_dof = self.report.chi2_per_dof;

@@ -50,7 +50,38 @@ pub fn rendered_from(start: Start, duration_secs: f64, exposure_secs: f64, insta
         ..SynthConfig::default()
     };
     let flight = FlightPath::built_in(&config).unwrap();
-    let world = World::build(&config, &flight).unwrap();
+    rendered_along(&flight, &config, exposure_secs, instants)
+}
+
+/// The built-in flight after a second of rest and two in which the body creeps along it at a hundredth of its speed.
+pub fn rendered_after_creeping(duration_secs: f64) -> Recording {
+    let config = SynthConfig {
+        duration_secs,
+        camera_rate_hz: RATE_HZ as f64,
+        initial_accel_bias_m_per_s2: 0.05,
+        ..SynthConfig::default()
+    };
+    let flight = FlightPath::built_in(&config).unwrap();
+    let ramp = |secs: f64| (secs.clamp(0.0, 1.0) * std::f64::consts::FRAC_PI_2).sin().powi(2);
+    let speed = |secs: f64| 0.01 * ramp(2.0 * (secs - 1.0)) + 0.99 * ramp(secs - 3.0);
+    let mut along = 0.0;
+    let poses = (0..=((duration_secs + 1.0) * 100.0) as i64).map(|k| {
+        let secs = k as f64 / 100.0;
+        let world_from_body = flight.world_from_body(along);
+        along += 0.01 * speed(secs);
+        StampedPose { time: EPOCH + Duration::from_millis(10 * k), world_from_body }
+    });
+    let path = Trajectory::new(BodyFrame::Imu, poses.collect()).unwrap();
+    rendered_along(&FlightPath::new(&config, Some(&path)).unwrap(), &config, 0.0, 1)
+}
+
+fn rendered_along(
+    flight: &FlightPath,
+    config: &SynthConfig,
+    exposure_secs: f64,
+    instants: usize,
+) -> Recording {
+    let world = World::build(config, flight).unwrap();
     let camera = vidar_synth::euroc_camera(config.width, config.height).unwrap();
     let count = (config.duration_secs * RATE_HZ as f64) as i64;
     let times: Vec<Timestamp> =
@@ -75,7 +106,7 @@ pub fn rendered_from(start: Start, duration_secs: f64, exposure_secs: f64, insta
         .map(|t| StampedPose { time: *t, world_from_body: flight.world_from_body(secs(t)) })
         .collect();
     let rig = vidar_synth::euroc_rig(config.width, config.height).unwrap();
-    let imu = simulate_imu(&flight, &config).samples;
+    let imu = simulate_imu(flight, config).samples;
     Recording { rig, images, imu, truth, config: OdometryConfig::default() }
 }
 

@@ -1,6 +1,8 @@
 //! Bodies that stand still: at the beginning, in the middle, for long.
 
-use crate::recording::{EPOCH, Recording, add_noise, lost, recording, rendered_from, rest_reading};
+use crate::recording::{
+    EPOCH, Recording, add_noise, lost, recording, rendered_after_creeping, rendered_from, rest_reading,
+};
 use nalgebra::Vector3;
 use vidar_core::{AngularRate, Duration, ImuSample, LieGroup, StampedPose, Timestamp};
 use vidar_odometry::OdometryOutput;
@@ -93,4 +95,17 @@ fn a_pause_in_the_middle_of_a_flight_is_a_pause() {
 #[ignore = "long form: cargo test --release -p vidar-odometry --test ladder -- --ignored"]
 fn a_minute_of_rest_in_the_middle_of_a_flight_does_not_drift() {
     pause(60);
+}
+
+/// Too slow for a parallax that tells distances, too fast for a standstill: the accelerometer alone would carry the state away.
+#[test]
+fn a_body_that_creeps_after_a_rest_stays_where_it_is_until_it_flies() {
+    let recording = rendered_after_creeping(8.0);
+    let outputs = recording.run();
+    assert!(lost(&outputs).is_empty(), "{:?}", lost(&outputs));
+    let far = drift(&outputs, 0.0, 3.0);
+    let (ate, share) = recording.error_and_share("creeping for 2 s after a rest", &outputs);
+    eprintln!("{far:.4} m within the first three seconds");
+    assert!(far < 0.03, "{far} m while it creeps");
+    assert!(ate < 0.03 && share > 0.6, "{ate} m, {share} of the images");
 }

@@ -3,7 +3,9 @@
 use super::{SlidingWindowOdometry, WindowPoses, observation};
 use crate::backend::{Observation, SmootherError};
 use crate::tracking::CameraPoses;
+use crate::tracking::track::{InverseDistance, Track};
 use crate::tracking::{host_covariance, parallax, unknown_distance};
+use vidar_core::camera::Pixel;
 use vidar_core::{FrameId, LandmarkId, LieGroup};
 
 /// Mean chi-square per measurement (two degrees of freedom) up to which a seed's distance is accepted.
@@ -16,7 +18,45 @@ const PROMOTION_PARALLAX: f64 = 0.5 * std::f64::consts::PI / 180.0;
 /// ... and it was found in this many frames.
 const PROMOTION_FRAMES: u32 = 4;
 
+/// Landmarks whose distance is assumed while none is known, and the standard deviation of their inverse distances, as a
+/// multiple of the typical one. Together they claim to know the scale of the scene to a factor of about two
+/// (2 / √12 of it), not to a percent.
+const ASSUMED_LANDMARKS: usize = 12;
+const ASSUMED_RELATIVE_STD: f64 = 2.0;
+
 impl SlidingWindowOdometry {
+    /// A state that begins at rest knows no distance, and its velocity is that of the accelerometer alone as soon as it moves.
+    /// Some tracks become landmarks of an assumed distance: images without parallax then say that the body is where it was.
+    pub(super) fn assume_distances(&mut self) -> Result<(), SmootherError> {
+        if self.tracker.tracks.iter().any(|t| t.is_landmark) {
+            return Ok(());
+        }
+        let mut chosen: Vec<(LandmarkId, Pixel)> = Vec::with_capacity(ASSUMED_LANDMARKS);
+        let seen = |t: &&Track| t.measured.is_some() && t.found >= PROMOTION_FRAMES;
+        let seen: Vec<&Track> = self.tracker.tracks.iter().filter(seen).collect();
+        while chosen.len() < ASSUMED_LANDMARKS {
+            // Far from those chosen, so that they look in all directions.
+            let apart = |t: &Track| {
+                let nearest = chosen.iter().map(|(_, p)| (t.last_pixel - p).norm_squared());
+                nearest.fold(f64::INFINITY, f64::min)
+            };
+            let next = seen.iter().filter(|t| chosen.iter().all(|(id, _)| *id != t.id));
+            let Some(next) = next.max_by(|a, b| apart(a).total_cmp(&apart(b))) else { break };
+            chosen.push((next.id, next.last_pixel));
+        }
+        let typical = self.typical_inverse;
+        for (id, _) in &chosen {
+            if let Some(track) = self.tracker.tracks.iter_mut().find(|t| t.id == *id) {
+                track.is_landmark = true;
+                track.distance =
+                    InverseDistance { mean: typical, variance: (ASSUMED_RELATIVE_STD * typical).powi(2) };
+            }
+            self.promote(*id)?;
+            self.smoother.assume_distance(*id, typical, ASSUMED_RELATIVE_STD * typical);
+        }
+        Ok(())
+    }
+
     /// Estimates the distances of seeds and hands those that are known well enough to the smoother.
     pub(super) fn update_seeds(&mut self, frame: FrameId) -> Result<(), SmootherError> {
         let held = WindowPoses(&self.smoother);
