@@ -18,7 +18,7 @@ use vidar_odometry::simulate::{
     Course, CourseKind, FeatureOdometry, FeatureOdometryConfig, Flight, Motion, Simulation, SimulationConfig,
     StepOutput,
 };
-use vidar_synth::{FlightPath, Start, SynthConfig};
+use vidar_synth::{FlightKind, FlightPath, Start, SynthConfig};
 
 const FLIGHTS: [&str; 11] =
     ["MH_01", "MH_02", "MH_03", "MH_04", "MH_05", "V1_01", "V1_02", "V1_03", "V2_01", "V2_02", "V2_03"];
@@ -130,7 +130,12 @@ struct Outcome {
     /// Errors in the end: log(scale), and the body's velocity, m/s.
     later: f64,
     velocity_mps: f64,
+    /// Error of log(scale) over its stated standard deviation, [`SCALE_TOLD_SECS`] after the start.
+    normalised: Vec<f64>,
 }
+
+/// When the stated scale of a running state is compared with the truth, s after its start.
+const SCALE_TOLD_SECS: [f64; 4] = [0.5, 2.0, 5.0, 10.0];
 
 impl Outcome {
     fn is_lost(&self) -> bool {
@@ -145,9 +150,12 @@ fn velocity_error(state: &NavState, truth: &NavState) -> f64 {
 
 /// Starts in flight at `from_secs` and flies on for `later_secs`.
 fn start_in_flight(flight: &impl Flight, from_secs: f64, later_secs: f64, seed: u64) -> Outcome {
-    let settings = SimulationConfig { seed, ..Default::default() };
-    let simulation = Simulation::new(flight, from_secs, PATIENCE_SECS + later_secs, &settings);
-    let config = FeatureOdometryConfig::new(&ImuNoise::EUROC, 2.0);
+    start_with(flight, from_secs, later_secs, &SimulationConfig { seed, ..Default::default() })
+}
+
+fn start_with(flight: &impl Flight, from_secs: f64, later_secs: f64, settings: &SimulationConfig) -> Outcome {
+    let simulation = Simulation::new(flight, from_secs, PATIENCE_SECS + later_secs, settings);
+    let config = FeatureOdometryConfig::new(&settings.noise, 2.0);
     let mut odometry = FeatureOdometry::for_simulation(config, &simulation).unwrap();
     let mut outcome = Outcome { from_secs, ..Default::default() };
     for (k, frame) in simulation.frames.iter().enumerate() {
@@ -162,6 +170,14 @@ fn start_in_flight(flight: &impl Flight, from_secs: f64, later_secs: f64, seed: 
             StepOutput::Waiting(Some(failure)) => outcome.failure = failure.to_string(),
             StepOutput::Waiting(None) => {}
             StepOutput::Tracking(state) => outcome.velocity_mps = velocity_error(&state, &frame.truth),
+        }
+        let told = SCALE_TOLD_SECS.get(outcome.normalised.len());
+        if let (Some(at), Some(after)) = (outcome.waited_secs, told)
+            && secs >= at + after
+        {
+            let smoother = odometry.smoother().unwrap();
+            let sigma = smoother.log_scale_sigma().unwrap();
+            outcome.normalised.push(log_scale_error(smoother, &simulation) / sigma);
         }
         if outcome.waited_secs.is_some_and(|at| secs >= at + later_secs) {
             break;
@@ -255,7 +271,7 @@ fn tell_bad(outcomes: &[Outcome]) {
     }
 }
 
-const HEAD: &str = "| Flight | Accepted | After, s | Scale error % at acceptance | 95 % | over its sigma, rms | 10 s later % | 95 % | Lost |\n|---|--:|--:|--:|--:|--:|--:|--:|--:|";
+const HEAD: &str = "| Flight | Accepted | After, s | Scale error % at acceptance | 95 % | over its sigma, rms | In the end % | 95 % | Lost |\n|---|--:|--:|--:|--:|--:|--:|--:|--:|";
 
 #[test]
 fn starts_on_a_built_in_flight_are_metric() {
@@ -412,4 +428,81 @@ fn starts_from_rest_on_all_euroc_flights_meet_the_demands() {
         Outcome { name: (*name).to_owned(), from_secs: *from, ..outcome }
     });
     evaluate("starts from rest", &all);
+}
+
+/// A hand-held path of `seed` with a consumer IMU, and what its start `from_secs` on became.
+fn start_in_hand(kind: FlightKind, seed: u64, from_secs: f64, later_secs: f64) -> Outcome {
+    let preset = match kind {
+        FlightKind::HandheldLively => SynthConfig::phone_fast(),
+        _ => SynthConfig::phone_slow(),
+    };
+    let config = SynthConfig { seed, ..preset };
+    let flight = Flown(FlightPath::built_in(&config).unwrap());
+    let noise = config.imu_noise;
+    let settings = SimulationConfig { seed, noise, imu_rate_hz: noise.rate_hz, ..Default::default() };
+    start_with(&flight, from_secs, later_secs, &settings)
+}
+
+/// What starts in a hand must hold: started, and no more wrong claims than three standard deviations allow.
+fn evaluate_hand(what: &str, all: &[Outcome], least_share: f64, most_wrong_share: f64) {
+    println!("{what}\n{HEAD}");
+    report(what, all);
+    tell_bad(all);
+    let started = accepted(all, |o| o.at_acceptance).len() as f64;
+    let wrong = accepted(all, |o| o.at_acceptance / o.sigma).iter().filter(|z| **z > 3.0).count() as f64;
+    println!("{wrong} of {started} claims beyond 3 sigma");
+    assert!(started >= least_share * all.len() as f64, "{started} of {} started", all.len());
+    assert!(wrong <= most_wrong_share * started, "{wrong} of {started} claims beyond 3 sigma");
+    assert!(all.iter().all(|o| !o.is_lost()), "a state was lost");
+}
+
+#[test]
+fn starts_in_a_hand_are_metric() {
+    let kinds = [FlightKind::Handheld, FlightKind::HandheldLively];
+    let tasks: Vec<(FlightKind, u64)> =
+        kinds.into_iter().flat_map(|k| [(k, 501), (k, 502), (k, 503)]).collect();
+    let all = on_all_cores(&tasks, |(kind, seed)| start_in_hand(*kind, *seed, 3.0, 2.0));
+    evaluate_hand("in a hand", &all, 0.8, 0.0);
+}
+
+/// A state must know its scale as well as it says all along, not when it starts only.
+fn evaluate_scale_over_time(all: &[Outcome]) {
+    for (k, secs) in SCALE_TOLD_SECS.iter().enumerate() {
+        let of: Vec<f64> = all.iter().filter_map(|o| o.normalised.get(k).copied()).collect();
+        let rms = (of.iter().map(|z| z * z).sum::<f64>() / of.len() as f64).sqrt();
+        let wrong = of.iter().filter(|z| z.abs() > 3.0).count();
+        println!(
+            "{secs} s after the start: ln s over its sigma {rms:.2} rms, {wrong} of {} beyond 3",
+            of.len()
+        );
+        assert!(of.len() >= 45, "only {} runs", of.len());
+        assert!((0.4..=1.6).contains(&rms), "{rms:.2} {secs} s after the start");
+        assert!(wrong * 50 <= of.len(), "{wrong} beyond 3 sigma {secs} s after the start");
+    }
+}
+
+#[test]
+#[ignore = "long: 50 hand-held runs, ten seconds each"]
+fn the_stated_scale_is_consistent_through_50_runs() {
+    let kinds = [FlightKind::Handheld, FlightKind::HandheldLively];
+    let tasks: Vec<(FlightKind, u64)> =
+        kinds.into_iter().flat_map(|k| (0..25).map(move |s| (k, 700 + s))).collect();
+    let all = on_all_cores(&tasks, |(kind, seed)| start_in_hand(*kind, *seed, 2.0, 10.5));
+    report("50 runs", &all);
+    evaluate_scale_over_time(&all);
+}
+
+#[test]
+#[ignore = "long: 1000 starts in a slow and 1000 in a lively hand"]
+fn two_thousand_starts_in_a_hand_meet_the_demands() {
+    for (name, kind) in [("slow hand", FlightKind::Handheld), ("lively hand", FlightKind::HandheldLively)] {
+        let seeds = 1000..1100_u64;
+        let tasks: Vec<(u64, f64)> =
+            seeds.flat_map(|seed| (0..10).map(move |k| (seed, 0.5 + f64::from(k)))).collect();
+        let all = on_all_cores(&tasks, |(seed, from)| {
+            let outcome = start_in_hand(kind, *seed, *from, 5.0);
+            Outcome { name: format!("{name} {seed}"), ..outcome }
+        });
+        evaluate_hand(name, &all, 0.98, 0.01);
+    }
 }
