@@ -173,6 +173,9 @@ pub struct InputArgs {
     /// Body whose poses --trajectory holds: imu, or camera0, camera1, ….
     #[arg(long, help_heading = "Input")]
     pub trajectory_body: Option<String>,
+    /// Table of gyroscope and accelerometer (csv), for a video or a folder of images; twice for one of each.
+    #[arg(long, value_hint = ValueHint::FilePath, action = ArgAction::Append, help_heading = "Input")]
+    pub imu: Vec<PathBuf>,
     /// File of image times, for image folders.
     #[arg(long, value_hint = ValueHint::FilePath, help_heading = "Input")]
     pub timestamps: Option<PathBuf>,

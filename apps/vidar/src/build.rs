@@ -114,6 +114,7 @@ pub fn open_options(input: &InputArgs) -> Result<OpenOptions, Error> {
     let mut options = OpenOptions {
         calibration: input.calibration.clone(),
         trajectory: input.trajectory.clone(),
+        imu: input.imu.clone(),
         timestamps: input.timestamps.clone(),
         depth_scale: input.depth_scale,
         camera: CameraId(input.camera.unwrap_or(0)),

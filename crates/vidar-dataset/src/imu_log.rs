@@ -15,7 +15,8 @@ use crate::location::files;
 use crate::options::{DatasetKind, OpenOptions};
 use crate::parse::{self, Source, UnitRule};
 use crate::phone;
-use crate::video::{names_of_videos, take_frames};
+use crate::video::{self, names_of_videos, take_frames};
+use crate::wrong_thing;
 use std::path::{Path, PathBuf};
 use vidar_core::{CameraModel, Pinhole, Timestamp, Warning};
 use vidar_video::Video;
@@ -55,6 +56,47 @@ pub(crate) fn detect(path: &Path) -> Option<Log> {
     };
     let reason = format!("{} of gyroscope and accelerometer beside {beside}", names.join(" and "));
     Some(Log { tables, folder, pictures, reason })
+}
+
+/// The recording whose tables the user names: pictures at `path`, a video or a folder of either kind.
+pub(crate) fn named(path: &Path, options: &OpenOptions) -> Result<Log, DatasetError> {
+    let refuse = |path: &Path, found: &str, expected: &str| DatasetError::UnknownLayout {
+        path: path.to_path_buf(),
+        found: found.into(),
+        expected: expected.into(),
+    };
+    let pictures = match path.is_dir() {
+        true => pictures_in(path),
+        false => {
+            let is_video = video::is_one(&wrong_thing::head_of(path)?, options);
+            is_video.then(|| Pictures::Video(path.to_path_buf()))
+        }
+    };
+    let expected = "a video or a folder of images, where the IMU is in files of its own (--imu)";
+    let pictures = pictures.ok_or_else(|| refuse(path, "another kind of recording", expected))?;
+    let mut tables = Vec::new();
+    for file in &options.imu {
+        let expected = "a table with columns of a gyroscope, an accelerometer or both, with times";
+        let table = imu_file_at(file)?;
+        tables.push(table.ok_or_else(|| refuse(file, "no column of an IMU", expected))?);
+    }
+    let with = |has: &dyn Fn(&ImuFile) -> bool| tables.iter().filter(|t| has(t)).count();
+    let (gyros, accels) = (with(&|t| t.columns.has_gyroscope()), with(&|t| t.columns.has_accelerometer()));
+    if (gyros, accels) != (1, 1) {
+        let found = format!("{gyros} tables of a gyroscope and {accels} of an accelerometer");
+        return Err(refuse(
+            &options.imu[0],
+            &found,
+            "one of each, in one file or in two (--imu FILE, twice)",
+        ));
+    }
+    let folder = options.imu[0].parent().filter(|f| !f.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    Ok(Log {
+        tables,
+        folder: folder.to_path_buf(),
+        pictures,
+        reason: "the IMU's tables are named (--imu)".into(),
+    })
 }
 
 fn pictures_in(path: &Path) -> Option<Pictures> {

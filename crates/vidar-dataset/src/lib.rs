@@ -60,6 +60,9 @@ use std::path::Path;
 /// Layouts are tried from the most to the least specific; [`Dataset::reason`] states why one was chosen.
 pub fn open(path: &Path, options: &OpenOptions) -> Result<Dataset, DatasetError> {
     options.validate()?;
+    if !options.imu.is_empty() {
+        return imu_log::open(path, imu_log::named(path, options)?, options)?.finish(options);
+    }
     if !path.is_dir() {
         return open_file(path, options);
     }
@@ -83,10 +86,8 @@ fn open_file(path: &Path, options: &OpenOptions) -> Result<Dataset, DatasetError
         let reason = format!("its first bytes are those of {}", format.name());
         return bag::open(path, reason, options)?.finish(options);
     }
-    let is_movie = vidar_video::is_video(&head) && !wrong_thing::is_picture(&head);
-    let is_for_program = options.decoder == VideoDecoder::Ffmpeg && wrong_thing::may_be_video(&head);
-    if is_movie || is_for_program {
-        let first_bytes = if is_movie { "mp4 and mov" } else { "a video of another kind" };
+    if video::is_one(&head, options) {
+        let first_bytes = if video::is_movie(&head) { "mp4 and mov" } else { "a video of another kind" };
         let mut draft = video::open(path, format!("its first bytes are those of {first_bytes}"), options)?;
         if path.parent().is_some_and(is_recording_of_phone) {
             let message = format!(

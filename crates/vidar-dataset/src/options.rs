@@ -226,6 +226,8 @@ pub struct OpenOptions {
     pub topics: Vec<TopicFlag>,
     /// Who decodes videos.
     pub decoder: VideoDecoder,
+    /// Tables of gyroscope and accelerometer, in one file or in two, for a video or a folder of images.
+    pub imu: Vec<PathBuf>,
     /// A file of image times (image folders).
     pub timestamps: Option<PathBuf>,
     /// Unit of the times in image lists and file names; `None` detects it.
@@ -253,6 +255,7 @@ impl Default for OpenOptions {
             trajectory_body: None,
             topics: Vec::new(),
             decoder: VideoDecoder::default(),
+            imu: Vec::new(),
             timestamps: None,
             time_unit: None,
             start: None,

@@ -5,10 +5,11 @@ use crate::error::DatasetError;
 use crate::folder::{images_in, names_in};
 use crate::location::Location;
 use crate::options::{DatasetKind, OpenOptions};
+use crate::wrong_thing;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use vidar_core::{Timestamp, Warning};
-use vidar_video::{Telemetry, Video};
+use vidar_video::{Telemetry, Video, VideoDecoder};
 
 /// The video of a folder that holds one and no images.
 pub(crate) fn only_one_in(folder: &Path) -> Option<(PathBuf, String)> {
@@ -18,6 +19,18 @@ pub(crate) fn only_one_in(folder: &Path) -> Option<(PathBuf, String)> {
     }
     let name = videos.remove(0);
     Some((folder.join(&name), format!("its only video {name}")))
+}
+
+/// Whether a file with these first bytes is taken for a video: one that the built-in decoders may know, or whatever the
+/// user's own program is to decode.
+pub(crate) fn is_one(head: &[u8], options: &OpenOptions) -> bool {
+    let is_for_program = options.decoder == VideoDecoder::Ffmpeg && wrong_thing::may_be_video(head);
+    is_movie(head) || is_for_program
+}
+
+/// Whether it is an mp4 or mov.
+pub(crate) fn is_movie(head: &[u8]) -> bool {
+    vidar_video::is_video(head) && !wrong_thing::is_picture(head)
 }
 
 /// Names of videos in a folder, hidden files left out.

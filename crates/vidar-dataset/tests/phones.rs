@@ -88,6 +88,52 @@ fn a_video_out_of_a_recording_points_to_its_folder() {
     warning(&d, "folder-beside");
 }
 
+/// A logger's tables in a folder of their own, named by the user.
+#[test]
+fn tables_of_the_imu_may_lie_elsewhere_and_are_named() {
+    let (pictures, log) = (Folder::new(), Folder::new());
+    pictures.write("clip.mp4", clip("h264.mp4"));
+    let (mut gyro, mut accel, mut times) = (
+        String::from("timestamp_ns,gx,gy,gz\n"),
+        String::from("timestamp_ns,ax,ay,az\n"),
+        String::from("timestamp_ns\n"),
+    );
+    for i in 0..SAMPLES {
+        let nanos = (frame_ms(0) - 50 + 5 * i) * 1_000_000;
+        let _ = writeln!(gyro, "{nanos},0.01,0.02,0.03");
+        let _ = writeln!(accel, "{nanos},{UP},0.0,0.0");
+    }
+    for i in 0..FRAMES {
+        let _ = writeln!(times, "{}", frame_ms(i) * 1_000_000);
+    }
+    log.write("gyro.csv", gyro).write("accel.csv", accel).write("frames.csv", times);
+    let named = |tables: &[&str], timestamps: Option<&str>| OpenOptions {
+        imu: tables.iter().map(|t| log.join(t)).collect(),
+        timestamps: timestamps.map(|t| log.join(t)),
+        ..OpenOptions::default()
+    };
+    let d = vidar_dataset::open(
+        &pictures.join("clip.mp4"),
+        &named(&["gyro.csv", "accel.csv"], Some("frames.csv")),
+    )
+    .unwrap();
+    assert_eq!((d.kind, d.images.len()), (DatasetKind::ImuLog, FRAMES));
+    assert_eq!(d.images[3].time.nanos(), frame_ms(3) * 1_000_000);
+    assert_eq!(d.imu[60].gyro.0, Vector3::new(0.01, 0.02, 0.03));
+    assert!((d.imu[60].accel.0 - Vector3::new(UP, 0.0, 0.0)).norm() < 1e-9);
+    // The folder of the video does as well.
+    let folder = vidar_dataset::open(pictures.path(), &named(&["accel.csv", "gyro.csv"], Some("frames.csv")));
+    assert_eq!(folder.unwrap().imu, d.imu);
+
+    let refused = |tables: &[&str]| {
+        vidar_dataset::open(&pictures.join("clip.mp4"), &named(tables, None)).unwrap_err().to_string()
+    };
+    assert!(refused(&["gyro.csv"]).contains("1 tables of a gyroscope and 0 of an accelerometer"));
+    assert!(refused(&["frames.csv"]).contains("no column of an IMU"), "{}", refused(&["frames.csv"]));
+    let other = vidar_dataset::open(&log.join("gyro.csv"), &named(&["gyro.csv", "accel.csv"], None));
+    assert!(other.unwrap_err().to_string().contains("a video or a folder of images"));
+}
+
 #[test]
 fn poses_beside_images_are_no_imu() {
     let f = Folder::new();
