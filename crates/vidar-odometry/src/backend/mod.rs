@@ -293,14 +293,15 @@ impl Smoother {
         Ok(())
     }
 
-    /// Assumes that the inverse distance of a landmark, seen by its host alone until now, is `mean` up to `sigma` (1/m, at least 0).
+    /// Assumes that the inverse distance of a landmark of which no parallax is known yet is `median` (1/m), its logarithm up to `log_sigma`.
     ///
     /// A landmark of which nothing else is known this way says that a body whose images show no parallax does not move far
     /// (undelayed initialisation: Civera, Davison, Montiel, "Inverse depth parametrization for monocular SLAM", 2008).
-    pub(crate) fn assume_distance(&mut self, landmark: LandmarkId, mean: f64, sigma: f64) {
+    pub(crate) fn assume_distance(&mut self, landmark: LandmarkId, median: f64, log_sigma: f64) {
         if let Some(&slot) = self.slots.get(&landmark) {
             self.system.factorised = false;
-            self.landmarks[slot].prior = (sigma > 0.0).then_some(window::DistancePrior { mean, sigma });
+            let valid = log_sigma > 0.0 && median > 0.0;
+            self.landmarks[slot].prior = valid.then_some(window::DistancePrior { median, log_sigma });
         }
     }
 

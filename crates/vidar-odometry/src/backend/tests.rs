@@ -312,7 +312,7 @@ fn the_prior_is_the_dense_marginal() {
         }
     }
     for l in hosted.iter().step_by(2) {
-        smoother.assume_distance(*l, 0.3, 0.05);
+        smoother.assume_distance(*l, 0.3, 0.5);
     }
     let mut marginalisation = MarginalisationReport::default();
     let (h, g) = dense(smoother);

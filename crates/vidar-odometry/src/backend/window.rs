@@ -173,17 +173,18 @@ pub(crate) struct LandmarkObservation {
     pub(crate) chi2: f64,
 }
 
-/// What is assumed of an inverse distance (1/m) before any parallax tells it.
+/// What is assumed of a distance before any parallax tells it: its inverse (1/m) is log-normal, with this median and
+/// standard deviation of the logarithm. On a normal prior of the inverse, a far scene would explain any drift at next to no cost.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct DistancePrior {
-    pub(crate) mean: f64,
-    pub(crate) sigma: f64,
+    pub(crate) median: f64,
+    pub(crate) log_sigma: f64,
 }
 
 impl DistancePrior {
     /// Whitened residual at `rho`, and its derivative.
     pub(crate) fn residual(&self, rho: f64) -> (f64, f64) {
-        ((rho - self.mean) / self.sigma, 1.0 / self.sigma)
+        ((rho / self.median).ln() / self.log_sigma, 1.0 / (rho * self.log_sigma))
     }
 }
 

@@ -18,11 +18,10 @@ const PROMOTION_PARALLAX: f64 = 0.5 * std::f64::consts::PI / 180.0;
 /// ... and it was found in this many frames.
 const PROMOTION_FRAMES: u32 = 4;
 
-/// Landmarks whose distance is assumed while none is known, and the standard deviation of their inverse distances, as a
-/// multiple of the typical one. Together they claim to know the scale of the scene to a factor of about two
-/// (2 / √12 of it), not to a percent.
+/// Landmarks whose distance is assumed while none is known, and the standard deviation of the logarithms of their distances.
+/// Together they say that the scene is 2.5 m away to a factor of two (2.4 / √12 = 0.7), as rooms and desks are; each alone may be anywhere.
 const ASSUMED_LANDMARKS: usize = 12;
-const ASSUMED_RELATIVE_STD: f64 = 2.0;
+const ASSUMED_LOG_STD: f64 = 2.4;
 
 impl SlidingWindowOdometry {
     /// A state that begins at rest knows no distance, and its velocity is that of the accelerometer alone as soon as it moves.
@@ -49,10 +48,10 @@ impl SlidingWindowOdometry {
             if let Some(track) = self.tracker.tracks.iter_mut().find(|t| t.id == *id) {
                 track.is_landmark = true;
                 track.distance =
-                    InverseDistance { mean: typical, variance: (ASSUMED_RELATIVE_STD * typical).powi(2) };
+                    InverseDistance { mean: typical, variance: (ASSUMED_LOG_STD * typical).powi(2) };
             }
             self.promote(*id)?;
-            self.smoother.assume_distance(*id, typical, ASSUMED_RELATIVE_STD * typical);
+            self.smoother.assume_distance(*id, typical, ASSUMED_LOG_STD);
         }
         Ok(())
     }
