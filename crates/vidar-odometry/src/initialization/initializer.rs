@@ -130,6 +130,14 @@ impl Initializer {
         *self.in_flight.gyro_bias()
     }
 
+    /// Time that the log spans, s.
+    pub fn logged_secs(&self) -> f64 {
+        match (self.log.first(), self.log.last()) {
+            (Some(first), Some(last)) => (last.time - first.time).as_secs_f64(),
+            _ => 0.0,
+        }
+    }
+
     /// Tracks all features into an image and logs their observations; a metric state if the log determines one.
     pub fn follow(
         &mut self,
@@ -229,8 +237,7 @@ impl Initializer {
 
     /// Time until another attempt may tell more, s: paced by what the last one lacked.
     fn pause_after(&self, failure: &InitFailure) -> f64 {
-        let (Some(first), Some(last)) = (self.log.first(), self.log.last()) else { return ATTEMPT_SECS };
-        let span = (last.time - first.time).as_secs_f64();
+        let span = self.logged_secs();
         let ratio = failure.measured / failure.limit;
         let pause = match failure.reason {
             // σ falls with the square of a window's length, parallax grows with it.

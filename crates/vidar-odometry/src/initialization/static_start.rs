@@ -103,6 +103,57 @@ pub fn initialize_static(
     Ok(StaticState { state, sigmas })
 }
 
+/// Standard deviation of the velocity of a body whose images show no parallax for a second, m/s: a degree at 5 m.
+const SLOW_VELOCITY_MPS: f64 = 0.1;
+/// The same of a gyroscope bias that was fitted to images.
+const FITTED_GYRO_BIAS: f64 = 5e-3;
+
+/// Reads the state of a body that hardly moves, though it does not stand still, from a second or more of `samples`: level by the
+/// mean specific force in the axes of the last sample, no velocity.
+///
+/// # Errors
+/// A mean specific force that is not gravity.
+pub(crate) fn initialize_slow(
+    samples: &[ImuSample],
+    gyro_bias: &Vector3<f64>,
+    gravity_mps2: f64,
+) -> Result<StaticState, InitFailure> {
+    let (Some(first), Some(last)) = (samples.first(), samples.last()) else {
+        return Err(InitFailure::new(InitFailureReason::Seconds, 0.0, 1.0));
+    };
+    let mut sum = last.accel.0;
+    let mut last_from_sample = So3::IDENTITY;
+    for pair in samples.windows(2).rev() {
+        let secs = (pair[1].time - pair[0].time).as_secs_f64();
+        let rate = 0.5 * (pair[0].gyro.0 + pair[1].gyro.0) - gyro_bias;
+        last_from_sample = last_from_sample * So3::exp(&(-rate * secs));
+        sum += last_from_sample.act(&pair[0].accel.0);
+    }
+    let mean = sum / samples.len() as f64;
+    let off = (mean.norm() - gravity_mps2).abs();
+    if !(off <= IMPOSSIBLE_FORCE) {
+        return Err(InitFailure::new(InitFailureReason::SpecificForce, off, IMPOSSIBLE_FORCE));
+    }
+    let accel_sigma = if off > SUSPICIOUS_FORCE { 0.3 } else { 0.1 };
+    let secs = (last.time - first.time).as_secs_f64().max(0.1);
+    // What the mean force holds beside gravity is a change of velocity over its time.
+    let tilt_mps2 = f64::hypot(accel_sigma, SLOW_VELOCITY_MPS * std::f64::consts::SQRT_2 / secs);
+    let state = NavState {
+        world_from_body: Se3::new(leveled(&mean), Vector3::zeros()),
+        velocity: Vector3::zeros(),
+        bias: Bias { gyro: *gyro_bias, accel: Vector3::zeros() },
+    };
+    let sigmas = GaugePriorSigmas {
+        position_m: 1e-3,
+        yaw_rad: 1e-3,
+        tilt_rad: tilt_mps2 / gravity_mps2,
+        velocity_mps: SLOW_VELOCITY_MPS,
+        gyro_bias: FITTED_GYRO_BIAS,
+        accel_bias: accel_sigma,
+    };
+    Ok(StaticState { state, sigmas })
+}
+
 /// The rotation world_from_body of least angle that makes `up_in_body` vertical.
 pub(crate) fn leveled(up_in_body: &Vector3<f64>) -> So3 {
     let axis = up_in_body.cross(&Vector3::z());

@@ -303,6 +303,11 @@ impl Odometry {
                 match found {
                     _ if resting => self.start_static(frame, &host, time),
                     Ok(found) => self.start_in_flight(found, frame, &host),
+                    Err(failure)
+                        if self.imu_model.is_some() && start::hardly_moves(initializer, &failure) =>
+                    {
+                        self.start_slow(failure, frame, &host, time)
+                    }
                     Err(failure) => {
                         self.failure = failure.clone();
                         Status::Waiting(failure)

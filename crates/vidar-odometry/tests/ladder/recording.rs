@@ -53,8 +53,9 @@ pub fn rendered_from(start: Start, duration_secs: f64, exposure_secs: f64, insta
     rendered_along(&flight, &config, exposure_secs, instants)
 }
 
-/// The built-in flight after a second of rest and two in which the body creeps along it at a hundredth of its speed.
-pub fn rendered_after_creeping(duration_secs: f64) -> Recording {
+/// The built-in flight after `rest_secs` at rest and two seconds in which the body creeps along it at a hundredth of its speed.
+/// A hand trembles all along: three times a second by `tremor_m`.
+pub fn rendered_after_creeping(duration_secs: f64, rest_secs: f64, tremor_m: f64) -> Recording {
     let config = SynthConfig {
         duration_secs,
         camera_rate_hz: RATE_HZ as f64,
@@ -63,11 +64,13 @@ pub fn rendered_after_creeping(duration_secs: f64) -> Recording {
     };
     let flight = FlightPath::built_in(&config).unwrap();
     let ramp = |secs: f64| (secs.clamp(0.0, 1.0) * std::f64::consts::FRAC_PI_2).sin().powi(2);
-    let speed = |secs: f64| 0.01 * ramp(2.0 * (secs - 1.0)) + 0.99 * ramp(secs - 3.0);
+    let speed = |secs: f64| 0.01 * ramp(2.0 * (secs - rest_secs)) + 0.99 * ramp(secs - rest_secs - 2.0);
     let mut along = 0.0;
     let poses = (0..=((duration_secs + 1.0) * 100.0) as i64).map(|k| {
         let secs = k as f64 / 100.0;
-        let world_from_body = flight.world_from_body(along);
+        let mut world_from_body = flight.world_from_body(along);
+        let phase = 6.0 * std::f64::consts::PI * secs;
+        world_from_body.translation += Vector3::new(phase.sin(), phase.cos(), 0.0) * tremor_m;
         along += 0.01 * speed(secs);
         StampedPose { time: EPOCH + Duration::from_millis(10 * k), world_from_body }
     });

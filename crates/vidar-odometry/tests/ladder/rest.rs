@@ -100,12 +100,31 @@ fn a_minute_of_rest_in_the_middle_of_a_flight_does_not_drift() {
 /// Too slow for a parallax that tells distances, too fast for a standstill: the accelerometer alone would carry the state away.
 #[test]
 fn a_body_that_creeps_after_a_rest_stays_where_it_is_until_it_flies() {
-    let recording = rendered_after_creeping(8.0);
+    let recording = rendered_after_creeping(8.0, 1.0, 0.0);
     let outputs = recording.run();
     assert!(lost(&outputs).is_empty(), "{:?}", lost(&outputs));
     let far = drift(&outputs, 0.0, 3.0);
     let (ate, share) = recording.error_and_share("creeping for 2 s after a rest", &outputs);
     eprintln!("{far:.4} m within the first three seconds");
     assert!(far < 0.03, "{far} m while it creeps");
+    assert!(ate < 0.03 && share > 0.6, "{ate} m, {share} of the images");
+}
+
+/// A hand that holds a camera is never still to the IMU, and shows no parallax: the state begins all the same.
+#[test]
+fn a_trembling_hand_that_hardly_moves_has_a_state_after_a_second() {
+    let mut recording = rendered_after_creeping(8.0, 0.5, 1.5e-3);
+    // Clock and readout are known, as after a first pass over a recording.
+    recording.config.align_timing = false;
+    let outputs = recording.run();
+    assert!(lost(&outputs).is_empty(), "{:?}", lost(&outputs));
+    let first = outputs.iter().find(|o| o.tracking().is_some()).unwrap();
+    let waited = (first.time - EPOCH).as_secs_f64();
+    assert!((0.9..1.6).contains(&waited), "first state after {waited} s");
+    assert!(first.tracking().unwrap().scale_std > 0.3, "nothing has told the scale yet");
+    let far = drift(&outputs, 0.0, 2.5);
+    let (ate, share) = recording.error_and_share("a hand that hardly moves for 2.5 s", &outputs);
+    eprintln!("{far:.4} m within the first 2.5 seconds");
+    assert!(far < 0.05, "{far} m while it hardly moves");
     assert!(ate < 0.03 && share > 0.6, "{ate} m, {share} of the images");
 }

@@ -6,10 +6,20 @@ use crate::bundle_adjustment::TrackLog;
 use crate::config::OdometryConfig;
 use crate::frontend::FrontendConfig;
 use crate::initialization::{INITIAL_INVERSE_DISTANCE, InitialState, Initializer, STILL_SECS};
-use crate::initialization::{InitFailure, StaticInitConfig, initialize_static};
+use crate::initialization::{
+    InitFailure, InitFailureReason, StaticInitConfig, StaticState, initialize_slow, initialize_static,
+};
 use crate::tracking::{HostImage, ImuStatistics, SlidingWindowOdometry, StepReport, Tracker};
 use std::rc::Rc;
 use vidar_core::{Duration, Frame, FrameId, ImuSample, RigCamera, Timestamp};
+
+/// Images without parallax for this long begin a state that hardly moves, s.
+const SLOW_SECS: f64 = 1.0;
+
+/// Whether a failed attempt says that the body hardly moved for long enough.
+pub(super) fn hardly_moves(initializer: &Initializer, failure: &InitFailure) -> bool {
+    failure.reason == InitFailureReason::Parallax && initializer.logged_secs() >= SLOW_SECS
+}
 
 impl Odometry {
     /// Whether the IMU measurements of the last half second are those of a body at rest.
@@ -33,26 +43,53 @@ impl Odometry {
             Ok(at_rest) => at_rest,
             Err(failure) => return self.wait(failure),
         };
+        match self.start_at(host, time, &at_rest) {
+            Some(mut window) => {
+                window.stand(time);
+                self.begin(window, frame, host.frame)
+            }
+            None => self.wait(self.failure.clone()),
+        }
+    }
+
+    /// Starts from a body whose images show no parallax though it does not stand still: a hand that holds a camera, or turns
+    /// it on the spot. Level and gyroscope bias are known, the velocity is small, and the scale follows as soon as there is parallax.
+    pub(super) fn start_slow(
+        &mut self,
+        failure: InitFailure,
+        frame: &Frame,
+        host: &Rc<HostImage>,
+        time: Timestamp,
+    ) -> Status {
+        let Phase::Initializing(initializer) = &self.phase else { return self.wait(failure) };
+        let (from, gyro_bias) = (time - Duration::from_secs_f64(SLOW_SECS), initializer.gyro_bias());
+        let samples: Vec<ImuSample> =
+            self.imu.iter().filter(|s| (from..=time).contains(&s.time)).copied().collect();
+        let Ok(slow) = initialize_slow(&samples, &gyro_bias, self.config.gravity_mps2) else {
+            return self.wait(failure);
+        };
+        match self.start_at(host, time, &slow) {
+            Some(window) => self.begin(window, frame, host.frame),
+            None => self.wait(failure),
+        }
+    }
+
+    /// A window that begins with this image and state.
+    fn start_at(
+        &mut self,
+        host: &Rc<HostImage>,
+        time: Timestamp,
+        start: &StaticState,
+    ) -> Option<SlidingWindowOdometry> {
         self.time_calibration.forget_tracks();
         self.log.iter_mut().for_each(TrackLog::next_generation);
-        let Ok(mut smoother) = self.smoother() else { return self.wait(self.failure.clone()) };
-        let begun = smoother.start(host.frame, time, at_rest.state, at_rest.sigmas);
-        if begun.and_then(|()| smoother.mark_keyframe(host.frame)).is_err() {
-            return self.wait(self.failure.clone());
-        }
+        let mut smoother = self.smoother().ok()?;
+        smoother.start(host.frame, time, start.state, start.sigmas).ok()?;
+        smoother.mark_keyframe(host.frame).ok()?;
         let mut tracker = Tracker::new(self.camera.model.clone(), &self.frontend, IMAGE_NOISE_GRAY);
         tracker.detect(host, 2 * self.config.max_landmarks, INITIAL_INVERSE_DISTANCE);
-        let hosts = vec![host.clone()];
-        let window = SlidingWindowOdometry::new(
-            self.config.clone(),
-            smoother,
-            tracker,
-            hosts,
-            INITIAL_INVERSE_DISTANCE,
-        );
-        let Some(mut window) = window else { return self.wait(self.failure.clone()) };
-        window.stand(time);
-        self.begin(window, frame, host.frame)
+        let (config, hosts) = (self.config.clone(), vec![host.clone()]);
+        SlidingWindowOdometry::new(config, smoother, tracker, hosts, INITIAL_INVERSE_DISTANCE)
     }
 
     /// Goes on with the smoother that solved the start.
