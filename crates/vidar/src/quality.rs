@@ -37,6 +37,7 @@ struct AdjustedQuality {
     first: Timestamp,
     last: Timestamp,
     scale_std: f64,
+    inertial_chi2: f64,
 }
 
 /// States of one segment.
@@ -103,7 +104,13 @@ impl TrackQuality {
             first: first.1.time,
             last: last.1.time,
             scale_std: adjusted.scale_std,
+            inertial_chi2: adjusted.report.inertial_chi2_per_dof,
         });
+    }
+
+    /// χ² per degree of freedom that the adjustment left of the IMU; `None` for live states.
+    pub fn inertial_chi2(&self) -> Option<f64> {
+        self.adjusted.map(|a| a.inertial_chi2)
     }
 
     /// Images with a state in the one world that is mapped.
