@@ -9,5 +9,5 @@ mod recorded;
 mod store;
 
 pub use memory::MemoryStore;
-pub use recorded::{RECORDED, RecordedChunk, RecordedModel, Recording};
+pub use recorded::{RECORDED, RecordedChunk, RecordedModel, RecordedShapes, Recording};
 pub use store::{ChunkStore, StoredChunk};

@@ -22,6 +22,8 @@ pub(super) const CHUNK_SCHEMA: &str = "vidar.chunk/1";
 const FORMAT: &str = "chunk npz";
 /// Most bytes that one view of a prediction may hold: 2048 x 2048 pixels of 16 bytes each.
 const VIEW_BYTES: u64 = 64 << 20;
+/// Name of the array of another model's depth.
+const SHAPES: &str = "shape";
 /// What the names of loops' files begin with.
 const LOOP: &str = "loop-";
 
@@ -36,6 +38,8 @@ pub struct StoredChunk {
     pub colors: Vec<Image<[u8; 3]>>,
     /// Each view's descriptor for place recognition; empty where images serve.
     pub descriptors: Vec<Vec<f32>>,
+    /// Each view's depth by another model, in any unit, for what the prediction leaves empty; empty where there is none.
+    pub shapes: Vec<Option<Image<f32>>>,
     /// Why there is no prediction.
     pub failure: Option<String>,
 }
@@ -43,7 +47,14 @@ pub struct StoredChunk {
 impl StoredChunk {
     /// A prediction alone.
     pub fn of(prediction: GeometryPrediction) -> Self {
-        Self { prediction, times: Vec::new(), colors: Vec::new(), descriptors: Vec::new(), failure: None }
+        Self {
+            prediction,
+            times: Vec::new(),
+            colors: Vec::new(),
+            descriptors: Vec::new(),
+            shapes: Vec::new(),
+            failure: None,
+        }
     }
 }
 
@@ -234,10 +245,42 @@ fn pack(chunk: &StoredChunk) -> Result<Vec<u8>, Error> {
         descriptors = NpyArray::new(vec![n, first.len()], NpyData::F32(chunk.descriptors.concat()))?;
         arrays.push(("place", &descriptors));
     }
+    let shapes;
+    if let Some(array) = packed_shapes(&chunk.shapes, n)? {
+        shapes = array;
+        arrays.push((SHAPES, &shapes));
+    }
     let mut packed = std::io::Cursor::new(Vec::new());
     write_npz_arrays_with(&mut packed, &arrays, Packing::Stored)?;
     packed.flush().map_err(|e| Error::io("pack", Path::new(FORMAT), e))?;
     Ok(packed.into_inner())
+}
+
+/// One image per view at the size of the first; NaN where a view has none.
+fn packed_shapes(shapes: &[Option<Image<f32>>], n: usize) -> Result<Option<NpyArray>, Error> {
+    let Some(first) = shapes.iter().flatten().next().filter(|_| shapes.len() == n) else { return Ok(None) };
+    let (width, height) = (first.width(), first.height());
+    let empty = Image::filled(width, height, f32::NAN);
+    let of_size = |s: &Option<Image<f32>>| match s {
+        Some(image) if (image.width(), image.height()) == (width, height) => image.data().to_vec(),
+        _ => empty.data().to_vec(),
+    };
+    let values = shapes.iter().flat_map(of_size).collect();
+    Ok(Some(NpyArray::new(vec![n, height, width], NpyData::F32(values))?))
+}
+
+/// As [`packed_shapes`] wrote them; images of NaN alone are none.
+fn unpacked_shapes(array: NpyArray, n: usize) -> Vec<Option<Image<f32>>> {
+    let (height, width) = match array.shape[..] {
+        [found, height, width] if found == n && height * width > 0 => (height, width),
+        _ => return Vec::new(),
+    };
+    let values = array.into_f32().unwrap_or_default();
+    let image = |v: &[f32]| {
+        let image = Image::from_vec(width, height, v.to_vec()).ok()?;
+        image.data().iter().any(|z| z.is_finite()).then_some(image)
+    };
+    values.chunks(width * height).map(image).collect()
 }
 
 fn rows(m: &Matrix4<f64>) -> Vec<f64> {
@@ -327,8 +370,10 @@ pub(super) fn read_views(
         }
         _ => Vec::new(),
     };
+    let shapes = take(&[SHAPES]).map_or_else(Vec::new, |array| unpacked_shapes(array, n));
     let prediction = GeometryPrediction { chunk_id, frame, views };
-    Ok(StoredChunk { prediction, times: vec![Timestamp::default(); n], colors, descriptors, failure: None })
+    let times = vec![Timestamp::default(); n];
+    Ok(StoredChunk { prediction, times, colors, descriptors, shapes, failure: None })
 }
 
 /// `n` matrices of three rows and `columns` columns; a fourth row is left out.

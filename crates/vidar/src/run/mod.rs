@@ -1,5 +1,7 @@
 //! One run: recording → engine → evaluate → export.
 
+mod auto;
+mod by_source;
 mod evaluate;
 mod map;
 mod outputs;
@@ -17,6 +19,7 @@ mod trust;
 mod views;
 
 pub(crate) use evaluate::sampled;
+pub use by_source::SourceScore;
 pub use evaluate::{DepthScore, Evaluation};
 pub use map::MetricMap;
 pub use outputs::pose_of;
