@@ -183,7 +183,16 @@ impl AlignedView {
         if !world_from_camera.is_finite() {
             return Err(GeometryError::BadPose { frame: frame_id });
         }
-        Ok(Self { frame_id, time, world_from_camera, intrinsics, depth, confidence, color: None, origin: None })
+        Ok(Self {
+            frame_id,
+            time,
+            world_from_camera,
+            intrinsics,
+            depth,
+            confidence,
+            color: None,
+            origin: None,
+        })
     }
 
     /// The same view with colours.

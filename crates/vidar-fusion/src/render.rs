@@ -155,11 +155,7 @@ impl Eye {
             return None;
         }
         let inverse = 1.0 / p.z;
-        Some([
-            self.k[0] * p.x * inverse + self.k[2],
-            self.k[1] * p.y * inverse + self.k[3],
-            inverse,
-        ])
+        Some([self.k[0] * p.x * inverse + self.k[2], self.k[1] * p.y * inverse + self.k[3], inverse])
     }
 }
 

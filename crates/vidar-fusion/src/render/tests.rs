@@ -21,7 +21,8 @@ fn ball(k: &Pinhole, x: f64) -> Image<f32> {
 
 fn fused_ball() -> TriangleMesh {
     let k = camera();
-    let mut volume = TsdfVolume::new(&FusionConfig { voxel_size_m: 0.01, ..FusionConfig::default() }).unwrap();
+    let mut volume =
+        TsdfVolume::new(&FusionConfig { voxel_size_m: 0.01, ..FusionConfig::default() }).unwrap();
     for i in 0..5_u32 {
         let x = 0.1 * (f64::from(i) - 2.0);
         let pose = Se3::from_translation(Vector3::new(x, 0.0, 0.0));

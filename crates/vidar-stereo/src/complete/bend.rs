@@ -84,12 +84,7 @@ fn continued(shape: &[f32], width: usize) -> Vec<f32> {
 }
 
 impl Level {
-    fn finest(
-        width: usize,
-        height: usize,
-        known: Vec<f32>,
-        tie: impl Fn(usize, usize) -> f32,
-    ) -> Self {
+    fn finest(width: usize, height: usize, known: Vec<f32>, tie: impl Fn(usize, usize) -> f32) -> Self {
         let all = |step: usize, has: &dyn Fn(usize) -> bool| -> Vec<f32> {
             (0..width * height).map(|i| if has(i) { tie(i, i + step) } else { 0.0 }).collect()
         };
@@ -131,10 +126,10 @@ impl Level {
                     let inner = 0.5 * (resistance(tie(0)) + resistance(tie(2)).min(resistance(tie(1))));
                     if tie(1) > 0.0 { 1.0 / (inner + resistance(tie(1))) } else { 0.0 }
                 };
-                halved.right[i] = chain(&self.right, 2 * x, 2 * y, 1, 0)
-                    + chain(&self.right, 2 * x, 2 * y + 1, 1, 0);
-                halved.below[i] = chain(&self.below, 2 * x, 2 * y, 0, 1)
-                    + chain(&self.below, 2 * x + 1, 2 * y, 0, 1);
+                halved.right[i] =
+                    chain(&self.right, 2 * x, 2 * y, 1, 0) + chain(&self.right, 2 * x, 2 * y + 1, 1, 0);
+                halved.below[i] =
+                    chain(&self.below, 2 * x, 2 * y, 0, 1) + chain(&self.below, 2 * x + 1, 2 * y, 0, 1);
             }
         }
         Some(halved)
@@ -211,8 +206,7 @@ pub(super) fn distances(log_depth: &[f32], width: usize, height: usize) -> Vec<f
             let (x, y) = ((i % width) as i64, (i / width) as i64);
             let sign = if forward { -1 } else { 1 };
             let mut nearest = distance[i];
-            for (dx, dy, length) in
-                [(1, 0, STRAIGHT), (0, 1, STRAIGHT), (1, 1, DIAGONAL), (-1, 1, DIAGONAL)]
+            for (dx, dy, length) in [(1, 0, STRAIGHT), (0, 1, STRAIGHT), (1, 1, DIAGONAL), (-1, 1, DIAGONAL)]
             {
                 let (x, y) = (x + sign * dx, y + sign * dy);
                 if x >= 0 && y >= 0 && x < width as i64 && y < height as i64 {

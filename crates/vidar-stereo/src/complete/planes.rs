@@ -49,8 +49,11 @@ pub(super) fn fit_all(regions: &Regions, log_depth: &[f32], k: &Pinhole) -> Vec<
         Vector3::new((u - k.cx) / k.fx, (v - k.cy) / k.fy, 1.0)
     };
     let fill = |members: &Vec<(u32, bool)>| {
-        let empty: Vec<usize> =
-            members.iter().filter(|m| m.1 && log_depth[m.0 as usize].is_nan()).map(|m| m.0 as usize).collect();
+        let empty: Vec<usize> = members
+            .iter()
+            .filter(|m| m.1 && log_depth[m.0 as usize].is_nan())
+            .map(|m| m.0 as usize)
+            .collect();
         if empty.is_empty() {
             return None;
         }
@@ -63,7 +66,8 @@ pub(super) fn fit_all(regions: &Regions, log_depth: &[f32], k: &Pinhole) -> Vec<
         };
         let anchors: Vec<Anchor> = measured.iter().step_by(stride).map(anchor).collect();
         let plane = Plane::through(&anchors)?;
-        let pixels: Vec<_> = empty.iter().filter_map(|i| plane.at(&ray(*i)).map(|(d, s)| (*i, d, s))).collect();
+        let pixels: Vec<_> =
+            empty.iter().filter_map(|i| plane.at(&ray(*i)).map(|(d, s)| (*i, d, s))).collect();
         Some(FilledPlane { pixels })
     };
     regions.members.iter().filter_map(fill).collect()
@@ -156,4 +160,3 @@ impl Sequence {
         ((self.0 >> 33) % end as u64) as usize
     }
 }
-

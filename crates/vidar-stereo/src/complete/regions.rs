@@ -33,8 +33,10 @@ impl Regions {
         let is_flat: Vec<bool> = (0..width * height)
             .map(|i| {
                 let (x, y) = (i % width, i / width);
-                let across = smooth[y * width + (x + 1).min(width - 1)] - smooth[y * width + x.saturating_sub(1)];
-                let down = smooth[(y + 1).min(height - 1) * width + x] - smooth[y.saturating_sub(1) * width + x];
+                let across =
+                    smooth[y * width + (x + 1).min(width - 1)] - smooth[y * width + x.saturating_sub(1)];
+                let down =
+                    smooth[(y + 1).min(height - 1) * width + x] - smooth[y.saturating_sub(1) * width + x];
                 across.abs().max(down.abs()) <= MAX_STEP
             })
             .collect();

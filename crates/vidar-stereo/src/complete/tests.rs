@@ -57,8 +57,11 @@ fn nothing() -> Image<f32> {
 /// Largest relative error, and number, of the pixels from one source.
 fn worst(view: &AlignedView, truth: fn(usize, usize) -> f32, source: DepthSource) -> (f32, usize) {
     let (depth, origins) = (view.depth().image(), view.origin().unwrap());
-    let pixels = (0..WIDTH * HEIGHT).map(|i| (i % WIDTH, i / WIDTH)).filter(|at| origins[*at].source == source);
-    pixels.fold((0.0, 0), |(worst, n), (x, y)| (f32::max(worst, (depth[(x, y)] / truth(x, y) - 1.0).abs()), n + 1))
+    let pixels =
+        (0..WIDTH * HEIGHT).map(|i| (i % WIDTH, i / WIDTH)).filter(|at| origins[*at].source == source);
+    pixels.fold((0.0, 0), |(worst, n), (x, y)| {
+        (f32::max(worst, (depth[(x, y)] / truth(x, y) - 1.0).abs()), n + 1)
+    })
 }
 
 #[test]
@@ -140,7 +143,8 @@ fn errors_are_observed_where_the_surface_knows_what_stereo_does_not() {
 fn a_view_without_depth_stays_without() {
     let view = view(|_, _| f32::NAN);
     let map = nothing();
-    let completed = complete(&view, &Evidence { map: &map, network: Some(&map) }, &Spread::default()).unwrap();
+    let completed =
+        complete(&view, &Evidence { map: &map, network: Some(&map) }, &Spread::default()).unwrap();
     assert_eq!(completed.depth().valid_ratio(), 0.0);
     assert!(completed.origin().unwrap().data().iter().all(|o| o.source == DepthSource::None));
     let small = Image::filled(3, 2, 1.0);

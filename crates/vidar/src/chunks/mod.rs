@@ -6,6 +6,7 @@
 
 mod memory;
 mod recorded;
+mod shapes;
 mod store;
 
 pub use memory::MemoryStore;

@@ -221,8 +221,11 @@ impl RecordedShapes {
         let holds = |chunk: &RecordedChunk| chunk.images.binary_search(&image).is_ok();
         let Some(chunk) = self.recording.chunks.iter().position(holds) else { return Ok(None) };
         if self.last.as_ref().is_none_or(|(read, _)| *read != chunk) {
-            let ids: Vec<FrameId> =
-                self.recording.chunks[chunk].images.iter().filter_map(|i| self.images.get(*i).copied()).collect();
+            let ids: Vec<FrameId> = self.recording.chunks[chunk]
+                .images
+                .iter()
+                .filter_map(|i| self.images.get(*i).copied())
+                .collect();
             self.last = Some((chunk, self.recording.read(chunk, &ids)?));
         }
         let views = self.last.iter().flat_map(|(_, stored)| &stored.prediction.views);

@@ -1,5 +1,6 @@
 //! One chunk's prediction as a file, and back.
 
+use super::shapes::{pack_shapes, unpack_shapes};
 use crate::engine::PredictionId;
 use crate::error::Error;
 use crate::run_folder::pretty;
@@ -246,7 +247,7 @@ fn pack(chunk: &StoredChunk) -> Result<Vec<u8>, Error> {
         arrays.push(("place", &descriptors));
     }
     let shapes;
-    if let Some(array) = packed_shapes(&chunk.shapes, n)? {
+    if let Some(array) = pack_shapes(&chunk.shapes, n)? {
         shapes = array;
         arrays.push((SHAPES, &shapes));
     }
@@ -254,33 +255,6 @@ fn pack(chunk: &StoredChunk) -> Result<Vec<u8>, Error> {
     write_npz_arrays_with(&mut packed, &arrays, Packing::Stored)?;
     packed.flush().map_err(|e| Error::io("pack", Path::new(FORMAT), e))?;
     Ok(packed.into_inner())
-}
-
-/// One image per view at the size of the first; NaN where a view has none.
-fn packed_shapes(shapes: &[Option<Image<f32>>], n: usize) -> Result<Option<NpyArray>, Error> {
-    let Some(first) = shapes.iter().flatten().next().filter(|_| shapes.len() == n) else { return Ok(None) };
-    let (width, height) = (first.width(), first.height());
-    let empty = Image::filled(width, height, f32::NAN);
-    let of_size = |s: &Option<Image<f32>>| match s {
-        Some(image) if (image.width(), image.height()) == (width, height) => image.data().to_vec(),
-        _ => empty.data().to_vec(),
-    };
-    let values = shapes.iter().flat_map(of_size).collect();
-    Ok(Some(NpyArray::new(vec![n, height, width], NpyData::F32(values))?))
-}
-
-/// As [`packed_shapes`] wrote them; images of NaN alone are none.
-fn unpacked_shapes(array: NpyArray, n: usize) -> Vec<Option<Image<f32>>> {
-    let (height, width) = match array.shape[..] {
-        [found, height, width] if found == n && height * width > 0 => (height, width),
-        _ => return Vec::new(),
-    };
-    let values = array.into_f32().unwrap_or_default();
-    let image = |v: &[f32]| {
-        let image = Image::from_vec(width, height, v.to_vec()).ok()?;
-        image.data().iter().any(|z| z.is_finite()).then_some(image)
-    };
-    values.chunks(width * height).map(image).collect()
 }
 
 fn rows(m: &Matrix4<f64>) -> Vec<f64> {
@@ -370,7 +344,7 @@ pub(super) fn read_views(
         }
         _ => Vec::new(),
     };
-    let shapes = take(&[SHAPES]).map_or_else(Vec::new, |array| unpacked_shapes(array, n));
+    let shapes = take(&[SHAPES]).map_or_else(Vec::new, |array| unpack_shapes(array, n));
     let prediction = GeometryPrediction { chunk_id, frame, views };
     let times = vec![Timestamp::default(); n];
     Ok(StoredChunk { prediction, times, colors, descriptors, shapes, failure: None })

@@ -85,7 +85,7 @@ pub struct GeometryConfig {
     /// predictions of another program in that folder.
     pub source: String,
     /// The network that `auto` bends onto measured depth where nothing is measured: one of `vidar model list`, `recorded:DIR`, or
-    /// `none`, which interpolates. `auto` only.
+    /// `none`, which interpolates (as good as `da3-nano`, and it costs nothing). `auto` only.
     pub fill_network: String,
     /// Keyframes that are predicted together. Larger chunks need more memory and are more consistent.
     pub chunk_keyframes: usize,
@@ -102,7 +102,7 @@ impl Default for GeometryConfig {
     fn default() -> Self {
         Self {
             source: "stereo".into(),
-            fill_network: "da3-nano".into(),
+            fill_network: geometry::NO_NETWORK.into(),
             chunk_keyframes: 16,
             overlap_keyframes: 4,
             context_keyframes: 16,

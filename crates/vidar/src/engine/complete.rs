@@ -2,8 +2,8 @@
 //!
 //! The surface by stereo alone is seen from every keyframe, planes and a network's shape fill what it leaves
 //! ([`vidar_stereo::complete`]). The surface that is rendered stays as it was: what is filled in one view never supports what
-//! is filled in another, so the result depends on no order. Into the map go planes, and of the guesses those that views of
-//! other directions confirm.
+//! is filled in another, so the result depends on no order. Planes join the map; guesses do not, and what the map itself showed
+//! is in it already.
 
 use super::Sink;
 use super::events::MapEvent;
@@ -13,20 +13,10 @@ use super::setup::{PredictionId, PredictionStore};
 use crate::error::Error;
 use rayon::prelude::*;
 use vidar_align::Placement;
-use vidar_core::{
-    AlignedView, ChunkId, Confidence, DepthSource, GeometryError, Image, LieGroup, TriangleMesh,
-};
+use vidar_core::{AlignedView, ChunkId, Confidence, DepthSource, GeometryError, Image, TriangleMesh};
 use vidar_fusion::SurfaceRenderer;
 use vidar_stereo::StereoError;
 use vidar_stereo::complete::{ErrorStatistics, Evidence, Spread, complete, errors_where_hidden};
-
-/// Views that confirm a guess, and the relative difference up to which they do: stereo's own `agreement_ratio`.
-const CONFIRMING_VIEWS: usize = 2;
-const CONFIRMED_RATIO: f64 = 0.02;
-/// Least angle between the rays of two views that confirm each other: guesses from one place err alike.
-const LEAST_ANGLE_COS: f64 = 0.996_194_698;
-/// Confidence of a confirmed guess: just above what fusion takes by default, so that it never outweighs a measurement.
-const CONFIRMED: f32 = 0.35;
 
 /// Chunks, and views of each, at which errors are observed, spread over the recording: errors of a room's walls are much the
 /// same in all of its views, and a long recording should not pay more.
@@ -55,7 +45,8 @@ pub fn complete_chunks(
             break;
         }
         let views = completion.complete(&read(*chunk)?)?;
-        surface.fuse(&confirmed(&views)?).into_iter().try_for_each(&mut *sink)?;
+        let planes = views.iter().map(planes_alone).collect::<Result<Vec<_>, _>>()?;
+        surface.fuse(&planes).into_iter().try_for_each(&mut *sink)?;
         sink(MapEvent::ViewsFused(views))?;
     }
     Ok(())
@@ -89,8 +80,6 @@ impl<'m> Completion<'m> {
             statistics.add(&one?);
         }
         completion.spread = statistics.spread(&completion.spread);
-        #[allow(clippy::print_stderr)]
-        { eprintln!("DBG {:?}", completion.spread); }
         Ok(completion)
     }
 
@@ -113,35 +102,20 @@ impl<'m> Completion<'m> {
     }
 }
 
-/// Of completed views what the map does not hold yet: planes, and guesses that other views confirm. Other pixels keep their
-/// depth, so that slopes and free space are right, and get no confidence.
-fn confirmed(views: &[AlignedView]) -> Result<Vec<AlignedView>, Error> {
-    let one = |(number, view): (usize, &AlignedView)| {
-        let others: Vec<&AlignedView> =
-            views.iter().enumerate().filter(|(i, _)| *i != number).map(|(_, v)| v).collect();
-        newly_known(view, &others)
-    };
-    let found: Vec<_> = views.par_iter().enumerate().map(one).collect();
-    found.into_iter().collect()
-}
-
-fn newly_known(view: &AlignedView, others: &[&AlignedView]) -> Result<AlignedView, Error> {
+/// Of completed views what the map does not hold yet: the planes. Other pixels keep their depth, so that slopes and free space
+/// are right, and get no confidence.
+fn planes_alone(view: &AlignedView) -> Result<AlignedView, Error> {
     let k = view.intrinsics();
     let own = view.confidence().image();
-    let confidence = |x: usize, y: usize| match view.origin().map(|o| o[(x, y)].source) {
-        Some(DepthSource::Plane) if std::env::var("DA_NOPLANE").is_ok() => 0.0,
-        Some(DepthSource::Plane) => own[(x, y)],
-        Some(source) if std::env::var("DA_NOCONF").is_err() && source.is_guess() && is_confirmed(view, (x, y), others) => CONFIRMED,
-        _ => 0.0,
-    };
+    let is_plane = |at: (usize, usize)| view.origin().is_some_and(|o| o[at].source == DepthSource::Plane);
+    let confidence = |x: usize, y: usize| if is_plane((x, y)) { own[(x, y)] } else { 0.0 };
     let confidence = Confidence::new(Image::from_fn(k.width, k.height, confidence));
     let pose = *view.world_from_camera();
-    let found =
-        AlignedView::new(view.frame_id(), view.time(), pose, *k, view.depth().clone(), confidence)
-            .map_err(unfit)?;
+    let planes = AlignedView::new(view.frame_id(), view.time(), pose, *k, view.depth().clone(), confidence)
+        .map_err(unfit)?;
     match view.color() {
-        Some(color) => found.with_color(color.clone()).map_err(unfit),
-        None => Ok(found),
+        Some(color) => planes.with_color(color.clone()).map_err(unfit),
+        None => Ok(planes),
     }
 }
 
@@ -149,30 +123,6 @@ fn newly_known(view: &AlignedView, others: &[&AlignedView]) -> Result<AlignedVie
 fn unfit(error: GeometryError) -> Error {
     StereoError::Internal { what: error.to_string() }.into()
 }
-
-/// Whether enough other views, from other directions, have the same depth where this pixel is.
-fn is_confirmed(view: &AlignedView, (x, y): (usize, usize), others: &[&AlignedView]) -> bool {
-    let (k, z) = (view.intrinsics(), f64::from(view.depth().image()[(x, y)]));
-    let ray = nalgebra::Vector3::new((x as f64 - k.cx) / k.fx, (y as f64 - k.cy) / k.fy, 1.0);
-    let point = *view.world_from_camera() * (ray * z);
-    let agrees = |other: &&&AlignedView| {
-        let in_other = other.world_from_camera().inverse() * point;
-        let Some(pixel) = other.intrinsics().project(&in_other) else { return false };
-        let (u, v) = (pixel.x.round(), pixel.y.round());
-        let k = other.intrinsics();
-        if !(u >= 0.0 && v >= 0.0 && u < k.width as f64 && v < k.height as f64) {
-            return false;
-        }
-        let there = f64::from(other.depth().image()[(u as usize, v as usize)]);
-        let towards = point - other.world_from_camera().translation;
-        let from_here = point - view.world_from_camera().translation;
-        let cos = towards.dot(&from_here) / (towards.norm() * from_here.norm());
-        (there / in_other.z - 1.0).abs() < dbg_env("DA_R", CONFIRMED_RATIO) && cos < dbg_env("DA_A", LEAST_ANGLE_COS)
-    };
-    let n = dbg_env("DA_V", CONFIRMING_VIEWS as f64) as usize;
-    f64::from(view.origin().map_or(0.0, |o| o[(x, y)].log_std)) < dbg_env("DA_S", 9.0) && others.iter().filter(agrees).take(n).count() == n
-}
-fn dbg_env(name: &str, default: f64) -> f64 { std::env::var(name).ok().and_then(|v| v.parse().ok()).unwrap_or(default) }
 
 /// An image at another size, pixel centres kept (`c' = (c + 0.5)·s − 0.5`): bilinear, or the nearest where one of the four
 /// pixels is NaN.

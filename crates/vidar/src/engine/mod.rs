@@ -446,8 +446,7 @@ impl<'a> Engine<'a> {
         let cancelled = self.cancelled;
         let is_stopped = || cancelled() && !was_cancelled;
         let owns_views = |c: &ChunkId| placement.views.iter().any(|v| v.owner == *c);
-        let chunks: Vec<ChunkId> =
-            placement.chunks.iter().map(|c| c.chunk_id).filter(owns_views).collect();
+        let chunks: Vec<ChunkId> = placement.chunks.iter().map(|c| c.chunk_id).filter(owns_views).collect();
         let completes = self.predictor.geometry.completes();
         for chunk in &chunks {
             if is_stopped() {

@@ -102,8 +102,10 @@ impl AutoModel {
             }
             Some(Shapes::Network(network)) => {
                 let is_wanted = |v: &&vidar_core::ChunkView| frames.contains(&v.frame_id);
-                let views =
-                    ChunkViews { id: views.id, views: views.views.iter().filter(is_wanted).cloned().collect() };
+                let views = ChunkViews {
+                    id: views.id,
+                    views: views.views.iter().filter(is_wanted).cloned().collect(),
+                };
                 let count = views.views.len();
                 let predicted = network.0.predict_views(&views, 0..count, watch)?;
                 let of = |frame: &FrameId| {

@@ -44,7 +44,8 @@ impl BySource {
         let depths = view.depth().image().data().iter().zip(truth.image().data());
         for ((d, g), origin) in depths.zip(origins.data()) {
             self.truth_pixels += usize::from(!g.is_nan());
-            let Some(sums) = (origin.source as usize).checked_sub(1).and_then(|i| self.sums.get_mut(i)) else {
+            let Some(sums) = (origin.source as usize).checked_sub(1).and_then(|i| self.sums.get_mut(i))
+            else {
                 continue;
             };
             if d.is_nan() || g.is_nan() {
@@ -96,8 +97,7 @@ mod tests {
     #[test]
     fn errors_are_counted_with_their_source_and_guesses_taken_out() {
         let image = |values: [f32; 4]| MetricDepth::new(Image::from_vec(4, 1, values.to_vec()).unwrap());
-        let sources =
-            [DepthSource::Stereo, DepthSource::Stereo, DepthSource::Network, DepthSource::None];
+        let sources = [DepthSource::Stereo, DepthSource::Stereo, DepthSource::Network, DepthSource::None];
         let origins = sources.map(|source| DepthOrigin { source, log_std: 0.03 }).to_vec();
         let k = Pinhole::new(4.0, 4.0, 1.5, 0.0, 4, 1).unwrap();
         let view = AlignedView::new(

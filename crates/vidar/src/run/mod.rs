@@ -18,8 +18,8 @@ mod tracking;
 mod trust;
 mod views;
 
-pub(crate) use evaluate::sampled;
 pub use by_source::SourceScore;
+pub(crate) use evaluate::sampled;
 pub use evaluate::{DepthScore, Evaluation};
 pub use map::MetricMap;
 pub use outputs::pose_of;

@@ -1,7 +1,7 @@
 //! A run in at most twelve lines for the terminal.
 
-use super::by_source::SourceScore;
 use super::RunOutcome;
+use super::by_source::SourceScore;
 use crate::evaluate::refinement;
 use vidar_align::aligner::RejectionReason;
 
@@ -73,7 +73,8 @@ pub(super) fn lines(outcome: &RunOutcome) -> Vec<(&'static str, String)> {
             ),
         ));
     }
-    if let Some(by_source) = outcome.evaluation.depth.as_ref().map(|d| &d.by_source).filter(|s| !s.is_empty()) {
+    if let Some(by_source) = outcome.evaluation.depth.as_ref().map(|d| &d.by_source).filter(|s| !s.is_empty())
+    {
         let one = |s: &SourceScore| {
             format!("{} {:.0} % (AbsRel {:.3})", s.source.name(), 100.0 * s.share, s.abs_rel)
         };
