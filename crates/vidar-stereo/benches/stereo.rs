@@ -29,7 +29,7 @@ fn one_reference_and_its_checks(bencher: divan::Bencher<'_, '_>) {
 fn completion_of_one_view(bencher: divan::Bencher<'_, '_>, with_network: bool) {
     let (width, height) = (480, 320);
     let k = Pinhole::new(400.0, 400.0, 239.5, 159.5, width, height).expect("valid");
-    let is_blank = |x: usize, y: usize| (x / 60 + y / 60) % 2 == 0;
+    let is_blank = |x: usize, y: usize| (x / 60 + y / 60).is_multiple_of(2);
     let depth = |x: usize, y: usize| 2.0 + 0.001 * x as f32 + 0.3 * (y as f32 / 40.0).sin();
     let known = |x, y| if is_blank(x, y) { f32::NAN } else { depth(x, y) };
     let texture = |x: usize, y: usize| if is_blank(x, y) { 128 } else { (x * 7919 + y * 104_729) as u8 };
