@@ -20,7 +20,7 @@ const UNSEEN_FACTOR: f32 = 1.5;
 const LEAST_OBSERVATIONS: u64 = 2000;
 /// Errors are counted in steps of a logarithm from here on: a fifth of stereo's tolerance would not change a decision.
 const LEAST_ERROR: f32 = 1e-3;
-/// Steps per factor of e, and their number: up to an error of e⁴·10⁻³·… = 12.
+/// Steps per factor of e, and their number: up to an error of 10⁻³·e⁹·⁵ = 13.
 const STEPS_PER_E: f32 = 8.0;
 const STEPS: usize = 76;
 
