@@ -87,6 +87,10 @@ maps() {
         -o "$OUT/runs/redkitchen"
     step map-mh01 "$VIDAR" run "$DATA/euroc_MH_01_real_11s" --preset euroc --set input.poses=ground-truth \
         -o "$OUT/runs/mh01"
+    step auto-hololens "$VIDAR" run "$DATA/hololens_commonroom" --geometry auto -o "$OUT/runs/hololens-auto"
+    step auto-redkitchen "$VIDAR" run "${redkitchen[@]}" --color-from-depth=$color_from_depth --preset tum-rgbd \
+        --geometry auto -o "$OUT/runs/redkitchen-auto"
+    step auto-demo-truth "$VIDAR" demo --geometry auto --set input.poses=ground-truth -o "$OUT/runs/demo-truth-auto"
     step nano-hololens "$VIDAR" run "$DATA/hololens_commonroom" --geometry da3-nano -o "$OUT/runs/hololens-nano"
     step nano-redkitchen "$VIDAR" run "${redkitchen[@]}" --color-from-depth=$color_from_depth --preset tum-rgbd \
         --geometry da3-nano -o "$OUT/runs/redkitchen-nano"

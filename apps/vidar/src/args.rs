@@ -242,7 +242,7 @@ pub struct RunArgs {
     /// Where results go.
     #[command(flatten)]
     pub output: OutputArgs,
-    /// Source of depth: stereo, a network of `vidar model list` such as da3-small, or recorded:DIR.
+    /// Source of depth: stereo, auto (stereo, completed), a network of `vidar model list` such as da3-small, or recorded:DIR.
     #[arg(long, visible_alias = "model", value_name = "NAME", help_heading = "Model")]
     pub geometry: Option<String>,
     /// Coupling of depth and metric poses: coupled, hybrid, pose-conditioned, ground-truth, pose-free, da3-streaming.

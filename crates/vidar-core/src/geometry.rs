@@ -33,6 +33,7 @@ use crate::camera::Pinhole;
 use crate::id::FrameId;
 use crate::image::Image;
 use crate::lie::Se3;
+use crate::origin::DepthOrigin;
 use crate::time::Timestamp;
 use thiserror::Error;
 
@@ -161,6 +162,7 @@ pub struct AlignedView {
     depth: MetricDepth,
     confidence: Confidence,
     color: Option<Image<[u8; 3]>>,
+    origin: Option<Image<DepthOrigin>>,
 }
 
 impl AlignedView {
@@ -181,13 +183,29 @@ impl AlignedView {
         if !world_from_camera.is_finite() {
             return Err(GeometryError::BadPose { frame: frame_id });
         }
-        Ok(Self { frame_id, time, world_from_camera, intrinsics, depth, confidence, color: None })
+        Ok(Self {
+            frame_id,
+            time,
+            world_from_camera,
+            intrinsics,
+            depth,
+            confidence,
+            color: None,
+            origin: None,
+        })
     }
 
     /// The same view with colours.
     pub fn with_color(mut self, color: Image<[u8; 3]>) -> Result<Self, GeometryError> {
         check_size("color", &color, self.intrinsics.width, self.intrinsics.height)?;
         self.color = Some(color);
+        Ok(self)
+    }
+
+    /// The same view with the source of each pixel's depth.
+    pub fn with_origin(mut self, origin: Image<DepthOrigin>) -> Result<Self, GeometryError> {
+        check_size("source", &origin, self.intrinsics.width, self.intrinsics.height)?;
+        self.origin = Some(origin);
         Ok(self)
     }
 
@@ -219,6 +237,11 @@ impl AlignedView {
     /// Confidence in the depth.
     pub fn confidence(&self) -> &Confidence {
         &self.confidence
+    }
+
+    /// Where each pixel's depth comes from, where a view has several sources.
+    pub fn origin(&self) -> Option<&Image<DepthOrigin>> {
+        self.origin.as_ref()
     }
 
     /// Colours at the depth's size, if known.

@@ -60,6 +60,7 @@ pub mod image;
 pub mod lie;
 pub mod model;
 pub mod odometry;
+pub mod origin;
 pub mod printable;
 pub mod remap;
 pub mod rig;
@@ -83,6 +84,7 @@ pub use model::{
 pub use odometry::{
     Health, NavCovariance, NavState, OdometryKeyframe, PoseCovariance, RevisedPose, SparseLandmark,
 };
+pub use origin::{DepthOrigin, DepthSource};
 pub use printable::{printable, printable_json, printable_lines};
 pub use rig::{ImuNoise, Rig, RigCamera};
 pub use sensor::{AngularRate, Frame, ImuSample, SensorEvent, SpecificForce, TimedVector, merge_imu};

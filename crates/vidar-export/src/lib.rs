@@ -37,6 +37,7 @@ pub mod error;
 pub mod glb;
 mod json;
 pub mod official;
+mod origin;
 pub mod ply;
 mod text;
 pub mod trajectory;
@@ -48,6 +49,7 @@ pub use colmap::{ColmapFormat, ColmapModel, Observation, read_colmap, read_colma
 pub use depth::{DepthFrame, DepthPngStats, DepthSidecar, read_depth_png, write_depth_png};
 pub use error::ExportError;
 pub use glb::{Glb, read_glb, write_glb_cloud, write_glb_mesh};
+pub use origin::{STD_STEP, write_source_png, write_std_png};
 pub use ply::{Ply, read_ply, write_ply_cloud, write_ply_mesh};
 pub use trajectory::{
     KittiTimes, read_euroc_csv, read_kitti, read_kitti_times, read_tum, write_euroc_csv, write_kitti,

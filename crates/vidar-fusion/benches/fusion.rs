@@ -3,7 +3,7 @@
 #![allow(clippy::expect_used)] // a benchmark may stop at the first surprise, as a test may
 use divan::Bencher;
 use vidar_core::{AlignedView, Confidence, FrameId, Image, MetricDepth, Pinhole, Se3, So3, Timestamp};
-use vidar_fusion::{FusionConfig, PointFusion, TsdfVolume};
+use vidar_fusion::{FusionConfig, PointFusion, SurfaceRenderer, TsdfVolume};
 
 fn main() {
     divan::main();
@@ -69,4 +69,15 @@ fn integrate_one_view_into_points(bencher: Bencher<'_, '_>) {
     let mut points = PointFusion::new(&FusionConfig::default()).expect("valid default");
     let mut next = views.iter().cycle();
     bencher.bench_local(|| points.integrate(next.next().expect("endless")).expect("view fits"));
+}
+
+/// The surface of the room, some 400 000 triangles, seen at 480 × 360.
+#[divan::bench]
+fn render_one_view(bencher: Bencher<'_, '_>) {
+    let views = views(40);
+    let mesh = fused(&views).extract_mesh();
+    let renderer = SurfaceRenderer::new(&mesh);
+    let k = views[0].intrinsics().resized(480, 360).expect("valid intrinsics");
+    let mut next = views.iter().cycle();
+    bencher.bench_local(|| renderer.render(next.next().expect("endless").world_from_camera(), &k));
 }

@@ -32,7 +32,7 @@
 //! Integration of a view: [`sample`] weighs its pixels, [`allocate`] finds the blocks it touches, [`update`] adds it to
 //! the sums of each [`block`], [`carve`] adds free space. Extraction: [`field`] reads distances, [`cubes`] has the
 //! triangles, [`extract`] makes the mesh, [`components`] removes small components, [`coverage`] measures what was
-//! observed, [`double_wall`] detects double walls.
+//! observed, [`double_wall`] detects double walls, [`render`] shows the surface to a camera.
 //!
 //! A map whose poses still change is fused in [`SubVolumes`]: one volume per chunk, moved when the pose graph changes.
 
@@ -50,6 +50,7 @@ mod field;
 mod grid;
 mod pixels;
 mod points;
+mod render;
 mod sample;
 mod simd;
 mod sub_volumes;
@@ -63,5 +64,6 @@ pub use coverage::{CoverageReport, surface_area_m2};
 pub use double_wall::{DoubleWallDetector, DoubleWallReport};
 pub use error::FusionError;
 pub use points::PointFusion;
+pub use render::{RenderedDepth, SurfaceRenderer};
 pub use sub_volumes::{RevisedView, Revision, SubVolumeConfig, SubVolumeReport, SubVolumes};
 pub use volume::{IntegrationStats, TsdfVolume};

@@ -32,6 +32,7 @@
 //! sums, 60 bytes a pixel at the full size, and 24 bytes a pixel for each view's finished estimate, until the call ends.
 
 mod chunk;
+pub mod complete;
 mod confidence;
 mod config;
 mod consistency;

@@ -131,7 +131,7 @@ pub enum Event {
     },
     /// A step of the engine was worked on for this long in all.
     StepFinished {
-        /// `track`, `predict`, `align` or `fuse`.
+        /// `track`, `predict`, `align`, `fuse` or `complete`.
         step: &'static str,
         /// Wall time, s.
         seconds: f64,

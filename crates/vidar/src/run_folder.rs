@@ -170,6 +170,12 @@ pub struct StoredView {
     pub image: Option<String>,
     /// Depth PNG, relative to the run folder, if written.
     pub depth: Option<String>,
+    /// Where each pixel's depth comes from, as a PNG of the numbers of `vidar_core::DepthSource`, if there are several sources.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub depth_source: Option<String>,
+    /// Standard deviation of ln(depth), as a PNG in steps of 0.002, if there are several sources.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub depth_std: Option<String>,
     /// Undistorted intrinsics; pixel (0, 0) is the centre of the top-left pixel.
     pub intrinsics: vidar_core::Pinhole,
     /// Row-major 3×4 `world_from_camera`, metres.

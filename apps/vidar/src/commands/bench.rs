@@ -6,7 +6,7 @@ use crate::{Context, Outcome, print, progress};
 use serde_json::json;
 use vidar::align::CouplingMode;
 use vidar::bench::{BenchKind, BenchRequest, SyntheticBench};
-use vidar::models::geometry::{SourceChoice, source};
+use vidar::models::geometry::source;
 use vidar::synth::SynthConfig;
 use vidar::{Error, Layered};
 
@@ -84,7 +84,7 @@ fn modes(args: &BenchArgs, layered: &Layered) -> Result<Vec<CouplingMode>, Error
     if !args.modes.is_empty() {
         return args.modes.iter().map(|m| mode(m)).collect();
     }
-    let is_stereo = matches!(source(&layered.build()?)?, SourceChoice::Stereo);
+    let is_stereo = source(&layered.build()?)?.is_by_stereo();
     Ok(match is_stereo {
         true => vec![CouplingMode::PoseConditioned, CouplingMode::GroundTruth, CouplingMode::Coupled],
         false => vec![

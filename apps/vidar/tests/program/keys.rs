@@ -24,6 +24,8 @@ enum ExtraSettings {
     Simulated,
     /// The built-in network.
     Learned,
+    /// Stereo, completed.
+    Completed,
     /// No poses are known beforehand.
     Unposed,
     /// Voxels are so small that the map is large.
@@ -52,6 +54,7 @@ impl ExtraSettings {
                 &["geometry.source=simulated", "geometry.chunk_keyframes=4", "geometry.overlap_keyframes=2"]
             }
             Self::Learned => &["geometry.source=da3-nano"],
+            Self::Completed => &["geometry.source=auto"],
             Self::Unposed => &[
                 "geometry.source=simulated",
                 "coupling.mode=pose-free",
@@ -73,8 +76,8 @@ impl ExtraSettings {
 }
 
 use ExtraSettings::{
-    Chunked, Evaluated, Fine, Learned, Moving, Nothing, Odometry, Pictures, Refused, Simulated, Turning,
-    Unposed,
+    Chunked, Completed, Evaluated, Fine, Learned, Moving, Nothing, Odometry, Pictures, Refused, Simulated,
+    Turning, Unposed,
 };
 
 /// Ground truth at 10 Hz, 2 cm off on the way: a trajectory that must be interpolated and differs from ground truth.
@@ -130,6 +133,7 @@ const SETTINGS: &[(&str, &str, ExtraSettings)] = &[
     ("geometry.chunk_keyframes", "3", Nothing),
     ("geometry.context_keyframes", "2", Chunked),
     ("geometry.overlap_keyframes", "1", Simulated),
+    ("geometry.fill_network", "da3-nano", Completed),
     ("geometry.max_width_px", "80", Nothing),
     ("input.end_secs", "1.5", Nothing),
     ("input.max_pose_gap_secs", "0.05", Odometry),
@@ -211,8 +215,8 @@ fn every_setting_of_the_dense_pipeline_is_in_the_list() {
 #[test]
 fn every_setting_changes_what_a_run_leaves() {
     let all = [
-        Fine, Nothing, Evaluated, Refused, Pictures, Odometry, Chunked, Simulated, Learned, Unposed, Turning,
-        Moving,
+        Fine, Nothing, Evaluated, Refused, Pictures, Odometry, Chunked, Simulated, Learned, Completed,
+        Unposed, Turning, Moving,
     ];
     let bases: BTreeMap<ExtraSettings, BTreeMap<String, Vec<u8>>> = all
         .into_iter()

@@ -2,6 +2,7 @@
 // Helpers of tests are tests: they stop at the first surprise and say loudly what they skip.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::print_stderr)]
 
+mod auto;
 mod bench;
 mod calibrate;
 mod config;

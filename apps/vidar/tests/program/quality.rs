@@ -106,3 +106,18 @@ fn the_map_of_a_flight_by_the_bundled_network_is_within_its_bounds() {
         },
     );
 }
+
+#[test]
+fn the_map_of_a_flight_by_completed_stereo_is_within_its_bounds() {
+    holds(
+        "auto",
+        &Bounds {
+            most_ate_m: 0.006,
+            most_scale_error: 0.006,
+            least_f: [0.54, 0.8],
+            least_recall: 0.7,
+            least_completeness: 0.9,
+            most_abs_rel: 0.02,
+        },
+    );
+}

@@ -6,8 +6,9 @@
 
 mod memory;
 mod recorded;
+mod shapes;
 mod store;
 
 pub use memory::MemoryStore;
-pub use recorded::{RECORDED, RecordedChunk, RecordedModel, Recording};
+pub use recorded::{RECORDED, RecordedChunk, RecordedModel, RecordedShapes, Recording};
 pub use store::{ChunkStore, StoredChunk};

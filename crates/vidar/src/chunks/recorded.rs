@@ -195,6 +195,44 @@ impl GeometryModel for RecordedModel {
     }
 }
 
+/// Depth of single images, whichever chunk of a recording they are in.
+pub struct RecordedShapes {
+    recording: Recording,
+    /// Images that the recording may be of.
+    images: Vec<FrameId>,
+    /// The chunk read last: neighbours ask for the same one.
+    last: Option<(usize, StoredChunk)>,
+}
+
+impl RecordedShapes {
+    /// Depth of `images` as the recording has it.
+    pub fn new(recording: Recording, images: &[ImageEntry]) -> Self {
+        Self { recording, images: images.iter().map(|i| i.frame_id).collect(), last: None }
+    }
+
+    /// The folder.
+    pub fn folder(&self) -> &Path {
+        &self.recording.folder
+    }
+
+    /// z-depth of an image in the unit of its chunk; `None` where the recording does not hold it.
+    pub fn shape(&mut self, frame: FrameId) -> Result<Option<Image<f32>>, Error> {
+        let Some(image) = self.images.iter().position(|f| *f == frame) else { return Ok(None) };
+        let holds = |chunk: &RecordedChunk| chunk.images.binary_search(&image).is_ok();
+        let Some(chunk) = self.recording.chunks.iter().position(holds) else { return Ok(None) };
+        if self.last.as_ref().is_none_or(|(read, _)| *read != chunk) {
+            let ids: Vec<FrameId> = self.recording.chunks[chunk]
+                .images
+                .iter()
+                .filter_map(|i| self.images.get(*i).copied())
+                .collect();
+            self.last = Some((chunk, self.recording.read(chunk, &ids)?));
+        }
+        let views = self.last.iter().flat_map(|(_, stored)| &stored.prediction.views);
+        Ok(views.into_iter().find(|v| v.frame_id == frame).map(|v| v.depth.image().clone()))
+    }
+}
+
 /// Files of a folder in natural order, so that `chunk_10` comes after `chunk_9`.
 fn names(folder: &Path) -> Result<Vec<PathBuf>, Error> {
     let entries = std::fs::read_dir(folder).map_err(|e| Error::io("open", folder, e))?;

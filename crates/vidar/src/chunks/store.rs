@@ -1,5 +1,6 @@
 //! One chunk's prediction as a file, and back.
 
+use super::shapes::{pack_shapes, unpack_shapes};
 use crate::engine::PredictionId;
 use crate::error::Error;
 use crate::run_folder::pretty;
@@ -22,6 +23,8 @@ pub(super) const CHUNK_SCHEMA: &str = "vidar.chunk/1";
 const FORMAT: &str = "chunk npz";
 /// Most bytes that one view of a prediction may hold: 2048 x 2048 pixels of 16 bytes each.
 const VIEW_BYTES: u64 = 64 << 20;
+/// Name of the array of another model's depth.
+const SHAPES: &str = "shape";
 /// What the names of loops' files begin with.
 const LOOP: &str = "loop-";
 
@@ -36,6 +39,8 @@ pub struct StoredChunk {
     pub colors: Vec<Image<[u8; 3]>>,
     /// Each view's descriptor for place recognition; empty where images serve.
     pub descriptors: Vec<Vec<f32>>,
+    /// Each view's depth by another model, in any unit, for what the prediction leaves empty; empty where there is none.
+    pub shapes: Vec<Option<Image<f32>>>,
     /// Why there is no prediction.
     pub failure: Option<String>,
 }
@@ -43,7 +48,14 @@ pub struct StoredChunk {
 impl StoredChunk {
     /// A prediction alone.
     pub fn of(prediction: GeometryPrediction) -> Self {
-        Self { prediction, times: Vec::new(), colors: Vec::new(), descriptors: Vec::new(), failure: None }
+        Self {
+            prediction,
+            times: Vec::new(),
+            colors: Vec::new(),
+            descriptors: Vec::new(),
+            shapes: Vec::new(),
+            failure: None,
+        }
     }
 }
 
@@ -234,6 +246,11 @@ fn pack(chunk: &StoredChunk) -> Result<Vec<u8>, Error> {
         descriptors = NpyArray::new(vec![n, first.len()], NpyData::F32(chunk.descriptors.concat()))?;
         arrays.push(("place", &descriptors));
     }
+    let shapes;
+    if let Some(array) = pack_shapes(&chunk.shapes, n)? {
+        shapes = array;
+        arrays.push((SHAPES, &shapes));
+    }
     let mut packed = std::io::Cursor::new(Vec::new());
     write_npz_arrays_with(&mut packed, &arrays, Packing::Stored)?;
     packed.flush().map_err(|e| Error::io("pack", Path::new(FORMAT), e))?;
@@ -327,8 +344,10 @@ pub(super) fn read_views(
         }
         _ => Vec::new(),
     };
+    let shapes = take(&[SHAPES]).map_or_else(Vec::new, |array| unpack_shapes(array, n));
     let prediction = GeometryPrediction { chunk_id, frame, views };
-    Ok(StoredChunk { prediction, times: vec![Timestamp::default(); n], colors, descriptors, failure: None })
+    let times = vec![Timestamp::default(); n];
+    Ok(StoredChunk { prediction, times, colors, descriptors, shapes, failure: None })
 }
 
 /// `n` matrices of three rows and `columns` columns; a fourth row is left out.

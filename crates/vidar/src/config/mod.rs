@@ -12,7 +12,7 @@ pub use presets::{PRESETS, Preset};
 pub use vidar_align::keyframe_selection::KeyframeConfig;
 
 use crate::error::Error;
-use crate::models::geometry::SourceChoice;
+use crate::models::geometry;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -81,9 +81,12 @@ impl Default for InputConfig {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct GeometryConfig {
-    /// The model: `stereo` (needs poses, no weights), a network of `vidar model list` (`da3-small`), or `recorded:DIR`,
+    /// The model: `stereo` (needs poses, no weights), `auto` (stereo, completed by the map, planes and a network), a network of `vidar model list` (`da3-small`), or `recorded:DIR`,
     /// predictions of another program in that folder.
     pub source: String,
+    /// The network that `auto` bends onto measured depth where nothing is measured: one of `vidar model list`, `recorded:DIR`, or
+    /// `none`, which interpolates (as good as `da3-nano`, and it costs nothing). `auto` only.
+    pub fill_network: String,
     /// Keyframes that are predicted together. Larger chunks need more memory and are more consistent.
     pub chunk_keyframes: usize,
     /// Keyframes that a chunk shares with the one before it, for the overlap constraint between them. Networks and recordings only;
@@ -99,6 +102,7 @@ impl Default for GeometryConfig {
     fn default() -> Self {
         Self {
             source: "stereo".into(),
+            fill_network: geometry::NO_NETWORK.into(),
             chunk_keyframes: 16,
             overlap_keyframes: 4,
             context_keyframes: 16,
@@ -345,7 +349,7 @@ impl Config {
         positive("keyframes.min_rotation_deg", self.keyframes.min_rotation_deg)?;
         positive("output.depth_units_per_metre", self.output.depth_units_per_metre)?;
         let (chunk, overlap) = (self.geometry.chunk_keyframes, self.geometry.overlap_keyframes);
-        let overlaps = !matches!(crate::models::geometry::source(self), Ok(SourceChoice::Stereo));
+        let overlaps = !geometry::source(self).is_ok_and(|s| s.is_by_stereo());
         if overlaps && overlap >= chunk {
             return bad(format!(
                 "geometry.overlap_keyframes must be smaller than geometry.chunk_keyframes ({chunk}), found {overlap}"
@@ -357,10 +361,17 @@ impl Config {
                 self.geometry.max_width_px
             ));
         }
-        if crate::models::geometry::chosen(self).is_err() {
-            let (found, known) = (&self.geometry.source, crate::models::names());
+        if geometry::chosen(self).is_err() {
+            let known = crate::models::names();
+            let (source, network) = (&self.geometry.source, &self.geometry.fill_network);
+            if source == geometry::AUTO {
+                return bad(format!(
+                    "geometry.fill_network must be \"none\", \"recorded:DIR\" or one of {known}, found {network:?}"
+                ));
+            }
+            let found = source;
             return bad(format!(
-                "geometry.source must be \"stereo\", \"recorded:DIR\" or one of {known}, found {found:?}"
+                "geometry.source must be \"stereo\", \"auto\", \"recorded:DIR\" or one of {known}, found {found:?}"
             ));
         }
         let stage = |result: Result<(), String>| result.map_err(|reason| Error::BadValue { reason });

@@ -57,6 +57,8 @@ pub enum Step {
     Align,
     /// Placed depth into one surface.
     Fuse,
+    /// Depth for the pixels that stereo left empty.
+    Complete,
 }
 
 impl Step {
@@ -67,6 +69,7 @@ impl Step {
             Self::Predict => "predict",
             Self::Align => "align",
             Self::Fuse => "fuse",
+            Self::Complete => "complete",
         }
     }
 }

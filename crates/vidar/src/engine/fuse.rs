@@ -2,7 +2,7 @@
 
 use super::events::{MapEvent, Surface};
 use crate::error::Error;
-use vidar_core::{AlignedView, Warning};
+use vidar_core::{AlignedView, TriangleMesh, Warning};
 use vidar_fusion::{DoubleWallDetector, FusionConfig, PointFusion, TsdfVolume};
 
 /// Both forms of the surface, fed with the same views.
@@ -29,6 +29,11 @@ impl SurfaceFusion {
             }
         }
         events
+    }
+
+    /// The triangles so far.
+    pub fn mesh(&self) -> TriangleMesh {
+        self.volume.extract_mesh()
     }
 
     /// The surface, and what fusion reports.

@@ -2,7 +2,7 @@
 //!
 //! ```text
 //! push(SensorEvent) ─▶ track ─▶ select keyframes ─▶ predict ─▶ align ─┐
-//! finish()          ─────────── the rest of it ───────────────────────┴▶ fuse
+//! finish()          ─────────── the rest of it ───────────────────────┴▶ fuse (─▶ complete ─▶ fuse)
 //! ```
 //!
 //! It is the paper's figure of the pipeline (section III-A). Images are tracked to metric poses by visual-inertial odometry
@@ -12,6 +12,7 @@
 //! from outside it gets as traits ([`EngineSetup`]), and all that it finds out it reports as [`MapEvent`]s. Same input,
 //! same bits. Memory is bounded by one window of keyframes, the aligner's samples and the fusion's budget.
 
+mod complete;
 mod cut;
 mod events;
 mod fuse;
@@ -38,6 +39,7 @@ use crate::chunks::StoredChunk;
 use crate::config::{Config, LandmarkSources};
 use crate::error::Error;
 use crate::input::TrajectorySource;
+use complete::complete_chunks;
 use fuse::SurfaceFusion;
 use growing::GrowingSurface;
 use observe::{LandmarkUse, Observer};
@@ -441,17 +443,25 @@ impl<'a> Engine<'a> {
         let mut surface = SurfaceFusion::new(&fusion)?;
         // Asked to stop while predicting, what was predicted is fused; asked to stop now, fusing stops.
         let was_cancelled = (self.cancelled)();
-        for chunk in &placement.chunks {
-            if (self.cancelled)() && !was_cancelled {
+        let cancelled = self.cancelled;
+        let is_stopped = || cancelled() && !was_cancelled;
+        let owns_views = |c: &ChunkId| placement.views.iter().any(|v| v.owner == *c);
+        let chunks: Vec<ChunkId> = placement.chunks.iter().map(|c| c.chunk_id).filter(owns_views).collect();
+        let completes = self.predictor.geometry.completes();
+        for chunk in &chunks {
+            if is_stopped() {
                 break;
             }
-            if !placement.views.iter().any(|v| v.owner == chunk.chunk_id) {
-                continue;
-            }
-            let stored = self.predictor.store.read(PredictionId::Chunk(chunk.chunk_id))?;
+            let stored = self.predictor.store.read(PredictionId::Chunk(*chunk))?;
             let views = placed_views(placement, stored)?;
             surface.fuse(&views).into_iter().try_for_each(&mut *sink)?;
-            sink(MapEvent::ViewsFused(views))?;
+            if !completes {
+                sink(MapEvent::ViewsFused(views))?;
+            }
+        }
+        if completes {
+            self.enter(Step::Complete, sink)?;
+            complete_chunks(placement, &chunks, self.predictor.store, &mut surface, &is_stopped, sink)?;
         }
         let (surface, warnings) = surface.finish();
         for warning in warnings {

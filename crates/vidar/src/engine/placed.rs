@@ -6,15 +6,29 @@ use vidar_align::aligner::ViewPlacement;
 use vidar_align::{AlignError, Placement};
 use vidar_core::{AlignedView, Image, RelativeDepth, Timestamp, ViewGeometry};
 
+/// A placed view with the shape that a network gave it.
+pub struct Shaped {
+    /// The view.
+    pub view: AlignedView,
+    /// z-depth by a network, in any unit and at any size of the same view.
+    pub shape: Option<Image<f32>>,
+}
+
 /// The views that a chunk owns, in metres and in the world.
 pub fn placed_views(placement: &Placement, stored: StoredChunk) -> Result<Vec<AlignedView>, Error> {
+    Ok(placed_and_shaped(placement, stored)?.into_iter().map(|s| s.view).collect())
+}
+
+/// As [`placed_views`], with their shapes.
+pub fn placed_and_shaped(placement: &Placement, stored: StoredChunk) -> Result<Vec<Shaped>, Error> {
     let id = stored.prediction.chunk_id;
     let mut colors = stored.colors.into_iter();
+    let mut shapes = stored.shapes.into_iter();
     let mut views = Vec::new();
     for (view, time) in stored.prediction.views.into_iter().zip(stored.times) {
-        let color = colors.next();
+        let (color, shape) = (colors.next(), shapes.next().flatten());
         let Some(place) = placement.view(view.frame_id).filter(|p| p.owner == id) else { continue };
-        views.push(placed_view(view, time, place, color)?);
+        views.push(Shaped { view: placed_view(view, time, place, color)?, shape });
     }
     Ok(views)
 }

@@ -121,8 +121,9 @@ impl<'a> Predictor<'a> {
                     let warning = Warning::new("keyframes-without-depth", message).at(id);
                     events.push(MapEvent::Warning(warning));
                 }
-                let Prediction { geometry, colors, tokens } = prediction;
-                let mut stored = colored(geometry, &views.views, colors);
+                let Prediction { geometry, colors, tokens, shapes, warnings } = prediction;
+                events.extend(warnings.into_iter().map(|w| MapEvent::Warning(w.at(id))));
+                let mut stored = StoredChunk { shapes, ..colored(geometry, &views.views, colors) };
                 self.places.describe(&mut stored, &tokens)?;
                 Some(stored)
             }

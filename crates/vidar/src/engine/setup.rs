@@ -63,6 +63,11 @@ pub struct Prediction {
     pub colors: Vec<Image<[u8; 3]>>,
     /// The network's tokens, one list per view; empty where there are none.
     pub tokens: Vec<Vec<f32>>,
+    /// Another z-depth per view, in any unit and at any size of the same view, for what the geometry leaves empty; empty where
+    /// there is none.
+    pub shapes: Vec<Option<Image<f32>>>,
+    /// What the user should know of it.
+    pub warnings: Vec<Warning>,
 }
 
 /// The geometry model as the engine uses it.
@@ -73,6 +78,10 @@ pub trait GeometrySource {
     fn overlaps(&self) -> bool;
     /// Whether it predicts any set of views, so also both ends of a loop together.
     fn predicts_any_views(&self) -> bool;
+    /// Whether pixels that it leaves empty are filled once all is fused.
+    fn completes(&self) -> bool {
+        false
+    }
     /// Depth of the views `wanted` (indices into `views.views`).
     ///
     /// # Errors

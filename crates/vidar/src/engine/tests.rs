@@ -79,7 +79,13 @@ impl GeometrySource for Wall {
             frame: ChunkFrame::PriorWorld,
             views: views.views[wanted].iter().map(view).collect(),
         };
-        Ok(Prediction { geometry: views, colors: Vec::new(), tokens: Vec::new() })
+        Ok(Prediction {
+            geometry: views,
+            colors: Vec::new(),
+            tokens: Vec::new(),
+            shapes: Vec::new(),
+            warnings: Vec::new(),
+        })
     }
 }
 

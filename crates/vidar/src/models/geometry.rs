@@ -14,11 +14,18 @@ use vidar_da3::{Da3Model, Da3ModelConfig, Da3Options, DevicePlan, PoseMode, Prec
 /// The source of geometry that needs no network.
 pub const STEREO: &str = "stereo";
 
+/// The source of geometry that completes stereo's depth.
+pub const AUTO: &str = "auto";
+/// How `geometry.fill_network` says that there is none.
+pub const NO_NETWORK: &str = "none";
+
 /// The source of geometry of a configuration.
 #[derive(Clone, Debug)]
 pub enum SourceChoice {
     /// Multi-view stereo.
     Stereo,
+    /// Stereo, completed by the fused surface, planes, and the shapes of a source where there is one.
+    Auto(Option<ShapeChoice>),
     /// A network.
     Network(ModelChoice),
     /// Predictions in a folder.
@@ -27,11 +34,30 @@ pub enum SourceChoice {
     Simulated,
 }
 
+/// Where the shapes come from that fill what stereo leaves empty.
+#[derive(Clone, Debug)]
+pub enum ShapeChoice {
+    /// A network.
+    Network(ModelChoice),
+    /// Predictions in a folder.
+    Recorded(PathBuf),
+}
+
+impl SourceChoice {
+    /// Whether depth is measured by stereo, which is given its poses.
+    pub fn is_by_stereo(&self) -> bool {
+        matches!(self, Self::Stereo | Self::Auto(_))
+    }
+}
+
 /// The simulated network: true geometry of a synthetic recording with the errors of a network.
 pub const SIMULATED: &str = "simulated";
 
 /// The source of geometry that the configuration names.
 pub fn source(config: &Config) -> Result<SourceChoice, Error> {
+    if config.geometry.source == AUTO {
+        return shapes(config).map(SourceChoice::Auto);
+    }
     match config.geometry.source.strip_prefix(RECORDED) {
         Some(folder) if config.model.dir.is_empty() => Ok(SourceChoice::Recorded(PathBuf::from(folder))),
         None if config.model.dir.is_empty() && config.geometry.source == SIMULATED => {
@@ -39,6 +65,17 @@ pub fn source(config: &Config) -> Result<SourceChoice, Error> {
         }
         _ => Ok(chosen(config)?.map_or(SourceChoice::Stereo, SourceChoice::Network)),
     }
+}
+
+/// What `auto` fills with: custom weights where there are any, else what `geometry.fill_network` names.
+fn shapes(config: &Config) -> Result<Option<ShapeChoice>, Error> {
+    let named = config.geometry.fill_network.as_str();
+    Ok(match (config.model.dir.as_str(), named.strip_prefix(RECORDED)) {
+        ("", Some(folder)) => Some(ShapeChoice::Recorded(PathBuf::from(folder))),
+        ("", None) if named == NO_NETWORK => None,
+        ("", None) => Some(ShapeChoice::Network(ModelChoice::named(named)?)),
+        (dir, _) => Some(ShapeChoice::Network(ModelChoice::Folder(PathBuf::from(dir)))),
+    })
 }
 
 /// The network in a plan.
@@ -61,6 +98,10 @@ pub struct NetworkPlan {
 pub fn chosen(config: &Config) -> Result<Option<ModelChoice>, Error> {
     match (config.model.dir.as_str(), config.geometry.source.as_str()) {
         ("", STEREO) => Ok(None),
+        (_, AUTO) => match shapes(config)? {
+            Some(ShapeChoice::Network(choice)) => Ok(Some(choice)),
+            Some(ShapeChoice::Recorded(_)) | None => Ok(None),
+        },
         ("", name) if name.starts_with(RECORDED) || name == SIMULATED => Ok(None),
         ("", name) => ModelChoice::named(name).map(Some),
         (dir, _) => Ok(Some(ModelChoice::Folder(PathBuf::from(dir)))),

@@ -1,5 +1,6 @@
 //! Scores of the result, where there is something to compare it with.
 
+use super::by_source::{BySource, SourceScore, without_guesses};
 use super::map::MetricMap;
 use super::plan::Plan;
 use super::reference;
@@ -7,8 +8,10 @@ use crate::config::Config;
 use crate::error::Error;
 use crate::events::Events;
 use crate::input::truth_in_camera;
+use rayon::prelude::*;
 use serde::Serialize;
-use vidar_core::{AlignedView, PointCloud, Se3, Trajectory, TriangleMesh, Warning};
+use std::collections::BTreeMap;
+use vidar_core::{AlignedView, FrameId, MetricDepth, PointCloud, Se3, Trajectory, TriangleMesh, Warning};
 use vidar_dataset::Dataset;
 use vidar_eval::{
     DepthAccumulator, DepthSummary, EvalError, PlacementStart, SampleDensity, SurfaceEvalConfig,
@@ -34,9 +37,11 @@ pub struct Evaluation {
 /// Depth scores over all keyframes.
 #[derive(Clone, Debug, Serialize)]
 pub struct DepthScore {
-    /// Errors and completeness.
+    /// Errors and completeness of what is measured: of all depth where a view has one source, else without guesses.
     #[serde(flatten)]
     pub summary: DepthSummary,
+    /// The same pixels by where their depth comes from, guesses too; empty where views have one source.
+    pub by_source: Vec<SourceScore>,
 }
 
 /// Evaluates trajectory, surface and depth. What has no reference is left out; an evaluation that failed is a degradation.
@@ -121,7 +126,10 @@ pub fn sampled(mesh: &TriangleMesh, config: &Config) -> Result<PointCloud, EvalE
 
 /// Compares depth with the depth sensor's, view by view as views are fused.
 #[derive(Debug, Default)]
-pub struct DepthScorer(DepthAccumulator);
+pub struct DepthScorer {
+    measured: DepthAccumulator,
+    by_source: BySource,
+}
 
 impl DepthScorer {
     /// Adds the views for whose time there is a depth image.
@@ -130,11 +138,26 @@ impl DepthScorer {
             // An unreadable depth image is reported when the reference is fused.
             reference::sensor_depth_in_view(dataset, view.time(), view.intrinsics())?.ok()
         };
-        Ok(self.0.push_views(views, truth)?)
+        if views.iter().all(|v| v.origin().is_none()) {
+            return Ok(self.measured.push_views(views, truth)?);
+        }
+        let truths: BTreeMap<FrameId, Option<MetricDepth>> =
+            views.par_iter().map(|v| (v.frame_id(), truth(v))).collect();
+        let truth = |view: &AlignedView| truths.get(&view.frame_id()).cloned().flatten();
+        for view in views {
+            if let Some(Some(truth)) = truths.get(&view.frame_id()) {
+                self.by_source.add(view, truth);
+            }
+        }
+        let measured: Vec<_> = views.par_iter().map(without_guesses).collect();
+        // The images of one view have one size.
+        let measured: Vec<AlignedView> = measured.into_iter().filter_map(Result::ok).collect();
+        Ok(self.measured.push_views(&measured, truth)?)
     }
 
     /// The scores, if anything could be compared.
     pub fn score(&self) -> Option<DepthScore> {
-        self.0.summary().map(|summary| DepthScore { summary })
+        let by_source = self.by_source.scores();
+        self.measured.summary().map(|summary| DepthScore { summary, by_source })
     }
 }

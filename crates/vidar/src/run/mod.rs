@@ -1,5 +1,7 @@
 //! One run: recording → engine → evaluate → export.
 
+mod auto;
+mod by_source;
 mod evaluate;
 mod map;
 mod outputs;
@@ -16,6 +18,7 @@ mod tracking;
 mod trust;
 mod views;
 
+pub use by_source::SourceScore;
 pub(crate) use evaluate::sampled;
 pub use evaluate::{DepthScore, Evaluation};
 pub use map::MetricMap;

@@ -205,6 +205,14 @@ fn placement_json(placement: &Placement) -> Value {
     })
 }
 
+/// What the README says of a completed depth's further files.
+const ORIGIN: &str = "\x20 depth_source/*.png             where each depth comes from: 1 stereo, 2 map, 3 plane; guesses: 4 network, 5 interpolation\n\
+     \x20 depth_std/*.png                its relative standard deviation in steps of 0.2 %\n";
+
+fn is_completed(outcome: &RunOutcome) -> bool {
+    outcome.map.views.iter().any(|v| v.depth_source.is_some())
+}
+
 fn readme(outcome: &RunOutcome, request: &RunRequest) -> String {
     let plan: String =
         outcome.plan.lines().iter().map(|(k, v)| format!("  {k:<18} {}\n", printable(v))).collect();
@@ -220,12 +228,13 @@ fn readme(outcome: &RunOutcome, request: &RunRequest) -> String {
          \x20 map/points.ply                 points with normals, colour, confidence\n\
          \x20 trajectory/*.tum, *.csv        world_from_camera of all images and of the keyframes\n\
          \x20 depth/*.png, depth.json        z-depth, 16 bit, 0 = none; scale and cameras in depth.json\n\
-         \x20 images/*.png, views.json       undistorted keyframes with intrinsics and world_from_camera\n\
+         {origin}\x20 images/*.png, views.json       undistorted keyframes with intrinsics and world_from_camera\n\
          \x20 eval/metrics.json              scores and what the result was compared with\n\
          \x20 config.resolved.toml           every setting with its origin\n\
          \x20 manifest.json, log.jsonl       versions, hashes, timings, events\n\n\
          To do it again\n  {command}\n",
         version = crate::VERSION,
+        origin = if is_completed(outcome) { ORIGIN } else { "" },
         verdict = outcome.verdict.line(),
         scale = outcome.scale.words,
         unit = if outcome.is_metric() { "metres" } else { "lengths are not metres" },

@@ -1,5 +1,6 @@
 //! Where depth comes from: stereo, a network, or a recording, behind one trait.
 
+use super::auto::{AutoModel, Shapes};
 use crate::chunks::{RecordedModel, Recording};
 use crate::config::Config;
 use crate::engine::{GeometrySource, Prediction};
@@ -22,6 +23,8 @@ const SIMULATED_SIDE_PX: usize = 280;
 pub enum Source {
     /// Multi-view stereo: needs poses, answers in their world.
     Stereo(StereoModel),
+    /// Stereo, completed.
+    Auto(AutoModel),
     /// A network.
     Network(Box<(Da3Model, LocatedModel)>),
     /// Predictions made elsewhere.
@@ -44,7 +47,7 @@ impl Source {
         let mode = config.coupling.mode;
         let mut chunks = None;
         let source = match geometry::source(config)? {
-            SourceChoice::Stereo
+            SourceChoice::Stereo | SourceChoice::Auto(_)
                 if matches!(
                     mode,
                     CouplingMode::Da3Streaming | CouplingMode::PoseFree | CouplingMode::Hybrid
@@ -59,6 +62,9 @@ impl Source {
                 });
             }
             SourceChoice::Stereo => Self::Stereo(StereoModel::new(config.stereo.clone())?),
+            SourceChoice::Auto(shapes) => {
+                Self::Auto(AutoModel::open(shapes, images, config, pose_mode(config))?)
+            }
             SourceChoice::Network(choice) => {
                 Self::Network(Box::new(geometry::open(&choice, config, pose_mode(config))?))
             }
@@ -74,12 +80,12 @@ impl Source {
         Ok(OpenedSource { source, chunks })
     }
 
-    fn model(&mut self) -> &mut dyn GeometryModel {
+    /// The network, where one takes part.
+    fn network(&self) -> Option<&(Da3Model, LocatedModel)> {
         match self {
-            Self::Stereo(model) => model,
-            Self::Network(network) => &mut network.0,
-            Self::Recorded(model) => model,
-            Self::Simulated(model) => model,
+            Self::Network(network) => Some(network),
+            Self::Auto(AutoModel { shapes: Some(Shapes::Network(network)), .. }) => Some(network),
+            Self::Auto(_) | Self::Stereo(_) | Self::Recorded(_) | Self::Simulated(_) => None,
         }
     }
 
@@ -87,7 +93,7 @@ impl Source {
     pub fn token_channels(&self) -> Option<usize> {
         match self {
             Self::Network(network) => Some(network.0.token_channels()),
-            Self::Stereo(_) | Self::Recorded(_) | Self::Simulated(_) => None,
+            Self::Stereo(_) | Self::Auto(_) | Self::Recorded(_) | Self::Simulated(_) => None,
         }
     }
 
@@ -100,10 +106,7 @@ impl Source {
 
     /// The most memory of a graphics processor that it held at a time so far, bytes; `None` where it works on none.
     pub fn device_peak_bytes(&self) -> Option<u64> {
-        match self {
-            Self::Network(network) => network.0.network().device_peak_bytes(),
-            Self::Stereo(_) | Self::Recorded(_) | Self::Simulated(_) => None,
-        }
+        self.network()?.0.network().device_peak_bytes()
     }
 
     /// What running it on chunks of `views` such views takes; warnings join `warnings`.
@@ -114,8 +117,7 @@ impl Source {
         views: usize,
         warnings: &mut Vec<Warning>,
     ) -> Result<Option<NetworkPlan>, Error> {
-        let Self::Network(network) = self else { return Ok(None) };
-        let (model, located) = network.as_ref();
+        let Some((model, located)) = self.network() else { return Ok(None) };
         let (plan, noticed) = geometry::planned(model, located, config, view, views)?;
         warnings.extend(noticed);
         Ok(Some(plan))
@@ -126,6 +128,7 @@ impl GeometrySource for Source {
     fn info(&self) -> &ModelInfo {
         match self {
             Self::Stereo(model) => model.info(),
+            Self::Auto(model) => model.info(),
             Self::Network(network) => network.0.info(),
             Self::Recorded(model) => model.info(),
             Self::Simulated(model) => model.info(),
@@ -133,7 +136,11 @@ impl GeometrySource for Source {
     }
 
     fn overlaps(&self) -> bool {
-        !matches!(self, Self::Stereo(_))
+        !matches!(self, Self::Stereo(_) | Self::Auto(_))
+    }
+
+    fn completes(&self) -> bool {
+        matches!(self, Self::Auto(_))
     }
 
     fn predicts_any_views(&self) -> bool {
@@ -146,14 +153,23 @@ impl GeometrySource for Source {
         wanted: std::ops::Range<usize>,
         watch: vidar_core::Watch<'_>,
     ) -> Result<Prediction, ModelError> {
-        let geometry = self.model().predict_views(views, wanted, watch)?;
         let (mut colors, mut tokens) = (Vec::new(), Vec::new());
-        match self {
-            Self::Network(network) => tokens = network.0.take_place_tokens(),
-            Self::Recorded(model) => colors = model.take_colors(),
-            Self::Stereo(_) | Self::Simulated(_) => {}
-        }
-        Ok(Prediction { geometry, colors, tokens })
+        let geometry = match self {
+            Self::Auto(model) => return model.predict(views, wanted, watch),
+            Self::Network(network) => {
+                let geometry = network.0.predict_views(views, wanted, watch)?;
+                tokens = network.0.take_place_tokens();
+                geometry
+            }
+            Self::Recorded(model) => {
+                let geometry = model.predict_views(views, wanted, watch)?;
+                colors = model.take_colors();
+                geometry
+            }
+            Self::Stereo(model) => model.predict_views(views, wanted, watch)?,
+            Self::Simulated(model) => model.predict_views(views, wanted, watch)?,
+        };
+        Ok(Prediction { geometry, colors, tokens, shapes: Vec::new(), warnings: Vec::new() })
     }
 }
 

@@ -4,6 +4,7 @@ use crate::chunks::{ChunkStore, StoredChunk};
 use crate::config::Config;
 use crate::engine::{PredictedFrame, PredictionId, PredictionStore};
 use crate::error::Error;
+use crate::models::geometry::AUTO;
 use crate::run::plan::Plan;
 use serde_json::json;
 use sha2::{Digest, Sha256};
@@ -31,6 +32,7 @@ impl RunStore {
             "view": plan.view,
             "camera": format!("{:?}", plan.camera),
             "stereo": config.stereo,
+            "fill": (plan.model.name == AUTO).then_some(&config.geometry.fill_network),
             "network": config.model,
             "place_recognition": plan.place_recognition,
         });

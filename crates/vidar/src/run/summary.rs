@@ -1,6 +1,7 @@
 //! A run in at most twelve lines for the terminal.
 
 use super::RunOutcome;
+use super::by_source::SourceScore;
 use crate::evaluate::refinement;
 use vidar_align::aligner::RejectionReason;
 
@@ -71,6 +72,13 @@ pub(super) fn lines(outcome: &RunOutcome) -> Vec<(&'static str, String)> {
                 depth.completeness * 100.0
             ),
         ));
+    }
+    if let Some(by_source) = outcome.evaluation.depth.as_ref().map(|d| &d.by_source).filter(|s| !s.is_empty())
+    {
+        let one = |s: &SourceScore| {
+            format!("{} {:.0} % (AbsRel {:.3})", s.source.name(), 100.0 * s.share, s.abs_rel)
+        };
+        lines.push(("depth by source", by_source.iter().map(one).collect::<Vec<_>>().join(", ")));
     }
     let memory = crate::system::peak_memory_bytes()
         .map_or_else(String::new, |b| format!(", peak memory {}", super::bytes(b)));

@@ -16,6 +16,10 @@ pub(super) fn write_views(
 ) -> Result<Vec<StoredView>, Error> {
     folder.file("depth/.")?;
     folder.file("images/.")?;
+    if views.iter().any(|v| v.origin().is_some()) {
+        folder.file("depth_source/.")?;
+        folder.file("depth_std/.")?;
+    }
     let stored: Result<Vec<_>, Error> =
         views.par_iter().map(|view| write_view(view, config, folder)).collect();
     let stored = stored?;
@@ -44,6 +48,18 @@ fn write_view(
         artifacts.push((path.clone(), folder.write(&path, &bytes)?));
         depth = Some(path);
     }
+    let (mut depth_source, mut depth_std) = (None, None);
+    if let (true, Some(origins)) = (config.output.depth_png, view.origin()) {
+        let mut write = |path: String, bytes: Vec<u8>| -> Result<Option<String>, Error> {
+            artifacts.push((path.clone(), folder.write(&path, &bytes)?));
+            Ok(Some(path))
+        };
+        let (mut source, mut std) = (Vec::new(), Vec::new());
+        vidar_export::write_source_png(&mut source, origins)?;
+        vidar_export::write_std_png(&mut std, origins)?;
+        depth_source = write(format!("depth_source/{name}"), source)?;
+        depth_std = write(format!("depth_std/{name}"), std)?;
+    }
     let mut image = None;
     if let (true, Some(color)) = (config.output.images, view.color()) {
         let path = format!("images/{name}");
@@ -58,6 +74,8 @@ fn write_view(
         source: None,
         image,
         depth,
+        depth_source,
+        depth_std,
         intrinsics: *view.intrinsics(),
         world_from_camera: rows,
     };

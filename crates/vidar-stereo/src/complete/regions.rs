@@ -1,0 +1,141 @@
+//! Untextured regions: connected parts of the image in which brightness hardly changes from pixel to pixel.
+
+use vidar_core::Image;
+
+/// Largest difference between pixels two apart in the smoothed image, grey levels, that is no texture. Above the noise of
+/// consumer cameras after smoothing (1 to 2 levels), below what stereo matches.
+const MAX_STEP: f32 = 5.0;
+/// How far a region reaches beyond its own pixels to find measured depth, pixels: stereo's windows are 5 wide and see texture
+/// within 2 pixels; edges are smoothed over 2 more.
+const REACH: usize = 6;
+/// Smaller regions are not worth a plane.
+const LEAST_PIXELS: usize = 200;
+/// A region's number where there is none.
+const NOWHERE: u32 = u32::MAX;
+
+/// Grey levels of a colour image (Rec. 601); all alike where there is none.
+pub(super) fn luminance(color: Option<&Image<[u8; 3]>>, width: usize, height: usize) -> Vec<f32> {
+    let level = |[r, g, b]: &[u8; 3]| 0.299 * f32::from(*r) + 0.587 * f32::from(*g) + 0.114 * f32::from(*b);
+    color.map_or_else(|| vec![0.0; width * height], |c| c.data().iter().map(level).collect())
+}
+
+/// Pixels by region.
+pub(super) struct Regions {
+    pub width: usize,
+    /// Pixels of each region with those within [`REACH`] of it, and whether they are its own; ascending.
+    pub members: Vec<Vec<(u32, bool)>>,
+}
+
+impl Regions {
+    /// The regions of an image.
+    pub fn of(luminance: &[f32], width: usize, height: usize) -> Self {
+        let smooth = smoothed(luminance, width, height);
+        let is_flat: Vec<bool> = (0..width * height)
+            .map(|i| {
+                let (x, y) = (i % width, i / width);
+                let across =
+                    smooth[y * width + (x + 1).min(width - 1)] - smooth[y * width + x.saturating_sub(1)];
+                let down =
+                    smooth[(y + 1).min(height - 1) * width + x] - smooth[y.saturating_sub(1) * width + x];
+                across.abs().max(down.abs()) <= MAX_STEP
+            })
+            .collect();
+        let (mut of, count) = connected(&is_flat, width);
+        let own = of.clone();
+        for _ in 0..REACH {
+            grow(&mut of, width);
+        }
+        let mut members = vec![Vec::new(); count];
+        for (i, region) in of.iter().enumerate().filter(|(_, region)| **region != NOWHERE) {
+            members[*region as usize].push((i as u32, own[i] == *region));
+        }
+        Self { width, members }
+    }
+}
+
+/// Mean over 3 x 3 pixels.
+fn smoothed(values: &[f32], width: usize, height: usize) -> Vec<f32> {
+    let pass = |values: &[f32], step: usize, at: &dyn Fn(usize) -> (usize, usize)| -> Vec<f32> {
+        let mean = |i: usize| {
+            let (place, size) = at(i);
+            let before = if place > 0 { values[i - step] } else { values[i] };
+            let after = if place + 1 < size { values[i + step] } else { values[i] };
+            (before + values[i] + after) / 3.0
+        };
+        (0..values.len()).map(mean).collect()
+    };
+    let across = pass(values, 1, &|i| (i % width, width));
+    pass(&across, width, &|i| (i / width, height))
+}
+
+/// Numbers of the connected parts of `inside` with enough pixels, by their first pixel, and how many there are.
+fn connected(inside: &[bool], width: usize) -> (Vec<u32>, usize) {
+    let mut of = vec![NOWHERE; inside.len()];
+    let mut seen = vec![false; inside.len()];
+    let (mut count, mut part) = (0, Vec::new());
+    for first in 0..inside.len() {
+        if !inside[first] || seen[first] {
+            continue;
+        }
+        part.clear();
+        part.push(first);
+        seen[first] = true;
+        let mut next = 0;
+        while let Some(&i) = part.get(next) {
+            next += 1;
+            for j in neighbours(i, width, inside.len()) {
+                if inside[j] && !seen[j] {
+                    seen[j] = true;
+                    part.push(j);
+                }
+            }
+        }
+        if part.len() >= LEAST_PIXELS {
+            part.iter().for_each(|i| of[*i] = count);
+            count += 1;
+        }
+    }
+    (of, count as usize)
+}
+
+/// Every region takes the free pixels beside it; of several the one with the lowest number.
+fn grow(of: &mut [u32], width: usize) {
+    let before = of.to_vec();
+    for (i, region) in of.iter_mut().enumerate().filter(|(_, region)| **region == NOWHERE) {
+        let beside = neighbours(i, width, before.len()).map(|j| before[j]).min();
+        *region = beside.unwrap_or(NOWHERE);
+    }
+}
+
+fn neighbours(i: usize, width: usize, size: usize) -> impl Iterator<Item = usize> {
+    let x = i % width;
+    let left = (x > 0).then(|| i - 1);
+    let right = (x + 1 < width).then_some(i + 1);
+    let up = i.checked_sub(width);
+    let down = (i + width < size).then_some(i + width);
+    [left, right, up, down].into_iter().flatten()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_wall_and_a_floor_are_two_regions_and_texture_is_none() {
+        // A wall above, a darker floor below, texture on the right.
+        let (width, height) = (80, 60);
+        let level = |x: usize, y: usize| match (x < 60, y < 30) {
+            (true, true) => 200.0,
+            (true, false) => 90.0,
+            (false, _) => ((x * 7919 + y * 104_729) % 251) as f32,
+        };
+        let luminance: Vec<f32> = (0..width * height).map(|i| level(i % width, i / width)).collect();
+        let regions = Regions::of(&luminance, width, height);
+        assert_eq!(regions.members.len(), 2);
+        let own = |r: usize| regions.members[r].iter().filter(|m| m.1).map(|m| m.0 as usize);
+        assert!(own(0).all(|i| i / width < 30 && i % width < 60) && own(0).count() > 57 * 26);
+        assert!(own(1).all(|i| i / width >= 30 && i % width < 60) && own(1).count() > 57 * 26);
+        // Beyond its pixels a region reaches into the texture.
+        assert!(regions.members[0].iter().any(|(i, own)| !own && *i as usize % width >= 62));
+    }
+}

@@ -1,0 +1,53 @@
+//! Another model's depth of each view, as an array.
+
+use crate::error::Error;
+use vidar_core::Image;
+use vidar_export::official::{NpyArray, NpyData};
+
+/// One image per view at the size of the first; NaN where a view has none.
+pub(super) fn pack_shapes(shapes: &[Option<Image<f32>>], n: usize) -> Result<Option<NpyArray>, Error> {
+    let Some(first) = shapes.iter().flatten().next().filter(|_| shapes.len() == n) else { return Ok(None) };
+    let (width, height) = (first.width(), first.height());
+    let empty = Image::filled(width, height, f32::NAN);
+    let of_size = |s: &Option<Image<f32>>| match s {
+        Some(image) if (image.width(), image.height()) == (width, height) => image.data().to_vec(),
+        _ => empty.data().to_vec(),
+    };
+    let values = shapes.iter().flat_map(of_size).collect();
+    Ok(Some(NpyArray::new(vec![n, height, width], NpyData::F32(values))?))
+}
+
+/// As [`pack_shapes`] wrote them; images of NaN alone are none.
+pub(super) fn unpack_shapes(array: NpyArray, n: usize) -> Vec<Option<Image<f32>>> {
+    let (height, width) = match array.shape[..] {
+        [found, height, width] if found == n && height * width > 0 => (height, width),
+        _ => return Vec::new(),
+    };
+    let values = array.into_f32().unwrap_or_default();
+    let image = |v: &[f32]| {
+        let image = Image::from_vec(width, height, v.to_vec()).ok()?;
+        image.data().iter().any(|z| z.is_finite()).then_some(image)
+    };
+    values.chunks(width * height).map(image).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn shapes_come_back_with_the_same_bits_and_holes() {
+        let image = Image::from_fn(5, 4, |x, y| if x == y { f32::NAN } else { 0.1 + (x * y) as f32 });
+        let shapes = vec![Some(image.clone()), None, Some(image.map(|z| 2.0 * z))];
+        let array = pack_shapes(&shapes, 3).unwrap().unwrap();
+        assert_eq!(array.shape, [3, 4, 5]);
+        let bits = |s: &Option<Image<f32>>| {
+            s.as_ref().map(|i| i.data().iter().map(|z| z.to_bits()).collect::<Vec<_>>())
+        };
+        let read = unpack_shapes(array.clone(), 3);
+        assert_eq!(read.iter().map(bits).collect::<Vec<_>>(), shapes.iter().map(bits).collect::<Vec<_>>());
+        // Of another number of views, or of none.
+        assert!(unpack_shapes(array, 2).is_empty());
+        assert!(pack_shapes(&shapes, 2).unwrap().is_none() && pack_shapes(&[None], 1).unwrap().is_none());
+    }
+}
