@@ -183,21 +183,6 @@ pub fn place(output: &OutputArgs, name: &str) -> OutputLocation {
     }
 }
 
-/// The name of the recording at `path`, for the run folder.
-pub fn name_of(path: &Path) -> String {
-    let absolute = vidar::input::absolute(path);
-    let parts: Vec<String> = absolute
-        .components()
-        .filter_map(|c| match c {
-            std::path::Component::Normal(name) => Some(name.to_string_lossy().into_owned()),
-            _ => None,
-        })
-        .collect();
-    // `…/MH_01/mav0` has the name MH_01.
-    let meaningful = parts.iter().rev().find(|p| !["mav0", "cam0", "data"].contains(&p.as_str()));
-    meaningful.cloned().unwrap_or_else(|| "run".into())
-}
-
 /// The synthetic world of the flags.
 pub fn world(args: &WorldArgs, mut world: SynthConfig) -> Result<SynthConfig, Error> {
     if let Some(seed) = args.seed {

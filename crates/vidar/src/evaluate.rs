@@ -256,11 +256,7 @@ pub fn refinement(report: &SurfaceReport) -> String {
 /// The scores in the folder of a finished run.
 pub fn evaluate_run(run: &Path) -> Result<EvalOutcome, Error> {
     let not_a_run = |reason: String| Error::NotARun { path: run.to_owned(), reason };
-    let path = run.join("eval/metrics.json");
-    let bytes = crate::system::read_up_to(&path, crate::system::MAX_JSON_BYTES)
-        .map_err(|e| not_a_run(format!("eval/metrics.json: {e}")))?;
-    let report: Value =
-        serde_json::from_slice(&bytes).map_err(|e| not_a_run(format!("eval/metrics.json: {e}")))?;
+    let report: Value = crate::run_folder::read_json(run, "eval/metrics.json")?;
     let scores: Scores = serde_json::from_value(report["scores"].clone())
         .map_err(|e| not_a_run(format!("eval/metrics.json has no scores: {e}")))?;
     let mut lines: Vec<(String, String)> =
