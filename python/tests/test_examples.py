@@ -1,6 +1,6 @@
 """The scripts of examples/python run and check their own results."""
 
-import importlib.util
+import importlib
 import subprocess
 import sys
 
@@ -17,9 +17,14 @@ def script(name, *arguments):
     return done.stdout
 
 
-def needs(*modules):
-    missing = [m for m in modules if importlib.util.find_spec(m) is None]
-    return pytest.mark.skipif(bool(missing), reason=f"not installed: {', '.join(missing)}")
+def needs(module):
+    """Skips a test where a module is not installed, or cannot be loaded for want of a system library."""
+    try:
+        importlib.import_module(module)
+        reason = ""
+    except ImportError as error:
+        reason = str(error)
+    return pytest.mark.skipif(bool(reason), reason=reason)
 
 
 def test_own_frames(flight, tmp_path):

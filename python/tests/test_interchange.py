@@ -14,6 +14,11 @@ from conftest import call
 import vidar
 
 
+def required(module):
+    """The module, or a skipped test where it is not installed or lacks a system library."""
+    return pytest.importorskip(module, exc_type=ImportError)
+
+
 @pytest.fixture(scope="module")
 def trajectories(flight, tmp_path_factory):
     """Files of an estimate and of the truth, of the same run."""
@@ -24,7 +29,7 @@ def trajectories(flight, tmp_path_factory):
 
 
 def test_trajectory_scores_are_those_of_evo(trajectories):
-    core = pytest.importorskip("evo.core")  # noqa: F841 says why it is skipped
+    required("evo.core")
     import copy
 
     from evo.core import metrics, sync
@@ -75,7 +80,7 @@ def matrix_of(record):
 
 
 def test_map_scores_are_those_of_open3d(finished, tiny):
-    o3d = pytest.importorskip("open3d")
+    o3d = required("open3d")
     points = finished / "map/points.ply"
     scan = vidar.Recording(tiny).reference_cloud
     evaluation = vidar.evaluate(points, scan)
@@ -99,7 +104,7 @@ def test_map_scores_are_those_of_open3d(finished, tiny):
 
 
 def test_meshes_open_in_open3d(finished):
-    o3d = pytest.importorskip("open3d")
+    o3d = required("open3d")
     mesh = vidar.read_run(finished).mesh
     for name in ("mesh.ply", "mesh.glb"):
         opened = o3d.io.read_triangle_mesh(str(finished / "map" / name))
@@ -112,7 +117,7 @@ def test_meshes_open_in_open3d(finished):
 
 
 def test_meshes_open_in_trimesh(finished):
-    trimesh = pytest.importorskip("trimesh")
+    trimesh = required("trimesh")
     mesh = vidar.read_run(finished).mesh
     ply = trimesh.load(finished / "map/mesh.ply", process=False)
     assert np.array_equal(ply.vertices.astype(np.float32), mesh.vertices)
@@ -128,7 +133,7 @@ def test_meshes_open_in_trimesh(finished):
 
 @pytest.mark.parametrize("target", ["colmap", "colmap-text"])
 def test_models_open_in_pycolmap(finished, tmp_path, target):
-    pycolmap = pytest.importorskip("pycolmap")
+    pycolmap = required("pycolmap")
     run = vidar.read_run(finished)
     run.export(target, tmp_path, tracks=True)
     model = pycolmap.Reconstruction(tmp_path / "sparse/0")
