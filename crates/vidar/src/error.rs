@@ -583,6 +583,7 @@ mod tests {
         }
         let other = Error::io("read", &path(), NotFound.into());
         assert_eq!((other.code(), other.exit_status() as i32), ("E0401", 4));
+        assert_eq!(other.place().as_deref(), Some("map/mesh.ply"));
     }
 
     #[test]
