@@ -92,7 +92,9 @@ def test_an_exception_of_progress_stops_the_run(tiny, settings, tmp_path):
 def test_ctrl_c_ends_a_run(tiny, settings, tmp_path):
     script = textwrap.dedent(
         """
-        import sys, vidar
+        import signal, sys, vidar
+        # A job in the background of a shell is started with Ctrl-C ignored.
+        signal.signal(signal.SIGINT, signal.default_int_handler)
         def tell(event):
             print(event["event"], flush=True)
         try:
