@@ -7,9 +7,12 @@ use std::path::Path;
 /// Checks the licence expression of every package of the resolved graph.
 pub fn check(root: &Path) -> Result<Vec<String>> {
     let allowed = allowed(&std::fs::read_to_string(root.join("deny.toml")).context("deny.toml")?);
-    let metadata = MetadataCommand::new().manifest_path(root.join("Cargo.toml")).exec()?;
     let mut problems = Vec::new();
-    for package in &metadata.packages {
+    // The Python module is a workspace of its own.
+    let workspaces = ["Cargo.toml", "python/Cargo.toml"].map(|manifest| root.join(manifest));
+    let metadata = workspaces.map(|manifest| MetadataCommand::new().manifest_path(manifest).exec());
+    let packages = metadata.into_iter().collect::<Result<Vec<_>, _>>()?;
+    for package in packages.iter().flat_map(|metadata| &metadata.packages) {
         let expression = package.license.clone().unwrap_or_default();
         if !satisfied(&expression, &allowed) {
             problems.push(format!(

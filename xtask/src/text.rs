@@ -11,10 +11,10 @@ const WARN_LINES: usize = 600;
 const BANNED: &[&str] = &["extrinsic", "c2w", "w2c", "t_cw", "t_wc", "cam_to_world", "world_to_cam"];
 const BORDER: &[&str] = &["vidar-dataset", "vidar-export", "xtask"];
 
-/// Rust sources of crates, program and tasks.
+/// Rust sources of crates, program, tasks and bindings.
 fn sources(root: &Path) -> Result<Vec<PathBuf>> {
     let mut found = Vec::new();
-    let mut folders = vec![root.join("crates"), root.join("apps"), root.join("xtask")];
+    let mut folders = ["crates", "apps", "xtask", "python/src"].map(|folder| root.join(folder)).to_vec();
     while let Some(folder) = folders.pop() {
         for entry in std::fs::read_dir(&folder).with_context(|| folder.display().to_string())? {
             let path = entry?.path();

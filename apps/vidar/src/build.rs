@@ -3,8 +3,8 @@
 use crate::args::{ConfigArgs, EvalArgs, InputArgs, OutputArgs, RunArgs, WorldArgs};
 use std::path::Path;
 use vidar::config::Origin;
-use vidar::core::{BodyFrame, CameraId, Se3, So3};
-use vidar::dataset::{CameraFlag, OpenOptions, TrajectoryReadOptions, VideoDecoder};
+use vidar::core::{CameraId, Se3, So3};
+use vidar::dataset::{CameraFlag, OpenOptions, TrajectoryReadOptions, body_named, decoder_named};
 use vidar::run_folder::OutputLocation;
 use vidar::synth::{FlightKind, SceneKind, Start, SynthConfig};
 use vidar::{Error, Layered};
@@ -122,12 +122,12 @@ pub fn open_options(input: &InputArgs) -> Result<OpenOptions, Error> {
     };
     options.topics = input.topics.iter().map(|t| t.parse()).collect::<Result<_, _>>()?;
     options.format = input.format.as_deref().map(str::parse).transpose()?;
-    options.decoder = input.decoder.as_deref().map(decoder).transpose()?.unwrap_or_default();
+    options.decoder = input.decoder.as_deref().map(decoder_named).transpose()?.unwrap_or_default();
     options.trajectory_format = input.trajectory_format.as_deref().map(str::parse).transpose()?;
     options.time_unit = input.time_unit.as_deref().map(str::parse).transpose()?;
     options.camera_model =
         input.camera_model.as_deref().map(str::parse::<CameraFlag>).transpose()?.map(|flag| flag.0);
-    options.trajectory_body = input.trajectory_body.as_deref().map(body).transpose()?;
+    options.trajectory_body = input.trajectory_body.as_deref().map(body_named).transpose()?;
     options.depth_intrinsics = input.depth_intrinsics.as_deref().map(four).transpose()?;
     options.color_from_depth = input.color_from_depth.as_deref().map(motion).transpose()?;
     Ok(options)
@@ -140,27 +140,9 @@ pub fn trajectory_options(args: &EvalArgs) -> Result<TrajectoryReadOptions, Erro
         args.timestamps.as_deref().map(|file| vidar::dataset::read_times(file, time_unit)).transpose()?;
     Ok(TrajectoryReadOptions {
         format: args.trajectory_format.as_deref().map(str::parse).transpose()?,
-        body: args.trajectory_body.as_deref().map(body).transpose()?,
+        body: args.trajectory_body.as_deref().map(body_named).transpose()?,
         time_unit,
         times,
-    })
-}
-
-fn decoder(text: &str) -> Result<VideoDecoder, Error> {
-    match text {
-        "built-in" => Ok(VideoDecoder::BuiltIn),
-        "ffmpeg" => Ok(VideoDecoder::Ffmpeg),
-        _ => Err(usage(format!("--decoder {text:?} is not a decoder"), "write built-in or ffmpeg")),
-    }
-}
-
-fn body(text: &str) -> Result<BodyFrame, Error> {
-    if matches!(text, "imu" | "body") {
-        return Ok(BodyFrame::Imu);
-    }
-    let number = text.strip_prefix("camera").or_else(|| text.strip_prefix("cam"));
-    number.and_then(|n| n.parse().ok()).map(|n| BodyFrame::Camera(CameraId(n))).ok_or_else(|| {
-        usage(format!("--trajectory-body {text:?} is not a body"), "write imu, camera0, camera1, …")
     })
 }
 
@@ -200,21 +182,6 @@ pub fn place(output: &OutputArgs, name: &str) -> OutputLocation {
         Some(path) => OutputLocation::Exact { path: path.clone(), force: output.force },
         None => OutputLocation::Dated { base: ".".into(), name: name.to_owned() },
     }
-}
-
-/// The name of the recording at `path`, for the run folder.
-pub fn name_of(path: &Path) -> String {
-    let absolute = vidar::input::absolute(path);
-    let parts: Vec<String> = absolute
-        .components()
-        .filter_map(|c| match c {
-            std::path::Component::Normal(name) => Some(name.to_string_lossy().into_owned()),
-            _ => None,
-        })
-        .collect();
-    // `…/MH_01/mav0` has the name MH_01.
-    let meaningful = parts.iter().rev().find(|p| !["mav0", "cam0", "data"].contains(&p.as_str()));
-    meaningful.cloned().unwrap_or_else(|| "run".into())
 }
 
 /// The synthetic world of the flags.

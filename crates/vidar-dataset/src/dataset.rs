@@ -1,7 +1,7 @@
 //! The dataset that every reader returns.
 
 use crate::error::{DatasetError, io_error};
-use crate::events::Events;
+use crate::events::EventCursor;
 use crate::location::{Location, Media, StoredDepth};
 use crate::options::DatasetKind;
 use std::io::Write;
@@ -179,7 +179,8 @@ impl Dataset {
     ///
     /// At equal times: IMU, ground truth, depth, image; so that everything with an image's time is known when the image arrives.
     pub fn events(&self) -> impl Iterator<Item = Result<vidar_core::SensorEvent, DatasetError>> + '_ {
-        Events::new(self)
+        let mut cursor = EventCursor::default();
+        std::iter::from_fn(move || self.next_event(&mut cursor))
     }
 
     /// Writes the bytes to hash for a fingerprint of the dataset: name and size of every image and depth image, and every byte

@@ -1,6 +1,6 @@
 //! Why a dataset cannot be read.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use thiserror::Error;
 use vidar_core::{CameraError, CameraId};
 
@@ -181,7 +181,31 @@ pub enum DatasetError {
     },
 }
 
+impl DatasetError {
+    /// The file or folder that the error is about, where it is about one.
+    pub fn path(&self) -> Option<&Path> {
+        match self {
+            Self::Io { path, .. }
+            | Self::UnknownLayout { path, .. }
+            | Self::Malformed { path, .. }
+            | Self::MissingCamera { path, .. }
+            | Self::NoImages { path, .. }
+            | Self::NoPoses { path, .. }
+            | Self::BadCamera { path, .. }
+            | Self::UnsupportedCamera { path, .. }
+            | Self::NotRigid { path, .. }
+            | Self::BadImage { path, .. }
+            | Self::WrongImageSize { path, .. }
+            | Self::TooLarge { path, .. }
+            | Self::TimesMismatch { path, .. }
+            | Self::Topics { path, .. }
+            | Self::WrongThing { path, .. } => Some(path),
+            Self::Bag(_) | Self::Video(_) | Self::BadOption { .. } => None,
+        }
+    }
+}
+
 /// Makes an i/o error of `path`.
-pub(crate) fn io_error(path: &std::path::Path) -> impl FnOnce(std::io::Error) -> DatasetError + '_ {
+pub(crate) fn io_error(path: &Path) -> impl FnOnce(std::io::Error) -> DatasetError + '_ {
     move |source| DatasetError::Io { path: path.to_path_buf(), source }
 }

@@ -4,34 +4,49 @@ use crate::dataset::Dataset;
 use crate::error::DatasetError;
 use vidar_core::{Frame, SensorEvent, StampedPose};
 
-/// A cursor into each sensor's list. The order at equal times is the order of the fields.
-pub(crate) struct Events<'a> {
-    dataset: &'a Dataset,
-    truth: &'a [StampedPose],
-    next: [usize; 4],
+/// How far the stream of a dataset was read; a new one stands before the first event.
+///
+/// It borrows nothing, so that a stream can be kept beside the dataset that it belongs to ([`Dataset::next_event`]).
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct EventCursor {
+    /// Samples taken of IMU, ground truth, depth and images: the order at equal times.
+    taken: [usize; 4],
 }
 
-impl<'a> Events<'a> {
-    pub(crate) fn new(dataset: &'a Dataset) -> Self {
-        let truth = dataset.ground_truth.as_ref().map_or(&[][..], |t| t.poses());
-        Self { dataset, truth, next: [0; 4] }
+impl Dataset {
+    /// The event at the cursor, which moves past it, also past one that cannot be read; `None` at the end.
+    ///
+    /// # Errors
+    /// An image or a depth image cannot be read.
+    pub fn next_event(&self, cursor: &mut EventCursor) -> Option<Result<SensorEvent, DatasetError>> {
+        let truth = self.ground_truth.as_ref().map_or(&[][..], |t| t.poses());
+        let [imu, pose, depth, image] = cursor.taken;
+        let heads = [
+            self.imu.get(imu).map(|s| s.time),
+            truth.get(pose).map(|p| p.time),
+            self.depths.get(depth).map(|e| e.time),
+            self.images.get(image).map(|e| e.time),
+        ];
+        let (_, sensor) = heads.iter().enumerate().filter_map(|(i, t)| t.map(|t| (t, i))).min()?;
+        let index = cursor.taken[sensor];
+        cursor.taken[sensor] += 1;
+        Some(self.event(sensor, index))
     }
 
     fn event(&self, sensor: usize, index: usize) -> Result<SensorEvent, DatasetError> {
-        let d = self.dataset;
-        Ok(match sensor {
-            0 => SensorEvent::Imu(d.imu[index]),
-            1 => {
-                let StampedPose { time, world_from_body } = self.truth[index];
+        Ok(match (sensor, &self.ground_truth) {
+            (0, _) => SensorEvent::Imu(self.imu[index]),
+            (1, Some(truth)) => {
+                let StampedPose { time, world_from_body } = truth.poses()[index];
                 SensorEvent::GroundTruth { time, world_from_body }
             }
-            2 => {
-                let entry = &d.depths[index];
-                SensorEvent::Depth { time: entry.time, camera: d.camera, depth: d.load_depth(entry)? }
+            (2, _) => {
+                let entry = &self.depths[index];
+                SensorEvent::Depth { time: entry.time, camera: self.camera, depth: self.load_depth(entry)? }
             }
             _ => {
-                let entry = &d.images[index];
-                let image = d.load_image(entry)?;
+                let entry = &self.images[index];
+                let image = self.load_image(entry)?;
                 SensorEvent::Image(Frame {
                     id: entry.frame_id,
                     time: entry.time,
@@ -40,23 +55,5 @@ impl<'a> Events<'a> {
                 })
             }
         })
-    }
-}
-
-impl Iterator for Events<'_> {
-    type Item = Result<SensorEvent, DatasetError>;
-
-    fn next(&mut self) -> Option<Self::Item> {
-        let d = self.dataset;
-        let heads = [
-            d.imu.get(self.next[0]).map(|s| s.time),
-            self.truth.get(self.next[1]).map(|p| p.time),
-            d.depths.get(self.next[2]).map(|e| e.time),
-            d.images.get(self.next[3]).map(|e| e.time),
-        ];
-        let (_, sensor) = heads.iter().enumerate().filter_map(|(i, t)| t.map(|t| (t, i))).min()?;
-        let index = self.next[sensor];
-        self.next[sensor] += 1;
-        Some(self.event(sensor, index))
     }
 }

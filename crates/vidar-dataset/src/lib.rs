@@ -45,9 +45,11 @@ pub use dataset::{
     ImageEntry,
 };
 pub use error::DatasetError;
+pub use events::EventCursor;
 pub use location::Location;
 pub use options::{
     DatasetKind, OpenOptions, PoseUse, TimeUnit, TopicFlag, TrajectoryFormat, TrajectoryReadOptions,
+    body_named, decoder_named,
 };
 
 pub use trajectory_file::{read_times, read_trajectory, trajectory_from};

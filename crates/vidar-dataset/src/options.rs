@@ -182,6 +182,37 @@ impl FromStr for TimeUnit {
     }
 }
 
+/// The body of a trajectory by its name: `imu` (or `body`), `camera0` (or `cam0`), `camera1`, ….
+///
+/// # Errors
+/// [`DatasetError::BadOption`].
+pub fn body_named(text: &str) -> Result<BodyFrame, DatasetError> {
+    if matches!(text, "imu" | "body") {
+        return Ok(BodyFrame::Imu);
+    }
+    let number = text.strip_prefix("camera").or_else(|| text.strip_prefix("cam"));
+    number.and_then(|n| n.parse().ok()).map(|n| BodyFrame::Camera(CameraId(n))).ok_or_else(|| {
+        let expected = "imu, camera0, camera1, …".to_string();
+        DatasetError::BadOption { option: "trajectory body", found: format!("{text:?}"), expected }
+    })
+}
+
+/// The decoder of videos by its name.
+///
+/// # Errors
+/// [`DatasetError::BadOption`].
+pub fn decoder_named(text: &str) -> Result<VideoDecoder, DatasetError> {
+    match text {
+        "built-in" => Ok(VideoDecoder::BuiltIn),
+        "ffmpeg" => Ok(VideoDecoder::Ffmpeg),
+        _ => Err(DatasetError::BadOption {
+            option: "decoder",
+            found: format!("{text:?}"),
+            expected: "built-in or ffmpeg".to_string(),
+        }),
+    }
+}
+
 fn by_name<T: Copy>(
     option: &'static str,
     text: &str,

@@ -88,6 +88,9 @@ pub enum EvalError {
         /// Largest extent of the cloud, metres.
         extent_m: f64,
     },
+    /// The points that were paired do not determine an alignment.
+    #[error("no alignment: {0}")]
+    Alignment(#[from] vidar_core::UmeyamaError),
     /// The initial placement is not finite.
     #[error("the placement truth_from_estimate is not finite")]
     BadPlacement,

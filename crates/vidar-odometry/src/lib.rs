@@ -38,3 +38,9 @@ pub use pipeline::{
 pub use relocalization::SavedMap;
 pub use stages::{Stage, StageTimes};
 pub use tracking::TrackRecord;
+
+/// Bindings of other languages push from any thread: this does not compile if an odometry is tied to one.
+const _: fn() = || {
+    fn is_send<T: Send>() {}
+    is_send::<Odometry>();
+};

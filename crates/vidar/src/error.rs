@@ -307,6 +307,30 @@ impl Error {
         }
     }
 
+    /// What the error is about: a file or folder, with its line where one is known; or a configuration's origin.
+    pub fn place(&self) -> Option<String> {
+        use vidar_dataset::DatasetError;
+        use vidar_export::ExportError as Export;
+        let path = match self {
+            Self::UnknownKey { origin, .. } => return Some(origin.clone()),
+            Self::Dataset(DatasetError::Malformed { path, line, .. }) => {
+                return Some(format!("{}:{line}", path.display()));
+            }
+            Self::Dataset(error) => error.path()?,
+            Self::ConfigFile { path, .. }
+            | Self::OutputExists { path }
+            | Self::OtherRun { path, .. }
+            | Self::Io { path, .. }
+            | Self::NotARun { path, .. }
+            | Self::NotARecording { path, .. }
+            | Self::NotAMap { path, .. }
+            | Self::Interrupted { path }
+            | Self::Export(Export::File { path, .. }) => path,
+            _ => return None,
+        };
+        Some(path.display().to_string())
+    }
+
     /// The exit status for this error.
     pub fn exit_status(&self) -> ExitStatus {
         match self.code().as_bytes() {
@@ -559,6 +583,7 @@ mod tests {
         }
         let other = Error::io("read", &path(), NotFound.into());
         assert_eq!((other.code(), other.exit_status() as i32), ("E0401", 4));
+        assert_eq!(other.place().as_deref(), Some("map/mesh.ply"));
     }
 
     #[test]

@@ -6,7 +6,7 @@ use crate::run::Evaluation;
 use serde_json::Value;
 use std::collections::BTreeMap;
 use std::path::Path;
-use vidar_core::{PointCloud, Se3, Trajectory, Warning};
+use vidar_core::{PointCloud, Se3, Trajectory, TriangleMesh, Warning};
 use vidar_dataset::TrajectoryReadOptions;
 use vidar_eval::{SampleDensity, SurfaceReport, TrajectoryReport};
 
@@ -96,8 +96,21 @@ fn trajectory(
     };
     let ((estimate, mut warnings), (truth, more)) = (read(estimate)?, read(truth)?);
     warnings.extend(more);
-    let report = vidar_eval::evaluate_trajectory(&estimate, &truth, &config.eval.trajectory)?;
-    warnings.extend(report.warnings.iter().cloned());
+    let mut outcome = evaluate_trajectories(&estimate, &truth, config)?;
+    warnings.append(&mut outcome.warnings);
+    Ok(EvalOutcome { warnings, ..outcome })
+}
+
+/// Compares two trajectories of one body.
+///
+/// # Errors
+/// They are of two bodies, one is empty, or no stamps match.
+pub fn evaluate_trajectories(
+    estimate: &Trajectory,
+    truth: &Trajectory,
+    config: &Config,
+) -> Result<EvalOutcome, Error> {
+    let report = vidar_eval::evaluate_trajectory(estimate, truth, &config.eval.trajectory)?;
     let mut scores = Scores::new();
     add_trajectory(&mut scores, &report);
     Ok(EvalOutcome {
@@ -105,7 +118,7 @@ fn trajectory(
         scores,
         lines: trajectory_lines(&report),
         report: json(&report),
-        warnings,
+        warnings: report.warnings,
     })
 }
 
@@ -152,22 +165,37 @@ pub fn trajectory_lines(report: &TrajectoryReport) -> Vec<(String, String)> {
 }
 
 fn surface(estimate: &Path, truth: &Path, config: &Config) -> Result<EvalOutcome, Error> {
-    let report = vidar_eval::evaluate_surface(
-        &read_surface(estimate, config)?,
-        &read_surface(truth, config)?,
-        &Se3::IDENTITY,
-        &config.eval.surface,
-    )?;
+    evaluate_clouds(&read_surface(estimate, config)?, &read_surface(truth, config)?, config)
+}
+
+/// Compares two clouds in one world, metres.
+///
+/// # Errors
+/// One of them has no finite point.
+pub fn evaluate_clouds(
+    estimate: &PointCloud,
+    truth: &PointCloud,
+    config: &Config,
+) -> Result<EvalOutcome, Error> {
+    let report = vidar_eval::evaluate_surface(estimate, truth, &Se3::IDENTITY, &config.eval.surface)?;
     let mut scores = Scores::new();
     add_surface(&mut scores, &report);
-    let warnings = report.warnings.clone();
     Ok(EvalOutcome {
         kind: "surface",
         scores,
         lines: surface_lines(&report),
         report: json(&report),
-        warnings,
+        warnings: report.warnings,
     })
+}
+
+/// The evenly spread points by which a mesh is evaluated.
+///
+/// # Errors
+/// The mesh has no area.
+pub fn evaluated_points(mesh: &TriangleMesh, config: &Config) -> Result<PointCloud, Error> {
+    let density = SampleDensity::SpacingM(config.fusion.voxel_size_m / 2.0);
+    Ok(vidar_eval::sample_mesh(mesh, density)?)
 }
 
 /// A cloud as it is; a mesh as evenly spread points.
@@ -178,8 +206,7 @@ fn read_surface(path: &Path, config: &Config) -> Result<PointCloud, Error> {
     if ply.triangles.is_empty() {
         return Ok(ply.cloud);
     }
-    let density = SampleDensity::SpacingM(config.fusion.voxel_size_m / 2.0);
-    Ok(vidar_eval::sample_mesh(&ply.into_mesh(), density)?)
+    evaluated_points(&ply.into_mesh(), config)
 }
 
 /// The surface report in words: the rigid fit first, then what another scale would give.
@@ -229,11 +256,7 @@ pub fn refinement(report: &SurfaceReport) -> String {
 /// The scores in the folder of a finished run.
 pub fn evaluate_run(run: &Path) -> Result<EvalOutcome, Error> {
     let not_a_run = |reason: String| Error::NotARun { path: run.to_owned(), reason };
-    let path = run.join("eval/metrics.json");
-    let bytes = crate::system::read_up_to(&path, crate::system::MAX_JSON_BYTES)
-        .map_err(|e| not_a_run(format!("eval/metrics.json: {e}")))?;
-    let report: Value =
-        serde_json::from_slice(&bytes).map_err(|e| not_a_run(format!("eval/metrics.json: {e}")))?;
+    let report: Value = crate::run_folder::read_json(run, "eval/metrics.json")?;
     let scores: Scores = serde_json::from_value(report["scores"].clone())
         .map_err(|e| not_a_run(format!("eval/metrics.json has no scores: {e}")))?;
     let mut lines: Vec<(String, String)> =

@@ -370,6 +370,21 @@ pub fn absolute(path: &Path) -> PathBuf {
     std::path::absolute(path).unwrap_or_else(|_| path.to_owned())
 }
 
+/// The name of the recording at `path`, for the run folder.
+pub fn name_of(path: &Path) -> String {
+    let absolute = absolute(path);
+    let parts: Vec<String> = absolute
+        .components()
+        .filter_map(|c| match c {
+            std::path::Component::Normal(name) => Some(name.to_string_lossy().into_owned()),
+            _ => None,
+        })
+        .collect();
+    // `…/MH_01/mav0` has the name MH_01.
+    let meaningful = parts.iter().rev().find(|p| !["mav0", "cam0", "data"].contains(&p.as_str()));
+    meaningful.cloned().unwrap_or_else(|| "run".into())
+}
+
 #[cfg(test)]
 mod tests {
     use super::unit_slip;

@@ -100,24 +100,7 @@ pub fn inspect(
 ) -> Result<Inspection, Error> {
     let mut dataset = vidar_dataset::open(path, options)?;
     let noise = imu_noise::settle(&mut dataset);
-    let images: Vec<Timestamp> = dataset.images.iter().map(|i| i.time).collect();
-    let imu: Vec<Timestamp> = dataset.imu.iter().map(|s| s.time).collect();
-    let depths: Vec<Timestamp> = dataset.depths.iter().map(|d| d.time).collect();
-    let truth: Vec<Timestamp> = times(dataset.ground_truth.as_ref());
-    let external: Vec<Timestamp> = times(dataset.external_trajectory.as_ref().map(|a| &a.trajectory));
-    let camera = format!("images of camera {}", dataset.camera);
-    let streams = [
-        (camera.as_str(), images),
-        ("IMU", imu),
-        ("depth images", depths),
-        ("ground truth", truth),
-        ("trajectory", external),
-    ]
-    .into_iter()
-    .filter_map(|(what, times)| stream(what, &times))
-    // Poses of images have the images' times.
-    .map(|s| Stream { rate_hz: s.rate_hz.filter(|_| !dataset.times_are_invented), ..s })
-    .collect();
+    let streams = streams(&dataset);
     let motion = Motion::of(&dataset.imu);
     let images = image_health(&dataset);
     let needs_calibration = dataset.calibration == CalibrationSource::Guessed && !dataset.imu.is_empty();
@@ -168,6 +151,28 @@ fn missing(dataset: &Dataset) -> Vec<String> {
         (has_imu && (dataset.rig.imu.is_none() || imu_noise::is_guessed(dataset)), "noise of the IMU"),
     ];
     all.into_iter().filter(|(is_missing, _)| *is_missing).map(|(_, what)| what.to_owned()).collect()
+}
+
+/// The streams of a recording with their rates.
+pub fn streams(dataset: &Dataset) -> Vec<Stream> {
+    let images: Vec<Timestamp> = dataset.images.iter().map(|i| i.time).collect();
+    let imu: Vec<Timestamp> = dataset.imu.iter().map(|s| s.time).collect();
+    let depths: Vec<Timestamp> = dataset.depths.iter().map(|d| d.time).collect();
+    let truth: Vec<Timestamp> = times(dataset.ground_truth.as_ref());
+    let external: Vec<Timestamp> = times(dataset.external_trajectory.as_ref().map(|a| &a.trajectory));
+    let camera = format!("images of camera {}", dataset.camera);
+    [
+        (camera.as_str(), images),
+        ("IMU", imu),
+        ("depth images", depths),
+        ("ground truth", truth),
+        ("trajectory", external),
+    ]
+    .into_iter()
+    .filter_map(|(what, times)| stream(what, &times))
+    // Poses of images have the images' times.
+    .map(|s| Stream { rate_hz: s.rate_hz.filter(|_| !dataset.times_are_invented), ..s })
+    .collect()
 }
 
 fn times(trajectory: Option<&Trajectory>) -> Vec<Timestamp> {

@@ -103,9 +103,7 @@ pub fn odometry(
     folder.write_manifest(&started_manifest)?;
     folder.write("config.resolved.toml", request.layered.to_toml(true).as_bytes())?;
     let mut dump = if request.debug_dump { Some(dump::Dump::create(&folder)?) } else { None };
-    let timing = events.stage(camera_timing::STAGE, 0, || {
-        camera_timing::settle(&mut dataset, &mut config, events, cancel)
-    })?;
+    let timing = settle_timing(&mut dataset, &mut config, events, cancel)?;
     let recording = Recording { dataset: &dataset, config: &config, map: earlier_map.as_ref() };
     let tracked = track(&recording, sigmas.as_ref(), events, cancel, dump.as_mut())?;
     let dumped = dump.is_some();
@@ -158,6 +156,31 @@ pub fn odometry(
     folder.write_manifest(&manifest(started_manifest, &outcome, artifacts))?;
     events.emit(&Event::Finished { exit: status as i32, seconds: outcome.seconds });
     Ok(outcome)
+}
+
+/// What precedes tracking: a calibration found where the recording states none, and the clock offset, readout time and rotation
+/// of its camera. `dataset` and `config` are corrected; what was corrected is said.
+///
+/// # Errors
+/// There is no calibration and the recording does not show one; what the odometry refuses.
+pub fn prepare(
+    dataset: &mut Dataset,
+    config: &mut Config,
+    events: &Events,
+    cancel: &CancelToken,
+) -> Result<Option<Warning>, Error> {
+    calibrate::complete(dataset, &mut config.odometry, events, cancel)?;
+    input::require_calibration(dataset)?;
+    settle_timing(dataset, config, events, cancel)
+}
+
+fn settle_timing(
+    dataset: &mut Dataset,
+    config: &mut Config,
+    events: &Events,
+    cancel: &CancelToken,
+) -> Result<Option<Warning>, Error> {
+    events.stage(camera_timing::STAGE, 0, || camera_timing::settle(dataset, config, events, cancel))
 }
 
 /// What is tracked.

@@ -239,6 +239,18 @@ impl RunFolder {
     }
 }
 
+/// Reads a JSON file of the run in the folder `run`.
+///
+/// # Errors
+/// [`Error::NotARun`]: it is missing, too large or no JSON of that kind.
+pub fn read_json<T: serde::de::DeserializeOwned>(run: &Path, relative: &str) -> Result<T, Error> {
+    let not_a_run =
+        |reason: String| Error::NotARun { path: run.to_owned(), reason: format!("{relative}: {reason}") };
+    let bytes = crate::system::read_up_to(&run.join(relative), crate::system::MAX_JSON_BYTES)
+        .map_err(|e| not_a_run(e.to_string()))?;
+    serde_json::from_slice(&bytes).map_err(|e| not_a_run(e.to_string()))
+}
+
 /// An event with its schema, as one JSON object.
 pub fn event_line(event: &Event) -> serde_json::Value {
     let mut line = serde_json::json!({ "schema": EVENT_SCHEMA });

@@ -68,7 +68,7 @@ fn request(args: &DepthArgs, context: &Context) -> Result<DepthRequest, Error> {
         return Err(usage(format!("--focal {focal}"), "give the focal length in pixels of the images"));
     }
     let infer = infer_options(args, &model);
-    let name = args.inputs.first().map(|path| build::name_of(path)).unwrap_or_default();
+    let name = args.inputs.first().map(|path| vidar::input::name_of(path)).unwrap_or_default();
     Ok(DepthRequest {
         inputs: args.inputs.clone(),
         model,

@@ -18,7 +18,7 @@ pub fn odometry(args: &OdometryArgs, context: &Context) -> Outcome {
         path: recording.path.clone(),
         open: build::open_options(&args.input)?,
         layered,
-        place: build::place(&args.output, &build::name_of(&recording.path)),
+        place: build::place(&args.output, &vidar::input::name_of(&recording.path)),
         command: context.command.clone(),
         debug_dump: args.debug_dump,
     };

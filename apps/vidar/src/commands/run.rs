@@ -25,7 +25,7 @@ pub fn run(args: &RunArgs, context: &Context) -> Outcome {
         reference: args.reference.clone(),
         place: match (&args.output.output, args.resume) {
             (Some(path), true) => OutputLocation::Resumed { path: path.clone() },
-            _ => build::place(&args.output, &build::name_of(&args.path)),
+            _ => build::place(&args.output, &vidar::input::name_of(&args.path)),
         },
         command: context.command.clone(),
     };

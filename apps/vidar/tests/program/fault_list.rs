@@ -102,7 +102,10 @@ fn text(path: &Path) -> &str {
 
 /// A flight with a fault; its images are linked.
 fn with_fault(flight: &Path, fault: Fault, is_adjusted: bool) -> PathBuf {
-    let folder = shared().root.join(format!("fault {fault:?} {is_adjusted}"));
+    // Tests that run beside each other judge the same faults.
+    static MADE: AtomicUsize = AtomicUsize::new(0);
+    let number = MADE.fetch_add(1, Ordering::Relaxed);
+    let folder = shared().root.join(format!("fault {number} {fault:?} {is_adjusted}"));
     let (from, to) = (flight.join("mav0"), folder.join("mav0"));
     for part in ["cam0", "imu0", "state_groundtruth_estimate0"] {
         std::fs::create_dir_all(to.join(part)).unwrap();

@@ -4,7 +4,7 @@ use crate::backend::Smoother;
 use crate::imu::NavState;
 use crate::tracking::HostImage;
 use nalgebra::{Matrix2, Vector2};
-use std::rc::Rc;
+use std::sync::Arc;
 use vidar_core::{Duration, FrameId, ImuSample, LandmarkId, Se3, Timestamp, camera::Pixel};
 
 /// Images are logged this far apart, and keyframes in any case: preintegration over it is good to a tenth of a millimetre,
@@ -98,7 +98,7 @@ pub struct TrackLog {
     pub(crate) imu_rate_hz: f64,
     generation: u32,
     /// Images with their grey levels, to find what comes into view again.
-    places: Vec<(Timestamp, Rc<HostImage>)>,
+    places: Vec<(Timestamp, Arc<HostImage>)>,
     place_period: Duration,
 }
 
@@ -108,7 +108,7 @@ impl TrackLog {
     }
 
     /// Keeps the grey levels of an image taken at `stamp`, where they are due. It must be logged, too.
-    pub(crate) fn add_place(&mut self, stamp: Timestamp, image: &Rc<HostImage>) {
+    pub(crate) fn add_place(&mut self, stamp: Timestamp, image: &Arc<HostImage>) {
         if self.places.last().is_some_and(|(last, _)| stamp - *last < self.place_period) {
             return;
         }

@@ -13,7 +13,7 @@ use crate::tracking::{CameraPoses, Prediction, Tracker};
 use crate::tracking::{HostImage, host_covariance, noisy_covariance};
 use crate::tracking::{ImageMotion, tracks_in};
 use nalgebra::Vector3;
-use std::rc::Rc;
+use std::sync::Arc;
 use vidar_core::{Duration, FrameId, LieGroup, Se3, So3, Timestamp};
 
 /// The stretch of frames that is logged, s, and most frames of it (their images stay in memory): the longest window of an attempt, and
@@ -46,7 +46,7 @@ pub(crate) const STILL_SECS: f64 = 0.5;
 struct LoggedRotation {
     frame: FrameId,
     first_from_body: So3,
-    host: Rc<HostImage>,
+    host: Arc<HostImage>,
 }
 
 /// The odometry that waits for its start.
@@ -79,7 +79,7 @@ pub(crate) struct InitialState {
     /// Median distance of the landmarks.
     pub median_distance: f64,
     /// Images of the frames that the smoother holds.
-    pub hosts: Vec<Rc<HostImage>>,
+    pub hosts: Vec<Arc<HostImage>>,
 }
 
 /// Rotations of the logged frames; nothing has moved.
@@ -141,7 +141,7 @@ impl Initializer {
     /// Tracks all features into an image and logs their observations; a metric state if the log determines one.
     pub fn follow(
         &mut self,
-        host: Rc<HostImage>,
+        host: Arc<HostImage>,
         time: Timestamp,
         preintegration: Option<Preintegration>,
     ) -> Result<InitialState, InitFailure> {
@@ -263,7 +263,7 @@ impl Initializer {
     /// Measures all tracks in the newest image; how many were found.
     fn track(
         &mut self,
-        host: &Rc<HostImage>,
+        host: &Arc<HostImage>,
         time: Timestamp,
         preintegration: Option<&Preintegration>,
     ) -> usize {

@@ -18,7 +18,7 @@ use nalgebra::Vector3;
 use relocalization::Relocalizer;
 use start::initializer;
 use std::collections::VecDeque;
-use std::rc::Rc;
+use std::sync::Arc;
 use vidar_core::{
     CameraId, Duration, Frame, FrameId, ImuSample, LieGroup, Rig, RigCamera, Se3, SensorEvent, Timestamp,
 };
@@ -87,7 +87,7 @@ pub struct Odometry {
     placed: Option<Se3>,
     relocalizer: Relocalizer,
     interval: Vec<ImuSample>,
-    last_host: Option<Rc<HostImage>>,
+    last_host: Option<Arc<HostImage>>,
     failure: InitFailure,
     health_monitor: HealthMonitor,
     keyframes: KeyframeRegistry,
@@ -273,7 +273,7 @@ impl Odometry {
         Some(OdometryOutput { frame_id: frame.id, time: frame.time, status })
     }
 
-    fn status_after(&mut self, frame: &Frame, host: Rc<HostImage>, time: Timestamp) -> Status {
+    fn status_after(&mut self, frame: &Frame, host: Arc<HostImage>, time: Timestamp) -> Status {
         if let Some(reason) = self.gap_before(time) {
             self.last_frame = Some(time);
             self.last_host = Some(host);

@@ -16,12 +16,12 @@ use crate::imu::{NavState, Preintegration};
 use crate::pipeline::TrackSummary;
 use crate::stages::{Stage, StageClock};
 use standstill::{ZERO_MOTION_SIGMA_M, ZERO_MOTION_SIGMA_RAD, ZERO_VELOCITY_SIGMA_MPS};
-use std::rc::Rc;
+use std::sync::Arc;
 use vidar_core::{CameraModel, FrameId, LandmarkId, LieGroup, Se3, Timestamp};
 
 /// A frame that arrives.
 pub(crate) struct FrameInput {
-    pub host: Rc<HostImage>,
+    pub host: Arc<HostImage>,
     /// In the clock of the IMU.
     pub time: Timestamp,
     /// IMU measurements since the frame before.
@@ -70,9 +70,9 @@ pub(crate) struct SlidingWindowOdometry {
     pub smoother: Smoother,
     pub tracker: Tracker,
     /// Images of the keyframes held.
-    hosts: Vec<Rc<HostImage>>,
+    hosts: Vec<Arc<HostImage>>,
     last: FrameId,
-    last_host: Option<Rc<HostImage>>,
+    last_host: Option<Arc<HostImage>>,
     /// Pose of the frame before the last.
     before_last: Option<Se3>,
     aligner: ImageAligner,
@@ -115,7 +115,7 @@ impl SlidingWindowOdometry {
         config: OdometryConfig,
         smoother: Smoother,
         tracker: Tracker,
-        hosts: Vec<Rc<HostImage>>,
+        hosts: Vec<Arc<HostImage>>,
         typical_inverse: f64,
     ) -> Option<Self> {
         let (last, ..) = smoother.newest()?;
@@ -234,7 +234,7 @@ impl SlidingWindowOdometry {
     /// Measures all tracks from the predicted pose.
     fn measure(
         &mut self,
-        host: &Rc<HostImage>,
+        host: &Arc<HostImage>,
         time: Timestamp,
         last: &NavState,
         predicted: &NavState,
@@ -304,7 +304,7 @@ fn observation(
 fn follow_host(
     track: &mut Track,
     smoother: &Smoother,
-    hosts: &[Rc<HostImage>],
+    hosts: &[Arc<HostImage>],
     camera: &CameraModel,
 ) -> bool {
     let Some(landmark) = smoother.landmark(track.id) else { return false };

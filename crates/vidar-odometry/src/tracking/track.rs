@@ -6,7 +6,7 @@ use crate::frontend::{
 };
 use crate::gyro_alignment::RollingShutter;
 use nalgebra::{Matrix2, Matrix2x1, Vector2};
-use std::rc::Rc;
+use std::sync::Arc;
 use vidar_core::camera::Pixel;
 use vidar_core::{CameraModel, FrameId, FrameImage, LandmarkId, LieGroup, Se3};
 
@@ -24,7 +24,7 @@ pub(crate) struct HostImage {
 /// Images whose memory is used again once nobody holds them.
 #[derive(Debug, Default)]
 pub(crate) struct ImagePool {
-    images: Vec<Rc<HostImage>>,
+    images: Vec<Arc<HostImage>>,
 }
 
 impl ImagePool {
@@ -35,8 +35,8 @@ impl ImagePool {
         image: &FrameImage,
         levels: usize,
         shutter: RollingShutter,
-    ) -> Option<Rc<HostImage>> {
-        let free = self.images.iter_mut().find_map(Rc::get_mut);
+    ) -> Option<Arc<HostImage>> {
+        let free = self.images.iter_mut().find_map(Arc::get_mut);
         match free {
             Some(host) => {
                 host.frame = frame;
@@ -46,7 +46,7 @@ impl ImagePool {
             None => {
                 let mut pyramid = Pyramid::new(image.width(), image.height(), levels);
                 pyramid.rebuild(image).ok()?;
-                self.images.push(Rc::new(HostImage { frame, pyramid, shutter }));
+                self.images.push(Arc::new(HostImage { frame, pyramid, shutter }));
             }
         }
         self.images.iter().find(|h| h.frame == frame).cloned()
@@ -68,7 +68,7 @@ pub(crate) struct InverseDistance {
 pub(crate) struct Track {
     pub id: LandmarkId,
     /// Where its patch comes from.
-    pub host: Rc<HostImage>,
+    pub host: Arc<HostImage>,
     pub feature: Feature,
     pub distance: InverseDistance,
     /// Whether the smoother knows it.

@@ -5,7 +5,7 @@ use crate::frontend::{
     Detection, Detector, Feature, FrontendConfig, MatchFailure, OccupancyGrid, PixelMeasurement, Warp,
 };
 use nalgebra::Vector2;
-use std::rc::Rc;
+use std::sync::Arc;
 use vidar_core::camera::Pixel;
 use vidar_core::{CameraModel, FrameId, LandmarkId, LieGroup, Se3};
 
@@ -129,7 +129,7 @@ impl Tracker {
     }
 
     /// Starts tracks in the free cells of `host`, at most `limit`, with distances as `typical_inverse`.
-    pub fn detect(&mut self, host: &Rc<HostImage>, limit: usize, typical_inverse: f64) -> usize {
+    pub fn detect(&mut self, host: &Arc<HostImage>, limit: usize, typical_inverse: f64) -> usize {
         self.grid.clear();
         for track in self.tracks.iter().filter(|t| t.measured.is_some()) {
             self.grid.take(&track.last_pixel);
@@ -155,7 +155,7 @@ impl Tracker {
         self.tracks.len() - before
     }
 
-    fn fresh_track(&mut self, host: &Rc<HostImage>, feature: Feature, distance: InverseDistance) -> Track {
+    fn fresh_track(&mut self, host: &Arc<HostImage>, feature: Feature, distance: InverseDistance) -> Track {
         let id = LandmarkId(self.next_id);
         self.next_id = self.next_id.wrapping_add(1);
         Track {

@@ -97,12 +97,8 @@ pub fn read_views(run: &Path) -> Result<Vec<StoredView>, Error> {
 }
 
 fn read_stored(run: &Path) -> Result<StoredViews, Error> {
-    let path = run.join("views.json");
     let not_a_run = |reason: String| Error::NotARun { path: run.to_owned(), reason };
-    let bytes = crate::system::read_up_to(&path, crate::system::MAX_JSON_BYTES)
-        .map_err(|e| not_a_run(format!("views.json: {e}")))?;
-    let stored: StoredViews =
-        serde_json::from_slice(&bytes).map_err(|e| not_a_run(format!("views.json: {e}")))?;
+    let stored: StoredViews = crate::run_folder::read_json(run, "views.json")?;
     if stored.schema != VIEWS_SCHEMA {
         return Err(not_a_run(format!(
             "views.json has schema {:?}, expected {VIEWS_SCHEMA:?}",

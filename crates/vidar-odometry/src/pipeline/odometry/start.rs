@@ -10,7 +10,7 @@ use crate::initialization::{
     InitFailure, InitFailureReason, StaticInitConfig, StaticState, initialize_slow, initialize_static,
 };
 use crate::tracking::{HostImage, ImuStatistics, SlidingWindowOdometry, StepReport, Tracker};
-use std::rc::Rc;
+use std::sync::Arc;
 use vidar_core::{Duration, Frame, FrameId, ImuSample, RigCamera, Timestamp};
 
 /// Images without parallax for this long begin a state that hardly moves, s.
@@ -32,7 +32,7 @@ impl Odometry {
 
     /// Starts from a body at rest: level and gyroscope bias are known, the velocity is zero, and the scale follows as
     /// soon as the body moves.
-    pub(super) fn start_static(&mut self, frame: &Frame, host: &Rc<HostImage>, time: Timestamp) -> Status {
+    pub(super) fn start_static(&mut self, frame: &Frame, host: &Arc<HostImage>, time: Timestamp) -> Status {
         let samples: Vec<ImuSample> = self.imu.iter().filter(|s| s.time <= time).copied().collect();
         // An IMU sample early, so that the span is not shorter than asked for by less than one period.
         let from = time - Duration::from_secs_f64(STILL_SECS + 0.02);
@@ -97,7 +97,7 @@ impl Odometry {
         &mut self,
         found: InitialState,
         frame: &Frame,
-        host: &Rc<HostImage>,
+        host: &Arc<HostImage>,
     ) -> Status {
         let waiting = Phase::Initializing(Box::new(initializer(
             &self.config,

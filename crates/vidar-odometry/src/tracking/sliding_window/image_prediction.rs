@@ -4,7 +4,7 @@ use super::SlidingWindowOdometry;
 use crate::frontend::{AlignmentPoint, AlignmentReference, MotionPrediction};
 use crate::imu::NavState;
 use crate::tracking::HostImage;
-use std::rc::Rc;
+use std::sync::Arc;
 use vidar_core::{LieGroup, Se3};
 
 /// Standard deviation of a motion that is only guessed, rad, and as a share of the scene's distance.
@@ -12,7 +12,7 @@ const GUESS_SIGMA_RAD: f64 = 0.1;
 
 impl SlidingWindowOdometry {
     /// The pose without an IMU: the last motion goes on, and the last image's patches correct it.
-    pub(super) fn predict_by_image(&mut self, host: &Rc<HostImage>, last: &NavState) -> NavState {
+    pub(super) fn predict_by_image(&mut self, host: &Arc<HostImage>, last: &NavState) -> NavState {
         let body_from_camera = *self.smoother.body_from_camera();
         let last_from_before = self.before_last.map_or(Se3::IDENTITY, |b| b.inverse() * last.world_from_body);
         let mut predicted = NavState { world_from_body: last.world_from_body * last_from_before, ..*last };

@@ -4,7 +4,7 @@ use super::{SlidingWindowOdometry, StepReport, WindowPoses, follow_host};
 use crate::backend::SmootherError;
 use crate::tracking::CameraPoses;
 use crate::tracking::{HostImage, rotated_pixel};
-use std::rc::Rc;
+use std::sync::Arc;
 use vidar_core::{FrameId, LieGroup, Timestamp};
 
 /// Recent frames that are held whether they are keyframes or not.
@@ -71,7 +71,7 @@ impl SlidingWindowOdometry {
     }
 
     /// Marks the newest frame a keyframe and starts tracks in it.
-    pub(super) fn make_keyframe(&mut self, host: Rc<HostImage>) -> Result<(), SmootherError> {
+    pub(super) fn make_keyframe(&mut self, host: Arc<HostImage>) -> Result<(), SmootherError> {
         self.smoother.mark_keyframe(host.frame)?;
         self.last_keyframe = host.frame;
         self.frames_since_keyframe = 0;

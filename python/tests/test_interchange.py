@@ -1,0 +1,195 @@
+"""Numbers and files against other programs: evo, Open3D, trimesh, pycolmap, Khronos' glTF validator.
+
+Each is skipped where its program is not installed; requirements-interchange.txt lists those of Python.
+"""
+
+import json
+import shutil
+import subprocess
+
+import numpy as np
+import pytest
+from conftest import call
+
+import vidar
+
+
+def required(module):
+    """The module, or a skipped test where it is not installed or lacks a system library."""
+    return pytest.importorskip(module, exc_type=ImportError)
+
+
+@pytest.fixture(scope="module")
+def trajectories(flight, tmp_path_factory):
+    """Files of an estimate and of the truth, of the same run."""
+    folder = tmp_path_factory.mktemp("trajectories")
+    call("odometry", flight, "-o", folder / "run", "-q")
+    vidar.Recording(flight).ground_truth.write(folder / "truth.tum")
+    return folder / "run/trajectory/odometry_body.tum", folder / "truth.tum"
+
+
+def test_trajectory_scores_are_those_of_evo(trajectories):
+    required("evo.core")
+    import copy
+
+    from evo.core import metrics, sync
+    from evo.tools import file_interface
+
+    estimate_file, truth_file = trajectories
+    from_python = vidar.evaluate(estimate_file, truth_file)
+    from_program = json.loads(call("eval", estimate_file, truth_file, "--json").stdout)
+    assert from_python.scores == from_program["scores"] and from_python.report == from_program["report"]
+
+    truth, estimate = sync.associate_trajectories(
+        file_interface.read_tum_trajectory_file(truth_file),
+        file_interface.read_tum_trajectory_file(estimate_file),
+        max_diff=0.01,
+    )
+    report = from_python.report
+    assert report["matched"] == truth.num_poses
+    for name, with_scale in (("ate_se3_m", False), ("ate_sim3_m", True)):
+        moved = copy.deepcopy(estimate)
+        _, _, scale = moved.align(truth, correct_scale=with_scale)
+        ape = metrics.APE(metrics.PoseRelation.translation_part)
+        ape.process_data((truth, moved))
+        told = ape.get_all_statistics()
+        for statistic in ("rmse", "mean", "median", "max"):
+            assert report[name][statistic] == pytest.approx(told[statistic], abs=1e-9), (name, statistic)
+        if with_scale:
+            assert report["scale"] == pytest.approx(scale, abs=1e-9)
+            assert from_python.scores["scale"] == pytest.approx(abs(np.log(scale)), abs=1e-9)
+    rpe = metrics.RPE(metrics.PoseRelation.translation_part, delta=1, delta_unit=metrics.Unit.frames)
+    rpe.process_data((truth, estimate))
+    assert report["rpe_frames"]["translation_m"]["rmse"] == pytest.approx(
+        rpe.get_statistic(metrics.StatisticsType.rmse), abs=1e-9
+    )
+
+
+def matrix_of(record):
+    """The 4×4 matrix of a transform in a report."""
+    x, y, z, w = record["rotation_xyzw"]
+    rotation = np.array([
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+    ])
+    matrix = np.eye(4)
+    matrix[:3, :3] = record["scale"] * rotation
+    matrix[:3, 3] = record["translation_m"]
+    return matrix
+
+
+def test_map_scores_are_those_of_open3d(finished, tiny):
+    o3d = required("open3d")
+    points = finished / "map/points.ply"
+    scan = vidar.Recording(tiny).reference_cloud
+    evaluation = vidar.evaluate(points, scan)
+    told = json.loads(call("eval", points, scan, "--json").stdout)
+    assert evaluation.scores == told["scores"]
+    # The same placement, then Open3D's own distances.
+    estimate = o3d.io.read_point_cloud(str(points)).transform(matrix_of(evaluation.report["rigid_placement"]))
+    truth = o3d.io.read_point_cloud(str(scan))
+    accuracy = np.asarray(estimate.compute_point_cloud_distance(truth))
+    completeness = np.asarray(truth.compute_point_cloud_distance(estimate))
+    for score in evaluation.report["rigid"]:
+        precision = (accuracy < score["threshold_m"]).mean()
+        recall = (completeness < score["threshold_m"]).mean()
+        # Distances are float32 in VIDAR: a point at the threshold may fall on either side.
+        assert score["precision"] == pytest.approx(precision, abs=2e-4)
+        assert score["recall"] == pytest.approx(recall, abs=2e-4)
+        assert score["f"] == pytest.approx(2 * precision * recall / (precision + recall), abs=2e-4)
+    chamfer = evaluation.report["chamfer"]
+    assert chamfer["accuracy_mean_m"] == pytest.approx(accuracy.mean(), abs=1e-6)
+    assert chamfer["completeness_mean_m"] == pytest.approx(completeness.mean(), abs=1e-6)
+
+
+def test_meshes_open_in_open3d(finished):
+    o3d = required("open3d")
+    mesh = vidar.read_run(finished).mesh
+    for name in ("mesh.ply", "mesh.glb"):
+        opened = o3d.io.read_triangle_mesh(str(finished / "map" / name))
+        assert len(opened.triangles) == len(mesh.triangles), name
+        assert opened.has_vertex_normals() and opened.has_vertex_colors(), name
+    opened = o3d.io.read_triangle_mesh(str(finished / "map/mesh.ply"))
+    assert np.array_equal(np.asarray(opened.vertices, np.float32), mesh.vertices)
+    cloud = o3d.io.read_point_cloud(str(finished / "map/points.ply"))
+    assert len(cloud.points) == len(vidar.read_run(finished).points) and cloud.has_normals() and cloud.has_colors()
+
+
+def test_meshes_open_in_trimesh(finished):
+    trimesh = required("trimesh")
+    mesh = vidar.read_run(finished).mesh
+    ply = trimesh.load(finished / "map/mesh.ply", process=False)
+    assert np.array_equal(ply.vertices.astype(np.float32), mesh.vertices)
+    assert np.array_equal(ply.faces, mesh.triangles)
+    assert np.array_equal(ply.visual.vertex_colors[:, :3], mesh.colors)
+    scene = trimesh.load(finished / "map/mesh.glb", process=False)
+    (glb,) = scene.dump() if hasattr(scene, "dump") else [scene]
+    assert len(glb.faces) == len(mesh.triangles)
+    # y up: (x, y, z) of the world is (x, z, -y) of glTF, by the root node.
+    assert np.allclose(glb.vertices, mesh.vertices[:, [0, 2, 1]] * (1, 1, -1), atol=1e-5)
+    assert glb.area == pytest.approx(ply.area, rel=1e-5)
+
+
+@pytest.mark.parametrize("target", ["colmap", "colmap-text"])
+def test_models_open_in_pycolmap(finished, tmp_path, target):
+    pycolmap = required("pycolmap")
+    run = vidar.read_run(finished)
+    run.export(target, tmp_path, tracks=True)
+    model = pycolmap.Reconstruction(tmp_path / "sparse/0")
+    views = run.views
+    assert model.num_images() == len(views) and model.num_points3D() > 500
+    files = {p.name for p in (tmp_path / "images").iterdir()}
+    assert {image.name for image in model.images.values()} == files
+    errors = []
+    for image in model.images.values():
+        camera = model.cameras[image.camera_id]
+        camera_from_world = image.cam_from_world() if callable(image.cam_from_world) else image.cam_from_world
+        for observation in image.points2D:
+            if observation.has_point3D():
+                point = model.points3D[observation.point3D_id].xyz
+                projected = camera.img_from_cam(camera_from_world * point)
+                errors.append(np.linalg.norm(projected - observation.xy))
+    assert len(errors) > 1000 and max(errors) < 0.5, (len(errors), max(errors))
+    # Poses are those of the run: camera centres in metres, in one world.
+    centres = np.array([image.projection_center() for image in model.images.values()])
+    ours = np.array([view.world_from_camera[:3, 3] for view in views])
+    assert all(np.linalg.norm(ours - centre, axis=1).min() < 1e-6 for centre in centres)
+
+
+VALIDATE = """
+const validator = require('gltf-validator');
+const bytes = new Uint8Array(require('fs').readFileSync(process.argv[2]));
+validator.validateBytes(bytes, {maxIssues: 20}).then(report => console.log(JSON.stringify(report.issues)));
+"""
+
+
+@pytest.fixture(scope="session")
+def validator(tmp_path_factory):
+    if not shutil.which("node") or not shutil.which("npm"):
+        pytest.skip("node and npm are not installed")
+    folder = tmp_path_factory.mktemp("gltf")
+    installed = subprocess.run(
+        ["npm", "install", "--silent", "--no-audit", "--no-fund", "gltf-validator@2.0.0-dev.3.10"],
+        cwd=folder, capture_output=True, text=True,
+    )
+    if installed.returncode != 0:
+        pytest.skip(f"npm cannot install gltf-validator: {installed.stderr.strip()[:200]}")
+    (folder / "validate.js").write_text(VALIDATE)
+
+    def validate(path):
+        done = subprocess.run(["node", "validate.js", str(path)], cwd=folder, capture_output=True, text=True)
+        assert done.returncode == 0, done.stderr
+        return json.loads(done.stdout)
+
+    return validate
+
+
+def test_glb_files_are_valid(finished, validator, tmp_path):
+    mesh = vidar.read_run(finished).mesh
+    vidar.Mesh(mesh.vertices, mesh.triangles).write(tmp_path / "plain.glb")
+    for path in (finished / "map/mesh.glb", tmp_path / "plain.glb"):
+        issues = validator(path)
+        assert issues["numErrors"] == 0 and issues["numWarnings"] == 0, issues["messages"]
+
+
