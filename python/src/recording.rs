@@ -19,8 +19,8 @@ use vidar::dataset::{CalibrationSource, Dataset, EventCursor};
 /// A recording, opened: a bag, a video, or a folder in any layout that `vidar run` reads. Images stay on disk until asked for.
 ///
 /// Recording(path, **options) takes the input options of the command line: format, camera, calibration (a path or a list),
-/// topics, camera_model ("pinhole:fx,fy,cx,cy"), trajectory, trajectory_format, trajectory_body, timestamps, time_unit,
-/// depth_intrinsics (fx, fy, cx, cy), depth_scale, color_from_depth (4, 4), decoder, start and end (s), stride; and preset,
+/// topics, camera_model ("pinhole:fx,fy,cx,cy"), trajectory, trajectory_format, trajectory_body, imu (a path or a list), timestamps,
+/// time_unit, depth_intrinsics (fx, fy, cx, cy), depth_scale, color_from_depth (4, 4), decoder, start and end (s), stride; and preset,
 /// config and settings.
 ///
 /// Iterating gives Frame, ImuSample, DepthImage and GroundTruth objects in the order of time.

@@ -58,7 +58,7 @@ impl Odometry {
         &mut self,
         failure: InitFailure,
         frame: &Frame,
-        host: &Rc<HostImage>,
+        host: &Arc<HostImage>,
         time: Timestamp,
     ) -> Status {
         let Phase::Initializing(initializer) = &self.phase else { return self.wait(failure) };
@@ -77,7 +77,7 @@ impl Odometry {
     /// A window that begins with this image and state.
     fn start_at(
         &mut self,
-        host: &Rc<HostImage>,
+        host: &Arc<HostImage>,
         time: Timestamp,
         start: &StaticState,
     ) -> Option<SlidingWindowOdometry> {
