@@ -8,7 +8,9 @@ use crate::simulate::{
     StepOutput,
 };
 use nalgebra::Vector3;
-use vidar_core::{FrameId, GRAVITY_MPS2, ImuNoise, ImuSample, LieGroup, So3};
+use vidar_core::{
+    AngularRate, FrameId, GRAVITY_MPS2, ImuNoise, ImuSample, LieGroup, So3, SpecificForce, Timestamp,
+};
 
 fn simulate(course: &Course, config: &SimulationConfig) -> Simulation {
     Simulation::new(course, 0.0, course.secs, config)
@@ -227,4 +229,30 @@ fn a_log_without_imu_samples_or_tracks_fails() {
         })
         .collect();
     assert_eq!(failed(&mut start, &blind), InitFailureReason::Tracks);
+}
+
+/// A second of a level IMU whose body sways along x with this amplitude of its velocity, two periods a second.
+fn swaying(velocity_mps: f64) -> Vec<ImuSample> {
+    let rate = 4.0 * std::f64::consts::PI;
+    let sample = |k: i64| {
+        let accel = velocity_mps * rate * (rate * k as f64 / 200.0).cos();
+        ImuSample {
+            time: Timestamp::from_nanos(5_000_000 * k),
+            gyro: AngularRate(Vector3::zeros()),
+            accel: SpecificForce(Vector3::new(accel, 0.0, GRAVITY_MPS2)),
+        }
+    };
+    (0..=200).map(sample).collect()
+}
+
+#[test]
+fn a_hand_that_sways_is_not_one_that_hardly_moves() {
+    let slow = |samples: &[ImuSample]| initialize_slow(samples, &Vector3::zeros(), GRAVITY_MPS2);
+    let calm = slow(&swaying(0.1)).unwrap();
+    assert!(calm.state.world_from_body.rotation.log().norm() < 0.01, "{:?}", calm.state);
+    assert!(slow(&swaying(0.5)).is_none());
+    let mut damaged = swaying(0.1);
+    damaged[100].accel.0.x = f64::NAN;
+    assert!(slow(&damaged).is_none());
+    assert!(slow(&[]).is_none());
 }

@@ -65,7 +65,7 @@ impl Odometry {
         let (from, gyro_bias) = (time - Duration::from_secs_f64(SLOW_SECS), initializer.gyro_bias());
         let samples: Vec<ImuSample> =
             self.imu.iter().filter(|s| (from..=time).contains(&s.time)).copied().collect();
-        let Ok(slow) = initialize_slow(&samples, &gyro_bias, self.config.gravity_mps2) else {
+        let Some(slow) = initialize_slow(&samples, &gyro_bias, self.config.gravity_mps2) else {
             return self.wait(failure);
         };
         match self.start_at(host, time, &slow) {
