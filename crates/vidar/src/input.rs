@@ -15,6 +15,7 @@ use vidar_core::{
     BodyFrame, CameraId, Duration, Frame, FrameImage, SensorEvent, StampedPose, Trajectory, Warning,
 };
 use vidar_dataset::{Dataset, DatasetError, ImageEntry, OpenOptions};
+use vidar_odometry::bundle_adjustment::Adjusted;
 
 /// Where the metric poses of a run come from.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
@@ -260,6 +261,12 @@ pub fn open_dataset(path: &Path, options: &OpenOptions, config: &Config) -> Resu
     Ok(dataset)
 }
 
+/// Whether the adjustment of a recording that calibrated itself leaves so much of the IMU that its calibration may be wrong.
+pub(crate) fn leaves_calibration_unchecked(dataset: &Dataset, adjusted: &Adjusted) -> bool {
+    dataset.calibration == vidar_dataset::CalibrationSource::Recording
+        && adjusted.report.inertial_chi2_per_dof > MAX_SELF_CALIBRATED_CHI2
+}
+
 /// σ(ln s) of what the estimate of the scale does not see.
 #[derive(Clone, Copy, Debug)]
 pub struct UnseenScale {
@@ -292,12 +299,13 @@ impl UnseenScale {
     /// The scale of a trajectory: the adjustment estimates the calibration, too; the live one takes it as given. An adjustment
     /// that leaves camera and IMU apart has not checked a calibration that came from the same recording.
     pub fn source(&self, quality: &TrackQuality) -> ScaleSource {
-        let leaves = quality.inertial_chi2().unwrap_or(f64::INFINITY);
-        let limit = if self.is_self_calibrated { MAX_SELF_CALIBRATED_CHI2 } else { f64::MAX };
+        let is_unchecked = quality
+            .inertial_chi2()
+            .is_none_or(|left| self.is_self_calibrated && left > MAX_SELF_CALIBRATED_CHI2);
         ScaleSource::Odometry {
             stated: quality.scale_std(),
             unseen: self.sensors,
-            unchecked: (leaves > limit).then_some(self.calibration),
+            unchecked: is_unchecked.then_some(self.calibration),
         }
     }
 }

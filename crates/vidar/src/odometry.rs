@@ -191,8 +191,34 @@ pub(crate) struct Recording<'a> {
     pub map: Option<&'a EarlierMap>,
 }
 
-/// Feeds a recording to the odometry, and adjusts all states after its end where `adjustable` says what may change.
+/// Feeds a recording to the odometry, and adjusts all states after its end where `adjustable` says what may change. Where that leaves
+/// camera and IMU apart and the calibration is the recording's own, all of it happens once more with the calibration as adjusted.
 pub(crate) fn track(
+    recording: &Recording<'_>,
+    adjustable: Option<&CalibrationSigmas>,
+    events: &Events,
+    cancel: &CancelToken,
+    mut dump: Option<&mut dump::Dump>,
+) -> Result<Tracked, Error> {
+    let tracked = track_once(recording, adjustable, events, cancel, dump.as_deref_mut())?;
+    let Recording { dataset, config, map } = *recording;
+    let first = tracked.adjusted.as_ref().filter(|a| input::leaves_calibration_unchecked(dataset, a));
+    let Some(first) = first.filter(|_| !cancel.is_cancelled()) else { return Ok(tracked) };
+    let focal = |dataset: &Dataset| dataset.rig.cameras[dataset.camera.index()].model.intrinsics().fx;
+    let before = focal(dataset);
+    let (mut dataset, mut config) = (dataset.clone(), config.clone());
+    adjusted::apply(first, &mut dataset);
+    config.odometry.readout_ms = Some(1e3 * first.calibration.readout_secs);
+    if let Some(dump) = dump.as_deref_mut() {
+        dump.begin_again()?;
+    }
+    let again = Recording { dataset: &dataset, config: &config, map };
+    let mut again = track_once(&again, adjustable, events, cancel, dump)?;
+    again.calibrated_again = Some([before, focal(&dataset)]);
+    Ok(if again.adjusted.is_some() { again } else { tracked })
+}
+
+fn track_once(
     recording: &Recording<'_>,
     adjustable: Option<&CalibrationSigmas>,
     events: &Events,

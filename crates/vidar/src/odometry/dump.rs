@@ -4,7 +4,7 @@ use crate::error::Error;
 use crate::run_folder::RunFolder;
 use std::fs::File;
 use std::io::{BufWriter, Write};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use vidar_odometry::{OdometryOutput, TrackRecord};
 
 /// Files inside the run folder.
@@ -23,17 +23,28 @@ pub(crate) struct Dump {
     states: (PathBuf, BufWriter<File>),
 }
 
+/// An empty file but for its head.
+fn begin(path: &Path, name: &str) -> Result<BufWriter<File>, Error> {
+    let failed = |e| Error::io("write", path, e);
+    let mut writer = BufWriter::new(File::create(path).map_err(failed)?);
+    let head = if name == TRACKS { TRACKS_HEAD } else { STATES_HEAD };
+    writeln!(writer, "{head}").map_err(failed)?;
+    Ok(writer)
+}
+
 impl Dump {
     /// Begins both files.
     pub(super) fn create(folder: &RunFolder) -> Result<Self, Error> {
-        let open = |name: &str, head: &str| {
-            let path = folder.file(name)?;
-            let file = File::create(&path).map_err(|e| Error::io("write", &path, e))?;
-            let mut writer = BufWriter::new(file);
-            writeln!(writer, "{head}").map_err(|e| Error::io("write", &path, e))?;
-            Ok::<_, Error>((path, writer))
-        };
-        Ok(Self { tracks: open(TRACKS, TRACKS_HEAD)?, states: open(STATES, STATES_HEAD)? })
+        let file = |name: &str| folder.file(name).and_then(|path| Ok((begin(&path, name)?, path)));
+        let [(tracks, of_tracks), (states, of_states)] = [file(TRACKS)?, file(STATES)?];
+        Ok(Self { tracks: (of_tracks, tracks), states: (of_states, states) })
+    }
+
+    /// Drops what was written: the recording is tracked anew.
+    pub(super) fn begin_again(&mut self) -> Result<(), Error> {
+        self.tracks.1 = begin(&self.tracks.0, TRACKS)?;
+        self.states.1 = begin(&self.states.0, STATES)?;
+        Ok(())
     }
 
     /// Adds one image.

@@ -69,6 +69,8 @@ pub struct Tracked {
     pub adjusted: Option<Adjusted>,
     /// Why there are none.
     pub not_adjusted: Option<String>,
+    /// Focal length (pixels) that the recording's own calibration gave and the one that the adjustment found, where all was tracked again with it.
+    pub calibrated_again: Option<[f64; 2]>,
     /// How the map of an earlier recording served, where one was given.
     pub map: Option<MapUse>,
     /// The map for a later one.
@@ -236,6 +238,13 @@ impl Tracked {
         }
         if let (Some(reason), true) = (&self.not_adjusted, self.quality.longest().is_some()) {
             warnings.push(Warning::new("not-adjusted", format!("the live states are final: {reason}")));
+        }
+        if let Some([before, after]) = self.calibrated_again {
+            let text = format!(
+                "camera and IMU did not agree with the calibration found first (focal length {before:.1} px); the recording was tracked once more with the one \
+                 that their adjustment found ({after:.1} px)"
+            );
+            warnings.push(Warning::new("calibrated-again", text));
         }
         warnings.extend(self.adjusted.iter().flat_map(adjusted::warnings));
         warnings.extend(self.map.iter().map(MapUse::warning));
