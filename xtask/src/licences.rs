@@ -6,15 +6,18 @@ use std::path::Path;
 
 /// Checks the licence expression of every package of the resolved graph.
 pub fn check(root: &Path) -> Result<Vec<String>> {
-    let allowed = allowed(&std::fs::read_to_string(root.join("deny.toml")).context("deny.toml")?);
+    let deny = std::fs::read_to_string(root.join("deny.toml")).context("deny.toml")?;
+    let (allowed, exceptions) = (allowed(&deny), exceptions(&deny));
     let mut problems = Vec::new();
-    // The Python module is a workspace of its own.
-    let workspaces = ["Cargo.toml", "python/Cargo.toml"].map(|manifest| root.join(manifest));
+    // The Python module and the C library are workspaces of their own.
+    let workspaces = ["Cargo.toml", "python/Cargo.toml", "c/Cargo.toml"].map(|manifest| root.join(manifest));
     let metadata = workspaces.map(|manifest| MetadataCommand::new().manifest_path(manifest).exec());
     let packages = metadata.into_iter().collect::<Result<Vec<_>, _>>()?;
     for package in packages.iter().flat_map(|metadata| &metadata.packages) {
         let expression = package.license.clone().unwrap_or_default();
-        if !satisfied(&expression, &allowed) {
+        let is_excepted =
+            exceptions.iter().any(|(name, licence)| **package.name == *name && expression == *licence);
+        if !is_excepted && !satisfied(&expression, &allowed) {
             problems.push(format!(
                 "{} {}: licence {expression:?} is not on the list",
                 package.name, package.version
@@ -32,6 +35,18 @@ fn allowed(deny: &str) -> Vec<String> {
     let section = deny.split("[licenses]").nth(1).unwrap_or_default();
     let list = section.split("allow = [").nth(1).and_then(|s| s.split(']').next()).unwrap_or_default();
     list.split('"').skip(1).step_by(2).map(str::to_owned).collect()
+}
+
+/// Crate and licence of each of `exceptions = [{ crate = "…", allow = ["…"] }, …]` under `[licenses]`.
+fn exceptions(deny: &str) -> Vec<(String, String)> {
+    let section = deny.split("[licenses]").nth(1).unwrap_or_default();
+    let section = section.split("\n[").next().unwrap_or_default();
+    let list = section.split("exceptions = [").nth(1).unwrap_or_default();
+    let entry = |entry: &str| {
+        let mut quoted = entry.split('"').skip(1).step_by(2);
+        Some((quoted.next()?.to_owned(), quoted.next()?.to_owned()))
+    };
+    list.split("crate =").skip(1).filter_map(entry).collect()
 }
 
 /// Whether an SPDX expression of `OR`, `AND`, `WITH` and brackets can be met with the allowed licences.
@@ -106,5 +121,8 @@ mod tests {
         let deny =
             "[bans]\nallow = [\"no\"]\n[licenses]\nconfidence = 0.9\nallow = [\n \"MIT\",\n \"Zlib\",\n]\n";
         assert_eq!(allowed(deny), ["MIT", "Zlib"]);
+        assert!(exceptions(deny).is_empty());
+        let deny = "[licenses]\nallow = [\"MIT\"]\nexceptions = [{ crate = \"a\", allow = [\"X-1\"] }]\n[bans]\ndeny = [{ crate = \"b\" }]";
+        assert_eq!(exceptions(deny), [("a".to_owned(), "X-1".to_owned())]);
     }
 }
