@@ -101,7 +101,7 @@ pub struct GeometryConfig {
 impl Default for GeometryConfig {
     fn default() -> Self {
         Self {
-            source: "stereo".into(),
+            source: geometry::AUTO.into(),
             fill_network: geometry::NO_NETWORK.into(),
             chunk_keyframes: 16,
             overlap_keyframes: 4,
