@@ -5,16 +5,18 @@
 #   bench/run_all.sh                         run all groups (hours on two cores)
 #   bench/run_all.sh maps odometry           run some groups
 #
-# Groups: demo maps stereo odometry couplings align fusion evaluation da3 nano
+# Groups: demo maps stereo odometry ordinary couplings align fusion evaluation da3 nano
 #
 # Environment:
 #   DATA    folder with the real recordings euroc_MH_01_real_11s, hololens_commonroom, 7scenes_redkitchen
 #           (default ../shared/data)
 #   EUROC   folder with mav0/ per EuRoC sequence; ground truth suffices (default $DATA/euroc)
 #   OUT     folder of the results (default runs/bench-<commit>)
+#   FLIGHTS, ORDINARY   folders of rendered flights and of rendered hand-held recordings (default in OUT); what is there is not
+#           rendered again
 #   PYTHON  interpreter with the packages of bench/requirements-da3.txt, numpy, scipy, numba, open3d-cpu==0.19.0, pillow
 #
-# Each step writes its output, its command and its wall time to $OUT/<step>.txt. A step that fails is reported at the end
+# Each step writes its output, its command, its wall time and its processor time to $OUT/<step>.txt. A step that fails is reported at the end
 # and does not stop the others. A dirty work tree is refused, because its figures would belong to no commit.
 set -uo pipefail
 cd "$(dirname "$0")/.."
@@ -24,6 +26,8 @@ EUROC=${EUROC:-$DATA/euroc}
 PYTHON=${PYTHON:-python3}
 COMMIT=$(git rev-parse --short HEAD)
 OUT=${OUT:-runs/bench-$COMMIT}
+FLIGHTS=${FLIGHTS:-$OUT/flights}
+ORDINARY=${ORDINARY:-$OUT/ordinary}
 VIDAR=target/release/vidar
 EXAMPLES=target/release/examples
 
@@ -32,11 +36,11 @@ groups=()
 for argument in "$@"; do
     case $argument in
         --list) list=true ;;
-        demo|maps|stereo|odometry|couplings|align|fusion|evaluation|da3|nano) groups+=("$argument") ;;
+        demo|maps|stereo|odometry|ordinary|couplings|align|fusion|evaluation|da3|nano) groups+=("$argument") ;;
         *) echo "unknown argument $argument; see the head of bench/run_all.sh" >&2; exit 2 ;;
     esac
 done
-[ ${#groups[@]} -gt 0 ] || groups=(demo maps stereo odometry couplings align fusion evaluation da3 nano)
+[ ${#groups[@]} -gt 0 ] || groups=(demo maps stereo odometry ordinary couplings align fusion evaluation da3 nano)
 
 if ! $list && [ -n "$(git status --porcelain --untracked-files=no)" ]; then
     echo "the work tree has changes; commit them first" >&2
@@ -55,13 +59,12 @@ step() {
     fi
     mkdir -p "$OUT"
     echo "$name …"
-    local begin=$SECONDS
+    local TIMEFORMAT='# %R s of wall time, %U + %S s of processor time'
     {
         echo "# commit $COMMIT"
         echo "# $*"
-        "$@"
+        time "$@"
     } > "$OUT/$name.txt" 2>&1 || failed+=("$name")
-    echo "# $((SECONDS - begin)) s" >> "$OUT/$name.txt"
 }
 
 # world FILE LINE...: a description of a synthetic world for --world-config.
@@ -76,24 +79,25 @@ redkitchen=("$DATA/7scenes_redkitchen" --camera-model pinhole:525.1,525.1,322.3,
 color_from_depth=-0.023,0.012,0
 
 demo() {
-    step demo-nano "$VIDAR" demo -o "$OUT/runs/demo-nano"
-    step demo-stereo "$VIDAR" demo --geometry stereo -o "$OUT/runs/demo-stereo"
+    for geometry in da3-nano stereo auto; do
+        step "demo-$geometry" "$VIDAR" demo --geometry "$geometry" -o "$OUT/runs/demo-$geometry"
+    done
 }
 
 maps() {
-    step map-demo-truth "$VIDAR" demo --geometry stereo --set input.poses=ground-truth -o "$OUT/runs/demo-truth"
-    step map-hololens "$VIDAR" run "$DATA/hololens_commonroom" -o "$OUT/runs/hololens"
-    step map-redkitchen "$VIDAR" run "${redkitchen[@]}" --color-from-depth=$color_from_depth --preset tum-rgbd \
-        -o "$OUT/runs/redkitchen"
+    local geometry
+    for geometry in stereo auto; do
+        step "map-demo-truth-$geometry" "$VIDAR" demo --geometry "$geometry" --set input.poses=ground-truth \
+            -o "$OUT/runs/demo-truth-$geometry"
+    done
+    for geometry in stereo auto da3-nano; do
+        step "map-hololens-$geometry" "$VIDAR" run "$DATA/hololens_commonroom" --geometry "$geometry" \
+            -o "$OUT/runs/hololens-$geometry"
+        step "map-redkitchen-$geometry" "$VIDAR" run "${redkitchen[@]}" --color-from-depth=$color_from_depth \
+            --preset tum-rgbd --geometry "$geometry" -o "$OUT/runs/redkitchen-$geometry"
+    done
     step map-mh01 "$VIDAR" run "$DATA/euroc_MH_01_real_11s" --preset euroc --set input.poses=ground-truth \
         -o "$OUT/runs/mh01"
-    step auto-hololens "$VIDAR" run "$DATA/hololens_commonroom" --geometry auto -o "$OUT/runs/hololens-auto"
-    step auto-redkitchen "$VIDAR" run "${redkitchen[@]}" --color-from-depth=$color_from_depth --preset tum-rgbd \
-        --geometry auto -o "$OUT/runs/redkitchen-auto"
-    step auto-demo-truth "$VIDAR" demo --geometry auto --set input.poses=ground-truth -o "$OUT/runs/demo-truth-auto"
-    step nano-hololens "$VIDAR" run "$DATA/hololens_commonroom" --geometry da3-nano -o "$OUT/runs/hololens-nano"
-    step nano-redkitchen "$VIDAR" run "${redkitchen[@]}" --color-from-depth=$color_from_depth --preset tum-rgbd \
-        --geometry da3-nano -o "$OUT/runs/redkitchen-nano"
 }
 
 stereo() {
@@ -130,9 +134,9 @@ odometry() {
         MH_01_easy MH_02_easy MH_03_medium MH_04_difficult MH_05_difficult; do
         length=24
         case $name in V1_01*|V1_03*|V2_03*|MH_03*) length=40 ;; esac
-        step "synth-$name" "$VIDAR" synth "$OUT/$name" --world-config "$OUT/flight$length.toml" \
-            --trajectory "$EUROC/$name/mav0/state_groundtruth_estimate0/data.csv"
-        flights+=("$OUT/$name")
+        [ -e "$FLIGHTS/$name" ] || step "synth-$name" "$VIDAR" synth "$FLIGHTS/$name" \
+            --world-config "$OUT/flight$length.toml" --trajectory "$EUROC/$name/mav0/state_groundtruth_estimate0/data.csv"
+        flights+=("$FLIGHTS/$name")
     done
     step odometry-real "$EXAMPLES/evaluate" "$DATA/euroc_MH_01_real_11s"
     step odometry-rendered "$EXAMPLES/evaluate" "${flights[@]}"
@@ -142,6 +146,14 @@ odometry() {
     step odometry-starts cargo test --release -p vidar-odometry --test starts -- --ignored --nocapture
     step odometry-ladder cargo test --release -p vidar-odometry --test ladder -- --include-ignored --nocapture
     step odometry-consistency cargo test --release -p vidar-odometry --test monte_carlo -- --ignored --nocapture
+}
+
+ordinary() {
+    step ordinary-render env VIDAR="$VIDAR" bench/ordinary_recordings.sh "$ORDINARY"
+    step ordinary bash -c '"$0" bench/odometry_vs_peers.py "$1"/* --out "$2" --vidar "$3"' \
+        "$PYTHON" "$ORDINARY" "$OUT/ordinary-results" "$VIDAR"
+    step ordinary-tables bash -c '"$0" bench/odometry_vs_peers.py "$1"/* --out "$2" --table' \
+        "$PYTHON" "$ORDINARY" "$OUT/ordinary-results"
 }
 
 couplings() {
