@@ -459,6 +459,7 @@ def run(
     output: Optional[_Path] = None,
     *,
     reference: Optional[_Path] = None,
+    mcap: Optional[_Path] = None,
     force: bool = False,
     resume: bool = False,
     progress: _Progress = None,

@@ -32,18 +32,20 @@ const MODEL_FLAGS: [(&str, &str, &str); 5] = [
 ///
 /// `output` is the run folder; the default is runs/NAME/TIME/. `force` renames an existing folder, `resume` goes on in it. Input
 /// options are those of Recording; geometry, mode, model_dir, device and map are the options of the command line, as are
-/// preset, config and settings ({"fusion.voxel_size_m": 0.03}). `reference` is a cloud (PLY) to compare the map with.
+/// preset, config and settings ({"fusion.voxel_size_m": 0.03}). `reference` is a cloud (PLY) to compare the map with; `mcap` is a file to
+/// write for Foxglove and Rerun.
 ///
 /// `progress` is called with a dict per event, the objects of `--progress json`. Ctrl-C and an exception of `progress` stop the
 /// run: what was mapped is fused and written, then the exception is raised.
 #[pyfunction]
-#[pyo3(signature = (path, output = None, *, reference = None, force = false, resume = false, progress = None, **options))]
+#[pyo3(signature = (path, output = None, *, reference = None, mcap = None, force = false, resume = false, progress = None, **options))]
 #[allow(clippy::too_many_arguments)] // keyword arguments of a function of Python
 pub fn run(
     py: Python<'_>,
     path: PathBuf,
     output: Option<PathBuf>,
     reference: Option<PathBuf>,
+    mcap: Option<PathBuf>,
     force: bool,
     resume: bool,
     progress: Option<Py<PyAny>>,
@@ -63,7 +65,7 @@ pub fn run(
     };
     let given = options.map_or_else(String::new, |o| format!(", **{o}"));
     let command = vec!["python".into(), format!("vidar.run({path:?}{given})")];
-    let request = RunRequest { path, open, layered, reference, place, command };
+    let request = RunRequest { path, open, layered, reference, place, mcap, command };
     let folder = interruptible(py, progress, |events, cancel| {
         vidar::run(&request, events, cancel).map(|outcome| outcome.folder)
     })?;

@@ -54,6 +54,21 @@ def test_options_of_the_command_line_mean_the_same(tiny, settings, tmp_path):
     same_files(run.folder, tmp_path / "a")
 
 
+def test_a_run_for_viewers_is_read_by_the_formats_own_reader(tiny, settings, tmp_path):
+    reader = pytest.importorskip("mcap.reader")
+    run = vidar.run(tiny, tmp_path / "run", config=settings, mcap=tmp_path / "run.mcap")
+    views = json.loads((run.folder / "views.json").read_text())["views"]
+    with open(tmp_path / "run.mcap", "rb") as file:
+        opened = reader.make_reader(file)
+        summary = opened.get_summary()
+        topics = {c.topic: summary.schemas[c.schema_id].name for c in summary.channels.values()}
+        depth = [message.log_time for _, _, message in opened.iter_messages(topics=["/view/depth"])]
+    assert topics["/view/depth"] == "foxglove.RawImage" and topics["/tf"] == "foxglove.FrameTransform"
+    assert topics["/map/mesh"] == topics["/keyframes"] == "foxglove.SceneUpdate"
+    assert depth == [view["time_ns"] for view in views]
+    assert summary.statistics.message_count == sum(summary.statistics.channel_message_counts.values()) > len(views)
+
+
 def test_a_run_is_read_back(finished):
     run = vidar.read_run(finished)
     assert run.exit_status == 0 and run.manifest["schema"] == "vidar.run/1"

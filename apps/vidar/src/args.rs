@@ -242,7 +242,7 @@ pub struct RunArgs {
     /// Where results go.
     #[command(flatten)]
     pub output: OutputArgs,
-    /// Source of depth: stereo, auto (stereo, completed), a network of `vidar model list` such as da3-small, or recorded:DIR.
+    /// Source of depth: auto (stereo, completed), stereo, a network of `vidar model list` such as da3-small, or recorded:DIR.
     #[arg(long, visible_alias = "model", value_name = "NAME", help_heading = "Model")]
     pub geometry: Option<String>,
     /// Coupling of depth and metric poses: coupled, hybrid, pose-conditioned, ground-truth, pose-free, da3-streaming.
@@ -263,6 +263,9 @@ pub struct RunArgs {
     /// Reference cloud (PLY, metres, world frame of the ground truth) for the evaluation of the map.
     #[arg(long, value_hint = ValueHint::FilePath, help_heading = "Input")]
     pub reference: Option<PathBuf>,
+    /// MCAP file that shows the run in Foxglove or Rerun, written while it runs; it must not exist.
+    #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath, help_heading = "Output")]
+    pub mcap: Option<PathBuf>,
     /// Print the plan and stop.
     #[arg(long)]
     pub dry_run: bool,
@@ -306,7 +309,7 @@ pub struct DemoArgs {
     /// The synthetic world.
     #[command(flatten)]
     pub world: WorldArgs,
-    /// Source of depth: da3-nano (built in), stereo, or another network; `vidar model list` names them.
+    /// Source of depth: auto (stereo, completed), stereo, da3-nano (built in) or another network of `vidar model list`.
     #[arg(long, visible_alias = "model", value_name = "NAME", help_heading = "Model")]
     pub geometry: Option<String>,
     /// Folder with model.safetensors and config.json, for custom weights.
@@ -318,6 +321,9 @@ pub struct DemoArgs {
     /// Where results go.
     #[command(flatten)]
     pub output: OutputArgs,
+    /// MCAP file that shows the run in Foxglove or Rerun, written while it runs; it must not exist.
+    #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath, help_heading = "Output")]
+    pub mcap: Option<PathBuf>,
 }
 
 /// `vidar inspect`.

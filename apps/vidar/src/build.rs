@@ -23,7 +23,10 @@ pub fn layered(args: &ConfigArgs, default_preset: Option<&str>) -> Result<Layere
     if let Some(path) = &args.config {
         layered.file(path)?;
     }
-    layered.environment(std::env::vars())?;
+    // A name that is no text is not ours; a value that is none is refused as the text that it resembles.
+    let variables = std::env::vars_os()
+        .filter_map(|(k, v)| Some((k.into_string().ok()?, v.to_string_lossy().into_owned())));
+    layered.environment(variables)?;
     args.set.iter().try_for_each(|assignment| layered.set(assignment))?;
     Ok(layered)
 }

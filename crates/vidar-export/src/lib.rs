@@ -13,6 +13,7 @@
 //! | [depth PNG](depth) | z-depth, steps per metre in a sidecar | depth to half a step | depths out of range, counted |
 //! | [COLMAP](colmap) | `camera_from_world`; pixel corner is (0, 0) | views, points, colours | time, normals, confidence |
 //! | [transforms.json](transforms) | `world_from_camera`, OpenGL camera; pixel corner is (0, 0) | views, time | – |
+//! | [MCAP of a run](scene) | world z up; m | what viewers show | precision of depth below 1 mm |
 //!
 //! None of these formats re-centres, rotates or rescales the world. [`official`] holds the files of the official Depth
 //! Anything 3 program (npz, GLB scene, depth pictures, COLMAP) with that program's own conventions.
@@ -39,6 +40,7 @@ mod json;
 pub mod official;
 mod origin;
 pub mod ply;
+pub mod scene;
 mod text;
 pub mod trajectory;
 pub mod transforms;

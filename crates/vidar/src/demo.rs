@@ -20,6 +20,8 @@ pub struct DemoRequest {
     pub layered: Layered,
     /// Where sequence and run go.
     pub place: OutputLocation,
+    /// An MCAP file that shows the run in robotics viewers.
+    pub mcap: Option<PathBuf>,
     /// The command as typed.
     pub command: Vec<String>,
 }
@@ -39,6 +41,7 @@ pub fn demo(request: &DemoRequest, events: &Events, cancel: &CancelToken) -> Res
         layered: request.layered.clone(),
         reference: None,
         place: OutputLocation::Exact { path: root.join("run"), force: false },
+        mcap: request.mcap.clone(),
         command: request.command.clone(),
     };
     run(&run_request, events, cancel)

@@ -154,8 +154,8 @@ fn writable(folder: &Path) -> Finding {
 }
 
 fn environment() -> Finding {
-    let set: Vec<String> =
-        std::env::vars().filter(|(k, _)| k.starts_with("VIDAR_")).map(|(k, _)| k).collect();
+    let names = std::env::vars_os().filter_map(|(k, _)| k.into_string().ok());
+    let set: Vec<String> = names.filter(|k| k.starts_with("VIDAR_")).collect();
     let found = if set.is_empty() { "no VIDAR_* variable is set".into() } else { set.join(", ") };
     finding("environment", State::Ok, found)
 }

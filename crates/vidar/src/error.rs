@@ -358,7 +358,9 @@ impl Error {
             Self::BadValue { .. } => "`vidar config explain KEY` shows meaning, unit and range",
             Self::ConfigFile { .. } => "the file is TOML; `vidar config show > my.toml` writes a valid one",
             Self::UnknownPreset { .. } => "`vidar config presets` describes them",
-            Self::OutputExists { .. } => "choose another -o, or add --force to rename the old folder",
+            Self::OutputExists { .. } => {
+                "choose another name; --force renames an old folder that is given with -o"
+            }
             Self::OtherRun { .. } => {
                 "resume with the command in its manifest.json, choose another -o, or use --force instead of --resume to rename \
                  the old folder"
@@ -495,7 +497,7 @@ pub const CODES: &[(&str, &str)] = &[
     ("E0103", "A configuration file is missing or is not valid TOML."),
     ("E0104", "The preset is not one of those that `vidar config presets` lists."),
     ("E0105", "The command line has an invalid option, argument or combination of them."),
-    ("E0106", "The output folder exists. VIDAR never overwrites; --force renames the old folder."),
+    ("E0106", "The output exists. VIDAR never overwrites; --force renames an old folder."),
     ("E0107", "The folder given with --resume holds another run: its recording or its settings differ."),
     (
         "E0201",

@@ -27,6 +27,7 @@ pub fn run(args: &RunArgs, context: &Context) -> Outcome {
             (Some(path), true) => OutputLocation::Resumed { path: path.clone() },
             _ => build::place(&args.output, &vidar::input::name_of(&args.path)),
         },
+        mcap: args.mcap.clone(),
         command: context.command.clone(),
     };
     if args.dry_run {
@@ -67,6 +68,7 @@ pub fn demo(args: &DemoArgs, context: &Context) -> Outcome {
         world: build::world(&args.world, SynthConfig::demo())?,
         layered,
         place: build::place(&args.output, "demo"),
+        mcap: args.mcap.clone(),
         command: context.command.clone(),
     };
     let outcome = vidar::demo::demo(&request, &progress::events(&context.cli), &context.cancel)?;

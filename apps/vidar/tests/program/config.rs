@@ -1,6 +1,6 @@
 //! Settings: layers, origins, refusals.
 
-use crate::support::{command, files_under, keys, run_on, shared, vidar};
+use crate::support::{ProgramOutput, command, files_under, keys, run_on, shared, vidar};
 use serde_json::Value;
 
 fn value_of(args: &[&str], key: &str) -> (String, String) {
@@ -124,4 +124,17 @@ fn the_schema_describes_every_setting() {
     assert_eq!(schema["additionalProperties"], false);
     let ran = vidar(&["config", "explain", "fusion.voxel_size_m"]).ends_with(0);
     assert!(ran.stdout.contains("default"), "{}", ran.stdout);
+}
+
+#[cfg(unix)]
+#[test]
+fn an_environment_that_is_no_text_is_no_panic() {
+    use std::os::unix::ffi::OsStrExt;
+    let odd = std::ffi::OsStr::from_bytes(b"\xff\xfe");
+    let with = |name: &std::ffi::OsStr| -> ProgramOutput {
+        command().args(["config", "show"]).env(name, odd).output().unwrap().into()
+    };
+    with("SOMETHING_ELSE".as_ref()).ends_with(0);
+    with(odd).ends_with(0);
+    with("VIDAR_FUSION__VOXEL_SIZE_M".as_ref()).ends_with(2).says(&["fusion.voxel_size_m"]);
 }

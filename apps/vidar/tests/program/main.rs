@@ -15,6 +15,7 @@ mod faults;
 mod hostile;
 mod keys;
 mod map;
+mod mcap_file;
 mod models;
 mod numbers;
 mod odometry;

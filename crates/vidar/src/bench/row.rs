@@ -118,6 +118,7 @@ pub(super) fn run_row(
         layered,
         reference: None,
         place: OutputLocation::Replaced { path: place.clone() },
+        mcap: None,
         command: request.command.clone(),
     };
     let clock = std::time::Instant::now();

@@ -2,13 +2,14 @@
 
 use super::{Config, PRESETS};
 use crate::error::Error;
-use crate::models::bundled;
+use crate::models::{bundled, geometry};
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt;
 use std::path::{Path, PathBuf};
 use toml::{Table, Value};
 
 const SOURCE: &str = "geometry.source";
+const WEIGHTS: &str = "model.dir";
 const PROCESS_SIZE: &str = "model.network.preprocess.process_size_px";
 const POSE_MODE: &str = "model.network.mode";
 
@@ -136,23 +137,26 @@ impl Layered {
         )?;
         store(&mut self.values, key, value);
         self.origins.insert(key.to_owned(), origin);
-        if key == SOURCE {
+        if key == SOURCE || key == WEIGHTS {
             self.follow_source()?;
         }
         Ok(())
     }
 
-    /// The built-in network gets images of its training size and known camera poses, unless set otherwise; all other
-    /// networks get the defaults.
+    /// Custom weights are the source of geometry, the built-in network gets images of its training size and known camera
+    /// poses, unless set otherwise; all other networks get the defaults.
     fn follow_source(&mut self) -> Result<(), Error> {
-        let is_bundled = lookup(&self.values, SOURCE).and_then(Value::as_str) == Some(bundled::NAME);
+        let is = |key, wanted| lookup(&self.values, key).and_then(Value::as_str) == Some(wanted);
+        let (has_weights, is_bundled) = (!is(WEIGHTS, ""), is(SOURCE, bundled::NAME));
         let size = Value::Integer(bundled::PROCESS_SIZE_PX as i64);
+        let (custom, conditioned) = [geometry::CUSTOM, "conditioned"].map(|s| Value::String(s.into())).into();
         let wishes = [
-            (PROCESS_SIZE, size, "the training size of da3-nano"),
-            (POSE_MODE, Value::String("conditioned".into()), "cameras estimated by da3-nano are coarse"),
+            (has_weights, SOURCE, custom, "model.dir names weights"),
+            (is_bundled, PROCESS_SIZE, size, "the training size of da3-nano"),
+            (is_bundled, POSE_MODE, conditioned, "cameras estimated by da3-nano are coarse"),
         ];
-        for (key, wish, why) in wishes {
-            let (value, origin) = match (is_bundled, self.origins.get(key)) {
+        for (wished, key, wish, why) in wishes {
+            let (value, origin) = match (wished, self.origins.get(key)) {
                 (true, Some(Origin::Default)) => (Some(wish), Origin::Derived(why)),
                 (false, Some(Origin::Derived(_))) => {
                     (lookup(&Self::defaults()?.values, key).cloned(), Origin::Default)

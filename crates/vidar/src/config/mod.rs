@@ -81,11 +81,12 @@ impl Default for InputConfig {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct GeometryConfig {
-    /// The model: `stereo` (needs poses, no weights), `auto` (stereo, completed by the map, planes and a network), a network of `vidar model list` (`da3-small`), or `recorded:DIR`,
-    /// predictions of another program in that folder.
+    /// The model: `auto` (stereo, completed by the map and planes), `stereo` (needs poses, no weights), a network of
+    /// `vidar model list` (`da3-small`), `custom` (the weights of `model.dir`, which alone mean it), or `recorded:DIR`, predictions of
+    /// another program in that folder.
     pub source: String,
     /// The network that `auto` bends onto measured depth where nothing is measured: one of `vidar model list`, `recorded:DIR`, or
-    /// `none`, which interpolates (as good as `da3-nano`, and it costs nothing). `auto` only.
+    /// `none`, which interpolates (as good as `da3-nano`, and it costs nothing). `auto` only; `model.dir` comes first.
     pub fill_network: String,
     /// Keyframes that are predicted together. Larger chunks need more memory and are more consistent.
     pub chunk_keyframes: usize,
@@ -197,7 +198,8 @@ pub enum PlaceRecognitionConfig {
 #[derive(Clone, Debug, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct ModelConfig {
-    /// Folder with `model.safetensors` and `config.json` of custom weights, instead of the network that `geometry.source` names.
+    /// Folder with `model.safetensors` and `config.json` of custom weights. They are the source of geometry, unless
+    /// `geometry.source` is set to `auto`, which then fills with them.
     pub dir: String,
     /// Precision of the backbone. `auto` is bf16 if the processor supports it, else f32 (recorded in the manifest);
     /// `f32` is the reference.
@@ -361,6 +363,13 @@ impl Config {
                 self.geometry.max_width_px
             ));
         }
+        if !self.model.dir.is_empty() && ![geometry::AUTO, geometry::CUSTOM].contains(&&*self.geometry.source)
+        {
+            let (dir, source) = (&self.model.dir, &self.geometry.source);
+            return bad(format!(
+                "model.dir names weights ({dir:?}), but geometry.source is {source:?}: leave one of them out"
+            ));
+        }
         if geometry::chosen(self).is_err() {
             let known = crate::models::names();
             let (source, network) = (&self.geometry.source, &self.geometry.fill_network);
@@ -371,7 +380,7 @@ impl Config {
             }
             let found = source;
             return bad(format!(
-                "geometry.source must be \"stereo\", \"auto\", \"recorded:DIR\" or one of {known}, found {found:?}"
+                "geometry.source must be \"auto\", \"stereo\", \"recorded:DIR\", \"custom\" with model.dir, or one of {known}, found {found:?}"
             ));
         }
         let stage = |result: Result<(), String>| result.map_err(|reason| Error::BadValue { reason });

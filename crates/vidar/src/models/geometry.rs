@@ -16,6 +16,9 @@ pub const STEREO: &str = "stereo";
 
 /// The source of geometry that completes stereo's depth.
 pub const AUTO: &str = "auto";
+/// The source of geometry that `model.dir` alone means: its weights.
+pub const CUSTOM: &str = "custom";
+
 /// How `geometry.fill_network` says that there is none.
 pub const NO_NETWORK: &str = "none";
 
@@ -59,10 +62,8 @@ pub fn source(config: &Config) -> Result<SourceChoice, Error> {
         return shapes(config).map(SourceChoice::Auto);
     }
     match config.geometry.source.strip_prefix(RECORDED) {
-        Some(folder) if config.model.dir.is_empty() => Ok(SourceChoice::Recorded(PathBuf::from(folder))),
-        None if config.model.dir.is_empty() && config.geometry.source == SIMULATED => {
-            Ok(SourceChoice::Simulated)
-        }
+        Some(folder) => Ok(SourceChoice::Recorded(PathBuf::from(folder))),
+        None if config.geometry.source == SIMULATED => Ok(SourceChoice::Simulated),
         _ => Ok(chosen(config)?.map_or(SourceChoice::Stereo, SourceChoice::Network)),
     }
 }
@@ -97,14 +98,14 @@ pub struct NetworkPlan {
 /// The network that the configuration names; `None` where no network is needed.
 pub fn chosen(config: &Config) -> Result<Option<ModelChoice>, Error> {
     match (config.model.dir.as_str(), config.geometry.source.as_str()) {
-        ("", STEREO) => Ok(None),
+        (_, STEREO) => Ok(None),
         (_, AUTO) => match shapes(config)? {
             Some(ShapeChoice::Network(choice)) => Ok(Some(choice)),
             Some(ShapeChoice::Recorded(_)) | None => Ok(None),
         },
-        ("", name) if name.starts_with(RECORDED) || name == SIMULATED => Ok(None),
-        ("", name) => ModelChoice::named(name).map(Some),
-        (dir, _) => Ok(Some(ModelChoice::Folder(PathBuf::from(dir)))),
+        (dir, CUSTOM) if !dir.is_empty() => Ok(Some(ModelChoice::Folder(PathBuf::from(dir)))),
+        (_, name) if name.starts_with(RECORDED) || name == SIMULATED => Ok(None),
+        (_, name) => ModelChoice::named(name).map(Some),
     }
 }
 

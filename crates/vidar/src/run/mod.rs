@@ -11,6 +11,7 @@ mod plan;
 mod readers;
 mod record;
 pub(crate) mod reference;
+mod scene;
 mod source;
 mod store;
 mod summary;
@@ -37,6 +38,7 @@ use crate::verdict::{StatedScale, Verdict};
 use place_recognition::PlaceRecognition;
 use readers::{FINISH, MAP, Readers};
 use record::{Recorder, RunDescription};
+use scene::SceneWriter;
 use source::Source;
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -58,6 +60,8 @@ pub struct RunRequest {
     pub reference: Option<PathBuf>,
     /// Where results go.
     pub place: OutputLocation,
+    /// An MCAP file that shows the run in robotics viewers.
+    pub mcap: Option<PathBuf>,
     /// The command as typed, for the manifest.
     pub command: Vec<String>,
 }
@@ -139,13 +143,15 @@ pub fn run(request: &RunRequest, events: &Events, cancel: &CancelToken) -> Resul
         events.stage("plan", 0, || Plan::make(&dataset, &config, request.reference.as_deref()))?;
     let description = RunDescription::new(request, &dataset, fingerprint.clone(), &plan);
     let earlier = request.place.earlier(&description.0, &request.layered.to_toml(false))?;
+    let scene = request.mcap.as_deref().map(SceneWriter::create).transpose()?;
+    let events = scene.iter().fold(events, |events, scene| scene.listen(events));
     let folder = Arc::new(RunFolder::create(&request.place)?);
     folder.write_manifest(&description.0)?;
     folder.write("config.resolved.toml", request.layered.to_toml(true).as_bytes())?;
     recorder.keep_log_in(folder.clone());
     dataset.warnings.iter().chain(&plan.warnings).for_each(|w| events.warn(w));
     let poses = match plan.poses.is_odometry() {
-        true => tracking.track(&mut dataset, &mut config, &folder, &events, cancel)?,
+        true => tracking.track(&mut dataset, &mut config, &folder, scene.as_ref(), &events, cancel)?,
         false => None,
     };
 
@@ -155,6 +161,7 @@ pub fn run(request: &RunRequest, events: &Events, cancel: &CancelToken) -> Resul
         dataset: &dataset,
         fingerprint: &fingerprint,
         folder: &folder,
+        scene: scene.as_ref(),
         events: &events,
         cancel,
     };
@@ -163,6 +170,9 @@ pub fn run(request: &RunRequest, events: &Events, cancel: &CancelToken) -> Resul
         warnings: recorder.warnings(),
         ..outcome
     });
+    if let Some(scene) = &scene {
+        scene.finish(&events);
+    }
     let (exit, result) = match &made {
         Ok(outcome) => (outcome.status, outputs::result_json(outcome)),
         Err(error) => (error.exit_status(), record::failure_json(error)),
@@ -185,6 +195,7 @@ struct Context<'a> {
     /// SHA-256 of what the recording consists of.
     fingerprint: &'a str,
     folder: &'a RunFolder,
+    scene: Option<&'a SceneWriter>,
     events: &'a Events,
     cancel: &'a CancelToken,
 }
@@ -240,7 +251,7 @@ impl Context<'_> {
         tracked: Option<TrackedPoses>,
         places: &PlaceRecognition,
     ) -> Result<MetricMap, Error> {
-        let Self { config, dataset, folder, events, cancel, .. } = *self;
+        let Self { config, dataset, folder, scene, events, cancel, .. } = *self;
         let store = RunStore::new(folder.path(), self.fingerprint, plan, config);
         let images = ImageFiles(dataset);
         let (live, fallback) = plan.poses.open(dataset, config)?;
@@ -264,7 +275,7 @@ impl Context<'_> {
             cancelled: &cancelled,
             predicting: &predicting,
         })?;
-        let mut readers = Readers::new(dataset, plan, config, folder, events);
+        let mut readers = Readers::new(dataset, plan, config, folder, scene, events);
         events.stage(MAP, dataset.images.len(), || {
             self.push_recording(&mut engine, &mut |event| readers.read(event))
         })?;

@@ -2,6 +2,7 @@
 
 use super::map::{MapCollector, MetricMap};
 use super::plan::Plan;
+use super::scene::SceneWriter;
 use super::views::write_views;
 use crate::config::Config;
 use crate::engine::{MapEvent, Step};
@@ -10,6 +11,7 @@ use crate::events::{Event, Events};
 use crate::run_folder::RunFolder;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::{Duration, Instant};
+use vidar_core::Pinhole;
 use vidar_dataset::Dataset;
 
 /// File of the growing surface.
@@ -23,6 +25,9 @@ pub(super) struct Readers<'a> {
     events: &'a Events,
     config: &'a Config,
     folder: &'a RunFolder,
+    dataset: &'a Dataset,
+    view: Pinhole,
+    scene: Option<&'a SceneWriter>,
     collector: MapCollector<'a>,
     times: StepTimes,
     /// Keyframes predicted and fused, once the recording has ended.
@@ -36,11 +41,23 @@ impl<'a> Readers<'a> {
         plan: &'a Plan,
         config: &'a Config,
         folder: &'a RunFolder,
+        scene: Option<&'a SceneWriter>,
         events: &'a Events,
     ) -> Self {
         let collector = MapCollector::new(dataset, &plan.poses);
         let times = StepTimes::default();
-        Self { events, config, folder, collector, times, finishing: None, predicted: 0 }
+        Self {
+            events,
+            config,
+            folder,
+            dataset,
+            view: plan.view,
+            scene,
+            collector,
+            times,
+            finishing: None,
+            predicted: 0,
+        }
     }
 
     /// The recording has ended: progress is that of predicting and fusing what is left.
@@ -55,6 +72,9 @@ impl<'a> Readers<'a> {
         }
         self.times.read(&event);
         self.collector.read(&event)?;
+        if let Some(scene) = self.scene {
+            scene.read(&event, self.dataset, &self.view, self.events);
+        }
         match &event {
             MapEvent::World { .. } => self.predicted = 0,
             MapEvent::ChunkPredicted { with_depth, .. } => self.predicted += with_depth,

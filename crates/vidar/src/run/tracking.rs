@@ -1,6 +1,7 @@
 //! Track: calibration, timing and poses of a recording from its own camera and IMU, before it is mapped. The result is kept in the
 //! run folder until the map is made, so that a run that was killed does not track twice.
 
+use super::scene::SceneWriter;
 use crate::calibrate;
 use crate::camera_timing;
 use crate::config::Config;
@@ -112,6 +113,7 @@ impl Tracking {
         dataset: &mut Dataset,
         config: &mut Config,
         folder: &RunFolder,
+        scene: Option<&SceneWriter>,
         events: &Events,
         cancel: &CancelToken,
     ) -> Result<Option<TrackedPoses>, Error> {
@@ -131,6 +133,9 @@ impl Tracking {
         let Some(sigmas) = &self.sigmas else { return Ok(None) };
         let recording = Recording { dataset, config, map: self.map.as_ref() };
         let tracked = odometry::track(&recording, Some(sigmas), events, cancel, None)?;
+        if let Some(scene) = scene {
+            scene.tracked(&tracked.frames, events);
+        }
         if let Some((name, bytes)) = map::write(folder, &tracked.saved_map)? {
             events.emit(&Event::ArtifactWritten { path: name.into(), bytes });
         }
