@@ -95,6 +95,11 @@ pub enum Command {
         after_help = "Examples:\n  vidar export runs/demo/latest/run --to colmap -o colmap\n  vidar export runs/demo/latest/run --to nerfstudio -o ns\n  vidar export runs/demo/latest/run --to tum"
     )]
     Export(ExportArgs),
+    /// Serve a finished run to Foxglove on this computer, until Ctrl-C.
+    #[command(
+        after_help = "Examples:\n  vidar view runs/demo/latest/run\n  vidar view run.mcap --port 9000\n\nIn Foxglove: Open connection, Foxglove WebSocket, the address that is printed."
+    )]
+    View(ViewArgs),
     /// Predict depth, confidence, cameras and a cloud from images, with Depth Anything 3.
     #[command(
         after_help = "Examples:\n  vidar depth photos/\n  vidar depth a.jpg b.jpg --model da3-base --format ply,glb -o out\n  vidar depth frames/ --poses colmap/ --resolution input\n  vidar depth photos/ --dry-run"
@@ -432,7 +437,7 @@ pub struct ExportArgs {
     /// The run folder.
     #[arg(value_hint = ValueHint::DirPath)]
     pub run: PathBuf,
-    /// colmap, colmap-text, nerfstudio, tum, kitti, euroc, ply or glb.
+    /// colmap, colmap-text, nerfstudio, tum, kitti, euroc, ply, glb or mcap.
     #[arg(long)]
     pub to: String,
     /// COLMAP: with every point the keyframes that see it (projections, at most 200 000 points).
@@ -444,6 +449,17 @@ pub struct ExportArgs {
     /// Output folder; default `RUN/export/<format>`.
     #[arg(short, long, value_hint = ValueHint::DirPath)]
     pub output: Option<PathBuf>,
+}
+
+/// `vidar view`.
+#[derive(Args, Clone, Debug)]
+pub struct ViewArgs {
+    /// The run folder, or the file that --mcap wrote.
+    #[arg(value_hint = ValueHint::AnyPath)]
+    pub path: PathBuf,
+    /// Port on this computer; 0 takes any that is free.
+    #[arg(long, default_value_t = 8765)]
+    pub port: u16,
 }
 
 /// `vidar synth`.

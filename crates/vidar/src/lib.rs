@@ -32,6 +32,7 @@ pub mod run;
 pub mod run_folder;
 pub mod system;
 pub mod verdict;
+pub mod viewer;
 
 pub use config::{Config, Layered};
 pub use error::{Error, ExitStatus};

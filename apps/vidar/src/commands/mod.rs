@@ -14,6 +14,7 @@ pub mod model;
 pub mod odometry;
 pub mod run;
 pub mod synth;
+pub mod view;
 
 use crate::Outcome;
 use crate::args::Cli;

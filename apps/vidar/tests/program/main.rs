@@ -26,3 +26,4 @@ mod resume;
 mod support;
 mod trust;
 mod verbs;
+mod view;

@@ -10,6 +10,7 @@ const VERBS: &[&[&str]] = &[
     &["convert"],
     &["eval"],
     &["export"],
+    &["view"],
     &["depth"],
     &["model"],
     &["model", "list"],

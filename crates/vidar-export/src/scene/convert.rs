@@ -4,11 +4,12 @@ use super::{FORMAT, LogLevel, WORLD};
 use crate::error::ExportError;
 use foxglove::messages::{
     CameraCalibration, Color, FrameTransform, LinePrimitive, Log, PackedElementField, Point3, PointCloud,
-    Pose, Quaternion, RawImage, Vector3, line_primitive, log, packed_element_field::NumericType,
+    Pose, Quaternion, RawImage, TriangleListPrimitive, Vector3, line_primitive, log,
+    packed_element_field::NumericType,
 };
 use image::ImageEncoder;
 use image::codecs::jpeg::JpegEncoder;
-use vidar_core::{CameraModel, Image, LieGroup, Pinhole, Se3, Timestamp};
+use vidar_core::{CameraModel, Image, LieGroup, Pinhole, Se3, Timestamp, TriangleMesh};
 
 /// Quality of the JPEGs: differences from the original are not seen, at a tenth of its size.
 const JPEG_QUALITY: u8 = 85;
@@ -107,6 +108,22 @@ pub(super) fn frustum(camera: &Pinhole, world_from_camera: &Se3) -> LinePrimitiv
         color: Some(Color { r: 0.1, g: 0.5, b: 0.9, a: 1.0 }),
         indices: vec![0, 1, 0, 2, 0, 3, 0, 4, 1, 2, 2, 3, 3, 4, 4, 1],
         ..LinePrimitive::default()
+    }
+}
+
+/// A surface; grey where it has no colours.
+pub(super) fn triangles(mesh: &TriangleMesh) -> TriangleListPrimitive {
+    let [x, y, z] = [0, 1, 2].map(|i| move |p: &[f32; 3]| f64::from(p[i]));
+    let color = |c: &[u8; 3]| {
+        let [r, g, b] = c.map(|v| f64::from(v) / 255.0);
+        Color { r, g, b, a: 1.0 }
+    };
+    TriangleListPrimitive {
+        pose: Some(pose(&Se3::IDENTITY)),
+        points: mesh.positions.iter().map(|p| Point3 { x: x(p), y: y(p), z: z(p) }).collect(),
+        color: Some(Color { r: 0.6, g: 0.6, b: 0.6, a: 1.0 }),
+        colors: mesh.colors.iter().map(color).collect(),
+        indices: mesh.triangles.as_flattened().to_vec(),
     }
 }
 

@@ -10,7 +10,7 @@
 //! | `/trajectory` | `PosesInFrame` | all camera poses |
 //! | `/keyframes` | `SceneUpdate` | a frustum for each keyframe, again whenever it moves |
 //! | `/landmarks` | `PointCloud` | landmarks of the odometry, per keyframe |
-//! | `/map/mesh`, `/map/points` | `SceneUpdate` (GLB), `PointCloud` | the surface whenever it changes, its points at the end |
+//! | `/map/mesh`, `/map/points` | `SceneUpdate` (triangles), `PointCloud` | the surface whenever it changes, its points at the end |
 //! | `/log`, `/stages` | `Log`, JSON | warnings; seconds of each stage |
 //!
 //! Frames: `world` (z up where gravity is known), `camera` and `view` (x right, y down, z forward); metres where the run is metric.
@@ -18,15 +18,18 @@
 //! knows is a native library or slower than the run.
 
 mod convert;
+mod playback;
+mod server;
 
 use crate::error::ExportError;
 use convert::{calibration, clock, cloud, frustum, jpeg, pose, stamp};
 use foxglove::messages::{
-    CameraCalibration, CompressedImage, FrameTransform, Log, ModelPrimitive, PointCloud, PoseInFrame,
-    PosesInFrame, RawImage, SceneEntity, SceneUpdate,
+    CameraCalibration, CompressedImage, FrameTransform, Log, PointCloud, PoseInFrame, PosesInFrame, RawImage,
+    SceneEntity, SceneUpdate,
 };
 use foxglove::{Channel, Context, FoxgloveError, McapWriterHandle, RawChannel, Schema};
 use serde::Serialize;
+pub use server::{SceneServer, ServerError};
 use std::fs::File;
 use std::io::{self, BufWriter};
 use std::path::{Path, PathBuf};
@@ -181,15 +184,34 @@ impl Scene {
     /// # Errors
     /// Pixels that cannot be compressed.
     pub fn view(&mut self, view: &AlignedView) -> Result<(), ExportError> {
-        let at = self.at(view.time());
-        self.transforms.log_with_time(&convert::transform(at, VIEW, view.world_from_camera()), at);
-        if let Some(color) = view.color() {
-            let message = SceneImage::Pixels(color).message(at, VIEW)?;
+        let image = view.color().map(SceneImage::Pixels);
+        let depth = Some(view.depth().image());
+        self.posed_view(view.time(), view.world_from_camera(), view.intrinsics(), image, depth)
+    }
+
+    /// The same of its parts.
+    ///
+    /// # Errors
+    /// As [`Scene::view`].
+    pub fn posed_view(
+        &mut self,
+        time: Timestamp,
+        world_from_camera: &Se3,
+        intrinsics: &Pinhole,
+        image: Option<SceneImage<'_>>,
+        depth: Option<&Image<f32>>,
+    ) -> Result<(), ExportError> {
+        let at = self.at(time);
+        self.transforms.log_with_time(&convert::transform(at, VIEW, world_from_camera), at);
+        if let Some(image) = image {
+            let message = image.message(at, VIEW)?;
             self.view_image.log_with_time(&message, at);
         }
-        let model = CameraModel::Pinhole(*view.intrinsics());
+        let model = CameraModel::Pinhole(*intrinsics);
         self.view_calibration.log_with_time(&calibration(at, VIEW, &model), at);
-        self.view_depth.log_with_time(&convert::depth(at, VIEW, view.depth().image()), at);
+        if let Some(depth) = depth {
+            self.view_depth.log_with_time(&convert::depth(at, VIEW, depth), at);
+        }
         Ok(())
     }
 
@@ -222,32 +244,18 @@ impl Scene {
         self.landmarks.log_with_time(&cloud(at, WORLD, ["x", "y", "z", "relative_std"], rows), at);
     }
 
-    /// The surface.
-    ///
-    /// # Errors
-    /// A mesh that is not consistent.
-    pub fn mesh(&mut self, mesh: &TriangleMesh) -> Result<(), ExportError> {
+    /// The surface, as triangles: every viewer draws them where they are, while models of glTF are turned by some.
+    pub fn mesh(&mut self, mesh: &TriangleMesh) {
         let at = self.newest;
-        let mut data = Vec::new();
-        crate::write_glb_mesh(&mut data, mesh, &[])?;
-        let model = ModelPrimitive {
-            // Models are y up, as the format's root node has turned it; entities are shown as they are.
-            pose: Some(pose(&Se3::IDENTITY)),
-            scale: Some(foxglove::messages::Vector3 { x: 1.0, y: 1.0, z: 1.0 }),
-            media_type: "model/gltf-binary".into(),
-            data: data.into(),
-            ..ModelPrimitive::default()
-        };
         let entity = SceneEntity {
             timestamp: Some(stamp(at)),
             frame_id: WORLD.into(),
             id: "surface".into(),
-            models: vec![model],
+            triangles: vec![convert::triangles(mesh)],
             ..SceneEntity::default()
         };
         let update = SceneUpdate { entities: vec![entity], deletions: Vec::new() };
         self.mesh.log_with_time(&update, at);
-        Ok(())
     }
 
     /// The surface's points.

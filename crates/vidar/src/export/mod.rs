@@ -1,6 +1,7 @@
 //! `vidar export`: formats of other programs, made from a finished run folder.
 
 mod at_input;
+mod scene;
 mod tracks;
 
 use crate::error::Error;
@@ -31,6 +32,8 @@ pub enum ExportTarget {
     Ply,
     /// Mesh as GLB.
     Glb,
+    /// Everything as Foxglove and Rerun show it.
+    Mcap,
 }
 
 /// Names on the command line.
@@ -43,6 +46,7 @@ pub const TARGETS: &[(&str, ExportTarget)] = &[
     ("euroc", ExportTarget::Euroc),
     ("ply", ExportTarget::Ply),
     ("glb", ExportTarget::Glb),
+    ("mcap", ExportTarget::Mcap),
 ];
 
 impl FromStr for ExportTarget {
@@ -120,17 +124,18 @@ pub fn export_run(
 ) -> Result<Vec<PathBuf>, Error> {
     target.check(options)?;
     // A folder that is not a run folder is refused before any file is written.
-    read_views(run)?;
+    let stored = read_stored(run)?;
     std::fs::create_dir_all(out).map_err(|e| Error::io("create", out, e))?;
     match target {
-        ExportTarget::Colmap => colmap(run, out, ColmapFormat::Binary, options),
-        ExportTarget::ColmapText => colmap(run, out, ColmapFormat::Text, options),
-        ExportTarget::Nerfstudio => nerfstudio(run, out, options),
-        ExportTarget::Tum | ExportTarget::Kitti | ExportTarget::Euroc => trajectory(run, target, out),
+        ExportTarget::Colmap => colmap(run, &stored, out, ColmapFormat::Binary, options),
+        ExportTarget::ColmapText => colmap(run, &stored, out, ColmapFormat::Text, options),
+        ExportTarget::Nerfstudio => nerfstudio(run, &stored, out, options),
+        ExportTarget::Tum | ExportTarget::Kitti | ExportTarget::Euroc => trajectory(&stored, target, out),
         ExportTarget::Ply => {
             ["mesh.ply", "points.ply"].iter().map(|name| copy(run, "map", name, out)).collect()
         }
         ExportTarget::Glb => Ok(vec![glb(run, out)?]),
+        ExportTarget::Mcap => Ok(vec![scene::mcap(run, &stored, out)?]),
     }
 }
 
@@ -151,17 +156,18 @@ fn glb(run: &Path, out: &Path) -> Result<PathBuf, Error> {
 
 fn colmap(
     run: &Path,
+    stored: &StoredViews,
     out: &Path,
     format: ColmapFormat,
     options: ExportOptions,
 ) -> Result<Vec<PathBuf>, Error> {
-    let mut views = export_views(run)?;
-    let images = images(run, &mut views, options, out)?;
+    let mut views = export_views(run, stored)?;
+    let images = images(run, stored, &mut views, options, out)?;
     let mut cloud = points(run)?;
     let mut observations = Vec::new();
     if options.tracks {
         cloud = tracks::thinned(cloud);
-        observations = tracks::observations(run, &cloud, &views)?;
+        observations = tracks::observations(run, stored, &cloud, &views)?;
     }
     let sparse = out.join("sparse").join("0");
     std::fs::create_dir_all(&sparse).map_err(|e| Error::io("create", &sparse, e))?;
@@ -169,9 +175,14 @@ fn colmap(
     Ok(vec![sparse, images])
 }
 
-fn nerfstudio(run: &Path, out: &Path, options: ExportOptions) -> Result<Vec<PathBuf>, Error> {
-    let mut views = export_views(run)?;
-    let images = images(run, &mut views, options, out)?;
+fn nerfstudio(
+    run: &Path,
+    stored: &StoredViews,
+    out: &Path,
+    options: ExportOptions,
+) -> Result<Vec<PathBuf>, Error> {
+    let mut views = export_views(run, stored)?;
+    let images = images(run, stored, &mut views, options, out)?;
     views.iter_mut().for_each(|v| v.image_name = format!("images/{}", v.image_name));
     let json = out.join("transforms.json");
     let points = copy(run, "map", "points.ply", out)?;
@@ -181,8 +192,9 @@ fn nerfstudio(run: &Path, out: &Path, options: ExportOptions) -> Result<Vec<Path
     Ok(vec![json, points, images])
 }
 
-fn trajectory(run: &Path, target: ExportTarget, out: &Path) -> Result<Vec<PathBuf>, Error> {
-    let poses = read_views(run)?
+fn trajectory(stored: &StoredViews, target: ExportTarget, out: &Path) -> Result<Vec<PathBuf>, Error> {
+    let poses = stored
+        .views
         .iter()
         .filter_map(|v| {
             Some(StampedPose { time: Timestamp::from_nanos(v.time_ns), world_from_body: pose_of(v)? })
@@ -207,8 +219,9 @@ fn trajectory(run: &Path, target: ExportTarget, out: &Path) -> Result<Vec<PathBu
     }
 }
 
-fn export_views(run: &Path) -> Result<Vec<ExportView>, Error> {
-    let views: Vec<ExportView> = read_views(run)?
+fn export_views(run: &Path, stored: &StoredViews) -> Result<Vec<ExportView>, Error> {
+    let views: Vec<ExportView> = stored
+        .views
         .iter()
         .filter_map(|v| {
             Some(ExportView {
@@ -225,6 +238,17 @@ fn export_views(run: &Path) -> Result<Vec<ExportView>, Error> {
         return Err(Error::NotARun { path: run.to_owned(), reason });
     }
     Ok(views)
+}
+
+/// Units per metre of the run's depth images; none where it kept none.
+fn depth_units(run: &Path) -> Result<Option<f64>, Error> {
+    let sidecar = run.join("depth/depth.json");
+    if !sidecar.is_file() {
+        return Ok(None);
+    }
+    let bytes = crate::system::read_up_to(&sidecar, crate::system::MAX_JSON_BYTES)
+        .map_err(|e| Error::io("read", &sidecar, e))?;
+    Ok(Some(vidar_export::DepthSidecar::read(&bytes)?.scale))
 }
 
 fn points(run: &Path) -> Result<PointCloud, Error> {
@@ -244,6 +268,7 @@ fn copy(run: &Path, folder: &str, name: &str, out: &Path) -> Result<PathBuf, Err
 /// The folder of the views' images: those of the run, or new ones, whose size the views then have.
 fn images(
     run: &Path,
+    stored: &StoredViews,
     views: &mut [ExportView],
     options: ExportOptions,
     out: &Path,
@@ -251,7 +276,7 @@ fn images(
     let images = out.join("images");
     std::fs::create_dir_all(&images).map_err(|e| Error::io("create", &images, e))?;
     if options.input_size {
-        at_input::undistort(run, &read_stored(run)?, views, &images)?;
+        at_input::undistort(run, stored, views, &images)?;
     } else {
         views.iter().try_for_each(|view| copy(run, "images", &view.image_name, &images).map(|_| ()))?;
     }

@@ -3,7 +3,7 @@
 //! A point is seen in a view where it projects into the image and the view's depth there is the point's own: nearer surfaces hide
 //! it. The pixels are projections of the map, not matches of features, so their reprojection error says nothing.
 
-use super::{ExportView, pose_of, read_views};
+use super::{ExportView, StoredViews, pose_of};
 use crate::error::Error;
 use rayon::prelude::*;
 use std::collections::BTreeMap;
@@ -35,16 +35,15 @@ pub(super) fn thinned(cloud: PointCloud) -> PointCloud {
 /// Where the points are seen, view by view. `views` may have other sizes than the depth.
 pub(super) fn observations(
     run: &Path,
+    stored: &StoredViews,
     cloud: &PointCloud,
     views: &[ExportView],
 ) -> Result<Vec<Observation>, Error> {
-    let no_depth = |reason: String| Error::NotARun { path: run.to_owned(), reason };
-    let sidecar = run.join("depth/depth.json");
-    let bytes = crate::system::read_up_to(&sidecar, crate::system::MAX_JSON_BYTES)
-        .map_err(|e| no_depth(format!("depth/depth.json: {e}; tracks need output.depth_png = true")))?;
-    let units_per_metre = vidar_export::DepthSidecar::read(&bytes)?.scale;
-    let stored = read_views(run)?;
-    let stored: BTreeMap<u32, _> = stored.iter().map(|v| (v.frame, v)).collect();
+    let Some(units_per_metre) = super::depth_units(run)? else {
+        let reason = "depth/depth.json is missing; tracks need output.depth_png = true".to_owned();
+        return Err(Error::NotARun { path: run.to_owned(), reason });
+    };
+    let stored: BTreeMap<u32, _> = stored.views.iter().map(|v| (v.frame, v)).collect();
     let of_view = |(index, view): (usize, &ExportView)| {
         let Some(own) = stored.get(&view.frame_id.0) else { return Ok(Vec::new()) };
         let (Some(file), Some(pose)) = (&own.depth, pose_of(own)) else { return Ok(Vec::new()) };

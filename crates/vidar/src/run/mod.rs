@@ -25,6 +25,7 @@ pub use evaluate::{DepthScore, Evaluation};
 pub use map::MetricMap;
 pub use outputs::pose_of;
 pub use plan::{ExpectedWork, Plan, bytes};
+pub(crate) use scene::encoded_image;
 
 use crate::calibrate;
 use crate::config::{Config, Layered};

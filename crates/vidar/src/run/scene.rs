@@ -106,10 +106,10 @@ impl SceneWriter {
                 if *is_final {
                     scene.points(&surface.cloud);
                 }
-                match surface.mesh.triangles.is_empty() {
-                    true => Ok(()),
-                    false => scene.mesh(&surface.mesh),
+                if !surface.mesh.triangles.is_empty() {
+                    scene.mesh(&surface.mesh);
                 }
+                Ok(())
             }
             _ => Ok(()),
         });
@@ -150,7 +150,9 @@ fn landmarks(scene: &mut Scene, time: Timestamp, keyframe: &OdometryKeyframe, da
 fn image(scene: &mut Scene, frame: vidar_core::FrameId, dataset: &Dataset) -> Result<(), ExportError> {
     let Some(entry) = dataset.images.iter().find(|i| i.frame_id == frame) else { return Ok(()) };
     let Some(camera) = dataset.rig.camera(entry.camera).map(|c| c.model.clone()) else { return Ok(()) };
-    if let Some((bytes, format)) = encoded(&entry.location) {
+    if let Location::File(path) = &entry.location
+        && let Some((bytes, format)) = encoded_image(path)
+    {
         return scene.image(entry.time, &camera, &SceneImage::Encoded(&bytes, format));
     }
     match dataset.load_image(entry) {
@@ -159,9 +161,8 @@ fn image(scene: &mut Scene, frame: vidar_core::FrameId, dataset: &Dataset) -> Re
     }
 }
 
-/// The bytes of a file that viewers decode themselves.
-fn encoded(location: &Location) -> Option<(Vec<u8>, &'static str)> {
-    let Location::File(path) = location else { return None };
+/// The bytes of a file that viewers decode themselves, and its format.
+pub(crate) fn encoded_image(path: &Path) -> Option<(Vec<u8>, &'static str)> {
     let format = match path.extension()?.to_str()?.to_ascii_lowercase().as_str() {
         "jpg" | "jpeg" => "jpeg",
         "png" => "png",
