@@ -7,7 +7,8 @@
 
 use crate::camera::{CameraError, CameraModel, Pinhole};
 use crate::image::{FrameImage, Image};
-use nalgebra::{Matrix3x2, Vector2};
+use crate::lie::{LieGroup, So3};
+use nalgebra::{Matrix3x2, Vector2, Vector3};
 use rayon::prelude::*;
 
 /// Most sample positions along one side of a pixel; a reduction beyond it is no longer a full average.
@@ -23,6 +24,90 @@ pub struct RemapTable {
     samples_per_side: usize,
     /// Source positions, x then y; the samples of one pixel lie together. NaN outside the camera's image.
     source: Vec<[f32; 2]>,
+}
+
+/// How a camera turned while a rolling shutter read an image row by row.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct RollingShutter {
+    /// Rate of rotation in the camera's frame, rad/s.
+    pub turn_rad_per_s: Vector3<f64>,
+    /// Time from the first to the last row, s.
+    pub readout_secs: f64,
+}
+
+/// Where the pixels of a view lie in an image that was read row by row, beside where they would lie in one that was
+/// taken at once.
+///
+/// Positions are exact at the nodes of a grid and bilinear between them: the shift is smooth, and 16 pixels apart the error is below
+/// a hundredth of a pixel at 3 rad/s and 30 ms.
+#[derive(Clone, Debug)]
+pub struct RowShift {
+    columns: usize,
+    nodes: Vec<[f32; 2]>,
+    /// Size of the camera's image.
+    size: [f32; 2],
+}
+
+/// Pixels of the view from one node to the next.
+const NODE_SPACING: usize = 16;
+/// Rounds in which row and position are found from each other; each lowers the error by the shift per row, a hundredth.
+const ROW_ROUNDS: usize = 3;
+
+impl RowShift {
+    /// The shift of a view of `camera`, which has the pose of the middle row; `None` where it stays below `least_px` everywhere.
+    ///
+    /// Only the rotation is taken back: what the camera's translation shifts depends on the depth. At 0.5 m/s and 30 ms it is 7 mm
+    /// from the first row to the last, a third of a degree at 1.3 m.
+    pub fn new(
+        camera: &CameraModel,
+        view: &Pinhole,
+        shutter: &RollingShutter,
+        least_px: f64,
+    ) -> Option<Self> {
+        let (columns, rows) = (view.width.div_ceil(NODE_SPACING) + 1, view.height.div_ceil(NODE_SPACING) + 1);
+        let node = |i: usize| {
+            let (x, y) = (i % columns * NODE_SPACING, i / columns * NODE_SPACING);
+            shift_of_rows(camera, &view.ray(x as f64, y as f64), shutter).unwrap_or_default()
+        };
+        let nodes: Vec<Vector2<f64>> = (0..columns * rows).map(node).collect();
+        let largest = nodes.iter().map(|n| n.norm()).fold(0.0, f64::max);
+        (largest >= least_px).then(|| Self {
+            columns,
+            nodes: nodes.into_iter().map(|n| [n.x as f32, n.y as f32]).collect(),
+            size: [camera.width() as f32, camera.height() as f32],
+        })
+    }
+
+    /// The shift of a pixel of the view, pixels of the camera.
+    fn at(&self, x: usize, y: usize) -> [f32; 2] {
+        let first = y / NODE_SPACING * self.columns + x / NODE_SPACING;
+        let share = |v: usize| (v % NODE_SPACING) as f32 / NODE_SPACING as f32;
+        let (ax, ay) = (share(x), share(y));
+        let node = |i: usize| self.nodes[i];
+        let [a, b, c, d] =
+            [node(first), node(first + 1), node(first + self.columns), node(first + self.columns + 1)];
+        std::array::from_fn(|k| {
+            let (top, bottom) = (a[k] + ax * (b[k] - a[k]), c[k] + ax * (d[k] - c[k]));
+            top + ay * (bottom - top)
+        })
+    }
+
+    /// Whether a position lies on the image.
+    fn holds(&self, at: &[f32; 2]) -> bool {
+        (0..2).all(|k| at[k] >= -0.5 && at[k] <= self.size[k] - 0.5)
+    }
+}
+
+/// From where a direction (in the frame of the middle row) is seen at once to where its row sees it.
+fn shift_of_rows(camera: &CameraModel, ray: &Vector3<f64>, shutter: &RollingShutter) -> Option<Vector2<f64>> {
+    let at_once = camera.project(ray)?;
+    let mut pixel = at_once;
+    for _ in 0..ROW_ROUNDS {
+        let share = (pixel.y + 0.5) / camera.height() as f64 - 0.5;
+        let turned = So3::exp(&(shutter.turn_rad_per_s * (shutter.readout_secs * share)));
+        pixel = camera.project(&(turned.inverse() * *ray))?;
+    }
+    Some(pixel - at_once)
 }
 
 impl RemapTable {
@@ -71,15 +156,21 @@ impl RemapTable {
     /// Rows are done in parallel; the result is the same for any number of threads. The image must have the size of
     /// the camera; of a smaller one the border pixels are repeated.
     pub fn apply(&self, image: &FrameImage) -> FrameImage {
+        self.apply_shifted(image, None)
+    }
+
+    /// As [`RemapTable::apply`], with the positions shifted as the rows of this image were.
+    pub fn apply_shifted(&self, image: &FrameImage, shift: Option<&RowShift>) -> FrameImage {
         match image {
             FrameImage::Gray8(i) => {
-                FrameImage::Gray8(self.averaged(i, |p| [f32::from(*p)], |[v]| (v + 0.5) as u8))
+                FrameImage::Gray8(self.averaged(i, shift, |p| [f32::from(*p)], |[v]| (v + 0.5) as u8))
             }
             FrameImage::Gray16(i) => {
-                FrameImage::Gray16(self.averaged(i, |p| [f32::from(*p)], |[v]| (v + 0.5) as u16))
+                FrameImage::Gray16(self.averaged(i, shift, |p| [f32::from(*p)], |[v]| (v + 0.5) as u16))
             }
             FrameImage::Rgb8(i) => FrameImage::Rgb8(self.averaged(
                 i,
+                shift,
                 |p| p.map(f32::from),
                 |v: [f32; 3]| v.map(|c| (c + 0.5) as u8),
             )),
@@ -92,7 +183,7 @@ impl RemapTable {
     pub fn apply_nearest<P: Copy + Send + Sync>(&self, image: &Image<P>, outside: P) -> Image<P> {
         let (w, h) = (image.width(), image.height());
         let last = |n: usize| n.saturating_sub(1) as f32;
-        self.by_rows(outside, |samples| {
+        self.by_rows(outside, |_, samples| {
             if samples[0][0].is_nan() || w == 0 || h == 0 {
                 return outside;
             }
@@ -109,11 +200,15 @@ impl RemapTable {
         &self.source[first..first + per_pixel]
     }
 
-    fn by_rows<P: Copy + Send + Sync>(&self, fill: P, value: impl Fn(&[[f32; 2]]) -> P + Sync) -> Image<P> {
+    fn by_rows<P: Copy + Send + Sync>(
+        &self,
+        fill: P,
+        value: impl Fn((usize, usize), &[[f32; 2]]) -> P + Sync,
+    ) -> Image<P> {
         let mut out = Image::filled(self.target.width, self.target.height, fill);
         out.data_mut().par_chunks_mut(self.target.width.max(1)).enumerate().for_each(|(y, row)| {
             for (x, pixel) in row.iter_mut().enumerate() {
-                *pixel = value(self.samples(x, y));
+                *pixel = value((x, y), self.samples(x, y));
             }
         });
         out
@@ -122,6 +217,7 @@ impl RemapTable {
     fn averaged<P: Copy + Send + Sync, const C: usize>(
         &self,
         image: &Image<P>,
+        shift: Option<&RowShift>,
         load: impl Fn(&P) -> [f32; C] + Sync,
         store: impl Fn([f32; C]) -> P + Sync,
     ) -> Image<P> {
@@ -130,15 +226,26 @@ impl RemapTable {
             return Image::filled(self.target.width, self.target.height, black);
         }
         let share = 1.0 / (self.samples_per_side * self.samples_per_side) as f32;
-        self.by_rows(black, |samples| {
+        self.by_rows(black, |(x, y), samples| {
             if samples[0][0].is_nan() {
                 return black;
             }
             let mut sum = [0.0; C];
-            for at in samples {
+            let mut add = |at: &[f32; 2]| {
                 let value = bilinear(image, &load, at);
                 for c in 0..C {
                     sum[c] += value[c];
+                }
+            };
+            match shift {
+                None => samples.iter().for_each(add),
+                Some(shift) => {
+                    let [dx, dy] = shift.at(x, y);
+                    let moved = |at: &[f32; 2]| [at[0] + dx, at[1] + dy];
+                    if !samples.iter().all(|at| shift.holds(&moved(at))) {
+                        return black;
+                    }
+                    samples.iter().for_each(|at| add(&moved(at)));
                 }
             }
             store(sum.map(|v| v * share))

@@ -4,8 +4,8 @@
 
 use nalgebra::{Vector2, Vector3};
 use vidar_core::camera::{DoubleSphere, Equidistant, Fov, ParametricCamera, RadTan};
-use vidar_core::remap::{RemapTable, undistorted_view};
-use vidar_core::{CameraError, CameraModel, FrameImage, Image, Pinhole};
+use vidar_core::remap::{RemapTable, RollingShutter, RowShift, undistorted_view};
+use vidar_core::{CameraError, CameraModel, FrameImage, Image, LieGroup, Pinhole, So3};
 
 /// Grey level of the world in a unit direction: waves of `wavelength` (rad, in the middle of the view) on the sky.
 fn grey(direction: &Vector3<f64>, wavelength: f64) -> f64 {
@@ -232,4 +232,53 @@ fn views_of_every_example_are_covered_or_an_error() {
     let aside = CameraModel::Equidistant(Equidistant::new(aside, [0.0; 4]).unwrap());
     let error = undistorted_view(&aside, 640, 480).unwrap_err();
     assert!(matches!(error, CameraError::NoUndistortedView { width: 640, .. }), "{error}");
+}
+
+/// The image of a camera that turns while its rows are read; its pose is that of the middle row.
+fn photograph_turning(camera: &CameraModel, shutter: &RollingShutter, wavelength: f64) -> FrameImage {
+    FrameImage::Gray8(Image::from_fn(camera.width(), camera.height(), |x, y| {
+        let share = (y as f64 + 0.5) / camera.height() as f64 - 0.5;
+        let turned = So3::exp(&(shutter.turn_rad_per_s * (shutter.readout_secs * share)));
+        let ray = camera.unproject(&Vector2::new(x as f64, y as f64)).filter(|r| r.z > 0.05);
+        ray.map_or(0.0, |r| grey(&(turned * r), wavelength)).round() as u8
+    }))
+}
+
+#[test]
+fn rows_read_while_the_camera_turned_are_put_where_one_instant_sees_them() {
+    let shutter = RollingShutter { turn_rad_per_s: Vector3::new(0.9, -1.4, 0.7), readout_secs: 0.03 };
+    for camera in distorted_cameras() {
+        let view = undistorted_view(&camera, camera.width(), camera.height()).unwrap();
+        let table = RemapTable::new(&camera, &view);
+        let shift = RowShift::new(&camera, &view, &shutter, 0.25).unwrap();
+        let wavelength = 90.0 / camera.intrinsics().fx;
+        let rolling = photograph_turning(&camera, &shutter, wavelength);
+        let expected = draw(&CameraModel::Pinhole(view), wavelength, 1);
+        // Away from the border, beyond which a turned row looks.
+        let margin = 24;
+        let rms = |found: &FrameImage| {
+            let found = found.to_gray_f32();
+            let inside = (margin..view.height - margin)
+                .flat_map(|y| (margin..view.width - margin).map(move |x| (x, y)));
+            let squares: Vec<f64> =
+                inside.map(|p| (f64::from(found[p]) - expected[p]).powi(2)).collect();
+            (squares.iter().sum::<f64>() / squares.len() as f64).sqrt()
+        };
+        let (as_is, corrected) =
+            (rms(&table.apply(&rolling)), rms(&table.apply_shifted(&rolling, Some(&shift))));
+        assert!(corrected < 1.5, "{}: {corrected} of {as_is} grey levels", camera.name());
+        assert!(as_is > 10.0 * corrected, "{}: {corrected} of {as_is} grey levels", camera.name());
+    }
+}
+
+#[test]
+fn what_a_slow_turn_shifts_is_left_where_it_is() {
+    let camera = distorted_cameras().remove(0);
+    let view = undistorted_view(&camera, camera.width(), camera.height()).unwrap();
+    let shutter =
+        |rate: f64| RollingShutter { turn_rad_per_s: Vector3::new(0.0, rate, 0.0), readout_secs: 0.03 };
+    assert!(RowShift::new(&camera, &view, &shutter(0.02), 0.25).is_none());
+    assert!(RowShift::new(&camera, &view, &shutter(0.2), 0.25).is_some());
+    let global = RollingShutter { turn_rad_per_s: Vector3::new(1.0, 1.0, 1.0), readout_secs: 0.0 };
+    assert!(RowShift::new(&camera, &view, &global, 0.25).is_none());
 }

@@ -2,6 +2,7 @@
 
 use crate::input::TrajectorySource;
 use crate::quality::TrackQuality;
+use nalgebra::Vector3;
 use std::sync::Arc;
 use vidar_align::Placement;
 use vidar_align::aligner::{ChunkReport, FrameObservation, LoopReport};
@@ -42,6 +43,8 @@ pub struct MapKeyframe {
     pub stamp: FrameStamp,
     /// Pose of its camera as tracked, m; none where poses are found by the geometry model alone.
     pub world_from_camera: Option<Se3>,
+    /// Rate of rotation of its camera, in the camera's frame, rad/s; zero where the images around it have no pose.
+    pub turn_rad_per_s: Vector3<f64>,
     /// The odometry's keyframe of the same image, with its landmarks and covariance.
     pub odometry: Option<Arc<OdometryKeyframe>>,
 }

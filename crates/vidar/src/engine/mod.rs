@@ -104,7 +104,7 @@ impl<'a> Engine<'a> {
             setup.geometry,
             setup.places,
             (setup.images, setup.store),
-            (&setup.camera, &setup.view),
+            (&setup.camera, setup.readout, &setup.view),
             (setup.cancelled, setup.predicting),
         );
         // Chunks without overlaps are stereo's: their unit is that of the poses already.
@@ -340,7 +340,12 @@ impl<'a> Engine<'a> {
         sink: &mut Sink<'_>,
     ) -> Result<Option<StoredChunk>, Error> {
         self.enter(Step::Predict, sink)?;
-        let Some(world) = &self.world else { return Ok(None) };
+        let Some(world) = &mut self.world else { return Ok(None) };
+        if let Some(track) = self.track.longest() {
+            for keyframe in &mut world.keyframes[chunk.seen.clone()] {
+                keyframe.turn_rad_per_s = track.turn_rad_per_s(keyframe.stamp.frame_id);
+            }
+        }
         let mut events = Vec::new();
         let prediction = self.predictor.predict(id, chunk, &world.keyframes, &mut events)?;
         events.into_iter().try_for_each(&mut *sink)?;

@@ -3,6 +3,7 @@
 use super::cut::ChunkRule;
 use super::events::{FrameStamp, MapKeyframe};
 use super::track::PosedFrame;
+use nalgebra::Vector3;
 use vidar_align::keyframe_selection::{KeyframeConfig, KeyframeSelector, select_by_motion, select_by_time};
 use vidar_core::{Se3, Timestamp};
 
@@ -37,6 +38,7 @@ impl Selection {
         let keyframe = |f: &PosedFrame| MapKeyframe {
             stamp: f.stamp,
             world_from_camera: Some(f.world_from_camera),
+            turn_rad_per_s: Vector3::zeros(),
             odometry: f.odometry.clone(),
         };
         let is_preferred = |f: &PosedFrame| self.prefers_odometry && f.odometry.is_some();
@@ -68,8 +70,12 @@ impl Selection {
         rule: &ChunkRule,
         is_complete: bool,
     ) -> Vec<MapKeyframe> {
-        let keyframe =
-            |stamp: &FrameStamp| MapKeyframe { stamp: *stamp, world_from_camera: None, odometry: None };
+        let keyframe = |stamp: &FrameStamp| MapKeyframe {
+            stamp: *stamp,
+            world_from_camera: None,
+            turn_rad_per_s: Vector3::zeros(),
+            odometry: None,
+        };
         if self.config.max_count > 0 && !is_complete && !rule.is_prescribed() {
             return Vec::new();
         }
@@ -91,7 +97,6 @@ impl Selection {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use nalgebra::Vector3;
     use vidar_core::{CameraId, FrameId};
 
     fn posed(i: u32) -> PosedFrame {

@@ -7,7 +7,7 @@ use crate::config::Config;
 use crate::error::Error;
 use std::ops::Range;
 use vidar_core::{
-    CameraId, ChunkId, ChunkViews, FrameId, FrameImage, GeometryPrediction, Image, ModelError, ModelInfo,
+    CameraId, ChunkId, ChunkViews, Duration, FrameId, FrameImage, GeometryPrediction, Image, ModelError, ModelInfo,
     Pinhole, RigCamera, Se3, Timestamp, Warning, Watch,
 };
 
@@ -21,6 +21,8 @@ pub struct EngineSetup<'a> {
     pub camera_id: CameraId,
     /// The camera in use, with its place on the rig.
     pub camera: RigCamera,
+    /// Time from the first to the last row of an image; zero for a global shutter. Poses are those of the middle row.
+    pub readout: Duration,
     /// The undistorted view that the geometry model gets.
     pub view: Pinhole,
     /// Where poses come from; none where the coupling works without any.

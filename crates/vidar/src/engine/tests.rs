@@ -180,6 +180,7 @@ fn run(
         config: &config,
         camera_id: CameraId(0),
         camera,
+        readout: Duration::ZERO,
         view: pinhole(),
         poses: Some(poses),
         fallback,

@@ -4,10 +4,11 @@ use super::events::{FrameStamp, FrameState};
 use crate::error::Error;
 use crate::input::{MetricTrajectory, TrajectorySource};
 use crate::quality::TrackQuality;
+use nalgebra::Vector3;
 use std::collections::{BTreeMap, VecDeque};
 use std::sync::Arc;
 use vidar_core::{
-    CameraId, Duration, LieGroup, OdometryKeyframe, RevisedPose, Rig, Se3, SensorEvent, Timestamp, Warning,
+    CameraId, Duration, FrameId, LieGroup, OdometryKeyframe, RevisedPose, Rig, Se3, SensorEvent, Timestamp, Warning,
 };
 use vidar_odometry::{ImuUse, Joined, Odometry, OdometryConfig, OdometryOutput, SavedMap, Status, Tracking};
 
@@ -249,6 +250,27 @@ pub struct Segment {
     last: Option<(Timestamp, Se3)>,
 }
 
+/// Longest span over which a rate of rotation is taken: two images at 10 Hz.
+const MAX_TURN_SPAN: Duration = Duration::from_millis(210);
+
+impl Segment {
+    /// Rate of rotation of the camera at a frame, in its own frame, rad/s: from the frames before and after it. Zero where they are
+    /// far apart.
+    pub fn turn_rad_per_s(&self, frame: FrameId) -> Vector3<f64> {
+        let Ok(at) = self.frames.binary_search_by_key(&frame, |f| f.stamp.frame_id) else {
+            return Vector3::zeros();
+        };
+        let (before, after) = (&self.frames[at.saturating_sub(1)], self.frames.get(at + 1).unwrap_or(&self.frames[at]));
+        let span = after.stamp.time - before.stamp.time;
+        if span <= Duration::ZERO || span > MAX_TURN_SPAN {
+            return Vector3::zeros();
+        }
+        let turned = before.world_from_camera.rotation.inverse() * after.world_from_camera.rotation;
+        // Turning about one axis between the two, the middle one has the same rate in its own frame.
+        turned.log() / span.as_secs_f64()
+    }
+}
+
 /// The poses of all images so far, by segment.
 #[derive(Debug, Default)]
 pub struct Track {
@@ -373,8 +395,6 @@ fn between(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use nalgebra::Vector3;
-    use vidar_core::FrameId;
 
     fn stamp(i: u32) -> FrameStamp {
         let time = Timestamp::from_nanos(i64::from(i) * 100_000_000);

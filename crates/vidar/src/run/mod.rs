@@ -264,6 +264,7 @@ impl Context<'_> {
             config,
             camera_id: plan.camera_id,
             camera: camera_on_rig(dataset, plan),
+            readout: readout(dataset, config),
             view: plan.view,
             poses,
             fallback,
@@ -326,6 +327,12 @@ fn unreadable(dataset: &Dataset, stamp: FrameStamp, error: &DatasetError) -> War
     let entry = dataset.images.iter().find(|i| i.frame_id == stamp.frame_id);
     let warning = Warning::new("odometry-image-unreadable", error.to_string());
     entry.map_or(warning.clone(), |entry| warning.at(&entry.location))
+}
+
+/// Time from the first to the last row of an image: as found or set, else as the calibration states.
+pub(crate) fn readout(dataset: &Dataset, config: &Config) -> Duration {
+    let known = config.odometry.readout_ms.map(|ms| Duration::from_secs_f64(1e-3 * ms));
+    known.or(dataset.readout).unwrap_or(Duration::ZERO)
 }
 
 pub(crate) fn camera_on_rig(dataset: &Dataset, plan: &Plan) -> RigCamera {

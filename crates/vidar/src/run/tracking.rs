@@ -140,7 +140,10 @@ impl Tracking {
             events.emit(&Event::ArtifactWritten { path: name.into(), bytes });
         }
         let poses = TrackedPoses::new(&tracked, &dataset.rig, dataset.camera);
-        tracked.adjusted.iter().for_each(|adjusted| adjusted::apply(adjusted, dataset));
+        if let Some(adjusted) = &tracked.adjusted {
+            adjusted::apply(adjusted, dataset);
+            config.odometry.readout_ms = Some(1e3 * adjusted.calibration.readout_secs.max(0.0));
+        }
         if let (Some(calibrated), false) = (self.calibrated, cancel.is_cancelled()) {
             let after = Calibrated::of(dataset, config);
             let kept = Kept { key: self.key, calibrated, tracked: after, timing, poses };

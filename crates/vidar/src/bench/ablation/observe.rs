@@ -6,7 +6,7 @@ use crate::engine::{Engine, EngineSetup, MapEvent, PlaceDescriber, PredictionId,
 use crate::error::Error;
 use crate::events::CancelToken;
 use crate::input::{self, ImageFiles, Measurement};
-use crate::run::{Plan, camera_on_rig};
+use crate::run::{Plan, camera_on_rig, readout};
 use std::collections::BTreeMap;
 use vidar_align::FrameObservation;
 use vidar_core::{ChunkId, FrameId, Timestamp};
@@ -36,6 +36,7 @@ pub fn observe(dataset: &Dataset, config: &Config, cancel: &CancelToken) -> Resu
         config,
         camera_id: plan.camera_id,
         camera: camera_on_rig(dataset, &plan),
+        readout: readout(dataset, config),
         view: plan.view,
         poses,
         fallback,
