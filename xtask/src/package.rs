@@ -76,13 +76,16 @@ fn order(packages: &[Package]) -> Result<Vec<&Package>> {
     let names: BTreeSet<&str> = packages.iter().map(|p| p.name.as_str()).collect();
     let needs = |package: &Package| -> Vec<String> {
         // A package's own features in its tests have a path and no version: they are left out of the package.
-        let is_kept = |d: &&cargo_metadata::Dependency| d.kind != DependencyKind::Development || d.req.to_string() != "*";
+        let is_kept = |d: &&cargo_metadata::Dependency| {
+            d.kind != DependencyKind::Development || d.req.to_string() != "*"
+        };
         let ours = |d: &&cargo_metadata::Dependency| names.contains(d.name.as_str());
         package.dependencies.iter().filter(ours).filter(is_kept).map(|d| d.name.clone()).collect()
     };
     let (mut ordered, mut done) = (Vec::new(), BTreeSet::new());
     while ordered.len() < packages.len() {
-        let is_next = |p: &&Package| !done.contains(p.name.as_str()) && needs(p).iter().all(|n| done.contains(n));
+        let is_next =
+            |p: &&Package| !done.contains(p.name.as_str()) && needs(p).iter().all(|n| done.contains(n));
         let Some(next) = packages.iter().find(is_next) else {
             let left: Vec<&str> = names.iter().filter(|n| !done.contains(**n)).copied().collect();
             bail!("these packages need each other and cannot be published: {}", left.join(", "));
@@ -180,7 +183,8 @@ mod tests {
     #[test]
     fn included_files_are_found_from_the_source_that_names_them() {
         let text = "a(include_str!(\"../README.md\")); include_bytes!(\"x.bin\")";
-        let found: Vec<PathBuf> = included(text).map(|p| plain(&Path::new("src/config/a.rs").with_file_name(p))).collect();
+        let found: Vec<PathBuf> =
+            included(text).map(|p| plain(&Path::new("src/config/a.rs").with_file_name(p))).collect();
         assert_eq!(found, [Path::new("src/README.md"), Path::new("src/config/x.bin")]);
         let outside = plain(&Path::new("src/a.rs").with_file_name("../../presets/fast.toml"));
         assert_eq!(outside, Path::new("../presets/fast.toml"), "no file of a package");

@@ -6,10 +6,14 @@ fn root() -> &'static Path {
 
 #[test]
 fn a_choice_is_told_from_a_sum() {
-    for choice in ["Apache-2.0", "MIT OR Apache-2.0", "MIT/Apache-2.0", "Apache-2.0 / MIT", "Zlib OR Apache-2.0 OR MIT"] {
+    for choice in
+        ["Apache-2.0", "MIT OR Apache-2.0", "MIT/Apache-2.0", "Apache-2.0 / MIT", "Zlib OR Apache-2.0 OR MIT"]
+    {
         assert!(is_offered_under_apache(choice), "{choice}");
     }
-    for other in ["MIT", "Apache-2.0 AND ISC", "(MIT OR Apache-2.0) AND Unicode-3.0", "Apache-2.0 WITH LLVM-exception"] {
+    for other in
+        ["MIT", "Apache-2.0 AND ISC", "(MIT OR Apache-2.0) AND Unicode-3.0", "Apache-2.0 WITH LLVM-exception"]
+    {
         assert!(!is_offered_under_apache(other), "{other}");
     }
 }
@@ -26,7 +30,10 @@ fn copies_of_the_apache_licence_are_one_text_and_nothing_else_is() {
 #[test]
 fn texts_that_crates_share_are_written_once_with_all_their_names() {
     let users = |names: &[&str]| names.iter().map(|n| (*n).to_owned()).collect::<BTreeSet<_>>();
-    let texts = BTreeMap::from([("A".to_owned(), users(&["one 1.0.0"])), ("B".to_owned(), users(&["two 2.0.0", "three 3.0.0"]))]);
+    let texts = BTreeMap::from([
+        ("A".to_owned(), users(&["one 1.0.0"])),
+        ("B".to_owned(), users(&["two 2.0.0", "three 3.0.0"])),
+    ]);
     let file = assembled("list\n", &texts);
     assert!(file.find("three 3.0.0, two 2.0.0\n").unwrap() < file.find("one 1.0.0\n").unwrap(), "{file}");
     assert_eq!(file.matches("\nB\n").count(), 1);
@@ -45,7 +52,9 @@ fn what_is_linked_is_listed_and_what_only_tests_use_is_not() {
     for unlinked in ["\nproptest ", "\nassert_cmd ", "\ncbindgen ", "\ncargo_metadata ", "\nvidar-core "] {
         assert!(!text.contains(unlinked), "{unlinked:?}");
     }
-    for notice in ["Permission is hereby granted", "SIL OPEN FONT LICENSE", "TERMS AND CONDITIONS FOR USE", "Unicode"] {
+    for notice in
+        ["Permission is hereby granted", "SIL OPEN FONT LICENSE", "TERMS AND CONDITIONS FOR USE", "Unicode"]
+    {
         assert!(text.contains(notice), "{notice:?}");
     }
 }
