@@ -47,10 +47,11 @@ if [ -z "$binary" ]; then
 fi
 [ -f "$binary" ] || die "$binary is missing"
 
-mkdir -p "$out"
-out=$(cd "$out" && pwd)
 scratch=$(mktemp -d)
 trap 'rm -rf "$scratch"' EXIT
+# What fails below leaves nothing behind that could be taken for a release.
+files_at=$scratch/files
+mkdir "$files_at"
 
 say "archive"
 name=vidar-$version-$platform
@@ -74,7 +75,7 @@ if tar --version 2>/dev/null | grep -q GNU; then
   time=$(git log -1 --format=%ct 2>/dev/null || echo 0)
   reproducible=(--sort=name --owner=0 --group=0 --numeric-owner --mtime="@$time")
 fi
-tar -C "$scratch" ${reproducible[@]+"${reproducible[@]}"} -cf - "$name" | gzip -9n > "$out/$name.tar.gz"
+tar -C "$scratch" ${reproducible[@]+"${reproducible[@]}"} -cf - "$name" | gzip -9n > "$files_at/$name.tar.gz"
 files=("$name.tar.gz")
 
 if $wheel; then
@@ -83,17 +84,17 @@ if $wheel; then
   "$scratch/venv/bin/pip" install --quiet --disable-pip-version-check 'maturin>=1.7,<2'
   (cd python && CARGO_TARGET_DIR="${CARGO_TARGET_DIR:-$PWD/../target}" \
     "$scratch/venv/bin/maturin" build --release --strip --locked --out "$scratch/wheel" ${target:+--target "$target"})
-  cp "$scratch"/wheel/*.whl "$out/"
+  cp "$scratch"/wheel/*.whl "$files_at/"
   files+=("$(basename "$scratch"/wheel/*.whl)")
 fi
 
 sum() { if command -v sha256sum >/dev/null; then sha256sum "$@"; else shasum -a 256 "$@"; fi; }
-(cd "$out" && sum "${files[@]}" > SHA256SUMS)
+(cd "$files_at" && sum "${files[@]}" > SHA256SUMS)
 
 say "tried out"
-(cd "$out" && sum --check SHA256SUMS)
+(cd "$files_at" && sum --check SHA256SUMS)
 mkdir "$scratch/user"
-tar -C "$scratch/user" -xzf "$out/$name.tar.gz"
+tar -C "$scratch/user" -xzf "$files_at/$name.tar.gz"
 if [ "$platform" = "$host" ]; then
   told=$("$scratch/user/$name/$program" --version)
   [ "${told#vidar "$version"}" != "$told" ] || die "the packed program says \"$told\", not version $version"
@@ -101,10 +102,12 @@ if [ "$platform" = "$host" ]; then
   "$scratch/user/$name/$program" model verify da3-nano
   if $wheel; then
     python3 -m venv "$scratch/fresh"
-    "$scratch/fresh/bin/pip" install --quiet --disable-pip-version-check "$out/${files[1]}"
+    "$scratch/fresh/bin/pip" install --quiet --disable-pip-version-check "$files_at/${files[1]}"
     # Away from the checkout, so that nothing of it is imported.
     (cd "$scratch/user" && "$scratch/fresh/bin/python" -c 'import vidar; print("module", vidar.__version__, len(vidar.__all__), "names")')
   fi
 fi
+mkdir -p "$out"
+cp "$files_at"/* "$out/"
 say "done: $out"
 ls -l "$out"

@@ -22,6 +22,7 @@ mod odometry;
 mod photos;
 mod quality;
 mod recordings;
+mod release;
 mod resume;
 mod support;
 mod trust;
