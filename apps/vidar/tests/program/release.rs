@@ -36,7 +36,8 @@ fn the_packed_program_runs_and_has_its_licences_and_completions() {
     let output = release(&["--binary", VIDAR, "--no-wheel", "--out", out.to_str().unwrap()]);
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
 
-    let mut files: Vec<PathBuf> = std::fs::read_dir(&out).unwrap().map(|entry| entry.unwrap().path()).collect();
+    let mut files: Vec<PathBuf> =
+        std::fs::read_dir(&out).unwrap().map(|entry| entry.unwrap().path()).collect();
     files.sort();
     let [sums, archive] = files.as_slice() else { panic!("{files:?}") };
     let name = archive.file_name().unwrap().to_str().unwrap();
