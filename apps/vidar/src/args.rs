@@ -95,6 +95,11 @@ pub enum Command {
         after_help = "Examples:\n  vidar export runs/demo/latest/run --to colmap -o colmap\n  vidar export runs/demo/latest/run --to nerfstudio -o ns\n  vidar export runs/demo/latest/run --to tum"
     )]
     Export(ExportArgs),
+    /// Compare finished runs on one page: numbers side by side, linked cameras, distances of their surfaces in colour.
+    #[command(
+        after_help = "Examples:\n  vidar compare runs/a/latest runs/b/latest\n  vidar compare stereo/ nano/ small/ -o models.html\n  vidar compare before/ after/ --force --json"
+    )]
+    Compare(CompareArgs),
     /// Serve a finished run to Foxglove on this computer, until Ctrl-C.
     #[command(
         after_help = "Examples:\n  vidar view runs/demo/latest/run\n  vidar view run.mcap --port 9000\n\nIn Foxglove: Open connection, Foxglove WebSocket, the address that is printed."
@@ -449,6 +454,20 @@ pub struct ExportArgs {
     /// Output folder; default `RUN/export/<format>`.
     #[arg(short, long, value_hint = ValueHint::DirPath)]
     pub output: Option<PathBuf>,
+}
+
+/// `vidar compare`.
+#[derive(Args, Clone, Debug)]
+pub struct CompareArgs {
+    /// Folders of two to four runs; the others are placed in the world of the first and compared with it.
+    #[arg(value_name = "RUN", required = true, value_hint = ValueHint::DirPath)]
+    pub runs: Vec<PathBuf>,
+    /// The page: one HTML file that needs nothing else.
+    #[arg(short, long, value_name = "FILE", value_hint = ValueHint::FilePath, default_value = "compare.html", help_heading = "Output")]
+    pub output: PathBuf,
+    /// Replace a page that exists.
+    #[arg(long, help_heading = "Output")]
+    pub force: bool,
 }
 
 /// `vidar view`.
