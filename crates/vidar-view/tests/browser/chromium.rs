@@ -97,12 +97,14 @@ impl Page {
             errors: Vec::new(),
             _profile: profile,
         };
-        let target = page.call("Target.createTarget", json!({ "url": "about:blank", "width": width, "height": height }));
+        let target = page.call("Target.createTarget", json!({ "url": "about:blank" }));
         let attached = page.call("Target.attachToTarget", json!({ "targetId": target["targetId"], "flatten": true }));
         page.session = attached["sessionId"].as_str().unwrap().to_owned();
         for domain in ["Page", "Runtime", "Network"] {
             page.call(&format!("{domain}.enable"), json!({}));
         }
+        let metrics = json!({ "width": width, "height": height, "deviceScaleFactor": 1, "mobile": false });
+        page.call("Emulation.setDeviceMetricsOverride", metrics);
         page.call("Page.navigate", json!({ "url": format!("file://{}{fragment}", file.display()) }));
         page.until("document.readyState === 'complete'");
         page

@@ -3,11 +3,12 @@
 use super::load::StoredRun;
 use crate::error::Error;
 use crate::interactive::Samples;
+use rayon::prelude::*;
 use serde_json::{Value, json};
-use vidar_core::TriangleMesh;
-use vidar_eval::{NearestIndex, SampleDensity, nearest_distances, sample_mesh};
+use vidar_core::{PointCloud, TriangleMesh};
+use vidar_eval::{NearestIndex, Neighbour, SampleDensity, sample_mesh};
 
-/// Points on a surface at most: a point every centimetre on 200 m².
+/// Points on a surface at most: one every centimetre on 200 m².
 const MOST_SAMPLES: usize = 2_000_000;
 /// Spacing of points where a run does not say its voxels, m.
 const USUAL_SPACING_M: f64 = 0.01;
@@ -71,34 +72,58 @@ pub(super) fn summary(samples: &Samples) -> Summary {
 }
 
 /// Points on the surfaces and their distances to the surface of the other, in the world of the first run.
-///
-/// A surface is represented by points half a voxel apart, as in scores, so equal surfaces are some tenths of that apart.
 pub(super) fn measure(runs: &[StoredRun]) -> Result<Vec<SurfaceDistance>, Error> {
     let Some(first) = runs.first().filter(|r| !r.mesh.triangles.is_empty()) else { return Ok(Vec::new()) };
-    let of_first = sampled(first)?;
-    let first_index = NearestIndex::build(&of_first)?;
+    let of_first = SampledSurface::of(first)?;
     let mut distances = Vec::new();
     for (run, stored) in runs.iter().enumerate().skip(1).filter(|(_, r)| !r.mesh.triangles.is_empty()) {
-        let of_run = sampled(stored)?;
-        let index = NearestIndex::build(&of_run)?;
-        let to_first = nearest_distances(&of_run, &first_index, None);
-        let from_first = nearest_distances(&of_first, &index, None);
+        let of_run = SampledSurface::of(stored)?;
         distances.push(SurfaceDistance {
             run,
-            to_first: Samples { positions: of_run, values: to_first },
-            from_first: Samples { positions: of_first.clone(), values: from_first },
+            to_first: of_first.distances_of(&of_run.points.positions),
+            from_first: of_run.distances_of(&of_first.points.positions),
         });
     }
     Ok(distances)
 }
 
-fn sampled(run: &StoredRun) -> Result<Vec<[f32; 3]>, Error> {
-    let spacing = run.voxel_size_m().map_or(USUAL_SPACING_M, |v| v / 2.0);
-    let density = match area_m2(&run.mesh) / (spacing * spacing) {
-        count if count > MOST_SAMPLES as f64 => SampleDensity::Count(MOST_SAMPLES),
-        _ => SampleDensity::SpacingM(spacing),
-    };
-    Ok(sample_mesh(&run.mesh, density)?.positions)
+/// A surface as points with normals.
+struct SampledSurface {
+    points: PointCloud,
+    index: NearestIndex,
+    spacing_m: f64,
+}
+
+impl SampledSurface {
+    /// Points half a voxel apart, as scores have them.
+    fn of(run: &StoredRun) -> Result<Self, Error> {
+        let spacing = run.voxel_size_m().map_or(USUAL_SPACING_M, |v| v / 2.0);
+        let area = area_m2(&run.mesh);
+        // Fewer points are further apart.
+        let spacing_m = spacing.max((area / MOST_SAMPLES as f64).sqrt());
+        let points = sample_mesh(&run.mesh, SampleDensity::SpacingM(spacing_m))?;
+        let index = NearestIndex::build(&points.positions)?;
+        Ok(Self { points, index, spacing_m })
+    }
+
+    /// Distances of places to the surface.
+    ///
+    /// The nearest point is usually aside by a part of the spacing. Where that is all that is between, the distance is the one to
+    /// the tangent plane of the point; beyond the border of the surface it is the one to the point.
+    fn distances_of(&self, places: &[[f32; 3]]) -> Samples {
+        let nearest = self.index.nearest_all(places, None);
+        let distance = |(place, found): (&[f32; 3], &Option<Neighbour>)| {
+            let Some(found) = found else { return f32::NAN };
+            let normal = self.points.normals.get(found.index as usize).copied().unwrap_or_default();
+            let offset = |k: usize| f64::from(place[k]) - f64::from(found.position[k]);
+            let along = (0..3).map(|k| offset(k) * f64::from(normal[k])).sum::<f64>().abs();
+            let aside = (found.distance_m.powi(2) - along.powi(2)).max(0.0).sqrt();
+            // Points that are evenly spread are at most about a spacing from any place between them.
+            (if aside <= self.spacing_m { along } else { found.distance_m }) as f32
+        };
+        let values = places.par_iter().zip(&nearest).map(distance).collect();
+        Samples { positions: places.to_vec(), values }
+    }
 }
 
 fn area_m2(mesh: &TriangleMesh) -> f64 {

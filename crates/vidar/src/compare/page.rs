@@ -15,8 +15,8 @@ use vidar_view::{
 
 /// The largest end of the colour scale of distances, m: beyond it surfaces show different things, not the same one differently.
 const MOST_DIFFERENCE: f32 = 0.5;
-/// The smallest, m: below it the spacing of points shows.
-const LEAST_DIFFERENCE: f32 = 0.02;
+/// The smallest, m: below it the noise of any depth shows.
+const LEAST_DIFFERENCE: f32 = 0.01;
 
 pub(super) fn html(runs: &[StoredRun], placed: &[Placed], distances: &[SurfaceDistance]) -> Result<String, Error> {
     let names: Vec<&str> = runs.iter().map(|r| r.name.as_str()).collect();

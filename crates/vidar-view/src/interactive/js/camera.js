@@ -21,13 +21,14 @@ function Camera(basis, bounds) {
 
 Camera.prototype.home = function () {
   this.mode = "orbit";
-  this.pivot = this.bounds.center.slice();
   // Along the shorter side, so that the longer one lies across the picture.
   const isWide = this.bounds.half[0] >= this.bounds.half[1];
   this.yaw = isWide ? 0.5 : 0.5 + Math.PI / 2;
   this.pitch = -0.75;
-  this.distance = this.wholeDistance();
   this.pose = null;
+  this.fit();
+  // Until the reader moves, the map goes on filling a window that changes.
+  this.isWhole = true;
   this.halfHeight = HALF_HEIGHT;
 };
 
@@ -35,11 +36,52 @@ Camera.prototype.fromAbove = function () {
   this.home();
   this.yaw = 0;
   this.pitch = -MOST_PITCH;
+  this.fit();
 };
 
-Camera.prototype.wholeDistance = function () {
-  const aspect = Math.min(1, this.aspect || 1.5);
-  return 1.02 * this.bounds.radius / (HALF_HEIGHT * aspect);
+// Corners of the map's box that are seen from the present direction, from its middle. Walls are looked through from outside, so
+// the upper corners on the near side show nothing.
+Camera.prototype.seenCorners = function () {
+  const b = this.basis;
+  const half = this.bounds.half;
+  const forward = this.forward();
+  const corners = [];
+  for (let i = 0; i < 8; i++) {
+    const sign = [i & 1 ? 1 : -1, i & 2 ? 1 : -1, i & 4 ? 1 : -1];
+    const flat = add(scaled(b.right, sign[0] * half[0]), scaled(b.away, sign[1] * half[1]));
+    const isNear = dot(flat, forward) < 0;
+    if (sign[2] < 0 || !isNear) corners.push(add(flat, scaled(b.up, sign[2] * half[2])));
+  }
+  return corners;
+};
+
+// Pivot and distance with which the map fills the picture.
+Camera.prototype.fit = function () {
+  const aspect = this.aspect || 1.5;
+  const forward = this.forward();
+  const right = unit(cross(forward, this.basis.up));
+  const up = cross(right, forward);
+  const corners = this.seenCorners();
+  let shift = [0, 0, 0];
+  // The middle of the picture depends on the distance and the distance on the middle; three rounds settle both to a percent.
+  for (let round = 0; round < 3; round++) {
+    const at = corners.map(function (c) {
+      const offset = subtract(c, shift);
+      return [dot(offset, right), dot(offset, up), dot(offset, forward)];
+    });
+    this.distance = Math.max.apply(null, at.map(function (c) {
+      return Math.max(Math.abs(c[0]) / aspect, Math.abs(c[1])) / HALF_HEIGHT - c[2];
+    }));
+    const d = this.distance;
+    const middle = [0, 1].map(function (k) {
+      const seen = at.map(function (c) { return c[k] / (d + c[2]); });
+      return d * (Math.min.apply(null, seen) + Math.max.apply(null, seen)) / 2;
+    });
+    shift = add(shift, add(scaled(right, middle[0]), scaled(up, middle[1])));
+  }
+  this.pivot = add(this.bounds.center, shift);
+  // A margin for frusta and names.
+  this.distance *= 1.08;
 };
 
 Camera.prototype.forward = function () {
@@ -67,9 +109,12 @@ Camera.prototype.frame = function () {
 
 // Matrices and lengths for a picture of width x height pixels.
 Camera.prototype.lens = function (width, height) {
-  const frame = this.frame();
   const aspect = width / height;
-  this.aspect = aspect;
+  if (aspect !== this.aspect) {
+    this.aspect = aspect;
+    if (this.isWhole) this.fit();
+  }
+  const frame = this.frame();
   const isParallel = this.isParallel && this.mode === "orbit";
   const reach = distance(frame.eye, this.bounds.center) + 2 * this.bounds.radius;
   const near = isParallel ? -reach : Math.max(this.bounds.radius / 2000, this.mode === "orbit" ? this.distance / 200 : 0);
@@ -162,6 +207,7 @@ Camera.prototype.look = function (frame, mode) {
   this.yaw = Math.atan2(dot(forward, this.basis.right), dot(forward, this.basis.away));
   this.mode = mode;
   this.pose = null;
+  this.isWhole = false;
   if (mode === "walk") {
     this.eye = frame.eye.slice();
     this.distance = 0.3 * this.bounds.radius;
@@ -171,6 +217,7 @@ Camera.prototype.look = function (frame, mode) {
 
 // A drag on the path goes on as walking from there.
 Camera.prototype.leavePath = function () {
+  this.isWhole = false;
   if (this.mode === "path") this.look(this.frame(), "walk");
 };
 
@@ -198,7 +245,8 @@ Camera.prototype.turnAbout = function (point) {
 };
 
 Camera.prototype.copy = function (other) {
-  ["mode", "yaw", "pitch", "distance", "isParallel", "halfHeight", "pose"].forEach(function (key) { this[key] = other[key]; }, this);
+  const same = ["mode", "yaw", "pitch", "distance", "isParallel", "isWhole", "halfHeight", "pose"];
+  same.forEach(function (key) { this[key] = other[key]; }, this);
   this.pivot = other.pivot.slice();
   this.eye = other.eye ? other.eye.slice() : other.eye;
 };
