@@ -5,6 +5,7 @@
 pub mod args;
 mod build;
 mod commands;
+pub mod compare_args;
 pub mod model_args;
 mod print;
 mod progress;

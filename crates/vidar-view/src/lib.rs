@@ -33,8 +33,8 @@ pub use chart::{BarGroup, BarPlot, Histogram, plot_bars, plot_histogram};
 pub use colormap::ColorMap;
 pub use error::ViewError;
 pub use interactive::{
-    DepthThumbnail, EncodedView, Field, FieldKind, FieldValues, InteractiveView, Pane, PanePath, PaneScale, PanesShown,
-    PathRole, PosedThumbnail, depth_thumbnail, encode_view,
+    DepthThumbnail, EncodedView, Field, FieldKind, FieldValues, InteractiveView, Pane, PanePath, PaneScale,
+    PanesShown, PathRole, PosedThumbnail, depth_thumbnail, encode_view,
 };
 pub use lines::{AxisSpec, LinePlot, Mark, ReferenceLine, Series, plot_lines};
 pub use map::camera::{BackFaces, Cut, MapCamera, Projection, Viewpoint, up_of_world};

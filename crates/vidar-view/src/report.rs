@@ -153,7 +153,8 @@ pub(crate) fn escaped(text: &str) -> String {
 }
 
 /// The page may load nothing, from anywhere: browsers enforce it.
-const POLICY: &str = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'";
+const POLICY: &str =
+    "default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'";
 
 /// Writing to a `String` cannot fail.
 macro_rules! put {

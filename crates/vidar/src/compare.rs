@@ -109,7 +109,9 @@ fn in_lines(
 ) -> Vec<(String, String)> {
     let mut lines: Vec<(String, String)> = runs.iter().map(|r| (r.name.clone(), r.verdict_line())).collect();
     lines.extend((1..runs.len()).map(|i| (format!("{} placed", runs[i].name), placed[i].words())));
-    lines.extend(distances.iter().map(|d| (format!("{} to {}", runs[d.run].name, runs[0].name), d.words(runs))));
+    lines.extend(
+        distances.iter().map(|d| (format!("{} to {}", runs[d.run].name, runs[0].name), d.words(runs))),
+    );
     lines.push(("look at it".into(), request.page.display().to_string()));
     lines
 }

@@ -20,6 +20,8 @@ const THUMBNAIL_COLUMNS: usize = 192;
 const JPEG_QUALITY: u8 = 72;
 /// Every n-th column and row of a depth image takes part in the standard deviation of the surface.
 const SIGMA_STRIDE: usize = 3;
+/// Keyframes that take part in it, spread evenly: on a long recording the samples of all would not fit into memory.
+const MOST_SIGMA_VIEWS: usize = 300;
 /// Images of a run are smaller.
 const MAX_IMAGE_BYTES: u64 = 64 << 20;
 /// Part of the samples below the end of a colour scale.
@@ -97,7 +99,8 @@ pub(crate) fn depth_std(
         let world_from_camera = pose_of(view)?;
         Some(samples_of(&depth, &steps, view, &world_from_camera, pane_from_world))
     };
-    let parts: Vec<Option<Samples>> = views.par_iter().map(of_view).collect();
+    let every = views.len().div_ceil(MOST_SIGMA_VIEWS).max(1);
+    let parts: Vec<Option<Samples>> = views.par_iter().step_by(every).map(of_view).collect();
     let mut all = Samples::default();
     for part in parts.into_iter().flatten() {
         all.positions.extend(part.positions);

@@ -29,7 +29,12 @@ fn runs_are_compared_on_one_page_and_a_run_equals_itself() {
     let (again, coarse, page) =
         (folder.path().join("again <b>"), folder.path().join("coarse"), folder.path().join("new/page.html"));
     copy_tree(&finished().0, &again);
-    run_on(&shared().sequence, &coarse, &["-q", "--set", "eval.mode=auto", "--set", "fusion.voxel_size_m=0.08"]).ends_with(0);
+    run_on(
+        &shared().sequence,
+        &coarse,
+        &["-q", "--set", "eval.mode=auto", "--set", "fusion.voxel_size_m=0.08"],
+    )
+    .ends_with(0);
     let runs = [text(&finished().0), text(&again), text(&coarse)];
     let args = [&["compare"], &runs[..], &["-o", text(&page), "--json"]].concat();
     let json = vidar(&args).ends_with(0).json();
@@ -50,7 +55,10 @@ fn runs_are_compared_on_one_page_and_a_run_equals_itself() {
     assert_eq!(std::fs::metadata(&page).unwrap().len(), json["bytes"].as_u64().unwrap());
     let data = data_of(&page);
     let panes = data["panes"].as_array().unwrap();
-    assert_eq!(panes.iter().map(|p| p["name"].as_str().unwrap()).collect::<Vec<_>>(), ["finished run", "again <b>", "coarse"]);
+    assert_eq!(
+        panes.iter().map(|p| p["name"].as_str().unwrap()).collect::<Vec<_>>(),
+        ["finished run", "again <b>", "coarse"]
+    );
     assert_eq!((&data["shown"], &data["coloring"]), (&"all".into(), &"difference".into()));
     for pane in panes {
         let at = pane["fields"].as_array().unwrap().iter().position(|f| f["id"] == "difference").unwrap();
@@ -89,12 +97,17 @@ fn the_report_of_a_run_holds_its_map_in_three_dimensions() {
     let panes = data["panes"].as_array().unwrap();
     assert_eq!(panes.iter().map(|p| p["name"].as_str().unwrap()).collect::<Vec<_>>(), ["map", "reference"]);
     let map = &panes[0];
-    assert!(map["mesh"]["triangles"].as_u64().unwrap() > 1000 && map["cloud"]["vertices"].as_u64().unwrap() > 1000);
+    assert!(
+        map["mesh"]["triangles"].as_u64().unwrap() > 1000
+            && map["cloud"]["vertices"].as_u64().unwrap() > 1000
+    );
     assert!(map["isMetric"] == true && map["scaleLogStd"].is_number(), "{}", map["scaleLogStd"]);
     assert!(field(map, "error")["reason"].is_null() && field(map, "confidence")["reason"].is_null());
     assert!(field(map, "sigma")["reason"].is_null(), "auto states it");
     let keyframes = map["keyframes"].as_array().unwrap();
-    assert!(keyframes.len() > 3 && keyframes.iter().all(|k| k["image"].is_string() && k["depth"].is_string()));
+    assert!(
+        keyframes.len() > 3 && keyframes.iter().all(|k| k["image"].is_string() && k["depth"].is_string())
+    );
     assert!(std::fs::metadata(&page).unwrap().len() < 8_000_000);
     assert!(panes[1]["cloud"]["normals"].is_string(), "points of the reference have no sides");
 }

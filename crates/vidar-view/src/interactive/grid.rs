@@ -121,8 +121,10 @@ fn normal_at(
         let shift = corner(&neighbour, side_m) - place;
         count += m.count;
         sum += m.sum + shift * m.count;
-        products +=
-            m.products + m.sum * shift.transpose() + shift * m.sum.transpose() + shift * shift.transpose() * m.count;
+        products += m.products
+            + m.sum * shift.transpose()
+            + shift * m.sum.transpose()
+            + shift * shift.transpose() * m.count;
     }
     // Three points always lie in a plane; a few more make it one that was measured.
     if count < 6.0 {

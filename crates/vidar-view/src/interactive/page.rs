@@ -48,7 +48,9 @@ impl Controls {
             for field in of_kind {
                 match &field.values {
                     FieldValues::Missing(why) => reason = reason.or(Some(why.clone())),
-                    FieldValues::Own | FieldValues::Samples { .. } => return Some((kind.id(), name(kind), None)),
+                    FieldValues::Own | FieldValues::Samples { .. } => {
+                        return Some((kind.id(), name(kind), None));
+                    }
                 }
             }
             Some((kind.id(), name(kind), Some(reason.unwrap_or_default())))
@@ -122,7 +124,11 @@ fn push_coloring(html: &mut String, c: &Controls) {
         let _ = match reason {
             None => writeln!(html, "<option value=\"{value}\"{selected}>{text}</option>"),
             Some(why) => {
-                writeln!(html, "<option value=\"{value}\" disabled>{text} (not available: {})</option>", escaped(why))
+                writeln!(
+                    html,
+                    "<option value=\"{value}\" disabled>{text} (not available: {})</option>",
+                    escaped(why)
+                )
             }
         };
     };

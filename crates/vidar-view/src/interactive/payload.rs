@@ -8,8 +8,8 @@ use super::grid::{SampleMeans, normals_towards, thinned};
 use super::page::Controls;
 use super::simplify::simplified;
 use super::{
-    EncodedView, Field, FieldKind, FieldValues, InteractiveView, MAX_PATH_POSES, MAX_POINTS, MAX_TRIANGLES, Pane,
-    PanePath, PaneScale, PanesShown, PathRole, PosedThumbnail,
+    EncodedView, Field, FieldKind, FieldValues, InteractiveView, MAX_PATH_POSES, MAX_POINTS, MAX_TRIANGLES,
+    Pane, PanePath, PaneScale, PanesShown, PathRole, PosedThumbnail,
 };
 use crate::ViewError;
 use crate::colormap::ColorMap;
@@ -26,11 +26,13 @@ const EYES: usize = 100;
 
 pub(super) fn encode(view: &InteractiveView<'_>) -> Result<EncodedView, ViewError> {
     view.panes.iter().try_for_each(check)?;
-    let share = |most: usize, has: fn(&Pane<'_>) -> bool| most / view.panes.iter().filter(|p| has(p)).count().max(1);
+    let share =
+        |most: usize, has: fn(&Pane<'_>) -> bool| most / view.panes.iter().filter(|p| has(p)).count().max(1);
     let limits = (share(MAX_TRIANGLES, |p| p.mesh.is_some()), share(MAX_POINTS, |p| p.cloud.is_some()));
     let eyes = eyes(view);
     let mut encoded = EncodedView::default();
-    let panes: Vec<Value> = view.panes.iter().map(|pane| self::pane(pane, limits, &eyes, &mut encoded)).collect();
+    let panes: Vec<Value> =
+        view.panes.iter().map(|pane| self::pane(pane, limits, &eyes, &mut encoded)).collect();
     let table = |map: ColorMap| bytes((0..=254).flat_map(|i| map.color(i as f32 / 254.0)));
     let value = json!({
         "schema": "vidar.interactive/1",
@@ -46,7 +48,8 @@ pub(super) fn encode(view: &InteractiveView<'_>) -> Result<EncodedView, ViewErro
 }
 
 fn check(pane: &Pane<'_>) -> Result<(), ViewError> {
-    let inconsistent = |surface, vertices, triangles| ViewError::InconsistentSurface { surface, vertices, triangles };
+    let inconsistent =
+        |surface, vertices, triangles| ViewError::InconsistentSurface { surface, vertices, triangles };
     if let Some(mesh) = pane.mesh.filter(|m| !m.is_consistent()) {
         return Err(inconsistent("mesh", mesh.positions.len(), mesh.triangles.len()));
     }
@@ -248,7 +251,8 @@ pub(super) fn index_bytes(triangles: &[[u32; 3]]) -> Vec<u8> {
 
 /// Lower corner and step of each axis, metres, and the steps.
 fn positions_json(positions: &[[f32; 3]]) -> Value {
-    let bound = |axis: usize, start: f32, f: fn(f32, f32) -> f32| positions.iter().map(|p| p[axis]).fold(start, f);
+    let bound =
+        |axis: usize, start: f32, f: fn(f32, f32) -> f32| positions.iter().map(|p| p[axis]).fold(start, f);
     let mut lower = [0.0; 3];
     let mut step = [1.0; 3];
     for axis in 0..3 {
@@ -259,7 +263,8 @@ fn positions_json(positions: &[[f32; 3]]) -> Value {
         lower[axis] = if low.is_finite() { f64::from(low) } else { 0.0 };
     }
     let steps = positions.iter().flat_map(|p| {
-        (0..3).flat_map(|axis| (((f64::from(p[axis]) - lower[axis]) / step[axis]).round() as u16).to_le_bytes())
+        (0..3)
+            .flat_map(|axis| (((f64::from(p[axis]) - lower[axis]) / step[axis]).round() as u16).to_le_bytes())
     });
     json!({ "lower": lower, "step": step, "steps": bytes(steps.collect::<Vec<_>>()) })
 }

@@ -248,7 +248,8 @@ mod tests {
                 for i in 0..n {
                     for j in 0..n {
                         let quad = [at(i, j), at(i + 1, j), at(i + 1, j + 1), at(i, j + 1)];
-                        let [a, b, c, d] = if side == 0.0 { quad } else { [quad[0], quad[3], quad[2], quad[1]] };
+                        let [a, b, c, d] =
+                            if side == 0.0 { quad } else { [quad[0], quad[3], quad[2], quad[1]] };
                         mesh.triangles.extend([[a, b, c], [a, c, d]]);
                     }
                 }
@@ -284,7 +285,8 @@ mod tests {
         fine.positions.iter_mut().for_each(|p| p[2] *= 0.001);
         let (small, _) = simplified(&fine, 1_500);
         let up = |sign: f64| {
-            let faces = small.triangles.iter().map(|t| cross(&small, t)).filter(|n| n.z * sign > n.norm() * 0.9);
+            let faces =
+                small.triangles.iter().map(|t| cross(&small, t)).filter(|n| n.z * sign > n.norm() * 0.9);
             faces.map(|n| n.norm() / 2.0).sum::<f64>()
         };
         assert!(up(1.0) > 0.85 && up(-1.0) > 0.85, "{} {}", up(1.0), up(-1.0));
@@ -294,7 +296,10 @@ mod tests {
     fn a_small_mesh_keeps_its_vertices_and_bad_ones_are_left_out() {
         let mut mesh = room(2);
         let (same, _) = simplified(&mesh, 1_000);
-        assert_eq!((same.positions.len(), same.triangles.len()), (mesh.positions.len(), mesh.triangles.len()));
+        assert_eq!(
+            (same.positions.len(), same.triangles.len()),
+            (mesh.positions.len(), mesh.triangles.len())
+        );
         mesh.positions[0] = [f32::NAN; 3];
         assert!(simplified(&mesh, 1_000).0.triangles.len() < mesh.triangles.len());
         assert!(simplified(&TriangleMesh::default(), 10).0.triangles.is_empty());

@@ -68,18 +68,23 @@ fn a_page_holds_all_that_it_needs_and_every_name_is_harmless() {
         label: evil.into(),
         values: FieldValues::Missing(format!("\"{evil}")),
     };
-    let html = page(&view(vec![pane(evil, &mesh, &path, vec![missing]), pane("b", &mesh, &path, Vec::new())]));
+    let html =
+        page(&view(vec![pane(evil, &mesh, &path, vec![missing]), pane("b", &mesh, &path, Vec::new())]));
     assert_eq!(html.matches("<script").count(), 2, "data and program");
     assert_eq!(html.matches("</script>").count(), 2);
     assert!(!html.contains("alert(1)</script>") && !html.contains('\u{2028}') && !html.contains("<!--"));
-    for foreign in ["http://", "https://", "//cdn", "@import", "url(", "<link", "<iframe", "import(", "fetch("] {
+    for foreign in
+        ["http://", "https://", "//cdn", "@import", "url(", "<link", "<iframe", "import(", "fetch("]
+    {
         assert!(!html.contains(foreign), "{foreign}");
     }
     assert!(html.contains("default-src 'none'"));
     let reason = data(&html)["panes"][0]["fields"][0]["reason"].as_str().unwrap().to_owned();
     assert!(reason.contains("</script>"), "{reason}");
     // What is not available is in the list with its reason, and cannot be chosen.
-    assert!(html.contains("<option value=\"error\" disabled>error: distance to the reference (not available: &quot;"));
+    assert!(html.contains(
+        "<option value=\"error\" disabled>error: distance to the reference (not available: &quot;"
+    ));
 }
 
 #[test]
@@ -91,7 +96,12 @@ fn a_report_without_a_view_has_no_script() {
 fn labels_and_roles_are_there_for_readers_that_do_not_see() {
     let (mesh, path) = (floor(4), flight());
     let html = page(&view(vec![pane("map", &mesh, &path, Vec::new())]));
-    for part in ["aria-live=\"polite\"", "role=\"application\"", "aria-label=\"The map in three dimensions\"", "<noscript>"] {
+    for part in [
+        "aria-live=\"polite\"",
+        "role=\"application\"",
+        "aria-label=\"The map in three dimensions\"",
+        "<noscript>",
+    ] {
         assert!(html.contains(part), "{part}");
     }
     // Every input lies in its label, or has one.
@@ -128,13 +138,15 @@ fn positions_are_right_to_a_step_of_their_box() {
     let data = data(&html);
     let packed = &data["panes"][0]["mesh"];
     use base64::Engine;
-    let steps =
-        base64::engine::general_purpose::STANDARD.decode(packed["positions"]["steps"].as_str().unwrap()).unwrap();
+    let steps = base64::engine::general_purpose::STANDARD
+        .decode(packed["positions"]["steps"].as_str().unwrap())
+        .unwrap();
     assert_eq!(packed["vertices"].as_u64().unwrap() as usize, mesh.positions.len());
     let number = |name: &str, axis: usize| packed["positions"][name][axis].as_f64().unwrap();
     let place = |v: usize, axis: usize| {
         let at = 6 * v + 2 * axis;
-        number("lower", axis) + number("step", axis) * f64::from(u16::from_le_bytes([steps[at], steps[at + 1]]))
+        number("lower", axis)
+            + number("step", axis) * f64::from(u16::from_le_bytes([steps[at], steps[at + 1]]))
     };
     // Vertices come in the order of use: those of the first triangle first.
     for (v, &i) in mesh.triangles[0].iter().enumerate() {
@@ -149,7 +161,11 @@ fn positions_are_right_to_a_step_of_their_box() {
 #[test]
 fn a_large_map_fits_its_share_of_a_page_and_the_same_map_gives_the_same_bytes() {
     let (mesh, path) = (floor(500), flight());
-    let cloud = PointCloud { positions: mesh.positions.clone(), colors: mesh.colors.clone(), ..PointCloud::default() };
+    let cloud = PointCloud {
+        positions: mesh.positions.clone(),
+        colors: mesh.colors.clone(),
+        ..PointCloud::default()
+    };
     let own = || Field { kind: FieldKind::Confidence, label: "confidence".into(), values: FieldValues::Own };
     let errors: Vec<f32> = mesh.positions.iter().map(|p| p[0] * 0.01).collect();
     let sampled = || Field {

@@ -16,14 +16,14 @@ pub struct DepthThumbnail {
     pub far_m: f32,
 }
 
-/// Every n-th pixel of a depth image, so that it is about `columns` wide.
+/// Every n-th pixel of a depth image, so that it is at most `columns` wide.
 ///
 /// # Errors
 /// [`ViewError::BadSize`] for an image without pixels, [`ViewError::Png`].
 pub fn depth_thumbnail(depth: &Image<f32>, columns: usize) -> Result<DepthThumbnail, ViewError> {
     let valid = |z: f32| z.is_finite() && z > 0.0;
     let (near, far) = robust_range(depth, valid);
-    let every = (depth.width() / columns.max(1)).max(1);
+    let every = depth.width().div_ceil(columns.max(1)).max(1);
     let (width, height) = (depth.width() / every, depth.height() / every);
     if width == 0 || height == 0 {
         return Err(ViewError::BadSize { width, height, max: 65_535 });

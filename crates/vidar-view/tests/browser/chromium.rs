@@ -39,12 +39,15 @@ impl Drop for Page {
 pub fn browser() -> Option<String> {
     let named = std::env::var(VARIABLE).ok();
     let runs = |name: &String| {
-        let version = Command::new(name).arg("--version").stdout(Stdio::null()).stderr(Stdio::null()).status();
+        let version =
+            Command::new(name).arg("--version").stdout(Stdio::null()).stderr(Stdio::null()).status();
         version.is_ok_and(|s| s.success())
     };
     let found = named.into_iter().chain(NAMES.map(str::to_owned)).find(runs);
     if found.is_none() {
-        eprintln!("skipped: there is no Chromium (Debian: chromium; or name one in {VARIABLE}): the view was not drawn");
+        eprintln!(
+            "skipped: there is no Chromium (Debian: chromium; or name one in {VARIABLE}): the view was not drawn"
+        );
     }
     found
 }
@@ -98,7 +101,8 @@ impl Page {
             _profile: profile,
         };
         let target = page.call("Target.createTarget", json!({ "url": "about:blank" }));
-        let attached = page.call("Target.attachToTarget", json!({ "targetId": target["targetId"], "flatten": true }));
+        let attached =
+            page.call("Target.attachToTarget", json!({ "targetId": target["targetId"], "flatten": true }));
         page.session = attached["sessionId"].as_str().unwrap().to_owned();
         for domain in ["Page", "Runtime", "Network"] {
             page.call(&format!("{domain}.enable"), json!({}));
@@ -185,7 +189,12 @@ impl Page {
         self.mouse("mousePressed", from, 1, 0);
         for i in 1..=5 {
             let share = f64::from(i) / 5.0;
-            self.mouse("mouseMoved", (from.0 + share * (to.0 - from.0), from.1 + share * (to.1 - from.1)), 1, 0);
+            self.mouse(
+                "mouseMoved",
+                (from.0 + share * (to.0 - from.0), from.1 + share * (to.1 - from.1)),
+                1,
+                0,
+            );
         }
         self.mouse("mouseReleased", to, 0, 0);
     }

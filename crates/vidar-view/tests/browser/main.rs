@@ -73,7 +73,11 @@ fn it_draws_turns_and_changes_colours() {
     assert!(!seen.contains(&both["hash"]) && number(&both["share"]) > 0.1, "{both}");
     assert_eq!(page.value("vidarView.state().shown"), serde_json::json!([true, true]));
     assert_eq!(page.errors, Vec::<String>::new());
-    assert!(page.requests.iter().all(|r| r.starts_with("file:") || r.starts_with("data:")), "{:?}", page.requests);
+    assert!(
+        page.requests.iter().all(|r| r.starts_with("file:") || r.starts_with("data:")),
+        "{:?}",
+        page.requests
+    );
 }
 
 #[test]
@@ -99,7 +103,10 @@ fn it_measures_known_distances() {
     // The scale is known to 1.2 %, and so is every length.
     let text = found["text"].as_str().unwrap();
     assert!(text.contains("2.236 m ± 0.027 m") && text.contains("1.2 %"), "{text}");
-    assert_eq!(page.value("document.getElementById('view-status').textContent"), format!("Distance: {text}."));
+    assert_eq!(
+        page.value("document.getElementById('view-status').textContent"),
+        format!("Distance: {text}.")
+    );
 
     // Without it the surface itself: right to a pixel, and on the floor to a step.
     for point in [a, b] {
@@ -155,7 +162,10 @@ fn keyframes_show_their_pictures_and_can_be_looked_from() {
         page.until(&format!("document.getElementById('view-keyframe-{picture}').naturalWidth > 50"));
     }
     let words = page.value("document.getElementById('view-keyframe').textContent");
-    assert!(words.as_str().unwrap().contains("Keyframe") && words.as_str().unwrap().contains(" m (bright)"), "{words}");
+    assert!(
+        words.as_str().unwrap().contains("Keyframe") && words.as_str().unwrap().contains(" m bright, "),
+        "{words}"
+    );
 
     page.click(at, 0);
     let state = page.value("vidarView.state()");
@@ -198,7 +208,7 @@ fn pictures_of_a_page() {
     let file = PathBuf::from(std::env::var("VIDAR_PAGE").unwrap()).canonicalize().unwrap();
     let folder = PathBuf::from(std::env::var("VIDAR_SHOTS").unwrap());
     let mut page = Page::open(&browser, &file, "", (1100, 860));
-    let mut shot = |page: &mut Page, name: &str, script: &str| {
+    let shot = |page: &mut Page, name: &str, script: &str| {
         page.value(script);
         page.value("document.getElementById('view').scrollIntoView()");
         page.value("new Promise(f => requestAnimationFrame(() => requestAnimationFrame(() => f(1))))");
@@ -206,10 +216,12 @@ fn pictures_of_a_page() {
     };
     let choose = "const s = document.getElementById('view-coloring'); s.selectedIndex = [...s.options].findIndex(o => !o.disabled && o.value === ";
     let change = "); s.dispatchEvent(new Event('change'));";
+    let both = "const p = document.getElementById('view-pane-1'); if (p && !p.checked) p.click();";
     shot(&mut page, "start", "1");
-    println!("{}", page.value("vidarView.state()"));
+    let state = page.value("vidarView.state()");
+    println!("{} triangles, {} points", state["triangles"], state["points"]);
     println!("{} ms a frame", page.value("vidarView.frameTime(20)"));
-    page.key("Home");
+    page.value("document.getElementById('view-home').click()");
     for coloring in ["height", "confidence", "error", "sigma", "difference"] {
         let has = page.value(&format!(
             "[...document.getElementById('view-coloring').options].some(o => !o.disabled && o.value === '{coloring}')"
@@ -218,12 +230,16 @@ fn pictures_of_a_page() {
             shot(&mut page, coloring, &format!("{{ {choose}'{coloring}'{change} }}"));
         }
     }
-    shot(&mut page, "beside", &format!("{{ {choose}'color'{change} document.getElementById('view-pane-1')?.click(); }}"));
+    shot(&mut page, "beside", &format!("{{ {choose}'color'{change} {both} }}"));
     shot(&mut page, "flight", "document.querySelector('input[name=view-camera][value=path]').click()");
-    page.call("Emulation.setEmulatedMedia", serde_json::json!({ "features": [{ "name": "prefers-color-scheme", "value": "dark" }] }));
+    page.call(
+        "Emulation.setEmulatedMedia",
+        serde_json::json!({ "features": [{ "name": "prefers-color-scheme", "value": "dark" }] }),
+    );
     shot(&mut page, "dark", "document.getElementById('view-home').click()");
     if page.value("vidarView.state().keyframes.length > 0") == true {
-        let keyframe = page.value("vidarView.state().keyframes[5 % vidarView.state().keyframes.length].position");
+        let keyframe =
+            page.value("vidarView.state().keyframes[5 % vidarView.state().keyframes.length].position");
         page.value("document.getElementById('view').scrollIntoView()");
         let at = page.value(&format!(
             "(() => {{ const p = vidarView.project({keyframe}); const b = document.getElementById('view-canvas').getBoundingClientRect();
@@ -232,5 +248,18 @@ fn pictures_of_a_page() {
         page.mouse("mouseMoved", (number(&at[0]), number(&at[1])), 0, 0);
         std::fs::write(folder.join("hover.png"), page.screenshot()).unwrap();
     }
-    println!("errors: {:?}", page.errors);
+    page.call("Emulation.setEmulatedMedia", serde_json::json!({ "features": [] }));
+    // A measurement across the first pane.
+    page.value("document.getElementById('view-home').click()");
+    page.value("document.getElementById('view-measure').click()");
+    page.value("document.getElementById('view').scrollIntoView()");
+    let size = page.value(
+        "(() => { const b = document.getElementById('view-canvas').getBoundingClientRect(); return [b.left, b.top, b.width, b.height]; })()",
+    );
+    let at =
+        |x: f64, y: f64| (number(&size[0]) + x * number(&size[2]), number(&size[1]) + y * number(&size[3]));
+    page.click(at(0.4, 0.25), 0);
+    page.click(at(0.62, 0.25), 0);
+    std::fs::write(folder.join("measure.png"), page.screenshot()).unwrap();
+    println!("{}, errors: {:?}", page.value("vidarView.measurement()"), page.errors);
 }

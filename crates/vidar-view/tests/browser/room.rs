@@ -2,7 +2,8 @@
 
 use nalgebra::{Matrix3, Vector3};
 use vidar_core::{
-    BodyFrame, CameraId, Image, Pinhole, PointCloud, Se3, So3, StampedPose, Timestamp, Trajectory, TriangleMesh,
+    BodyFrame, CameraId, Image, Pinhole, PointCloud, Se3, So3, StampedPose, Timestamp, Trajectory,
+    TriangleMesh,
 };
 use vidar_view::{
     Field, FieldKind, FieldValues, Figure, InteractiveView, Pane, PanePath, PaneScale, PanesShown, PathRole,

@@ -61,7 +61,9 @@ pub(super) fn summary(samples: &Samples) -> Summary {
     let mut finite: Vec<f32> = samples.values.iter().copied().filter(|v| v.is_finite()).collect();
     finite.sort_unstable_by(f32::total_cmp);
     let n = finite.len();
-    let at = |share: f64| finite.get(((n as f64 * share) as usize).min(n.saturating_sub(1))).copied().unwrap_or(f32::NAN);
+    let at = |share: f64| {
+        finite.get(((n as f64 * share) as usize).min(n.saturating_sub(1))).copied().unwrap_or(f32::NAN)
+    };
     let of_all = |sum: f64| sum / n.max(1) as f64;
     Summary {
         median: f64::from(at(0.5)),

@@ -50,7 +50,8 @@ impl StoredRun {
         let not_a_run = |reason: String| Error::NotARun { path: folder.to_owned(), reason };
         let manifest: Manifest = read_json(folder, "manifest.json")?;
         if manifest.schema != MANIFEST_SCHEMA {
-            let found = format!("manifest.json has schema {:?}, expected {MANIFEST_SCHEMA:?}", manifest.schema);
+            let found =
+                format!("manifest.json has schema {:?}, expected {MANIFEST_SCHEMA:?}", manifest.schema);
             return Err(not_a_run(found));
         }
         let path = folder.join("map/mesh.ply");
@@ -108,7 +109,8 @@ pub(super) fn names(folders: &[PathBuf]) -> Vec<String> {
     let differ = |names: &[String]| names.iter().collect::<BTreeSet<_>>().len() == names.len();
     let found = (1..=longest).map(ends).find(|names| differ(names));
     // The same folder twice, which is no mistake: its distance to itself is zero.
-    found.unwrap_or_else(|| ends(1).into_iter().enumerate().map(|(i, n)| format!("{n} ({})", i + 1)).collect())
+    found
+        .unwrap_or_else(|| ends(1).into_iter().enumerate().map(|(i, n)| format!("{n} ({})", i + 1)).collect())
 }
 
 /// TOML as `section.key` and value; what cannot be read has no settings.

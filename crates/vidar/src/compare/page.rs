@@ -9,8 +9,8 @@ use serde_json::Value;
 use std::collections::BTreeSet;
 use vidar_core::Trajectory;
 use vidar_view::{
-    EncodedView, Field, FieldKind, FieldValues, InteractiveView, Pane, PanePath, PanesShown, PathRole, Report, Section,
-    Table,
+    EncodedView, Field, FieldKind, FieldValues, InteractiveView, Pane, PanePath, PanesShown, PathRole,
+    Report, Section, Table,
 };
 
 /// The largest end of the colour scale of distances, m: beyond it surfaces show different things, not the same one differently.
@@ -18,7 +18,11 @@ const MOST_DIFFERENCE: f32 = 0.5;
 /// The smallest, m: below it the noise of any depth shows.
 const LEAST_DIFFERENCE: f32 = 0.01;
 
-pub(super) fn html(runs: &[StoredRun], placed: &[Placed], distances: &[SurfaceDistance]) -> Result<String, Error> {
+pub(super) fn html(
+    runs: &[StoredRun],
+    placed: &[Placed],
+    distances: &[SurfaceDistance],
+) -> Result<String, Error> {
     let names: Vec<&str> = runs.iter().map(|r| r.name.as_str()).collect();
     let report = Report {
         title: format!("VIDAR: {}", names.join(" and ")),
@@ -109,7 +113,9 @@ fn difference<'a>(
 /// One colour scale for all panes, else colours could not be compared.
 fn difference_range(distances: &[SurfaceDistance]) -> (f32, f32) {
     let ends = distances.iter().flat_map(|d| [&d.to_first, &d.from_first]);
-    let high = ends.map(|s| interactive::scale_range(&s.values, LEAST_DIFFERENCE).1).fold(LEAST_DIFFERENCE, f32::max);
+    let high = ends
+        .map(|s| interactive::scale_range(&s.values, LEAST_DIFFERENCE).1)
+        .fold(LEAST_DIFFERENCE, f32::max);
     (0.0, high.min(MOST_DIFFERENCE))
 }
 
@@ -119,7 +125,9 @@ fn numbers(runs: &[StoredRun]) -> Section {
         rows.push(std::iter::once(name.to_owned()).chain(runs.iter().map(value)).collect());
     };
     let text = |value: &Value| value.as_str().map_or_else(|| value.to_string(), str::to_owned);
-    let count = |run: &StoredRun, key: &str| run.manifest.result[key].as_u64().map_or("–".into(), |n| n.to_string());
+    let count = |run: &StoredRun, key: &str| {
+        run.manifest.result[key].as_u64().map_or("–".into(), |n| n.to_string())
+    };
     row("verdict", &|r| r.metrics.verdict["level"].as_str().unwrap_or("–").to_owned());
     row("scale", &|r| r.metrics.scale.words.clone());
     let scores: BTreeSet<&String> = runs.iter().flat_map(|r| r.metrics.scores.keys()).collect();
@@ -144,7 +152,11 @@ fn numbers(runs: &[StoredRun]) -> Section {
     row("started", &|r| r.manifest.started.clone());
     Section {
         heading: "Numbers".into(),
-        tables: vec![Table { caption: "Scores and figures of each run".into(), columns: columns("What", runs), rows }],
+        tables: vec![Table {
+            caption: "Scores and figures of each run".into(),
+            columns: columns("What", runs),
+            rows,
+        }],
         ..Section::default()
     }
 }

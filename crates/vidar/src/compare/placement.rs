@@ -66,8 +66,7 @@ pub(super) fn place(runs: &mut [StoredRun]) -> Result<Vec<Placed>, Error> {
 }
 
 fn placement(first: &StoredRun, run: &StoredRun) -> Result<Placed, Error> {
-    let as_it_is =
-        |reason: String| Placed { first_from_run: Sim3::IDENTITY, how: How::AsItIs(reason) };
+    let as_it_is = |reason: String| Placed { first_from_run: Sim3::IDENTITY, how: How::AsItIs(reason) };
     let truth = keyframe_poses(first, &Sim3::IDENTITY)?;
     let estimate = keyframe_poses(run, &Sim3::IDENTITY)?;
     let report = match vidar_eval::evaluate_trajectory(&estimate, &truth, &TrajectoryEvalConfig::default()) {
@@ -76,7 +75,8 @@ fn placement(first: &StoredRun, run: &StoredRun) -> Result<Placed, Error> {
     };
     // A rigid fit shows a difference of scale; where one of the scales is arbitrary there is nothing to show.
     let is_scaled = !(first.metrics.scale.is_metric && run.metrics.scale.is_metric);
-    Ok(of_report(&report, is_scaled).unwrap_or_else(|| as_it_is("the motion does not determine a fit".into())))
+    Ok(of_report(&report, is_scaled)
+        .unwrap_or_else(|| as_it_is("the motion does not determine a fit".into())))
 }
 
 fn of_report(report: &TrajectoryReport, is_scaled: bool) -> Option<Placed> {

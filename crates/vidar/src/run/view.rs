@@ -8,7 +8,8 @@ use crate::run_folder::RunFolder;
 use vidar_core::{PointCloud, Se3, Sim3, Trajectory};
 use vidar_dataset::Dataset;
 use vidar_view::{
-    EncodedView, Field, FieldKind, FieldValues, InteractiveView, Pane, PanePath, PaneScale, PanesShown, PathRole,
+    EncodedView, Field, FieldKind, FieldValues, InteractiveView, Pane, PanePath, PaneScale, PanesShown,
+    PathRole,
 };
 
 /// Distances to the reference at the ends of the colour scale, as in the pictures, m.
@@ -74,8 +75,10 @@ fn paths<'a>(
 ) -> Vec<PanePath<'a>> {
     // Where chunks are chained, the metric trajectory lies elsewhere than the map.
     let own = if outcome.plan.mode.chains() { keyframes } else { metric.or(keyframes) };
-    let own = own.map(|trajectory| PanePath { name: "trajectory".into(), role: PathRole::Estimate, trajectory });
-    let truth = truth.map(|trajectory| PanePath { name: "ground truth".into(), role: PathRole::Truth, trajectory });
+    let own =
+        own.map(|trajectory| PanePath { name: "trajectory".into(), role: PathRole::Estimate, trajectory });
+    let truth =
+        truth.map(|trajectory| PanePath { name: "ground truth".into(), role: PathRole::Truth, trajectory });
     own.into_iter().chain(truth).collect()
 }
 

@@ -11,7 +11,7 @@ function basisOf(up) {
   return { right: unit(cross(away, up)), away: away, up: up };
 }
 
-// bounds: center, radius and half extents of the map, along right, away and up.
+// bounds: center, radius, half extents along right, away and up, and some places of the map with normals.
 function Camera(basis, bounds) {
   this.basis = basis;
   this.bounds = bounds;
@@ -39,49 +39,40 @@ Camera.prototype.fromAbove = function () {
   this.fit();
 };
 
-// Corners of the map's box that are seen from the present direction, from its middle. Walls are looked through from outside, so
-// the upper corners on the near side show nothing.
-Camera.prototype.seenCorners = function () {
-  const b = this.basis;
-  const half = this.bounds.half;
-  const forward = this.forward();
-  const corners = [];
-  for (let i = 0; i < 8; i++) {
-    const sign = [i & 1 ? 1 : -1, i & 2 ? 1 : -1, i & 4 ? 1 : -1];
-    const flat = add(scaled(b.right, sign[0] * half[0]), scaled(b.away, sign[1] * half[1]));
-    const isNear = dot(flat, forward) < 0;
-    if (sign[2] < 0 || !isNear) corners.push(add(flat, scaled(b.up, sign[2] * half[2])));
-  }
-  return corners;
-};
-
-// Pivot and distance with which the map fills the picture.
+// Pivot and distance with which the map fills the picture: what faces the camera, but for the outermost half percent.
 Camera.prototype.fit = function () {
   const aspect = this.aspect || 1.5;
   const forward = this.forward();
   const right = unit(cross(forward, this.basis.up));
   const up = cross(right, forward);
-  const corners = this.seenCorners();
-  let shift = [0, 0, 0];
-  // The middle of the picture depends on the distance and the distance on the middle; three rounds settle both to a percent.
-  for (let round = 0; round < 3; round++) {
-    const at = corners.map(function (c) {
-      const offset = subtract(c, shift);
-      return [dot(offset, right), dot(offset, up), dot(offset, forward)];
-    });
-    this.distance = Math.max.apply(null, at.map(function (c) {
-      return Math.max(Math.abs(c[0]) / aspect, Math.abs(c[1])) / HALF_HEIGHT - c[2];
-    }));
+  const center = this.bounds.center;
+  const seen = this.bounds.samples.filter(function (s) { return !s.normal || dot(s.normal, forward) < 0; });
+  const offsets = (seen.length ? seen : this.bounds.samples).map(function (s) {
+    const offset = subtract(s.place, center);
+    return [dot(offset, right), dot(offset, up), dot(offset, forward)];
+  });
+  const ends = function (values) {
+    values.sort(function (a, b) { return a - b; });
+    const trim = Math.floor(values.length / 200);
+    return [values[trim], values[values.length - 1 - trim]];
+  };
+  let shift = [0, 0];
+  this.distance = this.bounds.radius;
+  // The middle of the picture depends on the distance and the distance on the middle; four rounds settle both to a percent.
+  for (let round = 0; round < 4; round++) {
+    this.distance = Math.max(ends(offsets.map(function (o) {
+      const across = Math.max(Math.abs(o[0] - shift[0]) / aspect, Math.abs(o[1] - shift[1]));
+      return across / HALF_HEIGHT - o[2];
+    }))[1], 0.1 * this.bounds.radius);
     const d = this.distance;
-    const middle = [0, 1].map(function (k) {
-      const seen = at.map(function (c) { return c[k] / (d + c[2]); });
-      return d * (Math.min.apply(null, seen) + Math.max.apply(null, seen)) / 2;
+    [0, 1].forEach(function (k) {
+      const e = ends(offsets.map(function (o) { return (o[k] - shift[k]) / Math.max(d + o[2], 0.1 * d); }));
+      shift[k] += d * (e[0] + e[1]) / 2;
     });
-    shift = add(shift, add(scaled(right, middle[0]), scaled(up, middle[1])));
   }
-  this.pivot = add(this.bounds.center, shift);
-  // A margin for frusta and names.
-  this.distance *= 1.08;
+  this.pivot = add(center, add(scaled(right, shift[0]), scaled(up, shift[1])));
+  // A margin for names and scales.
+  this.distance *= 1.1;
 };
 
 Camera.prototype.forward = function () {

@@ -81,7 +81,7 @@ Controls.prototype.bindShow = function () {
       pane.isShown = e.target.checked;
       // One pane stays.
       if (view.shownPanes().length === 0) { pane.isShown = true; e.target.checked = true; }
-      view.request();
+      view.moved(this.camera());
     });
   }, this);
 };
@@ -206,7 +206,7 @@ Controls.prototype.showKeyframe = function (keyframe, place) {
   picture("keyframe-depth", "png", keyframe.depth);
   const range = keyframe.depthRange;
   const length = function (v) { return shortLength(v, place.pane.isMetric); };
-  this.byId("keyframe-depth-range").textContent = range ? "depth " + length(range[0]) + " (bright) to " + length(range[1]) + " (dark)" : "no depth";
+  this.byId("keyframe-depth-range").textContent = range ? length(range[0]) + " bright, " + length(range[1]) + " dark" : "no depth";
   // Beside the pointer, on the side where there is more room.
   const view = this.view.canvas;
   const isLeft = place.canvasX > view.clientWidth / 2;

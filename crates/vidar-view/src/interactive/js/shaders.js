@@ -23,7 +23,7 @@ void main() {
   float lit = mix(1.0, 1.0 - light * (1.0 - abs(facing)), hasNormal);
   shade = color * lit;
   height = dot(up, position);
-  gl_PointSize = clamp(pointPixels / max(mix(place.w, 1.0, isParallel), 1e-6), 1.5, 24.0);
+  gl_PointSize = clamp(pointPixels / max(mix(place.w, 1.0, isParallel), 1e-6), 1.5, 64.0);
   if (cullsPoints * hasNormal > 0.5 && facing < 0.0) place = vec4(0.0, 0.0, 2.0, 1.0);
   gl_Position = place;
 }`;

@@ -86,7 +86,9 @@ function handleOf(view, controls) {
       const pixel = new Uint8Array(4);
       const begin = performance.now();
       for (let k = 0; k < count; k++) {
-        view.shownPanes()[0].camera.turn(2, 0, 600);
+        const camera = view.shownPanes()[0].camera;
+        camera.turn(2, 0, 600);
+        view.moved(camera);
         view.draw();
         view.gl.readPixels(0, 0, 1, 1, view.gl.RGBA, view.gl.UNSIGNED_BYTE, pixel);
       }

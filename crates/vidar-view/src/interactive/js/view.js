@@ -25,8 +25,8 @@ function View(canvas, overlay, gl, data) {
   this.bounds = boundsOf(this.panes, basis);
   this.heights = this.bounds.heights;
   this.cut = 1e30;
-  // A frustum as long as a hand on a table: visible in a room, not in the way.
-  this.reach = 0.035 * this.bounds.radius;
+  // Long enough to be pointed at, short enough not to hide the room.
+  this.reach = 0.022 * this.bounds.radius;
   this.panes.forEach(function (pane, i) {
     pane.isShown = data.shown === "all" || i === 0;
     pane.camera = new Camera(basis, this.bounds);
@@ -37,10 +37,13 @@ function View(canvas, overlay, gl, data) {
   recolor(this);
 }
 
-// Middle, half extents along right, away and up, and radius of what the panes show, without the outermost percent.
+// Middle, half extents along right, away and up, and radius of what the panes show, without the outermost percent; and some of its
+// places.
 function boundsOf(panes, basis) {
   const MOST_SAMPLES = 20000;
+  const MOST_PLACES = 3000;
   const along = [[], [], []];
+  const samples = [];
   panes.forEach(function (pane) {
     const surface = pane.mesh || pane.cloud;
     const paths = pane.paths.flatMap(function (p) { return p.poses.map(function (q) { return q.position; }); });
@@ -48,6 +51,12 @@ function boundsOf(panes, basis) {
     const every = Math.max(1, Math.floor(count / MOST_SAMPLES));
     const places = count ? [] : paths;
     for (let i = 0; i < count; i += every) places.push(pointOf(surface, i));
+    const everyPlace = Math.max(1, Math.floor(count / MOST_PLACES));
+    for (let i = 0; i < count; i += everyPlace) {
+      const n = [0, 1, 2].map(function (k) { return surface.normals[4 * i + k]; });
+      samples.push({ place: pointOf(surface, i), normal: surface.hasNormals ? n : null });
+    }
+    if (count === 0) paths.forEach(function (p) { samples.push({ place: p, normal: null }); });
     places.forEach(function (p) {
       [basis.right, basis.away, basis.up].forEach(function (axis, k) { along[k].push(dot(p, axis)); });
     });
@@ -62,7 +71,8 @@ function boundsOf(panes, basis) {
   const center = [basis.right, basis.away, basis.up].reduce(function (sum, axis, k) {
     return add(sum, scaled(axis, middle[k]));
   }, [0, 0, 0]);
-  return { center: center, half: half, radius: length(half), heights: ends[2] };
+  if (samples.length === 0) samples.push({ place: center, normal: null });
+  return { center: center, half: half, radius: length(half), heights: ends[2], samples: samples };
 }
 
 // Colours of the page, which follow the reader's light or dark.
@@ -160,11 +170,11 @@ View.prototype.draw = function () {
 };
 
 View.prototype.drawLines = function (pane, lens) {
-  const isFlight = pane.camera.mode === "path";
+  // Lines that run through the eye would fill the picture.
+  if (pane.camera.mode === "path") return;
   if (this.show.truth) drawLines(this, lens, pane.lines.truth, 2, 0.35);
-  // The path that is flown along would fill the picture.
-  if (this.show.estimate && !isFlight) drawLines(this, lens, pane.lines.estimate, 2.5, 0.35);
-  if (!this.show.keyframes || isFlight) return;
+  if (this.show.estimate) drawLines(this, lens, pane.lines.estimate, 2.5, 0.35);
+  if (!this.show.keyframes) return;
   drawLines(this, lens, pane.lines.keyframes, 1.3, 0.12);
   if (this.hovered && pane.keyframes.indexOf(this.hovered) >= 0) {
     const ribbons = ribbonsOf(this.gl, frustumSegments(this.hovered, this.reach, this.colors.hovered));
