@@ -28,23 +28,41 @@ pub(super) fn simplified(mesh: &TriangleMesh, most: usize) -> (TriangleMesh, f64
     }
     // Two triangles per cell that the surface crosses, and an oblique surface crosses half as many again.
     let mut side = (3.0 * area / most.max(1) as f64).sqrt().max(1e-6);
-    let mut best: Option<(Vec<u32>, usize, Vec<[u32; 3]>, f64)> = None;
+    let mut best: Option<Clustering> = None;
     for _ in 0..ATTEMPTS {
-        let (cluster_of, clusters) = clustered(mesh, &normals, side);
-        let kept = merged(&triangles, &cluster_of);
-        let share = kept.len() as f64 / most.max(1) as f64;
-        if share <= 1.0 && best.as_ref().is_none_or(|b| kept.len() > b.2.len()) {
-            best = Some((cluster_of, clusters, kept, side));
+        let clustering = Clustering::new(mesh, &normals, &triangles, side);
+        let count = clustering.triangles.len();
+        let share = count as f64 / most.max(1) as f64;
+        if share <= 1.0 && best.as_ref().is_none_or(|b| count > b.triangles.len()) {
+            best = Some(clustering);
         }
         if (NEAR_ENOUGH..=1.0).contains(&share) {
             break;
         }
         side *= (share / 0.93).sqrt().clamp(0.1, 10.0);
     }
-    let Some((cluster_of, clusters, kept, side)) = best else {
-        return (TriangleMesh::default(), side);
-    };
-    (placed(mesh, &normals, &triangles, &cluster_of, clusters, kept, side), side)
+    let Some(best) = best else { return (TriangleMesh::default(), side) };
+    let side = best.side_m;
+    (placed(mesh, &normals, &triangles, best), side)
+}
+
+/// Vertices grouped by cells of a grid.
+struct Clustering {
+    /// The cluster of each vertex.
+    cluster_of: Vec<u32>,
+    /// Number of clusters.
+    clusters: usize,
+    /// Triangles between clusters.
+    triangles: Vec<[u32; 3]>,
+    side_m: f64,
+}
+
+impl Clustering {
+    fn new(mesh: &TriangleMesh, normals: &[[f32; 3]], triangles: &[[u32; 3]], side_m: f64) -> Self {
+        let (cluster_of, clusters) = clustered(mesh, normals, side_m);
+        let triangles = merged(triangles, &cluster_of);
+        Self { cluster_of, clusters, triangles, side_m }
+    }
 }
 
 /// The cluster of each vertex, numbered in the order of the vertices, and their number.
@@ -95,16 +113,14 @@ struct Cluster {
     offsets: Vector3<f64>,
 }
 
-#[allow(clippy::too_many_arguments)] // one call; a struct for it would only repeat the names
+/// The vertices of clusters, with the means of their attributes.
 fn placed(
     mesh: &TriangleMesh,
     normals: &[[f32; 3]],
     triangles: &[[u32; 3]],
-    cluster_of: &[u32],
-    clusters: usize,
-    kept: Vec<[u32; 3]>,
-    side_m: f64,
+    clustering: Clustering,
 ) -> TriangleMesh {
+    let Clustering { cluster_of, clusters, triangles: kept, side_m } = clustering;
     let empty = Cluster {
         count: 0.0,
         position: Vector3::zeros(),
