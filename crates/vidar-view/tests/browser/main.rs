@@ -25,7 +25,9 @@ fn written(folder: &tempfile::TempDir, is_metric: bool) -> PathBuf {
 
 /// The place on the page of a point of the world.
 fn place_of(page: &mut Page, point: [f64; 3]) -> (f64, f64) {
-    page.value("document.getElementById('view-canvas').scrollIntoView({block: 'center'})");
+    page.value(
+        "document.getElementById('view-canvas').scrollIntoView({block: 'center', behavior: 'instant'})",
+    );
     let at = page.value(&format!(
         "(() => {{ const p = vidarView.project({point:?}); const b = document.getElementById('view-canvas').getBoundingClientRect();
         return [p.x + b.left, p.y + b.top]; }})()"
@@ -210,7 +212,7 @@ fn pictures_of_a_page() {
     let mut page = Page::open(&browser, &file, "", (1100, 860));
     let shot = |page: &mut Page, name: &str, script: &str| {
         page.value(script);
-        page.value("document.getElementById('view').scrollIntoView()");
+        page.value("document.getElementById('view').scrollIntoView({behavior: 'instant'})");
         page.value("new Promise(f => requestAnimationFrame(() => requestAnimationFrame(() => f(1))))");
         std::fs::write(folder.join(format!("{name}.png")), page.screenshot()).unwrap();
     };
@@ -240,7 +242,7 @@ fn pictures_of_a_page() {
     if page.value("vidarView.state().keyframes.length > 0") == true {
         let keyframe =
             page.value("vidarView.state().keyframes[5 % vidarView.state().keyframes.length].position");
-        page.value("document.getElementById('view').scrollIntoView()");
+        page.value("document.getElementById('view').scrollIntoView({behavior: 'instant'})");
         let at = page.value(&format!(
             "(() => {{ const p = vidarView.project({keyframe}); const b = document.getElementById('view-canvas').getBoundingClientRect();
             return [p.x + b.left, p.y + b.top]; }})()"
@@ -252,7 +254,7 @@ fn pictures_of_a_page() {
     // A measurement across the first pane.
     page.value("document.getElementById('view-home').click()");
     page.value("document.getElementById('view-measure').click()");
-    page.value("document.getElementById('view').scrollIntoView()");
+    page.value("document.getElementById('view').scrollIntoView({behavior: 'instant'})");
     let size = page.value(
         "(() => { const b = document.getElementById('view-canvas').getBoundingClientRect(); return [b.left, b.top, b.width, b.height]; })()",
     );

@@ -28,6 +28,7 @@ Input.prototype.place = function (e) {
   const x = e.clientX - box.left;
   const y = e.clientY - box.top;
   const pane = this.view.paneAt(x, y);
+  this.view.refreshLens(pane);
   return { pane: pane, x: x - pane.rect.x, y: y - pane.rect.y, canvasX: x, canvasY: y };
 };
 
@@ -115,6 +116,7 @@ Input.prototype.keyDown = function (e) {
   const key = e.key.toLowerCase();
   const pane = this.view.cursor.pane.isShown ? this.view.cursor.pane : this.view.shownPanes()[0];
   this.view.cursor = { pane: pane, x: 0, y: 0, isKeyboard: true };
+  this.view.refreshLens(pane);
   if (TURNS[key] && pane.camera.mode === "path") {
     this.actions.step(TURNS[key][0] - TURNS[key][1]);
   } else if (TURNS[key]) {

@@ -210,6 +210,11 @@ View.prototype.paneAt = function (x, y) {
   }) || this.shownPanes()[0];
 };
 
+// What is clicked must be what the camera shows now, also before the next picture is drawn.
+View.prototype.refreshLens = function (pane) {
+  pane.lens = pane.camera.lens(pane.rect.width, pane.rect.height);
+};
+
 // After a camera moved: the others follow where they are linked.
 View.prototype.moved = function (camera) {
   if (this.isLinked) {
