@@ -18,6 +18,7 @@ mod canvas;
 mod chart;
 mod colormap;
 mod error;
+mod escape;
 mod interactive;
 mod lines;
 mod map;

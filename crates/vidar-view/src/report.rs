@@ -2,6 +2,7 @@
 
 mod style;
 
+use crate::escape::escaped;
 use crate::interactive::{EncodedView, page};
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
@@ -131,25 +132,6 @@ pub fn render_html(report: &Report) -> String {
     }
     html.push_str("</body>\n</html>\n");
     html
-}
-
-/// Text for HTML content and for attributes in double quotes.
-pub(crate) fn escaped(text: &str) -> String {
-    let text = vidar_core::printable_lines(text);
-    let mut out = String::with_capacity(text.len());
-    for c in text.chars() {
-        match c {
-            '&' => out.push_str("&amp;"),
-            '<' => out.push_str("&lt;"),
-            '>' => out.push_str("&gt;"),
-            '"' => out.push_str("&quot;"),
-            '\'' => out.push_str("&#39;"),
-            // Not allowed in HTML; would make the file invalid.
-            c if c.is_control() && !matches!(c, '\n' | '\t') => out.push('\u{fffd}'),
-            c => out.push(c),
-        }
-    }
-    out
 }
 
 /// The page may load nothing, from anywhere: browsers enforce it.

@@ -1,7 +1,7 @@
 //! The view's controls as HTML, and its scripts and styles.
 
 use super::{EncodedView, FieldKind, FieldValues, InteractiveView, PanesShown, PathRole};
-use crate::report::escaped;
+use crate::escape::escaped;
 use std::fmt::Write;
 
 /// The scripts in the order in which they define what the later ones use. They share one function scope.

@@ -260,8 +260,8 @@ fn pictures_of_a_page() {
     );
     let at =
         |x: f64, y: f64| (number(&size[0]) + x * number(&size[2]), number(&size[1]) + y * number(&size[3]));
-    page.click(at(0.4, 0.25), 0);
-    page.click(at(0.62, 0.25), 0);
+    page.click(at(0.2, 0.24), 0);
+    page.click(at(0.45, 0.22), 0);
     std::fs::write(folder.join("measure.png"), page.screenshot()).unwrap();
     println!("{}, errors: {:?}", page.value("vidarView.measurement()"), page.errors);
 }
