@@ -5,6 +5,7 @@
 mod auto;
 mod bench;
 mod calibrate;
+mod compare;
 mod config;
 mod convert;
 mod coupling;

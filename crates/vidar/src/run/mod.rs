@@ -17,6 +17,7 @@ mod store;
 mod summary;
 mod tracking;
 mod trust;
+mod view;
 mod views;
 
 pub use by_source::SourceScore;
