@@ -21,8 +21,9 @@ use vidar_core::{
 
 /// Looks for a bag in a folder.
 pub(crate) fn detect(path: &Path) -> Option<String> {
-    let described = std::fs::read_to_string(path.join("metadata.yaml"));
-    if described.is_ok_and(|text| text.contains("rosbag2_bagfile_information")) {
+    let described = read_file_up_to(&path.join("metadata.yaml"), MAX_DESCRIPTION_BYTES);
+    let is_bag = |text: Vec<u8>| String::from_utf8_lossy(&text).contains("rosbag2_bagfile_information");
+    if described.is_ok_and(is_bag) {
         return Some("metadata.yaml of a ROS 2 bag".into());
     }
     match vidar_bag::bags_in(path).ok()?.as_slice() {
