@@ -42,7 +42,8 @@ impl Decoders {
             let work = move || work(&media, &queue, &is_over);
             Builder::new().name(DECODER_THREAD.into()).spawn(work).ok()
         };
-        Self { jobs: Some(jobs), is_over, threads: (0..count).filter_map(spawn).collect() }
+        let threads = (0..count).filter_map(spawn).collect();
+        Self { jobs: Some(jobs), is_over, threads }
     }
 
     fn ask(&self, entry: &ImageEntry, expected: Option<(usize, usize)>) -> Receiver<Loaded> {

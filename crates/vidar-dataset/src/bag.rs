@@ -7,6 +7,7 @@ use crate::draft::{Draft, DraftCamera, DraftDepth};
 use crate::error::DatasetError;
 use crate::location::locate;
 use crate::options::{DatasetKind, OpenOptions, PoseUse};
+use crate::source::read_file_up_to;
 use crate::topics::{self, ImuTopics, problem};
 use crate::transforms::{Frames, rigid};
 use nalgebra::Vector3;
@@ -18,6 +19,9 @@ use vidar_core::{
     AngularRate, BodyFrame, CameraId, ImuNoise, ImuSample, Se3, SpecificForce, StampedPose, TimedVector,
     Timestamp, Trajectory, Warning,
 };
+
+/// Largest `metadata.yaml`; a real one has about 1 kB and some hundred bytes per topic.
+const MAX_DESCRIPTION_BYTES: u64 = 4 << 20;
 
 /// Looks for a bag in a folder.
 pub(crate) fn detect(path: &Path) -> Option<String> {
