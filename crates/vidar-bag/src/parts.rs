@@ -33,7 +33,9 @@ pub(crate) fn parts_in(folder: &Path) -> Result<Vec<PathBuf>, BagError> {
 fn are_one(parts: &[PathBuf]) -> bool {
     let follows = |pair: &[PathBuf]| match (number_of(&pair[0]), number_of(&pair[1])) {
         (Some((name, number)), Some((next_name, next))) => {
-            name == next_name && Some(next) == number.checked_add(1) && pair[0].extension() == pair[1].extension()
+            name == next_name
+                && Some(next) == number.checked_add(1)
+                && pair[0].extension() == pair[1].extension()
         }
         _ => false,
     };
@@ -55,7 +57,8 @@ fn number_of(path: &Path) -> Option<(String, u64)> {
 /// `2024-05-01-10-00-00`.
 fn is_time(text: &str) -> bool {
     let mut fields = text.split('-');
-    let is_number = |field: &str, digits: usize| field.len() == digits && field.bytes().all(|b| b.is_ascii_digit());
+    let is_number =
+        |field: &str, digits: usize| field.len() == digits && field.bytes().all(|b| b.is_ascii_digit());
     fields.next().is_some_and(|year| is_number(year, 4))
         && fields.clone().count() == 5
         && fields.all(|field| is_number(field, 2))

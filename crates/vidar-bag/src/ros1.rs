@@ -8,7 +8,9 @@ use crate::bytes::Bytes;
 use crate::compression::{Compression, MAX_DECOMPRESSED_BYTES};
 use crate::error::BagError;
 use crate::file::{BagFile, MESSAGE_AHEAD_BYTES, Window};
-use crate::index::{Chunk, Encoding, FileIndex, FileTopic, LastChunk, NO_CHUNK, cut_off, plain_type, read_list};
+use crate::index::{
+    Chunk, Encoding, FileIndex, FileTopic, LastChunk, NO_CHUNK, cut_off, plain_type, read_list,
+};
 use vidar_core::Warning;
 
 pub(crate) const MAGIC: &[u8] = b"#ROSBAG V2.0\n";

@@ -181,7 +181,8 @@ impl Dataset {
     pub fn events(&self) -> impl Iterator<Item = Result<SensorEvent, DatasetError>> + '_ {
         let (mut cursor, mut images) = (EventCursor::default(), self.images_ahead(self.images.iter()));
         std::iter::from_fn(move || {
-            let pixels = |entry: &ImageEntry| images.next().map_or_else(|| self.load_image(entry), |(_, image)| image);
+            let pixels =
+                |entry: &ImageEntry| images.next().map_or_else(|| self.load_image(entry), |(_, image)| image);
             self.event_after(&mut cursor, pixels)
         })
     }

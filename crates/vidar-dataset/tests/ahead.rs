@@ -39,7 +39,8 @@ fn a_stream_of_events_is_the_one_that_reads_image_by_image() {
     let f = euroc();
     let d = f.open().unwrap();
     let mut cursor = vidar_dataset::EventCursor::default();
-    let slow: Vec<SensorEvent> = std::iter::from_fn(|| d.next_event(&mut cursor)).map(Result::unwrap).collect();
+    let slow: Vec<SensorEvent> =
+        std::iter::from_fn(|| d.next_event(&mut cursor)).map(Result::unwrap).collect();
     let fast: Vec<SensorEvent> = d.events().map(Result::unwrap).collect();
     assert_eq!(format!("{slow:?}"), format!("{fast:?}"));
     assert!(fast.iter().filter(|e| matches!(e, SensorEvent::Image(_))).count() == 10);

@@ -142,12 +142,14 @@ fn add_run(
         found
     };
     let offset = next(stated & 0x1 != 0)?.map(|o| o as i32);
-    let mut place = offset.map_or(Some(after_last), |o| base.checked_add_signed(i64::from(o))).ok_or_else(cut)?;
+    let mut place =
+        offset.map_or(Some(after_last), |o| base.checked_add_signed(i64::from(o))).ok_or_else(cut)?;
     let first_flags = next(stated & 0x4 != 0)?;
     for number in 0..count {
         let duration = next(stated & 0x100 != 0)?.unwrap_or(defaults.duration);
         let size = next(stated & 0x200 != 0)?.unwrap_or(defaults.size);
-        let flags = next(stated & 0x400 != 0)?.or(first_flags.filter(|_| number == 0)).unwrap_or(defaults.flags);
+        let flags =
+            next(stated & 0x400 != 0)?.or(first_flags.filter(|_| number == 0)).unwrap_or(defaults.flags);
         // Version 0 counts shifts without sign; writers use negative ones in both versions, as in `ctts`.
         let shift = next(stated & 0x800 != 0)?.unwrap_or(0) as i32;
         // What takes no byte of the table must take some of the file.
@@ -200,7 +202,9 @@ mod tests {
         let second = [atom(b"tfhd", &words(&[0, 2])), atom(b"trun", &words(&[0, 2]))].concat();
         let moof = [atom(b"traf", &first), atom(b"traf", &second)].concat();
         fragments.add(&moof, 500).unwrap();
-        let places = |t: &Track| t.samples.iter().map(|s| (s.offset, s.size, s.time_ns / 1_000_000)).collect::<Vec<_>>();
+        let places = |t: &Track| {
+            t.samples.iter().map(|s| (s.offset, s.size, s.time_ns / 1_000_000)).collect::<Vec<_>>()
+        };
         assert_eq!(places(&tracks[0]), [(700, 10, 4080), (710, 20, 4040), (730, 30, 4120)]);
         assert_eq!(places(&tracks[1]), [(760, 7, 0), (767, 7, 40)]);
         assert_eq!(tracks[0].samples.iter().map(|s| s.is_sync).collect::<Vec<_>>(), [true, false, false]);
@@ -216,7 +220,9 @@ mod tests {
             atom(b"traf", &[atom(b"tfhd", &words(tfhd)), atom(b"trun", &words(run))].concat())
         };
         // Four thousand million pictures of seven bytes each, and of none.
-        assert!(fragments.add(&moof(&[0, 1], &[0, u32::MAX]), 0).unwrap_err().contains("longer than the file"));
+        assert!(
+            fragments.add(&moof(&[0, 1], &[0, u32::MAX]), 0).unwrap_err().contains("longer than the file")
+        );
         assert!(fragments.add(&moof(&[0x10, 1, 0], &[0, u32::MAX]), 0).unwrap_err().contains("no size"));
         assert!(fragments.add(&moof(&[0, 1], &[0x200, 3, 1]), 0).unwrap_err().contains("cut"));
         assert!(fragments.add(&moof(&[0x8], &[0, 1]), 0).unwrap_err().contains("cut"));

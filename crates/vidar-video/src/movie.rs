@@ -92,7 +92,8 @@ impl Movie {
         let mut warnings = Vec::new();
         if let Some(fragments) = Fragments::announced(&moov, &mut tracks, length) {
             let broken = read_fragments(&mut file, (moov_end, length), fragments).map_err(failed)?;
-            warnings.extend(broken.map(|message| Warning::degraded("video-cut-off", message).at(path.display())));
+            warnings
+                .extend(broken.map(|message| Warning::degraded("video-cut-off", message).at(path.display())));
         }
         if tracks[video].samples.is_empty() {
             let found = "a video track without pictures";
@@ -170,7 +171,9 @@ fn read_fragments(
             let mut kind = [0; 4];
             file.seek(SeekFrom::Start((at + 4).min(length)))?;
             let is_named = file.read_exact(&mut kind).is_ok();
-            let lost = format!("the file is cut off in the table of a fragment at byte {at}; it is read up to there");
+            let lost = format!(
+                "the file is cut off in the table of a fragment at byte {at}; it is read up to there"
+            );
             return Ok((!is_named || kind == *b"moof").then_some(lost));
         };
         if kind == *b"moof" {
@@ -179,7 +182,9 @@ fn read_fragments(
                 _ => fragments.add(&content(file, at + head_bytes, end)?, at),
             };
             if let Err(reason) = added {
-                let message = format!("the table of the fragment at byte {at} is damaged ({reason}); the video is read up to it");
+                let message = format!(
+                    "the table of the fragment at byte {at} is damaged ({reason}); the video is read up to it"
+                );
                 return Ok(Some(message));
             }
         }

@@ -92,7 +92,8 @@ fn a_clip_in_fragments_is_read_up_to_where_it_breaks_off() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("cut.mp4");
     let whole = std::fs::read(fixture("fragmented.mp4")).unwrap();
-    let moof = |nth: usize| whole.windows(4).enumerate().filter(|(_, w)| w == b"moof").nth(nth).unwrap().0 - 4;
+    let moof =
+        |nth: usize| whole.windows(4).enumerate().filter(|(_, w)| w == b"moof").nth(nth).unwrap().0 - 4;
     let said = |end: usize| -> (usize, Vec<String>) {
         std::fs::write(&path, &whole[..end]).unwrap();
         let video = Video::open(&path).unwrap();
@@ -103,7 +104,10 @@ fn a_clip_in_fragments_is_read_up_to_where_it_breaks_off() {
     assert_eq!(said(moof(1)), (8, Vec::new()));
     // In the table of the second, and in its pictures.
     let (count, warnings) = said(moof(1) + 40);
-    assert!(count == 8 && warnings[0].contains("video-cut-off") && warnings[0].contains("table"), "{warnings:?}");
+    assert!(
+        count == 8 && warnings[0].contains("video-cut-off") && warnings[0].contains("table"),
+        "{warnings:?}"
+    );
     let (count, warnings) = said(whole.windows(4).rposition(|w| w == b"mfra").unwrap() - 24);
     assert!((9..15).contains(&count) && warnings[0].contains("of 15 pictures"), "{count} {warnings:?}");
     // A fragment whose table contradicts itself.
@@ -112,7 +116,11 @@ fn a_clip_in_fragments_is_read_up_to_where_it_breaks_off() {
     damaged[run + 8..run + 12].copy_from_slice(&[0xff; 4]);
     std::fs::write(&path, &damaged).unwrap();
     let video = Video::open(&path).unwrap();
-    assert!(video.frame_count() >= 8 && video.warnings()[0].message.contains("damaged"), "{:?}", video.warnings());
+    assert!(
+        video.frame_count() >= 8 && video.warnings()[0].message.contains("damaged"),
+        "{:?}",
+        video.warnings()
+    );
 }
 
 #[test]

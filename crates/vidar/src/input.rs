@@ -368,9 +368,7 @@ pub(crate) fn needs_calibration(config: &Config) -> bool {
 /// Refuses a camera that is only guessed: it would bend every surface and still look metric.
 pub fn require_calibration(dataset: &Dataset) -> Result<(), Error> {
     match dataset.calibration {
-        CalibrationSource::Guessed
-            if dataset.imu.is_empty() && dataset.external_trajectory.is_none() =>
-        {
+        CalibrationSource::Guessed if dataset.imu.is_empty() && dataset.external_trajectory.is_none() => {
             Err(Error::ImagesAlone { name: dataset.name.clone() })
         }
         CalibrationSource::Guessed => Err(Error::NoCalibration { name: dataset.name.clone() }),
