@@ -6,7 +6,7 @@ use crate::location::{Location, Media};
 use std::collections::VecDeque;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::mpsc::{Receiver, Sender, SyncSender, channel, sync_channel};
+use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::{Builder, JoinHandle, available_parallelism};
 use vidar_core::FrameImage;
@@ -28,14 +28,15 @@ struct Job {
 
 /// Threads that decode images of one recording. Every image is what [`Dataset::load_image`] gives, whatever the number of threads.
 struct Decoders {
-    jobs: Option<Sender<Job>>,
+    jobs: Option<SyncSender<Job>>,
     is_over: Arc<AtomicBool>,
     threads: Vec<JoinHandle<()>>,
 }
 
 impl Decoders {
     fn start(media: &Media, count: usize) -> Self {
-        let (jobs, queue) = channel::<Job>();
+        // As many as are ever asked for, so that asking never waits.
+        let (jobs, queue) = sync_channel::<Job>(MOST_THREADS * IMAGES_PER_THREAD);
         let (queue, is_over) = (Arc::new(Mutex::new(queue)), Arc::new(AtomicBool::new(false)));
         let spawn = |_| {
             let (media, queue, is_over) = (media.clone(), Arc::clone(&queue), Arc::clone(&is_over));
