@@ -1,6 +1,8 @@
 //! Video without a container, as bags keep it: access units as byte streams; the first byte picks the codec and where the bytes are cut.
 #![no_main]
 
+mod decoders;
+
 use libfuzzer_sys::fuzz_target;
 use std::sync::Arc;
 use vidar_video::{AccessUnits, StreamCodec, StreamUnit, VideoStream};
@@ -14,6 +16,7 @@ impl AccessUnits for Units {
 }
 
 fuzz_target!(|bytes: &[u8]| {
+    decoders::allow_panics_of_decoders();
     let Some((selector, bytes)) = bytes.split_first() else { return };
     let codec = if selector & 1 == 0 { StreamCodec::H264 } else { StreamCodec::H265 };
     let length = (bytes.len() / (1 + usize::from(selector >> 1 & 7))).max(1);

@@ -10,10 +10,11 @@ import json
 from pathlib import Path
 
 import torch
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load, save
 from torch import Tensor
 
 from .config import POSITION_GRID, NanoConfig, from_dict
+from .halves import read_weights, write_weights
 from .model import Nano
 
 PREFIX = "model."
@@ -53,7 +54,7 @@ def write(model: Nano, folder: Path) -> None:
     tensors = {name: t.half() for name, t in exported(model).items()}
     if not all(torch.isfinite(t).all() for t in tensors.values()):
         raise ValueError("a weight does not fit 16 bits")
-    save_file(tensors, folder / "model.safetensors")
+    write_weights(folder, save(tensors))
     model.config.write(folder / "config.json")
 
 
@@ -76,7 +77,7 @@ def read(folder: Path) -> Nano:
         cam_enc_depth=cam_enc["trunk_depth"],
         cam_enc_ratio=cam_enc["mlp_ratio"],
     )
-    return imported(load_file(folder / "model.safetensors"), config)
+    return imported(load(read_weights(folder)), config)
 
 
 def mean(networks: list[tuple[Nano, float]]) -> Nano:
@@ -125,7 +126,7 @@ def main() -> None:
         model = mean([(model, 1 - sum(share for _, share in others)), *others])
     write(model, arguments.out)
     count = sum(t.numel() for t in exported(model).values())
-    print(f"step {state['step']}, {count} numbers, {(arguments.out / 'model.safetensors').stat().st_size} bytes")
+    print(f"step {state['step']}, {count} numbers, {len(read_weights(arguments.out))} bytes")
 
 
 if __name__ == "__main__":

@@ -25,6 +25,7 @@ from nano.evaluate import softened  # noqa: E402
 from nano.export import exported, imported, mean  # noqa: E402
 from nano.filters import smooth  # noqa: E402
 from nano.geometry import homogeneous, inverse, matches, matrix_from_quaternion, quaternion_from_matrix  # noqa: E402
+from nano.halves import read_weights, write_weights  # noqa: E402
 from nano.losses import WATCHED, depth_terms, differences, match_terms, relative, total  # noqa: E402
 from nano.metrics import depth_errors, pair_errors, scale_from_poses  # noqa: E402
 from nano.model import Nano, Output, position_operator, reference_first  # noqa: E402
@@ -474,3 +475,15 @@ def test_softening_blurs_pictures_alone() -> None:
     assert 0 < soft.image[0, 7, 15, 0] < soft.image[0, 7, 14, 0] < 200
     # What a point loses its neighbours get.
     assert abs(int(soft.image[0, :, :, 0].sum()) - 200) < 10
+
+
+def test_weights_are_the_same_whole_and_in_halves(tmp_path: Path) -> None:
+    data = bytes(range(251)) * 3
+    whole, crate = tmp_path / "whole", tmp_path / "crate"
+    whole.mkdir()
+    (crate / "second-half").mkdir(parents=True)
+    for folder in (whole, crate):
+        write_weights(folder, data)
+        assert read_weights(folder) == data
+    assert [p.name for p in whole.iterdir()] == ["model.safetensors"]
+    assert not (crate / "model.safetensors").exists()

@@ -10,6 +10,8 @@ const LAYERS: &[(&str, &[&str])] = &[
     ("vidar-nn", &[]),
     ("vidar-gpu", &[]),
     ("vidar-hub", &[]),
+    ("vidar-da3-nano-second-half", &[]),
+    ("vidar-da3-nano", &["vidar-da3-nano-second-half"]),
     ("vidar-solve", &["vidar-core"]),
     ("vidar-bag", &["vidar-core"]),
     ("vidar-video", &["vidar-core"]),
@@ -23,7 +25,7 @@ const LAYERS: &[(&str, &[&str])] = &[
     ("vidar-export", &["vidar-core"]),
     ("vidar-view", &["vidar-core"]),
     ("vidar-synth", &["vidar-core"]),
-    ("vidar-cli", &["vidar"]),
+    ("vidar-cli", &["vidar-map"]),
     ("xtask", &[]),
 ];
 
@@ -50,7 +52,7 @@ pub fn check(root: &Path) -> Result<Vec<String>> {
     for package in &metadata.packages {
         let name = package.name.to_string();
         let may: Option<&[&str]> = LAYERS.iter().find(|(n, _)| *n == name).map(|(_, may)| *may);
-        if may.is_none() && name != "vidar" {
+        if may.is_none() && name != "vidar-map" {
             problems.push(format!("{name} has no layer; add it to xtask/src/layers.rs and ARCHITECTURE.md"));
         }
         for dependency in &package.dependencies {

@@ -14,7 +14,7 @@ const BORDER: &[&str] = &["vidar-dataset", "vidar-export", "xtask"];
 /// Rust sources of crates, program, tasks and bindings.
 fn sources(root: &Path) -> Result<Vec<PathBuf>> {
     let mut found = Vec::new();
-    let mut folders = ["crates", "apps", "xtask", "python/src", "c/src", "c/tests"]
+    let mut folders = ["crates", "models", "apps", "xtask", "python/src", "c/src", "c/tests"]
         .map(|folder| root.join(folder))
         .to_vec();
     while let Some(folder) = folders.pop() {

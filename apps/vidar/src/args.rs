@@ -1,5 +1,6 @@
 //! The command line, as plain values. Validation and building happen in the commands.
 
+use crate::compare_args::CompareArgs;
 use crate::model_args::{DepthArgs, LicenceArgs, ModelCommand};
 use clap::{ArgAction, Args, Parser, Subcommand, ValueEnum, ValueHint};
 use std::path::PathBuf;
@@ -95,6 +96,11 @@ pub enum Command {
         after_help = "Examples:\n  vidar export runs/demo/latest/run --to colmap -o colmap\n  vidar export runs/demo/latest/run --to nerfstudio -o ns\n  vidar export runs/demo/latest/run --to tum"
     )]
     Export(ExportArgs),
+    /// Compare finished runs on one page: numbers side by side, linked cameras, distances of their surfaces in colour.
+    #[command(
+        after_help = "Examples:\n  vidar compare runs/a/latest runs/b/latest\n  vidar compare stereo/ nano/ small/ -o models.html\n  vidar compare before/ after/ --force --json"
+    )]
+    Compare(CompareArgs),
     /// Serve a finished run to Foxglove on this computer, until Ctrl-C.
     #[command(
         after_help = "Examples:\n  vidar view runs/demo/latest/run\n  vidar view run.mcap --port 9000\n\nIn Foxglove: Open connection, Foxglove WebSocket, the address that is printed."

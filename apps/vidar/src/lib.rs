@@ -5,6 +5,7 @@
 pub mod args;
 mod build;
 mod commands;
+pub mod compare_args;
 pub mod model_args;
 mod print;
 mod progress;
@@ -100,6 +101,7 @@ fn dispatch(command: Command, context: &Context) -> Outcome {
         Command::Calibrate(args) => commands::calibrate::calibrate(&args, context),
         Command::Eval(args) => commands::eval::eval(&args, context),
         Command::Export(args) => commands::export::export(&args, context),
+        Command::Compare(args) => commands::compare::compare(&args, context),
         Command::View(args) => commands::view::view(&args, context),
         Command::Depth(args) => commands::depth::depth(&args, context),
         Command::Model(command) => commands::model::model(&command, context),

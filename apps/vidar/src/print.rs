@@ -56,7 +56,7 @@ pub fn error(error: &Error, as_json: bool) {
             "exit": error.exit_status() as i32,
         }));
     }
-    talk(format!("error[{}]: {}", error.code(), printable(&error.to_string())));
+    talk(format!("error[{}]: {}", error.code(), laid_out(&error.to_string())));
     let mut source = std::error::Error::source(error);
     while let Some(cause) = source {
         // Transparent wrappers repeat their cause.
@@ -68,6 +68,12 @@ pub fn error(error: &Error, as_json: bool) {
     if let Some(hint) = hint {
         talk(format!("  hint: {}", printable(&hint)));
     }
+}
+
+/// An error as printed: the lines of a list, which begin with two blanks, stay lines; no text of a file can begin a line that looks like one of
+/// the program's own.
+fn laid_out(text: &str) -> String {
+    text.split("\n  ").map(printable).collect::<Vec<_>>().join("\n  ")
 }
 
 /// Warnings, each kind once with its count and its first example.

@@ -6,10 +6,10 @@ use crate::error::BagError;
 use crate::file::BagFile;
 use crate::index::{Encoding, FileIndex, MessageRef, NO_CHUNK, Topic};
 use crate::message::{self, Header, Message};
-use crate::{mcap, metadata, ros1, sqlite};
+use crate::{mcap, metadata, parts, ros1, sqlite};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 use vidar_core::{Timestamp, Warning};
 
 /// The containers that are read.
@@ -80,17 +80,18 @@ impl Container {
 /// The chunks decompressed last. Neighbouring messages share a chunk; sensors that are read side by side are a few chunks apart.
 #[derive(Debug, Default)]
 struct Cache {
-    chunks: Vec<(u16, u32, Arc<Vec<u8>>)>,
+    /// File, chunk, announced size, content.
+    chunks: Vec<(u16, u32, u64, Arc<Unpacked>)>,
 }
 
+/// A chunk that is decompressed once, by the first thread that needs it, while others wait; or why it cannot be.
+type Unpacked = OnceLock<Result<Vec<u8>, String>>;
+
 /// Decompressed chunks that are kept, bytes; the newest stays even when it is larger.
-const CACHE_BYTES: usize = 32 << 20;
+const CACHE_BYTES: u64 = 32 << 20;
 
 /// Bytes that hold stamp and frame of any message; names of frames are far shorter.
 const HEADER_BYTES: u64 = 1 << 10;
-
-/// Most files of one recording.
-const MAX_FILES: usize = 10_000;
 
 impl Bag {
     /// Opens a bag file, the folder of a ROS 2 bag, or a folder that holds the numbered parts of one recording, and lists its
@@ -99,14 +100,14 @@ impl Bag {
         let (files, messages_are_compressed) = if path.is_dir() {
             match metadata::read(path)? {
                 Some(found) => (found.files, found.messages_are_compressed),
-                None => (parts_in(path)?, false),
+                None => (parts::parts_in(path)?, false),
             }
         } else {
             (vec![path.to_path_buf()], false)
         };
-        if files.len() > MAX_FILES {
+        if files.len() > parts::MAX_FILES {
             let (path, found) = (path.to_path_buf(), files.len() as u64);
-            return Err(BagError::TooLarge { path, what: "files", found, limit: MAX_FILES as u64 });
+            return Err(BagError::TooLarge { path, what: "files", found, limit: parts::MAX_FILES as u64 });
         }
         let mut bag = Self {
             path: path.to_path_buf(),
@@ -270,47 +271,37 @@ impl Bag {
                 Container::Sqlite(_) => Ok(None),
             };
         }
-        let bytes = match self.cached(message) {
-            Some(bytes) => bytes,
-            None => {
-                let file = part.container.file();
-                let packed = file.read(chunk.offset, chunk.stored)?;
-                let bytes = chunk.compression.decompress(&packed, Some(chunk.size)).map_err(|reason| {
-                    file.malformed(
-                        chunk.offset,
-                        format!("a chunk that is damaged: {reason}"),
-                        "a whole chunk",
-                    )
-                })?;
-                self.keep(message, Arc::new(bytes))
-            }
-        };
+        let unpacked = self.cached(message, chunk.size);
+        let file = part.container.file();
+        let content = unpacked.get_or_init(|| {
+            let packed = file.read(chunk.offset, chunk.stored).map_err(|e| e.to_string())?;
+            chunk.compression.decompress(&packed, Some(chunk.size))
+        });
+        let bytes = content.as_ref().map_err(|reason| {
+            let found = format!("a chunk that is damaged: {reason}");
+            file.malformed(chunk.offset, found, "a whole chunk")
+        })?;
         Ok(match &part.container {
-            Container::Ros1(_) => ros1::message_in(&bytes, message.offset).map(|b| cut(b, most)),
-            Container::Mcap(_) => mcap::message_in(&bytes, message.offset).map(|b| cut(b, most)),
+            Container::Ros1(_) => ros1::message_in(bytes, message.offset).map(|b| cut(b, most)),
+            Container::Mcap(_) => mcap::message_in(bytes, message.offset).map(|b| cut(b, most)),
             Container::Sqlite(_) => None,
         })
     }
 
-    fn cached(&self, message: &MessageRef) -> Option<Arc<Vec<u8>>> {
+    /// The place of a chunk among those that are kept, as the newest.
+    fn cached(&self, message: &MessageRef, size: u64) -> Arc<Unpacked> {
         let mut cache = self.cache.lock().unwrap_or_else(PoisonError::into_inner);
-        let is_it =
-            |(file, chunk, _): &(u16, u32, Arc<Vec<u8>>)| (*file, *chunk) == (message.file, message.chunk);
-        let at = cache.chunks.iter().position(is_it)?;
-        let found = cache.chunks.remove(at);
-        let bytes = Arc::clone(&found.2);
-        cache.chunks.push(found);
-        Some(bytes)
-    }
-
-    fn keep(&self, message: &MessageRef, bytes: Arc<Vec<u8>>) -> Arc<Vec<u8>> {
-        let mut cache = self.cache.lock().unwrap_or_else(PoisonError::into_inner);
-        cache.chunks.push((message.file, message.chunk, Arc::clone(&bytes)));
-        let mut held: usize = cache.chunks.iter().map(|c| c.2.len()).sum();
-        while held > CACHE_BYTES && cache.chunks.len() > 1 {
-            held -= cache.chunks.remove(0).2.len();
+        let chunks = &mut cache.chunks;
+        let place = chunks.iter().position(|c| (c.0, c.1) == (message.file, message.chunk));
+        let found = place.map(|at| chunks.remove(at));
+        let kept = found.unwrap_or_else(|| (message.file, message.chunk, size, Arc::default()));
+        let unpacked = Arc::clone(&kept.3);
+        chunks.push(kept);
+        let mut held: u64 = chunks.iter().map(|c| c.2).sum();
+        while held > CACHE_BYTES && chunks.len() > 1 {
+            held -= chunks.remove(0).2;
         }
-        bytes
+        unpacked
     }
 
     fn bad_message(&self, message: &MessageRef, reason: String) -> BagError {
@@ -359,58 +350,4 @@ fn open_file(path: &Path) -> Result<(BagFormat, Container, FileIndex), BagError>
             return Err(BagError::NotABag { path: path.to_path_buf(), found, expected });
         }
     })
-}
-
-/// The bags in a folder, where they are the numbered parts of one recording (`x_0.mcap`, `x_1.mcap`, …) or only one.
-fn parts_in(folder: &Path) -> Result<Vec<PathBuf>, BagError> {
-    let mut parts = bags_in(folder)?;
-    let not_one = |found: String| BagError::NotABag {
-        path: folder.to_path_buf(),
-        found,
-        expected: "one bag, the numbered parts of one (x_0.bag, x_1.bag), or a metadata.yaml; name a file"
-            .into(),
-    };
-    let stem = |path: &PathBuf| -> (String, Option<u64>) {
-        let stem = path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
-        match stem.rsplit_once('_').and_then(|(name, n)| Some((name.to_string(), n.parse().ok()?))) {
-            Some((name, number)) => (name, Some(number)),
-            None => (stem, None),
-        }
-    };
-    parts.sort_by_key(&stem);
-    match parts.as_slice() {
-        [] => Err(not_one("a folder without bags".into())),
-        [_] => Ok(parts),
-        [first, ..] => {
-            let (name, number) = stem(first);
-            if number.is_some()
-                && parts.iter().all(|p| stem(p).0 == name && p.extension() == first.extension())
-            {
-                return Ok(parts);
-            }
-            let names = parts
-                .iter()
-                .take(6)
-                .map(|p| p.file_name().unwrap_or_default().to_string_lossy().into_owned());
-            Err(not_one(format!("{} bags: {}", parts.len(), names.collect::<Vec<_>>().join(", "))))
-        }
-    }
-}
-
-/// Files in a folder that are named as bags.
-pub fn bags_in(folder: &Path) -> Result<Vec<PathBuf>, BagError> {
-    let failed = |source| BagError::Io { path: folder.to_path_buf(), source };
-    let mut found = Vec::new();
-    for entry in std::fs::read_dir(folder).map_err(failed)? {
-        let path = entry.map_err(failed)?.path();
-        let ending = path.extension().map(|e| e.to_string_lossy().to_ascii_lowercase());
-        if matches!(ending.as_deref(), Some("bag" | "mcap" | "db3"))
-            && path.is_file()
-            && found.len() < MAX_FILES
-        {
-            found.push(path);
-        }
-    }
-    found.sort();
-    Ok(found)
 }

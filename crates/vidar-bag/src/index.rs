@@ -82,6 +82,8 @@ pub(crate) struct Chunk {
 
 /// Most messages of a recording: ten hours at 1 kHz. Their references then take 1.2 GB.
 pub(crate) const MAX_MESSAGES: usize = 36_000_000;
+/// Largest list of one topic's messages in one chunk, bytes: four million messages, and chunks have some MB.
+const MAX_LIST_BYTES: u64 = 64 << 20;
 /// Most topics; the largest robots publish some thousand.
 const MAX_TOPICS: usize = 60_000;
 
@@ -188,6 +190,15 @@ impl FileIndex {
             topic.places.truncate(kept);
         }
     }
+}
+
+/// A list of messages behind a chunk, where it is of a length that one has.
+pub(crate) fn read_list(file: &BagFile, at: u64, length: u64) -> Result<Vec<u8>, BagError> {
+    if length > MAX_LIST_BYTES {
+        let (path, what) = (file.path().to_path_buf(), "bytes of a list of messages");
+        return Err(BagError::TooLarge { path, what, found: length, limit: MAX_LIST_BYTES });
+    }
+    file.read(at, length)
 }
 
 fn too_many(file: &BagFile, what: &'static str, limit: usize) -> BagError {

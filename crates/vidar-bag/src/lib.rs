@@ -10,14 +10,16 @@ mod index;
 mod mcap;
 pub mod message;
 mod metadata;
+mod parts;
 mod ros1;
 mod sqlite;
 pub mod write;
 
-pub use bag::{Bag, BagFormat, bags_in};
+pub use bag::{Bag, BagFormat};
 pub use error::BagError;
 pub use index::{Encoding, MessageRef, Topic};
 pub use message::{
     CameraInfo, CompressedImage, FramePose, FrameTransform, Header, ImuMessage, Message, Pixels, Pose,
     RawImage, Role, role_of,
 };
+pub use parts::bags_in;

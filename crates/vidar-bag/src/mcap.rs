@@ -7,7 +7,9 @@ use crate::bytes::Bytes;
 use crate::compression::{Compression, MAX_DECOMPRESSED_BYTES};
 use crate::error::BagError;
 use crate::file::{BagFile, MESSAGE_AHEAD_BYTES, Window};
-use crate::index::{Chunk, Encoding, FileIndex, FileTopic, LastChunk, NO_CHUNK, cut_off, plain_type};
+use crate::index::{
+    Chunk, Encoding, FileIndex, FileTopic, LastChunk, NO_CHUNK, cut_off, plain_type, read_list,
+};
 use std::collections::BTreeMap;
 use vidar_core::Warning;
 
@@ -215,7 +217,7 @@ impl Walk<'_> {
     /// Messages of one channel in the chunk before.
     fn message_index(&mut self, body: u64, length: u64) -> Result<(), BagError> {
         let Some(mut last) = self.index.last else { return Ok(()) };
-        let data = self.file.read(body, length)?;
+        let data = read_list(self.file, body, length)?;
         let mut bytes = Bytes::new(&data);
         let (Some(channel), Some(entries)) = (bytes.u16(), bytes.counted()) else { return Ok(()) };
         if !self.index.topics.contains_key(&u32::from(channel)) && !last.was_opened {

@@ -8,7 +8,9 @@ use crate::bytes::Bytes;
 use crate::compression::{Compression, MAX_DECOMPRESSED_BYTES};
 use crate::error::BagError;
 use crate::file::{BagFile, MESSAGE_AHEAD_BYTES, Window};
-use crate::index::{Chunk, Encoding, FileIndex, FileTopic, LastChunk, NO_CHUNK, cut_off, plain_type};
+use crate::index::{
+    Chunk, Encoding, FileIndex, FileTopic, LastChunk, NO_CHUNK, cut_off, plain_type, read_list,
+};
 use vidar_core::Warning;
 
 pub(crate) const MAGIC: &[u8] = b"#ROSBAG V2.0\n";
@@ -213,7 +215,7 @@ impl Walk<'_> {
         }
         last.is_indexed = true;
         self.index.last = Some(last);
-        let data = self.file.read(head.data_at, u64::from(head.data_length))?;
+        let data = read_list(self.file, head.data_at, u64::from(head.data_length))?;
         let mut bytes = Bytes::new(&data);
         while let (Some(time), Some(offset)) = (time(&mut bytes), bytes.u32()) {
             if !self.index.add(self.file, connection, time, last.number, u64::from(offset))? {

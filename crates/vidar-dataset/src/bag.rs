@@ -7,6 +7,7 @@ use crate::draft::{Draft, DraftCamera, DraftDepth};
 use crate::error::DatasetError;
 use crate::location::locate;
 use crate::options::{DatasetKind, OpenOptions, PoseUse};
+use crate::source::read_file_up_to;
 use crate::topics::{self, ImuTopics, problem};
 use crate::transforms::{Frames, rigid};
 use nalgebra::Vector3;
@@ -19,10 +20,14 @@ use vidar_core::{
     Timestamp, Trajectory, Warning,
 };
 
+/// Largest `metadata.yaml`; a real one has about 1 kB and some hundred bytes per topic.
+const MAX_DESCRIPTION_BYTES: u64 = 4 << 20;
+
 /// Looks for a bag in a folder.
 pub(crate) fn detect(path: &Path) -> Option<String> {
-    let described = std::fs::read_to_string(path.join("metadata.yaml"));
-    if described.is_ok_and(|text| text.contains("rosbag2_bagfile_information")) {
+    let described = read_file_up_to(&path.join("metadata.yaml"), MAX_DESCRIPTION_BYTES);
+    let is_bag = |text: Vec<u8>| String::from_utf8_lossy(&text).contains("rosbag2_bagfile_information");
+    if described.is_ok_and(is_bag) {
         return Some("metadata.yaml of a ROS 2 bag".into());
     }
     match vidar_bag::bags_in(path).ok()?.as_slice() {

@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 use vidar_core::remap::RemapTable;
 use vidar_core::{
     CameraId, CameraModel, Duration, FrameId, FrameImage, Image, ImuSample, MetricDepth, Pinhole, Rig, Se3,
-    SpecificForce, Timestamp, Trajectory, Warning,
+    SensorEvent, SpecificForce, Timestamp, Trajectory, Warning,
 };
 
 /// One image of the chosen camera.
@@ -136,12 +136,12 @@ pub const DEPTH_TOLERANCE: Duration = Duration::from_millis(20);
 impl Dataset {
     /// Reads the pixels of an image; its size must be its camera's.
     pub fn load_image(&self, entry: &ImageEntry) -> Result<FrameImage, DatasetError> {
-        let image = self.media.image(&entry.location)?;
-        if let Some(camera) = self.rig.camera(entry.camera) {
-            let expected = (camera.model.width(), camera.model.height());
-            check_size(&entry.location, (image.width(), image.height()), expected)?;
-        }
-        Ok(image)
+        self.media.image_of_size(&entry.location, self.size_of(entry))
+    }
+
+    /// Columns and rows that an image must have: its camera's.
+    pub(crate) fn size_of(&self, entry: &ImageEntry) -> Option<(usize, usize)> {
+        self.rig.camera(entry.camera).map(|camera| (camera.model.width(), camera.model.height()))
     }
 
     /// Reads a depth image as z-depth in metres, NaN where there is none, in the depth camera's pixels; distortion
@@ -175,12 +175,16 @@ impl Dataset {
             .filter(|d| (d.time - time).abs() <= DEPTH_TOLERANCE)
     }
 
-    /// All sensors in the order of time, images loaded when their turn comes.
+    /// All sensors in the order of time, images decoded ahead of their turn ([`Dataset::images_ahead`]).
     ///
     /// At equal times: IMU, ground truth, depth, image; so that everything with an image's time is known when the image arrives.
-    pub fn events(&self) -> impl Iterator<Item = Result<vidar_core::SensorEvent, DatasetError>> + '_ {
-        let mut cursor = EventCursor::default();
-        std::iter::from_fn(move || self.next_event(&mut cursor))
+    pub fn events(&self) -> impl Iterator<Item = Result<SensorEvent, DatasetError>> + '_ {
+        let (mut cursor, mut images) = (EventCursor::default(), self.images_ahead(self.images.iter()));
+        std::iter::from_fn(move || {
+            let pixels =
+                |entry: &ImageEntry| images.next().map_or_else(|| self.load_image(entry), |(_, image)| image);
+            self.event_after(&mut cursor, pixels)
+        })
     }
 
     /// Writes the bytes to hash for a fingerprint of the dataset: name and size of every image and depth image, and every byte
@@ -254,7 +258,7 @@ impl DepthSensor {
     }
 }
 
-fn check_size(
+pub(crate) fn check_size(
     location: &Location,
     found: (usize, usize),
     expected: (usize, usize),

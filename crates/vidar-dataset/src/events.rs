@@ -1,8 +1,8 @@
 //! Merging the sensors of a dataset into one stream in the order of time.
 
-use crate::dataset::Dataset;
+use crate::dataset::{Dataset, ImageEntry};
 use crate::error::DatasetError;
-use vidar_core::{Frame, SensorEvent, StampedPose};
+use vidar_core::{Frame, FrameImage, SensorEvent, StampedPose};
 
 /// How far the stream of a dataset was read; a new one stands before the first event.
 ///
@@ -14,11 +14,21 @@ pub struct EventCursor {
 }
 
 impl Dataset {
-    /// The event at the cursor, which moves past it, also past one that cannot be read; `None` at the end.
+    /// The event at the cursor, which moves past it, also past one that cannot be read; `None` at the end. An image is decoded when it is the
+    /// event; [`Dataset::events`] decodes ahead.
     ///
     /// # Errors
     /// An image or a depth image cannot be read.
     pub fn next_event(&self, cursor: &mut EventCursor) -> Option<Result<SensorEvent, DatasetError>> {
+        self.event_after(cursor, |entry| self.load_image(entry))
+    }
+
+    /// The same with pixels from elsewhere.
+    pub(crate) fn event_after(
+        &self,
+        cursor: &mut EventCursor,
+        pixels: impl FnOnce(&ImageEntry) -> Result<FrameImage, DatasetError>,
+    ) -> Option<Result<SensorEvent, DatasetError>> {
         let truth = self.ground_truth.as_ref().map_or(&[][..], |t| t.poses());
         let [imu, pose, depth, image] = cursor.taken;
         let heads = [
@@ -30,10 +40,15 @@ impl Dataset {
         let (_, sensor) = heads.iter().enumerate().filter_map(|(i, t)| t.map(|t| (t, i))).min()?;
         let index = cursor.taken[sensor];
         cursor.taken[sensor] += 1;
-        Some(self.event(sensor, index))
+        Some(self.event(sensor, index, pixels))
     }
 
-    fn event(&self, sensor: usize, index: usize) -> Result<SensorEvent, DatasetError> {
+    fn event(
+        &self,
+        sensor: usize,
+        index: usize,
+        pixels: impl FnOnce(&ImageEntry) -> Result<FrameImage, DatasetError>,
+    ) -> Result<SensorEvent, DatasetError> {
         Ok(match (sensor, &self.ground_truth) {
             (0, _) => SensorEvent::Imu(self.imu[index]),
             (1, Some(truth)) => {
@@ -46,7 +61,7 @@ impl Dataset {
             }
             _ => {
                 let entry = &self.images[index];
-                let image = self.load_image(entry)?;
+                let image = pixels(entry)?;
                 SensorEvent::Image(Frame {
                     id: entry.frame_id,
                     time: entry.time,

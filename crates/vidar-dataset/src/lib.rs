@@ -1,5 +1,6 @@
 #![doc = include_str!("../README.md")]
 
+mod ahead;
 mod assemble;
 mod bag;
 mod bag_camera;
@@ -38,6 +39,7 @@ mod tum_rgbd;
 mod video;
 mod wrong_thing;
 
+pub use ahead::ImagesAhead;
 pub use camera_flag::{CameraFlag, with_size};
 pub use checks::{gain_error_at_rest, specific_force_at_rest};
 pub use dataset::{
@@ -75,6 +77,9 @@ pub fn open(path: &Path, options: &OpenOptions) -> Result<Dataset, DatasetError>
         }
     }
     let names = folder::names_in(path)?;
+    if let Some(error) = wrong_thing::describe_folder(path, &names) {
+        return Err(error);
+    }
     let shown = names.iter().take(6).map(String::as_str).collect::<Vec<_>>().join(", ");
     let found =
         if names.is_empty() { "an empty folder".into() } else { format!("{} entries: {shown}", names.len()) };

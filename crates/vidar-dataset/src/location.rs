@@ -1,5 +1,6 @@
 //! Where the pixels of an image lie, and how they are read from there.
 
+use crate::dataset::check_size;
 use crate::decode::{self, ImageLimits};
 use crate::error::{DatasetError, io_error};
 use std::fmt;
@@ -112,6 +113,22 @@ impl StoredDepth {
 }
 
 impl Media {
+    /// Whether pictures come from a decoder one after the other.
+    pub(crate) fn is_video(&self) -> bool {
+        self.video.is_some() || self.stream.is_some()
+    }
+
+    /// Decodes a grey or colour image, whose size must be the expected one.
+    pub(crate) fn image_of_size(
+        &self,
+        location: &Location,
+        expected: Option<(usize, usize)>,
+    ) -> Result<FrameImage, DatasetError> {
+        let image = self.image(location)?;
+        expected.map_or(Ok(()), |size| check_size(location, (image.width(), image.height()), size))?;
+        Ok(image)
+    }
+
     /// Decodes a grey or colour image.
     pub(crate) fn image(&self, location: &Location) -> Result<FrameImage, DatasetError> {
         if let Location::Frame { number, .. } = location {

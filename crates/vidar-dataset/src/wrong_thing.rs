@@ -81,6 +81,36 @@ pub(crate) fn describe(path: &Path, head: &[u8]) -> DatasetError {
     wrong(path, found.into(), way)
 }
 
+/// Why a folder with these entries is no recording, where they show it.
+pub(crate) fn describe_folder(path: &Path, names: &[String]) -> Option<DatasetError> {
+    let ending_with = |endings: &[&str]| -> Vec<&str> {
+        let is_one = |n: &&str| endings.iter().any(|e| n.to_ascii_lowercase().ends_with(e));
+        names.iter().map(String::as_str).filter(|n| !n.starts_with('.')).filter(is_one).collect()
+    };
+    let several = |files: &[&str]| {
+        let more = if files.len() > 3 { ", …" } else { "" };
+        format!("{}{more}", files[..files.len().min(3)].join(", "))
+    };
+    let (pictures, videos) = (ending_with(&[".heic", ".heif"]), ending_with(&[".mp4", ".mov", ".m4v"]));
+    let archives = ending_with(&[".zip", ".7z", ".rar", ".tar", ".gz", ".tgz", ".xz", ".bz2", ".zst"]);
+    let (found, way) = match (pictures.len(), videos.len(), archives.len()) {
+        (1.., 0, _) => (
+            format!("{} HEIC images ({}), which are not decoded", pictures.len(), several(&pictures)),
+            "export them as JPEG: on a phone choose \"most compatible\" as the camera's format",
+        ),
+        (_, 2.., _) => (
+            format!("{} videos ({})", videos.len(), several(&videos)),
+            "each is a recording of its own: give one of them",
+        ),
+        (0, 0, 1..) => (
+            format!("a folder with an archive ({})", several(&archives)),
+            "unpack it, then give the folder or file inside",
+        ),
+        _ => return None,
+    };
+    Some(wrong(path, found, way))
+}
+
 /// Whether a file may be a video that the user's own program reads: Matroska and WebM, AVI, MPEG's streams, and containers that begin
 /// like nothing known.
 pub(crate) fn may_be_video(head: &[u8]) -> bool {

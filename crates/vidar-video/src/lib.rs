@@ -4,6 +4,7 @@ mod boxes;
 mod codec;
 mod error;
 mod ffmpeg;
+mod fragments;
 mod gpmf;
 #[cfg(feature = "h265")]
 mod h265;

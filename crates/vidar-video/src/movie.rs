@@ -2,6 +2,7 @@
 
 use crate::boxes::{self, find};
 use crate::error::VideoError;
+use crate::fragments::{Fragments, MAX_MOOF_BYTES};
 use crate::lane::AccessUnits;
 use crate::pictures::Unit;
 use crate::track::{self, Sample, Track};
@@ -70,7 +71,7 @@ impl Movie {
         let failed = |source| VideoError::Io { path: path.to_path_buf(), source };
         let mut file = File::open(path).map_err(failed)?;
         let length = file.metadata().map_err(failed)?.len();
-        let moov = read_moov(&mut file, length, path)?;
+        let (moov, moov_end) = read_moov(&mut file, length, path)?;
         let malformed = |found: String| VideoError::Malformed {
             path: path.to_path_buf(),
             found,
@@ -88,18 +89,16 @@ impl Movie {
         let Some(video) = tracks.iter().position(is_it) else {
             return Err(malformed(problem.unwrap_or_else(|| "a movie without a video track".into())));
         };
-        if tracks[video].samples.is_empty() {
-            let is_fragmented = find(&moov, b"mvex").is_some();
-            let (found, way) = match is_fragmented {
-                true => (
-                    "a fragmented mp4",
-                    "repack it without loss: ffmpeg -i IN -c copy OUT.mp4 (or --decoder ffmpeg)",
-                ),
-                false => ("a video track without pictures", "the recorder stopped before its first picture"),
-            };
-            return Err(unsupported(path, found.into(), way));
-        }
         let mut warnings = Vec::new();
+        if let Some(fragments) = Fragments::announced(&moov, &mut tracks, length) {
+            let broken = read_fragments(&mut file, (moov_end, length), fragments).map_err(failed)?;
+            warnings
+                .extend(broken.map(|message| Warning::degraded("video-cut-off", message).at(path.display())));
+        }
+        if tracks[video].samples.is_empty() {
+            let found = "a video track without pictures";
+            return Err(unsupported(path, found.into(), "the recorder stopped before its first picture"));
+        }
         let frames = shown_frames(&mut tracks[video], length, path, &mut warnings);
         if frames.is_empty() {
             return Err(malformed(
@@ -118,34 +117,80 @@ impl Movie {
     }
 }
 
-/// The content of the box `moov`.
-fn read_moov(file: &mut File, length: u64, path: &Path) -> Result<Vec<u8>, VideoError> {
+/// Kind, length of the head and end of the box that begins at `at`; `None` where it is not whole.
+fn box_at(file: &mut File, at: u64, length: u64) -> std::io::Result<Option<([u8; 4], u64, u64)>> {
+    let mut head = [0; 16];
+    let held = (length - at).min(16) as usize;
+    file.seek(SeekFrom::Start(at))?;
+    file.read_exact(&mut head[..held])?;
+    let Some((kind, head_bytes, box_bytes)) = boxes::head(&head[..held]) else { return Ok(None) };
+    let box_bytes = if box_bytes == 0 { length - at } else { box_bytes };
+    let end = at.checked_add(box_bytes).filter(|&end| end <= length && at + head_bytes as u64 <= end);
+    Ok(end.map(|end| (kind, head_bytes as u64, end)))
+}
+
+/// The bytes from `from` to `end`, of which the caller has checked how many there are.
+fn content(file: &mut File, from: u64, end: u64) -> std::io::Result<Vec<u8>> {
+    let mut bytes = vec![0; (end - from) as usize];
+    file.seek(SeekFrom::Start(from))?;
+    file.read_exact(&mut bytes)?;
+    Ok(bytes)
+}
+
+/// The content of the box `moov`, and where it ends.
+fn read_moov(file: &mut File, length: u64, path: &Path) -> Result<(Vec<u8>, u64), VideoError> {
     let failed = |source| VideoError::Io { path: path.to_path_buf(), source };
     let mut at = 0;
     while at < length {
-        let mut head = [0; 16];
-        let held = (length - at).min(16) as usize;
-        file.seek(SeekFrom::Start(at)).map_err(failed)?;
-        file.read_exact(&mut head[..held]).map_err(failed)?;
-        let Some((kind, head_bytes, box_bytes)) = boxes::head(&head[..held]) else { break };
-        let box_bytes = if box_bytes == 0 { length - at } else { box_bytes };
-        let Some(end) = at.checked_add(box_bytes).filter(|&e| e <= length) else { break };
+        let Some((kind, head_bytes, end)) = box_at(file, at, length).map_err(failed)? else { break };
         if kind == *b"moov" {
-            if box_bytes > MAX_MOOV_BYTES {
-                let found = format!("a table of {box_bytes} bytes");
+            if end - at > MAX_MOOV_BYTES {
+                let found = format!("a table of {} bytes", end - at);
                 let expected = format!("at most {MAX_MOOV_BYTES} bytes");
                 return Err(VideoError::Malformed { path: path.to_path_buf(), found, expected });
             }
-            file.seek(SeekFrom::Start(at + head_bytes as u64)).map_err(failed)?;
-            let mut moov = vec![0; box_bytes as usize - head_bytes];
-            file.read_exact(&mut moov).map_err(failed)?;
-            return Ok(moov);
+            return Ok((content(file, at + head_bytes, end).map_err(failed)?, end));
         }
         at = end;
     }
     let found = "a video without its table (moov), which the camera writes last: the recording was cut off";
     let way = "a program such as untrunc rebuilds the table with another video of the same camera";
     Err(unsupported(path, found.into(), way))
+}
+
+/// Takes the fragments from `at` on; gives what is to be said where they end before the file does. Pictures that a fragment lists beyond the
+/// end of the file are told apart later.
+fn read_fragments(
+    file: &mut File,
+    (mut at, length): (u64, u64),
+    mut fragments: Fragments<'_>,
+) -> std::io::Result<Option<String>> {
+    while at < length {
+        // The pictures of the last fragment may be cut off, which their places show.
+        let Some((kind, head_bytes, end)) = box_at(file, at, length)? else {
+            let mut kind = [0; 4];
+            file.seek(SeekFrom::Start((at + 4).min(length)))?;
+            let is_named = file.read_exact(&mut kind).is_ok();
+            let lost = format!(
+                "the file is cut off in the table of a fragment at byte {at}; it is read up to there"
+            );
+            return Ok((!is_named || kind == *b"moof").then_some(lost));
+        };
+        if kind == *b"moof" {
+            let added = match end - at {
+                bytes if bytes > MAX_MOOF_BYTES => Err(format!("it has {bytes} bytes")),
+                _ => fragments.add(&content(file, at + head_bytes, end)?, at),
+            };
+            if let Err(reason) = added {
+                let message = format!(
+                    "the table of the fragment at byte {at} is damaged ({reason}); the video is read up to it"
+                );
+                return Ok(Some(message));
+            }
+        }
+        at = end;
+    }
+    Ok(None)
 }
 
 /// The frames that are shown, in the order of display. Pictures outside of the file are left out, with a warning.
@@ -157,12 +202,12 @@ fn shown_frames(track: &mut Track, length: u64, path: &Path, warnings: &mut Vec<
         warnings.push(Warning::degraded("video-cut-off", message).at(path.display()));
         track.samples.truncate(whole);
     }
-    if track.has_complex_edits {
+    if track.edits.is_complex {
         let message =
             "the edit list has several parts or another speed; the video is read as it was recorded";
         warnings.push(Warning::new("video-edits", message).at(path.display()));
     }
-    let shown = track.samples.iter().enumerate().filter(|(_, s)| s.time_ns >= track.shown_from_ns);
+    let shown = track.samples.iter().enumerate().filter(|(_, s)| s.time_ns >= track.edits.empty_ns);
     let mut frames: Vec<Frame> =
         shown.map(|(sample, s)| Frame { time: Timestamp::from_nanos(s.time_ns), sample }).collect();
     frames.sort_by_key(|f| f.time);

@@ -15,8 +15,10 @@ pub(crate) struct Sample {
 }
 
 /// One track.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Default)]
 pub(crate) struct Track {
+    /// Its number in the movie.
+    pub id: u32,
     /// `vide`, `soun`, `meta`, ….
     pub handler: [u8; 4],
     /// `avc1`, `hvc1`, `gpmd`, ….
@@ -29,9 +31,26 @@ pub(crate) struct Track {
     pub quarter_turns: u8,
     /// In the order of decoding.
     pub samples: Vec<Sample>,
-    /// Samples before this time are decoded and not shown.
-    pub shown_from_ns: i64,
-    pub has_complex_edits: bool,
+    pub edits: Edits,
+    /// Ticks a second.
+    pub scale: u32,
+    /// Decoding time of the sample after the last one, ticks.
+    pub next_ticks: i64,
+}
+
+impl Track {
+    /// Adds a sample behind the others, `shift` ticks after its decoding shown, and for so many ticks.
+    pub(crate) fn push(&mut self, mut sample: Sample, shift: i64, duration: u32) -> Result<(), String> {
+        if self.samples.len() as u64 == MAX_SAMPLES {
+            return Err(format!("more than {MAX_SAMPLES} samples of a track"));
+        }
+        let scale = i64::from(self.scale.max(1));
+        sample.time_ns = self.edits.time_ns(self.next_ticks.saturating_add(shift), scale);
+        sample.duration_ns = (i128::from(duration) * 1_000_000_000 / i128::from(scale)) as i64;
+        self.next_ticks = self.next_ticks.saturating_add(i64::from(duration));
+        self.samples.push(sample);
+        Ok(())
+    }
 }
 
 /// Most samples of a track: ten hours at 1 kHz.
@@ -47,7 +66,7 @@ pub(crate) fn read(trak: &[u8], movie_scale: u32) -> Result<Track, String> {
     let scale = find(mdia, b"mdhd").and_then(time_scale).filter(|&s| s > 0).ok_or_else(need("mdhd"))?;
     let stbl = find_in(mdia, &[b"minf", b"stbl"]).ok_or_else(need("stbl"))?;
     let entry = find(stbl, b"stsd").and_then(|b| atoms(b.get(8..)?).next()).ok_or_else(need("stsd"))?;
-    let edits = Edits::read(trak, movie_scale, scale);
+    let header = find(trak, b"tkhd").unwrap_or_default();
     let tables = Tables {
         sizes: find(stbl, b"stsz").ok_or_else(need("stsz"))?,
         chunks: find(stbl, b"stsc").ok_or_else(need("stsc"))?,
@@ -56,17 +75,20 @@ pub(crate) fn read(trak: &[u8], movie_scale: u32) -> Result<Track, String> {
         shifts: find(stbl, b"ctts"),
         syncs: find(stbl, b"stss"),
     };
-    let samples = tables.samples(|ticks| edits.time_ns(ticks), i64::from(scale))?;
-    Ok(Track {
+    let mut track = Track {
+        id: u32_at(header, if header.first() == Some(&1) { 20 } else { 12 }).unwrap_or(0),
         handler,
         codec: entry.kind,
         entry: entry.content.get(VISUAL_ENTRY_BYTES..).unwrap_or_default().to_vec(),
         size: (side_at(entry.content, 24), side_at(entry.content, 26)),
-        quarter_turns: find(trak, b"tkhd").map_or(0, quarter_turns),
-        samples,
-        shown_from_ns: edits.empty_ns,
-        has_complex_edits: edits.is_complex,
-    })
+        quarter_turns: quarter_turns(header),
+        samples: Vec::new(),
+        edits: Edits::read(trak, movie_scale),
+        scale,
+        next_ticks: 0,
+    };
+    tables.fill(&mut track)?;
+    Ok(track)
 }
 
 /// A side of a visual sample entry; 0 where there is none.
@@ -92,16 +114,18 @@ fn quarter_turns(header: &[u8]) -> u8 {
 }
 
 /// What an edit list says: an empty beginning, and which media time is shown first.
-struct Edits {
-    empty_ns: i64,
+#[derive(Clone, Copy, Debug, Default)]
+pub(crate) struct Edits {
+    /// Samples before this time are decoded and not shown.
+    pub empty_ns: i64,
     first_ticks: i64,
-    scale: i64,
-    is_complex: bool,
+    /// Whether it says more, which is not followed.
+    pub is_complex: bool,
 }
 
 impl Edits {
-    fn read(trak: &[u8], movie_scale: u32, scale: u32) -> Self {
-        let mut edits = Self { empty_ns: 0, first_ticks: 0, scale: i64::from(scale), is_complex: false };
+    fn read(trak: &[u8], movie_scale: u32) -> Self {
+        let mut edits = Self::default();
         let Some(list) = find_in(trak, &[b"edts", b"elst"]) else { return edits };
         let is_long = list.first() == Some(&1);
         let (count, step) = (u32_at(list, 4).unwrap_or(0) as usize, if is_long { 20 } else { 12 });
@@ -127,8 +151,8 @@ impl Edits {
         edits
     }
 
-    fn time_ns(&self, ticks: i64) -> i64 {
-        let ns = (i128::from(ticks) - i128::from(self.first_ticks)) * 1_000_000_000 / i128::from(self.scale);
+    fn time_ns(&self, ticks: i64, scale: i64) -> i64 {
+        let ns = (i128::from(ticks) - i128::from(self.first_ticks)) * 1_000_000_000 / i128::from(scale);
         i64::try_from(ns).unwrap_or(i64::MAX).saturating_add(self.empty_ns)
     }
 }
@@ -145,7 +169,7 @@ struct Tables<'a> {
 }
 
 impl Tables<'_> {
-    fn samples(&self, time_ns: impl Fn(i64) -> i64, scale: i64) -> Result<Vec<Sample>, String> {
+    fn fill(&self, track: &mut Track) -> Result<(), String> {
         let one_size = u32_at(self.sizes, 4).unwrap_or(0);
         let count = u64::from(u32_at(self.sizes, 8).unwrap_or(0));
         // Sizes of their own take four bytes each in the file; one size for all takes none, so the limit holds.
@@ -155,22 +179,21 @@ impl Tables<'_> {
                 "{count} samples announced, {held} sizes held; at most {MAX_SAMPLES} are read"
             ));
         }
-        let mut places = self.places(count, one_size)?;
+        let places = self.places(count, one_size)?;
         let (mut durations, mut shifts) = (Runs::new(Some(self.durations)), Runs::new(self.shifts));
-        let (mut ticks, mut next_sync) = (0i64, 0usize);
-        for (number, sample) in places.iter_mut().enumerate() {
+        let mut next_sync = 0usize;
+        track.samples.reserve_exact(places.len());
+        for (number, mut sample) in places.into_iter().enumerate() {
             let duration = durations.next().unwrap_or(0);
             // Version 0 counts shifts without sign; writers use negative ones in both versions.
             let shift = i64::from(shifts.next().unwrap_or(0) as i32);
-            sample.time_ns = time_ns(ticks.saturating_add(shift));
-            sample.duration_ns = (i128::from(duration) * 1_000_000_000 / i128::from(scale)) as i64;
-            ticks = ticks.saturating_add(i64::from(duration));
             if let Some(syncs) = self.syncs {
                 sample.is_sync = u32_at(syncs, 8 + 4 * next_sync) == u32::try_from(number + 1).ok();
                 next_sync += usize::from(sample.is_sync);
             }
+            track.push(sample, shift, duration)?;
         }
-        Ok(places)
+        Ok(())
     }
 
     /// Offsets and sizes.

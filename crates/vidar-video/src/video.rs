@@ -65,7 +65,7 @@ impl Video {
         let failed = |source| VideoError::Io { path: path.to_path_buf(), source };
         let mut head = [0; 8];
         let read = std::fs::File::open(path).and_then(|mut f| f.read(&mut head)).map_err(failed)?;
-        // A movie in fragments has no tables, which the program does without.
+        // The program does without tables that are missing or damaged.
         let mut movie = if is_video(&head[..read]) { Movie::open(path).ok() } else { None };
         let frames = match &mut movie {
             Some(movie) => std::mem::take(&mut movie.frames),

@@ -7,6 +7,7 @@
 //! - [`plot_lines`], [`plot_histogram`], [`plot_bars`]: errors over time, distributions, timings.
 //! - [`depth_picture`], [`confidence_picture`], [`side_by_side`]: output of the geometry stage.
 //! - [`render_map`]: a mesh or a cloud from a [`MapCamera`], by a software rasteriser.
+//! - [`encode_view`]: maps to turn, walk through and measure in, drawn by WebGL in the page.
 //! - [`render_html`]: a [`Report`] as one self-contained file.
 //!
 //! Plots and pictures never fail and never panic: values that are not finite are skipped, an empty input gives
@@ -17,6 +18,8 @@ mod canvas;
 mod chart;
 mod colormap;
 mod error;
+mod escape;
+mod interactive;
 mod lines;
 mod map;
 mod picture;
@@ -30,6 +33,10 @@ mod top_down;
 pub use chart::{BarGroup, BarPlot, Histogram, plot_bars, plot_histogram};
 pub use colormap::ColorMap;
 pub use error::ViewError;
+pub use interactive::{
+    DepthThumbnail, EncodedView, Field, FieldKind, FieldValues, InteractiveView, Pane, PanePath, PaneScale,
+    PanesShown, PathRole, PosedThumbnail, depth_thumbnail, encode_view,
+};
 pub use lines::{AxisSpec, LinePlot, Mark, ReferenceLine, Series, plot_lines};
 pub use map::camera::{BackFaces, Cut, MapCamera, Projection, Viewpoint, up_of_world};
 pub use map::{MapSurface, Shading, render_map, render_map_with_path};

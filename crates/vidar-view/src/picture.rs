@@ -33,7 +33,7 @@ pub fn confidence_picture(confidence: &Image<f32>) -> Picture {
 }
 
 /// 1st and 99th percentile of the valid values, opened where they coincide.
-fn robust_range(image: &Image<f32>, valid: impl Fn(f32) -> bool) -> (f32, f32) {
+pub(crate) fn robust_range(image: &Image<f32>, valid: impl Fn(f32) -> bool) -> (f32, f32) {
     // A million samples are enough for a percentile.
     let stride = (image.data().len() / 1_000_000).max(1);
     let mut values: Vec<f32> = image.data().iter().step_by(stride).copied().filter(|&v| valid(v)).collect();

@@ -1,7 +1,9 @@
-//! The report of one run as one self-contained HTML file: no network, no script, no font.
+//! The report of one run as one self-contained HTML file: no network, no font, and no script but that of the view.
 
 mod style;
 
+use crate::escape::escaped;
+use crate::interactive::{EncodedView, page};
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
 use std::fmt::Write;
@@ -98,6 +100,8 @@ pub struct Report {
     pub assessment: Option<Assessment>,
     /// The most important numbers.
     pub summary: Vec<SummaryItem>,
+    /// The map in three dimensions, before the sections.
+    pub view: Option<EncodedView>,
     /// The parts, in the order of reading.
     pub sections: Vec<Section>,
     /// Warnings.
@@ -109,37 +113,30 @@ pub struct Report {
 /// The report as one self-contained HTML file. All text is escaped, all pictures are inside.
 pub fn render_html(report: &Report) -> String {
     let pictures: usize = report.sections.iter().flat_map(|s| &s.figures).map(|f| f.png.len()).sum();
-    let mut html = String::with_capacity(pictures * 4 / 3 + 32 * 1024);
+    let view = report.view.as_ref().map_or(0, EncodedView::size_bytes);
+    let mut html = String::with_capacity(pictures * 4 / 3 + view + 128 * 1024);
     push_head(&mut html, report);
     push_summary(&mut html, report);
     push_warnings(&mut html, &report.warnings);
     push_contents(&mut html, &report.sections);
+    if let Some(view) = &report.view {
+        page::push_section(&mut html, view);
+    }
     for (i, section) in report.sections.iter().enumerate() {
         push_section(&mut html, i, section);
     }
     push_provenance(&mut html, &report.provenance);
-    html.push_str("</main>\n</body>\n</html>\n");
+    html.push_str("</main>\n");
+    if let Some(view) = &report.view {
+        page::push_scripts(&mut html, view);
+    }
+    html.push_str("</body>\n</html>\n");
     html
 }
 
-/// Text for HTML content and for attributes in double quotes.
-fn escaped(text: &str) -> String {
-    let text = vidar_core::printable_lines(text);
-    let mut out = String::with_capacity(text.len());
-    for c in text.chars() {
-        match c {
-            '&' => out.push_str("&amp;"),
-            '<' => out.push_str("&lt;"),
-            '>' => out.push_str("&gt;"),
-            '"' => out.push_str("&quot;"),
-            '\'' => out.push_str("&#39;"),
-            // Not allowed in HTML; would make the file invalid.
-            c if c.is_control() && !matches!(c, '\n' | '\t') => out.push('\u{fffd}'),
-            c => out.push(c),
-        }
-    }
-    out
-}
+/// The page may load nothing, from anywhere: browsers enforce it.
+const POLICY: &str =
+    "default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'";
 
 /// Writing to a `String` cannot fail.
 macro_rules! put {
@@ -152,9 +149,11 @@ fn push_head(html: &mut String, report: &Report) {
         html,
         "<!DOCTYPE html>\n<html lang=\"en\">\n<head>\n<meta charset=\"utf-8\">\n\
          <meta name=\"viewport\" content=\"width=device-width, initial-scale=1\">\n\
+         <meta http-equiv=\"Content-Security-Policy\" content=\"{POLICY}\">\n\
          <meta name=\"color-scheme\" content=\"light dark\">\n<title>{title}</title>\n\
-         <style>\n{}</style>\n</head>\n<body>\n<main>\n<header>\n<h1>{title}</h1>\n",
-        style::CSS
+         <style>\n{}{}</style>\n</head>\n<body>\n<main>\n<header>\n<h1>{title}</h1>\n",
+        style::CSS,
+        report.view.as_ref().map_or("", |_| page::CSS),
     );
     if !report.subtitle.is_empty() {
         put!(html, "<p class=\"subtitle\">{}</p>\n", escaped(&report.subtitle));

@@ -393,8 +393,9 @@ impl Error {
                 "give --calibration FILE (EuRoC sensor.yaml, Kalibr camchain) or --camera-model pinhole:fx,fy,cx,cy"
             }
             Self::ImagesAlone { .. } => {
-                "`vidar depth PATH` estimates depth; a metric map needs --camera-model pinhole:fx,fy,cx,cy (or --calibration \
-                 FILE) and the poses of another odometry with --trajectory FILE"
+                "`vidar depth PATH` estimates depth; `vidar run PATH --mode pose-free --geometry da3-nano` makes a map of it in a unit \
+                 of its own; a metric map needs --camera-model pinhole:fx,fy,cx,cy (or --calibration FILE) and the poses of another \
+                 odometry with --trajectory FILE"
             }
             Self::NoOdometry { .. } => {
                 "move sideways at the start; `vidar odometry PATH` writes the state at every image to odometry/health.csv"

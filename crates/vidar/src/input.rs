@@ -14,7 +14,7 @@ use vidar_align::CouplingMode;
 use vidar_core::{
     BodyFrame, CameraId, Duration, Frame, FrameImage, SensorEvent, StampedPose, Trajectory, Warning,
 };
-use vidar_dataset::{Dataset, DatasetError, ImageEntry, OpenOptions};
+use vidar_dataset::{CalibrationSource, Dataset, DatasetError, ImageEntry, OpenOptions};
 use vidar_odometry::bundle_adjustment::Adjusted;
 
 /// Where the metric poses of a run come from.
@@ -84,9 +84,12 @@ impl PosePlan {
         let in_use = |(trajectory, source): (&Trajectory, TrajectorySource)| {
             Ok::<_, Error>(MetricTrajectory { source, camera_trajectory: in_camera(trajectory, dataset)? })
         };
-        let has_imu = dataset.rig.imu.is_some() && !dataset.imu.is_empty();
+        // Odometry of a guessed camera leads nowhere; what is not metric does without.
+        let is_usable = mode.uses_pose_priors() || dataset.calibration != CalibrationSource::Guessed;
+        let has_imu = dataset.rig.imu.is_some() && !dataset.imu.is_empty() && is_usable;
         let given = match choice {
-            PoseChoice::Odometry => return Ok(Self::Odometry { fallback: None }),
+            PoseChoice::Odometry if is_usable => return Ok(Self::Odometry { fallback: None }),
+            PoseChoice::Odometry => None,
             PoseChoice::Auto if external.is_none() && has_imu => {
                 return Ok(Self::Odometry { fallback: truth.map(in_use).transpose()? });
             }
@@ -161,7 +164,7 @@ pub(crate) fn fingerprint(dataset: &Dataset) -> Result<String, Error> {
     Ok(vidar_hub::hex(&hash.finalize()))
 }
 
-/// A recording as the engine takes it: IMU samples and images in the order of time, each image decoded when its turn comes.
+/// A recording as the engine takes it: IMU samples and images in the order of time, the next images decoded ahead of their turn.
 /// An image that cannot be read comes as its time alone, with a warning.
 pub enum Measurement {
     /// A measurement, whole.
@@ -176,6 +179,7 @@ pub enum Measurement {
 pub fn measurements(dataset: &Dataset, sensors: bool) -> impl Iterator<Item = Measurement> + '_ {
     let mut imu = if sensors { dataset.imu.as_slice() } else { &[] }.iter().peekable();
     let mut images = dataset.images.iter().peekable();
+    let mut pixels = dataset.images_ahead(dataset.images.iter());
     std::iter::from_fn(move || {
         let image_time = images.peek().map(|i| i.time);
         // At equal times the IMU comes first.
@@ -187,7 +191,7 @@ pub fn measurements(dataset: &Dataset, sensors: bool) -> impl Iterator<Item = Me
         if !sensors {
             return Some(Measurement::Stamp(stamp));
         }
-        Some(match dataset.load_image(entry) {
+        Some(match pixels.next().map_or_else(|| dataset.load_image(entry), |(_, image)| image) {
             Ok(image) => {
                 let FrameStamp { frame_id: id, time, camera } = stamp;
                 Measurement::Event(SensorEvent::Image(Frame { id, time, camera, image }))
@@ -263,7 +267,7 @@ pub fn open_dataset(path: &Path, options: &OpenOptions, config: &Config) -> Resu
 
 /// Whether the adjustment of a recording that calibrated itself leaves so much of the IMU that its calibration may be wrong.
 pub(crate) fn leaves_calibration_unchecked(dataset: &Dataset, adjusted: &Adjusted) -> bool {
-    dataset.calibration == vidar_dataset::CalibrationSource::Recording
+    dataset.calibration == CalibrationSource::Recording
         && adjusted.report.inertial_chi2_per_dof > MAX_SELF_CALIBRATED_CHI2
 }
 
@@ -292,7 +296,7 @@ impl UnseenScale {
         Self {
             sensors: config.input.imu_scale_std.max(at_rest),
             calibration: config.input.calibration_scale_std,
-            is_self_calibrated: dataset.calibration == vidar_dataset::CalibrationSource::Recording,
+            is_self_calibrated: dataset.calibration == CalibrationSource::Recording,
         }
     }
 
@@ -356,15 +360,18 @@ fn unit_slip(image: vidar_core::Timestamp, pose: vidar_core::Timestamp) -> Optio
     known.into_iter().find(|(decades, _)| near(*decades)).map(|(_, words)| words)
 }
 
+/// Whether a run needs the camera's calibration: depth alone comes with a camera of the network's, in a unit of its own.
+pub(crate) fn needs_calibration(config: &Config) -> bool {
+    config.coupling.mode.uses_pose_priors()
+}
+
 /// Refuses a camera that is only guessed: it would bend every surface and still look metric.
 pub fn require_calibration(dataset: &Dataset) -> Result<(), Error> {
     match dataset.calibration {
-        vidar_dataset::CalibrationSource::Guessed
-            if dataset.imu.is_empty() && dataset.external_trajectory.is_none() =>
-        {
+        CalibrationSource::Guessed if dataset.imu.is_empty() && dataset.external_trajectory.is_none() => {
             Err(Error::ImagesAlone { name: dataset.name.clone() })
         }
-        vidar_dataset::CalibrationSource::Guessed => Err(Error::NoCalibration { name: dataset.name.clone() }),
+        CalibrationSource::Guessed => Err(Error::NoCalibration { name: dataset.name.clone() }),
         _ => Ok(()),
     }
 }

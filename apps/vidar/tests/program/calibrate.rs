@@ -82,6 +82,52 @@ fn a_wrong_calibration_is_contradicted() {
     assert!(ran.stdout.contains("contradicts"), "{}", ran.stdout);
 }
 
+/// The phone's gyroscope through `turn`, everything else as it is.
+fn with_gyroscope(folder: &Path, turn: impl Fn([f64; 3]) -> [f64; 3]) -> PathBuf {
+    let sequence = folder.join("turned");
+    let copy = |from: &Path, to: &Path| {
+        std::fs::create_dir_all(to).unwrap();
+        for entry in std::fs::read_dir(from).unwrap().map(Result::unwrap).filter(|e| e.path().is_file()) {
+            std::fs::copy(entry.path(), to.join(entry.file_name())).unwrap();
+        }
+    };
+    for part in ["mav0", "mav0/cam0", "mav0/cam0/data", "mav0/imu0"] {
+        copy(&phone().join(part), &sequence.join(part));
+    }
+    let table = sequence.join("mav0/imu0/data.csv");
+    let turned = |line: &str| {
+        let fields: Vec<&str> = line.split(',').collect();
+        let Ok(rates) = fields[1..4].iter().map(|f| f.parse()).collect::<Result<Vec<f64>, _>>() else {
+            return line.to_owned();
+        };
+        let [x, y, z] = turn([rates[0], rates[1], rates[2]]);
+        format!("{},{x},{y},{z},{}", fields[0], fields[4..].join(","))
+    };
+    let text: Vec<String> = std::fs::read_to_string(&table).unwrap().lines().map(turned).collect();
+    std::fs::write(&table, text.join("\n") + "\n").unwrap();
+    sequence
+}
+
+#[test]
+fn a_gyroscope_whose_axes_are_not_right_handed_is_contradicted_by_the_images() {
+    let folder = tempfile::tempdir().unwrap();
+    for (name, turn) in [("mirrored", [1.0, 1.0, -1.0]), ("reversed", [-1.0, -1.0, -1.0])] {
+        let sequence =
+            with_gyroscope(&folder.path().join(name), |[x, y, z]| [x * turn[0], y * turn[1], z * turn[2]]);
+        let told = vidar(&["calibrate", sequence.to_str().unwrap()]).ends_with(1);
+        told.says(&[
+            "error[E0208]",
+            "the gyroscope contradicts the images",
+            "not right-handed",
+            "opposite signs",
+        ]);
+    }
+    // Axes in another order are right-handed: the camera's rotation on the IMU is another one, and the rest is as it was.
+    let sequence = with_gyroscope(&folder.path().join("renamed"), |[x, y, z]| [z, x, y]);
+    let found = vidar(&["calibrate", sequence.to_str().unwrap(), "--json", "-q"]).ends_with(0).json();
+    check(&found["focal_px"], 330.0, 0.02 * 330.0);
+}
+
 #[test]
 fn odometry_calibrates_by_itself_and_says_so() {
     let out = shared().root.join("odometry without calibration");

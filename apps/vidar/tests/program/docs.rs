@@ -104,8 +104,18 @@ fn every_example_in_help_parses_and_every_verb_that_takes_something_has_examples
     for example in &examples {
         parses(&words(example)).unwrap_or_else(|e| panic!("`vidar {example}`: {e}"));
     }
-    for verb in ["run", "demo", "inspect", "convert", "eval", "export", "synth", "config explain", "explain"]
-    {
+    for verb in [
+        "run",
+        "demo",
+        "inspect",
+        "convert",
+        "eval",
+        "export",
+        "compare",
+        "synth",
+        "config explain",
+        "explain",
+    ] {
         assert!(examples.iter().any(|e| e.starts_with(verb)), "{verb} has no example");
     }
 }

@@ -5,6 +5,7 @@
 mod auto;
 mod bench;
 mod calibrate;
+mod compare;
 mod config;
 mod convert;
 mod coupling;
@@ -22,6 +23,7 @@ mod odometry;
 mod photos;
 mod quality;
 mod recordings;
+mod release;
 mod resume;
 mod support;
 mod trust;

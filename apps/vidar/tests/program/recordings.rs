@@ -33,7 +33,7 @@ fn bags_of_every_kind_are_inspected() {
 fn a_topic_that_is_not_there_lists_those_that_are() {
     inspect(&bag("ros2_mcap"), &["--topic", "/cam9"]).ends_with(1).says(&[
         "/cam9",
-        "/cam0/image_raw  sensor_msgs/Image  3",
+        "its topics:\n  /cam0/camera_info  sensor_msgs/CameraInfo  1\n  /cam0/image_raw  sensor_msgs/Image  3\n",
         "--topic NAME",
     ]);
     inspect(&bag("ros2_mcap"), &["--topic", "of=/truth"]).ends_with(2).says(&["trajectory=NAME"]);
@@ -43,11 +43,26 @@ fn a_topic_that_is_not_there_lists_those_that_are() {
 fn a_video_is_a_recording_of_images() {
     let told = inspect(&clip("h264.mp4"), &[]).ends_with(0);
     assert!(told.stdout.contains("15") && told.stdout.contains("25.0 Hz"), "{}", told.stdout);
+    let told = inspect(&clip("fragmented.mp4"), &[]).ends_with(0);
+    assert!(told.stdout.contains("15") && told.stdout.contains("25.0 Hz"), "{}", told.stdout);
     // Without an IMU there is no scale; the message says what there is instead.
     for verb in ["odometry", "run"] {
         let words = ["E0208", "nor an IMU", "vidar depth", "--trajectory"];
         vidar(&[verb.as_ref(), clip("h264.mp4").as_os_str()]).ends_with(1).says(&words);
     }
+    vidar(&["run".as_ref(), clip("h264.mp4").as_os_str()]).says(&["--mode pose-free --geometry da3-nano"]);
+}
+
+#[test]
+fn a_video_without_calibration_is_mapped_pose_free_in_a_unit_of_its_own() {
+    let folder = tempfile::tempdir().unwrap();
+    let clip = clip("h264.mp4");
+    let args =
+        ["run", clip.to_str().unwrap(), "--mode", "pose-free", "--geometry", "da3-nano", "--stride", "3"];
+    let told = vidar_in(folder.path(), &[&args[..], &["-o", "map"]].concat());
+    // Sixty-four pixels of a test pattern show no room: the map may be empty, and says so; it is never refused for its camera.
+    assert!(matches!(told.code, 0 | 3) && !told.stderr.contains("E0208"), "{} {}", told.code, told.stderr);
+    assert!(told.stdout.contains("arbitrary"), "{}", told.stdout);
 }
 
 #[test]
@@ -68,6 +83,16 @@ fn what_is_given_by_mistake_is_named_with_the_nearest_way() {
         vidar_in(&folder, &["inspect", name]).ends_with(1).says(&words);
     }
     vidar_in(&folder, &["run", "https://example.org/flight.bag"]).ends_with(1).says(&["URL", "download"]);
+    for (folder_name, files, words) in [
+        ("photos", &["IMG_1.HEIC", "IMG_2.HEIC"][..], ["2 HEIC images", "JPEG"]),
+        ("dcim", &["a.mp4", "b.MOV"], ["2 videos (a.mp4, b.MOV)", "give one of them"]),
+        ("download", &["scan.zip", "notes.txt"], ["an archive (scan.zip)", "unpack"]),
+    ] {
+        let inside = folder.join(folder_name);
+        std::fs::create_dir_all(&inside).unwrap();
+        files.iter().for_each(|name| std::fs::write(inside.join(name), b"x").unwrap());
+        vidar_in(&folder, &["inspect", folder_name]).ends_with(1).says(&words);
+    }
     // A codec that is not decoded, a file of sound, a bag without images.
     inspect(&clip("other_codec.mp4"), &[]).ends_with(1).says(&["mp4v", "ffmpeg"]);
     inspect(&clip("sound.mp4"), &[]).ends_with(1).says(&["without a video track"]);
@@ -142,6 +167,6 @@ fn the_users_own_ffmpeg_decodes_what_the_program_refuses() {
             "{}",
             told.stdout
         );
-        inspect(&self::clip("fragmented.mp4"), &["--decoder", "ffmpeg"]).ends_with(0);
+        inspect(&self::clip("variable.mov"), &["--decoder", "ffmpeg"]).ends_with(0);
     }
 }

@@ -10,6 +10,7 @@ const VERBS: &[&[&str]] = &[
     &["convert"],
     &["eval"],
     &["export"],
+    &["compare"],
     &["view"],
     &["depth"],
     &["model"],

@@ -29,6 +29,7 @@ fn full_report() -> Report {
             .to_vec(),
         warnings: vec![Warning::new(&evil, &evil).at(&evil).hint(&evil)],
         provenance: vec![(evil.clone(), evil)],
+        view: None,
     }
 }
 

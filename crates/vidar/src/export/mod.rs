@@ -241,7 +241,7 @@ fn export_views(run: &Path, stored: &StoredViews) -> Result<Vec<ExportView>, Err
 }
 
 /// Units per metre of the run's depth images; none where it kept none.
-fn depth_units(run: &Path) -> Result<Option<f64>, Error> {
+pub(crate) fn depth_units(run: &Path) -> Result<Option<f64>, Error> {
     let sidecar = run.join("depth/depth.json");
     if !sidecar.is_file() {
         return Ok(None);
@@ -251,7 +251,7 @@ fn depth_units(run: &Path) -> Result<Option<f64>, Error> {
     Ok(Some(vidar_export::DepthSidecar::read(&bytes)?.scale))
 }
 
-fn points(run: &Path) -> Result<PointCloud, Error> {
+pub(crate) fn points(run: &Path) -> Result<PointCloud, Error> {
     let path = run.join("map/points.ply");
     let bytes = crate::system::read_up_to(&path, crate::system::MAX_CLOUD_BYTES)
         .map_err(|e| Error::io("read", &path, e))?;

@@ -57,6 +57,7 @@ pub(super) fn write(
         assessment: Some(outcome.verdict.assessment()),
         summary: summary.collect(),
         sections: vec![path, time],
+        view: None,
         warnings: outcome.warnings.clone(),
         provenance: vec![("command".into(), command.join(" ")), ("version".into(), crate::VERSION.into())],
     };

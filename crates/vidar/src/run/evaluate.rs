@@ -32,6 +32,9 @@ pub struct Evaluation {
     /// Points of the estimate with their distance (m) to the reference; for figures.
     #[serde(skip)]
     pub error_cloud: Option<(PointCloud, Vec<f32>)>,
+    /// The reference that the surface was compared with, in the world of ground truth; for figures.
+    #[serde(skip)]
+    pub reference: Option<PointCloud>,
 }
 
 /// Depth scores over all keyframes.
@@ -106,6 +109,7 @@ pub fn evaluate(
             }
             Err(e) => warn("surface", e.to_string()),
         }
+        evaluation.reference = Some(reference);
     }
     evaluation.depth = map.depth_scores.score();
     Ok(evaluation)

@@ -17,6 +17,7 @@ mod store;
 mod summary;
 mod tracking;
 mod trust;
+mod view;
 mod views;
 
 pub use by_source::SourceScore;
@@ -118,7 +119,9 @@ pub fn plan(request: &RunRequest) -> Result<Plan, Error> {
     let mut dataset = input::open_every_image(&request.path, &request.open, &config)?;
     let untimed = input::use_every_untimed_image(&dataset, &mut config);
     let (events, cancel) = (Events::none(), CancelToken::default());
-    calibrate::complete(&mut dataset, &mut config.odometry, &events, &cancel)?;
+    if input::needs_calibration(&config) {
+        calibrate::complete(&mut dataset, &mut config.odometry, &events, &cancel)?;
+    }
     let (mut plan, ..) = Plan::make(&dataset, &config, request.reference.as_deref())?;
     plan.warnings.splice(0..0, dataset.warnings.iter().cloned().chain(untimed));
     Ok(plan)

@@ -223,7 +223,7 @@ fn readme(outcome: &RunOutcome, request: &RunRequest) -> String {
          \x20 camera: x right, y down, z forward; pixel (0, 0) is the centre of the top-left pixel.\n\
          \x20 a_from_b maps coordinates in b to coordinates in a.\n\n\
          Files\n\
-         \x20 report.html                    everything below in figures and numbers\n\
+         \x20 report.html                    everything below in three dimensions, figures and numbers\n\
          \x20 map/mesh.ply, mesh.glb         surface (GLB is y-up by a root node; PLY is in the world frame)\n\
          \x20 map/points.ply                 points with normals, colour, confidence\n\
          \x20 trajectory/*.tum, *.csv        world_from_camera of all images and of the keyframes\n\

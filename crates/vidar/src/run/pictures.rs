@@ -43,6 +43,7 @@ pub fn draw(
         ),
         assessment: Some(outcome.verdict.assessment()),
         summary: summary(outcome),
+        view: super::view::encoded(outcome, dataset, folder, &up)?,
         sections: vec![
             map_section(outcome, path.as_ref(), &up, &mut album)?,
             evaluation_section(outcome, path.as_ref(), &up, &mut album)?,

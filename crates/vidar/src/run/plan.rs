@@ -93,7 +93,9 @@ impl Plan {
             // Better refused now than after an hour of depth.
             std::fs::File::open(path).map_err(|e| Error::io("read", path, e))?;
         }
-        input::require_calibration(dataset)?;
+        if input::needs_calibration(config) {
+            input::require_calibration(dataset)?;
+        }
         let images = input::strided(dataset, config);
         let OpenedSource { mut source, chunks } = Source::open(dataset, &images, config)?;
         let frames_of = |chunk: Vec<usize>| chunk.into_iter().map(|i| images[i].frame_id).collect();

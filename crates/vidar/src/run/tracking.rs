@@ -7,6 +7,7 @@ use crate::camera_timing;
 use crate::config::Config;
 use crate::error::Error;
 use crate::events::{CancelToken, Event, Events};
+use crate::input;
 use crate::odometry::{self, EarlierMap, Recording, TrackedPoses, adjusted, map};
 use crate::run_folder::{OutputLocation, RunFolder};
 use crate::system::read_up_to;
@@ -101,6 +102,7 @@ impl Tracking {
     ) -> Result<(), Error> {
         match &self.kept {
             Some(kept) => kept.calibrated.apply(dataset, config),
+            None if !input::needs_calibration(config) => {}
             None => calibrate::complete(dataset, &mut config.odometry, events, cancel)?,
         }
         self.calibrated = Some(Calibrated::of(dataset, config));

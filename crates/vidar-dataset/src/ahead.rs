@@ -1,0 +1,125 @@
+//! Images of a recording, decoded ahead of who takes them: several at a time, handed out in their order.
+
+use crate::dataset::{Dataset, ImageEntry};
+use crate::error::DatasetError;
+use crate::location::{Location, Media};
+use std::collections::VecDeque;
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::thread::{Builder, JoinHandle, available_parallelism};
+use vidar_core::FrameImage;
+use vidar_video::DECODER_THREAD;
+
+/// Most images decoded at a time: odometry takes longer for an image than a quarter of its decoding.
+const MOST_THREADS: usize = 4;
+/// Images that are ready or in work for each thread: one in work and one that waits.
+const IMAGES_PER_THREAD: usize = 2;
+
+type Loaded = Result<FrameImage, DatasetError>;
+
+/// An image to decode and where to hand it.
+struct Job {
+    entry: ImageEntry,
+    expected: Option<(usize, usize)>,
+    done: SyncSender<Loaded>,
+}
+
+/// Threads that decode images of one recording. Every image is what [`Dataset::load_image`] gives, whatever the number of threads.
+struct Decoders {
+    jobs: Option<SyncSender<Job>>,
+    is_over: Arc<AtomicBool>,
+    threads: Vec<JoinHandle<()>>,
+}
+
+impl Decoders {
+    fn start(media: &Media, count: usize) -> Self {
+        // As many as are ever asked for, so that asking never waits.
+        let (jobs, queue) = sync_channel::<Job>(MOST_THREADS * IMAGES_PER_THREAD);
+        let (queue, is_over) = (Arc::new(Mutex::new(queue)), Arc::new(AtomicBool::new(false)));
+        let spawn = |_| {
+            let (media, queue, is_over) = (media.clone(), Arc::clone(&queue), Arc::clone(&is_over));
+            let work = move || work(&media, &queue, &is_over);
+            Builder::new().name(DECODER_THREAD.into()).spawn(work).ok()
+        };
+        let threads = (0..count).filter_map(spawn).collect();
+        Self { jobs: Some(jobs), is_over, threads }
+    }
+
+    fn ask(&self, entry: &ImageEntry, expected: Option<(usize, usize)>) -> Receiver<Loaded> {
+        let (done, answer) = sync_channel(1);
+        if let Some(jobs) = &self.jobs {
+            // Where all threads have ended the answer says so.
+            let _ = jobs.send(Job { entry: entry.clone(), expected, done });
+        }
+        answer
+    }
+}
+
+impl Drop for Decoders {
+    /// Waits for the images in work, so that no thread outlives the recording.
+    fn drop(&mut self) {
+        self.is_over.store(true, Ordering::Relaxed);
+        self.jobs = None;
+        self.threads.drain(..).for_each(|thread| drop(thread.join()));
+    }
+}
+
+fn work(media: &Media, queue: &Mutex<Receiver<Job>>, is_over: &AtomicBool) {
+    loop {
+        let next = queue.lock().unwrap_or_else(PoisonError::into_inner).recv();
+        let Ok(Job { entry, expected, done }) = next else { return };
+        if is_over.load(Ordering::Relaxed) {
+            return;
+        }
+        // What a decoder was doing when it broke down is not used again.
+        let loaded = catch_unwind(AssertUnwindSafe(|| media.image_of_size(&entry.location, expected)));
+        // Nobody may wait for it any more.
+        let _ = done.send(loaded.unwrap_or_else(|_| Err(broke_down(&entry.location))));
+    }
+}
+
+fn broke_down(location: &Location) -> DatasetError {
+    let reason = "the decoder broke down on it (the image is damaged, or the decoder has a fault)";
+    DatasetError::BadImage { path: location.place(), reason: reason.into() }
+}
+
+/// Iterator of [`Dataset::images_ahead`].
+pub struct ImagesAhead<'a, I> {
+    dataset: &'a Dataset,
+    entries: I,
+    /// `None` until the first image is asked for.
+    decoders: Option<Decoders>,
+    asked: VecDeque<(&'a ImageEntry, Receiver<Loaded>)>,
+}
+
+impl Dataset {
+    /// The pixels of images in the order of `entries`, decoded on threads of their own ahead of who takes them. At most eight are in memory
+    /// beside the one that is taken; a picture of a video, of which a decoder gives one after the other, is converted ahead, two at most.
+    pub fn images_ahead<'a, I: Iterator<Item = &'a ImageEntry>>(&'a self, entries: I) -> ImagesAhead<'a, I> {
+        ImagesAhead { dataset: self, entries, decoders: None, asked: VecDeque::new() }
+    }
+}
+
+impl<'a, I: Iterator<Item = &'a ImageEntry>> Iterator for ImagesAhead<'a, I> {
+    type Item = (&'a ImageEntry, Result<FrameImage, DatasetError>);
+
+    fn next(&mut self) -> Option<Self::Item> {
+        let media = &self.dataset.media;
+        let decoders = self.decoders.get_or_insert_with(|| {
+            let cores = available_parallelism().map_or(1, usize::from);
+            Decoders::start(media, if media.is_video() { 1 } else { cores.min(MOST_THREADS) })
+        });
+        if decoders.threads.is_empty() {
+            // The system gives no more threads.
+            return self.entries.next().map(|entry| (entry, self.dataset.load_image(entry)));
+        }
+        while self.asked.len() < IMAGES_PER_THREAD * decoders.threads.len() {
+            let Some(entry) = self.entries.next() else { break };
+            self.asked.push_back((entry, decoders.ask(entry, self.dataset.size_of(entry))));
+        }
+        let (entry, answer) = self.asked.pop_front()?;
+        Some((entry, answer.recv().unwrap_or_else(|_| Err(broke_down(&entry.location)))))
+    }
+}
