@@ -5,7 +5,7 @@
 //! of positions spread over the pixel's area and [`RemapTable::apply`] averages them: an area average, so that fine
 //! texture becomes grey instead of aliasing.
 
-use crate::camera::{CameraError, CameraModel, Pinhole};
+use crate::camera::{CameraError, CameraModel, Pinhole, Pixel};
 use crate::image::{FrameImage, Image};
 use crate::lie::{LieGroup, So3};
 use nalgebra::{Matrix3x2, Vector2, Vector3};
@@ -26,13 +26,43 @@ pub struct RemapTable {
     source: Vec<[f32; 2]>,
 }
 
-/// How a camera turned while a rolling shutter read an image row by row.
+/// How a camera moved while a rolling shutter read an image row by row. The camera's pose is that of the middle row.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct RollingShutter {
     /// Rate of rotation in the camera's frame, rad/s.
     pub turn_rad_per_s: Vector3<f64>,
+    /// Velocity in the camera's frame, m/s.
+    pub velocity_m_per_s: Vector3<f64>,
+    /// Inverse of the scene's typical depth, 1/m; zero where it is not known, which leaves the rotation.
+    pub inverse_depth: f64,
     /// Time from the first to the last row, s.
     pub readout_secs: f64,
+}
+
+impl RollingShutter {
+    /// The pixel at which an instant would have seen what an image shows at `pixel`; `None` outside the camera's domain.
+    pub fn at_once(&self, camera: &CameraModel, pixel: &Pixel) -> Option<Pixel> {
+        let secs = self.row_secs(camera, pixel);
+        let ray = camera.unproject(pixel).filter(|ray| ray.z > 0.0)?;
+        let turned = So3::exp(&(self.turn_rad_per_s * secs)) * (ray / ray.z);
+        camera.project(&(turned + self.velocity_m_per_s * (secs * self.inverse_depth)))
+    }
+
+    /// The pixel at which its row shows what an instant sees in the direction `ray`.
+    fn in_row(&self, camera: &CameraModel, ray: &Vector3<f64>) -> Option<Pixel> {
+        let mut pixel = camera.project(ray)?;
+        for _ in 0..ROW_ROUNDS {
+            let secs = self.row_secs(camera, &pixel);
+            let shifted = ray / ray.z - self.velocity_m_per_s * (secs * self.inverse_depth);
+            pixel = camera.project(&(So3::exp(&(self.turn_rad_per_s * -secs)) * shifted))?;
+        }
+        Some(pixel)
+    }
+
+    /// How long after the middle row a pixel was read, s.
+    fn row_secs(&self, camera: &CameraModel, pixel: &Pixel) -> f64 {
+        self.readout_secs * ((pixel.y + 0.5) / camera.height() as f64 - 0.5)
+    }
 }
 
 /// Where the pixels of a view lie in an image that was read row by row, beside where they would lie in one that was
@@ -56,8 +86,8 @@ const ROW_ROUNDS: usize = 3;
 impl RowShift {
     /// The shift of a view of `camera`, which has the pose of the middle row; `None` where it stays below `least_px` everywhere.
     ///
-    /// Only the rotation is taken back: what the camera's translation shifts depends on the depth. At 0.5 m/s and 30 ms it is 7 mm
-    /// from the first row to the last, a third of a degree at 1.3 m.
+    /// What the camera's translation shifts depends on the depth, which is taken to be the typical one everywhere: at 0.5 m/s and 30 ms
+    /// the first row is 7 mm from the middle one, and what is twice as far away as that is shifted by 0.2° too much at 1 m.
     pub fn new(
         camera: &CameraModel,
         view: &Pinhole,
@@ -67,7 +97,9 @@ impl RowShift {
         let (columns, rows) = (view.width.div_ceil(NODE_SPACING) + 1, view.height.div_ceil(NODE_SPACING) + 1);
         let node = |i: usize| {
             let (x, y) = (i % columns * NODE_SPACING, i / columns * NODE_SPACING);
-            shift_of_rows(camera, &view.ray(x as f64, y as f64), shutter).unwrap_or_default()
+            let ray = view.ray(x as f64, y as f64);
+            let shift = |at_once: Pixel| Some(shutter.in_row(camera, &ray)? - at_once);
+            camera.project(&ray).and_then(shift).unwrap_or_default()
         };
         let nodes: Vec<Vector2<f64>> = (0..columns * rows).map(node).collect();
         let largest = nodes.iter().map(|n| n.norm()).fold(0.0, f64::max);
@@ -96,18 +128,6 @@ impl RowShift {
     fn holds(&self, at: &[f32; 2]) -> bool {
         (0..2).all(|k| at[k] >= -0.5 && at[k] <= self.size[k] - 0.5)
     }
-}
-
-/// From where a direction (in the frame of the middle row) is seen at once to where its row sees it.
-fn shift_of_rows(camera: &CameraModel, ray: &Vector3<f64>, shutter: &RollingShutter) -> Option<Vector2<f64>> {
-    let at_once = camera.project(ray)?;
-    let mut pixel = at_once;
-    for _ in 0..ROW_ROUNDS {
-        let share = (pixel.y + 0.5) / camera.height() as f64 - 0.5;
-        let turned = So3::exp(&(shutter.turn_rad_per_s * (shutter.readout_secs * share)));
-        pixel = camera.project(&(turned.inverse() * *ray))?;
-    }
-    Some(pixel - at_once)
 }
 
 impl RemapTable {

@@ -246,7 +246,7 @@ fn photograph_turning(camera: &CameraModel, shutter: &RollingShutter, wavelength
 
 #[test]
 fn rows_read_while_the_camera_turned_are_put_where_one_instant_sees_them() {
-    let shutter = RollingShutter { turn_rad_per_s: Vector3::new(0.9, -1.4, 0.7), readout_secs: 0.03 };
+    let shutter = turning(Vector3::new(0.9, -1.4, 0.7), 0.03);
     for camera in distorted_cameras() {
         let view = undistorted_view(&camera, camera.width(), camera.height()).unwrap();
         let table = RemapTable::new(&camera, &view);
@@ -260,8 +260,7 @@ fn rows_read_while_the_camera_turned_are_put_where_one_instant_sees_them() {
             let found = found.to_gray_f32();
             let inside = (margin..view.height - margin)
                 .flat_map(|y| (margin..view.width - margin).map(move |x| (x, y)));
-            let squares: Vec<f64> =
-                inside.map(|p| (f64::from(found[p]) - expected[p]).powi(2)).collect();
+            let squares: Vec<f64> = inside.map(|p| (f64::from(found[p]) - expected[p]).powi(2)).collect();
             (squares.iter().sum::<f64>() / squares.len() as f64).sqrt()
         };
         let (as_is, corrected) =
@@ -275,10 +274,42 @@ fn rows_read_while_the_camera_turned_are_put_where_one_instant_sees_them() {
 fn what_a_slow_turn_shifts_is_left_where_it_is() {
     let camera = distorted_cameras().remove(0);
     let view = undistorted_view(&camera, camera.width(), camera.height()).unwrap();
-    let shutter =
-        |rate: f64| RollingShutter { turn_rad_per_s: Vector3::new(0.0, rate, 0.0), readout_secs: 0.03 };
-    assert!(RowShift::new(&camera, &view, &shutter(0.02), 0.25).is_none());
-    assert!(RowShift::new(&camera, &view, &shutter(0.2), 0.25).is_some());
-    let global = RollingShutter { turn_rad_per_s: Vector3::new(1.0, 1.0, 1.0), readout_secs: 0.0 };
+    let about_y = |rate: f64| turning(Vector3::new(0.0, rate, 0.0), 0.03);
+    assert!(RowShift::new(&camera, &view, &about_y(0.02), 0.25).is_none());
+    assert!(RowShift::new(&camera, &view, &about_y(0.2), 0.25).is_some());
+    let global = turning(Vector3::new(1.0, 1.0, 1.0), 0.0);
     assert!(RowShift::new(&camera, &view, &global, 0.25).is_none());
+}
+
+#[test]
+fn a_point_at_the_typical_depth_is_where_one_instant_sees_it() {
+    let shutter = RollingShutter {
+        velocity_m_per_s: Vector3::new(0.6, -0.4, 0.3),
+        inverse_depth: 1.0 / 1.5,
+        ..turning(Vector3::new(0.9, -1.4, 0.7), 0.03)
+    };
+    for camera in distorted_cameras() {
+        let (w, h) = (camera.width() as f64, camera.height() as f64);
+        for (x, y) in [(0.2, 0.1), (0.5, 0.5), (0.8, 0.9), (0.3, 0.8)] {
+            let ray = camera.unproject(&Vector2::new(x * w, y * h)).unwrap();
+            let point = ray * (1.5 / ray.z);
+            // Where its row sees it: the camera has moved on since the middle row.
+            let mut row = y * h;
+            let seen = |row: f64| {
+                let secs = shutter.readout_secs * ((row + 0.5) / h - 0.5);
+                let turned = So3::exp(&(shutter.turn_rad_per_s * secs));
+                camera.project(&(turned.inverse() * (point - shutter.velocity_m_per_s * secs))).unwrap()
+            };
+            (0..20).for_each(|_| row = seen(row).y);
+            let found = shutter.at_once(&camera, &seen(row)).unwrap();
+            // The depth changes by millimetres meanwhile.
+            let moved = (seen(row) - Vector2::new(x * w, y * h)).norm();
+            let error = (found - Vector2::new(x * w, y * h)).norm();
+            assert!(error < 0.05 * moved.max(1.0), "{}: {error} of {moved} px", camera.name());
+        }
+    }
+}
+
+fn turning(turn_rad_per_s: Vector3<f64>, readout_secs: f64) -> RollingShutter {
+    RollingShutter { turn_rad_per_s, velocity_m_per_s: Vector3::zeros(), inverse_depth: 0.0, readout_secs }
 }

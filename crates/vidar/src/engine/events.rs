@@ -1,14 +1,15 @@
 //! What the engine reports: progress and results in one typed stream.
 
+use super::track::Segment;
 use crate::input::TrajectorySource;
 use crate::quality::TrackQuality;
-use nalgebra::Vector3;
 use std::sync::Arc;
 use vidar_align::Placement;
 use vidar_align::aligner::{ChunkReport, FrameObservation, LoopReport};
+use vidar_core::remap::RollingShutter;
 use vidar_core::{
-    AlignedView, CameraId, ChunkId, FrameId, OdometryKeyframe, PointCloud, RevisedPose, Se3, Timestamp,
-    TriangleMesh, Warning,
+    AlignedView, CameraId, CameraModel, ChunkId, Duration, FrameId, OdometryKeyframe, PointCloud,
+    RevisedPose, Se3, Timestamp, TriangleMesh, Warning,
 };
 use vidar_fusion::{CoverageReport, DoubleWallReport};
 
@@ -43,10 +44,26 @@ pub struct MapKeyframe {
     pub stamp: FrameStamp,
     /// Pose of its camera as tracked, m; none where poses are found by the geometry model alone.
     pub world_from_camera: Option<Se3>,
-    /// Rate of rotation of its camera, in the camera's frame, rad/s; zero where the images around it have no pose.
-    pub turn_rad_per_s: Vector3<f64>,
+    /// How its rows were read; none until the images around it have poses, and for a global shutter.
+    pub shutter: Option<RollingShutter>,
     /// The odometry's keyframe of the same image, with its landmarks and covariance.
     pub odometry: Option<Arc<OdometryKeyframe>>,
+}
+
+impl MapKeyframe {
+    /// Finds out how its rows were read, once the images around it have poses, and puts the odometry's landmarks where one instant
+    /// would have seen them, as its pixels will be.
+    pub(super) fn read_by_rows(&mut self, track: &Segment, readout: Duration, camera: &CameraModel) {
+        if self.shutter.is_some() {
+            return;
+        }
+        self.shutter = track.shutter(self.stamp.frame_id, readout);
+        if let (Some(shutter), Some(odometry)) = (&self.shutter, &mut self.odometry) {
+            for landmark in &mut Arc::make_mut(odometry).landmarks {
+                landmark.pixel = shutter.at_once(camera, &landmark.pixel).unwrap_or(landmark.pixel);
+            }
+        }
+    }
 }
 
 /// The step of the method that the engine works on.

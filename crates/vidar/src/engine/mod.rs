@@ -50,7 +50,7 @@ use stereo_landmarks::StereoLandmarks;
 use track::Track;
 use vidar_align::chunking::ChunkSpan;
 use vidar_align::{Aligner, Placement};
-use vidar_core::{CameraId, ChunkId, Duration, FrameId, SensorEvent, Warning};
+use vidar_core::{CameraId, CameraModel, ChunkId, Duration, FrameId, SensorEvent, Warning};
 use vidar_fusion::FusionConfig;
 
 /// Where the engine's events go. An error of a reader ends the run.
@@ -61,6 +61,8 @@ pub struct Engine<'a> {
     name: String,
     config: &'a Config,
     camera: CameraId,
+    camera_model: CameraModel,
+    readout: Duration,
     cancelled: &'a (dyn Fn() -> bool + Sync),
     poses: Option<Box<dyn PoseSource + 'a>>,
     fallback: Option<Box<dyn PoseSource + 'a>>,
@@ -104,7 +106,7 @@ impl<'a> Engine<'a> {
             setup.geometry,
             setup.places,
             (setup.images, setup.store),
-            (&setup.camera, setup.readout, &setup.view),
+            (&setup.camera, &setup.view),
             (setup.cancelled, setup.predicting),
         );
         // Chunks without overlaps are stereo's: their unit is that of the poses already.
@@ -116,6 +118,8 @@ impl<'a> Engine<'a> {
             name: setup.name,
             config,
             camera: setup.camera_id,
+            camera_model: setup.camera.model.clone(),
+            readout: setup.readout,
             cancelled: setup.cancelled,
             poses: setup.poses,
             fallback: setup.fallback,
@@ -341,9 +345,9 @@ impl<'a> Engine<'a> {
     ) -> Result<Option<StoredChunk>, Error> {
         self.enter(Step::Predict, sink)?;
         let Some(world) = &mut self.world else { return Ok(None) };
-        if let Some(track) = self.track.longest() {
+        if let (true, Some(track)) = (self.readout > Duration::ZERO, self.track.longest()) {
             for keyframe in &mut world.keyframes[chunk.seen.clone()] {
-                keyframe.turn_rad_per_s = track.turn_rad_per_s(keyframe.stamp.frame_id);
+                keyframe.read_by_rows(track, self.readout, &self.camera_model);
             }
         }
         let mut events = Vec::new();

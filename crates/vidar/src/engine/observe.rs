@@ -119,13 +119,13 @@ impl Observer {
         let keyframe = &keyframes[k];
         let mut frame = FrameObservation::new(keyframe.stamp.frame_id, keyframe.stamp.time);
         let Some(pose) = keyframe.world_from_camera else { return frame };
-        let Some(odometry) = &keyframe.odometry else {
+        let Some(own) = &keyframe.odometry else {
             if let (LandmarkUse::Transferred, Some(depth)) = (self.landmarks, depth) {
                 frame.landmarks = self.transferred(keyframes, k, &pose, &self.transfer(&depth));
             }
             return frame.with_pose_prior(PosePrior::new(pose));
         };
-        let odometry = self.odometry.get(&odometry.id).unwrap_or(odometry);
+        let odometry = self.odometry.get(&own.id).unwrap_or(own);
         let mut prior = PosePrior::from_odometry(odometry, &self.body_from_camera);
         prior.world_from_camera = pose;
         let before = k.checked_sub(1).and_then(|k| keyframes[k].odometry.as_ref());
@@ -135,7 +135,7 @@ impl Observer {
             })
             .map(|covariance| covariance_in_camera(&covariance, &self.body_from_camera));
         if let Some(depth) = depth.filter(|_| self.landmarks != LandmarkUse::None) {
-            frame.landmarks = self.transfer(&depth).undistorted(&odometry.landmarks);
+            frame.landmarks = self.transfer(&depth).undistorted(&own.landmarks);
         }
         frame.with_pose_prior(prior)
     }

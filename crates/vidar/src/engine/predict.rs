@@ -16,7 +16,7 @@ use vidar_align::chunking::ChunkSpan;
 use vidar_align::color_at_size;
 use vidar_core::model::ChunkFrame;
 use vidar_core::{
-    ChunkId, ChunkView, ChunkViews, Duration, FrameId, GeometryPrediction, ModelError, RigCamera, ViewGeometry, Warning,
+    ChunkId, ChunkView, ChunkViews, FrameId, GeometryPrediction, ModelError, RigCamera, ViewGeometry, Warning,
 };
 
 /// The geometry model with all that it works on.
@@ -42,10 +42,10 @@ impl<'a> Predictor<'a> {
         geometry: &'a mut dyn GeometrySource,
         places: &'a dyn PlaceDescriber,
         (images, store): (&'a dyn ImageSource, &'a dyn PredictionStore),
-        (camera, readout, view): (&RigCamera, Duration, &vidar_core::Pinhole),
+        (camera, view): (&RigCamera, &vidar_core::Pinhole),
         (cancelled, predicting): (&'a (dyn Fn() -> bool + Sync), &'a (dyn Fn(f64) + Sync)),
     ) -> Self {
-        let window = ViewWindow::new(images, &camera.model, readout, view);
+        let window = ViewWindow::new(images, &camera.model, view);
         Self { geometry, places, store, cancelled, predicting, stereo_landmarks: None, window }
     }
 

@@ -3,7 +3,6 @@
 use super::cut::ChunkRule;
 use super::events::{FrameStamp, MapKeyframe};
 use super::track::PosedFrame;
-use nalgebra::Vector3;
 use vidar_align::keyframe_selection::{KeyframeConfig, KeyframeSelector, select_by_motion, select_by_time};
 use vidar_core::{Se3, Timestamp};
 
@@ -38,7 +37,7 @@ impl Selection {
         let keyframe = |f: &PosedFrame| MapKeyframe {
             stamp: f.stamp,
             world_from_camera: Some(f.world_from_camera),
-            turn_rad_per_s: Vector3::zeros(),
+            shutter: None,
             odometry: f.odometry.clone(),
         };
         let is_preferred = |f: &PosedFrame| self.prefers_odometry && f.odometry.is_some();
@@ -73,7 +72,7 @@ impl Selection {
         let keyframe = |stamp: &FrameStamp| MapKeyframe {
             stamp: *stamp,
             world_from_camera: None,
-            turn_rad_per_s: Vector3::zeros(),
+            shutter: None,
             odometry: None,
         };
         if self.config.max_count > 0 && !is_complete && !rule.is_prescribed() {
@@ -97,6 +96,7 @@ impl Selection {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use nalgebra::Vector3;
     use vidar_core::{CameraId, FrameId};
 
     fn posed(i: u32) -> PosedFrame {

@@ -7,8 +7,8 @@ use crate::config::Config;
 use crate::error::Error;
 use std::ops::Range;
 use vidar_core::{
-    CameraId, ChunkId, ChunkViews, Duration, FrameId, FrameImage, GeometryPrediction, Image, ModelError, ModelInfo,
-    Pinhole, RigCamera, Se3, Timestamp, Warning, Watch,
+    CameraId, ChunkId, ChunkViews, Duration, FrameId, FrameImage, GeometryPrediction, Image, ModelError,
+    ModelInfo, Pinhole, RigCamera, Se3, Timestamp, Warning, Watch,
 };
 
 /// Values and sources of an [`super::Engine`].

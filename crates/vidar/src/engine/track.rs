@@ -4,13 +4,15 @@ use super::events::{FrameStamp, FrameState};
 use crate::error::Error;
 use crate::input::{MetricTrajectory, TrajectorySource};
 use crate::quality::TrackQuality;
-use nalgebra::Vector3;
 use std::collections::{BTreeMap, VecDeque};
 use std::sync::Arc;
+use vidar_core::remap::RollingShutter;
 use vidar_core::{
-    CameraId, Duration, FrameId, LieGroup, OdometryKeyframe, RevisedPose, Rig, Se3, SensorEvent, Timestamp, Warning,
+    CameraId, Duration, FrameId, LieGroup, OdometryKeyframe, RevisedPose, Rig, Se3, SensorEvent, Timestamp,
+    Warning,
 };
 use vidar_odometry::{ImuUse, Joined, Odometry, OdometryConfig, OdometryOutput, SavedMap, Status, Tracking};
+use vidar_solve::statistics::median_upper;
 
 /// What a pose source reports of one image. Images are reported in the order of time; one may be left out.
 #[derive(Clone, Debug)]
@@ -250,24 +252,41 @@ pub struct Segment {
     last: Option<(Timestamp, Se3)>,
 }
 
-/// Longest span over which a rate of rotation is taken: two images at 10 Hz.
-const MAX_TURN_SPAN: Duration = Duration::from_millis(210);
+/// Longest span over which a camera's motion is taken: two images at 10 Hz.
+const MAX_MOTION_SPAN: Duration = Duration::from_millis(210);
+/// Time within which the odometry's keyframes tell the depth of what an image shows.
+const SAME_SCENE: Duration = Duration::from_millis(1000);
 
 impl Segment {
-    /// Rate of rotation of the camera at a frame, in its own frame, rad/s: from the frames before and after it. Zero where they are
-    /// far apart.
-    pub fn turn_rad_per_s(&self, frame: FrameId) -> Vector3<f64> {
-        let Ok(at) = self.frames.binary_search_by_key(&frame, |f| f.stamp.frame_id) else {
-            return Vector3::zeros();
-        };
-        let (before, after) = (&self.frames[at.saturating_sub(1)], self.frames.get(at + 1).unwrap_or(&self.frames[at]));
+    /// How the rows of a frame were read, by the poses of the frames before and after it, and by the landmarks of the odometry's
+    /// nearest keyframe. None where the frames are far apart.
+    pub fn shutter(&self, frame: FrameId, readout: Duration) -> Option<RollingShutter> {
+        let at = self.frames.binary_search_by_key(&frame, |f| f.stamp.frame_id).ok()?;
+        let own = &self.frames[at];
+        let (before, after) = (&self.frames[at.saturating_sub(1)], self.frames.get(at + 1).unwrap_or(own));
         let span = after.stamp.time - before.stamp.time;
-        if span <= Duration::ZERO || span > MAX_TURN_SPAN {
-            return Vector3::zeros();
+        if span <= Duration::ZERO || span > MAX_MOTION_SPAN {
+            return None;
         }
         let turned = before.world_from_camera.rotation.inverse() * after.world_from_camera.rotation;
-        // Turning about one axis between the two, the middle one has the same rate in its own frame.
-        turned.log() / span.as_secs_f64()
+        let moved = after.world_from_camera.translation - before.world_from_camera.translation;
+        Some(RollingShutter {
+            // Turning about one axis between the two, the frame between them has the same rate in its own axes.
+            turn_rad_per_s: turned.log() / span.as_secs_f64(),
+            velocity_m_per_s: own.world_from_camera.rotation.inverse() * moved / span.as_secs_f64(),
+            inverse_depth: self.inverse_depth(own.stamp.time),
+            readout_secs: readout.as_secs_f64(),
+        })
+    }
+
+    /// Median inverse depth of the landmarks near a time, 1/m; zero without any.
+    fn inverse_depth(&self, time: Timestamp) -> f64 {
+        let distance = |k: &&Arc<OdometryKeyframe>| (k.state.time - time).nanos().abs();
+        let nearest = self.odometry.iter().min_by_key(distance);
+        let near = nearest.filter(|k| distance(k) <= SAME_SCENE.nanos());
+        let mut inverse: Vec<f64> =
+            near.map_or_else(Vec::new, |k| k.landmarks.iter().map(|l| l.inverse_depth).collect());
+        median_upper(&mut inverse).filter(|rho| *rho > 0.0).unwrap_or(0.0)
     }
 }
 
@@ -395,6 +414,7 @@ fn between(
 #[cfg(test)]
 mod tests {
     use super::*;
+    use nalgebra::Vector3;
 
     fn stamp(i: u32) -> FrameStamp {
         let time = Timestamp::from_nanos(i64::from(i) * 100_000_000);
@@ -425,6 +445,27 @@ mod tests {
         let longest = track.longest().unwrap();
         let ids: Vec<u32> = longest.frames.iter().map(|f| f.stamp.frame_id.0).collect();
         assert_eq!((longest.id, ids, track.without_pose), (1, vec![5, 6, 7, 8, 9], 1));
+    }
+
+    #[test]
+    fn the_rows_of_a_frame_were_read_as_its_neighbours_say() {
+        let rate = Vector3::new(0.2, -0.5, 0.1);
+        let frame = |i: u32| {
+            let secs = f64::from(i) * 0.1;
+            let rotation = vidar_core::So3::exp(&(rate * secs));
+            let translation = Vector3::new(0.3 * secs, 0.0, 0.0);
+            PosedFrame { stamp: stamp(i), world_from_camera: Se3::new(rotation, translation), odometry: None }
+        };
+        let frames: Vec<PosedFrame> = [0, 1, 2, 7].into_iter().map(frame).collect();
+        let segment = Segment { id: 0, images: 4, frames, odometry: Vec::new(), last: None };
+        let shutter = segment.shutter(FrameId(1), Duration::from_millis(20)).unwrap();
+        assert!((shutter.turn_rad_per_s - rate).norm() < 1e-9, "{shutter:?}");
+        let velocity = segment.frames[1].world_from_camera.rotation * shutter.velocity_m_per_s;
+        assert!((velocity - Vector3::new(0.3, 0.0, 0.0)).norm() < 1e-9, "{shutter:?}");
+        assert_eq!((shutter.readout_secs, shutter.inverse_depth), (0.02, 0.0));
+        // Half a second says nothing of a hand.
+        assert!(segment.shutter(FrameId(2), Duration::from_millis(20)).is_none());
+        assert!(segment.shutter(FrameId(5), Duration::from_millis(20)).is_none());
     }
 
     #[test]

@@ -5,8 +5,8 @@ use super::events::{MapEvent, MapKeyframe};
 use super::setup::ImageSource;
 use rayon::prelude::*;
 use std::ops::Range;
-use vidar_core::remap::{RemapTable, RollingShutter, RowShift};
-use vidar_core::{CameraModel, ChunkView, Duration, Pinhole, Warning};
+use vidar_core::remap::{RemapTable, RowShift};
+use vidar_core::{CameraModel, ChunkView, Pinhole, Warning};
 
 /// Shifts of rows below this many pixels of the camera are left: matches are found to a few tenths of one.
 const LEAST_SHIFT_PX: f64 = 0.25;
@@ -15,8 +15,6 @@ const LEAST_SHIFT_PX: f64 = 0.25;
 pub struct ViewWindow<'a> {
     images: &'a dyn ImageSource,
     camera: CameraModel,
-    /// Time from the first to the last row of an image, s.
-    readout_secs: f64,
     remap: RemapTable,
     /// Keyframe index with its view, ascending. Unreadable images are missing.
     views: Vec<(usize, ChunkView)>,
@@ -25,20 +23,9 @@ pub struct ViewWindow<'a> {
 
 impl<'a> ViewWindow<'a> {
     /// An empty window before the first keyframe.
-    pub fn new(
-        images: &'a dyn ImageSource,
-        camera: &CameraModel,
-        readout: Duration,
-        view: &Pinhole,
-    ) -> Self {
-        Self {
-            images,
-            camera: camera.clone(),
-            readout_secs: readout.as_secs_f64(),
-            remap: RemapTable::new(camera, view),
-            views: Vec::new(),
-            next: 0,
-        }
+    pub fn new(images: &'a dyn ImageSource, camera: &CameraModel, view: &Pinhole) -> Self {
+        let remap = RemapTable::new(camera, view);
+        Self { images, camera: camera.clone(), remap, views: Vec::new(), next: 0 }
     }
 
     /// Moves back before the first keyframe.
@@ -78,9 +65,9 @@ impl<'a> ViewWindow<'a> {
     /// Reads one keyframe.
     pub fn load(&self, keyframe: &MapKeyframe) -> Result<ChunkView, Warning> {
         let image = self.images.image(&keyframe.stamp)?;
-        let shutter =
-            RollingShutter { turn_rad_per_s: keyframe.turn_rad_per_s, readout_secs: self.readout_secs };
-        let shift = RowShift::new(&self.camera, self.remap.target(), &shutter, LEAST_SHIFT_PX);
+        let shift = keyframe
+            .shutter
+            .and_then(|s| RowShift::new(&self.camera, self.remap.target(), &s, LEAST_SHIFT_PX));
         Ok(ChunkView {
             frame_id: keyframe.stamp.frame_id,
             time: keyframe.stamp.time,
