@@ -28,7 +28,7 @@ pub struct RemapTable {
 
 /// How a camera moved while a rolling shutter read an image row by row. The camera's pose is that of the middle row.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct RollingShutter {
+pub struct RowMotion {
     /// Rate of rotation in the camera's frame, rad/s.
     pub turn_rad_per_s: Vector3<f64>,
     /// Velocity in the camera's frame, m/s.
@@ -39,7 +39,7 @@ pub struct RollingShutter {
     pub readout_secs: f64,
 }
 
-impl RollingShutter {
+impl RowMotion {
     /// The pixel at which an instant would have seen what an image shows at `pixel`; `None` outside the camera's domain.
     pub fn at_once(&self, camera: &CameraModel, pixel: &Pixel) -> Option<Pixel> {
         let secs = self.row_secs(camera, pixel);
@@ -88,17 +88,12 @@ impl RowShift {
     ///
     /// What the camera's translation shifts depends on the depth, which is taken to be the typical one everywhere: at 0.5 m/s and 30 ms
     /// the first row is 7 mm from the middle one, and what is twice as far away as that is shifted by 0.2° too much at 1 m.
-    pub fn new(
-        camera: &CameraModel,
-        view: &Pinhole,
-        shutter: &RollingShutter,
-        least_px: f64,
-    ) -> Option<Self> {
+    pub fn new(camera: &CameraModel, view: &Pinhole, motion: &RowMotion, least_px: f64) -> Option<Self> {
         let (columns, rows) = (view.width.div_ceil(NODE_SPACING) + 1, view.height.div_ceil(NODE_SPACING) + 1);
         let node = |i: usize| {
             let (x, y) = (i % columns * NODE_SPACING, i / columns * NODE_SPACING);
             let ray = view.ray(x as f64, y as f64);
-            let shift = |at_once: Pixel| Some(shutter.in_row(camera, &ray)? - at_once);
+            let shift = |at_once: Pixel| Some(motion.in_row(camera, &ray)? - at_once);
             camera.project(&ray).and_then(shift).unwrap_or_default()
         };
         let nodes: Vec<Vector2<f64>> = (0..columns * rows).map(node).collect();

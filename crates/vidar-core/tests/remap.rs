@@ -4,7 +4,7 @@
 
 use nalgebra::{Vector2, Vector3};
 use vidar_core::camera::{DoubleSphere, Equidistant, Fov, ParametricCamera, RadTan};
-use vidar_core::remap::{RemapTable, RollingShutter, RowShift, undistorted_view};
+use vidar_core::remap::{RemapTable, RowMotion, RowShift, undistorted_view};
 use vidar_core::{CameraError, CameraModel, FrameImage, Image, LieGroup, Pinhole, So3};
 
 /// Grey level of the world in a unit direction: waves of `wavelength` (rad, in the middle of the view) on the sky.
@@ -235,7 +235,7 @@ fn views_of_every_example_are_covered_or_an_error() {
 }
 
 /// The image of a camera that turns while its rows are read; its pose is that of the middle row.
-fn photograph_turning(camera: &CameraModel, shutter: &RollingShutter, wavelength: f64) -> FrameImage {
+fn photograph_turning(camera: &CameraModel, shutter: &RowMotion, wavelength: f64) -> FrameImage {
     FrameImage::Gray8(Image::from_fn(camera.width(), camera.height(), |x, y| {
         let share = (y as f64 + 0.5) / camera.height() as f64 - 0.5;
         let turned = So3::exp(&(shutter.turn_rad_per_s * (shutter.readout_secs * share)));
@@ -283,7 +283,7 @@ fn what_a_slow_turn_shifts_is_left_where_it_is() {
 
 #[test]
 fn a_point_at_the_typical_depth_is_where_one_instant_sees_it() {
-    let shutter = RollingShutter {
+    let shutter = RowMotion {
         velocity_m_per_s: Vector3::new(0.6, -0.4, 0.3),
         inverse_depth: 1.0 / 1.5,
         ..turning(Vector3::new(0.9, -1.4, 0.7), 0.03)
@@ -310,6 +310,6 @@ fn a_point_at_the_typical_depth_is_where_one_instant_sees_it() {
     }
 }
 
-fn turning(turn_rad_per_s: Vector3<f64>, readout_secs: f64) -> RollingShutter {
-    RollingShutter { turn_rad_per_s, velocity_m_per_s: Vector3::zeros(), inverse_depth: 0.0, readout_secs }
+fn turning(turn_rad_per_s: Vector3<f64>, readout_secs: f64) -> RowMotion {
+    RowMotion { turn_rad_per_s, velocity_m_per_s: Vector3::zeros(), inverse_depth: 0.0, readout_secs }
 }

@@ -121,3 +121,36 @@ fn the_map_of_a_flight_by_completed_stereo_is_within_its_bounds() {
         },
     );
 }
+
+/// Measured (stereo, completed): F 0.657 and 0.819 with the readout time, 0.381 and 0.614 without (decision 24).
+#[test]
+fn the_map_of_a_rolling_shutter_is_that_of_one_instant() {
+    let root = &shared().root;
+    let recording = root.join("rolling");
+    let mut synth = command();
+    synth.arg("synth").arg(&recording).args([
+        "-q",
+        "--preset",
+        "phone-fast",
+        "--seed",
+        "7",
+        "--duration",
+        "5",
+    ]);
+    synth.args(["--size", "320x240", "--frame-rate", "20", "--readout-ms", "28", "--stamp-delay-ms=0"]);
+    ProgramOutput::from(synth.output().unwrap()).ends_with(0);
+    let scores = |readout_ms: u32| {
+        let mut run = command();
+        run.arg("run").arg(&recording).arg("-o").arg(root.join(format!("rolling {readout_ms}")));
+        run.args(["--json", "-q", "--set", "input.poses=ground-truth", "--set", "fusion.voxel_size_m=0.03"]);
+        run.args(["--set", "output.report=false", "--set", &format!("odometry.readout_ms={readout_ms}")]);
+        let json = ProgramOutput::from(run.output().unwrap()).ends_with(0).json();
+        let surface = &json["result"]["evaluation"]["surface"]["native"];
+        (surface[0]["f"].as_f64().unwrap(), surface[1]["f"].as_f64().unwrap())
+    };
+    let (as_global, as_it_is) = (scores(0), scores(28));
+    let measured = format!("F at 5 and 10 cm: {as_global:?} as a global shutter, {as_it_is:?} by its rows");
+    eprintln!("{measured}");
+    assert!(as_it_is.0 > 0.58 && as_it_is.1 > 0.74, "{measured}");
+    assert!(as_it_is.0 > as_global.0 + 0.15, "{measured}");
+}

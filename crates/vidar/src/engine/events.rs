@@ -6,7 +6,7 @@ use crate::quality::TrackQuality;
 use std::sync::Arc;
 use vidar_align::Placement;
 use vidar_align::aligner::{ChunkReport, FrameObservation, LoopReport};
-use vidar_core::remap::RollingShutter;
+use vidar_core::remap::RowMotion;
 use vidar_core::{
     AlignedView, CameraId, CameraModel, ChunkId, Duration, FrameId, OdometryKeyframe, PointCloud,
     RevisedPose, Se3, Timestamp, TriangleMesh, Warning,
@@ -45,7 +45,7 @@ pub struct MapKeyframe {
     /// Pose of its camera as tracked, m; none where poses are found by the geometry model alone.
     pub world_from_camera: Option<Se3>,
     /// How its rows were read; none until the images around it have poses, and for a global shutter.
-    pub shutter: Option<RollingShutter>,
+    pub row_motion: Option<RowMotion>,
     /// The odometry's keyframe of the same image, with its landmarks and covariance.
     pub odometry: Option<Arc<OdometryKeyframe>>,
 }
@@ -54,13 +54,13 @@ impl MapKeyframe {
     /// Finds out how its rows were read, once the images around it have poses, and puts the odometry's landmarks where one instant
     /// would have seen them, as its pixels will be.
     pub(super) fn read_by_rows(&mut self, track: &Segment, readout: Duration, camera: &CameraModel) {
-        if self.shutter.is_some() {
+        if self.row_motion.is_some() {
             return;
         }
-        self.shutter = track.shutter(self.stamp.frame_id, readout);
-        if let (Some(shutter), Some(odometry)) = (&self.shutter, &mut self.odometry) {
+        self.row_motion = track.row_motion(self.stamp.frame_id, readout);
+        if let (Some(motion), Some(odometry)) = (&self.row_motion, &mut self.odometry) {
             for landmark in &mut Arc::make_mut(odometry).landmarks {
-                landmark.pixel = shutter.at_once(camera, &landmark.pixel).unwrap_or(landmark.pixel);
+                landmark.pixel = motion.at_once(camera, &landmark.pixel).unwrap_or(landmark.pixel);
             }
         }
     }

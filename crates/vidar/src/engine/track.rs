@@ -6,7 +6,7 @@ use crate::input::{MetricTrajectory, TrajectorySource};
 use crate::quality::TrackQuality;
 use std::collections::{BTreeMap, VecDeque};
 use std::sync::Arc;
-use vidar_core::remap::RollingShutter;
+use vidar_core::remap::RowMotion;
 use vidar_core::{
     CameraId, Duration, FrameId, LieGroup, OdometryKeyframe, RevisedPose, Rig, Se3, SensorEvent, Timestamp,
     Warning,
@@ -260,7 +260,7 @@ const SAME_SCENE: Duration = Duration::from_millis(1000);
 impl Segment {
     /// How the rows of a frame were read, by the poses of the frames before and after it, and by the landmarks of the odometry's
     /// nearest keyframe. None where the frames are far apart.
-    pub fn shutter(&self, frame: FrameId, readout: Duration) -> Option<RollingShutter> {
+    pub fn row_motion(&self, frame: FrameId, readout: Duration) -> Option<RowMotion> {
         let at = self.frames.binary_search_by_key(&frame, |f| f.stamp.frame_id).ok()?;
         let own = &self.frames[at];
         let (before, after) = (&self.frames[at.saturating_sub(1)], self.frames.get(at + 1).unwrap_or(own));
@@ -270,7 +270,7 @@ impl Segment {
         }
         let turned = before.world_from_camera.rotation.inverse() * after.world_from_camera.rotation;
         let moved = after.world_from_camera.translation - before.world_from_camera.translation;
-        Some(RollingShutter {
+        Some(RowMotion {
             // Turning about one axis between the two, the frame between them has the same rate in its own axes.
             turn_rad_per_s: turned.log() / span.as_secs_f64(),
             velocity_m_per_s: own.world_from_camera.rotation.inverse() * moved / span.as_secs_f64(),
@@ -458,14 +458,14 @@ mod tests {
         };
         let frames: Vec<PosedFrame> = [0, 1, 2, 7].into_iter().map(frame).collect();
         let segment = Segment { id: 0, images: 4, frames, odometry: Vec::new(), last: None };
-        let shutter = segment.shutter(FrameId(1), Duration::from_millis(20)).unwrap();
-        assert!((shutter.turn_rad_per_s - rate).norm() < 1e-9, "{shutter:?}");
-        let velocity = segment.frames[1].world_from_camera.rotation * shutter.velocity_m_per_s;
-        assert!((velocity - Vector3::new(0.3, 0.0, 0.0)).norm() < 1e-9, "{shutter:?}");
-        assert_eq!((shutter.readout_secs, shutter.inverse_depth), (0.02, 0.0));
+        let motion = segment.row_motion(FrameId(1), Duration::from_millis(20)).unwrap();
+        assert!((motion.turn_rad_per_s - rate).norm() < 1e-9, "{motion:?}");
+        let velocity = segment.frames[1].world_from_camera.rotation * motion.velocity_m_per_s;
+        assert!((velocity - Vector3::new(0.3, 0.0, 0.0)).norm() < 1e-9, "{motion:?}");
+        assert_eq!((motion.readout_secs, motion.inverse_depth), (0.02, 0.0));
         // Half a second says nothing of a hand.
-        assert!(segment.shutter(FrameId(2), Duration::from_millis(20)).is_none());
-        assert!(segment.shutter(FrameId(5), Duration::from_millis(20)).is_none());
+        assert!(segment.row_motion(FrameId(2), Duration::from_millis(20)).is_none());
+        assert!(segment.row_motion(FrameId(5), Duration::from_millis(20)).is_none());
     }
 
     #[test]

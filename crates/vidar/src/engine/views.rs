@@ -66,7 +66,7 @@ impl<'a> ViewWindow<'a> {
     pub fn load(&self, keyframe: &MapKeyframe) -> Result<ChunkView, Warning> {
         let image = self.images.image(&keyframe.stamp)?;
         let shift = keyframe
-            .shutter
+            .row_motion
             .and_then(|s| RowShift::new(&self.camera, self.remap.target(), &s, LEAST_SHIFT_PX));
         Ok(ChunkView {
             frame_id: keyframe.stamp.frame_id,
