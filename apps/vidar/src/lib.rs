@@ -52,11 +52,11 @@ pub fn main_with(args: impl Iterator<Item = OsString>) -> ExitCode {
     }
 }
 
-/// A panic in the decoder of a video is an error of one image, and is said as that error; what Rust prints of it would look like a bug.
+/// A panic in a decoder is an error of one image, and is said as that error; what Rust prints of it would look like a bug.
 fn silence_decoders() {
     let before = std::panic::take_hook();
     std::panic::set_hook(Box::new(move |panic| {
-        if std::thread::current().name() != Some(vidar::dataset::DECODER_THREAD) {
+        if !vidar::dataset::is_decoding() {
             before(panic);
         }
     }));

@@ -5,6 +5,7 @@
 //! the rest with grey, which a stereo matcher would take for image content.
 
 use crate::error::DatasetError;
+use crate::isolated::isolated;
 use crate::source::read_file_up_to;
 use image::metadata::Orientation;
 use image::{ColorType, DynamicImage, ImageDecoder};
@@ -36,7 +37,7 @@ const DEFLATE_MAX_EXPANSION: u64 = 1032;
 /// colour is rounded to 8 bits. A photograph is turned upright as its EXIF says.
 pub fn read_image(path: &Path, limits: &ImageLimits) -> Result<FrameImage, DatasetError> {
     let bytes = read_file_up_to(path, limits.max_file_bytes)?;
-    decode_image(&bytes, limits).map_err(|reason| bad_image(path, reason))
+    isolated(|| decode_image(&bytes, limits)).map_err(|reason| bad_image(path, reason))
 }
 
 /// Reads a 16-bit grey PNG of raw depths (8-bit grey is widened, value for value).
@@ -52,13 +53,13 @@ pub fn read_depth(path: &Path, limits: &ImageLimits) -> Result<Image<u16>, Datas
 pub fn read_size(path: &Path, limits: &ImageLimits) -> Result<(usize, usize), DatasetError> {
     // Headers may follow kilobytes of metadata, so the decoder decides how much it reads.
     let bytes = read_file_up_to(path, limits.max_file_bytes)?;
-    open_decoder(&bytes, limits)
-        .map(|mut d| {
-            let (width, height) = d.dimensions();
-            let (width, height) = (width as usize, height as usize);
-            if lies_on_its_side(orientation(d.as_mut())) { (height, width) } else { (width, height) }
-        })
-        .map_err(|reason| bad_image(path, reason))
+    isolated(|| {
+        let mut decoder = open_decoder(&bytes, limits)?;
+        let (width, height) = decoder.dimensions();
+        let (width, height) = (width as usize, height as usize);
+        Ok(if lies_on_its_side(orientation(decoder.as_mut())) { (height, width) } else { (width, height) })
+    })
+    .map_err(|reason| bad_image(path, reason))
 }
 
 /// How the picture is to be turned; not at all where its EXIF is damaged.

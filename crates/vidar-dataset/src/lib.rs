@@ -19,6 +19,7 @@ mod folder;
 mod image_folder;
 mod imu_log;
 mod inertial;
+mod isolated;
 mod kitti;
 mod kitti_raw;
 mod location;
@@ -48,6 +49,7 @@ pub use dataset::{
 };
 pub use error::DatasetError;
 pub use events::EventCursor;
+pub use isolated::is_decoding;
 pub use location::Location;
 pub use options::{
     DatasetKind, OpenOptions, PoseUse, TimeUnit, TopicFlag, TrajectoryFormat, TrajectoryReadOptions,

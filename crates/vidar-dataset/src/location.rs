@@ -3,6 +3,7 @@
 use crate::dataset::check_size;
 use crate::decode::{self, ImageLimits};
 use crate::error::{DatasetError, io_error};
+use crate::isolated::isolated;
 use std::fmt;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -266,7 +267,7 @@ pub(crate) fn pixels(message: &Message) -> Result<Pixels, String> {
             let bytes =
                 if is_depth { image.data.get(DEPTH_PREFIX_BYTES..) } else { Some(image.data.as_slice()) };
             let bytes = bytes.ok_or("a compressed depth image without its head")?;
-            decode::decode_image(bytes, &ImageLimits::default())
+            isolated(|| decode::decode_image(bytes, &ImageLimits::default()))
                 .map(Pixels::Image)
                 .map_err(|reason| format!("{reason} (format {:?})", vidar_core::printable(&image.format)))
         }
