@@ -288,10 +288,14 @@ fn a_point_at_the_typical_depth_is_where_one_instant_sees_it() {
         inverse_depth: 1.0 / 1.5,
         ..turning(Vector3::new(0.9, -1.4, 0.7), 0.03)
     };
+    let mut judged = 0;
     for camera in distorted_cameras() {
         let (w, h) = (camera.width() as f64, camera.height() as f64);
         for (x, y) in [(0.2, 0.1), (0.5, 0.5), (0.8, 0.9), (0.3, 0.8)] {
-            let ray = camera.unproject(&Vector2::new(x * w, y * h)).unwrap();
+            // Fisheyes look sideways in their corners, where there is no depth.
+            let ray = camera.unproject(&Vector2::new(x * w, y * h)).filter(|ray| ray.z > 0.3);
+            let Some(ray) = ray else { continue };
+            judged += 1;
             let point = ray * (1.5 / ray.z);
             // Where its row sees it: the camera has moved on since the middle row.
             let mut row = y * h;
@@ -308,6 +312,7 @@ fn a_point_at_the_typical_depth_is_where_one_instant_sees_it() {
             assert!(error < 0.05 * moved.max(1.0), "{}: {error} of {moved} px", camera.name());
         }
     }
+    assert!(judged >= 10, "{judged}");
 }
 
 fn turning(turn_rad_per_s: Vector3<f64>, readout_secs: f64) -> RowMotion {
