@@ -42,7 +42,7 @@ pub fn write(root: &Path) -> Result<()> {
     std::fs::write(root.join(FILE), text(root)?).context(FILE)
 }
 
-/// Reports a file that is not what [`write`] writes.
+/// Reports a file that is not what [`write()`] writes.
 pub fn check(root: &Path) -> Result<Vec<String>> {
     let found = std::fs::read_to_string(root.join(FILE)).unwrap_or_default();
     Ok(difference(&found, &text(root)?).into_iter().collect())
