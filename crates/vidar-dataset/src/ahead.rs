@@ -2,9 +2,9 @@
 
 use crate::dataset::{Dataset, ImageEntry};
 use crate::error::DatasetError;
+use crate::isolated::BROKE_DOWN;
 use crate::location::{Location, Media};
 use std::collections::VecDeque;
-use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::sync::{Arc, Mutex, PoisonError};
@@ -73,16 +73,13 @@ fn work(media: &Media, queue: &Mutex<Receiver<Job>>, is_over: &AtomicBool) {
         if is_over.load(Ordering::Relaxed) {
             return;
         }
-        // What a decoder was doing when it broke down is not used again.
-        let loaded = catch_unwind(AssertUnwindSafe(|| media.image_of_size(&entry.location, expected)));
-        // Nobody may wait for it any more.
-        let _ = done.send(loaded.unwrap_or_else(|_| Err(broke_down(&entry.location))));
+        // A decoder's panic is the image's error already; nobody may wait for it any more.
+        let _ = done.send(media.image_of_size(&entry.location, expected));
     }
 }
 
 fn broke_down(location: &Location) -> DatasetError {
-    let reason = "the decoder broke down on it (the image is damaged, or the decoder has a fault)";
-    DatasetError::BadImage { path: location.place(), reason: reason.into() }
+    DatasetError::BadImage { path: location.place(), reason: BROKE_DOWN.into() }
 }
 
 /// Iterator of [`Dataset::images_ahead`].

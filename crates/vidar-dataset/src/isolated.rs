@@ -4,6 +4,10 @@ use std::cell::Cell;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use vidar_video::DECODER_THREAD;
 
+/// Why an image has no pixels after its decoder's panic.
+pub(crate) const BROKE_DOWN: &str =
+    "the decoder broke down on it (the image is damaged, or the decoder has a fault)";
+
 thread_local! {
     static IS_DECODING: Cell<bool> = const { Cell::new(false) };
 }
@@ -20,9 +24,7 @@ pub(crate) fn isolated<T>(decode: impl FnOnce() -> Result<T, String>) -> Result<
     // What the decoder was doing when it broke down is not used again.
     let decoded = catch_unwind(AssertUnwindSafe(decode));
     IS_DECODING.set(before);
-    decoded.unwrap_or_else(|_| {
-        Err("the decoder broke down on it (the image is damaged, or the decoder has a fault)".into())
-    })
+    decoded.unwrap_or_else(|_| Err(BROKE_DOWN.into()))
 }
 
 #[cfg(test)]
