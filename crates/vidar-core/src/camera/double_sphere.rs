@@ -63,7 +63,14 @@ impl DoubleSphere {
         }
         let z1 = self.xi * d1 + p.z;
         let d2 = (p.x * p.x + p.y * p.y + z1 * z1).sqrt();
-        let n = self.alpha * d2 + (1.0 - self.alpha) * z1;
+        let (a, b) = (self.alpha * d2, (1.0 - self.alpha) * z1);
+        // Behind the camera a and b nearly cancel: (a² − b²)/(a − b) without the difference of the large terms.
+        let n = if z1 < 0.0 {
+            let across = p.x * p.x + p.y * p.y;
+            (self.alpha * self.alpha * across + (2.0 * self.alpha - 1.0) * z1 * z1) / (a - b)
+        } else {
+            a + b
+        };
         (n > super::pinhole::MIN_Z * d1).then_some(Lengths { d1, z1, d2, n })
     }
 
