@@ -61,7 +61,8 @@ impl RowMotion {
 
     /// How long after the middle row a pixel was read, s.
     fn row_secs(&self, camera: &CameraModel, pixel: &Pixel) -> f64 {
-        self.readout_secs * ((pixel.y + 0.5) / camera.height() as f64 - 0.5)
+        let last_row = camera.height().max(2) as f64 - 1.0;
+        self.readout_secs * (pixel.y / last_row - 0.5)
     }
 }
 

@@ -429,6 +429,7 @@ fn set(config: &mut OdometryConfig, key: &str, number: f64) -> Result<(), Failur
         "pixel_noise_px" => config.pixel_noise_px = number,
         "gyro_noise_factor" => config.gyro_noise_factor = number,
         "accel_noise_factor" => config.accel_noise_factor = number,
+        "gyro_gain_std" => config.gyro_gain_std = number,
         other => return Err(format!("no number called {other} in the configuration").into()),
     }
     Ok(())

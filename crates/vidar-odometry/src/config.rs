@@ -36,6 +36,9 @@ pub struct OdometryConfig {
     pub gyro_noise_factor: f64,
     /// Factor on the data sheet's accelerometer noise, 1…100.
     pub accel_noise_factor: f64,
+    /// Standard deviation of the gyroscope's gain per axis while images come, relative, 0…0.1; data sheets of phones' sensors state
+    /// 0.01 to 0.03. The adjustment afterwards estimates the gains.
+    pub gyro_gain_std: f64,
     /// Strength of gravity, m/s², 9.5…10.
     pub gravity_mps2: f64,
     /// Whether the offset between the clocks of camera and IMU is estimated on the way.
@@ -67,6 +70,7 @@ impl Default for OdometryConfig {
             pixel_noise_px: 0.3,
             gyro_noise_factor: 2.0,
             accel_noise_factor: 4.0,
+            gyro_gain_std: 0.01,
             gravity_mps2: vidar_core::GRAVITY_MPS2,
             estimate_time_offset: true,
             align_timing: true,
@@ -110,6 +114,7 @@ impl OdometryConfig {
         check("pixel_noise_px", self.pixel_noise_px, 0.1, 5.0, "0.1 to 5 px")?;
         check("gyro_noise_factor", self.gyro_noise_factor, 1.0, 100.0, "1 to 100")?;
         check("accel_noise_factor", self.accel_noise_factor, 1.0, 100.0, "1 to 100")?;
+        check("gyro_gain_std", self.gyro_gain_std, 0.0, 0.1, "0 to 0.1")?;
         check("gravity_mps2", self.gravity_mps2, 9.5, 10.0, "9.5 to 10 m/s²")?;
         check("readout_ms", self.readout_ms.unwrap_or(0.0), 0.0, 50.0, "0 to 50 ms")?;
         check("max_speed_mps", self.max_speed_mps, 0.1, 100.0, "0.1 to 100 m/s")?;
@@ -124,13 +129,14 @@ mod tests {
     #[test]
     fn each_bad_key_is_named() {
         type Corrupt = fn(&mut OdometryConfig);
-        let cases: [(&str, Corrupt); 9] = [
+        let cases: [(&str, Corrupt); 10] = [
             ("max_landmarks", |c| c.max_landmarks = 3),
             ("max_keyframes", |c| c.max_keyframes = 100),
             ("iterations", |c| c.iterations = 0),
             ("pixel_noise_px", |c| c.pixel_noise_px = f64::NAN),
             ("gyro_noise_factor", |c| c.gyro_noise_factor = 0.0),
             ("accel_noise_factor", |c| c.accel_noise_factor = -1.0),
+            ("gyro_gain_std", |c| c.gyro_gain_std = 0.5),
             ("gravity_mps2", |c| c.gravity_mps2 = 1.62),
             ("max_speed_mps", |c| c.max_speed_mps = 0.0),
             ("max_blind_secs", |c| c.max_blind_secs = f64::INFINITY),

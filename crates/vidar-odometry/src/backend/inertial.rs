@@ -20,7 +20,7 @@ impl Whitening {
         let model = preintegration.model();
         let root_t = preintegration.secs().max(1e-9).sqrt();
         // A floor keeps exact test data and empty stretches invertible.
-        let mut covariance = *preintegration.covariance();
+        let mut covariance = preintegration.covariance();
         for k in 0..9 {
             covariance[(k, k)] += 1e-18;
         }

@@ -39,6 +39,8 @@ pub struct StepNoise {
 pub struct ImuModel {
     /// White noise.
     pub noise: StepNoise,
+    /// Standard deviation of the gyroscope's gain per axis, relative.
+    pub gyro_gain_std: f64,
     /// Gyroscope bias random walk, rad/s²/√Hz.
     pub gyro_walk: f64,
     /// Accelerometer bias random walk, m/s³/√Hz.
@@ -64,12 +66,19 @@ impl ImuModel {
                 accel_density: sheet.accel_noise_density * accel_factor,
                 period_secs: 1.0 / sheet.rate_hz.max(1.0),
             },
+            gyro_gain_std: 0.0,
             gyro_walk: sheet.gyro_random_walk.max(MIN_GYRO_WALK),
             accel_walk: sheet.accel_random_walk.max(MIN_ACCEL_WALK),
             gyro_limit: 17.0,
             accel_limit: 170.0,
             gravity_mps2: GRAVITY_MPS2,
         }
+    }
+
+    /// The same with a gyroscope whose gain is uncertain by `std`, relative.
+    #[must_use]
+    pub const fn with_gyro_gain_std(self, std: f64) -> Self {
+        Self { gyro_gain_std: std, ..self }
     }
 
     /// The same where gravity is `gravity_mps2` strong.
@@ -98,6 +107,9 @@ pub(crate) struct Delta {
     pub(crate) velocity: Vector3<f64>,
     pub(crate) by_gyro_bias: ByBias,
     pub(crate) by_accel_bias: ByBias,
+    /// By the gain of each axis of the gyroscope: over a step a gain acts as a bias of minus the reading.
+    pub(crate) by_gyro_gain: ByBias,
+    /// Of white noise.
     pub(crate) covariance: Matrix9,
 }
 
@@ -110,6 +122,7 @@ impl Delta {
             velocity: Vector3::new(0.0, 0.0, 0.0),
             by_gyro_bias: ByBias::from_array_storage(nalgebra::ArrayStorage([[0.0; 9]; 3])),
             by_accel_bias: ByBias::from_array_storage(nalgebra::ArrayStorage([[0.0; 9]; 3])),
+            by_gyro_gain: ByBias::from_array_storage(nalgebra::ArrayStorage([[0.0; 9]; 3])),
             covariance: Matrix9::from_array_storage(nalgebra::ArrayStorage([[0.0; 9]; 9])),
         }
     }
@@ -142,6 +155,10 @@ impl Delta {
         let identity = Matrix3::identity();
         by_accel_bias.fixed_view_mut::<3, 3>(3, 0).copy_from(&((identity + r_mid * 2.0) * -c2));
         by_accel_bias.fixed_view_mut::<3, 3>(6, 0).copy_from(&((identity + r_mid * 4.0 + r_end) * -c1));
+        let mut by_gyro_gain = by_gyro_bias;
+        for (k, mut column) in by_gyro_gain.column_iter_mut().enumerate() {
+            column *= -0.5 * (a.gyro.0[k] + b.gyro.0[k]);
+        }
         // White noise of density σ, averaged over the step, acts as a bias of variance σ²/h.
         let [gyro_variance, accel_variance] = step_variances(a, b, secs, model);
         let covariance = by_gyro_bias * by_gyro_bias.transpose() * gyro_variance
@@ -153,6 +170,7 @@ impl Delta {
             velocity: (f0 + force_mid * 4.0 + force_end) * c1,
             by_gyro_bias,
             by_accel_bias,
+            by_gyro_gain,
             covariance,
         }
     }
@@ -169,6 +187,7 @@ impl Delta {
             velocity: self.velocity + turn * next.velocity,
             by_gyro_bias: f * self.by_gyro_bias + g * next.by_gyro_bias,
             by_accel_bias: f * self.by_accel_bias + g * next.by_accel_bias,
+            by_gyro_gain: f * self.by_gyro_gain + g * next.by_gyro_gain,
             covariance: (covariance + covariance.transpose()) * 0.5,
         }
     }
@@ -347,28 +366,29 @@ impl Preintegration {
         self.corrected(bias).0
     }
 
-    /// Covariance of rotation (first side of the end), position and velocity, white noise only.
-    pub fn covariance(&self) -> &SMatrix<f64, 9, 9> {
-        &self.delta.covariance
+    /// Covariance of rotation (first side of the end), position and velocity: white noise, and the gyroscope's gain, which is the
+    /// same over the whole stretch.
+    pub fn covariance(&self) -> SMatrix<f64, 9, 9> {
+        let by_gain = self.delta.by_gyro_gain * self.model.gyro_gain_std;
+        self.delta.covariance + by_gain * by_gain.transpose()
     }
 
     /// Derivative of rotation, position and velocity by the sensors' gains (gyroscope, accelerometer, per axis): over a step a
-    /// gain acts as a bias of minus the reading. Zero after very long stretches, whose readings are not kept.
+    /// gain acts as a bias of minus the reading. The accelerometer's is zero after very long stretches, whose readings are not kept.
     pub(crate) fn by_gain(&self) -> SMatrix<f64, 9, 6> {
         let steps = self.samples.windows(2).filter(|pair| pair[1].time > pair[0].time);
-        let none = (Delta::none(), SMatrix::<f64, 9, 6>::zeros());
-        let (_, by_gain) = steps.fold(none, |(sum, by_gain), pair| {
+        let (_, by_accel_gain) = steps.fold((Delta::none(), ByBias::zeros()), |(sum, by_gain), pair| {
             let step = Delta::step(&pair[0], &pair[1], &self.bias, &self.model);
-            let rate = (pair[0].gyro.0 + pair[1].gyro.0) * -0.5;
-            let force = (pair[0].accel.0 + pair[1].accel.0) * -0.5;
-            let mut of_step = SMatrix::<f64, 9, 6>::zeros();
-            for k in 0..3 {
-                of_step.set_column(k, &(step.by_gyro_bias.column(k) * rate[k]));
-                of_step.set_column(3 + k, &(step.by_accel_bias.column(k) * force[k]));
+            let mut of_step = step.by_accel_bias;
+            for (k, mut column) in of_step.column_iter_mut().enumerate() {
+                column *= -0.5 * (pair[0].accel.0[k] + pair[1].accel.0[k]);
             }
             let (f, g) = sum.by_parts(&step);
             (sum.then(&step), f * by_gain + g * of_step)
         });
+        let mut by_gain = SMatrix::<f64, 9, 6>::zeros();
+        by_gain.fixed_columns_mut::<3>(0).copy_from(&self.delta.by_gyro_gain);
+        by_gain.fixed_columns_mut::<3>(3).copy_from(&by_accel_gain);
         by_gain
     }
 

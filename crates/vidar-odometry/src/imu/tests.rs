@@ -170,6 +170,51 @@ fn two_stretches_joined_are_the_whole() {
 }
 
 #[test]
+fn gains_of_both_sensors_act_as_their_derivatives_say() {
+    let samples = imu_samples(1.0, 1.6, 200.0, &bias());
+    let plain = Preintegration::new(model(), Bias::ZERO, &samples);
+    let step = 1e-5;
+    for axis in 0..6 {
+        // A reading that is larger by a share of itself is one whose bias is lower by as much.
+        let scaled: Vec<ImuSample> = samples
+            .iter()
+            .map(|s| {
+                let (mut gyro, mut accel) = (s.gyro.0, s.accel.0);
+                let reading = if axis < 3 { &mut gyro[axis] } else { &mut accel[axis - 3] };
+                *reading *= 1.0 + step;
+                ImuSample { time: s.time, gyro: AngularRate(gyro), accel: SpecificForce(accel) }
+            })
+            .collect();
+        let moved = Preintegration::new(model(), Bias::ZERO, &scaled).delta;
+        let mut numeric = SVector::<f64, 9>::zeros();
+        numeric.fixed_rows_mut::<3>(0).copy_from(&(plain.delta.rotation.inverse() * moved.rotation).log());
+        numeric.fixed_rows_mut::<3>(3).copy_from(&(moved.position - plain.delta.position));
+        numeric.fixed_rows_mut::<3>(6).copy_from(&(moved.velocity - plain.delta.velocity));
+        let error = (numeric / step - plain.by_gain().column(axis)).amax();
+        assert!(error < 2e-3, "axis {axis}: {error:.1e}");
+    }
+}
+
+#[test]
+fn an_uncertain_gain_widens_the_covariance_by_the_square_of_time() {
+    let samples = imu_samples(1.0, 1.6, 200.0, &bias());
+    let (short, long) = (&samples[..41], &samples[..81]);
+    let added = |samples: &[ImuSample]| {
+        let sure = Preintegration::new(model(), Bias::ZERO, samples).covariance();
+        let unsure = Preintegration::new(model().with_gyro_gain_std(0.01), Bias::ZERO, samples);
+        let turned = unsure.rotation(&Bias::ZERO).log().norm();
+        let added = unsure.covariance() - sure;
+        (added.fixed_view::<3, 3>(0, 0).trace().sqrt() / turned, added.amax())
+    };
+    // Gains of the three axes are independent, so that turning about one axis by an angle leaves 1 % of it.
+    for samples in [short, long] {
+        let (share, _) = added(samples);
+        assert!((0.009..0.011).contains(&share), "{share}");
+    }
+    assert!(added(long).1 > 3.0 * added(short).1);
+}
+
+#[test]
 fn a_bias_that_moved_far_is_integrated_again_and_a_near_one_is_not() {
     let samples = imu_samples(1.0, 1.6, 200.0, &bias());
     let mut found = Preintegration::new(model(), Bias::ZERO, &samples);

@@ -1,6 +1,6 @@
 //! Events in, one output per image.
 
-use super::health::{HealthMonitor, MAX_IMU_GAP_SECS};
+use super::health::HealthMonitor;
 use super::keyframes::KeyframeRegistry;
 use super::orientation_check::{MAX_TURN_DEG, OrientationCheck};
 use super::output::{DivergenceSign, LossReason, OdometryOutput, Status};
@@ -10,25 +10,27 @@ use crate::bundle_adjustment::TrackLog;
 use crate::config::{ImuUse, OdometryConfig};
 use crate::error::OdometryError;
 use crate::frontend::FrontendConfig;
-use crate::imu::{Bias, ImuBuffer, ImuModel, Preintegration};
+use crate::imu::{ImuBuffer, ImuModel};
 use crate::initialization::{InitFailure, InitFailureReason, Initializer};
 use crate::stages::{Stage, StageClock, StageTimes};
 use crate::tracking::{FrameInput, HostImage, ImagePool, SlidingWindowOdometry, TrackRecord};
-use nalgebra::Vector3;
 use relocalization::Relocalizer;
 use start::initializer;
 use std::collections::VecDeque;
 use std::sync::Arc;
+use successor::{RecentFrames, Successor};
 use vidar_core::{
     CameraId, Duration, Frame, FrameId, ImuSample, LieGroup, Rig, RigCamera, Se3, SensorEvent, Timestamp,
 };
 
 mod adjustment;
+mod inertial;
 mod joined_segments;
 mod relocalization;
 mod report;
 mod saved_map;
 mod start;
+mod successor;
 mod timing;
 
 /// Images that may wait for IMU measurements of their time.
@@ -94,6 +96,9 @@ pub struct Odometry {
     check: OrientationCheck,
     time_calibration: TimeCalibration,
     images: ImagePool,
+    /// Images that an odometry with another timing would begin with, as long as the timing is not settled.
+    recent: RecentFrames,
+    successor: Option<Successor>,
     clock: StageClock,
     /// What is kept for the adjustment, where one is wanted.
     log: Option<TrackLog>,
@@ -113,33 +118,50 @@ impl Odometry {
             ImuUse::Required => Some(rig.imu.ok_or(OdometryError::NoImu)?),
         };
         super::calibration::check(&rig_camera)?;
+        let given_body_from_camera = rig_camera.body_from_camera;
         let (working, working_camera) = WorkingSize::of(&rig_camera.model);
         rig_camera.model = working_camera;
         let imu_model = noise.map(|n| {
             ImuModel::from_data_sheet(&n, config.gyro_noise_factor, config.accel_noise_factor)
+                .with_gyro_gain_std(config.gyro_gain_std)
                 .with_gravity(config.gravity_mps2)
         });
-        let frontend = FrontendConfig::default();
         // From here on `off` says what is, not only what was asked for.
         let imu = if imu_model.is_some() { config.imu } else { ImuUse::Off };
         let config = OdometryConfig { imu, ..config.clone() };
+        let samples = ImuBuffer::new(noise.map_or(200.0, |n| n.rate_hz));
+        let fresh = Self::fresh(config, (camera, rig_camera), working, imu_model, samples);
+        Ok(Self { given_body_from_camera, ..fresh })
+    }
+
+    /// An odometry that has seen nothing; `camera` is that of the images that are worked with.
+    fn fresh(
+        config: OdometryConfig,
+        (camera_id, camera): (CameraId, RigCamera),
+        working: WorkingSize,
+        imu_model: Option<ImuModel>,
+        imu: ImuBuffer,
+    ) -> Self {
+        let frontend = FrontendConfig::default();
         let phase =
-            Phase::Initializing(Box::new(initializer(&config, imu_model.is_none(), &rig_camera, &frontend)));
+            Phase::Initializing(Box::new(initializer(&config, imu_model.is_none(), &camera, &frontend)));
         let time_calibration = TimeCalibration::new(&config);
-        Ok(Self {
+        Self {
             config,
             frontend,
-            camera_id: camera,
-            check: OrientationCheck::new(&rig_camera.body_from_camera.rotation),
+            camera_id,
+            check: OrientationCheck::new(&camera.body_from_camera.rotation),
+            recent: RecentFrames::new(imu_model.is_some() && !time_calibration.is_settled()),
+            successor: None,
             time_calibration,
             images: ImagePool::default(),
             clock: StageClock::start(),
             log: None,
-            given_body_from_camera: rig_camera.body_from_camera,
-            camera: rig_camera,
+            given_body_from_camera: camera.body_from_camera,
+            camera,
             working,
             imu_model,
-            imu: ImuBuffer::new(noise.map_or(200.0, |n| n.rate_hz)),
+            imu,
             pending: VecDeque::new(),
             phase,
             counts: InputCounts::default(),
@@ -155,7 +177,7 @@ impl Odometry {
             failure: InitFailure { reason: InitFailureReason::Frames, measured: 0.0, limit: 5.0 },
             health_monitor: HealthMonitor::default(),
             keyframes: KeyframeRegistry::default(),
-        })
+        }
     }
 
     /// Takes an event; says what is known after the oldest image that waited for it, if any did.
@@ -171,6 +193,7 @@ impl Odometry {
             SensorEvent::Imu(sample) if self.imu_model.is_some() => match self.imu.push(sample) {
                 Ok(()) => {
                     self.counts.imu_samples += 1;
+                    self.successor.iter_mut().for_each(|s| s.add_imu(sample));
                     if let Some(log) = &mut self.log {
                         log.add_imu(&sample);
                     }
@@ -257,6 +280,7 @@ impl Odometry {
         self.next_frame = self.next_frame.wrapping_add(1);
         // The size was checked when the image came.
         let host = self.images.take(id, &frame.image, self.frontend.pyramid.levels, self.shutter_at(time))?;
+        self.recent.add(id, &frame);
         let was_starting = matches!(self.phase, Phase::Initializing(_));
         let mut status = self.status_after(&frame, host, time);
         self.relocalize(&mut status, id, frame.id, time);
@@ -269,7 +293,9 @@ impl Odometry {
             None => status,
         };
         self.clock.lap(if was_starting { Stage::Initialise } else { Stage::Output });
-        self.imu.forget_before(self.last_frame.unwrap_or(time) - Duration::from_millis(1500));
+        let status = self.follow_successor(id).unwrap_or(status);
+        let used_from = self.last_frame.unwrap_or(time) - Duration::from_millis(1500);
+        self.imu.forget_before(self.recent.oldest().map_or(used_from, |t| used_from.min(t)));
         Some(OdometryOutput { frame_id: frame.id, time: frame.time, status })
     }
 
@@ -330,44 +356,9 @@ impl Odometry {
         }
     }
 
-    /// A stretch without images or IMU measurements that cannot be bridged.
-    fn gap_before(&mut self, time: Timestamp) -> Option<LossReason> {
-        let (Phase::Tracking(_), Some(last)) = (&self.phase, self.last_frame) else {
-            return None;
-        };
-        let secs = (time - last).as_secs_f64();
-        if secs > self.config.max_blind_secs {
-            return Some(LossReason::ImageGap { secs });
-        }
-        self.imu_model?;
-        match self.imu.interval(last, time, &mut self.interval) {
-            Ok(Some(gap)) if gap.length.as_secs_f64() > MAX_IMU_GAP_SECS => {
-                Some(LossReason::ImuGap { secs: gap.length.as_secs_f64() })
-            }
-            Ok(_) => None,
-            Err(_) => Some(LossReason::ImuGap { secs }),
-        }
-    }
-
-    fn preintegrate_until(&mut self, time: Timestamp) -> Option<Preintegration> {
-        let (model, from) = (self.imu_model?, self.last_frame?);
-        let gap = self.imu.interval(from, time, &mut self.interval).ok()?;
-        self.counts.imu_gaps += usize::from(gap.is_some());
-        let (bias, spare) = match &mut self.phase {
-            Phase::Tracking(window) => (window.state()?.bias, window.spare_preintegration()),
-            Phase::Initializing(initializer) => {
-                (Bias { gyro: initializer.gyro_bias(), accel: Vector3::zeros() }, None)
-            }
-        };
-        let Some(mut preintegration) = spare else {
-            return Some(Preintegration::new(model, bias, &self.interval));
-        };
-        preintegration.restart(bias, &self.interval);
-        Some(preintegration)
-    }
-
     /// Gives the state up and starts anew.
     fn lose(&mut self, reason: LossReason) -> Status {
+        self.successor = None;
         self.keep_clock_offset(&reason);
         self.initialize_anew();
         self.health_monitor = HealthMonitor::default();

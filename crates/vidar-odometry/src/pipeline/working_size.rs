@@ -35,6 +35,11 @@ impl WorkingSize {
         (Self { width, height, halvings, buffers: None }, working)
     }
 
+    /// The same conversion, with buffers of its own.
+    pub fn another(&self) -> Self {
+        Self { buffers: None, ..*self }
+    }
+
     /// The caller's columns and rows.
     pub fn given(&self) -> (usize, usize) {
         (self.width, self.height)

@@ -42,6 +42,16 @@ pub(crate) fn apply(adjusted: &Adjusted, dataset: &mut Dataset) {
     camera.time_offset = Duration::from_secs_f64(adjusted.calibration.time_offset_secs);
 }
 
+/// Standard deviations by which a readout must differ from zero before depth and map are corrected for it.
+const SHOWN_SIGMAS: f64 = 3.0;
+
+/// The readout that a recording shows, s: zero (a global shutter) where the estimate does not differ from it, so that images of a global
+/// shutter stay as they are.
+pub(crate) fn shown_readout_secs(calibration: &AdjustedCalibration) -> f64 {
+    let std = calibration.sigmas.get(1).copied().unwrap_or(0.0);
+    if calibration.readout_secs > SHOWN_SIGMAS * std { calibration.readout_secs } else { 0.0 }
+}
+
 /// The calibration as adjusted, with standard deviations; zero where it was held.
 pub(super) fn calibration_json(adjusted: &Adjusted) -> Value {
     let AdjustedCalibration { camera, body_from_camera, time_offset_secs, readout_secs, sigmas } =

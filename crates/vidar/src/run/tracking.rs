@@ -144,7 +144,7 @@ impl Tracking {
         let poses = TrackedPoses::new(&tracked, &dataset.rig, dataset.camera);
         if let Some(adjusted) = &tracked.adjusted {
             adjusted::apply(adjusted, dataset);
-            config.odometry.readout_ms = Some(1e3 * adjusted.calibration.readout_secs.max(0.0));
+            config.odometry.readout_ms = Some(1e3 * adjusted::shown_readout_secs(&adjusted.calibration));
         }
         if let (Some(calibrated), false) = (self.calibrated, cancel.is_cancelled()) {
             let after = Calibrated::of(dataset, config);

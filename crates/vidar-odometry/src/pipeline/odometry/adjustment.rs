@@ -90,7 +90,8 @@ impl Odometry {
             camera: &camera,
             readout_secs: self.time_calibration.readout_secs,
             given_body_from_camera: self.given_body_from_camera,
-            model: *model,
+            // The adjustment has the gains among its unknowns.
+            model: model.with_gyro_gain_std(0.0),
             data_sheet,
             sigmas: &CalibrationSigmas {
                 principal_point_px: sigmas.principal_point_px / self.working.factor(),

@@ -1,5 +1,6 @@
 //! The camera's clock, readout and rotation, as they are found while images come.
 
+use super::successor::RecentFrames;
 use super::{Odometry, Phase, Status};
 use crate::backend::CalibrationEstimate;
 use crate::config::OdometryConfig;
@@ -7,7 +8,7 @@ use crate::error::OdometryError;
 use crate::gyro_alignment::RollingShutter;
 use crate::pipeline::orientation_check::OrientationCheck;
 use crate::pipeline::output::LossReason;
-use crate::pipeline::time_calibration::CameraTiming;
+use crate::pipeline::time_calibration::{CameraTiming, Correction};
 use nalgebra::Vector3;
 use vidar_core::{CameraId, Duration, FrameId, LieGroup, Rig, SensorEvent, Timestamp};
 
@@ -46,6 +47,8 @@ impl Odometry {
         events: impl IntoIterator<Item = SensorEvent>,
     ) -> Result<CameraTiming, OdometryError> {
         let mut odometry = Self::new(rig, camera, config)?;
+        // Here no state is worth more than the values.
+        odometry.recent = RecentFrames::new(false);
         let mut first = None;
         for event in events {
             odometry.push(event)?;
@@ -111,9 +114,12 @@ impl Odometry {
         }
     }
 
-    /// Checks clock, readout and camera rotation against tracks and gyroscope, with an image stamped `now` or after the last one; starts
-    /// anew where they were corrected.
+    /// Checks clock, readout and camera rotation against tracks and gyroscope, with an image stamped `now` or after the last one. Where
+    /// they are corrected, a second odometry begins with them on the last images; without images it starts anew.
     pub(super) fn recalibrate(&mut self, now: Option<Timestamp>) -> Option<Status> {
+        if self.successor.is_some() {
+            return None;
+        }
         let offset = self.camera.time_offset + self.estimated_offset();
         let correction = self.time_calibration.correction(
             &self.camera,
@@ -121,6 +127,14 @@ impl Odometry {
             matches!(self.phase, Phase::Tracking(_)),
             now,
         )?;
+        if now.is_some() && self.begin_successor(&correction) {
+            return None;
+        }
+        self.correct(&correction)
+    }
+
+    /// Goes on with corrected values from here on; a state is given up.
+    pub(super) fn correct(&mut self, correction: &Correction) -> Option<Status> {
         self.camera.time_offset = Duration::from_secs_f64(correction.offset_secs);
         if let Some(rotation) = correction.body_from_camera {
             self.camera.body_from_camera.rotation = rotation;

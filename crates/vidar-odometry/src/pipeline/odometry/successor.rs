@@ -1,0 +1,219 @@
+//! Another clock, readout or rotation of the camera while there is a state: a second odometry catches up with them over the last
+//! seconds, and its state then goes on in the same world.
+
+use super::{Odometry, Phase, Status};
+use crate::bundle_adjustment::TrackLog;
+use crate::config::OdometryConfig;
+use crate::pipeline::health::HealthMonitor;
+use crate::pipeline::output::LossReason;
+use crate::pipeline::time_calibration::Correction;
+use nalgebra::Vector3;
+use std::collections::VecDeque;
+use vidar_core::{Duration, Frame, FrameId, ImuSample, LieGroup, Se3, So3, Timestamp};
+
+/// Images kept, s and number: the longest stretch that a start in motion is solved from.
+const REPLAY_SECS: f64 = 2.8;
+const REPLAY_FRAMES: usize = 100;
+
+/// IMU measurements kept before the oldest image, s: clocks differ by 0.15 s at most, and half a second shows a body at rest.
+const IMU_BEFORE_SECS: f64 = 0.7;
+
+/// Images that the second odometry works on per new one, so that it catches up without making any image wait for long.
+const IMAGES_A_TURN: usize = 3;
+
+/// After this long without a state of the second odometry the first one gives its own up, s.
+const PATIENCE_SECS: f64 = 6.0;
+
+/// An image that was worked on.
+#[derive(Clone, Debug)]
+struct RecentFrame {
+    id: FrameId,
+    frame: Frame,
+    /// Pose in the world of the segment, where there was a state.
+    world_from_body: Option<Se3>,
+}
+
+/// The last images, oldest first.
+#[derive(Debug)]
+pub(super) struct RecentFrames {
+    keeps: bool,
+    frames: VecDeque<RecentFrame>,
+}
+
+impl RecentFrames {
+    pub fn new(keeps: bool) -> Self {
+        Self { keeps, frames: VecDeque::new() }
+    }
+
+    pub fn add(&mut self, id: FrameId, frame: &Frame) {
+        if !self.keeps {
+            return;
+        }
+        self.frames.push_back(RecentFrame { id, frame: frame.clone(), world_from_body: None });
+        let is_old = |f: &RecentFrame| (frame.time - f.frame.time).as_secs_f64() > REPLAY_SECS;
+        while self.frames.len() > REPLAY_FRAMES || self.frames.front().is_some_and(is_old) {
+            self.frames.pop_front();
+        }
+    }
+
+    /// The time from which IMU measurements are needed.
+    pub fn oldest(&self) -> Option<Timestamp> {
+        self.frames.front().map(|f| f.frame.time - Duration::from_secs_f64(IMU_BEFORE_SECS))
+    }
+
+    fn pose(&self, id: FrameId) -> Option<Se3> {
+        self.frames.iter().find(|f| f.id == id)?.world_from_body
+    }
+}
+
+/// The second odometry.
+#[derive(Debug)]
+pub(super) struct Successor {
+    odometry: Box<Odometry>,
+    /// Images that it has not worked on.
+    waiting: VecDeque<RecentFrame>,
+    correction: Correction,
+    since: Timestamp,
+}
+
+impl Successor {
+    pub fn add_imu(&mut self, sample: ImuSample) {
+        // What the first odometry took, this one takes: their buffers hold the same.
+        let _ = self.odometry.imu.push(sample);
+    }
+
+    /// Works on some of the images that wait.
+    fn catch_up(&mut self) {
+        for _ in 0..IMAGES_A_TURN {
+            let Some(RecentFrame { id, frame, .. }) =
+                self.waiting.pop_front_if(|f| self.odometry.is_ready(&f.frame))
+            else {
+                return;
+            };
+            self.odometry.next_frame = id.0;
+            self.odometry.process(frame);
+        }
+    }
+
+    /// Whether it has worked on all images whose IMU measurements are there.
+    fn is_up_to_date(&self) -> bool {
+        !self.waiting.front().is_some_and(|f| self.odometry.is_ready(&f.frame))
+    }
+
+    /// The newest image that it has a pose of.
+    fn newest_pose(&self) -> Option<(FrameId, Se3)> {
+        let Phase::Tracking(window) = &self.odometry.phase else { return None };
+        window.smoother.newest().map(|(id, _, state)| (id, state.world_from_body))
+    }
+}
+
+impl Odometry {
+    /// Begins a second odometry with corrected values where there are images to begin with; says whether.
+    pub(super) fn begin_successor(&mut self, correction: &Correction) -> bool {
+        let Some(newest) = self.recent.frames.back() else { return false };
+        let mut camera = self.camera.clone();
+        camera.time_offset = Duration::from_secs_f64(correction.offset_secs);
+        if let Some(rotation) = correction.body_from_camera {
+            camera.body_from_camera.rotation = rotation;
+        }
+        let config = OdometryConfig {
+            readout_ms: Some(1e3 * correction.readout_secs),
+            align_timing: false,
+            ..self.config.clone()
+        };
+        let camera = (self.camera_id, camera);
+        let odometry = Self::fresh(config, camera, self.working.another(), self.imu_model, self.imu.clone());
+        self.successor = Some(Successor {
+            since: newest.frame.time,
+            odometry: Box::new(odometry),
+            waiting: self.recent.frames.clone(),
+            correction: *correction,
+        });
+        true
+    }
+
+    /// Lets the second odometry, if there is one, work on its images up to the newest, `id`, and goes on with its state when it has
+    /// caught up. What became of the image otherwise, where the state had to be given up.
+    pub(super) fn follow_successor(&mut self, id: FrameId) -> Option<Status> {
+        let pose = match &self.phase {
+            Phase::Tracking(window) => {
+                window.smoother.state(id).map(|s| self.world_from_smoother() * s.world_from_body)
+            }
+            Phase::Initializing(_) => None,
+        };
+        let newest = self.recent.frames.back_mut().filter(|f| f.id == id)?;
+        newest.world_from_body = pose;
+        let newest = newest.clone();
+        let Some(mut successor) = self.successor.take() else {
+            if self.time_calibration.is_settled() {
+                self.recent = RecentFrames::new(false);
+            }
+            return None;
+        };
+        let waited_secs = (newest.frame.time - successor.since).as_secs_f64();
+        if waited_secs > 0.0 {
+            successor.waiting.push_back(newest);
+        }
+        successor.catch_up();
+        let is_initializing = matches!(self.phase, Phase::Initializing(_));
+        match successor.newest_pose().filter(|_| successor.is_up_to_date()) {
+            Some((at, new)) => {
+                let old = self.recent.pose(at);
+                self.go_on_with(successor, old.map(|old| level_motion(&old, &new)));
+            }
+            None if is_initializing && successor.is_up_to_date() => self.go_on_with(successor, None),
+            None if waited_secs < PATIENCE_SECS => self.successor = Some(successor),
+            None => return self.correct(&successor.correction),
+        }
+        None
+    }
+
+    /// Takes the second odometry's state over; `world_from_new` leads from its world to that of the segment.
+    fn go_on_with(&mut self, successor: Successor, world_from_new: Option<Se3>) {
+        let correction = successor.correction;
+        let new = *successor.odometry;
+        let reason = LossReason::Recalibrated {
+            time_offset_ms: 1e3 * correction.offset_secs,
+            readout_ms: 1e3 * correction.readout_secs,
+        };
+        self.relocalizer.lose(&reason, new.last_frame.unwrap_or_default());
+        self.camera = new.camera;
+        self.phase = new.phase;
+        self.check = new.check;
+        self.last_frame = new.last_frame;
+        self.last_host = new.last_host;
+        self.failure = new.failure;
+        self.placed = world_from_new;
+        self.health_monitor = HealthMonitor::default();
+        self.keyframes.forget_held();
+        // Tracks have other names from here on.
+        self.time_calibration.forget_tracks();
+        self.log.iter_mut().for_each(TrackLog::next_generation);
+    }
+}
+
+/// The motion that brings `new` onto `old` about the vertical: both know where down is.
+fn level_motion(old: &Se3, new: &Se3) -> Se3 {
+    let turn = (old.rotation * new.rotation.inverse()).matrix();
+    let heading = (turn[(1, 0)] - turn[(0, 1)]).atan2(turn[(0, 0)] + turn[(1, 1)]);
+    let rotation = So3::exp(&(Vector3::z() * heading));
+    Se3::new(rotation, old.translation - rotation.act(&new.translation))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_level_motion_keeps_down_and_joins_the_poses() {
+        let motion = Se3::new(So3::exp(&Vector3::new(0.0, 0.0, 2.1)), Vector3::new(1.0, -2.0, 0.5));
+        let new = Se3::new(So3::exp(&Vector3::new(0.4, -0.3, 1.0)), Vector3::new(0.3, 0.2, -0.1));
+        let found = level_motion(&(motion * new), &new);
+        assert!((found.inverse() * motion).log().norm() < 1e-12);
+        // A pose that is out of level does not tilt the world.
+        let tilted = motion * new * Se3::new(So3::exp(&Vector3::new(0.05, 0.02, 0.0)), Vector3::zeros());
+        let found = level_motion(&tilted, &new);
+        assert!((found.rotation.act(&Vector3::z()) - Vector3::z()).norm() < 1e-12);
+        assert!((found.act(&new.translation) - tilted.translation).norm() < 1e-12);
+    }
+}
