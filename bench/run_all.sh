@@ -5,7 +5,7 @@
 #   bench/run_all.sh                         run all groups (hours on two cores)
 #   bench/run_all.sh maps odometry           run some groups
 #
-# Groups: demo maps stereo odometry ordinary couplings align fusion evaluation da3 nano
+# Groups: demo maps stereo odometry ordinary couplings align fusion evaluation peers da3 nano
 #
 # Environment:
 #   DATA    folder with the real recordings euroc_MH_01_real_11s, hololens_commonroom, 7scenes_redkitchen
@@ -14,7 +14,8 @@
 #   OUT     folder of the results (default runs/bench-<commit>)
 #   FLIGHTS, ORDINARY   folders of rendered flights and of rendered hand-held recordings (default in OUT); what is there is not
 #           rendered again
-#   PYTHON  interpreter with the packages of bench/requirements-da3.txt, numpy, scipy, numba, open3d-cpu==0.19.0, pillow
+#   PYTHON  interpreter with the packages of bench/requirements-da3.txt, numpy, scipy, numba, open3d-cpu==0.19.0, pillow,
+#           opencv-python-headless, pycolmap
 #
 # Each step writes its output, its command, its wall time and its processor time to $OUT/<step>.txt. A step that fails is reported at the end
 # and does not stop the others. A dirty work tree is refused, because its figures would belong to no commit.
@@ -36,11 +37,11 @@ groups=()
 for argument in "$@"; do
     case $argument in
         --list) list=true ;;
-        demo|maps|stereo|odometry|ordinary|couplings|align|fusion|evaluation|da3|nano) groups+=("$argument") ;;
+        demo|maps|stereo|odometry|ordinary|couplings|align|fusion|evaluation|peers|da3|nano) groups+=("$argument") ;;
         *) echo "unknown argument $argument; see the head of bench/run_all.sh" >&2; exit 2 ;;
     esac
 done
-[ ${#groups[@]} -gt 0 ] || groups=(demo maps stereo odometry ordinary couplings align fusion evaluation da3 nano)
+[ ${#groups[@]} -gt 0 ] || groups=(demo maps stereo odometry ordinary couplings align fusion evaluation peers da3 nano)
 
 if ! $list && [ -n "$(git status --porcelain --untracked-files=no)" ]; then
     echo "the work tree has changes; commit them first" >&2
@@ -185,7 +186,23 @@ fusion() {
 
 evaluation() {
     step build-evaluation cargo build --release -p vidar-eval --example nearest_files
+    step build-hard-maps cargo build --release -p vidar-eval --example hard_maps
+    local map
+    for map in good moved rotated scaled outliers bent; do
+        step "hard-map-$map" "$EXAMPLES/hard_maps" "$map"
+    done
     step nearest "$PYTHON" bench/nn_vs_scipy.py --binary "$EXAMPLES/nearest_files" --rounds 3 1
+}
+
+# After maps and stereo, whose runs and rendered room it takes.
+peers() {
+    local script=(bench/maps_vs_peers.py --vidar "$VIDAR")
+    step map-roomU-auto "$VIDAR" run "$OUT/roomU" --geometry auto --set input.poses=ground-truth -o "$OUT/runs/roomU-auto"
+    step peers-hololens "$PYTHON" "${script[@]}" "$OUT/runs/hololens-auto" --reference "hololens:$DATA/hololens_commonroom"
+    step peers-redkitchen "$PYTHON" "${script[@]}" "$OUT/runs/redkitchen-auto" \
+        --reference "7scenes:$DATA/7scenes_redkitchen/seq-01" --median-depth 1.8
+    step peers-roomU "$PYTHON" "${script[@]}" "$OUT/runs/roomU-auto" \
+        --reference "cloud:$OUT/roomU/mav0/pointcloud0/data.ply"
 }
 
 da3() {

@@ -35,7 +35,6 @@ const RESERVED: &[(&str, &[&str], &str)] = &[
     ("anyhow", &["vidar-cli", "xtask"], "libraries return typed errors"),
     ("indicatif", &["vidar-cli"], "libraries emit events; the program draws them"),
     ("tiny-skia", &["vidar-view"], "pictures are drawn in one place"),
-    ("kiddo", &["vidar-eval"], "nearest neighbours are searched in one place"),
     ("ureq", &["vidar-hub"], "the network is used in one place, and only when asked for"),
     ("wgpu", &["vidar-gpu"], "graphics processors are used in one place"),
     ("ruzstd", &["vidar-bag"], "recordings are decompressed in one place, within bounds"),

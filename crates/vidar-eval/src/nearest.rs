@@ -1,22 +1,30 @@
 //! Exact nearest neighbours among millions of points.
 //!
-//! The search is kiddo's immutable k-d tree. Queries are sorted along a
-//! Morton curve, so that successive queries visit nodes that are in the processor's cache; this more than halves the time. The
+//! Points lie in a tree of tight boxes. Queries are sorted along a Morton curve, so that successive queries visit nodes
+//! that are in the processor's cache; this more than halves the time. The
 //! tree compares squared distances in `f32`; the distance of the nearest is then computed again in `f64`. What remains is
-//! the `f32` choice among near-ties, a relative error below 3e-7. Comparison with other libraries:
-//! `docs/decisions/0005-nearest-neighbours.md`.
+//! the `f32` choice among near-ties, a relative error below 3e-7. Why this tree, and comparison with libraries:
+//! `docs/decisions/0025-tight-boxes.md`.
 //!
-//! Memory: 20 bytes per point for the tree, as much again while it is built, 16 bytes per query.
+//! Memory: 20 bytes per point for the tree, 36 while it is built, 16 bytes per query.
+
+mod follow;
+mod tree;
+
+pub(crate) use follow::Followed;
 
 use crate::error::EvalError;
-use kiddo::{ImmutableKdTree, SquaredEuclidean};
 use rayon::prelude::*;
+use tree::{Found, Tree};
 
 /// Queries that follow one another on the curve within one task.
 const QUERY_CHUNK: usize = 4096;
 
 /// Queries sorted at a time, which bounds the extra memory.
 const QUERY_BLOCK: usize = 1 << 24;
+
+/// The place in the tree of no point: there are fewer.
+const NOWHERE: u32 = u32::MAX;
 
 /// The point nearest to a query.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -33,12 +41,7 @@ pub struct Neighbour {
 #[derive(Debug)]
 pub struct NearestIndex {
     /// None without points.
-    tree: Option<ImmutableKdTree<f32, 3>>,
-    /// The points in the tree, in the order of its items (kiddo 6.3 visits every item to return one point).
-    points: Vec<[f32; 3]>,
-    /// The index among the points given of each point in the tree; empty when all points given are in it.
-    ids: Vec<u32>,
-    bounds: ([f32; 3], [f32; 3]),
+    tree: Option<Tree>,
     dropped: usize,
 }
 
@@ -48,33 +51,22 @@ impl NearestIndex {
     /// Fails only for more than 2³²−2 points. An index without points gives `None` for every query.
     pub fn build(points: &[[f32; 3]]) -> Result<Self, EvalError> {
         let limit = u32::MAX as usize - 1;
-        let too_many = || EvalError::TooManyPoints { found: points.len(), limit };
         if points.len() > limit {
-            return Err(too_many());
+            return Err(EvalError::TooManyPoints { found: points.len(), limit });
         }
-        let dropped = points.iter().filter(|p| !usable(p)).count();
-        let (ids, kept) = if dropped == 0 {
-            (Vec::new(), points.to_vec())
-        } else {
-            (0_u32..).zip(points).filter(|(_, p)| usable(p)).unzip()
-        };
-        // The one error that a tree from a slice can give is that of too many points.
-        let tree = if kept.is_empty() {
-            None
-        } else {
-            Some(ImmutableKdTree::new_from_slice(&kept).map_err(|_| too_many())?)
-        };
-        Ok(Self { tree, ids, bounds: bounds_of(kept.iter()), points: kept, dropped })
+        let items: Vec<_> = points.iter().copied().zip(0_u32..).filter(|(p, _)| usable(p)).collect();
+        let dropped = points.len() - items.len();
+        Ok(Self { tree: Tree::new(items), dropped })
     }
 
     /// Number of points in the index.
     pub fn len(&self) -> usize {
-        self.points.len()
+        self.tree.as_ref().map_or(0, Tree::len)
     }
 
     /// Whether the index has no point.
     pub fn is_empty(&self) -> bool {
-        self.points.is_empty()
+        self.tree.is_none()
     }
 
     /// Points that were left out because a coordinate was not finite.
@@ -84,33 +76,20 @@ impl NearestIndex {
 
     /// Smallest and largest coordinates of the points; `None` without points.
     pub fn bounds(&self) -> Option<([f32; 3], [f32; 3])> {
-        (!self.is_empty()).then_some(self.bounds)
+        self.tree.as_ref().map(Tree::bounds)
     }
 
     /// The point nearest to `query`; `None` for an empty index, a query that is not finite, or nothing within
     /// `max_distance_m` (strictly).
     pub fn nearest(&self, query: &[f32; 3], max_distance_m: Option<f32>) -> Option<Neighbour> {
         let tree = self.tree.as_ref().filter(|_| usable(query))?;
-        // A query this far from all points needs no search.
-        if max_distance_m.is_some_and(|limit| self.squared_distance_to_bounds(query) > limit * limit) {
-            return None;
-        }
-        let found = tree.query(query).nearest_one::<SquaredEuclidean<f32>>().execute();
         let limit = max_distance_m.unwrap_or(f32::INFINITY);
-        if !(found.distance < limit * limit) {
+        let found = tree.nearest(query, Found { place: NOWHERE, squared: limit * limit });
+        if found.place == NOWHERE {
             return None;
         }
-        let index = self.ids.get(found.item as usize).copied().unwrap_or(found.item);
-        let position = *self.points.get(found.item as usize)?;
-        let squared: f64 =
-            position.iter().zip(query).map(|(a, b)| (f64::from(*a) - f64::from(*b)).powi(2)).sum();
-        Some(Neighbour { index, position, distance_m: squared.sqrt() })
-    }
-
-    /// Squared distance from `query` to the bounding box of the points, m²; 0 inside.
-    fn squared_distance_to_bounds(&self, query: &[f32; 3]) -> f32 {
-        let (min, max) = self.bounds;
-        (0..3).map(|k| (min[k] - query[k]).max(query[k] - max[k]).max(0.0).powi(2)).sum()
+        let position = tree.position(found.place);
+        Some(Neighbour { index: tree.id(found.place), position, distance_m: distance_m(query, &position) })
     }
 
     /// The nearest point of each query, in their order; `None` as in [`nearest`](Self::nearest).
@@ -139,6 +118,11 @@ impl NearestIndex {
     }
 }
 
+/// The points in the order of a Morton curve: neighbours in the list are neighbours in space.
+pub(crate) fn along_curve(points: &[[f32; 3]]) -> Vec<[f32; 3]> {
+    morton_order(points).iter().map(|&key| points[key as u32 as usize]).collect()
+}
+
 /// Distance in metres from each query to its nearest point of `index`, in the queries' order.
 ///
 /// `f32::INFINITY` where nothing lies within `max_distance_m` (strictly) or the index is empty; NaN for a query that
@@ -163,6 +147,11 @@ pub fn nearest_distances(
 fn usable(p: &[f32; 3]) -> bool {
     // Comparisons with NaN are false.
     p.iter().all(|c| c.abs() < f32::MAX)
+}
+
+/// Distance between two points in double precision.
+fn distance_m(a: &[f32; 3], b: &[f32; 3]) -> f64 {
+    a.iter().zip(b).map(|(a, b)| (f64::from(*a) - f64::from(*b)).powi(2)).sum::<f64>().sqrt()
 }
 
 /// Smallest and largest coordinates.

@@ -21,6 +21,7 @@
 
 mod cloud;
 mod config;
+mod pairs;
 mod placement;
 mod report;
 #[cfg(test)]
@@ -32,6 +33,7 @@ pub use report::{Chamfer, FreePlacement, PlacementReport, PointErrors, Scores, S
 use crate::error::EvalError;
 use crate::nearest::{NearestIndex, nearest_distances};
 use cloud::{evaluated_points, finite_positions, thinned, transformed};
+use pairs::Matching;
 use placement::{Placement, free_candidates, native_placement, rigid_placement};
 use vidar_core::{PointCloud, Se3, Sim3, Warning};
 
@@ -83,15 +85,14 @@ pub fn evaluate_surface_from(
 
     let truth = Reference::new(thinned(&reference_points, config.voxel_size_m)?)?;
     let threshold = config.delta_f_threshold();
-    let rigid = rigid_placement(&estimated, &truth.index, start, config);
+    let matching = Matching::new(&estimated, &truth.index, config.icp.max_points);
+    let rigid = rigid_placement(&matching, start, config);
     let rigid_score = score(&estimated, &truth, &rigid.truth_from_estimate, config)?;
-    let native = native_placement(&estimated, &truth.index, start, config)?;
+    let native = native_placement(&matching, start, config)?;
     let native_scores = candidate_scores(&estimated, &truth, &native.truth_from_estimate, config)?;
     let mut free = FreePlacement::new(&rigid, rigid_score.scores.clone());
     let bounded = Placement { start: "native", truth_from_estimate: native.truth_from_estimate };
-    for candidate in
-        std::iter::once(bounded).chain(free_candidates(&estimated, &truth.index, start, config, &native)?)
-    {
+    for candidate in std::iter::once(bounded).chain(free_candidates(&matching, start, config, &native)?) {
         // A candidate that moves all points outside the crop is skipped.
         let scores = candidate_scores(&estimated, &truth, &candidate.truth_from_estimate, config);
         let Ok(scores) = scores else { continue };

@@ -87,6 +87,8 @@ fn encode_gray16(
     let mut encoder = png::Encoder::new(w, width, height);
     encoder.set_color(png::ColorType::Grayscale);
     encoder.set_depth(png::BitDepth::Sixteen);
+    // A depth image of 480×360: 1.6 ms, not 48, for 7 % more bytes.
+    encoder.set_compression(png::Compression::Fast);
     let mut writer = encoder.write_header()?;
     writer.write_image_data(big_endian)?;
     writer.finish()

@@ -43,6 +43,8 @@ fn write_gray8(
         let mut encoder = png::Encoder::new(w, width, height);
         encoder.set_color(png::ColorType::Grayscale);
         encoder.set_depth(png::BitDepth::Eight);
+        // As depth images: a thirtieth of the time, files of nearly the same size.
+        encoder.set_compression(png::Compression::Fast);
         let mut writer = encoder.write_header()?;
         writer.write_image_data(&data)?;
         writer.finish()

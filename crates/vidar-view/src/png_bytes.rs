@@ -21,7 +21,8 @@ pub fn encode_png(picture: &Picture) -> Result<Vec<u8>, ViewError> {
     encoder.set_color(png::ColorType::Rgb);
     encoder.set_depth(png::BitDepth::Eight);
     encoder.set_source_srgb(png::SrgbRenderingIntent::Perceptual);
-    encoder.set_compression(png::Compression::Balanced);
+    // A picture of a report: 3 ms, not 70, for 4 % more bytes.
+    encoder.set_compression(png::Compression::Fast);
     let mut writer = encoder.write_header().map_err(refused)?;
     writer.write_image_data(picture.data().as_flattened()).map_err(refused)?;
     writer.finish().map_err(refused)?;

@@ -115,3 +115,54 @@ fn one_thread_and_four_give_the_same_bits() {
     };
     assert_eq!(with(1), with(4));
 }
+
+#[test]
+fn followed_neighbours_are_those_of_a_new_search_wherever_the_query_goes() {
+    let points: Vec<[f32; 3]> = (0..4000)
+        .map(|i| [(i % 63) as f32 * 0.05, (i / 63) as f32 * 0.05, (i as f32 * 0.7).sin() * 0.01])
+        .collect();
+    let index = NearestIndex::build(&points).unwrap();
+    let mut known = Followed::NEW;
+    // Small steps along the surface, a leap, metres away from it, and back.
+    for step in 0..2000 {
+        let t = step as f32;
+        let height = if step % 500 < 400 { 0.02 } else { 3.0 };
+        let query = [1.5 + (t * 0.001).sin(), 1.5 + (t * 0.0013).cos(), height];
+        let followed = index.follow(&query, &mut known).unwrap();
+        assert_eq!(followed.0, index.nearest(&query, None).unwrap().distance_m, "step {step}");
+    }
+    assert_eq!(index.follow(&[f32::NAN; 3], &mut known), None);
+    let mut unknown = Followed::NEW;
+    assert_eq!(NearestIndex::build(&[]).unwrap().follow(&[0.0; 3], &mut unknown), None);
+}
+
+#[test]
+fn a_following_query_seldom_needs_a_search() {
+    let points: Vec<[f32; 3]> = (0..2500).map(|i| [(i % 50) as f32, (i / 50) as f32, 0.0]).collect();
+    let index = NearestIndex::build(&points).unwrap();
+    let mut known = Followed::NEW;
+    index.follow(&[20.1, 20.0, 0.1], &mut known).unwrap();
+    let searched = known;
+    index.follow(&[20.2, 20.1, 0.1], &mut known).unwrap();
+    assert_eq!(known, searched, "the nearest is still the same, by far");
+    index.follow(&[20.6, 20.1, 0.1], &mut known).unwrap();
+    assert_ne!(known, searched);
+}
+
+#[test]
+fn no_point_is_lost_between_leaves() {
+    for count in [1, 15, 16, 17, 33, 1000, 4097] {
+        let points: Vec<[f32; 3]> = (0..count)
+            .map(|i| [(i * 7919 % 613) as f32, (i * 104_729 % 31) as f32, (i / 7) as f32])
+            .collect();
+        let index = NearestIndex::build(&points).unwrap();
+        let (min, max) = index.bounds().unwrap();
+        let expected = bounds_of(points.iter());
+        assert_eq!((min, max), expected, "{count}");
+        assert_eq!(index.len(), count);
+        // Every point is found at its own place: none is lost between the leaves.
+        for p in &points {
+            assert_eq!(index.nearest(p, None).unwrap().distance_m, 0.0);
+        }
+    }
+}

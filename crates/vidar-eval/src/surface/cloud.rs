@@ -22,14 +22,16 @@ pub(super) fn transformed(points: &[[f32; 3]], b_from_a: &Sim3) -> Vec<[f32; 3]>
     if *b_from_a == Sim3::IDENTITY {
         return points.to_vec();
     }
+    points.par_iter().map(moved(b_from_a)).collect()
+}
+
+/// The function that moves a point into the other world frame.
+pub(super) fn moved(b_from_a: &Sim3) -> impl Fn(&[f32; 3]) -> [f32; 3] + Sync + Send + use<> {
     let (linear, offset) = (b_from_a.rotation.matrix() * b_from_a.scale, b_from_a.translation);
-    points
-        .par_iter()
-        .map(|p| {
-            let moved: Vector3<f64> = linear * Vector3::from(*p).cast::<f64>() + offset;
-            moved.cast::<f32>().into()
-        })
-        .collect()
+    move |p| {
+        let moved: Vector3<f64> = linear * Vector3::from(*p).cast::<f64>() + offset;
+        moved.cast::<f32>().into()
+    }
 }
 
 /// The placed points that are evaluated, and how many were cropped.

@@ -1,11 +1,10 @@
 //! Placement of the estimate in the reference's world frame: the bounded native one and the free ones.
 
 use super::PlacementStart;
-use super::cloud::{subset, transformed};
 use super::config::{IcpConfig, OnRejection, SurfaceEvalConfig};
+use super::pairs::{Matching, Pairs};
 use super::report::PlacementReport;
 use crate::error::EvalError;
-use crate::nearest::NearestIndex;
 use nalgebra::Vector3;
 use vidar_core::{Se3, Sim3, UmeyamaError, Warning, umeyama_se3, umeyama_sim3};
 
@@ -47,41 +46,32 @@ enum Motion {
 
 /// The SE(3) fit, refined by an ICP without scale where that does not make it worse: the scale is the estimate's own.
 pub(super) fn rigid_placement(
-    estimated: &[[f32; 3]],
-    reference: &NearestIndex,
+    matching: &Matching<'_>,
     start: &PlacementStart,
     config: &SurfaceEvalConfig,
 ) -> Placement {
     let rigid = Sim3::from_se3(&start.truth_from_estimate);
-    let points = subset(estimated, config.icp.max_points);
-    refined_rigidly(&points, reference, &rigid, config).map_or(
+    refined_rigidly(matching, &rigid, config).map_or(
         Placement { start: "rigid", truth_from_estimate: rigid },
         |truth_from_estimate| Placement { start: "rigid", truth_from_estimate },
     )
 }
 
 /// The result of an ICP without scale, unless it fails or fits worse than its start.
-fn refined_rigidly(
-    points: &[[f32; 3]],
-    reference: &NearestIndex,
-    start: &Sim3,
-    config: &SurfaceEvalConfig,
-) -> Option<Sim3> {
-    let refined = icp(points, reference, start, Motion::Rigid, &config.icp).ok();
+fn refined_rigidly(matching: &Matching<'_>, start: &Sim3, config: &SurfaceEvalConfig) -> Option<Sim3> {
+    let refined = icp(matching, start, Motion::Rigid, &config.icp).ok();
     refined.filter(|r| r.rms_after_m <= r.rms_before_m).map(|r| r.truth_from_estimate)
 }
 
 /// The SE(3) fit, refined by one similarity ICP when its scale is within bounds (the paper's eq. in section IV-B).
 pub(super) fn native_placement(
-    estimated: &[[f32; 3]],
-    reference: &NearestIndex,
+    matching: &Matching<'_>,
     start: &PlacementStart,
     config: &SurfaceEvalConfig,
 ) -> Result<Refinement, EvalError> {
     let rigid = Sim3::from_se3(&start.truth_from_estimate);
-    let points = subset(estimated, config.icp.max_points);
     let bounds = &config.scale_bounds;
-    let refined = icp(&points, reference, &rigid, Motion::Similarity, &config.icp);
+    let refined = icp(matching, &rigid, Motion::Similarity, &config.icp);
     let rejection = match &refined {
         Err(error) => format!("refinement failed: {error}"),
         Ok(r) if !bounds.contains(r.truth_from_estimate.scale) => format!(
@@ -100,15 +90,14 @@ pub(super) fn native_placement(
     };
     let kept = match config.on_rejection {
         OnRejection::KeepRigidFit => rigid,
-        OnRejection::RefineRigid => refined_rigidly(&points, reference, &rigid, config).unwrap_or(rigid),
+        OnRejection::RefineRigid => refined_rigidly(matching, &rigid, config).unwrap_or(rigid),
     };
     Ok(Refinement { truth_from_estimate: kept, accepted: false, reason: rejection, refined: refined.ok() })
 }
 
 /// Placements of any scale: the rejected refinement, and those from the trajectories' Sim(3) fit.
 pub(super) fn free_candidates(
-    estimated: &[[f32; 3]],
-    reference: &NearestIndex,
+    matching: &Matching<'_>,
     start: &PlacementStart,
     config: &SurfaceEvalConfig,
     native: &Refinement,
@@ -120,8 +109,7 @@ pub(super) fn free_candidates(
     }
     if let Some(similarity) = &start.truth_from_estimate_sim3 {
         candidates.push(Placement { start: "similarity-start", truth_from_estimate: *similarity });
-        let points = subset(estimated, config.icp.max_points);
-        if let Ok(refined) = icp(&points, reference, similarity, Motion::Similarity, &config.icp) {
+        if let Ok(refined) = icp(matching, similarity, Motion::Similarity, &config.icp) {
             let truth_from_estimate = refined.truth_from_estimate;
             candidates.push(Placement { start: "similarity-start-refined", truth_from_estimate });
         }
@@ -131,14 +119,14 @@ pub(super) fn free_candidates(
 
 /// Trimmed point-to-point ICP from `start`: `min Σ |T x − y(x)|²` over the nearest pairs, one closed form per step.
 fn icp(
-    points: &[[f32; 3]],
-    reference: &NearestIndex,
+    matching: &Matching<'_>,
     start: &Sim3,
     motion: Motion,
     config: &IcpConfig,
 ) -> Result<IcpResult, UmeyamaError> {
     let mut current = *start;
-    let mut pairs = trimmed_pairs(points, reference, &current, config.keep_ratio);
+    let mut followed = matching.followed();
+    let mut pairs = matching.trimmed_pairs(&mut followed, &current, config.keep_ratio);
     let rms_before_m = pairs.rms_m;
     let (mut iterations, mut converged) = (0, false);
     while iterations < config.max_iterations && !converged {
@@ -149,7 +137,7 @@ fn icp(
         iterations += 1;
         converged = step_rms(&pairs.source, &current, &next) <= config.tolerance_m;
         current = next;
-        pairs = trimmed_pairs(points, reference, &current, config.keep_ratio);
+        pairs = matching.trimmed_pairs(&mut followed, &current, config.keep_ratio);
     }
     Ok(IcpResult {
         truth_from_estimate: current,
@@ -165,31 +153,6 @@ fn rigid_step(pairs: &Pairs, scale: f64) -> Result<Sim3, UmeyamaError> {
     let scaled: Vec<_> = pairs.source.iter().map(|p| p * scale).collect();
     let Se3 { rotation, translation } = umeyama_se3(&scaled, &pairs.target)?;
     Ok(Sim3 { rotation, translation, scale })
-}
-
-/// Points of the estimate (in its own world frame) with their nearest points of the reference.
-struct Pairs {
-    source: Vec<Vector3<f64>>,
-    target: Vec<Vector3<f64>>,
-    rms_m: f64,
-}
-
-fn trimmed_pairs(points: &[[f32; 3]], reference: &NearestIndex, t: &Sim3, keep_ratio: f64) -> Pairs {
-    let placed = transformed(points, t);
-    let neighbours = reference.nearest_all(&placed, None);
-    let mut found: Vec<_> =
-        neighbours.iter().zip(points).filter_map(|(n, p)| n.map(|n| (n.distance_m, p, n.position))).collect();
-    let keep = ((found.len() as f64 * keep_ratio).ceil() as usize).min(found.len());
-    // A stable order of equal distances keeps the sums below the same on every run.
-    found.sort_by(|a, b| a.0.total_cmp(&b.0));
-    found.truncate(keep);
-    let sum: f64 = found.iter().map(|(d, _, _)| d * d).sum();
-    let to_f64 = |p: [f32; 3]| Vector3::from(p).cast::<f64>();
-    Pairs {
-        source: found.iter().map(|(_, p, _)| to_f64(**p)).collect(),
-        target: found.iter().map(|(_, _, q)| to_f64(*q)).collect(),
-        rms_m: (sum / keep.max(1) as f64).sqrt(),
-    }
 }
 
 fn step_rms(points: &[Vector3<f64>], from: &Sim3, to: &Sim3) -> f64 {

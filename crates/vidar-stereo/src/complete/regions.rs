@@ -30,21 +30,9 @@ impl Regions {
     /// The regions of an image.
     pub fn of(luminance: &[f32], width: usize, height: usize) -> Self {
         let smooth = smoothed(luminance, width, height);
-        let is_flat: Vec<bool> = (0..width * height)
-            .map(|i| {
-                let (x, y) = (i % width, i / width);
-                let across =
-                    smooth[y * width + (x + 1).min(width - 1)] - smooth[y * width + x.saturating_sub(1)];
-                let down =
-                    smooth[(y + 1).min(height - 1) * width + x] - smooth[y.saturating_sub(1) * width + x];
-                across.abs().max(down.abs()) <= MAX_STEP
-            })
-            .collect();
-        let (mut of, count) = connected(&is_flat, width);
+        let (mut of, count) = connected(&flat(&smooth, width, height), width);
         let own = of.clone();
-        for _ in 0..REACH {
-            grow(&mut of, width);
-        }
+        grow(&mut of, width);
         let mut members = vec![Vec::new(); count];
         for (i, region) in of.iter().enumerate().filter(|(_, region)| **region != NOWHERE) {
             members[*region as usize].push((i as u32, own[i] == *region));
@@ -55,17 +43,39 @@ impl Regions {
 
 /// Mean over 3 x 3 pixels.
 fn smoothed(values: &[f32], width: usize, height: usize) -> Vec<f32> {
-    let pass = |values: &[f32], step: usize, at: &dyn Fn(usize) -> (usize, usize)| -> Vec<f32> {
-        let mean = |i: usize| {
-            let (place, size) = at(i);
-            let before = if place > 0 { values[i - step] } else { values[i] };
-            let after = if place + 1 < size { values[i + step] } else { values[i] };
-            (before + values[i] + after) / 3.0
-        };
-        (0..values.len()).map(mean).collect()
-    };
-    let across = pass(values, 1, &|i| (i % width, width));
-    pass(&across, width, &|i| (i / width, height))
+    let mean = |before: f32, own: f32, after: f32| (before + own + after) / 3.0;
+    let mut across = values.to_vec();
+    for (out, row) in across.chunks_exact_mut(width).zip(values.chunks_exact(width)) {
+        for x in 0..width {
+            out[x] = mean(row[x.saturating_sub(1)], row[x], row[(x + 1).min(width - 1)]);
+        }
+    }
+    let mut smooth = across.clone();
+    for (y, out) in smooth.chunks_exact_mut(width).enumerate() {
+        let [above, own, below] = rows_around(&across, width, height, y);
+        for x in 0..width {
+            out[x] = mean(above[x], own[x], below[x]);
+        }
+    }
+    smooth
+}
+
+/// Where brightness hardly changes.
+fn flat(smooth: &[f32], width: usize, height: usize) -> Vec<bool> {
+    let mut is_flat = vec![false; width * height];
+    for (y, out) in is_flat.chunks_exact_mut(width).enumerate() {
+        let [above, own, below] = rows_around(smooth, width, height, y);
+        for x in 0..width {
+            let across = own[(x + 1).min(width - 1)] - own[x.saturating_sub(1)];
+            out[x] = across.abs().max((below[x] - above[x]).abs()) <= MAX_STEP;
+        }
+    }
+    is_flat
+}
+
+/// The row above, the row itself and the one below; the first and the last row are beside themselves.
+fn rows_around(values: &[f32], width: usize, height: usize, y: usize) -> [&[f32]; 3] {
+    [y.saturating_sub(1), y, (y + 1).min(height - 1)].map(|y| &values[y * width..][..width])
 }
 
 /// Numbers of the connected parts of `inside` with enough pixels, by their first pixel, and how many there are.
@@ -98,12 +108,20 @@ fn connected(inside: &[bool], width: usize) -> (Vec<u32>, usize) {
     (of, count as usize)
 }
 
-/// Every region takes the free pixels beside it; of several the one with the lowest number.
+/// [`REACH`] times every region takes the free pixels beside it; of several the one with the lowest number.
 fn grow(of: &mut [u32], width: usize) {
-    let before = of.to_vec();
-    for (i, region) in of.iter_mut().enumerate().filter(|(_, region)| **region == NOWHERE) {
-        let beside = neighbours(i, width, before.len()).map(|j| before[j]).min();
-        *region = beside.unwrap_or(NOWHERE);
+    let taken = (0..of.len()).filter(|i| of[*i] != NOWHERE);
+    let mut last: Vec<(usize, u32)> = taken.map(|i| (i, of[i])).collect();
+    for _ in 0..REACH {
+        // A pixel that was free beside one of an earlier round would have been taken then.
+        let beside = |&(i, region): &(usize, u32)| neighbours(i, width, of.len()).map(move |j| (j, region));
+        let mut next: Vec<(usize, u32)> =
+            last.iter().flat_map(beside).filter(|(j, _)| of[*j] == NOWHERE).collect();
+        for (j, region) in &next {
+            of[*j] = of[*j].min(*region);
+        }
+        next.iter_mut().for_each(|(j, region)| *region = of[*j]);
+        last = next;
     }
 }
 
@@ -119,6 +137,24 @@ fn neighbours(i: usize, width: usize, size: usize) -> impl Iterator<Item = usize
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn regions_grow_as_by_the_definition() {
+        let (width, height) = (37, 23);
+        let seed = |i: usize| if i * 7919 % 41 < 2 { (i % 5) as u32 } else { NOWHERE };
+        let mut grown: Vec<u32> = (0..width * height).map(seed).collect();
+        let mut expected = grown.clone();
+        for _ in 0..REACH {
+            let before = expected.clone();
+            for (i, region) in expected.iter_mut().enumerate().filter(|(_, region)| **region == NOWHERE) {
+                *region = neighbours(i, width, before.len()).map(|j| before[j]).min().unwrap_or(NOWHERE);
+            }
+        }
+        grow(&mut grown, width);
+        assert_eq!(grown, expected);
+        // Sparse seeds, so that regions also end where nothing is beside them.
+        assert!(expected.contains(&0) && expected.contains(&4));
+    }
 
     #[test]
     fn a_wall_and_a_floor_are_two_regions_and_texture_is_none() {
