@@ -48,6 +48,8 @@ class Batch:
     def __init__(self, planned, program="vidar", cpus=1, gpus=0, memory=None, retries=3):
         import ray
 
+        # Nodes need the program, not this file.
+        ray.cloudpickle.register_pickle_by_value(sys.modules[__name__])
         self.planned, self.program, self.threads = planned, program, max(1, int(cpus))
         options = {"num_cpus": cpus, "max_retries": retries, "retry_exceptions": True}
         if memory:

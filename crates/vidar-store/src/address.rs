@@ -39,6 +39,8 @@ fn local(folder: &Path, makes_folder: bool) -> Result<Opened, StoreError> {
 #[cfg(feature = "s3")]
 fn s3(uri: &str, rest: &str) -> Result<Opened, StoreError> {
     let (bucket, prefix) = rest.split_once('/').unwrap_or((rest, ""));
+    // Fails where the process has chosen one already, which serves as well.
+    let _ = rustls::crypto::ring::default_provider().install_default();
     let store = object_store::aws::AmazonS3Builder::from_env().with_bucket_name(bucket).build();
     let prefix = Name::parse(prefix).map_err(|e| bad(uri, e.to_string()))?;
     Ok((Arc::new(store.map_err(|e| bad(uri, e.to_string()))?), prefix))

@@ -182,6 +182,24 @@ fn maps_are_those_of_run_though_a_worker_is_killed_and_a_recording_is_garbage() 
 }
 
 #[test]
+fn chunks_of_a_network_that_overlap_are_placed_as_in_one_run() {
+    const NETWORK: &[&str] =
+        &["--geometry", "simulated", "--mode", "coupled", "--set", "geometry.overlap_keyframes=2"];
+    let batch = Batch::plan(&[&shared().sequence], &[NETWORK, &["--parts", "3"]].concat());
+    for (stage, tasks) in [("track", 1), ("predict", 3), ("map", 1)] {
+        batch.all(stage, tasks);
+    }
+    let out = batch.folder.path().join("run");
+    let ran: ProgramOutput = run_command(&shared().sequence, &out, &[SETTINGS, NETWORK, &["-q"]].concat())
+        .output()
+        .unwrap()
+        .into();
+    assert!([0, 3].contains(&ran.code), "{}", ran.stderr);
+    let mesh = |run: &Path| std::fs::read(run.join("map/mesh.ply")).unwrap();
+    assert!(mesh(&out) == mesh(&batch.folder_of("maps", "tiny_room")));
+}
+
+#[test]
 fn what_is_no_plan_or_was_changed_is_refused_and_leaves_no_record() {
     let base = tempfile::tempdir().unwrap();
     let sequence = copy_of_sequence(base.path());

@@ -15,6 +15,7 @@ mod plan;
 mod record;
 mod report;
 mod stages;
+mod task;
 mod work;
 
 pub use cost::Cost;
@@ -23,7 +24,8 @@ pub use plan::{
 };
 pub use record::{Problem, RECORD_SCHEMA, Stage, Status, StoredFile, TaskRecord};
 pub use report::{REPORT_SCHEMA, Row, Table};
-pub use work::{WorkOutcome, WorkRequest, work};
+pub use task::WorkRequest;
+pub use work::{WorkOutcome, work};
 
 /// Largest plan or record that is read, bytes: a plan has some 400 bytes a recording.
 const MAX_JSON_BYTES: u64 = 64 << 20;

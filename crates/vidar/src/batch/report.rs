@@ -3,7 +3,7 @@
 use super::Cost;
 use super::plan::{Planned, PlannedRecording};
 use super::record::{Problem, Stage, Status, TaskRecord};
-use super::work::task_key;
+use super::task::task_key;
 use crate::error::Error;
 use crate::run::bytes;
 use crate::run_folder::pretty;

@@ -2,7 +2,7 @@
 
 use super::plan::Planned;
 use super::record::{Problem, Stage, Status, StoredFile, TaskRecord};
-use super::work::Task;
+use super::task::Task;
 use crate::error::{Error, ExitStatus};
 use crate::run::parts::{self, PartOutcome};
 use crate::run::{self, RunOutcome, RunRequest};
@@ -26,6 +26,13 @@ impl Default for Made {
     fn default() -> Self {
         let (warnings, files, result) = (Vec::new(), Vec::new(), serde_json::Value::Null);
         Self { status: Status::Done, problem: None, warnings, files, result }
+    }
+}
+
+impl Made {
+    /// A recording that does not allow it.
+    pub fn failed(problem: Problem) -> Self {
+        Self { status: Status::Failed, problem: Some(problem), ..Self::default() }
     }
 }
 

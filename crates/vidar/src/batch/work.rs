@@ -1,36 +1,14 @@
 //! One task of a batch.
 
 use super::cost::Meter;
-use super::plan::{Planned, PlannedRecording};
-use super::record::{Problem, RECORD_SCHEMA, Stage, Status, TaskRecord};
+use super::record::{Problem, RECORD_SCHEMA, Stage, TaskRecord};
 use super::report::{Table, report};
 use super::stages::{self, Made};
+use super::task::{Task, WorkRequest};
 use crate::error::{Error, ExitStatus};
 use crate::events::{CancelToken, Events};
 use crate::run::parts::Part;
 use std::collections::BTreeMap;
-use std::path::PathBuf;
-use vidar_dataset::OpenOptions;
-use vidar_store::Store;
-
-/// What to do.
-#[derive(Debug)]
-pub struct WorkRequest {
-    /// The plan.
-    pub planned: Planned,
-    /// Its store.
-    pub store: Store,
-    /// The stage.
-    pub stage: Stage,
-    /// The task of that stage.
-    pub index: usize,
-    /// How recordings are read: what the plan's `input` says.
-    pub open: OpenOptions,
-    /// Where run folders are made; the system's folder for temporary files by default.
-    pub scratch: Option<PathBuf>,
-    /// The command as typed, for the manifest.
-    pub command: Vec<String>,
-}
 
 /// Result of a task.
 #[derive(Debug)]
@@ -41,15 +19,6 @@ pub enum WorkOutcome {
     WasThere(TaskRecord),
     /// The table.
     Report(Table),
-}
-
-/// A task with what it is of.
-pub(super) struct Task<'a> {
-    pub request: &'a WorkRequest,
-    pub recording: &'a PlannedRecording,
-    pub part: Part,
-    pub events: &'a Events,
-    pub cancel: &'a CancelToken,
 }
 
 /// Does a task, unless its result is in the store. What a recording does not allow is a result, too; everything else that goes
@@ -87,26 +56,6 @@ fn damaged(request: &WorkRequest, reason: &str) -> Error {
 }
 
 impl Task<'_> {
-    /// SHA-256 of all that the result of a stage depends on.
-    pub fn key(&self, stage: Stage, part: usize) -> String {
-        task_key(self.recording, stage, part, self.part.of)
-    }
-
-    /// The record of a stage before.
-    ///
-    /// # Errors
-    /// It is not there.
-    pub fn needs(&self, stage: Stage, part: usize) -> Result<TaskRecord, Error> {
-        let found = TaskRecord::find(&self.request.store, &self.key(stage, part))?;
-        found.ok_or_else(|| {
-            let of_part = if stage == Stage::Predict { format!(", part {part}") } else { String::new() };
-            Error::TaskTooEarly {
-                task: format!("{} of {}", self.request.stage, self.recording.name),
-                missing: format!("its stage {stage}{of_part} has no result yet"),
-            }
-        })
-    }
-
     fn carry_out(&self) -> Result<TaskRecord, Error> {
         let meter = Meter::start();
         let before = self.request.store.traffic();
@@ -144,12 +93,6 @@ impl Task<'_> {
         Ok(record)
     }
 
-    /// Where results of a stage lie in the store.
-    pub fn folder(&self, stage: Stage) -> String {
-        let stage = if stage == Stage::Map { "maps" } else { stage.name() };
-        format!("{stage}/{}", self.recording.name)
-    }
-
     /// Whether another attempt, on another machine or later, would fail in the same way.
     fn is_of_recording(&self, error: &Error) -> bool {
         use std::io::ErrorKind::{InvalidData, InvalidInput, UnexpectedEof};
@@ -163,12 +106,6 @@ impl Task<'_> {
     }
 }
 
-/// SHA-256 of all that the result of a stage depends on. Into how many parts the chunks were divided does not change a map.
-pub(super) fn task_key(recording: &PlannedRecording, stage: Stage, part: usize, parts: usize) -> String {
-    let part = if stage == Stage::Predict { format!(" {part}/{parts}") } else { String::new() };
-    vidar_hub::sha256_hex(format!("{RECORD_SCHEMA} {stage} {}{part}", recording.key).as_bytes())
-}
-
 /// The operating system's error behind an error, where there is one.
 fn os_error(error: &Error) -> Option<&std::io::Error> {
     let mut error: Option<&(dyn std::error::Error + 'static)> = Some(error);
@@ -179,13 +116,6 @@ fn os_error(error: &Error) -> Option<&std::io::Error> {
         error = cause.source();
     }
     None
-}
-
-impl Made {
-    /// A recording that does not allow it.
-    pub fn failed(problem: Problem) -> Self {
-        Self { status: Status::Failed, problem: Some(problem), ..Self::default() }
-    }
 }
 
 #[cfg(test)]
