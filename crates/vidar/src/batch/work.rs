@@ -65,7 +65,13 @@ impl Task<'_> {
             Stage::Map | Stage::Report => stages::map(self),
         };
         let made = match made {
-            Err(error) if self.is_of_recording(&error) => Made::failed(Problem::of(&error)),
+            // The run folder goes with the task; what is finished lies in the store.
+            Err(Error::Interrupted { .. }) => {
+                return Err(Error::Interrupted { path: self.request.store.uri().into() });
+            }
+            Err(error) if is_of_recording(&error, self.recording.problem.as_ref()) => {
+                Made::failed(Problem::of(&error))
+            }
             made => made?,
         };
         let mut traffic = self.request.store.traffic();
@@ -92,18 +98,17 @@ impl Task<'_> {
         record.write(&self.request.store)?;
         Ok(record)
     }
+}
 
-    /// Whether another attempt, on another machine or later, would fail in the same way.
-    fn is_of_recording(&self, error: &Error) -> bool {
-        use std::io::ErrorKind::{InvalidData, InvalidInput, UnexpectedEof};
-        let is_of_batch =
-            matches!(error, Error::NotABatch { .. } | Error::Store(_) | Error::TaskTooEarly { .. });
-        let was_planned = self.recording.problem.as_ref().is_some_and(|p| p.code == error.code());
-        let is_of_system =
-            os_error(error).is_some_and(|e| ![InvalidData, InvalidInput, UnexpectedEof].contains(&e.kind()));
-        let is_bad_input = error.exit_status() == ExitStatus::BadInput;
-        !is_of_batch && (was_planned || (is_bad_input && !is_of_system))
-    }
+/// Whether another attempt, on another machine or later, would fail in the same way; `planned` is what `plan` met.
+fn is_of_recording(error: &Error, planned: Option<&Problem>) -> bool {
+    use std::io::ErrorKind::{InvalidData, InvalidInput, UnexpectedEof};
+    let is_of_batch = matches!(error, Error::NotABatch { .. } | Error::Store(_) | Error::TaskTooEarly { .. });
+    let was_planned = planned.is_some_and(|p| p.code == error.code());
+    let of_content = [InvalidData, InvalidInput, UnexpectedEof];
+    let is_of_system = os_error(error).is_some_and(|e| !of_content.contains(&e.kind()));
+    let is_bad_input = error.exit_status() == ExitStatus::BadInput;
+    !is_of_batch && (was_planned || (is_bad_input && !is_of_system))
 }
 
 /// The operating system's error behind an error, where there is one.
@@ -128,8 +133,17 @@ mod tests {
         let io = |kind: std::io::ErrorKind| {
             Error::Dataset(DatasetError::Io { path: "a.bag".into(), source: kind.into() })
         };
-        let of_system = |error: &Error| os_error(error).map(std::io::Error::kind);
-        assert_eq!(of_system(&io(std::io::ErrorKind::NotFound)), Some(std::io::ErrorKind::NotFound));
-        assert_eq!(of_system(&Error::TooFewKeyframes { found: 0, needed: 2 }), None);
+        let is_fault = |error: &Error| is_of_recording(error, None);
+        for kind in [std::io::ErrorKind::NotFound, std::io::ErrorKind::PermissionDenied] {
+            assert!(!is_fault(&io(kind)), "{kind}");
+        }
+        let of_batch = Error::NotABatch { name: "plan".into(), reason: "damaged".into() };
+        assert!(!is_fault(&of_batch));
+        assert!(!is_fault(&Error::Interrupted { path: "store".into() }));
+        // What the recording consists of stays as it is, and so does what the plan met.
+        assert!(is_fault(&io(std::io::ErrorKind::UnexpectedEof)));
+        assert!(is_fault(&Error::TooFewKeyframes { found: 0, needed: 2 }));
+        let planned = Problem::of(&io(std::io::ErrorKind::NotFound));
+        assert!(is_of_recording(&io(std::io::ErrorKind::NotFound), Some(&planned)));
     }
 }
