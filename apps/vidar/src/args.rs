@@ -1,5 +1,6 @@
 //! The command line, as plain values. Validation and building happen in the commands.
 
+use crate::batch_args::{PlanArgs, WorkArgs};
 use crate::compare_args::CompareArgs;
 use crate::model_args::{DepthArgs, LicenceArgs, ModelCommand};
 use clap::{ArgAction, Args, Parser, Subcommand, ValueEnum, ValueHint};
@@ -129,6 +130,16 @@ pub enum Command {
         after_help = "Examples:\n  vidar bench euroc EuRoC/ --sequences V1,V2 --geometry da3-small -o tables\n  vidar bench euroc --synthetic --geometry simulated -o tables\n  vidar bench tum TUM/ --modes pose-free,pose-conditioned"
     )]
     Bench(Box<BenchArgs>),
+    /// Plan a batch: many recordings into maps and one table, by as many workers as there are.
+    #[command(
+        after_help = "Examples:\n  vidar plan bags/monday.bag bags/tuesday.bag --store results\n  vidar plan bags/one.mcap bags/two.mcap --store s3://maps/june --geometry da3-small --parts 8"
+    )]
+    Plan(Box<PlanArgs>),
+    /// Do one task of a plan; a task whose result is in the store is not done again.
+    #[command(
+        after_help = "Examples:\n  vidar work --plan results/plans/HASH.json --stage track --index 0\n  vidar work --plan results/plans/HASH.json --stage report"
+    )]
+    Work(WorkArgs),
     /// Check this machine: processor, memory, disk, networks, graphics processors.
     Doctor,
     /// Show and explain settings: show, explain, presets, schema.
@@ -153,7 +164,9 @@ const RUN_EXAMPLES: &str = "Examples:
   vidar run my_recording/ --dry-run";
 
 /// How the input is read.
-#[derive(Args, Clone, Debug, Default)]
+// The plan of a batch keeps it as it was typed.
+#[derive(Args, Clone, Debug, Default, serde::Serialize, serde::Deserialize)]
+#[serde(deny_unknown_fields)]
 pub struct InputArgs {
     /// Layout of the recording, instead of detecting it: euroc, tum-rgbd, 7scenes, kitti-raw, kitti, replica, icl-nuim,
     /// posed-folder, bag, stray-scanner, spectacular-ai, imu-log, video, images.

@@ -3,6 +3,7 @@
 //! Data goes to the standard output, messages to the error stream. Exit codes are set here only.
 
 pub mod args;
+pub mod batch_args;
 mod build;
 mod commands;
 pub mod compare_args;
@@ -108,6 +109,8 @@ fn dispatch(command: Command, context: &Context) -> Outcome {
         Command::Odometry(args) => commands::odometry::odometry(&args, context),
         Command::Synth(args) => commands::synth::synth(&args, context),
         Command::Bench(args) => commands::bench::bench(&args, context),
+        Command::Plan(args) => commands::batch::plan(&args, context),
+        Command::Work(args) => commands::batch::work(&args, context),
         Command::Doctor => commands::doctor::doctor(context),
         Command::Config(ConfigCommand::Show { config, origin }) => {
             commands::config::show(&config, origin, context)

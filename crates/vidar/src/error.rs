@@ -234,6 +234,25 @@ pub enum Error {
         /// What is wrong with it.
         reason: String,
     },
+    /// The store of a batch cannot be used.
+    #[error("{0}")]
+    Store(#[from] vidar_store::StoreError),
+    /// The plan of a batch, or a record of one of its tasks, cannot be used.
+    #[error("{name}: {reason}")]
+    NotABatch {
+        /// The plan or the record.
+        name: String,
+        /// What is wrong with it.
+        reason: String,
+    },
+    /// A task of a batch needs results that are not there.
+    #[error("{task} cannot start: {missing}")]
+    TaskTooEarly {
+        /// The task.
+        task: String,
+        /// What is missing.
+        missing: String,
+    },
     /// A threshold was missed.
     #[error("{0}")]
     Threshold(String),
@@ -273,6 +292,11 @@ impl Error {
             Self::NoOdometry { .. } => "E0209",
             Self::NotARecording { .. } => "E0210",
             Self::NotAMap { .. } => "E0211",
+            Self::NotABatch { .. } => "E0212",
+            Self::Store(vidar_store::StoreError::BadAddress { .. }) => "E0105",
+            Self::Store(_) if self.file_system().is_some_and(is_full) => "E0402",
+            Self::Store(_) => "E0406",
+            Self::TaskTooEarly { .. } => "E0407",
             Self::Geometry(_) | Self::Stereo(_) => "E0301",
             Self::Hub(error) | Self::WeightsMissing(error) => hub_code(error),
             Self::Da3(vidar_da3::Da3Error::Cancelled) => "E1301",
@@ -303,6 +327,7 @@ impl Error {
             | Self::Hub(vidar_hub::HubError::Io { source, .. })
             | Self::Export(Export::Write { source, .. } | Export::File { source, .. })
             | Self::Synth(vidar_synth::SynthError::Write { source, .. }) => Some(source),
+            Self::Store(error) => error.io(),
             _ => None,
         }
     }
@@ -381,6 +406,12 @@ impl Error {
             Self::Empty { .. } => {
                 "check the images in depth/ of the run folder; try --preset quality, or another depth range"
             }
+            Self::NotABatch { .. } => {
+                "`vidar plan RECORDINGS… --store FOLDER` writes a plan and prints its address"
+            }
+            Self::TaskTooEarly { .. } => {
+                "run the stages of a plan in their order: track, predict, map, report"
+            }
             other if other.file_system().is_some_and(is_full) => {
                 "free space, or choose another disk with -o; finished files are kept"
             }
@@ -399,6 +430,12 @@ impl Error {
             }
             Self::NoOdometry { .. } => {
                 "move sideways at the start; `vidar odometry PATH` writes the state at every image to odometry/health.csv"
+            }
+            Self::Store(vidar_store::StoreError::BadAddress { .. }) => {
+                "--store takes a folder, and s3://bucket/prefix where the program was built with --features s3"
+            }
+            Self::Store(_) => {
+                "check the address, the network and the rights of this worker; what is finished stays, and the same command goes on"
             }
             Self::Camera(_) => {
                 "check fx, fy, cx, cy and the distortion in the calibration, or give --camera-model"
@@ -529,6 +566,10 @@ pub const CODES: &[(&str, &str)] = &[
         "E0211",
         "The map of an earlier recording (--map) cannot be read, is damaged, or is of another version.",
     ),
+    (
+        "E0212",
+        "The plan of a batch, or the record of one of its tasks, cannot be read, is damaged, is of another version, or the recording changed after it was planned.",
+    ),
     ("E0301", "The geometry model could not predict depth for any chunk."),
     ("E0302", "Predicted geometry could not be placed in the metric world."),
     ("E0303", "Fusion rejected its configuration or a view, or reached its memory limit."),
@@ -560,6 +601,14 @@ pub const CODES: &[(&str, &str)] = &[
         "The weights may not be used commercially, and the licence has not been accepted: --accept-licence records an acceptance.",
     ),
     ("E0405", "A checkpoint or its record is damaged, or is not the official one."),
+    (
+        "E0406",
+        "The store of a batch could not be read or written. Nothing is half written; the same task may be tried again.",
+    ),
+    (
+        "E0407",
+        "A task of a batch was started before the tasks whose results it needs. It may be tried again when they are done.",
+    ),
     ("E0501", "A threshold given with --fail-above or --fail-below was missed."),
     ("E7001", "A bug in VIDAR. Please report it; finished files are on disk."),
     ("E1301", "Interrupted by Ctrl-C or a signal. Files that were being written are finished or removed."),

@@ -8,6 +8,7 @@
 //! [`engine::Engine`] is the method as a push machine: sensor measurements in, map events out. [`run::run`] is a run of it:
 //! recording → engine → evaluate → export. The program in `apps/vidar` only parses, calls it and prints.
 
+pub mod batch;
 pub mod bench;
 pub mod calibrate;
 mod camera_timing;

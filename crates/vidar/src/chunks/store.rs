@@ -158,6 +158,11 @@ impl ChunkStore {
         entries.filter_map(|e| Some(e.ok()?.path())).filter(ours).collect()
     }
 
+    /// The files of a chunk that is there, the one that makes it valid last.
+    pub fn files_of(&self, id: PredictionId) -> Vec<PathBuf> {
+        ["npz", "json"].map(|e| self.path(id, e)).into_iter().filter(|p| p.is_file()).collect()
+    }
+
     fn path(&self, id: PredictionId, extension: &str) -> PathBuf {
         self.folder.join(match id {
             PredictionId::Chunk(chunk) => format!("{:06}.{extension}", chunk.0),

@@ -170,7 +170,8 @@ impl Layered {
         Ok(())
     }
 
-    fn table(&mut self, text: &str, origin: &Origin) -> Result<(), Error> {
+    /// Applies TOML that was read already.
+    pub fn table(&mut self, text: &str, origin: &Origin) -> Result<(), Error> {
         let table: Table =
             text.parse().map_err(|e: toml::de::Error| Error::BadValue { reason: e.to_string() })?;
         let mut leaves = Vec::new();

@@ -5,6 +5,7 @@ mod by_source;
 mod evaluate;
 mod map;
 mod outputs;
+pub(crate) mod parts;
 mod pictures;
 mod place_recognition;
 mod plan;
@@ -13,6 +14,7 @@ mod record;
 pub(crate) mod reference;
 mod scene;
 mod source;
+mod start;
 mod store;
 mod summary;
 mod tracking;
@@ -30,7 +32,7 @@ pub(crate) use scene::encoded_image;
 
 use crate::calibrate;
 use crate::config::{Config, Layered};
-use crate::engine::{Engine, EngineSetup, FrameStamp, MapEvent, PoseSource};
+use crate::engine::{Engine, EngineSetup, FrameStamp, MapEvent, PoseSource, PredictionStore};
 use crate::error::{Error, ExitStatus};
 use crate::events::{CancelToken, Event, Events};
 use crate::input::{self, ImageFiles, Measurement, UnseenScale};
@@ -39,13 +41,12 @@ use crate::run_folder::{OutputLocation, RunFolder};
 use crate::verdict::{StatedScale, Verdict};
 use place_recognition::PlaceRecognition;
 use readers::{FINISH, MAP, Readers};
-use record::{Recorder, RunDescription};
+use record::Recorder;
 use scene::SceneWriter;
 use source::Source;
+use start::Started;
 use std::path::PathBuf;
-use std::sync::Arc;
 use store::RunStore;
-use tracking::Tracking;
 use vidar_core::{Duration, RigCamera, Se3, Warning};
 use vidar_dataset::{Dataset, DatasetError, OpenOptions};
 
@@ -134,31 +135,21 @@ pub fn plan(request: &RunRequest) -> Result<Plan, Error> {
 /// The input cannot be used, nothing could be mapped, or a result could not be written.
 pub fn run(request: &RunRequest, events: &Events, cancel: &CancelToken) -> Result<RunOutcome, Error> {
     let clock = std::time::Instant::now();
-    let recorder = Recorder::default();
-    let events = recorder.listen(events.clone());
-    let mut config = request.layered.build()?;
-    let mut dataset =
-        events.stage("read", 0, || input::open_every_image(&request.path, &request.open, &config))?;
-    dataset.warnings.extend(input::use_every_untimed_image(&dataset, &mut config));
-    let fingerprint = input::fingerprint(&dataset)?;
-    let mut tracking = Tracking::new(&dataset, &fingerprint, &config, &request.place)?;
-    tracking.calibrate(&mut dataset, &mut config, &events, cancel)?;
-    let (plan, source, places) =
-        events.stage("plan", 0, || Plan::make(&dataset, &config, request.reference.as_deref()))?;
-    let description = RunDescription::new(request, &dataset, fingerprint.clone(), &plan);
-    let earlier = request.place.earlier(&description.0, &request.layered.to_toml(false))?;
-    let scene = request.mcap.as_deref().map(SceneWriter::create).transpose()?;
-    let events = scene.iter().fold(events, |events, scene| scene.listen(events));
-    let folder = Arc::new(RunFolder::create(&request.place)?);
-    folder.write_manifest(&description.0)?;
-    folder.write("config.resolved.toml", request.layered.to_toml(true).as_bytes())?;
-    recorder.keep_log_in(folder.clone());
-    dataset.warnings.iter().chain(&plan.warnings).for_each(|w| events.warn(w));
-    let poses = match plan.poses.is_odometry() {
-        true => tracking.track(&mut dataset, &mut config, &folder, scene.as_ref(), &events, cancel)?,
-        false => None,
-    };
-
+    let Started {
+        recorder,
+        events,
+        config,
+        dataset,
+        fingerprint,
+        plan,
+        source,
+        places,
+        description,
+        earlier,
+        scene,
+        folder,
+        poses,
+    } = start::start(request, events, cancel)?;
     let context = Context {
         request,
         config: &config,
@@ -202,6 +193,14 @@ struct Context<'a> {
     scene: Option<&'a SceneWriter>,
     events: &'a Events,
     cancel: &'a CancelToken,
+}
+
+/// What the engine of a run is given besides configuration and poses.
+struct EngineParts<'e> {
+    geometry: &'e mut Source,
+    places: &'e PlaceRecognition,
+    images: &'e ImageFiles<'e>,
+    store: &'e dyn PredictionStore,
 }
 
 impl Context<'_> {
@@ -258,28 +257,10 @@ impl Context<'_> {
         let Self { config, dataset, folder, scene, events, cancel, .. } = *self;
         let store = RunStore::new(folder.path(), self.fingerprint, plan, config);
         let images = ImageFiles(dataset);
-        let (live, fallback) = plan.poses.open(dataset, config)?;
-        let poses = tracked.map(|p| Box::new(p) as Box<dyn PoseSource>).or(live);
         let cancelled = || cancel.is_cancelled();
         let predicting = readers::chunk_progress(events);
-        let mut engine = Engine::new(EngineSetup {
-            name: dataset.name.clone(),
-            config,
-            camera_id: plan.camera_id,
-            camera: camera_on_rig(dataset, plan),
-            readout: readout(dataset, config),
-            view: plan.view,
-            poses,
-            fallback,
-            prescribed: plan.prescribed.clone(),
-            geometry: source,
-            places,
-            images: &images,
-            store: &store,
-            volume_budget_bytes: plan.volume_budget_bytes,
-            cancelled: &cancelled,
-            predicting: &predicting,
-        })?;
+        let parts = EngineParts { geometry: source, places, images: &images, store: &store };
+        let mut engine = self.engine(plan, tracked, parts, &cancelled, &predicting)?;
         let mut readers = Readers::new(dataset, plan, config, folder, scene, events);
         events.stage(MAP, dataset.images.len(), || {
             self.push_recording(&mut engine, &mut |event| readers.read(event))
@@ -294,6 +275,38 @@ impl Context<'_> {
         }
         store.clean(config.output.keep_chunks || cancel.is_cancelled());
         Ok(map)
+    }
+
+    /// An engine that has seen nothing of the recording.
+    fn engine<'e>(
+        &'e self,
+        plan: &Plan,
+        tracked: Option<TrackedPoses>,
+        parts: EngineParts<'e>,
+        cancelled: &'e (dyn Fn() -> bool + Sync),
+        predicting: &'e (dyn Fn(f64) + Sync),
+    ) -> Result<Engine<'e>, Error> {
+        let Self { config, dataset, .. } = *self;
+        let (live, fallback) = plan.poses.open(dataset, config)?;
+        let poses = tracked.map(|p| Box::new(p) as Box<dyn PoseSource>).or(live);
+        Engine::new(EngineSetup {
+            name: dataset.name.clone(),
+            config,
+            camera_id: plan.camera_id,
+            camera: camera_on_rig(dataset, plan),
+            readout: readout(dataset, config),
+            view: plan.view,
+            poses,
+            fallback,
+            prescribed: plan.prescribed.clone(),
+            geometry: parts.geometry,
+            places: parts.places,
+            images: parts.images,
+            store: parts.store,
+            volume_budget_bytes: plan.volume_budget_bytes,
+            cancelled,
+            predicting,
+        })
     }
 
     /// Every measurement of the recording, until Ctrl-C.

@@ -54,6 +54,11 @@ impl RunStore {
         }
     }
 
+    /// The files of a prediction that is there, the one that makes it valid last.
+    pub(super) fn files_of(&self, id: PredictionId) -> Vec<PathBuf> {
+        self.chunks.files_of(id)
+    }
+
     /// SHA-256 of all that a prediction depends on.
     fn key(&self, frames: &[PredictedFrame]) -> String {
         let mut hash = Sha256::new_with_prefix(&self.identity);

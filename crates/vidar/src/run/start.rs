@@ -1,0 +1,85 @@
+//! The start of a run: its recording opened, planned and tracked, its folder made.
+
+use super::place_recognition::PlaceRecognition;
+use super::record::{Recorder, RunDescription};
+use super::scene::SceneWriter;
+use super::source::Source;
+use super::tracking::Tracking;
+use super::{Plan, RunRequest};
+use crate::config::Config;
+use crate::error::Error;
+use crate::events::{CancelToken, Events};
+use crate::input;
+use crate::odometry::TrackedPoses;
+use crate::run_folder::{Earlier, RunFolder};
+use std::sync::Arc;
+use vidar_dataset::Dataset;
+
+/// A run that has poses, or is to track while it maps.
+pub(super) struct Started {
+    pub recorder: Recorder,
+    /// The events of the caller, recorded.
+    pub events: Events,
+    /// As found by calibration and tracking.
+    pub config: Config,
+    /// As found by calibration and tracking.
+    pub dataset: Dataset,
+    /// SHA-256 of what the recording consists of.
+    pub fingerprint: String,
+    pub plan: Plan,
+    pub source: Source,
+    pub places: PlaceRecognition,
+    pub description: RunDescription,
+    /// What an earlier attempt left in the folder.
+    pub earlier: Option<Earlier>,
+    pub scene: Option<SceneWriter>,
+    pub folder: Arc<RunFolder>,
+    /// None where poses are given, and where the engine is to track while it maps.
+    pub poses: Option<TrackedPoses>,
+}
+
+/// Starts a run.
+///
+/// # Errors
+/// The input cannot be used, or the folder cannot be written.
+pub(super) fn start(request: &RunRequest, events: &Events, cancel: &CancelToken) -> Result<Started, Error> {
+    let recorder = Recorder::default();
+    let events = recorder.listen(events.clone());
+    let mut config = request.layered.build()?;
+    let mut dataset =
+        events.stage("read", 0, || input::open_every_image(&request.path, &request.open, &config))?;
+    dataset.warnings.extend(input::use_every_untimed_image(&dataset, &mut config));
+    let fingerprint = input::fingerprint(&dataset)?;
+    let mut tracking = Tracking::new(&dataset, &fingerprint, &config, &request.place)?;
+    tracking.calibrate(&mut dataset, &mut config, &events, cancel)?;
+    let (plan, source, places) =
+        events.stage("plan", 0, || Plan::make(&dataset, &config, request.reference.as_deref()))?;
+    let description = RunDescription::new(request, &dataset, fingerprint.clone(), &plan);
+    let earlier = request.place.earlier(&description.0, &request.layered.to_toml(false))?;
+    let scene = request.mcap.as_deref().map(SceneWriter::create).transpose()?;
+    let events = scene.iter().fold(events, |events, scene| scene.listen(events));
+    let folder = Arc::new(RunFolder::create(&request.place)?);
+    folder.write_manifest(&description.0)?;
+    folder.write("config.resolved.toml", request.layered.to_toml(true).as_bytes())?;
+    recorder.keep_log_in(folder.clone());
+    dataset.warnings.iter().chain(&plan.warnings).for_each(|w| events.warn(w));
+    let poses = match plan.poses.is_odometry() {
+        true => tracking.track(&mut dataset, &mut config, &folder, scene.as_ref(), &events, cancel)?,
+        false => None,
+    };
+    Ok(Started {
+        recorder,
+        events,
+        config,
+        dataset,
+        fingerprint,
+        plan,
+        source,
+        places,
+        description,
+        earlier,
+        scene,
+        folder,
+        poses,
+    })
+}
