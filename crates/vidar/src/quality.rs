@@ -127,7 +127,8 @@ impl TrackQuality {
         let (count, most) = of_kind.map(|(_, refusal)| refusal).max_by_key(|(count, _)| *count)?;
         Some(match contradicts {
             false if most.starts_with("std(log scale)") => format!(
-                "{most}. If the camera does speed up and slow down, signs or axes of the accelerometer are wrong"
+                "{most}. If the camera does speed up and slow down, images and IMU contradict each other: signs or axes of the \
+                 accelerometer, camera's orientation, or a clock that is far off"
             ),
             false => most.clone(),
             true => format!(
