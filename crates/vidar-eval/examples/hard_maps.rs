@@ -4,6 +4,9 @@
 //! by the case; `--help` lists them. The trajectories' Sim(3) fit is given, so that every refinement of the protocol runs. The clouds hold
 //! positions alone.
 
+mod process;
+
+use process::{peak_mib, processor_secs};
 use std::error::Error;
 use std::time::Instant;
 use vidar_core::{PointCloud, Se3, Sim3};
@@ -104,19 +107,4 @@ fn room(count: usize, seed: usize) -> Vec<[f32; 3]> {
             }
         })
         .collect()
-}
-
-/// Processor time of all threads, seconds, from Linux's own account; 0 without `/proc`.
-fn processor_secs() -> f64 {
-    let stat = std::fs::read_to_string("/proc/self/stat").unwrap_or_default();
-    let fields: Vec<&str> = stat.rsplit(')').next().unwrap_or_default().split_whitespace().collect();
-    let ticks = |i: usize| fields.get(i).and_then(|f| f.parse::<f64>().ok()).unwrap_or(0.0);
-    (ticks(11) + ticks(12)) / 100.0
-}
-
-/// Peak resident memory of this process, MiB; 0 without `/proc`.
-fn peak_mib() -> f64 {
-    let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
-    let line = status.lines().find(|l| l.starts_with("VmHWM")).unwrap_or_default();
-    line.split_whitespace().nth(1).and_then(|kib| kib.parse::<f64>().ok()).unwrap_or(0.0) / 1024.0
 }

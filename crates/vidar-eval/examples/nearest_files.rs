@@ -5,6 +5,9 @@
 
 #![allow(clippy::unwrap_used, clippy::panic, clippy::print_stdout)] // a measuring program: stops at the first surprise, prints
 
+mod process;
+
+use process::{peak_mib, processor_secs};
 use std::time::Instant;
 use vidar_eval::{NearestIndex, nearest_distances};
 
@@ -12,21 +15,6 @@ fn points(path: &str) -> Vec<[f32; 3]> {
     let bytes = std::fs::read(path).unwrap();
     let number = |b: &[u8]| f32::from_le_bytes(b.try_into().unwrap());
     bytes.chunks_exact(12).map(|p| [number(&p[..4]), number(&p[4..8]), number(&p[8..])]).collect()
-}
-
-/// Processor time of all threads, seconds, from Linux's own account.
-fn processor_secs() -> f64 {
-    let stat = std::fs::read_to_string("/proc/self/stat").unwrap_or_default();
-    let fields: Vec<&str> = stat.rsplit(')').next().unwrap_or_default().split_whitespace().collect();
-    let ticks = |i: usize| fields.get(i).and_then(|f| f.parse::<f64>().ok()).unwrap_or(0.0);
-    (ticks(11) + ticks(12)) / 100.0
-}
-
-/// Largest memory so far, MiB.
-fn peak_mib() -> f64 {
-    let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
-    let line = status.lines().find(|l| l.starts_with("VmHWM")).unwrap_or_default();
-    line.split_whitespace().nth(1).and_then(|kib| kib.parse::<f64>().ok()).unwrap_or(0.0) / 1024.0
 }
 
 fn main() {
