@@ -26,7 +26,8 @@ pub struct AdjustedCalibration {
     pub time_offset_secs: f64,
     /// From the first to the last row, s.
     pub readout_secs: f64,
-    /// Standard deviations: clock offset and readout (s), rotation (rad), position (m), intrinsics (their own units).
+    /// Standard deviations: clock offset and readout (s), rotation (rad, about the axes of the camera), position (m, in the body),
+    /// intrinsics (their own units).
     pub sigmas: Vec<f64>,
 }
 

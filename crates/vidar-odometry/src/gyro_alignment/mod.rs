@@ -23,8 +23,11 @@ use vidar_core::{CameraModel, ImuSample, LandmarkId, So3, Timestamp, camera::Pix
 const IMAGE_SPACING_SECS: f64 = 0.045;
 /// Longest stretch of images that is used, s.
 const SPAN_SECS: f64 = 5.0;
-/// Shortest stretch that is tried, s.
+/// Shortest stretch that is tried, s; a hand that turns as fast as [`LIVELY_RATE_RMS`] shows its clock in the shorter one.
 const MIN_SPAN_SECS: f64 = 1.5;
+const MIN_LIVELY_SPAN_SECS: f64 = 0.7;
+/// Root mean square of the angular rate about its mean, rad/s, that the shorter stretch needs.
+const LIVELY_RATE_RMS: f64 = 0.25;
 /// Gyroscope samples this far beyond an image must be there: the largest offset that is searched, and half a readout.
 const LOOKAHEAD_SECS: f64 = 0.19;
 /// Root mean square of the angular rate about its mean that a solution needs, rad/s: below it, a clock offset of 50 ms
@@ -82,12 +85,14 @@ impl GyroAlignmentLog {
         self.images.clear();
     }
 
-    /// The problem as it is now, if at least `pause_secs` of images came since the last one.
+    /// The problem as it is now, if at least `pause_secs` of images came since the last one. `hurries`: a shorter stretch will do where
+    /// motion is lively.
     pub fn next_problem(
         &mut self,
         camera: &CameraModel,
         guess: &Guess,
         pause_secs: f64,
+        hurries: bool,
     ) -> Option<AlignmentProblem> {
         let (newest, origin) = (self.gyro.back()?.0, self.images.front()?.0);
         let last_image = self.images.back()?.0;
@@ -100,20 +105,25 @@ impl GyroAlignmentLog {
             .filter(|(stamp, _)| (newest - *stamp).as_secs_f64() > LOOKAHEAD_SECS)
             .map(|(stamp, f)| ImageFeatures { secs: (*stamp - origin).as_secs_f64(), features: f.clone() })
             .collect();
-        if images.last().is_none_or(|i| i.secs < MIN_SPAN_SECS) {
+        let span_secs = images.last()?.secs;
+        if span_secs < if hurries { MIN_LIVELY_SPAN_SECS } else { MIN_SPAN_SECS } {
             return None;
         }
-        self.last_attempt = Some(last_image);
         let samples: Vec<RateSample> = self
             .gyro
             .iter()
             .map(|(time, rate)| RateSample { secs: (*time - origin).as_secs_f64(), rate: *rate })
             .collect();
         let covered = samples.first().is_some_and(|s| s.secs < -LOOKAHEAD_SECS) || samples.len() > 50;
-        if !covered || rate_rms(&samples) < MIN_RATE_RMS {
+        let rate_rms = rate_rms(&samples);
+        if span_secs < MIN_SPAN_SECS && rate_rms < LIVELY_RATE_RMS {
             return None;
         }
-        Some(AlignmentProblem { camera: camera.clone(), guess: *guess, images, samples })
+        self.last_attempt = Some(last_image);
+        if !covered || rate_rms < MIN_RATE_RMS {
+            return None;
+        }
+        Some(AlignmentProblem { camera: camera.clone(), guess: *guess, images, samples, span_secs })
     }
 }
 
@@ -124,9 +134,15 @@ pub(crate) struct AlignmentProblem {
     guess: Guess,
     images: Vec<ImageFeatures>,
     samples: Vec<RateSample>,
+    span_secs: f64,
 }
 
 impl AlignmentProblem {
+    /// Whether it has the shorter stretch of images, and so the fewer.
+    pub fn is_short(&self) -> bool {
+        self.span_secs < MIN_SPAN_SECS
+    }
+
     /// `None` where too few images share features, or nothing determines the alignment.
     pub fn solve(&self) -> Option<Alignment> {
         let guess = &self.guess;

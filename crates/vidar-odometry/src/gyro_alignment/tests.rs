@@ -92,7 +92,8 @@ impl Truth {
 
     fn check(&self, offset_ms: f64, readout_ms: f64, rotation_deg: f64) {
         for seed in 0..4 {
-            let found = self.log(seed).next_problem(&camera(), &self.guess(), 0.5).unwrap().solve().unwrap();
+            let found =
+                self.log(seed).next_problem(&camera(), &self.guess(), 0.5, true).unwrap().solve().unwrap();
             let offset = (found.offset_secs - self.offset_secs) * 1e3;
             let readout = (found.readout_secs - self.readout_secs) * 1e3;
             let turn = (self.body_from_camera.inverse() * found.body_from_camera).angle_rad().to_degrees();
@@ -126,6 +127,38 @@ fn a_slow_hand_gives_the_clock_within_some_milliseconds() {
     Truth { offset_secs: 0.044, readout_secs: 0.03, liveliness: 0.25, ..lively() }.check(3.0, 8.0, 4.0);
 }
 
+/// The first `secs` of a log's images.
+fn shortened(mut log: GyroAlignmentLog, secs: f64) -> GyroAlignmentLog {
+    let first = log.images[0].0;
+    log.images.retain(|(stamp, _)| (*stamp - first).as_secs_f64() <= secs + 1e-6);
+    log
+}
+
+#[test]
+fn a_lively_hand_shows_its_clock_in_less_than_a_second_and_a_slower_one_says_how_badly() {
+    for (liveliness, largest_sigma) in [(1.0, 0.05), (4.0, 0.008)] {
+        let truth = Truth { liveliness, ..lively() };
+        for seed in 0..4 {
+            let problem =
+                shortened(truth.log(seed), 0.75).next_problem(&camera(), &truth.guess(), 0.5, true).unwrap();
+            assert!(problem.is_short());
+            let found = problem.solve().unwrap();
+            let off = found.offset_secs - truth.offset_secs;
+            assert!(off.abs() < 4.0 * found.offset_sigma, "{found:?}");
+            assert!(found.offset_sigma < largest_sigma, "{found:?}");
+        }
+    }
+}
+
+#[test]
+fn a_slow_hand_is_not_asked_before_it_has_shown_enough() {
+    let slow = Truth { liveliness: 0.1, ..lively() };
+    assert!(shortened(slow.log(1), 1.4).next_problem(&camera(), &slow.guess(), 0.5, true).is_none());
+    let lively = lively();
+    assert!(shortened(lively.log(1), 1.4).next_problem(&camera(), &lively.guess(), 0.5, false).is_none());
+    assert!(shortened(slow.log(1), 1.6).next_problem(&camera(), &slow.guess(), 0.5, true).is_some());
+}
+
 #[test]
 fn turning_on_the_spot_is_enough() {
     Truth { translates: false, ..lively() }.check(1.0, 1.5, 0.6);
@@ -139,5 +172,5 @@ fn a_global_shutter_and_a_true_clock_are_left_as_they_are() {
 #[test]
 fn a_body_at_rest_gives_no_alignment() {
     let rest = Truth { liveliness: 0.01, ..lively() };
-    assert!(rest.log(1).next_problem(&camera(), &rest.guess(), 0.5).is_none());
+    assert!(rest.log(1).next_problem(&camera(), &rest.guess(), 0.5, true).is_none());
 }

@@ -23,8 +23,9 @@ const SETTLED_READOUT_SECS: f64 = 0.003;
 /// Largest mean squared whitened residual of a solution that explains the tracks.
 const MAX_CHI2_PER_DOF: f64 = 3.0;
 
-/// Time of the recording until the solution of an attempt is taken over, s.
+/// Time of the recording until the solution of an attempt is taken over, s; that of a short stretch has half the images.
 const SOLVING_SECS: f64 = 0.5;
+const SOLVING_SHORT_SECS: f64 = 0.3;
 /// Time between attempts, s: the first ones hurry. Later ones come as often as half of what they look at is new.
 const PAUSE_SECS: f64 = 0.5;
 const LATER_PAUSE_SECS: f64 = 2.0;
@@ -83,8 +84,8 @@ pub(crate) struct TimeCalibration {
     estimated: Option<(f64, f64)>,
     attempts: usize,
     is_settled: bool,
-    /// The attempt that is being solved.
-    solving: Option<Deferred<Option<Alignment>>>,
+    /// The attempt that is being solved, and whether from a short stretch.
+    solving: Option<(Deferred<Option<Alignment>>, bool)>,
 }
 
 impl TimeCalibration {
@@ -158,28 +159,34 @@ impl TimeCalibration {
         if self.is_settled() {
             return None;
         }
-        let solving = self.solving.take_if(|s| now.is_none_or(|now| s.is_due(now)));
-        if let Some(found) = solving.and_then(Deferred::result).flatten() {
+        let due = self.solving.take_if(|(s, _)| now.is_none_or(|now| s.is_due(now)));
+        // A state is not given up for what half the images say: on a slow hand that was twice as far off.
+        let due = due.filter(|(_, is_short)| !(*is_short && is_tracking));
+        if let Some(found) = due.and_then(|(solving, _)| solving.result()).flatten() {
             return self.take(&found, camera, offset_secs, is_tracking);
         }
         if let (None, Some(now)) = (&self.solving, now) {
-            self.begin(camera, offset_secs, now);
+            self.begin(camera, offset_secs, is_tracking, now);
         }
         None
     }
 
     /// Begins to solve for what the log holds.
-    fn begin(&mut self, camera: &RigCamera, offset_secs: f64, now: Timestamp) {
+    fn begin(&mut self, camera: &RigCamera, offset_secs: f64, is_tracking: bool, now: Timestamp) {
         let guess = Guess {
             body_from_camera: camera.body_from_camera.rotation,
             offset_secs,
             readout_secs: self.readout_secs,
-            search: self.attempts.is_multiple_of(4),
+            // Until something was found, the clock may be anywhere.
+            search: self.attempts.is_multiple_of(4)
+                || (self.estimated.is_none() && self.attempts < HURRIED_ATTEMPTS),
         };
         let pause = if self.attempts < HURRIED_ATTEMPTS { PAUSE_SECS } else { LATER_PAUSE_SECS };
-        if let Some(problem) = self.log.next_problem(&camera.model, &guess, pause) {
-            let due = now + Duration::from_secs_f64(SOLVING_SECS);
-            self.solving = Some(Deferred::begin(due, move || problem.solve()));
+        if let Some(problem) = self.log.next_problem(&camera.model, &guess, pause, !is_tracking) {
+            let secs = if problem.is_short() { SOLVING_SHORT_SECS } else { SOLVING_SECS };
+            let due = now + Duration::from_secs_f64(secs);
+            let is_short = problem.is_short();
+            self.solving = Some((Deferred::begin(due, move || problem.solve()), is_short));
         }
     }
 

@@ -18,8 +18,10 @@ const REPLAY_FRAMES: usize = 100;
 /// IMU measurements kept before the oldest image, s: clocks differ by 0.15 s at most, and half a second shows a body at rest.
 const IMU_BEFORE_SECS: f64 = 0.7;
 
-/// Images that the second odometry works on per new one, so that it catches up without making any image wait for long.
+/// Images that the second odometry works on per new one, so that it catches up without making any image wait for long: more where
+/// neither has a state, which costs an image a fifth.
 const IMAGES_A_TURN: usize = 3;
+const IMAGES_A_TURN_BEFORE_START: usize = 6;
 
 /// After this long without a state of the second odometry the first one gives its own up, s.
 const PATIENCE_SECS: f64 = 6.0;
@@ -83,8 +85,12 @@ impl Successor {
     }
 
     /// Works on some of the images that wait.
-    fn catch_up(&mut self) {
-        for _ in 0..IMAGES_A_TURN {
+    fn catch_up(&mut self, first_is_initializing: bool) {
+        for done in 0..IMAGES_A_TURN_BEFORE_START {
+            let has_state = !first_is_initializing || matches!(self.odometry.phase, Phase::Tracking(_));
+            if has_state && done >= IMAGES_A_TURN {
+                return;
+            }
             let Some(RecentFrame { id, frame, .. }) =
                 self.waiting.pop_front_if(|f| self.odometry.is_ready(&f.frame))
             else {
@@ -154,8 +160,8 @@ impl Odometry {
         if waited_secs > 0.0 {
             successor.waiting.push_back(newest);
         }
-        successor.catch_up();
         let is_initializing = matches!(self.phase, Phase::Initializing(_));
+        successor.catch_up(is_initializing);
         match successor.newest_pose().filter(|_| successor.is_up_to_date()) {
             Some((at, new)) => {
                 let old = self.recent.pose(at);

@@ -2,7 +2,7 @@
 //!
 //! ```text
 //! cargo run --release -p vidar-odometry --example evaluate -- [--mono] [--start S] [--secs S] [--verbose]
-//!     [--repeat N] [--stages] [--image-noise GRAY] [--imu-noise FACTOR] [--halve]
+//!     [--repeat N] [--stages] [--paced] [--image-noise GRAY] [--imu-noise FACTOR] [--halve]
 //!     [--live] [--adjust] [--variant KEY=VALUE,...]... [--lever-error M] [--turn-error DEG] [--trajectory FILE] [--frames FILE] [--set KEY=VALUE]... SEQUENCE...
 //! ```
 //!
@@ -13,6 +13,8 @@
 //!
 //! Time is wall time. On a machine that others use too, `--repeat 5` runs a sequence five times (the results are the same
 //! bits) and takes the least of every image's five times. `--stages` splits the median and the 95 % quantile by stage.
+//! `--paced` feeds each image no earlier than it was filmed, as a camera does, and says what an image costs the thread that feeds it,
+//! in processor time; attempts to start run on another thread, which then has the time that it has live.
 //!
 //! The camera's clock offset, readout and rotation are found in a first pass over the beginning; `--live` leaves it out,
 //! as for a stream, which cannot be read twice.
@@ -26,18 +28,17 @@
 
 #![allow(clippy::print_stdout, clippy::print_stderr)] // a program
 
+mod corrupt;
+mod print;
+
+use corrupt::{Corruptor, halved_camera};
 use nalgebra::Vector3;
+use print::{costs, frames, row, stages, tell, tum};
 use std::path::{Path, PathBuf};
-use vidar_core::camera::RadTan;
-use vidar_core::{
-    BodyFrame, CameraModel, Duration, FrameImage, Health, Image, ImuNoise, LieGroup, NavState, Se3,
-    SensorEvent, So3, StampedPose, Timestamp, Trajectory,
-};
+use vidar_core::{Duration, Health, LieGroup, NavState, Se3, SensorEvent, So3, StampedPose, Timestamp};
 use vidar_dataset::{Dataset, OpenOptions};
-use vidar_eval::{TrajectoryEvalConfig, evaluate_trajectory};
 use vidar_odometry::bundle_adjustment::{Adjusted, CalibrationSigmas};
-use vidar_odometry::simulate::Random;
-use vidar_odometry::{ImuUse, Odometry, OdometryConfig, OdometryOutput, Stage, StageTimes, Status};
+use vidar_odometry::{ImuUse, Odometry, OdometryConfig, OdometryOutput, StageTimes};
 
 type Failure = Box<dyn std::error::Error>;
 
@@ -53,6 +54,7 @@ struct Options {
     settings: Vec<(String, f64)>,
     repeat: usize,
     stages: bool,
+    paced: bool,
     image_noise: f64,
     imu_noise: f64,
     halve: bool,
@@ -73,6 +75,7 @@ fn options() -> Result<Options, Failure> {
             "--mono" => found.mono = true,
             "--repeat" => found.repeat = value()?.parse::<usize>()?.max(1),
             "--stages" => found.stages = true,
+            "--paced" => found.paced = true,
             "--image-noise" => found.image_noise = value()?.parse()?,
             "--imu-noise" => found.imu_noise = value()?.parse()?,
             "--halve" => found.halve = true,
@@ -123,9 +126,12 @@ fn main() -> Result<(), Failure> {
 }
 
 /// Everything that one run left behind.
+#[derive(Default)]
 struct Run {
     outputs: Vec<OdometryOutput>,
     times: Vec<StageTimes>,
+    /// Processor time of the feeding thread per image, s, and whether the image has a state.
+    processor: Vec<(f64, bool)>,
     poses: Vec<StampedPose>,
     /// The adjustments: what was changed, and the seconds each took.
     adjusted: Vec<(String, Adjusted, f64)>,
@@ -201,129 +207,20 @@ fn evaluate(path: &Path, options: &Options) -> Result<(), Failure> {
     if options.stages {
         println!("{}", stages(&run.times));
     }
+    if options.paced {
+        println!("{}", costs(&run.processor));
+    }
     Ok(())
 }
 
-/// Prints the figures of one trajectory.
-fn row(
-    name: &str,
-    poses: Vec<StampedPose>,
-    (first_image, images): (Timestamp, usize),
-    times: &[StageTimes],
-    truth: &Trajectory,
-) -> Result<Trajectory, Failure> {
-    let first_secs = (poses[0].time - first_image).as_secs_f64();
-    let done = 100.0 * poses.len() as f64 / images as f64;
-    let estimate = Trajectory::new(BodyFrame::Imu, poses)?;
-    let report = evaluate_trajectory(&estimate, truth, &TrajectoryEvalConfig::default())?;
-    let mut millis: Vec<f64> = times.iter().map(|t| 1e3 * t.total().as_secs_f64()).collect();
-    let mean = millis.iter().sum::<f64>() / millis.len().max(1) as f64;
-    millis.sort_by(f64::total_cmp);
-    let percentile = |share: f64| {
-        millis.get((millis.len().max(1) - 1) * (100.0 * share) as usize / 100).copied().unwrap_or(f64::NAN)
-    };
-    let or_nan = |v: Option<f64>| v.unwrap_or(f64::NAN);
-    println!(
-        "{name:<14} {:>7.4} {:>7.4} {:>7.4} {:>7.2} {:>8.4} {done:>6.1} {first_secs:>6.2} {mean:>7.2} {:>6.2} {:>6.2} {:>6.0} {:>6.1}",
-        or_nan(report.ate_se3_m.map(|e| e.rmse)),
-        or_nan(report.ate_sim3_m.map(|e| e.rmse)),
-        or_nan(report.scale_error),
-        or_nan(report.orientation_se3_deg.map(|e| e.rmse)),
-        or_nan(report.rpe_metres.map(|e| e.translation_m.rmse)),
-        percentile(0.5),
-        percentile(0.95),
-        peak_megabytes(),
-        report.matched_truth_path_m,
-    );
-    Ok(estimate)
-}
+/// Waits until as much time has passed since the first image as its camera needed.
+struct Pace(Option<(std::time::Instant, Timestamp)>);
 
-/// Median, 95 % quantile and mean of every stage, ms, over the images that passed it; and over the running odometry.
-fn stages(times: &[StageTimes]) -> String {
-    use std::fmt::Write as _;
-    let mut text = format!("  {:<12} {:>7} {:>7} {:>7} {:>7}", "stage", "images", "median", "p95", "mean");
-    let mut row = |name: &str, mut millis: Vec<f64>| {
-        if millis.is_empty() {
-            return;
-        }
-        millis.sort_by(f64::total_cmp);
-        let at = |share: f64| millis[((millis.len() - 1) as f64 * share) as usize];
-        let mean = millis.iter().sum::<f64>() / millis.len() as f64;
-        let (n, median, high) = (millis.len(), at(0.5), at(0.95));
-        let _ = write!(text, "\n  {name:<12} {n:>7} {median:>7.3} {high:>7.3} {mean:>7.3}");
-    };
-    let millis = |secs: std::time::Duration| 1e3 * secs.as_secs_f64();
-    let running = |t: &&StageTimes| t.of(Stage::Initialise).is_zero();
-    for stage in Stage::ALL {
-        let passed = times.iter().filter(|t| running(t) == (stage != Stage::Initialise));
-        row(stage.name(), passed.map(|t| millis(t.of(stage))).collect());
-    }
-    row("all, running", times.iter().filter(running).map(|t| millis(t.total())).collect());
-    text
-}
-
-/// What corrupts a recording while it is read.
-struct Corruptor {
-    random: Random,
-    image_noise: f64,
-    /// Standard deviations per reading: rad/s, m/s².
-    imu_noise: [f64; 2],
-    halve: bool,
-}
-
-impl Corruptor {
-    fn new(options: &Options, noise: Option<ImuNoise>) -> Self {
-        // Variances add up: what is missing to FACTOR times the data sheet's.
-        let more = (options.imu_noise * options.imu_noise - 1.0).max(0.0).sqrt();
-        let per_reading = |density: f64, n: &ImuNoise| more * density * n.rate_hz.sqrt();
-        let imu_noise = noise.map_or([0.0; 2], |n| {
-            [per_reading(n.gyro_noise_density, &n), per_reading(n.accel_noise_density, &n)]
-        });
-        Self { random: Random::new(7), image_noise: options.image_noise, imu_noise, halve: options.halve }
-    }
-
-    fn corrupt(&mut self, event: &mut SensorEvent) {
-        match event {
-            SensorEvent::Imu(sample) => {
-                let [gyro, accel] = self.imu_noise;
-                for k in 0..3 {
-                    sample.gyro.0[k] += gyro * self.random.normal();
-                    sample.accel.0[k] += accel * self.random.normal();
-                }
-            }
-            SensorEvent::Image(frame) if self.halve || self.image_noise > 0.0 => {
-                let mut gray = frame.image.to_gray8();
-                if self.halve {
-                    gray = halved(&gray);
-                }
-                let (random, sigma) = (&mut self.random, self.image_noise);
-                if sigma > 0.0 {
-                    gray = gray
-                        .map(|&p| (f64::from(p) + sigma * random.normal()).round().clamp(0.0, 255.0) as u8);
-                }
-                frame.image = FrameImage::Gray8(gray);
-            }
-            _ => {}
-        }
-    }
-}
-
-fn halved(image: &Image<u8>) -> Image<u8> {
-    let at = |x: usize, y: usize| u32::from(image[(x, y)]);
-    Image::from_fn(image.width() / 2, image.height() / 2, |x, y| {
-        let (x, y) = (2 * x, 2 * y);
-        ((at(x, y) + at(x + 1, y) + at(x, y + 1) + at(x + 1, y + 1) + 2) / 4) as u8
-    })
-}
-
-/// The camera of halved images; of distorted ones only radtan's, which EuRoC has.
-fn halved_camera(model: &CameraModel) -> Result<CameraModel, Failure> {
-    let k = model.intrinsics();
-    let half = k.resized(k.width / 2, k.height / 2)?;
-    match model {
-        CameraModel::Pinhole(_) => Ok(CameraModel::Pinhole(half)),
-        CameraModel::RadTan(m) => Ok(CameraModel::RadTan(RadTan::with_k3(half, m.distortion, m.k3)?)),
-        other => Err(format!("--halve does not know {}", other.name()).into()),
+impl Pace {
+    fn wait_for(&mut self, time: Timestamp) {
+        let (begun, first) = *self.0.get_or_insert_with(|| (std::time::Instant::now(), time));
+        let due = std::time::Duration::from_secs_f64((time - first).as_secs_f64().max(0.0));
+        std::thread::sleep(due.saturating_sub(begun.elapsed()));
     }
 }
 
@@ -358,7 +255,8 @@ fn run(dataset: &Dataset, options: &Options) -> Result<Run, Failure> {
             Odometry::with_timing(&rig, dataset.camera, &config, &timing)?
         }
     };
-    let mut run = Run { outputs: Vec::new(), times: Vec::new(), poses: Vec::new(), adjusted: Vec::new() };
+    let mut run = Run::default();
+    let (mut pace, mut timing) = (Pace(None), None);
     if options.adjust {
         odometry.keep_log();
     }
@@ -368,8 +266,18 @@ fn run(dataset: &Dataset, options: &Options) -> Result<Run, Failure> {
             continue;
         }
         corruptor.corrupt(&mut event);
+        if let (true, SensorEvent::Image(frame)) = (options.paced, &event) {
+            pace.wait_for(frame.time);
+        }
+        let begun = thread_secs();
         if let Some(output) = odometry.push(event)? {
+            run.processor.push((thread_secs() - begun, output.tracking().is_some()));
             run.times.push(odometry.stage_times());
+            if options.verbose
+                && timing.replace(odometry.timing().sigmas_secs) != Some(odometry.timing().sigmas_secs)
+            {
+                eprintln!("  {} frame {}: {:?}", output.time, output.frame_id, odometry.timing());
+            }
             keep(&mut run, output, options.mono);
         }
     }
@@ -379,9 +287,9 @@ fn run(dataset: &Dataset, options: &Options) -> Result<Run, Failure> {
     if options.adjust {
         for variant in std::iter::once("").chain(options.variants.iter().map(String::as_str)) {
             let sigmas = sigmas(variant, &mut odometry)?;
-            let begun = processor_secs();
+            let begun = thread_secs();
             let adjusted = odometry.adjust(&sigmas)?;
-            let secs = processor_secs() - begun;
+            let secs = thread_secs() - begun;
             if options.verbose {
                 println!("  {:?}\n  {:?}\n  {:?}", adjusted.report, adjusted.calibration, adjusted.imu);
             }
@@ -444,66 +352,15 @@ fn keep(run: &mut Run, output: OdometryOutput, mono: bool) {
     run.outputs.push(output);
 }
 
-/// Says when things changed.
-fn tell(run: &Run) {
-    let mut last = String::new();
-    for output in &run.outputs {
-        let now = match &output.status {
-            Status::Waiting(progress) => format!("waiting: {progress}"),
-            Status::Tracking(tracking) => format!("tracking: {}", tracking.health),
-            Status::Lost(reason) => format!("lost: {reason}"),
-        };
-        if now != last {
-            eprintln!("  {} frame {}: {now}", output.time, output.frame_id);
-            last = now;
-        }
+/// Processor time of this thread so far, s; wall time where the system does not tell.
+fn thread_secs() -> f64 {
+    #[cfg(unix)]
+    {
+        let told = rustix::time::clock_gettime(rustix::time::ClockId::ThreadCPUTime);
+        told.tv_sec as f64 + 1e-9 * told.tv_nsec as f64
     }
-}
-
-fn frames(run: &Run) -> String {
-    use std::fmt::Write as _;
-    let mut text =
-        String::from("#time,health,landmarks_found,tried,seeds_found,tried,contradicting,chi2,keyframe\n");
-    for (output, tracking) in run.outputs.iter().filter_map(|o| Some((o, o.tracking()?))) {
-        let t = &tracking.tracks;
-        let _ = writeln!(
-            text,
-            "{},{},{},{},{},{},{},{:.3},{}",
-            output.time,
-            tracking.health,
-            t.landmarks_found,
-            t.landmarks_tried,
-            t.seeds_found,
-            t.seeds_tried,
-            t.contradicting,
-            t.chi2_per_dof,
-            u8::from(tracking.keyframe.is_some())
-        );
+    #[cfg(not(unix))]
+    {
+        std::time::SystemTime::UNIX_EPOCH.elapsed().map_or(f64::NAN, |t| t.as_secs_f64())
     }
-    text
-}
-
-fn tum(trajectory: &Trajectory) -> String {
-    use std::fmt::Write as _;
-    let mut text = String::new();
-    for pose in trajectory.poses() {
-        let (t, q) = (pose.world_from_body.translation, pose.world_from_body.rotation.quaternion_xyzw());
-        let _ = writeln!(text, "{} {} {} {} {} {} {} {}", pose.time, t.x, t.y, t.z, q[0], q[1], q[2], q[3]);
-    }
-    text
-}
-
-/// Processor time of this process' first thread so far, s; NaN where the system does not tell.
-fn processor_secs() -> f64 {
-    let told = std::fs::read_to_string("/proc/thread-self/schedstat").unwrap_or_default();
-    let nanos = told.split_whitespace().next().and_then(|n| n.parse::<f64>().ok());
-    nanos.map_or(f64::NAN, |n| 1e-9 * n)
-}
-
-/// Peak resident memory of this process; NaN where the system does not tell.
-fn peak_megabytes() -> f64 {
-    let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
-    let line = status.lines().find_map(|l| l.strip_prefix("VmHWM:"));
-    let kilobytes = line.and_then(|l| l.trim().trim_end_matches("kB").trim().parse::<f64>().ok());
-    kilobytes.map_or(f64::NAN, |kb| kb / 1024.0)
 }
