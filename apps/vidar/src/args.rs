@@ -293,6 +293,13 @@ pub struct RunArgs {
     /// Print the plan and stop.
     #[arg(long)]
     pub dry_run: bool,
+    /// Cut down stereo so that the run takes no longer than the recording, on two quiet cores of the machine of BENCHMARK.md
+    /// (`budget.speed` tells of others). The same command makes the same map on every machine.
+    #[arg(long, conflicts_with = "time_budget", help_heading = "Model")]
+    pub realtime: bool,
+    /// The same with a limit in seconds.
+    #[arg(long, value_name = "SECONDS", help_heading = "Model")]
+    pub time_budget: Option<f64>,
     /// Memory limit for planning, such as 4GiB or 800MB; default: the sum of the parts.
     #[arg(long, value_name = "SIZE", help_heading = "Model")]
     pub memory_budget: Option<String>,

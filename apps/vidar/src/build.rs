@@ -69,6 +69,18 @@ pub fn apply_model_flags(layered: &mut Layered, args: &RunArgs) -> Result<(), Er
         let bytes = toml::Value::Integer(byte_count(size)?);
         layered.value("limits.memory_bytes", bytes, Origin::Flag("--memory-budget"))?;
     }
+    if args.realtime {
+        layered.value("budget.realtime", toml::Value::Boolean(true), Origin::Flag("--realtime"))?;
+    }
+    if let Some(seconds) = args.time_budget {
+        if !(seconds.is_finite() && seconds > 0.0) {
+            return Err(usage(
+                format!("--time-budget must be finite and positive, found {seconds}"),
+                "give the seconds that the run may take",
+            ));
+        }
+        layered.value("budget.seconds", toml::Value::Float(seconds), Origin::Flag("--time-budget"))?;
+    }
     if let Some(device) = args.device {
         layered.value("model.device", toml::Value::String(device.to_string()), Origin::Flag("--device"))?;
     }

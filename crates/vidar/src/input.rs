@@ -121,6 +121,14 @@ impl PosePlan {
         }
     }
 
+    /// The trajectory that serves where the odometry gives no pose.
+    pub fn fallback(&self, dataset: &Dataset, config: &Config) -> Option<GivenPoses> {
+        match self {
+            Self::Odometry { fallback: Some(trajectory) } => Some(given_poses(trajectory, dataset, config)),
+            Self::None | Self::Given(_) | Self::Odometry { fallback: None } => None,
+        }
+    }
+
     /// Whether they come from the recording's own camera and IMU.
     pub fn is_odometry(&self) -> bool {
         matches!(self, Self::Odometry { .. })

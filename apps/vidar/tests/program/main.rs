@@ -5,6 +5,7 @@
 mod auto;
 mod batch;
 mod bench;
+mod budget;
 mod calibrate;
 mod compare;
 mod config;

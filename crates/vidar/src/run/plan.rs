@@ -1,5 +1,6 @@
 //! What a run would do: all that is known before anything is tracked or predicted.
 
+use super::budget::Budget;
 use super::place_recognition::PlaceRecognition;
 use super::source::{OpenedSource, Source};
 use crate::config::Config;
@@ -66,6 +67,8 @@ pub struct Plan {
     pub volume_budget_bytes: u64,
     /// Disk that the run folder will take at most, bytes.
     pub disk_bytes: u64,
+    /// The time budget with what was chosen for it; none without a limit, and before the poses that it depends on are known.
+    pub budget: Option<Budget>,
     /// Warnings about the input and the settings.
     pub warnings: Vec<Warning>,
 }
@@ -138,6 +141,7 @@ impl Plan {
             depth_units_per_metre: config.output.depth_units_per_metre,
             volume_budget_bytes,
             poses,
+            budget: None,
             warnings,
         };
         Ok((plan, source, place_recognition))
@@ -188,6 +192,9 @@ impl Plan {
                 lines.push(("device", device.device.clone()));
                 lines.push(("memory of the device", device_memory(device)));
             }
+        }
+        if let Some(budget) = &self.budget {
+            lines.push(("time budget", budget.words()));
         }
         lines
     }
