@@ -284,6 +284,10 @@ pub struct RunArgs {
     /// Folder of an earlier `vidar odometry` or `vidar run` of the same place: the map is in the world of that recording.
     #[arg(long, value_name = "FOLDER", value_hint = ValueHint::AnyPath, help_heading = "Input")]
     pub map: Option<String>,
+    /// Folder of masks, black where an image is not to be used, as COLMAP and nerfstudio have them: people who move, the camera's
+    /// carrier. A mask is called as its image is: NAME.EXT.png or NAME.png.
+    #[arg(long, value_name = "FOLDER", value_hint = ValueHint::DirPath, help_heading = "Input")]
+    pub masks: Option<String>,
     /// Reference cloud (PLY, metres, world frame of the ground truth) for the evaluation of the map.
     #[arg(long, value_hint = ValueHint::FilePath, help_heading = "Input")]
     pub reference: Option<PathBuf>,

@@ -60,6 +60,16 @@ pub fn apply_map_flag(layered: &mut Layered, map: Option<&str>) -> Result<(), Er
     }
 }
 
+/// `--masks`.
+pub fn apply_masks_flag(layered: &mut Layered, masks: Option<&str>) -> Result<(), Error> {
+    match masks {
+        Some(folder) => {
+            layered.value("input.masks", toml::Value::String(folder.to_owned()), Origin::Flag("--masks"))
+        }
+        None => Ok(()),
+    }
+}
+
 /// The flags of `vidar run` that choose a model.
 pub fn apply_model_flags(layered: &mut Layered, args: &RunArgs) -> Result<(), Error> {
     if let Some(mode) = &args.mode {

@@ -165,6 +165,7 @@ const ELSEWHERE: &[(&str, &str)] = &[
     ("coupling.salad_checkpoint", "damage.rs has a small one"),
     ("input.imu_scale_std", "trust.rs compares what is stated with it"),
     ("input.calibration_scale_std", "trust.rs compares what is stated with it"),
+    ("input.masks", "masks.rs masks a part of every image"),
     ("input.map", "map.rs finds a recording in the map of another one"),
     ("input.poses", "verbs.rs runs with another trajectory"),
     ("eval.trajectory.low_coverage_ratio", "it decides a warning; vidar-eval's tests"),

@@ -18,6 +18,7 @@ mod faults;
 mod hostile;
 mod keys;
 mod map;
+mod masks;
 mod mcap_file;
 mod models;
 mod numbers;

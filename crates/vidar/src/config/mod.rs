@@ -45,6 +45,10 @@ pub struct InputConfig {
     /// Folder of an earlier `vidar odometry` or `vidar run` of the same place, or its `odometry/map.cbor`: the odometry looks for the place in
     /// it, and its poses are then in the world of that recording. Empty: none.
     pub map: String,
+    /// Folder of masks, black where an image is not to be used (people who move, the camera's carrier), called as the images are:
+    /// `NAME.EXT.png` as COLMAP has them, or `NAME.png`. Stereo, alignment and map leave these pixels out; the odometry does not read
+    /// them. Empty: none.
+    pub masks: String,
 }
 
 /// Where metric poses come from.
@@ -73,6 +77,7 @@ impl Default for InputConfig {
             imu_scale_std: 0.01,
             calibration_scale_std: 0.07,
             map: String::new(),
+            masks: String::new(),
         }
     }
 }

@@ -265,7 +265,7 @@ impl Context<'_> {
     ) -> Result<MetricMap, Error> {
         let Self { config, dataset, folder, scene, events, cancel, .. } = *self;
         let store = RunStore::new(folder.path(), self.fingerprint, plan, config);
-        let images = ImageFiles(dataset);
+        let images = ImageFiles(dataset, plan.masks.as_deref());
         let cancelled = || cancel.is_cancelled();
         let predicting = readers::chunk_progress(events);
         let parts = EngineParts { geometry: source, places, images: &images, store: &store };
