@@ -284,6 +284,10 @@ pub struct RunArgs {
     /// Folder of an earlier `vidar odometry` or `vidar run` of the same place: the map is in the world of that recording.
     #[arg(long, value_name = "FOLDER", value_hint = ValueHint::AnyPath, help_heading = "Input")]
     pub map: Option<String>,
+    /// Folder of masks, black where an image is not to be used, as COLMAP and nerfstudio have them: people who move, the camera's
+    /// carrier. A mask is called as its image is: NAME.EXT.png or NAME.png.
+    #[arg(long, value_name = "FOLDER", value_hint = ValueHint::DirPath, help_heading = "Input")]
+    pub masks: Option<String>,
     /// Reference cloud (PLY, metres, world frame of the ground truth) for the evaluation of the map.
     #[arg(long, value_hint = ValueHint::FilePath, help_heading = "Input")]
     pub reference: Option<PathBuf>,
@@ -293,6 +297,13 @@ pub struct RunArgs {
     /// Print the plan and stop.
     #[arg(long)]
     pub dry_run: bool,
+    /// Cut down stereo so that the run takes no longer than the recording, on two quiet cores of the machine of BENCHMARK.md
+    /// (`budget.speed` tells of others). The same command makes the same map on every machine.
+    #[arg(long, conflicts_with = "time_budget", help_heading = "Model")]
+    pub realtime: bool,
+    /// The same with a limit in seconds.
+    #[arg(long, value_name = "SECONDS", help_heading = "Model")]
+    pub time_budget: Option<f64>,
     /// Memory limit for planning, such as 4GiB or 800MB; default: the sum of the parts.
     #[arg(long, value_name = "SIZE", help_heading = "Model")]
     pub memory_budget: Option<String>,

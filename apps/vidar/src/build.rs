@@ -60,6 +60,16 @@ pub fn apply_map_flag(layered: &mut Layered, map: Option<&str>) -> Result<(), Er
     }
 }
 
+/// `--masks`.
+pub fn apply_masks_flag(layered: &mut Layered, masks: Option<&str>) -> Result<(), Error> {
+    match masks {
+        Some(folder) => {
+            layered.value("input.masks", toml::Value::String(folder.to_owned()), Origin::Flag("--masks"))
+        }
+        None => Ok(()),
+    }
+}
+
 /// The flags of `vidar run` that choose a model.
 pub fn apply_model_flags(layered: &mut Layered, args: &RunArgs) -> Result<(), Error> {
     if let Some(mode) = &args.mode {
@@ -68,6 +78,18 @@ pub fn apply_model_flags(layered: &mut Layered, args: &RunArgs) -> Result<(), Er
     if let Some(size) = &args.memory_budget {
         let bytes = toml::Value::Integer(byte_count(size)?);
         layered.value("limits.memory_bytes", bytes, Origin::Flag("--memory-budget"))?;
+    }
+    if args.realtime {
+        layered.value("budget.realtime", toml::Value::Boolean(true), Origin::Flag("--realtime"))?;
+    }
+    if let Some(seconds) = args.time_budget {
+        if !(seconds.is_finite() && seconds > 0.0) {
+            return Err(usage(
+                format!("--time-budget must be finite and positive, found {seconds}"),
+                "give the seconds that the run may take",
+            ));
+        }
+        layered.value("budget.seconds", toml::Value::Float(seconds), Origin::Flag("--time-budget"))?;
     }
     if let Some(device) = args.device {
         layered.value("model.device", toml::Value::String(device.to_string()), Origin::Flag("--device"))?;

@@ -63,6 +63,20 @@ pub enum StereoError {
         /// Principal point, y, pixels.
         cy: f64,
     },
+    /// A mask and its image differ in size.
+    #[error("frame {frame}: its mask is {width}x{height}, its image is {expected_width}x{expected_height}")]
+    MaskSize {
+        /// Which frame.
+        frame: FrameId,
+        /// Columns of the mask.
+        width: usize,
+        /// Rows of the mask.
+        height: usize,
+        /// Columns of the image.
+        expected_width: usize,
+        /// Rows of the image.
+        expected_height: usize,
+    },
     /// The image does not have the size of its intrinsics.
     #[error("frame {frame}: image of {width}x{height}, but intrinsics of {expected_width}x{expected_height}")]
     SizeMismatch {
@@ -123,6 +137,7 @@ impl From<StereoError> for ModelError {
             StereoError::BadPose { frame }
             | StereoError::BadIntrinsics { frame, .. }
             | StereoError::SizeMismatch { frame, .. }
+            | StereoError::MaskSize { frame, .. }
             | StereoError::TooSmall { frame, .. } => Self::BadView { frame, reason: error.to_string() },
             other => Self::Other(other.to_string()),
         }

@@ -109,7 +109,10 @@ fn matched(
     let windows = Reference::new(fine, noise_gray);
     let fine_sources = sources(0);
     let best_sources = &fine_sources[..fine_sources.len().min(SCORED_NEIGHBOURS)];
-    let settled = settle(&windows, best_sources, rho, planes.step);
+    let mut settled = settle(&windows, best_sources, rho, planes.step);
+    for (rho, _) in settled.rho.iter_mut().zip(&views[reference].masked).filter(|(_, masked)| **masked) {
+        *rho = f32::NAN;
+    }
     drop(span);
     let rho_per_px = 1.0 / shift_per_rho(fine, &fine_sources).max(f32::MIN_POSITIVE);
     let coarse_pixel = |i: usize| {
@@ -247,7 +250,9 @@ pub(crate) fn probe(views: &[Prepared], reference: usize, config: &StereoConfig)
     let planes = Labels { first, step: (last - first) / (PROBE_PLANES - 1) as f32, count: PROBE_PLANES };
     let penalties = Penalties { step: config.step_penalty as i16, jump: config.jump_penalty as i16 };
     let winners = best_planes(level, &sources, &planes, penalties, config.noise_gray as f32);
-    let is_distinct = |i: usize| winners.cost[i] < 0.4 && winners.margin[i] > 0.05 && winners.rho[i] > 0.0;
+    let is_usable = |i: usize| level.hidden.is_empty() || !level.hidden[i];
+    let is_distinct =
+        |i: usize| is_usable(i) && winners.cost[i] < 0.4 && winners.margin[i] > 0.05 && winners.rho[i] > 0.0;
     let rho: Vec<f32> =
         (0..winners.rho.len()).map(|i| if is_distinct(i) { winners.rho[i] } else { f32::NAN }).collect();
     let mut depths_m: Vec<f32> = rho.iter().filter(|rho| !rho.is_nan()).map(|rho| 1.0 / rho).collect();

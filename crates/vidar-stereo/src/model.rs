@@ -99,6 +99,19 @@ impl StereoModel {
         self.with_parallax(views, references, watch, true)
     }
 
+    /// As [`GeometryModel::predict_views`], without the pixels that are `true` in `masks` (one entry per view at the image's size; none, or
+    /// fewer entries, where every pixel may be used): they get no depth, and nothing is matched with them.
+    pub fn predict_unmasked(
+        &self,
+        views: &ChunkViews,
+        masks: &[Option<Image<bool>>],
+        requested: Range<usize>,
+        watch: Watch<'_>,
+    ) -> Result<GeometryPrediction, StereoError> {
+        let references: Vec<usize> = requested.filter(|&i| i < views.views.len()).collect();
+        Ok(self.depths_of(views, masks, &references, (watch, false))?.0.prediction)
+    }
+
     /// As [`Self::depths_of`]; an error if no reference has parallax.
     fn with_parallax(
         &self,
@@ -107,7 +120,7 @@ impl StereoModel {
         watch: Watch<'_>,
         keep_features: bool,
     ) -> Result<(StereoOutput, Vec<ViewFeatures>), StereoError> {
-        let (output, features) = self.depths_of(views, references, watch, keep_features)?;
+        let (output, features) = self.depths_of(views, &[], references, (watch, keep_features))?;
         if output.prediction.views.is_empty() && !output.omitted.is_empty() {
             let found_deg = output.omitted.iter().map(|o| o.found_parallax_deg).fold(0.0, f64::max);
             let needed_deg = self.config.min_parallax_deg;
@@ -120,9 +133,9 @@ impl StereoModel {
     fn depths_of(
         &self,
         views: &ChunkViews,
+        masks: &[Option<Image<bool>>],
         references: &[usize],
-        watch: Watch<'_>,
-        keep_features: bool,
+        (watch, keep_features): (Watch<'_>, bool),
     ) -> Result<(StereoOutput, Vec<ViewFeatures>), StereoError> {
         let found = views.views.len();
         if found < MIN_VIEWS {
@@ -132,8 +145,11 @@ impl StereoModel {
             return Err(StereoError::NoSuchReference { index, views: found });
         }
         let references: BTreeSet<usize> = references.iter().copied().collect();
-        let one = |view| trace_span!("preparation").in_scope(|| prepare(view, &self.config));
-        let prepared: Vec<_> = views.views.par_iter().map(one).collect();
+        let one = |(i, view)| {
+            let mask = masks.get(i).and_then(Option::as_ref);
+            trace_span!("preparation").in_scope(|| prepare(view, mask, &self.config))
+        };
+        let prepared: Vec<_> = views.views.par_iter().enumerate().map(one).collect();
         // Collected one by one, so that the error is that of the first bad view.
         let prepared = prepared.into_iter().collect::<Result<Vec<_>, _>>()?;
         let mut chunk = Chunk::new(prepared, &references, &self.config, watch);
@@ -220,8 +236,7 @@ impl GeometryModel for StereoModel {
         requested: Range<usize>,
         watch: Watch<'_>,
     ) -> Result<GeometryPrediction, ModelError> {
-        let references: Vec<usize> = requested.filter(|&i| i < views.views.len()).collect();
-        Ok(self.depths_of(views, &references, watch, false)?.0.prediction)
+        Ok(self.predict_unmasked(views, &[], requested, watch)?)
     }
 }
 

@@ -164,6 +164,7 @@ impl<'a> Strip<'a> {
             let rho = &surface.rho[y * surface.stride..][..width];
             let level = source.level;
             self.samples.locate(&source.warp, level, y, rho, shift, hidden);
+            self.samples.hide_masked(level, hidden);
             self.samples.fetch(level);
             self.samples.blend(&mut row[RADIUS..RADIUS + width]);
             repeat_borders(row);
@@ -269,7 +270,7 @@ mod tests {
         let gray =
             (0..width * height).map(|i| ((i * 7919 + seed * 104_729) % 1021) as i16 * 4 - 2048).collect();
         let intrinsics = Pinhole::new(20.0, 20.0, 10.0, 8.0, width, height).expect("valid");
-        Level { width, height, gray, intrinsics }
+        Level { width, height, gray, intrinsics, hidden: Vec::new() }
     }
 
     /// Moves by whole pixels: two to the right per unit of inverse depth.

@@ -12,7 +12,7 @@ mod solve;
 
 use crate::config::StereoConfig;
 use crate::estimate::{PROBE_LEVEL, Probe};
-use crate::prepare::{PoseCorrection, Prepared};
+use crate::prepare::{Level, PoseCorrection, Prepared};
 use crate::select::select;
 use crate::warp::{Warp, neighbour_from_reference};
 use nalgebra::{Vector2, Vector3};
@@ -91,6 +91,9 @@ fn tracks_of(views: &[Prepared], host: usize, probe: Option<&Probe>, config: &St
         .collect();
     let mut tracks = Vec::new();
     for (x, y) in search::corners(own) {
+        if touches_mask(own, x, y) {
+            continue;
+        }
         let scale = 1 << PROBE_LEVEL;
         let (cx, cy) = ((x / scale).min(coarse.width - 1), (y / scale).min(coarse.height - 1));
         let rho = probe.rho[cy * coarse.width + cx];
@@ -101,7 +104,10 @@ fn tracks_of(views: &[Prepared], host: usize, probe: Option<&Probe>, config: &St
         let mut observations = Vec::new();
         for (warp, &n) in warps.iter().zip(&searched) {
             let Some((u, v, _)) = warp.project(x as f32, y as f32, rho) else { continue };
-            if let Some(pixel) = template.search(&views[n].levels[0], u, v) {
+            let other = &views[n].levels[0];
+            if let Some(pixel) = template.search(other, u, v)
+                && !touches_mask(other, pixel.x as usize, pixel.y as usize)
+            {
                 observations.push((n, pixel));
             }
         }
@@ -111,4 +117,15 @@ fn tracks_of(views: &[Prepared], host: usize, probe: Option<&Probe>, config: &St
         }
     }
     tracks
+}
+
+/// Whether a template around the pixel may hold a part of what must not be used: at its corners or its middle, which a person covers
+/// where they cover any of it.
+fn touches_mask(level: &Level, x: usize, y: usize) -> bool {
+    let near = search::TEMPLATE;
+    let at =
+        |x: usize, y: usize| level.hidden[y.min(level.height - 1) * level.width + x.min(level.width - 1)];
+    let columns = [x.saturating_sub(near), x, x + near];
+    let rows = [y.saturating_sub(near), y, y + near];
+    !level.hidden.is_empty() && rows.iter().any(|&y| columns.iter().any(|&x| at(x, y)))
 }

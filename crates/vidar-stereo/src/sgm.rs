@@ -259,7 +259,7 @@ mod tests {
             padded[..planes].copy_from_slice(costs);
         }
         let k = Pinhole { fx: 1.0, fy: 1.0, cx: 0.0, cy: 0.0, width: w, height: 1 };
-        let image = Level { width: w, height: 1, gray: vec![9; w], intrinsics: k };
+        let image = Level { width: w, height: 1, gray: vec![9; w], intrinsics: k, hidden: Vec::new() };
         let (p1, p2) = (5i16, 30i16);
         let sums = aggregate(&image, &volume, Penalties { step: p1, jump: p2 });
         let cell = |x: usize| -> Vec<i64> {
@@ -292,7 +292,7 @@ mod tests {
         let (w, h, stride) = (23, 17, 3 * LANES);
         let k = Pinhole { fx: 1.0, fy: 1.0, cx: 0.0, cy: 0.0, width: w, height: h };
         let gray = (0..w * h).map(|i| ((i * 7919) % 4096) as i16 - 2048).collect();
-        let image = Level { width: w, height: h, gray, intrinsics: k };
+        let image = Level { width: w, height: h, gray, intrinsics: k, hidden: Vec::new() };
         let costs = (0..w * h * stride).map(|i| ((i * 104_729 + 17) % 256) as u8).collect();
         let volume = Volume { count: stride, stride, costs };
         let run = || aggregate(&image, &volume, Penalties { step: 12, jump: 80 });

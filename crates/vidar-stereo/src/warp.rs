@@ -132,6 +132,19 @@ impl RowSamples {
         }
     }
 
+    /// Hides the positions that a mask of the level covers.
+    #[inline(always)]
+    pub fn hide_masked(&self, level: &Level, hidden: &mut [f32]) {
+        if level.hidden.is_empty() {
+            return;
+        }
+        for (h, &i) in hidden.iter_mut().zip(&self.index) {
+            if level.hidden[i as usize] {
+                *h = HIDDEN;
+            }
+        }
+    }
+
     /// Reads the four pixels around each position.
     #[inline(always)]
     pub fn fetch(&mut self, level: &Level) {
@@ -207,7 +220,7 @@ mod tests {
         // Grey levels x + 10 y, in image units.
         let gray = (0..width * height).map(|i| ((i % width + 10 * (i / width)) * 16) as i16 - 2048).collect();
         let intrinsics = Pinhole::new(10.0, 10.0, 7.5, 5.5, width, height).expect("valid");
-        let level = Level { width, height, gray, intrinsics };
+        let level = Level { width, height, gray, intrinsics, hidden: Vec::new() };
         // Moves by (1.25, 0.5) per unit of inverse depth.
         let a = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]];
         let warp = Warp { a, b: [1.25, 0.5, 0.0] };

@@ -6,7 +6,9 @@ mod scene;
 
 use nalgebra::Vector3;
 use scene::{Scene, WALL, depth, poses, views};
-use vidar_core::{ChunkViews, FrameId, GeometryModel, LieGroup, ModelError, Se3, So3, ViewGeometry};
+use vidar_core::{
+    ChunkViews, FrameId, FrameImage, GeometryModel, Image, LieGroup, ModelError, Se3, So3, ViewGeometry,
+};
 use vidar_stereo::{StereoConfig, StereoError, StereoModel, TOLERANCE_RATIO};
 
 const MIDDLE: usize = 2;
@@ -176,4 +178,76 @@ fn confidence_is_the_share_of_correct_pixels() {
             "predicted {predicted:.3}, observed {observed:.3} of {count}: {bins:?}"
         );
     }
+}
+
+/// The wall with a board in front that moves with the camera at half its speed, as a person does who walks along, and the masks of the board.
+fn walking() -> (ChunkViews, Vec<Option<Image<bool>>>) {
+    let mut chunk = views(&WALL, &poses(), plain, 0.0);
+    let mut masks = Vec::new();
+    for (view, pose) in chunk.views.iter_mut().zip(poses()) {
+        // From half as far the board that stands still is where the moving one is.
+        let beside = Se3::new(pose.rotation, pose.translation * 0.5);
+        let seen = views(&boxed(), &[beside], plain, 0.0).views.remove(0).image.to_gray8();
+        let mask = depth(&boxed(), &beside).map(|z| *z < 2.5);
+        let FrameImage::Gray8(wall) = &view.image else { unreachable!("rendered in grey") };
+        let at = |x, y| if mask[(x, y)] { seen[(x, y)] } else { wall[(x, y)] };
+        view.image = FrameImage::Gray8(Image::from_fn(mask.width(), mask.height(), at));
+        masks.push(Some(mask));
+    }
+    (chunk, masks)
+}
+
+/// Pixels with depth in the mask, and of those beside it how many have depth, and how many one that is 3 % off.
+fn around(view: &ViewGeometry, mask: &Image<bool>) -> (usize, usize, usize) {
+    let truth = depth(&WALL, &poses()[MIDDLE]);
+    let is_near = |x: usize, y: usize| {
+        let rows = y.saturating_sub(6)..(y + 7).min(mask.height());
+        rows.into_iter().any(|v| mask.row(v)[x.saturating_sub(6)..(x + 7).min(mask.width())].contains(&true))
+    };
+    let (mut inside, mut near, mut wrong) = (0, 0, 0);
+    for (x, y) in (0..mask.height()).flat_map(|y| (0..mask.width()).map(move |x| (x, y))) {
+        let (z, t) = (view.depth.image()[(x, y)], truth[(x, y)]);
+        match mask[(x, y)] {
+            true => inside += usize::from(z.is_finite()),
+            false if z.is_finite() && is_near(x, y) => {
+                near += 1;
+                wrong += usize::from((z - t).abs() > 0.03 * t);
+            }
+            false => {}
+        }
+    }
+    (inside, near, wrong)
+}
+
+#[test]
+fn what_is_masked_gets_no_depth_and_spoils_none() {
+    let (chunk, masks) = walking();
+    let mask = masks[MIDDLE].clone().expect("every view has one");
+    let predict = |masks: &[Option<Image<bool>>]| {
+        let depths = model().predict_unmasked(&chunk, masks, MIDDLE..MIDDLE + 1, &|_| false);
+        depths.expect("has parallax").views.remove(0)
+    };
+    let (inside, near, wrong) = around(&predict(&[]), &mask);
+    assert!(inside > 500, "the walker is taken for something that stands still at {inside} pixels");
+    let (masked_inside, masked_near, masked_wrong) = around(&predict(&masks), &mask);
+    assert_eq!(masked_inside, 0);
+    let (right, masked_right) = (near - wrong, masked_near - masked_wrong);
+    assert!(masked_right > right, "{masked_right} pixels beside it are right, without masks {right}");
+    assert!(masked_wrong * 10 <= wrong, "{masked_wrong} pixels beside it are wrong, without masks {wrong}");
+    let confidence = predict(&masks).confidence;
+    assert!(mask.data().iter().zip(confidence.image().data()).all(|(m, c)| !m || *c == 0.0));
+    let wrong_size = vec![Some(Image::filled(4, 4, true)); 5];
+    let refused = model().predict_unmasked(&chunk, &wrong_size, 0..1, &|_| false);
+    assert!(matches!(refused, Err(StereoError::MaskSize { width: 4, .. })), "{refused:?}");
+}
+
+#[test]
+fn masks_of_nothing_change_no_bit() {
+    let chunk = views(&boxed(), &poses(), plain, 0.0);
+    let none = vec![Some(Image::filled(192, 144, false)); 5];
+    let bits = |masks: &[Option<Image<bool>>]| -> Vec<u32> {
+        let depths = model().predict_unmasked(&chunk, masks, 1..4, &|_| false).expect("has parallax");
+        depths.views.iter().flat_map(|v| v.depth.image().data().iter().map(|z| z.to_bits())).collect()
+    };
+    assert!(bits(&none) == bits(&[]));
 }

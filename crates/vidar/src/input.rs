@@ -4,6 +4,7 @@ use crate::config::{Config, PoseSource as PoseChoice};
 use crate::engine::{FrameStamp, GivenPoses, ImageSource, OdometryPoses, PoseSource};
 use crate::error::Error;
 use crate::imu_noise;
+use crate::masks::Masks;
 use crate::odometry::EarlierMap;
 use crate::quality::TrackQuality;
 use crate::verdict::ScaleSource;
@@ -12,7 +13,7 @@ use sha2::{Digest, Sha256};
 use std::path::{Path, PathBuf};
 use vidar_align::CouplingMode;
 use vidar_core::{
-    BodyFrame, CameraId, Duration, Frame, FrameImage, SensorEvent, StampedPose, Trajectory, Warning,
+    BodyFrame, CameraId, Duration, Frame, FrameImage, Image, SensorEvent, StampedPose, Trajectory, Warning,
 };
 use vidar_dataset::{CalibrationSource, Dataset, DatasetError, ImageEntry, OpenOptions};
 use vidar_odometry::bundle_adjustment::Adjusted;
@@ -121,6 +122,14 @@ impl PosePlan {
         }
     }
 
+    /// The trajectory that serves where the odometry gives no pose.
+    pub fn fallback(&self, dataset: &Dataset, config: &Config) -> Option<GivenPoses> {
+        match self {
+            Self::Odometry { fallback: Some(trajectory) } => Some(given_poses(trajectory, dataset, config)),
+            Self::None | Self::Given(_) | Self::Odometry { fallback: None } => None,
+        }
+    }
+
     /// Whether they come from the recording's own camera and IMU.
     pub fn is_odometry(&self) -> bool {
         matches!(self, Self::Odometry { .. })
@@ -207,7 +216,7 @@ pub fn stamp_of(entry: &ImageEntry) -> FrameStamp {
 }
 
 /// Reads a recording's images again when the engine needs their pixels.
-pub struct ImageFiles<'a>(pub &'a Dataset);
+pub struct ImageFiles<'a>(pub &'a Dataset, pub Option<&'a Masks>);
 
 impl ImageSource for ImageFiles<'_> {
     fn image(&self, stamp: &FrameStamp) -> Result<FrameImage, Warning> {
@@ -222,6 +231,11 @@ impl ImageSource for ImageFiles<'_> {
         self.0
             .load_image(entry)
             .map_err(|e| Warning::degraded("image-unreadable", e.to_string()).at(&entry.location))
+    }
+
+    fn mask(&self, stamp: &FrameStamp) -> Result<Option<Image<bool>>, Warning> {
+        let Some(masks) = self.1 else { return Ok(None) };
+        masks.load(stamp.frame_id).map_err(|e| Warning::degraded("mask-unreadable", e.to_string()))
     }
 }
 

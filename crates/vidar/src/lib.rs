@@ -28,6 +28,7 @@ mod imu_noise;
 pub mod input;
 pub mod inspect;
 mod interactive;
+mod masks;
 pub mod models;
 pub mod odometry;
 pub mod quality;

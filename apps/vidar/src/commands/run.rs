@@ -15,6 +15,7 @@ pub fn run(args: &RunArgs, context: &Context) -> Outcome {
     let mut layered = build::layered(&args.config, None)?;
     build::apply_input_flags(&mut layered, &args.input)?;
     build::apply_map_flag(&mut layered, args.map.as_deref())?;
+    build::apply_masks_flag(&mut layered, args.masks.as_deref())?;
     build::apply_model_flags(&mut layered, args)?;
     accept_licence(&layered, args)?;
     let thresholds = Thresholds::parse(&args.fail_above, &args.fail_below)?;

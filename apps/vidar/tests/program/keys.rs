@@ -104,6 +104,8 @@ fn sparse_truth() -> String {
 /// Every setting of the dense pipeline, another value for it, and the additional settings that it needs.
 const SETTINGS: &[(&str, &str, ExtraSettings)] = &[
     ("align.max_center_rms_m", "1e-12", Simulated),
+    ("budget.realtime", "true", Nothing),
+    ("budget.seconds", "0.01", Nothing),
     ("coupling.mode", "hybrid", Simulated),
     ("coupling.landmarks", "none", Learned),
     ("eval.mode", "auto", Nothing),
@@ -154,6 +156,7 @@ const SETTINGS: &[(&str, &str, ExtraSettings)] = &[
 
 /// Settings that are shown to matter elsewhere, with the place.
 const ELSEWHERE: &[(&str, &str)] = &[
+    ("budget.speed", "it needs a limit; budget.rs has one"),
     ("input.camera", "there is one camera here; faults.rs asks for another"),
     ("output.live_map", "it leaves nothing; coupling.rs watches it grow"),
     ("coupling.loops", "they need a revisit; coupling.rs has one"),
@@ -162,6 +165,7 @@ const ELSEWHERE: &[(&str, &str)] = &[
     ("coupling.salad_checkpoint", "damage.rs has a small one"),
     ("input.imu_scale_std", "trust.rs compares what is stated with it"),
     ("input.calibration_scale_std", "trust.rs compares what is stated with it"),
+    ("input.masks", "masks.rs masks a part of every image"),
     ("input.map", "map.rs finds a recording in the map of another one"),
     ("input.poses", "verbs.rs runs with another trajectory"),
     ("eval.trajectory.low_coverage_ratio", "it decides a warning; vidar-eval's tests"),

@@ -5,6 +5,7 @@
 mod auto;
 mod batch;
 mod bench;
+mod budget;
 mod calibrate;
 mod compare;
 mod config;
@@ -17,6 +18,7 @@ mod faults;
 mod hostile;
 mod keys;
 mod map;
+mod masks;
 mod mcap_file;
 mod models;
 mod numbers;

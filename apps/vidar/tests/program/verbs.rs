@@ -124,7 +124,8 @@ fn a_run_as_json_has_stable_keys() {
             "odometry",
             "placement",
             "evaluation",
-            "seconds"
+            "seconds",
+            "budget"
         ]
     );
     assert_eq!(

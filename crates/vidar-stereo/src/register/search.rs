@@ -6,7 +6,7 @@ use nalgebra::Vector2;
 /// One corner per square of this size, working pixels.
 const CELL_PX: usize = 20;
 /// Radius of a corner's template.
-const TEMPLATE: usize = 4;
+pub(super) const TEMPLATE: usize = 4;
 const SIDE: usize = 2 * TEMPLATE + 1;
 const AREA: usize = SIDE * SIDE;
 /// Radius of the search around the predicted position, working pixels.

@@ -31,6 +31,39 @@ pub(super) fn unpack_shapes(array: NpyArray, n: usize) -> Vec<Option<Image<f32>>
     values.chunks(width * height).map(image).collect()
 }
 
+/// One image of 0 and 1 per view; `None` where there is no mask.
+pub(super) fn pack_masks(
+    masks: &[Option<Image<bool>>],
+    shape: [usize; 3],
+) -> Result<Option<NpyArray>, Error> {
+    let [n, height, width] = shape;
+    if masks.len() != n || masks.iter().all(Option::is_none) {
+        return Ok(None);
+    }
+    let of_size = |mask: &Option<Image<bool>>| match mask {
+        Some(mask) if (mask.width(), mask.height()) == (width, height) => {
+            mask.data().iter().map(|m| u8::from(*m)).collect()
+        }
+        _ => vec![0; width * height],
+    };
+    let values = masks.iter().flat_map(of_size).collect();
+    Ok(Some(NpyArray::new(shape.to_vec(), NpyData::U8(values))?))
+}
+
+/// As [`pack_masks`] wrote them; images of zeros alone are none.
+pub(super) fn unpack_masks(array: NpyArray, shape: [usize; 3]) -> Vec<Option<Image<bool>>> {
+    let [_, height, width] = shape;
+    let NpyData::U8(values) = array.data else { return Vec::new() };
+    if array.shape != shape || height * width == 0 {
+        return Vec::new();
+    }
+    let image = |v: &[u8]| {
+        let image = Image::from_vec(width, height, v.iter().map(|m| *m != 0).collect()).ok()?;
+        image.data().contains(&true).then_some(image)
+    };
+    values.chunks(width * height).map(image).collect()
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -49,5 +82,15 @@ mod tests {
         // Of another number of views, or of none.
         assert!(unpack_shapes(array, 2).is_empty());
         assert!(pack_shapes(&shapes, 2).unwrap().is_none() && pack_shapes(&[None], 1).unwrap().is_none());
+    }
+
+    #[test]
+    fn masks_come_back_and_those_of_another_size_are_not_read() {
+        let mask = Image::from_fn(5, 4, |x, y| x > y);
+        let masks = vec![None, Some(mask.clone()), None];
+        let array = pack_masks(&masks, [3, 4, 5]).unwrap().unwrap();
+        assert_eq!(unpack_masks(array.clone(), [3, 4, 5]), masks);
+        assert!(unpack_masks(array, [3, 5, 4]).is_empty());
+        assert!(pack_masks(&[None, None], [2, 4, 5]).unwrap().is_none());
     }
 }

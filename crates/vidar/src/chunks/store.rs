@@ -1,6 +1,6 @@
 //! One chunk's prediction as a file, and back.
 
-use super::shapes::{pack_shapes, unpack_shapes};
+use super::shapes::{pack_masks, pack_shapes, unpack_masks, unpack_shapes};
 use crate::engine::PredictionId;
 use crate::error::Error;
 use crate::run_folder::pretty;
@@ -25,6 +25,8 @@ const FORMAT: &str = "chunk npz";
 const VIEW_BYTES: u64 = 64 << 20;
 /// Name of the array of another model's depth.
 const SHAPES: &str = "shape";
+/// Name of the array of what is not to be used.
+const MASKS: &str = "masked";
 /// What the names of loops' files begin with.
 const LOOP: &str = "loop-";
 
@@ -41,6 +43,8 @@ pub struct StoredChunk {
     pub descriptors: Vec<Vec<f32>>,
     /// Each view's depth by another model, in any unit, for what the prediction leaves empty; empty where there is none.
     pub shapes: Vec<Option<Image<f32>>>,
+    /// What of each view is not to be used, `true` there, at the depth's size; empty where all of all views is used.
+    pub masks: Vec<Option<Image<bool>>>,
     /// Why there is no prediction.
     pub failure: Option<String>,
 }
@@ -54,6 +58,7 @@ impl StoredChunk {
             colors: Vec::new(),
             descriptors: Vec::new(),
             shapes: Vec::new(),
+            masks: Vec::new(),
             failure: None,
         }
     }
@@ -256,6 +261,11 @@ fn pack(chunk: &StoredChunk) -> Result<Vec<u8>, Error> {
         shapes = array;
         arrays.push((SHAPES, &shapes));
     }
+    let masks;
+    if let Some(array) = pack_masks(&chunk.masks, [n, height, width])? {
+        masks = array;
+        arrays.push((MASKS, &masks));
+    }
     let mut packed = std::io::Cursor::new(Vec::new());
     write_npz_arrays_with(&mut packed, &arrays, Packing::Stored)?;
     packed.flush().map_err(|e| Error::io("pack", Path::new(FORMAT), e))?;
@@ -350,9 +360,10 @@ pub(super) fn read_views(
         _ => Vec::new(),
     };
     let shapes = take(&[SHAPES]).map_or_else(Vec::new, |array| unpack_shapes(array, n));
+    let masks = take(&[MASKS]).map_or_else(Vec::new, |array| unpack_masks(array, [n, height, width]));
     let prediction = GeometryPrediction { chunk_id, frame, views };
     let times = vec![Timestamp::default(); n];
-    Ok(StoredChunk { prediction, times, colors, descriptors, shapes, failure: None })
+    Ok(StoredChunk { prediction, times, colors, descriptors, shapes, masks, failure: None })
 }
 
 /// `n` matrices of three rows and `columns` columns; a fourth row is left out.

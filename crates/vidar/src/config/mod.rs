@@ -45,6 +45,10 @@ pub struct InputConfig {
     /// Folder of an earlier `vidar odometry` or `vidar run` of the same place, or its `odometry/map.cbor`: the odometry looks for the place in
     /// it, and its poses are then in the world of that recording. Empty: none.
     pub map: String,
+    /// Folder of masks, black where an image is not to be used (people who move, the camera's carrier), called as the images are:
+    /// `NAME.EXT.png` as COLMAP has them, or `NAME.png`. Stereo, alignment and map leave these pixels out; the odometry does not read
+    /// them. Empty: none.
+    pub masks: String,
 }
 
 /// Where metric poses come from.
@@ -73,6 +77,7 @@ impl Default for InputConfig {
             imu_scale_std: 0.01,
             calibration_scale_std: 0.07,
             map: String::new(),
+            masks: String::new(),
         }
     }
 }
@@ -280,6 +285,34 @@ pub struct LimitsConfig {
     pub memory_bytes: u64,
 }
 
+/// How long a run may take. What it may cost is planned from poses and keyframes by a fixed model of the cost, never measured, so that the
+/// same command gives the same bits on every machine.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(default, deny_unknown_fields)]
+pub struct BudgetConfig {
+    /// Wall time that the run should take at most, s; 0 means no limit. Stereo then takes smaller images, fewer neighbours and fewer
+    /// keyframes, as far as needed. `auto` without a network and `stereo` only.
+    pub seconds: f64,
+    /// The limit is the recording's own duration.
+    pub realtime: bool,
+    /// How many times as fast as two quiet cores of the machine of BENCHMARK.md this one is, 0.01 to 1000. A run with a limit says which
+    /// value would have been right.
+    pub speed: f64,
+}
+
+impl Default for BudgetConfig {
+    fn default() -> Self {
+        Self { seconds: 0.0, realtime: false, speed: 1.0 }
+    }
+}
+
+impl BudgetConfig {
+    /// Whether there is a limit.
+    pub fn is_limited(&self) -> bool {
+        self.realtime || self.seconds > 0.0
+    }
+}
+
 /// The whole configuration.
 #[derive(Clone, Debug, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
@@ -308,6 +341,8 @@ pub struct Config {
     pub output: OutputConfig,
     /// Resource limits.
     pub limits: LimitsConfig,
+    /// How long a run may take.
+    pub budget: BudgetConfig,
 }
 
 impl Config {
@@ -337,6 +372,16 @@ impl Config {
             if !(0.0..=1.0).contains(&found) {
                 return bad(format!("input.{key} must be 0 to 1, found {found}"));
             }
+        }
+        let budget = &self.budget;
+        if !(budget.seconds.is_finite() && budget.seconds >= 0.0) {
+            return bad(format!("budget.seconds must be finite and not negative, found {}", budget.seconds));
+        }
+        if budget.realtime && budget.seconds > 0.0 {
+            return bad("budget.realtime and budget.seconds are two limits: leave one of them out".into());
+        }
+        if !(0.01..=1000.0).contains(&budget.speed) {
+            return bad(format!("budget.speed must be 0.01 to 1000, found {}", budget.speed));
         }
         for (key, value) in
             [("input.stride", self.input.stride), ("geometry.chunk_keyframes", self.geometry.chunk_keyframes)]

@@ -13,7 +13,10 @@ use super::setup::{PredictionId, PredictionStore};
 use crate::error::Error;
 use rayon::prelude::*;
 use vidar_align::Placement;
-use vidar_core::{AlignedView, ChunkId, Confidence, DepthSource, GeometryError, Image, TriangleMesh};
+use vidar_core::{
+    AlignedView, ChunkId, Confidence, DepthOrigin, DepthSource, GeometryError, Image, MetricDepth,
+    TriangleMesh,
+};
 use vidar_fusion::SurfaceRenderer;
 use vidar_stereo::StereoError;
 use vidar_stereo::complete::{ErrorStatistics, Evidence, Spread, complete, errors_where_hidden};
@@ -87,7 +90,8 @@ impl<'m> Completion<'m> {
     fn complete(&self, views: &[Shaped]) -> Result<Vec<AlignedView>, Error> {
         let one = |v: &Shaped| {
             let completed = self.with_evidence(v, |evidence| complete(&v.view, evidence, &self.spread));
-            completed.map_err(unfit)
+            let completed = completed.map_err(unfit)?;
+            v.mask.as_ref().map_or(Ok(completed.clone()), |mask| without(&completed, mask))
         };
         // Collected one by one, so that the error is that of the first bad view.
         let completed: Vec<_> = views.par_iter().map(one).collect();
@@ -96,10 +100,37 @@ impl<'m> Completion<'m> {
 
     fn with_evidence<R>(&self, shaped: &Shaped, work: impl FnOnce(&Evidence<'_>) -> R) -> R {
         let (view, k) = (&shaped.view, shaped.view.intrinsics());
-        let seen = self.renderer.render(view.world_from_camera(), k);
+        let mut seen = self.renderer.render(view.world_from_camera(), k);
+        // What is masked stands in front of what the map shows there.
+        if let Some(mask) = &shaped.mask {
+            for (z, _) in seen.depth.data_mut().iter_mut().zip(mask.data()).filter(|(_, masked)| **masked) {
+                *z = f32::NAN;
+            }
+        }
         let network = shaped.shape.as_ref().map(|s| at_size(s, k.width, k.height));
         work(&Evidence { map: &seen.depth, network: network.as_ref() })
     }
+}
+
+/// A completed view without the pixels that are not to be used.
+fn without(view: &AlignedView, mask: &Image<bool>) -> Result<AlignedView, Error> {
+    let k = view.intrinsics();
+    let unless = |image: &Image<f32>, value: f32| {
+        Image::from_fn(k.width, k.height, |x, y| if mask[(x, y)] { value } else { image[(x, y)] })
+    };
+    let depth = MetricDepth::new(unless(view.depth().image(), f32::NAN));
+    let confidence = Confidence::new(unless(view.confidence().image(), 0.0));
+    let pose = *view.world_from_camera();
+    let mut out =
+        AlignedView::new(view.frame_id(), view.time(), pose, *k, depth, confidence).map_err(unfit)?;
+    if let Some(color) = view.color() {
+        out = out.with_color(color.clone()).map_err(unfit)?;
+    }
+    if let Some(origin) = view.origin() {
+        let at = |x: usize, y: usize| if mask[(x, y)] { DepthOrigin::NONE } else { origin[(x, y)] };
+        out = out.with_origin(Image::from_fn(k.width, k.height, at)).map_err(unfit)?;
+    }
+    Ok(out)
 }
 
 /// Of completed views what the map does not hold yet: the planes. Other pixels keep their depth, so that slopes and free space

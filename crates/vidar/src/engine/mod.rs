@@ -33,7 +33,7 @@ pub use setup::{
     EngineSetup, GeometrySource, ImageSource, PlaceDescriber, PredictedFrame, Prediction, PredictionId,
     PredictionStore,
 };
-pub use track::{GivenPoses, OdometryPoses, PoseReport, PoseSource, PosedFrame};
+pub use track::{GivenPoses, OdometryPoses, PoseReport, PoseSource, PosedFrame, longest_posed};
 
 use crate::chunks::StoredChunk;
 use crate::config::{Config, LandmarkSources};

@@ -12,6 +12,8 @@ pub struct Shaped {
     pub view: AlignedView,
     /// z-depth by a network, in any unit and at any size of the same view.
     pub shape: Option<Image<f32>>,
+    /// What of the view is not to be used: `true` there.
+    pub mask: Option<Image<bool>>,
 }
 
 /// The views that a chunk owns, in metres and in the world.
@@ -24,11 +26,12 @@ pub fn placed_and_shaped(placement: &Placement, stored: StoredChunk) -> Result<V
     let id = stored.prediction.chunk_id;
     let mut colors = stored.colors.into_iter();
     let mut shapes = stored.shapes.into_iter();
+    let mut masks = stored.masks.into_iter();
     let mut views = Vec::new();
     for (view, time) in stored.prediction.views.into_iter().zip(stored.times) {
-        let (color, shape) = (colors.next(), shapes.next().flatten());
+        let (color, shape, mask) = (colors.next(), shapes.next().flatten(), masks.next().flatten());
         let Some(place) = placement.view(view.frame_id).filter(|p| p.owner == id) else { continue };
-        views.push(Shaped { view: placed_view(view, time, place, color)?, shape });
+        views.push(Shaped { view: placed_view(view, time, place, color)?, shape, mask });
     }
     Ok(views)
 }

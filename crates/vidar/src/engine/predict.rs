@@ -5,7 +5,7 @@ use super::setup::{
     GeometrySource, ImageSource, PlaceDescriber, PredictedFrame, Prediction, PredictionId, PredictionStore,
 };
 use super::stereo_landmarks::StereoLandmarks;
-use super::views::ViewWindow;
+use super::views::{MaskedView, Taken, ViewWindow};
 use crate::chunks::StoredChunk;
 use crate::error::Error;
 use rayon::prelude::*;
@@ -16,7 +16,8 @@ use vidar_align::chunking::ChunkSpan;
 use vidar_align::color_at_size;
 use vidar_core::model::ChunkFrame;
 use vidar_core::{
-    ChunkId, ChunkView, ChunkViews, FrameId, GeometryPrediction, ModelError, RigCamera, ViewGeometry, Warning,
+    ChunkId, ChunkView, ChunkViews, Confidence, FrameId, GeometryPrediction, Image, ModelError,
+    RelativeDepth, RigCamera, ViewGeometry, Warning,
 };
 
 /// The geometry model with all that it works on.
@@ -104,11 +105,11 @@ impl<'a> Predictor<'a> {
     ) -> Result<Option<StoredChunk>, Error> {
         self.window.advance(keyframes, &span.seen, events);
         let wanted = self.wanted(span);
-        let (views, wanted, indices) = self.window.take(&wanted);
+        let Taken { views, masks, wanted, indices } = self.window.take(&wanted);
         let expected = wanted.len();
         let views = ChunkViews { id: id.model_number(), views };
         let watch = self.watch();
-        let predicted = match self.geometry.predict(&views, wanted, &watch) {
+        let predicted = match self.geometry.predict(&views, &masks, wanted, &watch) {
             Err(ModelError::Cancelled) => None,
             Err(error) => Some(failed(id, error.to_string())),
             Ok(prediction) if prediction.geometry.views.is_empty() => {
@@ -124,11 +125,12 @@ impl<'a> Predictor<'a> {
                 let Prediction { geometry, colors, tokens, shapes, warnings } = prediction;
                 events.extend(warnings.into_iter().map(|w| MapEvent::Warning(w.at(id))));
                 let mut stored = StoredChunk { shapes, ..colored(geometry, &views.views, colors) };
+                mask(&mut stored, &views.views, &masks);
                 self.places.describe(&mut stored, &tokens)?;
                 Some(stored)
             }
         };
-        self.window.put_back(views.views, indices);
+        self.window.put_back(views.views, masks, indices);
         Ok(predicted)
     }
 
@@ -142,9 +144,9 @@ impl<'a> Predictor<'a> {
     ) -> BTreeMap<FrameId, Vec<DepthPoint>> {
         let Some(stereo) = &self.stereo_landmarks else { return BTreeMap::new() };
         self.window.advance(keyframes, &span.seen, events);
-        let (views, _, indices) = self.window.take(&span.seen);
-        let landmarks = stereo.find(prediction, &views, &|_| (self.cancelled)());
-        self.window.put_back(views, indices);
+        let Taken { views, masks, indices, .. } = self.window.take(&span.seen);
+        let landmarks = stereo.find(prediction, &views, &masks, &|_| (self.cancelled)());
+        self.window.put_back(views, masks, indices);
         landmarks.unwrap_or_else(|error| {
             let place = PredictionId::Chunk(prediction.chunk_id);
             events.push(MapEvent::Warning(Warning::new("no-stereo-landmarks", error.to_string()).at(place)));
@@ -171,17 +173,20 @@ impl<'a> Predictor<'a> {
             let hint = "the geometry that is stored of the two chunks is compared instead";
             events.push(MapEvent::Warning(Warning::degraded("loop-not-predicted", reason).at(id).hint(hint)));
         };
-        let views: Result<Vec<ChunkView>, Warning> =
+        let views: Result<Vec<MaskedView>, Warning> =
             seen.iter().map(|k| self.window.load(&keyframes[*k])).collect();
-        let views = match views {
-            Ok(views) => ChunkViews { id: id.model_number(), views },
+        let (views, masks): (_, Vec<_>) = match views {
+            Ok(views) => {
+                let (views, masks) = views.into_iter().unzip();
+                (ChunkViews { id: id.model_number(), views }, masks)
+            }
             Err(warning) => {
                 not_predicted(warning.to_string());
                 return Ok(None);
             }
         };
         let watch = self.watch();
-        let geometry = match self.geometry.predict(&views, 0..seen.len(), &watch) {
+        let geometry = match self.geometry.predict(&views, &masks, 0..seen.len(), &watch) {
             Ok(prediction) => prediction.geometry,
             Err(ModelError::Cancelled) => return Ok(None),
             Err(error) => {
@@ -189,10 +194,11 @@ impl<'a> Predictor<'a> {
                 return Ok(None);
             }
         };
-        let stored = StoredChunk {
+        let mut stored = StoredChunk {
             times: geometry.views.iter().map(|_| Default::default()).collect(),
             ..StoredChunk::of(geometry)
         };
+        mask(&mut stored, &views.views, &masks);
         Ok(Some(self.store.keep(id, &made_of, &stored)?.prediction))
     }
 }
@@ -208,11 +214,7 @@ fn failed(id: PredictionId, reason: String) -> StoredChunk {
 }
 
 /// A prediction with the times and images of its views; the model's own `colors` are preferred to those of the input.
-fn colored(
-    prediction: GeometryPrediction,
-    views: &[ChunkView],
-    colors: Vec<vidar_core::Image<[u8; 3]>>,
-) -> StoredChunk {
+fn colored(prediction: GeometryPrediction, views: &[ChunkView], colors: Vec<Image<[u8; 3]>>) -> StoredChunk {
     let of = |id| views.iter().find(|v| v.frame_id == id);
     let times =
         prediction.views.iter().map(|v| of(v.frame_id).map_or_else(Default::default, |v| v.time)).collect();
@@ -224,4 +226,36 @@ fn colored(
         false => prediction.views.par_iter().map(resized).collect::<Option<_>>().unwrap_or_default(),
     };
     StoredChunk { times, colors, ..StoredChunk::of(prediction) }
+}
+
+/// Takes out of a prediction what is not to be used of its views, and notes it.
+fn mask(stored: &mut StoredChunk, views: &[ChunkView], masks: &[Option<Image<bool>>]) {
+    if masks.iter().all(Option::is_none) {
+        return;
+    }
+    let of = |id| views.iter().zip(masks).find(|(v, _)| v.frame_id == id).and_then(|(_, mask)| mask.as_ref());
+    stored.masks = stored
+        .prediction
+        .views
+        .iter_mut()
+        .map(|view| {
+            let (width, height) = (view.intrinsics.width, view.intrinsics.height);
+            let mask = at_size(of(view.frame_id)?, width, height);
+            let masked = |image: &Image<f32>, value: f32| {
+                Image::from_fn(width, height, |x, y| if mask[(x, y)] { value } else { image[(x, y)] })
+            };
+            view.depth = RelativeDepth::new(masked(view.depth.image(), f32::NAN));
+            view.confidence = Confidence::new(masked(view.confidence.image(), 0.0));
+            Some(mask)
+        })
+        .collect();
+}
+
+/// A mask at another size: `true` where the pixel covers a `true` one.
+fn at_size(mask: &Image<bool>, width: usize, height: usize) -> Image<bool> {
+    let span = |at: usize, size: usize, of: usize| at * of / size..((at + 1) * of).div_ceil(size).min(of);
+    Image::from_fn(width, height, |x, y| {
+        let columns = span(x, width, mask.width());
+        span(y, height, mask.height()).any(|row| mask.row(row)[columns.clone()].contains(&true))
+    })
 }

@@ -54,6 +54,13 @@ pub trait ImageSource: Sync {
     /// # Errors
     /// A degradation that names the image.
     fn image(&self, stamp: &FrameStamp) -> Result<FrameImage, Warning>;
+    /// What of the image is not to be used, as captured: `true` there; `None` where all of it is used.
+    ///
+    /// # Errors
+    /// A degradation that names the mask.
+    fn mask(&self, _: &FrameStamp) -> Result<Option<Image<bool>>, Warning> {
+        Ok(None)
+    }
 }
 
 /// A prediction with what came with it.
@@ -84,13 +91,15 @@ pub trait GeometrySource {
     fn completes(&self) -> bool {
         false
     }
-    /// Depth of the views `wanted` (indices into `views.views`).
+    /// Depth of the views `wanted` (indices into `views.views`). `masks` has one entry per view at its image's size, `true` where it is
+    /// not to be used; what a source says there all the same is taken out of its prediction.
     ///
     /// # Errors
     /// What the model reports; [`ModelError::Cancelled`] when `watch` answered `true`.
     fn predict(
         &mut self,
         views: &ChunkViews,
+        masks: &[Option<Image<bool>>],
         wanted: Range<usize>,
         watch: Watch<'_>,
     ) -> Result<Prediction, ModelError>;

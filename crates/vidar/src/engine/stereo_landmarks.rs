@@ -11,7 +11,7 @@ use vidar_align::landmark_transfer::pixel_at_size;
 use vidar_core::Watch;
 use vidar_core::camera::Pixel;
 use vidar_core::model::ChunkFrame;
-use vidar_core::{ChunkView, ChunkViews, FrameId, GeometryPrediction, ViewGeometry};
+use vidar_core::{ChunkView, ChunkViews, FrameId, GeometryPrediction, Image, ViewGeometry};
 use vidar_solve::statistics::median_upper;
 use vidar_stereo::{StereoConfig, StereoError, StereoModel, TOLERANCE_RATIO};
 
@@ -49,16 +49,17 @@ impl StereoLandmarks {
         &self,
         prediction: &GeometryPrediction,
         views: &[ChunkView],
+        masks: &[Option<Image<bool>>],
         watch: Watch<'_>,
     ) -> Result<BTreeMap<FrameId, Vec<DepthPoint>>, StereoError> {
-        let views: Vec<ChunkView> = views.iter().filter(|v| v.world_from_camera.is_some()).cloned().collect();
-        let references: Vec<usize> = (0..views.len()).collect();
+        let with_masks = views.iter().enumerate().map(|(i, v)| (v.clone(), masks.get(i).cloned().flatten()));
+        let (views, masks): (Vec<ChunkView>, Vec<_>) =
+            with_masks.filter(|(v, _)| v.world_from_camera.is_some()).unzip();
+        let references = 0..views.len();
         let views = ChunkViews { id: prediction.chunk_id, views };
-        let by_stereo = match self.stereo.predict_with(&views, &references, watch) {
-            Ok(output) => output.prediction.views,
-            Err(
-                StereoError::NoParallax { .. } | StereoError::TooFewViews { .. } | StereoError::Cancelled,
-            ) => return Ok(BTreeMap::new()),
+        let by_stereo = match self.stereo.predict_unmasked(&views, &masks, references, watch) {
+            Ok(prediction) => prediction.views,
+            Err(StereoError::TooFewViews { .. } | StereoError::Cancelled) => return Ok(BTreeMap::new()),
             Err(error) => return Err(error),
         };
         let mut numbers = 0..;

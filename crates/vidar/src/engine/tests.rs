@@ -61,6 +61,7 @@ impl GeometrySource for Wall {
     fn predict(
         &mut self,
         views: &ChunkViews,
+        _: &[Option<Image<bool>>],
         wanted: std::ops::Range<usize>,
         _: vidar_core::Watch<'_>,
     ) -> Result<Prediction, ModelError> {

@@ -396,6 +396,23 @@ impl Track {
     }
 }
 
+/// The frames of the longest segment that `poses`, which need no sensors, give these candidates.
+pub fn longest_posed(
+    poses: &mut dyn PoseSource,
+    candidates: &[FrameStamp],
+    max_gap: Duration,
+) -> Vec<PosedFrame> {
+    let mut track = Track::new(max_gap);
+    for stamp in candidates {
+        track.add_candidate(*stamp);
+        for report in poses.push_stamp(stamp) {
+            track.add(report);
+        }
+    }
+    track.finish();
+    track.longest().map_or_else(Vec::new, |s| s.frames.clone())
+}
+
 /// The pose between two others, if they are close enough in time.
 fn between(
     before: Option<(Timestamp, Se3)>,

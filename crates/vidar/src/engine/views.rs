@@ -6,18 +6,33 @@ use super::setup::ImageSource;
 use rayon::prelude::*;
 use std::ops::Range;
 use vidar_core::remap::{RemapTable, RowShift};
-use vidar_core::{CameraModel, ChunkView, Pinhole, Warning};
+use vidar_core::{CameraModel, ChunkView, FrameImage, Image, Pinhole, Warning};
 
 /// Shifts of rows below this many pixels of the camera are left: matches are found to a few tenths of one.
 const LEAST_SHIFT_PX: f64 = 0.25;
+
+/// A view with what of it is not to be used: `true` there; `None` where all of it is.
+pub type MaskedView = (ChunkView, Option<Image<bool>>);
+
+/// Views that were handed out.
+pub struct Taken {
+    /// The views.
+    pub views: Vec<ChunkView>,
+    /// One entry per view.
+    pub masks: Vec<Option<Image<bool>>>,
+    /// Those of them that are wanted.
+    pub wanted: Range<usize>,
+    /// Which keyframes they are.
+    pub indices: Vec<usize>,
+}
 
 /// A window of undistorted keyframes that moves forward through the sequence; each image is read once.
 pub struct ViewWindow<'a> {
     images: &'a dyn ImageSource,
     camera: CameraModel,
     remap: RemapTable,
-    /// Keyframe index with its view, ascending. Unreadable images are missing.
-    views: Vec<(usize, ChunkView)>,
+    /// Keyframe index with its view and its mask, ascending. Unreadable images are missing.
+    views: Vec<(usize, MaskedView)>,
     next: usize,
 }
 
@@ -48,32 +63,40 @@ impl<'a> ViewWindow<'a> {
         self.next = self.next.max(seen.end);
     }
 
-    /// Hands the views out, with the span of those that lie in `wanted`, and their indices for [`ViewWindow::put_back`].
-    pub fn take(&mut self, wanted: &Range<usize>) -> (Vec<ChunkView>, Range<usize>, Vec<usize>) {
-        let (indices, views): (Vec<usize>, Vec<ChunkView>) =
+    /// Hands the views out, until [`ViewWindow::put_back`], with the span of those that lie in `wanted`.
+    pub fn take(&mut self, wanted: &Range<usize>) -> Taken {
+        let (indices, views): (Vec<usize>, Vec<MaskedView>) =
             std::mem::take(&mut self.views).into_iter().unzip();
+        let (views, masks) = views.into_iter().unzip();
         let start = indices.partition_point(|&i| i < wanted.start);
         let end = indices.partition_point(|&i| i < wanted.end);
-        (views, start..end, indices)
+        Taken { views, masks, wanted: start..end, indices }
     }
 
     /// Takes the views back.
-    pub fn put_back(&mut self, views: Vec<ChunkView>, indices: Vec<usize>) {
-        self.views = indices.into_iter().zip(views).collect();
+    pub fn put_back(&mut self, views: Vec<ChunkView>, masks: Vec<Option<Image<bool>>>, indices: Vec<usize>) {
+        self.views = indices.into_iter().zip(views.into_iter().zip(masks)).collect();
     }
 
     /// Reads one keyframe.
-    pub fn load(&self, keyframe: &MapKeyframe) -> Result<ChunkView, Warning> {
+    pub fn load(&self, keyframe: &MapKeyframe) -> Result<MaskedView, Warning> {
         let image = self.images.image(&keyframe.stamp)?;
+        let mask = self.images.mask(&keyframe.stamp)?;
         let shift = keyframe
             .row_motion
             .and_then(|s| RowShift::new(&self.camera, self.remap.target(), &s, LEAST_SHIFT_PX));
-        Ok(ChunkView {
+        // Every pixel into which an ignored one is mixed; the camera's border is black in the view, not ignored.
+        let mask = mask.map(|mask| {
+            let white = FrameImage::Gray8(mask.map(|ignored| if *ignored { 255 } else { 0 }));
+            self.remap.apply_shifted(&white, shift.as_ref()).to_gray8().map(|v| *v > 0)
+        });
+        let view = ChunkView {
             frame_id: keyframe.stamp.frame_id,
             time: keyframe.stamp.time,
             image: self.remap.apply_shifted(&image, shift.as_ref()),
             intrinsics: *self.remap.target(),
             world_from_camera: keyframe.world_from_camera,
-        })
+        };
+        Ok((view, mask))
     }
 }

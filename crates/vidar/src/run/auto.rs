@@ -70,10 +70,11 @@ impl AutoModel {
     pub(super) fn predict(
         &mut self,
         views: &ChunkViews,
+        masks: &[Option<Image<bool>>],
         wanted: Range<usize>,
         watch: Watch<'_>,
     ) -> Result<Prediction, ModelError> {
-        let geometry = self.stereo.predict_views(views, wanted, watch)?;
+        let geometry = self.stereo.predict_unmasked(views, masks, wanted, watch)?;
         let (shapes, warnings) = match self.shapes(views, &geometry, watch) {
             Ok(shapes) => (shapes, Vec::new()),
             Err(ModelError::Cancelled) => return Err(ModelError::Cancelled),

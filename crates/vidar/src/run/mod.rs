@@ -1,6 +1,7 @@
 //! One run: recording → engine → evaluate → export.
 
 mod auto;
+mod budget;
 mod by_source;
 mod evaluate;
 mod map;
@@ -22,6 +23,7 @@ mod trust;
 mod view;
 mod views;
 
+pub use budget::{Budget, BudgetChoice};
 pub use by_source::SourceScore;
 pub(crate) use evaluate::sampled;
 pub use evaluate::{DepthScore, Evaluation};
@@ -124,6 +126,13 @@ pub fn plan(request: &RunRequest) -> Result<Plan, Error> {
         calibrate::complete(&mut dataset, &mut config.odometry, &events, &cancel)?;
     }
     let (mut plan, ..) = Plan::make(&dataset, &config, request.reference.as_deref())?;
+    if !plan.poses.is_odometry()
+        && let Some(found) = budget::settle(&dataset, &mut config, &plan, None)?
+    {
+        (plan, ..) = Plan::make(&dataset, &config, request.reference.as_deref())?;
+        plan.warnings.extend(found.warning());
+        plan.budget = Some(found);
+    }
     plan.warnings.splice(0..0, dataset.warnings.iter().cloned().chain(untimed));
     Ok(plan)
 }
@@ -256,7 +265,7 @@ impl Context<'_> {
     ) -> Result<MetricMap, Error> {
         let Self { config, dataset, folder, scene, events, cancel, .. } = *self;
         let store = RunStore::new(folder.path(), self.fingerprint, plan, config);
-        let images = ImageFiles(dataset);
+        let images = ImageFiles(dataset, plan.masks.as_deref());
         let cancelled = || cancel.is_cancelled();
         let predicting = readers::chunk_progress(events);
         let parts = EngineParts { geometry: source, places, images: &images, store: &store };

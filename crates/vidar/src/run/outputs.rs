@@ -169,6 +169,7 @@ pub fn result_json(outcome: &RunOutcome) -> Value {
         "placement": map.placement.as_deref().map(placement_json),
         "evaluation": outcome.evaluation,
         "seconds": outcome.seconds,
+        "budget": outcome.plan.budget,
     })
 }
 

@@ -120,7 +120,7 @@ fn predict_chunks(
     let context = Context { request, config, dataset, fingerprint, folder, scene: None, events, cancel };
     let inner = RunStore::new(folder.path(), fingerprint, plan, config);
     let store = PartStore { inner: &inner, part, kept, count: Cell::new(0) };
-    let images = ImageFiles(dataset);
+    let images = ImageFiles(dataset, plan.masks.as_deref());
     let cancelled = || cancel.is_cancelled();
     let predicting = readers::chunk_progress(events);
     let parts = EngineParts { geometry: source, places, images: &images, store: &store };

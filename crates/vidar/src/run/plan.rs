@@ -1,14 +1,17 @@
 //! What a run would do: all that is known before anything is tracked or predicted.
 
+use super::budget::Budget;
 use super::place_recognition::PlaceRecognition;
 use super::source::{OpenedSource, Source};
 use crate::config::Config;
 use crate::engine::{ChunkRule, GeometrySource, PosedFrame, Selection, chunk_rule};
 use crate::error::Error;
 use crate::input::{self, PosePlan};
+use crate::masks::Masks;
 use crate::models::device_memory;
 use crate::models::geometry::NetworkPlan;
 use std::path::Path;
+use std::sync::Arc;
 use vidar_align::CouplingMode;
 use vidar_core::remap::undistorted_view;
 use vidar_core::{CameraId, CameraModel, FrameId, ModelInfo, Pinhole, Warning};
@@ -66,6 +69,10 @@ pub struct Plan {
     pub volume_budget_bytes: u64,
     /// Disk that the run folder will take at most, bytes.
     pub disk_bytes: u64,
+    /// Masks of the images, where there are any.
+    pub masks: Option<Arc<Masks>>,
+    /// The time budget with what was chosen for it; none without a limit, and before the poses that it depends on are known.
+    pub budget: Option<Budget>,
     /// Warnings about the input and the settings.
     pub warnings: Vec<Warning>,
 }
@@ -109,6 +116,10 @@ impl Plan {
         if found < needed {
             return Err(Error::TooFewKeyframes { found, needed });
         }
+        let masks = match config.input.masks.as_str() {
+            "" => None,
+            folder => Some(Arc::new(Masks::open(Path::new(folder), dataset)?)),
+        };
         let mut warnings = Vec::new();
         let camera = camera_model(dataset)?;
         let view = model_view(&camera, config)?;
@@ -138,6 +149,8 @@ impl Plan {
             depth_units_per_metre: config.output.depth_units_per_metre,
             volume_budget_bytes,
             poses,
+            masks,
+            budget: None,
             warnings,
         };
         Ok((plan, source, place_recognition))
@@ -188,6 +201,12 @@ impl Plan {
                 lines.push(("device", device.device.clone()));
                 lines.push(("memory of the device", device_memory(device)));
             }
+        }
+        if let Some(masks) = &self.masks {
+            lines.push(("masks", masks.words()));
+        }
+        if let Some(budget) = &self.budget {
+            lines.push(("time budget", budget.words()));
         }
         lines
     }

@@ -9,7 +9,7 @@ use crate::models::LocatedModel;
 use crate::models::geometry::{self, NetworkPlan, SourceChoice};
 use std::sync::Arc;
 use vidar_align::CouplingMode;
-use vidar_core::{ChunkViews, GeometryModel, ModelError, ModelInfo, Pinhole, Warning};
+use vidar_core::{ChunkViews, GeometryModel, Image, ModelError, ModelInfo, Pinhole, Warning};
 use vidar_da3::{Da3Model, PoseMode};
 use vidar_dataset::{Dataset, ImageEntry};
 use vidar_stereo::StereoModel;
@@ -150,12 +150,13 @@ impl GeometrySource for Source {
     fn predict(
         &mut self,
         views: &ChunkViews,
+        masks: &[Option<Image<bool>>],
         wanted: std::ops::Range<usize>,
         watch: vidar_core::Watch<'_>,
     ) -> Result<Prediction, ModelError> {
         let (mut colors, mut tokens) = (Vec::new(), Vec::new());
         let geometry = match self {
-            Self::Auto(model) => return model.predict(views, wanted, watch),
+            Self::Auto(model) => return model.predict(views, masks, wanted, watch),
             Self::Network(network) => {
                 let geometry = network.0.predict_views(views, wanted, watch)?;
                 tokens = network.0.take_place_tokens();
@@ -166,7 +167,7 @@ impl GeometrySource for Source {
                 colors = model.take_colors();
                 geometry
             }
-            Self::Stereo(model) => model.predict_views(views, wanted, watch)?,
+            Self::Stereo(model) => model.predict_unmasked(views, masks, wanted, watch)?,
             Self::Simulated(model) => model.predict_views(views, wanted, watch)?,
         };
         Ok(Prediction { geometry, colors, tokens, shapes: Vec::new(), warnings: Vec::new() })

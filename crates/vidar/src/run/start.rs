@@ -1,5 +1,6 @@
 //! The start of a run: its recording opened, planned and tracked, its folder made.
 
+use super::budget;
 use super::place_recognition::PlaceRecognition;
 use super::record::{Recorder, RunDescription};
 use super::scene::SceneWriter;
@@ -8,10 +9,10 @@ use super::tracking::Tracking;
 use super::{Plan, RunRequest};
 use crate::config::Config;
 use crate::error::Error;
-use crate::events::{CancelToken, Events};
+use crate::events::{CancelToken, Event, Events};
 use crate::input;
 use crate::odometry::TrackedPoses;
-use crate::run_folder::{Earlier, RunFolder};
+use crate::run_folder::{Earlier, RunFolder, pretty};
 use std::sync::Arc;
 use vidar_dataset::Dataset;
 
@@ -67,6 +68,12 @@ pub(super) fn start(request: &RunRequest, events: &Events, cancel: &CancelToken)
         true => tracking.track(&mut dataset, &mut config, &folder, scene.as_ref(), &events, cancel)?,
         false => None,
     };
+    let (plan, source, places) = within_budget(
+        (plan, source, places),
+        (&dataset, &mut config, poses.as_ref()),
+        request,
+        (&folder, &events),
+    )?;
     Ok(Started {
         recorder,
         events,
@@ -82,4 +89,22 @@ pub(super) fn start(request: &RunRequest, events: &Events, cancel: &CancelToken)
         folder,
         poses,
     })
+}
+
+/// The plan with what a time budget leaves of it; its settings are those of `config` from then on.
+fn within_budget(
+    made: (Plan, Source, PlaceRecognition),
+    (dataset, config, poses): (&Dataset, &mut Config, Option<&TrackedPoses>),
+    request: &RunRequest,
+    (folder, events): (&RunFolder, &Events),
+) -> Result<(Plan, Source, PlaceRecognition), Error> {
+    let Some(found) = budget::settle(dataset, config, &made.0, poses)? else { return Ok(made) };
+    let bytes = folder.write(budget::FILE, &pretty(&found))?;
+    events.emit(&Event::ArtifactWritten { path: budget::FILE.into(), bytes });
+    found.warning().iter().for_each(|w| events.warn(w));
+    let (plan, source, places) = match found.chosen == found.unlimited {
+        true => made,
+        false => Plan::make(dataset, config, request.reference.as_deref())?,
+    };
+    Ok((Plan { budget: Some(found), ..plan }, source, places))
 }

@@ -34,6 +34,7 @@ impl RunStore {
             "stereo": config.stereo,
             "fill": (plan.model.name == AUTO).then_some(&config.geometry.fill_network),
             "network": config.model,
+            "masks": plan.masks.as_ref().map(|m| m.sha256()),
             "place_recognition": plan.place_recognition,
         });
         let identity = format!("{fingerprint}{part}").into_bytes();

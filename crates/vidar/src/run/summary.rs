@@ -82,11 +82,21 @@ pub(super) fn lines(outcome: &RunOutcome) -> Vec<(&'static str, String)> {
     }
     let memory = crate::system::peak_memory_bytes()
         .map_or_else(String::new, |b| format!(", peak memory {}", super::bytes(b)));
-    lines.push(("took", format!("{:.1} s{memory}", outcome.seconds)));
+    lines.push(("took", format!("{:.1} s{}{memory}", outcome.seconds, of_budget(outcome))));
     let report = outcome.folder.join("report.html");
     let shown = if report.exists() { report } else { outcome.folder.join("map/mesh.ply") };
     lines.push(("look at it", shown.display().to_string()));
     lines
+}
+
+/// How the time compares with the budget, and the speed that would have been right.
+fn of_budget(outcome: &RunOutcome) -> String {
+    let Some(budget) = &outcome.plan.budget else { return String::new() };
+    let found = budget.found_speed(outcome.seconds);
+    // A quarter is what one run differs from the next beside other work.
+    let is_off = !(0.8..1.25).contains(&(found / budget.speed));
+    let hint = if is_off { format!(" (here budget.speed is {found:.2})") } else { String::new() };
+    format!(" of a budget of {}{hint}", budget.words())
 }
 
 /// An area with the unit it has.

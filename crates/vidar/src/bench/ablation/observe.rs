@@ -29,7 +29,7 @@ pub fn observe(dataset: &Dataset, config: &Config, cancel: &CancelToken) -> Resu
     let (plan, mut source, places) = Plan::make(dataset, config, None)?;
     let (poses, fallback) = plan.poses.open(dataset, config)?;
     let store = MemoryStore::default();
-    let images = ImageFiles(dataset);
+    let images = ImageFiles(dataset, plan.masks.as_deref());
     let cancelled = || cancel.is_cancelled();
     let mut engine = Engine::new(EngineSetup {
         name: dataset.name.clone(),
