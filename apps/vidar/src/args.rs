@@ -2,6 +2,7 @@
 
 use crate::batch_args::{PlanArgs, WorkArgs};
 use crate::compare_args::CompareArgs;
+use crate::live_args::LiveArgs;
 use crate::model_args::{DepthArgs, LicenceArgs, ModelCommand};
 use clap::{ArgAction, Args, Parser, Subcommand, ValueEnum, ValueHint};
 use std::path::PathBuf;
@@ -67,6 +68,11 @@ pub enum Command {
     /// Run the whole pipeline on a recording: poses, depth, fusion into one surface, evaluation, files.
     #[command(after_help = RUN_EXAMPLES)]
     Run(Box<RunArgs>),
+    /// Map while images come: poses from a thread of its own, a growing surface, latencies measured.
+    #[command(
+        after_help = "Examples:\n  vidar live drive.mcap --realtime -o result\n  vidar live mav0/ --preset euroc --realtime\n  vidar live mav0/ -o result --resume"
+    )]
+    Live(Box<LiveArgs>),
     /// Render a flight through a synthetic room, map it and evaluate the map; nothing is downloaded.
     #[command(
         after_help = "Examples:\n  vidar demo\n  vidar demo -o my_demo --seed 7\n  vidar demo --scene corridor --set fusion.voxel_size_m=0.03"
