@@ -2,6 +2,7 @@
 
 use crate::batch_args::{PlanArgs, WorkArgs};
 use crate::compare_args::CompareArgs;
+use crate::live_args::LiveArgs;
 use crate::model_args::{DepthArgs, LicenceArgs, ModelCommand};
 use clap::{ArgAction, Args, Parser, Subcommand, ValueEnum, ValueHint};
 use std::path::PathBuf;
@@ -66,7 +67,12 @@ pub enum ProgressMode {
 pub enum Command {
     /// Run the whole pipeline on a recording: poses, depth, fusion into one surface, evaluation, files.
     #[command(after_help = RUN_EXAMPLES)]
-    Run(Box<RunArgs>),
+    Run(Box<WholeRunArgs>),
+    /// Map while images come: poses from a thread of its own, a growing surface, latencies measured.
+    #[command(
+        after_help = "Examples:\n  vidar live drive.mcap --realtime -o result\n  vidar live mav0/ --preset euroc --realtime\n  vidar live mav0/ -o result --resume"
+    )]
+    Live(Box<LiveArgs>),
     /// Render a flight through a synthetic room, map it and evaluate the map; nothing is downloaded.
     #[command(
         after_help = "Examples:\n  vidar demo\n  vidar demo -o my_demo --seed 7\n  vidar demo --scene corridor --set fusion.voxel_size_m=0.03"
@@ -253,6 +259,29 @@ pub struct OutputArgs {
 
 /// `vidar run`.
 #[derive(Args, Clone, Debug)]
+pub struct WholeRunArgs {
+    /// What `vidar live` has, too.
+    #[command(flatten)]
+    pub run: RunArgs,
+    /// How long it may take.
+    #[command(flatten)]
+    pub budget: BudgetArgs,
+}
+
+/// How long a run may take.
+#[derive(Args, Clone, Debug)]
+pub struct BudgetArgs {
+    /// Cut down stereo so that the run takes no longer than the recording, on two quiet cores of the machine of BENCHMARK.md
+    /// (`budget.speed` tells of others). The same command makes the same map on every machine.
+    #[arg(long, conflicts_with = "time_budget", help_heading = "Model")]
+    pub realtime: bool,
+    /// The same with a limit in seconds.
+    #[arg(long, value_name = "SECONDS", help_heading = "Model")]
+    pub time_budget: Option<f64>,
+}
+
+/// What `vidar run` and `vidar live` have in common.
+#[derive(Args, Clone, Debug)]
 pub struct RunArgs {
     /// The recording: a bag, a video, or a folder (EuRoC, TUM RGB-D, 7-Scenes, KITTI, a phone's, posed folder, images, …).
     #[arg(value_hint = ValueHint::AnyPath)]
@@ -297,13 +326,6 @@ pub struct RunArgs {
     /// Print the plan and stop.
     #[arg(long)]
     pub dry_run: bool,
-    /// Cut down stereo so that the run takes no longer than the recording, on two quiet cores of the machine of BENCHMARK.md
-    /// (`budget.speed` tells of others). The same command makes the same map on every machine.
-    #[arg(long, conflicts_with = "time_budget", help_heading = "Model")]
-    pub realtime: bool,
-    /// The same with a limit in seconds.
-    #[arg(long, value_name = "SECONDS", help_heading = "Model")]
-    pub time_budget: Option<f64>,
     /// Memory limit for planning, such as 4GiB or 800MB; default: the sum of the parts.
     #[arg(long, value_name = "SIZE", help_heading = "Model")]
     pub memory_budget: Option<String>,

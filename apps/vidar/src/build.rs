@@ -1,6 +1,6 @@
 //! Converts flags to values of the library; each is checked here or at its first use.
 
-use crate::args::{ConfigArgs, EvalArgs, InputArgs, OutputArgs, RunArgs, WorldArgs};
+use crate::args::{BudgetArgs, ConfigArgs, EvalArgs, InputArgs, OutputArgs, RunArgs, WorldArgs};
 use std::path::Path;
 use vidar::config::Origin;
 use vidar::core::{CameraId, Se3, So3};
@@ -70,15 +70,8 @@ pub fn apply_masks_flag(layered: &mut Layered, masks: Option<&str>) -> Result<()
     }
 }
 
-/// The flags of `vidar run` that choose a model.
-pub fn apply_model_flags(layered: &mut Layered, args: &RunArgs) -> Result<(), Error> {
-    if let Some(mode) = &args.mode {
-        layered.value("coupling.mode", toml::Value::String(mode.clone()), Origin::Flag("--mode"))?;
-    }
-    if let Some(size) = &args.memory_budget {
-        let bytes = toml::Value::Integer(byte_count(size)?);
-        layered.value("limits.memory_bytes", bytes, Origin::Flag("--memory-budget"))?;
-    }
+/// `--realtime` and `--time-budget` of `vidar run`.
+pub fn apply_budget_flags(layered: &mut Layered, args: &BudgetArgs) -> Result<(), Error> {
     if args.realtime {
         layered.value("budget.realtime", toml::Value::Boolean(true), Origin::Flag("--realtime"))?;
     }
@@ -90,6 +83,18 @@ pub fn apply_model_flags(layered: &mut Layered, args: &RunArgs) -> Result<(), Er
             ));
         }
         layered.value("budget.seconds", toml::Value::Float(seconds), Origin::Flag("--time-budget"))?;
+    }
+    Ok(())
+}
+
+/// The flags of `vidar run` and `vidar live` that choose a model.
+pub fn apply_model_flags(layered: &mut Layered, args: &RunArgs) -> Result<(), Error> {
+    if let Some(mode) = &args.mode {
+        layered.value("coupling.mode", toml::Value::String(mode.clone()), Origin::Flag("--mode"))?;
+    }
+    if let Some(size) = &args.memory_budget {
+        let bytes = toml::Value::Integer(byte_count(size)?);
+        layered.value("limits.memory_bytes", bytes, Origin::Flag("--memory-budget"))?;
     }
     if let Some(device) = args.device {
         layered.value("model.device", toml::Value::String(device.to_string()), Origin::Flag("--device"))?;

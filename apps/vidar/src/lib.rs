@@ -7,6 +7,7 @@ pub mod batch_args;
 mod build;
 mod commands;
 pub mod compare_args;
+pub mod live_args;
 pub mod model_args;
 mod print;
 mod progress;
@@ -96,6 +97,7 @@ impl Context {
 fn dispatch(command: Command, context: &Context) -> Outcome {
     match command {
         Command::Run(args) => commands::run::run(&args, context),
+        Command::Live(args) => commands::live::live(&args, context),
         Command::Demo(args) => commands::run::demo(&args, context),
         Command::Inspect(args) => commands::inspect::inspect(&args, context),
         Command::Convert(args) => commands::convert::convert(&args, context),

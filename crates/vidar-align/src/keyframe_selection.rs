@@ -39,7 +39,8 @@ impl KeyframeSelector {
         Self::widened(config, 1.0)
     }
 
-    fn widened(config: &KeyframeConfig, factor: f64) -> Self {
+    /// A selector without frames whose keyframes are `factor` times as far apart.
+    pub fn widened(config: &KeyframeConfig, factor: f64) -> Self {
         Self {
             min_translation_m: config.min_translation_m * factor,
             min_rotation_rad: config.min_rotation_deg.to_radians() * factor,

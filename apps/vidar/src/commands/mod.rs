@@ -12,6 +12,7 @@ pub mod eval;
 pub mod explain;
 pub mod export;
 pub mod inspect;
+pub mod live;
 pub mod model;
 pub mod odometry;
 pub mod run;

@@ -1,6 +1,6 @@
 //! `vidar run` and `vidar demo`.
 
-use crate::args::{DemoArgs, RunArgs};
+use crate::args::{BudgetArgs, DemoArgs, RunArgs, WholeRunArgs};
 use crate::{Context, Outcome, build, print, progress, spool};
 use serde_json::json;
 use vidar::demo::DemoRequest;
@@ -10,13 +10,31 @@ use vidar::synth::SynthConfig;
 use vidar::{Error, ExitStatus, RunOutcome, RunRequest};
 
 /// Everything, from recording to report.
-pub fn run(args: &RunArgs, context: &Context) -> Outcome {
+pub fn run(args: &WholeRunArgs, context: &Context) -> Outcome {
+    let (request, thresholds) = request(&args.run, Some(&args.budget), None, context)?;
+    if args.run.dry_run {
+        return dry_run(&request, context);
+    }
+    let outcome = vidar::run(&request, &progress::events(&context.cli), &context.cancel)?;
+    conclude(&outcome, &thresholds, context)
+}
+
+/// What the flags ask for, over a preset that holds where none is given.
+pub(super) fn request(
+    args: &RunArgs,
+    budget: Option<&BudgetArgs>,
+    default_preset: Option<&str>,
+    context: &Context,
+) -> Result<(RunRequest, Thresholds), Error> {
     spool::refuse(&args.path)?;
-    let mut layered = build::layered(&args.config, None)?;
+    let mut layered = build::layered(&args.config, default_preset)?;
     build::apply_input_flags(&mut layered, &args.input)?;
     build::apply_map_flag(&mut layered, args.map.as_deref())?;
     build::apply_masks_flag(&mut layered, args.masks.as_deref())?;
     build::apply_model_flags(&mut layered, args)?;
+    if let Some(budget) = budget {
+        build::apply_budget_flags(&mut layered, budget)?;
+    }
     accept_licence(&layered, args)?;
     let thresholds = Thresholds::parse(&args.fail_above, &args.fail_below)?;
     let request = RunRequest {
@@ -31,11 +49,7 @@ pub fn run(args: &RunArgs, context: &Context) -> Outcome {
         mcap: args.mcap.clone(),
         command: context.command.clone(),
     };
-    if args.dry_run {
-        return dry_run(&request, context);
-    }
-    let outcome = vidar::run(&request, &progress::events(&context.cli), &context.cancel)?;
-    conclude(&outcome, &thresholds, context)
+    Ok((request, thresholds))
 }
 
 /// Records an acceptance of a licence given with this command, before the model is opened.
@@ -48,7 +62,7 @@ fn accept_licence(layered: &vidar::Layered, args: &RunArgs) -> Result<(), Error>
     vidar::models::locate(&choice, Some(&accepted), &vidar::models::store(true)?).map(|_| ())
 }
 
-fn dry_run(request: &RunRequest, context: &Context) -> Outcome {
+pub(super) fn dry_run(request: &RunRequest, context: &Context) -> Outcome {
     let plan = vidar::run::plan(request)?;
     if context.cli.json {
         let lines: serde_json::Map<String, serde_json::Value> =
@@ -77,7 +91,7 @@ pub fn demo(args: &DemoArgs, context: &Context) -> Outcome {
 }
 
 /// Prints the result with its warnings and scores; then applies thresholds.
-fn conclude(outcome: &RunOutcome, thresholds: &Thresholds, context: &Context) -> Outcome {
+pub(super) fn conclude(outcome: &RunOutcome, thresholds: &Thresholds, context: &Context) -> Outcome {
     let scores = vidar::evaluate::scores(&outcome.evaluation);
     print::warnings(&outcome.warnings);
     if context.cli.json {

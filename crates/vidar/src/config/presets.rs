@@ -34,6 +34,11 @@ pub const PRESETS: &[Preset] = &[
         toml: include_str!("../../presets/quality.toml"),
     },
     Preset {
+        name: "live",
+        about: "of `vidar live` unless another is given: small images, a surface after every few keyframes",
+        toml: include_str!("../../presets/live.toml"),
+    },
+    Preset {
         name: "demo",
         about: "the synthetic room of `vidar demo`: small images, a few metres",
         toml: include_str!("../../presets/demo.toml"),

@@ -167,6 +167,23 @@ impl<'a> Engine<'a> {
         self.advance(reports, false, sink)
     }
 
+    /// Takes images, and what was found of their poses elsewhere: on a thread of its own, say, so that tracking waits for no
+    /// prediction. Images come in the order of time, each before its report; the source of poses of the setup gives what is
+    /// left at the end. The result is that of [`Engine::push`] with the same reports.
+    ///
+    /// # Errors
+    /// As [`Engine::push`].
+    pub fn push_tracked(
+        &mut self,
+        images: &[FrameStamp],
+        reports: Vec<PoseReport>,
+        sink: &mut Sink<'_>,
+    ) -> Result<(), Error> {
+        images.iter().for_each(|stamp| self.add_image(*stamp));
+        self.enter(Step::Track, sink)?;
+        self.advance(reports, false, sink)
+    }
+
     /// Maps what is left, places everything once more, and fuses it.
     ///
     /// # Errors

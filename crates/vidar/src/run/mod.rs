@@ -4,6 +4,7 @@ mod auto;
 mod budget;
 mod by_source;
 mod evaluate;
+mod live;
 mod map;
 mod outputs;
 pub(crate) mod parts;
@@ -27,6 +28,7 @@ pub use budget::{Budget, BudgetChoice};
 pub use by_source::SourceScore;
 pub(crate) use evaluate::sampled;
 pub use evaluate::{DepthScore, Evaluation};
+pub use live::{Latency, LiveOptions, LiveReport};
 pub use map::MetricMap;
 pub use outputs::pose_of;
 pub use plan::{ExpectedWork, Plan, bytes};
@@ -41,6 +43,7 @@ use crate::input::{self, ImageFiles, Measurement, UnseenScale};
 use crate::odometry::TrackedPoses;
 use crate::run_folder::{OutputLocation, RunFolder};
 use crate::verdict::{StatedScale, Verdict};
+use live::{EndingCell, SurfaceLatency, TrackedElsewhere};
 use place_recognition::PlaceRecognition;
 use readers::{FINISH, MAP, Readers};
 use record::Recorder;
@@ -92,6 +95,8 @@ pub struct RunOutcome {
     pub warnings: Vec<Warning>,
     /// The most memory of a graphics processor held at a time, bytes; `None` where none was used.
     pub device_peak_bytes: Option<u64>,
+    /// What a live run measured; none of others.
+    pub live: Option<LiveReport>,
     /// Wall time, s.
     pub seconds: f64,
 }
@@ -143,6 +148,29 @@ pub fn plan(request: &RunRequest) -> Result<Plan, Error> {
 /// # Errors
 /// The input cannot be used, nothing could be mapped, or a result could not be written.
 pub fn run(request: &RunRequest, events: &Events, cancel: &CancelToken) -> Result<RunOutcome, Error> {
+    carry(request, None, events, cancel)
+}
+
+/// Runs all of it as on a robot: poses while images come, by an odometry on a thread of its own; the map behind it. A camera without
+/// a calibration is refused, and `odometry.adjust` has no effect, because it needs the end of the recording.
+///
+/// # Errors
+/// As [`run`]; and a thread that the system does not give.
+pub fn live(
+    request: &RunRequest,
+    options: &LiveOptions,
+    events: &Events,
+    cancel: &CancelToken,
+) -> Result<RunOutcome, Error> {
+    carry(request, Some(options), events, cancel)
+}
+
+fn carry(
+    request: &RunRequest,
+    live: Option<&LiveOptions>,
+    events: &Events,
+    cancel: &CancelToken,
+) -> Result<RunOutcome, Error> {
     let clock = std::time::Instant::now();
     let Started {
         recorder,
@@ -158,9 +186,10 @@ pub fn run(request: &RunRequest, events: &Events, cancel: &CancelToken) -> Resul
         scene,
         folder,
         poses,
-    } = start::start(request, events, cancel)?;
+    } = start::start(request, live.is_some(), events, cancel)?;
     let context = Context {
         request,
+        live,
         config: &config,
         dataset: &dataset,
         fingerprint: &fingerprint,
@@ -194,6 +223,8 @@ pub fn run(request: &RunRequest, events: &Events, cancel: &CancelToken) -> Resul
 /// What the stages of a run share.
 struct Context<'a> {
     request: &'a RunRequest,
+    /// None where the map may look ahead.
+    live: Option<&'a LiveOptions>,
     config: &'a Config,
     dataset: &'a Dataset,
     /// SHA-256 of what the recording consists of.
@@ -223,7 +254,8 @@ impl Context<'_> {
         recorder: &Recorder,
     ) -> Result<RunOutcome, Error> {
         let Self { request, config, dataset, folder, events, cancel, .. } = *self;
-        let map = self.build_map(&plan, &mut source, tracked, places)?;
+        let (map, live) = self.build_map(&plan, &mut source, tracked, places)?;
+        live.as_ref().and_then(live::warning).iter().for_each(|w| events.warn(w));
         let evaluation =
             events.stage("evaluate", 0, || evaluate::evaluate(dataset, &plan, &map, config, events))?;
         let scale = trust::stated_scale(&map, plan.mode, UnseenScale::of(dataset, config));
@@ -246,6 +278,7 @@ impl Context<'_> {
             verdict,
             warnings,
             device_peak_bytes: source.device_peak_bytes(),
+            live,
             seconds: 0.0,
         };
         events.stage("write", 0, || outputs::write(&outcome, dataset, config, request, folder, events))?;
@@ -262,42 +295,49 @@ impl Context<'_> {
         source: &mut Source,
         tracked: Option<TrackedPoses>,
         places: &PlaceRecognition,
-    ) -> Result<MetricMap, Error> {
+    ) -> Result<(MetricMap, Option<LiveReport>), Error> {
         let Self { config, dataset, folder, scene, events, cancel, .. } = *self;
         let store = RunStore::new(folder.path(), self.fingerprint, plan, config);
         let images = ImageFiles(dataset, plan.masks.as_deref());
         let cancelled = || cancel.is_cancelled();
         let predicting = readers::chunk_progress(events);
         let parts = EngineParts { geometry: source, places, images: &images, store: &store };
-        let mut engine = self.engine(plan, tracked, parts, &cancelled, &predicting)?;
+        let ending = EndingCell::default();
+        let elsewhere = plan.poses.source().filter(|_| self.live.is_some());
+        let elsewhere = elsewhere.map(|s| Box::new(TrackedElsewhere::new(s, ending.clone())) as _);
+        let poses = tracked.map(|p| Box::new(p) as Box<dyn PoseSource>).or(elsewhere);
+        let mut engine = self.engine(plan, poses, parts, &cancelled, &predicting)?;
         let mut readers = Readers::new(dataset, plan, config, folder, scene, events);
-        events.stage(MAP, dataset.images.len(), || {
-            self.push_recording(&mut engine, &mut |event| readers.read(event))
+        readers.surfaces = self.live.map(|_| SurfaceLatency::default());
+        let pushed = events.stage(MAP, dataset.images.len(), || match self.live {
+            Some(options) => live::push(self, (plan, options), &ending, &mut engine, &mut readers).map(Some),
+            None => self.push_recording(&mut engine, &mut |event| readers.read(event)).map(|()| None),
         })?;
         readers.finishing();
         events
             .stage(FINISH, 0, || engine.finish(&mut |event| readers.read(event)))
             .map_err(|error| of_synthetic_weights(error, plan))?;
+        let report = pushed.zip(readers.surfaces.take()).map(|(pushed, surfaces)| pushed.report(surfaces));
         let map = readers.finish(plan);
         if !cancel.is_cancelled() {
             tracking::forget(folder);
         }
         store.clean(config.output.keep_chunks || cancel.is_cancelled());
-        Ok(map)
+        Ok((map, report))
     }
 
     /// An engine that has seen nothing of the recording.
     fn engine<'e>(
         &'e self,
         plan: &Plan,
-        tracked: Option<TrackedPoses>,
+        poses: Option<Box<dyn PoseSource + 'e>>,
         parts: EngineParts<'e>,
         cancelled: &'e (dyn Fn() -> bool + Sync),
         predicting: &'e (dyn Fn(f64) + Sync),
     ) -> Result<Engine<'e>, Error> {
         let Self { config, dataset, .. } = *self;
         let (live, fallback) = plan.poses.open(dataset, config)?;
-        let poses = tracked.map(|p| Box::new(p) as Box<dyn PoseSource>).or(live);
+        let poses = poses.or(live.map(|p| p as _));
         Engine::new(EngineSetup {
             name: dataset.name.clone(),
             config,

@@ -151,7 +151,7 @@ fn metrics(outcome: &RunOutcome) -> Value {
 /// Counts and scores for the manifest and `--json`.
 pub fn result_json(outcome: &RunOutcome) -> Value {
     let map = &outcome.map;
-    json!({
+    let mut result = json!({
         "keyframes": map.keyframes.len(),
         "keyframes_with_depth": map.views.len(),
         "mesh_triangles": map.surface.mesh.triangles.len(),
@@ -170,7 +170,11 @@ pub fn result_json(outcome: &RunOutcome) -> Value {
         "evaluation": outcome.evaluation,
         "seconds": outcome.seconds,
         "budget": outcome.plan.budget,
-    })
+    });
+    if let (Some(live), Some(object)) = (&outcome.live, result.as_object_mut()) {
+        object.insert("live".into(), json!(live));
+    }
+    result
 }
 
 /// The alignment: chunk status and scale, loops, rejections, graph, drift.

@@ -1,5 +1,6 @@
 //! Readers of the engine's events: log and progress, times of the steps, the map, the growing surface, and files of views.
 
+use super::live::SurfaceLatency;
 use super::map::{MapCollector, MetricMap};
 use super::plan::Plan;
 use super::scene::SceneWriter;
@@ -33,6 +34,8 @@ pub(super) struct Readers<'a> {
     /// Keyframes predicted and fused, once the recording has ended.
     finishing: Option<(usize, usize)>,
     predicted: usize,
+    /// Of a live run.
+    pub(super) surfaces: Option<SurfaceLatency>,
 }
 
 impl<'a> Readers<'a> {
@@ -57,6 +60,7 @@ impl<'a> Readers<'a> {
             times,
             finishing: None,
             predicted: 0,
+            surfaces: None,
         }
     }
 
@@ -101,6 +105,9 @@ impl<'a> Readers<'a> {
             let keyframes = self.collector.map().keyframes.len();
             let done = self.predicted.min(keyframes) + fused.min(keyframes);
             self.events.emit(&Event::Progress { stage: FINISH, done, total: 2 * keyframes });
+        }
+        if let Some(surfaces) = &mut self.surfaces {
+            surfaces.read(&event, Instant::now());
         }
         Ok(())
     }

@@ -43,7 +43,12 @@ pub(super) struct Started {
 ///
 /// # Errors
 /// The input cannot be used, or the folder cannot be written.
-pub(super) fn start(request: &RunRequest, events: &Events, cancel: &CancelToken) -> Result<Started, Error> {
+pub(super) fn start(
+    request: &RunRequest,
+    is_live: bool,
+    events: &Events,
+    cancel: &CancelToken,
+) -> Result<Started, Error> {
     let recorder = Recorder::default();
     let events = recorder.listen(events.clone());
     let mut config = request.layered.build()?;
@@ -52,7 +57,14 @@ pub(super) fn start(request: &RunRequest, events: &Events, cancel: &CancelToken)
     dataset.warnings.extend(input::use_every_untimed_image(&dataset, &mut config));
     let fingerprint = input::fingerprint(&dataset)?;
     let mut tracking = Tracking::new(&dataset, &fingerprint, &config, &request.place)?;
-    tracking.calibrate(&mut dataset, &mut config, &events, cancel)?;
+    // What is live looks at nothing before it comes: neither to calibrate, nor for the camera's timing, nor to track.
+    if is_live {
+        config.odometry.adjust = false;
+        let stated = dataset.readout.map(|r| 1e3 * r.as_secs_f64());
+        config.odometry.readout_ms = config.odometry.readout_ms.or(stated);
+    } else {
+        tracking.calibrate(&mut dataset, &mut config, &events, cancel)?;
+    }
     let (plan, source, places) =
         events.stage("plan", 0, || Plan::make(&dataset, &config, request.reference.as_deref()))?;
     let description = RunDescription::new(request, &dataset, fingerprint.clone(), &plan);
@@ -64,7 +76,7 @@ pub(super) fn start(request: &RunRequest, events: &Events, cancel: &CancelToken)
     folder.write("config.resolved.toml", request.layered.to_toml(true).as_bytes())?;
     recorder.keep_log_in(folder.clone());
     dataset.warnings.iter().chain(&plan.warnings).for_each(|w| events.warn(w));
-    let poses = match plan.poses.is_odometry() {
+    let poses = match plan.poses.is_odometry() && !is_live {
         true => tracking.track(&mut dataset, &mut config, &folder, scene.as_ref(), &events, cancel)?,
         false => None,
     };

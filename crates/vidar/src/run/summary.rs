@@ -80,6 +80,9 @@ pub(super) fn lines(outcome: &RunOutcome) -> Vec<(&'static str, String)> {
         };
         lines.push(("depth by source", by_source.iter().map(one).collect::<Vec<_>>().join(", ")));
     }
+    if let Some(live) = &outcome.live {
+        lines.push(("live", live.words()));
+    }
     let memory = crate::system::peak_memory_bytes()
         .map_or_else(String::new, |b| format!(", peak memory {}", super::bytes(b)));
     lines.push(("took", format!("{:.1} s{}{memory}", outcome.seconds, of_budget(outcome))));

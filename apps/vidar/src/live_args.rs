@@ -1,0 +1,16 @@
+//! The command line of `vidar live`.
+
+use crate::args::RunArgs;
+use clap::Args;
+
+/// `vidar live`.
+#[derive(Args, Clone, Debug)]
+pub struct LiveArgs {
+    /// As `vidar run` has them.
+    #[command(flatten)]
+    pub run: RunArgs,
+    /// Replay the recording at its own rate; what does not keep up is left out, and counted. Otherwise it goes as fast as it can, and
+    /// nothing is left out.
+    #[arg(long, help_heading = "Input")]
+    pub realtime: bool,
+}

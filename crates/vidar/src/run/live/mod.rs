@@ -1,0 +1,241 @@
+//! A live run: the odometry on a thread of its own, the map behind a bounded queue.
+//!
+//! ```text
+//! arrival ─▶ odometry ─▶ poses (trajectory/live.tum)
+//!            (thread)  └▶ queue ─▶ engine: keyframes ─▶ predict ─▶ align ─▶ growing surface (map/so_far.ply)
+//! ```
+//!
+//! A recording that is replayed at its own rate does not wait. Where the map is behind, keyframes are taken farther apart, then
+//! none; where the odometry itself is, images are left to the IMU. All of it is said and counted. As fast as it goes, nothing is
+//! left out, and the result has the bits of `vidar run` on live poses.
+
+mod ending;
+mod latency;
+mod pose_file;
+mod queue;
+mod thinning;
+mod tracker;
+
+pub(super) use ending::{EndingCell, TrackedElsewhere};
+pub use latency::Latency;
+pub(super) use latency::SurfaceLatency;
+
+use super::readers::{MAP, Readers};
+use super::{Context, Plan, unreadable};
+use crate::engine::{Engine, FrameStamp, MapEvent};
+use crate::error::Error;
+use crate::events::Event;
+use crate::input;
+use ending::Ending;
+use pose_file::PoseFile;
+use queue::{Closing, Item, Queue};
+use serde::Serialize;
+use std::time::Instant;
+use thinning::Thinning;
+use tracker::{Arrival, Counts, Tracker};
+use vidar_core::Warning;
+use vidar_dataset::DatasetError;
+
+/// How a live run goes.
+#[derive(Clone, Copy, Debug)]
+pub struct LiveOptions {
+    /// Whether measurements arrive in the rhythm of their stamps; otherwise each arrives when it is taken, and nothing is left out.
+    pub is_realtime: bool,
+    /// Threads of the odometry's own pool; the map uses the pool of the caller.
+    pub odometry_threads: usize,
+}
+
+/// What a live run measured. Latencies count from the arrival of an image: its stamp, replayed at its own rate.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct LiveReport {
+    /// Whether measurements arrived in the rhythm of their stamps.
+    pub is_realtime: bool,
+    /// Images that arrived.
+    pub images: usize,
+    /// Images that the odometry left to the IMU, because it was late.
+    pub images_not_tracked: usize,
+    /// Keyframes left out because the map was behind and others are near.
+    pub keyframes_thinned: usize,
+    /// Keyframes left out because the queue was full.
+    pub keyframes_dropped: usize,
+    /// Poses that the map never got, because it was minutes behind.
+    pub poses_dropped: usize,
+    /// The most images that waited for the map.
+    pub most_waiting: usize,
+    /// From an image's arrival to its pose, s; none where no image got one.
+    pub image_to_pose: Option<Latency>,
+    /// From a keyframe's arrival to the first growing surface with its depth, s; none without `output.live_map`.
+    pub keyframe_to_surface: Option<Latency>,
+    /// Keyframes that no growing surface showed.
+    pub keyframes_without_surface: usize,
+}
+
+impl LiveReport {
+    /// In words: latencies, then what was left out.
+    pub fn words(&self) -> String {
+        let latency = |name: &str, latency: &Option<Latency>, factor: f64, unit: &str| match latency {
+            Some(l) => {
+                let [a, b, c] = [l.median, l.p95, l.p99].map(|v| v * factor);
+                format!("{name} {a:.1} / {b:.1} / {c:.1} {unit}")
+            }
+            None => format!("{name} not measured"),
+        };
+        let left_out = self.images_not_tracked + self.keyframes_thinned + self.keyframes_dropped;
+        let left_out = match left_out {
+            0 => "nothing left out".to_owned(),
+            _ => format!(
+                "left out: {} of {} images, {} keyframes near others, {} others",
+                self.images_not_tracked, self.images, self.keyframes_thinned, self.keyframes_dropped
+            ),
+        };
+        format!(
+            "{}, {} (median / 95 % / 99 %); {left_out}",
+            latency("image to pose", &self.image_to_pose, 1e3, "ms"),
+            latency("keyframe to surface", &self.keyframe_to_surface, 1.0, "s"),
+        )
+    }
+}
+
+/// What is measured until the recording has ended.
+pub(super) struct Pushed {
+    is_realtime: bool,
+    counts: Counts,
+    thinning: Thinning,
+    most_waiting: usize,
+}
+
+impl Pushed {
+    /// The whole report; `surfaces` also saw the end of the map.
+    pub fn report(&self, surfaces: SurfaceLatency) -> LiveReport {
+        let (keyframe_to_surface, keyframes_without_surface) = surfaces.finish();
+        LiveReport {
+            is_realtime: self.is_realtime,
+            images: self.counts.images,
+            images_not_tracked: self.counts.not_tracked,
+            keyframes_thinned: self.thinning.thinned,
+            keyframes_dropped: self.thinning.dropped,
+            poses_dropped: self.thinning.poses_dropped,
+            most_waiting: self.most_waiting,
+            image_to_pose: self.counts.image_to_pose(),
+            keyframe_to_surface,
+            keyframes_without_surface,
+        }
+    }
+}
+
+/// What was left out, once it is known how much.
+pub(super) fn warning(report: &LiveReport) -> Option<Warning> {
+    let (late, dropped) = (report.images_not_tracked, report.keyframes_dropped + report.poses_dropped);
+    let mut parts = Vec::new();
+    if late > 0 {
+        parts.push(format!("{late} of {} images came too late to be tracked", report.images));
+    }
+    if report.keyframes_thinned > 0 {
+        parts.push(format!("{} keyframes near others were left out", report.keyframes_thinned));
+    }
+    if dropped > 0 {
+        parts.push(format!("{dropped} keyframes were left out because the map was behind"));
+    }
+    let message = parts.join(", ");
+    let hint = "the same command without --realtime maps all of the recording";
+    match (parts.is_empty(), late + dropped) {
+        (true, _) => None,
+        (_, 0) => Some(Warning::new("live-left-out", message).hint(hint)),
+        _ => Some(Warning::degraded("live-left-out", message).hint(hint)),
+    }
+}
+
+/// Pushes the recording into the engine, tracked on a thread of its own. `ending` is where the engine's source of poses finds the end.
+pub(super) fn push(
+    context: &Context<'_>,
+    (plan, options): (&Plan, &LiveOptions),
+    ending: &EndingCell,
+    engine: &mut Engine<'_>,
+    readers: &mut Readers<'_>,
+) -> Result<Pushed, Error> {
+    let pool = rayon::ThreadPoolBuilder::new().num_threads(options.odometry_threads).build();
+    let pool = pool.map_err(|e| Error::Usage {
+        what: format!("cannot start {} threads for the odometry: {e}", options.odometry_threads),
+        hint: "give a smaller --threads".into(),
+    })?;
+    let queue = Queue::default();
+    let pose_file = PoseFile::create(context.folder, context.events)?;
+    let tracked = std::thread::scope(|scope| {
+        let track = || {
+            let _closing = Closing(&queue);
+            pool.install(|| track(context, plan, options, &queue, pose_file))
+        };
+        let thread = std::thread::Builder::new().name("odometry".into()).spawn_scoped(scope, track);
+        let thread = thread.map_err(|e| Error::io("start", "the odometry's thread".as_ref(), e))?;
+        let mapped = map(context, &queue, engine, readers);
+        let tracked = thread.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic));
+        // Where the map failed, the odometry only stopped.
+        mapped.and(tracked)
+    })?;
+    let (end, counts, thinning) = tracked;
+    // The cell is new.
+    let _ = ending.set(end);
+    Ok(Pushed { is_realtime: options.is_realtime, counts, thinning, most_waiting: queue.most_images() })
+}
+
+/// The odometry's thread.
+fn track(
+    context: &Context<'_>,
+    plan: &Plan,
+    options: &LiveOptions,
+    queue: &Queue,
+    pose_file: PoseFile<'_>,
+) -> Result<(Ending, Counts, Thinning), Error> {
+    let Context { dataset, config, cancel, .. } = *context;
+    let (poses, _) = plan.poses.open(dataset, config)?;
+    let needs_sensors = poses.as_ref().is_some_and(|p| p.needs_sensors());
+    let unreadable = |stamp: FrameStamp, error: &DatasetError| unreadable(dataset, stamp, error);
+    let mut tracker = Tracker {
+        poses,
+        queue,
+        arrival: if options.is_realtime { Arrival::Stamped(None) } else { Arrival::Taken },
+        thinning: Thinning::new(&config.keyframes),
+        pose_file,
+        unreadable: &unreadable,
+        counts: Counts::default(),
+        waiting: Default::default(),
+    };
+    let end = tracker.run(input::measurements(dataset, needs_sensors), &|| cancel.is_cancelled())?;
+    let Tracker { counts, thinning, pose_file, .. } = tracker;
+    pose_file.finish();
+    Ok((end, counts, thinning))
+}
+
+/// The map's side: what is tracked into the engine, until the odometry ends.
+fn map(
+    context: &Context<'_>,
+    queue: &Queue,
+    engine: &mut Engine<'_>,
+    readers: &mut Readers<'_>,
+) -> Result<(), Error> {
+    let _closing = Closing(queue);
+    let (total, mut done) = (context.dataset.images.len(), 0);
+    while let Some(item) = queue.pop() {
+        match item {
+            Item::Warning(warning) => readers.read(MapEvent::Warning(warning))?,
+            Item::Tracked { images, report } => {
+                images.iter().for_each(|(stamp, at)| readers.arrived(stamp.frame_id, *at));
+                let stamps: Vec<FrameStamp> = images.iter().map(|(stamp, _)| *stamp).collect();
+                let reports = report.into_iter().map(|report| *report).collect();
+                engine.push_tracked(&stamps, reports, &mut |event| readers.read(event))?;
+                done += stamps.len();
+                context.events.emit(&Event::Progress { stage: MAP, done, total });
+            }
+        }
+    }
+    Ok(())
+}
+
+impl Readers<'_> {
+    /// An image arrived that may become a keyframe.
+    fn arrived(&mut self, frame: vidar_core::FrameId, at: Instant) {
+        if let Some(surfaces) = &mut self.surfaces {
+            surfaces.arrived(frame, at);
+        }
+    }
+}

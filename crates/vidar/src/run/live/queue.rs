@@ -1,0 +1,165 @@
+//! The bounded queue between the odometry and the map.
+
+use crate::engine::{FrameStamp, PoseReport};
+use std::collections::VecDeque;
+use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
+use std::time::{Duration, Instant};
+use vidar_core::Warning;
+
+/// Images that wait for the map at most: 13 s at 20 Hz. A chunk that takes that long to predict is no live map.
+pub(super) const CAPACITY: usize = 256;
+/// Reports without images that are kept beyond it, so that the trajectory stays whole: 3 min at 20 Hz, some 40 MB with their keyframes.
+pub(super) const MOST_REPORTS: usize = 4096;
+
+/// What the odometry hands to the map.
+pub(super) enum Item {
+    /// Images that may become keyframes, with when each arrived, and the report that decides the pose of the last one.
+    Tracked { images: Vec<(FrameStamp, Instant)>, report: Option<Box<PoseReport>> },
+    /// Something to say.
+    Warning(Warning),
+}
+
+impl Item {
+    fn images(&self) -> usize {
+        match self {
+            Self::Tracked { images, .. } => images.len(),
+            Self::Warning(_) => 0,
+        }
+    }
+}
+
+/// The queue; both ends may close it.
+#[derive(Default)]
+pub(super) struct Queue {
+    inner: Mutex<Inner>,
+    changed: Condvar,
+}
+
+#[derive(Default)]
+struct Inner {
+    items: VecDeque<Item>,
+    images: usize,
+    most_images: usize,
+    is_closed: bool,
+}
+
+impl Queue {
+    fn lock(&self) -> MutexGuard<'_, Inner> {
+        self.inner.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Images that wait, and items in all.
+    pub fn load(&self) -> (usize, usize) {
+        let inner = self.lock();
+        (inner.images, inner.items.len())
+    }
+
+    /// The most images that ever waited.
+    pub fn most_images(&self) -> usize {
+        self.lock().most_images
+    }
+
+    /// Adds an item at once; whether anybody will take it.
+    pub fn push(&self, item: Item) -> bool {
+        let mut inner = self.lock();
+        if inner.is_closed {
+            return false;
+        }
+        inner.images += item.images();
+        inner.most_images = inner.most_images.max(inner.images);
+        inner.items.push_back(item);
+        self.changed.notify_all();
+        true
+    }
+
+    /// Adds an item once there is room for it; whether anybody will take it.
+    pub fn push_waiting(&self, item: Item) -> bool {
+        let mut inner = self.lock();
+        while inner.items.len() >= CAPACITY && !inner.is_closed {
+            inner = self.changed.wait(inner).unwrap_or_else(PoisonError::into_inner);
+        }
+        drop(inner);
+        self.push(item)
+    }
+
+    /// The next item; none once the queue is closed and empty.
+    pub fn pop(&self) -> Option<Item> {
+        let mut inner = self.lock();
+        while inner.items.is_empty() && !inner.is_closed {
+            inner = self.changed.wait(inner).unwrap_or_else(PoisonError::into_inner);
+        }
+        let item = inner.items.pop_front()?;
+        inner.images -= item.images();
+        self.changed.notify_all();
+        Some(item)
+    }
+
+    /// Nothing more comes, or nobody takes it. Whatever thread ends, the other one is woken.
+    pub fn close(&self) {
+        self.lock().is_closed = true;
+        self.changed.notify_all();
+    }
+
+    /// Waits until it is closed, for `time` at most; whether it is.
+    pub fn is_closed_within(&self, time: Duration) -> bool {
+        let inner = self.lock();
+        let waited = self.changed.wait_timeout_while(inner, time, |inner| !inner.is_closed);
+        waited.map_or(true, |(inner, _)| inner.is_closed)
+    }
+}
+
+/// Closes a queue when it goes, also on the way of an error or a panic.
+pub(super) struct Closing<'a>(pub &'a Queue);
+
+impl Drop for Closing<'_> {
+    fn drop(&mut self) {
+        self.0.close();
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use vidar_core::{CameraId, FrameId, Timestamp};
+
+    fn image(i: u32) -> Item {
+        let stamp =
+            FrameStamp { frame_id: FrameId(i), time: Timestamp::from_nanos(i.into()), camera: CameraId(0) };
+        Item::Tracked { images: vec![(stamp, Instant::now())], report: None }
+    }
+
+    #[test]
+    fn who_may_wait_waits_for_room_and_who_may_not_does_not() {
+        let queue = Queue::default();
+        (0..CAPACITY as u32).for_each(|i| assert!(queue.push(image(i))));
+        assert!(queue.push(image(9999)), "the queue never stops the odometry");
+        assert_eq!((queue.load().0, queue.most_images()), (CAPACITY + 1, CAPACITY + 1));
+        let taken = std::thread::scope(|scope| {
+            let waiting = scope.spawn(|| queue.push_waiting(image(1)) && queue.push_waiting(image(2)));
+            let taken = (0..CAPACITY + 3).filter(|_| queue.pop().is_some()).count();
+            assert!(waiting.join().unwrap());
+            taken
+        });
+        assert_eq!((taken, queue.load()), (CAPACITY + 3, (0, 0)));
+        assert_eq!(queue.most_images(), CAPACITY + 1, "who waits adds nothing above the bound");
+    }
+
+    #[test]
+    fn an_end_that_goes_wakes_the_other_one() {
+        let queue = Queue::default();
+        std::thread::scope(|scope| {
+            let taker = scope.spawn(|| queue.pop().is_none());
+            drop(Closing(&queue));
+            assert!(taker.join().unwrap());
+        });
+        assert!(!queue.push(image(1)) && !queue.push_waiting(image(1)));
+        let full = Queue::default();
+        (0..CAPACITY as u32).for_each(|i| assert!(full.push(image(i))));
+        std::thread::scope(|scope| {
+            let giver = scope.spawn(|| full.push_waiting(image(1)));
+            drop(Closing(&full));
+            assert!(!giver.join().unwrap());
+        });
+        assert!(full.pop().is_some(), "what is in it is still there");
+    }
+}

@@ -1,0 +1,218 @@
+//! The odometry's thread: measurements as they arrive, poses as they are found.
+
+use super::ending::Ending;
+use super::latency::Latency;
+use super::pose_file::PoseFile;
+use super::queue::{Item, Queue};
+use super::thinning::Thinning;
+use crate::engine::{FrameStamp, FrameState, PoseReport, PoseSource};
+use crate::error::Error;
+use crate::input::Measurement;
+use std::collections::VecDeque;
+use std::time::{Duration, Instant};
+use vidar_core::{SensorEvent, Timestamp, Warning};
+use vidar_dataset::DatasetError;
+
+/// An image that is taken up this long after it arrived is not tracked: four images at 20 Hz. The IMU bridges such a gap, while a delay
+/// that grows makes every later pose late.
+const MOST_DELAY: Duration = Duration::from_millis(200);
+
+/// When measurements arrive.
+pub(super) enum Arrival {
+    /// As fast as they are taken.
+    Taken,
+    /// In the rhythm of their stamps, from the first one on.
+    Stamped(Option<(Instant, Timestamp)>),
+}
+
+impl Arrival {
+    /// When a measurement of this time arrives.
+    fn of(&mut self, time: Timestamp) -> Instant {
+        match self {
+            Self::Taken => Instant::now(),
+            Self::Stamped(start) => {
+                let (began, first) = *start.get_or_insert_with(|| (Instant::now(), time));
+                let after = u64::try_from((time - first).nanos()).unwrap_or(0);
+                began + Duration::from_nanos(after)
+            }
+        }
+    }
+
+    fn is_stamped(&self) -> bool {
+        matches!(self, Self::Stamped(_))
+    }
+}
+
+/// The machine of the thread.
+pub(super) struct Tracker<'a> {
+    pub poses: Option<Box<dyn PoseSource + 'a>>,
+    pub queue: &'a Queue,
+    pub arrival: Arrival,
+    pub thinning: Thinning,
+    pub pose_file: PoseFile<'a>,
+    pub unreadable: &'a (dyn Fn(FrameStamp, &DatasetError) -> Warning + Sync),
+    pub counts: Counts,
+    /// Images without a report, with when they arrived.
+    pub waiting: VecDeque<(FrameStamp, Instant)>,
+}
+
+/// What is counted and measured on the way.
+#[derive(Clone, Debug, Default)]
+pub(super) struct Counts {
+    pub images: usize,
+    pub not_tracked: usize,
+    /// From the arrival of an image to its pose, s.
+    seconds: Vec<f32>,
+}
+
+impl Counts {
+    pub fn image_to_pose(&self) -> Option<Latency> {
+        Latency::of(&self.seconds)
+    }
+}
+
+impl Tracker<'_> {
+    /// Takes measurements until they end, `is_cancelled`, or nobody takes the poses. What the odometry says at the end.
+    ///
+    /// # Errors
+    /// What the odometry cannot go on with, or the file of poses could not be written.
+    pub fn run(
+        &mut self,
+        measurements: impl Iterator<Item = Measurement>,
+        is_cancelled: &dyn Fn() -> bool,
+    ) -> Result<Ending, Error> {
+        for measurement in measurements {
+            let arrived = self.arrival.of(time_of(&measurement));
+            if !self.sleep_until(arrived, is_cancelled) || is_cancelled() {
+                break;
+            }
+            if !self.take(measurement, arrived)? {
+                break;
+            }
+        }
+        let ending = self.poses.as_mut().map_or_else(Ending::default, |poses| Ending::of(poses.as_mut()));
+        for report in &ending.reports {
+            self.measure(report)?;
+        }
+        let images = self.waiting.drain(..).collect();
+        self.send(Item::Tracked { images, report: None });
+        Ok(ending)
+    }
+
+    /// Sleeps until a measurement arrives, in steps, so that Ctrl-C and the end of the map are noticed. Whether to go on.
+    fn sleep_until(&self, arrived: Instant, is_cancelled: &dyn Fn() -> bool) -> bool {
+        const STEP: Duration = Duration::from_millis(50);
+        loop {
+            let left = arrived.saturating_duration_since(Instant::now());
+            if left.is_zero() {
+                return true;
+            }
+            if is_cancelled() || self.queue.is_closed_within(left.min(STEP)) {
+                return false;
+            }
+        }
+    }
+
+    /// Takes one measurement; whether anybody wants more.
+    fn take(&mut self, measurement: Measurement, arrived: Instant) -> Result<bool, Error> {
+        let reports = match measurement {
+            Measurement::Event(SensorEvent::Image(frame)) => {
+                let stamp = FrameStamp { frame_id: frame.id, time: frame.time, camera: frame.camera };
+                self.image(stamp, arrived);
+                if self.arrival.is_stamped() && arrived.elapsed() > MOST_DELAY {
+                    self.counts.not_tracked += 1;
+                    self.stamp(&stamp)
+                } else {
+                    self.event(SensorEvent::Image(frame))?
+                }
+            }
+            Measurement::Event(event) => self.event(event)?,
+            Measurement::Stamp(stamp) => {
+                self.image(stamp, arrived);
+                self.stamp(&stamp)
+            }
+            Measurement::Unreadable(stamp, error) => {
+                if !self.send(Item::Warning((self.unreadable)(stamp, &error))) {
+                    return Ok(false);
+                }
+                self.image(stamp, arrived);
+                self.stamp(&stamp)
+            }
+        };
+        if self.poses.is_none() {
+            let images = self.waiting.drain(..).collect();
+            return Ok(self.send(Item::Tracked { images, report: None }));
+        }
+        for report in reports {
+            if !self.deliver(report)? {
+                return Ok(false);
+            }
+        }
+        Ok(true)
+    }
+
+    fn image(&mut self, stamp: FrameStamp, arrived: Instant) {
+        self.counts.images += 1;
+        self.waiting.push_back((stamp, arrived));
+    }
+
+    fn event(&mut self, event: SensorEvent) -> Result<Vec<PoseReport>, Error> {
+        self.poses.as_mut().map_or_else(|| Ok(Vec::new()), |poses| poses.push(event))
+    }
+
+    fn stamp(&mut self, stamp: &FrameStamp) -> Vec<PoseReport> {
+        self.poses.as_mut().map_or_else(Vec::new, |poses| poses.push_stamp(stamp))
+    }
+
+    /// Measures and writes the pose of a report.
+    fn measure(&mut self, report: &PoseReport) -> Result<(), Error> {
+        let PoseReport::Posed { state, .. } = report else { return Ok(()) };
+        let image = self.waiting.iter().find(|(stamp, _)| stamp.frame_id == state.frame_id);
+        self.counts.seconds.extend(image.map(|(_, arrived)| arrived.elapsed().as_secs_f32()));
+        self.pose_file.add(state)
+    }
+
+    /// Hands a report over, with the images up to its time that may become keyframes.
+    fn deliver(&mut self, report: PoseReport) -> Result<bool, Error> {
+        self.measure(&report)?;
+        let (time, pose, joins) = match &report {
+            PoseReport::Posed { state, joined, .. } => {
+                let FrameState { time, world_from_camera, .. } = *state;
+                (time, Some(world_from_camera), joined.is_some())
+            }
+            PoseReport::NotPosed { time } => (*time, None, false),
+        };
+        let count = self.waiting.iter().take_while(|(stamp, _)| stamp.time <= time).count();
+        let mut images: Vec<(FrameStamp, Instant)> = self.waiting.drain(..count).collect();
+        let mut report = Some(Box::new(report));
+        if self.arrival.is_stamped() {
+            let (waiting, items) = self.queue.load();
+            if let Some(warning) = self.thinning.observe(waiting) {
+                self.send(Item::Warning(warning));
+            }
+            if !self.thinning.passes(pose.as_ref()) {
+                images.clear();
+            }
+            if !self.thinning.keeps_report(items, joins) {
+                report = None;
+                images.clear();
+            }
+        }
+        Ok(self.send(Item::Tracked { images, report }))
+    }
+
+    /// Hands something over: at once where time does not wait; else when there is room.
+    fn send(&self, item: Item) -> bool {
+        match self.arrival.is_stamped() {
+            true => self.queue.push(item),
+            false => self.queue.push_waiting(item),
+        }
+    }
+}
+
+fn time_of(measurement: &Measurement) -> Timestamp {
+    match measurement {
+        Measurement::Event(event) => event.time(),
+        Measurement::Stamp(stamp) | Measurement::Unreadable(stamp, _) => stamp.time,
+    }
+}
