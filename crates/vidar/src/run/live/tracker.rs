@@ -197,6 +197,10 @@ impl Tracker<'_> {
                 report = None;
                 images.clear();
             }
+            if report.is_none() && images.is_empty() {
+                // Nothing is left of it; an empty item would wait like any other.
+                return Ok(!self.queue.is_closed_within(Duration::ZERO));
+            }
         }
         Ok(self.send(Item::Tracked { images, report }))
     }
@@ -214,5 +218,51 @@ fn time_of(measurement: &Measurement) -> Timestamp {
     match measurement {
         Measurement::Event(event) => event.time(),
         Measurement::Stamp(stamp) | Measurement::Unreadable(stamp, _) => stamp.time,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::queue::{CAPACITY, MOST_REPORTS};
+    use super::*;
+    use crate::events::Events;
+    use crate::run_folder::{OutputLocation, RunFolder};
+    use vidar_core::{CameraId, FrameId};
+
+    /// A map that takes nothing, however long the recording goes on.
+    #[test]
+    fn behind_a_map_that_stands_still_no_more_waits_than_is_stated() {
+        let parent = tempfile::tempdir().unwrap();
+        let place = OutputLocation::Exact { path: parent.path().join("run"), force: false };
+        let folder = RunFolder::create(&place).unwrap();
+        let (events, queue) = (Events::none(), Queue::default());
+        let unreadable = |_: FrameStamp, _: &DatasetError| Warning::new("unread", "not read");
+        let mut tracker = Tracker {
+            poses: None,
+            queue: &queue,
+            arrival: Arrival::Stamped(None),
+            thinning: Thinning::new(&vidar_align::keyframe_selection::KeyframeConfig::default()),
+            pose_file: PoseFile::create(&folder, &events).unwrap(),
+            unreadable: &unreadable,
+            counts: Counts::default(),
+            waiting: VecDeque::new(),
+        };
+        for i in 0..3 * MOST_REPORTS as u32 {
+            let time = Timestamp::from_nanos(i64::from(i) * 50_000_000);
+            tracker.image(FrameStamp { frame_id: FrameId(i), time, camera: CameraId(0) }, Instant::now());
+            assert!(tracker.deliver(PoseReport::NotPosed { time }).unwrap());
+        }
+        let (images, items) = queue.load();
+        assert!(images <= CAPACITY, "{images} images wait");
+        // Warnings are few: one for each change of what is left out.
+        assert!((MOST_REPORTS..MOST_REPORTS + 8).contains(&items), "{items} items wait");
+        assert_eq!(tracker.thinning.poses_dropped + items, 3 * MOST_REPORTS + warnings(&queue));
+        assert!(!tracker.deliver(PoseReport::NotPosed { time: Timestamp::from_nanos(0) }).unwrap());
+    }
+
+    /// Empties and closes the queue; how many of its items were warnings.
+    fn warnings(queue: &Queue) -> usize {
+        queue.close();
+        std::iter::from_fn(|| queue.pop()).filter(|item| matches!(item, Item::Warning(_))).count()
     }
 }
