@@ -93,7 +93,7 @@ pub struct GeometryConfig {
     /// The network that `auto` bends onto measured depth where nothing is measured: one of `vidar model list`, `recorded:DIR`, or
     /// `none`, which interpolates (as good as `da3-nano`, and it costs nothing). `auto` only; `model.dir` comes first.
     pub fill_network: String,
-    /// Keyframes that are predicted together. Larger chunks need more memory and are more consistent.
+    /// Keyframes that are predicted together, with stereo at least 2. Larger chunks need more memory and are more consistent.
     pub chunk_keyframes: usize,
     /// Keyframes that a chunk shares with the one before it, for the overlap constraint between them. Networks and recordings only;
     /// smaller than the chunk.
@@ -397,6 +397,10 @@ impl Config {
         positive("output.depth_units_per_metre", self.output.depth_units_per_metre)?;
         let (chunk, overlap) = (self.geometry.chunk_keyframes, self.geometry.overlap_keyframes);
         let overlaps = !geometry::source(self).is_ok_and(|s| s.is_by_stereo());
+        if !overlaps && chunk < 2 {
+            // A chunk of one keyframe has no pair to estimate depth from but those of its context, and is lost.
+            return bad("geometry.chunk_keyframes must be at least 2 with stereo, found 1".into());
+        }
         if overlaps && overlap >= chunk {
             return bad(format!(
                 "geometry.overlap_keyframes must be smaller than geometry.chunk_keyframes ({chunk}), found {overlap}"

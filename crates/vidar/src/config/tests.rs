@@ -85,6 +85,7 @@ fn wrong_kinds_and_ranges_name_the_key() {
     assert!(reason("output.images=1").contains("true or false"));
     assert!(reason("input.stride=0").contains("input.stride"));
     assert!(reason("keyframes.min_rotation_deg=-2").contains("keyframes.min_rotation_deg"));
+    assert!(reason("geometry.chunk_keyframes=1").contains("at least 2 with stereo"));
     assert!(reason("geometry.source=magic").contains("geometry.source"));
     assert!(reason("geometry").contains("has no '='"));
 }
