@@ -6,10 +6,13 @@ use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 use std::collections::BTreeMap;
 use std::collections::btree_map::Entry;
-use vidar_core::{Health, LieGroup, Timestamp};
+use vidar_core::{Health, LieGroup, Timestamp, Warning};
 use vidar_odometry::bundle_adjustment::Adjusted;
 use vidar_odometry::initialization::InitFailureReason;
 use vidar_odometry::{Joined, LossReason, OdometryOutput, Status, Tracking};
+
+/// States that come after contradictions are doubted where less than this share has health OK.
+const DOUBTFUL_HEALTH: f64 = 0.5;
 
 /// Statements of the odometry, summed up image by image.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
@@ -147,6 +150,20 @@ impl TrackQuality {
     pub fn longest(&self) -> Option<&SegmentQuality> {
         let longest = self.segments.iter().max_by_key(|(id, s)| (s.images, std::cmp::Reverse(**id)));
         longest.map(|(_, s)| s).filter(|s| s.images >= 2)
+    }
+
+    /// Whether sensors contradicted each other, nothing has checked the states since (no adjustment), and they are not healthy either: a
+    /// clock 200 ms off once gave a scale 37 % off like that.
+    pub fn is_doubtful(&self) -> bool {
+        self.contradicts() && !self.is_adjusted() && self.healthy() < DOUBTFUL_HEALTH
+    }
+
+    /// The degradation that doubtful states are.
+    pub(crate) fn warning(&self) -> Option<Warning> {
+        let is_told = self.is_doubtful() && self.longest().is_some();
+        let why = self.why_not_started().filter(|_| is_told)?;
+        let hint = "`vidar calibrate` finds what a recording shows of its calibration; docs/failures.md lists causes";
+        Some(Warning::degraded("sensors-contradict", format!("before it started: {why}")).hint(hint))
     }
 
     /// σ(ln s) of the longest segment, without what no estimate sees; infinite where it is not observed.

@@ -85,7 +85,8 @@ impl Findings {
                 100.0 * quality.covered()
             )
         });
-        self.when(quality.contradicts(), Level::Caution, || {
+        let contradicted = if quality.is_doubtful() { Level::Bad } else { Level::Caution };
+        self.when(quality.contradicts(), contradicted, || {
             let why = quality.why_not_started().unwrap_or_default();
             format!("before it started: {why}")
         });
@@ -304,5 +305,24 @@ mod tests {
         findings.add(Level::Bad, "b");
         let verdict = findings.verdict(Some("F 0.9".into()));
         assert_eq!((verdict.level, verdict.reasons.join(" ")), (Level::Bad, "b a F 0.9".to_owned()));
+    }
+
+    #[test]
+    fn contradictions_that_nothing_checked_are_bad() {
+        let level = |adjusted: serde_json::Value| {
+            let mut quality = serde_json::to_value(TrackQuality::default()).unwrap();
+            quality["contradictions"] = 48.into();
+            quality["waits"] = 78.into();
+            quality["adjusted"] = adjusted;
+            let mut findings = Findings::default();
+            findings.track(&serde_json::from_value(quality).unwrap());
+            findings.verdict(Some("ATE".into())).level
+        };
+        assert_eq!(level(serde_json::Value::Null), Level::Bad);
+        let time = serde_json::to_value(vidar_core::Timestamp::from_nanos(0)).unwrap();
+        let adjusted = serde_json::json!({
+            "images": 100, "first": time, "last": time, "scale_std": 0.01, "inertial_chi2": 0.1
+        });
+        assert_eq!(level(adjusted), Level::Caution);
     }
 }

@@ -211,7 +211,7 @@ impl PoseSource for OdometryPoses {
         let lost = |(time, reason): &(Timestamp, String)| {
             Warning::degraded("track-lost", format!("at {time} s: {reason}")).hint(hint)
         };
-        self.lost.iter().map(lost).collect()
+        self.lost.iter().map(lost).chain(self.quality.warning()).collect()
     }
 
     fn why_no_pose(&self) -> String {

@@ -236,6 +236,7 @@ impl Tracked {
                 "`vidar inspect` shows calibration and units in plain words; docs/failures.md lists causes";
             warnings.push(Warning::degraded(NEVER_STARTED, text).hint(hint));
         }
+        warnings.extend(self.quality.warning());
         if let (Some(reason), true) = (&self.not_adjusted, self.quality.longest().is_some()) {
             warnings.push(Warning::new("not-adjusted", format!("the live states are final: {reason}")));
         }
