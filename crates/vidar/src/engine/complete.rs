@@ -10,6 +10,7 @@ use super::events::MapEvent;
 use super::fuse::SurfaceFusion;
 use super::placed::{Shaped, placed_and_shaped};
 use super::setup::{PredictionId, PredictionStore};
+use super::views::blanked;
 use crate::error::Error;
 use rayon::prelude::*;
 use vidar_align::Placement;
@@ -91,7 +92,10 @@ impl<'m> Completion<'m> {
         let one = |v: &Shaped| {
             let completed = self.with_evidence(v, |evidence| complete(&v.view, evidence, &self.spread));
             let completed = completed.map_err(unfit)?;
-            v.mask.as_ref().map_or(Ok(completed.clone()), |mask| without(&completed, mask))
+            match &v.mask {
+                Some(mask) => without(&completed, mask),
+                None => Ok(completed),
+            }
         };
         // Collected one by one, so that the error is that of the first bad view.
         let completed: Vec<_> = views.par_iter().map(one).collect();
@@ -115,11 +119,8 @@ impl<'m> Completion<'m> {
 /// A completed view without the pixels that are not to be used.
 fn without(view: &AlignedView, mask: &Image<bool>) -> Result<AlignedView, Error> {
     let k = view.intrinsics();
-    let unless = |image: &Image<f32>, value: f32| {
-        Image::from_fn(k.width, k.height, |x, y| if mask[(x, y)] { value } else { image[(x, y)] })
-    };
-    let depth = MetricDepth::new(unless(view.depth().image(), f32::NAN));
-    let confidence = Confidence::new(unless(view.confidence().image(), 0.0));
+    let depth = MetricDepth::new(blanked(view.depth().image(), mask, f32::NAN));
+    let confidence = Confidence::new(blanked(view.confidence().image(), mask, 0.0));
     let pose = *view.world_from_camera();
     let mut out =
         AlignedView::new(view.frame_id(), view.time(), pose, *k, depth, confidence).map_err(unfit)?;
@@ -127,8 +128,7 @@ fn without(view: &AlignedView, mask: &Image<bool>) -> Result<AlignedView, Error>
         out = out.with_color(color.clone()).map_err(unfit)?;
     }
     if let Some(origin) = view.origin() {
-        let at = |x: usize, y: usize| if mask[(x, y)] { DepthOrigin::NONE } else { origin[(x, y)] };
-        out = out.with_origin(Image::from_fn(k.width, k.height, at)).map_err(unfit)?;
+        out = out.with_origin(blanked(origin, mask, DepthOrigin::NONE)).map_err(unfit)?;
     }
     Ok(out)
 }

@@ -5,7 +5,7 @@ use super::setup::{
     GeometrySource, ImageSource, PlaceDescriber, PredictedFrame, Prediction, PredictionId, PredictionStore,
 };
 use super::stereo_landmarks::StereoLandmarks;
-use super::views::{MaskedView, Taken, ViewWindow};
+use super::views::{MaskedView, Taken, ViewWindow, blanked};
 use crate::chunks::StoredChunk;
 use crate::error::Error;
 use rayon::prelude::*;
@@ -241,11 +241,8 @@ fn mask(stored: &mut StoredChunk, views: &[ChunkView], masks: &[Option<Image<boo
         .map(|view| {
             let (width, height) = (view.intrinsics.width, view.intrinsics.height);
             let mask = at_size(of(view.frame_id)?, width, height);
-            let masked = |image: &Image<f32>, value: f32| {
-                Image::from_fn(width, height, |x, y| if mask[(x, y)] { value } else { image[(x, y)] })
-            };
-            view.depth = RelativeDepth::new(masked(view.depth.image(), f32::NAN));
-            view.confidence = Confidence::new(masked(view.confidence.image(), 0.0));
+            view.depth = RelativeDepth::new(blanked(view.depth.image(), &mask, f32::NAN));
+            view.confidence = Confidence::new(blanked(view.confidence.image(), &mask, 0.0));
             Some(mask)
         })
         .collect();

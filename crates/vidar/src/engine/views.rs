@@ -14,6 +14,11 @@ const LEAST_SHIFT_PX: f64 = 0.25;
 /// A view with what of it is not to be used: `true` there; `None` where all of it is.
 pub type MaskedView = (ChunkView, Option<Image<bool>>);
 
+/// An image with `value` where the mask is `true`.
+pub fn blanked<T: Copy>(image: &Image<T>, mask: &Image<bool>, value: T) -> Image<T> {
+    Image::from_fn(image.width(), image.height(), |x, y| if mask[(x, y)] { value } else { image[(x, y)] })
+}
+
 /// Views that were handed out.
 pub struct Taken {
     /// The views.
