@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 use vidar::core::{CameraId, FrameImage, ImuNoise, SensorEvent, So3, Timestamp};
 use vidar::da3::{Da3Options, InferOptions, Inputs, Precision};
-use vidar::dataset::{CameraFlag, Dataset, OpenOptions};
+use vidar::dataset::{CameraFlag, Recording, OpenOptions};
 use vidar::models::bundled;
 use vidar::odometry_stage::{Odometry, OdometryConfig, OdometryOutput};
 use vidar::synth::{SynthConfig, write_sequence};
@@ -37,7 +37,7 @@ fn library_folder() -> PathBuf {
 }
 
 /// A flight of six seconds as the example reads it.
-fn flight(folder: &Path) -> Dataset {
+fn flight(folder: &Path) -> Recording {
     let config = SynthConfig {
         duration_secs: 6.0,
         camera_rate_hz: 20.0,
@@ -72,7 +72,7 @@ fn flight(folder: &Path) -> Dataset {
 }
 
 /// The states that the Rust library makes of the same events, in the example's order.
-fn states(dataset: &Dataset) -> Vec<OdometryOutput> {
+fn states(dataset: &Recording) -> Vec<OdometryOutput> {
     let config = OdometryConfig { max_landmarks: 120, ..OdometryConfig::default() };
     let mut rig = dataset.rig.clone();
     rig.imu = Some(ImuNoise::EUROC);

@@ -10,15 +10,15 @@ use vidar::Error;
 const MAX_BYTES: u64 = 64 << 30;
 
 /// Where a recording lies; a copy of standard input is removed with it.
-pub struct Recording {
+pub struct Spooled {
     pub path: PathBuf,
     _copy: Option<TempDir>,
 }
 
 /// The recording at a path, or on standard input for `-`.
-pub fn recording(path: &Path) -> Result<Recording, Error> {
+pub fn recording(path: &Path) -> Result<Spooled, Error> {
     if path != Path::new("-") {
-        return Ok(Recording { path: path.to_owned(), _copy: None });
+        return Ok(Spooled { path: path.to_owned(), _copy: None });
     }
     let input = std::io::stdin();
     if input.is_terminal() {
@@ -40,7 +40,7 @@ pub fn refuse(path: &Path) -> Result<(), Error> {
     Err(Error::Usage { what, hint: "write it to a file first, such as `vidar convert - drive.mcap`".into() })
 }
 
-fn copy(input: impl Read, limit: u64) -> Result<Recording, Error> {
+fn copy(input: impl Read, limit: u64) -> Result<Spooled, Error> {
     let temporary = std::env::temp_dir();
     let folder =
         tempfile::Builder::new().prefix("vidar-").tempdir().map_err(|e| Error::io("write", &temporary, e))?;
@@ -52,7 +52,7 @@ fn copy(input: impl Read, limit: u64) -> Result<Recording, Error> {
         let what = format!("standard input holds more than {limit} bytes");
         return Err(Error::Usage { what, hint: "write it to a file and give that".into() });
     }
-    Ok(Recording { path, _copy: Some(folder) })
+    Ok(Spooled { path, _copy: Some(folder) })
 }
 
 #[cfg(test)]

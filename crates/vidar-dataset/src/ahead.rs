@@ -1,9 +1,9 @@
 //! Images of a recording, decoded ahead of who takes them: several at a time, handed out in their order.
 
-use crate::dataset::{Dataset, ImageEntry};
 use crate::error::DatasetError;
 use crate::isolated::BROKE_DOWN;
 use crate::location::{Location, Media};
+use crate::recording::{ImageEntry, Recording};
 use std::collections::VecDeque;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
@@ -26,7 +26,7 @@ struct Job {
     done: SyncSender<Loaded>,
 }
 
-/// Threads that decode images of one recording. Every image is what [`Dataset::load_image`] gives, whatever the number of threads.
+/// Threads that decode images of one recording. Every image is what [`Recording::load_image`] gives, whatever the number of threads.
 struct Decoders {
     jobs: Option<SyncSender<Job>>,
     is_over: Arc<AtomicBool>,
@@ -82,16 +82,16 @@ fn broke_down(location: &Location) -> DatasetError {
     DatasetError::BadImage { path: location.place(), reason: BROKE_DOWN.into() }
 }
 
-/// Iterator of [`Dataset::images_ahead`].
+/// Iterator of [`Recording::images_ahead`].
 pub struct ImagesAhead<'a, I> {
-    dataset: &'a Dataset,
+    dataset: &'a Recording,
     entries: I,
     /// `None` until the first image is asked for.
     decoders: Option<Decoders>,
     asked: VecDeque<(&'a ImageEntry, Receiver<Loaded>)>,
 }
 
-impl Dataset {
+impl Recording {
     /// The pixels of images in the order of `entries`, decoded on threads of their own ahead of who takes them. At most eight are in memory
     /// beside the one that is taken; a picture of a video, of which a decoder gives one after the other, is converted ahead, two at most.
     pub fn images_ahead<'a, I: Iterator<Item = &'a ImageEntry>>(&'a self, entries: I) -> ImagesAhead<'a, I> {

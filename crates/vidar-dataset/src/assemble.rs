@@ -1,10 +1,10 @@
 //! Small steps of completing a dataset: its name, existing files, a guessed camera, the selected part.
 
-use crate::dataset::{CalibrationSource, DEPTH_TOLERANCE, Dataset, ImageEntry};
 use crate::draft::image_range;
 use crate::error::{DatasetError, io_error};
 use crate::location::{Location, Media};
 use crate::options::OpenOptions;
+use crate::recording::{CalibrationSource, DEPTH_TOLERANCE, ImageEntry, Recording};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use vidar_core::{CameraModel, Duration, Pinhole, Timestamp, Warning};
@@ -153,7 +153,7 @@ pub(crate) fn guessed_model(
 const LEAD_IN: Duration = Duration::from_millis(3000);
 
 /// Applies start, end and stride.
-pub(crate) fn cut(dataset: &mut Dataset, options: &OpenOptions) -> Result<(), DatasetError> {
+pub(crate) fn cut(dataset: &mut Recording, options: &OpenOptions) -> Result<(), DatasetError> {
     let Some((first, last)) = image_range(&dataset.images) else { return Ok(()) };
     let from = options.start.map_or(first, |s| first + s);
     let to = options.end.map_or(last, |e| first + e);

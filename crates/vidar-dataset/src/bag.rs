@@ -6,7 +6,7 @@ use crate::convert::facts::{self, Facts};
 use crate::draft::{Draft, DraftCamera, DraftDepth};
 use crate::error::DatasetError;
 use crate::location::locate;
-use crate::options::{DatasetKind, OpenOptions, PoseUse};
+use crate::options::{OpenOptions, PoseUse, RecordingKind};
 use crate::source::read_file_up_to;
 use crate::topics::{self, ImuTopics, problem};
 use crate::transforms::{Frames, rigid};
@@ -53,7 +53,7 @@ pub(crate) fn open(path: &Path, reason: String, options: &OpenOptions) -> Result
     for (number, name) in &choice.others {
         reason.push_str(&format!(", not those of {name} (--camera {number})"));
     }
-    let mut draft = Draft::new(DatasetKind::Bag, path, reason);
+    let mut draft = Draft::new(RecordingKind::Bag, path, reason);
     draft.warnings.extend(bag.warnings().iter().cloned());
     draft.warnings.extend(choice.warnings.iter().cloned());
     let unused = topics::unused_poses(&bag, &choice);

@@ -1,9 +1,9 @@
 //! The camera of a bag: `CameraInfo`, and what VIDAR's own conversions leave beside it.
 
 use crate::convert::facts::{self, Facts};
-use crate::dataset::CalibrationSource;
 use crate::draft::Draft;
 use crate::error::DatasetError;
+use crate::recording::CalibrationSource;
 use crate::topics::Choice;
 use nalgebra::{Matrix3, Vector3};
 use vidar_bag::{Bag, CameraInfo, Message, Role, Topic, role_of};

@@ -204,7 +204,7 @@ pub(crate) fn check_imu(imu: &[ImuSample], place: &Path, notes: &mut Vec<Warning
 
 /// Checks that there are IMU samples before and after every image.
 pub(crate) fn check_imu_coverage(
-    images: &[crate::dataset::ImageEntry],
+    images: &[crate::recording::ImageEntry],
     imu: &[ImuSample],
     place: &Path,
     notes: &mut Vec<Warning>,

@@ -3,11 +3,13 @@
 use crate::assemble::{cut, guessed_model, keep_existing, keep_one_size, name_of};
 use crate::camera_flag::with_size;
 use crate::checks::{self, IMAGE_GAP_FLOOR};
-use crate::dataset::{CalibrationSource, Dataset, DepthEntry, DepthSensor, ExternalTrajectory, ImageEntry};
 use crate::error::DatasetError;
 use crate::location::{Location, Media};
-use crate::options::{DatasetKind, OpenOptions};
+use crate::options::{OpenOptions, RecordingKind};
 use crate::parse::{self, Source};
+use crate::recording::{
+    CalibrationSource, DepthEntry, DepthSensor, ExternalTrajectory, ImageEntry, Recording,
+};
 use crate::rig_checks;
 use crate::source::read_file_up_to;
 use crate::trajectory_file::{self, ReadPoses};
@@ -61,7 +63,7 @@ pub(crate) struct DraftDepth {
 
 /// The output of a reader.
 pub(crate) struct Draft {
-    pub kind: DatasetKind,
+    pub kind: RecordingKind,
     pub reason: String,
     pub root: PathBuf,
     pub cameras: Vec<DraftCamera>,
@@ -72,7 +74,7 @@ pub(crate) struct Draft {
     pub images: Vec<(Timestamp, Location)>,
     pub imu: Vec<ImuSample>,
     pub imu_noise: Option<ImuNoise>,
-    pub accelerometer: Vec<crate::dataset::AccelSample>,
+    pub accelerometer: Vec<crate::recording::AccelSample>,
     pub depths: Vec<(Timestamp, Location)>,
     pub depth: Option<DraftDepth>,
     pub ground_truth: Option<(Trajectory, PathBuf)>,
@@ -88,7 +90,7 @@ pub(crate) struct Draft {
 }
 
 impl Draft {
-    pub(crate) fn new(kind: DatasetKind, root: &Path, reason: String) -> Self {
+    pub(crate) fn new(kind: RecordingKind, root: &Path, reason: String) -> Self {
         Self {
             kind,
             reason,
@@ -129,7 +131,7 @@ impl Draft {
     }
 
     /// Completes the dataset. The order of the steps follows their dependencies.
-    pub(crate) fn finish(mut self, options: &OpenOptions) -> Result<Dataset, DatasetError> {
+    pub(crate) fn finish(mut self, options: &OpenOptions) -> Result<Recording, DatasetError> {
         for path in &options.calibration {
             self.apply_calibration(path)?;
         }
@@ -137,7 +139,7 @@ impl Draft {
         self.complete_model(options, &mut images)?;
         self.report_unread_calibrations();
         let chosen = CameraId(self.chosen as u32);
-        let mut dataset = Dataset {
+        let mut dataset = Recording {
             name: name_of(&self.root),
             kind: self.kind,
             reason: self.reason.clone(),
@@ -351,7 +353,7 @@ impl Draft {
         camera.source = CalibrationSource::File(path.to_path_buf());
     }
 
-    fn complete_depth(&mut self, options: &OpenOptions, dataset: &mut Dataset) -> Result<(), DatasetError> {
+    fn complete_depth(&mut self, options: &OpenOptions, dataset: &mut Recording) -> Result<(), DatasetError> {
         let Some(mut depth) = self.depth.take() else { return Ok(()) };
         let mut depths = std::mem::take(&mut self.depths);
         let notes = &mut dataset.warnings;
@@ -431,7 +433,7 @@ impl Draft {
     fn read_external_trajectory(
         &mut self,
         options: &OpenOptions,
-        dataset: &mut Dataset,
+        dataset: &mut Recording,
     ) -> Result<(), DatasetError> {
         let Some(path) = &options.trajectory else {
             if let Some((trajectory, source)) = self.trajectory.take() {
@@ -473,7 +475,11 @@ fn looks_like_calibration(name: &str) -> bool {
 }
 
 /// Without an IMU there is no IMU frame: poses that a format calls the IMU's are then the chosen camera's.
-fn with_known_body(found: ReadPoses, path: &Path, dataset: &mut Dataset) -> Result<Trajectory, DatasetError> {
+fn with_known_body(
+    found: ReadPoses,
+    path: &Path,
+    dataset: &mut Recording,
+) -> Result<Trajectory, DatasetError> {
     if !found.body_is_assumed {
         return Ok(found.trajectory);
     }

@@ -3,13 +3,13 @@
 //! `T_BS` of each `sensor.yaml` maps sensor coordinates to the body. VIDAR's body is the IMU, so all sensor poses are
 //! converted to be relative to `imu0`, which in EuRoC's own recordings is the body.
 
-use crate::dataset::CalibrationSource;
 use crate::draft::{Draft, DraftCamera, DraftDepth};
 use crate::error::{DatasetError, io_error};
 use crate::folder::{images_in, names_in};
 use crate::location;
-use crate::options::{DatasetKind, OpenOptions, TimeUnit, TrajectoryFormat, TrajectoryReadOptions};
+use crate::options::{OpenOptions, RecordingKind, TimeUnit, TrajectoryFormat, TrajectoryReadOptions};
 use crate::parse::{self, EurocSensor, Source, UnitRule};
+use crate::recording::CalibrationSource;
 use crate::trajectory_file::{ReadPoses, read_poses};
 use std::path::{Path, PathBuf};
 use vidar_core::{
@@ -87,7 +87,7 @@ fn camera_numbers(root: &Path) -> Vec<u32> {
 
 /// Reads the layout.
 pub(crate) fn open(path: &Path, layout: EurocLayout, options: &OpenOptions) -> Result<Draft, DatasetError> {
-    let mut draft = Draft::new(DatasetKind::EurocAsl, &layout.root, layout.reason.clone());
+    let mut draft = Draft::new(RecordingKind::EurocAsl, &layout.root, layout.reason.clone());
     let body_from_imu = read_imu(&mut draft, options)?;
     read_cameras(&mut draft, path, &layout, &body_from_imu, options)?;
     read_tum_vi_calibration(&mut draft)?;

@@ -1,21 +1,21 @@
 //! Merging the sensors of a dataset into one stream in the order of time.
 
-use crate::dataset::{Dataset, ImageEntry};
 use crate::error::DatasetError;
+use crate::recording::{ImageEntry, Recording};
 use vidar_core::{Frame, FrameImage, SensorEvent, StampedPose};
 
 /// How far the stream of a dataset was read; a new one stands before the first event.
 ///
-/// It borrows nothing, so that a stream can be kept beside the dataset that it belongs to ([`Dataset::next_event`]).
+/// It borrows nothing, so that a stream can be kept beside the dataset that it belongs to ([`Recording::next_event`]).
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct EventCursor {
     /// Samples taken of IMU, ground truth, depth and images: the order at equal times.
     taken: [usize; 4],
 }
 
-impl Dataset {
+impl Recording {
     /// The event at the cursor, which moves past it, also past one that cannot be read; `None` at the end. An image is decoded when it is the
-    /// event; [`Dataset::events`] decodes ahead.
+    /// event; [`Recording::events`] decodes ahead.
     ///
     /// # Errors
     /// An image or a depth image cannot be read.

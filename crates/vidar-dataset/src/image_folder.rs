@@ -1,15 +1,15 @@
 //! Images in one folder, in natural order, with a file of times, or times as names, or neither.
 
-use crate::dataset::CalibrationSource;
 use crate::draft::Draft;
 use crate::error::{DatasetError, io_error};
 use crate::folder::{
     MAX_NAME_STEP, first_file, images_in, names_in, numbers_of, stem, synthetic_time, synthetic_warning,
 };
 use crate::location::files;
-use crate::options::{DatasetKind, OpenOptions};
+use crate::options::{OpenOptions, RecordingKind};
 use crate::parse::units::decide_unit;
 use crate::parse::{self, PhotoExif, Source, UnitRule};
+use crate::recording::CalibrationSource;
 use crate::seven_scenes::checked_pinhole;
 use std::collections::HashMap;
 use std::io::Read;
@@ -38,7 +38,7 @@ pub(crate) fn open(
     reason: String,
     options: &OpenOptions,
 ) -> Result<Draft, DatasetError> {
-    let mut draft = Draft::new(DatasetKind::ImageFolder, path, reason);
+    let mut draft = Draft::new(RecordingKind::ImageFolder, path, reason);
     draft.image_list = folder.to_path_buf();
     let names = images_in(folder)?;
     if names.is_empty() {

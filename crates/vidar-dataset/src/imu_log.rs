@@ -5,16 +5,16 @@
 //! video), Sensor Logger, and others whose header names its columns. Frames get the times of the log where there is one, because a
 //! video's own begin at zero.
 
-use crate::dataset::CalibrationSource;
 use crate::draft::Draft;
 use crate::error::DatasetError;
 use crate::folder::{images_in, names_in};
 use crate::image_folder;
 use crate::inertial::{ImuFile, imu_file_at, read_imu};
 use crate::location::files;
-use crate::options::{DatasetKind, OpenOptions};
+use crate::options::{OpenOptions, RecordingKind};
 use crate::parse::{self, Source, UnitRule};
 use crate::phone;
+use crate::recording::CalibrationSource;
 use crate::video::{self, names_of_videos, take_frames};
 use crate::wrong_thing;
 use std::path::{Path, PathBuf};
@@ -154,7 +154,7 @@ fn tables_of(folder: &Path) -> Option<Vec<ImuFile>> {
 
 /// Reads the recording.
 pub(crate) fn open(path: &Path, log: Log, options: &OpenOptions) -> Result<Draft, DatasetError> {
-    let mut draft = Draft::new(DatasetKind::ImuLog, path, log.reason.clone());
+    let mut draft = Draft::new(RecordingKind::ImuLog, path, log.reason.clone());
     let tables: Vec<PathBuf> = log.tables.iter().map(|t| t.path.clone()).collect();
     let logged = logged_times(&mut draft, &log.folder, &tables, options)?;
     let mut quarter_turns = 0;

@@ -3,14 +3,14 @@
 //! Images are rectified. A line `PN: …` of `calib.txt` is the projection of camera N's image, K·[I | t], with t the position of camera 0
 //! in camera N; poses are `world_from_camera` of camera 0 (Geiger et al., "Vision meets Robotics", 2013, and the development kit).
 
-use crate::dataset::CalibrationSource;
 use crate::draft::{Draft, DraftCamera};
 use crate::error::DatasetError;
 use crate::folder::{images_in, names_in};
 use crate::image_folder::images_by_list;
 use crate::location::files;
-use crate::options::{DatasetKind, OpenOptions, TrajectoryFormat, TrajectoryReadOptions};
+use crate::options::{OpenOptions, RecordingKind, TrajectoryFormat, TrajectoryReadOptions};
 use crate::parse::{self, ProjectionMatrix, Source};
+use crate::recording::CalibrationSource;
 use crate::trajectory_file::{ReadPoses, read_poses};
 use std::path::{Path, PathBuf};
 use vidar_core::{BodyFrame, CameraId, CameraModel, LieGroup, Pinhole, Se3};
@@ -31,7 +31,7 @@ fn cameras_of(path: &Path) -> Vec<u32> {
 
 /// Reads the layout.
 pub(crate) fn open(path: &Path, reason: String, options: &OpenOptions) -> Result<Draft, DatasetError> {
-    let mut draft = Draft::new(DatasetKind::KittiOdometry, path, reason);
+    let mut draft = Draft::new(RecordingKind::KittiOdometry, path, reason);
     let wanted = options.camera.0;
     let cameras = cameras_of(path);
     if !cameras.contains(&wanted) {

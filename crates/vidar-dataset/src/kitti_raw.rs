@@ -3,14 +3,14 @@
 //! The `_sync` recordings hold rectified images and one inertial record an image (10 Hz), the `_extract` ones raw images and records at
 //! 100 Hz; the size of the images tells which calibration is theirs. The unit of oxts is the IMU and, by its poses, the reference.
 
-use crate::dataset::CalibrationSource;
 use crate::draft::{Draft, DraftCamera};
 use crate::error::DatasetError;
 use crate::folder::{images_in, names_in};
 use crate::kitti::{camera_of, chosen, missing_camera};
 use crate::location::files;
-use crate::options::{DatasetKind, OpenOptions};
+use crate::options::{OpenOptions, RecordingKind};
 use crate::parse::{self, Oxts, Source};
+use crate::recording::CalibrationSource;
 use crate::source::read_file_up_to;
 use nalgebra::{Matrix3, Vector3};
 use std::path::{Path, PathBuf};
@@ -45,7 +45,7 @@ fn cameras_of(path: &Path) -> Vec<u32> {
 
 /// Reads the layout.
 pub(crate) fn open(path: &Path, reason: String, options: &OpenOptions) -> Result<Draft, DatasetError> {
-    let mut draft = Draft::new(DatasetKind::KittiRaw, path, reason);
+    let mut draft = Draft::new(RecordingKind::KittiRaw, path, reason);
     let cameras = cameras_of(path);
     let wanted = match options.camera.0 {
         // Many download the colour cameras only; camera 0 is nobody's wish then.

@@ -9,7 +9,6 @@ mod calibration;
 pub mod camera_flag;
 mod checks;
 pub mod convert;
-mod dataset;
 pub mod decode;
 mod draft;
 mod error;
@@ -27,6 +26,7 @@ mod options;
 pub mod parse;
 mod phone;
 mod posed_folder;
+mod recording;
 mod rendered;
 mod rig_checks;
 mod seven_scenes;
@@ -43,17 +43,17 @@ mod wrong_thing;
 pub use ahead::ImagesAhead;
 pub use camera_flag::{CameraFlag, with_size};
 pub use checks::{gain_error_at_rest, specific_force_at_rest};
-pub use dataset::{
-    AccelSample, CalibrationSource, DEPTH_TOLERANCE, Dataset, DepthEntry, DepthSensor, ExternalTrajectory,
-    ImageEntry,
-};
 pub use error::DatasetError;
 pub use events::EventCursor;
 pub use isolated::is_decoding;
 pub use location::Location;
 pub use options::{
-    DatasetKind, OpenOptions, PoseUse, TimeUnit, TopicFlag, TrajectoryFormat, TrajectoryReadOptions,
+    OpenOptions, PoseUse, RecordingKind, TimeUnit, TopicFlag, TrajectoryFormat, TrajectoryReadOptions,
     body_named, decoder_named,
+};
+pub use recording::{
+    AccelSample, CalibrationSource, DEPTH_TOLERANCE, DepthEntry, DepthSensor, ExternalTrajectory, ImageEntry,
+    Recording,
 };
 
 pub use trajectory_file::{read_times, read_trajectory, trajectory_from};
@@ -63,8 +63,8 @@ use std::path::Path;
 
 /// Opens the dataset at `path`, in the format that the user names or else in the one that is detected.
 ///
-/// Layouts are tried from the most to the least specific; [`Dataset::reason`] states why one was chosen.
-pub fn open(path: &Path, options: &OpenOptions) -> Result<Dataset, DatasetError> {
+/// Layouts are tried from the most to the least specific; [`Recording::reason`] states why one was chosen.
+pub fn open(path: &Path, options: &OpenOptions) -> Result<Recording, DatasetError> {
     options.validate()?;
     if !options.imu.is_empty() {
         return imu_log::open(path, imu_log::named(path, options)?, options)?.finish(options);
@@ -72,7 +72,7 @@ pub fn open(path: &Path, options: &OpenOptions) -> Result<Dataset, DatasetError>
     if !path.is_dir() {
         return open_file(path, options);
     }
-    let kinds = options.format.map_or(DatasetKind::ALL.to_vec(), |kind| vec![kind]);
+    let kinds = options.format.map_or(RecordingKind::ALL.to_vec(), |kind| vec![kind]);
     for kind in kinds {
         if let Some(draft) = try_kind(kind, path, options)? {
             return draft.finish(options);
@@ -89,7 +89,7 @@ pub fn open(path: &Path, options: &OpenOptions) -> Result<Dataset, DatasetError>
 }
 
 /// Opens a recording in one file, by its first bytes.
-fn open_file(path: &Path, options: &OpenOptions) -> Result<Dataset, DatasetError> {
+fn open_file(path: &Path, options: &OpenOptions) -> Result<Recording, DatasetError> {
     let head = wrong_thing::head_of(path)?;
     if let Some(format) = vidar_bag::BagFormat::of_bytes(&head) {
         let reason = format!("its first bytes are those of {}", format.name());
@@ -120,7 +120,7 @@ fn is_recording_of_phone(folder: &Path) -> bool {
 
 /// Reads `path` as one kind; `None` when the path does not have that layout.
 fn try_kind(
-    kind: DatasetKind,
+    kind: RecordingKind,
     path: &Path,
     options: &OpenOptions,
 ) -> Result<Option<draft::Draft>, DatasetError> {
@@ -134,40 +134,40 @@ fn try_kind(
         }
     };
     match kind {
-        DatasetKind::EurocAsl => {
+        RecordingKind::EurocAsl => {
             euroc::detect(path).map(|found| euroc::open(path, found, options)).transpose()
         }
-        DatasetKind::TumRgbd => {
+        RecordingKind::TumRgbd => {
             tum_rgbd::detect(path).map_or(Ok(None), |reason| single(tum_rgbd::open(path, reason, options)))
         }
-        DatasetKind::SevenScenes => seven_scenes::detect(path)
+        RecordingKind::SevenScenes => seven_scenes::detect(path)
             .map_or(Ok(None), |(folder, reason)| single(seven_scenes::open(&folder, reason, options))),
-        DatasetKind::PosedFolder => posed_folder::detect(path)
+        RecordingKind::PosedFolder => posed_folder::detect(path)
             .map_or(Ok(None), |reason| single(posed_folder::open(path, reason, options))),
-        DatasetKind::Bag => bag::detect(path).map(|reason| bag::open(path, reason, options)).transpose(),
-        DatasetKind::Video => {
+        RecordingKind::Bag => bag::detect(path).map(|reason| bag::open(path, reason, options)).transpose(),
+        RecordingKind::Video => {
             let found = video::only_one_in(path);
             found.map(|(file, reason)| video::open(&file, reason, options)).transpose()
         }
-        DatasetKind::StrayScanner => stray_scanner::detect(path)
+        RecordingKind::StrayScanner => stray_scanner::detect(path)
             .map_or(Ok(None), |reason| single(stray_scanner::open(path, reason, options))),
-        DatasetKind::SpectacularAi => {
+        RecordingKind::SpectacularAi => {
             spectacular::detect(path).map(|reason| spectacular::open(path, reason, options)).transpose()
         }
-        DatasetKind::ImuLog => {
+        RecordingKind::ImuLog => {
             imu_log::detect(path).map_or(Ok(None), |log| single(imu_log::open(path, log, options)))
         }
-        DatasetKind::KittiRaw => {
+        RecordingKind::KittiRaw => {
             kitti_raw::detect(path).map(|reason| kitti_raw::open(path, reason, options)).transpose()
         }
-        DatasetKind::KittiOdometry => {
+        RecordingKind::KittiOdometry => {
             kitti::detect(path).map(|reason| kitti::open(path, reason, options)).transpose()
         }
-        DatasetKind::Replica => rendered::detect_replica(path)
+        RecordingKind::Replica => rendered::detect_replica(path)
             .map_or(Ok(None), |reason| single(rendered::open_replica(path, reason, options))),
-        DatasetKind::IclNuim => rendered::detect_icl(path)
+        RecordingKind::IclNuim => rendered::detect_icl(path)
             .map_or(Ok(None), |reason| single(rendered::open_icl(path, reason, options))),
-        DatasetKind::ImageFolder => image_folder::detect(path)
+        RecordingKind::ImageFolder => image_folder::detect(path)
             .map_or(Ok(None), |(folder, reason)| single(image_folder::open(path, &folder, reason, options))),
     }
 }

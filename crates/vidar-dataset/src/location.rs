@@ -1,9 +1,9 @@
 //! Where the pixels of an image lie, and how they are read from there.
 
-use crate::dataset::check_size;
 use crate::decode::{self, ImageLimits};
 use crate::error::{DatasetError, io_error};
 use crate::isolated::isolated;
+use crate::recording::check_size;
 use std::fmt;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;

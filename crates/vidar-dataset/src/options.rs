@@ -9,7 +9,7 @@ use vidar_video::VideoDecoder;
 
 /// Layouts of datasets.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
-pub enum DatasetKind {
+pub enum RecordingKind {
     /// EuRoC's ASL folders (`mav0/cam0/data.csv`, …).
     EurocAsl,
     /// TUM RGB-D (`rgb.txt`, `depth.txt`, `groundtruth.txt`, `accelerometer.txt`).
@@ -40,7 +40,7 @@ pub enum DatasetKind {
     ImageFolder,
 }
 
-impl DatasetKind {
+impl RecordingKind {
     /// Every kind, in the order in which a path is tried.
     pub const ALL: [Self; 14] = [
         Self::EurocAsl,
@@ -80,13 +80,13 @@ impl DatasetKind {
     }
 }
 
-impl fmt::Display for DatasetKind {
+impl fmt::Display for RecordingKind {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(self.name())
     }
 }
 
-impl FromStr for DatasetKind {
+impl FromStr for RecordingKind {
     type Err = DatasetError;
     fn from_str(text: &str) -> Result<Self, DatasetError> {
         by_name("format", text, &Self::ALL, |k| k.name())
@@ -233,7 +233,7 @@ fn by_name<T: Copy>(
 #[derive(Clone, Debug, PartialEq)]
 pub struct OpenOptions {
     /// The layout; `None` detects it.
-    pub format: Option<DatasetKind>,
+    pub format: Option<RecordingKind>,
     /// The camera whose images are read, as the dataset numbers it (`cam0`, `cam1`, …).
     pub camera: CameraId,
     /// Calibration files: EuRoC `sensor.yaml`, Kalibr camchain, Kalibr imu yaml. They override the dataset's own.

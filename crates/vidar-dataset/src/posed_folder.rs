@@ -1,13 +1,13 @@
 //! A folder of `images/`, `poses.txt` (one row-major world_from_camera a line and image), `K.txt`, perhaps `depth/`.
 
-use crate::dataset::CalibrationSource;
 use crate::draft::{Draft, DraftDepth};
 use crate::error::DatasetError;
 use crate::folder::{images_in, numbers_of, stem, synthetic_time, synthetic_warning};
 use crate::image_folder;
 use crate::location::files;
-use crate::options::{DatasetKind, OpenOptions};
+use crate::options::{OpenOptions, RecordingKind};
 use crate::parse::{self, Source};
+use crate::recording::CalibrationSource;
 use crate::seven_scenes::checked_pinhole;
 use std::path::Path;
 use vidar_core::{BodyFrame, CameraId, CameraModel, StampedPose, Trajectory, Warning};
@@ -20,7 +20,7 @@ pub(crate) fn detect(path: &Path) -> Option<String> {
 
 /// Reads the layout.
 pub(crate) fn open(path: &Path, reason: String, options: &OpenOptions) -> Result<Draft, DatasetError> {
-    let mut draft = Draft::new(DatasetKind::PosedFolder, path, reason);
+    let mut draft = Draft::new(RecordingKind::PosedFolder, path, reason);
     let folder = path.join("images");
     let names = images_in(&folder)?;
     draft.image_list = folder.clone();

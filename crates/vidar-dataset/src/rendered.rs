@@ -1,11 +1,11 @@
 //! Rendered rooms with exact depth and poses: Replica as NICE-SLAM renders it, and ICL-NUIM.
 
-use crate::dataset::CalibrationSource;
 use crate::draft::{Draft, DraftDepth};
 use crate::error::DatasetError;
 use crate::folder::{frame_number, images_in, names_in, synthetic_time, synthetic_warning};
-use crate::options::{DatasetKind, OpenOptions, TimeUnit, TrajectoryFormat, TrajectoryReadOptions};
+use crate::options::{OpenOptions, RecordingKind, TimeUnit, TrajectoryFormat, TrajectoryReadOptions};
 use crate::parse::{self, Source};
+use crate::recording::CalibrationSource;
 use crate::seven_scenes::checked_pinhole;
 use crate::trajectory_file::{ReadPoses, read_poses};
 use std::path::{Path, PathBuf};
@@ -36,7 +36,7 @@ pub(crate) fn detect_replica(path: &Path) -> Option<String> {
 
 /// Reads `results/frame*.jpg`, `results/depth*.png`, `traj.txt` (one row-major `world_from_camera` a frame) and `cam_params.json`.
 pub(crate) fn open_replica(path: &Path, reason: String, _: &OpenOptions) -> Result<Draft, DatasetError> {
-    let mut draft = Draft::new(DatasetKind::Replica, path, reason);
+    let mut draft = Draft::new(RecordingKind::Replica, path, reason);
     let folder = path.join("results");
     draft.image_list = folder.clone();
     let mut numbers = Vec::new();
@@ -117,7 +117,7 @@ fn icl_truth(path: &Path) -> Option<PathBuf> {
 /// A point (x, y, z) of that camera, whose y is up, is (x, −y, z) of a camera of computer vision. With F = diag(1, −1, 1) the same images
 /// come from `F·world_from_camera·F` and a positive fy, in a world that is mirrored in y like the camera.
 pub(crate) fn open_icl(path: &Path, reason: String, _: &OpenOptions) -> Result<Draft, DatasetError> {
-    let mut draft = Draft::new(DatasetKind::IclNuim, path, reason);
+    let mut draft = Draft::new(RecordingKind::IclNuim, path, reason);
     let list = path.join("associations.txt");
     let bytes = draft.read(&list)?;
     draft.image_list = list.clone();

@@ -6,7 +6,7 @@
 use crate::draft::{Draft, DraftDepth};
 use crate::error::DatasetError;
 use crate::folder::{first_file, frame_number, names_in, synthetic_time, synthetic_warning};
-use crate::options::{DatasetKind, OpenOptions};
+use crate::options::{OpenOptions, RecordingKind};
 use crate::parse::{self, Source};
 use crate::source::read_file_up_to;
 use std::path::{Path, PathBuf};
@@ -41,7 +41,7 @@ pub(crate) fn detect(path: &Path) -> Option<(PathBuf, String)> {
 
 /// Reads the layout.
 pub(crate) fn open(folder: &Path, reason: String, options: &OpenOptions) -> Result<Draft, DatasetError> {
-    let mut draft = Draft::new(DatasetKind::SevenScenes, folder, reason);
+    let mut draft = Draft::new(RecordingKind::SevenScenes, folder, reason);
     let mut poses = Vec::new();
     for name in names_in(folder)? {
         let Some(base) = name.find(".color.").map(|at| &name[..at]) else { continue };

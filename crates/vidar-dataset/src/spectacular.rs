@@ -1,13 +1,13 @@
 //! Spectacular AI and AaltoML: `data.jsonl` beside `data.mp4` (and `data2.mp4`) or `frames1/`, and `calibration.json`.
 
-use crate::dataset::CalibrationSource;
 use crate::draft::{Draft, DraftCamera};
 use crate::error::DatasetError;
 use crate::folder::{images_in, names_in};
 use crate::inertial::{median_rate_hz, to_specific_force};
-use crate::options::{DatasetKind, OpenOptions};
+use crate::options::{OpenOptions, RecordingKind};
 use crate::parse::{self, JsonPose, JsonRecording, Source};
 use crate::phone;
+use crate::recording::CalibrationSource;
 use crate::source::for_each_block;
 use crate::stray_scanner::recorded_poses;
 use crate::video::take_frames;
@@ -54,7 +54,7 @@ pub(crate) fn open(path: &Path, reason: String, options: &OpenOptions) -> Result
         let found = found.collect::<Vec<_>>().join(", ");
         return Err(DatasetError::MissingCamera { path: path.to_path_buf(), camera: options.camera, found });
     };
-    let mut draft = Draft::new(DatasetKind::SpectacularAi, path, reason);
+    let mut draft = Draft::new(RecordingKind::SpectacularAi, path, reason);
     let list = path.join("data.jsonl");
     let mut recording = JsonRecording::default();
     for_each_block(&list, |block, lines_before| recording.add(block, lines_before, number))?;

@@ -6,14 +6,14 @@
 //! is in millimetres, registered to the camera, in smaller pixels; where `confidence/` says "low" (0) it is none. The documentation says that the accelerometer is in m/s²; the
 //! recorder writes Core Motion's values, which are in g and of the opposite sign, so gravity decides.
 
-use crate::dataset::CalibrationSource;
 use crate::draft::{Draft, DraftDepth};
 use crate::error::DatasetError;
 use crate::folder::{first_file, frame_number, images_in};
 use crate::inertial;
-use crate::options::{DatasetKind, OpenOptions, TimeUnit};
+use crate::options::{OpenOptions, RecordingKind, TimeUnit};
 use crate::parse::{self, NumberedPose, Source, UnitRule};
 use crate::phone;
+use crate::recording::CalibrationSource;
 use crate::seven_scenes::checked_pinhole;
 use crate::video::take_frames;
 use nalgebra::Vector3;
@@ -35,7 +35,7 @@ pub(crate) fn detect(path: &Path) -> Option<String> {
 
 /// Reads the layout.
 pub(crate) fn open(path: &Path, reason: String, options: &OpenOptions) -> Result<Draft, DatasetError> {
-    let mut draft = Draft::new(DatasetKind::StrayScanner, path, reason);
+    let mut draft = Draft::new(RecordingKind::StrayScanner, path, reason);
     let list = path.join("odometry.csv");
     let bytes = draft.read(&list)?;
     let rule = UnitRule::given_or(options.time_unit, TimeUnit::Seconds);

@@ -3,13 +3,13 @@
 //! Depth is registered to the colour camera, in units of 1/5000 m; poses are the colour camera's. TUM's files hold no
 //! calibration: the calibration that the dataset's authors publish for each of the three cameras is used, with a warning.
 
-use crate::dataset::CalibrationSource;
 use crate::draft::{Draft, DraftDepth};
 use crate::error::DatasetError;
 use crate::inertial;
 use crate::location::files;
-use crate::options::{DatasetKind, OpenOptions, TimeUnit, TrajectoryFormat, TrajectoryReadOptions};
+use crate::options::{OpenOptions, RecordingKind, TimeUnit, TrajectoryFormat, TrajectoryReadOptions};
 use crate::parse::{self, Source, UnitRule};
+use crate::recording::CalibrationSource;
 use crate::seven_scenes::checked_pinhole;
 use crate::trajectory_file::{ReadPoses, read_poses};
 use std::path::{Path, PathBuf};
@@ -32,7 +32,7 @@ pub(crate) fn detect(path: &Path) -> Option<String> {
 
 /// Reads the layout.
 pub(crate) fn open(path: &Path, reason: String, options: &OpenOptions) -> Result<Draft, DatasetError> {
-    let mut draft = Draft::new(DatasetKind::TumRgbd, path, reason);
+    let mut draft = Draft::new(RecordingKind::TumRgbd, path, reason);
     let rule = UnitRule::given_or(options.time_unit, TimeUnit::Seconds);
     draft.image_list = path.join("rgb.txt");
     draft.images = files(read_list(&mut draft, &path.join("rgb.txt"), rule)?);
@@ -125,7 +125,7 @@ const CAMERAS: [Published; 4] = [
 /// The published model for a dataset named like TUM's, for images of 640×480.
 pub(crate) fn published_model(
     root: &Path,
-    kind: DatasetKind,
+    kind: RecordingKind,
     size: (usize, usize),
 ) -> Option<(CameraModel, CalibrationSource, Warning)> {
     let absolute = root.canonicalize().unwrap_or_else(|_| root.to_path_buf());
@@ -135,7 +135,7 @@ pub(crate) fn published_model(
     });
     let index = match (named, kind) {
         (Some(i), _) => i - 1,
-        (None, DatasetKind::TumRgbd) => 3,
+        (None, RecordingKind::TumRgbd) => 3,
         _ => return None,
     };
     if size != (640, 480) {

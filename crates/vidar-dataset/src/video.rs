@@ -4,7 +4,7 @@ use crate::draft::Draft;
 use crate::error::DatasetError;
 use crate::folder::{images_in, names_in};
 use crate::location::Location;
-use crate::options::{DatasetKind, OpenOptions};
+use crate::options::{OpenOptions, RecordingKind};
 use crate::wrong_thing;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -49,7 +49,7 @@ pub(crate) fn open(path: &Path, reason: String, options: &OpenOptions) -> Result
         return Err(DatasetError::MissingCamera { path: path.to_path_buf(), camera: options.camera, found });
     }
     let video = Video::open_with(path, options.decoder)?;
-    let mut draft = Draft::new(DatasetKind::Video, path, format!("{reason}; {}", video.codec_name()));
+    let mut draft = Draft::new(RecordingKind::Video, path, format!("{reason}; {}", video.codec_name()));
     if let Some(telemetry) = video.telemetry()? {
         take_telemetry(&mut draft, telemetry);
     }

@@ -6,13 +6,13 @@ mod common;
 
 use common::*;
 use vidar_core::SensorEvent;
-use vidar_dataset::Dataset;
+use vidar_dataset::Recording;
 
-fn one_by_one(dataset: &Dataset) -> Vec<Result<vidar_core::FrameImage, String>> {
+fn one_by_one(dataset: &Recording) -> Vec<Result<vidar_core::FrameImage, String>> {
     dataset.images.iter().map(|e| dataset.load_image(e).map_err(|e| e.to_string())).collect()
 }
 
-fn ahead(dataset: &Dataset) -> Vec<Result<vidar_core::FrameImage, String>> {
+fn ahead(dataset: &Recording) -> Vec<Result<vidar_core::FrameImage, String>> {
     let images = dataset.images_ahead(dataset.images.iter());
     images.map(|(_, image)| image.map_err(|e| e.to_string())).collect()
 }

@@ -4,7 +4,7 @@
 
 use std::path::{Path, PathBuf};
 use vidar_core::{BodyFrame, SensorEvent};
-use vidar_dataset::{CalibrationSource, Dataset, DatasetKind, OpenOptions, open};
+use vidar_dataset::{CalibrationSource, OpenOptions, Recording, RecordingKind, open};
 
 /// Made by third-party writers; see `make.py` there.
 fn fixture(name: &str) -> PathBuf {
@@ -15,18 +15,18 @@ fn with_topics(topics: &[&str]) -> OpenOptions {
     OpenOptions { topics: topics.iter().map(|t| t.parse().unwrap()).collect(), ..OpenOptions::default() }
 }
 
-fn open_bag(name: &str, topics: &[&str]) -> Dataset {
+fn open_bag(name: &str, topics: &[&str]) -> Recording {
     open(&fixture(name), &with_topics(topics)).unwrap_or_else(|e| panic!("{name}: {e}"))
 }
 
-fn kinds(dataset: &Dataset) -> Vec<&str> {
+fn kinds(dataset: &Recording) -> Vec<&str> {
     dataset.warnings.iter().map(|w| w.kind.as_ref()).collect()
 }
 
 #[test]
 fn every_container_is_the_same_recording() {
     let first = open_bag("ros1.bag", &[]);
-    assert_eq!(first.kind, DatasetKind::Bag);
+    assert_eq!(first.kind, RecordingKind::Bag);
     assert_eq!(first.name, "ros1");
     assert_eq!((first.images.len(), first.imu.len()), (3, 8));
     assert_eq!(first.calibration, CalibrationSource::Topic("/cam0/camera_info".into()));
@@ -46,7 +46,7 @@ fn every_container_is_the_same_recording() {
         "mcap_ros2_plain.mcap",
     ] {
         let other = open_bag(name, &[]);
-        let times = |d: &Dataset| d.images.iter().map(|i| i.time).collect::<Vec<_>>();
+        let times = |d: &Recording| d.images.iter().map(|i| i.time).collect::<Vec<_>>();
         assert_eq!((times(&other), &other.imu), (times(&first), &first.imu), "{name}");
         assert_eq!(other.rig, first.rig, "{name}");
         for (entry, frame) in other.images.iter().zip(&frames) {
@@ -113,7 +113,7 @@ fn a_folder_of_one_bag_is_the_bag() {
     let folder = tempfile::tempdir().unwrap();
     std::fs::copy(fixture("ros1_lz4.bag"), folder.path().join("flight.bag")).unwrap();
     let dataset = open(folder.path(), &OpenOptions::default()).unwrap();
-    assert_eq!((dataset.kind, dataset.images.len()), (DatasetKind::Bag, 3));
+    assert_eq!((dataset.kind, dataset.images.len()), (RecordingKind::Bag, 3));
     assert!(dataset.reason.contains("flight.bag"), "{}", dataset.reason);
 }
 
@@ -230,7 +230,7 @@ fn video_fixture(name: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/fixtures").join(name)
 }
 
-fn greens(dataset: &Dataset, number: usize) -> Vec<u8> {
+fn greens(dataset: &Recording, number: usize) -> Vec<u8> {
     match dataset.load_image(&dataset.images[number]).unwrap() {
         vidar_core::FrameImage::Rgb8(image) => image.data().iter().map(|p| p[1]).collect(),
         other => panic!("{other:?}"),

@@ -11,7 +11,7 @@ mod common;
 
 use common::*;
 use vidar_core::{CameraModel, LieGroup};
-use vidar_dataset::{Dataset, DatasetError, OpenOptions};
+use vidar_dataset::{DatasetError, OpenOptions, Recording};
 
 /// A camchain as Kalibr writes it, with the numbers of EuRoC's first camera.
 const KALIBR: &str = "cam0:
@@ -67,7 +67,7 @@ imu0:
 ";
 
 /// A EuRoC folder with images of EuRoC's size, read with `camera` and `imu` as its calibration.
-fn with(camera: &str, imu: &str) -> Result<Dataset, DatasetError> {
+fn with(camera: &str, imu: &str) -> Result<Recording, DatasetError> {
     let f = euroc();
     for i in 0..10 {
         f.write(&format!("mav0/cam0/data/{}.png", frame_ns(i)), gray_png(752, 480, 90));
@@ -77,7 +77,7 @@ fn with(camera: &str, imu: &str) -> Result<Dataset, DatasetError> {
     f.open_with(&OpenOptions { calibration, ..Default::default() })
 }
 
-fn camera(dataset: &Dataset) -> &vidar_core::RigCamera {
+fn camera(dataset: &Recording) -> &vidar_core::RigCamera {
     dataset.rig.camera(dataset.camera).unwrap()
 }
 

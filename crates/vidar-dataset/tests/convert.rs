@@ -14,13 +14,13 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 use vidar_core::LieGroup;
 use vidar_dataset::convert::{ConvertFormat, convert};
-use vidar_dataset::{CalibrationSource, Dataset, DatasetKind, OpenOptions, open};
+use vidar_dataset::{CalibrationSource, OpenOptions, Recording, RecordingKind, open};
 
-fn opened(path: &Path) -> Dataset {
+fn opened(path: &Path) -> Recording {
     open(path, &OpenOptions::default()).unwrap_or_else(|e| panic!("{e}"))
 }
 
-fn written(from: &Dataset, to: &Path) -> Dataset {
+fn written(from: &Recording, to: &Path) -> Recording {
     let done = convert(from, to, ConvertFormat::of_path(to), &|_, _| true).unwrap_or_else(|e| panic!("{e}"));
     assert_eq!(
         (done.images, done.imu_samples, done.depths),
@@ -31,7 +31,7 @@ fn written(from: &Dataset, to: &Path) -> Dataset {
 
 /// Times, pixels, samples and calibration to the bit; rotations to the rounding of a matrix.
 #[track_caller]
-fn assert_same(a: &Dataset, b: &Dataset) {
+fn assert_same(a: &Recording, b: &Recording) {
     assert_eq!(a.images.len(), b.images.len());
     for (x, y) in a.images.iter().zip(&b.images) {
         assert_eq!(x.time, y.time);
@@ -96,7 +96,7 @@ fn euroc_to_mcap_to_euroc_is_the_same_recording() {
     let first = opened(f.path());
     assert_eq!((first.depths.len(), first.readout.is_some()), (10, true));
     let mcap = written(&first, &f.join("out.mcap"));
-    assert_eq!(mcap.kind, DatasetKind::Bag);
+    assert_eq!(mcap.kind, RecordingKind::Bag);
     assert_same(&first, &mcap);
     assert!(
         !kinds(&mcap).contains(&"imu-noise") && !kinds(&mcap).contains(&"extrinsics-missing"),
@@ -104,7 +104,7 @@ fn euroc_to_mcap_to_euroc_is_the_same_recording() {
         kinds(&mcap)
     );
     let again = written(&mcap, &f.join("again"));
-    assert_eq!(again.kind, DatasetKind::EurocAsl);
+    assert_eq!(again.kind, RecordingKind::EurocAsl);
     assert_same(&first, &again);
     assert_eq!(kinds(&again), Vec::<&str>::new());
     // EuRoC's own numbers come back: those of the second file are those of the first.

@@ -8,7 +8,7 @@ use common::*;
 use nalgebra::Vector3;
 use std::fmt::Write as _;
 use vidar_core::{BodyFrame, CameraId, LieGroup};
-use vidar_dataset::{CalibrationSource, DatasetKind, OpenOptions, open};
+use vidar_dataset::{CalibrationSource, OpenOptions, RecordingKind, open};
 
 fn camera(number: u32) -> OpenOptions {
     OpenOptions { camera: CameraId(number), ..Default::default() }
@@ -57,7 +57,7 @@ fn kitti_odometry_has_rectified_cameras_and_poses_of_the_first() {
     let d = open(&path, &camera(2)).unwrap();
     assert_eq!(
         (d.kind, d.images.len(), d.images[3].time.nanos()),
-        (DatasetKind::KittiOdometry, 4, 311_208_600)
+        (RecordingKind::KittiOdometry, 4, 311_208_600)
     );
     assert!(d.images[0].location.path().ends_with("image_2/000000.png"));
     // Camera 2 is 6 cm left of camera 0, which the poses are of.
@@ -115,7 +115,7 @@ fn kitti_raw(records: usize) -> (Folder, std::path::PathBuf) {
 fn kitti_raw_synchronised_has_reference_poses_and_no_imu() {
     let (f, path) = kitti_raw(1);
     let d = open(&path, &OpenOptions::default()).unwrap();
-    assert_eq!((d.kind, d.images.len(), d.imu.len()), (DatasetKind::KittiRaw, 5, 0));
+    assert_eq!((d.kind, d.images.len(), d.imu.len()), (RecordingKind::KittiRaw, 5, 0));
     assert_eq!(d.images[1].time.nanos(), 1_317_042_145_100_000_123);
     warning(&d, "imu-rate-low");
     let truth = d.ground_truth.as_ref().unwrap();
@@ -172,7 +172,7 @@ fn replica() -> Folder {
 fn replica_has_exact_depth_and_poses() {
     let f = replica();
     let d = open(&f.join("room0"), &OpenOptions::default()).unwrap();
-    assert_eq!((d.kind, d.images.len(), d.depths.len()), (DatasetKind::Replica, 4, 4));
+    assert_eq!((d.kind, d.images.len(), d.depths.len()), (RecordingKind::Replica, 4, 4));
     assert_eq!(d.load_depth(&d.depths[1]).unwrap().image()[(3, 3)], 2.0);
     assert_eq!(
         d.ground_truth.as_ref().unwrap().poses()[3].world_from_body.translation,
@@ -202,7 +202,7 @@ fn icl() -> Folder {
 fn icl_nuim_is_mirrored_so_that_its_focal_length_is_positive() {
     let f = icl();
     let d = f.open().unwrap();
-    assert_eq!((d.kind, d.images.len(), d.depths.len()), (DatasetKind::IclNuim, 3, 3));
+    assert_eq!((d.kind, d.images.len(), d.depths.len()), (RecordingKind::IclNuim, 3, 3));
     let k = d.rig.cameras[0].model.intrinsics();
     assert_eq!((k.fx, k.fy, d.calibration.clone()), (481.2, 480.0, CalibrationSource::DatasetDefault));
     let truth = d.ground_truth.as_ref().unwrap();
@@ -227,7 +227,7 @@ fn eth3d_is_tum_rgbd_with_a_calibration_and_an_imu() {
     let d = f.open().unwrap();
     assert_eq!(
         (d.kind, d.imu.len(), d.rig.cameras[0].model.intrinsics().fx),
-        (DatasetKind::TumRgbd, 400, 726.21)
+        (RecordingKind::TumRgbd, 400, 726.21)
     );
     assert_eq!(d.imu[0].accel.0, Vector3::new(0.0, -9.8, 0.4));
     assert_eq!(d.calibration, CalibrationSource::File(f.join("calibration.txt")));

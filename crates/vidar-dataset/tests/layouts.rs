@@ -13,7 +13,7 @@ use common::*;
 use nalgebra::Vector3;
 use vidar_core::{BodyFrame, CameraId, Duration, FrameId, LieGroup, SensorEvent};
 use vidar_dataset::{
-    CalibrationSource, CameraFlag, DatasetKind, OpenOptions, TimeUnit, TrajectoryFormat,
+    CalibrationSource, CameraFlag, OpenOptions, RecordingKind, TimeUnit, TrajectoryFormat,
     TrajectoryReadOptions, read_trajectory,
 };
 
@@ -22,7 +22,7 @@ fn a_clean_euroc_sequence_opens_without_a_warning() {
     let f = euroc();
     let d = f.open().unwrap();
     assert_eq!(kinds(&d), Vec::<&str>::new());
-    assert_eq!((d.kind, d.images.len(), d.imu.len()), (DatasetKind::EurocAsl, 10, 120));
+    assert_eq!((d.kind, d.images.len(), d.imu.len()), (RecordingKind::EurocAsl, 10, 120));
     assert_eq!(d.images[3].frame_id, FrameId(3));
     let camera = d.rig.camera(CameraId(0)).unwrap();
     assert_eq!(camera.rate_hz, Some(20.0));
@@ -40,7 +40,7 @@ fn one_camera_alone_is_a_euroc_dataset() {
     let inner = f.join("mav0/cam0");
     std::fs::remove_dir_all(f.join("mav0/imu0")).unwrap();
     let d = vidar_dataset::open(&inner, &OpenOptions::default()).unwrap();
-    assert_eq!((d.kind, d.images.len(), d.imu.len(), d.rig.imu), (DatasetKind::EurocAsl, 10, 0, None));
+    assert_eq!((d.kind, d.images.len(), d.imu.len(), d.rig.imu), (RecordingKind::EurocAsl, 10, 0, None));
 }
 
 #[test]
@@ -118,7 +118,7 @@ fn a_kalibr_chain_overrides_the_dataset_and_is_inverted() {
 fn tum_rgbd_opens_with_published_intrinsics_registered_depth_and_camera_poses() {
     let f = tum();
     let d = f.open().unwrap();
-    assert_eq!((d.kind, d.images.len(), d.depths.len()), (DatasetKind::TumRgbd, 5, 5));
+    assert_eq!((d.kind, d.images.len(), d.depths.len()), (RecordingKind::TumRgbd, 5, 5));
     assert!(warning(&d, "intrinsics-published").message.contains("ROS default"));
     assert_eq!(d.ground_truth.as_ref().unwrap().body(), BodyFrame::Camera(CameraId(0)));
     assert_eq!(d.load_depth(d.depth_for(d.images[1].time).unwrap()).unwrap().image()[(5, 5)], 1.0);
@@ -160,7 +160,7 @@ fn seven_scenes_may_have_separate_depth_and_colour_cameras() {
 fn a_posed_folder_pairs_lines_and_images() {
     let f = posed();
     let d = f.open().unwrap();
-    assert_eq!((d.kind, d.images.len(), d.depths.len()), (DatasetKind::PosedFolder, 4, 4));
+    assert_eq!((d.kind, d.images.len(), d.depths.len()), (RecordingKind::PosedFolder, 4, 4));
     assert_eq!(d.images[0].time.nanos(), 100_000_000);
     assert_eq!(d.ground_truth.as_ref().unwrap().poses()[3].world_from_body.translation.x, 3.0);
     assert_eq!(d.load_depth(&d.depths[0]).unwrap().image()[(0, 0)], 1.5);
@@ -292,8 +292,8 @@ fn external_trajectories_are_read_in_three_formats() {
 
 #[test]
 fn names_of_options_are_read_back() {
-    for kind in DatasetKind::ALL {
-        assert_eq!(kind.to_string().parse::<DatasetKind>().unwrap(), kind);
+    for kind in RecordingKind::ALL {
+        assert_eq!(kind.to_string().parse::<RecordingKind>().unwrap(), kind);
     }
     for unit in TimeUnit::ALL {
         assert_eq!(unit.to_string().parse::<TimeUnit>().unwrap(), unit);
@@ -301,7 +301,7 @@ fn names_of_options_are_read_back() {
     for format in TrajectoryFormat::ALL {
         assert_eq!(format.to_string().parse::<TrajectoryFormat>().unwrap(), format);
     }
-    let error = "eurok".parse::<DatasetKind>().unwrap_err().to_string();
+    let error = "eurok".parse::<RecordingKind>().unwrap_err().to_string();
     let expected = "euroc, tum-rgbd, 7scenes, kitti-raw, kitti, replica, icl-nuim, posed-folder, bag, stray-scanner, \
                     spectacular-ai, imu-log, video, images";
     assert!(error.contains(expected), "{error}");
@@ -310,15 +310,15 @@ fn names_of_options_are_read_back() {
 #[test]
 fn the_format_flag_overrides_detection() {
     let f = posed();
-    let options = OpenOptions { format: Some(DatasetKind::ImageFolder), ..Default::default() };
+    let options = OpenOptions { format: Some(RecordingKind::ImageFolder), ..Default::default() };
     let d = f.open_with(&options).unwrap();
-    assert_eq!((d.kind, d.images.len(), d.ground_truth.is_none()), (DatasetKind::ImageFolder, 4, true));
-    let wrong = OpenOptions { format: Some(DatasetKind::EurocAsl), ..Default::default() };
+    assert_eq!((d.kind, d.images.len(), d.ground_truth.is_none()), (RecordingKind::ImageFolder, 4, true));
+    let wrong = OpenOptions { format: Some(RecordingKind::EurocAsl), ..Default::default() };
     assert!(f.open_with(&wrong).is_err());
 }
 
 /// What identifies a dataset.
-fn fingerprint(dataset: &vidar_dataset::Dataset) -> Vec<u8> {
+fn fingerprint(dataset: &vidar_dataset::Recording) -> Vec<u8> {
     let mut bytes = Vec::new();
     dataset.write_fingerprint(&mut bytes).unwrap();
     bytes

@@ -9,7 +9,7 @@ use nalgebra::Vector3;
 use std::fmt::Write as _;
 use std::path::Path;
 use vidar_core::{BodyFrame, CameraId, LieGroup, SensorEvent};
-use vidar_dataset::{CalibrationSource, Dataset, DatasetKind, OpenOptions};
+use vidar_dataset::{CalibrationSource, OpenOptions, Recording, RecordingKind};
 
 /// Frames of the clip that the readers of videos are tested with.
 const FRAMES: usize = 15;
@@ -56,7 +56,7 @@ fn stray(sign: f64) -> Folder {
 fn stray_scanner_is_a_recording_with_arkits_poses_and_an_imu_in_g() {
     let f = stray(-1.0);
     let d = f.open().unwrap();
-    assert_eq!((d.kind, d.images.len()), (DatasetKind::StrayScanner, FRAMES));
+    assert_eq!((d.kind, d.images.len()), (RecordingKind::StrayScanner, FRAMES));
     assert_eq!(d.images[3].time.nanos(), frame_ms(3) * 1_000_000, "the log's time, not the video's");
     assert_eq!(d.calibration, CalibrationSource::File(f.join("camera_matrix.csv")));
     let external = d.external_trajectory.as_ref().unwrap();
@@ -84,7 +84,7 @@ fn stray_scanner_is_a_recording_with_arkits_poses_and_an_imu_in_g() {
 fn a_video_out_of_a_recording_points_to_its_folder() {
     let f = stray(-1.0);
     let d = vidar_dataset::open(&f.join("rgb.mp4"), &OpenOptions::default()).unwrap();
-    assert_eq!(d.kind, DatasetKind::Video);
+    assert_eq!(d.kind, RecordingKind::Video);
     warning(&d, "folder-beside");
 }
 
@@ -117,7 +117,7 @@ fn tables_of_the_imu_may_lie_elsewhere_and_are_named() {
         &named(&["gyro.csv", "accel.csv"], Some("frames.csv")),
     )
     .unwrap();
-    assert_eq!((d.kind, d.images.len()), (DatasetKind::ImuLog, FRAMES));
+    assert_eq!((d.kind, d.images.len()), (RecordingKind::ImuLog, FRAMES));
     assert_eq!(d.images[3].time.nanos(), frame_ms(3) * 1_000_000);
     assert_eq!(d.imu[60].gyro.0, Vector3::new(0.01, 0.02, 0.03));
     assert!((d.imu[60].accel.0 - Vector3::new(UP, 0.0, 0.0)).norm() < 1e-9);
@@ -143,7 +143,7 @@ fn poses_beside_images_are_no_imu() {
         let _ = writeln!(poses, "{i} 0.0 {i} 9.8 0.0 0.0 0.0 1.0");
     }
     f.write("trajectory.txt", poses);
-    assert_eq!(f.open().unwrap().kind, DatasetKind::ImageFolder);
+    assert_eq!(f.open().unwrap().kind, RecordingKind::ImageFolder);
 }
 
 #[test]
@@ -219,7 +219,7 @@ fn spectacular() -> Folder {
 fn spectacular_ai_is_a_calibrated_recording_with_both_sensors_as_one() {
     let f = spectacular();
     let d = f.open().unwrap();
-    assert_eq!((d.kind, d.images.len()), (DatasetKind::SpectacularAi, FRAMES));
+    assert_eq!((d.kind, d.images.len()), (RecordingKind::SpectacularAi, FRAMES));
     assert_eq!(d.images[5].time.nanos(), frame_ms(5) * 1_000_000);
     let camera = d.rig.camera(CameraId(0)).unwrap();
     assert_eq!((camera.model.name(), camera.model.intrinsics().fx), ("pinhole-equidistant", 50.0));
@@ -245,9 +245,9 @@ fn damaged_records_are_skipped_and_counted() {
     assert!(f.open().unwrap_err().to_string().contains("imuToCamera is not a rigid motion"));
 }
 
-fn opens_as_log(f: &Folder) -> Dataset {
+fn opens_as_log(f: &Folder) -> Recording {
     let d = f.open().unwrap();
-    assert_eq!(d.kind, DatasetKind::ImuLog, "{}", d.reason);
+    assert_eq!(d.kind, RecordingKind::ImuLog, "{}", d.reason);
     assert_eq!(d.images.len(), FRAMES);
     assert_eq!(d.images[7].time.nanos(), frame_ms(7) * 1_000_000);
     d
@@ -351,7 +351,7 @@ fn a_video_without_a_log_of_frame_times_says_so() {
     (0..SAMPLES).for_each(|i| writeln!(imu, "{:.3},0,0,0.1,0,{UP},0", 0.005 * i as f64).unwrap());
     f.write("clip.mp4", clip("h264.mp4")).write("imu.csv", &imu);
     let d = f.open().unwrap();
-    assert_eq!(d.kind, DatasetKind::ImuLog);
+    assert_eq!(d.kind, RecordingKind::ImuLog);
     warning(&d, "frame-clock");
     // What only looks like a log of times is told, and not used.
     f.write("frame_timestamps.txt", "begin\nend\n");
@@ -359,7 +359,7 @@ fn a_video_without_a_log_of_frame_times_says_so() {
     std::fs::remove_file(f.join("frame_timestamps.txt")).unwrap();
     // Two tables of the same sensor: it is not clear which is meant, and a video alone remains.
     f.write("imu.csv", imu.replace("gx,gy,gz", "a,b,c")).write("acc2.csv", imu.replace("gx,gy,gz", "a,b,c"));
-    assert_eq!(f.open().unwrap().kind, DatasetKind::Video);
+    assert_eq!(f.open().unwrap().kind, RecordingKind::Video);
 }
 
 #[test]

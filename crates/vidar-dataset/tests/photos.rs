@@ -9,7 +9,7 @@ use image::codecs::jpeg::JpegEncoder;
 use proptest::prelude::*;
 use vidar_core::FrameImage;
 use vidar_dataset::parse::photo_exif;
-use vidar_dataset::{CalibrationSource, DatasetKind};
+use vidar_dataset::{CalibrationSource, RecordingKind};
 
 /// A TIFF directory entry, big-endian.
 fn entry(tag: u16, kind: u16, count: u32, value: [u8; 4]) -> Vec<u8> {
@@ -69,7 +69,7 @@ fn photographs_are_upright_with_the_focal_length_and_times_of_their_exif() {
         f.write(&format!("IMG_{i}.jpg"), photo(64, 48, &tiff));
     }
     let d = f.open().unwrap();
-    assert_eq!((d.kind, d.times_are_invented), (DatasetKind::ImageFolder, false));
+    assert_eq!((d.kind, d.times_are_invented), (RecordingKind::ImageFolder, false));
     assert_eq!(d.images[2].time.nanos(), 1_709_296_202_250_000_000);
     let camera = d.rig.camera(d.camera).unwrap();
     assert_eq!((camera.model.width(), camera.model.height()), (48, 64));

@@ -10,7 +10,7 @@
 use std::path::PathBuf;
 use vidar_core::{BodyFrame, CameraId, SensorEvent};
 use vidar_dataset::{
-    CalibrationSource, CameraFlag, Dataset, DatasetKind, OpenOptions, TrajectoryReadOptions, open,
+    CalibrationSource, CameraFlag, OpenOptions, Recording, RecordingKind, TrajectoryReadOptions, open,
     read_trajectory,
 };
 
@@ -27,13 +27,13 @@ fn shared(part: &str) -> Option<PathBuf> {
 }
 
 /// What identifies a dataset.
-fn fingerprint(dataset: &Dataset) -> Vec<u8> {
+fn fingerprint(dataset: &Recording) -> Vec<u8> {
     let mut bytes = Vec::new();
     dataset.write_fingerprint(&mut bytes).unwrap();
     bytes
 }
 
-fn kinds(dataset: &Dataset) -> Vec<&str> {
+fn kinds(dataset: &Recording) -> Vec<&str> {
     dataset.warnings.iter().map(|w| w.kind.as_str()).collect()
 }
 
@@ -41,7 +41,7 @@ fn kinds(dataset: &Dataset) -> Vec<&str> {
 fn euroc_mh_01_opens_with_everything_it_has() {
     let Some(path) = shared("euroc_MH_01_real_11s") else { return };
     let d = open(&path, &OpenOptions::default()).unwrap();
-    assert_eq!((d.kind, d.name.as_str()), (DatasetKind::EurocAsl, "euroc_MH_01_real_11s"));
+    assert_eq!((d.kind, d.name.as_str()), (RecordingKind::EurocAsl, "euroc_MH_01_real_11s"));
     assert_eq!((d.images.len(), d.rig.cameras.len(), d.camera), (220, 2, CameraId(0)));
     assert_eq!(d.images[0].time.nanos(), 1_403_636_584_763_555_584);
     let camera = d.rig.camera(d.camera).unwrap();
@@ -92,7 +92,7 @@ fn events_of_the_real_flight_are_ordered_and_imu_samples_come_first() {
 fn seven_scenes_red_kitchen_opens_as_rgbd_with_metric_poses() {
     let Some(path) = shared("7scenes_redkitchen") else { return };
     let d = open(&path, &OpenOptions::default()).unwrap();
-    assert_eq!((d.kind, d.images.len(), d.depths.len()), (DatasetKind::SevenScenes, 125, 125));
+    assert_eq!((d.kind, d.images.len(), d.depths.len()), (RecordingKind::SevenScenes, 125, 125));
     assert_eq!(d.name, "7scenes_redkitchen-seq-01");
     let truth = d.ground_truth.as_ref().unwrap();
     assert_eq!((truth.body(), truth.len()), (BodyFrame::Camera(CameraId(0)), 125));
@@ -118,7 +118,7 @@ fn seven_scenes_red_kitchen_opens_as_rgbd_with_metric_poses() {
 fn the_hololens_room_opens_with_poses_line_by_line() {
     let Some(path) = shared("hololens_commonroom") else { return };
     let d = open(&path, &OpenOptions::default()).unwrap();
-    assert_eq!((d.kind, d.images.len(), d.depths.len()), (DatasetKind::PosedFolder, 48, 48));
+    assert_eq!((d.kind, d.images.len(), d.depths.len()), (RecordingKind::PosedFolder, 48, 48));
     let truth = d.ground_truth.as_ref().unwrap();
     assert!((truth.poses()[0].world_from_body.translation.z - 4.67999).abs() < 1e-9);
     assert!((d.rig.cameras[0].model.intrinsics().fx - 495.567_757).abs() < 1e-6);
@@ -129,7 +129,7 @@ fn the_hololens_room_opens_with_poses_line_by_line() {
 fn bare_tum_frames_open_as_images_with_times_from_their_names() {
     let Some(path) = shared("tum_fr3_office_1hz") else { return };
     let d = open(&path, &OpenOptions::default()).unwrap();
-    assert_eq!((d.kind, d.images.len()), (DatasetKind::ImageFolder, 17));
+    assert_eq!((d.kind, d.images.len()), (RecordingKind::ImageFolder, 17));
     assert_eq!(d.images[0].time.nanos(), 1_341_847_980_722_988_000);
     assert_eq!(d.calibration, CalibrationSource::DatasetDefault);
     assert_eq!(d.rig.cameras[0].model.intrinsics().fx, 535.4);

@@ -6,7 +6,7 @@
 use std::sync::OnceLock;
 use tempfile::TempDir;
 use vidar_core::{BodyFrame, Duration, NavState, SensorEvent, StampedPose, Trajectory};
-use vidar_dataset::{Dataset, OpenOptions};
+use vidar_dataset::{OpenOptions, Recording};
 use vidar_eval::{TrajectoryEvalConfig, evaluate_trajectory};
 use vidar_odometry::bundle_adjustment::{Adjusted, CalibrationSigmas};
 use vidar_odometry::{Odometry, OdometryConfig, OdometryOutput, Status};
@@ -16,8 +16,8 @@ const READOUT_SECS: f64 = 0.022;
 const STAMP_DELAY_SECS: f64 = -0.035;
 
 /// The recording on disk, and what was read of it. Half a phone's resolution, so that rendering stays short.
-fn recording() -> &'static (TempDir, Dataset) {
-    static ONCE: OnceLock<(TempDir, Dataset)> = OnceLock::new();
+fn recording() -> &'static (TempDir, Recording) {
+    static ONCE: OnceLock<(TempDir, Recording)> = OnceLock::new();
     ONCE.get_or_init(|| {
         let mut config = SynthConfig::phone_fast();
         (config.seed, config.duration_secs, config.camera_rate_hz) = (91, 10.0, 20.0);
@@ -36,11 +36,11 @@ fn recording() -> &'static (TempDir, Dataset) {
     })
 }
 
-fn events(dataset: &Dataset) -> impl Iterator<Item = SensorEvent> + '_ {
+fn events(dataset: &Recording) -> impl Iterator<Item = SensorEvent> + '_ {
     dataset.events().map(Result::unwrap)
 }
 
-fn run(dataset: &Dataset, mut odometry: Odometry) -> Vec<OdometryOutput> {
+fn run(dataset: &Recording, mut odometry: Odometry) -> Vec<OdometryOutput> {
     let mut outputs: Vec<OdometryOutput> =
         events(dataset).filter_map(|e| odometry.push(e).unwrap()).collect();
     outputs.extend(odometry.finish());

@@ -2,7 +2,7 @@
 #![allow(clippy::print_stdout)] // an example prints
 
 use vidar_core::{BodyFrame, SensorEvent, StampedPose, Trajectory};
-use vidar_dataset::{Dataset, OpenOptions};
+use vidar_dataset::{OpenOptions, Recording};
 use vidar_eval::{TrajectoryEvalConfig, evaluate_trajectory};
 use vidar_odometry::{Odometry, OdometryConfig};
 use vidar_synth::{SynthConfig, write_sequence};
@@ -34,7 +34,7 @@ pub fn main() -> Result<(), Failure> {
 }
 
 /// Pushes every event in time order. A pose counts once its scale is metric.
-fn run_odometry(dataset: &Dataset) -> Result<Trajectory, Failure> {
+fn run_odometry(dataset: &Recording) -> Result<Trajectory, Failure> {
     let mut odometry = Odometry::new(&dataset.rig, dataset.camera, &OdometryConfig::default())?;
     let mut outputs = Vec::new();
     for event in dataset.events() {

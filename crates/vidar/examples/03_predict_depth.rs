@@ -3,7 +3,7 @@
 
 use vidar_core::remap::{RemapTable, undistorted_view};
 use vidar_core::{BodyFrame, ChunkId, ChunkView, ChunkViews, Duration, GeometryModel};
-use vidar_dataset::{Dataset, OpenOptions};
+use vidar_dataset::{OpenOptions, Recording};
 use vidar_stereo::{StereoConfig, StereoModel};
 use vidar_synth::predict::{TruePlace, true_views};
 use vidar_synth::{Simulation, SynthConfig, write_sequence};
@@ -40,7 +40,7 @@ pub fn main() -> Result<(), Failure> {
 }
 
 /// The first `count` images as a model sees them: undistorted, with their poses.
-fn read_views(dataset: &Dataset, count: usize) -> Result<ChunkViews, Failure> {
+fn read_views(dataset: &Recording, count: usize) -> Result<ChunkViews, Failure> {
     let camera = &dataset.rig.camera(dataset.camera).ok_or("the rig lacks the camera")?.model;
     let remap = RemapTable::new(camera, &undistorted_view(camera, camera.width(), camera.height())?);
     let truth = dataset.ground_truth.as_ref().ok_or("the sequence has no ground truth")?;

@@ -13,7 +13,7 @@ use vidar_core::camera::RadTan;
 use vidar_core::{
     AngularRate, CameraModel, Duration, ImuNoise, ImuSample, Pinhole, Se3, SensorEvent, Warning,
 };
-use vidar_dataset::{CalibrationSource, Dataset, OpenOptions};
+use vidar_dataset::{CalibrationSource, OpenOptions, Recording};
 use vidar_odometry::OdometryConfig;
 use vidar_odometry::calibration::{
     Calibration, CalibrationFailure, CalibrationLog, FeatureTracker, SensorNoise, sensor_noise,
@@ -134,7 +134,7 @@ fn write(path: &Path, text: &str) -> Result<(), Error> {
 /// # Errors
 /// The recording does not show its calibration.
 pub(crate) fn complete(
-    dataset: &mut Dataset,
+    dataset: &mut Recording,
     settings: &mut OdometryConfig,
     events: &Events,
     cancel: &CancelToken,
@@ -174,7 +174,7 @@ pub(crate) fn complete(
 
 /// What calibrating `dataset` gives, as a sentence; the error is why it gives nothing that would be used unasked.
 pub(crate) fn found_in_words(
-    dataset: &Dataset,
+    dataset: &Recording,
     events: &Events,
     cancel: &CancelToken,
 ) -> Result<String, String> {
@@ -188,7 +188,7 @@ pub(crate) fn found_in_words(
 }
 
 /// Follows features through the recording and estimates.
-fn look(dataset: &Dataset, events: &Events, cancel: &CancelToken) -> Result<Calibration, Error> {
+fn look(dataset: &Recording, events: &Events, cancel: &CancelToken) -> Result<Calibration, Error> {
     let refuse = |reason: &str| Error::NotCalibrated { name: dataset.name.clone(), reason: reason.into() };
     if dataset.imu.is_empty() {
         return Err(refuse("it has no gyroscope"));
@@ -255,7 +255,7 @@ fn reason(failure: CalibrationFailure) -> &'static str {
     }
 }
 
-fn size_of(dataset: &Dataset) -> (usize, usize) {
+fn size_of(dataset: &Recording) -> (usize, usize) {
     dataset.rig.camera(dataset.camera).map_or((0, 0), |c| (c.model.width(), c.model.height()))
 }
 

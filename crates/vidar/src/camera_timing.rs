@@ -8,7 +8,7 @@ use crate::error::Error;
 use crate::events::{CancelToken, Event, Events};
 use crate::input::{self, Measurement};
 use vidar_core::{LieGroup, SensorEvent, Warning};
-use vidar_dataset::Dataset;
+use vidar_dataset::Recording;
 use vidar_odometry::{CameraTiming, ImuUse, Odometry};
 
 /// The stage's name in events.
@@ -19,7 +19,7 @@ pub(crate) const STAGE: &str = "camera timing";
 /// # Errors
 /// What the odometry refuses: its settings, the calibration, an image of another size.
 pub(crate) fn settle(
-    dataset: &mut Dataset,
+    dataset: &mut Recording,
     config: &mut Config,
     events: &Events,
     cancel: &CancelToken,

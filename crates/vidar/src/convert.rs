@@ -4,7 +4,7 @@ use crate::error::Error;
 use crate::events::{CancelToken, Event, Events};
 use std::path::Path;
 use vidar_dataset::convert::{ConvertFormat, Converted};
-use vidar_dataset::{Dataset, OpenOptions};
+use vidar_dataset::{OpenOptions, Recording};
 
 /// Opens the recording at `path` and writes it to `out`, telling of its progress; returns the recording, too.
 ///
@@ -17,7 +17,7 @@ pub fn convert(
     format: ConvertFormat,
     events: &Events,
     cancel: &CancelToken,
-) -> Result<(Dataset, Converted), Error> {
+) -> Result<(Recording, Converted), Error> {
     if out.symlink_metadata().is_ok() {
         let hint = "choose a new name; nothing is overwritten".to_owned();
         return Err(Error::Usage { what: format!("{} exists", out.display()), hint });

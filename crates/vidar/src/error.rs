@@ -84,17 +84,17 @@ pub enum Error {
     },
     /// The input cannot be read.
     #[error(transparent)]
-    Dataset(#[from] vidar_dataset::DatasetError),
+    Recording(#[from] vidar_dataset::DatasetError),
     /// No metric poses.
     #[error("{name} has no metric trajectory: no IMU, no --trajectory and no ground truth")]
     NoMetricTrajectory {
-        /// Dataset name.
+        /// Name of the recording.
         name: String,
     },
     /// The camera model is only guessed, which gives no metric map.
     #[error("{name} has no calibration: the camera model is only guessed from the image size")]
     NoCalibration {
-        /// Dataset name.
+        /// Name of the recording.
         name: String,
     },
     /// Images alone: neither a calibration nor what would show it.
@@ -102,13 +102,13 @@ pub enum Error {
         "{name} has neither a calibration nor an IMU that would show it: images alone give depth without scale"
     )]
     ImagesAlone {
-        /// Dataset name.
+        /// Name of the recording.
         name: String,
     },
     /// The recording does not show its calibration.
     #[error("{name} has no calibration, and the recording does not show it: {reason}")]
     NotCalibrated {
-        /// Dataset name.
+        /// Name of the recording.
         name: String,
         /// What is missing.
         reason: String,
@@ -116,7 +116,7 @@ pub enum Error {
     /// Camera and IMU gave no metric poses.
     #[error("the odometry of {name} never initialised: {reason}")]
     NoOdometry {
-        /// Dataset name.
+        /// Name of the recording.
         name: String,
         /// What was missing.
         reason: String,
@@ -280,8 +280,8 @@ impl Error {
             Self::Usage { .. } => "E0105",
             Self::OutputExists { .. } => "E0106",
             Self::OtherRun { .. } => "E0107",
-            Self::Dataset(vidar_dataset::DatasetError::BadOption { .. }) => "E0105",
-            Self::Dataset(_) => "E0201",
+            Self::Recording(vidar_dataset::DatasetError::BadOption { .. }) => "E0105",
+            Self::Recording(_) => "E0201",
             Self::NoMetricTrajectory { .. } => "E0202",
             Self::NoOverlap { .. } => "E0203",
             Self::TooFewKeyframes { .. } => "E0204",
@@ -338,10 +338,10 @@ impl Error {
         use vidar_export::ExportError as Export;
         let path = match self {
             Self::UnknownKey { origin, .. } => return Some(origin.clone()),
-            Self::Dataset(DatasetError::Malformed { path, line, .. }) => {
+            Self::Recording(DatasetError::Malformed { path, line, .. }) => {
                 return Some(format!("{}:{line}", path.display()));
             }
-            Self::Dataset(error) => error.path()?,
+            Self::Recording(error) => error.path()?,
             Self::ConfigFile { path, .. }
             | Self::OutputExists { path }
             | Self::OtherRun { path, .. }
@@ -458,7 +458,7 @@ impl Error {
                 "--map takes the folder that `vidar odometry` or `vidar run` left, of this version; it holds odometry/map.cbor"
             }
             Self::NotARun { .. } => "a run folder contains manifest.json; `vidar run PATH` creates one",
-            Self::Dataset(error) => return Some(dataset_hint(error).to_owned()),
+            Self::Recording(error) => return Some(dataset_hint(error).to_owned()),
             Self::Hub(error) => return error.hint(),
             // Every command that opens a network has --model.
             Self::WeightsMissing(error) => {

@@ -4,7 +4,7 @@
 //! noise throws the scale away: rendered slow phones with three times their noise had two to five times the error, with ten times no start.
 
 use vidar_core::{ImuNoise, Warning};
-use vidar_dataset::Dataset;
+use vidar_dataset::Recording;
 use vidar_odometry::calibration::{SensorNoise, sensor_noise};
 
 /// Bias walks, which half a minute does not show: those of consumer sensors.
@@ -27,7 +27,7 @@ const GUESSED: &str = "imu-noise";
 const FROM_SAMPLES: &str = "imu-noise-from-samples";
 
 /// Whether nobody states the noise.
-pub(crate) fn is_guessed(dataset: &Dataset) -> bool {
+pub(crate) fn is_guessed(dataset: &Recording) -> bool {
     dataset.warnings.iter().any(|w| [GUESSED, FROM_SAMPLES].contains(&w.kind.as_str()))
 }
 
@@ -45,7 +45,7 @@ pub(crate) fn believed_noise(seen: Option<SensorNoise>) -> ImuNoise {
 }
 
 /// Replaces noise that nobody stated, and noise that the samples contradict; warnings say so. Returns what the samples show.
-pub(crate) fn settle(dataset: &mut Dataset) -> Option<SensorNoise> {
+pub(crate) fn settle(dataset: &mut Recording) -> Option<SensorNoise> {
     let seen = sensor_noise(&dataset.imu)?;
     if let Some(stated) = dataset.rig.imu {
         replace(dataset, &stated, seen);
@@ -53,7 +53,7 @@ pub(crate) fn settle(dataset: &mut Dataset) -> Option<SensorNoise> {
     Some(seen)
 }
 
-fn replace(dataset: &mut Dataset, stated: &ImuNoise, seen: SensorNoise) {
+fn replace(dataset: &mut Recording, stated: &ImuNoise, seen: SensorNoise) {
     let shown = believed_noise(Some(seen));
     if is_guessed(dataset) {
         // What it said is used is not.

@@ -15,7 +15,7 @@ use vidar_align::CouplingMode;
 use vidar_core::{
     BodyFrame, CameraId, Duration, Frame, FrameImage, Image, SensorEvent, StampedPose, Trajectory, Warning,
 };
-use vidar_dataset::{CalibrationSource, Dataset, DatasetError, ImageEntry, OpenOptions};
+use vidar_dataset::{CalibrationSource, DatasetError, ImageEntry, OpenOptions, Recording};
 use vidar_odometry::bundle_adjustment::Adjusted;
 
 /// Where the metric poses of a run come from.
@@ -71,7 +71,7 @@ impl PosePlan {
     ///
     /// # Errors
     /// [`Error::NoMetricTrajectory`] where the coupling needs poses and there are none; a calibration that is only guessed.
-    pub fn new(dataset: &Dataset, config: &Config) -> Result<Self, Error> {
+    pub fn new(dataset: &Recording, config: &Config) -> Result<Self, Error> {
         let mode = config.coupling.mode;
         let choice = match mode {
             CouplingMode::GroundTruth => PoseChoice::GroundTruth,
@@ -115,7 +115,7 @@ impl PosePlan {
     }
 
     /// The given trajectory as a source of poses.
-    pub fn given(&self, dataset: &Dataset, config: &Config) -> Option<GivenPoses> {
+    pub fn given(&self, dataset: &Recording, config: &Config) -> Option<GivenPoses> {
         match self {
             Self::Given(trajectory) => Some(given_poses(trajectory, dataset, config)),
             Self::None | Self::Odometry { .. } => None,
@@ -123,7 +123,7 @@ impl PosePlan {
     }
 
     /// The trajectory that serves where the odometry gives no pose.
-    pub fn fallback(&self, dataset: &Dataset, config: &Config) -> Option<GivenPoses> {
+    pub fn fallback(&self, dataset: &Recording, config: &Config) -> Option<GivenPoses> {
         match self {
             Self::Odometry { fallback: Some(trajectory) } => Some(given_poses(trajectory, dataset, config)),
             Self::None | Self::Given(_) | Self::Odometry { fallback: None } => None,
@@ -142,7 +142,7 @@ impl PosePlan {
     #[allow(clippy::type_complexity)] // two sources of one kind, named by their place in `EngineSetup`
     pub fn open(
         &self,
-        dataset: &Dataset,
+        dataset: &Recording,
         config: &Config,
     ) -> Result<(Option<Box<dyn PoseSource>>, Option<Box<dyn PoseSource>>), Error> {
         let boxed = |poses: GivenPoses| Box::new(poses) as Box<dyn PoseSource>;
@@ -160,14 +160,14 @@ impl PosePlan {
     }
 }
 
-fn given_poses(trajectory: &MetricTrajectory, dataset: &Dataset, config: &Config) -> GivenPoses {
+fn given_poses(trajectory: &MetricTrajectory, dataset: &Recording, config: &Config) -> GivenPoses {
     // Poses are in the IMU's clock: t_imu = t_camera + offset.
     let offset = dataset.rig.camera(dataset.camera).map_or(Duration::ZERO, |c| c.time_offset);
     GivenPoses::new(trajectory.clone(), offset, Duration::from_secs_f64(config.input.max_pose_gap_secs))
 }
 
 /// SHA-256 of what a recording consists of.
-pub(crate) fn fingerprint(dataset: &Dataset) -> Result<String, Error> {
+pub(crate) fn fingerprint(dataset: &Recording) -> Result<String, Error> {
     let mut hash = Sha256::new();
     dataset.write_fingerprint(&mut hash)?;
     Ok(vidar_hub::hex(&hash.finalize()))
@@ -185,7 +185,7 @@ pub enum Measurement {
 }
 
 /// The measurements of a recording; without `sensors` only the times of its images.
-pub fn measurements(dataset: &Dataset, sensors: bool) -> impl Iterator<Item = Measurement> + '_ {
+pub fn measurements(dataset: &Recording, sensors: bool) -> impl Iterator<Item = Measurement> + '_ {
     let mut imu = if sensors { dataset.imu.as_slice() } else { &[] }.iter().peekable();
     let mut images = dataset.images.iter().peekable();
     let mut pixels = dataset.images_ahead(dataset.images.iter());
@@ -216,7 +216,7 @@ pub fn stamp_of(entry: &ImageEntry) -> FrameStamp {
 }
 
 /// Reads a recording's images again when the engine needs their pixels.
-pub struct ImageFiles<'a>(pub &'a Dataset, pub Option<&'a Masks>);
+pub struct ImageFiles<'a>(pub &'a Recording, pub Option<&'a Masks>);
 
 impl ImageSource for ImageFiles<'_> {
     fn image(&self, stamp: &FrameStamp) -> Result<FrameImage, Warning> {
@@ -241,14 +241,14 @@ impl ImageSource for ImageFiles<'_> {
 
 /// Opens the recording with all of its images between start and end: the odometry uses every one,
 /// whatever `input.stride` leaves for depth.
-pub fn open_every_image(path: &Path, options: &OpenOptions, config: &Config) -> Result<Dataset, Error> {
+pub fn open_every_image(path: &Path, options: &OpenOptions, config: &Config) -> Result<Recording, Error> {
     let mut config = config.clone();
     config.input.stride = 1;
     open_dataset(path, options, &config)
 }
 
 /// Where image times are invented, an interval of time between keyframes means nothing: every image is one.
-pub fn use_every_untimed_image(dataset: &Dataset, config: &mut Config) -> Option<Warning> {
+pub fn use_every_untimed_image(dataset: &Recording, config: &mut Config) -> Option<Warning> {
     if !dataset.times_are_invented {
         return None;
     }
@@ -263,12 +263,12 @@ pub fn use_every_untimed_image(dataset: &Dataset, config: &mut Config) -> Option
 }
 
 /// The images that `input.stride` leaves.
-pub fn strided(dataset: &Dataset, config: &Config) -> Vec<ImageEntry> {
+pub fn strided(dataset: &Recording, config: &Config) -> Vec<ImageEntry> {
     dataset.images.iter().step_by(config.input.stride.max(1)).cloned().collect()
 }
 
 /// Applies the configuration's part of the options and opens the dataset.
-pub fn open_dataset(path: &Path, options: &OpenOptions, config: &Config) -> Result<Dataset, Error> {
+pub fn open_dataset(path: &Path, options: &OpenOptions, config: &Config) -> Result<Recording, Error> {
     let mut options = options.clone();
     options.camera = CameraId(config.input.camera);
     options.stride = config.input.stride;
@@ -280,7 +280,7 @@ pub fn open_dataset(path: &Path, options: &OpenOptions, config: &Config) -> Resu
 }
 
 /// Whether the adjustment of a recording that calibrated itself leaves so much of the IMU that its calibration may be wrong.
-pub(crate) fn leaves_calibration_unchecked(dataset: &Dataset, adjusted: &Adjusted) -> bool {
+pub(crate) fn leaves_calibration_unchecked(dataset: &Recording, adjusted: &Adjusted) -> bool {
     dataset.calibration == CalibrationSource::Recording
         && adjusted.report.inertial_chi2_per_dof > MAX_SELF_CALIBRATED_CHI2
 }
@@ -303,7 +303,7 @@ const MAX_SELF_CALIBRATED_CHI2: f64 = 0.25;
 
 impl UnseenScale {
     /// As configured, and at least what the accelerometer is off at rest.
-    pub fn of(dataset: &Dataset, config: &Config) -> Self {
+    pub fn of(dataset: &Recording, config: &Config) -> Self {
         let at_rest = vidar_dataset::gain_error_at_rest(&dataset.imu).map_or(0.0, f64::abs);
         // Gravity itself differs by 0.3 % on Earth, which says nothing of the gain.
         let at_rest = if at_rest > 0.01 { at_rest } else { 0.0 };
@@ -329,19 +329,19 @@ impl UnseenScale {
 }
 
 /// Ground truth of the camera in use at the images' stamps, where its place on the rig is known.
-pub fn truth_in_camera(dataset: &Dataset) -> Option<Trajectory> {
+pub fn truth_in_camera(dataset: &Recording) -> Option<Trajectory> {
     let truth = dataset.ground_truth.as_ref().and_then(|t| in_camera(t, dataset).ok())?;
     in_image_clock(&truth, dataset)
 }
 
 /// A trajectory in the IMU's clock, as ground truth is, with the stamps that images of these times have.
-pub fn in_image_clock(trajectory: &Trajectory, dataset: &Dataset) -> Option<Trajectory> {
+pub fn in_image_clock(trajectory: &Trajectory, dataset: &Recording) -> Option<Trajectory> {
     let offset = dataset.rig.camera(dataset.camera).map_or(Duration::ZERO, |c| c.time_offset);
     let stamped = |p: &StampedPose| StampedPose { time: p.time - offset, ..*p };
     Trajectory::new(trajectory.body(), trajectory.poses().iter().map(stamped).collect()).ok()
 }
 
-fn in_camera(trajectory: &Trajectory, dataset: &Dataset) -> Result<Trajectory, Error> {
+fn in_camera(trajectory: &Trajectory, dataset: &Recording) -> Result<Trajectory, Error> {
     Ok(trajectory.in_frame(BodyFrame::Camera(dataset.camera), &dataset.rig)?)
 }
 
@@ -380,7 +380,7 @@ pub(crate) fn needs_calibration(config: &Config) -> bool {
 }
 
 /// Refuses a camera that is only guessed: it would bend every surface and still look metric.
-pub fn require_calibration(dataset: &Dataset) -> Result<(), Error> {
+pub fn require_calibration(dataset: &Recording) -> Result<(), Error> {
     match dataset.calibration {
         CalibrationSource::Guessed if dataset.imu.is_empty() && dataset.external_trajectory.is_none() => {
             Err(Error::ImagesAlone { name: dataset.name.clone() })

@@ -12,7 +12,7 @@ use crate::imu_noise;
 use serde::Serialize;
 use std::path::Path;
 use vidar_core::{Duration, FrameImage, Timestamp, Trajectory, Warning};
-use vidar_dataset::{CalibrationSource, Dataset, OpenOptions};
+use vidar_dataset::{CalibrationSource, OpenOptions, Recording};
 use vidar_odometry::calibration::SensorNoise;
 
 /// Summary of a recording.
@@ -134,7 +134,7 @@ pub fn inspect(
 }
 
 /// What a metric map needs and the recording does not state.
-fn missing(dataset: &Dataset) -> Vec<String> {
+fn missing(dataset: &Recording) -> Vec<String> {
     let is_guessed = dataset.calibration == CalibrationSource::Guessed;
     let has_imu = !dataset.imu.is_empty();
     let warned = |kind: &str| dataset.warnings.iter().any(|w| w.kind == kind);
@@ -154,7 +154,7 @@ fn missing(dataset: &Dataset) -> Vec<String> {
 }
 
 /// The streams of a recording with their rates.
-pub fn streams(dataset: &Dataset) -> Vec<Stream> {
+pub fn streams(dataset: &Recording) -> Vec<Stream> {
     let images: Vec<Timestamp> = dataset.images.iter().map(|i| i.time).collect();
     let imu: Vec<Timestamp> = dataset.imu.iter().map(|s| s.time).collect();
     let depths: Vec<Timestamp> = dataset.depths.iter().map(|d| d.time).collect();
@@ -194,7 +194,7 @@ fn stream(what: &str, times: &[Timestamp]) -> Option<Stream> {
     })
 }
 
-fn describe_imu(dataset: &Dataset, motion: Option<&Motion>) -> Vec<String> {
+fn describe_imu(dataset: &Recording, motion: Option<&Motion>) -> Vec<String> {
     if dataset.imu.is_empty() {
         return vec!["none: the scale can only come from an external trajectory".into()];
     }
@@ -214,7 +214,7 @@ fn describe_imu(dataset: &Dataset, motion: Option<&Motion>) -> Vec<String> {
     words
 }
 
-fn describe_poses(dataset: &Dataset) -> Vec<String> {
+fn describe_poses(dataset: &Recording) -> Vec<String> {
     let describe = |what: &str, t: &Trajectory| {
         format!("{what}: {} poses of the {}, path {:.1} m", t.len(), t.body(), t.path_length_m())
     };
@@ -228,7 +228,7 @@ fn describe_poses(dataset: &Dataset) -> Vec<String> {
     words
 }
 
-fn image_health(dataset: &Dataset) -> Option<ImageHealth> {
+fn image_health(dataset: &Recording) -> Option<ImageHealth> {
     let n = dataset.images.len();
     let chosen: Vec<usize> = (0..SAMPLED_IMAGES.min(n)).map(|i| i * n / SAMPLED_IMAGES.min(n)).collect();
     let loaded: Vec<Option<FrameImage>> =
@@ -273,7 +273,7 @@ fn measure(image: &FrameImage) -> [f64; 3] {
 }
 
 /// `is_refused`: there is no calibration, and the recording does not show one.
-fn possible(dataset: &Dataset, is_refused: bool) -> Vec<String> {
+fn possible(dataset: &Recording, is_refused: bool) -> Vec<String> {
     let mut lines = Vec::new();
     if is_refused {
         lines.push(

@@ -2,7 +2,7 @@
 //!
 //! ```text
 //! vidar-dataset ─▶ metric poses ─▶ vidar-stereo ─▶ vidar-align ─▶ vidar-fusion ─▶ vidar-eval · vidar-export · vidar-view
-//!  Dataset          MapKeyframe     GeometryPrediction  AlignedView    Surface          scores · files · figures
+//!  Recording          MapKeyframe     GeometryPrediction  AlignedView    Surface          scores · files · figures
 //! ```
 //!
 //! [`engine::Engine`] is the method as a push machine: sensor measurements in, map events out. [`run::run`] is a run of it:

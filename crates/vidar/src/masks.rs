@@ -10,7 +10,7 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use vidar_core::{FrameId, FrameImage, Image};
 use vidar_dataset::decode::{ImageLimits, read_image, read_size};
-use vidar_dataset::{Dataset, DatasetError, ImageEntry};
+use vidar_dataset::{DatasetError, ImageEntry, Recording};
 
 /// The masks of a recording's images.
 #[derive(Clone, Debug)]
@@ -26,7 +26,7 @@ impl Masks {
     ///
     /// # Errors
     /// The folder cannot be read or has no mask of any image, or a mask has another size than its image.
-    pub fn open(folder: &Path, dataset: &Dataset) -> Result<Self, Error> {
+    pub fn open(folder: &Path, dataset: &Recording) -> Result<Self, Error> {
         std::fs::read_dir(folder).map_err(|e| Error::io("read", folder, e))?;
         let mut files = BTreeMap::new();
         let mut hash = Sha256::new();
@@ -86,7 +86,7 @@ fn names(entry: &ImageEntry) -> Vec<String> {
     vec![format!("{}.png", text(file.file_name())), format!("{}.png", text(file.file_stem()))]
 }
 
-fn check_size(path: &Path, dataset: &Dataset) -> Result<(), Error> {
+fn check_size(path: &Path, dataset: &Recording) -> Result<(), Error> {
     let (found_width, found_height) = read_size(path, &ImageLimits::default())?;
     let Some(camera) = dataset.rig.camera(dataset.camera) else { return Ok(()) };
     let (expected_width, expected_height) = (camera.model.width(), camera.model.height());

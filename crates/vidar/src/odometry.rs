@@ -28,7 +28,7 @@ use std::ops::ControlFlow;
 use std::path::PathBuf;
 use std::time::Instant;
 use vidar_core::{BodyFrame, Severity, Trajectory, Warning};
-use vidar_dataset::{Dataset, OpenOptions};
+use vidar_dataset::{OpenOptions, Recording};
 use vidar_eval::TrajectoryReport;
 use vidar_odometry::bundle_adjustment::{CalibrationSigmas, Progress};
 use vidar_odometry::{ImuUse, Odometry};
@@ -104,7 +104,7 @@ pub fn odometry(
     folder.write("config.resolved.toml", request.layered.to_toml(true).as_bytes())?;
     let mut dump = if request.debug_dump { Some(dump::Dump::create(&folder)?) } else { None };
     let timing = settle_timing(&mut dataset, &mut config, events, cancel)?;
-    let recording = Recording { dataset: &dataset, config: &config, map: earlier_map.as_ref() };
+    let recording = TrackingInput { dataset: &dataset, config: &config, map: earlier_map.as_ref() };
     let tracked = track(&recording, sigmas.as_ref(), events, cancel, dump.as_mut())?;
     let dumped = dump.is_some();
     dump.map_or(Ok(()), dump::Dump::finish)?;
@@ -164,7 +164,7 @@ pub fn odometry(
 /// # Errors
 /// There is no calibration and the recording does not show one; what the odometry refuses.
 pub fn prepare(
-    dataset: &mut Dataset,
+    dataset: &mut Recording,
     config: &mut Config,
     events: &Events,
     cancel: &CancelToken,
@@ -175,7 +175,7 @@ pub fn prepare(
 }
 
 fn settle_timing(
-    dataset: &mut Dataset,
+    dataset: &mut Recording,
     config: &mut Config,
     events: &Events,
     cancel: &CancelToken,
@@ -184,8 +184,8 @@ fn settle_timing(
 }
 
 /// What is tracked.
-pub(crate) struct Recording<'a> {
-    pub dataset: &'a Dataset,
+pub(crate) struct TrackingInput<'a> {
+    pub dataset: &'a Recording,
     pub config: &'a Config,
     /// The map to look in.
     pub map: Option<&'a EarlierMap>,
@@ -194,17 +194,17 @@ pub(crate) struct Recording<'a> {
 /// Feeds a recording to the odometry, and adjusts all states after its end where `adjustable` says what may change. Where that leaves
 /// camera and IMU apart and the calibration is the recording's own, all of it happens once more with the calibration as adjusted.
 pub(crate) fn track(
-    recording: &Recording<'_>,
+    recording: &TrackingInput<'_>,
     adjustable: Option<&CalibrationSigmas>,
     events: &Events,
     cancel: &CancelToken,
     mut dump: Option<&mut dump::Dump>,
 ) -> Result<Tracked, Error> {
     let tracked = track_once(recording, adjustable, events, cancel, dump.as_deref_mut())?;
-    let Recording { dataset, config, map } = *recording;
+    let TrackingInput { dataset, config, map } = *recording;
     let first = tracked.adjusted.as_ref().filter(|a| input::leaves_calibration_unchecked(dataset, a));
     let Some(first) = first.filter(|_| !cancel.is_cancelled()) else { return Ok(tracked) };
-    let focal = |dataset: &Dataset| dataset.rig.cameras[dataset.camera.index()].model.intrinsics().fx;
+    let focal = |dataset: &Recording| dataset.rig.cameras[dataset.camera.index()].model.intrinsics().fx;
     let before = focal(dataset);
     let (mut dataset, mut config) = (dataset.clone(), config.clone());
     adjusted::apply(first, &mut dataset);
@@ -212,14 +212,14 @@ pub(crate) fn track(
     if let Some(dump) = dump.as_deref_mut() {
         dump.begin_again()?;
     }
-    let again = Recording { dataset: &dataset, config: &config, map };
+    let again = TrackingInput { dataset: &dataset, config: &config, map };
     let mut again = track_once(&again, adjustable, events, cancel, dump)?;
     again.calibrated_again = Some([before, focal(&dataset)]);
     Ok(if again.adjusted.is_some() { again } else { tracked })
 }
 
 fn track_once(
-    recording: &Recording<'_>,
+    recording: &TrackingInput<'_>,
     adjustable: Option<&CalibrationSigmas>,
     events: &Events,
     cancel: &CancelToken,
@@ -252,13 +252,13 @@ fn track_once(
 }
 
 fn push_all(
-    recording: &Recording<'_>,
+    recording: &TrackingInput<'_>,
     keeps_log: bool,
     events: &Events,
     cancel: &CancelToken,
     mut dump: Option<&mut dump::Dump>,
 ) -> Result<(Tracked, Odometry), Error> {
-    let Recording { dataset, config, map } = *recording;
+    let TrackingInput { dataset, config, map } = *recording;
     let settings = &config.odometry;
     let mut odometry = Odometry::new(&dataset.rig, dataset.camera, settings)?;
     if let Some(earlier) = map {
@@ -331,7 +331,7 @@ fn verdict(
 /// Scores against ground truth, where there are both.
 fn against_truth(
     trajectory: Option<&Trajectory>,
-    dataset: &Dataset,
+    dataset: &Recording,
     config: &Config,
 ) -> Result<Option<TrajectoryReport>, Error> {
     let (Some(trajectory), Some(truth)) = (trajectory, &dataset.ground_truth) else { return Ok(None) };
@@ -345,7 +345,11 @@ fn against_truth(
 }
 
 /// What is known before tracking.
-fn start_manifest(request: &OdometryRequest, dataset: &Dataset, started: String) -> Result<Manifest, Error> {
+fn start_manifest(
+    request: &OdometryRequest,
+    dataset: &Recording,
+    started: String,
+) -> Result<Manifest, Error> {
     Ok(Manifest {
         schema: MANIFEST_SCHEMA.into(),
         version: crate::VERSION.into(),

@@ -51,7 +51,7 @@ pub enum OutputLocation {
     Dated {
         /// Usually the current folder.
         base: PathBuf,
-        /// Dataset name.
+        /// Name of the recording.
         name: String,
     },
 }

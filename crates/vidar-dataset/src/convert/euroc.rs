@@ -2,9 +2,9 @@
 
 use super::mcap::without_invalid;
 use super::{Converted, Progress, interrupted};
-use crate::dataset::{CalibrationSource, Dataset, DepthSensor};
 use crate::error::{DatasetError, io_error};
 use crate::location::StoredDepth;
+use crate::recording::{CalibrationSource, DepthSensor, Recording};
 use image::codecs::png::{CompressionType, FilterType, PngEncoder};
 use image::{ExtendedColorType, ImageEncoder};
 use std::fmt::Write as _;
@@ -16,7 +16,7 @@ use vidar_core::{
 
 /// Writes the folder.
 pub(super) fn write(
-    dataset: &Dataset,
+    dataset: &Recording,
     out: &Path,
     progress: &Progress<'_>,
 ) -> Result<Converted, DatasetError> {
@@ -59,7 +59,7 @@ fn write_text(path: &Path, text: &str) -> Result<(), DatasetError> {
 }
 
 fn write_images(
-    dataset: &Dataset,
+    dataset: &Recording,
     folder: &Path,
     done: &mut Converted,
     progress: &Progress<'_>,
@@ -131,7 +131,7 @@ fn model_yaml(model: &CameraModel) -> String {
     )
 }
 
-fn camera_yaml(dataset: &Dataset, camera: &RigCamera, is_known: bool) -> String {
+fn camera_yaml(dataset: &Recording, camera: &RigCamera, is_known: bool) -> String {
     let mut text = format!("sensor_type: camera\n{}", mount_yaml(&camera.body_from_camera));
     if let Some(rate_hz) = camera.rate_hz {
         let _ = writeln!(text, "rate_hz: {rate_hz}");
@@ -152,7 +152,7 @@ fn camera_yaml(dataset: &Dataset, camera: &RigCamera, is_known: bool) -> String 
     text
 }
 
-fn write_imu(dataset: &Dataset, folder: &Path, done: &mut Converted) -> Result<(), DatasetError> {
+fn write_imu(dataset: &Recording, folder: &Path, done: &mut Converted) -> Result<(), DatasetError> {
     if dataset.imu.is_empty() {
         return Ok(());
     }
@@ -185,7 +185,7 @@ fn write_imu(dataset: &Dataset, folder: &Path, done: &mut Converted) -> Result<(
 /// Millimetres, for depth that is not stored as whole numbers.
 const UNITS_PER_METRE: f64 = 1000.0;
 
-fn write_depth(dataset: &Dataset, folder: &Path, done: &mut Converted) -> Result<(), DatasetError> {
+fn write_depth(dataset: &Recording, folder: &Path, done: &mut Converted) -> Result<(), DatasetError> {
     let Some(sensor) = dataset.depth_sensor.as_ref().filter(|_| !dataset.depths.is_empty()) else {
         return Ok(());
     };
@@ -221,7 +221,7 @@ fn write_depth(dataset: &Dataset, folder: &Path, done: &mut Converted) -> Result
     write_text(&folder.join("sensor.yaml"), &depth_yaml(dataset, sensor, units))
 }
 
-fn depth_yaml(dataset: &Dataset, sensor: &DepthSensor, units: f64) -> String {
+fn depth_yaml(dataset: &Recording, sensor: &DepthSensor, units: f64) -> String {
     let body_from_camera = dataset.rig.camera(dataset.camera).map_or(Se3::IDENTITY, |c| c.body_from_camera);
     let body_from_depth = body_from_camera * sensor.color_from_depth;
     let pinhole = CameraModel::Pinhole(sensor.intrinsics);
@@ -230,7 +230,7 @@ fn depth_yaml(dataset: &Dataset, sensor: &DepthSensor, units: f64) -> String {
 }
 
 /// Reference poses of the body, or positions of another one.
-fn write_truth(dataset: &Dataset, truth: &Trajectory, root: &Path) -> Result<(), DatasetError> {
+fn write_truth(dataset: &Recording, truth: &Trajectory, root: &Path) -> Result<(), DatasetError> {
     let camera_from_body = |id| {
         let camera = dataset.rig.camera(id).map(|c| c.body_from_camera);
         camera.filter(|m| *m != Se3::IDENTITY).map(|m| m.inverse())

@@ -2,7 +2,7 @@
 //! camera, models that `CameraInfo` does not know, the unit of depth, and which topics hold poses.
 
 use crate::camera_flag::CameraFlag;
-use crate::dataset::{CalibrationSource, Dataset};
+use crate::recording::{CalibrationSource, Recording};
 use std::collections::BTreeMap;
 use std::fmt::Display;
 use std::str::FromStr;
@@ -26,7 +26,7 @@ pub(crate) struct Facts {
 
 impl Facts {
     /// Those of a dataset, without its topics.
-    pub(crate) fn of(dataset: &Dataset) -> Self {
+    pub(crate) fn of(dataset: &Recording) -> Self {
         let camera = dataset.rig.camera(dataset.camera);
         let is_known = dataset.calibration != CalibrationSource::Guessed;
         Self {

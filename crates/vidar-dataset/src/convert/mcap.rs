@@ -2,9 +2,9 @@
 
 use super::facts::{Facts, NAME};
 use super::{Converted, Progress, interrupted};
-use crate::dataset::{CalibrationSource, Dataset, DepthEntry, DepthSensor, ImageEntry};
 use crate::error::{DatasetError, io_error};
 use crate::location::StoredDepth;
+use crate::recording::{CalibrationSource, DepthEntry, DepthSensor, ImageEntry, Recording};
 use std::fs::File;
 use std::io::BufWriter;
 use std::path::Path;
@@ -30,7 +30,7 @@ enum Item {
 }
 
 struct Writer<'a> {
-    dataset: &'a Dataset,
+    dataset: &'a Recording,
     out: McapWriter<BufWriter<File>>,
     path: &'a Path,
     channels: Vec<(String, ChannelId)>,
@@ -38,7 +38,7 @@ struct Writer<'a> {
 
 /// Writes the file.
 pub(super) fn write(
-    dataset: &Dataset,
+    dataset: &Recording,
     path: &Path,
     progress: &Progress<'_>,
 ) -> Result<Converted, DatasetError> {

@@ -1,14 +1,14 @@
 //! Writing a recording in another layout: MCAP with messages of ROS 2, or a folder in EuRoC's layout.
 //!
-//! What is written is what a [`Dataset`] holds: the images of its chosen camera with their calibration, the IMU, depth and poses; times,
+//! What is written is what a [`Recording`] holds: the images of its chosen camera with their calibration, the IMU, depth and poses; times,
 //! pixels and numbers stay as they are. What a layout has no place for is named in [`Converted::warnings`].
 
 mod euroc;
 pub(crate) mod facts;
 mod mcap;
 
-use crate::dataset::{CalibrationSource, Dataset};
 use crate::error::{DatasetError, io_error};
+use crate::recording::{CalibrationSource, Recording};
 use std::fmt;
 use std::path::{Path, PathBuf};
 use std::str::FromStr;
@@ -82,7 +82,7 @@ pub type Progress<'a> = dyn Fn(usize, usize) -> bool + 'a;
 
 /// Writes `dataset` to `out`, which must not exist. Nothing is left there when it fails.
 pub fn convert(
-    dataset: &Dataset,
+    dataset: &Recording,
     out: &Path,
     format: ConvertFormat,
     progress: &Progress<'_>,
@@ -114,7 +114,7 @@ fn remove(part: &PathBuf) {
 }
 
 /// What neither layout carries.
-fn left_out(dataset: &Dataset, out: &Path) -> Vec<Warning> {
+fn left_out(dataset: &Recording, out: &Path) -> Vec<Warning> {
     let note = |kind: &str, message: String| Warning::new(kind, message).at(out.display());
     let mut notes = Vec::new();
     if dataset.rig.cameras.len() > 1 {

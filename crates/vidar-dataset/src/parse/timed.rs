@@ -1,9 +1,9 @@
 //! Tables of a time and numbers in every row: IMU samples, accelerometer samples, poses with numbers of frames.
 
 use super::units::{UnitRule, decide_unit, read_time};
-use crate::dataset::AccelSample;
 use crate::error::DatasetError;
 use crate::options::TimeUnit;
+use crate::recording::AccelSample;
 use crate::source::{MAX_ROWS, Row, Source, for_each_block};
 use nalgebra::Vector3;
 use std::path::Path;

@@ -4,7 +4,7 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 use tempfile::TempDir;
-use vidar_dataset::{Dataset, DatasetError, OpenOptions, open};
+use vidar_dataset::{DatasetError, OpenOptions, Recording, open};
 
 /// A folder that is removed when dropped.
 pub struct Folder(TempDir);
@@ -35,11 +35,11 @@ impl Folder {
         self.write(part, change(text))
     }
 
-    pub fn open(&self) -> Result<Dataset, DatasetError> {
+    pub fn open(&self) -> Result<Recording, DatasetError> {
         open(self.path(), &OpenOptions::default())
     }
 
-    pub fn open_with(&self, options: &OpenOptions) -> Result<Dataset, DatasetError> {
+    pub fn open_with(&self, options: &OpenOptions) -> Result<Recording, DatasetError> {
         open(self.path(), options)
     }
 }
@@ -158,13 +158,13 @@ pub fn posed() -> Folder {
 }
 
 /// The kinds of a dataset's warnings.
-pub fn kinds(dataset: &Dataset) -> Vec<&str> {
+pub fn kinds(dataset: &Recording) -> Vec<&str> {
     dataset.warnings.iter().map(|w| w.kind.as_str()).collect()
 }
 
 /// The one warning of a kind.
 #[track_caller]
-pub fn warning<'a>(dataset: &'a Dataset, kind: &str) -> &'a vidar_core::Warning {
+pub fn warning<'a>(dataset: &'a Recording, kind: &str) -> &'a vidar_core::Warning {
     dataset
         .warnings
         .iter()

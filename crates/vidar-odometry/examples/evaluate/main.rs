@@ -36,7 +36,7 @@ use nalgebra::Vector3;
 use print::{costs, frames, row, stages, tell, tum};
 use std::path::{Path, PathBuf};
 use vidar_core::{Duration, Health, LieGroup, NavState, Se3, SensorEvent, So3, StampedPose, Timestamp};
-use vidar_dataset::{Dataset, OpenOptions};
+use vidar_dataset::{OpenOptions, Recording};
 use vidar_odometry::bundle_adjustment::{Adjusted, CalibrationSigmas};
 use vidar_odometry::{ImuUse, Odometry, OdometryConfig, OdometryOutput, StageTimes};
 
@@ -224,7 +224,7 @@ impl Pace {
     }
 }
 
-fn run(dataset: &Dataset, options: &Options) -> Result<Run, Failure> {
+fn run(dataset: &Recording, options: &Options) -> Result<Run, Failure> {
     let imu = if options.mono { ImuUse::Off } else { ImuUse::Auto };
     let mut config = OdometryConfig { imu, ..OdometryConfig::default() };
     for (key, number) in &options.settings {

@@ -7,7 +7,7 @@
 use super::initial::{self, Guess, MIN_OBSERVATIONS};
 use super::problem::CalibrationPrior;
 use super::progress::Watch;
-use super::{AdjustmentError, Recording, Work, optimise};
+use super::{AdjustmentError, Measurements, Work, optimise};
 use crate::imu::NavState;
 use vidar_core::{Duration, Timestamp};
 
@@ -31,7 +31,7 @@ const MIN_SEGMENT_SECS: f64 = 3.0;
 
 /// The states of `work`, and those of all images that can be reached from them.
 pub(super) fn outward(
-    recording: &Recording<'_>,
+    recording: &Measurements<'_>,
     work: &Work,
     watch: &mut Watch<'_>,
 ) -> Result<Guess, AdjustmentError> {
@@ -43,7 +43,7 @@ pub(super) fn outward(
 }
 
 struct Grown<'a> {
-    recording: &'a Recording<'a>,
+    recording: &'a Measurements<'a>,
     work: &'a Work,
     guess: Guess,
     /// Length of the newest stretch that shows too little.
@@ -57,7 +57,7 @@ impl Grown<'_> {
 
     /// A second more at the end; whether anything more could be reached.
     fn forward(&mut self, watch: &mut Watch<'_>) -> Result<bool, AdjustmentError> {
-        let Recording { log, imu, model } = *self.recording;
+        let Measurements { log, imu, model } = *self.recording;
         let known = self.guess.images.len();
         let (Some(last), Some(&end)) = (self.guess.images.last(), self.guess.times.last()) else {
             return Ok(false);
@@ -89,7 +89,7 @@ impl Grown<'_> {
 
     /// A second more at the beginning.
     fn backward(&mut self, watch: &mut Watch<'_>) -> Result<bool, AdjustmentError> {
-        let Recording { imu, model, .. } = *self.recording;
+        let Measurements { imu, model, .. } = *self.recording;
         let known = self.guess.images.len();
         let (Some(&first), Some(&begin)) = (self.guess.images.first(), self.guess.times.first()) else {
             return Ok(false);

@@ -5,7 +5,7 @@ use super::log::{TrackKey, TrackLog};
 use super::observation::{self, Calibration, Landmark, MIN_INVERSE_DISTANCE};
 use super::problem::CalibrationPrior;
 use super::problem::{FrameState, Observation, ObservedLandmark, Problem};
-use super::{AdjustmentError, Recording};
+use super::{AdjustmentError, Measurements};
 use crate::backend::whitening;
 use crate::imu::{ImuBuffer, ImuModel, NavState, Preintegration};
 use nalgebra::Vector3;
@@ -55,13 +55,13 @@ impl Guess {
 
 /// The problem that begins with `guess`, whose state number `held` fixes position and heading of the world.
 pub(super) fn build(
-    recording: &Recording<'_>,
+    recording: &Measurements<'_>,
     calibration: &Calibration,
     prior: CalibrationPrior,
     guess: &Guess,
     held: usize,
 ) -> Result<Problem, AdjustmentError> {
-    let Recording { log, imu, model } = *recording;
+    let Measurements { log, imu, model } = *recording;
     let gain = &calibration.gain;
     let at = |(time, state): (&Timestamp, &NavState)| FrameState::new(*time, *state, imu, model, gain);
     let frames: Option<Vec<FrameState>> = guess.times.iter().zip(&guess.states).map(at).collect();

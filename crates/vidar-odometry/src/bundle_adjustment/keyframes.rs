@@ -2,7 +2,7 @@
 
 use super::observation::{self, MovingBody};
 use super::problem::FRAME_DIM;
-use super::{Recording, Solution};
+use super::{Measurements, Solution};
 use crate::backend::d_relative_d_poses;
 use crate::pipeline::public_state;
 use nalgebra::{Matrix6, SMatrix};
@@ -13,7 +13,7 @@ use vidar_core::{
 /// σ(ln s) above which a keyframe's health says that the scale is not settled.
 const SETTLED_SCALE_STD: f64 = 0.02;
 
-pub(super) fn of(recording: &Recording<'_>, solution: &Solution, scale_std: f64) -> Vec<OdometryKeyframe> {
+pub(super) fn of(recording: &Measurements<'_>, solution: &Solution, scale_std: f64) -> Vec<OdometryKeyframe> {
     let Solution { problem, images, .. } = solution;
     let mut landmarks = seen_landmarks(solution);
     let mut pose_covariance = PoseCovariance::zeros();

@@ -142,7 +142,7 @@ pub fn adjust(
         gain: ImuGain::default(),
     };
     let prior = CalibrationPrior { sigmas: input.sigmas.of(&calibration), mean: calibration.clone() };
-    let recording = Recording { log, imu: &imu, model: &input.model };
+    let recording = Measurements { log, imu: &imu, model: &input.model };
     let clock_offset = input.camera.time_offset;
     let (segment, guess) = initial::longest_segment(log, &imu, &input.model, clock_offset);
     let mut work = Work { calibration, prior, clock_offset, guess };
@@ -180,7 +180,7 @@ pub fn adjust(
         covariance,
     };
     let corrected = imu.multiplied(&solution.problem.calibration.gain);
-    let recording = Recording { imu: &corrected, model: &solution.model, ..recording };
+    let recording = Measurements { imu: &corrected, model: &solution.model, ..recording };
     Ok(result::collect(input, &recording, &solution))
 }
 
@@ -208,7 +208,7 @@ fn weigh(
 
 /// What was recorded.
 #[derive(Clone, Copy)]
-struct Recording<'a> {
+struct Measurements<'a> {
     log: &'a TrackLog,
     imu: &'a ImuBuffer,
     model: &'a ImuModel,
@@ -237,7 +237,11 @@ struct Passed {
 
 impl Work {
     /// Adjusts all states of the guess.
-    fn pass(&mut self, recording: &Recording<'_>, watch: &mut Watch<'_>) -> Result<Passed, AdjustmentError> {
+    fn pass(
+        &mut self,
+        recording: &Measurements<'_>,
+        watch: &mut Watch<'_>,
+    ) -> Result<Passed, AdjustmentError> {
         let (clock_offset, images) = (self.clock_offset, self.guess.images.clone());
         let mut problem = initial::build(recording, &self.calibration, self.prior.clone(), &self.guess, 0)?;
         if problem.landmarks.len() < MIN_LANDMARKS {

@@ -5,7 +5,7 @@ use super::inertial::GAIN_DIM;
 use super::initial::preintegrate;
 use super::linearise::System;
 use super::problem::{FRAME_DIM, Problem};
-use super::{AdjustmentFinding, AdjustmentInput, Recording, Solution, findings, keyframes};
+use super::{AdjustmentFinding, AdjustmentInput, Measurements, Solution, findings, keyframes};
 use crate::backend::dot;
 use crate::imu::{ImuBuffer, ImuModel, NavState};
 use crate::pipeline::{Joined, public_state};
@@ -121,10 +121,10 @@ impl Adjusted {
 /// `recording` has IMU measurements with the gains applied; the stamps are those of `input`.
 pub(super) fn collect(
     input: &AdjustmentInput<'_>,
-    recording: &Recording<'_>,
+    recording: &Measurements<'_>,
     solution: &Solution,
 ) -> Adjusted {
-    let Recording { log, imu, model } = *recording;
+    let Measurements { log, imu, model } = *recording;
     let Solution { problem, clock_offset, report, system, covariance, .. } = solution;
     let clock = Duration::from_secs_f64(problem.calibration.clock_secs);
     // States at the images' true instants.

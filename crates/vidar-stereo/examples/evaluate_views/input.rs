@@ -5,7 +5,7 @@ use std::error::Error;
 use std::path::PathBuf;
 use vidar_core::remap::{RemapTable, undistorted_view};
 use vidar_core::{BodyFrame, ChunkView, Duration, Image, LieGroup, Pinhole, Se3, So3, ViewGeometry};
-use vidar_dataset::{CameraFlag, Dataset, ImageEntry, OpenOptions};
+use vidar_dataset::{CameraFlag, ImageEntry, OpenOptions, Recording};
 
 /// Widest undistorted view, as the program's default is.
 const WIDEST_PX: usize = 640;
@@ -94,13 +94,13 @@ pub struct Keyframe {
     lagging: Se3,
 }
 
-pub struct Recording {
-    dataset: Dataset,
+pub struct ViewSet {
+    dataset: Recording,
     pub keyframes: Vec<Keyframe>,
     remap: RemapTable,
 }
 
-impl Recording {
+impl ViewSet {
     pub fn open(request: &Request) -> Result<Self, Box<dyn Error>> {
         let dataset = vidar_dataset::open(&request.path, &request.options)?;
         let camera = dataset.rig.camera(dataset.camera).ok_or("no camera")?;

@@ -17,7 +17,7 @@ mod input;
 mod score;
 mod stages;
 
-use input::{Recording, Request};
+use input::{Request, ViewSet};
 use score::Score;
 use stages::Stages;
 use std::error::Error;
@@ -33,7 +33,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     let args: Vec<String> = std::env::args().skip(1).collect();
     let request = Request::parse(&args)?;
     let config: StereoConfig = toml::from_str(&request.settings.join("\n"))?;
-    let recording = Recording::open(&request)?;
+    let recording = ViewSet::open(&request)?;
     let model = StereoModel::new(config)?;
     let stages = Arc::new(Stages::default());
     if request.stages {

@@ -131,7 +131,7 @@ mod tests {
     #[test]
     fn a_disk_that_is_not_mounted_is_no_fault_of_the_recording() {
         let io = |kind: std::io::ErrorKind| {
-            Error::Dataset(DatasetError::Io { path: "a.bag".into(), source: kind.into() })
+            Error::Recording(DatasetError::Io { path: "a.bag".into(), source: kind.into() })
         };
         let is_fault = |error: &Error| is_of_recording(error, None);
         for kind in [std::io::ErrorKind::NotFound, std::io::ErrorKind::PermissionDenied] {

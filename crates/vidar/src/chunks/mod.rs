@@ -10,5 +10,5 @@ mod shapes;
 mod store;
 
 pub use memory::MemoryStore;
-pub use recorded::{RECORDED, RecordedChunk, RecordedModel, RecordedShapes, Recording};
+pub use recorded::{RECORDED, RecordedChunk, RecordedGeometry, RecordedModel, RecordedShapes};
 pub use store::{ChunkStore, StoredChunk};

@@ -45,7 +45,7 @@ enum Files {
 
 /// What was recorded of the images at hand.
 #[derive(Clone, Debug)]
-pub struct Recording {
+pub struct RecordedGeometry {
     folder: PathBuf,
     /// Its chunks, in order.
     pub chunks: Vec<RecordedChunk>,
@@ -53,7 +53,7 @@ pub struct Recording {
     poses: Vec<Se3>,
 }
 
-impl Recording {
+impl RecordedGeometry {
     /// Looks into `folder` and finds the images that its files are of.
     pub fn open(folder: &Path, images: &[ImageEntry], chunk: usize, overlap: usize) -> Result<Self, Error> {
         let names = names(folder)?;
@@ -149,7 +149,7 @@ impl Recording {
 
 /// A recording as a geometry model: a chunk's number tells which prediction it gets.
 pub struct RecordedModel {
-    recording: Recording,
+    recording: RecordedGeometry,
     info: ModelInfo,
     /// Pictures of the last prediction, as its network saw them.
     colors: Vec<Image<[u8; 3]>>,
@@ -157,7 +157,7 @@ pub struct RecordedModel {
 
 impl RecordedModel {
     /// The recording of a plan's chunks.
-    pub fn new(recording: Recording) -> Self {
+    pub fn new(recording: RecordedGeometry) -> Self {
         let name = format!("{RECORDED}{}", recording.folder.display());
         let info = ModelInfo {
             name,
@@ -197,7 +197,7 @@ impl GeometryModel for RecordedModel {
 
 /// Depth of single images, whichever chunk of a recording they are in.
 pub struct RecordedShapes {
-    recording: Recording,
+    recording: RecordedGeometry,
     /// Images that the recording may be of.
     images: Vec<FrameId>,
     /// The chunk read last: neighbours ask for the same one.
@@ -206,7 +206,7 @@ pub struct RecordedShapes {
 
 impl RecordedShapes {
     /// Depth of `images` as the recording has it.
-    pub fn new(recording: Recording, images: &[ImageEntry]) -> Self {
+    pub fn new(recording: RecordedGeometry, images: &[ImageEntry]) -> Self {
         Self { recording, images: images.iter().map(|i| i.frame_id).collect(), last: None }
     }
 

@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use vidar_core::{Duration, Image, LieGroup, Pinhole, Se3};
 use vidar_dataset::decode::{ImageLimits, read_image, read_size};
-use vidar_dataset::{Dataset, DatasetKind, OpenOptions};
+use vidar_dataset::{OpenOptions, Recording, RecordingKind};
 
 /// A decoded image.
 pub(super) struct Picture {
@@ -22,7 +22,7 @@ pub(super) struct Picture {
 pub(super) struct Source {
     /// Its file; of an image inside a recording a name that states both.
     pub path: PathBuf,
-    recording: Option<(Arc<Dataset>, usize)>,
+    recording: Option<(Arc<Recording>, usize)>,
 }
 
 /// Most images that are taken of a video or bag. All images are predicted together, and the cost grows with the square of their
@@ -37,7 +37,7 @@ pub(super) fn list(inputs: &[PathBuf]) -> Result<Vec<Source>, Error> {
     let of_file = |path: PathBuf| Source { path, recording: None };
     for input in inputs {
         if input.is_dir() {
-            let options = OpenOptions { format: Some(DatasetKind::ImageFolder), ..OpenOptions::default() };
+            let options = OpenOptions { format: Some(RecordingKind::ImageFolder), ..OpenOptions::default() };
             let folder = vidar_dataset::open(input, &options)?;
             let files = folder.images.iter().filter_map(|entry| entry.location.as_file());
             images.extend(files.map(|path| of_file(path.to_owned())));

@@ -2,10 +2,10 @@
 
 use nalgebra::{Vector2, Vector3};
 use vidar_core::{CameraModel, ImuNoise, LieGroup, Pinhole, RigCamera, Se3};
-use vidar_dataset::{CalibrationSource, Dataset};
+use vidar_dataset::{CalibrationSource, Recording};
 
 /// The camera in use: model, field of view, extrinsics, clock, distance to the other cameras.
-pub(super) fn describe_camera(dataset: &Dataset) -> Vec<String> {
+pub(super) fn describe_camera(dataset: &Recording) -> Vec<String> {
     let Some(camera) = dataset.rig.camera(dataset.camera) else { return Vec::new() };
     let mut words = describe_model(&camera.model, &dataset.calibration);
     if dataset.rig.imu.is_some() || camera.body_from_camera != Se3::IDENTITY {

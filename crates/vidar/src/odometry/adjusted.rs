@@ -4,7 +4,7 @@ use crate::config::Config;
 use nalgebra::Vector3;
 use serde_json::{Value, json};
 use vidar_core::{BodyFrame, Duration, StampedPose, Trajectory, Warning};
-use vidar_dataset::{CalibrationSource, Dataset};
+use vidar_dataset::{CalibrationSource, Recording};
 use vidar_odometry::bundle_adjustment::{
     Adjusted, AdjustedCalibration, AdjustedImu, AdjustmentFinding, CalibrationSigmas,
 };
@@ -19,7 +19,7 @@ const FOUND_PRINCIPAL_POINT: f64 = 0.004;
 
 /// What the adjustment may change of the camera; `None` where nothing is to be adjusted. `dataset` and `config` are as the user
 /// gave them: what was given is held.
-pub(crate) fn adjustable(dataset: &Dataset, config: &Config) -> Option<CalibrationSigmas> {
+pub(crate) fn adjustable(dataset: &Recording, config: &Config) -> Option<CalibrationSigmas> {
     let settings = &config.odometry;
     let by_default = CalibrationSigmas::default();
     let clock = if settings.estimate_time_offset { by_default.time_offset_secs } else { 0.0 };
@@ -38,12 +38,12 @@ pub(crate) fn adjustable(dataset: &Dataset, config: &Config) -> Option<Calibrati
     })
 }
 
-fn image_width(dataset: &Dataset) -> f64 {
+fn image_width(dataset: &Recording) -> f64 {
     dataset.rig.camera(dataset.camera).map_or(0.0, |camera| camera.model.intrinsics().width as f64)
 }
 
 /// Puts the adjusted calibration into the recording's rig.
-pub(crate) fn apply(adjusted: &Adjusted, dataset: &mut Dataset) {
+pub(crate) fn apply(adjusted: &Adjusted, dataset: &mut Recording) {
     let Some(camera) = dataset.rig.cameras.get_mut(dataset.camera.index()) else { return };
     camera.model = adjusted.calibration.camera.clone();
     camera.body_from_camera = adjusted.calibration.body_from_camera;

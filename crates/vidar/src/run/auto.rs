@@ -1,6 +1,6 @@
 //! Stereo with the shapes of another source for what it leaves empty.
 
-use crate::chunks::{RecordedShapes, Recording};
+use crate::chunks::{RecordedGeometry, RecordedShapes};
 use crate::config::Config;
 use crate::engine::Prediction;
 use crate::error::Error;
@@ -45,7 +45,7 @@ impl AutoModel {
             }
             Some(ShapeChoice::Recorded(folder)) => {
                 let (size, overlap) = (config.geometry.chunk_keyframes, config.geometry.overlap_keyframes);
-                let recording = Recording::open(&folder, images, size, overlap)?;
+                let recording = RecordedGeometry::open(&folder, images, size, overlap)?;
                 Some(Shapes::Recorded(Box::new(RecordedShapes::new(recording, images))))
             }
         };

@@ -13,7 +13,7 @@ use crate::models::geometry::{self, SourceChoice};
 use crate::odometry::TrackedPoses;
 use serde::Serialize;
 use vidar_core::{Duration, Warning};
-use vidar_dataset::Dataset;
+use vidar_dataset::Recording;
 
 /// What was chosen, in the run folder.
 pub(super) const FILE: &str = "budget.json";
@@ -118,7 +118,7 @@ impl Budget {
 /// # Errors
 /// The cost of this run cannot be planned.
 pub(super) fn settle(
-    dataset: &Dataset,
+    dataset: &Recording,
     config: &mut Config,
     plan: &Plan,
     tracked: Option<&TrackedPoses>,
@@ -166,7 +166,7 @@ fn choose(unlimited: &BudgetChoice, fits: impl Fn(&BudgetChoice) -> bool) -> Bud
 }
 
 /// Seconds of the budget.
-fn budget_seconds(dataset: &Dataset, config: &Config) -> Result<f64, Error> {
+fn budget_seconds(dataset: &Recording, config: &Config) -> Result<f64, Error> {
     if !config.budget.realtime {
         return Ok(config.budget.seconds);
     }
@@ -205,7 +205,7 @@ fn require_plannable(config: &Config, plan: &Plan, is_tracked: bool) -> Result<(
 }
 
 /// Keyframes without a budget.
-fn keyframes(dataset: &Dataset, config: &Config, plan: &Plan, tracked: Option<&TrackedPoses>) -> usize {
+fn keyframes(dataset: &Recording, config: &Config, plan: &Plan, tracked: Option<&TrackedPoses>) -> usize {
     if let Some(expected) = &plan.expected {
         return expected.keyframes;
     }
@@ -259,7 +259,7 @@ const EVALUATION_SECS: f64 = 2.0;
 const EVALUATED_SECS: f64 = 0.02;
 
 impl Work {
-    fn of(dataset: &Dataset, config: &Config, plan: &Plan) -> Self {
+    fn of(dataset: &Recording, config: &Config, plan: &Plan) -> Self {
         let mpx = |width: usize, height: usize| (width * height) as f64 * 1e-6;
         let output = &config.output;
         Self {

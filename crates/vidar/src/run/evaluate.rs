@@ -12,7 +12,7 @@ use rayon::prelude::*;
 use serde::Serialize;
 use std::collections::BTreeMap;
 use vidar_core::{AlignedView, FrameId, MetricDepth, PointCloud, Se3, Trajectory, TriangleMesh, Warning};
-use vidar_dataset::Dataset;
+use vidar_dataset::Recording;
 use vidar_eval::{
     DepthAccumulator, DepthSummary, EvalError, PlacementStart, SampleDensity, SurfaceEvalConfig,
     SurfaceReport, TrajectoryReport,
@@ -49,7 +49,7 @@ pub struct DepthScore {
 
 /// Evaluates trajectory, surface and depth. What has no reference is left out; an evaluation that failed is a degradation.
 pub fn evaluate(
-    dataset: &Dataset,
+    dataset: &Recording,
     plan: &Plan,
     map: &MetricMap,
     config: &Config,
@@ -137,7 +137,7 @@ pub struct DepthScorer {
 
 impl DepthScorer {
     /// Adds the views for whose time there is a depth image.
-    pub fn add(&mut self, dataset: &Dataset, views: &[AlignedView]) -> Result<(), Error> {
+    pub fn add(&mut self, dataset: &Recording, views: &[AlignedView]) -> Result<(), Error> {
         let truth = |view: &AlignedView| {
             // An unreadable depth image is reported when the reference is fused.
             reference::sensor_depth_in_view(dataset, view.time(), view.intrinsics())?.ok()

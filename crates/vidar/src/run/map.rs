@@ -10,7 +10,7 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 use vidar_align::Placement;
 use vidar_core::{AlignedView, BodyFrame, CameraId, StampedPose, Trajectory};
-use vidar_dataset::Dataset;
+use vidar_dataset::Recording;
 
 /// The fused world.
 #[derive(Debug, Default)]
@@ -73,7 +73,7 @@ impl MetricMap {
 
 /// Collects the map from the events of the engine.
 pub(super) struct MapCollector<'a> {
-    dataset: &'a Dataset,
+    dataset: &'a Recording,
     poses: &'a PosePlan,
     map: MetricMap,
     /// Tracked poses of each segment, and the segment that is mapped.
@@ -84,7 +84,7 @@ pub(super) struct MapCollector<'a> {
 
 impl<'a> MapCollector<'a> {
     /// Nothing yet.
-    pub(super) fn new(dataset: &'a Dataset, poses: &'a PosePlan) -> Self {
+    pub(super) fn new(dataset: &'a Recording, poses: &'a PosePlan) -> Self {
         Self { dataset, poses, map: MetricMap::default(), states: BTreeMap::new(), segment: 0, source: None }
     }
 

@@ -53,7 +53,7 @@ use start::Started;
 use std::path::PathBuf;
 use store::RunStore;
 use vidar_core::{Duration, RigCamera, Se3, Warning};
-use vidar_dataset::{Dataset, DatasetError, OpenOptions};
+use vidar_dataset::{DatasetError, OpenOptions, Recording};
 
 /// What to run on, how, and where to.
 #[derive(Clone, Debug)]
@@ -226,7 +226,7 @@ struct Context<'a> {
     /// None where the map may look ahead.
     live: Option<&'a LiveOptions>,
     config: &'a Config,
-    dataset: &'a Dataset,
+    dataset: &'a Recording,
     /// SHA-256 of what the recording consists of.
     fingerprint: &'a str,
     folder: &'a RunFolder,
@@ -388,19 +388,19 @@ impl Context<'_> {
 }
 
 /// An image that the odometry has to do without. It is tracked across; if it becomes a keyframe, that is a degradation.
-fn unreadable(dataset: &Dataset, stamp: FrameStamp, error: &DatasetError) -> Warning {
+fn unreadable(dataset: &Recording, stamp: FrameStamp, error: &DatasetError) -> Warning {
     let entry = dataset.images.iter().find(|i| i.frame_id == stamp.frame_id);
     let warning = Warning::new("odometry-image-unreadable", error.to_string());
     entry.map_or(warning.clone(), |entry| warning.at(&entry.location))
 }
 
 /// Time from the first to the last row of an image: as found or set, else as the calibration states.
-pub(crate) fn readout(dataset: &Dataset, config: &Config) -> Duration {
+pub(crate) fn readout(dataset: &Recording, config: &Config) -> Duration {
     let known = config.odometry.readout_ms.map(|ms| Duration::from_secs_f64(1e-3 * ms));
     known.or(dataset.readout).unwrap_or(Duration::ZERO)
 }
 
-pub(crate) fn camera_on_rig(dataset: &Dataset, plan: &Plan) -> RigCamera {
+pub(crate) fn camera_on_rig(dataset: &Recording, plan: &Plan) -> RigCamera {
     dataset.rig.camera(plan.camera_id).cloned().unwrap_or_else(|| RigCamera {
         model: plan.camera.clone(),
         body_from_camera: Se3::IDENTITY,

@@ -10,13 +10,13 @@ use serde_json::{Value, json};
 use vidar_align::Placement;
 use vidar_align::aligner::{ChunkPlacement, LoopReport};
 use vidar_core::{FrameId, Se3, Timestamp, Trajectory, printable};
-use vidar_dataset::{CameraFlag, Dataset, Location};
+use vidar_dataset::{CameraFlag, Location, Recording};
 use vidar_export::{DepthFrame, DepthSidecar, ExportError};
 
 /// Writes everything but pictures and manifest.
 pub fn write(
     outcome: &RunOutcome,
-    dataset: &Dataset,
+    dataset: &Recording,
     config: &Config,
     request: &RunRequest,
     folder: &RunFolder,
@@ -89,7 +89,7 @@ impl Writer<'_> {
 }
 
 /// Keyframes, the files that they were read from, and the camera as it was used.
-fn views_json(outcome: &RunOutcome, dataset: &Dataset) -> Value {
+fn views_json(outcome: &RunOutcome, dataset: &Recording) -> Value {
     let source = |view: &StoredView| {
         let entry = dataset.images.iter().find(|i| i.frame_id.0 == view.frame)?;
         match &entry.location {

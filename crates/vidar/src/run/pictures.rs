@@ -8,7 +8,7 @@ use crate::events::{Event, Events};
 use crate::input::truth_in_camera;
 use crate::run_folder::{RunFolder, StoredView};
 use vidar_core::Trajectory;
-use vidar_dataset::Dataset;
+use vidar_dataset::Recording;
 use vidar_view::{
     AxisSpec, Figure, FigureWidth, Histogram, MapCamera, MapSurface, Picture, PictureSize, PlotTrajectory,
     Report, Section, Shading, SummaryItem, Table, TrajectoryPlot, Viewpoint,
@@ -24,7 +24,7 @@ const SHOWN_VIEWS: usize = 6;
 /// Draws everything and writes `pictures/*.png` and `report.html`.
 pub fn draw(
     outcome: &RunOutcome,
-    dataset: &Dataset,
+    dataset: &Recording,
     request: &RunRequest,
     folder: &RunFolder,
     events: &Events,
@@ -268,7 +268,7 @@ fn evaluation_section(
 
 fn trajectory_section(
     outcome: &RunOutcome,
-    dataset: &Dataset,
+    dataset: &Recording,
     up: &nalgebra::Vector3<f64>,
     album: &mut Album<'_>,
 ) -> Result<Section, Error> {

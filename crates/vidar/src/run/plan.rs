@@ -15,7 +15,7 @@ use std::sync::Arc;
 use vidar_align::CouplingMode;
 use vidar_core::remap::undistorted_view;
 use vidar_core::{CameraId, CameraModel, FrameId, ModelInfo, Pinhole, Warning};
-use vidar_dataset::{Dataset, ImageEntry};
+use vidar_dataset::{ImageEntry, Recording};
 
 /// Keyframes and chunks, where they are known before tracking.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -37,7 +37,7 @@ pub struct ExpectedWork {
 pub struct Plan {
     /// When it was made, RFC 3339.
     pub started: String,
-    /// Dataset name and kind, and why that kind.
+    /// Recording name and kind, and why that kind.
     pub input: String,
     /// How depth is coupled to the metric poses.
     pub mode: CouplingMode,
@@ -92,7 +92,7 @@ impl Plan {
     /// Checks poses, camera and configuration, and opens the geometry model and place recognition. Nothing is tracked,
     /// predicted or written.
     pub fn make(
-        dataset: &Dataset,
+        dataset: &Recording,
         config: &Config,
         reference: Option<&Path>,
     ) -> Result<(Self, Source, PlaceRecognition), Error> {
@@ -223,7 +223,7 @@ impl Plan {
 
 /// Keyframes and chunks, where no odometry has to track for them.
 fn expected_work(
-    dataset: &Dataset,
+    dataset: &Recording,
     images: &[ImageEntry],
     poses: &PosePlan,
     rule: &ChunkRule,
@@ -280,7 +280,7 @@ pub fn bytes(n: u64) -> String {
     }
 }
 
-fn camera_model(dataset: &Dataset) -> Result<CameraModel, Error> {
+fn camera_model(dataset: &Recording) -> Result<CameraModel, Error> {
     match dataset.rig.camera(dataset.camera) {
         Some(camera) => Ok(camera.model.clone()),
         None => Err(vidar_core::TrajectoryError::NoSuchCamera(dataset.camera).into()),
@@ -295,7 +295,7 @@ fn model_view(camera: &CameraModel, config: &Config) -> Result<Pinhole, Error> {
     Ok(undistorted_view(camera, target, scaled)?)
 }
 
-fn reference_source(dataset: &Dataset, config: &Config, given: Option<&Path>) -> ReferenceSource {
+fn reference_source(dataset: &Recording, config: &Config, given: Option<&Path>) -> ReferenceSource {
     let has_depth =
         dataset.depth_sensor.is_some() && !dataset.depths.is_empty() && dataset.ground_truth.is_some();
     match (config.eval.mode, given.or(dataset.reference_cloud.as_deref())) {

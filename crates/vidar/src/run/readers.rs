@@ -13,7 +13,7 @@ use crate::run_folder::RunFolder;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::{Duration, Instant};
 use vidar_core::Pinhole;
-use vidar_dataset::Dataset;
+use vidar_dataset::Recording;
 
 /// File of the growing surface.
 const SO_FAR: &str = "map/so_far.ply";
@@ -26,7 +26,7 @@ pub(super) struct Readers<'a> {
     events: &'a Events,
     config: &'a Config,
     folder: &'a RunFolder,
-    dataset: &'a Dataset,
+    dataset: &'a Recording,
     view: Pinhole,
     scene: Option<&'a SceneWriter>,
     collector: MapCollector<'a>,
@@ -40,7 +40,7 @@ pub(super) struct Readers<'a> {
 
 impl<'a> Readers<'a> {
     pub(super) fn new(
-        dataset: &'a Dataset,
+        dataset: &'a Recording,
         plan: &'a Plan,
         config: &'a Config,
         folder: &'a RunFolder,

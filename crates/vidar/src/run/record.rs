@@ -9,7 +9,7 @@ use crate::run_folder::{MANIFEST_SCHEMA, Manifest, RunFolder};
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::{Arc, Mutex};
 use vidar_core::{Severity, Warning};
-use vidar_dataset::Dataset;
+use vidar_dataset::Recording;
 
 /// Records events for the manifest and for `log.jsonl`.
 #[derive(Clone, Default)]
@@ -115,7 +115,7 @@ pub(super) struct RunDescription(pub Manifest);
 
 impl RunDescription {
     /// Input, configuration, model and machine.
-    pub fn new(request: &RunRequest, dataset: &Dataset, fingerprint: String, plan: &Plan) -> Self {
+    pub fn new(request: &RunRequest, dataset: &Recording, fingerprint: String, plan: &Plan) -> Self {
         Self(Manifest {
             schema: MANIFEST_SCHEMA.into(),
             version: crate::VERSION.into(),

@@ -8,7 +8,7 @@ use crate::input::truth_in_camera;
 use vidar_core::{
     AlignedView, Confidence, Duration, FrameId, MetricDepth, Pinhole, PointCloud, Se3, Trajectory, Warning,
 };
-use vidar_dataset::{Dataset, DepthEntry, DepthSensor};
+use vidar_dataset::{DepthEntry, DepthSensor, Recording};
 use vidar_fusion::{FusionConfig, TsdfVolume};
 
 /// Longest time between a depth image and the pose it is given, and between a depth image and its colour image.
@@ -17,7 +17,7 @@ const MAX_STAMP_DIFFERENCE: Duration = Duration::from_millis(20);
 /// Reads or makes the reference cloud, in the world of ground truth, metres.
 pub fn cloud(
     source: &ReferenceSource,
-    dataset: &Dataset,
+    dataset: &Recording,
     config: &Config,
     events: &Events,
 ) -> Result<Option<PointCloud>, Error> {
@@ -33,7 +33,7 @@ pub fn cloud(
 }
 
 /// The depth sensor's images fused with ground-truth poses, by the same fusion as the result.
-fn fused_sensor_depth(dataset: &Dataset, config: &Config, events: &Events) -> Result<PointCloud, Error> {
+fn fused_sensor_depth(dataset: &Recording, config: &Config, events: &Events) -> Result<PointCloud, Error> {
     let (Some(sensor), Some(truth)) = (&dataset.depth_sensor, truth_in_camera(dataset)) else {
         return Ok(PointCloud::default());
     };
@@ -74,7 +74,7 @@ fn world_from_depth(entry: &DepthEntry, sensor: &DepthSensor, truth: &Trajectory
 ///
 /// `None` when no depth image was taken at that time.
 pub fn sensor_depth_in_view(
-    dataset: &Dataset,
+    dataset: &Recording,
     time: vidar_core::Timestamp,
     view: &Pinhole,
 ) -> Option<Result<MetricDepth, vidar_dataset::DatasetError>> {

@@ -7,7 +7,7 @@ use crate::odometry::TrackedFrame;
 use std::path::Path;
 use std::sync::{Arc, Mutex, PoisonError};
 use vidar_core::{Health, LieGroup, OdometryKeyframe, Pinhole, Severity, Timestamp, Warning};
-use vidar_dataset::{Dataset, Location};
+use vidar_dataset::{Location, Recording};
 use vidar_export::ExportError;
 use vidar_export::scene::{LogLevel, Scene, SceneImage, SceneStatus};
 
@@ -82,7 +82,7 @@ impl SceneWriter {
     }
 
     /// Takes an event of the engine. `view` is the camera of undistorted views.
-    pub fn read(&self, event: &MapEvent, dataset: &Dataset, view: &Pinhole, events: &Events) {
+    pub fn read(&self, event: &MapEvent, dataset: &Recording, view: &Pinhole, events: &Events) {
         self.write(events, |scene| match event {
             MapEvent::State(state) => {
                 scene.camera_pose(state.time, &state.world_from_camera);
@@ -135,7 +135,7 @@ fn status(time: Timestamp, segment: u32, health: Health, scale_std: f64) -> Scen
 }
 
 /// The landmarks that a keyframe sees, in the world, as the odometry had them then.
-fn landmarks(scene: &mut Scene, time: Timestamp, keyframe: &OdometryKeyframe, dataset: &Dataset) {
+fn landmarks(scene: &mut Scene, time: Timestamp, keyframe: &OdometryKeyframe, dataset: &Recording) {
     let Some(camera) = dataset.rig.camera(dataset.camera) else { return };
     let place = |l: &vidar_core::SparseLandmark| {
         let ray = camera.model.unproject(&l.pixel)?;
@@ -147,7 +147,7 @@ fn landmarks(scene: &mut Scene, time: Timestamp, keyframe: &OdometryKeyframe, da
 }
 
 /// A keyframe's image as it was taken. One that cannot be read is reported by the stage that needs it.
-fn image(scene: &mut Scene, frame: vidar_core::FrameId, dataset: &Dataset) -> Result<(), ExportError> {
+fn image(scene: &mut Scene, frame: vidar_core::FrameId, dataset: &Recording) -> Result<(), ExportError> {
     let Some(entry) = dataset.images.iter().find(|i| i.frame_id == frame) else { return Ok(()) };
     let Some(camera) = dataset.rig.camera(entry.camera).map(|c| c.model.clone()) else { return Ok(()) };
     if let Location::File(path) = &entry.location

@@ -1,7 +1,7 @@
 //! Where depth comes from: stereo, a network, or a recording, behind one trait.
 
 use super::auto::{AutoModel, Shapes};
-use crate::chunks::{RecordedModel, Recording};
+use crate::chunks::{RecordedGeometry, RecordedModel};
 use crate::config::Config;
 use crate::engine::{GeometrySource, Prediction};
 use crate::error::Error;
@@ -11,7 +11,7 @@ use std::sync::Arc;
 use vidar_align::CouplingMode;
 use vidar_core::{ChunkViews, GeometryModel, Image, ModelError, ModelInfo, Pinhole, Warning};
 use vidar_da3::{Da3Model, PoseMode};
-use vidar_dataset::{Dataset, ImageEntry};
+use vidar_dataset::{ImageEntry, Recording};
 use vidar_stereo::StereoModel;
 use vidar_synth::Simulation;
 use vidar_synth::predict::{Conditioning, PredictionErrors, SyntheticModel};
@@ -43,7 +43,7 @@ pub struct OpenedSource {
 
 impl Source {
     /// Opens what the configuration names. `images` are those that a recording may be of.
-    pub fn open(dataset: &Dataset, images: &[ImageEntry], config: &Config) -> Result<OpenedSource, Error> {
+    pub fn open(dataset: &Recording, images: &[ImageEntry], config: &Config) -> Result<OpenedSource, Error> {
         let mode = config.coupling.mode;
         let mut chunks = None;
         let source = match geometry::source(config)? {
@@ -70,8 +70,12 @@ impl Source {
             }
             SourceChoice::Recorded(folder) => {
                 let geometry = &config.geometry;
-                let recording =
-                    Recording::open(&folder, images, geometry.chunk_keyframes, geometry.overlap_keyframes)?;
+                let recording = RecordedGeometry::open(
+                    &folder,
+                    images,
+                    geometry.chunk_keyframes,
+                    geometry.overlap_keyframes,
+                )?;
                 chunks = Some(recording.chunks.iter().map(|c| c.images.clone()).collect());
                 Self::Recorded(RecordedModel::new(recording))
             }
@@ -175,7 +179,7 @@ impl GeometrySource for Source {
 }
 
 /// The simulated network of a recording that `vidar synth` made.
-fn simulated(dataset: &Dataset, config: &Config) -> Result<SyntheticModel, Error> {
+fn simulated(dataset: &Recording, config: &Config) -> Result<SyntheticModel, Error> {
     // `mav0/` lies inside the folder that was written.
     let inner = dataset.root.ends_with("mav0").then(|| dataset.root.parent()).flatten();
     let simulation = Arc::new(Simulation::open(inner.unwrap_or(&dataset.root))?);

@@ -14,7 +14,7 @@ use crate::input;
 use crate::odometry::TrackedPoses;
 use crate::run_folder::{Earlier, RunFolder, pretty};
 use std::sync::Arc;
-use vidar_dataset::Dataset;
+use vidar_dataset::Recording;
 
 /// A run that has poses, or is to track while it maps.
 pub(super) struct Started {
@@ -24,7 +24,7 @@ pub(super) struct Started {
     /// As found by calibration and tracking.
     pub config: Config,
     /// As found by calibration and tracking.
-    pub dataset: Dataset,
+    pub dataset: Recording,
     /// SHA-256 of what the recording consists of.
     pub fingerprint: String,
     pub plan: Plan,
@@ -106,7 +106,7 @@ pub(super) fn start(
 /// The plan with what a time budget leaves of it; its settings are those of `config` from then on.
 fn within_budget(
     made: (Plan, Source, PlaceRecognition),
-    (dataset, config, poses): (&Dataset, &mut Config, Option<&TrackedPoses>),
+    (dataset, config, poses): (&Recording, &mut Config, Option<&TrackedPoses>),
     request: &RunRequest,
     (folder, events): (&RunFolder, &Events),
 ) -> Result<(Plan, Source, PlaceRecognition), Error> {

@@ -8,12 +8,12 @@ use crate::config::Config;
 use crate::error::Error;
 use crate::events::{CancelToken, Event, Events};
 use crate::input;
-use crate::odometry::{self, EarlierMap, Recording, TrackedPoses, adjusted, map};
+use crate::odometry::{self, EarlierMap, TrackedPoses, TrackingInput, adjusted, map};
 use crate::run_folder::{OutputLocation, RunFolder};
 use crate::system::read_up_to;
 use serde::{Deserialize, Serialize};
 use vidar_core::{Rig, Warning};
-use vidar_dataset::{CalibrationSource, Dataset};
+use vidar_dataset::{CalibrationSource, Recording};
 use vidar_odometry::OdometryConfig;
 use vidar_odometry::bundle_adjustment::CalibrationSigmas;
 
@@ -32,7 +32,7 @@ struct Calibrated {
 }
 
 impl Calibrated {
-    fn of(dataset: &Dataset, config: &Config) -> Self {
+    fn of(dataset: &Recording, config: &Config) -> Self {
         Self {
             rig: dataset.rig.clone(),
             source: dataset.calibration.clone(),
@@ -41,7 +41,7 @@ impl Calibrated {
         }
     }
 
-    fn apply(&self, dataset: &mut Dataset, config: &mut Config) {
+    fn apply(&self, dataset: &mut Recording, config: &mut Config) {
         dataset.rig = self.rig.clone();
         dataset.calibration = self.source.clone();
         dataset.warnings = self.warnings.clone();
@@ -77,7 +77,7 @@ impl Tracking {
     /// # Errors
     /// The map of an earlier recording cannot be read.
     pub fn new(
-        dataset: &Dataset,
+        dataset: &Recording,
         fingerprint: &str,
         config: &Config,
         place: &OutputLocation,
@@ -95,7 +95,7 @@ impl Tracking {
     /// Calibrates a recording that has no calibration.
     pub fn calibrate(
         &mut self,
-        dataset: &mut Dataset,
+        dataset: &mut Recording,
         config: &mut Config,
         events: &Events,
         cancel: &CancelToken,
@@ -112,7 +112,7 @@ impl Tracking {
     /// Settles the camera's timing and tracks; none where the engine is to track while it maps.
     pub fn track(
         self,
-        dataset: &mut Dataset,
+        dataset: &mut Recording,
         config: &mut Config,
         folder: &RunFolder,
         scene: Option<&SceneWriter>,
@@ -133,7 +133,7 @@ impl Tracking {
             .stage(camera_timing::STAGE, 0, || camera_timing::settle(dataset, config, events, cancel))?;
         timing.iter().for_each(|w| events.warn(w));
         let Some(sigmas) = &self.sigmas else { return Ok(None) };
-        let recording = Recording { dataset, config, map: self.map.as_ref() };
+        let recording = TrackingInput { dataset, config, map: self.map.as_ref() };
         let tracked = odometry::track(&recording, Some(sigmas), events, cancel, None)?;
         if let Some(scene) = scene {
             scene.tracked(&tracked.frames, events);

@@ -6,7 +6,7 @@ use crate::input::truth_in_camera;
 use crate::interactive::{self, inverse, moved_trajectory};
 use crate::run_folder::RunFolder;
 use vidar_core::{PointCloud, Se3, Sim3, Trajectory};
-use vidar_dataset::Dataset;
+use vidar_dataset::Recording;
 use vidar_view::{
     EncodedView, Field, FieldKind, FieldValues, InteractiveView, Pane, PanePath, PaneScale, PanesShown,
     PathRole,
@@ -18,7 +18,7 @@ const ERROR_RANGE: (f32, f32) = (0.0, 0.1);
 /// The view, in the world of the map; none where there is no surface to look at.
 pub(super) fn encoded(
     outcome: &RunOutcome,
-    dataset: &Dataset,
+    dataset: &Recording,
     folder: &RunFolder,
     up: &nalgebra::Vector3<f64>,
 ) -> Result<Option<EncodedView>, Error> {
@@ -83,7 +83,7 @@ fn paths<'a>(
 }
 
 /// Ground truth in the world of the map, rigidly aligned; none where the map's poses are ground truth themselves.
-fn truth_of_map(outcome: &RunOutcome, dataset: &Dataset) -> Option<Trajectory> {
+fn truth_of_map(outcome: &RunOutcome, dataset: &Recording) -> Option<Trajectory> {
     let report = outcome.evaluation.trajectory.as_ref()?;
     let truth_from_map = report.truth_from_estimate_se3?.to_se3()?;
     moved_trajectory(&truth_in_camera(dataset)?, &inverse(&truth_from_map))

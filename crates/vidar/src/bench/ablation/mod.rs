@@ -129,7 +129,7 @@ pub struct AblationRow {
 
 /// All cases of one recording.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
-struct Recording {
+struct FlightResult {
     rows: Vec<AblationRow>,
     failure: Option<String>,
 }
@@ -200,14 +200,14 @@ fn recording(
     sequence: &Sequence,
     seed: u64,
     cancel: &CancelToken,
-) -> Result<Recording, Error> {
+) -> Result<FlightResult, Error> {
     let config = request.layered.build()?;
     let key = row::key(sequence, &format!("ablation\n{}", request.layered.to_toml(false)))?;
     let place = request.out.join("ablation").join(&config.geometry.source).join(&sequence.name);
     if let Some(stored) = row::stored(&place, &key)? {
         return Ok(stored);
     }
-    let mut recording = Recording::default();
+    let mut recording = FlightResult::default();
     for kind in PredictionKind::ALL {
         match cases(request, sequence, kind, cancel) {
             Ok(rows) => recording.rows.extend(rows),

@@ -10,7 +10,7 @@ use crate::run::{Plan, camera_on_rig, readout};
 use std::collections::BTreeMap;
 use vidar_align::FrameObservation;
 use vidar_core::{ChunkId, FrameId, Timestamp};
-use vidar_dataset::Dataset;
+use vidar_dataset::Recording;
 
 /// Everything that couplings place and measure with.
 pub struct Observed {
@@ -25,7 +25,7 @@ pub struct Observed {
 }
 
 /// Runs the engine on a recording and keeps what it hands to the aligner.
-pub fn observe(dataset: &Dataset, config: &Config, cancel: &CancelToken) -> Result<Observed, Error> {
+pub fn observe(dataset: &Recording, config: &Config, cancel: &CancelToken) -> Result<Observed, Error> {
     let (plan, mut source, places) = Plan::make(dataset, config, None)?;
     let (poses, fallback) = plan.poses.open(dataset, config)?;
     let store = MemoryStore::default();

@@ -97,9 +97,9 @@ fn line(text: &mut String, first: &str, cell: impl Fn(Measurements) -> String) {
 }
 
 /// A recording: flight and seed.
-type Recording<'a> = (&'a str, u64);
+type FlightKey<'a> = (&'a str, u64);
 
-fn recordings(rows: &[AblationRow]) -> BTreeSet<Recording<'_>> {
+fn recordings(rows: &[AblationRow]) -> BTreeSet<FlightKey<'_>> {
     rows.iter().map(|r| (r.sequence.as_str(), r.seed)).collect()
 }
 
@@ -114,7 +114,7 @@ fn values(
     coupling: CouplingMode,
     m: Measurements,
     of: fn(&AblationRow) -> Option<f64>,
-) -> BTreeMap<Recording<'_>, f64> {
+) -> BTreeMap<FlightKey<'_>, f64> {
     let of_case = rows.iter().filter(|r| is_case(r, kind, coupling, m));
     of_case.filter_map(|r| Some(((r.sequence.as_str(), r.seed), of(r)?))).collect()
 }

@@ -1,9 +1,9 @@
-//! The dataset that every reader returns.
+//! The recording that every reader returns.
 
 use crate::error::{DatasetError, io_error};
 use crate::events::EventCursor;
 use crate::location::{Location, Media, StoredDepth};
-use crate::options::DatasetKind;
+use crate::options::RecordingKind;
 use std::io::Write;
 use std::path::{Path, PathBuf};
 use vidar_core::remap::RemapTable;
@@ -37,7 +37,7 @@ pub struct DepthEntry {
 /// The depth camera.
 #[derive(Clone, Debug, PartialEq)]
 pub struct DepthSensor {
-    /// How its depth projects as [`Dataset::load_depth`] returns it, without distortion.
+    /// How its depth projects as [`Recording::load_depth`] returns it, without distortion.
     pub intrinsics: Pinhole,
     /// The camera as its files are, where these are distorted.
     pub distorted: Option<CameraModel>,
@@ -84,13 +84,13 @@ pub enum CalibrationSource {
     Guessed,
 }
 
-/// A dataset, ready to be streamed. Images and depth stay on disk until asked for.
+/// A recording, ready to be streamed. Images and depth stay on disk until asked for.
 #[derive(Clone, Debug)]
-pub struct Dataset {
+pub struct Recording {
     /// Name for people and for run folders.
     pub name: String,
     /// Its layout.
-    pub kind: DatasetKind,
+    pub kind: RecordingKind,
     /// Why this layout was chosen.
     pub reason: String,
     /// The folder that printed paths are relative to.
@@ -133,7 +133,7 @@ pub struct Dataset {
 /// association tolerance that the TUM RGB-D tools use.
 pub const DEPTH_TOLERANCE: Duration = Duration::from_millis(20);
 
-impl Dataset {
+impl Recording {
     /// Reads the pixels of an image; its size must be its camera's.
     pub fn load_image(&self, entry: &ImageEntry) -> Result<FrameImage, DatasetError> {
         self.media.image_of_size(&entry.location, self.size_of(entry))
@@ -175,7 +175,7 @@ impl Dataset {
             .filter(|d| (d.time - time).abs() <= DEPTH_TOLERANCE)
     }
 
-    /// All sensors in the order of time, images decoded ahead of their turn ([`Dataset::images_ahead`]).
+    /// All sensors in the order of time, images decoded ahead of their turn ([`Recording::images_ahead`]).
     ///
     /// At equal times: IMU, ground truth, depth, image; so that everything with an image's time is known when the image arrives.
     pub fn events(&self) -> impl Iterator<Item = Result<SensorEvent, DatasetError>> + '_ {
