@@ -90,14 +90,14 @@ pub fn evaluate_surface_from(
     let rigid_score = score(&estimated, &truth, &rigid.truth_from_estimate, config)?;
     let native = native_placement(&matching, start, config)?;
     let native_scores = candidate_scores(&estimated, &truth, &native.truth_from_estimate, config)?;
-    let mut free = FreePlacement::new(&rigid, rigid_score.scores.clone());
+    let mut free = FreePlacement::new(rigid.start, rigid.truth_from_estimate, rigid_score.scores.clone());
     let bounded = Placement { start: "native", truth_from_estimate: native.truth_from_estimate };
     for candidate in std::iter::once(bounded).chain(free_candidates(&matching, start, config, &native)?) {
         // A candidate that moves all points outside the crop is skipped.
         let scores = candidate_scores(&estimated, &truth, &candidate.truth_from_estimate, config);
         let Ok(scores) = scores else { continue };
         if report::f_at(&scores, threshold) > free.f_at(threshold) {
-            free = FreePlacement::new(&candidate, scores);
+            free = FreePlacement::new(candidate.start, candidate.truth_from_estimate, scores);
         }
     }
     warnings.extend(native.rejection_warning(config));

@@ -1,11 +1,10 @@
 //! Device memory and what is held of it.
 
-use crate::device::Gpu;
 use crate::error::GpuError;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
-const FLOAT: u64 = 4;
+pub(crate) const FLOAT: u64 = 4;
 
 /// How many bytes are held, and how many may be.
 #[derive(Debug)]
@@ -40,7 +39,7 @@ impl Account {
         }
     }
 
-    fn take(&self, what: &str, bytes: u64) -> Result<(), GpuError> {
+    pub fn take(&self, what: &str, bytes: u64) -> Result<(), GpuError> {
         let held = self.held.fetch_add(bytes, Ordering::Relaxed);
         match self.allowed.filter(|allowed| held + bytes > *allowed) {
             Some(allowed) => {
@@ -62,8 +61,8 @@ impl Account {
 /// Numbers in device memory.
 pub struct Buffer {
     pub(crate) raw: wgpu::Buffer,
-    len: usize,
-    account: Arc<Account>,
+    pub(crate) len: usize,
+    pub(crate) account: Arc<Account>,
 }
 
 impl Drop for Buffer {
@@ -73,31 +72,6 @@ impl Drop for Buffer {
 }
 
 impl Buffer {
-    pub(crate) fn new(gpu: &Gpu, what: &str, len: usize) -> Result<Self, GpuError> {
-        // An empty buffer cannot be bound; whole vectors of four can always be read.
-        let bytes = (len.max(1).next_multiple_of(4)) as u64 * FLOAT;
-        let most = gpu.max_buffer_bytes();
-        let adapter = || gpu.adapter().name.clone();
-        if bytes > most {
-            return Err(GpuError::BufferTooLarge { what: what.to_owned(), bytes, adapter: adapter(), most });
-        }
-        let account = &gpu.shared.account;
-        let held = account.held();
-        account.take(what, bytes)?;
-        let scope = gpu.shared.device.push_error_scope(wgpu::ErrorFilter::OutOfMemory);
-        let raw = gpu.shared.device.create_buffer(&wgpu::BufferDescriptor {
-            label: Some(what),
-            size: bytes,
-            usage: wgpu::BufferUsages::STORAGE | wgpu::BufferUsages::COPY_SRC | wgpu::BufferUsages::COPY_DST,
-            mapped_at_creation: false,
-        });
-        let buffer = Self { raw, len, account: Arc::clone(account) };
-        match pollster::block_on(scope.pop()) {
-            Some(_) => Err(GpuError::OutOfMemory { what: what.to_owned(), bytes, held, adapter: adapter() }),
-            None => Ok(buffer),
-        }
-    }
-
     /// Numbers in it.
     pub fn len(&self) -> usize {
         self.len
@@ -106,20 +80,5 @@ impl Buffer {
     /// Whether it has no number.
     pub fn is_empty(&self) -> bool {
         self.len == 0
-    }
-
-    /// Writes numbers from place `at` on, before anything that is recorded but not yet submitted.
-    ///
-    /// # Panics
-    /// When they do not fit.
-    pub fn write(&self, gpu: &Gpu, at: usize, values: &[f32]) {
-        self.write_words(gpu, at, bytemuck::cast_slice(values));
-    }
-
-    pub(crate) fn write_words(&self, gpu: &Gpu, at: usize, words: &[u32]) {
-        assert!(at + words.len() <= self.len, "{} numbers at {at} of {}", words.len(), self.len);
-        if !words.is_empty() {
-            gpu.shared.queue.write_buffer(&self.raw, at as u64 * FLOAT, bytemuck::cast_slice(words));
-        }
     }
 }

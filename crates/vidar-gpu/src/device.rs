@@ -1,8 +1,8 @@
 //! Adapters and open devices.
 
-use crate::buffer::{Account, Buffer};
+use crate::buffer::{Account, Buffer, FLOAT};
 use crate::error::GpuError;
-use crate::kernel::{Kernel, Layouts};
+use crate::kernel::{IMMEDIATES, Kernel, Layouts};
 use std::collections::HashMap;
 use std::fmt;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -83,8 +83,6 @@ pub(crate) struct Shared {
     failure: Arc<Mutex<Option<GpuError>>>,
 }
 
-/// Bytes of immediate data that every operation may use; every interface has at least as many.
-pub(crate) const IMMEDIATES: u32 = 64;
 /// Workgroup memory of the largest shader, bytes.
 const WORKGROUP_BYTES: u32 = 16 << 10;
 /// Invocations of the largest workgroup.
@@ -370,4 +368,47 @@ fn listen(device: &wgpu::Device, adapter: &Adapter, failure: &Arc<Mutex<Option<G
         };
         keep(&kept, error);
     }));
+}
+
+/// Buffers are made and written by their device.
+impl Buffer {
+    pub(crate) fn new(gpu: &Gpu, what: &str, len: usize) -> Result<Self, GpuError> {
+        // An empty buffer cannot be bound; whole vectors of four can always be read.
+        let bytes = (len.max(1).next_multiple_of(4)) as u64 * FLOAT;
+        let most = gpu.max_buffer_bytes();
+        let adapter = || gpu.adapter().name.clone();
+        if bytes > most {
+            return Err(GpuError::BufferTooLarge { what: what.to_owned(), bytes, adapter: adapter(), most });
+        }
+        let account = &gpu.shared.account;
+        let held = account.held();
+        account.take(what, bytes)?;
+        let scope = gpu.shared.device.push_error_scope(wgpu::ErrorFilter::OutOfMemory);
+        let raw = gpu.shared.device.create_buffer(&wgpu::BufferDescriptor {
+            label: Some(what),
+            size: bytes,
+            usage: wgpu::BufferUsages::STORAGE | wgpu::BufferUsages::COPY_SRC | wgpu::BufferUsages::COPY_DST,
+            mapped_at_creation: false,
+        });
+        let buffer = Self { raw, len, account: Arc::clone(account) };
+        match pollster::block_on(scope.pop()) {
+            Some(_) => Err(GpuError::OutOfMemory { what: what.to_owned(), bytes, held, adapter: adapter() }),
+            None => Ok(buffer),
+        }
+    }
+
+    /// Writes numbers from place `at` on, before anything that is recorded but not yet submitted.
+    ///
+    /// # Panics
+    /// When they do not fit.
+    pub fn write(&self, gpu: &Gpu, at: usize, values: &[f32]) {
+        self.write_words(gpu, at, bytemuck::cast_slice(values));
+    }
+
+    pub(crate) fn write_words(&self, gpu: &Gpu, at: usize, words: &[u32]) {
+        assert!(at + words.len() <= self.len, "{} numbers at {at} of {}", words.len(), self.len);
+        if !words.is_empty() {
+            gpu.shared.queue.write_buffer(&self.raw, at as u64 * FLOAT, bytemuck::cast_slice(words));
+        }
+    }
 }

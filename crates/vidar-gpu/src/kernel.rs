@@ -1,7 +1,9 @@
 //! A kernel: shader text put together for its constants, and what it binds.
 
-use crate::device::IMMEDIATES;
 use std::sync::OnceLock;
+
+/// Bytes of immediate data that every operation may use; every interface has at least as many.
+pub(crate) const IMMEDIATES: u32 = 64;
 
 /// Most buffers of one kind that a kernel binds.
 const MOST_READS: usize = 6;

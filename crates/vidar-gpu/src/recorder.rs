@@ -1,9 +1,9 @@
 //! Operations recorded and submitted together.
 
 use crate::buffer::Buffer;
-use crate::device::{Gpu, IMMEDIATES};
+use crate::device::Gpu;
 use crate::error::GpuError;
-use crate::kernel::Kernel;
+use crate::kernel::{IMMEDIATES, Kernel};
 use std::sync::mpsc;
 
 /// Submissions that may be under way before the next one waits.

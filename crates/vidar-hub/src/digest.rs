@@ -1,7 +1,7 @@
 //! SHA-256 of streams and of files.
 
-use crate::download::{Progress, TransferCallbacks};
 use crate::error::HubError;
+use crate::progress::{Progress, TransferCallbacks};
 use sha2::{Digest as _, Sha256};
 use std::fs::File;
 use std::io::{Read, Seek, SeekFrom};

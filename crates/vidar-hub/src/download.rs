@@ -11,6 +11,7 @@
 use crate::client::{Client, Failure, FileMetadata, Method, Response, header};
 use crate::digest::{Digest, hash_prefix};
 use crate::error::HubError;
+use crate::progress::{Progress, TransferCallbacks};
 use crate::settings::HubSettings;
 use std::fs::{File, OpenOptions};
 use std::io::{Read, Seek, SeekFrom, Write};
@@ -23,31 +24,6 @@ const PIECE: usize = 64 << 10;
 const MOST_UNKNOWN: u64 = 16 << 20;
 /// After this much progress the count of tries starts again, bytes.
 const REAL_PROGRESS: u64 = 1 << 20;
-
-/// Progress of one file.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Progress<'a> {
-    /// Which file.
-    pub file: &'a str,
-    /// Bytes present.
-    pub done: u64,
-    /// Bytes in total; 0 if the hub does not state it.
-    pub total: u64,
-}
-
-/// Callbacks of a transfer: progress and cancellation.
-pub struct TransferCallbacks<'a> {
-    /// Called with progress, at most once per 64 KiB.
-    pub progress: &'a dyn Fn(Progress<'_>),
-    /// Called repeatedly; `true` stops.
-    pub cancel: &'a dyn Fn() -> bool,
-}
-
-impl TransferCallbacks<'_> {
-    pub(crate) fn stop(&self) -> Result<(), HubError> {
-        if (self.cancel)() { Err(HubError::Cancelled) } else { Ok(()) }
-    }
-}
 
 /// A file to fetch.
 pub(crate) struct FileRequest<'a> {

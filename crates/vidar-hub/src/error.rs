@@ -1,6 +1,6 @@
 //! Errors of finding, fetching and verifying checkpoints: file or address, found value, expected value.
 
-use crate::catalogue::Licence;
+use crate::licence::Licence;
 use std::io;
 use std::path::{Path, PathBuf};
 use thiserror::Error;

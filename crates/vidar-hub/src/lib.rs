@@ -28,15 +28,18 @@ mod disk;
 mod download;
 mod error;
 mod header;
+mod licence;
 mod lock;
+mod progress;
 mod pull;
 mod settings;
 mod store;
 
-pub use catalogue::{Ability, Checkpoint, Licence, OfficialFile};
+pub use catalogue::{Ability, Checkpoint, OfficialFile};
 pub use digest::{hex, sha256_hex, sha256_of};
-pub use download::{Progress, TransferCallbacks};
 pub use error::HubError;
+pub use licence::Licence;
+pub use progress::{Progress, TransferCallbacks};
 pub use pull::PullOptions;
 pub use settings::{ENDPOINT, HubSettings};
 pub use store::{

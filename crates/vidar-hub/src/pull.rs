@@ -3,10 +3,11 @@
 use crate::catalogue::{CHECKPOINTS, CONFIG, Checkpoint, WEIGHTS, of_hash, of_size};
 use crate::client::Client;
 use crate::digest::sha256_of;
-use crate::download::{FileRequest, TransferCallbacks, fetch};
+use crate::download::{FileRequest, fetch};
 use crate::error::HubError;
 use crate::header::{Header, read_header};
 use crate::lock::Lock;
+use crate::progress::TransferCallbacks;
 use crate::store::{
     Acceptance, CheckpointLocation, IdentifiedBy, InstalledCheckpoint, RECORD, RecordedFile, Store,
     make_folder, minimal_config, record_of, write_json,

@@ -11,10 +11,11 @@
 //! If a checkpoint is missing there, the cache of the hub's official programs is searched
 //! (`models--depth-anything--DA3-SMALL/snapshots/…`). That cache is never written.
 
-use crate::catalogue::{CHECKPOINTS, CONFIG, Checkpoint, Licence, OfficialFile, WEIGHTS};
+use crate::catalogue::{CHECKPOINTS, CONFIG, Checkpoint, OfficialFile, WEIGHTS};
 use crate::digest::sha256_of;
-use crate::download::TransferCallbacks;
 use crate::error::HubError;
+use crate::licence::Licence;
+use crate::progress::TransferCallbacks;
 use crate::settings::HubSettings;
 use serde::{Deserialize, Serialize, de::DeserializeOwned};
 use std::fs;

@@ -2,7 +2,8 @@
 
 use std::ops::Range;
 
-use crate::compute::{Compute, Isa};
+use crate::compute::Compute;
+use crate::isa::Isa;
 use crate::kernels::attend::{
     Attend, BLOCK, HeadLayout, LayoutOf, PackKeys, Prepare, QUERIES, Tokens, for_each_part,
 };

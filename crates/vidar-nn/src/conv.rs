@@ -5,8 +5,8 @@
 
 use crate::compute::Compute;
 use crate::error::NnError;
-use crate::kernels::gemm::{End, OutLayout, Product};
 use crate::kernels::pack::Columns;
+use crate::kernels::product::{End, OutLayout, Product};
 use crate::kernels::scratch::{self, Role};
 use crate::kernels::source::{Bands, Fill, Source};
 use crate::linear::{Epilogue, vector, wrong_shape};

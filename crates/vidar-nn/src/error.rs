@@ -1,7 +1,5 @@
 //! What can go wrong when kernels are chosen or layers are put together.
 
-use crate::compute::Isa;
-
 /// A layer that cannot be built, or a kernel set that this machine does not have.
 ///
 /// Wrong slice lengths given to an operation are programming errors, not data, and are asserted instead.
@@ -12,7 +10,7 @@ pub enum NnError {
     #[error("kernel set {asked} does not run on this machine; it has: {available}")]
     IsaUnavailable {
         /// What was asked for.
-        asked: Isa,
+        asked: &'static str,
         /// What would run, comma separated.
         available: String,
     },

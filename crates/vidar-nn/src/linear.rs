@@ -2,8 +2,8 @@
 
 use crate::compute::Compute;
 use crate::error::NnError;
-use crate::kernels::gemm::{End, OutLayout, Product};
 use crate::kernels::pack::Columns;
+use crate::kernels::product::{End, OutLayout, Product};
 use crate::kernels::source::Source;
 use crate::weight::Weight;
 

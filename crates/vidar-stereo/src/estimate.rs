@@ -7,13 +7,14 @@
 use crate::config::StereoConfig;
 use crate::edges::with_sharp_edges;
 use crate::fine::settle;
-use crate::ncc::{Reference, Source, Surface, UNITS};
+use crate::ncc::{Reference, Source, Surface};
 use crate::prepare::{Level, Prepared};
 use crate::select::{Selection, select};
 use crate::sgm::{Penalties, Winners, aggregate};
 use crate::surface::{Grid, doubled};
 use crate::sweep::{Labels, sweep};
 use crate::warp::{Warp, neighbour_from_reference};
+use crate::window::UNITS;
 use tracing::trace_span;
 
 /// Pyramid level of the sweep over the whole range, and of the probe for the scene's depth.

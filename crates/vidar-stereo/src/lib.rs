@@ -52,6 +52,7 @@ mod simd;
 mod surface;
 mod sweep;
 mod warp;
+mod window;
 
 pub use confidence::{PixelFeatures, TOLERANCE_RATIO};
 pub use config::StereoConfig;

@@ -9,15 +9,10 @@
 
 use crate::prepare::{GRAY_STEPS, Level};
 use crate::warp::{RowSamples, Warp};
+use crate::window::{HIDDEN, RADIUS, UNITS};
 
-/// Cost of a window that is not visible in a neighbour; every visible one costs at most 1.
-pub(crate) const HIDDEN: f32 = 2.0;
-/// Window radius, pixels.
-pub(crate) const RADIUS: usize = 2;
 const WINDOW: usize = 2 * RADIUS + 1;
 const INVERSE_AREA: f32 = 1.0 / (WINDOW * WINDOW) as f32;
-/// Matched units per grey level.
-pub(crate) const UNITS: f32 = 4.0;
 /// Image units per matched unit.
 const COARSENING: i32 = GRAY_STEPS / 4;
 

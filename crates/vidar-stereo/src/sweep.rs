@@ -3,7 +3,8 @@
 //! A label moves a surface by a step of inverse depth. Over the surface ρ = 0 the labels are fronto-parallel planes; over
 //! an estimate they are offsets from it, and a few of them suffice.
 
-use crate::ncc::{HIDDEN, Reference, Source, Strip, Surface};
+use crate::ncc::{Reference, Source, Strip, Surface};
+use crate::window::HIDDEN;
 use rayon::prelude::*;
 
 /// Cost of a label that no neighbour sees.

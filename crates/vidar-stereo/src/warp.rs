@@ -5,8 +5,8 @@
 //! For fixed ρ this is the plane-induced homography of Collins 1996; on a plane in space ρ is affine in (x, y),
 //! so slanted planes are homographies as well.
 
-use crate::ncc::{HIDDEN, RADIUS};
 use crate::prepare::Level;
+use crate::window::{HIDDEN, RADIUS};
 use nalgebra::{Matrix3, Vector3};
 use vidar_core::{LieGroup, Pinhole, Se3};
 
@@ -91,7 +91,7 @@ impl RowSamples {
     }
 
     /// Where row `y` at the inverse depths `rho + shift` lies in `level`. `hidden` becomes 0 where a window around the
-    /// position is inside the image and [`HIDDEN`](crate::ncc::HIDDEN) elsewhere, also where `rho` is NaN.
+    /// position is inside the image and [`HIDDEN`](crate::window::HIDDEN) elsewhere, also where `rho` is NaN.
     #[inline(always)]
     pub fn locate(
         &mut self,
@@ -158,7 +158,7 @@ impl RowSamples {
         }
     }
 
-    /// The samples, rounded to [matched units](crate::ncc::UNITS).
+    /// The samples, rounded to [matched units](crate::window::UNITS).
     #[inline(always)]
     pub fn blend(&self, out: &mut [f32]) {
         let n = out.len();

@@ -1,5 +1,6 @@
 //! What to simulate.
 
+use crate::bounds::{ensure, within};
 use crate::device::DeviceConfig;
 use crate::error::SynthError;
 use serde::{Deserialize, Serialize};
@@ -221,25 +222,6 @@ impl SynthConfig {
         }
         Ok(())
     }
-}
-
-pub(crate) fn ensure(
-    holds: bool,
-    key: &'static str,
-    expected: &'static str,
-    found: impl std::fmt::Display,
-) -> Result<(), SynthError> {
-    if holds { Ok(()) } else { Err(SynthError::BadConfig { key, expected, found: found.to_string() }) }
-}
-
-pub(crate) fn within(
-    key: &'static str,
-    value: f64,
-    low: f64,
-    high: f64,
-    expected: &'static str,
-) -> Result<(), SynthError> {
-    ensure(value >= low && value <= high, key, expected, value)
 }
 
 #[cfg(test)]

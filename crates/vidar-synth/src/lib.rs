@@ -7,10 +7,12 @@
 //! Every random number is drawn from a stream that belongs to its purpose and frame, so that the same [`SynthConfig`]
 //! gives the same bytes for any number of threads.
 
+mod bounds;
 pub mod clip;
 mod config;
 mod device;
 mod error;
+mod extent;
 mod flight;
 mod image_file;
 mod imu;
@@ -23,6 +25,7 @@ mod render;
 mod rig;
 mod scan;
 mod schedule;
+mod sensors;
 mod sequence;
 mod simulation;
 mod staging;
@@ -33,6 +36,7 @@ mod world;
 pub use config::{FlightKind, SceneKind, Start, SynthConfig, Variety};
 pub use device::{CalibrationKind, DeviceConfig, ImuTiming, Lens, Mount};
 pub use error::SynthError;
+pub use extent::Extent;
 pub use flight::{FlightPath, FlightState};
 pub use imu::{ImuRecord, simulate_imu};
 pub use presets::PRESETS;
@@ -40,7 +44,7 @@ pub use render::{RenderedView, SynthView, render_views};
 pub use rig::{euroc_body_from_camera, euroc_camera, euroc_rig};
 pub use sequence::{SynthSummary, write_sequence};
 pub use simulation::Simulation;
-pub use world::{Extent, Hit, World};
+pub use world::{Hit, World};
 
 #[cfg(test)]
 mod tests;

@@ -122,3 +122,8 @@ impl<R: Rng> Gaussian<R> {
         nalgebra::Vector3::new(self.next(), self.next(), self.next())
     }
 }
+
+/// A number between `low` and `high`, all alike.
+pub(crate) fn between(rng: &mut ChaCha8Rng, low: f64, high: f64) -> f64 {
+    low + (high - low) * rng.random::<f64>()
+}

@@ -1,6 +1,5 @@
 //! Matrices as text: intrinsics, 4×4 poses in one file or one line each.
 
-use super::poses::rigid;
 use crate::error::DatasetError;
 use crate::source::{Row, Source};
 use nalgebra::Matrix4;
@@ -102,4 +101,11 @@ pub fn single_pose(source: &Source<'_>) -> Result<Option<Se3>, DatasetError> {
     let m = Matrix4::from_row_iterator(numbers.iter().map(|(_, v)| *v));
     check_last_row(source, numbers[15].0, &m, 16)?;
     rigid(source, 1, &m).map(Some)
+}
+
+/// The rigid motion of a matrix in a file of poses.
+pub(super) fn rigid(source: &Source<'_>, line: usize, m: &Matrix4<f64>) -> Result<Se3, DatasetError> {
+    Se3::from_matrix(m).ok_or_else(|| {
+        source.malformed(line, crate::calibration::departure(m), "a rigid motion (orthonormal rotation)")
+    })
 }

@@ -4,11 +4,12 @@
 //! skipped and counted in a warning. A quaternion whose norm differs from one by more than 5 %, or a matrix that is not
 //! a rotation, means a wrong file: an error with its line.
 
+use super::matrices::{rigid, row_matrix};
 use super::units::{UnitRule, decide_unit, read_time};
 use crate::error::DatasetError;
 use crate::options::TrajectoryFormat;
 use crate::source::{Lines, Row, Source};
-use nalgebra::{Matrix4, Vector3};
+use nalgebra::Vector3;
 use vidar_core::{BodyFrame, CameraId, Se3, So3, Timestamp, Warning};
 
 /// A pose and its line.
@@ -143,7 +144,7 @@ pub fn kitti_poses(source: &Source<'_>) -> Result<PoseFile, DatasetError> {
     let mut poses = Vec::with_capacity(lines.rows.len());
     let mut lost = LostPoses::default();
     for (index, row) in lines.rows.iter().enumerate() {
-        let m = super::matrices::row_matrix(source, row)?;
+        let m = row_matrix(source, row)?;
         if m.iter().all(|v| v.is_finite()) {
             let world_from_body = rigid(source, row.line, &m)?;
             poses.push(RawPose { line: row.line, row: index, time: None, world_from_body });
@@ -154,13 +155,6 @@ pub fn kitti_poses(source: &Source<'_>) -> Result<PoseFile, DatasetError> {
     lost.warn(&source.path.display().to_string(), &mut notes);
     let body = body_of(&lines);
     Ok(PoseFile { poses, rows: lines.rows.len(), body, positions_only: false, notes })
-}
-
-/// The rigid motion of a matrix in a file of poses.
-pub(super) fn rigid(source: &Source<'_>, line: usize, m: &Matrix4<f64>) -> Result<Se3, DatasetError> {
-    Se3::from_matrix(m).ok_or_else(|| {
-        source.malformed(line, crate::calibration::departure(m), "a rigid motion (orthonormal rotation)")
-    })
 }
 
 /// The body of the poses according to the header.

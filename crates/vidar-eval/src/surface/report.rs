@@ -1,6 +1,5 @@
 //! Results of surface evaluation.
 
-use super::placement::Placement;
 use crate::transform::TransformRecord;
 use serde::{Deserialize, Serialize};
 use vidar_core::{Sim3, Warning};
@@ -174,9 +173,9 @@ pub(super) fn f_at(scores: &[Scores], threshold_m: f64) -> f64 {
 }
 
 impl FreePlacement {
-    pub(super) fn new(candidate: &Placement, scores: Vec<Scores>) -> Self {
-        let start = candidate.start.to_owned();
-        Self { start, truth_from_estimate: candidate.truth_from_estimate, scores }
+    /// With the scores of a placement that was found from `start`.
+    pub(super) fn new(start: &str, truth_from_estimate: Sim3, scores: Vec<Scores>) -> Self {
+        Self { start: start.to_owned(), truth_from_estimate, scores }
     }
 
     pub(super) fn f_at(&self, threshold_m: f64) -> f64 {

@@ -1,8 +1,7 @@
 //! Accessors: typed views of the binary chunk, checked before use.
 
 use super::json::{Accessor, Document};
-use super::read::{bad, unsupported};
-use super::{FLOAT, UNSIGNED_BYTE, UNSIGNED_INT, UNSIGNED_SHORT, srgb_from_linear};
+use super::{FLOAT, FORMAT, UNSIGNED_BYTE, UNSIGNED_INT, UNSIGNED_SHORT, srgb_from_linear};
 use crate::error::{ExportError, quoted};
 
 /// Largest distance between elements that glTF allows, bytes.
@@ -175,4 +174,13 @@ impl<'a> Accessors<'a> {
 
 fn window(bytes: &[u8], start: usize, length: usize) -> Option<&[u8]> {
     bytes.get(start..start.checked_add(length)?)
+}
+
+pub(super) fn bad(place: &str, expected: &str, found: String) -> ExportError {
+    ExportError::malformed(FORMAT, place, expected, found)
+}
+
+pub(super) fn unsupported(place: &str, feature: String) -> ExportError {
+    let hint = "save it again as a plain GLB of one file";
+    ExportError::Unsupported { format: FORMAT, place: place.to_owned(), feature, hint }
 }

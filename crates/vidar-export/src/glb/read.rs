@@ -1,6 +1,6 @@
 //! The default scene of a GLB as one mesh in VIDAR's world.
 
-use super::accessor::Accessors;
+use super::accessor::{Accessors, bad, unsupported};
 use super::json::{Document, Node, Primitive};
 use super::{CHUNK_BIN, CHUNK_JSON, COMMENTS_KEY, FORMAT, MAGIC, MODE_POINTS, MODE_TRIANGLES, VERSION};
 use crate::axes::y_up_from_z_up;
@@ -63,15 +63,6 @@ pub fn read_glb(bytes: &[u8]) -> Result<Glb, ExportError> {
         None => return Err(bad("scene", "the number of a scene", format!("{:?}", document.scene))),
     }
     Ok(Glb { mesh: reader.parts.into_mesh(), comments })
-}
-
-pub(super) fn bad(place: &str, expected: &str, found: String) -> ExportError {
-    ExportError::malformed(FORMAT, place, expected, found)
-}
-
-pub(super) fn unsupported(place: &str, feature: String) -> ExportError {
-    let hint = "save it again as a plain GLB of one file";
-    ExportError::Unsupported { format: FORMAT, place: place.to_owned(), feature, hint }
 }
 
 /// The JSON chunk and the binary chunk (empty if there is none); chunks of other kinds are skipped.

@@ -12,7 +12,7 @@ use super::shared::SharedMut;
 use super::simd::Simd;
 use super::source::{Fill, Source};
 use super::{Factors, Kernel, dispatch};
-use crate::compute::Isa;
+use crate::isa::Isa;
 
 /// Rows that the centre is the mean of, at most.
 const SAMPLES: usize = 64;

@@ -15,62 +15,17 @@ use std::ops::Range;
 use rayon::prelude::*;
 
 use super::centre::{Bias, centre_of};
-use super::pack::{Columns, Pack};
+use super::pack::Pack;
+use super::product::{End, PACKED_WORDS, Product, Target};
 use super::scratch::{self, Role};
+use super::shape::{Shape, ShapeOf};
 use super::shared::SharedMut;
 use super::simd::Simd;
-use super::source::{Geometry, Inner, Source};
+use super::source::{Geometry, Source};
 use super::tile::{MAX_ROWS, Multiply, Sums, steps_of, tile_start};
 use super::{Factors, ProductKernel, dispatch_product, math, winograd};
 use crate::compute::{Compute, Precision};
 
-/// What happens to a sum before it is stored, after the bias.
-#[derive(Debug, Clone, Copy)]
-pub(crate) enum End<'a> {
-    Store,
-    Gelu,
-    Relu,
-    /// `out += gamma * sum`
-    Accumulate(Option<&'a [f32]>),
-    /// `out = other + sum`, `other` laid out as `out`
-    Add(&'a [f32]),
-    /// The first half of the columns gates the second: `out = silu(gate) * value`, half as wide.
-    SwiGlu,
-}
-
-/// Where row m of the product goes: rows come in lines of `line`.
-#[derive(Debug, Clone, Copy)]
-pub(crate) struct OutLayout {
-    pub(crate) line: usize,
-    pub(crate) line_stride: usize,
-    pub(crate) row_stride: usize,
-    pub(crate) offset: usize,
-}
-
-impl OutLayout {
-    /// Dense rows of `width`.
-    pub(crate) fn dense(rows: usize, width: usize) -> Self {
-        Self { line: rows.max(1), line_stride: rows * width, row_stride: width, offset: 0 }
-    }
-
-    fn at(&self, row: usize) -> usize {
-        self.offset + row / self.line * self.line_stride + row % self.line * self.row_stride
-    }
-}
-
-/// `out = end(A B + bias)`.
-pub(crate) struct Product<'a> {
-    pub(crate) source: Source<'a>,
-    pub(crate) columns: &'a dyn Columns,
-    /// Number of columns of B.
-    pub(crate) width: usize,
-    pub(crate) bias: Option<&'a [f32]>,
-    pub(crate) end: End<'a>,
-    pub(crate) layout: OutLayout,
-}
-
-/// Words of packed weights that exist at a time.
-pub(crate) const PACKED_WORDS: usize = 1 << 20;
 /// Tasks per thread that make their different speeds even out.
 const TASKS_PER_THREAD: usize = 8;
 
@@ -135,24 +90,6 @@ impl Product<'_> {
     }
 }
 
-/// Asks for the shape of panels.
-pub(crate) struct ShapeOf {
-    pub(crate) inner: Inner,
-}
-
-/// Columns of a panel, and words of a column.
-pub(crate) struct Shape {
-    pub(crate) panel: usize,
-    pub(crate) words: usize,
-}
-
-impl ProductKernel for ShapeOf {
-    type Output = Shape;
-    fn run<M: Multiply>(self, _: M) -> Shape {
-        Shape { panel: 2 * M::Simd::LANES, words: self.inner.words::<M>() }
-    }
-}
-
 /// Packed columns: `count` units of one panel (or a pair) from unit `first` on.
 #[derive(Clone, Copy)]
 pub(crate) struct Panels<'a> {
@@ -191,15 +128,6 @@ impl ProductKernel for Task<'_> {
         };
         multiply(m, a, &geometry, rows, 0, self.panels, self.units, &target);
     }
-}
-
-/// Where sums go and what is done with them.
-pub(crate) struct Target<'a> {
-    pub(crate) width: usize,
-    pub(crate) bias: Option<&'a [f32]>,
-    pub(crate) end: End<'a>,
-    pub(crate) layout: OutLayout,
-    pub(crate) out: SharedMut<'a>,
 }
 
 /// Multiplies rows `rows` of A (in `a`, which starts with the first of them) with some units of the panels. Row m of A goes to

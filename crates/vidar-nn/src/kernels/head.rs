@@ -3,8 +3,9 @@
 
 use std::ops::Range;
 
-use super::gemm::{End, OutLayout, Panels, Target, multiply};
+use super::gemm::{Panels, multiply};
 use super::norm::{NormRef, norm_row};
+use super::product::{End, OutLayout, Target};
 use super::scratch::{self, Role};
 use super::shared::SharedMut;
 use super::simd::Simd;

@@ -14,8 +14,10 @@ pub(crate) mod math;
 mod neon;
 pub(crate) mod norm;
 pub(crate) mod pack;
+pub(crate) mod product;
 pub(crate) mod resample;
 pub(crate) mod scratch;
+pub(crate) mod shape;
 pub(crate) mod shared;
 pub(crate) mod simd;
 pub(crate) mod source;
@@ -24,9 +26,8 @@ pub(crate) mod winograd;
 #[cfg(target_arch = "x86_64")]
 mod x86;
 
-use std::sync::atomic::{AtomicU8, Ordering};
-
-use crate::compute::{Compute, Isa, Precision};
+use crate::compute::{Compute, Precision};
+use crate::isa::Isa;
 use simd::{Portable, Simd};
 use tile::{InBf16, InF32, Multiply};
 
@@ -54,63 +55,18 @@ impl Factors {
     /// What a kernel set does for a precision: bf16 only where the processor multiplies it (elsewhere `f32` is as fast).
     pub(crate) fn of(c: &Compute) -> Self {
         match c.precision() {
-            Precision::Bf16 if multiplies_bf16(c.isa()) => Self::Bf16,
+            Precision::Bf16 if c.isa().multiplies_bf16() => Self::Bf16,
             _ => Self::F32,
         }
     }
 }
 
-/// Whether a kernel set runs on this machine.
-pub(crate) fn is_available(isa: Isa) -> bool {
-    match isa {
-        Isa::Portable => true,
-        #[cfg(target_arch = "x86_64")]
-        Isa::Avx2 => is_x86_feature_detected!("avx2") && is_x86_feature_detected!("fma"),
-        #[cfg(target_arch = "x86_64")]
-        Isa::Avx512 => {
-            is_x86_feature_detected!("avx512f")
-                && is_x86_feature_detected!("avx512bw")
-                && is_x86_feature_detected!("avx512dq")
-                && is_x86_feature_detected!("avx512vl")
-                && is_x86_feature_detected!("fma")
-        }
-        #[cfg(target_arch = "aarch64")]
-        Isa::Neon => std::arch::is_aarch64_feature_detected!("neon"),
-        _ => false,
-    }
-}
-
-pub(crate) fn multiplies_bf16(isa: Isa) -> bool {
-    match isa {
-        #[cfg(target_arch = "x86_64")]
-        Isa::Avx512 => is_x86_feature_detected!("avx512bf16"),
-        _ => false,
-    }
-}
-
-/// One bit per kernel set that has run.
-static USED: AtomicU8 = AtomicU8::new(0);
-
-/// Records a kernel set in builds with debug assertions.
-#[inline(always)]
-fn record(isa: Isa) {
-    if cfg!(debug_assertions) {
-        USED.fetch_or(1 << isa as u8, Ordering::Relaxed);
-    }
-}
-
-/// The kernel sets that this process has run since the last call.
-pub(crate) fn take_used() -> Vec<Isa> {
-    let used = USED.swap(0, Ordering::Relaxed);
-    Isa::ALL.into_iter().filter(|isa| used >> *isa as u8 & 1 == 1).collect()
-}
-
 /// Runs a kernel on a kernel set, which must be available (a `Compute` proves it).
 pub(crate) fn dispatch<K: Kernel>(isa: Isa, kernel: K) -> K::Output {
-    record(isa);
+    isa.record();
     match isa {
         #[cfg(target_arch = "x86_64")]
-        // SAFETY: a kernel set reaches this point only after `is_available`.
+        // SAFETY: a kernel set reaches this point only after `Isa::is_available`.
         Isa::Avx2 => unsafe { in_avx2(kernel) },
         #[cfg(target_arch = "x86_64")]
         // SAFETY: as above.
@@ -124,11 +80,11 @@ pub(crate) fn dispatch<K: Kernel>(isa: Isa, kernel: K) -> K::Output {
 
 /// Runs a kernel on a kernel set, which must be available, with factors in a number format.
 pub(crate) fn dispatch_product<K: ProductKernel>(isa: Isa, factors: Factors, kernel: K) -> K::Output {
-    record(isa);
+    isa.record();
     match (isa, factors) {
         #[cfg(target_arch = "x86_64")]
         // SAFETY: bf16 is checked here, the rest before a kernel set reaches this point.
-        (Isa::Avx512, Factors::Bf16) if multiplies_bf16(isa) => unsafe { in_avx512_bf16(kernel) },
+        (Isa::Avx512, Factors::Bf16) if isa.multiplies_bf16() => unsafe { in_avx512_bf16(kernel) },
         (_, Factors::Bf16) => kernel.run(InBf16(Portable)),
         (_, Factors::F32) => dispatch(isa, F32Product(kernel)),
     }

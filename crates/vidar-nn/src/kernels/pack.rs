@@ -3,14 +3,14 @@
 use rayon::prelude::*;
 
 use super::centre::dot_repeated;
-use super::gemm::{Shape, ShapeOf};
 use super::scratch::{self, Role};
+use super::shape::{Shape, ShapeOf};
 use super::shared::SharedMut;
 use super::simd::Simd;
 use super::source::Inner;
 use super::tile::Multiply;
 use super::{Factors, ProductKernel, dispatch_product};
-use crate::compute::Isa;
+use crate::isa::Isa;
 
 /// Where the columns of B come from.
 pub(crate) trait Columns: Sync {

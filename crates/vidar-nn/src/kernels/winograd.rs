@@ -12,9 +12,10 @@ use std::ops::Range;
 
 use rayon::prelude::*;
 
-use super::gemm::{PACKED_WORDS, Product, ShapeOf, Target};
 use super::pack::{Columns, transpose};
+use super::product::{PACKED_WORDS, Product, Target};
 use super::scratch::{self, Role};
+use super::shape::ShapeOf;
 use super::shared::SharedMut;
 use super::simd::Simd;
 use super::source::{Bands, Fill};

@@ -1,6 +1,7 @@
 //! The odometry before it has a metric state: tracks are followed with the gyroscope's help and logged.
 
 use super::log::joined;
+use super::monocular::INITIAL_INVERSE_DISTANCE;
 use super::{
     InFlightConfig, InFlightInitializer, InitFailure, InitFailureReason, InitOutcome, LoggedFrame,
     TrackObservation,
@@ -20,9 +21,6 @@ use vidar_core::{Duration, FrameId, LieGroup, Se3, So3, Timestamp};
 /// what comes while it is solved.
 const LOG_SECS: f64 = 3.2;
 const LOG_FRAMES: usize = 100;
-
-/// Inverse distance to assume of everything, 1/m.
-pub(crate) const INITIAL_INVERSE_DISTANCE: f64 = 0.4;
 
 /// New tracks are started when fewer than this share of the wanted ones is left.
 const REFILL_SHARE: f64 = 0.7;

@@ -23,8 +23,9 @@ mod views;
 
 pub use failure::{InitFailure, InitFailureReason};
 pub use in_flight::{InFlightConfig, InFlightInitializer, InFlightSolution, InitOutcome};
-pub(crate) use initializer::{INITIAL_INVERSE_DISTANCE, InitialState, Initializer, STILL_SECS};
+pub(crate) use initializer::{InitialState, Initializer, STILL_SECS};
 pub use log::{LoggedFrame, TrackObservation};
+pub(crate) use monocular::INITIAL_INVERSE_DISTANCE;
 pub(crate) use static_start::initialize_slow;
 pub use static_start::{StaticInitConfig, StaticState, initialize_static};
 

@@ -1,12 +1,14 @@
 //! A start without an IMU: two views give motion and structure up to scale, and the scale is set by convention.
 
-use super::initializer::INITIAL_INVERSE_DISTANCE;
 use super::{InitFailure, InitFailureReason, LoggedFrame, TrackObservation};
 use crate::backend::{GaugePriorSigmas, Observation, Smoother};
 use crate::config::OdometryConfig;
 use crate::frontend::{RayPair, TwoViewConfig, TwoViewFailure, TwoViewSolver, triangulate};
 use crate::imu::NavState;
 use vidar_core::{CameraModel, LieGroup, Se3};
+
+/// Inverse distance to assume of everything, 1/m.
+pub(crate) const INITIAL_INVERSE_DISTANCE: f64 = 0.4;
 
 /// Least median parallax between the two views, degrees.
 const MIN_PARALLAX_DEG: f64 = 2.0;

@@ -103,7 +103,7 @@ impl ClipRoom {
     /// # Errors
     /// A width that no camera has, a share outside 0…1.
     pub fn with_homes(split: Split, index: u32, width: usize, share: f64) -> Result<Self, SynthError> {
-        crate::config::ensure((0.0..=1.0).contains(&share), "share", "0 to 1", share)?;
+        crate::bounds::ensure((0.0..=1.0).contains(&share), "share", "0 to 1", share)?;
         let seed = split.seed(index);
         let mut rng = stream(seed, Purpose::ClipRoom);
         let mut config = SynthConfig {
@@ -145,7 +145,7 @@ impl ClipRoom {
     /// # Errors
     /// Settings outside their domain.
     pub fn clip(&self, number: u32, settings: &ClipSettings) -> Result<Clip, SynthError> {
-        use crate::config::ensure;
+        use crate::bounds::ensure;
         let ClipSettings { views, width, height, samples } = *settings;
         ensure((1..=256).contains(&views), "views", "1 to 256", views)?;
         ensure((1..=64).contains(&samples), "samples", "1 to 64", samples)?;

@@ -4,9 +4,10 @@
 //! something and look at it; in homes they inspect objects at close range. Steps between neighbouring views
 //! are 5 to 70 cm and up to about 20°.
 
+use crate::extent::Extent;
 use crate::rig::euroc_body_from_camera;
 use crate::simulation::Simulation;
-use crate::world::{Extent, World};
+use crate::world::World;
 use nalgebra::{Matrix3, Vector3};
 use rand::Rng;
 use rand_chacha::ChaCha8Rng;

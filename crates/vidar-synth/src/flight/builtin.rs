@@ -36,7 +36,7 @@ impl Course {
             (SceneKind::Corridor, _) => ([11.0, 0.35], 1.5),
         };
         // A randomized place is smaller or larger than a standard one, and the flight with it.
-        let grown = crate::world::room_size(config).component_div(&crate::world::room_size(&SynthConfig {
+        let grown = crate::extent::room_size(config).component_div(&crate::extent::room_size(&SynthConfig {
             variety: Variety::Standard,
             ..config.clone()
         }));

@@ -90,7 +90,7 @@ impl Handheld {
             FlightKind::Sweep | FlightKind::Orbit | FlightKind::Aggressive => return None,
         };
         let mut random = Gaussian::new(stream(config.seed, Purpose::Handheld));
-        let size = crate::world::room_size(config);
+        let size = crate::extent::room_size(config);
         // Near the middle, so that furniture may stand along the walls; a corridor is walked along.
         let across = if config.scene == SceneKind::Corridor { 0.08 } else { 0.24 };
         let half = [(0.24 * size.x).min(6.0), across * size.y];

@@ -13,7 +13,7 @@ pub use spline::FlightState;
 use crate::config::{Start, SynthConfig};
 use crate::device::Mount;
 use crate::error::SynthError;
-use crate::world::Extent;
+use crate::extent::Extent;
 use nalgebra::Vector3;
 use spline::{LEAD, ORDER, PoseSpline};
 use vidar_core::{Se3, Trajectory};

@@ -1,6 +1,6 @@
 //! How wrong a simulated network is.
 
-use crate::config::{ensure, within};
+use crate::bounds::{ensure, within};
 use crate::error::SynthError;
 use serde::{Deserialize, Serialize};
 

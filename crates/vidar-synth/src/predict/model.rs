@@ -1,7 +1,7 @@
 //! A simulated network behind the trait of all geometry models.
 
 use super::{PredictionErrors, TruePlace, predict_chunk, true_views};
-use crate::config::ensure;
+use crate::bounds::ensure;
 use crate::error::SynthError;
 use crate::simulation::Simulation;
 use std::sync::Arc;

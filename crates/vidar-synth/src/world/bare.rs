@@ -2,8 +2,8 @@
 
 use super::furniture::RoomContents;
 use super::material::{Decal, Kind, Material};
-use super::shape::Extent;
 use crate::config::SynthConfig;
+use crate::extent::Extent;
 use crate::random::{Purpose, stream};
 use rand::Rng;
 use rand::seq::SliceRandom;

@@ -1,7 +1,8 @@
 //! A bounding-volume hierarchy over shapes, split at the median of the longest axis.
 
-use super::shape::{Extent, Shape};
+use super::shape::Shape;
 use super::tile::Pyramid;
+use crate::extent::Extent;
 use nalgebra::Vector3;
 
 /// Shapes per leaf at most.

@@ -1,10 +1,12 @@
 //! Furniture: groups of shapes placed at random where neither the flight nor other furniture is.
 
 use super::material::{Decal, Kind, Material, Surface};
-use super::shape::{Extent, Shape};
+use super::piece::{Piece, WallPlace, material, on_floor, pick, piece, plain};
+use super::shape::Shape;
 use super::{home, randomized};
 use crate::config::{SceneKind, SynthConfig, Variety};
-use crate::random::{Purpose, stream};
+use crate::extent::Extent;
+use crate::random::{Purpose, between, stream};
 use nalgebra::{Rotation3, Vector3};
 use rand::Rng;
 use rand_chacha::ChaCha8Rng;
@@ -16,12 +18,6 @@ const CLEARANCE_M: f64 = 0.45;
 
 /// Places tried for each group.
 const ATTEMPTS: usize = 30;
-
-/// One shape and what it is made of.
-pub(super) struct Piece {
-    pub shape: Shape,
-    pub surface: Surface,
-}
 
 /// The room's six faces and everything in it.
 pub(super) struct RoomContents {
@@ -204,67 +200,6 @@ impl Group {
             Self::Pillar => pillar(room, rng),
             Self::Duct => duct(room, rng),
         }
-    }
-}
-
-pub(super) fn between(rng: &mut ChaCha8Rng, low: f64, high: f64) -> f64 {
-    low + (high - low) * rng.random::<f64>()
-}
-
-pub(super) fn pick<T: Copy>(choice: &[T], rng: &mut ChaCha8Rng) -> T {
-    choice[rng.random_range(0..choice.len())]
-}
-
-pub(super) fn material(kind: Kind, tone: f64, rng: &mut ChaCha8Rng) -> Material {
-    Material { kind, seed: rng.random(), tone: (tone + between(rng, -0.08, 0.08)) as f32 }
-}
-
-pub(super) fn plain(material: Material) -> Surface {
-    Surface { base: material, decals: Vec::new() }
-}
-
-pub(super) fn piece(shape: Shape, kind: Kind, tone: f64, rng: &mut ChaCha8Rng) -> Piece {
-    Piece { shape, surface: plain(material(kind, tone, rng)) }
-}
-
-/// A random place on the floor, `margin` from the walls.
-pub(super) fn on_floor(room: &Extent, margin: f64, rng: &mut ChaCha8Rng) -> Vector3<f64> {
-    let axis = |k: usize, rng: &mut ChaCha8Rng| between(rng, room.min[k] + margin, room.max[k] - margin);
-    Vector3::new(axis(0, rng), axis(1, rng), room.min.z)
-}
-
-/// A wall's own frame: a point on it at floor height, the direction along it and into the room.
-pub(super) struct WallPlace {
-    pub foot: Vector3<f64>,
-    along: Vector3<f64>,
-    pub inward: Vector3<f64>,
-}
-
-impl WallPlace {
-    /// A random place on a random wall with `half_width` of wall on both sides; long walls are chosen more often.
-    pub(super) fn random(room: &Extent, half_width: f64, rng: &mut ChaCha8Rng) -> Self {
-        let size = room.max - room.min;
-        let on_long_y = rng.random::<f64>() * (size.x + size.y) < size.x;
-        let (axis, across) = if on_long_y { (0, 1) } else { (1, 0) };
-        let mut foot = Vector3::new(0.0, 0.0, room.min.z);
-        let reach = (0.5 * size[axis] - half_width).max(0.0);
-        foot[axis] = 0.5 * (room.min[axis] + room.max[axis]) + between(rng, -reach, reach);
-        let far = rng.random::<bool>();
-        foot[across] = if far { room.max[across] } else { room.min[across] };
-        let mut along = Vector3::zeros();
-        along[axis] = 1.0;
-        let mut inward = Vector3::zeros();
-        inward[across] = if far { -1.0 } else { 1.0 };
-        Self { foot, along, inward }
-    }
-
-    /// A block `offset` along the wall, its back `gap` from the wall and its foot `height` above the floor.
-    pub(super) fn block(&self, offset: f64, gap: f64, height: f64, size: [f64; 3]) -> Shape {
-        let [width, depth, tall] = size;
-        let foot =
-            self.foot + self.along * offset + self.inward * (gap + 0.5 * depth) + Vector3::z() * height;
-        let size = if self.along.x != 0.0 { [width, depth, tall] } else { [depth, width, tall] };
-        Shape::block(foot, size, 0.0)
     }
 }
 

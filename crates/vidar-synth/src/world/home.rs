@@ -3,9 +3,11 @@
 //! A camera in the hand looks down on such objects from near, where the standard and the randomized places have little. The
 //! furniture's own frame has x along the wall or the longer side, y into the room and z up.
 
-use super::furniture::{Piece, WallPlace, between, material, on_floor, pick, plain};
 use super::material::{Kind, Material};
-use super::shape::{Extent, Shape};
+use super::piece::{Piece, WallPlace, material, on_floor, pick, plain};
+use super::shape::Shape;
+use crate::extent::Extent;
+use crate::random::between;
 use nalgebra::{Rotation3, Vector3};
 use rand::Rng;
 use rand_chacha::ChaCha8Rng;

@@ -4,7 +4,8 @@
 
 use super::Bvh;
 use super::noise::cell;
-use super::shape::{Extent, Shape};
+use super::shape::Shape;
+use crate::extent::Extent;
 use nalgebra::Vector3;
 
 /// Spacing of the grid on which light is computed, m; coarser where textures are coarse.

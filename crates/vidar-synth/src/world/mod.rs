@@ -7,18 +7,18 @@ mod home;
 mod light;
 mod material;
 mod noise;
+mod piece;
 mod randomized;
 mod shape;
 mod texture;
 mod tile;
 
-pub(crate) use randomized::room_size;
-pub use shape::Extent;
 pub(crate) use shape::Shape;
 pub(crate) use tile::{TileBounds, TileHits};
 
 use crate::config::{SceneKind, SynthConfig};
 use crate::error::SynthError;
+use crate::extent::{Extent, room_size};
 use crate::flight::FlightPath;
 use bvh::Bvh;
 use light::{LightMap, Lighting};

@@ -4,39 +4,17 @@
 //! places keep their size and style, [`crate::Variety::Randomized`] draws them anew for each seed, and adds furniture that
 //! the standard places lack: stairs, sofas, lamps, plants, rugs, windows that shine.
 
-use super::furniture::{Piece, WallPlace, between, material, on_floor, pick, piece, plain};
 use super::light::Lighting;
 use super::material::{Decal, Kind, Material, Surface};
-use super::shape::{Extent, Shape};
-use crate::config::{SceneKind, SynthConfig, Variety};
-use crate::random::{Purpose, stream};
+use super::piece::{Piece, WallPlace, material, on_floor, pick, piece, plain};
+use super::shape::Shape;
+use crate::config::{SynthConfig, Variety};
+use crate::extent::Extent;
+use crate::random::{Purpose, between, stream};
 use nalgebra::Vector3;
 use rand::Rng;
 use rand_chacha::ChaCha8Rng;
 use std::f64::consts::PI;
-
-/// Size of the place that `config` asks for, m.
-pub(crate) fn room_size(config: &SynthConfig) -> Vector3<f64> {
-    let usual = match config.scene {
-        SceneKind::Room => Vector3::new(8.0, 8.0, 4.0),
-        SceneKind::Hall => Vector3::new(20.0, 15.0, 7.0),
-        SceneKind::Corridor => Vector3::new(30.0, 3.0, 3.0),
-    };
-    if config.variety == Variety::Home {
-        let mut rng = stream(config.seed, Purpose::Size);
-        return [(2.6, 6.8), (2.6, 6.0), (2.3, 3.0)].map(|(low, high)| between(&mut rng, low, high)).into();
-    }
-    if config.variety == Variety::Standard {
-        return usual;
-    }
-    let mut rng = stream(config.seed, Purpose::Size);
-    // A corridor's width leaves little to shrink.
-    let across = if config.scene == SceneKind::Corridor { (0.85, 1.5) } else { (0.55, 1.35) };
-    let factors =
-        [between(&mut rng, 0.55, 1.35), between(&mut rng, across.0, across.1), between(&mut rng, 0.65, 1.25)];
-    let size = usual.component_mul(&Vector3::from(factors));
-    Vector3::new(size.x, size.y, size.z.max(2.3))
-}
 
 /// Light of the place that `config` asks for.
 pub(super) fn lighting(config: &SynthConfig) -> Lighting {

@@ -4,6 +4,7 @@
 //! without distortion; a sphere by longitude and height (Lambert's equal-area map), so that equal areas of `(u, v)`
 //! are equal areas of surface everywhere.
 
+use crate::extent::Extent;
 use nalgebra::{Rotation3, Vector3};
 use std::f64::consts::PI;
 
@@ -31,53 +32,6 @@ pub(crate) enum Shape {
     Cylinder { base: Vector3<f64>, frame: [Vector3<f64>; 3], radius: f64, height: f64 },
     /// A ball. One face.
     Ball { center: Vector3<f64>, radius: f64 },
-}
-
-/// An axis-aligned box of space.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Extent {
-    /// Smallest coordinates, m.
-    pub min: Vector3<f64>,
-    /// Largest coordinates, m.
-    pub max: Vector3<f64>,
-}
-
-impl Extent {
-    /// The smallest box around `points`; inverted and infinite without points.
-    pub fn around(points: &[Vector3<f64>]) -> Self {
-        let empty = Self { min: Vector3::repeat(f64::INFINITY), max: Vector3::repeat(f64::NEG_INFINITY) };
-        points.iter().fold(empty, |e, p| Self { min: e.min.inf(p), max: e.max.sup(p) })
-    }
-
-    /// The box around both.
-    pub fn union(&self, other: &Self) -> Self {
-        Self { min: self.min.inf(&other.min), max: self.max.sup(&other.max) }
-    }
-
-    /// The box grown by `margin_m` on every side.
-    pub fn grown(&self, margin_m: f64) -> Self {
-        Self { min: self.min.add_scalar(-margin_m), max: self.max.add_scalar(margin_m) }
-    }
-
-    /// Distance from `point` to the box, 0 inside, m.
-    pub fn distance(&self, point: &Vector3<f64>) -> f64 {
-        (self.min - point).sup(&(point - self.max)).sup(&Vector3::zeros()).norm()
-    }
-
-    /// Whether the two boxes share space.
-    pub fn overlaps(&self, other: &Self) -> bool {
-        (0..3).all(|k| self.min[k] < other.max[k] && other.min[k] < self.max[k])
-    }
-
-    /// Whether `other` lies within this box.
-    pub fn holds(&self, other: &Self) -> bool {
-        (0..3).all(|k| self.min[k] <= other.min[k] && other.max[k] <= self.max[k])
-    }
-
-    /// The middle.
-    pub fn center(&self) -> Vector3<f64> {
-        (self.min + self.max) * 0.5
-    }
 }
 
 /// Rays start this far along (in units of the direction's length, m for unit directions), so that they leave the
