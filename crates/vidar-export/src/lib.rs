@@ -50,7 +50,7 @@ pub mod view;
 pub use colmap::{ColmapFormat, ColmapModel, Observation, read_colmap, read_colmap_bytes, write_colmap};
 pub use depth::{DepthFrame, DepthPngStats, DepthSidecar, read_depth_png, write_depth_png};
 pub use error::ExportError;
-pub use glb::{Glb, read_glb, write_glb_cloud, write_glb_mesh};
+pub use glb::{Glb, read_glb, write_glb_cloud, write_glb_mesh, write_glb_textured};
 pub use origin::{STD_STEP, write_source_png, write_std_png};
 pub use ply::{Ply, read_ply, write_ply_cloud, write_ply_mesh};
 pub use trajectory::{
