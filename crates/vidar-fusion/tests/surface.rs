@@ -108,6 +108,11 @@ fn a_slanted_floor_across_many_blocks_has_no_seams() {
     assert!(error < 0.1 * 0.02, "rms {error}");
 }
 
+/// By the confidence, 1 for .99 and above.
+fn inverse_variance(confidence: f64) -> f64 {
+    (1.0 - confidence.min(0.99).powi(2)).ln() / (1.0 - 0.99f64.powi(2)).ln()
+}
+
 #[test]
 fn confidence_decides_where_disagreeing_views_put_the_surface() {
     let camera = || look_at(Vec3::new(0.0, 0.0, 1.0), Vec3::zeros());
@@ -119,11 +124,11 @@ fn confidence_decides_where_disagreeing_views_put_the_surface() {
             (mesh.positions.iter()).filter(|p| p[0].hypot(p[1]) < 0.2).map(|p| f64::from(p[2])).collect();
         middle.iter().sum::<f64>() / middle.len() as f64
     };
-    // The weighted mean of 0 and 0.03: c / (1 + c) of the way.
-    for confidence in [0.05, 0.25, 1.0] {
-        let expected = 0.03 * f64::from(confidence) / (1.0 + f64::from(confidence));
-        let found = height_with(confidence);
-        assert!((found - expected).abs() < 0.0015, "confidence {confidence}: {found} instead of {expected}");
+    // The weighted mean of 0 and 0.03: w / (1 + w) of the way.
+    for confidence in [0.25, 0.5, 0.9, 1.0] {
+        let weight = inverse_variance(confidence);
+        let (expected, found) = (0.03 * weight / (1.0 + weight), height_with(confidence as f32));
+        assert!((found - expected).abs() < 3e-4, "confidence {confidence}: {found} instead of {expected}");
     }
     assert!(height_with(0.0).abs() < 2e-4, "a view of no confidence moved the surface");
 }
@@ -135,23 +140,27 @@ fn colours_and_confidences_are_the_weighted_means_of_the_views() {
         view(id, pose, confidence, floor(0.0)).with_color(Image::filled(WIDTH, HEIGHT, rgb)).unwrap()
     };
     let views = [painted(0, 1.0, [200, 0, 40]), painted(1, 0.5, [50, 90, 40])];
-    let check = |colors: &[[u8; 3]], confidences: &[f32], positions: &[[f32; 3]]| {
+    let check = |colors: &[[u8; 3]], confidences: &[f32], positions: &[[f32; 3]], weight: f64| {
         assert!(!positions.is_empty() && colors.len() == positions.len());
+        let expected = [200.0 + weight * 50.0, weight * 90.0].map(|sum| (sum / (1.0 + weight)).round() as u8);
         for c in colors {
-            // (1·200 + 0.5·50) / 1.5 = 150 and (0.5·90) / 1.5 = 30.
-            assert!(c[0].abs_diff(150) <= 1 && c[1].abs_diff(30) <= 1 && c[2] == 40, "{c:?}");
+            assert!(
+                c[0].abs_diff(expected[0]) <= 1 && c[1].abs_diff(expected[1]) <= 1 && c[2] == 40,
+                "{c:?}"
+            );
         }
         assert!(confidences.iter().all(|c| (c - 0.75).abs() < 0.005));
     };
     let mesh = fuse(&config(), &views).extract_mesh();
-    check(&mesh.colors, &mesh.confidences, &mesh.positions);
+    // Colours of nodes are weighed by confidence, those of points as their positions are.
+    check(&mesh.colors, &mesh.confidences, &mesh.positions, 0.5);
     let mut points = PointFusion::new(&config()).unwrap();
     for view in &views {
         points.integrate(view).unwrap();
     }
     let cloud = points.finish();
     assert!(cloud.is_consistent());
-    check(&cloud.colors, &cloud.confidences, &cloud.positions);
+    check(&cloud.colors, &cloud.confidences, &cloud.positions, inverse_variance(0.5));
     // Views without colour give no colours, not black.
     assert!(fuse(&config(), &[view(0, pose, 1.0, floor(0.0))]).extract_mesh().colors.is_empty());
 }
