@@ -191,7 +191,7 @@ fn a_smaller_texture_shows_less_and_stays_in_its_bounds() {
 #[test]
 fn seams_between_images_of_other_exposure_are_levelled() {
     // Every other image is brighter by 40.
-    let brighter = |i: usize, _: Vec3| if i % 2 == 0 { [100; 3] } else { [140; 3] };
+    let brighter = |i: usize, _: Vec3| if i.is_multiple_of(2) { [100; 3] } else { [140; 3] };
     let scene = Scene::new(&in_room(8), room, brighter);
     let mesh = scene.textured(8192);
     // The same place in two charts.
