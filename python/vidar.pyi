@@ -403,7 +403,15 @@ class Run:
     def points(self) -> PointCloud: ...
     @property
     def views(self) -> list[View]: ...
-    def export(self, to: str, output: _Path, *, tracks: bool = False, input_size: bool = False) -> list[Path]: ...
+    def export(
+        self,
+        to: str,
+        output: _Path,
+        *,
+        tracks: bool = False,
+        input_size: bool = False,
+        texture_px: int | None = None,
+    ) -> list[Path]: ...
 
 @final
 class View:

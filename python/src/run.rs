@@ -149,9 +149,9 @@ impl Run {
         Ok(views.into_iter().map(|view| View { folder: self.folder.clone(), view }).collect())
     }
 
-    /// Writes it for another program: "colmap", "colmap-text", "nerfstudio", "tum", "kitti", "euroc", "ply" or "glb"; returns the
-    /// files made.
-    #[pyo3(signature = (to, output, *, tracks = false, input_size = false))]
+    /// Writes it for another program: "colmap", "colmap-text", "nerfstudio", "tum", "kitti", "euroc", "ply", "glb", "textured-glb"
+    /// or "mcap"; returns the files made.
+    #[pyo3(signature = (to, output, *, tracks = false, input_size = false, texture_px = None))]
     fn export(
         &self,
         py: Python<'_>,
@@ -159,9 +159,10 @@ impl Run {
         output: PathBuf,
         tracks: bool,
         input_size: bool,
+        texture_px: Option<usize>,
     ) -> PyResult<Vec<PathBuf>> {
         let target = to.parse().map_err(PyValueError::new_err)?;
-        let options = ExportOptions { tracks, input_size };
+        let options = ExportOptions { tracks, input_size, texture_px };
         interruptible(py, None, |_, _| export_run(&self.folder, target, options, &output))
     }
 

@@ -273,6 +273,7 @@ def test_glb_files_are_valid(finished, validator, tmp_path):
     # Points and camera frustums, as the official program of Depth Anything 3 shows a prediction.
     images = sorted((finished / "images").iterdir())[:2]
     call("depth", *images, "--model", "da3-nano", "-o", tmp_path / "depth", "--format", "glb", "--process-res", "112", "-q")
-    for path in (finished / "map/mesh.glb", tmp_path / "plain.glb", tmp_path / "depth/scene.glb"):
+    (textured,) = run.export("textured-glb", tmp_path / "textured")
+    for path in (finished / "map/mesh.glb", tmp_path / "plain.glb", tmp_path / "depth/scene.glb", textured):
         issues = validator(path)
         assert issues["numErrors"] == 0 and issues["numWarnings"] == 0, (path.name, issues["messages"])

@@ -489,15 +489,18 @@ pub struct ExportArgs {
     /// The run folder.
     #[arg(value_hint = ValueHint::DirPath)]
     pub run: PathBuf,
-    /// colmap, colmap-text, nerfstudio, tum, kitti, euroc, ply, glb or mcap.
+    /// colmap, colmap-text, nerfstudio, tum, kitti, euroc, ply, glb, textured-glb or mcap.
     #[arg(long)]
     pub to: String,
     /// COLMAP: with every point the keyframes that see it (projections, at most 200 000 points).
     #[arg(long)]
     pub tracks: bool,
-    /// COLMAP and nerfstudio: images at the recording's size, undistorted again from its files.
+    /// COLMAP, nerfstudio and textured-glb: images at the recording's size, undistorted again from its files.
     #[arg(long)]
     pub input_size: bool,
+    /// textured-glb: most texels along an edge of the texture, 64 to 16384; default 8192.
+    #[arg(long, value_name = "PX")]
+    pub texture_px: Option<usize>,
     /// Output folder; default `RUN/export/<format>`.
     #[arg(short, long, value_hint = ValueHint::DirPath)]
     pub output: Option<PathBuf>,

@@ -88,7 +88,7 @@ pub use origin::{DepthOrigin, DepthSource};
 pub use printable::{printable, printable_json, printable_lines};
 pub use rig::{ImuNoise, Rig, RigCamera};
 pub use sensor::{AngularRate, Frame, ImuSample, SensorEvent, SpecificForce, TimedVector, merge_imu};
-pub use surface::{PointCloud, TriangleMesh};
+pub use surface::{PointCloud, TexturedMesh, TriangleMesh};
 pub use time::{Duration, TimeError, Timestamp};
 pub use trajectory::{BodyFrame, StampedPose, Trajectory, TrajectoryError};
 pub use umeyama::{UmeyamaError, umeyama_se3, umeyama_sim3, umeyama_sim3_weighted};

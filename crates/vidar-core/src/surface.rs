@@ -1,5 +1,7 @@
 //! Point clouds and triangle meshes, in metres, in the world frame: outputs of fusion, inputs of export and evaluation.
 
+use crate::Image;
+
 /// Points with optional attributes; an attribute list is either empty or as long as `positions`.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct PointCloud {
@@ -51,6 +53,19 @@ pub struct TriangleMesh {
     pub confidences: Vec<f32>,
     /// Vertex indices of each triangle.
     pub triangles: Vec<[u32; 3]>,
+}
+
+/// A mesh whose colours are those of a texture.
+#[derive(Clone, Debug, PartialEq)]
+pub struct TexturedMesh {
+    /// The triangles that the texture shows. Vertices at its seams are repeated.
+    pub textured: TriangleMesh,
+    /// Where each of their vertices lies in the texture, 0…1 of its width and height; (0, 0) is its top-left corner.
+    pub uvs: Vec<[f32; 2]>,
+    /// The texture, sRGB.
+    pub texture: Image<[u8; 3]>,
+    /// The triangles that no image shows, with the colours of their vertices.
+    pub rest: TriangleMesh,
 }
 
 impl TriangleMesh {

@@ -9,7 +9,7 @@
 //! | [TUM, EuRoC csv](trajectory) | `world_from_body`, the body named in a comment; m | time to 1 ns, pose to 1e-9 | – |
 //! | [KITTI](trajectory) | same, body and times in a second file; m | pose to 13 digits | – |
 //! | [PLY](ply) | world z up; m | every value | – |
-//! | [GLB](glb) | vertices in the world; a root node rotates them to y up | every value | – |
+//! | [GLB](glb) | vertices in the world; a root node rotates them to y up | every value; textures as JPEG | a texture is not read back |
 //! | [depth PNG](depth) | z-depth, steps per metre in a sidecar | depth to half a step | depths out of range, counted |
 //! | [COLMAP](colmap) | `camera_from_world`; pixel corner is (0, 0) | views, points, colours | time, normals, confidence |
 //! | [transforms.json](transforms) | `world_from_camera`, OpenGL camera; pixel corner is (0, 0) | views, time | – |
@@ -50,7 +50,7 @@ pub mod view;
 pub use colmap::{ColmapFormat, ColmapModel, Observation, read_colmap, read_colmap_bytes, write_colmap};
 pub use depth::{DepthFrame, DepthPngStats, DepthSidecar, read_depth_png, write_depth_png};
 pub use error::ExportError;
-pub use glb::{Glb, read_glb, write_glb_cloud, write_glb_mesh};
+pub use glb::{Glb, read_glb, write_glb_cloud, write_glb_mesh, write_glb_textured};
 pub use origin::{STD_STEP, write_source_png, write_std_png};
 pub use ply::{Ply, read_ply, write_ply_cloud, write_ply_mesh};
 pub use trajectory::{

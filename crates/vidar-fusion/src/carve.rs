@@ -1,13 +1,14 @@
-//! Free space: blocks that lie entirely in front of the surface of a view.
+//! Free space: cells (eighths of blocks) that lie entirely in front of the surface of a view.
 //!
-//! Space carving in the sense of Curless & Levoy (1996, section 4), at the resolution of blocks: a block in front
-//! of the surface of every pixel it covers, by more than the truncation, receives the free-space weight
-//! `c · min(1, (1 m / z)²)`; at extraction, the weight is an observation of distance +1 for all nodes of the block.
+//! Space carving in the sense of Curless & Levoy (1996, section 4), at the resolution of cells: a cell in front
+//! of the surface of every pixel it covers receives the free-space weight `c · min(1, (1 m / z)²)`; at extraction, the
+//! weight is an observation of distance +1 for all nodes of the cell.
 //! A floater is removed once its free-space weight exceeds its own. Free-space weights are stored beside the blocks,
-//! because the result must not depend on whether a block exists yet. Within the blocks that a view touches, carving is per voxel.
+//! because the result must not depend on whether a block exists yet. Blocks that a view touches are carved node by node and are no
+//! part of this, so nothing is counted twice and no margin is needed before the surface.
 
 use crate::FusionConfig;
-use crate::grid::{BlockKey, CameraFromWorld, EDGE};
+use crate::grid::{BlockKey, CELLS, CameraFromWorld, EDGE};
 use crate::sample::{CONFIDENCE_ONE, SampledView, Tile, WEIGHT_ONE, round_to_i32};
 use nalgebra::Vector3;
 use rayon::prelude::*;
@@ -18,8 +19,8 @@ const MAX_EXAMINED: f64 = (1u32 << 19) as f64;
 /// The tiles in which a block is looked up are so large that it covers about this many along each axis.
 const TILES_ACROSS: usize = 4;
 
-/// A free block, with its weight in units of [`WEIGHT_ONE`].
-pub(crate) type FreeBlock = (BlockKey, u32);
+/// A block with free cells, and the weight of each cell in units of [`WEIGHT_ONE`], 0 where it is not free.
+pub(crate) type FreeBlock = (BlockKey, [u32; CELLS]);
 
 /// The free space of a view. It depends on the view and the configuration only.
 #[derive(Default)]
@@ -30,8 +31,13 @@ pub(crate) struct FreeSpace {
     pub shortened: bool,
 }
 
-/// Finds the blocks that are free in `view`.
-pub(crate) fn free_space(view: &AlignedView, sampled: &SampledView, config: &FusionConfig) -> FreeSpace {
+/// Finds the cells that are free in `view`, outside of the blocks that it touches (sorted).
+pub(crate) fn free_space(
+    view: &AlignedView,
+    sampled: &SampledView,
+    touched: &[BlockKey],
+    config: &FusionConfig,
+) -> FreeSpace {
     let block_m = config.voxel_size_m * EDGE as f64;
     let Some(frustum) = frustum_blocks(view, sampled, config, block_m) else { return FreeSpace::default() };
     let Frustum { low, high, range, shortened } = frustum;
@@ -42,8 +48,8 @@ pub(crate) fn free_space(view: &AlignedView, sampled: &SampledView, config: &Fus
         size: [sampled.width as f32, sampled.height as f32],
         k: [k.fx as f32, k.fy as f32, k.cx as f32, k.cy as f32],
         radius: (block_m * 0.5 * 3f64.sqrt()) as f32,
-        truncation: config.truncation_m() as f32,
         range: range as f32,
+        cells: cell_centres(view, block_m),
     };
     let camera_from_world = CameraFromWorld::new(view);
     let step = camera_from_world.rotation.column(0) * block_m;
@@ -56,8 +62,9 @@ pub(crate) fn free_space(view: &AlignedView, sampled: &SampledView, config: &Fus
                 let first = camera_from_world.apply(&first);
                 for x in low[0]..=high[0] {
                     let centre = first + step * f64::from(x - low[0]);
-                    if let Some(weight) = test.weight(centre.x as f32, centre.y as f32, centre.z as f32) {
-                        free.push(([x, y, z], weight));
+                    let weights = test.weights(centre.map(|v| v as f32).into());
+                    if weights != [0; CELLS] && touched.binary_search(&[x, y, z]).is_err() {
+                        free.push(([x, y, z], weights));
                     }
                 }
             }
@@ -88,7 +95,7 @@ fn frustum_blocks(
     }
     // Beyond the view's farthest depth no block is free.
     let farthest = sampled.tiles.iter().map(|t| t.farthest).fold(0.0, f32::max);
-    let mut range = config.carve_range_m.min(f64::from(farthest) - config.truncation_m());
+    let mut range = config.carve_range_m.min(f64::from(farthest));
     if !(range > 0.0) {
         return None;
     }
@@ -117,41 +124,81 @@ fn frustum_blocks(
     Some(Frustum { low: key(origin + low), high: key(origin + high), range, shortened })
 }
 
+/// The centres of a block's cells in the camera, seen from the block's centre, metres.
+fn cell_centres(view: &AlignedView, block_m: f64) -> [[f32; 3]; CELLS] {
+    let rotation = CameraFromWorld::new(view).rotation;
+    std::array::from_fn(|cell| {
+        let offset = [cell & 1, cell >> 1 & 1, cell >> 2 & 1].map(|o| (o as f64 - 0.5) * 0.5 * block_m);
+        (rotation * Vector3::from(offset)).map(|v| v as f32).into()
+    })
+}
+
 struct FreeSpaceTest<'a> {
     pyramid: &'a Pyramid,
     size: [f32; 2],
     k: [f32; 4],
+    /// Of the sphere around a block.
     radius: f32,
-    truncation: f32,
     range: f32,
+    cells: [[f32; 3]; CELLS],
+}
+
+/// What a view says of a sphere.
+enum Sight {
+    /// Nothing, or that it is behind the surface: so it is for everything within.
+    Hidden,
+    /// In front of the surface, with the weight of that.
+    Free(u32),
+    /// In front of it in parts.
+    Mixed,
 }
 
 impl FreeSpaceTest<'_> {
-    /// The free-space weight of a block whose centre lies at (x, y, z) in the camera.
+    /// The free-space weights of the cells of a block whose centre lies there in the camera.
     #[inline(always)]
-    fn weight(&self, x: f32, y: f32, z: f32) -> Option<u32> {
-        let front = z - self.radius;
+    fn weights(&self, centre: [f32; 3]) -> [u32; CELLS] {
+        match self.sight(centre, self.radius) {
+            Sight::Hidden => [0; CELLS],
+            Sight::Free(weight) => [weight; CELLS],
+            Sight::Mixed => self.cells.map(|cell| {
+                let centre = [0, 1, 2].map(|a| centre[a] + cell[a]);
+                if let Sight::Free(weight) = self.sight(centre, 0.5 * self.radius) { weight } else { 0 }
+            }),
+        }
+    }
+
+    #[inline(always)]
+    fn sight(&self, [x, y, z]: [f32; 3], radius: f32) -> Sight {
+        let front = z - radius;
+        if z + radius <= 1e-3 || front > self.range {
+            return Sight::Hidden;
+        }
         if front <= 1e-3 || z > self.range {
-            return None;
+            return Sight::Mixed;
         }
         let [fx, fy, cx, cy] = self.k;
         let (rx, ry) = (x / z, y / z);
-        // |Δ(X/Z)| ≤ (r + |X/Z| r) / (Z − r) bounds the projection of the block's bounding sphere.
-        let (hu, hv) =
-            (fx * self.radius * (1.0 + rx.abs()) / front, fy * self.radius * (1.0 + ry.abs()) / front);
+        // |Δ(X/Z)| ≤ (r + |X/Z| r) / (Z − r) bounds the projection of the sphere.
+        let (hu, hv) = (fx * radius * (1.0 + rx.abs()) / front, fy * radius * (1.0 + ry.abs()) / front);
         let (u, v) = (fx * rx + cx, fy * ry + cy);
         let (u0, u1, v0, v1) = (u - hu, u + hu, v - hv, v + hv);
-        if u0 < 0.0 || v0 < 0.0 || u1 > self.size[0] - 1.0 || v1 > self.size[1] - 1.0 {
-            return None;
+        let (right, bottom) = (self.size[0] - 1.0, self.size[1] - 1.0);
+        if u1 < 0.0 || v1 < 0.0 || u0 > right || v0 > bottom {
+            return Sight::Hidden;
         }
-        let tile = self.pyramid.over([u0 as usize, v0 as usize], [u1 as usize, v1 as usize]);
+        let pixel = |u: f32, v: f32| [u.clamp(0.0, right) as usize, v.clamp(0.0, bottom) as usize];
+        let tile = self.pyramid.over(pixel(u0, v0), pixel(u1, v1));
+        if tile.farthest <= front {
+            return Sight::Hidden;
+        }
+        let is_inside = u0 >= 0.0 && v0 >= 0.0 && u1 <= right && v1 <= bottom;
         // Pixels without depth may hide a surface: half of the pixels must have a usable depth.
-        if tile.nearest <= z + self.radius + self.truncation || 2 * tile.usable < tile.pixels {
-            return None;
+        if !is_inside || tile.nearest <= z + radius || 2 * tile.usable < tile.pixels {
+            return Sight::Mixed;
         }
         let confidence = tile.confidence as f32 / (tile.usable as f32 * CONFIDENCE_ONE);
         let near = (1.0 / (z * z)).min(1.0);
-        Some(round_to_i32(confidence * near * WEIGHT_ONE).max(1) as u32)
+        Sight::Free(round_to_i32(confidence * near * WEIGHT_ONE).max(1) as u32)
     }
 }
 

@@ -1,7 +1,7 @@
 //! Coverage: what was observed, by how many views and with which confidence.
 
 use crate::field::Field;
-use crate::grid::NODES;
+use crate::grid::{CELL, NODES, cell_of};
 use crate::volume::TsdfVolume;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
@@ -74,13 +74,18 @@ impl TsdfVolume {
         }
     }
 
-    /// Nodes with an observation, with all nodes of free blocks.
+    /// Nodes with an observation, with all nodes of free cells.
     fn observed_nodes(&self) -> u64 {
         let within_blocks: usize = (self.keys.par_iter().zip(&self.blocks))
-            .filter(|(key, _)| !self.free.contains_key(*key))
-            .map(|(_, block)| block.rows.iter().flat_map(|row| row.weight).filter(|&w| w > 0).count())
+            .map(|(key, block)| {
+                let free = self.free.get(key).copied().unwrap_or_default();
+                let weights = block.rows.iter().flat_map(|row| row.weight).enumerate();
+                weights.filter(|&(node, w)| w > 0 && free[cell_of(node)] == 0).count()
+            })
             .sum();
-        (within_blocks + self.free.len() * NODES) as u64
+        let free_cells: usize =
+            self.free.values().map(|cells| cells.iter().filter(|w| **w > 0).count()).sum();
+        (within_blocks + free_cells * CELL.pow(3)) as u64
     }
 }
 

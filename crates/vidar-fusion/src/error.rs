@@ -49,6 +49,32 @@ pub enum FusionError {
         /// Smallest voxel edge that this view allows, metres.
         smallest_m: f64,
     },
+    /// The texture would be larger or smaller than is made.
+    #[error("a texture must have {min} to {max} texels along its longer edge, found {found}")]
+    BadTextureSize {
+        /// Smallest value allowed.
+        min: usize,
+        /// Largest value allowed.
+        max: usize,
+        /// The value.
+        found: usize,
+    },
+    /// A mesh whose lists do not fit each other.
+    #[error("a mesh has triangles or attributes that do not fit its {vertices} vertices")]
+    BadMesh {
+        /// Vertices of the mesh.
+        vertices: usize,
+    },
+    /// An image that is not that of its camera.
+    #[error("view {view}: the image has {}x{} pixels, its camera {}x{}", found.0, found.1, expected.0, expected.1)]
+    ImageSize {
+        /// Which of the views, counted from 0.
+        view: usize,
+        /// Width and height of the image.
+        found: (usize, usize),
+        /// Width and height of its camera.
+        expected: (usize, usize),
+    },
     /// The accumulators hold no more views without overflow.
     #[error("frame {frame}: the volume already holds {limit} views, the limit of its sums")]
     TooManyViews {

@@ -1,7 +1,7 @@
 //! The distance field from which the surface is extracted: one value per node, blocks in the order of their keys.
 
 use crate::block::Block;
-use crate::grid::{BlockKey, EDGE, NODES};
+use crate::grid::{BlockKey, EDGE, NODES, cell_of};
 use crate::volume::TsdfVolume;
 use rayon::prelude::*;
 use rustc_hash::FxHashMap;
@@ -32,10 +32,10 @@ impl<'a> Field<'a> {
             .zip(&blocks)
             .with_min_len(32)
             .map(|(key, block)| {
-                let free = volume.free.get(key).copied().unwrap_or(0);
+                let free = volume.free.get(key).copied().unwrap_or_default();
                 let mut values = [f32::NAN; NODES];
                 for (node, value) in values.iter_mut().enumerate() {
-                    *value = block.distance(node, free, min_observations).unwrap_or(f32::NAN);
+                    *value = block.distance(node, free[cell_of(node)], min_observations).unwrap_or(f32::NAN);
                 }
                 let signs = [values.iter().any(|&v| v > 0.0), values.iter().any(|&v| v < 0.0)];
                 (values, signs)

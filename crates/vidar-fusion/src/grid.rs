@@ -8,6 +8,11 @@ use vidar_core::AlignedView;
 pub(crate) const EDGE: usize = 8;
 /// Nodes of a block.
 pub(crate) const NODES: usize = EDGE * EDGE * EDGE;
+/// Nodes along the edge of a cell, the unit of free space: half a block, so that one fits between a surface and what floats
+/// before it.
+pub(crate) const CELL: usize = 4;
+/// Cells of a block, two along each axis, x fastest.
+pub(crate) const CELLS: usize = 8;
 /// Most views a volume takes: 16-bit counts and 32-bit colour sums (255 · 255 · 65535 < 2³²) cannot overflow then.
 pub(crate) const MAX_VIEWS: u32 = 65_535;
 /// Reach of the lattice in voxels: single precision still resolves eighths of a voxel there.
@@ -22,6 +27,12 @@ pub(crate) type BlockKey = [i32; 3];
 pub(crate) fn node_of(key: BlockKey, local: usize) -> [i32; 3] {
     let offset = [local % EDGE, local / EDGE % EDGE, local / (EDGE * EDGE)];
     [0, 1, 2].map(|a| key[a] * EDGE as i32 + offset[a] as i32)
+}
+
+/// The cell of a block that node `local` lies in.
+pub(crate) fn cell_of(local: usize) -> usize {
+    let [x, y, z] = [local % EDGE, local / EDGE % EDGE, local / (EDGE * EDGE)].map(|i| i / CELL);
+    (z * 2 + y) * 2 + x
 }
 
 /// Rejects views that the lattice cannot hold: too far out, or with pixels much coarser than the voxels.

@@ -32,7 +32,8 @@
 //! Integration of a view: [`sample`] weighs its pixels, [`allocate`] finds the blocks it touches, [`update`] adds it to
 //! the sums of each [`block`], [`carve`] adds free space. Extraction: [`field`] reads distances, [`cubes`] has the
 //! triangles, [`extract`] makes the mesh, [`components`] removes small components, [`coverage`] measures what was
-//! observed, [`double_wall`] detects double walls, [`render`] shows the surface to a camera.
+//! observed, [`double_wall`] detects double walls, [`render`] shows the surface to a camera, [`texture`] gives it the pixels
+//! of its images.
 //!
 //! A map whose poses still change is fused in [`SubVolumes`]: one volume per chunk, moved when the pose graph changes.
 
@@ -54,6 +55,7 @@ mod render;
 mod sample;
 mod simd;
 mod sub_volumes;
+mod texture;
 mod update;
 #[cfg(target_arch = "x86_64")]
 mod update_avx2;
@@ -66,4 +68,5 @@ pub use error::FusionError;
 pub use points::PointFusion;
 pub use render::{RenderedDepth, SurfaceRenderer};
 pub use sub_volumes::{RevisedView, Revision, SubVolumeConfig, SubVolumeReport, SubVolumes};
+pub use texture::{TextureCamera, TextureConfig, TextureImage, TextureReport, texture_mesh};
 pub use volume::{IntegrationStats, TsdfVolume};

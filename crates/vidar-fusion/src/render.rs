@@ -10,7 +10,7 @@ use rayon::prelude::*;
 use vidar_core::{Image, LieGroup, Pinhole, Se3, TriangleMesh};
 
 /// Triangles of a run. Smaller runs fit the view more tightly, larger ones need fewer tests.
-const RUN: usize = 128;
+pub(crate) const RUN: usize = 128;
 /// Nearest distance that is seen, metres: closer triangles would cover the image by their rounding errors.
 const NEAR_M: f32 = 0.05;
 /// A pixel centre this far outside of an edge, as a share of the triangle, still belongs to it: neighbours share their
@@ -35,7 +35,7 @@ pub struct SurfaceRenderer<'m> {
 }
 
 /// A vertex in the image: column, row, inverse depth.
-type Projected = [f32; 3];
+pub(crate) type Projected = [f32; 3];
 
 impl<'m> SurfaceRenderer<'m> {
     /// A renderer of `mesh`, whose triangles are counter-clockwise as seen from their observed side.
@@ -50,18 +50,7 @@ impl<'m> SurfaceRenderer<'m> {
     /// lies there is unknown. The same bits for any number of threads.
     pub fn render(&self, world_from_camera: &Se3, camera: &Pinhole) -> RenderedDepth {
         let (width, height) = (camera.width, camera.height);
-        let eye = Eye::new(world_from_camera, camera);
-        let mut raster = Raster {
-            width,
-            height,
-            inverse_depth: vec![0.0; width * height],
-            confidence: vec![0.0; width * height],
-        };
-        for (run, sphere) in self.mesh.triangles.chunks(RUN).zip(&self.spheres) {
-            if eye.may_see(sphere) {
-                self.draw(run, &eye, &mut raster);
-            }
-        }
+        let raster = self.raster(&Eye::new(world_from_camera, camera), camera);
         let depth = raster.inverse_depth.iter().zip(&raster.confidence);
         let depth = depth.map(|(r, c)| if *r > 0.0 && *c > 0.0 { 1.0 / r } else { f32::NAN }).collect();
         let confidence = raster.confidence.iter().map(|c| c.max(0.0)).collect();
@@ -70,6 +59,35 @@ impl<'m> SurfaceRenderer<'m> {
             depth: Image::from_vec(width, height, depth).unwrap_or_else(|_| empty()),
             confidence: Image::from_vec(width, height, confidence).unwrap_or_else(|_| empty()),
         }
+    }
+
+    /// z-depth of the nearest surface at the pixels of a camera, metres, from whichever side it is seen; infinite where there is none.
+    pub(crate) fn nearest(&self, world_from_camera: &Se3, camera: &Pinhole) -> (Image<f32>, Eye) {
+        let eye = Eye::new(world_from_camera, camera);
+        let depth = self.raster(&eye, camera).inverse_depth.iter().map(|r| 1.0 / r).collect();
+        let empty = |_| Image::filled(camera.width, camera.height, f32::INFINITY);
+        (Image::from_vec(camera.width, camera.height, depth).unwrap_or_else(empty), eye)
+    }
+
+    /// The sphere around each run of [`RUN`] triangles.
+    pub(crate) fn spheres(&self) -> &[(Vector3<f32>, f32)] {
+        &self.spheres
+    }
+
+    fn raster(&self, eye: &Eye, camera: &Pinhole) -> Raster {
+        let (width, height) = (camera.width, camera.height);
+        let mut raster = Raster {
+            width,
+            height,
+            inverse_depth: vec![0.0; width * height],
+            confidence: vec![0.0; width * height],
+        };
+        for (run, sphere) in self.mesh.triangles.chunks(RUN).zip(&self.spheres) {
+            if eye.may_see(sphere) {
+                self.draw(run, eye, &mut raster);
+            }
+        }
+        raster
     }
 
     fn draw(&self, run: &[[u32; 3]], eye: &Eye, raster: &mut Raster) {
@@ -107,7 +125,7 @@ fn sphere(mesh: &TriangleMesh, run: &[[u32; 3]]) -> (Vector3<f32>, f32) {
 }
 
 /// A camera in single precision; its place is subtracted in double precision.
-struct Eye {
+pub(crate) struct Eye {
     center: Vector3<f64>,
     camera_from_world: Matrix3<f32>,
     k: [f32; 4],
@@ -116,7 +134,7 @@ struct Eye {
 }
 
 impl Eye {
-    fn new(world_from_camera: &Se3, camera: &Pinhole) -> Self {
+    pub fn new(world_from_camera: &Se3, camera: &Pinhole) -> Self {
         let camera_from_world = world_from_camera.inverse();
         let k = [camera.fx, camera.fy, camera.cx, camera.cy];
         let (right, bottom) = (camera.width as f64 - 0.5, camera.height as f64 - 0.5);
@@ -143,12 +161,12 @@ impl Eye {
         self.camera_from_world * from_center
     }
 
-    fn may_see(&self, (center, radius): &(Vector3<f32>, f32)) -> bool {
+    pub fn may_see(&self, (center, radius): &(Vector3<f32>, f32)) -> bool {
         let center = self.to_camera(&(*center).into());
         center.z > NEAR_M - radius && self.sides.iter().all(|side| side.dot(&center) > -radius)
     }
 
-    fn project(&self, p: &[f32; 3]) -> Option<Projected> {
+    pub fn project(&self, p: &[f32; 3]) -> Option<Projected> {
         let p = self.to_camera(p);
         // Also false for NaN.
         if !(p.z > NEAR_M) {

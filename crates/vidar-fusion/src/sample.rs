@@ -1,22 +1,28 @@
 //! Depth, weight and confidence of each pixel of a view.
 //!
-//! The weight of a pixel with confidence c, incidence angle θ between its ray and its surface normal and depth z is
+//! A confidence c is the probability of an error within a share t of the depth, the same t for all pixels. Where errors are normal with the
+//! standard deviation σ of ln(depth), `c = erf(t / (σ √2))`, and with `erf(x)² ≈ 1 − exp(−4 x² / π)` (within 1 %)
+//! `1/σ² ∝ −ln(1 − c²)`. The weight of a pixel with incidence angle θ between its ray and its surface normal and depth z is
 //!
-//! `w = c · cos θ · min(1, (1 m / z)²)`,
+//! `w = ln(1 − c²) / ln(1 − c₁²) · cos θ · min(1, (1 m / z)²)`, at most 1 in its first factor,
 //!
-//! the angle as in Curless & Levoy (SIGGRAPH 1996, section 3.1: uncertainty grows as the surface turns away), the
+//! so it is the inverse of the depth's variance in metres, [`SURE`] being the c₁ beyond which σ is no longer told apart; the
+//! angle as in Curless & Levoy (SIGGRAPH 1996, section 3.1: uncertainty grows as the surface turns away), the
 //! depth as in Nießner et al. (TOG 2013, section 4: weight falls with depth, since depth noise grows with it).
 //! It is stored as an integer, [`WEIGHT_ONE`] for w = 1, so that sums do not depend on their order.
 
 use crate::FusionConfig;
 use crate::simd::dispatch;
 use rayon::prelude::*;
+use std::sync::LazyLock;
 use vidar_core::{AlignedView, Pinhole};
 
 /// The integer that stands for a weight of 1 (12 bits).
 pub(crate) const WEIGHT_ONE: f32 = 4095.0;
 /// The integer that stands for a confidence of 1.
 pub(crate) const CONFIDENCE_ONE: f32 = 255.0;
+/// The confidence from which on all pixels are equally sure: a standard deviation of 0.39 tolerances.
+const SURE: f64 = 0.99;
 /// Pixels along the edge of a tile.
 pub(crate) const TILE: usize = 8;
 /// Depth steps between neighbouring pixels above this share of the depth are treated as the edge of an object.
@@ -165,6 +171,14 @@ pub(crate) fn camera_normal(k: &[f32; 4], du: f32, dv: f32, z: f32, gx: f32, gy:
     [k[0] * gx, k[1] * gy, -(z + du * gx + dv * gy)]
 }
 
+/// The inverse variance of a pixel by its confidence in steps of 1 / [`CONFIDENCE_ONE`], 1 for [`SURE`] ones.
+static INVERSE_VARIANCE: LazyLock<[f32; 256]> = LazyLock::new(|| {
+    std::array::from_fn(|step| {
+        let confidence = (step as f64 / f64::from(CONFIDENCE_ONE)).min(SURE);
+        ((1.0 - confidence * confidence).ln() / (1.0 - SURE * SURE).ln()) as f32
+    })
+});
+
 struct PixelWeighting<'a> {
     width: usize,
     height: usize,
@@ -178,6 +192,7 @@ struct PixelWeighting<'a> {
     min_confidence: f32,
     max_depth: f32,
     min_cos: f32,
+    inverse_variance: &'static [f32; 256],
 }
 
 impl<'a> PixelWeighting<'a> {
@@ -195,6 +210,7 @@ impl<'a> PixelWeighting<'a> {
             // A confidence of 0 is unusable, whatever the threshold.
             min_confidence: (config.min_confidence as f32).max(f32::MIN_POSITIVE),
             max_depth: config.max_depth_m as f32,
+            inverse_variance: &INVERSE_VARIANCE,
             min_cos: (config.max_incidence_deg.to_radians().cos() as f32).max(0.0),
         }
     }
@@ -256,8 +272,10 @@ impl<'a> PixelWeighting<'a> {
         let usable = (z <= self.max_depth) & (confidence >= self.min_confidence) & !steep;
         // cos θ · min(1, 1 / z²) with a single division: they and the root dominate the time of this kernel.
         let far = if z > 1.0 { z * z } else { 1.0 };
-        let weight = round_to_i32(confidence * z / (norms * far) * WEIGHT_ONE).max(1) as u32;
+        // Below 0, above 1 and NaN are not in a `Confidence`.
         let confidence = round_to_i32(confidence * CONFIDENCE_ONE).max(1) as u32;
+        let sure = self.inverse_variance[(confidence & 255) as usize];
+        let weight = round_to_i32(sure * z / (norms * far) * WEIGHT_ONE).max(1) as u32;
         let packed = weight | (confidence << 16);
         // Every field of an unusable sample is a number, so that kernels may compute with it and weigh it 0.
         Sample { depth: if usable { z } else { 0.0 }, weight_and_confidence: if usable { packed } else { 0 } }

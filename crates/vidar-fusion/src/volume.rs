@@ -3,7 +3,7 @@
 use crate::allocate::touched_blocks;
 use crate::block::Block;
 use crate::carve::{FreeBlock, free_space};
-use crate::grid::{BlockKey, CameraFromWorld, EDGE, MAX_VIEWS, check_view, table_bytes};
+use crate::grid::{BlockKey, CELLS, CameraFromWorld, EDGE, MAX_VIEWS, check_view, table_bytes};
 use crate::sample::SampledView;
 use crate::update::BlockUpdate;
 use crate::{FusionConfig, FusionError};
@@ -24,7 +24,7 @@ pub struct IntegrationStats {
     pub blocks_total: u64,
     /// Blocks (or voxels) that the view needed and the memory budget rejected.
     pub dropped_by_budget: u64,
-    /// Blocks that are entirely free in the view.
+    /// Blocks of which at least an eighth is free in the view.
     pub blocks_carved: u64,
 }
 
@@ -40,8 +40,8 @@ pub struct TsdfVolume {
     pub(crate) keys: Vec<BlockKey>,
     // Boxed, so that a growing list moves pointers and not the blocks.
     pub(crate) blocks: Vec<Box<Block>>,
-    /// Free-space weights of blocks.
-    pub(crate) free: FxHashMap<BlockKey, u32>,
+    /// Free-space weights of the cells of blocks.
+    pub(crate) free: FxHashMap<BlockKey, [u32; CELLS]>,
     colored_blocks: u64,
     /// Memory of the last view's samples, for the next one.
     scratch: SampledView,
@@ -89,7 +89,7 @@ impl TsdfVolume {
         let mut sampled = std::mem::take(&mut self.scratch);
         sampled.fill(view, &self.config);
         let needed = touched_blocks(view, &sampled, &self.config);
-        let free = free_space(view, &sampled, &self.config);
+        let free = free_space(view, &sampled, &needed, &self.config);
         let (touched, dropped_blocks) = self.allocate(&needed, view.color().is_some());
         self.update(view, &sampled, &touched);
         let dropped_free = self.add_free(&free.blocks);
@@ -171,13 +171,13 @@ impl TsdfVolume {
     /// Adds the weights of free blocks; returns how many the budget rejected.
     fn add_free(&mut self, blocks: &[FreeBlock]) -> u64 {
         let mut dropped = 0;
-        for &(key, weight) in blocks {
+        for &(key, weights) in blocks {
             if let Some(sum) = self.free.get_mut(&key) {
-                *sum += weight;
+                (0..CELLS).for_each(|cell| sum[cell] += weights[cell]);
             } else if self.bytes_with(self.blocks.len(), self.free.len() + 1, 0)
                 <= self.config.memory_budget_bytes
             {
-                self.free.insert(key, weight);
+                self.free.insert(key, weights);
             } else {
                 dropped += 1;
             }
@@ -218,7 +218,7 @@ impl TsdfVolume {
 
     /// The free blocks with their weights, in the order of their keys.
     pub(crate) fn free_blocks(&self) -> Vec<FreeBlock> {
-        let mut blocks: Vec<FreeBlock> = self.free.iter().map(|(key, weight)| (*key, *weight)).collect();
+        let mut blocks: Vec<FreeBlock> = self.free.iter().map(|(key, weights)| (*key, *weights)).collect();
         blocks.sort_unstable();
         blocks
     }
@@ -289,13 +289,13 @@ impl TsdfVolume {
     /// Bytes with `blocks` block entries and `free` free blocks in the tables, and `more` bytes of block.
     fn bytes_with(&self, blocks: usize, free: usize, more: u64) -> u64 {
         let lists = blocks.next_power_of_two() * (size_of::<BlockKey>() + size_of::<usize>());
-        let entry = size_of::<(BlockKey, u32)>();
+        let (entry, free_entry) = (size_of::<(BlockKey, u32)>(), size_of::<FreeBlock>());
         self.blocks.len() as u64 * Block::BYTES
             + self.colored_blocks * Block::COLOR_BYTES
             + more
             + lists as u64
             + table_bytes(blocks, entry)
-            + table_bytes(free, entry)
+            + table_bytes(free, free_entry)
     }
 }
 

@@ -108,6 +108,11 @@ fn a_slanted_floor_across_many_blocks_has_no_seams() {
     assert!(error < 0.1 * 0.02, "rms {error}");
 }
 
+/// By the confidence, 1 for .99 and above.
+fn inverse_variance(confidence: f64) -> f64 {
+    (1.0 - confidence.min(0.99).powi(2)).ln() / (1.0 - 0.99f64.powi(2)).ln()
+}
+
 #[test]
 fn confidence_decides_where_disagreeing_views_put_the_surface() {
     let camera = || look_at(Vec3::new(0.0, 0.0, 1.0), Vec3::zeros());
@@ -119,11 +124,11 @@ fn confidence_decides_where_disagreeing_views_put_the_surface() {
             (mesh.positions.iter()).filter(|p| p[0].hypot(p[1]) < 0.2).map(|p| f64::from(p[2])).collect();
         middle.iter().sum::<f64>() / middle.len() as f64
     };
-    // The weighted mean of 0 and 0.03: c / (1 + c) of the way.
-    for confidence in [0.05, 0.25, 1.0] {
-        let expected = 0.03 * f64::from(confidence) / (1.0 + f64::from(confidence));
-        let found = height_with(confidence);
-        assert!((found - expected).abs() < 0.0015, "confidence {confidence}: {found} instead of {expected}");
+    // The weighted mean of 0 and 0.03: w / (1 + w) of the way.
+    for confidence in [0.25, 0.5, 0.9, 1.0] {
+        let weight = inverse_variance(confidence);
+        let (expected, found) = (0.03 * weight / (1.0 + weight), height_with(confidence as f32));
+        assert!((found - expected).abs() < 1e-3, "confidence {confidence}: {found} instead of {expected}");
     }
     assert!(height_with(0.0).abs() < 2e-4, "a view of no confidence moved the surface");
 }
@@ -135,23 +140,27 @@ fn colours_and_confidences_are_the_weighted_means_of_the_views() {
         view(id, pose, confidence, floor(0.0)).with_color(Image::filled(WIDTH, HEIGHT, rgb)).unwrap()
     };
     let views = [painted(0, 1.0, [200, 0, 40]), painted(1, 0.5, [50, 90, 40])];
-    let check = |colors: &[[u8; 3]], confidences: &[f32], positions: &[[f32; 3]]| {
+    let check = |colors: &[[u8; 3]], confidences: &[f32], positions: &[[f32; 3]], weight: f64| {
         assert!(!positions.is_empty() && colors.len() == positions.len());
+        let expected = [200.0 + weight * 50.0, weight * 90.0].map(|sum| (sum / (1.0 + weight)).round() as u8);
         for c in colors {
-            // (1·200 + 0.5·50) / 1.5 = 150 and (0.5·90) / 1.5 = 30.
-            assert!(c[0].abs_diff(150) <= 1 && c[1].abs_diff(30) <= 1 && c[2] == 40, "{c:?}");
+            assert!(
+                c[0].abs_diff(expected[0]) <= 1 && c[1].abs_diff(expected[1]) <= 1 && c[2] == 40,
+                "{c:?}"
+            );
         }
         assert!(confidences.iter().all(|c| (c - 0.75).abs() < 0.005));
     };
     let mesh = fuse(&config(), &views).extract_mesh();
-    check(&mesh.colors, &mesh.confidences, &mesh.positions);
+    // Colours of nodes are weighed by confidence, those of points as their positions are.
+    check(&mesh.colors, &mesh.confidences, &mesh.positions, 0.5);
     let mut points = PointFusion::new(&config()).unwrap();
     for view in &views {
         points.integrate(view).unwrap();
     }
     let cloud = points.finish();
     assert!(cloud.is_consistent());
-    check(&cloud.colors, &cloud.confidences, &cloud.positions);
+    check(&cloud.colors, &cloud.confidences, &cloud.positions, inverse_variance(0.5));
     // Views without colour give no colours, not black.
     assert!(fuse(&config(), &[view(0, pose, 1.0, floor(0.0))]).extract_mesh().colors.is_empty());
 }
@@ -179,6 +188,39 @@ fn carving_removes_a_floater_that_other_views_look_through_and_nothing_else() {
     assert_eq!(floor_with, floor_without, "carving touched the floor");
     // Out of the carving range it stays.
     assert_eq!(floating(0.5).0, kept);
+}
+
+#[test]
+fn carving_reaches_what_floats_close_before_a_slanted_surface() {
+    // The camera looks at the floor at a slant; one view has a false surface 35 cm above it. Blocks there are neither entirely in
+    // front of the floor nor touched by it.
+    let eye = |y: f64| look_at(Vec3::new(-1.6, y, 1.1), Vec3::new(0.2, 0.0, 0.1));
+    let floats = |o: Vec3, d: Vec3| {
+        let t = (0.35 - o.z) / d.z;
+        let p = o + d * t;
+        if t > 0.0 && p.x.abs() < 0.3 && p.y.abs() < 0.3 { Some(t) } else { floor(0.0)(o, d) }
+    };
+    let mut views = vec![view(0, eye(0.0), 1.0, floats)];
+    views.extend((1..9).map(|i| view(i, eye(0.03 * f64::from(i)), 1.0, floor(0.0))));
+    let above = |carve_range_m: f64| {
+        let mesh = fuse(&vidar_fusion::FusionConfig { carve_range_m, ..config() }, &views).extract_mesh();
+        mesh.positions.iter().filter(|p| p[2] > 0.1).count()
+    };
+    assert!(above(0.0) > 300, "{} vertices of the false surface", above(0.0));
+    assert_eq!(above(4.0), 0, "of {}", above(0.0));
+}
+
+#[test]
+fn views_are_averaged_by_their_inverse_variances() {
+    // With a tolerance of 3 %, erf(t / (σ √2)) is the confidence of σ = 1.5 % and of σ = 6 %.
+    let (sure, unsure, offset) = (0.954_5, 0.382_9, 0.03);
+    let pose = look_at(Vec3::new(0.0, 0.0, 1.0), Vec3::zeros());
+    let views = [view(0, pose, sure, floor(0.0)), view(1, pose, unsure, floor(offset))];
+    let mesh = fuse(&config(), &views).extract_mesh();
+    let heights: Vec<f64> = mesh.positions.iter().filter(|p| p[2] < 0.02).map(|p| f64::from(p[2])).collect();
+    let mean = heights.iter().sum::<f64>() / heights.len() as f64;
+    // Of inverse variances 16 : 1, which also the lesser depth of the upper one changes little.
+    assert!((mean - offset / 17.0).abs() < 0.15 * offset / 17.0, "{mean:.5} m");
 }
 
 #[test]

@@ -11,7 +11,8 @@ pub fn export(args: &ExportArgs, context: &Context) -> Outcome {
     let target: ExportTarget =
         args.to.parse().map_err(|e: String| usage(format!("--to: {e}"), "see `vidar export --help`"))?;
     let out = args.output.clone().unwrap_or_else(|| args.run.join("export").join(&args.to));
-    let options = ExportOptions { tracks: args.tracks, input_size: args.input_size };
+    let options =
+        ExportOptions { tracks: args.tracks, input_size: args.input_size, texture_px: args.texture_px };
     let made = export_run(&args.run, target, options, &out)?;
     if context.cli.json {
         let files: Vec<String> = made.iter().map(|p| p.display().to_string()).collect();

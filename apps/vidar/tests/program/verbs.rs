@@ -2,6 +2,7 @@
 
 use crate::support::{command, files_under, finished, keys, manifest, run_on, shared, vidar, vidar_in};
 use serde_json::Value;
+use std::path::Path;
 
 const VERBS: &[&[&str]] = &[
     &["run"],
@@ -386,7 +387,9 @@ fn options_named_in_hints_of_eval_exist() {
 fn every_export_is_made_and_an_unknown_one_is_refused_with_the_list() {
     let run = text(&finished().0);
     let folder = tempfile::tempdir().unwrap();
-    for format in ["colmap", "colmap-text", "nerfstudio", "tum", "kitti", "euroc", "ply", "glb"] {
+    for format in
+        ["colmap", "colmap-text", "nerfstudio", "tum", "kitti", "euroc", "ply", "glb", "textured-glb"]
+    {
         let out = folder.path().join(format);
         let json = vidar(&["export", run, "--to", format, "-o", text(&out), "--json"]).ends_with(0).json();
         assert_eq!(keys(&json, 1), ["schema", "made"]);
@@ -400,6 +403,46 @@ fn every_export_is_made_and_an_unknown_one_is_refused_with_the_list() {
     vidar(&["export", run, "--to", "dwg"]).ends_with(2).says(&["dwg", "colmap", "nerfstudio"]);
     vidar_in(folder.path(), &["export", "tum", "--to", "tum"]).ends_with(1).says(&["error[E0207]", "hint:"]);
     assert!(!folder.path().join("tum/export").exists(), "a refused export left a folder");
+}
+
+/// The JSON of a GLB.
+fn gltf(path: &Path) -> Value {
+    let bytes = std::fs::read(path).unwrap();
+    let length = u32::from_le_bytes(bytes[12..16].try_into().unwrap()) as usize;
+    serde_json::from_slice(&bytes[20..20 + length]).unwrap()
+}
+
+#[test]
+fn a_textured_mesh_has_the_triangles_of_the_map_and_the_asked_size() {
+    let run = text(&finished().0);
+    let folder = tempfile::tempdir().unwrap();
+    let mut widths = Vec::new();
+    for more in [&["--texture-px", "256"][..], &[], &["--input-size"]] {
+        let out = folder.path().join(widths.len().to_string());
+        vidar(&[&["export", run, "--to", "textured-glb", "-o", text(&out)], more].concat()).ends_with(0);
+        let document = gltf(&out.join("textured.glb"));
+        let indices = |p: &Value| {
+            let accessor = p["indices"].as_u64().unwrap() as usize;
+            document["accessors"][accessor]["count"].as_u64().unwrap()
+        };
+        let primitives = document["meshes"][0]["primitives"].as_array().unwrap();
+        assert!(primitives[0]["attributes"]["TEXCOORD_0"].is_u64(), "{primitives:?}");
+        let ply = std::fs::read(Path::new(run).join("map/mesh.ply")).unwrap();
+        let header = String::from_utf8_lossy(&ply[..2000]);
+        let faces = header.lines().find_map(|l| l.strip_prefix("element face ")).unwrap();
+        let all: u64 = primitives.iter().map(indices).sum();
+        assert_eq!(all, 3 * faces.parse::<u64>().unwrap());
+        assert!(indices(&primitives[0]) * 10 > all * 9, "{} of {all} are textured", indices(&primitives[0]));
+        // Columns of the JPEG, from the frame header of a baseline image (T.81, B.2.2).
+        let glb = std::fs::read(out.join("textured.glb")).unwrap();
+        let start = glb.windows(3).rposition(|w| w == [0xff, 0xd8, 0xff]).unwrap();
+        let frame = start + glb[start..].windows(2).position(|w| w == [0xff, 0xc0]).unwrap();
+        widths.push(u16::from_be_bytes([glb[frame + 7], glb[frame + 8]]));
+    }
+    assert!(widths[0] <= 256 && widths[0] < widths[1] && widths[1] < widths[2], "{widths:?}");
+    let refused = |more: &[&str]| vidar(&[&["export", run], more].concat()).ends_with(2);
+    refused(&["--to", "textured-glb", "--texture-px", "20"]).says(&["--texture-px", "64", "16384"]);
+    refused(&["--to", "glb", "--texture-px", "256"]).says(&["--texture-px", "textured-glb"]);
 }
 
 #[test]

@@ -7,6 +7,8 @@
 //! - Confidence is the application's own attribute `_CONFIDENCE`.
 //! - Indices are `unsigned int`; a mesh without triangles, and a cloud, is drawn as points.
 //! - Coloured surfaces are unlit (`KHR_materials_unlit`), because their colours include the lighting of the images.
+//! - A textured mesh has two primitives: one with `TEXCOORD_0` and the texture as a JPEG inside the file, and one with `COLOR_0` of what no
+//!   image shows. Textures are sRGB, as the images are, and nothing is converted. [`read_glb`] reads its triangles, not its texture.
 //! - `asset.extras` has frame, units and the caller's comments. An empty cloud has a node and no mesh.
 //!
 //! Read: the default scene of a GLB with one binary chunk; node trees with matrices or TRS; primitives of triangles or
@@ -16,9 +18,11 @@
 mod accessor;
 mod json;
 mod read;
+mod textured;
 mod write;
 
 pub use read::{Glb, read_glb};
+pub use textured::write_glb_textured;
 pub use write::{write_glb_cloud, write_glb_mesh};
 
 const FORMAT: &str = "GLB";

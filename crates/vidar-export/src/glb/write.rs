@@ -11,8 +11,8 @@ use serde_json::{Map, Value, json};
 use std::io::{self, BufWriter, Write};
 use vidar_core::{PointCloud, TriangleMesh};
 
-const ARRAY_BUFFER: u32 = 34962;
-const ELEMENT_ARRAY_BUFFER: u32 = 34963;
+pub(super) const ARRAY_BUFFER: u32 = 34962;
+pub(super) const ELEMENT_ARRAY_BUFFER: u32 = 34963;
 
 /// Writes a mesh; `comments` (the source, the run) are kept in `asset.extras`.
 pub fn write_glb_mesh(w: impl Write, mesh: &TriangleMesh, comments: &[String]) -> Result<(), ExportError> {
@@ -56,7 +56,7 @@ fn write(
     write().map_err(write_error(FORMAT))
 }
 
-fn write_words(w: &mut impl Write, words: &[u32]) -> io::Result<()> {
+pub(super) fn write_words(w: &mut impl Write, words: &[u32]) -> io::Result<()> {
     words.iter().try_for_each(|word| w.write_all(&word.to_le_bytes()))
 }
 
@@ -194,7 +194,7 @@ impl Layout {
     }
 }
 
-fn asset(comments: &[String]) -> Value {
+pub(super) fn asset(comments: &[String]) -> Value {
     json!({
         "version": "2.0",
         "generator": "vidar",
@@ -207,7 +207,7 @@ fn asset(comments: &[String]) -> Value {
 }
 
 /// The rotation of the root node, column by column as glTF requires.
-fn root_matrix() -> [f64; 16] {
+pub(super) fn root_matrix() -> [f64; 16] {
     let mut matrix = nalgebra::Matrix4::identity();
     matrix.fixed_view_mut::<3, 3>(0, 0).copy_from(&y_up_from_z_up());
     let mut columns = [0.0; 16];
@@ -215,7 +215,7 @@ fn root_matrix() -> [f64; 16] {
     columns
 }
 
-fn material(unlit: bool) -> Value {
+pub(super) fn material(unlit: bool) -> Value {
     let surface =
         json!({ "baseColorFactor": [1.0, 1.0, 1.0, 1.0], "metallicFactor": 0.0, "roughnessFactor": 1.0 });
     // The inside of a room must be visible from outside, too.
@@ -227,7 +227,7 @@ fn material(unlit: bool) -> Value {
 }
 
 /// Smallest and largest coordinates; `f64` holds them exactly, so their text is theirs.
-fn bounds(positions: &[[f32; 3]]) -> ([f64; 3], [f64; 3]) {
+pub(super) fn bounds(positions: &[[f32; 3]]) -> ([f64; 3], [f64; 3]) {
     let (mut min, mut max) = ([f64::INFINITY; 3], [f64::NEG_INFINITY; 3]);
     for position in positions {
         for axis in 0..3 {

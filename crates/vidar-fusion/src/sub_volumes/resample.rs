@@ -6,7 +6,7 @@
 
 use crate::block::{Block, DISTANCE_ONE, NodeSums};
 use crate::carve::FreeBlock;
-use crate::grid::{BlockKey, EDGE, NODES, node_of};
+use crate::grid::{BlockKey, CELL, CELLS, EDGE, NODES, node_of};
 use crate::volume::TsdfVolume;
 use nalgebra::Vector3;
 use rayon::prelude::*;
@@ -32,7 +32,7 @@ pub(super) fn add_moved(merged: &mut TsdfVolume, source: &TsdfVolume, now_from_f
     }
     let free = covered(source.free.keys().copied(), now_from_fused, voxel_m);
     let free: Vec<FreeBlock> =
-        free.par_iter().with_min_len(64).filter_map(|key| Some((*key, reader.free_weight(*key)?))).collect();
+        free.par_iter().with_min_len(64).filter_map(|key| reader.free_block(*key)).collect();
     merged.add_free_blocks(&free);
 }
 
@@ -147,16 +147,28 @@ impl Reader<'_> {
         }
     }
 
-    /// The free-space weight of a block: the smallest of the weights around the position that it came from.
-    fn free_weight(&self, key: BlockKey) -> Option<u32> {
-        let edge_m = EDGE as f64 * self.voxel_m;
+    /// The free-space weights of a block's cells; `None` where none is free.
+    fn free_block(&self, key: BlockKey) -> Option<FreeBlock> {
+        let weights = std::array::from_fn(|cell| {
+            let offset = [cell & 1, cell >> 1 & 1, cell >> 2 & 1];
+            self.free_weight([0, 1, 2].map(|a| 2 * key[a] + offset[a] as i32)).unwrap_or(0)
+        });
+        (weights != [0; CELLS]).then_some((key, weights))
+    }
+
+    /// The free-space weight of a cell: the smallest of the weights around the position that it came from.
+    fn free_weight(&self, cell: [i32; 3]) -> Option<u32> {
+        let edge_m = CELL as f64 * self.voxel_m;
         let weight = |corner: usize| {
             let offset = [corner & 1, corner >> 1 & 1, corner >> 2 & 1].map(|o| o as f64);
-            let position = Vector3::from([0, 1, 2].map(|a| (f64::from(key[a]) + offset[a]) * edge_m));
-            // Corners lie on borders: slightly inside, so that a block that did not move is only itself.
-            let centre = Vector3::from(key.map(|i| (f64::from(i) + 0.5) * edge_m));
+            let position = Vector3::from([0, 1, 2].map(|a| (f64::from(cell[a]) + offset[a]) * edge_m));
+            // Corners lie on borders: slightly inside, so that a cell that did not move is only itself.
+            let centre = Vector3::from(cell.map(|i| (f64::from(i) + 0.5) * edge_m));
             let position = self.fused_from_now.act(&(position + (centre - position) * 0.05)) / edge_m;
-            self.source.free.get(&<BlockKey>::from(position.map(|v| v.floor() as i32))).copied()
+            let [x, y, z] = position.map(|v| v.floor() as i32).into();
+            let weights = self.source.free.get(&[x, y, z].map(|i: i32| i.div_euclid(2)))?;
+            let at = [x, y, z].map(|i| i.rem_euclid(2) as usize);
+            Some(weights[(at[2] * 2 + at[1]) * 2 + at[0]]).filter(|w| *w > 0)
         };
         (0..8).map(weight).try_fold(u32::MAX, |least, weight| Some(least.min(weight?)))
     }

@@ -1,15 +1,15 @@
 //! Lossless serialisation of a volume, for offloading finished chunks to disk.
 //!
-//! `VSUB1`, then as LEB128 numbers: views, shortened views, blocks, free blocks. Per block its key, whether it has colour, a
-//! bit per node that was observed, and the sums of those nodes; per free block its key and weight. Signed numbers are zigzag.
+//! `VSUB2`, then as LEB128 numbers: views, shortened views, blocks, free blocks. Per block its key, whether it has colour, a
+//! bit per node that was observed, and the sums of those nodes; per free block its key and the weights of its cells. Signed numbers are zigzag.
 //! About a quarter of what the volume takes in memory.
 
 use crate::block::{Block, NodeSums};
-use crate::grid::{BlockKey, MAX_VIEWS, NODES};
+use crate::grid::{BlockKey, CELLS, MAX_VIEWS, NODES};
 use crate::volume::TsdfVolume;
 use crate::{FusionConfig, FusionError};
 
-const MAGIC: &[u8; 5] = b"VSUB1";
+const MAGIC: &[u8; 5] = b"VSUB2";
 
 /// The volume as bytes; blocks in the order of their keys, so that equal volumes give equal bytes.
 pub(super) fn write(volume: &TsdfVolume) -> Vec<u8> {
@@ -41,9 +41,9 @@ pub(super) fn write(volume: &TsdfVolume) -> Vec<u8> {
             }
         }
     }
-    for (key, weight) in free_blocks {
+    for (key, weights) in free_blocks {
         put_key(&mut out, key);
-        put(&mut out, u64::from(weight));
+        weights.iter().for_each(|weight| put(&mut out, u64::from(*weight)));
     }
     out
 }
@@ -100,8 +100,12 @@ pub(super) fn read(bytes: &[u8], config: &FusionConfig) -> Result<TsdfVolume, Fu
         }
     }
     for _ in 0..free_blocks {
-        let free_block = (input.key()?, input.small()?);
-        if free_block.1 > views * 4095 {
+        let mut free_block = (input.key()?, [0; CELLS]);
+        for weight in &mut free_block.1 {
+            *weight = input.small()?;
+        }
+        let all: u64 = free_block.1.iter().map(|w| u64::from(*w)).sum();
+        if all == 0 || free_block.1.iter().any(|w| *w > views * 4095) {
             return Err(input.bad("a free block"));
         }
         if volume.add_free_blocks(&[free_block]) > 0 {

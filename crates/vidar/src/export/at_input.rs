@@ -5,11 +5,13 @@ use super::{ExportView, StoredViews};
 use crate::error::Error;
 use rayon::prelude::*;
 use std::collections::BTreeMap;
-use std::path::Path;
-use vidar_core::Pinhole;
+use std::path::{Path, PathBuf};
 use vidar_core::remap::RemapTable;
+use vidar_core::{Image, Pinhole};
 use vidar_dataset::decode::{ImageLimits, read_image};
 use vidar_dataset::{CameraFlag, with_size};
+
+const NEEDS: &str = "--input-size needs a run of this version on a recording of image files";
 
 /// Writes the images of `views` into `images` and gives the views their intrinsics.
 pub(super) fn undistort(
@@ -18,35 +20,70 @@ pub(super) fn undistort(
     views: &mut [ExportView],
     images: &Path,
 ) -> Result<(), Error> {
-    let refuse = |reason: String| Error::NotARun { path: run.to_owned(), reason };
-    let needs = "--input-size needs a run of this version on a recording of image files";
-    let camera =
-        stored.camera.as_ref().ok_or_else(|| refuse(format!("views.json has no camera: {needs}")))?;
-    let model: CameraFlag = camera.model.parse()?;
-    let model = with_size(&model.0, camera.width, camera.height)?;
-    let sources: BTreeMap<u32, _> = stored.views.iter().map(|v| (v.frame, &v.source)).collect();
-    // The same rectangle of rays.
-    let at_width =
-        |view: &Pinhole| view.resized(camera.width, (view.height * camera.width).div_ceil(view.width));
-    let first = views.first().map(|view| at_width(&view.intrinsics)).transpose()?;
-    let shared = first.map(|view| RemapTable::new(&model, &view));
+    let at_input = AtInputSize::new(run, stored)?;
     views.par_iter_mut().try_for_each(|view| {
-        let Some(Some(source)) = sources.get(&view.frame_id.0) else {
-            return Err(refuse(format!("frame {} has no image file: {needs}", view.frame_id)));
-        };
-        let image = read_image(source, &ImageLimits::default())?;
-        if (image.width(), image.height()) != (camera.width, camera.height) {
-            let found = format!("{} is {}x{} pixels", source.display(), image.width(), image.height());
-            return Err(refuse(format!("{found}, the run's camera has {}x{}", camera.width, camera.height)));
-        }
-        // All views have the first one's intrinsics, unless a prediction brought its own.
-        view.intrinsics = at_width(&view.intrinsics)?;
-        let undistorted = match &shared {
-            Some(table) if *table.target() == view.intrinsics => table.apply(&image),
-            _ => RemapTable::new(&model, &view.intrinsics).apply(&image),
-        };
+        view.intrinsics = at_input.intrinsics(&view.intrinsics)?;
+        let undistorted = at_input.image(view.frame_id.0, &view.intrinsics)?;
         let path = images.join(&view.image_name);
-        let png = vidar_view::encode_png(&undistorted.to_rgb8())?;
+        let png = vidar_view::encode_png(&undistorted)?;
         Ok(vidar_export::atomic::write_file_atomically(&path, &png)?)
     })
+}
+
+/// The recording's images of a run's keyframes.
+pub(super) struct AtInputSize<'a> {
+    run: &'a Path,
+    model: CameraFlag,
+    width: usize,
+    height: usize,
+    sources: BTreeMap<u32, &'a Option<PathBuf>>,
+    /// For the intrinsics that all views have, unless a prediction brought its own.
+    shared: Option<RemapTable>,
+}
+
+impl<'a> AtInputSize<'a> {
+    /// Of the run in the folder `run`; fails where its camera or files are not known.
+    pub fn new(run: &'a Path, stored: &'a StoredViews) -> Result<Self, Error> {
+        let Some(camera) = stored.camera.as_ref() else {
+            return Err(refused(run, format!("views.json has no camera: {NEEDS}")));
+        };
+        let model: CameraFlag = camera.model.parse()?;
+        let sources = stored.views.iter().map(|v| (v.frame, &v.source)).collect();
+        let mut this = Self { run, model, width: camera.width, height: camera.height, sources, shared: None };
+        if let Some(first) = stored.views.first() {
+            this.shared = Some(this.table(&this.intrinsics(&first.intrinsics)?)?);
+        }
+        Ok(this)
+    }
+
+    /// The same rectangle of rays at the width of the recording's images.
+    pub fn intrinsics(&self, view: &Pinhole) -> Result<Pinhole, Error> {
+        Ok(view.resized(self.width, (view.height * self.width).div_ceil(view.width))?)
+    }
+
+    /// The undistorted image of a frame with the given [`Self::intrinsics`].
+    pub fn image(&self, frame: u32, intrinsics: &Pinhole) -> Result<Image<[u8; 3]>, Error> {
+        let Some(Some(source)) = self.sources.get(&frame) else {
+            return Err(refused(self.run, format!("frame {frame} has no image file: {NEEDS}")));
+        };
+        let image = read_image(source, &ImageLimits::default())?;
+        if (image.width(), image.height()) != (self.width, self.height) {
+            let found = format!("{} is {}x{} pixels", source.display(), image.width(), image.height());
+            let expected = format!("the run's camera has {}x{}", self.width, self.height);
+            return Err(refused(self.run, format!("{found}, {expected}")));
+        }
+        let undistorted = match &self.shared {
+            Some(table) if table.target() == intrinsics => table.apply(&image),
+            _ => self.table(intrinsics)?.apply(&image),
+        };
+        Ok(undistorted.to_rgb8())
+    }
+
+    fn table(&self, intrinsics: &Pinhole) -> Result<RemapTable, Error> {
+        Ok(RemapTable::new(&with_size(&self.model.0, self.width, self.height)?, intrinsics))
+    }
+}
+
+fn refused(run: &Path, reason: String) -> Error {
+    Error::NotARun { path: run.to_owned(), reason }
 }

@@ -2,6 +2,7 @@
 
 mod at_input;
 mod scene;
+mod textured;
 mod tracks;
 
 use crate::error::Error;
@@ -32,6 +33,8 @@ pub enum ExportTarget {
     Ply,
     /// Mesh as GLB.
     Glb,
+    /// Mesh as GLB with a texture from the keyframes' images.
+    TexturedGlb,
     /// Everything as Foxglove and Rerun show it.
     Mcap,
 }
@@ -46,6 +49,7 @@ pub const TARGETS: &[(&str, ExportTarget)] = &[
     ("euroc", ExportTarget::Euroc),
     ("ply", ExportTarget::Ply),
     ("glb", ExportTarget::Glb),
+    ("textured-glb", ExportTarget::TexturedGlb),
     ("mcap", ExportTarget::Mcap),
 ];
 
@@ -66,20 +70,32 @@ impl FromStr for ExportTarget {
 pub struct ExportOptions {
     /// COLMAP: every point with the images that see it.
     pub tracks: bool,
-    /// COLMAP and nerfstudio: images at the size of the recording's, undistorted again from its files.
+    /// COLMAP, nerfstudio and textures: images at the size of the recording's, undistorted again from its files.
     pub input_size: bool,
+    /// Textures: most texels along an edge.
+    pub texture_px: Option<usize>,
 }
 
 impl ExportTarget {
     fn check(self, options: ExportOptions) -> Result<(), Error> {
         let is_colmap = matches!(self, Self::Colmap | Self::ColmapText);
-        let has_images = is_colmap || self == Self::Nerfstudio;
+        let is_textured = self == Self::TexturedGlb;
+        let has_images = is_colmap || is_textured || self == Self::Nerfstudio;
+        if let Some(max_px) = options.texture_px {
+            let valid = vidar_fusion::TextureConfig { max_px }.validate();
+            let what = match valid {
+                _ if !is_textured => "--texture-px: only textured-glb has a texture".to_owned(),
+                Err(error) => format!("--texture-px: {error}"),
+                Ok(()) => return Self::TexturedGlb.check(ExportOptions { texture_px: None, ..options }),
+            };
+            return Err(Error::Usage { what, hint: "leave it out".to_owned() });
+        }
         let refused = match options {
             ExportOptions { tracks: true, .. } if !is_colmap => {
                 "--tracks: only colmap and colmap-text have tracks"
             }
             ExportOptions { input_size: true, .. } if !has_images => {
-                "--input-size: only colmap, colmap-text and nerfstudio hold images"
+                "--input-size: only colmap, colmap-text, nerfstudio and textured-glb hold images"
             }
             _ => return Ok(()),
         };
@@ -135,6 +151,7 @@ pub fn export_run(
             ["mesh.ply", "points.ply"].iter().map(|name| copy(run, "map", name, out)).collect()
         }
         ExportTarget::Glb => Ok(vec![glb(run, out)?]),
+        ExportTarget::TexturedGlb => Ok(vec![textured::glb(run, &stored, options, out)?]),
         ExportTarget::Mcap => Ok(vec![scene::mcap(run, &stored, out)?]),
     }
 }
