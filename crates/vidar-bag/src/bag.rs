@@ -1,5 +1,6 @@
 //! An open recording: one bag, or the split files of one.
 
+use crate::chunks::Chunks;
 use crate::compression::Compression;
 use crate::db3::{self, Db3};
 use crate::error::BagError;
@@ -9,7 +10,7 @@ use crate::message::{self, Header, Message};
 use crate::{mcap, metadata, parts, ros1, sqlite};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
-use std::sync::{Arc, Mutex, OnceLock, PoisonError};
+use std::sync::Arc;
 use vidar_core::{Timestamp, Warning};
 
 /// The containers that are read.
@@ -51,7 +52,7 @@ pub struct Bag {
     warnings: Vec<Warning>,
     metadata: BTreeMap<String, BTreeMap<String, String>>,
     messages_are_compressed: bool,
-    cache: Mutex<Cache>,
+    unpacked: Chunks,
 }
 
 /// One file with its chunks.
@@ -63,8 +64,8 @@ struct Part {
 
 #[derive(Debug)]
 enum Container {
-    Ros1(BagFile),
-    Mcap(BagFile),
+    Ros1(Arc<BagFile>),
+    Mcap(Arc<BagFile>),
     Sqlite(Db3),
 }
 
@@ -76,19 +77,6 @@ impl Container {
         }
     }
 }
-
-/// The chunks decompressed last. Neighbouring messages share a chunk; sensors that are read side by side are a few chunks apart.
-#[derive(Debug, Default)]
-struct Cache {
-    /// File, chunk, announced size, content.
-    chunks: Vec<(u16, u32, u64, Arc<Unpacked>)>,
-}
-
-/// A chunk that is decompressed once, by the first thread that needs it, while others wait; or why it cannot be.
-type Unpacked = OnceLock<Result<Vec<u8>, String>>;
-
-/// Decompressed chunks that are kept, bytes; the newest stays even when it is larger.
-const CACHE_BYTES: u64 = 32 << 20;
 
 /// Bytes that hold stamp and frame of any message; names of frames are far shorter.
 const HEADER_BYTES: u64 = 1 << 10;
@@ -117,7 +105,7 @@ impl Bag {
             warnings: Vec::new(),
             metadata: BTreeMap::new(),
             messages_are_compressed,
-            cache: Mutex::default(),
+            unpacked: Chunks::default(),
         };
         let mut topics = BTreeMap::<(String, String), Topic>::new();
         for file in &files {
@@ -271,37 +259,19 @@ impl Bag {
                 Container::Sqlite(_) => Ok(None),
             };
         }
-        let unpacked = self.cached(message, chunk.size);
-        let file = part.container.file();
-        let content = unpacked.get_or_init(|| {
-            let packed = file.read(chunk.offset, chunk.stored).map_err(|e| e.to_string())?;
-            chunk.compression.decompress(&packed, Some(chunk.size))
-        });
-        let bytes = content.as_ref().map_err(|reason| {
-            let found = format!("a chunk that is damaged: {reason}");
-            file.malformed(chunk.offset, found, "a whole chunk")
-        })?;
-        Ok(match &part.container {
-            Container::Ros1(_) => ros1::message_in(bytes, message.offset).map(|b| cut(b, most)),
-            Container::Mcap(_) => mcap::message_in(bytes, message.offset).map(|b| cut(b, most)),
-            Container::Sqlite(_) => None,
-        })
-    }
-
-    /// The place of a chunk among those that are kept, as the newest.
-    fn cached(&self, message: &MessageRef, size: u64) -> Arc<Unpacked> {
-        let mut cache = self.cache.lock().unwrap_or_else(PoisonError::into_inner);
-        let chunks = &mut cache.chunks;
-        let place = chunks.iter().position(|c| (c.0, c.1) == (message.file, message.chunk));
-        let found = place.map(|at| chunks.remove(at));
-        let kept = found.unwrap_or_else(|| (message.file, message.chunk, size, Arc::default()));
-        let unpacked = Arc::clone(&kept.3);
-        chunks.push(kept);
-        let mut held: u64 = chunks.iter().map(|c| c.2).sum();
-        while held > CACHE_BYTES && chunks.len() > 1 {
-            held -= chunks.remove(0).2;
-        }
-        unpacked
+        let (Container::Ros1(file) | Container::Mcap(file)) = &part.container else { return Ok(None) };
+        let read = |content: &Result<Vec<u8>, String>| {
+            let bytes = content.as_ref().map_err(|reason| {
+                let found = format!("a chunk that is damaged: {reason}");
+                file.malformed(chunk.offset, found, "a whole chunk")
+            })?;
+            let found = match &part.container {
+                Container::Ros1(_) => ros1::message_in(bytes, message.offset),
+                _ => mcap::message_in(bytes, message.offset),
+            };
+            Ok(found.map(|bytes| cut(bytes, most)))
+        };
+        self.unpacked.get((message.file, file), &part.chunks, message.chunk, read).unwrap_or(Ok(None))
     }
 
     fn bad_message(&self, message: &MessageRef, reason: String) -> BagError {
@@ -330,11 +300,11 @@ fn open_file(path: &Path) -> Result<(BagFormat, Container, FileIndex), BagError>
     Ok(match BagFormat::of_bytes(&head) {
         Some(format @ BagFormat::Ros1) => {
             let index = ros1::index(&file)?;
-            (format, Container::Ros1(file), index)
+            (format, Container::Ros1(Arc::new(file)), index)
         }
         Some(format @ BagFormat::Mcap) => {
             let index = mcap::index(&file)?;
-            (format, Container::Mcap(file), index)
+            (format, Container::Mcap(Arc::new(file)), index)
         }
         Some(format @ BagFormat::Sqlite) => {
             let (db3, index) = db3::index(file)?;

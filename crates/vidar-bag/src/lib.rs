@@ -2,6 +2,7 @@
 
 mod bag;
 mod bytes;
+mod chunks;
 mod compression;
 mod db3;
 mod error;
@@ -16,6 +17,7 @@ mod sqlite;
 pub mod write;
 
 pub use bag::{Bag, BagFormat};
+pub use chunks::CHUNK_THREAD;
 pub use error::BagError;
 pub use index::{Encoding, MessageRef, Topic};
 pub use message::{
