@@ -5,7 +5,7 @@ use crate::compression::Compression;
 use crate::db3::{self, Db3};
 use crate::error::BagError;
 use crate::file::BagFile;
-use crate::index::{Encoding, FileIndex, MessageRef, NO_CHUNK, Topic};
+use crate::index::{CUT_OFF, Encoding, FileIndex, MessageRef, NO_CHUNK, Topic};
 use crate::message::{self, Header, Message};
 use crate::{mcap, metadata, parts, ros1, sqlite};
 use std::collections::BTreeMap;
@@ -97,33 +97,52 @@ impl Bag {
             let (path, found) = (path.to_path_buf(), files.len() as u64);
             return Err(BagError::TooLarge { path, what: "files", found, limit: parts::MAX_FILES as u64 });
         }
-        let mut bag = Self {
+        let mut bag = Self { messages_are_compressed, ..Self::without_files(path) };
+        let files = files.iter().map(|file| BagFile::open(file));
+        bag.list(files)?;
+        Ok(bag)
+    }
+
+    /// Opens the first bytes of an MCAP file that is still written, as if it had no more.
+    pub fn open_beginning(path: &Path, bytes: u64) -> Result<Self, BagError> {
+        let mut bag = Self::without_files(path);
+        bag.list([BagFile::beginning(path, bytes)].into_iter())?;
+        bag.warnings.retain(|w| w.kind != CUT_OFF);
+        Ok(bag)
+    }
+
+    fn without_files(path: &Path) -> Self {
+        Self {
             path: path.to_path_buf(),
             format: BagFormat::Mcap,
             parts: Vec::new(),
             topics: Vec::new(),
             warnings: Vec::new(),
             metadata: BTreeMap::new(),
-            messages_are_compressed,
+            messages_are_compressed: false,
             unpacked: Chunks::default(),
-        };
-        let mut topics = BTreeMap::<(String, String), Topic>::new();
-        for file in &files {
-            let (format, container, index) = open_file(file)?;
-            bag.format = format;
-            bag.take(index, container, &mut topics);
         }
-        bag.topics = topics.into_values().collect();
-        for (number, topic) in bag.topics.iter_mut().enumerate() {
+    }
+
+    /// Lists topics and messages of the files.
+    fn list(&mut self, files: impl Iterator<Item = Result<BagFile, BagError>>) -> Result<(), BagError> {
+        let mut topics = BTreeMap::<(String, String), Topic>::new();
+        for file in files {
+            let (format, container, index) = open_file(file?)?;
+            self.format = format;
+            self.take(index, container, &mut topics);
+        }
+        self.topics = topics.into_values().collect();
+        for (number, topic) in self.topics.iter_mut().enumerate() {
             topic.messages.iter_mut().for_each(|m| m.topic = number as u16);
             // Stable: messages of one time stay in the order in which they were written.
             topic.messages.sort_by_key(|m| m.log_time);
         }
-        if bag.topics.iter().all(|t| t.messages.is_empty()) {
-            let found = format!("{} topics without messages", bag.topics.len());
-            return Err(BagError::Empty { path: path.to_path_buf(), found });
+        if self.topics.iter().all(|t| t.messages.is_empty()) {
+            let found = format!("{} topics without messages", self.topics.len());
+            return Err(BagError::Empty { path: self.path.clone(), found });
         }
-        Ok(bag)
+        Ok(())
     }
 
     /// Adds the index of one file.
@@ -207,15 +226,7 @@ impl Bag {
             return message::header(topic.encoding, &topic.message_type, &head)
                 .map_err(|reason| self.bad_message(message, reason));
         }
-        let header = match self.read(message)? {
-            Message::Image(m) => m.header,
-            Message::CompressedImage(m) | Message::CompressedVideo(m) => m.header,
-            Message::Imu(m) => m.header,
-            Message::CameraInfo(m) => m.header,
-            Message::Transforms(m) => m.into_iter().next().map(|t| t.parent).unwrap_or_default(),
-            Message::Poses(m) => m.into_iter().next().map(|p| p.header).unwrap_or_default(),
-        };
-        Ok(header)
+        Ok(self.read(message)?.header())
     }
 
     /// The serialised bytes of one message.
@@ -294,8 +305,7 @@ fn cut(bytes: &[u8], most: u64) -> Vec<u8> {
     bytes[..length].to_vec()
 }
 
-fn open_file(path: &Path) -> Result<(BagFormat, Container, FileIndex), BagError> {
-    let file = BagFile::open(path)?;
+fn open_file(file: BagFile) -> Result<(BagFormat, Container, FileIndex), BagError> {
     let head = file.read(0, file.length().min(16))?;
     Ok(match BagFormat::of_bytes(&head) {
         Some(format @ BagFormat::Ros1) => {
@@ -317,7 +327,7 @@ fn open_file(path: &Path) -> Result<(BagFormat, Container, FileIndex), BagError>
                 head => format!("a file whose first bytes are {head:02x?}"),
             };
             let expected = "a ROS 1 bag 2.0, an MCAP file or an SQLite bag of ROS 2".to_string();
-            return Err(BagError::NotABag { path: path.to_path_buf(), found, expected });
+            return Err(BagError::NotABag { path: file.path().to_path_buf(), found, expected });
         }
     })
 }

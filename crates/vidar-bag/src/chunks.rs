@@ -18,8 +18,8 @@ const MOST_AHEAD_BYTES: u64 = 8 << 20;
 /// The name of threads that decompress chunks. A panic of theirs is an error of one chunk, and nothing for a panic hook to report.
 pub const CHUNK_THREAD: &str = "vidar chunk decoder";
 
-/// File and number of a chunk.
-type Place = (u16, u32);
+/// File of a chunk, and its number there; its offset where chunks are not numbered.
+type Place = (u16, u64);
 
 /// A chunk that is decompressed once, by the first thread that needs it, while others wait; or why it cannot be.
 pub(crate) type Unpacked = OnceLock<Result<Vec<u8>, String>>;
@@ -106,6 +106,17 @@ impl Chunks {
         Some(read(Job { file: Arc::clone(file), chunk, unpacked }.content()))
     }
 
+    /// The content of a chunk that no others are known beside.
+    pub(crate) fn get_alone<T>(
+        &self,
+        file: &Arc<BagFile>,
+        chunk: Chunk,
+        read: impl FnOnce(&Result<Vec<u8>, String>) -> T,
+    ) -> T {
+        let unpacked = self.shared.lock().newest((0, chunk.offset), chunk.size);
+        read(Job { file: Arc::clone(file), chunk, unpacked }.content())
+    }
+
     /// Threads that run.
     #[cfg(test)]
     pub(crate) fn threads(&self) -> usize {
@@ -122,21 +133,21 @@ impl Chunks {
     ) -> Arc<Unpacked> {
         let mut guard = self.shared.lock();
         let state = &mut *guard;
-        let unpacked = state.newest((number, index), size);
-        let follows = index.checked_sub(1).is_some_and(|before| state.was_asked((number, before)));
+        let unpacked = state.newest((number, index.into()), size);
+        let follows = index.checked_sub(1).is_some_and(|before| state.was_asked((number, before.into())));
         if follows && self.count > 0 {
             let mut held: u64 = state.kept.iter().map(|k| k.size).sum();
             for (next, chunk) in
                 (index + 1..).zip(all.iter().skip(index as usize + 1)).take(self.count * AHEAD_PER_THREAD)
             {
-                let is_kept = state.kept.iter().any(|k| k.place == (number, next));
+                let is_kept = state.kept.iter().any(|k| k.place == (number, next.into()));
                 if chunk.compression == Compression::None || chunk.size > MOST_AHEAD_BYTES || is_kept {
                     continue;
                 }
                 // The oldest go first, and never the one that is read now or those ahead of it.
                 while held + chunk.size > KEPT_BYTES {
                     let Some(oldest) =
-                        state.kept.iter().position(|k| k.was_asked && k.place != (number, index))
+                        state.kept.iter().position(|k| k.was_asked && k.place != (number, index.into()))
                     else {
                         break;
                     };
@@ -148,7 +159,7 @@ impl Chunks {
                 held += chunk.size;
                 let ahead = Arc::<Unpacked>::default();
                 let kept = Kept {
-                    place: (number, next),
+                    place: (number, next.into()),
                     size: chunk.size,
                     unpacked: Arc::clone(&ahead),
                     was_asked: false,
@@ -304,7 +315,7 @@ mod tests {
         let chunks = Chunks::with_threads(2);
         let is_ready = |index: u32| {
             let state = chunks.shared.lock();
-            state.kept.iter().any(|k| k.place == (0, index) && k.unpacked.get().is_some())
+            state.kept.iter().any(|k| k.place == (0, index.into()) && k.unpacked.get().is_some())
         };
         read(&chunks, &file, &all, 7).unwrap();
         read(&chunks, &file, &all, 3).unwrap();

@@ -14,6 +14,7 @@ mod metadata;
 mod parts;
 mod ros1;
 mod sqlite;
+mod stream;
 pub mod write;
 
 pub use bag::{Bag, BagFormat};
@@ -25,3 +26,4 @@ pub use message::{
     RawImage, Role, role_of,
 };
 pub use parts::bags_in;
+pub use stream::{KeptStream, McapStream, StreamEnd, StreamMessage, StreamPlace, StreamTopic};
