@@ -39,7 +39,16 @@ pub(crate) fn detect(path: &Path) -> Option<String> {
 
 /// Reads the recording's index, calibration, IMU and poses; images stay in it.
 pub(crate) fn open(path: &Path, reason: String, options: &OpenOptions) -> Result<Draft, DatasetError> {
-    let bag = Arc::new(Bag::open(path)?);
+    of(Arc::new(Bag::open(path)?), path, reason, options)
+}
+
+/// The same of a bag that is open.
+pub(crate) fn of(
+    bag: Arc<Bag>,
+    path: &Path,
+    reason: String,
+    options: &OpenOptions,
+) -> Result<Draft, DatasetError> {
     let mut choice = topics::choose(&bag, options)?;
     // What VIDAR's own conversions leave beside the messages.
     let facts = bag.metadata(facts::NAME).map(Facts::from_map).unwrap_or_default();
