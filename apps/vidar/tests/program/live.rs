@@ -42,7 +42,8 @@ fn of(path: &Path, out: &Path, more: &[&str]) -> Command {
 /// The command with bytes sent into it, slowly where told so.
 fn sent(mut command: Command, bytes: Vec<u8>) -> ProgramOutput {
     use std::process::Stdio;
-    let mut child = command.stdin(Stdio::piped()).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
+    let mut child =
+        command.stdin(Stdio::piped()).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
     let mut pipe = child.stdin.take().unwrap();
     // A program that refuses the stream closes it.
     let sender = std::thread::spawn(move || drop(pipe.write_all(&bytes)));
@@ -149,7 +150,11 @@ fn what_came_of_a_stream_that_breaks_is_mapped_and_a_killed_one_goes_on_with_wha
     let out = shared().root.join("live cut stream");
     let ran = sent(of(Path::new("-"), &out, &[]), cut.clone());
     assert_eq!(ran.code, 3, "{}", ran.stderr);
-    assert!(manifest(&out)["warnings"]["stream-cut-off"].as_u64() == Some(1), "{}", manifest(&out)["warnings"]);
+    assert!(
+        manifest(&out)["warnings"]["stream-cut-off"].as_u64() == Some(1),
+        "{}",
+        manifest(&out)["warnings"]
+    );
     // Killed while it waits for more of the stream.
     let killed = shared().root.join("live killed stream");
     let mut command = of(Path::new("-"), &killed, &[]);
@@ -161,7 +166,8 @@ fn what_came_of_a_stream_that_breaks_is_mapped_and_a_killed_one_goes_on_with_wha
         (pipe, written)
     });
     let (file, clock) = (killed.join("trajectory/live.tum"), Instant::now());
-    while clock.elapsed() < Duration::from_secs(120) && !std::fs::read_to_string(&file).is_ok_and(|t| t.lines().count() > 5)
+    while clock.elapsed() < Duration::from_secs(120)
+        && !std::fs::read_to_string(&file).is_ok_and(|t| t.lines().count() > 5)
     {
         assert!(child.try_wait().unwrap().is_none(), "it waits");
         std::thread::sleep(Duration::from_millis(5));

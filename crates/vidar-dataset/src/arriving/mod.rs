@@ -182,7 +182,12 @@ impl Opening {
         let (mut items, mut bytes) = (Vec::new(), 0);
         let mut has_calibration = options.camera_model.is_some() || !options.calibration.is_empty();
         let (mut first, mut last, mut imu) = (None::<Timestamp>, None::<Timestamp>, None::<Timestamp>);
-        while let Some(item) = feed.next(go_on)? {
+        loop {
+            let Some(item) = feed.next(go_on)? else {
+                // The stream has ended: all of it is its beginning.
+                bytes = u64::MAX;
+                break;
+            };
             bytes = bytes.max(item.end);
             match item.kind {
                 Kind::Image => {
