@@ -142,7 +142,7 @@ fn a_cut_bag_says_so() {
 fn what_is_no_recording_is_named_with_the_nearest_way() {
     let folder = tempfile::tempdir().unwrap();
     for (name, bytes, says, way) in [
-        ("a.zip", &b"PK\x03\x04rest"[..], "a zip archive", "unpack"),
+        ("a.zip", &b"PK\x03\x04\x14\0\0\0rest"[..], "a zip archive", "unpack"),
         ("a.bag.gz", b"\x1f\x8brest", "compressed", "gunzip"),
         ("a.heic", b"\0\0\0\x18ftypheic\0\0", "HEIC", "JPEG"),
         ("b.zip", b"PK\x03\x04\x14\0\x01\0rest", "an encrypted zip archive", "password"),
