@@ -1,5 +1,7 @@
 //! MCAP as it comes: the same messages as from the file, whatever the pieces; cut, damaged and hostile streams.
 
+#![allow(clippy::unwrap_used, clippy::panic, reason = "tests may stop at the first surprise")]
+
 use std::io::Write;
 use std::path::Path;
 use vidar_bag::write::{McapWriter, encode};

@@ -1,6 +1,8 @@
 //! A recording from a stream: the same measurements in the same order as from the file, whatever the pieces; its images read again;
 //! cut off, broken and refused streams.
 
+#![allow(clippy::unwrap_used, clippy::panic, reason = "tests may stop at the first surprise")]
+
 use std::io::Read;
 use std::path::Path;
 use vidar_bag::write::{McapWriter, encode};
