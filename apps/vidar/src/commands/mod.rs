@@ -18,6 +18,7 @@ pub mod odometry;
 pub mod run;
 pub mod synth;
 pub mod view;
+pub mod worker;
 
 use crate::Outcome;
 use crate::args::Cli;

@@ -17,6 +17,7 @@ mod fault_list;
 mod faults;
 mod hostile;
 mod keys;
+mod link;
 mod live;
 mod map;
 mod masks;

@@ -14,6 +14,7 @@ mod plan;
 mod readers;
 mod record;
 pub(crate) mod reference;
+mod remote;
 mod scene;
 mod source;
 mod start;
@@ -97,6 +98,8 @@ pub struct RunOutcome {
     pub device_peak_bytes: Option<u64>,
     /// What a live run measured; none of others.
     pub live: Option<LiveReport>,
+    /// What went to workers elsewhere and back; none where none were asked.
+    pub remote: Option<vidar_link::geometry::RemoteReport>,
     /// Wall time, s.
     pub seconds: f64,
 }
@@ -279,6 +282,7 @@ impl Context<'_> {
             warnings,
             device_peak_bytes: source.device_peak_bytes(),
             live,
+            remote: source.remote().map(|r| r.report()),
             seconds: 0.0,
         };
         events.stage("write", 0, || outputs::write(&outcome, dataset, config, request, folder, events))?;
