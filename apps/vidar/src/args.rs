@@ -2,7 +2,7 @@
 
 use crate::batch_args::{PlanArgs, WorkArgs};
 use crate::compare_args::CompareArgs;
-use crate::link_args::{LinkArgs, WorkerArgs};
+use crate::link_args::{LinkArgs, ReceiveArgs, WorkerArgs};
 use crate::live_args::LiveArgs;
 use crate::model_args::{DepthArgs, LicenceArgs, ModelCommand};
 use clap::{ArgAction, Args, Parser, Subcommand, ValueEnum, ValueHint};
@@ -152,6 +152,11 @@ pub enum Command {
         after_help = "Examples:\n  vidar worker --model da3-nano\n  vidar worker --model da3-small --device gpu --listen tcp/0.0.0.0:7447\n  vidar worker --key lab/depth --link-config tls.json5"
     )]
     Worker(Box<WorkerArgs>),
+    /// Take a robot's messages (ROS 2 over Zenoh) as they come, as an MCAP stream or file.
+    #[command(
+        after_help = "Examples:\n  vidar receive '0/cam0/**' '0/imu/**' -o drive.mcap\n  vidar receive '0/**' --connect tcp/robot:7447 --duration 60 -o drive.mcap"
+    )]
+    Receive(Box<ReceiveArgs>),
     /// Check this machine: processor, memory, disk, networks, graphics processors.
     Doctor,
     /// Show and explain settings: show, explain, presets, schema.

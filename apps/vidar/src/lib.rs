@@ -115,6 +115,7 @@ fn dispatch(command: Command, context: &Context) -> Outcome {
         Command::Plan(args) => commands::batch::plan(&args, context),
         Command::Work(args) => commands::batch::work(&args, context),
         Command::Worker(args) => commands::worker::worker(&args, context),
+        Command::Receive(args) => commands::receive::receive(&args, context),
         Command::Doctor => commands::doctor::doctor(context),
         Command::Config(ConfigCommand::Show { config, origin }) => {
             commands::config::show(&config, origin, context)

@@ -45,3 +45,26 @@ pub struct WorkerArgs {
     #[command(flatten)]
     pub config: ConfigArgs,
 }
+
+/// `vidar receive`.
+#[derive(Args, Clone, Debug)]
+pub struct ReceiveArgs {
+    /// Key expressions of topics as rmw_zenoh has them: DOMAIN/TOPIC/**; several may be given.
+    #[arg(value_name = "KEYEXPR", required = true)]
+    pub expressions: Vec<String>,
+    /// MCAP file; it must not exist. Default: the standard output.
+    #[arg(short, long, value_name = "FILE", value_hint = ValueHint::FilePath, help_heading = "Output")]
+    pub output: Option<PathBuf>,
+    /// End after this time, seconds.
+    #[arg(long, value_name = "SECONDS")]
+    pub duration: Option<f64>,
+    /// End when nothing has come for this time, seconds, once something has.
+    #[arg(long, value_name = "SECONDS")]
+    pub idle: Option<f64>,
+    /// How other machines are reached.
+    #[command(flatten)]
+    pub link: LinkArgs,
+    /// How settings are given.
+    #[command(flatten)]
+    pub config: ConfigArgs,
+}

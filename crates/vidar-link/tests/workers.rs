@@ -2,80 +2,19 @@
 //! right answer to the right question gets through.
 #![allow(clippy::unwrap_used, clippy::panic)]
 
+mod common;
+
+use common::{Brightness, HEIGHT, WIDTH, chunk, facts, local, same_bits};
 use proptest::prelude::*;
 use std::collections::VecDeque;
-use std::ops::Range;
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
-use vidar_core::model::ChunkFrame;
-use vidar_core::{
-    ChunkId, ChunkView, ChunkViews, Confidence, FrameId, FrameImage, GeometryPrediction, Image, ModelError,
-    ModelInfo, Pinhole, RelativeDepth, Se3, So3, Timestamp, ViewGeometry, Watch,
-};
+use vidar_core::{ChunkViews, ModelError, Se3};
 use vidar_link::LinkError;
 use vidar_link::geometry::{
-    AskError, DepthFormat, Expected, Hello, HelloRequest, ImageFormat, ModelFacts, PredictReply,
-    PredictRequest, Predicted, Reach, RemoteModel, RemoteOptions, Served, answer_hello, answer_predict,
+    AskError, DepthFormat, Expected, Hello, HelloRequest, ImageFormat, ModelFacts, Outcome, PredictReply,
+    PredictRequest, Reach, RemoteModel, RemoteOptions, answer_hello, answer_predict,
 };
-
-const WIDTH: usize = 24;
-const HEIGHT: usize = 16;
-
-/// A model whose depth is the brightness of the image.
-struct Brightness(ModelFacts);
-
-fn facts(model: &str) -> ModelFacts {
-    let info = ModelInfo {
-        name: model.into(),
-        licence: "MIT".into(),
-        weights_sha256: Some("0123456789abcdef".repeat(4)),
-        needs_poses: false,
-        min_views: 1,
-    };
-    ModelFacts {
-        model: model.into(),
-        licence: "MIT".into(),
-        info,
-        token_channels: Some(3),
-        arithmetic: "f32".into(),
-    }
-}
-
-impl Served for Brightness {
-    fn facts(&self, settings: &str) -> Result<ModelFacts, String> {
-        match settings {
-            "impossible" => Err("no such mode".into()),
-            _ => Ok(self.0.clone()),
-        }
-    }
-
-    fn predict(
-        &self,
-        _: &str,
-        wants_tokens: bool,
-        views: &ChunkViews,
-        wanted: Range<usize>,
-        _: Watch<'_>,
-    ) -> Result<Predicted, String> {
-        let view = |v: &ChunkView| {
-            let gray = v.image.to_gray8();
-            ViewGeometry {
-                frame_id: v.frame_id,
-                chunk_from_camera: v.world_from_camera.unwrap_or(Se3::IDENTITY),
-                intrinsics: v.intrinsics,
-                depth: RelativeDepth::new(gray.map(|g| f32::from(*g) / 7.0)),
-                confidence: Confidence::new(gray.map(|g| f32::from(*g) / 255.0)),
-            }
-        };
-        assert!(views.id.0 != 666, "a bug in the model");
-        let views: Vec<ViewGeometry> = views.views[wanted].iter().map(view).collect();
-        let tokens = views.iter().map(|v| vec![v.frame_id.0 as f32 + 0.1; 6]).collect();
-        Ok(Predicted {
-            geometry: GeometryPrediction { chunk_id: ChunkId(0), frame: ChunkFrame::ModelNative, views },
-            tokens: if wants_tokens { tokens } else { Vec::new() },
-        })
-    }
-}
 
 /// What happens to a request.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -136,7 +75,7 @@ impl Reach for Fake {
             Fault::Late => Err(AskError::Late),
             Fault::Busy => {
                 let asked = PredictRequest::decode(request).unwrap();
-                let outcome = vidar_link::geometry::Outcome::Busy;
+                let outcome = Outcome::Busy;
                 let busy = PredictReply { run: asked.run, number: asked.number, queue: 9, outcome };
                 Ok(busy.encode(DepthFormat::F32).unwrap())
             }
@@ -158,25 +97,6 @@ impl Reach for Fake {
             }
         }
     }
-}
-
-fn chunk(id: u32) -> ChunkViews {
-    let intrinsics = Pinhole::new(20.0, 21.0, 11.5, 7.5, WIDTH, HEIGHT).unwrap();
-    let view = |i: u32| ChunkView {
-        frame_id: FrameId(100 * id + i),
-        time: Timestamp::from_nanos(i64::from(i)),
-        image: match i % 3 {
-            0 => FrameImage::Gray8(Image::from_fn(WIDTH, HEIGHT, |x, y| (9 * x + 5 * y + i as usize) as u8)),
-            1 => FrameImage::Rgb8(Image::from_fn(WIDTH, HEIGHT, |x, y| [x as u8, y as u8, (id + i) as u8])),
-            _ => FrameImage::Gray16(Image::from_fn(WIDTH, HEIGHT, |x, y| (1000 * x + y) as u16)),
-        },
-        intrinsics,
-        world_from_camera: (i % 2 == 0).then(|| {
-            let turn = So3::from_quaternion(0.1 * f64::from(i), 0.2, -0.3, 0.9).unwrap();
-            Se3::new(turn, [0.1, f64::from(id), 1.0 / 3.0].into())
-        }),
-    };
-    ChunkViews { id: ChunkId(id), views: (0..4).map(view).collect() }
 }
 
 struct Setup {
@@ -209,23 +129,6 @@ fn open(workers: &[(&str, &str)], expected: Expected, depth: DepthFormat) -> Res
 
 fn three() -> Setup {
     open(&[("a", "bright"), ("b", "bright"), ("c", "bright")], Expected::default(), DepthFormat::F32).unwrap()
-}
-
-/// What the model says here.
-fn local(views: &ChunkViews, wanted: Range<usize>) -> Predicted {
-    Brightness(facts("bright")).predict("{}", true, views, wanted, &|_| false).unwrap()
-}
-
-fn same_bits(found: &Predicted, here: &Predicted) -> bool {
-    let bits = |image: &Image<f32>| image.data().iter().map(|v| v.to_bits()).collect::<Vec<_>>();
-    found.tokens == here.tokens
-        && found.geometry.frame == here.geometry.frame
-        && found.geometry.views.len() == here.geometry.views.len()
-        && found.geometry.views.iter().zip(&here.geometry.views).all(|(a, b)| {
-            (a.frame_id, a.chunk_from_camera, a.intrinsics) == (b.frame_id, b.chunk_from_camera, b.intrinsics)
-                && bits(a.depth.image()) == bits(b.depth.image())
-                && bits(a.confidence.image()) == bits(b.confidence.image())
-        })
 }
 
 #[test]
@@ -368,8 +271,10 @@ fn announced_sizes_are_believed_only_within_bounds() {
     let good = request(&chunk(1)).encode(ImageFormat::Jpeg).unwrap();
     PredictRequest::decode(&good).unwrap();
     let text = |bytes: &[u8]| PredictRequest::decode(bytes).unwrap_err().to_string();
-    // CBOR: a number of one byte follows its key.
-    assert!(text(&forged(&good, "width", &[0x17])).contains("px, announced") || !text(&forged(&good, "width", &[0x17])).is_empty());
+    // CBOR: numbers below 24 are one byte, 24 takes two; here a width of 24 becomes one of 25.
+    assert!(text(&forged(&good, "width", &[0x18, 25])).contains("size"), "{}", text(&forged(&good, "width", &[0x18, 25])));
+    // And the length of the first image one of 255 bytes.
+    assert!(text(&forged(&good, "wanted", &[0x82, 4])).contains("wanted views"));
     let header = u32::from_le_bytes(good[8..12].try_into().unwrap());
     let mut long = good.clone();
     long[8..12].copy_from_slice(&(header + (1 << 24)).to_le_bytes());
@@ -423,7 +328,7 @@ proptest! {
             let answer = answer_predict(&bytes, &served, 0, &|_| false);
             prop_assert!(answer.bytes.len() <= reply.len() + 4096, "{}", answer.bytes.len());
             if let Ok(read) = PredictReply::decode(&bytes, &asked)
-                && let vidar_link::geometry::Outcome::Predicted(geometry, _) = read.outcome
+                && let Outcome::Predicted(geometry, _) = read.outcome
             {
                 for view in geometry.views {
                     prop_assert!(view.chunk_from_camera.is_finite());

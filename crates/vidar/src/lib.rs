@@ -32,6 +32,7 @@ mod masks;
 pub mod models;
 pub mod odometry;
 pub mod quality;
+pub mod receive;
 pub mod run;
 pub mod run_folder;
 pub mod system;

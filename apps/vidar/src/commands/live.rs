@@ -4,6 +4,7 @@ use super::run::{conclude, dry_run, request};
 use crate::build::usage;
 use crate::live_args::LiveArgs;
 use crate::{Context, Outcome, progress};
+use vidar::config::Origin;
 use vidar::run::LiveOptions;
 
 /// The preset of what is live, where none is given.
@@ -11,7 +12,11 @@ const PRESET: &str = "live";
 
 /// The map while images come.
 pub fn live(args: &LiveArgs, context: &Context) -> Outcome {
-    let (request, thresholds) = request(&args.run, None, Some(PRESET), context)?;
+    let (mut request, thresholds) = request(&args.run, None, Some(PRESET), context)?;
+    if let Some(place) = &args.publish {
+        let place = toml::Value::String(place.clone());
+        request.layered.value("link.publish", place, Origin::Flag("--publish"))?;
+    }
     if args.run.dry_run {
         return dry_run(&request, context);
     }

@@ -15,6 +15,7 @@ pub mod inspect;
 pub mod live;
 pub mod model;
 pub mod odometry;
+pub mod receive;
 pub mod run;
 pub mod synth;
 pub mod view;

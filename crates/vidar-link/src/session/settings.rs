@@ -25,7 +25,10 @@ fn settings(options: &LinkOptions, role: Role) -> Result<Value, LinkError> {
         "mode": "peer",
         "scouting": { "multicast": { "enabled": false }, "gossip": { "enabled": false } },
         "listen": { "endpoints": [] },
-        "connect": { "endpoints": [], "timeout_ms": -1, "exit_on_failure": false },
+        "connect": {
+            "endpoints": [], "timeout_ms": -1, "exit_on_failure": false,
+            "retry": { "period_init_ms": 200, "period_max_ms": 2000, "period_increase_factor": 2 },
+        },
         "transport": { "link": { "rx": { "max_message_size": MAX_MESSAGE_BYTES + (1 << 20) } } },
     });
     let mut names_endpoints = !(options.listen.is_empty() && options.connect.is_empty());

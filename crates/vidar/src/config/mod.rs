@@ -340,6 +340,9 @@ pub struct LinkConfig {
     pub listen: String,
     /// A file of Zenoh's settings (JSON5): TLS, certificates, access control.
     pub config: String,
+    /// Where `vidar live` publishes poses, keyframes, cloud and health as ROS 2 messages: domain and namespace, such as `0/vidar`. Empty:
+    /// nowhere.
+    pub publish: String,
     /// After this time (s) without an answer a worker counts as slow and another one is asked. Several times as long as a chunk takes there.
     pub timeout_secs: f64,
     /// How long (s) a worker is waited for at the start, and while none answers.
@@ -348,8 +351,8 @@ pub struct LinkConfig {
 
 impl Default for LinkConfig {
     fn default() -> Self {
-        let (connect, listen, config) = Default::default();
-        Self { connect, listen, config, timeout_secs: 120.0, patience_secs: 10.0 }
+        let (connect, listen, config, publish) = Default::default();
+        Self { connect, listen, config, publish, timeout_secs: 120.0, patience_secs: 10.0 }
     }
 }
 

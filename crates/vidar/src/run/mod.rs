@@ -44,7 +44,7 @@ use crate::input::{self, ImageFiles, Measurement, UnseenScale};
 use crate::odometry::TrackedPoses;
 use crate::run_folder::{OutputLocation, RunFolder};
 use crate::verdict::{StatedScale, Verdict};
-use live::{EndingCell, SurfaceLatency, TrackedElsewhere};
+use live::{EndingCell, LivePublisher, SurfaceLatency, TrackedElsewhere};
 use place_recognition::PlaceRecognition;
 use readers::{FINISH, MAP, Readers};
 use record::Recorder;
@@ -311,7 +311,12 @@ impl Context<'_> {
         let elsewhere = elsewhere.map(|s| Box::new(TrackedElsewhere::new(s, ending.clone())) as _);
         let poses = tracked.map(|p| Box::new(p) as Box<dyn PoseSource>).or(elsewhere);
         let mut engine = self.engine(plan, poses, parts, &cancelled, &predicting)?;
+        let publisher = match self.live {
+            Some(_) => LivePublisher::open(config, &camera_on_rig(dataset, plan))?,
+            None => None,
+        };
         let mut readers = Readers::new(dataset, plan, config, folder, scene, events);
+        readers.publisher = publisher.as_ref();
         readers.surfaces = self.live.map(|_| SurfaceLatency::default());
         let pushed = events.stage(MAP, dataset.images.len(), || match self.live {
             Some(options) => live::push(self, (plan, options), &ending, &mut engine, &mut readers).map(Some),
