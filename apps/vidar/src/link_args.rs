@@ -24,7 +24,13 @@ pub struct LinkArgs {
 #[derive(Args, Clone, Debug)]
 pub struct WorkerArgs {
     /// Network that it serves: one of `vidar model list`.
-    #[arg(long, visible_alias = "geometry", value_name = "NAME", default_value = "da3-small", help_heading = "Model")]
+    #[arg(
+        long,
+        visible_alias = "geometry",
+        value_name = "NAME",
+        default_value = "da3-small",
+        help_heading = "Model"
+    )]
     pub model: String,
     /// Folder with model.safetensors and config.json, for custom weights; instead of --model.
     #[arg(long, value_hint = ValueHint::AnyPath, help_heading = "Model")]

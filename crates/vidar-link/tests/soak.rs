@@ -32,7 +32,12 @@ impl Proxy {
     fn start(to: u16) -> Self {
         let listener = TcpListener::bind("127.0.0.1:0").unwrap();
         let port = listener.local_addr().unwrap().port();
-        let this = Self { port, cut: Default::default(), stands_still: Default::default(), delay_ms: Default::default() };
+        let this = Self {
+            port,
+            cut: Default::default(),
+            stands_still: Default::default(),
+            delay_ms: Default::default(),
+        };
         let (cut, still, delay) = (this.cut.clone(), this.stands_still.clone(), this.delay_ms.clone());
         std::thread::spawn(move || {
             for here in listener.incoming().flatten() {
@@ -58,7 +63,9 @@ impl Proxy {
                                         break;
                                     }
                                 }
-                                Err(e) if [std::io::ErrorKind::WouldBlock, std::io::ErrorKind::TimedOut].contains(&e.kind()) => {}
+                                Err(e)
+                                    if [std::io::ErrorKind::WouldBlock, std::io::ErrorKind::TimedOut]
+                                        .contains(&e.kind()) => {}
                                 Err(_) => break,
                             }
                         }

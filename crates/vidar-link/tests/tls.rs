@@ -97,7 +97,8 @@ fn only_who_has_a_certificate_of_the_right_authority_is_answered() {
                     sender.send(endpoints).unwrap();
                 }
             };
-            Link::open(&listens, Role::Server)?.serve(KEY, "test", served, &told, &|| stop.load(Ordering::SeqCst))
+            Link::open(&listens, Role::Server)?
+                .serve(KEY, "test", served, &told, &|| stop.load(Ordering::SeqCst))
         });
         let endpoints = ready.recv_timeout(Duration::from_secs(20)).unwrap();
         assert_eq!(endpoints, [format!("tls/127.0.0.1:{port}")], "the file says where");

@@ -183,7 +183,11 @@ fn faults_cost_a_retry_and_never_a_chunk_or_a_bit() {
         assert!(same_bits(&found, &local(&views, 0..4)), "{fault:?}");
         assert_eq!(model.report().retries, 2, "{fault:?}");
         let asked = asked.lock().unwrap();
-        assert_eq!(asked[1..].iter().collect::<std::collections::BTreeSet<_>>().len(), 3, "each once: {asked:?}");
+        assert_eq!(
+            asked[1..].iter().collect::<std::collections::BTreeSet<_>>().len(),
+            3,
+            "each once: {asked:?}"
+        );
     }
 }
 
@@ -272,7 +276,11 @@ fn announced_sizes_are_believed_only_within_bounds() {
     PredictRequest::decode(&good).unwrap();
     let text = |bytes: &[u8]| PredictRequest::decode(bytes).unwrap_err().to_string();
     // CBOR: numbers below 24 are one byte, 24 takes two; here a width of 24 becomes one of 25.
-    assert!(text(&forged(&good, "width", &[0x18, 25])).contains("size"), "{}", text(&forged(&good, "width", &[0x18, 25])));
+    assert!(
+        text(&forged(&good, "width", &[0x18, 25])).contains("size"),
+        "{}",
+        text(&forged(&good, "width", &[0x18, 25]))
+    );
     // And the length of the first image one of 255 bytes.
     assert!(text(&forged(&good, "wanted", &[0x82, 4])).contains("wanted views"));
     let header = u32::from_le_bytes(good[8..12].try_into().unwrap());

@@ -511,7 +511,9 @@ fn link_hint(error: &vidar_link::LinkError) -> &'static str {
             "start `vidar worker --model da3-small` there; --connect names its endpoint; with TLS, a certificate that is not \
              accepted looks the same"
         }
-        L::OtherModel { .. } => "remote.model names the model that workers must have; give each of them the same",
+        L::OtherModel { .. } => {
+            "remote.model names the model that workers must have; give each of them the same"
+        }
         _ => "check the address, whether the port is free, and --link-config",
     }
 }

@@ -204,7 +204,9 @@ pub fn receive(
     while !is_over(&last) && !is_closed {
         let mut is_quiet = true;
         for subscription in &subscriptions {
-            let Some(sample) = subscription.next(if is_quiet { step } else { Duration::ZERO }) else { continue };
+            let Some(sample) = subscription.next(if is_quiet { step } else { Duration::ZERO }) else {
+                continue;
+            };
             (is_quiet, last) = (false, Some(Instant::now()));
             let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default().as_nanos() as u64;
             let mut written = writer.take(&sample, now).map(|_| ());
@@ -274,7 +276,10 @@ mod tests {
         assert!(!takes(&mut writer, &named("no topic")));
         assert!(!takes(&mut writer, &Sample { attachment: Some(vec![1, 2, 3]), ..sample(60, 1) }));
         assert!(!takes(&mut writer, &Sample { payload: vec![0; MAX_BYTES + 1], ..sample(60, 1) }));
-        assert!(takes(&mut writer, &Sample { attachment: None, ..sample(60, 1) }), "no attachment, no number");
+        assert!(
+            takes(&mut writer, &Sample { attachment: None, ..sample(60, 1) }),
+            "no attachment, no number"
+        );
         let received = writer.finish().unwrap();
         assert_eq!(received.topics, BTreeMap::from([("/imu/data".to_owned(), 52)]));
         assert_eq!((received.ignored, received.repeated, received.refused), (2, 2, 2));

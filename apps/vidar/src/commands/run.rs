@@ -56,7 +56,8 @@ pub(super) fn request(
 fn accept_licence(layered: &vidar::Layered, args: &RunArgs) -> Result<(), Error> {
     let Some(accepted) = super::model::accepted(&args.licence) else { return Ok(()) };
     let config = layered.build()?;
-    if !config.remote.model.is_empty() && config.geometry.source.starts_with(vidar::models::geometry::REMOTE) {
+    if !config.remote.model.is_empty() && config.geometry.source.starts_with(vidar::models::geometry::REMOTE)
+    {
         return vidar::models::accept(&config.remote.model, &accepted);
     }
     let Some(choice) = vidar::models::geometry::chosen(&config)? else { return Ok(()) };

@@ -32,7 +32,10 @@ pub fn worker(args: &WorkerArgs, context: &Context) -> Outcome {
         )),
         Serving::Answered { keyframes, took, received, sent, problem } if !context.cli.quiet => {
             let (took, kb) = (print::seconds(took.as_secs_f64()), |bytes: usize| bytes / 1000);
-            let outcome = problem.map_or_else(|| format!("{keyframes} keyframes"), |why| vidar::core::printable(&why).to_string());
+            let outcome = problem.map_or_else(
+                || format!("{keyframes} keyframes"),
+                |why| vidar::core::printable(&why).to_string(),
+            );
             print::talk(format!("{outcome} in {took}, {} kB in, {} kB out", kb(received), kb(sent)));
         }
         Serving::TooLate if !context.cli.quiet => print::talk("a request waited longer than its sender"),

@@ -69,9 +69,17 @@ mod built {
     impl Worker {
         fn start(endpoint: &str, more: &[&str]) -> Self {
             let mut command = command();
-            command.args(["worker", "--model", "da3-nano", "--key", "lab/depth", "--listen", endpoint, "--json"]);
-            let mut child =
-                command.args(more).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
+            command.args([
+                "worker",
+                "--model",
+                "da3-nano",
+                "--key",
+                "lab/depth",
+                "--listen",
+                endpoint,
+                "--json",
+            ]);
+            let mut child = command.args(more).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
             let mut ready = String::new();
             BufReader::new(child.stdout.take().unwrap()).read_line(&mut ready).unwrap();
             if ready.is_empty() {
@@ -83,7 +91,9 @@ mod built {
             assert_eq!((&ready["schema"], &ready["key"]), (&"vidar.worker/1".into(), &"lab/depth".into()));
             let (sender, told) = channel();
             let lines = BufReader::new(child.stderr.take().unwrap());
-            std::thread::spawn(move || lines.lines().map_while(Result::ok).for_each(|l| drop(sender.send(l))));
+            std::thread::spawn(move || {
+                lines.lines().map_while(Result::ok).for_each(|l| drop(sender.send(l)))
+            });
             Self { child, told }
         }
     }
@@ -133,7 +143,8 @@ mod built {
         assert!(number(&told, "bytes_sent") > 40_000 * number(&told, "keyframes"), "{told}");
         let small = ["--set", "remote.images=jpeg", "--set", "remote.depth=f16"];
         let smaller = mapped("jpeg", &[&at], &small);
-        let ratio = number(&smaller, "bytes_per_keyframe") as f64 / number(&told, "bytes_per_keyframe") as f64;
+        let ratio =
+            number(&smaller, "bytes_per_keyframe") as f64 / number(&told, "bytes_per_keyframe") as f64;
         assert!(ratio < 0.6, "{ratio}: {smaller}");
     }
 
@@ -164,7 +175,9 @@ mod built {
     fn another_model_and_nobody_at_all_are_refused_before_the_first_chunk() {
         let at = endpoint();
         let nobody = ["--connect", &at, "--set", "link.patience_secs=0.3"];
-        ended(run("nobody", "remote:lab/depth", &nobody)).ends_with(4).says(&["error[E0409]", "vidar worker"]);
+        ended(run("nobody", "remote:lab/depth", &nobody))
+            .ends_with(4)
+            .says(&["error[E0409]", "vidar worker"]);
         let _worker = Worker::start(&at, &[]);
         let other = ["--connect", &at, "--set", "remote.model=da3-small"];
         let ran = ended(run("other", "remote:lab/depth", &other)).ends_with(4);

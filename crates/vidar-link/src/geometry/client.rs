@@ -133,6 +133,9 @@ struct Known {
     last: u64,
 }
 
+/// Workers that answered, with their model or why they cannot use it so.
+type Found = Vec<(Known, Result<ModelFacts, String>)>;
+
 /// A model whose predictions are made elsewhere.
 pub struct RemoteModel {
     reach: Box<dyn Reach>,
@@ -171,15 +174,15 @@ impl RemoteModel {
         let found = this.wait_for(stop)?;
         let (usable, others): (Vec<_>, Vec<_>) =
             found.into_iter().partition(|(_, facts)| facts.as_ref().is_ok_and(|f| this.is_expected(f)));
-        let words = |(name, facts): &(Known, Result<ModelFacts, String>)| match facts {
+        let words = |(worker, facts): &(Known, Result<ModelFacts, String>)| match facts {
             Ok(f) => format!(
                 "{} has {} ({}, weights {})",
-                name.name,
+                worker.name,
                 vidar_core::printable(&f.model),
                 vidar_core::printable(&f.licence),
                 f.info.weights_sha256.as_deref().unwrap_or("none")
             ),
-            Err(why) => format!("{}: {}", name.name, vidar_core::printable(why)),
+            Err(why) => format!("{}: {}", worker.name, vidar_core::printable(why)),
         };
         let other = |reason: String| LinkError::OtherModel { key: this.report.key.clone(), reason };
         let Some((_, Ok(first))) = usable.first() else {
@@ -221,7 +224,7 @@ impl RemoteModel {
     }
 
     /// All workers that answer now. What is no answer of this protocol counts as none.
-    fn greet(&mut self) -> Result<Vec<(Known, Result<ModelFacts, String>)>, LinkError> {
+    fn greet(&mut self) -> Result<Found, LinkError> {
         let question = HelloRequest { protocol: PROTOCOL, settings: self.options.settings.clone() };
         let bad = |e: crate::WireError| LinkError::BadSetting {
             what: "the model's settings".into(),
@@ -239,11 +242,7 @@ impl RemoteModel {
     }
 
     /// As [`Self::greet`], for as long as the patience lasts.
-    #[allow(clippy::type_complexity)] // as of `greet`
-    fn wait_for(
-        &mut self,
-        stop: &dyn Fn() -> bool,
-    ) -> Result<Vec<(Known, Result<ModelFacts, String>)>, LinkError> {
+    fn wait_for(&mut self, stop: &dyn Fn() -> bool) -> Result<Found, LinkError> {
         let clock = Instant::now();
         loop {
             let found = self.greet()?;
@@ -271,7 +270,7 @@ impl RemoteModel {
         Ok(())
     }
 
-    fn keep_ours(&mut self, found: Vec<(Known, Result<ModelFacts, String>)>) {
+    fn keep_ours(&mut self, found: Found) {
         let ours = |(known, facts): (Known, Result<ModelFacts, String>)| {
             facts.is_ok_and(|f| f == self.facts).then_some(known)
         };

@@ -369,7 +369,8 @@ impl PredictReply {
             Outcome::Predicted(prediction, tokens) => (prediction, tokens),
         };
         let per_view = tokens.first().map_or(0, Vec::len);
-        if per_view > 0 && (tokens.len() != prediction.views.len() || tokens.iter().any(|t| t.len() != per_view))
+        if per_view > 0
+            && (tokens.len() != prediction.views.len() || tokens.iter().any(|t| t.len() != per_view))
         {
             return Err(WireError::bad("tokens", "as many for each view expected"));
         }
@@ -455,9 +456,8 @@ fn predicted(
             planes = rest;
             described.depth.take(mine)
         };
-        let mut plane = || {
-            Image::from_vec(width, height, take(width * height)).map_err(|e| WireError::bad("plane", e))
-        };
+        let mut plane =
+            || Image::from_vec(width, height, take(width * height)).map_err(|e| WireError::bad("plane", e));
         let (depth, confidence) = (RelativeDepth::new(plane()?), Confidence::new(plane()?));
         if tokens > 0 {
             all_tokens.push(take(tokens).into_iter().map(|v| if v.is_finite() { v } else { 0.0 }).collect());

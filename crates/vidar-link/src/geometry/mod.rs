@@ -5,7 +5,7 @@ mod message;
 mod pixels;
 mod server;
 
-pub use client::{AskError, Expected, RemoteModel, RemoteOptions, RemoteReport, Reach};
+pub use client::{AskError, Expected, Reach, RemoteModel, RemoteOptions, RemoteReport};
 pub use message::{Hello, HelloRequest, ModelFacts, Outcome, PredictReply, PredictRequest};
 pub use pixels::{DepthFormat, ImageFormat};
 pub use server::{Answer, Predicted, Served, answer_hello, answer_predict};

@@ -67,15 +67,16 @@ impl DepthFormat {
             Self::F32 => {
                 bytes.chunks_exact(4).map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]])).collect()
             }
-            Self::F16 => {
-                bytes.chunks_exact(2).map(|b| f16::from_le_bytes([b[0], b[1]]).to_f32()).collect()
-            }
+            Self::F16 => bytes.chunks_exact(2).map(|b| f16::from_le_bytes([b[0], b[1]]).to_f32()).collect(),
         }
     }
 }
 
 /// An image as bytes. 16 bits do not fit into JPEG and travel as they are.
-pub(crate) fn encode(image: &FrameImage, as_format: ImageFormat) -> Result<(PixelFormat, Vec<u8>), WireError> {
+pub(crate) fn encode(
+    image: &FrameImage,
+    as_format: ImageFormat,
+) -> Result<(PixelFormat, Vec<u8>), WireError> {
     let (width, height) = (image.width(), image.height());
     Ok(match (image, as_format) {
         (FrameImage::Gray16(i), _) => {
@@ -93,7 +94,11 @@ pub(crate) fn encode(image: &FrameImage, as_format: ImageFormat) -> Result<(Pixe
     })
 }
 
-fn jpeg(data: &[u8], (width, height): (usize, usize), color: ExtendedColorType) -> Result<Vec<u8>, WireError> {
+fn jpeg(
+    data: &[u8],
+    (width, height): (usize, usize),
+    color: ExtendedColorType,
+) -> Result<Vec<u8>, WireError> {
     within("width of an image", width, MAX_SIDE_PX)?;
     within("height of an image", height, MAX_SIDE_PX)?;
     let mut bytes = Vec::new();

@@ -82,7 +82,11 @@ mod tests {
     use super::*;
 
     fn one() -> Attachment {
-        Attachment { sequence: 7, sent_ns: 1_700_000_000_123_456_789, sender: std::array::from_fn(|i| i as u8) }
+        Attachment {
+            sequence: 7,
+            sent_ns: 1_700_000_000_123_456_789,
+            sender: std::array::from_fn(|i| i as u8),
+        }
     }
 
     #[test]

@@ -33,9 +33,8 @@ impl TopicKey {
         let (domain, topic) = rest.split_once('/').ok_or_else(bad)?;
         let (package, name) = message_type.split_once("::msg::dds_::").ok_or_else(bad)?;
         let name = name.strip_suffix('_').ok_or_else(bad)?;
-        let plain = |text: &str| {
-            !text.is_empty() && text.chars().all(|c| c.is_ascii_alphanumeric() || c == '_')
-        };
+        let plain =
+            |text: &str| !text.is_empty() && text.chars().all(|c| c.is_ascii_alphanumeric() || c == '_');
         if !(plain(package) && plain(name) && plain(hash)) || topic.is_empty() {
             return Err(bad());
         }
@@ -81,7 +80,9 @@ mod tests {
         let read = TopicKey::parse(&key).unwrap();
         assert_eq!((read.domain, read.topic.as_str()), (3, "/vidar/pose"));
         assert_eq!(read.message_type, "geometry_msgs/PoseStamped");
-        for bad in ["", "0", "0/a", "x/a/p::msg::dds_::T_/h", "0/a/p::msg::dds_::T/h", "0/a/p::srv::dds_::T_/h"] {
+        for bad in
+            ["", "0", "0/a", "x/a/p::msg::dds_::T_/h", "0/a/p::msg::dds_::T/h", "0/a/p::srv::dds_::T_/h"]
+        {
             assert!(TopicKey::parse(bad).is_err(), "{bad}");
         }
         assert!(TopicKey::parse(&format!("0/{}/p::msg::dds_::T_/h", "a".repeat(2000))).is_err());

@@ -8,5 +8,5 @@ mod message;
 pub use attachment::Attachment;
 pub use key::{TopicKey, liveliness_token};
 pub use message::{
-    CloudPoint, HealthLevel, RosType, health, odometry, pose_stamped, point_cloud, transforms,
+    CloudPoint, HealthLevel, RosType, health, odometry, point_cloud, pose_stamped, transforms,
 };

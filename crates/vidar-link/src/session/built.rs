@@ -181,7 +181,9 @@ impl Link {
 
 fn checked(key: &str) -> Result<(), LinkError> {
     let found = zenoh::key_expr::KeyExpr::try_from(key.to_owned());
-    found.map(|_| ()).map_err(|e| LinkError::BadSetting { what: format!("key {key:?}"), reason: e.to_string() })
+    found
+        .map(|_| ())
+        .map_err(|e| LinkError::BadSetting { what: format!("key {key:?}"), reason: e.to_string() })
 }
 
 struct Workers {
@@ -285,7 +287,8 @@ impl Waiting {
         let waited = self.changed.wait_timeout_while(inner, within, |inner| inner.samples.is_empty());
         let mut inner = waited.map_or_else(|e| e.into_inner().0, |(inner, _)| inner);
         let sample = inner.samples.pop_front()?;
-        inner.bytes -= sample.key.len() + sample.payload.len() + sample.attachment.as_ref().map_or(0, Vec::len);
+        inner.bytes -=
+            sample.key.len() + sample.payload.len() + sample.attachment.as_ref().map_or(0, Vec::len);
         Some(sample)
     }
 }

@@ -99,7 +99,8 @@ mod tests {
     fn a_file_comes_over_the_defaults_and_leaves_the_others() {
         let path = std::env::temp_dir().join(format!("vidar-link-{}.json5", std::process::id()));
         let options = LinkOptions { config: Some(path.clone()), ..LinkOptions::default() };
-        std::fs::write(&path, "{ /* x */ connect: { endpoints: ['tls/host:7447'] }, mode: 'client' }").unwrap();
+        std::fs::write(&path, "{ /* x */ connect: { endpoints: ['tls/host:7447'] }, mode: 'client' }")
+            .unwrap();
         let made = settings(&options, Role::Client).unwrap();
         assert_eq!(made["connect"]["endpoints"], json!(["tls/host:7447"]));
         assert_eq!((&made["mode"], &made["connect"]["timeout_ms"]), (&json!("client"), &json!(-1)));

@@ -206,7 +206,8 @@ impl Plan {
             }
         }
         if let Some(remote) = &self.remote {
-            let (model, licence) = (vidar_core::printable(&remote.model), vidar_core::printable(&remote.licence));
+            let (model, licence) =
+                (vidar_core::printable(&remote.model), vidar_core::printable(&remote.licence));
             let arithmetic = vidar_core::printable(&remote.arithmetic);
             lines.push(("computed elsewhere", format!("{model} ({licence}), {arithmetic}")));
         }

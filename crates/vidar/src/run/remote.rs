@@ -97,9 +97,13 @@ fn check_licence(key: &str, facts: &ModelFacts) -> Result<(), Error> {
     match known {
         Some((name, licence)) if licence != facts.licence => {
             let found = vidar_core::printable(&facts.licence);
-            return other(format!("these are the weights of {name}, whose licence is {licence}, not {found}"));
+            return other(format!(
+                "these are the weights of {name}, whose licence is {licence}, not {found}"
+            ));
         }
-        None if models::known_hash(&facts.model).is_ok_and(|h| h.is_some()) || facts.model == bundled::NAME => {
+        None if models::known_hash(&facts.model).is_ok_and(|h| h.is_some())
+            || facts.model == bundled::NAME =>
+        {
             let name = vidar_core::printable(&facts.model);
             return other(format!("they call their model {name}, and its weights have another hash"));
         }

@@ -95,7 +95,9 @@ impl Source {
         match self {
             Self::Network(network) => Some(network),
             Self::Auto(AutoModel { shapes: Some(Shapes::Network(network)), .. }) => Some(network),
-            Self::Auto(_) | Self::Stereo(_) | Self::Recorded(_) | Self::Simulated(_) | Self::Remote(_) => None,
+            Self::Auto(_) | Self::Stereo(_) | Self::Recorded(_) | Self::Simulated(_) | Self::Remote(_) => {
+                None
+            }
         }
     }
 

@@ -19,8 +19,8 @@ mod tracker;
 
 pub(super) use ending::{EndingCell, TrackedElsewhere};
 pub use latency::Latency;
-pub(super) use publish::LivePublisher;
 pub(super) use latency::SurfaceLatency;
+pub(super) use publish::LivePublisher;
 
 use super::readers::{MAP, Readers};
 use super::{Context, Plan, unreadable};

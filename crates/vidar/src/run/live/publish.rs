@@ -174,10 +174,8 @@ impl LivePublisher {
                 let mesh = &surface.mesh;
                 let step = mesh.positions.len().div_ceil(MOST_POINTS).max(1);
                 let color = |i: usize| mesh.colors.get(i).copied().unwrap_or([128; 3]);
-                let points: Vec<CloudPoint> = (0..mesh.positions.len())
-                    .step_by(step)
-                    .map(|i| (mesh.positions[i], color(i)))
-                    .collect();
+                let points: Vec<CloudPoint> =
+                    (0..mesh.positions.len()).step_by(step).map(|i| (mesh.positions[i], color(i))).collect();
                 self.put(Topic::Cloud, point_cloud(self.time(), WORLD, &points));
             }
             MapEvent::Warning(warning) => {
