@@ -52,6 +52,10 @@ fn a_program_without_links_says_so() {
 #[cfg(feature = "link")]
 mod built {
     use super::*;
+    use crate::odometry::flight;
+    use std::collections::BTreeMap;
+    use vidar::link::ros::Attachment;
+    use vidar::link::{Link, LinkOptions, Publisher, Role};
 
     /// A port that is free now.
     fn endpoint() -> String {
@@ -214,5 +218,118 @@ mod built {
         let mut worker = command();
         worker.args(["worker", "--model", "stereo"]);
         ended(worker).ends_with(2).says(&["error[E0105]", "\"stereo\" is none"]);
+    }
+
+    /// `vidar receive` in a process of its own, which waits for messages when this returns.
+    fn receiving(at: &str, file: &Path, idle: &str) -> Child {
+        let mut receive = command();
+        receive.args([
+            "receive",
+            "0/**",
+            "--listen",
+            at,
+            "--idle",
+            idle,
+            "--duration",
+            "120",
+            "--json",
+            "-o",
+        ]);
+        let mut child = receive.arg(file).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
+        let mut lines = BufReader::new(child.stderr.take().unwrap());
+        let mut line = String::new();
+        lines.read_line(&mut line).unwrap();
+        assert!(line.contains("waiting for messages"), "{line}");
+        child
+    }
+
+    fn received(child: Child) -> serde_json::Value {
+        let ran: ProgramOutput = child.wait_with_output().unwrap().into();
+        ran.ends_with(0).json()["received"].clone()
+    }
+
+    #[test]
+    fn a_robot_that_is_received_makes_the_map_of_its_recording() {
+        let folder = out("robot");
+        std::fs::create_dir_all(&folder).unwrap();
+        let (drive, file) = (folder.join("drive.mcap"), folder.join("received.mcap"));
+        let mut convert = command();
+        convert.arg("convert").arg(&shared().sequence).arg(&drive).arg("-q");
+        ended(convert).ends_with(0);
+        let at = endpoint();
+        let child = receiving(&at, &file, "3");
+        // What the recording holds, as a robot sends it.
+        let options = LinkOptions { connect: vec![at], ..LinkOptions::default() };
+        let link = Link::open(&options, Role::Client).unwrap();
+        let bytes = std::fs::read(&drive).unwrap();
+        let mut publishers: BTreeMap<String, (Publisher, i64)> = BTreeMap::new();
+        let sends = |message: &mcap::Message<'_>| message.channel.topic != "/ground_truth";
+        let messages: Vec<mcap::Message<'_>> =
+            mcap::MessageStream::new(&bytes).unwrap().map(Result::unwrap).filter(sends).collect();
+        for message in &messages {
+            let topic = message.channel.topic.clone();
+            let (package, name) = message.channel.schema.as_ref().unwrap().name.split_once("/msg/").unwrap();
+            let key = format!("0{topic}/{package}::msg::dds_::{name}_/RIHS01_0");
+            publishers.entry(topic).or_insert_with(|| (link.publisher(&key, None).unwrap(), 0));
+        }
+        std::thread::sleep(Duration::from_secs(2));
+        for message in &messages {
+            let (publisher, sequence) = publishers.get_mut(&message.channel.topic).unwrap();
+            *sequence += 1;
+            let attached =
+                Attachment { sequence: *sequence, sent_ns: message.publish_time as i64, sender: [7; 16] };
+            // Everything comes twice.
+            for _ in 0..2 {
+                publisher.put(message.data.to_vec(), attached.encode()).unwrap();
+            }
+            std::thread::sleep(Duration::from_micros(200));
+        }
+        let told = received(child);
+        let count: u64 = told["topics"].as_object().unwrap().values().map(|n| n.as_u64().unwrap()).sum();
+        let known: u64 = messages.len() as u64;
+        assert_eq!(
+            (count + told["ignored"].as_u64().unwrap() / 2, &told["dropped"]),
+            (known, &0.into()),
+            "{told}"
+        );
+        assert_eq!(told["repeated"].as_u64(), Some(count), "{told}");
+        let mesh_of = |recording: &Path, name: &str| {
+            let out = folder.join(name);
+            let mut run = command();
+            run.arg("run").arg(recording).arg("-o").arg(&out).arg("--config").arg(&shared().settings);
+            run.args(["-q", "--mode", "pose-free", "--geometry", "da3-nano", "--set", "input.poses=auto"]);
+            let ran = ended(run);
+            assert!([0, 3].contains(&ran.code), "{}", ran.stderr);
+            mesh(&out)
+        };
+        assert!(mesh_of(&drive, "of the drive") == mesh_of(&file, "of what came"), "the same bits");
+    }
+
+    #[test]
+    fn a_live_run_tells_ros_where_it_is() {
+        let folder = out("told");
+        std::fs::create_dir_all(&folder).unwrap();
+        let (at, file, map) = (endpoint(), folder.join("tf.mcap"), folder.join("map"));
+        let child = receiving(&at, &file, "20");
+        let mut live = command();
+        live.arg("live").arg(flight()).arg("-o").arg(&map).args([
+            "-q",
+            "--set",
+            "input.poses=odometry",
+            "--realtime",
+        ]);
+        live.args(["--publish", "0/vidar", "--connect", &at]);
+        let ran = ended(live);
+        assert!([0, 3].contains(&ran.code), "{}", ran.stderr);
+        let told = received(child);
+        let lines = std::fs::read_to_string(map.join("trajectory/live.tum")).unwrap();
+        let poses = lines.lines().filter(|l| !l.starts_with('#')).count() as u64;
+        let transforms = told["topics"]["/tf"].as_u64().unwrap();
+        assert!(transforms <= poses && transforms > poses / 2, "{transforms} of {poses}: {told}");
+        // Poses, odometry, keyframes, clouds and health are of types that no map needs.
+        assert!(told["ignored"].as_u64().unwrap() > poses, "{told}");
+        let mut wrong = command();
+        wrong.arg("live").arg(flight()).args(["--publish", "vidar", "-o"]).arg(folder.join("wrong"));
+        ended(wrong).ends_with(2).says(&["error[E0105]", "--publish 0/vidar"]);
     }
 }

@@ -9,7 +9,7 @@ use std::sync::atomic::{AtomicI64, AtomicU64, Ordering};
 use std::sync::{Mutex, PoisonError};
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 use vidar_align::covariance::covariance_in_camera;
-use vidar_core::{OdometryKeyframe, RigCamera, Severity, Timestamp};
+use vidar_core::{OdometryKeyframe, PoseCovariance, RigCamera, Se3, Severity, Timestamp};
 use vidar_link::ros::{Attachment, CloudPoint, HealthLevel, RosType, TopicKey, liveliness_token};
 use vidar_link::ros::{health, odometry, point_cloud, pose_stamped, transforms};
 use vidar_link::{Link, LinkError, Publisher, Role};
@@ -47,7 +47,7 @@ enum Topic {
 pub(in crate::run) struct LivePublisher {
     publishers: BTreeMap<Topic, (Publisher, AtomicI64)>,
     id: [u8; 16],
-    body_from_camera: vidar_core::Se3,
+    body_from_camera: Se3,
     /// Row by row, position then rotation, in the world's axes; none before the first keyframe.
     covariance: Mutex<Option<[f64; 36]>>,
     images: AtomicU64,
@@ -123,7 +123,8 @@ impl LivePublisher {
         };
         let mut known = self.covariance.lock().unwrap_or_else(PoisonError::into_inner);
         if let Some(keyframe) = keyframe {
-            *known = Some(in_world(keyframe, &self.body_from_camera));
+            let OdometryKeyframe { pose_covariance, world_from_camera, .. } = keyframe;
+            *known = Some(in_world(pose_covariance, world_from_camera, &self.body_from_camera));
         }
         // A first element of -1 says that it is not known.
         let covariance = known.unwrap_or_else(|| std::array::from_fn(|i| if i == 0 { -1.0 } else { 0.0 }));
@@ -190,9 +191,9 @@ impl LivePublisher {
 }
 
 /// The covariance of a keyframe's camera in the world's axes: position, then rotation.
-fn in_world(keyframe: &OdometryKeyframe, body_from_camera: &vidar_core::Se3) -> [f64; 36] {
-    let covariance = covariance_in_camera(&keyframe.pose_covariance, body_from_camera);
-    let turn = keyframe.world_from_camera.rotation.matrix();
+fn in_world(in_body: &PoseCovariance, world_from_camera: &Se3, body_from_camera: &Se3) -> [f64; 36] {
+    let covariance = covariance_in_camera(in_body, body_from_camera);
+    let turn = world_from_camera.rotation.matrix();
     // Rotation comes first in a tangent, position in a message.
     let block = |row: usize, column: usize| {
         let part = covariance.fixed_view::<3, 3>(3 * (1 - row), 3 * (1 - column));
@@ -207,6 +208,9 @@ fn in_world(keyframe: &OdometryKeyframe, body_from_camera: &vidar_core::Se3) -> 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use vidar_bag::message::decode;
+    use vidar_bag::{Encoding, FramePose, FrameTransform, Header, Message, Pose};
+    use vidar_core::So3;
 
     #[test]
     fn a_place_in_a_ros_system_is_a_domain_and_a_namespace() {
@@ -215,5 +219,35 @@ mod tests {
         for bad in ["", "vidar", "x/vidar", "0/", "0/a b", "0/a//b", "0/*"] {
             assert_eq!(prefix(bad).unwrap_err().code(), "E0105", "{bad}");
         }
+    }
+
+    #[test]
+    fn what_is_published_is_read_by_the_reader_of_bags() {
+        let (frames, at) = (("map", CAMERA), Timestamp::from_nanos(1_700_000_000_000_000_001));
+        let turn = So3::from_quaternion(0.1, 0.2, -0.3, 0.9).unwrap();
+        let pose = Se3::new(turn, [1.0, -2.0, 3.5].into());
+        let stated = Pose { position: [1.0, -2.0, 3.5], orientation: turn.quaternion_xyzw() };
+        let header = Header { stamp: at, frame: "map".into() };
+        let read = |name: &str, bytes: &[u8]| decode(name, Encoding::Cdr, bytes).unwrap();
+        let one = |child: &str| FramePose { header: header.clone(), child: child.into(), pose: stated };
+        let covariance = std::array::from_fn(|i| i as f64);
+        let found = read("nav_msgs/Odometry", &odometry(at, frames, &pose, &covariance));
+        assert_eq!(found, Message::Poses(vec![one(CAMERA)]));
+        let found = read("geometry_msgs/PoseStamped", &pose_stamped(at, "map", &pose));
+        assert_eq!(found, Message::Poses(vec![one("")]));
+        let found = read("tf2_msgs/TFMessage", &transforms(at, frames, &pose));
+        let transform = FrameTransform { parent: header, child: CAMERA.into(), pose: stated };
+        assert_eq!(found, Message::Transforms(vec![transform]));
+    }
+
+    #[test]
+    fn a_covariance_is_in_the_axes_of_the_world_position_first() {
+        // Half a turn less a quarter: the camera's x is the world's y, its y the world's -x.
+        let turn = So3::from_quaternion(0.0, 0.0, 0.5_f64.sqrt(), 0.5_f64.sqrt()).unwrap();
+        let pose = Se3::new(turn, [7.0, 8.0, 9.0].into());
+        let covariance = PoseCovariance::from_diagonal(&[1.0, 2.0, 3.0, 4.0, 5.0, 6.0].into());
+        let found = in_world(&covariance, &pose, &Se3::IDENTITY);
+        let diagonal: Vec<f64> = (0..6).map(|i| (1e9 * found[7 * i]).round() / 1e9).collect();
+        assert_eq!(diagonal, [5.0, 4.0, 6.0, 2.0, 1.0, 3.0]);
     }
 }
