@@ -224,8 +224,7 @@ pub fn receive(
     let received = writer.received.clone();
     match writer.finish() {
         Ok(received) => Ok(received),
-        Err(error) if ended(Err(error)).map_err(failed)? => Ok(received),
-        Err(error) => Err(failed(error)),
+        Err(error) => ended(Err(error)).map(|_| received).map_err(failed),
     }
 }
 
