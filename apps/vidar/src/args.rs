@@ -71,7 +71,7 @@ pub enum Command {
     Run(Box<WholeRunArgs>),
     /// Map while images come: poses from a thread of its own, a growing surface, latencies measured.
     #[command(
-        after_help = "Examples:\n  vidar live drive.mcap --realtime -o result\n  vidar live mav0/ --preset euroc --realtime\n  vidar live mav0/ -o result --resume"
+        after_help = "Examples:\n  vidar live drive.mcap --realtime -o result\n  vidar live mav0/ --preset euroc --realtime\n  vidar live mav0/ -o result --resume\n  vidar live 'zenoh:0/cam0/**,0/imu/**' --connect tcp/robot:7447 -o result"
     )]
     Live(Box<LiveArgs>),
     /// Render a flight through a synthetic room, map it and evaluate the map; nothing is downloaded.

@@ -1,7 +1,7 @@
 //! A recording from standard input, written as `-`: copied to a temporary file, because readers go back and forth in it.
 
 use std::fs::File;
-use std::io::{IsTerminal, Read};
+use std::io::{IsTerminal, Read, Stdin};
 use std::path::{Path, PathBuf};
 use tempfile::TempDir;
 use vidar::Error;
@@ -17,9 +17,19 @@ pub struct Spooled {
 
 /// The recording at a path, or on standard input for `-`.
 pub fn recording(path: &Path) -> Result<Spooled, Error> {
-    if path != Path::new("-") {
+    if !is_standard_input(path) {
         return Ok(Spooled { path: path.to_owned(), _copy: None });
     }
+    copy(standard_input()?.lock(), MAX_BYTES)
+}
+
+/// Whether a path stands for standard input.
+pub fn is_standard_input(path: &Path) -> bool {
+    path == Path::new("-")
+}
+
+/// Standard input, where something is sent into it.
+pub fn standard_input() -> Result<Stdin, Error> {
     let input = std::io::stdin();
     if input.is_terminal() {
         let what = "`-` reads a recording from standard input, which is a terminal here".to_owned();
@@ -28,16 +38,21 @@ pub fn recording(path: &Path) -> Result<Spooled, Error> {
             hint: "send a bag into it: cat drive.mcap | vidar inspect -".into(),
         });
     }
-    copy(input.lock(), MAX_BYTES)
+    Ok(input)
 }
 
 /// Refuses standard input where a recording is read again after the command: a run is resumed, evaluated and exported from it.
 pub fn refuse(path: &Path) -> Result<(), Error> {
-    if path != Path::new("-") {
+    if !is_standard_input(path) {
         return Ok(());
     }
     let what = "a run needs its recording again, and standard input is read only once".to_owned();
-    Err(Error::Usage { what, hint: "write it to a file first, such as `vidar convert - drive.mcap`".into() })
+    Err(Error::Usage {
+        what,
+        hint:
+            "write it to a file first, such as `vidar convert - drive.mcap`; `vidar live -` keeps what comes"
+                .into(),
+    })
 }
 
 fn copy(input: impl Read, limit: u64) -> Result<Spooled, Error> {

@@ -1,15 +1,16 @@
 //! An open recording: one bag, or the split files of one.
 
+use crate::chunks::Chunks;
 use crate::compression::Compression;
 use crate::db3::{self, Db3};
 use crate::error::BagError;
 use crate::file::BagFile;
-use crate::index::{Encoding, FileIndex, MessageRef, NO_CHUNK, Topic};
+use crate::index::{CUT_OFF, Encoding, FileIndex, MessageRef, NO_CHUNK, Topic};
 use crate::message::{self, Header, Message};
 use crate::{mcap, metadata, parts, ros1, sqlite};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
-use std::sync::{Arc, Mutex, OnceLock, PoisonError};
+use std::sync::Arc;
 use vidar_core::{Timestamp, Warning};
 
 /// The containers that are read.
@@ -51,7 +52,7 @@ pub struct Bag {
     warnings: Vec<Warning>,
     metadata: BTreeMap<String, BTreeMap<String, String>>,
     messages_are_compressed: bool,
-    cache: Mutex<Cache>,
+    unpacked: Chunks,
 }
 
 /// One file with its chunks.
@@ -63,8 +64,8 @@ struct Part {
 
 #[derive(Debug)]
 enum Container {
-    Ros1(BagFile),
-    Mcap(BagFile),
+    Ros1(Arc<BagFile>),
+    Mcap(Arc<BagFile>),
     Sqlite(Db3),
 }
 
@@ -76,19 +77,6 @@ impl Container {
         }
     }
 }
-
-/// The chunks decompressed last. Neighbouring messages share a chunk; sensors that are read side by side are a few chunks apart.
-#[derive(Debug, Default)]
-struct Cache {
-    /// File, chunk, announced size, content.
-    chunks: Vec<(u16, u32, u64, Arc<Unpacked>)>,
-}
-
-/// A chunk that is decompressed once, by the first thread that needs it, while others wait; or why it cannot be.
-type Unpacked = OnceLock<Result<Vec<u8>, String>>;
-
-/// Decompressed chunks that are kept, bytes; the newest stays even when it is larger.
-const CACHE_BYTES: u64 = 32 << 20;
 
 /// Bytes that hold stamp and frame of any message; names of frames are far shorter.
 const HEADER_BYTES: u64 = 1 << 10;
@@ -109,33 +97,52 @@ impl Bag {
             let (path, found) = (path.to_path_buf(), files.len() as u64);
             return Err(BagError::TooLarge { path, what: "files", found, limit: parts::MAX_FILES as u64 });
         }
-        let mut bag = Self {
+        let mut bag = Self { messages_are_compressed, ..Self::without_files(path) };
+        let files = files.iter().map(|file| BagFile::open(file));
+        bag.list(files)?;
+        Ok(bag)
+    }
+
+    /// Opens the first bytes of an MCAP file that is still written, as if it had no more.
+    pub fn open_beginning(path: &Path, bytes: u64) -> Result<Self, BagError> {
+        let mut bag = Self::without_files(path);
+        bag.list([BagFile::beginning(path, bytes)].into_iter())?;
+        bag.warnings.retain(|w| w.kind != CUT_OFF);
+        Ok(bag)
+    }
+
+    fn without_files(path: &Path) -> Self {
+        Self {
             path: path.to_path_buf(),
             format: BagFormat::Mcap,
             parts: Vec::new(),
             topics: Vec::new(),
             warnings: Vec::new(),
             metadata: BTreeMap::new(),
-            messages_are_compressed,
-            cache: Mutex::default(),
-        };
-        let mut topics = BTreeMap::<(String, String), Topic>::new();
-        for file in &files {
-            let (format, container, index) = open_file(file)?;
-            bag.format = format;
-            bag.take(index, container, &mut topics);
+            messages_are_compressed: false,
+            unpacked: Chunks::default(),
         }
-        bag.topics = topics.into_values().collect();
-        for (number, topic) in bag.topics.iter_mut().enumerate() {
+    }
+
+    /// Lists topics and messages of the files.
+    fn list(&mut self, files: impl Iterator<Item = Result<BagFile, BagError>>) -> Result<(), BagError> {
+        let mut topics = BTreeMap::<(String, String), Topic>::new();
+        for file in files {
+            let (format, container, index) = open_file(file?)?;
+            self.format = format;
+            self.take(index, container, &mut topics);
+        }
+        self.topics = topics.into_values().collect();
+        for (number, topic) in self.topics.iter_mut().enumerate() {
             topic.messages.iter_mut().for_each(|m| m.topic = number as u16);
             // Stable: messages of one time stay in the order in which they were written.
             topic.messages.sort_by_key(|m| m.log_time);
         }
-        if bag.topics.iter().all(|t| t.messages.is_empty()) {
-            let found = format!("{} topics without messages", bag.topics.len());
-            return Err(BagError::Empty { path: path.to_path_buf(), found });
+        if self.topics.iter().all(|t| t.messages.is_empty()) {
+            let found = format!("{} topics without messages", self.topics.len());
+            return Err(BagError::Empty { path: self.path.clone(), found });
         }
-        Ok(bag)
+        Ok(())
     }
 
     /// Adds the index of one file.
@@ -219,15 +226,7 @@ impl Bag {
             return message::header(topic.encoding, &topic.message_type, &head)
                 .map_err(|reason| self.bad_message(message, reason));
         }
-        let header = match self.read(message)? {
-            Message::Image(m) => m.header,
-            Message::CompressedImage(m) | Message::CompressedVideo(m) => m.header,
-            Message::Imu(m) => m.header,
-            Message::CameraInfo(m) => m.header,
-            Message::Transforms(m) => m.into_iter().next().map(|t| t.parent).unwrap_or_default(),
-            Message::Poses(m) => m.into_iter().next().map(|p| p.header).unwrap_or_default(),
-        };
-        Ok(header)
+        Ok(self.read(message)?.header())
     }
 
     /// The serialised bytes of one message.
@@ -271,37 +270,19 @@ impl Bag {
                 Container::Sqlite(_) => Ok(None),
             };
         }
-        let unpacked = self.cached(message, chunk.size);
-        let file = part.container.file();
-        let content = unpacked.get_or_init(|| {
-            let packed = file.read(chunk.offset, chunk.stored).map_err(|e| e.to_string())?;
-            chunk.compression.decompress(&packed, Some(chunk.size))
-        });
-        let bytes = content.as_ref().map_err(|reason| {
-            let found = format!("a chunk that is damaged: {reason}");
-            file.malformed(chunk.offset, found, "a whole chunk")
-        })?;
-        Ok(match &part.container {
-            Container::Ros1(_) => ros1::message_in(bytes, message.offset).map(|b| cut(b, most)),
-            Container::Mcap(_) => mcap::message_in(bytes, message.offset).map(|b| cut(b, most)),
-            Container::Sqlite(_) => None,
-        })
-    }
-
-    /// The place of a chunk among those that are kept, as the newest.
-    fn cached(&self, message: &MessageRef, size: u64) -> Arc<Unpacked> {
-        let mut cache = self.cache.lock().unwrap_or_else(PoisonError::into_inner);
-        let chunks = &mut cache.chunks;
-        let place = chunks.iter().position(|c| (c.0, c.1) == (message.file, message.chunk));
-        let found = place.map(|at| chunks.remove(at));
-        let kept = found.unwrap_or_else(|| (message.file, message.chunk, size, Arc::default()));
-        let unpacked = Arc::clone(&kept.3);
-        chunks.push(kept);
-        let mut held: u64 = chunks.iter().map(|c| c.2).sum();
-        while held > CACHE_BYTES && chunks.len() > 1 {
-            held -= chunks.remove(0).2;
-        }
-        unpacked
+        let (Container::Ros1(file) | Container::Mcap(file)) = &part.container else { return Ok(None) };
+        let read = |content: &Result<Vec<u8>, String>| {
+            let bytes = content.as_ref().map_err(|reason| {
+                let found = format!("a chunk that is damaged: {reason}");
+                file.malformed(chunk.offset, found, "a whole chunk")
+            })?;
+            let found = match &part.container {
+                Container::Ros1(_) => ros1::message_in(bytes, message.offset),
+                _ => mcap::message_in(bytes, message.offset),
+            };
+            Ok(found.map(|bytes| cut(bytes, most)))
+        };
+        self.unpacked.get((message.file, file), &part.chunks, message.chunk, read).unwrap_or(Ok(None))
     }
 
     fn bad_message(&self, message: &MessageRef, reason: String) -> BagError {
@@ -324,17 +305,16 @@ fn cut(bytes: &[u8], most: u64) -> Vec<u8> {
     bytes[..length].to_vec()
 }
 
-fn open_file(path: &Path) -> Result<(BagFormat, Container, FileIndex), BagError> {
-    let file = BagFile::open(path)?;
+fn open_file(file: BagFile) -> Result<(BagFormat, Container, FileIndex), BagError> {
     let head = file.read(0, file.length().min(16))?;
     Ok(match BagFormat::of_bytes(&head) {
         Some(format @ BagFormat::Ros1) => {
             let index = ros1::index(&file)?;
-            (format, Container::Ros1(file), index)
+            (format, Container::Ros1(Arc::new(file)), index)
         }
         Some(format @ BagFormat::Mcap) => {
             let index = mcap::index(&file)?;
-            (format, Container::Mcap(file), index)
+            (format, Container::Mcap(Arc::new(file)), index)
         }
         Some(format @ BagFormat::Sqlite) => {
             let (db3, index) = db3::index(file)?;
@@ -347,7 +327,7 @@ fn open_file(path: &Path) -> Result<(BagFormat, Container, FileIndex), BagError>
                 head => format!("a file whose first bytes are {head:02x?}"),
             };
             let expected = "a ROS 1 bag 2.0, an MCAP file or an SQLite bag of ROS 2".to_string();
-            return Err(BagError::NotABag { path: path.to_path_buf(), found, expected });
+            return Err(BagError::NotABag { path: file.path().to_path_buf(), found, expected });
         }
     })
 }

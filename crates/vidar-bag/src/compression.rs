@@ -1,6 +1,7 @@
 //! Decompression of chunks and messages, never to more bytes than announced or permitted.
 
 use std::io::Read;
+use std::panic::{AssertUnwindSafe, catch_unwind};
 
 /// Largest decompressed chunk or message, bytes. Writers make chunks of 0.75 to 4 MiB; one 8K image of 16-bit colour has
 /// 200 MB.
@@ -34,6 +35,12 @@ impl Compression {
         if limit > MAX_DECOMPRESSED_BYTES {
             return Err(format!("{limit} bytes decompressed; the limit is {MAX_DECOMPRESSED_BYTES}"));
         }
+        // A panic of a decompressor costs the chunk, not the program; what it was doing is not used again.
+        catch_unwind(AssertUnwindSafe(|| self.unpack(packed, size, limit)))
+            .unwrap_or_else(|_| Err("the decompressor broke down on it".into()))
+    }
+
+    fn unpack(self, packed: &[u8], size: Option<u64>, limit: u64) -> Result<Vec<u8>, String> {
         let mut out = Vec::new();
         match self {
             Self::None => out.extend_from_slice(packed),

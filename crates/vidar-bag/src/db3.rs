@@ -55,9 +55,11 @@ pub(crate) fn index(file: BagFile) -> Result<(Db3, FileIndex), BagError> {
         Ok(())
     })?;
     let place = file.path().display();
-    if missing > 0 {
+    // Large messages go on in pages of their own, which may lie behind the end.
+    let lost = if missing > 0 || database.is_cut_off() { keep_whole(&database, &mut index) } else { 0 };
+    if missing + lost > 0 {
         let message = format!(
-            "the bag is cut off: {missing} pages of its messages are missing; the {} messages of the others are listed",
+            "the bag is cut off: {missing} pages of its messages are missing, and {lost} other messages are not whole; the {} that are whole are listed",
             index.messages
         );
         index.warnings.push(Warning::degraded("bag-cut-off", message).at(place));
@@ -73,6 +75,21 @@ pub(crate) fn index(file: BagFile) -> Result<(Db3, FileIndex), BagError> {
         index.warnings.push(Warning::new("bag-not-closed", message).at(file.path().display()));
     }
     Ok((Db3 { database, data }, index))
+}
+
+/// Leaves out messages of which a page is missing; returns how many.
+fn keep_whole(database: &Database, index: &mut FileIndex) -> usize {
+    let is_whole = |&(_, _, offset): &(i64, u32, u64)| matches!(database.row(place_of(offset)), Ok(Some(_)));
+    let before = index.messages;
+    for topic in index.topics.values_mut() {
+        topic.places.retain(is_whole);
+    }
+    index.messages = index.topics.values().map(|t| t.places.len()).sum();
+    before - index.messages
+}
+
+fn place_of(offset: u64) -> RowPlace {
+    RowPlace { page: (offset >> 16) as u32, cell: offset as u16 }
 }
 
 fn table(database: &Database, name: &str) -> Result<Table, BagError> {
@@ -91,8 +108,7 @@ impl Db3 {
 
     /// The bytes of a message; `None` where they are missing.
     pub(crate) fn message(&self, offset: u64) -> Result<Option<Vec<u8>>, BagError> {
-        let place = RowPlace { page: (offset >> 16) as u32, cell: offset as u16 };
-        let Some(mut row) = self.database.row(place)? else { return Ok(None) };
+        let Some(mut row) = self.database.row(place_of(offset))? else { return Ok(None) };
         let Some(Value::Blob(range)) = values(&row.payload).and_then(|v| v.get(self.data).cloned()) else {
             return Ok(None);
         };

@@ -4,13 +4,15 @@ use crate::error::BagError;
 use std::fs::File;
 use std::io::{Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Mutex, PoisonError};
 
-/// An open file of known length.
+/// An open file, of known length or still written.
 #[derive(Debug)]
 pub(crate) struct BagFile {
     path: PathBuf,
-    length: u64,
+    length: AtomicU64,
+    grows: bool,
     // Positioned reads differ between systems; one lock around seek and read works on all of them.
     file: Mutex<File>,
 }
@@ -25,7 +27,20 @@ impl BagFile {
             let expected = "a file, because messages are read in any order".to_string();
             return Err(BagError::NotABag { path: path.to_path_buf(), found: found.into(), expected });
         }
-        Ok(Self { path: path.to_path_buf(), length: metadata.len(), file: Mutex::new(file) })
+        let length = AtomicU64::new(metadata.len());
+        Ok(Self { path: path.to_path_buf(), length, grows: false, file: Mutex::new(file) })
+    }
+
+    /// A file that is still written.
+    pub(crate) fn growing(path: &Path) -> Result<Self, BagError> {
+        Ok(Self { grows: true, ..Self::open(path)? })
+    }
+
+    /// The first bytes of a file, as if it had no more.
+    pub(crate) fn beginning(path: &Path, length: u64) -> Result<Self, BagError> {
+        let file = Self::open(path)?;
+        file.length.fetch_min(length, Ordering::Relaxed);
+        Ok(file)
     }
 
     pub(crate) fn path(&self) -> &Path {
@@ -33,14 +48,23 @@ impl BagFile {
     }
 
     pub(crate) fn length(&self) -> u64 {
-        self.length
+        self.length.load(Ordering::Relaxed)
+    }
+
+    /// Whether the file has so many bytes by now.
+    fn reaches(&self, end: u64) -> Result<bool, BagError> {
+        if self.grows && end > self.length() {
+            let failed = |source| BagError::Io { path: self.path.clone(), source };
+            let file = self.file.lock().unwrap_or_else(PoisonError::into_inner);
+            self.length.fetch_max(file.metadata().map_err(failed)?.len(), Ordering::Relaxed);
+        }
+        Ok(end <= self.length())
     }
 
     /// The bytes from `offset`; an error where the file ends before. The length is checked before memory is taken.
     pub(crate) fn read(&self, offset: u64, length: u64) -> Result<Vec<u8>, BagError> {
-        let end = offset.checked_add(length).filter(|&end| end <= self.length);
-        if end.is_none() {
-            let found = format!("the end of the file (of {} bytes)", self.length);
+        if !self.reaches(offset.saturating_add(length))? {
+            let found = format!("the end of the file (of {} bytes)", self.length());
             return Err(self.malformed(offset, found, format!("{length} bytes")));
         }
         let mut bytes = vec![0; length as usize];
@@ -100,11 +124,12 @@ impl<'a> Window<'a> {
 
     /// The bytes from `offset`, or `None` where the file ends before.
     pub(crate) fn get(&mut self, offset: u64, length: u64) -> Result<Option<&[u8]>, BagError> {
-        let Some(end) = offset.checked_add(length).filter(|&end| end <= self.file.length) else {
+        let end = offset.saturating_add(length);
+        if !self.file.reaches(end)? {
             return Ok(None);
-        };
+        }
         if offset < self.start || end > self.start + self.bytes.len() as u64 {
-            let wanted = length.max(self.ahead).min(self.file.length - offset);
+            let wanted = length.max(self.ahead).min(self.file.length() - offset);
             self.bytes = self.file.read(offset, wanted)?;
             self.start = offset;
         }

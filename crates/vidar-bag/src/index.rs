@@ -72,7 +72,7 @@ pub struct MessageRef {
 pub(crate) const NO_CHUNK: u32 = u32::MAX;
 
 /// Where a chunk lies.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct Chunk {
     pub offset: u64,
     pub stored: u64,
@@ -85,7 +85,7 @@ pub(crate) const MAX_MESSAGES: usize = 36_000_000;
 /// Largest list of one topic's messages in one chunk, bytes: four million messages, and chunks have some MB.
 const MAX_LIST_BYTES: u64 = 64 << 20;
 /// Most topics; the largest robots publish some thousand.
-const MAX_TOPICS: usize = 60_000;
+pub(crate) const MAX_TOPICS: usize = 60_000;
 
 /// The index of one file while it is built.
 #[derive(Debug, Default)]
@@ -211,13 +211,16 @@ pub(crate) fn plain_type(name: &str) -> String {
     name.replace("/msg/", "/")
 }
 
+/// Kind of the warning about a file that ends inside a record.
+pub(crate) const CUT_OFF: &str = "bag-cut-off";
+
 /// The warning about a file that ends inside a record.
 pub(crate) fn cut_off(file: &BagFile, whole: u64, messages: usize) -> Warning {
     let lost = file.length().saturating_sub(whole);
     let message = format!(
         "the bag is cut off: its last {lost} bytes are no whole record; the {messages} messages before them are read"
     );
-    Warning::degraded("bag-cut-off", message)
+    Warning::degraded(CUT_OFF, message)
         .at(file.path().display())
         .hint("a power loss or a full disk while recording does this; nothing else is needed to use the rest")
 }

@@ -2,6 +2,7 @@
 
 mod bag;
 mod bytes;
+mod chunks;
 mod compression;
 mod db3;
 mod error;
@@ -13,9 +14,11 @@ mod metadata;
 mod parts;
 mod ros1;
 mod sqlite;
+mod stream;
 pub mod write;
 
 pub use bag::{Bag, BagFormat};
+pub use chunks::CHUNK_THREAD;
 pub use error::BagError;
 pub use index::{Encoding, MessageRef, Topic};
 pub use message::{
@@ -23,3 +26,4 @@ pub use message::{
     RawImage, Role, role_of,
 };
 pub use parts::bags_in;
+pub use stream::{KeptStream, McapStream, StreamEnd, StreamMessage, StreamPlace, StreamTopic};

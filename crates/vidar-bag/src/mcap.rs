@@ -25,13 +25,13 @@ pub(crate) const METADATA: u8 = 0x0c;
 pub(crate) const DATA_END: u8 = 0x0f;
 
 /// Opcode and length.
-const HEAD_BYTES: u64 = 9;
+pub(crate) const HEAD_BYTES: u64 = 9;
 /// Fields of a message before its data: channel, sequence, two times.
-const MESSAGE_HEAD_BYTES: u64 = 22;
+pub(crate) const MESSAGE_HEAD_BYTES: u64 = 22;
 /// Fields of a chunk before its compression's name: two times, size, checksum.
 const CHUNK_HEAD_BYTES: u64 = 28;
 /// Largest schema or channel; the largest definitions of ROS have under 100 kB.
-const MAX_DESCRIPTION_BYTES: u64 = 16 << 20;
+pub(crate) const MAX_DESCRIPTION_BYTES: u64 = 16 << 20;
 
 /// Largest record of metadata that is kept, and how many are.
 const MAX_METADATA_BYTES: u64 = 64 << 10;
@@ -82,7 +82,7 @@ fn head_at(window: &mut Window<'_>, at: u64) -> Result<Option<(u8, u64)>, BagErr
     Ok(head_in(&mut Bytes::new(bytes)))
 }
 
-fn head_in(bytes: &mut Bytes<'_>) -> Option<(u8, u64)> {
+pub(crate) fn head_in(bytes: &mut Bytes<'_>) -> Option<(u8, u64)> {
     Some((bytes.array::<1>()?[0], bytes.u64()?))
 }
 
@@ -179,37 +179,11 @@ impl Walk<'_> {
         let malformed = || {
             self.file.malformed(body, "a chunk that ends in its head", "times, size, compression, records")
         };
-        let (size, compression, records, stored) = {
-            // The name of a compression has a few bytes; more than the window's 64 would be no name.
-            let head = window.get(body, length.min(CHUNK_HEAD_BYTES + 64))?.ok_or_else(malformed)?;
-            let mut bytes = Bytes::new(head);
-            let parsed = (|| {
-                bytes.take(16)?;
-                let size = bytes.u64()?;
-                bytes.u32()?;
-                let compression = bytes.text()?;
-                let stored = bytes.u64()?;
-                Some((size, compression, body + bytes.position() as u64, stored))
-            })();
-            parsed.ok_or_else(malformed)?
-        };
-        if records.checked_add(stored).is_none_or(|end| end > body + length) {
-            return Err(malformed());
-        }
-        let Some(compression) = Compression::from_name(&compression) else {
-            let found = format!("chunks are compressed with {:?}", vidar_core::printable(&compression));
-            return Err(self.file.unsupported(
-                found,
-                "lz4, zstd and none are read; `mcap compress` and `mcap decompress` convert",
-            ));
-        };
-        if size > MAX_DECOMPRESSED_BYTES {
-            let path = self.file.path().to_path_buf();
-            let what = "bytes of a chunk";
-            return Err(BagError::TooLarge { path, what, found: size, limit: MAX_DECOMPRESSED_BYTES });
-        }
+        // The name of a compression has a few bytes; more than the window's 64 would be no name.
+        let head = window.get(body, length.min(CHUNK_HEAD_BYTES + 64))?.ok_or_else(malformed)?;
+        let chunk = chunk_in(self.file, head, body, length)?;
         let number = self.index.chunks.len() as u32;
-        self.index.chunks.push(Chunk { offset: records, stored, size, compression });
+        self.index.chunks.push(chunk);
         self.index.last = Some(LastChunk { number, is_indexed: false, was_opened: false });
         Ok(())
     }
@@ -264,6 +238,35 @@ impl Walk<'_> {
         }
         Ok(())
     }
+}
+
+/// The chunk whose record's body of `length` bytes lies at `body` and begins with `head`.
+pub(crate) fn chunk_in(file: &BagFile, head: &[u8], body: u64, length: u64) -> Result<Chunk, BagError> {
+    let malformed =
+        || file.malformed(body, "a chunk that ends in its head", "times, size, compression, records");
+    let mut bytes = Bytes::new(head);
+    let parsed = (|| {
+        bytes.take(16)?;
+        let size = bytes.u64()?;
+        bytes.u32()?;
+        let compression = bytes.text()?;
+        let stored = bytes.u64()?;
+        Some((size, compression, body + bytes.position() as u64, stored))
+    })();
+    let (size, compression, offset, stored) = parsed.ok_or_else(malformed)?;
+    if offset.checked_add(stored).is_none_or(|end| end > body + length) {
+        return Err(malformed());
+    }
+    let Some(compression) = Compression::from_name(&compression) else {
+        let found = format!("chunks are compressed with {:?}", vidar_core::printable(&compression));
+        let way = "lz4, zstd and none are read; `mcap compress` and `mcap decompress` convert";
+        return Err(file.unsupported(found, way));
+    };
+    if size > MAX_DECOMPRESSED_BYTES {
+        let (path, what) = (file.path().to_path_buf(), "bytes of a chunk");
+        return Err(BagError::TooLarge { path, what, found: size, limit: MAX_DECOMPRESSED_BYTES });
+    }
+    Ok(Chunk { offset, stored, size, compression })
 }
 
 /// A record of metadata: its name, and texts by key.

@@ -27,6 +27,7 @@ pub(crate) struct Database {
     page_bytes: u64,
     /// Bytes of a page that hold content.
     usable: u64,
+    is_cut_off: bool,
     log: Option<Log>,
 }
 
@@ -103,7 +104,14 @@ impl Database {
         let mut name = file.path().as_os_str().to_owned();
         name.push("-wal");
         let log = Log::open(Path::new(&name), page_bytes)?;
-        Ok(Self { file, page_bytes, usable, log })
+        let stated = u64::from(be_u32(&header[28..]).unwrap_or(0));
+        let is_cut_off = log.is_none() && stated > file.length() / page_bytes;
+        Ok(Self { file, page_bytes, usable, log, is_cut_off })
+    }
+
+    /// Whether the file has fewer pages than it says.
+    pub(crate) fn is_cut_off(&self) -> bool {
+        self.is_cut_off
     }
 
     pub(crate) fn file(&self) -> &BagFile {

@@ -2,7 +2,7 @@
 
 use crate::error::DatasetError;
 use crate::isolated::BROKE_DOWN;
-use crate::location::{Location, Media};
+use crate::location::Location;
 use crate::recording::{ImageEntry, Recording};
 use std::collections::VecDeque;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -19,39 +19,48 @@ const IMAGES_PER_THREAD: usize = 2;
 
 type Loaded = Result<FrameImage, DatasetError>;
 
-/// An image to decode and where to hand it.
+/// How an image is decoded, and where to hand it.
 struct Job {
-    entry: ImageEntry,
-    expected: Option<(usize, usize)>,
+    decode: Box<dyn FnOnce() -> Loaded + Send>,
     done: SyncSender<Loaded>,
 }
 
 /// Threads that decode images of one recording. Every image is what [`Recording::load_image`] gives, whatever the number of threads.
-struct Decoders {
+pub(crate) struct Decoders {
     jobs: Option<SyncSender<Job>>,
     is_over: Arc<AtomicBool>,
     threads: Vec<JoinHandle<()>>,
 }
 
 impl Decoders {
-    fn start(media: &Media, count: usize) -> Self {
+    /// For images that do not depend on each other.
+    pub(crate) fn for_images() -> Self {
+        Self::start(available_parallelism().map_or(1, usize::from).min(MOST_THREADS))
+    }
+
+    fn start(count: usize) -> Self {
         // As many as are ever asked for, so that asking never waits.
         let (jobs, queue) = sync_channel::<Job>(MOST_THREADS * IMAGES_PER_THREAD);
         let (queue, is_over) = (Arc::new(Mutex::new(queue)), Arc::new(AtomicBool::new(false)));
         let spawn = |_| {
-            let (media, queue, is_over) = (media.clone(), Arc::clone(&queue), Arc::clone(&is_over));
-            let work = move || work(&media, &queue, &is_over);
+            let (queue, is_over) = (Arc::clone(&queue), Arc::clone(&is_over));
+            let work = move || work(&queue, &is_over);
             Builder::new().name(DECODER_THREAD.into()).spawn(work).ok()
         };
         let threads = (0..count).filter_map(spawn).collect();
         Self { jobs: Some(jobs), is_over, threads }
     }
 
-    fn ask(&self, entry: &ImageEntry, expected: Option<(usize, usize)>) -> Receiver<Loaded> {
+    /// The most images that may be asked for at a time; none where the system gives no threads.
+    pub(crate) fn most_asked(&self) -> usize {
+        IMAGES_PER_THREAD * self.threads.len()
+    }
+
+    pub(crate) fn ask(&self, decode: impl FnOnce() -> Loaded + Send + 'static) -> Receiver<Loaded> {
         let (done, answer) = sync_channel(1);
         if let Some(jobs) = &self.jobs {
             // Where all threads have ended the answer says so.
-            let _ = jobs.send(Job { entry: entry.clone(), expected, done });
+            let _ = jobs.send(Job { decode: Box::new(decode), done });
         }
         answer
     }
@@ -66,15 +75,15 @@ impl Drop for Decoders {
     }
 }
 
-fn work(media: &Media, queue: &Mutex<Receiver<Job>>, is_over: &AtomicBool) {
+fn work(queue: &Mutex<Receiver<Job>>, is_over: &AtomicBool) {
     loop {
         let next = queue.lock().unwrap_or_else(PoisonError::into_inner).recv();
-        let Ok(Job { entry, expected, done }) = next else { return };
+        let Ok(Job { decode, done }) = next else { return };
         if is_over.load(Ordering::Relaxed) {
             return;
         }
         // A decoder's panic is the image's error already; nobody may wait for it any more.
-        let _ = done.send(media.image_of_size(&entry.location, expected));
+        let _ = done.send(decode());
     }
 }
 
@@ -104,17 +113,19 @@ impl<'a, I: Iterator<Item = &'a ImageEntry>> Iterator for ImagesAhead<'a, I> {
 
     fn next(&mut self) -> Option<Self::Item> {
         let media = &self.dataset.media;
-        let decoders = self.decoders.get_or_insert_with(|| {
-            let cores = available_parallelism().map_or(1, usize::from);
-            Decoders::start(media, if media.is_video() { 1 } else { cores.min(MOST_THREADS) })
+        let decoders = self.decoders.get_or_insert_with(|| match media.is_video() {
+            true => Decoders::start(1),
+            false => Decoders::for_images(),
         });
         if decoders.threads.is_empty() {
             // The system gives no more threads.
             return self.entries.next().map(|entry| (entry, self.dataset.load_image(entry)));
         }
-        while self.asked.len() < IMAGES_PER_THREAD * decoders.threads.len() {
+        while self.asked.len() < decoders.most_asked() {
             let Some(entry) = self.entries.next() else { break };
-            self.asked.push_back((entry, decoders.ask(entry, self.dataset.size_of(entry))));
+            let (media, location, size) =
+                (media.clone(), entry.location.clone(), self.dataset.size_of(entry));
+            self.asked.push_back((entry, decoders.ask(move || media.image_of_size(&location, size))));
         }
         let (entry, answer) = self.asked.pop_front()?;
         Some((entry, answer.recv().unwrap_or_else(|_| Err(broke_down(&entry.location)))))

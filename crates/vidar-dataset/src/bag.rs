@@ -39,7 +39,16 @@ pub(crate) fn detect(path: &Path) -> Option<String> {
 
 /// Reads the recording's index, calibration, IMU and poses; images stay in it.
 pub(crate) fn open(path: &Path, reason: String, options: &OpenOptions) -> Result<Draft, DatasetError> {
-    let bag = Arc::new(Bag::open(path)?);
+    of(Arc::new(Bag::open(path)?), path, reason, options)
+}
+
+/// The same of a bag that is open.
+pub(crate) fn of(
+    bag: Arc<Bag>,
+    path: &Path,
+    reason: String,
+    options: &OpenOptions,
+) -> Result<Draft, DatasetError> {
     let mut choice = topics::choose(&bag, options)?;
     // What VIDAR's own conversions leave beside the messages.
     let facts = bag.metadata(facts::NAME).map(Facts::from_map).unwrap_or_default();
@@ -76,7 +85,7 @@ pub(crate) fn open(path: &Path, reason: String, options: &OpenOptions) -> Result
     if let Some(depth) = choice.depth {
         read_depth(&mut draft, &bag, depth, &clock, &frames, imu_frame.as_deref().unwrap_or(&camera_frame))?;
         if let Some(stated) = draft.depth.as_mut() {
-            stated.units_per_metre = facts.depth_units_per_metre;
+            stated.units_per_metre = facts.depth_units_per_metre.or(stated.units_per_metre);
         }
     }
     for (used, topic) in &choice.poses {
@@ -268,12 +277,15 @@ fn read_depth(
         Some(Message::CameraInfo(info)) if info.k[0] != 0.0 => Some(info),
         _ => None,
     };
+    // Numbers of 32 bits are metres (REP 118), whose unit nobody needs to state.
+    let first = topic.messages.first().map(|m| bag.read(m)).transpose()?;
+    let is_metres = matches!(&first, Some(Message::Image(image)) if image.encoding == "32FC1");
     let aligned = ["aligned", "registered"].iter().any(|w| topic.name.contains(w));
     draft.depth = Some(DraftDepth {
         intrinsics: info.map(|i| [i.k[0], i.k[4], i.k[2], i.k[5]]),
         distorted: None,
-        units_per_metre: None,
-        // REP 118: 16UC1 is millimetres; 32FC1 is metres and needs no unit.
+        units_per_metre: is_metres.then_some(1000.0),
+        // REP 118: 16UC1 is millimetres.
         default_units: 1000.0,
         body_from_depth: frames.a_from_b(body_frame, &frame),
         invalid: vec![0, u16::MAX],

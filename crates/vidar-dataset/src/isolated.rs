@@ -15,7 +15,8 @@ thread_local! {
 /// Whether this thread is within a decoder, whose panic is an error of one image. For a program's panic hook, which has nothing to
 /// report then.
 pub fn is_decoding() -> bool {
-    IS_DECODING.get() || std::thread::current().name() == Some(DECODER_THREAD)
+    let threads = [DECODER_THREAD, vidar_bag::CHUNK_THREAD];
+    IS_DECODING.get() || std::thread::current().name().is_some_and(|name| threads.contains(&name))
 }
 
 /// What a decoder gives; its panic is an error. Time is bounded by the size, which is checked beforehand.

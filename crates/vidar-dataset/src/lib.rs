@@ -1,6 +1,7 @@
 #![doc = include_str!("../README.md")]
 
 mod ahead;
+mod arriving;
 mod assemble;
 mod bag;
 mod bag_camera;
@@ -41,6 +42,7 @@ mod video;
 mod wrong_thing;
 
 pub use ahead::ImagesAhead;
+pub use arriving::{Arrival, Arrivals, ArrivingRecording, OPENING};
 pub use camera_flag::{CameraFlag, with_size};
 pub use checks::{gain_error_at_rest, specific_force_at_rest};
 pub use error::DatasetError;

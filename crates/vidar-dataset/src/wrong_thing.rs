@@ -30,6 +30,10 @@ pub(crate) fn describe(path: &Path, head: &[u8]) -> DatasetError {
     let name = path.file_name().unwrap_or_default().to_string_lossy().to_ascii_lowercase();
     let (found, way) = match head {
         [] => ("an empty file (0 bytes)", "the copy failed or the recorder never wrote; copy it again"),
+        // The first file's flags: bit 0 says that a password is needed.
+        [b'P', b'K', 3, 4, _, _, flags, ..] if flags & 1 == 1 => {
+            ("an encrypted zip archive", "unpack it with its password, then give the folder or file inside")
+        }
         [b'P', b'K', 3 | 5, ..] => ("a zip archive", "unpack it, then give the folder or file inside"),
         [0x1f, 0x8b, ..] | [0x28, 0xb5, 0x2f, 0xfd, ..] | [0xfd, b'7', b'z', ..] | [b'B', b'Z', b'h', ..] => {
             ("a compressed file", "unpack it (gunzip, unzstd, xz -d, tar -x), then give what is inside")
@@ -40,6 +44,10 @@ pub(crate) fn describe(path: &Path, head: &[u8]) -> DatasetError {
         [0x89, b'P', b'N', b'G', ..] | [0xff, 0xd8, 0xff, ..] => {
             ("one image", "give the folder that holds all images; `vidar depth IMAGE` estimates depth of one")
         }
+        head if is_brand(head, AVIF) => (
+            "an AVIF image, which is not decoded",
+            "convert it to JPEG or PNG; a folder of such images is a recording",
+        ),
         head if is_picture(head) => (
             "an HEIC image, which is not decoded",
             "export as JPEG: on a phone choose \"most compatible\" as the camera's format",
@@ -92,6 +100,11 @@ pub(crate) fn describe_folder(path: &Path, names: &[String]) -> Option<DatasetEr
         format!("{}{more}", files[..files.len().min(3)].join(", "))
     };
     let (pictures, videos) = (ending_with(&[".heic", ".heif"]), ending_with(&[".mp4", ".mov", ".m4v"]));
+    let others = ending_with(&[".avif", ".webp", ".tif", ".tiff", ".bmp", ".jxl", ".jp2"]);
+    if pictures.is_empty() && videos.is_empty() && !others.is_empty() {
+        let found = format!("{} images of a kind that is not decoded ({})", others.len(), several(&others));
+        return Some(wrong(path, found, "convert them to PNG or JPEG, under the same names"));
+    }
     let archives = ending_with(&[".zip", ".7z", ".rar", ".tar", ".gz", ".tgz", ".xz", ".bz2", ".zst"]);
     let (found, way) = match (pictures.len(), videos.len(), archives.len()) {
         (1.., 0, _) => (
@@ -118,9 +131,11 @@ pub(crate) fn may_be_video(head: &[u8]) -> bool {
     !head.is_empty() && !is_text && !is_picture(head) && !head.starts_with(b"PK")
 }
 
+const AVIF: &[&[u8; 4]] = &[b"avif", b"avis"];
+
 /// Whether an ISO media file holds pictures instead of a movie.
 pub(crate) fn is_picture(head: &[u8]) -> bool {
-    is_brand(head, &[b"heic", b"heix", b"mif1", b"msf1", b"heif", b"avif"])
+    is_brand(head, AVIF) || is_brand(head, &[b"heic", b"heix", b"mif1", b"msf1", b"heif"])
 }
 
 /// Whether an ISO media file states one of these brands.

@@ -142,9 +142,11 @@ fn a_cut_bag_says_so() {
 fn what_is_no_recording_is_named_with_the_nearest_way() {
     let folder = tempfile::tempdir().unwrap();
     for (name, bytes, says, way) in [
-        ("a.zip", &b"PK\x03\x04rest"[..], "a zip archive", "unpack"),
+        ("a.zip", &b"PK\x03\x04\x14\0\0\0rest"[..], "a zip archive", "unpack"),
         ("a.bag.gz", b"\x1f\x8brest", "compressed", "gunzip"),
         ("a.heic", b"\0\0\0\x18ftypheic\0\0", "HEIC", "JPEG"),
+        ("b.zip", b"PK\x03\x04\x14\0\x01\0rest", "an encrypted zip archive", "password"),
+        ("a.avif", b"\0\0\0\x18ftypavif\0\0", "AVIF", "PNG"),
         ("a.mkv", b"\x1a\x45\xdf\xa3rest", "Matroska", "ffmpeg"),
         ("a.jpg", b"\xff\xd8\xff\xe0", "one image", "vidar depth"),
         ("a.bag", b"\x9a\x11\x34garbage", "named as a bag", "encrypted"),
@@ -156,6 +158,10 @@ fn what_is_no_recording_is_named_with_the_nearest_way() {
         let error = open(&path, &OpenOptions::default()).unwrap_err().to_string();
         assert!(error.contains(says) && error.contains(way), "{name}: {error}");
     }
+    let images = tempfile::tempdir().unwrap();
+    ["1.webp", "2.webp"].iter().for_each(|name| std::fs::write(images.path().join(name), b"RIFF").unwrap());
+    let error = open(images.path(), &OpenOptions::default()).unwrap_err().to_string();
+    assert!(error.contains("2 images of a kind that is not decoded (1.webp, 2.webp)"), "{error}");
     let error =
         open(Path::new("https://example.org/a.bag"), &OpenOptions::default()).unwrap_err().to_string();
     assert!(error.contains("URL") && error.contains("download"), "{error}");
@@ -322,4 +328,31 @@ fn the_other_camera_of_a_stereo_bag_is_named_and_can_be_chosen() {
     assert!(reason.contains("not those of /stereo/right/image_raw (--camera 1)") && value == 50, "{reason}");
     let (reason, value) = of_camera(1);
     assert!(reason.contains("images of /stereo/right/image_raw") && value == 200, "{reason}");
+}
+
+#[test]
+fn depth_of_32_bits_is_metres_and_nobody_is_asked_for_its_unit() {
+    use vidar_bag::write::{McapWriter, encode};
+    use vidar_bag::{Header, Message, RawImage};
+    use vidar_core::Timestamp;
+    let (folder, mut writer) = (tempfile::tempdir().unwrap(), McapWriter::new(Vec::new(), "test").unwrap());
+    let depth: Vec<u8> = [1.5f32, f32::INFINITY, 0.0, 2.0].iter().flat_map(|m| m.to_le_bytes()).collect();
+    for (topic, encoding, row_bytes, data) in
+        [("/cam/image_raw", "mono8", 2, vec![7; 4]), ("/cam/depth/image", "32FC1", 8, depth)]
+    {
+        let stamp = Timestamp::from_nanos(1_000_000_000);
+        let header = Header { stamp, frame: "cam".into() };
+        let encoding = encoding.to_string();
+        let image = RawImage { header, width: 2, height: 2, encoding, row_bytes, is_big_endian: false, data };
+        let (name, bytes) = encode(&Message::Image(image)).unwrap();
+        let channel = writer.channel(topic, name).unwrap();
+        writer.write(channel, stamp, &bytes).unwrap();
+    }
+    let path = folder.path().join("depth.mcap");
+    std::fs::write(&path, writer.finish().unwrap()).unwrap();
+    let dataset = open(&path, &OpenOptions::default()).unwrap();
+    assert!(!kinds(&dataset).contains(&"depth-scale"), "{:?}", kinds(&dataset));
+    let metres = dataset.load_depth(&dataset.depths[0]).unwrap();
+    let metres = metres.image().data().to_vec();
+    assert!(metres[0] == 1.5 && metres[1].is_nan() && metres[2].is_nan() && metres[3] == 2.0, "{metres:?}");
 }

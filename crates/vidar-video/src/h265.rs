@@ -1,7 +1,7 @@
 //! H.265 through `rusty_h265`: parameter sets of `hvcC` (ISO/IEC 14496-15, 8.3.3), pictures in the order of output.
 
 use crate::boxes::u16_at;
-use crate::picture::{Picture, check_size, colours_of, round_to_eight};
+use crate::picture::{Colours, Picture, check_size, colours_of, round_to_eight};
 use crate::unit::{Parameters, UnitDecoder};
 use rusty_h265::{Error, Frame};
 
@@ -11,11 +11,17 @@ pub(crate) struct H265 {
     length_size: Option<usize>,
     /// Highest temporal sub-layer: only its pictures can be left out without looking further.
     top_layer: u8,
+    colours: Colours,
 }
 
 impl H265 {
     pub(crate) fn new(parameters: &Parameters) -> Result<Self, String> {
-        let mut made = Self { decoder: rusty_h265::Decoder::new(), length_size: None, top_layer: 0 };
+        let mut made = Self {
+            decoder: rusty_h265::Decoder::new(),
+            length_size: None,
+            top_layer: 0,
+            colours: colours_of(false, 0, 0),
+        };
         let hvcc = match parameters {
             Parameters::Described(hvcc) => hvcc,
             Parameters::InStream(bytes) => {
@@ -49,6 +55,9 @@ impl H265 {
         {
             check_size(u64::from(sps.width), u64::from(sps.height))?;
             self.top_layer = sps.max_sub_layers_minus1;
+            let (is_full_range, matrix) =
+                sps.vui.as_ref().map_or((false, 0), |v| (v.video_full_range_flag, v.matrix_coeffs));
+            self.colours = colours_of(is_full_range, matrix, sps.height as usize);
         }
         self.decoder.push_nal(nal, unit).map_err(|e| e.to_string())
     }
@@ -102,7 +111,7 @@ impl UnitDecoder for H265 {
             match self.decoder.next_frame() {
                 Ok(frame) => {
                     if let Some(number) = frame.pts.and_then(|p| usize::try_from(p).ok()) {
-                        pictures.push((number, picture(&frame)?));
+                        pictures.push((number, picture(&frame, self.colours)?));
                     }
                 }
                 Err(Error::Again | Error::Eof) => break,
@@ -116,7 +125,7 @@ impl UnitDecoder for H265 {
     }
 }
 
-fn picture(frame: &Frame) -> Result<Picture, String> {
+fn picture(frame: &Frame, colours: Colours) -> Result<Picture, String> {
     let p = &frame.picture;
     check_size(frame.width as u64, frame.height as u64)?;
     if p.chroma_format_idc != 1 {
@@ -138,7 +147,6 @@ fn picture(frame: &Frame) -> Result<Picture, String> {
         Some((luma, [cut(1, p.bit_depth_chroma, 1)?, cut(2, p.bit_depth_chroma, 1)?]))
     })();
     let (luma, chroma) = planes.ok_or("the decoder gave planes that do not fit its size")?;
-    let colours = colours_of(false, 0, frame.height);
     let picture =
         Picture { width: frame.width, height: frame.height, luma, chroma, chroma_shift: [1, 1], colours };
     if picture.is_whole() {

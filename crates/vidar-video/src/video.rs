@@ -83,7 +83,14 @@ impl Video {
     ) -> Result<Self, VideoError> {
         let mut open = Self { path: path.to_path_buf(), movie, size: (0, 0), frames, decoder };
         // The decoder's own size counts; the container's may be that of the display.
-        let first = open.frame(0)?;
+        let first = open.frame(0).map_err(|error| match (error, &open.decoder) {
+            (VideoError::BadFrame { path, number, reason }, Decoder::BuiltIn { .. }) => {
+                let way = "if it plays elsewhere, --decoder ffmpeg lets that program decode it, or convert it: \
+                           ffmpeg -i IN -c:v libx264 -crf 16 -pix_fmt yuv420p OUT.mp4";
+                VideoError::BadFrame { path, number, reason: format!("{reason}; {way}") }
+            }
+            (error, _) => error,
+        })?;
         open.size = (first.width(), first.height());
         Ok(open)
     }

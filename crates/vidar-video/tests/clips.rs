@@ -70,6 +70,7 @@ fn frames_of_h264_are_those_of_ffmpeg() {
 fn frames_of_h265_are_those_of_ffmpeg() {
     check("h265.mp4");
     check("h265_10bit.mp4");
+    check("h265_full.mp4");
 }
 
 #[test]

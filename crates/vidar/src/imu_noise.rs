@@ -47,6 +47,18 @@ pub(crate) fn believed_noise(seen: Option<SensorNoise>) -> ImuNoise {
 /// Replaces noise that nobody stated, and noise that the samples contradict; warnings say so. Returns what the samples show.
 pub(crate) fn settle(dataset: &mut Recording) -> Option<SensorNoise> {
     let seen = sensor_noise(&dataset.imu)?;
+    settle_with(dataset, seen)
+}
+
+/// The same from the beginning of a recording, up to [`vidar_dataset::OPENING`] after its first image.
+pub(crate) fn settle_of_opening(dataset: &mut Recording) -> Option<SensorNoise> {
+    let until = dataset.images.first().map(|i| i.time + vidar_dataset::OPENING);
+    let count = dataset.imu.partition_point(|s| until.is_none_or(|t| s.time <= t));
+    let seen = sensor_noise(&dataset.imu[..count])?;
+    settle_with(dataset, seen)
+}
+
+fn settle_with(dataset: &mut Recording, seen: SensorNoise) -> Option<SensorNoise> {
     if let Some(stated) = dataset.rig.imu {
         replace(dataset, &stated, seen);
     }

@@ -242,9 +242,26 @@ impl ImageSource for ImageFiles<'_> {
 /// Opens the recording with all of its images between start and end: the odometry uses every one,
 /// whatever `input.stride` leaves for depth.
 pub fn open_every_image(path: &Path, options: &OpenOptions, config: &Config) -> Result<Recording, Error> {
-    let mut config = config.clone();
-    config.input.stride = 1;
-    open_dataset(path, options, &config)
+    let mut dataset = vidar_dataset::open(path, &options_of(options, config))?;
+    imu_noise::settle(&mut dataset);
+    Ok(dataset)
+}
+
+/// The same for a live run, which looks at nothing before it comes, but for the beginning: only that shows the noise of the IMU.
+pub(crate) fn open_for_live(path: &Path, options: &OpenOptions, config: &Config) -> Result<Recording, Error> {
+    let mut dataset = vidar_dataset::open(path, &options_of(options, config))?;
+    imu_noise::settle_of_opening(&mut dataset);
+    Ok(dataset)
+}
+
+/// The options with the configuration's part of them, for all images.
+pub(crate) fn options_of(options: &OpenOptions, config: &Config) -> OpenOptions {
+    let mut options = options.clone();
+    options.camera = CameraId(config.input.camera);
+    options.stride = 1;
+    options.start = Some(Duration::from_secs_f64(config.input.start_secs)).filter(|d| *d > Duration::ZERO);
+    options.end = Some(Duration::from_secs_f64(config.input.end_secs)).filter(|d| *d > Duration::ZERO);
+    options
 }
 
 /// Where image times are invented, an interval of time between keyframes means nothing: every image is one.
@@ -269,11 +286,7 @@ pub fn strided(dataset: &Recording, config: &Config) -> Vec<ImageEntry> {
 
 /// Applies the configuration's part of the options and opens the dataset.
 pub fn open_dataset(path: &Path, options: &OpenOptions, config: &Config) -> Result<Recording, Error> {
-    let mut options = options.clone();
-    options.camera = CameraId(config.input.camera);
-    options.stride = config.input.stride;
-    options.start = Some(Duration::from_secs_f64(config.input.start_secs)).filter(|d| *d > Duration::ZERO);
-    options.end = Some(Duration::from_secs_f64(config.input.end_secs)).filter(|d| *d > Duration::ZERO);
+    let options = OpenOptions { stride: config.input.stride, ..options_of(options, config) };
     let mut dataset = vidar_dataset::open(path, &options)?;
     imu_noise::settle(&mut dataset);
     Ok(dataset)

@@ -1,9 +1,11 @@
-//! `vidar live`: the same bits as `vidar run` where nothing is left out; a recording at its own rate; a kill in between.
+//! `vidar live`: the same bits as `vidar run` where nothing is left out; a recording at its own rate; a stream; a kill in between.
 
 use crate::odometry::flight;
 use crate::support::{ProgramOutput, command, manifest, shared};
-use std::path::Path;
+use std::io::Write;
+use std::path::{Path, PathBuf};
 use std::process::Command;
+use std::sync::OnceLock;
 use std::time::{Duration, Instant};
 
 /// What `vidar run` would find in a first pass over the recording is given, so that both have the same odometry.
@@ -15,6 +17,39 @@ fn mapped(verb: &str, out: &Path, more: &[&str]) -> Command {
     command.arg(verb).arg(flight()).arg("-o").arg(out).args(["--preset", "live", "-q", "--json"]);
     command.args(["--progress", "off", "--set", "input.poses=odometry"]).args(NO_FIRST_PASS).args(more);
     command
+}
+
+/// The flight as MCAP.
+fn flight_mcap() -> PathBuf {
+    static MADE: OnceLock<PathBuf> = OnceLock::new();
+    let made = MADE.get_or_init(|| {
+        let out = shared().root.join("live flight.mcap");
+        let converted = command().arg("convert").arg(flight()).arg(&out).arg("-q").output().unwrap();
+        assert!(converted.status.success(), "{}", String::from_utf8_lossy(&converted.stderr));
+        out
+    });
+    made.clone()
+}
+
+/// `vidar live` of a path, or of standard input for `-`.
+fn of(path: &Path, out: &Path, more: &[&str]) -> Command {
+    let mut command = command();
+    command.arg("live").arg(path).arg("-o").arg(out).args(["-q", "--json", "--progress", "off"]);
+    command.args(["--set", "input.poses=odometry"]).args(NO_FIRST_PASS).args(more);
+    command
+}
+
+/// The command with bytes sent into it, slowly where told so.
+fn sent(mut command: Command, bytes: Vec<u8>) -> ProgramOutput {
+    use std::process::Stdio;
+    let mut child =
+        command.stdin(Stdio::piped()).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
+    let mut pipe = child.stdin.take().unwrap();
+    // A program that refuses the stream closes it.
+    let sender = std::thread::spawn(move || drop(pipe.write_all(&bytes)));
+    let ended: ProgramOutput = child.wait_with_output().unwrap().into();
+    sender.join().unwrap();
+    ended
 }
 
 fn ended(mut command: Command) -> ProgramOutput {
@@ -87,4 +122,81 @@ fn a_kill_leaves_whole_lines_and_a_resume_goes_on() {
     let mesh = |out: &Path| std::fs::read(out.join("map/mesh.ply")).unwrap();
     assert!(mesh(&whole) == mesh(&out), "the same bits as without the kill");
     assert_eq!(poses(&whole), poses(&out));
+}
+
+#[test]
+fn a_stream_on_standard_input_has_the_bits_of_its_file_and_is_kept() {
+    let (file, stream) = (shared().root.join("live file"), shared().root.join("live stream"));
+    let bytes = std::fs::read(flight_mcap()).unwrap();
+    ended(of(&flight_mcap(), &file, &[]));
+    let ran = sent(of(Path::new("-"), &stream, &[]), bytes.clone());
+    assert!([0, 3].contains(&ran.code), "{}", ran.stderr);
+    let mesh = |out: &Path| std::fs::read(out.join("map/mesh.ply")).unwrap();
+    assert!(mesh(&file) == mesh(&stream), "the same bits, though nothing was known of it before it came");
+    assert_eq!(poses(&file), poses(&stream));
+    assert!(std::fs::read(stream.join("recording.mcap")).unwrap() == bytes, "kept as it came");
+    let (of_file, of_stream) = (manifest(&file), manifest(&stream));
+    assert_eq!(of_stream["result"]["live"]["images"], of_file["result"]["live"]["images"]);
+    assert!(of_stream["artifacts"].to_string().contains("recording.mcap"), "{}", of_stream["artifacts"]);
+    // Ground truth of the recording, which comes with it, is compared with at the end.
+    let ate = |m: &serde_json::Value| m["result"]["scores"].to_string();
+    assert_eq!(ate(&of_stream), ate(&of_file));
+}
+
+#[test]
+fn what_came_of_a_stream_that_breaks_is_mapped_and_a_killed_one_goes_on_with_what_was_kept() {
+    let bytes = std::fs::read(flight_mcap()).unwrap();
+    let cut = bytes[..bytes.len() * 2 / 3].to_vec();
+    let out = shared().root.join("live cut stream");
+    let ran = sent(of(Path::new("-"), &out, &[]), cut.clone());
+    assert_eq!(ran.code, 3, "{}", ran.stderr);
+    assert!(
+        manifest(&out)["warnings"]["stream-cut-off"].as_u64() == Some(1),
+        "{}",
+        manifest(&out)["warnings"]
+    );
+    // Killed while it waits for more of the stream.
+    let killed = shared().root.join("live killed stream");
+    let mut command = of(Path::new("-"), &killed, &[]);
+    let mut child = command.stdin(std::process::Stdio::piped()).spawn().unwrap();
+    let mut pipe = child.stdin.take().unwrap();
+    let part = cut.clone();
+    let sender = std::thread::spawn(move || {
+        let written = pipe.write_all(&part);
+        (pipe, written)
+    });
+    let (file, clock) = (killed.join("trajectory/live.tum"), Instant::now());
+    while clock.elapsed() < Duration::from_secs(120)
+        && !std::fs::read_to_string(&file).is_ok_and(|t| t.lines().count() > 5)
+    {
+        assert!(child.try_wait().unwrap().is_none(), "it waits");
+        std::thread::sleep(Duration::from_millis(5));
+    }
+    let (pipe, written) = sender.join().unwrap();
+    written.unwrap();
+    child.kill().unwrap();
+    child.wait().unwrap();
+    drop(pipe);
+    assert!(cut.starts_with(&std::fs::read(killed.join("recording.mcap")).unwrap()), "what came, whole");
+    let ran = of(Path::new("-"), &killed, &["--resume"]).output().unwrap();
+    assert!([0, 3].contains(&ran.status.code().unwrap()), "{}", String::from_utf8_lossy(&ran.stderr));
+    assert!(killed.join("map/mesh.ply").is_file() && killed.join("recording.mcap").is_file());
+    let kept = std::fs::read(killed.join("recording.mcap")).unwrap();
+    if kept == cut {
+        let mesh = |out: &Path| std::fs::read(out.join("map/mesh.ply")).unwrap();
+        assert!(mesh(&killed) == mesh(&out), "the same bits as without the kill");
+    }
+}
+
+#[test]
+fn what_cannot_be_a_stream_is_refused_and_leaves_nothing() {
+    let out = shared().root.join("live no stream");
+    let ran = sent(of(Path::new("-"), &out, &[]), b"#ROSBAG V2.0\n and so on".to_vec());
+    assert_eq!(ran.code, 1, "{}", ran.stderr);
+    assert!(ran.stderr.contains("MCAP"), "{}", ran.stderr);
+    assert!(!out.exists(), "no folder of a run that never was");
+    let ran = sent(of(Path::new("-"), &out, &["--realtime"]), Vec::new());
+    assert!(ran.code == 2 && ran.stderr.contains("its own rate"), "{}", ran.stderr);
+    let ran = sent(of(Path::new("-"), &out, &["--resume"]), Vec::new());
+    assert!(ran.code == 2 && ran.stderr.contains("recording.mcap"), "{}", ran.stderr);
 }

@@ -185,6 +185,20 @@ pub fn decode(message_type: &str, encoding: Encoding, bytes: &[u8]) -> Result<Me
     }
 }
 
+impl Message {
+    /// Its stamp and frame; of several transforms or poses the first one's.
+    pub fn header(self) -> Header {
+        match self {
+            Self::Image(m) => m.header,
+            Self::CompressedImage(m) | Self::CompressedVideo(m) => m.header,
+            Self::Imu(m) => m.header,
+            Self::CameraInfo(m) => m.header,
+            Self::Transforms(m) => m.into_iter().next().map(|t| t.parent).unwrap_or_default(),
+            Self::Poses(m) => m.into_iter().next().map(|p| p.header).unwrap_or_default(),
+        }
+    }
+}
+
 /// Stamp and frame at the beginning of a message of ROS; the error is the reason as text.
 pub(crate) fn header(encoding: Encoding, message_type: &str, head: &[u8]) -> Result<Header, String> {
     let mut wire = if encoding == Encoding::Ros1 { ros::Wire::ros1(head) } else { ros::Wire::cdr(head)? };

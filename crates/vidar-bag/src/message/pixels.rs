@@ -16,7 +16,8 @@ pub enum Pixels {
 const MAX_SIDE_PX: u32 = 16_384;
 
 /// The pixel formats that are read, for messages.
-const READ: &str = "mono8, mono16, 8UC1, 16UC1, 32FC1, rgb8, bgr8, 8UC3, rgba8, bgra8, bayer_*8, yuv422, uyvy, yuv422_yuy2, yuyv";
+const READ: &str = "mono8, mono16, 8UC1, 16UC1, 32FC1, rgb8, bgr8, 8UC3, rgba8, bgra8, rgb16, bgr16, rgba16, bgra16, bayer_*8, bayer_*16, yuv422, uyvy, \
+                    yuv422_yuy2, yuyv, nv12, nv21, nv24";
 
 impl RawImage {
     /// The pixels; the error is the reason as text.
@@ -32,11 +33,18 @@ impl RawImage {
             "rgb8" | "bgr8" | "8UC3" => 3,
             "rgba8" | "bgra8" | "8UC4" => 4,
             "yuv422" | "uyvy" | "yuv422_yuy2" | "yuyv" => 2,
-            name if bayer_phase(name).is_some() => 1,
-            other => {
-                let other = vidar_core::printable(other);
-                return Err(format!("pixel format {other:?} is not read; {READ} are"));
-            }
+            "rgb16" | "bgr16" => 6,
+            "rgba16" | "bgra16" => 8,
+            // The plane of luma; chroma follows it.
+            "nv12" | "nv21" | "nv24" => 1,
+            name => match bayer_phase(name) {
+                Some(_) if name.ends_with("16") => 2,
+                Some(_) => 1,
+                None => {
+                    let name = vidar_core::printable(name);
+                    return Err(format!("pixel format {name:?} is not read; {READ} are"));
+                }
+            },
         };
         let row = width * pixel_bytes;
         // Some writers leave the step at 0 where rows are not padded.
@@ -54,7 +62,31 @@ impl RawImage {
             let pixels = rows().flat_map(|r| r.chunks_exact(pixel_bytes).map(pixel)).collect();
             Image::from_vec(width, height, pixels).map(|i| Pixels::Image(FrameImage::Rgb8(i)))
         };
+        // Of 16 bits the upper eight, where colours are made of them.
+        let upper = usize::from(!self.is_big_endian);
         let made = match self.encoding.as_str() {
+            "rgb16" | "rgba16" => rgb([0, 2, 4].map(|i| i + upper)),
+            "bgr16" | "bgra16" => rgb([4, 2, 0].map(|i| i + upper)),
+            name @ ("nv12" | "nv21" | "nv24") => {
+                let chroma = self.data.get(step.saturating_mul(height)..).unwrap_or_default();
+                // nv24 has chroma at every pixel, the others at every second one of every second row.
+                let (share, stride) = if name == "nv24" { (1, 2 * step) } else { (2, step) };
+                let (pairs, lines) = (width.div_ceil(share), height.div_ceil(share));
+                if chroma.len() < stride.saturating_mul(lines - 1).saturating_add(2 * pairs)
+                    || stride < 2 * pairs
+                {
+                    let found = self.data.len();
+                    return Err(format!(
+                        "{found} bytes in rows of {step} do not hold {width}x{height} pixels of {name}"
+                    ));
+                }
+                let [u, v] = if name == "nv21" { [1, 0] } else { [0, 1] };
+                let image = Image::from_fn(width, height, |x, y| {
+                    let at = y / share * stride + x / share * 2;
+                    rgb_of_yuv([self.data[y * step + x], chroma[at + u], chroma[at + v]])
+                });
+                Ok(Pixels::Image(FrameImage::Rgb8(image)))
+            }
             "mono16" | "16UC1" => {
                 let number = if self.is_big_endian { u16::from_be_bytes } else { u16::from_le_bytes };
                 let pixels = rows().flat_map(|r| r.as_chunks::<2>().0.iter().map(|p| number(*p))).collect();
@@ -71,7 +103,9 @@ impl RawImage {
             "yuv422" | "uyvy" => yuv422(width, height, rows(), [1, 0, 2]),
             "yuv422_yuy2" | "yuyv" => yuv422(width, height, rows(), [0, 1, 3]),
             name => {
-                let grey = Image::from_vec(width, height, rows().flatten().copied().collect());
+                let bytes = rows()
+                    .flat_map(|r| r.iter().copied().skip((pixel_bytes - 1) * upper).step_by(pixel_bytes));
+                let grey = Image::from_vec(width, height, bytes.collect());
                 grey.map(|grey| match bayer_phase(name) {
                     Some(phase) => Pixels::Image(FrameImage::Rgb8(demosaic(&grey, phase))),
                     None => Pixels::Image(FrameImage::Gray8(grey)),
@@ -85,10 +119,10 @@ impl RawImage {
 /// Column and row, modulo 2, of the red pixels.
 fn bayer_phase(encoding: &str) -> Option<[usize; 2]> {
     match encoding {
-        "bayer_rggb8" => Some([0, 0]),
-        "bayer_grbg8" => Some([1, 0]),
-        "bayer_gbrg8" => Some([0, 1]),
-        "bayer_bggr8" => Some([1, 1]),
+        "bayer_rggb8" | "bayer_rggb16" => Some([0, 0]),
+        "bayer_grbg8" | "bayer_grbg16" => Some([1, 0]),
+        "bayer_gbrg8" | "bayer_gbrg16" => Some([0, 1]),
+        "bayer_bggr8" | "bayer_bggr16" => Some([1, 1]),
         _ => None,
     }
 }
@@ -118,7 +152,15 @@ fn demosaic(raw: &Image<u8>, red: [usize; 2]) -> Image<[u8; 3]> {
     })
 }
 
-/// Two pixels in four bytes; `at` says where the first luma, U and V lie. BT.601, 16…235, as ROS and OpenCV take it.
+/// Luma, U and V of BT.601, 16…235, as ROS and OpenCV take it.
+fn rgb_of_yuv(yuv: [u8; 3]) -> [u8; 3] {
+    let [y, u, v] = yuv.map(f32::from);
+    let (luma, u, v) = (1.164_383 * (y - 16.0), u - 128.0, v - 128.0);
+    let rgb = [luma + 1.596_027 * v, luma - 0.391_762 * u - 0.812_968 * v, luma + 2.017_232 * u];
+    rgb.map(|c| c.round().clamp(0.0, 255.0) as u8)
+}
+
+/// Two pixels in four bytes; `at` says where the first luma, U and V lie.
 fn yuv422<'a>(
     width: usize,
     height: usize,
@@ -130,11 +172,8 @@ fn yuv422<'a>(
         for x in 0..width {
             let pair = &row[x / 2 * 4..];
             // A row of odd width ends in half a pair, which may lack a chroma.
-            let byte = |i: usize, missing: u8| f32::from(pair.get(i).copied().unwrap_or(missing));
-            let luma = 1.164_383 * (byte(at[0] + 2 * (x % 2), 16) - 16.0);
-            let (u, v) = (byte(at[1], 128) - 128.0, byte(at[2], 128) - 128.0);
-            let rgb = [luma + 1.596_027 * v, luma - 0.391_762 * u - 0.812_968 * v, luma + 2.017_232 * u];
-            pixels.push(rgb.map(|c| c.round().clamp(0.0, 255.0) as u8));
+            let byte = |i: usize, missing: u8| pair.get(i).copied().unwrap_or(missing);
+            pixels.push(rgb_of_yuv([byte(at[0] + 2 * (x % 2), 16), byte(at[1], 128), byte(at[2], 128)]));
         }
     }
     Image::from_vec(width, height, pixels).map(|i| Pixels::Image(FrameImage::Rgb8(i)))
@@ -199,6 +238,40 @@ mod tests {
             let colours = [200u8, 120, 40];
             let data: Vec<u8> = (0..6 * 4).map(|i| colours[pattern[(i / 6 % 2) * 2 + i % 6 % 2]]).collect();
             assert!(rgb(&image(name, 6, 4, 6, &data)).iter().all(|p| *p == colours), "{name}");
+            // The same in the upper bytes of 16 bits, in both byte orders.
+            let wide: Vec<u8> = data.iter().flat_map(|v| [7, *v]).collect();
+            let mut raw = image(&name.replace('8', "16"), 6, 4, 12, &wide);
+            assert!(rgb(&raw).iter().all(|p| *p == colours), "{name} of 16 bits");
+            (raw.is_big_endian, raw.data) = (true, data.iter().flat_map(|v| [*v, 7]).collect());
+            assert!(rgb(&raw).iter().all(|p| *p == colours), "{name} of 16 bits, big-endian");
+        }
+    }
+
+    #[test]
+    fn colours_of_sixteen_bits_keep_their_upper_bytes() {
+        let data = [0, 10, 0, 20, 0, 30, 9, 40, 9, 50, 9, 60];
+        assert_eq!(rgb(&image("rgb16", 2, 1, 12, &data)), [[10, 20, 30], [40, 50, 60]]);
+        assert_eq!(rgb(&image("bgr16", 2, 1, 12, &data)), [[30, 20, 10], [60, 50, 40]]);
+        assert_eq!(rgb(&image("bgra16", 1, 1, 8, &data[..8])), [[30, 20, 10]]);
+    }
+
+    #[test]
+    fn planes_of_chroma_belong_to_their_pixels() {
+        // 4×2 pixels: red on the left, white on the right; rows are padded to six bytes.
+        let luma = [81, 81, 235, 235, 0, 0, 81, 81, 235, 235, 0, 0];
+        let with = |chroma: &[u8]| [&luma[..], chroma].concat();
+        for (name, chroma) in [
+            ("nv12", vec![90, 240, 128, 128]),
+            ("nv21", vec![240, 90, 128, 128]),
+            ("nv24", [[90, 240, 90, 240, 128, 128, 128, 128, 0, 0, 0, 0]; 2].concat()),
+        ] {
+            let found = rgb(&image(name, 4, 2, 6, &with(&chroma)));
+            for (at, pixel) in found.iter().enumerate() {
+                let expected = if at % 4 < 2 { [255, 0, 0] } else { [255; 3] };
+                assert!((0..3).all(|c| pixel[c].abs_diff(expected[c]) <= 2), "{name}: {found:?}");
+            }
+            let short = with(&chroma[..2]);
+            assert!(image(name, 4, 2, 6, &short).pixels().unwrap_err().contains(name));
         }
     }
 

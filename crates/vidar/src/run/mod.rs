@@ -29,7 +29,7 @@ pub use budget::{Budget, BudgetChoice};
 pub use by_source::SourceScore;
 pub(crate) use evaluate::sampled;
 pub use evaluate::{DepthScore, Evaluation};
-pub use live::{Latency, LiveOptions, LiveReport};
+pub use live::{Latency, LiveInput, LiveOptions, LiveReport, RECORDING};
 pub use map::MetricMap;
 pub use outputs::pose_of;
 pub use plan::{ExpectedWork, Plan, bytes};
@@ -37,14 +37,14 @@ pub(crate) use scene::encoded_image;
 
 use crate::calibrate;
 use crate::config::{Config, Layered};
-use crate::engine::{Engine, EngineSetup, FrameStamp, MapEvent, PoseSource, PredictionStore};
+use crate::engine::{Engine, EngineSetup, FrameStamp, ImageSource, MapEvent, PoseSource, PredictionStore};
 use crate::error::{Error, ExitStatus};
 use crate::events::{CancelToken, Event, Events};
 use crate::input::{self, ImageFiles, Measurement, UnseenScale};
 use crate::odometry::TrackedPoses;
 use crate::run_folder::{OutputLocation, RunFolder};
 use crate::verdict::{StatedScale, Verdict};
-use live::{EndingCell, LivePublisher, SurfaceLatency, TrackedElsewhere};
+use live::{EndingCell, Incoming, LivePublisher, LiveStream, SurfaceLatency, TrackedElsewhere};
 use place_recognition::PlaceRecognition;
 use readers::{FINISH, MAP, Readers};
 use record::Recorder;
@@ -151,7 +151,7 @@ pub fn plan(request: &RunRequest) -> Result<Plan, Error> {
 /// # Errors
 /// The input cannot be used, nothing could be mapped, or a result could not be written.
 pub fn run(request: &RunRequest, events: &Events, cancel: &CancelToken) -> Result<RunOutcome, Error> {
-    carry(request, None, events, cancel)
+    carry(request, None, None, events, cancel)
 }
 
 /// Runs all of it as on a robot: poses while images come, by an odometry on a thread of its own; the map behind it. A camera without
@@ -165,12 +165,30 @@ pub fn live(
     events: &Events,
     cancel: &CancelToken,
 ) -> Result<RunOutcome, Error> {
-    carry(request, Some(options), events, cancel)
+    carry(request, Some(options), None, events, cancel)
+}
+
+/// The same of MCAP that comes, such as on standard input; the request's path is not used. What came is kept in the run folder as
+/// [`RECORDING`] while it comes, so that the request with this path goes on after a kill.
+///
+/// # Errors
+/// As [`live`]; and a stream that is no MCAP, or has no images.
+pub fn live_stream(
+    request: &RunRequest,
+    options: &LiveOptions,
+    input: LiveInput,
+    events: &Events,
+    cancel: &CancelToken,
+) -> Result<RunOutcome, Error> {
+    let folder = std::sync::Arc::new(RunFolder::create(&request.place)?);
+    let request = RunRequest { path: folder.path().join(RECORDING), ..request.clone() };
+    carry(&request, Some(options), Some(Incoming { folder, input }), events, cancel)
 }
 
 fn carry(
     request: &RunRequest,
     live: Option<&LiveOptions>,
+    incoming: Option<Incoming>,
     events: &Events,
     cancel: &CancelToken,
 ) -> Result<RunOutcome, Error> {
@@ -189,7 +207,8 @@ fn carry(
         scene,
         folder,
         poses,
-    } = start::start(request, live.is_some(), events, cancel)?;
+        stream,
+    } = start::start(request, live.is_some(), incoming, events, cancel)?;
     let context = Context {
         request,
         live,
@@ -198,6 +217,7 @@ fn carry(
         fingerprint: &fingerprint,
         folder: &folder,
         scene: scene.as_ref(),
+        stream: stream.as_ref(),
         events: &events,
         cancel,
     };
@@ -213,6 +233,9 @@ fn carry(
         Ok(outcome) => (outcome.status, outputs::result_json(outcome)),
         Err(error) => (error.exit_status(), record::failure_json(error)),
     };
+    if stream.is_some() || live::kept(request).is_some() {
+        live::list(&folder, &events);
+    }
     if let (Some(earlier), Ok(_)) = (&earlier, &made) {
         earlier.remove_all_but(folder.path(), &recorder.files());
     }
@@ -234,6 +257,8 @@ struct Context<'a> {
     fingerprint: &'a str,
     folder: &'a RunFolder,
     scene: Option<&'a SceneWriter>,
+    /// Where the recording is still made: `dataset` has the facts of its beginning.
+    stream: Option<&'a LiveStream>,
     events: &'a Events,
     cancel: &'a CancelToken,
 }
@@ -242,7 +267,7 @@ struct Context<'a> {
 struct EngineParts<'e> {
     geometry: &'e mut Source,
     places: &'e PlaceRecognition,
-    images: &'e ImageFiles<'e>,
+    images: &'e dyn ImageSource,
     store: &'e dyn PredictionStore,
 }
 
@@ -259,6 +284,8 @@ impl Context<'_> {
         let Self { request, config, dataset, folder, events, cancel, .. } = *self;
         let (map, live) = self.build_map(&plan, &mut source, tracked, places)?;
         live.as_ref().and_then(live::warning).iter().for_each(|w| events.warn(w));
+        let whole = self.stream.map(|stream| stream.whole(dataset)).transpose()?;
+        let dataset = whole.as_ref().unwrap_or(dataset);
         let evaluation =
             events.stage("evaluate", 0, || evaluate::evaluate(dataset, &plan, &map, config, events))?;
         let scale = trust::stated_scale(&map, plan.mode, UnseenScale::of(dataset, config));
@@ -305,7 +332,8 @@ impl Context<'_> {
         let images = ImageFiles(dataset, plan.masks.as_deref());
         let cancelled = || cancel.is_cancelled();
         let predicting = readers::chunk_progress(events);
-        let parts = EngineParts { geometry: source, places, images: &images, store: &store };
+        let images: &dyn ImageSource = self.stream.map_or(&images, |stream| stream);
+        let parts = EngineParts { geometry: source, places, images, store: &store };
         let ending = EndingCell::default();
         let elsewhere = plan.poses.source().filter(|_| self.live.is_some());
         let elsewhere = elsewhere.map(|s| Box::new(TrackedElsewhere::new(s, ending.clone())) as _);
@@ -322,6 +350,9 @@ impl Context<'_> {
             Some(options) => live::push(self, (plan, options), &ending, &mut engine, &mut readers).map(Some),
             None => self.push_recording(&mut engine, &mut |event| readers.read(event)).map(|()| None),
         })?;
+        if let Some(stream) = self.stream {
+            stream.tell(events);
+        }
         readers.finishing();
         events
             .stage(FINISH, 0, || engine.finish(&mut |event| readers.read(event)))

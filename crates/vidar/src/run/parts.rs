@@ -67,7 +67,7 @@ impl PartOutcome {
 /// # Errors
 /// The input cannot be used, or the folder cannot be written.
 pub fn track(request: &RunRequest, events: &Events, cancel: &CancelToken) -> Result<PartOutcome, Error> {
-    let started = start::start(request, false, events, cancel)?;
+    let started = start::start(request, false, None, events, cancel)?;
     if cancel.is_cancelled() {
         return Err(Error::Interrupted { path: started.folder.path().to_owned() });
     }
@@ -92,7 +92,7 @@ pub fn predict(
     events: &Events,
     cancel: &CancelToken,
 ) -> Result<PartOutcome, Error> {
-    let mut started = start::start(request, false, events, cancel)?;
+    let mut started = start::start(request, false, None, events, cancel)?;
     let poses = started.poses.take();
     let is_tracked_live = poses.is_none() && started.plan.poses.is_odometry();
     let chunks = match is_tracked_live {
@@ -117,8 +117,18 @@ fn predict_chunks(
     // Nothing of it is shown, and a surface that grows costs time.
     started.config.output.live_map = false;
     let Started { events, config, dataset, fingerprint, plan, source, places, folder, .. } = started;
-    let context =
-        Context { request, live: None, config, dataset, fingerprint, folder, scene: None, events, cancel };
+    let context = Context {
+        request,
+        live: None,
+        config,
+        dataset,
+        fingerprint,
+        folder,
+        scene: None,
+        stream: None,
+        events,
+        cancel,
+    };
     let inner = RunStore::new(folder.path(), fingerprint, plan, config);
     let store = PartStore { inner: &inner, part, kept, count: Cell::new(0) };
     let images = ImageFiles(dataset, plan.masks.as_deref());

@@ -1,6 +1,7 @@
 //! The start of a run: its recording opened, planned and tracked, its folder made.
 
 use super::budget;
+use super::live::{self, Incoming, LiveStream};
 use super::place_recognition::PlaceRecognition;
 use super::record::{Recorder, RunDescription};
 use super::scene::SceneWriter;
@@ -37,6 +38,8 @@ pub(super) struct Started {
     pub folder: Arc<RunFolder>,
     /// None where poses are given, and where the engine is to track while it maps.
     pub poses: Option<TrackedPoses>,
+    /// Where the recording is still made.
+    pub stream: Option<LiveStream>,
 }
 
 /// Starts a run.
@@ -46,16 +49,28 @@ pub(super) struct Started {
 pub(super) fn start(
     request: &RunRequest,
     is_live: bool,
+    incoming: Option<Incoming>,
     events: &Events,
     cancel: &CancelToken,
 ) -> Result<Started, Error> {
     let recorder = Recorder::default();
     let events = recorder.listen(events.clone());
     let mut config = request.layered.build()?;
-    let mut dataset =
-        events.stage("read", 0, || input::open_every_image(&request.path, &request.open, &config))?;
+    let early = incoming.as_ref().map(|i| i.folder.clone());
+    let (stream, mut dataset) = events.stage("read", 0, || match incoming {
+        Some(incoming) => {
+            incoming.open(request, &config, cancel).map(|(stream, facts)| (Some(stream), facts))
+        }
+        None => {
+            let open = if is_live { input::open_for_live } else { input::open_every_image };
+            open(&request.path, &request.open, &config).map(|dataset| (None, dataset))
+        }
+    })?;
     dataset.warnings.extend(input::use_every_untimed_image(&dataset, &mut config));
-    let fingerprint = input::fingerprint(&dataset)?;
+    let fingerprint = match (&stream, live::kept(request)) {
+        (Some(_), _) | (None, Some(_)) => live::fingerprint(&request.path)?,
+        (None, None) => input::fingerprint(&dataset)?,
+    };
     let mut tracking = Tracking::new(&dataset, &fingerprint, &config, &request.place)?;
     // What is live looks at nothing before it comes: neither to calibrate, nor for the camera's timing, nor to track.
     if is_live {
@@ -71,7 +86,7 @@ pub(super) fn start(
     let earlier = request.place.earlier(&description.0, &request.layered.to_toml(false))?;
     let scene = request.mcap.as_deref().map(SceneWriter::create).transpose()?;
     let events = scene.iter().fold(events, |events, scene| scene.listen(events));
-    let folder = Arc::new(RunFolder::create(&request.place)?);
+    let folder = early.map_or_else(|| RunFolder::create(&request.place).map(Arc::new), Ok)?;
     folder.write_manifest(&description.0)?;
     folder.write("config.resolved.toml", request.layered.to_toml(true).as_bytes())?;
     recorder.keep_log_in(folder.clone());
@@ -100,6 +115,7 @@ pub(super) fn start(
         scene,
         folder,
         poses,
+        stream,
     })
 }
 

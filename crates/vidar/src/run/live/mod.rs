@@ -14,6 +14,7 @@ mod latency;
 mod pose_file;
 mod publish;
 mod queue;
+mod stream;
 mod thinning;
 mod tracker;
 
@@ -21,13 +22,15 @@ pub(super) use ending::{EndingCell, TrackedElsewhere};
 pub use latency::Latency;
 pub(super) use latency::SurfaceLatency;
 pub(super) use publish::LivePublisher;
+pub(super) use stream::{Incoming, LiveStream, fingerprint, kept, list};
+pub use stream::{LiveInput, RECORDING};
 
 use super::readers::{MAP, Readers};
 use super::{Context, Plan, unreadable};
 use crate::engine::{Engine, FrameStamp, MapEvent};
 use crate::error::Error;
 use crate::events::Event;
-use crate::input;
+use crate::input::{self, Measurement};
 use ending::Ending;
 use pose_file::PoseFile;
 use queue::{Closing, Item, Queue};
@@ -204,7 +207,11 @@ fn track(
         counts: Counts::default(),
         waiting: Default::default(),
     };
-    let end = tracker.run(input::measurements(dataset, needs_sensors), &|| cancel.is_cancelled())?;
+    let measurements: Box<dyn Iterator<Item = Measurement>> = match context.stream {
+        Some(stream) => Box::new(stream.measurements(needs_sensors, cancel)),
+        None => Box::new(input::measurements(dataset, needs_sensors)),
+    };
+    let end = tracker.run(measurements, &|| cancel.is_cancelled())?;
     let Tracker { counts, thinning, pose_file, .. } = tracker;
     pose_file.finish();
     Ok((end, counts, thinning))
@@ -228,6 +235,8 @@ fn map(
                 let reports = report.into_iter().map(|report| *report).collect();
                 engine.push_tracked(&stamps, reports, &mut |event| readers.read(event))?;
                 done += stamps.len();
+                // How long a stream goes on is not known.
+                let total = context.stream.map_or(total, |_| done);
                 context.events.emit(&Event::Progress { stage: MAP, done, total });
             }
         }
