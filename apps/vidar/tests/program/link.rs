@@ -27,7 +27,7 @@ fn out(name: &str) -> PathBuf {
 
 fn run(name: &str, geometry: &str, more: &[&str]) -> Command {
     let mut all = SHORT.to_vec();
-    all.extend(["--geometry", geometry]);
+    all.extend(["--geometry", geometry, "--set", "remote.model=da3-nano"]);
     all.extend(more);
     run_command(&shared().sequence, &out(name), &all)
 }
@@ -54,7 +54,7 @@ mod built {
     use super::*;
     use crate::odometry::flight;
     use vidar::link::ros::Attachment;
-    use vidar::link::{Link, LinkOptions, Role};
+    use vidar::link::{Delivery, Link, LinkOptions, Role};
     use vidar_bag::{Bag, write::encode};
 
     /// A port that is free now.
@@ -135,7 +135,7 @@ mod built {
     fn a_worker_gives_the_bits_of_the_same_network_here_and_bytes_are_told() {
         let at = endpoint();
         let _worker = Worker::start(&at, &[]);
-        let told = mapped("raw", &[&at], &["--set", "remote.model=da3-nano"]);
+        let told = mapped("raw", &[&at], &[]);
         assert!(mesh(&out("raw")) == local(), "the same bits");
         assert_eq!((&told["images"], &told["depth"]), (&"raw".into(), &"f32".into()));
         assert_eq!((&told["retries"], &told["invalid_replies"]), (&0.into(), &0.into()));
@@ -184,6 +184,10 @@ mod built {
         let other = ["--connect", &at, "--set", "remote.model=da3-small"];
         let ran = ended(run("other", "remote:lab/depth", &other)).ends_with(4);
         ran.says(&["error[E0410]", "asked for was da3-small", "has da3-nano (MIT OR Apache-2.0"]);
+        let any = ["--connect", &at, "--set", "remote.model="];
+        ended(run("any", "remote:lab/depth", &any))
+            .ends_with(4)
+            .says(&["error[E0410]", "remote.model=da3-nano"]);
         let bad = ["--connect", &at];
         ended(run("bad key", "remote:lab depth/*", &bad)).ends_with(2).says(&["error[E0105]"]);
         let bad = ["--connect", "nonsense"];
@@ -263,7 +267,8 @@ mod built {
         let mut messages = Vec::new();
         for topic in bag.topics().iter().filter(|t| t.message_type != "nav_msgs/Odometry") {
             let kind = topic.message_type.replacen('/', "::msg::dds_::", 1);
-            let publisher = link.publisher(&format!("0{}/{kind}_/RIHS01_0", topic.name), None).unwrap();
+            let publisher =
+                link.publisher(&format!("0{}/{kind}_/RIHS01_0", topic.name), None, Delivery::Wait).unwrap();
             let publisher = std::rc::Rc::new(publisher);
             for (i, message) in topic.messages.iter().enumerate() {
                 messages.push((message.log_time, i, publisher.clone(), bag.read(message).unwrap()));
