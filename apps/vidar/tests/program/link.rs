@@ -27,7 +27,7 @@ fn out(name: &str) -> PathBuf {
 
 fn run(name: &str, geometry: &str, more: &[&str]) -> Command {
     let mut all = SHORT.to_vec();
-    all.extend(["--geometry", geometry]);
+    all.extend(["--geometry", geometry, "--set", "remote.model=da3-nano"]);
     all.extend(more);
     run_command(&shared().sequence, &out(name), &all)
 }
@@ -53,9 +53,9 @@ fn a_program_without_links_says_so() {
 mod built {
     use super::*;
     use crate::odometry::flight;
-    use std::collections::BTreeMap;
     use vidar::link::ros::Attachment;
-    use vidar::link::{Link, LinkOptions, Publisher, Role};
+    use vidar::link::{Delivery, Link, LinkOptions, Role};
+    use vidar_bag::{Bag, write::encode};
 
     /// A port that is free now.
     fn endpoint() -> String {
@@ -84,14 +84,12 @@ mod built {
                 "--json",
             ]);
             let mut child = command.args(more).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
-            let mut ready = String::new();
-            BufReader::new(child.stdout.take().unwrap()).read_line(&mut ready).unwrap();
-            if ready.is_empty() {
+            let words = serde_json::Deserializer::from_reader(child.stdout.take().unwrap());
+            let Some(Ok(ready)) = words.into_iter::<serde_json::Value>().next() else {
                 let mut said = String::new();
                 child.stderr.take().unwrap().read_to_string(&mut said).unwrap();
                 panic!("no worker: {said}");
-            }
-            let ready: serde_json::Value = serde_json::from_str(&ready).unwrap();
+            };
             assert_eq!((&ready["schema"], &ready["key"]), (&"vidar.worker/1".into(), &"lab/depth".into()));
             let (sender, told) = channel();
             let lines = BufReader::new(child.stderr.take().unwrap());
@@ -137,7 +135,7 @@ mod built {
     fn a_worker_gives_the_bits_of_the_same_network_here_and_bytes_are_told() {
         let at = endpoint();
         let _worker = Worker::start(&at, &[]);
-        let told = mapped("raw", &[&at], &["--set", "remote.model=da3-nano"]);
+        let told = mapped("raw", &[&at], &[]);
         assert!(mesh(&out("raw")) == local(), "the same bits");
         assert_eq!((&told["images"], &told["depth"]), (&"raw".into(), &"f32".into()));
         assert_eq!((&told["retries"], &told["invalid_replies"]), (&0.into(), &0.into()));
@@ -186,6 +184,10 @@ mod built {
         let other = ["--connect", &at, "--set", "remote.model=da3-small"];
         let ran = ended(run("other", "remote:lab/depth", &other)).ends_with(4);
         ran.says(&["error[E0410]", "asked for was da3-small", "has da3-nano (MIT OR Apache-2.0"]);
+        let any = ["--connect", &at, "--set", "remote.model="];
+        ended(run("any", "remote:lab/depth", &any))
+            .ends_with(4)
+            .says(&["error[E0410]", "remote.model=da3-nano"]);
         let bad = ["--connect", &at];
         ended(run("bad key", "remote:lab depth/*", &bad)).ends_with(2).says(&["error[E0105]"]);
         let bad = ["--connect", "nonsense"];
@@ -261,32 +263,31 @@ mod built {
         // What the recording holds, as a robot sends it.
         let options = LinkOptions { connect: vec![at], ..LinkOptions::default() };
         let link = Link::open(&options, Role::Client).unwrap();
-        let bytes = std::fs::read(&drive).unwrap();
-        let mut publishers: BTreeMap<String, (Publisher, i64)> = BTreeMap::new();
-        let sends = |message: &mcap::Message<'_>| message.channel.topic != "/ground_truth";
-        let messages: Vec<mcap::Message<'_>> =
-            mcap::MessageStream::new(&bytes).unwrap().map(Result::unwrap).filter(sends).collect();
-        for message in &messages {
-            let topic = message.channel.topic.clone();
-            let (package, name) = message.channel.schema.as_ref().unwrap().name.split_once("/msg/").unwrap();
-            let key = format!("0{topic}/{package}::msg::dds_::{name}_/RIHS01_0");
-            publishers.entry(topic).or_insert_with(|| (link.publisher(&key, None).unwrap(), 0));
+        let bag = Bag::open(&drive).unwrap();
+        let mut messages = Vec::new();
+        for topic in bag.topics().iter().filter(|t| t.message_type != "nav_msgs/Odometry") {
+            let kind = topic.message_type.replacen('/', "::msg::dds_::", 1);
+            let publisher =
+                link.publisher(&format!("0{}/{kind}_/RIHS01_0", topic.name), None, Delivery::Wait).unwrap();
+            let publisher = std::rc::Rc::new(publisher);
+            for (i, message) in topic.messages.iter().enumerate() {
+                messages.push((message.log_time, i, publisher.clone(), bag.read(message).unwrap()));
+            }
         }
+        messages.sort_by_key(|(time, ..)| *time);
         std::thread::sleep(Duration::from_secs(2));
-        for message in &messages {
-            let (publisher, sequence) = publishers.get_mut(&message.channel.topic).unwrap();
-            *sequence += 1;
-            let attached =
-                Attachment { sequence: *sequence, sent_ns: message.publish_time as i64, sender: [7; 16] };
+        for (time, i, publisher, message) in &messages {
+            let attached = Attachment { sequence: *i as i64, sent_ns: time.nanos(), sender: [7; 16] };
+            let (_, payload) = encode(message).unwrap();
             // Everything comes twice.
             for _ in 0..2 {
-                publisher.put(message.data.to_vec(), attached.encode()).unwrap();
+                publisher.put(payload.clone(), attached.encode()).unwrap();
             }
             std::thread::sleep(Duration::from_micros(200));
         }
         let told = received(child);
         let count: u64 = told["topics"].as_object().unwrap().values().map(|n| n.as_u64().unwrap()).sum();
-        let known: u64 = messages.len() as u64;
+        let known = messages.len() as u64;
         assert_eq!(
             (count + told["ignored"].as_u64().unwrap() / 2, &told["dropped"]),
             (known, &0.into()),

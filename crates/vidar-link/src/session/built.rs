@@ -1,6 +1,6 @@
 //! Sessions by Zenoh, with plain calls.
 
-use super::{LinkOptions, Role, Sample, Serving, settings};
+use super::{Delivery, LinkOptions, Role, Sample, Serving, settings};
 use crate::error::LinkError;
 use crate::geometry::{AskError, Reach, Served, answer_hello, answer_predict, busy, patience_of};
 use std::collections::VecDeque;
@@ -59,7 +59,7 @@ impl Link {
     /// # Errors
     /// A key that is none.
     pub fn reach(self, key: &str) -> Result<Box<dyn Reach>, LinkError> {
-        checked(key)?;
+        plain(key)?;
         Ok(Box::new(Workers { session: self.session, key: key.to_owned() }))
     }
 
@@ -75,7 +75,7 @@ impl Link {
         told: &dyn Fn(Serving),
         stop: &(dyn Fn() -> bool + Sync),
     ) -> Result<(), LinkError> {
-        checked(key)?;
+        plain(key)?;
         let worker = self.session.zid().to_string();
         let queue = Arc::new(AtomicUsize::new(0));
         let hello_key = format!("{key}/{worker}/hello");
@@ -166,16 +166,36 @@ impl Link {
     ///
     /// # Errors
     /// A key that is none.
-    pub fn publisher(&self, key: &str, token: Option<&str>) -> Result<Publisher, LinkError> {
+    pub fn publisher(
+        &self,
+        key: &str,
+        token: Option<&str>,
+        delivery: Delivery,
+    ) -> Result<Publisher, LinkError> {
         checked(key)?;
         let failed = || format!("cannot publish to {key}");
         let publisher = self.session.declare_publisher(key.to_owned());
-        // Who does not keep up loses messages; the one that publishes never waits.
-        let publisher = publisher.congestion_control(CongestionControl::Drop).express(true).wait();
+        let control = match delivery {
+            Delivery::Drop => CongestionControl::Drop,
+            Delivery::Wait => CongestionControl::Block,
+        };
+        let publisher = publisher.congestion_control(control).express(true).wait();
         let publisher = publisher.map_err(transport(failed()))?;
         let token = token.map(|t| self.session.liveliness().declare_token(t.to_owned()).wait());
         let _token = token.transpose().map_err(transport(failed()))?;
         Ok(Publisher { publisher, _token })
+    }
+}
+
+/// A key that is no expression: it is one place.
+fn plain(key: &str) -> Result<(), LinkError> {
+    checked(key)?;
+    match key.chars().all(|c| c.is_ascii_alphanumeric() || "_-./".contains(c)) {
+        true => Ok(()),
+        false => {
+            let reason = "letters, digits, `_`, `-`, `.` and `/` expected".into();
+            Err(LinkError::BadSetting { what: format!("key {key:?}"), reason })
+        }
     }
 }
 

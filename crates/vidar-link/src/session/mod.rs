@@ -29,6 +29,15 @@ pub struct LinkOptions {
     pub config: Option<PathBuf>,
 }
 
+/// What happens to a message while its receivers do not keep up.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Delivery {
+    /// It is lost; the one that publishes never waits.
+    Drop,
+    /// The one that publishes waits.
+    Wait,
+}
+
 /// What a session is for where no endpoint is given.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Role {

@@ -1,6 +1,6 @@
 //! The same functions for a program without Zenoh: nothing can be opened.
 
-use super::{LinkOptions, Role, Sample, Serving};
+use super::{Delivery, LinkOptions, Role, Sample, Serving};
 use crate::error::LinkError;
 use crate::geometry::{Reach, Served};
 use std::sync::Arc;
@@ -57,7 +57,7 @@ impl Link {
     ///
     /// # Errors
     /// None: there is no session.
-    pub fn publisher(&self, _: &str, _: Option<&str>) -> Result<Publisher, LinkError> {
+    pub fn publisher(&self, _: &str, _: Option<&str>, _: Delivery) -> Result<Publisher, LinkError> {
         match *self {}
     }
 

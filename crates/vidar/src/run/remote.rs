@@ -41,6 +41,11 @@ impl RemoteSource {
         let reach = Link::open(&config.link.options(), Role::Client)?.reach(key)?;
         let model = RemoteModel::open(reach, options, &|| false)?;
         check_licence(key, model.facts())?;
+        if model.facts().model == bundled::NAME && config.remote.model.is_empty() {
+            // Its images have another size, and it is told its poses, which the settings know only by its name.
+            let reason = format!("they have {}: say so with remote.model={}", bundled::NAME, bundled::NAME);
+            return Err(LinkError::OtherModel { key: key.to_owned(), reason }.into());
+        }
         Ok(Self { model, wants_tokens: false })
     }
 

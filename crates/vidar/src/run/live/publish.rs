@@ -12,7 +12,7 @@ use vidar_align::covariance::covariance_in_camera;
 use vidar_core::{OdometryKeyframe, PoseCovariance, RigCamera, Se3, Severity, Timestamp};
 use vidar_link::ros::{Attachment, CloudPoint, HealthLevel, RosType, TopicKey, liveliness_token};
 use vidar_link::ros::{health, odometry, point_cloud, pose_stamped, transforms};
-use vidar_link::{Link, LinkError, Publisher, Role};
+use vidar_link::{Delivery, Link, LinkError, Publisher, Role};
 
 /// The world; further segments, which have no common world with the first, are `map_1`, `map_2`, ….
 const WORLD: &str = "map";
@@ -87,7 +87,8 @@ impl LivePublisher {
         for (number, (topic, name, kind)) in TOPICS.into_iter().enumerate() {
             let name = if name.starts_with('/') { name.to_owned() } else { format!("/{namespace}/{name}") };
             let token = liveliness_token((domain, "vidar"), &session, number, &name, kind);
-            let publisher = link.publisher(&TopicKey::of(domain, &name, kind), Some(&token))?;
+            let publisher =
+                link.publisher(&TopicKey::of(domain, &name, kind), Some(&token), Delivery::Drop)?;
             publishers.insert(topic, (publisher, AtomicI64::new(0)));
         }
         Ok(Some(Self {
