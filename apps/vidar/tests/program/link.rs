@@ -250,20 +250,11 @@ mod built {
         ran.ends_with(0).json()["received"].clone()
     }
 
-    #[test]
-    fn a_robot_that_is_received_makes_the_map_of_its_recording() {
-        let folder = out("robot");
-        std::fs::create_dir_all(&folder).unwrap();
-        let (drive, file) = (folder.join("drive.mcap"), folder.join("received.mcap"));
-        let mut convert = command();
-        convert.arg("convert").arg(&shared().sequence).arg(&drive).arg("-q");
-        ended(convert).ends_with(0);
-        let at = endpoint();
-        let child = receiving(&at, &file, "3");
-        // What the recording holds, as a robot sends it.
+    /// Sends what a recording holds, as a robot does, each message twice; how many there are.
+    fn drives(recording: &Path, at: String) -> u64 {
         let options = LinkOptions { connect: vec![at], ..LinkOptions::default() };
         let link = Link::open(&options, Role::Client).unwrap();
-        let bag = Bag::open(&drive).unwrap();
+        let bag = Bag::open(recording).unwrap();
         let mut messages = Vec::new();
         for topic in bag.topics().iter().filter(|t| t.message_type != "nav_msgs/Odometry") {
             let kind = topic.message_type.replacen('/', "::msg::dds_::", 1);
@@ -285,9 +276,48 @@ mod built {
             }
             std::thread::sleep(Duration::from_micros(200));
         }
+        messages.len() as u64
+    }
+
+    #[test]
+    fn a_robot_is_mapped_while_it_drives() {
+        let folder = out("driving");
+        std::fs::create_dir_all(&folder).unwrap();
+        let (drive, map) = (folder.join("drive.mcap"), folder.join("map"));
+        let mut convert = command();
+        convert.arg("convert").arg(flight()).arg(&drive).arg("-q");
+        ended(convert).ends_with(0);
+        let at = endpoint();
+        let mut live = command();
+        live.args(["live", "zenoh:0/**", "--listen", &at, "--idle", "3", "--duration", "200", "-o"])
+            .arg(&map);
+        let child =
+            live.args(["-q", "--set", "input.poses=odometry"]).stderr(Stdio::piped()).spawn().unwrap();
+        std::thread::sleep(Duration::from_secs(2));
+        drives(&drive, at);
+        let ran: ProgramOutput = child.wait_with_output().unwrap().into();
+        assert!([0, 3].contains(&ran.code), "{}", ran.stderr);
+        let lines = std::fs::read_to_string(map.join("trajectory/live.tum")).unwrap();
+        assert!(lines.lines().filter(|l| !l.starts_with('#')).count() > 10, "{lines}");
+        let kept = Bag::open(&map.join("recording.mcap")).unwrap();
+        let images = |bag: &Bag| bag.topics().iter().map(|t| t.messages.len()).sum::<usize>();
+        assert!(images(&kept) > images(&Bag::open(&drive).unwrap()) / 2, "what came is kept");
+        assert!(mesh(&map).len() > 10_000);
+    }
+
+    #[test]
+    fn a_robot_that_is_received_makes_the_map_of_its_recording() {
+        let folder = out("robot");
+        std::fs::create_dir_all(&folder).unwrap();
+        let (drive, file) = (folder.join("drive.mcap"), folder.join("received.mcap"));
+        let mut convert = command();
+        convert.arg("convert").arg(&shared().sequence).arg(&drive).arg("-q");
+        ended(convert).ends_with(0);
+        let at = endpoint();
+        let child = receiving(&at, &file, "3");
+        let known = drives(&drive, at);
         let told = received(child);
         let count: u64 = told["topics"].as_object().unwrap().values().map(|n| n.as_u64().unwrap()).sum();
-        let known = messages.len() as u64;
         assert_eq!(
             (count + told["ignored"].as_u64().unwrap() / 2, &told["dropped"]),
             (known, &0.into()),
