@@ -141,8 +141,8 @@ mod built {
         assert_eq!((&told["retries"], &told["invalid_replies"]), (&0.into(), &0.into()));
         let number = |told: &serde_json::Value, key: &str| told[key].as_u64().unwrap();
         assert!(number(&told, "chunks") >= 3, "{told}");
-        // A keyframe of 160x104 pixels takes 50 kB as it is.
-        assert!(number(&told, "bytes_sent") > 40_000 * number(&told, "keyframes"), "{told}");
+        // A keyframe of 160x104 grey pixels takes 16.6 kB as it is.
+        assert!(number(&told, "bytes_sent") > 16_600 * number(&told, "keyframes"), "{told}");
         let small = ["--set", "remote.images=jpeg", "--set", "remote.depth=f16"];
         let smaller = mapped("jpeg", &[&at], &small);
         let ratio =
@@ -306,7 +306,7 @@ mod built {
     }
 
     #[test]
-    fn a_robot_that_is_received_makes_the_map_of_its_recording() {
+    fn a_robot_that_is_received_leaves_the_recording_that_it_sent() {
         let folder = out("robot");
         std::fs::create_dir_all(&folder).unwrap();
         let (drive, file) = (folder.join("drive.mcap"), folder.join("received.mcap"));
@@ -324,16 +324,14 @@ mod built {
             "{told}"
         );
         assert_eq!(told["repeated"].as_u64(), Some(count), "{told}");
-        let mesh_of = |recording: &Path, name: &str| {
-            let out = folder.join(name);
-            let mut run = command();
-            run.arg("run").arg(recording).arg("-o").arg(&out).arg("--config").arg(&shared().settings);
-            run.args(["-q", "--mode", "pose-free", "--geometry", "da3-nano", "--set", "input.poses=auto"]);
-            let ran = ended(run);
-            assert!([0, 3].contains(&ran.code), "{}", ran.stderr);
-            mesh(&out)
-        };
-        assert!(mesh_of(&drive, "of the drive") == mesh_of(&file, "of what came"), "the same bits");
+        let (kept, bag) = (Bag::open(&file).unwrap(), Bag::open(&drive).unwrap());
+        for topic in kept.topics() {
+            let sent = bag.topics().iter().find(|t| t.name == topic.name).unwrap();
+            assert_eq!(topic.messages.len(), sent.messages.len(), "{}", topic.name);
+            for (came, went) in topic.messages.iter().zip(&sent.messages) {
+                assert!(kept.read(came).unwrap() == bag.read(went).unwrap(), "{}", topic.name);
+            }
+        }
     }
 
     #[test]
