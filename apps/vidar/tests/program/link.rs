@@ -276,6 +276,8 @@ mod built {
             }
             std::thread::sleep(Duration::from_micros(200));
         }
+        // A session that is closed takes what is on its way with it.
+        std::thread::sleep(Duration::from_secs(1));
         messages.len() as u64
     }
 
