@@ -26,6 +26,7 @@ const LAYERS: &[(&str, &[&str])] = &[
     ("vidar-export", &["vidar-core"]),
     ("vidar-view", &["vidar-core"]),
     ("vidar-synth", &["vidar-core"]),
+    ("vidar-link", &["vidar-core"]),
     ("vidar-cli", &["vidar-map"]),
     ("xtask", &[]),
 ];
@@ -38,6 +39,7 @@ const RESERVED: &[(&str, &[&str], &str)] = &[
     ("tiny-skia", &["vidar-view"], "pictures are drawn in one place"),
     ("ureq", &["vidar-hub"], "the network is used in one place, and only when asked for"),
     ("object_store", &["vidar-store"], "stores of batches are reached in one place"),
+    ("zenoh", &["vidar-link"], "other machines are reached in one place"),
     ("wgpu", &["vidar-gpu"], "graphics processors are used in one place"),
     ("ruzstd", &["vidar-bag"], "recordings are decompressed in one place, within bounds"),
     ("lz4_flex", &["vidar-bag"], "recordings are decompressed in one place, within bounds"),

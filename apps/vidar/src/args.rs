@@ -2,6 +2,7 @@
 
 use crate::batch_args::{PlanArgs, WorkArgs};
 use crate::compare_args::CompareArgs;
+use crate::link_args::{LinkArgs, ReceiveArgs, WorkerArgs};
 use crate::live_args::LiveArgs;
 use crate::model_args::{DepthArgs, LicenceArgs, ModelCommand};
 use clap::{ArgAction, Args, Parser, Subcommand, ValueEnum, ValueHint};
@@ -70,7 +71,7 @@ pub enum Command {
     Run(Box<WholeRunArgs>),
     /// Map while images come: poses from a thread of its own, a growing surface, latencies measured.
     #[command(
-        after_help = "Examples:\n  vidar live drive.mcap --realtime -o result\n  vidar live mav0/ --preset euroc --realtime\n  vidar live mav0/ -o result --resume"
+        after_help = "Examples:\n  vidar live drive.mcap --realtime -o result\n  vidar live mav0/ --preset euroc --realtime\n  vidar live mav0/ -o result --resume\n  vidar live 'zenoh:0/cam0/**,0/imu/**' --connect tcp/robot:7447 -o result"
     )]
     Live(Box<LiveArgs>),
     /// Render a flight through a synthetic room, map it and evaluate the map; nothing is downloaded.
@@ -146,6 +147,16 @@ pub enum Command {
         after_help = "Examples:\n  vidar work --plan results/plans/HASH.json --stage track --index 0\n  vidar work --plan results/plans/HASH.json --stage report"
     )]
     Work(WorkArgs),
+    /// Serve a network to runs on other machines (`--geometry remote:KEY`), until Ctrl-C.
+    #[command(
+        after_help = "Examples:\n  vidar worker --model da3-nano\n  vidar worker --model da3-small --device gpu --listen tcp/0.0.0.0:7447\n  vidar worker --key lab/depth --link-config tls.json5"
+    )]
+    Worker(Box<WorkerArgs>),
+    /// Take a robot's messages (ROS 2 over Zenoh) as they come, as an MCAP stream or file.
+    #[command(
+        after_help = "Examples:\n  vidar receive '0/cam0/**' '0/imu/**' -o drive.mcap\n  vidar receive '0/**' --connect tcp/robot:7447 --duration 60 -o drive.mcap"
+    )]
+    Receive(Box<ReceiveArgs>),
     /// Check this machine: processor, memory, disk, networks, graphics processors.
     Doctor,
     /// Show and explain settings: show, explain, presets, schema.
@@ -295,9 +306,13 @@ pub struct RunArgs {
     /// Where results go.
     #[command(flatten)]
     pub output: OutputArgs,
-    /// Source of depth: auto (stereo, completed), stereo, a network of `vidar model list` such as da3-small, or recorded:DIR.
+    /// Source of depth: auto (stereo, completed), stereo, a network of `vidar model list` such as da3-small, recorded:DIR, or remote:KEY,
+    /// the network of the `vidar worker`s under that key.
     #[arg(long, visible_alias = "model", value_name = "NAME", help_heading = "Model")]
     pub geometry: Option<String>,
+    /// How other machines are reached.
+    #[command(flatten)]
+    pub link: LinkArgs,
     /// Coupling of depth and metric poses: coupled, hybrid, pose-conditioned, ground-truth, pose-free, da3-streaming.
     #[arg(long, value_name = "MODE", help_heading = "Model")]
     pub mode: Option<String>,

@@ -1,9 +1,11 @@
 //! Converts flags to values of the library; each is checked here or at its first use.
 
 use crate::args::{BudgetArgs, ConfigArgs, EvalArgs, InputArgs, OutputArgs, RunArgs, WorldArgs};
+use crate::link_args::LinkArgs;
 use std::path::Path;
 use vidar::config::Origin;
 use vidar::core::{CameraId, Se3, So3};
+use vidar::da3::Device;
 use vidar::dataset::{CameraFlag, OpenOptions, TrajectoryReadOptions, body_named, decoder_named};
 use vidar::run_folder::OutputLocation;
 use vidar::synth::{FlightKind, SceneKind, Start, SynthConfig};
@@ -96,10 +98,30 @@ pub fn apply_model_flags(layered: &mut Layered, args: &RunArgs) -> Result<(), Er
         let bytes = toml::Value::Integer(byte_count(size)?);
         layered.value("limits.memory_bytes", bytes, Origin::Flag("--memory-budget"))?;
     }
-    if let Some(device) = args.device {
-        layered.value("model.device", toml::Value::String(device.to_string()), Origin::Flag("--device"))?;
-    }
+    apply_device_flag(layered, args.device)?;
+    apply_link_flags(layered, &args.link)?;
     apply_source_flags(layered, args.geometry.as_deref(), args.model_dir.as_deref())
+}
+
+/// `--device`.
+pub fn apply_device_flag(layered: &mut Layered, device: Option<Device>) -> Result<(), Error> {
+    let Some(device) = device else { return Ok(()) };
+    layered.value("model.device", toml::Value::String(device.to_string()), Origin::Flag("--device"))
+}
+
+/// `--connect`, `--listen`, `--link-config`.
+pub fn apply_link_flags(layered: &mut Layered, link: &LinkArgs) -> Result<(), Error> {
+    let config = link.link_config.iter().map(|p| p.display().to_string()).collect();
+    for (key, flag, values) in [
+        ("link.connect", "--connect", &link.connect),
+        ("link.listen", "--listen", &link.listen),
+        ("link.config", "--link-config", &config),
+    ] {
+        if !values.is_empty() {
+            layered.value(key, toml::Value::String(values.join(",")), Origin::Flag(flag))?;
+        }
+    }
+    Ok(())
 }
 
 /// `4GiB`, `800MB`, `1.5G`, or bytes.

@@ -7,6 +7,7 @@ pub mod batch_args;
 mod build;
 mod commands;
 pub mod compare_args;
+pub mod link_args;
 pub mod live_args;
 pub mod model_args;
 mod print;
@@ -113,6 +114,8 @@ fn dispatch(command: Command, context: &Context) -> Outcome {
         Command::Bench(args) => commands::bench::bench(&args, context),
         Command::Plan(args) => commands::batch::plan(&args, context),
         Command::Work(args) => commands::batch::work(&args, context),
+        Command::Worker(args) => commands::worker::worker(&args, context),
+        Command::Receive(args) => commands::receive::receive(&args, context),
         Command::Doctor => commands::doctor::doctor(context),
         Command::Config(ConfigCommand::Show { config, origin }) => {
             commands::config::show(&config, origin, context)

@@ -116,6 +116,9 @@ pub enum ModelError {
     /// The caller asked to stop.
     #[error("cancelled")]
     Cancelled,
+    /// The model is elsewhere and does not answer any more: no other chunk would be predicted either.
+    #[error("{0}")]
+    OutOfReach(String),
     /// Any other error, as the model describes it.
     #[error("{0}")]
     Other(String),

@@ -58,7 +58,7 @@ pub fn examine(folder: &Path) -> Vec<Finding> {
     ]
     .into_iter()
     .chain(graphics_processors())
-    .chain([environment()])
+    .chain([links(), environment()])
     .collect()
 }
 
@@ -106,6 +106,24 @@ fn graphics_processors() -> Vec<Finding> {
             .into_iter()
             .map(|(word, name)| finding("gpu", State::Ok, format!("{name}: --device {word}")))
             .collect(),
+    }
+}
+
+/// Robots and geometry servers. Nobody is asked: an answer would need the network.
+fn links() -> Finding {
+    let at = vidar_link::DEFAULT_ENDPOINT;
+    match vidar_link::is_built() {
+        true => finding(
+            "link",
+            State::Ok,
+            format!("Zenoh is built in: `vidar worker`, --geometry remote:KEY; {at} unless told otherwise"),
+        ),
+        false => Finding {
+            what: "link",
+            state: State::Optional,
+            found: "this program was built without links to other machines".into(),
+            advice: Some("build it with `--features link` for robots and geometry servers".into()),
+        },
     }
 }
 

@@ -237,6 +237,9 @@ pub enum Error {
     /// The store of a batch cannot be used.
     #[error("{0}")]
     Store(#[from] vidar_store::StoreError),
+    /// Other machines cannot be reached, or are not what was asked for.
+    #[error("{0}")]
+    Link(#[from] vidar_link::LinkError),
     /// The plan of a batch, or a record of one of its tasks, cannot be used.
     #[error("{name}: {reason}")]
     NotABatch {
@@ -297,6 +300,8 @@ impl Error {
             Self::Store(_) if self.file_system().is_some_and(is_full) => "E0402",
             Self::Store(_) => "E0406",
             Self::TaskTooEarly { .. } => "E0407",
+            Self::Geometry(vidar_core::ModelError::OutOfReach(_)) => "E0409",
+            Self::Link(error) => link_code(error),
             Self::Geometry(_) | Self::Stereo(_) => "E0301",
             Self::Hub(error) | Self::WeightsMissing(error) => hub_code(error),
             Self::Da3(vidar_da3::Da3Error::Cancelled) => "E1301",
@@ -406,6 +411,10 @@ impl Error {
             Self::Empty { .. } => {
                 "check the images in depth/ of the run folder; try --preset quality, or another depth range"
             }
+            Self::Geometry(vidar_core::ModelError::OutOfReach(_)) => {
+                "start a `vidar worker`, then run the same command with --resume: what is predicted is kept"
+            }
+            Self::Link(error) => link_hint(error),
             Self::NotABatch { .. } => {
                 "`vidar plan RECORDINGS… --store FOLDER` writes a plan and prints its address"
             }
@@ -473,6 +482,39 @@ impl Error {
             _ => return None,
         };
         Some(text.to_owned())
+    }
+}
+
+/// The code of an error between machines.
+fn link_code(error: &vidar_link::LinkError) -> &'static str {
+    use vidar_link::LinkError as L;
+    match error {
+        L::BadSetting { .. } => "E0105",
+        L::File { .. } => "E0401",
+        L::NoWorker { .. } => "E0409",
+        L::OtherModel { .. } => "E0410",
+        L::Cancelled => "E1301",
+        _ => "E0408",
+    }
+}
+
+/// The hint for an error between machines.
+fn link_hint(error: &vidar_link::LinkError) -> &'static str {
+    use vidar_link::LinkError as L;
+    match error {
+        L::NotBuilt => "build the program with `--features link`",
+        L::BadSetting { .. } => {
+            "endpoints are like tcp/192.168.1.5:7447; keys like vidar/geometry, without * and spaces; --link-config takes a file like \
+             Zenoh's DEFAULT_CONFIG.json5"
+        }
+        L::NoWorker { .. } => {
+            "start `vidar worker --model da3-small` there; --connect names its endpoint; with TLS, a certificate that is not \
+             accepted looks the same"
+        }
+        L::OtherModel { .. } => {
+            "remote.model names the model that workers must have; give each of them the same"
+        }
+        _ => "check the address, whether the port is free, and --link-config",
     }
 }
 
@@ -608,6 +650,18 @@ pub const CODES: &[(&str, &str)] = &[
     (
         "E0407",
         "A task of a batch was started before the tasks whose results it needs. It may be tried again when they are done.",
+    ),
+    (
+        "E0408",
+        "A link to other machines could not be opened or used: the program was built without it, or an endpoint cannot be listened at.",
+    ),
+    (
+        "E0409",
+        "No geometry worker answers, or none answers any more. Chunks that were predicted are kept; the same command with --resume goes on once a worker is there.",
+    ),
+    (
+        "E0410",
+        "The geometry workers are not what was asked for: another model, other weights, another licence than that of these weights, or workers that differ from each other.",
     ),
     ("E0501", "A threshold given with --fail-above or --fail-below was missed."),
     ("E7001", "A bug in VIDAR. Please report it; finished files are on disk."),

@@ -32,11 +32,13 @@ mod masks;
 pub mod models;
 pub mod odometry;
 pub mod quality;
+pub mod receive;
 pub mod run;
 pub mod run_folder;
 pub mod system;
 pub mod verdict;
 pub mod viewer;
+pub mod worker;
 
 pub use config::{Config, Layered};
 pub use error::{Error, ExitStatus};
@@ -50,6 +52,7 @@ pub use vidar_eval as eval;
 pub use vidar_export as export_formats;
 pub use vidar_fusion as fusion;
 pub use vidar_hub as hub;
+pub use vidar_link as link;
 pub use vidar_odometry as odometry_stage;
 pub use vidar_synth as synth;
 

@@ -15,9 +15,11 @@ pub mod inspect;
 pub mod live;
 pub mod model;
 pub mod odometry;
+pub mod receive;
 pub mod run;
 pub mod synth;
 pub mod view;
+pub mod worker;
 
 use crate::Outcome;
 use crate::args::Cli;

@@ -54,11 +54,13 @@ pub(super) fn request(
 
 /// Records an acceptance of a licence given with this command, before the model is opened.
 fn accept_licence(layered: &vidar::Layered, args: &RunArgs) -> Result<(), Error> {
-    let (Some(accepted), Some(choice)) =
-        (super::model::accepted(&args.licence), vidar::models::geometry::chosen(&layered.build()?)?)
-    else {
-        return Ok(());
-    };
+    let Some(accepted) = super::model::accepted(&args.licence) else { return Ok(()) };
+    let config = layered.build()?;
+    if !config.remote.model.is_empty() && config.geometry.source.starts_with(vidar::models::geometry::REMOTE)
+    {
+        return vidar::models::accept(&config.remote.model, &accepted);
+    }
+    let Some(choice) = vidar::models::geometry::chosen(&config)? else { return Ok(()) };
     vidar::models::locate(&choice, Some(&accepted), &vidar::models::store(true)?).map(|_| ())
 }
 

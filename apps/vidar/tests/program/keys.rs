@@ -156,6 +156,15 @@ const SETTINGS: &[(&str, &str, ExtraSettings)] = &[
 
 /// Settings that are shown to matter elsewhere, with the place.
 const ELSEWHERE: &[(&str, &str)] = &[
+    ("remote.model", "it needs a worker; link.rs has some"),
+    ("remote.images", "it needs a worker; link.rs has some"),
+    ("remote.depth", "it needs a worker; link.rs has some"),
+    ("link.connect", "it needs a worker; link.rs has some"),
+    ("link.listen", "it needs a worker; link.rs has some"),
+    ("link.config", "it needs certificates; vidar-link's test tls has some"),
+    ("link.publish", "it needs somebody who listens; link.rs does"),
+    ("link.timeout_secs", "it needs a worker; link.rs has one that hangs"),
+    ("link.patience_secs", "it needs no worker; link.rs has none"),
     ("budget.speed", "it needs a limit; budget.rs has one"),
     ("input.camera", "there is one camera here; faults.rs asks for another"),
     ("output.live_map", "it leaves nothing; coupling.rs watches it grow"),

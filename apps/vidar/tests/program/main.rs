@@ -18,6 +18,7 @@ mod faults;
 mod hostile;
 mod keys;
 mod ladder;
+mod link;
 mod live;
 mod map;
 mod masks;

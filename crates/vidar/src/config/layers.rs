@@ -10,6 +10,8 @@ use toml::{Table, Value};
 
 const SOURCE: &str = "geometry.source";
 const WEIGHTS: &str = "model.dir";
+/// The model of workers elsewhere.
+const REMOTE_MODEL: &str = "remote.model";
 const PROCESS_SIZE: &str = "model.network.preprocess.process_size_px";
 const POSE_MODE: &str = "model.network.mode";
 
@@ -137,7 +139,7 @@ impl Layered {
         )?;
         store(&mut self.values, key, value);
         self.origins.insert(key.to_owned(), origin);
-        if key == SOURCE || key == WEIGHTS {
+        if [SOURCE, WEIGHTS, REMOTE_MODEL].contains(&key) {
             self.follow_source()?;
         }
         Ok(())
@@ -147,7 +149,11 @@ impl Layered {
     /// poses, unless set otherwise; all other networks get the defaults.
     fn follow_source(&mut self) -> Result<(), Error> {
         let is = |key, wanted| lookup(&self.values, key).and_then(Value::as_str) == Some(wanted);
-        let (has_weights, is_bundled) = (!is(WEIGHTS, ""), is(SOURCE, bundled::NAME));
+        let is_remote = lookup(&self.values, SOURCE)
+            .and_then(Value::as_str)
+            .is_some_and(|s| s.starts_with(geometry::REMOTE));
+        let is_bundled = is(SOURCE, bundled::NAME) || (is_remote && is(REMOTE_MODEL, bundled::NAME));
+        let has_weights = !is(WEIGHTS, "");
         let size = Value::Integer(bundled::PROCESS_SIZE_PX as i64);
         let (custom, conditioned) = [geometry::CUSTOM, "conditioned"].map(|s| Value::String(s.into())).into();
         let wishes = [

@@ -87,8 +87,8 @@ impl Default for InputConfig {
 #[serde(default, deny_unknown_fields)]
 pub struct GeometryConfig {
     /// The model: `auto` (stereo, completed by the map and planes), `stereo` (needs poses, no weights), a network of
-    /// `vidar model list` (`da3-small`), `custom` (the weights of `model.dir`, which alone mean it), or `recorded:DIR`, predictions of
-    /// another program in that folder.
+    /// `vidar model list` (`da3-small`), `custom` (the weights of `model.dir`, which alone mean it), `recorded:DIR`, predictions of
+    /// another program in that folder, or `remote:KEY`, the network of the `vidar worker`s under that key.
     pub source: String,
     /// The network that `auto` bends onto measured depth where nothing is measured: one of `vidar model list`, `recorded:DIR`, or
     /// `none`, which interpolates (as good as `da3-nano`, and it costs nothing). `auto` only; `model.dir` comes first.
@@ -313,6 +313,63 @@ impl BudgetConfig {
     }
 }
 
+/// What goes between a run and the workers of `geometry.source = "remote:KEY"`.
+#[derive(Clone, Debug, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
+#[serde(default, deny_unknown_fields)]
+pub struct RemoteConfig {
+    /// The model that the workers must have: one of `vidar model list`. Empty: any that all of them agree on, whose hash and licence are
+    /// recorded. A name that is known must come with its known hash and licence.
+    pub model: String,
+    /// How images travel: `raw`, the worker sees the same bits, or `jpeg` (quality 92), about a tenth of the bytes and another map.
+    #[schemars(with = "String")]
+    pub images: vidar_link::geometry::ImageFormat,
+    /// How depth and confidence travel: `f32`, the bits of the same model on this machine, or `f16`, half the bytes with a relative error of
+    /// at most 5e-4.
+    #[schemars(with = "String")]
+    pub depth: vidar_link::geometry::DepthFormat,
+}
+
+/// How other machines are reached. Nothing here changes a result, and an interrupted run may be resumed with other values.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(default, deny_unknown_fields)]
+pub struct LinkConfig {
+    /// Endpoints to connect to, separated by commas, such as `tls/server:7447`. Empty, with `listen` and `config` empty, too: this computer
+    /// (`tcp/127.0.0.1:7447`).
+    pub connect: String,
+    /// Endpoints to listen at, separated by commas, such as `tcp/0.0.0.0:7447`.
+    pub listen: String,
+    /// A file of Zenoh's settings (JSON5): TLS, certificates, access control.
+    pub config: String,
+    /// Where `vidar live` publishes poses, keyframes, cloud and health as ROS 2 messages: domain and namespace, such as `0/vidar`. Empty:
+    /// nowhere.
+    pub publish: String,
+    /// After this time (s) without an answer a worker counts as slow and another one is asked. Several times as long as a chunk takes there.
+    pub timeout_secs: f64,
+    /// How long (s) a worker is waited for at the start, and while none answers.
+    pub patience_secs: f64,
+}
+
+impl Default for LinkConfig {
+    fn default() -> Self {
+        let (connect, listen, config, publish) = Default::default();
+        Self { connect, listen, config, publish, timeout_secs: 120.0, patience_secs: 10.0 }
+    }
+}
+
+impl LinkConfig {
+    /// As a session takes it.
+    pub fn options(&self) -> vidar_link::LinkOptions {
+        let list = |text: &str| {
+            text.split(',').map(str::trim).filter(|t| !t.is_empty()).map(str::to_owned).collect()
+        };
+        vidar_link::LinkOptions {
+            listen: list(&self.listen),
+            connect: list(&self.connect),
+            config: (!self.config.is_empty()).then(|| self.config.clone().into()),
+        }
+    }
+}
+
 /// The whole configuration.
 #[derive(Clone, Debug, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
@@ -343,6 +400,10 @@ pub struct Config {
     pub limits: LimitsConfig,
     /// How long a run may take.
     pub budget: BudgetConfig,
+    /// What goes between a run and geometry workers.
+    pub remote: RemoteConfig,
+    /// How other machines are reached.
+    pub link: LinkConfig,
 }
 
 impl Config {
@@ -382,6 +443,13 @@ impl Config {
         }
         if !(0.01..=1000.0).contains(&budget.speed) {
             return bad(format!("budget.speed must be 0.01 to 1000, found {}", budget.speed));
+        }
+        for (key, value) in
+            [("timeout_secs", self.link.timeout_secs), ("patience_secs", self.link.patience_secs)]
+        {
+            if !(0.1..=86_400.0).contains(&value) {
+                return bad(format!("link.{key} must be 0.1 to 86400, found {value}"));
+            }
         }
         for (key, value) in
             [("input.stride", self.input.stride), ("geometry.chunk_keyframes", self.geometry.chunk_keyframes)]
@@ -429,7 +497,7 @@ impl Config {
             }
             let found = source;
             return bad(format!(
-                "geometry.source must be \"auto\", \"stereo\", \"recorded:DIR\", \"custom\" with model.dir, or one of {known}, found {found:?}"
+                "geometry.source must be \"auto\", \"stereo\", \"recorded:DIR\", \"remote:KEY\", \"custom\" with model.dir, or one of {known}, found {found:?}"
             ));
         }
         let stage = |result: Result<(), String>| result.map_err(|reason| Error::BadValue { reason });

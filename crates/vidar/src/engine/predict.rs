@@ -111,6 +111,7 @@ impl<'a> Predictor<'a> {
         let watch = self.watch();
         let predicted = match self.geometry.predict(&views, &masks, wanted, &watch) {
             Err(ModelError::Cancelled) => None,
+            Err(error @ ModelError::OutOfReach(_)) => return Err(error.into()),
             Err(error) => Some(failed(id, error.to_string())),
             Ok(prediction) if prediction.geometry.views.is_empty() => {
                 Some(failed(id, "no keyframe of the chunk got depth".into()))
@@ -189,6 +190,7 @@ impl<'a> Predictor<'a> {
         let geometry = match self.geometry.predict(&views, &masks, 0..seen.len(), &watch) {
             Ok(prediction) => prediction.geometry,
             Err(ModelError::Cancelled) => return Ok(None),
+            Err(error @ ModelError::OutOfReach(_)) => return Err(error.into()),
             Err(error) => {
                 not_predicted(error.to_string());
                 return Ok(None);

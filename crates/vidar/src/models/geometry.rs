@@ -35,6 +35,8 @@ pub enum SourceChoice {
     Recorded(PathBuf),
     /// A simulated network over a synthetic recording.
     Simulated,
+    /// The workers under a key.
+    Remote(String),
 }
 
 /// Where the shapes come from that fill what stereo leaves empty.
@@ -56,10 +58,16 @@ impl SourceChoice {
 /// The simulated network: true geometry of a synthetic recording with the errors of a network.
 pub const SIMULATED: &str = "simulated";
 
+/// How a source begins that lies with the workers under the key that follows.
+pub const REMOTE: &str = "remote:";
+
 /// The source of geometry that the configuration names.
 pub fn source(config: &Config) -> Result<SourceChoice, Error> {
     if config.geometry.source == AUTO {
         return shapes(config).map(SourceChoice::Auto);
+    }
+    if let Some(key) = config.geometry.source.strip_prefix(REMOTE) {
+        return Ok(SourceChoice::Remote(key.to_owned()));
     }
     match config.geometry.source.strip_prefix(RECORDED) {
         Some(folder) => Ok(SourceChoice::Recorded(PathBuf::from(folder))),
@@ -104,7 +112,7 @@ pub fn chosen(config: &Config) -> Result<Option<ModelChoice>, Error> {
             Some(ShapeChoice::Recorded(_)) | None => Ok(None),
         },
         (dir, CUSTOM) if !dir.is_empty() => Ok(Some(ModelChoice::Folder(PathBuf::from(dir)))),
-        (_, name) if name.starts_with(RECORDED) || name == SIMULATED => Ok(None),
+        (_, name) if [RECORDED, REMOTE].iter().any(|p| name.starts_with(p)) || name == SIMULATED => Ok(None),
         (_, name) => ModelChoice::named(name).map(Some),
     }
 }

@@ -147,6 +147,30 @@ pub fn locate(
     }
 }
 
+/// Hash of the weights that go by a name; none where it is not known.
+///
+/// # Errors
+/// A name that no network has.
+pub fn known_hash(name: &str) -> Result<Option<&'static str>, Error> {
+    Ok(match ModelChoice::named(name)? {
+        ModelChoice::Bundled => Some(bundled::sha256()),
+        ModelChoice::Official(checkpoint) => checkpoint.weights().sha256,
+        ModelChoice::Folder(_) | ModelChoice::Untrained(_) => None,
+    })
+}
+
+/// Records the acceptance of a licence for weights that need not be here: those of workers elsewhere.
+///
+/// # Errors
+/// A name that no network has, another licence, or a record that cannot be written.
+pub fn accept(name: &str, accepted: &LicenceAccepted) -> Result<(), Error> {
+    let ModelChoice::Official(checkpoint) = ModelChoice::named(name)? else { return Ok(()) };
+    match acceptance_of(checkpoint, Some(accepted))? {
+        Some(acceptance) => Ok(store(true)?.accept(checkpoint, &acceptance)?),
+        None => Ok(()),
+    }
+}
+
 /// The record of the acceptance given with this command.
 pub fn acceptance_of(
     checkpoint: &'static Checkpoint,

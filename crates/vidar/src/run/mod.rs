@@ -14,6 +14,7 @@ mod plan;
 mod readers;
 mod record;
 pub(crate) mod reference;
+mod remote;
 mod scene;
 mod source;
 mod start;
@@ -43,7 +44,7 @@ use crate::input::{self, ImageFiles, Measurement, UnseenScale};
 use crate::odometry::TrackedPoses;
 use crate::run_folder::{OutputLocation, RunFolder};
 use crate::verdict::{StatedScale, Verdict};
-use live::{EndingCell, Incoming, LiveStream, SurfaceLatency, TrackedElsewhere};
+use live::{EndingCell, Incoming, LivePublisher, LiveStream, SurfaceLatency, TrackedElsewhere};
 use place_recognition::PlaceRecognition;
 use readers::{FINISH, MAP, Readers};
 use record::Recorder;
@@ -97,6 +98,8 @@ pub struct RunOutcome {
     pub device_peak_bytes: Option<u64>,
     /// What a live run measured; none of others.
     pub live: Option<LiveReport>,
+    /// What went to workers elsewhere and back; none where none were asked.
+    pub remote: Option<vidar_link::geometry::RemoteReport>,
     /// Wall time, s.
     pub seconds: f64,
 }
@@ -306,6 +309,7 @@ impl Context<'_> {
             warnings,
             device_peak_bytes: source.device_peak_bytes(),
             live,
+            remote: source.remote().map(|r| r.report()),
             seconds: 0.0,
         };
         events.stage("write", 0, || outputs::write(&outcome, dataset, config, request, folder, events))?;
@@ -335,7 +339,12 @@ impl Context<'_> {
         let elsewhere = elsewhere.map(|s| Box::new(TrackedElsewhere::new(s, ending.clone())) as _);
         let poses = tracked.map(|p| Box::new(p) as Box<dyn PoseSource>).or(elsewhere);
         let mut engine = self.engine(plan, poses, parts, &cancelled, &predicting)?;
+        let publisher = match self.live {
+            Some(_) => LivePublisher::open(config, &camera_on_rig(dataset, plan))?,
+            None => None,
+        };
         let mut readers = Readers::new(dataset, plan, config, folder, scene, events);
+        readers.publisher = publisher.as_ref();
         readers.surfaces = self.live.map(|_| SurfaceLatency::default());
         let pushed = events.stage(MAP, dataset.images.len(), || match self.live {
             Some(options) => live::push(self, (plan, options), &ending, &mut engine, &mut readers).map(Some),

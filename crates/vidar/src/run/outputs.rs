@@ -174,6 +174,9 @@ pub fn result_json(outcome: &RunOutcome) -> Value {
     if let (Some(live), Some(object)) = (&outcome.live, result.as_object_mut()) {
         object.insert("live".into(), json!(live));
     }
+    if let (Some(remote), Some(object)) = (&outcome.remote, result.as_object_mut()) {
+        object.insert("remote".into(), json!(remote));
+    }
     result
 }
 

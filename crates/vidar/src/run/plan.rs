@@ -73,6 +73,8 @@ pub struct Plan {
     pub masks: Option<Arc<Masks>>,
     /// The time budget with what was chosen for it; none without a limit, and before the poses that it depends on are known.
     pub budget: Option<Budget>,
+    /// What the workers elsewhere compute with, where they are asked.
+    pub remote: Option<vidar_link::geometry::ModelFacts>,
     /// Warnings about the input and the settings.
     pub warnings: Vec<Warning>,
 }
@@ -143,6 +145,7 @@ impl Plan {
             camera,
             view,
             model: source.info().clone(),
+            remote: source.remote().map(|r| r.facts().clone()),
             place_recognition: place_recognition.name(),
             network,
             reference: reference_source(dataset, config, reference),
@@ -202,6 +205,12 @@ impl Plan {
                 lines.push(("memory of the device", device_memory(device)));
             }
         }
+        if let Some(remote) = &self.remote {
+            let (model, licence) =
+                (vidar_core::printable(&remote.model), vidar_core::printable(&remote.licence));
+            let arithmetic = vidar_core::printable(&remote.arithmetic);
+            lines.push(("computed elsewhere", format!("{model} ({licence}), {arithmetic}")));
+        }
         if let Some(masks) = &self.masks {
             lines.push(("masks", masks.words()));
         }
@@ -216,6 +225,9 @@ impl Plan {
         let mut value = serde_json::json!(self.model);
         if let (Some(object), Some(network)) = (value.as_object_mut(), &self.network) {
             object.insert("network".to_owned(), serde_json::json!(network));
+        }
+        if let (Some(object), Some(remote)) = (value.as_object_mut(), &self.remote) {
+            object.insert("remote".to_owned(), serde_json::json!(remote));
         }
         value
     }

@@ -1,6 +1,6 @@
 //! Readers of the engine's events: log and progress, times of the steps, the map, the growing surface, and files of views.
 
-use super::live::SurfaceLatency;
+use super::live::{LivePublisher, SurfaceLatency};
 use super::map::{MapCollector, MetricMap};
 use super::plan::Plan;
 use super::scene::SceneWriter;
@@ -36,6 +36,8 @@ pub(super) struct Readers<'a> {
     predicted: usize,
     /// Of a live run.
     pub(super) surfaces: Option<SurfaceLatency>,
+    /// Who else hears of a live run.
+    pub(super) publisher: Option<&'a LivePublisher>,
 }
 
 impl<'a> Readers<'a> {
@@ -61,6 +63,7 @@ impl<'a> Readers<'a> {
             finishing: None,
             predicted: 0,
             surfaces: None,
+            publisher: None,
         }
     }
 
@@ -76,6 +79,9 @@ impl<'a> Readers<'a> {
         }
         self.times.read(&event);
         self.collector.read(&event)?;
+        if let Some(publisher) = self.publisher {
+            publisher.read(&event);
+        }
         if let Some(scene) = self.scene {
             scene.read(&event, self.dataset, &self.view, self.events);
         }

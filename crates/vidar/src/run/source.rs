@@ -1,6 +1,7 @@
 //! Where depth comes from: stereo, a network, or a recording, behind one trait.
 
 use super::auto::{AutoModel, Shapes};
+use super::remote::RemoteSource;
 use crate::chunks::{RecordedGeometry, RecordedModel};
 use crate::config::Config;
 use crate::engine::{GeometrySource, Prediction};
@@ -31,6 +32,8 @@ pub enum Source {
     Recorded(RecordedModel),
     /// A simulated network that knows a synthetic recording's world.
     Simulated(SyntheticModel),
+    /// Workers elsewhere.
+    Remote(Box<RemoteSource>),
 }
 
 /// A source, with the chunks that it prescribes.
@@ -80,6 +83,9 @@ impl Source {
                 Self::Recorded(RecordedModel::new(recording))
             }
             SourceChoice::Simulated => Self::Simulated(simulated(dataset, config)?),
+            SourceChoice::Remote(key) => {
+                Self::Remote(Box::new(RemoteSource::open(&key, config, pose_mode(config))?))
+            }
         };
         Ok(OpenedSource { source, chunks })
     }
@@ -89,22 +95,32 @@ impl Source {
         match self {
             Self::Network(network) => Some(network),
             Self::Auto(AutoModel { shapes: Some(Shapes::Network(network)), .. }) => Some(network),
-            Self::Auto(_) | Self::Stereo(_) | Self::Recorded(_) | Self::Simulated(_) => None,
+            Self::Auto(_) | Self::Stereo(_) | Self::Recorded(_) | Self::Simulated(_) | Self::Remote(_) => {
+                None
+            }
         }
+    }
+
+    /// The workers elsewhere, where they are asked.
+    pub fn remote(&self) -> Option<&RemoteSource> {
+        if let Self::Remote(remote) = self { Some(remote) } else { None }
     }
 
     /// Channels of the tokens that a network can tell places by.
     pub fn token_channels(&self) -> Option<usize> {
         match self {
             Self::Network(network) => Some(network.0.token_channels()),
+            Self::Remote(remote) => remote.token_channels(),
             Self::Stereo(_) | Self::Auto(_) | Self::Recorded(_) | Self::Simulated(_) => None,
         }
     }
 
     /// From now on tokens are kept.
     pub fn keep_place_tokens(&mut self) {
-        if let Self::Network(network) = self {
-            network.0.keep_place_tokens();
+        match self {
+            Self::Network(network) => network.0.keep_place_tokens(),
+            Self::Remote(remote) => remote.keep_place_tokens(),
+            Self::Stereo(_) | Self::Auto(_) | Self::Recorded(_) | Self::Simulated(_) => {}
         }
     }
 
@@ -136,6 +152,7 @@ impl GeometrySource for Source {
             Self::Network(network) => network.0.info(),
             Self::Recorded(model) => model.info(),
             Self::Simulated(model) => model.info(),
+            Self::Remote(remote) => remote.info(),
         }
     }
 
@@ -148,7 +165,7 @@ impl GeometrySource for Source {
     }
 
     fn predicts_any_views(&self) -> bool {
-        matches!(self, Self::Network(_) | Self::Simulated(_))
+        matches!(self, Self::Network(_) | Self::Simulated(_) | Self::Remote(_))
     }
 
     fn predict(
@@ -161,6 +178,7 @@ impl GeometrySource for Source {
         let (mut colors, mut tokens) = (Vec::new(), Vec::new());
         let geometry = match self {
             Self::Auto(model) => return model.predict(views, masks, wanted, watch),
+            Self::Remote(remote) => return remote.predict(views, wanted, watch),
             Self::Network(network) => {
                 let geometry = network.0.predict_views(views, wanted, watch)?;
                 tokens = network.0.take_place_tokens();

@@ -4,7 +4,7 @@ use crate::chunks::{ChunkStore, StoredChunk};
 use crate::config::Config;
 use crate::engine::{PredictedFrame, PredictionId, PredictionStore};
 use crate::error::Error;
-use crate::models::geometry::AUTO;
+use crate::models::geometry::{AUTO, REMOTE};
 use crate::run::plan::Plan;
 use serde_json::json;
 use sha2::{Digest, Sha256};
@@ -34,6 +34,7 @@ impl RunStore {
             "stereo": config.stereo,
             "fill": (plan.model.name == AUTO).then_some(&config.geometry.fill_network),
             "network": config.model,
+            "remote": config.geometry.source.starts_with(REMOTE).then_some((config.remote.images, config.remote.depth)),
             "masks": plan.masks.as_ref().map(|m| m.sha256()),
             "place_recognition": plan.place_recognition,
         });

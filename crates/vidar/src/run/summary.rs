@@ -83,6 +83,9 @@ pub(super) fn lines(outcome: &RunOutcome) -> Vec<(&'static str, String)> {
     if let Some(live) = &outcome.live {
         lines.push(("live", live.words()));
     }
+    if let Some(remote) = &outcome.remote {
+        lines.push(("geometry from", remote.words()));
+    }
     let memory = crate::system::peak_memory_bytes()
         .map_or_else(String::new, |b| format!(", peak memory {}", super::bytes(b)));
     lines.push(("took", format!("{:.1} s{}{memory}", outcome.seconds, of_budget(outcome))));

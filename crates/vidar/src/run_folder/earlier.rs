@@ -54,8 +54,15 @@ impl Earlier {
         }
         if before.config_sha256 != now.config_sha256 {
             let config = settings(config);
-            let old: Vec<&str> = self.config.difference(&config).take(3).map(String::as_str).collect();
-            let new: Vec<&str> = config.difference(&self.config).take(3).map(String::as_str).collect();
+            // How other machines are reached changes no result.
+            let matters = |line: &&String| !line.starts_with("link.");
+            let differing = |a: &BTreeSet<String>, b: &BTreeSet<String>| -> Vec<String> {
+                a.difference(b).filter(matters).take(3).cloned().collect()
+            };
+            let (old, new) = (differing(&self.config, &config), differing(&config, &self.config));
+            if old.is_empty() && new.is_empty() {
+                return None;
+            }
             return Some(format!(
                 "its settings are others: {} before, {} now",
                 old.join(", "),

@@ -12,6 +12,7 @@
 mod ending;
 mod latency;
 mod pose_file;
+mod publish;
 mod queue;
 mod stream;
 mod thinning;
@@ -20,6 +21,7 @@ mod tracker;
 pub(super) use ending::{EndingCell, TrackedElsewhere};
 pub use latency::Latency;
 pub(super) use latency::SurfaceLatency;
+pub(super) use publish::LivePublisher;
 pub(super) use stream::{Incoming, LiveStream, fingerprint, kept, list};
 pub use stream::{LiveInput, RECORDING};
 
@@ -163,10 +165,11 @@ pub(super) fn push(
     })?;
     let queue = Queue::default();
     let pose_file = PoseFile::create(context.folder, context.events)?;
+    let publisher = readers.publisher;
     let tracked = std::thread::scope(|scope| {
         let track = || {
             let _closing = Closing(&queue);
-            pool.install(|| track(context, plan, options, &queue, pose_file))
+            pool.install(|| track(context, (plan, options), &queue, pose_file, publisher))
         };
         let thread = std::thread::Builder::new().name("odometry".into()).spawn_scoped(scope, track);
         let thread = thread.map_err(|e| Error::io("start", "the odometry's thread".as_ref(), e))?;
@@ -184,10 +187,10 @@ pub(super) fn push(
 /// The odometry's thread.
 fn track(
     context: &Context<'_>,
-    plan: &Plan,
-    options: &LiveOptions,
+    (plan, options): (&Plan, &LiveOptions),
     queue: &Queue,
     pose_file: PoseFile<'_>,
+    publisher: Option<&LivePublisher>,
 ) -> Result<(Ending, Counts, Thinning), Error> {
     let Context { dataset, config, cancel, .. } = *context;
     let (poses, _) = plan.poses.open(dataset, config)?;
@@ -199,6 +202,7 @@ fn track(
         arrival: if options.is_realtime { Arrival::Stamped(None) } else { Arrival::Taken },
         thinning: Thinning::new(&config.keyframes),
         pose_file,
+        publisher,
         unreadable: &unreadable,
         counts: Counts::default(),
         waiting: Default::default(),

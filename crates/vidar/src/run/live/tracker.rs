@@ -3,6 +3,7 @@
 use super::ending::Ending;
 use super::latency::Latency;
 use super::pose_file::PoseFile;
+use super::publish::LivePublisher;
 use super::queue::{Item, Queue};
 use super::thinning::Thinning;
 use crate::engine::{FrameStamp, FrameState, PoseReport, PoseSource};
@@ -50,6 +51,8 @@ pub(super) struct Tracker<'a> {
     pub arrival: Arrival,
     pub thinning: Thinning,
     pub pose_file: PoseFile<'a>,
+    /// Who else hears of poses.
+    pub publisher: Option<&'a LivePublisher>,
     pub unreadable: &'a (dyn Fn(FrameStamp, &DatasetError) -> Warning + Sync),
     pub counts: Counts,
     /// Images without a report, with when they arrived.
@@ -166,7 +169,12 @@ impl Tracker<'_> {
 
     /// Measures and writes the pose of a report.
     fn measure(&mut self, report: &PoseReport) -> Result<(), Error> {
-        let PoseReport::Posed { state, .. } = report else { return Ok(()) };
+        let PoseReport::Posed { state, keyframe, .. } = report else { return Ok(()) };
+        if let Some(publisher) = self.publisher {
+            publisher.pose(state, keyframe.as_deref());
+            let left_out = self.counts.not_tracked + self.thinning.thinned + self.thinning.dropped;
+            publisher.health((self.queue.load().0, left_out));
+        }
         let image = self.waiting.iter().find(|(stamp, _)| stamp.frame_id == state.frame_id);
         self.counts.seconds.extend(image.map(|(_, arrived)| arrived.elapsed().as_secs_f32()));
         self.pose_file.add(state)
@@ -243,6 +251,7 @@ mod tests {
             arrival: Arrival::Stamped(None),
             thinning: Thinning::new(&vidar_align::keyframe_selection::KeyframeConfig::default()),
             pose_file: PoseFile::create(&folder, &events).unwrap(),
+            publisher: None,
             unreadable: &unreadable,
             counts: Counts::default(),
             waiting: VecDeque::new(),

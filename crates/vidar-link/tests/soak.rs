@@ -1,0 +1,184 @@
+//! Workers behind a network with faults: connections that are cut, stand still, deliver late, or are flooded with garbage. Every chunk
+//! comes back with its own bits, and memory stays flat. A few seconds in the ordinary tests; half an hour with
+//! `cargo test -p vidar-link --features zenoh --release --test soak -- --ignored --nocapture`.
+#![allow(clippy::unwrap_used, clippy::panic, clippy::print_stderr)]
+
+mod common;
+
+use common::{Brightness, chunk, facts, local, same_bits};
+use std::io::{Read, Write};
+use std::net::{Shutdown, TcpListener, TcpStream};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::mpsc::channel;
+use std::time::{Duration, Instant};
+use vidar_link::geometry::{DepthFormat, Expected, ImageFormat, RemoteModel, RemoteOptions};
+use vidar_link::{Link, LinkOptions, Role, Serving};
+
+const KEY: &str = "soak/depth";
+
+/// A way to an address that can be disturbed.
+struct Proxy {
+    port: u16,
+    /// Connections made before this moment are cut when they notice.
+    cut: Arc<AtomicU64>,
+    /// Nothing passes while it is set.
+    stands_still: Arc<AtomicBool>,
+    /// Each piece waits for so long, ms.
+    delay_ms: Arc<AtomicU64>,
+}
+
+impl Proxy {
+    fn start(to: u16) -> Self {
+        let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+        let port = listener.local_addr().unwrap().port();
+        let this = Self {
+            port,
+            cut: Default::default(),
+            stands_still: Default::default(),
+            delay_ms: Default::default(),
+        };
+        let (cut, still, delay) = (this.cut.clone(), this.stands_still.clone(), this.delay_ms.clone());
+        std::thread::spawn(move || {
+            for here in listener.incoming().flatten() {
+                let Ok(there) = TcpStream::connect(("127.0.0.1", to)) else { continue };
+                let born = cut.load(Ordering::SeqCst);
+                for (mut from, mut into) in
+                    [(here.try_clone().unwrap(), there.try_clone().unwrap()), (there, here)]
+                {
+                    let (cut, still, delay) = (cut.clone(), still.clone(), delay.clone());
+                    std::thread::spawn(move || {
+                        from.set_read_timeout(Some(Duration::from_millis(20))).unwrap();
+                        let mut buffer = vec![0; 16 << 10];
+                        while cut.load(Ordering::SeqCst) == born {
+                            if still.load(Ordering::SeqCst) {
+                                std::thread::sleep(Duration::from_millis(10));
+                                continue;
+                            }
+                            match from.read(&mut buffer) {
+                                Ok(0) => break,
+                                Ok(n) => {
+                                    std::thread::sleep(Duration::from_millis(delay.load(Ordering::SeqCst)));
+                                    if into.write_all(&buffer[..n]).is_err() {
+                                        break;
+                                    }
+                                }
+                                Err(e)
+                                    if [std::io::ErrorKind::WouldBlock, std::io::ErrorKind::TimedOut]
+                                        .contains(&e.kind()) => {}
+                                Err(_) => break,
+                            }
+                        }
+                        let _ = (from.shutdown(Shutdown::Both), into.shutdown(Shutdown::Both));
+                    });
+                }
+            }
+        });
+        this
+    }
+}
+
+fn resident_bytes() -> u64 {
+    let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
+    let line = status.lines().find(|l| l.starts_with("VmRSS:")).unwrap_or("VmRSS: 0 kB");
+    line.split_whitespace().nth(1).and_then(|n| n.parse::<u64>().ok()).unwrap_or(0) * 1024
+}
+
+/// Pseudo-random numbers, so that a failure can be had again.
+fn next(state: &mut u64) -> u64 {
+    *state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+    *state >> 33
+}
+
+fn soak(time: Duration, least_chunks: u32) {
+    let stop = AtomicBool::new(false);
+    std::thread::scope(|scope| {
+        let mut ways = Vec::new();
+        for _ in 0..2 {
+            let port = TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
+            let (sender, ready) = channel();
+            let stop = &stop;
+            scope.spawn(move || {
+                let options =
+                    LinkOptions { listen: vec![format!("tcp/127.0.0.1:{port}")], ..LinkOptions::default() };
+                let link = Link::open(&options, Role::Server).unwrap();
+                let told = move |serving: Serving| {
+                    if matches!(serving, Serving::Ready { .. }) {
+                        sender.send(()).unwrap();
+                    }
+                };
+                let served = Arc::new(Brightness(facts("bright")));
+                link.serve(KEY, "test", served, &told, &|| stop.load(Ordering::SeqCst)).unwrap();
+            });
+            ready.recv_timeout(Duration::from_secs(20)).unwrap();
+            ways.push(Proxy::start(port));
+        }
+        let connect = ways.iter().map(|w| format!("tcp/127.0.0.1:{}", w.port)).collect();
+        let link = Link::open(&LinkOptions { connect, ..LinkOptions::default() }, Role::Client).unwrap();
+        let options = RemoteOptions {
+            settings: "{}".into(),
+            expected: Expected::default(),
+            images: ImageFormat::Raw,
+            depth: DepthFormat::F32,
+            timeout: Duration::from_millis(800),
+            patience: Duration::from_secs(30),
+            run: 5,
+        };
+        let mut model = RemoteModel::open(link.reach(KEY).unwrap(), options, &|| false).unwrap();
+        let (clock, mut random, mut done, mut warm) = (Instant::now(), 7_u64, 0_u32, 0_u64);
+        while clock.elapsed() < time || done < least_chunks {
+            let way = &ways[next(&mut random) as usize % 2];
+            match next(&mut random) % 6 {
+                0 => drop(way.cut.fetch_add(1, Ordering::SeqCst)),
+                1 => way.stands_still.store(true, Ordering::SeqCst),
+                2 => way.delay_ms.store(next(&mut random) % 30, Ordering::SeqCst),
+                3 => {
+                    // Somebody who speaks no Zenoh at all.
+                    if let Ok(mut stranger) = TcpStream::connect(("127.0.0.1", way.port)) {
+                        let garbage: Vec<u8> = (0..4096).map(|_| next(&mut random) as u8).collect();
+                        let _ = stranger.write_all(&garbage);
+                    }
+                }
+                _ => ways.iter().for_each(|w| {
+                    w.stands_still.store(false, Ordering::SeqCst);
+                    w.delay_ms.store(0, Ordering::SeqCst);
+                }),
+            }
+            // One of both ways is always open.
+            if ways.iter().all(|w| w.stands_still.load(Ordering::SeqCst)) {
+                ways[0].stands_still.store(false, Ordering::SeqCst);
+            }
+            let views = chunk(done % 500);
+            let found = model.predict(&views, 0..4, true, &|_| false).unwrap();
+            assert!(same_bits(&found, &local(&views, 0..4)), "chunk {done}");
+            done += 1;
+            if done == 200 {
+                warm = resident_bytes();
+            }
+        }
+        let report = model.report();
+        eprintln!(
+            "{done} chunks, {} retries, {} invalid replies, {:?}, {} MB resident",
+            report.retries,
+            report.invalid_replies,
+            report.workers,
+            resident_bytes() >> 20
+        );
+        assert_eq!(report.chunks, done as usize);
+        if warm > 0 {
+            assert!(resident_bytes() < warm + (64 << 20), "{} MB at 200 chunks", warm >> 20);
+        }
+        stop.store(true, Ordering::SeqCst);
+    });
+}
+
+#[test]
+fn every_chunk_comes_back_from_a_network_with_faults() {
+    soak(Duration::from_secs(6), 20);
+}
+
+#[test]
+#[ignore = "half an hour"]
+fn every_chunk_comes_back_for_half_an_hour_and_memory_is_flat() {
+    soak(Duration::from_secs(1800), 200);
+}
