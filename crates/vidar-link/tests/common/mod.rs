@@ -79,7 +79,7 @@ pub fn chunk(id: u32) -> ChunkViews {
             _ => FrameImage::Gray16(Image::from_fn(WIDTH, HEIGHT, |x, y| (1000 * x + y) as u16)),
         },
         intrinsics,
-        world_from_camera: (i % 2 == 0).then(|| {
+        world_from_camera: i.is_multiple_of(2).then(|| {
             let turn = So3::from_quaternion(0.1 * f64::from(i), 0.2, -0.3, 0.9).unwrap();
             Se3::new(turn, [0.1, f64::from(id), 1.0 / 3.0].into())
         }),
