@@ -85,3 +85,52 @@ fn axis_permutation(index: usize) -> Matrix3<f64> {
     second[(x + 1 + turn % 2) % 3] = if turn < 2 { 1.0 } else { -1.0 };
     Matrix3::from_columns(&[first, second, first.cross(&second)])
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::device::DeviceConfig;
+
+    #[test]
+    fn the_24_axis_permutations_are_right_handed_and_distinct() {
+        for i in 0..24 {
+            assert!((axis_permutation(i).determinant() - 1.0).abs() < 1e-12, "{i}");
+            for j in 0..i {
+                assert_ne!(axis_permutation(i), axis_permutation(j), "{i} and {j}");
+            }
+        }
+    }
+
+    #[test]
+    fn a_phone_held_in_landscape_sees_upright_images() {
+        let config = SynthConfig {
+            device: DeviceConfig { mount: Mount::Phone, ..Default::default() },
+            ..Default::default()
+        };
+        let mount = config.body_from_camera();
+        // The image's down (camera y) is the body's −x; 5° is more than 3 σ of the misalignment.
+        let down = mount.rotation * Vector3::y();
+        assert!(down.dot(&-Vector3::x()) > 5_f64.to_radians().cos(), "{down:?}");
+        assert!((0.03..0.09).contains(&mount.translation.norm()));
+        let other = SynthConfig { seed: 2, ..config.clone() };
+        assert_ne!(other.body_from_camera(), mount);
+        assert_eq!(config.body_from_camera(), mount);
+    }
+
+    #[test]
+    fn a_lens_of_given_focal_length_projects_with_it() {
+        let lens = Lens::Radtan {
+            focal_px: 487.0,
+            centre_offset_px: [3.0, -2.0],
+            distortion: [0.08, -0.1, 0.0, 0.0],
+        };
+        let device = DeviceConfig { lens, ..Default::default() };
+        let config = SynthConfig { width: 640, height: 480, device, ..Default::default() };
+        let camera = config.camera().unwrap();
+        let k = camera.intrinsics();
+        assert_eq!([k.fx, k.fy, k.cx, k.cy], [487.0, 487.0, 322.5, 237.5]);
+        assert!(matches!(camera, CameraModel::RadTan(_)));
+        let stated = config.stated_focal_px(487.0);
+        assert!((stated / 487.0 - 1.0).abs() <= 0.03 && stated != 487.0);
+    }
+}

@@ -1,12 +1,8 @@
 //! Geometry elsewhere, on this computer's loopback: the bits of a local run, whatever happens to workers.
 
-use crate::support::{ProgramOutput, command, manifest, run_command, shared};
-use std::io::{BufRead, BufReader, Read};
-use std::net::TcpListener;
-use std::path::{Path, PathBuf};
-use std::process::{Child, Command, Stdio};
-use std::sync::mpsc::{Receiver, channel};
-use std::time::Duration;
+use crate::support::{ProgramOutput, command, run_command, shared};
+use std::path::PathBuf;
+use std::process::Command;
 
 /// Small chunks of small images; poses are ground truth.
 const SHORT: &[&str] = &[
@@ -53,6 +49,13 @@ fn a_program_without_links_says_so() {
 mod built {
     use super::*;
     use crate::odometry::flight;
+    use crate::support::manifest;
+    use std::io::{BufRead, BufReader, Read};
+    use std::net::TcpListener;
+    use std::path::Path;
+    use std::process::{Child, Stdio};
+    use std::sync::mpsc::{Receiver, channel};
+    use std::time::Duration;
     use vidar::link::ros::Attachment;
     use vidar::link::{Delivery, Link, LinkOptions, Role};
     use vidar_bag::{Bag, write::encode};

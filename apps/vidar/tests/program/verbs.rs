@@ -32,7 +32,7 @@ const VERBS: &[&[&str]] = &[
     &["completions"],
 ];
 
-fn text(path: &std::path::Path) -> &str {
+fn text(path: &Path) -> &str {
     path.to_str().unwrap()
 }
 
@@ -252,7 +252,7 @@ fn quiet_prints_only_the_result_in_at_most_twelve_lines() {
         assert!(ran.stdout.contains(word), "{word:?} is missing in\n{}", ran.stdout);
     }
     let shown = ran.stdout.lines().find_map(|l| l.strip_prefix("look at it")).unwrap().trim();
-    assert!(std::path::Path::new(shown).is_file(), "{shown} is printed but does not exist");
+    assert!(Path::new(shown).is_file(), "{shown} is printed but does not exist");
 }
 
 #[test]
