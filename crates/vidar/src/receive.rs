@@ -3,6 +3,7 @@
 use crate::config::LinkConfig;
 use crate::error::Error;
 use crate::events::CancelToken;
+use crate::run_folder::now_ns;
 use mcap::records::MessageHeader;
 use mcap::write::NoSeek;
 use mcap::{WriteOptions, Writer};
@@ -10,7 +11,7 @@ use serde::Serialize;
 use std::collections::{BTreeMap, HashMap};
 use std::io::{self, Write};
 use std::path::Path;
-use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
+use std::time::{Duration, Instant};
 use vidar_link::ros::{Attachment, TopicKey};
 use vidar_link::{Link, Role, Sample};
 
@@ -208,8 +209,7 @@ pub fn receive(
                 continue;
             };
             (is_quiet, last) = (false, Some(Instant::now()));
-            let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default().as_nanos() as u64;
-            let mut written = writer.take(&sample, now).map(|_| ());
+            let mut written = writer.take(&sample, now_ns()).map(|_| ());
             if written.is_ok() && flushed.elapsed() > FLUSH_EVERY {
                 written = writer.flush();
                 flushed = Instant::now();

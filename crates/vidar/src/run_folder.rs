@@ -309,7 +309,13 @@ fn safe_name(name: &str) -> String {
     if trimmed.is_empty() { "run".to_owned() } else { trimmed }
 }
 
-#[allow(clippy::disallowed_methods)] // the run folder's name and manifest are the places where the clock is wanted
+/// Now, ns since 1970: the stamp of a message that is sent or received.
+pub(crate) fn now_ns() -> u64 {
+    let since = now().duration_since(std::time::UNIX_EPOCH).unwrap_or_default();
+    u64::try_from(since.as_nanos()).unwrap_or(u64::MAX)
+}
+
+#[allow(clippy::disallowed_methods)] // the run folder, its manifest and messages to others are where the clock is wanted
 fn now() -> std::time::SystemTime {
     std::time::SystemTime::now()
 }

@@ -5,7 +5,7 @@ use crate::args::RunArgs;
 use crate::build::usage;
 use crate::live_args::LiveArgs;
 use crate::{Context, Outcome, print, progress, spool};
-use std::sync::mpsc::channel;
+use std::sync::mpsc::sync_channel;
 use std::time::Duration;
 use vidar::config::Origin;
 use vidar::receive::{ReceiveRequest, receive};
@@ -71,7 +71,8 @@ fn robot(
         idle: seconds(args.idle),
     };
     let (reader, writer) = std::io::pipe().map_err(|e| Error::io("make", "a pipe".as_ref(), e))?;
-    let (sender, ready) = channel();
+    // That it listens, and an error: no more than two messages.
+    let (sender, ready) = sync_channel(2);
     let (cancel, is_quiet) = (context.cancel.clone(), context.cli.quiet);
     let work = move || {
         let told = || drop(sender.send(Ok(())));

@@ -4,6 +4,7 @@ use crate::config::Config;
 use crate::engine::Prediction;
 use crate::error::Error;
 use crate::models::{self, bundled};
+use crate::run_folder::now_ns;
 use sha2::{Digest, Sha256};
 use std::ops::Range;
 use std::time::Duration;
@@ -122,8 +123,7 @@ fn check_licence(key: &str, facts: &ModelFacts) -> Result<(), Error> {
 
 /// A number that tells this run's requests from those of others.
 fn run_number() -> u64 {
-    let now = std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH).unwrap_or_default();
-    let digest = Sha256::digest(format!("{} {}", std::process::id(), now.as_nanos()));
+    let digest = Sha256::digest(format!("{} {}", std::process::id(), now_ns()));
     digest.iter().take(8).fold(0, |n, byte| n << 8 | u64::from(*byte))
 }
 

@@ -4,10 +4,11 @@
 use crate::config::Config;
 use crate::engine::{FrameState, MapEvent};
 use crate::error::Error;
+use crate::run_folder::now_ns;
 use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicI64, AtomicU64, Ordering};
 use std::sync::{Mutex, PoisonError};
-use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
+use std::time::{Duration, Instant};
 use vidar_align::covariance::covariance_in_camera;
 use vidar_core::{OdometryKeyframe, PoseCovariance, RigCamera, Se3, Severity, Timestamp};
 use vidar_link::ros::{Attachment, CloudPoint, HealthLevel, RosType, TopicKey, liveliness_token};
@@ -106,10 +107,9 @@ impl LivePublisher {
 
     fn put(&self, topic: Topic, message: Vec<u8>) {
         let Some((publisher, sequence)) = self.publishers.get(&topic) else { return };
-        let sent = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default().as_nanos();
         let attachment = Attachment {
             sequence: sequence.fetch_add(1, Ordering::Relaxed),
-            sent_ns: i64::try_from(sent).unwrap_or(i64::MAX),
+            sent_ns: i64::try_from(now_ns()).unwrap_or(i64::MAX),
             sender: self.id,
         };
         // A link that broke is made again in the background; what is said meanwhile is lost, as to everybody who does not listen.
