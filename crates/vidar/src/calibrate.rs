@@ -128,29 +128,69 @@ fn write(path: &Path, text: &str) -> Result<(), Error> {
     std::fs::write(path, text).map_err(|e| Error::io("write", path, e))
 }
 
-/// Where `dataset` has a gyroscope but no calibration: finds it, puts it into the rig, and says so. The settings of the
-/// odometry follow from what is known then.
+/// Whether nothing says how the camera is mounted on the IMU: a lens is given (by flags, or a file with intrinsics alone), and the
+/// readers took the IMU's own pose for it.
+pub(crate) fn has_no_mount(dataset: &Recording) -> bool {
+    dataset.calibration != CalibrationSource::Guessed
+        && !dataset.imu.is_empty()
+        && dataset.rig.camera(dataset.camera).is_some_and(|c| c.body_from_camera == Se3::IDENTITY)
+}
+
+/// Whether a lens is given by its focal length and principal point alone: nobody measured it.
+pub(crate) fn is_plain(dataset: &Recording) -> bool {
+    dataset.rig.camera(dataset.camera).is_some_and(|camera| match &camera.model {
+        CameraModel::Pinhole(_) => true,
+        model @ CameraModel::RadTan(_) => model.parameters().iter().skip(4).all(|k| *k == 0.0),
+        _ => false,
+    })
+}
+
+/// Whether the recording contradicts a lens without distortion: by its focal length or by the distortion that it shows.
+fn contradicts(found: &Calibration, given: &CameraModel) -> bool {
+    let focal = found.focal_px;
+    let is_other = |shown: f64, sigma: f64| shown.abs() > CONTRADICTING_SIGMAS * sigma;
+    is_other(focal.value - given.intrinsics().fx, focal.sigma)
+        || found.radial.iter().any(|k| k.is_observable && is_other(k.value, k.sigma))
+}
+
+/// Standard deviations from which a given lens is contradicted; as `vidar calibrate` reports it.
+const CONTRADICTING_SIGMAS: f64 = 3.0;
+
+/// Where `dataset` has a gyroscope but no calibration, or a lens whose place on the IMU nothing tells: finds what is missing, puts it into
+/// the rig, and says so. The settings of the odometry follow from what is known then. A given lens stays unless it is a plain pinhole that
+/// the recording contradicts; where a recording does not show the mount, what was read stays.
 ///
 /// # Errors
-/// The recording does not show its calibration.
+/// The recording does not show its calibration, and none was given.
 pub(crate) fn complete(
     dataset: &mut Recording,
     settings: &mut OdometryConfig,
     events: &Events,
     cancel: &CancelToken,
 ) -> Result<(), Error> {
-    if dataset.calibration != CalibrationSource::Guessed || dataset.imu.is_empty() {
+    let has_lens = has_no_mount(dataset);
+    if dataset.imu.is_empty() || !(has_lens || dataset.calibration == CalibrationSource::Guessed) {
         return Ok(());
     }
-    let found = events.stage(STAGE, 0, || look(dataset, events, cancel))?;
-    if let Some(reason) = too_uncertain(&found) {
-        return Err(Error::NotCalibrated { name: dataset.name.clone(), reason });
+    let found = match events.stage(STAGE, 0, || look(dataset, events, cancel)) {
+        Err(Error::NotCalibrated { .. }) if has_lens => return Ok(()),
+        found => found?,
+    };
+    match too_uncertain(&found) {
+        Some(_) if has_lens => return Ok(()),
+        Some(reason) => return Err(Error::NotCalibrated { name: dataset.name.clone(), reason }),
+        None => {}
     }
     let size = size_of(dataset);
-    let noise = believed_noise(sensor_noise(&dataset.imu));
+    let is_noise_given = has_lens && !dataset.warnings.iter().any(|w| w.kind == "imu-noise");
+    let noise = dataset.rig.imu.filter(|_| is_noise_given);
+    let noise = noise.unwrap_or_else(|| believed_noise(sensor_noise(&dataset.imu)));
     let model = model_of(&found, size)?;
+    let is_lens_plain = is_plain(dataset);
     let Some(camera) = dataset.rig.cameras.get_mut(dataset.camera.index()) else { return Ok(()) };
-    camera.model = model;
+    if !has_lens || is_lens_plain && contradicts(&found, &camera.model) {
+        camera.model = model;
+    }
     camera.body_from_camera = Se3::new(found.body_from_camera, nalgebra::Vector3::zeros());
     camera.time_offset = Duration::from_secs_f64(found.time_offset_secs.value);
     if found.readout_secs.is_observable {
@@ -166,7 +206,7 @@ pub(crate) fn complete(
     // What these said is no longer so.
     dataset.warnings.retain(|w| !OF_A_GUESS.contains(&w.kind.as_str()));
     dataset.warnings.push(
-        Warning::new("calibrated-from-recording", report::sentence(&found))
+        Warning::new("calibrated-from-recording", report::sentence(&found, has_lens))
             .hint("`vidar calibrate` writes it to a file; --calibration FILE gives a better one"),
     );
     Ok(())

@@ -202,3 +202,28 @@ fn inspect_says_what_is_missing_and_what_the_recording_shows_of_it() {
     let missing = calibrated["missing"].as_array().unwrap();
     assert!(!missing.iter().any(|m| m.as_str().unwrap().contains("intrinsics")), "{calibrated}");
 }
+
+#[test]
+fn a_lens_without_its_place_on_the_imu_is_completed_from_the_recording() {
+    let folder = tempfile::tempdir().unwrap();
+    let sequence = folder.path().join("recording");
+    let mut synth = command();
+    synth.arg("synth").arg(&sequence).args([
+        "--preset",
+        "phone-fast",
+        "--size",
+        "320x240",
+        "--frame-rate",
+        "20",
+    ]);
+    synth.args(["--duration", "10", "--seed", "9611", "--calibration", "partial", "-q"]);
+    ProgramOutput::from(synth.output().unwrap()).ends_with(0);
+    let mut program = command();
+    program.arg("odometry").arg(&sequence).arg("-o").arg(folder.path().join("out")).args(["--json", "-q"]);
+    let ran = ProgramOutput::from(program.output().unwrap()).ends_with(0);
+    assert!(ran.stderr.contains("nothing says how the camera is mounted"), "{}", ran.stderr);
+    let json = ran.json();
+    let number = |path: &str| json.pointer(path).and_then(Value::as_f64).unwrap();
+    let path_m = number("/final/trajectory/matched_truth_path_m");
+    assert!(number("/final/trajectory/ate_se3_m/rmse") < 0.01 * path_m, "{}", json["final"]["trajectory"]);
+}

@@ -10,6 +10,8 @@ use vidar_core::{Duration, ImuSample, LandmarkId, LieGroup, RigCamera, Se3, So3,
 /// estimates a clock offset of some milliseconds by itself, and a readout of 4 ms moves a pixel by less than one at 1 rad/s.
 const MIN_OFFSET_SECS: f64 = 0.004;
 const MIN_READOUT_SECS: f64 = 0.004;
+/// No shutter takes longer: what a wrong camera explains by a longer one is its error. The bound of `readout_ms`.
+const MAX_READOUT_SECS: f64 = 0.05;
 const MIN_ROTATION_RAD: f64 = 2.0 * std::f64::consts::PI / 180.0;
 
 /// A running state is given up only for differences this many times larger.
@@ -229,7 +231,7 @@ impl TimeCalibration {
         };
         let readout_secs = match differs(found.readout_secs, 0.0, found.readout_sigma, 0.0, MIN_READOUT_SECS)
         {
-            true => found.readout_secs.max(0.0),
+            true => found.readout_secs.clamp(0.0, MAX_READOUT_SECS),
             false => 0.0,
         };
         let offset = self.estimates_offset

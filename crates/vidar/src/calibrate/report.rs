@@ -11,8 +11,10 @@ use vidar_odometry::calibration::{Calibration, Estimate};
 const CONTRADICTION_SIGMAS: f64 = 3.0;
 
 /// One sentence for a warning.
-pub(super) fn sentence(found: &Calibration) -> String {
-    format!("no calibration; found from the recording: {}", values(found))
+pub(super) fn sentence(found: &Calibration, has_lens: bool) -> String {
+    let missing =
+        if has_lens { "nothing says how the camera is mounted on the IMU" } else { "no calibration" };
+    format!("{missing}; found from the recording: {}", values(found))
 }
 
 /// The values with their standard deviations.

@@ -1,5 +1,6 @@
 //! The adjustment of a recording after its end, as `vidar odometry` and `vidar run` use it: what may change, and what it found.
 
+use crate::calibrate;
 use crate::config::Config;
 use nalgebra::Vector3;
 use serde_json::{Value, json};
@@ -25,17 +26,27 @@ pub(crate) fn adjustable(dataset: &Recording, config: &Config) -> Option<Calibra
     let clock = if settings.estimate_time_offset { by_default.time_offset_secs } else { 0.0 };
     let readout = if settings.readout_ms.is_none() { by_default.readout_secs } else { 0.0 };
     let given = CalibrationSigmas { time_offset_secs: clock, readout_secs: readout, ..by_default };
-    settings.adjust.then_some(match dataset.calibration {
-        CalibrationSource::Guessed => CalibrationSigmas {
-            rotation_rad: FOUND_ROTATION_RAD,
-            position_m: crate::calibrate::UNKNOWN_LEVER_M,
+    let has_no_mount = calibrate::has_no_mount(dataset);
+    let mounted = CalibrationSigmas {
+        rotation_rad: FOUND_ROTATION_RAD,
+        position_m: calibrate::UNKNOWN_LEVER_M,
+        ..given.clone()
+    };
+    let sigmas = if dataset.calibration == CalibrationSource::Guessed
+        || has_no_mount && calibrate::is_plain(dataset)
+    {
+        CalibrationSigmas {
             focal: FOUND_FOCAL,
             principal_point_px: FOUND_PRINCIPAL_POINT * image_width(dataset),
             distortion: FOUND_DISTORTION,
-            ..given
-        },
-        _ => given,
-    })
+            ..mounted
+        }
+    } else if has_no_mount {
+        mounted
+    } else {
+        given
+    };
+    settings.adjust.then_some(sigmas)
 }
 
 fn image_width(dataset: &Recording) -> f64 {
