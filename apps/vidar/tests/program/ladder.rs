@@ -58,7 +58,7 @@ const REST: [Rung; 16] = [
     rung("gyroscope and accelerometer interleaved, gaps of 20 to 50 ms every two seconds", |c| {
         (c.device.imu_timing, c.device.imu_gaps_per_min) = (ImuTiming::Interleaved, 30.0);
     }),
-    Rung { imu_gap_secs: 0.5, ..rung("half a second without IMU measurements", |_| {}) },
+    Rung { imu_gap_secs: 0.4, ..rung("0.4 s without IMU measurements", |_| {}) },
     rung("IMU noise of twice a phone's, gains 1 % off", |c| {
         (c.imu_noise_scale, c.device.imu_scale_sigma) = (2.0, 0.01);
     }),
@@ -178,4 +178,19 @@ fn the_short_rungs_of_the_ladder_hold() {
 fn every_rung_of_the_ladder_holds() {
     let all: Vec<Rung> = REST.into_iter().chain(SHORT).collect();
     climb_all(&all, &[9600, 9700, 9800]);
+}
+
+#[test]
+fn what_the_imu_does_not_bridge_is_told_and_joined_by_no_guess() {
+    let folder = tempfile::tempdir().unwrap();
+    let sequence = folder.path().join("recording");
+    render(&Rung { imu_gap_secs: 0.6, ..rung("0.6 s without IMU measurements", |_| {}) }, 9808, &sequence);
+    let mut program = command();
+    program.arg("odometry").arg(&sequence).arg("-o").arg(folder.path().join("out")).args(["--json", "-q"]);
+    let ran =
+        ProgramOutput::from(program.output().unwrap()).ends_with(3).says(&["no IMU measurement for 0.6"]);
+    let json = ran.json();
+    let path_m = number(&json, "/final/trajectory/matched_truth_path_m");
+    let ate_m = number(&json, "/final/trajectory/ate_se3_m/rmse");
+    assert!(ate_m < 0.01 * path_m, "ATE {ate_m} m over {path_m} m: {}", json["final"]);
 }

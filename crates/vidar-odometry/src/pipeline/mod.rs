@@ -1,7 +1,7 @@
 //! The odometry as a push machine: sensor events in, one output per image out.
 
 mod calibration;
-mod health;
+pub(crate) mod health;
 mod keyframes;
 mod odometry;
 mod orientation_check;
