@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 use vidar::core::{CameraId, FrameImage, ImuNoise, SensorEvent, So3, Timestamp};
 use vidar::da3::{Da3Options, InferOptions, Inputs, Precision};
-use vidar::dataset::{CameraFlag, Recording, OpenOptions};
+use vidar::dataset::{CameraFlag, OpenOptions, Recording};
 use vidar::models::bundled;
 use vidar::odometry_stage::{Odometry, OdometryConfig, OdometryOutput};
 use vidar::synth::{SynthConfig, write_sequence};

@@ -2,8 +2,8 @@
 #![no_main]
 
 use libfuzzer_sys::fuzz_target;
-use vidar_bag::message::{Message, decode};
 use vidar_bag::Encoding;
+use vidar_bag::message::{Message, decode};
 
 const TYPES: [&str; 16] = [
     "sensor_msgs/Image",
@@ -26,7 +26,8 @@ const TYPES: [&str; 16] = [
 
 fuzz_target!(|bytes: &[u8]| {
     let Some((selector, bytes)) = bytes.split_first() else { return };
-    let encoding = [Encoding::Ros1, Encoding::Cdr, Encoding::Protobuf, Encoding::Json][usize::from(selector >> 4 & 3)];
+    let encoding =
+        [Encoding::Ros1, Encoding::Cdr, Encoding::Protobuf, Encoding::Json][usize::from(selector >> 4 & 3)];
     if let Ok(Message::Image(image)) = decode(TYPES[usize::from(selector & 15)], encoding, bytes)
         && let Ok(pixels) = image.pixels()
     {

@@ -2,9 +2,7 @@
 #![no_main]
 
 use libfuzzer_sys::fuzz_target;
-use vidar_export::{
-    ColmapFormat, DepthSidecar, read_colmap_bytes, read_depth_png, read_transforms_json,
-};
+use vidar_export::{ColmapFormat, DepthSidecar, read_colmap_bytes, read_depth_png, read_transforms_json};
 
 /// One camera of number 1, so that images have something to refer to.
 const CAMERA_TEXT: &[u8] = b"1 PINHOLE 64 48 100 110 32 24\n";

@@ -2,9 +2,7 @@
 #![no_main]
 
 use libfuzzer_sys::fuzz_target;
-use vidar_export::{
-    read_euroc_csv, read_kitti, read_kitti_times, read_tum, write_euroc_csv, write_tum,
-};
+use vidar_export::{read_euroc_csv, read_kitti, read_kitti_times, read_tum, write_euroc_csv, write_tum};
 
 fuzz_target!(|bytes: &[u8]| {
     if let Ok(read) = read_tum(bytes) {

@@ -10,7 +10,7 @@ use vidar_core::{
     Pinhole, RelativeDepth, Se3, Timestamp, ViewGeometry, Watch,
 };
 use vidar_link::geometry::{
-    DepthFormat, Hello, ModelFacts, Outcome, Predicted, PredictReply, PredictRequest, Served, answer_hello,
+    DepthFormat, Hello, ModelFacts, Outcome, PredictReply, PredictRequest, Predicted, Served, answer_hello,
     answer_predict,
 };
 use vidar_link::ros::{Attachment, TopicKey};
@@ -96,7 +96,9 @@ fuzz_target!(|data: &[u8]| {
             }
         }
         _ => {
-            if let Ok(key) = std::str::from_utf8(bytes).map_err(|_| ()).and_then(|k| TopicKey::parse(k).map_err(|_| ())) {
+            if let Ok(key) =
+                std::str::from_utf8(bytes).map_err(|_| ()).and_then(|k| TopicKey::parse(k).map_err(|_| ()))
+            {
                 assert!(key.topic.starts_with('/') && !key.message_type.contains("::"));
             }
         }

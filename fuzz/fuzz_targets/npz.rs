@@ -11,7 +11,10 @@ fuzz_target!(|bytes: &[u8]| {
     if let Ok(array) = NpyArray::read(&mut &bytes[..], "fuzz", LIMITS.bytes) {
         let mut again = Vec::new();
         array.write(&mut again).expect("a vector takes everything");
-        assert_eq!(NpyArray::read(&mut again.as_slice(), "fuzz", u64::MAX).expect("our own file").shape, array.shape);
+        assert_eq!(
+            NpyArray::read(&mut again.as_slice(), "fuzz", u64::MAX).expect("our own file").shape,
+            array.shape
+        );
     }
     if let Ok(arrays) = read_npz(Cursor::new(bytes), LIMITS) {
         assert!(arrays.values().map(|a| a.data.bytes()).sum::<u64>() <= LIMITS.bytes);

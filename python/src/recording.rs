@@ -14,7 +14,7 @@ use pythonize::pythonize;
 use std::path::PathBuf;
 use std::sync::{Arc, Mutex, PoisonError};
 use vidar::core::Timestamp;
-use vidar::dataset::{CalibrationSource, Recording, EventCursor};
+use vidar::dataset::{CalibrationSource, EventCursor};
 
 /// A recording, opened: a bag, a video, or a folder in any layout that `vidar run` reads. Images stay on disk until asked for.
 ///
@@ -25,7 +25,7 @@ use vidar::dataset::{CalibrationSource, Recording, EventCursor};
 ///
 /// Iterating gives Frame, ImuSample, DepthImage and GroundTruth objects in the order of time.
 #[pyclass(frozen, module = "vidar")]
-pub struct Recording(pub Arc<Recording>);
+pub struct Recording(pub Arc<vidar::dataset::Recording>);
 
 #[pymethods]
 impl Recording {
@@ -183,7 +183,7 @@ impl Recording {
 /// The events of a recording.
 #[pyclass(frozen, module = "vidar")]
 pub struct EventIterator {
-    dataset: Arc<Recording>,
+    dataset: Arc<vidar::dataset::Recording>,
     cursor: Mutex<EventCursor>,
 }
 

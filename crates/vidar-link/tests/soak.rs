@@ -10,7 +10,7 @@ use std::io::{Read, Write};
 use std::net::{Shutdown, TcpListener, TcpStream};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
-use std::sync::mpsc::channel;
+use std::sync::mpsc::sync_channel;
 use std::time::{Duration, Instant};
 use vidar_link::geometry::{DepthFormat, Expected, ImageFormat, RemoteModel, RemoteOptions};
 use vidar_link::{Link, LinkOptions, Role, Serving};
@@ -96,7 +96,7 @@ fn soak(time: Duration, least_chunks: u32) {
         let mut ways = Vec::new();
         for _ in 0..2 {
             let port = TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
-            let (sender, ready) = channel();
+            let (sender, ready) = sync_channel(1);
             let stop = &stop;
             scope.spawn(move || {
                 let options =

@@ -9,7 +9,7 @@ use std::net::TcpListener;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::mpsc::channel;
+use std::sync::mpsc::sync_channel;
 use std::time::Duration;
 use vidar_link::geometry::{DepthFormat, Expected, ImageFormat, RemoteModel, RemoteOptions};
 use vidar_link::{Link, LinkError, LinkOptions, Role, Serving};
@@ -89,7 +89,7 @@ fn only_who_has_a_certificate_of_the_right_authority_is_answered() {
     };
     let stop = AtomicBool::new(false);
     std::thread::scope(|scope| {
-        let (sender, ready) = channel();
+        let (sender, ready) = sync_channel(1);
         let serving = scope.spawn(|| {
             let served = Arc::new(Brightness(facts("bright")));
             let told = move |serving: Serving| {

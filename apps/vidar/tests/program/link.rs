@@ -54,7 +54,7 @@ mod built {
     use std::net::TcpListener;
     use std::path::Path;
     use std::process::{Child, Stdio};
-    use std::sync::mpsc::{Receiver, channel};
+    use std::sync::mpsc::{Receiver, sync_channel};
     use std::time::Duration;
     use vidar::link::ros::Attachment;
     use vidar::link::{Delivery, Link, LinkOptions, Role};
@@ -94,7 +94,7 @@ mod built {
                 panic!("no worker: {said}");
             };
             assert_eq!((&ready["schema"], &ready["key"]), (&"vidar.worker/1".into(), &"lab/depth".into()));
-            let (sender, told) = channel();
+            let (sender, told) = sync_channel(1000);
             let lines = BufReader::new(child.stderr.take().unwrap());
             std::thread::spawn(move || {
                 lines.lines().map_while(Result::ok).for_each(|l| drop(sender.send(l)))
