@@ -2,12 +2,13 @@
 
 use crate::batch_args::{PlanArgs, WorkArgs};
 use crate::compare_args::CompareArgs;
-use crate::link_args::{LinkArgs, ReceiveArgs, WorkerArgs};
+use crate::link_args::{ReceiveArgs, WorkerArgs};
 use crate::live_args::LiveArgs;
-use crate::model_args::{DepthArgs, LicenceArgs, ModelCommand};
-use clap::{ArgAction, Args, Parser, Subcommand, ValueEnum, ValueHint};
+use crate::model_args::{DepthArgs, ModelCommand};
+use crate::run_args::WholeRunArgs;
+use crate::shared_args::{ConfigArgs, InputArgs, OutputArgs};
+use clap::{Args, Parser, Subcommand, ValueEnum, ValueHint};
 use std::path::PathBuf;
-use vidar::da3::Device;
 
 /// Metric dense 3-D maps from one camera and an IMU, or from one camera and metric poses.
 #[derive(Debug, Parser)]
@@ -179,181 +180,6 @@ const RUN_EXAMPLES: &str = "Examples:
   vidar run mav0/ --preset euroc -o result
   vidar run frames/ --timestamps times.txt --camera-model pinhole:525,525,319.5,239.5 --trajectory vio.tum
   vidar run my_recording/ --dry-run";
-
-/// How the input is read.
-// The plan of a batch keeps it as it was typed.
-#[derive(Args, Clone, Debug, Default, serde::Serialize, serde::Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct InputArgs {
-    /// Layout of the recording, instead of detecting it: euroc, tum-rgbd, 7scenes, kitti-raw, kitti, replica, icl-nuim,
-    /// posed-folder, bag, stray-scanner, spectacular-ai, imu-log, video, images.
-    #[arg(long, help_heading = "Input")]
-    pub format: Option<String>,
-    /// Number of the camera (`cam0` is 0).
-    #[arg(long, help_heading = "Input")]
-    pub camera: Option<u32>,
-    /// Calibration: EuRoC sensor.yaml, Kalibr camchain or imu yaml. Repeatable.
-    #[arg(long, value_hint = ValueHint::FilePath, help_heading = "Input")]
-    pub calibration: Vec<PathBuf>,
-    /// Topic of a bag to use: NAME for images, depth or IMU; truth=NAME or trajectory=NAME for poses. Repeatable.
-    #[arg(long = "topic", value_name = "NAME", action = ArgAction::Append, help_heading = "Input")]
-    pub topics: Vec<String>,
-    /// Who decodes videos: built-in, or ffmpeg, the program of that name on this machine (5.1 or newer), for codecs and containers that
-    /// the built-in decoders refuse.
-    #[arg(long, help_heading = "Input")]
-    pub decoder: Option<String>,
-    /// Camera model of the images: pinhole:fx,fy,cx,cy  radtan:…,k1,k2,p1,p2(,k3)  kb4:…,k1,k2,k3,k4  ds:…,xi,alpha  fov:…,w.
-    #[arg(long, allow_hyphen_values = true, help_heading = "Input")]
-    pub camera_model: Option<String>,
-    /// Metric trajectory of the same recording, used instead of VIDAR's own odometry.
-    #[arg(long, value_hint = ValueHint::FilePath, help_heading = "Input")]
-    pub trajectory: Option<PathBuf>,
-    /// Format of --trajectory, instead of detecting it: tum, euroc, kitti.
-    #[arg(long, help_heading = "Input")]
-    pub trajectory_format: Option<String>,
-    /// Body whose poses --trajectory holds: imu, or camera0, camera1, ….
-    #[arg(long, help_heading = "Input")]
-    pub trajectory_body: Option<String>,
-    /// Table of gyroscope and accelerometer (csv), for a video or a folder of images; twice for one of each.
-    #[arg(long, value_hint = ValueHint::FilePath, action = ArgAction::Append, help_heading = "Input")]
-    pub imu: Vec<PathBuf>,
-    /// File of image times, for image folders.
-    #[arg(long, value_hint = ValueHint::FilePath, help_heading = "Input")]
-    pub timestamps: Option<PathBuf>,
-    /// Unit of image times, instead of detecting it: s, ms, us, ns.
-    #[arg(long, help_heading = "Input")]
-    pub time_unit: Option<String>,
-    /// Intrinsics of the depth camera, pixels: fx,fy,cx,cy.
-    #[arg(long, allow_hyphen_values = true, help_heading = "Input")]
-    pub depth_intrinsics: Option<String>,
-    /// Raw depth units per metre (1000: millimetres, 5000: TUM).
-    #[arg(long, help_heading = "Input")]
-    pub depth_scale: Option<f64>,
-    /// Pose of the depth camera in the colour camera: tx,ty,tz in metres, optionally ,qx,qy,qz,qw.
-    #[arg(long, allow_hyphen_values = true, help_heading = "Input")]
-    pub color_from_depth: Option<String>,
-    /// Start, seconds after the first image.
-    #[arg(long, help_heading = "Input")]
-    pub start: Option<f64>,
-    /// End, seconds after the first image.
-    #[arg(long, help_heading = "Input")]
-    pub end: Option<f64>,
-    /// Use every n-th image only.
-    #[arg(long, help_heading = "Input")]
-    pub stride: Option<usize>,
-}
-
-/// How settings are given.
-#[derive(Args, Clone, Debug, Default)]
-pub struct ConfigArgs {
-    /// Preset; `vidar config presets` lists them.
-    #[arg(long, help_heading = "Settings")]
-    pub preset: Option<String>,
-    /// TOML file of settings; overrides the preset.
-    #[arg(long, value_hint = ValueHint::FilePath, help_heading = "Settings")]
-    pub config: Option<PathBuf>,
-    /// One setting: section.key=value. Repeatable; overrides files.
-    #[arg(long = "set", value_name = "KEY=VALUE", action = ArgAction::Append, help_heading = "Settings")]
-    pub set: Vec<String>,
-}
-
-/// Where results go.
-#[derive(Args, Clone, Debug, Default)]
-pub struct OutputArgs {
-    /// Output folder; default `runs/<name>/<time>/` with a `latest` link.
-    #[arg(short, long, value_hint = ValueHint::DirPath, help_heading = "Output")]
-    pub output: Option<PathBuf>,
-    /// Rename an existing output folder instead of failing.
-    #[arg(long, help_heading = "Output")]
-    pub force: bool,
-}
-
-/// `vidar run`.
-#[derive(Args, Clone, Debug)]
-pub struct WholeRunArgs {
-    /// What `vidar live` has, too.
-    #[command(flatten)]
-    pub run: RunArgs,
-    /// How long it may take.
-    #[command(flatten)]
-    pub budget: BudgetArgs,
-}
-
-/// How long a run may take.
-#[derive(Args, Clone, Debug)]
-pub struct BudgetArgs {
-    /// Cut down stereo so that the run takes no longer than the recording, on two quiet cores of the machine of BENCHMARK.md
-    /// (`budget.speed` tells of others). The same command makes the same map on every machine.
-    #[arg(long, conflicts_with = "time_budget", help_heading = "Model")]
-    pub realtime: bool,
-    /// The same with a limit in seconds.
-    #[arg(long, value_name = "SECONDS", help_heading = "Model")]
-    pub time_budget: Option<f64>,
-}
-
-/// What `vidar run` and `vidar live` have in common.
-#[derive(Args, Clone, Debug)]
-pub struct RunArgs {
-    /// The recording: a bag, a video, or a folder (EuRoC, TUM RGB-D, 7-Scenes, KITTI, a phone's, posed folder, images, …).
-    #[arg(value_hint = ValueHint::AnyPath)]
-    pub path: PathBuf,
-    /// How the input is read.
-    #[command(flatten)]
-    pub input: InputArgs,
-    /// How settings are given.
-    #[command(flatten)]
-    pub config: ConfigArgs,
-    /// Where results go.
-    #[command(flatten)]
-    pub output: OutputArgs,
-    /// Source of depth: auto (stereo, completed), stereo, a network of `vidar model list` such as da3-small, recorded:DIR, or remote:KEY,
-    /// the network of the `vidar worker`s under that key.
-    #[arg(long, visible_alias = "model", value_name = "NAME", help_heading = "Model")]
-    pub geometry: Option<String>,
-    /// How other machines are reached.
-    #[command(flatten)]
-    pub link: LinkArgs,
-    /// Coupling of depth and metric poses: coupled, hybrid, pose-conditioned, ground-truth, pose-free, da3-streaming.
-    #[arg(long, value_name = "MODE", help_heading = "Model")]
-    pub mode: Option<String>,
-    /// Folder with model.safetensors and config.json, for custom weights.
-    #[arg(long, value_hint = ValueHint::AnyPath, help_heading = "Model")]
-    pub model_dir: Option<PathBuf>,
-    /// Device that runs the network: cpu, gpu, gpu:N or auto; `vidar doctor` lists graphics processors.
-    #[arg(long, value_name = "DEVICE", help_heading = "Model")]
-    pub device: Option<Device>,
-    /// Acceptance of a licence.
-    #[command(flatten)]
-    pub licence: LicenceArgs,
-    /// Folder of an earlier `vidar odometry` or `vidar run` of the same place: the map is in the world of that recording.
-    #[arg(long, value_name = "FOLDER", value_hint = ValueHint::AnyPath, help_heading = "Input")]
-    pub map: Option<String>,
-    /// Folder of masks, black where an image is not to be used, as COLMAP and nerfstudio have them: people who move, the camera's
-    /// carrier. A mask is called as its image is: NAME.EXT.png or NAME.png.
-    #[arg(long, value_name = "FOLDER", value_hint = ValueHint::DirPath, help_heading = "Input")]
-    pub masks: Option<String>,
-    /// Reference cloud (PLY, metres, world frame of the ground truth) for the evaluation of the map.
-    #[arg(long, value_hint = ValueHint::FilePath, help_heading = "Input")]
-    pub reference: Option<PathBuf>,
-    /// MCAP file that shows the run in Foxglove or Rerun, written while it runs; it must not exist.
-    #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath, help_heading = "Output")]
-    pub mcap: Option<PathBuf>,
-    /// Print the plan and stop.
-    #[arg(long)]
-    pub dry_run: bool,
-    /// Memory limit for planning, such as 4GiB or 800MB; default: the sum of the parts.
-    #[arg(long, value_name = "SIZE", help_heading = "Model")]
-    pub memory_budget: Option<String>,
-    /// Continue an interrupted run in the folder of -o; valid results in it are not computed again.
-    #[arg(long, requires = "output", conflicts_with = "force", help_heading = "Output")]
-    pub resume: bool,
-    /// End with status 5 when a score is above its bound: ate, scale, chamfer (e.g. ate=0.1). Repeatable.
-    #[arg(long, value_name = "NAME=VALUE")]
-    pub fail_above: Vec<String>,
-    /// End with status 5 when a score is below its bound: f@0.05, f@0.10, … of the rigid fit (e.g. f@0.05=0.5). Repeatable.
-    #[arg(long, value_name = "NAME=VALUE")]
-    pub fail_below: Vec<String>,
-}
 
 /// The synthetic world.
 #[derive(Args, Clone, Debug, Default)]

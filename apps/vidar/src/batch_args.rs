@@ -1,6 +1,6 @@
 //! The command lines of `vidar plan` and `vidar work`.
 
-use crate::args::{ConfigArgs, InputArgs};
+use crate::shared_args::{ConfigArgs, InputArgs};
 use clap::{Args, ValueEnum, ValueHint};
 use std::path::PathBuf;
 use vidar::batch::Stage;

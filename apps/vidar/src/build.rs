@@ -1,7 +1,9 @@
 //! Converts flags to values of the library; each is checked here or at its first use.
 
-use crate::args::{BudgetArgs, ConfigArgs, EvalArgs, InputArgs, OutputArgs, RunArgs, WorldArgs};
+use crate::args::{EvalArgs, WorldArgs};
 use crate::link_args::LinkArgs;
+use crate::run_args::RunArgs;
+use crate::shared_args::{BudgetArgs, ConfigArgs, InputArgs, OutputArgs};
 use std::path::Path;
 use vidar::config::Origin;
 use vidar::core::{CameraId, Se3, So3};

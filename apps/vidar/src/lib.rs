@@ -13,6 +13,8 @@ pub mod model_args;
 mod print;
 mod progress;
 pub mod reference;
+pub mod run_args;
+pub mod shared_args;
 mod spool;
 
 use args::{Cli, Command, ConfigCommand};

@@ -1,7 +1,7 @@
 //! The command line of what reaches other machines, and of `vidar worker`.
 
-use crate::args::ConfigArgs;
 use crate::model_args::LicenceArgs;
+use crate::shared_args::ConfigArgs;
 use clap::{ArgAction, Args, ValueHint};
 use std::path::PathBuf;
 use vidar::da3::Device;

@@ -1,6 +1,6 @@
 //! The command line of `vidar live`.
 
-use crate::args::RunArgs;
+use crate::run_args::RunArgs;
 use clap::Args;
 
 /// `vidar live`.

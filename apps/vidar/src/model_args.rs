@@ -1,6 +1,6 @@
 //! Flags of `vidar model` and `vidar depth`.
 
-use crate::args::OutputArgs;
+use crate::shared_args::OutputArgs;
 use clap::{Args, Subcommand, ValueEnum, ValueHint};
 use std::path::PathBuf;
 use vidar::da3::Device;

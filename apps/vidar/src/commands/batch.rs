@@ -1,7 +1,7 @@
 //! `vidar plan` and `vidar work`.
 
-use crate::args::InputArgs;
 use crate::batch_args::{PlanArgs, WorkArgs};
+use crate::shared_args::InputArgs;
 use crate::{Context, Outcome, build, print, progress, spool};
 use serde_json::json;
 use std::path::{Path, PathBuf};

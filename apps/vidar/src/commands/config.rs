@@ -1,6 +1,6 @@
 //! `vidar config`.
 
-use crate::args::ConfigArgs;
+use crate::shared_args::ConfigArgs;
 use crate::{Context, Outcome, build, print};
 use serde_json::json;
 use vidar::ExitStatus;

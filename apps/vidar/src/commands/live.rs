@@ -1,9 +1,9 @@
 //! `vidar live`.
 
 use super::run::{conclude, dry_run, request};
-use crate::args::RunArgs;
 use crate::build::usage;
 use crate::live_args::LiveArgs;
+use crate::run_args::RunArgs;
 use crate::{Context, Outcome, print, progress, spool};
 use std::sync::mpsc::sync_channel;
 use std::time::Duration;

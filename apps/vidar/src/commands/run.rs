@@ -1,6 +1,8 @@
 //! `vidar run` and `vidar demo`.
 
-use crate::args::{BudgetArgs, DemoArgs, RunArgs, WholeRunArgs};
+use crate::args::DemoArgs;
+use crate::run_args::{RunArgs, WholeRunArgs};
+use crate::shared_args::BudgetArgs;
 use crate::{Context, Outcome, build, print, progress, spool};
 use serde_json::json;
 use vidar::demo::DemoRequest;

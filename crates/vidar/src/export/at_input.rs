@@ -7,7 +7,7 @@ use rayon::prelude::*;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use vidar_core::remap::RemapTable;
-use vidar_core::{Image, Pinhole};
+use vidar_core::{CameraModel, Image, Pinhole};
 use vidar_dataset::decode::{ImageLimits, read_image};
 use vidar_dataset::{CameraFlag, with_size};
 
@@ -33,9 +33,8 @@ pub(super) fn undistort(
 /// The recording's images of a run's keyframes.
 pub(super) struct AtInputSize<'a> {
     run: &'a Path,
-    model: CameraFlag,
-    width: usize,
-    height: usize,
+    /// At the size of the recording's images.
+    model: CameraModel,
     sources: BTreeMap<u32, &'a Option<PathBuf>>,
     /// For the intrinsics that all views have, unless a prediction brought its own.
     shared: Option<RemapTable>,
@@ -47,18 +46,20 @@ impl<'a> AtInputSize<'a> {
         let Some(camera) = stored.camera.as_ref() else {
             return Err(refused(run, format!("views.json has no camera: {NEEDS}")));
         };
-        let model: CameraFlag = camera.model.parse()?;
+        let flag: CameraFlag = camera.model.parse()?;
+        let model = with_size(&flag.0, camera.width, camera.height)?;
         let sources = stored.views.iter().map(|v| (v.frame, &v.source)).collect();
-        let mut this = Self { run, model, width: camera.width, height: camera.height, sources, shared: None };
+        let mut this = Self { run, model, sources, shared: None };
         if let Some(first) = stored.views.first() {
-            this.shared = Some(this.table(&this.intrinsics(&first.intrinsics)?)?);
+            this.shared = Some(RemapTable::new(&this.model, &this.intrinsics(&first.intrinsics)?));
         }
         Ok(this)
     }
 
     /// The same rectangle of rays at the width of the recording's images.
     pub fn intrinsics(&self, view: &Pinhole) -> Result<Pinhole, Error> {
-        Ok(view.resized(self.width, (view.height * self.width).div_ceil(view.width))?)
+        let width = self.model.width();
+        Ok(view.resized(width, (view.height * width).div_ceil(view.width))?)
     }
 
     /// The undistorted image of a frame with the given [`Self::intrinsics`].
@@ -67,20 +68,17 @@ impl<'a> AtInputSize<'a> {
             return Err(refused(self.run, format!("frame {frame} has no image file: {NEEDS}")));
         };
         let image = read_image(source, &ImageLimits::default())?;
-        if (image.width(), image.height()) != (self.width, self.height) {
+        let size = (self.model.width(), self.model.height());
+        if (image.width(), image.height()) != size {
             let found = format!("{} is {}x{} pixels", source.display(), image.width(), image.height());
-            let expected = format!("the run's camera has {}x{}", self.width, self.height);
+            let expected = format!("the run's camera has {}x{}", size.0, size.1);
             return Err(refused(self.run, format!("{found}, {expected}")));
         }
         let undistorted = match &self.shared {
             Some(table) if table.target() == intrinsics => table.apply(&image),
-            _ => self.table(intrinsics)?.apply(&image),
+            _ => RemapTable::new(&self.model, intrinsics).apply(&image),
         };
         Ok(undistorted.to_rgb8())
-    }
-
-    fn table(&self, intrinsics: &Pinhole) -> Result<RemapTable, Error> {
-        Ok(RemapTable::new(&with_size(&self.model.0, self.width, self.height)?, intrinsics))
     }
 }
 

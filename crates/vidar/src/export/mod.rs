@@ -82,13 +82,14 @@ impl ExportTarget {
         let is_textured = self == Self::TexturedGlb;
         let has_images = is_colmap || is_textured || self == Self::Nerfstudio;
         if let Some(max_px) = options.texture_px {
-            let valid = vidar_fusion::TextureConfig { max_px }.validate();
-            let what = match valid {
-                _ if !is_textured => "--texture-px: only textured-glb has a texture".to_owned(),
-                Err(error) => format!("--texture-px: {error}"),
-                Ok(()) => return Self::TexturedGlb.check(ExportOptions { texture_px: None, ..options }),
+            let refused = match is_textured {
+                false => Some("only textured-glb has a texture".to_owned()),
+                true => vidar_fusion::TextureConfig { max_px }.validate().err().map(|e| e.to_string()),
             };
-            return Err(Error::Usage { what, hint: "leave it out".to_owned() });
+            if let Some(reason) = refused {
+                let what = format!("--texture-px: {reason}");
+                return Err(Error::Usage { what, hint: "leave it out".to_owned() });
+            }
         }
         let refused = match options {
             ExportOptions { tracks: true, .. } if !is_colmap => {
