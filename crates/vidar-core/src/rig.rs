@@ -19,6 +19,13 @@ pub struct RigCamera {
     pub rate_hz: Option<f64>,
 }
 
+impl RigCamera {
+    /// Whether nothing says how it is mounted: its pose is the body's own, which readers assume and no device has.
+    pub fn has_no_mount(&self) -> bool {
+        self.body_from_camera == Se3::IDENTITY
+    }
+}
+
 /// Continuous-time noise of an IMU, as Kalibr and EuRoC state it.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]

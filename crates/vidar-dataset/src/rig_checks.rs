@@ -4,7 +4,7 @@
 //! not an unusual rig. Errors that show only with motion (an inverted camera orientation) are checked by the odometry in its first seconds.
 
 use std::path::Path;
-use vidar_core::{CameraModel, Duration, ImuNoise, ImuSample, LieGroup, Rig, RigCamera, Se3, Warning};
+use vidar_core::{CameraModel, Duration, ImuNoise, ImuSample, LieGroup, Rig, RigCamera, Warning};
 
 /// Largest plausible distance of camera and IMU, m.
 const MAX_LEVER_M: f64 = 1.0;
@@ -38,7 +38,7 @@ pub(crate) fn check_rig(rig: &Rig, chosen: usize, imu: &[ImuSample], place: &Pat
         }
         for (number, other) in rig.cameras.iter().enumerate().filter(|(k, _)| *k != chosen) {
             let baseline = (camera.body_from_camera.inverse() * other.body_from_camera).translation.norm();
-            let known = |c: &RigCamera| c.body_from_camera != Se3::IDENTITY;
+            let known = |c: &RigCamera| !c.has_no_mount();
             if (known(camera) || known(other)) && !BASELINE_M.contains(&baseline) {
                 let message =
                     format!("cameras {chosen} and {number} are {baseline:.4} m apart, not 1 mm to 3 m");
@@ -98,7 +98,7 @@ fn check_model(model: &CameraModel, report: &mut impl FnMut(&str, String, &str))
 
 fn check_place(camera: &RigCamera, report: &mut impl FnMut(&str, String, &str)) {
     let lever = camera.body_from_camera.translation.norm();
-    if camera.body_from_camera == Se3::IDENTITY {
+    if camera.has_no_mount() {
         report(
             "extrinsics-identity",
             "the camera's pose is that of the IMU: same position, same axes".into(),

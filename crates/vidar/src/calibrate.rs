@@ -11,7 +11,7 @@ use crate::input::{self, Measurement};
 use std::path::{Path, PathBuf};
 use vidar_core::camera::RadTan;
 use vidar_core::{
-    AngularRate, CameraModel, Duration, ImuNoise, ImuSample, Pinhole, Se3, SensorEvent, Warning,
+    AngularRate, CameraModel, Duration, ImuNoise, ImuSample, Pinhole, RigCamera, Se3, SensorEvent, Warning,
 };
 use vidar_dataset::{CalibrationSource, OpenOptions, Recording};
 use vidar_odometry::OdometryConfig;
@@ -133,7 +133,7 @@ fn write(path: &Path, text: &str) -> Result<(), Error> {
 pub(crate) fn has_no_mount(dataset: &Recording) -> bool {
     dataset.calibration != CalibrationSource::Guessed
         && !dataset.imu.is_empty()
-        && dataset.rig.camera(dataset.camera).is_some_and(|c| c.body_from_camera == Se3::IDENTITY)
+        && dataset.rig.camera(dataset.camera).is_some_and(RigCamera::has_no_mount)
 }
 
 /// Whether a lens is given by its focal length and principal point alone: nobody measured it.

@@ -146,8 +146,7 @@ impl Guess {
     /// The newest state carried to `time`; `None` where the IMU does not cover it.
     pub(super) fn carried_to(&self, time: Timestamp, imu: &ImuBuffer, model: &ImuModel) -> Option<NavState> {
         let (from, state) = (self.times.last()?, self.states.last()?);
-        is_bridged(imu, *from, time).then_some(())?;
-        Some(preintegrate(imu, model, state, *from, time, &mut Vec::new())?.predict(state))
+        Some(bridge(imu, model, state, *from, time)?.predict(state))
     }
 
     /// The oldest state carried back to `time`.
@@ -158,17 +157,23 @@ impl Guess {
         model: &ImuModel,
     ) -> Option<NavState> {
         let (until, state) = (self.times.first()?, self.states.first()?);
-        is_bridged(imu, time, *until).then_some(())?;
-        let preintegration = preintegrate(imu, model, state, time, *until, &mut Vec::new())?;
-        Some(before(state, &preintegration))
+        Some(before(state, &bridge(imu, model, state, time, *until)?))
     }
 }
 
-/// Whether the IMU measured all along, but for gaps that the odometry bridges, too. Through a longer one it carries nothing: half a second of
-/// interpolated measurements moved a segment by 0.4 m without a word.
-fn is_bridged(imu: &ImuBuffer, from: Timestamp, until: Timestamp) -> bool {
-    let gap = imu.interval(from, until, &mut Vec::new()).ok().flatten();
-    gap.is_none_or(|gap| gap.length.as_secs_f64() <= MAX_IMU_GAP_SECS)
+/// What the IMU carries a state by; nothing through a gap that the odometry does not bridge, either: half a second of interpolated
+/// measurements moved a segment by 0.4 m without a word.
+fn bridge(
+    imu: &ImuBuffer,
+    model: &ImuModel,
+    state: &NavState,
+    from: Timestamp,
+    until: Timestamp,
+) -> Option<Preintegration> {
+    let mut interval = Vec::new();
+    let gap = imu.interval(from, until, &mut interval).ok()?;
+    let is_bridged = gap.is_none_or(|gap| gap.length.as_secs_f64() <= MAX_IMU_GAP_SECS);
+    is_bridged.then(|| Preintegration::new(*model, state.bias, &interval))
 }
 
 pub(super) fn preintegrate(
