@@ -29,6 +29,7 @@ const LAYERS: &[(&str, &[&str])] = &[
     ("vidar-link", &["vidar-core"]),
     ("vidar-cli", &["vidar-map"]),
     ("xtask", &[]),
+    ("xtask-features", &[]),
 ];
 
 /// Third-party crates that only the listed crates may use, with the reason.

@@ -1,12 +1,12 @@
 //! Sessions by Zenoh, with plain calls.
 
+use super::waiting::Waiting;
 use super::{Delivery, LinkOptions, Role, Sample, Serving, settings};
 use crate::error::LinkError;
 use crate::geometry::{AskError, Reach, Served, answer_hello, answer_predict, busy, patience_of};
-use std::collections::VecDeque;
-use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::mpsc::{RecvTimeoutError, TrySendError, sync_channel};
-use std::sync::{Arc, Condvar, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 use zenoh::handlers::FifoChannel;
 use zenoh::liveliness::LivelinessToken;
@@ -19,13 +19,6 @@ use zenoh::{Session, Wait};
 const QUEUE: usize = 4;
 /// How often waits look whether they should go on.
 const STEP: Duration = Duration::from_millis(50);
-/// Bytes of messages that wait to be taken: 8 s of colour images of one megapixel at 10 Hz.
-const MAX_WAITING_BYTES: usize = 256 << 20;
-/// Messages that wait: a minute of an IMU of 1 kHz.
-const MAX_WAITING: usize = 65_536;
-/// Messages up to this size are only left out where there are too many of them; IMU samples are some 350 bytes.
-const SMALL_BYTES: usize = 4096;
-
 /// A session.
 pub struct Link {
     session: Session,
@@ -273,46 +266,6 @@ impl Publisher {
     }
 }
 
-/// Messages that came and were not taken yet, within bounds.
-#[derive(Default)]
-struct Waiting {
-    inner: Mutex<Inner>,
-    changed: Condvar,
-    dropped: AtomicU64,
-}
-
-#[derive(Default)]
-struct Inner {
-    samples: VecDeque<Sample>,
-    bytes: usize,
-}
-
-impl Waiting {
-    /// Adds a message; a large one that comes where there is no room is left out, and counted.
-    fn add(&self, sample: Sample) {
-        let size = sample.key.len() + sample.payload.len() + sample.attachment.as_ref().map_or(0, Vec::len);
-        let mut inner = self.inner.lock().unwrap_or_else(PoisonError::into_inner);
-        let is_full = size > SMALL_BYTES && inner.bytes + size > MAX_WAITING_BYTES;
-        if is_full || inner.samples.len() >= MAX_WAITING {
-            self.dropped.fetch_add(1, Ordering::Relaxed);
-            return;
-        }
-        inner.bytes += size;
-        inner.samples.push_back(sample);
-        self.changed.notify_one();
-    }
-
-    fn take(&self, within: Duration) -> Option<Sample> {
-        let inner = self.inner.lock().unwrap_or_else(PoisonError::into_inner);
-        let waited = self.changed.wait_timeout_while(inner, within, |inner| inner.samples.is_empty());
-        let mut inner = waited.map_or_else(|e| e.into_inner().0, |(inner, _)| inner);
-        let sample = inner.samples.pop_front()?;
-        inner.bytes -=
-            sample.key.len() + sample.payload.len() + sample.attachment.as_ref().map_or(0, Vec::len);
-        Some(sample)
-    }
-}
-
 /// Messages under a key expression.
 pub struct Subscription {
     waiting: Arc<Waiting>,
@@ -328,29 +281,6 @@ impl Subscription {
 
     /// Messages left out because nobody took them in time.
     pub fn dropped(&self) -> u64 {
-        self.waiting.dropped.load(Ordering::Relaxed)
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    fn sample(bytes: usize) -> Sample {
-        Sample { key: "k".into(), payload: vec![0; bytes], attachment: None }
-    }
-
-    #[test]
-    fn what_waits_is_bounded_and_small_messages_survive_large_ones() {
-        let waiting = Waiting::default();
-        let image = 64 << 20;
-        (0..5).for_each(|_| waiting.add(sample(image)));
-        assert_eq!(waiting.dropped.load(Ordering::Relaxed), 2, "of five images three fit");
-        (0..MAX_WAITING).for_each(|_| waiting.add(sample(8)));
-        assert_eq!(waiting.dropped.load(Ordering::Relaxed), 5, "no more small ones than are stated");
-        let sizes: Vec<usize> =
-            std::iter::from_fn(|| waiting.take(Duration::ZERO)).map(|s| s.payload.len()).collect();
-        assert_eq!((sizes.len(), sizes[2], sizes[3]), (MAX_WAITING, image, 8));
-        assert_eq!(waiting.inner.lock().unwrap().bytes, 0);
+        self.waiting.dropped()
     }
 }

@@ -6,6 +6,8 @@ mod built;
 mod settings;
 #[cfg(not(feature = "zenoh"))]
 mod unbuilt;
+#[cfg(any(test, feature = "zenoh"))]
+mod waiting;
 
 #[cfg(feature = "zenoh")]
 pub use built::{Link, Publisher, Subscription};
