@@ -13,7 +13,7 @@ pub struct LiveArgs {
     /// nothing is left out.
     #[arg(long, help_heading = "Input")]
     pub realtime: bool,
-    /// Publish poses, odometry, tf, keyframes, cloud and health as ROS 2 messages (rmw_zenoh): domain and namespace, such as 0/vidar.
+    /// Publish poses, odometry, tf, keyframes, cloud, mesh and health as ROS 2 messages (rmw_zenoh): domain and namespace, such as 0/vidar.
     #[arg(long, value_name = "DOMAIN/NAMESPACE", help_heading = "Link")]
     pub publish: Option<String>,
     /// End a robot's recording (zenoh:KEYEXPR) after this time, seconds.

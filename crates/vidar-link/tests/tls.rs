@@ -56,37 +56,48 @@ fn ask(options: &LinkOptions) -> Result<RemoteModel, LinkError> {
     RemoteModel::open(Link::open(options, Role::Client)?.reach(KEY)?, remote, &|| false)
 }
 
-#[test]
-fn only_who_has_a_certificate_of_the_right_authority_is_answered() {
-    let folder = std::env::temp_dir().join(format!("vidar-tls-{}", std::process::id()));
-    std::fs::create_dir_all(&folder).unwrap();
-    let (ours, theirs) = (authority("ours"), authority("theirs"));
-    let (our_ca, their_ca) = (folder.join("ours.ca"), folder.join("theirs.ca"));
-    std::fs::write(&our_ca, ours.pem()).unwrap();
-    std::fs::write(&their_ca, theirs.pem()).unwrap();
-    let server = issue(&folder, "server", &ours);
-    let client = issue(&folder, "client", &ours);
-    let stranger = issue(&folder, "stranger", &theirs);
-    let port = TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
-    let at = format!("tls/localhost:{port}");
-    let listens = settings(
-        &folder,
-        "server",
-        format!(
-            "{{ listen: {{ endpoints: ['tls/127.0.0.1:{port}'] }}, transport: {{ link: {{ tls: {{\n\
-             enable_mtls: true, root_ca_certificate: {our_ca:?}, listen_private_key: {:?}, listen_certificate: {:?} }} }} }} }}",
-            server.0, server.1
-        ),
+/// The file of settings of a worker that asks for certificates of an authority.
+fn listens(
+    folder: &Path,
+    port: u16,
+    ca: &Path,
+    (key, certificate): &(PathBuf, PathBuf),
+    more: &str,
+) -> LinkOptions {
+    let text = format!(
+        "{{ listen: {{ endpoints: ['tls/127.0.0.1:{port}'] }}, {more} transport: {{ link: {{ tls: {{\n\
+         enable_mtls: true, root_ca_certificate: {ca:?}, listen_private_key: {key:?}, listen_certificate: {certificate:?} }} }} }} }}"
     );
-    let connects = |name: &str, ca: &Path, own: Option<&(PathBuf, PathBuf)>| {
-        let own = own.map_or_else(String::new, |(key, certificate)| {
-            format!(", enable_mtls: true, connect_private_key: {key:?}, connect_certificate: {certificate:?}")
-        });
-        let text = format!(
-            "{{ connect: {{ endpoints: ['{at}'] }}, transport: {{ link: {{ tls: {{ root_ca_certificate: {ca:?}{own} }} }} }} }}"
-        );
-        settings(&folder, name, text)
-    };
+    settings(folder, "server", text)
+}
+
+/// That of an engine, with or without a certificate of its own.
+fn connects(
+    folder: &Path,
+    name: &str,
+    port: u16,
+    ca: &Path,
+    own: Option<&(PathBuf, PathBuf)>,
+) -> LinkOptions {
+    let own = own.map_or_else(String::new, |(key, certificate)| {
+        format!(", enable_mtls: true, connect_private_key: {key:?}, connect_certificate: {certificate:?}")
+    });
+    let text = format!(
+        "{{ connect: {{ endpoints: ['tls/localhost:{port}'] }}, transport: {{ link: {{ tls: {{ root_ca_certificate: {ca:?}{own} }} }} }} }}"
+    );
+    settings(folder, name, text)
+}
+
+fn require_refused(options: &LinkOptions) {
+    match ask(options) {
+        Err(LinkError::NoWorker { .. }) => {}
+        Err(other) => panic!("{other}"),
+        Ok(_) => panic!("answered"),
+    }
+}
+
+/// Runs `asks` beside a worker with these settings.
+fn beside_a_worker(options: &LinkOptions, asks: impl FnOnce(&[String])) {
     let stop = AtomicBool::new(false);
     std::thread::scope(|scope| {
         let (sender, ready) = sync_channel(1);
@@ -97,28 +108,78 @@ fn only_who_has_a_certificate_of_the_right_authority_is_answered() {
                     sender.send(endpoints).unwrap();
                 }
             };
-            Link::open(&listens, Role::Server)?
+            Link::open(options, Role::Server)?
                 .serve(KEY, "test", served, &told, &|| stop.load(Ordering::SeqCst))
         });
-        let endpoints = ready.recv_timeout(Duration::from_secs(20)).unwrap();
+        asks(&ready.recv_timeout(Duration::from_secs(20)).unwrap());
+        stop.store(true, Ordering::SeqCst);
+        serving.join().unwrap().unwrap();
+    });
+}
+
+fn free_port() -> u16 {
+    TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port()
+}
+
+/// A folder of this test's own.
+fn folder_of(name: &str) -> PathBuf {
+    let folder = std::env::temp_dir().join(format!("vidar-{name}-{}", std::process::id()));
+    std::fs::create_dir_all(&folder).unwrap();
+    folder
+}
+
+#[test]
+fn access_control_by_the_name_in_a_certificate_decides_who_may_ask() {
+    let folder = folder_of("acl");
+    let ours = authority("ours");
+    let ca = folder.join("ours.ca");
+    std::fs::write(&ca, ours.pem()).unwrap();
+    let [server, robot, visitor] = ["server", "robot", "visitor"].map(|name| issue(&folder, name, &ours));
+    let port = free_port();
+    // As the guide has it.
+    let control = "access_control: { enabled: true, default_permission: 'deny',\n\
+         rules: [{ id: 'ask', permission: 'allow', key_exprs: ['lab/depth/**'],\n\
+           messages: ['query', 'reply', 'declare_queryable', 'liveliness_token', 'declare_liveliness_subscriber', 'liveliness_query'] }],\n\
+         subjects: [{ id: 'robots', cert_common_names: ['robot'] }],\n\
+         policies: [{ rules: ['ask'], subjects: ['robots'] }] },";
+    beside_a_worker(&listens(&folder, port, &ca, &server, control), |_| {
+        let views = chunk(3);
+        let mut model = ask(&connects(&folder, "robot", port, &ca, Some(&robot))).unwrap();
+        let found = model.predict(&views, 0..4, true, &|_| false).unwrap();
+        assert!(same_bits(&found, &local(&views, 0..4)));
+        // Its certificate is of the right authority, but its name is not on the list.
+        require_refused(&connects(&folder, "visitor", port, &ca, Some(&visitor)));
+        let again = model.predict(&views, 0..4, true, &|_| false).unwrap();
+        assert!(same_bits(&again, &local(&views, 0..4)), "who may ask still may");
+    });
+    std::fs::remove_dir_all(&folder).unwrap();
+}
+
+#[test]
+fn only_who_has_a_certificate_of_the_right_authority_is_answered() {
+    let folder = folder_of("tls");
+    let (ours, theirs) = (authority("ours"), authority("theirs"));
+    let (our_ca, their_ca) = (folder.join("ours.ca"), folder.join("theirs.ca"));
+    std::fs::write(&our_ca, ours.pem()).unwrap();
+    std::fs::write(&their_ca, theirs.pem()).unwrap();
+    let server = issue(&folder, "server", &ours);
+    let client = issue(&folder, "client", &ours);
+    let stranger = issue(&folder, "stranger", &theirs);
+    let port = free_port();
+    let of = |name: &str, ca: &Path, own| connects(&folder, name, port, ca, own);
+    beside_a_worker(&listens(&folder, port, &our_ca, &server, ""), |endpoints| {
         assert_eq!(endpoints, [format!("tls/127.0.0.1:{port}")], "the file says where");
-        let mut model = ask(&connects("right", &our_ca, Some(&client))).unwrap();
+        let mut model = ask(&of("right", &our_ca, Some(&client))).unwrap();
         let views = chunk(3);
         let found = model.predict(&views, 0..4, true, &|_| false).unwrap();
         assert!(same_bits(&found, &local(&views, 0..4)));
-        let refused = |options: &LinkOptions| match ask(options) {
-            Err(LinkError::NoWorker { .. }) => {}
-            Err(other) => panic!("{other}"),
-            Ok(_) => panic!("answered"),
-        };
-        refused(&connects("other authority", &our_ca, Some(&stranger)));
-        refused(&connects("no certificate", &our_ca, None));
-        refused(&connects("does not trust the server", &their_ca, Some(&client)));
-        refused(&LinkOptions { connect: vec![format!("tcp/127.0.0.1:{port}")], ..LinkOptions::default() });
+        require_refused(&of("other authority", &our_ca, Some(&stranger)));
+        require_refused(&of("no certificate", &our_ca, None));
+        require_refused(&of("does not trust the server", &their_ca, Some(&client)));
+        let plain = vec![format!("tcp/127.0.0.1:{port}")];
+        require_refused(&LinkOptions { connect: plain, ..LinkOptions::default() });
         let again = model.predict(&views, 0..4, true, &|_| false).unwrap();
         assert!(same_bits(&again, &local(&views, 0..4)), "who was let in stays in");
-        stop.store(true, Ordering::SeqCst);
-        serving.join().unwrap().unwrap();
     });
     std::fs::remove_dir_all(&folder).unwrap();
 }

@@ -33,6 +33,13 @@ impl Cdr {
         self.bytes.extend(value.to_le_bytes());
     }
 
+    pub fn f32s(&mut self, values: &[f32]) {
+        for value in values {
+            self.align(4);
+            self.bytes.extend(value.to_le_bytes());
+        }
+    }
+
     pub fn f64s(&mut self, values: &[f64]) {
         for value in values {
             self.align(8);

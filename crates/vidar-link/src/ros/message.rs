@@ -14,6 +14,8 @@ pub enum RosType {
     Transforms,
     /// `sensor_msgs/PointCloud2`.
     PointCloud,
+    /// `visualization_msgs/MarkerArray`.
+    Markers,
     /// `diagnostic_msgs/DiagnosticArray`.
     Diagnostics,
 }
@@ -26,6 +28,7 @@ impl RosType {
             Self::Odometry => "nav_msgs::msg::dds_::Odometry_",
             Self::Transforms => "tf2_msgs::msg::dds_::TFMessage_",
             Self::PointCloud => "sensor_msgs::msg::dds_::PointCloud2_",
+            Self::Markers => "visualization_msgs::msg::dds_::MarkerArray_",
             Self::Diagnostics => "diagnostic_msgs::msg::dds_::DiagnosticArray_",
         }
     }
@@ -37,6 +40,7 @@ impl RosType {
             Self::Odometry => "RIHS01_3cc97dc7fb7502f8714462c526d369e35b603cfc34d946e3f2eda2766dfec6e0",
             Self::Transforms => "RIHS01_e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087",
             Self::PointCloud => "RIHS01_9198cabf7da3796ae6fe19c4cb3bdd3525492988c70522628af5daa124bae2b5",
+            Self::Markers => "RIHS01_86cb8800b6fb05b5eff1abd7a56f62a5641d3ae9a1c29e78e67e704f1d067dcf",
             Self::Diagnostics => "RIHS01_5a8a36efb05fb25070fa0fb3810290c0e6cd4862b54a8fb975a1ee8dc55a333e",
         }
     }

@@ -340,7 +340,7 @@ pub struct LinkConfig {
     pub listen: String,
     /// A file of Zenoh's settings (JSON5): TLS, certificates, access control.
     pub config: String,
-    /// Where `vidar live` publishes poses, keyframes, cloud and health as ROS 2 messages: domain and namespace, such as `0/vidar`. Empty:
+    /// Where `vidar live` publishes poses, keyframes, cloud, mesh and health as ROS 2 messages: domain and namespace, such as `0/vidar`. Empty:
     /// nowhere.
     pub publish: String,
     /// After this time (s) without an answer a worker counts as slow and another one is asked. Several times as long as a chunk takes there.

@@ -11,6 +11,7 @@
 
 mod ending;
 mod latency;
+mod patches;
 mod pose_file;
 mod publish;
 mod queue;

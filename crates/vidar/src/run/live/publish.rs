@@ -1,6 +1,7 @@
 //! What a live run tells a ROS 2 system while it goes: a reader of poses and of the engine's events. Who does not keep up loses messages;
 //! the run never waits.
 
+use super::patches::Patches;
 use crate::config::Config;
 use crate::engine::{FrameState, MapEvent};
 use crate::error::Error;
@@ -12,7 +13,7 @@ use std::time::{Duration, Instant};
 use vidar_align::covariance::covariance_in_camera;
 use vidar_core::{OdometryKeyframe, PoseCovariance, RigCamera, Se3, Severity, Timestamp};
 use vidar_link::ros::{Attachment, CloudPoint, HealthLevel, RosType, TopicKey, liveliness_token};
-use vidar_link::ros::{health, odometry, point_cloud, pose_stamped, transforms};
+use vidar_link::ros::{health, mesh_markers, odometry, point_cloud, pose_stamped, transforms};
 use vidar_link::{Delivery, Link, LinkError, Publisher, Role};
 
 /// The world; further segments, which have no common world with the first, are `map_1`, `map_2`, ….
@@ -25,11 +26,12 @@ const MOST_POINTS: usize = 200_000;
 const HEALTH_EVERY: Duration = Duration::from_secs(1);
 
 /// What is published, and under which name.
-const TOPICS: [(Topic, &str, RosType); 6] = [
+const TOPICS: [(Topic, &str, RosType); 7] = [
     (Topic::Pose, "pose", RosType::PoseStamped),
     (Topic::Odometry, "odometry", RosType::Odometry),
     (Topic::Keyframe, "keyframe", RosType::PoseStamped),
     (Topic::Cloud, "cloud", RosType::PointCloud),
+    (Topic::Mesh, "mesh", RosType::Markers),
     (Topic::Health, "health", RosType::Diagnostics),
     (Topic::Transforms, "/tf", RosType::Transforms),
 ];
@@ -40,6 +42,7 @@ enum Topic {
     Odometry,
     Keyframe,
     Cloud,
+    Mesh,
     Health,
     Transforms,
 }
@@ -51,6 +54,7 @@ pub(in crate::run) struct LivePublisher {
     body_from_camera: Se3,
     /// Row by row, position then rotation, in the world's axes; none before the first keyframe.
     covariance: Mutex<Option<[f64; 36]>>,
+    patches: Mutex<Patches>,
     images: AtomicU64,
     keyframes: AtomicU64,
     last: AtomicI64,
@@ -97,6 +101,7 @@ impl LivePublisher {
             id,
             body_from_camera: camera.body_from_camera,
             covariance: Mutex::default(),
+            patches: Mutex::default(),
             images: AtomicU64::new(0),
             keyframes: AtomicU64::new(0),
             last: AtomicI64::new(0),
@@ -172,13 +177,17 @@ impl LivePublisher {
                     self.put(Topic::Keyframe, pose_stamped(keyframe.stamp.time, WORLD, pose));
                 }
             }
-            MapEvent::SurfaceChanged { surface, .. } => {
+            MapEvent::SurfaceChanged { surface, is_final } => {
                 let mesh = &surface.mesh;
                 let step = mesh.positions.len().div_ceil(MOST_POINTS).max(1);
                 let color = |i: usize| mesh.colors.get(i).copied().unwrap_or([128; 3]);
                 let points: Vec<CloudPoint> =
                     (0..mesh.positions.len()).step_by(step).map(|i| (mesh.positions[i], color(i))).collect();
                 self.put(Topic::Cloud, point_cloud(self.time(), WORLD, &points));
+                let mut patches = self.patches.lock().unwrap_or_else(PoisonError::into_inner);
+                for message in mesh_markers(self.time(), WORLD, &patches.changes(mesh, *is_final)) {
+                    self.put(Topic::Mesh, message);
+                }
             }
             MapEvent::Warning(warning) => {
                 let level =
