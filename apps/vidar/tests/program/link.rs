@@ -346,12 +346,7 @@ mod built {
         let (at, file, map) = (endpoint(), folder.join("tf.mcap"), folder.join("map"));
         let child = receiving(&at, &file, "20");
         let mut live = command();
-        live.arg("live").arg(flight()).arg("-o").arg(&map).args([
-            "-q",
-            "--set",
-            "input.poses=odometry",
-            "--realtime",
-        ]);
+        live.arg("live").arg(flight()).arg("-o").arg(&map).args(["-q", "--set", "input.poses=odometry"]);
         live.args(["--publish", "0/vidar", "--connect", &at]);
         let ran = ended(live);
         assert!([0, 3].contains(&ran.code), "{}", ran.stderr);
