@@ -52,15 +52,16 @@ impl Patches {
     }
 }
 
+/// Position and colour of a vertex; grey where the mesh has no colours.
+pub(super) fn vertex(mesh: &TriangleMesh, i: usize) -> CloudPoint {
+    (mesh.positions[i], mesh.colors.get(i).copied().unwrap_or([128; 3]))
+}
+
 /// The triangles by the cube that their first vertex lies in.
 fn split(mesh: &TriangleMesh) -> BTreeMap<[i32; 3], Vec<[CloudPoint; 3]>> {
     let mut patches: BTreeMap<[i32; 3], Vec<[CloudPoint; 3]>> = BTreeMap::new();
-    let corner = |i: u32| {
-        let i = i as usize;
-        (mesh.positions[i], mesh.colors.get(i).copied().unwrap_or([128; 3]))
-    };
     for triangle in &mesh.triangles {
-        let corners = triangle.map(corner);
+        let corners = triangle.map(|i| vertex(mesh, i as usize));
         let cell = corners[0].0.map(|v| (v / EDGE_M).floor() as i32);
         patches.entry(cell).or_default().push(corners);
     }

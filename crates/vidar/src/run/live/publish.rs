@@ -1,7 +1,7 @@
 //! What a live run tells a ROS 2 system while it goes: a reader of poses and of the engine's events. Who does not keep up loses messages;
 //! the run never waits.
 
-use super::patches::Patches;
+use super::patches::{Patches, vertex};
 use crate::config::Config;
 use crate::engine::{FrameState, MapEvent};
 use crate::error::Error;
@@ -180,9 +180,8 @@ impl LivePublisher {
             MapEvent::SurfaceChanged { surface, is_final } => {
                 let mesh = &surface.mesh;
                 let step = mesh.positions.len().div_ceil(MOST_POINTS).max(1);
-                let color = |i: usize| mesh.colors.get(i).copied().unwrap_or([128; 3]);
                 let points: Vec<CloudPoint> =
-                    (0..mesh.positions.len()).step_by(step).map(|i| (mesh.positions[i], color(i))).collect();
+                    (0..mesh.positions.len()).step_by(step).map(|i| vertex(mesh, i)).collect();
                 self.put(Topic::Cloud, point_cloud(self.time(), WORLD, &points));
                 let mut patches = self.patches.lock().unwrap_or_else(PoisonError::into_inner);
                 for message in mesh_markers(self.time(), WORLD, &patches.changes(mesh, *is_final)) {
