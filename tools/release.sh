@@ -79,7 +79,7 @@ tar -C "$scratch" ${reproducible[@]+"${reproducible[@]}"} -cf - "$name" | gzip -
 files=("$name.tar.gz")
 
 if $wheel; then
-  say "wheel, from python/Cargo.lock"
+  say "wheel, from Cargo.lock"
   python3 -m venv "$scratch/venv"
   "$scratch/venv/bin/pip" install --quiet --disable-pip-version-check 'maturin>=1.7,<2'
   (cd python && CARGO_TARGET_DIR="${CARGO_TARGET_DIR:-$PWD/../target}" \

@@ -28,8 +28,10 @@ const LAYERS: &[(&str, &[&str])] = &[
     ("vidar-synth", &["vidar-core"]),
     ("vidar-link", &["vidar-core"]),
     ("vidar-cli", &["vidar-map"]),
+    ("vidar-python", &["vidar-map", "xtask-features"]),
+    ("vidar-c", &["vidar-map"]),
     ("xtask", &[]),
-    ("xtask-features", &[]),
+    ("xtask-features", &["vidar-odometry"]),
 ];
 
 /// Third-party crates that only the listed crates may use, with the reason.
@@ -43,6 +45,7 @@ const RESERVED: &[(&str, &[&str], &str)] = &[
     ("zenoh", &["vidar-link"], "other machines are reached in one place"),
     ("wgpu", &["vidar-gpu"], "graphics processors are used in one place"),
     ("ruzstd", &["vidar-bag"], "recordings are decompressed in one place, within bounds"),
+    ("zstd", &["vidar-bag"], "recordings are decompressed in one place, within bounds"),
     ("lz4_flex", &["vidar-bag"], "recordings are decompressed in one place, within bounds"),
     ("re_mp4", &["vidar-video"], "videos are read in one place"),
     ("zip", &["vidar-export"], "archives are read and written in one place, within bounds"),

@@ -9,11 +9,8 @@ pub fn check(root: &Path) -> Result<Vec<String>> {
     let deny = std::fs::read_to_string(root.join("deny.toml")).context("deny.toml")?;
     let (allowed, exceptions) = (allowed(&deny), exceptions(&deny));
     let mut problems = Vec::new();
-    // The Python module and the C library are workspaces of their own.
-    let workspaces = ["Cargo.toml", "python/Cargo.toml", "c/Cargo.toml"].map(|manifest| root.join(manifest));
-    let metadata = workspaces.map(|manifest| MetadataCommand::new().manifest_path(manifest).exec());
-    let packages = metadata.into_iter().collect::<Result<Vec<_>, _>>()?;
-    for package in packages.iter().flat_map(|metadata| &metadata.packages) {
+    let metadata = MetadataCommand::new().manifest_path(root.join("Cargo.toml")).exec()?;
+    for package in &metadata.packages {
         let expression = package.license.clone().unwrap_or_default();
         let is_excepted =
             exceptions.iter().any(|(name, licence)| **package.name == *name && expression == *licence);

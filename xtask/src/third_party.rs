@@ -12,9 +12,8 @@ use std::path::Path;
 /// The file, in the root of the repository.
 pub const FILE: &str = "THIRD-PARTY-LICENSES.txt";
 
-/// What is shipped: the manifest of each workspace and its package.
-const SHIPPED: [(&str, &str); 3] =
-    [("Cargo.toml", "vidar-cli"), ("python/Cargo.toml", "vidar-python"), ("c/Cargo.toml", "vidar-c")];
+/// What is shipped.
+const SHIPPED: [&str; 3] = ["vidar-cli", "vidar-python", "vidar-c"];
 
 const HEAD: &str = "\
 THIRD-PARTY LICENCES
@@ -22,7 +21,7 @@ THIRD-PARTY LICENCES
 VIDAR is licensed under MIT OR Apache-2.0 (LICENSE-MIT, LICENSE-APACHE, NOTICE). Its program, Python module and C library
 also contain the crates listed here, with any feature and on any platform, and the Rust standard library (MIT OR
 Apache-2.0, copyright The Rust Project Developers). `cargo xtask third-party` writes this file from the packages that
-the lock files name.
+the lock file names.
 ";
 
 /// Work of others that a crate contains, and whose licence its manifest does not name.
@@ -57,13 +56,13 @@ fn difference(found: &str, wanted: &str) -> Option<String> {
 }
 
 fn text(root: &Path) -> Result<String> {
+    let metadata = MetadataCommand::new()
+        .manifest_path(root.join("Cargo.toml"))
+        .features(CargoOpt::AllFeatures)
+        .other_options(["--locked".to_owned()])
+        .exec()?;
     let mut packages = BTreeMap::new();
-    for (manifest, shipped) in SHIPPED {
-        let metadata = MetadataCommand::new()
-            .manifest_path(root.join(manifest))
-            .features(CargoOpt::AllFeatures)
-            .other_options(["--locked".to_owned()])
-            .exec()?;
+    for shipped in SHIPPED {
         for package in linked(&metadata, shipped)? {
             packages.insert((package.name.to_string(), package.version.clone()), package.clone());
         }

@@ -46,10 +46,7 @@ impl Compression {
             Self::None => out.extend_from_slice(packed),
             Self::Lz4 => read_all(lz4_flex::frame::FrameDecoder::new(packed), limit, &mut out)?,
             Self::Bzip2 => read_all(bzip2::read::BzDecoder::new(packed), limit, &mut out)?,
-            Self::Zstd => {
-                let decoder = ruzstd::decoding::StreamingDecoder::new(packed).map_err(|e| e.to_string())?;
-                read_all(decoder, limit, &mut out)?;
-            }
+            Self::Zstd => read_all(zstd_decoder(packed)?, limit, &mut out)?,
         }
         match size {
             Some(size) if out.len() as u64 != size => {
@@ -58,6 +55,17 @@ impl Compression {
             _ => Ok(out),
         }
     }
+}
+
+/// The C library, or the decoder in Rust: the same bytes (decision 32).
+#[cfg(feature = "native-zstd")]
+fn zstd_decoder(packed: &[u8]) -> Result<impl Read + '_, String> {
+    zstd::stream::read::Decoder::with_buffer(packed).map(|d| d.single_frame()).map_err(|e| e.to_string())
+}
+
+#[cfg(not(feature = "native-zstd"))]
+fn zstd_decoder(packed: &[u8]) -> Result<impl Read + '_, String> {
+    ruzstd::decoding::StreamingDecoder::new(packed).map_err(|e| e.to_string())
 }
 
 fn read_all(reader: impl Read, limit: u64, out: &mut Vec<u8>) -> Result<(), String> {
