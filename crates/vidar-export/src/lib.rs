@@ -39,6 +39,7 @@ pub mod glb;
 mod json;
 pub mod official;
 mod origin;
+mod patches;
 pub mod ply;
 pub mod scene;
 mod text;
@@ -52,6 +53,7 @@ pub use depth::{DepthFrame, DepthPngStats, DepthSidecar, read_depth_png, write_d
 pub use error::ExportError;
 pub use glb::{Glb, read_glb, write_glb_cloud, write_glb_mesh, write_glb_textured};
 pub use origin::{STD_STEP, write_source_png, write_std_png};
+pub use patches::{SurfaceChange, SurfacePatch, SurfacePatches, thinned_vertices};
 pub use ply::{Ply, read_ply, write_ply_cloud, write_ply_mesh};
 pub use trajectory::{
     KittiTimes, read_euroc_csv, read_kitti, read_kitti_times, read_tum, write_euroc_csv, write_kitti,

@@ -87,9 +87,13 @@ fn a_run_is_shown_to_viewers_as_it_was_made() {
     assert_eq!(frusta[0].1.entities[0].lines[0].indices.len(), 16);
 
     let surface = read::<SceneUpdate>(&topics, "/map/mesh");
-    let entity = &surface.last().unwrap().1.entities[0];
-    let (triangles, points) = (&entity.triangles[0].indices.len() / 3, entity.triangles[0].points.len());
-    assert!(points > 3 && entity.triangles[0].colors.len() == points);
+    let last = &surface.last().unwrap().1;
+    assert_eq!(last.deletions.len(), 1, "the last message is the whole surface, whatever was told before");
+    let patches: Vec<_> = last.entities.iter().map(|entity| &entity.triangles[0]).collect();
+    assert!(
+        patches.len() > 10 && patches.iter().all(|p| p.points.len() >= 3 && p.colors.len() == p.points.len())
+    );
+    let triangles: usize = patches.iter().map(|p| p.indices.len() / 3).sum();
     assert_eq!(triangles as u64, result["result"]["mesh_triangles"].as_u64().unwrap());
     let points = &read::<PointCloud>(&topics, "/map/points").pop().unwrap().1;
     assert_eq!(points.data.len() as u64, 16 * result["result"]["points"].as_u64().unwrap());

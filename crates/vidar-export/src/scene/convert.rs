@@ -2,10 +2,12 @@
 
 use super::{FORMAT, LogLevel, WORLD};
 use crate::error::ExportError;
+use crate::patches::{SurfaceChange, SurfacePatch};
+use foxglove::Decode;
 use foxglove::messages::{
     CameraCalibration, Color, FrameTransform, LinePrimitive, Log, PackedElementField, Point3, PointCloud,
-    Pose, Quaternion, RawImage, TriangleListPrimitive, Vector3, line_primitive, log,
-    packed_element_field::NumericType,
+    Pose, Quaternion, RawImage, SceneEntity, SceneEntityDeletion, SceneUpdate, TriangleListPrimitive,
+    Vector3, line_primitive, log, packed_element_field::NumericType, scene_entity_deletion,
 };
 use image::ImageEncoder;
 use image::codecs::jpeg::JpegEncoder;
@@ -111,8 +113,49 @@ pub(super) fn frustum(camera: &Pinhole, world_from_camera: &Se3) -> LinePrimitiv
     }
 }
 
-/// A surface; grey where it has no colours.
-pub(super) fn triangles(mesh: &TriangleMesh) -> TriangleListPrimitive {
+/// Everything that was told on this topic is void.
+pub(super) fn all(at: u64) -> SceneEntityDeletion {
+    SceneEntityDeletion {
+        timestamp: Some(stamp(at)),
+        r#type: scene_entity_deletion::Type::All as i32,
+        ..SceneEntityDeletion::default()
+    }
+}
+
+/// Whether a message stands alone: it says first that what was told before is void.
+pub(super) fn stands_alone(message: &[u8]) -> bool {
+    let all = scene_entity_deletion::Type::All as i32;
+    SceneUpdate::decode(message).is_ok_and(|update| update.deletions.iter().any(|d| d.r#type == all))
+}
+
+/// A changed surface.
+pub(super) fn surface(at: u64, frame: &str, change: &SurfaceChange) -> SceneUpdate {
+    let mut update = SceneUpdate::default();
+    if change.is_whole {
+        update.deletions.push(all(at));
+    }
+    for SurfacePatch { id, mesh } in &change.patches {
+        let id = format!("surface {id}");
+        if !mesh.triangles.is_empty() {
+            let (frame_id, triangles) = (frame.into(), vec![triangles(mesh)]);
+            let timestamp = Some(stamp(at));
+            update.entities.push(SceneEntity {
+                timestamp,
+                frame_id,
+                id,
+                triangles,
+                ..SceneEntity::default()
+            });
+        } else if !change.is_whole {
+            let r#type = scene_entity_deletion::Type::MatchingId as i32;
+            update.deletions.push(SceneEntityDeletion { timestamp: Some(stamp(at)), r#type, id });
+        }
+    }
+    update
+}
+
+/// A mesh; grey where it has no colours.
+fn triangles(mesh: &TriangleMesh) -> TriangleListPrimitive {
     let [x, y, z] = [0, 1, 2].map(|i| move |p: &[f32; 3]| f64::from(p[i]));
     let color = |c: &[u8; 3]| {
         let [r, g, b] = c.map(|v| f64::from(v) / 255.0);

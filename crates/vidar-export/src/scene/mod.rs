@@ -10,7 +10,7 @@
 //! | `/trajectory` | `PosesInFrame` | all camera poses |
 //! | `/keyframes` | `SceneUpdate` | a frustum for each keyframe, again whenever it moves |
 //! | `/landmarks` | `PointCloud` | landmarks of the odometry, per keyframe |
-//! | `/map/mesh`, `/map/points` | `SceneUpdate` (triangles), `PointCloud` | the surface whenever it changes, its points at the end |
+//! | `/map/mesh`, `/map/points` | `SceneUpdate` (triangles), `PointCloud` | of a surface that grows the patches (1 m) that changed, all of them at every tenth time and at the end; its points |
 //! | `/log`, `/stages` | `Log`, JSON | warnings; seconds of each stage |
 //!
 //! Frames: `world` (z up where gravity is known), `camera` and `view` (x right, y down, z forward); metres where the run is metric.
@@ -22,6 +22,7 @@ mod playback;
 mod server;
 
 use crate::error::ExportError;
+use crate::patches::SurfacePatches;
 use convert::{calibration, clock, cloud, frustum, jpeg, pose, stamp};
 use foxglove::messages::{
     CameraCalibration, CompressedImage, FrameTransform, Log, PointCloud, PoseInFrame, PosesInFrame, RawImage,
@@ -78,6 +79,7 @@ pub struct Scene {
     file: McapWriterHandle<BufWriter<File>>,
     /// Time of the newest message, ns: what has no time of its own comes then.
     newest: u64,
+    patches: SurfacePatches,
     camera_image: Channel<CompressedImage>,
     camera_calibration: Channel<CameraCalibration>,
     view_image: Channel<CompressedImage>,
@@ -117,6 +119,7 @@ impl Scene {
             _context: context.clone(),
             file: file.map_err(other)?,
             newest: 0,
+            patches: SurfacePatches::default(),
             camera_image: context.channel_builder("/camera/image").build(),
             camera_calibration: context.channel_builder("/camera/calibration").build(),
             view_image: context.channel_builder("/view/image").build(),
@@ -225,7 +228,7 @@ impl Scene {
             lines: vec![frustum(camera, world_from_camera)],
             ..SceneEntity::default()
         };
-        let update = SceneUpdate { entities: poses.map(entity).collect(), deletions: Vec::new() };
+        let update = SceneUpdate { entities: poses.map(entity).collect(), deletions: vec![convert::all(at)] };
         self.keyframes.log_with_time(&update, at);
     }
 
@@ -244,18 +247,14 @@ impl Scene {
         self.landmarks.log_with_time(&cloud(at, WORLD, ["x", "y", "z", "relative_std"], rows), at);
     }
 
-    /// The surface, as triangles: every viewer draws them where they are, while models of glTF are turned by some.
-    pub fn mesh(&mut self, mesh: &TriangleMesh) {
+    /// The surface, as triangles: every viewer draws them where they are, while models of glTF are turned by some. Of one that
+    /// grows, what changed.
+    pub fn mesh(&mut self, mesh: &TriangleMesh, is_final: bool) {
         let at = self.newest;
-        let entity = SceneEntity {
-            timestamp: Some(stamp(at)),
-            frame_id: WORLD.into(),
-            id: "surface".into(),
-            triangles: vec![convert::triangles(mesh)],
-            ..SceneEntity::default()
-        };
-        let update = SceneUpdate { entities: vec![entity], deletions: Vec::new() };
-        self.mesh.log_with_time(&update, at);
+        let change = self.patches.change(mesh, is_final);
+        if !change.patches.is_empty() {
+            self.mesh.log_with_time(&convert::surface(at, WORLD, &change), at);
+        }
     }
 
     /// The surface's points.

@@ -1,6 +1,7 @@
 //! Messages of an MCAP file in the order of their times, from any time on.
 
 use super::FORMAT;
+use super::convert::stands_alone;
 use crate::error::ExportError;
 use mcap::McapResult;
 use mcap::records::MessageHeader;
@@ -15,6 +16,9 @@ use std::sync::Arc;
 
 /// Longest chunk that is read. A chunk holds one message at least, and the longest is a mesh: 40 bytes a triangle.
 const MAX_CHUNK_BYTES: usize = 1 << 30;
+
+/// Schema of messages that change a scene, and need those before them.
+const SCENE_SCHEMA: &str = "foxglove.SceneUpdate";
 
 /// A message.
 pub(super) struct Message {
@@ -89,13 +93,28 @@ impl Playback {
         Ok(due.and_then(|(id, message)| Some((self.summary.channels.get(&id)?.topic.clone(), message))))
     }
 
-    /// The last message of a topic up to a time.
-    pub fn latest(&mut self, topic: &str, time: u64) -> Result<Option<Message>, ExportError> {
+    /// What a viewer needs of a topic to show this time, in order: its last message; of a scene those since the last one that
+    /// stands alone.
+    pub fn state(&mut self, topic: &str, time: u64) -> Result<Vec<Message>, ExportError> {
         if self.first.get(topic).is_none_or(|first| *first > time) {
-            return Ok(None);
+            return Ok(Vec::new());
         }
+        let is_scene = self
+            .channels()
+            .any(|c| c.topic == topic && c.schema.as_ref().is_some_and(|s| s.name == SCENE_SCHEMA));
         let backward = IndexedReaderOptions::new().with_order(ReadOrder::ReverseLogTime).ending_at(time);
-        self.scan(backward.include_topics([topic]))
+        let failed = |e| malformed(&self.path, "messages", e);
+        let mut reader = reader(&self.summary, backward.include_topics([topic])).map_err(failed)?;
+        let mut state = Vec::new();
+        while let Some((_, message)) = next(&mut reader, &mut self.file).map_err(failed)? {
+            let is_enough = !is_scene || stands_alone(&message.data);
+            state.push(message);
+            if is_enough {
+                break;
+            }
+        }
+        state.reverse();
+        Ok(state)
     }
 
     /// The first message with these options.
@@ -153,5 +172,68 @@ fn malformed(path: &Path, expected: &str, found: impl ToString) -> ExportError {
         place: path.display().to_string(),
         expected: expected.to_owned(),
         found: found.to_string(),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::scene::Scene;
+    use foxglove::Decode;
+    use foxglove::messages::SceneUpdate;
+    use vidar_core::{Se3, Timestamp, TriangleMesh};
+
+    /// A triangle at each place, metres along x.
+    fn mesh(at: &[f32]) -> TriangleMesh {
+        TriangleMesh {
+            positions: at
+                .iter()
+                .flat_map(|x| [[*x, 0.2, 0.2], [x + 0.1, 0.2, 0.2], [*x, 0.3, 0.2]])
+                .collect(),
+            triangles: (0..at.len() as u32).map(|i| [3 * i, 3 * i + 1, 3 * i + 2]).collect(),
+            ..TriangleMesh::default()
+        }
+    }
+
+    /// Numbers of the patches that a viewer shows which takes these messages one after the other.
+    fn shown(messages: &[Message]) -> Vec<String> {
+        let mut shown = Vec::new();
+        for message in messages {
+            let update = SceneUpdate::decode(&message.data[..]).unwrap();
+            for deletion in &update.deletions {
+                shown.retain(|id| !deletion.id.is_empty() && *id != deletion.id);
+            }
+            for entity in update.entities {
+                shown.retain(|id| *id != entity.id);
+                shown.push(entity.id);
+            }
+        }
+        shown.sort();
+        shown
+    }
+
+    #[test]
+    fn a_viewer_that_jumps_is_told_the_surface_of_that_time() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("run.mcap");
+        let mut scene = Scene::create(&path).unwrap();
+        let surfaces: [&[f32]; 4] = [&[0.2, 5.2], &[0.2, 5.2, 9.2], &[0.2, 9.2], &[0.2, 9.2]];
+        for (second, places) in surfaces.iter().enumerate() {
+            scene.camera_pose(Timestamp::from_nanos(1_000_000_000 * (1 + second as i64)), &Se3::IDENTITY);
+            scene.mesh(&mesh(places), second == 3);
+        }
+        scene.finish().unwrap();
+        let mut playback = Playback::open(&path).unwrap();
+        let mut at = |secs: f64| {
+            let messages = playback.state("/map/mesh", (secs * 1e9) as u64).unwrap();
+            (messages.len(), shown(&messages))
+        };
+        let names = |numbers: &[u32]| numbers.iter().map(|n| format!("surface {n}")).collect::<Vec<_>>();
+        assert_eq!(at(0.5), (0, Vec::new()));
+        assert_eq!(at(1.5), (1, names(&[0, 1])));
+        assert_eq!(at(2.5), (2, names(&[0, 1, 2])));
+        assert_eq!(at(3.5), (3, names(&[0, 2])));
+        assert_eq!(at(4.5), (1, names(&[0, 2])), "the last surface stands alone");
+        assert_eq!(playback.state("/tf", 3_500_000_000).unwrap().len(), 1);
     }
 }

@@ -203,7 +203,7 @@ impl SceneServer {
         if has_jumped {
             self.playback.seek(now);
             for (topic, channel) in &self.channels {
-                if let Some(message) = self.playback.latest(topic, now)? {
+                for message in self.playback.state(topic, now)? {
                     channel.log_with_meta(&message.data, PartialMetadata::with_log_time(message.time));
                 }
             }
@@ -215,7 +215,7 @@ impl SceneServer {
         }
         for (sink, topic) in subscribed {
             let Some(channel) = self.channels.get(&topic) else { continue };
-            if let Some(message) = self.playback.latest(&topic, now)? {
+            for message in self.playback.state(&topic, now)? {
                 let time = PartialMetadata::with_log_time(message.time);
                 channel.log_with_meta_to_sink(&message.data, time, Some(sink));
             }

@@ -63,7 +63,7 @@ fn write(run: &Path, stored: &StoredViews, scene: &mut Scene) -> Result<(), Erro
         scene.trajectory(placed.iter().map(|(_, pose)| pose));
     }
     if let Some(mesh) = file("map/mesh.ply", MAX_CLOUD_BYTES)? {
-        scene.mesh(&vidar_export::read_ply(&mesh)?.into_mesh());
+        scene.mesh(&vidar_export::read_ply(&mesh)?.into_mesh(), true);
     }
     if let Some(points) = file("map/points.ply", MAX_CLOUD_BYTES)? {
         scene.points(&vidar_export::read_ply(&points)?.cloud);

@@ -8,9 +8,11 @@ use std::path::Path;
 use std::sync::{Arc, Mutex, PoisonError};
 use vidar_core::{Health, LieGroup, OdometryKeyframe, Pinhole, Severity, Timestamp, Warning};
 use vidar_dataset::{Location, Recording};
-use vidar_export::ExportError;
 use vidar_export::scene::{LogLevel, Scene, SceneImage, SceneStatus};
+use vidar_export::{ExportError, thinned_vertices};
 
+/// The most points of a cloud of a surface that grows, 3 MB; the final one has all.
+const MOST_POINTS: usize = 200_000;
 /// An image file's bytes are taken over as they are up to this size; larger ones are compressed anew.
 const MAX_IMAGE_BYTES: u64 = 32 << 20;
 
@@ -103,12 +105,11 @@ impl SceneWriter {
             }
             MapEvent::ViewsFused(views) => views.iter().try_for_each(|view| scene.view(view)),
             MapEvent::SurfaceChanged { surface, is_final } => {
-                if *is_final {
-                    scene.points(&surface.cloud);
+                match is_final {
+                    true => scene.points(&surface.cloud),
+                    false => scene.points(&thinned_vertices(&surface.mesh, MOST_POINTS)),
                 }
-                if !surface.mesh.triangles.is_empty() {
-                    scene.mesh(&surface.mesh);
-                }
+                scene.mesh(&surface.mesh, *is_final);
                 Ok(())
             }
             _ => Ok(()),

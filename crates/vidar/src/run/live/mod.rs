@@ -11,7 +11,6 @@
 
 mod ending;
 mod latency;
-mod patches;
 mod pose_file;
 mod publish;
 mod queue;

@@ -1,7 +1,6 @@
 //! What a live run tells a ROS 2 system while it goes: a reader of poses and of the engine's events. Who does not keep up loses messages;
 //! the run never waits.
 
-use super::patches::{Patches, vertex};
 use crate::config::Config;
 use crate::engine::{FrameState, MapEvent};
 use crate::error::Error;
@@ -12,7 +11,8 @@ use std::sync::{Mutex, PoisonError};
 use std::time::{Duration, Instant};
 use vidar_align::covariance::covariance_in_camera;
 use vidar_core::{OdometryKeyframe, PoseCovariance, RigCamera, Se3, Severity, Timestamp};
-use vidar_link::ros::{Attachment, CloudPoint, HealthLevel, RosType, TopicKey, liveliness_token};
+use vidar_export::{SurfacePatch, SurfacePatches, thinned_vertices};
+use vidar_link::ros::{Attachment, CloudPoint, HealthLevel, MeshMarker, RosType, TopicKey, liveliness_token};
 use vidar_link::ros::{health, mesh_markers, odometry, point_cloud, pose_stamped, transforms};
 use vidar_link::{Delivery, Link, LinkError, Publisher, Role};
 
@@ -54,12 +54,18 @@ pub(in crate::run) struct LivePublisher {
     body_from_camera: Se3,
     /// Row by row, position then rotation, in the world's axes; none before the first keyframe.
     covariance: Mutex<Option<[f64; 36]>>,
-    patches: Mutex<Patches>,
+    patches: Mutex<SurfacePatches>,
     images: AtomicU64,
     keyframes: AtomicU64,
     last: AtomicI64,
     told: Mutex<Option<Instant>>,
     _link: Link,
+}
+
+/// A patch as ROS has it, each triangle with corners of its own.
+fn marker(SurfacePatch { id, mesh }: SurfacePatch) -> MeshMarker {
+    let corner = |v: u32| (mesh.positions[v as usize], mesh.colors[v as usize]);
+    MeshMarker { id: id as i32, triangles: mesh.triangles.iter().map(|t| t.map(corner)).collect() }
 }
 
 /// `DOMAIN/NAMESPACE`, as in `0/vidar`.
@@ -179,12 +185,13 @@ impl LivePublisher {
             }
             MapEvent::SurfaceChanged { surface, is_final } => {
                 let mesh = &surface.mesh;
-                let step = mesh.positions.len().div_ceil(MOST_POINTS).max(1);
-                let points: Vec<CloudPoint> =
-                    (0..mesh.positions.len()).step_by(step).map(|i| vertex(mesh, i)).collect();
+                let cloud = thinned_vertices(mesh, MOST_POINTS);
+                let points: Vec<CloudPoint> = cloud.positions.into_iter().zip(cloud.colors).collect();
                 self.put(Topic::Cloud, point_cloud(self.time(), WORLD, &points));
                 let mut patches = self.patches.lock().unwrap_or_else(PoisonError::into_inner);
-                for message in mesh_markers(self.time(), WORLD, &patches.changes(mesh, *is_final)) {
+                let markers: Vec<MeshMarker> =
+                    patches.change(mesh, *is_final).patches.into_iter().map(marker).collect();
+                for message in mesh_markers(self.time(), WORLD, &markers) {
                     self.put(Topic::Mesh, message);
                 }
             }
