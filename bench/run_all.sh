@@ -5,7 +5,8 @@
 #   bench/run_all.sh                         run all groups (hours on two cores)
 #   bench/run_all.sh maps odometry           run some groups
 #
-# Groups: demo maps stereo odometry ordinary couplings align fusion evaluation peers da3 nano
+# Groups: demo maps couplings odometry ordinary stereo align fusion evaluation peers da3 nano; and tables, the paper's tables on rendered
+# flights, only when named
 #
 # Environment:
 #   DATA    folder with the real recordings euroc_MH_01_real_11s, hololens_commonroom, 7scenes_redkitchen
@@ -17,8 +18,8 @@
 #   PYTHON  interpreter with the packages of bench/requirements-da3.txt, numpy, scipy, numba, open3d-cpu==0.19.0, pillow,
 #           opencv-python-headless, pycolmap
 #
-# Each step writes its output, its command, its wall time and its processor time to $OUT/<step>.txt. A step that fails is reported at the end
-# and does not stop the others. A dirty work tree is refused, because its figures would belong to no commit.
+# Each step writes its output, its command, its wall time and its processor time to $OUT/<step>.txt, and is left out where that file says
+# that it was done: the script goes on where it was stopped. A step that fails is reported at the end and does not stop the others. A dirty work tree is refused, because its figures would belong to no commit.
 set -uo pipefail
 cd "$(dirname "$0")/.."
 
@@ -37,11 +38,11 @@ groups=()
 for argument in "$@"; do
     case $argument in
         --list) list=true ;;
-        demo|maps|stereo|odometry|ordinary|couplings|align|fusion|evaluation|peers|da3|nano) groups+=("$argument") ;;
+        demo|maps|stereo|odometry|ordinary|couplings|tables|align|fusion|evaluation|peers|da3|nano) groups+=("$argument") ;;
         *) echo "unknown argument $argument; see the head of bench/run_all.sh" >&2; exit 2 ;;
     esac
 done
-[ ${#groups[@]} -gt 0 ] || groups=(demo maps stereo odometry ordinary couplings align fusion evaluation peers da3 nano)
+[ ${#groups[@]} -gt 0 ] || groups=(demo maps couplings odometry ordinary stereo align fusion evaluation peers da3 nano)
 
 if ! $list && [ -n "$(git status --porcelain --untracked-files=no)" ]; then
     echo "the work tree has changes; commit them first" >&2
@@ -59,13 +60,17 @@ step() {
         return
     fi
     mkdir -p "$OUT"
+    if [ "$(tail -n 1 "$OUT/$name.txt" 2>/dev/null)" = "# done" ]; then
+        return
+    fi
     echo "$name …"
     local TIMEFORMAT='# %R s of wall time, %U + %S s of processor time'
     {
         echo "# commit $COMMIT"
         echo "# $*"
         time "$@"
-    } > "$OUT/$name.txt" 2>&1 || failed+=("$name")
+    } > "$OUT/$name.txt" 2>&1 || { failed+=("$name"); return; }
+    echo "# done" >> "$OUT/$name.txt"
 }
 
 # world FILE LINE...: a description of a synthetic world for --world-config.
@@ -157,11 +162,26 @@ ordinary() {
         "$PYTHON" "$ORDINARY" "$OUT/ordinary-results"
 }
 
+# One recording each of six flights for three seeds; every coupling with and without each measurement, nothing else changed.
 couplings() {
+    flights_world
+    local geometry
+    for geometry in simulated da3-nano; do
+        step "ablation-$geometry" "$VIDAR" bench euroc "$EUROC" --synthetic --ablation --seeds 3 --world-config "$OUT/flights.toml" \
+            --sequences V1,V2 --geometry "$geometry" --set keyframes.max_count=80 --set fusion.voxel_size_m=0.05 \
+            --set geometry.max_width_px=280 --set eval.surface.voxel_size_m=0.05 -o "$OUT/ablation-$geometry"
+    done
+}
+
+flights_world() {
     world flights.toml 'duration_secs = 40.0' 'camera_rate_hz = 20.0' 'width = 376' 'height = 240' \
         'exposure_secs = 0.004' 'blur_samples = 2' 'exposure_drift = 0.15' 'image_noise_sigma = 2.0' \
         'initial_gyro_bias_rad_per_s = 0.05' 'initial_accel_bias_m_per_s2 = 0.1' 'depth = false' \
         'scan_spacing_m = 0.02' 'start = "in-flight"'
+}
+
+tables() {
+    flights_world
     local common=(bench euroc "$EUROC" --synthetic --world-config "$OUT/flights.toml" --sequences V1,V2
         --set fusion.voxel_size_m=0.03 --set keyframes.min_translation_m=0.15 --set keyframes.min_rotation_deg=10.0)
     step bench-simulated "$VIDAR" "${common[@]}" --geometry simulated -o "$OUT/tables-simulated"

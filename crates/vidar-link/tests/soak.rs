@@ -123,6 +123,7 @@ fn soak(time: Duration, least_chunks: u32) {
             timeout: Duration::from_millis(800),
             patience: Duration::from_secs(30),
             run: 5,
+            rank: 0,
         };
         let mut model = RemoteModel::open(link.reach(KEY).unwrap(), options, &|| false).unwrap();
         let (clock, mut random, mut done, mut warm) = (Instant::now(), 7_u64, 0_u32, 0_u64);

@@ -52,6 +52,7 @@ fn ask(options: &LinkOptions) -> Result<RemoteModel, LinkError> {
         timeout: Duration::from_secs(20),
         patience: Duration::from_secs(4),
         run: 1,
+        rank: 0,
     };
     RemoteModel::open(Link::open(options, Role::Client)?.reach(KEY)?, remote, &|| false)
 }

@@ -123,6 +123,7 @@ fn open(workers: &[(&str, &str)], expected: Expected, depth: DepthFormat) -> Res
         timeout: Duration::from_secs(5),
         patience: Duration::from_millis(10),
         run: 77,
+        rank: 0,
     };
     let model = RemoteModel::open(Box::new(fake), options, &|| false)?;
     Ok(Setup { model, faults, asked })

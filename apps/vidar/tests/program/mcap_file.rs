@@ -42,6 +42,13 @@ fn a_run_is_shown_to_viewers_as_it_was_made() {
     let result = run_on(&shared().sequence, &out, &mcap).ends_with(0).json();
     let topics = topics(&file);
 
+    let first = topics["/camera/image"].1[0].0;
+    let earliest = topics.values().filter_map(|(_, messages)| messages.first()).map(|(time, _)| *time).min();
+    assert!(
+        earliest.is_some_and(|t| t + 5_000_000_000 > first),
+        "times are the recording's: {earliest:?}, {first}"
+    );
+
     let views = json(&out.join("views.json"));
     let views = views["views"].as_array().unwrap();
     let stored: Vec<u64> = views.iter().map(|v| v["time_ns"].as_u64().unwrap()).collect();

@@ -98,11 +98,11 @@ pub struct Scene {
 }
 
 impl Scene {
-    /// Begins an MCAP file.
+    /// Begins an MCAP file. What has no time of its own, such as a warning, has that of the newest image, or of `begin`: the recording's.
     ///
     /// # Errors
     /// The file exists or cannot be written.
-    pub fn create(path: &Path) -> Result<Self, ExportError> {
+    pub fn create(path: &Path, begin: Timestamp) -> Result<Self, ExportError> {
         let failed =
             |source: io::Error| ExportError::File { action: "create", path: path.to_owned(), source };
         let context = Context::new();
@@ -118,7 +118,7 @@ impl Scene {
             path: path.to_owned(),
             _context: context.clone(),
             file: file.map_err(other)?,
-            newest: 0,
+            newest: clock(begin),
             patches: SurfacePatches::default(),
             camera_image: context.channel_builder("/camera/image").build(),
             camera_calibration: context.channel_builder("/camera/calibration").build(),

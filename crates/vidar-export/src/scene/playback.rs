@@ -216,7 +216,7 @@ mod tests {
     fn a_viewer_that_jumps_is_told_the_surface_of_that_time() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("run.mcap");
-        let mut scene = Scene::create(&path).unwrap();
+        let mut scene = Scene::create(&path, Timestamp::from_nanos(500_000_000)).unwrap();
         let surfaces: [&[f32]; 4] = [&[0.2, 5.2], &[0.2, 5.2, 9.2], &[0.2, 9.2], &[0.2, 9.2]];
         for (second, places) in surfaces.iter().enumerate() {
             scene.camera_pose(Timestamp::from_nanos(1_000_000_000 * (1 + second as i64)), &Se3::IDENTITY);

@@ -83,6 +83,8 @@ pub struct RemoteOptions {
     pub patience: Duration,
     /// A random number that tells this run's requests from those of others.
     pub run: u64,
+    /// Of equally busy workers the one of this number is asked first: several links of one run begin with different ones.
+    pub rank: usize,
 }
 
 /// What went over the link.
@@ -113,6 +115,21 @@ pub struct RemoteReport {
 }
 
 impl RemoteReport {
+    /// With what went over another link to the same workers.
+    pub fn and(mut self, other: &Self) -> Self {
+        self.chunks += other.chunks;
+        self.keyframes += other.keyframes;
+        self.retries += other.retries;
+        self.invalid_replies += other.invalid_replies;
+        self.bytes_sent += other.bytes_sent;
+        self.bytes_received += other.bytes_received;
+        for (worker, chunks) in &other.workers {
+            *self.workers.entry(worker.clone()).or_default() += chunks;
+        }
+        self.bytes_per_keyframe = (self.bytes_sent + self.bytes_received) / (self.keyframes.max(1) as u64);
+        self
+    }
+
     /// In words.
     pub fn words(&self) -> String {
         format!(
@@ -212,9 +229,7 @@ impl RemoteModel {
 
     /// What went over the link so far.
     pub fn report(&self) -> RemoteReport {
-        let RemoteReport { bytes_sent, bytes_received, keyframes, .. } = self.report;
-        let bytes_per_keyframe = (bytes_sent + bytes_received) / (keyframes.max(1) as u64);
-        RemoteReport { bytes_per_keyframe, ..self.report.clone() }
+        self.report.clone().and(&RemoteReport::default())
     }
 
     fn is_expected(&self, facts: &ModelFacts) -> bool {
@@ -353,8 +368,10 @@ impl RemoteModel {
 
     /// The worker with the fewest requests, of several the one that was asked longest ago.
     fn next(&self, tried: &[String]) -> Option<String> {
-        let free = self.workers.iter().filter(|w| !tried.contains(&w.name));
-        free.min_by_key(|w| (w.queue, w.last)).map(|w| w.name.clone())
+        let count = self.workers.len();
+        let turn = |number: usize| (number + count - self.options.rank % count.max(1)) % count.max(1);
+        let free = self.workers.iter().enumerate().filter(|(_, w)| !tried.contains(&w.name));
+        free.min_by_key(|(number, w)| (w.queue, w.last, turn(*number))).map(|(_, w)| w.name.clone())
     }
 
     fn ask(

@@ -68,7 +68,7 @@ pub(super) fn predict(task: &Task<'_>) -> Result<Made, Error> {
             store.get_file(&name, &target)?;
         }
     }
-    let send = |files: &[PathBuf]| {
+    let send = |_, files: &[PathBuf]| {
         for file in files {
             store.put_file(&format!("{there}/{}", relative(&folder, file)), file)?;
         }

@@ -21,7 +21,8 @@ const MAX_IMAGE_BYTES: u64 = 64 << 20;
 pub(super) fn mcap(run: &Path, stored: &StoredViews, out: &Path) -> Result<PathBuf, Error> {
     let (part, path) = (out.join(PART), out.join(NAME));
     let _absent = std::fs::remove_file(&part);
-    let mut scene = Scene::create(&part)?;
+    let begin = stored.views.first().map_or(0, |view| view.time_ns);
+    let mut scene = Scene::create(&part, Timestamp::from_nanos(begin))?;
     write(run, stored, &mut scene)?;
     scene.finish()?;
     std::fs::rename(&part, &path).map_err(|e| Error::io("rename", &part, e))?;

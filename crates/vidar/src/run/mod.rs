@@ -1,5 +1,6 @@
 //! One run: recording → engine → evaluate → export.
 
+mod ahead;
 mod auto;
 mod budget;
 mod by_source;
@@ -44,10 +45,12 @@ use crate::input::{self, ImageFiles, Measurement, UnseenScale};
 use crate::odometry::TrackedPoses;
 use crate::run_folder::{OutputLocation, RunFolder};
 use crate::verdict::{StatedScale, Verdict};
+use ahead::{Ahead, AheadStore};
 use live::{EndingCell, Incoming, LivePublisher, LiveStream, SurfaceLatency, TrackedElsewhere};
 use place_recognition::PlaceRecognition;
 use readers::{FINISH, MAP, Readers};
 use record::Recorder;
+use remote::RemoteSource;
 use scene::SceneWriter;
 use source::Source;
 use start::Started;
@@ -282,7 +285,13 @@ impl Context<'_> {
         recorder: &Recorder,
     ) -> Result<RunOutcome, Error> {
         let Self { request, config, dataset, folder, events, cancel, .. } = *self;
-        let (map, live) = self.build_map(&plan, &mut source, tracked, places)?;
+        let (crew, known) = (source.remote().map(RemoteSource::crew), tracked.clone());
+        let ((map, live), said) =
+            ahead::beside(self, (&plan, places), crew.as_ref(), known.as_ref(), |ahead| {
+                self.build_map(&plan, &mut source, tracked, places, ahead)
+            })?;
+        let known = recorder.warnings();
+        said.warnings.iter().filter(|w| !known.contains(w)).for_each(|w| events.warn(w));
         live.as_ref().and_then(live::warning).iter().for_each(|w| events.warn(w));
         let whole = self.stream.map(|stream| stream.whole(dataset)).transpose()?;
         let dataset = whole.as_ref().unwrap_or(dataset);
@@ -309,7 +318,7 @@ impl Context<'_> {
             warnings,
             device_peak_bytes: source.device_peak_bytes(),
             live,
-            remote: source.remote().map(|r| r.report()),
+            remote: source.remote().map(|r| said.reports.iter().fold(r.report(), |all, more| all.and(more))),
             seconds: 0.0,
         };
         events.stage("write", 0, || outputs::write(&outcome, dataset, config, request, folder, events))?;
@@ -326,11 +335,13 @@ impl Context<'_> {
         source: &mut Source,
         tracked: Option<TrackedPoses>,
         places: &PlaceRecognition,
+        ahead: Option<&Ahead>,
     ) -> Result<(MetricMap, Option<LiveReport>), Error> {
         let Self { config, dataset, folder, scene, events, cancel, .. } = *self;
-        let store = RunStore::new(folder.path(), self.fingerprint, plan, config);
+        let kept = RunStore::new(folder.path(), self.fingerprint, plan, config);
         let images = ImageFiles(dataset, plan.masks.as_deref());
         let cancelled = || cancel.is_cancelled();
+        let store = AheadStore { inner: &kept, ahead, is_cancelled: &cancelled };
         let predicting = readers::chunk_progress(events);
         let images: &dyn ImageSource = self.stream.map_or(&images, |stream| stream);
         let parts = EngineParts { geometry: source, places, images, store: &store };
@@ -362,7 +373,7 @@ impl Context<'_> {
         if !cancel.is_cancelled() {
             tracking::forget(folder);
         }
-        store.clean(config.output.keep_chunks || cancel.is_cancelled());
+        kept.clean(config.output.keep_chunks || cancel.is_cancelled());
         Ok((map, report))
     }
 

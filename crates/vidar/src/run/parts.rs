@@ -3,6 +3,9 @@
 //! Each part leaves in its folder what an interrupted run would have left: poses in `odometry/`, predictions in `chunks/`. A run
 //! that is resumed in a folder with the parts of all others makes the same map, bit by bit, as one that did everything itself.
 
+use super::place_recognition::PlaceRecognition;
+use super::plan::Plan;
+use super::source::Source;
 use super::start::{self, Started};
 use super::store::RunStore;
 use super::{Context, EngineParts, RunRequest, readers};
@@ -28,7 +31,7 @@ pub struct Part {
 }
 
 /// Called with the files of a prediction once they are whole, the one that makes it valid last.
-pub type Kept<'a> = &'a dyn Fn(&[PathBuf]) -> Result<(), Error>;
+pub type Kept<'a> = &'a dyn Fn(PredictionId, &[PathBuf]) -> Result<(), Error>;
 
 impl Part {
     /// Whether a chunk is of this part.
@@ -129,20 +132,33 @@ fn predict_chunks(
         events,
         cancel,
     };
-    let inner = RunStore::new(folder.path(), fingerprint, plan, config);
-    let store = PartStore { inner: &inner, part, kept, count: Cell::new(0) };
-    let images = ImageFiles(dataset, plan.masks.as_deref());
-    let cancelled = || cancel.is_cancelled();
-    let predicting = readers::chunk_progress(events);
+    let store = RunStore::new(folder.path(), fingerprint, plan, config);
+    let (cancelled, warned) = (|| cancel.is_cancelled(), |warning| events.warn(&warning));
+    predict_part(&context, plan, (source, places, &store), poses, (part, kept), &cancelled, &warned)
+}
+
+/// Predicts the chunks of `part` into the store; how many there are now.
+pub(super) fn predict_part(
+    context: &Context<'_>,
+    plan: &Plan,
+    (source, places, store): (&mut Source, &PlaceRecognition, &RunStore),
+    poses: Option<TrackedPoses>,
+    (part, kept): (Part, Kept<'_>),
+    cancelled: &(dyn Fn() -> bool + Sync),
+    warned: &dyn Fn(Warning),
+) -> Result<usize, Error> {
+    let store = PartStore { inner: store, part, kept, count: Cell::new(0) };
+    let images = ImageFiles(context.dataset, plan.masks.as_deref());
+    let predicting = readers::chunk_progress(context.events);
     let parts = EngineParts { geometry: source, places, images: &images, store: &store };
     let poses = poses.map(|p| Box::new(p) as Box<dyn crate::engine::PoseSource>);
-    let mut engine = context.engine(plan, poses, parts, &cancelled, &predicting)?;
+    let mut engine = context.engine(plan, poses, parts, cancelled, &predicting)?;
     let mut sink = |event| {
         // Chunks of other parts count as failed.
         if let MapEvent::Warning(warning) = event
             && warning.kind != FAILED
         {
-            events.warn(&warning);
+            warned(warning);
         }
         Ok(())
     };
@@ -181,7 +197,7 @@ impl PredictionStore for PartStore<'_> {
         chunk: &StoredChunk,
     ) -> Result<StoredChunk, Error> {
         self.inner.keep(id, frames, chunk)?;
-        (self.kept)(&self.inner.files_of(id))?;
+        (self.kept)(id, &self.inner.files_of(id))?;
         self.count.set(self.count.get() + 1);
         Ok(left(id))
     }

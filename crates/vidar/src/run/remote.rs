@@ -17,7 +17,39 @@ use vidar_link::{Link, LinkError, Role};
 /// Workers that are asked for predictions.
 pub struct RemoteSource {
     model: RemoteModel,
+    mode: PoseMode,
     wants_tokens: bool,
+}
+
+/// Who is asked, for more links to the same workers.
+pub(super) struct Crew {
+    /// How many there are.
+    pub workers: usize,
+    key: String,
+    mode: PoseMode,
+    facts: ModelFacts,
+    wants_tokens: bool,
+}
+
+impl Crew {
+    /// A link of its own, which of equally busy workers asks the one of this rank.
+    ///
+    /// # Errors
+    /// As [`RemoteSource::open`]; and workers whose model is another one now.
+    pub(super) fn join(&self, config: &Config, rank: usize) -> Result<RemoteSource, Error> {
+        let source = RemoteSource {
+            wants_tokens: self.wants_tokens,
+            ..RemoteSource::ranked(&self.key, config, self.mode, rank)?
+        };
+        match *source.facts() == self.facts {
+            true => Ok(source),
+            false => Err(LinkError::OtherModel {
+                key: self.key.clone(),
+                reason: "they have another model than before".into(),
+            }
+            .into()),
+        }
+    }
 }
 
 impl RemoteSource {
@@ -26,6 +58,10 @@ impl RemoteSource {
     /// # Errors
     /// No link, no worker, another model than asked for, or a licence that is not accepted.
     pub(super) fn open(key: &str, config: &Config, mode: PoseMode) -> Result<Self, Error> {
+        Self::ranked(key, config, mode, 0)
+    }
+
+    fn ranked(key: &str, config: &Config, mode: PoseMode, rank: usize) -> Result<Self, Error> {
         let expected = expected(&config.remote.model)?;
         let settings = Da3ModelConfig { mode, ..config.model.network.clone() };
         let settings = serde_json::to_string(&settings)
@@ -37,7 +73,8 @@ impl RemoteSource {
             depth: config.remote.depth,
             timeout: Duration::from_secs_f64(config.link.timeout_secs),
             patience: Duration::from_secs_f64(config.link.patience_secs),
-            run: run_number(),
+            run: run_number() ^ rank as u64,
+            rank,
         };
         let reach = Link::open(&config.link.options(), Role::Client)?.reach(key)?;
         let model = RemoteModel::open(reach, options, &|| false)?;
@@ -47,7 +84,7 @@ impl RemoteSource {
             let reason = format!("they have {}: say so with remote.model={}", bundled::NAME, bundled::NAME);
             return Err(LinkError::OtherModel { key: key.to_owned(), reason }.into());
         }
-        Ok(Self { model, wants_tokens: false })
+        Ok(Self { model, mode, wants_tokens: false })
     }
 
     pub(super) fn info(&self) -> &ModelInfo {
@@ -64,6 +101,12 @@ impl RemoteSource {
 
     pub(super) fn keep_place_tokens(&mut self) {
         self.wants_tokens = true;
+    }
+
+    /// The workers that are known now.
+    pub(super) fn crew(&self) -> Crew {
+        let (workers, key, facts) = (self.model.workers(), self.report().key, self.facts().clone());
+        Crew { workers, key, mode: self.mode, facts, wants_tokens: self.wants_tokens }
     }
 
     pub(super) fn report(&self) -> RemoteReport {

@@ -21,15 +21,16 @@ const MAX_IMAGE_BYTES: u64 = 32 << 20;
 pub(super) struct SceneWriter(Arc<Mutex<Option<Scene>>>);
 
 impl SceneWriter {
-    /// Begins the file.
+    /// Begins the file of this recording.
     ///
     /// # Errors
     /// It exists, or cannot be made.
-    pub fn create(path: &Path) -> Result<Self, Error> {
+    pub fn create(path: &Path, recording: &Recording) -> Result<Self, Error> {
         if path.exists() {
             return Err(Error::OutputExists { path: path.to_owned() });
         }
-        Ok(Self(Arc::new(Mutex::new(Some(Scene::create(path)?)))))
+        let begin = recording.images.first().map_or(Timestamp::from_nanos(0), |image| image.time);
+        Ok(Self(Arc::new(Mutex::new(Some(Scene::create(path, begin)?)))))
     }
 
     /// Writes something, unless writing has failed before. The first failure is told, and the run goes on.

@@ -84,7 +84,7 @@ pub(super) fn start(
         events.stage("plan", 0, || Plan::make(&dataset, &config, request.reference.as_deref()))?;
     let description = RunDescription::new(request, &dataset, fingerprint.clone(), &plan);
     let earlier = request.place.earlier(&description.0, &request.layered.to_toml(false))?;
-    let scene = request.mcap.as_deref().map(SceneWriter::create).transpose()?;
+    let scene = request.mcap.as_deref().map(|path| SceneWriter::create(path, &dataset)).transpose()?;
     let events = scene.iter().fold(events, |events, scene| scene.listen(events));
     let folder = early.map_or_else(|| RunFolder::create(&request.place).map(Arc::new), Ok)?;
     folder.write_manifest(&description.0)?;
