@@ -46,7 +46,7 @@ impl VidarImage {
     /// Grey pixels, copied.
     ///
     /// # Safety
-    /// As [`VidarImage::rows`].
+    /// As `VidarImage::rows`.
     pub unsafe fn gray(&self) -> Result<Image<u8>, Error> {
         if self.channels != 1 {
             return Err(usage(format!("{} channels, expected 1", self.channels)));
@@ -59,7 +59,7 @@ impl VidarImage {
     /// Colour pixels, copied; grey is repeated.
     ///
     /// # Safety
-    /// As [`VidarImage::rows`].
+    /// As `VidarImage::rows`.
     pub unsafe fn rgb(&self) -> Result<Image<[u8; 3]>, Error> {
         // SAFETY: the caller's promise.
         let rows = unsafe { self.rows() }?;

@@ -285,7 +285,8 @@ impl Context<'_> {
         recorder: &Recorder,
     ) -> Result<RunOutcome, Error> {
         let Self { request, config, dataset, folder, events, cancel, .. } = *self;
-        let (crew, known) = (source.remote().map(RemoteSource::crew), tracked.clone());
+        let crew = source.remote().map(RemoteSource::crew);
+        let known = crew.as_ref().and_then(|_| tracked.clone());
         let ((map, live), said) =
             ahead::beside(self, (&plan, places), crew.as_ref(), known.as_ref(), |ahead| {
                 self.build_map(&plan, &mut source, tracked, places, ahead)
