@@ -13,7 +13,7 @@ use super::Context;
 use super::parts::{Part, predict_part};
 use super::place_recognition::PlaceRecognition;
 use super::plan::Plan;
-use super::remote::{Crew, RemoteSource};
+use super::remote::{RemoteSource, WorkerGroup};
 use super::source::Source;
 use super::store::RunStore;
 use crate::chunks::StoredChunk;
@@ -54,7 +54,7 @@ struct Progress {
 
 /// What the threads had to say.
 #[derive(Default)]
-pub(super) struct SaidAhead {
+pub(super) struct AheadReport {
     /// Warnings, of which the run may have said some itself.
     pub warnings: Vec<Warning>,
     /// What went over each link.
@@ -131,14 +131,14 @@ impl PredictionStore for AheadStore<'_> {
 pub(super) fn beside<T>(
     context: &Context<'_>,
     (plan, places): (&Plan, &PlaceRecognition),
-    crew: Option<&Crew>,
+    group: Option<&WorkerGroup>,
     tracked: Option<&TrackedPoses>,
     work: impl FnOnce(Option<&Ahead>) -> Result<T, Error>,
-) -> Result<(T, SaidAhead), Error> {
+) -> Result<(T, AheadReport), Error> {
     let is_known = context.live.is_none() && (tracked.is_some() || !plan.poses.is_odometry());
-    let parts = crew.map_or(1, |crew| crew.workers.min(MOST));
-    let Some(crew) = crew.filter(|_| is_known && parts > 1) else {
-        return Ok((work(None)?, SaidAhead::default()));
+    let parts = group.map_or(1, |group| group.workers.min(MOST));
+    let Some(group) = group.filter(|_| is_known && parts > 1) else {
+        return Ok((work(None)?, AheadReport::default()));
     };
     let (progress, changed, is_over) = Default::default();
     let ahead = Ahead { parts, progress, changed, is_over };
@@ -148,7 +148,7 @@ pub(super) fn beside<T>(
             let part = Part { index, of: parts };
             let thread = move || {
                 let ended = Ended(ahead, index);
-                if let Err(error) = predict(context, plan, places, (crew, tracked.cloned()), part, ahead) {
+                if let Err(error) = predict(context, plan, places, (group, tracked.cloned()), part, ahead) {
                     let message = format!("a thread that asked workers ahead ended: {error}");
                     let hint = "the run asked for its chunks itself";
                     ahead.change(|p| p.warnings.push(Warning::new("not-ahead", message).hint(hint)));
@@ -165,7 +165,7 @@ pub(super) fn beside<T>(
         made
     });
     let Progress { warnings, reports, .. } = std::mem::take(&mut *ahead.locked());
-    Ok((made?, SaidAhead { warnings, reports }))
+    Ok((made?, AheadReport { warnings, reports }))
 }
 
 /// Says that the thread of a part has ended, however it did.
@@ -184,7 +184,7 @@ fn predict(
     context: &Context<'_>,
     plan: &Plan,
     places: &PlaceRecognition,
-    (crew, tracked): (&Crew, Option<TrackedPoses>),
+    (group, tracked): (&WorkerGroup, Option<TrackedPoses>),
     part: Part,
     ahead: &Ahead,
 ) -> Result<(), Error> {
@@ -193,7 +193,7 @@ fn predict(
     config.output.live_map = false;
     let events = Events::none();
     let context = Context { config: &config, events: &events, scene: None, stream: None, ..*context };
-    let mut source = Source::Remote(Box::new(crew.join(&config, part.index)?));
+    let mut source = Source::Remote(Box::new(group.join(&config, part.index)?));
     let store = RunStore::new(context.folder.path(), context.fingerprint, plan, &config);
     let kept = |id: PredictionId, _: &[std::path::PathBuf]| {
         if let PredictionId::Chunk(chunk) = id {

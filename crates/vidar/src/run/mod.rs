@@ -285,10 +285,10 @@ impl Context<'_> {
         recorder: &Recorder,
     ) -> Result<RunOutcome, Error> {
         let Self { request, config, dataset, folder, events, cancel, .. } = *self;
-        let crew = source.remote().map(RemoteSource::crew);
-        let known = crew.as_ref().and_then(|_| tracked.clone());
+        let group = source.remote().map(RemoteSource::group);
+        let known = group.as_ref().and_then(|_| tracked.clone());
         let ((map, live), said) =
-            ahead::beside(self, (&plan, places), crew.as_ref(), known.as_ref(), |ahead| {
+            ahead::beside(self, (&plan, places), group.as_ref(), known.as_ref(), |ahead| {
                 self.build_map(&plan, &mut source, tracked, places, ahead)
             })?;
         let known = recorder.warnings();

@@ -22,7 +22,7 @@ pub struct RemoteSource {
 }
 
 /// Who is asked, for more links to the same workers.
-pub(super) struct Crew {
+pub(super) struct WorkerGroup {
     /// How many there are.
     pub workers: usize,
     key: String,
@@ -31,7 +31,7 @@ pub(super) struct Crew {
     wants_tokens: bool,
 }
 
-impl Crew {
+impl WorkerGroup {
     /// A link of its own, which of equally busy workers asks the one of this rank.
     ///
     /// # Errors
@@ -104,9 +104,9 @@ impl RemoteSource {
     }
 
     /// The workers that are known now.
-    pub(super) fn crew(&self) -> Crew {
+    pub(super) fn group(&self) -> WorkerGroup {
         let (workers, key, facts) = (self.model.workers(), self.report().key, self.facts().clone());
-        Crew { workers, key, mode: self.mode, facts, wants_tokens: self.wants_tokens }
+        WorkerGroup { workers, key, mode: self.mode, facts, wants_tokens: self.wants_tokens }
     }
 
     pub(super) fn report(&self) -> RemoteReport {
