@@ -16,8 +16,7 @@ use super::plan::Plan;
 use super::remote::{RemoteSource, WorkerGroup};
 use super::source::Source;
 use super::store::RunStore;
-use crate::chunks::StoredChunk;
-use crate::engine::{PredictedFrame, PredictionId, PredictionStore};
+use crate::engine::PredictionId;
 use crate::error::Error;
 use crate::events::Events;
 use crate::odometry::TrackedPoses;
@@ -72,7 +71,7 @@ impl Ahead {
     }
 
     /// Waits until a thread has predicted the chunk, or will not.
-    fn wait_for(&self, chunk: ChunkId, is_cancelled: &dyn Fn() -> bool) {
+    pub(super) fn wait_for(&self, chunk: ChunkId, is_cancelled: &dyn Fn() -> bool) {
         let part = chunk.0 as usize % self.parts;
         let mut progress = self.locked();
         while part != 0
@@ -83,47 +82,6 @@ impl Ahead {
             let waited = self.changed.wait_timeout(progress, LOOK);
             progress = waited.unwrap_or_else(PoisonError::into_inner).0;
         }
-    }
-}
-
-/// The predictions of a run, those that threads make included.
-pub(super) struct AheadStore<'a> {
-    pub inner: &'a RunStore,
-    pub ahead: Option<&'a Ahead>,
-    pub is_cancelled: &'a (dyn Fn() -> bool + Sync),
-}
-
-impl PredictionStore for AheadStore<'_> {
-    fn find(&self, id: PredictionId, frames: &[PredictedFrame]) -> Option<StoredChunk> {
-        let kept = self.inner.find(id, frames);
-        match (kept, self.ahead, id) {
-            (None, Some(ahead), PredictionId::Chunk(chunk)) => {
-                ahead.wait_for(chunk, self.is_cancelled);
-                self.inner.find(id, frames)
-            }
-            (kept, ..) => kept,
-        }
-    }
-
-    fn keep(
-        &self,
-        id: PredictionId,
-        frames: &[PredictedFrame],
-        chunk: &StoredChunk,
-    ) -> Result<StoredChunk, Error> {
-        self.inner.keep(id, frames, chunk)
-    }
-
-    fn read(&self, id: PredictionId) -> Result<StoredChunk, Error> {
-        self.inner.read(id)
-    }
-
-    fn keep_volume(&self, chunk: ChunkId, bytes: &[u8]) -> Result<(), Error> {
-        self.inner.keep_volume(chunk, bytes)
-    }
-
-    fn read_volume(&self, chunk: ChunkId) -> Result<Vec<u8>, Error> {
-        self.inner.read_volume(chunk)
     }
 }
 

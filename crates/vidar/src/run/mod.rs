@@ -45,7 +45,7 @@ use crate::input::{self, ImageFiles, Measurement, UnseenScale};
 use crate::odometry::TrackedPoses;
 use crate::run_folder::{OutputLocation, RunFolder};
 use crate::verdict::{StatedScale, Verdict};
-use ahead::{Ahead, AheadStore};
+use ahead::Ahead;
 use live::{EndingCell, Incoming, LivePublisher, LiveStream, SurfaceLatency, TrackedElsewhere};
 use place_recognition::PlaceRecognition;
 use readers::{FINISH, MAP, Readers};
@@ -56,7 +56,7 @@ use source::Source;
 use start::Started;
 use std::path::PathBuf;
 use store::RunStore;
-use vidar_core::{Duration, RigCamera, Se3, Warning};
+use vidar_core::{ChunkId, Duration, RigCamera, Se3, Warning};
 use vidar_dataset::{DatasetError, OpenOptions, Recording};
 
 /// What to run on, how, and where to.
@@ -339,10 +339,11 @@ impl Context<'_> {
         ahead: Option<&Ahead>,
     ) -> Result<(MetricMap, Option<LiveReport>), Error> {
         let Self { config, dataset, folder, scene, events, cancel, .. } = *self;
-        let kept = RunStore::new(folder.path(), self.fingerprint, plan, config);
         let images = ImageFiles(dataset, plan.masks.as_deref());
         let cancelled = || cancel.is_cancelled();
-        let store = AheadStore { inner: &kept, ahead, is_cancelled: &cancelled };
+        let waiting = ahead.map(|ahead| |chunk| ahead.wait_for(chunk, &cancelled));
+        let wait_for = waiting.as_ref().map(|wait| wait as &dyn Fn(ChunkId));
+        let store = RunStore::new(folder.path(), self.fingerprint, plan, config).waiting(wait_for);
         let predicting = readers::chunk_progress(events);
         let images: &dyn ImageSource = self.stream.map_or(&images, |stream| stream);
         let parts = EngineParts { geometry: source, places, images, store: &store };
@@ -374,7 +375,7 @@ impl Context<'_> {
         if !cancel.is_cancelled() {
             tracking::forget(folder);
         }
-        kept.clean(config.output.keep_chunks || cancel.is_cancelled());
+        store.clean(config.output.keep_chunks || cancel.is_cancelled());
         Ok((map, report))
     }
 

@@ -141,7 +141,7 @@ fn predict_chunks(
 pub(super) fn predict_part(
     context: &Context<'_>,
     plan: &Plan,
-    (source, places, store): (&mut Source, &PlaceRecognition, &RunStore),
+    (source, places, store): (&mut Source, &PlaceRecognition, &RunStore<'_>),
     poses: Option<TrackedPoses>,
     (part, kept): (Part, Kept<'_>),
     cancelled: &(dyn Fn() -> bool + Sync),
@@ -176,7 +176,7 @@ const FAILED: &str = "chunk-failed";
 /// Predictions of one part; those of other parts count as failed, so that they are neither predicted nor aligned. Which
 /// keyframes a chunk has does not depend on what was predicted before.
 struct PartStore<'a> {
-    inner: &'a RunStore,
+    inner: &'a RunStore<'a>,
     part: Part,
     kept: Kept<'a>,
     count: Cell<usize>,

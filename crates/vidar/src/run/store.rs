@@ -15,14 +15,16 @@ use vidar_core::ChunkId;
 pub(super) const CHUNKS: &str = "chunks";
 
 /// `chunks/` and `volumes/` of a run folder.
-pub(super) struct RunStore {
+pub(super) struct RunStore<'a> {
     chunks: ChunkStore,
     volumes: PathBuf,
     /// What all predictions of the run depend on, besides their own frames.
     identity: Vec<u8>,
+    /// Called before a chunk counts as absent: it may be on its way.
+    wait_for: Option<&'a dyn Fn(ChunkId)>,
 }
 
-impl RunStore {
+impl<'a> RunStore<'a> {
     /// The store of a plan in the run folder `root`; `fingerprint` is the recording's.
     pub(super) fn new(root: &Path, fingerprint: &str, plan: &Plan, config: &Config) -> Self {
         let part = json!({
@@ -39,7 +41,17 @@ impl RunStore {
             "place_recognition": plan.place_recognition,
         });
         let identity = format!("{fingerprint}{part}").into_bytes();
-        Self { chunks: ChunkStore::new(root.join(CHUNKS)), volumes: root.join("volumes"), identity }
+        Self {
+            chunks: ChunkStore::new(root.join(CHUNKS)),
+            volumes: root.join("volumes"),
+            identity,
+            wait_for: None,
+        }
+    }
+
+    /// The same store, which waits for a chunk before it says that it is absent.
+    pub(super) fn waiting(self, wait_for: Option<&'a dyn Fn(ChunkId)>) -> Self {
+        Self { wait_for, ..self }
     }
 
     /// Removes volumes, and predictions unless they are to be kept.
@@ -78,9 +90,17 @@ impl RunStore {
     }
 }
 
-impl PredictionStore for RunStore {
+impl PredictionStore for RunStore<'_> {
     fn find(&self, id: PredictionId, frames: &[PredictedFrame]) -> Option<StoredChunk> {
-        self.chunks.find(id, &self.key(frames))
+        let key = self.key(frames);
+        let kept = self.chunks.find(id, &key);
+        match (kept, id, self.wait_for) {
+            (None, PredictionId::Chunk(chunk), Some(wait_for)) => {
+                wait_for(chunk);
+                self.chunks.find(id, &key)
+            }
+            (kept, ..) => kept,
+        }
     }
 
     fn keep(
