@@ -189,18 +189,28 @@ impl Block {
 
     /// Adds the sums of `other`; both together hold at most [`crate::grid::MAX_VIEWS`] views.
     pub fn add(&mut self, other: &Self) {
+        self.combine(other, |a, b| a + b, |a, b| a + b);
+    }
+
+    /// Takes the sums of `other` out again, which were added. Of others, read from a file that was changed, it makes nonsense, but no
+    /// panic.
+    pub fn subtract(&mut self, other: &Self) {
+        self.combine(other, i64::wrapping_sub, u32::wrapping_sub);
+    }
+
+    fn combine(&mut self, other: &Self, of_distances: fn(i64, i64) -> i64, of_counts: fn(u32, u32) -> u32) {
         for node in 0..NODES {
             let more = other.sums(node);
             if more.weight == 0 && more.observations == 0 {
                 continue;
             }
             let mut sums = self.sums(node);
-            sums.weighted_distance += more.weighted_distance;
-            sums.weight += more.weight;
-            sums.observations += more.observations;
-            sums.confidence += more.confidence;
+            sums.weighted_distance = of_distances(sums.weighted_distance, more.weighted_distance);
+            sums.weight = of_counts(sums.weight, more.weight);
+            sums.observations = of_counts(sums.observations, more.observations);
+            sums.confidence = of_counts(sums.confidence, more.confidence);
             for (sum, value) in sums.color.iter_mut().zip(more.color) {
-                *sum += value;
+                *sum = of_counts(*sum, value);
             }
             self.put(node, &sums);
         }

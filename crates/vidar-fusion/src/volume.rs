@@ -185,15 +185,6 @@ impl TsdfVolume {
         dropped
     }
 
-    /// Adds all sums of `other`, a volume of the same voxels, as if its views had been fused here.
-    ///
-    /// Returns how many blocks and free-space weights the budget rejected.
-    pub(crate) fn add(&mut self, other: &Self) -> u64 {
-        self.count_views(other);
-        let blocks = other.keys.iter().copied().zip(other.blocks.iter().map(|b| &**b));
-        self.add_blocks(blocks) + self.add_free_blocks(&other.free_blocks())
-    }
-
     /// Adds sums block by block; returns how many blocks the budget rejected.
     pub(crate) fn add_blocks<'a>(&mut self, more: impl Iterator<Item = (BlockKey, &'a Block)>) -> u64 {
         let mut dropped = 0;
@@ -216,6 +207,27 @@ impl TsdfVolume {
         dropped
     }
 
+    /// Takes blocks and free blocks out again that were added, so that the sums are what they were.
+    pub(crate) fn subtract_blocks<'a>(
+        &mut self,
+        blocks: impl Iterator<Item = (BlockKey, &'a Block)>,
+        free: &[FreeBlock],
+    ) {
+        for (key, block) in blocks {
+            if let Some(&at) = self.index.get(&key) {
+                self.blocks[at as usize].subtract(block);
+            }
+        }
+        for (key, weights) in free {
+            if let Some(sum) = self.free.get_mut(key) {
+                (0..CELLS).for_each(|cell| sum[cell] = sum[cell].wrapping_sub(weights[cell]));
+                if *sum == [0; CELLS] {
+                    self.free.remove(key);
+                }
+            }
+        }
+    }
+
     /// The free blocks with their weights, in the order of their keys.
     pub(crate) fn free_blocks(&self) -> Vec<FreeBlock> {
         let mut blocks: Vec<FreeBlock> = self.free.iter().map(|(key, weights)| (*key, *weights)).collect();
@@ -227,6 +239,22 @@ impl TsdfVolume {
     pub(crate) fn count_views(&mut self, other: &Self) {
         self.views += other.views;
         self.shortened_views += other.shortened_views;
+    }
+
+    /// Takes the views of [`Self::count_views`] out again.
+    pub(crate) fn uncount_views(&mut self, other: &Self) {
+        self.views -= other.views;
+        self.shortened_views -= other.shortened_views;
+    }
+
+    /// Blocks with their keys.
+    pub(crate) fn keyed_blocks(&self) -> impl Iterator<Item = (BlockKey, &Block)> {
+        self.keys.iter().copied().zip(self.blocks.iter().map(|b| &**b))
+    }
+
+    /// Whether the budget rejected anything.
+    pub(crate) fn is_incomplete(&self) -> bool {
+        self.dropped > 0
     }
 
     /// Views fused, and how many of them carved a shorter range.

@@ -54,7 +54,7 @@ fn without_motion_the_merged_volume_equals_plain_fusion_to_the_bit() {
     let fusion = FusionConfig { carve_range_m: 2.0, min_observations: 2, voxel_size_m: 0.04, ..config() };
     let plain = fuse(&fusion, &views);
     for chunks in [1, 4, 130] {
-        let volumes = dealt(&settings(fusion.clone()), &views, chunks);
+        let mut volumes = dealt(&settings(fusion.clone()), &views, chunks);
         assert_eq!(volumes.chunks().count(), chunks as usize);
         let merged = volumes.merged().unwrap();
         assert_eq!(merged.views(), plain.views());
@@ -144,21 +144,21 @@ fn a_loop_correction_removes_the_double_wall() {
     add(&mut volumes, ChunkId(0), &first);
     add(&mut volumes, ChunkId(7), &second);
     let detector = DoubleWallDetector::default();
-    let rate = |volumes: &SubVolumes| detector.of_mesh(&volumes.extract_mesh().unwrap()).unwrap().rate;
-    let before = rate(&volumes);
+    let rate = |volumes: &mut SubVolumes| detector.of_mesh(&volumes.extract_mesh().unwrap()).unwrap().rate;
+    let before = rate(&mut volumes);
     assert!(before > 0.45, "the second visit lies above the first: {before}");
 
     let moves: Vec<_> = second.iter().map(|v| undrifted(v, drift)).collect();
     let revision = volumes.revise(ChunkId(7), &moves).unwrap();
     assert!((revision.moved_m - drift).abs() < 1e-9 && revision.bent_m < 1e-9 && revision.stale);
     assert_eq!(volumes.stale().iter().map(|(id, _)| *id).collect::<Vec<_>>(), [ChunkId(7)]);
-    let moved = rate(&volumes);
+    let moved = rate(&mut volumes);
     assert!(moved < 0.01, "moved: {moved}");
     let height = rms(volumes.extract_mesh().unwrap().positions.iter().map(|p| f64::from(p[2])));
     assert!(height < 0.004, "{height}");
 
     volumes.rebuild(ChunkId(7), floor_views(100, 24, 0.1, 0.0)).unwrap();
-    assert!(volumes.stale().is_empty() && rate(&volumes) < 0.01);
+    assert!(volumes.stale().is_empty() && rate(&mut volumes) < 0.01);
     assert_eq!(volumes.report().rebuilt, 1);
     // Fused again where it is, the map is as if it never had been elsewin_memory.
     let all: Vec<AlignedView> = first.into_iter().chain(floor_views(100, 24, 0.1, 0.0)).collect();
@@ -215,17 +215,17 @@ fn a_moved_chunk_carves_at_its_present_pose() {
     let mut volumes = SubVolumes::new(&settings(fusion)).unwrap();
     volumes.integrate(ChunkId(0), &floater).unwrap();
     add(&mut volumes, ChunkId(1), &clear);
-    let floats = |volumes: &SubVolumes| {
+    let floats = |volumes: &mut SubVolumes| {
         volumes.extract_mesh().unwrap().positions.iter().filter(|p| p[2] > 0.5 && p[2] < 0.9).count()
     };
-    assert!(floats(&volumes) > 50);
+    assert!(floats(&mut volumes) > 50);
     // A quarter turn and a shift that is no whole number of blocks.
     let turn = So3::from_axis_angle(&Vec3::z(), 0.7);
     let middle = Vec3::new(0.3, 0.0, 0.0);
     let to = Sim3::new(turn, middle - turn * (middle + far), 1.0).unwrap();
     let moves: Vec<_> = clear.iter().map(|v| revised(v, &to)).collect();
     assert!(volumes.revise(ChunkId(1), &moves).unwrap().stale);
-    assert_eq!(floats(&volumes), 0, "free space of the moved chunk is carved");
+    assert_eq!(floats(&mut volumes), 0, "free space of the moved chunk is carved");
 }
 
 #[test]
@@ -334,6 +334,7 @@ fn offloaded_chunks_move_and_merge_like_those_in_memory() {
     let expected = in_memory.extract_mesh().unwrap();
     let load = |chunk: ChunkId| Ok::<_, FusionError>(stored[&chunk].clone());
     assert!(same_bits(&expected, &offloaded.merged_with(load).unwrap().extract_mesh()));
+    offloaded.forget_merged();
     assert_eq!(offloaded.merged().unwrap_err(), FusionError::Offloaded { chunk: ChunkId(0) });
     assert_eq!(offloaded.offload(ChunkId(0)).unwrap_err(), FusionError::Offloaded { chunk: ChunkId(0) });
     let late = &views_around(131, 1.3, ball(0.4))[130];
@@ -360,6 +361,7 @@ fn corrupt_bytes_are_an_error_and_never_panic() {
         } else {
             bytes[random(good.len())] ^= 1 << random(8);
         }
+        volumes.forget_merged();
         // A flipped bit of a sum may still be a sum; whatever is read can be made a mesh.
         match volumes.merged_with(|_| Ok::<_, FusionError>(bytes.clone())) {
             Ok(volume) => drop(volume.extract_mesh()),
@@ -368,10 +370,53 @@ fn corrupt_bytes_are_an_error_and_never_panic() {
         }
     }
     assert!(rejected >= 200, "{rejected}");
-    let read = |bytes: &[u8]| volumes.merged_with(|_| Ok::<_, FusionError>(bytes.to_vec()));
+    let mut read = |bytes: &[u8]| {
+        volumes.forget_merged();
+        volumes.merged_with(|_| Ok::<_, FusionError>(bytes.to_vec())).map(|volume| volume.extract_mesh())
+    };
     assert!(read(b"VSUB2").is_err());
     let mut endless = b"VSUB1".to_vec();
     endless.extend([0xFF; 20]);
     assert!(read(&endless).is_err());
-    assert!(read(&good).unwrap().extract_mesh().positions.len() > 100);
+    assert!(read(&good).unwrap().positions.len() > 100);
+}
+
+/// A sum that is kept from surface to surface has the bits of one that is made at the end.
+#[test]
+fn a_kept_sum_forgets_nothing_and_keeps_nothing_too_much() {
+    let views: Vec<AlignedView> = views_around(40, 1.3, ball(0.4)).into_iter().map(colored).collect();
+    let fusion = FusionConfig { carve_range_m: 2.0, ..config() };
+    let mut kept = SubVolumes::new(&settings(fusion)).unwrap();
+    let mut stored = std::collections::BTreeMap::<ChunkId, Vec<u8>>::new();
+    for (chunk, part) in (0..).map(ChunkId).zip(views.chunks(8)) {
+        add(&mut kept, chunk, part);
+        // Every chunk so far is turned about the last one, the older ones farther; some come back.
+        for (k, earlier) in (0..chunk.0).zip(views.chunks(8)) {
+            let angle = 0.03 * f64::from((chunk.0 - k) % 3);
+            let motion =
+                Sim3::new(So3::exp(&Vec3::new(0.0, 0.0, angle)), Vec3::zeros(), 1.0 + angle).unwrap();
+            let moves: Vec<_> = earlier.iter().map(|v| revised(v, &motion)).collect();
+            kept.revise(ChunkId(k), &moves).unwrap();
+        }
+        let load = |c: ChunkId| Ok::<_, FusionError>(stored[&c].clone());
+        let mesh = kept.merged_with(load).unwrap().extract_mesh();
+        // The same motions, nothing kept.
+        let mut fresh = kept.clone();
+        fresh.forget_merged();
+        assert!(same_bits(&mesh, &fresh.merged_with(load).unwrap().extract_mesh()), "{chunk}");
+        if chunk.0 > 0 {
+            let old = ChunkId(chunk.0 - 1);
+            stored.insert(old, kept.offload(old).unwrap());
+        }
+    }
+    // More views of a chunk that is in the sum already, and one that is made anew.
+    let last = ChunkId(4);
+    let more = colored(views_around(41, 1.3, ball(0.4)).remove(40));
+    kept.integrate(last, &more).unwrap();
+    kept.rebuild(ChunkId(1), views[8..16].to_vec()).unwrap();
+    let load = |c: ChunkId| Ok::<_, FusionError>(stored[&c].clone());
+    let mesh = kept.merged_with(load).unwrap().extract_mesh();
+    kept.forget_merged();
+    assert!(same_bits(&mesh, &kept.merged_with(load).unwrap().extract_mesh()));
+    assert_eq!(kept.merged_with(load).unwrap().views(), 41);
 }

@@ -138,16 +138,7 @@ impl<'a> Strip<'a> {
     /// Costs of `surface` moved by `shift`: the mean of the better half of the sources, because a surface that is
     /// occluded in some of them is mostly visible in others. `HIDDEN` where no source sees it.
     pub fn costs(&mut self, sources: &[Source<'_>], surface: Surface<'_>, shift: f32, merged: &mut [f32]) {
-        crate::simd::dispatch!(self.merged_costs(sources, surface, shift, merged));
-    }
-
-    #[inline(always)]
-    fn merged_costs(&mut self, sources: &[Source<'_>], surface: Surface<'_>, shift: f32, merged: &mut [f32]) {
-        for (i, source) in sources.iter().enumerate() {
-            self.warp(source, surface, shift);
-            self.correlate(i);
-        }
-        merge_better_half(&self.per_source[..sources.len()], merged);
+        merged_costs(self, sources, surface, shift, merged);
     }
 
     #[inline(always)]
@@ -216,6 +207,22 @@ impl<'a> Strip<'a> {
                 out[x] = if cost > hidden[x] { cost } else { hidden[x] };
             }
         }
+    }
+}
+
+crate::simd::for_each_instruction_set! {
+    fn merged_costs(
+        strip: &mut Strip<'_>,
+        sources: &[Source<'_>],
+        surface: Surface<'_>,
+        shift: f32,
+        merged: &mut [f32],
+    ) {
+        for (i, source) in sources.iter().enumerate() {
+            strip.warp(source, surface, shift);
+            strip.correlate(i);
+        }
+        merge_better_half(&strip.per_source[..sources.len()], merged);
     }
 }
 

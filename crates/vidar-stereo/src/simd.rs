@@ -32,6 +32,35 @@ macro_rules! dispatch {
 }
 pub(crate) use dispatch;
 
+/// Defines a function whose body is compiled for each instruction set. [`dispatch`] leaves it to the compiler whether a large kernel is
+/// compiled into the function that has the instructions; where it is not, it gets those of the portable one (the matching costs did).
+macro_rules! for_each_instruction_set {
+    ($(#[$meta:meta])* fn $name:ident($($arg:ident: $type:ty),* $(,)?) $body:block) => {
+        $(#[$meta])*
+        fn $name($($arg: $type),*) {
+            #[inline(always)]
+            fn kernel($($arg: $type),*) $body
+            #[cfg(target_arch = "x86_64")]
+            #[target_feature(enable = "avx512f,avx512bw,avx512dq,avx512vl,avx2")]
+            fn avx512($($arg: $type),*) { kernel($($arg),*) }
+            #[cfg(target_arch = "x86_64")]
+            #[target_feature(enable = "avx2")]
+            fn avx2($($arg: $type),*) { kernel($($arg),*) }
+            #[cfg(target_arch = "x86_64")]
+            match $crate::simd::available() {
+                // SAFETY: `available` found the instructions on this processor.
+                $crate::simd::Instructions::Avx512 => unsafe { avx512($($arg),*) },
+                // SAFETY: as above.
+                $crate::simd::Instructions::Avx2 => unsafe { avx2($($arg),*) },
+                $crate::simd::Instructions::Portable => kernel($($arg),*),
+            }
+            #[cfg(not(target_arch = "x86_64"))]
+            kernel($($arg),*);
+        }
+    };
+}
+pub(crate) use for_each_instruction_set;
+
 /// The widest instructions of this processor; tests may ask for less.
 #[cfg(target_arch = "x86_64")]
 pub(crate) fn available() -> Instructions {

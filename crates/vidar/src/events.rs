@@ -195,7 +195,7 @@ impl Event {
                 keyframes: placement.keyframes.len(),
                 is_final: *is_final,
             },
-            MapEvent::SurfaceChanged { surface, is_final } => {
+            MapEvent::SurfaceChanged { surface, is_final, .. } => {
                 Self::SurfaceChanged { triangles: surface.mesh.triangles.len(), is_final: *is_final }
             }
             MapEvent::Warning(warning) => Self::Warning { warning: warning.clone() },

@@ -168,6 +168,7 @@ const ELSEWHERE: &[(&str, &str)] = &[
     ("budget.speed", "it needs a limit; budget.rs has one"),
     ("input.camera", "there is one camera here; faults.rs asks for another"),
     ("output.live_map", "it leaves nothing; coupling.rs watches it grow"),
+    ("output.live_map_wait_secs", "it leaves nothing; the tests of the engine watch what it shows"),
     ("coupling.loops", "they need a revisit; coupling.rs has one"),
     ("coupling.loop_chunks", "it needs a revisit; coupling.rs has one"),
     ("coupling.place_recognition", "damage.rs has a run of each"),

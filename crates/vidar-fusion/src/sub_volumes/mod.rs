@@ -11,16 +11,18 @@
 //!
 //! [`SubVolumes::merged`] adds all sub-volumes to one. Sums are integers, so as long as nothing moved the result is
 //! the volume that fusing all views at once would have made, to the bit, and with any motion it does not depend on
-//! the order in which chunks came or on the number of threads.
+//! the order in which chunks came or on the number of threads. The sum is kept: what has not moved since stays in it.
 
 mod motion;
 mod resample;
 mod snapshot;
+mod sum;
 
 use crate::{FusionConfig, FusionError, IntegrationStats, TsdfVolume};
 use motion::SurfaceProbe;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
+use sum::Sum;
 use vidar_core::{AlignedView, ChunkId, FrameId, LieGroup, Se3, Sim3, TriangleMesh, Warning};
 
 /// Settings of sub-volumes.
@@ -104,6 +106,8 @@ pub struct SubVolumes {
     config: SubVolumeConfig,
     chunks: BTreeMap<ChunkId, SubVolume>,
     owners: BTreeMap<FrameId, ChunkId>,
+    /// Of the last surface.
+    sum: Option<Sum>,
     rebuilt: u64,
     peak_bytes: u64,
     dropped: u64,
@@ -129,6 +133,7 @@ impl SubVolumes {
             config: config.clone(),
             chunks: BTreeMap::new(),
             owners: BTreeMap::new(),
+            sum: None,
             rebuilt: 0,
             peak_bytes: 0,
             dropped: 0,
@@ -171,6 +176,7 @@ impl SubVolumes {
         if sub_volume.is_offloaded {
             return Err(FusionError::Offloaded { chunk });
         }
+        take_out(&mut self.sum, chunk, sub_volume);
         sub_volume.volume.set_budget(budget);
         let stats = sub_volume.integrate(view)?;
         if let Some(fresh) = fresh {
@@ -200,7 +206,7 @@ impl SubVolumes {
         }
         let voxel_m = self.config.fusion.voxel_size_m;
         let tolerance_m = self.config.move_tolerance_voxels * voxel_m;
-        let (now_from_fused, revision) = motion::fit(&pairs, tolerance_m);
+        let (now_from_fused, revision) = motion::fit(&pairs, &sub_volume.now_from_fused, tolerance_m);
         sub_volume.now_from_fused = now_from_fused;
         sub_volume.revision = revision;
         Ok(revision)
@@ -254,7 +260,9 @@ impl SubVolumes {
         self.dropped += total.dropped_by_budget;
         self.owners.retain(|_, owner| *owner != chunk);
         self.owners.extend(sub_volume.probes.keys().map(|frame| (*frame, chunk)));
-        self.chunks.insert(chunk, sub_volume);
+        if let Some(old) = self.chunks.insert(chunk, sub_volume) {
+            take_out(&mut self.sum, chunk, &old);
+        }
         self.rebuilt += 1;
         Ok(total)
     }
@@ -281,26 +289,32 @@ impl SubVolumes {
         self.chunks.iter().filter(|(_, sub_volume)| sub_volume.is_offloaded).map(|(id, _)| *id)
     }
 
-    /// All sub-volumes at their present poses, as one volume.
+    /// All sub-volumes at their present poses, as one volume. It is kept, and costs what is new or moved since it was last asked for.
     ///
     /// Chunks that did not move are added sum by sum, the others are resampled (trilinear, in space and in all sums).
     ///
     /// # Errors
     /// More than 65535 views, or an offloaded chunk: see [`Self::merged_with`].
-    pub fn merged(&self) -> Result<TsdfVolume, FusionError> {
+    pub fn merged(&mut self) -> Result<&TsdfVolume, FusionError> {
         self.merged_with(|chunk| Err(FusionError::Offloaded { chunk }))
     }
 
-    /// As [`Self::merged`]; `load` returns the bytes of each offloaded chunk, one at a time.
+    /// As [`Self::merged`]; `load` returns the bytes of each offloaded chunk that is added or moved, one at a time.
     ///
     /// # Errors
     /// More than 65535 views, whatever `load` returns, or bytes that are not a volume.
     pub fn merged_with<E: From<FusionError>>(
-        &self,
+        &mut self,
         mut load: impl FnMut(ChunkId) -> Result<Vec<u8>, E>,
-    ) -> Result<TsdfVolume, E> {
-        let mut merged = TsdfVolume::new(&self.config.fusion)?;
+    ) -> Result<&TsdfVolume, E> {
+        // What the budget rejected cannot be taken out again. Where an error ends this, the sum is made anew next time.
+        let kept = self.sum.take().filter(|sum| !sum.volume().is_incomplete());
+        let mut sum = kept.map_or_else(|| Sum::new(&self.config.fusion), Ok)?;
         for (chunk, sub_volume) in &self.chunks {
+            let before = sum.place(*chunk);
+            if before == Some(&sub_volume.now_from_fused) {
+                continue;
+            }
             let loaded;
             let volume = if sub_volume.is_offloaded {
                 loaded = snapshot::read(&load(*chunk)?, &self.config.fusion)?;
@@ -309,24 +323,25 @@ impl SubVolumes {
                 &sub_volume.volume
             };
             let limit = crate::grid::MAX_VIEWS;
-            if merged.views() + volume.views() > limit {
+            if before.is_none() && sum.volume().views() + volume.views() > limit {
                 let frame = sub_volume.probes.keys().next().copied().unwrap_or_default();
                 return Err(FusionError::TooManyViews { frame, limit }.into());
             }
-            if sub_volume.now_from_fused == Sim3::IDENTITY {
-                merged.add(volume);
-            } else {
-                resample::add_moved(&mut merged, volume, &sub_volume.now_from_fused);
-            }
+            sum.set(*chunk, volume, &sub_volume.now_from_fused);
         }
-        Ok(merged)
+        Ok(self.sum.insert(sum).volume())
+    }
+
+    /// Drops what is kept of [`Self::merged`], and its memory.
+    pub fn forget_merged(&mut self) {
+        self.sum = None;
     }
 
     /// The surface of [`Self::merged`].
     ///
     /// # Errors
     /// As [`Self::merged`].
-    pub fn extract_mesh(&self) -> Result<TriangleMesh, FusionError> {
+    pub fn extract_mesh(&mut self) -> Result<TriangleMesh, FusionError> {
         Ok(self.merged()?.extract_mesh())
     }
 
@@ -357,6 +372,14 @@ impl SubVolumes {
             }
         }
         warnings
+    }
+}
+
+/// Takes a chunk out of the sum before its volume changes; where the volume is elsewhere, the sum is made anew.
+fn take_out(sum: &mut Option<Sum>, chunk: ChunkId, sub_volume: &SubVolume) {
+    match (sub_volume.is_offloaded, &mut *sum) {
+        (false, Some(sum)) if !sum.volume().is_incomplete() => sum.remove(chunk, &sub_volume.volume),
+        _ => *sum = sum.take().filter(|sum| sum.place(chunk).is_none()),
     }
 }
 

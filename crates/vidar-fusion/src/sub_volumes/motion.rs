@@ -25,8 +25,13 @@ impl SurfaceProbe {
     }
 }
 
-/// The similarity that best fits the motion of the surface, or the identity if it moved no more than `tolerance_m`.
-pub(super) fn fit(pairs: &[(&SurfaceProbe, &RevisedView)], tolerance_m: f64) -> (Sim3, Revision) {
+/// The similarity that best fits the motion of the surface, or the identity if it moved no more than `tolerance_m`; or the one `before`,
+/// if that is no farther off, so that a chunk is not moved by less than a voxel again and again.
+pub(super) fn fit(
+    pairs: &[(&SurfaceProbe, &RevisedView)],
+    before: &Sim3,
+    tolerance_m: f64,
+) -> (Sim3, Revision) {
     let (mut fused, mut now) = (Vec::new(), Vec::new());
     for (probe, view) in pairs {
         for point in &probe.points {
@@ -40,6 +45,10 @@ pub(super) fn fit(pairs: &[(&SurfaceProbe, &RevisedView)], tolerance_m: f64) -> 
     let moved_m = largest(&Sim3::IDENTITY);
     if moved_m <= tolerance_m {
         return (Sim3::IDENTITY, Revision { moved_m, bent_m: moved_m, stale: false });
+    }
+    let since = largest(before);
+    if since <= tolerance_m {
+        return (*before, Revision { moved_m, bent_m: since, stale: true });
     }
     // A view's five points are neither collinear nor coincident, so the similarity exists; should rounding prevent
     // it, the motion of the first view is used.

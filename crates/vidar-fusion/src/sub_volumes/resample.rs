@@ -15,12 +15,15 @@ use vidar_core::{LieGroup, Sim3};
 /// Share of the trilinear weight that must fall on observed nodes; less would extend the surface beyond its border.
 const MIN_OBSERVED_SHARE: f64 = 0.5;
 
-/// Adds `source`, moved by `now_from_fused`, to `merged`.
-pub(super) fn add_moved(merged: &mut TsdfVolume, source: &TsdfVolume, now_from_fused: &Sim3) {
+/// Blocks and free blocks of `source`, moved by `now_from_fused`, in batches.
+pub(super) fn moved(
+    source: &TsdfVolume,
+    now_from_fused: &Sim3,
+    mut take: impl FnMut(&mut dyn Iterator<Item = (BlockKey, &Block)>, &[FreeBlock]),
+) {
     let voxel_m = source.config().voxel_size_m;
     let fused_from_now = now_from_fused.inverse();
     let reader = Reader { source, scale: now_from_fused.scale, fused_from_now, voxel_m };
-    merged.count_views(source);
 
     let targets = covered(source.keys.iter().copied(), now_from_fused, voxel_m);
     // In batches, so that the resampled blocks do not all exist twice.
@@ -28,12 +31,12 @@ pub(super) fn add_moved(merged: &mut TsdfVolume, source: &TsdfVolume, now_from_f
         let blocks: Vec<Option<Block>> =
             batch.par_iter().with_min_len(8).map(|key| reader.block(*key)).collect();
         let pairs = batch.iter().copied().zip(&blocks);
-        merged.add_blocks(pairs.filter_map(|(key, block)| Some((key, block.as_ref()?))));
+        take(&mut pairs.filter_map(|(key, block)| Some((key, block.as_ref()?))), &[]);
     }
     let free = covered(source.free.keys().copied(), now_from_fused, voxel_m);
     let free: Vec<FreeBlock> =
         free.par_iter().with_min_len(64).filter_map(|key| reader.free_block(*key)).collect();
-    merged.add_free_blocks(&free);
+    take(&mut std::iter::empty(), &free);
 }
 
 /// Blocks of the lattice that the moved blocks `keys` reach, sorted, each once.

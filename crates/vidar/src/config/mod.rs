@@ -260,6 +260,9 @@ pub struct OutputConfig {
     /// Write `map/so_far.ply` after every chunk, with provisional placements, for viewing. Costs one more fusion; the final
     /// map is the same.
     pub live_map: bool,
+    /// `vidar live`: longest that a keyframe waits until that file shows it (s of the recording). One that still waits for the keyframes
+    /// after it is predicted without them, where there is time, and once more with them. 0: as long as it takes. Stereo only.
+    pub live_map_wait_secs: f64,
 }
 
 impl Default for OutputConfig {
@@ -272,6 +275,7 @@ impl Default for OutputConfig {
             report: true,
             keep_chunks: false,
             live_map: false,
+            live_map_wait_secs: 0.0,
         }
     }
 }
@@ -419,9 +423,11 @@ impl Config {
         {
             return bad("coupling.place_recognition = \"salad\" needs coupling.salad_checkpoint".into());
         }
-        for (key, value) in
-            [("input.start_secs", self.input.start_secs), ("input.end_secs", self.input.end_secs)]
-        {
+        for (key, value) in [
+            ("input.start_secs", self.input.start_secs),
+            ("input.end_secs", self.input.end_secs),
+            ("output.live_map_wait_secs", self.output.live_map_wait_secs),
+        ] {
             if !(value.is_finite() && value >= 0.0) {
                 return bad(format!("{key} must be finite and not negative, found {value}"));
             }

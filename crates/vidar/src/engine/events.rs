@@ -164,6 +164,8 @@ pub enum MapEvent {
     SurfaceChanged {
         /// The surface. Only the final one has points and coverage.
         surface: Arc<Surface>,
+        /// Keyframes whose depth is in it for the first time; of the map none are named.
+        shown: Vec<FrameId>,
         /// Whether it is the map.
         is_final: bool,
     },

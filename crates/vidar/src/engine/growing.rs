@@ -1,8 +1,9 @@
 //! The surface while the map grows: it follows the graph.
 //!
 //! Each chunk is a volume of its own, placed where the aligner has it now; when a loop moves chunks, their volumes move with
-//! them. Volumes of older chunks are kept outside, so that memory stays flat. The final map is fused from the predictions
-//! at their final poses, each keyframe once.
+//! them. Volumes of older chunks are kept outside, so that memory stays flat. Keyframes that wait for their chunk may be shown
+//! before ([`super::preview`]); the chunk replaces them. The final map is fused from the predictions at their final poses, each
+//! keyframe once.
 
 use super::events::{MapEvent, Surface};
 use super::setup::PredictionStore;
@@ -23,6 +24,8 @@ pub struct GrowingSurface {
     volumes: SubVolumes,
     /// Depth scale that each keyframe was fused with.
     fused: BTreeMap<FrameId, f64>,
+    /// Keyframes that are shown before their chunk is there.
+    previewed: BTreeMap<FrameId, ChunkId>,
     /// Chunks in memory, oldest first.
     in_memory: Vec<ChunkId>,
 }
@@ -32,13 +35,15 @@ impl GrowingSurface {
     pub fn new(config: &Config) -> Result<Self, Error> {
         let config = SubVolumeConfig { fusion: config.fusion.clone(), ..SubVolumeConfig::default() };
         let volumes = SubVolumes::new(&config)?;
-        Ok(Self { config, volumes, fused: BTreeMap::new(), in_memory: Vec::new() })
+        let (fused, previewed) = (BTreeMap::new(), BTreeMap::new());
+        Ok(Self { config, volumes, fused, previewed, in_memory: Vec::new() })
     }
 
     /// Removes every chunk.
     pub fn reset(&mut self) -> Result<(), Error> {
         self.volumes = SubVolumes::new(&self.config)?;
         self.fused.clear();
+        self.previewed.clear();
         self.in_memory.clear();
         Ok(())
     }
@@ -52,21 +57,24 @@ impl GrowingSurface {
         store: &dyn PredictionStore,
     ) -> Result<Vec<MapEvent>, Error> {
         let mut events = Vec::new();
+        if self.previewed.values().any(|c| *c == chunk) {
+            self.volumes.rebuild(chunk, [])?;
+        }
+        let mut shown = Vec::new();
         for view in views {
-            if self.fused.contains_key(&view.frame_id()) {
+            let frame = view.frame_id();
+            if self.fused.contains_key(&frame) {
                 continue;
             }
-            match self.volumes.integrate(chunk, view) {
-                Ok(_) => {
-                    let scale = placement.view(view.frame_id()).map_or(1.0, |p| p.metres_per_unit);
-                    self.fused.insert(view.frame_id(), scale);
-                }
-                // The final map reports its own losses; this surface is provisional.
-                Err(error) => {
-                    events.push(MapEvent::Warning(Warning::new("growing-surface", error.to_string())))
+            if integrate(&mut self.volumes, chunk, view, &mut events) {
+                let scale = placement.view(frame).map_or(1.0, |p| p.metres_per_unit);
+                self.fused.insert(frame, scale);
+                if !self.previewed.contains_key(&frame) {
+                    shown.push(frame);
                 }
             }
         }
+        self.previewed.retain(|_, c| *c != chunk);
         self.follow(placement)?;
         self.in_memory.push(chunk);
         while self.in_memory.len() > IN_MEMORY {
@@ -75,10 +83,34 @@ impl GrowingSurface {
                 store.keep_volume(oldest, &self.volumes.offload(oldest)?)?;
             }
         }
+        events.push(self.surface(shown, store)?);
+        Ok(events)
+    }
+
+    /// Adds views of chunks that are still to come.
+    pub fn preview(
+        &mut self,
+        views: Vec<(ChunkId, AlignedView)>,
+        store: &dyn PredictionStore,
+    ) -> Result<Vec<MapEvent>, Error> {
+        let mut events = Vec::new();
+        let mut shown = Vec::new();
+        for (chunk, view) in views {
+            if integrate(&mut self.volumes, chunk, &view, &mut events) {
+                self.previewed.insert(view.frame_id(), chunk);
+                shown.push(view.frame_id());
+            }
+        }
+        if !shown.is_empty() {
+            events.push(self.surface(shown, store)?);
+        }
+        Ok(events)
+    }
+
+    fn surface(&mut self, shown: Vec<FrameId>, store: &dyn PredictionStore) -> Result<MapEvent, Error> {
         let merged = self.volumes.merged_with(|chunk| store.read_volume(chunk))?;
         let surface = Surface { mesh: merged.extract_mesh(), ..Surface::default() };
-        events.push(MapEvent::SurfaceChanged { surface: Arc::new(surface), is_final: false });
-        Ok(events)
+        Ok(MapEvent::SurfaceChanged { surface: Arc::new(surface), shown, is_final: false })
     }
 
     /// Moves every chunk with its keyframes.
@@ -103,4 +135,18 @@ impl GrowingSurface {
         }
         Ok(())
     }
+}
+
+/// Adds a view, unless it cannot be fused. The final map reports its own losses; this surface is provisional.
+fn integrate(
+    volumes: &mut SubVolumes,
+    chunk: ChunkId,
+    view: &AlignedView,
+    events: &mut Vec<MapEvent>,
+) -> bool {
+    let result = volumes.integrate(chunk, view);
+    if let Err(error) = &result {
+        events.push(MapEvent::Warning(Warning::new("growing-surface", error.to_string())));
+    }
+    result.is_ok()
 }

@@ -20,6 +20,7 @@ mod growing;
 mod observe;
 pub(crate) mod placed;
 mod predict;
+mod preview;
 mod select;
 mod setup;
 mod stereo_landmarks;
@@ -45,6 +46,7 @@ use growing::GrowingSurface;
 use observe::{LandmarkUse, Observer};
 use placed::placed_views;
 use predict::Predictor;
+use preview::Preview;
 use std::sync::Arc;
 use stereo_landmarks::StereoLandmarks;
 use track::Track;
@@ -75,6 +77,7 @@ pub struct Engine<'a> {
     predictor: Predictor<'a>,
     world: Option<World>,
     growing: Option<GrowingSurface>,
+    preview: Option<Preview<'a>>,
     volume_budget_bytes: u64,
     step: Option<Step>,
 }
@@ -102,6 +105,13 @@ impl<'a> Engine<'a> {
         let config = setup.config;
         let overlaps = setup.geometry.overlaps();
         let rule = chunk_rule(config, overlaps, setup.prescribed);
+        let wait = Duration::from_secs_f64(config.output.live_map_wait_secs);
+        let preview = match rule {
+            ChunkRule::WithContext { size, context } if wait > Duration::ZERO => {
+                Some(Preview::new(wait, (size, context), setup.images, (&setup.camera.model, &setup.view)))
+            }
+            _ => None,
+        };
         let mut predictor = Predictor::new(
             setup.geometry,
             setup.places,
@@ -131,6 +141,7 @@ impl<'a> Engine<'a> {
             predictor,
             world: None,
             growing: config.output.live_map.then(|| GrowingSurface::new(config)).transpose()?,
+            preview,
             volume_budget_bytes: setup.volume_budget_bytes,
             step: None,
         })
@@ -184,6 +195,14 @@ impl<'a> Engine<'a> {
         self.advance(reports, false, sink)
     }
 
+    /// Whether there is time to show keyframes in the growing surface before their chunk is predicted (`output.live_map_wait_secs`). Not
+    /// before this is called; it changes nothing in the map.
+    pub fn preview_when_late(&mut self, has_time: bool) {
+        if let Some(preview) = &mut self.preview {
+            preview.has_time = has_time;
+        }
+    }
+
     /// Maps what is left, places everything once more, and fuses it.
     ///
     /// # Errors
@@ -207,13 +226,13 @@ impl<'a> Engine<'a> {
     ) -> Result<(), Error> {
         self.add_reports(reports, sink)?;
         if !self.select_keyframes(is_complete, sink)? && !is_complete {
-            return Ok(());
+            return self.preview(sink);
         }
         while let Some((id, chunk)) = self.next_chunk(is_complete)? {
             let Some(prediction) = self.predict(id, &chunk, sink)? else { break };
             self.align(id, &chunk, prediction, sink)?;
         }
-        Ok(())
+        if is_complete { Ok(()) } else { self.preview(sink) }
     }
 
     fn add_image(&mut self, stamp: FrameStamp) {
@@ -333,6 +352,9 @@ impl<'a> Engine<'a> {
             aligner,
             failures: Vec::new(),
         });
+        if let Some(preview) = &mut self.preview {
+            preview.reset();
+        }
         self.observer.reset();
         self.predictor.reset();
         if let Some(growing) = &mut self.growing {
@@ -493,7 +515,7 @@ impl<'a> Engine<'a> {
         for warning in warnings {
             sink(MapEvent::Warning(warning))?;
         }
-        sink(MapEvent::SurfaceChanged { surface: Arc::new(surface), is_final: true })
+        sink(MapEvent::SurfaceChanged { surface: Arc::new(surface), shown: Vec::new(), is_final: true })
     }
 
     fn enter(&mut self, step: Step, sink: &mut Sink<'_>) -> Result<(), Error> {

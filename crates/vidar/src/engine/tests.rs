@@ -163,22 +163,35 @@ fn truth() -> GivenPoses {
     GivenPoses::new(trajectory, Duration::ZERO, Duration::from_millis(500))
 }
 
+fn config() -> Config {
+    let mut config = Config::default();
+    config.geometry.chunk_keyframes = 6;
+    config.geometry.context_keyframes = 2;
+    config.fusion.voxel_size_m = 0.1;
+    config
+}
+
 /// Events of a run, and how many of them came before the recording ended.
 fn run(
     poses: Box<dyn PoseSource>,
     fallback: Option<Box<dyn PoseSource>>,
     geometry: &mut Wall,
 ) -> (Result<(), Error>, Vec<MapEvent>, usize) {
-    let mut config = Config::default();
-    config.geometry.chunk_keyframes = 6;
-    config.geometry.context_keyframes = 2;
-    config.fusion.voxel_size_m = 0.1;
+    run_with(&config(), poses, fallback, geometry)
+}
+
+fn run_with(
+    config: &Config,
+    poses: Box<dyn PoseSource>,
+    fallback: Option<Box<dyn PoseSource>>,
+    geometry: &mut Wall,
+) -> (Result<(), Error>, Vec<MapEvent>, usize) {
     let (store, model) = (MemoryStore::default(), CameraModel::Pinhole(pinhole()));
     let camera =
         RigCamera { model, body_from_camera: Se3::IDENTITY, time_offset: Duration::ZERO, rate_hz: None };
     let mut engine = Engine::new(EngineSetup {
         name: "wall".into(),
-        config: &config,
+        config,
         camera_id: CameraId(0),
         camera,
         readout: Duration::ZERO,
@@ -195,6 +208,7 @@ fn run(
         predicting: &|_| {},
     })
     .unwrap();
+    engine.preview_when_late(true);
     let mut events = Vec::new();
     for i in 0..FRAMES {
         engine
@@ -230,7 +244,7 @@ fn degradations(events: &[MapEvent]) -> Vec<String> {
 
 fn surface(events: &[MapEvent]) -> &Surface {
     match events.last() {
-        Some(MapEvent::SurfaceChanged { surface, is_final: true }) => surface,
+        Some(MapEvent::SurfaceChanged { surface, is_final: true, .. }) => surface,
         other => panic!("the last event is {other:?}"),
     }
 }
@@ -249,6 +263,58 @@ fn chunks_are_placed_while_the_recording_goes_on_and_the_surface_is_the_wall() {
     let surface = surface(&events);
     assert!(surface.mesh.triangles.len() > 500, "{}", surface.mesh.triangles.len());
     assert!(surface.mesh.positions.iter().all(|p| (p[2] - 2.0).abs() < 0.05));
+}
+
+/// Each keyframe with how many images had come when the growing surface showed it first.
+fn shown(events: &[MapEvent]) -> Vec<(u32, u32)> {
+    let mut images = 0;
+    let mut shown = Vec::new();
+    for event in events {
+        match event {
+            MapEvent::State(_) => images += 1,
+            MapEvent::SurfaceChanged { shown: frames, is_final: false, .. } => {
+                shown.extend(frames.iter().map(|f| (f.0, images)));
+            }
+            _ => {}
+        }
+    }
+    shown.sort_unstable();
+    shown
+}
+
+#[test]
+fn a_keyframe_that_waits_for_its_chunk_is_shown_before_and_the_map_is_the_same() {
+    let watched = |wait, failing: &[u32]| {
+        let mut config = config();
+        config.output.live_map = true;
+        config.output.live_map_wait_secs = wait;
+        let (ended, events, _) = run_with(&config, Box::new(truth()), None, &mut Wall::new(failing));
+        ended.unwrap();
+        events
+    };
+    let (patient, soon) = (watched(0.0, &[]), watched(0.25, &[]));
+    let frames = |events| shown(events).iter().map(|(f, _)| *f).collect::<Vec<_>>();
+    for events in [&patient, &soon] {
+        assert_eq!(frames(events), (0..FRAMES).collect::<Vec<_>>(), "each keyframe once");
+    }
+    let most_wait = |events| shown(events).iter().map(|(f, images)| images - 1 - f).max();
+    // Chunks of six and two more after them; 0.25 s and the next image, or the four views that the first preview needs.
+    assert_eq!((most_wait(&patient), most_wait(&soon)), (Some(7), Some(3)));
+    let surfaces = [surface(&patient), surface(&soon)].map(|s| &s.mesh);
+    assert!(surfaces[0] == surfaces[1], "the map does not know of it");
+
+    // What was shown of a chunk that is lost is taken away again.
+    let grown = |events: &[MapEvent]| {
+        let of = |e: &MapEvent| match e {
+            MapEvent::SurfaceChanged { surface, is_final: false, .. } => Some(surface.mesh.triangles.len()),
+            _ => None,
+        };
+        events.iter().filter_map(of).collect::<Vec<_>>()
+    };
+    let lost = watched(0.25, &[1]);
+    let sizes = grown(&lost);
+    assert!(sizes.windows(2).any(|pair| pair[1] < pair[0]), "{sizes:?}");
+    assert!(grown(&soon).windows(2).all(|pair| pair[1] >= pair[0]));
 }
 
 #[test]

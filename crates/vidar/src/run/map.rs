@@ -105,7 +105,7 @@ impl<'a> MapCollector<'a> {
             MapEvent::PlacementsRevised { placement, is_final: true } => {
                 self.map.placement = Some(placement.clone());
             }
-            MapEvent::SurfaceChanged { surface, is_final: true } => self.map.surface = surface.clone(),
+            MapEvent::SurfaceChanged { surface, is_final: true, .. } => self.map.surface = surface.clone(),
             MapEvent::ViewsFused(views) => {
                 self.map.view_areas_m2.extend(views.iter().filter_map(area_in_view));
                 self.map.depth_scores.add(self.dataset, views)?;

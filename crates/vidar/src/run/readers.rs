@@ -88,7 +88,7 @@ impl<'a> Readers<'a> {
         match &event {
             MapEvent::World { .. } => self.predicted = 0,
             MapEvent::ChunkPredicted { with_depth, .. } => self.predicted += with_depth,
-            MapEvent::SurfaceChanged { surface, is_final: false } => {
+            MapEvent::SurfaceChanged { surface, is_final: false, .. } => {
                 let target = self.folder.file(SO_FAR)?;
                 let comments = vec!["VIDAR map so far: provisional poses".to_owned()];
                 vidar_export::atomic::write_atomically(&target, |w| {

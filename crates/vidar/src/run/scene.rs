@@ -105,7 +105,7 @@ impl SceneWriter {
                 Ok(())
             }
             MapEvent::ViewsFused(views) => views.iter().try_for_each(|view| scene.view(view)),
-            MapEvent::SurfaceChanged { surface, is_final } => {
+            MapEvent::SurfaceChanged { surface, is_final, .. } => {
                 match is_final {
                     true => scene.points(&surface.cloud),
                     false => scene.points(&thinned_vertices(&surface.mesh, MOST_POINTS)),

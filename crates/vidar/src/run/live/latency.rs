@@ -48,8 +48,6 @@ pub(in crate::run) struct SurfaceLatency {
     arrivals: BTreeMap<FrameId, Instant>,
     /// Keyframes without a surface.
     waiting: BTreeMap<FrameId, Instant>,
-    /// Keyframes that the last placement has, and the surface does not show yet.
-    placed: Vec<FrameId>,
     seconds: Vec<f32>,
 }
 
@@ -68,18 +66,14 @@ impl SurfaceLatency {
             MapEvent::World { .. } => {
                 // What was mapped before is void: its keyframes are selected again.
                 self.arrivals.append(&mut self.waiting);
-                self.placed.clear();
             }
             MapEvent::Keyframe(keyframe) => {
                 let frame = keyframe.stamp.frame_id;
                 self.waiting.extend(self.arrivals.get(&frame).map(|at| (frame, *at)));
             }
-            MapEvent::PlacementsRevised { placement, is_final: false } => {
-                self.placed = placement.views.iter().map(|v| v.frame_id).collect();
-            }
-            MapEvent::SurfaceChanged { is_final: false, .. } => {
-                for frame in std::mem::take(&mut self.placed) {
-                    let since = self.waiting.remove(&frame);
+            MapEvent::SurfaceChanged { shown, .. } => {
+                for frame in shown {
+                    let since = self.waiting.remove(frame);
                     self.seconds.extend(since.map(|at| now.duration_since(at).as_secs_f32()));
                 }
             }

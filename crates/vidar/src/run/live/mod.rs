@@ -5,8 +5,8 @@
 //!            (thread)  └▶ queue ─▶ engine: keyframes ─▶ predict ─▶ align ─▶ growing surface (map/so_far.ply)
 //! ```
 //!
-//! A recording that is replayed at its own rate does not wait. Where the map is behind, keyframes are taken farther apart, then
-//! none; where the odometry itself is, images are left to the IMU. All of it is said and counted. As fast as it goes, nothing is
+//! A recording that is replayed at its own rate does not wait. Where the map is behind, keyframes are no longer shown before their chunk
+//! is predicted, then taken farther apart, then none; where the odometry itself is, images are left to the IMU. All of it is said and counted. As fast as it goes, nothing is
 //! left out, and the result has the bits of `vidar run` on live poses.
 
 mod ending;
@@ -35,11 +35,15 @@ use ending::Ending;
 use pose_file::PoseFile;
 use queue::{Closing, Item, Queue};
 use serde::Serialize;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 use thinning::Thinning;
 use tracker::{Arrival, Counts, Tracker};
 use vidar_core::Warning;
 use vidar_dataset::DatasetError;
+
+/// Keyframes that wait longer than this for the map's thread get no preview: it would make the others wait still longer. About what a
+/// chunk takes, measured on two cores.
+const MOST_DELAY_OF_PREVIEWS: Duration = Duration::from_millis(500);
 
 /// How a live run goes.
 #[derive(Clone, Copy, Debug)]
@@ -173,7 +177,7 @@ pub(super) fn push(
         };
         let thread = std::thread::Builder::new().name("odometry".into()).spawn_scoped(scope, track);
         let thread = thread.map_err(|e| Error::io("start", "the odometry's thread".as_ref(), e))?;
-        let mapped = map(context, &queue, engine, readers);
+        let mapped = map((context, options.is_realtime), &queue, engine, readers);
         let tracked = thread.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic));
         // Where the map failed, the odometry only stopped.
         mapped.and(tracked)
@@ -219,7 +223,7 @@ fn track(
 
 /// The map's side: what is tracked into the engine, until the odometry ends.
 fn map(
-    context: &Context<'_>,
+    (context, is_realtime): (&Context<'_>, bool),
     queue: &Queue,
     engine: &mut Engine<'_>,
     readers: &mut Readers<'_>,
@@ -233,6 +237,7 @@ fn map(
                 images.iter().for_each(|(stamp, at)| readers.arrived(stamp.frame_id, *at));
                 let stamps: Vec<FrameStamp> = images.iter().map(|(stamp, _)| *stamp).collect();
                 let reports = report.into_iter().map(|report| *report).collect();
+                engine.preview_when_late(is_realtime && queue.load().delay < MOST_DELAY_OF_PREVIEWS);
                 engine.push_tracked(&stamps, reports, &mut |event| readers.read(event))?;
                 done += stamps.len();
                 // How long a stream goes on is not known.

@@ -183,7 +183,7 @@ impl LivePublisher {
                     self.put(Topic::Keyframe, pose_stamped(keyframe.stamp.time, WORLD, pose));
                 }
             }
-            MapEvent::SurfaceChanged { surface, is_final } => {
+            MapEvent::SurfaceChanged { surface, is_final, .. } => {
                 let mesh = &surface.mesh;
                 let cloud = thinned_vertices(mesh, MOST_POINTS);
                 let points: Vec<CloudPoint> = cloud.positions.into_iter().zip(cloud.colors).collect();

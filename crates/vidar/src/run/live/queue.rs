@@ -28,6 +28,17 @@ impl Item {
     }
 }
 
+/// What waits in the queue.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) struct Load {
+    /// Images.
+    pub images: usize,
+    /// Images, reports and warnings.
+    pub items: usize,
+    /// How long the first of them has waited.
+    pub delay: Duration,
+}
+
 /// The queue; both ends may close it.
 #[derive(Default)]
 pub(super) struct Queue {
@@ -37,7 +48,8 @@ pub(super) struct Queue {
 
 #[derive(Default)]
 struct Inner {
-    items: VecDeque<Item>,
+    /// With when each came.
+    items: VecDeque<(Item, Instant)>,
     images: usize,
     most_images: usize,
     is_closed: bool,
@@ -48,10 +60,11 @@ impl Queue {
         self.inner.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Images that wait, and items in all.
-    pub fn load(&self) -> (usize, usize) {
+    /// What waits.
+    pub fn load(&self) -> Load {
         let inner = self.lock();
-        (inner.images, inner.items.len())
+        let delay = inner.items.front().map_or(Duration::ZERO, |(_, since)| since.elapsed());
+        Load { images: inner.images, items: inner.items.len(), delay }
     }
 
     /// The most images that ever waited.
@@ -67,7 +80,7 @@ impl Queue {
         }
         inner.images += item.images();
         inner.most_images = inner.most_images.max(inner.images);
-        inner.items.push_back(item);
+        inner.items.push_back((item, Instant::now()));
         self.changed.notify_all();
         true
     }
@@ -88,7 +101,7 @@ impl Queue {
         while inner.items.is_empty() && !inner.is_closed {
             inner = self.changed.wait(inner).unwrap_or_else(PoisonError::into_inner);
         }
-        let item = inner.items.pop_front()?;
+        let (item, _) = inner.items.pop_front()?;
         inner.images -= item.images();
         self.changed.notify_all();
         Some(item)
@@ -133,14 +146,15 @@ mod tests {
         let queue = Queue::default();
         (0..CAPACITY as u32).for_each(|i| assert!(queue.push(image(i))));
         assert!(queue.push(image(9999)), "the queue never stops the odometry");
-        assert_eq!((queue.load().0, queue.most_images()), (CAPACITY + 1, CAPACITY + 1));
+        assert_eq!((queue.load().images, queue.most_images()), (CAPACITY + 1, CAPACITY + 1));
         let taken = std::thread::scope(|scope| {
             let waiting = scope.spawn(|| queue.push_waiting(image(1)) && queue.push_waiting(image(2)));
             let taken = (0..CAPACITY + 3).filter(|_| queue.pop().is_some()).count();
             assert!(waiting.join().unwrap());
             taken
         });
-        assert_eq!((taken, queue.load()), (CAPACITY + 3, (0, 0)));
+        let nothing = Load { images: 0, items: 0, delay: Duration::ZERO };
+        assert_eq!((taken, queue.load()), (CAPACITY + 3, nothing));
         assert_eq!(queue.most_images(), CAPACITY + 1, "who waits adds nothing above the bound");
     }
 

@@ -1,14 +1,15 @@
 //! What is left out where the map does not keep up: keyframes first, the odometry never.
 
-use super::queue::{CAPACITY, MOST_REPORTS};
+use super::queue::{CAPACITY, Load, MOST_REPORTS};
+use std::time::Duration;
 use vidar_align::keyframe_selection::{KeyframeConfig, KeyframeSelector};
 use vidar_core::{Se3, Warning};
 
-/// Images that wait when keyframes begin to be taken farther apart: half of the queue, 6 s at 20 Hz. Predicting a chunk takes less
-/// where the map keeps up at all.
-const THIN_FROM: usize = CAPACITY / 2;
-/// Images that wait when that ends.
-const THIN_UNTIL: usize = CAPACITY / 4;
+/// How long the first image has waited when keyframes begin to be taken farther apart. Half of the goal from keyframe to surface, 2 s; a
+/// chunk is predicted in a third of it where the map keeps up.
+const THIN_FROM: Duration = Duration::from_millis(1000);
+/// How long when that ends.
+const THIN_UNTIL: Duration = Duration::from_millis(300);
 /// Factor of their distance meanwhile. Stereo finds depth from keyframes twice as far apart; four times is a loss.
 const WIDENED: f64 = 2.0;
 
@@ -51,12 +52,13 @@ impl Thinning {
         }
     }
 
-    /// Looks at how many images wait; what there is to say if something begins to be left out.
-    pub fn observe(&mut self, waiting: usize) -> Option<Warning> {
+    /// Looks at what waits; what there is to say if something begins to be left out.
+    pub fn observe(&mut self, load: &Load) -> Option<Warning> {
         let before = self.mode;
-        self.mode = match (before, waiting) {
-            (_, CAPACITY..) => Mode::None,
-            (Mode::All, THIN_FROM..) | (Mode::Thin | Mode::None, THIN_UNTIL..) => Mode::Thin,
+        let most_delay = if before == Mode::All { THIN_FROM } else { THIN_UNTIL };
+        self.mode = match load {
+            Load { images: CAPACITY.., .. } => Mode::None,
+            Load { delay, .. } if *delay >= most_delay => Mode::Thin,
             _ => Mode::All,
         };
         let (text, kind) = match (before, self.mode) {
@@ -69,7 +71,7 @@ impl Thinning {
             }
             _ => return None,
         };
-        let message = format!("the map is behind, {waiting} images wait: {text}");
+        let message = format!("the map is {:.1} s behind: {text}", load.delay.as_secs_f64());
         let hint = "a smaller geometry.max_width_px, --preset fast, or a faster machine keeps up";
         Some(match self.mode {
             Mode::None => Warning::degraded(kind, message).hint(hint),
@@ -119,19 +121,21 @@ mod tests {
         let pass = |t: &mut Thinning, from: usize| {
             (from..from + 100).filter(|i| t.passes(Some(&at(*i as f64 * 0.051)))).count()
         };
-        assert!(thinning.observe(THIN_FROM - 1).is_none());
+        let load = |images, millis| Load { images, items: images, delay: Duration::from_millis(millis) };
+        assert!(thinning.observe(&load(30, 999)).is_none());
         assert_eq!(pass(&mut thinning, 0), 100, "who keeps up decides for itself");
-        assert_eq!(thinning.observe(THIN_FROM).unwrap().kind, "keyframes-thinned");
-        assert!(thinning.observe(THIN_FROM + 1).is_none());
+        assert_eq!(thinning.observe(&load(20, 1000)).unwrap().kind, "keyframes-thinned");
+        assert!(thinning.observe(&load(20, 1100)).is_none());
         assert_eq!(pass(&mut thinning, 100), 25, "of 50 keyframes that there would be");
         assert_eq!((thinning.thinned, thinning.dropped), (25, 0));
-        assert_eq!(thinning.observe(CAPACITY).unwrap().kind, "keyframes-dropped");
+        assert_eq!(thinning.observe(&load(CAPACITY, 9000)).unwrap().kind, "keyframes-dropped");
         assert_eq!(pass(&mut thinning, 200), 0);
         assert_eq!((thinning.thinned, thinning.dropped), (25, 50));
         // A little room is not yet room for all.
-        assert!(thinning.observe(CAPACITY - 1).is_none() && thinning.observe(THIN_UNTIL).is_none());
+        assert!(thinning.observe(&load(CAPACITY - 1, 8000)).is_none());
+        assert!(thinning.observe(&load(6, 300)).is_none());
         assert!(pass(&mut thinning, 300) < 30);
-        assert!(thinning.observe(THIN_UNTIL - 1).is_none());
+        assert!(thinning.observe(&load(5, 299)).is_none());
         assert_eq!(pass(&mut thinning, 400), 100);
     }
 

@@ -173,7 +173,7 @@ impl Tracker<'_> {
         if let Some(publisher) = self.publisher {
             publisher.pose(state, keyframe.as_deref());
             let left_out = self.counts.not_tracked + self.thinning.thinned + self.thinning.dropped;
-            publisher.health((self.queue.load().0, left_out));
+            publisher.health((self.queue.load().images, left_out));
         }
         let image = self.waiting.iter().find(|(stamp, _)| stamp.frame_id == state.frame_id);
         self.counts.seconds.extend(image.map(|(_, arrived)| arrived.elapsed().as_secs_f32()));
@@ -194,14 +194,14 @@ impl Tracker<'_> {
         let mut images: Vec<(FrameStamp, Instant)> = self.waiting.drain(..count).collect();
         let mut report = Some(Box::new(report));
         if self.arrival.is_stamped() {
-            let (waiting, items) = self.queue.load();
-            if let Some(warning) = self.thinning.observe(waiting) {
+            let load = self.queue.load();
+            if let Some(warning) = self.thinning.observe(&load) {
                 self.send(Item::Warning(warning));
             }
             if !self.thinning.passes(pose.as_ref()) {
                 images.clear();
             }
-            if !self.thinning.keeps_report(items, joins) {
+            if !self.thinning.keeps_report(load.items, joins) {
                 report = None;
                 images.clear();
             }
@@ -231,7 +231,7 @@ fn time_of(measurement: &Measurement) -> Timestamp {
 
 #[cfg(test)]
 mod tests {
-    use super::super::queue::{CAPACITY, MOST_REPORTS};
+    use super::super::queue::{CAPACITY, Load, MOST_REPORTS};
     use super::*;
     use crate::events::Events;
     use crate::run_folder::{OutputLocation, RunFolder};
@@ -261,7 +261,7 @@ mod tests {
             tracker.image(FrameStamp { frame_id: FrameId(i), time, camera: CameraId(0) }, Instant::now());
             assert!(tracker.deliver(PoseReport::NotPosed { time }).unwrap());
         }
-        let (images, items) = queue.load();
+        let Load { images, items, .. } = queue.load();
         assert!(images <= CAPACITY, "{images} images wait");
         // Warnings are few: one for each change of what is left out.
         assert!((MOST_REPORTS..MOST_REPORTS + 8).contains(&items), "{items} items wait");
