@@ -14,7 +14,7 @@ use std::collections::BTreeMap;
 use vidar_core::{AlignedView, FrameId, MetricDepth, PointCloud, Se3, Trajectory, TriangleMesh, Warning};
 use vidar_dataset::Recording;
 use vidar_eval::{
-    DepthAccumulator, DepthSummary, EvalError, PlacementStart, SampleDensity, SurfaceEvalConfig,
+    Coverage, DepthAccumulator, DepthSummary, EvalError, PlacementStart, SampleDensity, SurfaceEvalConfig,
     SurfaceReport, TrajectoryReport,
 };
 
@@ -66,10 +66,7 @@ pub fn evaluate(
             &truth,
             &config.eval.trajectory,
         ) {
-            Ok(report) => {
-                report.warnings.iter().for_each(|w| events.warn(w));
-                Some(report)
-            }
+            Ok(report) => Some(report),
             Err(e) => {
                 warn(what, e.to_string());
                 None
@@ -81,10 +78,15 @@ pub fn evaluate(
         match moved {
             Some(trajectory) => {
                 evaluation.trajectory = against_truth("poses of the map", &trajectory);
+                if let (Some(keyframes), Some(metric)) = (&mut evaluation.trajectory, &metric) {
+                    covered_as(keyframes, metric);
+                }
                 evaluation.metric_trajectory = metric;
             }
             None => evaluation.trajectory = metric,
         }
+        let reports = evaluation.metric_trajectory.iter().chain(&evaluation.trajectory);
+        reports.flat_map(|r| &r.warnings).for_each(|w| events.warn(w));
         if let Some(report) = &evaluation.trajectory {
             start = placement_start(report);
         }
@@ -113,6 +115,13 @@ pub fn evaluate(
     }
     evaluation.depth = map.depth_scores.score();
     Ok(evaluation)
+}
+
+/// Keyframes cover the time of the track that they were selected from: a camera that hardly moves has none for seconds.
+fn covered_as(keyframes: &mut TrajectoryReport, track: &TrajectoryReport) {
+    let estimate_ratio = keyframes.coverage.estimate_ratio;
+    keyframes.coverage = Coverage { estimate_ratio, ..track.coverage };
+    keyframes.warnings.retain(|w| w.kind != "low-coverage");
 }
 
 /// Pose of the estimate in the world of ground truth, by its trajectory.
@@ -163,5 +172,35 @@ impl DepthScorer {
     pub fn score(&self) -> Option<DepthScore> {
         let by_source = self.by_source.scores();
         self.measured.summary().map(|summary| DepthScore { summary, by_source })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use vidar_core::{BodyFrame, CameraId, LieGroup, StampedPose, Timestamp};
+
+    #[test]
+    fn keyframes_of_a_camera_that_rests_cover_what_its_track_covers() {
+        let along = |step: usize| {
+            let pose = |i: usize| {
+                let (secs, turn) = (i as f64 * 0.05, 0.2 * (i as f64 * 0.05).sin());
+                let rotation = vidar_core::So3::exp(&nalgebra::Vector3::new(0.0, 0.0, turn));
+                let at = nalgebra::Vector3::new(secs.sin(), secs.cos(), 0.3 * secs);
+                let time = Timestamp::from_nanos(i as i64 * 50_000_000);
+                StampedPose { time, world_from_body: Se3::new(rotation, at) }
+            };
+            let poses = (0..=200).step_by(step).map(pose).collect();
+            Trajectory::new(BodyFrame::Camera(CameraId(0)), poses).unwrap()
+        };
+        let truth = along(1);
+        let report =
+            |step| vidar_eval::evaluate_trajectory(&along(step), &truth, &Config::default().eval.trajectory);
+        let (track, mut keyframes) = (report(2).unwrap(), report(40).unwrap());
+        let is_low = |r: &TrajectoryReport| r.warnings.iter().any(|w| w.kind == "low-coverage");
+        assert!(is_low(&keyframes) && keyframes.coverage.truth_time_ratio == 0.0);
+        covered_as(&mut keyframes, &track);
+        assert!(!is_low(&keyframes) && keyframes.coverage.truth_time_ratio > 0.999);
+        assert_eq!((keyframes.coverage.estimate_ratio, keyframes.matched), (1.0, 6));
     }
 }
