@@ -297,6 +297,35 @@ fn memory_grows_by_a_few_kilobytes_per_view_and_no_more() {
     assert!(growth < 6000.0, "{growth} bytes per view");
 }
 
+/// Placements while chunks come: near what the whole estimate would be, and estimated far fewer times.
+#[test]
+fn a_provisional_placement_has_every_view_and_is_estimated_less_often_the_longer_it_is() {
+    let truth = laps(400, 4.0);
+    let mut noise = Noise::new(17);
+    let odometry = drifting(&truth, 0.01, &mut noise);
+    let mut aligner = Aligner::new(CouplingMode::Coupled, &AlignerConfig::default()).unwrap();
+    let (mut estimated, mut chunks) = (Vec::new(), 0);
+    for (k, range) in chunk_ranges(truth.len(), 12, 4).unwrap().into_iter().enumerate() {
+        let prediction = predict(&truth, range.frames.clone(), k as u32, REAL, &mut noise);
+        aligner.push(observe(prediction, Some(&odometry), none)).unwrap();
+        for candidate in aligner.loop_candidates() {
+            aligner.push_loop(&candidate, None).unwrap();
+        }
+        let provisional = aligner.provisional_placement();
+        chunks = k + 1;
+        assert_eq!(provisional.chunks.len(), chunks);
+        assert_eq!(provisional.views.len(), range.frames.end, "every view has a place");
+        let inside = provisional.graph.as_ref().unwrap().chunks;
+        assert!(inside + inside / 16 >= chunks, "{inside} of {chunks}");
+        estimated.push(inside);
+        let error = absolute_error(&provisional, &truth);
+        assert!(error < 0.25, "chunk {k}: {error} m");
+    }
+    estimated.dedup();
+    assert_eq!(estimated[..16], (1..=16).collect::<Vec<_>>(), "at first with every chunk");
+    assert!(estimated.len() < chunks * 3 / 4, "{} estimates for {chunks} chunks", estimated.len());
+}
+
 #[test]
 fn settings_out_of_range_are_named_and_modes_have_their_names() {
     let mut config = AlignerConfig::default();

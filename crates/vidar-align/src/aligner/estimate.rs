@@ -11,6 +11,7 @@ use std::collections::BTreeMap;
 use vidar_core::{FrameId, LieGroup, Se3, Sim3};
 
 /// Gauges of chunks and, where something other than their chunk determines them, poses of keyframes.
+#[derive(Clone, Debug)]
 pub(super) struct Estimate {
     /// `world_from_chunk` per chunk; `None` leaves the chunk out.
     pub chunks: Vec<Option<Sim3>>,
@@ -43,6 +44,21 @@ impl Estimate {
             failures: Vec::new(),
             loops: reports(loops),
         }
+    }
+}
+
+impl Estimate {
+    /// The same with the chunks that came since, each where it began, moved as the last estimated chunk was.
+    pub fn extended(&self, history: &History) -> Self {
+        let moved = |(place, chunk): (&Option<Sim3>, &Chunk)| Some((*place)? * chunk.initial?.inverse());
+        let correction = self.chunks.iter().zip(&history.chunks).rev().find_map(moved);
+        let since = &history.chunks[self.chunks.len()..];
+        let mut extended = self.clone();
+        let place =
+            |c: &Chunk| Some(correction.unwrap_or(Sim3::IDENTITY) * c.initial.filter(|_| c.is_usable())?);
+        extended.chunks.extend(since.iter().map(place));
+        extended.log_scale_std.extend(since.iter().map(|c| c.log_scale_std));
+        extended
     }
 }
 

@@ -77,6 +77,7 @@ use crate::AlignError;
 use crate::overlap::{SampledView, shared_views};
 use chunk::{Chunk, OverlapConstraint, sampled_views};
 use coupling::{Coupling, SharedFrames};
+use estimate::Estimate;
 use history::{History, LoopMeasurement};
 use loops::LoopSearch;
 use loops::checks::CheckedLoop;
@@ -93,7 +94,13 @@ pub struct Aligner {
     history: History,
     previous: PreviousChunk,
     search: LoopSearch,
+    /// What [`Aligner::provisional_placement`] estimated last.
+    latest: Option<Estimate>,
 }
+
+/// Share of more chunks that are there when a provisional placement is estimated anew. A graph with loops costs more than in proportion to
+/// its length: with an estimate after every chunk 377 chunks with a loop each took 1300 s (`bench/live_hour.py`, on a busy machine).
+const CHUNKS_PER_ESTIMATE: usize = 16;
 
 /// Geometry of the last usable chunk.
 #[derive(Debug, Default)]
@@ -117,6 +124,7 @@ impl Aligner {
             history: History::new(config.clone()),
             previous: PreviousChunk::default(),
             search: LoopSearch::default(),
+            latest: None,
         })
     }
 
@@ -249,14 +257,23 @@ impl Aligner {
         Ok(report)
     }
 
-    /// The placement from everything pushed so far.
-    pub fn placement_so_far(&self) -> Placement {
-        estimate::placement(self.mode, &self.history, self.coupling.estimate(&self.history))
+    /// A placement of all chunks so far for who watches them come. It is estimated anew once a sixteenth more chunks are there; those since
+    /// stand where they began, moved as the last estimated one was.
+    pub fn provisional_placement(&mut self) -> Placement {
+        let chunks = self.history.chunks.len();
+        let is_recent = |e: &Estimate| chunks <= e.chunks.len() + e.chunks.len() / CHUNKS_PER_ESTIMATE;
+        let estimate = match self.latest.take().filter(is_recent) {
+            Some(latest) => latest,
+            None => self.coupling.estimate(&self.history),
+        };
+        let placement = estimate::placement(self.mode, &self.history, estimate.extended(&self.history));
+        self.latest = Some(estimate);
+        placement
     }
 
-    /// The final placement.
+    /// The placement from everything that was pushed.
     pub fn finish(self) -> Placement {
-        self.placement_so_far()
+        estimate::placement(self.mode, &self.history, self.coupling.estimate(&self.history))
     }
 
     /// Bytes held, without allocator overhead.

@@ -12,7 +12,7 @@ use crate::error::Error;
 use std::collections::BTreeMap;
 use std::sync::Arc;
 use vidar_align::Placement;
-use vidar_core::{AlignedView, ChunkId, FrameId, Se3, Warning};
+use vidar_core::{AlignedView, ChunkId, FrameId, Warning};
 use vidar_fusion::{RevisedView, SubVolumeConfig, SubVolumes};
 
 /// Chunks whose volumes are kept in memory.
@@ -115,23 +115,22 @@ impl GrowingSurface {
 
     /// Moves every chunk with its keyframes.
     fn follow(&mut self, placement: &Placement) -> Result<(), Error> {
-        let chunks: Vec<ChunkId> = self.volumes.chunks().collect();
-        for chunk in chunks {
-            let moved: Vec<RevisedView> = self
-                .fused
-                .iter()
-                .filter(|(frame, _)| self.volumes.owner(**frame) == Some(chunk))
-                .filter_map(|(frame, scale)| {
-                    let now = placement.view(*frame)?;
-                    let (frame_id, world_from_camera): (FrameId, Se3) = (*frame, now.world_from_camera);
-                    // A frame whose depth comes from another chunk by now still constrains where this one is.
-                    let depth_factor = if now.owner == chunk { now.metres_per_unit / scale } else { 1.0 };
-                    Some(RevisedView { frame_id, world_from_camera, depth_factor })
-                })
-                .collect();
-            if !moved.is_empty() {
-                self.volumes.revise(chunk, &moved)?;
-            }
+        let mut moved = BTreeMap::<ChunkId, Vec<RevisedView>>::new();
+        for (frame, scale) in &self.fused {
+            let (Some(chunk), Some(now)) = (self.volumes.owner(*frame), placement.view(*frame)) else {
+                continue;
+            };
+            // A frame whose depth comes from another chunk by now still constrains where this one is.
+            let depth_factor = if now.owner == chunk { now.metres_per_unit / scale } else { 1.0 };
+            let world_from_camera = now.world_from_camera;
+            moved.entry(chunk).or_default().push(RevisedView {
+                frame_id: *frame,
+                world_from_camera,
+                depth_factor,
+            });
+        }
+        for (chunk, views) in moved {
+            self.volumes.revise(chunk, &views)?;
         }
         Ok(())
     }

@@ -443,7 +443,7 @@ impl<'a> Engine<'a> {
             events.push(MapEvent::LoopMeasured(world.aligner.push_loop(&candidate, together.as_ref())?));
         }
         if let Some(growing) = &mut self.growing {
-            let placement = Arc::new(world.aligner.placement_so_far());
+            let placement = Arc::new(world.aligner.provisional_placement());
             let stored = self.predictor.store.read(PredictionId::Chunk(id))?;
             let grown =
                 growing.grow(id, &placed_views(&placement, stored)?, &placement, self.predictor.store)?;

@@ -9,6 +9,7 @@ use super::track::Segment;
 use super::views::{Taken, ViewWindow};
 use super::{Engine, Sink};
 use crate::error::Error;
+use std::borrow::Cow;
 use std::ops::Range;
 use vidar_align::{AlignError, color_at_size};
 use vidar_core::{
@@ -21,10 +22,10 @@ const FEWEST_VIEWS: usize = 4;
 /// Finds which keyframes are due, and their depth.
 pub struct Preview<'a> {
     max_wait: Duration,
-    /// Chunks are this many keyframes, and see so many before them.
+    /// Keyframes of a chunk, and those that it sees before them.
     size: usize,
     context: usize,
-    /// Images are read as they look now; a chunk knows better how their rows were read, so it reads them itself.
+    /// Its own: what is known by now of how an image's rows were read is less than the chunk will know.
     window: ViewWindow<'a>,
     /// Keyframes before this one had their preview.
     done: usize,
@@ -33,7 +34,7 @@ pub struct Preview<'a> {
 }
 
 impl<'a> Preview<'a> {
-    /// None is due yet. `chunk` is how many keyframes a chunk has, and how many it sees before them.
+    /// None is due yet. A chunk has `size` keyframes and sees `context` before them.
     pub fn new(
         max_wait: Duration,
         (size, context): (usize, usize),
@@ -75,9 +76,9 @@ impl<'a> Preview<'a> {
     ) -> Result<Vec<(ChunkId, AlignedView)>, Error> {
         self.done = wanted.end;
         let seen = wanted.start.saturating_sub(self.context)..wanted.end;
-        let mut keyframes = keyframes[..wanted.end].to_vec();
+        let mut keyframes = Cow::Borrowed(&keyframes[..wanted.end]);
         if readout > Duration::ZERO {
-            for keyframe in &mut keyframes[seen.clone()] {
+            for keyframe in &mut keyframes.to_mut()[seen.clone()] {
                 keyframe.row_motion = track.row_motion(keyframe.stamp.frame_id, readout);
             }
         }

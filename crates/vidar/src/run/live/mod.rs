@@ -177,7 +177,7 @@ pub(super) fn push(
         };
         let thread = std::thread::Builder::new().name("odometry".into()).spawn_scoped(scope, track);
         let thread = thread.map_err(|e| Error::io("start", "the odometry's thread".as_ref(), e))?;
-        let mapped = map((context, options.is_realtime), &queue, engine, readers);
+        let mapped = map((context, options), &queue, engine, readers);
         let tracked = thread.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic));
         // Where the map failed, the odometry only stopped.
         mapped.and(tracked)
@@ -223,13 +223,15 @@ fn track(
 
 /// The map's side: what is tracked into the engine, until the odometry ends.
 fn map(
-    (context, is_realtime): (&Context<'_>, bool),
+    (context, options): (&Context<'_>, &LiveOptions),
     queue: &Queue,
     engine: &mut Engine<'_>,
     readers: &mut Readers<'_>,
 ) -> Result<(), Error> {
     let _closing = Closing(queue);
     let (total, mut done) = (context.dataset.images.len(), 0);
+    // Of a recording that is replayed as fast as it goes nobody sees the surface grow.
+    let is_watched = options.is_realtime || context.stream.is_some();
     while let Some(item) = queue.pop() {
         match item {
             Item::Warning(warning) => readers.read(MapEvent::Warning(warning))?,
@@ -237,7 +239,7 @@ fn map(
                 images.iter().for_each(|(stamp, at)| readers.arrived(stamp.frame_id, *at));
                 let stamps: Vec<FrameStamp> = images.iter().map(|(stamp, _)| *stamp).collect();
                 let reports = report.into_iter().map(|report| *report).collect();
-                engine.preview_when_late(is_realtime && queue.load().delay < MOST_DELAY_OF_PREVIEWS);
+                engine.preview_when_late(is_watched && queue.load().delay < MOST_DELAY_OF_PREVIEWS);
                 engine.push_tracked(&stamps, reports, &mut |event| readers.read(event))?;
                 done += stamps.len();
                 // How long a stream goes on is not known.
