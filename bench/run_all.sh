@@ -12,6 +12,7 @@
 #   DATA    folder with the real recordings euroc_MH_01_real_11s, hololens_commonroom, 7scenes_redkitchen
 #           (default ../shared/data)
 #   EUROC   folder with mav0/ per EuRoC sequence; ground truth suffices (default $DATA/euroc)
+#   TUMVI   folder with dataset-room1_512_16 and rooms 2, 4, 6; IMU and motion capture suffice (default $DATA/tumvi)
 #   OUT     folder of the results (default runs/bench-<commit>)
 #   FLIGHTS, ORDINARY   folders of rendered flights and of rendered hand-held recordings (default in OUT); what is there is not
 #           rendered again
@@ -25,6 +26,7 @@ cd "$(dirname "$0")/.."
 
 DATA=${DATA:-../shared/data}
 EUROC=${EUROC:-$DATA/euroc}
+TUMVI=${TUMVI:-$DATA/tumvi}
 PYTHON=${PYTHON:-python3}
 COMMIT=$(git rev-parse --short HEAD)
 OUT=${OUT:-runs/bench-$COMMIT}
@@ -102,6 +104,13 @@ maps() {
         step "map-redkitchen-$geometry" "$VIDAR" run "${redkitchen[@]}" --color-from-depth=$color_from_depth \
             --preset tum-rgbd --geometry "$geometry" -o "$OUT/runs/redkitchen-$geometry"
     done
+    # A rolling shutter of 28 ms.
+    local preset
+    for preset in fast:1001 slow:1002; do
+        step "synth-phone-${preset%:*}" "$VIDAR" synth "$OUT/phone-${preset%:*}" --preset "phone-${preset%:*}" --seed "${preset#*:}" \
+            --size 640x480 --frame-rate 20 --duration 12 --readout-ms 28 --stamp-delay-ms=20
+        step "map-phone-${preset%:*}" "$VIDAR" run "$OUT/phone-${preset%:*}" --geometry auto -o "$OUT/runs/phone-${preset%:*}"
+    done
     step map-mh01 "$VIDAR" run "$DATA/euroc_MH_01_real_11s" --preset euroc --set input.poses=ground-truth \
         -o "$OUT/runs/mh01"
 }
@@ -144,10 +153,17 @@ odometry() {
             --world-config "$OUT/flight$length.toml" --trajectory "$EUROC/$name/mav0/state_groundtruth_estimate0/data.csv"
         flights+=("$FLIGHTS/$name")
     done
-    step odometry-real "$EXAMPLES/evaluate" "$DATA/euroc_MH_01_real_11s"
-    step odometry-rendered "$EXAMPLES/evaluate" "${flights[@]}"
+    step odometry-real "$EXAMPLES/evaluate" --adjust "$DATA/euroc_MH_01_real_11s"
+    step odometry-rendered "$EXAMPLES/evaluate" --adjust "${flights[@]}"
     step odometry-noise "$EXAMPLES/evaluate" --image-noise 3.46 --imu-noise 2 "${flights[@]}"
     step odometry-mono "$EXAMPLES/evaluate" --mono "${flights[@]:0:6}"
+    local rooms=() room
+    for room in 1 2 4 6; do
+        [ -e "$ORDINARY-tumvi/room$room" ] || step "synth-room$room" "$PYTHON" bench/tumvi_real_imu.py \
+            "$TUMVI/dataset-room${room}_512_16" "$ORDINARY-tumvi/room$room" --seed "93$room" --begin 5 --vidar "$VIDAR"
+        rooms+=("$ORDINARY-tumvi/room$room")
+    done
+    step odometry-tumvi "$EXAMPLES/evaluate" --adjust "${rooms[@]}"
     step odometry-time "$EXAMPLES/evaluate" --repeat 3 --stages "$DATA/euroc_MH_01_real_11s" "${flights[3]}"
     step odometry-starts cargo test --release -p vidar-odometry --test starts -- --ignored --nocapture
     step odometry-ladder cargo test --release -p vidar-odometry --test ladder -- --include-ignored --nocapture
