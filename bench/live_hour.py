@@ -103,7 +103,7 @@ def resident_mb(pid):
     return int(match[1]) / 1024 if match else 0.0
 
 
-def watch(vidar, recording, out, rounds):
+def watch(vidar, recording, out):
     command = [vidar, "live", recording, "-o", out, "--json", "--progress", "off"]
     command += ["--set", "odometry.readout_ms=0", "--set", "output.depth_png=false", "--set", "output.images=false"]
     with open(out.with_suffix(".json"), "w") as result, open(out.with_suffix(".log"), "w") as events:
@@ -139,7 +139,7 @@ def main():
     recording = arguments.out / f"{rounds}-rounds"
     if not recording.exists():
         repeat(arguments.out / "round", recording, rounds)
-    watch(arguments.vidar, recording, arguments.out / f"live-{rounds}", rounds)
+    watch(arguments.vidar, recording, arguments.out / f"live-{rounds}")
 
 
 if __name__ == "__main__":

@@ -105,11 +105,12 @@ maps() {
             --preset tum-rgbd --geometry "$geometry" -o "$OUT/runs/redkitchen-$geometry"
     done
     # A rolling shutter of 28 ms.
-    local preset
-    for preset in fast:1001 slow:1002; do
-        step "synth-phone-${preset%:*}" "$VIDAR" synth "$OUT/phone-${preset%:*}" --preset "phone-${preset%:*}" --seed "${preset#*:}" \
-            --size 640x480 --frame-rate 20 --duration 12 --readout-ms 28 --stamp-delay-ms=20
-        step "map-phone-${preset%:*}" "$VIDAR" run "$OUT/phone-${preset%:*}" --geometry auto -o "$OUT/runs/phone-${preset%:*}"
+    local phone seed=1000
+    for phone in fast slow; do
+        seed=$((seed + 1))
+        step "synth-phone-$phone" "$VIDAR" synth "$OUT/phone-$phone" --preset "phone-$phone" --seed $seed --size 640x480 \
+            --frame-rate 20 --duration 12 --readout-ms 28 --stamp-delay-ms=20
+        step "map-phone-$phone" "$VIDAR" run "$OUT/phone-$phone" --geometry auto -o "$OUT/runs/phone-$phone"
     done
     step map-mh01 "$VIDAR" run "$DATA/euroc_MH_01_real_11s" --preset euroc --set input.poses=ground-truth \
         -o "$OUT/runs/mh01"

@@ -45,9 +45,7 @@ impl Estimate {
             loops: reports(loops),
         }
     }
-}
 
-impl Estimate {
     /// The same with the chunks that came since, each where it began, moved as the last estimated chunk was.
     pub fn extended(&self, history: &History) -> Self {
         let moved = |(place, chunk): (&Option<Sim3>, &Chunk)| Some((*place)? * chunk.initial?.inverse());

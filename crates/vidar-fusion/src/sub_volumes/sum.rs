@@ -32,7 +32,7 @@ impl Sum {
         self.placed.get(&chunk)
     }
 
-    /// Takes a chunk out whose volume is going to change.
+    /// Takes out what a chunk's volume added, if it did.
     pub fn remove(&mut self, chunk: ChunkId, source: &TsdfVolume) {
         if let Some(before) = self.placed.remove(&chunk) {
             blocks_at(source, &before, |blocks, free| self.volume.subtract_blocks(blocks, free));
@@ -42,12 +42,8 @@ impl Sum {
 
     /// Adds a chunk's volume at a place, or moves it there; together they have at most [`crate::grid::MAX_VIEWS`] views.
     pub fn set(&mut self, chunk: ChunkId, source: &TsdfVolume, now_from_fused: &Sim3) {
-        match self.placed.get(&chunk) {
-            Some(before) => {
-                blocks_at(source, before, |blocks, free| self.volume.subtract_blocks(blocks, free));
-            }
-            None => self.volume.count_views(source),
-        }
+        self.remove(chunk, source);
+        self.volume.count_views(source);
         blocks_at(source, now_from_fused, |blocks, free| {
             self.volume.add_blocks(blocks);
             self.volume.add_free_blocks(free);

@@ -36,8 +36,8 @@ pub fn placed_and_shaped(placement: &Placement, stored: StoredChunk) -> Result<V
     Ok(views)
 }
 
-/// The view where the alignment puts it, its depth in metres and corrected where landmarks support it.
-fn placed_view(
+/// The view where it is placed, its depth in metres and corrected where landmarks support it.
+pub(super) fn placed_view(
     view: ViewGeometry,
     time: Timestamp,
     place: &ViewPlacement,

@@ -4,6 +4,7 @@
 //! such keyframes before, by a prediction without those; the chunk replaces it. The map knows nothing of it.
 
 use super::events::MapKeyframe;
+use super::placed::placed_view;
 use super::setup::{GeometrySource, ImageSource};
 use super::track::Segment;
 use super::views::{Taken, ViewWindow};
@@ -11,7 +12,8 @@ use super::{Engine, Sink};
 use crate::error::Error;
 use std::borrow::Cow;
 use std::ops::Range;
-use vidar_align::{AlignError, color_at_size};
+use vidar_align::aligner::ViewPlacement;
+use vidar_align::color_at_size;
 use vidar_core::{
     AlignedView, CameraModel, ChunkId, ChunkViews, Duration, ModelError, Pinhole, Timestamp, ViewGeometry,
 };
@@ -90,7 +92,16 @@ impl<'a> Preview<'a> {
         let predicted = geometry.predict(&chunk, &masks, wanted, &|_| cancelled());
         let place = |view: ViewGeometry| {
             let at = chunk.views.iter().position(|v| v.frame_id == view.frame_id)?;
-            Some(placed(view, chunk_of(indices[at]), &chunk.views[at]))
+            let (image, owner) = (&chunk.views[at], chunk_of(indices[at]));
+            let place = ViewPlacement {
+                frame_id: view.frame_id,
+                owner,
+                world_from_camera: view.chunk_from_camera,
+                metres_per_unit: 1.0,
+                field: None,
+            };
+            let color = color_at_size(&image.image, view.intrinsics.width, view.intrinsics.height);
+            Some(placed_view(view, image.time, &place, Some(color)).map(|placed| (owner, placed)))
         };
         let views = match predicted {
             Ok(prediction) => prediction.geometry.views.into_iter().filter_map(place).collect(),
@@ -116,19 +127,4 @@ impl Engine<'_> {
         let views = preview.predict(geometry, self.cancelled, keyframes, seen, wanted)?;
         growing.preview(views, self.predictor.store)?.into_iter().try_for_each(&mut *sink)
     }
-}
-
-fn placed(
-    view: ViewGeometry,
-    chunk: ChunkId,
-    image: &vidar_core::ChunkView,
-) -> Result<(ChunkId, AlignedView), Error> {
-    let geometry = |source| AlignError::Geometry { chunk, source };
-    let (width, height) = (view.intrinsics.width, view.intrinsics.height);
-    let metres = view.depth.to_metric(1.0).map_err(geometry)?;
-    let pose = view.chunk_from_camera;
-    let placed = AlignedView::new(view.frame_id, image.time, pose, view.intrinsics, metres, view.confidence)
-        .and_then(|placed| placed.with_color(color_at_size(&image.image, width, height)))
-        .map_err(geometry)?;
-    Ok((chunk, placed))
 }
