@@ -1,12 +1,12 @@
 #!/usr/bin/env python3
 """Times Depth Anything 3 here against the official PyTorch code on one graphics processor, in turn, in one run.
 
-NOT YET RUN: no GPU was available. The first run is also the test of this script.
+Results of 26 November 2026 (NVIDIA H200): docs/benchmark/da3.md.
 
     cargo build --release -p vidar-da3 --features gpu --example time_da3 --example check
     target/release/examples/check --device gpu --precision f32 --on-demand .../small_v2_42x56_full.safetensors   # parity first
     python3 -m venv venv && venv/bin/pip install torch -r bench/requirements-da3.txt
-    venv/bin/pip install --no-deps depth-anything-3==0.1.1
+    venv/bin/pip install --no-deps depth-anything-3==0.1.1   # da3-giant also needs: pip install evo
     venv/bin/python bench/da3_gpu_vs_torch.py --ours target/release/examples/time_da3 --out da3-gpu.json
 
 Both sides run the network's forward pass on the same number of pixels, pixels from and depth to the machine's memory

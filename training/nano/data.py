@@ -101,18 +101,15 @@ class Scenes:
     pose9: Tensor
     scale: Tensor
 
-    def to(self, device: str) -> Scenes:
-        """A copy there."""
-        return Scenes(**{name: value.to(device) for name, value in vars(self).items()})
 
-
-def normalise(image: np.ndarray) -> Tensor:
+def normalise(image: np.ndarray, device: str = "cpu") -> Tensor:
     """u8 [B, S, H, W, 3] -> [B, S, 3, H, W]."""
-    tensor = torch.from_numpy(np.ascontiguousarray(image)).permute(0, 1, 4, 2, 3).float()
-    return (tensor / 255 - MEAN) / STD
+    # Bytes travel to the device, a quarter of what floats would be.
+    tensor = torch.from_numpy(np.ascontiguousarray(image)).to(device).permute(0, 1, 4, 2, 3).float()
+    return (tensor / 255 - MEAN.to(device)) / STD.to(device)
 
 
-def scenes(parts: list[tuple[Clip, list[int], bool]]) -> Scenes:
+def scenes(parts: list[tuple[Clip, list[int], bool]], device: str = "cpu") -> Scenes:
     """Scenes of the same size from clips, the views to take in their order, and whether to mirror."""
     images, depths, poses, focals = [], [], [], []
     for clip, views, mirrored in parts:
@@ -125,10 +122,10 @@ def scenes(parts: list[tuple[Clip, list[int], bool]]) -> Scenes:
         depths.append(depth)
         poses.append(pose)
         focals.append(np.tile(np.float32(clip.focal), (len(views), 1)))
-    depth = torch.from_numpy(np.ascontiguousarray(np.stack(depths))).float()
+    depth = torch.from_numpy(np.ascontiguousarray(np.stack(depths))).to(device).float()
     world_from_camera = homogeneous(torch.from_numpy(np.stack(poses)))
-    first_from_camera = (inverse(world_from_camera[:, :1]) @ world_from_camera).float()
-    focal = torch.from_numpy(np.stack(focals))
+    first_from_camera = (inverse(world_from_camera[:, :1]) @ world_from_camera).float().to(device)
+    focal = torch.from_numpy(np.stack(focals)).to(device)
     height, width = depth.shape[-2:]
     scale = gauge(depth, first_from_camera, focal)
     given = normalised_poses(first_from_camera)
@@ -136,26 +133,28 @@ def scenes(parts: list[tuple[Clip, list[int], bool]]) -> Scenes:
     first_from_camera = first_from_camera.clone()
     first_from_camera[..., :3, 3] /= scale[:, None, None]
     return Scenes(
-        normalise(np.stack(images)), depth / scale[:, None, None, None], first_from_camera, focal, pose9, scale
+        normalise(np.stack(images), device), depth / scale[:, None, None, None], first_from_camera, focal, pose9, scale
     )
 
 
 class Renderer:
-    """The renderer as a process, read by a thread into a bounded queue."""
+    """The renderer as a process for each list of arguments, read by a thread each into one bounded queue."""
 
-    def __init__(self, program: Path, arguments: list[str], ahead: int = 32) -> None:
-        # The renderer keeps to one thread; the trainer has the rest.
+    def __init__(self, program: Path, arguments: list[list[str]], ahead: int = 32) -> None:
+        # A renderer keeps to one thread; the trainer has the rest.
         environment = {"RAYON_NUM_THREADS": "1", "PATH": "/usr/bin:/bin"}
-        self.process = subprocess.Popen([str(program), *arguments], stdout=subprocess.PIPE, env=environment)
+        self.processes = [
+            subprocess.Popen([str(program), *own], stdout=subprocess.PIPE, env=environment) for own in arguments
+        ]
         self.queue: queue.Queue[Clip | None] = queue.Queue(ahead)
         self.stopped = False
-        threading.Thread(target=self._read, daemon=True).start()
+        for process in self.processes:
+            threading.Thread(target=self._read, args=(process.stdout,), daemon=True).start()
 
-    def _read(self) -> None:
-        assert self.process.stdout is not None
+    def _read(self, source: BinaryIO) -> None:
         while not self.stopped:
             try:
-                clip = read_clip(self.process.stdout)
+                clip = read_clip(source)
             except ValueError:
                 clip = None
             self.queue.put(clip)
@@ -163,13 +162,22 @@ class Renderer:
                 return
 
     def __iter__(self) -> Iterator[Clip]:
-        while (clip := self.queue.get()) is not None:
-            yield clip
+        ended = 0
+        while ended < len(self.processes):
+            clip = self.queue.get()
+            if clip is None:
+                ended += 1
+            else:
+                yield clip
 
     def stop(self) -> None:
-        """Ends the process."""
+        """Ends the processes."""
         self.stopped = True
-        self.process.terminate()
+        for process in self.processes:
+            process.terminate()
+
+
+ROOMS_APART = 1 << 20  # between the first rooms of two renderers
 
 
 class Pool:
@@ -185,7 +193,8 @@ class Pool:
         while len(self.clips) < count:
             clip = next(self.source)
             self.views += clip.image.shape[0]
-            self.rooms = max(self.rooms, (clip.seed & 0xFFFF_FFFF) + 1)
+            # Renderers are about as far as each other, each from its own first room.
+            self.rooms = max(self.rooms, (clip.seed & 0xFFFF_FFFF) % ROOMS_APART + 1)
             self.clips.append([clip, self.uses])
 
     def draw(self, count: int, wanted: tuple[int, int] | None = None, share: float = 1.0) -> list[Clip]:

@@ -99,7 +99,7 @@ def mean(networks: list[tuple[Nano, float]]) -> Nano:
 
 def trained(run: Path, which: str) -> tuple[Nano, dict]:
     """The network of a run (`ema` or `model`) and what else its state says."""
-    state = torch.load(run / "state.pt", weights_only=True)
+    state = torch.load(run / "state.pt", map_location="cpu", weights_only=True)
     model = Nano(from_dict(state["config"]))
     model.load_state_dict(state[which])
     return model.eval(), state

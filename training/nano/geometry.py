@@ -87,7 +87,7 @@ def rays_in_camera(focal: Tensor, height: int, width: int, rows: int, columns: i
     shape = (*focal.shape[:2], rows, columns)
     x = (xs / focal[..., None, None, 0]).expand(shape)
     y = (ys[:, None] / focal[..., None, None, 1]).expand(shape)
-    return torch.stack([x, y, torch.ones(shape, dtype=focal.dtype)], -1)
+    return torch.stack([x, y, torch.ones_like(x)], -1)
 
 
 def gauge(depth: Tensor, first_from_camera: Tensor, focal: Tensor) -> Tensor:

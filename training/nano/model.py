@@ -90,6 +90,10 @@ class Attention(nn.Module):
         if rope is not None:
             q, k = rotate(q, *rope), rotate(k, *rope)
         q, k, v = (t.to(v.dtype).transpose(1, 2) for t in (q, k, v))
+        self.logits = None
+        if x.is_cuda and not self.is_watched:
+            mixed = F.scaled_dot_product_attention(q, k, v)
+            return self.proj(mixed.transpose(1, 2).reshape(batch, tokens, dim))
         # On a CPU and for few tokens this is several times faster than `scaled_dot_product_attention`.
         logits = (q * q.shape[-1] ** -0.5) @ k.transpose(-1, -2)
         self.logits = logits if self.is_watched else None

@@ -1,10 +1,11 @@
 """Trains the network on endless rendered rooms; stops and goes on at any time.
 
     python -m nano.train --run RUN_FOLDER [--recipe recipe.json] [--stream stream_views]
-                         [--processes 2] [--threads 1] [--device cpu]
+                         [--processes 2] [--threads 1] [--renderers 1] [--device cpu]
 
 On a CPU let every core have a process of one thread: each works on scenes and with a renderer of its own, and gradients
-are averaged in shared memory. On a graphics processor one process is enough.
+are averaged in shared memory. On a graphics processor one process with a renderer on every other core is enough:
+`--device cuda --renderers 15`.
 
 `RUN_FOLDER/state.pt` holds everything that is needed to go on and is replaced every few minutes, and on SIGTERM, which
 ends training after the step under way; `train.csv` and
@@ -31,15 +32,14 @@ from torch import Tensor, nn
 
 from .augment import varied
 from .config import NATIVE, NanoConfig, from_dict
-from .data import Clip, Pool, Renderer, Scenes, clips_of, normalise, scenes
+from .data import ROOMS_APART, Clip, Pool, Renderer, Scenes, clips_of, normalise, scenes
 from .losses import WATCHED, total
 from .metrics import Tally, add_scenes
 from .model import Nano, whiten_patches
 from .optim import optimisers
 
 ROOT = Path(__file__).resolve().parents[1]
-ROOMS_APART = 1 << 20  # between the rooms of two processes
-MOST_CLIPS = 8  # that a process takes scenes from in one step
+MOST_CLIPS = 24  # that a process takes scenes from in one step
 
 
 @dataclass
@@ -149,12 +149,14 @@ class Trainer:
         device: str = "cpu",
         rank: int = 0,
         config: NanoConfig | None = None,
+        renderers: int = 1,
     ) -> None:
         self.run, self.recipe, self.stream, self.device, self.rank = run, recipe, stream, device, rank
+        self.renderers = renderers
         self.step, self.room, self.seconds, self.views_seen = 0, 0, 0.0, 0
         self.distinct_views = 0
         saved = run / "state.pt"
-        state = torch.load(saved, weights_only=True) if saved.exists() else None
+        state = torch.load(saved, map_location="cpu", weights_only=True) if saved.exists() else None
         self.config = from_dict(state["config"]) if state else config or NanoConfig()
         torch.manual_seed(1)
         self.model = Nano(self.config)
@@ -232,9 +234,9 @@ class Trainer:
         for k, clip in enumerate(clips):
             groups = wanted // len(clips) + (k < wanted % len(clips))
             parts.extend((clip, own, mirrored) for own, mirrored in self.split(len(clip.image), views, groups))
-        found = scenes(parts)
+        found = scenes(parts, self.device)
         found.images = varied(found.images, stage.augmented, self.rng)
-        return found.to(self.device), self.common_rng.random() < self.recipe.posed_share
+        return found, self.common_rng.random() < self.recipe.posed_share
 
     def split(self, available: int, views: int, wanted: int) -> list[tuple[list[int], bool]]:
         """At most `wanted` disjoint groups of views of a clip: neighbours or spread out, in random order, mirrored or
@@ -296,14 +298,13 @@ class Trainer:
         signal.signal(signal.SIGTERM, lambda *_: setattr(self, "asked", True))
         while (found := self.recipe.stage(self.step)) is not None and not self.stopping:
             begin, stage = found
-            # Each process has its own rooms.
-            first_room = self.room + self.rank * ROOMS_APART
             arguments = ["--sizes", stage.sizes, "--views", str(stage.views_per_clip)]
-            arguments += ["--clips", str(self.recipe.clips_per_room), "--first-room", str(first_room)]
-            arguments += ["--home-share", str(stage.home_share)]
-            renderer = Renderer(self.stream, arguments)
+            arguments += ["--clips", str(self.recipe.clips_per_room), "--home-share", str(stage.home_share)]
+            # Each renderer of each process has its own rooms.
+            first_rooms = [self.room + (self.rank * self.renderers + k) * ROOMS_APART for k in range(self.renderers)]
+            renderer = Renderer(self.stream, [[*arguments, "--first-room", str(room)] for room in first_rooms])
             pool = Pool(iter(renderer), 800 if stage.views_per_clip <= 8 else 400, self.recipe.clip_uses, self.rng)
-            print(f"step {self.step}: {stage}, rooms from {first_room}", flush=True)
+            print(f"step {self.step}: {stage}, rooms from {first_rooms}", flush=True)
             seen_before = self.distinct_views
             sums: dict[str, list[float]] = {}
             while self.step < stage.until_step and not self.stopping:
@@ -314,7 +315,7 @@ class Trainer:
                 terms["waited"] = waited
                 terms["took"] = time.monotonic() - tick
                 self.seconds += terms["took"]
-                self.room = max(self.room, pool.rooms - self.rank * ROOMS_APART)
+                self.room = max(self.room, pool.rooms)
                 self.distinct_views = seen_before + pool.views * self.team.processes
                 for name, value in terms.items():
                     sums.setdefault(name, []).append(value)
@@ -327,7 +328,7 @@ class Trainer:
                     append(self.run / "train.csv", row)
                     print(" ".join(f"{k} {v}" for k, v in row.items()), flush=True)
                     sums = {}
-                if self.step % validate_every == 0 and self.rank == 0:
+                if validate_every and self.step % validate_every == 0 and self.rank == 0:
                     self.validate()
                 if time.monotonic() - saved > save_every_secs and self.rank == 0:
                     self.save()
@@ -340,14 +341,16 @@ class Trainer:
         if self.stopping:
             print(f"stopped and saved at step {self.step}", flush=True)
             return
-        self.validate()
+        if validate_every:
+            self.validate()
         print(f"the recipe's last step is done after {time.monotonic() - began:.0f} s", flush=True)
 
 
 def trainer_of(arguments: argparse.Namespace, rank: int) -> Trainer:
     """The trainer of one process."""
     torch.set_num_threads(arguments.threads)
-    return Trainer(arguments.run, Recipe.read(arguments.recipe), arguments.stream, arguments.device, rank)
+    recipe = Recipe.read(arguments.recipe)
+    return Trainer(arguments.run, recipe, arguments.stream, arguments.device, rank, renderers=arguments.renderers)
 
 
 def work(rank: int, arguments: argparse.Namespace, team: Team) -> None:
@@ -392,9 +395,10 @@ def main() -> None:
     parser.add_argument("--stream", type=Path, default=ROOT.parent / "target/release/examples/stream_views")
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--processes", type=int, default=1)
+    parser.add_argument("--renderers", type=int, default=1, help="that each process takes its rooms from")
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--save-every", type=float, default=180.0, help="seconds")
-    parser.add_argument("--validate-every", type=int, default=500, help="steps")
+    parser.add_argument("--validate-every", type=int, default=500, help="steps; 0: never")
     arguments = parser.parse_args()
     arguments.run.mkdir(parents=True, exist_ok=True)
     # The first makes what all need (sample clips) before the others look for it.

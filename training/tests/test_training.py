@@ -17,10 +17,10 @@ import torch
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from nano.anatomy import beyond_plane, cells, parts, read_linearly  # noqa: E402
-from nano.augment import repainted, varied  # noqa: E402
+from nano.augment import compressed, photographed, repainted, shaded, varied  # noqa: E402
 from nano.begin import tapped, trainable, widened  # noqa: E402
 from nano.config import NanoConfig  # noqa: E402
-from nano.data import Clip, Pool, read_clip, scenes, write_clip  # noqa: E402
+from nano.data import Clip, Pool, Renderer, read_clip, scenes, write_clip  # noqa: E402
 from nano.evaluate import softened  # noqa: E402
 from nano.export import exported, imported, mean  # noqa: E402
 from nano.filters import smooth  # noqa: E402
@@ -411,7 +411,7 @@ def test_a_step_takes_its_scenes_from_many_clips(tmp_path):
         count, views = batch.depth.shape[:2]
         seen.add(views)
         assert count == {1: 32, 3: 10, 8: 4, 16: 2}[views]
-        assert len({c.number for c in drawn[-1]}) == min(count, 8)
+        assert len({c.number for c in drawn[-1]}) == min(count, 24)
     assert seen == {1, 3, 8, 16}
 
 
@@ -463,6 +463,32 @@ def test_a_share_of_the_scenes_look_different_and_their_views_alike() -> None:
         ratio = (a / b)[inside]
         assert 0 <= min(a.min(), b.min()) and max(a.max(), b.max()) <= 1
         assert ratio.numel() == 0 or ratio.max() - ratio.min() < 1e-3
+
+
+def test_a_small_camera_keeps_the_picture_and_treats_its_views_alike() -> None:
+    y, x = torch.meshgrid(torch.linspace(0, 6, 30), torch.linspace(0, 9, 44), indexing="ij")
+    one = (0.5 + 0.2 * torch.sin(x + torch.tensor([0.0, 1, 2])[:, None, None]) * torch.cos(y)).expand(2, 3, 30, 44)
+    assert torch.allclose(compressed(one, 1e-6), one, atol=1e-4), "without rounding it is its own inverse"
+    coarse = (compressed(one, 0.01) - one).abs()
+    assert 0.001 < coarse.mean() < 0.02
+    dark = shaded(torch.ones(1, 3, 30, 44), random.Random(1))
+    assert dark[..., 15, 22].min() > 0.99 and 0.3 < dark[..., 0, 0].min() < dark[..., 0, 0].max() < 0.96
+    changed = [photographed(one, random.Random(seed)) for seed in range(40)]
+    assert all(0 <= c.min() and c.max() <= 1 for c in changed)
+    # Noise alone tells two views of the same picture apart.
+    assert all((c[0] - c[1]).abs().mean() < 0.03 for c in changed)
+    assert all((c - one).mean((0, 1))[10:20, 15:30].abs().mean() < 0.06 for c in changed)
+    assert sum(torch.equal(c, one) for c in changed) < 8, "seldom is nothing done"
+
+
+def test_a_pool_has_the_clips_of_all_renderers(tmp_path: Path) -> None:
+    program = tmp_path / "stream"
+    body = tmp_path / "clip.bin"
+    with body.open("wb") as out:
+        write_clip(clip(), out)
+    program.write_text(f"#!/bin/sh\ncat {body} {body}\n")
+    program.chmod(0o755)
+    assert len(list(Renderer(program, [[], [], []]))) == 6
 
 
 def test_softening_blurs_pictures_alone() -> None:

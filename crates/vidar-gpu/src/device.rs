@@ -5,7 +5,7 @@ use crate::error::GpuError;
 use crate::kernel::{IMMEDIATES, Kernel, Layouts};
 use std::collections::HashMap;
 use std::fmt;
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
 
 /// What stands behind an adapter.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
@@ -88,10 +88,15 @@ const WORKGROUP_BYTES: u32 = 16 << 10;
 /// Invocations of the largest workgroup.
 const INVOCATIONS: u32 = 256;
 
-fn instance() -> wgpu::Instance {
-    let mut descriptor = wgpu::InstanceDescriptor::new_without_display_handle();
-    descriptor.backends = wgpu::Backends::VULKAN | wgpu::Backends::METAL | wgpu::Backends::DX12;
-    wgpu::Instance::new(descriptor)
+/// The driver's instance, one for the process and never given back: with one for each device, two of six test programs
+/// that opened and closed devices in several threads hung in NVIDIA's Vulkan driver 580.159 (H200).
+fn instance() -> &'static wgpu::Instance {
+    static INSTANCE: OnceLock<wgpu::Instance> = OnceLock::new();
+    INSTANCE.get_or_init(|| {
+        let mut descriptor = wgpu::InstanceDescriptor::new_without_display_handle();
+        descriptor.backends = wgpu::Backends::VULKAN | wgpu::Backends::METAL | wgpu::Backends::DX12;
+        wgpu::Instance::new(descriptor)
+    })
 }
 
 fn enumerate(instance: &wgpu::Instance) -> Vec<(Adapter, wgpu::Adapter)> {
@@ -125,7 +130,7 @@ fn describe(adapter: &wgpu::Adapter) -> Adapter {
 
 /// All devices of this machine, the best first.
 pub fn adapters() -> Vec<Adapter> {
-    enumerate(&instance()).into_iter().map(|(adapter, _)| adapter).collect()
+    enumerate(instance()).into_iter().map(|(adapter, _)| adapter).collect()
 }
 
 /// The adapter that options name, without opening it.
@@ -133,7 +138,7 @@ pub fn adapters() -> Vec<Adapter> {
 /// # Errors
 /// [`GpuError::NoAdapter`] when there is none of the kind asked for.
 pub fn find(options: &GpuOptions) -> Result<Adapter, GpuError> {
-    choose(options, enumerate(&instance())).map(|(adapter, _)| adapter)
+    choose(options, enumerate(instance())).map(|(adapter, _)| adapter)
 }
 
 fn choose(
@@ -157,7 +162,7 @@ impl Gpu {
     /// [`GpuError::NoAdapter`] when there is none of the kind asked for, [`GpuError::Unsuitable`] when it lacks something,
     /// [`GpuError::NotOpened`] when the driver refuses.
     pub fn open(options: &GpuOptions) -> Result<Self, GpuError> {
-        let (adapter, raw) = choose(options, enumerate(&instance()))?;
+        let (adapter, raw) = choose(options, enumerate(instance()))?;
         let limits = required_limits(&adapter, &raw)?;
         let not_opened = |reason: String| GpuError::NotOpened { adapter: adapter.name.clone(), reason };
         let (device, queue) = pollster::block_on(raw.request_device(&wgpu::DeviceDescriptor {
