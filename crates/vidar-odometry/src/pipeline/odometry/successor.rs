@@ -1,9 +1,11 @@
 //! Another clock, readout or rotation of the camera while there is a state: a second odometry catches up with them over the last
-//! seconds, and its state then goes on in the same world.
+//! seconds, and its state then goes on in the same world. It works beside the first one, in turns whose results are due at instants
+//! that the recording decides, so that no image waits for it longer than for its own.
 
 use super::{Odometry, Phase, Status};
 use crate::bundle_adjustment::TrackLog;
 use crate::config::OdometryConfig;
+use crate::deferred::Deferred;
 use crate::pipeline::health::HealthMonitor;
 use crate::pipeline::output::LossReason;
 use crate::pipeline::time_calibration::Correction;
@@ -18,10 +20,16 @@ const REPLAY_FRAMES: usize = 100;
 /// IMU measurements kept before the oldest image, s: clocks differ by 0.15 s at most, and half a second shows a body at rest.
 const IMU_BEFORE_SECS: f64 = 0.7;
 
-/// Images that the second odometry works on per new one, so that it catches up without making any image wait for long: more where
-/// neither has a state, which costs an image a fifth.
-const IMAGES_A_TURN: usize = 3;
-const IMAGES_A_TURN_BEFORE_START: usize = 6;
+/// Time of the recording until the result of a turn is taken over, s, and how much of what waits a turn works on: three times as
+/// much, so that it catches up, and six times where neither odometry has a state. A turn of fewer images than these ends with the
+/// next image.
+const TURN_SECS: f64 = 0.1;
+const CAUGHT_UP_A_TURN_SECS: f64 = 0.3;
+const CAUGHT_UP_BEFORE_START_SECS: f64 = 0.6;
+const SHORT_TURN: usize = 6;
+
+/// So few images are worked on at once, without another thread.
+const AT_ONCE: usize = 1;
 
 /// After this long without a state of the second odometry the first one gives its own up, s.
 const PATIENCE_SECS: f64 = 6.0;
@@ -71,45 +79,86 @@ impl RecentFrames {
 /// The second odometry.
 #[derive(Debug)]
 pub(super) struct Successor {
-    odometry: Box<Odometry>,
-    /// Images that it has not worked on.
-    waiting: VecDeque<RecentFrame>,
+    /// Between its turns.
+    catch_up: Option<Box<CatchUp>>,
+    turn: Option<Deferred<Box<CatchUp>>>,
+    /// What came during a turn.
+    samples: Vec<ImuSample>,
+    images: Vec<RecentFrame>,
     correction: Correction,
     since: Timestamp,
 }
 
-impl Successor {
-    pub fn add_imu(&mut self, sample: ImuSample) {
-        // What the first odometry took, this one takes: their buffers hold the same.
-        let _ = self.odometry.imu.push(sample);
+/// The second odometry itself and the images that it has not worked on.
+#[derive(Debug)]
+struct CatchUp {
+    odometry: Odometry,
+    waiting: VecDeque<RecentFrame>,
+}
+
+impl CatchUp {
+    fn has_state(&self) -> bool {
+        matches!(self.odometry.phase, Phase::Tracking(_))
     }
 
-    /// Works on some of the images that wait.
-    fn catch_up(&mut self, first_is_initializing: bool) {
-        for done in 0..IMAGES_A_TURN_BEFORE_START {
-            let has_state = !first_is_initializing || matches!(self.odometry.phase, Phase::Tracking(_));
-            if has_state && done >= IMAGES_A_TURN {
-                return;
-            }
-            let Some(RecentFrame { id, frame, .. }) =
-                self.waiting.pop_front_if(|f| self.odometry.is_ready(&f.frame))
-            else {
-                return;
+    /// Works on the images that wait, up to a stretch of the recording that is longer where neither odometry has a state.
+    fn run(&mut self, first_has_state: bool) {
+        let Some(begin) = self.waiting.front().map(|f| f.frame.time) else { return };
+        loop {
+            let has_state = first_has_state || self.has_state();
+            let secs = if has_state { CAUGHT_UP_A_TURN_SECS } else { CAUGHT_UP_BEFORE_START_SECS };
+            let is_next = |f: &mut RecentFrame| {
+                (f.frame.time - begin).as_secs_f64() < secs && self.odometry.is_ready(&f.frame)
             };
+            let Some(RecentFrame { id, frame, .. }) = self.waiting.pop_front_if(is_next) else { return };
             self.odometry.next_frame = id.0;
             self.odometry.process(frame);
         }
     }
 
-    /// Whether it has worked on all images whose IMU measurements are there.
-    fn is_up_to_date(&self) -> bool {
-        !self.waiting.front().is_some_and(|f| self.odometry.is_ready(&f.frame))
+    /// Images that wait and whose IMU measurements are there.
+    fn ready(&self) -> usize {
+        self.waiting.iter().take_while(|f| self.odometry.is_ready(&f.frame)).count()
     }
 
     /// The newest image that it has a pose of.
     fn newest_pose(&self) -> Option<(FrameId, Se3)> {
         let Phase::Tracking(window) = &self.odometry.phase else { return None };
         window.smoother.newest().map(|(id, _, state)| (id, state.world_from_body))
+    }
+}
+
+impl Successor {
+    pub fn add_imu(&mut self, sample: ImuSample) {
+        self.samples.push(sample);
+    }
+
+    /// The second odometry where its turn is over, with what came meanwhile and what it can do of it at once.
+    fn between_turns(&mut self, now: Timestamp, first_has_state: bool) -> Option<&CatchUp> {
+        if let Some(turn) = self.turn.take_if(|turn| turn.is_due(now)) {
+            self.catch_up = turn.result();
+        }
+        let catch_up = self.catch_up.as_mut()?;
+        for sample in self.samples.drain(..) {
+            // What the first odometry took, this one takes: their buffers hold the same.
+            let _ = catch_up.odometry.imu.push(sample);
+        }
+        catch_up.waiting.extend(self.images.drain(..));
+        if catch_up.ready() <= AT_ONCE {
+            catch_up.run(first_has_state);
+        }
+        Some(catch_up)
+    }
+
+    /// Begins another turn where the last one is over.
+    fn go_on(&mut self, now: Timestamp, first_has_state: bool) {
+        let Some(mut catch_up) = self.catch_up.take_if(|c| c.ready() > 0) else { return };
+        let is_short = catch_up.ready() < SHORT_TURN;
+        let due = if is_short { now } else { now + Duration::from_secs_f64(TURN_SECS) };
+        self.turn = Some(Deferred::begin(due, move || {
+            catch_up.run(first_has_state);
+            catch_up
+        }));
     }
 }
 
@@ -130,9 +179,11 @@ impl Odometry {
         let camera = (self.camera_id, camera);
         let odometry = Self::fresh(config, camera, self.working.another(), self.imu_model, self.imu.clone());
         self.successor = Some(Successor {
+            catch_up: Some(Box::new(CatchUp { odometry, waiting: self.recent.frames.clone() })),
+            turn: None,
+            samples: Vec::new(),
+            images: Vec::new(),
             since: newest.frame.time,
-            odometry: Box::new(odometry),
-            waiting: self.recent.frames.clone(),
             correction: *correction,
         });
         true
@@ -156,20 +207,24 @@ impl Odometry {
             }
             return None;
         };
-        let waited_secs = (newest.frame.time - successor.since).as_secs_f64();
+        let now = newest.frame.time;
+        let waited_secs = (now - successor.since).as_secs_f64();
         if waited_secs > 0.0 {
-            successor.waiting.push_back(newest);
+            successor.images.push(newest);
         }
-        let is_initializing = matches!(self.phase, Phase::Initializing(_));
-        successor.catch_up(is_initializing);
-        match successor.newest_pose().filter(|_| successor.is_up_to_date()) {
-            Some((at, new)) => {
+        let has_state = matches!(self.phase, Phase::Tracking(_));
+        let up_to_date = successor.between_turns(now, has_state).filter(|c| c.ready() == 0);
+        match up_to_date.map(CatchUp::newest_pose) {
+            Some(Some((at, new))) => {
                 let old = self.recent.pose(at);
                 self.go_on_with(successor, old.map(|old| level_motion(&old, &new)));
             }
-            None if is_initializing && successor.is_up_to_date() => self.go_on_with(successor, None),
-            None if waited_secs < PATIENCE_SECS => self.successor = Some(successor),
-            None => return self.correct(&successor.correction),
+            Some(None) if !has_state => self.go_on_with(successor, None),
+            _ if waited_secs < PATIENCE_SECS => {
+                successor.go_on(now, has_state);
+                self.successor = Some(successor);
+            }
+            _ => return self.correct(&successor.correction),
         }
         None
     }
@@ -177,7 +232,8 @@ impl Odometry {
     /// Takes the second odometry's state over; `world_from_new` leads from its world to that of the segment.
     fn go_on_with(&mut self, successor: Successor, world_from_new: Option<Se3>) {
         let correction = successor.correction;
-        let new = *successor.odometry;
+        let Some(catch_up) = successor.catch_up else { return };
+        let new = catch_up.odometry;
         let reason = LossReason::Recalibrated {
             time_offset_ms: 1e3 * correction.offset_secs,
             readout_ms: 1e3 * correction.readout_secs,
