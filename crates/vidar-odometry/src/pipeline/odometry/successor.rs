@@ -20,12 +20,14 @@ const REPLAY_FRAMES: usize = 100;
 /// IMU measurements kept before the oldest image, s: clocks differ by 0.15 s at most, and half a second shows a body at rest.
 const IMU_BEFORE_SECS: f64 = 0.7;
 
-/// Time of the recording until the result of a turn is taken over, s, and how much of what waits a turn works on: three times as
-/// much, so that it catches up, and six times where neither odometry has a state. A turn of fewer images than these ends with the
-/// next image.
+/// Time of the recording until the result of a turn is taken over, s, and how much of what waits a turn works on, so that the second
+/// odometry catches up: with a state, without one while the first has one, and where neither has. An attempt to start takes up to
+/// 0.4 s on one core, for which the images of a first odometry that has a state do not wait; a turn of few images ends with the next.
 const TURN_SECS: f64 = 0.1;
-const CAUGHT_UP_A_TURN_SECS: f64 = 0.3;
-const CAUGHT_UP_BEFORE_START_SECS: f64 = 0.6;
+const STARTING_TURN_SECS: f64 = 0.5;
+const CAUGHT_UP_SECS: f64 = 0.3;
+const CAUGHT_UP_STARTING_SECS: f64 = 0.9;
+const CAUGHT_UP_BEFORE_ANY_STATE_SECS: f64 = 0.6;
 const SHORT_TURN: usize = 6;
 
 /// So few images are worked on at once, without another thread.
@@ -101,12 +103,15 @@ impl CatchUp {
         matches!(self.odometry.phase, Phase::Tracking(_))
     }
 
-    /// Works on the images that wait, up to a stretch of the recording that is longer where neither odometry has a state.
+    /// Works on the images that wait, up to a stretch of the recording.
     fn run(&mut self, first_has_state: bool) {
         let Some(begin) = self.waiting.front().map(|f| f.frame.time) else { return };
         loop {
-            let has_state = first_has_state || self.has_state();
-            let secs = if has_state { CAUGHT_UP_A_TURN_SECS } else { CAUGHT_UP_BEFORE_START_SECS };
+            let secs = match (first_has_state, self.has_state()) {
+                (_, true) => CAUGHT_UP_SECS,
+                (true, false) => CAUGHT_UP_STARTING_SECS,
+                (false, false) => CAUGHT_UP_BEFORE_ANY_STATE_SECS,
+            };
             let is_next = |f: &mut RecentFrame| {
                 (f.frame.time - begin).as_secs_f64() < secs && self.odometry.is_ready(&f.frame)
             };
@@ -153,8 +158,12 @@ impl Successor {
     /// Begins another turn where the last one is over.
     fn go_on(&mut self, now: Timestamp, first_has_state: bool) {
         let Some(mut catch_up) = self.catch_up.take_if(|c| c.ready() > 0) else { return };
-        let is_short = catch_up.ready() < SHORT_TURN;
-        let due = if is_short { now } else { now + Duration::from_secs_f64(TURN_SECS) };
+        let secs = match catch_up.ready() < SHORT_TURN {
+            true => 0.0,
+            false if first_has_state && !catch_up.has_state() => STARTING_TURN_SECS,
+            false => TURN_SECS,
+        };
+        let due = now + Duration::from_secs_f64(secs);
         self.turn = Some(Deferred::begin(due, move || {
             catch_up.run(first_has_state);
             catch_up
