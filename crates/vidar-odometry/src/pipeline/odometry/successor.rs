@@ -158,10 +158,10 @@ impl Successor {
     /// Begins another turn where the last one is over.
     fn go_on(&mut self, now: Timestamp, first_has_state: bool) {
         let Some(mut catch_up) = self.catch_up.take_if(|c| c.ready() > 0) else { return };
-        let secs = match catch_up.ready() < SHORT_TURN {
-            true => 0.0,
-            false if first_has_state && !catch_up.has_state() => STARTING_TURN_SECS,
-            false => TURN_SECS,
+        let secs = match catch_up.ready() {
+            _ if first_has_state && !catch_up.has_state() => STARTING_TURN_SECS,
+            0..SHORT_TURN => 0.0,
+            _ => TURN_SECS,
         };
         let due = now + Duration::from_secs_f64(secs);
         self.turn = Some(Deferred::begin(due, move || {
