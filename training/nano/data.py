@@ -19,6 +19,7 @@ from torch import Tensor
 from .geometry import gauge, homogeneous, inverse, normalised_poses, pose_vector
 
 MAGIC = b"VIDARCL1"
+ROOMS_APART = 1 << 20  # between the first rooms of two renderers
 HEAD = struct.Struct("<8sQIIII4f")
 MEAN = torch.tensor([0.485, 0.456, 0.406]).view(1, 1, 3, 1, 1)
 STD = torch.tensor([0.229, 0.224, 0.225]).view(1, 1, 3, 1, 1)
@@ -175,9 +176,6 @@ class Renderer:
         self.stopped = True
         for process in self.processes:
             process.terminate()
-
-
-ROOMS_APART = 1 << 20  # between the first rooms of two renderers
 
 
 class Pool:

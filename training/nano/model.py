@@ -93,12 +93,12 @@ class Attention(nn.Module):
         self.logits = None
         if x.is_cuda and not self.is_watched:
             mixed = F.scaled_dot_product_attention(q, k, v)
-            return self.proj(mixed.transpose(1, 2).reshape(batch, tokens, dim))
-        # On a CPU and for few tokens this is several times faster than `scaled_dot_product_attention`.
-        logits = (q * q.shape[-1] ** -0.5) @ k.transpose(-1, -2)
-        self.logits = logits if self.is_watched else None
-        weights = torch.softmax(logits, -1)
-        mixed = weights.to(v.dtype) @ v
+        else:
+            # On a CPU and for few tokens this is several times faster than `scaled_dot_product_attention`.
+            logits = (q * q.shape[-1] ** -0.5) @ k.transpose(-1, -2)
+            if self.is_watched:
+                self.logits = logits
+            mixed = torch.softmax(logits, -1).to(v.dtype) @ v
         return self.proj(mixed.transpose(1, 2).reshape(batch, tokens, dim))
 
 

@@ -1,6 +1,6 @@
 //! Another clock, readout or rotation of the camera while there is a state: a second odometry catches up with them over the last
 //! seconds, and its state then goes on in the same world. It works beside the first one, in turns whose results are due at instants
-//! that the recording decides, so that no image waits for it longer than for its own.
+//! that the recording decides: an image waits for it only where a turn is not done when it is due.
 
 use super::{Odometry, Phase, Status};
 use crate::bundle_adjustment::TrackLog;
