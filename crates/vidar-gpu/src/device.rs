@@ -1,81 +1,23 @@
-//! Adapters and open devices.
+//! Open devices.
 
+use crate::adapter::{Adapter, GpuOptions, chosen};
 use crate::buffer::{Account, Buffer, FLOAT};
 use crate::error::GpuError;
 use crate::kernel::{IMMEDIATES, Kernel, Layouts};
-use std::collections::HashMap;
-use std::fmt;
-use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
+use std::collections::{BTreeMap, HashMap};
+use std::sync::{Arc, Mutex, PoisonError};
 
-/// What stands behind an adapter.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
-pub enum AdapterKind {
-    /// A processor with memory of its own.
-    Discrete,
-    /// A processor that shares the machine's memory.
-    Integrated,
-    /// Lent by a host to a virtual machine.
-    Virtual,
-    /// Nobody says.
-    Unknown,
-    /// Shaders run on the CPU: for tests, slower than this project's own CPU kernels.
-    Software,
-}
-
-/// A device that could be opened.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Adapter {
-    /// Its place in the list, by which it can be asked for.
-    pub index: usize,
-    /// Its name.
-    pub name: String,
-    /// What stands behind it.
-    pub kind: AdapterKind,
-    /// The interface: vulkan, metal, dx12.
-    pub interface: String,
-    /// The driver and its version.
-    pub driver: String,
-}
-
-/// As people are told of it: name, kind, interface and driver.
-impl fmt::Display for Adapter {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Self { name, kind, interface, driver, .. } = self;
-        write!(f, "{name} ({kind}, {interface}, {driver})")
-    }
-}
-
-impl fmt::Display for AdapterKind {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(match self {
-            Self::Discrete => "discrete",
-            Self::Integrated => "integrated",
-            Self::Virtual => "virtual",
-            Self::Unknown => "of unknown kind",
-            Self::Software => "software: shaders run on the CPU",
-        })
-    }
-}
-
-/// Which device, and how much of it.
-#[derive(Debug, Clone, Default, PartialEq, Eq)]
-pub struct GpuOptions {
-    /// A place in [`adapters`], software included; `None` is the best that is no software.
-    pub adapter: Option<usize>,
-    /// Bytes of device memory that may be held at a time; `None` is whatever the device gives.
-    pub memory_limit: Option<u64>,
-}
-
-/// An open device; cheap to clone.
+/// An open device with an account of its own of what is held; cheap to clone.
 #[derive(Clone)]
 pub struct Gpu {
     pub(crate) shared: Arc<Shared>,
+    pub(crate) account: Arc<Account>,
 }
 
+/// The driver's device, its compiled kernels, and what went wrong on it.
 pub(crate) struct Shared {
     pub device: wgpu::Device,
     pub queue: wgpu::Queue,
-    pub account: Arc<Account>,
     pub limits: wgpu::Limits,
     pub layouts: Layouts,
     adapter: Adapter,
@@ -88,82 +30,26 @@ const WORKGROUP_BYTES: u32 = 16 << 10;
 /// Invocations of the largest workgroup.
 const INVOCATIONS: u32 = 256;
 
-/// The driver's instance, one for the process and never given back: with one for each device, two of six test programs
-/// that opened and closed devices in several threads hung in NVIDIA's Vulkan driver 580.159 (H200).
-fn instance() -> &'static wgpu::Instance {
-    static INSTANCE: OnceLock<wgpu::Instance> = OnceLock::new();
-    INSTANCE.get_or_init(|| {
-        let mut descriptor = wgpu::InstanceDescriptor::new_without_display_handle();
-        descriptor.backends = wgpu::Backends::VULKAN | wgpu::Backends::METAL | wgpu::Backends::DX12;
-        wgpu::Instance::new(descriptor)
-    })
-}
-
-fn enumerate(instance: &wgpu::Instance) -> Vec<(Adapter, wgpu::Adapter)> {
-    let found = pollster::block_on(instance.enumerate_adapters(wgpu::Backends::all()));
-    let mut all: Vec<(Adapter, wgpu::Adapter)> = found.into_iter().map(|a| (describe(&a), a)).collect();
-    // Stable: the driver's order within a kind.
-    all.sort_by_key(|(adapter, _)| adapter.kind);
-    for (index, (adapter, _)) in all.iter_mut().enumerate() {
-        adapter.index = index;
-    }
-    all
-}
-
-fn describe(adapter: &wgpu::Adapter) -> Adapter {
-    let info = adapter.get_info();
-    let kind = match info.device_type {
-        wgpu::DeviceType::DiscreteGpu => AdapterKind::Discrete,
-        wgpu::DeviceType::IntegratedGpu => AdapterKind::Integrated,
-        wgpu::DeviceType::VirtualGpu => AdapterKind::Virtual,
-        wgpu::DeviceType::Cpu => AdapterKind::Software,
-        wgpu::DeviceType::Other => AdapterKind::Unknown,
-    };
-    Adapter {
-        index: 0,
-        name: info.name,
-        kind,
-        interface: info.backend.to_string(),
-        driver: format!("{} {}", info.driver, info.driver_info).trim().to_owned(),
+/// The open devices of the process, by the place of their adapter. They are shared and never closed: programs of twelve
+/// threads, each with a device of its own, hung in NVIDIA's Vulkan driver 580.159 (H200) in 17 of 21 runs, all waiting for
+/// one that closed its device; with one thread none of 10 did.
+fn opened(adapter: Adapter, raw: &wgpu::Adapter) -> Result<Arc<Shared>, GpuError> {
+    static OPENED: Mutex<BTreeMap<usize, Arc<Shared>>> = Mutex::new(BTreeMap::new());
+    let mut opened = OPENED.lock().unwrap_or_else(PoisonError::into_inner);
+    // A device that failed is left to those who have it.
+    match opened.get(&adapter.index).filter(|shared| shared.adapter == adapter && shared.check().is_ok()) {
+        Some(shared) => Ok(Arc::clone(shared)),
+        None => {
+            let (index, shared) = (adapter.index, Arc::new(Shared::open(adapter, raw)?));
+            opened.insert(index, Arc::clone(&shared));
+            Ok(shared)
+        }
     }
 }
 
-/// All devices of this machine, the best first.
-pub fn adapters() -> Vec<Adapter> {
-    enumerate(instance()).into_iter().map(|(adapter, _)| adapter).collect()
-}
-
-/// The adapter that options name, without opening it.
-///
-/// # Errors
-/// [`GpuError::NoAdapter`] when there is none of the kind asked for.
-pub fn find(options: &GpuOptions) -> Result<Adapter, GpuError> {
-    choose(options, enumerate(instance())).map(|(adapter, _)| adapter)
-}
-
-fn choose(
-    options: &GpuOptions,
-    mut all: Vec<(Adapter, wgpu::Adapter)>,
-) -> Result<(Adapter, wgpu::Adapter), GpuError> {
-    let wanted = match options.adapter {
-        Some(index) => (index < all.len()).then_some(index),
-        None => all.iter().position(|(a, _)| a.kind != AdapterKind::Software),
-    };
-    match wanted {
-        Some(index) => Ok(all.swap_remove(index)),
-        None => Err(no_adapter(options, &all)),
-    }
-}
-
-impl Gpu {
-    /// Opens a device.
-    ///
-    /// # Errors
-    /// [`GpuError::NoAdapter`] when there is none of the kind asked for, [`GpuError::Unsuitable`] when it lacks something,
-    /// [`GpuError::NotOpened`] when the driver refuses.
-    pub fn open(options: &GpuOptions) -> Result<Self, GpuError> {
-        let (adapter, raw) = choose(options, enumerate(instance()))?;
-        let limits = required_limits(&adapter, &raw)?;
+impl Shared {
+    fn open(adapter: Adapter, raw: &wgpu::Adapter) -> Result<Self, GpuError> {
+        let limits = required_limits(&adapter, raw)?;
         let not_opened = |reason: String| GpuError::NotOpened { adapter: adapter.name.clone(), reason };
         let (device, queue) = pollster::block_on(raw.request_device(&wgpu::DeviceDescriptor {
             label: Some("vidar"),
@@ -176,17 +62,31 @@ impl Gpu {
         .map_err(|error| not_opened(error.to_string()))?;
         let failure = Arc::new(Mutex::new(None));
         listen(&device, &adapter, &failure);
-        let shared = Shared {
+        Ok(Self {
             layouts: Layouts::new(&device),
-            account: Arc::new(Account::new(options.memory_limit)),
             limits,
             adapter,
             pipelines: Mutex::new(HashMap::new()),
             failure,
             device,
             queue,
-        };
-        Ok(Self { shared: Arc::new(shared) })
+        })
+    }
+
+    fn check(&self) -> Result<(), GpuError> {
+        self.failure.lock().unwrap_or_else(PoisonError::into_inner).clone().map_or(Ok(()), Err)
+    }
+}
+
+impl Gpu {
+    /// Opens a device, or shares it if the process has it open. The account of bytes is the caller's own; a failure of the device is everybody's.
+    ///
+    /// # Errors
+    /// [`GpuError::NoAdapter`] when there is none of the kind asked for, [`GpuError::Unsuitable`] when it lacks something,
+    /// [`GpuError::NotOpened`] when the driver refuses.
+    pub fn open(options: &GpuOptions) -> Result<Self, GpuError> {
+        let (adapter, raw) = chosen(options)?;
+        Ok(Self { shared: opened(adapter, &raw)?, account: Arc::new(Account::new(options.memory_limit)) })
     }
 
     /// Which device this is.
@@ -194,19 +94,19 @@ impl Gpu {
         &self.shared.adapter
     }
 
-    /// Bytes held in buffers now.
+    /// Bytes held in buffers of this opening now.
     pub fn held_bytes(&self) -> u64 {
-        self.shared.account.held()
+        self.account.held()
     }
 
-    /// The most bytes held in buffers at a time since the device was opened or [`Gpu::reset_peak`] was called.
+    /// The most bytes held in buffers of this opening at a time, since it or since [`Gpu::reset_peak`] was called.
     pub fn peak_bytes(&self) -> u64 {
-        self.shared.account.peak()
+        self.account.peak()
     }
 
     /// Starts measuring [`Gpu::peak_bytes`] anew.
     pub fn reset_peak(&self) {
-        self.shared.account.reset_peak();
+        self.account.reset_peak();
     }
 
     /// The most bytes that one buffer may have.
@@ -219,7 +119,7 @@ impl Gpu {
     /// # Errors
     /// [`GpuError::OverBudget`].
     pub fn allows(&self, what: &str, bytes: u64) -> Result<(), GpuError> {
-        self.shared.account.allows(what, bytes)
+        self.account.allows(what, bytes)
     }
 
     /// A buffer of `len` numbers, of no certain content.
@@ -245,14 +145,7 @@ impl Gpu {
     /// # Errors
     /// [`GpuError::Lost`], [`GpuError::OutOfMemory`] or [`GpuError::Refused`].
     pub fn check(&self) -> Result<(), GpuError> {
-        match self.failure().clone() {
-            Some(error) => Err(error),
-            None => Ok(()),
-        }
-    }
-
-    fn failure(&self) -> MutexGuard<'_, Option<GpuError>> {
-        self.shared.failure.lock().unwrap_or_else(PoisonError::into_inner)
+        self.shared.check()
     }
 
     /// Waits until all submitted work is done.
@@ -306,26 +199,6 @@ impl Gpu {
         let pipeline = Arc::new(pipeline);
         pipelines.insert(kernel.name.clone(), Arc::clone(&pipeline));
         Ok(pipeline)
-    }
-}
-
-fn no_adapter(options: &GpuOptions, all: &[(Adapter, wgpu::Adapter)]) -> GpuError {
-    let names: Vec<String> = all.iter().map(|(a, _)| a.to_string()).collect();
-    let advice = if all.is_empty() {
-        "Install the graphics driver with its Vulkan part, or compute on the CPU".to_owned()
-    } else if options.adapter.is_some() {
-        "Name one of these by its place, counted from 0".to_owned()
-    } else {
-        "These run shaders on the CPU: name one by its place to use it all the same, or compute on the CPU"
-            .to_owned()
-    };
-    GpuError::NoAdapter {
-        wanted: match options.adapter {
-            Some(index) => format!("number {index}"),
-            None => "that is no software".to_owned(),
-        },
-        found: if names.is_empty() { "none".to_owned() } else { names.join(", ") },
-        advice,
     }
 }
 
@@ -385,7 +258,7 @@ impl Buffer {
         if bytes > most {
             return Err(GpuError::BufferTooLarge { what: what.to_owned(), bytes, adapter: adapter(), most });
         }
-        let account = &gpu.shared.account;
+        let account = &gpu.account;
         let held = account.held();
         account.take(what, bytes)?;
         let scope = gpu.shared.device.push_error_scope(wgpu::ErrorFilter::OutOfMemory);

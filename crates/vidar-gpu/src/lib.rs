@@ -13,6 +13,7 @@
 #![cfg(feature = "device")]
 #![forbid(unsafe_code)]
 
+mod adapter;
 mod buffer;
 mod device;
 mod error;
@@ -21,8 +22,9 @@ pub mod ops;
 mod recorder;
 mod weight;
 
+pub use adapter::{Adapter, AdapterKind, GpuOptions, adapters, find};
 pub use buffer::Buffer;
-pub use device::{Adapter, AdapterKind, Gpu, GpuOptions, adapters, find};
+pub use device::Gpu;
 pub use error::GpuError;
 pub use recorder::Recorder;
 pub use weight::{Matrix, Storage};

@@ -5,9 +5,13 @@ use crate::device::Gpu;
 use crate::error::GpuError;
 use crate::kernel::{IMMEDIATES, Kernel};
 use std::sync::mpsc;
+use std::time::Duration;
 
 /// Submissions that may be under way before the next one waits.
 const IN_FLIGHT: usize = 2;
+/// Until memory that the device is done with must be mapped: another thread that waits for the device can have taken the message
+/// and not yet passed it on.
+const MAPPED_WITHIN: Duration = Duration::from_secs(10);
 
 /// Takes operations in order; [`Recorder::submit`] sends them off. Few submissions are under way at a time, so that a run
 /// can be stopped between them.
@@ -135,7 +139,7 @@ impl Recorder {
         });
         self.gpu.wait()?;
         self.under_way.clear();
-        match told.try_recv() {
+        match told.recv_timeout(MAPPED_WITHIN) {
             Ok(Ok(())) => {}
             Ok(Err(reason)) => return Err(self.gpu.refused(reason)),
             Err(_) => return Err(self.gpu.refused("memory was not mapped".to_owned())),

@@ -42,6 +42,24 @@ fn bytes_are_counted_and_bounded() {
 }
 
 #[test]
+fn openings_of_a_device_share_it_and_count_their_own_bytes() {
+    let Some(first) = any_device() else { return };
+    let second = any_device().unwrap();
+    let held = first.buffer("first", 512).unwrap();
+    assert_eq!((first.held_bytes(), second.held_bytes()), (2048, 0));
+    // Only one device's buffers can stand in one product.
+    let weight = common::numbers(1, 16 * 16);
+    let matrix = Matrix::new(&second, "w", &weight, None, [16, 16], Storage::F32).unwrap();
+    held.write(&second, 0, &common::numbers(2, 512));
+    let out = second.buffer("y", 32 * 16).unwrap();
+    let mut recorder = Recorder::new(&second);
+    product_into(&mut recorder, &held, 32, &matrix, &out, End::Gelu).unwrap();
+    assert!(recorder.read(&out, 0, 32 * 16).unwrap().iter().any(|value| *value != 0.0));
+    drop(held);
+    assert_eq!(first.held_bytes(), 0);
+}
+
+#[test]
 fn a_buffer_larger_than_the_device_binds_is_refused_before_it_is_made() {
     let Some(gpu) = any_device() else { return };
     let said =
