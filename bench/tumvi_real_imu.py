@@ -85,11 +85,11 @@ def clock_offset(mocap_secs, poses, imu_secs, gyro):
     spline = RotationSpline(mocap_secs, Rotation.from_quat(poses[:, [4, 5, 6, 3]]))
     captured = np.linalg.norm(slow(spline(grid, 1), FIT_SECS), axis=1)
 
-    def misfit(offset):
+    def residual(offset):
         sensed = np.stack([np.interp(grid + offset, imu_secs, gyro[:, k]) for k in range(3)], 1)
         return float(((np.linalg.norm(slow(sensed, FIT_SECS), axis=1) - captured) ** 2).mean())
 
-    return min(np.arange(-0.02, 0.02, 0.00025), key=misfit)
+    return min(np.arange(-0.02, 0.02, 0.00025), key=residual)
 
 
 def fused_path(mocap_secs, poses, imu_secs, gyro, accel):

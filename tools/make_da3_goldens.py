@@ -4,8 +4,8 @@
     python3 tools/make_da3_goldens.py crates/vidar-da3/tests/data
 
 Needs numpy only. It shares no code with the Rust side: convolutions are sums of shifted products, attention is the full
-matrix, position and ray maths are written out again. Weights and pictures are made by rule (weights/deterministic.rs
-has the same rule), so the files hold inputs, intermediate results and outputs only.
+matrix, position and ray maths are written out again. Weights and pictures are synthetic (weights/synthetic.rs
+has the same formula), so the files hold inputs, intermediate results and outputs only.
 """
 import json
 import math

@@ -40,7 +40,8 @@ def trainable(model: Nano) -> Nano:
 @torch.no_grad()
 def widened(model: Nano, channels: tuple[int, int, int, int]) -> Nano:
     """The same network with as many or several times as many channels at each of the head's four levels; the new ones
-    are made from the features at random and nobody listens to them yet, so that it answers as before."""
+    are projected from the features at random; the layers after them have weights of zero for them, so that the
+    output is the same."""
     few = model.config.out_channels
     if any(b % a for a, b in zip(few, channels, strict=True)):
         raise ValueError(f"channels can stay or become several times as many: {few} cannot become {channels}")
@@ -62,8 +63,8 @@ def widened(model: Nano, channels: tuple[int, int, int, int]) -> Nano:
 
 @torch.no_grad()
 def tapped(model: Nano, layers: tuple[int, int, int, int], images: Tensor) -> Nano:
-    """The same network with a head that reads other blocks: its projections become those that hear about what they
-    heard before, by least squares over pictures [B, S, 3, H, W]."""
+    """The same network with a head that reads other blocks: its projections are fitted to give what they
+    gave before, by least squares over pictures [B, S, 3, H, W]."""
     other = Nano(replace(model.config, out_layers=layers))
     other.load_state_dict(model.state_dict())
     before, after = (
@@ -77,10 +78,10 @@ def tapped(model: Nano, layers: tuple[int, int, int, int], images: Tensor) -> Na
         if layers[k] == model.config.out_layers[k]:
             continue
         project = other.head.projects[k]
-        heard = before[k] @ project.weight.flatten(1).T.double() + project.bias
+        target = before[k] @ project.weight.flatten(1).T.double() + project.bias
         known = torch.cat([after[k], torch.ones_like(after[k][:, :1])], 1)
         # Some features are the same twice over: of all answers the smallest.
-        found = torch.linalg.lstsq(known, heard, rcond=1e-4, driver="gelsd").solution
+        found = torch.linalg.lstsq(known, target, rcond=1e-4, driver="gelsd").solution
         project.weight.copy_(found[:-1].T.view_as(project.weight))
         project.bias.copy_(found[-1])
     return other

@@ -2,7 +2,7 @@
 
     python -m nano.golden --out ../crates/vidar-da3/tests/data/nano [--model ../models/da3-nano]
 
-Without `--model` the weights are made by rule, the same on both sides, so that the files need no checkpoint.
+Without `--model` the weights are synthetic, the same on both sides, so that the files need no checkpoint.
 """
 
 from __future__ import annotations

@@ -8,11 +8,13 @@ use std::fmt;
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Severity {
-    /// The result is what was asked for; the user should know this about the input or the way it was made.
+    /// The result is what such an input gives; the user should know this about the input or the way it was made. That includes what
+    /// sound recordings lack as well (images before the odometry starts, keyframes without parallax, metres without an IMU), and what
+    /// is provisional.
     #[default]
     Info,
-    /// A part of the result is missing, or it was made in a weaker way than asked for. A run that raised one ends as
-    /// degraded (exit code 3).
+    /// A part of the result that sound recordings have is missing, or it was made in a weaker way than asked for. A run that raised
+    /// one ends as degraded (exit code 3).
     Degraded,
 }
 

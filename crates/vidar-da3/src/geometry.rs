@@ -92,7 +92,7 @@ impl Da3Model {
         Ok(Self { network, config, info, place_layer: None, place_tokens: Vec::new() })
     }
 
-    /// From now on keeps the tokens by which a place can be told again ([`Da3Model::take_place_tokens`]): those of the last
+    /// From now on keeps the tokens by which a place is recognised ([`Da3Model::take_place_tokens`]): those of the last
     /// block before attention across views, so that an image's do not depend on what it was seen with.
     pub fn keep_place_tokens(&mut self) {
         let backbone = &self.network.config().main().backbone;

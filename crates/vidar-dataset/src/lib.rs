@@ -42,7 +42,7 @@ mod video;
 mod wrong_thing;
 
 pub use ahead::ImagesAhead;
-pub use arriving::{Arrival, Arrivals, ArrivingRecording, OPENING};
+pub use arriving::{Arrival, Arrivals, Arrived, ArrivingRecording, OPENING};
 pub use camera_flag::{CameraFlag, with_size};
 pub use checks::{gain_error_at_rest, specific_force_at_rest};
 pub use error::DatasetError;

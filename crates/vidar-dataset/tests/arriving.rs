@@ -8,7 +8,7 @@ use std::path::Path;
 use vidar_bag::write::{McapWriter, encode};
 use vidar_bag::{CameraInfo, FrameTransform, Header, ImuMessage, Message, Pose, RawImage};
 use vidar_core::{FrameImage, SensorEvent, Timestamp};
-use vidar_dataset::{Arrival, ArrivingRecording, CalibrationSource, DatasetError, OpenOptions, Recording};
+use vidar_dataset::{Arrived, ArrivingRecording, CalibrationSource, DatasetError, OpenOptions, Recording};
 
 const MS: i64 = 1_000_000;
 const START: i64 = 1_700_000_000_000 * MS;
@@ -19,6 +19,11 @@ fn header(at: i64, frame: &str) -> Header {
 
 /// Four seconds of a camera at 20 Hz and an IMU at 200 Hz as a driver logs them: images 40 ms after their stamps.
 fn recorded() -> Vec<u8> {
+    recorded_with(|_| {})
+}
+
+/// The same with something changed.
+fn recorded_with(change: impl Fn(&mut Vec<(i64, &str, Message)>)) -> Vec<u8> {
     let mut messages: Vec<(i64, &str, Message)> = Vec::new();
     let pose = Pose { position: [0.1, 0.0, 0.0], orientation: [0.0, 0.0, 0.0, 1.0] };
     let mount = FrameTransform { parent: header(0, "imu"), child: "cam".into(), pose };
@@ -55,6 +60,7 @@ fn recorded() -> Vec<u8> {
         messages.push((at + 40 * MS, "/cam/camera_info", Message::CameraInfo(Box::new(info))));
     }
     messages.sort_by_key(|(at, ..)| *at);
+    change(&mut messages);
     let mut writer = McapWriter::new(Vec::new(), "test").unwrap();
     let mut channels = std::collections::BTreeMap::new();
     for (at, topic, message) in &messages {
@@ -88,9 +94,9 @@ fn arrived(bytes: Vec<u8>, piece: usize, kept: &Path, options: &OpenOptions) -> 
     let (mut arrivals, mut measured) = (stream.arrivals().unwrap(), Vec::new());
     assert!(stream.arrivals().is_none());
     while let Some(arrival) = arrivals.next(&|| true) {
-        measured.push(match arrival {
-            Arrival::Imu(sample) => (sample.time, None),
-            Arrival::Image(entry, image) => (entry.time, Some((entry.frame_id.0, image.unwrap()))),
+        measured.push(match arrival.what {
+            Arrived::Imu(sample) => (sample.time, None),
+            Arrived::Image(entry, image) => (entry.time, Some((entry.frame_id.0, image.unwrap()))),
         });
     }
     Ok(Came { facts, measured, stream })
@@ -146,6 +152,97 @@ fn a_part_is_selected_as_of_a_file() {
     };
     assert_eq!(images(&came.measured), images(&expected));
     assert_eq!(images(&expected).len(), 7);
+}
+
+/// Moves the stamps of an IMU sample and of an image.
+fn restamped(messages: &mut [(i64, &str, Message)], moved: impl Fn(i64) -> i64) {
+    for (_, _, message) in messages {
+        let header = match message {
+            Message::Imu(sample) => &mut sample.header,
+            Message::Image(image) => &mut image.header,
+            _ => continue,
+        };
+        header.stamp = Timestamp::from_nanos(START + moved(header.stamp.nanos() - START));
+    }
+}
+
+#[test]
+fn a_stamp_far_ahead_is_left_out_and_what_comes_behind_it_is_not() {
+    let folder = tempfile::tempdir().unwrap();
+    let kept = folder.path().join("recording.mcap");
+    let hour = 3600 * 1000 * MS;
+    // One sample and one image an hour ahead, after the opening.
+    let wrong = |at: i64| if at == 3000 * MS || at == 3001 * MS { at + hour } else { at };
+    let bytes = recorded_with(|messages| restamped(messages, wrong));
+    let Came { measured, stream, .. } = arrived(bytes, 4096, &kept, &OpenOptions::default()).unwrap();
+    let expected = arrived(recorded(), 4096, &folder.path().join("right.mcap"), &OpenOptions::default());
+    let left: Vec<Timestamp> = expected.unwrap().measured.iter().map(|(time, _)| *time).collect();
+    let right = |time: &Timestamp| ![3000 * MS, 3001 * MS].contains(&(time.nanos() - START));
+    let times: Vec<Timestamp> = measured.iter().map(|(time, _)| *time).collect();
+    assert_eq!(times, left.into_iter().filter(right).collect::<Vec<_>>());
+    let warnings = stream.take_warnings();
+    assert_eq!(warnings.len(), 2, "{warnings:?}");
+    assert!(warnings.iter().all(|w| w.message.starts_with("1 ")), "{warnings:?}");
+    // An image is read again by its place in the stream, also behind one that is left out.
+    let whole = stream.whole().unwrap();
+    let last = measured.iter().rev().find_map(|(time, image)| Some((*time, image.clone()?))).unwrap();
+    assert_eq!(stream.load_image(vidar_core::FrameId(last.1.0), last.0).unwrap(), last.1.1);
+    assert_eq!(whole.images.len(), 80);
+    // A pause is none: what comes after it goes on.
+    let bytes = recorded_with(|m| restamped(m, |at| if at > 3000 * MS { at + hour } else { at }));
+    let Came { measured, stream, .. } = arrived(bytes, 4096, &kept, &OpenOptions::default()).unwrap();
+    assert_eq!((measured.len(), stream.take_warnings().len()), (880, 0));
+}
+
+#[test]
+fn a_clock_that_is_set_back_ends_the_recording_and_it_says_so() {
+    let folder = tempfile::tempdir().unwrap();
+    let kept = folder.path().join("recording.mcap");
+    let bytes = recorded_with(|m| restamped(m, |at| if at > 2700 * MS { at - 100_000 * MS } else { at }));
+    let Came { measured, stream, .. } = arrived(bytes, 4096, &kept, &OpenOptions::default()).unwrap();
+    assert!(measured.iter().all(|(time, _)| time.nanos() <= START + 2700 * MS));
+    assert_eq!(measured.len(), 541 + 54);
+    let warnings = stream.take_warnings();
+    assert!(warnings.iter().any(|w| w.kind == "clock-set-back"), "{warnings:?}");
+}
+
+/// A stream that stands still after its bytes.
+struct Standing(std::io::Cursor<Vec<u8>>);
+
+impl Read for Standing {
+    fn read(&mut self, into: &mut [u8]) -> std::io::Result<usize> {
+        let count = self.0.read(into)?;
+        while count == 0 {
+            std::thread::park();
+        }
+        Ok(count)
+    }
+}
+
+#[test]
+fn samples_behind_an_image_do_not_wait_for_the_next_one() {
+    let folder = tempfile::tempdir().unwrap();
+    let plain = unchunked(&recorded());
+    let cut = plain[..plain.len() * 4 / 5].to_vec();
+    let (kept, options) = (folder.path().join("recording.mcap"), OpenOptions::default());
+    let input = Standing(std::io::Cursor::new(cut));
+    let (stream, _) = ArrivingRecording::open(input, &kept, &options, &|| true).unwrap();
+    let (mut arrivals, mut last) = (stream.arrivals().unwrap(), [Timestamp::from_nanos(0); 2]);
+    // What is handed out before the stream is given up.
+    let given_up = std::cell::Cell::new(false);
+    let go_on = || {
+        given_up.set(true);
+        false
+    };
+    while let Some(arrival) = arrivals.next(&go_on).filter(|_| !given_up.get()) {
+        match arrival.what {
+            Arrived::Imu(sample) => last[0] = sample.time,
+            Arrived::Image(entry, _) => last[1] = entry.time,
+        }
+    }
+    // Half of the 50 ms between images, in steps of 5 ms.
+    let ahead = (last[0] - last[1]).as_secs_f64();
+    assert!((0.019..=0.025).contains(&ahead), "{ahead} s");
 }
 
 #[test]

@@ -24,6 +24,8 @@ enum Fault {
     Gone,
     Late,
     Busy,
+    /// The model gives an error, as where a device is out of memory.
+    ModelError,
     Garbage,
     Cut,
     Bit(usize),
@@ -79,6 +81,12 @@ impl Reach for Fake {
                 let outcome = Outcome::Busy;
                 let busy = PredictReply { run: asked.run, number: asked.number, queue: 9, outcome };
                 Ok(busy.encode(DepthFormat::F32).unwrap())
+            }
+            Fault::ModelError => {
+                let asked = PredictRequest::decode(request).unwrap();
+                let outcome = Outcome::ModelFailed("out of memory".into());
+                let failed = PredictReply { run: asked.run, number: asked.number, queue: 0, outcome };
+                Ok(failed.encode(DepthFormat::F32).unwrap())
             }
             Fault::Garbage => Ok(vec![0xa5; 999]),
             Fault::Cut => Ok(answer[..answer.len() / 2].to_vec()),
@@ -207,6 +215,19 @@ fn busy_workers_are_waited_for_and_dead_ones_end_the_run() {
     assert!(why.contains("no worker under lab/depth answered") && why.contains("is gone"), "{why}");
     let cancelled = model.predict(&chunk(3), 0..4, false, &|_| true).unwrap_err();
     assert!(matches!(cancelled, ModelError::Cancelled));
+}
+
+#[test]
+fn an_error_of_one_device_costs_no_chunk_and_one_of_all_is_told() {
+    let Setup { mut model, faults, asked } = three();
+    faults.lock().unwrap().extend([Fault::ModelError; 2]);
+    let views = chunk(1);
+    let found = model.predict(&views, 0..4, true, &|_| false).unwrap();
+    assert!(same_bits(&found, &local(&views, 0..4)));
+    faults.lock().unwrap().extend([Fault::ModelError, Fault::Gone, Fault::ModelError]);
+    let error = model.predict(&chunk(2), 0..4, false, &|_| false).unwrap_err();
+    assert!(matches!(&error, ModelError::Other(why) if why == "out of memory"), "{error}");
+    assert_eq!(asked.lock().unwrap().len(), 6, "each once for each chunk");
 }
 
 #[test]

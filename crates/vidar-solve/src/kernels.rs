@@ -27,7 +27,8 @@ impl Kernel {
     pub fn loss(self, squared: f64) -> f64 {
         match self {
             Self::Quadratic => 0.5 * squared,
-            Self::Huber { .. } => self.loss_of_length(squared.sqrt()),
+            Self::Huber { k } if squared <= k * k => 0.5 * squared,
+            Self::Huber { k } => k * (squared.sqrt() - 0.5 * k),
             Self::Cauchy { k } => 0.5 * k * k * (squared / (k * k)).ln_1p(),
             Self::GemanMcClure { k } => 0.5 * squared * k * k / (k * k + squared),
         }
@@ -46,7 +47,9 @@ impl Kernel {
     pub fn weight(self, squared: f64) -> f64 {
         match self {
             Self::Quadratic => 1.0,
-            Self::Huber { .. } => self.weight_of_length(squared.sqrt()),
+            // Most errors are small ones, which need no root.
+            Self::Huber { k } if squared <= k * k => 1.0,
+            Self::Huber { k } => k / squared.sqrt(),
             Self::Cauchy { k } => 1.0 / (1.0 + squared / (k * k)),
             Self::GemanMcClure { k } => {
                 let share = k * k / (k * k + squared);

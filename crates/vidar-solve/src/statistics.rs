@@ -17,6 +17,7 @@ pub trait Real: Copy {
 }
 
 impl Real for f64 {
+    #[inline]
     fn order(&self, other: &Self) -> std::cmp::Ordering {
         self.total_cmp(other)
     }
@@ -27,6 +28,7 @@ impl Real for f64 {
 }
 
 impl Real for f32 {
+    #[inline]
     fn order(&self, other: &Self) -> std::cmp::Ordering {
         self.total_cmp(other)
     }

@@ -156,6 +156,50 @@ fn contradicts(found: &Calibration, given: &CameraModel) -> bool {
 /// Standard deviations from which a given lens is contradicted; as `vidar calibrate` reports it.
 const CONTRADICTING_SIGMAS: f64 = 3.0;
 
+/// What a recording with a gyroscope does not state of its calibration, and what therefore is looked for before it is tracked.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum MissingCalibration {
+    /// All of it: camera, mount and clock.
+    Camera,
+    /// How the camera is mounted on the IMU; a lens is given.
+    Mount,
+}
+
+impl MissingCalibration {
+    fn of(dataset: &Recording) -> Option<Self> {
+        if dataset.imu.is_empty() {
+            None
+        } else if dataset.calibration == CalibrationSource::Guessed {
+            Some(Self::Camera)
+        } else {
+            has_no_mount(dataset).then_some(Self::Mount)
+        }
+    }
+
+    /// What a run does about it.
+    pub fn words(self) -> &'static str {
+        match self {
+            Self::Camera => {
+                "none is given: a run finds it from images and gyroscope first, and ends with E0208 where they do not show it; until then there \
+                 are no poses, and camera and model view are a guess"
+            }
+            Self::Mount => {
+                "the camera's place on the IMU is not given: a run finds it from images and gyroscope first; where they do not show it, the \
+                 odometry starts with that of the IMU"
+            }
+        }
+    }
+}
+
+/// For a plan, which tracks nothing: the recording as if [`complete`] had found what is missing, with the values that were read or
+/// guessed. Says what is missing.
+pub(crate) fn assume_complete(dataset: &mut Recording) -> Option<MissingCalibration> {
+    let missing = MissingCalibration::of(dataset)?;
+    dataset.rig.imu.get_or_insert_with(|| believed_noise(None));
+    dataset.calibration = CalibrationSource::Recording;
+    Some(missing)
+}
+
 /// Where `dataset` has a gyroscope but no calibration, or a lens whose place on the IMU nothing tells: finds what is missing, puts it into
 /// the rig, and says so. The settings of the odometry follow from what is known then. A given lens stays unless it is a plain pinhole that
 /// the recording contradicts; where a recording does not show the mount, what was read stays.
@@ -168,10 +212,8 @@ pub(crate) fn complete(
     events: &Events,
     cancel: &CancelToken,
 ) -> Result<(), Error> {
-    let has_lens = has_no_mount(dataset);
-    if dataset.imu.is_empty() || !(has_lens || dataset.calibration == CalibrationSource::Guessed) {
-        return Ok(());
-    }
+    let Some(missing) = MissingCalibration::of(dataset) else { return Ok(()) };
+    let has_lens = missing == MissingCalibration::Mount;
     let found = match events.stage(STAGE, 0, || look(dataset, events, cancel)) {
         Err(Error::NotCalibrated { .. }) if has_lens => return Ok(()),
         found => found?,

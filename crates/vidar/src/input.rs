@@ -1,170 +1,22 @@
 //! From a path to a recording, its poses and its images.
 
-use crate::config::{Config, PoseSource as PoseChoice};
-use crate::engine::{FrameStamp, GivenPoses, ImageSource, OdometryPoses, PoseSource};
+mod poses;
+
+pub(crate) use poses::not_evaluated;
+pub use poses::{MetricTrajectory, PosePlan, TrajectorySource, truth_in_camera, truth_in_imu};
+
+use crate::config::Config;
+use crate::engine::{FrameStamp, GivenPoses, ImageSource};
 use crate::error::Error;
 use crate::imu_noise;
 use crate::masks::Masks;
-use crate::odometry::EarlierMap;
 use crate::quality::TrackQuality;
 use crate::verdict::ScaleSource;
-use serde::Serialize;
 use sha2::{Digest, Sha256};
 use std::path::{Path, PathBuf};
-use vidar_align::CouplingMode;
-use vidar_core::{
-    BodyFrame, CameraId, Duration, Frame, FrameImage, Image, SensorEvent, StampedPose, Trajectory, Warning,
-};
+use vidar_core::{CameraId, Duration, Frame, FrameImage, Image, SensorEvent, Trajectory, Warning};
 use vidar_dataset::{CalibrationSource, DatasetError, ImageEntry, OpenOptions, Recording};
 use vidar_odometry::bundle_adjustment::Adjusted;
-
-/// Where the metric poses of a run come from.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
-#[serde(tag = "source", rename_all = "kebab-case")]
-pub enum TrajectorySource {
-    /// A trajectory that the user gave.
-    External {
-        /// Which file.
-        file: String,
-    },
-    /// The dataset's ground truth: scores made with it are an upper bound.
-    GroundTruth,
-    /// Odometry of the recording's own camera and IMU.
-    Odometry,
-}
-
-impl std::fmt::Display for TrajectorySource {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        match self {
-            Self::External { file } => write!(f, "external trajectory {file}"),
-            Self::GroundTruth => f.write_str("ground truth (upper bound)"),
-            Self::Odometry => f.write_str("odometry of camera and IMU"),
-        }
-    }
-}
-
-/// A metric trajectory of the camera in use.
-#[derive(Clone, Debug)]
-pub struct MetricTrajectory {
-    /// Where it came from.
-    pub source: TrajectorySource,
-    /// Poses of the camera in use, m.
-    pub camera_trajectory: Trajectory,
-}
-
-/// Where a run takes its poses from, decided before anything is tracked.
-#[derive(Clone, Debug)]
-pub enum PosePlan {
-    /// Nowhere: the coupling needs none.
-    None,
-    /// A given trajectory.
-    Given(MetricTrajectory),
-    /// Odometry; where it gives none, the fallback.
-    Odometry {
-        /// Ground truth, where `input.poses` is `auto` and there is any.
-        fallback: Option<MetricTrajectory>,
-    },
-}
-
-impl PosePlan {
-    /// What the configuration asks for, of what the recording has.
-    ///
-    /// # Errors
-    /// [`Error::NoMetricTrajectory`] where the coupling needs poses and there are none; a calibration that is only guessed.
-    pub fn new(dataset: &Recording, config: &Config) -> Result<Self, Error> {
-        let mode = config.coupling.mode;
-        let choice = match mode {
-            CouplingMode::GroundTruth => PoseChoice::GroundTruth,
-            _ => config.input.poses,
-        };
-        let external = dataset
-            .external_trajectory
-            .as_ref()
-            .map(|t| (&t.trajectory, TrajectorySource::External { file: t.source.display().to_string() }));
-        let truth = dataset.ground_truth.as_ref().map(|t| (t, TrajectorySource::GroundTruth));
-        let in_use = |(trajectory, source): (&Trajectory, TrajectorySource)| {
-            Ok::<_, Error>(MetricTrajectory { source, camera_trajectory: in_camera(trajectory, dataset)? })
-        };
-        // Odometry of a guessed camera leads nowhere; what is not metric does without.
-        let is_usable = mode.uses_pose_priors() || dataset.calibration != CalibrationSource::Guessed;
-        let has_imu = dataset.rig.imu.is_some() && !dataset.imu.is_empty() && is_usable;
-        let given = match choice {
-            PoseChoice::Odometry if is_usable => return Ok(Self::Odometry { fallback: None }),
-            PoseChoice::Odometry => None,
-            PoseChoice::Auto if external.is_none() && has_imu => {
-                return Ok(Self::Odometry { fallback: truth.map(in_use).transpose()? });
-            }
-            PoseChoice::External => external,
-            PoseChoice::GroundTruth => truth,
-            PoseChoice::Auto => external.or(truth),
-        };
-        match given {
-            Some(given) => in_use(given).map(Self::Given),
-            None if mode.uses_pose_priors() => Err(Error::NoMetricTrajectory { name: dataset.name.clone() }),
-            None => Ok(Self::None),
-        }
-    }
-
-    /// Where poses come from, as far as it is known before tracking.
-    pub fn source(&self) -> Option<TrajectorySource> {
-        match self {
-            Self::None => None,
-            Self::Given(trajectory) => Some(trajectory.source.clone()),
-            Self::Odometry { .. } => Some(TrajectorySource::Odometry),
-        }
-    }
-
-    /// The given trajectory as a source of poses.
-    pub fn given(&self, dataset: &Recording, config: &Config) -> Option<GivenPoses> {
-        match self {
-            Self::Given(trajectory) => Some(given_poses(trajectory, dataset, config)),
-            Self::None | Self::Odometry { .. } => None,
-        }
-    }
-
-    /// The trajectory that serves where the odometry gives no pose.
-    pub fn fallback(&self, dataset: &Recording, config: &Config) -> Option<GivenPoses> {
-        match self {
-            Self::Odometry { fallback: Some(trajectory) } => Some(given_poses(trajectory, dataset, config)),
-            Self::None | Self::Given(_) | Self::Odometry { fallback: None } => None,
-        }
-    }
-
-    /// Whether they come from the recording's own camera and IMU.
-    pub fn is_odometry(&self) -> bool {
-        matches!(self, Self::Odometry { .. })
-    }
-
-    /// Sources of poses for the engine: the one that is planned, and its fallback.
-    ///
-    /// # Errors
-    /// Settings or calibration that the odometry refuses.
-    #[allow(clippy::type_complexity)] // two sources of one kind, named by their place in `EngineSetup`
-    pub fn open(
-        &self,
-        dataset: &Recording,
-        config: &Config,
-    ) -> Result<(Option<Box<dyn PoseSource>>, Option<Box<dyn PoseSource>>), Error> {
-        let boxed = |poses: GivenPoses| Box::new(poses) as Box<dyn PoseSource>;
-        Ok(match self {
-            Self::None => (None, None),
-            Self::Given(trajectory) => (Some(boxed(given_poses(trajectory, dataset, config))), None),
-            Self::Odometry { fallback } => {
-                let earlier = EarlierMap::of(config)?;
-                let map = earlier.as_ref().map(|earlier| &earlier.map);
-                let odometry = OdometryPoses::new(&dataset.rig, dataset.camera, &config.odometry, map)?;
-                let fallback = fallback.as_ref().map(|t| boxed(given_poses(t, dataset, config)));
-                (Some(Box::new(odometry)), fallback)
-            }
-        })
-    }
-}
-
-fn given_poses(trajectory: &MetricTrajectory, dataset: &Recording, config: &Config) -> GivenPoses {
-    // Poses are in the IMU's clock: t_imu = t_camera + offset.
-    let offset = dataset.rig.camera(dataset.camera).map_or(Duration::ZERO, |c| c.time_offset);
-    GivenPoses::new(trajectory.clone(), offset, Duration::from_secs_f64(config.input.max_pose_gap_secs))
-}
 
 /// SHA-256 of what a recording consists of.
 pub(crate) fn fingerprint(dataset: &Recording) -> Result<String, Error> {
@@ -339,23 +191,6 @@ impl UnseenScale {
             unchecked: is_unchecked.then_some(self.calibration),
         }
     }
-}
-
-/// Ground truth of the camera in use at the images' stamps, where its place on the rig is known.
-pub fn truth_in_camera(dataset: &Recording) -> Option<Trajectory> {
-    let truth = dataset.ground_truth.as_ref().and_then(|t| in_camera(t, dataset).ok())?;
-    in_image_clock(&truth, dataset)
-}
-
-/// A trajectory in the IMU's clock, as ground truth is, with the stamps that images of these times have.
-pub fn in_image_clock(trajectory: &Trajectory, dataset: &Recording) -> Option<Trajectory> {
-    let offset = dataset.rig.camera(dataset.camera).map_or(Duration::ZERO, |c| c.time_offset);
-    let stamped = |p: &StampedPose| StampedPose { time: p.time - offset, ..*p };
-    Trajectory::new(trajectory.body(), trajectory.poses().iter().map(stamped).collect()).ok()
-}
-
-fn in_camera(trajectory: &Trajectory, dataset: &Recording) -> Result<Trajectory, Error> {
-    Ok(trajectory.in_frame(BodyFrame::Camera(dataset.camera), &dataset.rig)?)
 }
 
 /// Refuses a given trajectory that no image was taken within.

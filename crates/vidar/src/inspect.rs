@@ -14,6 +14,7 @@ use std::path::Path;
 use vidar_core::{Duration, FrameImage, Timestamp, Trajectory, Warning};
 use vidar_dataset::{CalibrationSource, OpenOptions, Recording};
 use vidar_odometry::calibration::SensorNoise;
+use vidar_solve::statistics::median_upper;
 
 /// Summary of a recording.
 #[derive(Clone, Debug, Serialize)]
@@ -181,16 +182,15 @@ fn times(trajectory: Option<&Trajectory>) -> Vec<Timestamp> {
 
 fn stream(what: &str, times: &[Timestamp]) -> Option<Stream> {
     let (first, last) = (*times.first()?, *times.last()?);
-    let mut gaps: Vec<i64> = times.windows(2).map(|w| (w[1] - w[0]).nanos()).collect();
-    gaps.sort_unstable();
-    let median = gaps.get(gaps.len() / 2).copied().unwrap_or(0);
+    let mut gaps: Vec<f64> = times.windows(2).map(|w| (w[1] - w[0]).nanos() as f64).collect();
+    let median = median_upper(&mut gaps).unwrap_or(0.0);
     Some(Stream {
         what: what.to_owned(),
         count: times.len(),
         start_secs: first.as_secs_f64(),
         length_secs: (last - first).as_secs_f64(),
-        rate_hz: Some(if median > 0 { 1e9 / median as f64 } else { 0.0 }),
-        longest_gap_secs: gaps.last().copied().unwrap_or(0) as f64 * 1e-9,
+        rate_hz: Some(if median > 0.0 { 1e9 / median } else { 0.0 }),
+        longest_gap_secs: gaps.iter().copied().fold(0.0, f64::max) * 1e-9,
     })
 }
 
@@ -235,20 +235,13 @@ fn image_health(dataset: &Recording) -> Option<ImageHealth> {
         chosen.iter().map(|&i| dataset.load_image(&dataset.images[i]).ok()).collect();
     let unreadable = loaded.iter().filter(|i| i.is_none()).count();
     let measured: Vec<[f64; 3]> = loaded.iter().flatten().map(measure).collect();
-    if measured.is_empty() {
-        return None;
-    }
-    let median = |which: usize| {
-        let mut values: Vec<f64> = measured.iter().map(|m| m[which]).collect();
-        values.sort_by(f64::total_cmp);
-        values[values.len() / 2]
-    };
+    let median = |which: usize| median_upper(&mut measured.iter().map(|m| m[which]).collect::<Vec<_>>());
     Some(ImageHealth {
         sampled: chosen.len(),
         unreadable,
-        brightness: median(0),
-        clipped: median(1),
-        sharpness: median(2),
+        brightness: median(0)?,
+        clipped: median(1)?,
+        sharpness: median(2)?,
     })
 }
 

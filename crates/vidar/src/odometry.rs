@@ -27,7 +27,7 @@ use std::collections::BTreeSet;
 use std::ops::ControlFlow;
 use std::path::PathBuf;
 use std::time::Instant;
-use vidar_core::{BodyFrame, Severity, Trajectory, Warning};
+use vidar_core::{Severity, Trajectory, Warning};
 use vidar_dataset::{OpenOptions, Recording};
 use vidar_eval::TrajectoryReport;
 use vidar_odometry::bundle_adjustment::{CalibrationSigmas, Progress};
@@ -115,14 +115,15 @@ pub fn odometry(
     warnings.extend(timing);
     warnings.extend(tracked.warnings());
     warnings.extend(trajectory.as_ref().and_then(|_| scale.warning()));
+    warnings.extend(input::truth_in_imu(&dataset).err().map(|e| input::not_evaluated("ground truth", &e)));
     warnings.iter().for_each(|w| events.warn(w));
     let final_trajectory = tracked.adjusted.as_ref().and_then(adjusted::trajectory);
     let report = against_truth(trajectory.as_ref(), &dataset, &config)?;
     tracked.adjusted.iter().for_each(|adjusted| adjusted::apply(adjusted, &mut dataset));
     let final_report = against_truth(final_trajectory.as_ref(), &dataset, &config)?;
     let is_degraded = warnings.iter().any(|w| w.severity == Severity::Degraded);
-    let judged = final_report.as_ref().or(report.as_ref());
-    let verdict = verdict(&tracked, &scale, judged, cancel.is_cancelled());
+    let evaluated = final_report.as_ref().or(report.as_ref());
+    let verdict = verdict(&tracked, &scale, evaluated, cancel.is_cancelled());
     let status = match (cancel.is_cancelled(), is_degraded) {
         (true, _) => ExitStatus::Interrupted,
         (false, true) => ExitStatus::Degraded,
@@ -145,7 +146,7 @@ pub fn odometry(
     if dumped {
         artifacts.extend([dump::TRACKS, dump::STATES].map(String::from));
     }
-    let truth = dataset.ground_truth.as_ref().and_then(|t| t.in_frame(BodyFrame::Imu, &dataset.rig).ok());
+    let truth = input::truth_in_imu(&dataset).ok().flatten();
     let made = report::write(&outcome, truth.as_ref(), &dataset.name, &request.command, &folder)?;
     artifacts.extend(made);
     artifacts.extend(["log.jsonl", "manifest.json"].map(String::from));
@@ -328,15 +329,14 @@ fn verdict(
     findings.verdict(compared)
 }
 
-/// Scores against ground truth, where there are both.
+/// Scores against ground truth, where there are both and their bodies can be compared.
 fn against_truth(
     trajectory: Option<&Trajectory>,
     dataset: &Recording,
     config: &Config,
 ) -> Result<Option<TrajectoryReport>, Error> {
-    let (Some(trajectory), Some(truth)) = (trajectory, &dataset.ground_truth) else { return Ok(None) };
-    let truth = truth.in_frame(BodyFrame::Imu, &dataset.rig).ok();
-    let Some(truth) = truth.and_then(|t| input::in_image_clock(&t, dataset)) else { return Ok(None) };
+    let truth = input::truth_in_imu(dataset).ok().flatten();
+    let (Some(trajectory), Some(truth)) = (trajectory, truth) else { return Ok(None) };
     match vidar_eval::evaluate_trajectory(trajectory, &truth, &config.eval.trajectory) {
         Ok(report) => Ok(Some(report)),
         Err(vidar_eval::EvalError::NoMatches { .. }) => Ok(None),

@@ -24,8 +24,8 @@ pub struct TrackQuality {
     /// Times that a state was given up.
     pub losses: usize,
     times: Option<(Timestamp, Timestamp)>,
-    /// Refusals to start, each kind with its count and its last text.
-    refusals: BTreeMap<String, (usize, String)>,
+    /// Failures to initialise, each kind with its count and its last text.
+    initialization_failures: BTreeMap<String, (usize, String)>,
     /// How many of them found that images and IMU contradict each other.
     contradictions: usize,
     waits: usize,
@@ -83,8 +83,9 @@ impl TrackQuality {
                 self.waits += usize::from(is_attempt);
                 let kind = kind_of(&failure.reason);
                 self.contradictions += usize::from(kind.is_contradiction);
-                let refusal = self.refusals.entry(kind.name.into()).or_default();
-                *refusal = (refusal.0 + 1, failure.to_string());
+                let (count, text) = self.initialization_failures.entry(kind.name.into()).or_default();
+                *count += 1;
+                *text = failure.to_string();
             }
         }
     }
@@ -121,13 +122,15 @@ impl TrackQuality {
         self.adjusted.map_or_else(|| self.longest().map_or(0, |s| s.images), |a| a.images)
     }
 
-    /// Why the odometry never started: the refusal that was found most often, of the kind that was found more often. The last one
+    /// Why the odometry never started: the failure that was found most often, of the kind that was found more often. The last one
     /// alone may be an accident of where the recording ends.
     pub fn why_not_started(&self) -> Option<String> {
         let contradicts = 2 * self.contradictions > self.waits;
-        let of_kind =
-            self.refusals.iter().filter(|(name, _)| CONTRADICTIONS.contains(&name.as_str()) == contradicts);
-        let (count, most) = of_kind.map(|(_, refusal)| refusal).max_by_key(|(count, _)| *count)?;
+        let of_kind = self
+            .initialization_failures
+            .iter()
+            .filter(|(name, _)| CONTRADICTIONS.contains(&name.as_str()) == contradicts);
+        let (count, most) = of_kind.map(|(_, failure)| failure).max_by_key(|(count, _)| *count)?;
         Some(match contradicts {
             false if most.starts_with("std(log scale)") => format!(
                 "{most}. If the camera does speed up and slow down, images and IMU contradict each other: signs or axes of the \
@@ -232,7 +235,7 @@ impl TrackQuality {
 const LIKELY_CAUSES: &str = "Most likely the calibration is not this recording's: the camera's rotation and position on the IMU \
     (T_BS), the clock offset, the focal length or the distortion, or axes, signs and units of the IMU";
 
-/// Refusals that say that images and IMU contradict each other. The others say that something is missing yet.
+/// Failures that say that images and IMU contradict each other. The others say that something is missing yet.
 const CONTRADICTIONS: [&str; 8] = [
     "outliers",
     "image residual",
@@ -244,12 +247,12 @@ const CONTRADICTIONS: [&str; 8] = [
     "camera orientation",
 ];
 
-struct RefusalKind {
+struct FailureKind {
     name: &'static str,
     is_contradiction: bool,
 }
 
-fn kind_of(reason: &InitFailureReason) -> RefusalKind {
+fn kind_of(reason: &InitFailureReason) -> FailureKind {
     use InitFailureReason as R;
     let name = match reason {
         R::OutlierShare => "outliers",
@@ -268,7 +271,7 @@ fn kind_of(reason: &InitFailureReason) -> RefusalKind {
         R::GyroStd | R::AccelStd | R::ImageMotion => "neither at rest nor moving",
         _ => "other",
     };
-    RefusalKind { name, is_contradiction: CONTRADICTIONS.contains(&name) }
+    FailureKind { name, is_contradiction: CONTRADICTIONS.contains(&name) }
 }
 
 impl SegmentQuality {

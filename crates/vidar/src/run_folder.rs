@@ -3,17 +3,19 @@
 //! Written atomically, appended as computed; nothing is deleted that this run did not write.
 
 mod earlier;
+mod log;
 
 pub use earlier::Earlier;
+pub use log::event_line;
 
 use crate::error::Error;
-use crate::events::{EVENT_SCHEMA, Event};
+use crate::events::Event;
+use log::{EventLog, LOG};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeSet;
 use std::fs::File;
-use std::io::Write;
 use std::path::{Path, PathBuf};
-use std::sync::Mutex;
+use vidar_core::Warning;
 
 /// Schema of `manifest.json`.
 pub const MANIFEST_SCHEMA: &str = "vidar.run/1";
@@ -24,7 +26,7 @@ pub const VIEWS_SCHEMA: &str = "vidar.views/1";
 #[derive(Debug)]
 pub struct RunFolder {
     root: PathBuf,
-    log: Mutex<Option<File>>,
+    log: EventLog,
 }
 
 /// Where a new run folder goes.
@@ -186,7 +188,7 @@ impl RunFolder {
     /// Makes the folder, refusing one that is in use.
     pub fn create(place: &OutputLocation) -> Result<Self, Error> {
         let root = place.reserve()?;
-        let path = root.join("log.jsonl");
+        let path = root.join(LOG);
         let mut options = File::options();
         let log = match place {
             OutputLocation::Resumed { .. } | OutputLocation::Replaced { .. } => {
@@ -197,7 +199,7 @@ impl RunFolder {
             }
         };
         let log = log.open(&path).map_err(|e| Error::io("create", &path, e))?;
-        Ok(Self { root, log: Mutex::new(Some(log)) })
+        Ok(Self { root, log: EventLog::new(log) })
     }
 
     /// The folder.
@@ -221,21 +223,15 @@ impl RunFolder {
         Ok(bytes.len() as u64)
     }
 
-    /// Appends an event to `log.jsonl`. A log that cannot be written must not end a run.
-    pub fn log(&self, event: &Event) {
-        let Ok(mut guard) = self.log.lock() else { return };
-        if let Some(file) = guard.as_mut() {
-            let written = serde_json::to_string(&event_line(event))
-                .map(|line| writeln!(file, "{}", vidar_core::printable_json(&line)));
-            if !matches!(written, Ok(Ok(()))) {
-                *guard = None;
-            }
-        }
+    /// Appends an event to `log.jsonl`. A log that cannot be written must not end a run: it ends there, with one warning.
+    #[must_use = "the warning says that the log is incomplete"]
+    pub fn log(&self, event: &Event) -> Option<Warning> {
+        self.log.append(event)
     }
 
     /// Writes the manifest.
     pub fn write_manifest(&self, manifest: &Manifest) -> Result<(), Error> {
-        self.write("manifest.json", &pretty(manifest)).map(|_| ())
+        self.write("manifest.json", &pretty(manifest)?).map(|_| ())
     }
 }
 
@@ -251,23 +247,19 @@ pub fn read_json<T: serde::de::DeserializeOwned>(run: &Path, relative: &str) -> 
     serde_json::from_slice(&bytes).map_err(|e| not_a_run(e.to_string()))
 }
 
-/// An event with its schema, as one JSON object.
-pub fn event_line(event: &Event) -> serde_json::Value {
-    let mut line = serde_json::json!({ "schema": EVENT_SCHEMA });
-    if let (Some(object), Ok(serde_json::Value::Object(fields))) =
-        (line.as_object_mut(), serde_json::to_value(event))
-    {
-        object.extend(fields);
-    }
-    line
-}
-
 /// Indented JSON with a final newline.
-pub fn pretty(value: &impl Serialize) -> Vec<u8> {
-    let text = serde_json::to_string_pretty(value).unwrap_or_default();
+///
+/// # Errors
+/// JSON cannot hold the value.
+pub fn pretty(value: &impl Serialize) -> Result<Vec<u8>, Error> {
+    let text = serde_json::to_string_pretty(value).map_err(|e| vidar_export::ExportError::Unwritable {
+        format: "JSON",
+        what: std::any::type_name_of_val(value).into(),
+        reason: e.to_string(),
+    })?;
     let mut bytes = vidar_core::printable_json(&text).into_owned().into_bytes();
     bytes.push(b'\n');
-    bytes
+    Ok(bytes)
 }
 
 fn create_dir(path: &Path) -> Result<(), Error> {
@@ -373,22 +365,5 @@ mod tests {
             base.path().join("runs/_my_room/latest").canonicalize().unwrap(),
             second.path().canonicalize().unwrap()
         );
-    }
-
-    #[test]
-    fn events_are_lines_with_a_schema() {
-        let base = tempfile::tempdir().unwrap();
-        let folder =
-            RunFolder::create(&OutputLocation::Exact { path: base.path().join("r"), force: false }).unwrap();
-        folder.log(&Event::StageStarted { stage: "stereo", total: 3 });
-        let warning = vidar_core::Warning::new("time-gap", "0.5 s without images").at("cam0");
-        folder.log(&Event::Warning { warning });
-        let text = std::fs::read_to_string(folder.path().join("log.jsonl")).unwrap();
-        let lines: Vec<serde_json::Value> = text.lines().map(|l| serde_json::from_str(l).unwrap()).collect();
-        assert_eq!(
-            lines[0],
-            serde_json::json!({"schema": EVENT_SCHEMA, "event": "stage-started", "stage": "stereo", "total": 3})
-        );
-        assert_eq!(lines[1]["kind"], "time-gap");
     }
 }

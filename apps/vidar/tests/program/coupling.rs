@@ -67,7 +67,7 @@ fn every_coupling_makes_a_map_and_says_what_it_is() {
         ("coupled", true),
     ] {
         let (ran, run) = simulated(mode, &["--mode", mode, "--set", "eval.mode=auto"]);
-        assert!([0, 3].contains(&ran.code), "{mode}: {}", ran.stderr);
+        assert_eq!(ran.code, 0, "{mode}: {}", ran.stderr);
         let result = &manifest(&run)["result"];
         assert_eq!(
             (result["coupling"].as_str(), result["is_metric"].as_bool()),
@@ -96,7 +96,7 @@ fn what_stereo_is_sure_of_straightens_a_small_networks_depth_and_leaves_a_good_o
     let run = |name: &str, source: &str, landmarks: &str| {
         let landmarks = format!("coupling.landmarks={landmarks}");
         let (ran, out) = with_geometry(source, name, &["--set", &landmarks, "--set", "eval.mode=auto"]);
-        assert!([0, 3].contains(&ran.code), "{}", ran.stderr);
+        assert_eq!(ran.code, 0, "{}", ran.stderr);
         out
     };
     let error = |run: &Path| {
@@ -122,11 +122,11 @@ fn stereo_is_no_pose_free_model() {
 #[test]
 fn what_a_run_kept_is_read_back_as_a_recording_with_the_same_result() {
     let (ran, first) = simulated("kept", &["--mode", "hybrid", "--set", "output.keep_chunks=true"]);
-    assert!([0, 3].contains(&ran.code), "{}", ran.stderr);
+    assert_eq!(ran.code, 0, "{}", ran.stderr);
     let chunks = first.join("chunks");
     assert!(files_under(&chunks).iter().any(|f| f == "000000.npz"));
     let (ran, again) = recorded("replayed", &chunks, &["--mode", "hybrid"]);
-    assert!([0, 3].contains(&ran.code), "{}", ran.stderr);
+    assert_eq!(ran.code, 0, "{}", ran.stderr);
     assert!(surface(&first) == surface(&again));
 
     // The official API's files carry no times: the chunks' sizes tell which frames they are of.
@@ -138,12 +138,11 @@ fn what_a_run_kept_is_read_back_as_a_recording_with_the_same_result() {
     }
     let every = ["--mode", "hybrid", "--set", "keyframes.min_translation_m=1e-6"];
     let (ran, kept) = simulated("kept of all", &[&every[..], &["--set", "output.keep_chunks=true"]].concat());
-    assert!([0, 3].contains(&ran.code), "{}", ran.stderr);
-    if files_under(&kept.join("chunks")).len() == files_under(&chunks).len() {
-        let (ran, by_order) = recorded("by order", &plain, &["--mode", "hybrid"]);
-        assert!([0, 3].contains(&ran.code), "{}", ran.stderr);
-        assert!(surface(&first) == surface(&by_order));
-    }
+    assert_eq!(ran.code, 0, "{}", ran.stderr);
+    assert_eq!(files_under(&kept.join("chunks")).len(), files_under(&chunks).len());
+    let (ran, by_order) = recorded("by order", &plain, &["--mode", "hybrid"]);
+    assert_eq!(ran.code, 0, "{}", ran.stderr);
+    assert!(surface(&first) == surface(&by_order));
 }
 
 /// Writes what DA3-Streaming leaves: a file per frame and a line of 16 numbers per pose.
@@ -196,12 +195,12 @@ fn the_folder_of_da3_streaming_is_read() {
         "hybrid",
     ];
     let (ran, first) = simulated("one chunk", &[&every[..], &["--set", "output.keep_chunks=true"]].concat());
-    assert!([0, 3].contains(&ran.code), "{}", ran.stderr);
+    assert_eq!(ran.code, 0, "{}", ran.stderr);
     let folder = out("official streaming");
     streaming_folder(&first.join("chunks"), &folder);
     let evaluated = ["--mode", "hybrid", "--set", "geometry.chunk_keyframes=60", "--set", "eval.mode=auto"];
     let (ran, run) = recorded("from streaming", &folder, &evaluated);
-    assert!([0, 3].contains(&ran.code), "{}", ran.stderr);
+    assert_eq!(ran.code, 0, "{}", ran.stderr);
     let result = &manifest(&run)["result"];
     let abs_rel = result["evaluation"]["depth"]["pixel_weighted"]["metric"]["abs_rel"].as_f64().unwrap();
     assert!(abs_rel < 0.1, "{result}");
@@ -237,7 +236,7 @@ fn recordings_that_do_not_fit_are_refused_with_their_reason() {
 #[test]
 fn a_killed_run_goes_on_and_ends_with_the_same_bits() {
     let (ran, whole) = simulated("uninterrupted", &[]);
-    assert!([0, 3].contains(&ran.code), "{}", ran.stderr);
+    assert_eq!(ran.code, 0, "{}", ran.stderr);
     for chunk in [0, 2] {
         let out = out(&format!("killed after {chunk}"));
         let mut child = run_command(&shared().sequence, &out, &SHORT).spawn().unwrap();
@@ -253,7 +252,7 @@ fn a_killed_run_goes_on_and_ends_with_the_same_bits() {
         let _ = child.kill();
         child.wait().unwrap();
         let ran = run_on(&shared().sequence, &out, &[&SHORT[..], &["--resume"]].concat());
-        assert!([0, 3].contains(&ran.code), "{}", ran.stderr);
+        assert_eq!(ran.code, 0, "{}", ran.stderr);
         assert!(mesh(&whole) == mesh(&out), "killed after chunk {chunk}");
         assert_eq!(manifest(&whole)["result"]["placement"], manifest(&out)["result"]["placement"]);
     }
@@ -269,9 +268,9 @@ fn a_killed_run_goes_on_and_ends_with_the_same_bits() {
 #[test]
 fn the_map_grows_while_chunks_come_and_ends_as_it_would_have() {
     let (ran, plain) = simulated("not watched", &["--mode", "coupled"]);
-    assert!([0, 3].contains(&ran.code), "{}", ran.stderr);
+    assert_eq!(ran.code, 0, "{}", ran.stderr);
     let (ran, watched) = simulated("watched", &["--mode", "coupled", "--set", "output.live_map=true"]);
-    assert!([0, 3].contains(&ran.code), "{}", ran.stderr);
+    assert_eq!(ran.code, 0, "{}", ran.stderr);
     let log = std::fs::read_to_string(watched.join("log.jsonl")).unwrap();
     let grown: Vec<u64> = log
         .lines()
@@ -308,7 +307,7 @@ fn a_revisit_is_found_measured_and_reported() {
             settings
         };
         let ran = run_on(&sequence, &out, &settings);
-        assert!([0, 3].contains(&ran.code), "{}", ran.stderr);
+        assert_eq!(ran.code, 0, "{}", ran.stderr);
         let loops = manifest(&out)["result"]["placement"]["loops"].as_array().unwrap().clone();
         let accepted = loops.iter().filter(|l| l["rejection"].is_null()).count();
         found.push((loops.len(), accepted));
@@ -321,7 +320,7 @@ fn a_revisit_is_found_measured_and_reported() {
 #[test]
 fn poses_are_not_needed_where_no_metres_are_asked_for() {
     let (ran, run) = simulated("unposed", &["--mode", "pose-free", "--set", "input.poses=external"]);
-    assert!([0, 3].contains(&ran.code), "{}", ran.stderr);
+    assert_eq!(ran.code, 0, "{}", ran.stderr);
     let manifest = manifest(&run);
     assert!(manifest["poses"].is_null() && manifest["result"]["is_metric"] == false, "{manifest}");
     assert!(!run.join("trajectory/metric_camera.tum").exists());

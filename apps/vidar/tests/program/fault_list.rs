@@ -102,7 +102,7 @@ fn text(path: &Path) -> &str {
 
 /// A flight with a fault; its images are linked.
 fn with_fault(flight: &Path, fault: Fault, is_adjusted: bool) -> PathBuf {
-    // Tests that run beside each other judge the same faults.
+    // Tests that run beside each other evaluate the same faults.
     static MADE: AtomicUsize = AtomicUsize::new(0);
     let number = MADE.fetch_add(1, Ordering::Relaxed);
     let folder = shared().root.join(format!("fault {number} {fault:?} {is_adjusted}"));
@@ -209,7 +209,7 @@ fn imu_with(fault: Fault, text: &str) -> String {
 /// Fails unless the fault is right within σ, told as degraded with a cause, or refused with one.
 ///
 /// `is_adjusted`: the stated scale is that of the final trajectory, else that of the live one.
-fn judge((fault, causes): Case, is_adjusted: bool) -> Result<String, String> {
+fn evaluate((fault, causes): Case, is_adjusted: bool) -> Result<String, String> {
     let folder = with_fault(flight(), fault, is_adjusted);
     let mut odometry = command();
     odometry.arg("odometry").arg(&folder).arg("-o").arg(folder.join("out"));
@@ -232,9 +232,9 @@ fn judge((fault, causes): Case, is_adjusted: bool) -> Result<String, String> {
         1 | 3 => Err(format!("{short}: none of {causes:?} is said")),
         0 => {
             // Right within three times what is stated.
-            let judged =
+            let evaluated =
                 if json["final"].is_null() { &json["trajectory"] } else { &json["final"]["trajectory"] };
-            let error = judged["scale_error"].as_f64();
+            let error = evaluated["scale_error"].as_f64();
             let sigma = json["scale"]["sigma"].as_f64();
             match error.zip(sigma) {
                 Some((error, sigma)) if error <= 3.0 * sigma => Ok(format!("{short}: |ln s| {error:.4}")),
@@ -245,7 +245,7 @@ fn judge((fault, causes): Case, is_adjusted: bool) -> Result<String, String> {
     }
 }
 
-fn judge_all(cases: &[&[Case]], adjusted: &[bool]) {
+fn evaluate_all(cases: &[&[Case]], adjusted: &[bool]) {
     let all: Vec<(Case, bool)> =
         adjusted.iter().flat_map(|a| cases.concat().into_iter().map(|c| (c, *a))).collect();
     flight();
@@ -254,7 +254,7 @@ fn judge_all(cases: &[&[Case]], adjusted: &[bool]) {
         for _ in 0..2 {
             scope.spawn(|| {
                 while let Some((case, is_adjusted)) = all.get(next.fetch_add(1, Ordering::Relaxed)) {
-                    match judge(*case, *is_adjusted) {
+                    match evaluate(*case, *is_adjusted) {
                         Ok(text) => eprintln!("{text}"),
                         Err(text) => wrong.lock().unwrap().push(text),
                     }
@@ -267,19 +267,19 @@ fn judge_all(cases: &[&[Case]], adjusted: &[bool]) {
 
 #[test]
 fn faults_are_right_within_sigma_told_or_refused_with_their_cause() {
-    judge_all(&[SHORT], &[true]);
+    evaluate_all(&[SHORT], &[true]);
 }
 
 #[test]
 #[ignore = "six minutes; the command is at the top of this file"]
 fn the_whole_list_of_faults() {
-    judge_all(&[SHORT, REST], &[true]);
+    evaluate_all(&[SHORT, REST], &[true]);
 }
 
 #[test]
 #[ignore = "four minutes; the command is at the top of this file"]
 fn the_whole_list_of_faults_live() {
-    judge_all(&[SHORT, REST], &[false]);
+    evaluate_all(&[SHORT, REST], &[false]);
 }
 
 #[test]

@@ -53,9 +53,7 @@ fn sent(mut command: Command, bytes: Vec<u8>) -> ProgramOutput {
 }
 
 fn ended(mut command: Command) -> ProgramOutput {
-    let ran: ProgramOutput = command.output().unwrap().into();
-    assert!([0, 3].contains(&ran.code), "{}", ran.stderr);
-    ran
+    ProgramOutput::from(command.output().unwrap()).ends_with(0)
 }
 
 /// The folder of a live run that nothing disturbed.
@@ -95,9 +93,14 @@ fn a_live_map_that_leaves_nothing_out_has_the_bits_of_a_run() {
 fn at_its_own_rate_a_recording_takes_its_own_time_and_latencies_are_told() {
     let out = shared().root.join("live realtime");
     let clock = Instant::now();
-    ended(mapped("live", &out, &["--realtime"]));
+    let ran = ProgramOutput::from(mapped("live", &out, &["--realtime"]).output().unwrap());
     let told = &manifest(&out)["result"]["live"];
     assert_eq!(told["is_realtime"], true);
+    // How fast this machine is decides whether something was left out; whoever reads only the status learns of it.
+    let left_out = ["images_not_tracked", "keyframes_dropped", "poses_dropped"];
+    let left_out: u64 = left_out.iter().map(|key| told[*key].as_u64().unwrap()).sum();
+    assert!(left_out == 0 || ran.code == 3, "{left_out} left out: {}", ran.stderr);
+    assert_eq!(manifest(&out)["exit"], ran.code, "{}", ran.stderr);
     let images = told["images"].as_u64().unwrap();
     // Images are never earlier than they were filmed.
     let film_secs = (images - 1) as f64 / 20.0;
@@ -139,7 +142,7 @@ fn a_stream_on_standard_input_has_the_bits_of_its_file_and_is_kept() {
     let bytes = std::fs::read(flight_mcap()).unwrap();
     ended(of(&flight_mcap(), &file, &[]));
     let ran = sent(of(Path::new("-"), &stream, &[]), bytes.clone());
-    assert!([0, 3].contains(&ran.code), "{}", ran.stderr);
+    assert_eq!(ran.code, 0, "{}", ran.stderr);
     let mesh = |out: &Path| std::fs::read(out.join("map/mesh.ply")).unwrap();
     assert!(mesh(&file) == mesh(&stream), "the same bits, though nothing was known of it before it came");
     assert_eq!(poses(&file), poses(&stream));

@@ -433,7 +433,7 @@ fn run_on_network(out: &str, more: &[&str]) -> (ProgramOutput, PathBuf) {
 fn a_run_uses_a_network_with_and_without_poses_and_names_it_in_the_manifest() {
     // With cameras given, predictions are in their world; the geometry of these weights is meaningless, the pipeline is tested.
     let (ran, out) = run_on_network("run conditioned", &["--set", "model.network.mode=conditioned"]);
-    assert!(matches!(ran.code, 0 | 3), "{}\n{}", ran.stdout, ran.stderr);
+    assert_eq!(ran.code, 0, "{}\n{}", ran.stdout, ran.stderr);
     let manifest = read_json(&out.join("manifest.json"));
     let network = &manifest["model"]["network"];
     assert_eq!(manifest["model"]["name"], "tiny-any");
@@ -441,10 +441,10 @@ fn a_run_uses_a_network_with_and_without_poses_and_names_it_in_the_manifest() {
     assert_eq!((&network["licence"], &network["acceptance"]), (&json!("unknown"), &Value::Null));
     assert!(network["memory"]["working"].as_u64().unwrap() > 0);
     assert!(files_under(&out).iter().any(|f| f.starts_with("depth/") && f.ends_with(".png")));
-    // Without, one similarity aligns each chunk to the trajectory, or reports why it cannot.
+    // Without, one similarity aligns each chunk to the trajectory, or reports why it cannot, as for these weights: no map is left.
     let settings = ["--set", "align.max_center_rms_m=100"];
     let (ran, out) = run_on_network("run free", &settings);
-    assert!(matches!(ran.code, 0 | 1 | 3), "{}\n{}", ran.stdout, ran.stderr);
+    assert_eq!(ran.code, 1, "{}\n{}", ran.stdout, ran.stderr);
     let log = std::fs::read_to_string(out.join("log.jsonl")).unwrap();
     let aligned: Vec<Value> = log
         .lines()

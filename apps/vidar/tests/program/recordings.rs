@@ -60,8 +60,8 @@ fn a_video_without_calibration_is_mapped_pose_free_in_a_unit_of_its_own() {
     let args =
         ["run", clip.to_str().unwrap(), "--mode", "pose-free", "--geometry", "da3-nano", "--stride", "3"];
     let told = vidar_in(folder.path(), &[&args[..], &["-o", "map"]].concat());
-    // Sixty-four pixels of a test pattern show no room: the map may be empty, and says so; it is never refused for its camera.
-    assert!(matches!(told.code, 0 | 3) && !told.stderr.contains("E0208"), "{} {}", told.code, told.stderr);
+    // Sixty-four pixels of a test pattern show no room, but the camera is no reason to refuse it.
+    assert_eq!(told.code, 0, "{}", told.stderr);
     assert!(told.stdout.contains("arbitrary"), "{}", told.stdout);
 }
 

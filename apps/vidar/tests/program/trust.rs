@@ -206,11 +206,9 @@ fn a_map_of_views_that_contradict_each_other_is_bad_and_degraded() {
         row(&poses.borrow_mut().pop().unwrap(), p.time.as_secs_f64())
     });
     let ran = mapped_on(&wrong, "another recording");
-    let found = if ran.code == 1 { ran.stderr.clone() } else { reasons(&ran.json()["result"]["verdict"]) };
-    assert!(ran.code == 3 || ran.code == 1, "{} {found}", ran.code);
-    if ran.code == 3 {
-        assert_eq!(ran.json()["result"]["verdict"]["level"], "bad", "{found}");
-    }
+    assert_eq!(ran.code, 3, "{}", ran.stderr);
+    let verdict = &ran.json()["result"]["verdict"];
+    assert_eq!(verdict["level"], "bad", "{}", reasons(verdict));
 }
 
 #[test]

@@ -42,7 +42,7 @@ pub fn tiny() -> Da3 {
     Da3::synthetic_of(tiny_config(), &Da3Options::default()).unwrap()
 }
 
-/// All tensors of a network, made by rule.
+/// All tensors of a network with synthetic weights.
 pub fn tensors(config: &Da3Config) -> BTreeMap<String, (Vec<usize>, Vec<f32>)> {
     let made = |p: Parameter| (p.name.clone(), (p.shape.clone(), tensor(&p.name, &p.shape)));
     parameters(config).into_iter().map(made).collect()

@@ -7,6 +7,7 @@ use std::io::{Read, Write};
 use std::path::Path;
 use std::sync::Arc;
 use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender, sync_channel};
+use std::time::Instant;
 use vidar_bag::{
     KeptStream, McapStream, Message, Role, StreamEnd, StreamMessage, StreamPlace, StreamTopic, role_of,
 };
@@ -26,6 +27,8 @@ pub(super) struct Item {
     pub place: StreamPlace,
     /// Bytes of the stream in which it came.
     pub end: u64,
+    /// When it came.
+    pub came: Instant,
     pub kind: Kind,
 }
 
@@ -179,7 +182,8 @@ fn item(message: &StreamMessage<'_>) -> Option<Result<Item, ()>> {
     let topic = message.topic;
     let made = |time: Timestamp, kind: Kind| {
         let time = if time.nanos() == 0 { message.log_time } else { time };
-        Item { topic: Arc::clone(topic), time, place: message.place, end: message.end, kind }
+        let (place, end, came) = (message.place, message.end, Instant::now());
+        Item { topic: Arc::clone(topic), time, place, end, came, kind }
     };
     Some(match role_of(&topic.message_type, topic.encoding)? {
         Role::Image => topic.header(message.data).map(|header| made(header.stamp, Kind::Image)).map_err(drop),

@@ -7,8 +7,9 @@
 
 mod feed;
 mod order;
+mod stamps;
 
-pub use order::{Arrival, Arrivals};
+pub use order::{Arrival, Arrivals, Arrived};
 
 use crate::bag;
 use crate::error::DatasetError;

@@ -1,6 +1,7 @@
 //! Measurements of a stream in the order of their stamps, images decoded ahead of their turn.
 
 use super::feed::{Feed, Item, Kind};
+use super::stamps::Stamps;
 use super::{Shared, Topics, load};
 use crate::ahead::Decoders;
 use crate::error::DatasetError;
@@ -10,6 +11,7 @@ use std::collections::VecDeque;
 use std::path::Path;
 use std::sync::mpsc::Receiver;
 use std::sync::{Arc, PoisonError};
+use std::time::Instant;
 use vidar_bag::{StreamPlace, StreamTopic};
 use vidar_core::{CameraId, Duration, FrameId, FrameImage, ImuSample, Timestamp, Warning};
 
@@ -17,6 +19,10 @@ use vidar_core::{CameraId, Duration, FrameId, FrameImage, ImuSample, Timestamp, 
 const MOST_HELD: Duration = Duration::from_millis(2000);
 /// IMU samples before and after the selected part, as for files.
 const LEAD_IN: Duration = Duration::from_millis(3000);
+/// Messages in a row of the IMU, and of the camera, that come behind later ones when its clock was set back: a second at 200 and at 20 Hz.
+const CLOCK_SET_BACK: [usize; 2] = [200, 20];
+/// Intervals between images that tell when the next one can come at the earliest.
+const INTERVALS: usize = 8;
 
 /// What is taken of a stream.
 #[derive(Debug)]
@@ -31,7 +37,16 @@ pub(super) struct Wanted {
 
 /// A measurement that arrived.
 #[derive(Debug)]
-pub enum Arrival {
+pub struct Arrival {
+    /// When its message came.
+    pub came: Instant,
+    /// What came.
+    pub what: Arrived,
+}
+
+/// What an arrival is.
+#[derive(Debug)]
+pub enum Arrived {
     /// A sample of the IMU.
     Imu(ImuSample),
     /// An image with its pixels, or why it has none.
@@ -40,6 +55,7 @@ pub enum Arrival {
 
 /// An image that waits for its turn.
 struct Waiting {
+    came: Instant,
     entry: ImageEntry,
     topic: Arc<StreamTopic>,
     place: StreamPlace,
@@ -54,15 +70,17 @@ pub struct Arrivals {
     wanted: Wanted,
     shared: Arc<Shared>,
     decoders: Option<Decoders>,
-    imu: VecDeque<ImuSample>,
+    imu: VecDeque<(ImuSample, Instant)>,
     images: VecDeque<Waiting>,
     first_image: Option<Timestamp>,
-    last_imu: Option<Timestamp>,
     last_image: Option<Timestamp>,
+    /// The newest intervals between images.
+    intervals: VecDeque<Duration>,
+    /// Of the IMU and of the camera.
+    stamps: [Stamps; 2],
     /// Images of the topic so far, and those in the order of time.
     came: u32,
     numbered: u32,
-    out_of_order: [usize; 2],
     has_ended: bool,
 }
 
@@ -77,16 +95,17 @@ impl Arrivals {
             imu: VecDeque::new(),
             images: VecDeque::new(),
             first_image: None,
-            last_imu: None,
             last_image: None,
+            intervals: VecDeque::new(),
+            stamps: Default::default(),
             came: 0,
             numbered: 0,
-            out_of_order: [0; 2],
             has_ended: false,
         }
     }
 
-    /// The next measurement, waiting for it while `go_on` says so; `None` at the end of the stream. At equal times the IMU comes first.
+    /// The next measurement, waiting for it while `go_on` says so; `None` at the end of the stream. At equal times the IMU comes first. An
+    /// image that comes in less than half of the shortest interval before it can be behind IMU samples that are later.
     pub fn next(&mut self, go_on: &dyn Fn() -> bool) -> Option<Arrival> {
         while !self.has_ended && !self.is_decided() {
             let item = match self.opening.next() {
@@ -104,16 +123,17 @@ impl Arrivals {
         }
         self.decode_ahead();
         let image = self.images.front().map(|i| i.entry.time);
-        if let Some(sample) = self.imu.front().copied().filter(|s| image.is_none_or(|t| s.time <= t)) {
+        let is_first = |(s, _): &(ImuSample, Instant)| image.is_none_or(|t| s.time <= t);
+        if let Some((sample, came)) = self.imu.front().copied().filter(is_first) {
             self.imu.pop_front();
-            return Some(Arrival::Imu(sample));
+            return Some(Arrival { came, what: Arrived::Imu(sample) });
         }
-        let Waiting { entry, topic, place, asked } = self.images.pop_front()?;
+        let Waiting { came, entry, topic, place, asked } = self.images.pop_front()?;
         let loaded = asked.and_then(|answer| answer.recv().ok());
         let image =
             loaded.unwrap_or_else(|| load(&self.shared.kept, &entry, &topic, &place, self.wanted.size));
         self.decode_ahead();
-        Some(Arrival::Image(entry, Box::new(image)))
+        Some(Arrival { came, what: Arrived::Image(entry, Box::new(image)) })
     }
 
     /// Whether nothing that is still to come is earlier than what is here.
@@ -123,39 +143,58 @@ impl Arrivals {
             return !images.is_empty();
         }
         let is_long = |span: Option<Duration>| span.is_some_and(|span| span > MOST_HELD);
-        let of_imu = || imu.back().zip(imu.front()).map(|(last, first)| last.time - first.time);
+        let of_imu = || imu.back().zip(imu.front()).map(|((last, _), (first, _))| last.time - first.time);
         let of_images =
             || images.back().zip(images.front()).map(|(last, first)| last.entry.time - first.entry.time);
         match (imu.is_empty(), images.is_empty()) {
             (false, false) => true,
-            (false, true) => is_long(of_imu()),
+            // The image before waits for samples after it.
+            (false, true) => {
+                let next = self.next_image_from();
+                is_long(of_imu()) || imu.front().zip(next).is_some_and(|((first, _), t)| first.time <= t)
+            }
             (true, false) => is_long(of_images()),
             (true, true) => false,
         }
     }
 
+    /// Until when no further image comes, where their rhythm is known.
+    fn next_image_from(&self) -> Option<Timestamp> {
+        let shortest = self.intervals.iter().min().filter(|_| self.intervals.len() == INTERVALS)?;
+        Some(self.last_image? + Duration::from_nanos(shortest.nanos() / 2))
+    }
+
     fn take(&mut self, item: Item) {
-        match item.kind {
-            Kind::Imu(sample) if self.wanted.topics.imu.as_ref() == Some(&item.topic.name) => {
-                if self.last_imu.is_some_and(|t| sample.time <= t) {
-                    self.out_of_order[0] += 1;
-                    return;
+        let (sensor, number) = match item.kind {
+            Kind::Imu(_) if self.wanted.topics.imu.as_ref() == Some(&item.topic.name) => (0, 0),
+            Kind::Image if self.wanted.topics.image == item.topic.name => (1, self.came),
+            _ => return,
+        };
+        self.came += u32::from(sensor == 1);
+        let Some(stamps) = self.stamps.get_mut(sensor) else { return };
+        let passed = stamps.pass(item);
+        let is_set_back = CLOCK_SET_BACK.get(sensor).is_some_and(|most| stamps.behind_in_a_row() >= *most);
+        for (item, before) in passed.into_iter().zip([1, 0]) {
+            match item {
+                Some(Item { kind: Kind::Imu(sample), came, .. }) => {
+                    self.imu.push_back((sample, came));
+                    self.drop_unwanted();
                 }
-                self.last_imu = Some(sample.time);
-                self.imu.push_back(sample);
-                self.drop_unwanted();
+                Some(item) => self.image(item, number.saturating_sub(before)),
+                None => {}
             }
-            Kind::Image if self.wanted.topics.image == item.topic.name => self.image(item),
-            _ => {}
+        }
+        if is_set_back {
+            let message = "stamps went back and stay behind: a clock was set; what came before is used";
+            self.shared.warn(Warning::degraded("clock-set-back", message.to_owned()));
+            self.end();
         }
     }
 
-    fn image(&mut self, item: Item) {
-        let number = self.came;
-        self.came += 1;
-        if self.last_image.is_some_and(|t| item.time <= t) {
-            self.out_of_order[1] += 1;
-            return;
+    fn image(&mut self, item: Item, number: u32) {
+        if let Some(last) = self.last_image {
+            self.intervals.push_back(item.time - last);
+            self.intervals.drain(..self.intervals.len().saturating_sub(INTERVALS));
         }
         self.last_image = Some(item.time);
         let first = *self.first_image.get_or_insert(item.time);
@@ -173,7 +212,8 @@ impl Arrivals {
         let mut images = self.shared.images.write().unwrap_or_else(PoisonError::into_inner);
         images.push((entry.clone(), Arc::clone(&item.topic), item.place));
         drop(images);
-        self.images.push_back(Waiting { entry, topic: item.topic, place: item.place, asked: None });
+        let Item { topic, place, came, .. } = item;
+        self.images.push_back(Waiting { came, entry, topic, place, asked: None });
     }
 
     /// Lets IMU samples go that lie outside of the selected part.
@@ -186,7 +226,7 @@ impl Arrivals {
         }
         let from = start.map(|s| first + s - LEAD_IN);
         let to = end.map(|e| first + e + LEAD_IN);
-        self.imu.retain(|s| from.is_none_or(|t| s.time >= t) && to.is_none_or(|t| s.time <= t));
+        self.imu.retain(|(s, _)| from.is_none_or(|t| s.time >= t) && to.is_none_or(|t| s.time <= t));
     }
 
     fn decode_ahead(&mut self) {
@@ -204,9 +244,12 @@ impl Arrivals {
     fn end(&mut self) {
         self.has_ended = true;
         self.feed.ending().into_iter().for_each(|w| self.shared.warn(w));
-        for (count, what) in self.out_of_order.iter().zip(["IMU samples", "images"]) {
-            if *count > 0 {
-                let message = format!("{count} {what} came behind later ones and are left out");
+        for (stamps, what) in self.stamps.iter().zip(["IMU samples", "images"]) {
+            let count = stamps.left_out();
+            if count > 0 {
+                let message = format!(
+                    "{count} {what} came behind later ones, or far ahead of all others, and are left out"
+                );
                 self.shared
                     .warn(Warning::new("time-not-increasing", message).hint("files are sorted before use"));
             }

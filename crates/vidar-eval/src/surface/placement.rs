@@ -194,7 +194,7 @@ impl Refinement {
                  scale, of poses or of depth of {:.1} %",
                 (1.0 / scale - 1.0).abs() * 100.0
             );
-            Warning::new("scale-refined", message).hint("judge by the rigid F, which keeps the scale as it is")
+            Warning::new("scale-refined", message).hint("read the rigid F, which keeps the scale as it is")
         })
     }
 }

@@ -60,12 +60,12 @@ impl<'m> Candidates<'m> {
     /// Offers a view to all triangles; views must come in the order of their numbers.
     pub fn add(&mut self, view: u32, camera: &TextureCamera, image: &TextureImage) {
         let (nearest, eye) = self.renderer.nearest(&camera.world_from_camera, &camera.intrinsics);
-        let judge = Judge { eye: &eye, nearest: &nearest, image };
+        let evaluator = Evaluator { eye: &eye, nearest: &nearest, image };
         let (mesh, spheres) = (self.mesh, self.renderer.spheres());
         let runs = self.best.par_chunks_mut(RUN).zip(mesh.triangles.par_chunks(RUN)).zip(spheres);
         runs.filter(|(_, sphere)| eye.may_see(sphere)).for_each(|((best, triangles), _)| {
             for (best, triangle) in best.iter_mut().zip(triangles) {
-                if let Some((quality, color)) = judge.quality(mesh, triangle) {
+                if let Some((quality, color)) = evaluator.quality(mesh, triangle) {
                     let worse = best.iter().position(|b| quality > b.quality);
                     if let Some(at) = worse {
                         best[at..].rotate_right(1);
@@ -77,15 +77,15 @@ impl<'m> Candidates<'m> {
     }
 }
 
-/// One view, ready to be judged triangle by triangle.
-struct Judge<'a> {
+/// One view, ready to be evaluated triangle by triangle.
+struct Evaluator<'a> {
     eye: &'a Eye,
     /// z-depth of the nearest surface, either side; infinite where there is none.
     nearest: &'a Image<f32>,
     image: &'a TextureImage,
 }
 
-impl Judge<'_> {
+impl Evaluator<'_> {
     /// How well the view shows a triangle, pixels, and the colour at its centre; `None` where it does not show it.
     fn quality(&self, mesh: &TriangleMesh, triangle: &[u32; 3]) -> Option<(f32, [u8; 3])> {
         let (right, bottom) =

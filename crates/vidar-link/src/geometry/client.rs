@@ -295,7 +295,8 @@ impl RemoteModel {
     /// Predicts the views `wanted` at one worker, at another one where that fails.
     ///
     /// # Errors
-    /// [`ModelError::OutOfReach`] where no worker answers any more; the model's own error; [`ModelError::Cancelled`].
+    /// [`ModelError::OutOfReach`] where no worker answers any more; the model's own error where every worker that answers has one;
+    /// [`ModelError::Cancelled`].
     pub fn predict(
         &mut self,
         views: &ChunkViews,
@@ -329,6 +330,7 @@ impl RemoteModel {
         let (mut rounds, mut reasons) = (0, Vec::new());
         loop {
             let (mut tried, mut is_busy): (Vec<String>, bool) = (Vec::new(), false);
+            let mut model_error = None;
             while let Some(worker) = self.next(&tried) {
                 tried.push(worker.clone());
                 match self.ask(&worker, &bytes, &request, &stop)? {
@@ -338,7 +340,12 @@ impl RemoteModel {
                         reasons.push(format!("{worker} {why}"));
                     }
                     Tried::Busy => is_busy = true,
+                    Tried::ModelFailed(why) => model_error = Some(why),
                 }
+            }
+            // One device may be out of memory where another is not; what fails everywhere is the model's own error.
+            if let Some(why) = model_error.filter(|_| !is_busy) {
+                return Err(ModelError::Other(why));
             }
             // Where all are only busy, they are there, and their queues get shorter.
             let waits = is_busy && clock.elapsed() < self.options.timeout * 10;
@@ -406,7 +413,7 @@ impl RemoteModel {
                                 *self.report.workers.entry(worker.to_owned()).or_default() += 1;
                                 Tried::Predicted(Predicted { geometry, tokens })
                             }
-                            Outcome::ModelFailed(why) => return Err(ModelError::Other(why)),
+                            Outcome::ModelFailed(why) => Tried::ModelFailed(why),
                             Outcome::Refused(why) => Tried::Failed(format!("refused: {why}")),
                             Outcome::Busy => Tried::Busy,
                         }
@@ -435,4 +442,6 @@ enum Tried {
     Predicted(Predicted),
     Failed(String),
     Busy,
+    /// The model there gave an error.
+    ModelFailed(String),
 }

@@ -7,13 +7,14 @@ use super::dense::Cholesky;
 use super::inertial::{Shift, body_velocity, by_time_offset, gauge_prior_at, jacobians, residual};
 use super::prior::Part;
 use super::visual::{self, CameraPose};
-use super::window::{CALIBRATION_DIM, Calibration, Frame, Landmark, LandmarkObservation, OFFSET_AT};
+use super::window::{CALIBRATION_DIM, CalibrationState, Frame, Landmark, LandmarkObservation, OFFSET_AT};
 use super::{Linearisation, Smoother, SmootherConfig};
 use crate::imu::NavState;
 use nalgebra::{Matrix3, SMatrix, SVector, Vector2, Vector3};
 use vidar_core::CameraModel;
+use vidar_solve::Kernel;
 
-/// Whitened residual that a observation which does not project counts as.
+/// Whitened residual that an observation which does not project counts as.
 const UNPROJECTABLE_SIGMAS: f64 = 50.0;
 
 type ByCalibration = SMatrix<f64, 2, CALIBRATION_DIM>;
@@ -170,17 +171,11 @@ pub(crate) struct Scene<'a> {
 }
 
 impl Scene<'_> {
-    fn huber(&self, chi2: f64) -> (f64, f64) {
-        let k = self.config.huber_sigmas;
-        if chi2 <= k * k {
-            (1.0, 0.5 * chi2)
-        } else {
-            let norm = chi2.sqrt();
-            (k / norm, k * (norm - 0.5 * k))
-        }
+    fn kernel(&self) -> Kernel {
+        Kernel::Huber { k: self.config.huber_sigmas }
     }
 
-    /// Whitened residual of a observation whose landmark projects to `pixel`.
+    /// Whitened residual of an observation whose landmark projects to `pixel`.
     fn residual(&self, pixel: &Vector2<f64>, s: &LandmarkObservation) -> Vector2<f64> {
         s.whitening * (pixel - s.pixel)
     }
@@ -191,14 +186,14 @@ impl Scene<'_> {
         self.camera.project(&visual::direction(host, target, &landmark.bearing, landmark.rho))
     }
 
-    /// Evaluates a observation: stores its χ², returns its cost and, if it projects, what the system needs.
+    /// Evaluates an observation: stores its χ², returns its cost and, if it projects, what the system needs.
     pub(crate) fn observation(
         &self,
         landmark: &Landmark,
         s: &mut LandmarkObservation,
     ) -> (f64, Option<WeightedObservation>) {
         let (host, target) = (&self.camera_poses_at[landmark.host.frame], &self.camera_poses_at[s.frame]);
-        let lost = self.huber(UNPROJECTABLE_SIGMAS * UNPROJECTABLE_SIGMAS).1;
+        let lost = self.kernel().loss(UNPROJECTABLE_SIGMAS * UNPROJECTABLE_SIGMAS);
         let jacobians = visual::jacobians(self.camera, host, target, &landmark.bearing, landmark.rho);
         let now = match &jacobians {
             // Derivatives are taken at the present states, and the pixel came with them.
@@ -211,7 +206,7 @@ impl Scene<'_> {
         };
         let residual = self.residual(&now, s);
         s.chi2 = residual.norm_squared();
-        let (weight, cost) = self.huber(s.chi2);
+        let (weight, cost) = (self.kernel().weight(s.chi2), self.kernel().loss(s.chi2));
         let whiten = s.whitening * weight.sqrt();
         jacobians.by_host = whiten * jacobians.by_host;
         jacobians.by_target = whiten * jacobians.by_target;
@@ -252,7 +247,7 @@ fn calibration_columns(config: &SmootherConfig, by_place: &SMatrix<f64, 2, 6>) -
 }
 
 /// How far the instants of two frames lie from where the IMU measurements between them were cut.
-pub(crate) fn shift_between(calibration: &Calibration, from: &Frame, to: &Frame) -> Shift {
+pub(crate) fn shift_between(calibration: &CalibrationState, from: &Frame, to: &Frame) -> Shift {
     let now = calibration.time_offset_secs;
     Shift { begin: now - from.clock_secs, end: now - to.clock_secs }
 }

@@ -227,39 +227,39 @@ impl Smoother {
         in_keyframes.map(|(at, _)| at).nth(skip).unwrap_or(landmark.observations.len())
     }
 
-    /// Columns: the leaving frame first, then everything it is tied to, in the order of frames, calibration last.
+    /// Columns: the leaving frame first, then everything it is coupled to, in the order of frames, calibration last.
     fn lay_out(&self, gone: usize, motion: usize, bench: &mut Workspace) {
         bench.parts.clear();
         bench.insert(Part::Pose(gone));
         bench.insert(Part::Motion(motion));
-        let mut tied = [0_u8; 64];
+        let mut coupled = [0_u8; 64];
         let mut calibration = false;
         for part in &self.prior.parts {
             match part {
-                Part::Pose(k) => tied[*k] |= 1,
-                Part::Motion(k) => tied[*k] |= 2,
+                Part::Pose(k) => coupled[*k] |= 1,
+                Part::Motion(k) => coupled[*k] |= 2,
                 Part::Calibration => calibration = true,
             }
         }
         for k in [gone, motion].into_iter().filter(|&k| k > 0 && self.frames[k].imu_factor.is_some()) {
-            tied[k - 1] = 3;
+            coupled[k - 1] = 3;
             calibration |= self.config.estimate_time_offset;
         }
         if self.frames.get(gone + 1).is_some_and(|f| f.imu_factor.is_some()) {
-            tied[gone + 1] = 3;
+            coupled[gone + 1] = 3;
             calibration |= self.config.estimate_time_offset;
         }
         if self.frames[gone].zero_motion.is_some() && gone > 0 {
-            tied[gone - 1] |= 1;
+            coupled[gone - 1] |= 1;
         }
         if self.frames.get(gone + 1).is_some_and(|f| f.zero_motion.is_some()) {
-            tied[gone + 1] |= 1;
+            coupled[gone + 1] |= 1;
         }
         let mut rows = self.prior.rows + 3 * (15 + 6) + 15 + 2 * 3 + CALIBRATION_DIM;
         for &(slot, leaving) in &bench.leaving {
             let landmark = &self.landmarks[slot];
             for s in landmark.observations[..leaving].iter().filter(|s| self.frames[s.frame].keyframe) {
-                tied[s.frame] |= 1;
+                coupled[s.frame] |= 1;
                 rows += 2;
                 calibration |= self.config.calibrates_camera();
             }
@@ -269,10 +269,10 @@ impl Smoother {
             bench.insert(Part::Motion(gone));
         }
         for k in (0..self.frames.len()).filter(|&k| k != gone) {
-            if tied[k] & 1 != 0 {
+            if coupled[k] & 1 != 0 {
                 bench.insert(Part::Pose(k));
             }
-            if tied[k] & 2 != 0 {
+            if coupled[k] & 2 != 0 {
                 bench.insert(Part::Motion(k));
             }
         }

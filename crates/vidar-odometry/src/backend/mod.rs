@@ -40,7 +40,7 @@ use nalgebra::{Matrix2, Vector2};
 use prior::Prior;
 use rustc_hash::FxHashMap;
 use vidar_core::{CameraModel, Duration, FrameId, LandmarkId, Se3, Timestamp};
-use window::{Calibration, Frame, GaugePrior, ImuFactor, Landmark, LandmarkObservation};
+use window::{CalibrationState, Frame, GaugePrior, ImuFactor, Landmark, LandmarkObservation};
 
 /// Errors of the smoother.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
@@ -103,6 +103,9 @@ pub enum SmootherError {
     /// A state that is not finite.
     #[error("the state given for frame {0} is not finite")]
     BadState(FrameId),
+    /// The window holds no frame.
+    #[error("the window holds no frame; it has to begin with one")]
+    Empty,
 }
 
 /// The clock offset that frames are stamped with changes by no more than this from frame to frame, s: less than the time
@@ -114,7 +117,7 @@ const MAX_CLOCK_STEP_SECS: f64 = 2e-3;
 pub struct Smoother {
     config: SmootherConfig,
     camera: CameraModel,
-    calibration: Calibration,
+    calibration: CalibrationState,
     frames: Vec<Frame>,
     landmarks: Vec<Landmark>,
     /// Slots of `landmarks` that are free.
@@ -143,7 +146,7 @@ impl Smoother {
         slots.reserve(1024);
         Ok(Self {
             camera,
-            calibration: Calibration::new(body_from_camera),
+            calibration: CalibrationState::new(body_from_camera),
             frames: Vec::with_capacity(frames),
             landmarks: Vec::with_capacity(512),
             free: Vec::with_capacity(512),
@@ -407,11 +410,6 @@ impl Smoother {
     pub fn landmarks(&self) -> impl Iterator<Item = LandmarkEstimate> + '_ {
         let place = &self.calibration.body_from_camera;
         self.landmarks.iter().filter(|l| l.alive).map(|l| l.estimate(&self.frames, place))
-    }
-
-    /// Number of landmarks.
-    pub fn landmark_count(&self) -> usize {
-        self.slots.len()
     }
 
     /// Whether a frame sees a landmark.

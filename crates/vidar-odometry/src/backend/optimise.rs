@@ -3,12 +3,12 @@
 use super::Smoother;
 use super::linearise::System;
 use super::prior::Part;
-use super::window::{CALIBRATION_DIM, Calibration};
+use super::window::{CALIBRATION_DIM, CalibrationState};
 use crate::imu::{NavState, Vector15};
 use nalgebra::{SVector, Vector3};
 use vidar_core::{FrameId, LandmarkId};
 
-/// A observation that does not fit.
+/// An observation that does not fit.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Outlier {
     /// The frame.
@@ -49,7 +49,7 @@ const MOST_LAMBDA: f64 = 1e8;
 /// Inverse squares of the steps at which damping of 1 sets in: 0.1 rad, 1 m; 1 m/s, 0.05 rad/s, 0.5 m/s²; calibration
 /// 0.02 rad, 2 cm, 5 ms.
 ///
-/// Damping by the system's own diagonal would hold biases in place: each is tied to its neighbours by a walk a million
+/// Damping by the system's own diagonal would hold biases in place: each is coupled to its neighbours by a walk a million
 /// times stiffer than what is known of all of them together.
 const POSE_DAMPING: [f64; 6] = [1e2, 1e2, 1e2, 1.0, 1.0, 1.0];
 const MOTION_DAMPING: [f64; 9] = [1.0, 1.0, 1.0, 4e2, 4e2, 4e2, 4.0, 4.0, 4.0];
@@ -120,7 +120,7 @@ impl Smoother {
         self.find_outliers(report);
     }
 
-    fn save(&self, system: &mut System) -> Calibration {
+    fn save(&self, system: &mut System) -> CalibrationState {
         system.saved.clear();
         system.saved.extend(self.frames.iter().map(|f| StateBackup { state: f.state, step: f.step }));
         system.saved_landmarks.clear();
@@ -131,7 +131,7 @@ impl Smoother {
         self.calibration
     }
 
-    fn restore(&mut self, system: &System, calibration: Calibration) {
+    fn restore(&mut self, system: &System, calibration: CalibrationState) {
         for (frame, saved) in self.frames.iter_mut().zip(&system.saved) {
             frame.state = saved.state;
             frame.step = saved.step;

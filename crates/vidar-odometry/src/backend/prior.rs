@@ -1,6 +1,6 @@
 //! The square-root prior: `½ |r₀ + R δ|²` over the steps δ of the states that are in it.
 
-use super::window::{CALIBRATION_DIM, Calibration, Frame};
+use super::window::{CALIBRATION_DIM, CalibrationState, Frame};
 use nalgebra::Vector3;
 use vidar_core::LieGroup;
 
@@ -172,7 +172,12 @@ impl Prior {
 
     /// Moves the linearisation points to the present states: the residual becomes its present value, the root its
     /// corrected self. The frames' own points are the caller's to move.
-    pub(crate) fn relinearise(&mut self, frames: &[Frame], calibration: &Calibration, constrained: bool) {
+    pub(crate) fn relinearise(
+        &mut self,
+        frames: &[Frame],
+        calibration: &CalibrationState,
+        constrained: bool,
+    ) {
         self.evaluate(frames, calibration);
         self.constrain(frames, constrained);
         let n = self.dim;
@@ -208,7 +213,7 @@ impl Prior {
     }
 
     /// Evaluates residual and gradient at the present steps, and returns the cost.
-    pub(crate) fn evaluate(&mut self, frames: &[Frame], calibration: &Calibration) -> f64 {
+    pub(crate) fn evaluate(&mut self, frames: &[Frame], calibration: &CalibrationState) -> f64 {
         let n = self.dim;
         self.step.clear();
         for part in &self.parts {

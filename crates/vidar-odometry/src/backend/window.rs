@@ -291,7 +291,7 @@ pub(crate) struct GaugePrior {
 
 /// The camera's place on the body and its clock, with linearisation point and step once they are in the prior.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct Calibration {
+pub(crate) struct CalibrationState {
     pub(crate) body_from_camera: Se3,
     pub(crate) time_offset_secs: f64,
     /// As given, the centre of the calibration's own prior.
@@ -302,7 +302,7 @@ pub(crate) struct Calibration {
     pub(crate) in_prior: bool,
 }
 
-impl Calibration {
+impl CalibrationState {
     pub(crate) fn new(body_from_camera: Se3) -> Self {
         Self {
             body_from_camera,

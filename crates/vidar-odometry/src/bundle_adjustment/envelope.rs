@@ -2,7 +2,7 @@
 //!
 //! States that see the same landmarks are neighbours in time, so that the reduced system of a recording is a band with a few
 //! full rows for the calibration: factorising it costs the square of the band's width per row, and the factor fills nothing
-//! outside the envelope (George and Liu 1981, chapter 4). A loop makes the rows of the states that it ties long, and no others.
+//! outside the envelope (George and Liu 1981, chapter 4). A loop makes the rows of the states that it constrains long, and no others.
 
 use crate::backend::dot;
 
@@ -99,7 +99,7 @@ impl Envelope {
             begin: self.begin.clone(),
             values: vec![0.0; self.values.len()],
         };
-        // Last row of the band that is tied to each column.
+        // Last row of the band that is coupled to each column.
         let mut last: Vec<usize> = (0..n).collect();
         for row in 0..border {
             for column in self.first[row]..row {
@@ -230,7 +230,7 @@ mod tests {
 
     #[test]
     fn the_inverse_within_the_envelope_is_that_of_the_dense_matrix() {
-        // The last two rows are the border; row 5 is tied to less than row 4 is.
+        // The last two rows are the border; row 5 is coupled to less than row 4 is.
         let (envelope, dense) = example(&[0, 0, 1, 1, 2, 4, 4, 0, 0]);
         let mut factor = envelope.clone();
         assert!(envelope.factorise(&[0.0; 9], &mut factor));

@@ -84,7 +84,7 @@ impl Grown<'_> {
         let from = support.unwrap_or(0);
         let until = self.until(known, STEP_SECS);
         let seen = self.settle(from, until, from, known..until, watch)?;
-        Ok(self.judge(seen, (self.guess.times[until - 1] - end).as_secs_f64()))
+        Ok(self.evaluate(seen, (self.guess.times[until - 1] - end).as_secs_f64()))
     }
 
     /// A second more at the beginning.
@@ -108,7 +108,7 @@ impl Grown<'_> {
         }
         let until = self.until(added, SUPPORT_SECS).min(known + added);
         let seen = self.settle(0, until, until - 1, 0..added, watch)?;
-        Ok(self.judge(seen, (begin - self.guess.times[0]).as_secs_f64()))
+        Ok(self.evaluate(seen, (begin - self.guess.times[0]).as_secs_f64()))
     }
 
     /// State of the first image of a segment that is long enough to be taken over.
@@ -163,7 +163,7 @@ impl Grown<'_> {
     }
 
     /// Goes on unless too long a stretch showed too little.
-    fn judge(&mut self, seen_share: f64, secs: f64) -> bool {
+    fn evaluate(&mut self, seen_share: f64, secs: f64) -> bool {
         self.blind_secs = if seen_share >= 0.3 { 0.0 } else { self.blind_secs + secs };
         self.blind_secs <= MAX_BLIND_SECS
     }

@@ -1,7 +1,7 @@
 //! The inertial factor of the adjustment: a preintegrated stretch with the sensors' gains.
 //!
-//! A consumer IMU's readings are off by up to a percent in scale. With gains `γ` the true rate is `(1 + γ) ∘ measured − b`, per axis
-//! and sensor. The stretch is integrated with gains and biases as they were, and corrected to first order for what they are.
+//! A consumer IMU's measurements are off by up to a percent in scale. With gains `γ` the true rate is `(1 + γ) ∘ measured − b`, per
+//! axis and sensor. The stretch is integrated with gains and biases as they were, and corrected to first order for what they are.
 
 use crate::backend::{Shift, Whitening, inertial_jacobians, inertial_residual};
 use crate::imu::{Bias, ImuBuffer, ImuModel, Matrix15, NavState, Preintegration, Vector15};
@@ -15,7 +15,7 @@ pub(super) const GAIN_DIM: usize = 6;
 /// below 1e-6 rad.
 const REINTEGRATE_GAIN: f64 = 1e-3;
 
-/// What the sensors' readings are to be multiplied by, minus one, per axis of the body.
+/// What the sensors' measurements are to be multiplied by, minus one, per axis of the body.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub(super) struct ImuGain {
     pub(super) gyro: Vector3<f64>,

@@ -2,9 +2,9 @@
 
 use super::inertial::InertialFactor;
 use super::log::{TrackKey, TrackLog};
-use super::observation::{self, Calibration, Landmark, MIN_INVERSE_DISTANCE};
+use super::observation::{self, Landmark, MIN_INVERSE_DISTANCE, SensorCalibration};
 use super::problem::CalibrationPrior;
-use super::problem::{FrameState, Observation, ObservedLandmark, Problem};
+use super::problem::{FrameState, ObservedLandmark, Problem, WhitenedObservation};
 use super::{AdjustmentError, Measurements};
 use crate::backend::whitening;
 use crate::imu::{ImuBuffer, ImuModel, NavState, Preintegration};
@@ -57,7 +57,7 @@ impl Guess {
 /// The problem that begins with `guess`, whose state number `held` fixes position and heading of the world.
 pub(super) fn build(
     recording: &Measurements<'_>,
-    calibration: &Calibration,
+    calibration: &SensorCalibration,
     prior: CalibrationPrior,
     guess: &Guess,
     held: usize,
@@ -215,13 +215,13 @@ fn triangulate(
     log: &TrackLog,
     chain: &[usize],
     frames: &[FrameState],
-    calibration: &Calibration,
+    calibration: &SensorCalibration,
 ) -> Vec<ObservedLandmark> {
-    let mut tracks: BTreeMap<TrackKey, Vec<Observation>> = BTreeMap::new();
+    let mut tracks: BTreeMap<TrackKey, Vec<WhitenedObservation>> = BTreeMap::new();
     for (frame, index) in chain.iter().enumerate() {
         for logged in &log.images[*index].observations {
             if let Some(whitening) = whitening(&logged.covariance()) {
-                tracks.entry(logged.key).or_default().push(Observation {
+                tracks.entry(logged.key).or_default().push(WhitenedObservation {
                     frame,
                     pixel: logged.pixel(),
                     whitening,
@@ -229,7 +229,7 @@ fn triangulate(
             }
         }
     }
-    let landmark = |observations: &[Observation]| {
+    let landmark = |observations: &[WhitenedObservation]| {
         let landmark = first_guess(observations, frames, calibration)?;
         Some(ObservedLandmark { landmark, observations: observations.to_vec() })
     };
@@ -240,11 +240,11 @@ fn triangulate(
 /// Direction of the first observation; the inverse distance that fits the other rays best: linear least squares of
 /// `(m + ρ (A − c)) × d = 0`.
 pub(super) fn first_guess(
-    observations: &[Observation],
+    observations: &[WhitenedObservation],
     frames: &[FrameState],
-    calibration: &Calibration,
+    calibration: &SensorCalibration,
 ) -> Option<Landmark> {
-    let ray = |o: &Observation| {
+    let ray = |o: &WhitenedObservation| {
         let camera = observation::camera_pose(&frames[o.frame].body, calibration, &o.pixel);
         Some((camera.translation, camera.rotation.act(&calibration.camera.unproject(&o.pixel)?)))
     };

@@ -207,8 +207,14 @@ impl TrackLog {
         image.observations.iter().find(|o| o.key == key).map(LoggedObservation::pixel)
     }
 
-    /// Adds to image `frame`, if it was logged, that it shows an earlier track.
-    pub(crate) fn tie(&mut self, frame: FrameId, key: TrackKey, pixel: &Pixel, covariance: &Matrix2<f64>) {
+    /// Adds a loop constraint: image `frame`, if it was logged, shows an earlier track.
+    pub(crate) fn add_loop_constraint(
+        &mut self,
+        frame: FrameId,
+        key: TrackKey,
+        pixel: &Pixel,
+        covariance: &Matrix2<f64>,
+    ) {
         let Some(image) = self.images.iter_mut().rev().find(|i| i.frame == frame) else { return };
         if image.observations.iter().all(|o| o.key != key) {
             image.observations.push(LoggedObservation::new(key, pixel, covariance));

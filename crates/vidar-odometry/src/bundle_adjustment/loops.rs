@@ -1,4 +1,4 @@
-//! Loops: landmarks that a later image shows again under another name are measured in it, and so tie both times together.
+//! Loops: landmarks that a later image shows again under another name are measured in it, which constrains the states of both times.
 //!
 //! The log keeps the grey levels of an image now and then (a *place*). At the solution, the landmarks that one place shows are
 //! projected into another one, long before or after it, and their patches aligned there. What is left between prediction and
@@ -11,15 +11,16 @@ use super::linearise::{Cost, cost};
 use super::log::TrackLog;
 use super::observation::{self, Landmark};
 use super::optimise::{self, OptimiseReport};
-use super::problem::{Observation, Problem};
+use super::problem::{Problem, WhitenedObservation};
 use super::progress::Watch;
 use crate::backend::whitening;
 use crate::frontend::{Feature, FeatureKind, MatchingConfig, Warp};
 use crate::tracking::{HostImage, Measurer};
 use nalgebra::{Matrix2, Matrix3, Vector2, Vector3};
 use vidar_core::{LieGroup, Se3, camera::Pixel};
+use vidar_solve::statistics::median_upper;
 
-/// Times that are closer are tied by tracks and IMU well enough, s.
+/// States that are closer in time are constrained by tracks and IMU well enough, s.
 const MIN_GAP_SECS: f64 = 5.0;
 
 /// Places that a place is matched with: those that should show most of what it shows. More say the same again, and each costs as much.
@@ -46,25 +47,26 @@ const MATCH_SIGMA_PX: f64 = 0.5;
 /// Rounds of matching and adjusting: the second finds what drift had kept out of reach.
 const ROUNDS: usize = 2;
 
-/// What tying one pair of places may raise the cost of all other measurements by: half of χ² of its six degrees of freedom at
-/// 99.9 %. More says that tracks and IMU contradict it.
+/// What the loop constraint of one pair of places may raise the cost of all other measurements by: half of χ² of its six degrees
+/// of freedom at 99.9 %. More says that tracks and IMU contradict it.
 const MAX_COST_PER_PAIR: f64 = 11.2;
 
 /// A match: which landmark, in which state's image, where.
 #[derive(Clone, Copy, Debug)]
 struct Match {
     landmark: usize,
-    observation: Observation,
+    observation: WhitenedObservation,
 }
 
-/// What was tied.
+/// The loop constraints that were kept: pairs of places and matches between them.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub(super) struct Closed {
     pub(super) pairs: usize,
     pub(super) matches: usize,
 }
 
-/// Ties places that show the same, and adjusts again. Without loops, or where they contradict the rest, `problem` is as it was.
+/// Adds loop constraints between places that show the same, and adjusts again. Without loops, or where they contradict the rest,
+/// `problem` is as it was.
 pub(super) fn close(
     problem: &mut Problem,
     report: &mut OptimiseReport,
@@ -77,20 +79,20 @@ pub(super) fn close(
         .collect();
     let mut kept = Closed::default();
     let mut measurer = Measurer::new(MatchingConfig::default(), NOISE_GRAY);
-    let mut tied = problem.clone();
-    let mut tied_report = *report;
+    let mut constrained = problem.clone();
+    let mut constrained_report = *report;
     for _ in 0..ROUNDS {
-        let found = matches(problem, &tied, &places, &mut measurer);
+        let found = matches(problem, &constrained, &places, &mut measurer);
         if found.pairs == 0 || found.all.len() <= kept.matches {
             break;
         }
         // Matches are found anew at the better solution, so that the first round's do not count twice.
         let mut next = problem.clone();
-        for (state, place) in next.frames.iter_mut().zip(&tied.frames) {
+        for (state, place) in next.frames.iter_mut().zip(&constrained.frames) {
             state.body.state = place.body.state;
         }
-        next.calibration = tied.calibration.clone();
-        for (seen, other) in next.landmarks.iter_mut().zip(&tied.landmarks) {
+        next.calibration = constrained.calibration.clone();
+        for (seen, other) in next.landmarks.iter_mut().zip(&constrained.landmarks) {
             seen.landmark = other.landmark;
         }
         for one in &found.all {
@@ -100,18 +102,18 @@ pub(super) fn close(
                 observations.insert(at, one.observation);
             }
         }
-        tied_report = *report;
-        optimise::finish(&mut next, &mut tied_report, watch)?;
+        constrained_report = *report;
+        optimise::finish(&mut next, &mut constrained_report, watch)?;
         let raised = without(&next, &found.all).total() - cost(problem).total();
         if raised > MAX_COST_PER_PAIR * found.pairs as f64 {
             break;
         }
         kept = Closed { pairs: found.pairs, matches: found.all.len() };
-        tied = next;
+        constrained = next;
     }
     if kept.pairs > 0 {
-        *problem = tied;
-        *report = tied_report;
+        *problem = constrained;
+        *report = constrained_report;
     }
     Ok(kept)
 }
@@ -128,7 +130,8 @@ fn without(problem: &Problem, matches: &[Match]) -> Cost {
     cost(&rest)
 }
 
-struct Found {
+/// All matches, and how many pairs of places they are between.
+struct LoopMatches {
     pairs: usize,
     all: Vec<Match>,
 }
@@ -140,14 +143,14 @@ fn matches(
     solution: &Problem,
     places: &[(usize, &HostImage)],
     measurer: &mut Measurer,
-) -> Found {
+) -> LoopMatches {
     let mut shown: Vec<Vec<(usize, Pixel)>> = vec![Vec::new(); problem.frames.len()];
     for (k, seen) in problem.landmarks.iter().enumerate() {
         for observation in &seen.observations {
             shown[observation.frame].push((k, observation.pixel));
         }
     }
-    let mut found = Found { pairs: 0, all: Vec::new() };
+    let mut found = LoopMatches { pairs: 0, all: Vec::new() };
     for (from, host) in places {
         let far = |to: usize| {
             let secs = (solution.frames[to].time - solution.frames[*from].time).as_secs_f64();
@@ -221,7 +224,7 @@ impl Pair<'_> {
         let one = |(k, _, measured): &(usize, Pixel, crate::frontend::PixelMeasurement)| {
             let covariance = measured.covariance() + Matrix2::identity() * MATCH_SIGMA_PX.powi(2);
             let whitening = whitening(&covariance)?;
-            let observation = Observation { frame: self.to, pixel: measured.pixel, whitening };
+            let observation = WhitenedObservation { frame: self.to, pixel: measured.pixel, whitening };
             Some(Match { landmark: *k, observation })
         };
         aligned.iter().zip(&fits).filter(|(_, fit)| **fit).filter_map(|(a, _)| one(a)).collect()
@@ -255,11 +258,11 @@ impl Pair<'_> {
 
 /// Which shifts agree with one affine function of the place in the image: fitted to all, then to those near it.
 fn smooth(shifts: &[(Vector2<f64>, Vector2<f64>)]) -> Vec<bool> {
-    let median = |mut values: Vec<f64>| {
-        values.sort_by(f64::total_cmp);
-        values.get(values.len() / 2).copied().unwrap_or(0.0)
+    let median = |k: usize| {
+        let mut along: Vec<f64> = shifts.iter().map(|(_, shift)| shift[k]).collect();
+        median_upper(&mut along).unwrap_or(0.0)
     };
-    let middle = Vector2::from_fn(|k, _| median(shifts.iter().map(|(_, shift)| shift[k]).collect()));
+    let middle = Vector2::from_fn(|k, _| median(k));
     // Within reach of the median a patch is at most twice as far off as a match can be wrong.
     let mut fits: Vec<bool> =
         shifts.iter().map(|(_, shift)| (shift - middle).norm() < 3.0 * MAX_DEPARTURE_PX).collect();

@@ -5,7 +5,7 @@
 //! the images before the start: poses, velocities, biases, landmarks and, where asked for, the camera's calibration
 //! (clock, readout, place on the body, intrinsics) are estimated together; scale and gravity are part of it, because states are
 //! metric and z is up. Segments that the odometry had to leave apart are joined by the IMU where the gap is short. The sensors' gains
-//! and their noise are estimated, too, and what comes into view again ties its times together.
+//! and their noise are estimated, too, and what comes into view again gives loop constraints.
 //!
 //! [`adjust`] is the way through: the odometry's longest segment → outward over images without a state, and over other segments
 //! → all together → again with the noise that the residuals show → again with loops → covariance → a state for every image.
@@ -41,7 +41,7 @@ use inertial::ImuGain;
 use initial::Guess;
 use linearise::System;
 use loops::Closed;
-use observation::{Calibration, POSITION, ROTATION};
+use observation::{POSITION, ROTATION, SensorCalibration};
 use optimise::OptimiseReport;
 use problem::{CalibrationPrior, Problem};
 use progress::Watch;
@@ -66,7 +66,7 @@ struct Solution {
     report: OptimiseReport,
     /// Mean squared inertial residual, whitened with the noise as given.
     inertial_chi2_per_dof: f64,
-    /// Places that were tied.
+    /// The loop constraints.
     closed: Closed,
     /// The IMU's model with noise as the residuals show it.
     model: ImuModel,
@@ -134,7 +134,7 @@ pub fn adjust(
         // What is out of order was left out by the odometry, too.
         let _ = imu.push(*sample);
     }
-    let calibration = Calibration {
+    let calibration = SensorCalibration {
         camera: input.camera.model.clone(),
         body_from_camera: input.camera.body_from_camera,
         clock_secs: 0.0,
@@ -216,7 +216,7 @@ struct Measurements<'a> {
 
 /// What is known so far.
 struct Work {
-    calibration: Calibration,
+    calibration: SensorCalibration,
     prior: CalibrationPrior,
     /// What the states' instants are their images' stamps plus.
     clock_offset: Duration,
@@ -256,7 +256,7 @@ impl Work {
         } else {
             self.clock_offset += Duration::from_secs_f64(clock_secs);
             self.guess = self.guess.at_corrected_clock(&problem, recording.imu);
-            self.calibration = Calibration { clock_secs: 0.0, ..problem.calibration.clone() };
+            self.calibration = SensorCalibration { clock_secs: 0.0, ..problem.calibration.clone() };
             self.prior.mean.clock_secs -= clock_secs;
         }
         Ok(Passed { problem, images, report, clock_offset, is_settled })

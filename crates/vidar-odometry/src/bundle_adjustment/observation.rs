@@ -24,7 +24,7 @@ pub(super) const POSITION: usize = 5;
 
 /// What is estimated of the sensors.
 #[derive(Clone, Debug, PartialEq)]
-pub(super) struct Calibration {
+pub(super) struct SensorCalibration {
     pub(super) camera: CameraModel,
     pub(super) body_from_camera: Se3,
     /// Correction of the clock offset that the states are stamped with, s.
@@ -105,7 +105,7 @@ impl MovingBody {
     }
 }
 
-impl Calibration {
+impl SensorCalibration {
     /// Share of the readout after which row `v` is exposed, counted from the centre row.
     pub(super) fn row_share(&self, row: f64) -> f64 {
         row / (self.camera.height() as f64 - 1.0) - 0.5
@@ -160,7 +160,7 @@ pub(super) struct Linearised {
 }
 
 /// Pose of the camera while the row of `measured` is exposed.
-pub(super) fn camera_pose(body: &MovingBody, calibration: &Calibration, measured: &Pixel) -> Se3 {
+pub(super) fn camera_pose(body: &MovingBody, calibration: &SensorCalibration, measured: &Pixel) -> Se3 {
     body.pose_after(calibration.row_secs(measured.y)) * calibration.body_from_camera
 }
 
@@ -168,7 +168,7 @@ pub(super) fn camera_pose(body: &MovingBody, calibration: &Calibration, measured
 pub(super) fn project(
     body: &MovingBody,
     landmark: &Landmark,
-    calibration: &Calibration,
+    calibration: &SensorCalibration,
     measured: &Pixel,
 ) -> Option<Pixel> {
     let camera = camera_pose(body, calibration, measured);
@@ -185,7 +185,7 @@ pub(super) fn from_camera(landmark: &Landmark, place: &Vector3<f64>) -> Vector3<
 pub(super) fn linearise(
     body: &MovingBody,
     landmark: &Landmark,
-    calibration: &Calibration,
+    calibration: &SensorCalibration,
     measured: &Pixel,
 ) -> Option<Linearised> {
     let secs = calibration.row_secs(measured.y);
@@ -237,7 +237,7 @@ mod tests {
     use crate::imu::{Bias, Vector15};
     use vidar_core::{CameraModel, Pinhole, camera::RadTan};
 
-    fn example() -> (MovingBody, Landmark, Calibration, Pixel) {
+    fn example() -> (MovingBody, Landmark, SensorCalibration, Pixel) {
         let state = NavState {
             world_from_body: Se3::new(So3::exp(&Vector3::new(0.3, -0.5, 0.9)), Vector3::new(1.0, -0.4, 0.7)),
             velocity: Vector3::new(0.5, -0.3, 0.2),
@@ -251,7 +251,7 @@ mod tests {
             gravity: Vector3::new(0.0, 0.0, -9.81),
         };
         let pinhole = Pinhole::new(420.0, 424.0, 317.0, 243.0, 640, 480).unwrap();
-        let calibration = Calibration {
+        let calibration = SensorCalibration {
             camera: CameraModel::RadTan(RadTan::new(pinhole, [-0.2, 0.05, 1e-3, -5e-4]).unwrap()),
             body_from_camera: Se3::new(
                 So3::exp(&Vector3::new(1.2, 0.1, -0.3)),
@@ -272,7 +272,7 @@ mod tests {
         (body, landmark, calibration, measured)
     }
 
-    fn perturbed(calibration: &Calibration, index: usize, by: f64) -> Calibration {
+    fn perturbed(calibration: &SensorCalibration, index: usize, by: f64) -> SensorCalibration {
         let mut step = vec![0.0; calibration.dim()];
         step[index] = by;
         let moved = calibration.plus(&step).unwrap();

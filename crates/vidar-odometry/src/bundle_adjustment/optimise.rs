@@ -2,7 +2,7 @@
 
 use super::AdjustmentError;
 use super::linearise::{Cost, System, cost, inertial_error, linearise, squared_error};
-use super::observation::{Calibration, Landmark};
+use super::observation::{Landmark, SensorCalibration};
 use super::problem::{FRAME_DIM, Problem};
 use super::progress::Watch;
 use crate::imu::{NavState, Vector15};
@@ -131,7 +131,7 @@ fn follow(problem: &mut Problem) {
 struct Values {
     states: Vec<NavState>,
     landmarks: Vec<Landmark>,
-    calibration: Option<Calibration>,
+    calibration: Option<SensorCalibration>,
 }
 
 impl Values {

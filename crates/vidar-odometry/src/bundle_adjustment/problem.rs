@@ -2,7 +2,7 @@
 
 use super::envelope::Envelope;
 use super::inertial::{GAIN_DIM, ImuGain, InertialFactor};
-use super::observation::{Calibration, Landmark, MovingBody, STATE_DIM};
+use super::observation::{Landmark, MovingBody, STATE_DIM, SensorCalibration};
 use crate::imu::{ImuBuffer, ImuModel, NavState};
 use nalgebra::{Matrix2, Vector3};
 use vidar_core::{Timestamp, camera::Pixel};
@@ -22,7 +22,7 @@ pub(super) struct FrameState {
 
 /// An observation of a landmark.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Observation {
+pub(super) struct WhitenedObservation {
     pub(super) frame: usize,
     /// Where the image shows it, as read out.
     pub(super) pixel: Pixel,
@@ -34,13 +34,13 @@ pub(super) struct Observation {
 #[derive(Clone, Debug)]
 pub(super) struct ObservedLandmark {
     pub(super) landmark: Landmark,
-    pub(super) observations: Vec<Observation>,
+    pub(super) observations: Vec<WhitenedObservation>,
 }
 
 /// Standard deviations of what is known of the calibration before; zero: it is not estimated.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct CalibrationPrior {
-    pub(super) mean: Calibration,
+    pub(super) mean: SensorCalibration,
     /// In the order of [`super::observation::Linearised::by_calibration`].
     pub(super) sigmas: Vec<f64>,
 }
@@ -50,7 +50,7 @@ pub(super) struct CalibrationPrior {
 pub(super) struct Problem {
     pub(super) frames: Vec<FrameState>,
     pub(super) landmarks: Vec<ObservedLandmark>,
-    pub(super) calibration: Calibration,
+    pub(super) calibration: SensorCalibration,
     pub(super) prior: CalibrationPrior,
     /// Indices of the calibration's unknowns that are estimated.
     pub(super) active: Vec<usize>,
@@ -75,7 +75,7 @@ impl Problem {
         self.active.partition_point(|index| *index < gains)
     }
 
-    /// The envelope of the reduced system: a state is tied to the one before and to all that share a landmark with it.
+    /// The envelope of the reduced system: a state is coupled to the one before and to all that share a landmark with it.
     pub(super) fn envelope(&self) -> Envelope {
         let mut oldest: Vec<usize> = (0..self.frames.len()).map(|k| k.saturating_sub(1)).collect();
         for seen in &self.landmarks {
@@ -89,7 +89,7 @@ impl Problem {
     }
 
     /// The calibration moved by a step of its active unknowns; `None` where the camera would not be valid.
-    pub(super) fn calibration_plus(&self, step: &[f64]) -> Option<Calibration> {
+    pub(super) fn calibration_plus(&self, step: &[f64]) -> Option<SensorCalibration> {
         let mut delta = vec![0.0; self.calibration.dim()];
         for (index, value) in self.active.iter().zip(step) {
             delta[*index] = *value;
@@ -99,7 +99,7 @@ impl Problem {
 }
 
 impl FrameState {
-    /// A state at `time` with the sensors' readings around it; `None` where the IMU does not cover it.
+    /// A state at `time` with the IMU measurements around it; `None` where the IMU does not cover it.
     pub(super) fn new(
         time: Timestamp,
         state: NavState,

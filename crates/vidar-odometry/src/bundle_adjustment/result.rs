@@ -34,9 +34,9 @@ pub struct AdjustedCalibration {
 /// The IMU as estimated.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct AdjustedImu {
-    /// What readings of the gyroscope are to be multiplied by, per axis of the body.
+    /// What measurements of the gyroscope are to be multiplied by, per axis of the body.
     pub gyro_gain: Vector3<f64>,
-    /// What readings of the accelerometer are to be multiplied by.
+    /// What measurements of the accelerometer are to be multiplied by.
     pub accel_gain: Vector3<f64>,
     /// Standard deviations of both, relative; zero where they were held.
     pub gyro_gain_sigma: Vector3<f64>,
@@ -61,7 +61,7 @@ pub struct AdjustmentReport {
     pub rejected: usize,
     /// Iterations of all rounds.
     pub iterations: usize,
-    /// Pairs of places, seen at different times, that were tied to each other, and landmarks seen again in them.
+    /// Loop constraints: pairs of places, seen at different times, that show the same, and landmarks seen again in them.
     pub loops: usize,
     /// See `loops`.
     pub loop_matches: usize,

@@ -1,6 +1,6 @@
 //! How far a calibration may be from what was given.
 
-use super::observation::Calibration;
+use super::observation::SensorCalibration;
 
 /// What may change of the camera: standard deviations of the given values, zero where they are held.
 #[derive(Clone, Debug, PartialEq)]
@@ -46,7 +46,7 @@ impl Default for CalibrationSigmas {
 }
 
 impl CalibrationSigmas {
-    pub(super) fn of(&self, calibration: &Calibration) -> Vec<f64> {
+    pub(super) fn of(&self, calibration: &SensorCalibration) -> Vec<f64> {
         let mut sigmas = vec![self.time_offset_secs, self.readout_secs];
         sigmas.extend([self.rotation_rad; 3]);
         sigmas.extend([self.position_m; 3]);

@@ -2,7 +2,7 @@
 
 use super::parameters::Parameters;
 use super::path::GyroPath;
-use super::window::{Node, Observation, Point, Window};
+use super::window::{Node, NodeObservation, Point, Window};
 use crate::gyro_alignment::{ImageFeatures, RateSample};
 use nalgebra::Vector3;
 use rustc_hash::FxHashMap;
@@ -50,7 +50,7 @@ pub(super) fn stretches(size: (f64, f64), images: &[ImageFeatures], samples: &[R
     all.into_iter().map(|(.., window)| window).collect()
 }
 
-/// Length of the means of which the angular rate is judged, s: noise averages out, motion hardly.
+/// Length of the means of which the angular rate is evaluated, s: noise averages out, motion hardly.
 const MEAN_SECS: f64 = 0.1;
 
 /// Root mean square of the angular rate about its mean, rad/s.
@@ -69,14 +69,14 @@ fn turning(samples: &[RateSample], from: f64, to: f64) -> f64 {
 }
 
 fn stretch(size: (f64, f64), images: &[ImageFeatures]) -> Option<Window> {
-    let mut tracks: FxHashMap<LandmarkId, Vec<Observation>> = FxHashMap::default();
+    let mut tracks: FxHashMap<LandmarkId, Vec<NodeObservation>> = FxHashMap::default();
     for (node, image) in images.iter().enumerate() {
         for (id, pixel) in &image.features {
             let row = pixel.y / (size.1 - 1.0) - 0.5;
-            tracks.entry(*id).or_default().push(Observation { node, pixel: *pixel, row });
+            tracks.entry(*id).or_default().push(NodeObservation { node, pixel: *pixel, row });
         }
     }
-    let mut tracks: Vec<(LandmarkId, Vec<Observation>)> =
+    let mut tracks: Vec<(LandmarkId, Vec<NodeObservation>)> =
         tracks.into_iter().filter(|(_, seen)| seen.len() >= MIN_OBSERVATIONS).collect();
     // Longest first; of each cell of the image one after the other.
     tracks.sort_by_key(|(id, seen)| (std::cmp::Reverse(seen.len()), *id));

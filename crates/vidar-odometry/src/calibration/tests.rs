@@ -2,7 +2,7 @@
 
 use super::parameters::{DIM, Tangent};
 use super::path::GyroPath;
-use super::window::{Node, Noise, Observation, Point, Window};
+use super::window::{Node, NodeObservation, Noise, Point, Window};
 use super::*;
 use crate::simulate::{Handheld, Random};
 use nalgebra::Vector2;
@@ -37,7 +37,7 @@ fn small() -> (Window, Parameters, Vec<RateSample>) {
             direction: Vector3::new(0.1 * f64::from(k) - 0.3, 0.2 - 0.07 * f64::from(k), 1.0).normalize(),
             inverse_distance: 0.5 + 0.2 * f64::from(k),
             observations: (0..4)
-                .map(|node| Observation {
+                .map(|node| NodeObservation {
                     node,
                     pixel: Vector2::new(300.0 + 20.0 * r.normal(), 240.0 + 20.0 * r.normal()),
                     row: 0.3 * r.normal(),

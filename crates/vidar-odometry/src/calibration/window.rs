@@ -32,7 +32,7 @@ const FIXED: f64 = 1e-5;
 
 /// Where a point was seen.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Observation {
+pub(super) struct NodeObservation {
     pub node: usize,
     pub pixel: Pixel,
     /// Row over the image's height, −½…½.
@@ -44,7 +44,7 @@ pub(super) struct Observation {
 pub(super) struct Point {
     pub direction: Vector3<f64>,
     pub inverse_distance: f64,
-    pub observations: Vec<Observation>,
+    pub observations: Vec<NodeObservation>,
 }
 
 /// One image of the stretch.
@@ -148,7 +148,7 @@ impl Window {
     fn see(
         &self,
         point: &Point,
-        seen: &Observation,
+        seen: &NodeObservation,
         parameters: &Parameters,
         path: &GyroPath,
         reference: &PathPoint,
@@ -308,7 +308,7 @@ impl Window {
     fn linearise(
         &self,
         point: &Point,
-        seen: &Observation,
+        seen: &NodeObservation,
         at: &Seen,
         projection: &Projection,
         reference: &PathPoint,

@@ -13,6 +13,7 @@ use super::path::{OrientationPath, RateSample};
 use crate::backend::tangent_basis;
 use nalgebra::{Matrix2, Matrix3, SMatrix, SVector, Vector2, Vector3};
 use vidar_core::{CameraModel, LandmarkId, LieGroup, So3, camera::Pixel};
+use vidar_solve::Kernel;
 
 /// Parameters: clock offset (s), readout (s), rotation of the camera (rad, right perturbation), gyroscope bias (rad/s).
 const DIM: usize = 8;
@@ -30,6 +31,7 @@ const PIXEL_SIGMA: f64 = 0.7;
 
 /// Whitened residual from which a match loses weight (Cauchy).
 const CAUCHY: f64 = 2.0;
+const KERNEL: Kernel = Kernel::Cauchy { k: CAUCHY };
 
 /// Each ray takes part in up to four pairs, and tracking errors last over many images, so residuals are correlated:
 /// covariances are multiplied by this.
@@ -286,7 +288,8 @@ impl<'a> Problem<'a> {
                 let Some((n, a, b)) = normals(&at, m) else { continue };
                 let sigma = residual_sigma(&a, &b, &t, ray_sigma);
                 let r = n.dot(&t) / sigma;
-                let weight = 1.0 / (1.0 + r * r / (CAUCHY * CAUCHY));
+                let weight = KERNEL.weight(r * r);
+                // The kernel's loss up to rounding.
                 cost += 0.5 * CAUCHY * CAUCHY * (1.0 + r * r / (CAUCHY * CAUCHY)).ln();
                 let mut j = Parameters::zeros();
                 for p in 0..DIM {
@@ -322,7 +325,7 @@ impl<'a> Problem<'a> {
                 let (Some(a), Some(b)) = rays else { continue };
                 let sigma = residual_sigma(&a, &b, &pair.direction, self.ray_sigma);
                 let r = a.cross(&b).dot(&pair.direction) / sigma;
-                let weight = 1.0 / (1.0 + r * r / (CAUCHY * CAUCHY));
+                let weight = KERNEL.weight(r * r);
                 sum += weight * r * r;
                 weights += weight;
             }
@@ -374,7 +377,7 @@ fn direction(
             let weight = t.map_or(1.0, |t| {
                 let sigma = residual_sigma(&a, &b, &t, ray_sigma);
                 let r = n.dot(&t) / sigma;
-                1.0 / (1.0 + r * r / (CAUCHY * CAUCHY)) / (sigma * sigma)
+                KERNEL.weight(r * r) / (sigma * sigma)
             });
             sum += n * n.transpose() * weight;
         }

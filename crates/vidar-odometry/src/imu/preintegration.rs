@@ -107,7 +107,7 @@ pub(crate) struct Delta {
     pub(crate) velocity: Vector3<f64>,
     pub(crate) by_gyro_bias: ByBias,
     pub(crate) by_accel_bias: ByBias,
-    /// By the gain of each axis of the gyroscope: over a step a gain acts as a bias of minus the reading.
+    /// By the gain of each axis of the gyroscope: over a step a gain acts as a bias of minus the measurement.
     pub(crate) by_gyro_gain: ByBias,
     /// Of white noise.
     pub(crate) covariance: Matrix9,
@@ -374,7 +374,7 @@ impl Preintegration {
     }
 
     /// Derivative of rotation, position and velocity by the sensors' gains (gyroscope, accelerometer, per axis): over a step a
-    /// gain acts as a bias of minus the reading. The accelerometer's is zero after very long stretches, whose readings are not kept.
+    /// gain acts as a bias of minus the measurement. The accelerometer's is zero after very long stretches, whose samples are not kept.
     pub(crate) fn by_gain(&self) -> SMatrix<f64, 9, 6> {
         let steps = self.samples.windows(2).filter(|pair| pair[1].time > pair[0].time);
         let (_, by_accel_gain) = steps.fold((Delta::none(), ByBias::zeros()), |(sum, by_gain), pair| {

@@ -47,7 +47,7 @@ pub enum InitFailureReason {
     Backend(SmootherError),
 }
 
-/// An failure reason with its measured value and the limit.
+/// A failure reason with its measured value and the limit.
 #[derive(Clone, Debug, PartialEq)]
 pub struct InitFailure {
     /// Reason of an initialisation failure.

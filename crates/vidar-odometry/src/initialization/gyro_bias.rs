@@ -8,6 +8,7 @@
 use crate::imu::Bias;
 use nalgebra::{Matrix3, Vector3};
 use vidar_core::So3;
+use vidar_solve::statistics::median_upper;
 
 /// Rays of common points in two views, with the rotation between the views as a function of the bias.
 pub(crate) struct RayPair<F: Fn(&Bias) -> So3> {
@@ -53,8 +54,7 @@ fn fitting<F: Fn(&Bias) -> So3 + Copy>(pair: &RayPair<F>, bias: &Bias) -> RayPai
     let along = eigen.eigenvectors.column(eigen.eigenvalues.imin()).into_owned();
     let residual = |(a, b): &(Vector3<f64>, Vector3<f64>)| a.cross(&(rotation * b)).dot(&along).abs();
     let mut all: Vec<f64> = pair.rays.iter().map(residual).collect();
-    all.sort_unstable_by(f64::total_cmp);
-    let limit = OUTLIER_MEDIANS * all.get(all.len() / 2).copied().unwrap_or(0.0);
+    let limit = OUTLIER_MEDIANS * median_upper(&mut all).unwrap_or(0.0);
     let rays = pair.rays.iter().filter(|r| residual(r) <= limit).copied().collect();
     RayPair { rays, rotation: pair.rotation }
 }

@@ -11,6 +11,7 @@ use crate::imu::{Bias, NavState};
 use nalgebra::Vector3;
 use serde::{Deserialize, Serialize};
 use vidar_core::{CameraModel, FrameId, LandmarkId, LieGroup, Se3, So3};
+use vidar_solve::statistics::median_upper;
 
 /// Settings and acceptance limits of the initialisation in motion.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
@@ -452,7 +453,5 @@ fn scale_change(before: &[(FrameId, Vector3<f64>)], now: &[(FrameId, Vector3<f64
 }
 
 fn median(values: impl Iterator<Item = f64>) -> Option<f64> {
-    let mut all: Vec<f64> = values.collect();
-    all.sort_unstable_by(f64::total_cmp);
-    all.get(all.len() / 2).copied()
+    median_upper(&mut values.collect::<Vec<f64>>())
 }

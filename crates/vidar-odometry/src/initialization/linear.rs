@@ -5,6 +5,7 @@
 //! of g is known (Dong-Si & Mourikis, "Estimator initialization in vision-aided inertial navigation", IROS 2012).
 
 use nalgebra::{Matrix3, SMatrix, SVector, Vector3};
+use vidar_solve::statistics::median_upper;
 
 /// A view as the linear system needs it, in the first body's frame.
 #[derive(Clone, Copy, Debug)]
@@ -217,6 +218,5 @@ fn median_distance(
         .zip(points)
         .filter_map(|(rays, p)| Some(((*p)? - place(&views[rays.first()?.0], motion)).norm()))
         .collect();
-    all.sort_unstable_by(f64::total_cmp);
-    all.get(all.len() / 2).copied().filter(|m| *m > 0.0)
+    median_upper(&mut all).filter(|m| *m > 0.0)
 }

@@ -1,11 +1,12 @@
 //! A start without an IMU: two views give motion and structure up to scale, and the scale is set by convention.
 
 use super::{InitFailure, InitFailureReason, LoggedFrame, TrackObservation};
-use crate::backend::{GaugePriorSigmas, Observation, Smoother};
+use crate::backend::{GaugePriorSigmas, Smoother, SmootherError};
 use crate::config::OdometryConfig;
 use crate::frontend::{RayPair, TwoViewConfig, TwoViewFailure, TwoViewSolver, triangulate};
 use crate::imu::NavState;
 use vidar_core::{CameraModel, LieGroup, Se3};
+use vidar_solve::statistics::median_upper;
 
 /// Inverse distance to assume of everything, 1/m.
 pub(crate) const INITIAL_INVERSE_DISTANCE: f64 = 0.4;
@@ -21,6 +22,9 @@ const RAY_SIGMA_PX: f64 = 0.7;
 
 /// A point is kept when its distance is known to this share.
 const MAX_RELATIVE_SIGMA: f64 = 0.3;
+
+/// χ² per degree of freedom of both views' observations beyond which a solution is rejected.
+const MAX_CHI2_PER_DOF: f64 = 3.0;
 
 /// Tries the newest frame of the log against earlier ones, the oldest that shares enough first.
 ///
@@ -93,17 +97,26 @@ fn between(
             points.push((*a, *b, point.inverse_distance));
         }
     }
-    if points.len() < MIN_SHARED / 2 {
-        return Err(fail(InitFailureReason::Tracks, points.len() as f64, 0.5 * MIN_SHARED as f64));
-    }
     let mut inverses: Vec<f64> = points.iter().map(|p| p.2).collect();
-    inverses.sort_unstable_by(f64::total_cmp);
-    let scale = INITIAL_INVERSE_DISTANCE / inverses[inverses.len() / 2];
+    let Some(median) = median_upper(&mut inverses).filter(|_| points.len() >= MIN_SHARED / 2) else {
+        return Err(fail(InitFailureReason::Tracks, points.len() as f64, 0.5 * MIN_SHARED as f64));
+    };
+    let scale = INITIAL_INVERSE_DISTANCE / median;
     let b_from_a = Se3::new(found.b_from_a.rotation, found.b_from_a.translation / scale);
-    build(first, second, &points, scale, &b_from_a, camera, body_from_camera, config)
-        .ok_or_else(|| fail(InitFailureReason::ImageChi2, f64::INFINITY, 3.0))
+    let mut smoother = build(first, second, &points, scale, &b_from_a, camera, body_from_camera, config)
+        .map_err(InitFailure::backend)?;
+    let report = smoother.optimise(10);
+    for outlier in &report.outliers {
+        smoother.remove_landmark(outlier.landmark);
+    }
+    // A NaN must not pass.
+    match report.chi2_per_dof < MAX_CHI2_PER_DOF {
+        true => Ok(smoother),
+        false => Err(fail(InitFailureReason::ImageChi2, report.chi2_per_dof, MAX_CHI2_PER_DOF)),
+    }
 }
 
+/// Both views as keyframes of a smoother, with the points as its landmarks.
 #[allow(clippy::too_many_arguments)] // the end of one function, kept apart for its length only
 fn build(
     first: &LoggedFrame,
@@ -114,8 +127,8 @@ fn build(
     camera: &CameraModel,
     body_from_camera: &Se3,
     config: &OdometryConfig,
-) -> Option<Smoother> {
-    let mut smoother = Smoother::new(config.smoother(), camera.clone(), *body_from_camera).ok()?;
+) -> Result<Smoother, SmootherError> {
+    let mut smoother = Smoother::new(config.smoother(), camera.clone(), *body_from_camera)?;
     // Without an IMU nothing is vertical: the world is the first camera's, its y axis down.
     let world_from_first = Se3::new(
         vidar_core::So3::exp(&nalgebra::Vector3::new(-std::f64::consts::FRAC_PI_2, 0.0, 0.0)),
@@ -130,25 +143,37 @@ fn build(
         gyro_bias: 1.0,
         accel_bias: 1.0,
     };
-    smoother.start(first.frame, first.time, state, sigmas).ok()?;
+    smoother.start(first.frame, first.time, state, sigmas)?;
     let camera_motion = *body_from_camera * b_from_a.inverse() * body_from_camera.inverse();
     let next = NavState { world_from_body: world_from_first * camera_motion, ..NavState::REST };
-    smoother.add_frame(second.frame, second.time, next, None).ok()?;
-    smoother.mark_keyframe(first.frame).ok()?;
-    smoother.mark_keyframe(second.frame).ok()?;
+    smoother.add_frame(second.frame, second.time, next, None)?;
+    smoother.mark_keyframe(first.frame)?;
+    smoother.mark_keyframe(second.frame)?;
     for (a, b, inverse) in points {
-        let observation = |frame, observations: &TrackObservation| Observation {
-            frame,
-            landmark: observations.landmark,
-            pixel: observations.pixel,
-            covariance: observations.covariance,
+        smoother.add_landmark(&a.by(first.frame), inverse * scale)?;
+        smoother.add_observation(&b.by(second.frame))?;
+    }
+    Ok(smoother)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use vidar_core::{FrameId, Pinhole, Timestamp};
+
+    #[test]
+    fn what_the_backend_rejects_is_the_reason_of_the_failure() {
+        let frame = |id| LoggedFrame {
+            frame: FrameId(id),
+            time: Timestamp::from_nanos(1_000_000),
+            preintegration: None,
+            observations: Vec::new(),
         };
-        smoother.add_landmark(&observation(first.frame, a), inverse * scale).ok()?;
-        smoother.add_observation(&observation(second.frame, b)).ok()?;
+        let camera = CameraModel::Pinhole(Pinhole::new(458.0, 457.0, 367.0, 248.0, 752, 480).unwrap());
+        let (still, config) = (Se3::IDENTITY, OdometryConfig::default());
+        let error = build(&frame(0), &frame(1), &[], 1.0, &still, &camera, &still, &config).unwrap_err();
+        assert!(matches!(error, SmootherError::NotNext { id: FrameId(1), .. }), "{error}");
+        let failure = InitFailure::backend(error);
+        assert!(failure.to_string().starts_with("backend: frame"), "{failure}");
     }
-    let report = smoother.optimise(10);
-    for outlier in &report.outliers {
-        smoother.remove_landmark(outlier.landmark);
-    }
-    (report.chi2_per_dof < 3.0).then_some(smoother)
 }

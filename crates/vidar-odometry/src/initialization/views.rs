@@ -6,6 +6,7 @@ use crate::imu::{Bias, Preintegration};
 use nalgebra::{Matrix3, Vector3};
 use rustc_hash::FxHashMap;
 use vidar_core::{CameraModel, LandmarkId, Se3, So3};
+use vidar_solve::statistics::median_upper;
 
 /// A chosen frame, with IMU measurements from the chosen one before.
 pub(super) struct View<'a> {
@@ -23,7 +24,7 @@ pub(super) struct Track {
 /// Chooses at most `most` frames over the last `window_secs` of the log and joins their IMU measurements.
 pub(super) fn choose(log: &[LoggedFrame], window_secs: f64, most: usize) -> Vec<View<'_>> {
     let Some(newest) = log.last() else { return Vec::new() };
-    // A frame without IMU measurements cannot be tied to what came before it.
+    // A frame without IMU measurements cannot be connected to what came before it.
     let chained = log.iter().rposition(|f| f.preintegration.is_none()).unwrap_or(0);
     let within = |f: &&LoggedFrame| (newest.time - f.time).as_secs_f64() <= window_secs + 1e-6;
     let log = &log[chained..];
@@ -88,8 +89,7 @@ pub(super) fn median_parallax_deg(tracks: &[Track], turns: &[So3], body_from_cam
                 .fold(0.0, f64::max)
         })
         .collect();
-    widest.sort_unstable_by(f64::total_cmp);
-    widest.get(widest.len() / 2).map_or(0.0, |a| a.to_degrees())
+    median_upper(&mut widest).map_or(0.0, f64::to_degrees)
 }
 
 /// Views and rays of the linear system, all turned to the first view.

@@ -167,8 +167,8 @@ impl FeatureOdometry {
     ///
     /// # Errors
     /// An IMU sample out of order or not finite.
-    pub fn take(&mut self, reading: ImuSample) -> Result<(), BufferError> {
-        self.buffer.push(reading)
+    pub fn take(&mut self, sample: ImuSample) -> Result<(), BufferError> {
+        self.buffer.push(sample)
     }
 
     /// Begins at `frame` with a state that is known as well as `sigmas` say.

@@ -44,7 +44,7 @@ pub struct SimulationConfig {
     pub time_offset_secs: f64,
     /// Strength of gravity, m/s².
     pub gravity_mps2: f64,
-    /// Readings of the gyroscope are the true rates times this, per axis, before bias and noise.
+    /// Measurements of the gyroscope are the true rates times this, per axis, before bias and noise.
     pub gyro_scale: [f64; 3],
     /// The same of the accelerometer.
     pub accel_scale: [f64; 3],

@@ -110,15 +110,18 @@ impl CameraPoses for WindowPoses<'_> {
 }
 
 impl SlidingWindowOdometry {
-    /// Takes over a smoother that holds at least one frame; `hosts` are the images of its keyframes.
+    /// Takes over a smoother; `hosts` are the images of its keyframes.
+    ///
+    /// # Errors
+    /// A smoother that holds no frame.
     pub fn new(
         config: OdometryConfig,
         smoother: Smoother,
         tracker: Tracker,
         hosts: Vec<Arc<HostImage>>,
         typical_inverse: f64,
-    ) -> Option<Self> {
-        let (last, ..) = smoother.newest()?;
+    ) -> Result<Self, SmootherError> {
+        let (last, ..) = smoother.newest().ok_or(SmootherError::Empty)?;
         let last_keyframe = smoother.keyframes().next_back().unwrap_or(last);
         let camera = smoother.camera().clone();
         let mut tracker = tracker;
@@ -129,7 +132,7 @@ impl SlidingWindowOdometry {
             !track.is_landmark || follow_host(track, &smoother, &hosts, &camera)
         });
         let keyframe_landmarks = tracker.tracks.iter().filter(|t| t.is_landmark).count();
-        Some(Self {
+        Ok(Self {
             config,
             camera,
             smoother,
@@ -318,4 +321,21 @@ fn follow_host(
     track.feature = feature;
     track.distance.mean = landmark.inverse_distance;
     true
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::frontend::FrontendConfig;
+    use vidar_core::Pinhole;
+
+    #[test]
+    fn a_smoother_without_a_frame_is_refused() {
+        let camera = CameraModel::Pinhole(Pinhole::new(458.0, 457.0, 367.0, 248.0, 752, 480).unwrap());
+        let config = OdometryConfig::default();
+        let smoother = Smoother::new(config.smoother(), camera.clone(), Se3::IDENTITY).unwrap();
+        let tracker = Tracker::new(camera, &FrontendConfig::default(), 3.0);
+        let refused = SlidingWindowOdometry::new(config, smoother, tracker, Vec::new(), 0.4);
+        assert_eq!(refused.unwrap_err(), SmootherError::Empty);
+    }
 }

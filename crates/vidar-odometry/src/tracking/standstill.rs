@@ -5,6 +5,7 @@ use crate::imu::StepNoise;
 use nalgebra::{Vector2, Vector3};
 use rustc_hash::FxHashMap;
 use vidar_core::{Duration, FrameId, ImuSample, LandmarkId, Timestamp, camera::Pixel};
+use vidar_solve::statistics::median_upper;
 
 /// Median motion since the body is thought to stand that is still standing, pixels: along both axes, away from the middle
 /// of the tracks and around it. Noise of single tracks cancels.
@@ -88,8 +89,8 @@ impl ImageMotion {
         let mut median = |of: Measure<'_>| {
             values.clear();
             values.extend(moved.iter().map(of));
-            let middle = values.len() / 2;
-            *values.select_nth_unstable_by(middle, f64::total_cmp).1
+            // Not empty: as many values as tracks.
+            median_upper(values).unwrap_or(f64::INFINITY)
         };
         shifts.into_iter().all(|of| median(of).abs() < STILL_SHIFT_PX) && median(&|m| m.1.norm()) < STILL_PX
     }

@@ -9,6 +9,7 @@ use nalgebra::{Matrix2, Matrix2x1, Vector2};
 use std::sync::Arc;
 use vidar_core::camera::Pixel;
 use vidar_core::{CameraModel, FrameId, FrameImage, LandmarkId, LieGroup, Se3};
+use vidar_solve::Kernel;
 
 /// An image whose patches are followed.
 #[derive(Debug)]
@@ -53,8 +54,8 @@ impl ImagePool {
     }
 }
 
-/// Whitened residual from which a measurement pulls only linearly.
-const HUBER: f64 = 2.0;
+/// Whitened residuals beyond this pull only linearly.
+const KERNEL: Kernel = Kernel::Huber { k: 2.0 };
 
 /// Gaussian belief of an inverse distance (1/m along the bearing).
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -191,8 +192,7 @@ impl InverseDistance {
                 let (pixel, d_pixel) = project_with_distance(camera, feature, mean, current_from_host)?;
                 let left = measured.pixel - pixel;
                 let error2 = left.dot(&(measured.information * left));
-                let weight = if error2 > HUBER * HUBER { HUBER / error2.sqrt() } else { 1.0 };
-                let weighted = measured.information * d_pixel * weight;
+                let weighted = measured.information * d_pixel * KERNEL.weight(error2);
                 gradient += weighted.dot(&left);
                 information += weighted.dot(&d_pixel);
                 chi2 += error2;

@@ -157,7 +157,7 @@ pub fn plan(request: &PlanRequest, events: &Events, cancel: &CancelToken) -> Res
             stage(Stage::Report, 0),
         ],
     };
-    let bytes = pretty(&plan);
+    let bytes = pretty(&plan)?;
     let name = format!("{PLANS}/{}.json", vidar_hub::sha256_hex(&bytes));
     store.put(&name, bytes)?;
     Ok(Planned { uri: format!("{}/{name}", store.uri()), plan })

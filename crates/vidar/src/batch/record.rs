@@ -141,7 +141,7 @@ impl TaskRecord {
     }
 
     pub(super) fn write(&self, store: &Store) -> Result<(), Error> {
-        Ok(store.put(&Self::name(&self.key), pretty(self))?)
+        Ok(store.put(&Self::name(&self.key), pretty(self)?)?)
     }
 
     /// Whether later stages cannot go on from it.

@@ -77,7 +77,7 @@ pub(super) fn report(planned: &Planned, store: &Store) -> Result<Table, Error> {
     let plan = planned.uri.rsplit('/').next().unwrap_or_default().trim_end_matches(".json");
     let folder = format!("reports/{plan}");
     let table = Table { schema: REPORT_SCHEMA, plan: planned.uri.clone(), folder, recordings, counts, cost };
-    store.put(&format!("{}/report.json", table.folder), pretty(&table))?;
+    store.put(&format!("{}/report.json", table.folder), pretty(&table)?)?;
     store.put(&format!("{}/report.md", table.folder), table.markdown().into_bytes())?;
     Ok(table)
 }

@@ -156,7 +156,7 @@ fn write(request: &BenchRequest, outcome: &BenchOutcome, cells: &Cells) -> Resul
         "command": request.command, "sequences": outcome.sequences, "runs": outcome.rows,
         "odometry": outcome.odometry,
     });
-    put("bench.json", &pretty(&json))?;
+    put("bench.json", &pretty(&json)?)?;
     put("tables.md", outcome.markdown.as_bytes())?;
     put("report.html", figures::report(request, outcome, cells)?.as_bytes())
 }

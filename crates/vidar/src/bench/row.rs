@@ -13,6 +13,7 @@ use sha2::{Digest, Sha256};
 use std::path::{Path, PathBuf};
 use vidar_align::CouplingMode;
 use vidar_eval::{Scores, TrajectoryReport};
+use vidar_solve::statistics::median_upper;
 
 /// One sequence under one coupling.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -158,7 +159,9 @@ pub(super) fn run_row(
 fn keyframes_against_truth(request: &RunRequest, outcome: &RunOutcome) -> Result<TrajectoryScores, Error> {
     let config = request.layered.build()?;
     let dataset = open_dataset(&request.path, &request.open, &config)?;
-    let (Some(estimate), Some(truth)) = (outcome.map.keyframe_trajectory(), truth_in_camera(&dataset)) else {
+    // Where it cannot be compared, the run has said so.
+    let truth = truth_in_camera(&dataset).ok().flatten();
+    let (Some(estimate), Some(truth)) = (outcome.map.keyframe_trajectory(), truth) else {
         return Ok(TrajectoryScores::default());
     };
     let report = vidar_eval::evaluate_trajectory(&estimate, &truth, &config.eval.trajectory);
@@ -202,8 +205,7 @@ pub(super) fn odometry_row(
             row.degraded = outcome.status == ExitStatus::Degraded;
             row.trajectory = outcome.report.as_ref().map_or_else(Default::default, Into::into);
             let mut times: Vec<f64> = outcome.tracked.frames.iter().map(|f| 1e3 * f.seconds).collect();
-            times.sort_unstable_by(f64::total_cmp);
-            row.milliseconds = times.get(times.len() / 2).copied();
+            row.milliseconds = median_upper(&mut times);
             if outcome.trajectory.is_none() {
                 row.failure =
                     Some(outcome.tracked.why_not_started().unwrap_or_else(|| "no trajectory".into()));
@@ -255,5 +257,5 @@ pub(super) fn stored<T: DeserializeOwned>(place: &Path, key: &str) -> Result<Opt
 pub(super) fn store<T: Serialize>(place: &Path, key: &str, row: &T) -> Result<(), Error> {
     std::fs::create_dir_all(place).map_err(|e| Error::io("create", place, e))?;
     let stored = StoredRow { key: key.to_owned(), row };
-    Ok(vidar_export::atomic::write_file_atomically(&place.join("row.json"), &pretty(&stored))?)
+    Ok(vidar_export::atomic::write_file_atomically(&place.join("row.json"), &pretty(&stored)?)?)
 }

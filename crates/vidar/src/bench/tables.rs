@@ -75,7 +75,7 @@ impl Cells {
 
 fn notes(request: &BenchRequest) -> Vec<String> {
     let mut notes = vec![
-        "F of the rigid fit judges the map with its own scale. The paper's bounded placement (section IV-B) refines the scale \
+        "F of the rigid fit evaluates the map with its own scale. The paper's bounded placement (section IV-B) refines the scale \
          within 0.85 to 1.15; numbers in brackets are the paper's and compare with it."
             .to_owned(),
         "Means are over valid runs; failed ones are counted and listed with their reason.".to_owned(),

@@ -125,7 +125,7 @@ impl ChunkStore {
             key: key.to_owned(),
             failure: chunk.failure.clone(),
         };
-        vidar_export::atomic::write_file_atomically(&self.path(id, "json"), &pretty(&sidecar))?;
+        vidar_export::atomic::write_file_atomically(&self.path(id, "json"), &pretty(&sidecar)?)?;
         Ok(bytes)
     }
 

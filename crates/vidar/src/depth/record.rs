@@ -64,7 +64,7 @@ pub(super) fn predictions(
         })),
         "views": (0..outcome.views).map(view).collect::<Vec<_>>(),
     });
-    writer.bytes("predictions.json", &pretty(&document))
+    writer.bytes("predictions.json", &pretty(&document)?)
 }
 
 /// Writes `manifest.json`, last.
@@ -102,5 +102,5 @@ pub(super) fn manifest(
         "warnings": outcome.warnings,
         "artifacts": outcome.artifacts,
     });
-    folder.write("manifest.json", &pretty(&document)).map(|_| ())
+    folder.write("manifest.json", &pretty(&document)?).map(|_| ())
 }

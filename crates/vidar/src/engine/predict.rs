@@ -150,7 +150,8 @@ impl<'a> Predictor<'a> {
         self.window.put_back(views, masks, indices);
         landmarks.unwrap_or_else(|error| {
             let place = PredictionId::Chunk(prediction.chunk_id);
-            events.push(MapEvent::Warning(Warning::new("no-stereo-landmarks", error.to_string()).at(place)));
+            let warning = Warning::degraded("no-stereo-landmarks", error.to_string()).at(place);
+            events.push(MapEvent::Warning(warning));
             BTreeMap::new()
         })
     }

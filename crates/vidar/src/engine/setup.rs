@@ -134,7 +134,8 @@ pub enum PredictionId {
 
 impl PredictionId {
     /// The number under which the model is asked. Models use it in messages and as a seed; a loop's has the later chunk in
-    /// its upper half, so that no two predictions of a run (of less than 65 536 chunks) are asked for under one number.
+    /// its upper half, so that no two predictions of a run (of less than 65 536 chunks) are asked for under one number. In a longer one
+    /// two may share a seed and no more: what is stored is named by this id itself.
     pub fn model_number(self) -> ChunkId {
         match self {
             Self::Chunk(id) => id,

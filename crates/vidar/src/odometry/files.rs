@@ -42,10 +42,10 @@ pub(super) fn write(
     if let Some(keyframes) = keyframe_trajectory(&tracked.keyframes) {
         put_trajectory(&mut put, "trajectory/odometry_keyframes_camera", &keyframes, &note)?;
     }
-    put("odometry/keyframes.json", &pretty(&keyframes_json(outcome)))?;
+    put("odometry/keyframes.json", &pretty(&keyframes_json(outcome))?)?;
     put("odometry/landmarks.csv", landmarks_csv(&tracked.keyframes).as_bytes())?;
     put("odometry/health.csv", health_csv(tracked).as_bytes())?;
-    put("odometry/report.json", &pretty(&outcome.result_json()))?;
+    put("odometry/report.json", &pretty(&outcome.result_json())?)?;
     if let Some((name, bytes)) = map::write(folder, &tracked.saved_map)? {
         events.emit(&Event::ArtifactWritten { path: name.to_owned(), bytes });
         made.push(name.to_owned());
@@ -168,8 +168,8 @@ fn health_csv(tracked: &Tracked) -> String {
                     1e3 * frame.seconds
                 );
             }
-            Status::Waiting(refusal) => {
-                let _ = write!(text, ",,,,,,,,,,,,{:.3},\"{refusal}\"", 1e3 * frame.seconds);
+            Status::Waiting(failure) => {
+                let _ = write!(text, ",,,,,,,,,,,,{:.3},\"{failure}\"", 1e3 * frame.seconds);
             }
             Status::Lost(reason) => {
                 let _ = write!(text, ",,,,,,,,,,,,{:.3},\"{reason}\"", 1e3 * frame.seconds);

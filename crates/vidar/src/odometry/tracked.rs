@@ -238,7 +238,7 @@ impl Tracked {
         }
         warnings.extend(self.quality.warning());
         if let (Some(reason), true) = (&self.not_adjusted, self.quality.longest().is_some()) {
-            warnings.push(Warning::new("not-adjusted", format!("the live states are final: {reason}")));
+            warnings.push(Warning::degraded("not-adjusted", format!("the live states are final: {reason}")));
         }
         if let Some([before, after]) = self.calibrated_again {
             let text = format!(

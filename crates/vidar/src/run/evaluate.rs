@@ -7,11 +7,11 @@ use super::reference;
 use crate::config::Config;
 use crate::error::Error;
 use crate::events::Events;
-use crate::input::truth_in_camera;
+use crate::input::{not_evaluated, truth_in_camera};
 use rayon::prelude::*;
 use serde::Serialize;
 use std::collections::BTreeMap;
-use vidar_core::{AlignedView, FrameId, MetricDepth, PointCloud, Se3, Trajectory, TriangleMesh, Warning};
+use vidar_core::{AlignedView, FrameId, MetricDepth, PointCloud, Se3, Trajectory, TriangleMesh};
 use vidar_dataset::Recording;
 use vidar_eval::{
     Coverage, DepthAccumulator, DepthSummary, EvalError, PlacementStart, SampleDensity, SurfaceEvalConfig,
@@ -56,11 +56,13 @@ pub fn evaluate(
     events: &Events,
 ) -> Result<Evaluation, Error> {
     let mut evaluation = Evaluation::default();
-    let warn = |what: &str, reason: String| {
-        events.warn(&Warning::degraded("not-evaluated", format!("{what}: {reason}")))
-    };
+    let warn = |what: &str, reason: &dyn std::fmt::Display| events.warn(&not_evaluated(what, reason));
     let mut start = PlacementStart::from(Se3::IDENTITY);
-    if let Some(truth) = truth_in_camera(dataset) {
+    let truth = truth_in_camera(dataset).unwrap_or_else(|e| {
+        warn("ground truth", &e);
+        None
+    });
+    if let Some(truth) = truth {
         let against_truth = |what: &str, estimate: &Trajectory| match vidar_eval::evaluate_trajectory(
             estimate,
             &truth,
@@ -68,7 +70,7 @@ pub fn evaluate(
         ) {
             Ok(report) => Some(report),
             Err(e) => {
-                warn(what, e.to_string());
+                warn(what, &e);
                 None
             }
         };
@@ -93,7 +95,7 @@ pub fn evaluate(
     }
     // The map is finished: a reference that cannot be read must not cost it.
     let reference = reference::cloud(&plan.reference, dataset, config, events).unwrap_or_else(|e| {
-        warn("surface", format!("{}: {e}", plan.reference));
+        warn("surface", &format!("{}: {e}", plan.reference));
         None
     });
     if let Some(reference) = reference {
@@ -109,7 +111,7 @@ pub fn evaluate(
                     report.point_errors.take().map(|errors| (estimate, errors.estimate_m));
                 evaluation.surface = Some(report);
             }
-            Err(e) => warn("surface", e.to_string()),
+            Err(e) => warn("surface", &e),
         }
         evaluation.reference = Some(reference);
     }

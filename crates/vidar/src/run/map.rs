@@ -11,6 +11,7 @@ use std::sync::Arc;
 use vidar_align::Placement;
 use vidar_core::{AlignedView, BodyFrame, CameraId, StampedPose, Trajectory};
 use vidar_dataset::Recording;
+use vidar_solve::statistics::median_upper;
 
 /// The fused world.
 #[derive(Debug, Default)]
@@ -54,8 +55,7 @@ impl MetricMap {
     /// anything was fused.
     pub fn share_of_a_view(&self) -> Option<f64> {
         let mut areas = self.view_areas_m2.clone();
-        areas.sort_unstable_by(f64::total_cmp);
-        let median = areas.get(areas.len() / 2).filter(|a| **a > 0.0)?;
+        let median = median_upper(&mut areas).filter(|a| *a > 0.0)?;
         Some(self.surface.coverage.surface_area_m2 / median)
     }
 

@@ -124,7 +124,7 @@ impl RunOutcome {
     }
 }
 
-/// What a run would do, without doing it.
+/// What a run would do, without doing it: nothing is tracked, not even to find a calibration that the recording does not state.
 ///
 /// # Errors
 /// The input, the configuration or the model cannot be used.
@@ -132,10 +132,10 @@ pub fn plan(request: &RunRequest) -> Result<Plan, Error> {
     let mut config = request.layered.build()?;
     let mut dataset = input::open_every_image(&request.path, &request.open, &config)?;
     let untimed = input::use_every_untimed_image(&dataset, &mut config);
-    let (events, cancel) = (Events::none(), CancelToken::default());
-    if input::needs_calibration(&config) {
-        calibrate::complete(&mut dataset, &mut config.odometry, &events, &cancel)?;
-    }
+    let missing_calibration = match input::needs_calibration(&config) {
+        true => calibrate::assume_complete(&mut dataset),
+        false => None,
+    };
     let (mut plan, ..) = Plan::make(&dataset, &config, request.reference.as_deref())?;
     if !plan.poses.is_odometry()
         && let Some(found) = budget::settle(&dataset, &mut config, &plan, None)?
@@ -144,6 +144,7 @@ pub fn plan(request: &RunRequest) -> Result<Plan, Error> {
         plan.warnings.extend(found.warning());
         plan.budget = Some(found);
     }
+    plan.missing_calibration = missing_calibration;
     plan.warnings.splice(0..0, dataset.warnings.iter().cloned().chain(untimed));
     Ok(plan)
 }

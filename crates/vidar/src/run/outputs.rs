@@ -30,7 +30,7 @@ pub fn write(
     if let Some(keyframes) = map.keyframe_trajectory() {
         writer.trajectory("trajectory/keyframes_camera", &keyframes, map)?;
     }
-    writer.bytes("views.json", &pretty(&views_json(outcome, dataset)))?;
+    writer.bytes("views.json", &pretty(&views_json(outcome, dataset))?)?;
     if config.output.depth_png && !outcome.map.views.is_empty() {
         writer.export("depth/depth.json", |w| sidecar(outcome, config).write(w))?;
     }
@@ -51,8 +51,8 @@ pub fn write(
     if config.output.mesh_glb && !map.surface.mesh.triangles.is_empty() {
         writer.export("map/mesh.glb", |w| vidar_export::write_glb_mesh(w, &map.surface.mesh, &comments))?;
     }
-    writer.bytes("map/coverage.json", &pretty(&map.surface.coverage))?;
-    writer.bytes("eval/metrics.json", &pretty(&metrics(outcome)))?;
+    writer.bytes("map/coverage.json", &pretty(&map.surface.coverage)?)?;
+    writer.bytes("eval/metrics.json", &pretty(&metrics(outcome))?)?;
     writer.bytes("README.txt", readme(outcome, request).as_bytes())
 }
 

@@ -277,7 +277,8 @@ fn trajectory_section(
     if let Some(quality) = &outcome.map.quality {
         section.paragraphs.push(format!("Odometry: {}.", quality.words()));
     }
-    let truth = truth_in_camera(dataset);
+    // Where it cannot be compared, the evaluation has said so.
+    let truth = truth_in_camera(dataset).ok().flatten();
     let evaluation = &outcome.evaluation;
     let moved = outcome.plan.mode.chains().then(|| outcome.map.keyframe_trajectory()).flatten();
     let metric = outcome.map.trajectory.as_ref().map(|t| t.camera_trajectory.clone());

@@ -3,6 +3,7 @@
 use super::budget::Budget;
 use super::place_recognition::PlaceRecognition;
 use super::source::{OpenedSource, Source};
+use crate::calibrate::MissingCalibration;
 use crate::config::Config;
 use crate::engine::{ChunkRule, GeometrySource, PosedFrame, Selection, chunk_rule};
 use crate::error::Error;
@@ -53,6 +54,8 @@ pub struct Plan {
     pub camera_id: CameraId,
     /// The camera as it is.
     pub camera: CameraModel,
+    /// What of the calibration is still to be found; nothing once a run has calibrated.
+    pub missing_calibration: Option<MissingCalibration>,
     /// The undistorted view that the model gets.
     pub view: Pinhole,
     /// The geometry model.
@@ -122,7 +125,7 @@ impl Plan {
             "" => None,
             folder => Some(Arc::new(Masks::open(Path::new(folder), dataset)?)),
         };
-        let mut warnings = Vec::new();
+        let mut warnings: Vec<Warning> = poses.warning(dataset, config).into_iter().collect();
         let camera = camera_model(dataset)?;
         let view = model_view(&camera, config)?;
         let coverage = vidar_core::remap::RemapTable::new(&camera, &view).coverage();
@@ -143,6 +146,7 @@ impl Plan {
             prescribed,
             camera_id: dataset.camera,
             camera,
+            missing_calibration: None,
             view,
             model: source.info().clone(),
             remote: source.remote().map(|r| r.facts().clone()),
@@ -196,6 +200,7 @@ impl Plan {
             ("memory of the map", format!("at most {}", bytes(self.volume_budget_bytes))),
             ("disk", format!("at most {}", bytes(self.disk_bytes))),
         ];
+        lines.extend(self.missing_calibration.map(|missing| ("calibration", missing.words().to_owned())));
         if let Some(network) = &self.network {
             let (memory, views) = (bytes(network.memory.total()), network.views_at_once);
             lines.push(("memory of the network", format!("about {memory} for {views} views at once")));

@@ -34,10 +34,14 @@ impl Recorder {
         let recorded = self.0.clone();
         events.with(move |event| {
             let Ok(mut recorded) = recorded.lock() else { return };
-            match &recorded.folder {
+            let failed = match &recorded.folder {
                 Some(folder) => folder.log(event),
-                None => recorded.waiting.push(event.clone()),
-            }
+                None => {
+                    recorded.waiting.push(event.clone());
+                    None
+                }
+            };
+            recorded.warnings.extend(failed);
             match event {
                 Event::Warning { warning } => recorded.warnings.push(warning.clone()),
                 Event::StageFinished { stage: name, seconds }
@@ -54,7 +58,8 @@ impl Recorder {
     /// From now on `log.jsonl` of this folder holds every event, also those from before.
     pub fn keep_log_in(&self, folder: Arc<RunFolder>) {
         let Ok(mut recorded) = self.0.lock() else { return };
-        std::mem::take(&mut recorded.waiting).iter().for_each(|event| folder.log(event));
+        let waiting = std::mem::take(&mut recorded.waiting);
+        recorded.warnings.extend(waiting.iter().filter_map(|event| folder.log(event)));
         recorded.folder = Some(folder);
     }
 

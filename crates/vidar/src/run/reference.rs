@@ -34,7 +34,7 @@ pub fn cloud(
 
 /// The depth sensor's images fused with ground-truth poses, by the same fusion as the result.
 fn fused_sensor_depth(dataset: &Recording, config: &Config, events: &Events) -> Result<PointCloud, Error> {
-    let (Some(sensor), Some(truth)) = (&dataset.depth_sensor, truth_in_camera(dataset)) else {
+    let (Some(sensor), Some(truth)) = (&dataset.depth_sensor, truth_in_camera(dataset)?) else {
         return Ok(PointCloud::default());
     };
     // A depth sensor's pixels are equally sure; everything else is as for the result.

@@ -127,7 +127,7 @@ fn within_budget(
     (folder, events): (&RunFolder, &Events),
 ) -> Result<(Plan, Source, PlaceRecognition), Error> {
     let Some(found) = budget::settle(dataset, config, &made.0, poses)? else { return Ok(made) };
-    let bytes = folder.write(budget::FILE, &pretty(&found))?;
+    let bytes = folder.write(budget::FILE, &pretty(&found)?)?;
     events.emit(&Event::ArtifactWritten { path: budget::FILE.into(), bytes });
     found.warning().iter().for_each(|w| events.warn(w));
     let (plan, source, places) = match found.chosen == found.unlimited {

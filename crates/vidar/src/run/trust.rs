@@ -8,6 +8,7 @@ use crate::verdict::{
 };
 use vidar_align::CouplingMode;
 use vidar_core::{Severity, Warning};
+use vidar_solve::statistics::median_upper;
 
 /// What is said of the map's scale: chunks, metric poses, and what no estimate sees.
 pub(super) fn stated_scale(map: &MetricMap, mode: CouplingMode, unseen: UnseenScale) -> StatedScale {
@@ -18,7 +19,6 @@ pub(super) fn stated_scale(map: &MetricMap, mode: CouplingMode, unseen: UnseenSc
         .map(|c| c.log_scale_std)
         .filter(|s| s.is_finite())
         .collect();
-    chunks.sort_unstable_by(f64::total_cmp);
     let source = match map.trajectory.as_ref().map(|t| &t.source).filter(|_| mode.uses_pose_priors()) {
         None => ScaleSource::None,
         Some(TrajectorySource::External { .. }) => ScaleSource::Given,
@@ -27,7 +27,7 @@ pub(super) fn stated_scale(map: &MetricMap, mode: CouplingMode, unseen: UnseenSc
             map.quality.as_ref().map_or(ScaleSource::None, |quality| unseen.source(quality))
         }
     };
-    StatedScale::new(source, chunks.get(chunks.len() / 2).copied())
+    StatedScale::new(source, median_upper(&mut chunks))
 }
 
 /// Degradations that the whole result shows.

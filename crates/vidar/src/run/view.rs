@@ -86,7 +86,7 @@ fn paths<'a>(
 fn truth_of_map(outcome: &RunOutcome, dataset: &Recording) -> Option<Trajectory> {
     let report = outcome.evaluation.trajectory.as_ref()?;
     let truth_from_map = report.truth_from_estimate_se3?.to_se3()?;
-    moved_trajectory(&truth_in_camera(dataset)?, &inverse(&truth_from_map))
+    moved_trajectory(&truth_in_camera(dataset).ok()??, &inverse(&truth_from_map))
 }
 
 /// The reference in the world of the map, by the rigid fit that its scores have.

@@ -136,7 +136,7 @@ mod tests {
             artifacts: ["pictures/old.png", "../outside.txt", "/etc/none"].map(String::from).to_vec(),
             ..Manifest::default()
         };
-        std::fs::write(root.join("manifest.json"), super::super::pretty(&manifest)).unwrap();
+        std::fs::write(root.join("manifest.json"), super::super::pretty(&manifest).unwrap()).unwrap();
         let line =
             r#"{"schema":"vidar.event/1","event":"artifact-written","path":"pictures/kept.png","bytes":1}"#;
         std::fs::write(root.join("log.jsonl"), line).unwrap();

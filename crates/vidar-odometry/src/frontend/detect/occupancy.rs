@@ -35,7 +35,8 @@ impl OccupancyGrid {
     }
 
     /// Number of cells that hold a feature.
-    pub fn taken_count(&self) -> usize {
+    #[cfg(test)]
+    fn taken_count(&self) -> usize {
         self.taken.iter().filter(|t| **t).count()
     }
 

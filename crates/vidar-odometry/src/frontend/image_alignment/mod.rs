@@ -20,6 +20,7 @@ use nalgebra::{Matrix6, SMatrix, SVector, Vector3, Vector6};
 use patches::{PIXELS, Patch};
 use vidar_core::camera::Pixel;
 use vidar_core::{CameraModel, LieGroup, Se3};
+use vidar_solve::statistics::median_upper;
 
 /// Most reference images of one alignment.
 pub const MAX_REFERENCES: usize = 2;
@@ -253,12 +254,8 @@ impl ImageAligner {
             let (a, b) = (state.gain[patch.reference], state.offset[patch.reference]);
             self.scratch.extend(patch.squared_residual(a, b));
         }
-        let middle = self.scratch.len() / 2;
-        if self.scratch.is_empty() {
-            return MIN_NOISE_GRAY;
-        }
-        let (_, median, _) = self.scratch.select_nth_unstable_by(middle, f64::total_cmp);
-        let variance = (*median / PIXELS).max(MIN_NOISE_GRAY * MIN_NOISE_GRAY);
+        let Some(median) = median_upper(&mut self.scratch) else { return MIN_NOISE_GRAY };
+        let variance = (median / PIXELS).max(MIN_NOISE_GRAY * MIN_NOISE_GRAY);
         let k2 = self.config.outlier_ratio * self.config.outlier_ratio * variance * PIXELS;
         for patch in &mut self.patches {
             let (a, b) = (state.gain[patch.reference], state.offset[patch.reference]);

@@ -20,6 +20,7 @@ use five_point::five_point;
 use nalgebra::{Matrix3, Vector3};
 use random::Sampler;
 use vidar_core::{Se3, So3};
+use vidar_solve::statistics::median_upper;
 
 /// Unit directions to one feature from two views, each in its own camera.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -170,11 +171,7 @@ impl TwoViewSolver {
                 self.scratch.push(turned.cross(&pair.b).norm().atan2(turned.dot(&pair.b)));
             }
         }
-        if self.scratch.is_empty() {
-            return 0.0;
-        }
-        let middle = self.scratch.len() / 2;
-        *self.scratch.select_nth_unstable_by(middle, f64::total_cmp).1
+        median_upper(&mut self.scratch).unwrap_or(0.0)
     }
 
     fn demand_parallax(

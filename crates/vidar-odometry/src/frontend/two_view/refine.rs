@@ -4,6 +4,7 @@ use super::RayPair;
 use crate::frontend::template::tangents;
 use nalgebra::{Matrix5, RowVector5, Vector3, Vector5};
 use vidar_core::{LieGroup, Se3, So3};
+use vidar_solve::Kernel;
 
 /// What may change.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -14,8 +15,8 @@ pub(super) enum Free {
     Both,
 }
 
-/// Huber's bound, standard deviations.
-const HUBER: f64 = 1.5;
+/// Errors beyond this many standard deviations lose weight.
+const KERNEL: Kernel = Kernel::Huber { k: 1.5 };
 
 /// The motion that fits the marked pairs best, from a start that fits them well.
 pub(super) fn refine(pairs: &[RayPair], inliers: &[bool], start: &Se3, sigma_rad: f64, free: Free) -> Se3 {
@@ -25,7 +26,7 @@ pub(super) fn refine(pairs: &[RayPair], inliers: &[bool], start: &Se3, sigma_rad
         for pair in pairs.iter().zip(inliers).filter(|(_, i)| **i).map(|(p, _)| p) {
             let (error, slope, jacobian) = sampson(pair, &motion);
             let normalised = (error / slope / sigma_rad).abs();
-            let weight = if normalised > HUBER { HUBER / normalised } else { 1.0 } / (slope * slope);
+            let weight = KERNEL.weight_of_length(normalised) / (slope * slope);
             h += jacobian.transpose() * jacobian * weight;
             g += jacobian.transpose() * (error * weight);
         }

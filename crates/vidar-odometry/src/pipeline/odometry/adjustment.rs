@@ -52,7 +52,7 @@ impl Odometry {
         self.log = Some(TrackLog::new(1.0 / self.imu.nominal_period().as_secs_f64()));
     }
 
-    /// Drops the grey levels that were kept: the adjustment then ties nothing that comes into view again.
+    /// Drops the grey levels that were kept: the adjustment then has no loop constraints.
     pub fn forget_log_images(&mut self) {
         self.log.iter_mut().for_each(TrackLog::forget_places);
     }

@@ -44,7 +44,9 @@ impl Odometry {
             let log = log.to_mut();
             log.join(segment, place.segment, &place.map_from_own, place.scale);
             for i in place.agreeing {
-                found[i].matches.iter().for_each(|m| log.tie(frames[i], m.key, &m.pixel, &m.covariance));
+                for m in &found[i].matches {
+                    log.add_loop_constraint(frames[i], m.key, &m.pixel, &m.covariance);
+                }
             }
         }
         log

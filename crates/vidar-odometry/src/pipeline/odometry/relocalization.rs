@@ -118,7 +118,9 @@ impl Odometry {
         if let Some(log) = &mut self.log {
             log.join(segment, into, &into_from_segment, 1.0);
             for (id, result) in [(first_id, first), (id, found)] {
-                result.matches.iter().for_each(|m| log.tie(id, m.key, &m.pixel, &m.covariance));
+                for m in &result.matches {
+                    log.add_loop_constraint(id, m.key, &m.pixel, &m.covariance);
+                }
             }
         }
         Some(Joined { segment, into, into_from_segment, matches })

@@ -44,11 +44,11 @@ impl Odometry {
             Err(failure) => return self.wait(failure),
         };
         match self.start_at(host, time, &at_rest) {
-            Some(mut window) => {
+            Ok(mut window) => {
                 window.stand(time);
                 self.begin(window, frame, host.frame)
             }
-            None => self.wait(self.failure.clone()),
+            Err(error) => self.wait(InitFailure::backend(error)),
         }
     }
 
@@ -69,8 +69,8 @@ impl Odometry {
             return self.wait(failure);
         };
         match self.start_at(host, time, &slow) {
-            Some(window) => self.begin(window, frame, host.frame),
-            None => self.wait(failure),
+            Ok(window) => self.begin(window, frame, host.frame),
+            Err(error) => self.wait(InitFailure::backend(error)),
         }
     }
 
@@ -80,12 +80,12 @@ impl Odometry {
         host: &Arc<HostImage>,
         time: Timestamp,
         start: &StaticState,
-    ) -> Option<SlidingWindowOdometry> {
+    ) -> Result<SlidingWindowOdometry, SmootherError> {
         self.time_calibration.forget_tracks();
         self.log.iter_mut().for_each(TrackLog::next_generation);
-        let mut smoother = self.smoother().ok()?;
-        smoother.start(host.frame, time, start.state, start.sigmas).ok()?;
-        smoother.mark_keyframe(host.frame).ok()?;
+        let mut smoother = self.smoother()?;
+        smoother.start(host.frame, time, start.state, start.sigmas)?;
+        smoother.mark_keyframe(host.frame)?;
         let mut tracker = Tracker::new(self.camera.model.clone(), &self.frontend, IMAGE_NOISE_GRAY);
         tracker.detect(host, 2 * self.config.max_landmarks, INITIAL_INVERSE_DISTANCE);
         let (config, hosts) = (self.config.clone(), vec![host.clone()]);
@@ -116,8 +116,10 @@ impl Odometry {
             found.hosts,
             typical,
         );
-        let Some(window) = window else { return self.wait(self.failure.clone()) };
-        self.begin(window, frame, host.frame)
+        match window {
+            Ok(window) => self.begin(window, frame, host.frame),
+            Err(error) => self.wait(InitFailure::backend(error)),
+        }
     }
 
     fn begin(&mut self, window: SlidingWindowOdometry, frame: &Frame, id: FrameId) -> Status {

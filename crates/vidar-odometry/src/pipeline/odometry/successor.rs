@@ -1,6 +1,6 @@
 //! Another clock, readout or rotation of the camera while there is a state: a second odometry catches up with them over the last
-//! seconds, and its state then goes on in the same world. It works beside the first one, in turns whose results are due at instants
-//! that the recording decides: an image waits for it only where a turn is not done when it is due.
+//! seconds, and its state then goes on in the same world. It works beside the first one, in slices of work whose results are due at
+//! instants that the recording decides: an image waits for it only where a slice is not done when it is due.
 
 use super::{Odometry, Phase, Status};
 use crate::bundle_adjustment::TrackLog;
@@ -20,15 +20,15 @@ const REPLAY_FRAMES: usize = 100;
 /// IMU measurements kept before the oldest image, s: clocks differ by 0.15 s at most, and half a second shows a body at rest.
 const IMU_BEFORE_SECS: f64 = 0.7;
 
-/// Time of the recording until the result of a turn is taken over, s, and how much of what waits a turn works on, so that the second
+/// Time of the recording until the result of a slice is taken over, s, and how much of what waits a slice works on, so that the second
 /// odometry catches up: with a state, without one while the first has one, and where neither has. An attempt to start takes up to
-/// 0.4 s on one core, for which the images of a first odometry that has a state do not wait; a turn of few images ends with the next.
-const TURN_SECS: f64 = 0.1;
-const STARTING_TURN_SECS: f64 = 0.5;
+/// 0.4 s on one core, for which the images of a first odometry that has a state do not wait; a slice of few images ends with the next.
+const SLICE_SECS: f64 = 0.1;
+const STARTING_SLICE_SECS: f64 = 0.5;
 const CAUGHT_UP_SECS: f64 = 0.3;
 const CAUGHT_UP_STARTING_SECS: f64 = 0.9;
 const CAUGHT_UP_BEFORE_ANY_STATE_SECS: f64 = 0.6;
-const SHORT_TURN: usize = 6;
+const SHORT_SLICE: usize = 6;
 
 /// So few images are worked on at once, without another thread.
 const AT_ONCE: usize = 1;
@@ -81,10 +81,10 @@ impl RecentFrames {
 /// The second odometry.
 #[derive(Debug)]
 pub(super) struct Successor {
-    /// Between its turns.
+    /// Between two slices of work.
     catch_up: Option<Box<CatchUp>>,
-    turn: Option<Deferred<Box<CatchUp>>>,
-    /// What came during a turn.
+    slice: Option<Deferred<Box<CatchUp>>>,
+    /// What came during a slice.
     samples: Vec<ImuSample>,
     images: Vec<RecentFrame>,
     correction: Correction,
@@ -138,10 +138,10 @@ impl Successor {
         self.samples.push(sample);
     }
 
-    /// The second odometry where its turn is over, with what came meanwhile and what it can do of it at once.
-    fn between_turns(&mut self, now: Timestamp, first_has_state: bool) -> Option<&CatchUp> {
-        if let Some(turn) = self.turn.take_if(|turn| turn.is_due(now)) {
-            self.catch_up = turn.result();
+    /// The second odometry where its slice is done, with what came meanwhile and what it can do of it at once.
+    fn between_slices(&mut self, now: Timestamp, first_has_state: bool) -> Option<&CatchUp> {
+        if let Some(slice) = self.slice.take_if(|slice| slice.is_due(now)) {
+            self.catch_up = slice.result();
         }
         let catch_up = self.catch_up.as_mut()?;
         for sample in self.samples.drain(..) {
@@ -155,16 +155,16 @@ impl Successor {
         Some(catch_up)
     }
 
-    /// Begins another turn where the last one is over.
+    /// Begins another slice where the last one is done.
     fn go_on(&mut self, now: Timestamp, first_has_state: bool) {
         let Some(mut catch_up) = self.catch_up.take_if(|c| c.ready() > 0) else { return };
         let secs = match catch_up.ready() {
-            _ if first_has_state && !catch_up.has_state() => STARTING_TURN_SECS,
-            0..SHORT_TURN => 0.0,
-            _ => TURN_SECS,
+            _ if first_has_state && !catch_up.has_state() => STARTING_SLICE_SECS,
+            0..SHORT_SLICE => 0.0,
+            _ => SLICE_SECS,
         };
         let due = now + Duration::from_secs_f64(secs);
-        self.turn = Some(Deferred::begin(due, move || {
+        self.slice = Some(Deferred::begin(due, move || {
             catch_up.run(first_has_state);
             catch_up
         }));
@@ -189,7 +189,7 @@ impl Odometry {
         let odometry = Self::fresh(config, camera, self.working.another(), self.imu_model, self.imu.clone());
         self.successor = Some(Successor {
             catch_up: Some(Box::new(CatchUp { odometry, waiting: self.recent.frames.clone() })),
-            turn: None,
+            slice: None,
             samples: Vec::new(),
             images: Vec::new(),
             since: newest.frame.time,
@@ -222,7 +222,7 @@ impl Odometry {
             successor.images.push(newest);
         }
         let has_state = matches!(self.phase, Phase::Tracking(_));
-        let up_to_date = successor.between_turns(now, has_state).filter(|c| c.ready() == 0);
+        let up_to_date = successor.between_slices(now, has_state).filter(|c| c.ready() == 0);
         match up_to_date.map(CatchUp::newest_pose) {
             Some(Some((at, new))) => {
                 let old = self.recent.pose(at);

@@ -6,6 +6,7 @@ use crate::tracking::CameraPoses;
 use crate::tracking::{HostImage, rotated_pixel};
 use std::sync::Arc;
 use vidar_core::{FrameId, LieGroup, Timestamp};
+use vidar_solve::statistics::median_upper;
 
 /// Recent frames that are held whether they are keyframes or not.
 const RECENT_FRAMES: usize = 3;
@@ -63,11 +64,7 @@ impl SlidingWindowOdometry {
             let (measured, then) = (t.measured?, t.keyframe_pixel?);
             Some((measured.pixel - rotated_pixel(camera, &then, &current_from_keyframe)?).norm())
         }));
-        if moved.is_empty() {
-            return f64::INFINITY;
-        }
-        let middle = moved.len() / 2;
-        *moved.select_nth_unstable_by(middle, f64::total_cmp).1
+        median_upper(moved).unwrap_or(f64::INFINITY)
     }
 
     /// Marks the newest frame a keyframe and starts tracks in it.
@@ -98,9 +95,7 @@ impl SlidingWindowOdometry {
             .filter(|t| t.is_landmark && t.measured.is_some())
             .filter_map(|t| Some(camera_from_world.act(&self.smoother.landmark(t.id)?.in_world).norm()))
             .collect();
-        if distances.len() >= 10 {
-            let middle = distances.len() / 2;
-            let median = *distances.select_nth_unstable_by(middle, f64::total_cmp).1;
+        if let Some(median) = median_upper(&mut distances).filter(|_| distances.len() >= 10) {
             self.typical_inverse = 1.0 / median.clamp(0.1, 100.0);
         }
     }

@@ -114,7 +114,7 @@ impl SlidingWindowOdometry {
         for (frame, measured) in &track.observations {
             let observations = observation(*frame, id, measured, self.config.pixel_noise_px);
             if *frame != track.host.frame && self.smoother.add_observation(&observations).is_err() {
-                // A observation of no use; the others remain.
+                // An observation of no use; the others remain.
                 continue;
             }
         }

@@ -188,7 +188,7 @@ pub fn ablation(
         "schema": ABLATION_SCHEMA, "command": request.command, "geometry": source, "rows": rows,
         "failures": failures,
     });
-    put("ablation.json", &pretty(&json))?;
+    put("ablation.json", &pretty(&json)?)?;
     put("ablation.md", markdown.as_bytes())?;
     let status = if failures.is_empty() { ExitStatus::Done } else { ExitStatus::Degraded };
     Ok(AblationOutcome { folder: request.out.clone(), rows, markdown, status })
@@ -241,7 +241,7 @@ fn cases(
     let dataset = open_every_image(&sequence.path, &super::open_options(), &config)?;
     let observed = observe::observe(&dataset, &config, cancel)?;
     let truth = Truth {
-        trajectory: truth_in_camera(&dataset),
+        trajectory: truth_in_camera(&dataset)?,
         scan: reference::cloud(&observed.plan.reference, &dataset, &config, &Events::none())?
             .map(|cloud| {
                 Ok::<_, Error>(Scan {

@@ -37,7 +37,7 @@ use queue::{Closing, Item, Queue};
 use serde::Serialize;
 use std::time::{Duration, Instant};
 use thinning::Thinning;
-use tracker::{Arrival, Counts, Tracker};
+use tracker::{ArrivalClock, Counts, Tracker};
 use vidar_core::Warning;
 use vidar_dataset::DatasetError;
 
@@ -48,13 +48,15 @@ const MOST_DELAY_OF_PREVIEWS: Duration = Duration::from_millis(500);
 /// How a live run goes.
 #[derive(Clone, Copy, Debug)]
 pub struct LiveOptions {
-    /// Whether measurements arrive in the rhythm of their stamps; otherwise each arrives when it is taken, and nothing is left out.
+    /// Whether measurements arrive in the rhythm of their stamps, those of a stream when they come; otherwise each arrives when it is taken, and
+    /// nothing is left out.
     pub is_realtime: bool,
     /// Threads of the odometry's own pool; the map uses the pool of the caller.
     pub odometry_threads: usize,
 }
 
-/// What a live run measured. Latencies count from the arrival of an image: its stamp, replayed at its own rate.
+/// What a live run measured. Latencies count from the arrival of an image: of a recording that is replayed at its own rate its stamp,
+/// of a robot's stream when its message came.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct LiveReport {
     /// Whether measurements arrived in the rhythm of their stamps.
@@ -203,7 +205,11 @@ fn track(
     let mut tracker = Tracker {
         poses,
         queue,
-        arrival: if options.is_realtime { Arrival::Stamped(None) } else { Arrival::Taken },
+        arrival: match (options.is_realtime, context.stream) {
+            (false, _) => ArrivalClock::Taken,
+            (true, None) => ArrivalClock::Stamped(None),
+            (true, Some(_)) => ArrivalClock::Came(Some(Instant::now())),
+        },
         thinning: Thinning::new(&config.keyframes),
         pose_file,
         publisher,
@@ -211,9 +217,10 @@ fn track(
         counts: Counts::default(),
         waiting: Default::default(),
     };
-    let measurements: Box<dyn Iterator<Item = Measurement>> = match context.stream {
-        Some(stream) => Box::new(stream.measurements(needs_sensors, cancel)),
-        None => Box::new(input::measurements(dataset, needs_sensors)),
+    let go_on = || !cancel.is_cancelled() && !queue.is_closed_within(Duration::ZERO);
+    let measurements: Box<dyn Iterator<Item = (Measurement, Option<Instant>)>> = match context.stream {
+        Some(stream) => Box::new(stream.measurements(needs_sensors, &go_on)),
+        None => Box::new(input::measurements(dataset, needs_sensors).map(|m| (m, None))),
     };
     let end = tracker.run(measurements, &|| cancel.is_cancelled())?;
     let Tracker { counts, thinning, pose_file, .. } = tracker;

@@ -6,7 +6,7 @@ use crate::engine::{FrameState, MapEvent};
 use crate::error::Error;
 use crate::run_folder::now_ns;
 use std::collections::BTreeMap;
-use std::sync::atomic::{AtomicI64, AtomicU64, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicI64, AtomicU32, AtomicU64, AtomicUsize, Ordering};
 use std::sync::{Mutex, PoisonError};
 use std::time::{Duration, Instant};
 use vidar_align::covariance::covariance_in_camera;
@@ -55,11 +55,24 @@ pub(in crate::run) struct LivePublisher {
     /// Row by row, position then rotation, in the world's axes; none before the first keyframe.
     covariance: Mutex<Option<[f64; 36]>>,
     patches: Mutex<SurfacePatches>,
+    /// The segment that is mapped.
+    segment: AtomicU32,
+    has_pose: AtomicBool,
+    /// What was left out when health was last told.
+    left_out: AtomicUsize,
     images: AtomicU64,
     keyframes: AtomicU64,
     last: AtomicI64,
     told: Mutex<Option<Instant>>,
     _link: Link,
+}
+
+/// The name of a segment's world.
+fn world_of(segment: u32) -> String {
+    match segment {
+        0 => WORLD.to_owned(),
+        n => format!("{WORLD}_{n}"),
+    }
 }
 
 /// A patch as ROS has it, each triangle with corners of its own.
@@ -108,6 +121,9 @@ impl LivePublisher {
             body_from_camera: camera.body_from_camera,
             covariance: Mutex::default(),
             patches: Mutex::default(),
+            segment: AtomicU32::new(0),
+            has_pose: AtomicBool::new(false),
+            left_out: AtomicUsize::new(0),
             images: AtomicU64::new(0),
             keyframes: AtomicU64::new(0),
             last: AtomicI64::new(0),
@@ -129,10 +145,7 @@ impl LivePublisher {
 
     /// The pose of an image, as it is found.
     pub fn pose(&self, state: &FrameState, keyframe: Option<&OdometryKeyframe>) {
-        let world = match state.segment {
-            0 => WORLD.to_owned(),
-            n => format!("{WORLD}_{n}"),
-        };
+        let world = world_of(state.segment);
         let mut known = self.covariance.lock().unwrap_or_else(PoisonError::into_inner);
         if let Some(keyframe) = keyframe {
             let OdometryKeyframe { pose_covariance, world_from_camera, .. } = keyframe;
@@ -147,6 +160,12 @@ impl LivePublisher {
         self.put(Topic::Transforms, transforms(time, (&world, CAMERA), pose));
         self.images.fetch_add(1, Ordering::Relaxed);
         self.last.store(time.nanos(), Ordering::Relaxed);
+        self.has_pose.store(true, Ordering::Relaxed);
+    }
+
+    /// An image got no pose.
+    pub fn no_pose(&self) {
+        self.has_pose.store(false, Ordering::Relaxed);
     }
 
     /// How the run is doing, once a second at most.
@@ -157,17 +176,26 @@ impl LivePublisher {
         }
         *told = Some(Instant::now());
         drop(told);
-        let (level, message) = match left_out {
-            0 => (HealthLevel::Ok, "tracking and mapping"),
-            _ => (HealthLevel::Warn, "the map is behind: keyframes or images were left out"),
+        let (images, before) =
+            (self.images.load(Ordering::Relaxed), self.left_out.swap(left_out, Ordering::Relaxed));
+        let (level, message) = match (self.has_pose.load(Ordering::Relaxed), left_out > before) {
+            (true, false) => (HealthLevel::Ok, "tracking and mapping"),
+            (true, true) => (HealthLevel::Warn, "the map is behind: keyframes or images are left out"),
+            (false, _) if images == 0 => (HealthLevel::Warn, "no image has a pose yet"),
+            (false, _) => (HealthLevel::Warn, "tracking is lost"),
         };
         let values = [
-            ("images with a pose", self.images.load(Ordering::Relaxed).to_string()),
+            ("images with a pose", images.to_string()),
             ("keyframes", self.keyframes.load(Ordering::Relaxed).to_string()),
             ("images that wait for the map", waiting.to_string()),
             ("left out", left_out.to_string()),
         ];
         self.put(Topic::Health, health(self.time(), ("vidar: live", message), level, &values));
+    }
+
+    /// The world of the map.
+    fn world(&self) -> String {
+        world_of(self.segment.load(Ordering::Relaxed))
     }
 
     fn time(&self) -> Timestamp {
@@ -177,21 +205,22 @@ impl LivePublisher {
     /// Takes an event of the engine.
     pub fn read(&self, event: &MapEvent) {
         match event {
+            MapEvent::World { segment, .. } => self.segment.store(*segment, Ordering::Relaxed),
             MapEvent::Keyframe(keyframe) => {
                 self.keyframes.fetch_add(1, Ordering::Relaxed);
                 if let Some(pose) = &keyframe.world_from_camera {
-                    self.put(Topic::Keyframe, pose_stamped(keyframe.stamp.time, WORLD, pose));
+                    self.put(Topic::Keyframe, pose_stamped(keyframe.stamp.time, &self.world(), pose));
                 }
             }
             MapEvent::SurfaceChanged { surface, is_final, .. } => {
-                let mesh = &surface.mesh;
+                let (mesh, world) = (&surface.mesh, self.world());
                 let cloud = thinned_vertices(mesh, MOST_POINTS);
                 let points: Vec<CloudPoint> = cloud.positions.into_iter().zip(cloud.colors).collect();
-                self.put(Topic::Cloud, point_cloud(self.time(), WORLD, &points));
+                self.put(Topic::Cloud, point_cloud(self.time(), &world, &points));
                 let mut patches = self.patches.lock().unwrap_or_else(PoisonError::into_inner);
                 let markers: Vec<MeshMarker> =
                     patches.change(mesh, *is_final).patches.into_iter().map(marker).collect();
-                for message in mesh_markers(self.time(), WORLD, &markers) {
+                for message in mesh_markers(self.time(), &world, &markers) {
                     self.put(Topic::Mesh, message);
                 }
             }

@@ -11,8 +11,9 @@ use crate::run_folder::{OutputLocation, RunFolder};
 use std::io::Read;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
+use std::time::Instant;
 use vidar_core::{Frame, FrameImage, Image, SensorEvent, Warning};
-use vidar_dataset::{Arrival, ArrivingRecording, Recording};
+use vidar_dataset::{Arrived, ArrivingRecording, Recording};
 
 /// Where the stream is kept, in the run folder.
 pub const RECORDING: &str = "recording.mcap";
@@ -70,20 +71,21 @@ pub(in crate::run) struct LiveStream {
 }
 
 impl LiveStream {
-    /// The measurements as they come, once.
+    /// The measurements as they come, with when each came, once. `go_on` is asked while nothing comes.
     pub fn measurements<'a>(
         &self,
         sensors: bool,
-        cancel: &'a CancelToken,
-    ) -> impl Iterator<Item = Measurement> + 'a {
+        go_on: &'a dyn Fn() -> bool,
+    ) -> impl Iterator<Item = (Measurement, Option<Instant>)> + 'a {
         let mut arrivals = self.arriving.arrivals();
         std::iter::from_fn(move || {
             let arrivals = arrivals.as_mut()?;
             loop {
-                return Some(match arrivals.next(&|| !cancel.is_cancelled())? {
-                    Arrival::Imu(_) if !sensors => continue,
-                    Arrival::Imu(sample) => Measurement::Event(SensorEvent::Imu(sample)),
-                    Arrival::Image(entry, image) => {
+                let arrival = arrivals.next(go_on)?;
+                let measurement = match arrival.what {
+                    Arrived::Imu(_) if !sensors => continue,
+                    Arrived::Imu(sample) => Measurement::Event(SensorEvent::Imu(sample)),
+                    Arrived::Image(entry, image) => {
                         let stamp = input::stamp_of(&entry);
                         let FrameStamp { frame_id: id, time, camera } = stamp;
                         match *image {
@@ -94,7 +96,8 @@ impl LiveStream {
                             Err(error) => Measurement::Unreadable(stamp, error),
                         }
                     }
-                });
+                };
+                return Some((measurement, Some(arrival.came)));
             }
         })
     }

@@ -18,17 +18,23 @@ use vidar_dataset::DatasetError;
 /// that grows makes every later pose late.
 const MOST_DELAY: Duration = Duration::from_millis(200);
 
+/// What came while a stream was opened waits, and is tracked all the same until it has been caught up with, for this long at most:
+/// four times the opening.
+const CATCH_UP: Duration = Duration::from_secs(10);
+
 /// When measurements arrive.
-pub(super) enum Arrival {
+pub(super) enum ArrivalClock {
     /// As fast as they are taken.
     Taken,
     /// In the rhythm of their stamps, from the first one on.
     Stamped(Option<(Instant, Timestamp)>),
+    /// When their messages came. Since when what came before is being caught up with; none once it is.
+    Came(Option<Instant>),
 }
 
-impl Arrival {
-    /// When a measurement of this time arrives.
-    fn of(&mut self, time: Timestamp) -> Instant {
+impl ArrivalClock {
+    /// When a measurement of this time arrives; `came` is when its message did.
+    fn of(&mut self, time: Timestamp, came: Option<Instant>) -> Instant {
         match self {
             Self::Taken => Instant::now(),
             Self::Stamped(start) => {
@@ -36,11 +42,25 @@ impl Arrival {
                 let after = u64::try_from((time - first).nanos()).unwrap_or(0);
                 began + Duration::from_nanos(after)
             }
+            Self::Came(_) => came.unwrap_or_else(Instant::now),
         }
     }
 
-    fn is_stamped(&self) -> bool {
-        matches!(self, Self::Stamped(_))
+    /// Whether time goes on while the map works.
+    fn waits_for_nobody(&self) -> bool {
+        !matches!(self, Self::Taken)
+    }
+
+    /// Whether an image that arrived then is too late to be tracked.
+    fn is_too_late(&mut self, arrived: Instant) -> bool {
+        let is_late = self.waits_for_nobody() && arrived.elapsed() > MOST_DELAY;
+        match self {
+            Self::Came(catching_up) => {
+                *catching_up = catching_up.filter(|since| is_late && since.elapsed() < CATCH_UP);
+                is_late && catching_up.is_none()
+            }
+            _ => is_late,
+        }
     }
 }
 
@@ -48,7 +68,7 @@ impl Arrival {
 pub(super) struct Tracker<'a> {
     pub poses: Option<Box<dyn PoseSource + 'a>>,
     pub queue: &'a Queue,
-    pub arrival: Arrival,
+    pub arrival: ArrivalClock,
     pub thinning: Thinning,
     pub pose_file: PoseFile<'a>,
     /// Who else hears of poses.
@@ -75,17 +95,17 @@ impl Counts {
 }
 
 impl Tracker<'_> {
-    /// Takes measurements until they end, `is_cancelled`, or nobody takes the poses. What the odometry says at the end.
+    /// Takes measurements, of a stream with when each came, until they end, `is_cancelled`, or nobody takes the poses. What the odometry says at the end.
     ///
     /// # Errors
     /// What the odometry cannot go on with, or the file of poses could not be written.
     pub fn run(
         &mut self,
-        measurements: impl Iterator<Item = Measurement>,
+        measurements: impl Iterator<Item = (Measurement, Option<Instant>)>,
         is_cancelled: &dyn Fn() -> bool,
     ) -> Result<Ending, Error> {
-        for measurement in measurements {
-            let arrived = self.arrival.of(time_of(&measurement));
+        for (measurement, came) in measurements {
+            let arrived = self.arrival.of(time_of(&measurement), came);
             if !self.sleep_until(arrived, is_cancelled) || is_cancelled() {
                 break;
             }
@@ -122,7 +142,7 @@ impl Tracker<'_> {
             Measurement::Event(SensorEvent::Image(frame)) => {
                 let stamp = FrameStamp { frame_id: frame.id, time: frame.time, camera: frame.camera };
                 self.image(stamp, arrived);
-                if self.arrival.is_stamped() && arrived.elapsed() > MOST_DELAY {
+                if self.arrival.is_too_late(arrived) {
                     self.counts.not_tracked += 1;
                     self.stamp(&stamp)
                 } else {
@@ -151,6 +171,10 @@ impl Tracker<'_> {
                 return Ok(false);
             }
         }
+        if let Some(publisher) = self.publisher {
+            let left_out = self.counts.not_tracked + self.thinning.thinned + self.thinning.dropped;
+            publisher.health((self.queue.load().images, left_out));
+        }
         Ok(true)
     }
 
@@ -169,11 +193,12 @@ impl Tracker<'_> {
 
     /// Measures and writes the pose of a report.
     fn measure(&mut self, report: &PoseReport) -> Result<(), Error> {
-        let PoseReport::Posed { state, keyframe, .. } = report else { return Ok(()) };
+        let PoseReport::Posed { state, keyframe, .. } = report else {
+            self.publisher.into_iter().for_each(LivePublisher::no_pose);
+            return Ok(());
+        };
         if let Some(publisher) = self.publisher {
             publisher.pose(state, keyframe.as_deref());
-            let left_out = self.counts.not_tracked + self.thinning.thinned + self.thinning.dropped;
-            publisher.health((self.queue.load().images, left_out));
         }
         let image = self.waiting.iter().find(|(stamp, _)| stamp.frame_id == state.frame_id);
         self.counts.seconds.extend(image.map(|(_, arrived)| arrived.elapsed().as_secs_f32()));
@@ -193,7 +218,7 @@ impl Tracker<'_> {
         let count = self.waiting.iter().take_while(|(stamp, _)| stamp.time <= time).count();
         let mut images: Vec<(FrameStamp, Instant)> = self.waiting.drain(..count).collect();
         let mut report = Some(Box::new(report));
-        if self.arrival.is_stamped() {
+        if self.arrival.waits_for_nobody() {
             let load = self.queue.load();
             if let Some(warning) = self.thinning.observe(&load) {
                 self.send(Item::Warning(warning));
@@ -215,7 +240,7 @@ impl Tracker<'_> {
 
     /// Hands something over: at once where time does not wait; else when there is room.
     fn send(&self, item: Item) -> bool {
-        match self.arrival.is_stamped() {
+        match self.arrival.waits_for_nobody() {
             true => self.queue.push(item),
             false => self.queue.push_waiting(item),
         }
@@ -248,7 +273,7 @@ mod tests {
         let mut tracker = Tracker {
             poses: None,
             queue: &queue,
-            arrival: Arrival::Stamped(None),
+            arrival: ArrivalClock::Stamped(None),
             thinning: Thinning::new(&vidar_align::keyframe_selection::KeyframeConfig::default()),
             pose_file: PoseFile::create(&folder, &events).unwrap(),
             publisher: None,
@@ -267,6 +292,20 @@ mod tests {
         assert!((MOST_REPORTS..MOST_REPORTS + 8).contains(&items), "{items} items wait");
         assert_eq!(tracker.thinning.poses_dropped + items, 3 * MOST_REPORTS + warnings(&queue));
         assert!(!tracker.deliver(PoseReport::NotPosed { time: Timestamp::from_nanos(0) }).unwrap());
+    }
+
+    #[test]
+    fn what_came_while_a_stream_was_opened_is_tracked_until_it_is_caught_up_with() {
+        let now = Instant::now();
+        let before = |ms: u64| now.checked_sub(Duration::from_millis(ms)).unwrap();
+        let mut clock = ArrivalClock::Came(Some(now));
+        assert_eq!(clock.of(Timestamp::from_nanos(5), Some(before(2500))), before(2500));
+        assert!(!clock.is_too_late(before(2500)) && !clock.is_too_late(before(900)));
+        assert!(!clock.is_too_late(before(10)), "caught up");
+        assert!(clock.is_too_late(before(2500)) && !clock.is_too_late(before(10)));
+        // A machine that never catches up leaves images to the IMU, too.
+        let mut slow = ArrivalClock::Came(Some(before(11_000)));
+        assert!(slow.is_too_late(before(2500)));
     }
 
     /// Empties and closes the queue; how many of its items were warnings.
