@@ -211,11 +211,12 @@ struct Standing(std::io::Cursor<Vec<u8>>);
 
 impl Read for Standing {
     fn read(&mut self, into: &mut [u8]) -> std::io::Result<usize> {
-        let count = self.0.read(into)?;
-        while count == 0 {
-            std::thread::park();
+        match self.0.read(into)? {
+            0 => loop {
+                std::thread::park();
+            },
+            count => Ok(count),
         }
-        Ok(count)
     }
 }
 
