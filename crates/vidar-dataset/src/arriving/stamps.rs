@@ -27,24 +27,22 @@ impl Stamps {
             return [None, None];
         }
         let is_near = |before: Timestamp| time > before && time - before <= MOST_AHEAD;
-        let suspect = self.suspect.take().map(|s| *s);
-        let (before, now) = match (self.last, suspect) {
-            (Some(last), suspect) if !is_near(last) => match suspect {
-                Some(suspect) if is_near(suspect.time) => (Some(suspect), item),
-                other => {
-                    self.left_out += usize::from(other.is_some());
-                    self.suspect = Some(Box::new(item));
-                    return [None, None];
-                }
-            },
-            (_, suspect) => {
-                self.left_out += usize::from(suspect.is_some());
-                (None, item)
+        let goes_on = self.last.is_none_or(is_near);
+        let before = match self.suspect.take() {
+            Some(suspect) if !goes_on && is_near(suspect.time) => Some(*suspect),
+            Some(_) => {
+                self.left_out += 1;
+                None
             }
+            None => None,
         };
+        if !goes_on && before.is_none() {
+            self.suspect = Some(Box::new(item));
+            return [None, None];
+        }
         self.last = Some(time);
         self.behind_in_a_row = 0;
-        [before, Some(now)]
+        [before, Some(item)]
     }
 
     /// Messages that came behind later ones since the last one that did not.

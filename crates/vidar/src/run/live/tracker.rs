@@ -171,16 +171,17 @@ impl Tracker<'_> {
                 return Ok(false);
             }
         }
-        if let Some(publisher) = self.publisher {
-            let left_out = self.counts.not_tracked + self.thinning.thinned + self.thinning.dropped;
-            publisher.health((self.queue.load().images, left_out));
-        }
         Ok(true)
     }
 
     fn image(&mut self, stamp: FrameStamp, arrived: Instant) {
         self.counts.images += 1;
         self.waiting.push_back((stamp, arrived));
+        // With each image, also while none gets a pose.
+        if let Some(publisher) = self.publisher {
+            let left_out = self.counts.not_tracked + self.thinning.thinned + self.thinning.dropped;
+            publisher.health((self.queue.load().images, left_out));
+        }
     }
 
     fn event(&mut self, event: SensorEvent) -> Result<Vec<PoseReport>, Error> {
