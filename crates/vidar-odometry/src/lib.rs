@@ -24,6 +24,7 @@ pub mod imu;
 pub mod initialization;
 mod pipeline;
 mod relocalization;
+mod simd;
 #[cfg(any(test, feature = "simulation"))]
 pub mod simulate;
 mod stages;

@@ -6,6 +6,7 @@
 use super::dense::Cholesky;
 use super::inertial::{Shift, body_velocity, by_time_offset, gauge_prior_at, jacobians, residual};
 use super::prior::Part;
+use super::products::{product, transposed_product};
 use super::visual::{self, CameraPose};
 use super::window::{CALIBRATION_DIM, CalibrationState, Frame, Landmark, LandmarkObservation, OFFSET_AT};
 use super::{Linearisation, Smoother, SmootherConfig};
@@ -83,6 +84,7 @@ impl System {
         }
     }
 
+    #[inline(always)]
     pub(crate) fn offset(&self, part: Part) -> usize {
         match part {
             Part::Motion(k) => 9 * k,
@@ -118,6 +120,7 @@ impl System {
     }
 
     /// Adds a block at (`row`, `col`), `row ≥ col`; of diagonal blocks the upper half is ignored later.
+    #[inline(always)]
     pub(crate) fn add<const R: usize, const C: usize>(
         &mut self,
         row: usize,
@@ -134,6 +137,7 @@ impl System {
     }
 
     /// As `add`, for a block that may lie above the diagonal.
+    #[inline(always)]
     fn add_either<const R: usize, const C: usize>(
         &mut self,
         row: usize,
@@ -148,6 +152,26 @@ impl System {
         }
     }
 
+    /// Subtracts `left rightᵀ` at (`row`, `col`), or its transpose at (`col`, `row`) where that lies below the diagonal.
+    #[inline(always)]
+    fn subtract_outer(
+        &mut self,
+        (row, left): (usize, &SMatrix<f64, 6, 3>),
+        (col, right): (usize, &SMatrix<f64, 6, 3>),
+    ) {
+        let ((row, left), (col, right)) =
+            if row >= col { ((row, left), (col, right)) } else { ((col, right), (row, left)) };
+        for i in 0..6 {
+            let target = &mut self.h[(row + i) * self.n + col..(row + i) * self.n + col + 6];
+            for j in 0..6 {
+                target[j] -= left[(i, 0)] * right[(j, 0)]
+                    + left[(i, 1)] * right[(j, 1)]
+                    + left[(i, 2)] * right[(j, 2)];
+            }
+        }
+    }
+
+    #[inline(always)]
     pub(crate) fn add_gradient<const N: usize>(&mut self, at: usize, value: &SVector<f64, N>, sign: f64) {
         for (g, v) in self.gradient[at..at + N].iter_mut().zip(value.iter()) {
             *g += sign * v;
@@ -171,22 +195,26 @@ pub(crate) struct Scene<'a> {
 }
 
 impl Scene<'_> {
+    #[inline(always)]
     fn kernel(&self) -> Kernel {
         Kernel::Huber { k: self.config.huber_sigmas }
     }
 
     /// Whitened residual of an observation whose landmark projects to `pixel`.
+    #[inline(always)]
     fn residual(&self, pixel: &Vector2<f64>, s: &LandmarkObservation) -> Vector2<f64> {
         s.whitening * (pixel - s.pixel)
     }
 
     /// Where a landmark projects at the present states.
+    #[inline(always)]
     fn pixel(&self, landmark: &Landmark, s: &LandmarkObservation) -> Option<Vector2<f64>> {
         let (host, target) = (&self.camera_poses[landmark.host.frame], &self.camera_poses[s.frame]);
         self.camera.project(&visual::direction(host, target, &landmark.bearing, landmark.rho))
     }
 
     /// Evaluates an observation: stores its χ², returns its cost and, if it projects, what the system needs.
+    #[inline(always)]
     pub(crate) fn observation(
         &self,
         landmark: &Landmark,
@@ -208,9 +236,9 @@ impl Scene<'_> {
         s.chi2 = residual.norm_squared();
         let (weight, cost) = (self.kernel().weight(s.chi2), self.kernel().loss(s.chi2));
         let whiten = s.whitening * weight.sqrt();
-        jacobians.by_host = whiten * jacobians.by_host;
-        jacobians.by_target = whiten * jacobians.by_target;
-        jacobians.by_landmark = whiten * jacobians.by_landmark;
+        jacobians.by_host = product(&whiten, &jacobians.by_host);
+        jacobians.by_target = product(&whiten, &jacobians.by_target);
+        jacobians.by_landmark = product(&whiten, &jacobians.by_landmark);
         let by_calibration = self.config.calibrates_camera().then(|| {
             let by_place =
                 visual::by_body_from_camera(self.camera, host, target, &landmark.bearing, landmark.rho)
@@ -221,6 +249,7 @@ impl Scene<'_> {
     }
 
     /// The host's own observation: it fixes the bearing only.
+    #[inline(always)]
     pub(crate) fn host(&self, landmark: &mut Landmark) -> Option<(f64, WeightedObservation)> {
         let (pixel, by_direction) = self.camera.project_with_jacobian(&landmark.bearing)?;
         let residual = self.residual(&pixel, &landmark.host);
@@ -456,18 +485,52 @@ impl Smoother {
             camera_poses: &camera_poses,
             camera_poses_at: &camera_poses_at,
         };
-        let mut cost = 0.0;
-        for (slot, landmark) in self.landmarks.iter_mut().enumerate() {
-            if landmark.alive && !landmark.observations.is_empty() {
-                cost += add_landmark(system, &scene, landmark, slot, lambda);
-            }
-        }
+        let cost = add_each_landmark(system, &scene, &mut self.landmarks, lambda);
         system.camera_poses = camera_poses;
         system.camera_poses_at = camera_poses_at;
         cost
     }
 }
 
+/// Adds all landmarks; with AVX2 where the processor has it, to the same bits.
+fn add_each_landmark(system: &mut System, scene: &Scene<'_>, landmarks: &mut [Landmark], lambda: f64) -> f64 {
+    // Not `dispatch!`: the compiler does not put a closure of this size into the function that has AVX2.
+    #[cfg(target_arch = "x86_64")]
+    if crate::simd::has_avx2() {
+        // SAFETY: the processor has AVX2, as checked on the line above.
+        return unsafe { add_each_landmark_avx2(system, scene, landmarks, lambda) };
+    }
+    add_each_landmark_here(system, scene, landmarks, lambda)
+}
+
+#[cfg(target_arch = "x86_64")]
+#[target_feature(enable = "avx2")]
+fn add_each_landmark_avx2(
+    system: &mut System,
+    scene: &Scene<'_>,
+    landmarks: &mut [Landmark],
+    lambda: f64,
+) -> f64 {
+    add_each_landmark_here(system, scene, landmarks, lambda)
+}
+
+#[inline(always)]
+fn add_each_landmark_here(
+    system: &mut System,
+    scene: &Scene<'_>,
+    landmarks: &mut [Landmark],
+    lambda: f64,
+) -> f64 {
+    let mut cost = 0.0;
+    for (slot, landmark) in landmarks.iter_mut().enumerate() {
+        if landmark.alive && !landmark.observations.is_empty() {
+            cost += add_landmark(system, scene, landmark, slot, lambda);
+        }
+    }
+    cost
+}
+
+#[inline(always)]
 fn add_landmark(
     system: &mut System,
     scene: &Scene<'_>,
@@ -501,17 +564,16 @@ fn add_landmark(
             continue;
         };
         let target = system.offset(Part::Pose(s.frame));
-        host_square += j.by_host.transpose() * j.by_host;
-        host_gradient += j.by_host.transpose() * r;
-        system.add(target, target, &(j.by_target.transpose() * j.by_target), 1.0);
-        system.add_either(target, at_host, &(j.by_target.transpose() * j.by_host), 1.0);
-        system.add_gradient(target, &(j.by_target.transpose() * r), 1.0);
-        square += j.by_landmark.transpose() * j.by_landmark;
-        gradient += j.by_landmark.transpose() * r;
-        system.cross[cross_begin].value += j.by_host.transpose() * j.by_landmark;
-        system
-            .cross
-            .push(PoseLandmarkBlock { frame: s.frame, value: j.by_target.transpose() * j.by_landmark });
+        host_square += transposed_product(&j.by_host, &j.by_host);
+        host_gradient += transposed_product(&j.by_host, &r);
+        system.add(target, target, &transposed_product(&j.by_target, &j.by_target), 1.0);
+        system.add_either(target, at_host, &transposed_product(&j.by_target, &j.by_host), 1.0);
+        system.add_gradient(target, &transposed_product(&j.by_target, &r), 1.0);
+        square += transposed_product(&j.by_landmark, &j.by_landmark);
+        gradient += transposed_product(&j.by_landmark, &r);
+        system.cross[cross_begin].value += transposed_product(&j.by_host, &j.by_landmark);
+        let value = transposed_product(&j.by_target, &j.by_landmark);
+        system.cross.push(PoseLandmarkBlock { frame: s.frame, value });
         if let Some(c) = c {
             by_calibration += c.transpose() * j.by_landmark;
             system.add(at_calibration, at_calibration, &(c.transpose() * c), 1.0);
@@ -536,13 +598,13 @@ fn add_landmark(
     let cross_end = system.cross.len();
     for a in cross_begin..cross_end {
         let PoseLandmarkBlock { frame, value } = system.cross[a];
-        let weighted = value * inverse;
+        let weighted = product(&value, &inverse);
         let row = system.offset(Part::Pose(frame));
-        system.add_gradient(row, &(weighted * gradient), -1.0);
+        system.add_gradient(row, &product(&weighted, &gradient), -1.0);
         for b in cross_begin..=a {
             let other = system.cross[b];
             let col = system.offset(Part::Pose(other.frame));
-            system.add_either(row, col, &(weighted * other.value.transpose()), -1.0);
+            system.subtract_outer((row, &weighted), (col, &other.value));
         }
         if calibrates {
             system.add(at_calibration, row, &(by_calibration * weighted.transpose()), -1.0);

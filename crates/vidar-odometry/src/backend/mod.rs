@@ -17,6 +17,7 @@ mod linearise;
 mod marginalise;
 mod optimise;
 mod prior;
+mod products;
 mod standstill;
 mod visual;
 mod window;

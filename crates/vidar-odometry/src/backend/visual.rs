@@ -5,6 +5,7 @@
 //! at infinity (ρ = 0). Residual: `π(q) − u`. States are those of the images' true instants; clocks that are off are the
 //! inertial factor's affair.
 
+use super::products::{product, transposed_product};
 use crate::imu::hat;
 use nalgebra::{Matrix2, Matrix2x3, Matrix3, Matrix3x2, SMatrix, Vector2, Vector3};
 use vidar_core::{CameraModel, Se3};
@@ -46,16 +47,18 @@ pub(crate) struct VisualJacobians {
 }
 
 /// Direction of the landmark in the target camera, up to scale.
+#[inline(always)]
 pub(crate) fn direction(
     host: &CameraPose,
     target: &CameraPose,
     bearing: &Vector3<f64>,
     rho: f64,
 ) -> Vector3<f64> {
-    target.turn.tr_mul(&(host.turn * bearing + (host.at - target.at) * rho))
+    transposed_product(&target.turn, &(product(&host.turn, bearing) + (host.at - target.at) * rho))
 }
 
 /// Derivatives of the pixel at the given places; `None` where the landmark does not project.
+#[inline(always)]
 pub(crate) fn jacobians(
     camera: &CameraModel,
     host: &CameraPose,
@@ -65,21 +68,25 @@ pub(crate) fn jacobians(
 ) -> Option<VisualJacobians> {
     let (pixel, by_direction) = camera.project_with_jacobian(&direction(host, target, bearing, rho))?;
     // d_pixel_d_(point in world axes)
-    let m: Matrix2x3<f64> = by_direction * target.turn.transpose();
-    let far = host.turn * bearing;
+    let m: Matrix2x3<f64> = product(&by_direction, &target.turn.transpose());
+    let far = product(&host.turn, bearing);
     let from_host_body = far + (host.at - host.body_at) * rho;
     let from_target_body = far + (host.at - target.body_at) * rho;
     let mut by_host = SMatrix::<f64, 2, 6>::zeros();
     let mut by_target = SMatrix::<f64, 2, 6>::zeros();
-    by_host.fixed_view_mut::<2, 3>(0, 0).copy_from(&(crossed(&m, &from_host_body, -1.0) * host.body_turn));
+    by_host
+        .fixed_view_mut::<2, 3>(0, 0)
+        .copy_from(&product(&crossed(&m, &from_host_body, -1.0), &host.body_turn));
     by_host.fixed_view_mut::<2, 3>(0, 3).copy_from(&(m * rho));
     by_target
         .fixed_view_mut::<2, 3>(0, 0)
-        .copy_from(&(crossed(&m, &from_target_body, 1.0) * target.body_turn));
+        .copy_from(&product(&crossed(&m, &from_target_body, 1.0), &target.body_turn));
     by_target.fixed_view_mut::<2, 3>(0, 3).copy_from(&(m * -rho));
     let mut by_landmark = SMatrix::<f64, 2, 3>::zeros();
-    by_landmark.fixed_view_mut::<2, 2>(0, 0).copy_from(&(m * host.turn * tangent_basis(bearing)));
-    by_landmark.fixed_view_mut::<2, 1>(0, 2).copy_from(&(m * (host.at - target.at)));
+    by_landmark
+        .fixed_view_mut::<2, 2>(0, 0)
+        .copy_from(&product(&product(&m, &host.turn), &tangent_basis(bearing)));
+    by_landmark.fixed_view_mut::<2, 1>(0, 2).copy_from(&product(&m, &(host.at - target.at)));
     Some(VisualJacobians { pixel, by_host, by_target, by_landmark })
 }
 
@@ -101,12 +108,14 @@ pub(crate) fn by_body_from_camera(
 }
 
 /// `sign · m · hat(x)`, row by row.
+#[inline(always)]
 fn crossed(m: &Matrix2x3<f64>, x: &Vector3<f64>, sign: f64) -> Matrix2x3<f64> {
     let row = |k: usize| Vector3::new(m[(k, 0)], m[(k, 1)], m[(k, 2)]).cross(x) * sign;
     Matrix2x3::from_rows(&[row(0).transpose(), row(1).transpose()])
 }
 
 /// Two unit vectors orthogonal to `bearing` and to each other.
+#[inline(always)]
 pub(crate) fn tangent_basis(bearing: &Vector3<f64>) -> Matrix3x2<f64> {
     let axis = if bearing.z.abs() < 0.9 { Vector3::z() } else { Vector3::x() };
     let first = bearing.cross(&axis).normalize();

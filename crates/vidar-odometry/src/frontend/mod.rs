@@ -25,7 +25,6 @@ mod feature_alignment;
 mod image_alignment;
 mod patch;
 mod pyramid;
-mod simd;
 mod template;
 #[cfg(test)]
 mod testbed;

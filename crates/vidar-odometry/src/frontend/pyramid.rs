@@ -4,7 +4,7 @@
 //! levels differ by more than a factor, and [`to_level`]/[`from_level`] are the only conversions.
 
 use super::error::FrontendError;
-use super::simd::dispatch;
+use crate::simd::dispatch;
 use vidar_core::camera::Pixel;
 use vidar_core::{FrameImage, Image};
 
@@ -138,7 +138,7 @@ pub fn from_level(pixel: &Pixel, l: usize) -> Pixel {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::frontend::simd::narrow;
+    use crate::simd::narrow;
 
     #[test]
     fn levels_are_rounded_means_of_blocks() {

@@ -7,7 +7,7 @@
 use super::feature::{Feature, FeatureKind};
 use super::patch::sample;
 use super::pyramid::{Pyramid, level_scale, to_level};
-use super::simd::dispatch;
+use crate::simd::dispatch;
 use nalgebra::{Matrix2, Matrix3x2, Vector2, Vector3};
 use vidar_core::camera::Pixel;
 use vidar_core::{CameraModel, Se3, So3};

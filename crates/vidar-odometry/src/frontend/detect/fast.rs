@@ -4,7 +4,7 @@
 //! best arc's margin over the centre is the score, i.e. the largest threshold for which the pixel would still be a corner.
 //! Only minima and maxima of bytes are taken, so every width of vector gives the same bits.
 
-use super::super::simd::dispatch;
+use crate::simd::dispatch;
 use vidar_core::Image;
 
 /// The circle of radius 3, clockwise from the top.
@@ -199,7 +199,7 @@ fn suppress(rows: [&Vec<u8>; 3], border: usize, best: &mut [u8]) {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::frontend::simd::narrow;
+    use crate::simd::narrow;
 
     /// The definition, pixel by pixel, without shortcuts.
     fn score_by_definition(image: &Image<u8>, x: usize, y: usize, threshold: i32) -> i32 {

@@ -3,7 +3,7 @@
 //! The mean gradient is taken out first: alignment frees the offset of the exposure, and a ramp shifted is a ramp offset.
 
 use super::super::feature::eigen;
-use super::super::simd::dispatch;
+use crate::simd::dispatch;
 use nalgebra::{Matrix2, Vector2};
 use vidar_core::Image;
 

@@ -1,6 +1,6 @@
 use super::*;
-use crate::frontend::simd::narrow;
 use crate::frontend::testbed::scene;
+use crate::simd::narrow;
 
 fn detect(config: DetectorConfig, taken: impl Fn(&mut OccupancyGrid)) -> Vec<Detection> {
     let pyramid = scene().pyramid(0);

@@ -1,8 +1,8 @@
 use super::*;
 use crate::frontend::feature::{Feature, FeatureKind};
-use crate::frontend::simd::narrow;
 use crate::frontend::template::Warp;
 use crate::frontend::testbed::{Random, Scene, full_scene, median, rms, scene};
+use crate::simd::narrow;
 use nalgebra::Vector3;
 use std::collections::BTreeMap;
 

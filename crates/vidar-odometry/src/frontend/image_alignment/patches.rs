@@ -5,7 +5,7 @@
 
 use super::super::patch::Bilinear;
 use super::super::pyramid::{Pyramid, level_scale, to_level};
-use super::super::simd::dispatch;
+use crate::simd::dispatch;
 use nalgebra::{Matrix2, Matrix2x6, Vector2, Vector3};
 use vidar_core::camera::Pixel;
 use vidar_core::{CameraModel, Image, LieGroup, Se3};

@@ -7,9 +7,9 @@ macro_rules! dispatch {
     ($kernel:expr) => {{
         #[cfg(target_arch = "x86_64")]
         {
-            if $crate::frontend::simd::has_avx2() {
+            if $crate::simd::has_avx2() {
                 // SAFETY: the processor has AVX2, as checked on the line above.
-                unsafe { $crate::frontend::simd::with_avx2(|| $kernel) }
+                unsafe { $crate::simd::with_avx2(|| $kernel) }
             } else {
                 $kernel
             }
