@@ -46,6 +46,9 @@ fn a_program_without_links_says_so() {
 }
 
 #[cfg(feature = "link")]
+mod robots;
+
+#[cfg(feature = "link")]
 mod built {
     use super::*;
     use crate::odometry::flight;
@@ -56,12 +59,9 @@ mod built {
     use std::process::{Child, Stdio};
     use std::sync::mpsc::{Receiver, sync_channel};
     use std::time::Duration;
-    use vidar::link::ros::Attachment;
-    use vidar::link::{Delivery, Link, LinkOptions, Role};
-    use vidar_bag::{Bag, write::encode};
 
     /// A port that is free now.
-    fn endpoint() -> String {
+    pub(super) fn endpoint() -> String {
         let listener = TcpListener::bind("127.0.0.1:0").unwrap();
         format!("tcp/{}", listener.local_addr().unwrap())
     }
@@ -110,7 +110,7 @@ mod built {
         }
     }
 
-    fn mesh(run: &Path) -> Vec<u8> {
+    pub(super) fn mesh(run: &Path) -> Vec<u8> {
         let mesh = std::fs::read(run.join("map/mesh.ply")).unwrap();
         assert!(mesh.len() > 10_000);
         mesh
@@ -216,6 +216,38 @@ mod built {
     }
 
     #[test]
+    fn when_the_last_worker_goes_a_live_map_stops_and_poses_go_on() {
+        let at = endpoint();
+        let mut worker = Worker::start(&at, &[]);
+        let mut live = command();
+        live.arg("live")
+            .arg(flight())
+            .args(["--realtime", "-o"])
+            .arg(out("left on the way"))
+            .args(&SHORT[3..]);
+        live.args(["--geometry", "remote:lab/depth", "--set", "remote.model=da3-nano", "--connect", &at]);
+        live.args(["--set", "link.patience_secs=0.5", "--set", "input.poses=odometry"]);
+        let child = live.stderr(Stdio::piped()).spawn().unwrap();
+        worker.told.recv_timeout(Duration::from_secs(120)).unwrap();
+        worker.child.kill().unwrap();
+        let ran: ProgramOutput = child.wait_with_output().unwrap().into();
+        ran.ends_with(4).says(&["map-stopped", "error[E0409]", "--resume"]);
+        let lines = std::fs::read_to_string(out("left on the way").join("trajectory/live.tum")).unwrap();
+        let times: Vec<f64> = lines
+            .lines()
+            .filter(|l| !l.starts_with('#'))
+            .map(|l| l.split(' ').next().unwrap().parse().unwrap())
+            .collect();
+        let images = std::fs::read_to_string(flight().join("mav0/cam0/data.csv")).unwrap();
+        let last = images.lines().last().unwrap().split(',').next().unwrap().parse::<f64>().unwrap() * 1e-9;
+        assert!(
+            times.len() > 30 && last - times.last().unwrap() < 0.2,
+            "{} of {last}",
+            times.last().unwrap()
+        );
+    }
+
+    #[test]
     fn the_doctor_tells_that_links_are_built_in() {
         let mut doctor = command();
         doctor.arg("doctor");
@@ -223,156 +255,5 @@ mod built {
         let mut worker = command();
         worker.args(["worker", "--model", "stereo"]);
         ended(worker).ends_with(2).says(&["error[E0105]", "\"stereo\" is none"]);
-    }
-
-    /// `vidar receive` in a process of its own, which waits for messages when this returns.
-    fn receiving(at: &str, file: &Path, idle: &str) -> Child {
-        let mut receive = command();
-        receive.args([
-            "receive",
-            "0/**",
-            "--listen",
-            at,
-            "--idle",
-            idle,
-            "--duration",
-            "120",
-            "--json",
-            "-o",
-        ]);
-        let mut child = receive.arg(file).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
-        let mut lines = BufReader::new(child.stderr.take().unwrap());
-        let mut line = String::new();
-        lines.read_line(&mut line).unwrap();
-        assert!(line.contains("waiting for messages"), "{line}");
-        child
-    }
-
-    fn received(child: Child) -> serde_json::Value {
-        let ran: ProgramOutput = child.wait_with_output().unwrap().into();
-        ran.ends_with(0).json()["received"].clone()
-    }
-
-    /// Sends what a recording holds, as a robot does, each message twice, as fast as it goes or in the rhythm of the recording; how many
-    /// there are.
-    fn drives(recording: &Path, at: String, is_paced: bool) -> u64 {
-        let options = LinkOptions { connect: vec![at], ..LinkOptions::default() };
-        let link = Link::open(&options, Role::Client).unwrap();
-        let bag = Bag::open(recording).unwrap();
-        let mut messages = Vec::new();
-        for topic in bag.topics().iter().filter(|t| t.message_type != "nav_msgs/Odometry") {
-            let kind = topic.message_type.replacen('/', "::msg::dds_::", 1);
-            let publisher =
-                link.publisher(&format!("0{}/{kind}_/RIHS01_0", topic.name), None, Delivery::Wait).unwrap();
-            let publisher = std::rc::Rc::new(publisher);
-            for (i, message) in topic.messages.iter().enumerate() {
-                messages.push((message.log_time, i, publisher.clone(), bag.read(message).unwrap()));
-            }
-        }
-        messages.sort_by_key(|(time, ..)| *time);
-        std::thread::sleep(Duration::from_secs(2));
-        let (clock, first) = (std::time::Instant::now(), messages.first().unwrap().0);
-        for (time, i, publisher, message) in &messages {
-            if is_paced {
-                let after = Duration::from_nanos((*time - first).nanos() as u64);
-                std::thread::sleep(after.saturating_sub(clock.elapsed()));
-            }
-            let attached = Attachment { sequence: *i as i64, sent_ns: time.nanos(), sender: [7; 16] };
-            let (_, payload) = encode(message).unwrap();
-            // Everything comes twice.
-            for _ in 0..2 {
-                publisher.put(payload.clone(), attached.encode()).unwrap();
-            }
-            std::thread::sleep(Duration::from_micros(if is_paced { 0 } else { 200 }));
-        }
-        // A session that is closed takes what is on its way with it.
-        std::thread::sleep(Duration::from_secs(1));
-        messages.len() as u64
-    }
-
-    #[test]
-    fn a_robot_is_mapped_while_it_drives() {
-        let folder = out("driving");
-        std::fs::create_dir_all(&folder).unwrap();
-        let (drive, map) = (folder.join("drive.mcap"), folder.join("map"));
-        let mut convert = command();
-        convert.arg("convert").arg(flight()).arg(&drive).arg("-q");
-        ended(convert).ends_with(0);
-        let at = endpoint();
-        let mut live = command();
-        live.args(["live", "zenoh:0/**", "--listen", &at, "--idle", "3", "--duration", "200", "-o"])
-            .arg(&map);
-        let child =
-            live.args(["-q", "--set", "input.poses=odometry"]).stderr(Stdio::piped()).spawn().unwrap();
-        std::thread::sleep(Duration::from_secs(2));
-        drives(&drive, at, true);
-        let ran: ProgramOutput = child.wait_with_output().unwrap().into();
-        let made = manifest(&map);
-        let told = &made["result"]["live"];
-        let left_out = ["images_not_tracked", "keyframes_dropped", "poses_dropped"];
-        let left_out: u64 = left_out.iter().map(|key| told[*key].as_u64().unwrap()).sum();
-        assert!(left_out == 0 || ran.code == 3, "{left_out} left out: {}", ran.stderr);
-        assert_eq!(made["exit"], ran.code, "{}", ran.stderr);
-        let lines = std::fs::read_to_string(map.join("trajectory/live.tum")).unwrap();
-        assert!(lines.lines().filter(|l| !l.starts_with('#')).count() > 10, "{lines}");
-        let kept = Bag::open(&map.join("recording.mcap")).unwrap();
-        let images = |bag: &Bag| bag.topics().iter().map(|t| t.messages.len()).sum::<usize>();
-        assert!(images(&kept) > images(&Bag::open(&drive).unwrap()) / 2, "what came is kept");
-        assert!(mesh(&map).len() > 10_000);
-        // Opening the stream takes 2.5 s of it. Who caught up has poses as images come; who did not has each of them that late.
-        let latency = &told["image_to_pose"];
-        assert!(latency["median"].as_f64().unwrap() < 1.25, "{latency}");
-    }
-
-    #[test]
-    fn a_robot_that_is_received_leaves_the_recording_that_it_sent() {
-        let folder = out("robot");
-        std::fs::create_dir_all(&folder).unwrap();
-        let (drive, file) = (folder.join("drive.mcap"), folder.join("received.mcap"));
-        let mut convert = command();
-        convert.arg("convert").arg(&shared().sequence).arg(&drive).arg("-q");
-        ended(convert).ends_with(0);
-        let at = endpoint();
-        let child = receiving(&at, &file, "3");
-        let known = drives(&drive, at, false);
-        let told = received(child);
-        let count: u64 = told["topics"].as_object().unwrap().values().map(|n| n.as_u64().unwrap()).sum();
-        assert_eq!(
-            (count + told["ignored"].as_u64().unwrap() / 2, &told["dropped"]),
-            (known, &0.into()),
-            "{told}"
-        );
-        assert_eq!(told["repeated"].as_u64(), Some(count), "{told}");
-        let (kept, bag) = (Bag::open(&file).unwrap(), Bag::open(&drive).unwrap());
-        for topic in kept.topics() {
-            let sent = bag.topics().iter().find(|t| t.name == topic.name).unwrap();
-            assert_eq!(topic.messages.len(), sent.messages.len(), "{}", topic.name);
-            for (came, went) in topic.messages.iter().zip(&sent.messages) {
-                assert!(kept.read(came).unwrap() == bag.read(went).unwrap(), "{}", topic.name);
-            }
-        }
-    }
-
-    #[test]
-    fn a_live_run_tells_ros_where_it_is() {
-        let folder = out("told");
-        std::fs::create_dir_all(&folder).unwrap();
-        let (at, file, map) = (endpoint(), folder.join("tf.mcap"), folder.join("map"));
-        let child = receiving(&at, &file, "20");
-        let mut live = command();
-        live.arg("live").arg(flight()).arg("-o").arg(&map).args(["-q", "--set", "input.poses=odometry"]);
-        live.args(["--publish", "0/vidar", "--connect", &at]);
-        let ran = ended(live);
-        assert_eq!(ran.code, 0, "{}", ran.stderr);
-        let told = received(child);
-        let lines = std::fs::read_to_string(map.join("trajectory/live.tum")).unwrap();
-        let poses = lines.lines().filter(|l| !l.starts_with('#')).count() as u64;
-        let transforms = told["topics"]["/tf"].as_u64().unwrap();
-        assert!(transforms <= poses && transforms > poses / 2, "{transforms} of {poses}: {told}");
-        // Poses, odometry, keyframes, clouds and health are of types that no map needs.
-        assert!(told["ignored"].as_u64().unwrap() > poses, "{told}");
-        let mut wrong = command();
-        wrong.arg("live").arg(flight()).args(["--publish", "vidar", "-o"]).arg(folder.join("wrong"));
-        ended(wrong).ends_with(2).says(&["error[E0105]", "--publish 0/vidar"]);
     }
 }

@@ -87,7 +87,12 @@ impl GrowingSurface {
         Ok(events)
     }
 
-    /// Adds views of chunks that are still to come.
+    /// Whether it has the depth of a keyframe.
+    pub fn shows(&self, frame: FrameId) -> bool {
+        self.fused.contains_key(&frame) || self.previewed.contains_key(&frame)
+    }
+
+    /// Adds views of chunks that are still to come, but for those that it has.
     pub fn preview(
         &mut self,
         views: Vec<(ChunkId, AlignedView)>,
@@ -96,7 +101,7 @@ impl GrowingSurface {
         let mut events = Vec::new();
         let mut shown = Vec::new();
         for (chunk, view) in views {
-            if integrate(&mut self.volumes, chunk, &view, &mut events) {
+            if !self.shows(view.frame_id()) && integrate(&mut self.volumes, chunk, &view, &mut events) {
                 self.previewed.insert(view.frame_id(), chunk);
                 shown.push(view.frame_id());
             }

@@ -26,10 +26,11 @@ fn pose(i: u32) -> Se3 {
     Se3::from_translation(Vector3::new(f64::from(i) * 0.06, 0.0, 0.0))
 }
 
-/// A wall 2 m in front of the camera; predictions of the chunks in `failing` fail.
+/// A wall 2 m in front of the camera; predictions of the chunks in `failing` fail, and views less than `least_span_m` apart show nothing.
 struct Wall {
     info: ModelInfo,
     failing: Vec<u32>,
+    least_span_m: f64,
 }
 
 impl Wall {
@@ -41,7 +42,7 @@ impl Wall {
             needs_poses: true,
             min_views: 2,
         };
-        Self { info, failing: failing.to_vec() }
+        Self { info, failing: failing.to_vec(), least_span_m: 0.0 }
     }
 }
 
@@ -75,6 +76,10 @@ impl GeometrySource for Wall {
             depth: RelativeDepth::new(Image::filled(64, 48, 2.0)),
             confidence: Confidence::full(64, 48),
         };
+        let x = |v: &vidar_core::ChunkView| v.world_from_camera.unwrap().translation.x;
+        let spans = |from: f64, to: f64| to - from >= self.least_span_m;
+        let ends = views.views.iter().map(x).fold((f64::MAX, f64::MIN), |(a, b), x| (a.min(x), b.max(x)));
+        let wanted = if spans(ends.0, ends.1) { wanted } else { 0..0 };
         let views = GeometryPrediction {
             chunk_id: views.id,
             frame: ChunkFrame::PriorWorld,
@@ -315,6 +320,28 @@ fn a_keyframe_that_waits_for_its_chunk_is_shown_before_and_the_map_is_the_same()
     let sizes = grown(&lost);
     assert!(sizes.windows(2).any(|pair| pair[1] < pair[0]), "{sizes:?}");
     assert!(grown(&soon).windows(2).all(|pair| pair[1] >= pair[0]));
+}
+
+#[test]
+fn images_between_keyframes_help_where_those_are_few_and_who_got_no_depth_is_tried_again() {
+    // A keyframe every five images, of six centimetres each.
+    let watched = |least_span_m| {
+        let mut config = config();
+        config.keyframes.min_translation_m = 0.29;
+        config.output.live_map = true;
+        config.output.live_map_wait_secs = 0.25;
+        let mut wall = Wall { least_span_m, ..Wall::new(&[]) };
+        let (ended, events, _) = run_with(&config, Box::new(truth()), None, &mut wall);
+        ended.unwrap();
+        events
+    };
+    let waits = |events| shown(events).iter().map(|(f, images)| images - 1 - f).collect::<Vec<_>>();
+    let events = watched(0.0);
+    let frames = shown(&events).iter().map(|(f, _)| *f).collect::<Vec<_>>();
+    assert_eq!(frames, (0..FRAMES).step_by(5).collect::<Vec<_>>(), "no image that helped is shown");
+    assert_eq!(waits(&events), [3; 8], "none waits for a fourth keyframe");
+    // Three images are .18 m: the first keyframe is tried after them, and again after three more.
+    assert_eq!(waits(&watched(0.25))[..2], [6, 3]);
 }
 
 #[test]

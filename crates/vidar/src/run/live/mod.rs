@@ -38,7 +38,7 @@ use serde::Serialize;
 use std::time::{Duration, Instant};
 use thinning::Thinning;
 use tracker::{ArrivalClock, Counts, Tracker};
-use vidar_core::Warning;
+use vidar_core::{ModelError, Warning};
 use vidar_dataset::DatasetError;
 
 /// Keyframes that wait longer than this for the map's thread get no preview: it would make the others wait still longer. About what a
@@ -228,7 +228,7 @@ fn track(
     Ok((end, counts, thinning))
 }
 
-/// The map's side: what is tracked into the engine, until the odometry ends.
+/// The map's side. Where no worker elsewhere answers any more, the map ends and the poses of a robot do not.
 fn map(
     (context, options): (&Context<'_>, &LiveOptions),
     queue: &Queue,
@@ -236,6 +236,24 @@ fn map(
     readers: &mut Readers<'_>,
 ) -> Result<(), Error> {
     let _closing = Closing(queue);
+    let mapped = map_queue((context, options), queue, engine, readers);
+    let is_watched = options.is_realtime || context.stream.is_some();
+    if let (Err(error @ Error::Geometry(ModelError::OutOfReach(_))), true) = (&mapped, is_watched) {
+        let message = format!("the map has stopped, poses go on: {error}");
+        let hint = "the same command with --resume maps the recording once workers answer";
+        context.events.warn(&Warning::degraded("map-stopped", message).hint(hint));
+        while queue.pop().is_some() {}
+    }
+    mapped
+}
+
+/// What is tracked into the engine, until the odometry ends or the engine cannot go on.
+fn map_queue(
+    (context, options): (&Context<'_>, &LiveOptions),
+    queue: &Queue,
+    engine: &mut Engine<'_>,
+    readers: &mut Readers<'_>,
+) -> Result<(), Error> {
     let (total, mut done) = (context.dataset.images.len(), 0);
     // Of a recording that is replayed as fast as it goes nobody sees the surface grow.
     let is_watched = options.is_realtime || context.stream.is_some();
