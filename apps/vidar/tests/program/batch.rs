@@ -181,6 +181,37 @@ fn maps_are_those_of_run_though_a_worker_is_killed_and_a_recording_is_garbage() 
     assert_eq!(other.all("map", 3)[0]["task"]["result"], maps[0]["task"]["result"]);
 }
 
+/// A scheduler gives a task that hangs to another node, and the first one goes on later.
+#[cfg(unix)]
+#[test]
+fn a_node_that_stands_still_and_goes_on_after_another_did_its_task_changes_nothing() {
+    let batch = Batch::plan(&[&shared().sequence], &["--parts", "1"]);
+    batch.all("track", 1);
+    let slow = batch.command("predict", 0).stdout(std::process::Stdio::piped()).spawn().unwrap();
+    let signal = |name: &str| {
+        let sent = Command::new("kill").args([name, &slow.id().to_string()]).status().unwrap();
+        assert!(sent.success(), "{name}");
+    };
+    let clock = Instant::now();
+    let begun = || batch.store().join("predict").read_dir().is_ok_and(|mut d| d.next().is_some());
+    while !begun() && clock.elapsed() < Duration::from_secs(120) {
+        std::thread::sleep(Duration::from_millis(1));
+    }
+    signal("-STOP");
+    let chunks = |of: &Value| of["task"]["result"]["chunks"].as_u64();
+    let quick = batch.all("predict", 1).remove(0);
+    assert_eq!(quick["was_there"], false, "the slow one had not ended");
+    let map = batch.all("map", 1).remove(0);
+    let before = results(&batch.folder_of("maps", "tiny_room"));
+    signal("-CONT");
+    let ended: ProgramOutput = slow.wait_with_output().unwrap().into();
+    assert_eq!(chunks(&ended.ends_with(0).json()), chunks(&quick));
+    assert!(results(&batch.folder_of("maps", "tiny_room")) == before);
+    let again = batch.all("map", 1).remove(0);
+    assert_eq!((&again["was_there"], &again["task"]["result"]), (&true.into(), &map["task"]["result"]));
+    assert_eq!(batch.report()["counts"]["done"], 1);
+}
+
 #[test]
 fn chunks_of_a_network_that_overlap_are_placed_as_in_one_run() {
     const NETWORK: &[&str] =
@@ -228,16 +259,20 @@ fn what_is_no_plan_or_was_changed_is_refused_and_leaves_no_record() {
     std::fs::rename(&sequence, &away).unwrap();
     assert_ne!(batch.work("track", 0).code, 0);
     std::fs::rename(&away, &sequence).unwrap();
-    // So may it after a disk was full.
-    if cfg!(target_os = "linux") {
-        let mut limited = Command::new("sh");
-        limited.args(["-c", "trap '' XFSZ; ulimit -f 2; exec \"$0\" \"$@\"", VIDAR]);
-        limited.args(batch.command("track", 0).get_args());
-        assert_eq!(code(limited.output().unwrap().into(), 4), "E0402");
+    // So may it after a disk was full, in any stage.
+    let records = || files_under(&batch.store()).iter().filter(|f| f.starts_with("records/")).count();
+    for (done, stage) in ["track", "predict", "map"].into_iter().enumerate() {
+        if cfg!(target_os = "linux") {
+            let mut limited = Command::new("sh");
+            limited.args(["-c", "trap '' XFSZ; ulimit -f 2; exec \"$0\" \"$@\"", VIDAR]);
+            limited.args(batch.command(stage, 0).get_args());
+            assert_eq!(code(limited.output().unwrap().into(), 4), "E0402", "{stage}");
+        }
+        assert_eq!(records(), done, "{stage}: what failed has no record");
+        if stage != "map" {
+            assert_eq!(batch.all(stage, 1)[0]["task"]["status"], "done");
+        }
     }
-    assert!(!batch.store().join("records").exists());
-    assert_eq!(batch.all("track", 1)[0]["task"]["status"], "done");
-    batch.all("predict", 1);
 
     // A chunk that was damaged on its way is not mapped.
     let chunk = batch.folder_of("predict", "copy").join("chunks/000000.npz");

@@ -31,6 +31,7 @@ mod quality;
 mod recordings;
 mod release;
 mod resume;
+mod schedulers;
 mod support;
 mod trust;
 mod verbs;
