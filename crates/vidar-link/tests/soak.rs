@@ -1,4 +1,4 @@
-//! Workers behind a network with faults: connections that are cut, stand still, deliver late, or are flooded with garbage. Every chunk
+//! Workers behind a network with faults: connections that are cut, stand still, deliver late, deliver twice, or are flooded with garbage. Every chunk
 //! comes back with its own bits, and memory stays flat. A few seconds in the ordinary tests; half an hour with
 //! `cargo test -p vidar-link --features zenoh --release --test soak -- --ignored --nocapture`.
 #![allow(clippy::unwrap_used, clippy::panic, clippy::print_stderr)]
@@ -12,8 +12,8 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::mpsc::sync_channel;
 use std::time::{Duration, Instant};
-use vidar_link::geometry::{DepthFormat, Expected, ImageFormat, RemoteModel, RemoteOptions};
-use vidar_link::{Link, LinkOptions, Role, Serving};
+use vidar_link::geometry::{AskError, DepthFormat, Expected, ImageFormat, Reach, RemoteModel, RemoteOptions};
+use vidar_link::{Link, LinkError, LinkOptions, Role, Serving};
 
 const KEY: &str = "soak/depth";
 
@@ -78,6 +78,48 @@ impl Proxy {
     }
 }
 
+/// A way on which requests and replies come twice: now and then a worker gets a request two times, and now and then the reply to an
+/// earlier request comes first.
+struct Duplicating {
+    reach: Box<dyn Reach>,
+    random: u64,
+    earlier: Vec<u8>,
+    /// Requests and replies that came twice.
+    count: Arc<AtomicU64>,
+}
+
+impl Reach for Duplicating {
+    fn key(&self) -> &str {
+        self.reach.key()
+    }
+
+    fn greet(&mut self, question: &[u8], within: Duration) -> Result<Vec<Vec<u8>>, LinkError> {
+        let answers = self.reach.greet(question, within)?;
+        Ok([answers.clone(), answers].concat())
+    }
+
+    fn ask(
+        &mut self,
+        worker: &str,
+        request: &[u8],
+        within: Duration,
+        stop: &dyn Fn() -> bool,
+    ) -> Result<Vec<u8>, AskError> {
+        let dice = next(&mut self.random) % 10;
+        if dice == 0 {
+            drop(self.reach.ask(worker, request, within, stop));
+        }
+        if dice == 1 && !self.earlier.is_empty() {
+            self.count.fetch_add(1, Ordering::SeqCst);
+            return Ok(std::mem::take(&mut self.earlier));
+        }
+        let answer = self.reach.ask(worker, request, within, stop)?;
+        self.count.fetch_add(u64::from(dice == 0), Ordering::SeqCst);
+        self.earlier.clone_from(&answer);
+        Ok(answer)
+    }
+}
+
 fn resident_bytes() -> u64 {
     let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
     let line = status.lines().find(|l| l.starts_with("VmRSS:")).unwrap_or("VmRSS: 0 kB");
@@ -125,7 +167,10 @@ fn soak(time: Duration, least_chunks: u32) {
             run: 5,
             rank: 0,
         };
-        let mut model = RemoteModel::open(link.reach(KEY).unwrap(), options, &|| false).unwrap();
+        let count = Arc::new(AtomicU64::new(0));
+        let reach = link.reach(KEY).unwrap();
+        let reach = Duplicating { reach, random: 14, earlier: Vec::new(), count: count.clone() };
+        let mut model = RemoteModel::open(Box::new(reach), options, &|| false).unwrap();
         let (clock, mut random, mut done, mut warm) = (Instant::now(), 7_u64, 0_u32, 0_u64);
         while clock.elapsed() < time || done < least_chunks {
             let way = &ways[next(&mut random) as usize % 2];
@@ -159,13 +204,17 @@ fn soak(time: Duration, least_chunks: u32) {
         }
         let report = model.report();
         eprintln!(
-            "{done} chunks, {} retries, {} invalid replies, {:?}, {} MB resident",
+            "{done} chunks, {} retries, {} duplicates, {} invalid replies, {:?}, {} MB resident",
             report.retries,
+            count.load(Ordering::SeqCst),
             report.invalid_replies,
             report.workers,
             resident_bytes() >> 20
         );
         assert_eq!(report.chunks, done as usize);
+        assert!(count.load(Ordering::SeqCst) > 0);
+        // The reply to another request is none.
+        assert!(report.invalid_replies > 0, "{report:?}");
         if warm > 0 {
             assert!(resident_bytes() < warm + (64 << 20), "{} MB at 200 chunks", warm >> 20);
         }
