@@ -62,6 +62,7 @@ pub mod model;
 pub mod odometry;
 pub mod origin;
 pub mod printable;
+pub mod random;
 pub mod remap;
 pub mod rig;
 pub mod sensor;

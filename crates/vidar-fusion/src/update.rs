@@ -139,15 +139,7 @@ impl BlockUpdate<'_> {
 mod tests {
     use super::*;
     use crate::sample::{CONFIDENCE_ONE, WEIGHT_ONE};
-
-    /// A sequence of pseudo-random numbers in 0…1 (an LCG of Knuth).
-    fn noise() -> impl FnMut() -> f32 {
-        let mut state = 1u64;
-        move || {
-            state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
-            (state >> 40) as f32 / (1u64 << 24) as f32
-        }
-    }
+    use vidar_core::random::SplitMix64;
 
     #[test]
     fn the_avx2_path_gives_the_bits_of_the_portable_path() {
@@ -155,7 +147,8 @@ mod tests {
             eprintln!("skipped: this processor has no AVX2");
             return;
         }
-        let mut next = noise();
+        let mut random = SplitMix64::new(1);
+        let mut next = || random.uniform() as f32;
         let (mut nodes_changed, mut colors_changed) = (0, 0);
         for (width, height) in [(61, 47), (8, 8), (2, 1), (640, 3)] {
             let samples: Vec<Sample> = (0..width * height)

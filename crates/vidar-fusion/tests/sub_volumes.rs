@@ -5,6 +5,7 @@
 mod common;
 
 use common::{Vec3, ball, border_edges, config, floor, fuse, look_at, point, rms, view, views_around};
+use vidar_core::random::SplitMix64;
 use vidar_core::{AlignedView, ChunkId, FrameId, Image, LieGroup, Se3, Sim3, So3, TriangleMesh};
 use vidar_fusion::{DoubleWallDetector, FusionConfig, FusionError, RevisedView, SubVolumeConfig, SubVolumes};
 
@@ -348,18 +349,14 @@ fn corrupt_bytes_are_an_error_and_never_panic() {
     let fusion = FusionConfig { carve_range_m: 1.0, voxel_size_m: 0.05, ..config() };
     let mut volumes = dealt(&settings(fusion), &views, 1);
     let good = volumes.offload(ChunkId(0)).unwrap();
-    let mut state = 1_u64;
-    let mut random = |below: usize| {
-        state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
-        (state >> 33) as usize % below
-    };
+    let mut random = SplitMix64::new(1);
     let mut rejected = 0;
     for round in 0..400 {
         let mut bytes = good.clone();
         if round % 2 == 0 {
-            bytes.truncate(random(good.len()));
+            bytes.truncate(random.below(good.len()));
         } else {
-            bytes[random(good.len())] ^= 1 << random(8);
+            bytes[random.below(good.len())] ^= 1 << random.below(8);
         }
         volumes.forget_merged();
         // A flipped bit of a sum may still be a sum; whatever is read can be made a mesh.

@@ -12,10 +12,13 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::mpsc::sync_channel;
 use std::time::{Duration, Instant};
+use vidar_core::random::SplitMix64;
 use vidar_link::geometry::{AskError, DepthFormat, Expected, ImageFormat, Reach, RemoteModel, RemoteOptions};
 use vidar_link::{Link, LinkError, LinkOptions, Role, Serving};
 
 const KEY: &str = "soak/depth";
+/// Its first numbers below ten have a nought and a one.
+const DICE_SEED: u64 = 5;
 
 /// A way to an address that can be disturbed.
 struct Proxy {
@@ -82,7 +85,7 @@ impl Proxy {
 /// earlier request comes first.
 struct Duplicating {
     reach: Box<dyn Reach>,
-    random: u64,
+    dice: SplitMix64,
     earlier: Vec<u8>,
     /// Requests and replies that came twice.
     count: Arc<AtomicU64>,
@@ -105,7 +108,7 @@ impl Reach for Duplicating {
         within: Duration,
         stop: &dyn Fn() -> bool,
     ) -> Result<Vec<u8>, AskError> {
-        let dice = next(&mut self.random) % 10;
+        let dice = self.dice.below(10);
         if dice == 0 {
             drop(self.reach.ask(worker, request, within, stop));
         }
@@ -124,12 +127,6 @@ fn resident_bytes() -> u64 {
     let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
     let line = status.lines().find(|l| l.starts_with("VmRSS:")).unwrap_or("VmRSS: 0 kB");
     line.split_whitespace().nth(1).and_then(|n| n.parse::<u64>().ok()).unwrap_or(0) * 1024
-}
-
-/// Pseudo-random numbers, so that a failure can be had again.
-fn next(state: &mut u64) -> u64 {
-    *state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
-    *state >> 33
 }
 
 fn soak(time: Duration, least_chunks: u32) {
@@ -169,19 +166,22 @@ fn soak(time: Duration, least_chunks: u32) {
         };
         let count = Arc::new(AtomicU64::new(0));
         let reach = link.reach(KEY).unwrap();
-        let reach = Duplicating { reach, random: 14, earlier: Vec::new(), count: count.clone() };
+        let dice = SplitMix64::new(DICE_SEED);
+        let reach = Duplicating { reach, dice, earlier: Vec::new(), count: count.clone() };
         let mut model = RemoteModel::open(Box::new(reach), options, &|| false).unwrap();
-        let (clock, mut random, mut done, mut warm) = (Instant::now(), 7_u64, 0_u32, 0_u64);
+        // By seed, so that a failure can be had again.
+        let mut random = SplitMix64::new(7);
+        let (clock, mut done, mut warm) = (Instant::now(), 0_u32, 0_u64);
         while clock.elapsed() < time || done < least_chunks {
-            let way = &ways[next(&mut random) as usize % 2];
-            match next(&mut random) % 6 {
+            let way = &ways[random.below(2)];
+            match random.below(6) {
                 0 => drop(way.cut.fetch_add(1, Ordering::SeqCst)),
                 1 => way.stands_still.store(true, Ordering::SeqCst),
-                2 => way.delay_ms.store(next(&mut random) % 30, Ordering::SeqCst),
+                2 => way.delay_ms.store(random.next_u64() % 30, Ordering::SeqCst),
                 3 => {
                     // Somebody who speaks no Zenoh at all.
                     if let Ok(mut stranger) = TcpStream::connect(("127.0.0.1", way.port)) {
-                        let garbage: Vec<u8> = (0..4096).map(|_| next(&mut random) as u8).collect();
+                        let garbage: Vec<u8> = (0..4096).map(|_| random.next_u64() as u8).collect();
                         let _ = stranger.write_all(&garbage);
                     }
                 }

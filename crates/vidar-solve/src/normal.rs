@@ -178,6 +178,7 @@ fn minimum_degree(nodes: usize, edges: impl Iterator<Item = (usize, usize)>) -> 
 mod tests {
     use super::*;
     use nalgebra::DVector;
+    use vidar_core::random::SplitMix64;
 
     /// A chain of blocks of different sizes with one long loop, and its dense twin.
     fn problem() -> (NormalEquations, DMatrix<f64>, DVector<f64>) {
@@ -186,11 +187,8 @@ mod tests {
         let mut sparse = NormalEquations::new(&sizes);
         let mut dense = DMatrix::zeros(24, 24);
         let mut gradient = DVector::zeros(24);
-        let mut seed = 1u64;
-        let mut next = || {
-            seed = seed.wrapping_mul(6364136223846793005).wrapping_add(1442695040888963407);
-            (seed >> 33) as f64 / (1u64 << 30) as f64 - 1.0
-        };
+        let mut random = SplitMix64::new(1);
+        let mut next = || 2.0 * random.uniform() - 1.0;
         for (i, j) in [(0, 1), (2, 1), (2, 3), (4, 3), (4, 0), (0, 0)] {
             let a = DMatrix::from_fn(9, sizes[i], |_, _| next());
             let b = DMatrix::from_fn(9, sizes[j], |_, _| next());

@@ -2,6 +2,7 @@
 
 use super::PointPairs;
 use nalgebra::Vector3;
+use vidar_core::random::splitmix64;
 use vidar_core::{FrameId, LieGroup, Pinhole, Se3, ViewGeometry};
 use vidar_solve::statistics::median_upper;
 
@@ -183,7 +184,7 @@ impl Pattern {
 
     fn pixel(&self, cell: usize) -> (usize, usize) {
         let (column, row) = (cell % self.columns, cell / self.columns);
-        let hash = mix((u64::from(self.frame) << 32) ^ cell as u64);
+        let hash = splitmix64((u64::from(self.frame) << 32) ^ cell as u64);
         let within = |index: usize, cells: usize, size: usize, bits: u64| {
             let (from, to) = (index * size / cells, (index + 1) * size / cells);
             from + (bits % (to - from).max(1) as u64) as usize
@@ -208,12 +209,4 @@ impl Pattern {
             row * self.columns + column
         })
     }
-}
-
-/// SplitMix64's finaliser (Steele, Lea, Flood 2014): well-mixed bits of a counter.
-fn mix(value: u64) -> u64 {
-    let z = value.wrapping_add(0x9e37_79b9_7f4a_7c15);
-    let z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-    let z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
-    z ^ (z >> 31)
 }

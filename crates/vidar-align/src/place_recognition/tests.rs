@@ -1,14 +1,10 @@
 use super::*;
+use vidar_core::random::SplitMix64;
 use vidar_core::{FrameId, Image, Timestamp};
 
 fn direction(seed: u64, n: usize) -> Vec<f32> {
-    let mut state = seed.wrapping_mul(0x9e37_79b9_7f4a_7c15) | 1;
-    let mut values: Vec<f32> = (0..n)
-        .map(|_| {
-            state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
-            (state >> 40) as f32 / (1u64 << 23) as f32 - 1.0
-        })
-        .collect();
+    let mut random = SplitMix64::new(seed);
+    let mut values: Vec<f32> = (0..n).map(|_| 2.0 * random.uniform() as f32 - 1.0).collect();
     let length = values.iter().map(|v| v * v).sum::<f32>().sqrt();
     values.iter_mut().for_each(|v| *v /= length);
     values

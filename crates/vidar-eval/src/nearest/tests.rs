@@ -1,5 +1,6 @@
 use super::*;
 use proptest::prelude::*;
+use vidar_core::random::SplitMix64;
 
 fn brute_force(query: &[f32; 3], points: &[[f32; 3]]) -> f64 {
     let squared = |p: &[f32; 3]| -> f64 {
@@ -99,11 +100,8 @@ fn coordinates_at_the_end_of_the_range_neither_panic_nor_win() {
 
 #[test]
 fn one_thread_and_four_give_the_same_bits() {
-    let mut state = 5_u64;
-    let mut next = || {
-        state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1);
-        (state >> 40) as f32 / (1 << 22) as f32
-    };
+    let mut random = SplitMix64::new(5);
+    let mut next = || 4.0 * random.uniform() as f32;
     // Enough points for the parallel build, enough queries for several tasks.
     let mut points: Vec<[f32; 3]> = (0..20_000).map(|_| [next(), next(), 0.125]).collect();
     // Equal points are equally near; which of them is named must not depend on threads either.

@@ -15,6 +15,7 @@ use crate::error::{ExportError, write_error};
 use nalgebra::{Matrix4, Vector3};
 use serde_json::{Value, json};
 use std::io::Write;
+use vidar_core::random::SplitMix64;
 
 const FORMAT: &str = "GLB scene";
 /// `glTF`, version 2, and the names of its two chunks, little-endian.
@@ -187,19 +188,11 @@ fn diagonal(points: &[Vector3<f64>]) -> f64 {
 
 /// `keep` indices below `n`, ascending, each subset as likely (Knuth's selection sampling) and always the same.
 pub fn thinned(n: usize, keep: usize) -> Vec<usize> {
-    let mut state = 0x9E37_79B9_7F4A_7C15_u64;
-    let mut random = || {
-        // splitmix64
-        state = state.wrapping_add(0x9E37_79B9_7F4A_7C15);
-        let mut z = state;
-        z = (z ^ (z >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
-        z = (z ^ (z >> 27)).wrapping_mul(0x94D0_49BB_1331_11EB);
-        (z ^ (z >> 31)) >> 11
-    };
+    let mut random = SplitMix64::new(0x9E37_79B9_7F4A_7C15);
     let mut chosen = Vec::with_capacity(keep);
     for index in 0..n {
         let (left, wanted) = ((n - index) as u128, (keep - chosen.len()) as u128);
-        if u128::from(random()) * left < wanted << 53 {
+        if u128::from(random.next_u64() >> 11) * left < wanted << 53 {
             chosen.push(index);
         }
     }

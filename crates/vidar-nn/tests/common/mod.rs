@@ -3,7 +3,8 @@
 
 use vidar_nn::{Compute, Isa, Precision, Weight};
 
-/// splitmix64 as a stream of numbers in [-1, 1).
+/// SplitMix64 as a stream of numbers in [-1, 1): that of `vidar_core::random`, which this crate cannot see, as it depends on no
+/// other of the workspace.
 pub struct Numbers(pub u64);
 
 impl Numbers {

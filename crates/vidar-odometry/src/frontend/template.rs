@@ -233,19 +233,19 @@ fn dot(a: &[f32; SIDE * SIDE], b: &[f32; SIDE * SIDE]) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::frontend::testbed::Random;
     use vidar_core::LieGroup;
+    use vidar_core::random::SplitMix64;
     use vidar_core::testing::check_jacobian;
 
     #[test]
     fn the_warp_is_the_derivative_of_the_map_through_the_plane() {
-        let mut random = Random::new(4);
+        let mut random = SplitMix64::new(4);
         for camera in CameraModel::examples() {
             let centre = Pixel::new(camera.intrinsics().cx + 60.0, camera.intrinsics().cy - 40.0);
             let Some(feature) = Feature::new(&camera, centre, 0, FeatureKind::Corner) else { continue };
             for inverse_distance in [0.0, 0.1, 0.6] {
                 let current_from_keyframe =
-                    Se3::new(So3::exp(&(random.vector() * 0.1)), random.vector() * 0.1);
+                    Se3::new(So3::exp(&(random.normal3() * 0.1)), random.normal3() * 0.1);
                 let warp = Warp::new(&camera, &feature, inverse_distance, &current_from_keyframe).unwrap();
                 let through = |key: &Pixel| -> Vector2<f64> {
                     let ray = camera.unproject(key).unwrap();

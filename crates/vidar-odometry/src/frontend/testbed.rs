@@ -7,6 +7,7 @@ use super::pyramid::Pyramid;
 use nalgebra::Vector3;
 use std::sync::OnceLock;
 use vidar_core::camera::Pixel;
+use vidar_core::random::SplitMix64;
 use vidar_core::{CameraModel, Image, LieGroup, Se3};
 use vidar_synth::{
     FlightKind, FlightPath, SceneKind, SynthConfig, SynthView, World, euroc_body_from_camera, euroc_camera,
@@ -89,10 +90,10 @@ impl Scene {
 
     /// `view` as a worse camera saw it: grey levels times `gain` plus noise, clipped.
     pub fn degraded(&self, view: usize, gain: f64, sigma: f64) -> Pyramid {
-        let mut random = Random::new(17 + view as u64);
+        let mut random = SplitMix64::new(17 + view as u64);
         let image = self.views[view]
             .image
-            .map(|p| (f64::from(*p) * gain + sigma * random.gaussian()).round().clamp(0.0, 255.0) as u8);
+            .map(|p| (f64::from(*p) * gain + sigma * random.normal()).round().clamp(0.0, 255.0) as u8);
         Pyramid::of(&image, LEVELS)
     }
 
@@ -171,32 +172,6 @@ impl Scene {
             Some((feature, 1.0 / point.norm(), *d))
         };
         found.iter().filter_map(with_depth).collect()
-    }
-}
-
-/// SplitMix64 with Box-Muller: the tests' only source of chance.
-pub(crate) struct Random(u64);
-
-impl Random {
-    pub fn new(seed: u64) -> Self {
-        Self(seed)
-    }
-
-    pub fn uniform(&mut self) -> f64 {
-        self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
-        let mut z = self.0;
-        z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-        z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
-        ((z ^ (z >> 31)) >> 11) as f64 / (1_u64 << 53) as f64
-    }
-
-    pub fn gaussian(&mut self) -> f64 {
-        let (u, v) = (self.uniform().max(1e-300), self.uniform());
-        (-2.0 * u.ln()).sqrt() * (std::f64::consts::TAU * v).cos()
-    }
-
-    pub fn vector(&mut self) -> Vector3<f64> {
-        Vector3::new(self.gaussian(), self.gaussian(), self.gaussian())
     }
 }
 

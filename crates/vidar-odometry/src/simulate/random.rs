@@ -1,6 +1,7 @@
 //! Random numbers of a seed: xoshiro256++ (Blackman, Vigna, 2019), seeded by SplitMix64.
 
 use nalgebra::Vector3;
+use vidar_core::random::{SplitMix64, unit};
 
 /// A stream of random numbers that is the same on every machine.
 #[derive(Clone, Debug)]
@@ -12,15 +13,8 @@ pub struct Random {
 impl Random {
     /// The stream of `seed`.
     pub fn new(seed: u64) -> Self {
-        let mut z = seed;
-        let state = std::array::from_fn(|_| {
-            z = z.wrapping_add(0x9e37_79b9_7f4a_7c15);
-            let mut x = z;
-            x = (x ^ (x >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-            x = (x ^ (x >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
-            x ^ (x >> 31)
-        });
-        Self { state, spare: None }
+        let mut words = SplitMix64::new(seed);
+        Self { state: std::array::from_fn(|_| words.next_u64()), spare: None }
     }
 
     fn next(&mut self) -> u64 {
@@ -38,7 +32,7 @@ impl Random {
 
     /// Uniform in 0…1, 1 excluded.
     pub fn uniform(&mut self) -> f64 {
-        (self.next() >> 11) as f64 / (1_u64 << 53) as f64
+        unit(self.next())
     }
 
     /// Uniform in `low`…`high`.

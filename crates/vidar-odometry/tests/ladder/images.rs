@@ -1,6 +1,7 @@
 //! Images that are missing, repeated, dark, noisy, blurred or blank.
 
 use crate::recording::{add_noise, lost, recording, rendered, within};
+use vidar_core::random::SplitMix64;
 use vidar_core::{Health, Image};
 
 #[test]
@@ -21,11 +22,8 @@ fn a_third_of_the_images_may_be_missing_from_the_first_on() {
 fn images_may_be_missing_by_chance() {
     for (seed, percent) in [(1_u64, 10), (2, 10), (3, 30), (4, 30), (5, 30)] {
         let mut recording = recording();
-        let mut state = seed;
-        recording.images.retain(|_| {
-            state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
-            (state >> 33) % 100 >= percent
-        });
+        let mut random = SplitMix64::new(seed);
+        recording.images.retain(|_| random.below(100) >= percent);
         let outputs = recording.run();
         let (ate, share) = recording.error_and_share(&format!("{percent} % of the images missing"), &outputs);
         assert!(ate < 0.05 && share > 0.5, "{percent} % missing: {ate} m, {share} of the images");

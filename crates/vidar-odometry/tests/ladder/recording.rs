@@ -2,6 +2,7 @@
 
 use nalgebra::Vector3;
 use std::sync::OnceLock;
+use vidar_core::random::SplitMix64;
 use vidar_core::{
     AngularRate, BodyFrame, CameraId, Duration, Frame, FrameId, FrameImage, Image, ImuSample, LieGroup, Rig,
     SensorEvent, SpecificForce, StampedPose, Timestamp, Trajectory,
@@ -127,16 +128,10 @@ pub fn clean_outputs() -> &'static [OdometryOutput] {
 
 /// Noise of standard deviation `sigma` grey levels, always the same for one `seed`.
 pub fn add_noise(image: &Image<u8>, sigma: f64, seed: u64) -> Image<u8> {
-    let mut state = seed.wrapping_mul(0x9E37_79B9_7F4A_7C15) | 1;
-    let mut uniform = move || {
-        state ^= state << 13;
-        state ^= state >> 7;
-        state ^= state << 17;
-        (state >> 11) as f64 / (1_u64 << 53) as f64
-    };
+    let mut random = SplitMix64::new(seed);
     // Four uniforms make a fair bell of variance 1/3.
     image.map(|&p| {
-        let bell: f64 = (0..4).map(|_| uniform() - 0.5).sum();
+        let bell: f64 = (0..4).map(|_| random.uniform() - 0.5).sum();
         (f64::from(p) + bell * sigma * 3.0_f64.sqrt()).round().clamp(0.0, 255.0) as u8
     })
 }
@@ -237,13 +232,8 @@ impl Recording {
 
 /// What an IMU reads at rest, with a gyroscope bias of 0.01 rad/s about x.
 pub fn rest_reading(time: Timestamp, up_in_body: &Vector3<f64>, seed: u64) -> ImuSample {
-    let mut state = (seed + 1).wrapping_mul(0x9E37_79B9_7F4A_7C15);
-    let mut noise = || {
-        state ^= state >> 12;
-        state ^= state << 25;
-        state ^= state >> 27;
-        (state.wrapping_mul(0x2545_F491_4F6C_DD1D) >> 11) as f64 / (1_u64 << 53) as f64 - 0.5
-    };
+    let mut random = SplitMix64::new(seed);
+    let mut noise = || random.uniform() - 0.5;
     let gyro = Vector3::from_fn(|_, _| 0.008 * noise()) + Vector3::new(0.01, 0.0, 0.0);
     let accel = up_in_body + Vector3::from_fn(|_, _| 0.1 * noise());
     ImuSample { time, gyro: AngularRate(gyro), accel: SpecificForce(accel) }

@@ -3,6 +3,7 @@
 use nalgebra::Vector3;
 use std::error::Error;
 use std::path::PathBuf;
+use vidar_core::random::SplitMix64;
 use vidar_core::remap::{RemapTable, undistorted_view};
 use vidar_core::{BodyFrame, ChunkView, Duration, Image, LieGroup, Pinhole, Se3, So3, ViewGeometry};
 use vidar_dataset::{CameraFlag, ImageEntry, OpenOptions, Recording};
@@ -131,7 +132,7 @@ impl ViewSet {
 
     /// Every keyframe as input of the model, with the requested errors.
     pub fn views(&self, request: &Request) -> Result<Vec<ChunkView>, Box<dyn Error>> {
-        let mut draw = Draw(request.seed);
+        let mut random = SplitMix64::new(request.seed);
         let target = self.remap.target();
         let intrinsics = Pinhole::new(
             target.fx * request.focal_ratio,
@@ -145,8 +146,8 @@ impl ViewSet {
             .iter()
             .map(|keyframe| {
                 let jitter = Se3::new(
-                    So3::exp(&(draw.vector() * request.jitter_deg.to_radians())),
-                    draw.vector() * request.jitter_m,
+                    So3::exp(&(deviation(&mut random) * request.jitter_deg.to_radians())),
+                    deviation(&mut random) * request.jitter_m,
                 );
                 Ok(ChunkView {
                     frame_id: keyframe.image.frame_id,
@@ -175,20 +176,7 @@ impl ViewSet {
     }
 }
 
-/// Small random numbers by seed (SplitMix64).
-struct Draw(u64);
-
-impl Draw {
-    fn uniform(&mut self) -> f64 {
-        self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
-        let mut z = self.0;
-        z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-        z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
-        ((z ^ (z >> 31)) >> 11) as f64 / (1u64 << 53) as f64
-    }
-
-    /// Three numbers of mean zero and variance one (sums of twelve uniforms).
-    fn vector(&mut self) -> Vector3<f64> {
-        Vector3::from_fn(|_, _| (0..12).map(|_| self.uniform()).sum::<f64>() - 6.0)
-    }
+/// Three numbers of mean zero and variance one (sums of twelve uniforms).
+fn deviation(random: &mut SplitMix64) -> Vector3<f64> {
+    Vector3::from_fn(|_, _| (0..12).map(|_| random.uniform()).sum::<f64>() - 6.0)
 }

@@ -151,7 +151,8 @@ fn fitted<'a>(anchors: impl Iterator<Item = &'a Anchor>) -> Option<Vector3<f64>>
     plane.iter().all(|v| v.is_finite()).then_some(plane)
 }
 
-/// Numbers that look random and are the same in every run (Knuth's multiplier for 64 bits).
+/// Knuth's linear congruence of 64 bits. Not `vidar_core::random`: other samples would find other planes, and published
+/// depth was completed by these.
 struct Sequence(u64);
 
 impl Sequence {

@@ -1,6 +1,7 @@
 //! A tiny renderer: textured planes and boxes seen by a pinhole, with exact depth.
 
 use nalgebra::Vector3;
+use vidar_core::random::{finalize, unit};
 use vidar_core::{
     ChunkId, ChunkView, ChunkViews, FrameId, FrameImage, Image, LieGroup, Pinhole, Se3, So3, Timestamp,
 };
@@ -18,11 +19,8 @@ pub const WALL: Scene =
     Scene { normal: Vector3::new(0.0, 0.0, 1.0), distance: 3.0, board: None, textured: true };
 
 fn hash(x: i64, y: i64, seed: i64) -> f64 {
-    let mut h =
-        (x.wrapping_mul(73_856_093) ^ y.wrapping_mul(19_349_663) ^ seed.wrapping_mul(83_492_791)) as u64;
-    h = (h ^ (h >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-    h = (h ^ (h >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
-    ((h ^ (h >> 31)) >> 11) as f64 / (1u64 << 53) as f64
+    let key = x.wrapping_mul(73_856_093) ^ y.wrapping_mul(19_349_663) ^ seed.wrapping_mul(83_492_791);
+    unit(finalize(key as u64))
 }
 
 fn value_noise(x: f64, y: f64, seed: i64) -> f64 {

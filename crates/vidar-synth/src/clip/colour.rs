@@ -3,6 +3,7 @@
 use crate::world::{Hit, World};
 use rand::Rng;
 use rand_chacha::ChaCha8Rng;
+use vidar_core::random::splitmix64;
 
 /// Gives every face of a world a tint, or none at all.
 #[derive(Clone, Copy, Debug)]
@@ -37,19 +38,12 @@ impl Palette {
             return [1.0; 3];
         }
         let number = if self.by_material { world.material_number(hit) } else { hit.face_number() };
-        let bits = mix(self.seed ^ (u64::from(number) << 20));
-        let richness = if self.by_material { 2.0 * (mix(bits) >> 40) as f32 / (1 << 24) as f32 } else { 1.0 };
+        let bits = splitmix64(self.seed ^ (u64::from(number) << 20));
+        let richness =
+            if self.by_material { 2.0 * (splitmix64(bits) >> 40) as f32 / (1 << 24) as f32 } else { 1.0 };
         let of = |k: u32| (bits >> (20 * k) & 0xF_FFFF) as f32 / 524_288.0 - 1.0;
         let log = [of(0), of(1), of(2)];
         let mean = log.iter().sum::<f32>() / 3.0;
         log.map(|l| (self.strength * richness * (l - mean)).exp())
     }
-}
-
-/// Steele, Lea and Flood's SplitMix64 finaliser.
-fn mix(mut x: u64) -> u64 {
-    x = x.wrapping_add(0x9E37_79B9_7F4A_7C15);
-    x = (x ^ (x >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
-    x = (x ^ (x >> 27)).wrapping_mul(0x94D0_49BB_1331_11EB);
-    x ^ (x >> 31)
 }

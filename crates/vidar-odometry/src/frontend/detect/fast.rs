@@ -200,6 +200,7 @@ fn suppress(rows: [&Vec<u8>; 3], border: usize, best: &mut [u8]) {
 mod tests {
     use super::*;
     use crate::simd::narrow;
+    use vidar_core::random::SplitMix64;
 
     /// The definition, pixel by pixel, without shortcuts.
     fn score_by_definition(image: &Image<u8>, x: usize, y: usize, threshold: i32) -> i32 {
@@ -213,13 +214,8 @@ mod tests {
     }
 
     fn blobs() -> Image<u8> {
-        let mut state = 1_u32;
-        let noise: Vec<u8> = (0..90 * 70)
-            .map(|_| {
-                state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
-                (state >> 24) as u8
-            })
-            .collect();
+        let mut random = SplitMix64::new(1);
+        let noise: Vec<u8> = (0..90 * 70).map(|_| random.below(256) as u8).collect();
         // Blocks of random grey: corners where they meet.
         Image::from_fn(90, 70, |x, y| noise[(y / 7) * 90 + x / 7])
     }

@@ -1,10 +1,11 @@
 use super::*;
 use crate::frontend::feature::{Feature, FeatureKind};
 use crate::frontend::template::Warp;
-use crate::frontend::testbed::{Random, Scene, full_scene, median, rms, scene};
+use crate::frontend::testbed::{Scene, full_scene, median, rms, scene};
 use crate::simd::narrow;
 use nalgebra::Vector3;
 use std::collections::BTreeMap;
+use vidar_core::random::SplitMix64;
 
 /// What became of the features of a keyframe in another view.
 #[derive(Default)]
@@ -40,7 +41,7 @@ fn score(scene: &Scene, trial: Trial) -> Score {
     let current = if blur_px > 1 { scene.blurred(view, blur_px) } else { scene.degraded(view, gain, sigma) };
     let config = MatchingConfig::default();
     let motion = scene.motion(0, view);
-    let mut random = Random::new(5);
+    let mut random = SplitMix64::new(5);
     let mut template = Template::empty();
     let mut result = Score::default();
     for (feature, inverse_distance, _) in scene.features(0) {
@@ -51,7 +52,7 @@ fn score(scene: &Scene, trial: Trial) -> Score {
         let Some(warp) = Warp::new(&scene.camera, &feature, inverse_distance, &motion) else { continue };
         assert!((warp.pixel - truth).norm() < 1e-6);
         result.tried += 1;
-        let start = warp.pixel + Vector2::new(random.gaussian(), random.gaussian()) * disturbed_px;
+        let start = warp.pixel + Vector2::new(random.normal(), random.normal()) * disturbed_px;
         let filled = template.fill(&keyframe, &feature, &warp);
         let found = if filled {
             align_feature(&template, &current, &start, sigma, &config)
@@ -209,7 +210,7 @@ fn each_failure_has_its_name() {
     let outside = align_feature(&template, &reference, &Pixel::new(158.0, 50.0), 0.0, &config);
     assert_eq!(outside, Err(MatchFailure::OutsideImage));
     assert!(align_feature(&template, &flat, &f.pixel, 0.0, &config).is_err());
-    let mut random = Random::new(1);
+    let mut random = SplitMix64::new(1);
     let noise = Pyramid::of(&Image::from_fn(160, 120, |_, _| (255.0 * random.uniform()) as u8), 3);
     assert!(align_feature(&template, &noise, &f.pixel, 2.0, &config).is_err());
     let nowhere = align_feature(&template, &reference, &Pixel::new(f64::NAN, 3.0), 0.0, &config);

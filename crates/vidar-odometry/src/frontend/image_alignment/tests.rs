@@ -1,6 +1,7 @@
 use super::*;
-use crate::frontend::testbed::{Random, Scene, scene};
+use crate::frontend::testbed::{Scene, scene};
 use nalgebra::{SVector, Vector2};
+use vidar_core::random::SplitMix64;
 use vidar_core::testing::check_jacobian;
 
 fn points(scene: &Scene, view: usize) -> Vec<AlignmentPoint> {
@@ -135,8 +136,8 @@ fn a_prior_holds_what_the_image_does_not_know_and_too_few_patches_change_nothing
 #[test]
 fn the_derivative_of_a_pixel_by_the_anchor_is_the_numeric_one() {
     let scene = scene();
-    let mut random = Random::new(6);
-    let anchor_from_reference = Se3::exp(&Vector6::from_fn(|_, _| 0.2 * random.gaussian()));
+    let mut random = SplitMix64::new(6);
+    let anchor_from_reference = Se3::exp(&Vector6::from_fn(|_, _| 0.2 * random.normal()));
     for p in points(scene, 0).iter().take(20) {
         let patch =
             Patch::new(&scene.camera, 0, &anchor_from_reference, p.pixel, &p.bearing, p.inverse_distance)

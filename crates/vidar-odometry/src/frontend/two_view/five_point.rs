@@ -301,19 +301,19 @@ fn null_vector(k: &PolyRow, l: &PolyRow, m: &PolyRow, z: f64) -> Option<(f64, f6
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::frontend::testbed::Random;
+    use vidar_core::random::SplitMix64;
     use vidar_core::{LieGroup, Se3, So3};
 
     #[test]
     fn the_true_matrix_is_among_the_solutions_and_all_are_essential() {
-        let mut random = Random::new(11);
+        let mut random = SplitMix64::new(11);
         let mut found = [Matrix3::zeros(); 10];
         for trial in 0..200 {
-            let rotation = So3::exp(&(random.vector() * 0.3));
-            let translation = random.vector().normalize();
+            let rotation = So3::exp(&(random.normal3() * 0.3));
+            let translation = random.normal3().normalize();
             let motion = Se3::new(rotation, translation);
             let a: [Vector3<f64>; 5] = std::array::from_fn(|_| {
-                Vector3::new(random.gaussian(), random.gaussian(), 4.0 + random.uniform())
+                Vector3::new(random.normal(), random.normal(), 4.0 + random.uniform())
             });
             let b = a.map(|p| (motion * p).normalize());
             let a = a.map(|p| p.normalize());

@@ -1,20 +1,14 @@
 //! Chance for sampling, from a seed: the same samples every time.
 
-/// SplitMix64 (Steele, Lea & Flood 2014).
+use vidar_core::random::SplitMix64;
+
+/// Draws samples of different numbers.
 #[derive(Clone, Debug)]
-pub(super) struct Sampler(u64);
+pub(super) struct Sampler(SplitMix64);
 
 impl Sampler {
     pub fn new(seed: u64) -> Self {
-        Self(seed)
-    }
-
-    fn below(&mut self, n: usize) -> usize {
-        self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
-        let mut z = self.0;
-        z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-        z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
-        ((u128::from(z ^ (z >> 31)) * n as u128) >> 64) as usize
+        Self(SplitMix64::new(seed))
     }
 
     /// `K` different numbers below `n`; `n` must be at least `K`.
@@ -23,7 +17,7 @@ impl Sampler {
         let mut chosen = [0; K];
         for k in 0..K {
             // Floyd's algorithm: never rejects.
-            let candidate = self.below(n - K + k + 1);
+            let candidate = self.0.below(n - K + k + 1);
             chosen[k] = if chosen[..k].contains(&candidate) { n - K + k } else { candidate };
         }
         chosen

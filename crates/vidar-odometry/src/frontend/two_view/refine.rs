@@ -76,16 +76,16 @@ fn sampson(pair: &RayPair, motion: &Se3) -> (f64, f64, RowVector5<f64>) {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::frontend::testbed::Random;
     use nalgebra::Vector1;
+    use vidar_core::random::SplitMix64;
     use vidar_core::testing::check_jacobian;
 
     #[test]
     fn the_epipolar_jacobian_is_the_numeric_one() {
-        let mut random = Random::new(8);
+        let mut random = SplitMix64::new(8);
         for _ in 0..20 {
-            let pair = RayPair { a: random.vector().normalize(), b: random.vector().normalize() };
-            let motion = Se3::new(So3::exp(&random.vector()), random.vector().normalize());
+            let pair = RayPair { a: random.normal3().normalize(), b: random.normal3().normalize() };
+            let motion = Se3::new(So3::exp(&random.normal3()), random.normal3().normalize());
             let (_, _, jacobian) = sampson(&pair, &motion);
             let f = |x: &Vector5<f64>| Vector1::new(sampson(&pair, &moved(&motion, x)).0);
             check_jacobian("epipolar", &jacobian, f, &Vector5::zeros(), 1e-6).unwrap();

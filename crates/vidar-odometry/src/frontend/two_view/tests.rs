@@ -1,20 +1,20 @@
 use super::*;
-use crate::frontend::testbed::Random;
 use vidar_core::LieGroup;
+use vidar_core::random::SplitMix64;
 
 const SIGMA: f64 = 0.5 / 458.0;
 
 /// Pairs of rays of a cloud (or a plane), with noise and outliers.
 fn pairs(motion: &Se3, n: usize, outliers: usize, plane: bool, seed: u64) -> Vec<RayPair> {
-    let mut random = Random::new(seed);
+    let mut random = SplitMix64::new(seed);
     (0..n)
         .map(|k| {
             let z = if plane { 4.0 } else { 2.0 + 6.0 * random.uniform() };
-            let p = Vector3::new(random.gaussian() * 0.5 * z, random.gaussian() * 0.4 * z, z);
+            let p = Vector3::new(random.normal() * 0.5 * z, random.normal() * 0.4 * z, z);
             let p = if plane { p + Vector3::new(0.0, 0.0, 0.2 * p.x) } else { p };
-            let mut noise = || random.vector() * SIGMA;
+            let mut noise = || random.normal3() * SIGMA;
             let (na, nb) = (noise(), noise());
-            let b = if k < outliers { random.vector() + Vector3::z() * 2.0 } else { *motion * p };
+            let b = if k < outliers { random.normal3() + Vector3::z() * 2.0 } else { *motion * p };
             RayPair { a: (p.normalize() + na).normalize(), b: (b.normalize() + nb).normalize() }
         })
         .collect()

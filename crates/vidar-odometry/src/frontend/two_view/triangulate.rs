@@ -42,24 +42,24 @@ pub fn triangulate(pair: &RayPair, b_from_a: &Se3, sigma_rad: f64) -> Option<Tri
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::frontend::testbed::Random;
     use nalgebra::Vector3;
+    use vidar_core::random::SplitMix64;
     use vidar_core::{LieGroup, So3};
 
     #[test]
     fn exact_rays_give_the_exact_distance_and_noise_the_stated_error() {
-        let mut random = Random::new(2);
+        let mut random = SplitMix64::new(2);
         let b_from_a = Se3::new(So3::exp(&Vector3::new(0.1, -0.2, 0.05)), Vector3::new(-0.3, 0.05, 0.1));
         let mut normalised = Vec::new();
         for _ in 0..2000 {
-            let point = Vector3::new(random.gaussian(), random.gaussian(), 4.0 + random.uniform());
+            let point = Vector3::new(random.normal(), random.normal(), 4.0 + random.uniform());
             let mut pair = RayPair { a: point.normalize(), b: (b_from_a * point).normalize() };
             let exact = triangulate(&pair, &b_from_a, 1e-3).unwrap();
             assert!((exact.inverse_distance * point.norm() - 1.0).abs() < 1e-9);
             assert!(exact.off_plane_rad < 1e-9);
             let angle = (b_from_a.rotation * pair.a).dot(&pair.b).clamp(-1.0, 1.0).acos();
             assert!((exact.parallax_rad - angle).abs() < 1e-6);
-            pair.b = (pair.b + random.vector() * 1e-3).normalize();
+            pair.b = (pair.b + random.normal3() * 1e-3).normalize();
             let noisy = triangulate(&pair, &b_from_a, 1e-3).unwrap();
             normalised.push((noisy.inverse_distance - exact.inverse_distance) / exact.sigma);
         }
