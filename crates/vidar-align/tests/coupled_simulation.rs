@@ -69,10 +69,7 @@ fn rigid(similarity: &Sim3, pose: &Se3) -> Se3 {
 /// The rotation that fits pairs of rotations best, `Σ a bᵀ` projected.
 fn mean_rotation(pairs: impl Iterator<Item = (So3, So3)>) -> So3 {
     let sum = pairs.fold(nalgebra::Matrix3::zeros(), |m, (a, b)| m + a.matrix() * b.matrix().transpose());
-    let svd = sum.svd(true, true);
-    let (u, v) = (svd.u.unwrap(), svd.v_t.unwrap());
-    let sign = nalgebra::Matrix3::from_diagonal(&Vector3::new(1.0, 1.0, (u * v).determinant()));
-    So3::from_matrix(&(u * sign * v)).unwrap()
+    So3::from_matrix(&vidar_core::nearest_rotation(&sum).unwrap().rotation).unwrap()
 }
 
 fn rigid_fit(source: &[Vector3<f64>], target: &[Vector3<f64>]) -> Se3 {

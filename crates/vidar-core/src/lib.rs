@@ -62,6 +62,7 @@ pub mod model;
 pub mod odometry;
 pub mod origin;
 pub mod printable;
+pub mod procrustes;
 pub mod random;
 pub mod remap;
 pub mod rig;
@@ -87,6 +88,7 @@ pub use odometry::{
 };
 pub use origin::{DepthOrigin, DepthSource};
 pub use printable::{printable, printable_json, printable_lines};
+pub use procrustes::{NearestRotation, nearest_rotation};
 pub use rig::{ImuNoise, Rig, RigCamera};
 pub use sensor::{AngularRate, Frame, ImuSample, SensorEvent, SpecificForce, TimedVector, merge_imu};
 pub use surface::{PointCloud, TexturedMesh, TriangleMesh};

@@ -7,7 +7,7 @@
 use crate::pcg64::Pcg64;
 use crate::statistics::median;
 use nalgebra::{Matrix3, Vector3};
-use vidar_core::{LieGroup, Sim3, So3, UmeyamaError, umeyama_sim3};
+use vidar_core::{LieGroup, Sim3, So3, UmeyamaError, nearest_rotation, umeyama_sim3};
 
 /// Fewer pairs than this are fitted without RANSAC.
 const RANSAC_MIN_PAIRS: usize = 10;
@@ -84,13 +84,10 @@ pub fn mean_rotation(rotations: impl Iterator<Item = So3>) -> Option<So3> {
         count += 1;
         m + r.matrix()
     });
-    if count == 0 || !sum.iter().all(|v| v.is_finite()) {
+    if count == 0 {
         return None;
     }
-    let svd = sum.svd(true, true);
-    let (u, v) = (svd.u?, svd.v_t?);
-    let sign = Matrix3::from_diagonal(&Vector3::new(1.0, 1.0, (u * v).determinant().signum()));
-    So3::from_matrix(&(u * sign * v))
+    So3::from_matrix(&nearest_rotation(&sum)?.rotation)
 }
 
 #[cfg(test)]

@@ -7,7 +7,7 @@
 use super::StreamingError;
 use nalgebra::{Matrix3, Vector3};
 use serde::{Deserialize, Serialize};
-use vidar_core::{Sim3, So3};
+use vidar_core::{Sim3, So3, nearest_rotation};
 
 /// What is estimated between two chunks.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, schemars::JsonSchema)]
@@ -64,18 +64,7 @@ pub fn weighted_similarity(
 
 /// R = V Uᵀ of `H = U D Vᵀ`, turned into a rotation by the sign of the smallest singular direction.
 fn rotation_of(covariance: &Matrix3<f64>) -> Option<So3> {
-    if !covariance.iter().all(|v| v.is_finite()) {
-        return None;
-    }
-    let svd = covariance.svd(true, true);
-    let (u, mut v_t) = (svd.u?, svd.v_t?);
-    let mut rotation = v_t.transpose() * u.transpose();
-    if rotation.determinant() < 0.0 {
-        let smallest = svd.singular_values.imin();
-        v_t.row_mut(smallest).neg_mut();
-        rotation = v_t.transpose() * u.transpose();
-    }
-    So3::from_matrix(&rotation)
+    So3::from_matrix(&nearest_rotation(covariance)?.rotation.transpose())
 }
 
 #[cfg(test)]

@@ -1,6 +1,7 @@
 //! Rotations SO(3), stored as unit quaternions.
 
 use super::{LieGroup, impl_group_ops};
+use crate::procrustes::nearest_rotation;
 use nalgebra::{Matrix3, Quaternion, UnitQuaternion, Vector3};
 
 /// A rotation: maps vectors of one frame into another.
@@ -69,8 +70,7 @@ impl So3 {
         if !(deviation < 1e-3 && matrix.determinant() > 0.0) {
             return None;
         }
-        let svd = matrix.svd(true, true);
-        let nearest = svd.u? * svd.v_t?;
+        let nearest = nearest_rotation(matrix)?.rotation;
         let rotation = nalgebra::Rotation3::from_matrix_unchecked(nearest);
         Some(Self(UnitQuaternion::from_rotation_matrix(&rotation)))
     }

@@ -10,7 +10,7 @@ use super::parameters::Parameters;
 use super::path::GyroPath;
 use crate::gyro_alignment::{ImageFeatures, RateSample, common};
 use nalgebra::{Matrix3, Vector2, Vector3};
-use vidar_core::{LieGroup, So3};
+use vidar_core::{LieGroup, So3, nearest_rotation};
 
 /// Matches that a pair of images needs.
 const MIN_MATCHES: usize = 12;
@@ -122,13 +122,11 @@ fn best_rotation(rates: &[(Vector3<f64>, Vector3<f64>)]) -> Option<(f64, So3, Ve
             left += weight * r2;
             weights += weight;
         }
-        let svd = cross.svd(true, true);
-        let (u, v_t) = (svd.u?, svd.v_t?);
-        if !(svd.singular_values[1] > 0.02 * svd.singular_values[0] && weights > 0.0) {
+        let nearest = nearest_rotation(&cross)?;
+        if !(nearest.singular_values[1] > 0.02 * nearest.singular_values[0] && weights > 0.0) {
             return None;
         }
-        let sign = (u * v_t).determinant().signum();
-        rotation = u * Matrix3::from_diagonal(&Vector3::new(1.0, 1.0, sign)) * v_t;
+        rotation = nearest.rotation;
         unexplained = 1.0 - (rotation * cross.transpose()).trace() / energy;
         weight_scale2 = if weight_scale2.is_finite() { (left / weights).max(1e-6) } else { energy / weights };
     }

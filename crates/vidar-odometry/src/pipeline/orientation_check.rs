@@ -8,7 +8,7 @@
 use crate::tracking::Track;
 use nalgebra::{Matrix3, Vector3};
 use rustc_hash::FxHashMap;
-use vidar_core::{CameraModel, FrameId, LandmarkId, LieGroup, So3, camera::Pixel};
+use vidar_core::{CameraModel, FrameId, LandmarkId, LieGroup, So3, camera::Pixel, nearest_rotation};
 
 /// Tracks that a comparison needs.
 const MIN_TRACKS: usize = 15;
@@ -109,16 +109,13 @@ impl OrientationCheck {
         if !(gyro2.min(image2) > MIN_RATE * MIN_RATE) {
             return None;
         }
-        // Σ |seen − R felt|² = Σ |seen|² + Σ |felt|² − 2 tr(R Σ felt seenᵀ), least for R = V D Uᵀ of the sum's U S Vᵀ.
-        let svd = cross.svd(true, true);
-        let values = svd.singular_values;
+        // Σ |seen − R felt|² = Σ |seen|² + Σ |felt|² − 2 tr(R Σ felt seenᵀ), least for Rᵀ nearest to the sum.
+        let nearest = nearest_rotation(&cross)?;
+        let values = nearest.singular_values;
         if values[1] < MIN_SECOND_AXIS * values[0] || cross.trace() > SHOWN_SHARE * gyro2 {
             return None;
         }
-        let (u, v_t) = (svd.u?, svd.v_t?);
-        let mut signs = Vector3::new(1.0, 1.0, 1.0);
-        signs[2] = (u * v_t).determinant().signum();
-        let best = v_t.transpose() * Matrix3::from_diagonal(&signs) * u.transpose();
+        let best = nearest.rotation.transpose();
         let share = |trace: f64| (image2 + gyro2 - 2.0 * trace) / image2;
         let (given, least) = (share(cross.trace()), share((best * cross).trace()));
         let turn_deg = (0.5 * (best.trace() - 1.0)).clamp(-1.0, 1.0).acos().to_degrees();
