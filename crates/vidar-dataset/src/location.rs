@@ -139,7 +139,7 @@ impl Media {
             return stream.frame(number).map_err(|reason| bad_image(location, reason));
         }
         match self.message(location)? {
-            None => decode::read_image(location.path(), &ImageLimits::default()),
+            None => decode::read_image(location.path()),
             Some(message) => match pixels(&message).map_err(|reason| bad_image(location, reason))? {
                 Pixels::Image(image) => Ok(image),
                 Pixels::Float(_) => Err(bad_image(location, "numbers of 32 bits, which are depth".into())),
@@ -150,7 +150,7 @@ impl Media {
     /// Decodes a depth image.
     pub(crate) fn depth(&self, location: &Location) -> Result<StoredDepth, DatasetError> {
         let Some(message) = self.message(location)? else {
-            let raw = decode::read_depth(location.path(), &ImageLimits::default())?;
+            let raw = decode::read_depth(location.path())?;
             return self.confident(location.path(), raw).map(StoredDepth::Units);
         };
         match pixels(&message).map_err(|reason| bad_image(location, reason))? {
@@ -166,7 +166,7 @@ impl Media {
         let Some(path) = self.depth_confidence.as_ref().and_then(beside).filter(|p| p.is_file()) else {
             return Ok(raw);
         };
-        let reason = match decode::read_image(&path, &ImageLimits::default())? {
+        let reason = match decode::read_image(&path)? {
             FrameImage::Gray8(levels) if (levels.width(), levels.height()) == (raw.width(), raw.height()) => {
                 let kept = |(depth, level): (&u16, &u8)| if *level < MIN_CONFIDENCE { 0 } else { *depth };
                 let pixels = raw.data().iter().zip(levels.data()).map(kept).collect();
@@ -193,7 +193,7 @@ impl Media {
             return Ok(stream.size());
         }
         match self.message(location)? {
-            None => decode::read_size(location.path(), &ImageLimits::default()),
+            None => decode::read_size(location.path()),
             Some(Message::Image(image)) => Ok((image.width as usize, image.height as usize)),
             Some(message) => match pixels(&message).map_err(|reason| bad_image(location, reason))? {
                 Pixels::Image(image) => Ok((image.width(), image.height())),

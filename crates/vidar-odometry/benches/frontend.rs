@@ -5,8 +5,8 @@ use nalgebra::{Matrix6, Vector6};
 use std::sync::OnceLock;
 use vidar_core::{CameraModel, FrameImage, LieGroup, Se3};
 use vidar_odometry::frontend::{
-    AlignmentPoint, AlignmentReference, Detector, DetectorConfig, Feature, FrontendConfig, ImageAligner,
-    MotionPrediction, Pyramid, RayPair, Template, TwoViewSolver, Warp, align_feature,
+    AlignmentPoint, AlignmentReference, Detector, DetectorConfig, Feature, ImageAligner, MotionPrediction,
+    Pyramid, RayPair, Template, TwoViewSolver, Warp, align_feature,
 };
 use vidar_synth::{
     FlightKind, FlightPath, SynthConfig, SynthView, World, euroc_body_from_camera, euroc_camera, render_views,
@@ -117,22 +117,21 @@ fn image_alignment(bencher: Bencher<'_, '_>, points: usize) {
     let off = Vector6::new(0.003, -0.002, 0.003, 0.01, -0.01, 0.01);
     let prediction =
         MotionPrediction { current_from_anchor: s.motion(1, 2).plus(&off), information: Matrix6::identity() };
-    let mut aligner = ImageAligner::new(FrontendConfig::default().image_alignment);
+    let mut aligner = ImageAligner::new(ImageAligner::FINEST_LEVEL);
     bencher.bench_local(|| aligner.align(&s.camera, black_box(&references), &s.pyramids[2], &prediction));
 }
 
 #[divan::bench]
 fn landmarks_150(bencher: Bencher<'_, '_>) {
     let s = scene();
-    let (config, motion) = (FrontendConfig::default().matching, s.motion(0, 2));
+    let motion = s.motion(0, 2);
     let mut template = Template::empty();
     bencher.bench_local(|| {
         let mut found = 0;
         for (feature, inverse_distance) in s.landmarks() {
             let Some(warp) = Warp::new(&s.camera, feature, *inverse_distance, &motion) else { continue };
             if template.fill(&s.pyramids[0], feature, &warp) {
-                found +=
-                    usize::from(align_feature(&template, &s.pyramids[2], &warp.pixel, 1.0, &config).is_ok());
+                found += usize::from(align_feature(&template, &s.pyramids[2], &warp.pixel, 1.0).is_ok());
             }
         }
         found
@@ -154,13 +153,13 @@ fn pairs() -> Vec<RayPair> {
 #[divan::bench]
 fn two_view_with_rotation(bencher: Bencher<'_, '_>) {
     let (pairs, turn) = (pairs(), scene().motion(0, 2).rotation);
-    let mut solver = TwoViewSolver::new(FrontendConfig::default().two_view);
+    let mut solver = TwoViewSolver::default();
     bencher.bench_local(|| solver.with_rotation(black_box(&pairs), &turn, 0.5 / 458.0));
 }
 
 #[divan::bench]
 fn two_view_five_point(bencher: Bencher<'_, '_>) {
     let pairs = pairs();
-    let mut solver = TwoViewSolver::new(FrontendConfig::default().two_view);
+    let mut solver = TwoViewSolver::default();
     bencher.bench_local(|| solver.without_rotation(black_box(&pairs), 0.5 / 458.0));
 }

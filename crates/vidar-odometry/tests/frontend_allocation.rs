@@ -12,8 +12,9 @@ use vidar_core::{
     So3, Timestamp,
 };
 use vidar_odometry::frontend::{
-    AlignmentPoint, AlignmentReference, Detection, Detector, Feature, FrontendConfig, ImageAligner,
-    MotionPrediction, OccupancyGrid, Pyramid, RayPair, Template, TwoViewSolver, Warp, align_feature,
+    AlignmentPoint, AlignmentReference, Detection, Detector, DetectorConfig, Feature, ImageAligner,
+    MotionPrediction, OccupancyGrid, PYRAMID_LEVELS, Pyramid, RayPair, Template, TwoViewSolver, Warp,
+    align_feature,
 };
 use vidar_odometry::{Odometry, OdometryConfig};
 use vidar_synth::{FlightPath, Start, SynthConfig, SynthView, World, render_views, simulate_imu};
@@ -75,14 +76,12 @@ struct Frontend {
     aligner: ImageAligner,
     two_view: TwoViewSolver,
     template: Template,
-    config: FrontendConfig,
 }
 
 impl Frontend {
     fn new() -> Self {
-        let config = FrontendConfig::default();
-        let detector = Detector::new(config.detector.clone());
-        let pyramid = || Pyramid::new(SIZE.0, SIZE.1, config.pyramid.levels);
+        let detector = Detector::new(DetectorConfig::default());
+        let pyramid = || Pyramid::new(SIZE.0, SIZE.1, PYRAMID_LEVELS);
         Self {
             camera: camera(),
             keyframe: pyramid(),
@@ -94,10 +93,9 @@ impl Frontend {
             features: Vec::new(),
             points: Vec::new(),
             pairs: Vec::new(),
-            aligner: ImageAligner::new(config.image_alignment.clone()),
-            two_view: TwoViewSolver::new(config.two_view.clone()),
+            aligner: ImageAligner::new(ImageAligner::FINEST_LEVEL),
+            two_view: TwoViewSolver::default(),
             template: Template::empty(),
-            config,
         }
     }
 
@@ -140,9 +138,7 @@ impl Frontend {
             if !self.template.fill(&self.keyframe, feature, &warp) {
                 continue;
             }
-            let Ok(found) =
-                align_feature(&self.template, &self.current, &warp.pixel, 1.0, &self.config.matching)
-            else {
+            let Ok(found) = align_feature(&self.template, &self.current, &warp.pixel, 1.0) else {
                 continue;
             };
             let Some(b) = self.camera.unproject(&found.measurement.pixel) else { continue };

@@ -13,7 +13,7 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use vidar_core::{BodyFrame, FrameId, ImuNoise, LieGroup, Se3, So3, StampedPose, Timestamp, Trajectory};
 use vidar_odometry::backend::Smoother;
 use vidar_odometry::imu::NavState;
-use vidar_odometry::initialization::{InFlightConfig, StaticInitConfig, initialize_static};
+use vidar_odometry::initialization::{MAX_LOG_SCALE_SIGMA, StaticInitConfig, initialize_static};
 use vidar_odometry::simulate::{
     Course, CourseKind, FeatureOdometry, FeatureOdometryConfig, Flight, Motion, Simulation, SimulationConfig,
     StepOutput,
@@ -206,7 +206,7 @@ fn start_from_rest(flight: &impl Flight, later_secs: f64, seed: u64) -> Outcome 
         Err(failure) => return Outcome { failure: failure.to_string(), ..outcome },
     };
     odometry.start_at(&simulation.frames[first], rest.state, rest.sigmas).unwrap();
-    let limit = InFlightConfig::default().max_log_scale_sigma;
+    let limit = MAX_LOG_SCALE_SIGMA;
     for (k, frame) in simulation.frames.iter().enumerate().skip(first + 1) {
         let StepOutput::Tracking(state) = odometry.push(frame.id, frame.time, &frame.observations).unwrap()
         else {

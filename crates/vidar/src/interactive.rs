@@ -53,8 +53,7 @@ pub(crate) fn thumbnails(
 
 /// A picture that cannot be read is left out: the view is none the worse for the others.
 fn small_jpeg(path: &Path) -> Option<Vec<u8>> {
-    let limits = vidar_dataset::decode::ImageLimits::default();
-    let picture = vidar_dataset::decode::read_image(path, &limits).ok()?.to_rgb8();
+    let picture = vidar_dataset::decode::read_image(path).ok()?.to_rgb8();
     let (width, height) = (u32::try_from(picture.width()).ok()?, u32::try_from(picture.height()).ok()?);
     let full = image::RgbImage::from_raw(width, height, picture.data().as_flattened().to_vec())?;
     let columns = width.min(THUMBNAIL_COLUMNS as u32);

@@ -9,7 +9,7 @@ use sha2::{Digest, Sha256};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use vidar_core::{FrameId, FrameImage, Image};
-use vidar_dataset::decode::{ImageLimits, read_image, read_size};
+use vidar_dataset::decode::{read_image, read_size};
 use vidar_dataset::{DatasetError, ImageEntry, Recording};
 
 /// The masks of a recording's images.
@@ -70,7 +70,7 @@ impl Masks {
     /// The file cannot be decoded.
     pub fn load(&self, frame: FrameId) -> Result<Option<Image<bool>>, DatasetError> {
         let Some(path) = self.files.get(&frame) else { return Ok(None) };
-        let ignored = match read_image(path, &ImageLimits::default())? {
+        let ignored = match read_image(path)? {
             FrameImage::Gray8(image) => image.map(|v| *v == 0),
             FrameImage::Gray16(image) => image.map(|v| *v == 0),
             FrameImage::Rgb8(image) => image.map(|v| *v == [0; 3]),
@@ -87,7 +87,7 @@ fn names(entry: &ImageEntry) -> Vec<String> {
 }
 
 fn check_size(path: &Path, dataset: &Recording) -> Result<(), Error> {
-    let (found_width, found_height) = read_size(path, &ImageLimits::default())?;
+    let (found_width, found_height) = read_size(path)?;
     let Some(camera) = dataset.rig.camera(dataset.camera) else { return Ok(()) };
     let (expected_width, expected_height) = (camera.model.width(), camera.model.height());
     if (found_width, found_height) == (expected_width, expected_height) {

@@ -14,7 +14,7 @@ use super::optimise::{self, OptimiseReport};
 use super::problem::{Problem, WhitenedObservation};
 use super::progress::Watch;
 use crate::backend::whitening;
-use crate::frontend::{Feature, FeatureKind, MatchingConfig, Warp};
+use crate::frontend::{Feature, FeatureKind, Warp};
 use crate::tracking::{HostImage, Measurer};
 use nalgebra::{Matrix2, Matrix3, Vector2, Vector3};
 use vidar_core::{LieGroup, Se3, camera::Pixel};
@@ -78,7 +78,7 @@ pub(super) fn close(
         .filter_map(|(state, image)| Some((state, log.place_of(*image)?)))
         .collect();
     let mut kept = Closed::default();
-    let mut measurer = Measurer::new(MatchingConfig::default(), NOISE_GRAY);
+    let mut measurer = Measurer::new(NOISE_GRAY);
     let mut constrained = problem.clone();
     let mut constrained_report = *report;
     for _ in 0..ROUNDS {

@@ -61,7 +61,7 @@ impl FeatureTracker {
         let base = Pyramid::level_for(width, height, MAX_WIDTH);
         let cell_px = (width.max(height) / CELLS_ACROSS).clamp(8, 256);
         // One level is searched: the detector names the finest, and large images are followed on a coarser one.
-        let config = DetectorConfig { cell_px, levels: base + 1, ..DetectorConfig::default() };
+        let config = DetectorConfig { cell_px, levels: base + 1 };
         Self {
             detector: Detector::new(config),
             kept: Pyramid::new(width, height, LEVELS + base),

@@ -18,14 +18,4 @@ pub enum FrontendError {
         /// Rows found.
         found_height: usize,
     },
-    /// A key of the configuration is outside its domain.
-    #[error("frontend.{key}: expected {expected}, found {found}")]
-    BadConfig {
-        /// Which key.
-        key: &'static str,
-        /// Its domain.
-        expected: &'static str,
-        /// The value found.
-        found: f64,
-    },
 }

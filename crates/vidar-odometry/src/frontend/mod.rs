@@ -17,7 +17,6 @@
 //! Every stage is a plain function or an object that owns nothing but buffers; the map, the states and the decisions are the
 //! caller's. Results do not depend on threads, and vector instructions give the bits that scalar code gives.
 
-mod config;
 mod detect;
 mod error;
 mod feature;
@@ -30,10 +29,7 @@ mod template;
 mod testbed;
 mod two_view;
 
-pub use config::{
-    DetectorConfig, FrontendConfig, ImageAlignmentConfig, MatchingConfig, PyramidConfig, TwoViewConfig,
-};
-pub use detect::{Detection, Detector, OccupancyGrid};
+pub use detect::{Detection, Detector, DetectorConfig, OccupancyGrid};
 pub use error::FrontendError;
 pub use feature::{Feature, FeatureKind, PixelMeasurement};
 pub use feature_alignment::{AlignedFeature, MatchFailure, align_feature};
@@ -41,6 +37,6 @@ pub use image_alignment::{
     AlignmentPoint, AlignmentReference, ImageAligner, ImageAlignment, MAX_REFERENCES, MotionPrediction,
 };
 pub(crate) use patch::sample;
-pub use pyramid::{Pyramid, from_level, level_scale, to_level};
+pub use pyramid::{PYRAMID_LEVELS, Pyramid, from_level, level_scale, to_level};
 pub use template::{Template, Warp};
 pub use two_view::{RayPair, Triangulated, TwoView, TwoViewFailure, TwoViewSolver, triangulate};

@@ -8,6 +8,9 @@ use crate::simd::dispatch;
 use vidar_core::camera::Pixel;
 use vidar_core::{FrameImage, Image};
 
+/// Levels of the odometry's pyramids, each half the size of the one before: 752 × 480 pixels become 47 × 30.
+pub const PYRAMID_LEVELS: usize = 5;
+
 /// Smallest side of a level that is still built, pixels: a patch and its search must fit.
 const MIN_SIDE_PX: usize = 24;
 

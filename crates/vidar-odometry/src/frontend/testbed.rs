@@ -1,7 +1,6 @@
 //! Rendered images with exact depth and motion, for the tests of the front end.
 
-use super::config::DetectorConfig;
-use super::detect::{Detection, Detector};
+use super::detect::{Detection, Detector, DetectorConfig};
 use super::feature::Feature;
 use super::pyramid::Pyramid;
 use nalgebra::Vector3;

@@ -9,59 +9,45 @@ use super::views::{self, Track, View};
 use crate::backend::{GaugePriorSigmas, OptimiseReport, Smoother, SmootherConfig, SmootherError};
 use crate::imu::{Bias, NavState};
 use nalgebra::Vector3;
-use serde::{Deserialize, Serialize};
 use vidar_core::{CameraModel, FrameId, LandmarkId, LieGroup, Se3, So3};
 use vidar_solve::statistics::median_upper;
 
-/// Settings and acceptance limits of the initialisation in motion.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
-#[serde(default, deny_unknown_fields)]
-pub struct InFlightConfig {
-    /// Longest stretch of the log that is used, s, 0.5…10.
-    pub window_secs: f64,
-    /// Shortest stretch that is tried, s, 0.2…5.
-    pub min_secs: f64,
-    /// Most frames that are chosen from it, 5…15.
-    pub keyframes: usize,
-    /// Fewest tracks that at least three chosen frames share, 10…500.
-    pub min_tracks: usize,
-    /// Least median parallax, degrees, 0.1…20.
-    pub min_parallax_deg: f64,
-    /// Most standard deviation of log(scale), 0.005…0.5. 0.03 lets half of the starts be within 2 %.
-    pub max_log_scale_sigma: f64,
-    /// A stretch of the log from which on the scale may be provisional, s, 0.5…10: the state starts with whatever scale is
-    /// known then, and its standard deviation is reported.
-    pub provisional_secs: f64,
-    /// Most standard deviation of log(scale) of a provisional start, 0.005…0.5.
-    pub provisional_log_scale_sigma: f64,
-    /// Most change of scale between two successive solutions, relative, 0.01…1.
-    pub max_scale_change: f64,
-    /// Standard deviation of the accelerometer's bias before anything is known, m/s², 0.01…2.
-    pub accel_bias_sigma: f64,
-    /// Standard deviation of the gyroscope's bias before anything is known, rad/s, 0.001…0.5.
-    pub gyro_bias_sigma: f64,
-    /// Highest valid speed, m/s, 1…100.
-    pub max_speed_mps: f64,
-}
+/// Longest stretch of the log that is used, s.
+pub const WINDOW_SECS: f64 = 2.8;
 
-impl Default for InFlightConfig {
-    fn default() -> Self {
-        Self {
-            window_secs: 2.8,
-            min_secs: 0.7,
-            keyframes: 15,
-            min_tracks: 25,
-            min_parallax_deg: 1.0,
-            max_log_scale_sigma: 0.03,
-            provisional_secs: 1.8,
-            provisional_log_scale_sigma: 0.15,
-            max_scale_change: 0.1,
-            accel_bias_sigma: 0.15,
-            gyro_bias_sigma: 0.1,
-            max_speed_mps: 15.0,
-        }
-    }
-}
+/// Shortest stretch that is tried, s: in less the acceleration hardly changes, and the scale follows from its change.
+const MIN_SECS: f64 = 0.7;
+
+/// Most frames that are chosen from it.
+const KEYFRAMES: usize = 15;
+
+/// Fewest tracks that at least three chosen frames share.
+const MIN_TRACKS: usize = 25;
+
+/// Least median parallax, degrees.
+const MIN_PARALLAX_DEG: f64 = 1.0;
+
+/// Most standard deviation of log(scale) of a start. 0.03 lets half of the starts be within 2 %.
+pub const MAX_LOG_SCALE_SIGMA: f64 = 0.03;
+
+/// A stretch of the log from which on the scale may be provisional, s: the state starts with whatever scale is known then, and its
+/// standard deviation is reported.
+pub(super) const PROVISIONAL_SECS: f64 = 1.8;
+
+/// Most standard deviation of log(scale) of a provisional start.
+const PROVISIONAL_LOG_SCALE_SIGMA: f64 = 0.15;
+
+/// Most change of scale between two successive solutions, relative.
+const MAX_SCALE_CHANGE: f64 = 0.1;
+
+/// Standard deviation of the accelerometer's bias before anything is known, m/s².
+const ACCEL_BIAS_SIGMA: f64 = 0.15;
+
+/// Standard deviation of the gyroscope's bias before anything is known, rad/s.
+const GYRO_BIAS_SIGMA: f64 = 0.1;
+
+/// Highest valid speed, m/s: more comes of a wrong scale.
+const MAX_SPEED_MPS: f64 = 15.0;
 
 /// A metric state found in motion.
 #[derive(Clone, Debug)]
@@ -142,7 +128,6 @@ impl Fit {
 /// Finds the first metric state in motion. Give it the log whenever a frame came; it remembers its last solution.
 #[derive(Clone, Debug)]
 pub struct InFlightInitializer {
-    config: InFlightConfig,
     smoother_config: SmootherConfig,
     camera: CameraModel,
     body_from_camera: Se3,
@@ -153,14 +138,8 @@ pub struct InFlightInitializer {
 
 impl InFlightInitializer {
     /// Nothing is known yet but the calibration.
-    pub fn new(
-        config: InFlightConfig,
-        smoother_config: SmootherConfig,
-        camera: CameraModel,
-        body_from_camera: Se3,
-    ) -> Self {
+    pub fn new(smoother_config: SmootherConfig, camera: CameraModel, body_from_camera: Se3) -> Self {
         Self {
-            config,
             smoother_config,
             camera,
             body_from_camera,
@@ -168,11 +147,6 @@ impl InFlightInitializer {
             gyro_bias_known: false,
             last: None,
         }
-    }
-
-    /// Its settings.
-    pub(crate) fn config(&self) -> &InFlightConfig {
-        &self.config
     }
 
     /// Gyroscope bias as found by the last attempt that came so far, rad/s.
@@ -198,21 +172,21 @@ impl InFlightInitializer {
     }
 
     fn solve(&mut self, log: &[LoggedFrame]) -> Result<Result<InFlightSolution, InitFailure>, SmootherError> {
-        let most = self.config.keyframes.min(self.smoother_config.max_frames - 1).max(3);
-        let mut views = views::choose(log, self.config.window_secs, most);
+        let most = KEYFRAMES.min(self.smoother_config.max_frames - 1).max(3);
+        let mut views = views::choose(log, WINDOW_SECS, most);
         let span = match (views.first(), views.last()) {
             (Some(first), Some(last)) => (last.logged.time - first.logged.time).as_secs_f64(),
             _ => 0.0,
         };
-        if !(span >= self.config.min_secs) {
-            return Ok(Err(InitFailure::new(InitFailureReason::Seconds, span, self.config.min_secs)));
+        if !(span >= MIN_SECS) {
+            return Ok(Err(InitFailure::new(InitFailureReason::Seconds, span, MIN_SECS)));
         }
         if views.len() < 5 {
             return Ok(Err(InitFailure::new(InitFailureReason::Frames, views.len() as f64, 5.0)));
         }
         let tracks = views::gather(&views, &self.camera);
-        if tracks.len() < self.config.min_tracks {
-            let wanted = self.config.min_tracks as f64;
+        if tracks.len() < MIN_TRACKS {
+            let wanted = MIN_TRACKS as f64;
             return Ok(Err(InitFailure::new(InitFailureReason::Tracks, tracks.len() as f64, wanted)));
         }
         if !self.gyro_bias_known {
@@ -222,19 +196,15 @@ impl InFlightInitializer {
         views.iter_mut().filter_map(|v| v.preintegration.as_mut()).for_each(|r| r.reintegrate(bias));
         let turns = views::rotations(&views, &bias);
         let parallax = views::median_parallax_deg(&tracks, &turns, &self.body_from_camera.rotation);
-        if !(parallax >= self.config.min_parallax_deg) {
+        if !(parallax >= MIN_PARALLAX_DEG) {
             self.last = None;
-            return Ok(Err(InitFailure::new(
-                InitFailureReason::Parallax,
-                parallax,
-                self.config.min_parallax_deg,
-            )));
+            return Ok(Err(InitFailure::new(InitFailureReason::Parallax, parallax, MIN_PARALLAX_DEG)));
         }
         let Some(first) = self.linear_start(&views, &tracks, &turns) else {
             return Ok(Err(InitFailure::new(
                 InitFailureReason::ScaleUncertainty,
                 f64::INFINITY,
-                self.config.max_log_scale_sigma,
+                MAX_LOG_SCALE_SIGMA,
             )));
         };
         let mut best: Option<(Smoother, Fit)> = None;
@@ -289,7 +259,7 @@ impl InFlightInitializer {
         let gravity_mps2 = views.iter().find_map(|v| v.preintegration.as_ref())?.model().gravity_mps2;
         let (linear_views, rays) = views::linear_input(views, tracks, turns, &self.body_from_camera);
         let sigma_rad = LINEAR_INFLATION * views::ray_sigma_rad(tracks, &self.camera);
-        linear::solve(&linear_views, &rays, sigma_rad, self.config.accel_bias_sigma, gravity_mps2)
+        linear::solve(&linear_views, &rays, sigma_rad, ACCEL_BIAS_SIGMA, gravity_mps2)
     }
 
     /// Step 3: the window as a smoother.
@@ -310,8 +280,8 @@ impl InFlightInitializer {
         let mut smoother =
             Smoother::new(self.smoother_config.clone(), self.camera.clone(), self.body_from_camera)?;
         let sigmas = GaugePriorSigmas {
-            gyro_bias: self.config.gyro_bias_sigma,
-            accel_bias: self.config.accel_bias_sigma,
+            gyro_bias: GYRO_BIAS_SIGMA,
+            accel_bias: ACCEL_BIAS_SIGMA,
             ..GaugePriorSigmas::GAUGE
         };
         for (k, view) in views.iter().enumerate() {
@@ -404,18 +374,16 @@ impl InFlightInitializer {
         let bias = smoother.newest().map_or(Bias::ZERO, |(.., s)| s.bias);
         let median_distance_m = median(smoother.landmarks().map(|l| 1.0 / l.inverse_distance)).unwrap_or(0.0);
         // A well-known scale is taken as soon as it is there; a provisional one only from a long stretch that fits well.
-        let (max_sigma, max_left_out) = match span_secs >= self.config.provisional_secs {
-            true if sigma > self.config.max_log_scale_sigma => {
-                (self.config.provisional_log_scale_sigma, MOST_LEFT_OUT_PROVISIONAL)
-            }
-            _ => (self.config.max_log_scale_sigma, MOST_LEFT_OUT),
+        let (max_sigma, max_left_out) = match span_secs >= PROVISIONAL_SECS {
+            true if sigma > MAX_LOG_SCALE_SIGMA => (PROVISIONAL_LOG_SCALE_SIGMA, MOST_LEFT_OUT_PROVISIONAL),
+            _ => (MAX_LOG_SCALE_SIGMA, MOST_LEFT_OUT),
         };
         let at_most = [
             (InitFailureReason::ScaleUncertainty, sigma, max_sigma),
             (InitFailureReason::OutlierShare, fit.left_out, max_left_out),
             (InitFailureReason::ImageChi2, fit.image, MAX_CHI2_PER_DOF),
             (InitFailureReason::ImuChi2, fit.inertial, GOOD_INERTIAL_FIT),
-            (InitFailureReason::Speed, fastest, self.config.max_speed_mps),
+            (InitFailureReason::Speed, fastest, MAX_SPEED_MPS),
             (InitFailureReason::AccelBias, bias.accel.norm(), MAX_ACCEL_BIAS),
             (InitFailureReason::GyroBias, bias.gyro.norm(), MAX_GYRO_BIAS),
             (InitFailureReason::SceneDistance, median_distance_m, 200.0),
@@ -426,7 +394,7 @@ impl InFlightInitializer {
             return Err(InitFailure::new(reason, measured, limit));
         }
         let change = previous.and_then(|p| scale_change(&p, &places)).unwrap_or(f64::INFINITY);
-        let max_change = self.config.max_scale_change.max(sigma);
+        let max_change = MAX_SCALE_CHANGE.max(sigma);
         if !(change <= max_change) {
             return Err(InitFailure::new(InitFailureReason::ScaleAgreement, change, max_change));
         }

@@ -1,10 +1,10 @@
 //! The odometry before it has a metric state: tracks are followed with the gyroscope's help and logged.
 
+use super::in_flight::PROVISIONAL_SECS;
 use super::log::joined;
 use super::monocular::INITIAL_INVERSE_DISTANCE;
 use super::{
-    InFlightConfig, InFlightInitializer, InitFailure, InitFailureReason, InitOutcome, LoggedFrame,
-    TrackObservation,
+    InFlightInitializer, InitFailure, InitFailureReason, InitOutcome, LoggedFrame, TrackObservation,
 };
 use crate::backend::{Smoother, SmootherError};
 use crate::config::OdometryConfig;
@@ -100,12 +100,8 @@ fn rotated_camera(first_from_body: &So3, body_from_camera: &Se3) -> Se3 {
 
 impl Initializer {
     pub fn new(config: OdometryConfig, is_mono: bool, body_from_camera: Se3, tracker: Tracker) -> Self {
-        let in_flight = InFlightInitializer::new(
-            InFlightConfig::default(),
-            config.smoother(),
-            tracker.camera().clone(),
-            body_from_camera,
-        );
+        let in_flight =
+            InFlightInitializer::new(config.smoother(), tracker.camera().clone(), body_from_camera);
         Self {
             config,
             is_mono,
@@ -248,7 +244,7 @@ impl Initializer {
             _ => CONTRADICTION_PAUSE_SECS,
         };
         // From some length on less is asked for.
-        let until_less = Some(self.in_flight.config().provisional_secs - span).filter(|s| *s > 0.0);
+        let until_less = Some(PROVISIONAL_SECS - span).filter(|s| *s > 0.0);
         pause.min(until_less.unwrap_or(f64::INFINITY)).clamp(ATTEMPT_SECS, LONGEST_PAUSE_SECS)
     }
 

@@ -22,7 +22,7 @@ mod static_start;
 mod views;
 
 pub use failure::{InitFailure, InitFailureReason};
-pub use in_flight::{InFlightConfig, InFlightInitializer, InFlightSolution, InitOutcome};
+pub use in_flight::{InFlightInitializer, InFlightSolution, InitOutcome, MAX_LOG_SCALE_SIGMA, WINDOW_SECS};
 pub(crate) use initializer::{InitialState, Initializer, STILL_SECS};
 pub use log::{LoggedFrame, TrackObservation};
 pub(crate) use monocular::INITIAL_INVERSE_DISTANCE;

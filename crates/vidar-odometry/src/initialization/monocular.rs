@@ -3,7 +3,7 @@
 use super::{InitFailure, InitFailureReason, LoggedFrame, TrackObservation};
 use crate::backend::{GaugePriorSigmas, Smoother, SmootherError};
 use crate::config::OdometryConfig;
-use crate::frontend::{RayPair, TwoViewConfig, TwoViewFailure, TwoViewSolver, triangulate};
+use crate::frontend::{RayPair, TwoViewFailure, TwoViewSolver, triangulate};
 use crate::imu::NavState;
 use vidar_core::{CameraModel, LieGroup, Se3};
 use vidar_solve::statistics::median_upper;
@@ -74,7 +74,7 @@ fn between(
     let with_rays: Vec<(TrackObservation, TrackObservation, RayPair)> =
         shared.iter().filter_map(|(a, b)| Some((*a, *b, RayPair { a: ray(a)?, b: ray(b)? }))).collect();
     let pairs: Vec<RayPair> = with_rays.iter().map(|w| w.2).collect();
-    let mut solver = TwoViewSolver::new(TwoViewConfig::default());
+    let mut solver = TwoViewSolver::default();
     let found = solver.without_rotation(&pairs, sigma_rad).map_err(|failure| match failure {
         TwoViewFailure::NoParallax { median_rad, .. } => {
             fail(InitFailureReason::Parallax, median_rad.to_degrees(), MIN_PARALLAX_DEG)

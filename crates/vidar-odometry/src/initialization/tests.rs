@@ -203,7 +203,6 @@ fn a_log_without_imu_samples_or_tracks_fails() {
     let course = Course { kind: CourseKind::Eight, secs: 3.0, speed: 1.0, phase: 0.1 };
     let simulation = simulate(&course, &SimulationConfig::default());
     let mut start = InFlightInitializer::new(
-        InFlightConfig::default(),
         crate::backend::SmootherConfig::default(),
         simulation.camera.clone(),
         simulation.body_from_camera,

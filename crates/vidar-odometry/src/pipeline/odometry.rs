@@ -9,7 +9,7 @@ use super::working_size::WorkingSize;
 use crate::bundle_adjustment::TrackLog;
 use crate::config::{ImuUse, OdometryConfig};
 use crate::error::OdometryError;
-use crate::frontend::FrontendConfig;
+use crate::frontend::PYRAMID_LEVELS;
 use crate::imu::{ImuBuffer, ImuModel};
 use crate::initialization::{InitFailure, InitFailureReason, Initializer};
 use crate::stages::{Stage, StageClock, StageTimes};
@@ -66,7 +66,6 @@ enum Phase {
 #[derive(Debug)]
 pub struct Odometry {
     config: OdometryConfig,
-    frontend: FrontendConfig,
     camera_id: CameraId,
     /// Of the images that are worked with.
     camera: RigCamera,
@@ -142,13 +141,10 @@ impl Odometry {
         imu_model: Option<ImuModel>,
         imu: ImuBuffer,
     ) -> Self {
-        let frontend = FrontendConfig::default();
-        let phase =
-            Phase::Initializing(Box::new(initializer(&config, imu_model.is_none(), &camera, &frontend)));
+        let phase = Phase::Initializing(Box::new(initializer(&config, imu_model.is_none(), &camera)));
         let time_calibration = TimeCalibration::new(&config);
         Self {
             config,
-            frontend,
             camera_id,
             check: OrientationCheck::new(&camera.body_from_camera.rotation),
             recent: RecentFrames::new(imu_model.is_some() && !time_calibration.is_settled()),
@@ -279,7 +275,7 @@ impl Odometry {
         let id = FrameId(self.next_frame);
         self.next_frame = self.next_frame.wrapping_add(1);
         // The size was checked when the image came.
-        let host = self.images.take(id, &frame.image, self.frontend.pyramid.levels, self.shutter_at(time))?;
+        let host = self.images.take(id, &frame.image, PYRAMID_LEVELS, self.shutter_at(time))?;
         self.recent.add(id, &frame);
         let was_starting = matches!(self.phase, Phase::Initializing(_));
         let mut status = self.status_after(&frame, host, time);

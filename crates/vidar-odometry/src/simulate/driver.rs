@@ -6,10 +6,8 @@ use crate::backend::{
     SmootherError,
 };
 use crate::imu::{Bias, BufferError, ImuBuffer, ImuModel, NavState, Preintegration};
-use crate::initialization::STILL_SECS;
-use crate::initialization::{
-    InFlightConfig, InFlightInitializer, InitFailure, InitOutcome, LoggedFrame, TrackObservation,
-};
+use crate::initialization::{InFlightInitializer, InitFailure, InitOutcome, LoggedFrame, TrackObservation};
+use crate::initialization::{STILL_SECS, WINDOW_SECS};
 use crate::tracking::{ImageMotion, ImuStatistics};
 use nalgebra::Vector3;
 use rustc_hash::{FxHashMap, FxHashSet};
@@ -20,8 +18,6 @@ use vidar_core::{CameraModel, Duration, FrameId, ImuSample, LandmarkId, LieGroup
 pub struct FeatureOdometryConfig {
     /// The smoother.
     pub smoother: SmootherConfig,
-    /// The start.
-    pub in_flight: InFlightConfig,
     /// The IMU model of the smoother.
     pub imu: ImuModel,
     /// Nominal rate of IMU measurements, Hz.
@@ -48,7 +44,6 @@ impl FeatureOdometryConfig {
     pub fn new(noise: &vidar_core::ImuNoise, factor: f64) -> Self {
         Self {
             smoother: SmootherConfig::default(),
-            in_flight: InFlightConfig::default(),
             imu: ImuModel::from_data_sheet(noise, factor, factor),
             imu_rate_hz: noise.rate_hz,
             keyframes: 10,
@@ -122,12 +117,7 @@ const NEW_GATE_SIGMAS: f64 = 4.0;
 impl FeatureOdometry {
     /// For one camera on a body.
     pub fn new(config: FeatureOdometryConfig, camera: CameraModel, body_from_camera: Se3) -> Self {
-        let start = InFlightInitializer::new(
-            config.in_flight.clone(),
-            config.smoother.clone(),
-            camera.clone(),
-            body_from_camera,
-        );
+        let start = InFlightInitializer::new(config.smoother.clone(), camera.clone(), body_from_camera);
         Self {
             buffer: ImuBuffer::new(config.imu_rate_hz),
             config,
@@ -278,7 +268,7 @@ impl FeatureOdometry {
         preintegration: Option<Preintegration>,
     ) -> Result<StepOutput, SmootherError> {
         self.log.push(LoggedFrame { frame: id, time, preintegration, observations: observations.to_vec() });
-        let old = self.log.len().saturating_sub((self.config.in_flight.window_secs * 100.0) as usize);
+        let old = self.log.len().saturating_sub((WINDOW_SECS * 100.0) as usize);
         self.log.drain(..old);
         if self.resting || !self.log.len().is_multiple_of(self.config.attempt_every) {
             return Ok(StepOutput::Waiting(None));

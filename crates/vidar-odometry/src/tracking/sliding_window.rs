@@ -11,7 +11,7 @@ use super::track::{HostImage, Track, noisy_covariance};
 use super::tracker::{CameraPoses, Prediction, TrackCounts, Tracker};
 use crate::backend::{MarginalisationReport, Observation, OptimiseReport, Smoother, SmootherError};
 use crate::config::OdometryConfig;
-use crate::frontend::{ImageAligner, ImageAlignmentConfig, PixelMeasurement};
+use crate::frontend::{ImageAligner, PixelMeasurement};
 use crate::imu::{NavState, Preintegration};
 use crate::pipeline::TrackSummary;
 use crate::stages::{Stage, StageClock};
@@ -141,7 +141,7 @@ impl SlidingWindowOdometry {
             last,
             last_host: None,
             before_last: None,
-            aligner: ImageAligner::new(ImageAlignmentConfig::default()),
+            aligner: ImageAligner::new(ImageAligner::FINEST_LEVEL),
             last_keyframe,
             frames_since_keyframe: 0,
             keyframe_landmarks,
@@ -326,7 +326,6 @@ fn follow_host(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::frontend::FrontendConfig;
     use vidar_core::Pinhole;
 
     #[test]
@@ -334,7 +333,7 @@ mod tests {
         let camera = CameraModel::Pinhole(Pinhole::new(458.0, 457.0, 367.0, 248.0, 752, 480).unwrap());
         let config = OdometryConfig::default();
         let smoother = Smoother::new(config.smoother(), camera.clone(), Se3::IDENTITY).unwrap();
-        let tracker = Tracker::new(camera, &FrontendConfig::default(), 3.0);
+        let tracker = Tracker::new(camera, 3.0);
         let refused = SlidingWindowOdometry::new(config, smoother, tracker, Vec::new(), 0.4);
         assert_eq!(refused.unwrap_err(), SmootherError::Empty);
     }

@@ -1,8 +1,7 @@
 //! Tracks: features of keyframes that are measured in every new frame against their keyframe's patch.
 
 use crate::frontend::{
-    AlignedFeature, Feature, MatchFailure, MatchingConfig, PixelMeasurement, Pyramid, Template, Warp,
-    align_feature,
+    AlignedFeature, Feature, MatchFailure, PixelMeasurement, Pyramid, Template, Warp, align_feature,
 };
 use crate::gyro_alignment::RollingShutter;
 use nalgebra::{Matrix2, Matrix2x1, Vector2};
@@ -119,13 +118,12 @@ pub struct TrackRecord {
 #[derive(Debug)]
 pub(crate) struct Measurer {
     template: Template,
-    config: MatchingConfig,
     noise_gray: f64,
 }
 
 impl Measurer {
-    pub fn new(config: MatchingConfig, noise_gray: f64) -> Self {
-        Self { template: Template::empty(), config, noise_gray }
+    pub fn new(noise_gray: f64) -> Self {
+        Self { template: Template::empty(), noise_gray }
     }
 
     /// Finds `feature` of `host` in `current` around `expected`, the patch deformed by `warp`.
@@ -144,8 +142,7 @@ impl Measurer {
         if search_wide {
             let coarse = Feature { level: feature.level + 2, ..*feature };
             if self.template.fill(host, &coarse, warp)
-                && let Ok(found) =
-                    align_feature(&self.template, current, &start, self.noise_gray, &self.config)
+                && let Ok(found) = align_feature(&self.template, current, &start, self.noise_gray)
             {
                 start = found.measurement.pixel;
             }
@@ -153,7 +150,7 @@ impl Measurer {
         if !self.template.fill(host, feature, warp) {
             return Err(MatchFailure::NoTexture);
         }
-        align_feature(&self.template, current, &start, self.noise_gray, &self.config)
+        align_feature(&self.template, current, &start, self.noise_gray)
     }
 }
 

@@ -2,7 +2,7 @@
 
 use super::track::{HostImage, InverseDistance, Measurer, Track, rotated_pixel, unknown_distance};
 use crate::frontend::{
-    Detection, Detector, Feature, FrontendConfig, MatchFailure, OccupancyGrid, PixelMeasurement, Warp,
+    Detection, Detector, DetectorConfig, Feature, MatchFailure, OccupancyGrid, PixelMeasurement, Warp,
 };
 use nalgebra::Vector2;
 use std::sync::Arc;
@@ -62,10 +62,10 @@ pub(crate) struct Prediction<'a> {
 }
 
 impl Tracker {
-    pub fn new(camera: CameraModel, config: &FrontendConfig, noise_gray: f64) -> Self {
-        let detector = Detector::new(config.detector.clone());
+    pub fn new(camera: CameraModel, noise_gray: f64) -> Self {
+        let detector = Detector::new(DetectorConfig::default());
         let grid = detector.grid(camera.width(), camera.height());
-        let measurer = Measurer::new(config.matching.clone(), noise_gray);
+        let measurer = Measurer::new(noise_gray);
         Self { camera, tracks: Vec::new(), measurer, detector, grid, detections: Vec::new(), next_id: 0 }
     }
 

@@ -8,7 +8,7 @@ use rayon::prelude::*;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use vidar_core::{Duration, Image, LieGroup, Pinhole, Se3};
-use vidar_dataset::decode::{ImageLimits, read_image, read_size};
+use vidar_dataset::decode::{read_image, read_size};
 use vidar_dataset::{OpenOptions, Recording, RecordingKind};
 
 /// A decoded image.
@@ -80,7 +80,7 @@ impl Source {
     /// Columns and rows.
     pub fn size(&self) -> Result<(usize, usize), Error> {
         match &self.recording {
-            None => Ok(read_size(&self.path, &ImageLimits::default())?),
+            None => Ok(read_size(&self.path)?),
             // All images of a recording have its camera's size.
             Some((dataset, _)) => {
                 Ok(dataset.rig.camera(dataset.camera).map_or((0, 0), |c| (c.model.width(), c.model.height())))
@@ -90,7 +90,7 @@ impl Source {
 
     fn read(&self) -> Result<Picture, Error> {
         let image = match &self.recording {
-            None => read_image(&self.path, &ImageLimits::default())?,
+            None => read_image(&self.path)?,
             Some((dataset, number)) => dataset.load_image(&dataset.images[*number])?,
         };
         Ok(Picture { path: self.path.clone(), image: image.to_rgb8() })

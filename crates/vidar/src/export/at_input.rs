@@ -8,7 +8,7 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use vidar_core::remap::RemapTable;
 use vidar_core::{CameraModel, Image, Pinhole};
-use vidar_dataset::decode::{ImageLimits, read_image};
+use vidar_dataset::decode::read_image;
 use vidar_dataset::{CameraFlag, with_size};
 
 const NEEDS: &str = "--input-size needs a run of this version on a recording of image files";
@@ -67,7 +67,7 @@ impl<'a> AtInputSize<'a> {
         let Some(Some(source)) = self.sources.get(&frame) else {
             return Err(refused(self.run, format!("frame {frame} has no image file: {NEEDS}")));
         };
-        let image = read_image(source, &ImageLimits::default())?;
+        let image = read_image(source)?;
         let size = (self.model.width(), self.model.height());
         if (image.width(), image.height()) != size {
             let found = format!("{} is {}x{} pixels", source.display(), image.width(), image.height());

@@ -7,7 +7,7 @@ use crate::run_folder::StoredView;
 use crate::system::{MAX_CLOUD_BYTES, read_up_to};
 use std::path::{Path, PathBuf};
 use vidar_core::Image;
-use vidar_dataset::decode::{ImageLimits, read_image};
+use vidar_dataset::decode::read_image;
 use vidar_fusion::{TextureCamera, TextureConfig, TextureImage, texture_mesh};
 
 /// Name of the file.
@@ -41,7 +41,7 @@ pub(super) fn glb(
         let view = &views[at];
         let color = match &at_input {
             Some(at_input) => at_input.image(view.stored.frame, &view.camera.intrinsics)?,
-            None => read_image(&run.join(view.image), &ImageLimits::default())?.to_rgb8(),
+            None => read_image(&run.join(view.image))?.to_rgb8(),
         };
         Ok::<_, Error>(TextureImage { color, depth: view.depth(run, units_per_metre)? })
     };

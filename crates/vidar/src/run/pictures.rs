@@ -363,13 +363,10 @@ fn view_picture(view: &StoredView, outcome: &RunOutcome, folder: &RunFolder) -> 
     let read = |path: &Option<String>| std::fs::read(folder.path().join(path.as_ref()?)).ok();
     let depth = vidar_export::read_depth_png(&read(&view.depth)?, outcome.plan.depth_units_per_metre).ok()?;
     let depth = vidar_view::depth_picture(depth.image(), None);
-    let image = view.image.as_ref().and_then(|path| {
-        vidar_dataset::decode::read_image(
-            &folder.path().join(path),
-            &vidar_dataset::decode::ImageLimits::default(),
-        )
-        .ok()
-    });
+    let image = view
+        .image
+        .as_ref()
+        .and_then(|path| vidar_dataset::decode::read_image(&folder.path().join(path)).ok());
     match image {
         Some(image) => Some(vidar_view::side_by_side(&[("image", &image.to_rgb8()), ("depth", &depth)])),
         None => Some(depth),

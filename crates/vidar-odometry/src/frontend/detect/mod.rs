@@ -12,7 +12,6 @@ mod tests;
 
 pub use occupancy::OccupancyGrid;
 
-use super::config::DetectorConfig;
 use super::feature::FeatureKind;
 use super::pyramid::{Pyramid, from_level, level_scale};
 use fast::{Candidate, FastScanner};
@@ -20,6 +19,19 @@ use nalgebra::Vector2;
 pub(crate) use structure::Structure;
 use vidar_core::Image;
 use vidar_core::camera::Pixel;
+
+/// Difference to the centre that FAST asks of a circle's pixels, grey levels: low, as structure decides among its candidates.
+const FAST_THRESHOLD: u8 = 10;
+
+/// Least structure of a corner: root of the smaller eigenvalue of its mean gradient tensor, grey levels per pixel. It bounds the
+/// error of the alignment: with 2 grey levels of noise on the 64 pixels of a patch, 0.1 px.
+const MIN_CORNER_STRENGTH: f64 = 2.5;
+
+/// Least gradient of an edgelet, grey levels per pixel. More than of a corner, as it is measured in one direction alone.
+const MIN_EDGE_STRENGTH: f64 = 8.0;
+
+/// Distance that features keep from the image's border on their own level, pixels: the patch around them lies inside.
+const BORDER_PX: usize = 8;
 
 /// Candidates a cell and level of which the best by structure is taken.
 const KEPT: usize = 3;
@@ -58,6 +70,21 @@ impl Cell {
             self.best[at] = candidate;
             self.count = (self.count + 1).min(KEPT);
         }
+    }
+}
+
+/// Where features are looked for. The defaults suit the odometry's images of about 752 × 480; the calibration has others.
+#[derive(Clone, Debug, PartialEq)]
+pub struct DetectorConfig {
+    /// Side of the cells of which each holds at most one feature, level-0 pixels, 8…256. Smaller gives more features.
+    pub cell_px: usize,
+    /// Pyramid levels on which corners are looked for, 1…5.
+    pub levels: usize,
+}
+
+impl Default for DetectorConfig {
+    fn default() -> Self {
+        Self { cell_px: 32, levels: 3 }
     }
 }
 
@@ -104,9 +131,9 @@ impl Detector {
     }
 
     fn collect_corners(&mut self, pyramid: &Pyramid, level: usize, taken: &OccupancyGrid) {
-        let (config, cells) = (&self.config, &mut self.cells);
+        let cells = &mut self.cells;
         cells.iter_mut().for_each(|cell| cell.count = 0);
-        self.scanner.scan(pyramid.level(level), config.fast_threshold, config.border_px, |candidate| {
+        self.scanner.scan(pyramid.level(level), FAST_THRESHOLD, BORDER_PX, |candidate| {
             let pixel = from_level(&Pixel::new(candidate.x as f64, candidate.y as f64), level);
             if let Some(index) = taken.index(&pixel).filter(|i| !taken.is_taken_at(*i)) {
                 cells[index].offer(candidate);
@@ -119,7 +146,7 @@ impl Detector {
             for candidate in &cell.best[..cell.count] {
                 let strength = Structure::around(image, candidate.x, candidate.y).weak;
                 // A finer level localises better, so a coarser one must be clearly stronger.
-                let asked = cell.corner.map_or(self.config.min_corner_strength, |c| {
+                let asked = cell.corner.map_or(MIN_CORNER_STRENGTH, |c| {
                     if usize::from(c.level) == level { c.strength } else { COARSER_MUST_EXCEED * c.strength }
                 });
                 if strength > asked {
@@ -135,7 +162,6 @@ impl Detector {
     fn find_edgelets(&self, pyramid: &Pyramid, taken: &OccupancyGrid, found: &mut Vec<Detection>) {
         let level = 1.min(pyramid.level_count() - 1);
         let image = pyramid.level(level);
-        let border = self.config.border_px.max(6);
         let cell = taken.cell_px() as f64 / level_scale(level);
         for (index, corner) in self.cells.iter().map(|c| c.corner).enumerate() {
             if corner.is_some() || taken.is_taken_at(index) {
@@ -144,7 +170,7 @@ impl Detector {
             let (column, row) = (index % taken.columns(), index / taken.columns());
             let span = |c: usize, size: usize| {
                 let (low, high) = ((c as f64 * cell) as usize, ((c + 1) as f64 * cell) as usize);
-                low.max(border)..high.min(size - border)
+                low.max(BORDER_PX)..high.min(size - BORDER_PX)
             };
             let area = (span(column, image.width()), span(row, image.height()));
             if let Some(edgelet) = self.edgelet_in(image, level, area) {
@@ -175,7 +201,7 @@ impl Detector {
         let structure = Structure::around(image, x, y);
         // Where the patch's gradients do not agree with each other, the direction means nothing.
         let is_edge = structure.strong > EDGE_RATIO * structure.weak;
-        if strength < self.config.min_edge_strength || !is_edge {
+        if strength < MIN_EDGE_STRENGTH || !is_edge {
             return None;
         }
         let normal: Vector2<f64> = structure.direction;

@@ -20,13 +20,13 @@ fn a_room_has_features_everywhere_and_at_most_one_a_cell() {
     let mut grid = OccupancyGrid::new(376, 240, config.cell_px);
     for d in &found {
         assert!(grid.take(&d.pixel), "two in a cell: {d:?}");
-        let border = (config.border_px as f64 - 1.0) * level_scale(d.level.into());
+        let border = (BORDER_PX as f64 - 1.0) * level_scale(d.level.into());
         assert!(d.pixel.x >= border && d.pixel.y >= border);
         assert!(d.pixel.x < 376.0 - border && d.pixel.y < 240.0 - border);
         match d.kind {
-            FeatureKind::Corner => assert!(d.strength >= config.min_corner_strength),
+            FeatureKind::Corner => assert!(d.strength >= MIN_CORNER_STRENGTH),
             FeatureKind::Edgelet { normal } => {
-                assert!((normal.norm() - 1.0).abs() < 1e-9 && d.strength >= config.min_edge_strength);
+                assert!((normal.norm() - 1.0).abs() < 1e-9 && d.strength >= MIN_EDGE_STRENGTH);
             }
         }
     }

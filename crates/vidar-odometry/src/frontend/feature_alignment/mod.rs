@@ -13,7 +13,6 @@
 #[cfg(test)]
 mod tests;
 
-use super::config::MatchingConfig;
 use super::feature::PixelMeasurement;
 use super::patch::{Bilinear, sum8};
 use super::pyramid::{Pyramid, from_level, level_scale, to_level};
@@ -22,6 +21,31 @@ use crate::simd::dispatch;
 use nalgebra::{Matrix2, Vector2};
 use vidar_core::Image;
 use vidar_core::camera::Pixel;
+
+/// Most steps of one alignment; bounds the time of one that does not settle.
+const MAX_ITERATIONS: usize = 12;
+
+/// Step below which an alignment has settled, pixels of its level: far below [`SIGMA_FLOOR_PX`].
+const MIN_STEP_PX: f64 = 0.015;
+
+/// Furthest that a feature may be from where it is expected, pixels of its level: the side of the patch.
+const MAX_SHIFT_PX: f64 = 8.0;
+
+/// Least correlation of what is accepted; less only resembles the patch.
+const MIN_NCC: f64 = 0.8;
+
+/// Least correlation of what differs by no more than image noise.
+const MIN_NOISY_NCC: f64 = 0.5;
+
+/// Least change of contrast that is accepted; its inverse is the largest: exposure may change fivefold.
+const MIN_GAIN: f64 = 0.2;
+
+/// Least structure of a patch that is aligned: its summed squared gradients in the weakest direction that matters, grey levels²
+/// per pixel². At 2 grey levels of noise its error is 0.2 px.
+const MIN_TEXTURE: f64 = 100.0;
+
+/// Error that a measurement has at least, pixels of its level: what the patch model does not know.
+const SIGMA_FLOOR_PX: f64 = 0.1;
 
 /// A feature found in the current image.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -104,27 +128,25 @@ pub fn align_feature(
     current: &Pyramid,
     start: &Pixel,
     noise_gray: f64,
-    config: &MatchingConfig,
 ) -> Result<AlignedFeature, MatchFailure> {
     let level = template.level;
     let image = current.level(level);
     let scale = level_scale(level);
-    let solve = StepSolver::new(template, config).ok_or(MatchFailure::NoTexture)?;
+    let solve = StepSolver::new(template).ok_or(MatchFailure::NoTexture)?;
     let half = Vector2::repeat(0.5 * (SIDE as f64 - 1.0));
     let first = to_level(start, level) - half;
-    let max_shift = config.max_shift_px;
     let mut corner = first;
-    for _ in 0..config.max_iterations {
+    for _ in 0..MAX_ITERATIONS {
         let found = dispatch!(sums(image, template, &corner)).ok_or(MatchFailure::OutsideImage)?;
         let step = solve.step(template, &found);
         corner -= step;
-        if !((corner - first).norm_squared() <= max_shift * max_shift) {
+        if !((corner - first).norm_squared() <= MAX_SHIFT_PX * MAX_SHIFT_PX) {
             return Err(MatchFailure::Diverged);
         }
-        if step.norm_squared() < config.min_step_px * config.min_step_px {
+        if step.norm_squared() < MIN_STEP_PX * MIN_STEP_PX {
             let last = dispatch!(sums(image, template, &corner)).ok_or(MatchFailure::OutsideImage)?;
             let moved_px = (corner - first).norm() * scale;
-            return evaluate(template, current, &corner, &last, &solve, moved_px, noise_gray, config);
+            return evaluate(template, current, &corner, &last, &solve, moved_px, noise_gray);
         }
     }
     Err(MatchFailure::Diverged)
@@ -137,16 +159,16 @@ struct StepSolver {
 }
 
 impl StepSolver {
-    fn new(template: &Template, config: &MatchingConfig) -> Option<Self> {
+    fn new(template: &Template) -> Option<Self> {
         let h = &template.hessian;
         let inverse = match template.normal {
             Some(n) => {
                 let strength = (n.transpose() * h * n).x;
-                (strength > config.min_texture).then(|| n * n.transpose() / strength)?
+                (strength > MIN_TEXTURE).then(|| n * n.transpose() / strength)?
             }
             None => {
                 let [_, weak, _] = super::feature::eigen(h);
-                (weak > config.min_texture).then(|| h.try_inverse())??
+                (weak > MIN_TEXTURE).then(|| h.try_inverse())??
             }
         };
         Some(Self { inverse })
@@ -170,7 +192,6 @@ fn evaluate(
     solve: &StepSolver,
     moved_px: f64,
     noise_gray: f64,
-    config: &MatchingConfig,
 ) -> Result<AlignedFeature, MatchFailure> {
     debug_assert!(found.mean.is_finite());
     let gain = found.with_template / template.energy;
@@ -184,15 +205,15 @@ fn evaluate(
     if (clipped - template.saturated_share).abs() > MAX_SATURATED {
         return Err(MatchFailure::Dissimilar);
     }
-    let alike = ncc >= config.min_ncc || (ncc >= config.min_noisy_ncc && variance <= expected);
-    if !(alike && gain > config.min_gain && gain < 1.0 / config.min_gain) {
+    let alike = ncc >= MIN_NCC || (ncc >= MIN_NOISY_NCC && variance <= expected);
+    if !(alike && gain > MIN_GAIN && gain < 1.0 / MIN_GAIN) {
         return Err(MatchFailure::Dissimilar);
     }
     let pixel = from_level(&corner.add_scalar(0.5 * (SIDE as f64 - 1.0)), template.level);
     let scale = level_scale(template.level);
     // What the residual shows, but never less than rounding to grey levels leaves.
-    let noise = variance.max(QUANTISATION_VARIANCE) * config.variance_factor / (gain * gain);
-    let floor = config.sigma_floor_px * config.sigma_floor_px;
+    let noise = variance.max(QUANTISATION_VARIANCE) / (gain * gain);
+    let floor = SIGMA_FLOOR_PX * SIGMA_FLOOR_PX;
     let information = match template.normal {
         Some(n) => {
             let across = (n.transpose() * solve.inverse * n).x * noise;

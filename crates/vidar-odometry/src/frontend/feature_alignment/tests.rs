@@ -39,7 +39,6 @@ fn score(scene: &Scene, trial: Trial) -> Score {
     let Trial { view, gain, sigma, disturbed_px, blur_px, smooth } = trial;
     let keyframe = scene.degraded(0, 1.0, sigma);
     let current = if blur_px > 1 { scene.blurred(view, blur_px) } else { scene.degraded(view, gain, sigma) };
-    let config = MatchingConfig::default();
     let motion = scene.motion(0, view);
     let mut random = SplitMix64::new(5);
     let mut template = Template::empty();
@@ -55,7 +54,7 @@ fn score(scene: &Scene, trial: Trial) -> Score {
         let start = warp.pixel + Vector2::new(random.normal(), random.normal()) * disturbed_px;
         let filled = template.fill(&keyframe, &feature, &warp);
         let found = if filled {
-            align_feature(&template, &current, &start, sigma, &config)
+            align_feature(&template, &current, &start, sigma)
         } else {
             Err(MatchFailure::NoTexture)
         };
@@ -153,13 +152,12 @@ fn feature(level: u8, kind: FeatureKind) -> Feature {
 fn shift_gain_and_offset_of_an_exact_image_are_recovered() {
     let reference = waves(0.0, 0.0, 1.0, 0.0);
     let mut template = Template::empty();
-    let config = MatchingConfig::default();
     for (dx, dy, gain, offset) in [(0.4, -0.3, 1.0, 0.0), (1.7, 1.2, 0.6, 40.0), (-2.2, 0.9, 1.15, -20.0)] {
         for level in [0, 1] {
             let f = feature(level, FeatureKind::Corner);
             assert!(template.fill(&reference, &f, &Warp::shift(f.pixel)));
             let current = waves(dx, dy, gain, offset);
-            let found = align_feature(&template, &current, &f.pixel, 0.0, &config).unwrap();
+            let found = align_feature(&template, &current, &f.pixel, 0.0).unwrap();
             let error = found.measurement.pixel - f.pixel - Vector2::new(dx, dy);
             assert!(error.norm() < 0.03 * level_scale(level.into()), "level {level}: {error}");
             assert!((f64::from(found.gain) - gain).abs() < 0.03 && found.ncc > 0.99, "{found:?}");
@@ -182,7 +180,7 @@ fn an_edgelet_moves_across_its_edge_only() {
     let mut template = Template::empty();
     assert!(template.fill(&edge(0.0), &f, &Warp::shift(f.pixel)));
     let start = f.pixel + Vector2::new(0.5, 0.5);
-    let found = align_feature(&template, &edge(1.3), &start, 0.0, &MatchingConfig::default()).unwrap();
+    let found = align_feature(&template, &edge(1.3), &start, 0.0).unwrap();
     let moved = found.measurement.pixel - f.pixel;
     assert!((moved.dot(&normal) - 1.3).abs() < 0.05, "{moved}");
     let along = Vector2::new(-0.6, 0.8);
@@ -191,7 +189,7 @@ fn an_edgelet_moves_across_its_edge_only() {
     assert!(normal.dot(&(found.measurement.information * normal)) > 10.0);
     let corner = feature(0, FeatureKind::Corner);
     let corner_fits = template.fill(&edge(0.0), &corner, &Warp::shift(corner.pixel))
-        && align_feature(&template, &edge(1.3), &start, 0.0, &MatchingConfig::default())
+        && align_feature(&template, &edge(1.3), &start, 0.0)
             .is_ok_and(|f| f.measurement.covariance().amax() < 0.5);
     assert!(!corner_fits, "a straight edge is no corner");
 }
@@ -199,7 +197,6 @@ fn an_edgelet_moves_across_its_edge_only() {
 #[test]
 fn each_failure_has_its_name() {
     let reference = waves(0.0, 0.0, 1.0, 0.0);
-    let config = MatchingConfig::default();
     let f = feature(0, FeatureKind::Corner);
     let mut template = Template::empty();
     let at_border = Feature { pixel: Pixel::new(3.0, 50.0), ..f };
@@ -207,13 +204,13 @@ fn each_failure_has_its_name() {
     let flat = Pyramid::of(&Image::filled(160, 120, 80), 3);
     assert!(!template.fill(&flat, &f, &Warp::shift(f.pixel)));
     assert!(template.fill(&reference, &f, &Warp::shift(f.pixel)));
-    let outside = align_feature(&template, &reference, &Pixel::new(158.0, 50.0), 0.0, &config);
+    let outside = align_feature(&template, &reference, &Pixel::new(158.0, 50.0), 0.0);
     assert_eq!(outside, Err(MatchFailure::OutsideImage));
-    assert!(align_feature(&template, &flat, &f.pixel, 0.0, &config).is_err());
+    assert!(align_feature(&template, &flat, &f.pixel, 0.0).is_err());
     let mut random = SplitMix64::new(1);
     let noise = Pyramid::of(&Image::from_fn(160, 120, |_, _| (255.0 * random.uniform()) as u8), 3);
-    assert!(align_feature(&template, &noise, &f.pixel, 2.0, &config).is_err());
-    let nowhere = align_feature(&template, &reference, &Pixel::new(f64::NAN, 3.0), 0.0, &config);
+    assert!(align_feature(&template, &noise, &f.pixel, 2.0).is_err());
+    let nowhere = align_feature(&template, &reference, &Pixel::new(f64::NAN, 3.0), 0.0);
     assert!(nowhere.is_err());
 }
 
@@ -227,7 +224,7 @@ fn wide_and_narrow_paths_give_the_same_bits() {
         for (feature, inverse_distance, _) in scene.features(0) {
             let Some(warp) = Warp::new(&scene.camera, &feature, inverse_distance, &motion) else { continue };
             if template.fill(&keyframe, &feature, &warp) {
-                all.push(align_feature(&template, &current, &warp.pixel, 0.0, &MatchingConfig::default()));
+                all.push(align_feature(&template, &current, &warp.pixel, 0.0));
             }
         }
         all

@@ -10,12 +10,16 @@
 //! Patches are weighted as wholes (Geman-McClure on their rms over the median's): what moves or is hidden is a patch, not a
 //! pixel. The prediction enters as a Gaussian prior, with the patches' noise taken from the same median.
 
+mod limits;
 mod patches;
 #[cfg(test)]
 mod tests;
 
-use super::config::ImageAlignmentConfig;
 use super::pyramid::{Pyramid, level_scale};
+use limits::{
+    COARSEST_LEVEL, COST_SLACK, MAX_ITERATIONS, MIN_GAIN, MIN_NOISE_GRAY, MIN_PATCHES, MIN_STEP_PX,
+    OUTLIER_RATIO,
+};
 use nalgebra::{Matrix6, SMatrix, SVector, Vector3, Vector6};
 use patches::{PIXELS, Patch};
 use vidar_core::camera::Pixel;
@@ -86,7 +90,7 @@ pub struct ImageAlignment {
 /// Aligns frames; its buffers are kept.
 #[derive(Clone, Debug)]
 pub struct ImageAligner {
-    config: ImageAlignmentConfig,
+    finest_level: usize,
     patches: Vec<Patch>,
     scratch: Vec<f64>,
 }
@@ -108,9 +112,13 @@ struct System {
 }
 
 impl ImageAligner {
-    /// An aligner with no buffers yet.
-    pub fn new(config: ImageAlignmentConfig) -> Self {
-        Self { config, patches: Vec::new(), scratch: Vec::new() }
+    /// Finest pyramid level for a prediction: features are measured on their own afterwards, on their own level.
+    pub const FINEST_LEVEL: usize = 2;
+
+    /// An aligner with no buffers yet. `finest_level` is the pyramid level that it ends on; a lower one is more exact and
+    /// slower.
+    pub fn new(finest_level: usize) -> Self {
+        Self { finest_level, patches: Vec::new(), scratch: Vec::new() }
     }
 
     /// Aligns `current` with up to [`MAX_REFERENCES`] references (further ones are ignored).
@@ -125,8 +133,8 @@ impl ImageAligner {
         self.collect(camera, references);
         let start = prediction.current_from_anchor;
         let mut state = State { current_from_anchor: start, gain: [1.0; 2], offset: [0.0; 2] };
-        let coarsest = self.config.coarsest_level.min(current.level_count() - 1);
-        let finest = self.config.finest_level.min(coarsest);
+        let coarsest = COARSEST_LEVEL.min(current.level_count() - 1);
+        let finest = self.finest_level.min(coarsest);
         let (mut iterations, mut converged) = (0, false);
         for level in (finest..=coarsest).rev() {
             for patch in &mut self.patches {
@@ -167,8 +175,8 @@ impl ImageAligner {
         state: &mut State,
     ) -> (usize, bool) {
         let mut previous: Option<(f64, State)> = None;
-        for iteration in 0..self.config.max_iterations {
-            if self.look(camera, references, current, level, state) < self.config.min_patches {
+        for iteration in 0..MAX_ITERATIONS {
+            if self.look(camera, references, current, level, state) < MIN_PATCHES {
                 return (0, false);
             }
             if iteration == 0 {
@@ -189,11 +197,11 @@ impl ImageAligner {
                 return (iteration, false);
             }
             apply(state, &step);
-            if self.mean_motion_px(&step) < self.config.min_step_px * level_scale(level) {
+            if self.mean_motion_px(&step) < MIN_STEP_PX * level_scale(level) {
                 return (iteration + 1, true);
             }
         }
-        (self.config.max_iterations, false)
+        (MAX_ITERATIONS, false)
     }
 
     /// Reads all patches; how many are seen.
@@ -256,7 +264,7 @@ impl ImageAligner {
         }
         let Some(median) = median_upper(&mut self.scratch) else { return MIN_NOISE_GRAY };
         let variance = (median / PIXELS).max(MIN_NOISE_GRAY * MIN_NOISE_GRAY);
-        let k2 = self.config.outlier_ratio * self.config.outlier_ratio * variance * PIXELS;
+        let k2 = OUTLIER_RATIO * OUTLIER_RATIO * variance * PIXELS;
         for patch in &mut self.patches {
             let (a, b) = (state.gain[patch.reference], state.offset[patch.reference]);
             let share = patch.squared_residual(a, b).map_or(0.0, |e| k2 / (k2 + e));
@@ -343,7 +351,7 @@ impl ImageAligner {
         converged: bool,
     ) -> ImageAlignment {
         let patches = self.look(camera, references, current, level, &state);
-        let enough = patches >= self.config.min_patches && iterations > 0;
+        let enough = patches >= MIN_PATCHES && iterations > 0;
         let state = if enough {
             state
         } else {
@@ -368,15 +376,6 @@ impl ImageAligner {
         }
     }
 }
-
-/// Least change of contrast that an exposure is fitted to; its inverse is the largest.
-const MIN_GAIN: f64 = 0.2;
-
-/// Noise that residuals have at least, grey levels: rounding alone leaves 0.3.
-const MIN_NOISE_GRAY: f64 = 0.5;
-
-/// Growth of the cost that weights alone may cause.
-const COST_SLACK: f64 = 1.02;
 
 fn apply(state: &mut State, step: &SVector<f64, UNKNOWNS>) {
     let motion: Vector6<f64> = step.fixed_rows::<6>(0).into_owned();

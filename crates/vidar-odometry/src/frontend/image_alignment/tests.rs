@@ -30,8 +30,7 @@ fn the_motion_is_found_from_a_wrong_prediction() {
     let keyframe = scene.pyramid(0);
     let reference =
         AlignmentReference { pyramid: &keyframe, anchor_from_reference: Se3::IDENTITY, points: &points };
-    let config = ImageAlignmentConfig { finest_level: 1, ..ImageAlignmentConfig::default() };
-    let mut aligner = ImageAligner::new(config);
+    let mut aligner = ImageAligner::new(1);
     for view in [1, 2, 3] {
         let truth = scene.motion(0, view);
         let off = Vector6::new(0.01, -0.012, 0.015, 0.03, -0.03, 0.03);
@@ -67,9 +66,7 @@ fn two_references_share_one_motion_and_exposures_are_their_own() {
     ];
     let truth = scene.motion(2, 3);
     let off = Vector6::new(0.01, 0.01, -0.01, 0.02, 0.02, -0.02);
-    let config = ImageAlignmentConfig { finest_level: 1, ..ImageAlignmentConfig::default() };
-    let found =
-        ImageAligner::new(config).align(&scene.camera, &references, &current, &prediction(&truth, &off));
+    let found = ImageAligner::new(1).align(&scene.camera, &references, &current, &prediction(&truth, &off));
     let (turn, shift) = apart(&found.current_from_anchor, &truth);
     assert!(found.converged && turn < 0.15 && shift < 0.015, "{turn} {shift} {found:?}");
     assert!(
@@ -94,9 +91,8 @@ fn hard_images_are_aligned_within_a_pixel() {
             AlignmentReference { pyramid: &keyframe, anchor_from_reference: Se3::IDENTITY, points: &points };
         let truth = scene.motion(0, 2);
         let off = Vector6::new(0.01, 0.01, -0.01, 0.02, 0.02, -0.02);
-        let config = ImageAlignmentConfig { finest_level: 1, ..ImageAlignmentConfig::default() };
         let found =
-            ImageAligner::new(config).align(&scene.camera, &[reference], &current, &prediction(&truth, &off));
+            ImageAligner::new(1).align(&scene.camera, &[reference], &current, &prediction(&truth, &off));
         let mut worst: Vec<f64> = points
             .iter()
             .filter_map(|p| {
@@ -121,7 +117,7 @@ fn a_prior_holds_what_the_image_does_not_know_and_too_few_patches_change_nothing
     let truth = scene.motion(0, 1);
     let wrong = truth.plus(&Vector6::new(0.02, 0.0, 0.0, 0.0, 0.0, 0.0));
     let sure = MotionPrediction { current_from_anchor: wrong, information: Matrix6::identity() * 1e12 };
-    let mut aligner = ImageAligner::new(ImageAlignmentConfig::default());
+    let mut aligner = ImageAligner::new(ImageAligner::FINEST_LEVEL);
     let reference =
         AlignmentReference { pyramid: &keyframe, anchor_from_reference: Se3::IDENTITY, points: &points };
     let held = aligner.align(&scene.camera, &[reference], &scene.pyramid(1), &sure);
@@ -158,7 +154,7 @@ fn the_gradient_of_the_cost_is_the_numeric_one() {
     let keyframe = scene.pyramid(0);
     let references =
         [AlignmentReference { pyramid: &keyframe, anchor_from_reference: Se3::IDENTITY, points: &points }];
-    let mut aligner = ImageAligner::new(ImageAlignmentConfig::default());
+    let mut aligner = ImageAligner::new(ImageAligner::FINEST_LEVEL);
     aligner.collect(&scene.camera, &references);
     for patch in &mut aligner.patches {
         patch.prepare(&keyframe, 2);

@@ -15,12 +15,26 @@ mod triangulate;
 
 pub use triangulate::{Triangulated, triangulate};
 
-use super::config::TwoViewConfig;
 use five_point::five_point;
 use nalgebra::{Matrix3, Vector3};
 use random::Sampler;
 use vidar_core::{Se3, So3};
 use vidar_solve::statistics::median_upper;
+
+/// Angle to the epipolar plane up to which a pair agrees, standard deviations of a ray: of true pairs, one in eighty is beyond.
+const THRESHOLD_SIGMAS: f64 = 2.5;
+
+/// Fewest pairs that must agree: over twice the five that a wrong motion fits anyway.
+const MIN_INLIERS: usize = 12;
+
+/// Most samples that are drawn: with half of the pairs wrong, 200 samples of five hold a right one with [`CONFIDENCE`].
+const MAX_SAMPLES: usize = 200;
+
+/// Probability that one sample was free of wrong pairs.
+const CONFIDENCE: f64 = 0.995;
+
+/// Least median parallax, standard deviations of a ray. Below it a motion cannot be told from a rotation.
+const MIN_PARALLAX_SIGMAS: f64 = 4.0;
 
 /// Unit directions to one feature from two views, each in its own camera.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -73,19 +87,13 @@ pub enum TwoViewFailure {
 }
 
 /// Finds motions between views; its buffers are kept.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Default)]
 pub struct TwoViewSolver {
-    config: TwoViewConfig,
     inliers: Vec<bool>,
     scratch: Vec<f64>,
 }
 
 impl TwoViewSolver {
-    /// A solver with no buffers yet.
-    pub fn new(config: TwoViewConfig) -> Self {
-        Self { config, inliers: Vec::new(), scratch: Vec::new() }
-    }
-
     /// Which pairs agreed in the last solution, in the order given.
     pub fn inliers(&self) -> &[bool] {
         &self.inliers
@@ -105,8 +113,8 @@ impl TwoViewSolver {
         self.check(pairs, 2)?;
         self.demand_parallax(pairs, b_from_a, sigma_rad)?;
         let rotation = b_from_a.matrix();
-        let limit2 = (self.config.threshold_sigmas * sigma_rad).powi(2);
-        let mut search = Search::new(pairs.len(), &self.config);
+        let limit2 = (THRESHOLD_SIGMAS * sigma_rad).powi(2);
+        let mut search = Search::new(pairs.len());
         let mut sampler = Sampler::new(SEED);
         while search.goes_on(2) {
             let [i, j]: [usize; 2] = sampler.distinct(pairs.len());
@@ -127,8 +135,8 @@ impl TwoViewSolver {
     /// Says what was missing. A motion without parallax has no answer.
     pub fn without_rotation(&mut self, pairs: &[RayPair], sigma_rad: f64) -> Result<TwoView, TwoViewFailure> {
         self.check(pairs, 5)?;
-        let limit2 = (self.config.threshold_sigmas * sigma_rad).powi(2);
-        let mut search = Search::new(pairs.len(), &self.config);
+        let limit2 = (THRESHOLD_SIGMAS * sigma_rad).powi(2);
+        let mut search = Search::new(pairs.len());
         let mut sampler = Sampler::new(SEED);
         let mut found = [Matrix3::zeros(); 10];
         while search.goes_on(5) {
@@ -153,7 +161,7 @@ impl TwoViewSolver {
     }
 
     fn check(&mut self, pairs: &[RayPair], sample: usize) -> Result<(), TwoViewFailure> {
-        let needed = self.config.min_inliers.max(sample + 1);
+        let needed = MIN_INLIERS.max(sample + 1);
         self.inliers.clear();
         self.inliers.resize(pairs.len(), false);
         if pairs.len() < needed {
@@ -181,7 +189,7 @@ impl TwoViewSolver {
         sigma_rad: f64,
     ) -> Result<(), TwoViewFailure> {
         let median_rad = self.median_parallax(pairs, rotation, false);
-        let needed_rad = self.config.min_parallax_sigmas * sigma_rad;
+        let needed_rad = MIN_PARALLAX_SIGMAS * sigma_rad;
         if median_rad < needed_rad {
             return Err(TwoViewFailure::NoParallax { median_rad, needed_rad });
         }
@@ -196,9 +204,9 @@ impl TwoViewSolver {
         free: refine::Free,
     ) -> Result<TwoView, TwoViewFailure> {
         let samples = search.drawn;
-        let needed = self.config.min_inliers;
+        let needed = MIN_INLIERS;
         let mut motion = search.best.ok_or(TwoViewFailure::NoConsensus { inliers: 0, needed })?;
-        let limit = self.config.threshold_sigmas * sigma_rad;
+        let limit = THRESHOLD_SIGMAS * sigma_rad;
         let mut count = self.mark(pairs, &motion, limit);
         for _ in 0..2 {
             let refined = refine::refine(pairs, &self.inliers, &motion, sigma_rad, free);
@@ -253,14 +261,13 @@ struct Search {
     inliers: usize,
     pairs: usize,
     drawn: usize,
-    most: usize,
     miss: f64,
 }
 
 impl Search {
-    fn new(pairs: usize, config: &TwoViewConfig) -> Self {
-        let miss = f64::ln(1.0 - config.confidence);
-        Self { best: None, cost: f64::INFINITY, inliers: 0, pairs, drawn: 0, most: config.max_samples, miss }
+    fn new(pairs: usize) -> Self {
+        let miss = f64::ln(1.0 - CONFIDENCE);
+        Self { best: None, cost: f64::INFINITY, inliers: 0, pairs, drawn: 0, miss }
     }
 
     /// Fischler & Bolles' number of samples for the share of inliers seen so far.
@@ -269,7 +276,7 @@ impl Search {
         let good = share.powi(sample).clamp(1e-9, 1.0 - 1e-9);
         let enough = self.drawn as f64 * (1.0 - good).ln() <= self.miss;
         self.drawn += 1;
-        self.drawn <= self.most && !enough
+        self.drawn <= MAX_SAMPLES && !enough
     }
 
     /// Scores a motion by truncated squares (MSAC) and keeps it if it is the best.

@@ -4,7 +4,6 @@ use super::{IMAGE_NOISE_GRAY, Odometry, Phase, Status};
 use crate::backend::{Smoother, SmootherError};
 use crate::bundle_adjustment::TrackLog;
 use crate::config::OdometryConfig;
-use crate::frontend::FrontendConfig;
 use crate::initialization::{INITIAL_INVERSE_DISTANCE, InitialState, Initializer, STILL_SECS};
 use crate::initialization::{
     InitFailure, InitFailureReason, StaticInitConfig, StaticState, initialize_slow, initialize_static,
@@ -86,7 +85,7 @@ impl Odometry {
         let mut smoother = self.smoother()?;
         smoother.start(host.frame, time, start.state, start.sigmas)?;
         smoother.mark_keyframe(host.frame)?;
-        let mut tracker = Tracker::new(self.camera.model.clone(), &self.frontend, IMAGE_NOISE_GRAY);
+        let mut tracker = Tracker::new(self.camera.model.clone(), IMAGE_NOISE_GRAY);
         tracker.detect(host, 2 * self.config.max_landmarks, INITIAL_INVERSE_DISTANCE);
         let (config, hosts) = (self.config.clone(), vec![host.clone()]);
         SlidingWindowOdometry::new(config, smoother, tracker, hosts, INITIAL_INVERSE_DISTANCE)
@@ -99,12 +98,8 @@ impl Odometry {
         frame: &Frame,
         host: &Arc<HostImage>,
     ) -> Status {
-        let waiting = Phase::Initializing(Box::new(initializer(
-            &self.config,
-            self.imu_model.is_none(),
-            &self.camera,
-            &self.frontend,
-        )));
+        let waiting =
+            Phase::Initializing(Box::new(initializer(&self.config, self.imu_model.is_none(), &self.camera)));
         let Phase::Initializing(before) = std::mem::replace(&mut self.phase, waiting) else {
             return Status::Waiting(self.failure.clone());
         };
@@ -131,12 +126,8 @@ impl Odometry {
     pub(super) fn initialize_anew(&mut self) {
         self.time_calibration.forget_tracks();
         self.log.iter_mut().for_each(TrackLog::next_generation);
-        self.phase = Phase::Initializing(Box::new(initializer(
-            &self.config,
-            self.imu_model.is_none(),
-            &self.camera,
-            &self.frontend,
-        )));
+        self.phase =
+            Phase::Initializing(Box::new(initializer(&self.config, self.imu_model.is_none(), &self.camera)));
     }
 
     pub(super) fn wait(&mut self, failure: InitFailure) -> Status {
@@ -149,12 +140,7 @@ impl Odometry {
     }
 }
 
-pub(super) fn initializer(
-    config: &OdometryConfig,
-    is_mono: bool,
-    camera: &RigCamera,
-    frontend: &FrontendConfig,
-) -> Initializer {
-    let tracker = Tracker::new(camera.model.clone(), frontend, IMAGE_NOISE_GRAY);
+pub(super) fn initializer(config: &OdometryConfig, is_mono: bool, camera: &RigCamera) -> Initializer {
+    let tracker = Tracker::new(camera.model.clone(), IMAGE_NOISE_GRAY);
     Initializer::new(config.clone(), is_mono, camera.body_from_camera, tracker)
 }
