@@ -8,7 +8,7 @@
 
 #![allow(clippy::unwrap_used)] // helpers of tests are test code, though not marked so
 
-use nalgebra::{Matrix6, SVector, UnitVector3, Vector3, Vector6};
+use nalgebra::{Matrix6, SMatrix, SVector, UnitVector3, Vector3, Vector6};
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::{RngCore, SeedableRng};
 use vidar_align::coupled::{
@@ -308,8 +308,10 @@ fn coupled(world: &World) -> (f64, f64) {
     }
     let link = |k: usize, l, l_from_k, rotation_deg: f64, translation_std_m: f64, log_scale_std, kernel| {
         let translation = translation_std_m / start.chunks[k].scale;
-        let stds = [rotation_deg.to_radians(), translation, log_scale_std];
-        Factor::Relative(RelativeChunk::from_stds(k, l, l_from_k, stds, kernel))
+        let rotation = rotation_deg.to_radians();
+        let stds = [rotation, rotation, rotation, translation, translation, translation, log_scale_std];
+        let covariance = SMatrix::from_diagonal(&SVector::from(stds.map(|s| s * s)));
+        Factor::Relative(RelativeChunk::from_covariance(k, l, l_from_k, &covariance, kernel).unwrap())
     };
     for (l, l_from_k) in world.overlaps.iter().enumerate() {
         factors.push(link(l + 1, l, *l_from_k, 1.2, 0.06, 0.018, robust));

@@ -334,8 +334,7 @@ fn offloaded_chunks_move_and_merge_like_those_in_memory() {
     }
     let expected = in_memory.extract_mesh().unwrap();
     let load = |chunk: ChunkId| Ok::<_, FusionError>(stored[&chunk].clone());
-    assert!(same_bits(&expected, &offloaded.merged_with(load).unwrap().extract_mesh()));
-    offloaded.forget_merged();
+    assert!(same_bits(&expected, &offloaded.clone().merged_with(load).unwrap().extract_mesh()));
     assert_eq!(offloaded.merged().unwrap_err(), FusionError::Offloaded { chunk: ChunkId(0) });
     assert_eq!(offloaded.offload(ChunkId(0)).unwrap_err(), FusionError::Offloaded { chunk: ChunkId(0) });
     let late = &views_around(131, 1.3, ball(0.4))[130];
@@ -358,17 +357,16 @@ fn corrupt_bytes_are_an_error_and_never_panic() {
         } else {
             bytes[random.below(good.len())] ^= 1 << random.below(8);
         }
-        volumes.forget_merged();
         // A flipped bit of a sum may still be a sum; whatever is read can be made a mesh.
-        match volumes.merged_with(|_| Ok::<_, FusionError>(bytes.clone())) {
+        match volumes.clone().merged_with(|_| Ok::<_, FusionError>(bytes.clone())) {
             Ok(volume) => drop(volume.extract_mesh()),
             Err(FusionError::BadSnapshot { .. }) => rejected += 1,
             Err(other) => panic!("{other}"),
         }
     }
     assert!(rejected >= 200, "{rejected}");
-    let mut read = |bytes: &[u8]| {
-        volumes.forget_merged();
+    let read = |bytes: &[u8]| {
+        let mut volumes = volumes.clone();
         volumes.merged_with(|_| Ok::<_, FusionError>(bytes.to_vec())).map(|volume| volume.extract_mesh())
     };
     assert!(read(b"VSUB2").is_err());
@@ -384,9 +382,12 @@ fn a_kept_sum_forgets_nothing_and_keeps_nothing_too_much() {
     let views: Vec<AlignedView> = views_around(40, 1.3, ball(0.4)).into_iter().map(colored).collect();
     let fusion = FusionConfig { carve_range_m: 2.0, ..config() };
     let mut kept = SubVolumes::new(&settings(fusion)).unwrap();
+    // Goes through all that `kept` does, but only copies of it are merged: nothing is kept.
+    let mut bare = kept.clone();
     let mut stored = std::collections::BTreeMap::<ChunkId, Vec<u8>>::new();
     for (chunk, part) in (0..).map(ChunkId).zip(views.chunks(8)) {
         add(&mut kept, chunk, part);
+        add(&mut bare, chunk, part);
         // Every chunk so far is turned about the last one, the older ones farther; some come back.
         for (k, earlier) in (0..chunk.0).zip(views.chunks(8)) {
             let angle = 0.03 * f64::from((chunk.0 - k) % 3);
@@ -394,26 +395,26 @@ fn a_kept_sum_forgets_nothing_and_keeps_nothing_too_much() {
                 Sim3::new(So3::exp(&Vec3::new(0.0, 0.0, angle)), Vec3::zeros(), 1.0 + angle).unwrap();
             let moves: Vec<_> = earlier.iter().map(|v| revised(v, &motion)).collect();
             kept.revise(ChunkId(k), &moves).unwrap();
+            bare.revise(ChunkId(k), &moves).unwrap();
         }
         let load = |c: ChunkId| Ok::<_, FusionError>(stored[&c].clone());
         let mesh = kept.merged_with(load).unwrap().extract_mesh();
-        // The same motions, nothing kept.
-        let mut fresh = kept.clone();
-        fresh.forget_merged();
-        assert!(same_bits(&mesh, &fresh.merged_with(load).unwrap().extract_mesh()), "{chunk}");
+        assert!(same_bits(&mesh, &bare.clone().merged_with(load).unwrap().extract_mesh()), "{chunk}");
         if chunk.0 > 0 {
             let old = ChunkId(chunk.0 - 1);
             stored.insert(old, kept.offload(old).unwrap());
+            assert_eq!(bare.offload(old).unwrap(), stored[&old]);
         }
     }
     // More views of a chunk that is in the sum already, and one that is made anew.
     let last = ChunkId(4);
     let more = colored(views_around(41, 1.3, ball(0.4)).remove(40));
-    kept.integrate(last, &more).unwrap();
-    kept.rebuild(ChunkId(1), views[8..16].to_vec()).unwrap();
+    for volumes in [&mut kept, &mut bare] {
+        volumes.integrate(last, &more).unwrap();
+        volumes.rebuild(ChunkId(1), views[8..16].to_vec()).unwrap();
+    }
     let load = |c: ChunkId| Ok::<_, FusionError>(stored[&c].clone());
     let mesh = kept.merged_with(load).unwrap().extract_mesh();
-    kept.forget_merged();
-    assert!(same_bits(&mesh, &kept.merged_with(load).unwrap().extract_mesh()));
+    assert!(same_bits(&mesh, &bare.merged_with(load).unwrap().extract_mesh()));
     assert_eq!(kept.merged_with(load).unwrap().views(), 41);
 }

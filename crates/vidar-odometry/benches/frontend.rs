@@ -151,15 +151,8 @@ fn pairs() -> Vec<RayPair> {
 }
 
 #[divan::bench]
-fn two_view_with_rotation(bencher: Bencher<'_, '_>) {
-    let (pairs, turn) = (pairs(), scene().motion(0, 2).rotation);
-    let mut solver = TwoViewSolver::default();
-    bencher.bench_local(|| solver.with_rotation(black_box(&pairs), &turn, 0.5 / 458.0));
-}
-
-#[divan::bench]
 fn two_view_five_point(bencher: Bencher<'_, '_>) {
     let pairs = pairs();
     let mut solver = TwoViewSolver::default();
-    bencher.bench_local(|| solver.without_rotation(black_box(&pairs), 0.5 / 458.0));
+    bencher.bench_local(|| solver.solve(black_box(&pairs), 0.5 / 458.0));
 }

@@ -9,7 +9,7 @@ use std::alloc::{GlobalAlloc, Layout, System};
 use std::cell::Cell;
 use vidar_core::{
     CameraId, CameraModel, Duration, Frame, FrameId, FrameImage, Image, LieGroup, Pinhole, Se3, SensorEvent,
-    So3, Timestamp,
+    Timestamp,
 };
 use vidar_odometry::frontend::{
     AlignmentPoint, AlignmentReference, Detection, Detector, DetectorConfig, Feature, ImageAligner,
@@ -144,9 +144,7 @@ impl Frontend {
             let Some(b) = self.camera.unproject(&found.measurement.pixel) else { continue };
             self.pairs.push(RayPair { a: feature.bearing, b });
         }
-        let two_view = self.two_view.with_rotation(&self.pairs, &So3::IDENTITY, 0.2 / 230.0);
-        let both = self.two_view.without_rotation(&self.pairs, 0.2 / 230.0);
-        let agreed = two_view.map_or(0, |t| t.inliers).min(both.map_or(0, |t| t.inliers));
+        let agreed = self.two_view.solve(&self.pairs, 0.2 / 230.0).map_or(0, |t| t.inliers);
         [aligned.patches, self.pairs.len(), agreed]
     }
 }

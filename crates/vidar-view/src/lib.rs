@@ -38,7 +38,7 @@ pub use interactive::{
     PanesShown, PathRole, PosedThumbnail, depth_thumbnail, encode_view,
 };
 pub use lines::{AxisSpec, LinePlot, Mark, ReferenceLine, Series, plot_lines};
-pub use map::camera::{BackFaces, Cut, MapCamera, Projection, Viewpoint, up_of_world};
+pub use map::camera::{BackFaces, MapCamera, Projection, Viewpoint, up_of_world};
 pub use map::{MapSurface, Shading, render_map, render_map_with_path};
 pub use picture::{confidence_picture, depth_picture, side_by_side};
 pub use png_bytes::encode_png;

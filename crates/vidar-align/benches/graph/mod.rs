@@ -1,6 +1,6 @@
 //! The coupled graph whose cost is measured: 500 keyframes, 25 chunks. The example `solve_graphs` measures the same one.
 
-use nalgebra::{Matrix6, Vector3, Vector6};
+use nalgebra::{Matrix6, SMatrix, SVector, Vector3, Vector6};
 use vidar_align::coupled::{Attachment, CoupledState, Factor, Kernel, RelativeChunk, inflation};
 use vidar_core::{LieGroup, Se3, Sim3, So3};
 
@@ -53,7 +53,12 @@ pub fn graph() -> (CoupledState, Vec<Factor>) {
         }
         let link = |l: usize, kernel| {
             let relative = gauges[l].inverse() * *gauge;
-            Factor::Relative(RelativeChunk::from_stds(k, l, relative, [0.02, 0.05, 0.015], kernel))
+            let variances = [0.02, 0.02, 0.02, 0.05, 0.05, 0.05, 0.015_f64].map(|s| s * s);
+            let covariance = SMatrix::from_diagonal(&SVector::from(variances));
+            let Some(link) = RelativeChunk::from_covariance(k, l, relative, &covariance, kernel) else {
+                unreachable!("positive")
+            };
+            Factor::Relative(link)
         };
         if k > 0 {
             factors.push(link(k - 1, Kernel::Cauchy { k: 3.0 }));

@@ -103,14 +103,6 @@ pub struct RelativeChunk {
 }
 
 impl RelativeChunk {
-    /// From standard deviations: rotation (rad), translation (units of chunk k), ln(scale).
-    pub fn from_stds(k: usize, l: usize, l_from_k: Sim3, stds: [f64; 3], kernel: Kernel) -> Self {
-        let [rotation, translation, log_scale] = stds.map(|s| 1.0 / s);
-        let diagonal = [rotation, rotation, rotation, translation, translation, translation, log_scale];
-        let whitening = SMatrix::from_diagonal(&SVector::from(diagonal));
-        Self { k, l, l_from_k, whitening: Box::new(whitening), kernel }
-    }
-
     /// From the covariance of δ; `None` when it is not positive definite.
     pub fn from_covariance(
         k: usize,

@@ -73,11 +73,6 @@ impl SampledView {
         self.depth.is_empty()
     }
 
-    /// Share of samples that have a depth and lie on no edge.
-    pub fn valid_share(&self) -> f64 {
-        self.depth.iter().filter(|z| z.is_finite()).count() as f64 / self.len().max(1) as f64
-    }
-
     /// The median depth in chunk units; `None` when no sample has one.
     pub fn median_depth(&self) -> Option<f64> {
         let mut valid: Vec<f32> = self.depth.iter().copied().filter(|z| z.is_finite()).collect();

@@ -7,7 +7,7 @@ use crate::axes::y_up_from_z_up;
 use crate::bytes::Cursor;
 use crate::error::{ExportError, quoted};
 use nalgebra::{Matrix3, Matrix4, Vector3};
-use vidar_core::{PointCloud, So3, TriangleMesh};
+use vidar_core::{So3, TriangleMesh};
 
 /// Deepest node tree read; bounds the recursion.
 const MAX_DEPTH: usize = 64;
@@ -19,14 +19,6 @@ pub struct Glb {
     pub mesh: TriangleMesh,
     /// The comments that VIDAR's writer put into `asset.extras`.
     pub comments: Vec<String>,
-}
-
-impl Glb {
-    /// The vertices as a cloud.
-    pub fn into_cloud(self) -> PointCloud {
-        let TriangleMesh { positions, normals, colors, confidences, .. } = self.mesh;
-        PointCloud { positions, normals, colors, confidences }
-    }
 }
 
 /// Reads a GLB file; see the [module](super) for the supported part.

@@ -332,11 +332,6 @@ impl SubVolumes {
         Ok(self.sum.insert(sum).volume())
     }
 
-    /// Drops what is kept of [`Self::merged`], and its memory.
-    pub fn forget_merged(&mut self) {
-        self.sum = None;
-    }
-
     /// The surface of [`Self::merged`].
     ///
     /// # Errors

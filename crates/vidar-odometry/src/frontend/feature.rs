@@ -66,16 +66,6 @@ pub struct PixelMeasurement {
 const UNKNOWN_PX: f64 = 1e3;
 
 impl PixelMeasurement {
-    /// A measurement of equal error `sigma_px` in both directions.
-    pub fn isotropic(pixel: Pixel, sigma_px: f64) -> Self {
-        Self { pixel, information: Matrix2::identity() / (sigma_px * sigma_px) }
-    }
-
-    /// A measurement across an edge only: `sigma_px` along the unit vector `normal`.
-    pub fn across_edge(pixel: Pixel, normal: &Vector2<f64>, sigma_px: f64) -> Self {
-        Self { pixel, information: normal * normal.transpose() / (sigma_px * sigma_px) }
-    }
-
     /// Covariance, px²; a direction of which nothing is known gets (1000 px)².
     pub fn covariance(&self) -> Matrix2<f64> {
         let floor = Matrix2::identity() / (UNKNOWN_PX * UNKNOWN_PX);
@@ -118,7 +108,8 @@ mod tests {
     #[test]
     fn nothing_is_known_along_an_edge() {
         let normal = Vector2::new(0.6, 0.8);
-        let measured = PixelMeasurement::across_edge(Pixel::new(3.0, 4.0), &normal, 0.5);
+        let information = normal * normal.transpose() / 0.25;
+        let measured = PixelMeasurement { pixel: Pixel::new(3.0, 4.0), information };
         let along = Vector2::new(-0.8, 0.6);
         let variance = |d: &Vector2<f64>| (d.transpose() * measured.covariance() * d).x;
         assert!((variance(&normal) - 0.25).abs() < 1e-6);

@@ -9,7 +9,7 @@
 //! 3. [`Warp`], [`Template`], [`align_feature`]: each landmark is measured against its **keyframe's** patch, so that errors do
 //!    not add up from frame to frame, with a covariance per measurement.
 //! 4. [`Detector`]: new features of a keyframe in the cells of an [`OccupancyGrid`] that no landmark holds.
-//! 5. [`TwoViewSolver`], [`triangulate`]: motion between two views, with and without a known rotation.
+//! 5. [`TwoViewSolver`], [`triangulate`]: motion between two views.
 //!
 //! Features of unknown depth are measured like landmarks, against their keyframe's patch: a frame-to-frame tracker (KLT)
 //! lets errors add up, and a depth filter beside the smoother would count its measurements twice.

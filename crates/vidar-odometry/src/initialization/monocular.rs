@@ -75,7 +75,7 @@ fn between(
         shared.iter().filter_map(|(a, b)| Some((*a, *b, RayPair { a: ray(a)?, b: ray(b)? }))).collect();
     let pairs: Vec<RayPair> = with_rays.iter().map(|w| w.2).collect();
     let mut solver = TwoViewSolver::default();
-    let found = solver.without_rotation(&pairs, sigma_rad).map_err(|failure| match failure {
+    let found = solver.solve(&pairs, sigma_rad).map_err(|failure| match failure {
         TwoViewFailure::NoParallax { median_rad, .. } => {
             fail(InitFailureReason::Parallax, median_rad.to_degrees(), MIN_PARALLAX_DEG)
         }

@@ -256,7 +256,10 @@ mod tests {
             let turn = So3::exp(&Vector3::new(0.01, 0.02 * f64::from(k), 0.0));
             let current_from_host = Se3::new(turn, Vector3::new(-x, 0.3 * x, 0.1 * x));
             let (pixel, _) = project_with_distance(&camera, &feature, truth, &current_from_host).unwrap();
-            observations.push((current_from_host, PixelMeasurement::isotropic(pixel, 0.3)));
+            observations.push((
+                current_from_host,
+                PixelMeasurement { pixel, information: Matrix2::identity() / 0.09 },
+            ));
         }
         let estimate = unknown_distance(0.2).updated(&camera, &feature, &observations, 9.0).unwrap();
         assert!((estimate.mean - truth).abs() < 0.5 * estimate.variance.sqrt(), "{estimate:?}");

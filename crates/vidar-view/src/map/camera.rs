@@ -111,17 +111,6 @@ pub struct MapCamera {
     pub projection: Projection,
     /// How surfaces seen from behind are drawn.
     pub back_faces: BackFaces,
-    /// Points with `up · p` above this limit are not drawn: opens a ceiling that has no normals.
-    pub cut: Option<Cut>,
-}
-
-/// A horizontal cut that removes everything above it.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Cut {
-    /// Unit direction of up, world.
-    pub up: Vector3<f64>,
-    /// Largest `up · p` that is shown, metres.
-    pub height_m: f64,
 }
 
 /// The fixed viewpoints of a run's pictures.
@@ -190,11 +179,6 @@ impl MapCamera {
         }
     }
 
-    /// The same camera with everything above `height_m` along `up` removed.
-    pub fn cut_above(self, up: &Vector3<f64>, height_m: f64) -> Self {
-        Self { cut: Some(Cut { up: *up, height_m }), ..self }
-    }
-
     /// Viewing direction, unit, world.
     pub fn forward(&self) -> Vector3<f64> {
         self.right.cross(&self.down)
@@ -210,7 +194,6 @@ impl MapCamera {
             down: plane.direction(0.0, -1.0, 0.0),
             projection: Projection::Orthographic { height_m },
             back_faces: BackFaces::Cull,
-            cut: None,
         }
     }
 
@@ -233,7 +216,6 @@ impl MapCamera {
             down,
             projection: Projection::Perspective { vertical_angle_deg: VERTICAL_ANGLE_DEG },
             back_faces: BackFaces::Cull,
-            cut: None,
         }
     }
 
@@ -262,7 +244,6 @@ impl MapCamera {
             down: forward.cross(&right),
             projection: Projection::Perspective { vertical_angle_deg: 68.0 },
             back_faces: BackFaces::Dim,
-            cut: None,
         }
     }
 }

@@ -11,7 +11,7 @@ use vidar_core::{PointCloud, TriangleMesh};
 /// Colour of a surface without colours.
 const PLASTER: [f32; 3] = [214.0, 209.0, 200.0];
 
-/// Every vertex in the camera's frame with its final colour; vertices that are cut away or not finite have a NaN position.
+/// Every vertex in the camera's frame with its final colour; vertices that are hidden or not finite have a NaN position.
 pub(super) fn painted(surface: &MapSurface<'_>, lens: &Lens, shading: &Shading<'_>) -> Vec<Vertex> {
     let computed;
     let normals = match surface {
@@ -32,7 +32,7 @@ pub(super) fn painted(surface: &MapSurface<'_>, lens: &Lens, shading: &Shading<'
             let facing = normal.map(|n| n.normalize().dot(&lens.towards_eye(&place)));
             // Discs have no winding: their normal says which side they are seen from.
             let hidden = is_cloud && lens.culls() && facing.is_some_and(|f| f < 0.0);
-            if hidden || !lens.shows(&place) {
+            if hidden || !place.iter().all(|v| v.is_finite()) {
                 return Vertex::hidden();
             }
             let color = match *shading {

@@ -61,7 +61,6 @@ pub(super) struct Lens {
     focal: f64,
     is_perspective: bool,
     back_faces: BackFaces,
-    cut: Option<super::camera::Cut>,
 }
 
 impl Lens {
@@ -93,17 +92,11 @@ impl Lens {
             focal,
             is_perspective,
             back_faces: camera.back_faces,
-            cut: camera.cut,
         })
     }
 
     pub(super) fn culls(&self) -> bool {
         self.back_faces == BackFaces::Cull
-    }
-
-    /// Whether a point is finite and not cut away.
-    pub(super) fn shows(&self, p: &Vector3<f64>) -> bool {
-        p.iter().all(|v| v.is_finite()) && self.cut.is_none_or(|c| c.up.dot(p) <= c.height_m)
     }
 
     pub(super) fn to_camera(&self, p: &Vector3<f64>) -> [f32; 3] {

@@ -46,13 +46,13 @@ fn factors() -> Vec<Factor> {
             std_rad: 0.01,
         },
         Factor::Attachment(attachment),
-        Factor::Relative(RelativeChunk::from_stds(
-            0,
-            1,
-            x[1].inverse() * x[0] * close,
-            [0.02, 0.05, 0.01],
-            Kernel::GemanMcClure { k: 4.0 },
-        )),
+        Factor::Relative(RelativeChunk {
+            k: 0,
+            l: 1,
+            l_from_k: x[1].inverse() * x[0] * close,
+            whitening: Box::new(SMatrix::from_diagonal(&[50.0, 50.0, 50.0, 20.0, 20.0, 20.0, 100.0].into())),
+            kernel: Kernel::GemanMcClure { k: 4.0 },
+        }),
         Factor::Scale { k: 1, log_scale: 0.4, std: 0.02, kernel: Kernel::Quadratic },
         Factor::ScaleWalk { k: 1, l: 0, log_ratio: 0.8, std: 0.02 },
         Factor::GaugePrior {

@@ -1,6 +1,6 @@
 use super::*;
 use crate::coupled::{Attachment, RelativeChunk};
-use nalgebra::{Matrix6, UnitVector3, Vector3};
+use nalgebra::{Matrix6, SMatrix, SVector, UnitVector3, Vector3};
 use vidar_core::So3;
 
 fn circle(n: usize) -> Vec<Se3> {
@@ -82,8 +82,11 @@ fn a_false_loop_is_let_go_and_a_true_one_is_kept() {
         other => other,
     }));
     let link = |l_from_k| {
-        let stds = [0.01, 0.05 / gauges[1].scale, 0.02];
-        Factor::Relative(RelativeChunk::from_stds(1, 0, l_from_k, stds, Kernel::GemanMcClure { k: 4.0 }))
+        let (r, t) = (0.01, 0.05 / gauges[1].scale);
+        let variances = [r, r, r, t, t, t, 0.02].map(|s| s * s);
+        let covariance = SMatrix::from_diagonal(&SVector::from(variances));
+        let kernel = Kernel::GemanMcClure { k: 4.0 };
+        Factor::Relative(RelativeChunk::from_covariance(1, 0, l_from_k, &covariance, kernel).unwrap())
     };
     let right = gauges[0].inverse() * gauges[1];
     let wrong =

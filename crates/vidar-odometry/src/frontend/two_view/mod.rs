@@ -1,8 +1,7 @@
 //! The motion between two views from pairs of rays: consensus, then refinement.
 //!
-//! With a known rotation (gyroscope) two pairs give the direction of translation, `t ∥ (R a₁ × b₁) × (R a₂ × b₂)`; without
-//! one, five pairs give up to ten essential matrices. Both are scored by the angle of rays to their epipolar planes
-//! (Sampson's first-order distance, truncated) and refined on their inliers. Samples come from a fixed seed, so that the same
+//! Five pairs give up to ten essential matrices, scored by the angle of rays to their epipolar planes (Sampson's first-order
+//! distance, truncated) and refined on their inliers. Samples come from a fixed seed, so that the same
 //! pairs give the same bits. The translation has length one: two views do not know the scale.
 
 mod five_point;
@@ -99,41 +98,11 @@ impl TwoViewSolver {
         &self.inliers
     }
 
-    /// The direction of translation when the rotation is known; `sigma_rad` is the error of a ray (pixel error over focal
-    /// length).
-    ///
-    /// # Errors
-    /// Says what was missing.
-    pub fn with_rotation(
-        &mut self,
-        pairs: &[RayPair],
-        b_from_a: &So3,
-        sigma_rad: f64,
-    ) -> Result<TwoView, TwoViewFailure> {
-        self.check(pairs, 2)?;
-        self.demand_parallax(pairs, b_from_a, sigma_rad)?;
-        let rotation = b_from_a.matrix();
-        let limit2 = (THRESHOLD_SIGMAS * sigma_rad).powi(2);
-        let mut search = Search::new(pairs.len());
-        let mut sampler = Sampler::new(SEED);
-        while search.goes_on(2) {
-            let [i, j]: [usize; 2] = sampler.distinct(pairs.len());
-            let plane = |p: &RayPair| (rotation * p.a).cross(&p.b);
-            let Some(direction) = plane(&pairs[i]).cross(&plane(&pairs[j])).try_normalize(1e-12) else {
-                continue;
-            };
-            // The planes do not tell forth from back; what lies ahead does.
-            search.offer(pairs, &rotation, &direction, limit2);
-            search.offer(pairs, &rotation, &-direction, limit2);
-        }
-        self.finish(pairs, search, sigma_rad, refine::Free::Translation)
-    }
-
     /// Rotation and direction of translation; `sigma_rad` is the error of a ray.
     ///
     /// # Errors
     /// Says what was missing. A motion without parallax has no answer.
-    pub fn without_rotation(&mut self, pairs: &[RayPair], sigma_rad: f64) -> Result<TwoView, TwoViewFailure> {
+    pub fn solve(&mut self, pairs: &[RayPair], sigma_rad: f64) -> Result<TwoView, TwoViewFailure> {
         self.check(pairs, 5)?;
         let limit2 = (THRESHOLD_SIGMAS * sigma_rad).powi(2);
         let mut search = Search::new(pairs.len());
@@ -155,7 +124,7 @@ impl TwoViewSolver {
                 }
             }
         }
-        let solution = self.finish(pairs, search, sigma_rad, refine::Free::Both)?;
+        let solution = self.finish(pairs, search, sigma_rad)?;
         self.demand_parallax(pairs, &solution.b_from_a.rotation, sigma_rad)?;
         Ok(solution)
     }
@@ -201,7 +170,6 @@ impl TwoViewSolver {
         pairs: &[RayPair],
         search: Search,
         sigma_rad: f64,
-        free: refine::Free,
     ) -> Result<TwoView, TwoViewFailure> {
         let samples = search.drawn;
         let needed = MIN_INLIERS;
@@ -209,7 +177,7 @@ impl TwoViewSolver {
         let limit = THRESHOLD_SIGMAS * sigma_rad;
         let mut count = self.mark(pairs, &motion, limit);
         for _ in 0..2 {
-            let refined = refine::refine(pairs, &self.inliers, &motion, sigma_rad, free);
+            let refined = refine::refine(pairs, &self.inliers, &motion, sigma_rad);
             let before = std::mem::take(&mut count);
             count = self.mark(pairs, &refined, limit);
             if count * 10 < before * 9 {

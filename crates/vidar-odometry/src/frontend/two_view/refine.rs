@@ -6,20 +6,11 @@ use nalgebra::{Matrix5, RowVector5, Vector3, Vector5};
 use vidar_core::{LieGroup, Se3, So3};
 use vidar_solve::Kernel;
 
-/// What may change.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Free {
-    /// The direction of translation.
-    Translation,
-    /// Rotation and direction of translation.
-    Both,
-}
-
 /// Errors beyond this many standard deviations lose weight.
 const KERNEL: Kernel = Kernel::Huber { k: 1.5 };
 
 /// The motion that fits the marked pairs best, from a start that fits them well.
-pub(super) fn refine(pairs: &[RayPair], inliers: &[bool], start: &Se3, sigma_rad: f64, free: Free) -> Se3 {
+pub(super) fn refine(pairs: &[RayPair], inliers: &[bool], start: &Se3, sigma_rad: f64) -> Se3 {
     let mut motion = *start;
     for _ in 0..8 {
         let (mut h, mut g) = (Matrix5::zeros(), Vector5::zeros());
@@ -29,11 +20,6 @@ pub(super) fn refine(pairs: &[RayPair], inliers: &[bool], start: &Se3, sigma_rad
             let weight = KERNEL.weight_of_length(normalised) / (slope * slope);
             h += jacobian.transpose() * jacobian * weight;
             g += jacobian.transpose() * (error * weight);
-        }
-        if free == Free::Translation {
-            h.fixed_rows_mut::<3>(0).fill(0.0);
-            h.fixed_columns_mut::<3>(0).fill(0.0);
-            g.fixed_rows_mut::<3>(0).fill(0.0);
         }
         // Directions that nothing fixes must not move.
         let ridge = 1e-9 * h.trace().max(1e-12);
