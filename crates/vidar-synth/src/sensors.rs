@@ -51,7 +51,7 @@ impl SynthConfig {
         }
     }
 
-    /// True scale factors of gyroscope and accelerometer per axis: a reading is motion times this, plus bias and noise.
+    /// True scale factors of gyroscope and accelerometer per axis: a measurement is motion times this, plus bias and noise.
     pub fn imu_scale(&self) -> [Vector3<f64>; 2] {
         let mut random = Gaussian::new(stream(self.seed, Purpose::ImuScale));
         let mut draw = || Vector3::repeat(1.0) + random.vector() * self.device.imu_scale_sigma;

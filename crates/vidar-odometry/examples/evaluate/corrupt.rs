@@ -9,7 +9,7 @@ use vidar_odometry::simulate::Random;
 pub struct Corruptor {
     random: Random,
     image_noise: f64,
-    /// Standard deviations per reading: rad/s, m/s².
+    /// Standard deviations per IMU sample: rad/s, m/s².
     imu_noise: [f64; 2],
     halve: bool,
 }
@@ -18,9 +18,9 @@ impl Corruptor {
     pub fn new(options: &Options, noise: Option<ImuNoise>) -> Self {
         // Variances add up: what is missing to FACTOR times the data sheet's.
         let more = (options.imu_noise * options.imu_noise - 1.0).max(0.0).sqrt();
-        let per_reading = |density: f64, n: &ImuNoise| more * density * n.rate_hz.sqrt();
+        let per_sample = |density: f64, n: &ImuNoise| more * density * n.rate_hz.sqrt();
         let imu_noise = noise.map_or([0.0; 2], |n| {
-            [per_reading(n.gyro_noise_density, &n), per_reading(n.accel_noise_density, &n)]
+            [per_sample(n.gyro_noise_density, &n), per_sample(n.accel_noise_density, &n)]
         });
         Self { random: Random::new(7), image_noise: options.image_noise, imu_noise, halve: options.halve }
     }

@@ -60,7 +60,7 @@ fn inertial_factor_agrees_with_numeric_derivatives() {
 }
 
 #[test]
-fn shifted_readings_are_those_of_the_shifted_stretch() {
+fn shifted_measurements_are_those_of_the_shifted_stretch() {
     let course = Course { kind: CourseKind::Eight, secs: 3.0, speed: 1.2, phase: 0.2 };
     let settings = SimulationConfig { noise_scale: 0.0, imu_rate_hz: 1000.0, ..Default::default() };
     let simulation = Simulation::new(&course, 0.0, 2.0, &settings);
@@ -78,7 +78,7 @@ fn shifted_readings_are_those_of_the_shifted_stretch() {
         let not_at_all = residual(&cut(bias, 100, 300), &i, &j, Shift::NONE);
         ((shifted - exact).amax(), (not_at_all - exact).amax())
     };
-    // The shift holds the rates of one reading: what they change by meanwhile is of second order.
+    // The shift holds the rates of one sample: what they change by meanwhile is of second order.
     let lefts = [(8, 4), (4, 2), (2, 1)].map(|(begin, end)| left(i.bias, begin, end));
     assert!(lefts[0].0 < 0.1 * lefts[0].1, "{lefts:?}");
     assert!(lefts.windows(2).all(|w| w[1].0 < 0.3 * w[0].0), "a quarter per halving: {lefts:?}");
@@ -417,7 +417,7 @@ fn a_clock_that_is_10_ms_off_is_found() {
 }
 
 #[test]
-fn dropping_a_frame_joins_its_readings() {
+fn dropping_a_frame_joins_its_imu_measurements() {
     let (mut odometry, simulation) = flown(7, 2.0, |_, _| {});
     let smoother = odometry.smoother().unwrap();
     let keyframes: Vec<FrameId> = smoother.keyframes().collect();

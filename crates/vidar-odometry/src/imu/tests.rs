@@ -13,7 +13,7 @@ fn model() -> ImuModel {
     ImuModel::from_data_sheet(&ImuNoise::EUROC, 2.0, 2.0)
 }
 
-fn reading(flight: &impl Flight, secs: f64, bias: &Bias) -> ImuSample {
+fn sample(flight: &impl Flight, secs: f64, bias: &Bias) -> ImuSample {
     let m = flight.motion(secs);
     let up = Vector3::new(0.0, 0.0, GRAVITY_MPS2);
     ImuSample {
@@ -25,7 +25,7 @@ fn reading(flight: &impl Flight, secs: f64, bias: &Bias) -> ImuSample {
 
 fn imu_samples(from: f64, until: f64, rate: f64, bias: &Bias) -> Vec<ImuSample> {
     let n = ((until - from) * rate).round() as usize;
-    (0..=n).map(|k| reading(&COURSE, from + k as f64 / rate, bias)).collect()
+    (0..=n).map(|k| sample(&COURSE, from + k as f64 / rate, bias)).collect()
 }
 
 fn bias() -> Bias {
@@ -39,7 +39,7 @@ fn runge_kutta(from: f64, until: f64) -> (So3, Vector3<f64>, Vector3<f64>) {
     let n = ((until - from) / h).round() as usize;
     let none = Bias::ZERO;
     let at = |t: f64| {
-        let r = reading(&COURSE, t, &none);
+        let r = sample(&COURSE, t, &none);
         // The clock of IMU measurements is in whole nanoseconds; the rates are exact.
         (r.gyro.0, r.accel.0)
     };
@@ -123,7 +123,7 @@ fn derivatives_by_biases_agree_with_numeric_ones() {
 }
 
 #[test]
-fn covariance_of_motion_is_what_noisy_readings_scatter() {
+fn covariance_of_motion_is_what_noisy_measurements_scatter() {
     let model = model();
     let clean = imu_samples(0.5, 0.8, 200.0, &Bias::ZERO);
     let exact = Preintegration::new(model, Bias::ZERO, &clean);
@@ -175,13 +175,13 @@ fn gains_of_both_sensors_act_as_their_derivatives_say() {
     let plain = Preintegration::new(model(), Bias::ZERO, &samples);
     let step = 1e-5;
     for axis in 0..6 {
-        // A reading that is larger by a share of itself is one whose bias is lower by as much.
+        // A measurement that is larger by a share of itself is one whose bias is lower by as much.
         let scaled: Vec<ImuSample> = samples
             .iter()
             .map(|s| {
                 let (mut gyro, mut accel) = (s.gyro.0, s.accel.0);
-                let reading = if axis < 3 { &mut gyro[axis] } else { &mut accel[axis - 3] };
-                *reading *= 1.0 + step;
+                let measured = if axis < 3 { &mut gyro[axis] } else { &mut accel[axis - 3] };
+                *measured *= 1.0 + step;
                 ImuSample { time: s.time, gyro: AngularRate(gyro), accel: SpecificForce(accel) }
             })
             .collect();
@@ -253,7 +253,7 @@ fn propagated_covariance_grows_and_stays_symmetric() {
 }
 
 #[test]
-fn a_gap_and_a_saturated_reading_inflate_the_noise() {
+fn a_gap_and_a_saturated_sample_inflate_the_noise() {
     let mut samples = imu_samples(1.0, 1.5, 200.0, &Bias::ZERO);
     let plain = Preintegration::new(model(), Bias::ZERO, &samples).delta.covariance;
     let mut clipped = samples.clone();
@@ -265,7 +265,7 @@ fn a_gap_and_a_saturated_reading_inflate_the_noise() {
 }
 
 #[test]
-fn the_buffer_cuts_between_readings_and_tells_gaps() {
+fn the_buffer_cuts_between_samples_and_tells_gaps() {
     let mut buffer = ImuBuffer::new(200.0);
     let all = imu_samples(0.0, 1.0, 200.0, &Bias::ZERO);
     for (k, s) in all.iter().enumerate().filter(|(k, _)| !(100..130).contains(k)) {

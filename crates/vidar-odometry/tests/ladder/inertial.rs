@@ -5,7 +5,7 @@ use nalgebra::Vector3;
 use vidar_core::{Duration, Health, LieGroup, Se3, So3};
 
 #[test]
-fn a_gap_of_readings_is_bridged() {
+fn a_gap_of_imu_samples_is_bridged() {
     let mut recording = recording();
     let from = EPOCH + Duration::from_millis(5010);
     recording.imu.retain(|s| s.time < from || s.time > from + Duration::from_millis(100));
@@ -15,7 +15,7 @@ fn a_gap_of_readings_is_bridged() {
 }
 
 #[test]
-fn a_second_without_readings_is_a_loss_with_its_reason_and_a_new_segment() {
+fn a_second_without_imu_samples_is_a_loss_with_its_reason_and_a_new_segment() {
     let mut recording = recording();
     let from = EPOCH + Duration::from_millis(4010);
     recording.imu.retain(|s| s.time < from || s.time > from + Duration::from_millis(1000));

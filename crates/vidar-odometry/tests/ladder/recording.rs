@@ -224,14 +224,14 @@ impl Recording {
             .collect();
         let up = self.truth[0].world_from_body.rotation.inverse() * Vector3::new(0.0, 0.0, 9.81);
         standing.imu = (0..secs * 200)
-            .map(|k| rest_reading(EPOCH + Duration::from_millis(5 * k), &up, k as u64))
+            .map(|k| sample_at_rest(EPOCH + Duration::from_millis(5 * k), &up, k as u64))
             .collect();
         standing
     }
 }
 
-/// What an IMU reads at rest, with a gyroscope bias of 0.01 rad/s about x.
-pub fn rest_reading(time: Timestamp, up_in_body: &Vector3<f64>, seed: u64) -> ImuSample {
+/// What an IMU measures at rest, with a gyroscope bias of 0.01 rad/s about x.
+pub fn sample_at_rest(time: Timestamp, up_in_body: &Vector3<f64>, seed: u64) -> ImuSample {
     let mut random = SplitMix64::new(seed);
     let mut noise = || random.uniform() - 0.5;
     let gyro = Vector3::from_fn(|_, _| 0.008 * noise()) + Vector3::new(0.01, 0.0, 0.0);

@@ -1,7 +1,7 @@
 //! Bodies that stand still: at the beginning, in the middle, for long.
 
 use crate::recording::{
-    EPOCH, Recording, add_noise, lost, recording, rendered_after_creeping, rendered_from, rest_reading,
+    EPOCH, Recording, add_noise, lost, recording, rendered_after_creeping, rendered_from, sample_at_rest,
 };
 use nalgebra::Vector3;
 use vidar_core::{AngularRate, Duration, ImuSample, LieGroup, StampedPose, Timestamp};
@@ -56,10 +56,10 @@ fn with_a_pause(more_secs: i64) -> Recording {
     let up = forth.truth[0].world_from_body.rotation.inverse() * Vector3::new(0.0, 0.0, 9.81);
     let begin = EPOCH + end;
     for k in 1..more_secs * 200 {
-        let mut reading = rest_reading(begin + Duration::from_millis(5 * k), &up, k as u64);
+        let mut sample = sample_at_rest(begin + Duration::from_millis(5 * k), &up, k as u64);
         // The simulated IMU's bias there is small.
-        reading.gyro.0.x -= 0.01;
-        all.imu.push(reading);
+        sample.gyro.0.x -= 0.01;
+        all.imu.push(sample);
     }
     for k in 1..more_secs * 20 {
         let time = begin + Duration::from_millis(50 * k);
