@@ -6,7 +6,9 @@ use super::prior::Part;
 use super::window::{CALIBRATION_DIM, CalibrationState};
 use crate::imu::{NavState, Vector15};
 use nalgebra::{SVector, Vector3};
+use std::convert::Infallible;
 use vidar_core::{FrameId, LandmarkId};
+use vidar_solve::levenberg_marquardt::{Decrease, Increase, LeastSquares, Limits, Schedule, Trial, minimise};
 
 /// An observation that does not fit.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -41,10 +43,16 @@ pub struct OptimiseReport {
 /// Smallest relative change of the cost that is worth another step.
 const CONVERGED_CHANGE: f64 = 1e-4;
 
-/// Nearly Gauss-Newton to begin with.
-const FIRST_LAMBDA: f64 = 1e-4;
-const LEAST_LAMBDA: f64 = 1e-9;
-const MOST_LAMBDA: f64 = 1e8;
+/// Nielsen's damping, nearly Gauss-Newton to begin with.
+const SCHEDULE: Schedule = Schedule {
+    first: 1e-4,
+    least: 1e-9,
+    on_accepted: Decrease::GainRatio,
+    on_rejected: FAILURE,
+    on_unsolvable: Some(FAILURE),
+};
+const FAILURE: Increase = Increase { acceleration: 4.0, least: 1e-3, ..Increase::by(4.0) };
+const LIMITS: Limits = Limits { damping: 1e8, ..Limits::NONE };
 
 /// Inverse squares of the steps at which damping of 1 sets in: 0.1 rad, 1 m; 1 m/s, 0.05 rad/s, 0.5 m/s²; calibration
 /// 0.02 rad, 2 cm, 5 ms.
@@ -72,50 +80,19 @@ impl Smoother {
 
     /// As [`Smoother::optimise`], into a report whose memory is used again.
     pub fn optimise_into(&mut self, max_iterations: usize, report: &mut OptimiseReport) {
-        self.optimise_from(FIRST_LAMBDA, max_iterations, report);
+        self.optimise_from(SCHEDULE.first, max_iterations, report);
     }
 
     /// As [`Smoother::optimise_into`], with a damping to begin with (larger for rough starts).
-    pub(crate) fn optimise_from(
-        &mut self,
-        first_lambda: f64,
-        max_iterations: usize,
-        report: &mut OptimiseReport,
-    ) {
+    pub(crate) fn optimise_from(&mut self, first: f64, max_iterations: usize, report: &mut OptimiseReport) {
         let mut system = std::mem::take(&mut self.system);
-        let mut lambda = first_lambda;
-        let mut growth = 4.0;
-        let mut cost = self.linearise(&mut system, lambda);
-        (report.iterations, report.converged, report.cost_before) = (0, false, cost);
-        while report.iterations < max_iterations && !report.converged && lambda < MOST_LAMBDA {
-            report.iterations += 1;
-            let calibration = self.save(&mut system);
-            let gain = solve(&mut system, lambda);
-            let Some(expected) = gain else {
-                lambda = (lambda * growth).max(1e-3);
-                growth *= 4.0;
-                cost = self.linearise(&mut system, lambda);
-                continue;
-            };
-            self.apply(&system);
-            let lambda_next = (lambda / 3.0).max(LEAST_LAMBDA);
-            let after = self.linearise(&mut system, lambda_next);
-            let change = cost - after;
-            if change >= 0.0 || -change < 1e-9 * cost {
-                let ratio = change / expected.max(1e-300);
-                lambda =
-                    (lambda * (1.0 - (2.0 * ratio - 1.0).powi(3)).clamp(1.0 / 3.0, 2.0)).max(LEAST_LAMBDA);
-                growth = 4.0;
-                report.converged = change <= CONVERGED_CHANGE * cost;
-                cost = after;
-            } else {
-                self.restore(&system, calibration);
-                lambda = (lambda * growth).max(1e-3);
-                growth *= 4.0;
-                cost = self.linearise(&mut system, lambda);
-            }
-        }
-        report.cost_after = cost;
+        let cost = self.linearise(&mut system, first);
+        let calibration = self.calibration;
+        let mut window = Window { smoother: self, system: &mut system, calibration, promised: 0.0 };
+        let limits = Limits { trials: max_iterations, ..LIMITS };
+        let Ok(done) = minimise(&mut window, cost, &Schedule { first, ..SCHEDULE }, &limits);
+        (report.iterations, report.converged) = (done.trials, done.converged);
+        (report.cost_before, report.cost_after) = (done.cost_before, done.cost_after);
         self.system = system;
         self.find_outliers(report);
     }
@@ -191,6 +168,51 @@ impl Smoother {
         }
         report.observations = all;
         report.chi2_per_dof = if fitting > 0 { sum / (2 * fitting) as f64 } else { 0.0 };
+    }
+}
+
+/// The window while it is optimised.
+struct Window<'a> {
+    smoother: &'a mut Smoother,
+    system: &'a mut System,
+    /// The calibration before the last trial; what else it moved is saved in `system`.
+    calibration: CalibrationState,
+    promised: f64,
+}
+
+impl LeastSquares for Window<'_> {
+    type Error = Infallible;
+    type Values = ();
+
+    /// Ends linearised at the new values: the cost comes with it, and of most trials the system is the next one's.
+    fn try_step(&mut self, damping: f64) -> Result<Option<(f64, ())>, Infallible> {
+        self.calibration = self.smoother.save(self.system);
+        let Some(promised) = solve(self.system, damping) else { return Ok(None) };
+        self.promised = promised;
+        self.smoother.apply(self.system);
+        Ok(Some((self.smoother.linearise(self.system, (damping / 3.0).max(SCHEDULE.least)), ())))
+    }
+
+    fn promised_decrease(&self) -> f64 {
+        self.promised
+    }
+
+    /// A cost that rises by what rounding makes of it is none that rises.
+    fn improves(&self, cost_before: f64, cost_after: f64) -> bool {
+        let change = cost_before - cost_after;
+        change >= 0.0 || -change < 1e-9 * cost_before
+    }
+
+    fn accept(&mut self, (): ()) {}
+
+    /// The cost is that of IMU measurements which the trial may have integrated again, about its own biases.
+    fn reject(&mut self, _: f64, next_damping: f64) -> f64 {
+        self.smoother.restore(self.system, self.calibration);
+        self.smoother.linearise(self.system, next_damping)
+    }
+
+    fn has_converged(&mut self, trial: &Trial) -> bool {
+        trial.is_accepted && trial.decrease() <= CONVERGED_CHANGE * trial.cost_before
     }
 }
 

@@ -7,19 +7,24 @@ use super::problem::{FRAME_DIM, Problem};
 use super::progress::Watch;
 use crate::imu::{NavState, Vector15};
 use nalgebra::Vector3;
+use vidar_solve::levenberg_marquardt::{self, Decrease, Increase, LeastSquares, Limits, Schedule, Trial};
 
 /// Rounds of minimising and leaving out what does not fit.
 const ROUNDS: usize = 3;
 
-/// Iterations of a round at most. The cost of healthy recordings settles within ten.
-const ITERATIONS: usize = 15;
-
 /// A round ends when an iteration lowers the cost by less than this share.
 const SETTLED_SHARE: f64 = 1e-4;
 
-/// First damping, and the largest at which a descent is still looked for.
-const FIRST_DAMPING: f64 = 1e-4;
-const MAX_DAMPING: f64 = 1e4;
+const SCHEDULE: Schedule = Schedule {
+    first: 1e-4,
+    least: 1e-9,
+    on_accepted: Decrease::Factor(0.2),
+    on_rejected: Increase::by(8.0),
+    on_unsolvable: Some(Increase::by(8.0)),
+};
+
+/// The cost of healthy recordings settles within ten iterations.
+const LIMITS: Limits = Limits { iterations: 15, damping: 1e4, ..Limits::NONE };
 
 /// Squared whitened error, 2 degrees of freedom, beyond which an observation is left out: 99.9 %, and in the first round
 /// more, where states are still to settle.
@@ -80,39 +85,55 @@ pub(super) fn solution(problem: &Problem) -> Option<System> {
 }
 
 fn minimise(problem: &mut Problem, watch: &mut Watch<'_>) -> Result<usize, AdjustmentError> {
-    let mut system = System::new(problem);
-    let mut damping = FIRST_DAMPING;
-    let mut before = Values::default();
-    for iteration in 0..ITERATIONS {
-        watch.iteration()?;
-        follow(problem);
-        let best = cost(problem).total();
-        before.keep(problem);
-        let mut lowered = None;
-        while damping <= MAX_DAMPING {
-            linearise(problem, damping, &mut system);
-            let extra: Vec<f64> =
-                (0..problem.dim()).map(|k| damping * system.h.diagonal(k).max(1e-12)).collect();
-            if system.h.factorise(&extra, &mut system.factor) {
-                let mut step: Vec<f64> = system.gradient.iter().map(|g| -g).collect();
-                system.factor.forward(&mut step);
-                system.factor.backward(&mut step);
-                let found =
-                    if advance(problem, &system, &step) { cost(problem).total() } else { f64::INFINITY };
-                if found < best {
-                    lowered = Some(best - found);
-                    damping = (damping * 0.2).max(1e-9);
-                    break;
-                }
-                before.restore(problem);
-            }
-            damping *= 8.0;
-        }
-        if lowered.is_none_or(|by| by < SETTLED_SHARE * best) {
-            return Ok(iteration + 1);
-        }
+    let mut round = Round { system: System::new(problem), before: Values::default(), problem, watch };
+    // Linearising tells the cost at the start, too: it integrates again before.
+    Ok(levenberg_marquardt::minimise(&mut round, f64::INFINITY, &SCHEDULE, &LIMITS)?.iterations)
+}
+
+/// The recording while it is minimised.
+struct Round<'a, 'w> {
+    problem: &'a mut Problem,
+    watch: &'a mut Watch<'w>,
+    system: System,
+    before: Values,
+}
+
+impl LeastSquares for Round<'_, '_> {
+    type Error = AdjustmentError;
+    type Values = ();
+
+    fn linearise(&mut self, _: f64) -> Result<f64, AdjustmentError> {
+        self.watch.iteration()?;
+        follow(self.problem);
+        self.before.keep(self.problem);
+        Ok(cost(self.problem).total())
     }
-    Ok(ITERATIONS)
+
+    /// The system holds the damping of the landmarks that it eliminates, so each trial has its own.
+    fn try_step(&mut self, damping: f64) -> Result<Option<(f64, ())>, AdjustmentError> {
+        let Self { problem, system, .. } = self;
+        linearise(problem, damping, system);
+        let extra: Vec<f64> = (0..problem.dim()).map(|k| damping * system.h.diagonal(k).max(1e-12)).collect();
+        if !system.h.factorise(&extra, &mut system.factor) {
+            return Ok(None);
+        }
+        let mut step: Vec<f64> = system.gradient.iter().map(|g| -g).collect();
+        system.factor.forward(&mut step);
+        system.factor.backward(&mut step);
+        let is_valid = advance(problem, system, &step);
+        Ok(Some((if is_valid { cost(problem).total() } else { f64::INFINITY }, ())))
+    }
+
+    fn accept(&mut self, (): ()) {}
+
+    fn reject(&mut self, cost: f64, _: f64) -> f64 {
+        self.before.restore(self.problem);
+        cost
+    }
+
+    fn has_converged(&mut self, trial: &Trial) -> bool {
+        trial.is_accepted && trial.decrease() < SETTLED_SHARE * trial.cost_before
+    }
 }
 
 /// Integrates again where biases or gains have moved.

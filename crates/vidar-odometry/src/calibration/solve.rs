@@ -5,11 +5,24 @@ use super::path::GyroPath;
 use super::window::{Noise, Reduced, Window};
 use crate::gyro_alignment::RateSample;
 use nalgebra::SMatrix;
+use std::convert::Infallible;
+use vidar_solve::levenberg_marquardt::{Decrease, Increase, LeastSquares, Limits, Schedule, Trial, minimise};
 use vidar_solve::statistics::{STD_PER_MAD, median};
 
-/// Rounds of scale estimation, and steps in each.
-const COARSE: (usize, usize) = (5, 4);
-const FINE: (usize, usize) = (5, 6);
+/// Rounds of scale estimation.
+const ROUNDS: usize = 5;
+/// Steps that are tried in each, of few stretches and of all.
+const COARSE: Limits = Limits { trials: 4, ..Limits::NONE };
+const FINE: Limits = Limits { trials: 6, ..Limits::NONE };
+
+const SCHEDULE: Schedule = Schedule {
+    first: 1e-3,
+    least: 1e-9,
+    on_accepted: Decrease::Factor(0.2),
+    on_rejected: Increase { most: 1e6, ..Increase::by(10.0) },
+    on_unsolvable: Some(Increase::by(10.0)),
+};
+
 /// Starts that are refined.
 const MAX_STARTS: usize = 8;
 
@@ -53,39 +66,28 @@ impl Problem<'_> {
     }
 
     /// Levenberg-Marquardt with the pixel noise estimated anew from the residuals in each round.
-    fn refine(&self, start: &Parameters, windows: &[Window], rounds: (usize, usize)) -> Option<Solution> {
-        let mut parameters = *start;
+    fn refine(&self, start: &Parameters, windows: &[Window], limits: Limits) -> Option<Solution> {
         let mut windows = windows.to_vec();
         for window in &mut windows {
-            window.restart(&parameters, &self.path(&parameters));
+            window.restart(start, &self.path(start));
         }
-        let mut noise = Noise { pixel: PIXEL_SIGMA.1, gyro: self.gyro_noise };
-        let mut damping = 1e-3;
-        let mut cost = f64::INFINITY;
-        for round in 0..rounds.0 {
-            let path = self.path(&parameters);
+        let noise = Noise { pixel: PIXEL_SIGMA.1, gyro: self.gyro_noise };
+        let at = Solution { parameters: *start, windows, cost: f64::INFINITY, noise };
+        let mut refinement = Refinement { problem: self, at };
+        let mut schedule = SCHEDULE;
+        for round in 0..ROUNDS {
+            let at = &mut refinement.at;
+            let path = self.path(&at.parameters);
             // The scale falls by at most four a round, so that the kernel does not close round a wrong start.
-            let scale = residual_scale(&windows, &parameters, &path)?.clamp(PIXEL_SIGMA.0, PIXEL_SIGMA.1);
-            noise.pixel = if round == 0 { (2.0 * scale).max(1.0) } else { scale };
-            cost = self.cost(&parameters, &windows, &noise);
-            for _ in 0..rounds.1 {
-                let Some((next, moved, there)) = self.step(&parameters, &windows, &noise, damping) else {
-                    damping *= 10.0;
-                    continue;
-                };
-                if there < cost {
-                    let gain = cost - there;
-                    (parameters, windows, cost) = (next, moved, there);
-                    damping = (damping * 0.2).max(1e-9);
-                    if gain < 1e-5 * cost {
-                        break;
-                    }
-                } else {
-                    damping = (damping * 10.0).min(1e6);
-                }
-            }
+            let scale =
+                residual_scale(&at.windows, &at.parameters, &path)?.clamp(PIXEL_SIGMA.0, PIXEL_SIGMA.1);
+            at.noise.pixel = if round == 0 { (2.0 * scale).max(1.0) } else { scale };
+            at.cost = self.cost(&at.parameters, &at.windows, &at.noise);
+            let cost = at.cost;
+            let Ok(report) = minimise(&mut refinement, cost, &schedule, &limits);
+            schedule.first = report.damping;
         }
-        Some(Solution { parameters, windows, cost, noise })
+        Some(refinement.at)
     }
 
     fn cost(&self, parameters: &Parameters, windows: &[Window], noise: &Noise) -> f64 {
@@ -94,27 +96,20 @@ impl Problem<'_> {
         0.5 * off.norm_squared() + windows.iter().map(|w| w.cost(parameters, &path, noise)).sum::<f64>()
     }
 
-    fn step(
-        &self,
-        parameters: &Parameters,
-        windows: &[Window],
-        noise: &Noise,
-        damping: f64,
-    ) -> Option<(Parameters, Vec<Window>, f64)> {
-        let (mut h, mut g, reduced) = self.reduce(parameters, windows, noise, damping)?;
+    fn step(&self, at: &Solution, damping: f64) -> Option<Solution> {
+        let (mut h, g, reduced) = self.reduce(&at.parameters, &at.windows, &at.noise, damping)?;
         for p in 0..DIM {
             h[(p, p)] *= 1.0 + damping;
         }
         let step = h.cholesky()?.solve(&g);
-        g = step;
-        if !g.iter().all(|v| v.is_finite()) {
+        if !step.iter().all(|v| v.is_finite()) {
             return None;
         }
-        let next = parameters.plus(&g);
-        let mut moved = windows.to_vec();
-        moved.iter_mut().zip(&reduced).for_each(|(w, r)| w.step(r, &g));
-        let cost = self.cost(&next, &moved, noise);
-        cost.is_finite().then_some((next, moved, cost))
+        let parameters = at.parameters.plus(&step);
+        let mut windows = at.windows.clone();
+        windows.iter_mut().zip(&reduced).for_each(|(w, r)| w.step(r, &step));
+        let cost = self.cost(&parameters, &windows, &at.noise);
+        cost.is_finite().then_some(Solution { parameters, windows, cost, noise: at.noise })
     }
 
     fn reduce(
@@ -154,6 +149,29 @@ impl Problem<'_> {
             spread += r.gradient * r.gradient.transpose();
         }
         Some([inverse, inverse * spread * inverse])
+    }
+}
+
+/// A solution while it is refined.
+struct Refinement<'a> {
+    problem: &'a Problem<'a>,
+    at: Solution,
+}
+
+impl LeastSquares for Refinement<'_> {
+    type Error = Infallible;
+    type Values = Solution;
+
+    fn try_step(&mut self, damping: f64) -> Result<Option<(f64, Solution)>, Infallible> {
+        Ok(self.problem.step(&self.at, damping).map(|tried| (tried.cost, tried)))
+    }
+
+    fn accept(&mut self, values: Solution) {
+        self.at = values;
+    }
+
+    fn has_converged(&mut self, trial: &Trial) -> bool {
+        trial.is_accepted && trial.decrease() < 1e-5 * trial.cost_after
     }
 }
 

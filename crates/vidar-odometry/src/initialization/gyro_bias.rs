@@ -7,7 +7,9 @@
 
 use crate::imu::Bias;
 use nalgebra::{Matrix3, Vector3};
+use std::convert::Infallible;
 use vidar_core::So3;
+use vidar_solve::levenberg_marquardt::{self, Decrease, Increase, LeastSquares, Limits, Schedule, Trial};
 use vidar_solve::statistics::median_upper;
 
 /// Rays of common points in two views, with the rotation between the views as a function of the bias.
@@ -18,8 +20,16 @@ pub(crate) struct RayPair<F: Fn(&Bias) -> So3> {
     pub(crate) rotation: F,
 }
 
-/// Steps of Newton's method.
-const STEPS: usize = 12;
+/// Steps of Newton's method, damped.
+const LIMITS: Limits = Limits { trials: 12, ..Limits::NONE };
+const SCHEDULE: Schedule = Schedule {
+    first: 1e-3,
+    least: 0.0,
+    on_accepted: Decrease::Factor(0.2),
+    on_rejected: Increase { least: 1e-3, ..Increase::by(10.0) },
+    // Far from the solution the second derivatives need not be positive definite.
+    on_unsolvable: Some(Increase { least: 1.0, ..Increase::by(10.0) }),
+};
 
 /// Step of the numeric derivatives, rad/s.
 const H: f64 = 1e-4;
@@ -64,33 +74,53 @@ fn minimise<F: Fn(&Bias) -> So3>(pairs: &[RayPair<F>], start: Vector3<f64>) -> V
         let bias = Bias { gyro: *gyro, accel: Vector3::zeros() };
         pairs.iter().map(|p| smallest_eigenvalue(&p.rays, &(p.rotation)(&bias).matrix())).sum()
     };
-    let mut at = start;
-    let mut value = cost(&at);
-    let mut damping = 1e-3;
-    for _ in 0..STEPS {
-        let (gradient, hessian) = derivatives(&cost, &at, value);
-        let mut damped = hessian;
+    let (derivatives, value) = ((Vector3::zeros(), Matrix3::zeros()), cost(&start));
+    let mut search = Search { cost, start, at: start, derivatives, step: 0.0 };
+    let Ok(_) = levenberg_marquardt::minimise(&mut search, value, &SCHEDULE, &LIMITS);
+    search.at
+}
+
+/// Newton's method from `start`.
+struct Search<C> {
+    cost: C,
+    start: Vector3<f64>,
+    at: Vector3<f64>,
+    /// Gradient and second derivatives there.
+    derivatives: (Vector3<f64>, Matrix3<f64>),
+    /// Length of the last step, rad/s.
+    step: f64,
+}
+
+impl<C: Fn(&Vector3<f64>) -> f64> LeastSquares for Search<C> {
+    type Error = Infallible;
+    /// The step.
+    type Values = Vector3<f64>;
+
+    fn linearise(&mut self, value: f64) -> Result<f64, Infallible> {
+        self.derivatives = derivatives(&self.cost, &self.at, value);
+        Ok(value)
+    }
+
+    fn try_step(&mut self, damping: f64) -> Result<Option<(f64, Vector3<f64>)>, Infallible> {
+        let (gradient, hessian) = &self.derivatives;
+        let mut damped = *hessian;
         for k in 0..3 {
             damped[(k, k)] += damping * hessian[(k, k)].abs() + 1e-12;
         }
-        let Some(step) = damped.cholesky().map(|c| c.solve(&-gradient)) else {
-            damping = (damping * 10.0).max(1.0);
-            continue;
-        };
-        let next = at + step;
-        let next_value = cost(&next);
-        if next_value < value && (next - start).norm() < REACH {
-            let done = step.norm() < 1e-6;
-            (at, value) = (next, next_value);
-            damping *= 0.2;
-            if done {
-                break;
-            }
-        } else {
-            damping = (damping * 10.0).max(1e-3);
-        }
+        let Some(step) = damped.cholesky().map(|c| c.solve(&-gradient)) else { return Ok(None) };
+        let next = self.at + step;
+        let is_near = (next - self.start).norm() < REACH;
+        Ok(Some((if is_near { (self.cost)(&next) } else { f64::INFINITY }, step)))
     }
-    at
+
+    fn accept(&mut self, step: Vector3<f64>) {
+        self.at += step;
+        self.step = step.norm();
+    }
+
+    fn has_converged(&mut self, trial: &Trial) -> bool {
+        trial.is_accepted && self.step < 1e-6
+    }
 }
 
 fn smallest_eigenvalue(rays: &[(Vector3<f64>, Vector3<f64>)], rotation: &Matrix3<f64>) -> f64 {
