@@ -5,6 +5,7 @@ use nalgebra::{DMatrix, SVector, Vector6};
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 use vidar_core::{LieGroup, Se3, Sim3};
+use vidar_solve::levenberg_marquardt::{Decrease, Increase, LeastSquares, Limits, Schedule, Trial, minimise};
 use vidar_solve::{Kernel, NormalEquations, SolveError};
 
 /// What is estimated.
@@ -194,8 +195,18 @@ fn cost(state: &CoupledState, factors: &[&Factor], widening: f64) -> f64 {
     factors.iter().map(|f| kernel_of(f, widening).loss(squared_error(f, state))).sum()
 }
 
+const SCHEDULE: Schedule = Schedule {
+    first: 1e-6,
+    least: 1e-9,
+    on_accepted: Decrease::Factor(0.2),
+    on_rejected: Increase { least: 1e-6, ..Increase::by(10.0) },
+    on_unsolvable: None,
+};
+/// A step that does not help is retried shorter; eight times less a million is as good as standing still.
+const LIMITS: Limits = Limits { trials_per_iteration: 8, ..Limits::NONE };
+
 fn descend(
-    mut state: CoupledState,
+    state: CoupledState,
     factors: &[&Factor],
     widening: f64,
     config: &CoupledConfig,
@@ -204,33 +215,52 @@ fn descend(
     if layout.touched.is_empty() {
         return Ok((state, 0));
     }
-    let mut equations = NormalEquations::new(&layout.sizes());
-    let mut current = cost(&state, factors, widening);
-    let mut lambda = 1e-6;
-    for iteration in 0..config.max_iterations {
-        linearise(&state, factors, widening, &layout, &mut equations);
-        // A step that does not help is retried shorter; eight times less a million is as good as standing still.
-        let mut improved = None;
-        for _ in 0..8 {
-            let step = equations.solve(|d| d * (1.0 + lambda) + 1e-9)?;
-            let tried = layout.moved(&state, &step);
-            let next = cost(&tried, factors, widening);
-            if next <= current {
-                improved = Some((tried, next));
-                lambda = (lambda * 0.2).max(1e-9);
-                break;
-            }
-            lambda = (lambda * 10.0).max(1e-6);
-        }
-        let Some((tried, next)) = improved else { return Ok((state, iteration + 1)) };
-        // Below the second bound only rounding is left.
-        let settled = current - next <= config.tolerance * current || next < 1e-18 * factors.len() as f64;
-        (state, current) = (tried, next);
-        if settled {
-            return Ok((state, iteration + 1));
-        }
+    let equations = NormalEquations::new(&layout.sizes());
+    let cost = cost(&state, factors, widening);
+    let mut descent = Descent { state, factors, widening, tolerance: config.tolerance, layout, equations };
+    let limits = Limits { iterations: config.max_iterations, ..LIMITS };
+    let report = minimise(&mut descent, cost, &SCHEDULE, &limits)?;
+    Ok((descent.state, report.iterations))
+}
+
+/// The graph while it is solved with kernels of one width.
+struct Descent<'a> {
+    state: CoupledState,
+    factors: &'a [&'a Factor],
+    widening: f64,
+    tolerance: f64,
+    layout: Layout,
+    equations: NormalEquations,
+}
+
+impl LeastSquares for Descent<'_> {
+    type Error = GraphError;
+    type Values = CoupledState;
+
+    fn linearise(&mut self, cost: f64) -> Result<f64, GraphError> {
+        linearise(&self.state, self.factors, self.widening, &self.layout, &mut self.equations);
+        Ok(cost)
     }
-    Ok((state, config.max_iterations))
+
+    fn try_step(&mut self, lambda: f64) -> Result<Option<(f64, CoupledState)>, GraphError> {
+        let step = self.equations.solve(|d| d * (1.0 + lambda) + 1e-9)?;
+        let tried = self.layout.moved(&self.state, &step);
+        Ok(Some((cost(&tried, self.factors, self.widening), tried)))
+    }
+
+    fn improves(&self, cost_before: f64, cost_after: f64) -> bool {
+        cost_after <= cost_before
+    }
+
+    fn accept(&mut self, state: CoupledState) {
+        self.state = state;
+    }
+
+    /// Below the second bound only rounding is left.
+    fn has_converged(&mut self, trial: &Trial) -> bool {
+        let is_small = trial.decrease() <= self.tolerance * trial.cost_before;
+        trial.is_accepted && (is_small || trial.cost_after < 1e-18 * self.factors.len() as f64)
+    }
 }
 
 /// Unknowns that at least one factor moves, in order: keyframes, then chunks.

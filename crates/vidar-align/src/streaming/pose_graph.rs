@@ -12,6 +12,7 @@ use super::StreamingError;
 use nalgebra::{Dyn, Matrix3, SMatrix, SVector, Vector3};
 use vidar_core::{LieGroup, Sim3};
 use vidar_solve::NormalEquations;
+use vidar_solve::levenberg_marquardt::{Decrease, Increase, LeastSquares, Limits, Schedule, Trial, minimise};
 
 type Tangent = SVector<f64, 7>;
 type Matrix7 = SMatrix<f64, 7, 7>;
@@ -27,7 +28,7 @@ pub struct PoseGraphConfig {
 
 impl Default for PoseGraphConfig {
     fn default() -> Self {
-        Self { max_iterations: 30, initial_lambda: 1e-6 }
+        Self { max_iterations: 30, initial_lambda: SCHEDULE.first }
     }
 }
 
@@ -64,6 +65,15 @@ pub struct PoseGraphOutcome {
     pub steps: Vec<LmStep>,
 }
 
+/// The reference's: an unsolvable system ends it.
+const SCHEDULE: Schedule = Schedule {
+    first: 1e-6,
+    least: 0.0,
+    on_accepted: Decrease::Factor(0.5),
+    on_rejected: Increase::by(2.0),
+    on_unsolvable: None,
+};
+
 struct Edge {
     i: usize,
     j: usize,
@@ -85,46 +95,66 @@ pub fn optimise_chain(
     }
     let mut first_from_chunk = vec![Sim3::IDENTITY];
     first_from_chunk.extend(super::accumulate(previous_from_next));
-    let mut logs: Vec<Tangent> = first_from_chunk.iter().map(|x| log(&x.inverse())).collect();
+    let logs: Vec<Tangent> = first_from_chunk.iter().map(|x| log(&x.inverse())).collect();
     let chain = previous_from_next.iter().enumerate().map(|(k, s)| Edge { i: k + 1, j: k, j_from_i: *s });
     let loops = loops.iter().map(|l| Edge { i: l.a, j: l.b, j_from_i: l.b_from_a });
     let edges: Vec<Edge> = chain.chain(loops).collect();
 
-    let mut equations = NormalEquations::new(&vec![7; chunks]);
-    let mut lambda = config.initial_lambda;
-    let mut steps: Vec<LmStep> = Vec::new();
-    for iteration in 0..config.max_iterations {
-        let cost_before = linearise(&edges, &logs, &mut equations);
-        let step = match equations.solve(|diagonal| diagonal * (1.0 + lambda)) {
-            Ok(step) => step,
-            // The reference keeps what it has; without a single step there is no solution to keep.
-            Err(error) if steps.is_empty() => {
-                return Err(StreamingError::Unsolvable { reason: error.to_string() });
-            }
-            Err(_) => break,
-        };
-        let tried: Vec<Tangent> =
-            logs.iter().zip(step.chunks_exact(7)).map(|(g, d)| g + Tangent::from_column_slice(d)).collect();
-        let cost_after = cost(&edges, &tried);
-        let is_accepted = cost_after < cost_before;
-        steps.push(LmStep { lambda, cost_before, cost_after, is_accepted });
-        if is_accepted {
-            logs = tried;
-            lambda /= 2.0;
-        } else {
-            lambda *= 2.0;
-        }
-        let slow = |n: usize| steps[n - 5].cost_before / steps[n - 1].cost_before < 1.5;
-        if cost_before < 1e-5 && iteration >= 4 && slow(steps.len()) {
-            break;
-        }
-    }
+    let equations = NormalEquations::new(&vec![7; chunks]);
+    let cost = cost(&edges, &logs);
+    let mut chain = Chain { edges, logs, equations, steps: Vec::new() };
+    let schedule = Schedule { first: config.initial_lambda, ..SCHEDULE };
+    minimise(&mut chain, cost, &schedule, &Limits { trials: config.max_iterations, ..Limits::NONE })?;
+    let Chain { logs, steps, .. } = chain;
     let optimised: Vec<Sim3> = logs.iter().map(|g| exp(g).inverse()).collect();
     if let Some(k) = optimised.iter().position(|x| !x.is_finite()) {
         return Err(StreamingError::Unsolvable { reason: format!("chunk {k} is not finite") });
     }
     let relatives = optimised.windows(2).map(|x| x[0].inverse() * x[1]).collect();
     Ok(PoseGraphOutcome { previous_from_next: relatives, steps })
+}
+
+/// The chain while it is optimised.
+struct Chain {
+    edges: Vec<Edge>,
+    logs: Vec<Tangent>,
+    equations: NormalEquations,
+    steps: Vec<LmStep>,
+}
+
+impl LeastSquares for Chain {
+    type Error = StreamingError;
+    type Values = Vec<Tangent>;
+
+    fn linearise(&mut self, cost: f64) -> Result<f64, StreamingError> {
+        linearise(&self.edges, &self.logs, &mut self.equations);
+        Ok(cost)
+    }
+
+    fn try_step(&mut self, lambda: f64) -> Result<Option<(f64, Vec<Tangent>)>, StreamingError> {
+        let step = match self.equations.solve(|diagonal| diagonal * (1.0 + lambda)) {
+            Ok(step) => step,
+            // The reference keeps what it has; without a single step there is no solution to keep.
+            Err(error) if self.steps.is_empty() => {
+                return Err(StreamingError::Unsolvable { reason: error.to_string() });
+            }
+            Err(_) => return Ok(None),
+        };
+        let moved = self.logs.iter().zip(step.chunks_exact(7));
+        let moved: Vec<Tangent> = moved.map(|(g, d)| g + Tangent::from_column_slice(d)).collect();
+        Ok(Some((cost(&self.edges, &moved), moved)))
+    }
+
+    fn accept(&mut self, logs: Vec<Tangent>) {
+        self.logs = logs;
+    }
+
+    fn has_converged(&mut self, trial: &Trial) -> bool {
+        let Trial { damping: lambda, cost_before, cost_after, is_accepted } = *trial;
+        self.steps.push(LmStep { lambda, cost_before, cost_after, is_accepted });
+        let earlier = self.steps.iter().rev().nth(4);
+        cost_before < 1e-5 && earlier.is_some_and(|e| e.cost_before / cost_before < 1.5)
+    }
 }
 
 fn residual(edge: &Edge, logs: &[Tangent]) -> (Sim3, Tangent) {
@@ -137,7 +167,7 @@ fn cost(edges: &[Edge], logs: &[Tangent]) -> f64 {
     sum / (7 * edges.len()).max(1) as f64
 }
 
-fn linearise(edges: &[Edge], logs: &[Tangent], equations: &mut NormalEquations) -> f64 {
+fn linearise(edges: &[Edge], logs: &[Tangent], equations: &mut NormalEquations) {
     equations.clear();
     for edge in edges {
         let (error, r) = residual(edge, logs);
@@ -149,7 +179,6 @@ fn linearise(edges: &[Edge], logs: &[Tangent], equations: &mut NormalEquations) 
             r.as_slice(),
         );
     }
-    cost(edges, logs)
 }
 
 /// `[τ, φ, σ]` of a similarity.
