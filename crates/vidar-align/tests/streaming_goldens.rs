@@ -13,16 +13,7 @@ use vidar_align::streaming::*;
 use vidar_core::{LieGroup, Pinhole, Se3, Sim3, So3};
 
 fn folder() -> Option<PathBuf> {
-    let shared = std::env::var_os("VIDAR_SHARED").map_or_else(
-        || PathBuf::from(concat!(env!("CARGO_MANIFEST_DIR"), "/../../../shared")),
-        PathBuf::from,
-    );
-    let folder = shared.join("golden/streaming");
-    if folder.is_dir() {
-        return Some(folder);
-    }
-    eprintln!("skipped: no recordings at {}", folder.display());
-    None
+    vidar_core::testing::shared_data("golden/streaming")
 }
 
 struct Golden(Vec<u8>);

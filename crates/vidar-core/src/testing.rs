@@ -1,6 +1,32 @@
-//! Helpers for tests: checks of analytic derivatives, used by all crates.
+//! Helpers for tests, used by all crates: checks of analytic derivatives, and the recordings beside the checkout.
 
 use nalgebra::{SMatrix, SVector};
+use std::fmt::Display;
+use std::io::Write;
+use std::path::{Path, PathBuf};
+
+/// A file or folder of the recordings and reference results that are not part of the repository: below `VIDAR_SHARED`, or below
+/// `shared` beside the checkout. `None` where it is not there, which [`skipped`] tells.
+pub fn shared_data(part: &str) -> Option<PathBuf> {
+    let root = std::env::var_os("VIDAR_SHARED")
+        .map_or_else(|| Path::new(env!("CARGO_MANIFEST_DIR")).join("../../../shared"), PathBuf::from);
+    let path = root.join(part);
+    if path.exists() {
+        return Some(path);
+    }
+    skipped(&format_args!("{} is not there (VIDAR_SHARED names another place)", path.display()));
+    None
+}
+
+/// Says on standard error that the test that asks is skipped, and why.
+///
+/// Not by `eprintln`, whose text is kept back when a test passes.
+pub fn skipped(why: &dyn Display) {
+    let thread = std::thread::current();
+    let test = thread.name().unwrap_or("a test");
+    // Where standard error is closed, nobody can be told.
+    let _ = writeln!(std::io::stderr(), "skipped {test}: {why}");
+}
 
 /// Jacobian of `f` at `x` by central differences with Richardson extrapolation.
 fn numeric_jacobian<const M: usize, const N: usize>(

@@ -6,8 +6,9 @@
 
 mod common;
 
-use common::{own, shared};
+use common::own;
 use std::path::Path;
+use vidar_core::testing::shared_data;
 use vidar_da3::check::{CheckReport, CheckResult, check_file};
 use vidar_da3::gpu::adapters;
 use vidar_da3::{Da3Options, Device, Precision, Residency};
@@ -90,7 +91,7 @@ fn parts_put_on_the_device_on_demand_answer_the_same() {
 
 /// The official recordings: small ones here, the others as `cargo test … -- --ignored`.
 fn official(files: &[&str], precision: Precision) {
-    let Some(folder) = shared("golden/da3") else { return };
+    let Some(folder) = shared_data("golden/da3") else { return };
     let Some(options) = any_device(precision) else { return };
     let options = Da3Options { residency: Residency::OnDemand, ..options };
     for file in files {

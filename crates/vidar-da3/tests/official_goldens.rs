@@ -4,13 +4,13 @@
 
 mod common;
 
-use common::shared;
+use vidar_core::testing::shared_data;
 use vidar_da3::check::{CheckResult, check_file};
 use vidar_da3::{Da3Options, Precision, Residency};
 
 /// Checks the files with synthetic weights, block by block.
 fn all_hold(files: &[&str], precision: Precision) {
-    let Some(folder) = shared("golden/da3") else { return };
+    let Some(folder) = shared_data("golden/da3") else { return };
     let options = Da3Options { precision, residency: Residency::OnDemand, ..Da3Options::default() };
     for file in files {
         let report = check_file(&folder.join(format!("{file}.safetensors")), None, &options).unwrap();

@@ -4,10 +4,10 @@
 
 mod common;
 
-use common::shared;
 use nalgebra::{Matrix3, Matrix4};
 use std::collections::BTreeMap;
 use vidar_core::Image;
+use vidar_core::testing::shared_data;
 use vidar_da3::align::align_cameras;
 use vidar_da3::preprocess::{self, PreprocessConfig, ResizeMethod, normalise};
 use vidar_da3::ray_pose::{RayMap, camera_from_rays, split};
@@ -21,7 +21,7 @@ struct File(Checkpoint);
 
 impl File {
     fn open(name: &str) -> Option<Self> {
-        Some(Self(Checkpoint::open(&shared(&format!("golden/da3/{name}.safetensors"))?).unwrap()))
+        Some(Self(Checkpoint::open(&shared_data(&format!("golden/da3/{name}.safetensors"))?).unwrap()))
     }
 
     fn numbers(&self, name: &str) -> Vec<f64> {
@@ -61,7 +61,7 @@ fn row_major<const R: usize, const C: usize>(m: &nalgebra::SMatrix<f64, R, C>) -
 
 #[test]
 fn the_key_lists_are_those_of_the_official_files() {
-    let Some(folder) = shared("golden/da3/keys") else { return };
+    let Some(folder) = shared_data("golden/da3/keys") else { return };
     for variant in Variant::ALL {
         let text = std::fs::read_to_string(folder.join(format!("{}.txt", variant.name()))).unwrap();
         let mut listed = BTreeMap::new();
@@ -106,7 +106,7 @@ fn weights_and_pictures_by_rule_have_the_published_bits() {
 #[test]
 fn preprocessing_is_opencvs() {
     let Some(file) = File::open("preprocess") else { return };
-    let manifest = std::fs::read_to_string(shared("golden/da3/manifest.json").unwrap()).unwrap();
+    let manifest = std::fs::read_to_string(shared_data("golden/da3/manifest.json").unwrap()).unwrap();
     let manifest: serde_json::Value = serde_json::from_str(&manifest).unwrap();
     let cases = manifest["files"]["preprocess.safetensors"]["cases"].as_object().unwrap();
     for (name, case) in cases.iter().filter(|(name, _)| !name.starts_with("mixed")) {
@@ -160,7 +160,7 @@ fn preprocessing_is_opencvs() {
 fn a_batch_of_two_sizes_is_cut_about_its_middle() {
     let Some(file) = File::open("preprocess") else { return };
     let pictures = [image_u8(1, 128, 96), image_u8(2, 96, 128)];
-    let manifest = std::fs::read_to_string(shared("golden/da3/manifest.json").unwrap()).unwrap();
+    let manifest = std::fs::read_to_string(shared_data("golden/da3/manifest.json").unwrap()).unwrap();
     let manifest: serde_json::Value = serde_json::from_str(&manifest).unwrap();
     let case = &manifest["files"]["preprocess.safetensors"]["cases"]["mixed_128x96_96x128_140"];
     eprintln!("{case}");
@@ -214,7 +214,8 @@ fn alignment_and_its_samples_are_the_official_ones() {
         let moved: Vec<f64> = given.iter().flat_map(|g| row_major(&found.to_predicted(g))).collect();
         close(n, &moved, &file.numbers(&format!("{n}.aligned_w2c_f64")), 5e-6);
     }
-    let text = std::fs::read_to_string(shared("golden/da3/ransac_samples_seed42.json").unwrap()).unwrap();
+    let text =
+        std::fs::read_to_string(shared_data("golden/da3/ransac_samples_seed42.json").unwrap()).unwrap();
     let tables: BTreeMap<usize, Vec<Vec<usize>>> = serde_json::from_str(&text).unwrap();
     assert!(tables.len() > 100);
     tables.iter().for_each(|(views, table)| assert_eq!(&ransac_samples(*views), table, "{views} views"));

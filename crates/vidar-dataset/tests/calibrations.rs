@@ -165,13 +165,7 @@ fn broken_files_are_refused_with_key_and_line() {
 
 #[test]
 fn the_real_excerpt_is_plausible() {
-    let shared = std::env::var("VIDAR_SHARED")
-        .unwrap_or_else(|_| concat!(env!("CARGO_MANIFEST_DIR"), "/../../../shared").into());
-    let folder = std::path::Path::new(&shared).join("data/euroc_MH_01_real_11s");
-    if !folder.exists() {
-        eprintln!("skipped: no {}", folder.display());
-        return;
-    }
+    let Some(folder) = vidar_core::testing::shared_data("data/euroc_MH_01_real_11s") else { return };
     let d = vidar_dataset::open(&folder, &OpenOptions::default()).unwrap();
     let doubts: Vec<&str> = kinds(&d)
         .into_iter()

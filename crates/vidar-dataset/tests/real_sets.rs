@@ -15,15 +15,7 @@ use vidar_dataset::{
 };
 
 fn shared(part: &str) -> Option<PathBuf> {
-    let root = std::env::var_os("VIDAR_SHARED")
-        .map(PathBuf::from)
-        .unwrap_or_else(|| PathBuf::from(concat!(env!("CARGO_MANIFEST_DIR"), "/../../../shared")));
-    let path = root.join("data").join(part);
-    if path.exists() {
-        return Some(path);
-    }
-    eprintln!("skipped: {} is not there (set VIDAR_SHARED)", path.display());
-    None
+    vidar_core::testing::shared_data(&format!("data/{part}"))
 }
 
 /// What identifies a dataset.

@@ -4,6 +4,7 @@
 
 use serde_json::Value;
 use std::path::{Path, PathBuf};
+use vidar_core::testing::{shared_data, skipped};
 use vidar_core::{BodyFrame, Se3, So3, StampedPose, Timestamp, Trajectory};
 use vidar_eval::{ErrorStats, TrajectoryEvalConfig, TrajectoryReport, evaluate_trajectory};
 
@@ -98,30 +99,25 @@ fn a_made_up_flight_is_judged_as_evo_judges_it() {
 }
 
 /// Ground truth of the eleven EuRoC sequences, unpacked into a folder of this process; `None` when not at hand.
-fn unpacked_euroc(shared: &Path) -> Option<PathBuf> {
-    let packed = shared.join("data/packed/euroc_imu_gt_all11.tar.xz");
+fn unpacked_euroc() -> Option<PathBuf> {
+    let packed = shared_data("data/packed/euroc_imu_gt_all11.tar.xz")?;
     let folder = std::env::temp_dir().join(format!("vidar-eval-evo-{}", std::process::id()));
     std::fs::create_dir_all(&folder).ok()?;
     let unpacked = std::process::Command::new("tar")
         .args(["-xJf".as_ref(), packed.as_os_str(), "-C".as_ref(), folder.as_os_str()])
         .args(["--wildcards", "*/groundtruth_openvins_tum.txt"])
         .status();
-    matches!(unpacked, Ok(status) if status.success()).then_some(folder)
+    if !matches!(unpacked, Ok(status) if status.success()) {
+        skipped(&"the EuRoC ground truth could not be unpacked with tar and xz");
+        return None;
+    }
+    Some(folder)
 }
 
 #[test]
 fn real_euroc_estimates_are_judged_as_evo_judges_them() {
-    let shared = std::env::var_os("VIDAR_SHARED")
-        .map_or_else(|| Path::new(env!("CARGO_MANIFEST_DIR")).join("../../../shared"), PathBuf::from);
-    let root = shared.join("data/rpg_reference_trajectories");
-    if !root.is_dir() {
-        eprintln!("skipped: {} is absent, real trajectories were not compared with evo", root.display());
-        return;
-    }
-    let Some(folder) = unpacked_euroc(&shared) else {
-        eprintln!("skipped: the EuRoC ground truth could not be unpacked with tar and xz");
-        return;
-    };
+    let Some(root) = shared_data("data/rpg_reference_trajectories") else { return };
+    let Some(folder) = unpacked_euroc() else { return };
     let golden = json("evo_euroc.json");
     let results = golden["results"].as_array().unwrap();
     assert!(results.len() >= 20, "golden file holds only {} trajectories", results.len());

@@ -4,7 +4,6 @@
 use serde_json::Value;
 use std::collections::BTreeMap;
 use std::io::Cursor;
-use std::path::Path;
 use vidar_core::Image;
 use vidar_export::official::*;
 
@@ -149,13 +148,8 @@ struct Golden(BTreeMap<String, (Vec<usize>, Vec<u8>)>);
 impl Golden {
     /// `None`, with a message, without the folder of shared data.
     fn open() -> Option<Self> {
-        let default = concat!(env!("CARGO_MANIFEST_DIR"), "/../../../shared");
-        let shared = std::env::var("VIDAR_SHARED").unwrap_or_else(|_| default.to_owned());
-        let path = Path::new(&shared).join("golden/da3/units_export.safetensors");
-        let Ok(bytes) = std::fs::read(&path) else {
-            eprintln!("skipped: {} is absent", path.display());
-            return None;
-        };
+        let path = vidar_core::testing::shared_data("golden/da3/units_export.safetensors")?;
+        let bytes = std::fs::read(path).unwrap();
         let header = u64::from_le_bytes(bytes[..8].try_into().unwrap()) as usize;
         let tensors: BTreeMap<String, Value> = serde_json::from_slice(&bytes[8..8 + header]).unwrap();
         let numbers =

@@ -8,7 +8,6 @@
 #![allow(clippy::unwrap_used, clippy::print_stdout, clippy::print_stderr)] // helpers of tests are test code, though not marked so
 
 use nalgebra::Vector3;
-use std::path::PathBuf;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use vidar_core::{BodyFrame, FrameId, ImuNoise, LieGroup, Se3, So3, StampedPose, Timestamp, Trajectory};
 use vidar_odometry::backend::Smoother;
@@ -50,17 +49,12 @@ impl Flight for Flown {
     }
 }
 
-fn shared() -> PathBuf {
-    std::env::var_os("VIDAR_SHARED")
-        .map_or_else(|| PathBuf::from(concat!(env!("CARGO_MANIFEST_DIR"), "/../../../shared")), PathBuf::from)
-}
-
-/// Poses of a EuRoC flight; `None` where the data is absent.
+/// Poses of a EuRoC flight; `None` where the data is absent, which is told.
 fn euroc_poses(name: &str) -> Option<Vec<StampedPose>> {
-    let path = shared().join(format!(
+    let path = vidar_core::testing::shared_data(&format!(
         "data/rpg_reference_trajectories/euroc_vislam_mono/laptop/vislam_rp/laptop_vislam_rp_{name}/stamped_traj_estimate0.txt"
-    ));
-    let text = std::fs::read_to_string(path).ok()?;
+    ))?;
+    let text = std::fs::read_to_string(path).unwrap();
     let mut poses: Vec<StampedPose> = Vec::new();
     for line in text.lines().filter(|l| !l.starts_with('#') && !l.trim().is_empty()) {
         let words: Vec<&str> = line.split_whitespace().collect();
@@ -290,10 +284,7 @@ fn starts_on_a_built_in_flight_are_metric() {
 fn starts_on_euroc_flights_are_metric() {
     let mut outcomes = Vec::new();
     for (name, from) in [("V1_02", 30.0), ("V2_02", 40.0), ("MH_03", 40.0), ("V1_02", 45.0)] {
-        let Some(poses) = euroc_poses(name) else {
-            eprintln!("skipped: no EuRoC trajectories under {}", shared().display());
-            return;
-        };
+        let Some(poses) = euroc_poses(name) else { return };
         outcomes.push(start_in_flight(&flown(&poses, Start::InFlight), from, 2.0, 7));
     }
     report("EuRoC, four starts", &outcomes);
@@ -303,10 +294,7 @@ fn starts_on_euroc_flights_are_metric() {
 
 #[test]
 fn a_start_from_rest_is_metric_once_the_body_moved() {
-    let Some(poses) = euroc_poses("V2_02") else {
-        eprintln!("skipped: no EuRoC trajectories under {}", shared().display());
-        return;
-    };
+    let Some(poses) = euroc_poses("V2_02") else { return };
     let outcome = start_from_rest(&flown(&poses, Start::Static { secs: REST_SECS }), 5.0, 3);
     assert!(outcome.waited_secs.is_some() && !outcome.is_lost(), "{outcome:?}");
     assert!(outcome.later.abs() < 0.03, "{outcome:?}");
@@ -314,10 +302,7 @@ fn a_start_from_rest_is_metric_once_the_body_moved() {
 
 #[test]
 fn a_start_that_comes_to_rest_does_not_throw_its_scale_away() {
-    let Some(poses) = euroc_poses("MH_02") else {
-        eprintln!("skipped: no EuRoC trajectories under {}", shared().display());
-        return;
-    };
+    let Some(poses) = euroc_poses("MH_02") else { return };
     // Shaken by hand, then put down.
     let outcome = start_in_flight(&flown(&poses, Start::InFlight), 0.5, 10.0, 0);
     assert!(outcome.waited_secs.is_some() && !outcome.is_lost(), "{outcome:?}");
@@ -350,11 +335,7 @@ fn on_all_cores<T: Sync>(tasks: &[T], of: impl Fn(&T) -> Outcome + Sync) -> Vec<
 fn chosen_flights() -> Option<Vec<(&'static str, Vec<StampedPose>)>> {
     let wanted = std::env::var("VIDAR_FLIGHTS").unwrap_or_default();
     let names = FLIGHTS.into_iter().filter(|n| wanted.is_empty() || wanted.split(',').any(|w| w == *n));
-    let all: Option<Vec<_>> = names.map(|n| Some((n, euroc_poses(n)?))).collect();
-    if all.is_none() {
-        eprintln!("skipped: no EuRoC trajectories under {}", shared().display());
-    }
-    all
+    names.map(|n| Some((n, euroc_poses(n)?))).collect()
 }
 
 fn length_secs(poses: &[StampedPose]) -> f64 {

@@ -4,6 +4,7 @@
 
 use nalgebra::{Matrix4, Vector3};
 use std::path::{Path, PathBuf};
+use vidar_core::testing::shared_data;
 use vidar_core::{
     ChunkId, ChunkView, ChunkViews, FrameId, FrameImage, GeometryModel, Image, LieGroup, Pinhole, Se3,
     Timestamp,
@@ -13,11 +14,6 @@ use vidar_stereo::{StereoConfig, StereoModel};
 /// Frames of each recording, and which of them are evaluated.
 const FRAMES: usize = 9;
 const EVALUATED: std::ops::Range<usize> = 3..6;
-
-fn shared() -> PathBuf {
-    std::env::var_os("VIDAR_SHARED")
-        .map_or_else(|| Path::new(env!("CARGO_MANIFEST_DIR")).join("../../../shared"), PathBuf::from)
-}
 
 fn numbers(path: &Path) -> Vec<f64> {
     let text = std::fs::read_to_string(path).expect("readable");
@@ -86,11 +82,7 @@ fn sorted(folder: &Path, end: &str) -> Vec<PathBuf> {
 
 #[test]
 fn depth_of_a_room_seen_by_a_headset_is_mostly_correct() {
-    let folder = shared().join("data/hololens_commonroom");
-    if !folder.is_dir() {
-        eprintln!("skipped: no real frames at {}", folder.display());
-        return;
-    }
+    let Some(folder) = shared_data("data/hololens_commonroom") else { return };
     let k = numbers(&folder.join("K.txt"));
     let poses = numbers(&folder.join("poses.txt"));
     let camera = |w: usize, h: usize| Pinhole::new(k[0], k[4], k[2], k[5], w, h).expect("a camera");
@@ -109,11 +101,7 @@ fn depth_of_a_room_seen_by_a_headset_is_mostly_correct() {
 
 #[test]
 fn depth_of_a_kitchen_with_poses_of_another_clock_is_mostly_correct() {
-    let folder = shared().join("data/7scenes_redkitchen/seq-01");
-    if !folder.is_dir() {
-        eprintln!("skipped: no real frames at {}", folder.display());
-        return;
-    }
+    let Some(folder) = shared_data("data/7scenes_redkitchen/seq-01") else { return };
     let color_from_depth = Se3::from_translation(Vector3::new(-0.023, 0.012, 0.0));
     let (mut views, mut sensor) = (Vec::new(), Vec::new());
     for (i, image) in sorted(&folder, ".color.jpg").iter().step_by(3).take(FRAMES).enumerate() {

@@ -7,17 +7,12 @@
     reason = "tests may stop at the first surprise"
 )]
 
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use vidar_core::FrameImage;
 use vidar_video::Video;
 
 fn clip() -> Option<PathBuf> {
-    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../../shared/data/gopro_karma/karma.mp4");
-    if path.is_file() {
-        return Some(path);
-    }
-    eprintln!("skipped: {} is not there", path.display());
-    None
+    vidar_core::testing::shared_data("data/gopro_karma/karma.mp4")
 }
 
 fn grey(video: &Video, number: usize) -> Vec<u8> {

@@ -1,4 +1,4 @@
-//! Every setting has an effect: each one of the dense pipeline changes the result of a run.
+//! Every setting has an effect: each one of the dense pipeline changes a stated part of what a run leaves, and how it ends is stated.
 
 use crate::support::{ProgramOutput, files_under, run_command, shared, vidar};
 use std::collections::BTreeMap;
@@ -101,57 +101,86 @@ fn sparse_truth() -> String {
     .clone()
 }
 
-/// Every setting of the dense pipeline, another value for it, and the additional settings that it needs.
-const SETTINGS: &[(&str, &str, ExtraSettings)] = &[
-    ("align.max_center_rms_m", "1e-12", Simulated),
-    ("budget.realtime", "true", Nothing),
-    ("budget.seconds", "0.01", Nothing),
-    ("coupling.mode", "hybrid", Simulated),
-    ("coupling.landmarks", "none", Learned),
-    ("eval.mode", "auto", Nothing),
-    ("eval.surface.crop_margin_m", "0.1", Evaluated),
-    ("eval.surface.on_rejection", "refine_rigid", Refused),
-    ("eval.surface.thresholds_m", "[0.07]", Evaluated),
-    ("eval.surface.voxel_size_m", "0.2", Evaluated),
-    ("eval.surface.icp.keep_ratio", "0.5", Evaluated),
-    ("eval.surface.icp.max_iterations", "1", Evaluated),
-    ("eval.surface.icp.max_points", "100", Evaluated),
-    ("eval.surface.icp.tolerance_m", "0.1", Evaluated),
-    ("eval.surface.scale_bounds.max", "1.000001", Evaluated),
-    ("eval.surface.scale_bounds.min", "0.999999", Evaluated),
-    ("eval.trajectory.coverage_gap_ms", "1.0", Odometry),
-    ("eval.trajectory.max_time_difference_ms", "0.000001", Odometry),
-    ("eval.trajectory.rpe_distance_m", "0.2", Odometry),
-    ("eval.trajectory.rpe_frames", "2", Odometry),
-    ("fusion.carve_range_m", "0.5", Nothing),
-    ("fusion.max_depth_m", "2.0", Nothing),
-    ("fusion.max_incidence_deg", "40.0", Nothing),
-    ("fusion.memory_budget_bytes", "1500000", Nothing),
-    ("fusion.min_component_triangles", "400", Nothing),
-    ("fusion.min_confidence", "0.9", Nothing),
-    ("fusion.min_observations", "5", Nothing),
-    ("fusion.truncation_voxels", "6.0", Nothing),
-    ("fusion.voxel_size_m", "0.06", Nothing),
-    ("geometry.chunk_keyframes", "3", Nothing),
-    ("geometry.context_keyframes", "2", Chunked),
-    ("geometry.overlap_keyframes", "1", Simulated),
-    ("geometry.fill_network", "da3-nano", Completed),
-    ("geometry.max_width_px", "80", Nothing),
-    ("input.end_secs", "1.5", Nothing),
-    ("input.max_pose_gap_secs", "0.05", Odometry),
-    ("input.start_secs", "1.0", Nothing),
-    ("input.stride", "3", Nothing),
-    ("keyframes.max_count", "4", Nothing),
-    ("keyframes.unposed_interval_secs", "1.0", Unposed),
-    ("keyframes.min_rotation_deg", "60.0", Turning),
-    ("keyframes.min_translation_m", "1.0", Moving),
-    ("output.keep_chunks", "true", Nothing),
-    ("limits.memory_bytes", "165000000", Fine),
-    ("output.depth_png", "false", Nothing),
-    ("output.depth_units_per_metre", "500.0", Nothing),
-    ("output.images", "false", Nothing),
-    ("output.mesh_glb", "false", Pictures),
-    ("output.report", "true", Nothing),
+/// How a run ends, with the code of its warning or error.
+#[derive(Clone, Copy, Debug)]
+enum Ends {
+    /// Status 0.
+    Well,
+    /// Status 3.
+    Degraded(&'static str),
+    /// Status 1.
+    Denied(&'static str),
+}
+
+/// What becomes of a file that a run leaves.
+#[derive(Clone, Copy, Debug)]
+enum Effect {
+    Changes(&'static str),
+    Adds(&'static str),
+    Removes(&'static str),
+}
+
+use Effect::{Adds, Changes, Removes};
+use Ends::{Degraded, Denied, Well};
+
+/// Every setting of the dense pipeline, another value for it, the additional settings that it needs, how the run ends, and a file that
+/// shows the effect.
+const SETTINGS: &[(&str, &str, ExtraSettings, Ends, Effect)] = &[
+    ("align.max_center_rms_m", "1e-12", Simulated, Denied("chunk-not-placed"), Removes("map/mesh.ply")),
+    ("budget.realtime", "true", Nothing, Well, Adds("budget.json")),
+    ("budget.seconds", "0.01", Nothing, Well, Adds("budget.json")),
+    ("coupling.mode", "hybrid", Simulated, Well, Changes("trajectory/keyframes_camera.tum")),
+    ("coupling.landmarks", "none", Learned, Well, Changes("map/mesh.ply")),
+    ("eval.mode", "auto", Nothing, Well, Changes("eval/metrics.json")),
+    ("eval.surface.crop_margin_m", "0.1", Evaluated, Well, Changes("eval/metrics.json")),
+    ("eval.surface.on_rejection", "refine_rigid", Refused, Well, Changes("eval/metrics.json")),
+    ("eval.surface.thresholds_m", "[0.07]", Evaluated, Well, Changes("eval/metrics.json")),
+    ("eval.surface.voxel_size_m", "0.2", Evaluated, Well, Changes("eval/metrics.json")),
+    ("eval.surface.icp.keep_ratio", "0.5", Evaluated, Well, Changes("eval/metrics.json")),
+    ("eval.surface.icp.max_iterations", "1", Evaluated, Well, Changes("eval/metrics.json")),
+    ("eval.surface.icp.max_points", "100", Evaluated, Well, Changes("eval/metrics.json")),
+    ("eval.surface.icp.tolerance_m", "0.1", Evaluated, Well, Changes("eval/metrics.json")),
+    ("eval.surface.scale_bounds.max", "1.000001", Evaluated, Well, Changes("eval/metrics.json")),
+    ("eval.surface.scale_bounds.min", "0.999999", Evaluated, Well, Changes("eval/metrics.json")),
+    ("eval.trajectory.coverage_gap_ms", "1.0", Odometry, Well, Changes("eval/metrics.json")),
+    ("eval.trajectory.max_time_difference_ms", "0.000001", Odometry, Well, Changes("eval/metrics.json")),
+    ("eval.trajectory.rpe_distance_m", "0.2", Odometry, Well, Changes("eval/metrics.json")),
+    ("eval.trajectory.rpe_frames", "2", Odometry, Well, Changes("eval/metrics.json")),
+    ("fusion.carve_range_m", "0.5", Nothing, Well, Changes("map/coverage.json")),
+    ("fusion.max_depth_m", "2.0", Nothing, Degraded("map-almost-empty"), Changes("map/mesh.ply")),
+    ("fusion.max_incidence_deg", "40.0", Nothing, Well, Changes("map/mesh.ply")),
+    (
+        "fusion.memory_budget_bytes",
+        "1500000",
+        Nothing,
+        Degraded("fusion-memory-budget"),
+        Changes("map/mesh.ply"),
+    ),
+    ("fusion.min_component_triangles", "400", Nothing, Well, Changes("map/mesh.ply")),
+    ("fusion.min_confidence", "0.9", Nothing, Well, Changes("map/mesh.ply")),
+    ("fusion.min_observations", "5", Nothing, Well, Changes("map/mesh.ply")),
+    ("fusion.truncation_voxels", "6.0", Nothing, Well, Changes("map/mesh.ply")),
+    ("fusion.voxel_size_m", "0.06", Nothing, Well, Changes("map/mesh.ply")),
+    ("geometry.chunk_keyframes", "3", Nothing, Well, Changes("map/mesh.ply")),
+    ("geometry.context_keyframes", "2", Chunked, Well, Changes("map/mesh.ply")),
+    ("geometry.overlap_keyframes", "1", Simulated, Well, Changes("map/mesh.ply")),
+    ("geometry.fill_network", "da3-nano", Completed, Well, Changes("map/mesh.ply")),
+    ("geometry.max_width_px", "80", Nothing, Well, Changes("views.json")),
+    ("input.end_secs", "1.5", Nothing, Well, Changes("trajectory/keyframes_camera.tum")),
+    ("input.max_pose_gap_secs", "0.05", Odometry, Well, Changes("trajectory/keyframes_camera.tum")),
+    ("input.start_secs", "1.0", Nothing, Well, Changes("trajectory/keyframes_camera.tum")),
+    ("input.stride", "3", Nothing, Well, Changes("trajectory/keyframes_camera.tum")),
+    ("keyframes.max_count", "4", Nothing, Well, Changes("trajectory/keyframes_camera.tum")),
+    ("keyframes.unposed_interval_secs", "1.0", Unposed, Well, Changes("trajectory/keyframes_camera.tum")),
+    ("keyframes.min_rotation_deg", "25.0", Turning, Well, Changes("trajectory/keyframes_camera.tum")),
+    ("keyframes.min_translation_m", "0.5", Moving, Well, Changes("trajectory/keyframes_camera.tum")),
+    ("output.keep_chunks", "true", Nothing, Well, Adds("chunks/000000.npz")),
+    ("limits.memory_bytes", "165000000", Fine, Degraded("fusion-memory-budget"), Changes("map/mesh.ply")),
+    ("output.depth_png", "false", Nothing, Well, Removes("depth/depth.json")),
+    ("output.depth_units_per_metre", "500.0", Nothing, Well, Changes("depth/depth.json")),
+    ("output.images", "false", Nothing, Well, Removes("images/000000.png")),
+    ("output.mesh_glb", "false", Pictures, Well, Removes("map/mesh.glb")),
+    ("output.report", "true", Nothing, Well, Adds("report.html")),
 ];
 
 /// Settings that are shown to matter elsewhere, with the place.
@@ -186,28 +215,53 @@ const ELSEWHERE: &[(&str, &str)] = &[
     ("model.", "the model's own tests"),
 ];
 
-/// Everything a run leaves but what the clock or the command line decides.
-fn leavings(out: &Path, ran: &ProgramOutput) -> BTreeMap<String, Vec<u8>> {
+/// What a run left.
+struct Left {
+    exit: i32,
+    /// Everything but what the clock or the command line decides.
+    files: BTreeMap<String, Vec<u8>>,
+    /// The error stream and the log.
+    said: String,
+}
+
+impl Left {
+    fn ends(&self, ends: Ends) -> bool {
+        match ends {
+            Well => self.exit == 0,
+            Degraded(code) => self.exit == 3 && self.said.contains(code),
+            Denied(code) => self.exit == 1 && self.said.contains(code),
+        }
+    }
+
+    fn shows(&self, effect: Effect, base: &Self) -> bool {
+        let (Changes(name) | Adds(name) | Removes(name)) = effect;
+        match (effect, base.files.get(name), self.files.get(name)) {
+            (Changes(_), Some(before), Some(now)) => before != now,
+            (Adds(_), None, Some(_)) | (Removes(_), Some(_), None) => true,
+            _ => false,
+        }
+    }
+}
+
+fn files(out: &Path) -> BTreeMap<String, Vec<u8>> {
     let clocked = ["manifest.json", "log.jsonl", "README.txt", "config.resolved.toml", "report.html"];
-    let mut found: BTreeMap<String, Vec<u8>> = files_under(out)
+    files_under(out)
         .into_iter()
         .map(|name| {
             let keep = !clocked.contains(&name.as_str());
             let bytes = if keep { std::fs::read(out.join(&name)).unwrap() } else { Vec::new() };
             (name, bytes)
         })
-        .collect();
-    found.insert("exit".into(), vec![ran.code as u8]);
-    found
+        .collect()
 }
 
-fn run(name: &str, arguments: &[String]) -> BTreeMap<String, Vec<u8>> {
+fn run(name: &str, arguments: &[String]) -> Left {
     let out: PathBuf = shared().root.join("keys").join(name);
     let small = ["-q", "--threads", "1", "--set", "input.stride=2"];
     let mut command = run_command(&shared().sequence, &out, &small);
     let ran: ProgramOutput = command.args(arguments).output().unwrap().into();
-    assert!([0, 1, 3].contains(&ran.code), "{name}: {} {}", ran.code, ran.stderr);
-    let left = leavings(&out, &ran);
+    let log = std::fs::read_to_string(out.join("log.jsonl")).unwrap_or_default();
+    let left = Left { exit: ran.code, files: files(&out), said: ran.stderr + &log };
     std::fs::remove_dir_all(&out).unwrap_or(());
     left
 }
@@ -232,23 +286,33 @@ fn every_setting_changes_what_a_run_leaves() {
         Fine, Nothing, Evaluated, Refused, Pictures, Odometry, Chunked, Simulated, Learned, Completed,
         Unposed, Turning, Moving,
     ];
-    let bases: BTreeMap<ExtraSettings, BTreeMap<String, Vec<u8>>> = all
+    let bases: BTreeMap<ExtraSettings, Left> = all
         .into_iter()
         .map(|beside| (beside, run(&format!("base {beside:?}"), &beside.arguments())))
         .collect();
-    let (next, dead) = (AtomicUsize::new(0), Mutex::new(Vec::new()));
+    for (beside, base) in &bases {
+        assert!(base.ends(Well), "{beside:?}: {} {}", base.exit, base.said);
+    }
+    let (next, wrong) = (AtomicUsize::new(0), Mutex::new(Vec::new()));
     std::thread::scope(|scope| {
         for _ in 0..2 {
             scope.spawn(|| {
-                while let Some((key, value, beside)) = SETTINGS.get(next.fetch_add(1, Ordering::Relaxed)) {
+                while let Some((key, value, beside, ends, effect)) =
+                    SETTINGS.get(next.fetch_add(1, Ordering::Relaxed))
+                {
                     let setting = format!("{key}={value}");
                     let with = [beside.arguments(), vec!["--set".into(), setting.clone()]].concat();
-                    if run(key, &with) == bases[beside] {
-                        dead.lock().unwrap().push(setting);
+                    let left = run(key, &with);
+                    if !left.ends(*ends) {
+                        let told = format!("{setting} ends with {} and not {ends:?}", left.exit);
+                        wrong.lock().unwrap().push(told);
+                    }
+                    if !left.shows(*effect, &bases[beside]) {
+                        wrong.lock().unwrap().push(format!("{setting} has not the effect {effect:?}"));
                     }
                 }
             });
         }
     });
-    assert!(dead.lock().unwrap().is_empty(), "no effect: {:?}", dead.lock().unwrap());
+    assert!(wrong.lock().unwrap().is_empty(), "{:#?}", wrong.lock().unwrap());
 }

@@ -132,15 +132,7 @@ fn settings_of_the_odometry_are_checked() {
 
 #[test]
 fn real_frames_are_tracked_to_a_centimetre() {
-    let shared_data = std::env::var_os("VIDAR_SHARED").map_or_else(
-        || PathBuf::from(concat!(env!("CARGO_MANIFEST_DIR"), "/../../../shared")),
-        PathBuf::from,
-    );
-    let excerpt = shared_data.join("data/euroc_MH_01_real_11s");
-    if !excerpt.is_dir() {
-        eprintln!("skipped: no recording at {}", excerpt.display());
-        return;
-    }
+    let Some(excerpt) = vidar::core::testing::shared_data("data/euroc_MH_01_real_11s") else { return };
     let out = shared().root.join("real");
     let json = odometry(&excerpt, &out, &[]).ends_with(0).json();
     assert!(json["trajectory"]["ate_se3_m"]["rmse"].as_f64().unwrap() < 0.01, "{json}");

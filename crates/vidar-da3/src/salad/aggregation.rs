@@ -146,10 +146,9 @@ fn unit(mut values: Vec<f64>) -> Vec<f64> {
 }
 
 #[cfg(test)]
-#[allow(clippy::print_stderr)] // a skipped test says so
 mod tests {
     use super::*;
-    use std::path::PathBuf;
+    use vidar_core::testing::shared_data;
     use vidar_nn::Checkpoint;
 
     fn perceptron(input: usize, hidden: usize, output: usize) -> Perceptron {
@@ -195,13 +194,7 @@ mod tests {
     /// Recorded from the official code; the file is outside the repository.
     #[test]
     fn descriptors_match_the_official_code() {
-        let shared = std::env::var_os("VIDAR_SHARED")
-            .map_or_else(|| concat!(env!("CARGO_MANIFEST_DIR"), "/../../../shared").into(), PathBuf::from);
-        let file = shared.join("golden/streaming/salad_small.safetensors");
-        if !file.exists() {
-            eprintln!("skipped: {} is not there (set VIDAR_SHARED)", file.display());
-            return;
-        }
+        let Some(file) = shared_data("golden/streaming/salad_small.safetensors") else { return };
         let golden = Checkpoint::open(&file).unwrap();
         let values = |key: &str| golden.tensor(key).unwrap().to_f32().unwrap();
         let shape = |key: &str| golden.tensor(key).unwrap().shape.to_vec();

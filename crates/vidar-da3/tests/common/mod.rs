@@ -10,18 +10,6 @@ use vidar_da3::weights::inventory::{Parameter, parameters};
 use vidar_da3::weights::synthetic::tensor;
 use vidar_da3::{Da3, Da3Config, Da3Options};
 
-/// A file of the reference material outside the repository; says so when it is not there.
-pub fn shared(part: &str) -> Option<PathBuf> {
-    let root = std::env::var_os("VIDAR_SHARED")
-        .map_or_else(|| concat!(env!("CARGO_MANIFEST_DIR"), "/../../../shared").into(), PathBuf::from);
-    let path = root.join(part);
-    if path.exists() {
-        return Some(path);
-    }
-    eprintln!("skipped: {} is not there (set VIDAR_SHARED)", path.display());
-    None
-}
-
 /// A file of the repository's own reference material.
 pub fn own(name: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data").join(name)

@@ -212,22 +212,16 @@ fn trajectories_that_cannot_be_flown_are_refused_with_a_reason() {
 
 #[test]
 fn along_a_real_flight_the_simulated_imu_reads_what_the_real_one_read() {
-    let shared = std::env::var("VIDAR_SHARED")
-        .unwrap_or_else(|_| concat!(env!("CARGO_MANIFEST_DIR"), "/../../../shared").to_string());
-    let mav = std::path::Path::new(&shared).join("data/euroc_MH_01_real_11s/mav0");
-    let read = |name: &str| -> Option<Vec<(i64, Vec<f64>)>> {
-        let text = std::fs::read_to_string(mav.join(name)).ok()?;
+    let Some(mav) = vidar_core::testing::shared_data("data/euroc_MH_01_real_11s/mav0") else { return };
+    let read = |name: &str| -> Vec<(i64, Vec<f64>)> {
+        let text = std::fs::read_to_string(mav.join(name)).unwrap();
         let row = |line: &str| {
             let (time, rest) = line.split_once(',').unwrap();
             (time.parse().unwrap(), rest.split(',').map(|v| v.trim().parse().unwrap()).collect())
         };
-        Some(text.lines().filter(|l| !l.starts_with('#') && !l.is_empty()).map(row).collect())
+        text.lines().filter(|l| !l.starts_with('#') && !l.is_empty()).map(row).collect()
     };
-    let (Some(truth), Some(imu)) = (read("state_groundtruth_estimate0/data.csv"), read("imu0/data.csv"))
-    else {
-        eprintln!("skipped: {} is not there", mav.display());
-        return;
-    };
+    let (truth, imu) = (read("state_groundtruth_estimate0/data.csv"), read("imu0/data.csv"));
     let pose = |(time, v): &(i64, Vec<f64>)| {
         let rotation = vidar_core::So3::from_quaternion(v[4], v[5], v[6], v[3]).unwrap();
         let position = Vector3::new(v[0], v[1], v[2]);
