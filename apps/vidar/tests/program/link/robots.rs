@@ -254,7 +254,7 @@ fn a_live_run_tells_ros_where_it_is_and_what_it_sees() {
     assert_eq!(of("/vidar/odometry nav_msgs/Odometry").len(), told.len());
     let keyframes = of("/vidar/keyframe geometry_msgs/PoseStamped");
     assert!(keyframes.len() > 3 && keyframes.len() < told.len(), "{}", keyframes.len());
-    keyframes.iter().for_each(|k| drop(line_of(stamped(k).0)));
+    assert!(keyframes.iter().all(|k| line_of(stamped(k).0).len() == 8), "a keyframe is an image with a pose");
 
     // The surface grows, and its points lie round the camera's path, in a room.
     let clouds: Vec<_> =
