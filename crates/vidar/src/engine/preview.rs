@@ -42,6 +42,8 @@ pub struct Preview<'a> {
     /// Keyframes before this one were tried, the last time when images up to this time had a pose.
     tried: usize,
     tried_at: Option<Timestamp>,
+    /// The first keyframe that the window holds.
+    seen_from: usize,
     /// Whether there is time for it.
     pub has_time: bool,
 }
@@ -64,13 +66,22 @@ impl<'a> Preview<'a> {
         (camera, view): (&CameraModel, &Pinhole),
     ) -> Self {
         let window = ViewWindow::new(images, camera, view);
-        Self { max_wait, size: size.max(1), context, window, tried: 0, tried_at: None, has_time: false }
+        Self {
+            max_wait,
+            size: size.max(1),
+            context,
+            window,
+            tried: 0,
+            tried_at: None,
+            seen_from: 0,
+            has_time: false,
+        }
     }
 
     /// Goes back before the first keyframe.
     pub fn reset(&mut self) {
         self.window.reset();
-        (self.tried, self.tried_at) = (0, None);
+        (self.tried, self.tried_at, self.seen_from) = (0, None, 0);
     }
 
     /// Keyframes to show now: those that are not shown yet, once one of them has waited for too long, since it came or since it was
@@ -86,20 +97,20 @@ impl<'a> Preview<'a> {
         let is_hidden = |k: &usize| !is_shown(&keyframes[*k]);
         let first = (chunks * self.size..keyframes.len()).find(is_hidden)?;
         let is_late = |since: Timestamp| known_until > since + self.max_wait;
-        let next = (self.tried.max(first)..keyframes.len()).find(is_hidden);
-        let is_new = next.is_some_and(|k| is_late(keyframes[k].stamp.time));
-        let is_retried = first < self.tried && self.tried_at.is_some_and(is_late);
-        if !self.has_time || !(is_new || is_retried) {
-            return None;
-        }
-        let seen = &keyframes[first.saturating_sub(self.context)..];
+        let untried = (self.tried.max(first)..keyframes.len()).find(is_hidden);
+        let new = untried.filter(|k| is_late(keyframes[*k].stamp.time));
+        // Where keyframes go on coming, the chunk is near.
+        let may_retry = first < self.tried && (untried.is_none() || keyframes.len() < FEWEST_VIEWS);
+        let is_retried = may_retry && self.tried_at.is_some_and(is_late);
+        let from = if is_retried { Some(first) } else { new }.filter(|_| self.has_time)?;
+        let seen = &keyframes[from.saturating_sub(self.context)..];
         let few = FEWEST_VIEWS.saturating_sub(seen.len());
-        let since = track.partition_point(|f| f.stamp.time <= keyframes[first].stamp.time);
+        let since = track.partition_point(|f| f.stamp.time <= keyframes[from].stamp.time);
         let since = since.max(track.len().saturating_sub(RECENT));
         let more = if is_retried { few.max(HELP_OF_RETRIES) } else { few };
         let helping = spread(seen, (track, since), more);
-        let is_other = is_new || helping.iter().any(|&k| Some(track[k].stamp.time) > self.tried_at);
-        (helping.len() >= few && is_other).then_some(Due { wanted: first..keyframes.len(), helping })
+        let is_other = !is_retried || helping.iter().any(|&k| Some(track[k].stamp.time) > self.tried_at);
+        (helping.len() >= few && is_other).then_some(Due { wanted: from..keyframes.len(), helping })
     }
 
     /// The views of these keyframes at the poses and in the metres of their track, each with the chunk that it will be of.
@@ -119,6 +130,11 @@ impl<'a> Preview<'a> {
                 keyframe.row_motion = track.row_motion(keyframe.stamp.frame_id, readout);
             }
         }
+        // A window moves forward only.
+        if seen.start < self.seen_from {
+            self.window.reset();
+        }
+        self.seen_from = seen.start;
         // The chunk reports images that cannot be read.
         self.window.advance(&keyframes, &seen, &mut Vec::new());
         let chunk_of = |k: usize| ChunkId(u32::try_from(k / self.size).unwrap_or(u32::MAX));
