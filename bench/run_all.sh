@@ -200,7 +200,8 @@ flights_world() {
 tables() {
     flights_world
     local common=(bench euroc "$EUROC" --synthetic --world-config "$OUT/flights.toml" --sequences V1,V2
-        --set fusion.voxel_size_m=0.03 --set keyframes.min_translation_m=0.15 --set keyframes.min_rotation_deg=10.0)
+        --set keyframes.max_count=80 --set fusion.voxel_size_m=0.05 --set geometry.max_width_px=280
+        --set eval.surface.voxel_size_m=0.05)
     step bench-simulated "$VIDAR" "${common[@]}" --geometry simulated -o "$OUT/tables-simulated"
     step bench-stereo "$VIDAR" "${common[@]}" --geometry stereo --modes pose-conditioned,ground-truth,coupled \
         -o "$OUT/tables-stereo"
