@@ -193,7 +193,11 @@ fn a_node_that_stands_still_and_goes_on_after_another_did_its_task_changes_nothi
         assert!(sent.success(), "{name}");
     };
     let clock = Instant::now();
-    let begun = || batch.store().join("predict").read_dir().is_ok_and(|mut d| d.next().is_some());
+    // Its folder is there from the beginning of its task on.
+    let is_scratch = |e: std::io::Result<std::fs::DirEntry>| {
+        e.is_ok_and(|e| e.file_name().to_string_lossy().starts_with("vidar-work-"))
+    };
+    let begun = || batch.folder.path().read_dir().unwrap().any(is_scratch);
     while !begun() && clock.elapsed() < Duration::from_secs(120) {
         std::thread::sleep(Duration::from_millis(1));
     }
