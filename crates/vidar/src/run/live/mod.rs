@@ -241,7 +241,7 @@ fn map(
     if let (Err(error @ Error::Geometry(ModelError::OutOfReach(_))), true) = (&mapped, is_watched) {
         let message = format!("the map has stopped, poses go on: {error}");
         let hint = "the same command with --resume maps the recording once workers answer";
-        context.events.warn(&Warning::degraded("map-stopped", message).hint(hint));
+        readers.read(MapEvent::Warning(Warning::degraded("map-stopped", message).hint(hint)))?;
         while queue.pop().is_some() {}
     }
     mapped
