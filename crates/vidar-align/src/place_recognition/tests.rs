@@ -79,9 +79,9 @@ fn places_that_share_a_common_look_are_told_apart_once_it_is_removed() {
     for place in 0..60 {
         let found = whitened.search(at(100.0), 0.0, &look(place, 1), 2, 10.0, 0.0);
         assert_eq!(found[0].frame_id.index(), place);
-        // Half of the channels are large: the nearest of sixty strangers in 32 dimensions is still far.
-        assert!(found[0].similarity > 0.78 && found[1].similarity < 0.85, "{place}: {found:?}");
-        assert!(found[0].similarity > found[1].similarity + 0.03, "{place}: {found:?}");
+        // The nearest of sixty strangers, in the 32 channels that are large, is still far from the place itself.
+        assert!(found[0].similarity > 0.6, "{place}: {found:?}");
+        assert!(found[0].similarity > found[1].similarity + 0.1, "{place}: {found:?}");
         assert!(plain.search(at(100.0), 0.0, &look(place, 1), 60, 10.0, 0.0)[59].similarity > 0.97);
     }
 }
