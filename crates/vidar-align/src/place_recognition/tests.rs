@@ -1,10 +1,14 @@
 use super::*;
-use vidar_core::random::SplitMix64;
 use vidar_core::{FrameId, Image, Timestamp};
 
 fn direction(seed: u64, n: usize) -> Vec<f32> {
-    let mut random = SplitMix64::new(seed);
-    let mut values: Vec<f32> = (0..n).map(|_| 2.0 * random.uniform() as f32 - 1.0).collect();
+    let mut state = seed.wrapping_mul(0x9e37_79b9_7f4a_7c15) | 1;
+    let mut values: Vec<f32> = (0..n)
+        .map(|_| {
+            state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+            (state >> 40) as f32 / (1u64 << 23) as f32 - 1.0
+        })
+        .collect();
     let length = values.iter().map(|v| v * v).sum::<f32>().sqrt();
     values.iter_mut().for_each(|v| *v /= length);
     values
@@ -79,9 +83,8 @@ fn places_that_share_a_common_look_are_told_apart_once_it_is_removed() {
     for place in 0..60 {
         let found = whitened.search(at(100.0), 0.0, &look(place, 1), 2, 10.0, 0.0);
         assert_eq!(found[0].frame_id.index(), place);
-        // The nearest of sixty strangers, in the 32 channels that are large, is still far from the place itself.
-        assert!(found[0].similarity > 0.6, "{place}: {found:?}");
-        assert!(found[0].similarity > found[1].similarity + 0.1, "{place}: {found:?}");
+        // The nearest of sixty strangers in 64 dimensions is still far.
+        assert!(found[0].similarity > 0.78 && found[1].similarity < 0.75, "{place}: {found:?}");
         assert!(plain.search(at(100.0), 0.0, &look(place, 1), 60, 10.0, 0.0)[59].similarity > 0.97);
     }
 }
