@@ -1,8 +1,8 @@
 //! Uncertainty out of the factor of the normal equations.
 
 use super::Smoother;
-use super::linearise::System;
 use super::prior::Part;
+use super::system::System;
 use crate::imu::{Matrix15, hat};
 use nalgebra::{Matrix6, SMatrix};
 use vidar_core::{FrameId, LieGroup, Se3};

@@ -1,10 +1,8 @@
 //! Dense linear algebra on preallocated slices: a Cholesky factorisation that skips leading zeros of its rows, and
-//! Householder QR of tall matrices. With AVX2 where the processor has it, to the same bits.
-
-use crate::simd::dispatch;
+//! Householder QR of tall matrices.
 
 /// Dot product with eight independent sums: vectorises, and adds in one fixed order.
-#[inline(always)]
+#[inline]
 pub(crate) fn dot(a: &[f64], b: &[f64]) -> f64 {
     let mut sums = [0.0; 8];
     let (a8, b8) = (a.chunks_exact(8), b.chunks_exact(8));
@@ -22,7 +20,7 @@ pub(crate) fn dot(a: &[f64], b: &[f64]) -> f64 {
 }
 
 /// `y += a · x`.
-#[inline(always)]
+#[inline]
 pub(crate) fn axpy(a: f64, x: &[f64], y: &mut [f64]) {
     for (x, y) in x.iter().zip(y) {
         *y += a * x;
@@ -52,11 +50,6 @@ impl Cholesky {
     /// Factorises `a + diag(extra)`, `a` row-major `n × n` of which the lower triangle from column `first[i]` of each
     /// row is read. `false` when a pivot is not positive; the factor is of no use then.
     pub(crate) fn factorise(&mut self, a: &[f64], extra: &[f64], first: &[usize]) -> bool {
-        dispatch!(self.factorise_rows(a, extra, first))
-    }
-
-    #[inline(always)]
-    fn factorise_rows(&mut self, a: &[f64], extra: &[f64], first: &[usize]) -> bool {
         let n = first.len();
         self.n = n;
         self.first.clear();
@@ -96,11 +89,6 @@ impl Cholesky {
 
     /// Solves `L y = b` in place.
     pub(crate) fn forward(&self, b: &mut [f64]) {
-        dispatch!(self.forward_rows(b));
-    }
-
-    #[inline(always)]
-    fn forward_rows(&self, b: &mut [f64]) {
         for i in 0..self.n {
             let from = self.first[i];
             let row = &self.l[i * self.n..i * self.n + i];
@@ -110,11 +98,6 @@ impl Cholesky {
 
     /// Solves `Lᵀ x = y` in place.
     pub(crate) fn backward(&self, b: &mut [f64]) {
-        dispatch!(self.backward_rows(b));
-    }
-
-    #[inline(always)]
-    fn backward_rows(&self, b: &mut [f64]) {
         for i in (0..self.n).rev() {
             let x = b[i] * self.inverse_diagonal[i];
             b[i] = x;
@@ -183,11 +166,6 @@ impl Tall {
     /// A column that depends on those before it (up to 1e-13 of its length) makes no step: its row would otherwise
     /// be lost to what is said of later columns.
     pub(crate) fn triangularise(&mut self, from_row: usize, from: usize, until: usize) -> usize {
-        dispatch!(self.reflect_columns(from_row, from, until))
-    }
-
-    #[inline(always)]
-    fn reflect_columns(&mut self, from_row: usize, from: usize, until: usize) -> usize {
         let (stride, rows, cols) = (self.stride, self.rows, self.cols);
         let mut at = from_row;
         for k in from..until.min(cols) {

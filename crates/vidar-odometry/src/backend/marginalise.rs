@@ -9,8 +9,9 @@
 
 use super::dense::Tall;
 use super::inertial::{body_velocity, by_time_offset, gauge_prior_at, jacobians, residual};
-use super::linearise::{Scene, System, calibration_weights, shift_between};
+use super::linearise::{Scene, calibration_weights, shift_between};
 use super::prior::Part;
+use super::system::System;
 use super::visual;
 use super::window::{
     CALIBRATION_DIM, Landmark, LandmarkObservation, MAX_INVERSE_DISTANCE, MIN_INVERSE_DISTANCE, OFFSET_AT,

@@ -19,6 +19,7 @@ mod optimise;
 mod prior;
 mod products;
 mod standstill;
+mod system;
 mod visual;
 mod window;
 
@@ -36,10 +37,10 @@ pub(crate) use visual::{bearing_plus, tangent_basis, whitening};
 pub use window::{LandmarkEstimate, Observation};
 
 use crate::imu::{ImuModel, NavState, Preintegration};
-use linearise::System;
 use nalgebra::{Matrix2, Vector2};
 use prior::Prior;
 use rustc_hash::FxHashMap;
+use system::System;
 use vidar_core::{CameraModel, Duration, FrameId, LandmarkId, Se3, Timestamp};
 use window::{CalibrationState, Frame, GaugePrior, ImuFactor, Landmark, LandmarkObservation};
 

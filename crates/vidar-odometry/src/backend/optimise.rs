@@ -1,8 +1,8 @@
 //! Levenberg-Marquardt over the window.
 
 use super::Smoother;
-use super::linearise::System;
 use super::prior::Part;
+use super::system::System;
 use super::window::{CALIBRATION_DIM, CalibrationState};
 use crate::imu::{NavState, Vector15};
 use nalgebra::{SVector, Vector3};

@@ -9,17 +9,7 @@ pub(crate) fn product<const R: usize, const K: usize, const C: usize>(
     a: &SMatrix<f64, R, K>,
     b: &SMatrix<f64, K, C>,
 ) -> SMatrix<f64, R, C> {
-    let mut out = SMatrix::zeros();
-    for j in 0..C {
-        for i in 0..R {
-            let mut sum = a[(i, 0)] * b[(0, j)];
-            for k in 1..K {
-                sum += a[(i, k)] * b[(k, j)];
-            }
-            out[(i, j)] = sum;
-        }
-    }
-    out
+    product_of(|i, k| a[(i, k)], b)
 }
 
 /// `aᵀ b`.
@@ -28,12 +18,21 @@ pub(crate) fn transposed_product<const R: usize, const K: usize, const C: usize>
     a: &SMatrix<f64, K, R>,
     b: &SMatrix<f64, K, C>,
 ) -> SMatrix<f64, R, C> {
+    product_of(|i, k| a[(k, i)], b)
+}
+
+/// The product with `b` of the matrix that has these entries.
+#[inline(always)]
+fn product_of<const R: usize, const K: usize, const C: usize>(
+    entry: impl Fn(usize, usize) -> f64,
+    b: &SMatrix<f64, K, C>,
+) -> SMatrix<f64, R, C> {
     let mut out = SMatrix::zeros();
     for j in 0..C {
         for i in 0..R {
-            let mut sum = a[(0, i)] * b[(0, j)];
+            let mut sum = entry(i, 0) * b[(0, j)];
             for k in 1..K {
-                sum += a[(k, i)] * b[(k, j)];
+                sum += entry(i, k) * b[(k, j)];
             }
             out[(i, j)] = sum;
         }

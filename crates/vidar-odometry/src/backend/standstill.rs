@@ -1,7 +1,7 @@
 //! A body that stands still: its pose is that of the frame before, and one frame may stand for the whole rest.
 
-use super::linearise::System;
 use super::prior::Part;
+use super::system::System;
 use super::{MarginalisationReport, Smoother, SmootherError};
 use crate::imu::NavState;
 use nalgebra::{Matrix3, Matrix6, Vector6};

@@ -1,8 +1,8 @@
 //! Factors against numeric derivatives, the prior against dense algebra, and what must stay unobservable.
 
 use super::inertial::{Shift, body_velocity, by_time_offset, gauge_prior_at, jacobians, residual};
-use super::linearise::System;
 use super::prior::Part;
+use super::system::System;
 use super::visual::{self, CameraPose};
 use super::*;
 use crate::imu::{Bias, Matrix15, Vector15};
