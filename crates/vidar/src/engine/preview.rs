@@ -42,8 +42,6 @@ pub struct Preview<'a> {
     /// Keyframes before this one were tried, the last time when images up to this time had a pose.
     tried: usize,
     tried_at: Option<Timestamp>,
-    /// The first keyframe that the window holds.
-    seen_from: usize,
     /// Whether there is time for it.
     pub has_time: bool,
 }
@@ -66,22 +64,13 @@ impl<'a> Preview<'a> {
         (camera, view): (&CameraModel, &Pinhole),
     ) -> Self {
         let window = ViewWindow::new(images, camera, view);
-        Self {
-            max_wait,
-            size: size.max(1),
-            context,
-            window,
-            tried: 0,
-            tried_at: None,
-            seen_from: 0,
-            has_time: false,
-        }
+        Self { max_wait, size: size.max(1), context, window, tried: 0, tried_at: None, has_time: false }
     }
 
     /// Goes back before the first keyframe.
     pub fn reset(&mut self) {
         self.window.reset();
-        (self.tried, self.tried_at, self.seen_from) = (0, None, 0);
+        (self.tried, self.tried_at) = (0, None);
     }
 
     /// Keyframes to show now: those that are not shown yet, once one of them has waited for too long, since it came or since it was
@@ -130,11 +119,6 @@ impl<'a> Preview<'a> {
                 keyframe.row_motion = track.row_motion(keyframe.stamp.frame_id, readout);
             }
         }
-        // A window moves forward only.
-        if seen.start < self.seen_from {
-            self.window.reset();
-        }
-        self.seen_from = seen.start;
         // The chunk reports images that cannot be read.
         self.window.advance(&keyframes, &seen, &mut Vec::new());
         let chunk_of = |k: usize| ChunkId(u32::try_from(k / self.size).unwrap_or(u32::MAX));

@@ -31,13 +31,16 @@ pub struct Taken {
     pub indices: Vec<usize>,
 }
 
-/// A window of undistorted keyframes that moves forward through the sequence; each image is read once.
+/// A window of undistorted keyframes that moves forward through the sequence; each image is read once, and again where the window is
+/// moved back.
 pub struct ViewWindow<'a> {
     images: &'a dyn ImageSource,
     camera: CameraModel,
     remap: RemapTable,
     /// Keyframe index with its view and its mask, ascending. Unreadable images are missing.
     views: Vec<(usize, MaskedView)>,
+    /// The first keyframe that it was moved to, and the one after the last.
+    start: usize,
     next: usize,
 }
 
@@ -45,17 +48,21 @@ impl<'a> ViewWindow<'a> {
     /// An empty window before the first keyframe.
     pub fn new(images: &'a dyn ImageSource, camera: &CameraModel, view: &Pinhole) -> Self {
         let remap = RemapTable::new(camera, view);
-        Self { images, camera: camera.clone(), remap, views: Vec::new(), next: 0 }
+        Self { images, camera: camera.clone(), remap, views: Vec::new(), start: 0, next: 0 }
     }
 
     /// Moves back before the first keyframe.
     pub fn reset(&mut self) {
         self.views.clear();
-        self.next = 0;
+        (self.start, self.next) = (0, 0);
     }
 
     /// Moves the window to the keyframes `seen`, reading what is new. Unreadable images are reported and left out.
     pub fn advance(&mut self, keyframes: &[MapKeyframe], seen: &Range<usize>, report: &mut Vec<MapEvent>) {
+        if seen.start < self.start {
+            self.reset();
+        }
+        self.start = seen.start;
         self.views.retain(|(index, _)| seen.contains(index));
         let fresh: Vec<usize> = (self.next.max(seen.start)..seen.end).collect();
         let loaded: Vec<_> = fresh.par_iter().map(|&index| (index, self.load(&keyframes[index]))).collect();

@@ -236,8 +236,9 @@ fn map(
     readers: &mut Readers<'_>,
 ) -> Result<(), Error> {
     let _closing = Closing(queue);
-    let mapped = map_queue((context, options), queue, engine, readers);
+    // Of a recording that is replayed as fast as it goes nobody sees the surface grow, nor waits for poses.
     let is_watched = options.is_realtime || context.stream.is_some();
+    let mapped = map_queue((context, is_watched), queue, engine, readers);
     if let (Err(error @ Error::Geometry(ModelError::OutOfReach(_))), true) = (&mapped, is_watched) {
         let message = format!("the map has stopped, poses go on: {error}");
         let hint = "the same command with --resume maps the recording once workers answer";
@@ -249,14 +250,12 @@ fn map(
 
 /// What is tracked into the engine, until the odometry ends or the engine cannot go on.
 fn map_queue(
-    (context, options): (&Context<'_>, &LiveOptions),
+    (context, is_watched): (&Context<'_>, bool),
     queue: &Queue,
     engine: &mut Engine<'_>,
     readers: &mut Readers<'_>,
 ) -> Result<(), Error> {
     let (total, mut done) = (context.dataset.images.len(), 0);
-    // Of a recording that is replayed as fast as it goes nobody sees the surface grow.
-    let is_watched = options.is_realtime || context.stream.is_some();
     while let Some(item) = queue.pop() {
         match item {
             Item::Warning(warning) => readers.read(MapEvent::Warning(warning))?,
