@@ -7,9 +7,8 @@
 # and in the containers. IMAGE (vidar:latest) is built from the Containerfile. Running it again does only what is missing.
 set -eu
 IMAGE=${IMAGE:-vidar:latest} MOUNT=${MOUNT:-/data} CPUS=${CPUS:-4}
-PLANNED=$(vidar plan "$@" --json | tr -d '\n')
-PLAN=$(printf %s "$PLANNED" | sed -n 's/.*"plan": *"\([^"]*\)".*/\1/p')
-tasks() { printf %s "$PLANNED" | tr -d ' ' | sed -n "s/.*\"stage\":\"$1\",\"tasks\":\([0-9]*\).*/\1/p"; }
+# shellcheck source=examples/batches/plan.sh
+. "$(dirname "$0")/plan.sh"
 template=$(dirname "$0")/kubernetes.yaml
 # A job's name tells the plan, so that two batches do not meet.
 hash=${PLAN##*/}

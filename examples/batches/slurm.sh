@@ -7,9 +7,8 @@
 # of a task, SBATCH_OPTIONS what else sbatch is to be told (partition, account, time). Running it again does only what is missing.
 set -eu
 CPUS=${CPUS:-4}
-PLANNED=$(vidar plan "$@" --json | tr -d '\n')
-PLAN=$(printf %s "$PLANNED" | sed -n 's/.*"plan": *"\([^"]*\)".*/\1/p')
-tasks() { printf %s "$PLANNED" | tr -d ' ' | sed -n "s/.*\"stage\":\"$1\",\"tasks\":\([0-9]*\).*/\1/p"; }
+# shellcheck source=examples/batches/plan.sh
+. "$(dirname "$0")/plan.sh"
 
 after=
 for stage in track predict map; do
