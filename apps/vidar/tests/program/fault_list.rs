@@ -43,8 +43,9 @@ const DEGREES: f64 = 180.0 / std::f64::consts::PI;
 enum Outcome {
     /// Status 0 without a warning: the scale is right within three times what is stated.
     Right,
-    /// Status 3 with these warnings, in this order, and words that name the cause.
-    Told(&'static [&'static str], &'static str),
+    /// Status 3 with these warnings, in this order, and words that name the cause; then words of which a live trajectory that is not right
+    /// says one, empty: any.
+    Told(&'static [&'static str], &'static str, &'static [&'static str]),
     /// Right, told or refused: where it is not right, one of these words is said; empty: any. Of the long list, whose faults may be
     /// small enough to be either.
     Any(&'static [&'static str]),
@@ -60,19 +61,31 @@ const NEVER_STARTED: &[&str] = &["odometry-never-started"];
 
 const SHORT: &[Case] = &[
     (Fault::None, Right),
-    (Fault::Turned(10.0), Told(NEVER_STARTED, "contradict each other")),
-    (Fault::Turned(180.0), Told(NEVER_STARTED, "camera's orientation on the IMU is off")),
+    (Fault::Turned(10.0), Told(NEVER_STARTED, "contradict each other", CONTRADICTION)),
+    (Fault::Turned(180.0), Told(NEVER_STARTED, "camera's orientation on the IMU is off", CONTRADICTION)),
     // The lever arm takes the place of accelerations: what is known of the scale is too little, which is said.
-    (Fault::Lever(0.10), Told(&["scale-not-converged"], "lengths are not metres")),
+    (Fault::Lever(0.10), Told(&["scale-not-converged"], "lengths are not metres", &[])),
     (
         Fault::Gains(1.0, 1.0 / STANDARD_GRAVITY),
-        Told(&["gravity-norm", "odometry-never-started"], "it looks like units of g"),
+        Told(&["gravity-norm", "odometry-never-started"], "it looks like units of g", &["units of g"]),
     ),
-    (Fault::Gains(DEGREES, 1.0), Told(&["gyro-range", "odometry-never-started"], "it looks like °/s")),
-    (Fault::Gains(1.0, -1.0), Told(NEVER_STARTED, "signs or axes of the accelerometer")),
-    (Fault::Clock(500), Told(&["imu-coverage", "odometry-never-started"], "contradict each other")),
-    (Fault::OtherCamera, Told(NEVER_STARTED, "contradict each other")),
-    (Fault::Gap(3.5, 4.5), Told(&["imu-gap", "track-lost"], "no IMU measurement for 1.01 s")),
+    (
+        Fault::Gains(DEGREES, 1.0),
+        Told(&["gyro-range", "odometry-never-started"], "it looks like °/s", &["°/s", "contradict"]),
+    ),
+    (
+        Fault::Gains(1.0, -1.0),
+        Told(NEVER_STARTED, "signs or axes of the accelerometer", &["signs or axes of the accelerometer"]),
+    ),
+    (
+        Fault::Clock(500),
+        Told(&["imu-coverage", "odometry-never-started"], "contradict each other", CONTRADICTION),
+    ),
+    (Fault::OtherCamera, Told(NEVER_STARTED, "contradict each other", CONTRADICTION)),
+    (
+        Fault::Gap(3.5, 4.5),
+        Told(&["imu-gap", "track-lost"], "no IMU measurement for 1.01 s", &["imu-gap", "IMU measurement"]),
+    ),
 ];
 
 const REST: &[Case] = &[
@@ -268,10 +281,9 @@ fn evaluate((fault, outcome): Case, is_adjusted: bool) -> Result<String, String>
     };
     let is_as_expected = match outcome {
         Right if is_adjusted => ran.code == 0 && warned.is_empty() && is_right(),
-        Told(codes, cause) if is_adjusted => ran.code == 3 && warned == codes && said.contains(cause),
+        Told(codes, cause, _) if is_adjusted => ran.code == 3 && warned == codes && said.contains(cause),
         Right => is_honest(&[]),
-        Told(codes, cause) => is_honest(&[&[cause], codes, CONTRADICTION].concat()),
-        Any(causes) => is_honest(causes),
+        Told(_, _, causes) | Any(causes) => is_honest(causes),
     };
     let short = format!("{short}, warnings {warned:?}");
     if is_as_expected { Ok(short) } else { Err(format!("{short}: not {outcome:?}")) }
