@@ -67,6 +67,7 @@ pub mod random;
 pub mod remap;
 pub mod rig;
 pub mod sensor;
+pub mod simd;
 pub mod surface;
 mod svd3;
 pub mod testing;

@@ -1,5 +1,6 @@
 //! Helpers for tests, used by all crates: checks of analytic derivatives, and the recordings beside the checkout.
 
+use crate::simd::{self, Instructions};
 use nalgebra::{SMatrix, SVector};
 use std::fmt::Display;
 use std::io::Write;
@@ -26,6 +27,33 @@ pub fn skipped(why: &dyn Display) {
     let test = thread.name().unwrap_or("a test");
     // Where standard error is closed, nobody can be told.
     let _ = writeln!(std::io::stderr(), "skipped {test}: {why}");
+}
+
+/// Results of `work` on one thread, with each instruction set that this processor has, the portable one first.
+pub fn with_each_instruction_set<R: Send>(work: impl Fn() -> R + Sync) -> Vec<(Instructions, R)> {
+    let pool = rayon::ThreadPoolBuilder::new().num_threads(1).build().expect("a pool of one thread");
+    let mut results = Vec::new();
+    for limit in [Instructions::Portable, Instructions::Avx2, Instructions::Avx512] {
+        let run = || {
+            simd::limit(limit);
+            (simd::available() == limit).then(&work)
+        };
+        results.extend(pool.install(run).map(|r| (limit, r)));
+    }
+    results
+}
+
+/// The result of `work`, which must not depend on the instruction set.
+///
+/// # Panics
+/// If it does.
+pub fn same_with_each_instruction_set<R: Send + PartialEq>(work: impl Fn() -> R + Sync) -> R {
+    let mut results = with_each_instruction_set(work).into_iter();
+    let (_, portable) = results.next().expect("the portable one is always there");
+    for (instructions, result) in results {
+        assert!(result == portable, "{instructions:?} gives another result than the portable instructions");
+    }
+    portable
 }
 
 /// Jacobian of `f` at `x` by central differences with Richardson extrapolation.

@@ -3,10 +3,10 @@
 use crate::FusionConfig;
 use crate::grid::{BlockKey, EDGE, median_depth};
 use crate::sample::{SampledView, TILE, round_to_i32};
-use crate::simd::dispatch;
 use nalgebra::Vector3;
 use rayon::prelude::*;
 use vidar_core::AlignedView;
+use vidar_core::simd::kernel;
 
 /// Neighbouring rays that start a search lie at most this share of a block apart at the median depth…
 const RAY_SPACING: f64 = 1.0 / 5.0;
@@ -100,7 +100,7 @@ impl Rays {
         for point in 0..self.points {
             // Point by point, not ray by ray: neighbours in the row mostly lie in the same block.
             let offset = point as f32 * self.spacing;
-            dispatch!(self.encode(first, stagger, offset, &found.depths, &mut found.row));
+            encode(self, first, stagger, offset, &found.depths, &mut found.row);
             found.add_row();
         }
     }
@@ -125,6 +125,12 @@ impl Rays {
         let at = |shift: u32| (code >> shift & CODE_MASK) as i32 - CODE_ORIGIN;
         let [x, y, z] = self.camera_block;
         [x + at(2 * CODE_BITS), y + at(CODE_BITS), z + at(0)]
+    }
+}
+
+kernel! {
+    fn encode(rays: &Rays, first: [f32; 3], stagger: usize, offset: f32, depths: &[f32], codes: &mut [Code]) {
+        rays.encode(first, stagger, offset, depths, codes);
     }
 }
 

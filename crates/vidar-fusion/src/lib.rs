@@ -53,7 +53,6 @@ mod pixels;
 mod points;
 mod render;
 mod sample;
-mod simd;
 mod sub_volumes;
 mod texture;
 mod update;

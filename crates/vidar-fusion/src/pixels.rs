@@ -6,12 +6,12 @@
 
 use crate::grid::BlockKey;
 use crate::sample::{Sample, SampledView, camera_normal, gradient_step, round_to_i32, slope};
-use crate::simd::dispatch;
 use nalgebra::{Matrix3, Vector3};
 use rayon::prelude::*;
 use rustc_hash::FxBuildHasher;
 use std::hash::BuildHasher;
 use vidar_core::AlignedView;
+use vidar_core::simd::kernel;
 
 /// Voxels are distributed over this many tables, which are filled in parallel.
 pub(crate) const SHARDS: usize = 16;
@@ -91,9 +91,9 @@ impl Strips {
             strip.clear();
             for (row, samples) in samples.chunks_exact(sampled.width).enumerate() {
                 let y = at * STRIP + row;
-                dispatch!(backprojector.backproject(y, samples, &mut strip.row));
+                backproject(&backprojector, y, samples, &mut strip.row);
                 let colors = view.color().map(|c| &c.data()[y * sampled.width..][..sampled.width]);
-                dispatch!(strip.add(samples, colors, backprojector.camera_voxel));
+                add_row(strip, samples, colors, backprojector.camera_voxel);
             }
             strip.finish();
         });
@@ -102,6 +102,18 @@ impl Strips {
     /// The partial sums of one shard, in the order of strips.
     pub fn of_shard(&self, shard: usize) -> impl Iterator<Item = &PartialSum> {
         self.strips.iter().flat_map(move |strip| &strip.partial_sums[shard])
+    }
+}
+
+kernel! {
+    fn backproject(backprojector: &Backprojector<'_>, y: usize, samples: &[Sample], row: &mut Row) {
+        backprojector.backproject(y, samples, row);
+    }
+}
+
+kernel! {
+    fn add_row(strip: &mut Strip, samples: &[Sample], colors: Option<&[[u8; 3]]>, camera_voxel: BlockKey) {
+        strip.add(samples, colors, camera_voxel);
     }
 }
 

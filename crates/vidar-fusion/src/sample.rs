@@ -12,9 +12,9 @@
 //! It is stored as an integer, [`WEIGHT_ONE`] for w = 1, so that sums do not depend on their order.
 
 use crate::FusionConfig;
-use crate::simd::dispatch;
 use rayon::prelude::*;
 use std::sync::LazyLock;
+use vidar_core::simd::kernel;
 use vidar_core::{AlignedView, Pinhole};
 
 /// The integer that stands for a weight of 1 (12 bits).
@@ -119,7 +119,7 @@ impl SampledView {
             for (row, samples) in samples.chunks_mut(width).enumerate() {
                 weigher.row(tile_row * TILE + row, samples);
             }
-            dispatch!(weigher.fill_tiles(tile_row, samples, tiles));
+            fill_tiles(&weigher, tile_row, samples, tiles);
         });
         self.fill_colors(view);
         self.pixels_used = self.tiles.iter().map(|t| u64::from(t.usable)).sum();
@@ -195,6 +195,25 @@ struct PixelWeighting<'a> {
     inverse_variance: &'static [f32; 256],
 }
 
+kernel! {
+    fn weigh_inner(
+        weighting: &PixelWeighting<'_>,
+        range: std::ops::Range<usize>,
+        y: f32,
+        rows: [&[f32]; 3],
+        confidence: &[f32],
+        out: &mut [Sample],
+    ) {
+        weighting.inner(range, y, rows, confidence, out);
+    }
+}
+
+kernel! {
+    fn fill_tiles(weighting: &PixelWeighting<'_>, tile_row: usize, samples: &[Sample], tiles: &mut [Tile]) {
+        weighting.fill_tiles(tile_row, samples, tiles);
+    }
+}
+
 impl<'a> PixelWeighting<'a> {
     fn new(view: &'a AlignedView, config: &FusionConfig) -> Self {
         let k: &Pinhole = view.intrinsics();
@@ -229,7 +248,7 @@ impl<'a> PixelWeighting<'a> {
             let column = [above[x], below[x]];
             out[x] = self.sample(x as f32, y as f32, line, column, confidence[x]);
         }
-        dispatch!(self.inner(inner, y as f32, rows, confidence, out));
+        weigh_inner(self, inner, y as f32, rows, confidence, out);
     }
 
     /// Pixels that have neighbours on both sides; cut to equal slices so that the loop has no bounds to check.

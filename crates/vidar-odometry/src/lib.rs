@@ -24,7 +24,6 @@ pub mod imu;
 pub mod initialization;
 mod pipeline;
 mod relocalization;
-mod simd;
 #[cfg(any(test, feature = "simulation"))]
 pub mod simulate;
 mod stages;

@@ -18,6 +18,7 @@ use crate::consistency::Support;
 use crate::elementary::{exp, ln};
 use crate::estimate::Estimate;
 use crate::prepare::PoseCorrection;
+use vidar_core::simd::kernel;
 
 /// Relative depth error below which a depth counts as correct.
 pub const TOLERANCE_RATIO: f32 = 0.03;
@@ -82,12 +83,25 @@ pub(crate) fn confident(
 ) -> (Vec<f32>, Vec<f32>) {
     let (mut rho, mut confidence) = (vec![f32::NAN; support.rho.len()], vec![0.0; support.rho.len()]);
     let view = ViewBound::new(correction);
-    crate::simd::dispatch!(fill(estimate, support, &view, min_confidence, &mut rho, &mut confidence));
+    fill(estimate, support, &view, min_confidence, &mut rho, &mut confidence);
     (rho, confidence)
 }
 
+kernel! {
+    fn fill(
+        estimate: &Estimate,
+        support: &Support,
+        view: &ViewBound,
+        min_confidence: f32,
+        rho: &mut [f32],
+        confidence: &mut [f32],
+    ) {
+        keep_confident(estimate, support, view, min_confidence, rho, confidence);
+    }
+}
+
 #[inline(always)]
-fn fill(
+fn keep_confident(
     estimate: &Estimate,
     support: &Support,
     view: &ViewBound,

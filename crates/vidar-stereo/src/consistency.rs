@@ -11,6 +11,7 @@ use crate::chunk::ViewDepth;
 use crate::config::StereoConfig;
 use crate::warp::{MIN_DEPTH_RATIO, Warp, neighbour_from_reference};
 use rayon::prelude::*;
+use vidar_core::simd::kernel;
 
 /// Largest forward-backward reprojection error, working pixels.
 const REPROJECTION_LIMIT_PX: f32 = 1.5;
@@ -76,7 +77,7 @@ pub(crate) fn support(own: &ViewDepth, others: &[&ViewDepth], config: &StereoCon
             };
             let y = (ROWS * i + y) as f32;
             for other in &others {
-                crate::simd::dispatch!(row.compare(other, y, config.agreement_ratio as f32, &mut totals));
+                compare(&mut row, other, y, config.agreement_ratio as f32, &mut totals);
             }
             totals.average();
         }
@@ -113,6 +114,12 @@ struct Row {
     expected: Vec<f32>,
     /// The inverse depths that the view has at the four: left and right above, left and right below.
     found: [Vec<f32>; 4],
+}
+
+kernel! {
+    fn compare(row: &mut Row, other: &Other<'_>, y: f32, agreement: f32, totals: &mut Totals<'_>) {
+        row.compare(other, y, agreement, totals);
+    }
 }
 
 impl Row {

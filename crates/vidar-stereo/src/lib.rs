@@ -48,7 +48,6 @@ mod prepare;
 mod register;
 mod select;
 mod sgm;
-mod simd;
 mod surface;
 mod sweep;
 mod warp;

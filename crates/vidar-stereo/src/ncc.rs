@@ -10,6 +10,7 @@
 use crate::prepare::{GRAY_STEPS, Level};
 use crate::warp::{RowSamples, Warp};
 use crate::window::{HIDDEN, RADIUS, UNITS};
+use vidar_core::simd::kernel;
 
 const WINDOW: usize = 2 * RADIUS + 1;
 const INVERSE_AREA: f32 = 1.0 / (WINDOW * WINDOW) as f32;
@@ -37,9 +38,15 @@ pub(crate) struct Reference {
     noise_variance: f32,
 }
 
+kernel! {
+    fn with_statistics(level: &Level, noise_gray: f32) -> Reference {
+        Reference::with_statistics(level, noise_gray)
+    }
+}
+
 impl Reference {
     pub fn new(level: &Level, noise_gray: f32) -> Self {
-        crate::simd::dispatch!(Self::with_statistics(level, noise_gray))
+        with_statistics(level, noise_gray)
     }
 
     #[inline(always)]
@@ -210,7 +217,7 @@ impl<'a> Strip<'a> {
     }
 }
 
-crate::simd::for_each_instruction_set! {
+kernel! {
     fn merged_costs(
         strip: &mut Strip<'_>,
         sources: &[Source<'_>],

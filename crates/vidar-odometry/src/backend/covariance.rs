@@ -154,7 +154,7 @@ impl System {
         for (k, &column) in columns.iter().enumerate() {
             let unit = &mut solved[k * n..(k + 1) * n];
             unit[column] = 1.0;
-            self.cholesky.forward(unit);
+            self.cholesky.forward_from(column, unit);
         }
         // A⁻¹ = L⁻ᵀ L⁻¹, so its entries are dot products of the columns of L⁻¹.
         for i in 0..columns.len() {

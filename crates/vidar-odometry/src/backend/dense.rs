@@ -89,7 +89,12 @@ impl Cholesky {
 
     /// Solves `L y = b` in place.
     pub(crate) fn forward(&self, b: &mut [f64]) {
-        for i in 0..self.n {
+        self.forward_from(0, b);
+    }
+
+    /// The same of a `b` that is zero before entry `begin`, as `y` is, too.
+    pub(crate) fn forward_from(&self, begin: usize, b: &mut [f64]) {
+        for i in begin..self.n {
             let from = self.first[i];
             let row = &self.l[i * self.n..i * self.n + i];
             b[i] = (b[i] - dot(&row[from..], &b[from..i])) * self.inverse_diagonal[i];

@@ -164,14 +164,11 @@ impl Template {
         if !fits(image, centre, HALF + 1) {
             return None;
         }
-        let read = |x: i32, y: i32| {
-            sample(image, (centre.x + f64::from(x)) as f32, (centre.y + f64::from(y)) as f32)
-        };
         const WIDE: usize = SIDE + 2;
-        let mut wide = [0.0_f32; WIDE * WIDE];
-        for (k, value) in wide.iter_mut().enumerate() {
-            *value = read((k % WIDE) as i32 - HALF - 1, (k / WIDE) as i32 - HALF - 1);
-        }
+        let place = |centre: f64, k: usize| (centre + f64::from(k as i32 - HALF - 1)) as f32;
+        let x = std::array::from_fn(|k| place(centre.x, k % WIDE));
+        let y = std::array::from_fn(|k| place(centre.y, k / WIDE));
+        let wide: [f32; WIDE * WIDE] = sample(image, &x, &y);
         let (mut grey, mut gx, mut gy) = ([0.0; SIDE * SIDE], [0.0; SIDE * SIDE], [0.0; SIDE * SIDE]);
         for y in 0..SIDE {
             for x in 0..SIDE {

@@ -4,8 +4,8 @@
 //! levels differ by more than a factor, and [`to_level`]/[`from_level`] are the only conversions.
 
 use super::error::FrontendError;
-use crate::simd::dispatch;
 use vidar_core::camera::Pixel;
+use vidar_core::simd::kernel;
 use vidar_core::{FrameImage, Image};
 
 /// Levels of the odometry's pyramids, each half the size of the one before: 752 × 480 pixels become 47 × 30.
@@ -96,7 +96,7 @@ impl Pyramid {
         for l in 1..self.levels.len() {
             let (below, above) = self.levels.split_at_mut(l);
             let (from, to) = (&below[l - 1], &mut above[0]);
-            dispatch!(half_sample(from, to));
+            half_sample(from, to);
         }
     }
 }
@@ -106,9 +106,15 @@ fn luma(p: &[u8; 3]) -> u8 {
     (0.299 * f32::from(p[0]) + 0.587 * f32::from(p[1]) + 0.114 * f32::from(p[2])).round() as u8
 }
 
+kernel! {
+    fn half_sample(from: &Image<u8>, to: &mut Image<u8>) {
+        average_blocks(from, to);
+    }
+}
+
 /// `(a + b + c + d + 2) / 4` of every 2×2 block; an odd last row or column is left out.
 #[inline(always)]
-fn half_sample(from: &Image<u8>, to: &mut Image<u8>) {
+fn average_blocks(from: &Image<u8>, to: &mut Image<u8>) {
     let (width, height) = (to.width(), to.height());
     let stride = from.width();
     for y in 0..height {
@@ -141,7 +147,7 @@ pub fn from_level(pixel: &Pixel, l: usize) -> Pixel {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::simd::narrow;
+    use vidar_core::testing::same_with_each_instruction_set;
 
     #[test]
     fn levels_are_rounded_means_of_blocks() {
@@ -159,13 +165,13 @@ mod tests {
     }
 
     #[test]
-    fn wide_and_narrow_paths_give_the_same_bits() {
+    fn the_bits_do_not_depend_on_the_instructions() {
         let image = Image::from_fn(301, 203, |x, y| ((x * x + 31 * y + x * y) % 256) as u8);
-        let wide = Pyramid::of(&image, 4);
-        let scalar = narrow(|| Pyramid::of(&image, 4));
-        for l in 0..wide.level_count() {
-            assert_eq!(wide.level(l), scalar.level(l));
-        }
+        let levels = same_with_each_instruction_set(|| {
+            let pyramid = Pyramid::of(&image, 4);
+            (0..pyramid.level_count()).map(|l| pyramid.level(l).clone()).collect::<Vec<_>>()
+        });
+        assert_eq!(levels.len(), 4);
     }
 
     #[test]

@@ -7,9 +7,9 @@
 use super::feature::{Feature, FeatureKind};
 use super::patch::sample;
 use super::pyramid::{Pyramid, level_scale, to_level};
-use crate::simd::dispatch;
 use nalgebra::{Matrix2, Matrix3x2, Vector2, Vector3};
 use vidar_core::camera::Pixel;
+use vidar_core::simd::kernel;
 use vidar_core::{CameraModel, Se3, So3};
 
 /// Side of the patch that is aligned, pixels.
@@ -148,7 +148,7 @@ impl Template {
         let source = (step.log2().round().max(0.0) as usize).min(keyframe.level_count() - 1);
         let centre = to_level(&feature.pixel, source);
         let steps = key_from_current * (level_scale(self.level) / level_scale(source));
-        dispatch!(self.sample_from(keyframe, source, &centre, &steps)) && self.prepare()
+        sample_from(self, keyframe, source, &centre, &steps) && self.prepare()
     }
 
     #[inline(always)]
@@ -176,12 +176,13 @@ impl Template {
         let mut patch = [[0.0_f32; BORDERED]; BORDERED];
         for (j, row) in patch.iter_mut().enumerate() {
             let (rx, ry) = (cx + j as f32 * xy, cy + j as f32 * yy);
-            for (i, value) in row.iter_mut().enumerate() {
+            let (mut x, mut y) = ([0.0; BORDERED], [0.0; BORDERED]);
+            for i in 0..BORDERED {
                 // Rounding to f32 may step over the border that was checked in f64.
-                let x = (rx + i as f32 * xx).clamp(0.0, max_x);
-                let y = (ry + i as f32 * yx).clamp(0.0, max_y);
-                *value = sample(image, x, y);
+                x[i] = (rx + i as f32 * xx).clamp(0.0, max_x);
+                y[i] = (ry + i as f32 * yx).clamp(0.0, max_y);
             }
+            *row = sample(image, &x, &y);
         }
         for j in 0..SIDE {
             for i in 0..SIDE {
@@ -214,6 +215,18 @@ impl Template {
         let xy = dot(&self.gx, &self.gy);
         self.hessian = Matrix2::new(dot(&self.gx, &self.gx), xy, xy, dot(&self.gy, &self.gy));
         true
+    }
+}
+
+kernel! {
+    fn sample_from(
+        template: &mut Template,
+        keyframe: &Pyramid,
+        source: usize,
+        centre: &Pixel,
+        steps: &Matrix2<f64>,
+    ) -> bool {
+        template.sample_from(keyframe, source, centre, steps)
     }
 }
 

@@ -8,7 +8,7 @@
 use crate::tracking::Track;
 use nalgebra::{Matrix3, Vector3};
 use rustc_hash::FxHashMap;
-use vidar_core::{CameraModel, FrameId, LandmarkId, LieGroup, So3, camera::Pixel, nearest_rotation};
+use vidar_core::{CameraModel, FrameId, LandmarkId, LieGroup, So3, nearest_rotation};
 
 /// Tracks that a comparison needs.
 const MIN_TRACKS: usize = 15;
@@ -34,7 +34,9 @@ pub(crate) const MAX_TURN_DEG: f64 = 15.0;
 #[derive(Debug)]
 pub(crate) struct OrientationCheck {
     camera_from_body: So3,
-    last: FxHashMap<LandmarkId, Pixel>,
+    /// Rays of the newest image's features.
+    last: FxHashMap<LandmarkId, Vector3<f64>>,
+    current: FxHashMap<LandmarkId, Vector3<f64>>,
     pairs: Vec<(Vector3<f64>, Vector3<f64>)>,
     images: usize,
     image_sum: Vector3<f64>,
@@ -50,6 +52,7 @@ impl OrientationCheck {
         Self {
             camera_from_body: body_from_camera.inverse(),
             last: FxHashMap::default(),
+            current: FxHashMap::default(),
             pairs: Vec::new(),
             images: 0,
             image_sum: Vector3::zeros(),
@@ -73,15 +76,13 @@ impl OrientationCheck {
             return;
         }
         self.pairs.clear();
+        self.current.clear();
         for track in tracks.iter().filter(|t| t.last_frame == frame) {
-            let Some(before) = self.last.get(&track.id) else { continue };
-            let rays = (camera.unproject(before), camera.unproject(&track.last_pixel));
-            if let (Some(before), Some(now)) = rays {
-                self.pairs.push((before, now));
-            }
+            let Some(ray) = camera.unproject(&track.last_pixel) else { continue };
+            self.pairs.extend(self.last.get(&track.id).map(|before| (*before, ray)));
+            self.current.insert(track.id, ray);
         }
-        self.last.clear();
-        self.last.extend(tracks.iter().filter(|t| t.last_frame == frame).map(|t| (t.id, t.last_pixel)));
+        std::mem::swap(&mut self.last, &mut self.current);
         if let (Some((turn, secs)), Some(seen)) = (gyro.filter(|f| f.1 > 0.0), rotation_of(&self.pairs)) {
             self.add_rates(self.camera_from_body * (turn / secs), seen / secs);
         }

@@ -4,8 +4,9 @@
 use crate::frontend::{Pyramid, sample, to_level};
 use nalgebra::{Vector2, Vector3};
 use std::sync::LazyLock;
-use vidar_core::CameraModel;
 use vidar_core::camera::Pixel;
+use vidar_core::simd::kernel;
+use vidar_core::{CameraModel, Image};
 use vidar_solve::pcg64::Pcg64;
 
 const WORDS: usize = 4;
@@ -21,8 +22,14 @@ const MIN_INCLINATION: f64 = 0.2;
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct Descriptor([u64; WORDS]);
 
+/// Pairs that are compared at a time.
+const LANES: usize = 8;
+
+/// Places of some pairs about the centre, one coordinate after another: x and y of the first, x and y of the second of each pair.
+type Places = [[f64; LANES]; 4];
+
 /// The pairs of places that are compared: normal about the centre with a fifth of the patch's side (the paper's G II).
-static PAIRS: LazyLock<Vec<[Vector2<f64>; 2]>> = LazyLock::new(|| {
+static PAIRS: LazyLock<Vec<Places>> = LazyLock::new(|| {
     let mut random = Pcg64::seed(0);
     let mut uniform = || (random.next_u64() >> 11) as f64 / (1_u64 << 53) as f64 - 0.5;
     // The sum of twelve has the variance 1.
@@ -31,7 +38,14 @@ static PAIRS: LazyLock<Vec<[Vector2<f64>; 2]>> = LazyLock::new(|| {
         let place = 0.4 * RADIUS_PX * Vector2::new(normal(), normal());
         place * (RADIUS_PX / place.norm()).min(1.0)
     };
-    (0..BITS).map(|_| [place(), place()]).collect()
+    let mut pairs = vec![[[0.0; LANES]; 4]; BITS / LANES];
+    for bit in 0..BITS {
+        let (one, other) = (place(), place());
+        for (k, value) in [one.x, one.y, other.x, other.y].into_iter().enumerate() {
+            pairs[bit / LANES][k][bit % LANES] = value;
+        }
+    }
+    pairs
 });
 
 impl Descriptor {
@@ -48,17 +62,8 @@ impl Descriptor {
         if !is_inside(centre.x, image.width()) || !is_inside(centre.y, image.height()) {
             return None;
         }
-        let gray = |offset: &Vector2<f64>| {
-            // The patch's y axis is turned to `down`.
-            let x = centre.x + offset.x * down.y + offset.y * down.x;
-            let y = centre.y - offset.x * down.x + offset.y * down.y;
-            sample(image, x as f32, y as f32)
-        };
-        let mut words = [0_u64; WORDS];
-        for (bit, [one, other]) in PAIRS.iter().enumerate() {
-            words[bit / 64] |= u64::from(gray(one) < gray(other)) << (bit % 64);
-        }
-        Some(Self(words))
+        let pairs: &[Places] = &PAIRS;
+        Some(Self(comparisons(image, &centre, down, pairs)))
     }
 
     /// Number of comparisons that differ, 0…256.
@@ -75,6 +80,44 @@ impl Descriptor {
     pub fn from_words(words: [u64; WORDS]) -> Self {
         Self(words)
     }
+}
+
+kernel! {
+    fn comparisons(image: &Image<u8>, centre: &Pixel, down: &Vector2<f64>, pairs: &[Places]) -> [u64; WORDS] {
+        compare_pairs(image, centre, down, pairs)
+    }
+}
+
+/// For each pair whether the first place is darker, one bit after another.
+#[inline(always)]
+fn compare_pairs(image: &Image<u8>, centre: &Pixel, down: &Vector2<f64>, pairs: &[Places]) -> [u64; WORDS] {
+    let mut words = [0_u64; WORDS];
+    for (group, [one_x, one_y, other_x, other_y]) in pairs.iter().enumerate() {
+        let one = turned_samples(image, centre, down, one_x, one_y);
+        let other = turned_samples(image, centre, down, other_x, other_y);
+        for lane in 0..LANES {
+            let bit = group * LANES + lane;
+            words[bit / 64] |= u64::from(one[lane] < other[lane]) << (bit % 64);
+        }
+    }
+    words
+}
+
+/// Grey levels at places about the centre, the patch's y axis turned to `down`.
+#[inline(always)]
+fn turned_samples(
+    image: &Image<u8>,
+    centre: &Pixel,
+    down: &Vector2<f64>,
+    x: &[f64; LANES],
+    y: &[f64; LANES],
+) -> [f32; LANES] {
+    let (mut turned_x, mut turned_y) = ([0.0; LANES], [0.0; LANES]);
+    for k in 0..LANES {
+        turned_x[k] = (centre.x + x[k] * down.y + y[k] * down.x) as f32;
+        turned_y[k] = (centre.y - x[k] * down.x + y[k] * down.y) as f32;
+    }
+    sample(image, &turned_x, &turned_y)
 }
 
 /// The unit direction in the image, at a ray, in which gravity points; the image's own where the ray is nearly vertical.
@@ -95,7 +138,7 @@ pub(crate) fn downward(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use vidar_core::{Image, Pinhole};
+    use vidar_core::Pinhole;
 
     /// Blobs at fixed places of a plane, seen turned by an angle about the point (x, y).
     fn view(x: f64, y: f64, angle: f64) -> Pyramid {

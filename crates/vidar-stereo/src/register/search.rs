@@ -2,6 +2,7 @@
 
 use crate::prepare::{GRAY_STEPS, Level};
 use nalgebra::Vector2;
+use vidar_core::simd::kernel;
 
 /// One corner per square of this size, working pixels.
 const CELL_PX: usize = 20;
@@ -32,7 +33,7 @@ pub(super) fn corners(level: &Level) -> Vec<(usize, usize)> {
         let mut best = vec![(0.0f32, None); cells.clone().count()];
         // Every other pixel: a corner is wider than that, and the match is found to a fraction of a pixel anyway.
         for y in (top..(top + CELL_PX).min(h - margin)).step_by(2) {
-            crate::simd::dispatch!(tensor.row(level, y));
+            tensor_row(&mut tensor, level, y);
             for (best, left) in best.iter_mut().zip(cells.clone()) {
                 for x in (left..(left + CELL_PX).min(w - margin)).step_by(2) {
                     if tensor.strength[x] > best.0 {
@@ -44,6 +45,22 @@ pub(super) fn corners(level: &Level) -> Vec<(usize, usize)> {
         out.extend(best.into_iter().filter_map(|b| b.1));
     }
     out
+}
+
+kernel! {
+    fn tensor_row(tensor: &mut Tensor, level: &Level, y: usize) {
+        tensor.row(level, y);
+    }
+}
+
+kernel! {
+    fn correlate(
+        template: &Template,
+        around: &[[f32; COLUMNS]; ROWS],
+        correlations: &mut [[f32; LANES]; SHIFTS],
+    ) {
+        template.correlate(around, correlations);
+    }
 }
 
 /// Strength of the corners in one row.
@@ -145,7 +162,7 @@ impl Template {
             }
         }
         let mut correlations = [[0.0f32; LANES]; SHIFTS];
-        crate::simd::dispatch!(self.correlate(&around, &mut correlations));
+        correlate(self, &around, &mut correlations);
         // A template that reaches beyond the image matches nothing.
         let fits = |begin: i64, shift: usize, size: i64| {
             let first = begin + shift as i64;

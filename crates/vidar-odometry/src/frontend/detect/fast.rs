@@ -4,8 +4,8 @@
 //! best arc's margin over the centre is the score, i.e. the largest threshold for which the pixel would still be a corner.
 //! Only minima and maxima of bytes are taken, so every width of vector gives the same bits.
 
-use crate::simd::dispatch;
 use vidar_core::Image;
+use vidar_core::simd::kernel;
 
 /// The circle of radius 3, clockwise from the top.
 const CIRCLE: [(isize, isize); 16] = [
@@ -71,12 +71,12 @@ impl FastScanner {
         // One row further on each side is scored, so that suppression knows the neighbours of the border rows.
         for y in border - 1..=height - border {
             let scores = &mut self.scores[y % 3];
-            dispatch!(score_row(image, y, threshold, scores));
+            score_row(image, y, threshold, scores);
             if y <= border {
                 continue;
             }
             let rows = [&self.scores[(y - 2) % 3], &self.scores[(y - 1) % 3], &self.scores[y % 3]];
-            dispatch!(suppress(rows, border, &mut self.best));
+            suppress(rows, border, &mut self.best);
             for (block, scores) in self.best.chunks(LANES).enumerate() {
                 if scores.iter().all(|s| *s == 0) {
                     continue;
@@ -89,9 +89,21 @@ impl FastScanner {
     }
 }
 
+kernel! {
+    fn score_row(image: &Image<u8>, y: usize, threshold: u8, scores: &mut [u8]) {
+        score_blocks(image, y, threshold, scores);
+    }
+}
+
+kernel! {
+    fn suppress(rows: [&Vec<u8>; 3], border: usize, best: &mut [u8]) {
+        keep_greatest(rows, border, best);
+    }
+}
+
 /// Scores of a row; zero where no arc exceeds the threshold, and in the three outermost columns.
 #[inline(always)]
-fn score_row(image: &Image<u8>, y: usize, threshold: u8, scores: &mut [u8]) {
+fn score_blocks(image: &Image<u8>, y: usize, threshold: u8, scores: &mut [u8]) {
     let width = image.width();
     let end = width - 3 - LANES;
     let mut x = 3;
@@ -109,22 +121,20 @@ fn score_row(image: &Image<u8>, y: usize, threshold: u8, scores: &mut [u8]) {
 
 #[inline(always)]
 fn score_block(data: &[u8], at: usize, width: usize, threshold: u8) -> Block {
-    let load = |offset: (isize, isize)| -> Block {
-        let start = at.wrapping_add_signed(offset.1 * width as isize + offset.0);
-        let mut block = [0; LANES];
-        block.copy_from_slice(&data[start..start + LANES]);
-        block
-    };
-    let centre = load((0, 0));
+    let centre = load(data, at, width, (0, 0));
     // Of the four compass points an arc of nine holds one of each opposite pair; most blocks of calm images end here.
-    let [up, right, down, left] = [0, 4, 8, 12].map(|k| load(CIRCLE[k]));
+    let (up, down) = (load(data, at, width, CIRCLE[0]), load(data, at, width, CIRCLE[8]));
+    let (right, left) = (load(data, at, width, CIRCLE[4]), load(data, at, width, CIRCLE[12]));
     let bright = least(&greatest(&up, &down), &greatest(&left, &right));
     let dark = greatest(&least(&up, &down), &least(&left, &right));
     let margin = greatest(&above(&bright, &centre), &above(&centre, &dark));
     if margin.iter().fold(0, |m: u8, v| m.max(*v)) <= threshold {
         return [0; LANES];
     }
-    let ring: [Block; 16] = std::array::from_fn(|k| load(CIRCLE[k]));
+    let mut ring = [[0; LANES]; 16];
+    for (block, offset) in ring.iter_mut().zip(CIRCLE) {
+        *block = load(data, at, width, offset);
+    }
     let brightest = best_arc(&ring, least, greatest);
     let darkest = best_arc(&ring, greatest, least);
     let mut score = greatest(&above(&brightest, &centre), &above(&centre, &darkest));
@@ -132,6 +142,14 @@ fn score_block(data: &[u8], at: usize, width: usize, threshold: u8) -> Block {
         *s = if *s > threshold { *s } else { 0 };
     }
     score
+}
+
+#[inline(always)]
+fn load(data: &[u8], at: usize, width: usize, offset: (isize, isize)) -> Block {
+    let start = at.wrapping_add_signed(offset.1 * width as isize + offset.0);
+    let mut block = [0; LANES];
+    block.copy_from_slice(&data[start..start + LANES]);
+    block
 }
 
 /// `better` over all arcs of nine of `worse` within the arc.
@@ -144,15 +162,18 @@ fn best_arc(
     worse: impl Fn(&Block, &Block) -> Block,
     better: impl Fn(&Block, &Block) -> Block,
 ) -> Block {
-    let two: [Block; 8] = std::array::from_fn(|k| worse(&ring[2 * k + 1], &ring[(2 * k + 2) % 16]));
-    let four: [Block; 8] = std::array::from_fn(|k| worse(&two[k], &two[(k + 1) % 8]));
-    let arcs = |k: usize| {
+    let (mut two, mut four) = ([[0; LANES]; 8], [[0; LANES]; 8]);
+    for k in 0..8 {
+        two[k] = worse(&ring[2 * k + 1], &ring[(2 * k + 2) % 16]);
+    }
+    for k in 0..8 {
+        four[k] = worse(&two[k], &two[(k + 1) % 8]);
+    }
+    let mut best = [0; LANES];
+    for k in 0..8 {
         let eight = worse(&four[k], &four[(k + 2) % 8]);
-        worse(&eight, &better(&ring[2 * k], &ring[(2 * k + 9) % 16]))
-    };
-    let mut best = arcs(0);
-    for k in 1..8 {
-        best = better(&best, &arcs(k));
+        let arcs = worse(&eight, &better(&ring[2 * k], &ring[(2 * k + 9) % 16]));
+        best = if k == 0 { arcs } else { better(&best, &arcs) };
     }
     best
 }
@@ -160,14 +181,18 @@ fn best_arc(
 #[inline(always)]
 fn least(a: &Block, b: &Block) -> Block {
     let mut out = *a;
-    out.iter_mut().zip(b).for_each(|(o, v)| *o = (*o).min(*v));
+    for (o, v) in out.iter_mut().zip(b) {
+        *o = (*o).min(*v);
+    }
     out
 }
 
 #[inline(always)]
 fn greatest(a: &Block, b: &Block) -> Block {
     let mut out = *a;
-    out.iter_mut().zip(b).for_each(|(o, v)| *o = (*o).max(*v));
+    for (o, v) in out.iter_mut().zip(b) {
+        *o = (*o).max(*v);
+    }
     out
 }
 
@@ -175,13 +200,15 @@ fn greatest(a: &Block, b: &Block) -> Block {
 #[inline(always)]
 fn above(a: &Block, b: &Block) -> Block {
     let mut out = *a;
-    out.iter_mut().zip(b).for_each(|(o, v)| *o = o.saturating_sub(*v));
+    for (o, v) in out.iter_mut().zip(b) {
+        *o = o.saturating_sub(*v);
+    }
     out
 }
 
 /// Keeps what is strictly better than earlier neighbours and at least as good as later ones; zero elsewhere.
 #[inline(always)]
-fn suppress(rows: [&Vec<u8>; 3], border: usize, best: &mut [u8]) {
+fn keep_greatest(rows: [&Vec<u8>; 3], border: usize, best: &mut [u8]) {
     let n = best.len() - 2 * border;
     let part = |row: usize, shift: usize| &rows[row][border + shift - 1..][..n];
     let (nw, no, ne, we) = (part(0, 0), part(0, 1), part(0, 2), part(1, 0));
@@ -199,8 +226,8 @@ fn suppress(rows: [&Vec<u8>; 3], border: usize, best: &mut [u8]) {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::simd::narrow;
     use vidar_core::random::SplitMix64;
+    use vidar_core::testing::same_with_each_instruction_set;
 
     /// The definition, pixel by pixel, without shortcuts.
     fn score_by_definition(image: &Image<u8>, x: usize, y: usize, threshold: i32) -> i32 {
@@ -252,8 +279,7 @@ mod tests {
             FastScanner::default().scan(&image, 15, 6, |c| found.push(c));
             found
         };
-        let found = run();
-        assert_eq!(found, narrow(run));
+        let found = same_with_each_instruction_set(run);
         for (i, a) in found.iter().enumerate() {
             assert!((6..84).contains(&a.x) && (6..64).contains(&a.y));
             for b in &found[i + 1..] {

@@ -3,9 +3,9 @@
 //! The mean gradient is taken out first: alignment frees the offset of the exposure, and a ramp shifted is a ramp offset.
 
 use super::super::feature::eigen;
-use crate::simd::dispatch;
 use nalgebra::{Matrix2, Vector2};
 use vidar_core::Image;
+use vidar_core::simd::kernel;
 
 /// Half of the window's side; 8 × 8 pixels, as alignment uses.
 const HALF: usize = 4;
@@ -24,7 +24,7 @@ pub(crate) struct Structure {
 impl Structure {
     /// Of the window with upper left corner `(x − 4, y − 4)`; the caller keeps 5 pixels from the border.
     pub fn around(image: &Image<u8>, x: usize, y: usize) -> Self {
-        let [sx, sy, xx, xy, yy] = dispatch!(tensor(image, x, y)).map(f64::from);
+        let [sx, sy, xx, xy, yy] = tensor(image, x, y).map(f64::from);
         let n = (2 * HALF * 2 * HALF) as f64;
         // Differences are not halved in the sums: (2·g)² over the pixels.
         let (xx, xy, yy) = (xx - sx * sx / n, xy - sx * sy / n, yy - sy * sy / n);
@@ -38,8 +38,14 @@ impl Structure {
     }
 }
 
+kernel! {
+    fn tensor(image: &Image<u8>, x: usize, y: usize) -> [i32; 5] {
+        sum_gradients(image, x, y)
+    }
+}
+
 #[inline(always)]
-fn tensor(image: &Image<u8>, x: usize, y: usize) -> [i32; 5] {
+fn sum_gradients(image: &Image<u8>, x: usize, y: usize) -> [i32; 5] {
     let (width, data) = (image.width(), image.data());
     let (mut sx, mut sy) = ([0_i32; 8], [0_i32; 8]);
     let (mut xx, mut xy, mut yy) = ([0_i32; 8], [0_i32; 8], [0_i32; 8]);

@@ -1,6 +1,6 @@
 use super::*;
 use crate::frontend::testbed::scene;
-use crate::simd::narrow;
+use vidar_core::testing::same_with_each_instruction_set;
 
 fn detect(config: DetectorConfig, taken: impl Fn(&mut OccupancyGrid)) -> Vec<Detection> {
     let pyramid = scene().pyramid(0);
@@ -47,7 +47,7 @@ fn taken_cells_are_left_alone() {
 #[test]
 fn features_are_the_same_on_every_path() {
     let run = || detect(DetectorConfig::default(), |_| {});
-    assert_eq!(run(), narrow(run));
+    assert!(!same_with_each_instruction_set(run).is_empty());
 }
 
 #[test]

@@ -17,10 +17,10 @@ use super::feature::PixelMeasurement;
 use super::patch::{Bilinear, sum8};
 use super::pyramid::{Pyramid, from_level, level_scale, to_level};
 use super::template::{SIDE, Template};
-use crate::simd::dispatch;
 use nalgebra::{Matrix2, Vector2};
 use vidar_core::Image;
 use vidar_core::camera::Pixel;
+use vidar_core::simd::kernel;
 
 /// Most steps of one alignment; bounds the time of one that does not settle.
 const MAX_ITERATIONS: usize = 12;
@@ -87,8 +87,14 @@ struct Sums {
     with_gradient: Vector2<f64>,
 }
 
+kernel! {
+    fn sums(image: &Image<u8>, template: &Template, corner: &Pixel) -> Option<Sums> {
+        sum_products(image, template, corner)
+    }
+}
+
 #[inline(always)]
-fn sums(image: &Image<u8>, template: &Template, corner: &Pixel) -> Option<Sums> {
+fn sum_products(image: &Image<u8>, template: &Template, corner: &Pixel) -> Option<Sums> {
     let at = Bilinear::for_patch(image, corner.x, corner.y, SIDE)?;
     let (mut sum, mut square) = ([0.0_f32; 8], [0.0_f32; 8]);
     let (mut t, mut x, mut y) = ([0.0_f32; 8], [0.0_f32; 8], [0.0_f32; 8]);
@@ -137,14 +143,14 @@ pub fn align_feature(
     let first = to_level(start, level) - half;
     let mut corner = first;
     for _ in 0..MAX_ITERATIONS {
-        let found = dispatch!(sums(image, template, &corner)).ok_or(MatchFailure::OutsideImage)?;
+        let found = sums(image, template, &corner).ok_or(MatchFailure::OutsideImage)?;
         let step = solve.step(template, &found);
         corner -= step;
         if !((corner - first).norm_squared() <= MAX_SHIFT_PX * MAX_SHIFT_PX) {
             return Err(MatchFailure::Diverged);
         }
         if step.norm_squared() < MIN_STEP_PX * MIN_STEP_PX {
-            let last = dispatch!(sums(image, template, &corner)).ok_or(MatchFailure::OutsideImage)?;
+            let last = sums(image, template, &corner).ok_or(MatchFailure::OutsideImage)?;
             let moved_px = (corner - first).norm() * scale;
             return evaluate(template, current, &corner, &last, &solve, moved_px, noise_gray);
         }

@@ -2,10 +2,10 @@ use super::*;
 use crate::frontend::feature::{Feature, FeatureKind};
 use crate::frontend::template::Warp;
 use crate::frontend::testbed::{Scene, full_scene, median, rms, scene};
-use crate::simd::narrow;
 use nalgebra::Vector3;
 use std::collections::BTreeMap;
 use vidar_core::random::SplitMix64;
+use vidar_core::testing::same_with_each_instruction_set;
 
 /// What became of the features of a keyframe in another view.
 #[derive(Default)]
@@ -229,7 +229,7 @@ fn wide_and_narrow_paths_give_the_same_bits() {
         }
         all
     };
-    assert_eq!(run(), narrow(run));
+    assert!(!same_with_each_instruction_set(run).is_empty());
 }
 
 /// `cargo test -p vidar-odometry --lib accuracy_table -- --ignored --nocapture`

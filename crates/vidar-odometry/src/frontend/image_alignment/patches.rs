@@ -5,9 +5,9 @@
 
 use super::super::patch::Bilinear;
 use super::super::pyramid::{Pyramid, level_scale, to_level};
-use crate::simd::dispatch;
 use nalgebra::{Matrix2, Matrix2x6, Vector2, Vector3};
 use vidar_core::camera::Pixel;
+use vidar_core::simd::kernel;
 use vidar_core::{CameraModel, Image, LieGroup, Se3};
 
 /// Side of a patch, pixels.
@@ -57,6 +57,18 @@ pub(super) struct Moments {
     pub ii: f64,
 }
 
+kernel! {
+    fn read_reference(patch: &mut Patch, image: &Image<u8>, corner: &Pixel, level: usize) -> bool {
+        patch.read_reference(image, corner, level)
+    }
+}
+
+kernel! {
+    fn moments(patch: &Patch, image: &Image<u8>, corner: &Pixel) -> Option<Moments> {
+        patch.moments(image, corner)
+    }
+}
+
 impl Patch {
     /// `None` where the camera does not hold for the point.
     pub fn new(
@@ -95,7 +107,7 @@ impl Patch {
     pub fn prepare(&mut self, reference: &Pyramid, level: usize) {
         let image = reference.level(level);
         let corner = to_level(&self.pixel, level).add_scalar(-0.5 * (BORDERED as f64 - 1.0));
-        self.usable = dispatch!(self.read_reference(image, &corner, level));
+        self.usable = read_reference(self, image, &corner, level);
     }
 
     #[inline(always)]
@@ -143,7 +155,7 @@ impl Patch {
             + current_from_reference.translation * self.inverse_distance;
         let Some(pixel) = camera.project(&point) else { return };
         let corner = to_level(&pixel, level).add_scalar(-0.5 * (SIDE as f64 - 1.0));
-        self.seen = dispatch!(self.moments(current, &corner));
+        self.seen = moments(self, current, &corner);
     }
 
     #[inline(always)]
