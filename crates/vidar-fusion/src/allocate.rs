@@ -111,11 +111,11 @@ impl Rays {
         for (i, (code, &depth)) in codes.iter_mut().zip(depths).enumerate() {
             let z = (depth - self.truncation).max(0.0) + offset;
             let x = (stagger + i * self.stride) as i32 as f32;
-            let [a, b, c] = [0, 1, 2].map(|axis| {
+            let mut packed = 0;
+            for axis in 0..3 {
                 let at = self.start[axis] + (first[axis] + x * self.column[axis]) * z;
-                (floor(at) + CODE_ORIGIN) as u32 as u64 & CODE_MASK
-            });
-            let packed = a << (2 * CODE_BITS) | b << CODE_BITS | c;
+                packed = packed << CODE_BITS | (floor(at) + CODE_ORIGIN) as u32 as u64 & CODE_MASK;
+            }
             // Unusable samples have a depth of 0.
             *code = if depth > 0.0 { packed } else { NO_BLOCK };
         }

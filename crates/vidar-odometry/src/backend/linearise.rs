@@ -77,12 +77,13 @@ impl Scene<'_> {
         jacobians.by_host = product(&whiten, &jacobians.by_host);
         jacobians.by_target = product(&whiten, &jacobians.by_target);
         jacobians.by_landmark = product(&whiten, &jacobians.by_landmark);
-        let by_calibration = self.config.calibrates_camera().then(|| {
+        let mut by_calibration = None;
+        if self.config.calibrates_camera() {
             let by_place =
                 visual::by_body_from_camera(self.camera, host, target, &landmark.bearing, landmark.rho)
                     .unwrap_or_else(SMatrix::zeros);
-            whiten * calibration_columns(self.config, &by_place)
-        });
+            by_calibration = Some(product(&whiten, &calibration_columns(self.config, &by_place)));
+        }
         (cost, Some(WeightedObservation { residual: residual * weight.sqrt(), jacobians, by_calibration }))
     }
 

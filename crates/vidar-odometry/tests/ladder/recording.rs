@@ -127,7 +127,7 @@ pub fn clean_outputs() -> &'static [OdometryOutput] {
 }
 
 /// Noise of standard deviation `sigma` grey levels, always the same for one `seed`. By a generator of its own (Marsaglia's xorshift): the
-/// figures of the ladder were measured with it, and drawn anew an inverted extrinsic is refused for another reason than its own.
+/// figures of the ladder were measured with it.
 pub fn add_noise(image: &Image<u8>, sigma: f64, seed: u64) -> Image<u8> {
     let mut state = seed.wrapping_mul(0x9E37_79B9_7F4A_7C15) | 1;
     let mut uniform = move || {
