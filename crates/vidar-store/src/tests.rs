@@ -67,25 +67,3 @@ fn a_store_that_cannot_be_written_names_the_systems_reason() {
     assert!(error.io().is_some(), "{error}: {error:?}");
     assert_eq!(store.get("a", 10).unwrap().unwrap(), b"1");
 }
-
-/// Against a server that speaks S3: `VIDAR_TEST_S3=s3://bucket/prefix`, with its endpoint and keys in `AWS_…`.
-#[test]
-#[cfg(feature = "s3")]
-fn an_object_store_does_what_a_folder_does() {
-    let Ok(uri) = std::env::var("VIDAR_TEST_S3") else {
-        eprintln!("SKIPPED: VIDAR_TEST_S3 names no bucket");
-        return;
-    };
-    let (store, base) = (Store::open(&uri).unwrap(), tempfile::tempdir().unwrap());
-    assert!(store.get("records/none.json", 10).unwrap().is_none());
-    store.put("records/a.json", b"{}".to_vec()).unwrap();
-    assert_eq!(store.get("records/a.json", 10).unwrap().unwrap(), b"{}");
-    assert!(store.get("records/a.json", 1).is_err());
-    let bytes: Vec<u8> = (0..2 * PART_BYTES + 12_345).map(|i| (i * 31 % 251) as u8).collect();
-    let (file, back) = (base.path().join("file"), base.path().join("back"));
-    std::fs::write(&file, &bytes).unwrap();
-    store.put_file("maps/a/mesh.ply", &file).unwrap();
-    assert_eq!(store.get_file("maps/a/mesh.ply", &back).unwrap(), bytes.len() as u64);
-    assert!(std::fs::read(&back).unwrap() == bytes);
-    assert_eq!(store.list("maps").unwrap(), ["maps/a/mesh.ply"]);
-}

@@ -33,6 +33,7 @@ pub mod models;
 pub mod odometry;
 pub mod quality;
 pub mod receive;
+mod recorder;
 pub mod run;
 pub mod run_folder;
 pub mod system;

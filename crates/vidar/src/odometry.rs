@@ -20,14 +20,16 @@ use crate::config::{Config, Layered};
 use crate::error::{Error, ExitStatus};
 use crate::events::{CancelToken, Event, Events};
 use crate::input::{self, Measurement, UnseenScale};
+use crate::recorder::Recorder;
 use crate::run_folder::{MANIFEST_SCHEMA, Manifest, OutputLocation, RunFolder};
 use crate::verdict::{Findings, Level, StatedScale, Verdict};
 use serde_json::json;
 use std::collections::BTreeSet;
 use std::ops::ControlFlow;
 use std::path::PathBuf;
+use std::sync::Arc;
 use std::time::Instant;
-use vidar_core::{Severity, Trajectory, Warning};
+use vidar_core::{Trajectory, Warning};
 use vidar_dataset::{OpenOptions, Recording};
 use vidar_eval::TrajectoryReport;
 use vidar_odometry::bundle_adjustment::{CalibrationSigmas, Progress};
@@ -90,6 +92,8 @@ pub fn odometry(
 ) -> Result<OdometryOutcome, Error> {
     let clock = Instant::now();
     let started = crate::run_folder::now_rfc3339();
+    let recorder = Recorder::default();
+    let events = &recorder.listen(events.clone());
     let mut config = request.layered.build()?;
     let earlier_map = EarlierMap::of(&config)?;
     let mut dataset =
@@ -99,7 +103,8 @@ pub fn odometry(
     input::require_calibration(&dataset)?;
     let started_manifest = start_manifest(request, &dataset, started)?;
     let earlier = request.place.earlier(&started_manifest, &request.layered.to_toml(false))?;
-    let folder = RunFolder::create(&request.place)?;
+    let folder = Arc::new(RunFolder::create(&request.place)?);
+    recorder.keep_log_in(folder.clone());
     folder.write_manifest(&started_manifest)?;
     folder.write("config.resolved.toml", request.layered.to_toml(true).as_bytes())?;
     let mut dump = if request.debug_dump { Some(dump::Dump::create(&folder)?) } else { None };
@@ -121,23 +126,17 @@ pub fn odometry(
     let report = against_truth(trajectory.as_ref(), &dataset, &config)?;
     tracked.adjusted.iter().for_each(|adjusted| adjusted::apply(adjusted, &mut dataset));
     let final_report = against_truth(final_trajectory.as_ref(), &dataset, &config)?;
-    let is_degraded = warnings.iter().any(|w| w.severity == Severity::Degraded);
     let evaluated = final_report.as_ref().or(report.as_ref());
     let verdict = verdict(&tracked, &scale, evaluated, cancel.is_cancelled());
-    let status = match (cancel.is_cancelled(), is_degraded) {
-        (true, _) => ExitStatus::Interrupted,
-        (false, true) => ExitStatus::Degraded,
-        (false, false) => ExitStatus::Done,
-    };
-    let outcome = OdometryOutcome {
+    let mut outcome = OdometryOutcome {
         folder: folder.path().to_owned(),
-        status,
+        status: ExitStatus::Done,
         tracked,
         trajectory,
         final_trajectory,
         report,
         final_report,
-        warnings,
+        warnings: recorder.warnings(),
         scale,
         verdict,
         seconds: clock.elapsed().as_secs_f64(),
@@ -154,8 +153,15 @@ pub fn odometry(
     if let Some(earlier) = earlier {
         earlier.remove_all_but(folder.path(), &artifacts);
     }
+    // A log that could not be written is told by the recorder alone.
+    outcome.warnings = recorder.warnings();
+    outcome.status = match (cancel.is_cancelled(), recorder.is_degraded()) {
+        (true, _) => ExitStatus::Interrupted,
+        (false, true) => ExitStatus::Degraded,
+        (false, false) => ExitStatus::Done,
+    };
     folder.write_manifest(&manifest(started_manifest, &outcome, artifacts))?;
-    events.emit(&Event::Finished { exit: status as i32, seconds: outcome.seconds });
+    events.emit(&Event::Finished { exit: outcome.status as i32, seconds: outcome.seconds });
     Ok(outcome)
 }
 

@@ -65,8 +65,11 @@ impl Batch {
 
 fn plan_command(folder: &Path, recordings: &[&Path], more: &[&str]) -> Command {
     let mut command = command();
-    command.current_dir(folder).arg("plan").args(recordings).args(["--store", "the store", "-q", "--config"]);
+    command.current_dir(folder).arg("plan").args(recordings).args(["-q", "--config"]);
     command.arg(&shared().settings).args(SETTINGS).args(more);
+    if !more.contains(&"--store") {
+        command.args(["--store", "the store"]);
+    }
     command
 }
 
@@ -214,6 +217,36 @@ fn a_node_that_stands_still_and_goes_on_after_another_did_its_task_changes_nothi
     let again = batch.all("map", 1).remove(0);
     assert_eq!((&again["was_there"], &again["task"]["result"]), (&true.into(), &map["task"]["result"]));
     assert_eq!(batch.report()["counts"], serde_json::json!({ "degraded": 1 }));
+}
+
+/// Needs a server that speaks S3: `VIDAR_TEST_S3=s3://bucket/prefix`, with its endpoint and keys in `AWS_…` (`.ci/s3`).
+#[cfg(feature = "s3")]
+#[test]
+fn a_batch_in_an_object_store_makes_the_files_of_one_in_a_folder() {
+    let Ok(bucket) = std::env::var("VIDAR_TEST_S3") else {
+        return vidar_core::testing::skipped(&"VIDAR_TEST_S3 names no bucket");
+    };
+    let recordings = [shared().sequence.as_path()];
+    let in_folder = Batch::plan(&recordings, &["--parts", "2"]);
+    let in_bucket = Batch::plan(&recordings, &["--parts", "2", "--store", &format!("{bucket}/batch")]);
+    assert!(in_bucket.plan.starts_with("s3://") && !in_bucket.store().exists(), "{}", in_bucket.plan);
+    for (stage, tasks) in [("track", 1), ("predict", 2), ("map", 1)] {
+        let made = |batch: &Batch| -> Vec<Value> {
+            // Pictures of the time that a stage took differ.
+            let is_data = |f: &&Value| {
+                let path = f["path"].as_str().unwrap();
+                ["map/", "depth", "trajectory/", "images/", "chunks/"].iter().any(|p| path.starts_with(p))
+            };
+            let tasks = batch.all(stage, tasks);
+            let files = tasks.iter().flat_map(|t| t["task"]["files"].as_array().unwrap());
+            files.filter(is_data).cloned().collect()
+        };
+        let found = made(&in_bucket);
+        assert!(found.len() >= tasks, "{stage}: {found:?}");
+        assert_eq!(found, made(&in_folder), "{stage}");
+        assert!(in_bucket.all(stage, tasks).iter().all(|t| t["was_there"] == true), "{stage} again");
+    }
+    assert_eq!(in_bucket.report()["counts"], in_folder.report()["counts"]);
 }
 
 #[test]

@@ -71,6 +71,12 @@ fn a_rendered_flight_is_tracked_in_metres_and_its_trajectory_places_a_map() {
     let tracks = std::fs::read_to_string(out.join("odometry/debug_tracks.csv")).unwrap();
     assert!(tracks.lines().count() > 1000, "{} tracks", tracks.lines().count());
 
+    let log = std::fs::read_to_string(out.join("log.jsonl")).unwrap();
+    let events: Vec<Value> = log.lines().map(|l| serde_json::from_str(l).unwrap()).collect();
+    let ended = |stage: &str| events.iter().any(|e| e["event"] == "stage-finished" && e["stage"] == stage);
+    assert!(ended("read") && ended("odometry") && ended("write"), "{log}");
+    assert_eq!(events.last().unwrap()["event"], "finished");
+
     // The trajectory places a map like any other.
     let map = shared().root.join("map on odometry");
     let trajectory = out.join("trajectory/odometry_body.tum");

@@ -138,12 +138,11 @@ fn compressed_video_of_a_bag_is_a_recording_of_images() {
 }
 
 /// A program called ffmpeg is on this machine; says so where it is not.
-#[allow(clippy::print_stderr, reason = "a test that is skipped says so")]
 fn has_ffmpeg() -> bool {
     let found =
         std::process::Command::new("ffmpeg").arg("-version").output().is_ok_and(|o| o.status.success());
     if !found {
-        eprintln!("skipped: this machine has no ffmpeg");
+        vidar_core::testing::skipped(&"this machine has no ffmpeg");
     }
     found
 }

@@ -15,7 +15,7 @@ fn release(arguments: &[&str]) -> Output {
 fn is_available() -> bool {
     let is_there = cfg!(unix) && Command::new("tar").arg("--version").output().is_ok();
     if !is_there {
-        eprintln!("skipped: tools/release.sh needs bash and tar");
+        vidar_core::testing::skipped(&"tools/release.sh needs bash and tar");
     }
     is_there
 }

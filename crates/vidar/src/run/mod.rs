@@ -292,6 +292,7 @@ impl Context<'_> {
             ahead::beside(self, (&plan, places), group.as_ref(), known.as_ref(), |ahead| {
                 self.build_map(&plan, &mut source, tracked, places, ahead)
             })?;
+        crate::system::release_freed_memory();
         let known = recorder.warnings();
         said.warnings.iter().filter(|w| !known.contains(w)).for_each(|w| events.warn(w));
         live.as_ref().and_then(live::warning).iter().for_each(|w| events.warn(w));

@@ -1,87 +1,17 @@
-//! Warnings, timings and files of a run as a reader of its events, and the manifest made of them.
+//! Files of a run, and the manifest made of what was recorded of it.
 
 use super::store::CHUNKS;
 use super::{Plan, RunRequest};
 use crate::chunks::ChunkStore;
 use crate::error::{Error, ExitStatus};
-use crate::events::{Event, Events};
-use crate::run_folder::{MANIFEST_SCHEMA, Manifest, RunFolder};
+pub(super) use crate::recorder::Recorder;
+use crate::run_folder::{MANIFEST_SCHEMA, Manifest};
 use std::collections::{BTreeMap, BTreeSet};
-use std::sync::{Arc, Mutex};
-use vidar_core::{Severity, Warning};
 use vidar_dataset::Recording;
 
-/// Records events for the manifest and for `log.jsonl`.
-#[derive(Clone, Default)]
-pub(super) struct Recorder(Arc<Mutex<Recorded>>);
-
-#[derive(Default)]
-struct Recorded {
-    /// Where the log goes, once the run has a folder.
-    folder: Option<Arc<RunFolder>>,
-    /// Events from before that.
-    waiting: Vec<Event>,
-    warnings: Vec<Warning>,
-    seconds: Vec<(&'static str, f64)>,
-    artifacts: Vec<String>,
-    /// Where the poses of the world that is mapped come from.
-    poses: Option<serde_json::Value>,
-}
-
 impl Recorder {
-    /// The same events, recorded.
-    pub fn listen(&self, events: Events) -> Events {
-        let recorded = self.0.clone();
-        events.with(move |event| {
-            let Ok(mut recorded) = recorded.lock() else { return };
-            let failed = match &recorded.folder {
-                Some(folder) => folder.log(event),
-                None => {
-                    recorded.waiting.push(event.clone());
-                    None
-                }
-            };
-            recorded.warnings.extend(failed);
-            match event {
-                Event::Warning { warning } => recorded.warnings.push(warning.clone()),
-                Event::StageFinished { stage: name, seconds }
-                | Event::StepFinished { step: name, seconds } => {
-                    recorded.seconds.push((name, *seconds));
-                }
-                Event::ArtifactWritten { path, .. } => recorded.artifacts.push(path.clone()),
-                Event::World { poses, .. } => recorded.poses = Some(serde_json::json!(poses)),
-                _ => {}
-            }
-        })
-    }
-
-    /// From now on `log.jsonl` of this folder holds every event, also those from before.
-    pub fn keep_log_in(&self, folder: Arc<RunFolder>) {
-        let Ok(mut recorded) = self.0.lock() else { return };
-        let waiting = std::mem::take(&mut recorded.waiting);
-        recorded.warnings.extend(waiting.iter().filter_map(|event| folder.log(event)));
-        recorded.folder = Some(folder);
-    }
-
-    fn read<T>(&self, f: impl FnOnce(&Recorded) -> T) -> T {
-        match self.0.lock() {
-            Ok(recorded) => f(&recorded),
-            Err(poisoned) => f(&poisoned.into_inner()),
-        }
-    }
-
-    /// Every warning so far, in order.
-    pub fn warnings(&self) -> Vec<Warning> {
-        self.read(|r| r.warnings.clone())
-    }
-
-    /// Whether a part of the result is missing or weaker than asked for.
-    pub fn is_degraded(&self) -> bool {
-        self.read(|r| r.warnings.iter().any(|w| w.severity == Severity::Degraded))
-    }
-
     /// Every file of the run so far, with those that are no results: its records, and what a later attempt can go on from.
-    pub fn files(&self) -> BTreeSet<String> {
+    pub(super) fn files(&self) -> BTreeSet<String> {
         let own = ["config.resolved.toml", "log.jsonl", "manifest.json"].map(String::from);
         self.read(|r| {
             let root = r.folder.as_ref().map(|f| f.path().to_owned()).unwrap_or_default();
@@ -94,7 +24,7 @@ impl Recorder {
     }
 
     /// The manifest of a run that ended with `exit`.
-    pub fn manifest(
+    pub(super) fn manifest(
         &self,
         description: RunDescription,
         result: serde_json::Value,
