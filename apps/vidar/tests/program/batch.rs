@@ -231,18 +231,22 @@ fn a_batch_in_an_object_store_makes_the_files_of_one_in_a_folder() {
     let in_bucket = Batch::plan(&recordings, &["--parts", "2", "--store", &format!("{bucket}/batch")]);
     assert!(in_bucket.plan.starts_with("s3://") && !in_bucket.store().exists(), "{}", in_bucket.plan);
     for (stage, tasks) in [("track", 1), ("predict", 2), ("map", 1)] {
-        let made = |batch: &Batch| -> Vec<Value> {
-            // Pictures of the time that a stage took differ.
-            let is_data = |f: &&Value| {
-                let path = f["path"].as_str().unwrap();
-                ["map/", "depth", "trajectory/", "images/", "chunks/"].iter().any(|p| path.starts_with(p))
-            };
+        let made = |batch: &Batch| -> Vec<(String, Option<Value>)> {
             let tasks = batch.all(stage, tasks);
             let files = tasks.iter().flat_map(|t| t["task"]["files"].as_array().unwrap());
-            files.filter(is_data).cloned().collect()
+            let of = |file: &Value| {
+                let path = file["path"].as_str().unwrap().to_owned();
+                // Others, as the record of what was tracked, hold times of this machine.
+                let is_data = ["map/", "depth", "trajectory/", "images/", "chunks/"]
+                    .iter()
+                    .any(|p| path.starts_with(p));
+                (path, is_data.then(|| file["sha256"].clone()))
+            };
+            files.map(of).collect()
         };
         let found = made(&in_bucket);
         assert!(found.len() >= tasks, "{stage}: {found:?}");
+        assert!(stage != "map" || found.iter().any(|(path, hash)| path == "map/mesh.ply" && hash.is_some()));
         assert_eq!(found, made(&in_folder), "{stage}");
         assert!(in_bucket.all(stage, tasks).iter().all(|t| t["was_there"] == true), "{stage} again");
     }
