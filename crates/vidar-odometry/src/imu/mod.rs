@@ -6,12 +6,14 @@
 //! *pose*, the last nine its *motion*.
 
 mod buffer;
+mod model;
 mod preintegration;
 mod propagate;
 
 pub use buffer::{BufferError, Gap, ImuBuffer};
+pub use model::{Bias, ImuModel, StepNoise};
+pub use preintegration::Preintegration;
 pub(crate) use preintegration::Rates;
-pub use preintegration::{Bias, ImuModel, Preintegration, StepNoise};
 pub use propagate::{Propagated, propagate};
 
 use nalgebra::{Matrix3, SMatrix, SVector, Vector3};

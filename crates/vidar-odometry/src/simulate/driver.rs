@@ -1,61 +1,20 @@
 //! Start and smoother run on tracks, as the whole odometry runs on images.
 
+mod config;
+mod landmarks;
+
+pub use config::FeatureOdometryConfig;
+
 use super::sensors::{SimulatedFrame, Simulation};
-use crate::backend::{
-    GaugePriorSigmas, MarginalisationReport, Observation, OptimiseReport, Smoother, SmootherConfig,
-    SmootherError,
-};
-use crate::imu::{Bias, BufferError, ImuBuffer, ImuModel, NavState, Preintegration};
+use crate::backend::{GaugePriorSigmas, MarginalisationReport, OptimiseReport, Smoother, SmootherError};
+use crate::imu::{Bias, BufferError, ImuBuffer, NavState, Preintegration};
 use crate::initialization::{InFlightInitializer, InitFailure, InitOutcome, LoggedFrame, TrackObservation};
 use crate::initialization::{STILL_SECS, WINDOW_SECS};
 use crate::tracking::{ImageMotion, ImuStatistics};
+use landmarks::observation;
 use nalgebra::Vector3;
 use rustc_hash::{FxHashMap, FxHashSet};
-use vidar_core::{CameraModel, Duration, FrameId, ImuSample, LandmarkId, LieGroup, Se3, Timestamp};
-
-/// Settings of [`FeatureOdometry`].
-#[derive(Clone, Debug)]
-pub struct FeatureOdometryConfig {
-    /// The smoother.
-    pub smoother: SmootherConfig,
-    /// The IMU model of the smoother.
-    pub imu: ImuModel,
-    /// Nominal rate of IMU measurements, Hz.
-    pub imu_rate_hz: f64,
-    /// Keyframes held.
-    pub keyframes: usize,
-    /// Other frames held.
-    pub recent: usize,
-    /// Steps of the smoother per frame.
-    pub iterations: usize,
-    /// Frames from keyframe to keyframe.
-    pub keyframe_every: usize,
-    /// Least angle between rays of a new landmark, degrees.
-    pub min_parallax_deg: f64,
-    /// Frames between attempts to start.
-    pub attempt_every: usize,
-    /// Whether standstill is detected from tracks and IMU measurements, as in the whole odometry; else only
-    /// [`FeatureOdometry::push_resting`] does.
-    pub notices_rest: bool,
-}
-
-impl FeatureOdometryConfig {
-    /// For a simulation's IMU, its white noise inflated by `factor`.
-    pub fn new(noise: &vidar_core::ImuNoise, factor: f64) -> Self {
-        Self {
-            smoother: SmootherConfig::default(),
-            imu: ImuModel::from_data_sheet(noise, factor, factor),
-            imu_rate_hz: noise.rate_hz,
-            keyframes: 10,
-            recent: 3,
-            iterations: 3,
-            keyframe_every: 4,
-            min_parallax_deg: 1.0,
-            attempt_every: 6,
-            notices_rest: true,
-        }
-    }
-}
+use vidar_core::{CameraModel, Duration, FrameId, ImuSample, LandmarkId, Se3, Timestamp};
 
 /// What a frame led to.
 #[derive(Clone, Debug)]
@@ -110,9 +69,6 @@ const GATE_PX: f64 = 25.0;
 
 /// Least way from keyframe to keyframe, as a share of the scene's distance.
 const MIN_KEYFRAME_BASE: f64 = 2e-3;
-
-/// Residual of a new landmark's observations that is accepted, in standard deviations.
-const NEW_GATE_SIGMAS: f64 = 4.0;
 
 impl FeatureOdometry {
     /// For one camera on a body.
@@ -376,63 +332,6 @@ impl FeatureOdometry {
         }
     }
 
-    fn leave_out(&mut self, smoother: &mut Smoother) {
-        for outlier in &self.report.outliers {
-            smoother.remove_observation(outlier.frame, outlier.landmark);
-            if smoother.landmark(outlier.landmark).is_some_and(|l| l.observations < 2) {
-                smoother.remove_landmark(outlier.landmark);
-                self.banned.insert(outlier.landmark);
-                self.tracks.remove(&outlier.landmark);
-            }
-        }
-    }
-
-    /// Tracks with enough parallax become landmarks, hosted by the first keyframe that saw them.
-    fn add_landmarks(
-        &mut self,
-        smoother: &mut Smoother,
-        id: FrameId,
-        observations: &[TrackObservation],
-    ) -> Result<(), SmootherError> {
-        let keyframes: Vec<FrameId> = smoother.keyframes().collect();
-        let held: Vec<FrameId> = smoother.frames().collect();
-        let body_from_camera = *smoother.body_from_camera();
-        for s in observations {
-            if smoother.landmark(s.landmark).is_some() {
-                continue;
-            }
-            let Some(history) = self.tracks.get_mut(&s.landmark) else { continue };
-            history.retain(|(f, _)| held.contains(f));
-            let Some((host, host_seen)) = history.iter().find(|(f, _)| keyframes.contains(f)).copied() else {
-                continue;
-            };
-            let camera_of = |f: FrameId| smoother.state(f).map(|x| x.world_from_body * body_from_camera);
-            let (Some(first), Some(now)) = (camera_of(host), camera_of(id)) else { continue };
-            let rays = (self.camera.unproject(&host_seen.pixel), self.camera.unproject(&s.pixel));
-            let (Some(ray), Some(ray_now)) = rays else { continue };
-            let Some(distance) = triangulate(&first, &ray, &now, &ray_now, self.config.min_parallax_deg)
-            else {
-                continue;
-            };
-            let point = first.act(&(ray * distance));
-            let fits = |f: FrameId, observations: &TrackObservation| {
-                let pixel = camera_of(f).and_then(|c| self.camera.project(&c.inverse().act(&point)));
-                let limit = NEW_GATE_SIGMAS * (0.5 * observations.covariance.trace()).sqrt() + 1.0;
-                pixel.is_some_and(|p| (p - observations.pixel).norm() < limit)
-            };
-            let fitting: Vec<(FrameId, TrackObservation)> =
-                history.iter().filter(|(f, s)| *f != host && fits(*f, s)).copied().collect();
-            if fitting.len() < 2 || fitting.len() * 3 < history.len() {
-                continue;
-            }
-            smoother.add_landmark(&observation(host, &host_seen), 1.0 / distance)?;
-            for (frame, observations) in fitting.iter().filter(|(f, _)| *f >= host) {
-                smoother.add_observation(&observation(*frame, observations))?;
-            }
-        }
-        Ok(())
-    }
-
     fn trim(&mut self, smoother: &mut Smoother) -> Result<(), SmootherError> {
         loop {
             let newest = smoother.newest().map(|(id, ..)| id);
@@ -471,33 +370,4 @@ fn has_moved(smoother: &Smoother, id: FrameId) -> bool {
     inverse.sort_unstable_by(f64::total_cmp);
     let Some(median) = inverse.get(inverse.len() / 2) else { return true };
     (here - last).norm() * median > MIN_KEYFRAME_BASE
-}
-
-fn observation(frame: FrameId, observations: &TrackObservation) -> Observation {
-    Observation {
-        frame,
-        landmark: observations.landmark,
-        pixel: observations.pixel,
-        covariance: observations.covariance,
-    }
-}
-
-/// Distance along the first ray of the point nearest to both rays, if their angle is wide enough and it lies ahead.
-fn triangulate(
-    first: &Se3,
-    ray: &Vector3<f64>,
-    now: &Se3,
-    ray_now: &Vector3<f64>,
-    min_deg: f64,
-) -> Option<f64> {
-    let (a, b) = (first.rotation * *ray, now.rotation * *ray_now);
-    let cross = a.cross(&b);
-    let sin2 = cross.norm_squared();
-    if sin2 < min_deg.to_radians().sin().powi(2) {
-        return None;
-    }
-    let base = now.translation - first.translation;
-    let along_first = base.cross(&b).dot(&cross) / sin2;
-    let along_now = base.cross(&a).dot(&cross) / sin2;
-    (along_first > 0.1 && along_now > 0.1 && along_first < 500.0).then_some(along_first)
 }
