@@ -2,16 +2,17 @@
 
 #![allow(clippy::unwrap_used)] // helpers of tests are test code, though not marked so
 
+#[path = "../flat/mod.rs"]
 mod flat;
+mod prior_world;
 
 use flat::*;
-use vidar_align::aligner::{DepthPoint, RejectionReason};
+use vidar_align::aligner::RejectionReason;
 use vidar_align::streaming::chunk_ranges;
 use vidar_align::{Aligner, AlignerConfig, ChunkStatus, CouplingMode, Placement};
-use vidar_core::model::ChunkFrame;
 use vidar_core::{
-    ChunkView, FrameId, FrameImage, GeometryPrediction, Image, LieGroup, RelativeDepth, Se3, SparseLandmark,
-    Timestamp, umeyama_sim3,
+    ChunkView, FrameId, FrameImage, GeometryPrediction, Image, LieGroup, RelativeDepth, Se3, Timestamp,
+    umeyama_sim3,
 };
 
 fn run(mode: CouplingMode, truth: &[Se3], odometry: Option<&[Se3]>, model: Model, seed: u64) -> Placement {
@@ -142,146 +143,6 @@ fn landmarks_straighten_a_leaning_depth_and_determine_the_scale() {
     assert!(after < 0.75 * before, "{} before, {} after", before / count, after / count);
 }
 
-/// What a small network that was given the poses may say: too near by a fifth, and bent its own way in each view.
-fn rough(truth: &[Se3], range: std::ops::Range<usize>, id: u32, noise: &mut Noise) -> GeometryPrediction {
-    let mut prediction = predict(truth, range, id, Model { has_gauge: false, ..EXACT }, noise);
-    prediction.frame = ChunkFrame::PriorWorld;
-    for view in &mut prediction.views {
-        let (offset, across, down) = (0.08 * noise.normal(), 0.25 * noise.normal(), 0.25 * noise.normal());
-        let exact = view.depth.image().clone();
-        let bent = Image::from_fn(WIDTH, HEIGHT, |x, y| {
-            let (x_share, y_share) = (x as f64 / WIDTH as f64 - 0.5, y as f64 / HEIGHT as f64 - 0.5);
-            let off = (-0.22 + offset + across * x_share + down * y_share).exp();
-            (f64::from(exact[(x, y)]) * off) as f32
-        });
-        view.depth = RelativeDepth::new(bent);
-    }
-    prediction
-}
-
-/// Middle of |ln| of depth over truth, of a run of rough predictions; landmarks in every `step`-th frame.
-fn rough_run(step: usize) -> (f64, Placement) {
-    rough_run_sharing(step, 0.0)
-}
-
-/// A landmark as a point without a track.
-fn untracked(landmark: SparseLandmark) -> DepthPoint {
-    let SparseLandmark { id, pixel, inverse_depth, inverse_depth_std } = landmark;
-    DepthPoint { number: id.0, pixel, inverse_depth, inverse_depth_std }
-}
-
-/// The same with points that have an error in common, where it is above 0.
-fn rough_run_sharing(step: usize, shared_std: f64) -> (f64, Placement) {
-    let truth = laps(36, 0.7);
-    let (mut noise, mut points) = (Noise::new(21), Noise::new(22));
-    let mut aligner = Aligner::new(CouplingMode::Coupled, &AlignerConfig::default()).unwrap();
-    let mut predictions = Vec::new();
-    for (k, range) in chunk_ranges(36, 12, 4).unwrap().into_iter().enumerate() {
-        let prediction = rough(&truth, range.frames.clone(), k as u32, &mut noise);
-        predictions.push(prediction.clone());
-        let seen: Vec<_> = range
-            .frames
-            .map(|i| {
-                let count = if i % step == 0 { 50 } else { 0 };
-                (i, landmarks(&truth[i], i, count, 0.02, 0.05, &mut points))
-            })
-            .collect();
-        let of = |i: usize| seen.iter().find(|s| s.0 == i).map_or(Vec::new(), |s| s.1.clone());
-        let mut observation = observe(prediction, Some(&truth), of);
-        if shared_std > 0.0 {
-            for frame in &mut observation.frames {
-                frame.points = frame.landmarks.drain(..).map(untracked).collect();
-                frame.shared_point_std = shared_std;
-            }
-        }
-        aligner.push(observation).unwrap();
-    }
-    let placement = aligner.finish();
-    let mut off: Vec<f64> = Vec::new();
-    for prediction in predictions {
-        for view in placement.aligned_views(prediction, &[]).unwrap() {
-            let exact = depth(&truth[view.frame_id().index()]);
-            let ratios = view.depth().image().data().iter().zip(exact.data()).map(|(d, z)| f64::from(d / z));
-            off.extend(ratios.map(|r| r.ln().abs()));
-        }
-    }
-    off.sort_by(f64::total_cmp);
-    (off[off.len() / 2], placement)
-}
-
-#[test]
-fn a_rough_depth_in_the_world_of_its_priors_is_scaled_to_landmarks_and_its_poses_stay() {
-    let (error, placement) = rough_run(1);
-    assert_eq!(placement.rejections.of(RejectionReason::DepthRescaled), placement.chunks.len());
-    assert_eq!(
-        placement.rejections.of(RejectionReason::OdometryDownweighted)
-            + placement.rejections.of(RejectionReason::InconsistentChunk),
-        0
-    );
-    assert_eq!(placement.views.len(), 36);
-    let moved = absolute_error(&placement, &laps(36, 0.7));
-    assert!(moved < 0.02, "{moved}");
-    // Uncorrected it is off by more than a fifth.
-    assert!(error < 0.04, "{error}");
-}
-
-/// Chunks with true poses given, every other one seen at `factor` times its size.
-fn with_given_poses(mode: CouplingMode, factor: f32) -> Placement {
-    let truth = laps(36, 0.7);
-    let mut noise = Noise::new(31);
-    let mut aligner = Aligner::new(mode, &AlignerConfig::default()).unwrap();
-    for (k, range) in chunk_ranges(36, 12, 4).unwrap().into_iter().enumerate() {
-        let model = Model { has_gauge: false, ..EXACT };
-        let mut prediction = predict(&truth, range.frames, k as u32, model, &mut noise);
-        prediction.frame = ChunkFrame::PriorWorld;
-        let seen = if k % 2 == 1 { factor } else { 1.0 };
-        for view in &mut prediction.views {
-            view.depth = RelativeDepth::new(view.depth.image().map(|z| z * seen));
-        }
-        aligner.push(observe(prediction, Some(&truth), none)).unwrap();
-    }
-    aligner.finish()
-}
-
-#[test]
-fn chunks_in_the_world_of_their_priors_keep_their_scale_whatever_the_scale_of_their_overlap() {
-    let placement = with_given_poses(CouplingMode::PoseConditioned, 0.67);
-    assert!(placement.rejections.of(RejectionReason::ScaleOutOfRange) >= 2, "{:?}", placement.rejections);
-    for chunk in &placement.chunks {
-        assert!((chunk.world_from_chunk.scale - 1.0).abs() < 1e-12, "{}", chunk.world_from_chunk.scale);
-    }
-}
-
-#[test]
-fn given_poses_do_not_make_a_depth_metric_that_its_neighbours_contradict() {
-    for mode in [CouplingMode::PoseConditioned, CouplingMode::Coupled] {
-        let known_to = |factor: f32| {
-            let chunks = with_given_poses(mode, factor).chunks;
-            chunks.iter().map(|c| c.log_scale_std).fold(0.0, f64::max)
-        };
-        assert!(known_to(1.0) < 0.006, "{mode}: {}", known_to(1.0));
-        assert!(known_to(0.8) > 0.05, "{mode}: {}", known_to(0.8));
-    }
-}
-
-#[test]
-fn no_number_of_landmarks_lowers_sigma_below_their_shared_error() {
-    let (alone, shared) = (rough_run(1).1, rough_run_sharing(1, 0.02).1);
-    for (alone, shared) in alone.chunks.iter().zip(&shared.chunks) {
-        assert!(alone.log_scale_std < 0.01, "{}", alone.log_scale_std);
-        assert!((shared.log_scale_std - alone.log_scale_std.hypot(0.02)).abs() < 1e-12);
-        // It is known of, not acted on.
-        assert_eq!(alone.world_from_chunk, shared.world_from_chunk);
-    }
-}
-
-#[test]
-fn views_without_landmarks_are_corrected_by_their_neighbours() {
-    let (error, placement) = rough_run(3);
-    assert!(placement.views.iter().all(|v| v.field.is_some()));
-    assert!(error < 0.06, "{error}");
-}
-
 #[test]
 fn memory_grows_by_a_few_kilobytes_per_view_and_no_more() {
     let truth = laps(200, 3.0);
@@ -363,48 +224,6 @@ fn a_metric_scale_that_jumps_between_neighbours_is_clamped_and_counted() {
     assert!(placement.rejections.of(RejectionReason::ScaleOutOfRange) >= 1, "{:?}", placement.rejections);
     let jump = placement.chunks[2].world_from_chunk.scale / gauges[2].scale;
     assert!((jump - 1.0).abs() < 0.2, "{jump}");
-}
-
-#[test]
-fn a_chunk_in_the_world_of_its_priors_keeps_its_metres_though_its_cameras_are_beside_them() {
-    // As where the trajectory is of another sensor of the rig: every camera 3 cm beside its pose prior, on a short path.
-    let truth = laps(120, 0.5);
-    let beside = Se3::new(vidar_core::So3::IDENTITY, nalgebra::Vector3::new(-0.025, 0.012, 0.01));
-    let priors: Vec<Se3> = truth.iter().map(|t| *t * beside).collect();
-    let mut aligner = Aligner::new(CouplingMode::Coupled, &AlignerConfig::default()).unwrap();
-    for (k, start) in [0, 12, 24].into_iter().enumerate() {
-        let mut noise = Noise::new(3);
-        let mut prediction = predict(&truth, start..start + 12, k as u32, EXACT, &mut noise);
-        prediction.frame = ChunkFrame::PriorWorld;
-        for view in &mut prediction.views {
-            let pose = truth[view.frame_id.index()];
-            view.chunk_from_camera = pose;
-            view.depth = RelativeDepth::new(depth(&pose));
-        }
-        aligner.push(observe(prediction, Some(&priors), none)).unwrap();
-    }
-    let placement = aligner.finish();
-    assert_eq!(placement.views.len(), 36);
-    for chunk in &placement.chunks {
-        assert!((chunk.world_from_chunk.scale.ln()).abs() < 2e-3, "{:?}", chunk.world_from_chunk);
-        assert!(chunk.log_scale_std < 0.006, "{}", chunk.log_scale_std);
-    }
-}
-
-#[test]
-fn a_chunk_in_the_world_of_its_priors_is_checked_against_them_and_not_moved() {
-    let truth = laps(12, 0.2);
-    let far: Vec<Se3> =
-        truth.iter().map(|t| Se3::from_translation(nalgebra::Vector3::x() * 2.0) * *t).collect();
-    for (priors, expected) in [(&truth, ChunkStatus::PriorWorld), (&far, ChunkStatus::Inconsistent)] {
-        let model = Model { has_gauge: false, ..EXACT };
-        let mut prediction = predict(&truth, 0..12, 0, model, &mut Noise::new(1));
-        prediction.frame = ChunkFrame::PriorWorld;
-        let mut aligner = Aligner::new(CouplingMode::PoseConditioned, &AlignerConfig::default()).unwrap();
-        let report = aligner.push(observe(prediction, Some(priors), none)).unwrap();
-        assert_eq!(report.status, expected);
-        assert_eq!(report.world_from_chunk, Some(vidar_core::Sim3::IDENTITY));
-    }
 }
 
 #[test]
