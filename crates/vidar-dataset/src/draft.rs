@@ -1,22 +1,22 @@
 //! Completes the output of a reader to a consistent dataset: calibration, order, sizes, cuts, external trajectory.
 
+mod calibration;
+mod depth;
+
 use crate::assemble::{cut, guessed_model, keep_existing, keep_one_size, name_of};
 use crate::camera_flag::with_size;
 use crate::checks::{self, IMAGE_GAP_FLOOR};
 use crate::error::DatasetError;
 use crate::location::{Location, Media};
 use crate::options::{OpenOptions, RecordingKind};
-use crate::parse::{self, Source};
-use crate::recording::{
-    CalibrationSource, DepthEntry, DepthSensor, ExternalTrajectory, ImageEntry, Recording,
-};
+use crate::parse::Source;
+use crate::recording::{CalibrationSource, ExternalTrajectory, ImageEntry, Recording};
 use crate::rig_checks;
-use crate::source::read_file_up_to;
 use crate::trajectory_file::{self, ReadPoses};
 use crate::tum_rgbd;
 use std::path::{Path, PathBuf};
 use vidar_core::{
-    BodyFrame, CameraId, CameraModel, Duration, FrameId, ImuNoise, ImuSample, Pinhole, Rig, RigCamera, Se3,
+    BodyFrame, CameraId, CameraModel, Duration, FrameId, ImuNoise, ImuSample, Rig, RigCamera, Se3,
     StampedPose, Timestamp, Trajectory, Warning,
 };
 
@@ -208,24 +208,6 @@ impl Draft {
             .collect())
     }
 
-    /// Names the files next to the images that look like a calibration and are not read.
-    fn report_unread_calibrations(&mut self) {
-        for name in crate::folder::names_in(&self.root).unwrap_or_default() {
-            let path = self.root.join(&name);
-            if self.text_files.contains(&path) || !looks_like_calibration(&name) || !path.is_file() {
-                continue;
-            }
-            self.warnings.push(
-                Warning::new("calibration-ignored", format!("{name} looks like a calibration and is not read"))
-                    .at(path.display())
-                    .hint(
-                        "--calibration FILE reads EuRoC's and Kalibr's yaml; --camera-model pinhole:fx,fy,cx,cy gives \
-                         the values",
-                    ),
-            );
-        }
-    }
-
     /// The chosen camera's model at the size of its images.
     fn complete_model(
         &mut self,
@@ -294,142 +276,6 @@ impl Draft {
         rig
     }
 
-    /// Applies a calibration file, EuRoC's or Kalibr's.
-    pub(crate) fn apply_calibration(&mut self, path: &Path) -> Result<(), DatasetError> {
-        let bytes = read_file_up_to(path, parse::yaml::MAX_YAML_BYTES as u64)?;
-        self.text_files.push(path.to_path_buf());
-        let source = Source { path, bytes: &bytes };
-        let (sensor, notes) = parse::euroc_sensor_yaml(&source)?;
-        let is_euroc = sensor.camera.is_some() || sensor.imu.is_some() || sensor.body_from_sensor.is_some();
-        if is_euroc {
-            self.warnings.extend(notes);
-            if sensor.imu.is_some() {
-                self.imu_noise = sensor.imu;
-            }
-            if let Some(calibration) = sensor.camera {
-                self.use_calibration(self.chosen, calibration, sensor.body_from_sensor, path);
-            }
-            return Ok(());
-        }
-        let (file, notes) = parse::kalibr_yaml(&source)?;
-        self.warnings.extend(notes);
-        if let Some(imu) = file.imu {
-            self.imu_noise = Some(imu.noise);
-        }
-        let single = file.cameras.len() == 1 && self.cameras.len() == 1;
-        for camera in file.cameras {
-            let index = self.cameras.iter().position(|c| c.number == camera.number || single);
-            let body_from_camera = camera.camera_from_imu.map(|m| vidar_core::LieGroup::inverse(&m));
-            if let Some(index) = index {
-                self.use_calibration(index, camera.calibration, body_from_camera, path);
-            }
-        }
-        Ok(())
-    }
-
-    fn use_calibration(
-        &mut self,
-        index: usize,
-        calibration: parse::CameraCalibration,
-        body_from_camera: Option<Se3>,
-        path: &Path,
-    ) {
-        let camera = &mut self.cameras[index];
-        if body_from_camera.is_none() && !self.imu.is_empty() {
-            self.warnings.push(
-                Warning::new(
-                    "extrinsics-missing",
-                    format!("no extrinsics of cam{}; {}", camera.number, "the earlier ones are kept"),
-                )
-                .at(path.display())
-                .hint("Kalibr writes T_cam_imu after its camera-imu calibration"),
-            );
-        }
-        camera.model = Some(calibration.model);
-        camera.time_offset = calibration.time_offset;
-        camera.readout = calibration.readout;
-        camera.rate_hz = calibration.rate_hz.or(camera.rate_hz);
-        camera.body_from_camera = body_from_camera.unwrap_or(camera.body_from_camera);
-        camera.source = CalibrationSource::File(path.to_path_buf());
-    }
-
-    fn complete_depth(&mut self, options: &OpenOptions, dataset: &mut Recording) -> Result<(), DatasetError> {
-        let Some(mut depth) = self.depth.take() else { return Ok(()) };
-        let mut depths = std::mem::take(&mut self.depths);
-        let notes = &mut dataset.warnings;
-        keep_existing(&mut depths, "depth images", &self.root, notes)?;
-        checks::put_in_order(&mut depths, |d| d.0, "depth images", &self.root, notes);
-        let Some((_, first)) = depths.first() else { return Ok(()) };
-        let (width, height) = self.media.size(first)?;
-        let Some(camera) = dataset.rig.camera(dataset.camera) else { return Ok(()) };
-        let bad = |key: &str| {
-            let (path, key) = (first.place(), key.to_string());
-            move |source| DatasetError::BadCamera { path, key, source }
-        };
-        let intrinsics = match options.depth_intrinsics.or(depth.intrinsics) {
-            Some([fx, fy, cx, cy]) => {
-                Pinhole::new(fx, fy, cx, cy, width, height).map_err(bad("depth intrinsics"))?
-            }
-            None => {
-                if !depth.is_registered {
-                    notes.push(
-                        Warning::new(
-                            "depth-intrinsics",
-                            "no intrinsics of the depth camera; those of the colour camera are used",
-                        )
-                        .at(self.root.display())
-                        .hint("--depth-intrinsics fx,fy,cx,cy"),
-                    );
-                }
-                camera.model.intrinsics().resized(width, height).map_err(bad("depth intrinsics"))?
-            }
-        };
-        // Intrinsics from a flag describe images without distortion, and so does a model of another size.
-        let distorted = depth.distorted.take().filter(|model| {
-            options.depth_intrinsics.is_none() && (model.width(), model.height()) == (width, height)
-        });
-        let units_per_metre = match options.depth_scale.or(depth.units_per_metre) {
-            Some(units) => units,
-            None => {
-                let message = format!(
-                    "the unit of depth is not stated; assumed: {} per metre, as usual for {}",
-                    depth.default_units, self.kind
-                );
-                notes.push(
-                    Warning::new("depth-scale", message).at(self.root.display()).hint("--depth-scale UNITS"),
-                );
-                depth.default_units
-            }
-        };
-        let by_rig =
-            depth.body_from_depth.map(|b| vidar_core::LieGroup::inverse(&camera.body_from_camera) * b);
-        let color_from_depth = match options.color_from_depth.or(by_rig) {
-            Some(motion) => motion,
-            None => {
-                if !depth.is_registered {
-                    notes.push(
-                        Warning::new(
-                            "depth-extrinsics",
-                            "no pose of the depth camera is given; assumed: that of the colour camera",
-                        )
-                        .at(self.root.display())
-                        .hint("--color-from-depth"),
-                    );
-                }
-                Se3::IDENTITY
-            }
-        };
-        dataset.depth_sensor = Some(DepthSensor {
-            intrinsics,
-            distorted,
-            units_per_metre,
-            color_from_depth,
-            invalid: depth.invalid,
-        });
-        dataset.depths = depths.into_iter().map(|(time, location)| DepthEntry { time, location }).collect();
-        Ok(())
-    }
-
     fn read_external_trajectory(
         &mut self,
         options: &OpenOptions,
@@ -464,14 +310,6 @@ impl Draft {
         dataset.text_files.push(path.clone());
         Ok(())
     }
-}
-
-/// Names under which programs write calibrations.
-fn looks_like_calibration(name: &str) -> bool {
-    let lower = name.to_ascii_lowercase();
-    let words = ["calib", "intrinsic", "camchain", "camera", "extrinsic"];
-    let endings = [".txt", ".yaml", ".yml", ".json", ".xml", ".ini"];
-    words.iter().any(|w| lower.contains(w)) && endings.iter().any(|e| lower.ends_with(e))
 }
 
 /// Without an IMU there is no IMU frame: poses that a format calls the IMU's are then the chosen camera's.
