@@ -32,6 +32,7 @@ mod licence;
 mod lock;
 mod progress;
 mod pull;
+mod record;
 mod settings;
 mod store;
 
@@ -41,8 +42,6 @@ pub use error::HubError;
 pub use licence::Licence;
 pub use progress::{Progress, TransferCallbacks};
 pub use pull::PullOptions;
+pub use record::{Acceptance, IdentifiedBy, Record, RecordedFile};
 pub use settings::{ENDPOINT, HubSettings};
-pub use store::{
-    Acceptance, CheckpointLocation, IdentifiedBy, InstalledCheckpoint, Record, RecordedFile, Store,
-    VerifiedFile, official_licence,
-};
+pub use store::{CheckpointLocation, InstalledCheckpoint, Store, VerifiedFile, official_licence};

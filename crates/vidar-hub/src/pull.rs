@@ -8,10 +8,8 @@ use crate::error::HubError;
 use crate::header::{Header, read_header};
 use crate::lock::Lock;
 use crate::progress::TransferCallbacks;
-use crate::store::{
-    Acceptance, CheckpointLocation, IdentifiedBy, InstalledCheckpoint, RECORD, RecordedFile, Store,
-    make_folder, minimal_config, record_of, write_json,
-};
+use crate::record::{Acceptance, IdentifiedBy, RECORD, RecordedFile, record_of};
+use crate::store::{CheckpointLocation, InstalledCheckpoint, Store, make_folder, minimal_config, write_json};
 use std::fs;
 use std::path::{Path, PathBuf};
 
