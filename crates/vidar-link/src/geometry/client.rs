@@ -2,10 +2,11 @@
 
 use super::message::{Hello, HelloRequest, ModelFacts, Outcome, PredictReply, PredictRequest};
 use super::pixels::{DepthFormat, ImageFormat};
+use super::reach::{AskError, Reach};
+use super::report::RemoteReport;
 use super::server::Predicted;
 use crate::envelope::PROTOCOL;
 use crate::error::LinkError;
-use serde::Serialize;
 use std::collections::BTreeMap;
 use std::ops::Range;
 use std::time::{Duration, Instant};
@@ -21,41 +22,6 @@ const PAUSE: Duration = Duration::from_millis(200);
 const NEWS: Duration = Duration::from_secs(5);
 /// The most workers that are known at a time.
 const MOST_WORKERS: usize = 256;
-
-/// Why a worker gave no answer.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum AskError {
-    /// It is gone, or the way to it is.
-    Gone,
-    /// It did not answer in time.
-    Late,
-    /// The caller asked to stop.
-    Cancelled,
-}
-
-/// The way to the workers under a key.
-pub trait Reach: Send {
-    /// The key.
-    fn key(&self) -> &str;
-
-    /// Asks all workers; the answers that came within a time.
-    ///
-    /// # Errors
-    /// The way itself cannot be used.
-    fn greet(&mut self, question: &[u8], within: Duration) -> Result<Vec<Vec<u8>>, LinkError>;
-
-    /// Asks one worker. `stop` is asked now and then.
-    ///
-    /// # Errors
-    /// Why there is no answer.
-    fn ask(
-        &mut self,
-        worker: &str,
-        request: &[u8],
-        within: Duration,
-        stop: &dyn Fn() -> bool,
-    ) -> Result<Vec<u8>, AskError>;
-}
 
 /// The model that is asked for; what is empty may be anything that all workers agree on.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
@@ -85,62 +51,6 @@ pub struct RemoteOptions {
     pub run: u64,
     /// Of equally busy workers the one of this number is asked first: several links of one run begin with different ones.
     pub rank: usize,
-}
-
-/// What went over the link.
-#[derive(Clone, Debug, Default, PartialEq, Serialize)]
-pub struct RemoteReport {
-    /// The key.
-    pub key: String,
-    /// How the images travelled.
-    pub images: ImageFormat,
-    /// How depth travelled.
-    pub depth: DepthFormat,
-    /// Requests that were answered with geometry.
-    pub chunks: usize,
-    /// Keyframes that came back with geometry.
-    pub keyframes: usize,
-    /// Requests that another worker had to be asked for: gone, slow, or without a usable answer.
-    pub retries: usize,
-    /// Of those, answers that were no valid answers.
-    pub invalid_replies: usize,
-    /// To workers, bytes, retries included.
-    pub bytes_sent: u64,
-    /// From workers, bytes.
-    pub bytes_received: u64,
-    /// Both over the keyframes.
-    pub bytes_per_keyframe: u64,
-    /// Chunks that each worker answered.
-    pub workers: BTreeMap<String, usize>,
-}
-
-impl RemoteReport {
-    /// With what went over another link to the same workers.
-    pub fn and(mut self, other: &Self) -> Self {
-        self.chunks += other.chunks;
-        self.keyframes += other.keyframes;
-        self.retries += other.retries;
-        self.invalid_replies += other.invalid_replies;
-        self.bytes_sent += other.bytes_sent;
-        self.bytes_received += other.bytes_received;
-        for (worker, chunks) in &other.workers {
-            *self.workers.entry(worker.clone()).or_default() += chunks;
-        }
-        self.bytes_per_keyframe = (self.bytes_sent + self.bytes_received) / (self.keyframes.max(1) as u64);
-        self
-    }
-
-    /// In words.
-    pub fn words(&self) -> String {
-        format!(
-            "{} chunks from {} workers under {}, {} retries, {} kB per keyframe",
-            self.chunks,
-            self.workers.len(),
-            self.key,
-            self.retries,
-            self.bytes_per_keyframe / 1000
-        )
-    }
 }
 
 struct Known {
