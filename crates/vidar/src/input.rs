@@ -1,9 +1,11 @@
 //! From a path to a recording, its poses and its images.
 
 mod poses;
+pub(crate) mod trajectory;
 
 pub(crate) use poses::not_evaluated;
-pub use poses::{MetricTrajectory, PosePlan, TrajectorySource, truth_in_camera, truth_in_imu};
+pub use poses::{PosePlan, truth_in_camera, truth_in_imu};
+pub use trajectory::{MetricTrajectory, TrajectorySource};
 
 use crate::config::Config;
 use crate::engine::{FrameStamp, GivenPoses, ImageSource};

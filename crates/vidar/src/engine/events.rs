@@ -1,7 +1,7 @@
 //! What the engine reports: progress and results in one typed stream.
 
 use super::track::Segment;
-use crate::input::TrajectorySource;
+use crate::input::trajectory::TrajectorySource;
 use crate::quality::TrackQuality;
 use std::sync::Arc;
 use vidar_align::Placement;

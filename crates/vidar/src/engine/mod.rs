@@ -17,8 +17,10 @@ mod cut;
 mod events;
 mod fuse;
 mod growing;
+mod mapping;
 mod observe;
 pub(crate) mod placed;
+mod pose_source;
 mod predict;
 mod preview;
 mod select;
@@ -29,31 +31,25 @@ mod views;
 
 pub use cut::ChunkRule;
 pub use events::{FrameStamp, FrameState, MapEvent, MapKeyframe, Step, Surface};
+pub use pose_source::{GivenPoses, OdometryPoses, PoseReport, PoseSource};
 pub use select::Selection;
 pub use setup::{
     EngineSetup, GeometrySource, ImageSource, PlaceDescriber, PredictedFrame, Prediction, PredictionId,
     PredictionStore,
 };
-pub use track::{GivenPoses, OdometryPoses, PoseReport, PoseSource, PosedFrame, longest_posed};
+pub use track::{PosedFrame, longest_posed};
 
-use crate::chunks::StoredChunk;
 use crate::config::{Config, LandmarkSources};
 use crate::error::Error;
-use crate::input::TrajectorySource;
-use complete::complete_chunks;
-use fuse::SurfaceFusion;
+use crate::input::trajectory::TrajectorySource;
 use growing::GrowingSurface;
 use observe::{LandmarkUse, Observer};
-use placed::placed_views;
 use predict::Predictor;
 use preview::Preview;
-use std::sync::Arc;
 use stereo_landmarks::StereoLandmarks;
 use track::Track;
-use vidar_align::chunking::ChunkSpan;
-use vidar_align::{Aligner, Placement};
-use vidar_core::{CameraId, CameraModel, ChunkId, Duration, FrameId, SensorEvent, Warning};
-use vidar_fusion::FusionConfig;
+use vidar_align::Aligner;
+use vidar_core::{CameraId, CameraModel, Duration, FrameId, SensorEvent, Warning};
 
 /// Where the engine's events go. An error of a reader ends the run.
 pub type Sink<'s> = dyn FnMut(MapEvent) -> Result<(), Error> + 's;
@@ -364,160 +360,6 @@ impl<'a> Engine<'a> {
         sink(MapEvent::World { source, segment: segment.unwrap_or(0) })
     }
 
-    /// The next chunk that later keyframes cannot change.
-    fn next_chunk(&self, is_complete: bool) -> Result<Option<(ChunkId, ChunkSpan)>, Error> {
-        let Some(world) = self.world.as_ref().filter(|_| !(self.cancelled)()) else { return Ok(None) };
-        let chunk = match is_complete {
-            true => self.rule.chunks(&world.frames)?.into_iter().nth(world.chunks),
-            false => self.rule.decided(world.chunks, &world.frames)?.into_iter().next(),
-        };
-        let is_ready = |c: &ChunkSpan| is_complete || self.observer.is_decided(&world.keyframes, c.seen.end);
-        Ok(chunk.filter(is_ready).map(|c| (number(world.chunks), c)))
-    }
-
-    /// Predict: depth of a chunk; `None` when cancelled.
-    fn predict(
-        &mut self,
-        id: ChunkId,
-        chunk: &ChunkSpan,
-        sink: &mut Sink<'_>,
-    ) -> Result<Option<StoredChunk>, Error> {
-        self.enter(Step::Predict, sink)?;
-        let Some(world) = &mut self.world else { return Ok(None) };
-        if let (true, Some(track)) = (self.readout > Duration::ZERO, self.track.longest()) {
-            for keyframe in &mut world.keyframes[chunk.seen.clone()] {
-                keyframe.read_by_rows(track, self.readout, &self.camera_model);
-            }
-        }
-        let mut events = Vec::new();
-        let prediction = self.predictor.predict(id, chunk, &world.keyframes, &mut events)?;
-        events.into_iter().try_for_each(&mut *sink)?;
-        Ok(prediction)
-    }
-
-    /// Align: the chunk in the metric world, and the loops that it closes.
-    fn align(
-        &mut self,
-        id: ChunkId,
-        chunk: &ChunkSpan,
-        stored: StoredChunk,
-        sink: &mut Sink<'_>,
-    ) -> Result<(), Error> {
-        self.enter(Step::Align, sink)?;
-        let Some(world) = &mut self.world else { return Ok(()) };
-        world.chunks += 1;
-        let mut events = Vec::new();
-        match &stored.failure {
-            Some(reason) => world.failures.push(reason.clone()),
-            None => {
-                let descriptors = self.predictor.places.descriptors(&stored);
-                let keyframes = &world.keyframes;
-                let prediction = stored.prediction;
-                let by_stereo = self.predictor.landmarks(chunk, keyframes, &prediction, &mut events);
-                let observation =
-                    self.observer.observe(keyframes, chunk, prediction, &descriptors, &by_stereo);
-                events.push(MapEvent::ChunkObserved { chunk: id, frames: observation.frames.clone() });
-                let report = world.aligner.push(observation)?;
-                if !report.status.is_usable() {
-                    let mut message = format!("not placed: {}", report.status.description());
-                    if report.center_rms_m.is_finite() {
-                        message += &format!(" (RMS distance of camera centres {:.3} m)", report.center_rms_m);
-                    }
-                    world.failures.push(message.clone());
-                    let warning = Warning::degraded("chunk-not-placed", message).at(PredictionId::Chunk(id));
-                    events.push(MapEvent::Warning(warning));
-                }
-                events.push(MapEvent::ChunkPlaced(report));
-            }
-        }
-        let predicts_loops = self.predictor.geometry.predicts_any_views() && self.config.coupling.loop_chunks;
-        let candidates = match self.config.coupling.loops {
-            true => world.aligner.loop_candidates(),
-            false => Vec::new(),
-        };
-        for candidate in candidates {
-            let together = match predicts_loops {
-                true => self.predictor.predict_loop(&candidate, &world.keyframes, &mut events)?,
-                false => None,
-            };
-            events.push(MapEvent::LoopMeasured(world.aligner.push_loop(&candidate, together.as_ref())?));
-        }
-        if let Some(growing) = &mut self.growing {
-            let placement = Arc::new(world.aligner.provisional_placement());
-            let stored = self.predictor.store.read(PredictionId::Chunk(id))?;
-            let grown =
-                growing.grow(id, &placed_views(&placement, stored)?, &placement, self.predictor.store)?;
-            events.push(MapEvent::PlacementsRevised { placement, is_final: false });
-            events.extend(grown);
-        }
-        events.into_iter().try_for_each(&mut *sink)
-    }
-
-    /// Every chunk and keyframe, placed by all that was measured.
-    fn place(&mut self, sink: &mut Sink<'_>) -> Result<Arc<Placement>, Error> {
-        let is_cancelled = (self.cancelled)();
-        let without_pose = self.track.without_pose;
-        if without_pose > 0 && self.poses.is_some() {
-            let message =
-                format!("{without_pose} of {} images have no pose and are skipped", self.candidates.len());
-            let hint = "they lie outside the trajectory, or in a gap longer than input.max_pose_gap_secs";
-            sink(MapEvent::Warning(Warning::new("images-without-pose", message).hint(hint)))?;
-        }
-        let needed = self.predictor.geometry.info().min_views.max(1);
-        let found = self.world.as_ref().map_or(0, |w| w.keyframes.len());
-        if found < needed && !is_cancelled {
-            return Err(Error::TooFewKeyframes { found, needed });
-        }
-        if self.world.is_none() {
-            self.begin_world(None, sink)?;
-        }
-        let world = self.world.take().ok_or(Error::TooFewKeyframes { found, needed })?;
-        self.enter(Step::Align, sink)?;
-        let placement = Arc::new(world.aligner.finish());
-        if placement.views.is_empty() && !is_cancelled {
-            let reason = world.failures.last().cloned();
-            let reason = reason.unwrap_or_else(|| "no keyframe image could be read".into());
-            return Err(Error::Empty { keyframes: found, reason });
-        }
-        sink(MapEvent::PlacementsRevised { placement: placement.clone(), is_final: true })?;
-        Ok(placement)
-    }
-
-    /// Fuse: every placed chunk's own keyframes into one surface.
-    fn fuse(&mut self, placement: &Placement, sink: &mut Sink<'_>) -> Result<(), Error> {
-        self.enter(Step::Fuse, sink)?;
-        let fusion =
-            FusionConfig { memory_budget_bytes: self.volume_budget_bytes, ..self.config.fusion.clone() };
-        let mut surface = SurfaceFusion::new(&fusion)?;
-        // Asked to stop while predicting, what was predicted is fused; asked to stop now, fusing stops.
-        let was_cancelled = (self.cancelled)();
-        let cancelled = self.cancelled;
-        let is_stopped = || cancelled() && !was_cancelled;
-        let owns_views = |c: &ChunkId| placement.views.iter().any(|v| v.owner == *c);
-        let chunks: Vec<ChunkId> = placement.chunks.iter().map(|c| c.chunk_id).filter(owns_views).collect();
-        let completes = self.predictor.geometry.completes();
-        for chunk in &chunks {
-            if is_stopped() {
-                break;
-            }
-            let stored = self.predictor.store.read(PredictionId::Chunk(*chunk))?;
-            let views = placed_views(placement, stored)?;
-            surface.fuse(&views).into_iter().try_for_each(&mut *sink)?;
-            if !completes {
-                sink(MapEvent::ViewsFused(views))?;
-            }
-        }
-        if completes {
-            self.enter(Step::Complete, sink)?;
-            complete_chunks(placement, &chunks, self.predictor.store, &mut surface, &is_stopped, sink)?;
-        }
-        let (surface, warnings) = surface.finish();
-        for warning in warnings {
-            sink(MapEvent::Warning(warning))?;
-        }
-        sink(MapEvent::SurfaceChanged { surface: Arc::new(surface), shown: Vec::new(), is_final: true })
-    }
-
     fn enter(&mut self, step: Step, sink: &mut Sink<'_>) -> Result<(), Error> {
         match self.step.replace(step) == Some(step) {
             true => Ok(()),
@@ -536,10 +378,6 @@ pub fn chunk_rule(config: &Config, overlaps: bool, prescribed: Option<Vec<Vec<Fr
         (None, true) => ChunkRule::Overlapping { size, overlap: geometry.overlap_keyframes },
         (None, false) => ChunkRule::WithContext { size, context: geometry.context_keyframes },
     }
-}
-
-fn number(chunk: usize) -> ChunkId {
-    ChunkId(u32::try_from(chunk).unwrap_or(u32::MAX))
 }
 
 #[cfg(test)]

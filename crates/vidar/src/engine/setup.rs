@@ -1,7 +1,7 @@
 //! What the engine needs from outside, as traits and values: it opens no file and starts no thread of its own.
 
 use super::events::FrameStamp;
-use super::track::PoseSource;
+use super::pose_source::PoseSource;
 use crate::chunks::StoredChunk;
 use crate::config::Config;
 use crate::error::Error;

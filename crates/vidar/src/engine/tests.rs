@@ -1,15 +1,16 @@
 //! The engine on a wall: a geometry model that is right, and sources that fail.
 
+mod wall;
+
 use super::*;
 use crate::chunks::{MemoryStore, StoredChunk};
 use crate::input::MetricTrajectory;
 use nalgebra::Vector3;
-use vidar_core::model::ChunkFrame;
 use vidar_core::{
-    BodyFrame, CameraModel, ChunkViews, Confidence, FrameImage, GeometryPrediction, Image, ModelError,
-    ModelInfo, Pinhole, RelativeDepth, RigCamera, Se3, Severity, StampedPose, Timestamp, Trajectory,
-    ViewGeometry,
+    BodyFrame, CameraModel, FrameImage, Image, Pinhole, RigCamera, Se3, Severity, StampedPose, Timestamp,
+    Trajectory,
 };
+use wall::Wall;
 
 const FRAMES: u32 = 40;
 
@@ -24,75 +25,6 @@ fn stamp(i: u32) -> FrameStamp {
 
 fn pose(i: u32) -> Se3 {
     Se3::from_translation(Vector3::new(f64::from(i) * 0.06, 0.0, 0.0))
-}
-
-/// A wall 2 m in front of the camera; predictions of the chunks in `failing` fail, and views less than `least_span_m` apart show nothing.
-struct Wall {
-    info: ModelInfo,
-    failing: Vec<u32>,
-    least_span_m: f64,
-}
-
-impl Wall {
-    fn new(failing: &[u32]) -> Self {
-        let info = ModelInfo {
-            name: "wall".into(),
-            licence: "none".into(),
-            weights_sha256: None,
-            needs_poses: true,
-            min_views: 2,
-        };
-        Self { info, failing: failing.to_vec(), least_span_m: 0.0 }
-    }
-}
-
-impl GeometrySource for Wall {
-    fn info(&self) -> &ModelInfo {
-        &self.info
-    }
-
-    fn overlaps(&self) -> bool {
-        false
-    }
-
-    fn predicts_any_views(&self) -> bool {
-        false
-    }
-
-    fn predict(
-        &mut self,
-        views: &ChunkViews,
-        _: &[Option<Image<bool>>],
-        wanted: std::ops::Range<usize>,
-        _: vidar_core::Watch<'_>,
-    ) -> Result<Prediction, ModelError> {
-        if self.failing.contains(&views.id.0) {
-            return Err(ModelError::Other("out of order".into()));
-        }
-        let view = |v: &vidar_core::ChunkView| ViewGeometry {
-            frame_id: v.frame_id,
-            chunk_from_camera: v.world_from_camera.unwrap(),
-            intrinsics: pinhole(),
-            depth: RelativeDepth::new(Image::filled(64, 48, 2.0)),
-            confidence: Confidence::full(64, 48),
-        };
-        let x = |v: &vidar_core::ChunkView| v.world_from_camera.unwrap().translation.x;
-        let spans = |from: f64, to: f64| to - from >= self.least_span_m;
-        let ends = views.views.iter().map(x).fold((f64::MAX, f64::MIN), |(a, b), x| (a.min(x), b.max(x)));
-        let wanted = if spans(ends.0, ends.1) { wanted } else { 0..0 };
-        let views = GeometryPrediction {
-            chunk_id: views.id,
-            frame: ChunkFrame::PriorWorld,
-            views: views.views[wanted].iter().map(view).collect(),
-        };
-        Ok(Prediction {
-            geometry: views,
-            colors: Vec::new(),
-            tokens: Vec::new(),
-            shapes: Vec::new(),
-            warnings: Vec::new(),
-        })
-    }
 }
 
 struct NoPlaces;
