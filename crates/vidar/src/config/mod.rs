@@ -3,16 +3,19 @@
 //! defaults < preset < file < `VIDAR_SECTION__KEY` < `--set section.key=value` < dedicated flags.
 
 mod explain;
+mod geometry;
 mod layers;
+mod link;
 mod presets;
+mod validate;
 
 pub use explain::{Explanation, explain, schema};
+pub use geometry::GeometryConfig;
 pub use layers::{Layered, Origin};
+pub use link::{LinkConfig, RemoteConfig};
 pub use presets::{PRESETS, Preset};
 pub use vidar_align::keyframe_selection::KeyframeConfig;
 
-use crate::error::Error;
-use crate::models::geometry;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -78,41 +81,6 @@ impl Default for InputConfig {
             calibration_scale_std: 0.07,
             map: String::new(),
             masks: String::new(),
-        }
-    }
-}
-
-/// The geometry model, and the number of keyframes per prediction.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
-#[serde(default, deny_unknown_fields)]
-pub struct GeometryConfig {
-    /// The model: `auto` (stereo, completed by the map and planes), `stereo` (needs poses, no weights), a network of
-    /// `vidar model list` (`da3-small`), `custom` (the weights of `model.dir`, which alone mean it), `recorded:DIR`, predictions of
-    /// another program in that folder, or `remote:KEY`, the network of the `vidar worker`s under that key.
-    pub source: String,
-    /// The network that `auto` bends onto measured depth where nothing is measured: one of `vidar model list`, `recorded:DIR`, or
-    /// `none`, which interpolates (as good as `da3-nano`, and it costs nothing). `auto` only; `model.dir` comes first.
-    pub fill_network: String,
-    /// Keyframes that are predicted together, with stereo at least 2. Larger chunks need more memory and are more consistent.
-    pub chunk_keyframes: usize,
-    /// Keyframes that a chunk shares with the one before it, for the overlap constraint between them. Networks and recordings only;
-    /// smaller than the chunk.
-    pub overlap_keyframes: usize,
-    /// Keyframes on each side that are used as context only. Stereo only.
-    pub context_keyframes: usize,
-    /// Largest width of the undistorted images (px); wider images are reduced.
-    pub max_width_px: usize,
-}
-
-impl Default for GeometryConfig {
-    fn default() -> Self {
-        Self {
-            source: geometry::AUTO.into(),
-            fill_network: geometry::NO_NETWORK.into(),
-            chunk_keyframes: 16,
-            overlap_keyframes: 4,
-            context_keyframes: 16,
-            max_width_px: 640,
         }
     }
 }
@@ -317,63 +285,6 @@ impl BudgetConfig {
     }
 }
 
-/// What goes between a run and the workers of `geometry.source = "remote:KEY"`.
-#[derive(Clone, Debug, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
-#[serde(default, deny_unknown_fields)]
-pub struct RemoteConfig {
-    /// The model that the workers must have: one of `vidar model list`. Empty: any that all of them agree on, whose hash and licence are
-    /// recorded. A name that is known must come with its known hash and licence.
-    pub model: String,
-    /// How images travel: `raw`, the worker sees the same bits, or `jpeg` (quality 92), about a tenth of the bytes and another map.
-    #[schemars(with = "String")]
-    pub images: vidar_link::geometry::ImageFormat,
-    /// How depth and confidence travel: `f32`, the bits of the same model on this machine, or `f16`, half the bytes with a relative error of
-    /// at most 5e-4.
-    #[schemars(with = "String")]
-    pub depth: vidar_link::geometry::DepthFormat,
-}
-
-/// How other machines are reached. Nothing here changes a result, and an interrupted run may be resumed with other values.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
-#[serde(default, deny_unknown_fields)]
-pub struct LinkConfig {
-    /// Endpoints to connect to, separated by commas, such as `tls/server:7447`. Empty, with `listen` and `config` empty, too: this computer
-    /// (`tcp/127.0.0.1:7447`).
-    pub connect: String,
-    /// Endpoints to listen at, separated by commas, such as `tcp/0.0.0.0:7447`.
-    pub listen: String,
-    /// A file of Zenoh's settings (JSON5): TLS, certificates, access control.
-    pub config: String,
-    /// Where `vidar live` publishes poses, keyframes, cloud, mesh and health as ROS 2 messages: domain and namespace, such as `0/vidar`. Empty:
-    /// nowhere.
-    pub publish: String,
-    /// After this time (s) without an answer a worker counts as slow and another one is asked. Several times as long as a chunk takes there.
-    pub timeout_secs: f64,
-    /// How long (s) a worker is waited for at the start, and while none answers.
-    pub patience_secs: f64,
-}
-
-impl Default for LinkConfig {
-    fn default() -> Self {
-        let (connect, listen, config, publish) = Default::default();
-        Self { connect, listen, config, publish, timeout_secs: 120.0, patience_secs: 10.0 }
-    }
-}
-
-impl LinkConfig {
-    /// As a session takes it.
-    pub fn options(&self) -> vidar_link::LinkOptions {
-        let list = |text: &str| {
-            text.split(',').map(str::trim).filter(|t| !t.is_empty()).map(str::to_owned).collect()
-        };
-        vidar_link::LinkOptions {
-            listen: list(&self.listen),
-            connect: list(&self.connect),
-            config: (!self.config.is_empty()).then(|| self.config.clone().into()),
-        }
-    }
-}
-
 /// The whole configuration.
 #[derive(Clone, Debug, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
@@ -408,113 +319,6 @@ pub struct Config {
     pub remote: RemoteConfig,
     /// How other machines are reached.
     pub link: LinkConfig,
-}
-
-impl Config {
-    /// Checks every range; the message names the key.
-    pub fn validate(&self) -> Result<(), Error> {
-        let bad = |reason: String| Err(Error::BadValue { reason });
-        let positive = |key: &str, value: f64| match value.is_finite() && value > 0.0 {
-            true => Ok(()),
-            false => bad(format!("{key} must be finite and positive, found {value}")),
-        };
-        if self.coupling.place_recognition == PlaceRecognitionConfig::Salad
-            && self.coupling.salad_checkpoint.is_empty()
-        {
-            return bad("coupling.place_recognition = \"salad\" needs coupling.salad_checkpoint".into());
-        }
-        for (key, value) in [
-            ("input.start_secs", self.input.start_secs),
-            ("input.end_secs", self.input.end_secs),
-            ("output.live_map_wait_secs", self.output.live_map_wait_secs),
-        ] {
-            if !(value.is_finite() && value >= 0.0) {
-                return bad(format!("{key} must be finite and not negative, found {value}"));
-            }
-        }
-        for (key, found) in [
-            ("imu_scale_std", self.input.imu_scale_std),
-            ("calibration_scale_std", self.input.calibration_scale_std),
-        ] {
-            if !(0.0..=1.0).contains(&found) {
-                return bad(format!("input.{key} must be 0 to 1, found {found}"));
-            }
-        }
-        let budget = &self.budget;
-        if !(budget.seconds.is_finite() && budget.seconds >= 0.0) {
-            return bad(format!("budget.seconds must be finite and not negative, found {}", budget.seconds));
-        }
-        if budget.realtime && budget.seconds > 0.0 {
-            return bad("budget.realtime and budget.seconds are two limits: leave one of them out".into());
-        }
-        if !(0.01..=1000.0).contains(&budget.speed) {
-            return bad(format!("budget.speed must be 0.01 to 1000, found {}", budget.speed));
-        }
-        for (key, value) in
-            [("timeout_secs", self.link.timeout_secs), ("patience_secs", self.link.patience_secs)]
-        {
-            if !(0.1..=86_400.0).contains(&value) {
-                return bad(format!("link.{key} must be 0.1 to 86400, found {value}"));
-            }
-        }
-        for (key, value) in
-            [("input.stride", self.input.stride), ("geometry.chunk_keyframes", self.geometry.chunk_keyframes)]
-        {
-            if value == 0 {
-                return bad(format!("{key} must be at least 1"));
-            }
-        }
-        positive("input.max_pose_gap_secs", self.input.max_pose_gap_secs)?;
-        positive("keyframes.min_translation_m", self.keyframes.min_translation_m)?;
-        positive("keyframes.unposed_interval_secs", self.keyframes.unposed_interval_secs)?;
-        positive("keyframes.min_rotation_deg", self.keyframes.min_rotation_deg)?;
-        positive("output.depth_units_per_metre", self.output.depth_units_per_metre)?;
-        let (chunk, overlap) = (self.geometry.chunk_keyframes, self.geometry.overlap_keyframes);
-        let overlaps = !geometry::source(self).is_ok_and(|s| s.is_by_stereo());
-        if !overlaps && chunk < 2 {
-            // A chunk of one keyframe has no pair to estimate depth from but those of its context, and is lost.
-            return bad("geometry.chunk_keyframes must be at least 2 with stereo, found 1".into());
-        }
-        if overlaps && overlap >= chunk {
-            return bad(format!(
-                "geometry.overlap_keyframes must be smaller than geometry.chunk_keyframes ({chunk}), found {overlap}"
-            ));
-        }
-        if !(32..=8192).contains(&self.geometry.max_width_px) {
-            return bad(format!(
-                "geometry.max_width_px must be 32 to 8192, found {}",
-                self.geometry.max_width_px
-            ));
-        }
-        if !self.model.dir.is_empty() && ![geometry::AUTO, geometry::CUSTOM].contains(&&*self.geometry.source)
-        {
-            let (dir, source) = (&self.model.dir, &self.geometry.source);
-            return bad(format!(
-                "model.dir names weights ({dir:?}), but geometry.source is {source:?}: leave one of them out"
-            ));
-        }
-        if geometry::chosen(self).is_err() {
-            let known = crate::models::names();
-            let (source, network) = (&self.geometry.source, &self.geometry.fill_network);
-            if source == geometry::AUTO {
-                return bad(format!(
-                    "geometry.fill_network must be \"none\", \"recorded:DIR\" or one of {known}, found {network:?}"
-                ));
-            }
-            let found = source;
-            return bad(format!(
-                "geometry.source must be \"auto\", \"stereo\", \"recorded:DIR\", \"remote:KEY\", \"custom\" with model.dir, or one of {known}, found {found:?}"
-            ));
-        }
-        let stage = |result: Result<(), String>| result.map_err(|reason| Error::BadValue { reason });
-        stage(self.model.network.validate().map_err(|e| e.to_string()))?;
-        stage(self.odometry.validate().map_err(|e| e.to_string()))?;
-        stage(self.stereo.validate().map_err(|e| e.to_string()))?;
-        stage(self.align.validate().map_err(|e| e.to_string()))?;
-        stage(self.fusion.validate().map_err(|e| e.to_string()))?;
-        stage(self.eval.trajectory.validate().map_err(|e| e.to_string()))?;
-        stage(self.eval.surface.validate().map_err(|e| e.to_string()))
-    }
 }
 
 #[cfg(test)]

@@ -1,4 +1,5 @@
 use super::*;
+use crate::error::Error;
 
 fn defaults() -> Layered {
     Layered::defaults().unwrap()

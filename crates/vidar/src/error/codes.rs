@@ -1,4 +1,6 @@
-//! What each error code means, as `vidar explain` tells it.
+//! The codes of errors, and what each means, as `vidar explain` tells it.
+
+use super::{Error, is_full, link};
 
 /// Every error code with what it means, for `vidar explain` and the reference page.
 pub const CODES: &[(&str, &str)] = &[
@@ -100,3 +102,71 @@ pub const CODES: &[(&str, &str)] = &[
     ("E7001", "A bug in VIDAR. Please report it; finished files are on disk."),
     ("E1301", "Interrupted by Ctrl-C or a signal. Files that were being written are finished or removed."),
 ];
+
+impl Error {
+    /// Stable code for scripts and for `vidar explain CODE`.
+    pub fn code(&self) -> &'static str {
+        match self {
+            Self::UnknownKey { .. } => "E0101",
+            Self::BadValue { .. } => "E0102",
+            Self::ConfigFile { .. } => "E0103",
+            Self::UnknownPreset { .. } => "E0104",
+            Self::Usage { .. } => "E0105",
+            Self::OutputExists { .. } => "E0106",
+            Self::OtherRun { .. } => "E0107",
+            Self::Recording(vidar_dataset::DatasetError::BadOption { .. }) => "E0105",
+            Self::Recording(_) => "E0201",
+            Self::NoMetricTrajectory { .. } => "E0202",
+            Self::NoOverlap { .. } => "E0203",
+            Self::TooFewKeyframes { .. } => "E0204",
+            Self::Camera(_) => "E0205",
+            Self::Trajectory(_) => "E0206",
+            Self::NotARun { .. } => "E0207",
+            Self::NoCalibration { .. } | Self::ImagesAlone { .. } | Self::NotCalibrated { .. } => "E0208",
+            Self::NoOdometry { .. } => "E0209",
+            Self::NotARecording { .. } => "E0210",
+            Self::NotAMap { .. } => "E0211",
+            Self::NotABatch { .. } => "E0212",
+            Self::Store(vidar_store::StoreError::BadAddress { .. }) => "E0105",
+            Self::Store(_) if self.file_system().is_some_and(is_full) => "E0402",
+            Self::Store(_) => "E0406",
+            Self::TaskTooEarly { .. } => "E0407",
+            Self::Geometry(vidar_core::ModelError::OutOfReach(_)) => "E0409",
+            Self::Link(error) => link::code(error),
+            Self::Geometry(_) | Self::Stereo(_) => "E0301",
+            Self::Hub(error) | Self::WeightsMissing(error) => hub_code(error),
+            Self::Da3(vidar_da3::Da3Error::Cancelled) => "E1301",
+            Self::Da3(error) if error.device_advice().is_some() => "E0311",
+            Self::Da3(_) => "E0309",
+            Self::Odometry(_) => "E0310",
+            Self::Align(_) => "E0302",
+            Self::Fusion(_) => "E0303",
+            Self::Eval(_) => "E0304",
+            Self::Empty { .. } | Self::Untrained { .. } => "E0305",
+            Self::Export(_) | Self::View(_) | Self::Synth(_) | Self::Io { .. } => match self.file_system() {
+                Some(source) if is_full(source) => "E0402",
+                Some(_) => "E0401",
+                None if matches!(self, Self::Export(_)) => "E0306",
+                None if matches!(self, Self::View(_)) => "E0307",
+                None => "E0308",
+            },
+            Self::Threshold(_) => "E0501",
+            Self::Interrupted { .. } => "E1301",
+        }
+    }
+}
+
+/// The code of a checkpoint error.
+fn hub_code(error: &vidar_hub::HubError) -> &'static str {
+    use vidar_hub::HubError as H;
+    match error {
+        H::UnknownModel { .. } | H::WrongLicence { .. } | H::BadSetting { .. } => "E0105",
+        H::LicenceNotAccepted { .. } => "E0404",
+        H::WrongSize { .. } | H::WrongHash { .. } | H::BadRecord { .. } | H::NotACheckpoint { .. } => "E0405",
+        H::Io { source, .. } if is_full(source) => "E0402",
+        H::Io { .. } => "E0401",
+        H::NoSpace { .. } => "E0402",
+        H::Cancelled => "E1301",
+        _ => "E0403",
+    }
+}
