@@ -1,5 +1,8 @@
 //! The command line, as plain values. Validation and building happen in the commands.
 
+pub use crate::bench_args::{BenchArgs, BenchDataset};
+pub use crate::synth_args::{SynthArgs, WorldArgs};
+
 use crate::batch_args::{PlanArgs, WorkArgs};
 use crate::compare_args::CompareArgs;
 use crate::link_args::{ReceiveArgs, WorkerArgs};
@@ -181,26 +184,6 @@ const RUN_EXAMPLES: &str = "Examples:
   vidar run frames/ --timestamps times.txt --camera-model pinhole:525,525,319.5,239.5 --trajectory vio.tum
   vidar run my_recording/ --dry-run";
 
-/// The synthetic world.
-#[derive(Args, Clone, Debug, Default)]
-pub struct WorldArgs {
-    /// Seed of all random numbers.
-    #[arg(long, help_heading = "World")]
-    pub seed: Option<u64>,
-    /// room, hall or corridor.
-    #[arg(long, help_heading = "World")]
-    pub scene: Option<String>,
-    /// sweep, orbit, aggressive, handheld or handheld-lively.
-    #[arg(long, help_heading = "World")]
-    pub flight: Option<String>,
-    /// Length, seconds.
-    #[arg(long, help_heading = "World")]
-    pub duration: Option<f64>,
-    /// Stand still for this many seconds first; default: moving from the first frame.
-    #[arg(long, help_heading = "World")]
-    pub static_start: Option<f64>,
-}
-
 /// `vidar demo`.
 #[derive(Args, Clone, Debug)]
 pub struct DemoArgs {
@@ -356,109 +339,6 @@ pub struct ViewArgs {
     /// Port on this computer; 0 takes any that is free.
     #[arg(long, default_value_t = 8765)]
     pub port: u16,
-}
-
-/// `vidar synth`.
-#[derive(Args, Clone, Debug)]
-pub struct SynthArgs {
-    /// Folder of the sequence; must not exist.
-    #[arg(value_hint = ValueHint::DirPath)]
-    pub out: PathBuf,
-    /// The synthetic world.
-    #[command(flatten)]
-    pub world: WorldArgs,
-    /// Fly along this trajectory (TUM or EuRoC csv) instead of a built-in flight.
-    #[arg(long, value_hint = ValueHint::FilePath)]
-    pub trajectory: Option<PathBuf>,
-    /// Image size and rates of EuRoC: 752x480 at 20 Hz, static start, 60 s.
-    #[arg(long, conflicts_with_all = ["preset", "world_config"])]
-    pub euroc: bool,
-    /// Settings to start from: demo, euroc, phone-slow, phone-fast, realsense, or tumvi (with --trajectory).
-    #[arg(long, value_name = "NAME", conflicts_with = "world_config")]
-    pub preset: Option<String>,
-    /// TOML file with every setting of the world.
-    #[arg(long, value_hint = ValueHint::FilePath)]
-    pub world_config: Option<PathBuf>,
-    /// Image size, such as 1280x720; a lens given in pixels is scaled with the width.
-    #[arg(long, value_name = "WxH", help_heading = "Recording")]
-    pub size: Option<String>,
-    /// Frames per second.
-    #[arg(long, value_name = "HZ", help_heading = "Recording")]
-    pub frame_rate: Option<f64>,
-    /// IMU samples per second.
-    #[arg(long, value_name = "HZ", help_heading = "Recording")]
-    pub imu_rate: Option<f64>,
-    /// Rolling shutter: milliseconds from the first row to the last.
-    #[arg(long, value_name = "MS", help_heading = "Recording")]
-    pub readout_ms: Option<f64>,
-    /// Milliseconds by which image stamps are late (negative: early).
-    #[arg(long, value_name = "MS", allow_negative_numbers = true, help_heading = "Recording")]
-    pub stamp_delay_ms: Option<f64>,
-    /// Calibration files that are written: given, partial (focal length only) or absent.
-    #[arg(long, value_name = "WHICH", help_heading = "Recording")]
-    pub calibration: Option<String>,
-    /// Share of the surface without texture, 0 to 1.
-    #[arg(long, value_name = "SHARE", help_heading = "Recording")]
-    pub bare_share: Option<f64>,
-}
-
-/// `vidar bench`.
-#[derive(Args, Clone, Debug)]
-pub struct BenchArgs {
-    /// Which dataset.
-    #[arg(value_enum)]
-    pub dataset: BenchDataset,
-    /// Folder of the unpacked dataset. With --synthetic only its ground truth is used, as flight path.
-    #[arg(value_hint = ValueHint::DirPath)]
-    pub root: Option<PathBuf>,
-    /// Render the sequences (EuRoC's camera and IMU) instead of reading images.
-    #[arg(long, help_heading = "World")]
-    pub synthetic: bool,
-    /// TOML file with every setting of the rendered worlds.
-    #[arg(long, value_hint = ValueHint::FilePath, requires = "synthetic", help_heading = "World")]
-    pub world_config: Option<PathBuf>,
-    /// Sequences to run, as prefixes of their names separated by commas; default: all.
-    #[arg(long, value_delimiter = ',', help_heading = "Input")]
-    pub sequences: Vec<String>,
-    /// Couplings to compare, separated by commas; default: those of the paper's tables that the geometry source supports, and coupled.
-    #[arg(long, value_delimiter = ',', help_heading = "Model")]
-    pub modes: Vec<String>,
-    /// Source of depth: as for `vidar run`, or simulated (with --synthetic: a network's errors on true depth).
-    #[arg(long, visible_alias = "model", value_name = "NAME", help_heading = "Model")]
-    pub geometry: Option<String>,
-    /// Folder with model.safetensors and config.json, for custom weights.
-    #[arg(long, value_hint = ValueHint::AnyPath, help_heading = "Model")]
-    pub model_dir: Option<PathBuf>,
-    /// Omit the rows of the odometry in Table I.
-    #[arg(long, help_heading = "Output")]
-    pub no_trajectories: bool,
-    /// Instead of the paper's tables, each coupling with and without landmarks, stereo points and loops on the same
-    /// keyframes and predictions; takes no --modes.
-    #[arg(long, requires = "synthetic", conflicts_with = "modes", help_heading = "Model")]
-    pub ablation: bool,
-    /// Seeds of rooms, noise and simulated networks over which --ablation takes median and spread.
-    #[arg(long, default_value_t = 3, value_parser = clap::value_parser!(u64).range(1..=100), help_heading = "World")]
-    pub seeds: u64,
-    /// How settings are given.
-    #[command(flatten)]
-    pub config: ConfigArgs,
-    /// Folder of runs and tables; an existing one is continued.
-    #[arg(short, long, value_hint = ValueHint::DirPath, default_value = "bench", help_heading = "Output")]
-    pub output: PathBuf,
-}
-
-/// A dataset that `vidar bench` supports.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
-pub enum BenchDataset {
-    /// EuRoC MAV: a folder with mav0/ per sequence.
-    Euroc,
-    /// TUM RGB-D: rgbd_dataset_*/.
-    Tum,
-    /// TUM-VI: dataset-*_512_16/ with mav0/.
-    TumVi,
-    /// 7-Scenes: a folder per scene with seq-01/ ….
-    #[value(name = "7scenes")]
-    SevenScenes,
 }
 
 /// `vidar config`.

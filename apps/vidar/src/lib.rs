@@ -4,6 +4,7 @@
 
 pub mod args;
 pub mod batch_args;
+mod bench_args;
 mod build;
 mod commands;
 pub mod compare_args;
@@ -16,6 +17,7 @@ pub mod reference;
 pub mod run_args;
 pub mod shared_args;
 mod spool;
+mod synth_args;
 
 use args::{Cli, Command, ConfigCommand};
 use clap::Parser;
