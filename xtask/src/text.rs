@@ -3,9 +3,8 @@
 use anyhow::{Context, Result};
 use std::path::{Path, PathBuf};
 
-/// A file above this fails (CODE_STYLE.md); above [`WARN_LINES`] it is reported.
-const MAX_LINES: usize = 800;
-const WARN_LINES: usize = 600;
+/// A file above this fails (CODE_STYLE.md).
+const MAX_LINES: usize = 400;
 
 /// Words that hide a transform's direction, and the crates at the file-format border that may use them.
 const BANNED: &[&str] = &["extrinsic", "c2w", "w2c", "t_cw", "t_wc", "cam_to_world", "world_to_cam"];
@@ -38,8 +37,6 @@ pub fn check_size(root: &Path) -> Result<Vec<String>> {
         let lines = std::fs::read_to_string(&path)?.lines().count();
         if lines > MAX_LINES {
             problems.push(format!("{}: {lines} lines, the limit is {MAX_LINES}", path.display()));
-        } else if lines > WARN_LINES {
-            super::say(&format!("  note: {} has {lines} lines", path.display()));
         }
     }
     Ok(problems)
