@@ -30,6 +30,7 @@ pub fn skipped(why: &dyn Display) {
 }
 
 /// Results of `work` on one thread, with each instruction set that this processor has, the portable one first.
+#[allow(clippy::expect_used, reason = "a helper of tests fails as a test does")]
 pub fn with_each_instruction_set<R: Send>(work: impl Fn() -> R + Sync) -> Vec<(Instructions, R)> {
     let pool = rayon::ThreadPoolBuilder::new().num_threads(1).build().expect("a pool of one thread");
     let mut results = Vec::new();
@@ -47,6 +48,7 @@ pub fn with_each_instruction_set<R: Send>(work: impl Fn() -> R + Sync) -> Vec<(I
 ///
 /// # Panics
 /// If it does.
+#[allow(clippy::expect_used, reason = "a helper of tests fails as a test does")]
 pub fn same_with_each_instruction_set<R: Send + PartialEq>(work: impl Fn() -> R + Sync) -> R {
     let mut results = with_each_instruction_set(work).into_iter();
     let (_, portable) = results.next().expect("the portable one is always there");

@@ -36,10 +36,16 @@ impl SurfaceFusion {
         self.volume.extract_mesh()
     }
 
-    /// The surface, and what fusion reports.
+    /// The surface, and what fusion reports. One form after the other: the sums of what is done are given up before the next is made.
     pub fn finish(self) -> (Surface, Vec<Warning>) {
-        let mesh = self.volume.extract_mesh();
-        let voxel_m = self.volume.config().voxel_size_m;
+        let Self { volume, points } = self;
+        let mut warnings = volume.warnings();
+        warnings.extend(points.warnings());
+        let cloud = points.finish();
+        let mesh = volume.extract_mesh();
+        let coverage = volume.coverage(&mesh);
+        let (voxel_m, volume_bytes) = (volume.config().voxel_size_m, volume.peak_memory_bytes());
+        drop(volume);
         // About two voxels: nearer ones are the roughness of one surface.
         let walls = DoubleWallDetector {
             min_distance_m: 2.0 * voxel_m,
@@ -47,15 +53,6 @@ impl SurfaceFusion {
             radius_m: voxel_m,
             ..DoubleWallDetector::default()
         };
-        let mut warnings = self.volume.warnings();
-        warnings.extend(self.points.warnings());
-        let surface = Surface {
-            coverage: self.volume.coverage(&mesh),
-            double_walls: walls.of_mesh(&mesh).ok(),
-            volume_bytes: self.volume.peak_memory_bytes(),
-            cloud: self.points.finish(),
-            mesh,
-        };
-        (surface, warnings)
+        (Surface { coverage, double_walls: walls.of_mesh(&mesh).ok(), volume_bytes, cloud, mesh }, warnings)
     }
 }
