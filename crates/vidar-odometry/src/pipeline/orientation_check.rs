@@ -20,8 +20,9 @@ const MIN_RATE: f64 = 0.12;
 /// Share of the images' rotation that the given orientation leaves unexplained, from which it is doubted ...
 const MAX_UNEXPLAINED_SHARE: f64 = 0.7;
 /// ... provided that the best orientation leaves less than this share of that. Where gyroscope and wrong orientation predict the features, those in slow
-/// images are followed best, and the rates seen are too small: an inverted EuRoC camera had 0.53 to 0.62 in eight draws of image noise, phones without
-/// calibration 0.005 to 0.13. Of 42 recordings with a true orientation none comes as far as this.
+/// images are followed best, and the rates seen are too small: an inverted EuRoC camera had 0.53 to 0.62 in eight draws of image noise, seven phones
+/// without calibration 0.005 to 0.13, an eighth, off by 52 degrees, 0.99. Of 33 recordings with a true orientation none comes as far as this: the images
+/// of each show enough of the rotation before.
 const BETTER_SHARE: f64 = 0.75;
 /// Least ratio of the second to the first singular value of the rates' cross-covariance: turning about one axis leaves the orientation about it
 /// free, and the best one is that of the translation. A camera moved to and fro with yaw alone had 0.01 to 0.1 and was off by 128 degrees by it.
