@@ -30,6 +30,17 @@ pub enum ExitStatus {
     Interrupted = 130,
 }
 
+impl ExitStatus {
+    /// Of a run that came to its end, or to an interruption with what was finished.
+    pub(crate) fn of_run(is_interrupted: bool, is_degraded: bool) -> Self {
+        match (is_interrupted, is_degraded) {
+            (true, _) => Self::Interrupted,
+            (false, true) => Self::Degraded,
+            (false, false) => Self::Done,
+        }
+    }
+}
+
 /// Why a run stopped.
 #[derive(Debug, Error)]
 #[non_exhaustive]

@@ -155,11 +155,7 @@ pub fn odometry(
     }
     // A log that could not be written is told by the recorder alone.
     outcome.warnings = recorder.warnings();
-    outcome.status = match (cancel.is_cancelled(), recorder.is_degraded()) {
-        (true, _) => ExitStatus::Interrupted,
-        (false, true) => ExitStatus::Degraded,
-        (false, false) => ExitStatus::Done,
-    };
+    outcome.status = ExitStatus::of_run(cancel.is_cancelled(), recorder.is_degraded());
     folder.write_manifest(&manifest(started_manifest, &outcome, artifacts))?;
     events.emit(&Event::Finished { exit: outcome.status as i32, seconds: outcome.seconds });
     Ok(outcome)

@@ -30,6 +30,26 @@ pub enum PoseReport {
     },
 }
 
+impl PoseReport {
+    /// Of an image whose segment and `world_from_camera`, where it has them, are known before and stay.
+    pub fn settled(
+        stamp: &FrameStamp,
+        pose: Option<(u32, Se3)>,
+        keyframe: Option<Box<OdometryKeyframe>>,
+    ) -> Self {
+        let FrameStamp { frame_id, time, .. } = *stamp;
+        match pose {
+            Some((segment, world_from_camera)) => Self::Posed {
+                state: FrameState { frame_id, time, segment, world_from_camera },
+                keyframe,
+                revised: Vec::new(),
+                joined: None,
+            },
+            None => Self::NotPosed { time },
+        }
+    }
+}
+
 /// Where the poses of images come from.
 pub trait PoseSource {
     /// What it is.
@@ -95,16 +115,7 @@ impl PoseSource for GivenPoses {
     }
 
     fn push_stamp(&mut self, stamp: &FrameStamp) -> Vec<PoseReport> {
-        let FrameStamp { frame_id, time, .. } = *stamp;
-        vec![match self.pose_at(time) {
-            Some(world_from_camera) => PoseReport::Posed {
-                state: FrameState { frame_id, time, segment: 0, world_from_camera },
-                keyframe: None,
-                revised: Vec::new(),
-                joined: None,
-            },
-            None => PoseReport::NotPosed { time },
-        }]
+        vec![PoseReport::settled(stamp, self.pose_at(stamp.time).map(|pose| (0, pose)), None)]
     }
 
     fn finish(&mut self) -> Vec<PoseReport> {

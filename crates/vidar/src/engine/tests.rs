@@ -68,16 +68,8 @@ impl PoseSource for Scripted {
     }
 
     fn push_stamp(&mut self, stamp: &FrameStamp) -> Vec<PoseReport> {
-        let FrameStamp { frame_id, time, .. } = *stamp;
-        vec![match (self.0)(frame_id.0) {
-            Some(segment) => PoseReport::Posed {
-                state: FrameState { frame_id, time, segment, world_from_camera: pose(frame_id.0) },
-                keyframe: None,
-                revised: Vec::new(),
-                joined: None,
-            },
-            None => PoseReport::NotPosed { time },
-        }]
+        let at = stamp.frame_id.0;
+        vec![PoseReport::settled(stamp, (self.0)(at).map(|segment| (segment, pose(at))), None)]
     }
 
     fn finish(&mut self) -> Vec<PoseReport> {

@@ -221,10 +221,8 @@ mod tests {
     }
 
     fn posed(i: u32, segment: u32) -> PoseReport {
-        let FrameStamp { frame_id, time, .. } = stamp(i);
         let world_from_camera = Se3::from_translation(Vector3::new(f64::from(i), 0.0, 0.0));
-        let state = FrameState { frame_id, time, segment, world_from_camera };
-        PoseReport::Posed { state, keyframe: None, revised: Vec::new(), joined: None }
+        PoseReport::settled(&stamp(i), Some((segment, world_from_camera)), None)
     }
 
     #[test]

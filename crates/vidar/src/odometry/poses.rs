@@ -1,7 +1,7 @@
 //! What the odometry made of a whole recording, as poses for the engine.
 
 use super::{NEVER_STARTED, Tracked};
-use crate::engine::{FrameStamp, FrameState, PoseReport, PoseSource};
+use crate::engine::{FrameStamp, PoseReport, PoseSource};
 use crate::error::Error;
 use crate::input::TrajectorySource;
 use crate::quality::TrackQuality;
@@ -78,21 +78,9 @@ impl PoseSource for TrackedPoses {
     }
 
     fn push_stamp(&mut self, stamp: &FrameStamp) -> Vec<PoseReport> {
-        let FrameStamp { frame_id, time, .. } = *stamp;
-        vec![match self.poses.get(&frame_id) {
-            Some((segment, world_from_camera)) => PoseReport::Posed {
-                state: FrameState {
-                    frame_id,
-                    time,
-                    segment: *segment,
-                    world_from_camera: *world_from_camera,
-                },
-                keyframe: self.keyframes.remove(&frame_id).map(Box::new),
-                revised: Vec::new(),
-                joined: None,
-            },
-            None => PoseReport::NotPosed { time },
-        }]
+        let pose = self.poses.get(&stamp.frame_id).copied();
+        let keyframe = pose.and_then(|_| self.keyframes.remove(&stamp.frame_id)).map(Box::new);
+        vec![PoseReport::settled(stamp, pose, keyframe)]
     }
 
     fn finish(&mut self) -> Vec<PoseReport> {

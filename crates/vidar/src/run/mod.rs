@@ -293,11 +293,7 @@ impl Context<'_> {
         let scale = trust::stated_scale(&map, plan.mode, UnseenScale::of(dataset, config));
         trust::warnings(&map, &evaluation, &scale).iter().for_each(|w| events.warn(w));
         let is_degraded = recorder.is_degraded() || map.surface.mesh.triangles.is_empty();
-        let status = match (cancel.is_cancelled(), is_degraded) {
-            (true, _) => ExitStatus::Interrupted,
-            (false, true) => ExitStatus::Degraded,
-            (false, false) => ExitStatus::Done,
-        };
+        let status = ExitStatus::of_run(cancel.is_cancelled(), is_degraded);
         let (root, warnings) = (folder.path().to_owned(), recorder.warnings());
         let verdict = trust::verdict(&map, &evaluation, &scale, &warnings, status);
         let outcome = RunOutcome {
