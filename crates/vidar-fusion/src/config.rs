@@ -38,7 +38,7 @@ impl Default for FusionConfig {
             voxel_size_m: 0.02,
             truncation_voxels: 4.0,
             max_depth_m: 6.0,
-            min_confidence: 0.3,
+            min_confidence: 0.2,
             max_incidence_deg: 80.0,
             carve_range_m: 4.0,
             min_observations: 2,

@@ -129,16 +129,16 @@ fn keep_confident(
 const FEATURES: usize = 7;
 
 /// Weights of the features, in their order.
-const WEIGHTS: [f32; FEATURES] = [-0.393, 1.956, 1.986, 0.298, -0.625, 0.152, -0.131];
+const WEIGHTS: [f32; FEATURES] = [-0.055, 2.972, 1.244, 0.376, -0.831, 0.203, -0.193];
 
 /// Residual at which the remaining pose error is about as large as the correction, working pixels. The noise of the
-/// matches is 0.15 to 0.25; a larger residual is not explained by any poses.
+/// matches is 0.1 to 0.2; a larger residual is not explained by any poses.
 const HALF_RESIDUAL_PX: f32 = 0.5;
 /// Standard deviation of the remaining shift, per pixel of pose error.
-const SHIFT_PER_POSE_ERROR: f32 = 1.450;
+const SHIFT_PER_POSE_ERROR: f32 = 1.970;
 /// Standard deviation of the remaining relative error of depth in tolerances, per pixel of pose error: an error of scale,
 /// which does not depend on the baseline.
-const SCALE_PER_POSE_ERROR: f32 = 0.260;
+const SCALE_PER_POSE_ERROR: f32 = 0.545;
 
 /// Weighted sum of a pixel's features: constant, share of agreeing views, agreeing views (saturating), log of the margin,
 /// matching cost, log of how much the cost grows when the depth changes by the tolerance, log of the depth resolution.

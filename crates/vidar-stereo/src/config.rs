@@ -56,7 +56,7 @@ impl Default for StereoConfig {
             pose_std_m: 0.01,
             noise_gray: 1.0,
             agreement_ratio: 0.02,
-            min_confidence: 0.3,
+            min_confidence: 0.2,
         }
     }
 }

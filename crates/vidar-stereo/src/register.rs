@@ -2,7 +2,7 @@
 //!
 //! Errors of odometry, of a depth camera's tracker or of a clock displace projections by several pixels, and stereo then
 //! finds a wrong depth or none. Corners of every view, at the depth of the probe, are therefore matched around their
-//! projections in other views, and a small bundle adjustment (Triggs 2000) corrects the poses: unknown are a correction
+//! projections in other views, as these see the window around them and only where no other place looks like it, and a small bundle adjustment (Triggs 2000) corrects the poses: unknown are a correction
 //! per view and an inverse depth per corner, the given poses are priors with the standard deviations of the settings,
 //! and outliers are down-weighted (Cauchy). Inverse depths are eliminated (a scalar each), which leaves a dense system of
 //! six unknowns per view.
@@ -15,7 +15,7 @@ use crate::estimate::{PROBE_LEVEL, Probe};
 use crate::prepare::{Level, PoseCorrection, Prepared};
 use crate::select::select;
 use crate::warp::{Warp, neighbour_from_reference};
-use nalgebra::{Vector2, Vector3};
+use nalgebra::{Matrix2, Vector2, Vector3};
 use rayon::prelude::*;
 use tracing::trace_span;
 use vidar_core::Se3;
@@ -24,6 +24,8 @@ use vidar_core::Se3;
 const SEARCHED_VIEWS: usize = 5;
 /// Least standard deviation of a template in multiples of the noise: weaker ones match anything.
 const MIN_TEXTURE: f32 = 4.0;
+/// A window that is seen at less than this share of its area, or more than its inverse, is not matched.
+const MIN_AREA_RATIO: f32 = 0.1;
 
 /// A corner of one view and its observations in others.
 #[derive(Clone, Debug)]
@@ -105,7 +107,8 @@ fn tracks_of(views: &[Prepared], host: usize, probe: Option<&Probe>, config: &St
         for (warp, &n) in warps.iter().zip(&searched) {
             let Some((u, v, _)) = warp.project(x as f32, y as f32, rho) else { continue };
             let other = &views[n].levels[0];
-            if let Some(pixel) = template.search(other, u, v)
+            let Some(seen) = seen_by(own, warp, (x, y), rho) else { continue };
+            if let Some(pixel) = seen.search(other, u, v)
                 && !touches_mask(other, pixel.x as usize, pixel.y as usize)
             {
                 observations.push((n, pixel));
@@ -117,6 +120,20 @@ fn tracks_of(views: &[Prepared], host: usize, probe: Option<&Probe>, config: &St
         }
     }
     tracks
+}
+
+/// The window around a corner as a neighbour sees it, on a plane across the corner's ray at inverse depth `rho`: turned and scaled windows
+/// match where upright ones are off by a fraction of a pixel, all to the same side. `None` where the neighbour sees it at less than a
+/// third of the size or more than three times of it.
+fn seen_by(own: &Level, warp: &Warp, (x, y): (usize, usize), rho: f32) -> Option<search::Template> {
+    let at = |x, y| warp.project(x as f32, y as f32, rho).map(|(u, v, _)| Vector2::new(u, v));
+    let corner = at(x, y)?;
+    let other_from_own = Matrix2::from_columns(&[at(x + 1, y)? - corner, at(x, y + 1)? - corner]);
+    let area = other_from_own.determinant();
+    if !(MIN_AREA_RATIO..=1.0 / MIN_AREA_RATIO).contains(&area) {
+        return None;
+    }
+    search::Template::warped(own, x, y, &other_from_own.try_inverse()?)
 }
 
 /// Whether a template around the pixel may hold a part of what must not be used: at its corners or its middle, which a person covers
