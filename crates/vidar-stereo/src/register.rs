@@ -2,10 +2,10 @@
 //!
 //! Errors of odometry, of a depth camera's tracker or of a clock displace projections by several pixels, and stereo then
 //! finds a wrong depth or none. Corners of every view, at the depth of the probe, are therefore matched around their
-//! projections in other views, as these see the window around them and only where no other place looks like it, and a small bundle adjustment (Triggs 2000) corrects the poses: unknown are a correction
-//! per view and an inverse depth per corner, the given poses are priors with the standard deviations of the settings,
-//! and outliers are down-weighted (Cauchy). Inverse depths are eliminated (a scalar each), which leaves a dense system of
-//! six unknowns per view.
+//! projections in other views, as these see the window around them and only where no other place looks like it. A small
+//! bundle adjustment (Triggs 2000) corrects the poses: unknown are a correction per view and an inverse depth per corner,
+//! the given poses are priors with the standard deviations of the settings, and outliers are down-weighted (Cauchy).
+//! Inverse depths are eliminated (a scalar each), which leaves a dense system of six unknowns per view.
 
 mod search;
 mod solve;
@@ -105,10 +105,9 @@ fn tracks_of(views: &[Prepared], host: usize, probe: Option<&Probe>, config: &St
         }
         let mut observations = Vec::new();
         for (warp, &n) in warps.iter().zip(&searched) {
-            let Some((u, v, _)) = warp.project(x as f32, y as f32, rho) else { continue };
+            let Some((seen, at)) = seen_by(own, warp, (x, y), rho) else { continue };
             let other = &views[n].levels[0];
-            let Some(seen) = seen_by(own, warp, (x, y), rho) else { continue };
-            if let Some(pixel) = seen.search(other, u, v)
+            if let Some(pixel) = seen.search(other, at.x, at.y)
                 && !touches_mask(other, pixel.x as usize, pixel.y as usize)
             {
                 observations.push((n, pixel));
@@ -122,10 +121,15 @@ fn tracks_of(views: &[Prepared], host: usize, probe: Option<&Probe>, config: &St
     tracks
 }
 
-/// The window around a corner as a neighbour sees it, on a plane across the corner's ray at inverse depth `rho`: turned and scaled windows
-/// match where upright ones are off by a fraction of a pixel, all to the same side. `None` where the neighbour sees it at less than a
-/// third of the size or more than three times of it.
-fn seen_by(own: &Level, warp: &Warp, (x, y): (usize, usize), rho: f32) -> Option<search::Template> {
+/// The window around a corner as a neighbour sees it, on a plane across the corner's ray at inverse depth `rho`, and the neighbour's
+/// pixel of the corner: turned and scaled windows match where upright ones are off by a fraction of a pixel, all to the same side. `None`
+/// where the neighbour sees it at less than a third of the size or more than three times of it.
+fn seen_by(
+    own: &Level,
+    warp: &Warp,
+    (x, y): (usize, usize),
+    rho: f32,
+) -> Option<(search::Template, Vector2<f32>)> {
     let at = |x, y| warp.project(x as f32, y as f32, rho).map(|(u, v, _)| Vector2::new(u, v));
     let corner = at(x, y)?;
     let other_from_own = Matrix2::from_columns(&[at(x + 1, y)? - corner, at(x, y + 1)? - corner]);
@@ -133,7 +137,8 @@ fn seen_by(own: &Level, warp: &Warp, (x, y): (usize, usize), rho: f32) -> Option
     if !(MIN_AREA_RATIO..=1.0 / MIN_AREA_RATIO).contains(&area) {
         return None;
     }
-    search::Template::warped(own, x, y, &other_from_own.try_inverse()?)
+    let template = search::Template::warped(own, x, y, &other_from_own.try_inverse()?)?;
+    Some((template, corner))
 }
 
 /// Whether a template around the pixel may hold a part of what must not be used: at its corners or its middle, which a person covers

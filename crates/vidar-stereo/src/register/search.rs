@@ -137,7 +137,8 @@ impl Template {
         Some(Self::centred(gray))
     }
 
-    /// The window as another view sees it, whose pixels lie at `own_from_other` in this one; `None` beyond the border.
+    /// The window as another view sees it, whose pixels lie at `own_from_other` in this one; `None` beyond the border, and where it reaches
+    /// what must not be used.
     pub fn warped(level: &Level, x: usize, y: usize, own_from_other: &Matrix2<f32>) -> Option<Self> {
         let reach = TEMPLATE as f32;
         let (x, y) = (x as f32, y as f32);
@@ -153,7 +154,11 @@ impl Template {
         for (j, row) in gray.iter_mut().enumerate() {
             for (i, target) in row.iter_mut().enumerate() {
                 let offset = own_from_other * Vector2::new(i as f32 - reach, j as f32 - reach);
-                *target = bilinear(level, x + offset.x, y + offset.y);
+                let (u, v) = (x + offset.x, y + offset.y);
+                if !level.hidden.is_empty() && level.hidden[v as usize * level.width + u as usize] {
+                    return None;
+                }
+                *target = bilinear(level, u, v);
             }
         }
         Some(Self::centred(gray))
@@ -347,5 +352,14 @@ mod tests {
             assert!(seen.is_none(), "({x}, {y})");
         }
         assert!(Template::warped(&own, 48, 48, &Matrix2::repeat(f32::NAN)).is_none());
+    }
+
+    #[test]
+    fn a_window_that_reaches_a_mask_has_no_template() {
+        let mut own = level(blobs);
+        // Eight pixels to the right of the corner: a window of the own size ends before it, one of twice the size reaches it.
+        own.hidden = (0..SIZE * SIZE).map(|i| i % SIZE == 56).collect();
+        assert!(Template::warped(&own, 48, 48, &Matrix2::identity()).is_some());
+        assert!(Template::warped(&own, 48, 48, &(Matrix2::identity() * 2.0)).is_none());
     }
 }
