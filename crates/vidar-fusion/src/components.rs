@@ -11,11 +11,11 @@ pub(crate) fn remove_small_components(mesh: TriangleMesh, min_triangles: usize) 
             components.union(t[0], t[1]);
             components.union(t[1], t[2]);
         }
-        let mut sizes = vec![0usize; mesh.positions.len()];
+        let mut sizes = vec![0u32; mesh.positions.len()];
         for t in &triangles {
             sizes[components.find(t[0]) as usize] += 1;
         }
-        triangles.retain(|t| sizes[components.find(t[0]) as usize] >= min_triangles);
+        triangles.retain(|t| sizes[components.find(t[0]) as usize] as usize >= min_triangles);
     }
     const UNUSED: u32 = u32::MAX;
     let mut new_index = vec![UNUSED; mesh.positions.len()];

@@ -14,13 +14,34 @@ use vidar_core::TriangleMesh;
 
 /// Vertices keep this share of an edge away from its ends, so that no two of them coincide.
 const END_MARGIN: f32 = 0.002;
-/// Marks an edge without vertex.
-const NO_VERTEX: u16 = u16::MAX;
-
-/// Vertices of one block, and which of its edges (node · 3 + axis) carries which.
+/// Vertices of one block in the order of their edges (node · 3 + axis), and which edges those are.
 struct BlockVertices {
-    of_edge: Box<[u16; NODES * 3]>,
+    edges: EdgeSet,
     vertices: Vec<Vertex>,
+}
+
+/// Edges of a block as bits, with the number of those before each word: a list of all edges would take ten times as much, and a mesh has
+/// tens of thousands of blocks.
+#[derive(Default)]
+struct EdgeSet {
+    words: [u64; EDGE_WORDS],
+    before: [u16; EDGE_WORDS],
+}
+
+const EDGE_WORDS: usize = NODES * 3 / 64;
+
+impl EdgeSet {
+    /// Adds an edge, in ascending order.
+    fn push(&mut self, edge: usize) {
+        self.words[edge / 64] |= 1 << (edge % 64);
+        self.before[edge / 64 + 1..].iter_mut().for_each(|n| *n += 1);
+    }
+
+    /// How many edges of the set come before this one; `None` where it is not in the set.
+    fn rank(&self, edge: usize) -> Option<u32> {
+        let (word, bit) = (self.words[edge / 64], 1u64 << (edge % 64));
+        (word & bit != 0).then(|| u32::from(self.before[edge / 64]) + (word & (bit - 1)).count_ones())
+    }
 }
 
 struct Vertex {
@@ -59,7 +80,14 @@ impl TsdfVolume {
             .with_min_len(8)
             .map(|at| connect_vertices(&field, at, &vertices, &first, table))
             .collect();
+        drop(field);
         let mut mesh = TriangleMesh { triangles: triangles.concat(), ..TriangleMesh::default() };
+        drop(triangles);
+        let count = next as usize;
+        mesh.positions.reserve_exact(count);
+        mesh.normals.reserve_exact(count);
+        mesh.confidences.reserve_exact(count);
+        mesh.colors.reserve_exact(if colored { count } else { 0 });
         for vertex in vertices.iter().flatten().flat_map(|p| &p.vertices) {
             mesh.positions.push(vertex.position);
             mesh.normals.push(vertex.normal);
@@ -68,6 +96,7 @@ impl TsdfVolume {
                 mesh.colors.push(vertex.color);
             }
         }
+        drop(vertices);
         remove_small_components(mesh, self.config().min_component_triangles as usize)
     }
 }
@@ -75,7 +104,7 @@ impl TsdfVolume {
 /// Places a vertex on every edge of block `at` whose ends are observed on different sides of the surface.
 fn place_vertices(field: &Field<'_>, at: usize, voxel_m: f64) -> Option<BlockVertices> {
     let around = field.neighbourhood(at)?;
-    let mut of_edge = Box::new([NO_VERTEX; NODES * 3]);
+    let mut edges = EdgeSet::default();
     let mut vertices = Vec::new();
     for node in 0..NODES {
         let node_index = [node % EDGE, node / EDGE % EDGE, node / (EDGE * EDGE)];
@@ -86,12 +115,13 @@ fn place_vertices(field: &Field<'_>, at: usize, voxel_m: f64) -> Option<BlockVer
             if !((a < 0.0 && b > 0.0) || (a > 0.0 && b < 0.0)) {
                 continue;
             }
-            of_edge[node * 3 + axis] = vertices.len() as u16;
+            edges.push(node * 3 + axis);
             let t = (a / (a - b)).clamp(END_MARGIN, 1.0 - END_MARGIN);
             vertices.push(vertex(field, &around, [at, node, axis], t, voxel_m)?);
         }
     }
-    Some(BlockVertices { of_edge, vertices })
+    vertices.shrink_to_fit();
+    Some(BlockVertices { edges, vertices })
 }
 
 /// The vertex at share `t` of the edge [block, node, axis].
@@ -153,8 +183,8 @@ fn connect_vertices(
                 let (corner, axis) = edge_start(edge);
                 let start = [0, 1, 2].map(|a| node_index[a] + (corner >> a & 1));
                 let (block, node) = around.owner(start)?;
-                let vertex = vertices[block as usize].as_ref()?.of_edge[node * 3 + axis];
-                (vertex != NO_VERTEX).then(|| first[block as usize] + u32::from(vertex))
+                let vertex = vertices[block as usize].as_ref()?.edges.rank(node * 3 + axis)?;
+                Some(first[block as usize] + vertex)
             });
             if let [Some(a), Some(b), Some(c)] = indices {
                 triangles.push([a, b, c]);

@@ -50,6 +50,7 @@ mod extract;
 mod field;
 mod grid;
 mod pixels;
+mod point_sums;
 mod points;
 mod render;
 mod sample;

@@ -3,37 +3,20 @@
 //! Simpler than a TSDF and preserves thin objects, but has no free space and no surface between the points. Weights are those of the TSDF; all sums are integers, so the cloud is the same for any order of views
 //! and any number of threads, except where the memory budget rejected voxels (see [`PointFusion::warnings`]).
 
-use crate::grid::{BlockKey, MAX_VIEWS, check_view, table_bytes};
-use crate::pixels::{FRACTION_ONE, PartialSum, SHARDS, Strips};
+use crate::grid::{BlockKey, MAX_VIEWS, check_view};
+use crate::pixels::{FRACTION_ONE, SHARDS, Strips};
+use crate::point_sums::{PointSum, Shard};
 use crate::sample::{CONFIDENCE_ONE, SampledView};
 use crate::{FusionConfig, FusionError, IntegrationStats};
 use nalgebra::Vector3;
 use rayon::prelude::*;
-use rustc_hash::FxHashMap;
 use vidar_core::{AlignedView, PointCloud, Warning};
-
-/// Sums over the pixels of one voxel. 65535 views of 2³² pixels' weights would be needed to overflow them.
-#[derive(Clone, Debug, Default)]
-struct PointSum {
-    /// Σ w · (position − centre of the voxel).
-    offset: [i64; 3],
-    /// Σ w · normal.
-    normal: [i64; 3],
-    /// Σ w · colour, and Σ w of the pixels that had one.
-    color: [u64; 4],
-    weight: u64,
-    confidence: u64,
-    pixels: u64,
-    views: u32,
-    /// The call that added last, to count each view once; never read for anything else.
-    last_call: u32,
-}
 
 /// A voxel-hashed point cloud that views are added to.
 #[derive(Clone, Debug)]
 pub struct PointFusion {
     config: FusionConfig,
-    shards: Vec<FxHashMap<BlockKey, PointSum>>,
+    shards: Vec<Shard>,
     /// Memory of the last view's samples and partial_sums, for the next one.
     scratch: (SampledView, Strips),
     views: u32,
@@ -46,7 +29,7 @@ impl PointFusion {
         config.validate()?;
         Ok(Self {
             config: config.clone(),
-            shards: vec![FxHashMap::default(); SHARDS],
+            shards: vec![Shard::default(); SHARDS],
             scratch: <(SampledView, Strips)>::default(),
             views: 0,
             dropped: 0,
@@ -68,13 +51,13 @@ impl PointFusion {
         let (sampled, strips) = &mut self.scratch;
         sampled.fill(view, &self.config);
         strips.fill(view, sampled, self.config.voxel_size_m);
-        let call = self.views;
+        let call = self.views as u16;
         let budget = self.config.memory_budget_bytes / SHARDS as u64;
         let (touched, dropped) = self
             .shards
             .par_iter_mut()
             .enumerate()
-            .map(|(at, shard)| add_to_shard(shard, strips.of_shard(at), call, budget))
+            .map(|(at, shard)| shard.add(strips.of_shard(at), call, budget))
             .reduce(|| (0, 0), |a, b| (a.0 + b.0, a.1 + b.1));
         self.dropped += dropped;
         Ok(IntegrationStats {
@@ -90,18 +73,29 @@ impl PointFusion {
     /// position, unit normal facing the observers, mean confidence, and colour when any view had one.
     pub fn finish(self) -> PointCloud {
         let min_views = self.config.min_observations;
-        let mut sums: Vec<(BlockKey, PointSum)> =
-            self.shards.into_iter().flatten().filter(|(_, sum)| sum.views >= min_views).collect();
-        sums.par_sort_unstable_by_key(|(key, _)| *key);
-        let colored = sums.iter().any(|(_, sum)| sum.color[3] > 0);
-        let mut cloud = PointCloud::default();
-        for (key, sum) in &sums {
-            cloud.positions.push(sum.position(*key, self.config.voxel_size_m));
-            cloud.normals.push(sum.unit_normal());
-            cloud.confidences.push(sum.confidence as f32 / (sum.pixels as f32 * CONFIDENCE_ONE));
+        let kept = |(at, shard): (usize, &Shard)| {
+            shard.seen_by(min_views).map(move |(key, sum)| (key, at, sum)).collect()
+        };
+        let kept: Vec<Vec<(BlockKey, usize, u32)>> = self.shards.par_iter().enumerate().map(kept).collect();
+        let mut order = kept.concat();
+        drop(kept);
+        order.par_sort_unstable_by_key(|(key, ..)| *key);
+        let sums = || order.iter().map(|&(key, shard, at)| (key, self.shards[shard].sum(at)));
+        let colored = sums().any(|(_, sum)| sum.color()[3] > 0);
+        let mut cloud = PointCloud {
+            positions: Vec::with_capacity(order.len()),
+            normals: Vec::with_capacity(order.len()),
+            confidences: Vec::with_capacity(order.len()),
+            colors: Vec::with_capacity(if colored { order.len() } else { 0 }),
+        };
+        for (key, sum) in sums() {
+            cloud.positions.push(position(&sum, key, self.config.voxel_size_m));
+            cloud.normals.push(unit_normal(&sum));
+            cloud.confidences.push(sum.confidence() as f32 / (sum.pixels() as f32 * CONFIDENCE_ONE));
             if colored {
-                let weight = sum.color[3].max(1);
-                cloud.colors.push([0, 1, 2].map(|c| ((sum.color[c] + weight / 2) / weight) as u8));
+                let [r, g, b, weight] = sum.color();
+                let weight = weight.max(1);
+                cloud.colors.push([r, g, b].map(|c| ((c + weight / 2) / weight) as u8));
             }
         }
         cloud
@@ -124,62 +118,19 @@ impl PointFusion {
 
     /// Bytes held now; never above the budget.
     pub fn memory_bytes(&self) -> u64 {
-        self.shards.iter().map(|s| shard_bytes(s.len())).sum()
+        self.shards.iter().map(Shard::bytes).sum()
     }
 }
 
-impl PointSum {
-    fn add(&mut self, partial: &PartialSum, call: u32) {
-        let (offset, normal) = (partial.offset(), partial.normal());
-        for a in 0..3 {
-            self.offset[a] += i64::from(offset[a]);
-            self.normal[a] += i64::from(normal[a]);
-        }
-        for (sum, more) in self.color.iter_mut().zip(partial.color) {
-            *sum += u64::from(more);
-        }
-        self.weight += u64::from(partial.weight());
-        self.confidence += u64::from(partial.confidence);
-        self.pixels += u64::from(partial.pixels);
-        self.views += u32::from(self.last_call != call);
-        self.last_call = call;
-    }
-
-    fn position(&self, key: BlockKey, voxel_m: f64) -> [f32; 3] {
-        let per_unit = 1.0 / (self.weight.max(1) as f64 * f64::from(FRACTION_ONE));
-        [0, 1, 2].map(|a| ((f64::from(key[a]) + self.offset[a] as f64 * per_unit) * voxel_m) as f32)
-    }
-
-    fn unit_normal(&self) -> [f32; 3] {
-        let sum = Vector3::from(self.normal.map(|n| n as f64));
-        // Opposite normals of a thin sheet may cancel; the direction is then arbitrary.
-        let unit = sum.try_normalize(0.5).unwrap_or_else(Vector3::z);
-        unit.map(|c| c as f32).into()
-    }
+fn position(sum: &PointSum, key: BlockKey, voxel_m: f64) -> [f32; 3] {
+    let per_unit = 1.0 / (sum.weight().max(1) as f64 * f64::from(FRACTION_ONE));
+    let offset = sum.offset();
+    [0, 1, 2].map(|a| ((f64::from(key[a]) + offset[a] as f64 * per_unit) * voxel_m) as f32)
 }
 
-fn shard_bytes(entries: usize) -> u64 {
-    table_bytes(entries, size_of::<(BlockKey, PointSum)>())
-}
-
-/// Adds partial_sums to the voxels of one shard; how many voxels changed, and how many pixels the budget rejected.
-fn add_to_shard<'a>(
-    shard: &mut FxHashMap<BlockKey, PointSum>,
-    partial_sums: impl Iterator<Item = &'a PartialSum>,
-    call: u32,
-    budget: u64,
-) -> (u64, u64) {
-    let (mut touched, mut dropped) = (0, 0);
-    for partial in partial_sums {
-        if let Some(sum) = shard.get_mut(&partial.key) {
-            touched += u64::from(sum.last_call != call);
-            sum.add(partial, call);
-        } else if shard_bytes(shard.len() + 1) <= budget {
-            touched += 1;
-            shard.entry(partial.key).or_default().add(partial, call);
-        } else {
-            dropped += u64::from(partial.pixels);
-        }
-    }
-    (touched, dropped)
+fn unit_normal(sum: &PointSum) -> [f32; 3] {
+    let sum = Vector3::from(sum.normal().map(|n| n as f64));
+    // Opposite normals of a thin sheet may cancel; the direction is then arbitrary.
+    let unit = sum.try_normalize(0.5).unwrap_or_else(Vector3::z);
+    unit.map(|c| c as f32).into()
 }

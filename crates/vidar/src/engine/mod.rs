@@ -313,7 +313,7 @@ impl<'a> Engine<'a> {
         let selected = match self.track.longest().filter(|_| segment.is_some()) {
             Some(track) => {
                 for keyframe in &track.odometry[world.odometry_taken..] {
-                    self.observer.add(keyframe.clone());
+                    self.observer.add(keyframe);
                 }
                 world.odometry_taken = track.odometry.len();
                 world.selection.among_posed(&track.frames, &self.rule, is_complete)

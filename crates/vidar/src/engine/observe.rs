@@ -5,7 +5,6 @@ use super::events::MapKeyframe;
 use super::stereo_landmarks;
 use crate::config::{CouplingConfig, LandmarkSources};
 use std::collections::BTreeMap;
-use std::sync::Arc;
 use vidar_align::aligner::DepthPoint;
 use vidar_align::chunking::ChunkSpan;
 use vidar_align::covariance::{chained_covariance, covariance_in_camera};
@@ -48,8 +47,9 @@ pub struct Observer {
     view: Pinhole,
     body_from_camera: Se3,
     landmarks: LandmarkUse,
-    /// The odometry's keyframes: the chain of covariances runs through those that were not selected, too.
-    odometry: BTreeMap<KeyframeId, Arc<OdometryKeyframe>>,
+    /// The odometry's keyframes: the chain of covariances runs through those that were not selected, too. Without their landmarks, which
+    /// would be held a second time for as long as the recording lasts.
+    odometry: BTreeMap<KeyframeId, OdometryKeyframe>,
 }
 
 impl Observer {
@@ -70,14 +70,14 @@ impl Observer {
     }
 
     /// A keyframe of the odometry.
-    pub fn add(&mut self, keyframe: Arc<OdometryKeyframe>) {
-        self.odometry.insert(keyframe.id, keyframe);
+    pub fn add(&mut self, keyframe: &OdometryKeyframe) {
+        self.odometry.insert(keyframe.id, OdometryKeyframe { landmarks: Vec::new(), ..keyframe.clone() });
     }
 
     /// A keyframe's pose was estimated again: chunks that are aligned from now on use it.
     pub fn revise(&mut self, revised: &RevisedPose) {
         if let Some(keyframe) = self.odometry.get_mut(&revised.id) {
-            Arc::make_mut(keyframe).world_from_camera = revised.world_from_camera;
+            keyframe.world_from_camera = revised.world_from_camera;
         }
     }
 
@@ -130,9 +130,7 @@ impl Observer {
         prior.world_from_camera = pose;
         let before = k.checked_sub(1).and_then(|k| keyframes[k].odometry.as_ref());
         prior.relative_covariance = before
-            .and_then(|before| {
-                chained_covariance(odometry, before.id, |id| self.odometry.get(&id).map(Arc::as_ref))
-            })
+            .and_then(|before| chained_covariance(odometry, before.id, |id| self.odometry.get(&id)))
             .map(|covariance| covariance_in_camera(&covariance, &self.body_from_camera));
         if let Some(depth) = depth.filter(|_| self.landmarks != LandmarkUse::None) {
             frame.landmarks = self.transfer(&depth).undistorted(&own.landmarks);
