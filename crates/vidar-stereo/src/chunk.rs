@@ -69,11 +69,12 @@ impl<'a> Chunk<'a> {
     /// Depth of the references and of the views that they are checked against.
     pub fn work(&mut self) -> Result<(), StereoError> {
         let probes = self.probe()?;
-        if self.config.pose_std_deg > 0.0 && self.config.pose_std_m > 0.0 {
-            let corrected = register(&self.views, &probes, self.config);
+        if let Some(prior) = self.config.pose_std() {
+            let corrected = register(&self.views, &probes, &prior, self.config);
             for (view, corrected) in self.views.iter_mut().zip(corrected) {
-                (view.world_from_camera, view.correction) =
-                    (corrected.world_from_camera, corrected.correction);
+                view.world_from_camera = corrected.world_from_camera;
+                view.correction = corrected.correction;
+                view.pose_std = Some(corrected.std);
             }
         }
         self.estimate(self.references, &probes)?;

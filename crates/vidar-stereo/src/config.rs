@@ -61,7 +61,22 @@ impl Default for StereoConfig {
     }
 }
 
+/// Standard deviations of a pose.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct PoseStd {
+    /// Of each component of its rotation, rad.
+    pub rotation_rad: f64,
+    /// Of each coordinate of its camera centre, m.
+    pub translation_m: f64,
+}
+
 impl StereoConfig {
+    /// What the given poses are taken to be known to; `None` where they are taken as they are.
+    pub fn pose_std(&self) -> Option<PoseStd> {
+        let (rotation_rad, translation_m) = (self.pose_std_deg.to_radians(), self.pose_std_m);
+        (rotation_rad > 0.0 && translation_m > 0.0).then_some(PoseStd { rotation_rad, translation_m })
+    }
+
     /// Checks every field against the range in its description.
     pub fn validate(&self) -> Result<(), StereoError> {
         let check = |key: &'static str, found: f64, low: f64, high: f64| {

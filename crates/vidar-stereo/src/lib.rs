@@ -54,6 +54,6 @@ mod warp;
 mod window;
 
 pub use confidence::{PixelFeatures, TOLERANCE_RATIO};
-pub use config::StereoConfig;
+pub use config::{PoseStd, StereoConfig};
 pub use error::StereoError;
 pub use model::{OmittedView, StereoModel, StereoOutput, ViewFeatures};

@@ -2,7 +2,7 @@
 
 use crate::chunk::{Chunk, ViewDepth};
 use crate::confidence::{PixelFeatures, confident, pixel_features};
-use crate::config::StereoConfig;
+use crate::config::{PoseStd, StereoConfig};
 use crate::consistency::{Support, support};
 use crate::error::StereoError;
 use crate::filter::remove_speckles;
@@ -44,6 +44,9 @@ pub struct StereoOutput {
     /// One entry per reference with parallax, in the order of the views. The depth has the working size
     /// (`max_width_px`), and the intrinsics are those of that size.
     pub prediction: GeometryPrediction,
+    /// What the pose of each view of the prediction is known to, by the images and the given poses together; empty where poses are taken
+    /// as given.
+    pub pose_std: Vec<PoseStd>,
     /// References without parallax.
     pub omitted: Vec<OmittedView>,
 }
@@ -107,9 +110,9 @@ impl StereoModel {
         masks: &[Option<Image<bool>>],
         requested: Range<usize>,
         watch: Watch<'_>,
-    ) -> Result<GeometryPrediction, StereoError> {
+    ) -> Result<StereoOutput, StereoError> {
         let references: Vec<usize> = requested.filter(|&i| i < views.views.len()).collect();
-        Ok(self.depths_of(views, masks, &references, (watch, false))?.0.prediction)
+        Ok(self.depths_of(views, masks, &references, (watch, false))?.0)
     }
 
     /// As [`Self::depths_of`]; an error if no reference has parallax.
@@ -159,6 +162,8 @@ impl StereoModel {
             .filter_map(|&r| checked_geometry(&chunk, r, &self.config, keep_features))
             .collect();
         let (geometries, features) = results.into_iter().collect::<Result<Vec<_>, _>>()?.into_iter().unzip();
+        let pose_std = references.iter().filter(|r| chunk.depths.contains_key(r));
+        let pose_std = pose_std.filter_map(|&r| chunk.views[r].pose_std).collect();
         let omitted = references
             .iter()
             .filter(|r| !chunk.depths.contains_key(r))
@@ -170,7 +175,7 @@ impl StereoModel {
             .collect();
         let prediction =
             GeometryPrediction { chunk_id: views.id, frame: ChunkFrame::PriorWorld, views: geometries };
-        Ok((StereoOutput { prediction, omitted }, features))
+        Ok((StereoOutput { prediction, pose_std, omitted }, features))
     }
 }
 
@@ -236,7 +241,7 @@ impl GeometryModel for StereoModel {
         requested: Range<usize>,
         watch: Watch<'_>,
     ) -> Result<GeometryPrediction, ModelError> {
-        Ok(self.predict_unmasked(views, &[], requested, watch)?)
+        Ok(self.predict_unmasked(views, &[], requested, watch)?.prediction)
     }
 }
 

@@ -1,6 +1,6 @@
 //! Preparation of views for matching: grey, at the working size, with two coarser levels and their intrinsics.
 
-use crate::config::StereoConfig;
+use crate::config::{PoseStd, StereoConfig};
 use crate::error::StereoError;
 use vidar_core::{ChunkView, FrameId, Image, Pinhole, Se3};
 
@@ -40,6 +40,8 @@ pub(crate) struct Prepared {
     pub world_from_camera: Se3,
     /// Size and residual of its pose correction; zero where poses are taken as given.
     pub correction: PoseCorrection,
+    /// Standard deviation of its corrected pose; `None` where poses are taken as given.
+    pub pose_std: Option<PoseStd>,
     /// Working size, half of it, a quarter of it.
     pub levels: [Level; 3],
     /// Row-major at the working size, the pixels that get no depth; empty where every pixel may.
@@ -110,7 +112,8 @@ pub(crate) fn prepare(
             }
         }
     }
-    Ok(Prepared { frame_id: frame, world_from_camera, correction: PoseCorrection::default(), levels, masked })
+    let correction = PoseCorrection::default();
+    Ok(Prepared { frame_id: frame, world_from_camera, correction, pose_std: None, levels, masked })
 }
 
 /// A mask at a smaller size: `true` where any of the pixels that a target pixel covers is.

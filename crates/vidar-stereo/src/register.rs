@@ -10,7 +10,7 @@
 mod search;
 mod solve;
 
-use crate::config::StereoConfig;
+use crate::config::{PoseStd, StereoConfig};
 use crate::estimate::{PROBE_LEVEL, Probe};
 use crate::prepare::{Level, PoseCorrection, Prepared};
 use crate::select::select;
@@ -45,12 +45,15 @@ pub(crate) struct CorrectedPose {
     pub world_from_camera: Se3,
     /// Size and residual of the correction.
     pub correction: PoseCorrection,
+    /// By matches and prior together; the prior's where there are too few matches.
+    pub std: PoseStd,
 }
 
-/// The views' poses, corrected; the given ones where there are too few matches.
+/// The views' poses, corrected; the given ones, which `prior` is the standard deviation of, where there are too few matches.
 pub(crate) fn register(
     views: &[Prepared],
     probes: &[Option<Probe>],
+    prior: &PoseStd,
     config: &StereoConfig,
 ) -> Vec<CorrectedPose> {
     let mut tracks: Vec<Track> = (0..views.len())
@@ -60,15 +63,12 @@ pub(crate) fn register(
     let _span = trace_span!("adjustment").entered();
     let cameras: Vec<_> = views.iter().map(|v| v.levels[0].intrinsics).collect();
     let given: Vec<Se3> = views.iter().map(|v| v.world_from_camera).collect();
-    let prior =
-        solve::PosePrior { rotation_rad: config.pose_std_deg.to_radians(), translation_m: config.pose_std_m };
-    let poses = solve::adjusted(&given, &cameras, &mut tracks, &prior);
+    let adjusted = solve::adjusted(&given, &cameras, &mut tracks, prior);
+    let poses: Vec<Se3> = adjusted.iter().map(|a| a.0).collect();
     let corrections = solve::corrections(&given, &poses, &cameras, &tracks);
-    poses
-        .into_iter()
-        .zip(corrections)
-        .map(|(world_from_camera, correction)| CorrectedPose { world_from_camera, correction })
-        .collect()
+    let corrected =
+        |((world_from_camera, std), correction)| CorrectedPose { world_from_camera, correction, std };
+    adjusted.into_iter().zip(corrections).map(corrected).collect()
 }
 
 /// Corners of a view with known depth, each matched in its best neighbours.

@@ -225,7 +225,7 @@ fn what_is_masked_gets_no_depth_and_spoils_none() {
     let mask = masks[MIDDLE].clone().expect("every view has one");
     let predict = |masks: &[Option<Image<bool>>]| {
         let depths = model().predict_unmasked(&chunk, masks, MIDDLE..MIDDLE + 1, &|_| false);
-        depths.expect("has parallax").views.remove(0)
+        depths.expect("has parallax").prediction.views.remove(0)
     };
     let (inside, near, wrong) = around(&predict(&[]), &mask);
     assert!(inside > 500, "the walker is taken for something that stands still at {inside} pixels");
@@ -247,7 +247,12 @@ fn masks_of_nothing_change_no_bit() {
     let none = vec![Some(Image::filled(192, 144, false)); 5];
     let bits = |masks: &[Option<Image<bool>>]| -> Vec<u32> {
         let depths = model().predict_unmasked(&chunk, masks, 1..4, &|_| false).expect("has parallax");
-        depths.views.iter().flat_map(|v| v.depth.image().data().iter().map(|z| z.to_bits())).collect()
+        depths
+            .prediction
+            .views
+            .iter()
+            .flat_map(|v| v.depth.image().data().iter().map(|z| z.to_bits()))
+            .collect()
     };
     assert!(bits(&none) == bits(&[]));
 }

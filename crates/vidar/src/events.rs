@@ -172,12 +172,14 @@ impl Event {
             MapEvent::Keyframe(keyframe) => {
                 Self::Keyframe { frame: keyframe.stamp.frame_id, time_ns: keyframe.stamp.time.nanos() }
             }
-            MapEvent::ChunkPredicted { chunk, keyframes, with_depth, is_reused } => Self::ChunkPredicted {
-                chunk: *chunk,
-                keyframes: *keyframes,
-                with_depth: *with_depth,
-                is_reused: *is_reused,
-            },
+            MapEvent::ChunkPredicted { chunk, keyframes, with_depth, is_reused, .. } => {
+                Self::ChunkPredicted {
+                    chunk: *chunk,
+                    keyframes: *keyframes,
+                    with_depth: *with_depth,
+                    is_reused: *is_reused,
+                }
+            }
             MapEvent::ChunkPlaced(report) => Self::ChunkPlaced {
                 chunk: report.chunk_id,
                 scale: report.world_from_chunk.map(|s| s.scale),

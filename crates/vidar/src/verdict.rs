@@ -98,7 +98,7 @@ impl Findings {
 
     /// How well the scale is known.
     pub fn scale(&mut self, scale: &StatedScale) {
-        let is_loose = scale.sigma.is_some_and(|sigma| sigma > GOOD_SCALE);
+        let is_loose = scale.sigma.or(scale.poses).is_some_and(|sigma| sigma > GOOD_SCALE);
         match (scale.is_metric, scale.source) {
             (false, ScaleSource::Odometry { .. }) => {
                 self.add(Level::Bad, format!("lengths are not metres: scale {}", scale.words));
@@ -186,12 +186,23 @@ pub enum ScaleSource {
         unchecked: Option<f64>,
     },
     /// A trajectory whose scale nobody states.
-    Given,
+    Given {
+        /// σ of ln(size) by what the images say otherwise of its poses; `None` where they were not asked.
+        contradicted: Option<f64>,
+    },
     /// Ground truth.
-    GroundTruth,
+    GroundTruth {
+        /// As of a trajectory.
+        contradicted: Option<f64>,
+    },
     /// None: lengths are arbitrary.
     #[default]
     None,
+}
+
+/// What images say of given poses, in words.
+fn by_images(contradicted: Option<f64>) -> String {
+    contradicted.map_or_else(String::new, |c| format!(", which the images confirm to {:.1} %", 100.0 * c))
 }
 
 impl StatedScale {
@@ -213,20 +224,18 @@ impl StatedScale {
             ScaleSource::None => {
                 Self { is_metric: false, words: "arbitrary: nothing metric takes part".into(), ..empty }
             }
-            ScaleSource::Given => Self {
-                words: match chunks {
-                    Some(c) => format!(
-                        "as metric as the trajectory given, whose σ is not known; chunks add {:.1} %",
-                        100.0 * c
-                    ),
-                    None => "as metric as the trajectory given, whose σ is not known".into(),
-                },
+            ScaleSource::Given { contradicted } => Self {
+                poses: contradicted,
+                words: format!(
+                    "as metric as the trajectory given, whose σ is not known{}{of_chunks}",
+                    by_images(contradicted)
+                ),
                 ..empty
             },
-            ScaleSource::GroundTruth => Self {
-                sigma: Some(known),
-                poses: Some(0.0),
-                words: format!("metric by ground truth{of_chunks}"),
+            ScaleSource::GroundTruth { contradicted } => Self {
+                sigma: Some(known.hypot(contradicted.unwrap_or(0.0))),
+                poses: Some(contradicted.unwrap_or(0.0)),
+                words: format!("metric by ground truth{}{of_chunks}", by_images(contradicted)),
                 ..empty
             },
             ScaleSource::Odometry { stated, .. } if !stated.is_finite() => {
@@ -290,10 +299,20 @@ mod tests {
         assert!(live.words.contains("calibration not checked 2.0 %"), "{}", live.words);
         let loose = StatedScale::new(odometry(0.108), Some(0.005));
         assert!(!loose.is_metric && loose.warning().unwrap().message.contains("0.11"));
-        let given = StatedScale::new(ScaleSource::Given, Some(0.005));
+        let given = StatedScale::new(ScaleSource::Given { contradicted: None }, Some(0.005));
         assert_eq!((given.sigma, given.warning()), (None, None));
         assert!(given.words.contains("not known"), "{}", given.words);
         assert!(StatedScale::new(odometry(f64::INFINITY), None).warning().is_some());
+        for (contradicted, level) in [(0.002, Level::NotEvaluated), (0.07, Level::Caution)] {
+            let contradicted = Some(contradicted);
+            for source in [ScaleSource::Given { contradicted }, ScaleSource::GroundTruth { contradicted }] {
+                let stated = StatedScale::new(source, Some(0.005));
+                let mut findings = Findings::default();
+                findings.scale(&stated);
+                assert_eq!((findings.verdict(None).level, stated.poses), (level, contradicted), "{stated:?}");
+                assert!(stated.words.contains("images confirm") && stated.is_metric, "{}", stated.words);
+            }
+        }
     }
 
     #[test]

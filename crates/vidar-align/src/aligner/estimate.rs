@@ -3,12 +3,16 @@
 use super::chunk::Chunk;
 use super::coupling::CouplingMode;
 use super::history::{History, LoopMeasurement, NEIGHBOURS, reports};
+use super::pose_fit::CameraPair;
 use super::report::{
     ChunkPlacement, ChunkStatus, DriftReport, GraphFailure, GraphReport, KeyframePlacement, LoopReport,
-    Placement, RejectionCounts, RejectionReason, ViewPlacement,
+    Placement, PoseCorrection, RejectionCounts, RejectionReason, ViewPlacement,
 };
+use nalgebra::Vector3;
 use std::collections::BTreeMap;
+use vidar_core::model::ChunkFrame;
 use vidar_core::{FrameId, LieGroup, Se3, Sim3};
+use vidar_solve::statistics::median_upper;
 
 /// Gauges of chunks and, where something other than their chunk determines them, poses of keyframes.
 #[derive(Clone, Debug)]
@@ -142,7 +146,36 @@ fn drift(history: &History, estimate: &Estimate) -> DriftReport {
     report.center_rms_m = (squares / report.matched.max(1) as f64).sqrt();
     let n = steps.len().max(1) as f64;
     report.scale_step_std = (steps.iter().map(|s| s * s).sum::<f64>() / n).sqrt();
+    report.pose_correction = pose_correction(history);
     report
+}
+
+/// What the images changed of the poses of the chunks that were predicted in the world of those.
+fn pose_correction(history: &History) -> Option<PoseCorrection> {
+    let (mut centers, mut shares, mut rotations) = (Vec::new(), Vec::new(), Vec::new());
+    for chunk in history.chunks.iter().filter(|c| c.is_usable() && c.frame == ChunkFrame::PriorWorld) {
+        let pairs = chunk.pairs(&history.frames);
+        let n = pairs.len() as f64;
+        let mean = pairs.iter().map(|p| p.world_from_camera.translation).sum::<Vector3<f64>>() / n;
+        let rms =
+            |of: &dyn Fn(&CameraPair) -> f64| (pairs.iter().map(|p| of(p).powi(2)).sum::<f64>() / n).sqrt();
+        let radius = rms(&|p| (p.world_from_camera.translation - mean).norm());
+        let moved = rms(&|p| (p.chunk_from_camera.translation - p.world_from_camera.translation).norm());
+        let turned =
+            rms(&|p| (p.world_from_camera.rotation.inverse() * p.chunk_from_camera.rotation).angle_rad());
+        if radius > 0.0 && moved.is_finite() {
+            centers.push(moved);
+            shares.push(moved / radius);
+            rotations.push(turned);
+        }
+    }
+    let center_share = median_upper(&mut shares)?;
+    Some(PoseCorrection {
+        center_rms_m: median_upper(&mut centers)?,
+        rotation_rms_rad: median_upper(&mut rotations)?,
+        center_share,
+        log_scale_std: center_share / (shares.len() as f64).sqrt(),
+    })
 }
 
 /// ln of the scale step from the chunk before over that of their overlap.

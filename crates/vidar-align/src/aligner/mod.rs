@@ -70,7 +70,8 @@ pub use loops::candidate::LoopCandidate;
 pub use observation::{ChunkObservation, DepthPoint, FrameObservation, PosePrior};
 pub use report::{
     ChunkPlacement, ChunkReport, ChunkStatus, DriftReport, GraphFailure, GraphReport, KeyframePlacement,
-    LoopRejection, LoopReport, OverlapReport, Placement, RejectionCounts, RejectionReason, ViewPlacement,
+    LoopRejection, LoopReport, OverlapReport, Placement, PoseCorrection, RejectionCounts, RejectionReason,
+    ViewPlacement,
 };
 
 use crate::AlignError;

@@ -263,6 +263,23 @@ pub struct DriftReport {
     pub scale_step_std: f64,
     /// Camera centres compared.
     pub matched: usize,
+    /// Of chunks that were predicted in the world of their pose priors: how far the images moved them from those.
+    pub pose_correction: Option<PoseCorrection>,
+}
+
+/// How far the images move cameras from the poses that chunks were given.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct PoseCorrection {
+    /// RMS distance of the camera centres of the median chunk, m.
+    pub center_rms_m: f64,
+    /// RMS angle of its rotations, rad.
+    pub rotation_rms_rad: f64,
+    /// The median over chunks of that distance as a share of the RMS distance of the chunk's given centres from their mean. It is what
+    /// images and poses say differently of the chunk's size: errors within a chunk are correlated, so n centres know no more of it than
+    /// one pair.
+    pub center_share: f64,
+    /// σ of ln(size of the map) by that: chunks are taken to err independently of each other.
+    pub log_scale_std: f64,
 }
 
 /// The result of the alignment: chunks, views and keyframes in one world.

@@ -188,3 +188,36 @@ fn a_chunk_in_the_world_of_its_priors_is_checked_against_them_and_not_moved() {
         assert_eq!(report.world_from_chunk, Some(vidar_core::Sim3::IDENTITY));
     }
 }
+
+#[test]
+fn what_images_changed_of_given_poses_is_told_as_a_share_of_their_path() {
+    let truth = laps(24, 0.2);
+    for sigma in [0.0, 0.002, 0.02] {
+        let mut noise = Noise::new(5);
+        let given: Vec<Se3> = truth.iter().map(|t| *t * Se3::from_translation(noise.vector(sigma))).collect();
+        let mut aligner = Aligner::new(CouplingMode::GroundTruth, &AlignerConfig::default()).unwrap();
+        let ranges = [0..12, 12..24];
+        for (id, range) in ranges.iter().enumerate() {
+            let model = Model { has_gauge: false, ..EXACT };
+            let mut prediction = predict(&truth, range.clone(), id as u32, model, &mut noise);
+            prediction.frame = ChunkFrame::PriorWorld;
+            aligner.push(observe(prediction, Some(&given), none)).unwrap();
+        }
+        let correction = aligner.finish().drift.pose_correction.unwrap();
+        let expected = 3f64.sqrt() * sigma;
+        let off = (correction.center_rms_m - expected).abs();
+        assert!(off <= 0.2 * expected + 1e-12, "{correction:?}, expected {expected}");
+        let radius = |range: &std::ops::Range<usize>| {
+            let centres = given[range.clone()].iter().map(|p| p.translation);
+            let mean = centres.clone().sum::<nalgebra::Vector3<f64>>() / range.len() as f64;
+            (centres.map(|c| (c - mean).norm_squared()).sum::<f64>() / range.len() as f64).sqrt()
+        };
+        let share = correction.center_rms_m / radius(&ranges[0]).min(radius(&ranges[1]));
+        assert!(
+            correction.center_share <= 1.3 * share + 1e-12 && correction.center_share >= 0.5 * share,
+            "{correction:?}, {share}"
+        );
+        assert!((correction.log_scale_std - correction.center_share / 2f64.sqrt()).abs() < 1e-12);
+        assert!(correction.rotation_rms_rad < 1e-9);
+    }
+}

@@ -1,15 +1,10 @@
 //! The bundle adjustment: robust least squares over poses and inverse depths.
 
 use super::Track;
+use crate::config::PoseStd;
 use crate::prepare::PoseCorrection;
-use nalgebra::{DMatrix, DVector, Matrix2x3, Matrix3, Matrix6, SMatrix, Vector2, Vector3};
+use nalgebra::{Cholesky, DMatrix, DVector, Dyn, Matrix2x3, Matrix3, Matrix6, SMatrix, Vector2, Vector3};
 use vidar_core::{LieGroup, Pinhole, Se3, So3};
-
-/// Standard deviations of the given poses.
-pub(crate) struct PosePrior {
-    pub rotation_rad: f64,
-    pub translation_m: f64,
-}
 
 /// Residual at which a match has half its weight, by iteration: first wide, so that all matches take part, then narrow,
 /// so that outliers have little influence.
@@ -33,22 +28,25 @@ struct Row {
     by_rho: Vector2<f64>,
 }
 
-/// The maximum a posteriori poses given `tracks`, with the prior `given`; `given` itself if there are too few tracks or
-/// no solution.
+/// The maximum a posteriori poses given `tracks`, with the prior `given`, and what they are known to; `given` itself if there are too few
+/// tracks or no solution.
 pub(crate) fn adjusted(
     given: &[Se3],
     cameras: &[Pinhole],
     tracks: &mut [Track],
-    prior: &PosePrior,
-) -> Vec<Se3> {
-    let mut poses = given.to_vec();
+    prior: &PoseStd,
+) -> Vec<(Se3, PoseStd)> {
+    let as_given = || given.iter().map(|pose| (*pose, *prior)).collect();
     if tracks.len() < MIN_TRACKS {
-        return poses;
+        return as_given();
     }
+    let mut poses = given.to_vec();
+    let mut system = None;
     for half_weight_px in HALF_WEIGHT_PX {
-        let Some(step) = step(&poses, given, cameras, tracks, prior, half_weight_px) else {
-            return given.to_vec();
+        let Some((step, solved)) = step(&poses, given, cameras, tracks, prior, half_weight_px) else {
+            return as_given();
         };
+        system = Some(solved);
         for (i, pose) in poses.iter_mut().enumerate() {
             let turn = Vector3::new(step[6 * i + 3], step[6 * i + 4], step[6 * i + 5]);
             let shift = Vector3::new(step[6 * i], step[6 * i + 1], step[6 * i + 2]);
@@ -56,7 +54,19 @@ pub(crate) fn adjusted(
         }
     }
     restore_scale(&mut poses, given, prior);
-    if poses.iter().all(Se3::is_finite) { poses } else { given.to_vec() }
+    match system {
+        Some(system) if poses.iter().all(Se3::is_finite) => {
+            let covariance = system.inverse();
+            let of_axes =
+                |first: usize| (0..3).map(|k| covariance[(first + k, first + k)]).sum::<f64>() / 3.0;
+            let std = |i: usize| PoseStd {
+                rotation_rad: of_axes(6 * i + 3).sqrt(),
+                translation_m: of_axes(6 * i).sqrt(),
+            };
+            poses.into_iter().enumerate().map(|(i, pose)| (pose, std(i))).collect()
+        }
+        _ => as_given(),
+    }
 }
 
 /// Median shift of each view's matches by the correction, and median residual after it.
@@ -94,7 +104,7 @@ pub(crate) fn corrections(
 /// Matches do not determine the scale; only the prior does, and with a small error of the intrinsics a change of
 /// baseline and rotation costs hardly anything. Where the extent of the given centres is well above their standard
 /// deviation, the scale is taken from them.
-fn restore_scale(poses: &mut [Se3], given: &[Se3], prior: &PosePrior) {
+fn restore_scale(poses: &mut [Se3], given: &[Se3], prior: &PoseStd) {
     let n = poses.len() as f64;
     let centroid = |poses: &[Se3]| poses.iter().map(|p| p.translation).sum::<Vector3<f64>>() / n;
     let (own_centroid, given_centroid) = (centroid(poses), centroid(given));
@@ -114,15 +124,16 @@ fn restore_scale(poses: &mut [Se3], given: &[Se3], prior: &PosePrior) {
     }
 }
 
-/// One Gauss-Newton step: updates the inverse depths and returns the poses' (shift, turn) in their own frames.
+/// One Gauss-Newton step: updates the inverse depths and returns the poses' (shift, turn) in their own frames, with the factor of their
+/// information matrix.
 fn step(
     poses: &[Se3],
     given: &[Se3],
     cameras: &[Pinhole],
     tracks: &mut [Track],
-    prior: &PosePrior,
+    prior: &PoseStd,
     half_weight_px: f64,
-) -> Option<DVector<f64>> {
+) -> Option<(DVector<f64>, Cholesky<f64, Dyn>)> {
     let n = 6 * poses.len();
     let (mut h, mut g) = (DMatrix::<f64>::zeros(n, n), DVector::<f64>::zeros(n));
     for (i, (pose, given)) in poses.iter().zip(given).enumerate() {
@@ -169,14 +180,15 @@ fn step(
         }
         eliminated.push((h_rho, g_rho, cross));
     }
-    let step = -h.cholesky()?.solve(&g);
+    let factor = h.cholesky()?;
+    let step = -factor.solve(&g);
     for (track, (h_rho, g_rho, cross)) in tracks.iter_mut().zip(&eliminated) {
         let moved: f64 = cross.iter().map(|(i, c)| c.dot(&step.rows(6 * i, 6))).sum();
         let change = -(g_rho + moved) / h_rho;
         // At most by half in one round, so that it stays in front of the camera.
         track.rho += change.clamp(-0.5 * track.rho, track.rho);
     }
-    Some(step)
+    Some((step, factor))
 }
 
 fn add(h: &mut DMatrix<f64>, i: usize, j: usize, block: &Matrix6<f64>) {
@@ -214,4 +226,73 @@ fn row(
 
 fn skew(v: &Vector3<f64>) -> Matrix3<f64> {
     Matrix3::new(0.0, -v.z, v.y, v.z, 0.0, -v.x, -v.y, v.x, 0.0)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use vidar_core::random::SplitMix64;
+
+    /// Errors of corrected poses over their stated standard deviations, mean squares of (rotation, translation), and the mean ratio of the
+    /// stated ones to the prior's.
+    fn normalised_errors(prior: &PoseStd, seeds: std::ops::Range<u64>) -> ([f64; 2], [f64; 2]) {
+        let camera = Pinhole::new(250.0, 250.0, 159.5, 119.5, 320, 240).expect("valid");
+        let (mut squares, mut ratios, mut count) = ([0.0; 2], [0.0; 2], 0.0);
+        for seed in seeds {
+            let mut random = SplitMix64::new(seed);
+            let truth: Vec<Se3> = (0..8)
+                .map(|i| {
+                    let turn = So3::exp(&(random.normal3() * 0.05));
+                    Se3::new(
+                        turn,
+                        Vector3::new(0.1 * f64::from(i), 0.05 * random.normal(), 0.05 * random.normal()),
+                    )
+                })
+                .collect();
+            let mut tracks = Vec::new();
+            for host in 0..truth.len() {
+                for _ in 0..40 {
+                    let (x, y) = (320.0 * random.uniform(), 240.0 * random.uniform());
+                    let (ray, rho) = (camera.ray(x, y), 1.0 / (1.5 + 2.0 * random.uniform()));
+                    let in_world = truth[host].act(&(ray / rho));
+                    let others = (0..truth.len()).filter(|o| *o != host && o.abs_diff(host) <= 3);
+                    let seen = others.filter_map(|o| {
+                        let pixel = camera
+                            .project(&(truth[o].inverse() * Se3::from_translation(in_world)).translation)?;
+                        let noise = Vector2::new(random.normal(), random.normal()) * MATCH_STD_PX;
+                        Some((o, pixel + noise))
+                    });
+                    tracks.push(Track { host, ray, rho: 1.03 * rho, observations: seen.collect() });
+                }
+            }
+            let given: Vec<Se3> = truth
+                .iter()
+                .map(|pose| {
+                    let turn = So3::exp(&(random.normal3() * prior.rotation_rad));
+                    *pose * Se3::new(turn, random.normal3() * prior.translation_m)
+                })
+                .collect();
+            let cameras = vec![camera; truth.len()];
+            for ((pose, std), truth) in adjusted(&given, &cameras, &mut tracks, prior).iter().zip(&truth) {
+                let error = truth.inverse() * *pose;
+                squares[0] += (error.rotation.log() / std.rotation_rad).norm_squared();
+                squares[1] += (error.translation / std.translation_m).norm_squared();
+                ratios[0] += std.rotation_rad / prior.rotation_rad;
+                ratios[1] += std.translation_m / prior.translation_m;
+                count += 1.0;
+            }
+        }
+        (squares.map(|s| s / (3.0 * count)), ratios.map(|r| r / count))
+    }
+
+    #[test]
+    fn corrected_poses_are_as_far_off_as_is_stated() {
+        for (rotation_deg, translation_m) in [(0.1f64, 0.01), (0.05, 0.003), (1.0, 0.03)] {
+            let prior = PoseStd { rotation_rad: rotation_deg.to_radians(), translation_m };
+            let (squares, ratios) = normalised_errors(&prior, 0..30);
+            println!("{rotation_deg} deg, {translation_m} m: {squares:?}, of the prior {ratios:?}");
+            assert!(squares.iter().all(|s| (0.6..1.5).contains(s)), "{squares:?}");
+            assert!(ratios.iter().all(|r| *r < 0.95), "the images tell nothing: {ratios:?}");
+        }
+    }
 }

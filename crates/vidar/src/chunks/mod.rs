@@ -4,9 +4,9 @@
 //! says which frames it is of, in which frame its poses are, and what it was made of. The second is written last: a chunk
 //! exists when it does.
 
+mod arrays;
 mod memory;
 mod recorded;
-mod shapes;
 mod store;
 
 pub use memory::MemoryStore;

@@ -1,6 +1,9 @@
 //! One chunk's prediction as a file, and back.
 
-use super::shapes::{pack_masks, pack_shapes, unpack_masks, unpack_shapes};
+use super::arrays::{
+    MASKS, POSE_STD, SHAPES, pack_masks, pack_pose_std, pack_shapes, unpack_masks, unpack_pose_std,
+    unpack_shapes,
+};
 use crate::engine::PredictionId;
 use crate::error::Error;
 use crate::run_folder::pretty;
@@ -17,16 +20,13 @@ use vidar_core::{
 use vidar_da3::pose::{from_edge, to_edge};
 use vidar_export::ExportError;
 use vidar_export::official::{NpyArray, NpyData, NpzLimits, Packing, read_npz, write_npz_arrays_with};
+use vidar_stereo::PoseStd;
 
 /// Schema of a chunk's `json`.
 pub(super) const CHUNK_SCHEMA: &str = "vidar.chunk/1";
 const FORMAT: &str = "chunk npz";
 /// Most bytes that one view of a prediction may hold: 2048 x 2048 pixels of 16 bytes each.
 const VIEW_BYTES: u64 = 64 << 20;
-/// Name of the array of another model's depth.
-const SHAPES: &str = "shape";
-/// Name of the array of what is not to be used.
-const MASKS: &str = "masked";
 /// What the names of loops' files begin with.
 const LOOP: &str = "loop-";
 
@@ -43,6 +43,8 @@ pub struct StoredChunk {
     pub descriptors: Vec<Vec<f32>>,
     /// Each view's depth by another model, in any unit, for what the prediction leaves empty; empty where there is none.
     pub shapes: Vec<Option<Image<f32>>>,
+    /// What the pose of each view is known to, where the images corrected it; else empty.
+    pub pose_std: Vec<PoseStd>,
     /// What of each view is not to be used, `true` there, at the depth's size; empty where all of all views is used.
     pub masks: Vec<Option<Image<bool>>>,
     /// Why there is no prediction.
@@ -58,6 +60,7 @@ impl StoredChunk {
             colors: Vec::new(),
             descriptors: Vec::new(),
             shapes: Vec::new(),
+            pose_std: Vec::new(),
             masks: Vec::new(),
             failure: None,
         }
@@ -261,6 +264,11 @@ fn pack(chunk: &StoredChunk) -> Result<Vec<u8>, Error> {
         shapes = array;
         arrays.push((SHAPES, &shapes));
     }
+    let pose_std;
+    if let Some(array) = pack_pose_std(&chunk.pose_std, n)? {
+        pose_std = array;
+        arrays.push((POSE_STD, &pose_std));
+    }
     let masks;
     if let Some(array) = pack_masks(&chunk.masks, [n, height, width])? {
         masks = array;
@@ -360,10 +368,11 @@ pub(super) fn read_views(
         _ => Vec::new(),
     };
     let shapes = take(&[SHAPES]).map_or_else(Vec::new, |array| unpack_shapes(array, n));
+    let pose_std = take(&[POSE_STD]).map_or_else(Vec::new, |array| unpack_pose_std(array, n));
     let masks = take(&[MASKS]).map_or_else(Vec::new, |array| unpack_masks(array, [n, height, width]));
     let prediction = GeometryPrediction { chunk_id, frame, views };
     let times = vec![Timestamp::default(); n];
-    Ok(StoredChunk { prediction, times, colors, descriptors, shapes, masks, failure: None })
+    Ok(StoredChunk { prediction, times, colors, descriptors, shapes, pose_std, masks, failure: None })
 }
 
 /// `n` matrices of three rows and `columns` columns; a fourth row is left out.

@@ -27,7 +27,8 @@ use vidar_stereo::complete::{ErrorStatistics, Evidence, Spread, complete, errors
 const SAMPLED_CHUNKS: usize = 6;
 const SAMPLED_VIEWS: usize = 2;
 
-/// Completes the placed views of `chunks` from the surface so far, and adds to it what of that is sure.
+/// Completes the placed views of `chunks` from the surface so far, and adds to it what of that is sure. Once stopped, the views that are
+/// left are told as the surface has them.
 pub fn complete_chunks(
     placement: &Placement,
     chunks: &[ChunkId],
@@ -37,23 +38,27 @@ pub fn complete_chunks(
     sink: &mut Sink<'_>,
 ) -> Result<(), Error> {
     let read = |chunk: ChunkId| placed_and_shaped(placement, store.read(PredictionId::Chunk(chunk))?);
-    let mesh = surface.mesh();
-    let mut samples: Vec<Shaped> = Vec::new();
-    for chunk in spread_over(chunks.to_vec(), SAMPLED_CHUNKS) {
-        samples.extend(spread_over(read(chunk)?, SAMPLED_VIEWS));
-    }
-    let completion = Completion::new(&mesh, &samples)?;
-    drop(samples);
-    for chunk in chunks {
-        if is_stopped() {
-            break;
+    let mut done = 0;
+    if !is_stopped() {
+        let mesh = surface.mesh();
+        let mut samples: Vec<Shaped> = Vec::new();
+        for chunk in spread_over(chunks.to_vec(), SAMPLED_CHUNKS) {
+            samples.extend(spread_over(read(chunk)?, SAMPLED_VIEWS));
         }
-        let views = completion.complete(&read(*chunk)?)?;
-        let planes = views.iter().map(planes_alone).collect::<Result<Vec<_>, _>>()?;
-        surface.fuse(&planes).into_iter().try_for_each(&mut *sink)?;
-        sink(MapEvent::ViewsFused(views))?;
+        let completion = Completion::new(&mesh, &samples)?;
+        drop(samples);
+        while done < chunks.len() && !is_stopped() {
+            let views = completion.complete(&read(chunks[done])?)?;
+            let planes = views.iter().map(planes_alone).collect::<Result<Vec<_>, _>>()?;
+            surface.fuse(&planes).into_iter().try_for_each(&mut *sink)?;
+            sink(MapEvent::ViewsFused(views))?;
+            done += 1;
+        }
     }
-    Ok(())
+    chunks[done..].iter().try_for_each(|chunk| {
+        let views = read(*chunk)?.into_iter().map(|shaped| shaped.view).collect();
+        sink(MapEvent::ViewsFused(views))
+    })
 }
 
 /// At most `most` of the items, evenly spread.

@@ -12,6 +12,7 @@ use vidar_core::{
     RevisedPose, Se3, Timestamp, TriangleMesh, Warning,
 };
 use vidar_fusion::{CoverageReport, DoubleWallReport};
+use vidar_stereo::PoseStd;
 
 /// An image without its pixels.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -139,6 +140,8 @@ pub enum MapEvent {
         with_depth: usize,
         /// Whether an earlier run had predicted it.
         is_reused: bool,
+        /// What the pose of each of these is known to, where the images corrected it; else empty.
+        pose_std: Vec<PoseStd>,
     },
     /// What is known of a chunk's frames besides its prediction: the aligner's input.
     ChunkObserved {

@@ -145,10 +145,12 @@ impl Engine<'_> {
         let owns_views = |c: &ChunkId| placement.views.iter().any(|v| v.owner == *c);
         let chunks: Vec<ChunkId> = placement.chunks.iter().map(|c| c.chunk_id).filter(owns_views).collect();
         let completes = self.predictor.geometry.completes();
+        let mut fused = 0;
         for chunk in &chunks {
             if is_stopped() {
                 break;
             }
+            fused += 1;
             let stored = self.predictor.store.read(PredictionId::Chunk(*chunk))?;
             let views = placed_views(placement, stored)?;
             surface.fuse(&views).into_iter().try_for_each(&mut *sink)?;
@@ -158,7 +160,14 @@ impl Engine<'_> {
         }
         if completes {
             self.enter(Step::Complete, sink)?;
-            complete_chunks(placement, &chunks, self.predictor.store, &mut surface, &is_stopped, sink)?;
+            complete_chunks(
+                placement,
+                &chunks[..fused],
+                self.predictor.store,
+                &mut surface,
+                &is_stopped,
+                sink,
+            )?;
         }
         let (surface, warnings) = surface.finish();
         for warning in warnings {

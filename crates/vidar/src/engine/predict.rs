@@ -84,7 +84,8 @@ impl<'a> Predictor<'a> {
             },
         };
         let (wanted, with_depth) = (self.wanted(span).len(), stored.prediction.views.len());
-        events.push(MapEvent::ChunkPredicted { chunk, keyframes: wanted, with_depth, is_reused });
+        let pose_std = stored.pose_std.clone();
+        events.push(MapEvent::ChunkPredicted { chunk, keyframes: wanted, with_depth, is_reused, pose_std });
         if let Some(reason) = &stored.failure {
             events.push(MapEvent::Warning(Warning::degraded("chunk-failed", reason.clone()).at(id)));
         }
@@ -123,9 +124,9 @@ impl<'a> Predictor<'a> {
                     let warning = Warning::new("keyframes-without-depth", message).at(id);
                     events.push(MapEvent::Warning(warning));
                 }
-                let Prediction { geometry, colors, tokens, shapes, warnings } = prediction;
+                let Prediction { geometry, colors, tokens, shapes, pose_std, warnings } = prediction;
                 events.extend(warnings.into_iter().map(|w| MapEvent::Warning(w.at(id))));
-                let mut stored = StoredChunk { shapes, ..colored(geometry, &views.views, colors) };
+                let mut stored = StoredChunk { shapes, pose_std, ..colored(geometry, &views.views, colors) };
                 mask(&mut stored, &views.views, &masks);
                 self.places.describe(&mut stored, &tokens)?;
                 Some(stored)

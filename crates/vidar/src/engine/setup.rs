@@ -10,6 +10,7 @@ use vidar_core::{
     CameraId, ChunkId, ChunkViews, Duration, FrameId, FrameImage, GeometryPrediction, Image, ModelError,
     ModelInfo, Pinhole, RigCamera, Se3, Timestamp, Warning, Watch,
 };
+use vidar_stereo::PoseStd;
 
 /// Values and sources of an [`super::Engine`].
 pub struct EngineSetup<'a> {
@@ -75,8 +76,24 @@ pub struct Prediction {
     /// Another z-depth per view, in any unit and at any size of the same view, for what the geometry leaves empty; empty where
     /// there is none.
     pub shapes: Vec<Option<Image<f32>>>,
+    /// What the pose of each view is known to, where the images corrected it; else empty.
+    pub pose_std: Vec<PoseStd>,
     /// What the user should know of it.
     pub warnings: Vec<Warning>,
+}
+
+impl Prediction {
+    /// Geometry alone.
+    pub fn of(geometry: GeometryPrediction) -> Self {
+        Self {
+            geometry,
+            colors: Vec::new(),
+            tokens: Vec::new(),
+            shapes: Vec::new(),
+            pose_std: Vec::new(),
+            warnings: Vec::new(),
+        }
+    }
 }
 
 /// The geometry model as the engine uses it.

@@ -59,7 +59,7 @@ impl StereoLandmarks {
         let references = 0..views.len();
         let views = ChunkViews { id: prediction.chunk_id, views };
         let by_stereo = match self.stereo.predict_unmasked(&views, &masks, references, watch) {
-            Ok(prediction) => prediction.views,
+            Ok(output) => output.prediction.views,
             Err(StereoError::TooFewViews { .. } | StereoError::Cancelled) => return Ok(BTreeMap::new()),
             Err(error) => return Err(error),
         };

@@ -6,6 +6,7 @@ use super::*;
 use crate::chunks::{MemoryStore, StoredChunk};
 use crate::input::MetricTrajectory;
 use nalgebra::Vector3;
+use std::sync::atomic::{AtomicBool, Ordering};
 use vidar_core::{
     BodyFrame, CameraModel, FrameImage, Image, Pinhole, RigCamera, Se3, Severity, StampedPose, Timestamp,
     Trajectory,
@@ -115,6 +116,18 @@ fn run_with(
     fallback: Option<Box<dyn PoseSource>>,
     geometry: &mut Wall,
 ) -> (Result<(), Error>, Vec<MapEvent>, usize) {
+    run_until(&|_| false, config, (poses, fallback), geometry)
+}
+
+/// The same, stopped by the first event that is `last`.
+fn run_until(
+    last: &dyn Fn(&MapEvent) -> bool,
+    config: &Config,
+    (poses, fallback): (Box<dyn PoseSource>, Option<Box<dyn PoseSource>>),
+    geometry: &mut Wall,
+) -> (Result<(), Error>, Vec<MapEvent>, usize) {
+    let is_stopped = AtomicBool::new(false);
+    let cancelled = || is_stopped.load(Ordering::Relaxed);
     let (store, model) = (MemoryStore::default(), CameraModel::Pinhole(pinhole()));
     let camera =
         RigCamera { model, body_from_camera: Se3::IDENTITY, time_offset: Duration::ZERO, rate_hz: None };
@@ -133,7 +146,7 @@ fn run_with(
         images: &GrayImages,
         store: &store,
         volume_budget_bytes: 1 << 28,
-        cancelled: &|| false,
+        cancelled: &cancelled,
         predicting: &|_| {},
     })
     .unwrap();
@@ -149,6 +162,7 @@ fn run_with(
     }
     let during = events.len();
     let ended = engine.finish(&mut |e| {
+        is_stopped.fetch_or(last(&e), Ordering::Relaxed);
         events.push(e);
         Ok(())
     });
@@ -304,6 +318,26 @@ fn a_chunk_that_could_not_be_predicted_degrades_the_map_and_the_others_are_fused
     assert_eq!(degradations(&events), ["chunk-failed"]);
     assert_eq!(placed(&events), [0, 2, 3, 4, 5, 6]);
     assert!(surface(&events).mesh.triangles.len() > 300);
+}
+
+#[test]
+fn a_run_that_is_stopped_tells_every_view_that_its_surface_is_made_of() {
+    let views = |events: &[MapEvent]| -> usize {
+        let count = |e: &MapEvent| if let MapEvent::ViewsFused(views) = e { views.len() } else { 0 };
+        events.iter().map(count).sum()
+    };
+    let stopped_at = |last: &dyn Fn(&MapEvent) -> bool| {
+        let mut wall = Wall::new(&[]);
+        wall.completes = true;
+        let (ended, events, _) = run_until(last, &config(), (Box::new(truth()), None), &mut wall);
+        ended.unwrap();
+        assert!(!surface(&events).mesh.triangles.is_empty());
+        views(&events)
+    };
+    let all = stopped_at(&|_| false);
+    assert_eq!(all, stopped_at(&|e| matches!(e, MapEvent::Step(Step::Complete))));
+    assert_eq!(all, stopped_at(&|e| matches!(e, MapEvent::ViewsFused(_))));
+    assert!(all > 20, "{all}");
 }
 
 #[test]

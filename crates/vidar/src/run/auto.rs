@@ -12,7 +12,7 @@ use vidar_core::{
 };
 use vidar_da3::{Da3Model, PoseMode};
 use vidar_dataset::ImageEntry;
-use vidar_stereo::StereoModel;
+use vidar_stereo::{StereoModel, StereoOutput};
 
 /// Where shapes come from.
 pub(super) enum Shapes {
@@ -74,7 +74,8 @@ impl AutoModel {
         wanted: Range<usize>,
         watch: Watch<'_>,
     ) -> Result<Prediction, ModelError> {
-        let geometry = self.stereo.predict_unmasked(views, masks, wanted, watch)?;
+        let StereoOutput { prediction: geometry, pose_std, .. } =
+            self.stereo.predict_unmasked(views, masks, wanted, watch)?;
         let (shapes, warnings) = match self.shapes(views, &geometry, watch) {
             Ok(shapes) => (shapes, Vec::new()),
             Err(ModelError::Cancelled) => return Err(ModelError::Cancelled),
@@ -83,7 +84,7 @@ impl AutoModel {
                 (Vec::new(), vec![warning.hint("depth between what is measured is interpolated instead")])
             }
         };
-        Ok(Prediction { geometry, colors: Vec::new(), tokens: Vec::new(), shapes, warnings })
+        Ok(Prediction { pose_std, shapes, warnings, ..Prediction::of(geometry) })
     }
 
     fn shapes(

@@ -9,9 +9,11 @@ use crate::run_folder::StoredView;
 use std::collections::BTreeMap;
 use std::sync::Arc;
 use vidar_align::Placement;
+use vidar_align::aligner::PoseCorrection;
 use vidar_core::{AlignedView, BodyFrame, CameraId, StampedPose, Trajectory};
 use vidar_dataset::Recording;
 use vidar_solve::statistics::median_upper;
+use vidar_stereo::PoseStd;
 
 /// The fused world.
 #[derive(Debug, Default)]
@@ -30,6 +32,10 @@ pub struct MetricMap {
     pub depth_scores: DepthScorer,
     /// What the odometry said of the recording, where it ran; also when its poses were not used.
     pub quality: Option<TrackQuality>,
+    /// What the pose of each keyframe with depth is known to, where the images corrected it.
+    pub pose_stds: Vec<PoseStd>,
+    /// Whether poses changed after depth was predicted from them, as live ones do.
+    pub is_revised: bool,
     /// Area that each fused view would see if all of its pixels had depth, m².
     pub view_areas_m2: Vec<f64>,
 }
@@ -49,6 +55,19 @@ impl MetricMap {
     /// Whether the metric poses are ground truth.
     pub fn uses_ground_truth(&self) -> bool {
         self.trajectory.as_ref().is_some_and(|t| t.source == TrajectorySource::GroundTruth)
+    }
+
+    /// What the images changed of the poses that chunks were given, and what these are known to with the images; `None` where depth does
+    /// not come from stereo, and where the poses changed later.
+    pub fn pose_correction(&self) -> Option<(PoseCorrection, PoseStd)> {
+        let correction = self.placement.as_ref()?.drift.pose_correction.filter(|_| !self.is_revised)?;
+        let median =
+            |of: fn(&PoseStd) -> f64| median_upper(&mut self.pose_stds.iter().map(of).collect::<Vec<f64>>());
+        let std = PoseStd {
+            rotation_rad: median(|s| s.rotation_rad)?,
+            translation_m: median(|s| s.translation_m)?,
+        };
+        Some((correction, std))
     }
 
     /// What the surface is of the area that the median view sees; small where views contradict each other, so that hardly
@@ -101,6 +120,8 @@ impl<'a> MapCollector<'a> {
                 self.map = MetricMap { quality: self.map.quality.take(), ..MetricMap::default() };
                 (self.source, self.segment) = (source.clone(), *segment);
             }
+            MapEvent::ChunkPredicted { pose_std, .. } => self.map.pose_stds.extend(pose_std),
+            MapEvent::RevisedStates(revised) => self.map.is_revised |= !revised.is_empty(),
             MapEvent::Keyframe(keyframe) => self.map.keyframes.push(keyframe.clone()),
             MapEvent::PlacementsRevised { placement, is_final: true } => {
                 self.map.placement = Some(placement.clone());

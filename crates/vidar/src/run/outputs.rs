@@ -167,6 +167,12 @@ pub fn result_json(outcome: &RunOutcome) -> Value {
         "scale": outcome.scale,
         "odometry": map.quality.as_ref().map(TrackQuality::json),
         "placement": map.placement.as_deref().map(placement_json),
+        "pose_correction": map.pose_correction().map(|(correction, std)| json!({
+            "center_rms_m": correction.center_rms_m, "center_share": correction.center_share,
+            "log_scale_std": correction.log_scale_std,
+            "rotation_rms_deg": correction.rotation_rms_rad.to_degrees(),
+            "std_m": std.translation_m, "std_deg": std.rotation_rad.to_degrees(),
+        })),
         "evaluation": outcome.evaluation,
         "seconds": outcome.seconds,
         "budget": outcome.plan.budget,

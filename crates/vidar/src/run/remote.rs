@@ -120,7 +120,7 @@ impl RemoteSource {
         watch: Watch<'_>,
     ) -> Result<Prediction, ModelError> {
         let Predicted { geometry, tokens } = self.model.predict(views, wanted, self.wants_tokens, watch)?;
-        Ok(Prediction { geometry, colors: Vec::new(), tokens, shapes: Vec::new(), warnings: Vec::new() })
+        Ok(Prediction { tokens, ..Prediction::of(geometry) })
     }
 }
 

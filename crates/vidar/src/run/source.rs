@@ -175,7 +175,7 @@ impl GeometrySource for Source {
         wanted: std::ops::Range<usize>,
         watch: vidar_core::Watch<'_>,
     ) -> Result<Prediction, ModelError> {
-        let (mut colors, mut tokens) = (Vec::new(), Vec::new());
+        let (mut colors, mut tokens, mut pose_std) = (Vec::new(), Vec::new(), Vec::new());
         let geometry = match self {
             Self::Auto(model) => return model.predict(views, masks, wanted, watch),
             Self::Remote(remote) => return remote.predict(views, wanted, watch),
@@ -189,10 +189,14 @@ impl GeometrySource for Source {
                 colors = model.take_colors();
                 geometry
             }
-            Self::Stereo(model) => model.predict_unmasked(views, masks, wanted, watch)?,
+            Self::Stereo(model) => {
+                let output = model.predict_unmasked(views, masks, wanted, watch)?;
+                pose_std = output.pose_std;
+                output.prediction
+            }
             Self::Simulated(model) => model.predict_views(views, wanted, watch)?,
         };
-        Ok(Prediction { geometry, colors, tokens, shapes: Vec::new(), warnings: Vec::new() })
+        Ok(Prediction { colors, tokens, pose_std, ..Prediction::of(geometry) })
     }
 }
 

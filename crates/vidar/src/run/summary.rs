@@ -115,10 +115,18 @@ pub(super) fn area(value: f64, is_metric: bool, digits: usize) -> String {
 
 /// Where poses come from, and what the odometry says of its own.
 fn poses_line(outcome: &RunOutcome) -> String {
-    match &outcome.map.quality {
+    let poses = match &outcome.map.quality {
         Some(quality) => format!("{}; odometry: {}", outcome.map.poses(), quality.words()),
         None => outcome.map.poses(),
-    }
+    };
+    let Some((correction, std)) = outcome.map.pose_correction() else { return poses };
+    format!(
+        "{poses}; corrected by the images by {:.1} mm and {:.2} deg (1 σ {:.1} mm, {:.2} deg)",
+        1e3 * correction.center_rms_m,
+        correction.rotation_rms_rad.to_degrees(),
+        1e3 * std.translation_m,
+        std.rotation_rad.to_degrees()
+    )
 }
 
 /// How chunks were coupled, and what was left out and why.

@@ -19,10 +19,11 @@ pub(super) fn stated_scale(map: &MetricMap, mode: CouplingMode, unseen: UnseenSc
         .map(|c| c.log_scale_std)
         .filter(|s| s.is_finite())
         .collect();
+    let contradicted = map.pose_correction().map(|(correction, _)| correction.log_scale_std);
     let source = match map.trajectory.as_ref().map(|t| &t.source).filter(|_| mode.uses_pose_priors()) {
         None => ScaleSource::None,
-        Some(TrajectorySource::External { .. }) => ScaleSource::Given,
-        Some(TrajectorySource::GroundTruth) => ScaleSource::GroundTruth,
+        Some(TrajectorySource::External { .. }) => ScaleSource::Given { contradicted },
+        Some(TrajectorySource::GroundTruth) => ScaleSource::GroundTruth { contradicted },
         Some(TrajectorySource::Odometry) => {
             map.quality.as_ref().map_or(ScaleSource::None, |quality| unseen.source(quality))
         }

@@ -12,6 +12,8 @@ pub(super) struct Wall {
     pub(super) info: ModelInfo,
     pub(super) failing: Vec<u32>,
     pub(super) least_span_m: f64,
+    /// Whether its depth is completed once all is fused.
+    pub(super) completes: bool,
 }
 
 impl Wall {
@@ -23,7 +25,7 @@ impl Wall {
             needs_poses: true,
             min_views: 2,
         };
-        Self { info, failing: failing.to_vec(), least_span_m: 0.0 }
+        Self { info, failing: failing.to_vec(), least_span_m: 0.0, completes: false }
     }
 }
 
@@ -38,6 +40,10 @@ impl GeometrySource for Wall {
 
     fn predicts_any_views(&self) -> bool {
         false
+    }
+
+    fn completes(&self) -> bool {
+        self.completes
     }
 
     fn predict(
@@ -66,12 +72,6 @@ impl GeometrySource for Wall {
             frame: ChunkFrame::PriorWorld,
             views: views.views[wanted].iter().map(view).collect(),
         };
-        Ok(Prediction {
-            geometry: views,
-            colors: Vec::new(),
-            tokens: Vec::new(),
-            shapes: Vec::new(),
-            warnings: Vec::new(),
-        })
+        Ok(Prediction::of(views))
     }
 }

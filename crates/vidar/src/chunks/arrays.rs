@@ -1,8 +1,16 @@
-//! Another model's depth of each view, as an array.
+//! What a chunk may hold beside its depth, as arrays: another model's depth, masks, and what poses are known to.
 
 use crate::error::Error;
 use vidar_core::Image;
 use vidar_export::official::{NpyArray, NpyData};
+use vidar_stereo::PoseStd;
+
+/// Name of the array of another model's depth.
+pub(super) const SHAPES: &str = "shape";
+/// Name of the array of standard deviations of corrected poses: rotation, rad, and translation, m.
+pub(super) const POSE_STD: &str = "pose_std";
+/// Name of the array of what is not to be used.
+pub(super) const MASKS: &str = "masked";
 
 /// One image per view at the size of the first; NaN where a view has none.
 pub(super) fn pack_shapes(shapes: &[Option<Image<f32>>], n: usize) -> Result<Option<NpyArray>, Error> {
@@ -64,9 +72,38 @@ pub(super) fn unpack_masks(array: NpyArray, shape: [usize; 3]) -> Vec<Option<Ima
     values.chunks(width * height).map(image).collect()
 }
 
+/// Rotation, rad, and translation, m, of each of `n` views; `None` where not all are known.
+pub(super) fn pack_pose_std(pose_std: &[PoseStd], n: usize) -> Result<Option<NpyArray>, Error> {
+    if pose_std.len() != n || n == 0 {
+        return Ok(None);
+    }
+    let values = pose_std.iter().flat_map(|s| [s.rotation_rad, s.translation_m]).collect();
+    Ok(Some(NpyArray::new(vec![n, 2], NpyData::F64(values))?))
+}
+
+/// As [`pack_pose_std`] wrote them; none of another number.
+pub(super) fn unpack_pose_std(array: NpyArray, n: usize) -> Vec<PoseStd> {
+    match array.data {
+        NpyData::F64(values) if values.len() == 2 * n => {
+            let one = |v: &[f64; 2]| PoseStd { rotation_rad: v[0], translation_m: v[1] };
+            values.as_chunks::<2>().0.iter().map(one).collect()
+        }
+        _ => Vec::new(),
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn what_poses_are_known_to_comes_back_or_not_at_all() {
+        let stds = [(0.001, 0.002), (0.5, 0.25)].map(|(r, t)| PoseStd { rotation_rad: r, translation_m: t });
+        let array = pack_pose_std(&stds, 2).unwrap().unwrap();
+        assert_eq!(unpack_pose_std(array.clone(), 2), stds);
+        assert!(unpack_pose_std(array, 3).is_empty());
+        assert!(pack_pose_std(&stds, 3).unwrap().is_none() && pack_pose_std(&[], 0).unwrap().is_none());
+    }
 
     #[test]
     fn shapes_come_back_with_the_same_bits_and_holes() {
