@@ -127,10 +127,15 @@ fn a_run_as_json_has_stable_keys() {
             "scale",
             "odometry",
             "placement",
+            "pose_correction",
             "evaluation",
             "seconds",
             "budget"
         ]
+    );
+    assert_eq!(
+        keys(&json["result"]["pose_correction"], 1),
+        ["center_rms_m", "center_share", "log_scale_std", "rotation_rms_deg", "std_m", "std_deg"]
     );
     assert_eq!(
         keys(&json["result"]["evaluation"], 1),
