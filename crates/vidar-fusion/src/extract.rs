@@ -14,6 +14,7 @@ use vidar_core::TriangleMesh;
 
 /// Vertices keep this share of an edge away from its ends, so that no two of them coincide.
 const END_MARGIN: f32 = 0.002;
+
 /// Vertices of one block in the order of their edges (node · 3 + axis), and which edges those are.
 struct BlockVertices {
     edges: EdgeSet,

@@ -187,22 +187,23 @@ pub enum ScaleSource {
     },
     /// A trajectory whose scale nobody states.
     Given {
-        /// σ of ln(size) by what the images say otherwise of its poses; `None` where they were not asked.
-        contradicted: Option<f64>,
+        /// σ of ln s by how its paths differ from those that the images show; `None` where these were not compared. It is a lower bound:
+        /// images do not show a scale that is wrong everywhere.
+        disagreement: Option<f64>,
     },
     /// Ground truth.
     GroundTruth {
         /// As of a trajectory.
-        contradicted: Option<f64>,
+        disagreement: Option<f64>,
     },
     /// None: lengths are arbitrary.
     #[default]
     None,
 }
 
-/// What images say of given poses, in words.
-fn by_images(contradicted: Option<f64>) -> String {
-    contradicted.map_or_else(String::new, |c| format!(", which the images confirm to {:.1} %", 100.0 * c))
+/// How far images and given poses agree, in words.
+fn by_images(disagreement: Option<f64>) -> String {
+    disagreement.map_or_else(String::new, |d| format!(", images and its paths differ by {:.1} %", 100.0 * d))
 }
 
 impl StatedScale {
@@ -224,18 +225,18 @@ impl StatedScale {
             ScaleSource::None => {
                 Self { is_metric: false, words: "arbitrary: nothing metric takes part".into(), ..empty }
             }
-            ScaleSource::Given { contradicted } => Self {
-                poses: contradicted,
+            ScaleSource::Given { disagreement } => Self {
+                poses: disagreement,
                 words: format!(
                     "as metric as the trajectory given, whose σ is not known{}{of_chunks}",
-                    by_images(contradicted)
+                    by_images(disagreement)
                 ),
                 ..empty
             },
-            ScaleSource::GroundTruth { contradicted } => Self {
-                sigma: Some(known.hypot(contradicted.unwrap_or(0.0))),
-                poses: Some(contradicted.unwrap_or(0.0)),
-                words: format!("metric by ground truth{}{of_chunks}", by_images(contradicted)),
+            ScaleSource::GroundTruth { disagreement } => Self {
+                sigma: Some(known.hypot(disagreement.unwrap_or(0.0))),
+                poses: Some(disagreement.unwrap_or(0.0)),
+                words: format!("metric by ground truth{}{of_chunks}", by_images(disagreement)),
                 ..empty
             },
             ScaleSource::Odometry { stated, .. } if !stated.is_finite() => {
@@ -299,18 +300,22 @@ mod tests {
         assert!(live.words.contains("calibration not checked 2.0 %"), "{}", live.words);
         let loose = StatedScale::new(odometry(0.108), Some(0.005));
         assert!(!loose.is_metric && loose.warning().unwrap().message.contains("0.11"));
-        let given = StatedScale::new(ScaleSource::Given { contradicted: None }, Some(0.005));
+        let given = StatedScale::new(ScaleSource::Given { disagreement: None }, Some(0.005));
         assert_eq!((given.sigma, given.warning()), (None, None));
         assert!(given.words.contains("not known"), "{}", given.words);
         assert!(StatedScale::new(odometry(f64::INFINITY), None).warning().is_some());
-        for (contradicted, level) in [(0.002, Level::NotEvaluated), (0.07, Level::Caution)] {
-            let contradicted = Some(contradicted);
-            for source in [ScaleSource::Given { contradicted }, ScaleSource::GroundTruth { contradicted }] {
+        for (disagreement, level) in [(0.002, Level::NotEvaluated), (0.07, Level::Caution)] {
+            let disagreement = Some(disagreement);
+            for source in [ScaleSource::Given { disagreement }, ScaleSource::GroundTruth { disagreement }] {
                 let stated = StatedScale::new(source, Some(0.005));
                 let mut findings = Findings::default();
                 findings.scale(&stated);
-                assert_eq!((findings.verdict(None).level, stated.poses), (level, contradicted), "{stated:?}");
-                assert!(stated.words.contains("images confirm") && stated.is_metric, "{}", stated.words);
+                assert_eq!((findings.verdict(None).level, stated.poses), (level, disagreement), "{stated:?}");
+                assert!(
+                    stated.words.contains("images and its paths differ by") && stated.is_metric,
+                    "{}",
+                    stated.words
+                );
             }
         }
     }

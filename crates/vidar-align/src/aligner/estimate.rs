@@ -3,7 +3,7 @@
 use super::chunk::Chunk;
 use super::coupling::CouplingMode;
 use super::history::{History, LoopMeasurement, NEIGHBOURS, reports};
-use super::pose_fit::CameraPair;
+use super::pose_fit::{CameraPair, center_rms};
 use super::report::{
     ChunkPlacement, ChunkStatus, DriftReport, GraphFailure, GraphReport, KeyframePlacement, LoopReport,
     Placement, PoseCorrection, RejectionCounts, RejectionReason, ViewPlacement,
@@ -160,7 +160,7 @@ fn pose_correction(history: &History) -> Option<PoseCorrection> {
         let rms =
             |of: &dyn Fn(&CameraPair) -> f64| (pairs.iter().map(|p| of(p).powi(2)).sum::<f64>() / n).sqrt();
         let radius = rms(&|p| (p.world_from_camera.translation - mean).norm());
-        let moved = rms(&|p| (p.chunk_from_camera.translation - p.world_from_camera.translation).norm());
+        let moved = center_rms(&Sim3::IDENTITY, &pairs);
         let turned =
             rms(&|p| (p.world_from_camera.rotation.inverse() * p.chunk_from_camera.rotation).angle_rad());
         if radius > 0.0 && moved.is_finite() {

@@ -278,7 +278,8 @@ pub struct PoseCorrection {
     /// images and poses say differently of the chunk's size: errors within a chunk are correlated, so n centres know no more of it than
     /// one pair.
     pub center_share: f64,
-    /// σ of ln(size of the map) by that: chunks are taken to err independently of each other.
+    /// σ of ln(size of the map) by that: chunks are taken to err independently of each other. A lower bound: images do not show a scale that
+    /// is wrong in all of them.
     pub log_scale_std: f64,
 }
 

@@ -19,11 +19,11 @@ pub(super) fn stated_scale(map: &MetricMap, mode: CouplingMode, unseen: UnseenSc
         .map(|c| c.log_scale_std)
         .filter(|s| s.is_finite())
         .collect();
-    let contradicted = map.pose_correction().map(|(correction, _)| correction.log_scale_std);
+    let disagreement = map.pose_correction().map(|(correction, _)| correction.log_scale_std);
     let source = match map.trajectory.as_ref().map(|t| &t.source).filter(|_| mode.uses_pose_priors()) {
         None => ScaleSource::None,
-        Some(TrajectorySource::External { .. }) => ScaleSource::Given { contradicted },
-        Some(TrajectorySource::GroundTruth) => ScaleSource::GroundTruth { contradicted },
+        Some(TrajectorySource::External { .. }) => ScaleSource::Given { disagreement },
+        Some(TrajectorySource::GroundTruth) => ScaleSource::GroundTruth { disagreement },
         Some(TrajectorySource::Odometry) => {
             map.quality.as_ref().map_or(ScaleSource::None, |quality| unseen.source(quality))
         }
