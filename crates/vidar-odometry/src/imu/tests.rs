@@ -157,6 +157,29 @@ fn covariance_of_motion_is_what_noisy_measurements_scatter() {
 }
 
 #[test]
+fn one_step_has_the_covariance_of_white_noise_integrated_twice() {
+    let at_rest = |nanos| ImuSample {
+        time: Timestamp::from_nanos(nanos),
+        gyro: AngularRate(Vector3::zeros()),
+        accel: SpecificForce(Vector3::zeros()),
+    };
+    let model = model();
+    let (h, variance) = (0.005_f64, model.noise.accel_density.powi(2));
+    let found = Preintegration::new(model, Bias::ZERO, &[at_rest(0), at_rest(5_000_000)]).covariance();
+    for axis in 0..3 {
+        let (position, velocity) = (3 + axis, 6 + axis);
+        for (row, column, expected) in [
+            (position, position, variance * h.powi(3) / 3.0),
+            (position, velocity, variance * h.powi(2) / 2.0),
+            (velocity, velocity, variance * h),
+        ] {
+            assert!((found[(row, column)] / expected - 1.0).abs() < 1e-9, "({row}, {column})");
+        }
+    }
+    assert!(found.cholesky().is_some());
+}
+
+#[test]
 fn two_stretches_joined_are_the_whole() {
     let samples = imu_samples(1.0, 1.6, 200.0, &bias());
     let whole = Preintegration::new(model(), Bias::ZERO, &samples);
