@@ -14,6 +14,9 @@ use vidar_odometry::{Joined, LossReason, OdometryOutput, Status, Tracking};
 /// States that come after contradictions are doubted where less than this share has health OK.
 const DOUBTFUL_HEALTH: f64 = 0.5;
 
+/// χ² per degree of freedom of the IMU that its stated noise explains. Healthy recordings have 0.04 to 0.7.
+const SETTLED_CHI2: f64 = 1.0;
+
 /// Statements of the odometry, summed up image by image.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
 pub struct TrackQuality {
@@ -153,6 +156,12 @@ impl TrackQuality {
     pub fn longest(&self) -> Option<&SegmentQuality> {
         let longest = self.segments.iter().max_by_key(|(id, s)| (s.images, std::cmp::Reverse(**id)));
         longest.map(|(_, s)| s).filter(|s| s.images >= 2)
+    }
+
+    /// Whether the adjustment leaves of the IMU no more than its stated noise: contradictions before the start were then those of a
+    /// clock, readout or rotation that had still to be found.
+    pub fn contradictions_are_settled(&self) -> bool {
+        self.inertial_chi2().is_some_and(|chi2| chi2 < SETTLED_CHI2)
     }
 
     /// Whether sensors contradicted each other, nothing has checked the states since (no adjustment), and they are not healthy either: a

@@ -86,7 +86,7 @@ impl Findings {
             )
         });
         let contradicted = if quality.is_doubtful() { Level::Bad } else { Level::Caution };
-        self.when(quality.contradicts(), contradicted, || {
+        self.when(quality.contradicts() && !quality.contradictions_are_settled(), contradicted, || {
             let why = quality.why_not_started().unwrap_or_default();
             format!("before it started: {why}")
         });
@@ -332,21 +332,29 @@ mod tests {
     }
 
     #[test]
-    fn contradictions_that_nothing_checked_are_bad() {
-        let level = |adjusted: serde_json::Value| {
+    fn contradictions_that_nothing_checked_are_bad_and_settled_ones_are_not_told() {
+        let time = |secs: i64| {
+            serde_json::to_value(vidar_core::Timestamp::from_nanos(secs * 1_000_000_000)).unwrap()
+        };
+        let level = |adjusted: Option<f64>, health: vidar_core::Health| {
             let mut quality = serde_json::to_value(TrackQuality::default()).unwrap();
-            quality["contradictions"] = 48.into();
-            quality["waits"] = 78.into();
-            quality["adjusted"] = adjusted;
+            (quality["contradictions"], quality["waits"]) = (48.into(), 78.into());
+            quality["times"] = serde_json::json!([time(0), time(10)]);
+            quality["segments"] = serde_json::json!({ "0": {
+                "images": 100, "health": { health.as_str(): 100 }, "first": time(0), "last": time(10),
+                "last_position": [0.0, 0.0, 0.0], "last_scale_std": 0.01, "weighted": [0.0, 0.0]
+            } });
+            quality["adjusted"] = serde_json::json!(adjusted.map(|inertial_chi2| serde_json::json!({
+                "images": 100, "first": time(0), "last": time(10), "scale_std": 0.01, "inertial_chi2": inertial_chi2
+            })));
             let mut findings = Findings::default();
             findings.track(&serde_json::from_value(quality).unwrap());
             findings.verdict(Some("ATE".into())).level
         };
-        assert_eq!(level(serde_json::Value::Null), Level::Bad);
-        let time = serde_json::to_value(vidar_core::Timestamp::from_nanos(0)).unwrap();
-        let adjusted = serde_json::json!({
-            "images": 100, "first": time, "last": time, "scale_std": 0.01, "inertial_chi2": 0.1
-        });
-        assert_eq!(level(adjusted), Level::Caution);
+        use vidar_core::Health::{Degraded, Ok};
+        assert_eq!(level(None, Degraded), Level::Bad);
+        assert_eq!(level(None, Ok), Level::Caution);
+        assert_eq!(level(Some(1.5), Ok), Level::Caution);
+        assert_eq!(level(Some(0.1), Ok), Level::Good);
     }
 }
