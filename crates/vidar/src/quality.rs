@@ -44,6 +44,9 @@ struct AdjustedQuality {
     last: Timestamp,
     scale_std: f64,
     inertial_chi2: f64,
+    /// Whether it found what was given of the calibration wrong.
+    #[serde(default)]
+    contradicts_given: bool,
 }
 
 /// States of one segment.
@@ -112,6 +115,7 @@ impl TrackQuality {
             last: last.1.time,
             scale_std: adjusted.scale_std,
             inertial_chi2: adjusted.report.inertial_chi2_per_dof,
+            contradicts_given: !adjusted.findings.is_empty(),
         });
     }
 
@@ -158,10 +162,10 @@ impl TrackQuality {
         longest.map(|(_, s)| s).filter(|s| s.images >= 2)
     }
 
-    /// Whether the adjustment leaves of the IMU no more than its stated noise: contradictions before the start were then those of a
-    /// clock, readout or rotation that had still to be found.
+    /// Whether the adjustment leaves of the IMU no more than its stated noise, and nothing that was given stands against it:
+    /// contradictions before the start were then those of a clock, readout or rotation that had still to be found.
     pub fn contradictions_are_settled(&self) -> bool {
-        self.inertial_chi2().is_some_and(|chi2| chi2 < SETTLED_CHI2)
+        self.adjusted.is_some_and(|a| a.inertial_chi2 < SETTLED_CHI2 && !a.contradicts_given)
     }
 
     /// Whether sensors contradicted each other, nothing has checked the states since (no adjustment), and they are not healthy either: a

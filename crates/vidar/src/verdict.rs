@@ -336,7 +336,7 @@ mod tests {
         let time = |secs: i64| {
             serde_json::to_value(vidar_core::Timestamp::from_nanos(secs * 1_000_000_000)).unwrap()
         };
-        let level = |adjusted: Option<f64>, health: vidar_core::Health| {
+        let level = |adjusted: Option<(f64, bool)>, health: vidar_core::Health| {
             let mut quality = serde_json::to_value(TrackQuality::default()).unwrap();
             (quality["contradictions"], quality["waits"]) = (48.into(), 78.into());
             quality["times"] = serde_json::json!([time(0), time(10)]);
@@ -344,8 +344,9 @@ mod tests {
                 "images": 100, "health": { health.as_str(): 100 }, "first": time(0), "last": time(10),
                 "last_position": [0.0, 0.0, 0.0], "last_scale_std": 0.01, "weighted": [0.0, 0.0]
             } });
-            quality["adjusted"] = serde_json::json!(adjusted.map(|inertial_chi2| serde_json::json!({
-                "images": 100, "first": time(0), "last": time(10), "scale_std": 0.01, "inertial_chi2": inertial_chi2
+            quality["adjusted"] = serde_json::json!(adjusted.map(|(inertial_chi2, contradicts_given)| serde_json::json!({
+                "images": 100, "first": time(0), "last": time(10), "scale_std": 0.01, "inertial_chi2": inertial_chi2,
+                "contradicts_given": contradicts_given
             })));
             let mut findings = Findings::default();
             findings.track(&serde_json::from_value(quality).unwrap());
@@ -354,7 +355,8 @@ mod tests {
         use vidar_core::Health::{Degraded, Ok};
         assert_eq!(level(None, Degraded), Level::Bad);
         assert_eq!(level(None, Ok), Level::Caution);
-        assert_eq!(level(Some(1.5), Ok), Level::Caution);
-        assert_eq!(level(Some(0.1), Ok), Level::Good);
+        assert_eq!(level(Some((1.5, false)), Ok), Level::Caution);
+        assert_eq!(level(Some((0.1, true)), Ok), Level::Caution);
+        assert_eq!(level(Some((0.1, false)), Ok), Level::Good);
     }
 }
