@@ -25,6 +25,7 @@ mod optimise;
 mod problem;
 mod progress;
 mod result;
+mod scale_step;
 mod sigmas;
 mod thin;
 
