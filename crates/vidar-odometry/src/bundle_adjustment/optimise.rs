@@ -25,7 +25,7 @@ const FROM_GUESS: Schedule = Schedule {
 };
 
 /// From the solution of other weights or of fewer observations.
-const FROM_SOLUTION: Schedule = Schedule { first: 1e-9, ..FROM_GUESS };
+const FROM_SOLUTION: Schedule = Schedule { first: FROM_GUESS.least, ..FROM_GUESS };
 
 /// Largest damping at which a round may end. The scale of all, which images do not see, is held by the IMU a million times more weakly than
 /// single positions by images: with more damping it does not move, and a cost that no longer falls says nothing. In a hall walked

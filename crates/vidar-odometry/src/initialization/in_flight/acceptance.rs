@@ -11,7 +11,7 @@ use nalgebra::Vector3;
 use vidar_core::FrameId;
 
 /// Most standard deviation of log(scale) of a provisional start: a body that moves steadily shows no scale for long, and a camera that is not
-/// tracked meanwhile loses what would show it later. At 0.15 three of twelve such recordings (`vidar synth --flight orbit` and `sweep`, a
+/// tracked meanwhile loses what would show it later. At 0.15 seven of eighteen such recordings (`vidar synth --flight orbit` and `sweep`, a
 /// phone in motion from the first image on) had no state at all.
 const PROVISIONAL_LOG_SCALE_SIGMA: f64 = 1.0;
 
