@@ -17,19 +17,26 @@ const REINTEGRATE_GAIN: f64 = 1e-3;
 
 /// What the sensors' measurements are to be multiplied by, minus one, per axis of the body.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub(super) struct ImuGain {
-    pub(super) gyro: Vector3<f64>,
-    pub(super) accel: Vector3<f64>,
+pub(crate) struct ImuGain {
+    pub(crate) gyro: Vector3<f64>,
+    pub(crate) accel: Vector3<f64>,
 }
 
 impl ImuGain {
-    pub(super) fn applied(&self, sample: &ImuSample) -> ImuSample {
+    pub(crate) fn applied(&self, sample: &ImuSample) -> ImuSample {
         let one = Vector3::repeat(1.0);
         ImuSample {
             time: sample.time,
             gyro: AngularRate(sample.gyro.0.component_mul(&(one + self.gyro))),
             accel: SpecificForce(sample.accel.0.component_mul(&(one + self.accel))),
         }
+    }
+
+    /// What is left to apply where `used` was applied already.
+    pub(crate) fn beyond(&self, used: &Self) -> Self {
+        let ratio =
+            |new: &Vector3<f64>, old: &Vector3<f64>| new.zip_map(old, |n, o| (1.0 + n) / (1.0 + o) - 1.0);
+        Self { gyro: ratio(&self.gyro, &used.gyro), accel: ratio(&self.accel, &used.accel) }
     }
 
     pub(super) fn values(&self) -> [f64; GAIN_DIM] {
@@ -47,7 +54,7 @@ impl ImuGain {
 
 impl ImuBuffer {
     /// The same measurements with gains applied.
-    pub(super) fn multiplied(&self, gain: &ImuGain) -> Self {
+    pub(crate) fn multiplied(&self, gain: &ImuGain) -> Self {
         let mut out = Self::new(1.0 / self.nominal_period().as_secs_f64());
         for sample in self.iter() {
             // They are in order and finite, as they were.
@@ -125,5 +132,26 @@ impl InertialFactor {
             by_j: self.whitening.apply(&by_j),
             by_gain: self.whitening.apply(&by_gain),
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A gain that is applied after another one gives what the sum of knowledge says.
+    #[test]
+    fn what_is_beyond_a_used_gain_completes_it() {
+        let gain = |g: f64, a: f64| ImuGain { gyro: Vector3::new(g, 0.0, -g), accel: Vector3::repeat(a) };
+        let (used, found) = (gain(0.02, -0.01), gain(-0.01, 0.03));
+        let sample = ImuSample {
+            time: vidar_core::Timestamp::from_nanos(0),
+            gyro: AngularRate(Vector3::new(0.4, -0.2, 1.0)),
+            accel: SpecificForce(Vector3::new(1.0, 2.0, 9.0)),
+        };
+        let both = found.beyond(&used).applied(&used.applied(&sample));
+        assert!((both.gyro.0 - found.applied(&sample).gyro.0).norm() < 1e-14);
+        assert!((both.accel.0 - found.applied(&sample).accel.0).norm() < 1e-14);
+        assert_eq!(found.beyond(&ImuGain::default()), found);
     }
 }

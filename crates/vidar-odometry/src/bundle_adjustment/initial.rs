@@ -120,6 +120,10 @@ impl Guess {
         let last = log.images.iter().rposition(|i| i.is_of(segment)).unwrap_or(first);
         for image in first..=last {
             let time = log.images[image].stamp + clock_offset;
+            if imu.at(time).is_none() {
+                // With a corrected clock an image at either end may lie beyond the IMU's measurements.
+                continue;
+            }
             let state = match &log.images[image].state {
                 Some(logged) => Some(logged.state.moved(&placed)),
                 None => self.carried_to(time, imu, model),

@@ -19,6 +19,7 @@ mod keyframes;
 mod linearise;
 mod log;
 mod loops;
+mod newest;
 mod noise;
 mod observation;
 mod optimise;
@@ -30,15 +31,16 @@ mod sigmas;
 mod thin;
 
 pub use findings::AdjustmentFinding;
+pub(crate) use inertial::ImuGain;
 pub use log::TrackLog;
 pub(crate) use log::{LoggedState, TrackKey};
+pub(crate) use newest::{NewestState, newest_state};
 pub use progress::{AdjustmentStage, Progress};
 pub use result::{Adjusted, AdjustedCalibration, AdjustedImu, AdjustmentReport};
 pub use sigmas::CalibrationSigmas;
 
 use crate::imu::{ImuBuffer, ImuModel, StepNoise};
 use envelope::Envelope;
-use inertial::ImuGain;
 use initial::Guess;
 use linearise::System;
 use loops::Closed;
@@ -130,23 +132,10 @@ pub fn adjust(
     let thinned = thin::bounded(input.log);
     let log: &TrackLog = &thinned;
     let mut watch = Watch::new(log.images.len(), tell);
-    let mut imu = ImuBuffer::new(log.imu_rate_hz);
-    for sample in &log.imu {
-        // What is out of order was left out by the odometry, too.
-        let _ = imu.push(*sample);
-    }
-    let calibration = SensorCalibration {
-        camera: input.camera.model.clone(),
-        body_from_camera: input.camera.body_from_camera,
-        clock_secs: 0.0,
-        readout_secs: input.readout_secs,
-        gain: ImuGain::default(),
-    };
-    let prior = CalibrationPrior { sigmas: input.sigmas.of(&calibration), mean: calibration.clone() };
+    let imu = log.imu();
     let recording = Measurements { log, imu: &imu, model: &input.model };
-    let clock_offset = input.camera.time_offset;
-    let (segment, guess) = initial::longest_segment(log, &imu, &input.model, clock_offset);
-    let mut work = Work { calibration, prior, clock_offset, guess };
+    let (segment, guess) = initial::longest_segment(log, &imu, &input.model, input.camera.time_offset);
+    let mut work = Work::new(input, guess);
     // The longest segment first: it gives the calibration with which the rest is found.
     work.pass(&recording, &mut watch)?;
     watch.stage(AdjustmentStage::Outward, work.guess.images.len());
@@ -237,6 +226,19 @@ struct Passed {
 }
 
 impl Work {
+    /// With the calibration as it was used last.
+    fn new(input: &AdjustmentInput<'_>, guess: Guess) -> Self {
+        let calibration = SensorCalibration {
+            camera: input.camera.model.clone(),
+            body_from_camera: input.camera.body_from_camera,
+            clock_secs: 0.0,
+            readout_secs: input.readout_secs,
+            gain: ImuGain::default(),
+        };
+        let prior = CalibrationPrior { sigmas: input.sigmas.of(&calibration), mean: calibration.clone() };
+        Self { calibration, prior, clock_offset: input.camera.time_offset, guess }
+    }
+
     /// Adjusts all states of the guess.
     fn pass(
         &mut self,
@@ -290,6 +292,11 @@ const SETTLED_NOISE: f64 = 0.05;
 /// Standard deviations of a place that was given and is not believed any more.
 const WIDE_ROTATION_RAD: f64 = 0.1;
 const WIDE_POSITION_M: f64 = 0.3;
+
+/// Largest mean squared whitened inertial residual, and largest share of observations left out, of a solution in which camera
+/// and IMU agree. Healthy recordings have 0.04 to 0.7 (the stated noise is inflated) and 0.1 to 3 %.
+const MAX_INERTIAL_CHI2: f64 = 3.0;
+const MAX_REJECTED_SHARE: f64 = 0.2;
 
 /// Fewest landmarks of a recording.
 const MIN_LANDMARKS: usize = 30;

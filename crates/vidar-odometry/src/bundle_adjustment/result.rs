@@ -5,7 +5,10 @@ use super::inertial::GAIN_DIM;
 use super::initial::preintegrate;
 use super::linearise::System;
 use super::problem::{FRAME_DIM, Problem};
-use super::{AdjustmentFinding, AdjustmentInput, Measurements, Solution, findings, keyframes};
+use super::{
+    AdjustmentFinding, AdjustmentInput, MAX_INERTIAL_CHI2, MAX_REJECTED_SHARE, Measurements, Solution,
+};
+use super::{findings, keyframes};
 use crate::backend::dot;
 use crate::imu::{ImuBuffer, ImuModel, NavState};
 use crate::pipeline::{Joined, public_state};
@@ -92,11 +95,6 @@ pub struct Adjusted {
     /// How it went.
     pub report: AdjustmentReport,
 }
-
-/// Largest mean squared whitened inertial residual, and largest share of observations left out, of a solution in which camera
-/// and IMU agree. Healthy recordings have 0.04 to 0.7 (the stated noise is inflated) and 0.1 to 3 %.
-const MAX_INERTIAL_CHI2: f64 = 3.0;
-const MAX_REJECTED_SHARE: f64 = 0.2;
 
 impl Adjusted {
     /// Takes all poses to the world of another segment.
@@ -237,7 +235,7 @@ fn calibration_sigmas(problem: &Problem, covariance: &Envelope) -> Vec<f64> {
 }
 
 /// With positions `p_k` about their mean `m`, `d ln s / d p_k = (p_k − m) / Σ |p − m|²`.
-fn log_scale_sigma(problem: &Problem, system: &System) -> f64 {
+pub(super) fn log_scale_sigma(problem: &Problem, system: &System) -> f64 {
     let places: Vec<Vector3<f64>> =
         problem.frames.iter().map(|f| f.body.state.world_from_body.translation).collect();
     let mean = places.iter().sum::<Vector3<f64>>() / places.len() as f64;

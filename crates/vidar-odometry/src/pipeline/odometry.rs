@@ -6,7 +6,7 @@ use super::orientation_check::{MAX_TURN_DEG, OrientationCheck};
 use super::output::{DivergenceSign, LossReason, OdometryOutput, Status};
 use super::time_calibration::TimeCalibration;
 use super::working_size::WorkingSize;
-use crate::bundle_adjustment::TrackLog;
+use crate::bundle_adjustment::{ImuGain, TrackLog};
 use crate::config::{ImuUse, OdometryConfig};
 use crate::error::OdometryError;
 use crate::frontend::PYRAMID_LEVELS;
@@ -15,6 +15,7 @@ use crate::initialization::{InitFailure, InitFailureReason, Initializer};
 use crate::stages::{Stage, StageClock, StageTimes};
 use crate::tracking::{FrameInput, HostImage, ImagePool, SlidingWindowOdometry, TrackRecord};
 use relocalization::Relocalizer;
+use settling::Settling;
 use start::initializer;
 use std::collections::VecDeque;
 use std::sync::Arc;
@@ -29,6 +30,7 @@ mod joined_segments;
 mod relocalization;
 mod report;
 mod saved_map;
+mod settling;
 mod start;
 mod successor;
 mod timing;
@@ -73,7 +75,9 @@ pub struct Odometry {
     /// As the caller's calibration has it.
     given_body_from_camera: Se3,
     imu_model: Option<ImuModel>,
+    /// With `imu_gain` applied.
     imu: ImuBuffer,
+    imu_gain: ImuGain,
     pending: VecDeque<Frame>,
     phase: Phase,
     counts: InputCounts,
@@ -98,9 +102,12 @@ pub struct Odometry {
     /// Images that an odometry with another timing would begin with, as long as the timing is not settled.
     recent: RecentFrames,
     successor: Option<Successor>,
+    settling: Settling,
     clock: StageClock,
-    /// What is kept for the adjustment, where one is wanted.
+    /// What is kept for adjustments: of a scale that is not settled, and after the end.
     log: Option<TrackLog>,
+    /// Whether one after the end is wanted.
+    keeps_log: bool,
 }
 
 impl Odometry {
@@ -130,7 +137,8 @@ impl Odometry {
         let config = OdometryConfig { imu, ..config.clone() };
         let samples = ImuBuffer::new(noise.map_or(200.0, |n| n.rate_hz));
         let fresh = Self::fresh(config, (camera, rig_camera), working, imu_model, samples);
-        Ok(Self { given_body_from_camera, ..fresh })
+        let settling = Settling::new(fresh.imu_model.is_some());
+        Ok(Self { given_body_from_camera, settling, log: fresh.new_log(), ..fresh })
     }
 
     /// An odometry that has seen nothing; `camera` is that of the images that are worked with.
@@ -147,17 +155,20 @@ impl Odometry {
             config,
             camera_id,
             check: OrientationCheck::new(&camera.body_from_camera.rotation),
-            recent: RecentFrames::new(imu_model.is_some() && !time_calibration.is_settled()),
+            recent: RecentFrames::new(imu_model.is_some()),
             successor: None,
+            settling: Settling::new(false),
             time_calibration,
             images: ImagePool::default(),
             clock: StageClock::start(),
             log: None,
+            keeps_log: false,
             given_body_from_camera: camera.body_from_camera,
             camera,
             working,
             imu_model,
             imu,
+            imu_gain: ImuGain::default(),
             pending: VecDeque::new(),
             phase,
             counts: InputCounts::default(),
@@ -186,20 +197,22 @@ impl Odometry {
     /// An image of another size than its camera's model.
     pub fn push(&mut self, event: SensorEvent) -> Result<Option<OdometryOutput>, OdometryError> {
         match event {
-            SensorEvent::Imu(sample) if self.imu_model.is_some() => match self.imu.push(sample) {
-                Ok(()) => {
-                    self.counts.imu_samples += 1;
-                    self.successor.iter_mut().for_each(|s| s.add_imu(sample));
-                    if let Some(log) = &mut self.log {
-                        log.add_imu(&sample);
+            SensorEvent::Imu(sample) if self.imu_model.is_some() => {
+                match self.imu.push(self.imu_gain.applied(&sample)) {
+                    Ok(()) => {
+                        self.counts.imu_samples += 1;
+                        self.successor.iter_mut().for_each(|s| s.add_imu(sample));
+                        if let Some(log) = &mut self.log {
+                            log.add_imu(&sample);
+                        }
+                        match self.imu_model.is_some_and(|m| sample.gyro.0.amax() >= m.gyro_limit) {
+                            true => self.time_calibration.forget(),
+                            false => self.time_calibration.add_gyro(&sample),
+                        }
                     }
-                    match self.imu_model.is_some_and(|m| sample.gyro.0.amax() >= m.gyro_limit) {
-                        true => self.time_calibration.forget(),
-                        false => self.time_calibration.add_gyro(&sample),
-                    }
+                    Err(_) => self.counts.imu_samples_rejected += 1,
                 }
-                Err(_) => self.counts.imu_samples_rejected += 1,
-            },
+            }
             SensorEvent::Image(frame) if frame.camera == self.camera_id => self.take_image(frame)?,
             _ => {}
         }
@@ -289,6 +302,8 @@ impl Odometry {
             None => status,
         };
         self.clock.lap(if was_starting { Stage::Initialise } else { Stage::Output });
+        self.settle_scale(&status, frame.time);
+        self.shorten_log(frame.time);
         let status = self.follow_successor(id).unwrap_or(status);
         let used_from = self.last_frame.unwrap_or(time) - Duration::from_millis(1500);
         self.imu.forget_before(self.recent.oldest().map_or(used_from, |t| used_from.min(t)));
@@ -355,6 +370,8 @@ impl Odometry {
     /// Gives the state up and starts anew.
     fn lose(&mut self, reason: LossReason) -> Status {
         self.successor = None;
+        self.settling.begin_anew();
+        self.recent.go_on(!self.settling.is_over());
         self.keep_clock_offset(&reason);
         self.initialize_anew();
         self.health_monitor = HealthMonitor::default();

@@ -38,7 +38,7 @@ impl Odometry {
         let state = state.filter(|_| is_seen).map(logged);
         let Some(log) = &mut self.log else { return };
         log.add_image(id, (frame.id, frame.time), state, shown);
-        if let Some(host) = self.last_host.as_ref().filter(|host| host.frame == id) {
+        if let Some(host) = self.last_host.as_ref().filter(|host| self.keeps_log && host.frame == id) {
             log.add_place(frame.time, host);
         }
         if let Phase::Tracking(window) = &self.phase {
@@ -49,7 +49,8 @@ impl Odometry {
     /// Keeps tracks and IMU measurements from here on, for [`Odometry::adjust`]: about 2 MB per minute of recording, and at most
     /// 32 MB of grey levels.
     pub fn keep_log(&mut self) {
-        self.log = Some(TrackLog::new(1.0 / self.imu.nominal_period().as_secs_f64()));
+        self.keeps_log = true;
+        self.log = self.new_log();
     }
 
     /// Drops the grey levels that were kept: the adjustment then has no loop constraints.
@@ -74,7 +75,8 @@ impl Odometry {
         sigmas: &CalibrationSigmas,
         tell: &mut dyn FnMut(Progress) -> ControlFlow<()>,
     ) -> Result<Adjusted, AdjustmentError> {
-        let (Some(log), Some(model)) = (&self.log, &self.imu_model) else {
+        let kept = self.log.as_ref().filter(|_| self.keeps_log);
+        let (Some(log), Some(model)) = (kept, &self.imu_model) else {
             return Err(AdjustmentError::TooShort { images: 0 });
         };
         let mut camera = self.camera.clone();

@@ -42,7 +42,7 @@ impl Odometry {
             Ok(at_rest) => at_rest,
             Err(failure) => return self.wait(failure),
         };
-        match self.start_at(host, time, &at_rest) {
+        match self.start_at(host, time, &at_rest, INITIAL_INVERSE_DISTANCE) {
             Ok(mut window) => {
                 window.stand(time);
                 self.begin(window, frame, host.frame)
@@ -67,18 +67,19 @@ impl Odometry {
         let Some(slow) = initialize_slow(&samples, &gyro_bias, self.config.gravity_mps2) else {
             return self.wait(failure);
         };
-        match self.start_at(host, time, &slow) {
+        match self.start_at(host, time, &slow, INITIAL_INVERSE_DISTANCE) {
             Ok(window) => self.begin(window, frame, host.frame),
             Err(error) => self.wait(InitFailure::backend(error)),
         }
     }
 
-    /// A window that begins with this image and state.
-    fn start_at(
+    /// A window that begins with this image and state, among things at `typical_inverse` (1/m).
+    pub(super) fn start_at(
         &mut self,
         host: &Arc<HostImage>,
         time: Timestamp,
         start: &StaticState,
+        typical_inverse: f64,
     ) -> Result<SlidingWindowOdometry, SmootherError> {
         self.time_calibration.forget_tracks();
         self.log.iter_mut().for_each(TrackLog::next_generation);
@@ -86,9 +87,9 @@ impl Odometry {
         smoother.start(host.frame, time, start.state, start.sigmas)?;
         smoother.mark_keyframe(host.frame)?;
         let mut tracker = Tracker::new(self.camera.model.clone(), IMAGE_NOISE_GRAY);
-        tracker.detect(host, 2 * self.config.max_landmarks, INITIAL_INVERSE_DISTANCE);
+        tracker.detect(host, 2 * self.config.max_landmarks, typical_inverse);
         let (config, hosts) = (self.config.clone(), vec![host.clone()]);
-        SlidingWindowOdometry::new(config, smoother, tracker, hosts, INITIAL_INVERSE_DISTANCE)
+        SlidingWindowOdometry::new(config, smoother, tracker, hosts, typical_inverse)
     }
 
     /// Goes on with the smoother that solved the start.
@@ -117,7 +118,7 @@ impl Odometry {
         }
     }
 
-    fn begin(&mut self, window: SlidingWindowOdometry, frame: &Frame, id: FrameId) -> Status {
+    pub(super) fn begin(&mut self, window: SlidingWindowOdometry, frame: &Frame, id: FrameId) -> Status {
         self.phase = Phase::Tracking(Box::new(window));
         let step = StepReport { just_started: true, is_keyframe: true, ..StepReport::default() };
         self.report(&step, frame, id)

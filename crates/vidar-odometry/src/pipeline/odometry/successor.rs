@@ -3,18 +3,20 @@
 //! instants that the recording decides: an image waits for it only where a slice is not done when it is due.
 
 use super::{Odometry, Phase, Status};
-use crate::bundle_adjustment::TrackLog;
+use crate::bundle_adjustment::{NewestState, TrackLog};
 use crate::config::OdometryConfig;
 use crate::deferred::Deferred;
+use crate::frontend::PYRAMID_LEVELS;
+use crate::initialization::StaticState;
 use crate::pipeline::health::HealthMonitor;
 use crate::pipeline::output::LossReason;
 use crate::pipeline::time_calibration::Correction;
 use nalgebra::Vector3;
 use std::collections::VecDeque;
-use vidar_core::{Duration, Frame, FrameId, ImuSample, LieGroup, Se3, So3, Timestamp};
+use vidar_core::{Duration, Frame, FrameId, ImuSample, LieGroup, RigCamera, Se3, So3, Timestamp};
 
-/// Images kept, s and number: the longest stretch that a start in motion is solved from.
-const REPLAY_SECS: f64 = 2.8;
+/// Images kept, s and number: the longest stretch that a start in motion is solved from, or an adjustment takes; with some to spare.
+const REPLAY_SECS: f64 = 3.5;
 const REPLAY_FRAMES: usize = 100;
 
 /// IMU measurements kept before the oldest image, s: clocks differ by 0.15 s at most, and half a second shows a body at rest.
@@ -57,6 +59,11 @@ impl RecentFrames {
         Self { keeps, frames: VecDeque::new() }
     }
 
+    /// Keeps images again, where they are needed again.
+    pub fn go_on(&mut self, is_needed: bool) {
+        self.keeps |= is_needed;
+    }
+
     pub fn add(&mut self, id: FrameId, frame: &Frame) {
         if !self.keeps {
             return;
@@ -87,7 +94,10 @@ pub(super) struct Successor {
     /// What came during a slice.
     samples: Vec<ImuSample>,
     images: Vec<RecentFrame>,
-    correction: Correction,
+    /// Where it has other values of the camera than the first one.
+    correction: Option<Correction>,
+    /// Where it begins with a state from an adjustment.
+    begun: Option<NewestState>,
     since: Timestamp,
 }
 
@@ -146,7 +156,7 @@ impl Successor {
         let catch_up = self.catch_up.as_mut()?;
         for sample in self.samples.drain(..) {
             // What the first odometry took, this one takes: their buffers hold the same.
-            let _ = catch_up.odometry.imu.push(sample);
+            let _ = catch_up.odometry.imu.push(catch_up.odometry.imu_gain.applied(&sample));
         }
         catch_up.waiting.extend(self.images.drain(..));
         if catch_up.ready() <= AT_ONCE {
@@ -186,16 +196,62 @@ impl Odometry {
             ..self.config.clone()
         };
         let camera = (self.camera_id, camera);
-        let odometry = Self::fresh(config, camera, self.working.another(), self.imu_model, self.imu.clone());
+        let mut odometry =
+            Self::fresh(config, camera, self.working.another(), self.imu_model, self.imu.clone());
+        odometry.imu_gain = self.imu_gain;
         self.successor = Some(Successor {
             catch_up: Some(Box::new(CatchUp { odometry, waiting: self.recent.frames.clone() })),
             slice: None,
             samples: Vec::new(),
             images: Vec::new(),
             since: newest.frame.time,
-            correction: *correction,
+            correction: Some(*correction),
+            begun: None,
         });
         true
+    }
+
+    /// Begins a second odometry with the state that an adjustment found for an image that is kept, and with its clock, readout and gains.
+    pub(super) fn begin_successor_at(&mut self, begun: NewestState) -> Option<()> {
+        let now = self.recent.frames.back()?.frame.time;
+        let at = self.recent.frames.iter().position(|f| f.id == begun.frame)?;
+        let camera = RigCamera { time_offset: begun.time_offset, ..self.camera.clone() };
+        let config = OdometryConfig {
+            readout_ms: Some(1e3 * begun.readout_secs.max(0.0)),
+            align_timing: false,
+            ..self.config.clone()
+        };
+        let camera = (self.camera_id, camera);
+        let imu = self.imu.multiplied(&begun.gain.beyond(&self.imu_gain));
+        let mut odometry = Self::fresh(config, camera, self.working.another(), self.imu_model, imu);
+        odometry.imu_gain = begun.gain;
+        odometry.begin_at(&begun, &self.recent.frames[at].frame)?;
+        self.successor = Some(Successor {
+            catch_up: Some(Box::new(CatchUp {
+                odometry,
+                waiting: self.recent.frames.range(at + 1..).cloned().collect(),
+            })),
+            slice: None,
+            samples: Vec::new(),
+            images: Vec::new(),
+            since: now,
+            correction: None,
+            begun: Some(begun),
+        });
+        Some(())
+    }
+
+    /// Begins with a state that is known and the image that it belongs to.
+    fn begin_at(&mut self, begun: &NewestState, frame: &Frame) -> Option<()> {
+        let time = self.imu_time(frame);
+        let host = self.images.take(begun.frame, &frame.image, PYRAMID_LEVELS, self.shutter_at(time))?;
+        let start = StaticState { state: begun.state, sigmas: begun.sigmas };
+        let typical_inverse = 1.0 / begun.median_distance_m.clamp(0.1, 100.0);
+        let window = self.start_at(&host, time, &start, typical_inverse).ok()?;
+        self.last_frame = Some(time);
+        self.last_host = Some(host.clone());
+        self.begin(window, frame, host.frame);
+        matches!(self.phase, Phase::Tracking(_)).then_some(())
     }
 
     /// Lets the second odometry, if there is one, work on its images up to the newest, `id`, and goes on with its state when it has
@@ -211,7 +267,7 @@ impl Odometry {
         newest.world_from_body = pose;
         let newest = newest.clone();
         let Some(mut successor) = self.successor.take() else {
-            if self.time_calibration.is_settled() {
+            if self.time_calibration.is_settled() && self.settling.is_over() {
                 self.recent = RecentFrames::new(false);
             }
             return None;
@@ -233,22 +289,26 @@ impl Odometry {
                 successor.go_on(now, has_state);
                 self.successor = Some(successor);
             }
-            _ => return self.correct(&successor.correction),
+            _ => return successor.correction.and_then(|correction| self.correct(&correction)),
         }
         None
     }
 
     /// Takes the second odometry's state over; `world_from_new` leads from its world to that of the segment.
     fn go_on_with(&mut self, successor: Successor, world_from_new: Option<Se3>) {
-        let correction = successor.correction;
         let Some(catch_up) = successor.catch_up else { return };
         let new = catch_up.odometry;
         let reason = LossReason::Recalibrated {
-            time_offset_ms: 1e3 * correction.offset_secs,
-            readout_ms: 1e3 * correction.readout_secs,
+            time_offset_ms: 1e3 * new.camera.time_offset.as_secs_f64(),
+            readout_ms: 1e3 * new.time_calibration.readout_secs,
         };
+        if let (Some(log), Some(begun), Some(placed)) = (&mut self.log, &successor.begun, &world_from_new) {
+            log.replace_states(self.segment, &begun.states, placed);
+        }
         self.relocalizer.lose(&reason, new.last_frame.unwrap_or_default());
         self.camera = new.camera;
+        self.time_calibration.readout_secs = new.time_calibration.readout_secs;
+        (self.imu, self.imu_gain) = (new.imu, new.imu_gain);
         self.phase = new.phase;
         self.check = new.check;
         self.last_frame = new.last_frame;

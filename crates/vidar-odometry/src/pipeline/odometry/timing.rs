@@ -1,5 +1,6 @@
 //! The camera's clock, readout and rotation, as they are found while images come.
 
+use super::settling::Settling;
 use super::successor::RecentFrames;
 use super::{Odometry, Phase, Status};
 use crate::backend::CalibrationEstimate;
@@ -49,6 +50,7 @@ impl Odometry {
         let mut odometry = Self::new(rig, camera, config)?;
         // Here no state is worth more than the values.
         odometry.recent = RecentFrames::new(false);
+        odometry.settling = Settling::new(false);
         let mut first = None;
         for event in events {
             odometry.push(event)?;

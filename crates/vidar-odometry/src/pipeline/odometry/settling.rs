@@ -1,0 +1,155 @@
+//! A provisional scale is settled by adjustments of all that was seen so far, beside the odometry.
+//!
+//! A sliding window takes what it marginalises at the scale that it had then, and with the clock and the gains that were given. Where the scale
+//! was far off, or a body moves so steadily that a gain of 1 % is as large as what tells the scale, the window knows less of it than it
+//! says, and stays off. Adjusted all together with clock and gains among the unknowns, the same measurements give the scale with an honest
+//! σ; the odometry then goes on from the newest state of the adjustment (decision 38).
+
+use super::{Odometry, Status};
+use crate::bundle_adjustment::{AdjustmentInput, CalibrationSigmas, NewestState, TrackLog, newest_state};
+use crate::deferred::Deferred;
+use vidar_core::{Duration, Timestamp};
+
+/// Standard deviation of ln(scale) below which there is a scale to settle: a body that stands shows none.
+const BEGUN_STD: f64 = 1.0;
+
+/// A start is provisional where σ is still above this so long, s, after that.
+const PROVISIONAL_STD: f64 = 0.1;
+const JUDGED_SECS: f64 = 0.5;
+
+/// A scale that is known this well needs no adjustment: the calibration is not known better.
+const SETTLED_STD: f64 = 0.02;
+
+/// First adjustment, s after the start; each later one after twice that time, up to the last. At first the scale is worst; in 40 s a hand turns
+/// and accelerates often enough.
+const FIRST_SECS: f64 = 2.5;
+const LAST_SECS: f64 = 40.0;
+
+/// Time of the recording until the result is taken over, s: some 20 to 200 states, up to half a minute of them on one core where it is slow.
+const SOLVING_SECS: f64 = 2.0;
+
+/// Stretch before the start that is adjusted, too, s, and how much earlier its IMU measurements begin: clocks differ by less.
+const BEFORE_SECS: f64 = 4.0;
+const IMU_BEFORE_SECS: f64 = 0.5;
+
+/// A result that knows the scale no better is not gone on from.
+const MAX_SCALE_STD: f64 = 0.5;
+
+/// The provisional scale of the present state.
+#[derive(Debug)]
+pub(super) struct Settling {
+    /// Whether scales are settled at all.
+    is_wanted: bool,
+    began: Option<Timestamp>,
+    is_provisional: bool,
+    /// When the next adjustment is due, s after the start.
+    due_secs: f64,
+    is_over: bool,
+    solving: Option<Deferred<Option<NewestState>>>,
+}
+
+impl Settling {
+    /// Before a start. `is_wanted` is false for an odometry whose states are not given out.
+    pub fn new(is_wanted: bool) -> Self {
+        let due_secs = FIRST_SECS;
+        Self { is_wanted, began: None, is_provisional: false, due_secs, is_over: false, solving: None }
+    }
+
+    /// The state was given up.
+    pub fn begin_anew(&mut self) {
+        *self = Self::new(self.is_wanted);
+    }
+
+    /// Whether nothing is needed for it any more.
+    pub fn is_over(&self) -> bool {
+        self.is_over || !self.is_wanted
+    }
+
+    /// The time before which nothing is adjusted, at `now`.
+    fn needed_from(&self, now: Timestamp) -> Timestamp {
+        self.began.unwrap_or(now) - Duration::from_secs_f64(BEFORE_SECS)
+    }
+}
+
+impl Odometry {
+    /// Adjusts what was seen so far where that is due, and goes on from a result that is due.
+    pub(super) fn settle_scale(&mut self, status: &Status, now: Timestamp) {
+        let Status::Tracking(tracking) = status else { return };
+        let settling = &mut self.settling;
+        if settling.is_over() || (settling.began.is_none() && !(tracking.scale_std < BEGUN_STD)) {
+            return;
+        }
+        let age = (now - *settling.began.get_or_insert(now)).as_secs_f64();
+        settling.is_provisional |= age >= JUDGED_SECS && tracking.scale_std > PROVISIONAL_STD;
+        if let Some(solving) = settling.solving.take_if(|s| s.is_due(now)) {
+            if let Some(found) = solving.result().flatten().filter(|found| self.is_contradicted_by(found)) {
+                self.begin_successor_at(found);
+            }
+            return;
+        }
+        let due = settling.due_secs;
+        if age < due || settling.solving.is_some() || self.successor.is_some() {
+            return;
+        }
+        settling.due_secs = 2.0 * due;
+        let is_settled = !settling.is_provisional || tracking.scale_std < SETTLED_STD;
+        settling.is_over = is_settled || due > LAST_SECS;
+        if !settling.is_over() {
+            let since = settling.needed_from(now);
+            self.settling.solving =
+                self.begin_newest_state(since, now + Duration::from_secs_f64(SOLVING_SECS));
+        }
+    }
+
+    /// Whether the window's scale differs from an adjustment's by more than that does not know. Where it does not, the window goes on: a new one
+    /// would know less of the scene.
+    fn is_contradicted_by(&self, found: &NewestState) -> bool {
+        let difference = self.log.as_ref().and_then(|log| log.log_scale_to(&found.states, self.segment));
+        found.scale_std < MAX_SCALE_STD
+            && self.successor.is_none()
+            && difference.is_some_and(|ln| ln.abs() > found.scale_std)
+    }
+
+    /// Keeps no more of the log than is needed, where it is kept for nothing else.
+    pub(super) fn shorten_log(&mut self, now: Timestamp) {
+        if self.keeps_log {
+            return;
+        }
+        let from = self.settling.needed_from(now);
+        match &mut self.log {
+            Some(_) if self.settling.is_over() => self.log = None,
+            Some(log) => log.forget_before(from, Duration::from_secs_f64(IMU_BEFORE_SECS)),
+            None if self.settling.is_over() => {}
+            None => self.log = self.new_log(),
+        }
+    }
+
+    /// A log that begins now.
+    pub(super) fn new_log(&self) -> Option<TrackLog> {
+        self.imu_model.map(|_| TrackLog::new(1.0 / self.imu.nominal_period().as_secs_f64()))
+    }
+
+    /// Begins an adjustment of what was logged from `since` on.
+    fn begin_newest_state(&self, since: Timestamp, due: Timestamp) -> Option<Deferred<Option<NewestState>>> {
+        let (log, model) = (self.log.as_ref()?, self.imu_model?);
+        let log = log.since(since, Duration::from_secs_f64(IMU_BEFORE_SECS));
+        let mut camera = self.camera.clone();
+        camera.time_offset += self.estimated_offset();
+        let readout_secs = self.time_calibration.readout_secs;
+        let given_body_from_camera = self.given_body_from_camera;
+        let solve = move || {
+            let input = AdjustmentInput {
+                log: &log,
+                camera: &camera,
+                readout_secs,
+                given_body_from_camera,
+                // Gains are among the unknowns.
+                model: model.with_gyro_gain_std(0.0),
+                data_sheet: model.noise,
+                sigmas: &CalibrationSigmas::default(),
+            };
+            newest_state(&input).ok()
+        };
+        Some(Deferred::begin(due, solve))
+    }
+}
