@@ -163,16 +163,16 @@ fn a_frame_asks_the_allocator_for_nothing_once_buffers_have_grown() {
     assert_eq!(requests, 0, "requests to the allocator in a frame");
 }
 
-/// Five seconds of flight, all events in the order of time.
+/// Eight seconds of flight, all events in the order of time.
 fn flight() -> (vidar_core::Rig, Vec<SensorEvent>) {
-    let config = SynthConfig { start: Start::InFlight, duration_secs: 5.0, ..SynthConfig::default() };
+    let config = SynthConfig { start: Start::InFlight, duration_secs: 8.0, ..SynthConfig::default() };
     let path = FlightPath::built_in(&config).unwrap();
     let world = World::build(&config, &path).unwrap();
     let camera = vidar_synth::euroc_camera(config.width, config.height).unwrap();
     let body_from_camera = vidar_synth::euroc_body_from_camera();
     let imu = simulate_imu(&path, &config).samples;
     let begin: Timestamp = imu[0].time;
-    let views: Vec<SynthView> = (0..100)
+    let views: Vec<SynthView> = (0..160)
         .map(|k| SynthView {
             world_from_camera: path.world_from_body(0.05 * f64::from(k)) * body_from_camera,
             camera: camera.clone(),
@@ -195,7 +195,7 @@ fn flight() -> (vidar_core::Rig, Vec<SensorEvent>) {
 #[test]
 fn an_image_of_a_running_odometry_asks_only_for_what_is_handed_out() {
     let (rig, events) = flight();
-    // Clock and readout are known: their estimation in the first seconds allocates.
+    // Clock and readout are known: their estimation in the first seconds allocates. So does what is kept for 2.5 s to settle the scale from.
     let config =
         OdometryConfig { readout_ms: Some(0.0), estimate_time_offset: false, ..OdometryConfig::default() };
     let mut odometry = Odometry::new(&rig, CameraId(0), &config).unwrap();

@@ -265,13 +265,13 @@ impl Odometry {
         };
         let newest = self.recent.frames.back_mut().filter(|f| f.id == id)?;
         newest.world_from_body = pose;
-        let newest = newest.clone();
         let Some(mut successor) = self.successor.take() else {
             if self.time_calibration.is_settled() && self.settling.is_over() {
                 self.recent = RecentFrames::new(false);
             }
             return None;
         };
+        let newest = newest.clone();
         let now = newest.frame.time;
         let waited_secs = (now - successor.since).as_secs_f64();
         if waited_secs > 0.0 {
