@@ -1,6 +1,8 @@
 //! The newest state of a log from an adjustment of all its states, while the odometry goes on.
 
 use super::inertial::ImuGain;
+use super::initial::onto;
+use super::log::{LoggedState, TrackLog};
 use super::problem::{FRAME_DIM, Problem};
 use super::progress::Watch;
 use super::{
@@ -9,10 +11,13 @@ use super::{
 use super::{grow, initial, optimise, result};
 use crate::backend::GaugePriorSigmas;
 use crate::imu::{Matrix15, NavState, hat};
-use nalgebra::Matrix3;
+use nalgebra::{Matrix3, Vector3};
 use std::ops::ControlFlow;
-use vidar_core::{Duration, FrameId, LieGroup};
+use vidar_core::{Duration, FrameId, LieGroup, Se3};
 use vidar_solve::statistics::median_upper;
+
+/// States whose scale is compared with others of the same images: some 2 s.
+const COMPARED_STATES: usize = 12;
 
 /// The newest state that a log determines.
 #[derive(Clone, Debug)]
@@ -111,5 +116,91 @@ fn sigmas(state: &NavState, covariance: &Matrix15) -> GaugePriorSigmas {
         gyro_bias: largest(block(9, 9)),
         accel_bias: largest(block(12, 12)),
         ..GaugePriorSigmas::GAUGE
+    }
+}
+
+impl TrackLog {
+    /// `ln` of how much larger the newest [`COMPARED_STATES`] of other states (in the order of numbers) are than those logged in `segment`: by the
+    /// scatter of their positions. `None` where either does not move.
+    pub(crate) fn log_scale_to(&self, states: &[(FrameId, NavState)], segment: u32) -> Option<f64> {
+        let both = self.images.iter().rev().filter(|image| image.is_of(segment)).filter_map(|image| {
+            let at = states.binary_search_by_key(&image.number(), |(frame, _)| *frame).ok()?;
+            let place = |state: &NavState| state.world_from_body.translation;
+            Some((place(&image.state?.state), place(&states[at].1)))
+        });
+        let (logged, other): (Vec<_>, Vec<_>) = both.take(COMPARED_STATES).unzip();
+        let scatter = |places: &[Vector3<f64>]| {
+            let mean = places.iter().sum::<Vector3<f64>>() / places.len().max(1) as f64;
+            places.iter().map(|p| (p - mean).norm_squared()).sum::<f64>()
+        };
+        let ln = 0.5 * (scatter(&other) / scatter(&logged)).ln();
+        ln.is_finite().then_some(ln)
+    }
+
+    /// Takes over other states of logged images (in the order of numbers), moved into the world of `segment`. Later states of the segment follow the
+    /// last of them with their own motion, in its scale.
+    pub(crate) fn replace_states(&mut self, segment: u32, states: &[(FrameId, NavState)], placed: &Se3) {
+        let Some((last, newest)) = states.last().map(|(frame, state)| (*frame, state.moved(placed))) else {
+            return;
+        };
+        let factor = self.log_scale_to(states, segment).unwrap_or(0.0).exp();
+        let before =
+            self.images.iter().find(|i| i.number() == last && i.is_of(segment)).and_then(|i| i.state);
+        for image in &mut self.images {
+            if let Ok(at) = states.binary_search_by_key(&image.number(), |(frame, _)| *frame) {
+                image.state = Some(LoggedState { segment, state: states[at].1.moved(placed) });
+            } else if image.number() > last && image.is_of(segment) {
+                image.state = image.state.zip(before).map(|(logged, before)| {
+                    let (from, mut state) = (before.state.world_from_body, logged.state);
+                    let moved = state.world_from_body.translation - from.translation;
+                    state.world_from_body.translation = from.translation + moved * factor;
+                    state.velocity *= factor;
+                    LoggedState { segment, state: state.moved(&onto(&from, &newest.world_from_body)) }
+                });
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::log::tests::log;
+    use super::*;
+
+    #[test]
+    fn scales_are_compared_by_the_newest_common_states() {
+        let log = log(20);
+        let mut larger: Vec<_> =
+            log.images.iter().filter_map(|i| Some((i.number(), i.state?.state))).take(18).collect();
+        assert_eq!(log.log_scale_to(&larger, 3), Some(0.0));
+        larger.iter_mut().for_each(|(_, s)| s.world_from_body.translation *= 1.5);
+        // An old one does not count.
+        larger[2].1.world_from_body.translation.y = 100.0;
+        let ln = log.log_scale_to(&larger, 3).unwrap();
+        assert!((ln - 1.5_f64.ln()).abs() < 1e-12, "{ln}");
+        assert_eq!(log.log_scale_to(&larger, 4), None);
+        larger.iter_mut().for_each(|(_, s)| *s = NavState::REST);
+        assert_eq!(log.log_scale_to(&larger, 3), None);
+    }
+
+    #[test]
+    fn states_taken_over_are_moved_and_later_ones_forgotten() {
+        let mut log = log(6);
+        log.images[5].state = log.images[5].state.map(|s| LoggedState { segment: 4, ..s });
+        let placed = Se3::new(vidar_core::So3::IDENTITY, Vector3::new(0.0, 7.0, 0.0));
+        let solved = |k: u32| {
+            let mut state = NavState::REST;
+            state.world_from_body.translation.z = 8.0 * f64::from((k - 1) / 2);
+            (FrameId(k), state)
+        };
+        log.replace_states(3, &[solved(1), solved(3)], &placed);
+        let place = |k: usize| log.images[k].state.map(|s| s.state.world_from_body.translation);
+        assert_eq!(place(0), Some(Vector3::zeros()), "before what was solved");
+        assert_eq!(place(1), Some(Vector3::new(0.0, 7.0, 0.0)));
+        assert_eq!(place(2), Some(Vector3::new(2.0, 0.0, 0.0)), "not solved");
+        assert_eq!(place(3), Some(Vector3::new(0.0, 7.0, 8.0)));
+        // The last two states that were solved are four times as far apart as they were; what follows goes on from there.
+        assert_eq!(place(4), Some(Vector3::new(4.0, 7.0, 8.0)), "after what was solved");
+        assert_eq!(place(5), Some(Vector3::new(5.0, 0.0, 0.0)), "of another segment");
     }
 }
