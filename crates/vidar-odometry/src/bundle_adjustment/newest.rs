@@ -54,9 +54,12 @@ pub(crate) fn newest_state(input: &AdjustmentInput<'_>) -> Result<NewestState, A
     let recording = Measurements { log, imu: &imu, model: &input.model };
     let (_, guess) = initial::longest_segment(log, &imu, &input.model, input.camera.time_offset);
     let mut work = Work::new(input, guess);
-    work.pass(&recording, &mut watch)?;
-    work.guess = grow::outward(&recording, &work, &mut watch)?;
     let mut passed = work.pass(&recording, &mut watch)?;
+    // The images before the start; an earlier result gave them states.
+    if work.guess.images.first().is_some_and(|first| *first > 0) {
+        work.guess = grow::outward(&recording, &work, &mut watch)?;
+        passed = work.pass(&recording, &mut watch)?;
+    }
     for _ in 1..PASSES {
         if passed.is_settled {
             break;

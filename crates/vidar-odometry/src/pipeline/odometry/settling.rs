@@ -20,12 +20,16 @@ const JUDGED_SECS: f64 = 0.5;
 /// A scale that is known this well needs no adjustment: the calibration is not known better.
 const SETTLED_STD: f64 = 0.02;
 
-/// First adjustment, s after the start; each later one after twice that time, up to the last. At first the scale is worst; in 40 s a hand turns
-/// and accelerates often enough.
+/// First adjustment, s after the start, and each later one after so many times that time, up to the last. At first the scale is worst; in half a
+/// minute a hand turns and accelerates often enough, and more states cost more than an image can wait for.
 const FIRST_SECS: f64 = 2.5;
-const LAST_SECS: f64 = 40.0;
+const LATER: f64 = 3.0;
+const LAST_SECS: f64 = 30.0;
 
-/// Time of the recording until the result is taken over, s: some 20 to 200 states, up to half a minute of them on one core where it is slow.
+/// Images of an adjustment are this far apart, twice as far as they are logged: its time grows with up to the cube of their number.
+const SPARSE_PERIOD: Duration = Duration::from_millis(400);
+
+/// Time of the recording until the result is taken over, s: some 15 to 80 states take one to four seconds of a core.
 const SOLVING_SECS: f64 = 2.0;
 
 /// Stretch before the start that is adjusted, too, s, and how much earlier its IMU measurements begin: clocks differ by less.
@@ -91,7 +95,7 @@ impl Odometry {
         if age < due || settling.solving.is_some() || self.successor.is_some() {
             return;
         }
-        settling.due_secs = 2.0 * due;
+        settling.due_secs = LATER * due;
         let is_settled = !settling.is_provisional || tracking.scale_std < SETTLED_STD;
         settling.is_over = is_settled || due > LAST_SECS;
         if !settling.is_over() {
@@ -132,7 +136,7 @@ impl Odometry {
     /// Begins an adjustment of what was logged from `since` on.
     fn begin_newest_state(&self, since: Timestamp, due: Timestamp) -> Option<Deferred<Option<NewestState>>> {
         let (log, model) = (self.log.as_ref()?, self.imu_model?);
-        let log = log.since(since, Duration::from_secs_f64(IMU_BEFORE_SECS));
+        let log = log.since(since, Duration::from_secs_f64(IMU_BEFORE_SECS)).every(SPARSE_PERIOD);
         let mut camera = self.camera.clone();
         camera.time_offset += self.estimated_offset();
         let readout_secs = self.time_calibration.readout_secs;

@@ -17,7 +17,7 @@ use vidar_core::{Duration, Frame, FrameId, ImuSample, LieGroup, RigCamera, Se3, 
 
 /// Images kept, s and number: the longest stretch that a start in motion is solved from, or an adjustment takes; with some to spare.
 const REPLAY_SECS: f64 = 3.5;
-const REPLAY_FRAMES: usize = 100;
+const REPLAY_FRAMES: usize = 200;
 
 /// IMU measurements kept before the oldest image, s: clocks differ by 0.15 s at most, and half a second shows a body at rest.
 const IMU_BEFORE_SECS: f64 = 0.7;
