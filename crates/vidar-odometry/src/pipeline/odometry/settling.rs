@@ -1,7 +1,6 @@
 //! A provisional scale is settled by adjustments of all that was seen so far, beside the odometry.
 //!
-//! A sliding window takes what it marginalises at the scale that it had then, and with the clock and the gains that were given. Where the scale
-//! was far off, or a body moves so steadily that a gain of 1 % is as large as what tells the scale, the window knows less of it than it
+//! A sliding window takes what it marginalises at the scale that it had then. Where that was far off, the window knows less of the scale than it
 //! says, and stays off. Adjusted all together with clock and gains among the unknowns, the same measurements give the scale with an honest
 //! σ; the odometry then goes on from the newest state of the adjustment (decision 38).
 
