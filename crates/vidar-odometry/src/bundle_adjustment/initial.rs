@@ -126,6 +126,8 @@ impl Guess {
             }
             let state = match &log.images[image].state {
                 Some(logged) => Some(logged.state.moved(&placed)),
+                // The segment's first states were those of images that are left out.
+                None if self.images.is_empty() => continue,
                 None => self.carried_to(time, imu, model),
             };
             let Some(state) = state else { return };
@@ -264,4 +266,22 @@ pub(super) fn first_guess(
     let inverse = if told { across / along } else { TYPICAL_INVERSE_DISTANCE };
     let inverse = if inverse > 0.0 { inverse } else { MIN_INVERSE_DISTANCE };
     Some(Landmark { direction, inverse_distance: inverse.min(MAX_INVERSE_DISTANCE), origin })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::log::tests::log;
+    use super::*;
+    use vidar_core::ImuNoise;
+
+    /// The clock leaves the first image before the IMU's measurements, and the next one has no state: the segment begins with the third.
+    #[test]
+    fn a_segment_begins_with_the_first_state_that_the_imu_covers() {
+        let mut log = log(8);
+        log.images[1].state = None;
+        let (imu, model) = (log.imu(), ImuModel::from_data_sheet(&ImuNoise::EUROC, 2.0, 2.0));
+        let guess = |clock_ms| longest_segment(&log, &imu, &model, Duration::from_millis(clock_ms)).1;
+        assert_eq!(guess(-50).images, [2, 3, 4, 5, 6, 7]);
+        assert_eq!(guess(5).images, [0, 1, 2, 3, 4, 5, 6, 7], "carried where a state is known before");
+    }
 }
