@@ -2,7 +2,7 @@
 
 use super::envelope::Envelope;
 use super::inertial::{GAIN_DIM, InertialJacobians};
-use super::observation::{self, Linearised, STATE_DIM};
+use super::observation::{self, Landmark, Linearised, STATE_DIM};
 use super::problem::{FRAME_DIM, ObservedLandmark, Problem};
 use crate::backend::{GaugePriorSigmas, gauge_prior_at};
 use crate::imu::{Matrix15, Vector15};
@@ -59,21 +59,29 @@ impl System {
 
 /// Squared whitened error of an observation.
 pub(super) fn squared_error(problem: &Problem, seen: &ObservedLandmark, at: usize) -> f64 {
+    squared_error_of(problem, seen, &seen.landmark, at)
+}
+
+/// The same where the landmark is at `landmark`.
+fn squared_error_of(problem: &Problem, seen: &ObservedLandmark, landmark: &Landmark, at: usize) -> f64 {
     let measured = &seen.observations[at];
     let body = &problem.frames[measured.frame].body;
-    match observation::project(body, &seen.landmark, &problem.calibration, &measured.pixel) {
+    match observation::project(body, landmark, &problem.calibration, &measured.pixel) {
         Some(pixel) => (measured.whitening * (pixel - measured.pixel)).norm_squared(),
         None => BEHIND,
     }
+}
+
+/// Cost of a landmark's observations, were it at `landmark`.
+pub(super) fn landmark_cost(problem: &Problem, seen: &ObservedLandmark, landmark: &Landmark) -> f64 {
+    (0..seen.observations.len()).map(|at| KERNEL.loss(squared_error_of(problem, seen, landmark, at))).sum()
 }
 
 /// The cost at the present values.
 pub(super) fn cost(problem: &Problem) -> Cost {
     let mut cost = Cost::default();
     for seen in &problem.landmarks {
-        for at in 0..seen.observations.len() {
-            cost.visual += KERNEL.loss(squared_error(problem, seen, at));
-        }
+        cost.visual += landmark_cost(problem, seen, &seen.landmark);
     }
     for k in 1..problem.frames.len() {
         cost.inertial += 0.5 * inertial_error(problem, k).map_or(0.0, |r| r.norm_squared());

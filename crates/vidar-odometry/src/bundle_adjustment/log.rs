@@ -193,21 +193,19 @@ impl TrackLog {
 
     /// The log with images at least `period` apart.
     pub(crate) fn every(&self, period: Duration) -> Self {
-        let mut images: Vec<LoggedImage> = Vec::new();
-        for image in &self.images {
-            let is_due = |last: &LoggedImage| image.stamp - last.stamp >= period - STAMP_JITTER;
-            if images.last().is_none_or(is_due) {
-                images.push(image.clone());
-            }
+        Self {
+            images: at_least(period, self.images.iter()),
+            stamps: self.stamps.clone(),
+            imu: self.imu.clone(),
+            places: self.places.clone(),
+            ..*self
         }
-        Self { images, ..self.clone() }
     }
 
-    /// What was logged from a stamp on, without grey levels; IMU measurements from `before` that stamp on.
-    pub(crate) fn since(&self, stamp: Timestamp, before: Duration) -> Self {
-        let is_late = |image: &&LoggedImage| image.stamp >= stamp;
+    /// What was logged from a stamp on, without grey levels: images at least `period` apart, IMU measurements from `before` that stamp on.
+    pub(crate) fn since(&self, stamp: Timestamp, before: Duration, period: Duration) -> Self {
         Self {
-            images: self.images.iter().filter(is_late).cloned().collect(),
+            images: at_least(period, self.images.iter().filter(|image| image.stamp >= stamp)),
             stamps: self.stamps.iter().filter(|(_, s)| *s >= stamp).copied().collect(),
             imu: self.imu.iter().filter(|s| s.time >= stamp - before).copied().collect(),
             places: Vec::new(),
@@ -272,6 +270,18 @@ impl TrackLog {
     }
 }
 
+/// The images that are at least `period` apart.
+fn at_least<'a>(period: Duration, all: impl Iterator<Item = &'a LoggedImage>) -> Vec<LoggedImage> {
+    let mut images: Vec<LoggedImage> = Vec::new();
+    for image in all {
+        let is_due = |last: &LoggedImage| image.stamp - last.stamp >= period - STAMP_JITTER;
+        if images.last().is_none_or(is_due) {
+            images.push(image.clone());
+        }
+    }
+    images
+}
+
 #[cfg(test)]
 pub(super) mod tests {
     use super::*;
@@ -314,8 +324,8 @@ pub(super) mod tests {
         assert_eq!((kept.images[0].stamp, kept.stamps[0].1), (at(4000), at(4000)));
         assert_eq!(kept.imu[0].time, at(3500));
         let whole = log(50);
-        let late = whole.since(at(4000), Duration::from_millis(500));
-        assert_eq!((late.images.len(), late.stamps.len(), late.imu.len()), (30, 30, kept.imu.len()));
+        let late = whole.since(at(4000), Duration::from_millis(500), Duration::from_millis(400));
+        assert_eq!((late.images.len(), late.stamps.len(), late.imu.len()), (15, 30, kept.imu.len()));
         assert_eq!(whole.images.len(), 50);
     }
 }

@@ -28,6 +28,7 @@ mod progress;
 mod result;
 mod scale_step;
 mod sigmas;
+mod single_landmark;
 mod thin;
 
 pub use findings::AdjustmentFinding;

@@ -3,11 +3,10 @@
 use super::inertial::ImuGain;
 use super::initial::onto;
 use super::log::{LoggedState, TrackLog};
+use super::optimise::OptimiseReport;
 use super::problem::{FRAME_DIM, Problem};
 use super::progress::Watch;
-use super::{
-    AdjustmentError, AdjustmentInput, MAX_INERTIAL_CHI2, MAX_REJECTED_SHARE, Measurements, PASSES, Work,
-};
+use super::{AdjustmentError, AdjustmentInput, Measurements, PASSES, Work};
 use super::{grow, initial, optimise, result};
 use crate::backend::GaugePriorSigmas;
 use crate::imu::{Matrix15, NavState, hat};
@@ -67,9 +66,8 @@ pub(crate) fn newest_state(input: &AdjustmentInput<'_>) -> Result<NewestState, A
         passed = work.pass(&recording, &mut watch)?;
     }
     let problem = &passed.problem;
-    let rejected =
-        passed.report.rejected as f64 / (passed.report.observations + passed.report.rejected).max(1) as f64;
-    if optimise::inertial_chi2_per_dof(problem) > MAX_INERTIAL_CHI2 || rejected > MAX_REJECTED_SHARE {
+    let OptimiseReport { observations, rejected, .. } = passed.report;
+    if !result::agree(optimise::inertial_chi2_per_dof(problem), observations, rejected) {
         return Err(AdjustmentError::Undetermined);
     }
     let system = optimise::solution(problem).ok_or(AdjustmentError::Undetermined)?;
@@ -187,7 +185,7 @@ mod tests {
     }
 
     #[test]
-    fn states_taken_over_are_moved_and_later_ones_forgotten() {
+    fn states_taken_over_are_moved_and_later_ones_follow() {
         let mut log = log(6);
         log.images[5].state = log.images[5].state.map(|s| LoggedState { segment: 4, ..s });
         let placed = Se3::new(vidar_core::So3::IDENTITY, Vector3::new(0.0, 7.0, 0.0));

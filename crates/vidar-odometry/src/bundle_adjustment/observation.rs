@@ -232,12 +232,12 @@ pub(super) fn linearise(
 }
 
 #[cfg(test)]
-mod tests {
+pub(super) mod tests {
     use super::*;
     use crate::imu::{Bias, Vector15};
     use vidar_core::{CameraModel, Pinhole, camera::RadTan};
 
-    fn example() -> (MovingBody, Landmark, SensorCalibration, Pixel) {
+    pub(in crate::bundle_adjustment) fn example() -> (MovingBody, Landmark, SensorCalibration, Pixel) {
         let state = NavState {
             world_from_body: Se3::new(So3::exp(&Vector3::new(0.3, -0.5, 0.9)), Vector3::new(1.0, -0.4, 0.7)),
             velocity: Vector3::new(0.5, -0.3, 0.2),

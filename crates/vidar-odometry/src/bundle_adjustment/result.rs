@@ -111,9 +111,14 @@ impl Adjusted {
     /// Whether camera and IMU agree in the solution.
     pub fn is_consistent(&self) -> bool {
         let AdjustmentReport { observations, rejected, inertial_chi2_per_dof, .. } = self.report;
-        let share = rejected as f64 / (observations + rejected).max(1) as f64;
-        inertial_chi2_per_dof < MAX_INERTIAL_CHI2 && share < MAX_REJECTED_SHARE && self.scale_std.is_finite()
+        agree(inertial_chi2_per_dof, observations, rejected) && self.scale_std.is_finite()
     }
+}
+
+/// Whether camera and IMU agree in a solution with this mean squared inertial residual and so many observations left out.
+pub(super) fn agree(inertial_chi2_per_dof: f64, observations: usize, rejected: usize) -> bool {
+    let share = rejected as f64 / (observations + rejected).max(1) as f64;
+    inertial_chi2_per_dof < MAX_INERTIAL_CHI2 && share < MAX_REJECTED_SHARE
 }
 
 /// `recording` has IMU measurements with the gains applied; the stamps are those of `input`.

@@ -40,6 +40,11 @@ impl ScaleStep {
         Self { ln, centre }
     }
 
+    /// What it changes ln(scale) by.
+    pub(super) fn ln(&self) -> f64 {
+        self.ln
+    }
+
     /// The state after the whole step `delta`.
     pub(super) fn state(&self, state: &NavState, delta: &Vector15) -> NavState {
         let from = state.world_from_body.translation - self.centre;
@@ -65,13 +70,17 @@ impl ScaleStep {
         let moved = (from + direction / inverse) * self.ln;
         let across = tangent_basis(direction).transpose() * moved * inverse;
         let along = -direction.dot(&moved) * inverse * inverse;
+        self.scaled(landmark).plus(&(delta - Vector3::new(across.x, across.y, along)))
+    }
+
+    /// The landmark after the factor alone.
+    pub(super) fn scaled(&self, landmark: &Landmark) -> Landmark {
         let factor = self.ln.exp();
-        let scaled = Landmark {
-            direction: *direction,
-            inverse_distance: (inverse / factor).max(MIN_INVERSE_DISTANCE),
-            origin: self.centre + from * factor,
-        };
-        scaled.plus(&(delta - Vector3::new(across.x, across.y, along)))
+        Landmark {
+            direction: landmark.direction,
+            inverse_distance: (landmark.inverse_distance / factor).max(MIN_INVERSE_DISTANCE),
+            origin: self.centre + (landmark.origin - self.centre) * factor,
+        }
     }
 }
 

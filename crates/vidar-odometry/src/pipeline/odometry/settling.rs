@@ -19,16 +19,16 @@ const JUDGED_SECS: f64 = 0.5;
 /// A scale that is known this well needs no adjustment: the calibration is not known better.
 const SETTLED_STD: f64 = 0.02;
 
-/// First adjustment, s after the start, and each later one after so many times that time, up to the last. At first the scale is worst; in half a
-/// minute a hand turns and accelerates often enough, and more states cost more than an image can wait for.
+/// First adjustment, s after the start, and each later one after so many times that time, up to the last: 2.5, 5, 10, 20, 40 s. At first the scale
+/// is worst; in the end a hand has turned and accelerated often enough, and more states cost more than an image can wait for.
 const FIRST_SECS: f64 = 2.5;
-const LATER: f64 = 3.0;
-const LAST_SECS: f64 = 30.0;
+const LATER: f64 = 2.0;
+const LAST_SECS: f64 = 45.0;
 
 /// Images of an adjustment are this far apart, twice as far as they are logged: its time grows with up to the cube of their number.
 const SPARSE_PERIOD: Duration = Duration::from_millis(400);
 
-/// Time of the recording until the result is taken over, s: some 15 to 80 states take one to four seconds of a core.
+/// Time of the recording until the result is taken over, s: some 12 to 100 states take 0.2 to 2.5 s of a core.
 const SOLVING_SECS: f64 = 2.0;
 
 /// Stretch before the start that is adjusted, too, s, and how much earlier its IMU measurements begin: clocks differ by less.
@@ -135,7 +135,7 @@ impl Odometry {
     /// Begins an adjustment of what was logged from `since` on.
     fn begin_newest_state(&self, since: Timestamp, due: Timestamp) -> Option<Deferred<Option<NewestState>>> {
         let (log, model) = (self.log.as_ref()?, self.imu_model?);
-        let log = log.since(since, Duration::from_secs_f64(IMU_BEFORE_SECS)).every(SPARSE_PERIOD);
+        let log = log.since(since, Duration::from_secs_f64(IMU_BEFORE_SECS), SPARSE_PERIOD);
         let mut camera = self.camera.clone();
         camera.time_offset += self.estimated_offset();
         let readout_secs = self.time_calibration.readout_secs;

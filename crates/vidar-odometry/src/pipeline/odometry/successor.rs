@@ -7,6 +7,7 @@ use crate::bundle_adjustment::{NewestState, TrackLog};
 use crate::config::OdometryConfig;
 use crate::deferred::Deferred;
 use crate::frontend::PYRAMID_LEVELS;
+use crate::imu::ImuBuffer;
 use crate::initialization::StaticState;
 use crate::pipeline::health::HealthMonitor;
 use crate::pipeline::output::LossReason;
@@ -144,6 +145,19 @@ impl CatchUp {
 }
 
 impl Successor {
+    /// Begun at `since`, with images to work on.
+    fn new(odometry: Odometry, waiting: VecDeque<RecentFrame>, since: Timestamp) -> Self {
+        Self {
+            catch_up: Some(Box::new(CatchUp { odometry, waiting })),
+            slice: None,
+            samples: Vec::new(),
+            images: Vec::new(),
+            correction: None,
+            begun: None,
+            since,
+        }
+    }
+
     pub fn add_imu(&mut self, sample: ImuSample) {
         self.samples.push(sample);
     }
@@ -190,24 +204,10 @@ impl Odometry {
         if let Some(rotation) = correction.body_from_camera {
             camera.body_from_camera.rotation = rotation;
         }
-        let config = OdometryConfig {
-            readout_ms: Some(1e3 * correction.readout_secs),
-            align_timing: false,
-            ..self.config.clone()
-        };
-        let camera = (self.camera_id, camera);
-        let mut odometry =
-            Self::fresh(config, camera, self.working.another(), self.imu_model, self.imu.clone());
+        let mut odometry = self.another(camera, correction.readout_secs, self.imu.clone());
         odometry.imu_gain = self.imu_gain;
-        self.successor = Some(Successor {
-            catch_up: Some(Box::new(CatchUp { odometry, waiting: self.recent.frames.clone() })),
-            slice: None,
-            samples: Vec::new(),
-            images: Vec::new(),
-            since: newest.frame.time,
-            correction: Some(*correction),
-            begun: None,
-        });
+        let successor = Successor::new(odometry, self.recent.frames.clone(), newest.frame.time);
+        self.successor = Some(Successor { correction: Some(*correction), ..successor });
         true
     }
 
@@ -216,29 +216,23 @@ impl Odometry {
         let now = self.recent.frames.back()?.frame.time;
         let at = self.recent.frames.iter().position(|f| f.id == begun.frame)?;
         let camera = RigCamera { time_offset: begun.time_offset, ..self.camera.clone() };
+        let imu = self.imu.multiplied(&begun.gain.beyond(&self.imu_gain));
+        let mut odometry = self.another(camera, begun.readout_secs.max(0.0), imu);
+        odometry.imu_gain = begun.gain;
+        odometry.begin_at(&begun, &self.recent.frames[at].frame)?;
+        let successor = Successor::new(odometry, self.recent.frames.range(at + 1..).cloned().collect(), now);
+        self.successor = Some(Successor { begun: Some(begun), ..successor });
+        Some(())
+    }
+
+    /// A second odometry with other values of the camera, which are not corrected again.
+    fn another(&self, camera: RigCamera, readout_secs: f64, imu: ImuBuffer) -> Self {
         let config = OdometryConfig {
-            readout_ms: Some(1e3 * begun.readout_secs.max(0.0)),
+            readout_ms: Some(1e3 * readout_secs),
             align_timing: false,
             ..self.config.clone()
         };
-        let camera = (self.camera_id, camera);
-        let imu = self.imu.multiplied(&begun.gain.beyond(&self.imu_gain));
-        let mut odometry = Self::fresh(config, camera, self.working.another(), self.imu_model, imu);
-        odometry.imu_gain = begun.gain;
-        odometry.begin_at(&begun, &self.recent.frames[at].frame)?;
-        self.successor = Some(Successor {
-            catch_up: Some(Box::new(CatchUp {
-                odometry,
-                waiting: self.recent.frames.range(at + 1..).cloned().collect(),
-            })),
-            slice: None,
-            samples: Vec::new(),
-            images: Vec::new(),
-            since: now,
-            correction: None,
-            begun: Some(begun),
-        });
-        Some(())
+        Self::fresh(config, (self.camera_id, camera), self.working.another(), self.imu_model, imu)
     }
 
     /// Begins with a state that is known and the image that it belongs to.
