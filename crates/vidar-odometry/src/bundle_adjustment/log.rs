@@ -105,6 +105,8 @@ pub struct TrackLog {
     /// The IMU's rate, Hz.
     pub(crate) imu_rate_hz: f64,
     generation: u32,
+    /// Images are logged so far apart.
+    period: Duration,
     /// Images with their grey levels, to find what comes into view again.
     places: Vec<(Timestamp, Arc<HostImage>)>,
     place_period: Duration,
@@ -112,7 +114,12 @@ pub struct TrackLog {
 
 impl TrackLog {
     pub(crate) fn new(imu_rate_hz: f64) -> Self {
-        Self { imu_rate_hz, place_period: FIRST_PLACE_PERIOD, ..Self::default() }
+        Self { imu_rate_hz, period: LOG_PERIOD, place_period: FIRST_PLACE_PERIOD, ..Self::default() }
+    }
+
+    /// A log of every image, for what [`TrackLog::go_on_with`] adds to another one.
+    pub(crate) fn of_every_image() -> Self {
+        Self::default()
     }
 
     /// Keeps the grey levels of an image taken at `stamp`, where they are due. It must be logged, too.
@@ -150,6 +157,20 @@ impl TrackLog {
         self.generation = self.generation.wrapping_add(1);
     }
 
+    /// Another tracker goes on from here: `other` has what it saw of the same images so far, so that its tracks overlap with those that end.
+    pub(crate) fn go_on_with(&mut self, other: &Self) {
+        let first = self.generation.wrapping_add(1);
+        for image in &mut self.images {
+            if let Ok(at) = other.images.binary_search_by_key(&image.frame, |i| i.frame) {
+                image.observations.extend(other.images[at].observations.iter().map(|seen| {
+                    let generation = first.wrapping_add(seen.key.generation);
+                    LoggedObservation { key: TrackKey { generation, ..seen.key }, ..*seen }
+                }));
+            }
+        }
+        self.generation = first.wrapping_add(other.generation);
+    }
+
     pub(crate) fn add_imu(&mut self, sample: &ImuSample) {
         self.imu.push(*sample);
     }
@@ -171,7 +192,7 @@ impl TrackLog {
 
     /// Whether an image taken at `stamp` is due to be logged.
     pub(crate) fn is_due(&self, stamp: Timestamp) -> bool {
-        self.images.last().is_none_or(|last| stamp - last.stamp >= LOG_PERIOD)
+        self.images.last().is_none_or(|last| stamp - last.stamp >= self.period)
     }
 
     /// Logs an image, with the caller's number and its stamp.
@@ -313,6 +334,27 @@ pub(super) mod tests {
         }
         (0..i64::from(images) * 20).for_each(|k| log.add_imu(&sample(10 * k)));
         log
+    }
+
+    #[test]
+    fn tracks_of_another_tracker_overlap_with_those_that_end() {
+        let show = |log: &mut TrackLog, frame: u32, track: u32| {
+            let pixel = Vector2::new(f64::from(frame), 1.0);
+            let shown = [(LandmarkId(track), &pixel, Matrix2::identity())];
+            log.add_image(FrameId(frame), (FrameId(frame), at(0)), None, shown.into_iter());
+        };
+        let (mut log, mut other) = (TrackLog::new(100.0), TrackLog::of_every_image());
+        log.next_generation();
+        [2, 4, 6].into_iter().for_each(|frame| show(&mut log, frame, 7));
+        [3, 4].into_iter().for_each(|frame| show(&mut other, frame, 7));
+        // It had to start again.
+        other.next_generation();
+        [5, 6].into_iter().for_each(|frame| show(&mut other, frame, 7));
+        assert!(other.is_due(at(0)) && !log.is_due(at(0)));
+        log.go_on_with(&other);
+        show(&mut log, 8, 7);
+        let seen = |k: usize| log.images[k].observations.iter().map(|o| o.key.generation).collect::<Vec<_>>();
+        assert_eq!([seen(0), seen(1), seen(2), seen(3)], [vec![1], vec![1, 2], vec![1, 3], vec![3]]);
     }
 
     #[test]

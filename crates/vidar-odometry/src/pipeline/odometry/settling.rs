@@ -113,9 +113,9 @@ impl Odometry {
             && difference.is_some_and(|ln| ln.abs() > found.scale_std)
     }
 
-    /// Keeps no more of the log than is needed, where it is kept for nothing else.
+    /// Keeps no more of the log than is needed, where it is kept for nothing else: a second odometry's is needed until it takes over.
     pub(super) fn shorten_log(&mut self, now: Timestamp) {
-        if self.keeps_log {
+        if self.keeps_log || !self.settling.is_wanted {
             return;
         }
         let from = self.settling.needed_from(now);

@@ -232,7 +232,9 @@ impl Odometry {
             align_timing: false,
             ..self.config.clone()
         };
-        Self::fresh(config, (self.camera_id, camera), self.working.another(), self.imu_model, imu)
+        let fresh =
+            Self::fresh(config, (self.camera_id, camera), self.working.another(), self.imu_model, imu);
+        Self { log: self.log.as_ref().map(|_| TrackLog::of_every_image()), ..fresh }
     }
 
     /// Begins with a state that is known and the image that it belongs to.
@@ -244,7 +246,8 @@ impl Odometry {
         let window = self.start_at(&host, time, &start, typical_inverse).ok()?;
         self.last_frame = Some(time);
         self.last_host = Some(host.clone());
-        self.begin(window, frame, host.frame);
+        let status = self.begin(window, frame, host.frame);
+        self.log_image(frame, host.frame, &status);
         matches!(self.phase, Phase::Tracking(_)).then_some(())
     }
 
@@ -313,7 +316,10 @@ impl Odometry {
         self.keyframes.forget_held();
         // Tracks have other names from here on.
         self.time_calibration.forget_tracks();
-        self.log.iter_mut().for_each(TrackLog::next_generation);
+        match (&mut self.log, &new.log) {
+            (Some(log), Some(other)) => log.go_on_with(other),
+            (log, _) => log.iter_mut().for_each(TrackLog::next_generation),
+        }
     }
 }
 
