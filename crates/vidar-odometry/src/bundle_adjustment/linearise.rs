@@ -79,10 +79,12 @@ pub(super) fn landmark_cost(problem: &Problem, seen: &ObservedLandmark, landmark
 
 /// The cost at the present values.
 pub(super) fn cost(problem: &Problem) -> Cost {
-    let mut cost = Cost::default();
-    for seen in &problem.landmarks {
-        cost.visual += landmark_cost(problem, seen, &seen.landmark);
-    }
+    cost_with(problem, problem.landmarks.iter().map(|l| landmark_cost(problem, l, &l.landmark)).sum())
+}
+
+/// The same, where the landmarks' cost is known to be `visual`.
+pub(super) fn cost_with(problem: &Problem, visual: f64) -> Cost {
+    let mut cost = Cost { visual, ..Cost::default() };
     for k in 1..problem.frames.len() {
         cost.inertial += 0.5 * inertial_error(problem, k).map_or(0.0, |r| r.norm_squared());
     }

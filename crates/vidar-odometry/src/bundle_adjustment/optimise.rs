@@ -1,7 +1,9 @@
 //! Levenberg-Marquardt over the whole recording, with gross errors left out round by round.
 
 use super::AdjustmentError;
-use super::linearise::{Cost, System, cost, inertial_error, landmark_cost, linearise, squared_error};
+use super::linearise::{
+    Cost, System, cost, cost_with, inertial_error, landmark_cost, linearise, squared_error,
+};
 use super::observation::{Landmark, SensorCalibration};
 use super::problem::{FRAME_DIM, Problem};
 use super::progress::Watch;
@@ -128,7 +130,7 @@ impl LeastSquares for Round<'_, '_> {
         self.watch.iteration()?;
         follow(self.problem);
         self.before.keep(self.problem);
-        Ok(cost(self.problem).total())
+        Ok(cost_with(self.problem, self.before.costs.iter().sum()).total())
     }
 
     /// The system holds the damping of the landmarks that it eliminates, so each trial has its own.
@@ -146,8 +148,8 @@ impl LeastSquares for Round<'_, '_> {
         if damping <= SETTLED_DAMPING {
             self.log_scale_step = scale.ln();
         }
-        before.follow_worse(problem, &scale);
-        Ok(Some((cost(problem).total(), ())))
+        let visual = before.refine_worse(problem, &scale);
+        Ok(Some((cost_with(problem, visual).total(), ())))
     }
 
     fn accept(&mut self, (): ()) {}
@@ -197,13 +199,17 @@ impl Values {
         self.calibration = Some(problem.calibration.clone());
     }
 
-    /// Brings the landmarks that a step has made worse to where they fit the moved states.
-    fn follow_worse(&self, problem: &mut Problem, scale: &ScaleStep) {
+    /// Brings the landmarks that a step has made worse to where they fit the moved states; the cost of all.
+    fn refine_worse(&self, problem: &mut Problem, scale: &ScaleStep) -> f64 {
+        let mut visual = 0.0;
         for k in 0..problem.landmarks.len() {
             let before = scale.scaled(&self.landmarks[k]);
-            problem.landmarks[k].landmark =
-                single_landmark::better(problem, &problem.landmarks[k], before, self.costs[k]);
+            let (landmark, cost) =
+                single_landmark::refined(problem, &problem.landmarks[k], before, self.costs[k]);
+            problem.landmarks[k].landmark = landmark;
+            visual += cost;
         }
+        visual
     }
 
     fn restore(&self, problem: &mut Problem) {

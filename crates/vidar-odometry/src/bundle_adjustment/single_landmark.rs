@@ -3,7 +3,7 @@
 //! A landmark of few observations has other minima beside the one that it is in, and no step of all unknowns together is good for it where the
 //! linear step leads beyond: rejected for this one landmark, the step of all shrank to nothing. Where a step makes a landmark worse, it is
 //! minimised alone before the step is judged (embedded point iterations: Jeong, Nistér, Steedly, Szeliski, Kweon 2012, "Pushing the
-//! envelope of modern methods for bundle adjustment", section 3.4).
+//! envelope of modern methods for bundle adjustment").
 
 use super::linearise::{KERNEL, landmark_cost};
 use super::observation::{self, Landmark};
@@ -29,24 +29,24 @@ const LIMITS: Limits = Limits { trials: 12, ..Limits::NONE };
 /// The minimisation ends when a step lowers the cost by less than this share.
 const SETTLED_SHARE: f64 = 1e-3;
 
-/// The better one of where a landmark is after a step, and of what follows from where it was `before`; `cost_before` is its cost before the
-/// states had moved.
-pub(super) fn better(
+/// The better one of where a landmark is after a step, and of the minimum that follows from where it was `before`, with its cost; `cost_before`
+/// is its cost before the states had moved.
+pub(super) fn refined(
     problem: &Problem,
     seen: &ObservedLandmark,
     before: Landmark,
     cost_before: f64,
-) -> Landmark {
+) -> (Landmark, f64) {
     let stepped = landmark_cost(problem, seen, &seen.landmark);
     if stepped <= cost_before + WORSE {
-        return seen.landmark;
+        return (seen.landmark, stepped);
     }
     let mut alone =
         Alone { problem, seen, landmark: before, h: Matrix3::zeros(), gradient: Vector3::zeros() };
     let begin = landmark_cost(problem, seen, &before);
     match levenberg_marquardt::minimise(&mut alone, begin, &SCHEDULE, &LIMITS) {
-        Ok(report) if report.cost_after < stepped => alone.landmark,
-        _ => seen.landmark,
+        Ok(report) if report.cost_after < stepped => (alone.landmark, report.cost_after),
+        _ => (seen.landmark, stepped),
     }
 }
 
@@ -138,7 +138,8 @@ mod tests {
         }
         problem.landmarks[0].landmark.inverse_distance *= 0.2;
         let seen = &problem.landmarks[0];
-        let found = landmark_cost(&problem, seen, &better(&problem, seen, truth, before));
+        let (landmark, found) = refined(&problem, seen, truth, before);
+        assert_eq!(found, landmark_cost(&problem, seen, &landmark));
         let unmoved = landmark_cost(&problem, seen, &truth);
         assert!(
             found < 0.5 * unmoved && found < landmark_cost(&problem, seen, &seen.landmark),
@@ -147,7 +148,6 @@ mod tests {
         // It is at a minimum.
         for k in 0..3 {
             for step in [-1e-4, 1e-4] {
-                let landmark = better(&problem, seen, truth, before);
                 let moved = landmark.plus(&Vector3::ith(k, step));
                 assert!(landmark_cost(&problem, seen, &moved) > found - 1e-4 * found, "{k} {step}");
             }
@@ -160,11 +160,11 @@ mod tests {
         let truth = problem.landmarks[0].landmark;
         problem.landmarks[0].landmark = truth.plus(&Vector3::new(1e-5, 0.0, 0.0));
         let seen = &problem.landmarks[0];
-        let stays = better(&problem, seen, truth, 0.0);
+        let (stays, _) = refined(&problem, seen, truth, 0.0);
         assert_eq!(stays.direction, seen.landmark.direction);
         // The cost of what projects nowhere is bounded, so that a landmark behind the camera is brought back.
         problem.landmarks[0].landmark.direction = -truth.direction;
         let seen = &problem.landmarks[0];
-        assert!(landmark_cost(&problem, seen, &better(&problem, seen, truth, 0.0)) < 1e-6);
+        assert!(landmark_cost(&problem, seen, &refined(&problem, seen, truth, 0.0).0) < 1e-6);
     }
 }

@@ -3,7 +3,7 @@
 //! instants that the recording decides: an image waits for it only where a slice is not done when it is due.
 
 use super::{Odometry, Phase, Status};
-use crate::bundle_adjustment::{NewestState, TrackLog};
+use crate::bundle_adjustment::{ImuGain, NewestState, TrackLog};
 use crate::config::OdometryConfig;
 use crate::deferred::Deferred;
 use crate::frontend::PYRAMID_LEVELS;
@@ -204,8 +204,7 @@ impl Odometry {
         if let Some(rotation) = correction.body_from_camera {
             camera.body_from_camera.rotation = rotation;
         }
-        let mut odometry = self.another(camera, correction.readout_secs, self.imu.clone());
-        odometry.imu_gain = self.imu_gain;
+        let odometry = self.second(camera, correction.readout_secs, self.imu.clone(), self.imu_gain);
         let successor = Successor::new(odometry, self.recent.frames.clone(), newest.frame.time);
         self.successor = Some(Successor { correction: Some(*correction), ..successor });
         true
@@ -217,16 +216,15 @@ impl Odometry {
         let at = self.recent.frames.iter().position(|f| f.id == begun.frame)?;
         let camera = RigCamera { time_offset: begun.time_offset, ..self.camera.clone() };
         let imu = self.imu.multiplied(&begun.gain.beyond(&self.imu_gain));
-        let mut odometry = self.another(camera, begun.readout_secs.max(0.0), imu);
-        odometry.imu_gain = begun.gain;
+        let mut odometry = self.second(camera, begun.readout_secs.max(0.0), imu, begun.gain);
         odometry.begin_at(&begun, &self.recent.frames[at].frame)?;
         let successor = Successor::new(odometry, self.recent.frames.range(at + 1..).cloned().collect(), now);
         self.successor = Some(Successor { begun: Some(begun), ..successor });
         Some(())
     }
 
-    /// A second odometry with other values of the camera, which are not corrected again.
-    fn another(&self, camera: RigCamera, readout_secs: f64, imu: ImuBuffer) -> Self {
+    /// A second odometry with other values of the camera, which are not corrected again, and measurements that have gains applied.
+    fn second(&self, camera: RigCamera, readout_secs: f64, imu: ImuBuffer, imu_gain: ImuGain) -> Self {
         let config = OdometryConfig {
             readout_ms: Some(1e3 * readout_secs),
             align_timing: false,
@@ -234,7 +232,7 @@ impl Odometry {
         };
         let fresh =
             Self::fresh(config, (self.camera_id, camera), self.working.another(), self.imu_model, imu);
-        Self { log: self.log.as_ref().map(|_| TrackLog::of_every_image()), ..fresh }
+        Self { imu_gain, log: self.log.as_ref().map(|_| TrackLog::of_every_image()), ..fresh }
     }
 
     /// Begins with a state that is known and the image that it belongs to.
