@@ -146,7 +146,7 @@ pub struct RevisedPose {
     pub id: KeyframeId,
     /// Its present pose.
     pub world_from_camera: Se3,
-    /// Whether the pose is final: the keyframe was marginalised out of the window.
+    /// Whether the window has let go of the keyframe. Only a scale that is settled later revises it after that.
     pub is_final: bool,
 }
 

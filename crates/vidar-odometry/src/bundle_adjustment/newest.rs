@@ -33,12 +33,21 @@ pub(crate) struct NewestState {
     pub(crate) median_distance_m: f64,
     /// Every logged image with its state, in the order of time.
     pub(crate) states: Vec<(FrameId, NavState)>,
+    /// Every image, by the caller's number, with its pose world_from_body.
+    pub(crate) images: Vec<(FrameId, Se3)>,
     /// `t_imu = stamp + offset`.
     pub(crate) time_offset: Duration,
     /// From the first to the last row, s.
     pub(crate) readout_secs: f64,
     /// Of the sensors as they are logged.
     pub(crate) gain: ImuGain,
+}
+
+impl NewestState {
+    /// The pose world_from_body of an image, by the caller's number.
+    pub(crate) fn pose_of(&self, image: FrameId) -> Option<Se3> {
+        self.images.iter().find(|(frame, _)| *frame == image).map(|(_, pose)| *pose)
+    }
 }
 
 /// Adjusts all states of a log: those of the segment of most states, then outward, then all together.
@@ -75,6 +84,7 @@ pub(crate) fn newest_state(input: &AdjustmentInput<'_>) -> Result<NewestState, A
     let newest = problem.frames.len() - 1;
     let at = FRAME_DIM * newest;
     let state = problem.frames[newest].body.state;
+    let time_offset = passed.clock_offset + Duration::from_secs_f64(problem.calibration.clock_secs);
     let number = |k: usize| log.images[passed.images[k]].number();
     Ok(NewestState {
         frame: number(newest),
@@ -83,10 +93,27 @@ pub(crate) fn newest_state(input: &AdjustmentInput<'_>) -> Result<NewestState, A
         scale_std: result::log_scale_sigma(problem, &system),
         median_distance_m: median_distance(problem, newest).ok_or(AdjustmentError::Undetermined)?,
         states: problem.frames.iter().enumerate().map(|(k, f)| (number(k), f.body.state)).collect(),
-        time_offset: passed.clock_offset + Duration::from_secs_f64(problem.calibration.clock_secs),
+        images: poses_of_images(&recording, problem, time_offset),
+        time_offset,
         readout_secs: problem.calibration.readout_secs,
         gain: problem.calibration.gain,
     })
+}
+
+/// The pose of every image between the adjusted ones.
+fn poses_of_images(
+    recording: &Measurements<'_>,
+    problem: &Problem,
+    time_offset: Duration,
+) -> Vec<(FrameId, Se3)> {
+    let states = result::true_states(problem);
+    let imu = recording.imu.multiplied(&problem.calibration.gain);
+    let stamps = recording.log.stamps.iter();
+    let posed = stamps.filter_map(|(frame, stamp)| {
+        let state = result::state_at(&states, *stamp + time_offset, &imu, recording.model)?;
+        Some((*frame, state.world_from_body))
+    });
+    posed.collect()
 }
 
 /// Median distance of the landmarks that state `k` sees, m.
@@ -121,6 +148,12 @@ fn sigmas(state: &NavState, covariance: &Matrix15) -> GaugePriorSigmas {
 }
 
 impl TrackLog {
+    /// The pose world_from_body that was logged of an image, by the caller's number.
+    pub(crate) fn pose_of(&self, image: FrameId) -> Option<Se3> {
+        let logged = self.images.iter().find(|i| i.caller_frame == image)?;
+        Some(logged.state?.state.world_from_body)
+    }
+
     /// `ln` of how much larger the newest [`COMPARED_STATES`] of other states (in the order of numbers) are than those logged in `segment`: by the
     /// scatter of their positions. `None` where either does not move.
     pub(crate) fn log_scale_to(&self, states: &[(FrameId, NavState)], segment: u32) -> Option<f64> {

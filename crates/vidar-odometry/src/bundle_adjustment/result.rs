@@ -115,6 +115,13 @@ impl Adjusted {
     }
 }
 
+/// The adjusted states, at their images' true instants.
+pub(super) fn true_states(problem: &Problem) -> Vec<(Timestamp, NavState)> {
+    let secs = problem.calibration.clock_secs;
+    let clock = Duration::from_secs_f64(secs);
+    problem.frames.iter().map(|f| (f.time + clock, f.body.state_after(secs))).collect()
+}
+
 /// Whether camera and IMU agree in a solution with this mean squared inertial residual and so many observations left out.
 pub(super) fn agree(inertial_chi2_per_dof: f64, observations: usize, rejected: usize) -> bool {
     let share = rejected as f64 / (observations + rejected).max(1) as f64;
@@ -130,12 +137,7 @@ pub(super) fn collect(
     let Measurements { log, imu, model } = *recording;
     let Solution { problem, clock_offset, report, system, covariance, .. } = solution;
     let clock = Duration::from_secs_f64(problem.calibration.clock_secs);
-    // States at the images' true instants.
-    let states: Vec<(Timestamp, NavState)> = problem
-        .frames
-        .iter()
-        .map(|f| (f.time + clock, f.body.state_after(problem.calibration.clock_secs)))
-        .collect();
+    let states = true_states(problem);
     let offset = *clock_offset + clock;
     let every_image = log
         .stamps
@@ -185,7 +187,7 @@ pub(super) fn collect(
 
 /// The state at an instant: carried by the IMU from the adjusted state before it, and corrected by what the IMU misses the
 /// next one by, in proportion to the time.
-fn state_at(
+pub(super) fn state_at(
     states: &[(Timestamp, NavState)],
     time: Timestamp,
     imu: &ImuBuffer,

@@ -1,6 +1,7 @@
 //! Start in motion.
 
 mod acceptance;
+mod assumed;
 
 use super::failure::{InitFailure, InitFailureReason};
 use super::gyro_bias::{RayPair, gyro_bias};
@@ -210,11 +211,20 @@ impl InFlightInitializer {
                 break;
             }
         }
-        let Some((mut smoother, fit)) = best else {
+        let Some((mut smoother, mut fit)) = best else {
             return Ok(Err(InitFailure::new(InitFailureReason::Frames, 0.0, 1.0)));
         };
+        // Chosen views may begin a little after the log does.
+        let logged_secs = views::connected_secs(log);
+        if logged_secs >= PROVISIONAL_SECS
+            && !Self::tells_scale(&mut smoother)
+            && let Some(assumed) = Self::at_assumed_distance(&smoother, &views, &tracks)
+        {
+            smoother = self.build(&views, &tracks, &turns, &assumed)?;
+            fit = self.refine_with_assumed_distances(&mut smoother);
+        }
         self.learn_gyro_bias(&mut smoother);
-        Ok(self.evaluate(smoother, &fit, span))
+        Ok(self.evaluate(smoother, &fit, logged_secs))
     }
 
     /// Step 1: gyroscope bias from pairs of neighbouring and next-but-one views.

@@ -54,7 +54,7 @@ fn a_flight_with_speeding_up_and_turning_is_started_metrically() {
     }
 }
 
-/// A state may begin, but no attempt claims to know its scale better than to a factor (they say 0.63 and more).
+/// A state begins with an assumed distance, and no attempt claims to know its scale better than to a factor.
 #[test]
 fn constant_velocity_never_tells_the_scale() {
     for (seed, speed) in [(1, 0.4), (2, 1.0), (3, 2.5), (4, 1.5)] {
@@ -62,6 +62,10 @@ fn constant_velocity_never_tells_the_scale() {
         let simulation =
             simulate(&course, &SimulationConfig { seed, wall_distance_m: 4.0, ..Default::default() });
         let (failures, started) = until_started(&simulation);
+        let (at, ..) =
+            started.as_ref().unwrap_or_else(|| panic!("no state at {speed} m/s: {:?}", failures.last()));
+        let waited = (simulation.frames[at.index()].time - simulation.frames[0].time).as_secs_f64();
+        assert!(waited < 2.9, "a state after {waited} s at {speed} m/s");
         let refused = failures.iter().filter(|r| r.reason == InitFailureReason::ScaleUncertainty);
         let sigmas: Vec<f64> = refused.map(|r| r.measured).chain(started.map(|s| s.1)).collect();
         let least = sigmas.iter().copied().fold(f64::INFINITY, f64::min);

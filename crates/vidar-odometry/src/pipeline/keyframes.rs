@@ -15,6 +15,8 @@ pub(crate) struct KeyframeRegistry {
     next: u32,
     /// Frame of the smoother and name, oldest first.
     held: Vec<(FrameId, KeyframeId)>,
+    /// The caller's number of the image and name, of all keyframes of the segment while a scale that is settled later may revise them.
+    provisional: Vec<(FrameId, KeyframeId)>,
 }
 
 /// What a keyframe is made from, besides the smoother.
@@ -37,6 +39,20 @@ impl KeyframeRegistry {
         self.held.clear();
     }
 
+    /// Poses that were told so far are not revised by a settled scale any more.
+    pub fn forget_provisional(&mut self) {
+        self.provisional.clear();
+    }
+
+    /// The provisional keyframes that the smoother does not hold at other poses world_from_camera of their images, where there are any.
+    pub fn moved(&self, pose: impl Fn(FrameId) -> Option<Se3>) -> Vec<RevisedPose> {
+        let left = self.provisional.iter().filter(|(_, id)| self.held.iter().all(|(_, held)| held != id));
+        let moved = left.filter_map(|(frame, id)| {
+            Some(RevisedPose { id: *id, world_from_camera: pose(*frame)?, is_final: true })
+        });
+        moved.collect()
+    }
+
     pub fn make(&mut self, smoother: &mut Smoother, input: &KeyframeInput<'_>) -> OdometryKeyframe {
         let id = KeyframeId(self.next);
         self.next = self.next.wrapping_add(1);
@@ -44,6 +60,7 @@ impl KeyframeRegistry {
             smoother.relative_covariance(*frame, input.frame).map(|covariance| (*id, covariance))
         });
         self.held.push((input.frame, id));
+        self.provisional.push((input.caller_frame, id));
         let pose_covariance: PoseCovariance = input.covariance.fixed_view::<6, 6>(0, 0).into_owned();
         OdometryKeyframe {
             id,

@@ -21,7 +21,8 @@ use std::collections::VecDeque;
 use std::sync::Arc;
 use successor::{RecentFrames, Successor};
 use vidar_core::{
-    CameraId, Duration, Frame, FrameId, ImuSample, LieGroup, Rig, RigCamera, Se3, SensorEvent, Timestamp,
+    CameraId, Duration, Frame, FrameId, ImuSample, LieGroup, RevisedPose, Rig, RigCamera, Se3, SensorEvent,
+    Timestamp,
 };
 
 mod adjustment;
@@ -96,6 +97,8 @@ pub struct Odometry {
     failure: InitFailure,
     health_monitor: HealthMonitor,
     keyframes: KeyframeRegistry,
+    /// Poses of keyframes in a scale that was settled with the newest image.
+    settled: Vec<RevisedPose>,
     check: OrientationCheck,
     time_calibration: TimeCalibration,
     images: ImagePool,
@@ -184,6 +187,7 @@ impl Odometry {
             failure: InitFailure { reason: InitFailureReason::Frames, measured: 0.0, limit: 5.0 },
             health_monitor: HealthMonitor::default(),
             keyframes: KeyframeRegistry::default(),
+            settled: Vec::new(),
         }
     }
 
@@ -304,7 +308,10 @@ impl Odometry {
         self.clock.lap(if was_starting { Stage::Initialise } else { Stage::Output });
         self.settle_scale(&status, frame.time);
         self.shorten_log(frame.time);
-        let status = self.follow_successor(id).unwrap_or(status);
+        let mut status = self.follow_successor(id).unwrap_or(status);
+        if let Status::Tracking(tracking) = &mut status {
+            tracking.revised.append(&mut self.settled);
+        }
         let used_from = self.last_frame.unwrap_or(time) - Duration::from_millis(1500);
         self.imu.forget_before(self.recent.oldest().map_or(used_from, |t| used_from.min(t)));
         Some(OdometryOutput { frame_id: frame.id, time: frame.time, status })
@@ -376,6 +383,7 @@ impl Odometry {
         self.initialize_anew();
         self.health_monitor = HealthMonitor::default();
         self.keyframes.forget_held();
+        self.keyframes.forget_provisional();
         self.relocalizer.lose(&reason, self.last_frame.unwrap_or_default());
         self.placed = None;
         self.segment = self.next_segment;

@@ -4,10 +4,11 @@
 //! says, and stays off. Adjusted all together with clock and gains among the unknowns, the same measurements give the scale with an honest
 //! σ; the odometry then goes on from the newest state of the adjustment (decision 38).
 
+use super::successor::level_motion;
 use super::{Odometry, Status};
 use crate::bundle_adjustment::{AdjustmentInput, CalibrationSigmas, NewestState, TrackLog, newest_state};
 use crate::deferred::Deferred;
-use vidar_core::{Duration, Timestamp};
+use vidar_core::{Duration, Se3, Timestamp};
 
 /// Standard deviation of ln(scale) below which there is a scale to settle: a body that stands shows none.
 const BEGUN_STD: f64 = 1.0;
@@ -35,7 +36,7 @@ const SOLVING_SECS: f64 = 2.0;
 const BEFORE_SECS: f64 = 4.0;
 const IMU_BEFORE_SECS: f64 = 0.5;
 
-/// A result that knows the scale no better is not gone on from.
+/// A result that knows the scale no better is of no use.
 const MAX_SCALE_STD: f64 = 0.5;
 
 /// The provisional scale of the present state.
@@ -77,6 +78,9 @@ impl Settling {
 impl Odometry {
     /// Adjusts what was seen so far where that is due, and goes on from a result that is due.
     pub(super) fn settle_scale(&mut self, status: &Status, now: Timestamp) {
+        if self.settling.is_over() {
+            self.keyframes.forget_provisional();
+        }
         let Status::Tracking(tracking) = status else { return };
         let settling = &mut self.settling;
         if settling.is_over() || (settling.began.is_none() && !(tracking.scale_std < BEGUN_STD)) {
@@ -85,8 +89,11 @@ impl Odometry {
         let age = (now - *settling.began.get_or_insert(now)).as_secs_f64();
         settling.is_provisional |= age >= JUDGED_SECS && tracking.scale_std > PROVISIONAL_STD;
         if let Some(solving) = settling.solving.take_if(|s| s.is_due(now)) {
-            if let Some(found) = solving.result().flatten().filter(|found| self.is_contradicted_by(found)) {
-                self.begin_successor_at(found);
+            if let Some(found) = solving.result().flatten().filter(|found| found.scale_std < MAX_SCALE_STD) {
+                match self.is_contradicted_by(&found) {
+                    true => self.begin_successor_at(found),
+                    false => self.revise_by(&found),
+                };
             }
             return;
         }
@@ -108,9 +115,28 @@ impl Odometry {
     /// would know less of the scene.
     fn is_contradicted_by(&self, found: &NewestState) -> bool {
         let difference = self.log.as_ref().and_then(|log| log.log_scale_to(&found.states, self.segment));
-        found.scale_std < MAX_SCALE_STD
-            && self.successor.is_none()
-            && difference.is_some_and(|ln| ln.abs() > found.scale_std)
+        self.successor.is_none() && difference.is_some_and(|ln| ln.abs() > found.scale_std)
+    }
+
+    /// Keyframes that the window left before it knew the scale, as an adjustment that agrees with it now has them.
+    fn revise_by(&mut self, found: &NewestState) -> Option<()> {
+        let now = self.recent.pose(found.frame)?;
+        self.revise_keyframes(found, None, &level_motion(&now, &found.state.world_from_body));
+        Some(())
+    }
+
+    /// Keyframes told so far get their poses from an adjustment, and later ones from what a second odometry logged; `world_from_found` leads from
+    /// the world of both to that of the segment.
+    pub(super) fn revise_keyframes(
+        &mut self,
+        found: &NewestState,
+        second: Option<&TrackLog>,
+        world_from_found: &Se3,
+    ) {
+        let pose = |image| found.pose_of(image).or_else(|| second?.pose_of(image));
+        let body_from_camera = &self.camera.body_from_camera;
+        self.settled =
+            self.keyframes.moved(|image| Some(*world_from_found * pose(image)? * *body_from_camera));
     }
 
     /// Keeps no more of the log than is needed, where it is kept for nothing else: a second odometry's is needed until it takes over.

@@ -81,7 +81,7 @@ impl RecentFrames {
         self.frames.front().map(|f| f.frame.time - Duration::from_secs_f64(IMU_BEFORE_SECS))
     }
 
-    fn pose(&self, id: FrameId) -> Option<Se3> {
+    pub fn pose(&self, id: FrameId) -> Option<Se3> {
         self.frames.iter().find(|f| f.id == id)?.world_from_body
     }
 }
@@ -312,6 +312,9 @@ impl Odometry {
         self.placed = world_from_new;
         self.health_monitor = HealthMonitor::default();
         self.keyframes.forget_held();
+        if let (Some(begun), Some(placed)) = (&successor.begun, &world_from_new) {
+            self.revise_keyframes(begun, new.log.as_ref(), placed);
+        }
         // Tracks have other names from here on.
         self.time_calibration.forget_tracks();
         match (&mut self.log, &new.log) {
@@ -322,7 +325,7 @@ impl Odometry {
 }
 
 /// The motion that brings `new` onto `old` about the vertical: both know where down is.
-fn level_motion(old: &Se3, new: &Se3) -> Se3 {
+pub(super) fn level_motion(old: &Se3, new: &Se3) -> Se3 {
     let turn = (old.rotation * new.rotation.inverse()).matrix();
     let heading = (turn[(1, 0)] - turn[(0, 1)]).atan2(turn[(0, 0)] + turn[(1, 1)]);
     let rotation = So3::exp(&(Vector3::z() * heading));
