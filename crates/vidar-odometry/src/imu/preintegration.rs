@@ -44,7 +44,7 @@ impl Delta {
     }
 
     /// One step between neighbouring IMU measurements.
-    fn step(a: &ImuSample, b: &ImuSample, bias: &Bias, model: &ImuModel) -> Self {
+    fn step(a: &ImuSample, b: &ImuSample, bias: &Bias, [gyro_variance, accel_variance]: [f64; 2]) -> Self {
         let secs = (b.time - a.time).as_secs_f64();
         let (w0, w1) = (a.gyro.0 - bias.gyro, b.gyro.0 - bias.gyro);
         let (f0, f1) = (a.accel.0 - bias.accel, b.accel.0 - bias.accel);
@@ -78,7 +78,6 @@ impl Delta {
         // White noise of density σ, averaged over the step, acts as a bias of variance σ²/h. Its course within the step adds
         // σ² h³ / 12 to the position's variance (σ² h³ / 3 in all). Without it a stretch of one step, as within a gap of the IMU,
         // has a singular covariance, and holds position to velocity as if it knew how the force went.
-        let [gyro_variance, accel_variance] = step_variances(a, b, secs, model);
         let mut covariance = by_gyro_bias * by_gyro_bias.transpose() * gyro_variance
             + by_accel_bias * by_accel_bias.transpose() * accel_variance;
         for k in 3..6 {
@@ -135,7 +134,12 @@ fn magnus(w0: &Vector3<f64>, w1: &Vector3<f64>, secs: f64) -> (Vector3<f64>, Mat
     ((w0 + w1) * (0.5 * secs) + w0.cross(w1) * k, Matrix3::identity() * -secs + hat(&(w1 - w0)) * k)
 }
 
-fn step_variances(a: &ImuSample, b: &ImuSample, secs: f64, model: &ImuModel) -> [f64; 2] {
+/// A sensor stays beyond its range for about so long, s: its error is the same meanwhile, while steps are integrated as if theirs were independent.
+const SATURATED_SECS: f64 = 0.05;
+
+/// Variances of the white noise of the gyroscope and the accelerometer, averaged over the step between two samples.
+fn step_variances(a: &ImuSample, b: &ImuSample, model: &ImuModel) -> [f64; 2] {
+    let secs = (b.time - a.time).as_secs_f64();
     // Ten times the noise per 50 ms without IMU measurements, at most 1e4.
     let missing_secs = (secs - 2.0 * model.noise.period_secs).max(0.0);
     let gap_factor = 10.0_f64.powf((missing_secs / 0.05).min(4.0));
@@ -143,7 +147,7 @@ fn step_variances(a: &ImuSample, b: &ImuSample, secs: f64, model: &ImuModel) -> 
     // Beyond its range a sensor says only that much: what was may be off by the range again.
     let variance = |density: f64, saturated: bool, limit: f64| {
         let white = (density * gap_factor).powi(2) / secs;
-        if saturated { white.max(limit * limit) } else { white }
+        if saturated { white.max(limit * limit * (SATURATED_SECS / secs).max(1.0)) } else { white }
     };
     let gyro_saturated = beyond(&a.gyro.0, &b.gyro.0, model.gyro_limit);
     let accel_saturated = beyond(&a.accel.0, &b.accel.0, model.accel_limit);
@@ -299,7 +303,8 @@ impl Preintegration {
     pub(crate) fn by_gain(&self) -> SMatrix<f64, 9, 6> {
         let steps = self.samples.windows(2).filter(|pair| pair[1].time > pair[0].time);
         let (_, by_accel_gain) = steps.fold((Delta::none(), ByBias::zeros()), |(sum, by_gain), pair| {
-            let step = Delta::step(&pair[0], &pair[1], &self.bias, &self.model);
+            let variances = step_variances(&pair[0], &pair[1], &self.model);
+            let step = Delta::step(&pair[0], &pair[1], &self.bias, variances);
             let mut of_step = step.by_accel_bias;
             for (k, mut column) in of_step.column_iter_mut().enumerate() {
                 column *= -0.5 * (pair[0].accel.0[k] + pair[1].accel.0[k]);
@@ -343,8 +348,24 @@ impl Preintegration {
 }
 
 fn integrate(samples: &[ImuSample], bias: &Bias, model: &ImuModel) -> Delta {
-    samples
-        .windows(2)
-        .filter(|pair| pair[1].time > pair[0].time)
-        .fold(Delta::none(), |sum, pair| sum.then(&Delta::step(&pair[0], &pair[1], bias, model)))
+    let is_clipped = |s: &ImuSample| s.gyro.0.amax() > model.gyro_limit;
+    let steps = |read: &dyn Fn(usize) -> ImuSample| {
+        (1..samples.len()).filter(|k| samples[*k].time > samples[*k - 1].time).fold(
+            Delta::none(),
+            |sum, k| {
+                let variances = step_variances(&samples[k - 1], &samples[k], model);
+                sum.then(&Delta::step(&read(k - 1), &read(k), bias, variances))
+            },
+        )
+    };
+    if !samples.iter().any(is_clipped) {
+        return steps(&|k| samples[k]);
+    }
+    // What lies beyond the range was not measured, and a rotation of a radian that was not would turn what the accelerometer feels afterwards:
+    // the nearest rate within the range stands in, at the noise of a clipped one.
+    steps(&|k| {
+        let within = (0..samples.len()).filter(|j| !is_clipped(&samples[*j]));
+        let gyro = within.min_by_key(|j| j.abs_diff(k)).map_or(samples[k].gyro, |j| samples[j].gyro);
+        ImuSample { gyro, ..samples[k] }
+    })
 }

@@ -287,6 +287,22 @@ fn a_gap_and_a_saturated_sample_inflate_the_noise() {
     assert!(gapped[(0, 0)] > 100.0 * plain[(0, 0)] && saturated[(0, 0)] > 100.0 * plain[(0, 0)]);
 }
 
+/// A gyroscope that reads its limit for 60 ms: the rate around stands in, and the motion is told to a tenth of what its covariance says.
+#[test]
+fn a_clipped_gyroscope_does_not_turn_what_the_accelerometer_feels() {
+    let samples = imu_samples(1.0, 1.5, 200.0, &Bias::ZERO);
+    let clean = Preintegration::new(model(), Bias::ZERO, &samples).delta;
+    let mut clipped = samples;
+    clipped[40..52].iter_mut().for_each(|s| s.gyro.0 = Vector3::new(17.5, -17.5, 17.5));
+    let found = Preintegration::new(model(), Bias::ZERO, &clipped).delta;
+    let turned = (clean.rotation.inverse() * found.rotation).log().norm();
+    assert!(turned < 0.1, "{turned} rad");
+    let off = found.velocity - clean.velocity;
+    let sigma = found.covariance.fixed_view::<3, 3>(6, 6).trace().sqrt();
+    assert!(off.norm() < 0.1 * sigma, "velocity off by {} m/s at {sigma}", off.norm());
+    assert!(sigma > 0.5, "what was clipped is hardly known: {sigma} m/s");
+}
+
 #[test]
 fn the_buffer_cuts_between_samples_and_tells_gaps() {
     let mut buffer = ImuBuffer::new(200.0);

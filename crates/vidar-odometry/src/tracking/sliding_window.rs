@@ -219,7 +219,7 @@ impl SlidingWindowOdometry {
         step.is_keyframe = match step.is_still {
             // The first frame of a rest stands for all of it.
             true => self.rest.is_none(),
-            false => self.keyframe_is_due(frame, input.time),
+            false => self.keyframe_is_due(&input.host, input.time),
         };
         if step.is_keyframe {
             self.make_keyframe(input.host)?;

@@ -128,6 +128,13 @@ impl Tracker {
         }
     }
 
+    /// How many tracks could begin in an image, if there were none.
+    pub fn corners(&mut self, image: &HostImage) -> usize {
+        self.grid.clear();
+        self.detector.detect(&image.pyramid, &self.grid, &mut self.detections);
+        self.detections.len()
+    }
+
     /// Starts tracks in the free cells of `host`, at most `limit`, with distances as `typical_inverse`.
     pub fn detect(&mut self, host: &Arc<HostImage>, limit: usize, typical_inverse: f64) -> usize {
         self.grid.clear();

@@ -38,7 +38,7 @@ fn a_saturated_gyroscope_is_not_used() {
     }
     let outputs = recording.run();
     assert!(lost(&outputs).is_empty(), "{:?}", lost(&outputs));
-    within("gyroscope saturated for 60 ms", &recording, &outputs, 0.05);
+    within("gyroscope saturated for 60 ms", &recording, &outputs, 0.02);
 }
 
 fn inverted() -> Recording {

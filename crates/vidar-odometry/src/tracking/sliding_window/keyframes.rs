@@ -19,15 +19,17 @@ const KEYFRAME_PARALLAX_PX: f64 = 20.0;
 const KEYFRAME_SECS: f64 = 3.0;
 const KEYFRAME_MIN_FRAMES: u32 = 3;
 
-/// With fewer tracks than this, keyframes are this many frames apart.
+/// With fewer tracks than this, keyframes are this many frames apart, unless the image shows so many corners that tracks can begin.
 const BLIND_TRACKS: usize = 10;
 const BLIND_FRAMES: u32 = 10;
+const SEEING_CORNERS: usize = 40;
 
 /// Keyframes that share less than this of their landmarks with the newest frame leave first.
 const KEYFRAME_FORGOTTEN_SHARE: f64 = 0.1;
 
 impl SlidingWindowOdometry {
-    pub(super) fn keyframe_is_due(&mut self, frame: FrameId, time: Timestamp) -> bool {
+    pub(super) fn keyframe_is_due(&mut self, image: &HostImage, time: Timestamp) -> bool {
+        let frame = image.frame;
         self.frames_since_keyframe += 1;
         let tracked = self.tracker.tracks.iter().filter(|t| t.is_landmark && t.measured.is_some()).count();
         let seeds = self.tracker.tracks.iter().filter(|t| !t.is_landmark && t.measured.is_some()).count();
@@ -40,8 +42,8 @@ impl SlidingWindowOdometry {
             return false;
         }
         if tracked + seeds < BLIND_TRACKS && self.frames_since_keyframe < BLIND_FRAMES {
-            // Nothing to see: more keyframes would only push out those that know the scene.
-            return false;
+            // With nothing to see more keyframes would only push out those that know the scene.
+            return self.tracker.corners(image) >= SEEING_CORNERS;
         }
         let few = (tracked as f64) < KEYFRAME_SHARE * self.keyframe_landmarks as f64
             || tracked + seeds < self.config.max_landmarks / 2;
