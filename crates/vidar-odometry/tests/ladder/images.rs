@@ -3,6 +3,7 @@
 use crate::recording::{add_noise, lost, recording, rendered, within};
 use vidar_core::random::SplitMix64;
 use vidar_core::{Health, Image};
+use vidar_odometry::OdometryOutput;
 
 #[test]
 fn a_third_of_the_images_may_be_missing_from_the_first_on() {
@@ -54,6 +55,23 @@ fn a_second_without_texture_is_degraded_and_survived() {
     assert!(lost(&outputs).is_empty(), "{:?}", lost(&outputs));
     assert!(outputs[138].health().is_metric(), "{:?}", outputs[138].health());
     within("a second without texture", &recording, &outputs, 0.1);
+}
+
+/// However long it was before: keyframes of a window that sees nothing come every tenth image only.
+#[test]
+fn tracks_begin_again_as_soon_as_there_is_something_to_see() {
+    for blank in [12, 14, 16, 18] {
+        let mut recording = recording();
+        let (from, until) = (95, 95 + blank);
+        for k in from..until {
+            recording.images[k].1 = add_noise(&Image::filled(376, 240, 120), 1.5, k as u64);
+        }
+        let outputs = recording.run();
+        let sees = |o: &OdometryOutput| o.tracking().is_some_and(|t| t.tracked >= 15);
+        let waited = outputs[until..].iter().position(sees).unwrap();
+        println!("{blank} images without texture: landmarks again {waited} images later");
+        assert!(waited <= 6, "{blank} images without texture: landmarks again {waited} images later");
+    }
 }
 
 #[test]
