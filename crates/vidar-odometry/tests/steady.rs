@@ -10,6 +10,8 @@ use vidar_eval::{TrajectoryEvalConfig, evaluate_trajectory};
 use vidar_odometry::{Odometry, OdometryConfig, OdometryOutput};
 use vidar_synth::{FlightKind, SceneKind, SynthConfig, write_sequence};
 
+type Stamped = Vec<(Timestamp, Se3)>;
+
 fn run(recording: &Recording) -> Vec<OdometryOutput> {
     let events = || recording.events().map(Result::unwrap);
     let config = OdometryConfig::default();
@@ -21,7 +23,7 @@ fn run(recording: &Recording) -> Vec<OdometryOutput> {
 }
 
 /// Stamps and poses world_from_camera of all keyframes, as they were told and as they were revised last.
-fn keyframes(outputs: &[OdometryOutput]) -> (Vec<(Timestamp, Se3)>, Vec<(Timestamp, Se3)>) {
+fn keyframes(outputs: &[OdometryOutput]) -> (Stamped, Stamped) {
     let mut told: BTreeMap<KeyframeId, (Timestamp, Se3, Se3)> = BTreeMap::new();
     for tracking in outputs.iter().filter_map(|o| o.tracking()) {
         if let Some(k) = &tracking.keyframe {

@@ -12,7 +12,9 @@ pub(crate) mod standstill;
 mod track;
 mod tracker;
 
-pub(crate) use sliding_window::{FrameInput, SlidingWindowOdometry, StepReport};
+pub(crate) use sliding_window::{
+    ASSUMED_LANDMARKS, ASSUMED_LOG_STD, FrameInput, SlidingWindowOdometry, StepReport,
+};
 pub(crate) use standstill::{ImageMotion, ImuStatistics, tracks_in};
 pub use track::TrackRecord;
 pub(crate) use track::{

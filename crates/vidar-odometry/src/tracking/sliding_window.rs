@@ -5,6 +5,8 @@ mod keyframes;
 mod seeds;
 mod standstill;
 
+pub(crate) use seeds::{ASSUMED_LANDMARKS, ASSUMED_LOG_STD};
+
 use super::standstill::{ImageMotion, tracks_in};
 use super::track::TrackRecord;
 use super::track::{HostImage, Track, noisy_covariance};

@@ -5,12 +5,8 @@ use crate::backend::Smoother;
 use crate::initialization::linear::LinearSolution;
 use crate::initialization::monocular::INITIAL_INVERSE_DISTANCE;
 use crate::initialization::views::{Track, View};
+use crate::tracking::{ASSUMED_LANDMARKS, ASSUMED_LOG_STD};
 use vidar_core::{LandmarkId, LieGroup};
-
-/// Landmarks whose distance is assumed, and the standard deviation of the logarithms of their distances: together they say that the scene is
-/// 2.5 m away to a factor of two (2.4 / √12 = 0.7), as for a start from rest (`tracking::sliding_window::seeds`).
-const ASSUMED_LANDMARKS: usize = 12;
-const ASSUMED_LOG_STD: f64 = 2.4;
 
 /// Standard deviation of ln(scale) up to which a window needs no assumption: what the assumption tells. A body that goes steadily along a line or
 /// a circle does not show its scale, however long one waits: what it feels looks like a bias of the accelerometer.

@@ -20,8 +20,8 @@ const PROMOTION_FRAMES: u32 = 4;
 
 /// Landmarks whose distance is assumed while none is known, and the standard deviation of the logarithms of their distances.
 /// Together they say that the scene is 2.5 m away to a factor of two (2.4 / √12 = 0.7), as rooms and desks are; each alone may be anywhere.
-const ASSUMED_LANDMARKS: usize = 12;
-const ASSUMED_LOG_STD: f64 = 2.4;
+pub(crate) const ASSUMED_LANDMARKS: usize = 12;
+pub(crate) const ASSUMED_LOG_STD: f64 = 2.4;
 
 impl SlidingWindowOdometry {
     /// A state that begins at rest knows no distance, and its velocity is that of the accelerometer alone as soon as it moves.
