@@ -82,6 +82,8 @@ pub(crate) struct SlidingWindowOdometry {
     frames_since_keyframe: u32,
     /// Landmarks that the last keyframe showed.
     keyframe_landmarks: usize,
+    /// Whether landmarks have carried the state at any time.
+    has_seen: bool,
     /// Typical inverse distance, 1/m.
     typical_inverse: f64,
     motion: ImageMotion,
@@ -147,6 +149,7 @@ impl SlidingWindowOdometry {
             last_keyframe,
             frames_since_keyframe: 0,
             keyframe_landmarks,
+            has_seen: false,
             typical_inverse,
             motion: ImageMotion::default(),
             rest: None,

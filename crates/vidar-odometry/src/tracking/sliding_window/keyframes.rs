@@ -35,6 +35,7 @@ impl SlidingWindowOdometry {
         let seeds = self.tracker.tracks.iter().filter(|t| !t.is_landmark && t.measured.is_some()).count();
         let since =
             self.smoother.time(self.last_keyframe).map_or(f64::INFINITY, |t| (time - t).as_secs_f64());
+        self.has_seen |= tracked >= BLIND_TRACKS;
         if since > KEYFRAME_SECS {
             return true;
         }
@@ -42,8 +43,9 @@ impl SlidingWindowOdometry {
             return false;
         }
         if tracked + seeds < BLIND_TRACKS && self.frames_since_keyframe < BLIND_FRAMES {
-            // With nothing to see more keyframes would only push out those that know the scene.
-            return self.tracker.corners(image) >= SEEING_CORNERS;
+            // With nothing to see more keyframes would only push out those that know the scene. A state that has not seen anything yet waits, too:
+            // its tracks may fail for a clock that is not known, and would fail again.
+            return self.has_seen && self.tracker.corners(image) >= SEEING_CORNERS;
         }
         let few = (tracked as f64) < KEYFRAME_SHARE * self.keyframe_landmarks as f64
             || tracked + seeds < self.config.max_landmarks / 2;
