@@ -7,6 +7,7 @@
 
 use super::{Bias, ImuModel, NavState, hat};
 use nalgebra::{Matrix3, SMatrix, Vector3};
+use std::borrow::Cow;
 use vidar_core::{ImuSample, LieGroup, Se3, So3};
 
 /// 9×9 in the order rotation, position, velocity.
@@ -348,24 +349,27 @@ impl Preintegration {
 }
 
 fn integrate(samples: &[ImuSample], bias: &Bias, model: &ImuModel) -> Delta {
-    let is_clipped = |s: &ImuSample| s.gyro.0.amax() > model.gyro_limit;
-    let steps = |read: &dyn Fn(usize) -> ImuSample| {
-        (1..samples.len()).filter(|k| samples[*k].time > samples[*k - 1].time).fold(
-            Delta::none(),
-            |sum, k| {
-                let variances = step_variances(&samples[k - 1], &samples[k], model);
-                sum.then(&Delta::step(&read(k - 1), &read(k), bias, variances))
-            },
-        )
-    };
-    if !samples.iter().any(is_clipped) {
-        return steps(&|k| samples[k]);
-    }
-    // What lies beyond the range was not measured, and a rotation of a radian that was not would turn what the accelerometer feels afterwards:
-    // the nearest rate within the range stands in, at the noise of a clipped one.
-    steps(&|k| {
-        let within = (0..samples.len()).filter(|j| !is_clipped(&samples[*j]));
-        let gyro = within.min_by_key(|j| j.abs_diff(k)).map_or(samples[k].gyro, |j| samples[j].gyro);
-        ImuSample { gyro, ..samples[k] }
+    let is_clipped = samples.iter().any(|s| s.gyro.0.amax() > model.gyro_limit);
+    let read = if is_clipped { within_range(samples, model.gyro_limit).into() } else { Cow::from(samples) };
+    let steps = samples.windows(2).zip(read.windows(2)).filter(|(pair, _)| pair[1].time > pair[0].time);
+    steps.fold(Delta::none(), |sum, (pair, read)| {
+        let variances = step_variances(&pair[0], &pair[1], model);
+        sum.then(&Delta::step(&read[0], &read[1], bias, variances))
     })
+}
+
+/// Samples with the nearest rate within the gyroscope's range in place of clipped ones, where there is any. What lies beyond the range was not
+/// measured, and a rotation of a radian that was not would turn what the accelerometer feels afterwards.
+fn within_range(samples: &[ImuSample], limit: f64) -> Vec<ImuSample> {
+    let good: Vec<usize> = (0..samples.len()).filter(|k| samples[*k].gyro.0.amax() <= limit).collect();
+    let nearest = |k: usize| {
+        let after = good.partition_point(|g| *g < k);
+        let around = [after.checked_sub(1), Some(after)].into_iter().flatten();
+        around.filter_map(|at| good.get(at)).min_by_key(|g| g.abs_diff(k))
+    };
+    let stand_in = |(k, s): (usize, &ImuSample)| {
+        let gyro = nearest(k).map_or(s.gyro, |g| samples[*g].gyro);
+        ImuSample { gyro, ..*s }
+    };
+    samples.iter().enumerate().map(stand_in).collect()
 }
