@@ -214,9 +214,7 @@ impl InFlightInitializer {
         let Some((mut smoother, mut fit)) = best else {
             return Ok(Err(InitFailure::new(InitFailureReason::Frames, 0.0, 1.0)));
         };
-        // Chosen views may begin a little after the log does.
-        let logged_secs = views::connected_secs(log);
-        if logged_secs >= PROVISIONAL_SECS
+        if span >= PROVISIONAL_SECS
             && !Self::tells_scale(&mut smoother)
             && let Some(assumed) = Self::at_assumed_distance(&smoother, &views, &tracks)
         {
@@ -224,7 +222,7 @@ impl InFlightInitializer {
             fit = self.refine_with_assumed_distances(&mut smoother);
         }
         self.learn_gyro_bias(&mut smoother);
-        Ok(self.evaluate(smoother, &fit, logged_secs))
+        Ok(self.evaluate(smoother, &fit, span))
     }
 
     /// Step 1: gyroscope bias from pairs of neighbouring and next-but-one views.

@@ -1,6 +1,6 @@
 //! The odometry before it has a metric state: tracks are followed with the gyroscope's help and logged.
 
-use super::in_flight::{MAX_LOG_SCALE_SIGMA, PROVISIONAL_SECS};
+use super::in_flight::PROVISIONAL_SECS;
 use super::log::joined;
 use super::monocular::INITIAL_INVERSE_DISTANCE;
 use super::{
@@ -243,12 +243,9 @@ impl Initializer {
             | InitFailureReason::Tracks => ATTEMPT_SECS,
             _ => CONTRADICTION_PAUSE_SECS,
         };
-        // From some length on less is asked for; what failed began before that.
-        let until_less = match failure.limit <= MAX_LOG_SCALE_SIGMA {
-            true => PROVISIONAL_SECS - span,
-            false => f64::INFINITY,
-        };
-        pause.min(until_less).clamp(ATTEMPT_SECS, LONGEST_PAUSE_SECS)
+        // From some length on less is asked for.
+        let until_less = Some(PROVISIONAL_SECS - span).filter(|s| *s > 0.0);
+        pause.min(until_less.unwrap_or(f64::INFINITY)).clamp(ATTEMPT_SECS, LONGEST_PAUSE_SECS)
     }
 
     fn attempt_mono(&mut self) -> Result<InitialState, InitFailure> {

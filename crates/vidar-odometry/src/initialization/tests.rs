@@ -65,7 +65,7 @@ fn constant_velocity_never_tells_the_scale() {
         let (at, ..) =
             started.as_ref().unwrap_or_else(|| panic!("no state at {speed} m/s: {:?}", failures.last()));
         let waited = (simulation.frames[at.index()].time - simulation.frames[0].time).as_secs_f64();
-        assert!(waited < 2.9, "a state after {waited} s at {speed} m/s");
+        assert!(waited < 3.2, "a state after {waited} s at {speed} m/s");
         let refused = failures.iter().filter(|r| r.reason == InitFailureReason::ScaleUncertainty);
         let sigmas: Vec<f64> = refused.map(|r| r.measured).chain(started.map(|s| s.1)).collect();
         let least = sigmas.iter().copied().fold(f64::INFINITY, f64::min);

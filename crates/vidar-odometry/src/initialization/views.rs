@@ -25,7 +25,7 @@ pub(super) struct Track {
 pub(super) fn choose(log: &[LoggedFrame], window_secs: f64, most: usize) -> Vec<View<'_>> {
     let Some(newest) = log.last() else { return Vec::new() };
     // A frame without IMU measurements cannot be connected to what came before it.
-    let chained = first_connected(log);
+    let chained = log.iter().rposition(|f| f.preintegration.is_none()).unwrap_or(0);
     let within = |f: &&LoggedFrame| (newest.time - f.time).as_secs_f64() <= window_secs + 1e-6;
     let log = &log[chained..];
     let log = &log[log.len() - log.iter().rev().take_while(within).count()..];
@@ -44,19 +44,6 @@ pub(super) fn choose(log: &[LoggedFrame], window_secs: f64, most: usize) -> Vec<
         .windows(2)
         .map(|pair| View { logged: &log[pair[1]], preintegration: joined(&log[pair[0] + 1..=pair[1]]) });
     first.into_iter().chain(later).collect()
-}
-
-/// The first frame that IMU measurements connect with the last one.
-fn first_connected(log: &[LoggedFrame]) -> usize {
-    log.iter().rposition(|f| f.preintegration.is_none()).unwrap_or(0)
-}
-
-/// How long the log is from there on, s.
-pub(super) fn connected_secs(log: &[LoggedFrame]) -> f64 {
-    match (log.get(first_connected(log)), log.last()) {
-        (Some(first), Some(last)) => (last.time - first.time).as_secs_f64(),
-        _ => 0.0,
-    }
 }
 
 /// Tracks that at least three views share, in the order of their names.

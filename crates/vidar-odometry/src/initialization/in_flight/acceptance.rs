@@ -30,7 +30,7 @@ impl InFlightInitializer {
         &mut self,
         mut smoother: Smoother,
         fit: &Fit,
-        logged_secs: f64,
+        span_secs: f64,
     ) -> Result<InFlightSolution, InitFailure> {
         let places: Vec<(FrameId, Vector3<f64>)> = smoother
             .frames()
@@ -43,7 +43,7 @@ impl InFlightInitializer {
         let bias = smoother.newest().map_or(Bias::ZERO, |(.., s)| s.bias);
         let median_distance_m = median(smoother.landmarks().map(|l| 1.0 / l.inverse_distance)).unwrap_or(0.0);
         // A well-known scale is taken as soon as it is there; a provisional one only from a long stretch that fits well.
-        let (max_sigma, max_left_out) = match logged_secs >= PROVISIONAL_SECS {
+        let (max_sigma, max_left_out) = match span_secs >= PROVISIONAL_SECS {
             true if sigma > MAX_LOG_SCALE_SIGMA => (PROVISIONAL_LOG_SCALE_SIGMA, MOST_LEFT_OUT_PROVISIONAL),
             _ => (MAX_LOG_SCALE_SIGMA, MOST_LEFT_OUT),
         };
