@@ -33,7 +33,7 @@ pub(crate) struct NewestState {
     pub(crate) median_distance_m: f64,
     /// Every logged image with its state, in the order of time.
     pub(crate) states: Vec<(FrameId, NavState)>,
-    /// Every image, by the caller's number, with its pose world_from_body.
+    /// The images whose stamps the log has, by the caller's number, with their poses world_from_body.
     pub(crate) images: Vec<(FrameId, Se3)>,
     /// `t_imu = stamp + offset`.
     pub(crate) time_offset: Duration,
@@ -85,6 +85,9 @@ pub(crate) fn newest_state(input: &AdjustmentInput<'_>) -> Result<NewestState, A
     let at = FRAME_DIM * newest;
     let state = problem.frames[newest].body.state;
     let time_offset = passed.clock_offset + Duration::from_secs_f64(problem.calibration.clock_secs);
+    let with_gains =
+        Measurements { log, imu: &imu.multiplied(&problem.calibration.gain), model: &input.model };
+    let images = result::states_of_images(&with_gains, problem, time_offset).into_iter();
     let number = |k: usize| log.images[passed.images[k]].number();
     Ok(NewestState {
         frame: number(newest),
@@ -93,27 +96,11 @@ pub(crate) fn newest_state(input: &AdjustmentInput<'_>) -> Result<NewestState, A
         scale_std: result::log_scale_sigma(problem, &system),
         median_distance_m: median_distance(problem, newest).ok_or(AdjustmentError::Undetermined)?,
         states: problem.frames.iter().enumerate().map(|(k, f)| (number(k), f.body.state)).collect(),
-        images: poses_of_images(&recording, problem, time_offset),
+        images: images.map(|(image, _, state)| (image, state.world_from_body)).collect(),
         time_offset,
         readout_secs: problem.calibration.readout_secs,
         gain: problem.calibration.gain,
     })
-}
-
-/// The pose of every image between the adjusted ones.
-fn poses_of_images(
-    recording: &Measurements<'_>,
-    problem: &Problem,
-    time_offset: Duration,
-) -> Vec<(FrameId, Se3)> {
-    let states = result::true_states(problem);
-    let imu = recording.imu.multiplied(&problem.calibration.gain);
-    let stamps = recording.log.stamps.iter();
-    let posed = stamps.filter_map(|(frame, stamp)| {
-        let state = result::state_at(&states, *stamp + time_offset, &imu, recording.model)?;
-        Some((*frame, state.world_from_body))
-    });
-    posed.collect()
 }
 
 /// Median distance of the landmarks that state `k` sees, m.

@@ -115,11 +115,23 @@ impl Adjusted {
     }
 }
 
-/// The adjusted states, at their images' true instants.
-pub(super) fn true_states(problem: &Problem) -> Vec<(Timestamp, NavState)> {
+/// Every image of the log between the first and the last adjusted one, with its stamp and its state. `recording` has IMU measurements with the
+/// gains applied; `t_imu = stamp + offset`.
+pub(super) fn states_of_images(
+    recording: &Measurements<'_>,
+    problem: &Problem,
+    offset: Duration,
+) -> Vec<(FrameId, Timestamp, NavState)> {
+    let Measurements { log, imu, model } = *recording;
     let secs = problem.calibration.clock_secs;
     let clock = Duration::from_secs_f64(secs);
-    problem.frames.iter().map(|f| (f.time + clock, f.body.state_after(secs))).collect()
+    // At the images' true instants.
+    let adjusted: Vec<(Timestamp, NavState)> =
+        problem.frames.iter().map(|f| (f.time + clock, f.body.state_after(secs))).collect();
+    let state = |(frame, stamp): &(FrameId, Timestamp)| {
+        Some((*frame, *stamp, state_at(&adjusted, *stamp + offset, imu, model)?))
+    };
+    log.stamps.iter().filter_map(state).collect()
 }
 
 /// Whether camera and IMU agree in a solution with this mean squared inertial residual and so many observations left out.
@@ -134,19 +146,11 @@ pub(super) fn collect(
     recording: &Measurements<'_>,
     solution: &Solution,
 ) -> Adjusted {
-    let Measurements { log, imu, model } = *recording;
     let Solution { problem, clock_offset, report, system, covariance, .. } = solution;
     let clock = Duration::from_secs_f64(problem.calibration.clock_secs);
-    let states = true_states(problem);
     let offset = *clock_offset + clock;
-    let every_image = log
-        .stamps
-        .iter()
-        .filter_map(|(frame, stamp)| {
-            let state = state_at(&states, *stamp + offset, imu, model)?;
-            Some((*frame, public_state(&state, *stamp)))
-        })
-        .collect();
+    let states = states_of_images(recording, problem, offset).into_iter();
+    let every_image = states.map(|(frame, stamp, state)| (frame, public_state(&state, stamp))).collect();
     let scale_std = log_scale_sigma(problem, system);
     let sigmas = calibration_sigmas(problem, covariance);
     let gains = problem.calibration.dim() - GAIN_DIM;
@@ -166,8 +170,8 @@ pub(super) fn collect(
             accel_gain: problem.calibration.gain.accel.add_scalar(1.0),
             gyro_gain_sigma: Vector3::from_column_slice(&sigmas[gains..gains + 3]),
             accel_gain_sigma: Vector3::from_column_slice(&sigmas[gains + 3..]),
-            gyro_noise_density: model.noise.gyro_density,
-            accel_noise_density: model.noise.accel_density,
+            gyro_noise_density: recording.model.noise.gyro_density,
+            accel_noise_density: recording.model.noise.accel_density,
         },
         findings: findings::of(problem, covariance, &input.given_body_from_camera, input.sigmas),
         scale_std,
@@ -187,7 +191,7 @@ pub(super) fn collect(
 
 /// The state at an instant: carried by the IMU from the adjusted state before it, and corrected by what the IMU misses the
 /// next one by, in proportion to the time.
-pub(super) fn state_at(
+fn state_at(
     states: &[(Timestamp, NavState)],
     time: Timestamp,
     imu: &ImuBuffer,

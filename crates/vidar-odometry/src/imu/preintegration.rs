@@ -302,17 +302,16 @@ impl Preintegration {
     /// Derivative of rotation, position and velocity by the sensors' gains (gyroscope, accelerometer, per axis): over a step a
     /// gain acts as a bias of minus the measurement. The accelerometer's is zero after very long stretches, whose samples are not kept.
     pub(crate) fn by_gain(&self) -> SMatrix<f64, 9, 6> {
-        let steps = self.samples.windows(2).filter(|pair| pair[1].time > pair[0].time);
-        let (_, by_accel_gain) = steps.fold((Delta::none(), ByBias::zeros()), |(sum, by_gain), pair| {
-            let variances = step_variances(&pair[0], &pair[1], &self.model);
-            let step = Delta::step(&pair[0], &pair[1], &self.bias, variances);
-            let mut of_step = step.by_accel_bias;
-            for (k, mut column) in of_step.column_iter_mut().enumerate() {
-                column *= -0.5 * (pair[0].accel.0[k] + pair[1].accel.0[k]);
-            }
-            let (f, g) = sum.by_parts(&step);
-            (sum.then(&step), f * by_gain + g * of_step)
-        });
+        let none = (Delta::none(), ByBias::zeros());
+        let (_, by_accel_gain) =
+            fold_steps(&self.samples, &self.bias, &self.model, none, |(sum, by_gain), [a, b], step| {
+                let mut of_step = step.by_accel_bias;
+                for (k, mut column) in of_step.column_iter_mut().enumerate() {
+                    column *= -0.5 * (a.accel.0[k] + b.accel.0[k]);
+                }
+                let (f, g) = sum.by_parts(step);
+                (sum.then(step), f * by_gain + g * of_step)
+            });
         let mut by_gain = SMatrix::<f64, 9, 6>::zeros();
         by_gain.fixed_columns_mut::<3>(0).copy_from(&self.delta.by_gyro_gain);
         by_gain.fixed_columns_mut::<3>(3).copy_from(&by_accel_gain);
@@ -349,12 +348,23 @@ impl Preintegration {
 }
 
 fn integrate(samples: &[ImuSample], bias: &Bias, model: &ImuModel) -> Delta {
+    fold_steps(samples, bias, model, Delta::none(), |sum, _, step| sum.then(step))
+}
+
+/// Goes through the steps between samples, with the two samples of each as measured.
+fn fold_steps<T>(
+    samples: &[ImuSample],
+    bias: &Bias,
+    model: &ImuModel,
+    none: T,
+    then: impl Fn(T, [&ImuSample; 2], &Delta) -> T,
+) -> T {
     let is_clipped = samples.iter().any(|s| s.gyro.0.amax() > model.gyro_limit);
     let read = if is_clipped { within_range(samples, model.gyro_limit).into() } else { Cow::from(samples) };
     let steps = samples.windows(2).zip(read.windows(2)).filter(|(pair, _)| pair[1].time > pair[0].time);
-    steps.fold(Delta::none(), |sum, (pair, read)| {
+    steps.fold(none, |sum, (pair, read)| {
         let variances = step_variances(&pair[0], &pair[1], model);
-        sum.then(&Delta::step(&read[0], &read[1], bias, variances))
+        then(sum, [&pair[0], &pair[1]], &Delta::step(&read[0], &read[1], bias, variances))
     })
 }
 

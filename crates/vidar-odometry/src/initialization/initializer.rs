@@ -12,7 +12,7 @@ use crate::deferred::Deferred;
 use crate::imu::{Bias, Preintegration};
 use crate::tracking::{CameraPoses, Prediction, Tracker};
 use crate::tracking::{HostImage, host_covariance, noisy_covariance};
-use crate::tracking::{ImageMotion, tracks_in};
+use crate::tracking::{ImageMotion, MIN_CORNERS, tracks_in};
 use nalgebra::Vector3;
 use std::sync::Arc;
 use vidar_core::{Duration, FrameId, LieGroup, Se3, So3, Timestamp};
@@ -24,9 +24,6 @@ const LOG_FRAMES: usize = 100;
 
 /// New tracks are started when fewer than this share of the wanted ones is left.
 const REFILL_SHARE: f64 = 0.7;
-
-/// Fewest corners of a first image.
-const MIN_FEATURES: usize = 40;
 
 /// Least and longest time between attempts to start, s: every second frame at 20 Hz.
 const ATTEMPT_SECS: f64 = 0.09;
@@ -152,13 +149,13 @@ impl Initializer {
         }
         self.log_observations(frame);
         self.forget();
-        if self.tracker.tracks.len() < MIN_FEATURES {
+        if self.tracker.tracks.len() < MIN_CORNERS {
             self.solving = None;
             let found = self.tracker.tracks.len() as f64;
             return Err(InitFailure {
                 reason: InitFailureReason::Tracks,
                 measured: found,
-                limit: MIN_FEATURES as f64,
+                limit: MIN_CORNERS as f64,
             });
         }
         if let Some((in_flight, outcome)) =

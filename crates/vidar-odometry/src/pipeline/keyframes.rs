@@ -39,6 +39,11 @@ impl KeyframeRegistry {
         self.held.clear();
     }
 
+    /// Whether a keyframe of the caller's image may still be revised by a settled scale.
+    pub fn is_provisional(&self, image: FrameId) -> bool {
+        self.provisional.iter().any(|(frame, _)| *frame == image)
+    }
+
     /// Poses that were told so far are not revised by a settled scale any more.
     pub fn forget_provisional(&mut self) {
         self.provisional.clear();

@@ -21,4 +21,4 @@ pub(crate) use track::{
     HostImage, ImagePool, Measurer, Track, host_covariance, noisy_covariance, parallax, rotated_pixel,
     unknown_distance,
 };
-pub(crate) use tracker::{CameraPoses, Prediction, Tracker};
+pub(crate) use tracker::{CameraPoses, MIN_CORNERS, Prediction, Tracker};

@@ -22,6 +22,9 @@ const SEEN_FRAMES: usize = 24;
 /// Tracks may not come nearer than this to the border of the image, pixels.
 const BORDER_PX: f64 = 8.0;
 
+/// Fewest corners of an image in which tracks begin that are to carry a state.
+pub(crate) const MIN_CORNERS: usize = 40;
+
 /// What happened to the tracks in one image.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub(crate) struct TrackCounts {

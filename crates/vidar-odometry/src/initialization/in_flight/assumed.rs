@@ -42,7 +42,7 @@ impl InFlightInitializer {
         (scale.is_finite() && scale > 0.0).then(|| solution.scaled(scale))
     }
 
-    /// Solves a window with the distances of some landmarks, all over the image, assumed to a factor.
+    /// Solves a window with the distances of every so many-th landmark assumed to a factor: parallax holds the others to them.
     pub(super) fn refine_with_assumed_distances(&self, smoother: &mut Smoother) -> Fit {
         let held: Vec<LandmarkId> = smoother.landmarks().map(|l| l.id).collect();
         let stride = held.len().div_ceil(ASSUMED_LANDMARKS).max(1);

@@ -161,7 +161,9 @@ impl Odometry {
     /// Begins an adjustment of what was logged from `since` on.
     fn begin_newest_state(&self, since: Timestamp, due: Timestamp) -> Option<Deferred<Option<NewestState>>> {
         let (log, model) = (self.log.as_ref()?, self.imu_model?);
-        let log = log.since(since, Duration::from_secs_f64(IMU_BEFORE_SECS), SPARSE_PERIOD);
+        let mut log = log.since(since, Duration::from_secs_f64(IMU_BEFORE_SECS), SPARSE_PERIOD);
+        // Of other images nobody asks for the pose.
+        log.stamps.retain(|(image, _)| self.keyframes.is_provisional(*image));
         let mut camera = self.camera.clone();
         camera.time_offset += self.estimated_offset();
         let readout_secs = self.time_calibration.readout_secs;

@@ -3,7 +3,7 @@
 use super::{SlidingWindowOdometry, StepReport, WindowPoses, follow_host};
 use crate::backend::SmootherError;
 use crate::tracking::CameraPoses;
-use crate::tracking::{HostImage, rotated_pixel};
+use crate::tracking::{HostImage, MIN_CORNERS, rotated_pixel};
 use std::sync::Arc;
 use vidar_core::{FrameId, LieGroup, Timestamp};
 use vidar_solve::statistics::median_upper;
@@ -22,7 +22,6 @@ const KEYFRAME_MIN_FRAMES: u32 = 3;
 /// With fewer tracks than this, keyframes are this many frames apart, unless the image shows so many corners that tracks can begin.
 const BLIND_TRACKS: usize = 10;
 const BLIND_FRAMES: u32 = 10;
-const SEEING_CORNERS: usize = 40;
 
 /// Keyframes that share less than this of their landmarks with the newest frame leave first.
 const KEYFRAME_FORGOTTEN_SHARE: f64 = 0.1;
@@ -45,7 +44,7 @@ impl SlidingWindowOdometry {
         if tracked + seeds < BLIND_TRACKS && self.frames_since_keyframe < BLIND_FRAMES {
             // With nothing to see more keyframes would only push out those that know the scene. A state that has not seen anything yet waits, too:
             // its tracks may fail for a clock that is not known, and would fail again.
-            return self.has_seen && self.tracker.corners(image) >= SEEING_CORNERS;
+            return self.has_seen && self.tracker.corners(image) >= MIN_CORNERS;
         }
         let few = (tracked as f64) < KEYFRAME_SHARE * self.keyframe_landmarks as f64
             || tracked + seeds < self.config.max_landmarks / 2;
