@@ -29,7 +29,7 @@ fn keyframes(outputs: &[OdometryOutput]) -> (Stamped, Stamped) {
         if let Some(k) = &tracking.keyframe {
             told.insert(k.id, (k.state.time, k.world_from_camera, k.world_from_camera));
         }
-        for revised in &tracking.revised {
+        for revised in tracking.revised.iter().chain(&tracking.settled) {
             told.get_mut(&revised.id).unwrap().2 = revised.world_from_camera;
         }
     }

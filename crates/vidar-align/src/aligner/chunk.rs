@@ -2,7 +2,7 @@
 
 use super::config::AlignerConfig;
 use super::frames::Frames;
-use super::pose_fit::CameraPair;
+use super::pose_fit::{CameraPair, fit_about_rotations};
 use super::report::{ChunkStatus, RejectionReason};
 use crate::depth_field::DepthField;
 use crate::landmark_scale::LogScale;
@@ -37,6 +37,8 @@ pub(super) struct Chunk {
     /// ln(metres per unit) from landmarks.
     pub landmark_scale: Option<LogScale>,
     pub rejections: Vec<RejectionReason>,
+    /// From the world of its pose priors as they were when the chunk came to that as they are now.
+    pub now_from_then: Sim3,
     /// `world_from_chunk` from pose priors and overlap when the chunk came.
     pub initial: Option<Sim3>,
     pub log_scale_std: f64,
@@ -73,6 +75,21 @@ impl Chunk {
                 })
             })
             .collect()
+    }
+
+    /// Its pose priors, which were `before`, are `now`: how their world moved about it. Where they do not tell how lengths changed, it is by
+    /// the factor `scale`.
+    pub fn follow(&mut self, before: &[CameraPair], now: &[CameraPair], scale: f64) -> Option<Sim3> {
+        let moved = before.iter().zip(now).map(|(before, now)| CameraPair {
+            chunk_from_camera: before.world_from_camera,
+            world_from_camera: now.world_from_camera,
+        });
+        let now_from_before = fit_about_rotations(&moved.collect::<Vec<_>>(), scale, 0.0)?.world_from_chunk;
+        self.now_from_then = now_from_before * self.now_from_then;
+        if let Some(landmarks) = &mut self.landmark_scale {
+            landmarks.log_scale += now_from_before.scale.ln();
+        }
+        Some(now_from_before)
     }
 
     /// Median over views of their median depth, chunk units; 1 without views.

@@ -160,9 +160,9 @@ fn pose_correction(history: &History) -> Option<PoseCorrection> {
         let rms =
             |of: &dyn Fn(&CameraPair) -> f64| (pairs.iter().map(|p| of(p).powi(2)).sum::<f64>() / n).sqrt();
         let radius = rms(&|p| (p.world_from_camera.translation - mean).norm());
-        let moved = center_rms(&Sim3::IDENTITY, &pairs);
-        let turned =
-            rms(&|p| (p.world_from_camera.rotation.inverse() * p.chunk_from_camera.rotation).angle_rad());
+        let moved = center_rms(&chunk.now_from_then, &pairs);
+        let given = |p: &CameraPair| chunk.now_from_then.rotation * p.chunk_from_camera.rotation;
+        let turned = rms(&|p| (p.world_from_camera.rotation.inverse() * given(p)).angle_rad());
         if radius > 0.0 && moved.is_finite() {
             centers.push(moved);
             shares.push(moved / radius);

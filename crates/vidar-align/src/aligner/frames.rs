@@ -63,6 +63,15 @@ impl Frames {
         }
     }
 
+    /// Replaces the poses of pose priors.
+    pub fn revise(&mut self, poses: &[(FrameId, Se3)]) {
+        for (frame_id, pose) in poses.iter().filter(|(_, pose)| pose.is_finite()) {
+            if let Some(prior) = self.by_id.get_mut(frame_id).and_then(|f| f.pose_prior.as_mut()) {
+                prior.world_from_camera = *pose;
+            }
+        }
+    }
+
     pub fn iter(&self) -> impl Iterator<Item = &GraphKeyframe> {
         self.by_id.values()
     }

@@ -85,7 +85,7 @@ use loops::checks::CheckedLoop;
 use nalgebra::SMatrix;
 use pose_fit::{CameraPair, center_rms};
 use vidar_core::model::ChunkFrame;
-use vidar_core::{ChunkId, GeometryPrediction, Sim3, ViewGeometry};
+use vidar_core::{ChunkId, FrameId, GeometryPrediction, Se3, Sim3, ViewGeometry};
 
 /// The aligner.
 #[derive(Debug)]
@@ -172,6 +172,7 @@ impl Aligner {
             revisits: Vec::new(),
             landmark_scale: correction.scale,
             rejections,
+            now_from_then: Sim3::IDENTITY,
             initial: None,
             log_scale_std: f64::INFINITY,
             odometry_trusted: true,
@@ -198,6 +199,26 @@ impl Aligner {
             self.search.update(&self.history, &frames, min_travel_m);
         }
         Ok(report)
+    }
+
+    /// The odometry has estimated poses of frames again, in another scale perhaps (`world_from_camera`, m): chunks move with their cameras.
+    /// Frames without a pose prior are left.
+    pub fn revise(&mut self, poses: &[(FrameId, Se3)]) {
+        let pairs = |history: &History| -> Vec<Vec<CameraPair>> {
+            history.chunks.iter().map(|c| c.pairs(&history.frames)).collect()
+        };
+        let before = pairs(&self.history);
+        self.history.frames.revise(poses);
+        let now = pairs(&self.history);
+        let mut scale = 1.0;
+        for ((chunk, before), now) in self.history.chunks.iter_mut().zip(&before).zip(&now) {
+            let Some(now_from_before) = chunk.follow(before, now, scale) else { continue };
+            scale = now_from_before.scale;
+            if self.coupling.starts_at_priors() {
+                chunk.initial = chunk.initial.map(|place| now_from_before * place);
+            }
+        }
+        self.latest = None;
     }
 
     /// Pairs of chunks that may show one place and wait for [`Aligner::push_loop`], most similar first: the best pair of

@@ -1,11 +1,14 @@
 //! Chunks in the world of their pose priors.
 
 use crate::flat::*;
+use nalgebra::Vector3;
 use vidar_align::aligner::{DepthPoint, RejectionReason};
 use vidar_align::streaming::chunk_ranges;
 use vidar_align::{Aligner, AlignerConfig, ChunkStatus, CouplingMode, Placement};
 use vidar_core::model::ChunkFrame;
-use vidar_core::{GeometryPrediction, Image, RelativeDepth, Se3, SparseLandmark};
+use vidar_core::{
+    FrameId, GeometryPrediction, Image, LieGroup, RelativeDepth, Se3, Sim3, So3, SparseLandmark,
+};
 
 /// What a small network that was given the poses may say: too near by a fifth, and bent its own way in each view.
 fn rough(truth: &[Se3], range: std::ops::Range<usize>, id: u32, noise: &mut Noise) -> GeometryPrediction {
@@ -151,7 +154,7 @@ fn views_without_landmarks_are_corrected_by_their_neighbours() {
 fn a_chunk_in_the_world_of_its_priors_keeps_its_metres_though_its_cameras_are_beside_them() {
     // As where the trajectory is of another sensor of the rig: every camera 3 cm beside its pose prior, on a short path.
     let truth = laps(120, 0.5);
-    let beside = Se3::new(vidar_core::So3::IDENTITY, nalgebra::Vector3::new(-0.025, 0.012, 0.01));
+    let beside = Se3::new(So3::IDENTITY, Vector3::new(-0.025, 0.012, 0.01));
     let priors: Vec<Se3> = truth.iter().map(|t| *t * beside).collect();
     let mut aligner = Aligner::new(CouplingMode::Coupled, &AlignerConfig::default()).unwrap();
     for (k, start) in [0, 12, 24].into_iter().enumerate() {
@@ -176,8 +179,7 @@ fn a_chunk_in_the_world_of_its_priors_keeps_its_metres_though_its_cameras_are_be
 #[test]
 fn a_chunk_in_the_world_of_its_priors_is_checked_against_them_and_not_moved() {
     let truth = laps(12, 0.2);
-    let far: Vec<Se3> =
-        truth.iter().map(|t| Se3::from_translation(nalgebra::Vector3::x() * 2.0) * *t).collect();
+    let far: Vec<Se3> = truth.iter().map(|t| Se3::from_translation(Vector3::x() * 2.0) * *t).collect();
     for (priors, expected) in [(&truth, ChunkStatus::PriorWorld), (&far, ChunkStatus::Inconsistent)] {
         let model = Model { has_gauge: false, ..EXACT };
         let mut prediction = predict(&truth, 0..12, 0, model, &mut Noise::new(1));
@@ -185,7 +187,7 @@ fn a_chunk_in_the_world_of_its_priors_is_checked_against_them_and_not_moved() {
         let mut aligner = Aligner::new(CouplingMode::PoseConditioned, &AlignerConfig::default()).unwrap();
         let report = aligner.push(observe(prediction, Some(priors), none)).unwrap();
         assert_eq!(report.status, expected);
-        assert_eq!(report.world_from_chunk, Some(vidar_core::Sim3::IDENTITY));
+        assert_eq!(report.world_from_chunk, Some(Sim3::IDENTITY));
     }
 }
 
@@ -209,7 +211,7 @@ fn what_images_changed_of_given_poses_is_told_as_a_share_of_their_path() {
         assert!(off <= 0.2 * expected + 1e-12, "{correction:?}, expected {expected}");
         let radius = |range: &std::ops::Range<usize>| {
             let centres = given[range.clone()].iter().map(|p| p.translation);
-            let mean = centres.clone().sum::<nalgebra::Vector3<f64>>() / range.len() as f64;
+            let mean = centres.clone().sum::<Vector3<f64>>() / range.len() as f64;
             (centres.map(|c| (c - mean).norm_squared()).sum::<f64>() / range.len() as f64).sqrt()
         };
         let share = correction.center_rms_m / radius(&ranges[0]).min(radius(&ranges[1]));
@@ -219,5 +221,74 @@ fn what_images_changed_of_given_poses_is_told_as_a_share_of_their_path() {
         );
         assert!((correction.log_scale_std - correction.center_share / 2f64.sqrt()).abs() < 1e-12);
         assert!(correction.rotation_rms_rad < 1e-9);
+    }
+}
+
+/// As a start whose scale is settled late: what came before was told at half the size, turned and elsewhere.
+fn settled_late(mode: CouplingMode, frame: ChunkFrame) -> Placement {
+    let truth = laps(36, 0.7);
+    let (mut noise, mut points) = (Noise::new(41), Noise::new(42));
+    let told_from_true =
+        Sim3::new(So3::exp(&(Vector3::z() * 0.4)), Vector3::new(1.0, -2.0, 0.3), 0.5).unwrap();
+    let told: Vec<Se3> = truth.iter().map(|t| told_from_true.transform_pose(t)).collect();
+    let has_gauge = frame == ChunkFrame::ModelNative;
+    let mut aligner = Aligner::new(mode, &AlignerConfig::default()).unwrap();
+    let ranges: Vec<_> = chunk_ranges(36, 12, 4).unwrap();
+    for (k, range) in ranges.into_iter().enumerate() {
+        let is_told = k < 2;
+        let model = Model { has_gauge, ..EXACT };
+        let mut prediction = predict(&truth, range.frames.clone(), k as u32, model, &mut noise);
+        prediction.frame = frame;
+        let seen: Vec<Vec<SparseLandmark>> =
+            (0..36).map(|i| landmarks(&truth[i], i, 50, 0.002, 0.0, &mut points)).collect();
+        let of = |i: usize| -> Vec<SparseLandmark> {
+            let scale = if is_told { told_from_true.scale } else { 1.0 };
+            let told = |l: &SparseLandmark| SparseLandmark {
+                inverse_depth: l.inverse_depth / scale,
+                inverse_depth_std: l.inverse_depth_std / scale,
+                ..*l
+            };
+            seen[i].iter().map(told).collect()
+        };
+        if is_told && !has_gauge {
+            for view in &mut prediction.views {
+                view.chunk_from_camera = told[view.frame_id.index()];
+                view.depth = RelativeDepth::new(view.depth.image().map(|z| z * told_from_true.scale as f32));
+            }
+        }
+        aligner.push(observe(prediction, Some(if is_told { &told } else { &truth }), of)).unwrap();
+        if k == 1 {
+            let before = aligner.provisional_placement();
+            assert!(absolute_error(&before, &truth) > 0.3);
+            let poses: Vec<_> = (0..36).map(|i| (FrameId(i), truth[i as usize])).collect();
+            aligner.revise(&poses);
+            let after = absolute_error(&aligner.provisional_placement(), &truth);
+            assert!(after < 2e-3, "{mode}: {after}");
+        }
+    }
+    aligner.finish()
+}
+
+#[test]
+fn chunks_move_with_the_cameras_whose_scale_is_settled_later() {
+    let truth = laps(36, 0.7);
+    for mode in [CouplingMode::PoseConditioned, CouplingMode::Hybrid, CouplingMode::Coupled] {
+        for frame in [ChunkFrame::PriorWorld, ChunkFrame::ModelNative] {
+            // A chain knows nothing of the world of the priors.
+            if (mode, frame) == (CouplingMode::Hybrid, ChunkFrame::PriorWorld) {
+                continue;
+            }
+            let placement = settled_late(mode, frame);
+            assert!(placement.chunks.iter().all(|c| c.status.is_usable()), "{mode}: {:?}", placement.chunks);
+            let error = absolute_error(&placement, &truth);
+            assert!(error < 2e-3, "{mode} {frame:?}: {error}");
+            if frame == ChunkFrame::PriorWorld {
+                let scales: Vec<f64> = placement.chunks.iter().map(|c| c.world_from_chunk.scale).collect();
+                for (k, scale) in scales.iter().enumerate() {
+                    let expected = if k < 2 { 2.0 } else { 1.0f64 };
+                    assert!((scale / expected).ln().abs() < 2e-3, "{mode}: {scales:?}");
+                }
+            }
+        }
     }
 }

@@ -310,7 +310,7 @@ impl Odometry {
         self.shorten_log(frame.time);
         let mut status = self.follow_successor(id).unwrap_or(status);
         if let Status::Tracking(tracking) = &mut status {
-            tracking.revised.append(&mut self.settled);
+            tracking.settled.append(&mut self.settled);
         }
         let used_from = self.last_frame.unwrap_or(time) - Duration::from_millis(1500);
         self.imu.forget_before(self.recent.oldest().map_or(used_from, |t| used_from.min(t)));

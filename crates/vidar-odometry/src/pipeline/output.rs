@@ -72,6 +72,8 @@ pub struct Tracking {
     pub keyframe: Option<Box<OdometryKeyframe>>,
     /// Keyframes whose poses changed since the last output.
     pub revised: Vec<RevisedPose>,
+    /// Keyframes told before, as an adjustment that settles the scale has them: what was mapped by them moves with them.
+    pub settled: Vec<RevisedPose>,
     /// Two segments of which this image shows that they are of one world.
     pub joined: Option<Joined>,
 }
@@ -130,7 +132,7 @@ impl Tracking {
             keyframe.state = moved(&keyframe.state, to_from_own);
             move_keyframe(keyframe, to_from_own);
         }
-        for revised in &mut self.revised {
+        for revised in self.revised.iter_mut().chain(&mut self.settled) {
             revised.world_from_camera = *to_from_own * revised.world_from_camera;
         }
     }

@@ -6,10 +6,11 @@
 //! keyframe once.
 
 use super::events::{MapEvent, Surface};
-use super::setup::PredictionStore;
+use super::placed::placed_views;
+use super::setup::{PredictionId, PredictionStore};
 use crate::config::Config;
 use crate::error::Error;
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 use vidar_align::Placement;
 use vidar_core::{AlignedView, ChunkId, FrameId, Warning};
@@ -56,6 +57,33 @@ impl GrowingSurface {
         placement: &Placement,
         store: &dyn PredictionStore,
     ) -> Result<Vec<MapEvent>, Error> {
+        let (mut events, shown) = self.add(chunk, views, placement, store)?;
+        self.follow(placement)?;
+        events.push(self.surface(shown, store)?);
+        Ok(events)
+    }
+
+    /// Fuses all chunks so far again at these placements: moved by as much as a settled scale moves them, their volumes would be blurred, and
+    /// ten times as large.
+    pub fn fuse_again(&mut self, placement: &Placement, store: &dyn PredictionStore) -> Result<(), Error> {
+        let chunks: BTreeSet<ChunkId> =
+            self.fused.keys().filter_map(|frame| self.volumes.owner(*frame)).collect();
+        self.reset()?;
+        for chunk in chunks {
+            let views = placed_views(placement, store.read(PredictionId::Chunk(chunk))?)?;
+            self.add(chunk, &views, placement, store)?;
+        }
+        Ok(())
+    }
+
+    /// Adds a chunk's views: what could not be fused, and which of them were not shown before.
+    fn add(
+        &mut self,
+        chunk: ChunkId,
+        views: &[AlignedView],
+        placement: &Placement,
+        store: &dyn PredictionStore,
+    ) -> Result<(Vec<MapEvent>, Vec<FrameId>), Error> {
         let mut events = Vec::new();
         if self.previewed.values().any(|c| *c == chunk) {
             self.volumes.rebuild(chunk, [])?;
@@ -75,7 +103,6 @@ impl GrowingSurface {
             }
         }
         self.previewed.retain(|_, c| *c != chunk);
-        self.follow(placement)?;
         self.in_memory.push(chunk);
         while self.in_memory.len() > IN_MEMORY {
             let oldest = self.in_memory.remove(0);
@@ -83,8 +110,7 @@ impl GrowingSurface {
                 store.keep_volume(oldest, &self.volumes.offload(oldest)?)?;
             }
         }
-        events.push(self.surface(shown, store)?);
-        Ok(events)
+        Ok((events, shown))
     }
 
     /// Whether it has the depth of a keyframe.

@@ -93,6 +93,9 @@ impl Engine<'_> {
         }
         if let Some(growing) = &mut self.growing {
             let placement = Arc::new(world.aligner.provisional_placement());
+            if std::mem::take(&mut world.is_resettled) {
+                growing.fuse_again(&placement, self.predictor.store)?;
+            }
             let stored = self.predictor.store.read(PredictionId::Chunk(id))?;
             let grown =
                 growing.grow(id, &placed_views(&placement, stored)?, &placement, self.predictor.store)?;

@@ -24,6 +24,7 @@ mod pose_source;
 mod predict;
 mod preview;
 mod select;
+mod settled;
 mod setup;
 mod stereo_landmarks;
 mod track;
@@ -89,6 +90,8 @@ struct World {
     frames: Vec<FrameId>,
     chunks: usize,
     aligner: Aligner,
+    /// Whether chunks have moved with a settled scale since the surface was shown.
+    is_resettled: bool,
     failures: Vec<String>,
 }
 
@@ -242,10 +245,14 @@ impl<'a> Engine<'a> {
     /// Track: poses of images.
     fn add_reports(&mut self, reports: Vec<PoseReport>, sink: &mut Sink<'_>) -> Result<(), Error> {
         for report in reports {
-            if let PoseReport::Posed { revised, .. } = &report {
-                revised.iter().for_each(|r| self.observer.revise(r));
-                if !revised.is_empty() {
-                    sink(MapEvent::RevisedStates(revised.clone()))?;
+            if let PoseReport::Posed { state, revised, settled, .. } = &report {
+                let all = [revised.as_slice(), settled].concat();
+                all.iter().for_each(|r| self.observer.revise(r));
+                if !settled.is_empty() {
+                    self.settle(state, settled);
+                }
+                if !all.is_empty() {
+                    sink(MapEvent::RevisedStates(all))?;
                 }
             }
             if let Some(state) = self.track.add(report) {
@@ -346,6 +353,7 @@ impl<'a> Engine<'a> {
             frames: Vec::new(),
             chunks: 0,
             aligner,
+            is_resettled: false,
             failures: Vec::new(),
         });
         if let Some(preview) = &mut self.preview {

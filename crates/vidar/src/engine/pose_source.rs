@@ -20,6 +20,8 @@ pub enum PoseReport {
         keyframe: Option<Box<OdometryKeyframe>>,
         /// Earlier keyframes whose poses were estimated again.
         revised: Vec<RevisedPose>,
+        /// The same by an adjustment that settles the scale: what was mapped by them moves with them.
+        settled: Vec<RevisedPose>,
         /// Two segments that this image shows to be of one world.
         joined: Option<Joined>,
     },
@@ -43,6 +45,7 @@ impl PoseReport {
                 state: FrameState { frame_id, time, segment, world_from_camera },
                 keyframe,
                 revised: Vec::new(),
+                settled: Vec::new(),
                 joined: None,
             },
             None => Self::NotPosed { time },
@@ -177,8 +180,8 @@ impl OdometryPoses {
                 self.has_state = true;
                 let world_from_camera = tracking.state.world_from_body * self.body_from_camera;
                 let state = FrameState { frame_id, time, segment: tracking.segment, world_from_camera };
-                let Tracking { keyframe, revised, joined, .. } = *tracking;
-                PoseReport::Posed { state, keyframe, revised, joined }
+                let Tracking { keyframe, revised, settled, joined, .. } = *tracking;
+                PoseReport::Posed { state, keyframe, revised, settled, joined }
             }
             Status::Tracking(_) => PoseReport::NotPosed { time },
             Status::Lost(reason) => {

@@ -1,5 +1,6 @@
 //! The engine on a wall: a geometry model that is right, and sources that fail.
 
+mod settled;
 mod wall;
 
 use super::*;
@@ -15,6 +16,9 @@ use wall::Wall;
 
 const FRAMES: u32 = 40;
 
+/// From image to image, m.
+const STEP_M: f64 = 0.06;
+
 fn pinhole() -> Pinhole {
     Pinhole::new(40.0, 40.0, 31.5, 23.5, 64, 48).unwrap()
 }
@@ -25,7 +29,7 @@ fn stamp(i: u32) -> FrameStamp {
 }
 
 fn pose(i: u32) -> Se3 {
-    Se3::from_translation(Vector3::new(f64::from(i) * 0.06, 0.0, 0.0))
+    Se3::from_translation(Vector3::new(f64::from(i) * STEP_M, 0.0, 0.0))
 }
 
 struct NoPlaces;

@@ -30,7 +30,7 @@ pub struct Segment {
     pub frames: Vec<PosedFrame>,
     /// Every keyframe of the odometry, in the order of time.
     pub odometry: Vec<Arc<OdometryKeyframe>>,
-    last: Option<(Timestamp, Se3)>,
+    pub(super) last: Option<(Timestamp, Se3)>,
 }
 
 /// Longest span over which a camera's motion is taken: two images at 10 Hz.
@@ -42,7 +42,7 @@ impl Segment {
     /// How the rows of a frame were read, by the poses of the frames before and after it, and by the landmarks of the odometry's
     /// nearest keyframe. None where the frames are far apart.
     pub fn row_motion(&self, frame: FrameId, readout: Duration) -> Option<RowMotion> {
-        let at = self.frames.binary_search_by_key(&frame, |f| f.stamp.frame_id).ok()?;
+        let at = self.index(frame)?;
         let own = &self.frames[at];
         let (before, after) = (&self.frames[at.saturating_sub(1)], self.frames.get(at + 1).unwrap_or(own));
         let span = after.stamp.time - before.stamp.time;
@@ -58,6 +58,15 @@ impl Segment {
             inverse_depth: self.inverse_depth(own.stamp.time),
             readout_secs: readout.as_secs_f64(),
         })
+    }
+
+    /// A frame of it.
+    pub fn frame(&self, frame: FrameId) -> Option<&PosedFrame> {
+        self.index(frame).map(|at| &self.frames[at])
+    }
+
+    fn index(&self, frame: FrameId) -> Option<usize> {
+        self.frames.binary_search_by_key(&frame, |f| f.stamp.frame_id).ok()
     }
 
     /// Median inverse depth of the landmarks near a time, 1/m; zero without any.
@@ -76,7 +85,7 @@ impl Segment {
 pub struct Track {
     /// Candidates whose pose is not decided yet.
     waiting: VecDeque<FrameStamp>,
-    segments: BTreeMap<u32, Segment>,
+    pub(super) segments: BTreeMap<u32, Segment>,
     max_gap: Duration,
     /// Candidates without a pose.
     pub without_pose: usize,

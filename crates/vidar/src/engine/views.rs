@@ -64,6 +64,10 @@ impl<'a> ViewWindow<'a> {
         }
         self.start = seen.start;
         self.views.retain(|(index, _)| seen.contains(index));
+        // A scale that was settled has moved keyframes since.
+        self.views
+            .iter_mut()
+            .for_each(|(k, (view, _))| view.world_from_camera = keyframes[*k].world_from_camera);
         let fresh: Vec<usize> = (self.next.max(seen.start)..seen.end).collect();
         let loaded: Vec<_> = fresh.par_iter().map(|&index| (index, self.load(&keyframes[index]))).collect();
         for (index, result) in loaded {

@@ -88,8 +88,9 @@ impl Tracked {
                 }
                 tracking.joined.iter().for_each(|joined| self.join(joined, time_ns));
                 self.keyframes.extend(tracking.keyframe.take().map(|k| *k));
-                let revised = std::mem::take(&mut tracking.revised);
-                revised.iter().for_each(|r| self.revise(r));
+                let (revised, settled) =
+                    (std::mem::take(&mut tracking.revised), std::mem::take(&mut tracking.settled));
+                revised.iter().chain(&settled).for_each(|r| self.revise(r));
                 tracking.landmarks.clear();
             }
             Status::Lost(reason) => {

@@ -42,6 +42,10 @@ struct Index {
 pub(in crate::aligner) struct Coupled;
 
 impl Coupling for Coupled {
+    fn starts_at_priors(&self) -> bool {
+        true
+    }
+
     /// A chunk that contradicts both its pose priors and its neighbour is rejected.
     fn initialise(&self, history: &History, chunk: &mut Chunk, pairs: &[CameraPair]) {
         let by_overlap = history.initial_by_overlap(chunk);

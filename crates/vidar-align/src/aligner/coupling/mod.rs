@@ -132,6 +132,11 @@ pub(super) trait Coupling: std::fmt::Debug + Sync {
         overlaps::revisits(history, chunk)
     }
 
+    /// Whether initial places are in the world of the pose priors, so that they move with these.
+    fn starts_at_priors(&self) -> bool {
+        false
+    }
+
     /// Sets status, initial place and σ of the scale of a new chunk; `pairs` are its cameras with pose priors.
     fn initialise(&self, history: &History, chunk: &mut Chunk, pairs: &[CameraPair]);
 

@@ -27,6 +27,10 @@ impl Coupling for PoseConditioned {
         false
     }
 
+    fn starts_at_priors(&self) -> bool {
+        true
+    }
+
     fn initialise(&self, history: &History, chunk: &mut Chunk, pairs: &[CameraPair]) {
         if pairs.is_empty() {
             chunk.status = ChunkStatus::Unplaced;

@@ -45,6 +45,7 @@ impl Odometry {
             landmarks,
             keyframe: None,
             revised: Vec::new(),
+            settled: Vec::new(),
             joined: None,
         };
         if step.is_keyframe {
@@ -100,6 +101,7 @@ impl Odometry {
             landmarks: Vec::new(),
             keyframe: None,
             revised: Vec::new(),
+            settled: Vec::new(),
             joined: None,
         };
         self.placed.iter().for_each(|placed| tracking.move_by(placed));

@@ -7,7 +7,8 @@ use vidar_core::{
     ChunkViews, Confidence, GeometryPrediction, Image, ModelError, ModelInfo, RelativeDepth, ViewGeometry,
 };
 
-/// A wall 2 m in front of the camera; predictions of the chunks in `failing` fail, and views less than `least_span_m` apart show nothing.
+/// A wall 2 m in front of the camera, in the metres of the given poses; predictions of the chunks in `failing` fail, and views less than
+/// `least_span_m` apart show nothing.
 pub(super) struct Wall {
     pub(super) info: ModelInfo,
     pub(super) failing: Vec<u32>,
@@ -56,14 +57,21 @@ impl GeometrySource for Wall {
         if self.failing.contains(&views.id.0) {
             return Err(ModelError::Other("out of order".into()));
         }
+        let x = |v: &vidar_core::ChunkView| v.world_from_camera.unwrap().translation.x;
+        let depth_m = match views.views.as_slice() {
+            [first, .., last] => {
+                let step_m = (x(last) - x(first)) / f64::from(last.frame_id.0 - first.frame_id.0);
+                2.0 * step_m / super::STEP_M
+            }
+            _ => 2.0,
+        };
         let view = |v: &vidar_core::ChunkView| ViewGeometry {
             frame_id: v.frame_id,
             chunk_from_camera: v.world_from_camera.unwrap(),
             intrinsics: pinhole(),
-            depth: RelativeDepth::new(Image::filled(64, 48, 2.0)),
+            depth: RelativeDepth::new(Image::filled(64, 48, depth_m as f32)),
             confidence: Confidence::full(64, 48),
         };
-        let x = |v: &vidar_core::ChunkView| v.world_from_camera.unwrap().translation.x;
         let spans = |from: f64, to: f64| to - from >= self.least_span_m;
         let ends = views.views.iter().map(x).fold((f64::MAX, f64::MIN), |(a, b), x| (a.min(x), b.max(x)));
         let wanted = if spans(ends.0, ends.1) { wanted } else { 0..0 };

@@ -97,9 +97,9 @@ impl Thinning {
         }
     }
 
-    /// Whether a report without an image is kept while so many items wait.
-    pub fn keeps_report(&mut self, items: usize, joins_segments: bool) -> bool {
-        let is_kept = items < MOST_REPORTS || joins_segments;
+    /// Whether a report without an image is kept while so many items wait: always where it `moves_others`, poses told before it.
+    pub fn keeps_report(&mut self, items: usize, moves_others: bool) -> bool {
+        let is_kept = items < MOST_REPORTS || moves_others;
         self.poses_dropped += usize::from(!is_kept);
         is_kept
     }

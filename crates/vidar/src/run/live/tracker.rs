@@ -209,10 +209,10 @@ impl Tracker<'_> {
     /// Hands a report over, with the images up to its time that may become keyframes.
     fn deliver(&mut self, report: PoseReport) -> Result<bool, Error> {
         self.measure(&report)?;
-        let (time, pose, joins) = match &report {
-            PoseReport::Posed { state, joined, .. } => {
+        let (time, pose, moves_others) = match &report {
+            PoseReport::Posed { state, joined, settled, .. } => {
                 let FrameState { time, world_from_camera, .. } = *state;
-                (time, Some(world_from_camera), joined.is_some())
+                (time, Some(world_from_camera), joined.is_some() || !settled.is_empty())
             }
             PoseReport::NotPosed { time } => (*time, None, false),
         };
@@ -227,7 +227,7 @@ impl Tracker<'_> {
             if !self.thinning.passes(pose.as_ref()) {
                 images.clear();
             }
-            if !self.thinning.keeps_report(load.items, joins) {
+            if !self.thinning.keeps_report(load.items, moves_others) {
                 report = None;
                 images.clear();
             }

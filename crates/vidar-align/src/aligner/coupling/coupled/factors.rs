@@ -140,7 +140,8 @@ impl GraphBuilder {
         if chunk.frame == ChunkFrame::PriorWorld {
             // Its depth follows from the baselines of the pose priors; its centres, which were given, are no evidence of it.
             let std = prior_world_std(&history.chunks, number);
-            self.factors.push(Factor::Scale { k, log_scale: 0.0, std, kernel: ROBUST });
+            let log_scale = chunk.now_from_then.scale.ln();
+            self.factors.push(Factor::Scale { k, log_scale, std, kernel: ROBUST });
             information += std.powi(-2);
         }
         if chunk.odometry_trusted {
