@@ -63,8 +63,8 @@ impl GrowingSurface {
         Ok(events)
     }
 
-    /// Fuses all chunks so far again at these placements: moved by as much as a settled scale moves them, their volumes would be blurred, and
-    /// ten times as large.
+    /// Fuses all chunks so far again at these placements: scaled by as much as a settled scale does, volumes are blurred, and their blocks grow
+    /// with the cube.
     pub fn fuse_again(&mut self, placement: &Placement, store: &dyn PredictionStore) -> Result<(), Error> {
         let chunks: BTreeSet<ChunkId> =
             self.fused.keys().filter_map(|frame| self.volumes.owner(*frame)).collect();

@@ -210,7 +210,7 @@ impl<'a> Engine<'a> {
         let rest = self.poses.as_mut().map_or_else(Vec::new, |p| p.finish());
         self.add_reports(rest, sink)?;
         self.track.finish();
-        self.settle_poses(sink)?;
+        self.fall_back(sink)?;
         self.advance(Vec::new(), true, sink)?;
         let placement = self.place(sink)?;
         self.fuse(&placement, sink)
@@ -263,7 +263,7 @@ impl<'a> Engine<'a> {
     }
 
     /// When the recording has ended without a track, the fallback's poses are used, or none where the coupling needs none.
-    fn settle_poses(&mut self, sink: &mut Sink<'_>) -> Result<(), Error> {
+    fn fall_back(&mut self, sink: &mut Sink<'_>) -> Result<(), Error> {
         let Some(poses) = &self.poses else { return Ok(()) };
         for warning in poses.warnings() {
             sink(MapEvent::Warning(warning))?;

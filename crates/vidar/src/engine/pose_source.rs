@@ -34,7 +34,7 @@ pub enum PoseReport {
 
 impl PoseReport {
     /// Of an image whose segment and `world_from_camera`, where it has them, are known before and stay.
-    pub fn settled(
+    pub fn known(
         stamp: &FrameStamp,
         pose: Option<(u32, Se3)>,
         keyframe: Option<Box<OdometryKeyframe>>,
@@ -118,7 +118,7 @@ impl PoseSource for GivenPoses {
     }
 
     fn push_stamp(&mut self, stamp: &FrameStamp) -> Vec<PoseReport> {
-        vec![PoseReport::settled(stamp, self.pose_at(stamp.time).map(|pose| (0, pose)), None)]
+        vec![PoseReport::known(stamp, self.pose_at(stamp.time).map(|pose| (0, pose)), None)]
     }
 
     fn finish(&mut self) -> Vec<PoseReport> {

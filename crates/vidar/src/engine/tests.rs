@@ -56,8 +56,8 @@ impl ImageSource for GrayImages {
     }
 }
 
-/// Poses by a function of the frame's number: segment and pose.
-struct Scripted(fn(u32) -> Option<u32>);
+/// What an odometry tells of each image.
+struct Scripted(fn(&FrameStamp) -> PoseReport);
 
 impl PoseSource for Scripted {
     fn source(&self) -> TrajectorySource {
@@ -73,8 +73,7 @@ impl PoseSource for Scripted {
     }
 
     fn push_stamp(&mut self, stamp: &FrameStamp) -> Vec<PoseReport> {
-        let at = stamp.frame_id.0;
-        vec![PoseReport::settled(stamp, (self.0)(at).map(|segment| (segment, pose(at))), None)]
+        vec![(self.0)(stamp)]
     }
 
     fn finish(&mut self) -> Vec<PoseReport> {
@@ -288,10 +287,10 @@ fn images_between_keyframes_help_where_those_are_few_and_who_got_no_depth_is_tri
 
 #[test]
 fn a_later_segment_that_grows_longer_takes_the_map_over() {
-    let two = |i: u32| match i {
-        0..12 => Some(0),
-        12 => None,
-        _ => Some(1),
+    let two = |stamp: &FrameStamp| {
+        let i = stamp.frame_id.0;
+        let segment = (i != 12).then_some(u32::from(i > 12));
+        PoseReport::known(stamp, segment.map(|segment| (segment, pose(i))), None)
     };
     let (ended, events, _) = run(Box::new(Scripted(two)), None, &mut Wall::new(&[]));
     ended.unwrap();
@@ -346,7 +345,7 @@ fn a_run_that_is_stopped_tells_every_view_that_its_surface_is_made_of() {
 
 #[test]
 fn ground_truth_in_place_of_failed_odometry_is_a_degradation_and_without_it_an_error() {
-    let nothing = || Box::new(Scripted(|_| None));
+    let nothing = || Box::new(Scripted(|stamp| PoseReport::NotPosed { time: stamp.time }));
     let (ended, events, during) = run(nothing(), Some(Box::new(truth())), &mut Wall::new(&[]));
     ended.unwrap();
     assert_eq!(degradations(&events), ["odometry-not-used"]);

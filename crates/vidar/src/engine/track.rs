@@ -231,7 +231,7 @@ mod tests {
 
     fn posed(i: u32, segment: u32) -> PoseReport {
         let world_from_camera = Se3::from_translation(Vector3::new(f64::from(i), 0.0, 0.0));
-        PoseReport::settled(&stamp(i), Some((segment, world_from_camera)), None)
+        PoseReport::known(&stamp(i), Some((segment, world_from_camera)), None)
     }
 
     #[test]

@@ -80,7 +80,7 @@ impl PoseSource for TrackedPoses {
     fn push_stamp(&mut self, stamp: &FrameStamp) -> Vec<PoseReport> {
         let pose = self.poses.get(&stamp.frame_id).copied();
         let keyframe = pose.and_then(|_| self.keyframes.remove(&stamp.frame_id)).map(Box::new);
-        vec![PoseReport::settled(stamp, pose, keyframe)]
+        vec![PoseReport::known(stamp, pose, keyframe)]
     }
 
     fn finish(&mut self) -> Vec<PoseReport> {

@@ -10,9 +10,6 @@ use vidar_core::{
 /// Images before this one are told at half their size.
 const SETTLED: u32 = 25;
 
-/// Poses at half their size until the scale is settled; every other image is a keyframe of the odometry.
-struct SettledLate;
-
 /// As told with image `i`: the newest pose is where it is, lengths are half.
 fn told(i: u32) -> Se3 {
     let newest = pose(SETTLED).translation;
@@ -43,42 +40,17 @@ fn keyframe(i: u32) -> OdometryKeyframe {
     }
 }
 
-impl PoseSource for SettledLate {
-    fn source(&self) -> TrajectorySource {
-        TrajectorySource::Odometry
-    }
-
-    fn needs_sensors(&self) -> bool {
-        false
-    }
-
-    fn push(&mut self, _: SensorEvent) -> Result<Vec<PoseReport>, Error> {
-        Ok(Vec::new())
-    }
-
-    fn push_stamp(&mut self, stamp: &FrameStamp) -> Vec<PoseReport> {
-        let FrameStamp { frame_id, time, .. } = *stamp;
-        let i = frame_id.0;
-        let settled = |k| RevisedPose { id: KeyframeId(k), world_from_camera: pose(k), is_final: true };
-        vec![PoseReport::Posed {
-            state: FrameState { frame_id, time, segment: 0, world_from_camera: told(i) },
-            keyframe: i.is_multiple_of(2).then(|| Box::new(keyframe(i))),
-            revised: Vec::new(),
-            settled: if i == SETTLED { (0..SETTLED).step_by(2).map(settled).collect() } else { Vec::new() },
-            joined: None,
-        }]
-    }
-
-    fn finish(&mut self) -> Vec<PoseReport> {
-        Vec::new()
-    }
-
-    fn warnings(&self) -> Vec<Warning> {
-        Vec::new()
-    }
-
-    fn why_no_pose(&self) -> String {
-        String::new()
+/// Half as long until the scale is settled; every other image is a keyframe of the odometry.
+fn settled_late(stamp: &FrameStamp) -> PoseReport {
+    let FrameStamp { frame_id, time, .. } = *stamp;
+    let i = frame_id.0;
+    let settled = |k| RevisedPose { id: KeyframeId(k), world_from_camera: pose(k), is_final: true };
+    PoseReport::Posed {
+        state: FrameState { frame_id, time, segment: 0, world_from_camera: told(i) },
+        keyframe: i.is_multiple_of(2).then(|| Box::new(keyframe(i))),
+        revised: Vec::new(),
+        settled: if i == SETTLED { (0..SETTLED).step_by(2).map(settled).collect() } else { Vec::new() },
+        joined: None,
     }
 }
 
@@ -87,7 +59,8 @@ fn what_was_mapped_before_the_scale_was_settled_moves_with_its_keyframes() {
     let mut config = config();
     config.output.live_map = true;
     config.keyframes.min_translation_m = 0.02;
-    let (ended, events, during) = run_with(&config, Box::new(SettledLate), None, &mut Wall::new(&[]));
+    let (ended, events, during) =
+        run_with(&config, Box::new(Scripted(settled_late)), None, &mut Wall::new(&[]));
     ended.unwrap();
     assert!(degradations(&events).is_empty());
     let placements: Vec<&Arc<vidar_align::Placement>> = events
