@@ -188,7 +188,6 @@ impl InFlightInitializer {
         let turns = views::rotations(&views, &bias);
         let parallax = views::median_parallax_deg(&tracks, &turns, &self.body_from_camera.rotation);
         if !(parallax >= MIN_PARALLAX_DEG) {
-            self.last = None;
             return Ok(Err(InitFailure::new(InitFailureReason::Parallax, parallax, MIN_PARALLAX_DEG)));
         }
         let Some(first) = self.linear_start(&views, &tracks, &turns) else {
@@ -214,15 +213,17 @@ impl InFlightInitializer {
         let Some((mut smoother, mut fit)) = best else {
             return Ok(Err(InitFailure::new(InitFailureReason::Frames, 0.0, 1.0)));
         };
+        let mut is_assumed = false;
         if span >= PROVISIONAL_SECS
             && !Self::tells_scale(&mut smoother)
             && let Some(assumed) = Self::at_assumed_distance(&smoother, &views, &tracks)
         {
             smoother = self.build(&views, &tracks, &turns, &assumed)?;
             fit = self.refine_with_assumed_distances(&mut smoother);
+            is_assumed = true;
         }
         self.learn_gyro_bias(&mut smoother);
-        Ok(self.evaluate(smoother, &fit, span))
+        Ok(self.evaluate(smoother, &fit, (span, is_assumed)))
     }
 
     /// Step 1: gyroscope bias from pairs of neighbouring and next-but-one views.

@@ -1,6 +1,6 @@
 //! The odometry before it has a metric state: tracks are followed with the gyroscope's help and logged.
 
-use super::in_flight::PROVISIONAL_SECS;
+use super::in_flight::{MAX_LOG_SCALE_SIGMA, PROVISIONAL_SECS};
 use super::log::joined;
 use super::monocular::INITIAL_INVERSE_DISTANCE;
 use super::{
@@ -61,6 +61,8 @@ pub(crate) struct Initializer {
     /// When the last attempt began, and how long after that the next one is worth it, s.
     last_attempt: Option<Timestamp>,
     pause_secs: f64,
+    /// What the log spanned then, s.
+    solved_secs: f64,
     /// What stood in the way at the last attempt.
     failure: InitFailure,
 }
@@ -112,6 +114,7 @@ impl Initializer {
             solving: None,
             last_attempt: None,
             pause_secs: ATTEMPT_SECS,
+            solved_secs: 0.0,
             failure: InitFailure { reason: InitFailureReason::Frames, measured: 0.0, limit: 5.0 },
         }
     }
@@ -186,6 +189,7 @@ impl Initializer {
 
     /// Begins to look for a metric state in what is logged now.
     fn begin_attempt(&mut self, time: Timestamp) {
+        self.solved_secs = self.logged_secs();
         let (mut in_flight, log) = (self.in_flight.clone(), self.log.clone());
         let solve = move || {
             let outcome = in_flight.attempt(&log);
@@ -226,9 +230,9 @@ impl Initializer {
         Ok(())
     }
 
-    /// Time until another attempt may tell more, s: paced by what the last one lacked.
+    /// Time from the beginning of the last attempt until another one may tell more, s: paced by what the last one lacked.
     fn pause_after(&self, failure: &InitFailure) -> f64 {
-        let span = self.logged_secs();
+        let span = self.solved_secs;
         let ratio = failure.measured / failure.limit;
         let pause = match failure.reason {
             // σ falls with the square of a window's length, parallax grows with it.
@@ -240,9 +244,17 @@ impl Initializer {
             | InitFailureReason::Tracks => ATTEMPT_SECS,
             _ => CONTRADICTION_PAUSE_SECS,
         };
-        // From some length on less is asked for.
-        let until_less = Some(PROVISIONAL_SECS - span).filter(|s| *s > 0.0);
-        pause.min(until_less.unwrap_or(f64::INFINITY)).clamp(ATTEMPT_SECS, LONGEST_PAUSE_SECS)
+        let pause = pause.clamp(ATTEMPT_SECS, LONGEST_PAUSE_SECS);
+        // From some length on less is asked for. An attempt just before would only delay the one then.
+        let was_asked_more =
+            failure.reason == InitFailureReason::ScaleUncertainty && failure.limit <= MAX_LOG_SCALE_SIGMA;
+        match PROVISIONAL_SECS - span {
+            until_less if until_less > 0.0 && until_less < pause + ATTEMPT_SECS => {
+                until_less.max(ATTEMPT_SECS)
+            }
+            until_less if until_less <= 0.0 && was_asked_more => ATTEMPT_SECS,
+            _ => pause,
+        }
     }
 
     fn attempt_mono(&mut self) -> Result<InitialState, InitFailure> {

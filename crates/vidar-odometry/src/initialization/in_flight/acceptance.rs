@@ -25,12 +25,12 @@ const MAX_SPEED_MPS: f64 = 15.0;
 const MAX_CHI2_PER_DOF: f64 = 3.0;
 
 impl InFlightInitializer {
-    /// Step 4.
+    /// Step 4, of a window of so many seconds. Where its scale is assumed, since the IMU does not tell it, it need not agree with that of another.
     pub(super) fn evaluate(
         &mut self,
         mut smoother: Smoother,
         fit: &Fit,
-        span_secs: f64,
+        (span_secs, is_assumed): (f64, bool),
     ) -> Result<InFlightSolution, InitFailure> {
         let places: Vec<(FrameId, Vector3<f64>)> = smoother
             .frames()
@@ -64,7 +64,7 @@ impl InFlightInitializer {
         }
         let change = previous.and_then(|p| scale_change(&p, &places)).unwrap_or(f64::INFINITY);
         let max_change = MAX_SCALE_CHANGE.max(sigma);
-        if !(change <= max_change) {
+        if !is_assumed && !(change <= max_change) {
             return Err(InitFailure::new(InitFailureReason::ScaleAgreement, change, max_change));
         }
         self.last = None;
