@@ -168,7 +168,7 @@ impl Initializer {
             match self.take_over(outcome) {
                 Ok(found) => return Ok(found),
                 Err(failure) => {
-                    self.pause_secs = self.pause_after(&failure);
+                    self.pause_secs = pause_after(&failure, self.solved_secs);
                     self.failure = failure;
                 }
             }
@@ -228,33 +228,6 @@ impl Initializer {
         }
         smoother.optimise(self.config.iterations);
         Ok(())
-    }
-
-    /// Time from the beginning of the last attempt until another one may tell more, s: paced by what the last one lacked.
-    fn pause_after(&self, failure: &InitFailure) -> f64 {
-        let span = self.solved_secs;
-        let ratio = failure.measured / failure.limit;
-        let pause = match failure.reason {
-            // σ falls with the square of a window's length, parallax grows with it.
-            InitFailureReason::ScaleUncertainty => span * (ratio.sqrt() - 1.0),
-            InitFailureReason::Parallax => span * (1.0 / ratio - 1.0),
-            InitFailureReason::ScaleAgreement
-            | InitFailureReason::Seconds
-            | InitFailureReason::Frames
-            | InitFailureReason::Tracks => ATTEMPT_SECS,
-            _ => CONTRADICTION_PAUSE_SECS,
-        };
-        let pause = pause.clamp(ATTEMPT_SECS, LONGEST_PAUSE_SECS);
-        // From some length on less is asked for. An attempt just before would only delay the one then.
-        let was_asked_more =
-            failure.reason == InitFailureReason::ScaleUncertainty && failure.limit <= MAX_LOG_SCALE_SIGMA;
-        match PROVISIONAL_SECS - span {
-            until_less if until_less > 0.0 && until_less < pause + ATTEMPT_SECS => {
-                until_less.max(ATTEMPT_SECS)
-            }
-            until_less if until_less <= 0.0 && was_asked_more => ATTEMPT_SECS,
-            _ => pause,
-        }
     }
 
     fn attempt_mono(&mut self) -> Result<InitialState, InitFailure> {
@@ -327,5 +300,51 @@ impl Initializer {
         let held = |t: &&LoggedRotation| smoother.frames().any(|f| f == t.frame);
         let hosts = self.rotations.iter().filter(held).map(|t| t.host.clone()).collect();
         InitialState { smoother, median_distance, hosts }
+    }
+}
+
+/// Time from the beginning of an attempt of `span` seconds until another one may tell more, s: paced by what it lacked.
+fn pause_after(failure: &InitFailure, span: f64) -> f64 {
+    let ratio = failure.measured / failure.limit;
+    let pause = match failure.reason {
+        // σ falls with the square of a window's length, parallax grows with it.
+        InitFailureReason::ScaleUncertainty => span * (ratio.sqrt() - 1.0),
+        InitFailureReason::Parallax => span * (1.0 / ratio - 1.0),
+        InitFailureReason::ScaleAgreement
+        | InitFailureReason::Seconds
+        | InitFailureReason::Frames
+        | InitFailureReason::Tracks => ATTEMPT_SECS,
+        _ => CONTRADICTION_PAUSE_SECS,
+    };
+    let pause = pause.clamp(ATTEMPT_SECS, LONGEST_PAUSE_SECS);
+    // From some length on less is asked for; the chosen frames may span less than the log. An attempt just before delays the one then.
+    let was_asked_more =
+        failure.reason == InitFailureReason::ScaleUncertainty && failure.limit <= MAX_LOG_SCALE_SIGMA;
+    match PROVISIONAL_SECS - span {
+        left if left > 0.0 && left < pause + ATTEMPT_SECS => left.max(ATTEMPT_SECS),
+        left if left <= 0.0 && was_asked_more => ATTEMPT_SECS,
+        _ => pause,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Half a second was lost where the attempt that is judged as a provisional start came when another one was over.
+    #[test]
+    fn the_first_attempt_of_which_less_is_asked_begins_when_that_is_so() {
+        let after =
+            |reason, measured, limit, span| pause_after(&InitFailure::new(reason, measured, limit), span);
+        let uncertain = |limit, span| after(InitFailureReason::ScaleUncertainty, 1.0, limit, span);
+        assert_eq!(uncertain(MAX_LOG_SCALE_SIGMA, 0.8), LONGEST_PAUSE_SECS);
+        for span in [1.25, 1.4, 1.7] {
+            assert!((span + uncertain(MAX_LOG_SCALE_SIGMA, span) - PROVISIONAL_SECS).abs() < 1e-9, "{span}");
+        }
+        // Frames that span a little less than the log were judged as before.
+        assert_eq!(uncertain(MAX_LOG_SCALE_SIGMA, 1.8), ATTEMPT_SECS);
+        assert_eq!(uncertain(0.5, 1.8), LONGEST_PAUSE_SECS);
+        assert_eq!(after(InitFailureReason::ImuChi2, 8.0, 0.4, 0.8), CONTRADICTION_PAUSE_SECS);
+        assert!((after(InitFailureReason::Parallax, 0.8, 1.0, 1.0) - 0.25).abs() < 1e-9);
     }
 }
