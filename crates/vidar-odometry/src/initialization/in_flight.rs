@@ -30,6 +30,12 @@ const MIN_TRACKS: usize = 25;
 /// Least median parallax, degrees.
 const MIN_PARALLAX_DEG: f64 = 1.0;
 
+/// The same of a provisional start, over a turn of so many degrees. A body that turns on the spot shows 0.2 degrees and 1 % of its turn, by errors of
+/// the gyroscope (0.28 at 10, 0.65 at 33; `pure_rotation_is_never_accepted`); one that moves in a hall shows little, however long it goes on.
+fn least_parallax_deg(turned_deg: f64) -> f64 {
+    (0.5 + 0.015 * turned_deg).min(MIN_PARALLAX_DEG)
+}
+
 /// Most standard deviation of log(scale) of a start. 0.03 lets half of the starts be within 2 %.
 pub const MAX_LOG_SCALE_SIGMA: f64 = 0.03;
 
@@ -186,9 +192,10 @@ impl InFlightInitializer {
         let bias = Bias { gyro: self.gyro_bias, accel: Vector3::zeros() };
         views.iter_mut().filter_map(|v| v.preintegration.as_mut()).for_each(|r| r.reintegrate(bias));
         let turns = views::rotations(&views, &bias);
-        let parallax = views::median_parallax_deg(&tracks, &turns, &self.body_from_camera.rotation);
-        if !(parallax >= MIN_PARALLAX_DEG) {
-            return Ok(Err(InitFailure::new(InitFailureReason::Parallax, parallax, MIN_PARALLAX_DEG)));
+        let (parallax, turned) = views::median_parallax_deg(&tracks, &turns, &self.body_from_camera.rotation);
+        let least = if span >= PROVISIONAL_SECS { least_parallax_deg(turned) } else { MIN_PARALLAX_DEG };
+        if !(parallax >= least) {
+            return Ok(Err(InitFailure::new(InitFailureReason::Parallax, parallax, least)));
         }
         let Some(first) = self.linear_start(&views, &tracks, &turns) else {
             return Ok(Err(InitFailure::new(

@@ -98,7 +98,7 @@ fn standing_still_is_not_taken_for_flight() {
     let parallax = failures.iter().find(|r| r.reason == InitFailureReason::Parallax).unwrap();
     assert!(parallax.measured < 0.2, "{parallax}");
     let told = parallax.to_string();
-    assert!(told.starts_with("parallax 0.") && told.ends_with("deg < 1.000 deg: move sideways"), "{told}");
+    assert!(told.starts_with("parallax 0.") && told.ends_with("deg < 0.500 deg: move sideways"), "{told}");
 }
 
 #[test]

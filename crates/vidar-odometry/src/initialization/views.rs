@@ -5,6 +5,7 @@ use super::log::{LoggedFrame, TrackObservation, joined};
 use crate::imu::{Bias, Preintegration};
 use nalgebra::{Matrix3, Vector3};
 use rustc_hash::FxHashMap;
+use vidar_core::LieGroup;
 use vidar_core::{CameraModel, LandmarkId, Se3, So3};
 use vidar_solve::statistics::median_upper;
 
@@ -76,20 +77,25 @@ pub(super) fn rotations(views: &[View<'_>], bias: &Bias) -> Vec<So3> {
     views.iter().map(next).collect()
 }
 
-/// Median over tracks of the widest angle between rays that rotation leaves, degrees.
-pub(super) fn median_parallax_deg(tracks: &[Track], turns: &[So3], body_from_camera: &So3) -> f64 {
-    let mut widest: Vec<f64> = tracks
-        .iter()
-        .map(|t| {
-            let ray = |s: &(usize, TrackObservation, Vector3<f64>)| turns[s.0] * (*body_from_camera * s.2);
-            let first = ray(&t.observations[0]);
-            t.observations
-                .iter()
-                .map(|s| first.cross(&ray(s)).norm().atan2(first.dot(&ray(s))))
-                .fold(0.0, f64::max)
-        })
-        .collect();
-    median_upper(&mut widest).map_or(0.0, f64::to_degrees)
+/// Medians over tracks of the widest angle between rays that rotation leaves, and of the turn between the same views, degrees.
+pub(super) fn median_parallax_deg(tracks: &[Track], turns: &[So3], body_from_camera: &So3) -> (f64, f64) {
+    let (mut widest, mut turned) = (Vec::with_capacity(tracks.len()), Vec::with_capacity(tracks.len()));
+    for track in tracks {
+        let ray = |s: &(usize, TrackObservation, Vector3<f64>)| turns[s.0] * (*body_from_camera * s.2);
+        let (first, first_turn) = (ray(&track.observations[0]), turns[track.observations[0].0]);
+        let apart = track.observations.iter().map(|s| {
+            let ray = ray(s);
+            (
+                first.cross(&ray).norm().atan2(first.dot(&ray)),
+                (first_turn.inverse() * turns[s.0]).log().norm(),
+            )
+        });
+        let (parallax, turn) = apart.fold((0.0, 0.0), |a, b| if b.0 > a.0 { b } else { a });
+        widest.push(parallax);
+        turned.push(turn);
+    }
+    let median = |values: &mut Vec<f64>| median_upper(values).map_or(0.0, f64::to_degrees);
+    (median(&mut widest), median(&mut turned))
 }
 
 /// Views and rays of the linear system, all turned to the first view.
