@@ -60,7 +60,13 @@ const SHORT: &[Case] = &[
     (Fault::None, &[Right(&[])]),
     (Fault::Turned(10.0), &[Told(NEVER_STARTED, "contradict each other")]),
     (Fault::Turned(180.0), &[Told(NEVER_STARTED, "camera's orientation on the IMU is off")]),
-    (Fault::Lever(0.1), &[Right(&[])]),
+    (
+        Fault::Lever(0.1),
+        &[
+            Told(&["calibration-contradicted", "scale-not-converged"], "camera's position on the IMU"),
+            Right(&[]),
+        ],
+    ),
     (
         Fault::Gains(1.0, 1.0 / STANDARD_GRAVITY),
         &[Told(&["gravity-norm", "odometry-never-started"], "it looks like units of g")],

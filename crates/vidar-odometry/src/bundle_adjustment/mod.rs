@@ -40,7 +40,7 @@ pub use progress::{AdjustmentStage, Progress};
 pub use result::{Adjusted, AdjustedCalibration, AdjustedImu, AdjustmentReport};
 pub use sigmas::CalibrationSigmas;
 
-use crate::imu::{ImuBuffer, ImuModel, StepNoise};
+use crate::imu::{Bias, ImuBuffer, ImuModel, StepNoise};
 use envelope::Envelope;
 use initial::Guess;
 use linearise::System;
@@ -248,6 +248,8 @@ impl Work {
     ) -> Result<Passed, AdjustmentError> {
         let (clock_offset, images) = (self.clock_offset, self.guess.images.clone());
         let mut problem = initial::build(recording, &self.calibration, self.prior.clone(), &self.guess, 0)?;
+        // The guess tells where the world is. Its biases come from the same measurements: held, they would count twice.
+        problem.gauge.1.bias = Bias::ZERO;
         if problem.landmarks.len() < MIN_LANDMARKS {
             return Err(AdjustmentError::FewLandmarks { landmarks: problem.landmarks.len() });
         }
