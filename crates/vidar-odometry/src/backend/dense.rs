@@ -2,7 +2,7 @@
 //! Householder QR of tall matrices.
 
 /// Dot product with eight independent sums: vectorises, and adds in one fixed order.
-#[inline]
+#[inline(always)]
 pub(crate) fn dot(a: &[f64], b: &[f64]) -> f64 {
     let mut sums = [0.0; 8];
     let (a8, b8) = (a.chunks_exact(8), b.chunks_exact(8));

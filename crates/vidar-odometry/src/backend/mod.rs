@@ -37,6 +37,7 @@ pub(crate) use inertial::{
 };
 pub use marginalise::MarginalisationReport;
 pub use optimise::{OptimiseReport, Outlier};
+pub(crate) use products::product;
 pub(crate) use visual::{bearing_plus, tangent_basis, whitening};
 pub use window::{LandmarkEstimate, Observation};
 

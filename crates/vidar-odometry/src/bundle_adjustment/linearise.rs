@@ -4,9 +4,10 @@ use super::envelope::Envelope;
 use super::inertial::{GAIN_DIM, InertialJacobians};
 use super::observation::{self, Landmark, Linearised, STATE_DIM};
 use super::problem::{FRAME_DIM, ObservedLandmark, Problem};
-use crate::backend::{GaugePriorSigmas, gauge_prior_at};
+use crate::backend::{GaugePriorSigmas, gauge_prior_at, product};
 use crate::imu::{Matrix15, Vector15};
 use nalgebra::{Matrix3, SMatrix, Vector2, Vector3};
+use vidar_core::simd::kernel;
 use vidar_solve::Kernel;
 
 /// Loss of whitened reprojection errors: quadratic to 2 standard deviations, then without influence in the end. Tracks of the
@@ -30,14 +31,17 @@ impl Cost {
     }
 }
 
+/// `Jᵀ J` between the unknowns of a state and a landmark.
+type ByState = SMatrix<f64, STATE_DIM, 3>;
+
 /// A landmark's block of the normal equations, kept to find its step from the states'.
 #[derive(Clone, Debug, Default)]
 pub(super) struct LandmarkBlock {
     /// Inverse of the damped 3 × 3 block; `None` leaves the landmark where it is.
     inverse: Option<Matrix3<f64>>,
     gradient: Vector3<f64>,
-    /// `Jᵀ J` between the unknowns of each observation's state and the landmark.
-    by_state: Vec<(usize, SMatrix<f64, STATE_DIM, 3>)>,
+    /// Of each observation.
+    by_state: Vec<(usize, ByState)>,
     by_calibration: Vec<Vector3<f64>>,
 }
 
@@ -122,10 +126,23 @@ pub(super) fn linearise(problem: &Problem, damping: f64, system: &mut System) {
     }
     let mut blocks = std::mem::take(&mut system.landmarks);
     blocks.resize_with(problem.landmarks.len(), LandmarkBlock::default);
-    for (seen, block) in problem.landmarks.iter().zip(&mut blocks) {
+    add_each_landmark(problem, damping, &mut blocks, system);
+    system.landmarks = blocks;
+}
+
+kernel! {
+    up to Avx2;
+    /// Adds all landmarks.
+    fn add_each_landmark(problem: &Problem, damping: f64, blocks: &mut [LandmarkBlock], system: &mut System) {
+        add_landmarks(problem, damping, blocks, system);
+    }
+}
+
+#[inline(always)]
+fn add_landmarks(problem: &Problem, damping: f64, blocks: &mut [LandmarkBlock], system: &mut System) {
+    for (seen, block) in problem.landmarks.iter().zip(blocks) {
         add_landmark(problem, seen, damping, block, system);
     }
-    system.landmarks = blocks;
 }
 
 /// Whitened difference of the held state from where it is held, and its derivative.
@@ -197,6 +214,7 @@ fn add_gradient(system: &mut System, at: usize, gradient: &Vector15) {
 }
 
 /// Adds a landmark's observations, with the landmark eliminated (Schur complement).
+#[inline(always)]
 fn add_landmark(
     problem: &Problem,
     seen: &ObservedLandmark,
@@ -231,8 +249,8 @@ fn add_landmark(
         let gradient = by_state.transpose() * residual;
         for row in 0..STATE_DIM {
             system.gradient[from + row] += gradient[row];
-            for column in 0..=row {
-                system.h.add(from + row, from + column, square[(row, column)]);
+            for (column, sum) in system.h.part_mut(from + row, from, row + 1).iter_mut().enumerate() {
+                *sum += square[(row, column)];
             }
         }
         for (k, index) in problem.active[..calibrations].iter().enumerate() {
@@ -240,8 +258,8 @@ fn add_landmark(
             block.by_calibration[k] += by_landmark.transpose() * by_one;
             system.gradient[offset + k] += by_one.dot(&residual);
             let with_state = by_state.transpose() * by_one;
-            for row in 0..STATE_DIM {
-                system.h.add(offset + k, from + row, with_state[row]);
+            for (row, sum) in system.h.part_mut(offset + k, from, STATE_DIM).iter_mut().enumerate() {
+                *sum += with_state[row];
             }
             for (other, other_index) in problem.active[..=k].iter().enumerate() {
                 system.h.add(
@@ -261,31 +279,27 @@ fn add_landmark(
     eliminate(problem, block, &inverse, system);
 }
 
+#[inline(always)]
 fn eliminate(problem: &Problem, block: &LandmarkBlock, inverse: &Matrix3<f64>, system: &mut System) {
     let offset = problem.calibration_offset();
     let own_step = inverse * block.gradient;
     for (at, (frame, by_state)) in block.by_state.iter().enumerate() {
         let from = FRAME_DIM * frame;
-        let weighted = by_state * inverse;
+        let weighted = product(by_state, inverse);
         let gradient = by_state * own_step;
         for row in 0..STATE_DIM {
             system.gradient[from + row] -= gradient[row];
         }
         for (other_frame, other) in &block.by_state[..=at] {
-            let product = weighted * other.transpose();
-            let other_from = FRAME_DIM * other_frame;
-            let is_diagonal = other_frame == frame;
-            for row in 0..STATE_DIM {
-                let columns = if is_diagonal { row + 1 } else { STATE_DIM };
-                for column in 0..columns {
-                    system.h.add(from + row, other_from + column, -product[(row, column)]);
-                }
+            match other_frame == frame {
+                true => subtract_triangle(&mut system.h, from, &weighted, other),
+                false => subtract_product(&mut system.h, from, FRAME_DIM * other_frame, &weighted, other),
             }
         }
         for (k, by_calibration) in block.by_calibration.iter().enumerate() {
-            let product = weighted * by_calibration;
-            for row in 0..STATE_DIM {
-                system.h.add(offset + k, from + row, -product[row]);
+            let product = product(&weighted, by_calibration);
+            for (row, sum) in system.h.part_mut(offset + k, from, STATE_DIM).iter_mut().enumerate() {
+                *sum -= product[row];
             }
         }
     }
@@ -294,6 +308,31 @@ fn eliminate(problem: &Problem, block: &LandmarkBlock, inverse: &Matrix3<f64>, s
         let weighted = inverse * by_calibration;
         for (other, by_other) in block.by_calibration[..=k].iter().enumerate() {
             system.h.add(offset + k, offset + other, -weighted.dot(by_other));
+        }
+    }
+}
+
+/// Takes `weighted · otherᵀ` off the block of two states.
+#[inline(always)]
+fn subtract_product(h: &mut Envelope, row: usize, column: usize, weighted: &ByState, other: &ByState) {
+    let (first, rest) = other.as_slice().split_at(STATE_DIM);
+    let (second, third) = rest.split_at(STATE_DIM);
+    for i in 0..STATE_DIM {
+        let [a, b, c] = [weighted[(i, 0)], weighted[(i, 1)], weighted[(i, 2)]];
+        let sums = h.part_mut(row + i, column, STATE_DIM);
+        for j in 0..STATE_DIM {
+            sums[j] -= a * first[j] + b * second[j] + c * third[j];
+        }
+    }
+}
+
+/// The same of a state with itself, of which the lower triangle is held.
+#[inline(always)]
+fn subtract_triangle(h: &mut Envelope, at: usize, weighted: &ByState, own: &ByState) {
+    for i in 0..STATE_DIM {
+        for (j, sum) in h.part_mut(at + i, at, i + 1).iter_mut().enumerate() {
+            let [a, b, c] = [weighted[(i, 0)], weighted[(i, 1)], weighted[(i, 2)]];
+            *sum -= a * own[(j, 0)] + b * own[(j, 1)] + c * own[(j, 2)];
         }
     }
 }
