@@ -5,8 +5,7 @@ use super::log::{LoggedFrame, TrackObservation, joined};
 use crate::imu::{Bias, Preintegration};
 use nalgebra::{Matrix3, Vector3};
 use rustc_hash::FxHashMap;
-use vidar_core::LieGroup;
-use vidar_core::{CameraModel, LandmarkId, Se3, So3};
+use vidar_core::{CameraModel, LandmarkId, LieGroup, Se3, So3};
 use vidar_solve::statistics::median_upper;
 
 /// A chosen frame, with IMU measurements from the chosen one before.
@@ -82,17 +81,14 @@ pub(super) fn median_parallax_deg(tracks: &[Track], turns: &[So3], body_from_cam
     let (mut widest, mut turned) = (Vec::with_capacity(tracks.len()), Vec::with_capacity(tracks.len()));
     for track in tracks {
         let ray = |s: &(usize, TrackObservation, Vector3<f64>)| turns[s.0] * (*body_from_camera * s.2);
-        let (first, first_turn) = (ray(&track.observations[0]), turns[track.observations[0].0]);
+        let (first, first_view) = (ray(&track.observations[0]), track.observations[0].0);
         let apart = track.observations.iter().map(|s| {
             let ray = ray(s);
-            (
-                first.cross(&ray).norm().atan2(first.dot(&ray)),
-                (first_turn.inverse() * turns[s.0]).log().norm(),
-            )
+            (first.cross(&ray).norm().atan2(first.dot(&ray)), s.0)
         });
-        let (parallax, turn) = apart.fold((0.0, 0.0), |a, b| if b.0 > a.0 { b } else { a });
+        let (parallax, view) = apart.fold((0.0, first_view), |a, b| if b.0 > a.0 { b } else { a });
         widest.push(parallax);
-        turned.push(turn);
+        turned.push((turns[first_view].inverse() * turns[view]).log().norm());
     }
     let median = |values: &mut Vec<f64>| median_upper(values).map_or(0.0, f64::to_degrees);
     (median(&mut widest), median(&mut turned))
