@@ -8,6 +8,7 @@
 //!
 //! The lever arm and the accelerometer take no part: rotations alone do not show them.
 
+mod fixed;
 mod hand_eye;
 mod noise;
 mod parameters;
@@ -23,6 +24,7 @@ use crate::gyro_alignment::{ImageFeatures, RateSample};
 use nalgebra::Vector3;
 pub use noise::{SensorNoise, sensor_noise};
 use parameters::{BIAS, CENTRE, FOCAL, K1, K2, OFFSET, Parameters, READOUT, ROTATION, prior_sigmas};
+use path::GyroPath;
 use solve::Problem;
 pub use tracker::FeatureTracker;
 use vidar_core::{ImuSample, LandmarkId, So3, Timestamp, camera::Pixel};
@@ -174,13 +176,14 @@ impl CalibrationLog {
         let (Some(begin), Some(end)) = (samples.first(), samples.last()) else {
             return Err(CalibrationFailure::TooLittleData);
         };
-        let images: Vec<ImageFeatures> = self
+        let mut images: Vec<ImageFeatures> = self
             .images
             .iter()
             .map(|(t, features)| ImageFeatures { secs: secs(*t), features: features.clone() })
             .filter(|i| i.secs > begin.secs - 0.05 && i.secs < end.secs + 0.05)
             .collect();
         let size = (width as f64, height as f64);
+        fixed::leave_out(&mut images, &GyroPath::new(&samples, &Vector3::zeros(), &Vector3::zeros()), size.0);
         let windows = stretches::stretches(size, &images, &samples);
         if windows.is_empty() || samples.len() < 50 {
             return Err(CalibrationFailure::TooLittleData);

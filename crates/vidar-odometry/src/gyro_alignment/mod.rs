@@ -80,6 +80,13 @@ impl GyroAlignmentLog {
         }
     }
 
+    /// Forgets features: they show no point of the world.
+    pub fn leave_out(&mut self, features: &[LandmarkId]) {
+        for (_, seen) in self.images.iter_mut().filter(|_| !features.is_empty()) {
+            seen.retain(|(id, _)| !features.contains(id));
+        }
+    }
+
     /// Forgets the images, for when features are named anew.
     pub fn forget_images(&mut self) {
         self.images.clear();

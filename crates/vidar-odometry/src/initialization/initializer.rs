@@ -263,6 +263,10 @@ impl Initializer {
                 secs,
             };
             self.tracker.measure(host, &prediction);
+            let fixed = &self.tracker.fixed;
+            for logged in self.log.iter_mut().filter(|_| !fixed.is_empty()) {
+                logged.observations.retain(|seen| !fixed.contains(&seen.landmark));
+            }
         }
         self.images_still = self.motion.update(tracks_in(&self.tracker.tracks, frame), time);
         self.rotations.push(LoggedRotation { frame, first_from_body, host: host.clone() });

@@ -13,10 +13,10 @@ use crate::frontend::PYRAMID_LEVELS;
 use crate::imu::{ImuBuffer, ImuModel};
 use crate::initialization::{InitFailure, InitFailureReason, Initializer};
 use crate::stages::{Stage, StageClock, StageTimes};
-use crate::tracking::{FrameInput, HostImage, ImagePool, SlidingWindowOdometry, TrackRecord};
+use crate::tracking::{FrameInput, HostImage, ImagePool, SlidingWindowOdometry, TrackRecord, Tracker};
 use relocalization::Relocalizer;
 use settling::Settling;
-use start::initializer;
+use start::initializing;
 use std::collections::VecDeque;
 use std::sync::Arc;
 use successor::{RecentFrames, Successor};
@@ -152,7 +152,8 @@ impl Odometry {
         imu_model: Option<ImuModel>,
         imu: ImuBuffer,
     ) -> Self {
-        let phase = Phase::Initializing(Box::new(initializer(&config, imu_model.is_none(), &camera)));
+        let tracker = Tracker::new(camera.model.clone(), IMAGE_NOISE_GRAY);
+        let phase = initializing(&config, imu_model.is_none(), &camera, tracker);
         let time_calibration = TimeCalibration::new(&config);
         Self {
             config,

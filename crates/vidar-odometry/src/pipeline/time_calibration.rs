@@ -114,9 +114,15 @@ impl TimeCalibration {
         }
     }
 
-    /// Takes the features of an image as it shows them, with its own stamp.
-    pub fn add_image(&mut self, stamp: Timestamp, features: impl Iterator<Item = (LandmarkId, Pixel)>) {
+    /// Takes the features of an image as it shows them, with its own stamp; `fixed` ones turned out to move with the camera.
+    pub fn add_image(
+        &mut self,
+        stamp: Timestamp,
+        features: impl Iterator<Item = (LandmarkId, Pixel)>,
+        fixed: &[LandmarkId],
+    ) {
         if !self.is_settled() {
+            self.log.leave_out(fixed);
             self.log.add_image(stamp, features);
         }
     }

@@ -7,6 +7,7 @@
 //! - [`ImageMotion`] and [`ImuStatistics`]: standstill detection from images and from the IMU (as for OpenVINS' zero
 //!   velocity updates).
 
+mod fixed_parts;
 mod sliding_window;
 pub(crate) mod standstill;
 mod track;

@@ -200,6 +200,9 @@ impl SlidingWindowOdometry {
         self.smoother.add_frame(frame, input.time, predicted, input.preintegration)?;
         clock.lap(Stage::Predict);
         step.counts = self.measure(&input.host, input.time, &last_state, &predicted);
+        for fixed in &self.tracker.fixed {
+            self.smoother.remove_landmark(*fixed);
+        }
         step.is_still =
             self.motion.update(tracks_in(&self.tracker.tracks, frame), input.time) && input.imu_still;
         if step.is_still {

@@ -82,6 +82,8 @@ pub(crate) struct Track {
     pub keyframe_pixel: Option<Pixel>,
     /// Where frames of the window showed it, while the smoother does not know it.
     pub observations: Vec<(FrameId, PixelMeasurement)>,
+    /// Furthest that an image showed it from where it began, pixels.
+    pub moved_px: f64,
     /// What the last prediction was off by, pixels per second: continues into the next one while no depth is known.
     pub drift: Vector2<f64>,
     /// Frames in which it was found.
@@ -124,6 +126,10 @@ pub(crate) struct Measurer {
 impl Measurer {
     pub fn new(noise_gray: f64) -> Self {
         Self { template: Template::empty(), noise_gray }
+    }
+
+    pub fn noise_gray(&self) -> f64 {
+        self.noise_gray
     }
 
     /// Finds `feature` of `host` in `current` around `expected`, the patch deformed by `warp`.

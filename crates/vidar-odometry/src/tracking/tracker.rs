@@ -1,5 +1,6 @@
 //! All tracks of the odometry: predicted, measured, gated, detected, dropped.
 
+use super::fixed_parts::FixedParts;
 use super::track::{HostImage, InverseDistance, Measurer, Track, rotated_pixel, unknown_distance};
 use crate::frontend::{
     Detection, Detector, DetectorConfig, Feature, MatchFailure, OccupancyGrid, PixelMeasurement, Warp,
@@ -48,6 +49,9 @@ pub(crate) struct Tracker {
     measurer: Measurer,
     detector: Detector,
     grid: OccupancyGrid,
+    fixed_parts: FixedParts,
+    /// Tracks that ended in the newest image because they move with the camera.
+    pub fixed: Vec<LandmarkId>,
     detections: Vec<Detection>,
     next_id: u32,
 }
@@ -68,8 +72,23 @@ impl Tracker {
     pub fn new(camera: CameraModel, noise_gray: f64) -> Self {
         let detector = Detector::new(DetectorConfig::default());
         let grid = detector.grid(camera.width(), camera.height());
-        let measurer = Measurer::new(noise_gray);
-        Self { camera, tracks: Vec::new(), measurer, detector, grid, detections: Vec::new(), next_id: 0 }
+        Self {
+            fixed_parts: FixedParts::new(&grid, camera.width()),
+            fixed: Vec::new(),
+            camera,
+            tracks: Vec::new(),
+            measurer: Measurer::new(noise_gray),
+            detector,
+            grid,
+            detections: Vec::new(),
+            next_id: 0,
+        }
+    }
+
+    /// A tracker without tracks that knows which parts of the image are fixed.
+    pub fn another(&self) -> Self {
+        let fresh = Self::new(self.camera.clone(), self.measurer.noise_gray());
+        Self { fixed_parts: self.fixed_parts.clone(), ..fresh }
     }
 
     pub fn camera(&self) -> &CameraModel {
@@ -82,6 +101,8 @@ impl Tracker {
         let frame = current.frame;
         let mut counts = TrackCounts::default();
         let (camera, measurer) = (&self.camera, &mut self.measurer);
+        let (grid, fixed_parts, fixed) = (&self.grid, &mut self.fixed_parts, &mut self.fixed);
+        fixed.clear();
         self.tracks.retain_mut(|track| {
             let Some(world_from_host) = prediction.poses.world_from_camera(track.host.frame) else {
                 return false;
@@ -106,7 +127,14 @@ impl Tracker {
                     track.found += 1;
                     track.missed = 0;
                     track.measured = Some(measurement);
-                    true
+                    track.moved_px = track.moved_px.max((pixel - track.feature.pixel).norm());
+                    let is_fixed =
+                        fixed_parts.is_fixed(track.moved_px, by_turn_px(camera, track, &current_from_host));
+                    if is_fixed {
+                        fixed_parts.add(grid, &pixel, frame);
+                        fixed.push(track.id);
+                    }
+                    !is_fixed
                 }
                 Err(failure) => {
                     track.measured = None;
@@ -134,6 +162,7 @@ impl Tracker {
     /// How many tracks could begin in an image, if there were none.
     pub fn corners(&mut self, image: &HostImage) -> usize {
         self.grid.clear();
+        self.fixed_parts.take(&mut self.grid, image.frame);
         self.detector.detect(&image.pyramid, &self.grid, &mut self.detections);
         self.detections.len()
     }
@@ -144,6 +173,7 @@ impl Tracker {
         for track in self.tracks.iter().filter(|t| t.measured.is_some()) {
             self.grid.take(&track.last_pixel);
         }
+        self.fixed_parts.take(&mut self.grid, host.frame);
         let mut detections = std::mem::take(&mut self.detections);
         self.detector.detect(&host.pyramid, &self.grid, &mut detections);
         let before = self.tracks.len();
@@ -177,6 +207,7 @@ impl Tracker {
             last_pixel: feature.pixel,
             last_global_pixel: feature.global_pixel,
             last_frame: host.frame,
+            moved_px: 0.0,
             drift: Vector2::zeros(),
             keyframe_pixel: Some(feature.global_pixel),
             observations: Vec::with_capacity(SEEN_FRAMES),
@@ -185,6 +216,12 @@ impl Tracker {
             measured: None,
         }
     }
+}
+
+/// How far the camera's turn alone moves a track from where it began, pixels.
+fn by_turn_px(camera: &CameraModel, track: &Track, current_from_host: &Se3) -> f64 {
+    let began = &track.feature.global_pixel;
+    rotated_pixel(camera, began, current_from_host).map_or(0.0, |turned| (turned - began).norm())
 }
 
 fn is_known(distance: &InverseDistance, has_translation: bool) -> bool {

@@ -48,6 +48,11 @@ impl OccupancyGrid {
         }
     }
 
+    /// Takes a cell by its number.
+    pub fn take_index(&mut self, index: usize) {
+        self.taken[index] = true;
+    }
+
     /// Whether the cell of `pixel` is free; outside nothing is.
     pub fn is_free(&self, pixel: &Pixel) -> bool {
         self.index(pixel).is_some_and(|index| !self.taken[index])

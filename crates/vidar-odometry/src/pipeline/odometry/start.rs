@@ -1,6 +1,6 @@
 //! From images without a state to the first one, and back.
 
-use super::{IMAGE_NOISE_GRAY, Odometry, Phase, Status};
+use super::{Odometry, Phase, Status};
 use crate::backend::{Smoother, SmootherError};
 use crate::bundle_adjustment::TrackLog;
 use crate::config::OdometryConfig;
@@ -86,7 +86,7 @@ impl Odometry {
         let mut smoother = self.smoother()?;
         smoother.start(host.frame, time, start.state, start.sigmas)?;
         smoother.mark_keyframe(host.frame)?;
-        let mut tracker = Tracker::new(self.camera.model.clone(), IMAGE_NOISE_GRAY);
+        let mut tracker = self.phase.tracker().another();
         tracker.detect(host, 2 * self.config.max_landmarks, typical_inverse);
         let (config, hosts) = (self.config.clone(), vec![host.clone()]);
         SlidingWindowOdometry::new(config, smoother, tracker, hosts, typical_inverse)
@@ -99,8 +99,7 @@ impl Odometry {
         frame: &Frame,
         host: &Arc<HostImage>,
     ) -> Status {
-        let waiting =
-            Phase::Initializing(Box::new(initializer(&self.config, self.imu_model.is_none(), &self.camera)));
+        let waiting = self.initializing_anew();
         let Phase::Initializing(before) = std::mem::replace(&mut self.phase, waiting) else {
             return Status::Waiting(self.failure.clone());
         };
@@ -127,8 +126,11 @@ impl Odometry {
     pub(super) fn initialize_anew(&mut self) {
         self.time_calibration.forget_tracks();
         self.log.iter_mut().for_each(TrackLog::next_generation);
-        self.phase =
-            Phase::Initializing(Box::new(initializer(&self.config, self.imu_model.is_none(), &self.camera)));
+        self.phase = self.initializing_anew();
+    }
+
+    fn initializing_anew(&self) -> Phase {
+        initializing(&self.config, self.imu_model.is_none(), &self.camera, self.phase.tracker().another())
     }
 
     pub(super) fn wait(&mut self, failure: InitFailure) -> Status {
@@ -141,7 +143,21 @@ impl Odometry {
     }
 }
 
-pub(super) fn initializer(config: &OdometryConfig, is_mono: bool, camera: &RigCamera) -> Initializer {
-    let tracker = Tracker::new(camera.model.clone(), IMAGE_NOISE_GRAY);
-    Initializer::new(config.clone(), is_mono, camera.body_from_camera, tracker)
+pub(super) fn initializing(
+    config: &OdometryConfig,
+    is_mono: bool,
+    camera: &RigCamera,
+    tracker: Tracker,
+) -> Phase {
+    let initializer = Initializer::new(config.clone(), is_mono, camera.body_from_camera, tracker);
+    Phase::Initializing(Box::new(initializer))
+}
+
+impl Phase {
+    pub(super) fn tracker(&self) -> &Tracker {
+        match self {
+            Self::Initializing(initializer) => &initializer.tracker,
+            Self::Tracking(window) => &window.tracker,
+        }
+    }
 }

@@ -10,6 +10,7 @@ use crate::gyro_alignment::RollingShutter;
 use crate::pipeline::orientation_check::OrientationCheck;
 use crate::pipeline::output::LossReason;
 use crate::pipeline::time_calibration::{CameraTiming, Correction};
+use crate::tracking::tracks_in;
 use nalgebra::Vector3;
 use vidar_core::{CameraId, Duration, FrameId, LieGroup, Rig, SensorEvent, Timestamp};
 
@@ -155,12 +156,9 @@ impl Odometry {
 
     /// Hands the features of image `id` to the time calibration.
     pub(super) fn log_features_of(&mut self, id: FrameId, stamp: Timestamp) {
-        let tracks = match &self.phase {
-            Phase::Initializing(initializer) => &initializer.tracker.tracks,
-            Phase::Tracking(window) => &window.tracker.tracks,
-        };
-        let shown = tracks.iter().filter(|t| t.last_frame == id).map(|t| (t.id, t.last_pixel));
-        self.time_calibration.add_image(stamp, shown);
+        let tracker = self.phase.tracker();
+        let shown = tracks_in(&tracker.tracks, id);
+        self.time_calibration.add_image(stamp, shown, &tracker.fixed);
     }
 
     /// A clock offset that is well known is not forgotten with the state.
