@@ -304,6 +304,7 @@ fn push_all(
         tracked.keep(output, 0.0);
     }
     tracked.counts = odometry.counts();
+    tracked.carrier_share = odometry.carrier_share();
     Ok((tracked, odometry))
 }
 

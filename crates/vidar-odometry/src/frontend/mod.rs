@@ -26,7 +26,7 @@ mod patch;
 mod pyramid;
 mod template;
 #[cfg(test)]
-mod testbed;
+pub(crate) mod testbed;
 mod two_view;
 
 pub use detect::{Detection, Detector, DetectorConfig, OccupancyGrid};

@@ -8,10 +8,14 @@ use crate::frontend::OccupancyGrid;
 use vidar_core::FrameId;
 use vidar_core::camera::Pixel;
 
-/// A track that was never further than this from where it began is fixed ...
-const FIXED_PX: f64 = 1.0;
+/// A track that was never further than this from where it began is fixed: twice to four times the noise of an alignment. With 1 px what is as far away
+/// as the middle of an orbit was taken for fixed, too ...
+const FIXED_PX: f64 = 0.4;
 /// ... once the camera's turn alone would have moved it by this share of the image's width, 15 pixels of 640: two degrees.
 const TURNED_SHARE: f64 = 0.023;
+
+/// Further than this from where it began, a track has moved.
+const MOVED_PX: f64 = 4.0;
 
 /// Images for which a cell gets no tracks the first time, 2 s at 30 a second; each time twice as many, up to six times.
 const FIRST_PAUSE: u32 = 64;
@@ -28,16 +32,28 @@ struct Cell {
 pub(super) struct FixedParts {
     cells: Vec<Cell>,
     turned_px: f64,
+    /// Most cells that got no tracks at a time.
+    most: usize,
 }
 
 impl FixedParts {
     pub fn new(grid: &OccupancyGrid, width: usize) -> Self {
-        Self { cells: vec![Cell::default(); grid.len()], turned_px: TURNED_SHARE * width as f64 }
+        Self { cells: vec![Cell::default(); grid.len()], turned_px: TURNED_SHARE * width as f64, most: 0 }
     }
 
-    /// Whether a track that was at most `moved_px` from where it began should have moved, were it a point of the world.
-    pub fn is_fixed(&self, moved_px: f64, by_turn_px: f64) -> bool {
-        moved_px < FIXED_PX && by_turn_px > self.turned_px
+    /// Whether a track that was at most so far from where it began stays there.
+    pub fn stays(moved_px: f64) -> bool {
+        moved_px < FIXED_PX
+    }
+
+    /// Whether it moves, beyond doubt.
+    pub fn moves(moved_px: f64) -> bool {
+        moved_px > MOVED_PX
+    }
+
+    /// Whether a point of the world would have moved, were it as far away as can be.
+    pub fn should_move(&self, by_turn_px: f64) -> bool {
+        by_turn_px > self.turned_px
     }
 
     /// A fixed track at `pixel` ended in image `frame`.
@@ -45,6 +61,12 @@ impl FixedParts {
         let Some(cell) = grid.index(pixel).and_then(|index| self.cells.get_mut(index)) else { return };
         cell.until = frame.0.saturating_add(FIRST_PAUSE << cell.times.min(MAX_DOUBLINGS));
         cell.times += 1;
+        self.most = self.most.max(self.cells.iter().filter(|cell| frame.0 < cell.until).count());
+    }
+
+    /// Largest share of the image that got no tracks at a time.
+    pub fn share(&self) -> f64 {
+        self.most as f64 as f64 / self.cells.len().max(1) as f64
     }
 
     /// Takes the cells that get no tracks in image `frame`.
@@ -74,18 +96,11 @@ mod tests {
         parts.add(&grid, &at, FrameId(10));
         assert!(!is_free(&parts, &mut grid, 73) && is_free(&parts, &mut grid, 74));
         parts.add(&grid, &at, FrameId(80));
+        assert_eq!(parts.share(), 1.0 / 300.0);
         assert!(!is_free(&parts, &mut grid, 207) && is_free(&parts, &mut grid, 208));
         for _ in 0..100 {
             parts.add(&grid, &at, FrameId(u32::MAX - 5));
         }
         assert!(!is_free(&parts, &mut grid, u32::MAX - 1));
-    }
-
-    #[test]
-    fn what_stays_while_the_camera_turns_is_fixed() {
-        let parts = FixedParts::new(&OccupancyGrid::new(640, 480, 32), 640);
-        assert!(parts.is_fixed(0.4, 20.0));
-        assert!(!parts.is_fixed(0.4, 10.0), "it hardly turned");
-        assert!(!parts.is_fixed(3.0, 20.0), "it moved");
     }
 }

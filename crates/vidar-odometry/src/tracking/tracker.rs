@@ -91,6 +91,11 @@ impl Tracker {
         Self { fixed_parts: self.fixed_parts.clone(), ..fresh }
     }
 
+    /// Share of the image that shows what moves with the camera, the largest at a time.
+    pub fn fixed_share(&self) -> f64 {
+        self.fixed_parts.share()
+    }
+
     pub fn camera(&self) -> &CameraModel {
         &self.camera
     }
@@ -101,8 +106,6 @@ impl Tracker {
         let frame = current.frame;
         let mut counts = TrackCounts::default();
         let (camera, measurer) = (&self.camera, &mut self.measurer);
-        let (grid, fixed_parts, fixed) = (&self.grid, &mut self.fixed_parts, &mut self.fixed);
-        fixed.clear();
         self.tracks.retain_mut(|track| {
             let Some(world_from_host) = prediction.poses.world_from_camera(track.host.frame) else {
                 return false;
@@ -128,13 +131,7 @@ impl Tracker {
                     track.missed = 0;
                     track.measured = Some(measurement);
                     track.moved_px = track.moved_px.max((pixel - track.feature.pixel).norm());
-                    let is_fixed =
-                        fixed_parts.is_fixed(track.moved_px, by_turn_px(camera, track, &current_from_host));
-                    if is_fixed {
-                        fixed_parts.add(grid, &pixel, frame);
-                        fixed.push(track.id);
-                    }
-                    !is_fixed
+                    true
                 }
                 Err(failure) => {
                     track.measured = None;
@@ -148,7 +145,32 @@ impl Tracker {
                 }
             }
         });
+        self.end_fixed(frame, prediction);
         counts
+    }
+
+    /// Ends tracks that move with the camera: they stay while most of those that began in the same image do not. Where all stay, the body is at rest and
+    /// the gyroscope's bias seems to turn it.
+    fn end_fixed(&mut self, frame: FrameId, prediction: &Prediction<'_>) {
+        self.fixed.clear();
+        let stays = |t: &Track| t.measured.is_some() && FixedParts::stays(t.moved_px);
+        let should_move = |t: &Track| {
+            let world_from_host = prediction.poses.world_from_camera(t.host.frame)?;
+            let current_from_host = prediction.world_from_current.inverse() * world_from_host;
+            Some(self.fixed_parts.should_move(by_turn_px(&self.camera, t, &current_from_host)))
+        };
+        for track in self.tracks.iter().filter(|t| stays(t) && should_move(t) == Some(true)) {
+            let beside = || self.tracks.iter().filter(|t| t.host.frame == track.host.frame);
+            let moved = beside().filter(|t| FixedParts::moves(t.moved_px)).count();
+            if 2 * moved >= beside().filter(|t| stays(t)).count() {
+                self.fixed.push(track.id);
+            }
+        }
+        for id in &self.fixed {
+            let Some(at) = self.tracks.iter().position(|t| t.id == *id) else { continue };
+            let track = self.tracks.remove(at);
+            self.fixed_parts.add(&self.grid, &track.last_pixel, frame);
+        }
     }
 
     /// Forgets that `id` was found in this image, as if it had been missed.
@@ -261,4 +283,100 @@ fn measure_one(
         track.drift = (pixel - turned) / prediction.secs.max(1e-3);
     }
     Ok((shown, PixelMeasurement { pixel, ..found.measurement }))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::frontend::{Pyramid, testbed};
+    use crate::gyro_alignment::RollingShutter;
+    use vidar_core::Image;
+
+    /// Rows from here on show the carrier.
+    const CARRIER_FROM: usize = 180;
+
+    /// Poses of the views by number, turns alone.
+    struct Turns(Vec<Se3>);
+
+    impl CameraPoses for Turns {
+        fn world_from_camera(&self, frame: FrameId) -> Option<Se3> {
+            self.0.get(frame.index()).copied()
+        }
+    }
+
+    /// A view whose lower quarter is the same in all of them, or is that of the world.
+    fn host(view: usize, with_carrier: bool) -> Arc<HostImage> {
+        let image = &testbed::scene().views[view].image;
+        let painted = |x: usize, y: usize| ((x / 6 * 7919 + y / 6 * 104_729) % 31 * 7) as u8;
+        let image = Image::from_fn(image.width(), image.height(), |x, y| {
+            if with_carrier && y >= CARRIER_FROM { painted(x, y) } else { image[(x, y)] }
+        });
+        let pyramid = Pyramid::of(&image, testbed::LEVELS);
+        Arc::new(HostImage { frame: FrameId(view as u32), pyramid, shutter: RollingShutter::default() })
+    }
+
+    /// Follows all views by their turns; the tracker, and how many tracks ended as fixed.
+    fn followed(with_carrier: bool) -> (Tracker, usize) {
+        let scene = testbed::scene();
+        let turn = |v: &testbed::View| Se3::new(v.world_from_camera.rotation, nalgebra::Vector3::zeros());
+        let poses = Turns(scene.views.iter().map(turn).collect());
+        let mut tracker = Tracker::new(scene.camera.clone(), 3.0);
+        let begun = tracker.detect(&host(0, with_carrier), 400, 0.4);
+        assert!(begun > MIN_CORNERS, "{begun}");
+        let mut fixed = 0;
+        for view in 1..scene.views.len() {
+            let prediction = Prediction {
+                poses: &poses,
+                world_from_current: poses.0[view],
+                current_from_last: poses.0[view].inverse() * poses.0[view - 1],
+                has_translation: false,
+                last: FrameId(view as u32 - 1),
+                secs: testbed::OFFSETS_SECS[view] - testbed::OFFSETS_SECS[view - 1],
+            };
+            tracker.measure(&host(view, with_carrier), &prediction);
+            fixed += tracker.fixed.len();
+        }
+        (tracker, fixed)
+    }
+
+    #[test]
+    fn what_moves_with_the_camera_is_neither_followed_nor_begun_again() {
+        let on_carrier = |t: &&Track| t.last_pixel.y > CARRIER_FROM as f64 + 4.0;
+        let (mut tracker, fixed) = followed(true);
+        assert!(fixed > 10, "{fixed}");
+        let last = host(testbed::OFFSETS_SECS.len() - 1, true);
+        let left = tracker.tracks.iter().filter(on_carrier).count();
+        tracker.detect(&last, 400, 0.4);
+        let again = tracker.tracks.iter().filter(on_carrier).count() - left;
+        assert!(left * 5 < fixed, "{left} of {fixed} still followed");
+        assert!(again * 2 < fixed, "{again} begun again in {fixed} cells");
+        assert!(tracker.tracks.iter().filter(|t| !on_carrier(t)).count() > 30);
+
+        let (_, fixed) = followed(false);
+        assert_eq!(fixed, 0, "of the world");
+    }
+
+    #[test]
+    fn a_body_at_rest_with_a_biased_gyroscope_shows_the_world() {
+        let scene = testbed::scene();
+        let turn = |k: usize| LieGroup::exp(&nalgebra::Vector3::new(0.0, 0.02 * k as f64, 0.0));
+        let poses = Turns((0..6).map(|k| Se3::new(turn(k), nalgebra::Vector3::zeros())).collect());
+        let mut tracker = Tracker::new(scene.camera.clone(), 3.0);
+        let begun = tracker.detect(&host(0, false), 400, 0.4);
+        for k in 1..6 {
+            let mut again = Arc::into_inner(host(0, false)).unwrap();
+            again.frame = FrameId(k as u32);
+            let prediction = Prediction {
+                poses: &poses,
+                world_from_current: poses.0[k],
+                current_from_last: poses.0[k].inverse() * poses.0[k - 1],
+                has_translation: false,
+                last: FrameId(k as u32 - 1),
+                secs: 0.05,
+            };
+            tracker.measure(&again, &prediction);
+            assert!(tracker.fixed.is_empty());
+        }
+        assert!(tracker.tracks.len() * 2 > begun, "{} of {begun}", tracker.tracks.len());
+    }
 }

@@ -32,6 +32,7 @@ impl OdometryOutcome {
             "imu_samples_rejected": tracked.counts.imu_samples_rejected,
             "imu_gaps": tracked.counts.imu_gaps,
             "milliseconds_per_image": files::milliseconds(tracked),
+            "carrier_share": tracked.carrier_share,
             "map": tracked.map,
             "trajectory": self.report,
             "final": tracked.adjusted.as_ref().map(|adjusted| json!({

@@ -48,6 +48,9 @@ pub struct ApartSpan {
     pub images: usize,
 }
 
+/// Share of the image from which what moves with the camera is told: single cells may be chance.
+const TOLD_CARRIER_SHARE: f64 = 0.05;
+
 /// All outputs of the odometry on a recording.
 #[derive(Clone, Debug, Default)]
 pub struct Tracked {
@@ -59,6 +62,8 @@ pub struct Tracked {
     pub lost: Vec<LostSpan>,
     /// What was taken and left out.
     pub counts: InputCounts,
+    /// Share of the image that moves with the camera.
+    pub carrier_share: f64,
     /// Errors of images that could not be read; they are skipped.
     pub unreadable: Vec<String>,
     /// Whether camera and IMU were used together; else the trajectory is known up to scale.
@@ -238,6 +243,16 @@ impl Tracked {
             warnings.push(Warning::degraded(NEVER_STARTED, text).hint(hint));
         }
         warnings.extend(self.quality.warning());
+        if self.carrier_share >= TOLD_CARRIER_SHARE {
+            let text = format!(
+                "{:.0} % of the picture moves with the camera: its carrier, a finger, something on the lens; no features are taken there",
+                100.0 * self.carrier_share
+            );
+            warnings.push(
+                Warning::new("carrier-in-view", text)
+                    .hint("the map has no depth there; mount the camera so that it sees the scene alone"),
+            );
+        }
         if let (Some(reason), true) = (&self.not_adjusted, self.quality.longest().is_some()) {
             warnings.push(Warning::degraded("not-adjusted", format!("the live states are final: {reason}")));
         }

@@ -10,6 +10,11 @@ use crate::tracking::StepReport;
 use vidar_core::{Frame, FrameId, Health, NavCovariance, Timestamp};
 
 impl Odometry {
+    /// Share of the image that moves with the camera, the largest at a time so far: its carrier, a finger, dirt on the lens. No features are taken there.
+    pub fn carrier_share(&self) -> f64 {
+        self.phase.tracker().fixed_share()
+    }
+
     /// What is known after a step.
     pub(super) fn report(&mut self, step: &StepReport, frame: &Frame, id: FrameId) -> Status {
         let is_metric = self.imu_model.is_some();
