@@ -66,7 +66,7 @@ impl FixedParts {
 
     /// Largest share of the image that got no tracks at a time.
     pub fn share(&self) -> f64 {
-        self.most as f64 as f64 / self.cells.len().max(1) as f64
+        self.most as f64 / self.cells.len().max(1) as f64
     }
 
     /// Takes the cells that get no tracks in image `frame`.
