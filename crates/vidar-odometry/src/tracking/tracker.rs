@@ -149,8 +149,8 @@ impl Tracker {
         counts
     }
 
-    /// Ends tracks that move with the camera: they stay while most of those that began in the same image do not. Where all stay, the body is at rest and
-    /// the gyroscope's bias seems to turn it.
+    /// Ends tracks that move with the camera: they stay while at least half as many that began in the same image have moved. Where nearly all stay, the
+    /// body is at rest and the gyroscope's bias seems to turn it: a rendered flight that began on the ground lost two fifths of its picture.
     fn end_fixed(&mut self, frame: FrameId, prediction: &Prediction<'_>) {
         self.fixed.clear();
         let stays = |t: &Track| t.measured.is_some() && FixedParts::stays(t.moved_px);
