@@ -8,7 +8,7 @@
 
 use super::parameters::Parameters;
 use super::path::GyroPath;
-use crate::gyro_alignment::{ImageFeatures, RateSample, common};
+use crate::gyro_alignment::{ImageFeatures, common};
 use nalgebra::{Matrix3, Vector2, Vector3};
 use vidar_core::{LieGroup, So3, nearest_rotation};
 
@@ -35,10 +35,9 @@ pub(super) struct Start {
 pub(super) fn starts(
     size: (f64, f64),
     images: &[ImageFeatures],
-    samples: &[RateSample],
+    path: &GyroPath,
     readout_secs: f64,
 ) -> Vec<Start> {
-    let path = GyroPath::new(samples, &Vector3::zeros(), &Vector3::zeros());
     let mut found: Vec<Start> = Vec::new();
     for widths in FOCALS {
         let parameters = Parameters {

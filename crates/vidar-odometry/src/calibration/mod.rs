@@ -183,7 +183,8 @@ impl CalibrationLog {
             .filter(|i| i.secs > begin.secs - 0.05 && i.secs < end.secs + 0.05)
             .collect();
         let size = (width as f64, height as f64);
-        fixed::leave_out(&mut images, &GyroPath::new(&samples, &Vector3::zeros(), &Vector3::zeros()), size.0);
+        let as_measured = GyroPath::new(&samples, &Vector3::zeros(), &Vector3::zeros());
+        fixed::leave_out(&mut images, &as_measured, size.0);
         let windows = stretches::stretches(size, &images, &samples);
         if windows.is_empty() || samples.len() < 50 {
             return Err(CalibrationFailure::TooLittleData);
@@ -191,7 +192,7 @@ impl CalibrationLog {
         if windows.iter().map(|w| w.turning(&samples)).fold(0.0, f64::max) < MIN_TURNING {
             return Err(CalibrationFailure::TooLittleRotation);
         }
-        let starts = hand_eye::starts(size, &images, &samples, START_READOUT_SECS);
+        let starts = hand_eye::starts(size, &images, &as_measured, START_READOUT_SECS);
         let Some(first) = starts.first() else { return Err(CalibrationFailure::TooLittleRotation) };
         let prior =
             Parameters { focal: 0.75 * size.0, offset_secs: 0.0, bias: Vector3::zeros(), ..first.parameters };

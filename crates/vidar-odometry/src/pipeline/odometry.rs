@@ -139,7 +139,8 @@ impl Odometry {
         let imu = if imu_model.is_some() { config.imu } else { ImuUse::Off };
         let config = OdometryConfig { imu, ..config.clone() };
         let samples = ImuBuffer::new(noise.map_or(200.0, |n| n.rate_hz));
-        let fresh = Self::fresh(config, (camera, rig_camera), working, imu_model, samples);
+        let tracker = Tracker::new(rig_camera.model.clone(), IMAGE_NOISE_GRAY);
+        let fresh = Self::fresh(config, tracker, (camera, rig_camera), working, imu_model, samples);
         let settling = Settling::new(fresh.imu_model.is_some());
         Ok(Self { given_body_from_camera, settling, log: fresh.new_log(), ..fresh })
     }
@@ -147,12 +148,12 @@ impl Odometry {
     /// An odometry that has seen nothing; `camera` is that of the images that are worked with.
     fn fresh(
         config: OdometryConfig,
+        tracker: Tracker,
         (camera_id, camera): (CameraId, RigCamera),
         working: WorkingSize,
         imu_model: Option<ImuModel>,
         imu: ImuBuffer,
     ) -> Self {
-        let tracker = Tracker::new(camera.model.clone(), IMAGE_NOISE_GRAY);
         let phase = initializing(&config, imu_model.is_none(), &camera, tracker);
         let time_calibration = TimeCalibration::new(&config);
         Self {

@@ -315,6 +315,20 @@ mod tests {
         Arc::new(HostImage { frame: FrameId(view as u32), pyramid, shutter: RollingShutter::default() })
     }
 
+    /// Measures all tracks in image `view`, `secs` after the one before; how many ended as fixed.
+    fn measure(tracker: &mut Tracker, poses: &Turns, view: usize, image: &HostImage, secs: f64) -> usize {
+        let prediction = Prediction {
+            poses,
+            world_from_current: poses.0[view],
+            current_from_last: poses.0[view].inverse() * poses.0[view - 1],
+            has_translation: false,
+            last: FrameId(view as u32 - 1),
+            secs,
+        };
+        tracker.measure(image, &prediction);
+        tracker.fixed.len()
+    }
+
     /// Follows all views by their turns; the tracker, and how many tracks ended as fixed.
     fn followed(with_carrier: bool) -> (Tracker, usize) {
         let scene = testbed::scene();
@@ -325,16 +339,8 @@ mod tests {
         assert!(begun > MIN_CORNERS, "{begun}");
         let mut fixed = 0;
         for view in 1..scene.views.len() {
-            let prediction = Prediction {
-                poses: &poses,
-                world_from_current: poses.0[view],
-                current_from_last: poses.0[view].inverse() * poses.0[view - 1],
-                has_translation: false,
-                last: FrameId(view as u32 - 1),
-                secs: testbed::OFFSETS_SECS[view] - testbed::OFFSETS_SECS[view - 1],
-            };
-            tracker.measure(&host(view, with_carrier), &prediction);
-            fixed += tracker.fixed.len();
+            let secs = testbed::OFFSETS_SECS[view] - testbed::OFFSETS_SECS[view - 1];
+            fixed += measure(&mut tracker, &poses, view, &host(view, with_carrier), secs);
         }
         (tracker, fixed)
     }
@@ -366,16 +372,7 @@ mod tests {
         for k in 1..6 {
             let mut again = Arc::into_inner(host(0, false)).unwrap();
             again.frame = FrameId(k as u32);
-            let prediction = Prediction {
-                poses: &poses,
-                world_from_current: poses.0[k],
-                current_from_last: poses.0[k].inverse() * poses.0[k - 1],
-                has_translation: false,
-                last: FrameId(k as u32 - 1),
-                secs: 0.05,
-            };
-            tracker.measure(&again, &prediction);
-            assert!(tracker.fixed.is_empty());
+            assert_eq!(measure(&mut tracker, &poses, k, &again, 0.05), 0);
         }
         assert!(tracker.tracks.len() * 2 > begun, "{} of {begun}", tracker.tracks.len());
     }

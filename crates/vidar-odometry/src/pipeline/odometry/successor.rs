@@ -2,7 +2,6 @@
 //! seconds, and its state then goes on in the same world. It works beside the first one, in slices of work whose results are due at
 //! instants that the recording decides: an image waits for it only where a slice is not done when it is due.
 
-use super::start::initializing;
 use super::{Odometry, Phase, Status};
 use crate::bundle_adjustment::{ImuGain, NewestState, TrackLog};
 use crate::config::OdometryConfig;
@@ -232,10 +231,9 @@ impl Odometry {
             ..self.config.clone()
         };
         let tracker = self.phase.tracker().another();
-        let phase = initializing(&config, self.imu_model.is_none(), &camera, tracker);
-        let fresh =
-            Self::fresh(config, (self.camera_id, camera), self.working.another(), self.imu_model, imu);
-        Self { phase, imu_gain, log: self.log.as_ref().map(|_| TrackLog::of_every_image()), ..fresh }
+        let camera = (self.camera_id, camera);
+        let fresh = Self::fresh(config, tracker, camera, self.working.another(), self.imu_model, imu);
+        Self { imu_gain, log: self.log.as_ref().map(|_| TrackLog::of_every_image()), ..fresh }
     }
 
     /// Begins with a state that is known and the image that it belongs to.
