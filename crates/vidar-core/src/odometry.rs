@@ -135,6 +135,8 @@ pub struct OdometryKeyframe {
     pub scale_std: f64,
     /// Tracking health when it was created.
     pub health: Health,
+    /// `ln` of the focal length in its image over the calibration's: autofocus changes it. Zero where one holds for all images.
+    pub log_focal: f64,
     /// The landmarks it observes.
     pub landmarks: Vec<SparseLandmark>,
 }

@@ -39,6 +39,45 @@ pub struct RowMotion {
     pub readout_secs: f64,
 }
 
+/// How an image differs from what its camera's calibration would show at the instant of its middle row.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct ImageGeometry {
+    /// How the camera moved while the rows were read; `None` for a global shutter, and where it is not known.
+    pub rows: Option<RowMotion>,
+    /// `ln` of the image's focal length over the calibration's: autofocus changes it.
+    pub log_focal: f64,
+}
+
+impl ImageGeometry {
+    /// The pixel at which the calibrated camera would have seen, at one instant, what the image shows at `pixel`; `None` outside the
+    /// camera's domain.
+    pub fn as_calibrated(&self, camera: &CameraModel, pixel: &Pixel) -> Option<Pixel> {
+        let pixel = magnified(camera, pixel, -self.log_focal);
+        match &self.rows {
+            Some(rows) => rows.at_once(camera, &pixel),
+            None => Some(pixel),
+        }
+    }
+
+    /// The pixel at which the image shows what the calibrated camera sees in the direction `ray` at one instant.
+    fn shown(&self, camera: &CameraModel, ray: &Vector3<f64>) -> Option<Pixel> {
+        let pixel = match &self.rows {
+            Some(rows) => rows.in_row(camera, ray)?,
+            None => camera.project(ray)?,
+        };
+        Some(magnified(camera, &pixel, self.log_focal))
+    }
+}
+
+/// Where an image with another focal length shows what the camera's shows at `pixel`.
+fn magnified(camera: &CameraModel, pixel: &Pixel, log_focal: f64) -> Pixel {
+    if log_focal == 0.0 {
+        return *pixel;
+    }
+    let centre = camera.principal_point();
+    centre + (pixel - centre) * log_focal.exp()
+}
+
 impl RowMotion {
     /// The pixel at which an instant would have seen what an image shows at `pixel`; `None` outside the camera's domain.
     pub fn at_once(&self, camera: &CameraModel, pixel: &Pixel) -> Option<Pixel> {
@@ -66,13 +105,12 @@ impl RowMotion {
     }
 }
 
-/// Where the pixels of a view lie in an image that was read row by row, beside where they would lie in one that was
-/// taken at once.
+/// Where the pixels of a view lie in an image, beside where they would lie in one that the calibrated camera had taken at once.
 ///
 /// Positions are exact at the nodes of a grid and bilinear between them: the shift is smooth, and 16 pixels apart the error is below
 /// a hundredth of a pixel at 3 rad/s and 30 ms.
 #[derive(Clone, Debug)]
-pub struct RowShift {
+pub struct ViewShift {
     columns: usize,
     nodes: Vec<[f32; 2]>,
     /// Size of the camera's image.
@@ -84,17 +122,17 @@ const NODE_SPACING: usize = 16;
 /// Rounds in which row and position are found from each other; each lowers the error by the shift per row, a hundredth.
 const ROW_ROUNDS: usize = 3;
 
-impl RowShift {
+impl ViewShift {
     /// The shift of a view of `camera`, which has the pose of the middle row; `None` where it stays below `least_px` everywhere.
     ///
     /// What the camera's translation shifts depends on the depth, which is taken to be the typical one everywhere: at 0.5 m/s and 30 ms
     /// the first row is 7 mm from the middle one, and what is twice as far away as that is shifted by 0.2° too much at 1 m.
-    pub fn new(camera: &CameraModel, view: &Pinhole, motion: &RowMotion, least_px: f64) -> Option<Self> {
+    pub fn new(camera: &CameraModel, view: &Pinhole, image: &ImageGeometry, least_px: f64) -> Option<Self> {
         let (columns, rows) = (view.width.div_ceil(NODE_SPACING) + 1, view.height.div_ceil(NODE_SPACING) + 1);
         let node = |i: usize| {
             let (x, y) = (i % columns * NODE_SPACING, i / columns * NODE_SPACING);
             let ray = view.ray(x as f64, y as f64);
-            let shift = |at_once: Pixel| Some(motion.in_row(camera, &ray)? - at_once);
+            let shift = |at_once: Pixel| Some(image.shown(camera, &ray)? - at_once);
             camera.project(&ray).and_then(shift).unwrap_or_default()
         };
         let nodes: Vec<Vector2<f64>> = (0..columns * rows).map(node).collect();
@@ -175,8 +213,8 @@ impl RemapTable {
         self.apply_shifted(image, None)
     }
 
-    /// As [`RemapTable::apply`], with the positions shifted as the rows of this image were.
-    pub fn apply_shifted(&self, image: &FrameImage, shift: Option<&RowShift>) -> FrameImage {
+    /// As [`RemapTable::apply`], with the positions shifted as this image's are.
+    pub fn apply_shifted(&self, image: &FrameImage, shift: Option<&ViewShift>) -> FrameImage {
         match image {
             FrameImage::Gray8(i) => {
                 FrameImage::Gray8(self.averaged(i, shift, |p| [f32::from(*p)], |[v]| (v + 0.5) as u8))
@@ -233,7 +271,7 @@ impl RemapTable {
     fn averaged<P: Copy + Send + Sync, const C: usize>(
         &self,
         image: &Image<P>,
-        shift: Option<&RowShift>,
+        shift: Option<&ViewShift>,
         load: impl Fn(&P) -> [f32; C] + Sync,
         store: impl Fn([f32; C]) -> P + Sync,
     ) -> Image<P> {

@@ -4,7 +4,7 @@
 
 use nalgebra::{Vector2, Vector3};
 use vidar_core::camera::{DoubleSphere, Equidistant, Fov, ParametricCamera, RadTan};
-use vidar_core::remap::{RemapTable, RowMotion, RowShift, undistorted_view};
+use vidar_core::remap::{ImageGeometry, RemapTable, RowMotion, ViewShift, undistorted_view};
 use vidar_core::{CameraError, CameraModel, FrameImage, Image, LieGroup, Pinhole, So3};
 
 /// Grey level of the world in a unit direction: waves of `wavelength` (rad, in the middle of the view) on the sky.
@@ -250,7 +250,7 @@ fn rows_read_while_the_camera_turned_are_put_where_one_instant_sees_them() {
     for camera in distorted_cameras() {
         let view = undistorted_view(&camera, camera.width(), camera.height()).unwrap();
         let table = RemapTable::new(&camera, &view);
-        let shift = RowShift::new(&camera, &view, &shutter, 0.25).unwrap();
+        let shift = ViewShift::new(&camera, &view, &by_rows(shutter), 0.25).unwrap();
         let wavelength = 90.0 / camera.intrinsics().fx;
         let rolling = photograph_turning(&camera, &shutter, wavelength);
         let expected = draw(&CameraModel::Pinhole(view), wavelength, 1);
@@ -275,10 +275,10 @@ fn what_a_slow_turn_shifts_is_left_where_it_is() {
     let camera = distorted_cameras().remove(0);
     let view = undistorted_view(&camera, camera.width(), camera.height()).unwrap();
     let about_y = |rate: f64| turning(Vector3::new(0.0, rate, 0.0), 0.03);
-    assert!(RowShift::new(&camera, &view, &about_y(0.02), 0.25).is_none());
-    assert!(RowShift::new(&camera, &view, &about_y(0.2), 0.25).is_some());
+    assert!(ViewShift::new(&camera, &view, &by_rows(about_y(0.02)), 0.25).is_none());
+    assert!(ViewShift::new(&camera, &view, &by_rows(about_y(0.2)), 0.25).is_some());
     let global = turning(Vector3::new(1.0, 1.0, 1.0), 0.0);
-    assert!(RowShift::new(&camera, &view, &global, 0.25).is_none());
+    assert!(ViewShift::new(&camera, &view, &by_rows(global), 0.25).is_none());
 }
 
 #[test]
@@ -317,4 +317,36 @@ fn a_point_at_the_typical_depth_is_where_one_instant_sees_it() {
 
 fn turning(turn_rad_per_s: Vector3<f64>, readout_secs: f64) -> RowMotion {
     RowMotion { turn_rad_per_s, velocity_m_per_s: Vector3::zeros(), inverse_depth: 0.0, readout_secs }
+}
+
+fn by_rows(rows: RowMotion) -> ImageGeometry {
+    ImageGeometry { rows: Some(rows), log_focal: 0.0 }
+}
+
+#[test]
+fn an_image_with_a_longer_focal_length_is_put_where_the_calibrated_camera_sees_it() {
+    for log_focal in [-0.015, 0.02] {
+        for camera in distorted_cameras() {
+            let mut parameters = camera.parameters();
+            parameters[..2].iter_mut().for_each(|f| *f *= f64::exp(log_focal));
+            let longer = camera.with_parameters(&parameters).unwrap();
+            let image = ImageGeometry { rows: None, log_focal };
+            let view = undistorted_view(&camera, camera.width(), camera.height()).unwrap();
+            let wavelength = 90.0 / camera.intrinsics().fx;
+            let taken = FrameImage::Gray8(draw(&longer, wavelength, 1).map(|v| v.round() as u8));
+            let expected = draw(&CameraModel::Pinhole(view), wavelength, 1);
+            let shift = ViewShift::new(&camera, &view, &image, 0.25).unwrap();
+            let found = RemapTable::new(&camera, &view).apply_shifted(&taken, Some(&shift)).to_gray_f32();
+            // Without what the longer lens does not see at the border.
+            for y in (view.height / 6..view.height * 5 / 6).step_by(7) {
+                for x in (view.width / 6..view.width * 5 / 6).step_by(7) {
+                    let off = (f64::from(found[(x, y)]) - expected[(x, y)]).abs();
+                    assert!(off < 6.0, "{} ({x}, {y}): {off} grey levels", camera.name());
+                }
+            }
+            let ray = Vector3::new(0.2, -0.1, 1.0);
+            let back = image.as_calibrated(&camera, &longer.project(&ray).unwrap()).unwrap();
+            assert!((back - camera.project(&ray).unwrap()).norm() < 1e-9, "{}", camera.name());
+        }
+    }
 }

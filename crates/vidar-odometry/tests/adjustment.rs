@@ -10,7 +10,9 @@ use vidar_core::{
     BodyFrame, ImuNoise, LieGroup, NavState, OdometryKeyframe, Se3, So3, StampedPose, Trajectory,
 };
 use vidar_eval::{TrajectoryEvalConfig, evaluate_trajectory};
-use vidar_odometry::bundle_adjustment::{Adjusted, AdjustmentError, AdjustmentFinding, CalibrationSigmas};
+use vidar_odometry::bundle_adjustment::{
+    Adjusted, AdjustmentError, AdjustmentFinding, CalibrationSigmas, Focus,
+};
 use vidar_odometry::simulate::{
     AdjustSettings, Course, CourseKind, Logged, Random, Simulation, SimulationConfig,
 };
@@ -26,6 +28,18 @@ const CONSUMER: ImuNoise = ImuNoise {
 
 /// A flight of `secs` at `speed`, with gains that are off by `gain` (standard deviation, relative).
 fn logged(seed: u64, secs: f64, speed: f64, gain: f64, settings: &AdjustSettings) -> Logged {
+    logged_with(seed, secs, speed, gain, [0.0; 2], settings)
+}
+
+/// The same with a focal length that is off by a mean and an amplitude.
+fn logged_with(
+    seed: u64,
+    secs: f64,
+    speed: f64,
+    gain: f64,
+    log_focal: [f64; 2],
+    settings: &AdjustSettings,
+) -> Logged {
     let mut random = Random::new(900 + seed);
     let mut scale = || std::array::from_fn(|_| 1.0 + gain * random.normal());
     let course = Course { kind: CourseKind::Eight, secs: secs + 1.0, speed, phase: 0.37 * seed as f64 };
@@ -36,6 +50,7 @@ fn logged(seed: u64, secs: f64, speed: f64, gain: f64, settings: &AdjustSettings
         noise: CONSUMER,
         gyro_scale: scale(),
         accel_scale: scale(),
+        log_focal,
         ..SimulationConfig::default()
     };
     Logged::new(&Simulation::new(&course, 0.0, secs, &config), 2, seed, settings)
@@ -81,6 +96,56 @@ fn a_calibration_that_is_right_is_not_contradicted() {
         let adjusted = adjust(&logged(seed, 8.0, 1.0, 0.005, &settings()), &settings());
         assert!(adjusted.findings.is_empty(), "flight {seed}: {:?}", adjusted.findings);
         assert!(adjusted.is_consistent(), "{:?}", adjusted.report);
+    }
+}
+
+/// What the adjustment says of the focal length, where it doubts it.
+fn focus(adjusted: &Adjusted) -> Option<Focus> {
+    adjusted.findings.iter().find_map(|f| match f {
+        AdjustmentFinding::FocalLength(focus) => Some(*focus),
+        _ => None,
+    })
+}
+
+#[test]
+fn a_focal_length_that_changes_is_found_in_every_image() {
+    let (mut ln_s_nees, flights) = (0.0, 4);
+    for seed in 0..flights {
+        let flight = logged_with(seed, 12.0, 1.0, 0.0, [0.0, 0.015], &settings());
+        let adjusted = adjust(&flight, &settings());
+        let found = focus(&adjusted).unwrap_or_else(|| panic!("flight {seed}: {:?}", adjusted.findings));
+        // A sine has 0.7 of its amplitude.
+        assert!(
+            (found.spread - 0.0106).abs() < 0.001 && found.mean.abs() < 0.003,
+            "flight {seed}: {found:?}"
+        );
+        let begin = flight.truth[0].1;
+        let config = SimulationConfig { log_focal: [0.0, 0.015], ..SimulationConfig::default() };
+        for keyframe in &adjusted.keyframes {
+            let at = (flight.truth[keyframe.frame_id.index()].1 - begin).as_secs_f64();
+            let error = found.mean + keyframe.log_focal - config.log_focal_at(at);
+            assert!(error.abs() < 0.004, "flight {seed}, {at} s: {error}");
+        }
+        ln_s_nees += (flight.log_scale_error(&adjusted) / adjusted.scale_std).powi(2);
+        assert!(ate_m(&flight, &adjusted) < 0.03, "flight {seed}: {} m", ate_m(&flight, &adjusted));
+    }
+    // χ² of four at 99.9 %.
+    assert!(ln_s_nees < 18.5, "{ln_s_nees} of {flights}");
+}
+
+#[test]
+fn a_focal_length_that_is_given_wrong_is_found_and_told() {
+    for (seed, off) in [(1, 0.02), (2, -0.015)] {
+        let flight = logged_with(seed, 10.0, 1.0, 0.0, [off, 0.0], &settings());
+        let adjusted = adjust(&flight, &settings());
+        let found = focus(&adjusted).unwrap_or_else(|| panic!("flight {seed}: {:?}", adjusted.findings));
+        assert!((found.mean - off).abs() < 4.0 * found.mean_sigma.max(2e-4), "flight {seed}: {found:?}");
+        assert!(found.spread < 0.2 * off.abs(), "flight {seed}: {found:?}");
+        let [given, corrected] =
+            [&Simulation::camera(), &adjusted.calibration.camera].map(|c| c.parameters()[0]);
+        assert!(((corrected / given).ln() - found.mean).abs() < 1e-9);
+        let error = flight.log_scale_error(&adjusted);
+        assert!(error.abs() < 3.0 * adjusted.scale_std, "ln s {error} at σ {}", adjusted.scale_std);
     }
 }
 

@@ -134,6 +134,14 @@ impl CameraModel {
         each_model!(self, m => m.parameters().to_vec())
     }
 
+    /// Where the optical axis meets the image.
+    pub fn principal_point(&self) -> Pixel {
+        each_model!(self, m => {
+            let parameters = m.parameters();
+            Pixel::new(parameters[2], parameters[3])
+        })
+    }
+
     /// Names of the intrinsic parameters, fx, fy, cx, cy first.
     pub fn parameter_names(&self) -> &'static [&'static str] {
         match self {

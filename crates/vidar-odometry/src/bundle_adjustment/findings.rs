@@ -1,6 +1,7 @@
 //! What was given of the camera's place and the recording contradicts.
 
 use super::envelope::Envelope;
+use super::focus::Focus;
 use super::observation::{POSITION, ROTATION};
 use super::problem::Problem;
 use super::sigmas::CalibrationSigmas;
@@ -39,6 +40,8 @@ pub enum AdjustmentFinding {
         /// Standard deviation per axis, rad.
         sigma_rad: Vector3<f64>,
     },
+    /// The focal length differs from what was given, and from image to image.
+    FocalLength(Focus),
 }
 
 /// How far rotation and position are from what the prior takes them for, and how well the recording alone knows them.
@@ -101,9 +104,11 @@ pub(super) fn of(
     covariance: &Envelope,
     given: &Se3,
     sigmas: &CalibrationSigmas,
+    focus: Option<Focus>,
 ) -> Vec<AdjustmentFinding> {
     let found = &problem.calibration.body_from_camera;
-    let mut findings = Vec::new();
+    let mut findings: Vec<AdjustmentFinding> =
+        focus.map(AdjustmentFinding::FocalLength).into_iter().collect();
     let contradicts = |by: &Vector3<f64>, joint: &Matrix3<f64>, least: f64| {
         let chi2 = joint.try_inverse().map_or(0.0, |inverse| by.dot(&(inverse * by)));
         chi2 > CHI2_3_SIGMAS && by.norm() > least

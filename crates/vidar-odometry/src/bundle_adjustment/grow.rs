@@ -146,7 +146,11 @@ impl Grown<'_> {
             states: self.guess.states[from..until].to_vec(),
         };
         let calibration = &self.work.calibration;
-        let prior = CalibrationPrior { sigmas: vec![0.0; calibration.dim()], mean: calibration.clone() };
+        let prior = CalibrationPrior {
+            sigmas: vec![0.0; calibration.dim()],
+            mean: calibration.clone(),
+            focus: self.work.prior.focus,
+        };
         let Ok(mut problem) = initial::build(self.recording, calibration, prior, &part, held - from) else {
             return Ok(0.0);
         };

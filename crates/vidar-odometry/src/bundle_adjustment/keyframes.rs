@@ -1,7 +1,6 @@
 //! The adjusted images as keyframes: pose, covariance to the one before, and landmarks with their depth.
 
 use super::observation::{self, MovingBody};
-use super::problem::FRAME_DIM;
 use super::{Measurements, Solution};
 use crate::backend::d_relative_d_poses;
 use crate::pipeline::public_state;
@@ -38,6 +37,7 @@ pub(super) fn of(recording: &Measurements<'_>, solution: &Solution, scale_std: f
             gravity_in_world: recording.model.gravity(),
             scale_std,
             health,
+            log_focal: frame.body.log_focal,
             landmarks: std::mem::take(&mut landmarks[k]),
         });
     }
@@ -57,6 +57,7 @@ fn seen_landmarks(solution: &Solution) -> Vec<Vec<SparseLandmark>> {
             let ray = observation::from_camera(&seen.landmark, &camera.translation);
             let in_camera = camera.rotation.inverse().act(&ray) / seen.landmark.inverse_distance;
             let pixel = problem.calibration.camera.project(&in_camera);
+            let pixel = pixel.map(|pixel| problem.calibration.magnified(&pixel, body.log_focal));
             let (Some(pixel), true) = (pixel, in_camera.z > 1e-3 && relative.is_finite()) else { continue };
             all[observation.frame].push(SparseLandmark {
                 id: LandmarkId(id as u32),
@@ -72,7 +73,7 @@ fn seen_landmarks(solution: &Solution) -> Vec<Vec<SparseLandmark>> {
 /// Covariance of `a_from_b · exp(δ)` between the bodies of two neighbouring states.
 fn relative_covariance(solution: &Solution, a: usize, b: usize) -> Matrix6<f64> {
     let Solution { problem, covariance, .. } = solution;
-    let unknown = |k: usize| FRAME_DIM * if k < 6 { a } else { b } + k % 6;
+    let unknown = |k: usize| problem.offset(if k < 6 { a } else { b }) + k % 6;
     let joint =
         SMatrix::<f64, 12, 12>::from_fn(|row, column| covariance.entry(unknown(row), unknown(column)));
     let pose = |k: usize| problem.frames[k].body.state.world_from_body;

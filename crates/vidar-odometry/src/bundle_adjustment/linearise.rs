@@ -1,10 +1,11 @@
 //! Cost and normal equations: inertial factors, reprojections with the landmarks eliminated, priors.
 
 use super::envelope::Envelope;
+use super::focus;
 use super::inertial::{GAIN_DIM, InertialJacobians};
 use super::observation::{self, Landmark, Linearised, STATE_DIM};
 use super::problem::{FRAME_DIM, ObservedLandmark, Problem};
-use crate::backend::{GaugePriorSigmas, gauge_prior_at, product};
+use crate::backend::{GaugePriorSigmas, dot, gauge_prior_at, product};
 use crate::imu::{Matrix15, Vector15};
 use nalgebra::{Matrix3, SMatrix, Vector2, Vector3};
 use vidar_core::simd::kernel;
@@ -41,8 +42,10 @@ pub(super) struct LandmarkBlock {
     inverse: Option<Matrix3<f64>>,
     gradient: Vector3<f64>,
     /// Of each observation.
-    by_state: Vec<(usize, ByState)>,
-    by_calibration: Vec<Vector3<f64>>,
+    pub(super) by_state: Vec<(usize, ByState)>,
+    /// Of each observation with the focal length of its image; none where that is held.
+    pub(super) by_focal: Vec<Vector3<f64>>,
+    pub(super) by_calibration: Vec<Vector3<f64>>,
 }
 
 /// The reduced normal equations `H x = −g` of states and calibration.
@@ -58,6 +61,12 @@ impl System {
     pub(super) fn new(problem: &Problem) -> Self {
         let h = problem.envelope();
         Self { factor: h.clone(), h, gradient: vec![0.0; problem.dim()], landmarks: Vec::new() }
+    }
+
+    /// Standard deviation of a linear function of the unknowns, by the factor.
+    pub(super) fn sigma_of(&self, mut slope: Vec<f64>) -> f64 {
+        self.factor.forward(&mut slope);
+        dot(&slope, &slope).sqrt()
     }
 }
 
@@ -93,6 +102,7 @@ pub(super) fn cost_with(problem: &Problem, visual: f64) -> Cost {
         cost.inertial += 0.5 * inertial_error(problem, k).map_or(0.0, |r| r.norm_squared());
     }
     let (gauge, _) = gauge_error(problem);
+    cost.priors += focus::cost(problem);
     cost.priors += 0.5 * gauge.norm_squared();
     for (value, sigma) in problem.calibration.minus(&problem.prior.mean).iter().zip(&problem.prior.sigmas) {
         if *sigma > 0.0 {
@@ -154,11 +164,12 @@ fn gauge_error(problem: &Problem) -> (Vector15, Matrix15) {
 
 fn add_priors(problem: &Problem, system: &mut System) {
     let (residual, jacobian) = gauge_error(problem);
-    let at = FRAME_DIM * problem.gauge.0;
+    let at = problem.offset(problem.gauge.0);
     add_block(system, at, at, &(jacobian.transpose() * jacobian));
     add_gradient(system, at, &(jacobian.transpose() * residual));
     let offset = problem.calibration_offset();
     let moved = problem.calibration.minus(&problem.prior.mean);
+    focus::add_prior(problem, system);
     for (k, index) in problem.active.iter().enumerate() {
         let weight = problem.prior.sigmas[*index].powi(-2);
         system.h.add(offset + k, offset + k, weight);
@@ -170,7 +181,7 @@ fn add_inertial(problem: &Problem, k: usize, system: &mut System) {
     let Some(InertialJacobians { residual, by_i, by_j, by_gain }) = inertial_jacobians(problem, k) else {
         return;
     };
-    let (at_i, at_j) = (FRAME_DIM * (k - 1), FRAME_DIM * k);
+    let (at_i, at_j) = (problem.offset(k - 1), problem.offset(k));
     add_block(system, at_i, at_i, &(by_i.transpose() * by_i));
     add_block(system, at_j, at_j, &(by_j.transpose() * by_j));
     let across = by_j.transpose() * by_i;
@@ -225,6 +236,7 @@ fn add_landmark(
     let calibrations = problem.active_camera();
     let offset = problem.calibration_offset();
     block.by_state.clear();
+    block.by_focal.clear();
     block.by_calibration.clear();
     block.by_calibration.resize(calibrations, Vector3::zeros());
     block.gradient = Vector3::zeros();
@@ -239,18 +251,33 @@ fn add_landmark(
         let root_weight = KERNEL.weight(residual.norm_squared()).sqrt();
         let whitening = measured.whitening * root_weight;
         let residual = residual * root_weight;
+        let by_log_focal = at.by_log_focal(&problem.calibration);
         let Linearised { by_state, by_landmark, by_calibration, .. } = at;
         let (by_state, by_landmark) = (whitening * by_state, whitening * by_landmark);
         own += by_landmark.transpose() * by_landmark;
         block.gradient += by_landmark.transpose() * residual;
         block.by_state.push((measured.frame, by_state.transpose() * by_landmark));
-        let from = FRAME_DIM * measured.frame;
+        let from = problem.offset(measured.frame);
         let square = by_state.transpose() * by_state;
         let gradient = by_state.transpose() * residual;
         for row in 0..STATE_DIM {
             system.gradient[from + row] += gradient[row];
             for (column, sum) in system.h.part_mut(from + row, from, row + 1).iter_mut().enumerate() {
                 *sum += square[(row, column)];
+            }
+        }
+        if problem.prior.focus.is_some() {
+            let by_focal = whitening * by_log_focal;
+            block.by_focal.push(by_landmark.transpose() * by_focal);
+            let row = from + FRAME_DIM;
+            system.gradient[row] += by_focal.dot(&residual);
+            let with_state = by_state.transpose() * by_focal;
+            for (sum, value) in system.h.part_mut(row, from, STATE_DIM).iter_mut().zip(with_state.iter()) {
+                *sum += value;
+            }
+            system.h.add(row, row, by_focal.norm_squared());
+            for (k, index) in problem.active[..calibrations].iter().enumerate() {
+                system.h.add(offset + k, row, by_focal.dot(&(whitening * by_calibration[*index])));
             }
         }
         for (k, index) in problem.active[..calibrations].iter().enumerate() {
@@ -284,7 +311,7 @@ fn eliminate(problem: &Problem, block: &LandmarkBlock, inverse: &Matrix3<f64>, s
     let offset = problem.calibration_offset();
     let own_step = inverse * block.gradient;
     for (at, (frame, by_state)) in block.by_state.iter().enumerate() {
-        let from = FRAME_DIM * frame;
+        let from = problem.offset(*frame);
         let weighted = product(by_state, inverse);
         let gradient = by_state * own_step;
         for row in 0..STATE_DIM {
@@ -293,7 +320,9 @@ fn eliminate(problem: &Problem, block: &LandmarkBlock, inverse: &Matrix3<f64>, s
         for (other_frame, other) in &block.by_state[..=at] {
             match other_frame == frame {
                 true => subtract_triangle(&mut system.h, from, &weighted, other),
-                false => subtract_product(&mut system.h, from, FRAME_DIM * other_frame, &weighted, other),
+                false => {
+                    subtract_product(&mut system.h, from, problem.offset(*other_frame), &weighted, other)
+                }
             }
         }
         for (k, by_calibration) in block.by_calibration.iter().enumerate() {
@@ -303,6 +332,7 @@ fn eliminate(problem: &Problem, block: &LandmarkBlock, inverse: &Matrix3<f64>, s
             }
         }
     }
+    focus::eliminate(problem, block, inverse, &own_step, system);
     for (k, by_calibration) in block.by_calibration.iter().enumerate() {
         system.gradient[offset + k] -= by_calibration.dot(&own_step);
         let weighted = inverse * by_calibration;
@@ -344,10 +374,18 @@ impl LandmarkBlock {
     }
 
     /// The landmark's step that belongs to a step of states and calibration.
-    pub(super) fn step(&self, step: &[f64], calibration_offset: usize) -> Option<Vector3<f64>> {
+    pub(super) fn step(
+        &self,
+        step: &[f64],
+        frame_dim: usize,
+        calibration_offset: usize,
+    ) -> Option<Vector3<f64>> {
         let mut gradient = self.gradient;
-        for (frame, by_state) in &self.by_state {
-            let from = FRAME_DIM * frame;
+        for (at, (frame, by_state)) in self.by_state.iter().enumerate() {
+            let from = frame_dim * frame;
+            if let Some(by_focal) = self.by_focal.get(at) {
+                gradient += by_focal * step[from + FRAME_DIM];
+            }
             let moved = SMatrix::<f64, STATE_DIM, 1>::from_column_slice(&step[from..from + STATE_DIM]);
             gradient += by_state.transpose() * moved;
         }

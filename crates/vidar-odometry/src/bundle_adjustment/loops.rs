@@ -89,7 +89,7 @@ pub(super) fn close(
         // Matches are found anew at the better solution, so that the first round's do not count twice.
         let mut next = problem.clone();
         for (state, place) in next.frames.iter_mut().zip(&constrained.frames) {
-            state.body.state = place.body.state;
+            state.body = place.body;
         }
         next.calibration = constrained.calibration.clone();
         for (seen, other) in next.landmarks.iter_mut().zip(&constrained.landmarks) {

@@ -12,6 +12,7 @@
 
 mod envelope;
 mod findings;
+mod focus;
 mod grow;
 mod inertial;
 mod initial;
@@ -32,6 +33,7 @@ mod single_landmark;
 mod thin;
 
 pub use findings::AdjustmentFinding;
+pub use focus::Focus;
 pub(crate) use inertial::ImuGain;
 pub use log::TrackLog;
 pub(crate) use log::{LoggedState, TrackKey};
@@ -42,6 +44,7 @@ pub use sigmas::CalibrationSigmas;
 
 use crate::imu::{Bias, ImuBuffer, ImuModel, StepNoise};
 use envelope::Envelope;
+use focus::FocusPrior;
 use initial::Guess;
 use linearise::System;
 use loops::Closed;
@@ -77,6 +80,8 @@ struct Solution {
     system: System,
     /// Covariance within the system's envelope.
     covariance: Envelope,
+    /// Where every image has a focal length of its own.
+    focus: Option<Focus>,
 }
 
 /// Why a recording cannot be adjusted.
@@ -144,8 +149,9 @@ pub fn adjust(
     watch.stage(AdjustmentStage::Together, work.guess.images.len());
     let mut passed = work.pass(&recording, &mut watch)?;
     for _ in 1..PASSES {
-        let contradicted = work.doubt_given(&passed.problem)?;
-        if passed.is_settled && !contradicted {
+        // One focal length for all where it changes puts the camera elsewhere: the place is not judged by that.
+        let is_doubted = work.doubt_focus(&passed.problem) || work.doubt_given(&passed.problem)?;
+        if passed.is_settled && !is_doubted {
             break;
         }
         passed = work.pass(&recording, &mut watch)?;
@@ -155,9 +161,10 @@ pub fn adjust(
     let model = weigh(input, &mut passed, &mut watch)?;
     watch.stage(AdjustmentStage::Loops, work.guess.images.len());
     let closed = loops::close(&mut passed.problem, &mut passed.report, log, &passed.images, &mut watch)?;
-    let Passed { problem, images, report, clock_offset, .. } = passed;
+    let Passed { mut problem, images, report, clock_offset, .. } = passed;
     let system = optimise::solution(&problem).ok_or(AdjustmentError::Undetermined)?;
     let covariance = system.factor.inverse(problem.calibration_offset());
+    let focus = focus::centre(&mut problem, &system);
     let solution = Solution {
         segment,
         problem,
@@ -169,6 +176,7 @@ pub fn adjust(
         model,
         system,
         covariance,
+        focus,
     };
     let corrected = imu.multiplied(&solution.problem.calibration.gain);
     let recording = Measurements { imu: &corrected, model: &solution.model, ..recording };
@@ -236,7 +244,11 @@ impl Work {
             readout_secs: input.readout_secs,
             gain: ImuGain::default(),
         };
-        let prior = CalibrationPrior { sigmas: input.sigmas.of(&calibration), mean: calibration.clone() };
+        let prior = CalibrationPrior {
+            sigmas: input.sigmas.of(&calibration),
+            mean: calibration.clone(),
+            focus: None,
+        };
         Self { calibration, prior, clock_offset: input.camera.time_offset, guess }
     }
 
@@ -266,6 +278,15 @@ impl Work {
             self.prior.mean.clock_secs -= clock_secs;
         }
         Ok(Passed { problem, images, report, clock_offset, is_settled })
+    }
+
+    /// Where the recording shows that the focal length changes, every image gets its own; whether that is new.
+    fn doubt_focus(&mut self, problem: &Problem) -> bool {
+        let is_new = self.prior.focus.is_none() && focus::changes(problem);
+        if is_new {
+            self.prior.focus = Some(FocusPrior::AUTOFOCUS);
+        }
+        is_new
     }
 
     /// Where the recording contradicts the place of the camera that was given, its prior is widened, so that it no longer pulls;

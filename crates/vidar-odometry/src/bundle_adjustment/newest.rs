@@ -4,7 +4,7 @@ use super::inertial::ImuGain;
 use super::initial::onto;
 use super::log::{LoggedState, TrackLog};
 use super::optimise::OptimiseReport;
-use super::problem::{FRAME_DIM, Problem};
+use super::problem::Problem;
 use super::progress::Watch;
 use super::{AdjustmentError, AdjustmentInput, Measurements, PASSES, Work};
 use super::{grow, initial, optimise, result};
@@ -69,7 +69,7 @@ pub(crate) fn newest_state(input: &AdjustmentInput<'_>) -> Result<NewestState, A
         passed = work.pass(&recording, &mut watch)?;
     }
     for _ in 1..PASSES {
-        if passed.is_settled {
+        if passed.is_settled && !work.doubt_focus(&passed.problem) {
             break;
         }
         passed = work.pass(&recording, &mut watch)?;
@@ -82,7 +82,7 @@ pub(crate) fn newest_state(input: &AdjustmentInput<'_>) -> Result<NewestState, A
     let system = optimise::solution(problem).ok_or(AdjustmentError::Undetermined)?;
     let covariance = system.factor.inverse(problem.calibration_offset());
     let newest = problem.frames.len() - 1;
-    let at = FRAME_DIM * newest;
+    let at = problem.offset(newest);
     let state = problem.frames[newest].body.state;
     let time_offset = passed.clock_offset + Duration::from_secs_f64(problem.calibration.clock_secs);
     let with_gains =

@@ -57,8 +57,10 @@ pub(super) fn components(problem: &Problem, covariance: &Envelope) -> Components
         j.fixed_view_mut::<15, 15>(0, 0).copy_from(&at.by_i);
         j.fixed_view_mut::<15, 15>(0, 15).copy_from(&at.by_j);
         j.fixed_view_mut::<15, GAIN_DIM>(0, 30).copy_from(&at.by_gain);
-        let from = FRAME_DIM * (k - 1);
-        let unknown = |a: usize| if a < 30 { Some(from + a) } else { gains[a - 30] };
+        let at_states = [problem.offset(k - 1), problem.offset(k)];
+        let unknown = |a: usize| {
+            if a < 30 { Some(at_states[a / FRAME_DIM] + a % FRAME_DIM) } else { gains[a - 30] }
+        };
         let joint = SMatrix::<f64, UNKNOWNS, UNKNOWNS>::from_fn(|a, b| {
             unknown(a).zip(unknown(b)).map_or(0.0, |(a, b)| covariance.entry(a, b))
         });

@@ -72,6 +72,8 @@ pub(super) struct MovingBody {
     pub(super) force: Vector3<f64>,
     /// Gravity in the world, m/s².
     pub(super) gravity: Vector3<f64>,
+    /// `ln` of the focal length in the state's image over the calibration's (see [`super::focus`]).
+    pub(super) log_focal: f64,
 }
 
 impl MovingBody {
@@ -114,6 +116,15 @@ impl SensorCalibration {
     /// How much later than its state's instant an image's row was exposed, s.
     pub(super) fn row_secs(&self, row: f64) -> f64 {
         self.clock_secs + self.row_share(row) * self.readout_secs
+    }
+
+    /// Where an image with another focal length shows what the calibration's shows at `pixel`.
+    pub(super) fn magnified(&self, pixel: &Pixel, log_focal: f64) -> Pixel {
+        if log_focal == 0.0 {
+            return *pixel;
+        }
+        let centre = self.camera.principal_point();
+        centre + (pixel - centre) * log_focal.exp()
     }
 
     /// Unknowns.
@@ -159,6 +170,13 @@ pub(super) struct Linearised {
     pub(super) by_calibration: Vec<Vector2<f64>>,
 }
 
+impl Linearised {
+    /// Derivative by `ln` of the image's focal length.
+    pub(super) fn by_log_focal(&self, calibration: &SensorCalibration) -> Vector2<f64> {
+        self.pixel - calibration.camera.principal_point()
+    }
+}
+
 /// Pose of the camera while the row of `measured` is exposed.
 pub(super) fn camera_pose(body: &MovingBody, calibration: &SensorCalibration, measured: &Pixel) -> Se3 {
     body.pose_after(calibration.row_secs(measured.y)) * calibration.body_from_camera
@@ -172,7 +190,8 @@ pub(super) fn project(
     measured: &Pixel,
 ) -> Option<Pixel> {
     let camera = camera_pose(body, calibration, measured);
-    calibration.camera.project(&camera.rotation.inverse().act(&from_camera(landmark, &camera.translation)))
+    let ray = camera.rotation.inverse().act(&from_camera(landmark, &camera.translation));
+    Some(calibration.magnified(&calibration.camera.project(&ray)?, body.log_focal))
 }
 
 /// Direction from a camera at `place` to the landmark, world axes, scaled by the inverse distance from its origin.
@@ -196,8 +215,15 @@ pub(super) fn linearise(
     let camera_from_world: Matrix3<f64> = camera.rotation.matrix().transpose();
     let camera_from_body: Matrix3<f64> = calibration.body_from_camera.rotation.matrix().transpose();
     let ray = camera_from_world * from_camera(landmark, &camera.translation);
-    let (pixel, parameters) = calibration.camera.project_with_parameter_jacobian(&ray)?;
+    let (pixel, mut parameters) = calibration.camera.project_with_parameter_jacobian(&ray)?;
     let (_, by_ray) = calibration.camera.project_with_jacobian(&ray)?;
+    let (pixel, factor) = (calibration.magnified(&pixel, body.log_focal), body.log_focal.exp());
+    let by_ray = by_ray * factor;
+    parameters *= factor;
+    for axis in 0..2 {
+        // The principal point is the centre of the magnification, too.
+        parameters[(axis, 2 + axis)] += 1.0 - factor;
+    }
 
     // The landmark seen from the body's place while the row is exposed, in the axes of the state's body.
     let from_body =
@@ -249,6 +275,7 @@ pub(super) mod tests {
             gyro_change: Vector3::new(3.0, 5.0, -4.0),
             force: Vector3::new(0.5, 9.6, -1.0),
             gravity: Vector3::new(0.0, 0.0, -9.81),
+            log_focal: 0.01,
         };
         let pinhole = Pinhole::new(420.0, 424.0, 317.0, 243.0, 640, 480).unwrap();
         let calibration = SensorCalibration {
@@ -263,7 +290,8 @@ pub(super) mod tests {
         };
         let measured = Pixel::new(400.0, 100.0);
         let camera = camera_pose(&body, &calibration, &measured);
-        let bearing = calibration.camera.unproject(&Pixel::new(410.0, 120.0)).unwrap();
+        let seen = calibration.magnified(&Pixel::new(410.0, 120.0), -body.log_focal);
+        let bearing = calibration.camera.unproject(&seen).unwrap();
         // Counted from somewhere else than this camera.
         let origin = camera.translation + Vector3::new(0.3, 0.2, -0.1);
         let point = camera.act(&(bearing * 2.5));
@@ -315,6 +343,15 @@ pub(super) mod tests {
             let minus = project(&body, &landmark.plus(&-step), &calibration, &measured);
             check("landmark", plus, minus, h, at.by_landmark.column(k).into_owned());
         }
+        let magnified = |by: f64| {
+            project(
+                &MovingBody { log_focal: body.log_focal + by, ..body },
+                &landmark,
+                &calibration,
+                &measured,
+            )
+        };
+        check("focal length", magnified(h), magnified(-h), h, at.by_log_focal(&calibration));
         for k in 0..calibration.dim() - GAIN_DIM {
             let plus = project(&body, &landmark, &perturbed(&calibration, k, h), &measured);
             let minus = project(&body, &landmark, &perturbed(&calibration, k, -h), &measured);

@@ -182,6 +182,7 @@ fn follow(problem: &mut Problem) {
 #[derive(Default)]
 struct Values {
     states: Vec<NavState>,
+    log_focals: Vec<f64>,
     landmarks: Vec<Landmark>,
     /// Cost of each landmark.
     costs: Vec<f64>,
@@ -192,6 +193,8 @@ impl Values {
     fn keep(&mut self, problem: &Problem) {
         self.states.clear();
         self.states.extend(problem.frames.iter().map(|f| f.body.state));
+        self.log_focals.clear();
+        self.log_focals.extend(problem.frames.iter().map(|f| f.body.log_focal));
         self.landmarks.clear();
         self.landmarks.extend(problem.landmarks.iter().map(|l| l.landmark));
         self.costs.clear();
@@ -214,6 +217,11 @@ impl Values {
 
     fn restore(&self, problem: &mut Problem) {
         problem.frames.iter_mut().zip(&self.states).for_each(|(f, state)| f.body.state = *state);
+        problem
+            .frames
+            .iter_mut()
+            .zip(&self.log_focals)
+            .for_each(|(f, log_focal)| f.body.log_focal = *log_focal);
         problem.landmarks.iter_mut().zip(&self.landmarks).for_each(|(l, landmark)| l.landmark = *landmark);
         if let Some(calibration) = &self.calibration {
             problem.calibration.clone_from(calibration);
@@ -223,19 +231,20 @@ impl Values {
 
 /// Moves all unknowns by a step; `None` where that gives values that are not finite or no valid camera.
 fn advance(problem: &mut Problem, system: &System, step: &[f64]) -> Option<ScaleStep> {
-    let offset = problem.calibration_offset();
-    let calibration = problem.calibration_plus(&step[offset..])?;
+    let calibration = problem.calibration_plus(&step[problem.calibration_offset()..])?;
     if step.iter().any(|v| !v.is_finite()) {
         return None;
     }
     let scale = ScaleStep::of(problem, step);
     problem.calibration = calibration;
-    for (k, frame) in problem.frames.iter_mut().enumerate() {
-        let delta = Vector15::from_column_slice(&step[FRAME_DIM * k..FRAME_DIM * (k + 1)]);
-        frame.body.state = scale.state(&frame.body.state, &delta);
+    let (dim, offset) = (problem.frame_dim(), problem.calibration_offset());
+    for (frame, step) in problem.frames.iter_mut().zip(step.chunks_exact(dim)) {
+        let (delta, log_focal) = step.split_at(FRAME_DIM);
+        frame.body.state = scale.state(&frame.body.state, &Vector15::from_column_slice(delta));
+        frame.body.log_focal += log_focal.iter().sum::<f64>();
     }
     for (seen, block) in problem.landmarks.iter_mut().zip(&system.landmarks) {
-        let step: Vector3<f64> = block.step(step, offset).unwrap_or_default();
+        let step: Vector3<f64> = block.step(step, dim, offset).unwrap_or_default();
         seen.landmark = scale.landmark(&seen.landmark, &step);
     }
     Some(scale)

@@ -1,6 +1,7 @@
 //! The unknowns of the adjustment and what was measured of them.
 
 use super::envelope::Envelope;
+use super::focus::FocusPrior;
 use super::inertial::{GAIN_DIM, ImuGain, InertialFactor};
 use super::observation::{Landmark, MovingBody, STATE_DIM, SensorCalibration};
 use crate::imu::{ImuBuffer, ImuModel, NavState};
@@ -43,6 +44,8 @@ pub(super) struct CalibrationPrior {
     pub(super) mean: SensorCalibration,
     /// In the order of [`super::observation::Linearised::by_calibration`].
     pub(super) sigmas: Vec<f64>,
+    /// Whether every image has a focal length of its own.
+    pub(super) focus: Option<FocusPrior>,
 }
 
 /// States, landmarks and calibration, with all measurements.
@@ -61,12 +64,22 @@ pub(super) struct Problem {
 impl Problem {
     /// Unknowns of the reduced system: states, then calibration.
     pub(super) fn dim(&self) -> usize {
-        FRAME_DIM * self.frames.len() + self.active.len()
+        self.calibration_offset() + self.active.len()
     }
 
     /// Where the calibration's unknowns begin.
     pub(super) fn calibration_offset(&self) -> usize {
-        FRAME_DIM * self.frames.len()
+        self.offset(self.frames.len())
+    }
+
+    /// Unknowns of a state: [`FRAME_DIM`], then its image's focal length where that is one.
+    pub(super) fn frame_dim(&self) -> usize {
+        FRAME_DIM + usize::from(self.prior.focus.is_some())
+    }
+
+    /// Where the unknowns of a state begin.
+    pub(super) fn offset(&self, frame: usize) -> usize {
+        self.frame_dim() * frame
     }
 
     /// How many of the active unknowns are the camera's; the others are the IMU's gains.
@@ -84,7 +97,8 @@ impl Problem {
                 oldest[observation.frame] = oldest[observation.frame].min(first);
             }
         }
-        let states = oldest.iter().flat_map(|first| [FRAME_DIM * first; FRAME_DIM]);
+        let states =
+            oldest.iter().flat_map(|first| std::iter::repeat_n(self.offset(*first), self.frame_dim()));
         Envelope::new(states.chain(vec![0; self.active.len()]).collect())
     }
 
@@ -113,8 +127,14 @@ impl FrameState {
         let (before, after) = (at(time - around).unwrap_or(now), at(time + around).unwrap_or(now));
         let secs = (after.time - before.time).as_secs_f64();
         let gyro_change = if secs > 0.0 { (after.gyro.0 - before.gyro.0) / secs } else { Vector3::zeros() };
-        let body =
-            MovingBody { state, gyro: now.gyro.0, gyro_change, force: now.accel.0, gravity: model.gravity() };
+        let body = MovingBody {
+            state,
+            gyro: now.gyro.0,
+            gyro_change,
+            force: now.accel.0,
+            gravity: model.gravity(),
+            log_focal: 0.0,
+        };
         Some(Self { time, body, inertial: None })
     }
 }

@@ -4,12 +4,12 @@ use super::envelope::Envelope;
 use super::inertial::GAIN_DIM;
 use super::initial::preintegrate;
 use super::linearise::System;
-use super::problem::{FRAME_DIM, Problem};
+use super::observation::TIMING_AND_PLACE;
+use super::problem::Problem;
 use super::{
     AdjustmentFinding, AdjustmentInput, MAX_INERTIAL_CHI2, MAX_REJECTED_SHARE, Measurements, Solution,
 };
 use super::{findings, keyframes};
-use crate::backend::dot;
 use crate::imu::{ImuBuffer, ImuModel, NavState};
 use crate::pipeline::{Joined, public_state};
 use nalgebra::Vector3;
@@ -152,7 +152,14 @@ pub(super) fn collect(
     let states = states_of_images(recording, problem, offset).into_iter();
     let every_image = states.map(|(frame, stamp, state)| (frame, public_state(&state, stamp))).collect();
     let scale_std = log_scale_sigma(problem, system);
-    let sigmas = calibration_sigmas(problem, covariance);
+    let mut sigmas = calibration_sigmas(problem, covariance);
+    if let Some(focus) = solution.focus {
+        let intrinsics = problem.calibration.camera.parameters();
+        for axis in 0..2 {
+            let own = sigmas[TIMING_AND_PLACE + axis];
+            sigmas[TIMING_AND_PLACE + axis] = own.hypot(focus.mean_sigma * intrinsics[axis]);
+        }
+    }
     let gains = problem.calibration.dim() - GAIN_DIM;
     Adjusted {
         segment: solution.segment,
@@ -173,7 +180,13 @@ pub(super) fn collect(
             gyro_noise_density: recording.model.noise.gyro_density,
             accel_noise_density: recording.model.noise.accel_density,
         },
-        findings: findings::of(problem, covariance, &input.given_body_from_camera, input.sigmas),
+        findings: findings::of(
+            problem,
+            covariance,
+            &input.given_body_from_camera,
+            input.sigmas,
+            solution.focus,
+        ),
         scale_std,
         report: AdjustmentReport {
             states: problem.frames.len(),
@@ -230,12 +243,6 @@ fn state_at(
     }
 }
 
-/// Standard deviation of a linear function of the unknowns.
-fn sigma_of(mut slope: Vec<f64>, system: &System) -> f64 {
-    system.factor.forward(&mut slope);
-    dot(&slope, &slope).sqrt()
-}
-
 fn calibration_sigmas(problem: &Problem, covariance: &Envelope) -> Vec<f64> {
     let mut sigmas = vec![0.0; problem.calibration.dim()];
     for (k, index) in problem.active.iter().enumerate() {
@@ -256,8 +263,8 @@ pub(super) fn log_scale_sigma(problem: &Problem, system: &System) -> f64 {
     }
     let mut slope = vec![0.0; problem.dim()];
     for (k, place) in places.iter().enumerate() {
-        let at = FRAME_DIM * k + 3;
+        let at = problem.offset(k) + 3;
         slope[at..at + 3].copy_from_slice(((place - mean) / spread).as_slice());
     }
-    sigma_of(slope, system)
+    system.sigma_of(slope)
 }

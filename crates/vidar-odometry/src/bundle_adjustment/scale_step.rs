@@ -6,7 +6,7 @@
 //! before: to first order both are the same.
 
 use super::observation::{Landmark, MIN_INVERSE_DISTANCE};
-use super::problem::{FRAME_DIM, Problem};
+use super::problem::Problem;
 use crate::backend::tangent_basis;
 use crate::imu::{NavState, Vector15};
 use nalgebra::Vector3;
@@ -32,7 +32,7 @@ impl ScaleStep {
         let (mut along, mut spread) = (0.0, 0.0);
         for (k, frame) in problem.frames.iter().enumerate() {
             let from = frame.body.state.world_from_body.translation - centre;
-            let at = FRAME_DIM * k + 3;
+            let at = problem.offset(k) + 3;
             along += from.dot(&Vector3::from_column_slice(&step[at..at + 3]));
             spread += from.norm_squared();
         }

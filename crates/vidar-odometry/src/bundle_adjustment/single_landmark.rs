@@ -121,7 +121,8 @@ mod tests {
             observations.push(WhitenedObservation { frame, pixel, whitening });
             frames.push(FrameState { time: Timestamp::from_nanos(frame as i64), body, inertial: None });
         }
-        let prior = CalibrationPrior { sigmas: vec![0.0; calibration.dim()], mean: calibration.clone() };
+        let prior =
+            CalibrationPrior { sigmas: vec![0.0; calibration.dim()], mean: calibration.clone(), focus: None };
         let gauge = (0, frames[0].body.state);
         let landmarks = vec![ObservedLandmark { landmark, observations }];
         Problem { frames, landmarks, calibration, prior, active: Vec::new(), gauge }

@@ -48,6 +48,16 @@ pub struct SimulationConfig {
     pub gyro_scale: [f64; 3],
     /// The same of the accelerometer.
     pub accel_scale: [f64; 3],
+    /// Mean and amplitude of `ln` of the focal length over the camera's: a lens that autofocus moves to and fro in 6 s.
+    pub log_focal: [f64; 2],
+}
+
+impl SimulationConfig {
+    /// `ln` of the focal length over the camera's, so long after the first frame.
+    pub fn log_focal_at(&self, secs: f64) -> f64 {
+        let [mean, amplitude] = self.log_focal;
+        mean + amplitude * (std::f64::consts::TAU * secs / 6.0).sin()
+    }
 }
 
 impl Default for SimulationConfig {
@@ -70,6 +80,7 @@ impl Default for SimulationConfig {
             gravity_mps2: GRAVITY_MPS2,
             gyro_scale: [1.0; 3],
             accel_scale: [1.0; 3],
+            log_focal: [0.0; 2],
         }
     }
 }
@@ -146,6 +157,7 @@ impl Simulation {
             let bias = biases[((exposed * config.imu_rate_hz).round() as usize).min(biases.len() - 1)];
             let truth = NavState { world_from_body: motion.world_from_body, velocity: motion.velocity, bias };
             let camera_from_world = (motion.world_from_body * body_from_camera).inverse();
+            let camera = magnified(&camera, config.log_focal_at(at));
             let observations = tracker.look(&points, &camera, &camera_from_world, config, &mut random);
             all.push(SimulatedFrame { id: FrameId(k as u32), time: stamp(at), truth, observations });
         }
@@ -157,6 +169,13 @@ impl Simulation {
     pub fn point(&self, track: LandmarkId) -> Option<Vector3<f64>> {
         self.points.get(*self.point_of.get(track.index())?).copied()
     }
+}
+
+/// The camera with its focal lengths multiplied.
+fn magnified(camera: &CameraModel, log_focal: f64) -> CameraModel {
+    let mut parameters = camera.parameters();
+    parameters[..2].iter_mut().for_each(|focal| *focal *= log_focal.exp());
+    camera.with_parameters(&parameters).unwrap_or_else(|_| camera.clone())
 }
 
 fn simulate_imu(

@@ -6,7 +6,7 @@ use crate::quality::TrackQuality;
 use std::sync::Arc;
 use vidar_align::Placement;
 use vidar_align::aligner::{ChunkReport, FrameObservation, LoopReport};
-use vidar_core::remap::RowMotion;
+use vidar_core::remap::ImageGeometry;
 use vidar_core::{
     AlignedView, CameraId, CameraModel, ChunkId, Duration, FrameId, OdometryKeyframe, PointCloud,
     RevisedPose, Se3, Timestamp, TriangleMesh, Warning,
@@ -45,23 +45,24 @@ pub struct MapKeyframe {
     pub stamp: FrameStamp,
     /// Pose of its camera as tracked, m; none where poses are found by the geometry model alone.
     pub world_from_camera: Option<Se3>,
-    /// How its rows were read; none until the images around it have poses, and for a global shutter.
-    pub row_motion: Option<RowMotion>,
+    /// How its image differs from what the calibrated camera would show at one instant; none where it does not, and until the images around
+    /// it have poses.
+    pub geometry: Option<ImageGeometry>,
     /// The odometry's keyframe of the same image, with its landmarks and covariance.
     pub odometry: Option<Arc<OdometryKeyframe>>,
 }
 
 impl MapKeyframe {
-    /// Finds out how its rows were read, once the images around it have poses, and puts the odometry's landmarks where one instant
-    /// would have seen them, as its pixels will be.
-    pub(super) fn read_by_rows(&mut self, track: &Segment, readout: Duration, camera: &CameraModel) {
-        if self.row_motion.is_some() {
+    /// Finds out how its image differs from the calibrated camera's, once the images around it have poses, and puts the odometry's landmarks
+    /// where that would have seen them at one instant, as its pixels will be.
+    pub(super) fn as_calibrated(&mut self, track: &Segment, readout: Duration, camera: &CameraModel) {
+        if self.geometry.is_some() {
             return;
         }
-        self.row_motion = track.row_motion(self.stamp.frame_id, readout);
-        if let (Some(motion), Some(odometry)) = (&self.row_motion, &mut self.odometry) {
+        self.geometry = track.image_geometry(self.stamp.frame_id, readout);
+        if let (Some(geometry), Some(odometry)) = (&self.geometry, &mut self.odometry) {
             for landmark in &mut Arc::make_mut(odometry).landmarks {
-                landmark.pixel = motion.at_once(camera, &landmark.pixel).unwrap_or(landmark.pixel);
+                landmark.pixel = geometry.as_calibrated(camera, &landmark.pixel).unwrap_or(landmark.pixel);
             }
         }
     }

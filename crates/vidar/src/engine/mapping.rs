@@ -9,7 +9,7 @@ use crate::error::Error;
 use std::sync::Arc;
 use vidar_align::Placement;
 use vidar_align::chunking::ChunkSpan;
-use vidar_core::{ChunkId, Duration, Warning};
+use vidar_core::{ChunkId, Warning};
 use vidar_fusion::FusionConfig;
 
 impl Engine<'_> {
@@ -33,9 +33,9 @@ impl Engine<'_> {
     ) -> Result<Option<StoredChunk>, Error> {
         self.enter(Step::Predict, sink)?;
         let Some(world) = &mut self.world else { return Ok(None) };
-        if let (true, Some(track)) = (self.readout > Duration::ZERO, self.track.longest()) {
+        if let Some(track) = self.track.longest() {
             for keyframe in &mut world.keyframes[chunk.seen.clone()] {
-                keyframe.read_by_rows(track, self.readout, &self.camera_model);
+                keyframe.as_calibrated(track, self.readout, &self.camera_model);
             }
         }
         let mut events = Vec::new();

@@ -114,9 +114,9 @@ impl<'a> Preview<'a> {
         (self.tried, self.tried_at) = (wanted.end, track.frames.last().map(|f| f.stamp.time));
         let seen = wanted.start.saturating_sub(self.context)..wanted.end;
         let mut keyframes = Cow::Borrowed(&keyframes[..wanted.end]);
-        if readout > Duration::ZERO {
-            for keyframe in &mut keyframes.to_mut()[seen.clone()] {
-                keyframe.row_motion = track.row_motion(keyframe.stamp.frame_id, readout);
+        for k in seen.clone() {
+            if let Some(geometry) = track.image_geometry(keyframes[k].stamp.frame_id, readout) {
+                keyframes.to_mut()[k].geometry = Some(geometry);
             }
         }
         // The chunk reports images that cannot be read.
@@ -176,11 +176,10 @@ fn spread(seen: &[MapKeyframe], (track, since): (&[PosedFrame], usize), count: u
 /// A frame of the track as if it were a keyframe.
 fn help(track: &Segment, k: usize, readout: Duration) -> MapKeyframe {
     let PosedFrame { stamp, world_from_camera, .. } = track.frames[k];
-    let row_motion = Some(stamp.frame_id).filter(|_| readout > Duration::ZERO);
     MapKeyframe {
         stamp,
         world_from_camera: Some(world_from_camera),
-        row_motion: row_motion.and_then(|frame| track.row_motion(frame, readout)),
+        geometry: track.image_geometry(stamp.frame_id, readout),
         odometry: None,
     }
 }

@@ -3,7 +3,7 @@
 use super::{FrameStamp, FrameState, PoseReport, PoseSource};
 use std::collections::{BTreeMap, VecDeque};
 use std::sync::Arc;
-use vidar_core::remap::RowMotion;
+use vidar_core::remap::{ImageGeometry, RowMotion};
 use vidar_core::{Duration, FrameId, LieGroup, OdometryKeyframe, Se3, Timestamp};
 use vidar_odometry::Joined;
 use vidar_solve::statistics::median_upper;
@@ -39,9 +39,30 @@ const MAX_MOTION_SPAN: Duration = Duration::from_millis(210);
 const SAME_SCENE: Duration = Duration::from_millis(1000);
 
 impl Segment {
+    /// How a frame's image differs from what the calibrated camera would show at one instant; none where it does not.
+    pub fn image_geometry(&self, frame: FrameId, readout: Duration) -> Option<ImageGeometry> {
+        let time = self.frame(frame)?.stamp.time;
+        let rows = if readout > Duration::ZERO { self.row_motion(frame, readout) } else { None };
+        let log_focal = self.log_focal(time);
+        (rows.is_some() || log_focal != 0.0).then_some(ImageGeometry { rows, log_focal })
+    }
+
+    /// `ln` of the focal length at a time over the calibration's, linear between the odometry's keyframes.
+    fn log_focal(&self, time: Timestamp) -> f64 {
+        let after = self.odometry.partition_point(|k| k.state.time < time);
+        let at = |k: usize| self.odometry.get(k).map(|k| (k.state.time, k.log_focal));
+        match (after.checked_sub(1).and_then(at), at(after)) {
+            (Some((from, before)), Some((until, next))) => {
+                let share = (time - from).as_secs_f64() / (until - from).as_secs_f64();
+                before + share * (next - before)
+            }
+            (one, other) => one.or(other).map_or(0.0, |(_, log_focal)| log_focal),
+        }
+    }
+
     /// How the rows of a frame were read, by the poses of the frames before and after it, and by the landmarks of the odometry's
     /// nearest keyframe. None where the frames are far apart.
-    pub fn row_motion(&self, frame: FrameId, readout: Duration) -> Option<RowMotion> {
+    fn row_motion(&self, frame: FrameId, readout: Duration) -> Option<RowMotion> {
         let at = self.index(frame)?;
         let own = &self.frames[at];
         let (before, after) = (&self.frames[at.saturating_sub(1)], self.frames.get(at + 1).unwrap_or(own));
@@ -272,6 +293,27 @@ mod tests {
         // Half a second says nothing of a hand.
         assert!(segment.row_motion(FrameId(2), Duration::from_millis(20)).is_none());
         assert!(segment.row_motion(FrameId(5), Duration::from_millis(20)).is_none());
+    }
+
+    #[test]
+    fn the_focal_length_of_a_frame_is_between_those_of_the_keyframes_around_it() {
+        let keyframe = |i: u32, log_focal: f64| {
+            Arc::new(OdometryKeyframe { log_focal, ..crate::engine::tests::settled::keyframe(i) })
+        };
+        let frames = [0, 1, 2, 4, 5].map(|i| PosedFrame {
+            stamp: FrameStamp { time: keyframe(i, 0.0).state.time, ..stamp(i) },
+            world_from_camera: Se3::IDENTITY,
+            odometry: None,
+        });
+        let odometry = vec![keyframe(1, 0.004), keyframe(4, 0.010)];
+        let mut segment = Segment { id: 0, images: 5, frames: frames.into(), odometry, last: None };
+        let of = |segment: &Segment, i: u32| segment.image_geometry(FrameId(i), Duration::ZERO);
+        for (i, expected) in [(0, 0.004), (1, 0.004), (2, 0.006), (4, 0.010), (5, 0.010)] {
+            let found = of(&segment, i).unwrap();
+            assert!((found.log_focal - expected).abs() < 1e-12 && found.rows.is_none(), "{i}: {found:?}");
+        }
+        segment.odometry.iter_mut().for_each(|k| Arc::make_mut(k).log_focal = 0.0);
+        assert_eq!(of(&segment, 2), None);
     }
 
     #[test]

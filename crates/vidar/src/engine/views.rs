@@ -5,7 +5,7 @@ use super::events::{MapEvent, MapKeyframe};
 use super::setup::ImageSource;
 use rayon::prelude::*;
 use std::ops::Range;
-use vidar_core::remap::{RemapTable, RowShift};
+use vidar_core::remap::{RemapTable, ViewShift};
 use vidar_core::{CameraModel, ChunkView, FrameImage, Image, Pinhole, Warning};
 
 /// Shifts of rows below this many pixels of the camera are left: matches are found to a few tenths of one.
@@ -99,8 +99,8 @@ impl<'a> ViewWindow<'a> {
         let image = self.images.image(&keyframe.stamp)?;
         let mask = self.images.mask(&keyframe.stamp)?;
         let shift = keyframe
-            .row_motion
-            .and_then(|s| RowShift::new(&self.camera, self.remap.target(), &s, LEAST_SHIFT_PX));
+            .geometry
+            .and_then(|s| ViewShift::new(&self.camera, self.remap.target(), &s, LEAST_SHIFT_PX));
         // Every pixel into which an ignored one is mixed; the camera's border is black in the view, not ignored.
         let mask = mask.map(|mask| {
             let white = FrameImage::Gray8(mask.map(|ignored| if *ignored { 255 } else { 0 }));

@@ -7,7 +7,7 @@ use serde_json::{Value, json};
 use vidar_core::{BodyFrame, Duration, StampedPose, Trajectory, Warning};
 use vidar_dataset::{CalibrationSource, Recording};
 use vidar_odometry::bundle_adjustment::{
-    Adjusted, AdjustedCalibration, AdjustedImu, AdjustmentFinding, CalibrationSigmas,
+    Adjusted, AdjustedCalibration, AdjustedImu, AdjustmentFinding, CalibrationSigmas, Focus,
 };
 
 /// Standard deviations of a calibration that was found from the recording's own tracks and gyroscope.
@@ -99,6 +99,9 @@ pub(super) fn imu_json(adjusted: &Adjusted) -> Value {
 /// What was given and the recording contradicts: the values that were found are used.
 pub(super) fn warnings(adjusted: &Adjusted) -> Vec<Warning> {
     let told = |finding: &AdjustmentFinding| {
+        if let AdjustmentFinding::FocalLength(focus) = finding {
+            return focal_length(focus);
+        }
         let text = match finding {
             AdjustmentFinding::CameraPosition { given_m, found_m, sigma_m } => format!(
                 "the camera's position on the IMU is given as {} cm, the recording shows {} (σ {}) cm: {:.0} cm apart",
@@ -118,6 +121,29 @@ pub(super) fn warnings(adjusted: &Adjusted) -> Vec<Warning> {
             .hint("`vidar calibrate` and a ruler show which is right; correct T_BS in the calibration")
     };
     adjusted.findings.iter().map(told).collect()
+}
+
+/// Where the images' focal lengths scatter by less than this share of what their mean is off by, the lens is fixed and was given wrong: in rendered
+/// recordings 0.05 to 0.1, where it changes 1.5 and more.
+const FIXED_FOCUS: f64 = 0.3;
+
+fn focal_length(focus: &Focus) -> Warning {
+    let by = 100.0 * focus.mean.exp_m1();
+    if focus.spread < FIXED_FOCUS * focus.mean.abs() {
+        let text = format!(
+            "the focal length is {by:+.1} % (σ {:.1} %) off what is given; what was found is used",
+            100.0 * focus.mean_sigma
+        );
+        return Warning::new("calibration-contradicted", text)
+            .hint("`vidar calibrate` finds the camera's calibration; a resized or cropped recording has another one");
+    }
+    let text = format!(
+        "the focal length changes while filming: \u{b1}{:.1} % about {by:+.1} % off what is given; every image has its own from here on",
+        100.0 * focus.spread
+    );
+    Warning::new("focus-changes", text).hint(
+        "lock the focus before filming: `vidar live` and the live trajectory take one focal length for all images, and their scale is worse for it",
+    )
 }
 
 fn in_cm(v: &Vector3<f64>) -> String {

@@ -16,7 +16,7 @@ fn told(i: u32) -> Se3 {
     Se3::from_translation(newest + (pose(i).translation - newest) * if i < SETTLED { 0.5 } else { 1.0 })
 }
 
-fn keyframe(i: u32) -> OdometryKeyframe {
+pub(in crate::engine) fn keyframe(i: u32) -> OdometryKeyframe {
     let scale = if i < SETTLED { 0.5 } else { 1.0 };
     OdometryKeyframe {
         id: KeyframeId(i),
@@ -37,6 +37,7 @@ fn keyframe(i: u32) -> OdometryKeyframe {
                 inverse_depth_std: 0.01 / scale,
             })
             .collect(),
+        log_focal: 0.0,
     }
 }
 
