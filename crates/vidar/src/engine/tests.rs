@@ -1,6 +1,6 @@
 //! The engine on a wall: a geometry model that is right, and sources that fail.
 
-mod settled;
+pub(in crate::engine) mod settled;
 mod wall;
 
 use super::*;

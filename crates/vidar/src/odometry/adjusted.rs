@@ -129,16 +129,18 @@ const FIXED_FOCUS: f64 = 0.3;
 
 fn focal_length(focus: &Focus) -> Warning {
     let by = 100.0 * focus.mean.exp_m1();
+    let direction = if by < 0.0 { "shorter" } else { "longer" };
+    let by = by.abs();
     if focus.spread < FIXED_FOCUS * focus.mean.abs() {
         let text = format!(
-            "the focal length is {by:+.1} % (σ {:.1} %) off what is given; what was found is used",
+            "the focal length is {by:.1} % (σ {:.1} %) {direction} than what is given; what was found is used",
             100.0 * focus.mean_sigma
         );
         return Warning::new("calibration-contradicted", text)
             .hint("`vidar calibrate` finds the camera's calibration; a resized or cropped recording has another one");
     }
     let text = format!(
-        "the focal length changes while filming: \u{b1}{:.1} % about {by:+.1} % off what is given; every image has its own from here on",
+        "the focal length changes while filming: by \u{b1}{:.1} % about one that is {by:.1} % {direction} than the calibration's; every image gets its own",
         100.0 * focus.spread
     );
     Warning::new("focus-changes", text).hint(
@@ -158,4 +160,20 @@ pub(super) fn trajectory(adjusted: &Adjusted) -> Option<Trajectory> {
         .iter()
         .map(|(_, state)| StampedPose { time: state.time, world_from_body: state.world_from_body });
     Trajectory::new(BodyFrame::Imu, poses.collect()).ok()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_lens_that_moves_is_told_apart_from_one_that_is_given_wrong() {
+        let told = |mean, spread| focal_length(&Focus { mean, mean_sigma: 1e-3, spread });
+        let wrong = told(-0.02, 0.002);
+        assert_eq!(wrong.kind, "calibration-contradicted");
+        assert!(wrong.message.contains("2.0 % (σ 0.1 %) shorter than what is given"), "{}", wrong.message);
+        let moves = told(0.004, 0.006);
+        assert_eq!(moves.kind, "focus-changes");
+        assert!(moves.message.contains("by ±0.6 % about one that is 0.4 % longer"), "{}", moves.message);
+    }
 }
