@@ -5,6 +5,7 @@
 //! outside the envelope (George and Liu 1981, chapter 4). A loop makes the rows of the states that it constrains long, and no others.
 
 mod factorise;
+mod inverse;
 
 use crate::backend::dot;
 
@@ -79,73 +80,6 @@ impl Envelope {
             let (left, diagonal) = row.split_at(row.len() - 1);
             b[i] = (b[i] - dot(left, &b[self.first[i]..i])) / diagonal[0];
         }
-    }
-
-    /// The entries of the inverse within the envelope, for a factor (Takahashi, Fagan, Chin 1973): no others are needed to find
-    /// them. `border` is the number of the first of the last rows that begin at column 0.
-    pub(super) fn inverse(&self, border: usize) -> Self {
-        let n = self.dim();
-        let mut z = Self {
-            first: self.first.clone(),
-            begin: self.begin.clone(),
-            values: vec![0.0; self.values.len()],
-        };
-        // Last row of the band that is coupled to each column.
-        let mut last: Vec<usize> = (0..n).collect();
-        for row in 0..border {
-            for column in self.first[row]..row {
-                last[column] = row;
-            }
-        }
-        let (mut band, mut found) = (Vec::new(), Vec::new());
-        let mut edge = vec![0.0; n - border];
-        let mut edge_found = edge.clone();
-        for j in (0..n).rev() {
-            let end = if j < border { last[j] + 1 } else { j + 1 };
-            let from = border.max(j + 1);
-            band.clear();
-            band.extend((j + 1..end).map(|k| if self.first[k] <= j { self.at(k, j) } else { 0.0 }));
-            found.clear();
-            found.resize(band.len(), 0.0);
-            for k in from..n {
-                edge[k - border] = self.at(k, j);
-                edge_found[k - border] = 0.0;
-            }
-            for (at, k) in (j + 1..end).enumerate().filter(|(_, k)| self.first[*k] <= j) {
-                let row = z.range(k, j + 1, k + 1);
-                found[at] += dot(row, &band[..=at]);
-                for (sum, value) in found[..at].iter_mut().zip(row) {
-                    *sum += value * band[at];
-                }
-            }
-            for k in from..n {
-                let row = z.range(k, j + 1, j + 1 + band.len());
-                let value = edge[k - border];
-                edge_found[k - border] += dot(row, &band);
-                for (sum, entry) in found.iter_mut().zip(row) {
-                    *sum += entry * value;
-                }
-                let row = z.range(k, from, k + 1);
-                edge_found[k - border] += dot(row, &edge[from - border..=k - border]);
-                for (sum, entry) in edge_found[from - border..k - border].iter_mut().zip(row) {
-                    *sum += entry * value;
-                }
-            }
-            let diagonal = self.diagonal(j);
-            let mut own = 1.0 / (diagonal * diagonal);
-            for (at, k) in (j + 1..end).enumerate().filter(|(_, k)| self.first[*k] <= j) {
-                let value = -found[at] / diagonal;
-                z.set(k, j, value);
-                own -= band[at] * value / diagonal;
-            }
-            for k in from..n {
-                let value = -edge_found[k - border] / diagonal;
-                z.set(k, j, value);
-                own -= edge[k - border] * value / diagonal;
-            }
-            z.set(j, j, own);
-        }
-        z
     }
 
     /// Entry of a symmetric matrix that the envelope holds.

@@ -158,7 +158,12 @@ pub fn adjust(
     }
     watch.stage(AdjustmentStage::Weighted, work.guess.images.len());
     let inertial_chi2_per_dof = optimise::inertial_chi2_per_dof(&passed.problem);
-    let model = weigh(input, &mut passed, &mut watch)?;
+    let mut model = weigh(input, &mut passed, &mut watch)?;
+    // With noise that is taken for several times as large as it is, a lever arm that is 10 cm off was no contradiction.
+    if work.doubt_given(&passed.problem)? {
+        passed = work.pass(&recording, &mut watch)?;
+        model = weigh(input, &mut passed, &mut watch)?;
+    }
     watch.stage(AdjustmentStage::Loops, work.guess.images.len());
     let closed = loops::close(&mut passed.problem, &mut passed.report, log, &passed.images, &mut watch)?;
     let Passed { mut problem, images, report, clock_offset, .. } = passed;
