@@ -314,7 +314,13 @@ fn stated_deviations_hold_over_long_flights_whatever_is_given_wrong() {
         assert_consistent(&freed);
         assert!(freed.findings > 20, "{} findings in 24 flights", freed.findings);
         if metres > 0.0 {
-            assert!(freed.lever_squared < 0.05 * frozen.lever_squared);
+            // Three unknowns; what is left of 10 cm is what the flights know it to.
+            assert!(
+                freed.lever_nees / freed.flights < 6.0,
+                "NEES of the lever arm {}",
+                freed.lever_nees / freed.flights
+            );
+            assert!(freed.lever_squared < 0.1 * frozen.lever_squared);
         }
     }
 }

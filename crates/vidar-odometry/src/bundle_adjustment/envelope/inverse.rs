@@ -4,7 +4,7 @@ use super::Envelope;
 use std::ops::Range;
 use vidar_core::simd::kernel;
 
-/// Columns that are found together, at most, in two halves that two threads may take: those of a state.
+/// Columns that are found together, at most: those of a state. Half of them at a time is what registers hold of [`TOGETHER`] rows.
 const HALF: usize = 8;
 const WIDTH: usize = 2 * HALF;
 
@@ -46,11 +46,8 @@ impl Envelope {
                 products[0].factors[at].copy_from_slice(low);
                 products[1].factors[at].copy_from_slice(high);
             }
-            let [low, high] = &mut products;
-            rayon::join(
-                || low.multiply(&z, &below, columns.start),
-                || high.multiply(&z, &below, columns.start),
-            );
+            products.iter_mut().for_each(|p| multiply(&z, &below, columns.start, &p.factors, &mut p.sums));
+            let [low, high] = &products;
             for (at, row) in below.rows().filter(|(_, row)| self.first[*row] <= columns.start) {
                 let found = low.sums[at].iter().chain(&high.sums[at]);
                 let target = z.part_mut(row, columns.start, columns.len());
@@ -160,15 +157,10 @@ impl Products {
             halves.resize(rows, [0.0; HALF]);
         }
     }
-
-    /// `Z_RR W`, where the block begins at `column`: rows that do not reach it have no part in it.
-    fn multiply(&mut self, z: &Envelope, below: &Below, column: usize) {
-        multiply(z, below, column, &self.factors, &mut self.sums);
-    }
 }
 
 kernel! {
-    /// Adds the product of the symmetric matrix within the rows below with `factors`.
+    /// Adds `Z_RR W` of half of the columns. Rows that do not reach the block, which begins at `column`, have no part in it.
     fn multiply(z: &Envelope, below: &Below, column: usize, factors: &[Half], sums: &mut [Half]) {
         let reaches = |row: usize| z.first[row] <= column;
         // Rows of the border hold the band's columns before their own.
