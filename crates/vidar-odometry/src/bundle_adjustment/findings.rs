@@ -1,7 +1,7 @@
 //! What was given of the camera's place and the recording contradicts.
 
 use super::envelope::Envelope;
-use super::focus::Focus;
+use super::focus_evidence::Focus;
 use super::observation::{POSITION, ROTATION};
 use super::problem::Problem;
 use super::sigmas::CalibrationSigmas;

@@ -4,67 +4,13 @@
 //! rendered phones whose focal length changed by 1 % every few seconds had their scale 5 % off at a stated 1.1 %. Where the recording shows
 //! it, every image has its own, `f exp(z)`, and `z` walks at random.
 
-use super::linearise::{LandmarkBlock, System, linearise};
-use super::problem::{FRAME_DIM, Problem};
-use crate::backend::{dot, product};
+use super::problem::{FRAME_DIM, FocusPrior, Problem};
+use super::system::{LandmarkBlock, System};
+use crate::backend::product;
 use nalgebra::{Matrix3, Vector3};
-
-/// What is known of the changes before: an Ornstein-Uhlenbeck process, a random walk that stays about zero.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub(super) struct FocusPrior {
-    /// Standard deviation of `ln` of an image's focal length over the calibration's.
-    sigma: f64,
-}
-
-impl FocusPrior {
-    /// Autofocus of a phone: up to 2 % between near and far.
-    pub(super) const AUTOFOCUS: Self = Self { sigma: 0.015 };
-
-    /// The least that does harm: at changes of 0.4 % the scale was 0.4 to 0.8 % off, within what was stated.
-    const HARMFUL: Self = Self { sigma: 0.005 };
-}
 
 /// How long a lens keeps its place, s: autofocus moves every few seconds.
 const CORRELATED_SECS: f64 = 5.0;
-
-/// `ln` of the Bayes factor from which the focal length is taken to change: "decisive" is 4.6. Whole recordings of a fixed lens have -42 and less
-/// (real MH_01, 17 rendered phones, sweeps, orbits and flights; -0.2 and less of their first seconds), those whose focal length changes by 1 % 126 to
-/// 1120, those that were given one 2 % off 240 to 320.
-const DECISIVE: f64 = 10.0;
-
-/// Whether the measurements speak for a focal length that changes.
-pub(super) fn changes(problem: &Problem) -> bool {
-    log_bayes_factor(problem, FocusPrior::HARMFUL).is_some_and(|ln| ln > DECISIVE)
-}
-
-/// The focal lengths that the images have been found to have.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Focus {
-    /// `ln` of the mean over the images over what was given.
-    pub mean: f64,
-    /// Standard deviation of `mean`.
-    pub mean_sigma: f64,
-    /// Standard deviation of the images about the mean.
-    pub spread: f64,
-}
-
-/// Takes the mean over the images into the calibration; what was found, where every image has a focal length of its own. `system` is that of the
-/// solution.
-pub(super) fn centre(problem: &mut Problem, system: &System) -> Option<Focus> {
-    problem.prior.focus?;
-    let count = problem.frames.len() as f64;
-    let all = || problem.frames.iter().map(|f| f.body.log_focal);
-    let mean = all().sum::<f64>() / count;
-    let spread = (all().map(|z| (z - mean).powi(2)).sum::<f64>() / count).sqrt();
-    let mut slope = vec![0.0; problem.dim()];
-    (0..problem.frames.len()).for_each(|k| slope[problem.offset(k) + FRAME_DIM] = 1.0 / count);
-    let mean_sigma = system.sigma_of(slope);
-    let mut parameters = problem.calibration.camera.parameters();
-    parameters[..2].iter_mut().for_each(|focal| *focal *= mean.exp());
-    problem.calibration.camera = problem.calibration.camera.with_parameters(&parameters).ok()?;
-    problem.frames.iter_mut().for_each(|f| f.body.log_focal -= mean);
-    Some(Focus { mean, mean_sigma, spread })
-}
 
 /// How the prior ties the focal length of a state to that of the one before: `z = share · before`, with a weight. The first one is tied to zero.
 #[derive(Clone, Copy)]
@@ -82,6 +28,11 @@ fn ties(problem: &Problem, prior: FocusPrior) -> impl Iterator<Item = Tie> {
         Tie { share, weight: 1.0 / (variance * (1.0 - share * share)) }
     };
     (0..problem.frames.len()).map(of)
+}
+
+/// `ln` of the determinant of the prior's information.
+pub(super) fn log_det(problem: &Problem, prior: FocusPrior) -> f64 {
+    ties(problem, prior).map(|tie| tie.weight.ln()).sum()
 }
 
 /// What a state's focal length departs from its tie by.
@@ -153,45 +104,12 @@ pub(super) fn eliminate(
     }
 }
 
-/// `ln` of how many times more probable the measurements are with a focal length of its own for every image than with one for all (Laplace's
-/// approximation at the solution with one); `None` where the system is singular.
-fn log_bayes_factor(problem: &Problem, prior: FocusPrior) -> Option<f64> {
-    let one = Fit::of(problem)?;
-    let mut with = problem.clone();
-    with.prior.focus = Some(prior);
-    let each = Fit::of(&with)?;
-    let prior_log_det: f64 = ties(problem, prior).map(|tie| tie.weight.ln()).sum();
-    let occam = 0.5 * (prior_log_det - (each.log_det - one.log_det));
-    Some(each.decrease - one.decrease + occam)
-}
-
-/// The quadratic approximation of the cost.
-struct Fit {
-    /// What its minimum is lower by.
-    decrease: f64,
-    log_det: f64,
-}
-
-impl Fit {
-    fn of(problem: &Problem) -> Option<Self> {
-        let mut system = System::new(problem);
-        linearise(problem, 0.0, &mut system);
-        if !system.h.factorise(&vec![0.0; problem.dim()], &mut system.factor) {
-            return None;
-        }
-        let mut whitened = system.gradient.clone();
-        system.factor.forward(&mut whitened);
-        let log_det = 2.0 * (0..problem.dim()).map(|k| system.factor.diagonal(k).ln()).sum::<f64>();
-        Some(Self { decrease: 0.5 * dot(&whitened, &whitened), log_det })
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::super::observation::{self, tests::example};
     use super::super::problem::{CalibrationPrior, FrameState, ObservedLandmark, WhitenedObservation};
     use super::*;
-    use crate::bundle_adjustment::linearise::cost;
+    use crate::bundle_adjustment::linearise::{cost, linearise};
     use crate::imu::Vector15;
     use nalgebra::{DMatrix, Matrix2};
     use vidar_core::Timestamp;
@@ -296,7 +214,6 @@ mod tests {
         let problem = problem();
         let prior = FocusPrior::AUTOFOCUS;
         let mut information = DMatrix::zeros(3, 3);
-        let mut log_det = 0.0;
         for (k, tie) in ties(&problem, prior).enumerate() {
             let mut row = DMatrix::zeros(1, 3);
             row[k] = 1.0;
@@ -304,7 +221,6 @@ mod tests {
                 row[k - 1] = -tie.share;
             }
             information += row.transpose() * &row * tie.weight;
-            log_det += tie.weight.ln();
         }
         let covariance = information.clone().try_inverse().unwrap();
         for k in 0..3 {
@@ -312,6 +228,6 @@ mod tests {
             assert!((covariance[(k, 0)] - expected).abs() < 1e-9 * expected, "{covariance}");
             assert!((covariance[(k, k)].sqrt() - prior.sigma).abs() < 1e-9, "{covariance}");
         }
-        assert!((information.determinant().ln() - log_det).abs() < 1e-9);
+        assert!((information.determinant().ln() - log_det(&problem, prior)).abs() < 1e-9);
     }
 }

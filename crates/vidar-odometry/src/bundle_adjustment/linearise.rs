@@ -5,9 +5,10 @@ use super::focus;
 use super::inertial::{GAIN_DIM, InertialJacobians};
 use super::observation::{self, Landmark, Linearised, STATE_DIM};
 use super::problem::{FRAME_DIM, ObservedLandmark, Problem};
-use crate::backend::{GaugePriorSigmas, dot, gauge_prior_at, product};
+use super::system::{ByState, LandmarkBlock, System};
+use crate::backend::{GaugePriorSigmas, gauge_prior_at, product};
 use crate::imu::{Matrix15, Vector15};
-use nalgebra::{Matrix3, SMatrix, Vector2, Vector3};
+use nalgebra::{Matrix3, Vector2, Vector3};
 use vidar_core::simd::kernel;
 use vidar_solve::Kernel;
 
@@ -29,44 +30,6 @@ pub(super) struct Cost {
 impl Cost {
     pub(super) fn total(&self) -> f64 {
         self.visual + self.inertial + self.priors
-    }
-}
-
-/// `Jᵀ J` between the unknowns of a state and a landmark.
-type ByState = SMatrix<f64, STATE_DIM, 3>;
-
-/// A landmark's block of the normal equations, kept to find its step from the states'.
-#[derive(Clone, Debug, Default)]
-pub(super) struct LandmarkBlock {
-    /// Inverse of the damped 3 × 3 block; `None` leaves the landmark where it is.
-    inverse: Option<Matrix3<f64>>,
-    gradient: Vector3<f64>,
-    /// Of each observation.
-    pub(super) by_state: Vec<(usize, ByState)>,
-    /// Of each observation with the focal length of its image; none where that is held.
-    pub(super) by_focal: Vec<Vector3<f64>>,
-    pub(super) by_calibration: Vec<Vector3<f64>>,
-}
-
-/// The reduced normal equations `H x = −g` of states and calibration.
-#[derive(Clone, Debug)]
-pub(super) struct System {
-    pub(super) h: Envelope,
-    pub(super) factor: Envelope,
-    pub(super) gradient: Vec<f64>,
-    pub(super) landmarks: Vec<LandmarkBlock>,
-}
-
-impl System {
-    pub(super) fn new(problem: &Problem) -> Self {
-        let h = problem.envelope();
-        Self { factor: h.clone(), h, gradient: vec![0.0; problem.dim()], landmarks: Vec::new() }
-    }
-
-    /// Standard deviation of a linear function of the unknowns, by the factor.
-    pub(super) fn sigma_of(&self, mut slope: Vec<f64>) -> f64 {
-        self.factor.forward(&mut slope);
-        dot(&slope, &slope).sqrt()
     }
 }
 
@@ -364,34 +327,5 @@ fn subtract_triangle(h: &mut Envelope, at: usize, weighted: &ByState, own: &BySt
             let [a, b, c] = [weighted[(i, 0)], weighted[(i, 1)], weighted[(i, 2)]];
             *sum -= a * own[(j, 0)] + b * own[(j, 1)] + c * own[(j, 2)];
         }
-    }
-}
-
-impl LandmarkBlock {
-    /// Standard deviation of the inverse distance with the states held, 1/m.
-    pub(super) fn inverse_distance_sigma(&self) -> f64 {
-        self.inverse.map_or(f64::INFINITY, |inverse| inverse[(2, 2)].sqrt())
-    }
-
-    /// The landmark's step that belongs to a step of states and calibration.
-    pub(super) fn step(
-        &self,
-        step: &[f64],
-        frame_dim: usize,
-        calibration_offset: usize,
-    ) -> Option<Vector3<f64>> {
-        let mut gradient = self.gradient;
-        for (at, (frame, by_state)) in self.by_state.iter().enumerate() {
-            let from = frame_dim * frame;
-            if let Some(by_focal) = self.by_focal.get(at) {
-                gradient += by_focal * step[from + FRAME_DIM];
-            }
-            let moved = SMatrix::<f64, STATE_DIM, 1>::from_column_slice(&step[from..from + STATE_DIM]);
-            gradient += by_state.transpose() * moved;
-        }
-        for (by_calibration, moved) in self.by_calibration.iter().zip(&step[calibration_offset..]) {
-            gradient += by_calibration * *moved;
-        }
-        Some(-(self.inverse? * gradient))
     }
 }

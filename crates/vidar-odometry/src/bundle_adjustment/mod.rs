@@ -13,6 +13,7 @@
 mod envelope;
 mod findings;
 mod focus;
+mod focus_evidence;
 mod grow;
 mod inertial;
 mod initial;
@@ -30,10 +31,11 @@ mod result;
 mod scale_step;
 mod sigmas;
 mod single_landmark;
+mod system;
 mod thin;
 
 pub use findings::AdjustmentFinding;
-pub use focus::Focus;
+pub use focus_evidence::Focus;
 pub(crate) use inertial::ImuGain;
 pub use log::TrackLog;
 pub(crate) use log::{LoggedState, TrackKey};
@@ -44,15 +46,14 @@ pub use sigmas::CalibrationSigmas;
 
 use crate::imu::{Bias, ImuBuffer, ImuModel, StepNoise};
 use envelope::Envelope;
-use focus::FocusPrior;
 use initial::Guess;
-use linearise::System;
 use loops::Closed;
 use observation::{POSITION, ROTATION, SensorCalibration};
 use optimise::OptimiseReport;
-use problem::{CalibrationPrior, Problem};
+use problem::{CalibrationPrior, FocusPrior, Problem};
 use progress::Watch;
 use std::ops::ControlFlow;
+use system::System;
 use vidar_core::{Duration, RigCamera, Se3};
 
 /// Adjustments of all states at most: another one follows where the clock was corrected.
@@ -169,7 +170,7 @@ pub fn adjust(
     let Passed { mut problem, images, report, clock_offset, .. } = passed;
     let system = optimise::solution(&problem).ok_or(AdjustmentError::Undetermined)?;
     let covariance = system.factor.inverse(problem.calibration_offset());
-    let focus = focus::centre(&mut problem, &system);
+    let focus = focus_evidence::centre(&mut problem, &system);
     let solution = Solution {
         segment,
         problem,
@@ -287,7 +288,7 @@ impl Work {
 
     /// Where the recording shows that the focal length changes, every image gets its own; whether that is new.
     fn doubt_focus(&mut self, problem: &Problem) -> bool {
-        let is_new = self.prior.focus.is_none() && focus::changes(problem);
+        let is_new = self.prior.focus.is_none() && focus_evidence::changes(problem);
         if is_new {
             self.prior.focus = Some(FocusPrior::AUTOFOCUS);
         }

@@ -6,8 +6,9 @@
 
 use super::envelope::Envelope;
 use super::inertial::GAIN_DIM;
-use super::linearise::{self, System, inertial_jacobians};
+use super::linearise::{self, inertial_jacobians};
 use super::problem::{FRAME_DIM, Problem};
+use super::system::System;
 use crate::imu::{ImuModel, StepNoise};
 use nalgebra::SMatrix;
 

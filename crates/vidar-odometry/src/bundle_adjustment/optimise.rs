@@ -1,14 +1,13 @@
 //! Levenberg-Marquardt over the whole recording, with gross errors left out round by round.
 
 use super::AdjustmentError;
-use super::linearise::{
-    Cost, System, cost, cost_with, inertial_error, landmark_cost, linearise, squared_error,
-};
+use super::linearise::{Cost, cost, cost_with, inertial_error, landmark_cost, linearise, squared_error};
 use super::observation::{Landmark, SensorCalibration};
 use super::problem::{FRAME_DIM, Problem};
 use super::progress::Watch;
 use super::scale_step::ScaleStep;
 use super::single_landmark;
+use super::system::System;
 use crate::imu::{NavState, Vector15};
 use nalgebra::Vector3;
 use vidar_solve::levenberg_marquardt::{self, Decrease, Increase, LeastSquares, Limits, Schedule, Trial};

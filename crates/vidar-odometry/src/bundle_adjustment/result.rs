@@ -3,9 +3,9 @@
 use super::envelope::Envelope;
 use super::inertial::GAIN_DIM;
 use super::initial::preintegrate;
-use super::linearise::System;
 use super::observation::TIMING_AND_PLACE;
 use super::problem::Problem;
+use super::system::System;
 use super::{
     AdjustmentFinding, AdjustmentInput, MAX_INERTIAL_CHI2, MAX_REJECTED_SHARE, Measurements, Solution,
 };
