@@ -41,14 +41,14 @@ pub struct RowMotion {
 
 /// How an image differs from what its camera's calibration would show at the instant of its middle row.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct ImageGeometry {
+pub struct ImageWarp {
     /// How the camera moved while the rows were read; `None` for a global shutter, and where it is not known.
     pub rows: Option<RowMotion>,
     /// `ln` of the image's focal length over the calibration's: autofocus changes it.
     pub log_focal: f64,
 }
 
-impl ImageGeometry {
+impl ImageWarp {
     /// The pixel at which the calibrated camera would have seen, at one instant, what the image shows at `pixel`; `None` outside the
     /// camera's domain.
     pub fn as_calibrated(&self, camera: &CameraModel, pixel: &Pixel) -> Option<Pixel> {
@@ -127,7 +127,7 @@ impl ViewShift {
     ///
     /// What the camera's translation shifts depends on the depth, which is taken to be the typical one everywhere: at 0.5 m/s and 30 ms
     /// the first row is 7 mm from the middle one, and what is twice as far away as that is shifted by 0.2° too much at 1 m.
-    pub fn new(camera: &CameraModel, view: &Pinhole, image: &ImageGeometry, least_px: f64) -> Option<Self> {
+    pub fn new(camera: &CameraModel, view: &Pinhole, image: &ImageWarp, least_px: f64) -> Option<Self> {
         let (columns, rows) = (view.width.div_ceil(NODE_SPACING) + 1, view.height.div_ceil(NODE_SPACING) + 1);
         let node = |i: usize| {
             let (x, y) = (i % columns * NODE_SPACING, i / columns * NODE_SPACING);

@@ -4,7 +4,7 @@
 
 use nalgebra::{Vector2, Vector3};
 use vidar_core::camera::{DoubleSphere, Equidistant, Fov, ParametricCamera, RadTan};
-use vidar_core::remap::{ImageGeometry, RemapTable, RowMotion, ViewShift, undistorted_view};
+use vidar_core::remap::{ImageWarp, RemapTable, RowMotion, ViewShift, undistorted_view};
 use vidar_core::{CameraError, CameraModel, FrameImage, Image, LieGroup, Pinhole, So3};
 
 /// Grey level of the world in a unit direction: waves of `wavelength` (rad, in the middle of the view) on the sky.
@@ -319,8 +319,8 @@ fn turning(turn_rad_per_s: Vector3<f64>, readout_secs: f64) -> RowMotion {
     RowMotion { turn_rad_per_s, velocity_m_per_s: Vector3::zeros(), inverse_depth: 0.0, readout_secs }
 }
 
-fn by_rows(rows: RowMotion) -> ImageGeometry {
-    ImageGeometry { rows: Some(rows), log_focal: 0.0 }
+fn by_rows(rows: RowMotion) -> ImageWarp {
+    ImageWarp { rows: Some(rows), log_focal: 0.0 }
 }
 
 #[test]
@@ -330,7 +330,7 @@ fn an_image_with_a_longer_focal_length_is_put_where_the_calibrated_camera_sees_i
             let mut parameters = camera.parameters();
             parameters[..2].iter_mut().for_each(|f| *f *= f64::exp(log_focal));
             let longer = camera.with_parameters(&parameters).unwrap();
-            let image = ImageGeometry { rows: None, log_focal };
+            let image = ImageWarp { rows: None, log_focal };
             let view = undistorted_view(&camera, camera.width(), camera.height()).unwrap();
             let wavelength = 90.0 / camera.intrinsics().fx;
             let taken = FrameImage::Gray8(draw(&longer, wavelength, 1).map(|v| v.round() as u8));

@@ -287,6 +287,21 @@ fn kind_of(reason: &InitFailureReason) -> FailureKind {
     FailureKind { name, is_contradiction: CONTRADICTIONS.contains(&name) }
 }
 
+/// Share of the image from which what moves with the camera is told: single cells may be chance.
+const TOLD_CARRIER_SHARE: f64 = 0.05;
+
+/// What is said of the share of the image that moves with the camera.
+pub(crate) fn carrier_in_view(share: f64) -> Option<Warning> {
+    (share >= TOLD_CARRIER_SHARE).then(|| {
+        let text = format!(
+            "{:.0} % of the picture moves with the camera: its carrier, a finger, something on the lens; no features are taken there",
+            100.0 * share
+        );
+        Warning::new("carrier-in-view", text)
+            .hint("depth there is not the scene's; mount the camera so that it sees the scene alone, or give `--masks`")
+    })
+}
+
 impl SegmentQuality {
     fn new(time: Timestamp, tracking: &Tracking) -> Self {
         Self {

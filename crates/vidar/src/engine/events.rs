@@ -6,7 +6,7 @@ use crate::quality::TrackQuality;
 use std::sync::Arc;
 use vidar_align::Placement;
 use vidar_align::aligner::{ChunkReport, FrameObservation, LoopReport};
-use vidar_core::remap::ImageGeometry;
+use vidar_core::remap::ImageWarp;
 use vidar_core::{
     AlignedView, CameraId, CameraModel, ChunkId, Duration, FrameId, OdometryKeyframe, PointCloud,
     RevisedPose, Se3, Timestamp, TriangleMesh, Warning,
@@ -47,7 +47,7 @@ pub struct MapKeyframe {
     pub world_from_camera: Option<Se3>,
     /// How its image differs from what the calibrated camera would show at one instant; none where it does not, and until the images around
     /// it have poses.
-    pub geometry: Option<ImageGeometry>,
+    pub warp: Option<ImageWarp>,
     /// The odometry's keyframe of the same image, with its landmarks and covariance.
     pub odometry: Option<Arc<OdometryKeyframe>>,
 }
@@ -56,13 +56,13 @@ impl MapKeyframe {
     /// Finds out how its image differs from the calibrated camera's, once the images around it have poses, and puts the odometry's landmarks
     /// where that would have seen them at one instant, as its pixels will be.
     pub(super) fn as_calibrated(&mut self, track: &Segment, readout: Duration, camera: &CameraModel) {
-        if self.geometry.is_some() {
+        if self.warp.is_some() {
             return;
         }
-        self.geometry = track.image_geometry(self.stamp.frame_id, readout);
-        if let (Some(geometry), Some(odometry)) = (&self.geometry, &mut self.odometry) {
+        self.warp = track.image_warp(self.stamp.frame_id, readout);
+        if let (Some(warp), Some(odometry)) = (&self.warp, &mut self.odometry) {
             for landmark in &mut Arc::make_mut(odometry).landmarks {
-                landmark.pixel = geometry.as_calibrated(camera, &landmark.pixel).unwrap_or(landmark.pixel);
+                landmark.pixel = warp.as_calibrated(camera, &landmark.pixel).unwrap_or(landmark.pixel);
             }
         }
     }

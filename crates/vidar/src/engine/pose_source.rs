@@ -3,7 +3,7 @@
 use super::{FrameStamp, FrameState};
 use crate::error::Error;
 use crate::input::trajectory::{MetricTrajectory, TrajectorySource};
-use crate::quality::TrackQuality;
+use crate::quality::{TrackQuality, carrier_in_view};
 use vidar_core::{
     CameraId, Duration, OdometryKeyframe, RevisedPose, Rig, Se3, SensorEvent, Timestamp, Warning,
 };
@@ -220,7 +220,8 @@ impl PoseSource for OdometryPoses {
         let lost = |(time, reason): &(Timestamp, String)| {
             Warning::degraded("track-lost", format!("at {time} s: {reason}")).hint(hint)
         };
-        self.lost.iter().map(lost).chain(self.quality.warning()).collect()
+        let carrier = carrier_in_view(self.odometry.carrier_share());
+        self.lost.iter().map(lost).chain(self.quality.warning()).chain(carrier).collect()
     }
 
     fn why_no_pose(&self) -> String {

@@ -115,8 +115,8 @@ impl<'a> Preview<'a> {
         let seen = wanted.start.saturating_sub(self.context)..wanted.end;
         let mut keyframes = Cow::Borrowed(&keyframes[..wanted.end]);
         for k in seen.clone() {
-            if let Some(geometry) = track.image_geometry(keyframes[k].stamp.frame_id, readout) {
-                keyframes.to_mut()[k].geometry = Some(geometry);
+            if let Some(warp) = track.image_warp(keyframes[k].stamp.frame_id, readout) {
+                keyframes.to_mut()[k].warp = Some(warp);
             }
         }
         // The chunk reports images that cannot be read.
@@ -179,7 +179,7 @@ fn help(track: &Segment, k: usize, readout: Duration) -> MapKeyframe {
     MapKeyframe {
         stamp,
         world_from_camera: Some(world_from_camera),
-        geometry: track.image_geometry(stamp.frame_id, readout),
+        warp: track.image_warp(stamp.frame_id, readout),
         odometry: None,
     }
 }

@@ -37,7 +37,7 @@ impl Selection {
         let keyframe = |f: &PosedFrame| MapKeyframe {
             stamp: f.stamp,
             world_from_camera: Some(f.world_from_camera),
-            geometry: None,
+            warp: None,
             odometry: f.odometry.clone(),
         };
         let is_preferred = |f: &PosedFrame| self.prefers_odometry && f.odometry.is_some();
@@ -72,7 +72,7 @@ impl Selection {
         let keyframe = |stamp: &FrameStamp| MapKeyframe {
             stamp: *stamp,
             world_from_camera: None,
-            geometry: None,
+            warp: None,
             odometry: None,
         };
         if self.config.max_count > 0 && !is_complete && !rule.is_prescribed() {

@@ -25,7 +25,7 @@ impl Engine<'_> {
             let Some(frame) = track.frame(keyframe.stamp.frame_id) else { continue };
             keyframe.world_from_camera = Some(frame.world_from_camera);
             // Its landmarks are put where one instant would have seen them again.
-            (keyframe.geometry, keyframe.odometry) = (None, frame.odometry.clone());
+            (keyframe.warp, keyframe.odometry) = (None, frame.odometry.clone());
             moved.push((frame.stamp.frame_id, frame.world_from_camera));
         }
         world.aligner.revise(&moved);

@@ -3,7 +3,7 @@
 use super::{FrameStamp, FrameState, PoseReport, PoseSource};
 use std::collections::{BTreeMap, VecDeque};
 use std::sync::Arc;
-use vidar_core::remap::{ImageGeometry, RowMotion};
+use vidar_core::remap::{ImageWarp, RowMotion};
 use vidar_core::{Duration, FrameId, LieGroup, OdometryKeyframe, Se3, Timestamp};
 use vidar_odometry::Joined;
 use vidar_solve::statistics::median_upper;
@@ -40,11 +40,11 @@ const SAME_SCENE: Duration = Duration::from_millis(1000);
 
 impl Segment {
     /// How a frame's image differs from what the calibrated camera would show at one instant; none where it does not.
-    pub fn image_geometry(&self, frame: FrameId, readout: Duration) -> Option<ImageGeometry> {
+    pub fn image_warp(&self, frame: FrameId, readout: Duration) -> Option<ImageWarp> {
         let time = self.frame(frame)?.stamp.time;
         let rows = if readout > Duration::ZERO { self.row_motion(frame, readout) } else { None };
         let log_focal = self.log_focal(time);
-        (rows.is_some() || log_focal != 0.0).then_some(ImageGeometry { rows, log_focal })
+        (rows.is_some() || log_focal != 0.0).then_some(ImageWarp { rows, log_focal })
     }
 
     /// `ln` of the focal length at a time over the calibration's, linear between the odometry's keyframes.
@@ -307,7 +307,7 @@ mod tests {
         });
         let odometry = vec![keyframe(1, 0.004), keyframe(4, 0.010)];
         let mut segment = Segment { id: 0, images: 5, frames: frames.into(), odometry, last: None };
-        let of = |segment: &Segment, i: u32| segment.image_geometry(FrameId(i), Duration::ZERO);
+        let of = |segment: &Segment, i: u32| segment.image_warp(FrameId(i), Duration::ZERO);
         for (i, expected) in [(0, 0.004), (1, 0.004), (2, 0.006), (4, 0.010), (5, 0.010)] {
             let found = of(&segment, i).unwrap();
             assert!((found.log_focal - expected).abs() < 1e-12 && found.rows.is_none(), "{i}: {found:?}");

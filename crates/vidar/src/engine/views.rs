@@ -98,9 +98,8 @@ impl<'a> ViewWindow<'a> {
     pub fn load(&self, keyframe: &MapKeyframe) -> Result<MaskedView, Warning> {
         let image = self.images.image(&keyframe.stamp)?;
         let mask = self.images.mask(&keyframe.stamp)?;
-        let shift = keyframe
-            .geometry
-            .and_then(|s| ViewShift::new(&self.camera, self.remap.target(), &s, LEAST_SHIFT_PX));
+        let shift =
+            keyframe.warp.and_then(|s| ViewShift::new(&self.camera, self.remap.target(), &s, LEAST_SHIFT_PX));
         // Every pixel into which an ignored one is mixed; the camera's border is black in the view, not ignored.
         let mask = mask.map(|mask| {
             let white = FrameImage::Gray8(mask.map(|ignored| if *ignored { 255 } else { 0 }));

@@ -3,7 +3,7 @@
 use super::map::MapUse;
 use super::{NEVER_STARTED, adjusted};
 use crate::input::UnseenScale;
-use crate::quality::TrackQuality;
+use crate::quality::{TrackQuality, carrier_in_view};
 use crate::verdict::{ScaleSource, StatedScale};
 use std::collections::{BTreeMap, BTreeSet};
 use vidar_core::{BodyFrame, FrameId, OdometryKeyframe, RevisedPose, StampedPose, Trajectory, Warning};
@@ -47,9 +47,6 @@ pub struct ApartSpan {
     /// Images with a state.
     pub images: usize,
 }
-
-/// Share of the image from which what moves with the camera is told: single cells may be chance.
-const TOLD_CARRIER_SHARE: f64 = 0.05;
 
 /// All outputs of the odometry on a recording.
 #[derive(Clone, Debug, Default)]
@@ -243,16 +240,7 @@ impl Tracked {
             warnings.push(Warning::degraded(NEVER_STARTED, text).hint(hint));
         }
         warnings.extend(self.quality.warning());
-        if self.carrier_share >= TOLD_CARRIER_SHARE {
-            let text = format!(
-                "{:.0} % of the picture moves with the camera: its carrier, a finger, something on the lens; no features are taken there",
-                100.0 * self.carrier_share
-            );
-            warnings.push(
-                Warning::new("carrier-in-view", text)
-                    .hint("the map has no depth there; mount the camera so that it sees the scene alone"),
-            );
-        }
+        warnings.extend(carrier_in_view(self.carrier_share));
         if let (Some(reason), true) = (&self.not_adjusted, self.quality.longest().is_some()) {
             warnings.push(Warning::degraded("not-adjusted", format!("the live states are final: {reason}")));
         }
