@@ -52,7 +52,7 @@ impl ImageWarp {
     /// The pixel at which the calibrated camera would have seen, at one instant, what the image shows at `pixel`; `None` outside the
     /// camera's domain.
     pub fn as_calibrated(&self, camera: &CameraModel, pixel: &Pixel) -> Option<Pixel> {
-        let pixel = magnified(camera, pixel, -self.log_focal);
+        let pixel = camera.magnified(pixel, -self.log_focal);
         match &self.rows {
             Some(rows) => rows.at_once(camera, &pixel),
             None => Some(pixel),
@@ -65,17 +65,8 @@ impl ImageWarp {
             Some(rows) => rows.in_row(camera, ray)?,
             None => camera.project(ray)?,
         };
-        Some(magnified(camera, &pixel, self.log_focal))
+        Some(camera.magnified(&pixel, self.log_focal))
     }
-}
-
-/// Where an image with another focal length shows what the camera's shows at `pixel`.
-fn magnified(camera: &CameraModel, pixel: &Pixel, log_focal: f64) -> Pixel {
-    if log_focal == 0.0 {
-        return *pixel;
-    }
-    let centre = camera.principal_point();
-    centre + (pixel - centre) * log_focal.exp()
 }
 
 impl RowMotion {

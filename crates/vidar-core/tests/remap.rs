@@ -327,9 +327,7 @@ fn by_rows(rows: RowMotion) -> ImageWarp {
 fn an_image_with_a_longer_focal_length_is_put_where_the_calibrated_camera_sees_it() {
     for log_focal in [-0.015, 0.02] {
         for camera in distorted_cameras() {
-            let mut parameters = camera.parameters();
-            parameters[..2].iter_mut().for_each(|f| *f *= f64::exp(log_focal));
-            let longer = camera.with_parameters(&parameters).unwrap();
+            let longer = camera.with_longer_focal(log_focal).unwrap();
             let image = ImageWarp { rows: None, log_focal };
             let view = undistorted_view(&camera, camera.width(), camera.height()).unwrap();
             let wavelength = 90.0 / camera.intrinsics().fx;

@@ -142,6 +142,25 @@ impl CameraModel {
         })
     }
 
+    /// Where an image with focal lengths `exp(log_focal)` times as long shows what this camera's shows at `pixel`.
+    pub fn magnified(&self, pixel: &Pixel, log_focal: f64) -> Pixel {
+        if log_focal == 0.0 {
+            return *pixel;
+        }
+        let centre = self.principal_point();
+        centre + (pixel - centre) * log_focal.exp()
+    }
+
+    /// This camera with focal lengths `exp(log_focal)` times as long.
+    ///
+    /// # Errors
+    /// They are not those of a camera.
+    pub fn with_longer_focal(&self, log_focal: f64) -> Result<Self, CameraError> {
+        let mut parameters = self.parameters();
+        parameters[..2].iter_mut().for_each(|focal| *focal *= log_focal.exp());
+        self.with_parameters(&parameters)
+    }
+
     /// Names of the intrinsic parameters, fx, fy, cx, cy first.
     pub fn parameter_names(&self) -> &'static [&'static str] {
         match self {

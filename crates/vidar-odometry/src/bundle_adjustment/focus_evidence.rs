@@ -1,7 +1,7 @@
 //! Whether a recording shows that the focal length changes, and what it was found to be.
 
 use super::focus::log_det;
-use super::linearise::linearise;
+use super::optimise;
 use super::problem::{FRAME_DIM, FocusPrior, Problem};
 use super::system::System;
 use crate::backend::dot;
@@ -11,18 +11,18 @@ use crate::backend::dot;
 /// 1120, those that were given one 2 % off 240 to 320.
 const DECISIVE: f64 = 10.0;
 
-/// Whether the measurements speak for a focal length that changes.
-pub(super) fn changes(problem: &Problem) -> bool {
-    log_bayes_factor(problem, FocusPrior::HARMFUL).is_some_and(|ln| ln > DECISIVE)
+/// Whether the measurements speak for a focal length that changes; `system` is that of the solution with one for all.
+pub(super) fn changes(problem: &Problem, system: &System) -> bool {
+    log_bayes_factor(problem, system, FocusPrior::HARMFUL).is_some_and(|ln| ln > DECISIVE)
 }
 
 /// `ln` of how many times more probable the measurements are with a focal length of its own for every image than with one for all (Laplace's
 /// approximation at the solution with one); `None` where the system is singular.
-fn log_bayes_factor(problem: &Problem, prior: FocusPrior) -> Option<f64> {
-    let one = Fit::of(problem)?;
+fn log_bayes_factor(problem: &Problem, system: &System, prior: FocusPrior) -> Option<f64> {
+    let one = Fit::of(system);
     let mut with = problem.clone();
     with.prior.focus = Some(prior);
-    let each = Fit::of(&with)?;
+    let each = Fit::of(&optimise::solution(&with)?);
     let prior_log_det = log_det(problem, prior);
     let occam = 0.5 * (prior_log_det - (each.log_det - one.log_det));
     Some(each.decrease - one.decrease + occam)
@@ -36,16 +36,11 @@ struct Fit {
 }
 
 impl Fit {
-    fn of(problem: &Problem) -> Option<Self> {
-        let mut system = System::new(problem);
-        linearise(problem, 0.0, &mut system);
-        if !system.h.factorise(&vec![0.0; problem.dim()], &mut system.factor) {
-            return None;
-        }
+    fn of(system: &System) -> Self {
         let mut whitened = system.gradient.clone();
         system.factor.forward(&mut whitened);
-        let log_det = 2.0 * (0..problem.dim()).map(|k| system.factor.diagonal(k).ln()).sum::<f64>();
-        Some(Self { decrease: 0.5 * dot(&whitened, &whitened), log_det })
+        let log_det = 2.0 * (0..system.factor.dim()).map(|k| system.factor.diagonal(k).ln()).sum::<f64>();
+        Self { decrease: 0.5 * dot(&whitened, &whitened), log_det }
     }
 }
 
@@ -71,9 +66,7 @@ pub(super) fn centre(problem: &mut Problem, system: &System) -> Option<Focus> {
     let mut slope = vec![0.0; problem.dim()];
     (0..problem.frames.len()).for_each(|k| slope[problem.offset(k) + FRAME_DIM] = 1.0 / count);
     let mean_sigma = system.sigma_of(slope);
-    let mut parameters = problem.calibration.camera.parameters();
-    parameters[..2].iter_mut().for_each(|focal| *focal *= mean.exp());
-    problem.calibration.camera = problem.calibration.camera.with_parameters(&parameters).ok()?;
+    problem.calibration.camera = problem.calibration.camera.with_longer_focal(mean).ok()?;
     problem.frames.iter_mut().for_each(|f| f.body.log_focal -= mean);
     Some(Focus { mean, mean_sigma, spread })
 }

@@ -252,7 +252,7 @@ pub(super) fn first_guess(
 ) -> Option<Landmark> {
     let ray = |o: &WhitenedObservation| {
         let camera = observation::camera_pose(&frames[o.frame].body, calibration, &o.pixel);
-        let pixel = calibration.magnified(&o.pixel, -frames[o.frame].body.log_focal);
+        let pixel = calibration.camera.magnified(&o.pixel, -frames[o.frame].body.log_focal);
         Some((camera.translation, camera.rotation.act(&calibration.camera.unproject(&pixel)?)))
     };
     let (origin, direction) = ray(observations.first()?)?;

@@ -151,7 +151,9 @@ pub fn adjust(
     let mut passed = work.pass(&recording, &mut watch)?;
     for _ in 1..PASSES {
         // One focal length for all where it changes puts the camera elsewhere: the place is not judged by that.
-        let is_doubted = work.doubt_focus(&passed.problem) || work.doubt_given(&passed.problem)?;
+        let system = optimise::solution(&passed.problem).ok_or(AdjustmentError::Undetermined)?;
+        let is_doubted =
+            work.doubt_focus(&passed.problem, &system) || work.doubt_given(&passed.problem, &system);
         if passed.is_settled && !is_doubted {
             break;
         }
@@ -161,7 +163,8 @@ pub fn adjust(
     let inertial_chi2_per_dof = optimise::inertial_chi2_per_dof(&passed.problem);
     let mut model = weigh(input, &mut passed, &mut watch)?;
     // With noise that is taken for several times as large as it is, a lever arm that is 10 cm off was no contradiction.
-    if work.doubt_given(&passed.problem)? {
+    let system = optimise::solution(&passed.problem).ok_or(AdjustmentError::Undetermined)?;
+    if work.doubt_given(&passed.problem, &system) {
         passed = work.pass(&recording, &mut watch)?;
         model = weigh(input, &mut passed, &mut watch)?;
     }
@@ -287,8 +290,8 @@ impl Work {
     }
 
     /// Where the recording shows that the focal length changes, every image gets its own; whether that is new.
-    fn doubt_focus(&mut self, problem: &Problem) -> bool {
-        let is_new = self.prior.focus.is_none() && focus_evidence::changes(problem);
+    fn doubt_focus(&mut self, problem: &Problem, system: &System) -> bool {
+        let is_new = self.prior.focus.is_none() && focus_evidence::changes(problem, system);
         if is_new {
             self.prior.focus = Some(FocusPrior::AUTOFOCUS);
         }
@@ -297,8 +300,8 @@ impl Work {
 
     /// Where the recording contradicts the place of the camera that was given, its prior is widened, so that it no longer pulls;
     /// whether it was.
-    fn doubt_given(&mut self, problem: &Problem) -> Result<bool, AdjustmentError> {
-        let covariance = noise::covariance(problem).ok_or(AdjustmentError::Undetermined)?;
+    fn doubt_given(&mut self, problem: &Problem, system: &System) -> bool {
+        let covariance = system.factor.inverse(problem.calibration_offset());
         let departures = findings::departures(problem, &covariance);
         let mut widened = false;
         for (at, widest) in [(ROTATION, WIDE_ROTATION_RAD), (POSITION, WIDE_POSITION_M)] {
@@ -308,7 +311,7 @@ impl Work {
                 widened = true;
             }
         }
-        Ok(widened)
+        widened
     }
 }
 

@@ -69,7 +69,8 @@ pub(crate) fn newest_state(input: &AdjustmentInput<'_>) -> Result<NewestState, A
         passed = work.pass(&recording, &mut watch)?;
     }
     for _ in 1..PASSES {
-        if passed.is_settled && !work.doubt_focus(&passed.problem) {
+        let doubts = |system| work.doubt_focus(&passed.problem, &system);
+        if passed.is_settled && !optimise::solution(&passed.problem).is_some_and(doubts) {
             break;
         }
         passed = work.pass(&recording, &mut watch)?;

@@ -6,9 +6,9 @@
 
 use super::envelope::Envelope;
 use super::inertial::GAIN_DIM;
-use super::linearise::{self, inertial_jacobians};
+use super::linearise::inertial_jacobians;
+use super::optimise;
 use super::problem::{FRAME_DIM, Problem};
-use super::system::System;
 use crate::imu::{ImuModel, StepNoise};
 use nalgebra::SMatrix;
 
@@ -98,8 +98,5 @@ pub(super) fn largest_change(before: &ImuModel, after: &ImuModel) -> f64 {
 
 /// The covariance within the envelope at the present values; `None` where the solution is not determined.
 pub(super) fn covariance(problem: &Problem) -> Option<Envelope> {
-    let mut system = System::new(problem);
-    linearise::linearise(problem, 0.0, &mut system);
-    let is_definite = system.h.factorise(&vec![0.0; problem.dim()], &mut system.factor);
-    is_definite.then(|| system.factor.inverse(problem.calibration_offset()))
+    optimise::solution(problem).map(|system| system.factor.inverse(problem.calibration_offset()))
 }

@@ -118,15 +118,6 @@ impl SensorCalibration {
         self.clock_secs + self.row_share(row) * self.readout_secs
     }
 
-    /// Where an image with another focal length shows what the calibration's shows at `pixel`.
-    pub(super) fn magnified(&self, pixel: &Pixel, log_focal: f64) -> Pixel {
-        if log_focal == 0.0 {
-            return *pixel;
-        }
-        let centre = self.camera.principal_point();
-        centre + (pixel - centre) * log_focal.exp()
-    }
-
     /// Unknowns.
     pub(super) fn dim(&self) -> usize {
         TIMING_AND_PLACE + self.camera.parameters().len() + GAIN_DIM
@@ -191,7 +182,7 @@ pub(super) fn project(
 ) -> Option<Pixel> {
     let camera = camera_pose(body, calibration, measured);
     let ray = camera.rotation.inverse().act(&from_camera(landmark, &camera.translation));
-    Some(calibration.magnified(&calibration.camera.project(&ray)?, body.log_focal))
+    Some(calibration.camera.magnified(&calibration.camera.project(&ray)?, body.log_focal))
 }
 
 /// Direction from a camera at `place` to the landmark, world axes, scaled by the inverse distance from its origin.
@@ -217,7 +208,7 @@ pub(super) fn linearise(
     let ray = camera_from_world * from_camera(landmark, &camera.translation);
     let (pixel, mut parameters) = calibration.camera.project_with_parameter_jacobian(&ray)?;
     let (_, by_ray) = calibration.camera.project_with_jacobian(&ray)?;
-    let (pixel, factor) = (calibration.magnified(&pixel, body.log_focal), body.log_focal.exp());
+    let (pixel, factor) = (calibration.camera.magnified(&pixel, body.log_focal), body.log_focal.exp());
     let by_ray = by_ray * factor;
     parameters *= factor;
     for axis in 0..2 {
@@ -290,7 +281,7 @@ pub(super) mod tests {
         };
         let measured = Pixel::new(400.0, 100.0);
         let camera = camera_pose(&body, &calibration, &measured);
-        let seen = calibration.magnified(&Pixel::new(410.0, 120.0), -body.log_focal);
+        let seen = calibration.camera.magnified(&Pixel::new(410.0, 120.0), -body.log_focal);
         let bearing = calibration.camera.unproject(&seen).unwrap();
         // Counted from somewhere else than this camera.
         let origin = camera.translation + Vector3::new(0.3, 0.2, -0.1);

@@ -2,13 +2,13 @@
 
 use super::AdjustmentError;
 use super::linearise::{Cost, cost, cost_with, inertial_error, landmark_cost, linearise, squared_error};
-use super::observation::{Landmark, SensorCalibration};
+use super::observation::{Landmark, MovingBody, SensorCalibration};
 use super::problem::{FRAME_DIM, Problem};
 use super::progress::Watch;
 use super::scale_step::ScaleStep;
 use super::single_landmark;
 use super::system::System;
-use crate::imu::{NavState, Vector15};
+use crate::imu::Vector15;
 use nalgebra::Vector3;
 use vidar_solve::levenberg_marquardt::{self, Decrease, Increase, LeastSquares, Limits, Schedule, Trial};
 
@@ -180,8 +180,7 @@ fn follow(problem: &mut Problem) {
 /// The unknowns' values, to go back to.
 #[derive(Default)]
 struct Values {
-    states: Vec<NavState>,
-    log_focals: Vec<f64>,
+    bodies: Vec<MovingBody>,
     landmarks: Vec<Landmark>,
     /// Cost of each landmark.
     costs: Vec<f64>,
@@ -190,10 +189,8 @@ struct Values {
 
 impl Values {
     fn keep(&mut self, problem: &Problem) {
-        self.states.clear();
-        self.states.extend(problem.frames.iter().map(|f| f.body.state));
-        self.log_focals.clear();
-        self.log_focals.extend(problem.frames.iter().map(|f| f.body.log_focal));
+        self.bodies.clear();
+        self.bodies.extend(problem.frames.iter().map(|f| f.body));
         self.landmarks.clear();
         self.landmarks.extend(problem.landmarks.iter().map(|l| l.landmark));
         self.costs.clear();
@@ -215,12 +212,7 @@ impl Values {
     }
 
     fn restore(&self, problem: &mut Problem) {
-        problem.frames.iter_mut().zip(&self.states).for_each(|(f, state)| f.body.state = *state);
-        problem
-            .frames
-            .iter_mut()
-            .zip(&self.log_focals)
-            .for_each(|(f, log_focal)| f.body.log_focal = *log_focal);
+        problem.frames.iter_mut().zip(&self.bodies).for_each(|(f, body)| f.body = *body);
         problem.landmarks.iter_mut().zip(&self.landmarks).for_each(|(l, landmark)| l.landmark = *landmark);
         if let Some(calibration) = &self.calibration {
             problem.calibration.clone_from(calibration);

@@ -157,7 +157,8 @@ impl Simulation {
             let bias = biases[((exposed * config.imu_rate_hz).round() as usize).min(biases.len() - 1)];
             let truth = NavState { world_from_body: motion.world_from_body, velocity: motion.velocity, bias };
             let camera_from_world = (motion.world_from_body * body_from_camera).inverse();
-            let camera = magnified(&camera, config.log_focal_at(at));
+            let log_focal = config.log_focal_at(at);
+            let camera = camera.with_longer_focal(log_focal).unwrap_or_else(|_| camera.clone());
             let observations = tracker.look(&points, &camera, &camera_from_world, config, &mut random);
             all.push(SimulatedFrame { id: FrameId(k as u32), time: stamp(at), truth, observations });
         }
@@ -169,13 +170,6 @@ impl Simulation {
     pub fn point(&self, track: LandmarkId) -> Option<Vector3<f64>> {
         self.points.get(*self.point_of.get(track.index())?).copied()
     }
-}
-
-/// The camera with its focal lengths multiplied.
-fn magnified(camera: &CameraModel, log_focal: f64) -> CameraModel {
-    let mut parameters = camera.parameters();
-    parameters[..2].iter_mut().for_each(|focal| *focal *= log_focal.exp());
-    camera.with_parameters(&parameters).unwrap_or_else(|_| camera.clone())
 }
 
 fn simulate_imu(
