@@ -144,7 +144,7 @@ fn focal_length(focus: &Focus) -> Warning {
         100.0 * focus.spread
     );
     Warning::new("focus-changes", text).hint(
-        "lock the focus before filming: `vidar live` and the live trajectory take one focal length for all images, and their scale is worse for it",
+        "lock the focus before filming, and switch stabilisation off, which may look alike: `vidar live` and the live trajectory take one focal length for all images, and their scale is worse for it",
     )
 }
 
