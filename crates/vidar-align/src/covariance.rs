@@ -63,7 +63,7 @@ mod tests {
             gravity_in_world: Vector3::new(0.0, 0.0, -9.81),
             scale_std: 0.01,
             health: Health::Ok,
-            log_focal: 0.0,
+            lens: vidar_core::LensMotion::NONE,
             landmarks: Vec::new(),
         }
     }

@@ -76,7 +76,7 @@ pub mod trajectory;
 pub mod umeyama;
 pub mod warning;
 
-pub use camera::{CameraError, CameraModel, ParametricCamera, Pinhole};
+pub use camera::{CameraError, CameraModel, LensMotion, ParametricCamera, Pinhole};
 pub use geometry::{AlignedView, Confidence, GeometryError, MetricDepth, RelativeDepth};
 pub use id::{CameraId, ChunkId, FrameId, KeyframeId, LandmarkId};
 pub use image::{FrameImage, Image, ImageError};

@@ -3,7 +3,7 @@
 //! The error state of a frame is `[δθ, δp, δv, δb_gyro, δb_accel]`, three numbers each: `R · exp(δθ)` in the body
 //! frame, `p + δp` and `v + δv` in the world frame, additive biases. Covariances have the same order and units.
 
-use crate::camera::Pixel;
+use crate::camera::{LensMotion, Pixel};
 use crate::id::{FrameId, KeyframeId, LandmarkId};
 use crate::lie::Se3;
 use crate::time::Timestamp;
@@ -135,8 +135,8 @@ pub struct OdometryKeyframe {
     pub scale_std: f64,
     /// Tracking health when it was created.
     pub health: Health,
-    /// `ln` of the focal length in its image over the calibration's: autofocus changes it. Zero where one holds for all images.
-    pub log_focal: f64,
+    /// How the lens had moved when its image was taken; [`LensMotion::NONE`] where one calibration holds for all images.
+    pub lens: LensMotion,
     /// The landmarks it observes.
     pub landmarks: Vec<SparseLandmark>,
 }

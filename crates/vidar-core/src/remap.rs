@@ -5,7 +5,7 @@
 //! of positions spread over the pixel's area and [`RemapTable::apply`] averages them: an area average, so that fine
 //! texture becomes grey instead of aliasing.
 
-use crate::camera::{CameraError, CameraModel, Pinhole, Pixel};
+use crate::camera::{CameraError, CameraModel, LensMotion, Pinhole, Pixel};
 use crate::image::{FrameImage, Image};
 use crate::lie::{LieGroup, So3};
 use nalgebra::{Matrix3x2, Vector2, Vector3};
@@ -44,15 +44,15 @@ pub struct RowMotion {
 pub struct ImageWarp {
     /// How the camera moved while the rows were read; `None` for a global shutter, and where it is not known.
     pub rows: Option<RowMotion>,
-    /// `ln` of the image's focal length over the calibration's: autofocus changes it.
-    pub log_focal: f64,
+    /// How the lens had moved when it was taken.
+    pub lens: LensMotion,
 }
 
 impl ImageWarp {
     /// The pixel at which the calibrated camera would have seen, at one instant, what the image shows at `pixel`; `None` outside the
     /// camera's domain.
     pub fn as_calibrated(&self, camera: &CameraModel, pixel: &Pixel) -> Option<Pixel> {
-        let pixel = camera.magnified(pixel, -self.log_focal);
+        let pixel = self.lens.calibrated(camera, pixel, self.row_secs(camera, pixel));
         match &self.rows {
             Some(rows) => rows.at_once(camera, &pixel),
             None => Some(pixel),
@@ -65,7 +65,12 @@ impl ImageWarp {
             Some(rows) => rows.in_row(camera, ray)?,
             None => camera.project(ray)?,
         };
-        Some(camera.magnified(&pixel, self.log_focal))
+        Some(self.lens.shown(camera, &pixel, self.row_secs(camera, &pixel)))
+    }
+
+    /// How long after the middle row a pixel was read, s.
+    fn row_secs(&self, camera: &CameraModel, pixel: &Pixel) -> f64 {
+        self.rows.as_ref().map_or(0.0, |rows| rows.row_secs(camera, pixel))
     }
 }
 

@@ -5,7 +5,7 @@
 use nalgebra::{Vector2, Vector3};
 use vidar_core::camera::{DoubleSphere, Equidistant, Fov, ParametricCamera, RadTan};
 use vidar_core::remap::{ImageWarp, RemapTable, RowMotion, ViewShift, undistorted_view};
-use vidar_core::{CameraError, CameraModel, FrameImage, Image, LieGroup, Pinhole, So3};
+use vidar_core::{CameraError, CameraModel, FrameImage, Image, LensMotion, LieGroup, Pinhole, So3};
 
 /// Grey level of the world in a unit direction: waves of `wavelength` (rad, in the middle of the view) on the sky.
 fn grey(direction: &Vector3<f64>, wavelength: f64) -> f64 {
@@ -320,22 +320,29 @@ fn turning(turn_rad_per_s: Vector3<f64>, readout_secs: f64) -> RowMotion {
 }
 
 fn by_rows(rows: RowMotion) -> ImageWarp {
-    ImageWarp { rows: Some(rows), log_focal: 0.0 }
+    ImageWarp { rows: Some(rows), lens: LensMotion::NONE }
 }
 
 #[test]
-fn an_image_with_a_longer_focal_length_is_put_where_the_calibrated_camera_sees_it() {
-    for log_focal in [-0.015, 0.02] {
+fn an_image_of_a_moved_lens_is_put_where_the_calibrated_camera_sees_it() {
+    for (log_focal, shift) in
+        [(-0.015, [0.0, 0.0]), (0.02, [0.0, 0.0]), (0.0, [0.02, -0.01]), (0.01, [-0.015, 0.01])]
+    {
         for camera in distorted_cameras() {
-            let longer = camera.with_longer_focal(log_focal).unwrap();
-            let image = ImageWarp { rows: None, log_focal };
+            let mut parameters = camera.with_longer_focal(log_focal).unwrap().parameters();
+            for axis in 0..2 {
+                parameters[2 + axis] += shift[axis] * camera.focal_lengths()[axis];
+            }
+            let moved = camera.with_parameters(&parameters).unwrap();
+            let lens = LensMotion { log_focal, shift: shift.into(), ..LensMotion::NONE };
+            let image = ImageWarp { rows: None, lens };
             let view = undistorted_view(&camera, camera.width(), camera.height()).unwrap();
             let wavelength = 90.0 / camera.intrinsics().fx;
-            let taken = FrameImage::Gray8(draw(&longer, wavelength, 1).map(|v| v.round() as u8));
+            let taken = FrameImage::Gray8(draw(&moved, wavelength, 1).map(|v| v.round() as u8));
             let expected = draw(&CameraModel::Pinhole(view), wavelength, 1);
             let shift = ViewShift::new(&camera, &view, &image, 0.25).unwrap();
             let found = RemapTable::new(&camera, &view).apply_shifted(&taken, Some(&shift)).to_gray_f32();
-            // Without what the longer lens does not see at the border.
+            // Without what the moved lens does not see at the border.
             for y in (view.height / 6..view.height * 5 / 6).step_by(7) {
                 for x in (view.width / 6..view.width * 5 / 6).step_by(7) {
                     let off = (f64::from(found[(x, y)]) - expected[(x, y)]).abs();
@@ -343,7 +350,7 @@ fn an_image_with_a_longer_focal_length_is_put_where_the_calibrated_camera_sees_i
                 }
             }
             let ray = Vector3::new(0.2, -0.1, 1.0);
-            let back = image.as_calibrated(&camera, &longer.project(&ray).unwrap()).unwrap();
+            let back = image.as_calibrated(&camera, &moved.project(&ray).unwrap()).unwrap();
             assert!((back - camera.project(&ray).unwrap()).norm() < 1e-9, "{}", camera.name());
         }
     }

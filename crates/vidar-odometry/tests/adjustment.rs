@@ -28,16 +28,16 @@ const CONSUMER: ImuNoise = ImuNoise {
 
 /// A flight of `secs` at `speed`, with gains that are off by `gain` (standard deviation, relative).
 fn logged(seed: u64, secs: f64, speed: f64, gain: f64, settings: &AdjustSettings) -> Logged {
-    logged_with(seed, secs, speed, gain, [0.0; 2], settings)
+    logged_with(seed, secs, speed, gain, &SimulationConfig::default(), settings)
 }
 
-/// The same with a focal length that is off by a mean and an amplitude.
+/// The same with a lens that moves as `lens` says.
 fn logged_with(
     seed: u64,
     secs: f64,
     speed: f64,
     gain: f64,
-    log_focal: [f64; 2],
+    lens: &SimulationConfig,
     settings: &AdjustSettings,
 ) -> Logged {
     let mut random = Random::new(900 + seed);
@@ -50,8 +50,7 @@ fn logged_with(
         noise: CONSUMER,
         gyro_scale: scale(),
         accel_scale: scale(),
-        log_focal,
-        ..SimulationConfig::default()
+        ..lens.clone()
     };
     Logged::new(&Simulation::new(&course, 0.0, secs, &config), 2, seed, settings)
 }
@@ -110,8 +109,9 @@ fn focus(adjusted: &Adjusted) -> Option<Focus> {
 #[test]
 fn a_focal_length_that_changes_is_found_in_every_image() {
     let (mut ln_s_nees, flights) = (0.0, 4);
+    let config = SimulationConfig { log_focal: [0.0, 0.015], ..SimulationConfig::default() };
     for seed in 0..flights {
-        let flight = logged_with(seed, 12.0, 1.0, 0.0, [0.0, 0.015], &settings());
+        let flight = logged_with(seed, 12.0, 1.0, 0.0, &config, &settings());
         let adjusted = adjust(&flight, &settings());
         let found = focus(&adjusted).unwrap_or_else(|| panic!("flight {seed}: {:?}", adjusted.findings));
         // A sine has 0.7 of its amplitude.
@@ -120,10 +120,9 @@ fn a_focal_length_that_changes_is_found_in_every_image() {
             "flight {seed}: {found:?}"
         );
         let begin = flight.truth[0].1;
-        let config = SimulationConfig { log_focal: [0.0, 0.015], ..SimulationConfig::default() };
         for keyframe in &adjusted.keyframes {
             let at = (flight.truth[keyframe.frame_id.index()].1 - begin).as_secs_f64();
-            let error = found.mean + keyframe.log_focal - config.log_focal_at(at);
+            let error = found.mean + keyframe.lens.log_focal - config.lens_at(at).log_focal;
             assert!(error.abs() < 0.004, "flight {seed}, {at} s: {error}");
         }
         ln_s_nees += (flight.log_scale_error(&adjusted) / adjusted.scale_std).powi(2);
@@ -134,9 +133,49 @@ fn a_focal_length_that_changes_is_found_in_every_image() {
 }
 
 #[test]
+fn a_stabilised_lens_is_found_in_every_image() {
+    let (mut ln_s_nees, flights) = (0.0, 4);
+    let config = SimulationConfig { shift: 0.008, ..SimulationConfig::default() };
+    for seed in 0..flights {
+        let flight = logged_with(seed, 12.0, 1.0, 0.0, &config, &settings());
+        let adjusted = adjust(&flight, &settings());
+        let found = adjusted.findings.iter().find_map(|f| match f {
+            AdjustmentFinding::Stabilised { rms } => Some(*rms),
+            _ => None,
+        });
+        // Two sines in quadrature have one's amplitude.
+        let rms = found.unwrap_or_else(|| panic!("flight {seed}: {:?}", adjusted.findings));
+        assert!(
+            (rms - 0.008).abs() < 0.001 && adjusted.findings.len() == 1,
+            "flight {seed}: {:?}",
+            adjusted.findings
+        );
+        let begin = flight.truth[0].1;
+        let off = |k: &OdometryKeyframe| {
+            let at = (flight.truth[k.frame_id.index()].1 - begin).as_secs_f64();
+            (k.lens.shift - config.lens_at(at).shift).norm_squared()
+        };
+        let count = adjusted.keyframes.len() as f64;
+        let error = (adjusted.keyframes.iter().map(off).sum::<f64>() / count).sqrt();
+        println!(
+            "flight {seed}: rms {rms:.5}, error {error:.5}, ate {:.4}, ln s {:.4} at {:.4}",
+            ate_m(&flight, &adjusted),
+            flight.log_scale_error(&adjusted),
+            adjusted.scale_std
+        );
+        assert!(error < 0.003, "flight {seed}: {error}");
+        ln_s_nees += (flight.log_scale_error(&adjusted) / adjusted.scale_std).powi(2);
+        assert!(ate_m(&flight, &adjusted) < 0.03, "flight {seed}: {} m", ate_m(&flight, &adjusted));
+    }
+    // χ² of four at 99.9 %.
+    assert!(ln_s_nees < 18.5, "{ln_s_nees} of {flights}");
+}
+
+#[test]
 fn a_focal_length_that_is_given_wrong_is_found_and_told() {
     for (seed, off) in [(1, 0.02), (2, -0.015)] {
-        let flight = logged_with(seed, 10.0, 1.0, 0.0, [off, 0.0], &settings());
+        let config = SimulationConfig { log_focal: [off, 0.0], ..SimulationConfig::default() };
+        let flight = logged_with(seed, 10.0, 1.0, 0.0, &config, &settings());
         let adjusted = adjust(&flight, &settings());
         let found = focus(&adjusted).unwrap_or_else(|| panic!("flight {seed}: {:?}", adjusted.findings));
         assert!((found.mean - off).abs() < 4.0 * found.mean_sigma.max(2e-4), "flight {seed}: {found:?}");

@@ -7,7 +7,7 @@ use serde_json::{Value, json};
 use std::collections::BTreeMap;
 use std::collections::btree_map::Entry;
 use vidar_core::{Health, LieGroup, Timestamp, Warning};
-use vidar_odometry::bundle_adjustment::Adjusted;
+use vidar_odometry::bundle_adjustment::{Adjusted, AdjustmentFinding, AdjustmentReport};
 use vidar_odometry::initialization::InitFailureReason;
 use vidar_odometry::{Joined, LossReason, OdometryOutput, Status, Tracking};
 
@@ -47,6 +47,9 @@ struct AdjustedQuality {
     /// Whether it found what was given of the calibration wrong.
     #[serde(default)]
     contradicts_given: bool,
+    /// See [`vidar_odometry::bundle_adjustment::AdjustmentReport::noise_ratio`].
+    #[serde(default)]
+    noise_ratio: f64,
 }
 
 /// States of one segment.
@@ -115,7 +118,11 @@ impl TrackQuality {
             last: last.1.time,
             scale_std: adjusted.scale_std,
             inertial_chi2: adjusted.report.inertial_chi2_per_dof,
-            contradicts_given: !adjusted.findings.is_empty(),
+            contradicts_given: adjusted
+                .findings
+                .iter()
+                .any(|finding| !matches!(finding, AdjustmentFinding::Stabilised { .. })),
+            noise_ratio: adjusted.report.noise_ratio,
         });
     }
 
@@ -172,6 +179,18 @@ impl TrackQuality {
     /// clock 200 ms off once gave a scale 37 % off like that.
     pub fn is_doubtful(&self) -> bool {
         self.contradicts() && !self.is_adjusted() && self.healthy() < DOUBTFUL_HEALTH
+    }
+
+    /// The degradation that it is where noise does not explain what the adjustment left between camera and IMU.
+    pub(crate) fn unexplained(&self) -> Option<Warning> {
+        let ratio =
+            self.adjusted.map(|a| a.noise_ratio).filter(|r| *r > AdjustmentReport::EXPLAINED_NOISE)?;
+        let text = format!(
+            "camera and IMU differ by {ratio:.1} times the IMU's own noise: something about the recording is not as it is taken to be; what is stated of the scale is multiplied by that"
+        );
+        Some(Warning::degraded("motion-unexplained", text).hint(
+            "a camera that is loose on the IMU, things that move with it or fill the view, stabilisation, a wrong calibration; docs/failures.md lists causes",
+        ))
     }
 
     /// The degradation that doubtful states are.

@@ -90,6 +90,9 @@ impl Findings {
             let why = quality.why_not_started().unwrap_or_default();
             format!("before it started: {why}")
         });
+        if let Some(unexplained) = quality.unexplained() {
+            self.add(Level::Caution, unexplained.message);
+        }
         self.when(quality.losses > 0, Level::Caution, || format!("tracking was lost {}x", quality.losses));
         self.when(quality.healthy() < GOOD_HEALTH, Level::Caution, || {
             format!("health is OK in {:.0} % of the states", 100.0 * quality.healthy())

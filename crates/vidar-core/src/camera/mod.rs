@@ -5,6 +5,7 @@
 mod double_sphere;
 mod equidistant;
 mod fov;
+mod lens;
 mod parametric;
 mod pinhole;
 mod radtan;
@@ -12,6 +13,7 @@ mod radtan;
 pub use double_sphere::DoubleSphere;
 pub use equidistant::Equidistant;
 pub use fov::Fov;
+pub use lens::LensMotion;
 pub use parametric::{InvalidExample, ParametricCamera};
 pub use pinhole::Pinhole;
 pub use radtan::RadTan;
@@ -142,13 +144,12 @@ impl CameraModel {
         })
     }
 
-    /// Where an image with focal lengths `exp(log_focal)` times as long shows what this camera's shows at `pixel`.
-    pub fn magnified(&self, pixel: &Pixel, log_focal: f64) -> Pixel {
-        if log_focal == 0.0 {
-            return *pixel;
-        }
-        let centre = self.principal_point();
-        centre + (pixel - centre) * log_focal.exp()
+    /// Focal lengths in x and y, px.
+    pub fn focal_lengths(&self) -> Vector2<f64> {
+        each_model!(self, m => {
+            let parameters = m.parameters();
+            Vector2::new(parameters[0], parameters[1])
+        })
     }
 
     /// This camera with focal lengths `exp(log_focal)` times as long.

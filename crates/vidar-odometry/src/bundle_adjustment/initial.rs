@@ -252,7 +252,8 @@ pub(super) fn first_guess(
 ) -> Option<Landmark> {
     let ray = |o: &WhitenedObservation| {
         let camera = observation::camera_pose(&frames[o.frame].body, calibration, &o.pixel);
-        let pixel = calibration.camera.magnified(&o.pixel, -frames[o.frame].body.log_focal);
+        let row_secs = calibration.secs_from_middle(o.pixel.y);
+        let pixel = frames[o.frame].body.lens.calibrated(&calibration.camera, &o.pixel, row_secs);
         Some((camera.translation, camera.rotation.act(&calibration.camera.unproject(&pixel)?)))
     };
     let (origin, direction) = ray(observations.first()?)?;

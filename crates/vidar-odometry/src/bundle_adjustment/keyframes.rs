@@ -37,7 +37,7 @@ pub(super) fn of(recording: &Measurements<'_>, solution: &Solution, scale_std: f
             gravity_in_world: recording.model.gravity(),
             scale_std,
             health,
-            log_focal: frame.body.log_focal,
+            lens: frame.body.lens,
             landmarks: std::mem::take(&mut landmarks[k]),
         });
     }
@@ -57,7 +57,7 @@ fn seen_landmarks(solution: &Solution) -> Vec<Vec<SparseLandmark>> {
             let ray = observation::from_camera(&seen.landmark, &camera.translation);
             let in_camera = camera.rotation.inverse().act(&ray) / seen.landmark.inverse_distance;
             let pixel = problem.calibration.camera.project(&in_camera);
-            let pixel = pixel.map(|pixel| problem.calibration.camera.magnified(&pixel, body.log_focal));
+            let pixel = pixel.map(|pixel| body.lens.shown(&problem.calibration.camera, &pixel, 0.0));
             let (Some(pixel), true) = (pixel, in_camera.z > 1e-3 && relative.is_finite()) else { continue };
             all[observation.frame].push(SparseLandmark {
                 id: LandmarkId(id as u32),

@@ -1,8 +1,8 @@
 //! Cost and normal equations: inertial factors, reprojections with the landmarks eliminated, priors.
 
 use super::envelope::Envelope;
-use super::focus;
 use super::inertial::{GAIN_DIM, InertialJacobians};
+use super::lens;
 use super::observation::{self, Landmark, Linearised, STATE_DIM};
 use super::problem::{FRAME_DIM, ObservedLandmark, Problem};
 use super::system::{ByState, LandmarkBlock, System};
@@ -65,7 +65,7 @@ pub(super) fn cost_with(problem: &Problem, visual: f64) -> Cost {
         cost.inertial += 0.5 * inertial_error(problem, k).map_or(0.0, |r| r.norm_squared());
     }
     let (gauge, _) = gauge_error(problem);
-    cost.priors += focus::cost(problem);
+    cost.priors += lens::cost(problem);
     cost.priors += 0.5 * gauge.norm_squared();
     for (value, sigma) in problem.calibration.minus(&problem.prior.mean).iter().zip(&problem.prior.sigmas) {
         if *sigma > 0.0 {
@@ -132,7 +132,7 @@ fn add_priors(problem: &Problem, system: &mut System) {
     add_gradient(system, at, &(jacobian.transpose() * residual));
     let offset = problem.calibration_offset();
     let moved = problem.calibration.minus(&problem.prior.mean);
-    focus::add_prior(problem, system);
+    lens::add_prior(problem, system);
     for (k, index) in problem.active.iter().enumerate() {
         let weight = problem.prior.sigmas[*index].powi(-2);
         system.h.add(offset + k, offset + k, weight);
@@ -196,10 +196,10 @@ fn add_landmark(
     block: &mut LandmarkBlock,
     system: &mut System,
 ) {
-    let calibrations = problem.active_camera();
+    let (calibrations, lens_dim) = (problem.active_camera(), problem.prior.lens.dim());
     let offset = problem.calibration_offset();
     block.by_state.clear();
-    block.by_focal.clear();
+    block.by_lens.clear();
     block.by_calibration.clear();
     block.by_calibration.resize(calibrations, Vector3::zeros());
     block.gradient = Vector3::zeros();
@@ -214,7 +214,7 @@ fn add_landmark(
         let root_weight = KERNEL.weight(residual.norm_squared()).sqrt();
         let whitening = measured.whitening * root_weight;
         let residual = residual * root_weight;
-        let by_log_focal = at.by_log_focal(&problem.calibration);
+        let by_lens = at.by_lens(body, &problem.calibration, &problem.prior.lens, &measured.pixel);
         let Linearised { by_state, by_landmark, by_calibration, .. } = at;
         let (by_state, by_landmark) = (whitening * by_state, whitening * by_landmark);
         own += by_landmark.transpose() * by_landmark;
@@ -229,18 +229,21 @@ fn add_landmark(
                 *sum += square[(row, column)];
             }
         }
-        if problem.prior.focus.is_some() {
-            let by_focal = whitening * by_log_focal;
-            block.by_focal.push(by_landmark.transpose() * by_focal);
-            let row = from + FRAME_DIM;
-            system.gradient[row] += by_focal.dot(&residual);
-            let with_state = by_state.transpose() * by_focal;
-            for (sum, value) in system.h.part_mut(row, from, STATE_DIM).iter_mut().zip(with_state.iter()) {
-                *sum += value;
-            }
-            system.h.add(row, row, by_focal.norm_squared());
-            for (k, index) in problem.active[..calibrations].iter().enumerate() {
-                system.h.add(offset + k, row, by_focal.dot(&(whitening * by_calibration[*index])));
+        if lens_dim > 0 {
+            let by_lens = whitening * by_lens;
+            block.by_lens.push(by_landmark.tr_mul(&by_lens));
+            let with_state = by_state.tr_mul(&by_lens);
+            let square = by_lens.tr_mul(&by_lens);
+            for i in 0..lens_dim {
+                let row = from + FRAME_DIM + i;
+                system.gradient[row] += by_lens.column(i).dot(&residual);
+                let sums = system.h.part_mut(row, from, STATE_DIM);
+                sums.iter_mut().zip(with_state.column(i).iter()).for_each(|(sum, value)| *sum += value);
+                (0..=i).for_each(|j| system.h.add(row, from + FRAME_DIM + j, square[(i, j)]));
+                for (k, index) in problem.active[..calibrations].iter().enumerate() {
+                    let by_one = whitening * by_calibration[*index];
+                    system.h.add(offset + k, row, by_lens.column(i).dot(&by_one));
+                }
             }
         }
         for (k, index) in problem.active[..calibrations].iter().enumerate() {
@@ -295,7 +298,7 @@ fn eliminate(problem: &Problem, block: &LandmarkBlock, inverse: &Matrix3<f64>, s
             }
         }
     }
-    focus::eliminate(problem, block, inverse, &own_step, system);
+    lens::eliminate(problem, block, inverse, &own_step, system);
     for (k, by_calibration) in block.by_calibration.iter().enumerate() {
         system.gradient[offset + k] -= by_calibration.dot(&own_step);
         let weighted = inverse * by_calibration;

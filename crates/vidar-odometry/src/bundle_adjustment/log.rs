@@ -175,6 +175,11 @@ impl TrackLog {
         self.imu.push(*sample);
     }
 
+    /// IMU measurements as they came.
+    pub(crate) fn imu_samples(&self) -> &[ImuSample] {
+        &self.imu
+    }
+
     /// The IMU measurements.
     pub(crate) fn imu(&self) -> ImuBuffer {
         let mut imu = ImuBuffer::new(self.imu_rate_hz);

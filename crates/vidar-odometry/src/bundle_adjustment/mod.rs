@@ -12,12 +12,12 @@
 
 mod envelope;
 mod findings;
-mod focus;
-mod focus_evidence;
 mod grow;
 mod inertial;
 mod initial;
 mod keyframes;
+mod lens;
+mod lens_evidence;
 mod linearise;
 mod log;
 mod loops;
@@ -35,8 +35,8 @@ mod system;
 mod thin;
 
 pub use findings::AdjustmentFinding;
-pub use focus_evidence::Focus;
 pub(crate) use inertial::ImuGain;
+pub use lens_evidence::Focus;
 pub use log::TrackLog;
 pub(crate) use log::{LoggedState, TrackKey};
 pub(crate) use newest::{NewestState, newest_state};
@@ -47,10 +47,11 @@ pub use sigmas::CalibrationSigmas;
 use crate::imu::{Bias, ImuBuffer, ImuModel, StepNoise};
 use envelope::Envelope;
 use initial::Guess;
+use lens_evidence::FoundLens;
 use loops::Closed;
 use observation::{POSITION, ROTATION, SensorCalibration};
 use optimise::OptimiseReport;
-use problem::{CalibrationPrior, FocusPrior, Problem};
+use problem::{CalibrationPrior, LensPrior, Problem};
 use progress::Watch;
 use std::ops::ControlFlow;
 use system::System;
@@ -81,8 +82,8 @@ struct Solution {
     system: System,
     /// Covariance within the system's envelope.
     covariance: Envelope,
-    /// Where every image has a focal length of its own.
-    focus: Option<Focus>,
+    /// What the lens does.
+    lens: FoundLens,
 }
 
 /// Why a recording cannot be adjusted.
@@ -150,10 +151,10 @@ pub fn adjust(
     watch.stage(AdjustmentStage::Together, work.guess.images.len());
     let mut passed = work.pass(&recording, &mut watch)?;
     for _ in 1..PASSES {
-        // One focal length for all where it changes puts the camera elsewhere: the place is not judged by that.
+        // One lens for all where it moves puts the camera elsewhere: the place is not judged by that.
         let system = optimise::solution(&passed.problem).ok_or(AdjustmentError::Undetermined)?;
         let is_doubted =
-            work.doubt_focus(&passed.problem, &system) || work.doubt_given(&passed.problem, &system);
+            work.doubt_lens(&passed.problem, &system) || work.doubt_given(&passed.problem, &system);
         if passed.is_settled && !is_doubted {
             break;
         }
@@ -173,7 +174,7 @@ pub fn adjust(
     let Passed { mut problem, images, report, clock_offset, .. } = passed;
     let system = optimise::solution(&problem).ok_or(AdjustmentError::Undetermined)?;
     let covariance = system.factor.inverse(problem.calibration_offset());
-    let focus = focus_evidence::centre(&mut problem, &system);
+    let lens = lens_evidence::centre(&mut problem, &system);
     let solution = Solution {
         segment,
         problem,
@@ -185,7 +186,7 @@ pub fn adjust(
         model,
         system,
         covariance,
-        focus,
+        lens,
     };
     let corrected = imu.multiplied(&solution.problem.calibration.gain);
     let recording = Measurements { imu: &corrected, model: &solution.model, ..recording };
@@ -256,7 +257,7 @@ impl Work {
         let prior = CalibrationPrior {
             sigmas: input.sigmas.of(&calibration),
             mean: calibration.clone(),
-            focus: None,
+            lens: LensPrior::default(),
         };
         Self { calibration, prior, clock_offset: input.camera.time_offset, guess }
     }
@@ -289,13 +290,11 @@ impl Work {
         Ok(Passed { problem, images, report, clock_offset, is_settled })
     }
 
-    /// Where the recording shows that the focal length changes, every image gets its own; whether that is new.
-    fn doubt_focus(&mut self, problem: &Problem, system: &System) -> bool {
-        let is_new = self.prior.focus.is_none() && focus_evidence::changes(problem, system);
-        if is_new {
-            self.prior.focus = Some(FocusPrior::AUTOFOCUS);
-        }
-        is_new
+    /// Where the recording shows that the lens moves, every image gets its own; whether that is new.
+    fn doubt_lens(&mut self, problem: &Problem, system: &System) -> bool {
+        let moves = lens_evidence::moves(problem, system);
+        self.prior.lens = moves.unwrap_or(self.prior.lens);
+        moves.is_some()
     }
 
     /// Where the recording contradicts the place of the camera that was given, its prior is widened, so that it no longer pulls;

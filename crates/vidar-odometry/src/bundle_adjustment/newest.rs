@@ -69,7 +69,7 @@ pub(crate) fn newest_state(input: &AdjustmentInput<'_>) -> Result<NewestState, A
         passed = work.pass(&recording, &mut watch)?;
     }
     for _ in 1..PASSES {
-        let doubts = |system| work.doubt_focus(&passed.problem, &system);
+        let doubts = |system| work.doubt_lens(&passed.problem, &system);
         if passed.is_settled && !optimise::solution(&passed.problem).is_some_and(doubts) {
             break;
         }

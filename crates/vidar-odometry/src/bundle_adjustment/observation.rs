@@ -7,13 +7,18 @@
 //! velocity and the accelerometer's force (Patron-Perez, Lovegrove, Sibley 2015 do the same with splines).
 
 use super::inertial::{GAIN_DIM, ImuGain};
+use super::lens::LensUnknown;
+use super::problem::LensPrior;
 use crate::backend::tangent_basis;
 use crate::imu::{NavState, hat};
 use nalgebra::{Matrix2x3, Matrix3, SMatrix, Vector2, Vector3};
-use vidar_core::{CameraModel, LieGroup, Se3, So3, camera::Pixel};
+use vidar_core::{CameraModel, LensMotion, LieGroup, Se3, So3, camera::Pixel};
 
 /// Unknowns of a state that an observation depends on: rotation, position, velocity.
 pub(super) const STATE_DIM: usize = 9;
+
+/// Most unknowns of a lens.
+pub(super) const LENS_DIM: usize = 5;
 
 /// Unknowns of the calibration besides the intrinsics: clock offset, readout, rotation and position of the camera.
 pub(super) const TIMING_AND_PLACE: usize = 8;
@@ -72,8 +77,8 @@ pub(super) struct MovingBody {
     pub(super) force: Vector3<f64>,
     /// Gravity in the world, m/s².
     pub(super) gravity: Vector3<f64>,
-    /// `ln` of the focal length in the state's image over the calibration's (see [`super::focus`]).
-    pub(super) log_focal: f64,
+    /// How the lens had moved in the state's image (see [`super::lens`]).
+    pub(super) lens: LensMotion,
 }
 
 impl MovingBody {
@@ -113,9 +118,14 @@ impl SensorCalibration {
         row / (self.camera.height() as f64 - 1.0) - 0.5
     }
 
+    /// How much later than the centre row a row was exposed, s.
+    pub(super) fn secs_from_middle(&self, row: f64) -> f64 {
+        self.row_share(row) * self.readout_secs
+    }
+
     /// How much later than its state's instant an image's row was exposed, s.
     pub(super) fn row_secs(&self, row: f64) -> f64 {
-        self.clock_secs + self.row_share(row) * self.readout_secs
+        self.clock_secs + self.secs_from_middle(row)
     }
 
     /// Unknowns.
@@ -162,9 +172,31 @@ pub(super) struct Linearised {
 }
 
 impl Linearised {
-    /// Derivative by `ln` of the image's focal length.
-    pub(super) fn by_log_focal(&self, calibration: &SensorCalibration) -> Vector2<f64> {
-        self.pixel - calibration.camera.principal_point()
+    /// Derivatives by the unknowns of the image's lens, a column each; zero beyond them.
+    pub(super) fn by_lens(
+        &self,
+        body: &MovingBody,
+        calibration: &SensorCalibration,
+        prior: &LensPrior,
+        measured: &Pixel,
+    ) -> SMatrix<f64, 2, LENS_DIM> {
+        let focal = calibration.camera.focal_lengths();
+        let secs = calibration.secs_from_middle(measured.y);
+        let mut by_lens = SMatrix::<f64, 2, LENS_DIM>::zeros();
+        for (at, unknown) in prior.unknowns().enumerate() {
+            let by_one = match unknown {
+                LensUnknown::LogFocal => {
+                    let shift = body.lens.shift_px(&calibration.camera, secs);
+                    self.pixel - shift - calibration.camera.principal_point()
+                }
+                LensUnknown::ShiftX => Vector2::new(focal.x, 0.0),
+                LensUnknown::ShiftY => Vector2::new(0.0, focal.y),
+                LensUnknown::ShiftRateX => Vector2::new(secs * focal.x, 0.0),
+                LensUnknown::ShiftRateY => Vector2::new(0.0, secs * focal.y),
+            };
+            by_lens.set_column(at, &by_one);
+        }
+        by_lens
     }
 }
 
@@ -182,7 +214,8 @@ pub(super) fn project(
 ) -> Option<Pixel> {
     let camera = camera_pose(body, calibration, measured);
     let ray = camera.rotation.inverse().act(&from_camera(landmark, &camera.translation));
-    Some(calibration.camera.magnified(&calibration.camera.project(&ray)?, body.log_focal))
+    let pixel = calibration.camera.project(&ray)?;
+    Some(body.lens.shown(&calibration.camera, &pixel, calibration.secs_from_middle(measured.y)))
 }
 
 /// Direction from a camera at `place` to the landmark, world axes, scaled by the inverse distance from its origin.
@@ -208,12 +241,14 @@ pub(super) fn linearise(
     let ray = camera_from_world * from_camera(landmark, &camera.translation);
     let (pixel, mut parameters) = calibration.camera.project_with_parameter_jacobian(&ray)?;
     let (_, by_ray) = calibration.camera.project_with_jacobian(&ray)?;
-    let (pixel, factor) = (calibration.camera.magnified(&pixel, body.log_focal), body.log_focal.exp());
+    let row_secs = calibration.secs_from_middle(measured.y);
+    let (pixel, factor) = (body.lens.shown(&calibration.camera, &pixel, row_secs), body.lens.log_focal.exp());
     let by_ray = by_ray * factor;
     parameters *= factor;
     for axis in 0..2 {
-        // The principal point is the centre of the magnification, too.
+        // The principal point is the centre of the magnification, too; a shift counts in focal lengths.
         parameters[(axis, 2 + axis)] += 1.0 - factor;
+        parameters[(axis, axis)] += body.lens.shift[axis] + row_secs * body.lens.shift_rate[axis];
     }
 
     // The landmark seen from the body's place while the row is exposed, in the axes of the state's body.
@@ -241,7 +276,8 @@ pub(super) fn linearise(
     let by_camera_position = by_ray * camera_from_body * -rho;
     let mut by_calibration = Vec::with_capacity(calibration.dim());
     by_calibration.push(by_instant);
-    by_calibration.push(by_instant * calibration.row_share(measured.y));
+    let by_row = by_instant + calibration.camera.focal_lengths().component_mul(&body.lens.shift_rate);
+    by_calibration.push(by_row * calibration.row_share(measured.y));
     by_calibration.extend(by_camera_rotation.column_iter().map(|c| c.into_owned()));
     by_calibration.extend(by_camera_position.column_iter().map(|c| c.into_owned()));
     by_calibration.extend(parameters.column_iter().map(|c| c.into_owned()));
@@ -266,7 +302,11 @@ pub(super) mod tests {
             gyro_change: Vector3::new(3.0, 5.0, -4.0),
             force: Vector3::new(0.5, 9.6, -1.0),
             gravity: Vector3::new(0.0, 0.0, -9.81),
-            log_focal: 0.01,
+            lens: LensMotion {
+                log_focal: 0.01,
+                shift: Vector2::new(0.012, -0.006),
+                shift_rate: Vector2::new(-0.2, 0.3),
+            },
         };
         let pinhole = Pinhole::new(420.0, 424.0, 317.0, 243.0, 640, 480).unwrap();
         let calibration = SensorCalibration {
@@ -281,7 +321,8 @@ pub(super) mod tests {
         };
         let measured = Pixel::new(400.0, 100.0);
         let camera = camera_pose(&body, &calibration, &measured);
-        let seen = calibration.camera.magnified(&Pixel::new(410.0, 120.0), -body.log_focal);
+        let row_secs = calibration.secs_from_middle(measured.y);
+        let seen = body.lens.calibrated(&calibration.camera, &Pixel::new(410.0, 120.0), row_secs);
         let bearing = calibration.camera.unproject(&seen).unwrap();
         // Counted from somewhere else than this camera.
         let origin = camera.translation + Vector3::new(0.3, 0.2, -0.1);
@@ -334,15 +375,16 @@ pub(super) mod tests {
             let minus = project(&body, &landmark.plus(&-step), &calibration, &measured);
             check("landmark", plus, minus, h, at.by_landmark.column(k).into_owned());
         }
-        let magnified = |by: f64| {
-            project(
-                &MovingBody { log_focal: body.log_focal + by, ..body },
-                &landmark,
-                &calibration,
-                &measured,
-            )
-        };
-        check("focal length", magnified(h), magnified(-h), h, at.by_log_focal(&calibration));
+        let prior = LensPrior { focal: Some(1.0), shift: Some(1.0) };
+        let by_lens = at.by_lens(&body, &calibration, &prior, &measured);
+        for (k, unknown) in prior.unknowns().enumerate() {
+            let moved = |by: f64| {
+                let mut body = body;
+                unknown.add(&mut body.lens, by);
+                project(&body, &landmark, &calibration, &measured)
+            };
+            check(&format!("{unknown:?}"), moved(h), moved(-h), h, by_lens.column(k).into_owned());
+        }
         for k in 0..calibration.dim() - GAIN_DIM {
             let plus = project(&body, &landmark, &perturbed(&calibration, k, h), &measured);
             let minus = project(&body, &landmark, &perturbed(&calibration, k, -h), &measured);

@@ -5,7 +5,7 @@ use super::inertial::{GAIN_DIM, ImuGain, InertialFactor};
 use super::observation::{Landmark, MovingBody, STATE_DIM, SensorCalibration};
 use crate::imu::{ImuBuffer, ImuModel, NavState};
 use nalgebra::{Matrix2, Vector3};
-use vidar_core::{Timestamp, camera::Pixel};
+use vidar_core::{LensMotion, Timestamp, camera::Pixel};
 
 /// Unknowns of a state: rotation, position, velocity, biases of gyroscope and accelerometer.
 pub(super) const FRAME_DIM: usize = 15;
@@ -43,23 +43,24 @@ pub(super) struct CalibrationPrior {
     pub(super) mean: SensorCalibration,
     /// In the order of [`super::observation::Linearised::by_calibration`].
     pub(super) sigmas: Vec<f64>,
-    /// Whether every image has a focal length of its own.
-    pub(super) focus: Option<FocusPrior>,
+    /// What the lens may do from image to image.
+    pub(super) lens: LensPrior,
 }
 
-/// What is known before of how a focal length changes while filming: an Ornstein-Uhlenbeck process, a random walk that stays about zero.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub(super) struct FocusPrior {
-    /// Standard deviation of `ln` of an image's focal length over the calibration's.
-    pub(super) sigma: f64,
+/// What is known before of how the lens moves while filming (see [`super::lens`]); nothing of it is unknown where it does not.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub(super) struct LensPrior {
+    /// Standard deviation of `ln` of an image's focal length over the calibration's, where it changes.
+    pub(super) focal: Option<f64>,
+    /// Standard deviation of an image's shift in x and in y, focal lengths, where it is shifted; it has a rate, too.
+    pub(super) shift: Option<f64>,
 }
 
-impl FocusPrior {
-    /// Autofocus of a phone: up to 2 % between near and far.
-    pub(super) const AUTOFOCUS: Self = Self { sigma: 0.015 };
-
-    /// The least that does harm: at changes of 0.4 % the scale was 0.4 to 0.8 % off, within what was stated.
-    pub(super) const HARMFUL: Self = Self { sigma: 0.005 };
+impl LensPrior {
+    /// Unknowns of an image's lens.
+    pub(super) fn dim(&self) -> usize {
+        usize::from(self.focal.is_some()) + 4 * usize::from(self.shift.is_some())
+    }
 }
 
 /// States, landmarks and calibration, with all measurements.
@@ -86,9 +87,9 @@ impl Problem {
         self.offset(self.frames.len())
     }
 
-    /// Unknowns of a state: [`FRAME_DIM`], then its image's focal length where that is one.
+    /// Unknowns of a state: [`FRAME_DIM`], then those of its image's lens.
     pub(super) fn frame_dim(&self) -> usize {
-        FRAME_DIM + usize::from(self.prior.focus.is_some())
+        FRAME_DIM + self.prior.lens.dim()
     }
 
     /// Where the unknowns of a state begin.
@@ -147,7 +148,7 @@ impl FrameState {
             gyro_change,
             force: now.accel.0,
             gravity: model.gravity(),
-            log_focal: 0.0,
+            lens: LensMotion::NONE,
         };
         Some(Self { time, body, inertial: None })
     }

@@ -99,7 +99,7 @@ impl LeastSquares for Alone<'_> {
 #[cfg(test)]
 mod tests {
     use super::super::observation::tests::example;
-    use super::super::problem::{CalibrationPrior, FrameState, WhitenedObservation};
+    use super::super::problem::{CalibrationPrior, FrameState, LensPrior, WhitenedObservation};
     use super::*;
     use nalgebra::Matrix2;
     use vidar_core::Timestamp;
@@ -121,8 +121,8 @@ mod tests {
             observations.push(WhitenedObservation { frame, pixel, whitening });
             frames.push(FrameState { time: Timestamp::from_nanos(frame as i64), body, inertial: None });
         }
-        let prior =
-            CalibrationPrior { sigmas: vec![0.0; calibration.dim()], mean: calibration.clone(), focus: None };
+        let sigmas = vec![0.0; calibration.dim()];
+        let prior = CalibrationPrior { sigmas, mean: calibration.clone(), lens: LensPrior::default() };
         let gauge = (0, frames[0].body.state);
         let landmarks = vec![ObservedLandmark { landmark, observations }];
         Problem { frames, landmarks, calibration, prior, active: Vec::new(), gauge }

@@ -1,13 +1,16 @@
 //! The reduced normal equations of states and calibration, and what is kept of the landmarks that were eliminated.
 
 use super::envelope::Envelope;
-use super::observation::STATE_DIM;
+use super::observation::{LENS_DIM, STATE_DIM};
 use super::problem::{FRAME_DIM, Problem};
 use crate::backend::dot;
 use nalgebra::{Matrix3, SMatrix, Vector3};
 
 /// `Jᵀ J` between the unknowns of a state and a landmark.
 pub(super) type ByState = SMatrix<f64, STATE_DIM, 3>;
+
+/// The same of a landmark and the unknowns of a lens.
+pub(super) type ByLens = SMatrix<f64, 3, LENS_DIM>;
 
 /// A landmark's block of the normal equations, kept to find its step from the states'.
 #[derive(Clone, Debug, Default)]
@@ -17,8 +20,8 @@ pub(super) struct LandmarkBlock {
     pub(super) gradient: Vector3<f64>,
     /// Of each observation.
     pub(super) by_state: Vec<(usize, ByState)>,
-    /// Of each observation with the focal length of its image; none where that is held.
-    pub(super) by_focal: Vec<Vector3<f64>>,
+    /// Of each observation with the lens of its image, as many columns as it has unknowns; none where it has none.
+    pub(super) by_lens: Vec<ByLens>,
     pub(super) by_calibration: Vec<Vector3<f64>>,
 }
 
@@ -60,8 +63,10 @@ impl LandmarkBlock {
         let mut gradient = self.gradient;
         for (at, (frame, by_state)) in self.by_state.iter().enumerate() {
             let from = frame_dim * frame;
-            if let Some(by_focal) = self.by_focal.get(at) {
-                gradient += by_focal * step[from + FRAME_DIM];
+            if let Some(by_lens) = self.by_lens.get(at) {
+                for (column, moved) in by_lens.column_iter().zip(&step[from + FRAME_DIM..from + frame_dim]) {
+                    gradient += column * *moved;
+                }
             }
             let moved = SMatrix::<f64, STATE_DIM, 1>::from_column_slice(&step[from..from + STATE_DIM]);
             gradient += by_state.transpose() * moved;

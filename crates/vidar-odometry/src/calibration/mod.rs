@@ -22,6 +22,7 @@ mod window;
 
 use crate::gyro_alignment::{ImageFeatures, RateSample};
 use nalgebra::Vector3;
+pub(crate) use noise::loud_noise;
 pub use noise::{SensorNoise, sensor_noise};
 use parameters::{BIAS, CENTRE, FOCAL, K1, K2, OFFSET, Parameters, READOUT, ROTATION, prior_sigmas};
 use path::GyroPath;

@@ -3,7 +3,7 @@
 //! Third differences of means over 10 ms leave of a hand's motion next to nothing (of 2 Hz two thousandths, of 5 Hz three
 //! hundredths) and of white noise a known multiple. Means over 10 ms are used because some recordings write interpolated
 //! rows, whose neighbours differ by less than the sensor's noise. The quiet quarter of all half seconds counts: impacts and
-//! vibration are no noise of the sensor.
+//! vibration are no noise of the sensor. What an estimator has to reckon with is the loud tenth.
 
 use nalgebra::Vector3;
 use vidar_core::ImuSample;
@@ -12,8 +12,9 @@ use vidar_core::ImuSample;
 const BLOCK_SECS: f64 = 0.01;
 /// Third differences of a stretch.
 const STRETCH: usize = 50;
-/// Which stretch counts, of all in the order of their noise.
+/// Which stretch counts, of all in the order of their noise: for the sensor's own, and with vibration.
 const QUIET: f64 = 0.25;
+const LOUD: f64 = 0.9;
 /// Stretches that an answer needs: two seconds.
 const MIN_STRETCHES: usize = 4;
 /// Variance of a third difference of white noise, in units of its variance: 1 + 9 + 9 + 1.
@@ -32,6 +33,15 @@ pub struct SensorNoise {
 
 /// Noise of both sensors. `None` for less than two seconds of samples, or times that do not increase.
 pub fn sensor_noise(samples: &[ImuSample]) -> Option<SensorNoise> {
+    noise_of(samples, QUIET)
+}
+
+/// The same with vibration: nine tenths of the half seconds have less.
+pub(crate) fn loud_noise(samples: &[ImuSample]) -> Option<SensorNoise> {
+    noise_of(samples, LOUD)
+}
+
+fn noise_of(samples: &[ImuSample], quantile: f64) -> Option<SensorNoise> {
     let (first, last) = (samples.first()?.time, samples.last()?.time);
     let span = (last - first).as_secs_f64();
     let rate_hz = (samples.len() - 1) as f64 / span;
@@ -56,8 +66,8 @@ pub fn sensor_noise(samples: &[ImuSample]) -> Option<SensorNoise> {
             .filter(|v| v.is_finite())
             .collect();
         variances.sort_by(f64::total_cmp);
-        let quiet = *variances.get((QUIET * variances.len() as f64) as usize)?;
-        (variances.len() >= MIN_STRETCHES).then(|| (quiet * block_secs).sqrt())
+        let chosen = *variances.get((quantile * variances.len() as f64) as usize)?;
+        (variances.len() >= MIN_STRETCHES).then(|| (chosen * block_secs).sqrt())
     };
     let accel = density(|s| s.accel.0)?;
     // Rounding of sums is no noise.

@@ -80,7 +80,7 @@ impl KeyframeRegistry {
                 .map_or(Vector3::new(0.0, 0.0, -GRAVITY_MPS2), |imu| imu.gravity()),
             scale_std: input.scale_std,
             health: input.health,
-            log_focal: 0.0,
+            lens: vidar_core::LensMotion::NONE,
             landmarks: input.landmarks.to_vec(),
         }
     }

@@ -7,8 +7,8 @@ use crate::initialization::TrackObservation;
 use nalgebra::{Matrix2, Vector2, Vector3};
 use vidar_core::camera::RadTan;
 use vidar_core::{
-    AngularRate, CameraModel, FrameId, GRAVITY_MPS2, ImuNoise, ImuSample, LandmarkId, LieGroup, Pinhole, Se3,
-    So3, SpecificForce, Timestamp,
+    AngularRate, CameraModel, FrameId, GRAVITY_MPS2, ImuNoise, ImuSample, LandmarkId, LensMotion, LieGroup,
+    Pinhole, Se3, So3, SpecificForce, Timestamp,
 };
 
 /// What to simulate.
@@ -50,13 +50,20 @@ pub struct SimulationConfig {
     pub accel_scale: [f64; 3],
     /// Mean and amplitude of `ln` of the focal length over the camera's: a lens that autofocus moves to and fro in 6 s.
     pub log_focal: [f64; 2],
+    /// Amplitude of the image's shift, focal lengths: a stabilised lens that follows a tremor of two or three shakes a second.
+    pub shift: f64,
 }
 
 impl SimulationConfig {
-    /// `ln` of the focal length over the camera's, so long after the first frame.
-    pub fn log_focal_at(&self, secs: f64) -> f64 {
+    /// How the lens has moved so long after the first frame.
+    pub fn lens_at(&self, secs: f64) -> LensMotion {
         let [mean, amplitude] = self.log_focal;
-        mean + amplitude * (std::f64::consts::TAU * secs / 6.0).sin()
+        let wave = |hz: f64| (std::f64::consts::TAU * hz * secs).sin();
+        LensMotion {
+            log_focal: mean + amplitude * wave(1.0 / 6.0),
+            shift: Vector2::new(wave(2.3), wave(3.1)) * self.shift,
+            ..LensMotion::NONE
+        }
     }
 }
 
@@ -81,6 +88,7 @@ impl Default for SimulationConfig {
             gyro_scale: [1.0; 3],
             accel_scale: [1.0; 3],
             log_focal: [0.0; 2],
+            shift: 0.0,
         }
     }
 }
@@ -157,9 +165,17 @@ impl Simulation {
             let bias = biases[((exposed * config.imu_rate_hz).round() as usize).min(biases.len() - 1)];
             let truth = NavState { world_from_body: motion.world_from_body, velocity: motion.velocity, bias };
             let camera_from_world = (motion.world_from_body * body_from_camera).inverse();
-            let log_focal = config.log_focal_at(at);
-            let camera = camera.with_longer_focal(log_focal).unwrap_or_else(|_| camera.clone());
-            let observations = tracker.look(&points, &camera, &camera_from_world, config, &mut random);
+            let lens = config.lens_at(at);
+            let seen = |point: &Vector3<f64>| {
+                let q = camera_from_world.act(point);
+                // The distortion folds back far outside the image.
+                if q.z < 0.3 || q.xy().norm() > 1.2 * q.z {
+                    return None;
+                }
+                let pixel = lens.shown(&camera, &camera.project(&q)?, 0.0);
+                camera.contains(&pixel, 8.0).then_some(pixel)
+            };
+            let observations = tracker.look(&points, seen, config, &mut random);
             all.push(SimulatedFrame { id: FrameId(k as u32), time: stamp(at), truth, observations });
         }
         let point_of = tracker.point_of;
@@ -257,23 +273,14 @@ impl Tracker {
     fn look(
         &mut self,
         points: &[Vector3<f64>],
-        camera: &CameraModel,
-        camera_from_world: &Se3,
+        seen: impl Fn(&Vector3<f64>) -> Option<Vector2<f64>>,
         config: &SimulationConfig,
         random: &mut Random,
     ) -> Vec<TrackObservation> {
-        let visible = |p: &Vector3<f64>| {
-            let q = camera_from_world.act(p);
-            // The distortion folds back far outside the image.
-            if q.z < 0.3 || q.xy().norm() > 1.2 * q.z {
-                return None;
-            }
-            camera.project(&q).filter(|pixel| camera.contains(pixel, 8.0))
-        };
         let mut observations = Vec::with_capacity(config.tracks);
         let mut fresh = Vec::new();
         for (k, point) in points.iter().enumerate() {
-            match (visible(point), self.names[k]) {
+            match (seen(point), self.names[k]) {
                 (Some(pixel), Some(name)) => {
                     if random.uniform() < config.loss_share {
                         self.names[k] = None;

@@ -4,7 +4,7 @@ use super::{FrameStamp, FrameState, PoseReport, PoseSource};
 use std::collections::{BTreeMap, VecDeque};
 use std::sync::Arc;
 use vidar_core::remap::{ImageWarp, RowMotion};
-use vidar_core::{Duration, FrameId, LieGroup, OdometryKeyframe, Se3, Timestamp};
+use vidar_core::{Duration, FrameId, LensMotion, LieGroup, OdometryKeyframe, Se3, Timestamp};
 use vidar_odometry::Joined;
 use vidar_solve::statistics::median_upper;
 
@@ -43,20 +43,19 @@ impl Segment {
     pub fn image_warp(&self, frame: FrameId, readout: Duration) -> Option<ImageWarp> {
         let time = self.frame(frame)?.stamp.time;
         let rows = if readout > Duration::ZERO { self.row_motion(frame, readout) } else { None };
-        let log_focal = self.log_focal(time);
-        (rows.is_some() || log_focal != 0.0).then_some(ImageWarp { rows, log_focal })
+        let lens = self.lens(time);
+        (rows.is_some() || lens != LensMotion::NONE).then_some(ImageWarp { rows, lens })
     }
 
-    /// `ln` of the focal length at a time over the calibration's, linear between the odometry's keyframes.
-    fn log_focal(&self, time: Timestamp) -> f64 {
+    /// How the lens had moved at a time, linear between the odometry's keyframes.
+    fn lens(&self, time: Timestamp) -> LensMotion {
         let after = self.odometry.partition_point(|k| k.state.time < time);
-        let at = |k: usize| self.odometry.get(k).map(|k| (k.state.time, k.log_focal));
+        let at = |k: usize| self.odometry.get(k).map(|k| (k.state.time, k.lens));
         match (after.checked_sub(1).and_then(at), at(after)) {
             (Some((from, before)), Some((until, next))) => {
-                let share = (time - from).as_secs_f64() / (until - from).as_secs_f64();
-                before + share * (next - before)
+                before.towards(&next, (time - from).as_secs_f64() / (until - from).as_secs_f64())
             }
-            (one, other) => one.or(other).map_or(0.0, |(_, log_focal)| log_focal),
+            (one, other) => one.or(other).map_or(LensMotion::NONE, |(_, lens)| lens),
         }
     }
 
@@ -296,9 +295,14 @@ mod tests {
     }
 
     #[test]
-    fn the_focal_length_of_a_frame_is_between_those_of_the_keyframes_around_it() {
-        let keyframe = |i: u32, log_focal: f64| {
-            Arc::new(OdometryKeyframe { log_focal, ..crate::engine::tests::settled::keyframe(i) })
+    fn the_lens_of_a_frame_is_between_where_it_is_in_the_keyframes_around_it() {
+        let lens = |share: f64| LensMotion {
+            log_focal: share,
+            shift: Vector2::new(-share, 0.5 * share),
+            ..LensMotion::NONE
+        };
+        let keyframe = |i: u32, share: f64| {
+            Arc::new(OdometryKeyframe { lens: lens(share), ..crate::engine::tests::settled::keyframe(i) })
         };
         let frames = [0, 1, 2, 4, 5].map(|i| PosedFrame {
             stamp: FrameStamp { time: keyframe(i, 0.0).state.time, ..stamp(i) },
@@ -310,9 +314,11 @@ mod tests {
         let of = |segment: &Segment, i: u32| segment.image_warp(FrameId(i), Duration::ZERO);
         for (i, expected) in [(0, 0.004), (1, 0.004), (2, 0.006), (4, 0.010), (5, 0.010)] {
             let found = of(&segment, i).unwrap();
-            assert!((found.log_focal - expected).abs() < 1e-12 && found.rows.is_none(), "{i}: {found:?}");
+            let off = found.lens.shift - lens(expected).shift;
+            assert!((found.lens.log_focal - expected).abs() < 1e-12 && off.norm() < 1e-12, "{i}: {found:?}");
+            assert!(found.rows.is_none(), "{i}: {found:?}");
         }
-        segment.odometry.iter_mut().for_each(|k| Arc::make_mut(k).log_focal = 0.0);
+        segment.odometry.iter_mut().for_each(|k| Arc::make_mut(k).lens = LensMotion::NONE);
         assert_eq!(of(&segment, 2), None);
     }
 

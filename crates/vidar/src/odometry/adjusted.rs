@@ -7,7 +7,7 @@ use serde_json::{Value, json};
 use vidar_core::{BodyFrame, Duration, StampedPose, Trajectory, Warning};
 use vidar_dataset::{CalibrationSource, Recording};
 use vidar_odometry::bundle_adjustment::{
-    Adjusted, AdjustedCalibration, AdjustedImu, AdjustmentFinding, CalibrationSigmas, Focus,
+    Adjusted, AdjustedCalibration, AdjustedImu, AdjustmentFinding, AdjustmentReport, CalibrationSigmas, Focus,
 };
 
 /// Standard deviations of a calibration that was found from the recording's own tracks and gyroscope.
@@ -71,6 +71,12 @@ pub(crate) fn shown_readout_secs(calibration: &AdjustedCalibration) -> f64 {
     if calibration.readout_secs > SHOWN_SIGMAS * std { calibration.readout_secs } else { 0.0 }
 }
 
+/// Whether images are found to be stabilised, and nothing else is needed to explain what they and the IMU differ by.
+pub(super) fn explains_as_stabilised(adjusted: &Adjusted) -> bool {
+    adjusted.findings.iter().any(|finding| matches!(finding, AdjustmentFinding::Stabilised { .. }))
+        && adjusted.report.noise_ratio <= AdjustmentReport::EXPLAINED_NOISE
+}
+
 /// The calibration as adjusted, with standard deviations; zero where it was held.
 pub(super) fn calibration_json(adjusted: &Adjusted) -> Value {
     let AdjustedCalibration { camera, body_from_camera, time_offset_secs, readout_secs, sigmas } =
@@ -99,10 +105,9 @@ pub(super) fn imu_json(adjusted: &Adjusted) -> Value {
 /// What was given and the recording contradicts: the values that were found are used.
 pub(super) fn warnings(adjusted: &Adjusted) -> Vec<Warning> {
     let told = |finding: &AdjustmentFinding| {
-        if let AdjustmentFinding::FocalLength(focus) = finding {
-            return focal_length(focus);
-        }
         let text = match finding {
+            AdjustmentFinding::FocalLength(focus) => return focal_length(focus),
+            AdjustmentFinding::Stabilised { rms } => return stabilised(*rms),
             AdjustmentFinding::CameraPosition { given_m, found_m, sigma_m } => format!(
                 "the camera's position on the IMU is given as {} cm, the recording shows {} (σ {}) cm: {:.0} cm apart",
                 in_cm(given_m),
@@ -144,7 +149,17 @@ fn focal_length(focus: &Focus) -> Warning {
         100.0 * focus.spread
     );
     Warning::new("focus-changes", text).hint(
-        "lock the focus before filming, and switch stabilisation off, which may look alike: `vidar live` and the live trajectory take one focal length for all images, and their scale is worse for it",
+        "lock the focus before filming: `vidar live` and the live trajectory take one focal length for all images, and their scale is worse for it",
+    )
+}
+
+fn stabilised(rms: f64) -> Warning {
+    let text = format!(
+        "the images are stabilised: they are shifted against what the gyroscope says, by {:.1}° (root mean square); every image gets its own shift",
+        rms.atan().to_degrees()
+    );
+    Warning::new("images-stabilised", text).hint(
+        "switch optical and electronic stabilisation off before filming: `vidar live` and the live trajectory do not know it, and their scale is worse for it",
     )
 }
 

@@ -195,6 +195,11 @@ impl Tracked {
         StatedScale::new(source, None)
     }
 
+    /// Whether no adjustment explains the recording, and most attempts to begin found that images and IMU contradict each other.
+    pub(super) fn is_contradicted(&self) -> bool {
+        self.with_imu && self.adjusted.is_none() && self.quality.contradicts()
+    }
+
     /// Why it never had a state.
     pub(crate) fn why_not_started(&self) -> Option<String> {
         self.quality.why_not_started()
@@ -240,6 +245,7 @@ impl Tracked {
             warnings.push(Warning::degraded(NEVER_STARTED, text).hint(hint));
         }
         warnings.extend(self.quality.warning());
+        warnings.extend(self.quality.unexplained());
         warnings.extend(carrier_in_view(self.carrier_share));
         if let (Some(reason), true) = (&self.not_adjusted, self.quality.longest().is_some()) {
             warnings.push(Warning::degraded("not-adjusted", format!("the live states are final: {reason}")));

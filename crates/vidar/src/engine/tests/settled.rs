@@ -37,7 +37,7 @@ pub(in crate::engine) fn keyframe(i: u32) -> OdometryKeyframe {
                 inverse_depth_std: 0.01 / scale,
             })
             .collect(),
-        log_focal: 0.0,
+        lens: vidar_core::LensMotion::NONE,
     }
 }
 

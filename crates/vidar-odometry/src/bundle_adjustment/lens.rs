@@ -1,0 +1,319 @@
+//! A lens that moves while filming.
+//!
+//! Autofocus changes the focal length by up to 2 % ("focus breathing"). With one for all images, each change looks like a motion along the
+//! optical axis, which the IMU contradicts only weakly: rendered phones whose focal length changed by 1 % every few seconds had their scale 5 %
+//! off at a stated 1.1 %. Optical stabilisation shifts the image against the shake of the hand by up to a degree; without that the camera seems
+//! to turn otherwise than the gyroscope says. Where the recording shows it, every image has a focal length `f exp(z)` and a shift of its
+//! own, each an Ornstein-Uhlenbeck process: a random walk that stays about zero.
+
+use super::problem::{FRAME_DIM, LensPrior, Problem};
+use super::system::{ByLens, LandmarkBlock, System};
+use crate::backend::product;
+use nalgebra::{Matrix3, Vector3};
+use vidar_core::LensMotion;
+
+/// How long a lens keeps its place, s: autofocus moves every few seconds, stabilisation with each tremor of the hand.
+const FOCUS_SECS: f64 = 5.0;
+const SHIFT_SECS: f64 = 0.2;
+const RATE_SECS: f64 = 0.05;
+/// How fast a lens is shifted that is shifted by 1, 1/s: a hand shakes three to six times a second.
+const RATE_PER_SHIFT: f64 = 30.0;
+
+/// What is unknown of an image's lens.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) enum LensUnknown {
+    LogFocal,
+    ShiftX,
+    ShiftY,
+    ShiftRateX,
+    ShiftRateY,
+}
+
+impl LensUnknown {
+    fn of(self, lens: &LensMotion) -> f64 {
+        match self {
+            Self::LogFocal => lens.log_focal,
+            Self::ShiftX => lens.shift.x,
+            Self::ShiftY => lens.shift.y,
+            Self::ShiftRateX => lens.shift_rate.x,
+            Self::ShiftRateY => lens.shift_rate.y,
+        }
+    }
+
+    /// Changes it.
+    pub(super) fn add(self, lens: &mut LensMotion, step: f64) {
+        *match self {
+            Self::LogFocal => &mut lens.log_focal,
+            Self::ShiftX => &mut lens.shift.x,
+            Self::ShiftY => &mut lens.shift.y,
+            Self::ShiftRateX => &mut lens.shift_rate.x,
+            Self::ShiftRateY => &mut lens.shift_rate.y,
+        } += step;
+    }
+}
+
+/// A process: its standard deviation, and how long it keeps its value, s.
+#[derive(Clone, Copy)]
+struct Process {
+    sigma: f64,
+    secs: f64,
+}
+
+impl LensPrior {
+    /// What is unknown, in the order in which it follows a state.
+    pub(super) fn unknowns(&self) -> impl Iterator<Item = LensUnknown> {
+        self.processes().map(|(unknown, _)| unknown)
+    }
+
+    fn processes(&self) -> impl Iterator<Item = (LensUnknown, Process)> {
+        let focal = self.focal.map(|sigma| Process { sigma, secs: FOCUS_SECS });
+        let shift = self.shift.map(|sigma| Process { sigma, secs: SHIFT_SECS });
+        let rate = self.shift.map(|sigma| Process { sigma: RATE_PER_SHIFT * sigma, secs: RATE_SECS });
+        let all = [
+            (LensUnknown::LogFocal, focal),
+            (LensUnknown::ShiftX, shift),
+            (LensUnknown::ShiftY, shift),
+            (LensUnknown::ShiftRateX, rate),
+            (LensUnknown::ShiftRateY, rate),
+        ];
+        all.into_iter().filter_map(|(unknown, process)| Some((unknown, process?)))
+    }
+}
+
+/// How the prior ties an unknown to that of the state before: `z = share · before`, with a weight. The first one is tied to zero.
+#[derive(Clone, Copy)]
+struct Tie {
+    share: f64,
+    weight: f64,
+}
+
+fn ties(problem: &Problem, process: Process) -> impl Iterator<Item = Tie> {
+    let variance = process.sigma * process.sigma;
+    let of = move |k: usize| {
+        let before = k.checked_sub(1).map(|before| problem.frames[before].time);
+        let share = before
+            .map_or(0.0, |before| (-(problem.frames[k].time - before).as_secs_f64() / process.secs).exp());
+        Tie { share, weight: 1.0 / (variance * (1.0 - share * share)) }
+    };
+    (0..problem.frames.len()).map(of)
+}
+
+/// `ln` of the determinant of a prior's information.
+pub(super) fn log_det(problem: &Problem, prior: &LensPrior) -> f64 {
+    prior.processes().flat_map(|(_, process)| ties(problem, process)).map(|tie| tie.weight.ln()).sum()
+}
+
+/// What an unknown of state `k` departs from its tie by.
+fn departure(problem: &Problem, unknown: LensUnknown, k: usize, tie: Tie) -> f64 {
+    let value = |k: usize| unknown.of(&problem.frames[k].body.lens);
+    value(k) - tie.share * k.checked_sub(1).map_or(0.0, value)
+}
+
+/// Cost of the prior.
+pub(super) fn cost(problem: &Problem) -> f64 {
+    let mut cost = 0.0;
+    for (unknown, process) in problem.prior.lens.processes() {
+        for (k, tie) in ties(problem, process).enumerate() {
+            cost += 0.5 * tie.weight * departure(problem, unknown, k, tie).powi(2);
+        }
+    }
+    cost
+}
+
+/// Adds the prior to the normal equations.
+pub(super) fn add_prior(problem: &Problem, system: &mut System) {
+    for (at, (unknown, process)) in problem.prior.lens.processes().enumerate() {
+        for (k, tie) in ties(problem, process).enumerate() {
+            let row = problem.offset(k) + FRAME_DIM + at;
+            let slope = tie.weight * departure(problem, unknown, k, tie);
+            system.gradient[row] += slope;
+            system.h.add(row, row, tie.weight);
+            if k > 0 {
+                let before = problem.offset(k - 1) + FRAME_DIM + at;
+                system.gradient[before] -= tie.share * slope;
+                system.h.add(before, before, tie.share * tie.share * tie.weight);
+                system.h.add(row, before, -tie.share * tie.weight);
+            }
+        }
+    }
+}
+
+/// The lens' part of taking a landmark out of the normal equations (Schur complement).
+pub(super) fn eliminate(
+    problem: &Problem,
+    block: &LandmarkBlock,
+    inverse: &Matrix3<f64>,
+    own_step: &Vector3<f64>,
+    system: &mut System,
+) {
+    let unknowns = problem.prior.lens.dim();
+    let seen = |at: usize| {
+        let (frame, by_state) = &block.by_state[at];
+        (*frame, problem.offset(*frame), by_state, &block.by_lens[at])
+    };
+    for at in 0..block.by_lens.len() {
+        let (frame, from, by_state, by_lens) = seen(at);
+        let row = from + FRAME_DIM;
+        let weighted: ByLens = inverse * by_lens;
+        let weighted_state = product(by_state, inverse);
+        for i in 0..unknowns {
+            system.gradient[row + i] -= by_lens.column(i).dot(own_step);
+        }
+        for (other_frame, other_from, other_state, other_lens) in (0..=at).map(seen) {
+            let with_state = other_state * weighted;
+            let with_lens = weighted.tr_mul(other_lens);
+            for i in 0..unknowns {
+                let sums = system.h.part_mut(row + i, other_from, with_state.nrows());
+                sums.iter_mut().zip(with_state.column(i).iter()).for_each(|(sum, value)| *sum -= value);
+                let others = if other_frame == frame { i + 1 } else { unknowns };
+                for j in 0..others {
+                    system.h.add(row + i, other_from + FRAME_DIM + j, -with_lens[(i, j)]);
+                }
+            }
+            if other_frame != frame {
+                let with_lens = weighted_state * other_lens;
+                for j in 0..unknowns {
+                    for (k, value) in with_lens.column(j).iter().enumerate() {
+                        system.h.add(from + k, other_from + FRAME_DIM + j, -value);
+                    }
+                }
+            }
+        }
+        for (k, by_calibration) in block.by_calibration.iter().enumerate() {
+            for i in 0..unknowns {
+                let product = weighted.column(i).dot(by_calibration);
+                system.h.add(problem.calibration_offset() + k, row + i, -product);
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::observation::{self, tests::example};
+    use super::super::problem::{CalibrationPrior, FrameState, ObservedLandmark, WhitenedObservation};
+    use super::*;
+    use crate::bundle_adjustment::linearise::{cost, linearise};
+    use crate::imu::Vector15;
+    use nalgebra::{DMatrix, Matrix2};
+    use vidar_core::Timestamp;
+
+    /// Three states that see four landmarks where they are, with the clock among the unknowns.
+    fn problem() -> Problem {
+        let (body, landmark, calibration, measured) = example();
+        let mut frames = Vec::new();
+        for frame in 0..3 {
+            let mut body = body;
+            body.state.world_from_body.translation += Vector3::new(0.2, 0.05, -0.1) * f64::from(frame);
+            body.lens = LensMotion::NONE;
+            let time = Timestamp::from_nanos(i64::from(frame) * 200_000_000);
+            frames.push(FrameState { time, body, inertial: None });
+        }
+        let landmarks = (0..4).map(|k| {
+            let aside = Vector3::new(0.02 * f64::from(k), -0.03 * f64::from(k), 0.05);
+            let landmark = landmark.plus(&aside);
+            let seen = |(frame, state): (usize, &FrameState)| {
+                let mut pixel = measured;
+                // The row decides on the instant, which decides on the row.
+                for _ in 0..20 {
+                    pixel = observation::project(&state.body, &landmark, &calibration, &pixel).unwrap();
+                }
+                WhitenedObservation { frame, pixel, whitening: Matrix2::identity() * 0.1 }
+            };
+            ObservedLandmark { landmark, observations: frames.iter().enumerate().map(seen).collect() }
+        });
+        let landmarks = landmarks.collect();
+        let mut sigmas = vec![0.0; calibration.dim()];
+        sigmas[0] = 0.01;
+        let lens = LensPrior { focal: Some(0.015), shift: Some(0.01) };
+        let prior = CalibrationPrior { sigmas, mean: calibration.clone(), lens };
+        let gauge = (0, frames[0].body.state);
+        Problem { frames, landmarks, calibration, prior, active: vec![0], gauge }
+    }
+
+    /// Moves one unknown: states with their lenses, clock, landmarks.
+    fn moved(problem: &mut Problem, unknown: usize, by: f64) {
+        let (dim, reduced) = (problem.frame_dim(), problem.dim());
+        if unknown < problem.calibration_offset() {
+            let body = &mut problem.frames[unknown / dim].body;
+            let k = unknown % dim;
+            match problem.prior.lens.unknowns().nth(k.wrapping_sub(FRAME_DIM)) {
+                Some(unknown) => unknown.add(&mut body.lens, by),
+                None => {
+                    let mut delta = Vector15::zeros();
+                    delta[k] = by;
+                    body.state = body.state.plus(&delta);
+                }
+            }
+        } else if unknown < reduced {
+            problem.calibration.clock_secs += by;
+        } else {
+            let at = &mut problem.landmarks[(unknown - reduced) / 3];
+            at.landmark = at.landmark.plus(&Vector3::ith((unknown - reduced) % 3, by));
+        }
+    }
+
+    /// Where every observation fits, the normal equations are the second derivatives of the cost; the landmarks are eliminated from both.
+    #[test]
+    fn normal_equations_are_the_second_derivatives_of_the_cost() {
+        let problem = problem();
+        let (reduced, all) = (problem.dim(), problem.dim() + 3 * problem.landmarks.len());
+        // Steps that move the image by a hundredth of a pixel or so: the clock's derivative is that of milliseconds.
+        let step = |k: usize| if k == problem.calibration_offset() { 1e-6 } else { 1e-5 };
+        let at = |moves: &[(usize, f64)]| {
+            let mut other = problem.clone();
+            moves.iter().for_each(|(unknown, by)| moved(&mut other, *unknown, *by));
+            cost(&other).total()
+        };
+        let dense = DMatrix::from_fn(all, all, |a, b| {
+            let (h, k) = (step(a), step(b));
+            let apart = |i: f64, j: f64| at(&[(a, i * h), (b, j * k)]);
+            (apart(1.0, 1.0) - apart(1.0, -1.0) - apart(-1.0, 1.0) + apart(-1.0, -1.0)) / (4.0 * h * k)
+        });
+        let own = dense.view((reduced, reduced), (all - reduced, all - reduced)).into_owned();
+        let across = dense.view((0, reduced), (reduced, all - reduced)).into_owned();
+        let schur = dense.view((0, 0), (reduced, reduced))
+            - &across * own.try_inverse().unwrap() * across.transpose();
+        let mut system = System::new(&problem);
+        linearise(&problem, 0.0, &mut system);
+        let scale = |k: usize| dense[(k, k)].abs().sqrt().max(1.0);
+        // What biases do within a row's time is left out of the derivatives.
+        let is_bias = |k: usize| {
+            k < problem.calibration_offset() && (9..FRAME_DIM).contains(&(k % problem.frame_dim()))
+        };
+        for row in (0..reduced).filter(|k| !is_bias(*k)) {
+            for column in (0..=row).filter(|k| !is_bias(*k)) {
+                let off = (system.h.entry(row, column) - schur[(row, column)]) / (scale(row) * scale(column));
+                assert!(
+                    off.abs() < 2e-3,
+                    "({row}, {column}): {} not {}",
+                    system.h.entry(row, column),
+                    schur[(row, column)]
+                );
+            }
+        }
+    }
+
+    #[test]
+    fn the_prior_is_that_of_a_process_that_stays_about_zero() {
+        let problem = problem();
+        let prior = LensPrior { focal: Some(0.015), shift: None };
+        let (_, process) = prior.processes().next().unwrap();
+        let mut information = DMatrix::zeros(3, 3);
+        for (k, tie) in ties(&problem, process).enumerate() {
+            let mut row = DMatrix::zeros(1, 3);
+            row[k] = 1.0;
+            if k > 0 {
+                row[k - 1] = -tie.share;
+            }
+            information += row.transpose() * &row * tie.weight;
+        }
+        let covariance = information.clone().try_inverse().unwrap();
+        for k in 0..3 {
+            let expected = process.sigma.powi(2) * (-0.2 * (k as f64) / process.secs).exp();
+            assert!((covariance[(k, 0)] - expected).abs() < 1e-9 * expected, "{covariance}");
+            assert!((covariance[(k, k)].sqrt() - process.sigma).abs() < 1e-9, "{covariance}");
+        }
+        assert!((information.determinant().ln() - log_det(&problem, &prior)).abs() < 1e-9);
+    }
+}
