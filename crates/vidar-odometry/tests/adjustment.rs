@@ -140,7 +140,7 @@ fn a_stabilised_lens_is_found_in_every_image() {
         let flight = logged_with(seed, 12.0, 1.0, 0.0, &config, &settings());
         let adjusted = adjust(&flight, &settings());
         let found = adjusted.findings.iter().find_map(|f| match f {
-            AdjustmentFinding::Stabilised { rms } => Some(*rms),
+            AdjustmentFinding::Shifted { rms } => Some(*rms),
             _ => None,
         });
         // Two sines in quadrature have one's amplitude.

@@ -16,7 +16,7 @@ const UNSEEN_ACCEL_NOISE: f64 = 5e-3;
 const GYRO_NOISE: (f64, f64) = (1e-4, 1e-2);
 const ACCEL_NOISE: (f64, f64) = (1e-3, 0.1);
 
-/// A file is contradicted above this multiple of what the samples show. EuRoC's MH_01, TUM-VI's rooms and rendered phones show 0.7 to 1.4 times
+/// A file is contradicted above this multiple of what the samples show, and below one over it. EuRoC's MH_01, TUM-VI's rooms and rendered phones show 0.7 to 1.4 times
 /// what their files state.
 const CONTRADICTED: f64 = 2.0;
 /// Walks above this multiple of a consumer sensor's are those of no sensor.
@@ -99,18 +99,20 @@ fn densities(noise: &ImuNoise) -> String {
 fn bounded(stated: &ImuNoise, shown: &ImuNoise) -> (ImuNoise, Vec<String>) {
     let mut settled = *stated;
     let mut contradicted = Vec::new();
-    let mut bound = |value: &mut f64, limit: f64, then: f64, what: &str| {
-        if *value > limit {
+    let mut within = |value: &mut f64, [least, most]: [f64; 2], then: f64, what: &str| {
+        if *value > most || *value < least {
             contradicted.push(format!("{what} {value:.1e} is taken as {then:.1e}"));
             *value = then;
         }
     };
-    let shown = [shown.gyro_noise_density, shown.accel_noise_density];
-    bound(&mut settled.gyro_noise_density, CONTRADICTED * shown[0], shown[0], "gyroscope");
-    bound(&mut settled.accel_noise_density, CONTRADICTED * shown[1], shown[1], "accelerometer");
-    let walks = [GYRO_RANDOM_WALK, ACCEL_RANDOM_WALK].map(|walk| MOST_WALK * walk);
-    bound(&mut settled.gyro_random_walk, walks[0], walks[0], "bias walk of the gyroscope");
-    bound(&mut settled.accel_random_walk, walks[1], walks[1], "bias walk of the accelerometer");
+    let mut density = |value: &mut f64, shown: f64, what: &str| {
+        within(value, [shown / CONTRADICTED, shown * CONTRADICTED], shown, what);
+    };
+    density(&mut settled.gyro_noise_density, shown.gyro_noise_density, "gyroscope");
+    density(&mut settled.accel_noise_density, shown.accel_noise_density, "accelerometer");
+    let mut walk = |value: &mut f64, most: f64, what: &str| within(value, [0.0, most], most, what);
+    walk(&mut settled.gyro_random_walk, MOST_WALK * GYRO_RANDOM_WALK, "bias walk of the gyroscope");
+    walk(&mut settled.accel_random_walk, MOST_WALK * ACCEL_RANDOM_WALK, "bias walk of the accelerometer");
     (settled, contradicted)
 }
 
@@ -119,7 +121,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn inflated_noise_is_bounded_and_plausible_noise_stays() {
+    fn noise_that_the_samples_contradict_is_replaced_and_plausible_noise_stays() {
         let shown = believed_noise(Some(SensorNoise { gyro: 5e-4, accel: 5e-3, rate_hz: 200.0 }));
         let plausible = ImuNoise { gyro_noise_density: 9e-4, accel_noise_density: 3e-3, ..shown };
         assert_eq!(bounded(&plausible, &shown), (plausible, Vec::new()));
@@ -128,5 +130,8 @@ mod tests {
         let expected = ImuNoise { accel_noise_density: 5e-3, gyro_random_walk: 2e-4, ..plausible };
         assert_eq!((settled, contradicted.len()), (expected, 2), "{contradicted:?}");
         assert!(contradicted[0].contains("accelerometer 1.8e-1 is taken as 5.0e-3"), "{contradicted:?}");
+        let optimistic = ImuNoise { gyro_noise_density: 1e-4, ..plausible };
+        let (settled, contradicted) = bounded(&optimistic, &shown);
+        assert_eq!((settled.gyro_noise_density, contradicted.len()), (5e-4, 1), "{contradicted:?}");
     }
 }

@@ -219,7 +219,7 @@ pub(crate) fn track(
     }
     let recording = TrackingInput { config: &config, ..*recording };
     let again = track_calibrated(&recording, adjustable, events, cancel, dump)?;
-    Ok(if again.adjusted.as_ref().is_some_and(adjusted::explains_as_stabilised) { again } else { tracked })
+    Ok(if again.adjusted.as_ref().is_some_and(adjusted::explains_as_shifted) { again } else { tracked })
 }
 
 /// Feeds a recording to the odometry, and adjusts all states after its end where `adjustable` says what may change. Where that leaves

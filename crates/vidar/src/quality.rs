@@ -121,7 +121,7 @@ impl TrackQuality {
             contradicts_given: adjusted
                 .findings
                 .iter()
-                .any(|finding| !matches!(finding, AdjustmentFinding::Stabilised { .. })),
+                .any(|finding| !matches!(finding, AdjustmentFinding::Shifted { .. })),
             noise_ratio: adjusted.report.noise_ratio,
         });
     }

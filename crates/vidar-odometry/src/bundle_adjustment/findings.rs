@@ -42,8 +42,8 @@ pub enum AdjustmentFinding {
     },
     /// The focal length differs from what was given, and from image to image.
     FocalLength(Focus),
-    /// Images are shifted against each other: optical stabilisation.
-    Stabilised {
+    /// Images are shifted against what the gyroscope says: optical stabilisation, or a camera that is loose on the IMU.
+    Shifted {
         /// Root mean square of the shift, focal lengths.
         rms: f64,
     },
@@ -59,7 +59,7 @@ impl AdjustmentFinding {
     pub(super) fn is_plausible(&self) -> bool {
         match self {
             Self::FocalLength(focus) => focus.spread <= MOST_FOCUS_SPREAD,
-            Self::Stabilised { rms } => *rms <= MOST_SHIFT,
+            Self::Shifted { rms } => *rms <= MOST_SHIFT,
             _ => true,
         }
     }
@@ -134,7 +134,7 @@ pub(super) fn of(
     let found = &problem.calibration.body_from_camera;
     let mut findings: Vec<AdjustmentFinding> =
         lens.focus.map(AdjustmentFinding::FocalLength).into_iter().collect();
-    findings.extend(lens.shift.map(|rms| AdjustmentFinding::Stabilised { rms }));
+    findings.extend(lens.shift.map(|rms| AdjustmentFinding::Shifted { rms }));
     let contradicts = |by: &Vector3<f64>, joint: &Matrix3<f64>, least: f64| {
         let chi2 = joint.try_inverse().map_or(0.0, |inverse| by.dot(&(inverse * by)));
         chi2 > CHI2_3_SIGMAS && by.norm() > least

@@ -241,7 +241,7 @@ fn between(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use nalgebra::Vector3;
+    use nalgebra::{Vector2, Vector3};
     use vidar_core::CameraId;
 
     fn stamp(i: u32) -> FrameStamp {
