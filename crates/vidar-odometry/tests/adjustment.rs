@@ -11,7 +11,7 @@ use vidar_core::{
 };
 use vidar_eval::{TrajectoryEvalConfig, evaluate_trajectory};
 use vidar_odometry::bundle_adjustment::{
-    Adjusted, AdjustmentError, AdjustmentFinding, CalibrationSigmas, Focus,
+    Adjusted, AdjustmentError, AdjustmentFinding, AdjustmentReport, CalibrationSigmas, Focus,
 };
 use vidar_odometry::simulate::{
     AdjustSettings, Course, CourseKind, Logged, Random, Simulation, SimulationConfig,
@@ -132,9 +132,28 @@ fn a_focal_length_that_changes_is_found_in_every_image() {
     assert!(ln_s_nees < 18.5, "{ln_s_nees} of {flights}");
 }
 
+/// A gyroscope that is turned against the accelerometer, as in a file whose axes were mixed up, is no unknown of the adjustment.
+#[test]
+fn what_noise_does_not_explain_is_told_by_the_noise_ratio() {
+    let config = SimulationConfig { tracks: 60, camera_rate_hz: 10.0, noise: CONSUMER, ..Default::default() };
+    for turned_deg in [0.0_f64, 12.0] {
+        let course = Course { kind: CourseKind::Eight, secs: 9.0, speed: 1.0, phase: 0.3 };
+        let mut simulation = Simulation::new(&course, 0.0, 8.0, &config);
+        let turn = So3::exp(&(nalgebra::Vector3::x() * turned_deg.to_radians()));
+        simulation.imu_samples.iter_mut().for_each(|sample| sample.gyro.0 = turn.act(&sample.gyro.0));
+        let flight = Logged::new(&simulation, 2, 1, &settings());
+        let adjusted = adjust(&flight, &settings());
+        let ratio = adjusted.report.noise_ratio;
+        println!("turned by {turned_deg} degrees: noise ratio {ratio:.2}");
+        assert_eq!(ratio > AdjustmentReport::EXPLAINED_NOISE, turned_deg > 0.0, "{turned_deg}: {ratio}");
+        let error = flight.log_scale_error(&adjusted);
+        assert!(error.abs() < 3.0 * adjusted.scale_std, "ln s {error} at σ {}", adjusted.scale_std);
+    }
+}
+
 #[test]
 fn a_stabilised_lens_is_found_in_every_image() {
-    let (mut ln_s_nees, flights) = (0.0, 4);
+    let (mut ln_s_nees, flights) = (0.0, 2);
     let config = SimulationConfig { shift: 0.008, ..SimulationConfig::default() };
     for seed in 0..flights {
         let flight = logged_with(seed, 12.0, 1.0, 0.0, &config, &settings());
@@ -157,18 +176,12 @@ fn a_stabilised_lens_is_found_in_every_image() {
         };
         let count = adjusted.keyframes.len() as f64;
         let error = (adjusted.keyframes.iter().map(off).sum::<f64>() / count).sqrt();
-        println!(
-            "flight {seed}: rms {rms:.5}, error {error:.5}, ate {:.4}, ln s {:.4} at {:.4}",
-            ate_m(&flight, &adjusted),
-            flight.log_scale_error(&adjusted),
-            adjusted.scale_std
-        );
         assert!(error < 0.003, "flight {seed}: {error}");
         ln_s_nees += (flight.log_scale_error(&adjusted) / adjusted.scale_std).powi(2);
         assert!(ate_m(&flight, &adjusted) < 0.03, "flight {seed}: {} m", ate_m(&flight, &adjusted));
     }
-    // χ² of four at 99.9 %.
-    assert!(ln_s_nees < 18.5, "{ln_s_nees} of {flights}");
+    // χ² of two at 99.9 %.
+    assert!(ln_s_nees < 13.8, "{ln_s_nees} of {flights}");
 }
 
 #[test]

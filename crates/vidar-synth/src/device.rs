@@ -84,6 +84,9 @@ pub struct DeviceConfig {
     pub stamp_delay_secs: f64,
     /// Standard deviation of each frame's time in periods, 0…0.3 (variable frame rate); stamps follow.
     pub frame_jitter: f64,
+    /// Optical stabilisation: the share of the shake about the picture's axes that the lens takes back, 0…1, by up to 1.2° and without what is
+    /// slower than a second.
+    pub stabilisation: f64,
     /// Share of frames that are missing, 0…0.5.
     pub dropped_frames: f64,
     /// Share of frames that show the previous image again under a new stamp, 0…0.5.
@@ -110,6 +113,7 @@ impl Default for DeviceConfig {
             readout_secs: 0.0,
             stamp_delay_secs: 0.0,
             frame_jitter: 0.0,
+            stabilisation: 0.0,
             dropped_frames: 0.0,
             repeated_frames: 0.0,
             jpeg_quality: 0,
@@ -136,6 +140,7 @@ impl DeviceConfig {
         within("device.readout_secs", self.readout_secs, 0.0, 0.05, "0 to 0.05 s")?;
         within("device.stamp_delay_secs", self.stamp_delay_secs, -0.15, 0.15, "-0.15 to 0.15 s")?;
         within("device.frame_jitter", self.frame_jitter, 0.0, 0.3, "0 to 0.3")?;
+        within("device.stabilisation", self.stabilisation, 0.0, 1.0, "0 to 1")?;
         within("device.dropped_frames", self.dropped_frames, 0.0, 0.5, "0 to 0.5")?;
         within("device.repeated_frames", self.repeated_frames, 0.0, 0.5, "0 to 0.5")?;
         ensure(self.jpeg_quality <= 100, "device.jpeg_quality", "0 to 100", self.jpeg_quality)?;

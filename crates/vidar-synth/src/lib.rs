@@ -28,6 +28,7 @@ mod schedule;
 mod sensors;
 mod sequence;
 mod simulation;
+mod stabiliser;
 mod staging;
 mod stamps;
 mod truth;

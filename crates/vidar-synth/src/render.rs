@@ -5,12 +5,12 @@
 
 use crate::error::SynthError;
 use crate::world::{Hit, TileBounds, TileHits, World};
-use nalgebra::{Matrix3, Vector3};
+use nalgebra::{Matrix3, Vector2, Vector3};
 use rayon::prelude::*;
 use vidar_core::{CameraModel, FrameImage, Image, MetricDepth, Se3};
 
 /// Columns and rows of a tile, whose rays are cast together from one pose.
-const TILE: [usize; 2] = [8, 8];
+pub(crate) const TILE: [usize; 2] = [8, 8];
 
 /// Tiles of a rolling shutter: rows of a tile share a pose, which is off by half a row's time at most. At 30 ms for
 /// 480 rows, 3 rad/s and a focal length of 490 px that is 0.05 px.
@@ -43,13 +43,26 @@ impl RayTable {
 
     /// As [`RayTable::new`], with tiles of `tile` columns and rows.
     pub(crate) fn with_tiles(camera: &CameraModel, samples: usize, tile: [usize; 2]) -> Self {
+        Self::shifted(camera, samples, tile, |_| Vector2::zeros())
+    }
+
+    /// As [`RayTable::with_tiles`], of a camera whose picture is shifted by so many pixels in a row.
+    pub(crate) fn shifted(
+        camera: &CameraModel,
+        samples: usize,
+        tile: [usize; 2],
+        shift_px: impl Fn(usize) -> Vector2<f64>,
+    ) -> Self {
         let (width, height) = (camera.width(), camera.height());
+        let shifts: Vec<Vector2<f64>> = (0..height).map(shift_px).collect();
         let samples = (0..samples)
             .map(|s| {
                 let [dx, dy] = place_in_pixel(s, samples);
                 let ray = |i: usize| {
-                    let pixel = nalgebra::Vector2::new((i % width) as f64 + dx, (i / width) as f64 + dy);
-                    camera.unproject(&pixel).map_or([f64::NAN; 2], |r| [r.x / r.z, r.y / r.z])
+                    let pixel = Vector2::new((i % width) as f64 + dx, (i / width) as f64 + dy);
+                    camera
+                        .unproject(&(pixel - shifts[i / width]))
+                        .map_or([f64::NAN; 2], |r| [r.x / r.z, r.y / r.z])
                 };
                 let rays: Vec<[f64; 2]> = (0..width * height).into_par_iter().map(ray).collect();
                 let columns = width.div_ceil(tile[0]);

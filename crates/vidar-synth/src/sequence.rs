@@ -8,11 +8,12 @@ use crate::image_file;
 use crate::imu::simulate_imu;
 use crate::layout;
 use crate::photometry::Photometry;
-use crate::render::{ROLLING_TILE, RayTable, expose};
+use crate::render::{ROLLING_TILE, RayTable, TILE, expose};
 use crate::rig;
 use crate::scan::{ObservingFrame, Scan, scan_observed_surface};
 use crate::schedule::{Shot, shots};
 use crate::simulation::{CONFIG_FILE, FLIGHT_FILE, flight_list};
+use crate::stabiliser::Stabiliser;
 use crate::staging::{Staging, make_folder};
 use crate::truth::{TRUTH_FILE, truth_text};
 use crate::world::World;
@@ -112,11 +113,8 @@ impl Writer<'_> {
             make_folder(&self.mav.join("depth0/data"))?;
         }
         let samples = self.config.blur_samples;
-        let rays = if self.config.device.readout_secs > 0.0 {
-            RayTable::with_tiles(&self.camera, samples, ROLLING_TILE)
-        } else {
-            RayTable::new(&self.camera, samples)
-        };
+        let rays = RayTable::with_tiles(&self.camera, samples, self.tile());
+        let stabiliser = self.stabiliser();
         let photometry = Photometry::new(self.config);
         let total = self.shots.len();
         let done = AtomicUsize::new(0);
@@ -125,7 +123,8 @@ impl Writer<'_> {
             if cancelled.load(Ordering::Relaxed) {
                 return Err(SynthError::Cancelled);
             }
-            let frame_view = self.write_frame(k, &rays, &photometry)?;
+            let shifted = stabiliser.as_ref().map(|stabiliser| self.shifted_rays(k, stabiliser));
+            let frame_view = self.write_frame(k, shifted.as_ref().unwrap_or(&rays), &photometry)?;
             if !progress(done.fetch_add(1, Ordering::Relaxed) + 1, total) {
                 cancelled.store(true, Ordering::Relaxed);
                 return Err(SynthError::Cancelled);
@@ -133,6 +132,25 @@ impl Writer<'_> {
             Ok(frame_view)
         };
         (0..total).into_par_iter().with_max_len(1).map(frame).collect()
+    }
+
+    /// Columns and rows whose rays are cast together.
+    fn tile(&self) -> [usize; 2] {
+        if self.config.device.readout_secs > 0.0 { ROLLING_TILE } else { TILE }
+    }
+
+    fn stabiliser(&self) -> Option<Stabiliser> {
+        let share = self.config.device.stabilisation;
+        (share > 0.0).then(|| Stabiliser::new(self.path, &self.body_from_camera.rotation, share))
+    }
+
+    /// The rays of a stabilised image: the lens moves on from row to row.
+    fn shifted_rays(&self, k: usize, stabiliser: &Stabiliser) -> RayTable {
+        let shift_px = |row: usize| {
+            let secs = self.shots[k].secs + self.row_delay(row as f64);
+            stabiliser.shift(secs).component_mul(&self.camera.focal_lengths())
+        };
+        RayTable::shifted(&self.camera, self.config.blur_samples, self.tile(), shift_px)
     }
 
     fn write_frame(

@@ -31,6 +31,7 @@ pub(crate) fn truth_text(
             "distortion": layout::distortion(camera),
             "body_from_camera": layout::mount_matrix(config),
             "readout_secs": config.device.readout_secs,
+            "stabilisation": config.device.stabilisation,
             "stamp_delay_secs": config.device.stamp_delay_secs,
             "imu_time_minus_stamp_secs": -config.device.stamp_delay_secs,
             "frames": shots.iter().map(|s| s.stamps.len()).sum::<usize>(),

@@ -339,7 +339,7 @@ mod tests {
         let time = |secs: i64| {
             serde_json::to_value(vidar_core::Timestamp::from_nanos(secs * 1_000_000_000)).unwrap()
         };
-        let level = |adjusted: Option<(f64, bool)>, health: vidar_core::Health| {
+        let verdict = |adjusted: Option<(f64, bool, f64)>, health: vidar_core::Health| {
             let mut quality = serde_json::to_value(TrackQuality::default()).unwrap();
             (quality["contradictions"], quality["waits"]) = (48.into(), 78.into());
             quality["times"] = serde_json::json!([time(0), time(10)]);
@@ -347,19 +347,23 @@ mod tests {
                 "images": 100, "health": { health.as_str(): 100 }, "first": time(0), "last": time(10),
                 "last_position": [0.0, 0.0, 0.0], "last_scale_std": 0.01, "weighted": [0.0, 0.0]
             } });
-            quality["adjusted"] = serde_json::json!(adjusted.map(|(inertial_chi2, contradicts_given)| serde_json::json!({
+            quality["adjusted"] = serde_json::json!(adjusted.map(|(inertial_chi2, contradicts_given, noise_ratio)| serde_json::json!({
                 "images": 100, "first": time(0), "last": time(10), "scale_std": 0.01, "inertial_chi2": inertial_chi2,
-                "contradicts_given": contradicts_given
+                "contradicts_given": contradicts_given, "noise_ratio": noise_ratio
             })));
             let mut findings = Findings::default();
             findings.track(&serde_json::from_value(quality).unwrap());
-            findings.verdict(Some("ATE".into())).level
+            findings.verdict(Some("ATE".into()))
         };
+        let level = |adjusted, health| verdict(adjusted, health).level;
         use vidar_core::Health::{Degraded, Ok};
         assert_eq!(level(None, Degraded), Level::Bad);
         assert_eq!(level(None, Ok), Level::Caution);
-        assert_eq!(level(Some((1.5, false)), Ok), Level::Caution);
-        assert_eq!(level(Some((0.1, true)), Ok), Level::Caution);
-        assert_eq!(level(Some((0.1, false)), Ok), Level::Good);
+        assert_eq!(level(Some((1.5, false, 1.0)), Ok), Level::Caution);
+        assert_eq!(level(Some((0.1, true, 1.0)), Ok), Level::Caution);
+        assert_eq!(level(Some((0.1, false, 1.3)), Ok), Level::Good);
+        let unexplained = verdict(Some((0.1, false, 4.0)), Ok);
+        assert_eq!(unexplained.level, Level::Caution);
+        assert!(unexplained.reasons[0].contains("4.0 times the IMU's own noise"), "{unexplained:?}");
     }
 }

@@ -146,6 +146,28 @@ fn real_frames_are_tracked_to_a_centimetre() {
     assert!(json["first_state_secs"].as_f64().unwrap() < 1.5, "{json}");
 }
 
+/// A lively hand whose tremor the lens takes back: no attempt to begin believes it, and it is tracked once more.
+const STABILISED: &str = "seed = 11\nflight = \"handheld-lively\"\nduration_secs = 8.0\ncamera_rate_hz = 20.0\nwidth = 376\n\
+    height = 240\nblur_samples = 1\nexposure_secs = 0.0\nscan_spacing_m = 0.1\n[device]\nstabilisation = 0.8\n";
+
+#[test]
+fn stabilised_images_are_tracked_all_the_same_and_told() {
+    let (world, sequence) = (shared().root.join("stabilised.toml"), shared().root.join("stabilised"));
+    std::fs::write(&world, STABILISED).unwrap();
+    vidar(&["synth", sequence.to_str().unwrap(), "--world-config", world.to_str().unwrap()]).ends_with(0);
+    let live =
+        odometry(&sequence, &shared().root.join("stabilised live"), &["--set", "odometry.adjust=false"]);
+    live.ends_with(3).says(&["odometry-never-started", "contradict each other"]);
+    let out = shared().root.join("stabilised tracked");
+    let run = odometry(&sequence, &out, &[]).ends_with(0);
+    assert_eq!(manifest(&out)["warnings"], serde_json::json!({ "images-stabilised": 1 }));
+    let json = run.json();
+    assert!(json["mapped_images"].as_u64().unwrap() >= 150, "{json}");
+    let last = &json["final"]["trajectory"];
+    assert!(last["scale_error"].as_f64().unwrap() < 0.02, "{last}");
+    assert!(last["ate_se3_m"]["rmse"].as_f64().unwrap() < 0.02, "{last}");
+}
+
 #[test]
 fn noise_that_a_file_inflates_is_named_and_bounded() {
     let inflated = shared().root.join("inflated noise");

@@ -49,6 +49,7 @@ use envelope::Envelope;
 use initial::Guess;
 use lens_evidence::FoundLens;
 use loops::Closed;
+use noise::WeighedImu;
 use observation::{POSITION, ROTATION, SensorCalibration};
 use optimise::OptimiseReport;
 use problem::{CalibrationPrior, LensPrior, Problem};
@@ -77,8 +78,8 @@ struct Solution {
     inertial_chi2_per_dof: f64,
     /// The loop constraints.
     closed: Closed,
-    /// The IMU's model with noise as the residuals show it.
-    model: ImuModel,
+    /// The IMU's noise as the residuals show it.
+    weighed: WeighedImu,
     system: System,
     /// Covariance within the system's envelope.
     covariance: Envelope,
@@ -150,24 +151,27 @@ pub fn adjust(
     work.guess = grow::outward(&recording, &work, &mut watch)?;
     watch.stage(AdjustmentStage::Together, work.guess.images.len());
     let mut passed = work.pass(&recording, &mut watch)?;
-    for _ in 1..PASSES {
+    let mut passes = 1;
+    while passes < PASSES {
         // One lens for all where it moves puts the camera elsewhere: the place is not judged by that.
         let system = optimise::solution(&passed.problem).ok_or(AdjustmentError::Undetermined)?;
-        let is_doubted =
-            work.doubt_lens(&passed.problem, &system) || work.doubt_given(&passed.problem, &system);
+        let is_moving = work.doubt_lens(&passed.problem, &system);
+        let is_doubted = is_moving || work.doubt_given(&passed.problem, &system);
         if passed.is_settled && !is_doubted {
             break;
         }
         passed = work.pass(&recording, &mut watch)?;
+        // What a lens does is found once.
+        passes += usize::from(!is_moving);
     }
     watch.stage(AdjustmentStage::Weighted, work.guess.images.len());
     let inertial_chi2_per_dof = optimise::inertial_chi2_per_dof(&passed.problem);
-    let mut model = weigh(input, &mut passed, &mut watch)?;
+    let mut weighed = weigh(input, &mut passed, &mut watch)?;
     // With noise that is taken for several times as large as it is, a lever arm that is 10 cm off was no contradiction.
     let system = optimise::solution(&passed.problem).ok_or(AdjustmentError::Undetermined)?;
-    if work.doubt_given(&passed.problem, &system) {
+    if work.doubt_lens(&passed.problem, &system) || work.doubt_given(&passed.problem, &system) {
         passed = work.pass(&recording, &mut watch)?;
-        model = weigh(input, &mut passed, &mut watch)?;
+        weighed = weigh(input, &mut passed, &mut watch)?;
     }
     watch.stage(AdjustmentStage::Loops, work.guess.images.len());
     let closed = loops::close(&mut passed.problem, &mut passed.report, log, &passed.images, &mut watch)?;
@@ -183,36 +187,36 @@ pub fn adjust(
         report,
         inertial_chi2_per_dof,
         closed,
-        model,
+        weighed,
         system,
         covariance,
         lens,
     };
     let corrected = imu.multiplied(&solution.problem.calibration.gain);
-    let recording = Measurements { imu: &corrected, model: &solution.model, ..recording };
+    let recording = Measurements { imu: &corrected, model: &solution.weighed.model, ..recording };
     Ok(result::collect(input, &recording, &solution))
 }
 
-/// Adjusts again with the IMU's noise as the residuals show it, until that is settled; the model with it.
+/// Adjusts again with the IMU's noise as the residuals show it, until that is settled.
 fn weigh(
     input: &AdjustmentInput<'_>,
     passed: &mut Passed,
     watch: &mut Watch<'_>,
-) -> Result<ImuModel, AdjustmentError> {
+) -> Result<WeighedImu, AdjustmentError> {
     let Passed { problem, report, .. } = passed;
-    let mut model = input.model;
+    let mut weighed = WeighedImu { model: input.model, is_told: [false; 2] };
     for _ in 0..WEIGHINGS {
         let covariance = noise::covariance(problem).ok_or(AdjustmentError::Undetermined)?;
-        let found = noise::reweighed(&model, &noise::components(problem, &covariance), &input.data_sheet);
-        let change = noise::largest_change(&model, &found);
-        model = found;
-        if change < SETTLED_NOISE {
+        let before = weighed.model;
+        weighed = noise::reweighed(&before, &noise::components(problem, &covariance), &input.data_sheet);
+        let model = &weighed.model;
+        if noise::largest_change(&before, model) < SETTLED_NOISE {
             break;
         }
-        problem.frames.iter_mut().filter_map(|f| f.inertial.as_mut()).for_each(|i| i.reweigh(&model));
+        problem.frames.iter_mut().filter_map(|f| f.inertial.as_mut()).for_each(|i| i.reweigh(model));
         optimise::finish(problem, report, watch)?;
     }
-    Ok(model)
+    Ok(weighed)
 }
 
 /// What was recorded.

@@ -43,6 +43,21 @@ pub(super) struct Components {
     pub(super) accel: Component,
 }
 
+/// The IMU's model with noise as the residuals show it.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct WeighedImu {
+    pub(super) model: ImuModel,
+    /// Whether enough was left over to tell the noise of gyroscope and accelerometer; otherwise it is what was assumed.
+    pub(super) is_told: [bool; 2],
+}
+
+impl Components {
+    /// See [`WeighedImu::is_told`].
+    fn told(&self) -> [bool; 2] {
+        [&self.gyro, &self.accel].map(|component| component.factor().is_some())
+    }
+}
+
 /// The components at the solution whose covariance (within the envelope) is `covariance`.
 pub(super) fn components(problem: &Problem, covariance: &Envelope) -> Components {
     let mut found = Components::default();
@@ -76,7 +91,7 @@ pub(super) fn components(problem: &Problem, covariance: &Envelope) -> Components
 }
 
 /// The model with densities as the residuals show them, bounded below by the data sheet's.
-pub(super) fn reweighed(model: &ImuModel, found: &Components, data_sheet: &StepNoise) -> ImuModel {
+pub(super) fn reweighed(model: &ImuModel, found: &Components, data_sheet: &StepNoise) -> WeighedImu {
     let scaled = |density: f64, component: &Component, least: f64| {
         let factor = component.factor().unwrap_or(1.0).sqrt();
         (density * factor.min(MAX_FACTOR)).max(least)
@@ -86,7 +101,7 @@ pub(super) fn reweighed(model: &ImuModel, found: &Components, data_sheet: &StepN
         accel_density: scaled(model.noise.accel_density, &found.accel, data_sheet.accel_density),
         ..model.noise
     };
-    ImuModel { noise, ..*model }
+    WeighedImu { model: ImuModel { noise, ..*model }, is_told: found.told() }
 }
 
 /// By how much the densities of two models differ, relatively.

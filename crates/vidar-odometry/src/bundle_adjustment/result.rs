@@ -3,6 +3,7 @@
 use super::envelope::Envelope;
 use super::inertial::GAIN_DIM;
 use super::initial::preintegrate;
+use super::noise::WeighedImu;
 use super::observation::TIMING_AND_PLACE;
 use super::problem::Problem;
 use super::system::System;
@@ -11,7 +12,7 @@ use super::{
 };
 use super::{findings, keyframes};
 use crate::calibration::loud_noise;
-use crate::imu::{ImuBuffer, ImuModel, NavState, StepNoise};
+use crate::imu::{ImuBuffer, ImuModel, NavState};
 use crate::pipeline::{Joined, public_state};
 use nalgebra::Vector3;
 use vidar_core::{CameraModel, Duration, FrameId, LieGroup, OdometryKeyframe, Se3, So3, Timestamp};
@@ -84,14 +85,17 @@ impl AdjustmentReport {
     pub const EXPLAINED_NOISE: f64 = 2.5;
 }
 
-/// The factor by which the IMU's noise, as weighed, exceeds what its samples show with vibration and its data sheet states, of the sensor for which that is more.
-fn noise_ratio(input: &AdjustmentInput<'_>, weighed: &StepNoise) -> f64 {
+/// The factor by which the IMU's noise exceeds what its samples show with vibration and its data sheet states, of the sensor for which that is more; 1 where
+/// the residuals tell neither.
+fn noise_ratio(input: &AdjustmentInput<'_>, weighed: &WeighedImu) -> f64 {
+    let (sheet, found) = (&input.data_sheet, &weighed.model.noise);
     let seen = loud_noise(input.log.imu_samples());
-    let ratio =
-        |weighed: f64, sheet: f64, seen: Option<f64>| weighed / seen.map_or(sheet, |seen| seen.max(sheet));
-    let sheet = &input.data_sheet;
-    let gyro = ratio(weighed.gyro_density, sheet.gyro_density, seen.map(|n| n.gyro));
-    gyro.max(ratio(weighed.accel_density, sheet.accel_density, seen.map(|n| n.accel)))
+    let [gyro, accel] = [
+        found.gyro_density / seen.map_or(0.0, |n| n.gyro).max(sheet.gyro_density),
+        found.accel_density / seen.map_or(0.0, |n| n.accel).max(sheet.accel_density),
+    ];
+    let told = [gyro, accel].into_iter().zip(weighed.is_told).filter(|(_, is_told)| *is_told);
+    told.map(|(ratio, _)| ratio).reduce(f64::max).unwrap_or(1.0)
 }
 
 /// An adjusted recording. The world is levelled, z up, its origin where the first state was.
@@ -174,7 +178,7 @@ pub(super) fn collect(
     let offset = *clock_offset + clock;
     let states = states_of_images(recording, problem, offset).into_iter();
     let every_image = states.map(|(frame, stamp, state)| (frame, public_state(&state, stamp))).collect();
-    let noise_ratio = noise_ratio(input, &recording.model.noise);
+    let noise_ratio = noise_ratio(input, &solution.weighed);
     // Noise that stands in for an error of the model keeps its sign for seconds, which white noise does not.
     let scale_std = log_scale_sigma(problem, system) * noise_ratio.max(1.0);
     let mut sigmas = calibration_sigmas(problem, covariance);
