@@ -4,18 +4,17 @@
     disturb_pictures.py RECORDING OUT KIND
 
 Kinds: carrier (a textured fifth at the bottom and a dark corner move with the camera), walkers (two textured ellipses, a third of the width
-each, cross the picture again and again), stabilised (80 % of the shake is taken back, row by row, by up to 1.2 degrees), breathing (the focal length changes
+each, cross the picture again and again), breathing (the focal length changes
 by -1 to 1.5 % every few seconds), exposure (steps of up to a factor of 2.3), flicker (18 % at 100 Hz, row by row in 28 ms).
 """
 
-import json
 import pathlib
 import shutil
 import sys
 
 import numpy as np
 from PIL import Image
-from scipy.ndimage import affine_transform, map_coordinates, zoom
+from scipy.ndimage import affine_transform, zoom
 
 
 def texture(height, width, seed):
@@ -38,38 +37,13 @@ def steps(times, random, low, high, shortest, longest, share):
     return values
 
 
-class Stabiliser:
-    """An optical stabiliser: a leaky integral of the gyroscope about the picture's axes (1 s), with a soft limit."""
-
-    def __init__(self, imu, camera):
-        body_from_camera = np.array(camera["body_from_camera"]).reshape(4, 4)[:3, :3]
-        focal, limit = camera["intrinsics"][0], np.radians(1.2)
-        # About the camera's x the picture moves down, about its y to the left.
-        rates = (imu[:, 1:4] @ body_from_camera)[:, :2] * [1, -1]
-        period = np.median(np.diff(imu[:, 0])) * 1e-9
-        angle, angles = np.zeros(2), []
-        for rate in rates:
-            angle = angle * np.exp(-period) + rate * period
-            angles.append(angle)
-        self.stamps, self.rows_ns = imu[:, 0], 1e9 * camera["readout_secs"]
-        self.delay_ns = 1e9 * camera["stamp_delay_secs"]
-        # Of rows and columns.
-        self.shift_px = -0.8 * focal * limit * np.tanh(np.array(angles) / limit)
-
-    def at(self, stamp, height):
-        """What each row of a picture is shifted by: rows and columns, px."""
-        when = stamp - self.delay_ns + (np.arange(height) / height - 0.5) * self.rows_ns
-        return [np.interp(when, self.stamps, self.shift_px[:, axis])[:, None] for axis in range(2)]
-
-
 class Disturbance:
-    def __init__(self, kind, stamps, stabiliser, shape):
+    def __init__(self, kind, stamps, shape):
         self.height, self.width = shape
         self.times = (stamps - stamps[0]) * 1e-9
         random = np.random.default_rng(7)
         self.random = random
         self.paint = getattr(self, kind)
-        self.stamps, self.stabiliser = stamps, stabiliser
         self.zooms = steps(self.times, random, -0.01, 0.015, 2, 5, 0.2)
         self.gains = [2**v for v in steps(self.times, random, -1.2, 1.0, 0.8, 3, 0.35)]
         self.strip = texture(int(0.22 * self.height), self.width, 3)
@@ -98,11 +72,6 @@ class Disturbance:
                 area[inside] = (self.body[part] + self.random.normal(0, 2, inside.shape))[inside]
         return image
 
-    def stabilised(self, image, k):
-        down, right = self.stabiliser.at(self.stamps[k], self.height)
-        y, x = np.mgrid[: self.height, : self.width].astype(float)
-        return map_coordinates(image, [y - down, x - right], order=1, mode="nearest")
-
     def breathing(self, image, k):
         scale = 1 / (1 + self.zooms[k])
         middle = (1 - scale) * (np.array(image.shape) - 1) / 2
@@ -121,10 +90,8 @@ def main():
     shutil.copytree(source, out, ignore=lambda folder, names: names if folder.endswith("cam0/data") else [])
     files = sorted((source / "mav0/cam0/data").iterdir())
     stamps = np.array([int(file.stem) for file in files])
-    imu = np.loadtxt(source / "mav0/imu0/data.csv", delimiter=",", comments="#")
     read = lambda file: np.asarray(Image.open(file).convert("L")).astype(float)
-    truth = json.loads((source / "truth.json").read_text())
-    disturbance = Disturbance(kind, stamps, Stabiliser(imu, truth["camera"]), read(files[0]).shape)
+    disturbance = Disturbance(kind, stamps, read(files[0]).shape)
     for k, file in enumerate(files):
         image = np.clip(disturbance.paint(read(file), k), 0, 255).astype(np.uint8)
         quality = {"quality": 85} if file.suffix == ".jpg" else {}

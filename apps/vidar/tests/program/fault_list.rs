@@ -71,7 +71,10 @@ const SHORT: &[Case] = &[
         Fault::Gains(1.0, 1.0 / STANDARD_GRAVITY),
         &[Told(&["gravity-norm", "odometry-never-started"], "it looks like units of g")],
     ),
-    (Fault::Gains(DEGREES, 1.0), &[Told(&["gyro-range", "odometry-never-started"], "it looks like °/s")]),
+    (
+        Fault::Gains(DEGREES, 1.0),
+        &[Told(&["gyro-range", "imu-noise-contradicted", "odometry-never-started"], "it looks like °/s")],
+    ),
     (Fault::Gains(1.0, -1.0), &[Told(NEVER_STARTED, "axes, signs and units of the IMU")]),
     (Fault::Clock(500), &[Told(&["imu-coverage", "odometry-never-started"], "contradict each other")]),
     (Fault::OtherCamera, &[Told(NEVER_STARTED, "contradict each other")]),

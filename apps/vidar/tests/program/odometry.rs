@@ -162,7 +162,7 @@ fn stabilised_images_are_tracked_all_the_same_and_told() {
     let run = odometry(&sequence, &out, &[]).ends_with(0);
     assert_eq!(manifest(&out)["warnings"], serde_json::json!({ "images-stabilised": 1 }));
     let json = run.json();
-    assert!(json["mapped_images"].as_u64().unwrap() >= 150, "{json}");
+    assert!(json["quality"]["mapped_images"].as_u64().unwrap() >= 150, "{json}");
     let last = &json["final"]["trajectory"];
     assert!(last["scale_error"].as_f64().unwrap() < 0.02, "{last}");
     assert!(last["ate_se3_m"]["rmse"].as_f64().unwrap() < 0.02, "{last}");

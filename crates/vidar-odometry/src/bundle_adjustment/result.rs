@@ -83,6 +83,11 @@ impl AdjustmentReport {
     /// The noise ratio up to which noise explains what camera and IMU differ by. Real MH_01 has 1.3, 322 adjustments of rendered recordings up to 1.4 where all
     /// was modelled; 43 in which something was not (a focal length that changes, stabilised images, a carrier in view, swapped axes) 2.5 to 100.
     pub const EXPLAINED_NOISE: f64 = 2.5;
+
+    /// Whether noise explains what camera and IMU differ by.
+    pub fn is_explained(&self) -> bool {
+        self.noise_ratio <= Self::EXPLAINED_NOISE
+    }
 }
 
 /// The factor by which the IMU's noise exceeds what its samples show with vibration and its data sheet states, of the sensor for which that is more; 1 where

@@ -7,7 +7,7 @@ use serde_json::{Value, json};
 use vidar_core::{BodyFrame, Duration, StampedPose, Trajectory, Warning};
 use vidar_dataset::{CalibrationSource, Recording};
 use vidar_odometry::bundle_adjustment::{
-    Adjusted, AdjustedCalibration, AdjustedImu, AdjustmentFinding, AdjustmentReport, CalibrationSigmas, Focus,
+    Adjusted, AdjustedCalibration, AdjustedImu, AdjustmentFinding, CalibrationSigmas, Focus,
 };
 
 /// Standard deviations of a calibration that was found from the recording's own tracks and gyroscope.
@@ -74,7 +74,7 @@ pub(crate) fn shown_readout_secs(calibration: &AdjustedCalibration) -> f64 {
 /// Whether images are found to be stabilised, and nothing else is needed to explain what they and the IMU differ by.
 pub(super) fn explains_as_shifted(adjusted: &Adjusted) -> bool {
     adjusted.findings.iter().any(|finding| matches!(finding, AdjustmentFinding::Shifted { .. }))
-        && adjusted.report.noise_ratio <= AdjustmentReport::EXPLAINED_NOISE
+        && adjusted.report.is_explained()
 }
 
 /// The calibration as adjusted, with standard deviations; zero where it was held.

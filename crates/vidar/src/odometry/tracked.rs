@@ -195,9 +195,13 @@ impl Tracked {
         StatedScale::new(source, None)
     }
 
-    /// Whether no adjustment explains the recording, and most attempts to begin found that images and IMU contradict each other.
+    /// Whether images and IMU contradict each other: the adjustment leaves more than noise explains, or there is none and most attempts to begin found so.
     pub(super) fn is_contradicted(&self) -> bool {
-        self.with_imu && self.adjusted.is_none() && self.quality.contradicts()
+        let contradicts = match &self.adjusted {
+            Some(adjusted) => !adjusted.report.is_explained(),
+            None => self.quality.contradicts(),
+        };
+        self.with_imu && contradicts
     }
 
     /// Why it never had a state.
