@@ -4,6 +4,7 @@ pub(crate) mod adjusted;
 mod dump;
 mod files;
 pub(crate) mod map;
+mod passes;
 mod poses;
 mod report;
 mod summary;
@@ -11,6 +12,7 @@ mod tracked;
 
 pub(crate) use map::EarlierMap;
 pub use map::MapUse;
+pub(crate) use passes::{TrackingInput, track};
 pub(crate) use poses::TrackedPoses;
 pub use tracked::{ApartSpan, LostSpan, Tracked, TrackedFrame};
 
@@ -19,24 +21,19 @@ use crate::camera_timing;
 use crate::config::{Config, Layered};
 use crate::error::{Error, ExitStatus};
 use crate::events::{CancelToken, Event, Events};
-use crate::input::{self, Measurement, UnseenScale};
+use crate::input::{self, UnseenScale};
 use crate::recorder::Recorder;
 use crate::run_folder::{MANIFEST_SCHEMA, Manifest, OutputLocation, RunFolder};
 use crate::verdict::{Findings, Level, StatedScale, Verdict};
 use serde_json::json;
 use std::collections::BTreeSet;
-use std::ops::ControlFlow;
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Instant;
 use vidar_core::{Trajectory, Warning};
 use vidar_dataset::{OpenOptions, Recording};
 use vidar_eval::TrajectoryReport;
-use vidar_odometry::bundle_adjustment::{CalibrationSigmas, Progress};
-use vidar_odometry::{ImuUse, Odometry};
 
-/// The stage of the adjustment, in events.
-const ADJUSTMENT: &str = "adjustment";
 /// Kind of the warning that there is no state at all.
 const NEVER_STARTED: &str = "odometry-never-started";
 
@@ -184,156 +181,6 @@ fn settle_timing(
     cancel: &CancelToken,
 ) -> Result<Option<Warning>, Error> {
     events.stage(camera_timing::STAGE, 0, || camera_timing::settle(dataset, config, events, cancel))
-}
-
-/// What is tracked.
-pub(crate) struct TrackingInput<'a> {
-    pub dataset: &'a Recording,
-    pub config: &'a Config,
-    /// The map to look in.
-    pub map: Option<&'a EarlierMap>,
-}
-
-/// Noise of the gyroscope, as a multiple of the data sheet's, with which images that are shifted by half a degree against it are followed. With 30, 60 and 100
-/// six rendered phones began 1 to 13, 1 to 4 and 1 to 2 s after the first image; once they were adjusted, their errors were the same.
-const STABILISED_NOISE_FACTOR: f64 = 60.0;
-
-/// Feeds a recording to the odometry, and adjusts all states after its end where `adjustable` says what may change. Where images and IMU contradict
-/// each other, all of it happens once more as for stabilised images; that result stands where the adjustment shows that they are, and explains the recording.
-pub(crate) fn track(
-    recording: &TrackingInput<'_>,
-    adjustable: Option<&CalibrationSigmas>,
-    events: &Events,
-    cancel: &CancelToken,
-    mut dump: Option<&mut dump::Dump>,
-) -> Result<Tracked, Error> {
-    let tracked = track_calibrated(recording, adjustable, events, cancel, dump.as_deref_mut())?;
-    if adjustable.is_none() || !tracked.is_contradicted() || cancel.is_cancelled() {
-        return Ok(tracked);
-    }
-    let mut config = recording.config.clone();
-    let factor = &mut config.odometry.gyro_noise_factor;
-    *factor = factor.max(STABILISED_NOISE_FACTOR);
-    if let Some(dump) = dump.as_deref_mut() {
-        dump.begin_again()?;
-    }
-    let recording = TrackingInput { config: &config, ..*recording };
-    let again = track_calibrated(&recording, adjustable, events, cancel, dump)?;
-    Ok(if again.adjusted.as_ref().is_some_and(adjusted::explains_as_shifted) { again } else { tracked })
-}
-
-/// Feeds a recording to the odometry, and adjusts all states after its end where `adjustable` says what may change. Where that leaves
-/// camera and IMU apart and the calibration is the recording's own, all of it happens once more with the calibration as adjusted.
-fn track_calibrated(
-    recording: &TrackingInput<'_>,
-    adjustable: Option<&CalibrationSigmas>,
-    events: &Events,
-    cancel: &CancelToken,
-    mut dump: Option<&mut dump::Dump>,
-) -> Result<Tracked, Error> {
-    let tracked = track_once(recording, adjustable, events, cancel, dump.as_deref_mut())?;
-    let TrackingInput { dataset, config, map } = *recording;
-    let first = tracked.adjusted.as_ref().filter(|a| input::leaves_calibration_unchecked(dataset, a));
-    let Some(first) = first.filter(|_| !cancel.is_cancelled()) else { return Ok(tracked) };
-    let focal = |dataset: &Recording| dataset.rig.cameras[dataset.camera.index()].model.intrinsics().fx;
-    let before = focal(dataset);
-    let (mut dataset, mut config) = (dataset.clone(), config.clone());
-    adjusted::apply(first, &mut dataset);
-    config.odometry.readout_ms = Some(1e3 * first.calibration.readout_secs);
-    if let Some(dump) = dump.as_deref_mut() {
-        dump.begin_again()?;
-    }
-    let again = TrackingInput { dataset: &dataset, config: &config, map };
-    let mut again = track_once(&again, adjustable, events, cancel, dump)?;
-    again.calibrated_again = Some([before, focal(&dataset)]);
-    Ok(if again.adjusted.is_some() { again } else { tracked })
-}
-
-fn track_once(
-    recording: &TrackingInput<'_>,
-    adjustable: Option<&CalibrationSigmas>,
-    events: &Events,
-    cancel: &CancelToken,
-    dump: Option<&mut dump::Dump>,
-) -> Result<Tracked, Error> {
-    let total = recording.dataset.images.len();
-    let keeps_log = adjustable.is_some();
-    let (mut tracked, odometry) =
-        events.stage("odometry", total, || push_all(recording, keeps_log, events, cancel, dump))?;
-    if let Some(sigmas) = adjustable.filter(|_| tracked.with_imu && !cancel.is_cancelled()) {
-        let mut tell = |progress: Progress| {
-            events.emit(&Event::Progress { stage: ADJUSTMENT, done: progress.states, total: progress.of });
-            if cancel.is_cancelled() { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
-        };
-        match events.stage(ADJUSTMENT, 0, || odometry.adjust_with(sigmas, &mut tell)) {
-            Ok(mut adjusted) if adjusted.is_consistent() => {
-                if let Some(joined) = odometry.place_in_map(&adjusted) {
-                    adjusted.join(&joined);
-                    tracked.map.iter_mut().for_each(|map| map.matches = Some(joined.matches));
-                }
-                tracked.quality.adjust(&adjusted);
-                tracked.adjusted = Some(adjusted);
-            }
-            Ok(_) => tracked.not_adjusted = Some("camera and IMU contradict each other".into()),
-            Err(reason) => tracked.not_adjusted = Some(reason.to_string()),
-        }
-    }
-    tracked.saved_map = odometry.saved_map(tracked.adjusted.as_ref());
-    Ok(tracked)
-}
-
-fn push_all(
-    recording: &TrackingInput<'_>,
-    keeps_log: bool,
-    events: &Events,
-    cancel: &CancelToken,
-    mut dump: Option<&mut dump::Dump>,
-) -> Result<(Tracked, Odometry), Error> {
-    let TrackingInput { dataset, config, map } = *recording;
-    let settings = &config.odometry;
-    let mut odometry = Odometry::new(&dataset.rig, dataset.camera, settings)?;
-    if let Some(earlier) = map {
-        odometry = odometry.with_map(&earlier.map);
-    }
-    let with_imu = settings.imu != ImuUse::Off && dataset.rig.imu.is_some();
-    if keeps_log && with_imu {
-        odometry.keep_log();
-    }
-    let map = map.map(|m| MapUse { file: m.path.clone(), found_live_ns: None, matches: None });
-    let mut tracked = Tracked { with_imu, map, ..Tracked::default() };
-    let total = dataset.images.len();
-    let mut spent = 0.0;
-    for measurement in input::measurements(dataset, true) {
-        if cancel.is_cancelled() {
-            break;
-        }
-        let event = match measurement {
-            Measurement::Event(event) => event,
-            // A broken image is a gap in the stream, not the end of the flight.
-            Measurement::Unreadable(_, error) => {
-                tracked.unreadable.push(error.to_string());
-                continue;
-            }
-            Measurement::Stamp(_) => continue,
-        };
-        let clock = Instant::now();
-        let output = odometry.push(event)?;
-        spent += clock.elapsed().as_secs_f64();
-        if let Some(output) = output {
-            if let Some(dump) = &mut dump {
-                dump.add(&output, &odometry.tracks())?;
-            }
-            tracked.keep(output, std::mem::take(&mut spent));
-            let done = tracked.frames.len();
-            events.emit(&Event::Progress { stage: "odometry", done, total });
-        }
-    }
-    for output in odometry.finish() {
-        tracked.keep(output, 0.0);
-    }
-    tracked.counts = odometry.counts();
-    tracked.carrier_share = odometry.carrier_share();
-    Ok((tracked, odometry))
 }
 
 /// How far the trajectory may be trusted.

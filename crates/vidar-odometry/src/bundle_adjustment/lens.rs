@@ -6,79 +6,11 @@
 //! to turn otherwise than the gyroscope says. Where the recording shows it, every image has a focal length `f exp(z)` and a shift of its
 //! own, each an Ornstein-Uhlenbeck process: a random walk that stays about zero.
 
-use super::problem::{FRAME_DIM, LensPrior, Problem};
+use super::lens_prior::{LensPrior, LensUnknown, Process};
+use super::problem::{FRAME_DIM, Problem};
 use super::system::{ByLens, LandmarkBlock, System};
 use crate::backend::product;
 use nalgebra::{Matrix3, Vector3};
-use vidar_core::LensMotion;
-
-/// How long a lens keeps its place, s: autofocus moves every few seconds, stabilisation with each tremor of the hand.
-const FOCUS_SECS: f64 = 5.0;
-const SHIFT_SECS: f64 = 0.2;
-const RATE_SECS: f64 = 0.05;
-/// How fast a lens is shifted that is shifted by 1, 1/s: a hand shakes three to six times a second.
-const RATE_PER_SHIFT: f64 = 30.0;
-
-/// What is unknown of an image's lens.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub(super) enum LensUnknown {
-    LogFocal,
-    ShiftX,
-    ShiftY,
-    ShiftRateX,
-    ShiftRateY,
-}
-
-impl LensUnknown {
-    fn of(self, lens: &LensMotion) -> f64 {
-        match self {
-            Self::LogFocal => lens.log_focal,
-            Self::ShiftX => lens.shift.x,
-            Self::ShiftY => lens.shift.y,
-            Self::ShiftRateX => lens.shift_rate.x,
-            Self::ShiftRateY => lens.shift_rate.y,
-        }
-    }
-
-    /// Changes it.
-    pub(super) fn add(self, lens: &mut LensMotion, step: f64) {
-        *match self {
-            Self::LogFocal => &mut lens.log_focal,
-            Self::ShiftX => &mut lens.shift.x,
-            Self::ShiftY => &mut lens.shift.y,
-            Self::ShiftRateX => &mut lens.shift_rate.x,
-            Self::ShiftRateY => &mut lens.shift_rate.y,
-        } += step;
-    }
-}
-
-/// A process: its standard deviation, and how long it keeps its value, s.
-#[derive(Clone, Copy)]
-struct Process {
-    sigma: f64,
-    secs: f64,
-}
-
-impl LensPrior {
-    /// What is unknown, in the order in which it follows a state.
-    pub(super) fn unknowns(&self) -> impl Iterator<Item = LensUnknown> {
-        self.processes().map(|(unknown, _)| unknown)
-    }
-
-    fn processes(&self) -> impl Iterator<Item = (LensUnknown, Process)> {
-        let focal = self.focal.map(|sigma| Process { sigma, secs: FOCUS_SECS });
-        let shift = self.shift.map(|sigma| Process { sigma, secs: SHIFT_SECS });
-        let rate = self.shift.map(|sigma| Process { sigma: RATE_PER_SHIFT * sigma, secs: RATE_SECS });
-        let all = [
-            (LensUnknown::LogFocal, focal),
-            (LensUnknown::ShiftX, shift),
-            (LensUnknown::ShiftY, shift),
-            (LensUnknown::ShiftRateX, rate),
-            (LensUnknown::ShiftRateY, rate),
-        ];
-        all.into_iter().filter_map(|(unknown, process)| Some((unknown, process?)))
-    }
-}
 
 /// How the prior ties an unknown to that of the state before: `z = share · before`, with a weight. The first one is tied to zero.
 #[derive(Clone, Copy)]
@@ -196,7 +128,7 @@ mod tests {
     use crate::bundle_adjustment::linearise::{cost, linearise};
     use crate::imu::Vector15;
     use nalgebra::{DMatrix, Matrix2};
-    use vidar_core::Timestamp;
+    use vidar_core::{LensMotion, Timestamp};
 
     /// Three states that see four landmarks where they are, with the clock among the unknowns.
     fn problem() -> Problem {

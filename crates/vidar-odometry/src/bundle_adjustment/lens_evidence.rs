@@ -1,8 +1,9 @@
 //! Whether a recording shows that the lens moves, and what it was found to do.
 
 use super::lens::log_det;
+use super::lens_prior::LensPrior;
 use super::optimise;
-use super::problem::{FRAME_DIM, LensPrior, Problem};
+use super::problem::{FRAME_DIM, Problem};
 use super::system::System;
 use crate::backend::dot;
 
@@ -28,9 +29,6 @@ pub(super) fn moves(problem: &Problem, system: &System) -> Option<LensPrior> {
     let ln = |new: LensPrior| log_bayes_factor(problem, system, new).unwrap_or(f64::NEG_INFINITY);
     let of_focus = if known.focal.is_none() { ln(focus) } else { f64::NEG_INFINITY };
     let of_shift = if known.shift.is_none() { ln(shift) } else { f64::NEG_INFINITY };
-    if std::env::var_os("VIDAR_LENS").is_some() {
-        eprintln!("LENS focus {of_focus:.1} shift {of_shift:.1}");
-    }
     // One at a time: what a shift explains looks in part like a focal length that changes.
     if of_focus.max(of_shift) <= DECISIVE {
         return None;

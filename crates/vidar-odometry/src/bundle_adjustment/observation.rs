@@ -7,8 +7,7 @@
 //! velocity and the accelerometer's force (Patron-Perez, Lovegrove, Sibley 2015 do the same with splines).
 
 use super::inertial::{GAIN_DIM, ImuGain};
-use super::lens::LensUnknown;
-use super::problem::LensPrior;
+use super::lens_prior::{LENS_DIM, LensPrior, LensUnknown};
 use crate::backend::tangent_basis;
 use crate::imu::{NavState, hat};
 use nalgebra::{Matrix2x3, Matrix3, SMatrix, Vector2, Vector3};
@@ -16,9 +15,6 @@ use vidar_core::{CameraModel, LensMotion, LieGroup, Se3, So3, camera::Pixel};
 
 /// Unknowns of a state that an observation depends on: rotation, position, velocity.
 pub(super) const STATE_DIM: usize = 9;
-
-/// Most unknowns of a lens.
-pub(super) const LENS_DIM: usize = 5;
 
 /// Unknowns of the calibration besides the intrinsics: clock offset, readout, rotation and position of the camera.
 pub(super) const TIMING_AND_PLACE: usize = 8;

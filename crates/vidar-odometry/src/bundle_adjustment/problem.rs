@@ -2,6 +2,7 @@
 
 use super::envelope::Envelope;
 use super::inertial::{GAIN_DIM, ImuGain, InertialFactor};
+use super::lens_prior::LensPrior;
 use super::observation::{Landmark, MovingBody, STATE_DIM, SensorCalibration};
 use crate::imu::{ImuBuffer, ImuModel, NavState};
 use nalgebra::{Matrix2, Vector3};
@@ -45,22 +46,6 @@ pub(super) struct CalibrationPrior {
     pub(super) sigmas: Vec<f64>,
     /// What the lens may do from image to image.
     pub(super) lens: LensPrior,
-}
-
-/// What is known before of how the lens moves while filming (see [`super::lens`]); nothing of it is unknown where it does not.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub(super) struct LensPrior {
-    /// Standard deviation of `ln` of an image's focal length over the calibration's, where it changes.
-    pub(super) focal: Option<f64>,
-    /// Standard deviation of an image's shift in x and in y, focal lengths, where it is shifted; it has a rate, too.
-    pub(super) shift: Option<f64>,
-}
-
-impl LensPrior {
-    /// Unknowns of an image's lens.
-    pub(super) fn dim(&self) -> usize {
-        usize::from(self.focal.is_some()) + 4 * usize::from(self.shift.is_some())
-    }
 }
 
 /// States, landmarks and calibration, with all measurements.

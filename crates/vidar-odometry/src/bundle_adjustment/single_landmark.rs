@@ -98,8 +98,9 @@ impl LeastSquares for Alone<'_> {
 
 #[cfg(test)]
 mod tests {
+    use super::super::lens_prior::LensPrior;
     use super::super::observation::tests::example;
-    use super::super::problem::{CalibrationPrior, FrameState, LensPrior, WhitenedObservation};
+    use super::super::problem::{CalibrationPrior, FrameState, WhitenedObservation};
     use super::*;
     use nalgebra::Matrix2;
     use vidar_core::Timestamp;

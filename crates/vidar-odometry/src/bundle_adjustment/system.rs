@@ -1,7 +1,8 @@
 //! The reduced normal equations of states and calibration, and what is kept of the landmarks that were eliminated.
 
 use super::envelope::Envelope;
-use super::observation::{LENS_DIM, STATE_DIM};
+use super::lens_prior::LENS_DIM;
+use super::observation::STATE_DIM;
 use super::problem::{FRAME_DIM, Problem};
 use crate::backend::dot;
 use nalgebra::{Matrix3, SMatrix, Vector3};
