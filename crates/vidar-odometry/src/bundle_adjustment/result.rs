@@ -90,18 +90,20 @@ impl AdjustmentReport {
     }
 }
 
-/// The factor by which the IMU's noise exceeds what its samples show with vibration and its data sheet states, of the sensor for which that is more; 1 where
-/// the residuals tell neither.
+/// The factor by which the IMU's noise exceeds what its samples show with vibration and its data sheet states, of the sensor for which that is more. Noise that
+/// the residuals do not tell is what was assumed; it counts where so much was assumed that it may hide anything, and 1 is returned where neither does.
 fn noise_ratio(input: &AdjustmentInput<'_>, weighed: &WeighedImu) -> f64 {
     let (sheet, found) = (&input.data_sheet, &weighed.model.noise);
     let seen = loud_noise(input.log.imu_samples());
-    let [gyro, accel] = [
-        found.gyro_density / seen.map_or(0.0, |n| n.gyro).max(sheet.gyro_density),
-        found.accel_density / seen.map_or(0.0, |n| n.accel).max(sheet.accel_density),
-    ];
-    let told = [gyro, accel].into_iter().zip(weighed.is_told).filter(|(_, is_told)| *is_told);
-    told.map(|(ratio, _)| ratio).reduce(f64::max).unwrap_or(1.0)
+    let gyro = found.gyro_density / seen.map_or(0.0, |n| n.gyro).max(sheet.gyro_density);
+    let accel = found.accel_density / seen.map_or(0.0, |n| n.accel).max(sheet.accel_density);
+    let [gyro_told, accel_told] = weighed.is_told;
+    let counted = [(gyro, gyro_told || gyro > HIDING_NOISE), (accel, accel_told || accel > HIDING_NOISE)];
+    counted.into_iter().filter(|(_, counts)| *counts).map(|(ratio, _)| ratio).reduce(f64::max).unwrap_or(1.0)
 }
+
+/// Assumed noise, as a multiple of the IMU's own, that would hide errors of the model: the odometry takes it two and four times as large.
+const HIDING_NOISE: f64 = 5.0;
 
 /// An adjusted recording. The world is levelled, z up, its origin where the first state was.
 #[derive(Clone, Debug, PartialEq)]

@@ -71,12 +71,6 @@ pub(crate) fn shown_readout_secs(calibration: &AdjustedCalibration) -> f64 {
     if calibration.readout_secs > SHOWN_SIGMAS * std { calibration.readout_secs } else { 0.0 }
 }
 
-/// Whether images are found to be stabilised, and nothing else is needed to explain what they and the IMU differ by.
-pub(super) fn explains_as_shifted(adjusted: &Adjusted) -> bool {
-    adjusted.findings.iter().any(|finding| matches!(finding, AdjustmentFinding::Shifted { .. }))
-        && adjusted.report.is_explained()
-}
-
 /// The calibration as adjusted, with standard deviations; zero where it was held.
 pub(super) fn calibration_json(adjusted: &Adjusted) -> Value {
     let AdjustedCalibration { camera, body_from_camera, time_offset_secs, readout_secs, sigmas } =

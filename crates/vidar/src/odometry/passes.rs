@@ -24,10 +24,11 @@ pub(crate) struct TrackingInput<'a> {
 
 /// Noise of the gyroscope, as a multiple of the data sheet's, with which images that are shifted by half a degree against it are followed. With 30, 60 and 100
 /// six rendered phones began 1 to 13, 1 to 4 and 1 to 2 s after the first image; once they were adjusted, their errors were the same.
-const STABILISED_NOISE_FACTOR: f64 = 60.0;
+const DOUBTED_GYRO_NOISE_FACTOR: f64 = 60.0;
 
 /// Feeds a recording to the odometry, and adjusts all states after its end where `adjustable` says what may change. Where images and IMU contradict
-/// each other, all of it happens once more as for stabilised images; that result stands where the adjustment shows that they are, and explains the recording.
+/// each other, all of it happens once more with a gyroscope that is hardly believed: stabilised images, or a gain that is off. That result stands where its
+/// adjustment explains the recording with the noise that the IMU has.
 pub(crate) fn track(
     recording: &TrackingInput<'_>,
     adjustable: Option<&CalibrationSigmas>,
@@ -41,13 +42,14 @@ pub(crate) fn track(
     }
     let mut config = recording.config.clone();
     let factor = &mut config.odometry.gyro_noise_factor;
-    *factor = factor.max(STABILISED_NOISE_FACTOR);
+    *factor = factor.max(DOUBTED_GYRO_NOISE_FACTOR);
     if let Some(dump) = dump.as_deref_mut() {
         dump.begin_again()?;
     }
     let recording = TrackingInput { config: &config, ..*recording };
     let again = track_calibrated(&recording, adjustable, events, cancel, dump)?;
-    Ok(if again.adjusted.as_ref().is_some_and(adjusted::explains_as_shifted) { again } else { tracked })
+    let is_explained = again.adjusted.as_ref().is_some_and(|adjusted| adjusted.report.is_explained());
+    Ok(if is_explained { again } else { tracked })
 }
 
 /// Feeds a recording to the odometry, and adjusts all states after its end where `adjustable` says what may change. Where that leaves
