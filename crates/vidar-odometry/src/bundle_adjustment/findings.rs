@@ -1,4 +1,4 @@
-//! What was given of the camera's place and the recording contradicts.
+//! What was given of the camera's place and the recording contradicts, and what its lens was found to do.
 
 use super::envelope::Envelope;
 use super::lens_evidence::{Focus, FoundLens};

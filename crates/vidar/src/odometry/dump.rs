@@ -40,8 +40,8 @@ impl Dump {
         Ok(Self { tracks: (of_tracks, tracks), states: (of_states, states) })
     }
 
-    /// Drops what was written: the recording is tracked anew.
-    pub(super) fn begin_again(&mut self) -> Result<(), Error> {
+    /// Begins a pass: what an earlier one wrote is dropped.
+    pub(super) fn begin(&mut self) -> Result<(), Error> {
         self.tracks.1 = begin(&self.tracks.0, TRACKS)?;
         self.states.1 = begin(&self.states.0, STATES)?;
         Ok(())

@@ -34,134 +34,128 @@ pub(crate) fn track(
     adjustable: Option<&CalibrationSigmas>,
     events: &Events,
     cancel: &CancelToken,
-    mut dump: Option<&mut dump::Dump>,
+    dump: Option<&mut dump::Dump>,
 ) -> Result<Tracked, Error> {
-    let tracked = track_calibrated(recording, adjustable, events, cancel, dump.as_deref_mut())?;
+    let mut passes = Passes { adjustable, events, cancel, dump };
+    let tracked = passes.calibrated(recording)?;
     if adjustable.is_none() || !tracked.is_contradicted() || cancel.is_cancelled() {
         return Ok(tracked);
     }
     let mut config = recording.config.clone();
     let factor = &mut config.odometry.gyro_noise_factor;
     *factor = factor.max(DOUBTED_GYRO_NOISE_FACTOR);
-    if let Some(dump) = dump.as_deref_mut() {
-        dump.begin_again()?;
-    }
-    let recording = TrackingInput { config: &config, ..*recording };
-    let again = track_calibrated(&recording, adjustable, events, cancel, dump)?;
+    let again = passes.calibrated(&TrackingInput { config: &config, ..*recording })?;
     let is_explained = again.adjusted.as_ref().is_some_and(|adjusted| adjusted.report.is_explained());
     Ok(if is_explained { again } else { tracked })
 }
 
-/// Feeds a recording to the odometry, and adjusts all states after its end where `adjustable` says what may change. Where that leaves
-/// camera and IMU apart and the calibration is the recording's own, all of it happens once more with the calibration as adjusted.
-fn track_calibrated(
-    recording: &TrackingInput<'_>,
-    adjustable: Option<&CalibrationSigmas>,
-    events: &Events,
-    cancel: &CancelToken,
-    mut dump: Option<&mut dump::Dump>,
-) -> Result<Tracked, Error> {
-    let tracked = track_once(recording, adjustable, events, cancel, dump.as_deref_mut())?;
-    let TrackingInput { dataset, config, map } = *recording;
-    let first = tracked.adjusted.as_ref().filter(|a| input::leaves_calibration_unchecked(dataset, a));
-    let Some(first) = first.filter(|_| !cancel.is_cancelled()) else { return Ok(tracked) };
-    let focal = |dataset: &Recording| dataset.rig.cameras[dataset.camera.index()].model.intrinsics().fx;
-    let before = focal(dataset);
-    let (mut dataset, mut config) = (dataset.clone(), config.clone());
-    adjusted::apply(first, &mut dataset);
-    config.odometry.readout_ms = Some(1e3 * first.calibration.readout_secs);
-    if let Some(dump) = dump.as_deref_mut() {
-        dump.begin_again()?;
-    }
-    let again = TrackingInput { dataset: &dataset, config: &config, map };
-    let mut again = track_once(&again, adjustable, events, cancel, dump)?;
-    again.calibrated_again = Some([before, focal(&dataset)]);
-    Ok(if again.adjusted.is_some() { again } else { tracked })
+/// What every pass over a recording is done with.
+struct Passes<'a> {
+    /// What an adjustment after the end may change, where one is wanted.
+    adjustable: Option<&'a CalibrationSigmas>,
+    events: &'a Events,
+    cancel: &'a CancelToken,
+    /// Holds the last pass.
+    dump: Option<&'a mut dump::Dump>,
 }
 
-fn track_once(
-    recording: &TrackingInput<'_>,
-    adjustable: Option<&CalibrationSigmas>,
-    events: &Events,
-    cancel: &CancelToken,
-    dump: Option<&mut dump::Dump>,
-) -> Result<Tracked, Error> {
-    let total = recording.dataset.images.len();
-    let keeps_log = adjustable.is_some();
-    let (mut tracked, odometry) =
-        events.stage("odometry", total, || push_all(recording, keeps_log, events, cancel, dump))?;
-    if let Some(sigmas) = adjustable.filter(|_| tracked.with_imu && !cancel.is_cancelled()) {
-        let mut tell = |progress: Progress| {
-            events.emit(&Event::Progress { stage: ADJUSTMENT, done: progress.states, total: progress.of });
-            if cancel.is_cancelled() { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
-        };
-        match events.stage(ADJUSTMENT, 0, || odometry.adjust_with(sigmas, &mut tell)) {
-            Ok(mut adjusted) if adjusted.is_consistent() => {
-                if let Some(joined) = odometry.place_in_map(&adjusted) {
-                    adjusted.join(&joined);
-                    tracked.map.iter_mut().for_each(|map| map.matches = Some(joined.matches));
+impl Passes<'_> {
+    /// Feeds a recording to the odometry, and adjusts all states after its end. Where that leaves camera and IMU apart and the calibration is the
+    /// recording's own, all of it happens once more with the calibration as adjusted.
+    fn calibrated(&mut self, recording: &TrackingInput<'_>) -> Result<Tracked, Error> {
+        let tracked = self.once(recording)?;
+        let TrackingInput { dataset, config, map } = *recording;
+        let first = tracked.adjusted.as_ref().filter(|a| input::leaves_calibration_unchecked(dataset, a));
+        let Some(first) = first.filter(|_| !self.cancel.is_cancelled()) else { return Ok(tracked) };
+        let focal = |dataset: &Recording| dataset.rig.cameras[dataset.camera.index()].model.intrinsics().fx;
+        let before = focal(dataset);
+        let (mut dataset, mut config) = (dataset.clone(), config.clone());
+        adjusted::apply(first, &mut dataset);
+        config.odometry.readout_ms = Some(1e3 * first.calibration.readout_secs);
+        let mut again = self.once(&TrackingInput { dataset: &dataset, config: &config, map })?;
+        again.calibrated_again = Some([before, focal(&dataset)]);
+        Ok(if again.adjusted.is_some() { again } else { tracked })
+    }
+
+    /// One pass.
+    fn once(&mut self, recording: &TrackingInput<'_>) -> Result<Tracked, Error> {
+        let Self { adjustable, events, cancel, .. } = *self;
+        let total = recording.dataset.images.len();
+        let (mut tracked, odometry) = events.stage("odometry", total, || self.push_all(recording))?;
+        if let Some(sigmas) = adjustable.filter(|_| tracked.with_imu && !cancel.is_cancelled()) {
+            let mut tell = |progress: Progress| {
+                events.emit(&Event::Progress {
+                    stage: ADJUSTMENT,
+                    done: progress.states,
+                    total: progress.of,
+                });
+                if cancel.is_cancelled() { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
+            };
+            match events.stage(ADJUSTMENT, 0, || odometry.adjust_with(sigmas, &mut tell)) {
+                Ok(mut adjusted) if adjusted.is_consistent() => {
+                    if let Some(joined) = odometry.place_in_map(&adjusted) {
+                        adjusted.join(&joined);
+                        tracked.map.iter_mut().for_each(|map| map.matches = Some(joined.matches));
+                    }
+                    tracked.quality.adjust(&adjusted);
+                    tracked.adjusted = Some(adjusted);
                 }
-                tracked.quality.adjust(&adjusted);
-                tracked.adjusted = Some(adjusted);
+                Ok(_) => tracked.not_adjusted = Some("camera and IMU contradict each other".into()),
+                Err(reason) => tracked.not_adjusted = Some(reason.to_string()),
             }
-            Ok(_) => tracked.not_adjusted = Some("camera and IMU contradict each other".into()),
-            Err(reason) => tracked.not_adjusted = Some(reason.to_string()),
         }
+        tracked.saved_map = odometry.saved_map(tracked.adjusted.as_ref());
+        Ok(tracked)
     }
-    tracked.saved_map = odometry.saved_map(tracked.adjusted.as_ref());
-    Ok(tracked)
-}
 
-fn push_all(
-    recording: &TrackingInput<'_>,
-    keeps_log: bool,
-    events: &Events,
-    cancel: &CancelToken,
-    mut dump: Option<&mut dump::Dump>,
-) -> Result<(Tracked, Odometry), Error> {
-    let TrackingInput { dataset, config, map } = *recording;
-    let settings = &config.odometry;
-    let mut odometry = Odometry::new(&dataset.rig, dataset.camera, settings)?;
-    if let Some(earlier) = map {
-        odometry = odometry.with_map(&earlier.map);
-    }
-    let with_imu = settings.imu != ImuUse::Off && dataset.rig.imu.is_some();
-    if keeps_log && with_imu {
-        odometry.keep_log();
-    }
-    let map = map.map(|m| MapUse { file: m.path.clone(), found_live_ns: None, matches: None });
-    let mut tracked = Tracked { with_imu, map, ..Tracked::default() };
-    let total = dataset.images.len();
-    let mut spent = 0.0;
-    for measurement in input::measurements(dataset, true) {
-        if cancel.is_cancelled() {
-            break;
+    fn push_all(&mut self, recording: &TrackingInput<'_>) -> Result<(Tracked, Odometry), Error> {
+        let TrackingInput { dataset, config, map } = *recording;
+        if let Some(dump) = &mut self.dump {
+            dump.begin()?;
         }
-        let event = match measurement {
-            Measurement::Event(event) => event,
-            // A broken image is a gap in the stream, not the end of the flight.
-            Measurement::Unreadable(_, error) => {
-                tracked.unreadable.push(error.to_string());
-                continue;
-            }
-            Measurement::Stamp(_) => continue,
-        };
-        let clock = Instant::now();
-        let output = odometry.push(event)?;
-        spent += clock.elapsed().as_secs_f64();
-        if let Some(output) = output {
-            if let Some(dump) = &mut dump {
-                dump.add(&output, &odometry.tracks())?;
-            }
-            tracked.keep(output, std::mem::take(&mut spent));
-            let done = tracked.frames.len();
-            events.emit(&Event::Progress { stage: "odometry", done, total });
+        let settings = &config.odometry;
+        let mut odometry = Odometry::new(&dataset.rig, dataset.camera, settings)?;
+        if let Some(earlier) = map {
+            odometry = odometry.with_map(&earlier.map);
         }
+        let with_imu = settings.imu != ImuUse::Off && dataset.rig.imu.is_some();
+        if self.adjustable.is_some() && with_imu {
+            odometry.keep_log();
+        }
+        let map = map.map(|m| MapUse { file: m.path.clone(), found_live_ns: None, matches: None });
+        let mut tracked = Tracked { with_imu, map, ..Tracked::default() };
+        let total = dataset.images.len();
+        let mut spent = 0.0;
+        for measurement in input::measurements(dataset, true) {
+            if self.cancel.is_cancelled() {
+                break;
+            }
+            let event = match measurement {
+                Measurement::Event(event) => event,
+                // A broken image is a gap in the stream, not the end of the flight.
+                Measurement::Unreadable(_, error) => {
+                    tracked.unreadable.push(error.to_string());
+                    continue;
+                }
+                Measurement::Stamp(_) => continue,
+            };
+            let clock = Instant::now();
+            let output = odometry.push(event)?;
+            spent += clock.elapsed().as_secs_f64();
+            if let Some(output) = output {
+                if let Some(dump) = &mut self.dump {
+                    dump.add(&output, &odometry.tracks())?;
+                }
+                tracked.keep(output, std::mem::take(&mut spent));
+                let done = tracked.frames.len();
+                self.events.emit(&Event::Progress { stage: "odometry", done, total });
+            }
+        }
+        for output in odometry.finish() {
+            tracked.keep(output, 0.0);
+        }
+        tracked.counts = odometry.counts();
+        tracked.carrier_share = odometry.carrier_share();
+        Ok((tracked, odometry))
     }
-    for output in odometry.finish() {
-        tracked.keep(output, 0.0);
-    }
-    tracked.counts = odometry.counts();
-    tracked.carrier_share = odometry.carrier_share();
-    Ok((tracked, odometry))
 }
