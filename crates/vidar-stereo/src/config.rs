@@ -30,7 +30,8 @@ pub struct StereoConfig {
     /// Standard deviation of each given pose's rotation, degrees, 0…5. Poses are corrected by the images with this prior;
     /// 0 here or in `pose_std_m` takes them as given.
     pub pose_std_deg: f64,
-    /// Standard deviation of the given camera centres, metres, 0…1.
+    /// Standard deviation of the given camera centres, metres, 0…1. Narrower than most are off by: a chunk's size is theirs to
+    /// know, not the images'.
     pub pose_std_m: f64,
     /// Noise of the images, grey levels of 255, 0.1…50. Weaker texture is not matched.
     pub noise_gray: f64,
@@ -53,7 +54,7 @@ impl Default for StereoConfig {
             step_penalty: 12,
             jump_penalty: 80,
             pose_std_deg: 0.1,
-            pose_std_m: 0.01,
+            pose_std_m: 0.003,
             noise_gray: 1.0,
             agreement_ratio: 0.02,
             min_confidence: 0.2,
