@@ -185,6 +185,39 @@ fn a_stabilised_lens_is_found_in_every_image() {
 }
 
 #[test]
+fn stamps_that_scatter_are_found_for_every_image() {
+    let (mut ln_s_nees, flights) = (0.0, 3);
+    let config = SimulationConfig { stamp_scatter_secs: 0.005, ..SimulationConfig::default() };
+    for seed in 0..flights {
+        let flight = logged_with(seed, 12.0, 1.0, 0.0, &config, &settings());
+        let adjusted = adjust(&flight, &settings());
+        let found = adjusted.findings.iter().find_map(|f| match f {
+            AdjustmentFinding::StampsScatter { rms_secs } => Some(*rms_secs),
+            _ => None,
+        });
+        let rms = found.unwrap_or_else(|| panic!("flight {seed}: {:?}", adjusted.findings));
+        let AdjustmentReport { noise_ratio, .. } = adjusted.report;
+        println!(
+            "flight {seed}: {:.2} ms, noise ratio {noise_ratio:.2}, {:.4} m",
+            1e3 * rms,
+            ate_m(&flight, &adjusted)
+        );
+        // The prior holds it back where a camera hardly turns.
+        assert!(
+            (0.003..0.0055).contains(&rms) && adjusted.findings.len() == 1,
+            "{rms} {:?}",
+            adjusted.findings
+        );
+        assert!(adjusted.report.is_explained() && adjusted.is_consistent(), "{:?}", adjusted.report);
+        ln_s_nees += (flight.log_scale_error(&adjusted) / adjusted.scale_std).powi(2);
+        // Of every image, those between that took no part, too.
+        assert!(ate_m(&flight, &adjusted) < 0.03, "flight {seed}: {} m", ate_m(&flight, &adjusted));
+    }
+    // χ² of three at 99.9 %.
+    assert!(ln_s_nees < 16.3, "{ln_s_nees} of {flights}");
+}
+
+#[test]
 fn a_focal_length_that_is_given_wrong_is_found_and_told() {
     for (seed, off) in [(1, 0.02), (2, -0.015)] {
         let config = SimulationConfig { log_focal: [off, 0.0], ..SimulationConfig::default() };

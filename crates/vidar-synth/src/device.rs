@@ -82,6 +82,9 @@ pub struct DeviceConfig {
     pub readout_secs: f64,
     /// Image stamps are late by this, s, −0.15…0.15: stamp = time of the middle row + `stamp_delay_secs`.
     pub stamp_delay_secs: f64,
+    /// Standard deviation of the stamps' errors about that, s, 0…0.02: of when an image arrives rather than when it was exposed. Two fifths of the variance are
+    /// each image's own, the rest changes within a second, as exposure does.
+    pub stamp_scatter_secs: f64,
     /// Standard deviation of each frame's time in periods, 0…0.3 (variable frame rate); stamps follow.
     pub frame_jitter: f64,
     /// Optical stabilisation: the share of the shake about the picture's axes that the lens takes back, 0…1, by up to 1.2° and without what is
@@ -112,6 +115,7 @@ impl Default for DeviceConfig {
             mount: Mount::Euroc,
             readout_secs: 0.0,
             stamp_delay_secs: 0.0,
+            stamp_scatter_secs: 0.0,
             frame_jitter: 0.0,
             stabilisation: 0.0,
             dropped_frames: 0.0,
@@ -139,6 +143,7 @@ impl DeviceConfig {
         }
         within("device.readout_secs", self.readout_secs, 0.0, 0.05, "0 to 0.05 s")?;
         within("device.stamp_delay_secs", self.stamp_delay_secs, -0.15, 0.15, "-0.15 to 0.15 s")?;
+        within("device.stamp_scatter_secs", self.stamp_scatter_secs, 0.0, 0.02, "0 to 0.02 s")?;
         within("device.frame_jitter", self.frame_jitter, 0.0, 0.3, "0 to 0.3")?;
         within("device.stabilisation", self.stabilisation, 0.0, 1.0, "0 to 1")?;
         within("device.dropped_frames", self.dropped_frames, 0.0, 0.5, "0 to 0.5")?;

@@ -45,6 +45,8 @@ pub(crate) enum Purpose {
     StatedFocal,
     /// Times, drops and repeats of the frames.
     Schedule,
+    /// Errors of the frames' stamps.
+    StampErrors,
     /// Hand-held path.
     Handheld,
     /// Surfaces without texture.
@@ -72,6 +74,7 @@ pub(crate) fn stream(seed: u64, purpose: Purpose) -> ChaCha8Rng {
         Purpose::Mount => (17, 0),
         Purpose::ImuScale => (18, 0),
         Purpose::ImuTiming => (19, 0),
+        Purpose::StampErrors => (29, 0),
         Purpose::StatedFocal => (20, 0),
         Purpose::Schedule => (21, 0),
         Purpose::Handheld => (22, 0),

@@ -40,7 +40,37 @@ pub(crate) fn shots(config: &SynthConfig, path: &FlightPath) -> Vec<Shot> {
             _ => shots.push(Shot { secs, stamps: vec![time + delay] }),
         }
     }
+    scatter(config, &mut shots);
     shots
+}
+
+/// Share of the variance of a stamp's error that is the image's own, and how long the rest lasts, s.
+const OWN_SHARE: f64 = 0.4;
+const LASTING_SECS: f64 = 1.0;
+/// Stamps rise by this much at least.
+const LEAST_STEP: Duration = Duration::from_millis(1);
+
+/// Stamps of when images arrived.
+fn scatter(config: &SynthConfig, shots: &mut [Shot]) {
+    let sigma = config.device.stamp_scatter_secs;
+    if sigma == 0.0 {
+        return;
+    }
+    let mut random = Gaussian::new(stream(config.seed, Purpose::StampErrors));
+    let (mut lasting, mut last): (f64, Option<(Timestamp, Timestamp)>) = (random.next(), None);
+    for stamp in shots.iter_mut().flat_map(|s| &mut s.stamps) {
+        let exact = *stamp;
+        if let Some((before, _)) = last {
+            let share = (-(exact - before).as_secs_f64() / LASTING_SECS).exp();
+            lasting = share * lasting + (1.0 - share * share).sqrt() * random.next();
+        }
+        let error = OWN_SHARE.sqrt() * random.next() + (1.0 - OWN_SHARE).sqrt() * lasting;
+        *stamp = exact + Duration::from_secs_f64(sigma * error);
+        if let Some((_, written)) = last {
+            *stamp = (*stamp).max(written + LEAST_STEP);
+        }
+        last = Some((exact, *stamp));
+    }
 }
 
 #[cfg(test)]
@@ -64,6 +94,21 @@ mod tests {
             assert_eq!((b.stamps[0] - a.stamps[0]).nanos(), 25_000_000);
             assert_eq!(stamps::secs(a.stamps[0]), a.secs);
         }
+    }
+
+    #[test]
+    fn stamps_scatter_as_asked_and_times_do_not() {
+        let exact = shots_of(DeviceConfig::default());
+        let scattered = shots_of(DeviceConfig { stamp_scatter_secs: 0.004, ..Default::default() });
+        let off = |(a, b): (&Shot, &Shot)| (b.stamps[0] - a.stamps[0]).as_secs_f64();
+        let errors: Vec<f64> = exact.iter().zip(&scattered).map(off).collect();
+        assert!(exact.iter().zip(&scattered).all(|(a, b)| a.secs == b.secs));
+        assert!(scattered.windows(2).all(|w| w[0].stamps[0] < w[1].stamps[0]), "stamps rise");
+        let mean = |values: &mut dyn Iterator<Item = f64>| values.sum::<f64>() / errors.len() as f64;
+        let variance = mean(&mut errors.iter().map(|e| e * e));
+        assert!((0.0028..0.0052).contains(&variance.sqrt()), "{}", variance.sqrt());
+        let correlation = mean(&mut errors.windows(2).map(|w| w[0] * w[1])) / variance;
+        assert!((0.3..0.75).contains(&correlation), "{correlation}");
     }
 
     #[test]

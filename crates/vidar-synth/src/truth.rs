@@ -33,6 +33,7 @@ pub(crate) fn truth_text(
             "readout_secs": config.device.readout_secs,
             "stabilisation": config.device.stabilisation,
             "stamp_delay_secs": config.device.stamp_delay_secs,
+            "stamp_scatter_secs": config.device.stamp_scatter_secs,
             "imu_time_minus_stamp_secs": -config.device.stamp_delay_secs,
             "frames": shots.iter().map(|s| s.stamps.len()).sum::<usize>(),
             "repeated_stamps_nanos": repeated,

@@ -118,10 +118,7 @@ impl TrackQuality {
             last: last.1.time,
             scale_std: adjusted.scale_std,
             inertial_chi2: adjusted.report.inertial_chi2_per_dof,
-            contradicts_given: adjusted
-                .findings
-                .iter()
-                .any(|finding| !matches!(finding, AdjustmentFinding::Shifted { .. })),
+            contradicts_given: adjusted.findings.iter().any(AdjustmentFinding::contradicts_given),
             noise_ratio: adjusted.report.noise_ratio,
         });
     }

@@ -25,6 +25,8 @@ enum Fault {
     Swapped,
     /// The IMU's clock is off, ms.
     Clock(i64),
+    /// Images are stamped this much too early or too late, ms, each on its own.
+    Stamps(i64),
     /// Factor on the focal length.
     Focal(f64),
     /// The distortion is left out.
@@ -79,6 +81,7 @@ const SHORT: &[Case] = &[
     ),
     (Fault::Gains(1.0, -1.0), &[Told(NEVER_STARTED, "axes, signs and units of the IMU")]),
     (Fault::Clock(500), &[Told(&["imu-coverage", "odometry-never-started"], "contradict each other")]),
+    (Fault::Stamps(5), &[Right(&["stamps-scatter"]), Right(&[])]),
     (Fault::OtherCamera, &[Told(NEVER_STARTED, "contradict each other")]),
     (Fault::Gap(3.5, 4.5), &[Told(&["imu-gap", "track-lost"], "no IMU measurement for 1.01 s")]),
 ];
@@ -170,6 +173,7 @@ fn with_fault(flight: &Path, fault: Fault, is_adjusted: bool) -> PathBuf {
     };
     edit("cam0/sensor.yaml", &|text| camera_with(fault, text));
     edit("imu0/data.csv", &|text| imu_with(fault, text));
+    edit("cam0/data.csv", &|text| images_with(fault, text));
     folder
 }
 
@@ -223,6 +227,20 @@ fn camera_with(fault: Fault, text: &str) -> String {
         }
         _ => text.to_owned(),
     }
+}
+
+fn images_with(fault: Fault, text: &str) -> String {
+    let Fault::Stamps(ms) = fault else { return text.to_owned() };
+    let mut random = 1_u64;
+    let row = |line: &str| match line.split_once(',') {
+        Some((time, name)) if !line.starts_with('#') => {
+            random = random.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+            let error = if random >> 63 == 0 { ms } else { -ms };
+            format!("{},{name}\n", time.parse::<i64>().unwrap() + error * 1_000_000)
+        }
+        _ => format!("{line}\n"),
+    };
+    text.lines().map(row).collect()
 }
 
 fn imu_with(fault: Fault, text: &str) -> String {

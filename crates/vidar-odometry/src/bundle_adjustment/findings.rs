@@ -1,7 +1,7 @@
-//! What was given of the camera's place and the recording contradicts, and what its lens was found to do.
+//! What was given of the camera's place and the recording contradicts, and what its lens and its clock were found to do.
 
 use super::envelope::Envelope;
-use super::lens_evidence::{Focus, FoundLens};
+use super::image_evidence::{Focus, FoundImages};
 use super::observation::{POSITION, ROTATION};
 use super::problem::Problem;
 use super::sigmas::CalibrationSigmas;
@@ -47,19 +47,31 @@ pub enum AdjustmentFinding {
         /// Root mean square of the shift, focal lengths.
         rms: f64,
     },
+    /// Images were exposed earlier and later than their stamps say, beyond one clock offset for all.
+    StampsScatter {
+        /// Root mean square of what was found, s: less than the scatter where the camera hardly turns.
+        rms_secs: f64,
+    },
 }
 
 /// No lens does more: autofocus scatters the focal length by less than this (its range is 2 %), and a stabiliser shifts images by two degrees at most.
-/// A gyroscope with swapped axes was explained by 2.6 % and 0.014, and the path was 400 times too long.
+/// A gyroscope with swapped axes was explained by 2.6 % and 0.014, and the path was 400 times too long. Stamps of when images arrive scatter by some ms.
 const MOST_FOCUS_SPREAD: f64 = 0.02;
 const MOST_SHIFT: f64 = 0.035;
+const MOST_SCATTER_SECS: f64 = 0.02;
 
 impl AdjustmentFinding {
-    /// Whether a lens does what was found of it. Where none does, something else is wrong.
+    /// Whether it says that something that was given is wrong.
+    pub fn contradicts_given(&self) -> bool {
+        !matches!(self, Self::Shifted { .. } | Self::StampsScatter { .. })
+    }
+
+    /// Whether a lens, or a clock, does what was found of it. Where none does, something else is wrong.
     pub(super) fn is_plausible(&self) -> bool {
         match self {
             Self::FocalLength(focus) => focus.spread <= MOST_FOCUS_SPREAD,
             Self::Shifted { rms } => *rms <= MOST_SHIFT,
+            Self::StampsScatter { rms_secs } => *rms_secs <= MOST_SCATTER_SECS,
             _ => true,
         }
     }
@@ -129,12 +141,13 @@ pub(super) fn of(
     covariance: &Envelope,
     given: &Se3,
     sigmas: &CalibrationSigmas,
-    lens: &FoundLens,
+    of_images: &FoundImages,
 ) -> Vec<AdjustmentFinding> {
     let found = &problem.calibration.body_from_camera;
     let mut findings: Vec<AdjustmentFinding> =
-        lens.focus.map(AdjustmentFinding::FocalLength).into_iter().collect();
-    findings.extend(lens.shift.map(|rms| AdjustmentFinding::Shifted { rms }));
+        of_images.focus.map(AdjustmentFinding::FocalLength).into_iter().collect();
+    findings.extend(of_images.shift.map(|rms| AdjustmentFinding::Shifted { rms }));
+    findings.extend(of_images.delay.map(|rms_secs| AdjustmentFinding::StampsScatter { rms_secs }));
     let contradicts = |by: &Vector3<f64>, joint: &Matrix3<f64>, least: f64| {
         let chi2 = joint.try_inverse().map_or(0.0, |inverse| by.dot(&(inverse * by)));
         chi2 > CHI2_3_SIGMAS && by.norm() > least

@@ -149,7 +149,7 @@ impl Grown<'_> {
         let prior = CalibrationPrior {
             sigmas: vec![0.0; calibration.dim()],
             mean: calibration.clone(),
-            lens: self.work.prior.lens,
+            image: self.work.prior.image,
         };
         let Ok(mut problem) = initial::build(self.recording, calibration, prior, &part, held - from) else {
             return Ok(0.0);

@@ -20,7 +20,7 @@ pub(super) fn of(recording: &Measurements<'_>, solution: &Solution, scale_std: f
     let mut keyframes = Vec::with_capacity(problem.frames.len());
     for (k, (frame, image)) in problem.frames.iter().zip(images).enumerate() {
         let logged = &recording.log.images[*image];
-        let state = frame.body.state_after(problem.calibration.clock_secs);
+        let state = frame.body.state_after(problem.calibration.clock_secs + frame.body.delay_secs);
         let previous = k.checked_sub(1).map(|before| {
             let covariance = relative_covariance(solution, before, k);
             pose_covariance += covariance;
@@ -52,8 +52,8 @@ fn seen_landmarks(solution: &Solution) -> Vec<Vec<SparseLandmark>> {
         let relative = block.inverse_distance_sigma() / seen.landmark.inverse_distance;
         for observation in &seen.observations {
             let body: &MovingBody = &problem.frames[observation.frame].body;
-            let camera =
-                body.pose_after(problem.calibration.clock_secs) * problem.calibration.body_from_camera;
+            let camera = body.pose_after(problem.calibration.clock_secs + body.delay_secs)
+                * problem.calibration.body_from_camera;
             let ray = observation::from_camera(&seen.landmark, &camera.translation);
             let in_camera = camera.rotation.inverse().act(&ray) / seen.landmark.inverse_distance;
             let pixel = problem.calibration.camera.project(&in_camera);

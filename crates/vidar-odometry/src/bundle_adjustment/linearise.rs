@@ -1,8 +1,8 @@
 //! Cost and normal equations: inertial factors, reprojections with the landmarks eliminated, priors.
 
 use super::envelope::Envelope;
+use super::image_unknowns;
 use super::inertial::{GAIN_DIM, InertialJacobians};
-use super::lens;
 use super::observation::{self, Landmark, Linearised, STATE_DIM};
 use super::problem::{FRAME_DIM, ObservedLandmark, Problem};
 use super::system::{ByState, LandmarkBlock, System};
@@ -65,7 +65,7 @@ pub(super) fn cost_with(problem: &Problem, visual: f64) -> Cost {
         cost.inertial += 0.5 * inertial_error(problem, k).map_or(0.0, |r| r.norm_squared());
     }
     let (gauge, _) = gauge_error(problem);
-    cost.priors += lens::cost(problem);
+    cost.priors += image_unknowns::cost(problem);
     cost.priors += 0.5 * gauge.norm_squared();
     for (value, sigma) in problem.calibration.minus(&problem.prior.mean).iter().zip(&problem.prior.sigmas) {
         if *sigma > 0.0 {
@@ -132,7 +132,7 @@ fn add_priors(problem: &Problem, system: &mut System) {
     add_gradient(system, at, &(jacobian.transpose() * residual));
     let offset = problem.calibration_offset();
     let moved = problem.calibration.minus(&problem.prior.mean);
-    lens::add_prior(problem, system);
+    image_unknowns::add_prior(problem, system);
     for (k, index) in problem.active.iter().enumerate() {
         let weight = problem.prior.sigmas[*index].powi(-2);
         system.h.add(offset + k, offset + k, weight);
@@ -196,10 +196,10 @@ fn add_landmark(
     block: &mut LandmarkBlock,
     system: &mut System,
 ) {
-    let (calibrations, lens_dim) = (problem.active_camera(), problem.prior.lens.dim());
+    let (calibrations, image_dim) = (problem.active_camera(), problem.prior.image.dim());
     let offset = problem.calibration_offset();
     block.by_state.clear();
-    block.by_lens.clear();
+    block.by_image.clear();
     block.by_calibration.clear();
     block.by_calibration.resize(calibrations, Vector3::zeros());
     block.gradient = Vector3::zeros();
@@ -214,7 +214,7 @@ fn add_landmark(
         let root_weight = KERNEL.weight(residual.norm_squared()).sqrt();
         let whitening = measured.whitening * root_weight;
         let residual = residual * root_weight;
-        let by_lens = at.by_lens(body, &problem.calibration, &problem.prior.lens, &measured.pixel);
+        let by_image = at.by_image(body, &problem.calibration, &problem.prior.image, &measured.pixel);
         let Linearised { by_state, by_landmark, by_calibration, .. } = at;
         let (by_state, by_landmark) = (whitening * by_state, whitening * by_landmark);
         own += by_landmark.transpose() * by_landmark;
@@ -229,20 +229,20 @@ fn add_landmark(
                 *sum += square[(row, column)];
             }
         }
-        if lens_dim > 0 {
-            let by_lens = whitening * by_lens;
-            block.by_lens.push(by_landmark.tr_mul(&by_lens));
-            let with_state = by_state.tr_mul(&by_lens);
-            let square = by_lens.tr_mul(&by_lens);
-            for i in 0..lens_dim {
+        if image_dim > 0 {
+            let by_image = whitening * by_image;
+            block.by_image.push(by_landmark.tr_mul(&by_image));
+            let with_state = by_state.tr_mul(&by_image);
+            let square = by_image.tr_mul(&by_image);
+            for i in 0..image_dim {
                 let row = from + FRAME_DIM + i;
-                system.gradient[row] += by_lens.column(i).dot(&residual);
+                system.gradient[row] += by_image.column(i).dot(&residual);
                 let sums = system.h.part_mut(row, from, STATE_DIM);
                 sums.iter_mut().zip(with_state.column(i).iter()).for_each(|(sum, value)| *sum += value);
                 (0..=i).for_each(|j| system.h.add(row, from + FRAME_DIM + j, square[(i, j)]));
                 for (k, index) in problem.active[..calibrations].iter().enumerate() {
                     let by_one = whitening * by_calibration[*index];
-                    system.h.add(offset + k, row, by_lens.column(i).dot(&by_one));
+                    system.h.add(offset + k, row, by_image.column(i).dot(&by_one));
                 }
             }
         }
@@ -298,7 +298,7 @@ fn eliminate(problem: &Problem, block: &LandmarkBlock, inverse: &Matrix3<f64>, s
             }
         }
     }
-    lens::eliminate(problem, block, inverse, &own_step, system);
+    image_unknowns::eliminate(problem, block, inverse, &own_step, system);
     for (k, by_calibration) in block.by_calibration.iter().enumerate() {
         system.gradient[offset + k] -= by_calibration.dot(&own_step);
         let weighted = inverse * by_calibration;

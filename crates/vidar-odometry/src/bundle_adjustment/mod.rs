@@ -10,15 +10,16 @@
 //! [`adjust`] is the way through: the odometry's longest segment → outward over images without a state, and over other segments
 //! → all together → again with the noise that the residuals show → again with loops → covariance → a state for every image.
 
+mod delays;
 mod envelope;
 mod findings;
 mod grow;
+mod image_evidence;
+mod image_prior;
+mod image_unknowns;
 mod inertial;
 mod initial;
 mod keyframes;
-mod lens;
-mod lens_evidence;
-mod lens_prior;
 mod linearise;
 mod log;
 mod loops;
@@ -36,8 +37,8 @@ mod system;
 mod thin;
 
 pub use findings::AdjustmentFinding;
+pub use image_evidence::Focus;
 pub(crate) use inertial::ImuGain;
-pub use lens_evidence::Focus;
 pub use log::TrackLog;
 pub(crate) use log::{LoggedState, TrackKey};
 pub(crate) use newest::{NewestState, newest_state};
@@ -47,9 +48,9 @@ pub use sigmas::CalibrationSigmas;
 
 use crate::imu::{Bias, ImuBuffer, ImuModel, StepNoise};
 use envelope::Envelope;
+use image_evidence::FoundImages;
+use image_prior::ImagePrior;
 use initial::Guess;
-use lens_evidence::FoundLens;
-use lens_prior::LensPrior;
 use loops::Closed;
 use noise::WeighedImu;
 use observation::{POSITION, ROTATION, SensorCalibration};
@@ -85,8 +86,8 @@ struct Solution {
     system: System,
     /// Covariance within the system's envelope.
     covariance: Envelope,
-    /// What the lens does.
-    lens: FoundLens,
+    /// What lens and clock do from image to image.
+    of_images: FoundImages,
 }
 
 /// Why a recording cannot be adjusted.
@@ -157,13 +158,13 @@ pub fn adjust(
     while passes < PASSES {
         // One lens for all where it moves puts the camera elsewhere: the place is not judged by that.
         let system = optimise::solution(&passed.problem).ok_or(AdjustmentError::Undetermined)?;
-        let is_moving = work.doubt_lens(&passed.problem, &system);
+        let is_moving = work.doubt_images(&passed.problem, &system);
         let is_doubted = is_moving || work.doubt_given(&passed.problem, &system);
         if passed.is_settled && !is_doubted {
             break;
         }
         passed = work.pass(&recording, &mut watch)?;
-        // What a lens does is found once.
+        // What an image has of its own is found once.
         passes += usize::from(!is_moving);
     }
     watch.stage(AdjustmentStage::Weighted, work.guess.images.len());
@@ -171,7 +172,7 @@ pub fn adjust(
     let mut weighed = weigh(input, &mut passed, &mut watch)?;
     // With noise that is taken for several times as large as it is, a lever arm that is 10 cm off was no contradiction.
     let system = optimise::solution(&passed.problem).ok_or(AdjustmentError::Undetermined)?;
-    if work.doubt_lens(&passed.problem, &system) || work.doubt_given(&passed.problem, &system) {
+    if work.doubt_images(&passed.problem, &system) || work.doubt_given(&passed.problem, &system) {
         passed = work.pass(&recording, &mut watch)?;
         weighed = weigh(input, &mut passed, &mut watch)?;
     }
@@ -180,7 +181,7 @@ pub fn adjust(
     let Passed { mut problem, images, report, clock_offset, .. } = passed;
     let system = optimise::solution(&problem).ok_or(AdjustmentError::Undetermined)?;
     let covariance = system.factor.inverse(problem.calibration_offset());
-    let lens = lens_evidence::centre(&mut problem, &system);
+    let of_images = image_evidence::centre(&mut problem, &system);
     let solution = Solution {
         segment,
         problem,
@@ -192,7 +193,7 @@ pub fn adjust(
         weighed,
         system,
         covariance,
-        lens,
+        of_images,
     };
     let corrected = imu.multiplied(&solution.problem.calibration.gain);
     let recording = Measurements { imu: &corrected, model: &solution.weighed.model, ..recording };
@@ -263,7 +264,7 @@ impl Work {
         let prior = CalibrationPrior {
             sigmas: input.sigmas.of(&calibration),
             mean: calibration.clone(),
-            lens: LensPrior::default(),
+            image: ImagePrior::default(),
         };
         Self { calibration, prior, clock_offset: input.camera.time_offset, guess }
     }
@@ -296,10 +297,10 @@ impl Work {
         Ok(Passed { problem, images, report, clock_offset, is_settled })
     }
 
-    /// Where the recording shows that the lens moves, every image gets its own; whether that is new.
-    fn doubt_lens(&mut self, problem: &Problem, system: &System) -> bool {
-        let moves = lens_evidence::moves(problem, system);
-        self.prior.lens = moves.unwrap_or(self.prior.lens);
+    /// Where the recording shows that the lens moves or stamps scatter, every image gets unknowns of its own; whether that is new.
+    fn doubt_images(&mut self, problem: &Problem, system: &System) -> bool {
+        let moves = image_evidence::moves(problem, system);
+        self.prior.image = moves.unwrap_or(self.prior.image);
         moves.is_some()
     }
 

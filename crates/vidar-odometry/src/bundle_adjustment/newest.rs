@@ -69,7 +69,7 @@ pub(crate) fn newest_state(input: &AdjustmentInput<'_>) -> Result<NewestState, A
         passed = work.pass(&recording, &mut watch)?;
     }
     for _ in 1..PASSES {
-        let doubts = |system| work.doubt_lens(&passed.problem, &system);
+        let doubts = |system| work.doubt_images(&passed.problem, &system);
         if passed.is_settled && !optimise::solution(&passed.problem).is_some_and(doubts) {
             break;
         }
@@ -88,7 +88,7 @@ pub(crate) fn newest_state(input: &AdjustmentInput<'_>) -> Result<NewestState, A
     let time_offset = passed.clock_offset + Duration::from_secs_f64(problem.calibration.clock_secs);
     let with_gains =
         Measurements { log, imu: &imu.multiplied(&problem.calibration.gain), model: &input.model };
-    let images = result::states_of_images(&with_gains, problem, time_offset).into_iter();
+    let images = result::states_of_images(&with_gains, (problem, &passed.images), time_offset).into_iter();
     let number = |k: usize| log.images[passed.images[k]].number();
     Ok(NewestState {
         frame: number(newest),

@@ -6,8 +6,8 @@
 //! clock offset and `t_r` the readout time. Between them the body turns by the gyroscope's rates and moves with the state's
 //! velocity and the accelerometer's force (Patron-Perez, Lovegrove, Sibley 2015 do the same with splines).
 
+use super::image_prior::{IMAGE_DIM, ImagePrior, ImageUnknown};
 use super::inertial::{GAIN_DIM, ImuGain};
-use super::lens_prior::{LENS_DIM, LensPrior, LensUnknown};
 use crate::backend::tangent_basis;
 use crate::imu::{NavState, hat};
 use nalgebra::{Matrix2x3, Matrix3, SMatrix, Vector2, Vector3};
@@ -73,8 +73,10 @@ pub(super) struct MovingBody {
     pub(super) force: Vector3<f64>,
     /// Gravity in the world, m/s².
     pub(super) gravity: Vector3<f64>,
-    /// How the lens had moved in the state's image (see [`super::lens`]).
+    /// How the lens had moved in the state's image (see [`super::image_unknowns`]).
     pub(super) lens: LensMotion,
+    /// How much later than its stamp says the state's image was exposed, s: the state is that of the stamp.
+    pub(super) delay_secs: f64,
 }
 
 impl MovingBody {
@@ -168,37 +170,38 @@ pub(super) struct Linearised {
 }
 
 impl Linearised {
-    /// Derivatives by the unknowns of the image's lens, a column each; zero beyond them.
-    pub(super) fn by_lens(
+    /// Derivatives by the image's own unknowns, a column each; zero beyond them.
+    pub(super) fn by_image(
         &self,
         body: &MovingBody,
         calibration: &SensorCalibration,
-        prior: &LensPrior,
+        prior: &ImagePrior,
         measured: &Pixel,
-    ) -> SMatrix<f64, 2, LENS_DIM> {
+    ) -> SMatrix<f64, 2, IMAGE_DIM> {
         let focal = calibration.camera.focal_lengths();
         let secs = calibration.secs_from_middle(measured.y);
-        let mut by_lens = SMatrix::<f64, 2, LENS_DIM>::zeros();
+        let mut by_image = SMatrix::<f64, 2, IMAGE_DIM>::zeros();
         for (at, unknown) in prior.unknowns().enumerate() {
             let by_one = match unknown {
-                LensUnknown::LogFocal => {
+                ImageUnknown::LogFocal => {
                     let shift = body.lens.shift_px(&calibration.camera, secs);
                     self.pixel - shift - calibration.camera.principal_point()
                 }
-                LensUnknown::ShiftX => Vector2::new(focal.x, 0.0),
-                LensUnknown::ShiftY => Vector2::new(0.0, focal.y),
-                LensUnknown::ShiftRateX => Vector2::new(secs * focal.x, 0.0),
-                LensUnknown::ShiftRateY => Vector2::new(0.0, secs * focal.y),
+                ImageUnknown::ShiftX => Vector2::new(focal.x, 0.0),
+                ImageUnknown::ShiftY => Vector2::new(0.0, focal.y),
+                ImageUnknown::ShiftRateX => Vector2::new(secs * focal.x, 0.0),
+                ImageUnknown::ShiftRateY => Vector2::new(0.0, secs * focal.y),
+                ImageUnknown::Delay => self.by_calibration[0],
             };
-            by_lens.set_column(at, &by_one);
+            by_image.set_column(at, &by_one);
         }
-        by_lens
+        by_image
     }
 }
 
 /// Pose of the camera while the row of `measured` is exposed.
 pub(super) fn camera_pose(body: &MovingBody, calibration: &SensorCalibration, measured: &Pixel) -> Se3 {
-    body.pose_after(calibration.row_secs(measured.y)) * calibration.body_from_camera
+    body.pose_after(calibration.row_secs(measured.y) + body.delay_secs) * calibration.body_from_camera
 }
 
 /// Where the landmark lies in the image, in the row of `measured`.
@@ -227,7 +230,7 @@ pub(super) fn linearise(
     calibration: &SensorCalibration,
     measured: &Pixel,
 ) -> Option<Linearised> {
-    let secs = calibration.row_secs(measured.y);
+    let secs = calibration.row_secs(measured.y) + body.delay_secs;
     let (turn, rate) = body.turn(secs);
     let pose = body.pose_after(secs);
     let camera = pose * calibration.body_from_camera;
@@ -303,6 +306,7 @@ pub(super) mod tests {
                 shift: Vector2::new(0.012, -0.006),
                 shift_rate: Vector2::new(-0.2, 0.3),
             },
+            delay_secs: 0.004,
         };
         let pinhole = Pinhole::new(420.0, 424.0, 317.0, 243.0, 640, 480).unwrap();
         let calibration = SensorCalibration {
@@ -371,15 +375,15 @@ pub(super) mod tests {
             let minus = project(&body, &landmark.plus(&-step), &calibration, &measured);
             check("landmark", plus, minus, h, at.by_landmark.column(k).into_owned());
         }
-        let prior = LensPrior { focal: Some(1.0), shift: Some(1.0) };
-        let by_lens = at.by_lens(&body, &calibration, &prior, &measured);
+        let prior = ImagePrior { focal: Some(1.0), shift: Some(1.0), delay: Some(1.0) };
+        let by_image = at.by_image(&body, &calibration, &prior, &measured);
         for (k, unknown) in prior.unknowns().enumerate() {
             let moved = |by: f64| {
                 let mut body = body;
-                unknown.add(&mut body.lens, by);
+                unknown.add(&mut body, by);
                 project(&body, &landmark, &calibration, &measured)
             };
-            check(&format!("{unknown:?}"), moved(h), moved(-h), h, by_lens.column(k).into_owned());
+            check(&format!("{unknown:?}"), moved(h), moved(-h), h, by_image.column(k).into_owned());
         }
         for k in 0..calibration.dim() - GAIN_DIM {
             let plus = project(&body, &landmark, &perturbed(&calibration, k, h), &measured);

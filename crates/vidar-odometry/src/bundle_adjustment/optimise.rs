@@ -230,10 +230,10 @@ fn advance(problem: &mut Problem, system: &System, step: &[f64]) -> Option<Scale
     problem.calibration = calibration;
     let (dim, offset) = (problem.frame_dim(), problem.calibration_offset());
     for (frame, step) in problem.frames.iter_mut().zip(step.chunks_exact(dim)) {
-        let (delta, of_lens) = step.split_at(FRAME_DIM);
+        let (delta, of_image) = step.split_at(FRAME_DIM);
         frame.body.state = scale.state(&frame.body.state, &Vector15::from_column_slice(delta));
-        for (unknown, by) in problem.prior.lens.unknowns().zip(of_lens) {
-            unknown.add(&mut frame.body.lens, *by);
+        for (unknown, by) in problem.prior.image.unknowns().zip(of_image) {
+            unknown.add(&mut frame.body, *by);
         }
     }
     for (seen, block) in problem.landmarks.iter_mut().zip(&system.landmarks) {

@@ -1,8 +1,8 @@
 //! The unknowns of the adjustment and what was measured of them.
 
 use super::envelope::Envelope;
+use super::image_prior::ImagePrior;
 use super::inertial::{GAIN_DIM, ImuGain, InertialFactor};
-use super::lens_prior::LensPrior;
 use super::observation::{Landmark, MovingBody, STATE_DIM, SensorCalibration};
 use crate::imu::{ImuBuffer, ImuModel, NavState};
 use nalgebra::{Matrix2, Vector3};
@@ -44,8 +44,8 @@ pub(super) struct CalibrationPrior {
     pub(super) mean: SensorCalibration,
     /// In the order of [`super::observation::Linearised::by_calibration`].
     pub(super) sigmas: Vec<f64>,
-    /// What the lens may do from image to image.
-    pub(super) lens: LensPrior,
+    /// What may differ from image to image.
+    pub(super) image: ImagePrior,
 }
 
 /// States, landmarks and calibration, with all measurements.
@@ -72,9 +72,9 @@ impl Problem {
         self.offset(self.frames.len())
     }
 
-    /// Unknowns of a state: [`FRAME_DIM`], then those of its image's lens.
+    /// Unknowns of a state: [`FRAME_DIM`], then those of its image.
     pub(super) fn frame_dim(&self) -> usize {
-        FRAME_DIM + self.prior.lens.dim()
+        FRAME_DIM + self.prior.image.dim()
     }
 
     /// Where the unknowns of a state begin.
@@ -134,6 +134,7 @@ impl FrameState {
             force: now.accel.0,
             gravity: model.gravity(),
             lens: LensMotion::NONE,
+            delay_secs: 0.0,
         };
         Some(Self { time, body, inertial: None })
     }

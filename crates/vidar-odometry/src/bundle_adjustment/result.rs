@@ -10,7 +10,7 @@ use super::system::System;
 use super::{
     AdjustmentFinding, AdjustmentInput, MAX_INERTIAL_CHI2, MAX_REJECTED_SHARE, Measurements, Solution,
 };
-use super::{findings, keyframes};
+use super::{delays, findings, keyframes};
 use crate::calibration::loud_noise;
 use crate::imu::{ImuBuffer, ImuModel, NavState};
 use crate::pipeline::{Joined, public_state};
@@ -142,9 +142,9 @@ impl Adjusted {
     /// Whether camera and IMU agree in the solution.
     pub fn is_consistent(&self) -> bool {
         let AdjustmentReport { observations, rejected, inertial_chi2_per_dof, .. } = self.report;
-        let lens_is_plausible = self.findings.iter().all(AdjustmentFinding::is_plausible);
+        let images_are_plausible = self.findings.iter().all(AdjustmentFinding::is_plausible);
         agree(inertial_chi2_per_dof, observations, rejected)
-            && lens_is_plausible
+            && images_are_plausible
             && self.scale_std.is_finite()
     }
 }
@@ -153,19 +153,20 @@ impl Adjusted {
 /// gains applied; `t_imu = stamp + offset`.
 pub(super) fn states_of_images(
     recording: &Measurements<'_>,
-    problem: &Problem,
+    (problem, images): (&Problem, &[usize]),
     offset: Duration,
 ) -> Vec<(FrameId, Timestamp, NavState)> {
     let Measurements { log, imu, model } = *recording;
     let secs = problem.calibration.clock_secs;
     let clock = Duration::from_secs_f64(secs);
-    // At the images' true instants.
     let adjusted: Vec<(Timestamp, NavState)> =
         problem.frames.iter().map(|f| (f.time + clock, f.body.state_after(secs))).collect();
-    let state = |(frame, stamp): &(FrameId, Timestamp)| {
-        Some((*frame, *stamp, state_at(&adjusted, *stamp + offset, imu, model)?))
+    let delays = delays::of_images(log, problem, images);
+    let state = |((frame, stamp), delay): (&(FrameId, Timestamp), &f64)| {
+        let exposed = *stamp + offset + Duration::from_secs_f64(*delay);
+        Some((*frame, *stamp, state_at(&adjusted, exposed, imu, model)?))
     };
-    log.stamps.iter().filter_map(state).collect()
+    log.stamps.iter().zip(&delays).filter_map(state).collect()
 }
 
 /// Whether camera and IMU agree in a solution with this mean squared inertial residual and so many observations left out.
@@ -183,13 +184,13 @@ pub(super) fn collect(
     let Solution { problem, clock_offset, report, system, covariance, .. } = solution;
     let clock = Duration::from_secs_f64(problem.calibration.clock_secs);
     let offset = *clock_offset + clock;
-    let states = states_of_images(recording, problem, offset).into_iter();
+    let states = states_of_images(recording, (problem, &solution.images), offset).into_iter();
     let every_image = states.map(|(frame, stamp, state)| (frame, public_state(&state, stamp))).collect();
     let noise_ratio = noise_ratio(input, &solution.weighed);
     // Noise that stands in for an error of the model keeps its sign for seconds, which white noise does not.
     let scale_std = log_scale_sigma(problem, system) * noise_ratio.max(1.0);
     let mut sigmas = calibration_sigmas(problem, covariance);
-    if let Some(focus) = solution.lens.focus {
+    if let Some(focus) = solution.of_images.focus {
         let intrinsics = problem.calibration.camera.parameters();
         for axis in 0..2 {
             let own = sigmas[TIMING_AND_PLACE + axis];
@@ -221,7 +222,7 @@ pub(super) fn collect(
             covariance,
             &input.given_body_from_camera,
             input.sigmas,
-            &solution.lens,
+            &solution.of_images,
         ),
         scale_std,
         report: AdjustmentReport {

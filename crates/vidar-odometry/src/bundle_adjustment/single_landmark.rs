@@ -98,7 +98,7 @@ impl LeastSquares for Alone<'_> {
 
 #[cfg(test)]
 mod tests {
-    use super::super::lens_prior::LensPrior;
+    use super::super::image_prior::ImagePrior;
     use super::super::observation::tests::example;
     use super::super::problem::{CalibrationPrior, FrameState, WhitenedObservation};
     use super::*;
@@ -123,7 +123,7 @@ mod tests {
             frames.push(FrameState { time: Timestamp::from_nanos(frame as i64), body, inertial: None });
         }
         let sigmas = vec![0.0; calibration.dim()];
-        let prior = CalibrationPrior { sigmas, mean: calibration.clone(), lens: LensPrior::default() };
+        let prior = CalibrationPrior { sigmas, mean: calibration.clone(), image: ImagePrior::default() };
         let gauge = (0, frames[0].body.state);
         let landmarks = vec![ObservedLandmark { landmark, observations }];
         Problem { frames, landmarks, calibration, prior, active: Vec::new(), gauge }

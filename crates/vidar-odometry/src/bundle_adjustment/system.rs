@@ -1,7 +1,7 @@
 //! The reduced normal equations of states and calibration, and what is kept of the landmarks that were eliminated.
 
 use super::envelope::Envelope;
-use super::lens_prior::LENS_DIM;
+use super::image_prior::IMAGE_DIM;
 use super::observation::STATE_DIM;
 use super::problem::{FRAME_DIM, Problem};
 use crate::backend::dot;
@@ -10,8 +10,8 @@ use nalgebra::{Matrix3, SMatrix, Vector3};
 /// `Jᵀ J` between the unknowns of a state and a landmark.
 pub(super) type ByState = SMatrix<f64, STATE_DIM, 3>;
 
-/// The same of a landmark and the unknowns of a lens.
-pub(super) type ByLens = SMatrix<f64, 3, LENS_DIM>;
+/// The same of a landmark and the unknowns of an image.
+pub(super) type ByImage = SMatrix<f64, 3, IMAGE_DIM>;
 
 /// A landmark's block of the normal equations, kept to find its step from the states'.
 #[derive(Clone, Debug, Default)]
@@ -21,8 +21,8 @@ pub(super) struct LandmarkBlock {
     pub(super) gradient: Vector3<f64>,
     /// Of each observation.
     pub(super) by_state: Vec<(usize, ByState)>,
-    /// Of each observation with the lens of its image, as many columns as it has unknowns; none where it has none.
-    pub(super) by_lens: Vec<ByLens>,
+    /// Of each observation with its image, as many columns as that has unknowns; none where it has none.
+    pub(super) by_image: Vec<ByImage>,
     pub(super) by_calibration: Vec<Vector3<f64>>,
 }
 
@@ -64,8 +64,8 @@ impl LandmarkBlock {
         let mut gradient = self.gradient;
         for (at, (frame, by_state)) in self.by_state.iter().enumerate() {
             let from = frame_dim * frame;
-            if let Some(by_lens) = self.by_lens.get(at) {
-                for (column, moved) in by_lens.column_iter().zip(&step[from + FRAME_DIM..from + frame_dim]) {
+            if let Some(by_image) = self.by_image.get(at) {
+                for (column, moved) in by_image.column_iter().zip(&step[from + FRAME_DIM..from + frame_dim]) {
                     gradient += column * *moved;
                 }
             }

@@ -52,6 +52,8 @@ pub struct SimulationConfig {
     pub log_focal: [f64; 2],
     /// Amplitude of the image's shift, focal lengths: a stabilised lens that follows a tremor of two or three shakes a second.
     pub shift: f64,
+    /// Standard deviation of the stamps' errors, s, each image's own.
+    pub stamp_scatter_secs: f64,
 }
 
 impl SimulationConfig {
@@ -89,6 +91,7 @@ impl Default for SimulationConfig {
             accel_scale: [1.0; 3],
             log_focal: [0.0; 2],
             shift: 0.0,
+            stamp_scatter_secs: 0.0,
         }
     }
 }
@@ -127,6 +130,9 @@ pub struct Simulation {
 /// Nanoseconds of the first stamp: like real recordings, far from zero.
 const EPOCH_NANOS: i64 = 1_400_000_000_000_000_000;
 
+/// Tells the stream of the stamps' errors apart from that of everything else.
+const STAMPS: u64 = 0x5354_414d_5053;
+
 fn stamp(secs: f64) -> Timestamp {
     Timestamp::from_nanos(EPOCH_NANOS + (secs * 1e9).round() as i64)
 }
@@ -157,10 +163,12 @@ impl Simulation {
         let (camera, body_from_camera) = (Self::camera(), Self::body_from_camera());
         let frames = (secs * config.camera_rate_hz + 1e-6).floor() as usize;
         let mut tracker = Tracker { names: vec![None; points.len()], point_of: Vec::new() };
+        let mut stamps = Random::new(config.seed ^ STAMPS);
         let mut all = Vec::with_capacity(frames);
         for k in 0..frames {
             let at = k as f64 / config.camera_rate_hz;
-            let exposed = at + config.time_offset_secs;
+            let late = config.time_offset_secs + config.stamp_scatter_secs * stamps.normal();
+            let exposed = (at + late).max(0.0);
             let motion = flight.motion(from_secs + exposed);
             let bias = biases[((exposed * config.imu_rate_hz).round() as usize).min(biases.len() - 1)];
             let truth = NavState { world_from_body: motion.world_from_body, velocity: motion.velocity, bias };
@@ -197,7 +205,7 @@ fn simulate_imu(
 ) -> (Vec<ImuSample>, Vec<Bias>) {
     let (scale, noise) = (config.noise_scale, &config.noise);
     let root_rate = config.imu_rate_hz.sqrt();
-    let secs = secs + 2.0 * config.time_offset_secs.max(0.0);
+    let secs = secs + 2.0 * config.time_offset_secs.max(0.0) + 6.0 * config.stamp_scatter_secs;
     let count = (secs * config.imu_rate_hz + 1e-6).floor() as usize + 2;
     let mut bias = Bias {
         gyro: random.normal3() * (scale * config.gyro_bias_sigma),

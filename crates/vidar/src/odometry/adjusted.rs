@@ -102,6 +102,7 @@ pub(super) fn warnings(adjusted: &Adjusted) -> Vec<Warning> {
         let text = match finding {
             AdjustmentFinding::FocalLength(focus) => return focal_length(focus),
             AdjustmentFinding::Shifted { rms } => return shifted(*rms),
+            AdjustmentFinding::StampsScatter { rms_secs } => return stamps_scatter(*rms_secs),
             AdjustmentFinding::CameraPosition { given_m, found_m, sigma_m } => format!(
                 "the camera's position on the IMU is given as {} cm, the recording shows {} (σ {}) cm: {:.0} cm apart",
                 in_cm(given_m),
@@ -195,6 +196,17 @@ fn shifted(rms: f64) -> Warning {
     }
     Warning::new("images-stabilised", format!("the images are stabilised: {shifted}")).hint(
         "switch optical and electronic stabilisation off before filming: `vidar live` and the live trajectory do not know it, and their scale is worse for it",
+    )
+}
+
+fn stamps_scatter(rms_secs: f64) -> Warning {
+    let message = format!(
+        "image stamps scatter by {:.1} ms (root mean square) about when the images were exposed; every image gets its own instant",
+        1e3 * rms_secs
+    );
+    Warning::new("stamps-scatter", message).hint(
+        "stamp images with the sensor's time (Android: the image's own timestamp), not when they arrive: `vidar live` and the live trajectory \
+         take stamps as they are",
     )
 }
 

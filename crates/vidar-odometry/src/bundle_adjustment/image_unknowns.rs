@@ -1,14 +1,17 @@
-//! A lens that moves while filming.
+//! What an image has of its own: a lens that moves while filming, and a stamp that is not when it was exposed.
 //!
 //! Autofocus changes the focal length by up to 2 % ("focus breathing"). With one for all images, each change looks like a motion along the
 //! optical axis, which the IMU contradicts only weakly: rendered phones whose focal length changed by 1 % every few seconds had their scale 5 %
 //! off at a stated 1.1 %. Optical stabilisation shifts the image against the shake of the hand by up to a degree; without that the camera seems
 //! to turn otherwise than the gyroscope says. Where the recording shows it, every image has a focal length `f exp(z)` and a shift of its
 //! own, each an Ornstein-Uhlenbeck process: a random walk that stays about zero.
+//!
+//! Phones and drivers stamp images when they arrive, some ms sooner or later after the exposure from one to the next; at 60°/s a camera turns by two pixels
+//! in 4 ms. Two real phones scatter by 4 and 6 ms. Where the recording shows it, every image has a delay of its own, as a process of the same kind.
 
-use super::lens_prior::{LensPrior, LensUnknown, Process};
+use super::image_prior::{ImagePrior, ImageUnknown, Process};
 use super::problem::{FRAME_DIM, Problem};
-use super::system::{ByLens, LandmarkBlock, System};
+use super::system::{ByImage, LandmarkBlock, System};
 use crate::backend::product;
 use nalgebra::{Matrix3, Vector3};
 
@@ -31,20 +34,20 @@ fn ties(problem: &Problem, process: Process) -> impl Iterator<Item = Tie> {
 }
 
 /// `ln` of the determinant of a prior's information.
-pub(super) fn log_det(problem: &Problem, prior: &LensPrior) -> f64 {
+pub(super) fn log_det(problem: &Problem, prior: &ImagePrior) -> f64 {
     prior.processes().flat_map(|(_, process)| ties(problem, process)).map(|tie| tie.weight.ln()).sum()
 }
 
 /// What an unknown of state `k` departs from its tie by.
-fn departure(problem: &Problem, unknown: LensUnknown, k: usize, tie: Tie) -> f64 {
-    let value = |k: usize| unknown.of(&problem.frames[k].body.lens);
+fn departure(problem: &Problem, unknown: ImageUnknown, k: usize, tie: Tie) -> f64 {
+    let value = |k: usize| unknown.of(&problem.frames[k].body);
     value(k) - tie.share * k.checked_sub(1).map_or(0.0, value)
 }
 
 /// Cost of the prior.
 pub(super) fn cost(problem: &Problem) -> f64 {
     let mut cost = 0.0;
-    for (unknown, process) in problem.prior.lens.processes() {
+    for (unknown, process) in problem.prior.image.processes() {
         for (k, tie) in ties(problem, process).enumerate() {
             cost += 0.5 * tie.weight * departure(problem, unknown, k, tie).powi(2);
         }
@@ -54,7 +57,7 @@ pub(super) fn cost(problem: &Problem) -> f64 {
 
 /// Adds the prior to the normal equations.
 pub(super) fn add_prior(problem: &Problem, system: &mut System) {
-    for (at, (unknown, process)) in problem.prior.lens.processes().enumerate() {
+    for (at, (unknown, process)) in problem.prior.image.processes().enumerate() {
         for (k, tie) in ties(problem, process).enumerate() {
             let row = problem.offset(k) + FRAME_DIM + at;
             let slope = tie.weight * departure(problem, unknown, k, tie);
@@ -70,7 +73,7 @@ pub(super) fn add_prior(problem: &Problem, system: &mut System) {
     }
 }
 
-/// The lens' part of taking a landmark out of the normal equations (Schur complement).
+/// The images' own part of taking a landmark out of the normal equations (Schur complement).
 pub(super) fn eliminate(
     problem: &Problem,
     block: &LandmarkBlock,
@@ -78,34 +81,34 @@ pub(super) fn eliminate(
     own_step: &Vector3<f64>,
     system: &mut System,
 ) {
-    let unknowns = problem.prior.lens.dim();
+    let unknowns = problem.prior.image.dim();
     let seen = |at: usize| {
         let (frame, by_state) = &block.by_state[at];
-        (*frame, problem.offset(*frame), by_state, &block.by_lens[at])
+        (*frame, problem.offset(*frame), by_state, &block.by_image[at])
     };
-    for at in 0..block.by_lens.len() {
-        let (frame, from, by_state, by_lens) = seen(at);
+    for at in 0..block.by_image.len() {
+        let (frame, from, by_state, by_image) = seen(at);
         let row = from + FRAME_DIM;
-        let weighted: ByLens = inverse * by_lens;
+        let weighted: ByImage = inverse * by_image;
         let weighted_state = product(by_state, inverse);
         for i in 0..unknowns {
-            system.gradient[row + i] -= by_lens.column(i).dot(own_step);
+            system.gradient[row + i] -= by_image.column(i).dot(own_step);
         }
-        for (other_frame, other_from, other_state, other_lens) in (0..=at).map(seen) {
+        for (other_frame, other_from, other_state, other_image) in (0..=at).map(seen) {
             let with_state = other_state * weighted;
-            let with_lens = weighted.tr_mul(other_lens);
+            let with_image = weighted.tr_mul(other_image);
             for i in 0..unknowns {
                 let sums = system.h.part_mut(row + i, other_from, with_state.nrows());
                 sums.iter_mut().zip(with_state.column(i).iter()).for_each(|(sum, value)| *sum -= value);
                 let others = if other_frame == frame { i + 1 } else { unknowns };
                 for j in 0..others {
-                    system.h.add(row + i, other_from + FRAME_DIM + j, -with_lens[(i, j)]);
+                    system.h.add(row + i, other_from + FRAME_DIM + j, -with_image[(i, j)]);
                 }
             }
             if other_frame != frame {
-                let with_lens = weighted_state * other_lens;
+                let with_image = weighted_state * other_image;
                 for j in 0..unknowns {
-                    for (k, value) in with_lens.column(j).iter().enumerate() {
+                    for (k, value) in with_image.column(j).iter().enumerate() {
                         system.h.add(from + k, other_from + FRAME_DIM + j, -value);
                     }
                 }
@@ -137,7 +140,7 @@ mod tests {
         for frame in 0..3 {
             let mut body = body;
             body.state.world_from_body.translation += Vector3::new(0.2, 0.05, -0.1) * f64::from(frame);
-            body.lens = LensMotion::NONE;
+            (body.lens, body.delay_secs) = (LensMotion::NONE, 0.0);
             let time = Timestamp::from_nanos(i64::from(frame) * 200_000_000);
             frames.push(FrameState { time, body, inertial: None });
         }
@@ -157,20 +160,20 @@ mod tests {
         let landmarks = landmarks.collect();
         let mut sigmas = vec![0.0; calibration.dim()];
         sigmas[0] = 0.01;
-        let lens = LensPrior { focal: Some(0.015), shift: Some(0.01) };
-        let prior = CalibrationPrior { sigmas, mean: calibration.clone(), lens };
+        let image = ImagePrior { focal: Some(0.015), shift: Some(0.01), delay: Some(0.004) };
+        let prior = CalibrationPrior { sigmas, mean: calibration.clone(), image };
         let gauge = (0, frames[0].body.state);
         Problem { frames, landmarks, calibration, prior, active: vec![0], gauge }
     }
 
-    /// Moves one unknown: states with their lenses, clock, landmarks.
+    /// Moves one unknown: states with their images, clock, landmarks.
     fn moved(problem: &mut Problem, unknown: usize, by: f64) {
         let (dim, reduced) = (problem.frame_dim(), problem.dim());
         if unknown < problem.calibration_offset() {
             let body = &mut problem.frames[unknown / dim].body;
             let k = unknown % dim;
-            match problem.prior.lens.unknowns().nth(k.wrapping_sub(FRAME_DIM)) {
-                Some(unknown) => unknown.add(&mut body.lens, by),
+            match problem.prior.image.unknowns().nth(k.wrapping_sub(FRAME_DIM)) {
+                Some(unknown) => unknown.add(body, by),
                 None => {
                     let mut delta = Vector15::zeros();
                     delta[k] = by;
@@ -229,7 +232,7 @@ mod tests {
     #[test]
     fn the_prior_is_that_of_a_process_that_stays_about_zero() {
         let problem = problem();
-        let prior = LensPrior { focal: Some(0.015), shift: None };
+        let prior = ImagePrior { focal: Some(0.015), ..ImagePrior::default() };
         let (_, process) = prior.processes().next().unwrap();
         let mut information = DMatrix::zeros(3, 3);
         for (k, tie) in ties(&problem, process).enumerate() {

@@ -1,55 +1,65 @@
-//! What is unknown of a lens that moves while filming, and what is known of it before.
+//! What is unknown of a lens that moves while filming and of a clock that scatters, and what is known of it before.
 
-use vidar_core::LensMotion;
+use super::observation::MovingBody;
 
-/// Most unknowns of a lens.
-pub(super) const LENS_DIM: usize = 5;
+/// Most unknowns of an image.
+pub(super) const IMAGE_DIM: usize = 6;
 
-/// What is known before of how the lens moves while filming (see [`super::lens`]); nothing of it is unknown where it does not.
+/// What is known before of how the lens moves while filming, and of how stamps scatter (see [`super::image_unknowns`]); nothing of it is unknown where they
+/// do not.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub(super) struct LensPrior {
+pub(super) struct ImagePrior {
     /// Standard deviation of `ln` of an image's focal length over the calibration's, where it changes.
     pub(super) focal: Option<f64>,
     /// Standard deviation of an image's shift in x and in y, focal lengths, where it is shifted; it has a rate, too.
     pub(super) shift: Option<f64>,
+    /// Standard deviation of how much later than its stamp says an image was exposed, s, where stamps scatter.
+    pub(super) delay: Option<f64>,
 }
 
-/// How long a lens keeps its place, s: autofocus moves every few seconds, stabilisation with each tremor of the hand.
+/// How long a lens keeps its place, s: autofocus moves every few seconds, stabilisation with each tremor of the hand. Part of a stamp's error is that of the
+/// image alone, part goes with the exposure: delays of two real phones' images 0.14 s apart are correlated by 0.5 and 0.8.
 const FOCUS_SECS: f64 = 5.0;
 const SHIFT_SECS: f64 = 0.2;
 const RATE_SECS: f64 = 0.05;
+const DELAY_SECS: f64 = 0.2;
 /// How fast a lens is shifted that is shifted by 1, 1/s: a hand shakes three to six times a second.
 const RATE_PER_SHIFT: f64 = 30.0;
 
-/// What is unknown of an image's lens.
+/// What is unknown of an image.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(super) enum LensUnknown {
+pub(super) enum ImageUnknown {
     LogFocal,
     ShiftX,
     ShiftY,
     ShiftRateX,
     ShiftRateY,
+    Delay,
 }
 
-impl LensUnknown {
-    pub(super) fn of(self, lens: &LensMotion) -> f64 {
+impl ImageUnknown {
+    pub(super) fn of(self, body: &MovingBody) -> f64 {
+        let lens = &body.lens;
         match self {
             Self::LogFocal => lens.log_focal,
             Self::ShiftX => lens.shift.x,
             Self::ShiftY => lens.shift.y,
             Self::ShiftRateX => lens.shift_rate.x,
             Self::ShiftRateY => lens.shift_rate.y,
+            Self::Delay => body.delay_secs,
         }
     }
 
     /// Changes its value.
-    pub(super) fn add(self, lens: &mut LensMotion, step: f64) {
+    pub(super) fn add(self, body: &mut MovingBody, step: f64) {
+        let lens = &mut body.lens;
         *match self {
             Self::LogFocal => &mut lens.log_focal,
             Self::ShiftX => &mut lens.shift.x,
             Self::ShiftY => &mut lens.shift.y,
             Self::ShiftRateX => &mut lens.shift_rate.x,
             Self::ShiftRateY => &mut lens.shift_rate.y,
+            Self::Delay => &mut body.delay_secs,
         } += step;
     }
 }
@@ -61,27 +71,31 @@ pub(super) struct Process {
     pub(super) secs: f64,
 }
 
-impl LensPrior {
-    /// Unknowns of an image's lens.
+impl ImagePrior {
+    /// Unknowns of an image.
     pub(super) fn dim(&self) -> usize {
-        usize::from(self.focal.is_some()) + 4 * usize::from(self.shift.is_some())
+        usize::from(self.focal.is_some())
+            + 4 * usize::from(self.shift.is_some())
+            + usize::from(self.delay.is_some())
     }
 
     /// What is unknown, in the order in which it follows a state.
-    pub(super) fn unknowns(&self) -> impl Iterator<Item = LensUnknown> {
+    pub(super) fn unknowns(&self) -> impl Iterator<Item = ImageUnknown> {
         self.processes().map(|(unknown, _)| unknown)
     }
 
-    pub(super) fn processes(&self) -> impl Iterator<Item = (LensUnknown, Process)> {
+    pub(super) fn processes(&self) -> impl Iterator<Item = (ImageUnknown, Process)> {
         let focal = self.focal.map(|sigma| Process { sigma, secs: FOCUS_SECS });
         let shift = self.shift.map(|sigma| Process { sigma, secs: SHIFT_SECS });
         let rate = self.shift.map(|sigma| Process { sigma: RATE_PER_SHIFT * sigma, secs: RATE_SECS });
+        let delay = self.delay.map(|sigma| Process { sigma, secs: DELAY_SECS });
         let all = [
-            (LensUnknown::LogFocal, focal),
-            (LensUnknown::ShiftX, shift),
-            (LensUnknown::ShiftY, shift),
-            (LensUnknown::ShiftRateX, rate),
-            (LensUnknown::ShiftRateY, rate),
+            (ImageUnknown::LogFocal, focal),
+            (ImageUnknown::ShiftX, shift),
+            (ImageUnknown::ShiftY, shift),
+            (ImageUnknown::ShiftRateX, rate),
+            (ImageUnknown::ShiftRateY, rate),
+            (ImageUnknown::Delay, delay),
         ];
         all.into_iter().filter_map(|(unknown, process)| Some((unknown, process?)))
     }
