@@ -1,7 +1,5 @@
 //! What is unknown of a lens that moves while filming and of a clock that scatters, and what is known of it before.
 
-use super::observation::MovingBody;
-
 /// Most unknowns of an image.
 pub(super) const IMAGE_DIM: usize = 6;
 
@@ -35,33 +33,6 @@ pub(super) enum ImageUnknown {
     ShiftRateX,
     ShiftRateY,
     Delay,
-}
-
-impl ImageUnknown {
-    pub(super) fn of(self, body: &MovingBody) -> f64 {
-        let lens = &body.lens;
-        match self {
-            Self::LogFocal => lens.log_focal,
-            Self::ShiftX => lens.shift.x,
-            Self::ShiftY => lens.shift.y,
-            Self::ShiftRateX => lens.shift_rate.x,
-            Self::ShiftRateY => lens.shift_rate.y,
-            Self::Delay => body.delay_secs,
-        }
-    }
-
-    /// Changes its value.
-    pub(super) fn add(self, body: &mut MovingBody, step: f64) {
-        let lens = &mut body.lens;
-        *match self {
-            Self::LogFocal => &mut lens.log_focal,
-            Self::ShiftX => &mut lens.shift.x,
-            Self::ShiftY => &mut lens.shift.y,
-            Self::ShiftRateX => &mut lens.shift_rate.x,
-            Self::ShiftRateY => &mut lens.shift_rate.y,
-            Self::Delay => &mut body.delay_secs,
-        } += step;
-    }
 }
 
 /// A process: its standard deviation, and how long it keeps its value, s.

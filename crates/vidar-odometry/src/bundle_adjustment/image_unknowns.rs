@@ -10,10 +10,38 @@
 //! in 4 ms. Two real phones scatter by 4 and 6 ms. Where the recording shows it, every image has a delay of its own, as a process of the same kind.
 
 use super::image_prior::{ImagePrior, ImageUnknown, Process};
+use super::observation::MovingBody;
 use super::problem::{FRAME_DIM, Problem};
 use super::system::{ByImage, LandmarkBlock, System};
 use crate::backend::product;
 use nalgebra::{Matrix3, Vector3};
+
+impl ImageUnknown {
+    pub(super) fn of(self, body: &MovingBody) -> f64 {
+        let lens = &body.lens;
+        match self {
+            Self::LogFocal => lens.log_focal,
+            Self::ShiftX => lens.shift.x,
+            Self::ShiftY => lens.shift.y,
+            Self::ShiftRateX => lens.shift_rate.x,
+            Self::ShiftRateY => lens.shift_rate.y,
+            Self::Delay => body.delay_secs,
+        }
+    }
+
+    /// Changes its value.
+    pub(super) fn add(self, body: &mut MovingBody, step: f64) {
+        let lens = &mut body.lens;
+        *match self {
+            Self::LogFocal => &mut lens.log_focal,
+            Self::ShiftX => &mut lens.shift.x,
+            Self::ShiftY => &mut lens.shift.y,
+            Self::ShiftRateX => &mut lens.shift_rate.x,
+            Self::ShiftRateY => &mut lens.shift_rate.y,
+            Self::Delay => &mut body.delay_secs,
+        } += step;
+    }
+}
 
 /// How the prior ties an unknown to that of the state before: `z = share · before`, with a weight. The first one is tied to zero.
 #[derive(Clone, Copy)]
