@@ -262,7 +262,7 @@ impl TrackQuality {
 
 /// What ends most attempts where calibration, clock or units are wrong, in the order in which they are usually found.
 const LIKELY_CAUSES: &str = "Most likely the calibration is not this recording's: the camera's rotation and position on the IMU \
-    (T_BS), the clock offset, the focal length or the distortion, axes, signs and units of the IMU, or a stabilised picture";
+    (T_BS), the clock offset, the focal length or the distortion, axes, signs and units of the IMU, a stabilised picture, or image stamps that scatter";
 
 /// Failures that say that images and IMU contradict each other. The others say that something is missing yet.
 const CONTRADICTIONS: [&str; 8] = [

@@ -81,7 +81,7 @@ const SHORT: &[Case] = &[
     ),
     (Fault::Gains(1.0, -1.0), &[Told(NEVER_STARTED, "axes, signs and units of the IMU")]),
     (Fault::Clock(500), &[Told(&["imu-coverage", "odometry-never-started"], "contradict each other")]),
-    (Fault::Stamps(5), &[Right(&["stamps-scatter"]), Right(&[])]),
+    (Fault::Stamps(5), &[Right(&["stamps-scatter"]), Told(&["sensors-contradict"], "contradict each other")]),
     (Fault::OtherCamera, &[Told(NEVER_STARTED, "contradict each other")]),
     (Fault::Gap(3.5, 4.5), &[Told(&["imu-gap", "track-lost"], "no IMU measurement for 1.01 s")]),
 ];
@@ -119,13 +119,19 @@ const REST: &[Case] = &[
     (Fault::Gains(1.0, 1.10), &[Told(NEVER_STARTED, "contradict each other")]),
     (Fault::Gains(0.98, 1.0), &[Right(&[])]),
     (Fault::Gains(1.02, 1.0), &[Right(&[])]),
-    (Fault::Gains(0.95, 1.0), &[Right(&[])]),
-    (Fault::Gains(1.05, 1.0), &[Right(&[])]),
+    (Fault::Gains(0.95, 1.0), &[Right(&["imu-gain"]), Right(&[])]),
+    (Fault::Gains(1.05, 1.0), &[Right(&["imu-gain"]), Right(&[])]),
     (
         Fault::Gains(0.90, 1.0),
-        &[Told(&["calibration-contradicted", "scale-not-converged"], "lengths are not metres"), Right(&[])],
+        &[
+            Told(&["calibration-contradicted", "imu-gain", "scale-not-converged"], "lengths are not metres"),
+            Right(&[]),
+        ],
     ),
-    (Fault::Gains(1.10, 1.0), &[Told(&["scale-not-converged"], "lengths are not metres"), Right(&[])]),
+    (
+        Fault::Gains(1.10, 1.0),
+        &[Told(&["imu-gain", "scale-not-converged"], "lengths are not metres"), Right(&[])],
+    ),
     (Fault::Clock(-20), &[Right(&[])]),
     (Fault::Clock(20), &[Right(COVERAGE)]),
     (Fault::Clock(-50), &[Right(&[])]),
