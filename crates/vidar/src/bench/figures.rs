@@ -64,7 +64,7 @@ fn sequence_section(
     let odometry = outcome.odometry.iter().filter(|r| r.sequence == sequence && r.failure.is_none());
     for row in odometry {
         let file = request.out.join(&row.folder).join("trajectory/odometry_body.tum");
-        if let Some(picture) = path_picture(&file) {
+        if let Some(picture) = path_picture(&file, row.with_imu) {
             let name =
                 if row.with_imu { "odometry, camera and IMU" } else { "odometry, camera only (up to scale)" };
             let png = vidar_view::encode_png(&picture)?;
@@ -79,12 +79,12 @@ fn sequence_section(
     Ok(section)
 }
 
-/// A trajectory file from above; `None` if it cannot be read.
-fn path_picture(file: &Path) -> Option<vidar_view::Picture> {
+/// A trajectory file from above; `None` if it cannot be read. With an IMU its world has z up.
+fn path_picture(file: &Path, with_imu: bool) -> Option<vidar_view::Picture> {
     let (trajectory, _): (Trajectory, _) =
         vidar_dataset::read_trajectory(file, &TrajectoryReadOptions::default()).ok()?;
     let shown = [PlotTrajectory::estimate("odometry", &trajectory)];
-    let up = vidar_view::up_of_world(&trajectory);
+    let up = if with_imu { nalgebra::Vector3::z() } else { vidar_view::up_of_world(&trajectory) };
     let plot = TrajectoryPlot { up, ..TrajectoryPlot::default() };
     Some(vidar_view::plot_trajectories(&shown, &plot, PictureSize::new(PLOT_SIZE.0, PLOT_SIZE.1)))
 }

@@ -77,7 +77,11 @@ fn view(runs: &[StoredRun], placed: &[Placed], distances: &[SurfaceDistance]) ->
     };
     let view = InteractiveView {
         panes: (0..runs.len()).map(pane).collect(),
-        up: paths.first().map_or_else(nalgebra::Vector3::z, vidar_view::up_of_world),
+        up: match runs[0].manifest.result["metric_poses"]["source"].as_str() {
+            // Levelled by gravity, however the camera was held.
+            Some("odometry") => nalgebra::Vector3::z(),
+            _ => paths.first().map_or_else(nalgebra::Vector3::z, vidar_view::up_of_world),
+        },
         shown: PanesShown::All,
         coloring: (!distances.is_empty()).then_some(FieldKind::Difference),
     };

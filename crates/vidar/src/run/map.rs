@@ -6,6 +6,7 @@ use crate::error::Error;
 use crate::input::{MetricTrajectory, PosePlan, TrajectorySource};
 use crate::quality::TrackQuality;
 use crate::run_folder::StoredView;
+use nalgebra::Vector3;
 use std::collections::BTreeMap;
 use std::sync::Arc;
 use vidar_align::Placement;
@@ -55,6 +56,16 @@ impl MetricMap {
     /// Whether the metric poses are ground truth.
     pub fn uses_ground_truth(&self) -> bool {
         self.trajectory.as_ref().is_some_and(|t| t.source == TrajectorySource::GroundTruth)
+    }
+
+    /// Up in the map's world: z where the odometry levels it by gravity, however the camera was held; else as cameras are held.
+    pub fn up(&self) -> Vector3<f64> {
+        let given = self.trajectory.as_ref();
+        if given.is_some_and(|t| t.source == TrajectorySource::Odometry) {
+            return Vector3::z();
+        }
+        let path = self.keyframe_trajectory();
+        path.as_ref().or(given.map(|t| &t.camera_trajectory)).map_or_else(Vector3::z, vidar_view::up_of_world)
     }
 
     /// What the images changed of the poses that chunks were given, and what these are known to with the images; `None` where depth does
@@ -170,4 +181,29 @@ fn area_in_view(view: &AlignedView) -> Option<f64> {
     let count = valid().count();
     let area: f64 = valid().map(|z| z * z).sum::<f64>() / (k.fx * k.fy);
     (count > 0).then(|| area * pixels.len() as f64 / count as f64)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use vidar_core::{LieGroup, Se3, So3, Timestamp};
+
+    #[test]
+    fn a_phone_that_is_held_upright_does_not_lay_the_map_on_its_side() {
+        // A level camera of a world with z up, turned by a quarter about its axis.
+        let level = So3::exp(&(Vector3::x() * -std::f64::consts::FRAC_PI_2));
+        let quarter = So3::exp(&(Vector3::z() * std::f64::consts::FRAC_PI_2));
+        let pose = |i: i64| StampedPose {
+            time: Timestamp::from_nanos(i),
+            world_from_body: Se3::new(level * quarter, Vector3::new(i as f64, 0.0, 0.0)),
+        };
+        let path = Trajectory::new(BodyFrame::Camera(CameraId(0)), (0..5).map(pose).collect()).unwrap();
+        let up_of = |source: TrajectorySource| {
+            let trajectory = Some(MetricTrajectory { source, camera_trajectory: path.clone() });
+            MetricMap { trajectory, ..MetricMap::default() }.up()
+        };
+        assert_eq!(up_of(TrajectorySource::Odometry), Vector3::z());
+        assert_eq!(up_of(TrajectorySource::GroundTruth).x.abs(), 1.0, "as cameras are held");
+        assert_eq!(MetricMap::default().up(), Vector3::z());
+    }
 }

@@ -31,8 +31,7 @@ pub fn draw(
 ) -> Result<(), Error> {
     let mut album = Album { folder, events };
     let path = outcome.map.keyframe_trajectory();
-    let metric = outcome.map.trajectory.as_ref().map(|t| &t.camera_trajectory);
-    let up = path.as_ref().or(metric).map_or_else(nalgebra::Vector3::z, vidar_view::up_of_world);
+    let up = outcome.map.up();
     let report = Report {
         title: format!("VIDAR: {}", dataset.name),
         subtitle: format!(
