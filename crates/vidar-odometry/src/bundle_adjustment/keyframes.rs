@@ -49,13 +49,13 @@ fn seen_landmarks(solution: &Solution) -> Vec<Vec<SparseLandmark>> {
     let Solution { problem, system, .. } = solution;
     let mut all = vec![Vec::new(); problem.frames.len()];
     for (id, (seen, block)) in problem.landmarks.iter().zip(&system.landmarks).enumerate() {
-        let relative = block.inverse_distance_sigma() / seen.landmark.inverse_distance;
+        let relative = block.inverse_distance_sigma() / seen.landmark.positive_inverse();
         for observation in &seen.observations {
             let body: &MovingBody = &problem.frames[observation.frame].body;
             let camera = body.pose_after(problem.calibration.clock_secs + body.delay_secs)
                 * problem.calibration.body_from_camera;
             let ray = observation::from_camera(&seen.landmark, &camera.translation);
-            let in_camera = camera.rotation.inverse().act(&ray) / seen.landmark.inverse_distance;
+            let in_camera = camera.rotation.inverse().act(&ray) / seen.landmark.positive_inverse();
             let pixel = problem.calibration.camera.project(&in_camera);
             let pixel = pixel.map(|pixel| body.lens.shown(&problem.calibration.camera, &pixel, 0.0));
             let (Some(pixel), true) = (pixel, in_camera.z > 1e-3 && relative.is_finite()) else { continue };

@@ -250,7 +250,7 @@ impl Pair<'_> {
         let zoom = ray.norm() / other_ray.norm();
         let is_alike = ray.normalize().dot(&other_ray.normalize()) > MIN_SAME_DIRECTION
             && (1.0 / MAX_ZOOM..MAX_ZOOM).contains(&zoom);
-        let inverse_distance = landmark.inverse_distance / ray.norm();
+        let inverse_distance = landmark.positive_inverse() / ray.norm();
         let feature = Feature::new(camera, *pixel, LEVEL, FeatureKind::Corner).filter(|_| is_alike)?;
         Some((expected, Warp::new(camera, &feature, inverse_distance, &(other.inverse() * host))?))
     }

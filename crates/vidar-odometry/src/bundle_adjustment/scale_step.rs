@@ -5,7 +5,7 @@
 //! that only small steps or none were taken along it. Multiplied, it leaves the images as they are. What else a step holds is added, as
 //! before: to first order both are the same.
 
-use super::observation::{Landmark, MIN_INVERSE_DISTANCE};
+use super::observation::{BEYOND_INFINITY, Landmark};
 use super::problem::Problem;
 use crate::backend::tangent_basis;
 use crate::imu::{NavState, Vector15};
@@ -66,10 +66,10 @@ impl ScaleStep {
     pub(super) fn landmark(&self, landmark: &Landmark, delta: &Vector3<f64>) -> Landmark {
         let (direction, inverse) = (&landmark.direction, landmark.inverse_distance);
         let from = landmark.origin - self.centre;
-        // What the factor does to the point, in the coordinates of the landmark's steps, which hold the origin.
-        let moved = (from + direction / inverse) * self.ln;
-        let across = tangent_basis(direction).transpose() * moved * inverse;
-        let along = -direction.dot(&moved) * inverse * inverse;
+        // What the factor does to the point, times its inverse distance, in the coordinates of the landmark's steps, which hold the origin.
+        let moved = (from * inverse + direction) * self.ln;
+        let across = tangent_basis(direction).transpose() * moved;
+        let along = -direction.dot(&moved) * inverse;
         self.scaled(landmark).plus(&(delta - Vector3::new(across.x, across.y, along)))
     }
 
@@ -78,7 +78,7 @@ impl ScaleStep {
         let factor = self.ln.exp();
         Landmark {
             direction: landmark.direction,
-            inverse_distance: (landmark.inverse_distance / factor).max(MIN_INVERSE_DISTANCE),
+            inverse_distance: (landmark.inverse_distance / factor).max(BEYOND_INFINITY),
             origin: self.centre + (landmark.origin - self.centre) * factor,
         }
     }

@@ -157,6 +157,24 @@ mod tests {
     }
 
     #[test]
+    fn a_landmark_may_be_past_infinity() {
+        let mut problem = problem();
+        // What noise makes of one that is far: the images see it where no point is.
+        let found_there = Landmark { inverse_distance: -0.02, ..problem.landmarks[0].landmark };
+        for observation in &mut problem.landmarks[0].observations {
+            let body = &problem.frames[observation.frame].body;
+            for _ in 0..20 {
+                observation.pixel =
+                    observation::project(body, &found_there, &problem.calibration, &observation.pixel)
+                        .unwrap();
+            }
+        }
+        let (landmark, cost) = refined(&problem, &problem.landmarks[0], found_there.plus(&Vector3::z()), 0.0);
+        assert!((landmark.inverse_distance + 0.02).abs() < 1e-4 && cost < 1e-3, "{landmark:?} {cost}");
+        assert_eq!(landmark.positive_inverse(), observation::MIN_INVERSE_DISTANCE);
+    }
+
+    #[test]
     fn a_landmark_that_is_no_worse_stays_where_the_step_leads() {
         let mut problem = problem();
         let truth = problem.landmarks[0].landmark;
