@@ -7,9 +7,12 @@ use vidar_core::{FrameId, Timestamp};
 /// Stamps that are farther than this share of the interval from where even spacing has them tell of images that are missing: where one of three is, the
 /// others are a third off.
 const UNEVEN: f64 = 0.3;
+/// And so do stamps that are this far from there, s: four standard deviations of a delay. Of a stream the log keeps the stamps of keyframes alone.
+const FARTHEST_SECS: f64 = 0.02;
 
-/// Of every image whose stamp the log has, s; zero where stamps do not scatter. Those that took part have their own. A camera exposes images at even intervals for as long as it
-/// takes from one of them to the next, so the instants of those between are spaced evenly; where an image is missing, their delays are between the others'.
+/// Of every image whose stamp the log has, s; zero where stamps do not scatter. Those that took part have their own. A camera exposes images at even
+/// intervals for as long as it takes from one of them to the next, so the instants of those between are spaced evenly; where an image is missing, their
+/// delays are between the others'.
 pub(super) fn of_images(log: &TrackLog, problem: &Problem, images: &[usize]) -> Vec<f64> {
     if problem.prior.image.delay.is_none() {
         return vec![0.0; log.stamps.len()];
@@ -25,6 +28,8 @@ fn between(stamps: &[(FrameId, Timestamp)], own: &[(FrameId, f64)]) -> Vec<f64> 
     let mut known: Vec<(usize, f64)> = Vec::with_capacity(own.len());
     let mut rest = own.iter().peekable();
     for (k, (frame, _)) in stamps.iter().enumerate() {
+        // Not every image that took part has its stamp there.
+        while rest.next_if(|(own, _)| own < frame).is_some() {}
         known.extend(rest.next_if(|(own, _)| own == frame).map(|(_, delay)| (k, *delay)));
     }
     let Some((&first, &last)) = known.first().zip(known.last()) else { return vec![0.0; stamps.len()] };
@@ -37,7 +42,8 @@ fn between(stamps: &[(FrameId, Timestamp)], own: &[(FrameId, f64)]) -> Vec<f64> 
         let interval = (secs(until) + delay_until - delay_from) / (until - from) as f64;
         let even = |k: usize| delay_from + interval * (k - from) as f64 - secs(k);
         let linear = |k: usize| delay_from + share(k) * (delay_until - delay_from);
-        let is_even = (from..until).all(|k| (even(k) - linear(k)).abs() < UNEVEN * interval);
+        let most = FARTHEST_SECS.min(UNEVEN * interval);
+        let is_even = (from..until).all(|k| (even(k) - linear(k)).abs() < most);
         for k in from..until {
             delays[k] = if is_even { even(k) } else { linear(k) };
         }
@@ -75,5 +81,15 @@ mod tests {
         let found = between(&at(&[0, 30, 120]), &[(FrameId(0), 0.002), (FrameId(2), 0.004)]);
         is_near(&found, &[2.0, 3.0, 4.0]);
         is_near(&between(&at(&[0, 30]), &[]), &[0.0, 0.0]);
+        // Keyframes alone, a fifth of a second off an even spacing.
+        let found = between(&at(&[0, 500, 1400]), &[(FrameId(0), 0.002), (FrameId(2), 0.004)]);
+        is_near(&found, &[2.0, 3.0, 4.0]);
+    }
+
+    #[test]
+    fn images_whose_stamps_are_not_kept_are_passed_over() {
+        let stamps: Vec<_> = at(&[0, 30, 60, 90]).into_iter().filter(|(k, _)| k.0 != 1).collect();
+        let own = [(FrameId(1), 0.009), (FrameId(2), 0.002), (FrameId(3), 0.003)];
+        is_near(&between(&stamps, &own), &[2.0, 2.0, 3.0]);
     }
 }
