@@ -54,8 +54,7 @@ fn ply_is_unchanged() {
     let mesh = small_mesh();
     let mut expected = b"ply
 format binary_little_endian 1.0
-comment frame world: right-handed, z up, gravity along -z
-comment units metres; normals unit; colours sRGB; confidence 0..1
+comment normals unit; colours sRGB; confidence 0..1
 comment source test run
 element vertex 3
 property float x
@@ -95,8 +94,8 @@ fn glb_is_unchanged() {
     let mesh = TriangleMesh { normals: vec![], confidences: vec![], ..small_mesh() };
     let json = concat!(
         r#"{"asset":{"version":"2.0","generator":"vidar","extras":{"#,
-        r#""frame":"world: right-handed, z up, gravity along -z; node \"world\" turns it y up","#,
-        r#""units":"metres","comments":["test"]}},"scene":0,"scenes":[{"nodes":[0]}],"nodes":[{"name":"world","#,
+        r#""frame":"vertices as in the map's world; node \"world\" turns its z into y, glTF's up","#,
+        r#""comments":["test"]}},"scene":0,"scenes":[{"nodes":[0]}],"nodes":[{"name":"world","#,
         r#""matrix":[1.0,0.0,0.0,0.0,0.0,0.0,-1.0,0.0,0.0,1.0,0.0,0.0,0.0,0.0,0.0,1.0],"mesh":0}],"#,
         r#""meshes":[{"primitives":[{"indices":2,"attributes":{"POSITION":0,"COLOR_0":1},"material":0,"mode":4}]}],"#,
         r#""materials":[{"pbrMetallicRoughness":{"baseColorFactor":[1.0,1.0,1.0,1.0],"metallicFactor":0.0,"#,

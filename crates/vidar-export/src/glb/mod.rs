@@ -1,6 +1,6 @@
 //! GLB (binary glTF 2.0): coloured meshes and point clouds for any 3-D viewer.
 //!
-//! - glTF is y-up; VIDAR's world is z-up. The vertices are not changed; the root node `world` has the
+//! - glTF is y-up; VIDAR's world is z-up, unless poses with another up were given. The vertices are not changed; the root node `world` has the
 //!   rotation (x, y, z) ↦ (x, z, −y) as its matrix.
 //! - `POSITION` (metres) and `NORMAL` are `float`; `COLOR_0` is RGBA of normalised 16 bits. glTF requires linear light,
 //!   VIDAR's colours are sRGB: they are converted, and 16 bits restore every sRGB byte.
@@ -9,7 +9,7 @@
 //! - Coloured surfaces are unlit (`KHR_materials_unlit`), because their colours include the lighting of the images.
 //! - A textured mesh has two primitives: one with `TEXCOORD_0` and the texture as a JPEG inside the file, and one with `COLOR_0` of what no
 //!   image shows. Textures are sRGB, as the images are, and nothing is converted. [`read_glb`] reads its triangles, not its texture.
-//! - `asset.extras` has frame, units and the caller's comments. An empty cloud has a node and no mesh.
+//! - `asset.extras` has the turn of the root node and the caller's comments, frame and unit among them. An empty cloud has a node and no mesh.
 //!
 //! Read: the default scene of a GLB with one binary chunk; node trees with matrices or TRS; primitives of triangles or
 //! points, indexed or not; colours of 8, 16 bits or float; strides. Sparse or compressed data and other

@@ -199,8 +199,7 @@ pub(super) fn asset(comments: &[String]) -> Value {
         "version": "2.0",
         "generator": "vidar",
         "extras": {
-            "frame": "world: right-handed, z up, gravity along -z; node \"world\" turns it y up",
-            "units": "metres",
+            "frame": "vertices as in the map's world; node \"world\" turns its z into y, glTF's up",
             COMMENTS_KEY: comments,
         },
     })

@@ -2,8 +2,8 @@
 //!
 //! Written: `binary_little_endian 1.0`; element `vertex` with `float x y z`, then, where known,
 //! `float nx ny nz`, `uchar red green blue` (sRGB), `float confidence`; for meshes element `face` with
-//! `list uchar int vertex_indices`. The first comments state frame and units; the caller's follow (one line each).
-//! Positions are not moved or scaled: world frame, metres, z up.
+//! `list uchar int vertex_indices`. The first comment is on normals, colours and confidence; the caller's follow (one line each), frame
+//! and unit among them. Positions are not moved or scaled.
 //!
 //! Read: ASCII and binary of both byte orders, any scalar type for any property, unknown elements and properties
 //! skipped, `vertex_index` as well as `vertex_indices`, polygons cut into fans of triangles, colours of 8 or 16

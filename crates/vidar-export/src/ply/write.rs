@@ -6,13 +6,10 @@ use crate::vertices::{Vertices, check_triangles};
 use std::io::{self, BufWriter, Write};
 use vidar_core::{PointCloud, TriangleMesh};
 
-/// Comments of every file: they define frame and units.
-const FRAME_COMMENTS: [&str; 2] = [
-    "frame world: right-handed, z up, gravity along -z",
-    "units metres; normals unit; colours sRGB; confidence 0..1",
-];
+/// Comment of every file. Frame and unit of the positions are the caller's to state: not every map is levelled, or metric.
+const VALUES_COMMENT: &str = "normals unit; colours sRGB; confidence 0..1";
 
-/// Writes a point cloud; `comments` (the source, the run) follow those of frame and units.
+/// Writes a point cloud; `comments` (frame, unit, the run) follow the one on the values.
 ///
 /// A comment's line breaks become blanks. Errors: a value that is not finite, attribute lists of another length,
 /// the writer's own.
@@ -71,7 +68,7 @@ fn write_header(
     comments: &[String],
 ) -> io::Result<()> {
     w.write_all(b"ply\nformat binary_little_endian 1.0\n")?;
-    for comment in FRAME_COMMENTS.into_iter().chain(comments.iter().map(String::as_str)) {
+    for comment in std::iter::once(VALUES_COMMENT).chain(comments.iter().map(String::as_str)) {
         let line: String = comment.chars().map(|c| if c.is_control() { ' ' } else { c }).collect();
         writeln!(w, "comment {}", line.trim())?;
     }

@@ -58,6 +58,16 @@ impl MetricMap {
         self.trajectory.as_ref().is_some_and(|t| t.source == TrajectorySource::GroundTruth)
     }
 
+    /// The map's world, in words for whoever opens its files.
+    pub fn world_words(&self) -> String {
+        let axes = match self.trajectory.as_ref().map(|t| &t.source) {
+            Some(TrajectorySource::Odometry) => "z up, gravity along -z".to_owned(),
+            Some(given) => format!("axes of the given poses ({given})"),
+            None => "axes of the first camera".to_owned(),
+        };
+        format!("frame: world, right-handed, {axes}")
+    }
+
     /// Up in the map's world: z where the odometry levels it by gravity, however the camera was held; else as cameras are held.
     pub fn up(&self) -> Vector3<f64> {
         let given = self.trajectory.as_ref();

@@ -36,10 +36,8 @@ pub fn write(
     }
     let comments = [
         "VIDAR metric map".to_owned(),
-        format!(
-            "frame: world, right-handed; unit: {}",
-            if outcome.is_metric() { "metre" } else { "arbitrary" }
-        ),
+        map.world_words(),
+        format!("unit: {}", if outcome.is_metric() { "metre" } else { "arbitrary" }),
         format!("metric poses: {}", map.poses()),
         format!("coupling: {}", plan.mode),
         format!("geometry: {}", plan.model.name),
