@@ -38,6 +38,15 @@ pub struct FrameState {
     pub world_from_camera: Se3,
 }
 
+/// A keyframe that the growing surface shows: depth of at least a twentieth of its pixels is in it.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct ShownKeyframe {
+    /// Which image.
+    pub frame_id: FrameId,
+    /// Median z-depth of what it sees, m.
+    pub median_depth_m: f64,
+}
+
 /// A frame that carries geometry.
 #[derive(Clone, Debug)]
 pub struct MapKeyframe {
@@ -169,7 +178,7 @@ pub enum MapEvent {
         /// The surface. Only the final one has points and coverage.
         surface: Arc<Surface>,
         /// Keyframes whose depth is in it for the first time; of the map none are named.
-        shown: Vec<FrameId>,
+        shown: Vec<ShownKeyframe>,
         /// Whether it is the map.
         is_final: bool,
     },

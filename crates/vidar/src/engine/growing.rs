@@ -5,7 +5,7 @@
 //! before ([`super::preview`]); the chunk replaces them. The final map is fused from the predictions at their final poses, each
 //! keyframe once.
 
-use super::events::{MapEvent, Surface};
+use super::events::{MapEvent, ShownKeyframe, Surface};
 use super::placed::placed_views;
 use super::setup::{PredictionId, PredictionStore};
 use crate::config::Config;
@@ -15,9 +15,14 @@ use std::sync::Arc;
 use vidar_align::Placement;
 use vidar_core::{AlignedView, ChunkId, FrameId, Warning};
 use vidar_fusion::{RevisedView, SubVolumeConfig, SubVolumes};
+use vidar_solve::statistics::median_upper;
 
 /// Chunks whose volumes are kept in memory.
 const IN_MEMORY: usize = 2;
+
+/// Least share of its pixels with depth for a keyframe to be called shown. A camera that rests gives some pixels at random: with none
+/// asked for, a RealSense's first keyframe was called shown by a surface without a triangle. Of what moves a third or more have depth.
+const LEAST_SHOWN: f64 = 0.05;
 
 /// A growing surface.
 pub struct GrowingSurface {
@@ -83,7 +88,7 @@ impl GrowingSurface {
         views: &[AlignedView],
         placement: &Placement,
         store: &dyn PredictionStore,
-    ) -> Result<(Vec<MapEvent>, Vec<FrameId>), Error> {
+    ) -> Result<(Vec<MapEvent>, Vec<ShownKeyframe>), Error> {
         let mut events = Vec::new();
         if self.previewed.values().any(|c| *c == chunk) {
             self.volumes.rebuild(chunk, [])?;
@@ -98,7 +103,7 @@ impl GrowingSurface {
                 let scale = placement.view(frame).map_or(1.0, |p| p.metres_per_unit);
                 self.fused.insert(frame, scale);
                 if !self.previewed.contains_key(&frame) {
-                    shown.push(frame);
+                    shown.extend(shown_keyframe(view));
                 }
             }
         }
@@ -127,9 +132,10 @@ impl GrowingSurface {
         let mut events = Vec::new();
         let mut shown = Vec::new();
         for (chunk, view) in views {
-            if !self.shows(view.frame_id()) && integrate(&mut self.volumes, chunk, &view, &mut events) {
+            let Some(keyframe) = shown_keyframe(&view).filter(|k| !self.shows(k.frame_id)) else { continue };
+            if integrate(&mut self.volumes, chunk, &view, &mut events) {
                 self.previewed.insert(view.frame_id(), chunk);
-                shown.push(view.frame_id());
+                shown.push(keyframe);
             }
         }
         if !shown.is_empty() {
@@ -138,7 +144,7 @@ impl GrowingSurface {
         Ok(events)
     }
 
-    fn surface(&mut self, shown: Vec<FrameId>, store: &dyn PredictionStore) -> Result<MapEvent, Error> {
+    fn surface(&mut self, shown: Vec<ShownKeyframe>, store: &dyn PredictionStore) -> Result<MapEvent, Error> {
         let merged = self.volumes.merged_with(|chunk| store.read_volume(chunk))?;
         let surface = Surface { mesh: merged.extract_mesh(), ..Surface::default() };
         Ok(MapEvent::SurfaceChanged { surface: Arc::new(surface), shown, is_final: false })
@@ -165,6 +171,16 @@ impl GrowingSurface {
         }
         Ok(())
     }
+}
+
+/// The keyframe of a view, unless hardly anything of it has depth. Every 97th pixel is enough for that and for a median, and falls into
+/// every column.
+fn shown_keyframe(view: &AlignedView) -> Option<ShownKeyframe> {
+    let sampled: Vec<f64> = view.depth().image().data().iter().step_by(97).map(|z| f64::from(*z)).collect();
+    let mut depth: Vec<f64> = sampled.iter().copied().filter(|z| z.is_finite() && *z > 0.0).collect();
+    let is_seen = depth.len() as f64 >= LEAST_SHOWN * sampled.len() as f64;
+    let median_depth_m = median_upper(&mut depth).filter(|_| is_seen)?;
+    Some(ShownKeyframe { frame_id: view.frame_id(), median_depth_m })
 }
 
 /// Adds a view, unless it cannot be fused. The final map reports its own losses; this surface is provisional.

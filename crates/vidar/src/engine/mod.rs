@@ -31,7 +31,7 @@ mod track;
 mod views;
 
 pub use cut::ChunkRule;
-pub use events::{FrameStamp, FrameState, MapEvent, MapKeyframe, Step, Surface};
+pub use events::{FrameStamp, FrameState, MapEvent, MapKeyframe, ShownKeyframe, Step, Surface};
 pub use pose_source::{GivenPoses, OdometryPoses, PoseReport, PoseSource};
 pub use select::Selection;
 pub use setup::{

@@ -85,12 +85,15 @@ impl<'a> Preview<'a> {
         let known_until = track.last()?.stamp.time;
         let is_hidden = |k: &usize| !is_shown(&keyframes[*k]);
         let first = (chunks * self.size..keyframes.len()).find(is_hidden)?;
-        let is_late = |since: Timestamp| known_until > since + self.max_wait;
+        let is_late_by = |wait: Duration, since: Timestamp| known_until > since + wait;
+        let is_late = |since: Timestamp| is_late_by(self.max_wait, since);
         let untried = (self.tried.max(first)..keyframes.len()).find(is_hidden);
         let new = untried.filter(|k| is_late(keyframes[*k].stamp.time));
         // Where keyframes go on coming, the chunk is near.
         let may_retry = first < self.tried && (untried.is_none() || keyframes.len() < FEWEST_VIEWS);
-        let is_retried = may_retry && self.tried_at.is_some_and(is_late);
+        // Who waited once waits for the camera to move, which may be at any time, and a try that finds nothing is cheap.
+        let retry_wait = Duration::from_nanos(self.max_wait.nanos() / 2);
+        let is_retried = may_retry && self.tried_at.is_some_and(|since| is_late_by(retry_wait, since));
         let from = if is_retried { Some(first) } else { new }.filter(|_| self.has_time)?;
         let seen = &keyframes[from.saturating_sub(self.context)..];
         let few = FEWEST_VIEWS.saturating_sub(seen.len());

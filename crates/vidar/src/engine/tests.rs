@@ -219,7 +219,7 @@ fn shown(events: &[MapEvent]) -> Vec<(u32, u32)> {
         match event {
             MapEvent::State(_) => images += 1,
             MapEvent::SurfaceChanged { shown: frames, is_final: false, .. } => {
-                shown.extend(frames.iter().map(|f| (f.0, images)));
+                shown.extend(frames.iter().map(|f| (f.frame_id.0, images)));
             }
             _ => {}
         }
@@ -281,8 +281,8 @@ fn images_between_keyframes_help_where_those_are_few_and_who_got_no_depth_is_tri
     let frames = shown(&events).iter().map(|(f, _)| *f).collect::<Vec<_>>();
     assert_eq!(frames, (0..FRAMES).step_by(5).collect::<Vec<_>>(), "no image that helped is shown");
     assert_eq!(waits(&events), [3; 8], "none waits for a fourth keyframe");
-    // Three images are .18 m: the first keyframe is tried after them, and again after three more, with the second one.
-    assert_eq!(waits(&watched(0.25))[..2], [6, 1]);
+    // Three images are .18 m: the first keyframe is tried after them, and again after two more, with the second one.
+    assert_eq!(waits(&watched(0.25))[..2], [5, 0]);
 }
 
 #[test]

@@ -201,7 +201,7 @@ fn shifted(rms: f64) -> Warning {
 
 fn stamps_scatter(rms_secs: f64) -> Warning {
     let message = format!(
-        "image stamps scatter by {:.1} ms (root mean square) about when the images were exposed; every image gets its own instant",
+        "image stamps scatter by {:.1} ms or more (root mean square, where it shows) about when the images were exposed; every image gets its own instant",
         1e3 * rms_secs
     );
     Warning::new("stamps-scatter", message).hint(

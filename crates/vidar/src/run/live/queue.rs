@@ -13,8 +13,9 @@ pub(super) const MOST_REPORTS: usize = 4096;
 
 /// What the odometry hands to the map.
 pub(super) enum Item {
-    /// Images that may become keyframes, with when each arrived, and the report that decides the pose of the last one.
-    Tracked { images: Vec<(FrameStamp, Instant)>, report: Option<Box<PoseReport>> },
+    /// Images that may become keyframes, with when each arrived, and the report that decides the pose of the last one; whether that one
+    /// will be a keyframe.
+    Tracked { images: Vec<(FrameStamp, Instant)>, report: Option<Box<PoseReport>>, is_keyframe: bool },
     /// Something to say.
     Warning(Warning),
 }
@@ -25,6 +26,10 @@ impl Item {
             Self::Tracked { images, .. } => images.len(),
             Self::Warning(_) => 0,
         }
+    }
+
+    fn keyframes(&self) -> usize {
+        usize::from(matches!(self, Self::Tracked { is_keyframe: true, .. }))
     }
 }
 
@@ -37,6 +42,8 @@ pub(super) struct Load {
     pub items: usize,
     /// How long the first of them has waited.
     pub delay: Duration,
+    /// How long the keyframes among them will take, by what the last chunks took; zero before there is one.
+    pub work: Duration,
 }
 
 /// The queue; both ends may close it.
@@ -51,6 +58,9 @@ struct Inner {
     /// With when each came.
     items: VecDeque<(Item, Instant)>,
     images: usize,
+    keyframes: usize,
+    /// What a keyframe takes.
+    cost: Duration,
     most_images: usize,
     is_closed: bool,
 }
@@ -64,7 +74,16 @@ impl Queue {
     pub fn load(&self) -> Load {
         let inner = self.lock();
         let delay = inner.items.front().map_or(Duration::ZERO, |(_, since)| since.elapsed());
-        Load { images: inner.images, items: inner.items.len(), delay }
+        let keyframes = u32::try_from(inner.keyframes).unwrap_or(u32::MAX);
+        let work = inner.cost.saturating_mul(keyframes);
+        Load { images: inner.images, items: inner.items.len(), delay, work }
+    }
+
+    /// A chunk of so many keyframes took this long. Half of what is expected of the next one is from those before.
+    pub fn took(&self, time: Duration, keyframes: usize) {
+        let Some(cost) = u32::try_from(keyframes).ok().and_then(|n| time.checked_div(n)) else { return };
+        let mut inner = self.lock();
+        inner.cost = if inner.cost.is_zero() { cost } else { (inner.cost + cost) / 2 };
     }
 
     /// The most images that ever waited.
@@ -79,6 +98,7 @@ impl Queue {
             return false;
         }
         inner.images += item.images();
+        inner.keyframes += item.keyframes();
         inner.most_images = inner.most_images.max(inner.images);
         inner.items.push_back((item, Instant::now()));
         self.changed.notify_all();
@@ -103,6 +123,7 @@ impl Queue {
         }
         let (item, _) = inner.items.pop_front()?;
         inner.images -= item.images();
+        inner.keyframes -= item.keyframes();
         self.changed.notify_all();
         Some(item)
     }
@@ -138,7 +159,11 @@ mod tests {
     fn image(i: u32) -> Item {
         let stamp =
             FrameStamp { frame_id: FrameId(i), time: Timestamp::from_nanos(i.into()), camera: CameraId(0) };
-        Item::Tracked { images: vec![(stamp, Instant::now())], report: None }
+        Item::Tracked {
+            images: vec![(stamp, Instant::now())],
+            report: None,
+            is_keyframe: i.is_multiple_of(4),
+        }
     }
 
     #[test]
@@ -153,9 +178,22 @@ mod tests {
             assert!(waiting.join().unwrap());
             taken
         });
-        let nothing = Load { images: 0, items: 0, delay: Duration::ZERO };
+        let nothing = Load { images: 0, items: 0, delay: Duration::ZERO, work: Duration::ZERO };
         assert_eq!((taken, queue.load()), (CAPACITY + 3, nothing));
         assert_eq!(queue.most_images(), CAPACITY + 1, "who waits adds nothing above the bound");
+    }
+
+    #[test]
+    fn what_waits_takes_what_its_keyframes_took_before() {
+        let queue = Queue::default();
+        (0..12).for_each(|i| assert!(queue.push(image(i))));
+        assert_eq!(queue.load().work, Duration::ZERO, "nothing is known before a chunk");
+        queue.took(Duration::from_millis(800), 4);
+        assert_eq!(queue.load().work, Duration::from_millis(600), "images 0, 4 and 8");
+        queue.took(Duration::from_millis(400), 4);
+        queue.took(Duration::from_millis(5), 0);
+        queue.pop().unwrap();
+        assert_eq!(queue.load().work, Duration::from_millis(300));
     }
 
     #[test]

@@ -5,23 +5,38 @@ use std::time::Duration;
 use vidar_align::keyframe_selection::{KeyframeConfig, KeyframeSelector};
 use vidar_core::{Se3, Warning};
 
-/// How long the first image has waited when keyframes begin to be taken farther apart. Half of the goal from keyframe to surface, 2 s; a
-/// chunk is predicted in a third of it where the map keeps up.
+/// Work that waits when keyframes begin to be taken farther apart. Of the goal from keyframe to surface, 2 s, a chunk of four takes half a
+/// second and as much until it is full (two Zen 4 cores).
+const THIN_FROM_WORK: Duration = Duration::from_millis(400);
+/// How long the first image has waited when they are taken farther apart in any case: what a chunk takes may not be known yet.
 const THIN_FROM: Duration = Duration::from_millis(1000);
-/// How long when that ends.
+/// Both when that ends.
+const THIN_UNTIL_WORK: Duration = Duration::from_millis(200);
 const THIN_UNTIL: Duration = Duration::from_millis(300);
-/// Factor of their distance meanwhile. Stereo finds depth from keyframes twice as far apart; four times is a loss.
-const WIDENED: f64 = 2.0;
+/// Factor of their distance meanwhile, and where twice the work or delay waits all the same. Stereo finds depth from keyframes twice as far
+/// apart; four times is a loss.
+const WIDENED: [f64; 2] = [2.0, 3.0];
 
 /// How far the map is behind, in words of what is done about it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Mode {
     /// Every image may become a keyframe.
     All,
-    /// Those that are farther apart may.
-    Thin,
+    /// Those that are farther apart may: which of [`WIDENED`].
+    Thin(usize),
     /// None may.
     None,
+}
+
+/// What becomes of an image.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Passed {
+    /// It will be a keyframe.
+    Keyframe,
+    /// It may help keyframes.
+    Between,
+    /// It is left out.
+    LeftOut,
 }
 
 /// Decides which images may become keyframes.
@@ -45,7 +60,7 @@ impl Thinning {
             keyframes: keyframes.clone(),
             mode: Mode::All,
             plain: KeyframeSelector::new(keyframes),
-            widened: KeyframeSelector::widened(keyframes, WIDENED),
+            widened: KeyframeSelector::widened(keyframes, WIDENED[0]),
             thinned: 0,
             dropped: 0,
             poses_dropped: 0,
@@ -55,23 +70,31 @@ impl Thinning {
     /// Looks at what waits; what there is to say if something begins to be left out.
     pub fn observe(&mut self, load: &Load) -> Option<Warning> {
         let before = self.mode;
-        let most_delay = if before == Mode::All { THIN_FROM } else { THIN_UNTIL };
-        self.mode = match load {
-            Load { images: CAPACITY.., .. } => Mode::None,
-            Load { delay, .. } if *delay >= most_delay => Mode::Thin,
+        let waits = |work: Duration, delay: Duration| load.work >= work || load.delay >= delay;
+        self.mode = match before {
+            _ if load.images >= CAPACITY => Mode::None,
+            _ if waits(2 * THIN_FROM_WORK, 2 * THIN_FROM) => Mode::Thin(1),
+            _ if waits(THIN_FROM_WORK, THIN_FROM) => Mode::Thin(0),
+            Mode::Thin(level) if waits(THIN_UNTIL_WORK, THIN_UNTIL) => Mode::Thin(level),
+            Mode::None if waits(THIN_UNTIL_WORK, THIN_UNTIL) => Mode::Thin(0),
             _ => Mode::All,
         };
+        if let Mode::Thin(level) = self.mode
+            && before != self.mode
+        {
+            self.widened = KeyframeSelector::widened(&self.keyframes, WIDENED[level]);
+        }
         let (text, kind) = match (before, self.mode) {
-            (Mode::All, Mode::Thin) => {
-                self.widened = KeyframeSelector::widened(&self.keyframes, WIDENED);
-                ("keyframes are taken twice as far apart until it has caught up", "keyframes-thinned")
+            (Mode::All, Mode::Thin(_)) => {
+                ("keyframes are taken farther apart until it has caught up", "keyframes-thinned")
             }
-            (Mode::All | Mode::Thin, Mode::None) => {
+            (Mode::All | Mode::Thin(_), Mode::None) => {
                 ("no keyframes are taken until there is room again", "keyframes-dropped")
             }
             _ => return None,
         };
-        let message = format!("the map is {:.1} s behind: {text}", load.delay.as_secs_f64());
+        let behind = load.delay.max(load.work).as_secs_f64();
+        let message = format!("the map is {behind:.1} s behind: {text}");
         let hint = "a smaller geometry.max_width_px, --preset fast, or a faster machine keeps up";
         Some(match self.mode {
             Mode::None => Warning::degraded(kind, message).hint(hint),
@@ -79,20 +102,23 @@ impl Thinning {
         })
     }
 
-    /// Whether the image with this pose may become a keyframe.
-    pub fn passes(&mut self, world_from_camera: Option<&Se3>) -> bool {
-        let Some(pose) = world_from_camera else { return self.mode == Mode::All };
+    /// What becomes of the image with this pose.
+    pub fn pass(&mut self, world_from_camera: Option<&Se3>) -> Passed {
+        let Some(pose) = world_from_camera else {
+            return if self.mode == Mode::All { Passed::Between } else { Passed::LeftOut };
+        };
         let would_be_keyframe = self.plain.push(pose, false);
         match self.mode {
-            Mode::All => true,
-            Mode::Thin => {
-                let passes = self.widened.push(pose, false);
-                self.thinned += usize::from(would_be_keyframe && !passes);
-                passes
+            Mode::All if would_be_keyframe => Passed::Keyframe,
+            Mode::All => Passed::Between,
+            Mode::Thin(_) if self.widened.push(pose, false) => Passed::Keyframe,
+            Mode::Thin(_) => {
+                self.thinned += usize::from(would_be_keyframe);
+                Passed::LeftOut
             }
             Mode::None => {
                 self.dropped += usize::from(would_be_keyframe);
-                false
+                Passed::LeftOut
             }
         }
     }
@@ -119,9 +145,11 @@ mod tests {
         let config = KeyframeConfig { min_translation_m: 0.1, ..KeyframeConfig::default() };
         let mut thinning = Thinning::new(&config);
         let pass = |t: &mut Thinning, from: usize| {
-            (from..from + 100).filter(|i| t.passes(Some(&at(*i as f64 * 0.051)))).count()
+            let of = |i: usize| t.pass(Some(&at(i as f64 * 0.051)));
+            (from..from + 100).map(of).filter(|passed| *passed != Passed::LeftOut).count()
         };
-        let load = |images, millis| Load { images, items: images, delay: Duration::from_millis(millis) };
+        let ms = Duration::from_millis;
+        let load = |images, delay| Load { images, items: images, delay: ms(delay), work: Duration::ZERO };
         assert!(thinning.observe(&load(30, 999)).is_none());
         assert_eq!(pass(&mut thinning, 0), 100, "who keeps up decides for itself");
         assert_eq!(thinning.observe(&load(20, 1000)).unwrap().kind, "keyframes-thinned");
@@ -137,6 +165,19 @@ mod tests {
         assert!(pass(&mut thinning, 300) < 30);
         assert!(thinning.observe(&load(5, 299)).is_none());
         assert_eq!(pass(&mut thinning, 400), 100);
+
+        // What waits will take long: nobody has waited yet.
+        let work = |work| Load { images: 8, items: 8, delay: Duration::ZERO, work: ms(work) };
+        assert!(thinning.observe(&work(399)).is_none());
+        assert_eq!(thinning.observe(&work(400)).unwrap().kind, "keyframes-thinned");
+        assert_eq!(pass(&mut thinning, 500), 25);
+        // Twice as far apart is not enough.
+        assert!(thinning.observe(&work(800)).is_none());
+        assert!((16..=17).contains(&pass(&mut thinning, 600)));
+        assert!(thinning.observe(&work(200)).is_none());
+        assert!(pass(&mut thinning, 700) < 20);
+        assert!(thinning.observe(&work(199)).is_none());
+        assert_eq!(pass(&mut thinning, 800), 100);
     }
 
     #[test]

@@ -1,11 +1,10 @@
 //! The odometry's thread: measurements as they arrive, poses as they are found.
 
 use super::ending::Ending;
-use super::latency::Latency;
 use super::pose_file::PoseFile;
 use super::publish::LivePublisher;
 use super::queue::{Item, Queue};
-use super::thinning::Thinning;
+use super::thinning::{Passed, Thinning};
 use crate::engine::{FrameStamp, FrameState, PoseReport, PoseSource};
 use crate::error::Error;
 use crate::input::Measurement;
@@ -85,13 +84,9 @@ pub(super) struct Counts {
     pub images: usize,
     pub not_tracked: usize,
     /// From the arrival of an image to its pose, s.
-    seconds: Vec<f32>,
-}
-
-impl Counts {
-    pub fn image_to_pose(&self) -> Option<Latency> {
-        Latency::of(&self.seconds)
-    }
+    pub seconds: Vec<f32>,
+    /// From the arrival of the measurement that decided the pose, s: the image itself, or the IMU that reaches its instant.
+    pub seconds_from_sensors: Vec<f32>,
 }
 
 impl Tracker<'_> {
@@ -115,10 +110,10 @@ impl Tracker<'_> {
         }
         let ending = self.poses.as_mut().map_or_else(Ending::default, |poses| Ending::of(poses.as_mut()));
         for report in &ending.reports {
-            self.measure(report)?;
+            self.measure(report, None)?;
         }
         let images = self.waiting.drain(..).collect();
-        self.send(Item::Tracked { images, report: None });
+        self.send(Item::Tracked { images, report: None, is_keyframe: false });
         Ok(ending)
     }
 
@@ -164,10 +159,10 @@ impl Tracker<'_> {
         };
         if self.poses.is_none() {
             let images = self.waiting.drain(..).collect();
-            return Ok(self.send(Item::Tracked { images, report: None }));
+            return Ok(self.send(Item::Tracked { images, report: None, is_keyframe: false }));
         }
         for report in reports {
-            if !self.deliver(report)? {
+            if !self.deliver(report, arrived)? {
                 return Ok(false);
             }
         }
@@ -192,8 +187,8 @@ impl Tracker<'_> {
         self.poses.as_mut().map_or_else(Vec::new, |poses| poses.push_stamp(stamp))
     }
 
-    /// Measures and writes the pose of a report.
-    fn measure(&mut self, report: &PoseReport) -> Result<(), Error> {
+    /// Measures and writes the pose of a report, decided by what arrived at `decided`; at the end of the recording by nothing.
+    fn measure(&mut self, report: &PoseReport, decided: Option<Instant>) -> Result<(), Error> {
         let PoseReport::Posed { state, keyframe, .. } = report else {
             self.publisher.into_iter().for_each(LivePublisher::no_pose);
             return Ok(());
@@ -202,13 +197,17 @@ impl Tracker<'_> {
             publisher.pose(state, keyframe.as_deref());
         }
         let image = self.waiting.iter().find(|(stamp, _)| stamp.frame_id == state.frame_id);
-        self.counts.seconds.extend(image.map(|(_, arrived)| arrived.elapsed().as_secs_f32()));
+        if let Some((_, arrived)) = image {
+            let since = decided.map_or(*arrived, |decided| decided.max(*arrived));
+            self.counts.seconds.push(arrived.elapsed().as_secs_f32());
+            self.counts.seconds_from_sensors.push(since.elapsed().as_secs_f32());
+        }
         self.pose_file.add(state)
     }
 
     /// Hands a report over, with the images up to its time that may become keyframes.
-    fn deliver(&mut self, report: PoseReport) -> Result<bool, Error> {
-        self.measure(&report)?;
+    fn deliver(&mut self, report: PoseReport, arrived: Instant) -> Result<bool, Error> {
+        self.measure(&report, Some(arrived))?;
         let (time, pose, moves_others) = match &report {
             PoseReport::Posed { state, joined, settled, .. } => {
                 let FrameState { time, world_from_camera, .. } = *state;
@@ -219,24 +218,28 @@ impl Tracker<'_> {
         let count = self.waiting.iter().take_while(|(stamp, _)| stamp.time <= time).count();
         let mut images: Vec<(FrameStamp, Instant)> = self.waiting.drain(..count).collect();
         let mut report = Some(Box::new(report));
+        let mut is_keyframe = false;
         if self.arrival.waits_for_nobody() {
             let load = self.queue.load();
             if let Some(warning) = self.thinning.observe(&load) {
                 self.send(Item::Warning(warning));
             }
-            if !self.thinning.passes(pose.as_ref()) {
+            let passed = self.thinning.pass(pose.as_ref());
+            is_keyframe = passed == Passed::Keyframe;
+            if passed == Passed::LeftOut {
                 images.clear();
             }
             if !self.thinning.keeps_report(load.items, moves_others) {
                 report = None;
                 images.clear();
+                is_keyframe = false;
             }
             if report.is_none() && images.is_empty() {
                 // Nothing is left of it; an empty item would wait like any other.
                 return Ok(!self.queue.is_closed_within(Duration::ZERO));
             }
         }
-        Ok(self.send(Item::Tracked { images, report }))
+        Ok(self.send(Item::Tracked { images, report, is_keyframe }))
     }
 
     /// Hands something over: at once where time does not wait; else when there is room.
@@ -285,14 +288,15 @@ mod tests {
         for i in 0..3 * MOST_REPORTS as u32 {
             let time = Timestamp::from_nanos(i64::from(i) * 50_000_000);
             tracker.image(FrameStamp { frame_id: FrameId(i), time, camera: CameraId(0) }, Instant::now());
-            assert!(tracker.deliver(PoseReport::NotPosed { time }).unwrap());
+            assert!(tracker.deliver(PoseReport::NotPosed { time }, Instant::now()).unwrap());
         }
         let Load { images, items, .. } = queue.load();
         assert!(images <= CAPACITY, "{images} images wait");
         // Warnings are few: one for each change of what is left out.
         assert!((MOST_REPORTS..MOST_REPORTS + 8).contains(&items), "{items} items wait");
         assert_eq!(tracker.thinning.poses_dropped + items, 3 * MOST_REPORTS + warnings(&queue));
-        assert!(!tracker.deliver(PoseReport::NotPosed { time: Timestamp::from_nanos(0) }).unwrap());
+        let report = PoseReport::NotPosed { time: Timestamp::from_nanos(0) };
+        assert!(!tracker.deliver(report, Instant::now()).unwrap());
     }
 
     #[test]
