@@ -14,6 +14,9 @@ use vidar_core::simd::kernel;
 
 const WINDOW: usize = 2 * RADIUS + 1;
 const INVERSE_AREA: f32 = 1.0 / (WINDOW * WINDOW) as f32;
+/// Pixels that are taken at once, in loops whose length the compiler knows: it unrolls others by more than rows are long, and does the rest
+/// of each row one by one.
+const LANES: usize = 16;
 /// Image units per matched unit.
 const COARSENING: i32 = GRAY_STEPS / 4;
 
@@ -28,7 +31,7 @@ pub(crate) struct Source<'a> {
 pub(crate) struct Reference {
     pub width: usize,
     pub height: usize,
-    /// `width` and the radius on both sides.
+    /// `width` and the radius on both sides, and up to a multiple of [`LANES`] zeros.
     stride: usize,
     /// Padded by the radius on all sides, borders repeated.
     gray: Vec<f32>,
@@ -52,14 +55,14 @@ impl Reference {
     #[inline(always)]
     fn with_statistics(level: &Level, noise_gray: f32) -> Self {
         let (width, height) = (level.width, level.height);
-        let stride = width + 2 * RADIUS;
+        let stride = (width + 2 * RADIUS).next_multiple_of(LANES);
         let mut gray = vec![0.0; stride * (height + 2 * RADIUS)];
         for (i, row) in gray.chunks_exact_mut(stride).enumerate() {
             let y = i.saturating_sub(RADIUS).min(height - 1);
             for (unit, &g) in row[RADIUS..].iter_mut().zip(&level.gray[y * width..][..width]) {
                 *unit = ((i32::from(g) + COARSENING / 2) >> COARSENING.trailing_zeros()) as f32;
             }
-            repeat_borders(row);
+            repeat_borders(&mut row[..width + 2 * RADIUS]);
         }
         let noise_variance = (UNITS * noise_gray) * (UNITS * noise_gray);
         let (mut mean, mut inverse_deviation) = (vec![0.0; width * height], vec![0.0; width * height]);
@@ -160,7 +163,7 @@ impl<'a> Strip<'a> {
             self.samples.hide_masked(level, hidden);
             self.samples.fetch(level);
             self.samples.blend(&mut row[RADIUS..RADIUS + width]);
-            repeat_borders(row);
+            repeat_borders(&mut row[..width + 2 * RADIUS]);
         }
     }
 
@@ -181,19 +184,28 @@ impl<'a> Strip<'a> {
         };
         for i in 0..self.rows + 2 * RADIUS {
             let (n, o) = (&self.warped[row(&self.warped, i)], &own[row(own, i)]);
+            let [n, o] = [n, o].map(|row| row.as_chunks::<LANES>().0);
+            let sums = sum.as_chunks_mut::<LANES>().0.iter_mut();
+            let sums = sums.zip(square.as_chunks_mut::<LANES>().0).zip(cross.as_chunks_mut::<LANES>().0);
             if i < WINDOW {
-                for x in 0..stride {
-                    sum[x] += n[x];
-                    square[x] += n[x] * n[x];
-                    cross[x] += n[x] * o[x];
+                for (((s, q), c), (n, o)) in sums.zip(n.iter().zip(o)) {
+                    for x in 0..LANES {
+                        s[x] += n[x];
+                        q[x] += n[x] * n[x];
+                        c[x] += n[x] * o[x];
+                    }
                 }
             } else {
-                let (gone, gone_o) =
-                    (&self.warped[row(&self.warped, i - WINDOW)], &own[row(own, i - WINDOW)]);
-                for x in 0..stride {
-                    sum[x] += n[x] - gone[x];
-                    square[x] += n[x] * n[x] - gone[x] * gone[x];
-                    cross[x] += n[x] * o[x] - gone[x] * gone_o[x];
+                let gone = self.warped[row(&self.warped, i - WINDOW)].as_chunks::<LANES>().0;
+                let gone_o = own[row(own, i - WINDOW)].as_chunks::<LANES>().0;
+                for ((((s, q), c), (n, o)), (gone, gone_o)) in
+                    sums.zip(n.iter().zip(o)).zip(gone.iter().zip(gone_o))
+                {
+                    for x in 0..LANES {
+                        s[x] += n[x] - gone[x];
+                        q[x] += n[x] * n[x] - gone[x] * gone[x];
+                        c[x] += n[x] * o[x] - gone[x] * gone_o[x];
+                    }
                 }
             }
             if i + 1 < WINDOW {
@@ -204,15 +216,43 @@ impl<'a> Strip<'a> {
             let inverse = &r.inverse_deviation[(self.first_row + y) * width..][..width];
             let hidden = &self.hidden[(y + RADIUS) * width..][..width];
             let out = &mut self.per_source[source][y * width..][..width];
-            for x in 0..width {
-                let m = window(sum, x, width) * INVERSE_AREA;
-                let variance = (window(square, x, width) * INVERSE_AREA - m * m).max(0.0) + r.noise_variance;
-                let covariance = window(cross, x, width) * INVERSE_AREA - m * mean[x];
-                let cost = 1.0 - covariance * inverse[x] / variance.sqrt();
-                // A visible window has 0…1 here, a hidden one exactly HIDDEN.
-                let cost = if cost < 1.0 { cost } else { 1.0 };
-                out[x] = if cost > hidden[x] { cost } else { hidden[x] };
+            let windows = WindowRow { columns: [sum, square, cross], mean, inverse, hidden };
+            // The last pixels once more where the row is no multiple; a narrow row pixel by pixel.
+            let Some(last) = width.checked_sub(LANES) else {
+                (0..width).for_each(|x| windows.costs::<1>(r.noise_variance, x, out));
+                continue;
+            };
+            for block in 0..width.div_ceil(LANES) {
+                windows.costs::<LANES>(r.noise_variance, (block * LANES).min(last), out);
             }
+        }
+    }
+}
+
+/// What the costs of a row are computed from: sums over the columns of its windows, of the neighbour, its squares, and its products with
+/// the reference; of the reference the mean and the inverse deviation; and what is hidden.
+struct WindowRow<'a> {
+    columns: [&'a [f32]; 3],
+    mean: &'a [f32],
+    inverse: &'a [f32],
+    hidden: &'a [f32],
+}
+
+impl WindowRow<'_> {
+    /// The costs of `N` pixels from `x` on.
+    #[inline(always)]
+    fn costs<const N: usize>(&self, noise_variance: f32, x: usize, out: &mut [f32]) {
+        let [sum, square, cross] = self.columns.map(|columns| &columns[x..x + N + 2 * RADIUS]);
+        let (mean, inverse) = (&self.mean[x..x + N], &self.inverse[x..x + N]);
+        let (hidden, out) = (&self.hidden[x..x + N], &mut out[x..x + N]);
+        for x in 0..N {
+            let m = window(sum, x, N) * INVERSE_AREA;
+            let variance = (window(square, x, N) * INVERSE_AREA - m * m).max(0.0) + noise_variance;
+            let covariance = window(cross, x, N) * INVERSE_AREA - m * mean[x];
+            let cost = 1.0 - covariance * inverse[x] / variance.sqrt();
+            // A visible window has 0…1 here, a hidden one exactly HIDDEN.
+            let cost = if cost < 1.0 { cost } else { 1.0 };
+            out[x] = if cost > hidden[x] { cost } else { hidden[x] };
         }
     }
 }

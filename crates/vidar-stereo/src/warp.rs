@@ -148,13 +148,13 @@ impl RowSamples {
     /// Reads the four pixels around each position.
     #[inline(always)]
     pub fn fetch(&mut self, level: &Level) {
-        let n = self.index.len();
-        let (upper, lower) = (&mut self.upper[..n], &mut self.lower[..n]);
-        let pair = |left: i16, right: i16| u32::from(left as u16) | u32::from(right as u16) << 16;
-        for x in 0..n {
-            let around = &level.gray[self.index[x] as usize..][..level.width + 2];
-            upper[x] = pair(around[0], around[1]);
-            lower[x] = pair(around[level.width], around[level.width + 1]);
+        // Two slices, each with one comparison a fetch: half the instructions of one that spans both rows.
+        let (top, bottom) = (level.gray.as_slice(), &level.gray[level.width..]);
+        let fetched = self.upper.iter_mut().zip(&mut self.lower);
+        for ((upper, lower), &i) in fetched.zip(&self.index) {
+            let i = i as usize;
+            *upper = pair(&top[i..i + 2]);
+            *lower = pair(&bottom[i..i + 2]);
         }
     }
 
@@ -174,6 +174,12 @@ impl RowSamples {
             out[x] = ((top * 64 + (bottom - top) * down + (1 << 13)) >> 14) as f32;
         }
     }
+}
+
+/// Two pixels, the left one in the lower half.
+#[inline(always)]
+fn pair(pixels: &[i16]) -> u32 {
+    u32::from(pixels[0] as u16) | u32::from(pixels[1] as u16) << 16
 }
 
 /// A position from 0 to `most` in 64ths of a pixel; 0 for NaN.
