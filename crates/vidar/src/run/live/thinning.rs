@@ -46,6 +46,8 @@ pub(super) struct Thinning {
     /// Counts the keyframes that the images would give.
     plain: KeyframeSelector,
     widened: KeyframeSelector,
+    /// Pose of the last keyframe that was not left out: what is taken farther apart begins there.
+    last: Option<Se3>,
     /// Keyframes left out because they were near others.
     pub thinned: usize,
     /// Keyframes left out because the queue was full.
@@ -61,6 +63,7 @@ impl Thinning {
             mode: Mode::All,
             plain: KeyframeSelector::new(keyframes),
             widened: KeyframeSelector::widened(keyframes, WIDENED[0]),
+            last: None,
             thinned: 0,
             dropped: 0,
             poses_dropped: 0,
@@ -83,6 +86,9 @@ impl Thinning {
             && before != self.mode
         {
             self.widened = KeyframeSelector::widened(&self.keyframes, WIDENED[level]);
+            if let Some(last) = &self.last {
+                self.widened.push(last, true);
+            }
         }
         let (text, kind) = match (before, self.mode) {
             (Mode::All, Mode::Thin(_)) => {
@@ -108,7 +114,7 @@ impl Thinning {
             return if self.mode == Mode::All { Passed::Between } else { Passed::LeftOut };
         };
         let would_be_keyframe = self.plain.push(pose, false);
-        match self.mode {
+        let passed = match self.mode {
             Mode::All if would_be_keyframe => Passed::Keyframe,
             Mode::All => Passed::Between,
             Mode::Thin(_) if self.widened.push(pose, false) => Passed::Keyframe,
@@ -120,7 +126,11 @@ impl Thinning {
                 self.dropped += usize::from(would_be_keyframe);
                 Passed::LeftOut
             }
+        };
+        if passed == Passed::Keyframe {
+            self.last = Some(*pose);
         }
+        passed
     }
 
     /// Whether a report without an image is kept while so many items wait: always where it `moves_others`, poses told before it.
@@ -178,6 +188,13 @@ mod tests {
         assert!(pass(&mut thinning, 700) < 20);
         assert!(thinning.observe(&work(199)).is_none());
         assert_eq!(pass(&mut thinning, 800), 100);
+
+        // Where the distance changes with every image, none is a keyframe for that.
+        let changing = (900..1000).filter(|i| {
+            thinning.observe(&work(if i % 2 == 0 { 400 } else { 800 }));
+            thinning.pass(Some(&at(*i as f64 * 0.051))) == Passed::Keyframe
+        });
+        assert!((16..=25).contains(&changing.count()));
     }
 
     #[test]
