@@ -165,9 +165,11 @@ fn glb(run: &Path, out: &Path) -> Result<PathBuf, Error> {
     let path = run.join("map/mesh.ply");
     let bytes = crate::system::read_up_to(&path, crate::system::MAX_CLOUD_BYTES)
         .map_err(|e| Error::io("read", &path, e))?;
-    let mesh = vidar_export::read_ply(&bytes)?.into_mesh();
+    let mut ply = vidar_export::read_ply(&bytes)?;
+    // Frame and unit among them.
+    let comments = std::mem::take(&mut ply.comments);
+    let mesh = ply.into_mesh();
     let target = out.join("mesh.glb");
-    let comments = ["VIDAR metric map".to_owned()];
     vidar_export::atomic::write_atomically(&target, |w| vidar_export::write_glb_mesh(w, &mesh, &comments))?;
     Ok(target)
 }

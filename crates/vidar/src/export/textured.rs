@@ -23,7 +23,10 @@ pub(super) fn glb(
     let refuse = |reason: &str| Error::NotARun { path: run.to_owned(), reason: reason.to_owned() };
     let path = run.join("map/mesh.ply");
     let bytes = read_up_to(&path, MAX_CLOUD_BYTES).map_err(|e| Error::io("read", &path, e))?;
-    let mesh = vidar_export::read_ply(&bytes)?.into_mesh();
+    let mut ply = vidar_export::read_ply(&bytes)?;
+    // Frame and unit among them.
+    let mut comments = std::mem::take(&mut ply.comments);
+    let mesh = ply.into_mesh();
     drop(bytes);
     let mut views: Vec<View<'_>> = stored.views.iter().filter_map(View::new).collect();
     if views.is_empty() {
@@ -49,17 +52,14 @@ pub(super) fn glb(
     let (textured, report) = texture_mesh(&mesh, &cameras, image, &config)?;
     drop(mesh);
     let target = out.join(NAME);
-    let comments = [
-        "VIDAR metric map".to_owned(),
-        format!(
-            "{} of {} triangles textured from {} images, {} charts, {:.2} texels per pixel",
-            report.textured_triangles,
-            report.triangles,
-            cameras.len(),
-            report.charts,
-            report.scale
-        ),
-    ];
+    comments.push(format!(
+        "{} of {} triangles textured from {} images, {} charts, {:.2} texels per pixel",
+        report.textured_triangles,
+        report.triangles,
+        cameras.len(),
+        report.charts,
+        report.scale
+    ));
     vidar_export::atomic::write_atomically(&target, |w| {
         vidar_export::write_glb_textured(w, &textured, &comments)
     })?;

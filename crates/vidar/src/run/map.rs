@@ -9,8 +9,8 @@ use crate::run_folder::StoredView;
 use nalgebra::Vector3;
 use std::collections::BTreeMap;
 use std::sync::Arc;
-use vidar_align::Placement;
 use vidar_align::aligner::PoseCorrection;
+use vidar_align::{CouplingMode, Placement};
 use vidar_core::{AlignedView, BodyFrame, CameraId, StampedPose, Trajectory};
 use vidar_dataset::Recording;
 use vidar_solve::statistics::median_upper;
@@ -58,22 +58,27 @@ impl MetricMap {
         self.trajectory.as_ref().is_some_and(|t| t.source == TrajectorySource::GroundTruth)
     }
 
+    /// Whose world the map is in: that of the metric poses, where the coupling uses them; else the first chunk's.
+    fn world(&self, mode: CouplingMode) -> Option<&TrajectorySource> {
+        self.trajectory.as_ref().filter(|_| mode.uses_pose_priors()).map(|t| &t.source)
+    }
+
     /// The map's world, in words for whoever opens its files.
-    pub fn world_words(&self) -> String {
-        let axes = match self.trajectory.as_ref().map(|t| &t.source) {
-            Some(TrajectorySource::Odometry) => "z up, gravity along -z".to_owned(),
-            Some(given) => format!("axes of the given poses ({given})"),
-            None => "axes of the first camera".to_owned(),
+    pub fn world_words(&self, mode: CouplingMode) -> String {
+        let axes = match self.world(mode) {
+            Some(TrajectorySource::Odometry) => "z up, gravity along -z",
+            Some(_) => "axes as the given poses have them",
+            None => "axes of the first chunk",
         };
         format!("frame: world, right-handed, {axes}")
     }
 
     /// Up in the map's world: z where the odometry levels it by gravity, however the camera was held; else as cameras are held.
-    pub fn up(&self) -> Vector3<f64> {
-        let given = self.trajectory.as_ref();
-        if given.is_some_and(|t| t.source == TrajectorySource::Odometry) {
+    pub fn up(&self, mode: CouplingMode) -> Vector3<f64> {
+        if self.world(mode) == Some(&TrajectorySource::Odometry) {
             return Vector3::z();
         }
+        let given = self.trajectory.as_ref();
         let path = self.keyframe_trajectory();
         path.as_ref().or(given.map(|t| &t.camera_trajectory)).map_or_else(Vector3::z, vidar_view::up_of_world)
     }
@@ -208,12 +213,19 @@ mod tests {
             world_from_body: Se3::new(level * quarter, Vector3::new(i as f64, 0.0, 0.0)),
         };
         let path = Trajectory::new(BodyFrame::Camera(CameraId(0)), (0..5).map(pose).collect()).unwrap();
-        let up_of = |source: TrajectorySource| {
+        let map_of = |source: TrajectorySource| {
             let trajectory = Some(MetricTrajectory { source, camera_trajectory: path.clone() });
-            MetricMap { trajectory, ..MetricMap::default() }.up()
+            MetricMap { trajectory, ..MetricMap::default() }
         };
+        let up_of = |source: TrajectorySource| map_of(source).up(CouplingMode::Coupled);
         assert_eq!(up_of(TrajectorySource::Odometry), Vector3::z());
         assert_eq!(up_of(TrajectorySource::GroundTruth).x.abs(), 1.0, "as cameras are held");
-        assert_eq!(MetricMap::default().up(), Vector3::z());
+        assert_eq!(MetricMap::default().up(CouplingMode::Coupled), Vector3::z());
+
+        // A coupling without metric poses has a world of its own, whatever the odometry found.
+        let map = map_of(TrajectorySource::Odometry);
+        assert_eq!(map.up(CouplingMode::PoseFree).x.abs(), 1.0);
+        assert!(map.world_words(CouplingMode::Coupled).ends_with("gravity along -z"));
+        assert!(map.world_words(CouplingMode::PoseFree).ends_with("axes of the first chunk"));
     }
 }

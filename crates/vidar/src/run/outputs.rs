@@ -36,7 +36,7 @@ pub fn write(
     }
     let comments = [
         "VIDAR metric map".to_owned(),
-        map.world_words(),
+        map.world_words(plan.mode),
         format!("unit: {}", if outcome.is_metric() { "metre" } else { "arbitrary" }),
         format!("metric poses: {}", map.poses()),
         format!("coupling: {}", plan.mode),

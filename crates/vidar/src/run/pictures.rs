@@ -31,7 +31,7 @@ pub fn draw(
 ) -> Result<(), Error> {
     let mut album = Album { folder, events };
     let path = outcome.map.keyframe_trajectory();
-    let up = outcome.map.up();
+    let up = outcome.map.up(outcome.plan.mode);
     let report = Report {
         title: format!("VIDAR: {}", dataset.name),
         subtitle: format!(
