@@ -62,8 +62,8 @@ pub(crate) fn check_view(config: &FusionConfig, view: &AlignedView) -> Result<()
     Ok(())
 }
 
-/// Median of a regular sample of the usable depths; `None` when there are none.
-pub(crate) fn median_depth(view: &AlignedView, max_depth: f32) -> Option<f32> {
+/// Median of a regular sample of a view's depths up to `max_depth`, m; `None` when there are none.
+pub fn median_depth(view: &AlignedView, max_depth: f32) -> Option<f32> {
     let data = view.depth().image().data();
     // About a thousand samples determine the median well within the tolerance of its uses; the stride is
     // odd so that it does not fall on one column only.

@@ -65,6 +65,7 @@ pub use config::FusionConfig;
 pub use coverage::{CoverageReport, surface_area_m2};
 pub use double_wall::{DoubleWallDetector, DoubleWallReport};
 pub use error::FusionError;
+pub use grid::median_depth;
 pub use points::PointFusion;
 pub use render::{RenderedDepth, SurfaceRenderer};
 pub use sub_volumes::{RevisedView, Revision, SubVolumeConfig, SubVolumeReport, SubVolumes};

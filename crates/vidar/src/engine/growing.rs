@@ -14,8 +14,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 use vidar_align::Placement;
 use vidar_core::{AlignedView, ChunkId, FrameId, Warning};
-use vidar_fusion::{RevisedView, SubVolumeConfig, SubVolumes};
-use vidar_solve::statistics::median_upper;
+use vidar_fusion::{RevisedView, SubVolumeConfig, SubVolumes, median_depth};
 
 /// Chunks whose volumes are kept in memory.
 const IN_MEMORY: usize = 2;
@@ -103,7 +102,7 @@ impl GrowingSurface {
                 let scale = placement.view(frame).map_or(1.0, |p| p.metres_per_unit);
                 self.fused.insert(frame, scale);
                 if !self.previewed.contains_key(&frame) {
-                    shown.extend(shown_keyframe(view));
+                    shown.extend(self.shown_keyframe(view));
                 }
             }
         }
@@ -132,7 +131,10 @@ impl GrowingSurface {
         let mut events = Vec::new();
         let mut shown = Vec::new();
         for (chunk, view) in views {
-            let Some(keyframe) = shown_keyframe(&view).filter(|k| !self.shows(k.frame_id)) else { continue };
+            if self.shows(view.frame_id()) {
+                continue;
+            }
+            let Some(keyframe) = self.shown_keyframe(&view) else { continue };
             if integrate(&mut self.volumes, chunk, &view, &mut events) {
                 self.previewed.insert(view.frame_id(), chunk);
                 shown.push(keyframe);
@@ -142,6 +144,13 @@ impl GrowingSurface {
             events.push(self.surface(shown, store)?);
         }
         Ok(events)
+    }
+
+    /// The keyframe of a view, unless hardly anything of it has depth.
+    fn shown_keyframe(&self, view: &AlignedView) -> Option<ShownKeyframe> {
+        let is_seen = view.depth().valid_ratio() >= LEAST_SHOWN;
+        let median = median_depth(view, self.config.fusion.max_depth_m as f32).filter(|_| is_seen)?;
+        Some(ShownKeyframe { frame_id: view.frame_id(), median_depth_m: f64::from(median) })
     }
 
     fn surface(&mut self, shown: Vec<ShownKeyframe>, store: &dyn PredictionStore) -> Result<MapEvent, Error> {
@@ -171,16 +180,6 @@ impl GrowingSurface {
         }
         Ok(())
     }
-}
-
-/// The keyframe of a view, unless hardly anything of it has depth. Every 97th pixel is enough for that and for a median, and falls into
-/// every column.
-fn shown_keyframe(view: &AlignedView) -> Option<ShownKeyframe> {
-    let sampled: Vec<f64> = view.depth().image().data().iter().step_by(97).map(|z| f64::from(*z)).collect();
-    let mut depth: Vec<f64> = sampled.iter().copied().filter(|z| z.is_finite() && *z > 0.0).collect();
-    let is_seen = depth.len() as f64 >= LEAST_SHOWN * sampled.len() as f64;
-    let median_depth_m = median_upper(&mut depth).filter(|_| is_seen)?;
-    Some(ShownKeyframe { frame_id: view.frame_id(), median_depth_m })
 }
 
 /// Adds a view, unless it cannot be fused. The final map reports its own losses; this surface is provisional.
