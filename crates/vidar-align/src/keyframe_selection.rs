@@ -41,11 +41,15 @@ impl KeyframeSelector {
 
     /// A selector without frames whose keyframes are `factor` times as far apart.
     pub fn widened(config: &KeyframeConfig, factor: f64) -> Self {
-        Self {
-            min_translation_m: config.min_translation_m * factor,
-            min_rotation_rad: config.min_rotation_deg.to_radians() * factor,
-            last: None,
-        }
+        let mut selector = Self { min_translation_m: 0.0, min_rotation_rad: 0.0, last: None };
+        selector.widen(config, factor);
+        selector
+    }
+
+    /// Selects keyframes that are `factor` times as far apart from here on; the last one stays the last.
+    pub fn widen(&mut self, config: &KeyframeConfig, factor: f64) {
+        self.min_translation_m = config.min_translation_m * factor;
+        self.min_rotation_rad = config.min_rotation_deg.to_radians() * factor;
     }
 
     /// Whether the frame at this pose (m) is a keyframe: the first frame, frames far enough from the last keyframe, and

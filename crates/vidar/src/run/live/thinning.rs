@@ -45,9 +45,8 @@ pub(super) struct Thinning {
     mode: Mode,
     /// Counts the keyframes that the images would give.
     plain: KeyframeSelector,
-    widened: KeyframeSelector,
-    /// Pose of the last keyframe that was not left out: what is taken farther apart begins there.
-    last: Option<Se3>,
+    /// Knows the last keyframe that was not left out, from which others are farther apart.
+    taken: KeyframeSelector,
     /// Keyframes left out because they were near others.
     pub thinned: usize,
     /// Keyframes left out because the queue was full.
@@ -62,8 +61,7 @@ impl Thinning {
             keyframes: keyframes.clone(),
             mode: Mode::All,
             plain: KeyframeSelector::new(keyframes),
-            widened: KeyframeSelector::widened(keyframes, WIDENED[0]),
-            last: None,
+            taken: KeyframeSelector::new(keyframes),
             thinned: 0,
             dropped: 0,
             poses_dropped: 0,
@@ -85,10 +83,7 @@ impl Thinning {
         if let Mode::Thin(level) = self.mode
             && before != self.mode
         {
-            self.widened = KeyframeSelector::widened(&self.keyframes, WIDENED[level]);
-            if let Some(last) = &self.last {
-                self.widened.push(last, true);
-            }
+            self.taken.widen(&self.keyframes, WIDENED[level]);
         }
         let (text, kind) = match (before, self.mode) {
             (Mode::All, Mode::Thin(_)) => {
@@ -114,10 +109,13 @@ impl Thinning {
             return if self.mode == Mode::All { Passed::Between } else { Passed::LeftOut };
         };
         let would_be_keyframe = self.plain.push(pose, false);
-        let passed = match self.mode {
-            Mode::All if would_be_keyframe => Passed::Keyframe,
+        match self.mode {
+            Mode::All if would_be_keyframe => {
+                self.taken.push(pose, true);
+                Passed::Keyframe
+            }
             Mode::All => Passed::Between,
-            Mode::Thin(_) if self.widened.push(pose, false) => Passed::Keyframe,
+            Mode::Thin(_) if self.taken.push(pose, false) => Passed::Keyframe,
             Mode::Thin(_) => {
                 self.thinned += usize::from(would_be_keyframe);
                 Passed::LeftOut
@@ -126,11 +124,7 @@ impl Thinning {
                 self.dropped += usize::from(would_be_keyframe);
                 Passed::LeftOut
             }
-        };
-        if passed == Passed::Keyframe {
-            self.last = Some(*pose);
         }
-        passed
     }
 
     /// Whether a report without an image is kept while so many items wait: always where it `moves_others`, poses told before it.
