@@ -339,7 +339,12 @@ mod tests {
 
     #[test]
     fn costs_are_those_of_the_definition_at_every_row_of_the_running_sums() {
-        let (w, h) = (24, 19);
+        // A row that is no multiple of the pixels taken at once, and one narrower than they are.
+        [24, 13].into_iter().for_each(costs_are_those_of_the_definition);
+    }
+
+    fn costs_are_those_of_the_definition(w: usize) {
+        let h = 19;
         let (reference, other) = (level(w, h, 1), level(w, h, 2));
         let found = costs_of(&reference, &other, 1.0);
         let gray = |level: &Level, x: usize, y: usize| f64::from((level.gray[y * w + x] + 2) >> 2);
