@@ -119,12 +119,14 @@ pub fn live(args: &LiveArgs, context: &Context) -> Outcome {
         Some(expressions) => Some(robot(expressions, args, &request.layered, context)?),
         None => stream,
     };
-    let options = LiveOptions { is_realtime: args.realtime || is_robot, odometry_threads: threads };
+    let options = LiveOptions {
+        is_realtime: args.realtime || is_robot,
+        odometry_threads: threads,
+        is_map_pool_lowered: true,
+    };
     let events = progress::events(&context.cli);
-    // The map leaves one processor to the odometry, where there are several.
-    let pool = rayon::ThreadPoolBuilder::new().num_threads(threads.saturating_sub(1).max(1)).build();
-    let pool = pool.map_err(|e| usage(format!("cannot start threads: {e}"), "give a smaller --threads"))?;
-    let outcome = pool.install(|| match input {
+    // A pool of the map's own: its threads will have a lower priority.
+    let outcome = context.thread_pool()?.install(|| match input {
         Some(input) => vidar::run::live_stream(&request, &options, input, &events, cancel),
         None => vidar::run::live(&request, &options, &events, cancel),
     })?;

@@ -112,6 +112,31 @@ fn at_its_own_rate_a_recording_takes_its_own_time_and_latencies_are_told() {
     assert!(poses(&out).len() as u64 + late <= images);
 }
 
+/// Looks at the niceness of a program's threads: the map's have a higher one, the odometry's that of the program.
+#[cfg(target_os = "linux")]
+fn the_odometry_goes_before_the_map(process: u32) {
+    let tasks = std::fs::read_dir(format!("/proc/{process}/task")).unwrap();
+    let threads: Vec<(String, i32)> = tasks
+        .filter_map(|task| {
+            let task = task.ok()?.path();
+            let name = std::fs::read_to_string(task.join("comm")).ok()?;
+            let stat = std::fs::read_to_string(task.join("stat")).ok()?;
+            // The 19th value; the second one is the name in parentheses.
+            let nice = stat.rsplit_once(')')?.1.split_whitespace().nth(16)?.parse().ok()?;
+            Some((name.trim().to_owned(), nice))
+        })
+        .collect();
+    let (odometry, others): (Vec<_>, Vec<_>) =
+        threads.iter().partition(|(name, _)| name.starts_with("odometry"));
+    let of_program = others.iter().map(|(_, nice)| *nice).min();
+    let highest = others.iter().map(|(_, nice)| *nice).max();
+    assert!(
+        !odometry.is_empty() && odometry.iter().all(|(_, nice)| Some(*nice) == of_program),
+        "{threads:?}"
+    );
+    assert!(highest >= Some(9), "{threads:?}");
+}
+
 #[test]
 fn a_kill_leaves_whole_lines_and_a_resume_goes_on() {
     let out = shared().root.join("live killed");
@@ -124,6 +149,8 @@ fn a_kill_leaves_whole_lines_and_a_resume_goes_on() {
         std::thread::sleep(Duration::from_millis(1));
     }
     assert!(child.try_wait().unwrap().is_none(), "killed while images came");
+    #[cfg(target_os = "linux")]
+    the_odometry_goes_before_the_map(child.id());
     child.kill().unwrap();
     child.wait().unwrap();
     let text = std::fs::read_to_string(&file).unwrap();

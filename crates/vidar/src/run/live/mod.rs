@@ -37,6 +37,7 @@ use queue::{Closing, Item, Queue};
 use serde::Serialize;
 use std::time::{Duration, Instant};
 use thinning::Thinning;
+use thread_priority::{ThreadPriority, ThreadPriorityValue};
 use tracker::{ArrivalClock, Counts, Tracker};
 use vidar_core::{ModelError, Warning};
 use vidar_dataset::DatasetError;
@@ -53,6 +54,9 @@ pub struct LiveOptions {
     pub is_realtime: bool,
     /// Threads of the odometry's own pool; the map uses the pool of the caller.
     pub odometry_threads: usize,
+    /// Whether the threads of the caller's pool get a lower priority, and keep it, so that the map uses what the odometry leaves of all
+    /// processors. Without, a caller leaves one of them free.
+    pub is_map_pool_lowered: bool,
 }
 
 /// What a live run measured. Latencies count from the arrival of an image: of a recording that is replayed at its own rate its stamp,
@@ -187,7 +191,8 @@ pub(super) fn push(
     engine: &mut Engine<'_>,
     readers: &mut Readers<'_>,
 ) -> Result<Pushed, Error> {
-    let pool = rayon::ThreadPoolBuilder::new().num_threads(options.odometry_threads).build();
+    let pool = rayon::ThreadPoolBuilder::new().num_threads(options.odometry_threads);
+    let pool = pool.thread_name(|i| format!("odometry {i}")).build();
     let pool = pool.map_err(|e| Error::Usage {
         what: format!("cannot start {} threads for the odometry: {e}", options.odometry_threads),
         hint: "give a smaller --threads".into(),
@@ -202,6 +207,10 @@ pub(super) fn push(
         };
         let thread = std::thread::Builder::new().name("odometry".into()).spawn_scoped(scope, track);
         let thread = thread.map_err(|e| Error::io("start", "the odometry's thread".as_ref(), e))?;
+        if options.is_map_pool_lowered {
+            // Threads inherit a priority: those that serve poses have started.
+            rayon::broadcast(|_| lower_priority());
+        }
         let mapped = map((context, options), &queue, engine, readers);
         let tracked = thread.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic));
         // Where the map failed, the odometry only stopped.
@@ -211,6 +220,15 @@ pub(super) fn push(
     // The cell is new.
     let _ = ending.set(end);
     Ok(Pushed { is_realtime: options.is_realtime, counts, thinning, most_waiting: queue.most_images() })
+}
+
+/// Priority of the map's threads in per cent, a niceness of 9: where both want a processor, Linux gives the odometry nine tenths of it.
+const PRIORITY_OF_MAP: u8 = 25;
+
+/// Lets others go before this thread. Where the system refuses, they share the processors.
+fn lower_priority() {
+    let priority = ThreadPriorityValue::try_from(PRIORITY_OF_MAP).map(ThreadPriority::Crossplatform);
+    let _ = priority.map(ThreadPriority::set_for_current);
 }
 
 /// The odometry's thread.
