@@ -122,13 +122,13 @@ pub fn live(args: &LiveArgs, context: &Context) -> Outcome {
     let options = LiveOptions {
         is_realtime: args.realtime || is_robot,
         odometry_threads: threads,
-        is_map_pool_lowered: true,
+        // The pool in which commands run is the map's until the program ends.
+        is_map_low_priority: true,
     };
     let events = progress::events(&context.cli);
-    // A pool of the map's own: its threads will have a lower priority.
-    let outcome = context.thread_pool()?.install(|| match input {
+    let outcome = match input {
         Some(input) => vidar::run::live_stream(&request, &options, input, &events, cancel),
         None => vidar::run::live(&request, &options, &events, cancel),
-    })?;
+    }?;
     conclude(&outcome, &thresholds, context)
 }

@@ -56,7 +56,7 @@ pub struct LiveOptions {
     pub odometry_threads: usize,
     /// Whether the threads of the caller's pool get a lower priority, and keep it, so that the map uses what the odometry leaves of all
     /// processors. Without, a caller leaves one of them free.
-    pub is_map_pool_lowered: bool,
+    pub is_map_low_priority: bool,
 }
 
 /// What a live run measured. Latencies count from the arrival of an image: of a recording that is replayed at its own rate its stamp,
@@ -207,7 +207,7 @@ pub(super) fn push(
         };
         let thread = std::thread::Builder::new().name("odometry".into()).spawn_scoped(scope, track);
         let thread = thread.map_err(|e| Error::io("start", "the odometry's thread".as_ref(), e))?;
-        if options.is_map_pool_lowered {
+        if options.is_map_low_priority {
             // Threads inherit a priority: those that serve poses have started.
             rayon::broadcast(|_| lower_priority());
         }
