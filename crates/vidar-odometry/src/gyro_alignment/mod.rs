@@ -9,6 +9,7 @@ mod shutter;
 mod solver;
 #[cfg(test)]
 mod tests;
+mod translation;
 
 pub(crate) use path::RateSample;
 pub(crate) use shutter::RollingShutter;

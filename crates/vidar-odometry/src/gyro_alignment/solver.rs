@@ -3,17 +3,16 @@
 //!
 //! For a pair of images the gyroscope gives the rotation between the exposure times of any two rows. With both rays of a
 //! feature rotated to common axes, `w_i` and `w_j`, a static point satisfies the epipolar constraint
-//! `(w_i × w_j) · t = 0`, where `t` is the pair's direction of translation. `t` has two degrees of freedom per pair and is
+//! `(w_i × w_j) · t = 0`, where `t` is the pair's direction of translation between those rows ([`Translation`]). `t` has four degrees of freedom per pair and is
 //! eliminated (variable projection: Golub, Pereyra 1973; the derivative is Kaufman's approximation). What remains is a
 //! small nonlinear least-squares problem in the parameters. Without translation the products vanish for any `t`, so
 //! turning on the spot needs no special case. Rows and clocks follow Jia, Evans, "Probabilistic 3-D motion estimation for
 //! rolling shutter video rectification", 2012, and Kelly, Sukhatme, "A general framework for temporal calibration", 2014.
 
 use super::path::{OrientationPath, RateSample};
-use crate::backend::tangent_basis;
-use nalgebra::{Matrix2, Matrix3, SMatrix, SVector, Vector2, Vector3};
+use super::translation::{CAUCHY, Match, Translation, residual_sigma};
+use nalgebra::{Matrix3, SMatrix, SVector, Vector3};
 use vidar_core::{CameraModel, LandmarkId, LieGroup, So3, camera::Pixel};
-use vidar_solve::Kernel;
 
 /// Parameters: clock offset (s), readout (s), rotation of the camera (rad, right perturbation), gyroscope bias (rad/s).
 const DIM: usize = 8;
@@ -28,10 +27,6 @@ const ROW_SEGMENTS: usize = 8;
 
 /// Standard deviation of a feature's position in one image, pixels, tracking drift included.
 const PIXEL_SIGMA: f64 = 0.7;
-
-/// Whitened residual from which a match loses weight (Cauchy).
-const CAUCHY: f64 = 2.0;
-const KERNEL: Kernel = Kernel::Cauchy { k: CAUCHY };
 
 /// Each ray takes part in up to four pairs, and tracking errors last over many images, so residuals are correlated:
 /// covariances are multiplied by this.
@@ -84,8 +79,8 @@ pub(crate) struct Alignment {
 struct Pair {
     images: [usize; 2],
     matches: Vec<[usize; 2]>,
-    /// Direction of translation in common axes, at the last linearisation.
-    direction: Vector3<f64>,
+    /// In common axes, at the last linearisation.
+    translation: Translation,
 }
 
 /// The problem: images with unit rays in the camera, and pairs.
@@ -125,7 +120,7 @@ impl<'a> Problem<'a> {
                 if images[j].secs - image.secs < apart + 0.15 {
                     let matches = common(image, &images[j]);
                     if matches.len() >= 12 {
-                        pairs.push(Pair { images: [k, j], matches, direction: Vector3::zeros() });
+                        pairs.push(Pair { images: [k, j], matches, translation: Translation::default() });
                     }
                 }
             }
@@ -271,41 +266,34 @@ impl<'a> Problem<'a> {
             })
             .collect();
         let (mut h, mut g, mut cost) = (SMatrix::<f64, DIM, DIM>::zeros(), Parameters::zeros(), 0.0);
-        let ray_sigma = self.ray_sigma;
+        let (ray_sigma, rows) = (self.ray_sigma, Rows::of(self));
         for pair in &mut self.pairs {
-            let normals = |rays: &[Vec<Option<Vector3<f64>>>], m: &[usize; 2]| {
-                let (a, b) = (rays[pair.images[0]][m[0]]?, rays[pair.images[1]][m[1]]?);
-                Some((a.cross(&b), a, b))
-            };
-            pair.direction = direction(pair.matches.iter().filter_map(|m| normals(&at, m)), ray_sigma);
-            let t = pair.direction;
-            let tangents = tangent_basis(&t);
+            let seen = pair.matches.iter().filter_map(|m| rows.seen(pair.images, m, &at));
+            pair.translation = Translation::of(seen, ray_sigma);
             let mut h_pair = SMatrix::<f64, DIM, DIM>::zeros();
             let mut g_pair = Parameters::zeros();
-            let mut cross = SMatrix::<f64, DIM, 2>::zeros();
-            let (mut tt, mut tg) = (Matrix2::<f64>::zeros(), Vector2::zeros());
+            let mut cross = SMatrix::<f64, DIM, 4>::zeros();
+            let (mut tt, mut tg) = pair.translation.prior();
             for m in &pair.matches {
-                let Some((n, a, b)) = normals(&at, m) else { continue };
-                let sigma = residual_sigma(&a, &b, &t, ray_sigma);
-                let r = n.dot(&t) / sigma;
-                let weight = KERNEL.weight(r * r);
+                let Some(seen) = rows.seen(pair.images, m, &at) else { continue };
+                let (r, weight, jt) = pair.translation.residual(&seen, ray_sigma);
+                let t = pair.translation.at(seen.row);
+                let sigma = residual_sigma(&seen, &t, ray_sigma);
                 // The kernel's loss up to rounding.
                 cost += 0.5 * CAUCHY * CAUCHY * (1.0 + r * r / (CAUCHY * CAUCHY)).ln();
                 let mut j = Parameters::zeros();
                 for p in 0..DIM {
-                    if let Some((there, ..)) = moved[p].as_ref().and_then(|rays| normals(rays, m)) {
-                        j[p] = (there - n).dot(&t) / (STEPS[p] * sigma);
+                    let there = moved[p].as_ref().and_then(|rays| rows.seen(pair.images, m, rays));
+                    if let Some(there) = there {
+                        j[p] = (there.normal - seen.normal).dot(&t) / (STEPS[p] * sigma);
                     }
                 }
-                let jt = tangents.tr_mul(&n) / sigma;
                 h_pair += j * j.transpose() * weight;
                 g_pair -= j * (r * weight);
                 cross += j * jt.transpose() * weight;
                 tt += jt * jt.transpose() * weight;
                 tg -= jt * (r * weight);
             }
-            // A pair without parallax says nothing of the direction: the unit information keeps that harmless.
-            tt += Matrix2::identity();
             if let Some(inverse) = tt.try_inverse() {
                 h_pair -= cross * inverse * cross.transpose();
                 g_pair -= cross * inverse * tg;
@@ -319,18 +307,37 @@ impl<'a> Problem<'a> {
     fn chi2_per_dof(&self, x: &Parameters) -> f64 {
         let at = self.turned(x);
         let (mut sum, mut weights) = (0.0, 0.0);
+        let rows = Rows::of(self);
         for pair in &self.pairs {
-            for m in &pair.matches {
-                let rays = (at[pair.images[0]][m[0]], at[pair.images[1]][m[1]]);
-                let (Some(a), Some(b)) = rays else { continue };
-                let sigma = residual_sigma(&a, &b, &pair.direction, self.ray_sigma);
-                let r = a.cross(&b).dot(&pair.direction) / sigma;
-                let weight = KERNEL.weight(r * r);
+            for seen in pair.matches.iter().filter_map(|m| rows.seen(pair.images, m, &at)) {
+                let (r, weight, _) = pair.translation.residual(&seen, self.ray_sigma);
                 sum += weight * r * r;
                 weights += weight;
             }
         }
         if weights > 0.0 { sum / weights } else { f64::INFINITY }
+    }
+}
+
+/// Where images show features, for the rows of matches.
+#[derive(Clone, Copy)]
+struct Rows<'a> {
+    images: &'a [ImageFeatures],
+    last: f64,
+}
+
+impl<'a> Rows<'a> {
+    fn of(problem: &Problem<'a>) -> Self {
+        Self { images: problem.images, last: problem.camera.height() as f64 - 1.0 }
+    }
+
+    /// A match of two images, given all rays; `None` where the camera has no ray for a pixel.
+    fn seen(&self, images: [usize; 2], features: &[usize; 2], rays: &Rays) -> Option<Match> {
+        let [i, j] = images;
+        let (a, b) = (rays[i][features[0]]?, rays[j][features[1]]?);
+        let row = |image: usize, feature: usize| self.images[image].features[feature].1.y;
+        let mean = 0.5 * (row(i, features[0]) + row(j, features[1]));
+        Some(Match { normal: a.cross(&b), rays: [a, b], row: mean / self.last - 0.5 })
     }
 }
 
@@ -358,31 +365,4 @@ pub(crate) fn common(a: &ImageFeatures, b: &ImageFeatures) -> Vec<[usize; 2]> {
         }
     }
     out
-}
-
-/// Standard deviation of `(a × b) · t` for rays with independent errors.
-fn residual_sigma(a: &Vector3<f64>, b: &Vector3<f64>, t: &Vector3<f64>, ray_sigma: f64) -> f64 {
-    ray_sigma * (b.cross(t).norm_squared() + a.cross(t).norm_squared() + 1e-4).sqrt()
-}
-
-/// Direction of translation: the least eigenvector of Σ w n nᵀ, weighted anew three times.
-fn direction(
-    normals: impl Iterator<Item = (Vector3<f64>, Vector3<f64>, Vector3<f64>)> + Clone,
-    ray_sigma: f64,
-) -> Vector3<f64> {
-    let mut t: Option<Vector3<f64>> = None;
-    for _ in 0..3 {
-        let mut sum = Matrix3::zeros();
-        for (n, a, b) in normals.clone() {
-            let weight = t.map_or(1.0, |t| {
-                let sigma = residual_sigma(&a, &b, &t, ray_sigma);
-                let r = n.dot(&t) / sigma;
-                KERNEL.weight(r * r) / (sigma * sigma)
-            });
-            sum += n * n.transpose() * weight;
-        }
-        let eigen = sum.symmetric_eigen();
-        t = Some(eigen.eigenvectors.column(eigen.eigenvalues.imin()).into_owned());
-    }
-    t.unwrap_or_else(Vector3::z)
 }
