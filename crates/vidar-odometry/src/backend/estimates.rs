@@ -4,11 +4,16 @@ use super::window::Frame;
 use super::{LandmarkEstimate, Smoother, inertial, linearise, visual};
 use crate::imu::{ImuModel, NavState, Preintegration};
 use nalgebra::Vector2;
-use vidar_core::{CameraModel, Duration, FrameId, LandmarkId, Se3, Timestamp};
+use vidar_core::{CameraModel, Duration, FrameId, LandmarkId, LieGroup, Se3, Timestamp};
 
 /// The clock offset that frames are stamped with changes by no more than this from frame to frame, s: less than the time
 /// between images of any camera that is used.
 const MAX_CLOCK_STEP_SECS: f64 = 2e-3;
+
+/// Two frames nearer together than this share of the scene's distance, turned by less than this, rad, show the same: about a pixel of parallax and ten
+/// pixels of motion at a focal length of 460.
+const SAME_VIEW: f64 = 2e-3;
+const SAME_VIEW_RAD: f64 = 0.02;
 
 impl Smoother {
     /// Frames held, oldest first.
@@ -70,6 +75,19 @@ impl Smoother {
     pub fn seen_by(&self, frame: FrameId) -> impl Iterator<Item = LandmarkId> + '_ {
         let at = self.index(frame).unwrap_or(usize::MAX);
         self.landmarks.iter().filter(move |l| l.alive && l.sees(at)).map(|l| l.id)
+    }
+
+    /// The oldest keyframe that shows what the newest keyframe shows from the same place, `typical_inverse` being a typical inverse
+    /// distance of the scene, 1/m. It knows no distance that the newest one does not know.
+    pub fn repeated_keyframe(&self, typical_inverse: f64) -> Option<FrameId> {
+        let mut keyframes = self.frames.iter().filter(|f| f.keyframe);
+        let newest = keyframes.next_back()?;
+        let same_view = |f: &&Frame| {
+            let moved = f.state.world_from_body.inverse() * newest.state.world_from_body;
+            moved.translation.norm() * typical_inverse < SAME_VIEW
+                && moved.rotation.log().norm() < SAME_VIEW_RAD
+        };
+        keyframes.find(same_view).map(|f| f.id)
     }
 
     /// The camera's model.

@@ -15,6 +15,7 @@ use landmarks::observation;
 use nalgebra::Vector3;
 use rustc_hash::{FxHashMap, FxHashSet};
 use vidar_core::{CameraModel, Duration, FrameId, ImuSample, LandmarkId, Se3, Timestamp};
+use vidar_solve::statistics::median_upper;
 
 /// What a frame led to.
 #[derive(Clone, Debug)]
@@ -344,7 +345,8 @@ impl FeatureOdometry {
                 smoother.drop_frame(other, &mut self.marginalisation)?;
             } else if let Some(first) = first.filter(|_| keyframes.len() > self.config.keyframes) {
                 drop(others);
-                smoother.marginalise(first, &mut self.marginalisation)?;
+                let repeated = smoother.repeated_keyframe(median_inverse(smoother).unwrap_or(0.0));
+                smoother.marginalise(repeated.unwrap_or(first), &mut self.marginalisation)?;
             } else {
                 break;
             }
@@ -366,8 +368,12 @@ fn has_moved(smoother: &Smoother, id: FrameId) -> bool {
     let Some((here, last)) = place(id).zip(smoother.keyframes().next_back().and_then(place)) else {
         return true;
     };
-    let mut inverse: Vec<f64> = smoother.landmarks().map(|l| l.inverse_distance).collect();
-    inverse.sort_unstable_by(f64::total_cmp);
-    let Some(median) = inverse.get(inverse.len() / 2) else { return true };
+    let Some(median) = median_inverse(smoother) else { return true };
     (here - last).norm() * median > MIN_KEYFRAME_BASE
+}
+
+/// Median inverse distance of the landmarks from their hosts, 1/m.
+fn median_inverse(smoother: &Smoother) -> Option<f64> {
+    let mut inverse: Vec<f64> = smoother.landmarks().map(|l| l.inverse_distance).collect();
+    median_upper(&mut inverse)
 }

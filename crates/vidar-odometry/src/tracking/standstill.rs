@@ -23,7 +23,8 @@ const STILL_ACCEL: f64 = 0.15;
 
 /// Motion of tracks since the body was last seen to move.
 ///
-/// Standstill is evaluated against one image in the past, not from image to image, so that slow motion is detected.
+/// Standstill is evaluated against one image in the past, not from image to image, so that slow motion is detected. When most
+/// of that image's tracks have been lost, those that began since join with the place where they are then: a rest does not end with its tracks.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct ImageMotion {
     reference: FxHashMap<LandmarkId, Pixel>,
@@ -59,6 +60,7 @@ impl ImageMotion {
             self.begin(seen, time);
             return false;
         };
+        self.renew_reference(seen);
         self.frames += 1;
         self.frames >= STILL_FRAMES && (time - since).as_secs_f64() >= STILL_SECS
     }
@@ -68,6 +70,16 @@ impl ImageMotion {
         self.begin(seen, time);
         self.since = Some(time - Duration::from_secs_f64(STILL_SECS));
         self.frames = STILL_FRAMES;
+    }
+
+    /// Tracks that are new join the reference once fewer than half of those seen are in it.
+    fn renew_reference(&mut self, seen: impl Iterator<Item = (LandmarkId, Pixel)> + Clone) {
+        if 2 * self.moved.len() >= seen.clone().count() {
+            return;
+        }
+        let places =
+            seen.map(|(id, pixel)| (id, self.reference.get(&id).copied().unwrap_or(pixel))).collect();
+        self.reference = places;
     }
 
     fn begin(&mut self, seen: impl Iterator<Item = (LandmarkId, Pixel)>, time: Timestamp) {
@@ -180,5 +192,23 @@ mod tests {
             assert!(!is_still(sigma, |p| p * 0.02), "{sigma} ahead");
             assert!(!is_still(sigma, |p| Vector2::new(-p.y, p.x) * 0.02), "{sigma} about the axis");
         }
+    }
+
+    #[test]
+    fn a_rest_outlasts_its_tracks_and_is_left_as_soon_as_the_body_moves() {
+        let (mut random, mut images) = (Random::new(3), ImageMotion::default());
+        // Every image loses one of 60 tracks and has a new one: none is in the 61st that was in the first.
+        let mut seen_at = |k: u32, shift: f64| {
+            let tracks = (k..k + 60).map(|id| {
+                let noise = Vector2::new(random.normal(), random.normal()) * 0.3;
+                let place = Vector2::new(f64::from(id * 37 % 600), f64::from(id * 91 % 400));
+                (LandmarkId(id), place + Vector2::new(shift, 0.0) + noise)
+            });
+            let seen: Vec<(LandmarkId, Pixel)> = tracks.collect();
+            images.update(seen.into_iter(), Timestamp::from_nanos(i64::from(k) * 50_000_000))
+        };
+        let still: Vec<bool> = (0..200).map(|k| seen_at(k, 0.0)).collect();
+        assert!(still[10..].iter().all(|s| *s), "{still:?}");
+        assert!((200..210).any(|k| !seen_at(k, 0.1 * f64::from(k - 199))));
     }
 }

@@ -140,9 +140,13 @@ impl SlidingWindowOdometry {
         });
     }
 
-    /// The keyframe that is needed least: one that shows little of what is seen now, else by the distance score of
-    /// Engel, Koltun, Cremers, "Direct Sparse Odometry", 2016, section 3.1; the two newest stay.
+    /// The keyframe that is needed least: one that the newest repeats (a rest that began again: keyframes that saw motion know the scale, those at rest do not),
+    /// one that shows little of what is seen now, else by the distance score of Engel, Koltun, Cremers, "Direct Sparse Odometry", 2016, section 3.1;
+    /// of the last two the two newest stay.
     fn keyframe_to_remove(&self, keyframes: &[FrameId]) -> Option<FrameId> {
+        if let Some(repeated) = self.smoother.repeated_keyframe(self.typical_inverse) {
+            return Some(repeated);
+        }
         let candidates = &keyframes[..keyframes.len().saturating_sub(2)];
         let newest = self.last;
         let forgotten = candidates.iter().find(|k| {
