@@ -94,6 +94,8 @@ pub(crate) struct Problem<'a> {
     is_shown: Vec<bool>,
     given: So3,
     ray_sigma: f64,
+    /// Only the clock's basin is asked for: one direction of translation for all rows will do, at half the cost.
+    is_coarse: bool,
 }
 
 /// Per image and feature, the ray in camera or common axes; `None` where the camera has none for the pixel.
@@ -127,15 +129,16 @@ impl<'a> Problem<'a> {
         }
         let ray_sigma = PIXEL_SIGMA / camera.intrinsics().fx;
         let is_shown = shown(&pairs, images.len());
-        Self { camera, samples, images, rays, pairs, is_shown, given: body_from_camera, ray_sigma }
+        let given = body_from_camera;
+        Self { camera, samples, images, rays, pairs, is_shown, given, ray_sigma, is_coarse: false }
     }
 
-    /// The same problem with at most `most` of its pairs.
-    fn thinned(&self, most: usize) -> Self {
+    /// The same problem with at most `most` of its pairs, for the clock's basin.
+    fn coarse(&self, most: usize) -> Self {
         let stride = self.pairs.len().div_ceil(most).max(1);
         let pairs: Vec<Pair> = self.pairs.iter().step_by(stride).cloned().collect();
         let is_shown = shown(&pairs, self.images.len());
-        Self { pairs, is_shown, rays: self.rays.clone(), ..*self }
+        Self { pairs, is_shown, rays: self.rays.clone(), is_coarse: true, ..*self }
     }
 
     /// Number of pairs of images.
@@ -150,7 +153,7 @@ impl<'a> Problem<'a> {
         (x[OFFSET], x[READOUT]) = start;
         let prior = x;
         if search {
-            let mut coarse = self.thinned(SEARCH_PAIRS);
+            let mut coarse = self.coarse(SEARCH_PAIRS);
             let steps = (2.0 * SEARCH_SECS / SEARCH_STEP_SECS).round() as i32;
             let mut best = f64::INFINITY;
             for k in 0..=steps {
@@ -269,7 +272,10 @@ impl<'a> Problem<'a> {
         let (ray_sigma, rows) = (self.ray_sigma, Rows::of(self));
         for pair in &mut self.pairs {
             let seen = pair.matches.iter().filter_map(|m| rows.seen(pair.images, m, &at));
-            pair.translation = Translation::of(seen, ray_sigma);
+            pair.translation = match self.is_coarse {
+                true => Translation::of_centre_rows(seen, ray_sigma),
+                false => Translation::of(seen, ray_sigma, &pair.translation),
+            };
             let mut h_pair = SMatrix::<f64, DIM, DIM>::zeros();
             let mut g_pair = Parameters::zeros();
             let mut cross = SMatrix::<f64, DIM, 4>::zeros();

@@ -4,7 +4,7 @@
 //! velocity at both: with a rolling shutter and a velocity that changes, the direction of translation depends on the row.
 
 use crate::backend::tangent_basis;
-use nalgebra::{Matrix3, Matrix4, Vector2, Vector3, Vector4};
+use nalgebra::{Matrix3, Matrix3x2, Matrix4, Vector2, Vector3, Vector4};
 use vidar_solve::Kernel;
 
 /// Whitened residual from which a match loses weight (Cauchy).
@@ -17,10 +17,12 @@ pub(super) const KERNEL: Kernel = Kernel::Cauchy { k: CAUCHY };
 const CHANGE_SIGMA: f64 = 0.06;
 
 /// Direction of translation between centre rows, and its change from the first to the last row.
-#[derive(Clone, Copy, Default)]
+#[derive(Clone, Copy)]
 pub(super) struct Translation {
-    pub direction: Vector3<f64>,
+    direction: Vector3<f64>,
     change: Vector3<f64>,
+    /// Two directions at right angles to `direction`.
+    tangents: Matrix3x2<f64>,
 }
 
 /// A match in common axes: the normal `a × b`, both rays, and the mean of their rows as a share of the height from the centre row.
@@ -31,23 +33,34 @@ pub(super) struct Match {
     pub row: f64,
 }
 
+impl Default for Translation {
+    fn default() -> Self {
+        Self::along(Vector3::z(), Vector3::zeros())
+    }
+}
+
 impl Translation {
-    /// The direction of all matches as if their rows were the centre rows, then direction and change by Gauss-Newton, weighted anew each time.
-    pub fn of(seen: impl Iterator<Item = Match> + Clone, ray_sigma: f64) -> Self {
-        let mut found = Self { direction: direction(seen.clone(), ray_sigma), ..Default::default() };
-        for _ in 0..2 {
-            let (mut h, mut g) = found.prior();
-            for m in seen.clone() {
-                let (r, weight, j) = found.residual(&m, ray_sigma);
-                h += j * j.transpose() * weight;
-                g -= j * (r * weight);
-            }
-            let Some(step) = h.cholesky().map(|c| c.solve(&g)) else { return found };
-            let tangents = found.tangents();
-            found.direction = (found.direction + tangents * step.fixed_rows::<2>(0)).normalize();
-            found.change += tangents * step.fixed_rows::<2>(2);
+    /// One direction for all rows, as if they were the centre rows.
+    pub fn of_centre_rows(seen: impl Iterator<Item = Match> + Clone, ray_sigma: f64) -> Self {
+        Self::along(direction(seen, ray_sigma), Vector3::zeros())
+    }
+
+    /// That direction, then direction and change by a step of Gauss-Newton from the change `before`, which was found where the rays were nearly the same.
+    pub fn of(seen: impl Iterator<Item = Match> + Clone, ray_sigma: f64, before: &Self) -> Self {
+        let start = Self::along(direction(seen.clone(), ray_sigma), before.change);
+        let (mut h, mut g) = start.prior();
+        for m in seen {
+            let (r, weight, j) = start.residual(&m, ray_sigma);
+            h += j * j.transpose() * weight;
+            g -= j * (r * weight);
         }
-        found
+        let Some(step) = h.cholesky().map(|c| c.solve(&g)) else { return start };
+        let moved = start.direction + start.tangents * step.fixed_rows::<2>(0);
+        Self::along(moved.normalize(), start.change + start.tangents * step.fixed_rows::<2>(2))
+    }
+
+    fn along(direction: Vector3<f64>, change: Vector3<f64>) -> Self {
+        Self { direction, change, tangents: tangent_basis(&direction) }
     }
 
     /// Between rows at `row`, a share of the height from the centre row.
@@ -55,16 +68,12 @@ impl Translation {
         self.direction + self.change * row
     }
 
-    fn tangents(&self) -> nalgebra::Matrix3x2<f64> {
-        tangent_basis(&self.direction)
-    }
-
     /// Whitened residual of a match, its weight, and its derivatives by the direction's two tangents and by those of its change.
     pub fn residual(&self, m: &Match, ray_sigma: f64) -> (f64, f64, Vector4<f64>) {
         let t = self.at(m.row);
         let sigma = residual_sigma(m, &t, ray_sigma);
         let r = m.normal.dot(&t) / sigma;
-        let by_direction: Vector2<f64> = self.tangents().tr_mul(&m.normal) / sigma;
+        let by_direction: Vector2<f64> = self.tangents.tr_mul(&m.normal) / sigma;
         let by_change = by_direction * m.row;
         let j = Vector4::new(by_direction.x, by_direction.y, by_change.x, by_change.y);
         (r, KERNEL.weight(r * r), j)
@@ -74,7 +83,7 @@ impl Translation {
     /// direction: the unit information keeps that harmless.
     pub fn prior(&self) -> (Matrix4<f64>, Vector4<f64>) {
         let information = 1.0 / (CHANGE_SIGMA * CHANGE_SIGMA);
-        let towards_zero = self.tangents().tr_mul(&self.change) * -information;
+        let towards_zero = self.tangents.tr_mul(&self.change) * -information;
         let h = Matrix4::from_diagonal(&Vector4::new(1.0, 1.0, information, information));
         (h, Vector4::new(0.0, 0.0, towards_zero.x, towards_zero.y))
     }

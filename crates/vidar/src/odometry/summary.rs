@@ -6,6 +6,11 @@ use vidar_core::Trajectory;
 use vidar_eval::TrajectoryReport;
 
 impl OdometryOutcome {
+    /// Length of the best trajectory's path, m: after the adjustment, where there is one. Live poses that scatter are longer.
+    fn path_m(&self) -> Option<f64> {
+        self.final_trajectory.as_ref().or(self.trajectory.as_ref()).map(Trajectory::path_length_m)
+    }
+
     /// Counts and scores as JSON.
     pub fn result_json(&self) -> Value {
         let tracked = &self.tracked;
@@ -23,7 +28,7 @@ impl OdometryOutcome {
             "images_with_state": with_state,
             "first_state_secs": tracked.first_state_secs(),
             "keyframes": tracked.keyframes.len(),
-            "path_m": self.trajectory.as_ref().map(Trajectory::path_length_m),
+            "path_m": self.path_m(),
             "health": health,
             "lost": tracked.lost,
             "apart": tracked.apart(),
@@ -56,8 +61,8 @@ impl OdometryOutcome {
             ("scale", self.scale.words.clone()),
             ("keyframes", tracked.keyframes.len().to_string()),
         ];
-        if let Some(trajectory) = &self.trajectory {
-            lines.push(("path", format!("{:.2} {unit}", trajectory.path_length_m())));
+        if let Some(path_m) = self.path_m() {
+            lines.push(("path", format!("{path_m:.2} {unit}")));
         }
         if let Some(secs) = tracked.first_state_secs() {
             lines.push(("first state", format!("{secs:.2} s after the first image")));
