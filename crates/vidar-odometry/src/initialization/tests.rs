@@ -18,7 +18,13 @@ fn simulate(course: &Course, config: &SimulationConfig) -> Simulation {
 
 /// Runs until a start is accepted or the recording ends; every initialisation failure on the way, and the start if there was one.
 fn until_started(simulation: &Simulation) -> (Vec<InitFailure>, Option<(FrameId, f64, FeatureOdometry)>) {
-    let config = FeatureOdometryConfig::new(&ImuNoise::EUROC, 2.0);
+    until_started_with(simulation, FeatureOdometryConfig::new(&ImuNoise::EUROC, 2.0))
+}
+
+fn until_started_with(
+    simulation: &Simulation,
+    config: FeatureOdometryConfig,
+) -> (Vec<InitFailure>, Option<(FrameId, f64, FeatureOdometry)>) {
     let mut odometry = FeatureOdometry::for_simulation(config, simulation).unwrap();
     let mut failures = Vec::new();
     for frame in &simulation.frames {
@@ -93,9 +99,16 @@ fn pure_rotation_is_never_accepted() {
 #[test]
 fn standing_still_is_not_taken_for_flight() {
     let course = Course { kind: CourseKind::Still, secs: 5.0, speed: 0.0, phase: 0.3 };
-    let (failures, started) = until_started(&simulate(&course, &SimulationConfig::default()));
+    let simulation = simulate(&course, &SimulationConfig::default());
+    // Once it is noticed no attempt is made; those before had not seen enough.
+    let (failures, started) = until_started(&simulation);
     assert!(started.is_none());
-    let parallax = failures.iter().find(|r| r.reason == InitFailureReason::Parallax).unwrap();
+    assert!(failures.iter().all(|f| f.reason == InitFailureReason::Seconds), "{failures:?}");
+    let unnoticed =
+        FeatureOdometryConfig { notices_rest: false, ..FeatureOdometryConfig::new(&ImuNoise::EUROC, 2.0) };
+    let (failures, started) = until_started_with(&simulation, unnoticed);
+    assert!(started.is_none());
+    let parallax = failures.iter().rfind(|r| r.reason == InitFailureReason::Parallax).unwrap();
     assert!(parallax.measured < 0.2, "{parallax}");
     let told = parallax.to_string();
     assert!(told.starts_with("parallax 0.") && told.ends_with("deg < 0.500 deg: move sideways"), "{told}");
