@@ -32,7 +32,7 @@
 //! Integration of a view: [`sample`] weighs its pixels, [`allocate`] finds the blocks it touches, [`update`] adds it to
 //! the sums of each [`block`], [`carve`] adds free space. Extraction: [`field`] reads distances, [`cubes`] has the
 //! triangles, [`extract`] makes the mesh, [`components`] removes small components, [`coverage`] measures what was
-//! observed, [`double_wall`] detects double walls, [`render`] shows the surface to a camera, [`texture`] gives it the pixels
+//! observed, [`double_wall`] detects double walls, [`floor`] what is seen through the floor, [`render`] shows the surface to a camera, [`texture`] gives it the pixels
 //! of its images.
 //!
 //! A map whose poses still change is fused in [`SubVolumes`]: one volume per chunk, moved when the pose graph changes.
@@ -48,6 +48,7 @@ mod double_wall;
 mod error;
 mod extract;
 mod field;
+mod floor;
 mod grid;
 mod pixels;
 mod point_sums;
@@ -65,6 +66,7 @@ pub use config::FusionConfig;
 pub use coverage::{CoverageReport, surface_area_m2};
 pub use double_wall::{DoubleWallDetector, DoubleWallReport};
 pub use error::FusionError;
+pub use floor::Floor;
 pub use grid::median_depth;
 pub use points::PointFusion;
 pub use render::{RenderedDepth, SurfaceRenderer};

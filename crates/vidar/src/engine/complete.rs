@@ -18,7 +18,7 @@ use vidar_core::{
     AlignedView, ChunkId, Confidence, DepthOrigin, DepthSource, GeometryError, Image, MetricDepth,
     TriangleMesh,
 };
-use vidar_fusion::SurfaceRenderer;
+use vidar_fusion::{Floor, SurfaceRenderer};
 use vidar_stereo::StereoError;
 use vidar_stereo::complete::{ErrorStatistics, Evidence, Spread, complete, errors_where_hidden};
 
@@ -27,25 +27,31 @@ use vidar_stereo::complete::{ErrorStatistics, Evidence, Spread, complete, errors
 const SAMPLED_CHUNKS: usize = 6;
 const SAMPLED_VIEWS: usize = 2;
 
-/// Completes the placed views of `chunks` from the surface so far, and adds to it what of that is sure. Once stopped, the views that are
-/// left are told as the surface has them.
+/// Completes the placed views of `chunks` from the surface so far, whose triangles are `mesh`, and adds to it what of that is sure. What they show through
+/// `floor` is none of their depth. Once stopped, the views that are left are told as the surface has them.
+#[expect(clippy::too_many_arguments, reason = "what a pass over all chunks needs")]
 pub fn complete_chunks(
     placement: &Placement,
     chunks: &[ChunkId],
     store: &dyn PredictionStore,
+    mesh: &TriangleMesh,
+    floor: Option<&Floor>,
     surface: &mut SurfaceFusion,
     is_stopped: &dyn Fn() -> bool,
     sink: &mut Sink<'_>,
 ) -> Result<(), Error> {
-    let read = |chunk: ChunkId| placed_and_shaped(placement, store.read(PredictionId::Chunk(chunk))?);
+    let read = |chunk: ChunkId| {
+        let shaped = placed_and_shaped(placement, store.read(PredictionId::Chunk(chunk))?)?;
+        let on_floor = |s: Shaped| Ok(Shaped { view: not_through(floor, s.view)?, ..s });
+        shaped.into_iter().map(on_floor).collect::<Result<Vec<_>, Error>>()
+    };
     let mut done = 0;
     if !is_stopped() {
-        let mesh = surface.mesh();
         let mut samples: Vec<Shaped> = Vec::new();
         for chunk in spread_over(chunks.to_vec(), SAMPLED_CHUNKS) {
             samples.extend(spread_over(read(chunk)?, SAMPLED_VIEWS));
         }
-        let completion = Completion::new(&mesh, &samples)?;
+        let completion = Completion::new(mesh, &samples)?;
         drop(samples);
         while done < chunks.len() && !is_stopped() {
             let views = completion.complete(&read(chunks[done])?)?;
@@ -121,7 +127,15 @@ impl<'m> Completion<'m> {
     }
 }
 
-/// A completed view without the pixels that are not to be used.
+/// A view without what it shows through the floor.
+pub(super) fn not_through(floor: Option<&Floor>, view: AlignedView) -> Result<AlignedView, Error> {
+    match floor.and_then(|f| f.seen_through(&view)) {
+        Some(mask) => without(&view, &mask),
+        None => Ok(view),
+    }
+}
+
+/// A view without the pixels that are not to be used.
 fn without(view: &AlignedView, mask: &Image<bool>) -> Result<AlignedView, Error> {
     let k = view.intrinsics();
     let depth = MetricDepth::new(blanked(view.depth().image(), mask, f32::NAN));

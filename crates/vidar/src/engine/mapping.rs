@@ -1,16 +1,22 @@
 //! Predict, align, place and fuse: the way of a chunk of keyframes into the map.
 
-use super::complete::complete_chunks;
+use super::complete::{complete_chunks, not_through};
 use super::fuse::SurfaceFusion;
 use super::placed::placed_views;
 use super::{Engine, MapEvent, PredictionId, Sink, Step};
 use crate::chunks::StoredChunk;
 use crate::error::Error;
+use crate::input::trajectory::TrajectorySource;
 use std::sync::Arc;
 use vidar_align::Placement;
 use vidar_align::chunking::ChunkSpan;
-use vidar_core::{ChunkId, Warning};
-use vidar_fusion::FusionConfig;
+use vidar_core::{AlignedView, ChunkId, TriangleMesh, Warning};
+use vidar_fusion::{Floor, FusionConfig};
+
+/// Share of a surface below the floor from which it is asked what is seen through the floor, and share of the depth from which that is left out: a walk
+/// through a flat with tiles had 11 % and 2 %, a hall seen from a drone 6 % and none.
+const LEAST_BELOW: f64 = 0.005;
+const LEAST_THROUGH: f64 = 0.002;
 
 impl Engine<'_> {
     /// The next chunk that later keyframes cannot change.
@@ -147,26 +153,43 @@ impl Engine<'_> {
         let is_stopped = || cancelled() && !was_cancelled;
         let owns_views = |c: &ChunkId| placement.views.iter().any(|v| v.owner == *c);
         let chunks: Vec<ChunkId> = placement.chunks.iter().map(|c| c.chunk_id).filter(owns_views).collect();
-        let completes = self.predictor.geometry.completes();
+        let (completes, store) = (self.predictor.geometry.completes(), self.predictor.store);
+        let read = |chunk: &ChunkId| placed_views(placement, store.read(PredictionId::Chunk(*chunk))?);
         let mut fused = 0;
         for chunk in &chunks {
             if is_stopped() {
                 break;
             }
             fused += 1;
-            let stored = self.predictor.store.read(PredictionId::Chunk(*chunk))?;
-            let views = placed_views(placement, stored)?;
+            let views = read(chunk)?;
             surface.fuse(&views).into_iter().try_for_each(&mut *sink)?;
             if !completes {
                 sink(MapEvent::ViewsFused(views))?;
             }
         }
+        let chunks = &chunks[..fused];
         if completes {
+            let mut mesh = surface.mesh();
+            let floor = self.floor_with_much_below(&mesh, placement).filter(|_| !is_stopped());
+            let through = floor.as_ref().map(|f| share_through(f, chunks, &read)).transpose()?;
+            let floor = floor.filter(|_| through.is_some_and(|share| share > LEAST_THROUGH));
+            if let (Some(floor), Some(share)) = (&floor, through) {
+                surface = SurfaceFusion::new(&fusion)?;
+                for chunk in chunks {
+                    let views = read(chunk)?.into_iter().map(|v| not_through(Some(floor), v));
+                    let views = views.collect::<Result<Vec<_>, _>>()?;
+                    surface.fuse(&views).into_iter().try_for_each(&mut *sink)?;
+                }
+                mesh = surface.mesh();
+                sink(MapEvent::Warning(mirrored(share)))?;
+            }
             self.enter(Step::Complete, sink)?;
             complete_chunks(
                 placement,
-                &chunks[..fused],
-                self.predictor.store,
+                chunks,
+                store,
+                &mesh,
+                floor.as_ref(),
                 &mut surface,
                 &is_stopped,
                 sink,
@@ -178,6 +201,38 @@ impl Engine<'_> {
         }
         sink(MapEvent::SurfaceChanged { surface: Arc::new(surface), shown: Vec::new(), is_final: true })
     }
+
+    /// The floor of a world with z up, where much of the surface lies below it.
+    fn floor_with_much_below(&self, mesh: &TriangleMesh, placement: &Placement) -> Option<Floor> {
+        self.poses.as_ref().filter(|p| p.source() == TrajectorySource::Odometry)?;
+        let centres: Vec<_> = placement.views.iter().map(|v| v.world_from_camera.translation).collect();
+        Floor::of_mesh(mesh, &centres).filter(|floor| floor.share_below(mesh) > LEAST_BELOW)
+    }
+}
+
+/// Share of the views' depth that is seen through the floor.
+fn share_through(
+    floor: &Floor,
+    chunks: &[ChunkId],
+    read: &dyn Fn(&ChunkId) -> Result<Vec<AlignedView>, Error>,
+) -> Result<f64, Error> {
+    let (mut through, mut all) = (0, 0);
+    for chunk in chunks {
+        for view in read(chunk)? {
+            all += view.depth().image().data().iter().filter(|z| z.is_finite()).count();
+            let mask = floor.seen_through(&view);
+            through += mask.map_or(0, |m| m.data().iter().filter(|is| **is).count());
+        }
+    }
+    Ok(through as f64 / all.max(1) as f64)
+}
+
+fn mirrored(share: f64) -> Warning {
+    let message = format!(
+        "{:.1} % of the depth is seen through the floor, which mirrors what is above it; it is left out",
+        100.0 * share
+    );
+    Warning::new("mirrored-in-floor", message)
 }
 
 fn number(chunk: usize) -> ChunkId {
