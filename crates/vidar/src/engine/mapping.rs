@@ -13,8 +13,8 @@ use vidar_align::chunking::ChunkSpan;
 use vidar_core::{AlignedView, ChunkId, TriangleMesh, Warning};
 use vidar_fusion::{Floor, FusionConfig};
 
-/// Share of a surface below the floor from which it is asked what is seen through the floor, and share of the depth from which that is left out: a walk
-/// through a flat with tiles had 11 % and 2 %, a hall seen from a drone 6 % and none.
+/// Share of a surface below the floor from which it is asked what is seen through the floor, and share of the depth from which that is left out (less does
+/// not pay for fusing again). Of a walk through a flat with tiles 11 % of the surface lay below, of a hall seen from a drone 6 %, none of it through the floor.
 const LEAST_BELOW: f64 = 0.005;
 const LEAST_THROUGH: f64 = 0.002;
 
