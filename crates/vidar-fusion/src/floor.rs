@@ -21,7 +21,7 @@ const LEAST_SHARE: f64 = 0.8;
 const BELOW_M: f64 = 0.15;
 const BELOW_SHARE: f64 = 0.05;
 
-/// The largest horizontal surface that the cameras look down on, in a world with z up.
+/// The largest horizontal surface of a world with z up, which the cameras look down on.
 #[derive(Clone, Debug)]
 pub struct Floor {
     height_m: f64,
@@ -31,20 +31,14 @@ pub struct Floor {
 impl Floor {
     /// The floor of a fused surface with normals, seen by cameras at `centres`; `None` where there is none.
     pub fn of_mesh(mesh: &TriangleMesh, centres: &[Vector3<f64>]) -> Option<Self> {
-        let level = |i: &usize| mesh.normals.get(*i).is_some_and(|n| n[2] > LEVEL);
-        let step = |z: f32| (f64::from(z) / STEP_M).floor() as i64;
-        let mut steps: Vec<i64> =
-            (0..mesh.positions.len()).filter(level).map(|i| step(mesh.positions[i][2])).collect();
+        let level = mesh.positions.iter().zip(&mesh.normals).filter(|(_, n)| n[2] > LEVEL).map(|(p, _)| p);
+        let step = |p: &[f32; 3]| (f64::from(p[2]) / STEP_M).floor() as i64;
+        let mut steps: Vec<i64> = level.clone().map(step).collect();
         steps.sort_unstable();
         // The height around which most vertices lie: they are as dense everywhere. Of equals the lowest.
         let most =
             steps.chunk_by(|a, b| a == b).max_by(|a, b| a.len().cmp(&b.len()).then(b[0].cmp(&a[0])))?[0];
-        let near = |z: f32| (step(z) - most).abs() <= 1;
-        let floor: Vec<&[f32; 3]> = (0..mesh.positions.len())
-            .filter(level)
-            .map(|i| &mesh.positions[i])
-            .filter(|p| near(p[2]))
-            .collect();
+        let floor: Vec<&[f32; 3]> = level.filter(|p| (step(p) - most).abs() <= 1).collect();
         let height_m = floor.iter().map(|p| f64::from(p[2])).sum::<f64>() / floor.len() as f64;
         let above = centres.iter().filter(|c| c.z > height_m + LEAST_HEIGHT_M).count();
         if (above as f64) < LEAST_SHARE * centres.len() as f64 {

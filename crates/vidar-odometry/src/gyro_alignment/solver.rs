@@ -10,7 +10,7 @@
 //! rolling shutter video rectification", 2012, and Kelly, Sukhatme, "A general framework for temporal calibration", 2014.
 
 use super::path::{OrientationPath, RateSample};
-use super::translation::{CAUCHY, Match, Translation, residual_sigma};
+use super::translation::{CAUCHY, Match, Residual, Translation};
 use nalgebra::{Matrix3, SMatrix, SVector, Vector3};
 use vidar_core::{CameraModel, LandmarkId, LieGroup, So3, camera::Pixel};
 
@@ -282,16 +282,15 @@ impl<'a> Problem<'a> {
             let (mut tt, mut tg) = pair.translation.prior();
             for m in &pair.matches {
                 let Some(seen) = rows.seen(pair.images, m, &at) else { continue };
-                let (r, weight, jt) = pair.translation.residual(&seen, ray_sigma);
-                let t = pair.translation.at(seen.row);
-                let sigma = residual_sigma(&seen, &t, ray_sigma);
+                let Residual { value: r, weight, by_translation: jt, by_normal, sigma } =
+                    pair.translation.residual(&seen, ray_sigma);
                 // The kernel's loss up to rounding.
                 cost += 0.5 * CAUCHY * CAUCHY * (1.0 + r * r / (CAUCHY * CAUCHY)).ln();
                 let mut j = Parameters::zeros();
                 for p in 0..DIM {
                     let there = moved[p].as_ref().and_then(|rays| rows.seen(pair.images, m, rays));
                     if let Some(there) = there {
-                        j[p] = (there.normal - seen.normal).dot(&t) / (STEPS[p] * sigma);
+                        j[p] = (there.normal - seen.normal).dot(&by_normal) / (STEPS[p] * sigma);
                     }
                 }
                 h_pair += j * j.transpose() * weight;
@@ -316,9 +315,9 @@ impl<'a> Problem<'a> {
         let rows = Rows::of(self);
         for pair in &self.pairs {
             for seen in pair.matches.iter().filter_map(|m| rows.seen(pair.images, m, &at)) {
-                let (r, weight, _) = pair.translation.residual(&seen, self.ray_sigma);
-                sum += weight * r * r;
-                weights += weight;
+                let r = pair.translation.residual(&seen, self.ray_sigma);
+                sum += r.weight * r.value * r.value;
+                weights += r.weight;
             }
         }
         if weights > 0.0 { sum / weights } else { f64::INFINITY }

@@ -9,7 +9,7 @@ use vidar_solve::Kernel;
 
 /// Whitened residual from which a match loses weight (Cauchy).
 pub(super) const CAUCHY: f64 = 2.0;
-pub(super) const KERNEL: Kernel = Kernel::Cauchy { k: CAUCHY };
+const KERNEL: Kernel = Kernel::Cauchy { k: CAUCHY };
 
 /// Standard deviation of the change of the direction from the first to the last row. A lively hand's acceleration over its velocity is 3 per second, which
 /// changes it by 0.06 within 20 ms: a readout of 21 ms in a corridor was found as 36 without it and as 24 with it. Wider ones found slow hands' readouts up to
@@ -33,6 +33,18 @@ pub(super) struct Match {
     pub row: f64,
 }
 
+/// How far a match is from the epipolar constraint.
+pub(super) struct Residual {
+    /// Whitened: `normal · by_normal / sigma`.
+    pub value: f64,
+    pub weight: f64,
+    /// Derivatives of `value` by the direction's two tangents and by those of its change.
+    pub by_translation: Vector4<f64>,
+    /// The translation at the match's row.
+    pub by_normal: Vector3<f64>,
+    pub sigma: f64,
+}
+
 impl Default for Translation {
     fn default() -> Self {
         Self::along(Vector3::z(), Vector3::zeros())
@@ -50,9 +62,10 @@ impl Translation {
         let start = Self::along(direction(seen.clone(), ray_sigma), before.change);
         let (mut h, mut g) = start.prior();
         for m in seen {
-            let (r, weight, j) = start.residual(&m, ray_sigma);
-            h += j * j.transpose() * weight;
-            g -= j * (r * weight);
+            let r = start.residual(&m, ray_sigma);
+            let j = r.by_translation;
+            h += j * j.transpose() * r.weight;
+            g -= j * (r.value * r.weight);
         }
         let Some(step) = h.cholesky().map(|c| c.solve(&g)) else { return start };
         let moved = start.direction + start.tangents * step.fixed_rows::<2>(0);
@@ -68,15 +81,15 @@ impl Translation {
         self.direction + self.change * row
     }
 
-    /// Whitened residual of a match, its weight, and its derivatives by the direction's two tangents and by those of its change.
-    pub fn residual(&self, m: &Match, ray_sigma: f64) -> (f64, f64, Vector4<f64>) {
+    /// Residual of a match.
+    pub fn residual(&self, m: &Match, ray_sigma: f64) -> Residual {
         let t = self.at(m.row);
         let sigma = residual_sigma(m, &t, ray_sigma);
         let r = m.normal.dot(&t) / sigma;
         let by_direction: Vector2<f64> = self.tangents.tr_mul(&m.normal) / sigma;
         let by_change = by_direction * m.row;
-        let j = Vector4::new(by_direction.x, by_direction.y, by_change.x, by_change.y);
-        (r, KERNEL.weight(r * r), j)
+        let by_translation = Vector4::new(by_direction.x, by_direction.y, by_change.x, by_change.y);
+        Residual { value: r, weight: KERNEL.weight(r * r), by_translation, by_normal: t, sigma }
     }
 
     /// Normal equations of the derivatives of [`Translation::residual`] before any match. A pair without parallax says nothing of the
@@ -90,7 +103,7 @@ impl Translation {
 }
 
 /// Standard deviation of `(a × b) · t` for rays with independent errors.
-pub(super) fn residual_sigma(m: &Match, t: &Vector3<f64>, ray_sigma: f64) -> f64 {
+fn residual_sigma(m: &Match, t: &Vector3<f64>, ray_sigma: f64) -> f64 {
     let [a, b] = m.rays;
     ray_sigma * (b.cross(t).norm_squared() + a.cross(t).norm_squared() + 1e-4).sqrt()
 }

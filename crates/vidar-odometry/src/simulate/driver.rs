@@ -345,7 +345,8 @@ impl FeatureOdometry {
                 smoother.drop_frame(other, &mut self.marginalisation)?;
             } else if let Some(first) = first.filter(|_| keyframes.len() > self.config.keyframes) {
                 drop(others);
-                let repeated = smoother.repeated_keyframe(median_inverse(smoother).unwrap_or(0.0));
+                let repeated =
+                    median_inverse(smoother).and_then(|inverse| smoother.repeated_keyframe(inverse));
                 smoother.marginalise(repeated.unwrap_or(first), &mut self.marginalisation)?;
             } else {
                 break;

@@ -8,17 +8,15 @@
 use super::Sink;
 use super::events::MapEvent;
 use super::fuse::SurfaceFusion;
-use super::placed::{Shaped, placed_and_shaped};
-use super::setup::{PredictionId, PredictionStore};
+use super::placed::Shaped;
 use super::views::blanked;
 use crate::error::Error;
 use rayon::prelude::*;
-use vidar_align::Placement;
 use vidar_core::{
     AlignedView, ChunkId, Confidence, DepthOrigin, DepthSource, GeometryError, Image, MetricDepth,
     TriangleMesh,
 };
-use vidar_fusion::{Floor, SurfaceRenderer};
+use vidar_fusion::SurfaceRenderer;
 use vidar_stereo::StereoError;
 use vidar_stereo::complete::{ErrorStatistics, Evidence, Spread, complete, errors_where_hidden};
 
@@ -27,24 +25,16 @@ use vidar_stereo::complete::{ErrorStatistics, Evidence, Spread, complete, errors
 const SAMPLED_CHUNKS: usize = 6;
 const SAMPLED_VIEWS: usize = 2;
 
-/// Completes the placed views of `chunks` from the surface so far, whose triangles are `mesh`, and adds to it what of that is sure. What they show through
-/// `floor` is none of their depth. Once stopped, the views that are left are told as the surface has them.
-#[expect(clippy::too_many_arguments, reason = "what a pass over all chunks needs")]
+/// Completes the placed views of `chunks`, which `read` gives, from the surface so far, whose triangles are `mesh`, and adds to it what of that is sure.
+/// Once stopped, the views that are left are told as the surface has them.
 pub fn complete_chunks(
-    placement: &Placement,
     chunks: &[ChunkId],
-    store: &dyn PredictionStore,
+    read: &dyn Fn(ChunkId) -> Result<Vec<Shaped>, Error>,
     mesh: &TriangleMesh,
-    floor: Option<&Floor>,
     surface: &mut SurfaceFusion,
     is_stopped: &dyn Fn() -> bool,
     sink: &mut Sink<'_>,
 ) -> Result<(), Error> {
-    let read = |chunk: ChunkId| {
-        let shaped = placed_and_shaped(placement, store.read(PredictionId::Chunk(chunk))?)?;
-        let on_floor = |s: Shaped| Ok(Shaped { view: not_through(floor, s.view)?, ..s });
-        shaped.into_iter().map(on_floor).collect::<Result<Vec<_>, Error>>()
-    };
     let mut done = 0;
     if !is_stopped() {
         let mut samples: Vec<Shaped> = Vec::new();
@@ -127,16 +117,8 @@ impl<'m> Completion<'m> {
     }
 }
 
-/// A view without what it shows through the floor.
-pub(super) fn not_through(floor: Option<&Floor>, view: AlignedView) -> Result<AlignedView, Error> {
-    match floor.and_then(|f| f.seen_through(&view)) {
-        Some(mask) => without(&view, &mask),
-        None => Ok(view),
-    }
-}
-
 /// A view without the pixels that are not to be used.
-fn without(view: &AlignedView, mask: &Image<bool>) -> Result<AlignedView, Error> {
+pub(super) fn without(view: &AlignedView, mask: &Image<bool>) -> Result<AlignedView, Error> {
     let k = view.intrinsics();
     let depth = MetricDepth::new(blanked(view.depth().image(), mask, f32::NAN));
     let confidence = Confidence::new(blanked(view.confidence().image(), mask, 0.0));

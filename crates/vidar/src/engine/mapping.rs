@@ -1,8 +1,8 @@
 //! Predict, align, place and fuse: the way of a chunk of keyframes into the map.
 
-use super::complete::{complete_chunks, not_through};
+use super::complete::{complete_chunks, without};
 use super::fuse::SurfaceFusion;
-use super::placed::placed_views;
+use super::placed::{Shaped, placed_and_shaped, placed_views};
 use super::{Engine, MapEvent, PredictionId, Sink, Step};
 use crate::chunks::StoredChunk;
 use crate::error::Error;
@@ -10,7 +10,7 @@ use crate::input::trajectory::TrajectorySource;
 use std::sync::Arc;
 use vidar_align::Placement;
 use vidar_align::chunking::ChunkSpan;
-use vidar_core::{AlignedView, ChunkId, TriangleMesh, Warning};
+use vidar_core::{ChunkId, TriangleMesh, Warning};
 use vidar_fusion::{Floor, FusionConfig};
 
 /// Share of a surface below the floor from which it is asked what is seen through the floor, and share of the depth from which that is left out (less does
@@ -146,7 +146,6 @@ impl Engine<'_> {
         self.enter(Step::Fuse, sink)?;
         let fusion =
             FusionConfig { memory_budget_bytes: self.volume_budget_bytes, ..self.config.fusion.clone() };
-        let mut surface = SurfaceFusion::new(&fusion)?;
         // Asked to stop while predicting, what was predicted is fused; asked to stop now, fusing stops.
         let was_cancelled = (self.cancelled)();
         let cancelled = self.cancelled;
@@ -154,46 +153,36 @@ impl Engine<'_> {
         let owns_views = |c: &ChunkId| placement.views.iter().any(|v| v.owner == *c);
         let chunks: Vec<ChunkId> = placement.chunks.iter().map(|c| c.chunk_id).filter(owns_views).collect();
         let (completes, store) = (self.predictor.geometry.completes(), self.predictor.store);
-        let read = |chunk: &ChunkId| placed_views(placement, store.read(PredictionId::Chunk(*chunk))?);
-        let mut fused = 0;
-        for chunk in &chunks {
-            if is_stopped() {
-                break;
+        let read = |chunk: ChunkId, floor: Option<&Floor>| {
+            read_views(placement, store.read(PredictionId::Chunk(chunk))?, floor)
+        };
+        let fuse = |floor: Option<&Floor>, sink: &mut Sink<'_>| {
+            let mut surface = SurfaceFusion::new(&fusion)?;
+            let mut fused = 0;
+            while fused < chunks.len() && !is_stopped() {
+                let views: Vec<_> = read(chunks[fused], floor)?.into_iter().map(|s| s.view).collect();
+                surface.fuse(&views).into_iter().try_for_each(&mut *sink)?;
+                if !completes {
+                    sink(MapEvent::ViewsFused(views))?;
+                }
+                fused += 1;
             }
-            fused += 1;
-            let views = read(chunk)?;
-            surface.fuse(&views).into_iter().try_for_each(&mut *sink)?;
-            if !completes {
-                sink(MapEvent::ViewsFused(views))?;
-            }
-        }
-        let chunks = &chunks[..fused];
+            Ok::<_, Error>((surface, fused))
+        };
+        let (mut surface, mut fused) = fuse(None, sink)?;
         if completes {
             let mut mesh = surface.mesh();
             let floor = self.floor_with_much_below(&mesh, placement).filter(|_| !is_stopped());
-            let through = floor.as_ref().map(|f| share_through(f, chunks, &read)).transpose()?;
+            let through = floor.as_ref().map(|f| share_through(f, &chunks[..fused], &read)).transpose()?;
             let floor = floor.filter(|_| through.is_some_and(|share| share > LEAST_THROUGH));
             if let (Some(floor), Some(share)) = (&floor, through) {
-                surface = SurfaceFusion::new(&fusion)?;
-                for chunk in chunks {
-                    let views = read(chunk)?.into_iter().map(|v| not_through(Some(floor), v));
-                    let views = views.collect::<Result<Vec<_>, _>>()?;
-                    surface.fuse(&views).into_iter().try_for_each(&mut *sink)?;
-                }
+                (surface, fused) = fuse(Some(floor), sink)?;
                 mesh = surface.mesh();
-                sink(MapEvent::Warning(mirrored(share)))?;
+                sink(MapEvent::Warning(seen_through(share)))?;
             }
             self.enter(Step::Complete, sink)?;
-            complete_chunks(
-                placement,
-                chunks,
-                store,
-                &mesh,
-                floor.as_ref(),
-                &mut surface,
-                &is_stopped,
-                sink,
-            )?;
+            let read = |chunk| read(chunk, floor.as_ref());
+            complete_chunks(&chunks[..fused], &read, &mesh, &mut surface, &is_stopped, sink)?;
         }
         let (surface, warnings) = surface.finish();
         for warning in warnings {
@@ -210,15 +199,28 @@ impl Engine<'_> {
     }
 }
 
+/// The views of a chunk where they are placed, without what they show through `floor`.
+fn read_views(
+    placement: &Placement,
+    stored: StoredChunk,
+    floor: Option<&Floor>,
+) -> Result<Vec<Shaped>, Error> {
+    let without_floor = |s: Shaped| match floor.and_then(|f| f.seen_through(&s.view)) {
+        Some(mask) => Ok(Shaped { view: without(&s.view, &mask)?, ..s }),
+        None => Ok(s),
+    };
+    placed_and_shaped(placement, stored)?.into_iter().map(without_floor).collect()
+}
+
 /// Share of the views' depth that is seen through the floor.
 fn share_through(
     floor: &Floor,
     chunks: &[ChunkId],
-    read: &dyn Fn(&ChunkId) -> Result<Vec<AlignedView>, Error>,
+    read: &dyn Fn(ChunkId, Option<&Floor>) -> Result<Vec<Shaped>, Error>,
 ) -> Result<f64, Error> {
     let (mut through, mut all) = (0, 0);
     for chunk in chunks {
-        for view in read(chunk)? {
+        for Shaped { view, .. } in read(*chunk, None)? {
             all += view.depth().image().data().iter().filter(|z| z.is_finite()).count();
             let mask = floor.seen_through(&view);
             through += mask.map_or(0, |m| m.data().iter().filter(|is| **is).count());
@@ -227,12 +229,11 @@ fn share_through(
     Ok(through as f64 / all.max(1) as f64)
 }
 
-fn mirrored(share: f64) -> Warning {
-    let message = format!(
-        "{:.1} % of the depth is seen through the floor, which mirrors what is above it; it is left out",
-        100.0 * share
-    );
-    Warning::new("mirrored-in-floor", message)
+fn seen_through(share: f64) -> Warning {
+    let message = format!("{:.1} % of the depth is seen through the floor and left out", 100.0 * share);
+    let hint =
+        "a shiny floor mirrors what is above it; if this one does not, poses and depth contradict each other";
+    Warning::new("seen-through-floor", message).hint(hint)
 }
 
 fn number(chunk: usize) -> ChunkId {
