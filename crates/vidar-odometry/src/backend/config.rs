@@ -45,6 +45,9 @@ pub struct SmootherConfig {
     pub camera_position_sigma_m: f64,
     /// Standard deviation of the given clock offset, milliseconds, 0.01…100.
     pub time_offset_sigma_ms: f64,
+    /// Standard deviation of each image's stamp about the instant of its exposure, milliseconds, 0…20; 0: stamps are right up to the clock offset. Needs
+    /// `estimate_time_offset`, which is their mean.
+    pub stamp_scatter_ms: f64,
 }
 
 impl Default for SmootherConfig {
@@ -61,6 +64,7 @@ impl Default for SmootherConfig {
             camera_rotation_sigma_deg: 1.0,
             camera_position_sigma_m: 0.01,
             time_offset_sigma_ms: 5.0,
+            stamp_scatter_ms: 0.0,
         }
     }
 }
@@ -79,6 +83,7 @@ impl SmootherConfig {
             ("camera_rotation_sigma_deg", self.camera_rotation_sigma_deg, 0.01, 10.0),
             ("camera_position_sigma_m", self.camera_position_sigma_m, 1e-4, 0.5),
             ("time_offset_sigma_ms", self.time_offset_sigma_ms, 0.01, 100.0),
+            ("stamp_scatter_ms", self.stamp_scatter_ms, 0.0, 20.0),
         ];
         for (key, found, low, high) in ranges {
             if !(low..=high).contains(&found) {
@@ -94,6 +99,11 @@ impl SmootherConfig {
 
     pub(crate) fn calibrates(&self) -> bool {
         self.calibrates_camera() || self.estimate_time_offset
+    }
+
+    /// Standard deviation of an image's delay, s, where every image has one of its own.
+    pub(crate) fn delay_sigma(&self) -> Option<f64> {
+        (self.stamp_scatter_ms > 0.0).then_some(self.stamp_scatter_ms * 1e-3)
     }
 
     pub(crate) fn calibrates_camera(&self) -> bool {

@@ -221,6 +221,49 @@ pub(crate) fn by_time_offset(
     by
 }
 
+/// Derivatives of [`residual`] by the shifts of the first and of the last instant. Their sum is [`by_time_offset`], in which the length of the stretch
+/// drops out.
+pub(crate) fn by_ends(
+    preintegration: &Preintegration,
+    i: &NavState,
+    j: &NavState,
+    shift: Shift,
+) -> [Vector15; 2] {
+    let parts = moved(preintegration, i, shift);
+    let [before, integrated, after] = &parts;
+    let [first, last] = preintegration.ends();
+    let rest = integrated.then(after);
+    let all = before.then(&rest);
+    let back = i.world_from_body.rotation.inverse();
+    let q = all.turn.inverse() * (back * j.world_from_body.rotation);
+    let log_slope = So3::right_jacobian_inverse(&q.log()).unwrap_or_else(Matrix3::identity);
+    let gravity = preintegration.model().gravity();
+    // Of the states' part of the residual by the length of the stretch.
+    let moved = -(back * (i.velocity + gravity * all.secs));
+    let sped = -(back * gravity);
+    let by = |d_turn: Vector3<f64>, d_position: Vector3<f64>, d_velocity: Vector3<f64>, d_secs: f64| {
+        let mut by = Vector15::zeros();
+        by.fixed_rows_mut::<3>(0).copy_from(&-(log_slope * (q.inverse() * d_turn)));
+        by.fixed_rows_mut::<3>(3).copy_from(&(moved * d_secs - d_position));
+        by.fixed_rows_mut::<3>(6).copy_from(&(sped * d_secs - d_velocity));
+        by
+    };
+    let begin = by(
+        -(rest.turn.inverse() * first.turn),
+        first.force * (shift.begin - rest.secs) - before.turn * first.turn.cross(&rest.position),
+        -first.force - before.turn * first.turn.cross(&rest.velocity),
+        -1.0,
+    );
+    let d_rest_position = integrated.velocity + integrated.turn * (last.force * shift.end);
+    let end = by(
+        last.turn,
+        before.velocity + before.turn * d_rest_position,
+        before.turn * (integrated.turn * last.force),
+        1.0,
+    );
+    [begin, end]
+}
+
 /// Velocity in the body's axes, the residual of standstill, with its derivatives by rotation and velocity.
 /// The body's axes keep the factor blind to yaw.
 pub(crate) fn body_velocity(state: &NavState) -> (Vector3<f64>, Matrix3<f64>, Matrix3<f64>) {

@@ -1,6 +1,6 @@
 //! Linearises the window's factors into its normal equations ([`System`]); landmarks are eliminated.
 
-use super::inertial::{Shift, body_velocity, by_time_offset, gauge_prior_at, jacobians, residual};
+use super::inertial::{Shift, body_velocity, by_ends, by_time_offset, gauge_prior_at, jacobians, residual};
 use super::prior::Part;
 use super::products::{product, transposed_product};
 use super::reprojection::{Scene, WeightedObservation};
@@ -14,7 +14,7 @@ use vidar_core::simd::kernel;
 /// How far the instants of two frames lie from where the IMU measurements between them were cut.
 pub(crate) fn shift_between(calibration: &CalibrationState, from: &Frame, to: &Frame) -> Shift {
     let now = calibration.time_offset_secs;
-    Shift { begin: now - from.clock_secs, end: now - to.clock_secs }
+    Shift { begin: now - from.clock_secs + from.delay.secs, end: now - to.clock_secs + to.delay.secs }
 }
 
 /// Inverse standard deviations of the calibration's own prior; 0 for what is not estimated.
@@ -46,12 +46,13 @@ impl Smoother {
 
     /// Builds the system at the present states and returns the robust cost.
     pub(crate) fn linearise(&mut self, system: &mut System, lambda: f64) -> f64 {
-        system.begin(self.frames.len(), self.config.calibrates());
+        system.begin(self.frames.len(), self.config.delay_sigma().is_some(), self.config.calibrates());
         self.place_cameras(system);
         let mut cost = self.add_prior(system);
         cost += self.add_anchor(system);
         for k in 0..self.frames.len() {
             cost += self.add_link(system, k);
+            cost += self.add_delay(system, k);
             cost += self.add_standstill_factor(system, k);
             cost += self.add_rest_factor(system, k);
         }
@@ -140,6 +141,10 @@ impl Smoother {
         let by_offset = self.config.estimate_time_offset.then(|| {
             imu_factor.whitening.apply(&by_time_offset(&imu_factor.preintegration, state_i, state_j, shift))
         });
+        let by_ends = (system.delays > 0).then(|| {
+            by_ends(&imu_factor.preintegration, state_i, state_j, shift)
+                .map(|d| imu_factor.whitening.apply(&d))
+        });
         let (ji, jj) = (imu_factor.whitening.apply(&ji), imu_factor.whitening.apply(&jj));
         let parts = [Part::Motion(k - 1), Part::Motion(k), Part::Pose(k - 1), Part::Pose(k)];
         for a in 0..4 {
@@ -174,7 +179,40 @@ impl Smoother {
             }
             system.gradient[at] += d.dot(&r);
         }
+        if let Some(ends) = by_ends {
+            let at = [k - 1, k].map(|k| system.offset(Part::Delay(k)));
+            for (a, d) in ends.iter().enumerate() {
+                for part in [Part::Motion(k - 1), Part::Motion(k)] {
+                    system.couple(Part::Delay(k - 1 + a), part);
+                }
+                for part in [Part::Pose(k - 1), Part::Pose(k)] {
+                    system.couple(part, Part::Delay(k - 1 + a));
+                }
+                for (j, m, p) in [(&ji, mi, pi), (&jj, mj, pj)] {
+                    let row = d.transpose() * j;
+                    system.add(at[a], m, &row.fixed_columns::<9>(6).into_owned(), 1.0);
+                    system.add(p, at[a], &row.fixed_columns::<6>(0).transpose(), 1.0);
+                }
+                if let Some(by_offset) = &by_offset {
+                    let clock = system.offset(Part::Calibration) + OFFSET_AT;
+                    system.add(clock, at[a], &(by_offset.transpose() * d), 1.0);
+                }
+                system.gradient[at[a]] += d.dot(&r);
+                system.add(at[a], at[a], &(d.transpose() * d), 1.0);
+            }
+            system.couple(Part::Delay(k), Part::Delay(k - 1));
+            system.add(at[1], at[0], &(ends[1].transpose() * ends[0]), 1.0);
+        }
         0.5 * r.norm_squared()
+    }
+
+    /// That a frame's delay is about zero.
+    fn add_delay(&self, system: &mut System, k: usize) -> f64 {
+        let Some(sigma) = self.config.delay_sigma() else { return 0.0 };
+        let (at, r) = (system.offset(Part::Delay(k)), self.frames[k].delay.secs / sigma);
+        system.h[at * system.n + at] += 1.0 / (sigma * sigma);
+        system.gradient[at] += r / sigma;
+        0.5 * r * r
     }
 
     fn add_standstill_factor(&self, system: &mut System, k: usize) -> f64 {

@@ -45,6 +45,8 @@ const MOST_SPARE: usize = 8;
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Workspace {
     parts: Vec<Part>,
+    /// So many of them, in front, leave.
+    leaving_parts: usize,
     starts: Vec<usize>,
     stack: Tall,
     one: Tall,
@@ -174,7 +176,7 @@ impl Smoother {
             self.stack_prior(&mut bench);
             self.stack_frame(gone, motion, &system, &mut bench);
             self.stack_landmarks(gone, &system, &mut bench);
-            self.new_prior(gone, &mut bench);
+            self.new_prior(&mut bench);
             self.move_hosts(gone, &system, &bench, marginalisation);
         } else {
             self.prior.clear();
@@ -197,6 +199,7 @@ impl Smoother {
         for frame in &mut self.frames {
             frame.linearised = frame.state;
             frame.step.fill(0.0);
+            frame.delay.relinearise();
         }
         self.calibration.relinearise();
     }
@@ -230,23 +233,31 @@ impl Smoother {
     /// Columns: the leaving frame first, then everything it is coupled to, in the order of frames, calibration last.
     fn lay_out(&self, gone: usize, motion: usize, bench: &mut Workspace) {
         bench.parts.clear();
+        const DELAY: u8 = 4;
+        let has_delays = self.config.delay_sigma().is_some();
+        let by_imu = if has_delays { 3 | DELAY } else { 3 };
         bench.insert(Part::Pose(gone));
         bench.insert(Part::Motion(motion));
+        if has_delays {
+            bench.insert(Part::Delay(motion));
+        }
+        bench.leaving_parts = bench.parts.len();
         let mut coupled = [0_u8; 64];
         let mut calibration = false;
         for part in &self.prior.parts {
             match part {
                 Part::Pose(k) => coupled[*k] |= 1,
                 Part::Motion(k) => coupled[*k] |= 2,
+                Part::Delay(k) => coupled[*k] |= DELAY,
                 Part::Calibration => calibration = true,
             }
         }
         for k in [gone, motion].into_iter().filter(|&k| k > 0 && self.frames[k].imu_factor.is_some()) {
-            coupled[k - 1] = 3;
+            coupled[k - 1] = by_imu;
             calibration |= self.config.estimate_time_offset;
         }
         if self.frames.get(gone + 1).is_some_and(|f| f.imu_factor.is_some()) {
-            coupled[gone + 1] = 3;
+            coupled[gone + 1] = by_imu;
             calibration |= self.config.estimate_time_offset;
         }
         if self.frames[gone].zero_motion.is_some() && gone > 0 {
@@ -255,7 +266,7 @@ impl Smoother {
         if self.frames.get(gone + 1).is_some_and(|f| f.zero_motion.is_some()) {
             coupled[gone + 1] |= 1;
         }
-        let mut rows = self.prior.rows + 3 * (15 + 6) + 15 + 2 * 3 + CALIBRATION_DIM;
+        let mut rows = self.prior.rows + 3 * (15 + 6) + 15 + 2 * 3 + CALIBRATION_DIM + 1;
         for &(slot, leaving) in &bench.leaving {
             let landmark = &self.landmarks[slot];
             for s in landmark.observations[..leaving].iter().filter(|s| self.frames[s.frame].keyframe) {
@@ -267,6 +278,9 @@ impl Smoother {
         }
         if motion != gone {
             bench.insert(Part::Motion(gone));
+            if has_delays {
+                bench.insert(Part::Delay(gone));
+            }
         }
         for k in (0..self.frames.len()).filter(|&k| k != gone) {
             if coupled[k] & 1 != 0 {
@@ -274,6 +288,9 @@ impl Smoother {
             }
             if coupled[k] & 2 != 0 {
                 bench.insert(Part::Motion(k));
+            }
+            if coupled[k] & DELAY != 0 {
+                bench.insert(Part::Delay(k));
             }
         }
         if calibration {
@@ -289,12 +306,12 @@ impl Smoother {
     }
 
     /// Eliminates the leaving frame's columns; what is left is the prior.
-    fn new_prior(&mut self, gone: usize, bench: &mut Workspace) {
-        let leaving = Part::Pose(gone).dim() + Part::Motion(gone).dim();
+    fn new_prior(&mut self, bench: &mut Workspace) {
+        let leaving = bench.starts.get(bench.leaving_parts).copied().unwrap_or_else(|| bench.rhs());
         let variables = bench.rhs();
         let begin = bench.stack.triangularise(0, 0, leaving);
         let end = bench.stack.triangularise(begin, leaving, variables);
-        let parts = &bench.parts[2..];
+        let parts = &bench.parts[bench.leaving_parts..];
         self.prior.reset(parts, end - begin);
         let n = self.prior.dim;
         for r in 0..self.prior.rows {
@@ -308,6 +325,7 @@ impl Smoother {
             match part {
                 Part::Pose(k) => self.frames[k].enter_prior(true, false),
                 Part::Motion(k) => self.frames[k].enter_prior(false, true),
+                Part::Delay(k) => self.frames[k].delay.enter_prior(),
                 Part::Calibration => self.calibration.enter_prior(),
             }
         }

@@ -11,6 +11,7 @@
 
 mod config;
 mod covariance;
+mod delay;
 mod dense;
 mod error;
 mod estimates;
@@ -90,7 +91,7 @@ impl Smoother {
             slots,
             gauge_prior: None,
             prior: Prior::default(),
-            system: System::with_capacity(15 * frames + window::CALIBRATION_DIM),
+            system: System::with_capacity(16 * frames + window::CALIBRATION_DIM),
             spare: Vec::with_capacity(8),
             workspace: marginalise::Workspace::default(),
             config,

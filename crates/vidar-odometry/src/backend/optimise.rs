@@ -1,6 +1,7 @@
 //! Levenberg-Marquardt over the window.
 
 use super::Smoother;
+use super::delay::Delay;
 use super::prior::Part;
 use super::system::System;
 use super::window::{CALIBRATION_DIM, CalibrationState};
@@ -54,13 +55,14 @@ const SCHEDULE: Schedule = Schedule {
 const FAILURE: Increase = Increase { acceleration: 4.0, least: 1e-3, ..Increase::by(4.0) };
 const LIMITS: Limits = Limits { damping: 1e8, ..Limits::NONE };
 
-/// Inverse squares of the steps at which damping of 1 sets in: 0.1 rad, 1 m; 1 m/s, 0.05 rad/s, 0.5 m/s²; calibration
+/// Inverse squares of the steps at which damping of 1 sets in: 0.1 rad, 1 m; 1 m/s, 0.05 rad/s, 0.5 m/s²; a delay 5 ms; calibration
 /// 0.02 rad, 2 cm, 5 ms.
 ///
 /// Damping by the system's own diagonal would hold biases in place: each is coupled to its neighbours by a walk a million
 /// times stiffer than what is known of all of them together.
 const POSE_DAMPING: [f64; 6] = [1e2, 1e2, 1e2, 1.0, 1.0, 1.0];
 const MOTION_DAMPING: [f64; 9] = [1.0, 1.0, 1.0, 4e2, 4e2, 4e2, 4.0, 4.0, 4.0];
+const DELAY_DAMPING: f64 = 4e4;
 const CALIBRATION_DAMPING: [f64; CALIBRATION_DIM] = [2.5e3, 2.5e3, 2.5e3, 2.5e3, 2.5e3, 2.5e3, 4e4];
 
 /// A frame's state before a step.
@@ -68,6 +70,7 @@ const CALIBRATION_DAMPING: [f64; CALIBRATION_DIM] = [2.5e3, 2.5e3, 2.5e3, 2.5e3,
 pub(crate) struct StateBackup {
     state: NavState,
     step: Vector15,
+    delay: Delay,
 }
 
 impl Smoother {
@@ -99,7 +102,11 @@ impl Smoother {
 
     fn save(&self, system: &mut System) -> CalibrationState {
         system.saved.clear();
-        system.saved.extend(self.frames.iter().map(|f| StateBackup { state: f.state, step: f.step }));
+        system.saved.extend(self.frames.iter().map(|f| StateBackup {
+            state: f.state,
+            step: f.step,
+            delay: f.delay,
+        }));
         system.saved_landmarks.clear();
         for e in &system.eliminated {
             let landmark = &self.landmarks[e.slot];
@@ -112,6 +119,7 @@ impl Smoother {
         for (frame, saved) in self.frames.iter_mut().zip(&system.saved) {
             frame.state = saved.state;
             frame.step = saved.step;
+            frame.delay = saved.delay;
         }
         for &(slot, bearing, rho) in &system.saved_landmarks {
             self.landmarks[slot].bearing = bearing;
@@ -125,9 +133,10 @@ impl Smoother {
             let at = system.offset(Part::Pose(k));
             SVector::<f64, 6>::from_column_slice(&system.step[at..at + 6])
         };
-        let calibrates = system.n > 15 * system.frames;
+        let calibrates = system.calibrates();
         let calibration_step = if calibrates {
-            SVector::<f64, CALIBRATION_DIM>::from_column_slice(&system.step[15 * system.frames..])
+            let at = system.offset(Part::Calibration);
+            SVector::<f64, CALIBRATION_DIM>::from_column_slice(&system.step[at..])
         } else {
             SVector::zeros()
         };
@@ -142,9 +151,19 @@ impl Smoother {
             }
             self.landmarks[e.slot].apply(&-(e.inverse * rhs));
         }
-        for (k, frame) in self.frames.iter_mut().enumerate() {
+        for k in 0..self.frames.len() {
             let at = system.offset(Part::Motion(k));
-            frame.apply(&pose_step(k), &SVector::<f64, 9>::from_column_slice(&system.step[at..at + 9]));
+            let motion_step = SVector::<f64, 9>::from_column_slice(&system.step[at..at + 9]);
+            if system.delays > 0 {
+                self.apply_with_delay(
+                    k,
+                    &pose_step(k),
+                    &motion_step,
+                    system.step[system.offset(Part::Delay(k))],
+                );
+            } else {
+                self.frames[k].apply(&pose_step(k), &motion_step);
+            }
         }
         if calibrates {
             self.calibration.apply(&calibration_step);
@@ -219,12 +238,12 @@ impl LeastSquares for Window<'_> {
 /// Solves the damped system into `system.step`; the decrease of the cost that the linear model promises, or `None`
 /// when the system is not positive definite.
 fn solve(system: &mut System, lambda: f64) -> Option<f64> {
-    let n = system.n;
     system.damping.clear();
     let frames = system.frames;
     system.damping.extend((0..frames).flat_map(|_| MOTION_DAMPING));
+    system.damping.resize(9 * frames + system.delays, DELAY_DAMPING);
     system.damping.extend((0..frames).flat_map(|_| POSE_DAMPING));
-    if n > 15 * frames {
+    if system.calibrates() {
         system.damping.extend(CALIBRATION_DAMPING);
     }
     system.damping.iter_mut().for_each(|d| *d *= lambda);

@@ -11,6 +11,8 @@ pub(crate) enum Part {
     Pose(usize),
     /// Velocity and biases of a frame.
     Motion(usize),
+    /// How much later than its stamp a frame was exposed, where stamps scatter.
+    Delay(usize),
     /// The calibration.
     Calibration,
 }
@@ -20,13 +22,14 @@ impl Part {
         match self {
             Self::Pose(_) => 6,
             Self::Motion(_) => 9,
+            Self::Delay(_) => 1,
             Self::Calibration => CALIBRATION_DIM,
         }
     }
 
     pub(crate) const fn frame(self) -> Option<usize> {
         match self {
-            Self::Pose(k) | Self::Motion(k) => Some(k),
+            Self::Pose(k) | Self::Motion(k) | Self::Delay(k) => Some(k),
             Self::Calibration => None,
         }
     }
@@ -118,6 +121,10 @@ impl Prior {
                         vector.extend([0.0; 6]);
                     }
                 }
+                Part::Delay(_) => {
+                    self.turn.push(0.0);
+                    self.along.push(0.0);
+                }
                 Part::Calibration => {
                     self.turn.extend([0.0; CALIBRATION_DIM]);
                     self.along.extend([0.0; CALIBRATION_DIM]);
@@ -206,7 +213,7 @@ impl Prior {
     pub(crate) fn frame_left(&mut self, gone: usize) {
         for part in &mut self.parts {
             match part {
-                Part::Pose(k) | Part::Motion(k) if *k > gone => *k -= 1,
+                Part::Pose(k) | Part::Motion(k) | Part::Delay(k) if *k > gone => *k -= 1,
                 _ => {}
             }
         }
@@ -220,6 +227,7 @@ impl Prior {
             match *part {
                 Part::Pose(k) => self.step.extend_from_slice(&frames[k].step.as_slice()[..6]),
                 Part::Motion(k) => self.step.extend_from_slice(&frames[k].step.as_slice()[6..]),
+                Part::Delay(k) => self.step.push(frames[k].delay.step_secs),
                 Part::Calibration => self.step.extend_from_slice(calibration.step.as_slice()),
             }
         }

@@ -1,4 +1,4 @@
-//! The normal equations of the window in memory that is used again: motions first, then poses, then calibration.
+//! The normal equations of the window in memory that is used again: motions first, then delays (where frames have them), then poses, then calibration.
 //!
 //! Velocities and biases couple only to their neighbours in time, so with them in front the Cholesky factor has long
 //! runs of leading zeros in their rows.
@@ -33,6 +33,8 @@ pub(crate) struct PoseLandmarkBlock {
 #[derive(Clone, Debug, Default)]
 pub(crate) struct System {
     pub(crate) frames: usize,
+    /// Frames that have a delay: all or none.
+    pub(crate) delays: usize,
     pub(crate) n: usize,
     /// Lower triangle of `Jᵀ J`, row-major `n × n`.
     pub(crate) h: Vec<f64>,
@@ -79,22 +81,29 @@ impl System {
     pub(crate) fn offset(&self, part: Part) -> usize {
         match part {
             Part::Motion(k) => 9 * k,
-            Part::Pose(k) => 9 * self.frames + 6 * k,
-            Part::Calibration => 15 * self.frames,
+            Part::Delay(k) => 9 * self.frames + k,
+            Part::Pose(k) => 9 * self.frames + self.delays + 6 * k,
+            Part::Calibration => 15 * self.frames + self.delays,
         }
     }
 
-    pub(crate) fn begin(&mut self, frames: usize, calibrates: bool) {
+    /// Whether the calibration is among the unknowns.
+    pub(crate) fn calibrates(&self) -> bool {
+        self.n > self.offset(Part::Calibration)
+    }
+
+    pub(crate) fn begin(&mut self, frames: usize, has_delays: bool, calibrates: bool) {
         self.frames = frames;
-        self.n = 15 * frames + if calibrates { CALIBRATION_DIM } else { 0 };
-        let n = self.n;
+        self.delays = if has_delays { frames } else { 0 };
+        self.n = self.offset(Part::Calibration) + if calibrates { CALIBRATION_DIM } else { 0 };
+        let (n, calibration) = (self.n, self.offset(Part::Calibration));
         self.h.clear();
         self.h.resize(n * n, 0.0);
         self.gradient.clear();
         self.gradient.resize(n, 0.0);
         self.first.clear();
         self.first.extend((0..frames).flat_map(|k| [9 * k; 9]));
-        self.first.resize(15 * frames, 9 * frames);
+        self.first.resize(calibration, 9 * frames);
         self.first.resize(n, 0);
         self.eliminated.clear();
         self.cross.clear();

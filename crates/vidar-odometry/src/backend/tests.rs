@@ -60,7 +60,8 @@ fn free_directions(smoother: &Smoother, parts: &[Part], dim: usize) -> DMatrix<f
                     n.view_mut((at, 3), (3, 1)).copy_from(&turn);
                     n.view_mut((at + 3, 3), (3, 1)).copy_from(&shift);
                 }
-                _ => n.view_mut((at, 3), (3, 1)).copy_from(&up.cross(&state.velocity)),
+                Part::Motion(_) => n.view_mut((at, 3), (3, 1)).copy_from(&up.cross(&state.velocity)),
+                _ => {}
             }
         }
         at += part.dim();
@@ -70,15 +71,18 @@ fn free_directions(smoother: &Smoother, parts: &[Part], dim: usize) -> DMatrix<f
 
 #[test]
 fn shift_and_heading_stay_free_after_100_marginalisations() {
-    // Keyframes every second frame of 20 Hz.
-    let (mut odometry, simulation) = flown(3, 11.5, |config, sigmas| {
-        config.keyframe_every = 2;
-        (sigmas.position_m, sigmas.yaw_rad) = (f64::INFINITY, f64::INFINITY);
-    });
-    let departures = simulation.frames.len() / 2 - 10;
-    assert!(departures >= 100, "{departures} departures");
-    let worst = worst_information(odometry.smoother().unwrap());
-    assert!(worst < 1e-6, "|J N| / |J| = {worst:.2e}");
+    for stamp_scatter_ms in [0.0, 4.0] {
+        // Keyframes every second frame of 20 Hz.
+        let (mut odometry, simulation) = flown(3, 11.5, |config, sigmas| {
+            config.keyframe_every = 2;
+            config.smoother.stamp_scatter_ms = stamp_scatter_ms;
+            (sigmas.position_m, sigmas.yaw_rad) = (f64::INFINITY, f64::INFINITY);
+        });
+        let departures = simulation.frames.len() / 2 - 10;
+        assert!(departures >= 100, "{departures} departures");
+        let worst = worst_information(odometry.smoother().unwrap());
+        assert!(worst < 1e-6, "|J N| / |J| = {worst:.2e} with a scatter of {stamp_scatter_ms} ms");
+    }
 }
 
 /// Largest `|J N| / |J|` of the prior over the four free directions.
@@ -124,7 +128,11 @@ fn dense(smoother: &mut Smoother) -> (DMatrix<f64>, DVector<f64>) {
 
 #[test]
 fn the_prior_is_the_dense_marginal() {
-    let (mut odometry, _) = flown(5, 4.0, |_, _| {});
+    [0.0, 4.0].into_iter().for_each(prior_is_the_dense_marginal);
+}
+
+fn prior_is_the_dense_marginal(stamp_scatter_ms: f64) {
+    let (mut odometry, _) = flown(5, 4.0, |config, _| config.smoother.stamp_scatter_ms = stamp_scatter_ms);
     let smoother = odometry.smoother().unwrap();
     // Only what leaves may speak, or both sides would have the rest in common: no landmarks of other hosts, and none
     // that lives on; robust weights stay as they are.
@@ -149,14 +157,15 @@ fn the_prior_is_the_dense_marginal() {
     }
     let mut marginalisation = MarginalisationReport::default();
     let (h, g) = dense(smoother);
-    let k = smoother.len();
-    let leaving: Vec<usize> = (0..9).chain(9 * k..9 * k + 6).collect();
-    let staying: Vec<usize> = (0..15 * k).filter(|i| !leaving.contains(i)).collect();
+    let (k, has_delays) = (smoother.len(), usize::from(stamp_scatter_ms > 0.0));
+    let poses = (9 + has_delays) * k;
+    let leaving: Vec<usize> = (0..9).chain(9 * k..9 * k + has_delays).chain(poses..poses + 6).collect();
+    let staying: Vec<usize> = (0..h.nrows()).filter(|i| !leaving.contains(i)).collect();
     let pick = |r: &[usize], c: &[usize]| DMatrix::from_fn(r.len(), c.len(), |i, j| h[(r[i], c[j])]);
     let (mm, sm, ss) = (pick(&leaving, &leaving), pick(&staying, &leaving), pick(&staying, &staying));
     let inverse = mm.try_inverse().unwrap();
     let expected = &ss - &sm * &inverse * sm.transpose();
-    let gm = DVector::from_fn(15, |i, _| g[leaving[i]]);
+    let gm = DVector::from_fn(leaving.len(), |i, _| g[leaving[i]]);
     let gs = DVector::from_fn(staying.len(), |i, _| g[staying[i]]);
     let expected_gradient = gs - &sm * inverse * gm;
 
@@ -176,7 +185,10 @@ fn the_prior_is_the_dense_marginal() {
 
 #[test]
 fn the_gradient_is_the_slope_of_the_cost() {
-    let (mut odometry, _) = flown(6, 1.5, |config, _| config.smoother.huber_sigmas = 10.0);
+    let (mut odometry, _) = flown(6, 1.5, |config, _| {
+        config.smoother.huber_sigmas = 10.0;
+        config.smoother.stamp_scatter_ms = 4.0;
+    });
     // No frame has left yet: all derivatives are at the present states, so gradient and cost belong together.
     let smoother = odometry.smoother().unwrap();
     assert!(smoother.prior.parts.is_empty());
@@ -192,8 +204,9 @@ fn the_gradient_is_the_slope_of_the_cost() {
     let cost = |sign: f64| {
         let mut moved = smoother.clone();
         for (k, frame) in moved.frames.iter_mut().enumerate() {
-            let n = 9 * system.frames;
-            let pose = SVector::<f64, 6>::from_fn(|i, _| sign * direction[n + 6 * k + i]);
+            let [pose, delay] = [Part::Pose(k), Part::Delay(k)].map(|part| system.offset(part));
+            frame.delay.apply(sign * direction[delay]);
+            let pose = SVector::<f64, 6>::from_fn(|i, _| sign * direction[pose + i]);
             let motion = SVector::<f64, 9>::from_fn(|i, _| sign * direction[9 * k + i]);
             frame.apply(&pose, &motion);
         }

@@ -1,5 +1,6 @@
 //! What the window holds.
 
+use super::delay::Delay;
 use super::inertial::{GaugePriorSigmas, Whitening};
 use super::visual::bearing_plus;
 use crate::imu::{NavState, Preintegration, Vector15};
@@ -86,6 +87,7 @@ pub(crate) struct Frame {
     pub(crate) motion_in_prior: bool,
     pub(crate) imu_factor: Option<ImuFactor>,
     pub(crate) standstill_sigma: Option<f64>,
+    pub(crate) delay: Delay,
     /// What is known of the motion since the frame before: that there was none.
     pub(crate) zero_motion: Option<super::standstill::ZeroMotionFactor>,
 }
@@ -104,6 +106,7 @@ impl Frame {
             motion_in_prior: false,
             imu_factor,
             standstill_sigma: None,
+            delay: Delay::default(),
             zero_motion: None,
         }
     }

@@ -20,11 +20,11 @@ const HARMFUL_FOCUS: f64 = 0.005;
 const HARMFUL_SHIFT: f64 = 0.002;
 const HARMFUL_DELAY: f64 = 2e-3;
 
-/// What a lens does that moves: autofocus of a phone, up to 2 % between near and far; optical stabilisation, up to a degree or two. And what stamps do that
-/// say when an image arrived: real phones scatter by 4 and 6 ms, up to 20.
+/// What a lens does that moves: autofocus of a phone, up to 2 % between near and far; optical stabilisation, up to a degree or two.
 const FOCUS: f64 = 0.015;
 const SHIFT: f64 = 0.015;
-const DELAY: f64 = 5e-3;
+/// Standard deviation of image stamps that say when an image arrived, s: real phones scatter by 4 and 6 ms, up to 20.
+pub const STAMP_SCATTER_SECS: f64 = 5e-3;
 
 /// What the measurements say that images have of their own beyond what they are taken to have; `None` where they do not. `system` is that of the solution.
 pub(super) fn moves(problem: &Problem, system: &System) -> Option<ImagePrior> {
@@ -44,7 +44,7 @@ pub(super) fn moves(problem: &Problem, system: &System) -> Option<ImagePrior> {
         (
             known.delay,
             ImagePrior { delay: Some(HARMFUL_DELAY), ..none },
-            ImagePrior { delay: Some(DELAY), ..known },
+            ImagePrior { delay: Some(STAMP_SCATTER_SECS), ..known },
         ),
     ];
     // One at a time: what a shift explains looks in part like a focal length that changes.

@@ -37,7 +37,7 @@ mod system;
 mod thin;
 
 pub use findings::AdjustmentFinding;
-pub use image_evidence::Focus;
+pub use image_evidence::{Focus, STAMP_SCATTER_SECS};
 pub(crate) use inertial::ImuGain;
 pub use log::TrackLog;
 pub(crate) use log::{LoggedState, TrackKey};

@@ -7,8 +7,10 @@ use crate::events::{CancelToken, Event, Events};
 use crate::input::{self, Measurement};
 use std::ops::ControlFlow;
 use std::time::Instant;
-use vidar_dataset::Recording;
-use vidar_odometry::bundle_adjustment::{CalibrationSigmas, Progress};
+use vidar_dataset::{CalibrationSource, Recording};
+use vidar_odometry::bundle_adjustment::{
+    Adjusted, AdjustmentFinding, CalibrationSigmas, Progress, STAMP_SCATTER_SECS,
+};
 use vidar_odometry::{ImuUse, Odometry};
 
 /// The stage of the adjustment, in events.
@@ -28,7 +30,8 @@ const DOUBTED_GYRO_NOISE_FACTOR: f64 = 60.0;
 
 /// Feeds a recording to the odometry, and adjusts all states after its end where `adjustable` says what may change. Where images and IMU contradict
 /// each other, all of it happens once more with a gyroscope that is hardly believed: stabilised images, or a gain that is off. That result stands where its
-/// adjustment explains the recording with the noise that the IMU has.
+/// adjustment explains the recording with the noise that the IMU has. Where image stamps scatter, it happens once more with stamps that are not believed to the
+/// millisecond.
 pub(crate) fn track(
     recording: &TrackingInput<'_>,
     adjustable: Option<&CalibrationSigmas>,
@@ -38,6 +41,7 @@ pub(crate) fn track(
 ) -> Result<Tracked, Error> {
     let mut passes = Passes { adjustable, events, cancel, dump };
     let tracked = passes.calibrated(recording)?;
+    let tracked = passes.with_scattering_stamps(recording, tracked)?;
     if adjustable.is_none() || !tracked.is_contradicted() || cancel.is_cancelled() {
         return Ok(tracked);
     }
@@ -75,6 +79,34 @@ impl Passes<'_> {
         let mut again = self.once(&TrackingInput { dataset: &dataset, config: &config, map })?;
         again.calibrated_again = Some([before, focal(&dataset)]);
         Ok(if again.adjusted.is_some() { again } else { tracked })
+    }
+
+    /// Where the adjustment finds that image stamps scatter, all of it happens once more with an odometry that knows. That result stands where it follows
+    /// as many images.
+    fn with_scattering_stamps(
+        &mut self,
+        recording: &TrackingInput<'_>,
+        tracked: Tracked,
+    ) -> Result<Tracked, Error> {
+        let TrackingInput { dataset, config, map } = *recording;
+        let scatter =
+            |a: &&Adjusted| a.findings.iter().any(|f| matches!(f, AdjustmentFinding::StampsScatter { .. }));
+        let first = tracked.adjusted.as_ref().filter(scatter);
+        let is_told = config.odometry.stamp_scatter_ms.is_some();
+        let Some(first) = first.filter(|_| !is_told && !self.cancel.is_cancelled()) else {
+            return Ok(tracked);
+        };
+        let (mut dataset, mut config) = (dataset.clone(), config.clone());
+        if dataset.calibration == CalibrationSource::Recording {
+            adjusted::apply(first, &mut dataset);
+            config.odometry.readout_ms = Some(1e3 * first.calibration.readout_secs.max(0.0));
+        }
+        config.odometry.stamp_scatter_ms = Some(1e3 * STAMP_SCATTER_SECS);
+        let mut again = self.once(&TrackingInput { dataset: &dataset, config: &config, map })?;
+        again.calibrated_again = tracked.calibrated_again;
+        let followed = |t: &Tracked| t.adjusted.as_ref().map_or(0, |a| a.images.len());
+        let is_better = followed(&again) >= followed(&tracked) && again.lost.len() <= tracked.lost.len();
+        Ok(if is_better { again } else { tracked })
     }
 
     /// One pass.

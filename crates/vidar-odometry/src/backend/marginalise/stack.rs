@@ -1,7 +1,7 @@
 //! The rows of the stack: every factor of the frame that leaves, whitened, in the columns that were laid out.
 
 use super::super::Smoother;
-use super::super::inertial::{body_velocity, by_time_offset, gauge_prior_at, jacobians, residual};
+use super::super::inertial::{body_velocity, by_ends, by_time_offset, gauge_prior_at, jacobians, residual};
 use super::super::linearise::{calibration_weights, shift_between};
 use super::super::prior::Part;
 use super::super::reprojection::{Scene, WeightedObservation};
@@ -9,7 +9,7 @@ use super::super::system::System;
 use super::super::window::{CALIBRATION_DIM, Landmark, OFFSET_AT};
 use super::Workspace;
 use crate::imu::Vector15;
-use nalgebra::{SMatrix, SVector};
+use nalgebra::{Matrix1, SMatrix, SVector, Vector1};
 
 impl Smoother {
     pub(super) fn stack_prior(&self, bench: &mut Workspace) {
@@ -37,6 +37,11 @@ impl Smoother {
     fn motion_step(&self, k: usize) -> Option<SVector<f64, 9>> {
         let frame = &self.frames[k];
         frame.motion_in_prior.then(|| frame.step.fixed_rows::<9>(6).into_owned())
+    }
+
+    fn delay_step(&self, k: usize) -> Option<Vector1<f64>> {
+        let delay = &self.frames[k].delay;
+        delay.in_prior.then(|| Vector1::new(delay.step_secs))
     }
 
     fn calibration_step(&self) -> Option<SVector<f64, CALIBRATION_DIM>> {
@@ -80,6 +85,17 @@ impl Smoother {
                 block.set_column(OFFSET_AT, &by);
                 bench.put(row, Part::Calibration, &block, self.calibration_step());
             }
+            if self.config.delay_sigma().is_some() {
+                let ends = by_ends(&imu_factor.preintegration, state_i, state_j, shift);
+                for (k, by) in [k - 1, k].into_iter().zip(ends) {
+                    bench.put(row, Part::Delay(k), &imu_factor.whitening.apply(&by), self.delay_step(k));
+                }
+            }
+        }
+        if let Some(sigma) = self.config.delay_sigma() {
+            let row = bench.stack.add_rows(1);
+            bench.put_rhs(row, &[self.frames[motion].delay.secs / sigma]);
+            bench.put(row, Part::Delay(motion), &Matrix1::new(1.0 / sigma), self.delay_step(motion));
         }
         for k in [gone, gone + 1] {
             let Some(rest) = self.frames.get(k).and_then(|f| f.zero_motion).filter(|_| k > 0) else {

@@ -1,6 +1,8 @@
 //! Residuals and their derivatives.
 
-use crate::backend::inertial::{Shift, body_velocity, by_time_offset, gauge_prior_at, jacobians, residual};
+use crate::backend::inertial::{
+    Shift, body_velocity, by_ends, by_time_offset, gauge_prior_at, jacobians, residual,
+};
 use crate::backend::visual::{self, CameraPose};
 use crate::backend::*;
 use crate::imu::{Bias, ImuModel, Vector15};
@@ -50,6 +52,15 @@ fn inertial_factor_agrees_with_numeric_derivatives() {
                 residual(&preintegration, &i, &j, shift)
             };
             check_jacobian("by clock", &by_offset, later, &Vector1::zeros(), 1e-6).unwrap();
+            let [by_begin, by_end] = by_ends(&preintegration, &i, &j, shift);
+            assert!((by_begin + by_end - by_offset).amax() < 1e-9 * by_end.amax());
+            let begin = |d: &Vector1<f64>| {
+                residual(&preintegration, &i, &j, Shift { begin: shift.begin + d.x, ..shift })
+            };
+            check_jacobian("by begin", &by_begin, begin, &Vector1::zeros(), 1e-6).unwrap();
+            let end =
+                |d: &Vector1<f64>| residual(&preintegration, &i, &j, Shift { end: shift.end + d.x, ..shift });
+            check_jacobian("by end", &by_end, end, &Vector1::zeros(), 1e-6).unwrap();
         }
     }
 }

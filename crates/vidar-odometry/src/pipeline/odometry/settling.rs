@@ -5,8 +5,10 @@
 //! σ; the odometry then goes on from the newest state of the adjustment (decision 38).
 
 use super::successor::level_motion;
-use super::{Odometry, Status};
-use crate::bundle_adjustment::{AdjustmentInput, CalibrationSigmas, NewestState, TrackLog, newest_state};
+use super::{Odometry, Phase, Status};
+use crate::bundle_adjustment::{
+    AdjustmentInput, CalibrationSigmas, NewestState, STAMP_SCATTER_SECS, TrackLog, newest_state,
+};
 use crate::deferred::Deferred;
 use vidar_core::{Duration, Se3, Timestamp};
 
@@ -90,6 +92,9 @@ impl Odometry {
         settling.is_provisional |= age >= JUDGED_SECS && tracking.scale_std > PROVISIONAL_STD;
         if let Some(solving) = settling.solving.take_if(|s| s.is_due(now)) {
             if let Some(found) = solving.result().flatten().filter(|found| found.scale_std < MAX_SCALE_STD) {
+                if found.stamps_scatter {
+                    self.expect_stamps_to_scatter();
+                }
                 match self.is_contradicted_by(&found) {
                     true => self.begin_successor_at(found),
                     false => self.revise_by(&found),
@@ -108,6 +113,16 @@ impl Odometry {
             let since = settling.needed_from(now);
             self.settling.solving =
                 self.begin_newest_state(since, now + Duration::from_secs_f64(SOLVING_SECS));
+        }
+    }
+
+    /// From here on every image has a delay of its own, unless the settings say how large it is.
+    fn expect_stamps_to_scatter(&mut self) {
+        if self.config.stamp_scatter_ms.is_none() {
+            self.config.stamp_scatter_ms = Some(1e3 * STAMP_SCATTER_SECS);
+            if let Phase::Tracking(window) = &mut self.phase {
+                window.smoother.set_stamp_scatter(STAMP_SCATTER_SECS);
+            }
         }
     }
 
