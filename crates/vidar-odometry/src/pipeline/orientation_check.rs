@@ -3,12 +3,15 @@
 //!
 //! Both rates are compared without their means, so a gyroscope bias does not matter. The rotation of the images is the
 //! one that fits the motion of bearings best; translation disturbs it, which is why what counts is not a small residual but
-//! whether another orientation would explain much more.
+//! whether another orientation would explain much more. A camera that circles something and turns with it still shows another rotation than it makes, so the
+//! other orientation has to explain the last images better with their translation free, too: by the epipolar constraint.
 
 use crate::tracking::Track;
 use nalgebra::{Matrix3, Vector3};
 use rustc_hash::FxHashMap;
+use std::collections::VecDeque;
 use vidar_core::{CameraModel, FrameId, LandmarkId, LieGroup, So3, nearest_rotation};
+use vidar_solve::statistics::median_upper;
 
 /// Tracks that a comparison needs.
 const MIN_TRACKS: usize = 15;
@@ -30,8 +33,14 @@ const MIN_SECOND_AXIS: f64 = 0.15;
 /// Share of the gyroscope's rotation that the images show with the given orientation, from which it is not doubted: what they leave unexplained
 /// is translation then. A turn by 60 degrees about any axis leaves two thirds of rotation in all directions.
 const SHOWN_SHARE: f64 = 0.7;
+/// Pairs of images whose rays are kept for the epipolar constraint, and the share of the given orientation's misfit that the best one may leave.
+const KEPT_PAIRS: usize = MIN_IMAGES;
+const MISFIT_SHARE: f64 = 0.5;
 /// Orientations nearer than this to the best one are not doubted, degrees.
 pub(crate) const MAX_TURN_DEG: f64 = 15.0;
+
+/// Rotation vector of the camera as the gyroscope felt it, `before_from_now`, and rays (before, now).
+type TurnedRays = (Vector3<f64>, Vec<(Vector3<f64>, Vector3<f64>)>);
 
 /// Sums over pairs of successive images.
 #[derive(Debug)]
@@ -41,6 +50,8 @@ pub(crate) struct OrientationCheck {
     last: FxHashMap<LandmarkId, Vector3<f64>>,
     current: FxHashMap<LandmarkId, Vector3<f64>>,
     pairs: Vec<(Vector3<f64>, Vector3<f64>)>,
+    /// Of the last pairs of images what the gyroscope felt, in axes of the camera, and the rays.
+    kept: VecDeque<TurnedRays>,
     images: usize,
     image_sum: Vector3<f64>,
     gyro_sum: Vector3<f64>,
@@ -57,6 +68,7 @@ impl OrientationCheck {
             last: FxHashMap::default(),
             current: FxHashMap::default(),
             pairs: Vec::new(),
+            kept: VecDeque::new(),
             images: 0,
             image_sum: Vector3::zeros(),
             gyro_sum: Vector3::zeros(),
@@ -87,7 +99,12 @@ impl OrientationCheck {
         }
         std::mem::swap(&mut self.last, &mut self.current);
         if let (Some((turn, secs)), Some(seen)) = (gyro.filter(|f| f.1 > 0.0), rotation_of(&self.pairs)) {
-            self.add_rates(self.camera_from_body * (turn / secs), seen / secs);
+            let felt = self.camera_from_body * turn;
+            self.add_rates(felt / secs, seen / secs);
+            let spare = if self.kept.len() < KEPT_PAIRS { None } else { self.kept.pop_front() };
+            let mut rays = spare.map_or_else(Vec::new, |(_, rays)| rays);
+            rays.clone_from(&self.pairs);
+            self.kept.push_back((felt, rays));
         }
     }
 
@@ -125,7 +142,23 @@ impl OrientationCheck {
         let turn_deg = (0.5 * (best.trace() - 1.0)).clamp(-1.0, 1.0).acos().to_degrees();
         let inconsistent =
             given > MAX_UNEXPLAINED_SHARE && least < BETTER_SHARE * given && turn_deg > MAX_TURN_DEG;
-        inconsistent.then_some(turn_deg)
+        let is_better = || self.misfit(&best) < MISFIT_SHARE * self.misfit(&Matrix3::identity());
+        (inconsistent && is_better()).then_some(turn_deg)
+    }
+
+    /// How far the kept pairs of images are from the epipolar constraint when what the gyroscope felt is turned: the mean over pairs of the median
+    /// `|(a × R b) · t|`, with `t` the direction of translation that fits the pair best.
+    fn misfit(&self, turned: &Matrix3<f64>) -> f64 {
+        let of_pair = |(felt, rays): &TurnedRays| {
+            let before_from_now = So3::exp(&(turned * felt));
+            let normals: Vec<Vector3<f64>> =
+                rays.iter().map(|(a, b)| a.cross(&(before_from_now * *b))).collect();
+            let eigen = normals.iter().map(|n| n * n.transpose()).sum::<Matrix3<f64>>().symmetric_eigen();
+            let t = eigen.eigenvectors.column(eigen.eigenvalues.imin()).into_owned();
+            let mut off: Vec<f64> = normals.iter().map(|n| n.dot(&t).abs()).collect();
+            median_upper(&mut off).unwrap_or(0.0)
+        };
+        self.kept.iter().map(of_pair).sum::<f64>() / self.kept.len().max(1) as f64
     }
 }
 
@@ -176,15 +209,29 @@ mod tests {
             .collect()
     }
 
+    /// Adds a pair of images `secs` apart of a body that turns at `rate` while its camera moves by `shift`.
+    fn add_pair(
+        check: &mut OrientationCheck,
+        truth: &So3,
+        rate: &Vector3<f64>,
+        shift: &Vector3<f64>,
+        secs: f64,
+    ) {
+        let bias = Vector3::new(0.05, -0.03, 0.02);
+        let rays = pairs(&(truth.inverse() * (rate * secs)), shift);
+        let felt = check.camera_from_body * ((rate + bias) * secs);
+        check.add_rates(felt / secs, rotation_of(&rays).unwrap() / secs);
+        check.kept.push_back((felt, rays));
+        check.kept.truncate(KEPT_PAIRS);
+    }
+
     fn check_with(given: So3, truth: So3) -> Option<f64> {
         let mut check = OrientationCheck::new(&given);
         for k in 0..60 {
             let t = 0.05 * f64::from(k);
             let rate = Vector3::new((2.0 * t).sin(), 0.7 * (3.1 * t).cos(), 0.5 * (1.7 * t).sin());
             let shift = Vector3::new(0.02, -0.01, 0.015) * (2.3 * t).cos();
-            let seen = rotation_of(&pairs(&(truth.inverse() * (rate * 0.05)), &shift)).unwrap();
-            let bias = Vector3::new(0.05, -0.03, 0.02);
-            check.add_rates(check.camera_from_body * (rate + bias), seen / 0.05);
+            add_pair(&mut check, &truth, &rate, &shift, 0.05);
         }
         check.inconsistency_deg()
     }
@@ -206,6 +253,24 @@ mod tests {
             check.add_rates(Vector3::new(ripple, 0.0, rate), Vector3::new(2.0 * rate, ripple, rate));
             assert_eq!(check.inconsistency_deg(), None, "after {k} images");
         }
+    }
+
+    #[test]
+    fn a_camera_that_circles_what_it_looks_at_is_not_doubted() {
+        // It moves sideways as it turns, twice as fast as would keep the points in place: they seem to turn the other way, about an axis askew.
+        let (truth, mut doubts) = (So3::exp(&Vector3::new(0.02, -0.03, 1.55)), 0);
+        let mut check = OrientationCheck::new(&truth);
+        for k in 0..60 {
+            let t = 0.05 * f64::from(k);
+            let rate = Vector3::new(0.5 * (1.1 * t).sin(), 0.6 * (0.8 * t).cos(), 0.1 * (1.7 * t).sin());
+            let turned = truth.inverse() * rate;
+            let shift = Vector3::new(-turned.y, 1.3 * turned.x + 0.8 * turned.y, 0.0) * (2.0 * 3.0 * 0.05);
+            add_pair(&mut check, &truth, &rate, &shift, 0.05);
+            assert_eq!(check.inconsistency_deg(), None, "after {k} images");
+            let best = nearest_rotation(&(check.cross / f64::from(k + 1))).unwrap().rotation.transpose();
+            doubts += usize::from(check.misfit(&best) >= MISFIT_SHARE * check.misfit(&Matrix3::identity()));
+        }
+        assert!(doubts > 30, "{doubts}");
     }
 
     #[test]
