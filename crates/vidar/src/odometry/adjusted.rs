@@ -205,8 +205,8 @@ fn stamps_scatter(rms_secs: f64) -> Warning {
         1e3 * rms_secs
     );
     Warning::new("stamps-scatter", message).hint(
-        "stamp images with the sensor's time (Android: the image's own timestamp), not when they arrive: `vidar live` and the live trajectory \
-         take stamps as they are",
+        "stamp images with the sensor's time (Android: the image's own timestamp), not when they arrive; `vidar live` finds it some seconds after the start, or is told \
+         by odometry.stamp_scatter_ms",
     )
 }
 
