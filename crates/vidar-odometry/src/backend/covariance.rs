@@ -128,7 +128,7 @@ impl Smoother {
     }
 
     /// Factorises the undamped system at the present states, once.
-    fn factorise(&mut self) -> Option<()> {
+    pub(crate) fn factorise(&mut self) -> Option<()> {
         if self.frames.is_empty() {
             return None;
         }

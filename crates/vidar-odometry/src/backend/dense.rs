@@ -82,6 +82,11 @@ impl Cholesky {
         true
     }
 
+    /// Half the logarithm of the determinant of what was factorised.
+    pub(crate) fn half_log_det(&self) -> f64 {
+        -self.inverse_diagonal.iter().map(|d| d.ln()).sum::<f64>()
+    }
+
     /// Dimension of the factor.
     pub(crate) fn dim(&self) -> usize {
         self.n

@@ -184,6 +184,32 @@ fn prior_is_the_dense_marginal(stamp_scatter_ms: f64) {
 }
 
 #[test]
+fn scattering_stamps_are_told_from_right_ones_and_from_a_clock_that_is_off() {
+    let log_factor = |stamp_scatter_secs, time_offset_secs| {
+        let course = Course { kind: CourseKind::Eight, secs: 7.0, speed: 1.2, phase: 0.4 };
+        let settings =
+            SimulationConfig { tracks: 60, stamp_scatter_secs, time_offset_secs, ..Default::default() };
+        let simulation = Simulation::new(&course, 0.0, 6.0, &settings);
+        let mut config = FeatureOdometryConfig::new(&ImuNoise::EUROC, 2.0);
+        config.smoother.estimate_time_offset = true;
+        let mut odometry = FeatureOdometry::for_simulation(config, &simulation).unwrap();
+        let first = &simulation.frames[0];
+        let sigmas = GaugePriorSigmas { velocity_mps: 0.2, tilt_rad: 0.02, ..GaugePriorSigmas::GAUGE };
+        odometry.start_at(first, NavState { bias: Bias::ZERO, ..first.truth }, sigmas).unwrap();
+        let mut sum = 0.0;
+        for (k, frame) in simulation.frames.iter().enumerate().skip(1) {
+            odometry.push(frame.id, frame.time, &frame.observations).unwrap();
+            if k % 20 == 0 {
+                sum += odometry.smoother().unwrap().log_scatter(2e-3).unwrap();
+            }
+        }
+        sum
+    };
+    let [right, late, scattering] = [(0.0, 0.0), (0.0, 0.01), (0.004, 0.0)].map(|(s, t)| log_factor(s, t));
+    assert!(right < -20.0 && late < -20.0 && scattering > 20.0, "{right:.1} {late:.1} {scattering:.1}");
+}
+
+#[test]
 fn the_gradient_is_the_slope_of_the_cost() {
     let (mut odometry, _) = flown(6, 1.5, |config, _| {
         config.smoother.huber_sigmas = 10.0;

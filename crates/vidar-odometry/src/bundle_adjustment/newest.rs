@@ -41,8 +41,6 @@ pub(crate) struct NewestState {
     pub(crate) readout_secs: f64,
     /// Of the sensors as they are logged.
     pub(crate) gain: ImuGain,
-    /// Whether image stamps were found to scatter.
-    pub(crate) stamps_scatter: bool,
 }
 
 impl NewestState {
@@ -103,7 +101,6 @@ pub(crate) fn newest_state(input: &AdjustmentInput<'_>) -> Result<NewestState, A
         time_offset,
         readout_secs: problem.calibration.readout_secs,
         gain: problem.calibration.gain,
-        stamps_scatter: problem.prior.image.delay.is_some(),
     })
 }
 

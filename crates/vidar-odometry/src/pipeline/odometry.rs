@@ -16,6 +16,7 @@ use crate::stages::{Stage, StageClock, StageTimes};
 use crate::tracking::{FrameInput, HostImage, ImagePool, SlidingWindowOdometry, TrackRecord, Tracker};
 use relocalization::Relocalizer;
 use settling::Settling;
+use stamps::StampQuestions;
 use start::initializing;
 use std::collections::VecDeque;
 use std::sync::Arc;
@@ -32,6 +33,7 @@ mod relocalization;
 mod report;
 mod saved_map;
 mod settling;
+mod stamps;
 mod start;
 mod successor;
 mod timing;
@@ -106,6 +108,7 @@ pub struct Odometry {
     recent: RecentFrames,
     successor: Option<Successor>,
     settling: Settling,
+    stamps: StampQuestions,
     clock: StageClock,
     /// What is kept for adjustments: of a scale that is not settled, and after the end.
     log: Option<TrackLog>,
@@ -157,6 +160,7 @@ impl Odometry {
         let phase = initializing(&config, imu_model.is_none(), &camera, tracker);
         let time_calibration = TimeCalibration::new(&config);
         Self {
+            stamps: StampQuestions::new(config.stamp_scatter_ms.is_some() || imu_model.is_none()),
             config,
             camera_id,
             check: OrientationCheck::new(&camera.body_from_camera.rotation),
@@ -308,6 +312,7 @@ impl Odometry {
             None => status,
         };
         self.clock.lap(if was_starting { Stage::Initialise } else { Stage::Output });
+        self.question_stamps(frame.time);
         self.settle_scale(&status, frame.time);
         self.shorten_log(frame.time);
         let mut status = self.follow_successor(id).unwrap_or(status);

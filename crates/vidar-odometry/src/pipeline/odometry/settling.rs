@@ -2,13 +2,11 @@
 //!
 //! A sliding window takes what it marginalises at the scale that it had then. Where that was far off, the window knows less of the scale than it
 //! says, and stays off. Adjusted all together with clock and gains among the unknowns, the same measurements give the scale with an honest
-//! σ; the odometry then goes on from the newest state of the adjustment (decision 38). The first ones also tell whether image stamps scatter (decision 43).
+//! σ; the odometry then goes on from the newest state of the adjustment (decision 38).
 
 use super::successor::level_motion;
-use super::{Odometry, Phase, Status};
-use crate::bundle_adjustment::{
-    AdjustmentInput, CalibrationSigmas, NewestState, STAMP_SCATTER_SECS, TrackLog, newest_state,
-};
+use super::{Odometry, Status};
+use crate::bundle_adjustment::{AdjustmentInput, CalibrationSigmas, NewestState, TrackLog, newest_state};
 use crate::deferred::Deferred;
 use vidar_core::{Duration, Se3, Timestamp};
 
@@ -27,9 +25,6 @@ const SETTLED_STD: f64 = 0.02;
 const FIRST_SECS: f64 = 2.5;
 const LATER: f64 = 2.0;
 const LAST_SECS: f64 = 45.0;
-
-/// Where the scale is settled, adjustments before this tell whether image stamps scatter, s after the start: two of them.
-const LOOKED_SECS: f64 = 10.0;
 
 /// Images of an adjustment are this far apart, twice as far as they are logged: its time grows with up to the cube of their number.
 const SPARSE_PERIOD: Duration = Duration::from_millis(400);
@@ -95,11 +90,7 @@ impl Odometry {
         settling.is_provisional |= age >= JUDGED_SECS && tracking.scale_std > PROVISIONAL_STD;
         if let Some(solving) = settling.solving.take_if(|s| s.is_due(now)) {
             if let Some(found) = solving.result().flatten().filter(|found| found.scale_std < MAX_SCALE_STD) {
-                if found.stamps_scatter {
-                    self.expect_stamps_to_scatter();
-                }
                 match self.is_contradicted_by(&found) {
-                    _ if !self.settling.is_provisional => None,
                     true => self.begin_successor_at(found),
                     false => self.revise_by(&found),
                 };
@@ -112,21 +103,11 @@ impl Odometry {
         }
         settling.due_secs = LATER * due;
         let is_settled = !settling.is_provisional || tracking.scale_std < SETTLED_STD;
-        settling.is_over = due >= if is_settled { LOOKED_SECS } else { LAST_SECS };
+        settling.is_over = is_settled || due > LAST_SECS;
         if !settling.is_over() {
             let since = settling.needed_from(now);
             self.settling.solving =
                 self.begin_newest_state(since, now + Duration::from_secs_f64(SOLVING_SECS));
-        }
-    }
-
-    /// From here on every image has a delay of its own, unless the settings say how large it is.
-    fn expect_stamps_to_scatter(&mut self) {
-        if self.config.stamp_scatter_ms.is_none() {
-            self.config.stamp_scatter_ms = Some(1e3 * STAMP_SCATTER_SECS);
-            if let Phase::Tracking(window) = &mut self.phase {
-                window.smoother.set_stamp_scatter(STAMP_SCATTER_SECS);
-            }
         }
     }
 
