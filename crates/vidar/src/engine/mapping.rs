@@ -173,7 +173,9 @@ impl Engine<'_> {
         if completes {
             let mut mesh = surface.mesh();
             let floor = self.floor_with_much_below(&mesh, placement).filter(|_| !is_stopped());
-            let through = floor.as_ref().map(|f| share_through(f, &chunks[..fused], &read)).transpose()?;
+            let unmasked = |chunk| read(chunk, None);
+            let through =
+                floor.as_ref().map(|f| share_through(f, &chunks[..fused], &unmasked)).transpose()?;
             let floor = floor.filter(|_| through.is_some_and(|share| share > LEAST_THROUGH));
             if let (Some(floor), Some(share)) = (&floor, through) {
                 (surface, fused) = fuse(Some(floor), sink)?;
@@ -216,11 +218,11 @@ fn read_views(
 fn share_through(
     floor: &Floor,
     chunks: &[ChunkId],
-    read: &dyn Fn(ChunkId, Option<&Floor>) -> Result<Vec<Shaped>, Error>,
+    read: &dyn Fn(ChunkId) -> Result<Vec<Shaped>, Error>,
 ) -> Result<f64, Error> {
     let (mut through, mut all) = (0, 0);
     for chunk in chunks {
-        for Shaped { view, .. } in read(*chunk, None)? {
+        for Shaped { view, .. } in read(*chunk)? {
             all += view.depth().image().data().iter().filter(|z| z.is_finite()).count();
             let mask = floor.seen_through(&view);
             through += mask.map_or(0, |m| m.data().iter().filter(|is| **is).count());
