@@ -40,12 +40,16 @@ pub(crate) fn track(
     dump: Option<&mut dump::Dump>,
 ) -> Result<Tracked, Error> {
     let mut passes = Passes { adjustable, events, cancel, dump };
-    let tracked = passes.calibrated(recording)?;
+    let mut config = recording.config.clone();
+    if adjustable.is_some() {
+        // The adjustment tells scattering stamps from stabilised images; the window, which takes either for scattering stamps, is not asked.
+        config.odometry.stamp_scatter_ms.get_or_insert(0.0);
+    }
+    let tracked = passes.calibrated(&TrackingInput { config: &config, ..*recording })?;
     let tracked = passes.with_scattering_stamps(recording, tracked)?;
     if adjustable.is_none() || !tracked.is_contradicted() || cancel.is_cancelled() {
         return Ok(tracked);
     }
-    let mut config = recording.config.clone();
     let factor = &mut config.odometry.gyro_noise_factor;
     *factor = factor.max(DOUBTED_GYRO_NOISE_FACTOR);
     let again = passes.calibrated(&TrackingInput { config: &config, ..*recording })?;
@@ -81,7 +85,7 @@ impl Passes<'_> {
         Ok(if again.adjusted.is_some() { again } else { tracked })
     }
 
-    /// Where the adjustment finds that image stamps scatter, all of it happens once more with an odometry that knows. That result stands where it follows
+    /// Where the adjustment finds that image stamps scatter, and no shift of the images, all of it happens once more with an odometry that knows. That result stands where it follows
     /// as many images.
     fn with_scattering_stamps(
         &mut self,
@@ -89,8 +93,11 @@ impl Passes<'_> {
         tracked: Tracked,
     ) -> Result<Tracked, Error> {
         let TrackingInput { dataset, config, map } = *recording;
-        let scatter =
-            |a: &&Adjusted| a.findings.iter().any(|f| matches!(f, AdjustmentFinding::StampsScatter { .. }));
+        let finds = |a: &Adjusted, what: fn(&AdjustmentFinding) -> bool| a.findings.iter().any(what);
+        let scatter = |a: &&Adjusted| {
+            finds(a, |f| matches!(f, AdjustmentFinding::StampsScatter { .. }))
+                && !finds(a, |f| matches!(f, AdjustmentFinding::Shifted { .. }))
+        };
         let first = tracked.adjusted.as_ref().filter(scatter);
         let is_told = config.odometry.stamp_scatter_ms.is_some();
         let Some(first) = first.filter(|_| !is_told && !self.cancel.is_cancelled()) else {
