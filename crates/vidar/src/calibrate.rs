@@ -218,7 +218,7 @@ pub(crate) fn complete(
         Err(Error::NotCalibrated { .. }) if has_lens => return Ok(()),
         found => found?,
     };
-    match too_uncertain(&found) {
+    match too_uncertain(&found, has_lens) {
         Some(_) if has_lens => return Ok(()),
         Some(reason) => return Err(Error::NotCalibrated { name: dataset.name.clone(), reason }),
         None => {}
@@ -230,7 +230,9 @@ pub(crate) fn complete(
     let model = model_of(&found, size)?;
     let is_lens_plain = is_plain(dataset);
     let Some(camera) = dataset.rig.cameras.get_mut(dataset.camera.index()) else { return Ok(()) };
-    if !has_lens || is_lens_plain && contradicts(&found, &camera.model) {
+    // What is found of the lens may be vague where one is given.
+    let is_lens_known = vague_focal(&found).is_none();
+    if !has_lens || is_lens_known && is_lens_plain && contradicts(&found, &camera.model) {
         camera.model = model;
     }
     camera.body_from_camera = Se3::new(found.body_from_camera, nalgebra::Vector3::zeros());
@@ -261,7 +263,8 @@ pub(crate) fn found_in_words(
     cancel: &CancelToken,
 ) -> Result<String, String> {
     let found = events.stage(STAGE, 0, || look(dataset, events, cancel)).map_err(|e| e.to_string())?;
-    match too_uncertain(&found) {
+    let has_lens = MissingCalibration::of(dataset) == Some(MissingCalibration::Mount);
+    match too_uncertain(&found, has_lens) {
         Some(reason) => {
             Err(format!("{}; too uncertain to be used unasked: {reason}", report::values(&found)))
         }
@@ -350,20 +353,25 @@ pub(crate) fn model_of(found: &Calibration, (width, height): (usize, usize)) -> 
     Ok(CameraModel::RadTan(RadTan::new(pinhole, [k1, k2, 0.0, 0.0])?))
 }
 
-/// Why a calibration that was found is too uncertain to be used without being asked for: rotation and focal length not known
+/// Why a calibration that was found is too uncertain to be used without being asked for: rotation and focal length (unless a lens is given) not known
 /// well enough for tracks and gyroscope to agree within a few pixels, or the clock not within a tenth of a second's motion.
-fn too_uncertain(found: &Calibration) -> Option<String> {
-    let focal = found.focal_px.sigma / found.focal_px.value;
+fn too_uncertain(found: &Calibration, has_lens: bool) -> Option<String> {
     let clock_ms = 1e3 * found.time_offset_secs.sigma;
     if !found.rotation_is_observable {
         Some("the camera turns too little to show how it is mounted on the IMU".into())
-    } else if !found.focal_px.is_observable || focal > MAX_FOCAL_SIGMA {
-        Some(format!("its focal length is shown to {:.0} % only", 100.0 * focal))
-    } else if clock_ms > MAX_CLOCK_SIGMA_MS {
-        Some(format!("its clock offset is shown to {clock_ms:.0} ms only"))
+    } else if let Some(vague) = vague_focal(found).filter(|_| !has_lens) {
+        Some(vague)
     } else {
-        None
+        let is_vague = clock_ms > MAX_CLOCK_SIGMA_MS;
+        is_vague.then(|| format!("its clock offset is shown to {clock_ms:.0} ms only"))
     }
+}
+
+/// That the focal length is not known well enough to be used, in words.
+fn vague_focal(found: &Calibration) -> Option<String> {
+    let share = found.focal_px.sigma / found.focal_px.value;
+    let is_vague = !found.focal_px.is_observable || share > MAX_FOCAL_SIGMA;
+    is_vague.then(|| format!("its focal length is shown to {:.0} % only", 100.0 * share))
 }
 
 /// A readout that is not there within three standard deviations and below 4 ms is a global shutter's.
