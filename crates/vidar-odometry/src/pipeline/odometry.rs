@@ -369,7 +369,7 @@ impl Odometry {
                 let frame_id = host.frame;
                 let step = window.step(FrameInput { host, time, preintegration, imu_still }, &mut self.clock);
                 self.check.add(&self.camera.model, &window.tracker.tracks, frame_id, gyro);
-                if let Some(found) = self.check.inconsistency_deg() {
+                if let Some(found) = self.check.contradiction_deg() {
                     let (sign, limit) = (DivergenceSign::CameraOrientation, MAX_TURN_DEG);
                     return self.lose(LossReason::Diverged { sign, found, limit });
                 }
