@@ -191,6 +191,31 @@ pub(crate) fn jacobians(
     (by_i, by_j)
 }
 
+/// What derivatives of [`residual`] by shifts need: the motion from the first instant on, that of all, what the states' turn is beyond it, and the slope of
+/// its logarithm.
+struct ShiftedTurn {
+    rest: MotionIncrement,
+    all: MotionIncrement,
+    beyond: So3,
+    log_slope: Matrix3<f64>,
+}
+
+impl ShiftedTurn {
+    fn new([before, integrated, after]: &[MotionIncrement; 3], i: &NavState, j: &NavState) -> Self {
+        let rest = integrated.then(after);
+        let all = before.then(&rest);
+        let back = i.world_from_body.rotation.inverse();
+        let beyond = all.turn.inverse() * (back * j.world_from_body.rotation);
+        let log_slope = So3::right_jacobian_inverse(&beyond.log()).unwrap_or_else(Matrix3::identity);
+        Self { rest, all, beyond, log_slope }
+    }
+
+    /// Of the rotation's residual, where the motion turns on by `d_turn` at its end.
+    fn by(&self, d_turn: Vector3<f64>) -> Vector3<f64> {
+        -(self.log_slope * (self.beyond.inverse() * d_turn))
+    }
+}
+
 /// Derivative of [`residual`] by the clock offset, which shifts both ends alike.
 pub(crate) fn by_time_offset(
     preintegration: &Preintegration,
@@ -199,14 +224,10 @@ pub(crate) fn by_time_offset(
     shift: Shift,
 ) -> Vector15 {
     let parts = moved(preintegration, i, shift);
-    let [before, integrated, after] = &parts;
+    let [before, integrated, _] = &parts;
     let [first, last] = preintegration.ends();
-    let rest = integrated.then(after);
-    let all = before.then(&rest);
-    let back = i.world_from_body.rotation.inverse();
-    let q = all.turn.inverse() * (back * j.world_from_body.rotation);
-    let turn = q.log();
-    let log_slope = So3::right_jacobian_inverse(&turn).unwrap_or_else(Matrix3::identity);
+    let shifted = ShiftedTurn::new(&parts, i, j);
+    let rest = &shifted.rest;
     let d_turn = last.turn - rest.turn.inverse() * first.turn;
     let d_velocity =
         -first.force + before.turn * (integrated.turn * last.force - first.turn.cross(&rest.velocity));
@@ -215,7 +236,7 @@ pub(crate) fn by_time_offset(
         + before.velocity
         + before.turn * (d_rest_position - first.turn.cross(&rest.position));
     let mut by = Vector15::zeros();
-    by.fixed_rows_mut::<3>(0).copy_from(&-(log_slope * (q.inverse() * d_turn)));
+    by.fixed_rows_mut::<3>(0).copy_from(&shifted.by(d_turn));
     by.fixed_rows_mut::<3>(3).copy_from(&-d_position);
     by.fixed_rows_mut::<3>(6).copy_from(&-d_velocity);
     by
@@ -230,20 +251,18 @@ pub(crate) fn by_ends(
     shift: Shift,
 ) -> [Vector15; 2] {
     let parts = moved(preintegration, i, shift);
-    let [before, integrated, after] = &parts;
+    let [before, integrated, _] = &parts;
     let [first, last] = preintegration.ends();
-    let rest = integrated.then(after);
-    let all = before.then(&rest);
+    let shifted = ShiftedTurn::new(&parts, i, j);
+    let (rest, all) = (&shifted.rest, &shifted.all);
     let back = i.world_from_body.rotation.inverse();
-    let q = all.turn.inverse() * (back * j.world_from_body.rotation);
-    let log_slope = So3::right_jacobian_inverse(&q.log()).unwrap_or_else(Matrix3::identity);
     let gravity = preintegration.model().gravity();
     // Of the states' part of the residual by the length of the stretch.
     let moved = -(back * (i.velocity + gravity * all.secs));
     let sped = -(back * gravity);
     let by = |d_turn: Vector3<f64>, d_position: Vector3<f64>, d_velocity: Vector3<f64>, d_secs: f64| {
         let mut by = Vector15::zeros();
-        by.fixed_rows_mut::<3>(0).copy_from(&-(log_slope * (q.inverse() * d_turn)));
+        by.fixed_rows_mut::<3>(0).copy_from(&shifted.by(d_turn));
         by.fixed_rows_mut::<3>(3).copy_from(&(moved * d_secs - d_position));
         by.fixed_rows_mut::<3>(6).copy_from(&(sped * d_secs - d_velocity));
         by

@@ -18,7 +18,7 @@ const DECISIVE: f64 = 10.0;
 /// pixel, and so is what a camera turns by in 2 ms at 60°/s.
 const HARMFUL_FOCUS: f64 = 0.005;
 const HARMFUL_SHIFT: f64 = 0.002;
-const HARMFUL_DELAY: f64 = 2e-3;
+pub(crate) const HARMFUL_DELAY: f64 = 2e-3;
 
 /// What a lens does that moves: autofocus of a phone, up to 2 % between near and far; optical stabilisation, up to a degree or two.
 const FOCUS: f64 = 0.015;

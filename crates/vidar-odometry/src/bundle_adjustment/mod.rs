@@ -37,6 +37,7 @@ mod system;
 mod thin;
 
 pub use findings::AdjustmentFinding;
+pub(crate) use image_evidence::HARMFUL_DELAY;
 pub use image_evidence::{Focus, STAMP_SCATTER_SECS};
 pub(crate) use inertial::ImuGain;
 pub use log::TrackLog;

@@ -57,6 +57,15 @@ pub(crate) fn track(
     Ok(if is_explained { again } else { tracked })
 }
 
+/// A recording and its settings with the calibration that an adjustment found.
+fn as_adjusted(adjusted: &Adjusted, dataset: &Recording, config: &Config) -> (Recording, Config) {
+    let (mut dataset, mut config) = (dataset.clone(), config.clone());
+    adjusted::apply(adjusted, &mut dataset);
+    // A global shutter's may come out a little below zero, which no setting is.
+    config.odometry.readout_ms = Some(1e3 * adjusted.calibration.readout_secs.max(0.0));
+    (dataset, config)
+}
+
 /// What every pass over a recording is done with.
 struct Passes<'a> {
     /// What an adjustment after the end may change, where one is wanted.
@@ -77,16 +86,14 @@ impl Passes<'_> {
         let Some(first) = first.filter(|_| !self.cancel.is_cancelled()) else { return Ok(tracked) };
         let focal = |dataset: &Recording| dataset.rig.cameras[dataset.camera.index()].model.intrinsics().fx;
         let before = focal(dataset);
-        let (mut dataset, mut config) = (dataset.clone(), config.clone());
-        adjusted::apply(first, &mut dataset);
-        config.odometry.readout_ms = Some(1e3 * first.calibration.readout_secs);
+        let (dataset, config) = as_adjusted(first, dataset, config);
         let mut again = self.once(&TrackingInput { dataset: &dataset, config: &config, map })?;
         again.calibrated_again = Some([before, focal(&dataset)]);
         Ok(if again.adjusted.is_some() { again } else { tracked })
     }
 
-    /// Where the adjustment finds that image stamps scatter, and no shift of the images, all of it happens once more with an odometry that knows. That result stands where it follows
-    /// as many images.
+    /// Where the adjustment finds that image stamps scatter, and no shift of the images, all of it happens once more with an odometry that knows, and with
+    /// the calibration as adjusted where that is the recording's own. That result stands where it follows as many images.
     fn with_scattering_stamps(
         &mut self,
         recording: &TrackingInput<'_>,
@@ -103,11 +110,9 @@ impl Passes<'_> {
         let Some(first) = first.filter(|_| !is_told && !self.cancel.is_cancelled()) else {
             return Ok(tracked);
         };
-        let (mut dataset, mut config) = (dataset.clone(), config.clone());
-        if dataset.calibration == CalibrationSource::Recording {
-            adjusted::apply(first, &mut dataset);
-            config.odometry.readout_ms = Some(1e3 * first.calibration.readout_secs.max(0.0));
-        }
+        let is_own = dataset.calibration == CalibrationSource::Recording;
+        let (dataset, mut config) =
+            if is_own { as_adjusted(first, dataset, config) } else { (dataset.clone(), config.clone()) };
         config.odometry.stamp_scatter_ms = Some(1e3 * STAMP_SCATTER_SECS);
         let mut again = self.once(&TrackingInput { dataset: &dataset, config: &config, map })?;
         again.calibrated_again = tracked.calibrated_again;

@@ -1,15 +1,12 @@
 //! Whether image stamps scatter, asked of the window while images come (decision 43).
 
 use super::{Odometry, Phase};
-use crate::bundle_adjustment::STAMP_SCATTER_SECS;
+use crate::bundle_adjustment::{HARMFUL_DELAY, STAMP_SCATTER_SECS};
 use vidar_core::Timestamp;
 
 /// Time between questions, s: by then the window has other frames but for its keyframes. So many are asked at most.
 const PAUSE_SECS: f64 = 1.0;
 const MOST: usize = 30;
-
-/// The scatter that is asked for, s: less does no harm.
-const HARMFUL_SECS: f64 = 2e-3;
 
 /// Sum of the logarithms of Bayes factors from which stamps scatter, and from which they do not. Of rendered recordings by ten devices those whose stamps scatter
 /// by 3 ms had more than 20 after one to three questions, the others -60 to -240 after twenty. Stabilised images, which turn against the gyroscope, may have 20, too; their live
@@ -52,7 +49,7 @@ impl Odometry {
         if !self.stamps.is_due(now) {
             return;
         }
-        let answer = window.smoother.log_scatter(HARMFUL_SECS).unwrap_or(0.0);
+        let answer = window.smoother.log_scatter(HARMFUL_DELAY).unwrap_or(0.0);
         if self.stamps.take(answer, now) {
             self.config.stamp_scatter_ms = Some(1e3 * STAMP_SCATTER_SECS);
             window.smoother.set_stamp_scatter(STAMP_SCATTER_SECS);
