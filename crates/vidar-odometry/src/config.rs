@@ -53,6 +53,9 @@ pub struct OdometryConfig {
     /// Standard deviation of image stamps about the instants of exposure, milliseconds, 0…20: large where an image is stamped when it arrives. Absent: 0 until
     /// the images contradict that, then 5; a recording on disk is tracked once more then.
     pub stamp_scatter_ms: Option<f64>,
+    /// Standard deviation of how far a stabiliser shifts each image, as the angle that the camera would have to turn by, degrees, 0…3. Absent: 0 until the images
+    /// contradict that, then 0.86; a recording on disk is tracked once more then.
+    pub image_shift_deg: Option<f64>,
     /// Whether the camera's place on the body is refined on the way.
     pub estimate_extrinsics: bool,
     /// Whether all states of a recording on disk are adjusted together after its end: better poses, and poses for the images
@@ -81,6 +84,7 @@ impl Default for OdometryConfig {
             estimate_extrinsics: false,
             readout_ms: None,
             stamp_scatter_ms: None,
+            image_shift_deg: None,
             adjust: true,
             max_speed_mps: 20.0,
             max_blind_secs: 2.0,
@@ -102,6 +106,7 @@ impl OdometryConfig {
             estimate_camera_position: has_imu && self.estimate_extrinsics,
             linearisation,
             stamp_scatter_ms: self.stamp_scatter_ms.filter(|_| has_imu).unwrap_or(0.0),
+            image_shift_deg: self.image_shift_deg.filter(|_| has_imu).unwrap_or(0.0),
             ..SmootherConfig::default()
         }
     }
@@ -124,6 +129,7 @@ impl OdometryConfig {
         check("gravity_mps2", self.gravity_mps2, 9.5, 10.0, "9.5 to 10 m/s²")?;
         check("readout_ms", self.readout_ms.unwrap_or(0.0), 0.0, 50.0, "0 to 50 ms")?;
         check("stamp_scatter_ms", self.stamp_scatter_ms.unwrap_or(0.0), 0.0, 20.0, "0 to 20 ms")?;
+        check("image_shift_deg", self.image_shift_deg.unwrap_or(0.0), 0.0, 3.0, "0 to 3 degrees")?;
         check("max_speed_mps", self.max_speed_mps, 0.1, 100.0, "0.1 to 100 m/s")?;
         check("max_blind_secs", self.max_blind_secs, 0.1, 10.0, "0.1 to 10 s")
     }
@@ -136,7 +142,7 @@ mod tests {
     #[test]
     fn each_bad_key_is_named() {
         type Corrupt = fn(&mut OdometryConfig);
-        let cases: [(&str, Corrupt); 11] = [
+        let cases: [(&str, Corrupt); 12] = [
             ("max_landmarks", |c| c.max_landmarks = 3),
             ("max_keyframes", |c| c.max_keyframes = 100),
             ("iterations", |c| c.iterations = 0),
@@ -146,6 +152,7 @@ mod tests {
             ("gyro_gain_std", |c| c.gyro_gain_std = 0.5),
             ("gravity_mps2", |c| c.gravity_mps2 = 1.62),
             ("stamp_scatter_ms", |c| c.stamp_scatter_ms = Some(-1.0)),
+            ("image_shift_deg", |c| c.image_shift_deg = Some(4.0)),
             ("max_speed_mps", |c| c.max_speed_mps = 0.0),
             ("max_blind_secs", |c| c.max_blind_secs = f64::INFINITY),
         ];

@@ -48,6 +48,8 @@ pub struct SmootherConfig {
     /// Standard deviation of each image's stamp about the instant of its exposure, milliseconds, 0…20; 0: stamps are right up to the clock offset. Needs
     /// `estimate_time_offset`, which is their mean.
     pub stamp_scatter_ms: f64,
+    /// Standard deviation of how far a stabiliser shifts each image, as the angle by which the camera would have to turn, degrees, 0…3; 0: images are not shifted.
+    pub image_shift_deg: f64,
 }
 
 impl Default for SmootherConfig {
@@ -65,6 +67,7 @@ impl Default for SmootherConfig {
             camera_position_sigma_m: 0.01,
             time_offset_sigma_ms: 5.0,
             stamp_scatter_ms: 0.0,
+            image_shift_deg: 0.0,
         }
     }
 }
@@ -84,6 +87,7 @@ impl SmootherConfig {
             ("camera_position_sigma_m", self.camera_position_sigma_m, 1e-4, 0.5),
             ("time_offset_sigma_ms", self.time_offset_sigma_ms, 0.01, 100.0),
             ("stamp_scatter_ms", self.stamp_scatter_ms, 0.0, 20.0),
+            ("image_shift_deg", self.image_shift_deg, 0.0, 3.0),
         ];
         for (key, found, low, high) in ranges {
             if !(low..=high).contains(&found) {
@@ -104,6 +108,10 @@ impl SmootherConfig {
     /// Standard deviation of an image's delay, s, where every image has one of its own.
     pub(crate) fn delay_sigma(&self) -> Option<f64> {
         (self.stamp_scatter_ms > 0.0).then_some(self.stamp_scatter_ms * 1e-3)
+    }
+
+    pub(crate) fn image_shift_sigma(&self) -> Option<f64> {
+        (self.image_shift_deg > 0.0).then_some(self.image_shift_deg.to_radians())
     }
 
     pub(crate) fn calibrates_camera(&self) -> bool {

@@ -1,6 +1,6 @@
 //! Delays of images whose stamps scatter: every frame has one, an unknown of the inertial factors on both of its sides.
 
-use super::{Smoother, dot};
+use super::Smoother;
 use crate::imu::NavState;
 use nalgebra::{SVector, Vector3};
 use vidar_core::{LieGroup, Se3, So3};
@@ -33,42 +33,7 @@ impl Delay {
     }
 }
 
-/// The quadratic approximation of the cost: what its minimum is lower by, and half the logarithm of its determinant.
-struct Fit {
-    decrease: f64,
-    half_log_det: f64,
-}
-
 impl Smoother {
-    /// From now on every image's stamp is off by so much, standard deviation, s: [`super::SmootherConfig::stamp_scatter_ms`]. What is in the prior stays.
-    pub(crate) fn set_stamp_scatter(&mut self, sigma_secs: f64) {
-        self.config.stamp_scatter_ms = 1e3 * sigma_secs;
-        self.system.factorised = false;
-    }
-
-    /// Logarithm of how many times more probable the window's measurements are where image stamps scatter by `sigma_secs` than where they do not (Laplace's
-    /// approximation at the present states). `None` where they are taken to scatter already, or a system is singular.
-    pub(crate) fn log_scatter(&mut self, sigma_secs: f64) -> Option<f64> {
-        if self.config.delay_sigma().is_some() {
-            return None;
-        }
-        let without = self.fit();
-        self.set_stamp_scatter(sigma_secs);
-        let with = self.fit();
-        self.set_stamp_scatter(0.0);
-        let (without, with) = without.zip(with)?;
-        let occam = with.half_log_det - without.half_log_det + self.frames.len() as f64 * sigma_secs.ln();
-        Some(with.decrease - without.decrease - occam)
-    }
-
-    fn fit(&mut self) -> Option<Fit> {
-        self.factorise()?;
-        let cholesky = &self.system.cholesky;
-        let mut whitened = self.system.gradient.clone();
-        cholesky.forward(&mut whitened);
-        Some(Fit { decrease: 0.5 * dot(&whitened, &whitened), half_log_det: cholesky.half_log_det() })
-    }
-
     /// Applies a frame's step. What of it follows from the later instant is the motion until then, of the state that it leads to: velocity times delay is
     /// a millimetre where the IMU knows a hundredth of one, and a linear step would miss by its square.
     pub(crate) fn apply_with_delay(

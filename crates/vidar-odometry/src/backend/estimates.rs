@@ -136,7 +136,8 @@ impl Smoother {
         for pair in self.frames.windows(2) {
             let Some(imu_factor) = &pair[1].imu_factor else { continue };
             let shift = linearise::shift_between(&self.calibration, &pair[0], &pair[1]);
-            let r = inertial::residual(&imu_factor.preintegration, &pair[0].state, &pair[1].state, shift);
+            let [from, to] = [0, 1].map(|k| self.body_of(&pair[k], &pair[k].state).state);
+            let r = inertial::residual(&imu_factor.preintegration, &from, &to, shift);
             sum = (sum.0 + imu_factor.whitening.apply(&r).norm_squared(), sum.1 + 15.0);
         }
         if sum.1 > 0.0 { sum.0 / sum.1 } else { 0.0 }

@@ -1,12 +1,12 @@
 //! Linearises the window's factors into its normal equations ([`System`]); landmarks are eliminated.
 
-use super::inertial::{Shift, body_velocity, by_ends, by_time_offset, gauge_prior_at, jacobians, residual};
+use super::inertial::{Shift, body_velocity, gauge_prior_at};
 use super::prior::Part;
 use super::products::{product, transposed_product};
 use super::reprojection::{Scene, WeightedObservation};
 use super::system::{EliminatedLandmark, PoseLandmarkBlock, System};
 use super::visual::CameraPose;
-use super::window::{CALIBRATION_DIM, CalibrationState, Frame, Landmark, OFFSET_AT};
+use super::window::{CALIBRATION_DIM, CalibrationState, Frame, Landmark};
 use super::{Linearisation, Smoother, SmootherConfig};
 use nalgebra::{SMatrix, SVector};
 use vidar_core::simd::kernel;
@@ -46,13 +46,19 @@ impl Smoother {
 
     /// Builds the system at the present states and returns the robust cost.
     pub(crate) fn linearise(&mut self, system: &mut System, lambda: f64) -> f64 {
-        system.begin(self.frames.len(), self.config.delay_sigma().is_some(), self.config.calibrates());
+        system.begin(
+            self.frames.len(),
+            self.config.delay_sigma().is_some(),
+            self.config.image_shift_sigma().is_some(),
+            self.config.calibrates(),
+        );
         self.place_cameras(system);
         let mut cost = self.add_prior(system);
         cost += self.add_anchor(system);
         for k in 0..self.frames.len() {
             cost += self.add_link(system, k);
             cost += self.add_delay(system, k);
+            cost += self.add_image_shift(system, k);
             cost += self.add_standstill_factor(system, k);
             cost += self.add_rest_factor(system, k);
         }
@@ -122,87 +128,6 @@ impl Smoother {
         system.add(at_pose, at_pose, &(jp.transpose() * jp), 1.0);
         system.add_gradient(at_motion, &(jm.transpose() * r), 1.0);
         system.add_gradient(at_pose, &(jp.transpose() * r), 1.0);
-        0.5 * r.norm_squared()
-    }
-
-    fn add_link(&mut self, system: &mut System, k: usize) -> f64 {
-        if k == 0 {
-            return 0.0;
-        }
-        let (before, rest) = self.frames.split_at_mut(k);
-        let (from, to) = (&before[k - 1], &mut rest[0]);
-        let shift = shift_between(&self.calibration, from, to);
-        let Some(imu_factor) = &mut to.imu_factor else { return 0.0 };
-        imu_factor.follow(&from.state);
-        let r =
-            imu_factor.whitening.apply(&residual(&imu_factor.preintegration, &from.state, &to.state, shift));
-        let (state_i, state_j) = (&system.states_at[k - 1], &system.states_at[k]);
-        let (ji, jj) = jacobians(&imu_factor.preintegration, state_i, state_j, shift);
-        let by_offset = self.config.estimate_time_offset.then(|| {
-            imu_factor.whitening.apply(&by_time_offset(&imu_factor.preintegration, state_i, state_j, shift))
-        });
-        let by_ends = (system.delays > 0).then(|| {
-            by_ends(&imu_factor.preintegration, state_i, state_j, shift)
-                .map(|d| imu_factor.whitening.apply(&d))
-        });
-        let (ji, jj) = (imu_factor.whitening.apply(&ji), imu_factor.whitening.apply(&jj));
-        let parts = [Part::Motion(k - 1), Part::Motion(k), Part::Pose(k - 1), Part::Pose(k)];
-        for a in 0..4 {
-            for b in 0..a {
-                system.couple(parts[a], parts[b]);
-            }
-        }
-        let [mi, mj, pi, pj] = parts.map(|p| system.offset(p));
-        let (ii, ji_t) = (ji.transpose() * ji, jj.transpose() * ji);
-        let jj_t = jj.transpose() * jj;
-        for (square, m, p) in [(&ii, mi, pi), (&jj_t, mj, pj)] {
-            system.add(m, m, &square.fixed_view::<9, 9>(6, 6).into_owned(), 1.0);
-            system.add(p, m, &square.fixed_view::<6, 9>(0, 6).into_owned(), 1.0);
-            system.add(p, p, &square.fixed_view::<6, 6>(0, 0).into_owned(), 1.0);
-        }
-        system.add(mj, mi, &ji_t.fixed_view::<9, 9>(6, 6).into_owned(), 1.0);
-        system.add(pj, mi, &ji_t.fixed_view::<6, 9>(0, 6).into_owned(), 1.0);
-        system.add(pi, mj, &ji_t.fixed_view::<9, 6>(6, 0).transpose(), 1.0);
-        system.add(pj, pi, &ji_t.fixed_view::<6, 6>(0, 0).into_owned(), 1.0);
-        for (j, m, p) in [(&ji, mi, pi), (&jj, mj, pj)] {
-            let g = j.transpose() * r;
-            system.add_gradient(m, &g.fixed_rows::<9>(6).into_owned(), 1.0);
-            system.add_gradient(p, &g.fixed_rows::<6>(0).into_owned(), 1.0);
-        }
-        if let Some(d) = by_offset {
-            let at = system.offset(Part::Calibration) + OFFSET_AT;
-            system.add(at, at, &(d.transpose() * d), 1.0);
-            for (j, m, p) in [(&ji, mi, pi), (&jj, mj, pj)] {
-                let row = d.transpose() * j;
-                system.add(at, m, &row.fixed_columns::<9>(6).into_owned(), 1.0);
-                system.add(at, p, &row.fixed_columns::<6>(0).into_owned(), 1.0);
-            }
-            system.gradient[at] += d.dot(&r);
-        }
-        if let Some(ends) = by_ends {
-            let at = [k - 1, k].map(|k| system.offset(Part::Delay(k)));
-            for (a, d) in ends.iter().enumerate() {
-                for part in [Part::Motion(k - 1), Part::Motion(k)] {
-                    system.couple(Part::Delay(k - 1 + a), part);
-                }
-                for part in [Part::Pose(k - 1), Part::Pose(k)] {
-                    system.couple(part, Part::Delay(k - 1 + a));
-                }
-                for (j, m, p) in [(&ji, mi, pi), (&jj, mj, pj)] {
-                    let row = d.transpose() * j;
-                    system.add(at[a], m, &row.fixed_columns::<9>(6).into_owned(), 1.0);
-                    system.add(p, at[a], &row.fixed_columns::<6>(0).transpose(), 1.0);
-                }
-                if let Some(by_offset) = &by_offset {
-                    let clock = system.offset(Part::Calibration) + OFFSET_AT;
-                    system.add(clock, at[a], &(by_offset.transpose() * d), 1.0);
-                }
-                system.gradient[at[a]] += d.dot(&r);
-                system.add(at[a], at[a], &(d.transpose() * d), 1.0);
-            }
-            system.couple(Part::Delay(k), Part::Delay(k - 1));
-            system.add(at[1], at[0], &(ends[1].transpose() * ends[0]), 1.0);
-        }
         0.5 * r.norm_squared()
     }
 

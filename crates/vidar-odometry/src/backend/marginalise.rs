@@ -8,17 +8,15 @@
 //! its newer ones stay, and none is used twice.
 
 mod stack;
+mod workspace;
 
-use super::dense::Tall;
 use super::prior::Part;
 use super::system::System;
 use super::visual;
-use super::window::{
-    CALIBRATION_DIM, Landmark, LandmarkObservation, MAX_INVERSE_DISTANCE, MIN_INVERSE_DISTANCE,
-};
+use super::window::{CALIBRATION_DIM, Landmark, MAX_INVERSE_DISTANCE, MIN_INVERSE_DISTANCE};
 use super::{Linearisation, Smoother, SmootherError};
-use nalgebra::{SMatrix, SVector};
 use vidar_core::{FrameId, LandmarkId};
+pub(crate) use workspace::Workspace;
 
 /// What happened to landmarks when a frame left. Refill one to stay free of allocations.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -40,65 +38,6 @@ enum NextImuFactor {
 
 /// IMU measurements' memory that is kept for later.
 const MOST_SPARE: usize = 8;
-
-/// Memory for marginalising.
-#[derive(Clone, Debug, Default)]
-pub(crate) struct Workspace {
-    parts: Vec<Part>,
-    /// So many of them, in front, leave.
-    leaving_parts: usize,
-    starts: Vec<usize>,
-    stack: Tall,
-    one: Tall,
-    leaving: Vec<(usize, usize)>,
-    parting: Vec<LandmarkObservation>,
-}
-
-impl Workspace {
-    fn column(&self, part: Part) -> Option<usize> {
-        self.parts.iter().position(|&p| p == part).map(|at| self.starts[at])
-    }
-
-    fn rhs(&self) -> usize {
-        self.stack.cols() - 1
-    }
-
-    fn insert(&mut self, part: Part) {
-        if !self.parts.contains(&part) {
-            self.parts.push(part);
-        }
-    }
-
-    /// Writes a block of rows of one part and, for parts that already have a step, its share of the right-hand side.
-    fn put<const R: usize, const C: usize>(
-        &mut self,
-        row: usize,
-        part: Part,
-        block: &SMatrix<f64, R, C>,
-        step: Option<SVector<f64, C>>,
-    ) {
-        let Some(col) = self.column(part) else { return };
-        let rhs = self.rhs();
-        for c in 0..C {
-            for r in 0..R {
-                self.stack.add(row + r, col + c, block[(r, c)]);
-            }
-        }
-        if let Some(step) = step {
-            let shift = block * step;
-            for r in 0..R {
-                self.stack.add(row + r, rhs, -shift[r]);
-            }
-        }
-    }
-
-    fn put_rhs(&mut self, row: usize, values: &[f64]) {
-        let rhs = self.rhs();
-        for (r, v) in values.iter().enumerate() {
-            self.stack.add(row + r, rhs, *v);
-        }
-    }
-}
 
 impl Smoother {
     /// Takes a frame that is no keyframe out of the window: what it saw is forgotten, its IMU measurements are joined to the next
@@ -200,6 +139,7 @@ impl Smoother {
             frame.linearised = frame.state;
             frame.step.fill(0.0);
             frame.delay.relinearise();
+            frame.shift.relinearise();
         }
         self.calibration.relinearise();
     }
@@ -234,12 +174,17 @@ impl Smoother {
     fn lay_out(&self, gone: usize, motion: usize, bench: &mut Workspace) {
         bench.parts.clear();
         const DELAY: u8 = 4;
+        const SHIFT: u8 = 8;
         let has_delays = self.config.delay_sigma().is_some();
-        let by_imu = if has_delays { 3 | DELAY } else { 3 };
+        let has_shifts = self.config.image_shift_sigma().is_some();
+        let by_imu = 3 | if has_delays { DELAY } else { 0 } | if has_shifts { SHIFT } else { 0 };
         bench.insert(Part::Pose(gone));
         bench.insert(Part::Motion(motion));
         if has_delays {
             bench.insert(Part::Delay(motion));
+        }
+        if has_shifts {
+            bench.insert(Part::Shift(motion));
         }
         bench.leaving_parts = bench.parts.len();
         let mut coupled = [0_u8; 64];
@@ -249,6 +194,7 @@ impl Smoother {
                 Part::Pose(k) => coupled[*k] |= 1,
                 Part::Motion(k) => coupled[*k] |= 2,
                 Part::Delay(k) => coupled[*k] |= DELAY,
+                Part::Shift(k) => coupled[*k] |= SHIFT,
                 Part::Calibration => calibration = true,
             }
         }
@@ -266,7 +212,7 @@ impl Smoother {
         if self.frames.get(gone + 1).is_some_and(|f| f.zero_motion.is_some()) {
             coupled[gone + 1] |= 1;
         }
-        let mut rows = self.prior.rows + 3 * (15 + 6) + 15 + 2 * 3 + CALIBRATION_DIM + 1;
+        let mut rows = self.prior.rows + 3 * (15 + 6) + 15 + 2 * 3 + CALIBRATION_DIM + 3;
         for &(slot, leaving) in &bench.leaving {
             let landmark = &self.landmarks[slot];
             for s in landmark.observations[..leaving].iter().filter(|s| self.frames[s.frame].keyframe) {
@@ -281,6 +227,9 @@ impl Smoother {
             if has_delays {
                 bench.insert(Part::Delay(gone));
             }
+            if has_shifts {
+                bench.insert(Part::Shift(gone));
+            }
         }
         for k in (0..self.frames.len()).filter(|&k| k != gone) {
             if coupled[k] & 1 != 0 {
@@ -291,6 +240,9 @@ impl Smoother {
             }
             if coupled[k] & DELAY != 0 {
                 bench.insert(Part::Delay(k));
+            }
+            if coupled[k] & SHIFT != 0 {
+                bench.insert(Part::Shift(k));
             }
         }
         if calibration {
@@ -326,6 +278,7 @@ impl Smoother {
                 Part::Pose(k) => self.frames[k].enter_prior(true, false),
                 Part::Motion(k) => self.frames[k].enter_prior(false, true),
                 Part::Delay(k) => self.frames[k].delay.enter_prior(),
+                Part::Shift(k) => self.frames[k].shift.enter_prior(),
                 Part::Calibration => self.calibration.enter_prior(),
             }
         }

@@ -15,8 +15,11 @@ mod delay;
 mod dense;
 mod error;
 mod estimates;
+mod evidence;
+mod image_shift;
 mod inertial;
 mod linearise;
+mod link;
 mod marginalise;
 mod optimise;
 mod prior;
@@ -32,6 +35,7 @@ pub use covariance::CalibrationEstimate;
 pub(crate) use covariance::d_relative_d_poses;
 pub(crate) use dense::dot;
 pub use error::SmootherError;
+pub(crate) use evidence::FrameUnknown;
 pub use inertial::GaugePriorSigmas;
 pub(crate) use inertial::{
     Shift, Whitening, gauge_prior_at, jacobians as inertial_jacobians, residual as inertial_residual,
@@ -91,7 +95,7 @@ impl Smoother {
             slots,
             gauge_prior: None,
             prior: Prior::default(),
-            system: System::with_capacity(16 * frames + window::CALIBRATION_DIM),
+            system: System::with_capacity(18 * frames + window::CALIBRATION_DIM),
             spare: Vec::with_capacity(8),
             workspace: marginalise::Workspace::default(),
             config,
@@ -175,8 +179,10 @@ impl Smoother {
         }
         self.system.factorised = false;
         let clock_secs = self.next_frame_offset().as_secs_f64();
-        self.frames
-            .push(Frame { clock_secs, ..Frame::new(id, time, state, preintegration.map(ImuFactor::new)) });
+        let turn = self.next_shift(preintegration.as_ref());
+        let shift = image_shift::ImageShift { turn, ..Default::default() };
+        let frame = Frame::new(id, time, state, preintegration.map(ImuFactor::new));
+        self.frames.push(Frame { clock_secs, shift, ..frame });
         Ok(())
     }
 
@@ -296,7 +302,7 @@ impl Smoother {
             let c: &Matrix2<f64> = &seen.covariance;
             bad("covariance", format!("[{} {}; {} {}]", c[(0, 0)], c[(0, 1)], c[(1, 0)], c[(1, 1)]))
         })?;
-        Ok(LandmarkObservation { frame, pixel: seen.pixel, whitening, chi2: 0.0 })
+        Ok(LandmarkObservation { frame, seen: seen.pixel, pixel: seen.pixel, whitening, chi2: 0.0 })
     }
 
     fn index(&self, id: FrameId) -> Result<usize, SmootherError> {

@@ -2,11 +2,12 @@
 
 use super::Smoother;
 use super::delay::Delay;
+use super::image_shift::ImageShift;
 use super::prior::Part;
 use super::system::System;
 use super::window::{CALIBRATION_DIM, CalibrationState};
 use crate::imu::{NavState, Vector15};
-use nalgebra::{SVector, Vector3};
+use nalgebra::{SVector, Vector2, Vector3};
 use std::convert::Infallible;
 use vidar_core::{FrameId, LandmarkId};
 use vidar_solve::levenberg_marquardt::{Decrease, Increase, LeastSquares, Limits, Schedule, Trial, minimise};
@@ -55,7 +56,7 @@ const SCHEDULE: Schedule = Schedule {
 const FAILURE: Increase = Increase { acceleration: 4.0, least: 1e-3, ..Increase::by(4.0) };
 const LIMITS: Limits = Limits { damping: 1e8, ..Limits::NONE };
 
-/// Inverse squares of the steps at which damping of 1 sets in: 0.1 rad, 1 m; 1 m/s, 0.05 rad/s, 0.5 m/s²; a delay 5 ms; calibration
+/// Inverse squares of the steps at which damping of 1 sets in: 0.1 rad, 1 m; 1 m/s, 0.05 rad/s, 0.5 m/s²; a delay 5 ms; a shift 0.01 rad; calibration
 /// 0.02 rad, 2 cm, 5 ms.
 ///
 /// Damping by the system's own diagonal would hold biases in place: each is coupled to its neighbours by a walk a million
@@ -63,6 +64,7 @@ const LIMITS: Limits = Limits { damping: 1e8, ..Limits::NONE };
 const POSE_DAMPING: [f64; 6] = [1e2, 1e2, 1e2, 1.0, 1.0, 1.0];
 const MOTION_DAMPING: [f64; 9] = [1.0, 1.0, 1.0, 4e2, 4e2, 4e2, 4.0, 4.0, 4.0];
 const DELAY_DAMPING: f64 = 4e4;
+const SHIFT_DAMPING: f64 = 1e4;
 const CALIBRATION_DAMPING: [f64; CALIBRATION_DIM] = [2.5e3, 2.5e3, 2.5e3, 2.5e3, 2.5e3, 2.5e3, 4e4];
 
 /// A frame's state before a step.
@@ -71,6 +73,7 @@ pub(crate) struct StateBackup {
     state: NavState,
     step: Vector15,
     delay: Delay,
+    shift: ImageShift,
 }
 
 impl Smoother {
@@ -88,6 +91,7 @@ impl Smoother {
 
     /// As [`Smoother::optimise_into`], with a damping to begin with (larger for rough starts).
     pub(crate) fn optimise_from(&mut self, first: f64, max_iterations: usize, report: &mut OptimiseReport) {
+        self.turn_shifted_pixels();
         let mut system = std::mem::take(&mut self.system);
         let cost = self.linearise(&mut system, first);
         let calibration = self.calibration;
@@ -106,6 +110,7 @@ impl Smoother {
             state: f.state,
             step: f.step,
             delay: f.delay,
+            shift: f.shift,
         }));
         system.saved_landmarks.clear();
         for e in &system.eliminated {
@@ -120,6 +125,7 @@ impl Smoother {
             frame.state = saved.state;
             frame.step = saved.step;
             frame.delay = saved.delay;
+            frame.shift = saved.shift;
         }
         for &(slot, bearing, rho) in &system.saved_landmarks {
             self.landmarks[slot].bearing = bearing;
@@ -163,6 +169,10 @@ impl Smoother {
                 );
             } else {
                 self.frames[k].apply(&pose_step(k), &motion_step);
+            }
+            if system.shifts > 0 {
+                let at = system.offset(Part::Shift(k));
+                self.frames[k].shift.apply(Vector2::new(system.step[at], system.step[at + 1]));
             }
         }
         if calibrates {
@@ -242,6 +252,7 @@ fn solve(system: &mut System, lambda: f64) -> Option<f64> {
     let frames = system.frames;
     system.damping.extend((0..frames).flat_map(|_| MOTION_DAMPING));
     system.damping.resize(9 * frames + system.delays, DELAY_DAMPING);
+    system.damping.resize(system.offset(Part::Pose(0)), SHIFT_DAMPING);
     system.damping.extend((0..frames).flat_map(|_| POSE_DAMPING));
     if system.calibrates() {
         system.damping.extend(CALIBRATION_DAMPING);

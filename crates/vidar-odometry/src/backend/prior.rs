@@ -13,6 +13,8 @@ pub(crate) enum Part {
     Motion(usize),
     /// How much later than its stamp a frame was exposed, where stamps scatter.
     Delay(usize),
+    /// How far its image is shifted, where a stabiliser does that.
+    Shift(usize),
     /// The calibration.
     Calibration,
 }
@@ -23,13 +25,14 @@ impl Part {
             Self::Pose(_) => 6,
             Self::Motion(_) => 9,
             Self::Delay(_) => 1,
+            Self::Shift(_) => 2,
             Self::Calibration => CALIBRATION_DIM,
         }
     }
 
     pub(crate) const fn frame(self) -> Option<usize> {
         match self {
-            Self::Pose(k) | Self::Motion(k) | Self::Delay(k) => Some(k),
+            Self::Pose(k) | Self::Motion(k) | Self::Delay(k) | Self::Shift(k) => Some(k),
             Self::Calibration => None,
         }
     }
@@ -121,9 +124,9 @@ impl Prior {
                         vector.extend([0.0; 6]);
                     }
                 }
-                Part::Delay(_) => {
-                    self.turn.push(0.0);
-                    self.along.push(0.0);
+                Part::Delay(_) | Part::Shift(_) => {
+                    self.turn.extend(std::iter::repeat_n(0.0, part.dim()));
+                    self.along.extend(std::iter::repeat_n(0.0, part.dim()));
                 }
                 Part::Calibration => {
                     self.turn.extend([0.0; CALIBRATION_DIM]);
@@ -213,7 +216,7 @@ impl Prior {
     pub(crate) fn frame_left(&mut self, gone: usize) {
         for part in &mut self.parts {
             match part {
-                Part::Pose(k) | Part::Motion(k) | Part::Delay(k) if *k > gone => *k -= 1,
+                Part::Pose(k) | Part::Motion(k) | Part::Delay(k) | Part::Shift(k) if *k > gone => *k -= 1,
                 _ => {}
             }
         }
@@ -228,6 +231,7 @@ impl Prior {
                 Part::Pose(k) => self.step.extend_from_slice(&frames[k].step.as_slice()[..6]),
                 Part::Motion(k) => self.step.extend_from_slice(&frames[k].step.as_slice()[6..]),
                 Part::Delay(k) => self.step.push(frames[k].delay.step_secs),
+                Part::Shift(k) => self.step.extend_from_slice(frames[k].shift.step.as_slice()),
                 Part::Calibration => self.step.extend_from_slice(calibration.step.as_slice()),
             }
         }

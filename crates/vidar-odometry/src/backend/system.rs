@@ -35,6 +35,8 @@ pub(crate) struct System {
     pub(crate) frames: usize,
     /// Frames that have a delay: all or none.
     pub(crate) delays: usize,
+    /// Frames whose image has a shift: all or none.
+    pub(crate) shifts: usize,
     pub(crate) n: usize,
     /// Lower triangle of `Jᵀ J`, row-major `n × n`.
     pub(crate) h: Vec<f64>,
@@ -82,8 +84,9 @@ impl System {
         match part {
             Part::Motion(k) => 9 * k,
             Part::Delay(k) => 9 * self.frames + k,
-            Part::Pose(k) => 9 * self.frames + self.delays + 6 * k,
-            Part::Calibration => 15 * self.frames + self.delays,
+            Part::Shift(k) => 9 * self.frames + self.delays + 2 * k,
+            Part::Pose(k) => 9 * self.frames + self.delays + 2 * self.shifts + 6 * k,
+            Part::Calibration => 15 * self.frames + self.delays + 2 * self.shifts,
         }
     }
 
@@ -92,9 +95,10 @@ impl System {
         self.n > self.offset(Part::Calibration)
     }
 
-    pub(crate) fn begin(&mut self, frames: usize, has_delays: bool, calibrates: bool) {
+    pub(crate) fn begin(&mut self, frames: usize, has_delays: bool, has_shifts: bool, calibrates: bool) {
         self.frames = frames;
         self.delays = if has_delays { frames } else { 0 };
+        self.shifts = if has_shifts { frames } else { 0 };
         self.n = self.offset(Part::Calibration) + if calibrates { CALIBRATION_DIM } else { 0 };
         let (n, calibration) = (self.n, self.offset(Part::Calibration));
         self.h.clear();

@@ -1,5 +1,6 @@
 //! Factors against numeric derivatives, the prior against dense algebra, and what must stay unobservable.
 
+mod images;
 mod jacobians;
 
 use super::prior::Part;
@@ -69,19 +70,23 @@ fn free_directions(smoother: &Smoother, parts: &[Part], dim: usize) -> DMatrix<f
     n
 }
 
+/// Scatter of stamps, ms, and shift of images, degrees.
+const UNKNOWNS: [(f64, f64); 4] = [(0.0, 0.0), (4.0, 0.0), (0.0, 0.5), (4.0, 0.5)];
+
 #[test]
 fn shift_and_heading_stay_free_after_100_marginalisations() {
-    for stamp_scatter_ms in [0.0, 4.0] {
+    for (stamp_scatter_ms, image_shift_deg) in UNKNOWNS {
         // Keyframes every second frame of 20 Hz.
         let (mut odometry, simulation) = flown(3, 11.5, |config, sigmas| {
             config.keyframe_every = 2;
             config.smoother.stamp_scatter_ms = stamp_scatter_ms;
+            config.smoother.image_shift_deg = image_shift_deg;
             (sigmas.position_m, sigmas.yaw_rad) = (f64::INFINITY, f64::INFINITY);
         });
         let departures = simulation.frames.len() / 2 - 10;
         assert!(departures >= 100, "{departures} departures");
         let worst = worst_information(odometry.smoother().unwrap());
-        assert!(worst < 1e-6, "|J N| / |J| = {worst:.2e} with a scatter of {stamp_scatter_ms} ms");
+        assert!(worst < 1e-6, "|J N| / |J| = {worst:.2e}: {stamp_scatter_ms} ms, {image_shift_deg} degrees");
     }
 }
 
@@ -128,11 +133,14 @@ fn dense(smoother: &mut Smoother) -> (DMatrix<f64>, DVector<f64>) {
 
 #[test]
 fn the_prior_is_the_dense_marginal() {
-    [0.0, 4.0].into_iter().for_each(prior_is_the_dense_marginal);
+    UNKNOWNS.into_iter().for_each(prior_is_the_dense_marginal);
 }
 
-fn prior_is_the_dense_marginal(stamp_scatter_ms: f64) {
-    let (mut odometry, _) = flown(5, 4.0, |config, _| config.smoother.stamp_scatter_ms = stamp_scatter_ms);
+fn prior_is_the_dense_marginal((stamp_scatter_ms, image_shift_deg): (f64, f64)) {
+    let (mut odometry, _) = flown(5, 4.0, |config, _| {
+        config.smoother.stamp_scatter_ms = stamp_scatter_ms;
+        config.smoother.image_shift_deg = image_shift_deg;
+    });
     let smoother = odometry.smoother().unwrap();
     // Only what leaves may speak, or both sides would have the rest in common: no landmarks of other hosts, and none
     // that lives on; robust weights stay as they are.
@@ -157,9 +165,11 @@ fn prior_is_the_dense_marginal(stamp_scatter_ms: f64) {
     }
     let mut marginalisation = MarginalisationReport::default();
     let (h, g) = dense(smoother);
-    let (k, has_delays) = (smoother.len(), usize::from(stamp_scatter_ms > 0.0));
-    let poses = (9 + has_delays) * k;
-    let leaving: Vec<usize> = (0..9).chain(9 * k..9 * k + has_delays).chain(poses..poses + 6).collect();
+    let (k, delay) = (smoother.len(), usize::from(stamp_scatter_ms > 0.0));
+    let shift = 2 * usize::from(image_shift_deg > 0.0);
+    // Motions, delays, shifts, poses.
+    let first_columns = [(0, 9), (9 * k, delay), ((9 + delay) * k, shift), ((9 + delay + shift) * k, 6)];
+    let leaving: Vec<usize> = first_columns.into_iter().flat_map(|(at, dim)| at..at + dim).collect();
     let staying: Vec<usize> = (0..h.nrows()).filter(|i| !leaving.contains(i)).collect();
     let pick = |r: &[usize], c: &[usize]| DMatrix::from_fn(r.len(), c.len(), |i, j| h[(r[i], c[j])]);
     let (mm, sm, ss) = (pick(&leaving, &leaving), pick(&staying, &leaving), pick(&staying, &staying));
@@ -184,36 +194,11 @@ fn prior_is_the_dense_marginal(stamp_scatter_ms: f64) {
 }
 
 #[test]
-fn scattering_stamps_are_told_from_right_ones_and_from_a_clock_that_is_off() {
-    let log_factor = |stamp_scatter_secs, time_offset_secs| {
-        let course = Course { kind: CourseKind::Eight, secs: 7.0, speed: 1.2, phase: 0.4 };
-        let settings =
-            SimulationConfig { tracks: 60, stamp_scatter_secs, time_offset_secs, ..Default::default() };
-        let simulation = Simulation::new(&course, 0.0, 6.0, &settings);
-        let mut config = FeatureOdometryConfig::new(&ImuNoise::EUROC, 2.0);
-        config.smoother.estimate_time_offset = true;
-        let mut odometry = FeatureOdometry::for_simulation(config, &simulation).unwrap();
-        let first = &simulation.frames[0];
-        let sigmas = GaugePriorSigmas { velocity_mps: 0.2, tilt_rad: 0.02, ..GaugePriorSigmas::GAUGE };
-        odometry.start_at(first, NavState { bias: Bias::ZERO, ..first.truth }, sigmas).unwrap();
-        let mut sum = 0.0;
-        for (k, frame) in simulation.frames.iter().enumerate().skip(1) {
-            odometry.push(frame.id, frame.time, &frame.observations).unwrap();
-            if k % 20 == 0 {
-                sum += odometry.smoother().unwrap().log_scatter(2e-3).unwrap();
-            }
-        }
-        sum
-    };
-    let [right, late, scattering] = [(0.0, 0.0), (0.0, 0.01), (0.004, 0.0)].map(|(s, t)| log_factor(s, t));
-    assert!(right < -20.0 && late < -20.0 && scattering > 20.0, "{right:.1} {late:.1} {scattering:.1}");
-}
-
-#[test]
 fn the_gradient_is_the_slope_of_the_cost() {
     let (mut odometry, _) = flown(6, 1.5, |config, _| {
         config.smoother.huber_sigmas = 10.0;
         config.smoother.stamp_scatter_ms = 4.0;
+        config.smoother.image_shift_deg = 0.5;
     });
     // No frame has left yet: all derivatives are at the present states, so gradient and cost belong together.
     let smoother = odometry.smoother().unwrap();
@@ -222,9 +207,12 @@ fn the_gradient_is_the_slope_of_the_cost() {
     all.iter().for_each(|l| {
         smoother.remove_landmark(*l);
     });
+    let mut random = Random::new(4);
+    for frame in &mut smoother.frames {
+        frame.shift.apply(Vector2::new(random.normal(), random.normal()) * 0.01);
+    }
     let mut system = System::default();
     smoother.linearise(&mut system, 0.0);
-    let mut random = Random::new(4);
     let direction: Vec<f64> = system.gradient.iter().map(|_| random.normal() * 1e-6).collect();
     let slope: f64 = direction.iter().zip(&system.gradient).map(|(d, g)| d * g).sum();
     let cost = |sign: f64| {
@@ -232,6 +220,8 @@ fn the_gradient_is_the_slope_of_the_cost() {
         for (k, frame) in moved.frames.iter_mut().enumerate() {
             let [pose, delay] = [Part::Pose(k), Part::Delay(k)].map(|part| system.offset(part));
             frame.delay.apply(sign * direction[delay]);
+            let shift = system.offset(Part::Shift(k));
+            frame.shift.apply(Vector2::new(direction[shift], direction[shift + 1]) * sign);
             let pose = SVector::<f64, 6>::from_fn(|i, _| sign * direction[pose + i]);
             let motion = SVector::<f64, 9>::from_fn(|i, _| sign * direction[9 * k + i]);
             frame.apply(&pose, &motion);

@@ -1,6 +1,7 @@
 //! What the window holds.
 
 use super::delay::Delay;
+use super::image_shift::ImageShift;
 use super::inertial::{GaugePriorSigmas, Whitening};
 use super::visual::bearing_plus;
 use crate::imu::{NavState, Preintegration, Vector15};
@@ -88,6 +89,7 @@ pub(crate) struct Frame {
     pub(crate) imu_factor: Option<ImuFactor>,
     pub(crate) standstill_sigma: Option<f64>,
     pub(crate) delay: Delay,
+    pub(crate) shift: ImageShift,
     /// What is known of the motion since the frame before: that there was none.
     pub(crate) zero_motion: Option<super::standstill::ZeroMotionFactor>,
 }
@@ -107,6 +109,7 @@ impl Frame {
             imu_factor,
             standstill_sigma: None,
             delay: Delay::default(),
+            shift: ImageShift::default(),
             zero_motion: None,
         }
     }
@@ -170,6 +173,9 @@ impl Frame {
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct LandmarkObservation {
     pub(crate) frame: usize,
+    /// Where the image shows it.
+    pub(crate) seen: Vector2<f64>,
+    /// Where a camera would that is turned as the image is shifted; the same where no image is.
     pub(crate) pixel: Vector2<f64>,
     pub(crate) whitening: Matrix2<f64>,
     /// Squared whitened residual at the last linearisation.
@@ -214,6 +220,7 @@ impl Landmark {
     pub(crate) fn placeholder() -> Self {
         let host = LandmarkObservation {
             frame: 0,
+            seen: Vector2::zeros(),
             pixel: Vector2::zeros(),
             whitening: Matrix2::identity(),
             chi2: 0.0,

@@ -17,12 +17,13 @@ const DECISIVE: f64 = 10.0;
 /// The least motions that do harm. At changes of the focal length of 0.4 % the scale was 0.4 to 0.8 % off, within what was stated; a tenth of a degree is a
 /// pixel, and so is what a camera turns by in 2 ms at 60°/s.
 const HARMFUL_FOCUS: f64 = 0.005;
-const HARMFUL_SHIFT: f64 = 0.002;
+pub(crate) const HARMFUL_SHIFT: f64 = 0.002;
 pub(crate) const HARMFUL_DELAY: f64 = 2e-3;
 
 /// What a lens does that moves: autofocus of a phone, up to 2 % between near and far; optical stabilisation, up to a degree or two.
 const FOCUS: f64 = 0.015;
-const SHIFT: f64 = 0.015;
+/// Standard deviation of how far a stabiliser shifts an image, focal lengths: 0.86 degrees.
+pub const IMAGE_SHIFT_RAD: f64 = 0.015;
 /// Standard deviation of image stamps that say when an image arrived, s: real phones scatter by 4 and 6 ms, up to 20.
 pub const STAMP_SCATTER_SECS: f64 = 5e-3;
 
@@ -39,7 +40,7 @@ pub(super) fn moves(problem: &Problem, system: &System) -> Option<ImagePrior> {
         (
             known.shift,
             ImagePrior { shift: Some(HARMFUL_SHIFT), ..none },
-            ImagePrior { shift: Some(SHIFT), ..known },
+            ImagePrior { shift: Some(IMAGE_SHIFT_RAD), ..known },
         ),
         (
             known.delay,

@@ -37,8 +37,8 @@ mod system;
 mod thin;
 
 pub use findings::AdjustmentFinding;
-pub(crate) use image_evidence::HARMFUL_DELAY;
-pub use image_evidence::{Focus, STAMP_SCATTER_SECS};
+pub use image_evidence::{Focus, IMAGE_SHIFT_RAD, STAMP_SCATTER_SECS};
+pub(crate) use image_evidence::{HARMFUL_DELAY, HARMFUL_SHIFT};
 pub(crate) use inertial::ImuGain;
 pub use log::TrackLog;
 pub(crate) use log::{LoggedState, TrackKey};

@@ -218,7 +218,7 @@ impl Initializer {
         let since = self.log.iter().filter(|f| f.frame > solved);
         let Some(mut joined) = joined(since) else { return Ok(()) };
         joined.reintegrate(state.bias);
-        let predicted = joined.predict(&state);
+        let predicted = smoother.predict(&joined);
         smoother.add_frame(newest.frame, newest.time, predicted, Some(joined))?;
         smoother.mark_keyframe(newest.frame)?;
         for seen in &newest.observations {

@@ -14,9 +14,9 @@ use crate::imu::{ImuBuffer, ImuModel};
 use crate::initialization::{InitFailure, InitFailureReason, Initializer};
 use crate::stages::{Stage, StageClock, StageTimes};
 use crate::tracking::{FrameInput, HostImage, ImagePool, SlidingWindowOdometry, TrackRecord, Tracker};
+use image_questions::ImageQuestions;
 use relocalization::Relocalizer;
 use settling::Settling;
-use stamps::StampQuestions;
 use start::initializing;
 use std::collections::VecDeque;
 use std::sync::Arc;
@@ -27,13 +27,13 @@ use vidar_core::{
 };
 
 mod adjustment;
+mod image_questions;
 mod inertial;
 mod joined_segments;
 mod relocalization;
 mod report;
 mod saved_map;
 mod settling;
-mod stamps;
 mod start;
 mod successor;
 mod timing;
@@ -108,7 +108,7 @@ pub struct Odometry {
     recent: RecentFrames,
     successor: Option<Successor>,
     settling: Settling,
-    stamps: StampQuestions,
+    questions: ImageQuestions,
     clock: StageClock,
     /// What is kept for adjustments: of a scale that is not settled, and after the end.
     log: Option<TrackLog>,
@@ -160,7 +160,7 @@ impl Odometry {
         let phase = initializing(&config, imu_model.is_none(), &camera, tracker);
         let time_calibration = TimeCalibration::new(&config);
         Self {
-            stamps: StampQuestions::new(config.stamp_scatter_ms.is_some() || imu_model.is_none()),
+            questions: ImageQuestions::new(&config, imu_model.is_some()),
             config,
             camera_id,
             check: OrientationCheck::new(&camera.body_from_camera.rotation),
@@ -312,7 +312,7 @@ impl Odometry {
             None => status,
         };
         self.clock.lap(if was_starting { Stage::Initialise } else { Stage::Output });
-        self.question_stamps(frame.time);
+        self.question_images(frame.time);
         self.settle_scale(&status, frame.time);
         self.shorten_log(frame.time);
         let mut status = self.follow_successor(id).unwrap_or(status);

@@ -190,7 +190,7 @@ impl SlidingWindowOdometry {
     pub fn step(&mut self, input: FrameInput, clock: &mut StageClock) -> Result<StepReport, SmootherError> {
         let frame = input.host.frame;
         let last_state = self.state().unwrap_or(NavState::REST);
-        let predicted = input.preintegration.as_ref().map_or(last_state, |r| r.predict(&last_state));
+        let predicted = input.preintegration.as_ref().map_or(last_state, |r| self.smoother.predict(r));
         let mut step = StepReport::default();
         let image = input.host.clone();
 

@@ -9,7 +9,7 @@ use super::super::system::System;
 use super::super::window::{CALIBRATION_DIM, Landmark, OFFSET_AT};
 use super::Workspace;
 use crate::imu::Vector15;
-use nalgebra::{Matrix1, SMatrix, SVector, Vector1};
+use nalgebra::{Matrix1, Matrix2, SMatrix, SVector, Vector1};
 
 impl Smoother {
     pub(super) fn stack_prior(&self, bench: &mut Workspace) {
@@ -62,14 +62,18 @@ impl Smoother {
             };
             let (from, to) = (&self.frames[k - 1], &self.frames[k]);
             let shift = shift_between(&self.calibration, from, to);
+            let (body_i, body_j) = (self.body_of(from, &from.state), self.body_of(to, &to.state));
             let r: Vector15 = imu_factor.whitening.apply(&residual(
                 &imu_factor.preintegration,
-                &from.state,
-                &to.state,
+                &body_i.state,
+                &body_j.state,
                 shift,
             ));
-            let (state_i, state_j) = (&system.states_at[k - 1], &system.states_at[k]);
+            let (body_i, body_j) =
+                (self.body_of(from, &system.states_at[k - 1]), self.body_of(to, &system.states_at[k]));
+            let (state_i, state_j) = (&body_i.state, &body_j.state);
             let (ji, jj) = jacobians(&imu_factor.preintegration, state_i, state_j, shift);
+            let ((ji, si), (jj, sj)) = (body_i.through(&ji), body_j.through(&jj));
             let row = bench.stack.add_rows(15);
             bench.put_rhs(row, r.as_slice());
             self.put_state(bench, row, k - 1, &imu_factor.whitening.apply(&ji));
@@ -85,6 +89,12 @@ impl Smoother {
                 block.set_column(OFFSET_AT, &by);
                 bench.put(row, Part::Calibration, &block, self.calibration_step());
             }
+            if self.config.image_shift_sigma().is_some() {
+                for (k, by) in [(k - 1, si), (k, sj)] {
+                    let step = self.frames[k].shift.step_in_prior();
+                    bench.put(row, Part::Shift(k), &imu_factor.whitening.apply(&by), step);
+                }
+            }
             if self.config.delay_sigma().is_some() {
                 let ends = by_ends(&imu_factor.preintegration, state_i, state_j, shift);
                 for (k, by) in [k - 1, k].into_iter().zip(ends) {
@@ -96,6 +106,13 @@ impl Smoother {
             let row = bench.stack.add_rows(1);
             bench.put_rhs(row, &[self.frames[motion].delay.secs / sigma]);
             bench.put(row, Part::Delay(motion), &Matrix1::new(1.0 / sigma), self.delay_step(motion));
+        }
+        if let Some(sigma) = self.config.image_shift_sigma() {
+            let row = bench.stack.add_rows(2);
+            let shift = &self.frames[motion].shift;
+            bench.put_rhs(row, (shift.turn / sigma).as_slice());
+            let by = Matrix2::identity() / sigma;
+            bench.put(row, Part::Shift(motion), &by, shift.step_in_prior());
         }
         for k in [gone, gone + 1] {
             let Some(rest) = self.frames.get(k).and_then(|f| f.zero_motion).filter(|_| k > 0) else {

@@ -1,5 +1,6 @@
 //! Residuals and their derivatives.
 
+use crate::backend::image_shift::{BodyState, body_state, image_state, seen_by_turned};
 use crate::backend::inertial::{
     Shift, body_velocity, by_ends, by_time_offset, gauge_prior_at, jacobians, residual,
 };
@@ -62,6 +63,45 @@ fn inertial_factor_agrees_with_numeric_derivatives() {
                 |d: &Vector1<f64>| residual(&preintegration, &i, &j, Shift { end: shift.end + d.x, ..shift });
             check_jacobian("by end", &by_end, end, &Vector1::zeros(), 1e-6).unwrap();
         }
+    }
+}
+
+#[test]
+fn the_body_of_a_shifted_image_agrees_with_numeric_derivatives() {
+    let mut random = Random::new(16);
+    let place = Simulation::body_from_camera();
+    for _ in 0..5 {
+        let (image, other) = (random_state(&mut random), random_state(&mut random));
+        let turn = Vector2::new(random.normal(), random.normal()) * 0.02;
+        let body = BodyState::new(&image, &turn, &place);
+        // The camera stays where it is.
+        let camera = |s: &NavState| s.world_from_body.act(&place.translation);
+        assert!((camera(&body.state) - camera(&image)).norm() < 1e-12);
+        assert!(image_state(&body.state, &turn, &place).minus(&image).norm() < 1e-12);
+        let preintegration = some_preintegration(other.bias);
+        let of = |image: &NavState, turn: &Vector2<f64>| {
+            residual(&preintegration, &body_state(image, turn, &place), &other, Shift::NONE)
+        };
+        let (by_body, _) = jacobians(&preintegration, &body.state, &other, Shift::NONE);
+        let (by_image, by_shift) = body.through(&by_body);
+        check_jacobian("by image", &by_image, |d| of(&image.plus(d), &turn), &Vector15::zeros(), 1e-6)
+            .unwrap();
+        check_jacobian("by shift", &by_shift, |d| of(&image, &(turn + d)), &Vector2::zeros(), 1e-6).unwrap();
+    }
+}
+
+#[test]
+fn a_turned_camera_shows_what_a_shifted_lens_does() {
+    let camera = Simulation::camera();
+    let lens = *camera.intrinsics();
+    let turn = Vector2::new(0.008, -0.011);
+    for ray in [Vector3::new(0.0, 0.0, 1.0), Vector3::new(0.4, -0.2, 1.0), Vector3::new(-0.5, 0.3, 1.0)] {
+        let shifted = camera.project(&ray).unwrap() + Vector2::new(-lens.fx * turn.y, lens.fy * turn.x);
+        let turned = So3::exp(&-Vector3::new(turn.x, turn.y, 0.0)) * ray;
+        let seen = seen_by_turned(&camera, &shifted, &turn).unwrap();
+        assert!((seen - camera.project(&turned).unwrap()).norm() < 1e-9, "{ray}");
+        // What is left of it is of second order.
+        assert!((seen - shifted).norm() < 0.5 * lens.fx * turn.norm(), "{ray}");
     }
 }
 

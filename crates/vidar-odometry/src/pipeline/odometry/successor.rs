@@ -306,6 +306,11 @@ impl Odometry {
         self.time_calibration.readout_secs = new.time_calibration.readout_secs;
         (self.imu, self.imu_gain) = (new.imu, new.imu_gain);
         self.phase = new.phase;
+        self.config.stamp_scatter_ms = self.config.stamp_scatter_ms.or(new.config.stamp_scatter_ms);
+        self.config.image_shift_deg = self.config.image_shift_deg.or(new.config.image_shift_deg);
+        if let Phase::Tracking(window) = &mut self.phase {
+            window.smoother.set_image_unknowns(&self.config);
+        }
         self.check = new.check;
         self.last_frame = new.last_frame;
         self.last_host = new.last_host;

@@ -109,10 +109,17 @@ impl Odometry {
             }),
             Phase::Initializing(initializer) => (initializer.gyro_bias(), Vector3::zeros()),
         };
+        let left = match &self.phase {
+            Phase::Tracking(window) => 1.0 - window.smoother.stabilised_share(),
+            Phase::Initializing(_) => 1.0,
+        };
+        // A stabiliser takes back what turns the image, not what rolls it.
+        let left = Vector3::new(left, left, 1.0);
         RollingShutter {
             readout_secs,
-            rate: camera_from_body * (0.5 * (first.gyro.0 + last.gyro.0) - bias),
-            acceleration: camera_from_body * ((last.gyro.0 - first.gyro.0) / readout_secs),
+            rate: (camera_from_body * (0.5 * (first.gyro.0 + last.gyro.0) - bias)).component_mul(&left),
+            acceleration: (camera_from_body * ((last.gyro.0 - first.gyro.0) / readout_secs))
+                .component_mul(&left),
             velocity,
         }
     }
