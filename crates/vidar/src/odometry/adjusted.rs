@@ -195,7 +195,8 @@ fn shifted(rms: f64) -> Warning {
         );
     }
     Warning::new("images-stabilised", format!("the images are stabilised: {shifted}")).hint(
-        "switch optical and electronic stabilisation off before filming: `vidar live` and the live trajectory do not know it, and their scale is worse for it",
+        "switch optical and electronic stabilisation off before filming: live states are worse for it, and `vidar live` may begin late; it is told before by \
+         odometry.image_shift_deg",
     )
 }
 
