@@ -122,6 +122,11 @@ fn a_gyroscope_whose_axes_are_not_right_handed_is_contradicted_by_the_images() {
             "opposite signs",
         ]);
     }
+    // What is no gyroscope of this recording is not mended by a sign.
+    let sequence =
+        with_gyroscope(&folder.path().join("foreign"), |[x, y, z]| [3.0 * x * y, 3.0 * z * z, y.abs()]);
+    let told = vidar(&["calibrate", sequence.to_str().unwrap()]).ends_with(1);
+    told.says(&["error[E0208]", "no camera explains the images"]);
     // Axes in another order are right-handed: the camera's rotation on the IMU is another one, and the rest is as it was.
     let sequence = with_gyroscope(&folder.path().join("renamed"), |[x, y, z]| [z, x, y]);
     let found = vidar(&["calibrate", sequence.to_str().unwrap(), "--json", "-q"]).ends_with(0).json();
