@@ -9,7 +9,7 @@ pub(crate) enum FrameUnknown {
     /// How much later than its stamp the image was exposed.
     Delay { sigma_secs: f64 },
     /// How far a stabiliser shifts the image.
-    Shift { sigma_rad: f64 },
+    ImageShift { sigma_rad: f64 },
 }
 
 impl FrameUnknown {
@@ -17,7 +17,7 @@ impl FrameUnknown {
     fn log_sigmas(self) -> f64 {
         match self {
             Self::Delay { sigma_secs } => sigma_secs.ln(),
-            Self::Shift { sigma_rad } => 2.0 * sigma_rad.ln(),
+            Self::ImageShift { sigma_rad } => 2.0 * sigma_rad.ln(),
         }
     }
 }
@@ -42,7 +42,7 @@ impl Smoother {
     pub(crate) fn log_evidence(&mut self, unknown: FrameUnknown) -> Option<f64> {
         let has_it = match unknown {
             FrameUnknown::Delay { .. } => self.config.delay_sigma().is_some(),
-            FrameUnknown::Shift { .. } => self.config.image_shift_sigma().is_some(),
+            FrameUnknown::ImageShift { .. } => self.config.image_shift_sigma().is_some(),
         };
         if has_it {
             return None;
@@ -51,7 +51,7 @@ impl Smoother {
         let as_set = (self.config.stamp_scatter_ms, self.config.image_shift_deg);
         match unknown {
             FrameUnknown::Delay { sigma_secs } => self.config.stamp_scatter_ms = 1e3 * sigma_secs,
-            FrameUnknown::Shift { sigma_rad } => self.config.image_shift_deg = sigma_rad.to_degrees(),
+            FrameUnknown::ImageShift { sigma_rad } => self.config.image_shift_deg = sigma_rad.to_degrees(),
         }
         self.system.factorised = false;
         let with = self.fit();

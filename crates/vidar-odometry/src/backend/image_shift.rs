@@ -136,7 +136,7 @@ impl Smoother {
         }
         let (frames, camera) = (&self.frames, &self.camera);
         let turn = |s: &mut LandmarkObservation| {
-            s.pixel = seen_by_turned(camera, &s.seen, &frames[s.frame].shift.turn).unwrap_or(s.seen);
+            s.pixel = seen_by_turned(camera, &s.seen, &frames[s.frame].image_shift.turn).unwrap_or(s.seen);
         };
         for landmark in self.landmarks.iter_mut().filter(|l| l.alive) {
             turn(&mut landmark.host);
@@ -144,17 +144,17 @@ impl Smoother {
         }
     }
 
-    /// The state that IMU measurements since the newest frame lead to, with an image that is shifted as that frame's.
+    /// The state that IMU measurements since the newest frame lead to, of an image that is shifted as the stabiliser goes on.
     pub(crate) fn predict(&self, preintegration: &Preintegration) -> NavState {
         let Some(newest) = self.frames.last() else { return NavState::REST };
         let camera = &self.calibration.body_from_camera;
-        let body = preintegration.predict(&body_state(&newest.state, &newest.shift.turn, camera));
-        image_state(&body, &self.next_shift(Some(preintegration)), camera)
+        let body = preintegration.predict(&body_state(&newest.state, &newest.image_shift.turn, camera));
+        image_state(&body, &self.next_image_shift(Some(preintegration)), camera)
     }
 
     /// The shift that the next image has if the stabiliser goes on as in the window.
-    pub(crate) fn next_shift(&self, preintegration: Option<&Preintegration>) -> Vector2<f64> {
-        let last = self.frames.last().map_or_else(Vector2::zeros, |f| f.shift.turn);
+    pub(crate) fn next_image_shift(&self, preintegration: Option<&Preintegration>) -> Vector2<f64> {
+        let last = self.frames.last().map_or_else(Vector2::zeros, |f| f.image_shift.turn);
         let (Some(sigma), Some(preintegration)) = (self.config.image_shift_sigma(), preintegration) else {
             return last;
         };
@@ -181,7 +181,7 @@ impl Smoother {
             if turned.norm() > MOST_TURN_RAD {
                 continue;
             }
-            sums.0 -= turned.dot(&(pair[1].shift.turn - pair[0].shift.turn));
+            sums.0 -= turned.dot(&(pair[1].image_shift.turn - pair[0].image_shift.turn));
             sums.1 += turned.norm_squared();
         }
         (sums.0 / sums.1).clamp(0.0, 1.0)
@@ -190,8 +190,8 @@ impl Smoother {
     /// That a frame's image is hardly shifted.
     pub(crate) fn add_image_shift(&self, system: &mut System, k: usize) -> f64 {
         let Some(sigma) = self.config.image_shift_sigma() else { return 0.0 };
-        let at = system.offset(Part::Shift(k));
-        let turn = self.frames[k].shift.turn;
+        let at = system.offset(Part::ImageShift(k));
+        let turn = self.frames[k].image_shift.turn;
         for c in 0..2 {
             system.h[(at + c) * system.n + at + c] += 1.0 / (sigma * sigma);
             system.gradient[at + c] += turn[c] / (sigma * sigma);

@@ -114,7 +114,8 @@ impl Smoother {
         let by_delays = (system.delays > 0)
             .then(|| by_ends(measured, state_i, state_j, shift).map(|d| whitening.apply(&d)));
         let ((ji, by_shift_i), (jj, by_shift_j)) = (body_i.through(&ji), body_j.through(&jj));
-        let by_shifts = (system.shifts > 0).then(|| [by_shift_i, by_shift_j].map(|s| whitening.apply(&s)));
+        let by_shifts =
+            (system.image_shifts > 0).then(|| [by_shift_i, by_shift_j].map(|s| whitening.apply(&s)));
         let (ji, jj) = (whitening.apply(&ji), whitening.apply(&jj));
         let link = Link {
             residual: r,
@@ -128,7 +129,7 @@ impl Smoother {
             add_pair(system, (parts[1], &by[1]), (parts[0], &by[0]));
         }
         if let Some(by) = &by_shifts {
-            let parts = [Part::Shift(k - 1), Part::Shift(k)];
+            let parts = [Part::ImageShift(k - 1), Part::ImageShift(k)];
             parts.into_iter().zip(by).for_each(|(part, by)| link.add_unknown(system, part, by));
             add_pair(system, (parts[1], &by[1]), (parts[0], &by[0]));
             for (delay, by_delay) in
@@ -147,7 +148,7 @@ impl Smoother {
     pub(crate) fn body_of(&self, frame: &Frame, image: &NavState) -> BodyState {
         match self.config.image_shift_sigma() {
             None => BodyState::unshifted(image),
-            Some(_) => BodyState::new(image, &frame.shift.turn, &self.calibration.body_from_camera),
+            Some(_) => BodyState::new(image, &frame.image_shift.turn, &self.calibration.body_from_camera),
         }
     }
 }

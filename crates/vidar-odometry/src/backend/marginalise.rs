@@ -139,7 +139,7 @@ impl Smoother {
             frame.linearised = frame.state;
             frame.step.fill(0.0);
             frame.delay.relinearise();
-            frame.shift.relinearise();
+            frame.image_shift.relinearise();
         }
         self.calibration.relinearise();
     }
@@ -174,17 +174,17 @@ impl Smoother {
     fn lay_out(&self, gone: usize, motion: usize, bench: &mut Workspace) {
         bench.parts.clear();
         const DELAY: u8 = 4;
-        const SHIFT: u8 = 8;
+        const IMAGE_SHIFT: u8 = 8;
         let has_delays = self.config.delay_sigma().is_some();
-        let has_shifts = self.config.image_shift_sigma().is_some();
-        let by_imu = 3 | if has_delays { DELAY } else { 0 } | if has_shifts { SHIFT } else { 0 };
+        let has_image_shifts = self.config.image_shift_sigma().is_some();
+        let by_imu = 3 | if has_delays { DELAY } else { 0 } | if has_image_shifts { IMAGE_SHIFT } else { 0 };
         bench.insert(Part::Pose(gone));
         bench.insert(Part::Motion(motion));
         if has_delays {
             bench.insert(Part::Delay(motion));
         }
-        if has_shifts {
-            bench.insert(Part::Shift(motion));
+        if has_image_shifts {
+            bench.insert(Part::ImageShift(motion));
         }
         bench.leaving_parts = bench.parts.len();
         let mut coupled = [0_u8; 64];
@@ -194,7 +194,7 @@ impl Smoother {
                 Part::Pose(k) => coupled[*k] |= 1,
                 Part::Motion(k) => coupled[*k] |= 2,
                 Part::Delay(k) => coupled[*k] |= DELAY,
-                Part::Shift(k) => coupled[*k] |= SHIFT,
+                Part::ImageShift(k) => coupled[*k] |= IMAGE_SHIFT,
                 Part::Calibration => calibration = true,
             }
         }
@@ -227,8 +227,8 @@ impl Smoother {
             if has_delays {
                 bench.insert(Part::Delay(gone));
             }
-            if has_shifts {
-                bench.insert(Part::Shift(gone));
+            if has_image_shifts {
+                bench.insert(Part::ImageShift(gone));
             }
         }
         for k in (0..self.frames.len()).filter(|&k| k != gone) {
@@ -241,8 +241,8 @@ impl Smoother {
             if coupled[k] & DELAY != 0 {
                 bench.insert(Part::Delay(k));
             }
-            if coupled[k] & SHIFT != 0 {
-                bench.insert(Part::Shift(k));
+            if coupled[k] & IMAGE_SHIFT != 0 {
+                bench.insert(Part::ImageShift(k));
             }
         }
         if calibration {
@@ -278,7 +278,7 @@ impl Smoother {
                 Part::Pose(k) => self.frames[k].enter_prior(true, false),
                 Part::Motion(k) => self.frames[k].enter_prior(false, true),
                 Part::Delay(k) => self.frames[k].delay.enter_prior(),
-                Part::Shift(k) => self.frames[k].shift.enter_prior(),
+                Part::ImageShift(k) => self.frames[k].image_shift.enter_prior(),
                 Part::Calibration => self.calibration.enter_prior(),
             }
         }

@@ -179,10 +179,10 @@ impl Smoother {
         }
         self.system.factorised = false;
         let clock_secs = self.next_frame_offset().as_secs_f64();
-        let turn = self.next_shift(preintegration.as_ref());
-        let shift = image_shift::ImageShift { turn, ..Default::default() };
+        let turn = self.next_image_shift(preintegration.as_ref());
+        let image_shift = image_shift::ImageShift { turn, ..Default::default() };
         let frame = Frame::new(id, time, state, preintegration.map(ImuFactor::new));
-        self.frames.push(Frame { clock_secs, shift, ..frame });
+        self.frames.push(Frame { clock_secs, image_shift, ..frame });
         Ok(())
     }
 

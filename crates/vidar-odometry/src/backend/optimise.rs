@@ -64,7 +64,7 @@ const LIMITS: Limits = Limits { damping: 1e8, ..Limits::NONE };
 const POSE_DAMPING: [f64; 6] = [1e2, 1e2, 1e2, 1.0, 1.0, 1.0];
 const MOTION_DAMPING: [f64; 9] = [1.0, 1.0, 1.0, 4e2, 4e2, 4e2, 4.0, 4.0, 4.0];
 const DELAY_DAMPING: f64 = 4e4;
-const SHIFT_DAMPING: f64 = 1e4;
+const IMAGE_SHIFT_DAMPING: f64 = 1e4;
 const CALIBRATION_DAMPING: [f64; CALIBRATION_DIM] = [2.5e3, 2.5e3, 2.5e3, 2.5e3, 2.5e3, 2.5e3, 4e4];
 
 /// A frame's state before a step.
@@ -73,7 +73,7 @@ pub(crate) struct StateBackup {
     state: NavState,
     step: Vector15,
     delay: Delay,
-    shift: ImageShift,
+    image_shift: ImageShift,
 }
 
 impl Smoother {
@@ -110,7 +110,7 @@ impl Smoother {
             state: f.state,
             step: f.step,
             delay: f.delay,
-            shift: f.shift,
+            image_shift: f.image_shift,
         }));
         system.saved_landmarks.clear();
         for e in &system.eliminated {
@@ -125,7 +125,7 @@ impl Smoother {
             frame.state = saved.state;
             frame.step = saved.step;
             frame.delay = saved.delay;
-            frame.shift = saved.shift;
+            frame.image_shift = saved.image_shift;
         }
         for &(slot, bearing, rho) in &system.saved_landmarks {
             self.landmarks[slot].bearing = bearing;
@@ -170,9 +170,9 @@ impl Smoother {
             } else {
                 self.frames[k].apply(&pose_step(k), &motion_step);
             }
-            if system.shifts > 0 {
-                let at = system.offset(Part::Shift(k));
-                self.frames[k].shift.apply(Vector2::new(system.step[at], system.step[at + 1]));
+            if system.image_shifts > 0 {
+                let at = system.offset(Part::ImageShift(k));
+                self.frames[k].image_shift.apply(Vector2::new(system.step[at], system.step[at + 1]));
             }
         }
         if calibrates {
@@ -252,7 +252,7 @@ fn solve(system: &mut System, lambda: f64) -> Option<f64> {
     let frames = system.frames;
     system.damping.extend((0..frames).flat_map(|_| MOTION_DAMPING));
     system.damping.resize(9 * frames + system.delays, DELAY_DAMPING);
-    system.damping.resize(system.offset(Part::Pose(0)), SHIFT_DAMPING);
+    system.damping.resize(system.offset(Part::Pose(0)), IMAGE_SHIFT_DAMPING);
     system.damping.extend((0..frames).flat_map(|_| POSE_DAMPING));
     if system.calibrates() {
         system.damping.extend(CALIBRATION_DAMPING);

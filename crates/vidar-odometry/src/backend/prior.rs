@@ -14,7 +14,7 @@ pub(crate) enum Part {
     /// How much later than its stamp a frame was exposed, where stamps scatter.
     Delay(usize),
     /// How far its image is shifted, where a stabiliser does that.
-    Shift(usize),
+    ImageShift(usize),
     /// The calibration.
     Calibration,
 }
@@ -25,14 +25,14 @@ impl Part {
             Self::Pose(_) => 6,
             Self::Motion(_) => 9,
             Self::Delay(_) => 1,
-            Self::Shift(_) => 2,
+            Self::ImageShift(_) => 2,
             Self::Calibration => CALIBRATION_DIM,
         }
     }
 
     pub(crate) const fn frame(self) -> Option<usize> {
         match self {
-            Self::Pose(k) | Self::Motion(k) | Self::Delay(k) | Self::Shift(k) => Some(k),
+            Self::Pose(k) | Self::Motion(k) | Self::Delay(k) | Self::ImageShift(k) => Some(k),
             Self::Calibration => None,
         }
     }
@@ -124,7 +124,7 @@ impl Prior {
                         vector.extend([0.0; 6]);
                     }
                 }
-                Part::Delay(_) | Part::Shift(_) => {
+                Part::Delay(_) | Part::ImageShift(_) => {
                     self.turn.extend(std::iter::repeat_n(0.0, part.dim()));
                     self.along.extend(std::iter::repeat_n(0.0, part.dim()));
                 }
@@ -216,7 +216,9 @@ impl Prior {
     pub(crate) fn frame_left(&mut self, gone: usize) {
         for part in &mut self.parts {
             match part {
-                Part::Pose(k) | Part::Motion(k) | Part::Delay(k) | Part::Shift(k) if *k > gone => *k -= 1,
+                Part::Pose(k) | Part::Motion(k) | Part::Delay(k) | Part::ImageShift(k) if *k > gone => {
+                    *k -= 1
+                }
                 _ => {}
             }
         }
@@ -231,7 +233,7 @@ impl Prior {
                 Part::Pose(k) => self.step.extend_from_slice(&frames[k].step.as_slice()[..6]),
                 Part::Motion(k) => self.step.extend_from_slice(&frames[k].step.as_slice()[6..]),
                 Part::Delay(k) => self.step.push(frames[k].delay.step_secs),
-                Part::Shift(k) => self.step.extend_from_slice(frames[k].shift.step.as_slice()),
+                Part::ImageShift(k) => self.step.extend_from_slice(frames[k].image_shift.step.as_slice()),
                 Part::Calibration => self.step.extend_from_slice(calibration.step.as_slice()),
             }
         }

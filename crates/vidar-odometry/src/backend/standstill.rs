@@ -102,13 +102,13 @@ impl Smoother {
         before.step.fixed_rows_mut::<9>(6).copy_from(&newest.step.fixed_rows::<9>(6));
         before.motion_in_prior = newest.motion_in_prior;
         before.delay = newest.delay;
-        before.shift = newest.shift;
+        before.image_shift = newest.image_shift;
         before.standstill_sigma = None;
         self.spare.extend(before.imu_factor.take().map(|imu_factor| imu_factor.preintegration));
         self.gauge_prior = self.gauge_prior.filter(|a| a.frame + 1 != gone);
         for part in &mut self.prior.parts {
             match part {
-                Part::Motion(k) | Part::Delay(k) | Part::Shift(k) if *k == gone => *k = gone - 1,
+                Part::Motion(k) | Part::Delay(k) | Part::ImageShift(k) if *k == gone => *k = gone - 1,
                 _ => {}
             }
         }

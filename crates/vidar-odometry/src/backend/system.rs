@@ -36,7 +36,7 @@ pub(crate) struct System {
     /// Frames that have a delay: all or none.
     pub(crate) delays: usize,
     /// Frames whose image has a shift: all or none.
-    pub(crate) shifts: usize,
+    pub(crate) image_shifts: usize,
     pub(crate) n: usize,
     /// Lower triangle of `Jᵀ J`, row-major `n × n`.
     pub(crate) h: Vec<f64>,
@@ -84,9 +84,9 @@ impl System {
         match part {
             Part::Motion(k) => 9 * k,
             Part::Delay(k) => 9 * self.frames + k,
-            Part::Shift(k) => 9 * self.frames + self.delays + 2 * k,
-            Part::Pose(k) => 9 * self.frames + self.delays + 2 * self.shifts + 6 * k,
-            Part::Calibration => 15 * self.frames + self.delays + 2 * self.shifts,
+            Part::ImageShift(k) => 9 * self.frames + self.delays + 2 * k,
+            Part::Pose(k) => 9 * self.frames + self.delays + 2 * self.image_shifts + 6 * k,
+            Part::Calibration => 15 * self.frames + self.delays + 2 * self.image_shifts,
         }
     }
 
@@ -95,10 +95,16 @@ impl System {
         self.n > self.offset(Part::Calibration)
     }
 
-    pub(crate) fn begin(&mut self, frames: usize, has_delays: bool, has_shifts: bool, calibrates: bool) {
+    pub(crate) fn begin(
+        &mut self,
+        frames: usize,
+        has_delays: bool,
+        has_image_shifts: bool,
+        calibrates: bool,
+    ) {
         self.frames = frames;
         self.delays = if has_delays { frames } else { 0 };
-        self.shifts = if has_shifts { frames } else { 0 };
+        self.image_shifts = if has_image_shifts { frames } else { 0 };
         self.n = self.offset(Part::Calibration) + if calibrates { CALIBRATION_DIM } else { 0 };
         let (n, calibration) = (self.n, self.offset(Part::Calibration));
         self.h.clear();

@@ -89,7 +89,7 @@ pub(crate) struct Frame {
     pub(crate) imu_factor: Option<ImuFactor>,
     pub(crate) standstill_sigma: Option<f64>,
     pub(crate) delay: Delay,
-    pub(crate) shift: ImageShift,
+    pub(crate) image_shift: ImageShift,
     /// What is known of the motion since the frame before: that there was none.
     pub(crate) zero_motion: Option<super::standstill::ZeroMotionFactor>,
 }
@@ -109,7 +109,7 @@ impl Frame {
             imu_factor,
             standstill_sigma: None,
             delay: Delay::default(),
-            shift: ImageShift::default(),
+            image_shift: ImageShift::default(),
             zero_motion: None,
         }
     }

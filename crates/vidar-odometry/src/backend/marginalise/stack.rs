@@ -91,8 +91,8 @@ impl Smoother {
             }
             if self.config.image_shift_sigma().is_some() {
                 for (k, by) in [(k - 1, si), (k, sj)] {
-                    let step = self.frames[k].shift.step_in_prior();
-                    bench.put(row, Part::Shift(k), &imu_factor.whitening.apply(&by), step);
+                    let step = self.frames[k].image_shift.step_in_prior();
+                    bench.put(row, Part::ImageShift(k), &imu_factor.whitening.apply(&by), step);
                 }
             }
             if self.config.delay_sigma().is_some() {
@@ -109,10 +109,10 @@ impl Smoother {
         }
         if let Some(sigma) = self.config.image_shift_sigma() {
             let row = bench.stack.add_rows(2);
-            let shift = &self.frames[motion].shift;
+            let shift = &self.frames[motion].image_shift;
             bench.put_rhs(row, (shift.turn / sigma).as_slice());
             let by = Matrix2::identity() / sigma;
-            bench.put(row, Part::Shift(motion), &by, shift.step_in_prior());
+            bench.put(row, Part::ImageShift(motion), &by, shift.step_in_prior());
         }
         for k in [gone, gone + 1] {
             let Some(rest) = self.frames.get(k).and_then(|f| f.zero_motion).filter(|_| k > 0) else {

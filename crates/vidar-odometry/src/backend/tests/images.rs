@@ -59,7 +59,7 @@ fn scattering_stamps_and_shifted_images_are_told_from_right_ones_and_from_each_o
             |k, smoother| {
                 if k % 20 == 0 {
                     let delay = FrameUnknown::Delay { sigma_secs: 2e-3 };
-                    let asked = [delay, FrameUnknown::Shift { sigma_rad: 2e-3 }];
+                    let asked = [delay, FrameUnknown::ImageShift { sigma_rad: 2e-3 }];
                     for (sum, unknown) in sums.iter_mut().zip(asked) {
                         *sum += smoother.log_evidence(unknown).unwrap();
                     }
@@ -89,7 +89,7 @@ fn shifts_of_images_are_found() {
             // A shift that all images share is a turn of the camera on the body: what is known is how they differ. A turn about y moves the picture to
             // the left, one about x down.
             let off = |f: &Frame| {
-                let turn = f.shift.turn;
+                let turn = f.image_shift.turn;
                 Vector2::new(-turn.y, turn.x) - images.shift_at((f.time - begin).as_secs_f64())
             };
             let off: Vec<Vector2<f64>> = smoother.frames.iter().map(off).collect();

@@ -16,13 +16,15 @@ const MOST: usize = 120;
 const DECISIVE: f64 = 20.0;
 
 /// What is asked, with the least of it that does harm.
-const ASKED: [FrameUnknown; 2] =
-    [FrameUnknown::Delay { sigma_secs: HARMFUL_DELAY }, FrameUnknown::Shift { sigma_rad: HARMFUL_SHIFT }];
+const ASKED: [FrameUnknown; 2] = [
+    FrameUnknown::Delay { sigma_secs: HARMFUL_DELAY },
+    FrameUnknown::ImageShift { sigma_rad: HARMFUL_SHIFT },
+];
 
 /// What is taken of the images where the answer is yes.
 const TAKEN: [FrameUnknown; 2] = [
     FrameUnknown::Delay { sigma_secs: STAMP_SCATTER_SECS },
-    FrameUnknown::Shift { sigma_rad: IMAGE_SHIFT_RAD },
+    FrameUnknown::ImageShift { sigma_rad: IMAGE_SHIFT_RAD },
 ];
 
 /// The questions so far.
@@ -75,7 +77,9 @@ impl Odometry {
         let Some(told) = self.questions.take(answers, now) else { return };
         match TAKEN[told] {
             FrameUnknown::Delay { sigma_secs } => self.config.stamp_scatter_ms = Some(1e3 * sigma_secs),
-            FrameUnknown::Shift { sigma_rad } => self.config.image_shift_deg = Some(sigma_rad.to_degrees()),
+            FrameUnknown::ImageShift { sigma_rad } => {
+                self.config.image_shift_deg = Some(sigma_rad.to_degrees())
+            }
         }
         window.smoother.set_image_unknowns(&self.config);
     }
