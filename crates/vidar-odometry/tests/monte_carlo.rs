@@ -9,7 +9,7 @@
 
 use nalgebra::Vector3;
 use vidar_core::{FrameId, ImuNoise, LieGroup, Se3, So3};
-use vidar_odometry::backend::{GaugePriorSigmas, Smoother};
+use vidar_odometry::backend::{GaugePriorSigmas, Smoother, SmootherConfig};
 use vidar_odometry::imu::{Bias, NavState};
 use vidar_odometry::simulate::{
     Course, CourseKind, FeatureOdometry, FeatureOdometryConfig, Flight, Motion, Random, Simulation,
@@ -48,16 +48,24 @@ struct Run {
 
 fn fly(seed: u64, secs: f64, tracks: usize, rate_hz: f64) -> Run {
     let settings = SimulationConfig { seed, tracks, camera_rate_hz: rate_hz, ..Default::default() };
-    fly_with(&settings, secs, 0.0)
+    fly_with(&settings, secs, |_| {})
 }
 
-/// Told that stamps scatter by `stamp_scatter_ms`.
-fn fly_with(settings: &SimulationConfig, secs: f64, stamp_scatter_ms: f64) -> Run {
+/// The state whose orientation is that of the image: where the lens is shifted, a camera turned as much shows the same.
+fn of_image(truth: &NavState, settings: &SimulationConfig, secs: f64) -> NavState {
+    let (shift, camera) = (settings.lens_at(secs).shift, Simulation::body_from_camera());
+    let Se3 { rotation, translation } = truth.world_from_body;
+    let turned = rotation * So3::exp(&(camera.rotation * Vector3::new(shift.y, -shift.x, 0.0)));
+    let at_camera = translation + rotation * camera.translation;
+    NavState { world_from_body: Se3::new(turned, at_camera - turned * camera.translation), ..*truth }
+}
+
+fn fly_with(settings: &SimulationConfig, secs: f64, change: impl Fn(&mut SmootherConfig)) -> Run {
     let SimulationConfig { seed, camera_rate_hz: rate_hz, .. } = *settings;
     let course = Course { kind: CourseKind::Eight, secs: secs + 1.0, speed: 1.2, phase: 0.37 * seed as f64 };
     let simulation = Simulation::new(&course, 0.0, secs, settings);
     let mut config = FeatureOdometryConfig::new(&ImuNoise::EUROC, 1.0);
-    config.smoother.stamp_scatter_ms = stamp_scatter_ms;
+    change(&mut config.smoother);
     config.keyframe_every = (rate_hz / 5.0).round() as usize;
     let mut odometry = FeatureOdometry::for_simulation(config, &simulation).unwrap();
     let mut random = Random::new(7_000 + seed);
@@ -69,7 +77,10 @@ fn fly_with(settings: &SimulationConfig, secs: f64, stamp_scatter_ms: f64) -> Ru
         else {
             panic!("it was started");
         };
-        let error = state.minus(&frame.truth);
+        let truth = |id: FrameId| {
+            of_image(&simulation.frames[id.index()].truth, settings, id.index() as f64 / rate_hz)
+        };
+        let error = state.minus(&truth(frame.id));
         run.squared_errors += error.fixed_rows::<3>(3).norm_squared();
         run.frames += 1.0;
         if k % 10 == 0 {
@@ -77,7 +88,6 @@ fn fly_with(settings: &SimulationConfig, secs: f64, stamp_scatter_ms: f64) -> Ru
             let covariance = smoother.pose_covariance(frame.id).unwrap();
             let pose_error = error.fixed_rows::<6>(0).into_owned();
             run.nees.push(pose_error.dot(&covariance.cholesky().unwrap().solve(&pose_error)));
-            let truth = |id: FrameId| simulation.frames[id.index()].truth;
             run.relative_nees.extend(relative(smoother, truth));
         }
     }
@@ -138,11 +148,26 @@ fn pose_covariance_is_consistent_where_stamps_scatter() {
         stamp_scatter_secs: 0.004,
         ..Default::default()
     };
-    let runs: Vec<Run> = (0..20).map(|seed| fly_with(&scattering(seed), 4.0, 4.0)).collect();
+    let runs: Vec<Run> =
+        (0..20).map(|seed| fly_with(&scattering(seed), 4.0, |c| c.stamp_scatter_ms = 4.0)).collect();
     evaluate(&runs, 0.06);
     // Taken as they are, such stamps contradict the IMU.
-    let unaware: Vec<Run> = (0..20).map(|seed| fly_with(&scattering(seed), 4.0, 0.0)).collect();
+    let unaware: Vec<Run> = (0..20).map(|seed| fly_with(&scattering(seed), 4.0, |_| {})).collect();
     let nees = mean(unaware.iter().flat_map(|r| r.nees.iter().copied()));
+    assert!(nees > 20.0, "pose NEES {nees:.2}");
+}
+
+#[test]
+fn pose_covariance_is_consistent_where_images_are_shifted() {
+    let stabilised =
+        |seed| SimulationConfig { seed, tracks: 40, camera_rate_hz: 10.0, shift: 0.01, ..Default::default() };
+    let fly = |aware: bool| -> Vec<Run> {
+        let change = |c: &mut SmootherConfig| c.image_shift_deg = if aware { 0.6 } else { 0.0 };
+        (0..20).map(|seed| fly_with(&stabilised(seed), 4.0, change)).collect()
+    };
+    evaluate(&fly(true), 0.1);
+    // Taken as they are, such images contradict the gyroscope.
+    let nees = mean(fly(false).iter().flat_map(|r| r.nees.iter().copied()));
     assert!(nees > 20.0, "pose NEES {nees:.2}");
 }
 

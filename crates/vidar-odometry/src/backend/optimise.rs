@@ -91,7 +91,6 @@ impl Smoother {
 
     /// As [`Smoother::optimise_into`], with a damping to begin with (larger for rough starts).
     pub(crate) fn optimise_from(&mut self, first: f64, max_iterations: usize, report: &mut OptimiseReport) {
-        self.turn_shifted_pixels();
         let mut system = std::mem::take(&mut self.system);
         let cost = self.linearise(&mut system, first);
         let calibration = self.calibration;
